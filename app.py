@@ -1,0 +1,357 @@
+"""The command line: reads a scene, wires the parts, runs the loop. ``python app.py --help`` lists what it does."""
+
+import json
+import os
+import sys
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+import click
+import numpy as np
+from PIL import Image
+from tqdm import tqdm
+
+from scenes.anatomy import load_anatomy, patient_scene
+from scenes.patient import describe, import_patient, save_patient
+from scenes.reading import PatientError, read_volume
+from scenes.scene import SceneError, load_scene, scene_text, with_options
+
+if TYPE_CHECKING:
+    from render.viewer import Controls, Settings, View, Viewer
+    from studies.rehearsal import Rehearsal
+    from studies.report import Record
+
+EMBEDDED = Path(__file__).parent / "scenes" / "phantom.toml"
+PICTURES_A_SECOND = 10
+ANIMATION_WIDTH = 720
+
+
+class Fault(click.ClickException):
+    """What the user must know, in one line."""
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+def cli() -> None:
+    """Nephron: rehearse ultrasound on a patient's own deformable kidney.
+
+    Without a command it is `rehearse` on the embedded patient.
+    """
+
+
+@cli.command()
+@click.argument("scene", type=click.Path(path_type=Path), default=EMBEDDED, required=False)
+@click.option(
+    "--headless", is_flag=True, help="No window: run the scripted press, write pictures and a report."
+)
+@click.option(
+    "--seconds", type=click.FloatRange(0.02, 3600), help="Simulated seconds for the press [the scene's]."
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("out"),
+    show_default=True,
+    help="Folder for pictures and the report.",
+)
+@click.option(
+    "--arch",
+    type=click.Choice(["auto", "cuda", "vulkan", "cpu"]),
+    default="auto",
+    show_default=True,
+    help="Where to compute; auto is CUDA where there is one, else the CPU.",
+)
+@click.option("--radius", type=float, help="Particle radius in mm [the scene's].")
+@click.option("--stiffness", type=float, help="Cluster stiffness, 0 to 1 [the scene's].")
+@click.option("--substeps", type=int, help="Substeps of a time step [the scene's].")
+@click.option("--iterations", type=int, help="Passes over the constraints in a substep [the scene's].")
+def rehearse(
+    scene: Path,
+    headless: bool,
+    seconds: float | None,
+    out: Path,
+    arch: str,
+    radius: float | None,
+    stiffness: float | None,
+    substeps: int | None,
+    iterations: int | None,
+) -> None:
+    """Press the kidney of SCENE, a scene file or a patient's folder, and see what the transducer sees."""
+    path = scene / "scene.toml" if scene.is_dir() else scene
+    options = {
+        "tissue.radius_mm": radius,
+        "tissue.stiffness": stiffness,
+        "solver.substeps": substeps,
+        "solver.iterations": iterations,
+    }
+    loaded = with_options(load_scene(path), options)
+    anatomy = load_anatomy(loaded, path.parent)
+    from sim.device import NoDevice, start
+
+    try:
+        used = start(arch)
+    except NoDevice as error:
+        raise Fault(f"--arch {arch}: {error}") from None
+    from render.window import display_available
+    from studies.rehearsal import Rehearsal
+
+    if not headless and not display_available():
+        click.echo("No display: running the scripted press without a window.")
+        headless = True
+    make_folder(out)
+    started = perf_counter()
+    rehearsal = Rehearsal(loaded, anatomy)
+    if headless:
+        run_headless(rehearsal, used, seconds, out, perf_counter() - started)
+    else:
+        run_window(rehearsal, out)
+
+
+@cli.command("import")
+@click.argument("ct", type=click.Path(path_type=Path))
+@click.argument("labels", type=click.Path(path_type=Path))
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="Folder to write the patient to; new or empty.",
+)
+@click.option("--organ", help="Label values of the organ, such as 1 or 1,2 [all but the tumour's].")
+@click.option("--tumour", help="Label values of the tumour [none].")
+@click.option(
+    "--side", type=click.Choice(["left", "right"]), help="Which kidney, where the labels hold both."
+)
+def import_command(
+    ct: Path, labels: Path, out: Path, organ: str | None, tumour: str | None, side: str | None
+) -> None:
+    """Make a patient's folder, with a scene, out of a CT (DICOM folder, NIfTI, NRRD, MHA) and its LABELS."""
+    patient = import_patient(
+        read_volume(ct),
+        read_volume(labels),
+        label_values(organ, "--organ"),
+        label_values(tumour, "--tumour"),
+        side,
+    )
+    save_patient(patient, out, {"scene.toml": scene_text(patient_scene(patient))})
+    click.echo(describe(patient))
+    click.echo(f"Written to {out}. Rehearse with: python app.py rehearse {out}")
+
+
+def label_values(text: str | None, option: str) -> list[int] | None:
+    """Label values of an option's text, such as "1,2"."""
+    if text is None:
+        return None
+    try:
+        return [int(value) for value in text.split(",")]
+    except ValueError:
+        raise Fault(f"{option} is {text!r}: expected whole numbers such as 1 or 1,2") from None
+
+
+def make_folder(folder: Path) -> None:
+    """Make sure that a folder can be written to before time is spent on what goes there."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise Fault(
+            f"{folder}: cannot be made a folder for results ({error.strerror}); choose another --out"
+        ) from None
+    if not os.access(folder, os.W_OK):
+        raise Fault(f"{folder}: cannot be written to; choose another --out")
+
+
+def settings_of(rehearsal: "Rehearsal") -> "Settings":
+    """What the sliders start from."""
+    from render.viewer import Settings
+
+    scene, step = rehearsal.scene, rehearsal.settings
+    return Settings(
+        stiffness=step.stiffness,
+        iterations=step.iterations,
+        substeps=step.substeps,
+        gravity_m_s2=scene.gravity.acceleration_m_s2,
+        window_hu=round(scene.image.window_hu),
+        level_hu=round(scene.image.level_hu),
+        depth_mm=round(scene.image.depth_mm),
+    )
+
+
+def open_viewer(rehearsal: "Rehearsal", visible: bool) -> "Viewer":
+    """The window, or its off-screen twin. Raises NoVulkan."""
+    from render.viewer import Geometry
+    from render.window import Window
+
+    support, tumour = rehearsal.supports, rehearsal.tumour
+    # Room above the organ for the transducer; the support may reach out of the picture.
+    shown = rehearsal.organ.bounds
+    above = shown - 16.0 * rehearsal.gravity_direction
+    return Window(
+        Geometry(
+            organ_vertices=rehearsal.organ_skin.vertices,
+            organ_faces=np.asarray(rehearsal.organ.faces, np.int32),
+            bounds=np.array([np.minimum(shown, above)[0], np.maximum(shown, above)[1]]),
+            up=-rehearsal.gravity_direction,
+            transducer_size_mm=rehearsal.size_mm,
+            tumour_vertices=rehearsal.tumour_skin and rehearsal.tumour_skin.vertices,
+            tumour_faces=None if tumour is None else np.asarray(tumour.faces, np.int32),
+            support_vertices=np.asarray(support[0].vertices, np.float32) if support else None,
+            support_faces=np.asarray(support[0].faces, np.int32) if support else None,
+        ),
+        settings_of(rehearsal),
+        visible=visible,
+    )
+
+
+def run_frame(rehearsal: "Rehearsal", settings: "Settings", move, record: "Record") -> "View":
+    """One frame, on screen and off: move the transducer and step, carry the surfaces, take the picture."""
+    from render.viewer import View
+    from studies.report import timed
+
+    timed(move, record.step_ms)
+    rehearsal.update_surfaces()
+    picture = timed(
+        lambda: rehearsal.image(settings.window_hu, settings.level_hu, settings.depth_mm), record.slice_ms
+    )
+    readouts = {
+        "step": f"{np.median(record.step_ms[-30:]):.1f} ms",
+        "slice": f"{np.median(record.slice_ms[-30:]):.1f} ms",
+        "particles": f"{rehearsal.body.count}",
+        "indentation": f"{max(rehearsal.indentation_mm(), 0.0):.1f} mm",
+    }
+    return View(
+        transducer_pose=rehearsal.pose,
+        slice_image=picture,
+        width_mm=rehearsal.scene.image.width_mm,
+        depth_mm=settings.depth_mm,
+        readouts=readouts,
+        title=rehearsal.scene.title,
+    )
+
+
+def run_headless(rehearsal: "Rehearsal", arch: str, seconds: float | None, out: Path, build_s: float) -> None:
+    """The scripted press without a screen: frames, slices, an animated picture and report.json."""
+    from render.window import NoVulkan
+    from studies.report import Record
+
+    try:
+        viewer: Viewer | None = open_viewer(rehearsal, visible=False)
+    except NoVulkan as reason:
+        click.echo(f"{reason}; writing the slices and the report without 3D frames.")
+        viewer = None
+    settings = settings_of(rehearsal)
+    record = Record(build_s)
+    length_s = seconds or rehearsal.script_length_s()
+    dt = rehearsal.settings.time_step_s
+    steps = max(1, round(length_s / dt))
+    every = max(1, round(1 / (PICTURES_A_SECOND * dt)))
+    frames, slices = empty_folder(out / "frames"), empty_folder(out / "slices")
+    animation: list[Image.Image] = []
+    for step in tqdm(range(1, steps + 1), desc="press", unit="step"):
+        pose = rehearsal.scripted_pose(rehearsal.script_length_s() * step / steps)
+        view = run_frame(rehearsal, settings, lambda pose=pose: rehearsal.advance(pose), record)
+        record.watch(rehearsal)
+        if step % every == 0 or step == steps:
+            picture = Image.fromarray(view.slice_image)
+            picture.save(slices / f"{step:05d}.png")
+            if viewer is not None:
+                viewer.draw(view)
+                picture = Image.fromarray(viewer.picture())
+                picture.save(frames / f"{step:05d}.png")
+            animation.append(smaller(picture))
+    save_animation(animation, out / "press.gif")
+    (out / "report.json").write_text(json.dumps(record.report(rehearsal, arch), indent=2) + "\n", "utf-8")
+    click.echo(f"Wrote {len(animation)} pictures, press.gif and report.json to {out}")
+
+
+def run_window(rehearsal: "Rehearsal", out: Path) -> None:
+    """The interactive loop: input -> transducer -> step -> surfaces and slice -> picture."""
+    from render.window import NoVulkan
+    from studies.report import Record
+
+    try:
+        viewer = open_viewer(rehearsal, visible=True)
+    except NoVulkan as reason:
+        raise Fault(f"{reason}; install a Vulkan driver, or run with --headless") from None
+    record = Record(0.0)
+    frozen = False
+    shots = 0
+    before = perf_counter()
+    rate = 0.0
+    view = run_frame(rehearsal, viewer.settings, lambda: rehearsal.advance(rehearsal.pose), record)
+    while viewer.running:
+        controls = viewer.read_controls()
+        frozen ^= controls.freeze
+        move = steer(rehearsal, controls)
+        if not frozen:
+            view = run_frame(rehearsal, controls.settings, move, record)
+        now = perf_counter()
+        rate = 0.9 * rate + 0.1 / max(now - before, 1e-6)
+        before = now
+        view.readouts["frames"] = f"{rate:.0f} /s"
+        viewer.draw(with_status(view, "FROZEN" if frozen else ""))
+        if controls.screenshot:
+            shots += 1
+            Image.fromarray(viewer.picture()).save(out / f"screenshot-{shots:03d}.png")
+    viewer.close()
+
+
+def steer(rehearsal: "Rehearsal", controls: "Controls"):
+    """Hand the user's input to the hand that holds the transducer and to the solver; the step to take then."""
+    step, hand, asked = rehearsal.settings, rehearsal.hand, controls.settings
+    step.stiffness, step.iterations, step.substeps = asked.stiffness, asked.iterations, asked.substeps
+    rehearsal.set_gravity(asked.gravity_m_s2)
+    if controls.reset:
+        rehearsal.reset()
+    elif controls.ray is not None:
+        hand.point(*controls.ray)
+    hand.hold(controls.press, step.time_step_s)
+    hand.push(controls.push_mm)
+    hand.turn(controls.fan_deg, controls.tilt_deg, controls.roll_deg)
+    return lambda: rehearsal.follow(hand.pose())
+
+
+def with_status(view: "View", status: str) -> "View":
+    from dataclasses import replace
+
+    return replace(view, status=status)
+
+
+def empty_folder(folder: Path) -> Path:
+    """A folder without the pictures of an earlier run."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for picture in folder.glob("[0-9]*.png"):
+        picture.unlink()
+    return folder
+
+
+def smaller(picture: Image.Image) -> Image.Image:
+    """A picture no wider than the animation."""
+    width = min(ANIMATION_WIDTH, picture.width)
+    return picture.resize((width, round(picture.height * width / picture.width)), Image.Resampling.LANCZOS)
+
+
+def save_animation(pictures: list[Image.Image], path: Path) -> None:
+    """Write an animated GIF that repeats."""
+    first, *others = [picture.convert("P", palette=Image.Palette.ADAPTIVE) for picture in pictures]
+    first.save(path, save_all=True, append_images=others, duration=1000 // PICTURES_A_SECOND, loop=0)
+
+
+def main(arguments: list[str]) -> int:
+    """Run a command line; what the user must mend is one line, and the exit status 2."""
+    if not arguments or (arguments[0].startswith("-") and arguments[0] not in ("-h", "--help")):
+        arguments = ["rehearse", *arguments]
+    try:
+        cli.main(args=arguments, prog_name="app.py", standalone_mode=False)
+        return 0
+    except click.ClickException as error:
+        message = error.format_message()
+    except (SceneError, PatientError) as error:
+        message = str(error)
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("Stopped.", err=True)
+        return 130
+    click.echo(f"nephron: {' '.join(message.split())}", err=True)
+    return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,114 @@
+"""The camera that orbits the organ, and the way back from the mouse to a ray. NumPy only; lengths in mm.
+
+Window coordinates run from (0, 0) bottom left to (1, 1) top right, as GGUI gives the mouse.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+FIELD_OF_VIEW_DEG = 28.0
+MARGIN = 1.04
+
+
+class OrbitCamera:
+    """Perspective camera that turns about a target and shows it in the middle of one part of the window.
+
+    Args:
+        bounds: box to frame [mm], shape (2, 3).
+        up: unit direction, shape (3,), that stays upright.
+        part: left, bottom, right, top of the part of the window that shows the scene, window coordinates.
+        aspect: width / height of the whole window.
+    """
+
+    def __init__(self, bounds, up, part, aspect: float):
+        bounds = np.asarray(bounds, dtype=np.float64)
+        self.up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+        self.target = bounds.mean(axis=0)
+        self.aspect = aspect
+        self.part = part
+        self.azimuth_deg, self.elevation_deg = 20.0, 32.0
+        # The long side of the organ lies across the view: that is how a kidney is looked at.
+        flat = np.eye(3) - np.outer(self.up, self.up)
+        spread = (bounds[1] - bounds[0]) * np.linalg.norm(flat, axis=1)
+        side = flat[int(np.argmax(spread))]
+        self._side = side / np.linalg.norm(side)
+        self._ahead = np.cross(self.up, self._side)
+        self.distance = self.distance_home = self._distance_that_frames(bounds)
+
+    def _distance_that_frames(self, bounds: np.ndarray) -> float:
+        corners = np.array(
+            [[bounds[i][0], bounds[j][1], bounds[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+        )
+        right, up, ahead = self.axes()
+        offset = corners - self.target
+        left, bottom, right_edge, top = self.part
+        half = self._half_extent() * [right_edge - left, top - bottom]
+        # What lies behind the target drifts towards the middle of the window, as the eye stands aside of the target.
+        drift = np.outer(offset @ ahead, self._aside())
+        reach = np.abs(np.stack([offset @ right, offset @ up], axis=1) - drift) / half
+        return float(MARGIN * np.max(reach.max(axis=1) - offset @ ahead))
+
+    def axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Unit vectors to the right, up and ahead of the camera, world."""
+        azimuth, elevation = np.radians([self.azimuth_deg, self.elevation_deg])
+        level = np.cos(azimuth) * self._ahead + np.sin(azimuth) * self._side
+        ahead = np.cos(elevation) * level - np.sin(elevation) * self.up
+        right = np.cross(ahead, self.up)
+        right /= np.linalg.norm(right)
+        return right, np.cross(right, ahead), ahead
+
+    def _half_extent(self) -> np.ndarray:
+        """Half width and half height of the window at distance 1."""
+        half_height = np.tan(np.radians(FIELD_OF_VIEW_DEG / 2))
+        return np.array([half_height * self.aspect, half_height])
+
+    def _aside(self) -> np.ndarray:
+        """Slopes to the right and up at which the middle of the part is seen."""
+        left, bottom, right_edge, top = self.part
+        return np.array([left + right_edge - 1.0, bottom + top - 1.0]) * self._half_extent()
+
+    def eye(self) -> np.ndarray:
+        """Position [mm]. It stands aside of the target, so that the target falls in the middle of its part."""
+        right, up, ahead = self.axes()
+        across, along = self._aside()
+        return self.target - self.distance * (ahead + across * right + along * up)
+
+    def direction(self, cursor) -> np.ndarray:
+        """Direction, of length 1 along the view, from the eye through window coordinates (2,) or (k, 2)."""
+        slope = (2.0 * np.asarray(cursor, dtype=np.float64) - 1.0) * self._half_extent()
+        right, up, ahead = self.axes()
+        return ahead + slope[..., :1] * right + slope[..., 1:] * up
+
+    def ray(self, cursor) -> tuple[np.ndarray, np.ndarray]:
+        """Origin [mm] and unit direction under window coordinates (2,)."""
+        direction = self.direction(cursor)
+        return self.eye(), direction / np.linalg.norm(direction)
+
+    def project(self, points) -> np.ndarray:
+        """Window coordinates, shape (k, 2), of world points [mm], shape (k, 3), in front of the camera."""
+        offset = np.asarray(points, dtype=np.float64) - self.eye()
+        right, up, ahead = self.axes()
+        plane = np.stack([offset @ right, offset @ up], axis=-1) / (offset @ ahead)[..., None]
+        return 0.5 + 0.5 * plane / self._half_extent()
+
+    def orbit(self, across: float, along: float) -> None:
+        """Turn by a drag of the mouse, in window coordinates. The poles stay out of reach: up would be lost."""
+        self.azimuth_deg += 220.0 * across
+        self.elevation_deg = float(np.clip(self.elevation_deg - 160.0 * along, -80.0, 85.0))
+
+    def pan(self, across: float, along: float) -> None:
+        """Shift so that the tissue follows a drag of the mouse, in window coordinates."""
+        right, up, _ = self.axes()
+        half_width, half_height = self._half_extent()
+        self.target = self.target - 2.0 * self.distance * (
+            across * half_width * right + along * half_height * up
+        )
+
+    def zoom(self, factor: float) -> None:
+        """Multiply the distance, between a third and three times the first one."""
+        self.distance = float(np.clip(self.distance * factor, self.distance_home / 3, self.distance_home * 3))
+
+    def near_far(self) -> tuple[float, float]:
+        """Clipping distances [mm]."""
+        return self.distance_home / 100.0, self.distance_home * 10.0

@@ -1,0 +1,148 @@
+"""The 3D view: organ, tumour, support, transducer and image plane, handed to a GGUI scene.
+
+The scene is a parameter, so that taichi.ui is imported by window.py alone. Lengths in mm.
+"""
+
+import numpy as np
+import taichi as ti
+
+from render import solids
+from render.camera import OrbitCamera
+from render.surface import GLASS, SOLID, Surface
+from render.viewer import Geometry, Settings, View
+
+PLANE_ROWS, PLANE_COLUMNS = 96, 64
+KEY_LIGHT, FILL_LIGHT, AMBIENT = (0.82, 0.80, 0.77), (0.17, 0.19, 0.23), (0.17, 0.17, 0.19)
+TUMOUR, SUPPORT, EDGE, FRAME = (0.93, 0.76, 0.28), (0.30, 0.33, 0.36), (0.85, 0.9, 0.94), (0.25, 0.77, 1.0)
+LINE_WIDTH = 1.2
+MASKS = 4
+
+
+def _vector_field(values: np.ndarray):
+    field = ti.Vector.field(values.shape[1], ti.f32, shape=len(values))
+    _fill(field, values)
+    return field
+
+
+def _fill(field, values: np.ndarray) -> None:
+    field.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+
+
+class Stage:
+    """The fields of what is drawn, and one method that draws them all."""
+
+    def __init__(self, geometry: Geometry, camera: OrbitCamera):
+        self.camera = camera
+        self._organ = Surface(geometry.organ_vertices, geometry.organ_faces)
+        self._tumour = self._support = None
+        if geometry.tumour_vertices is not None:
+            self._tumour = Surface(geometry.tumour_vertices, geometry.tumour_faces, TUMOUR)
+        if geometry.support_vertices is not None:
+            self._support = self._matt_support(geometry)
+        self._half_axis_mm = geometry.transducer_size_mm[2] / 2
+        self._probe = solids.transducer(geometry.transducer_size_mm)
+        self._probe_vertices, self._probe_normals, self._probe_colours = map(_vector_field, self._probe[:3])
+        self._probe_edges = solids.cuboid_edges(geometry.transducer_size_mm)
+        self._edge_points = _vector_field(self._probe_edges)
+        self._plane, self._plane_indices = solids.image_plane_grid(PLANE_ROWS, PLANE_COLUMNS)
+        self._plane_points, self._plane_normals = _vector_field(self._plane), _vector_field(self._plane)
+        self._plane_colours = _vector_field(np.ones((len(self._plane), 3)))
+        self._frame_points = _vector_field(np.zeros((8, 3)))
+        self._mask_points, self._mask_normals = (_vector_field(np.ones((6 * MASKS, 3))) for _ in range(2))
+        self._mask_colours = _vector_field(np.zeros((6 * MASKS, 4)))
+        self._mask_indices = np.arange(6 * MASKS, dtype=np.int32)
+
+    def _matt_support(self, geometry: Geometry) -> Surface:
+        vertices = _vector_field(np.asarray(geometry.support_vertices))
+        support = Surface(vertices, geometry.support_faces, SUPPORT, gloss=0.0)
+        # It neither moves nor shines, so its colours are worked out once, as seen from far above.
+        above = self.camera.target + 10.0 * self.camera.distance_home * self.camera.up
+        support.shade(above, above)
+        return support
+
+    def draw(
+        self, scene, view: View, settings: Settings, masked: list[tuple[float, float, float, float]]
+    ) -> None:
+        """Hand everything to `scene`, in the order that depth and blending need.
+
+        masked: at most MASKS parts of the window (left, bottom, right, top) that nothing may cover.
+        """
+        right, up, ahead = self.camera.axes()
+        eye, distance = self.camera.eye(), self.camera.distance_home
+        key = eye + distance * (0.55 * up - 0.85 * right)
+        scene.ambient_light(AMBIENT)
+        scene.point_light(key.tolist(), KEY_LIGHT)
+        scene.point_light((eye + distance * (0.9 * right - 0.2 * up)).tolist(), FILL_LIGHT)
+        self._mask(scene, masked)
+        if self._support is not None and settings.show_support:
+            # A reduced mesh has slivers that face the wrong way, which would show as black specks.
+            _draw_surface(scene, self._support, two_sided=True)
+        self._draw_transducer(scene, view.transducer_pose)
+        if self._tumour is not None and settings.show_tumour:
+            self._tumour.shade(eye, key)
+            _draw_surface(scene, self._tumour)
+        self._draw_image_plane(scene, view, key)
+        cut = _cut(view.transducer_pose, eye) if settings.cut else None
+        opacity = GLASS if settings.translucent else SOLID
+        self._organ.shade(eye, key, opacity, cut)
+        _draw_surface(scene, self._organ, ahead if opacity < SOLID or cut is not None else None)
+
+    def _mask(self, scene, masked) -> None:
+        """Quads of alpha 0 just behind the near plane: they leave the image behind and stop whatever comes later."""
+        corners = np.full((MASKS, 6, 2), -1.0)
+        for quad, (left, bottom, right, top) in zip(corners, masked, strict=False):
+            quad[:] = [
+                [left, bottom],
+                [right, bottom],
+                [right, top],
+                [left, bottom],
+                [right, top],
+                [left, top],
+            ]
+        depth = 1.02 * self.camera.near_far()[0]
+        _fill(self._mask_points, self.camera.eye() + depth * self.camera.direction(corners.reshape(-1, 2)))
+        scene.mesh(
+            self._mask_points, self._mask_indices, self._mask_normals, per_vertex_color=self._mask_colours
+        )
+
+    def _draw_transducer(self, scene, pose: np.ndarray) -> None:
+        probe = self._probe
+        _fill(self._probe_vertices, solids.placed(probe.vertices, pose))
+        _fill(self._probe_normals, probe.normals @ pose[:3, :3].T)
+        _fill(self._edge_points, solids.placed(self._probe_edges, pose))
+        scene.mesh(
+            self._probe_vertices, probe.indices, self._probe_normals, per_vertex_color=self._probe_colours
+        )
+        scene.lines(self._edge_points, LINE_WIDTH, color=EDGE)
+
+    def _draw_image_plane(self, scene, view: View, key: np.ndarray) -> None:
+        face = np.array(view.transducer_pose, dtype=np.float64)
+        face[:3, 3] -= face[:3, 2] * self._half_axis_mm
+        points = solids.placed(self._plane * [view.width_mm, 1.0, view.depth_mm], face)
+        toward = key - points
+        # Facing the key light everywhere, the plane is evenly bright: its grey is the slice's, not the light's.
+        _fill(self._plane_points, points)
+        _fill(self._plane_normals, toward / np.linalg.norm(toward, axis=1, keepdims=True))
+        grey = solids.sampled(view.slice_image, PLANE_ROWS, PLANE_COLUMNS)
+        _fill(self._plane_colours, np.repeat(grey[:, None], 3, axis=1))
+        _fill(self._frame_points, solids.placed(solids.image_plane_frame(view.width_mm, view.depth_mm), face))
+        scene.mesh(
+            self._plane_points, self._plane_indices, self._plane_normals, per_vertex_color=self._plane_colours
+        )
+        scene.lines(self._frame_points, LINE_WIDTH, color=FRAME)
+
+
+def _draw_surface(scene, surface: Surface, ahead: np.ndarray | None = None, two_sided=False) -> None:
+    scene.mesh(
+        surface.vertices,
+        surface.indices(ahead),
+        surface.normal,
+        per_vertex_color=surface.colour,
+        two_sided=two_sided,
+    )
+
+
+def _cut(pose: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A point on the image plane and its normal on the side of the eye."""
+    point, normal = pose[:3, 3], pose[:3, 1]
+    return point, normal if (eye - point) @ normal > 0 else -normal

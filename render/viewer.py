@@ -1,0 +1,203 @@
+"""What a front end is given, what it gives back, and the front end that draws nothing.
+
+Lengths are in mm, angles in degrees, patient coordinates LPS. Nothing here needs a screen, Vulkan or Taichi.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+
+class Key(NamedTuple):
+    """One line of the key map: `key` as it is printed, `action` (its name in the code), `text` for the reader."""
+
+    key: str
+    action: str
+    text: str
+
+
+KEY_MAP = (
+    Key("Mouse", "point", "move the transducer over the organ"),
+    Key("Left button", "press", "press the transducer in while held"),
+    Key("W", "push", "push the transducer in"),
+    Key("S", "lift", "lift the transducer"),
+    Key("A", "roll_left", "roll about its axis, to the left"),
+    Key("D", "roll_right", "roll about its axis, to the right"),
+    Key("Q", "tilt_left", "tilt in the image plane, to the left"),
+    Key("E", "tilt_right", "tilt in the image plane, to the right"),
+    Key("Z", "fan_back", "tilt out of the image plane, back"),
+    Key("C", "fan_forth", "tilt out of the image plane, forth"),
+    Key("Right drag", "orbit", "turn the view"),
+    Key("Shift + right drag", "pan", "shift the view (or middle drag)"),
+    Key("Up", "zoom_in", "zoom in"),
+    Key("Down", "zoom_out", "zoom out"),
+    Key("T", "translucent", "organ translucent or solid"),
+    Key("X", "cut", "cut the organ along the image plane"),
+    Key("F", "freeze", "freeze and go on"),
+    Key("R", "reset", "reset tissue and transducer"),
+    Key("P", "screenshot", "save a picture of the window"),
+    Key("H", "help", "show or hide this list"),
+    Key("Esc", "quit", "quit"),
+)
+
+
+def key_table() -> str:
+    """The key map as a Markdown table, for the README."""
+    rows = [f"| {line.key} | {line.text} |" for line in KEY_MAP]
+    return "\n".join(["| Key | What it does |", "| --- | --- |", *rows])
+
+
+def _slider(default, label: str, unit: str, low, high, group: str):
+    about = {"label": label, "unit": unit, "low": low, "high": high, "group": group}
+    return field(default=default, metadata=about)
+
+
+def _switch(default: bool, label: str):
+    return _slider(default, label, "", False, True, "View")
+
+
+@dataclass
+class Settings:
+    """What the sliders change. The metadata of a field (label, unit, low, high, group) is all that they are made of."""
+
+    stiffness: float = _slider(0.6, "Stiffness", "", 0.0, 1.0, "Tissue")
+    iterations: int = _slider(9, "Iterations", "", 1, 40, "Tissue")
+    substeps: int = _slider(3, "Substeps", "", 1, 10, "Tissue")
+    gravity_m_s2: float = _slider(9.81, "Gravity", "m/s2", 0.0, 20.0, "Tissue")
+    window_hu: int = _slider(350, "Window", "HU", 1, 2000, "Picture")
+    level_hu: int = _slider(40, "Level", "HU", -500, 500, "Picture")
+    depth_mm: int = _slider(60, "Depth", "mm", 20, 120, "Picture")
+    translucent: bool = _switch(True, "Translucent")
+    cut: bool = _switch(False, "Cut open")
+    show_tumour: bool = _switch(True, "Tumour")
+    show_support: bool = _switch(True, "Support")
+
+    def check(self) -> None:
+        """Raises ValueError, naming the field, its unit and its range, if a value lies outside its range."""
+        for each in fields(self):
+            value, low, high = getattr(self, each.name), each.metadata["low"], each.metadata["high"]
+            if not low <= value <= high:
+                unit = each.metadata["unit"]
+                raise ValueError(f"{each.name} = {value} is outside [{low}, {high}] {unit}".rstrip())
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """What is fixed for a scene. Vertices that move are Taichi fields, which the app keeps up to date."""
+
+    organ_vertices: Any
+    """Surface of the organ [mm], ti.Vector.field(3, ti.f32), shape (n,)."""
+    organ_faces: np.ndarray
+    """Triangles, normals outward, int32, shape (m, 3)."""
+    bounds: np.ndarray
+    """Box that the camera frames, least and greatest corner [mm], shape (2, 3)."""
+    up: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    """Direction opposite to gravity, shape (3,)."""
+    transducer_size_mm: np.ndarray = field(default_factory=lambda: np.array([40.0, 10.0, 20.0]))
+    """The cuboid, shape (3,): x lateral and to the marked side, y elevation, z axis. The image leaves at z = -size/2."""
+    tumour_vertices: Any = None
+    """As organ_vertices, or None."""
+    tumour_faces: np.ndarray | None = None
+    support_vertices: np.ndarray | None = None
+    """Fixed [mm], shape (k, 3), or None."""
+    support_faces: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class View:
+    """What changes each frame."""
+
+    transducer_pose: np.ndarray
+    """World from transducer [mm], shape (4, 4)."""
+    slice_image: np.ndarray
+    """Grey values, uint8, shape (rows = depth, columns = lateral, local x growing to the right)."""
+    width_mm: float
+    depth_mm: float
+    readouts: Mapping[str, str] = field(default_factory=dict)
+    """Name -> text with its unit, in the order of display: {"step": "9.1 ms"}."""
+    status: str = ""
+    """A short word over the picture, such as FROZEN."""
+    title: str = ""
+    """What is shown (scene or case); no patient's name, id or date."""
+    marked_side: str = "right"
+    """Where the marker dot stands in the picture: "right" is local +x, "left" for a probe that is marked at -x."""
+
+
+@dataclass
+class Controls:
+    """What the user did since the last frame: lengths and angles are the changes asked for in that time.
+
+    Angles are right-handed about the transducer's own axes.
+    """
+
+    settings: Settings
+    ray: tuple[np.ndarray, np.ndarray] | None = None
+    """Origin [mm] and unit direction under the mouse, world, each (3,); None off the 3D view or while the view turns."""
+    press: bool = False
+    """The button that presses the transducer in is held."""
+    push_mm: float = 0.0
+    """Along the transducer's axis, positive into the tissue, negative lifts."""
+    roll_deg: float = 0.0
+    """About the transducer's axis (local z)."""
+    tilt_deg: float = 0.0
+    """In the image plane (about local y); positive swings the beam towards -x."""
+    fan_deg: float = 0.0
+    """Out of the image plane (about local x); positive swings the beam towards +y."""
+    reset: bool = False
+    freeze: bool = False
+    """The freeze key went down: the app toggles."""
+    screenshot: bool = False
+    quit: bool = False
+
+
+class Viewer(Protocol):
+    """A front end. The loop is: while running: read_controls, step, draw."""
+
+    settings: Settings
+
+    @property
+    def running(self) -> bool: ...
+
+    def read_controls(self) -> Controls: ...
+
+    def draw(self, view: View) -> None: ...
+
+    def picture(self) -> np.ndarray:
+        """The last view drawn, uint8, shape (height, width, 3), top row first."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class NullViewer:
+    """Draws nothing: for tests and benches. It runs until `close`; `script` feeds it controls, frame by frame."""
+
+    def __init__(self, settings: Settings | None = None, script=(), size: tuple[int, int] = (1280, 720)):
+        self.settings = settings or Settings()
+        self.frames = 0
+        self._script = iter(script)
+        self._size = size
+        self._running = True
+
+    @property
+    def running(self) -> bool:
+        return self._running
+
+    def read_controls(self) -> Controls:
+        controls = next(self._script, None) or Controls(settings=self.settings)
+        self._running = self._running and not controls.quit
+        return controls
+
+    def draw(self, view: View) -> None:
+        self.frames += 1
+
+    def picture(self) -> np.ndarray:
+        width, height = self._size
+        return np.zeros((height, width, 3), dtype=np.uint8)
+
+    def close(self) -> None:
+        self._running = False

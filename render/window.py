@@ -1,0 +1,354 @@
+"""The window of the surgeon, on a screen or off it: 3D view, ultrasound panel, sliders, mouse and keys.
+
+The only file that imports taichi.ui. How one frame is put together:
+1. a full-window image (frame.py: panel, slice, texts) lies behind everything;
+2. invisible quads right before the eye, over the panel and the strip, take the depth buffer there, so that no organ is
+   ever drawn over them, however far one zooms in;
+3. support, transducer, image plane, tumour, and last the organ, whose faces may be translucent;
+4. the sliders, generated from the metadata of `Settings`.
+"""
+
+import atexit
+import ctypes
+import dataclasses
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import taichi as ti
+from taichi.ui.utils import get_field_info
+
+from render import frame
+from render.camera import FIELD_OF_VIEW_DEG, OrbitCamera
+from render.stage import Stage
+from render.viewer import KEY_MAP, Controls, Geometry, Settings, View
+
+PUSH_MM_S, ROLL_DEG_S, TILT_DEG_S, ZOOM_S = 15.0, 45.0, 30.0, 0.5
+READOUT_PERIOD_S, FRAMES_A_SECOND = 0.25, 60
+PRESSED_ONCE = {"r": "reset", "f": "freeze", "p": "screenshot", ti.ui.ESCAPE: "quit"}
+TOGGLES = {"t": "translucent", "x": "cut"}
+HELD = {
+    "w": ("push_mm", PUSH_MM_S),
+    "s": ("push_mm", -PUSH_MM_S),
+    "a": ("roll_deg", ROLL_DEG_S),
+    "d": ("roll_deg", -ROLL_DEG_S),
+    "q": ("tilt_deg", TILT_DEG_S),
+    "e": ("tilt_deg", -TILT_DEG_S),
+    "z": ("fan_deg", -TILT_DEG_S),
+    "c": ("fan_deg", TILT_DEG_S),
+}
+
+
+class NoVulkan(RuntimeError):
+    """There is no Vulkan driver that Taichi could draw with."""
+
+
+def display_available() -> bool:
+    """Whether a window can be opened. GLFW ends the process where it cannot, so this asks the X server first."""
+    if sys.platform in ("win32", "darwin"):
+        return True
+    if not os.environ.get("DISPLAY"):
+        return False
+    try:
+        x11 = ctypes.CDLL("libX11.so.6")
+    except OSError:
+        return False
+    x11.XOpenDisplay.restype = ctypes.c_void_p
+    x11.XCloseDisplay.argtypes = [ctypes.c_void_p]
+    connection = x11.XOpenDisplay(None)
+    if connection:
+        x11.XCloseDisplay(connection)
+    return bool(connection)
+
+
+def _put_image(canvas, pixels: np.ndarray) -> None:
+    """Show RGBA pixels, uint8 (width, height, 4), behind everything.
+
+    Canvas.set_image would spend 10 ms on packing them into 32-bit words, which they already are in memory.
+    """
+    canvas.canvas.set_image(get_field_info(pixels.view(np.uint32)[..., 0]))
+
+
+def _group_width(members: list[dataclasses.Field]) -> float:
+    """Pixels that a group of sliders needs: Dear ImGui's glyphs are 7 wide, its labels get 35 % of the box."""
+    longest = max(7 * len(_label(member)) for member in members)
+    return longest + 46 if isinstance(members[0].metadata["low"], bool) else (longest + 16) / 0.35
+
+
+def _label(member: dataclasses.Field) -> str:
+    return f"{member.metadata['label']} {member.metadata['unit']}".strip()
+
+
+class Window:
+    """A `Viewer` on GGUI. `ti.init` comes before it, and one window is open at a time.
+
+    Args:
+        geometry: what is fixed.
+        settings: what the sliders start from and change.
+        size: width, height in pixels.
+        visible: a real window, at most FRAMES_A_SECOND; else off-screen, where nothing is drawn before `picture` asks.
+        name: in the title bar.
+
+    Raises:
+        NoVulkan: no Vulkan loader, driver or device.
+        RuntimeError: a visible window without a display.
+    """
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        settings: Settings | None = None,
+        size=(1280, 720),
+        visible=True,
+        name="Nephron",
+    ):
+        if visible and not display_available():
+            raise RuntimeError("no display to open a window on")
+        self.settings = settings or Settings()
+        self.layout = frame.Layout(*size)
+        # GGUI goes on to measure sliders in shares of the size that the window was opened with.
+        self._first_size = size
+        self._visible = visible
+        self._ini_was_there = Path("imgui.ini").exists()
+        try:
+            self._window = ti.ui.Window(name, tuple(size), show_window=visible, fps_limit=FRAMES_A_SECOND)
+        except RuntimeError as error:
+            raise NoVulkan("no Vulkan driver found: the window and its pictures need one") from error
+        atexit.register(self.close)
+        self._canvas, self._scene = self._window.get_canvas(), self._window.get_scene()
+        self._gui = self._window.get_gui()
+        self._view: View | None = None
+        self._quit = False
+        self._help_shown = False
+        self._warm_up = 2
+        self._drag: str | None = None
+        self._cursor: np.ndarray | None = None
+        self._pressing = False
+        self._at_press = None
+        self._boxes_placed = 0
+        self._last_read = time.perf_counter()
+        self._lens = ti.ui.Camera()
+        part = self.layout.window_coordinates(self.layout.scene)
+        self.camera = OrbitCamera(geometry.bounds, geometry.up, part, size[0] / size[1])
+        self._stage = Stage(geometry, self.camera)
+        self._start_pixels()
+
+    def _start_pixels(self) -> None:
+        # GGUI wants columns first, bottom up, RGBA; frame.py writes rows, top down, through this view of the memory.
+        width, height = self.layout.width, self.layout.height
+        self._pixels = np.full((width, height, 4), 255, dtype=np.uint8)
+        self._page = self._pixels.transpose(1, 0, 2)[::-1]
+        self._drawn_panel = None
+        self._drawn_readouts: dict[str, str] | None = None
+        self._readouts_at = 0.0
+
+    # What the user does
+
+    @property
+    def running(self) -> bool:
+        return not self._quit and (self._window.running if self._visible else True)
+
+    def read_controls(self) -> Controls:
+        controls = Controls(settings=self.settings)
+        now = time.perf_counter()
+        elapsed, self._last_read = min(now - self._last_read, 0.1), now
+        if not self._visible:
+            return controls
+        self._read_cursor()
+        self._read_events(controls)
+        self._move_camera(elapsed)
+        for key, (name, rate) in HELD.items():
+            if self._window.is_pressed(key):
+                setattr(controls, name, getattr(controls, name) + rate * elapsed)
+        controls.press = self._pressing
+        if self._drag is None and self._over_scene():
+            controls.ray = self.camera.ray(self._cursor)
+        self._quit = self._quit or controls.quit
+        return controls
+
+    def _read_cursor(self) -> None:
+        cursor = np.array(self._window.get_cursor_pos(), dtype=np.float64)
+        # Before the mouse first moves GGUI says (0, 1), which is no place that anybody pointed at.
+        known = self._cursor is not None or tuple(cursor) != (0.0, 1.0)
+        self._moved = cursor - self._cursor if self._cursor is not None else np.zeros(2)
+        self._cursor = cursor if known else None
+
+    def _over_scene(self) -> bool:
+        if self._cursor is None:
+            return False
+        left, bottom, right, top = self.layout.window_coordinates(self.layout.scene)
+        x, y = self._cursor
+        inside = left <= x <= right and bottom <= y <= top
+        if inside and self._help_shown:
+            left, bottom, right, top = self.layout.window_coordinates(self.layout.help)
+            return not (left <= x <= right and bottom <= y <= top)
+        return inside
+
+    def _read_events(self, controls: Controls) -> None:
+        for event in self._window.get_events(ti.ui.PRESS):
+            self._key_down(event.key, controls)
+        for event in self._window.get_events(ti.ui.RELEASE):
+            if event.key == ti.ui.LMB:
+                self._pressing = False
+                self._put_sliders_back()
+            elif event.key in (ti.ui.RMB, ti.ui.MMB):
+                self._drag = None
+
+    def _key_down(self, key: str, controls: Controls) -> None:
+        if key == ti.ui.LMB:
+            self._pressing = self._over_scene()
+            self._at_press = None if self._pressing else (self._cursor, dataclasses.astuple(self.settings))
+        elif key in (ti.ui.RMB, ti.ui.MMB) and self._over_scene():
+            pans = key == ti.ui.MMB or self._window.is_pressed(ti.ui.SHIFT)
+            self._drag = "pan" if pans else "orbit"
+        elif key in PRESSED_ONCE:
+            setattr(controls, PRESSED_ONCE[key], True)
+        elif key in TOGGLES:
+            setattr(self.settings, TOGGLES[key], not getattr(self.settings, TOGGLES[key]))
+        elif key == "h":
+            self._help_shown = not self._help_shown
+
+    def _put_sliders_back(self) -> None:
+        """A drag that changed no setting may have moved a box of sliders: GGUI can only place a new one."""
+        at_press, self._at_press = self._at_press, None
+        if at_press is None or at_press[0] is None:
+            return
+        cursor, settings = at_press
+        moved = np.abs(self._cursor - cursor).max() > 0.002
+        if moved and settings == dataclasses.astuple(self.settings):
+            self._boxes_placed += 1
+
+    def _move_camera(self, elapsed: float) -> None:
+        if self._drag == "orbit":
+            self.camera.orbit(*self._moved)
+        elif self._drag == "pan":
+            self.camera.pan(*self._moved)
+        for key, sense in ((ti.ui.UP, -1.0), (ti.ui.DOWN, 1.0)):
+            if self._window.is_pressed(key):
+                self.camera.zoom(np.exp(sense * elapsed / ZOOM_S))
+
+    # What is drawn
+
+    def draw(self, view: View) -> None:
+        """Show a view. Off-screen it is only kept, for `picture`."""
+        self._view = view
+        if self._visible:
+            self._submit(view)
+            self._window.show()
+            self._follow_size()
+
+    def picture(self) -> np.ndarray:
+        """The last view drawn, uint8, shape (height, width, 3). Raises RuntimeError if nothing was drawn."""
+        if self._view is None:
+            raise RuntimeError("nothing was drawn yet")
+        # GGUI makes its widgets while it draws the first frame, and Dear ImGui shows a new box one frame late.
+        while not self._visible and self._warm_up > 0:
+            self._warm_up -= 1
+            self._submit(self._view)
+            self._window.get_image_buffer_as_numpy()
+        self._submit(self._view)
+        colours = self._window.get_image_buffer_as_numpy()
+        if self._visible:
+            self._window.show()
+        levels = (colours * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)
+        return np.ascontiguousarray(levels.transpose(1, 0, 2)[::-1, :, :3])
+
+    def close(self) -> None:
+        """Give the window back. A second call does nothing."""
+        if self._window is None:
+            return
+        window, self._window, self._quit = self._window, None, True
+        self._canvas = self._scene = self._gui = None
+        window.destroy()
+        # Dear ImGui leaves its layout file in the working directory; GGUI offers no switch against it.
+        if not self._ini_was_there:
+            Path("imgui.ini").unlink(missing_ok=True)
+        atexit.unregister(self.close)
+
+    def _follow_size(self) -> None:
+        size = self._window.get_window_shape()
+        if tuple(size) == (self.layout.width, self.layout.height) or min(size) < 200:
+            return
+        self.layout = frame.Layout(*size)
+        self._boxes_placed += 1
+        self._start_pixels()
+        self.camera.aspect = size[0] / size[1]
+        self.camera.part = self.layout.window_coordinates(self.layout.scene)
+
+    def _submit(self, view: View) -> None:
+        self._compose(view)
+        _put_image(self._canvas, self._pixels)
+        self._aim()
+        rects = [self.layout.panel, self.layout.title, self.layout.strip] + (
+            [self.layout.help] if self._help_shown else []
+        )
+        masked = [self.layout.window_coordinates(rect) for rect in rects]
+        self._stage.draw(self._scene, view, self.settings, masked)
+        self._canvas.scene(self._scene)
+        self._draw_sliders()
+
+    def _compose(self, view: View) -> None:
+        settings = self.settings
+        panel = frame.Panel(
+            view.width_mm,
+            view.depth_mm,
+            settings.window_hu,
+            settings.level_hu,
+            view.title,
+            view.status,
+            view.marked_side,
+        )
+        if self._drawn_panel != (panel, self._help_shown):
+            lines = [(key.key, key.text) for key in KEY_MAP] if self._help_shown else None
+            self._page[:, :, :3] = frame.backdrop(self.layout, panel, lines)
+            self._drawn_panel, self._drawn_readouts = (panel, self._help_shown), None
+        box = self.layout.picture_box(view.width_mm, view.depth_mm)
+        frame.paste_slice(self._page, box, view.slice_image)
+        self._compose_readouts(dict(view.readouts))
+
+    def _compose_readouts(self, readouts: dict[str, str]) -> None:
+        now = time.perf_counter()
+        # On a screen, figures that change every frame cannot be read; a kept picture shows its own frame's figures.
+        waits = self._visible and now - self._readouts_at < READOUT_PERIOD_S
+        if self._drawn_readouts is not None and (waits or readouts == self._drawn_readouts):
+            return
+        rows, columns = self.layout.readouts.slices
+        self._page[rows, columns, :3] = frame.readout_picture(self.layout, readouts)
+        self._drawn_readouts, self._readouts_at = readouts, now
+
+    def _aim(self) -> None:
+        _, up, ahead = self.camera.axes()
+        eye = self.camera.eye()
+        self._lens.position(*eye)
+        self._lens.lookat(*(eye + ahead * self.camera.distance))
+        self._lens.up(*up)
+        self._lens.fov(FIELD_OF_VIEW_DEG)
+        near, far = self.camera.near_far()
+        self._lens.z_near(near)
+        self._lens.z_far(far)
+        self._scene.set_camera(self._lens)
+
+    def _draw_sliders(self) -> None:
+        groups: dict[str, list[dataclasses.Field]] = {}
+        for each in dataclasses.fields(self.settings):
+            groups.setdefault(each.metadata["group"], []).append(each)
+        width, height = self._first_size
+        boxes = self.layout.sliders([_group_width(members) for members in groups.values()])
+        for (name, members), box in zip(groups.items(), boxes, strict=True):
+            place = (box.left / width, box.top / height, box.width / width, box.height / height)
+            with self._gui.sub_window(f"{name}##{self._boxes_placed}", *place):
+                for member in members:
+                    self._draw_slider(member)
+
+    def _draw_slider(self, member: dataclasses.Field) -> None:
+        value, about = getattr(self.settings, member.name), member.metadata
+        label = _label(member)
+        if isinstance(about["low"], bool):
+            value = self._gui.checkbox(label, bool(value))
+        elif isinstance(about["low"], int):
+            value = self._gui.slider_int(label, int(value), about["low"], about["high"])
+        else:
+            value = self._gui.slider_float(label, float(value), about["low"], about["high"])
+        setattr(self.settings, member.name, value)

@@ -1,0 +1,160 @@
+"""Load what a scene names: surfaces, CT and labels of a patient's folder, or of the embedded patient."""
+
+import hashlib
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import SimpleITK as sitk
+import trimesh
+
+from scenes.patient import Patient, import_patient, save_patient
+from scenes.phantom import Label, make_phantom
+from scenes.reading import PatientError, read_volume
+from scenes.scene import Anatomy, DistanceShape, MeshShape, PlaneShape, Press, Scene, SceneError
+
+HERE = Path(__file__).parent
+CACHE = HERE.parent / ".cache"
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Voxels (nx, ny, nz) float32 and the affine map (4, 4) from patient coordinates [mm] to voxel indices."""
+
+    voxels: np.ndarray
+    index_from_mm: np.ndarray
+
+
+@dataclass(frozen=True)
+class LoadedAnatomy:
+    """Everything of one patient that a rehearsal needs; LPS [mm]."""
+
+    organ: trimesh.Trimesh
+    tumour: trimesh.Trimesh | None
+    ct: Grid | None
+    shapes: tuple[PlaneShape | trimesh.Trimesh | Grid, ...]
+
+
+def load_anatomy(scene: Scene, folder: Path) -> LoadedAnatomy:
+    """Read the files that a scene names, relative to ``folder``. Raises SceneError with one line."""
+    anatomy = scene.anatomy
+    if anatomy.phantom:
+        folder = phantom_folder()
+        anatomy = Anatomy(tumour="tumour.stl")
+    return LoadedAnatomy(
+        organ=_surface(folder, anatomy.organ),
+        tumour=_surface(folder, anatomy.tumour) if anatomy.tumour else None,
+        ct=_grid(folder, anatomy.ct),
+        shapes=tuple(_shape(folder, shape) for shape in scene.shape),
+    )
+
+
+def press_on(press: Press, anatomy: LoadedAnatomy, gravity: np.ndarray) -> Press:
+    """A press with what it leaves open filled in.
+
+    The axis follows gravity through the middle of the tumour, or of the organ where there is none; the image is
+    taken along the organ's long axis.
+    """
+    direction = np.array(press.direction or gravity, float)
+    middle = (anatomy.tumour or anatomy.organ).center_mass
+    long_axis = np.linalg.svd(
+        anatomy.organ.vertices - anatomy.organ.vertices.mean(axis=0), full_matrices=False
+    )[2][0]
+    # The sign of a principal axis is arbitrary; the head, or the patient's left, is to the marked side.
+    long_axis *= np.sign(long_axis[np.argmax(np.abs(long_axis))])
+    return press.model_copy(
+        update={
+            "target_mm": press.target_mm or tuple(float(v) for v in middle),
+            "direction": tuple(float(v) for v in direction / np.linalg.norm(direction)),
+            "lateral": press.lateral or tuple(float(v) for v in long_axis),
+        }
+    )
+
+
+def patient_scene(patient: Patient) -> Scene:
+    """The scene that an import writes beside the patient's files: on the back, on the moulded support."""
+    tumour = None if patient.tumour is None else "tumour.stl"
+    return Scene(
+        title=f"{patient.side.capitalize()} kidney",
+        anatomy=Anatomy(tumour=tumour),
+        shape=(MeshShape(kind="mesh", file="support.stl"),),
+    )
+
+
+def phantom_folder() -> Path:
+    """Folder of the embedded patient, imported like any other on first use and whenever its sources changed."""
+    sources = [HERE / f"{name}.py" for name in ("phantom", "abdomen", "patient", "surfaces", "support")]
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]
+    for root in (CACHE, Path(tempfile.gettempdir()) / "nephron"):
+        folder = root / f"phantom-{digest}"
+        if folder.is_dir():
+            return folder
+        if _can_write(root):
+            ct, labels = make_phantom()
+            patient = import_patient(ct, labels, tumour=[Label.TUMOUR], side="left")
+            try:
+                save_patient(patient, folder)
+            except PatientError:
+                if not folder.is_dir():
+                    raise
+            return folder
+    raise SceneError(f"{CACHE}: cannot be written; the embedded patient needs a folder for its files")
+
+
+def _can_write(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK)
+
+
+def _surface(folder: Path, name: str) -> trimesh.Trimesh:
+    path = folder / name
+    if not path.is_file():
+        raise SceneError(f"{path}: no such surface file")
+    try:
+        mesh = trimesh.load_mesh(path)
+    except Exception as error:  # trimesh's readers raise whatever their parsers do
+        raise SceneError(f"{path}: cannot be read as a surface ({type(error).__name__})") from None
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise SceneError(f"{path}: holds no triangles; expected a closed surface")
+    if not np.isfinite(mesh.vertices).all():
+        raise SceneError(f"{path}: has vertices that are not finite")
+    if not mesh.is_watertight or mesh.volume <= 0:
+        raise SceneError(f"{path}: is not a closed surface that faces outward; repair it and try again")
+    return mesh
+
+
+def _grid(folder: Path, name: str | None) -> Grid | None:
+    if name is None:
+        return None
+    try:
+        image = read_volume(folder / name)
+    except PatientError as error:
+        raise SceneError(str(error)) from None
+    voxels = np.ascontiguousarray(sitk.GetArrayFromImage(image).transpose(2, 1, 0), np.float32)
+    mm_from_index = np.eye(4)
+    direction = np.array(image.GetDirection()).reshape(3, 3)
+    mm_from_index[:3, :3] = direction * image.GetSpacing()
+    mm_from_index[:3, 3] = image.GetOrigin()
+    return Grid(voxels, np.linalg.inv(mm_from_index))
+
+
+def _shape(
+    folder: Path, shape: PlaneShape | MeshShape | DistanceShape
+) -> PlaneShape | trimesh.Trimesh | Grid:
+    if isinstance(shape, PlaneShape):
+        return shape
+    if isinstance(shape, MeshShape):
+        return _surface(folder, shape.file)
+    grid = _grid(folder, shape.file)
+    assert grid is not None
+    axes = grid.index_from_mm[:3, :3]
+    if not np.allclose(axes, np.diag(np.diag(axes))) or (np.diag(axes) <= 0).any():
+        raise SceneError(
+            f"{folder / shape.file}: its axes are not the patient's; expected the identity direction"
+        )
+    return grid

@@ -1,0 +1,242 @@
+"""The scene file: what is modelled and how, one TOML file with a unit in the name of every key that has one.
+
+Lengths are mm in patient coordinates (LPS), times s, angles degrees. ``load_scene`` refuses unknown keys, units
+other than the schema's, and values out of range, each by name.
+"""
+
+import difflib
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import tomli_w
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+Vector3 = tuple[float, float, float]
+Stiffness = Annotated[float, Field(ge=0, le=1)]
+
+
+class SceneError(ValueError):
+    """A scene that cannot be used; the message is one line that says where, what was found and what to do."""
+
+
+def _not_zero(vector: Vector3) -> Vector3:
+    if np.linalg.norm(vector) < 1e-9:
+        raise ValueError("a direction must not be zero")
+    return vector
+
+
+Direction = Annotated[Vector3, AfterValidator(_not_zero)]
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Anatomy(Section):
+    """The patient's folder, as ``app.py import`` writes it, or the embedded patient."""
+
+    phantom: bool = False
+    organ: str = "organ.stl"
+    tumour: str | None = None
+    ct: str | None = "ct.nrrd"
+
+
+class Tissue(Section):
+    """The tissue model and its sampling; the defaults are the paper's, but for the stiffness, which it fits."""
+
+    model: Literal["shape-matching"] = "shape-matching"
+    radius_mm: float = Field(2.7, ge=0.5, le=20)
+    stiffness: Stiffness = 0.95
+    density_g_cm3: float = Field(1.05, gt=0, le=20)
+    volume_sampling: float = Field(4.0, ge=1, le=8)
+    cluster_spacing: float = Field(3.33, ge=1, le=20)
+    surface_samples_per_mm2: float = Field(0.0, ge=0, le=10)
+
+
+class SolverSection(Section):
+    """One time step; the defaults are the paper's Table 1."""
+
+    time_step_s: float = Field(1 / 60, gt=0, le=0.1)
+    substeps: int = Field(3, ge=1, le=100)
+    iterations: int = Field(9, ge=1, le=1000)
+    stabilisation_iterations: int = Field(1, ge=0, le=100)
+    relaxation: Literal["local", "global"] = "local"
+    relaxation_factor: float = Field(1.0, ge=1, le=2)
+    damping_per_s: float = Field(12.0, ge=0, le=1000)
+    mass_scaling_per_mm: float = Field(0.0, ge=0, le=1)
+
+
+class Gravity(Section):
+    acceleration_m_s2: float = Field(9.81, ge=0, le=100)
+    direction: Direction = (0.0, 1.0, 0.0)
+
+
+class Contact(Section):
+    """``particles`` switches contacts of particles with each other on."""
+
+    shape_friction: float = Field(0.35, ge=0, le=10)
+    particle_friction: float = Field(0.25, ge=0, le=10)
+    particles: bool = False
+
+
+class PlaneShape(Section):
+    kind: Literal["plane"]
+    normal: Direction
+    offset_mm: float
+
+
+class MeshShape(Section):
+    """A closed surface in STL, PLY or OBJ."""
+
+    kind: Literal["mesh"]
+    file: str
+
+
+class DistanceShape(Section):
+    """A volume of signed distances in mm, negative inside (NRRD, MHA or NIfTI, axes along the patient's)."""
+
+    kind: Literal["sdf"]
+    file: str
+
+
+class Transducer(Section):
+    """A cuboid: lateral x elevation x length; it moves at most as fast as a hand does."""
+
+    size_mm: tuple[float, float, float] = (40.0, 10.0, 20.0)
+    speed_mm_s: float = Field(150.0, gt=0, le=2000)
+
+
+class Image(Section):
+    """The ultrasound panel: a linear array's plane and the CT window."""
+
+    width_mm: float = Field(40.0, gt=0, le=300)
+    depth_mm: float = Field(60.0, gt=0, le=300)
+    pixels: int = Field(512, ge=16, le=4096)
+    window_hu: float = Field(350.0, gt=0, le=10000)
+    level_hu: float = Field(40.0, ge=-2000, le=4000)
+    outside: Literal["background", "gel", "air"] = "background"
+
+
+class Press(Section):
+    """The scripted press, with the paper's warm-up and steps a stage.
+
+    The transducer's axis goes through ``target_mm`` along ``direction``, its image's width along ``lateral``; it
+    starts where it touches the resting organ and goes down to each of ``indentations_mm``.
+    """
+
+    target_mm: Vector3 | None = None
+    direction: Direction | None = None
+    lateral: Direction | None = None
+    warm_up_steps: int = Field(120, ge=0, le=100000)
+    stage_steps: int = Field(90, ge=1, le=100000)
+    indentations_mm: tuple[float, ...] = (5.95, 9.48, 12.38)
+
+
+class Scene(Section):
+    """A whole scene. ``shape`` lists what does not move: the support first."""
+
+    title: str = ""
+    anatomy: Anatomy
+    tissue: Tissue = Tissue()
+    solver: SolverSection = SolverSection()
+    gravity: Gravity = Gravity()
+    contact: Contact = Contact()
+    shape: tuple[Annotated[PlaneShape | MeshShape | DistanceShape, Field(discriminator="kind")], ...] = ()
+    transducer: Transducer = Transducer()
+    image: Image = Image()
+    press: Press = Press()
+
+
+def load_scene(path: Path) -> Scene:
+    """Read a scene file. Raises SceneError with one line that names the file, the key and the mend."""
+    try:
+        values = tomllib.loads(path.read_text("utf-8"))
+    except FileNotFoundError:
+        raise SceneError(f"{path}: no such scene file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path}: cannot be read as a scene ({_first_line(error)})") from None
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(f"{path}: not valid TOML: {_first_line(error)}") from None
+    try:
+        return Scene.model_validate(values)
+    except ValidationError as error:
+        raise SceneError(f"{path}: {_explain(error)}") from None
+
+
+def with_options(scene: Scene, options: dict[str, float | int | None]) -> Scene:
+    """The scene with single values changed, such as ``{"tissue.radius_mm": 3.0}``; None leaves what is there.
+
+    Raises SceneError for a value out of range.
+    """
+    values = scene.model_dump()
+    for name, value in options.items():
+        if value is not None:
+            section, key = name.split(".")
+            values[section][key] = value
+    try:
+        return Scene.model_validate(values)
+    except ValidationError as error:
+        raise SceneError(f"command line: {_explain(error)}") from None
+
+
+def scene_text(scene: Scene) -> str:
+    """The scene as TOML, without what is left at its default of none."""
+    values = scene.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
+    return tomli_w.dumps(values)
+
+
+def _explain(error: ValidationError) -> str:
+    problems = error.errors(include_url=False)
+    # A key that is missing under one spelling and unknown under another is one mistake: name the unknown one.
+    problems.sort(key=lambda problem: problem["type"] != "extra_forbidden")
+    first = problems[0]
+    where = [str(part) for part in first["loc"] if part not in ("plane", "mesh", "sdf")]
+    name = ".".join(where)
+    if first["type"] == "extra_forbidden":
+        text = f"{name}: unknown key; {_suggest(where)}"
+    elif first["type"] == "missing":
+        text = f"{name}: missing"
+    else:
+        text = f"{name} = {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}"
+    more = len(problems) - 1
+    return text + (f" (and {more} more)" if more else "")
+
+
+def _suggest(where: list[str]) -> str:
+    """What the writer of an unknown key may have meant; a unit other than the schema's is named as such."""
+    known = _keys_beside(where)
+    key = where[-1]
+    stem = key.split("_")[0]
+    for name in known:
+        if name != key and key.startswith(_quantity(name)) and _quantity(name) != name:
+            return f"the unit is in the key: write {name}"
+    close = difflib.get_close_matches(key, known, n=1) or [name for name in known if name.startswith(stem)]
+    return f"did you mean {close[0]}?" if close else f"known here: {', '.join(known)}"
+
+
+def _quantity(name: str) -> str:
+    """A key without its unit: radius_mm -> radius."""
+    for unit in ("_mm2", "_mm", "_m_s2", "_mm_s", "_g_cm3", "_per_mm", "_per_s", "_hu", "_s"):
+        if name.endswith(unit):
+            return name[: -len(unit)]
+    return name
+
+
+def _keys_beside(where: list[str]) -> list[str]:
+    section: type[BaseModel] = Scene
+    for part in where[:-1]:
+        if part == "shape":
+            return sorted(
+                {key for kind in (PlaneShape, MeshShape, DistanceShape) for key in kind.model_fields}
+            )
+        if part in section.model_fields:
+            annotation = section.model_fields[part].annotation
+            if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+                section = annotation
+    return list(section.model_fields)
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0]

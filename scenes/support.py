@@ -1,0 +1,166 @@
+"""The support that the organ lies in: the paper's bed of plasticine, moulded on the organ's underside.
+
+Camara et al. 2016 laid the kidney phantom in plasticine; the virtual bead experiments describe it as the
+lower 35 % of the organ's height, dilated by 0.3 mm and swept upwards, taken out of a block; its rim is
+filleted.
+"""
+
+from __future__ import annotations
+
+import igl
+import numpy as np
+import trimesh
+from skimage.measure import marching_cubes
+
+from scenes.surfaces import decimate
+
+ATTEMPTS = 4
+
+
+def cradle(
+    organ: trimesh.Trimesh,
+    gravity_direction: np.ndarray,
+    depth_fraction: float = 0.35,
+    clearance_mm: float = 0.3,
+    fillet_mm: float = 4.0,
+    wall_mm: float = 12.0,
+    floor_mm: float = 8.0,
+    grid_mm: float = 1.0,
+    faces: int = 5000,
+) -> trimesh.Trimesh:
+    """Rigid block with a mould of the organ's underside, which the organ at rest does not touch.
+
+    Args:
+        organ: watertight surface at rest, normals outward; vertices [mm], shape (vertex_count, 3).
+        gravity_direction: the way that things fall, shape (3,), any length but zero.
+        depth_fraction: part of the organ's height, along gravity, that lies in the mould, in (0, 1).
+        clearance_mm: gap between organ at rest and mould [mm]; the least gap is at least a quarter of it.
+        fillet_mm: radius of the mould's rim and of the block's edges [mm].
+        wall_mm: least width of block around the mould [mm].
+        floor_mm: thickness of block under the organ's lowest point [mm].
+        grid_mm: spacing of the grid that the shape is sampled on [mm].
+        faces: wanted number of triangles.
+
+    Returns:
+        Watertight mesh of one body, normals outward; same frame as `organ`, [mm].
+
+    Raises:
+        ValueError: gravity without direction, depth out of range, organ not watertight, or no shape found
+            that stays clear of the organ.
+    """
+    frame = _gravity_frame(np.asarray(gravity_direction, float))
+    if not 0 < depth_fraction < 1:
+        raise ValueError(f"depth_fraction is {depth_fraction}: expected more than 0 and less than 1")
+    if not organ.is_watertight:
+        raise ValueError("the organ's surface is not watertight: a support cannot be moulded on it")
+    upright = organ.vertices.view(np.ndarray) @ frame.T
+    organ_faces = organ.faces.view(np.ndarray).astype(np.int64)
+
+    low, high = upright.min(axis=0), upright.max(axis=0)
+    top = low[2] + depth_fraction * (high[2] - low[2])
+    bed = upright[upright[:, 2] <= top]
+    block_low = np.append(bed.min(axis=0)[:2] - wall_mm, low[2] - floor_mm)
+    block_high = np.append(bed.max(axis=0)[:2] + wall_mm, top)
+
+    grid = _grid(block_low, block_high, grid_mm)
+    gap = _distance_to_swept(upright, organ_faces, grid)
+    gap_wanted = clearance_mm
+    for _ in range(ATTEMPTS):
+        level = _carved_block(grid, gap - gap_wanted, block_low, block_high, fillet_mm)
+        support = _contour(level, grid, faces)
+        least = least_gap(support.vertices, support.faces, upright, organ_faces)
+        if least >= 0.25 * clearance_mm:
+            return trimesh.Trimesh(support.vertices @ frame, support.faces, process=False)
+        # Chords of the decimated mould bulge towards the organ; carve deeper by what is missing.
+        gap_wanted += clearance_mm - least
+    raise ValueError(
+        f"the support stays only {least:.2f} mm clear of the organ, {clearance_mm} mm were wanted"
+    )
+
+
+def least_gap(
+    support_vertices: np.ndarray,
+    support_faces: np.ndarray,
+    organ_vertices: np.ndarray,
+    organ_faces: np.ndarray,
+) -> float:
+    """Least signed distance [mm] between closed surfaces, at the vertices of both; negative: overlap."""
+    gaps = []
+    for points, vertices, faces in (
+        (support_vertices, organ_vertices, organ_faces),
+        (organ_vertices, support_vertices, support_faces),
+    ):
+        gaps.append(
+            igl.signed_distance(
+                np.ascontiguousarray(points, float),
+                np.ascontiguousarray(vertices, float),
+                np.ascontiguousarray(faces, np.int64),
+                igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER,
+            )[0].min()
+        )
+    return float(min(gaps))
+
+
+def _gravity_frame(gravity: np.ndarray) -> np.ndarray:
+    """Right-handed rotation whose rows are two level axes and the way up; patient axes where they fit."""
+    length = np.linalg.norm(gravity)
+    if gravity.shape != (3,) or not np.isfinite(length) or length == 0:
+        raise ValueError(f"gravity_direction is {gravity}: expected three numbers, not all zero")
+    up = -gravity / length
+    level = np.eye(3)[np.argmin(np.abs(up))]
+    level = level - (level @ up) * up
+    level /= np.linalg.norm(level)
+    return np.array([level, np.cross(up, level), up])
+
+
+def _grid(low: np.ndarray, high: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Axes of a grid around the block, one cell of air at every side; the block's faces lie between nodes."""
+    return tuple(
+        np.arange(start - 1.5 * step, end + 2.0 * step, step) for start, end in zip(low, high, strict=True)
+    )
+
+
+def _distance_to_swept(vertices: np.ndarray, faces: np.ndarray, grid: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Distance [mm] from the grid's nodes to the organ swept upwards without end; negative inside.
+
+    The distance to a union is the least of the distances to its parts, and the copy of the organ raised by t
+    is as far from a point as the organ itself is from the point t lower: a running minimum along the way up.
+    """
+    nodes = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1)
+    distance = igl.signed_distance(
+        nodes.reshape(-1, 3),
+        np.ascontiguousarray(vertices),
+        faces,
+        igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER,
+    )[0]
+    return np.minimum.accumulate(distance.reshape(nodes.shape[:3]), axis=2)
+
+
+def _carved_block(
+    grid: tuple[np.ndarray, ...], cavity: np.ndarray, low: np.ndarray, high: np.ndarray, fillet: float
+) -> np.ndarray:
+    """Level function of block minus cavity, negative in the material, its convex edges rounded."""
+    x, y, z = np.meshgrid(*grid, indexing="ij", sparse=True)
+    sides = _round_meet(
+        np.maximum(low[0] - x, x - high[0]), np.maximum(low[1] - y, y - high[1]), radius=fillet
+    )
+    walls = np.maximum(sides, low[2] - z)
+    return _round_meet(_round_meet(walls, z - high[2], radius=0.25 * fillet), -cavity, radius=fillet)
+
+
+def _round_meet(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
+    """Intersection of two solids given by signed distances, their common edge rounded to `radius`."""
+    corner = np.hypot(np.maximum(a + radius, 0.0), np.maximum(b + radius, 0.0)) - radius
+    return np.minimum(np.maximum(a, b), -radius) + np.maximum(corner + radius, 0.0)
+
+
+def _contour(level: np.ndarray, grid: tuple[np.ndarray, ...], faces: int) -> trimesh.Trimesh:
+    """Zero level on the grid, decimated, one body, normals outward."""
+    step = grid[0][1] - grid[0][0]
+    clear = 1e-3 * step  # a level of exactly zero at a node gives triangles of no area
+    level = np.where(level < 0, np.minimum(level, -clear), np.maximum(level, clear))
+    vertices, triangles, _, _ = marching_cubes(level, 0.0, spacing=(step,) * 3)
+    fine = trimesh.Trimesh(vertices + [axis[0] for axis in grid], triangles, process=False)
+    if fine.volume < 0:
+        fine.invert()
+    return decimate(fine, faces)

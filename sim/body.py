@@ -1,0 +1,95 @@
+"""One soft body: its rest state, which is fixed, and its current state, which the solver changes."""
+
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+import taichi as ti
+import trimesh
+
+from sim.sampling import sample_particles
+
+
+@dataclass(frozen=True)
+class RestBody:
+    """The body as it was built; nothing changes it.
+
+    particles (n, 3) float64 [mm], in the frame of the surface; particle_mass [g], the same for all;
+    contact_radius (n,) [mm]: how near a particle's centre may come to a shape.
+    """
+
+    particles: np.ndarray
+    particle_mass: float
+    radius_mm: float
+    contact_radius: np.ndarray
+
+
+@dataclass(frozen=True)
+class BodyState:
+    """What changes while a body moves: positions (n, 3) [mm] and velocities (n, 3) [mm/s], float32."""
+
+    position: np.ndarray
+    velocity: np.ndarray
+
+
+def fill_body(
+    surface: trimesh.Trimesh,
+    radius_mm: float,
+    density_g_cm3: float = 1.05,
+    volume_sampling: float = 4.0,
+    surface_samples_per_mm2: float = 0.0,
+) -> RestBody:
+    """Particles that fill a closed surface [mm] and share its mass equally.
+
+    A particle touches a shape where the surface above it would: its contact radius is its depth under the
+    surface, at most the particle radius, so that a body laid in a mould of its own shape rests without being
+    moved. Raises SamplingError when the radius is too large for the surface.
+    """
+    particles = sample_particles(
+        surface.vertices, surface.faces, radius_mm, volume_sampling, surface_samples_per_mm2
+    )
+    depth = -igl.signed_distance(
+        particles, np.asarray(surface.vertices, np.float64), np.asarray(surface.faces, np.int64)
+    )[0]
+    mass_g = density_g_cm3 * 1e-3 * surface.volume
+    return RestBody(particles, mass_g / len(particles), radius_mm, np.clip(depth, 0.0, radius_mm))
+
+
+@ti.data_oriented
+class Body:
+    """A rest body and its current state on the device; vectors are float32 fields of shape (n,).
+
+    ``mass_scaling_per_mm`` is k of Algorithm 1, line 4; at 0 there is no ``mass_scale`` (n,).
+    """
+
+    def __init__(self, rest: RestBody, mass_scaling_per_mm: float = 0.0) -> None:
+        self.rest_body = rest
+        self.count = len(rest.particles)
+        self.rest = ti.Vector.field(3, ti.f32, self.count)
+        self.contact_radius = ti.field(ti.f32, self.count)
+        self.position = ti.Vector.field(3, ti.f32, self.count)
+        self.velocity = ti.Vector.field(3, ti.f32, self.count)
+        self.estimate = ti.Vector.field(3, ti.f32, self.count)
+        self.mass_scaling_per_mm = mass_scaling_per_mm
+        self.mass_scaled = mass_scaling_per_mm > 0
+        if self.mass_scaled:
+            self.mass_scale = ti.field(ti.f32, self.count)
+            self.mass_scale.fill(1.0)
+        self.rest.from_numpy(rest.particles.astype(np.float32))
+        self.contact_radius.from_numpy(rest.contact_radius.astype(np.float32))
+        self.restore(self.rest_state())
+
+    def rest_state(self) -> BodyState:
+        """The state at build time: at rest in the rest position."""
+        position = self.rest_body.particles.astype(np.float32)
+        return BodyState(position, np.zeros_like(position))
+
+    def snapshot(self) -> BodyState:
+        """A copy of the current state."""
+        return BodyState(self.position.to_numpy(), self.velocity.to_numpy())
+
+    def restore(self, state: BodyState) -> None:
+        """Go back to a state; the steps that follow give the same bits as they did from it before."""
+        self.position.from_numpy(state.position)
+        self.estimate.from_numpy(state.position)
+        self.velocity.from_numpy(state.velocity)

@@ -1,0 +1,153 @@
+"""Contacts of particles with shapes: found once a substep, solved with Coulomb friction, never left violated."""
+
+import taichi as ti
+import taichi.math as tm
+
+from sim.body import Body
+from sim.shapes import FAR
+
+KEEP_OUT_SWEEPS = 8
+# Float32 positions of a body of 200 mm carry about 1e-5 mm; distances are compared with room for that.
+ROUNDING = 1e-4
+SAFETY = 1e-3
+
+
+@ti.data_oriented
+class ShapeContacts:
+    """Contact planes of each particle with each shape, and the push that each has given in this substep.
+
+    ``plane`` (shapes, n): normal and offset of n . x >= offset [mm]. ``push`` (shapes, n): friction (x, y, z) and
+    normal (w) displacement so far [mm]. As the clusters keep momentum, the sums of the pushes are the impulses
+    exchanged with the shape, so Coulomb's law holds for them: |friction| <= coefficient * normal.
+    """
+
+    def __init__(self, body: Body, shapes: list, friction: float) -> None:
+        self.body = body
+        self.shapes = list(shapes)
+        self.friction = friction
+        self.margin = body.rest_body.radius_mm / 2
+        # A mesh knows no distances beyond its reach, so "farther than that" is all that can be remembered.
+        self.reach = 2 * body.rest_body.radius_mm
+        self.plane = ti.Vector.field(4, ti.f32, (len(shapes), body.count))
+        self.push = ti.Vector.field(4, ti.f32, (len(shapes), body.count))
+        self.touched = ti.field(ti.i32, body.count)
+        self.found = ti.Vector.field(4, ti.f32, (len(shapes), body.count))
+        self.forget()
+        self.penetration = ti.field(ti.f32, ())
+
+    def forget(self) -> None:
+        """Drop what is known of the particles' distances, after they were moved by another hand."""
+        self.found.fill(-FAR)
+
+    @ti.func
+    def is_clear(self, s: ti.template(), i, p, distance):
+        """Whether p is farther than a distance from shape s, by what was last measured there (``found``)."""
+        known = self.found[s, i]
+        return known.w - (p - known.xyz).norm() > distance + SAFETY
+
+    @ti.func
+    def find(self):
+        """Lines 6-9: the plane of each shape that a particle's estimate is near to."""
+        for i in range(self.body.count):
+            p = self.body.estimate[i]
+            radius = self.body.contact_radius[i]
+            touched = 0
+            for s in ti.static(range(len(self.shapes))):
+                plane = tm.vec4(0.0, 0.0, 0.0, -FAR)
+                if ti.static(self.shapes[s].moves) or not self.is_clear(s, i, p, radius + self.margin):
+                    near = self.shapes[s].surface(p)
+                    self.found[s, i] = tm.vec4(p, ti.min(near.w, self.reach))
+                    if near.w < radius + self.margin:
+                        plane = tm.vec4(near.xyz, near.xyz.dot(p) - near.w + radius)
+                        touched += 1
+                self.plane[s, i] = plane
+                self.push[s, i] = tm.vec4(0.0)
+            self.touched[i] = touched
+
+    @ti.func
+    def stabilise(self):
+        """Lines 11-14: move positions and estimates alike out of what they start in, which adds no velocity."""
+        for i in range(self.body.count):
+            if self.touched[i] > 0:
+                x = self.body.position[i]
+                change, active = tm.vec3(0.0), 0
+                for s in ti.static(range(len(self.shapes))):
+                    plane = self.plane[s, i]
+                    depth = plane.w - plane.xyz.dot(x)
+                    if depth > 0.0:
+                        change += depth * plane.xyz
+                        active += 1
+                if active > 0:
+                    change /= ti.cast(active, ti.f32)
+                    self.body.position[i] = x + change
+                    self.body.estimate[i] += change
+
+    @ti.func
+    def project(self, relaxation_factor: float):
+        """Lines 18-20 for the contact group: averaged pushes out of the shapes, with their friction.
+
+        Friction opposes the particle's motion along the surface since the start of the substep, relative to the
+        shape's own (Macklin 2014, Eq. 24), up to the coefficient times all of the normal push so far.
+        """
+        for i in range(self.body.count):
+            if self.touched[i] > 0:
+                x = self.body.estimate[i]
+                moved = x - self.body.position[i]
+                change, active = tm.vec3(0.0), 0
+                for s in ti.static(range(len(self.shapes))):
+                    plane, push = self.plane[s, i], self.push[s, i]
+                    depth = plane.w - plane.xyz.dot(x)
+                    if depth > 0.0 or push.w > 0.0:
+                        active += 1
+                # A push beyond the surface would throw the particle off: averaging is undone, no more.
+                share = ti.min(relaxation_factor / ti.cast(ti.max(active, 1), ti.f32), 1.0)
+                for s in ti.static(range(len(self.shapes))):
+                    plane, push = self.plane[s, i], self.push[s, i]
+                    depth = ti.max(plane.w - plane.xyz.dot(x), 0.0)
+                    normal_push = push.w + share * depth
+                    if normal_push > 0.0:
+                        slip = moved - self.shapes[s].motion(x)
+                        slip -= slip.dot(plane.xyz) * plane.xyz
+                        friction = push.xyz - share * slip
+                        limit = self.friction * normal_push
+                        length = friction.norm()
+                        if length > limit:
+                            friction *= limit / length
+                        change += share * depth * plane.xyz + friction - push.xyz
+                        self.push[s, i] = tm.vec4(friction, normal_push)
+                self.body.estimate[i] = x + change
+
+    @ti.func
+    def keep_out(self):
+        """Leave no particle inside a shape: exact projections of those that the averaging left there.
+
+        Where shapes leave no room for the contact radius, its half, then the centre alone must be clear.
+        """
+        for i in range(self.body.count):
+            x = self.body.estimate[i]
+            radius = self.body.contact_radius[i]
+            clear = 0
+            for sweep in range(KEEP_OUT_SWEEPS):
+                if clear == 0:
+                    clear = 1
+                    for s in ti.static(range(len(self.shapes))):
+                        if not self.is_clear(s, i, x, radius):
+                            near = self.shapes[s].surface(x)
+                            if near.w < radius - ROUNDING:
+                                x += (radius - near.w) * near.xyz
+                                clear = 0
+                    if sweep % 2 == 1:
+                        radius = radius / 2 if sweep < KEEP_OUT_SWEEPS - 3 else 0.0
+            self.body.estimate[i] = x
+
+    @ti.kernel
+    def measure_penetration(self) -> float:
+        """Deepest a particle's centre lies inside a shape at the moment [mm], 0 where none does."""
+        self.penetration[None] = 0.0
+        for i in range(self.body.count):
+            p = self.body.position[i]
+            for s in ti.static(range(len(self.shapes))):
+                near = self.shapes[s].surface(p)
+                # The maximum of numbers does not depend on the order, so this atomic keeps runs alike.
+                ti.atomic_max(self.penetration[None], -near.w)
+        return self.penetration[None]

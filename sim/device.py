@@ -1,0 +1,33 @@
+"""Start Taichi on one backend, quietly. Fields of an earlier start are gone afterwards."""
+
+import contextlib
+import io
+import os
+
+# Before Taichi is imported: no banner, and no look on the network for newer versions.
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "False")
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
+
+import taichi as ti
+
+ARCHES = ("auto", "cuda", "vulkan", "cpu")
+
+
+class NoDevice(RuntimeError):
+    """The backend that was asked for is not there; the message is one line."""
+
+
+def start(arch: str = "cpu", **options) -> str:
+    """Initialise Taichi on ``auto`` (CUDA where there is one, else the CPU) or a named backend; the one it is.
+
+    ``options`` go to ``ti.init``. Raises NoDevice.
+    """
+    ti.set_logging_level(ti.ERROR)
+    backends = {"cuda": ti.cuda, "vulkan": ti.vulkan, "cpu": ti.cpu}
+    if arch == "auto":
+        arch = "cuda" if ti.lang.misc.is_arch_supported(ti.cuda) else "cpu"
+    elif arch != "cpu" and not ti.lang.misc.is_arch_supported(backends[arch]):
+        raise NoDevice(f"this machine has no {arch} device or driver; use --arch cpu or --arch auto")
+    with contextlib.redirect_stdout(io.StringIO()):
+        ti.init(arch=backends[arch], log_level=ti.ERROR, **options)
+    return arch

@@ -1,0 +1,131 @@
+"""A coarse tetrahedral mesh embedded in the body: deformed point -> tetrahedron -> rest point.
+
+The paper's way from the ultrasound plane back to the CT ("Weighted matrix blending"): the plane is expressed
+barycentrically in deformed tetrahedra and mapped back to where the tissue was at rest.
+"""
+
+from itertools import permutations
+
+import igl
+import numpy as np
+import taichi as ti
+import taichi.math as tm
+import trimesh
+
+from sim.skinning import Skin
+
+NOWHERE = 2**30
+# Barycentric slack that closes the seams between tetrahedra against rounding.
+SEAM = 1e-5
+PARALLEL = 1e-12
+
+
+@ti.data_oriented
+class Embedding:
+    """Tetrahedra of a regular grid around a closed surface, carried by the skin of their vertices.
+
+    ``tetrahedron`` (m,) holds four vertex indices each, of a rest mesh that fills space without gaps (Kuhn's six
+    tetrahedra a cell).
+    """
+
+    def __init__(self, model, surface: trimesh.Trimesh, cell_mm: float) -> None:
+        vertices, tetrahedra = tetrahedra_around(surface, cell_mm)
+        self.skin = Skin(model, vertices)
+        self.count = len(tetrahedra)
+        self.tetrahedron = ti.Vector.field(4, ti.i32, self.count)
+        self.tetrahedron.from_numpy(tetrahedra.astype(np.int32))
+
+    def update(self) -> None:
+        """Carry the vertices to where the body is now."""
+        self.skin.update()
+
+    @ti.kernel
+    def locate_on_plane(
+        self, plane_from_world: tm.mat4, pixel_mm: tm.vec2, first_mm: tm.vec2, owner: ti.template()
+    ):
+        """Which tetrahedron holds each pixel of an image plane; NOWHERE where none does.
+
+        ``plane_from_world`` takes world [mm] to (u, v, w) with the plane at w = 0; pixel (row, column) is at u =
+        first.x + column * pixel.x, v = first.y + row * pixel.y. ``owner`` (rows, columns) i32 comes out. Of
+        tetrahedra that overlap, which a folded mesh has, the one of lowest index is taken, whatever thread was first.
+        """
+        for pixel in ti.grouped(owner):
+            owner[pixel] = NOWHERE
+        for t in range(self.count):
+            corner = tm.mat4(0.0)
+            low, high = 1e30, -1e30
+            for k in ti.static(range(4)):
+                p = (plane_from_world @ tm.vec4(self.skin.vertices[self.tetrahedron[t][k]], 1.0)).xyz
+                corner[0, k], corner[1, k], corner[2, k], corner[3, k] = p.x, p.y, p.z, 1.0
+                low, high = ti.min(low, p.z), ti.max(high, p.z)
+            if low <= 0.0 and high >= 0.0 and ti.abs(corner.determinant()) > PARALLEL:
+                self.mark_pixels(t, corner, pixel_mm, first_mm, owner)
+
+    @ti.func
+    def mark_pixels(self, t, corner, pixel_mm, first_mm, owner: ti.template()):
+        """Row by row, the span of columns in which all four barycentric coordinates are positive."""
+        weights = corner.inverse()
+        bottom, top = 1e30, -1e30
+        for a, b in ti.static([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]):
+            wa, wb = corner[2, a], corner[2, b]
+            if wa * wb <= 0.0 and wa != wb:
+                v = corner[1, a] + (corner[1, b] - corner[1, a]) * wa / (wa - wb)
+                bottom, top = ti.min(bottom, v), ti.max(top, v)
+        first_row = ti.max(0, ti.cast(ti.floor((bottom - first_mm.y) / pixel_mm.y), ti.i32))
+        last_row = ti.min(owner.shape[0] - 1, ti.cast(ti.ceil((top - first_mm.y) / pixel_mm.y), ti.i32))
+        for row in range(first_row, last_row + 1):
+            v = first_mm.y + row * pixel_mm.y
+            left, right = -0.5, owner.shape[1] - 0.5
+            for k in ti.static(range(4)):
+                # Coordinate k along the row is at + slope * column.
+                slope = weights[k, 0] * pixel_mm.x
+                at = weights[k, 0] * first_mm.x + weights[k, 1] * v + weights[k, 3] + SEAM
+                if slope > PARALLEL:
+                    left = ti.max(left, -at / slope)
+                elif slope < -PARALLEL:
+                    right = ti.min(right, -at / slope)
+                elif at < 0.0:
+                    right = -1.0
+            for column in range(ti.cast(ti.ceil(left), ti.i32), ti.cast(ti.floor(right), ti.i32) + 1):
+                ti.atomic_min(owner[row, column], t)
+
+    @ti.func
+    def rest_point(self, t, p):
+        """Where the material at p [mm], which lies in tetrahedron t, was at rest [mm]."""
+        corner = self.tetrahedron[t]
+        x3, r3 = self.skin.vertices[corner[3]], self.skin.rest[corner[3]]
+        edges, rest_edges = tm.mat3(0.0), tm.mat3(0.0)
+        for k in ti.static(range(3)):
+            x, r = self.skin.vertices[corner[k]] - x3, self.skin.rest[corner[k]] - r3
+            for axis in ti.static(range(3)):
+                edges[axis, k], rest_edges[axis, k] = x[axis], r[axis]
+        return r3 + rest_edges @ (edges.inverse() @ (p - x3))
+
+
+def tetrahedra_around(surface: trimesh.Trimesh, cell_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (v, 3) float64 [mm] and tetrahedra (t, 4) of the grid cells that hold any of the surface's inside.
+
+    A cell counts where its centre is inside or no farther outside than half the cell's diagonal.
+    """
+    low = surface.vertices.min(axis=0) - cell_mm
+    shape = np.ceil((surface.vertices.max(axis=0) + cell_mm - low) / cell_mm).astype(int)
+    cells = np.indices(shape).reshape(3, -1).T
+    distance = igl.signed_distance(
+        low + cell_mm * (cells + 0.5),
+        np.asarray(surface.vertices, np.float64),
+        np.asarray(surface.faces, np.int64),
+    )[0]
+    cells = cells[distance <= cell_mm * np.sqrt(3) / 2]
+    nodes = []
+    for axes in permutations(range(3)):
+        corner = np.zeros((4, 3), int)
+        for step, axis in enumerate(axes):
+            corner[step + 1 :, axis] = 1
+        if np.linalg.det(corner[1:] - corner[0]) < 0:
+            corner = corner[[0, 2, 1, 3]]
+        nodes.append(cells[:, None] + corner)
+    grid = np.concatenate(nodes)
+    index = np.ravel_multi_index(tuple(np.moveaxis(grid, 2, 0)), tuple(shape + 1))
+    used, tetrahedra = np.unique(index, return_inverse=True)
+    vertices = low + cell_mm * np.column_stack(np.unravel_index(used, tuple(shape + 1)))
+    return vertices, tetrahedra.reshape(index.shape)

@@ -1,0 +1,151 @@
+"""Particle against particle: neighbours in a grid, and their contacts with friction."""
+
+import taichi as ti
+import taichi.math as tm
+
+from sim.body import Body
+from sim.shape_matching import ShapeMatching
+
+MOST_NEIGHBOURS = 24
+CELLS = 1 << 15
+
+
+@ti.data_oriented
+class ParticleContacts:
+    """Pairs of particles that share no cluster are kept one particle radius apart.
+
+    That is the distance at which sampling placed them; those that share a cluster are held by its shape. Cells
+    of a hashed grid hold lists of particles; the neighbours of each particle are sorted, so that no order in
+    which threads filled a list reaches a sum.
+    """
+
+    def __init__(self, body: Body, model: ShapeMatching, friction: float) -> None:
+        self.body = body
+        self.model = model
+        self.friction = friction
+        self.distance = body.rest_body.radius_mm
+        # Particles come nearer than they started during the substep, so some are listed before they touch.
+        self.reach = 1.5 * self.distance
+        self.cell_start = ti.field(ti.i32, CELLS + 1)
+        self.cell_count = ti.field(ti.i32, CELLS)
+        self.sorted = ti.field(ti.i32, body.count)
+        self.neighbour = ti.field(ti.i32, (body.count, MOST_NEIGHBOURS))
+        self.neighbour_count = ti.field(ti.i32, body.count)
+        self.change = ti.Vector.field(3, ti.f32, body.count)
+        self.most_contacts = ti.field(ti.i32, ())
+
+    @ti.func
+    def cell_of(self, p):
+        return ti.cast(ti.floor(p / self.reach), ti.i32)
+
+    @ti.func
+    def hash(self, cell):
+        mixed = (cell.x * 73856093) ^ (cell.y * 19349663) ^ (cell.z * 83492791)
+        return mixed & (CELLS - 1)
+
+    @ti.func
+    def share_cluster(self, i, j):
+        a, b = self.model.cluster_offset[i], self.model.cluster_offset[j]
+        shared = 0
+        while a < self.model.cluster_offset[i + 1] and b < self.model.cluster_offset[j + 1] and shared == 0:
+            ca, cb = self.model.cluster[a], self.model.cluster[b]
+            if ca == cb:
+                shared = 1
+            elif ca < cb:
+                a += 1
+            else:
+                b += 1
+        return shared
+
+    @ti.func
+    def find(self):
+        """Line 7: the sorted neighbours of every particle, at the estimates."""
+        for c in range(CELLS):
+            self.cell_count[c] = 0
+        for i in range(self.body.count):
+            self.cell_count[self.hash(self.cell_of(self.body.estimate[i]))] += 1
+        for _ in range(1):
+            total = 0
+            for c in range(CELLS):
+                self.cell_start[c] = total
+                total += self.cell_count[c]
+                self.cell_count[c] = 0
+            self.cell_start[CELLS] = total
+        for i in range(self.body.count):
+            c = self.hash(self.cell_of(self.body.estimate[i]))
+            self.sorted[self.cell_start[c] + ti.atomic_add(self.cell_count[c], 1)] = i
+        for i in range(self.body.count):
+            self.neighbour_count[i] = self.list_neighbours(i)
+
+    @ti.func
+    def list_neighbours(self, i):
+        p = self.body.estimate[i]
+        count = 0
+        for near in ti.grouped(ti.ndrange((-1, 2), (-1, 2), (-1, 2))):
+            cell = self.cell_of(p) + near
+            c = self.hash(cell)
+            for k in range(self.cell_start[c], self.cell_start[c + 1]):
+                j = self.sorted[k]
+                q = self.body.estimate[j]
+                # Two cells of the neighbourhood may share a hash: a particle counts in its own cell alone.
+                if j != i and (self.cell_of(q) == cell).all() and (p - q).norm() < self.reach:
+                    if self.share_cluster(i, j) == 0:
+                        count = self.insert(i, j, count)
+        return count
+
+    @ti.func
+    def insert(self, i, j, count):
+        """Keep the row ascending; beyond its length the particles of highest index are dropped."""
+        slot = count
+        if count == MOST_NEIGHBOURS:
+            slot = -1
+            if j < self.neighbour[i, MOST_NEIGHBOURS - 1]:
+                slot = MOST_NEIGHBOURS - 1
+        if slot >= 0:
+            while slot > 0 and self.neighbour[i, ti.max(slot - 1, 0)] > j:
+                self.neighbour[i, slot] = self.neighbour[i, slot - 1]
+                slot -= 1
+            self.neighbour[i, slot] = j
+        return ti.min(count + 1, MOST_NEIGHBOURS)
+
+    @ti.func
+    def project(self, relaxation_factor: float, relax_globally: ti.template()):
+        """Lines 18-20 for the group of pairs: C = distance - |x_i - x_j| <= 0 and its friction, gathered."""
+        self.most_contacts[None] = 0
+        for i in range(self.body.count):
+            x = self.body.estimate[i]
+            moved = x - self.body.position[i]
+            change, contacts = tm.vec3(0.0), 0
+            for k in range(self.neighbour_count[i]):
+                j = self.neighbour[i, k]
+                away = x - self.body.estimate[j]
+                gap = away.norm()
+                if gap < self.distance:
+                    normal = self.direction(i, j, away, gap)
+                    share = 0.5
+                    if ti.static(self.body.mass_scaled):
+                        share = self.body.mass_scale[j] / (self.body.mass_scale[i] + self.body.mass_scale[j])
+                    depth = self.distance - gap
+                    slip = moved - (self.body.estimate[j] - self.body.position[j])
+                    slip -= slip.dot(normal) * normal
+                    hold = ti.min(1.0, self.friction * depth / ti.max(slip.norm(), 1e-12))
+                    change += share * (depth * normal - hold * slip)
+                    contacts += 1
+            if contacts > 0:
+                ti.atomic_max(self.most_contacts[None], contacts)
+                if ti.static(not relax_globally):
+                    change /= ti.cast(contacts, ti.f32)
+            self.change[i] = relaxation_factor * change
+        for i in range(self.body.count):
+            if ti.static(relax_globally):
+                self.body.estimate[i] += self.change[i] / ti.cast(ti.max(self.most_contacts[None], 1), ti.f32)
+            else:
+                self.body.estimate[i] += self.change[i]
+
+    @ti.func
+    def direction(self, i, j, away, gap):
+        """Unit vector from j to i; of two particles at one place the one of higher index goes up."""
+        normal = tm.vec3(0.0, 0.0, 1.0 if i > j else -1.0)
+        if gap > 1e-6:
+            normal = away / gap
+        return normal

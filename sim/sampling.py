@@ -1,0 +1,162 @@
+"""A closed surface becomes particles, and particles become overlapping clusters (NumPy, at build time).
+
+The paper's greedy method (Camara 2016, "Collision and data preparation"): samples at each occupied voxel of a fine
+voxelisation, optionally samples on the surface, then one particle at a time, each removing the samples within
+its bounds. The clusters are chosen among the particles in the same way.
+"""
+
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+from scipy.spatial import cKDTree
+
+
+class SamplingError(ValueError):
+    """The surface cannot be filled with particles; the message says why and what to change."""
+
+
+@dataclass(frozen=True)
+class Clusters:
+    """Overlapping shape-matching clusters in compressed rows.
+
+    ``members[offsets[c]:offsets[c + 1]]`` are the particles of cluster c, ascending. Every particle is in at
+    least one cluster.
+    """
+
+    offsets: np.ndarray
+    members: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+    def transposed(self, particle_count: int) -> "Clusters":
+        """The same memberships seen from the particles: row i lists the clusters of particle i, ascending."""
+        cluster = np.repeat(np.arange(len(self), dtype=np.int32), np.diff(self.offsets))
+        order = np.argsort(self.members, kind="stable")
+        counts = np.bincount(self.members, minlength=particle_count)
+        return Clusters(_offsets(counts), cluster[order])
+
+
+def sample_particles(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    radius_mm: float,
+    volume_sampling: float = 4.0,
+    surface_samples_per_mm2: float = 0.0,
+    seed: int = 0,
+) -> np.ndarray:
+    """Particles (n, 3) float64 [mm] that fill a closed surface, no two nearer than ``radius_mm``.
+
+    ``vertices`` (v, 3) [mm] and ``faces`` (f, 3) are the surface; the voxels are ``radius_mm /
+    volume_sampling`` wide. Surface samples, where asked for, are drawn from ``seed`` and come first, so that thin
+    parts keep their boundary. Sorted along a space-filling curve. Raises SamplingError when nothing fits.
+    """
+    pitch = radius_mm / volume_sampling
+    origin, occupied = occupied_voxels(vertices, faces, pitch)
+    surface = _surface_particles(vertices, faces, radius_mm, surface_samples_per_mm2, seed)
+    _clear_near(occupied, origin, pitch, surface, radius_mm)
+    voxels = _greedy_voxels(occupied, volume_sampling)
+    particles = np.concatenate([surface, origin + pitch * voxels])
+    if len(particles) < 4:
+        raise SamplingError(
+            f"a particle radius of {radius_mm:g} mm leaves {len(particles)} particles in the organ: "
+            f"expected at least 4, choose a smaller radius"
+        )
+    return particles[np.argsort(morton_codes(particles, radius_mm), kind="stable")]
+
+
+def sample_clusters(particles: np.ndarray, spacing_mm: float) -> Clusters:
+    """Clusters of the particles (n, 3) [mm]: centres greedily chosen ``spacing_mm`` apart, members within it.
+
+    As the greedy choice leaves no particle farther than the spacing from a centre, the clusters cover the body,
+    and as wide as they are spaced, they overlap (FleX's extension chooses them in the same way).
+    """
+    tree = cKDTree(particles)
+    free = np.ones(len(particles), bool)
+    rows = []
+    for i in range(len(particles)):
+        if free[i]:
+            near = np.sort(tree.query_ball_point(particles[i], spacing_mm))
+            free[near] = False
+            rows.append(near.astype(np.int32))
+    return Clusters(_offsets([len(row) for row in rows]), np.concatenate(rows))
+
+
+def occupied_voxels(vertices: np.ndarray, faces: np.ndarray, pitch: float) -> tuple[np.ndarray, np.ndarray]:
+    """Centre (3,) [mm] of voxel 0 and the mask (nx, ny, nz) of voxels whose centre lies inside the surface."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    shape = np.maximum(np.ceil((high - low) / pitch).astype(int), 1)
+    origin = (low + high) / 2 - pitch * (shape - 1) / 2
+    centres = origin + pitch * np.indices(shape).reshape(3, -1).T
+    winding = igl.fast_winding_number(
+        np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64), centres
+    )
+    return origin, (winding > 0.5).reshape(shape)
+
+
+def morton_codes(points: np.ndarray, cell_mm: float) -> np.ndarray:
+    """Positions (n, 3) [mm] along a Z-order curve of cells, so that neighbours in space are neighbours in memory."""
+    cells = ((points - points.min(axis=0)) / cell_mm).astype(np.uint64)
+    code = np.zeros(len(points), np.uint64)
+    for bit in range(16):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return code
+
+
+def _greedy_voxels(occupied: np.ndarray, reach: float) -> np.ndarray:
+    """Indices (n, 3) of voxels taken in scan order, each removing those nearer than ``reach`` voxels."""
+    pad = int(np.ceil(reach))
+    padded = np.pad(occupied, pad)
+    offset = np.arange(-pad, pad + 1)
+    squared = (np.stack(np.meshgrid(offset, offset, offset, indexing="ij")) ** 2).sum(axis=0)
+    keep = squared >= reach**2 - 1e-9
+    buffer = bytearray(np.ascontiguousarray(padded, np.uint8).tobytes())
+    free = np.frombuffer(buffer, np.uint8).reshape(padded.shape)
+    taken = []
+    at = buffer.find(1)
+    while at >= 0:
+        i, j, k = np.unravel_index(at, padded.shape)
+        taken.append((i - pad, j - pad, k - pad))
+        free[i - pad : i + pad + 1, j - pad : j + pad + 1, k - pad : k + pad + 1] *= keep
+        at = buffer.find(1, at + 1)
+    return np.array(taken, np.float64).reshape(-1, 3)
+
+
+def _surface_particles(
+    vertices: np.ndarray, faces: np.ndarray, radius_mm: float, per_mm2: float, seed: int
+) -> np.ndarray:
+    """Particles (n, 3) [mm] on the surface, greedily from area-uniform random samples."""
+    corners = vertices[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    count = int(per_mm2 * area.sum())
+    if count == 0:
+        return np.zeros((0, 3))
+    random = np.random.default_rng(seed)
+    chosen = corners[random.choice(len(faces), count, p=area / area.sum())]
+    u, v = random.random((2, count, 1))
+    flip = u + v > 1
+    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
+    samples = chosen[:, 0] + u * (chosen[:, 1] - chosen[:, 0]) + v * (chosen[:, 2] - chosen[:, 0])
+    tree, free, taken = cKDTree(samples), np.ones(count, bool), []
+    for i in range(count):
+        if free[i]:
+            free[tree.query_ball_point(samples[i], radius_mm)] = False
+            taken.append(i)
+    return samples[taken]
+
+
+def _clear_near(
+    occupied: np.ndarray, origin: np.ndarray, pitch: float, points: np.ndarray, radius_mm: float
+) -> None:
+    """Remove in place the occupied voxels nearer than the radius to any of the points (n, 3) [mm]."""
+    if len(points):
+        voxels = np.argwhere(occupied)
+        distance, _ = cKDTree(points).query(origin + pitch * voxels)
+        near = voxels[distance < radius_mm]
+        occupied[near[:, 0], near[:, 1], near[:, 2]] = False
+
+
+def _offsets(counts: list[int] | np.ndarray) -> np.ndarray:
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)

@@ -1,0 +1,118 @@
+"""One time step of the paper's Algorithm 1; line numbers in the comments are those of its listing."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+import taichi.math as tm
+
+from sim.body import Body
+from sim.contact import ShapeContacts
+from sim.neighbours import ParticleContacts
+from sim.shape_matching import ShapeMatching
+from sim.shapes import ConvexTool
+
+
+@dataclass
+class StepSettings:
+    """What a step may be told anew each time; the defaults are the paper's Table 1.
+
+    ``stiffness`` is alpha of Eq. 12, ``relaxation_factor`` is w of Eq. 7, ``gravity`` (3,) is in mm/s^2,
+    ``damping`` [1/s] is the rate at which velocities decay.
+    """
+
+    stiffness: float = 0.5
+    time_step_s: float = 1 / 60
+    substeps: int = 3
+    iterations: int = 9
+    stabilisation_iterations: int = 1
+    relaxation_factor: float = 1.0
+    damping: float = 12.0
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9810.0)
+
+
+@ti.data_oriented
+class Solver:
+    """Steps one body with its tissue model, its contacts and at most one moving tool.
+
+    What is None does not exist: no kernel is compiled and no memory taken for it.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        model: ShapeMatching,
+        contacts: ShapeContacts | None = None,
+        pairs: ParticleContacts | None = None,
+        tool: ConvexTool | None = None,
+        relaxation: str = "local",
+    ) -> None:
+        self.body = body
+        self.model = model
+        self.contacts = contacts
+        self.pairs = pairs
+        self.tool = tool
+        self.relax_globally = relaxation == "global"
+        self.has_contacts = contacts is not None
+        self.has_pairs = pairs is not None
+
+    def step(self, settings: StepSettings, tool_poses: np.ndarray | None = None) -> None:
+        """Advance by one time step.
+
+        ``tool_poses`` (substeps + 1, 4, 4), world from tool [mm], are the tool's poses at the start of the step
+        and at the end of each substep.
+        """
+        dt = settings.time_step_s / settings.substeps
+        gravity = ti.Vector(list(settings.gravity))
+        for substep in range(settings.substeps):
+            if self.tool is not None and tool_poses is not None:
+                self.tool.move(tool_poses[substep], tool_poses[substep + 1])
+            self.begin(dt, gravity, settings.damping)
+            if self.has_contacts:
+                for _ in range(settings.stabilisation_iterations):
+                    self.stabilise()
+            for _ in range(settings.iterations - 1):
+                self.iterate(settings.stiffness, settings.relaxation_factor)
+            # An overshoot left by the last pass would be taken for velocity in line 24, and grow.
+            self.iterate(settings.stiffness, 1.0)
+            self.end(dt)
+        self.model.update_frames()
+
+    @ti.kernel
+    def begin(self, dt: float, gravity: tm.vec3, damping: float):
+        self.predict(dt, gravity, damping)
+        if ti.static(self.has_pairs):
+            self.pairs.find()  # line 7
+        if ti.static(self.has_contacts):
+            self.contacts.find()  # line 8
+
+    @ti.func
+    def predict(self, dt: float, gravity: tm.vec3, damping: float):
+        decay = ti.exp(-damping * dt)
+        for i in range(self.body.count):  # lines 1-5
+            velocity = (self.body.velocity[i] + dt * gravity) * decay
+            self.body.estimate[i] = self.body.position[i] + dt * velocity
+            if ti.static(self.body.mass_scaled):  # line 4, with the height against gravity
+                height = -gravity.dot(self.body.estimate[i]) / ti.max(gravity.norm(), 1e-12)
+                self.body.mass_scale[i] = ti.exp(-self.body.mass_scaling_per_mm * height)
+
+    @ti.kernel
+    def stabilise(self):
+        self.contacts.stabilise()  # lines 10-15
+
+    @ti.kernel
+    def iterate(self, stiffness: float, relaxation_factor: float):
+        self.model.project(stiffness, relaxation_factor)  # lines 17-21, group by group
+        if ti.static(self.has_pairs):
+            self.pairs.project(relaxation_factor, self.relax_globally)
+        if ti.static(self.has_contacts):
+            self.contacts.project(relaxation_factor)
+
+    @ti.kernel
+    def end(self, dt: float):
+        if ti.static(self.has_contacts):
+            self.contacts.keep_out()
+        for i in range(self.body.count):  # lines 23-26
+            x = self.body.estimate[i]
+            self.body.velocity[i] = (x - self.body.position[i]) / dt
+            self.body.position[i] = x

@@ -1,0 +1,194 @@
+"""One scene put together: the body under its probe, advanced and imaged one frame at a time.
+
+The window, the headless run and every measurement go through this class, so that they compute the same.
+"""
+
+import numpy as np
+import taichi as ti
+import trimesh
+
+from scenes.anatomy import Grid, LoadedAnatomy, press_on
+from scenes.scene import PlaneShape, Scene
+from sim.body import Body, fill_body
+from sim.contact import ShapeContacts
+from sim.embedding import Embedding
+from sim.neighbours import ParticleContacts
+from sim.shape_matching import ShapeMatching
+from sim.shapes import ConvexTool, Plane, SignedDistanceField, TriangleMesh
+from sim.skinning import Skin
+from sim.solver import Solver, StepSettings
+from ultrasound.probe import Hand, advanced, approached, between, image_plane, indentation, pose_at, touching
+from ultrasound.slice import Slice
+from ultrasound.volume import Volume, distance_volume
+
+# The tetrahedra that carry the image plane are "coarse": two particle radii wide.
+EMBEDDING_CELL_RADII = 2.0
+TURN_DEG_S = 180.0
+
+
+class Rehearsal:
+    """A scene on the device. All positions are mm relative to ``origin``, the middle of the resting organ (LPS).
+
+    Needs Taichi to be initialised; a new one for another scene needs it initialised anew, which frees the old.
+    """
+
+    def __init__(self, scene: Scene, anatomy: LoadedAnatomy) -> None:
+        self.scene = scene
+        self.origin = anatomy.organ.bounds.mean(axis=0)
+        self.organ = _shifted(anatomy.organ, -self.origin)
+        self.tumour = anatomy.tumour and _shifted(anatomy.tumour, -self.origin)
+        self.gravity_direction = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
+        self.supports = [_shifted(s, -self.origin) for s in anatomy.shapes if isinstance(s, trimesh.Trimesh)]
+        self._build_body()
+        self._build_solver(anatomy)
+        self._build_surfaces()
+        self._build_slice(anatomy)
+        self.press = press_on(scene.press, anatomy, self.gravity_direction)
+        self.hand = self._hand()
+        self.pose = self.hand.pose()
+        self.steps = 0
+        self.rest_state = self.body.snapshot()
+
+    def _build_body(self) -> None:
+        tissue, solver = self.scene.tissue, self.scene.solver
+        rest = fill_body(
+            self.organ,
+            tissue.radius_mm,
+            tissue.density_g_cm3,
+            tissue.volume_sampling,
+            tissue.surface_samples_per_mm2,
+        )
+        self.body = Body(rest, solver.mass_scaling_per_mm)
+        self.model = ShapeMatching(self.body, tissue.cluster_spacing, solver.relaxation)
+
+    def _build_solver(self, anatomy: LoadedAnatomy) -> None:
+        contact, solver = self.scene.contact, self.scene.solver
+        self.size_mm = np.array(self.scene.transducer.size_mm)
+        self.tool = ConvexTool.cuboid(self.size_mm)
+        static = [self._shape(shape) for shape in anatomy.shapes]
+        self.contacts = ShapeContacts(self.body, [*static, self.tool], contact.shape_friction)
+        pairs = (
+            ParticleContacts(self.body, self.model, contact.particle_friction) if contact.particles else None
+        )
+        self.solver = Solver(self.body, self.model, self.contacts, pairs, self.tool, solver.relaxation)
+        self.settings = StepSettings(
+            stiffness=self.scene.tissue.stiffness,
+            time_step_s=solver.time_step_s,
+            substeps=solver.substeps,
+            iterations=solver.iterations,
+            stabilisation_iterations=solver.stabilisation_iterations,
+            relaxation_factor=solver.relaxation_factor,
+            damping=solver.damping_per_s,
+        )
+        self.set_gravity(self.scene.gravity.acceleration_m_s2)
+
+    def _shape(
+        self, shape: PlaneShape | trimesh.Trimesh | Grid
+    ) -> Plane | TriangleMesh | SignedDistanceField:
+        if isinstance(shape, PlaneShape):
+            normal = np.array(shape.normal) / np.linalg.norm(shape.normal)
+            return Plane(normal, shape.offset_mm / np.linalg.norm(shape.normal) - normal @ self.origin)
+        if isinstance(shape, trimesh.Trimesh):
+            moved = _shifted(shape, -self.origin)
+            return TriangleMesh(moved.vertices, moved.faces, self.contacts_reach())
+        spacing = 1 / np.diag(shape.index_from_mm)[:3]
+        return SignedDistanceField(shape.voxels, -spacing * shape.index_from_mm[:3, 3] - self.origin, spacing)
+
+    def contacts_reach(self) -> float:
+        """How far from a static shape its distances must be known [mm]."""
+        return 2 * self.scene.tissue.radius_mm
+
+    def _build_surfaces(self) -> None:
+        self.organ_skin = Skin(self.model, self.organ.vertices)
+        self.tumour_skin = self.tumour and Skin(self.model, self.tumour.vertices)
+
+    def _build_slice(self, anatomy: LoadedAnatomy) -> None:
+        self.embedding = Embedding(self.model, self.organ, EMBEDDING_CELL_RADII * self.scene.tissue.radius_mm)
+        image = self.scene.image
+        self.slice = None
+        if anatomy.ct is not None:
+            ct = Volume(anatomy.ct.voxels, _moved(anatomy.ct, self.origin))
+            self.slice = Slice(ct, distance_volume(self.organ), self.embedding, image.pixels, image.outside)
+
+    def _hand(self) -> Hand:
+        target = np.array(self.press.target_mm) - self.origin
+        pose = pose_at(target, np.array(self.press.direction), np.array(self.press.lateral), self.size_mm[2])
+        home = touching(pose, self.size_mm, self.organ.vertices)
+        vertices, faces = np.array(self.organ.vertices, float), np.array(self.organ.faces, np.int64)
+        normals = np.array(self.organ.vertex_normals)
+        return Hand(vertices, faces, normals, self.size_mm, home, np.array(self.press.lateral))
+
+    def set_gravity(self, acceleration_m_s2: float) -> None:
+        """Change the acceleration due to gravity; its direction is the scene's."""
+        self.settings.gravity = tuple(1000.0 * acceleration_m_s2 * self.gravity_direction)
+
+    def scripted_pose(self, time_s: float) -> np.ndarray:
+        """The transducer's pose at a time of the scripted press: warm-up, then each stage in turn."""
+        press = self.press
+        step = time_s / self.scene.solver.time_step_s
+        stages = np.arange(len(press.indentations_mm) + 1)
+        steps = press.warm_up_steps + stages * press.stage_steps
+        depth = float(np.interp(step, steps, [0.0, *press.indentations_mm]))
+        return advanced(self.hand.home, depth)
+
+    def script_length_s(self) -> float:
+        """How long the scripted press takes [s]."""
+        steps = self.press.warm_up_steps + len(self.press.indentations_mm) * self.press.stage_steps
+        return steps * self.scene.solver.time_step_s
+
+    def follow(self, goal: np.ndarray) -> None:
+        """Advance one time step with the transducer going towards a pose, no faster than a hand can."""
+        most_mm = self.scene.transducer.speed_mm_s * self.settings.time_step_s
+        self.advance(approached(self.pose, goal, most_mm, TURN_DEG_S * self.settings.time_step_s))
+
+    def advance(self, pose: np.ndarray) -> None:
+        """Advance one time step, at whose end the transducer has a pose (4, 4)."""
+        self.solver.step(self.settings, between(self.pose, pose, self.settings.substeps))
+        self.pose = pose
+        self.steps += 1
+
+    def update_surfaces(self) -> None:
+        """Carry the surfaces that are drawn to where the body is."""
+        self.organ_skin.update()
+        if self.tumour_skin is not None:
+            self.tumour_skin.update()
+
+    def image(self, window_hu: float, level_hu: float, depth_mm: float) -> np.ndarray:
+        """What the transducer sees now: grey values (rows, columns) uint8."""
+        if self.slice is None:
+            raise ValueError("this scene has no CT: there is nothing to image")
+        self.embedding.update()
+        plane = image_plane(self.pose, self.size_mm[2], self.scene.image.width_mm, depth_mm)
+        self.slice.render(plane, window_hu, level_hu)
+        return self.slice.grey.to_numpy()
+
+    def indentation_mm(self) -> float:
+        """How deep the transducer is pressed into the resting surface; negative above it."""
+        return indentation(self.pose, self.size_mm, self.organ.vertices)
+
+    def volume_ratio(self) -> float:
+        """Volume inside the carried surface, as a share of the resting one."""
+        carried = self.organ_skin.vertices.to_numpy()[self.organ.faces].astype(float)
+        volume = np.einsum("ij,ij->", carried[:, 0], np.cross(carried[:, 1], carried[:, 2])) / 6
+        return float(volume / self.organ.volume)
+
+    def reset(self) -> None:
+        """Tissue and transducer as they were at the start."""
+        self.body.restore(self.rest_state)
+        self.contacts.forget()
+        self.model.update_frames()
+        self.hand.reset()
+        self.pose = self.hand.pose()
+        self.steps = 0
+        ti.sync()
+
+
+def _shifted(mesh: trimesh.Trimesh, by: np.ndarray) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices + by, mesh.faces, process=False)
+
+
+def _moved(grid: Grid, origin: np.ndarray) -> np.ndarray:
+    """The grid's map from positions relative to an origin."""
+    shift = np.eye(4)
+    shift[:3, 3] = origin
+    return grid.index_from_mm @ shift

@@ -1,0 +1,73 @@
+"""What a headless run measured, as ``report.json`` has it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from time import perf_counter
+
+import numpy as np
+import taichi as ti
+
+from studies.rehearsal import Rehearsal
+
+
+def timed(work: Callable, into_ms: list[float]):
+    """Do some work, wait for the device, and add the milliseconds that it took."""
+    start = perf_counter()
+    result = work()
+    ti.sync()
+    into_ms.append(1000 * (perf_counter() - start))
+    return result
+
+
+def spread(values_ms: list[float]) -> dict[str, float] | None:
+    """Mean, standard deviation, minimum, maximum and median; None of nothing."""
+    if not values_ms:
+        return None
+    v = np.array(values_ms)
+    figures = dict(mean=v.mean(), sd=v.std(), min=v.min(), max=v.max(), median=np.median(v))
+    return {name: round(float(value), 4) for name, value in figures.items()}
+
+
+@dataclass
+class Record:
+    """Figures gathered while a rehearsal runs; the first step and slice, which compile, count as building."""
+
+    build_s: float
+    step_ms: list[float] = field(default_factory=list)
+    slice_ms: list[float] = field(default_factory=list)
+    finite: bool = True
+    volume_ratio_min: float = 1.0
+    max_penetration_mm: float = 0.0
+    indentation_max_mm: float = 0.0
+
+    def watch(self, rehearsal: Rehearsal) -> None:
+        """Look at the state at the end of a step; the surfaces must be up to date."""
+        self.finite &= bool(np.isfinite(rehearsal.body.position.to_numpy()).all())
+        self.volume_ratio_min = min(self.volume_ratio_min, rehearsal.volume_ratio())
+        self.max_penetration_mm = max(self.max_penetration_mm, rehearsal.contacts.measure_penetration())
+        self.indentation_max_mm = max(self.indentation_max_mm, rehearsal.indentation_mm())
+
+    def report(self, rehearsal: Rehearsal, arch: str) -> dict:
+        """Everything in one dictionary; times in ms are over all steps but the first."""
+        settings = rehearsal.settings
+        return dict(
+            title=rehearsal.scene.title,
+            arch=arch,
+            particles=rehearsal.body.count,
+            clusters=rehearsal.model.count,
+            memberships=rehearsal.model.membership_count,
+            tetrahedra=rehearsal.embedding.count,
+            radius_mm=rehearsal.scene.tissue.radius_mm,
+            time_step_s=settings.time_step_s,
+            substeps=settings.substeps,
+            iterations=settings.iterations,
+            stiffness=settings.stiffness,
+            steps=rehearsal.steps,
+            ms_per_step=spread(self.step_ms[1:]),
+            ms_per_slice=spread(self.slice_ms[1:]),
+            build_s=round(self.build_s, 3),
+            finite=self.finite,
+            volume_ratio_min=round(self.volume_ratio_min, 6),
+            max_penetration_mm=round(self.max_penetration_mm, 6),
+            indentation_max_mm=round(self.indentation_max_mm, 4),
+        )

@@ -1,0 +1,46 @@
+"""Shared by all tests: a fresh Taichi for each, small bodies, and the place of the optional real data."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import taichi as ti
+import trimesh
+
+from sim.device import start
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def device():
+    """Taichi on the CPU, with nothing left of an earlier test."""
+    start("cpu")
+    yield
+    ti.reset()
+
+
+@pytest.fixture
+def data() -> Path:
+    """The folder of real data, which the project stands without."""
+    if not DATA.is_dir():
+        pytest.skip("no ../shared/data here")
+    return DATA
+
+
+@pytest.fixture
+def ball() -> trimesh.Trimesh:
+    """A ball of 12 mm radius about the origin."""
+    return trimesh.creation.icosphere(subdivisions=3, radius=12.0)
+
+
+@pytest.fixture
+def block() -> trimesh.Trimesh:
+    """A block of 24 x 20 x 16 mm about the origin."""
+    return trimesh.creation.box([24.0, 20.0, 16.0])
+
+
+def rotation_about(axis: list[float], degrees: float) -> np.ndarray:
+    """Rotation matrix (3, 3)."""
+    return trimesh.transformations.rotation_matrix(np.radians(degrees), axis)[:3, :3]

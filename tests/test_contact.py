@@ -1,0 +1,266 @@
+"""Shapes against closed forms, and contacts that leave nothing inside."""
+
+import igl
+import numpy as np
+import pytest
+import taichi as ti
+import trimesh
+from conftest import rotation_about
+from test_solver import position, solver_of
+
+from sim.body import Body, fill_body
+from sim.contact import ShapeContacts
+from sim.neighbours import ParticleContacts
+from sim.shape_matching import ShapeMatching
+from sim.shapes import FAR, ConvexTool, Plane, SignedDistanceField, TriangleMesh
+from sim.solver import Solver, StepSettings
+
+
+def measured(shape, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Normals (n, 3) and signed distances (n,) that a shape answers with."""
+    given = ti.Vector.field(3, ti.f32, len(points))
+    answer = ti.Vector.field(4, ti.f32, len(points))
+    given.from_numpy(points.astype(np.float32))
+
+    @ti.kernel
+    def ask():
+        for i in given:
+            answer[i] = shape.surface(given[i])
+
+    ask()
+    answers = answer.to_numpy().astype(np.float64)
+    return answers[:, :3], answers[:, 3]
+
+
+def scattered(count: int = 4000, reach: float = 16.0) -> np.ndarray:
+    return np.random.default_rng(4).uniform(-reach, reach, (count, 3))
+
+
+def test_plane(device):
+    normal = np.array([1.0, 2.0, 2.0])
+    points = scattered()
+    normals, distance = measured(Plane(normal, 6.0), points)
+    assert np.abs(distance - (points @ normal - 6.0) / 3).max() < 1e-5
+    assert np.abs(normals - normal / 3).max() < 1e-6
+
+
+def test_cuboid_in_any_pose(device):
+    half = np.array([6.0, 3.0, 4.0])
+    tool = ConvexTool.cuboid(2 * half)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation_about([1, 1, 0], 40), [2.0, -1.0, 3.0]
+    tool.move(pose, pose)
+    points = scattered()
+    normals, distance = measured(tool, points)
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    beyond = np.abs(local) - half
+    wanted = np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
+    assert np.abs(distance - wanted).max() < 2e-5
+    # A step along the normal changes the distance by its length, which is what makes it the normal.
+    away = np.abs(wanted) > 0.1
+    ahead = measured(tool, points + 0.05 * normals)[1]
+    assert np.abs(ahead - distance - 0.05)[away & (beyond.max(axis=1) > 0)].max() < 1e-4
+
+
+def test_a_tool_knows_how_its_material_moved(device):
+    tool = ConvexTool.cuboid(np.array([4.0, 4.0, 4.0]))
+    before, now = np.eye(4), np.eye(4)
+    now[:3, :3], now[:3, 3] = rotation_about([0, 0, 1], 3), [0.5, 0.0, -0.2]
+    tool.move(before, now)
+    moved = ti.Vector.field(3, ti.f32, ())
+
+    @ti.kernel
+    def ask(x: float, y: float, z: float):
+        moved[None] = tool.motion(ti.Vector([x, y, z]))
+
+    material = np.array([1.0, 2.0, -2.0, 1.0])
+    ask(*(now @ material)[:3])
+    assert np.abs(moved.to_numpy() - (now @ material - material)[:3]).max() < 1e-6
+
+
+def test_signed_distance_field_of_a_sphere(device):
+    spacing = 0.5
+    axis = np.arange(-16, 16.1, spacing)
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    field = SignedDistanceField(np.linalg.norm(grid, axis=-1) - 9, np.full(3, -16.0), np.full(3, spacing))
+    points = scattered(reach=11.0)
+    points = points[np.linalg.norm(points, axis=1) > 4]
+    normals, distance = measured(field, points)
+    # Linear interpolation is off by spacing^2 / 8 times the sum of the two curvatures 1 / r, here at r > 4.
+    assert np.abs(distance - (np.linalg.norm(points, axis=1) - 9)).max() < spacing**2 / 8 * 2 / 4
+    outward = points / np.linalg.norm(points, axis=1, keepdims=True)
+    assert (normals * outward).sum(axis=1).min() > 0.99
+    assert measured(field, np.full((1, 3), 40.0))[1][0] == FAR
+
+
+@pytest.mark.parametrize("kind", ["ball", "notched"])
+def test_triangle_mesh_has_the_exact_distance_and_sign(device, ball, kind):
+    mesh = ball if kind == "ball" else notched_block()
+    reach = 5.0
+    shape = TriangleMesh(mesh.vertices, mesh.faces, reach)
+    points = np.concatenate([scattered(), mesh.vertices, mesh.triangles_center, mesh.vertices * 0.97])
+    normals, distance = measured(shape, points)
+    exact = igl.signed_distance(points, np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64))[0]
+    near = (exact < reach) & (exact > -1.5)
+    assert near.sum() > 500
+    assert np.abs(distance - exact)[near].max() < 1e-4
+    assert (distance[exact > reach] > reach - 1e-4).all()
+    # Deep inside it names a way out: a step of that length ends on the surface.
+    deep = exact < -2
+    assert deep.sum() > 100
+    out = points[deep] - distance[deep, None] * normals[deep]
+    assert np.abs(igl.signed_distance(out, np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64))[0]).max() < 1e-3
+
+
+def notched_block() -> trimesh.Trimesh:
+    """A block with a notch: convex and concave edges and corners."""
+    outline = np.array([(-10, -8), (10, -8), (10, 8), (2, 8), (0, -2), (-3, 8), (-10, 8)], float)
+    n = len(outline)
+    vertices = np.concatenate([np.column_stack([outline, np.full(n, z)]) for z in (-7.0, 7.0)])
+    lid = [(0, 1, 4), (1, 2, 4), (2, 3, 4), (0, 4, 6), (4, 5, 6)]
+    faces = [(c, b, a) for a, b, c in lid] + [(a + n, b + n, c + n) for a, b, c in lid]
+    for a in range(n):
+        b = (a + 1) % n
+        faces += [(a, b, b + n), (a, b + n, a + n)]
+    mesh = trimesh.Trimesh(vertices, faces)
+    assert mesh.is_watertight and mesh.volume > 0
+    return mesh
+
+
+def test_a_body_laid_in_a_mould_of_its_shape_does_not_move_without_gravity(device, ball):
+    outside = trimesh.creation.box([60, 60, 60])
+    mould = trimesh.Trimesh(
+        np.concatenate([outside.vertices, ball.vertices]),
+        np.concatenate([outside.faces, ball.faces[:, ::-1] + len(outside.vertices)]),
+        process=False,
+    )
+    solver = solver_of(ball, [TriangleMesh(mould.vertices, mould.faces, 4.0)])
+    before = position(solver)
+    solver.step(StepSettings(gravity=(0, 0, 0)))
+    assert np.abs(position(solver) - before).max() < 1e-3
+
+
+@pytest.mark.parametrize("speed_mm_s", [20.0, 400.0, 5000.0])
+def test_no_particle_ends_a_step_inside_tool_or_floor(device, ball, speed_mm_s):
+    tool = ConvexTool.cuboid(np.array([30.0, 8.0, 20.0]))
+    floor = trimesh.creation.box([80, 80, 10])
+    floor.apply_translation([0, 0, -17.5])
+    solver = solver_of(ball, [TriangleMesh(floor.vertices, floor.faces, 4.0), tool], tool=tool)
+    height, deepest = 25.0, 0.0
+    while height > 8.0:
+        poses = np.tile(np.eye(4), (4, 1, 1))
+        poses[:, 2, 3] = np.linspace(height, max(height - speed_mm_s / 60, 8.0), 4)
+        poses[:, 0, 3] = 2.0
+        height = poses[-1, 2, 3]
+        solver.step(StepSettings(stiffness=0.6), poses)
+        x = position(solver)
+        assert np.isfinite(x).all()
+        in_tool = (10.0 - np.abs(x[:, 2] - height)).clip(None, 4.0 - np.abs(x[:, 1]))
+        in_tool = np.minimum(in_tool, 15.0 - np.abs(x[:, 0] - 2.0))
+        deepest = max(deepest, in_tool.max(), (-12.5 - x[:, 2]).max())
+        assert solver.contacts.measure_penetration() <= 1e-3
+    # The tool's face has passed the middle of the ball: it lies 10.5 mm above the floor.
+    assert deepest < 1e-3
+
+
+def test_pressing_squeezes_between_tool_and_floor(device, ball):
+    tool = ConvexTool.cuboid(np.array([40.0, 40.0, 10.0]))
+    solver = solver_of(ball, [Plane(np.array([0.0, 0.0, 1.0]), -12.0), tool], tool=tool)
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    wide = np.ptp(position(solver)[:, 0])
+    for step in range(60):
+        poses[:, 2, 3] = 17.0 - 6.0 * np.minimum((step + np.arange(4) / 3) / 50, 1)
+        solver.step(StepSettings(stiffness=0.5), poses)
+    x = position(solver)
+    assert x[:, 2].max() <= 6.0 + 1e-3
+    assert np.ptp(x[:, 0]) > wide
+
+
+def test_a_dragged_tool_drags_the_surface_by_its_friction(device, ball):
+    moved = {}
+    for friction in (0.0, 0.5):
+        tool = ConvexTool.cuboid(np.array([40.0, 40.0, 10.0]))
+        solver = solver_of(ball, [Plane(np.array([0.0, 0.0, 1.0]), -12.0), tool], friction, tool=tool)
+        poses = np.tile(np.eye(4), (4, 1, 1))
+        poses[:, 2, 3] = 16.0
+        for step in range(20):
+            poses[:, 0, 3] = 0.2 * (step + np.arange(4) / 3)
+            solver.step(StepSettings(), poses)
+        moved[friction] = position(solver)[:, 0].mean()
+    # Without friction the ball only slips sideways from under the tool a little.
+    assert moved[0.5] > moved[0.0] + 0.8
+
+
+def test_stabilisation_gets_out_without_adding_velocity(device, ball):
+    floor = Plane(np.array([0.0, 0.0, 1.0]), -10.0)
+    fastest = []
+    for passes in (0, 4):
+        solver = solver_of(ball, [floor], friction=0.0)
+        settings = StepSettings(gravity=(0, 0, 0), damping=0.0, stabilisation_iterations=passes, stiffness=0.0)
+        solver.step(settings)
+        fastest.append(np.abs(solver.body.velocity.to_numpy()).max())
+        assert position(solver)[:, 2].min() >= -10.0 - 1e-4
+    # Two millimetres in a third of a sixtieth of a second.
+    assert fastest[0] > 100
+    assert fastest[1] < 0.1
+
+
+def two_balls(pairs: bool, scaling: float = 0.0) -> Solver:
+    lower = trimesh.creation.icosphere(subdivisions=2, radius=6.0)
+    upper = lower.copy()
+    # Clusters reach 5 mm: nearer bodies would be held together by them.
+    upper.apply_translation([0, 0, 17.5])
+    both = trimesh.util.concatenate([lower, upper])
+    body = Body(fill_body(both, 1.5), scaling)
+    model = ShapeMatching(body)
+    contacts = ShapeContacts(body, [Plane(np.array([0.0, 0.0, 1.0]), -6.0)], 0.35)
+    return Solver(body, model, contacts, ParticleContacts(body, model, 0.25) if pairs else None)
+
+
+def test_particles_that_share_no_cluster_keep_their_distance(device):
+    gap = {}
+    for pairs in (False, True):
+        solver = two_balls(pairs)
+        upper = solver.body.rest_body.particles[:, 2] > 9
+        for _ in range(25):
+            solver.step(StepSettings(stiffness=1.0))
+        x = position(solver)
+        gap[pairs] = np.linalg.norm(x[upper][:, None] - x[~upper][None], axis=2).min()
+        if pairs:
+            # The last word has the clusters' averaging, not the pair: a fifth of the distance at most.
+            assert gap[True] > 0.8 * 1.5
+            assert x[upper][:, 2].mean() > 8
+    assert gap[False] < 0.8
+
+
+def test_contacts_of_particles_keep_momentum_of_a_symmetric_hit(device):
+    solver = two_balls(True)
+    solver.contacts, solver.has_contacts = None, False
+    x = position(solver)
+    upper = x[:, 2] > 9
+    velocity = np.where(upper[:, None], [0, 0, -150.0], [0, 0, 150.0])
+    solver.body.velocity.from_numpy(velocity.astype(np.float32))
+    before = velocity.sum(axis=0)
+    for _ in range(6):
+        solver.step(StepSettings(gravity=(0, 0, 0), damping=0.0, stiffness=1.0))
+    v = solver.body.velocity.to_numpy().astype(float)
+    assert v[upper, 2].mean() > -20 and v[~upper, 2].mean() < 20
+    # Averaging divides a particle's pushes by its own count: pairs of unlike counts leave a little over.
+    assert np.abs(v.sum(axis=0) - before).max() < 0.1 * np.abs(velocity).sum()
+
+
+def test_scaled_masses_make_the_lower_of_a_pair_the_heavier(device):
+    moved = {}
+    for scaling in (0.0, 0.5):
+        solver = two_balls(True, scaling)
+        solver.contacts, solver.has_contacts = None, False
+        x = position(solver)
+        upper = x[:, 2] > 9
+        start = x.copy()
+        start[upper, 2] -= 6.0
+        solver.body.position.from_numpy(start.astype(np.float32))
+        solver.step(StepSettings(gravity=(0, 0, -1e-3), damping=0.0, stiffness=1.0))
+        change = position(solver) - start
+        moved[scaling] = abs(change[~upper, 2].mean()) / abs(change[upper, 2].mean())
+    assert moved[0.0] == pytest.approx(1.0, abs=0.3)
+    assert moved[0.5] < 0.5 * moved[0.0]

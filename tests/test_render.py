@@ -1,0 +1,384 @@
+"""The front end: key map, camera, panel picture; the off-screen frame where there is Vulkan."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from render import frame, solids
+from render.camera import OrbitCamera
+from render.viewer import KEY_MAP, Controls, Geometry, NullViewer, Settings, View, key_table
+
+BOUNDS = np.array([[-54.0, -33.0, -21.0], [54.0, 27.0, 21.0]])
+LAYOUT = frame.Layout(1280, 720)
+
+
+def _camera(up=(0.0, 0.0, 1.0)) -> OrbitCamera:
+    return OrbitCamera(BOUNDS, up, LAYOUT.window_coordinates(LAYOUT.scene), 1280 / 720)
+
+
+def _view(**changes) -> View:
+    pose = np.eye(4)
+    pose[:3, 3] = [0.0, 0.0, 31.0]
+    rows, columns = np.indices((96, 64))
+    grey = ((rows * 2 + columns) % 256).astype(np.uint8)
+    return View(
+        **{"transducer_pose": pose, "slice_image": grey, "width_mm": 40.0, "depth_mm": 60.0} | changes
+    )
+
+
+# Settings and key map
+
+
+def test_key_map_names_every_key_and_action_once():
+    for column in ("key", "action", "text"):
+        values = [getattr(line, column).lower() for line in KEY_MAP]
+        assert len(set(values)) == len(values)
+
+
+def test_key_table_has_a_row_for_every_key():
+    rows = key_table().splitlines()[2:]
+    assert [row.split(" | ")[0] for row in rows] == [f"| {line.key}" for line in KEY_MAP]
+
+
+def test_key_map_and_window_agree():
+    window = pytest.importorskip("render.window")
+    bound = set(window.HELD) | set(window.TOGGLES) | set(window.PRESSED_ONCE) | {"h"}
+    printed = {line.key.lower() for line in KEY_MAP if len(line.key) == 1}
+    assert {key for key in bound if len(key) == 1} == printed
+    actions = {line.action for line in KEY_MAP}
+    assert set(window.TOGGLES.values()) | set(window.PRESSED_ONCE.values()) <= actions
+    assert set(window.PRESSED_ONCE.values()) <= {each.name for each in dataclasses.fields(Controls)}
+
+
+def test_defaults_lie_in_their_ranges_and_every_setting_can_become_a_slider():
+    Settings().check()
+    for each in dataclasses.fields(Settings):
+        assert {"label", "unit", "low", "high", "group"} <= set(each.metadata)
+        # The type of the range chooses the widget, so it must be the type of the value.
+        assert type(each.metadata["low"]) is type(each.metadata["high"]) is type(each.default)
+
+
+@pytest.mark.parametrize(("name", "value"), [("stiffness", 1.01), ("substeps", 0), ("depth_mm", 121)])
+def test_a_setting_out_of_range_is_named(name, value):
+    with pytest.raises(ValueError, match=name):
+        dataclasses.replace(Settings(), **{name: value}).check()
+
+
+# Camera
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.3, -0.8, 0.2)])
+def test_ray_under_the_mouse_passes_through_the_projected_point(up):
+    camera = _camera(up)
+    camera.orbit(0.13, -0.07)
+    camera.pan(0.05, 0.02)
+    camera.zoom(0.8)
+    points = np.random.default_rng(1).uniform(BOUNDS[0], BOUNDS[1], (50, 3))
+    for point, cursor in zip(points, camera.project(points), strict=True):
+        origin, direction = camera.ray(cursor)
+        assert np.linalg.norm(np.cross(point - origin, direction)) < 1e-6
+        assert (point - origin) @ direction > 0
+
+
+def test_bounds_just_fit_the_3d_view():
+    camera = _camera()
+    corners = np.array([[x, y, z] for x in BOUNDS[:, 0] for y in BOUNDS[:, 1] for z in BOUNDS[:, 2]])
+    left, bottom, right, top = LAYOUT.window_coordinates(LAYOUT.scene)
+    share = (camera.project(corners) - [left, bottom]) / [right - left, top - bottom]
+    assert share.min() > 0.0 and share.max() < 1.0
+    # The margin is 4 % of the distance, so one corner comes closer to an edge than that.
+    assert min(share.min(), 1.0 - share.max()) < 0.04
+
+
+def test_target_stays_in_the_middle_of_the_3d_view_when_the_camera_turns_and_zooms():
+    camera = _camera()
+    left, bottom, right, top = LAYOUT.window_coordinates(LAYOUT.scene)
+    camera.orbit(0.4, 0.2)
+    camera.zoom(0.5)
+    assert np.allclose(camera.project(camera.target), [(left + right) / 2, (bottom + top) / 2], atol=1e-9)
+
+
+def test_up_is_up_and_the_tissue_follows_a_pan():
+    camera = _camera()
+    low, high = camera.project(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 10.0]]))
+    assert high[1] > low[1]
+    target = camera.target
+    before = camera.project(target)
+    camera.pan(0.1, -0.05)
+    assert np.allclose(camera.project(target) - before, [0.1, -0.05], atol=1e-9)
+
+
+# Panel
+
+
+def test_slice_of_the_size_of_its_box_appears_unchanged_and_nothing_else_is_written():
+    box = LAYOUT.picture_box(40.0, 60.0)
+    grey = np.random.default_rng(2).integers(0, 256, (box.height, box.width), dtype=np.uint8)
+    picture = np.full((720, 1280, 4), 7, dtype=np.uint8)
+    frame.paste_slice(picture, box, grey)
+    assert np.array_equal(picture[box.slices][..., :3], np.repeat(grey[..., None], 3, axis=2))
+    assert np.all(picture[..., 3] == 7)
+    picture[box.slices] = 7
+    assert np.all(picture == 7)
+
+
+def test_resampled_slice_keeps_its_sides():
+    box = LAYOUT.picture_box(40.0, 60.0)
+    grey = np.zeros((512, 512), dtype=np.uint8)
+    grey[:256, :256] = 200
+    picture = np.zeros((720, 1280, 3), dtype=np.uint8)
+    frame.paste_slice(picture, box, grey)
+    inside = picture[box.slices][..., 0]
+    rows, columns = box.height // 2, box.width // 2
+    assert np.all(inside[: rows - 2, : columns - 2] == 200)
+    assert np.all(inside[rows + 2 :] == 0) and np.all(inside[:, columns + 2 :] == 0)
+
+
+@pytest.mark.parametrize(("width_mm", "depth_mm"), [(40.0, 60.0), (40.0, 20.0), (40.0, 120.0), (60.0, 45.0)])
+def test_picture_box_has_the_shape_of_the_image_plane_and_stays_in_the_panel(width_mm, depth_mm):
+    box = LAYOUT.picture_box(width_mm, depth_mm)
+    assert box.left >= LAYOUT.panel.left + frame.RULER_WIDTH and box.right <= LAYOUT.panel.right
+    assert box.top >= frame.HEADER_HEIGHT and box.bottom <= LAYOUT.panel.bottom
+    # Each side is rounded to whole pixels: half a pixel on either.
+    assert abs(box.width * depth_mm - box.height * width_mm) <= 0.5 * (width_mm + depth_mm)
+
+
+def test_image_plane_without_extent_is_refused():
+    with pytest.raises(ValueError, match="positive"):
+        LAYOUT.picture_box(40.0, 0.0)
+
+
+@pytest.mark.parametrize("depth_mm", [20.0, 60.0, 87.0, 120.0])
+def test_ruler_ticks_stand_at_their_depth(depth_mm):
+    box = LAYOUT.picture_box(40.0, depth_mm)
+    ticks = frame.ruler_ticks(depth_mm, box)
+    assert len(ticks) == int(depth_mm // 5) + 1
+    for i, (row, centimetres) in enumerate(ticks):
+        depth = (row - box.top) / (box.height - 1) * depth_mm
+        assert abs(depth - 5.0 * i) <= 0.5 * depth_mm / (box.height - 1) + 1e-9
+        assert centimetres == (i // 2 if i % 2 == 0 else None)
+
+
+def test_ruler_is_drawn_where_its_ticks_say():
+    panel = frame.Panel(40.0, 60.0, 350, 40)
+    box = LAYOUT.picture_box(40.0, 60.0)
+    picture = frame.backdrop(LAYOUT, panel)
+    column = picture[box.top : box.bottom, box.left - 8]
+    drawn = {box.top + int(row) for row in np.flatnonzero(np.any(column != frame.PANEL, axis=1))}
+    assert drawn == {row for row, _ in frame.ruler_ticks(60.0, box)}
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_marker_dot_is_on_the_marked_side(side):
+    picture = frame.backdrop(LAYOUT, frame.Panel(40.0, 60.0, 350, 40, marked_side=side))
+    box = LAYOUT.picture_box(40.0, 60.0)
+    columns = np.flatnonzero(np.any(np.all(picture == frame.MARK, axis=2), axis=0))
+    middle = (box.left + box.right) / 2
+    assert len(columns) > 0
+    assert np.all(columns < middle) if side == "left" else np.all(columns > middle)
+
+
+def test_unknown_marked_side_is_refused():
+    with pytest.raises(ValueError, match="marked_side"):
+        frame.backdrop(LAYOUT, frame.Panel(40.0, 60.0, 350, 40, marked_side="top"))
+
+
+def test_parts_of_the_window_do_not_overlap():
+    taken = np.zeros((720, 1280), dtype=int)
+    for rect in [LAYOUT.panel, LAYOUT.title, LAYOUT.scene, LAYOUT.strip]:
+        taken[rect.slices] += 1
+    assert np.all(taken == 1)
+    taken[:] = 0
+    for rect in [*LAYOUT.sliders([280.0, 220.0, 130.0]), LAYOUT.readouts]:
+        taken[rect.slices] += 1
+        assert rect.left >= 0 and rect.bottom <= 720 and rect.right <= LAYOUT.panel.left
+    assert taken.max() == 1
+
+
+def test_readouts_and_status_change_the_picture():
+    assert np.any(
+        frame.readout_picture(LAYOUT, {"Step": "9 ms"}) != frame.readout_picture(LAYOUT, {"Step": "8 ms"})
+    )
+    plain = frame.backdrop(LAYOUT, frame.Panel(40.0, 60.0, 350, 40))
+    frozen = frame.backdrop(LAYOUT, frame.Panel(40.0, 60.0, 350, 40, status="FROZEN"))
+    changed = np.argwhere(np.any(plain != frozen, axis=2))
+    assert len(changed) > 0 and changed[:, 1].min() > LAYOUT.panel.left
+
+
+# Solids
+
+
+def test_cuboid_faces_outward():
+    solid = solids.cuboid((40.0, 10.0, 20.0))
+    a, b, c = (solid.vertices[solid.indices.reshape(-1, 3)[:, i]] for i in range(3))
+    centre = (a + b + c) / 3
+    assert np.all(np.einsum("ij,ij->i", np.cross(b - a, c - a), centre) > 0)
+    assert np.all(np.einsum("ij,ij->i", solid.normals, solid.vertices) > 0)
+
+
+def test_image_plane_grid_carries_the_slice_the_right_way_round():
+    vertices, indices = solids.image_plane_grid(6, 4)
+    grey = np.zeros((60, 40), dtype=np.uint8)
+    grey[0, -1] = 255
+    bright = vertices[solids.sampled(grey, 6, 4) == 1.0]
+    assert np.allclose(bright, [[0.5, 0.0, 0.0]])
+    assert indices.max() == len(vertices) - 1 and len(indices) == 6 * 5 * 3
+
+
+# Front ends
+
+
+def test_null_viewer_drives_a_loop():
+    settings = Settings(stiffness=0.4)
+    script = [Controls(settings, push_mm=1.0), None, Controls(settings, quit=True)]
+    viewer = NullViewer(settings, script)
+    pushed = 0.0
+    while viewer.running:
+        controls = viewer.read_controls()
+        pushed += controls.push_mm
+        assert controls.settings.stiffness == 0.4
+        viewer.draw(_view())
+    assert (viewer.frames, pushed) == (3, 1.0)
+    assert viewer.picture().shape == (720, 1280, 3)
+
+
+ORGAN_MM = 22.0
+
+
+@pytest.fixture
+def window():
+    """An off-screen window on a ball, its vertices as a field and as an array; skips where Vulkan is missing."""
+    ti = pytest.importorskip("taichi")
+    from render.window import NoVulkan, Window
+
+    ti.init(arch=ti.cpu, log_level=ti.ERROR)
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=ORGAN_MM)
+    vertices = ball.vertices.astype(np.float32)
+    field = ti.Vector.field(3, ti.f32, shape=len(vertices))
+    field.from_numpy(vertices)
+    geometry = Geometry(field, ball.faces.astype(np.int32), np.array([[-45.0] * 3, [45.0] * 3]))
+    try:
+        opened = Window(geometry, Settings(translucent=False), size=(640, 360), visible=False)
+    except NoVulkan as reason:
+        ti.reset()
+        pytest.skip(str(reason))
+    yield opened, field, vertices
+    opened.close()
+    ti.reset()
+
+
+def _organ_pixels(picture: np.ndarray) -> np.ndarray:
+    """Where the picture is as red as the organ, bool (height, width). Nothing else in the window is."""
+    red, green, blue = (picture[..., i].astype(int) for i in range(3))
+    return (red > 60) & (red > 3 * green // 2) & (red > 3 * blue // 2)
+
+
+def _far_view() -> View:
+    # The transducer stands aside, so that it hides nothing.
+    pose = np.eye(4)
+    pose[:3, 3] = [0.0, 200.0, 200.0]
+    return _view(transducer_pose=pose)
+
+
+def test_picture_before_any_view_is_refused(window):
+    with pytest.raises(RuntimeError, match="nothing was drawn"):
+        window[0].picture()
+
+
+def test_organ_is_drawn_where_the_camera_projects_it(window):
+    opened, field, vertices = window
+    field.fill(0.0)
+    opened.draw(_far_view())
+    empty = opened.picture()
+    for shift in ([0.0, 0.0, 0.0], [18.0, 0.0, 0.0], [0.0, 0.0, 15.0]):
+        moved = (vertices + np.float32(shift)).astype(np.float32)
+        field.from_numpy(moved)
+        opened.draw(_far_view())
+        picture = opened.picture()
+        rows, columns = np.nonzero(np.any(picture != empty, axis=2))
+        assert _organ_pixels(picture).sum() > len(rows) / 2
+        # The outline of the vertices, in pixels from the bottom left. A pixel is drawn if its middle is inside.
+        outline = opened.camera.project(moved) * [640, 360]
+        drawn = [[columns.min(), 360 - rows.max() - 1], [columns.max() + 1, 360 - rows.min()]]
+        assert np.allclose(drawn, [outline.min(axis=0), outline.max(axis=0)], atol=1.0)
+
+
+def test_organ_never_covers_the_panel_the_title_or_the_readouts(window):
+    opened, _, _ = window
+    opened.camera.zoom(0.01)
+    left, bottom, right, top = opened.layout.window_coordinates(opened.layout.scene)
+    opened.camera.pan(0.62 - (left + right) / 2, 0.5 - (bottom + top) / 2)
+    opened.draw(_far_view())
+    picture = opened.picture()
+    red = _organ_pixels(picture)
+    layout = opened.layout
+    assert red[layout.scene.slices][:, -1].any(), "the organ does not reach the panel: this proves nothing"
+    expected = frame.backdrop(layout, frame.Panel(40.0, 60.0, 350, 40))
+    frame.paste_slice(expected, layout.picture_box(40.0, 60.0), _view().slice_image)
+    for rect in (layout.panel, layout.title):
+        assert np.array_equal(picture[rect.slices], expected[rect.slices])
+    assert np.array_equal(picture[layout.readouts.slices], frame.readout_picture(layout, {}))
+
+
+def test_two_pictures_of_one_view_are_the_same(window):
+    opened, _, _ = window
+    opened.draw(_view(status="FROZEN"))
+    assert np.array_equal(opened.picture(), opened.picture())
+
+
+@pytest.mark.parametrize(("setting", "value"), [("translucent", True), ("cut", True), ("level_hu", 90)])
+def test_settings_are_seen(window, setting, value):
+    opened, _, _ = window
+    opened.draw(_view())
+    before = opened.picture()
+    setattr(opened.settings, setting, value)
+    assert np.any(opened.picture() != before)
+    assert opened.read_controls().settings is opened.settings
+
+
+PROBE = """
+import numpy as np, taichi as ti
+ti.init(arch=ti.cpu, log_level=ti.ERROR)
+from render.viewer import Geometry
+from render.window import NoVulkan, Window
+field = ti.Vector.field(3, ti.f32, shape=3)
+try:
+    Window(Geometry(field, np.array([[0, 1, 2]]), np.array([[-1.0] * 3, [1.0] * 3])), visible=False)
+except NoVulkan as reason:
+    assert "\\n" not in str(reason)
+    print("said", reason)
+"""
+
+
+def test_missing_vulkan_is_said_and_not_died_of():
+    pytest.importorskip("taichi")
+    nowhere = {"VK_ICD_FILENAMES": "/nonexistent", "VK_DRIVER_FILES": "/nonexistent"}
+    root = Path(__file__).resolve().parent.parent
+    done = subprocess.run(
+        [sys.executable, "-c", PROBE],
+        cwd=root,
+        check=False,
+        env=os.environ | nowhere,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "said no Vulkan driver" in done.stdout
+
+
+@pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="these always have a display")
+@pytest.mark.parametrize("display", [None, ":4242"])
+def test_no_display_is_noticed(monkeypatch, display):
+    window = pytest.importorskip("render.window")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    if display:
+        monkeypatch.setenv("DISPLAY", display)
+    assert not window.display_available()

@@ -1,0 +1,159 @@
+"""The transducer: its pose, and how a hand moves it over the organ.
+
+A pose is a rigid (4, 4) matrix, world from transducer [mm]. The transducer is a cuboid about its origin: x lateral
+to the marked side, y elevation, z along its axis; the image leaves its face at z = -length / 2 along -z.
+"""
+
+from dataclasses import dataclass, field
+
+import igl
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from ultrasound.slice import ImagePlane
+
+# How wide a patch of surface the probe's axis is perpendicular to, as a hand would hold it.
+NORMAL_PATCH_MM = 12.0
+LEAST_DEPTH_MM, MOST_DEPTH_MM = -40.0, 25.0
+PRESS_MM_S, RELEASE_MM_S = 12.0, 40.0
+
+
+def pose_at(
+    face_centre: np.ndarray, direction: np.ndarray, lateral: np.ndarray, length_mm: float
+) -> np.ndarray:
+    """Pose whose face is centred at a point [mm] and looks along ``direction``; x is nearest to ``lateral``."""
+    z = -np.asarray(direction, float) / np.linalg.norm(direction)
+    x = np.asarray(lateral, float) - np.dot(lateral, z) * z
+    if np.linalg.norm(x) < 1e-6:
+        across = np.eye(3)[np.argmin(np.abs(z))]
+        x = across - np.dot(across, z) * z
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+    pose[:3, 3] = np.asarray(face_centre, float) + length_mm / 2 * z
+    return pose
+
+
+def image_plane(pose: np.ndarray, length_mm: float, width_mm: float, depth_mm: float) -> ImagePlane:
+    """The plane under the transducer's face: x to the marked side, y down into the tissue, origin at the face."""
+    plane_in_transducer = np.array(
+        [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, -length_mm / 2], [0.0, 0.0, 0.0, 1.0]]
+    )
+    return ImagePlane(pose @ plane_in_transducer, width_mm, depth_mm)
+
+
+def indentation(pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray) -> float:
+    """How deep the transducer's face is below the highest point (n, 3) of the resting surface under it [mm].
+
+    Negative above the surface; -inf where the transducer's footprint misses it.
+    """
+    local = (surface - pose[:3, 3]) @ pose[:3, :3]
+    half = np.asarray(size_mm) / 2
+    # Points past the transducer's other end belong to the far side of the organ.
+    under = (np.abs(local[:, :2]) <= half[:2]).all(axis=1) & (local[:, 2] <= half[2])
+    return float((local[under, 2] + half[2]).max()) if under.any() else -np.inf
+
+
+def touching(pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray) -> np.ndarray:
+    """The pose moved along its axis to where it just touches the resting surface (n, 3)."""
+    half = np.asarray(size_mm) / 2
+    local = (surface - pose[:3, 3]) @ pose[:3, :3]
+    under = (np.abs(local[:, :2]) <= half[:2]).all(axis=1)
+    moved = pose.copy()
+    if under.any():
+        moved[:3, 3] += pose[:3, 2] * (local[under, 2].max() + half[2])
+    return moved
+
+
+def advanced(pose: np.ndarray, depth_mm: float) -> np.ndarray:
+    """The pose moved by a depth along the way it looks [mm]."""
+    moved = pose.copy()
+    moved[:3, 3] -= depth_mm * pose[:3, 2]
+    return moved
+
+
+def between(start: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
+    """Poses (count + 1, 4, 4) evenly from start to end: straight in position, the short way round in angle."""
+    at = np.linspace(0.0, 1.0, count + 1)
+    poses = np.tile(np.eye(4), (count + 1, 1, 1))
+    turns = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([start[:3, :3], end[:3, :3]])))
+    poses[:, :3, :3] = turns(at).as_matrix()
+    poses[:, :3, 3] = start[:3, 3] + at[:, None] * (end[:3, 3] - start[:3, 3])
+    return poses
+
+
+def approached(pose: np.ndarray, goal: np.ndarray, most_mm: float, most_deg: float) -> np.ndarray:
+    """The pose moved towards a goal by at most a distance [mm] and an angle [degrees]."""
+    way = np.linalg.norm(goal[:3, 3] - pose[:3, 3])
+    turn = np.degrees(Rotation.from_matrix(goal[:3, :3] @ pose[:3, :3].T).magnitude())
+    share = min(1.0, most_mm / max(way, 1e-9), most_deg / max(turn, 1e-9))
+    if share >= 1.0:
+        return goal.copy()
+    turns = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([pose[:3, :3], goal[:3, :3]])))
+    moved = np.eye(4)
+    moved[:3, :3] = turns([share]).as_matrix()[0]
+    moved[:3, 3] = pose[:3, 3] + share * (goal[:3, 3] - pose[:3, 3])
+    return moved
+
+
+@dataclass
+class Hand:
+    """What holds the transducer: where on the resting organ it aims, how it is turned, how deep it presses.
+
+    ``vertices`` (n, 3), ``faces`` (m, 3) and ``normals`` (n, 3) are the resting surface [mm]; ``home`` is the pose it
+    starts from. ``depth_mm`` is what keys push, ``pressed_mm`` what a held button adds until it is let go.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+    size_mm: np.ndarray
+    home: np.ndarray
+    lateral: np.ndarray
+    depth_mm: float = 0.0
+    pressed_mm: float = 0.0
+    turn_deg: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    aim: np.ndarray | None = None
+
+    def reset(self) -> None:
+        """Back to the home pose, untilted and just touching."""
+        self.depth_mm, self.pressed_mm, self.turn_deg, self.aim = 0.0, 0.0, np.zeros(3), None
+
+    def point(self, origin: np.ndarray, direction: np.ndarray) -> None:
+        """Aim where a ray [mm] first meets the resting organ, perpendicular to its surface; a miss changes nothing."""
+        hits = igl.ray_mesh_intersect(
+            np.array(origin), np.array(direction), self.vertices, self.faces, first=True
+        )
+        if hits:
+            self.aim_at(np.array(origin) + hits[0][3] * np.array(direction))
+
+    def aim_at(self, target: np.ndarray) -> None:
+        """Aim at a point of the surface [mm], perpendicular to the patch around it."""
+        distance = np.linalg.norm(self.vertices - target, axis=1)
+        outward = np.exp(-((distance / NORMAL_PATCH_MM) ** 2)) @ self.normals
+        self.aim = pose_at(target, -outward, self.lateral, self.size_mm[2])
+
+    def push(self, depth_mm: float) -> None:
+        """Press in by a depth [mm], or lift where negative."""
+        self.depth_mm = float(np.clip(self.depth_mm + depth_mm, LEAST_DEPTH_MM, MOST_DEPTH_MM))
+
+    def hold(self, pressing: bool, time_s: float) -> None:
+        """Press further while the button is held, let go when it is not."""
+        speed = PRESS_MM_S if pressing else -RELEASE_MM_S
+        self.pressed_mm = float(np.clip(self.pressed_mm + speed * time_s, 0.0, MOST_DEPTH_MM))
+
+    def turn(self, fan_deg: float, tilt_deg: float, roll_deg: float) -> None:
+        """Turn about the transducer's x, y and z axes [degrees]; fan and tilt end where a hand's do."""
+        self.turn_deg = self.turn_deg + [fan_deg, tilt_deg, roll_deg]
+        self.turn_deg[:2] = np.clip(self.turn_deg[:2], -60.0, 60.0)
+
+    def pose(self) -> np.ndarray:
+        """The pose that the hand wants now: turned about the face's centre, touching, then pressed in."""
+        pose = (self.home if self.aim is None else self.aim).copy()
+        face = pose[:3, 3] - self.size_mm[2] / 2 * pose[:3, 2]
+        pose[:3, :3] = (
+            pose[:3, :3] @ Rotation.from_euler("zyx", self.turn_deg[::-1], degrees=True).as_matrix()
+        )
+        pose[:3, 3] = face + self.size_mm[2] / 2 * pose[:3, 2]
+        depth = min(self.depth_mm + self.pressed_mm, MOST_DEPTH_MM)
+        return advanced(touching(pose, self.size_mm, self.vertices), depth)
