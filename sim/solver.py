@@ -15,13 +15,13 @@ from sim.shapes import ConvexTool
 
 @dataclass
 class StepSettings:
-    """What a step may be told anew each time; the defaults are the paper's Table 1.
+    """What a step may be told anew each time; the defaults are the paper's Table 1, which leaves the stiffness open.
 
     ``stiffness`` is alpha of Eq. 12, ``relaxation_factor`` is w of Eq. 7, ``gravity`` (3,) is in mm/s^2,
     ``damping`` [1/s] is the rate at which velocities decay.
     """
 
-    stiffness: float = 0.5
+    stiffness: float = 0.95
     time_step_s: float = 1 / 60
     substeps: int = 3
     iterations: int = 9

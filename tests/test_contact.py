@@ -109,7 +109,12 @@ def test_triangle_mesh_has_the_exact_distance_and_sign(device, ball, kind):
     deep = exact < -2
     assert deep.sum() > 100
     out = points[deep] - distance[deep, None] * normals[deep]
-    assert np.abs(igl.signed_distance(out, np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64))[0]).max() < 1e-3
+    assert (
+        np.abs(
+            igl.signed_distance(out, np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64))[0]
+        ).max()
+        < 1e-3
+    )
 
 
 def notched_block() -> trimesh.Trimesh:
@@ -176,19 +181,22 @@ def test_pressing_squeezes_between_tool_and_floor(device, ball):
     assert np.ptp(x[:, 0]) > wide
 
 
-def test_a_dragged_tool_drags_the_surface_by_its_friction(device, ball):
+def test_a_dragged_tool_drags_the_surface_by_its_friction(device, block):
     moved = {}
     for friction in (0.0, 0.5):
-        tool = ConvexTool.cuboid(np.array([40.0, 40.0, 10.0]))
-        solver = solver_of(ball, [Plane(np.array([0.0, 0.0, 1.0]), -12.0), tool], friction, tool=tool)
+        tool = ConvexTool.cuboid(np.array([60.0, 60.0, 10.0]))
+        solver = solver_of(block, [Plane(np.array([0.0, 0.0, 1.0]), -8.0), tool], friction, tool=tool)
+        before = position(solver)
+        top = before[:, 2] > 6
         poses = np.tile(np.eye(4), (4, 1, 1))
-        poses[:, 2, 3] = 16.0
         for step in range(20):
-            poses[:, 0, 3] = 0.2 * (step + np.arange(4) / 3)
-            solver.step(StepSettings(), poses)
-        moved[friction] = position(solver)[:, 0].mean()
-    # Without friction the ball only slips sideways from under the tool a little.
-    assert moved[0.5] > moved[0.0] + 0.8
+            poses[:, 0, 3] = 0.1 * (step + np.arange(4) / 3)
+            poses[:, 2, 3] = 12.5
+            solver.step(StepSettings(gravity=(0, 0, 0)), poses)
+        moved[friction] = (position(solver) - before)[top, 0].mean()
+    # Pressed by half a millimetre, the top sticks to the tool, which went 2 mm.
+    assert abs(moved[0.0]) < 0.2
+    assert 0.7 < moved[0.5] < 2.1
 
 
 def test_stabilisation_gets_out_without_adding_velocity(device, ball):
@@ -196,7 +204,9 @@ def test_stabilisation_gets_out_without_adding_velocity(device, ball):
     fastest = []
     for passes in (0, 4):
         solver = solver_of(ball, [floor], friction=0.0)
-        settings = StepSettings(gravity=(0, 0, 0), damping=0.0, stabilisation_iterations=passes, stiffness=0.0)
+        settings = StepSettings(
+            gravity=(0, 0, 0), damping=0.0, stabilisation_iterations=passes, stiffness=0.0
+        )
         solver.step(settings)
         fastest.append(np.abs(solver.body.velocity.to_numpy()).max())
         assert position(solver)[:, 2].min() >= -10.0 - 1e-4
@@ -205,62 +215,59 @@ def test_stabilisation_gets_out_without_adding_velocity(device, ball):
     assert fastest[1] < 0.1
 
 
-def two_balls(pairs: bool, scaling: float = 0.0) -> Solver:
-    lower = trimesh.creation.icosphere(subdivisions=2, radius=6.0)
+def two_blocks(pairs: bool, scaling: float = 0.0) -> tuple[Solver, np.ndarray]:
+    """One block over another on a floor, and which particles are the upper one's."""
+    lower = trimesh.creation.box([12.0, 12.0, 8.0])
     upper = lower.copy()
     # Clusters reach 5 mm: nearer bodies would be held together by them.
-    upper.apply_translation([0, 0, 17.5])
-    both = trimesh.util.concatenate([lower, upper])
-    body = Body(fill_body(both, 1.5), scaling)
+    upper.apply_translation([0, 0, 14.0])
+    body = Body(fill_body(trimesh.util.concatenate([lower, upper]), 1.5), scaling)
     model = ShapeMatching(body)
-    contacts = ShapeContacts(body, [Plane(np.array([0.0, 0.0, 1.0]), -6.0)], 0.35)
-    return Solver(body, model, contacts, ParticleContacts(body, model, 0.25) if pairs else None)
+    contacts = ShapeContacts(body, [Plane(np.array([0.0, 0.0, 1.0]), -4.0)], 0.35)
+    solver = Solver(body, model, contacts, ParticleContacts(body, model, 0.25) if pairs else None)
+    return solver, body.rest_body.particles[:, 2] > 7
 
 
 def test_particles_that_share_no_cluster_keep_their_distance(device):
-    gap = {}
+    height = {}
     for pairs in (False, True):
-        solver = two_balls(pairs)
-        upper = solver.body.rest_body.particles[:, 2] > 9
-        for _ in range(25):
-            solver.step(StepSettings(stiffness=1.0))
+        solver, upper = two_blocks(pairs)
+        for _ in range(40):
+            solver.step(StepSettings(iterations=30))
         x = position(solver)
-        gap[pairs] = np.linalg.norm(x[upper][:, None] - x[~upper][None], axis=2).min()
+        height[pairs] = x[upper][:, 2].mean() - x[~upper][:, 2].mean()
         if pairs:
-            # The last word has the clusters' averaging, not the pair: a fifth of the distance at most.
-            assert gap[True] > 0.8 * 1.5
-            assert x[upper][:, 2].mean() > 8
-    assert gap[False] < 0.8
+            # The lowest layer, a twelfth of the block, holds its weight, g h^2 = 0.3 mm a substep, in 30 passes that
+            # share each push between two: 0.3 * 12 / 30 * 2 mm short of the distance, at the averaged pushes.
+            assert np.linalg.norm(x[upper][:, None] - x[~upper][None], axis=2).min() > 0.75 * 1.5
+    assert height[True] == pytest.approx(8.0, abs=1.5)
+    assert height[False] < 4.0
 
 
 def test_contacts_of_particles_keep_momentum_of_a_symmetric_hit(device):
-    solver = two_balls(True)
+    solver, upper = two_blocks(True)
     solver.contacts, solver.has_contacts = None, False
-    x = position(solver)
-    upper = x[:, 2] > 9
     velocity = np.where(upper[:, None], [0, 0, -150.0], [0, 0, 150.0])
     solver.body.velocity.from_numpy(velocity.astype(np.float32))
-    before = velocity.sum(axis=0)
     for _ in range(6):
-        solver.step(StepSettings(gravity=(0, 0, 0), damping=0.0, stiffness=1.0))
+        solver.step(StepSettings(gravity=(0, 0, 0), damping=0.0))
     v = solver.body.velocity.to_numpy().astype(float)
-    assert v[upper, 2].mean() > -20 and v[~upper, 2].mean() < 20
+    assert v[upper, 2].mean() > -20
+    assert v[~upper, 2].mean() < 20
     # Averaging divides a particle's pushes by its own count: pairs of unlike counts leave a little over.
-    assert np.abs(v.sum(axis=0) - before).max() < 0.1 * np.abs(velocity).sum()
+    assert np.abs(v.sum(axis=0) - velocity.sum(axis=0)).max() < 0.1 * np.abs(velocity).sum()
 
 
 def test_scaled_masses_make_the_lower_of_a_pair_the_heavier(device):
     moved = {}
     for scaling in (0.0, 0.5):
-        solver = two_balls(True, scaling)
+        solver, upper = two_blocks(True, scaling)
         solver.contacts, solver.has_contacts = None, False
-        x = position(solver)
-        upper = x[:, 2] > 9
-        start = x.copy()
+        start = position(solver)
         start[upper, 2] -= 6.0
         solver.body.position.from_numpy(start.astype(np.float32))
-        solver.step(StepSettings(gravity=(0, 0, -1e-3), damping=0.0, stiffness=1.0))
-        change = position(solver) - start
-        moved[scaling] = abs(change[~upper, 2].mean()) / abs(change[upper, 2].mean())
+        solver.step(StepSettings(gravity=(0, 0, -1e-3), damping=0.0))
+        change = np.abs(position(solver) - start)[:, 2]
+        moved[scaling] = change[~upper].mean() / change[upper].mean()
     assert moved[0.0] == pytest.approx(1.0, abs=0.3)
-    assert moved[0.5] < 0.5 * moved[0.0]
+    assert moved[0.5] < 0.6 * moved[0.0]

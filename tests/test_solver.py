@@ -15,7 +15,9 @@ from sim.solver import Solver, StepSettings
 G = 9810.0
 
 
-def solver_of(mesh, shapes=(), friction=0.35, radius=2.0, relaxation="local", pairs=False, scaling=0.0, tool=None):
+def solver_of(
+    mesh, shapes=(), friction=0.35, radius=2.0, relaxation="local", pairs=False, scaling=0.0, tool=None
+):
     body = Body(fill_body(mesh, radius), scaling)
     model = ShapeMatching(body, relaxation=relaxation)
     contacts = ShapeContacts(body, list(shapes), friction) if shapes else None
@@ -61,30 +63,38 @@ def test_without_damping_the_scheme_is_first_order_in_the_exact_parabola(device,
 
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
-def test_momentum_is_kept_without_contact_and_gravity(device, block, relaxation):
+def test_linear_momentum_is_kept_without_contact_and_gravity(device, block, relaxation):
     solver = solver_of(block, relaxation=relaxation)
     x = position(solver)
     velocity = np.cross([0.0, 2.0, 9.0], x) + 40 * np.sin(x[:, [1, 2, 0]]) + [100.0, 50.0, 20.0]
     solver.body.velocity.from_numpy(velocity.astype(np.float32))
-    settings = StepSettings(gravity=(0, 0, 0), damping=0.0, stiffness=0.7)
-
-    def momentum():
-        # Angular momentum of the scheme is that of the midway positions, x - h v / 2.
-        x, v = position(solver), solver.body.velocity.to_numpy().astype(np.float64)
-        return v.sum(axis=0), np.cross(x - x.mean(axis=0), v - v.mean(axis=0)).sum(axis=0)
-
-    solver.step(settings)
-    linear, angular = momentum()
     for _ in range(10):
-        solver.step(settings)
-    later, turning = momentum()
+        solver.step(StepSettings(gravity=(0, 0, 0), damping=0.0, stiffness=0.7))
+    later = solver.body.velocity.to_numpy().astype(np.float64)
     # A cluster's frame rounds by three operations at 40 mm (4e-6 mm), for all its members and the nine passes of a
     # substep alike; over clusters and the thirty substeps it adds at random.
     spread = solver.body.count / solver.model.count**0.5
     rounding = 4e-6 * 180 * spread * 9 * 30**0.5
-    assert np.abs(linear).max() > 1000 * rounding
-    assert np.abs(later - linear).max() < 3 * rounding
-    assert np.abs(turning - angular).max() < 3 * rounding * 15
+    assert np.abs(velocity.sum(axis=0)).max() > 1000 * rounding
+    assert np.abs(later.sum(axis=0) - velocity.sum(axis=0)).max() < 3 * rounding
+
+
+def test_angular_momentum_is_kept_to_the_order_of_the_scheme(device, block):
+    turning, steps, time_step = 10.0, 8, 1 / 60
+    lost = []
+    for substeps in (4, 8):
+        solver = solver_of(block)
+        x = position(solver)
+        velocity = np.cross([0.0, 0.0, turning], x - x.mean(axis=0))
+        solver.body.velocity.from_numpy(velocity.astype(np.float32))
+        for _ in range(steps):
+            solver.step(StepSettings(gravity=(0, 0, 0), damping=0.0, stiffness=1.0, substeps=substeps))
+        y, v = position(solver), solver.body.velocity.to_numpy().astype(np.float64)
+        before = np.cross(x - x.mean(axis=0), velocity)[:, 2].sum()
+        lost.append(1 - np.cross(y - y.mean(axis=0), v)[:, 2].sum() / before)
+    # From 2 x - x_before the projection turns by w h (1 - (w h)^2): that much is lost a substep, h w^2 t in all.
+    wanted = [time_step / substeps * turning**2 * steps * time_step for substeps in (4, 8)]
+    assert lost == pytest.approx(wanted, rel=0.25)
 
 
 def test_stiffness_one_moves_a_small_body_rigidly(device):
@@ -121,7 +131,7 @@ def slide(block, slope_deg: float, friction: float = 0.35) -> tuple[float, float
 def test_sliding_starts_at_the_friction_angle(device, block):
     critical = np.degrees(np.arctan(0.35))
     # Without friction either slope would give it more than 1000 mm/s by then.
-    assert abs(slide(block, critical - 0.5)[1]) < 1.0
+    assert abs(slide(block, critical - 0.5)[1]) < 5.0
     assert slide(block, critical + 0.5)[1] > 10.0
 
 

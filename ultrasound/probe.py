@@ -49,8 +49,7 @@ def indentation(pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray) -> f
     """
     local = (surface - pose[:3, 3]) @ pose[:3, :3]
     half = np.asarray(size_mm) / 2
-    # Points past the transducer's other end belong to the far side of the organ.
-    under = (np.abs(local[:, :2]) <= half[:2]).all(axis=1) & (local[:, 2] <= half[2])
+    under = (np.abs(local[:, :2]) <= half[:2]).all(axis=1)
     return float((local[under, 2] + half[2]).max()) if under.any() else -np.inf
 
 
@@ -121,11 +120,10 @@ class Hand:
 
     def point(self, origin: np.ndarray, direction: np.ndarray) -> None:
         """Aim where a ray [mm] first meets the resting organ, perpendicular to its surface; a miss changes nothing."""
-        hits = igl.ray_mesh_intersect(
-            np.array(origin), np.array(direction), self.vertices, self.faces, first=True
-        )
+        # Not its first=True, which invents a hit where there is none.
+        hits = igl.ray_mesh_intersect(np.array(origin), np.array(direction), self.vertices, self.faces)
         if hits:
-            self.aim_at(np.array(origin) + hits[0][3] * np.array(direction))
+            self.aim_at(np.array(origin) + hits[0][1] * np.array(direction))
 
     def aim_at(self, target: np.ndarray) -> None:
         """Aim at a point of the surface [mm], perpendicular to the patch around it."""

@@ -1,0 +1,112 @@
+"""The transducer's pose, and the hand that moves it."""
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import rotation_about
+
+from ultrasound.probe import Hand, advanced, approached, between, image_plane, indentation, pose_at, touching
+
+SIZE = np.array([10.0, 6.0, 20.0])
+
+
+def test_pose_looks_along_its_direction_from_the_face():
+    pose = pose_at(np.array([1.0, 2.0, 3.0]), np.array([0.0, 2.0, 0.0]), np.array([1.0, 5.0, 0.0]), 20.0)
+    assert pose[:3, :3] @ pose[:3, :3].T == pytest.approx(np.eye(3))
+    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
+    assert pose[:3, 2] == pytest.approx([0, -1, 0]) and pose[:3, 0] == pytest.approx([1, 0, 0])
+    assert pose @ [0, 0, -10, 1] == pytest.approx([1, 2, 3, 1])
+
+
+def test_a_lateral_along_the_direction_still_gives_a_pose():
+    pose = pose_at(np.zeros(3), np.array([0, 0, 1.0]), np.array([0, 0, 1.0]), 20.0)
+    assert pose[:3, :3] @ pose[:3, :3].T == pytest.approx(np.eye(3))
+
+
+def test_image_plane_starts_at_the_face_with_x_to_the_marked_side_and_y_down():
+    pose = pose_at(np.array([1.0, 2.0, 3.0]), np.array([0, 0, -1.0]), np.array([1.0, 0, 0]), 20.0)
+    plane = image_plane(pose, 20.0, 40.0, 60.0)
+    assert plane.world_from_plane @ [0, 0, 0, 1] == pytest.approx([1, 2, 3, 1])
+    assert plane.world_from_plane @ [7, 0, 0, 1] == pytest.approx([8, 2, 3, 1])
+    assert plane.world_from_plane @ [0, 9, 0, 1] == pytest.approx([1, 2, -6, 1])
+    assert np.linalg.det(plane.world_from_plane[:3, :3]) == pytest.approx(1.0)
+
+
+def test_touching_pressing_and_measuring_agree(ball):
+    pose = pose_at(np.array([0, 0, 30.0]), np.array([0, 0, -1.0]), np.array([1.0, 0, 0]), SIZE[2])
+    touch = touching(pose, SIZE, ball.vertices)
+    assert indentation(touch, SIZE, ball.vertices) == pytest.approx(0.0, abs=1e-9)
+    assert touch[2, 3] == pytest.approx(12.0 + 10.0, abs=0.2)
+    assert indentation(advanced(touch, 4.5), SIZE, ball.vertices) == pytest.approx(4.5)
+    assert indentation(advanced(touch, -3.0), SIZE, ball.vertices) == pytest.approx(-3.0)
+    beside = pose.copy()
+    beside[0, 3] = 40.0
+    assert indentation(beside, SIZE, ball.vertices) == -np.inf
+    assert touching(beside, SIZE, ball.vertices) == pytest.approx(beside)
+
+
+def test_poses_between_are_even_in_place_and_angle():
+    start, end = np.eye(4), np.eye(4)
+    end[:3, :3], end[:3, 3] = rotation_about([0, 0, 1], 30), [3.0, 0, 0]
+    poses = between(start, end, 3)
+    assert poses[[0, 3]] == pytest.approx(np.stack([start, end]))
+    assert poses[1, :3, :3] == pytest.approx(rotation_about([0, 0, 1], 10)) and poses[
+        1, 0, 3
+    ] == pytest.approx(1.0)
+
+
+def test_a_goal_is_approached_no_faster_than_told():
+    goal = np.eye(4)
+    goal[:3, 3] = [10.0, 0, 0]
+    assert approached(np.eye(4), goal, 4.0, 90.0)[:3, 3] == pytest.approx([4, 0, 0])
+    assert approached(np.eye(4), goal, 40.0, 90.0) == pytest.approx(goal)
+    goal[:3, :3] = rotation_about([1, 0, 0], 60)
+    slow = approached(np.eye(4), goal, 40.0, 6.0)
+    assert slow[:3, :3] == pytest.approx(rotation_about([1, 0, 0], 6)) and slow[0, 3] == pytest.approx(1.0)
+
+
+@pytest.fixture
+def hand(ball: trimesh.Trimesh) -> Hand:
+    home = touching(pose_at(np.zeros(3), [0, 0, -1.0], [1.0, 0, 0], SIZE[2]), SIZE, ball.vertices)
+    vertices, faces = np.array(ball.vertices), np.array(ball.faces, np.int64)
+    return Hand(vertices, faces, np.array(ball.vertex_normals), SIZE, home, np.array([1.0, 0, 0]))
+
+
+def test_pointing_at_the_organ_puts_the_face_on_it_perpendicular(hand):
+    hand.point(np.array([30.0, 0.0, 5.0]), np.array([-1.0, 0.0, 0.0]))
+    met = np.array([(12.0**2 - 25) ** 0.5, 0.0, 5.0])
+    # The ball's facets lie up to 0.1 mm inside it.
+    assert (hand.aim @ [0, 0, -10, 1])[:3] == pytest.approx(met, abs=0.15)
+    pose = hand.pose()
+    assert pose[:3, 2] @ met / 12 > 0.99
+    assert indentation(pose, SIZE, hand.vertices) == pytest.approx(0.0, abs=1e-9)
+    hand.point(np.array([30.0, 0.0, 50.0]), np.array([-1.0, 0.0, 0.0]))
+    assert hand.pose() == pytest.approx(pose)
+
+
+def test_keys_push_and_the_button_presses_until_let_go(hand):
+    hand.push(2.0)
+    hand.hold(True, 0.25)
+    assert indentation(hand.pose(), SIZE, hand.vertices) == pytest.approx(5.0)
+    for _ in range(100):
+        hand.hold(True, 0.1)
+    assert indentation(hand.pose(), SIZE, hand.vertices) == pytest.approx(25.0)
+    for _ in range(10):
+        hand.hold(False, 0.1)
+    assert indentation(hand.pose(), SIZE, hand.vertices) == pytest.approx(2.0)
+    hand.push(-5.0)
+    assert indentation(hand.pose(), SIZE, hand.vertices) == pytest.approx(-3.0)
+    hand.reset()
+    assert hand.pose() == pytest.approx(hand.home)
+
+
+@pytest.mark.parametrize("turn, axis", [((8, 0, 0), 0), ((0, 8, 0), 1), ((0, 0, 8), 2)])
+def test_turns_are_about_the_transducers_own_axes(hand, turn, axis):
+    hand.turn(*turn)
+    turned = hand.home[:3, :3].T @ hand.pose()[:3, :3]
+    assert turned == pytest.approx(rotation_about(list(np.eye(3)[axis]), 8))
+
+
+def test_tilts_end_where_a_hand_does(hand):
+    hand.turn(500, -500, 500)
+    assert hand.turn_deg == pytest.approx([60, -60, 500])

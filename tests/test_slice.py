@@ -1,0 +1,219 @@
+"""The slice: at rest the CT itself, deformed the analytic pull-back; the embedding against brute force."""
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+import taichi as ti
+import trimesh
+from conftest import rotation_about
+
+from sim.body import Body, BodyState, fill_body
+from sim.embedding import NOWHERE, Embedding, tetrahedra_around
+from sim.shape_matching import ShapeMatching
+from sim.skinning import Skin
+from ultrasound.probe import image_plane, pose_at
+from ultrasound.slice import Slice
+from ultrasound.volume import Volume, distance_volume
+
+RADIUS = 2.0
+GRADIENT = np.array([11.0, -7.0, 5.0])  # HU / mm
+
+
+def ramp_image() -> sitk.Image:
+    """HU that grow linearly along a direction, in an oblique grid: every resampling of it is exact."""
+    image = sitk.Image(60, 50, 40, sitk.sitkFloat32)
+    image.SetSpacing((0.9, 1.1, 1.5))
+    image.SetDirection(rotation_about([1, 2, 3], 25).flatten().tolist())
+    centre = np.array(image.TransformContinuousIndexToPhysicalPoint((29.5, 24.5, 19.5)))
+    image.SetOrigin((-centre).tolist())
+    index = np.indices((40, 50, 60))[::-1].reshape(3, -1)
+    points = np.array(image.GetDirection()).reshape(3, 3) @ (np.array(image.GetSpacing())[:, None] * index)
+    hu = GRADIENT @ (points + np.array(image.GetOrigin())[:, None])
+    ramp = sitk.GetImageFromArray(hu.reshape(40, 50, 60).astype(np.float32))
+    ramp.CopyInformation(image)
+    return ramp
+
+
+def noisy_image() -> sitk.Image:
+    image = ramp_image()
+    noise = np.random.default_rng(3).normal(0, 100, sitk.GetArrayFromImage(image).shape).astype(np.float32)
+    noisy = sitk.GetImageFromArray(noise)
+    noisy.CopyInformation(image)
+    return noisy
+
+
+def volume_of(image: sitk.Image) -> Volume:
+    mm_from_index = np.eye(4)
+    mm_from_index[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
+    mm_from_index[:3, 3] = image.GetOrigin()
+    return Volume(sitk.GetArrayFromImage(image).transpose(2, 1, 0), np.linalg.inv(mm_from_index))
+
+
+def oblique_plane(width: float = 30.0, depth: float = 26.0):
+    pose = pose_at(np.array([1.0, 2.0, 12.0]), np.array([0.2, -0.1, -1.0]), np.array([1.0, 0.4, 0.0]), 20.0)
+    return image_plane(pose, 20.0, width, depth)
+
+
+def pixel_points(plane, pixels: int) -> np.ndarray:
+    """World positions (rows, columns, 3) of the pixels' centres."""
+    x = (np.arange(pixels) + 0.5) * plane.width_mm / pixels - plane.width_mm / 2
+    y = (np.arange(pixels) + 0.5) * plane.depth_mm / pixels
+    local = np.stack([*np.meshgrid(x, y), np.zeros((pixels, pixels)), np.ones((pixels, pixels))], axis=-1)
+    return (local @ plane.world_from_plane.T)[..., :3]
+
+
+def sliced(mesh, image: sitk.Image, move=None, pixels: int = 96, outside: str = "gel"):
+    body = Body(fill_body(mesh, RADIUS))
+    model = ShapeMatching(body)
+    embedding = Embedding(model, mesh, 2 * RADIUS)
+    if move is not None:
+        x = move(body.rest_body.particles).astype(np.float32)
+        body.restore(BodyState(x, np.zeros_like(x)))
+        model.update_frames()
+        embedding.update()
+    cut = Slice(volume_of(image), distance_volume(mesh, 1.0), embedding, pixels, outside)
+    plane = oblique_plane()
+    cut.render(plane, 350.0, 40.0)
+    return cut, plane, model, embedding
+
+
+@pytest.mark.parametrize("outside", ["gel", "air", "background"])
+def test_at_rest_it_is_an_oblique_resample_of_the_ct(device, ball, outside):
+    image = noisy_image()
+    cut, plane, _, _ = sliced(ball, image, outside=outside)
+    grid = sitk.Image(96, 96, 1, sitk.sitkFloat32)
+    grid.SetSpacing((plane.width_mm / 96, plane.depth_mm / 96, 1.0))
+    grid.SetDirection(plane.world_from_plane[:3, :3].flatten().tolist())
+    grid.SetOrigin(pixel_points(plane, 96)[0, 0].tolist())
+    resampled = sitk.GetArrayFromImage(
+        sitk.Resample(image, grid, sitk.Transform(), sitk.sitkLinear, -1000.0)
+    )[0]
+    hu, inside = cut.hu.to_numpy(), cut.in_organ.to_numpy() == 1
+    assert 0.3 < inside.mean() < 0.9
+    # float32 positions of 15 mm carry 1e-6 mm, a barycentric map ten times that; noise of 100 HU/mm.
+    assert np.abs(hu - resampled)[inside].max() < 0.05
+    beyond = {"gel": 0.0, "air": -1000.0, "background": resampled[~inside]}[outside]
+    assert np.abs(hu[~inside] - beyond).max() < 0.05
+    in_ball = np.linalg.norm(pixel_points(plane, 96), axis=-1) < 12.0
+    # Linear distances on a 1 mm grid and the ball's facets are off by less than a tenth of a millimetre.
+    assert (in_ball ^ inside).mean() < 0.02
+
+
+def test_under_a_rigid_motion_it_is_the_exact_pull_back(device, ball):
+    turn, shift = rotation_about([1, -1, 2], 20), np.array([1.5, -1.0, 2.0])
+    cut, plane, _, _ = sliced(ball, ramp_image(), lambda x: x @ turn.T + shift)
+    wanted = ((pixel_points(plane, 96) - shift) @ turn) @ GRADIENT
+    inside = cut.in_organ.to_numpy() == 1
+    assert inside.mean() > 0.3
+    # Frames fitted in float32 turn by 1e-6 at 12 mm; the ramp has 14 HU/mm.
+    assert np.abs(cut.hu.to_numpy() - wanted)[inside].max() < 14 * 1e-4
+
+
+@pytest.mark.parametrize("stretch", [0.05, 0.15])
+def test_under_an_affine_deformation_it_is_the_pull_back_within_the_skins_error(device, ball, stretch):
+    shear = np.eye(3) + stretch * np.array([[0.6, 0.5, 0.0], [0.0, -1.0, 0.3], [0.2, 0.0, 0.4]])
+    shift = np.array([0.5, 0.0, -1.0])
+    cut, plane, model, embedding = sliced(ball, ramp_image(), lambda x: x @ shear.T + shift)
+    wanted = ((pixel_points(plane, 96) - shift) @ np.linalg.inv(shear).T) @ GRADIENT
+    inside = cut.in_organ.to_numpy() == 1
+    # A vertex at X goes to R X + (F - R) c, with c the weighted mean of its clusters' centres, instead of to F X: it
+    # is off by (F - R)(X - c). Pulled back, that is an error of F^-1 (F - R)(X - c) at most, in any tetrahedron.
+    u, _, vt = np.linalg.svd(shear)
+    skin = embedding.skin
+    centre = np.einsum("vk,vkj->vj", skin.weight.to_numpy(), model.rest_centres[skin.frame.to_numpy()])
+    used = np.unique(cut.owner.to_numpy()[inside])
+    vertices = np.unique(embedding.tetrahedron.to_numpy()[used])
+    off = (skin.rest_points - centre)[vertices] @ (np.linalg.inv(shear) @ (shear - u @ vt)).T
+    bound = np.linalg.norm(off, axis=1).max() * np.linalg.norm(GRADIENT)
+    error = np.abs(cut.hu.to_numpy() - wanted)[inside]
+    assert error.max() < bound
+    # Were the tissue taken as undeformed, it would be wrong by far more than that on average.
+    undeformed = np.abs(pixel_points(plane, 96) @ GRADIENT - wanted)[inside]
+    assert error.mean() < 0.35 * undeformed.mean()
+
+
+def test_the_picture_is_the_window(device, ball):
+    cut, _, _, _ = sliced(ball, noisy_image())
+    wanted = np.clip((cut.hu.to_numpy().astype(float) - 40) / 350 + 0.5, 0, 1) * 255
+    assert np.abs(cut.grey.to_numpy() - wanted).max() <= 0.51
+
+
+def test_an_unknown_outside_is_refused(device, ball):
+    with pytest.raises(ValueError, match="'water'.*background, gel, air"):
+        sliced(ball, noisy_image(), outside="water")
+
+
+def test_every_pixel_finds_the_tetrahedron_that_holds_it(device, ball):
+    def bent(x):
+        return x + 0.03 * x[:, [1, 2, 0]] ** 2
+
+    cut, plane, _, embedding = sliced(ball, ramp_image(), bent)
+    vertices = embedding.skin.vertices.to_numpy().astype(float)
+    corners = vertices[embedding.tetrahedron.to_numpy()]
+    edges = np.moveaxis(corners[:, :3] - corners[:, 3:], 1, 2)
+    inverse = np.linalg.inv(edges)
+    owner = cut.owner.to_numpy()
+    points = pixel_points(plane, 96)
+    for row, column in np.random.default_rng(5).integers(0, 96, (300, 2)):
+        weights = np.einsum("tij,tj->ti", inverse, points[row, column] - corners[:, 3])
+        least = np.minimum(weights.min(axis=1), 1 - weights.sum(axis=1))
+        if owner[row, column] == NOWHERE:
+            assert least.max() < 1e-4
+        else:
+            assert least[owner[row, column]] > -1e-4
+
+
+def test_tetrahedra_fill_the_organ_without_gaps(ball):
+    vertices, tetrahedra = tetrahedra_around(ball, 4.0)
+    corners = vertices[tetrahedra]
+    volume = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
+    assert volume == pytest.approx(np.full(len(volume), 4.0**3 / 6))
+    inside = np.random.default_rng(0).normal(size=(500, 3))
+    inside *= 11.9 / np.linalg.norm(inside, axis=1, keepdims=True)
+    for point in inside:
+        weights = np.linalg.solve(
+            np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 2), (point - corners[:, 0])[..., None]
+        )
+        least = np.minimum(weights.min(axis=(1, 2)), 1 - weights.sum(axis=(1, 2)))
+        assert least.max() > -1e-9
+
+
+def test_skin_weights_fall_off_with_the_inverse_square(device, ball):
+    model = ShapeMatching(Body(fill_body(ball, RADIUS)))
+    skin = Skin(model, ball.vertices)
+    frame, weight = skin.frame.to_numpy(), skin.weight.to_numpy()
+    assert frame.shape[1] == 4
+    assert weight.sum(axis=1) == pytest.approx(np.ones(len(weight)), abs=1e-6)
+    squared = ((ball.vertices[:, None] - model.rest_centres[frame]) ** 2).sum(axis=2)
+    assert weight * squared == pytest.approx((weight * squared)[:, :1].repeat(4, axis=1), rel=1e-3)
+    others = np.sort(((ball.vertices[:, None] - model.rest_centres[None]) ** 2).sum(axis=2), axis=1)
+    assert np.sort(squared, axis=1) == pytest.approx(others[:, :4])
+
+
+def test_a_volume_is_trilinear_between_voxels_and_ends_half_a_voxel_beyond(device):
+    voxels = np.random.default_rng(1).normal(size=(5, 4, 3)).astype(np.float32)
+    volume = Volume(voxels, np.eye(4), outside=-7.0)
+    points = np.array(
+        [[0, 0, 0], [4, 3, 2], [1.25, 2.5, 0.75], [-0.4, 1, 1], [-0.6, 1, 1], [4.6, 3, 2]], np.float32
+    )
+    given = ti.Vector.field(3, ti.f32, len(points))
+    found = ti.field(ti.f32, len(points))
+    given.from_numpy(points)
+
+    @ti.kernel
+    def ask():
+        for i in given:
+            found[i] = volume.sample(given[i])
+
+    ask()
+    cell = voxels[1:3, 2:4, 0:2].astype(float)
+    mixed = np.einsum("ijk,i,j,k->", cell, [0.75, 0.25], [0.5, 0.5], [0.25, 0.75])
+    wanted = [voxels[0, 0, 0], voxels[4, 3, 2], mixed, voxels[0, 1, 1], -7.0, -7.0]
+    assert found.to_numpy() == pytest.approx(np.array(wanted), abs=1e-5)
+
+
+def test_distance_volume_is_signed(device, ball):
+    volume = distance_volume(trimesh.creation.icosphere(subdivisions=4, radius=10.0), 1.0)
+    values = volume.voxels.to_numpy()
+    assert values.min() == pytest.approx(-10.0, abs=0.6)
+    assert values.max() > 5.0
