@@ -13,10 +13,12 @@ import trimesh
 from scenes.patient import Patient, import_patient, save_patient
 from scenes.phantom import Label, make_phantom
 from scenes.reading import PatientError, read_volume
-from scenes.scene import Anatomy, DistanceShape, MeshShape, PlaneShape, Press, Scene, SceneError
+from scenes.scene import Anatomy, DistanceShape, Image, MeshShape, PlaneShape, Press, Scene, SceneError
 
 HERE = Path(__file__).parent
 CACHE = HERE.parent / ".cache"
+FAT_HU = -110.0
+LEAST_WINDOW_HU = 150.0
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,11 @@ def press_on(press: Press, anatomy: LoadedAnatomy, gravity: np.ndarray) -> Press
 def patient_scene(patient: Patient) -> Scene:
     """The scene that an import writes beside the patient's files: on the back, on the moulded support."""
     tumour = None if patient.tumour is None else "tumour.stl"
+    hu = sitk.GetArrayViewFromImage(patient.ct)[sitk.GetArrayViewFromImage(patient.labels) > 0]
+    # From fat to the brightest of the organ, whatever contrast agent it holds.
+    darkest, brightest = FAT_HU, round(float(np.percentile(hu, 99)), -1)
     return Scene(
+        image=Image(window_hu=max(brightest - darkest, LEAST_WINDOW_HU), level_hu=(brightest + darkest) / 2),
         title=f"{patient.side.capitalize()} kidney",
         anatomy=Anatomy(tumour=tumour),
         shape=(MeshShape(kind="mesh", file="support.stl"),),

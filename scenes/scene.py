@@ -122,8 +122,9 @@ class Image(Section):
 class Press(Section):
     """The scripted press, with the paper's warm-up and steps a stage.
 
-    The transducer's axis goes through ``target_mm`` along ``direction``, its image's width along ``lateral``; it
-    starts where it touches the resting organ and goes down to each of ``indentations_mm``.
+    After the warm-up, in which the organ settles on its support, the transducer's axis goes through ``target_mm``
+    along ``direction``, its image's width along ``lateral``; it starts where it just touches the organ and goes down
+    to each of ``indentations_mm``.
     """
 
     target_mm: Vector3 | None = None
@@ -182,8 +183,8 @@ def with_options(scene: Scene, options: dict[str, float | int | None]) -> Scene:
 
 
 def scene_text(scene: Scene) -> str:
-    """The scene as TOML, without what is left at its default of none."""
-    values = scene.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
+    """The scene as TOML, every key with its value, so that a reader finds what can be changed."""
+    values = scene.model_dump(mode="json", exclude_none=True)
     return tomli_w.dumps(values)
 
 

@@ -18,6 +18,8 @@ NOWHERE = 2**30
 # Barycentric slack that closes the seams between tetrahedra against rounding.
 SEAM = 1e-5
 PARALLEL = 1e-12
+# Volume times six [mm^3] under which a tetrahedron holds no pixel.
+FLAT = 1e-3
 
 
 @ti.data_oriented
@@ -25,19 +27,55 @@ class Embedding:
     """Tetrahedra of a regular grid around a closed surface, carried by the skin of their vertices.
 
     ``tetrahedron`` (m,) holds four vertex indices each, of a rest mesh that fills space without gaps (Kuhn's six
-    tetrahedra a cell).
+    tetrahedra a cell). Around the body the vertices follow it less and less, to nothing at ``margin_mm``, so that
+    what lies around the organ gives way to it without a gap; ``share`` (n,) is how far each follows.
     """
 
-    def __init__(self, model, surface: trimesh.Trimesh, cell_mm: float) -> None:
-        vertices, tetrahedra = tetrahedra_around(surface, cell_mm)
+    def __init__(self, model, surface: trimesh.Trimesh, cell_mm: float, margin_mm: float = 0.0) -> None:
+        vertices, tetrahedra = tetrahedra_around(surface, cell_mm, margin_mm)
+        # A tetrahedron that holds tissue reaches this far out: all of its vertices must follow it wholly.
+        wholly = np.sqrt(3) * cell_mm
+        beyond = np.maximum(distance_to(surface, vertices) - wholly, 0.0)
+        share = np.clip(1.0 - beyond / max(margin_mm - wholly, cell_mm), 0.0, 1.0)
         self.skin = Skin(model, vertices)
+        self.share = ti.field(ti.f32, len(vertices))
+        self.share.from_numpy(share.astype(np.float32))
         self.count = len(tetrahedra)
         self.tetrahedron = ti.Vector.field(4, ti.i32, self.count)
         self.tetrahedron.from_numpy(tetrahedra.astype(np.int32))
+        self.rest_from_world = ti.Matrix.field(3, 4, ti.f32, self.count)
+        self._invert()
 
     def update(self) -> None:
         """Carry the vertices to where the body is now."""
         self.skin.update()
+        self._fade()
+        self._invert()
+
+    @ti.kernel
+    def _fade(self):
+        for v in self.share:
+            rest = self.skin.rest[v]
+            self.skin.vertices[v] = rest + self.share[v] * (self.skin.vertices[v] - rest)
+
+    @ti.kernel
+    def _invert(self):
+        """The affine map of each tetrahedron from where it is to where it was at rest; one squashed flat has none."""
+        for t in range(self.count):
+            corner = self.tetrahedron[t]
+            x3, r3 = self.skin.vertices[corner[3]], self.skin.rest[corner[3]]
+            edges, rest_edges = tm.mat3(0.0), tm.mat3(0.0)
+            for k in ti.static(range(3)):
+                x, r = self.skin.vertices[corner[k]] - x3, self.skin.rest[corner[k]] - r3
+                for axis in ti.static(range(3)):
+                    edges[axis, k], rest_edges[axis, k] = x[axis], r[axis]
+            if ti.abs(edges.determinant()) > FLAT:
+                linear = rest_edges @ edges.inverse()
+                offset = r3 - linear @ x3
+                for i in ti.static(range(3)):
+                    for j in ti.static(range(3)):
+                        self.rest_from_world[t][i, j] = linear[i, j]
+                    self.rest_from_world[t][i, 3] = offset[i]
 
     @ti.kernel
     def locate_on_plane(
@@ -58,7 +96,7 @@ class Embedding:
                 p = (plane_from_world @ tm.vec4(self.skin.vertices[self.tetrahedron[t][k]], 1.0)).xyz
                 corner[0, k], corner[1, k], corner[2, k], corner[3, k] = p.x, p.y, p.z, 1.0
                 low, high = ti.min(low, p.z), ti.max(high, p.z)
-            if low <= 0.0 and high >= 0.0 and ti.abs(corner.determinant()) > PARALLEL:
+            if low <= 0.0 and high >= 0.0 and ti.abs(corner.determinant()) > FLAT:
                 self.mark_pixels(t, corner, pixel_mm, first_mm, owner)
 
     @ti.func
@@ -86,36 +124,36 @@ class Embedding:
                     right = ti.min(right, -at / slope)
                 elif at < 0.0:
                     right = -1.0
-            for column in range(ti.cast(ti.ceil(left), ti.i32), ti.cast(ti.floor(right), ti.i32) + 1):
+            # Of a nearly flat tetrahedron the ends may be no numbers at all: the picture's own bound them.
+            first = ti.max(ti.cast(ti.ceil(left), ti.i32), 0)
+            last = ti.min(ti.cast(ti.floor(right), ti.i32), owner.shape[1] - 1)
+            for column in range(first, last + 1):
                 ti.atomic_min(owner[row, column], t)
 
     @ti.func
     def rest_point(self, t, p):
         """Where the material at p [mm], which lies in tetrahedron t, was at rest [mm]."""
-        corner = self.tetrahedron[t]
-        x3, r3 = self.skin.vertices[corner[3]], self.skin.rest[corner[3]]
-        edges, rest_edges = tm.mat3(0.0), tm.mat3(0.0)
-        for k in ti.static(range(3)):
-            x, r = self.skin.vertices[corner[k]] - x3, self.skin.rest[corner[k]] - r3
-            for axis in ti.static(range(3)):
-                edges[axis, k], rest_edges[axis, k] = x[axis], r[axis]
-        return r3 + rest_edges @ (edges.inverse() @ (p - x3))
+        return self.rest_from_world[t] @ tm.vec4(p, 1.0)
 
 
-def tetrahedra_around(surface: trimesh.Trimesh, cell_mm: float) -> tuple[np.ndarray, np.ndarray]:
+def distance_to(surface: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
+    """Signed distances (n,) [mm] of points (n, 3) to a closed surface, negative inside."""
+    vertices, faces = np.asarray(surface.vertices, np.float64), np.asarray(surface.faces, np.int64)
+    return igl.signed_distance(points, vertices, faces)[0]
+
+
+def tetrahedra_around(
+    surface: trimesh.Trimesh, cell_mm: float, margin_mm: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (v, 3) float64 [mm] and tetrahedra (t, 4) of the grid cells that hold any of the surface's inside.
 
-    A cell counts where its centre is inside or no farther outside than half the cell's diagonal.
+    A cell counts where its centre is no farther outside than the margin and half the cell's diagonal.
     """
-    low = surface.vertices.min(axis=0) - cell_mm
-    shape = np.ceil((surface.vertices.max(axis=0) + cell_mm - low) / cell_mm).astype(int)
+    low = surface.vertices.min(axis=0) - cell_mm - margin_mm
+    shape = np.ceil((surface.vertices.max(axis=0) + cell_mm + margin_mm - low) / cell_mm).astype(int)
     cells = np.indices(shape).reshape(3, -1).T
-    distance = igl.signed_distance(
-        low + cell_mm * (cells + 0.5),
-        np.asarray(surface.vertices, np.float64),
-        np.asarray(surface.faces, np.int64),
-    )[0]
-    cells = cells[distance <= cell_mm * np.sqrt(3) / 2]
+    distance = distance_to(surface, low + cell_mm * (cells + 0.5))
+    cells = cells[distance <= margin_mm + cell_mm * np.sqrt(3) / 2]
     nodes = []
     for axes in permutations(range(3)):
         corner = np.zeros((4, 3), int)

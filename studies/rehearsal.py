@@ -24,6 +24,9 @@ from ultrasound.volume import Volume, distance_volume
 # The tetrahedra that carry the image plane are "coarse": two particle radii wide.
 EMBEDDING_CELL_RADII = 2.0
 TURN_DEG_S = 180.0
+AWAY_MM = 200.0
+# How far around the organ the tissue in the picture gives way to it.
+SURROUNDINGS_MM = 25.0
 
 
 class Rehearsal:
@@ -44,10 +47,11 @@ class Rehearsal:
         self._build_surfaces()
         self._build_slice(anatomy)
         self.press = press_on(scene.press, anatomy, self.gravity_direction)
+        self.steps = 0
+        self.pose = self._settle()
         self.hand = self._hand()
         self.pose = self.hand.pose()
-        self.steps = 0
-        self.rest_state = self.body.snapshot()
+        self.settled = self.body.snapshot()
 
     def _build_body(self) -> None:
         tissue, solver = self.scene.tissue, self.scene.solver
@@ -103,38 +107,47 @@ class Rehearsal:
         self.tumour_skin = self.tumour and Skin(self.model, self.tumour.vertices)
 
     def _build_slice(self, anatomy: LoadedAnatomy) -> None:
-        self.embedding = Embedding(self.model, self.organ, EMBEDDING_CELL_RADII * self.scene.tissue.radius_mm)
         image = self.scene.image
+        margin = SURROUNDINGS_MM if image.outside == "background" else 0.0
+        cell = EMBEDDING_CELL_RADII * self.scene.tissue.radius_mm
+        self.embedding = Embedding(self.model, self.organ, cell, margin)
         self.slice = None
         if anatomy.ct is not None:
             ct = Volume(anatomy.ct.voxels, _moved(anatomy.ct, self.origin))
             self.slice = Slice(ct, distance_volume(self.organ), self.embedding, image.pixels, image.outside)
 
-    def _hand(self) -> Hand:
+    def _settle(self) -> np.ndarray:
+        """Let the organ come to rest on its support, the transducer far away: the paper's warm-up."""
         target = np.array(self.press.target_mm) - self.origin
         pose = pose_at(target, np.array(self.press.direction), np.array(self.press.lateral), self.size_mm[2])
-        home = touching(pose, self.size_mm, self.organ.vertices)
-        vertices, faces = np.array(self.organ.vertices, float), np.array(self.organ.faces, np.int64)
-        normals = np.array(self.organ.vertex_normals)
-        return Hand(vertices, faces, normals, self.size_mm, home, np.array(self.press.lateral))
+        self.pose = advanced(pose, -AWAY_MM)
+        for _ in range(self.press.warm_up_steps):
+            self.advance(self.pose)
+        self.steps = 0
+        self.update_surfaces()
+        return pose
+
+    def _hand(self) -> Hand:
+        settled = self.organ_skin.vertices.to_numpy().astype(float)
+        faces = np.array(self.organ.faces, np.int64)
+        normals = np.array(trimesh.Trimesh(settled, faces, process=False).vertex_normals)
+        home = touching(self.pose, self.size_mm, settled)
+        return Hand(settled, faces, normals, self.size_mm, home, np.array(self.press.lateral))
 
     def set_gravity(self, acceleration_m_s2: float) -> None:
         """Change the acceleration due to gravity; its direction is the scene's."""
         self.settings.gravity = tuple(1000.0 * acceleration_m_s2 * self.gravity_direction)
 
     def scripted_pose(self, time_s: float) -> np.ndarray:
-        """The transducer's pose at a time of the scripted press: warm-up, then each stage in turn."""
-        press = self.press
-        step = time_s / self.scene.solver.time_step_s
-        stages = np.arange(len(press.indentations_mm) + 1)
-        steps = press.warm_up_steps + stages * press.stage_steps
-        depth = float(np.interp(step, steps, [0.0, *press.indentations_mm]))
+        """The transducer's pose at a time of the scripted press: just touching at first, then down stage by stage."""
+        depths = [0.0, *self.press.indentations_mm]
+        stage = time_s / self.scene.solver.time_step_s / self.press.stage_steps
+        depth = float(np.interp(stage, np.arange(len(depths)), depths))
         return advanced(self.hand.home, depth)
 
     def script_length_s(self) -> float:
         """How long the scripted press takes [s]."""
-        steps = self.press.warm_up_steps + len(self.press.indentations_mm) * self.press.stage_steps
-        return steps * self.scene.solver.time_step_s
+        return len(self.press.indentations_mm) * self.press.stage_steps * self.scene.solver.time_step_s
 
     def follow(self, goal: np.ndarray) -> None:
         """Advance one time step with the transducer going towards a pose, no faster than a hand can."""
@@ -163,8 +176,8 @@ class Rehearsal:
         return self.slice.grey.to_numpy()
 
     def indentation_mm(self) -> float:
-        """How deep the transducer is pressed into the resting surface; negative above it."""
-        return indentation(self.pose, self.size_mm, self.organ.vertices)
+        """How deep the transducer is pressed into the settled surface; negative above it."""
+        return indentation(self.pose, self.size_mm, self.hand.vertices)
 
     def volume_ratio(self) -> float:
         """Volume inside the carried surface, as a share of the resting one."""
@@ -173,8 +186,8 @@ class Rehearsal:
         return float(volume / self.organ.volume)
 
     def reset(self) -> None:
-        """Tissue and transducer as they were at the start."""
-        self.body.restore(self.rest_state)
+        """Tissue and transducer as they were at the start: settled, and just touching."""
+        self.body.restore(self.settled)
         self.contacts.forget()
         self.model.update_frames()
         self.hand.reset()

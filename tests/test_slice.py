@@ -163,6 +163,31 @@ def test_every_pixel_finds_the_tetrahedron_that_holds_it(device, ball):
             assert least[owner[row, column]] > -1e-4
 
 
+@pytest.mark.parametrize("squash", [(1, 1, 0), (1, 0, 0), (0, 0, 0), (1, 1, -1), (1, 1, 1e-6)])
+def test_flat_collapsed_and_inverted_tissue_still_gives_a_picture(device, ball, squash):
+    cut, _, _, embedding = sliced(ball, ramp_image(), lambda x: x * np.array(squash) + [0, 0, 3.0])
+    owner = cut.owner.to_numpy()
+    assert ((owner == NOWHERE) | ((owner >= 0) & (owner < embedding.count))).all()
+    assert np.isfinite(cut.hu.to_numpy()).all()
+
+
+def test_what_lies_around_the_organ_gives_way_to_it_and_far_away_stays(device, ball):
+    shift = np.array([0.0, 0.0, 4.0])
+    body = Body(fill_body(ball, RADIUS))
+    model = ShapeMatching(body)
+    embedding = Embedding(model, ball, 2 * RADIUS, margin_mm=25.0)
+    x = (body.rest_body.particles + shift).astype(np.float32)
+    body.restore(BodyState(x, np.zeros_like(x)))
+    model.update_frames()
+    embedding.update()
+    moved = embedding.skin.vertices.to_numpy() - embedding.skin.rest_points
+    away = np.linalg.norm(embedding.skin.rest_points, axis=1) - 12.0
+    assert np.abs(moved[away < 2 * RADIUS] - shift).max() < 1e-4
+    assert np.abs(moved[away > 26.0]).max() < 1e-4
+    between = (away > 10.0) & (away < 20.0)
+    assert 0.5 < moved[between, 2].mean() < 3.5
+
+
 def test_tetrahedra_fill_the_organ_without_gaps(ball):
     vertices, tetrahedra = tetrahedra_around(ball, 4.0)
     corners = vertices[tetrahedra]

@@ -43,7 +43,7 @@ def image_plane(pose: np.ndarray, length_mm: float, width_mm: float, depth_mm: f
 
 
 def indentation(pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray) -> float:
-    """How deep the transducer's face is below the highest point (n, 3) of the resting surface under it [mm].
+    """How deep the transducer's face is below the highest point (n, 3) of the settled surface under it [mm].
 
     Negative above the surface; -inf where the transducer's footprint misses it.
     """
@@ -54,7 +54,7 @@ def indentation(pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray) -> f
 
 
 def touching(pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray) -> np.ndarray:
-    """The pose moved along its axis to where it just touches the resting surface (n, 3)."""
+    """The pose moved along its axis to where it just touches the settled surface (n, 3)."""
     half = np.asarray(size_mm) / 2
     local = (surface - pose[:3, 3]) @ pose[:3, :3]
     under = (np.abs(local[:, :2]) <= half[:2]).all(axis=1)
@@ -97,9 +97,9 @@ def approached(pose: np.ndarray, goal: np.ndarray, most_mm: float, most_deg: flo
 
 @dataclass
 class Hand:
-    """What holds the transducer: where on the resting organ it aims, how it is turned, how deep it presses.
+    """What holds the transducer: where on the settled organ it aims, how it is turned, how deep it presses.
 
-    ``vertices`` (n, 3), ``faces`` (m, 3) and ``normals`` (n, 3) are the resting surface [mm]; ``home`` is the pose it
+    ``vertices`` (n, 3), ``faces`` (m, 3) and ``normals`` (n, 3) are the settled surface [mm]; ``home`` is the pose it
     starts from. ``depth_mm`` is what keys push, ``pressed_mm`` what a held button adds until it is let go.
     """
 
@@ -119,7 +119,7 @@ class Hand:
         self.depth_mm, self.pressed_mm, self.turn_deg, self.aim = 0.0, 0.0, np.zeros(3), None
 
     def point(self, origin: np.ndarray, direction: np.ndarray) -> None:
-        """Aim where a ray [mm] first meets the resting organ, perpendicular to its surface; a miss changes nothing."""
+        """Aim where a ray [mm] first meets the settled organ, perpendicular to its surface; a miss changes nothing."""
         # Not its first=True, which invents a hit where there is none.
         hits = igl.ray_mesh_intersect(np.array(origin), np.array(direction), self.vertices, self.faces)
         if hits:

@@ -7,10 +7,10 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.embedding import NOWHERE, Embedding
-from ultrasound.volume import Volume
+from ultrasound.volume import AIR_HU, Volume
 
 OUTSIDES = ("background", "gel", "air")
-OUTSIDE_HU = {"background": 0.0, "gel": 0.0, "air": -1000.0}
+OUTSIDE_HU = {"background": 0.0, "gel": 0.0, "air": AIR_HU}
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,8 @@ class Slice:
     """HU (rows, columns) of an image plane through the deformed body, and which pixels show the organ.
 
     ``ct`` [HU] and ``organ``, the signed distance from its surface [mm], negative inside, are volumes in the body's
-    rest frame. ``outside`` is what the picture shows of all that is not the organ:
-    ``background``, the CT around the organ as it was, with gel where the organ was and has left; ``gel`` (0 HU);
-    ``air`` (-1000 HU).
+    rest frame. ``outside`` is what the picture shows of all that is not the organ: ``background``, the CT around it,
+    which gives way to the organ as far as the embedding reaches; ``gel`` (0 HU); ``air`` (-1000 HU).
     """
 
     def __init__(
@@ -71,16 +70,13 @@ class Slice:
                 world @ tm.vec4(first_mm.x + column * pixel_mm.x, first_mm.y + row * pixel_mm.y, 0.0, 1.0)
             ).xyz
             t = self.owner[row, column]
-            inside = 0
-            hu = self.outside_hu
+            rest = p
             if t != NOWHERE:
                 rest = self.embedding.rest_point(t, p)
-                if self.organ.sample(rest) <= 0.0:
-                    inside = 1
-                    hu = self.ct.sample(rest)
-            if ti.static(self.show_background):
-                if inside == 0 and self.organ.sample(p) > 0.0:
-                    hu = self.ct.sample(p)
+            inside = ti.cast(t != NOWHERE and self.organ.sample(rest) <= 0.0, ti.i32)
+            hu = self.outside_hu
+            if ti.static(self.show_background) or inside == 1:
+                hu = self.ct.sample(rest)
             self.hu[row, column] = hu
             self.in_organ[row, column] = inside
             bright = (hu - level_hu) / window_hu + 0.5

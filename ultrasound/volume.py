@@ -1,10 +1,11 @@
 """A scalar volume on the device, sampled in mm."""
 
-import igl
 import numpy as np
 import taichi as ti
 import taichi.math as tm
 import trimesh
+
+from sim.embedding import distance_to
 
 AIR_HU = -1000.0
 FAR_MM = 1e6
@@ -49,9 +50,7 @@ def distance_volume(surface: trimesh.Trimesh, spacing_mm: float = 2.0, reach_mm:
     low = surface.vertices.min(axis=0) - reach_mm
     shape = np.ceil((surface.vertices.max(axis=0) + reach_mm - low) / spacing_mm).astype(int) + 1
     points = low + spacing_mm * np.indices(shape).reshape(3, -1).T
-    distance = igl.signed_distance(
-        points, np.asarray(surface.vertices, np.float64), np.asarray(surface.faces, np.int64)
-    )[0]
+    distance = distance_to(surface, points)
     index_from_mm = np.eye(4)
     index_from_mm[:3] /= spacing_mm
     index_from_mm[:3, 3] = -low / spacing_mm
