@@ -344,7 +344,7 @@ def main(arguments: list[str]) -> int:
         return 0
     except click.ClickException as error:
         message = error.format_message()
-    except (SceneError, PatientError) as error:
+    except (SceneError, PatientError, SamplingError) as error:
         message = str(error)
     except (click.Abort, KeyboardInterrupt):
         click.echo("Stopped.", err=True)

@@ -1,0 +1,208 @@
+"""The command line as a user meets it: what it writes, and one clear line for each mistake."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+import trimesh
+from conftest import ROOT
+from PIL import Image
+
+REPORTED = {
+    "particles",
+    "clusters",
+    "memberships",
+    "tetrahedra",
+    "arch",
+    "radius_mm",
+    "time_step_s",
+    "substeps",
+    "iterations",
+    "stiffness",
+    "ms_per_step",
+    "ms_per_slice",
+    "build_s",
+    "finite",
+    "volume_ratio_min",
+    "max_penetration_mm",
+}
+SHORT = ("--seconds", "0.3", "--radius", "5", "--arch", "cpu")
+
+
+def run(*arguments, **environment) -> subprocess.CompletedProcess:
+    """The program in a process of its own, without a display unless the environment gives one."""
+    variables = {
+        name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")
+    }
+    return subprocess.run(
+        [sys.executable, str(ROOT / "app.py"), *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=240,
+        cwd=ROOT,
+        env=variables | environment,
+    )
+
+
+def refused(*arguments) -> str:
+    """The one line with which a command is refused."""
+    done = run(*arguments)
+    lines = done.stderr.strip().splitlines()
+    assert done.returncode == 2, done.stderr
+    assert len(lines) == 1 and lines[0].startswith("nephron: "), done.stderr
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def pressed(tmp_path_factory) -> Path:
+    """The folder of a short headless press of the embedded patient."""
+    out = tmp_path_factory.mktemp("press")
+    done = run("rehearse", "--headless", *SHORT, "--out", out)
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def test_a_headless_press_reports_what_it_promises(pressed):
+    report = json.loads((pressed / "report.json").read_text())
+    assert set(report) >= REPORTED
+    assert report["finite"] is True and report["arch"] == "cpu" and report["radius_mm"] == 5
+    assert report["particles"] > 1000 and report["memberships"] > report["particles"]
+    for name in ("ms_per_step", "ms_per_slice"):
+        spread = report[name]
+        assert 0 < spread["min"] <= spread["median"] <= spread["max"] and set(spread) == {
+            "mean",
+            "sd",
+            "min",
+            "max",
+            "median",
+        }
+    assert 0.6 < report["volume_ratio_min"] <= 1.0
+    assert report["max_penetration_mm"] <= 1e-3
+    assert report["indentation_max_mm"] == pytest.approx(12.38, abs=1e-3)
+
+
+def test_it_leaves_pictures_in_which_the_press_is_seen(pressed):
+    slices = [np.asarray(Image.open(path)).astype(int) for path in sorted((pressed / "slices").glob("*.png"))]
+    assert len(slices) >= 3 and slices[0].shape == (512, 512)
+    assert np.abs(slices[0] - slices[-1]).mean() > 10
+    assert slices[0].std() > 30
+    with Image.open(pressed / "press.gif") as animation:
+        assert animation.n_frames == len(slices)
+
+
+def test_without_a_display_it_runs_headless_by_itself_and_says_so(tmp_path):
+    done = run(*SHORT, "--out", tmp_path)
+    assert done.returncode == 0 and "No display" in done.stdout
+    assert (tmp_path / "report.json").is_file()
+
+
+def test_without_vulkan_it_says_so_in_one_line_and_still_writes_slices_and_report(tmp_path):
+    nowhere = "/nonexistent"
+    done = run("--headless", *SHORT, "--out", tmp_path, VK_ICD_FILENAMES=nowhere, VK_DRIVER_FILES=nowhere)
+    assert done.returncode == 0, done.stderr
+    assert sum("no Vulkan driver" in line for line in done.stdout.splitlines()) == 1
+    assert (tmp_path / "report.json").is_file() and list((tmp_path / "slices").glob("*.png"))
+    assert not list((tmp_path / "frames").glob("*.png"))
+
+
+def test_options_reach_the_solver(tmp_path):
+    done = run(
+        "rehearse",
+        "--headless",
+        *SHORT,
+        "--substeps",
+        2,
+        "--iterations",
+        5,
+        "--stiffness",
+        0.7,
+        "--out",
+        tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (report["substeps"], report["iterations"], report["stiffness"]) == (2, 5, 0.7)
+
+
+@pytest.mark.parametrize("command", [(), ("rehearse",), ("import",)])
+def test_help_names_every_option(command):
+    done = run(*command, "--help")
+    assert done.returncode == 0
+    wanted = {
+        (): ("rehearse", "import"),
+        ("rehearse",): (
+            "--headless",
+            "--seconds",
+            "--out",
+            "--arch",
+            "--radius",
+            "--stiffness",
+            "--substeps",
+            "--iterations",
+        ),
+        ("import",): ("--out", "--organ", "--tumour", "--side"),
+    }[command]
+    assert all(word in done.stdout for word in wanted)
+
+
+def test_mistakes_are_one_line_and_exit_status_2(tmp_path):
+    assert "no such scene file" in refused("rehearse", tmp_path / "none.toml")
+    assert "--hedless" in refused("rehearse", "--hedless")
+    assert "reherse" in refused("reherse")
+    assert "--arch" in refused("rehearse", "--arch", "abacus")
+    assert "--seconds" in refused("rehearse", "--seconds", "-1")
+    assert "tissue.radius_mm = 0.0" in refused("rehearse", "--radius", "0")
+    (tmp_path / "file").write_text("")
+    assert "choose another --out" in refused("rehearse", "--headless", "--out", tmp_path / "file")
+    (tmp_path / "scene.toml").write_text("[anatomy]\n[tissue]\nradius_cm = 1\n")
+    assert "write radius_mm" in refused("rehearse", tmp_path)
+
+
+def test_an_organ_too_small_for_its_particles_is_refused_in_one_line(tmp_path):
+    trimesh.creation.icosphere(subdivisions=2, radius=3.0).export(tmp_path / "organ.stl")
+    (tmp_path / "scene.toml").write_text("[anatomy]\n[tissue]\nradius_mm = 20.0\n")
+    sitk.WriteImage(sitk.Image(8, 8, 8, sitk.sitkInt16), str(tmp_path / "ct.nrrd"))
+    assert "choose a smaller radius" in refused("rehearse", tmp_path, "--headless", "--out", tmp_path / "out")
+
+
+def test_import_refuses_in_one_line_too(tmp_path):
+    assert "no such file or folder" in refused(
+        "import", tmp_path / "a", tmp_path / "b", "--out", tmp_path / "o"
+    )
+    assert "--out" in refused("import", tmp_path / "a", tmp_path / "b")
+    image = sitk.Image(8, 8, 8, sitk.sitkInt16)
+    sitk.WriteImage(image, str(tmp_path / "ct.nrrd"))
+    volume = tmp_path / "ct.nrrd"
+    assert "--organ is 'kidney'" in refused(
+        "import", volume, volume, "--organ", "kidney", "--out", tmp_path / "o"
+    )
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize(
+    "ct, labels",
+    [
+        ("crlm_1004", "crlm_1004_labels/kidneys_provisional.nii.gz"),
+        ("totalseg/ct.nii.gz", "totalseg/kidneys.nii.gz"),
+    ],
+)
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_real_kidneys_come_in_and_give_way(data, tmp_path, ct, labels, side):
+    patient = tmp_path / "patient"
+    done = run("import", data / "ct" / ct, data / "ct" / labels, "--side", side, "--out", patient)
+    assert done.returncode == 0, done.stderr
+    assert f"{side} kidney" in done.stdout and "crlm" not in (patient / "scene.toml").read_text()
+    done = run("rehearse", patient, "--headless", *SHORT, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["finite"] and report["max_penetration_mm"] <= 1e-3 and report["volume_ratio_min"] > 0.6
+    slices = [
+        np.asarray(Image.open(path)).astype(int)
+        for path in sorted((tmp_path / "out" / "slices").glob("*.png"))
+    ]
+    assert np.abs(slices[0] - slices[-1]).mean() > 5

@@ -1,0 +1,158 @@
+"""Scene files: what is refused, in which words, and what they load."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+import trimesh
+
+from scenes.anatomy import load_anatomy, phantom_folder, press_on
+from scenes.scene import Anatomy, Press, Scene, SceneError, load_scene, scene_text, with_options
+
+PHANTOM = Path(__file__).parents[1] / "scenes" / "phantom.toml"
+
+
+def refused(tmp_path: Path, text: str) -> str:
+    path = tmp_path / "a.toml"
+    path.write_text(text, "utf-8")
+    with pytest.raises(SceneError) as error:
+        load_scene(path)
+    assert "\n" not in str(error.value) and str(path) in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("", "anatomy: missing"),
+        (
+            "[anatomy]\n[tissue]\nradius_cm = 0.27",
+            "tissue.radius_cm: unknown key; the unit is in the key: write radius_mm",
+        ),
+        (
+            "[anatomy]\n[tissue]\nradius = 2.7",
+            "tissue.radius: unknown key; the unit is in the key: write radius_mm",
+        ),
+        (
+            "[anatomy]\n[solver]\ntime_step_ms = 16",
+            "solver.time_step_ms: unknown key; the unit is in the key: write time_step_s",
+        ),
+        ("[anatomy]\n[gravity]\nacceleration_mm_s2 = 9810", "write acceleration_m_s2"),
+        ("[anatomy]\n[tissue]\nstifness = 1", "tissue.stifness: unknown key; did you mean stiffness?"),
+        (
+            "[anatomy]\n[tissue]\nstiffness = 2",
+            "tissue.stiffness = 2: input should be less than or equal to 1",
+        ),
+        (
+            "[anatomy]\n[tissue]\nradius_mm = '2.7 mm'",
+            "tissue.radius_mm = '2.7 mm': input should be a valid number",
+        ),
+        ("[anatomy]\n[tissue]\nradius_mm = nan", "tissue.radius_mm"),
+        ("[anatomy]\n[gravity]\ndirection = [0, 0, 0]", "a direction must not be zero"),
+        ("[anatomy]\n[[shape]]\nkind = 'plane'\nnormal = [0, 0, 1]\noffset_cm = 1", "write offset_mm"),
+        ("[anatomy]\n[[shape]]\nkind = 'ball'", "'plane', 'mesh', 'sdf'"),
+        ("[anatomy]\n[organs]\n", "organs: unknown key"),
+        ("[anatomy\n", "not valid TOML"),
+    ],
+)
+def test_a_wrong_scene_is_refused_by_name(tmp_path, text, words):
+    assert words in refused(tmp_path, text)
+
+
+def test_missing_and_unreadable_files_are_named(tmp_path):
+    with pytest.raises(SceneError, match="no such scene file"):
+        load_scene(tmp_path / "none.toml")
+    (tmp_path / "b.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(SceneError, match="cannot be read"):
+        load_scene(tmp_path / "b.toml")
+    with pytest.raises(SceneError, match="cannot be read"):
+        load_scene(tmp_path)
+
+
+def test_a_scene_written_is_the_scene_read(tmp_path):
+    scene = with_options(load_scene(PHANTOM), {"tissue.radius_mm": 3.0, "tissue.stiffness": None})
+    (tmp_path / "a.toml").write_text(scene_text(scene), "utf-8")
+    assert load_scene(tmp_path / "a.toml") == scene
+    assert scene.tissue.radius_mm == 3.0
+
+
+def test_options_out_of_range_are_refused():
+    with pytest.raises(SceneError, match="command line: tissue.stiffness = 1.5"):
+        with_options(load_scene(PHANTOM), {"tissue.stiffness": 1.5})
+
+
+def test_defaults_are_the_papers_table_1():
+    solver, contact, tissue = (
+        Scene(anatomy=Anatomy()).solver,
+        Scene(anatomy=Anatomy()).contact,
+        Scene(anatomy=Anatomy()).tissue,
+    )
+    assert (solver.time_step_s, solver.substeps, solver.iterations) == (1 / 60, 3, 9)
+    assert (solver.relaxation, solver.relaxation_factor, solver.damping_per_s) == ("local", 1.0, 12.0)
+    assert (tissue.cluster_spacing, tissue.volume_sampling, tissue.density_g_cm3) == (3.33, 4.0, 1.05)
+    assert (contact.shape_friction, contact.particle_friction) == (0.35, 0.25)
+    assert Scene(anatomy=Anatomy()).gravity.acceleration_m_s2 == 9.81
+
+
+def with_ball(folder: Path, **changes) -> Scene:
+    trimesh.creation.icosphere(subdivisions=2, radius=10.0).export(folder / "organ.stl")
+    return Scene(anatomy=Anatomy(ct=None), **changes)
+
+
+def test_files_that_a_scene_names_are_checked(tmp_path):
+    scene = with_ball(tmp_path)
+    assert load_anatomy(scene, tmp_path).organ.is_watertight
+    trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]).export(tmp_path / "organ.stl")
+    with pytest.raises(SceneError, match="organ.stl: is not a closed surface"):
+        load_anatomy(scene, tmp_path)
+    (tmp_path / "organ.stl").write_text("solid nothing")
+    with pytest.raises(SceneError, match="organ.stl"):
+        load_anatomy(scene, tmp_path)
+    (tmp_path / "organ.stl").unlink()
+    with pytest.raises(SceneError, match="organ.stl: no such surface file"):
+        load_anatomy(scene, tmp_path)
+    with_ball(tmp_path)
+    with pytest.raises(SceneError, match="ct.nrrd: no such file"):
+        load_anatomy(Scene(anatomy=Anatomy()), tmp_path)
+
+
+def test_a_ct_keeps_its_place_in_the_patient(tmp_path):
+    image = sitk.GetImageFromArray(np.arange(4 * 5 * 6, dtype=np.int16).reshape(4, 5, 6))
+    image.SetSpacing((0.5, 1.0, 2.0))
+    image.SetOrigin((10.0, -20.0, 30.0))
+    image.SetDirection((-1, 0, 0, 0, -1, 0, 0, 0, 1))
+    sitk.WriteImage(image, str(tmp_path / "ct.nrrd"))
+    with_ball(tmp_path)
+    ct = load_anatomy(Scene(anatomy=Anatomy()), tmp_path).ct
+    point = np.array([*image.TransformIndexToPhysicalPoint((3, 4, 2)), 1.0])
+    assert ct.index_from_mm @ point == pytest.approx([3, 4, 2, 1])
+    assert ct.voxels[3, 4, 2] == image[3, 4, 2]
+
+
+def test_an_oblique_distance_field_is_refused(tmp_path):
+    image = sitk.Image(4, 4, 4, sitk.sitkFloat32)
+    image.SetDirection((-1, 0, 0, 0, -1, 0, 0, 0, 1))
+    sitk.WriteImage(image, str(tmp_path / "bed.nrrd"))
+    scene = with_ball(tmp_path, shape=({"kind": "sdf", "file": "bed.nrrd"},))
+    with pytest.raises(SceneError, match="bed.nrrd.*identity direction"):
+        load_anatomy(scene, tmp_path)
+
+
+def test_a_press_left_open_goes_with_gravity_through_the_tumour(tmp_path):
+    anatomy = load_anatomy(with_ball(tmp_path), tmp_path)
+    press = press_on(Press(), anatomy, np.array([0.0, 1.0, 0.0]))
+    assert press.target_mm == pytest.approx((0, 0, 0), abs=1e-6)
+    assert press.direction == (0.0, 1.0, 0.0)
+    given = Press(target_mm=(1, 2, 3), direction=(0, 0, -2), lateral=(1, 0, 0))
+    kept = press_on(given, anatomy, np.array([0.0, 1.0, 0.0]))
+    assert kept.target_mm == (1, 2, 3) and kept.direction == (0, 0, -1) and kept.lateral == (1, 0, 0)
+
+
+def test_the_embedded_patient_is_made_once():
+    folder = phantom_folder()
+    stamp = (folder / "ct.nrrd").stat().st_mtime_ns
+    assert phantom_folder() == folder and (folder / "ct.nrrd").stat().st_mtime_ns == stamp
+    anatomy = load_anatomy(load_scene(PHANTOM), PHANTOM.parent)
+    assert 150e3 < anatomy.organ.volume < 200e3
+    assert anatomy.tumour is not None and len(anatomy.shapes) == 1

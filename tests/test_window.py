@@ -1,0 +1,127 @@
+"""A real window under Xvfb, its mouse moved by xdotool: what the surgeon does is what happens."""
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from PIL import Image
+
+pytestmark = pytest.mark.skipif(
+    not (shutil.which("Xvfb") and shutil.which("xdotool")), reason="needs Xvfb and xdotool"
+)
+START_S = 120
+
+
+class Screen:
+    """The program in a window on a display of its own."""
+
+    def __init__(self, display: str, out: Path) -> None:
+        self.out = out
+        self.shots = 0
+        self.environment = os.environ | {"DISPLAY": display}
+        self.environment.pop("WAYLAND_DISPLAY", None)
+        self.program = subprocess.Popen(
+            [
+                sys.executable,
+                str(ROOT / "app.py"),
+                "rehearse",
+                "--radius",
+                "4",
+                "--arch",
+                "cpu",
+                "--out",
+                str(out),
+            ],
+            env=self.environment,
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self.window = self._wait_for_window()
+
+    def _wait_for_window(self) -> str:
+        end = time.monotonic() + START_S
+        while time.monotonic() < end and self.program.poll() is None:
+            found = self.do("search", "--name", "Nephron").stdout.split()
+            if found:
+                return found[0]
+            time.sleep(0.5)
+        self.program.kill()
+        output = self.program.communicate()[0]
+        if "Vulkan" in output:
+            pytest.skip("no Vulkan driver to open a window with")
+        pytest.fail(f"no window came: {output}")
+
+    def do(self, *command) -> subprocess.CompletedProcess:
+        return subprocess.run(
+            ["xdotool", *map(str, command)], env=self.environment, capture_output=True, text=True
+        )
+
+    def point(self, x: int, y: int) -> None:
+        self.do("mousemove", "--window", self.window, x, y)
+        time.sleep(1.5)
+
+    def picture(self) -> np.ndarray:
+        """What the window shows, saved by its own screenshot key."""
+        self.shots += 1
+        path = self.out / f"screenshot-{self.shots:03d}.png"
+        end = time.monotonic() + 20
+        while not path.exists() and time.monotonic() < end:
+            self.do("key", "--window", self.window, "p")
+            time.sleep(1.0)
+        self.shots = len(list(self.out.glob("screenshot-*.png")))
+        last = self.out / f"screenshot-{self.shots:03d}.png"
+        time.sleep(0.5)
+        return np.asarray(Image.open(last).convert("RGB")).astype(int)
+
+
+@pytest.fixture
+def screen(tmp_path):
+    read, write = os.pipe()
+    server = subprocess.Popen(
+        ["Xvfb", "-displayfd", str(write), "-screen", "0", "1400x900x24"],
+        pass_fds=[write],
+        stderr=subprocess.DEVNULL,
+    )
+    os.close(write)
+    with os.fdopen(read) as numbers:
+        display = f":{numbers.readline().strip()}"
+    shown = None
+    try:
+        shown = Screen(display, tmp_path)
+        yield shown
+    finally:
+        if shown is not None:
+            shown.program.kill()
+        server.terminate()
+        server.wait()
+
+
+PANEL, SCENE = np.s_[80:640, 860:1240], np.s_[60:570, 20:780]
+
+
+def test_the_mouse_moves_and_presses_the_transducer(screen):
+    screen.point(330, 330)
+    first = screen.picture()
+    screen.point(450, 330)
+    second = screen.picture()
+    assert np.abs(second - first)[SCENE].mean() > 1.0, "the transducer does not follow the mouse"
+    assert np.abs(second - first)[PANEL].mean() > 5.0, "the panel does not change with the transducer"
+    screen.do("mousedown", 1)
+    time.sleep(3.0)
+    pressed = screen.picture()
+    screen.do("mouseup", 1)
+    assert np.abs(pressed - second)[PANEL].mean() > 5.0, "pressing does not change the panel"
+    assert np.abs(pressed - second)[SCENE].mean() > 0.5, "pressing does not move the transducer in"
+    time.sleep(2.0)
+    let_go = screen.picture()
+    assert np.abs(let_go - second)[PANEL].mean() < 0.5 * np.abs(pressed - second)[PANEL].mean()
+    screen.do("key", "--window", screen.window, "Escape")
+    assert screen.program.wait(timeout=20) == 0
