@@ -13,9 +13,11 @@ from PIL import Image
 from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy, patient_scene
+from scenes.labels import Side
 from scenes.patient import describe, import_patient, save_patient
 from scenes.reading import PatientError, read_volume
 from scenes.scene import SceneError, load_scene, scene_text, with_options
+from sim.sampling import SamplingError
 
 if TYPE_CHECKING:
     from render.viewer import Controls, Settings, View, Viewer
@@ -122,7 +124,7 @@ def rehearse(
     "--side", type=click.Choice(["left", "right"]), help="Which kidney, where the labels hold both."
 )
 def import_command(
-    ct: Path, labels: Path, out: Path, organ: str | None, tumour: str | None, side: str | None
+    ct: Path, labels: Path, out: Path, organ: str | None, tumour: str | None, side: Side | None
 ) -> None:
     """Make a patient's folder, with a scene, out of a CT (DICOM folder, NIfTI, NRRD, MHA) and its LABELS."""
     patient = import_patient(
@@ -230,7 +232,7 @@ def run_frame(rehearsal: "Rehearsal", settings: "Settings", move, record: "Recor
 def run_headless(rehearsal: "Rehearsal", arch: str, seconds: float | None, out: Path, build_s: float) -> None:
     """The scripted press without a screen: frames, slices, an animated picture and report.json."""
     from render.window import NoVulkan
-    from studies.report import Record
+    from studies.report import Record, summary
 
     try:
         viewer: Viewer | None = open_viewer(rehearsal, visible=False)
@@ -258,7 +260,9 @@ def run_headless(rehearsal: "Rehearsal", arch: str, seconds: float | None, out: 
                 picture.save(frames / f"{step:05d}.png")
             animation.append(smaller(picture))
     save_animation(animation, out / "press.gif")
-    (out / "report.json").write_text(json.dumps(record.report(rehearsal, arch), indent=2) + "\n", "utf-8")
+    report = record.report(rehearsal, arch)
+    (out / "report.json").write_text(json.dumps(report, indent=2) + "\n", "utf-8")
+    click.echo(summary(report))
     click.echo(f"Wrote {len(animation)} pictures, press.gif and report.json to {out}")
 
 

@@ -49,12 +49,9 @@ def transducer(size) -> Solid:
         cuboid((0.5, y * 0.3, z * 0.45), (x / 2, 0, lens / 2), MARKER),
     ]
     offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
-    return Solid(
-        *(np.concatenate([part[i] for part in parts]) for i in range(3)),
-        np.concatenate([part.indices + offset for part, offset in zip(parts, offsets, strict=True)]).astype(
-            np.int32
-        ),
-    )
+    vertices, normals, colours = (np.concatenate([part[i] for part in parts]) for i in range(3))
+    indices = np.concatenate([part.indices + offset for part, offset in zip(parts, offsets, strict=True)])
+    return Solid(vertices, normals, colours, indices.astype(np.int32))
 
 
 def cuboid_edges(size) -> np.ndarray:

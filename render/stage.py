@@ -38,11 +38,11 @@ class Stage:
         self.camera = camera
         self._organ = Surface(geometry.organ_vertices, geometry.organ_faces)
         self._tumour = self._support = None
-        if geometry.tumour_vertices is not None:
+        if geometry.tumour_vertices is not None and geometry.tumour_faces is not None:
             self._tumour = Surface(geometry.tumour_vertices, geometry.tumour_faces, TUMOUR)
             self._organ.glass_faces = _faces_apart(self._organ, self._tumour)
-        if geometry.support_vertices is not None:
-            self._support = self._matt_support(geometry)
+        if geometry.support_vertices is not None and geometry.support_faces is not None:
+            self._support = self._matt_support(geometry.support_vertices, geometry.support_faces)
         self._half_axis_mm = geometry.transducer_size_mm[2] / 2
         self._probe = solids.transducer(geometry.transducer_size_mm)
         self._probe_vertices, self._probe_normals, self._probe_colours = map(_vector_field, self._probe[:3])
@@ -56,9 +56,8 @@ class Stage:
         self._mask_colours = _vector_field(np.zeros((6 * MASKS, 4)))
         self._mask_indices = np.arange(6 * MASKS, dtype=np.int32)
 
-    def _matt_support(self, geometry: Geometry) -> Surface:
-        vertices = _vector_field(np.asarray(geometry.support_vertices))
-        support = Surface(vertices, geometry.support_faces, SUPPORT, gloss=0.0)
+    def _matt_support(self, vertices: np.ndarray, faces: np.ndarray) -> Surface:
+        support = Surface(_vector_field(np.asarray(vertices)), faces, SUPPORT, gloss=0.0)
         # It neither moves nor shines, so its colours are worked out once, as seen from far above.
         above = self.camera.target + 10.0 * self.camera.distance_home * self.camera.up
         support.shade(above, above)

@@ -5,7 +5,6 @@ Lengths are in mm, angles in degrees, patient coordinates LPS. Nothing here need
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple, Protocol
 
@@ -117,7 +116,7 @@ class View:
     """Grey values, uint8, shape (rows = depth, columns = lateral, local x growing to the right)."""
     width_mm: float
     depth_mm: float
-    readouts: Mapping[str, str] = field(default_factory=dict)
+    readouts: dict[str, str] = field(default_factory=dict)
     """Name -> text with its unit, in the order of display: {"step": "9.1 ms"}."""
     status: str = ""
     """A short word over the picture, such as FROZEN."""

@@ -126,7 +126,7 @@ class Window:
         self._drag: str | None = None
         self._cursor: np.ndarray | None = None
         self._pressing = False
-        self._at_press = None
+        self._at_press: tuple[np.ndarray, tuple] | None = None
         self._boxes_placed = 0
         self._last_read = time.perf_counter()
         self._lens = ti.ui.Camera()
@@ -140,7 +140,7 @@ class Window:
         width, height = self.layout.width, self.layout.height
         self._pixels = np.full((width, height, 4), 255, dtype=np.uint8)
         self._page = self._pixels.transpose(1, 0, 2)[::-1]
-        self._drawn_panel = None
+        self._drawn_panel: tuple[frame.Panel, bool] | None = None
         self._drawn_readouts: dict[str, str] | None = None
         self._readouts_at = 0.0
 
@@ -199,7 +199,9 @@ class Window:
     def _key_down(self, key: str, controls: Controls) -> None:
         if key == ti.ui.LMB:
             self._pressing = self._over_scene()
-            self._at_press = None if self._pressing else (self._cursor, dataclasses.astuple(self.settings))
+            self._at_press = None
+            if not self._pressing and self._cursor is not None:
+                self._at_press = self._cursor, dataclasses.astuple(self.settings)
         elif key in (ti.ui.RMB, ti.ui.MMB) and self._over_scene():
             pans = key == ti.ui.MMB or self._window.is_pressed(ti.ui.SHIFT)
             self._drag = "pan" if pans else "orbit"
@@ -213,7 +215,7 @@ class Window:
     def _put_sliders_back(self) -> None:
         """A drag that changed no setting may have moved a box of sliders: GGUI can only place a new one."""
         at_press, self._at_press = self._at_press, None
-        if at_press is None or at_press[0] is None:
+        if at_press is None or self._cursor is None:
             return
         cursor, settings = at_press
         moved = np.abs(self._cursor - cursor).max() > 0.002

@@ -5,6 +5,7 @@ an axial CT of a slim adult, CRLM-CT-1004 (TCIA).
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 SPACING = 0.9
 ORIGIN = (-12.0, -48.0, -402.0)
@@ -58,7 +59,7 @@ class Canvas:
 
     def loft(
         self,
-        sections: np.ndarray,
+        sections: ArrayLike,
         value: float,
         rim: float | None = None,
         wall: float = 0.8,
@@ -127,10 +128,11 @@ def _wave_vectors(wavelength: float, rng: np.random.Generator, count: int) -> li
 
 def waves_at(points: np.ndarray, wavelength: float, rng: np.random.Generator, count: int = 6) -> np.ndarray:
     """As Canvas.waves, at points [mm], shape (n, 3)."""
-    total = sum(
+    waves = (
         np.cos(points @ k.astype(np.float32) + np.float32(phase))
         for k, phase in _wave_vectors(wavelength, rng, count)
     )
+    total = sum(waves, start=np.zeros(len(points), dtype=np.float32))
     return total * np.float32(np.sqrt(2 / count))
 
 

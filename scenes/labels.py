@@ -196,7 +196,8 @@ def _single_out(
             f"no {side} kidney is labelled, found: {found}; give the side that is there, or check that the "
             "labels are not mirrored"
         )
-    if len(chosen) > 1:
+    # Without a midline there are several here.
+    if midline is None or len(chosen) > 1:
         split = midline is not None and len({p.side_of(midline) for p in chosen}) == len(chosen)
         advice = "--side left or --side right, or --organ with" if split else "--organ with"
         raise PatientError(

@@ -12,6 +12,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import SimpleITK as sitk
@@ -197,4 +198,6 @@ def _tumour_surface(labels: sitk.Image, voxel_ml: float) -> trimesh.Trimesh:
         faces = FACES * (sizes[n] * voxel_ml / FACES_AT_ML) ** (2 / 3)
         body = _image((labelled == n + 1).astype(np.uint8), labels)
         surfaces.append(_surface(body, "tumour", int(np.clip(faces, LEAST_FACES, FACES))))
-    return surfaces[0] if len(surfaces) == 1 else trimesh.util.concatenate(surfaces)
+    if len(surfaces) == 1:
+        return surfaces[0]
+    return cast(trimesh.Trimesh, trimesh.util.concatenate(surfaces))

@@ -13,6 +13,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 import SimpleITK as sitk
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from scenes.abdomen import (
@@ -106,7 +107,7 @@ def to_patient(points: np.ndarray) -> np.ndarray:
     return KIDNEY_CENTRE + bent @ KIDNEY_AXES
 
 
-def to_kidney(points: np.ndarray) -> np.ndarray:
+def to_kidney(points: ArrayLike) -> np.ndarray:
     """LPS to kidney frame [mm], shape (..., 3)."""
     straight = (np.asarray(points) - KIDNEY_CENTRE) @ KIDNEY_AXES.T
     straight[..., 0] += KIDNEY_BEND * straight[..., 2] ** 2
@@ -224,7 +225,7 @@ MAJOR_CALYCES = np.array([[-9.0, -1.5, 15.0], [-10.0, -1.5, -1.0], [-9.0, -1.5, 
 PELVIS = np.array([-19.0, -4.0, -2.0])
 
 
-def _curve(*controls: np.ndarray, radii: tuple[float, float], pieces: int = 7) -> list[tuple]:
+def _curve(*controls: ArrayLike, radii: tuple[float, float], pieces: int = 7) -> list[tuple]:
     """A Bezier curve in the kidney frame as short tapering tubes (start, end, radius, radius) in LPS [mm]."""
     t = np.linspace(0, 1, pieces + 1)
     points = np.array(controls, dtype=float)[:, None, :] * np.ones((1, len(t), 1))

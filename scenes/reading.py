@@ -104,7 +104,7 @@ def _read_series(folder: Path) -> sitk.Image:
 
 def _headers(folder: Path) -> dict[Path, pydicom.Dataset]:
     """Geometry tags of every DICOM file in the folder, which may hold other files too."""
-    headers = {}
+    headers: dict[Path, pydicom.Dataset] = {}
     for file in sorted(entry for entry in folder.iterdir() if entry.is_file()):
         try:
             header = pydicom.dcmread(file, stop_before_pixels=True, specific_tags=GEOMETRY_TAGS)

@@ -113,7 +113,7 @@ def _gravity_frame(gravity: np.ndarray) -> np.ndarray:
     return np.array([level, np.cross(up, level), up])
 
 
-def _grid(low: np.ndarray, high: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _grid(low: np.ndarray, high: np.ndarray, step: float) -> tuple[np.ndarray, ...]:
     """Axes of a grid around the block, one cell of air at every side; the block's faces lie between nodes."""
     return tuple(
         np.arange(start - 1.5 * step, end + 2.0 * step, step) for start, end in zip(low, high, strict=True)

@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 
-import igl
 import numpy as np
 import taichi as ti
 import trimesh
 
+from sim.distance import signed_distance
 from sim.sampling import sample_particles
 
 
@@ -48,9 +48,7 @@ def fill_body(
     particles = sample_particles(
         surface.vertices, surface.faces, radius_mm, volume_sampling, surface_samples_per_mm2
     )
-    depth = -igl.signed_distance(
-        particles, np.asarray(surface.vertices, np.float64), np.asarray(surface.faces, np.int64)
-    )[0]
+    depth = -signed_distance(surface.vertices, surface.faces, particles)[0]
     mass_g = density_g_cm3 * 1e-3 * surface.volume
     return RestBody(particles, mass_g / len(particles), radius_mm, np.clip(depth, 0.0, radius_mm))
 

@@ -6,12 +6,12 @@ barycentrically in deformed tetrahedra and mapped back to where the tissue was a
 
 from itertools import permutations
 
-import igl
 import numpy as np
 import taichi as ti
 import taichi.math as tm
 import trimesh
 
+from sim.distance import signed_distance
 from sim.skinning import Skin
 
 NOWHERE = 2**30
@@ -35,7 +35,7 @@ class Embedding:
         vertices, tetrahedra = tetrahedra_around(surface, cell_mm, margin_mm)
         # A tetrahedron that holds tissue reaches this far out: all of its vertices must follow it wholly.
         wholly = np.sqrt(3) * cell_mm
-        beyond = np.maximum(distance_to(surface, vertices) - wholly, 0.0)
+        beyond = np.maximum(signed_distance(surface.vertices, surface.faces, vertices)[0] - wholly, 0.0)
         share = np.clip(1.0 - beyond / max(margin_mm - wholly, cell_mm), 0.0, 1.0)
         self.skin = Skin(model, vertices)
         self.share = ti.field(ti.f32, len(vertices))
@@ -136,12 +136,6 @@ class Embedding:
         return self.rest_from_world[t] @ tm.vec4(p, 1.0)
 
 
-def distance_to(surface: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
-    """Signed distances (n,) [mm] of points (n, 3) to a closed surface, negative inside."""
-    vertices, faces = np.asarray(surface.vertices, np.float64), np.asarray(surface.faces, np.int64)
-    return igl.signed_distance(points, vertices, faces)[0]
-
-
 def tetrahedra_around(
     surface: trimesh.Trimesh, cell_mm: float, margin_mm: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -152,7 +146,7 @@ def tetrahedra_around(
     low = surface.vertices.min(axis=0) - cell_mm - margin_mm
     shape = np.ceil((surface.vertices.max(axis=0) + cell_mm + margin_mm - low) / cell_mm).astype(int)
     cells = np.indices(shape).reshape(3, -1).T
-    distance = distance_to(surface, low + cell_mm * (cells + 0.5))
+    distance = signed_distance(surface.vertices, surface.faces, low + cell_mm * (cells + 0.5))[0]
     cells = cells[distance <= margin_mm + cell_mm * np.sqrt(3) / 2]
     nodes = []
     for axes in permutations(range(3)):

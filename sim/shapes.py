@@ -10,6 +10,8 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
+from sim.distance import signed_distance
+
 FAR = 1e6
 FACE, EDGE, VERTEX = 0, 1, 4
 Points = ti.types.ndarray(ti.f32, ndim=2)
@@ -162,7 +164,7 @@ class TriangleMesh(Static):
         self, vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, reach_mm: float
     ) -> None:
         centres = low + self.cell_mm * (np.indices(self.shape).reshape(3, -1).T + 0.5)
-        signed, nearest = igl.signed_distance(centres, vertices, faces)[:2]
+        signed, nearest = signed_distance(vertices, faces, centres)
         half_diagonal = self.cell_mm * np.sqrt(3) / 2
         near = np.abs(signed) <= half_diagonal + np.where(signed > 0, reach_mm, half_diagonal)
         deep = ~near & (signed < 0)
@@ -190,12 +192,10 @@ class TriangleMesh(Static):
     @ti.func
     def distance_within(self, p, bound, f):
         """Distance of triangle f from p [mm], FAR where it is more than the bound."""
-        a, b, c = self.corner[f, 0], self.corner[f, 1], self.corner[f, 2]
-        middle = (a + b + c) / 3
-        extent = ti.sqrt(ti.max((a - middle).norm_sqr(), (b - middle).norm_sqr(), (c - middle).norm_sqr()))
         distance = FAR
-        if (p - middle).norm() <= bound + extent:
-            distance = from_triangle(p, a, b, c)[0].norm()
+        around = self.sphere[f]
+        if (p - around.xyz).norm() <= bound + around.w:
+            distance = from_triangle(p, self.corner[f, 0], self.corner[f, 1], self.corner[f, 2])[0].norm()
         return distance if distance <= bound else FAR
 
     @ti.kernel
@@ -237,8 +237,13 @@ class TriangleMesh(Static):
         # Two faces folded onto each other leave no direction between them.
         edges /= np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-12)
         normals = np.concatenate([face_normal[:, None], edges, vertex_normal[faces]], axis=1)
+        corners = vertices[faces]
+        middle = corners.mean(axis=1)
+        extent = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
+        self.sphere = ti.Vector.field(4, ti.f32, len(faces))
+        self.sphere.from_numpy(np.column_stack([middle, extent]).astype(np.float32))
         self.corner = ti.Vector.field(3, ti.f32, (len(faces), 3))
-        self.corner.from_numpy(vertices[faces].astype(np.float32))
+        self.corner.from_numpy(corners.astype(np.float32))
         self.normal = ti.Vector.field(3, ti.f32, (len(faces), 7))
         self.normal.from_numpy(normals.astype(np.float32))
 

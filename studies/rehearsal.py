@@ -104,7 +104,7 @@ class Rehearsal:
 
     def _build_surfaces(self) -> None:
         self.organ_skin = Skin(self.model, self.organ.vertices)
-        self.tumour_skin = self.tumour and Skin(self.model, self.tumour.vertices)
+        self.tumour_skin = None if self.tumour is None else Skin(self.model, self.tumour.vertices)
 
     def _build_slice(self, anatomy: LoadedAnatomy) -> None:
         image = self.scene.image

@@ -71,3 +71,23 @@ class Record:
             max_penetration_mm=round(self.max_penetration_mm, 6),
             indentation_max_mm=round(self.indentation_max_mm, 4),
         )
+
+
+def summary(report: dict) -> str:
+    """The figures that matter, in a few lines for the terminal."""
+    step, picture = report["ms_per_step"], report["ms_per_slice"]
+    times = "too few steps to time"
+    if step and picture:
+        times = f"{step['median']:.1f} ms a step, {picture['median']:.1f} ms a slice (medians of {report['steps'] - 1})"
+    return "\n".join(
+        [
+            f"model     {report['particles']} particles of {report['radius_mm']:g} mm, {report['clusters']} clusters, "
+            f"{report['memberships']} memberships, {report['tetrahedra']} tetrahedra",
+            f"step      1/{1 / report['time_step_s']:.0f} s in {report['substeps']} substeps of {report['iterations']} "
+            f"iterations, stiffness {report['stiffness']:g}",
+            f"speed     {times} on {report['arch']}; built in {report['build_s']:.1f} s",
+            f"press     {report['indentation_max_mm']:.2f} mm deep; least volume {100 * report['volume_ratio_min']:.1f} %; "
+            f"penetration at most {report['max_penetration_mm']:.3f} mm; "
+            f"{'all particles finite' if report['finite'] else 'PARTICLES NOT FINITE'}",
+        ]
+    )

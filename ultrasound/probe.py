@@ -83,7 +83,7 @@ def between(start: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
 
 def approached(pose: np.ndarray, goal: np.ndarray, most_mm: float, most_deg: float) -> np.ndarray:
     """The pose moved towards a goal by at most a distance [mm] and an angle [degrees]."""
-    way = np.linalg.norm(goal[:3, 3] - pose[:3, 3])
+    way = float(np.linalg.norm(goal[:3, 3] - pose[:3, 3]))
     turn = np.degrees(Rotation.from_matrix(goal[:3, :3] @ pose[:3, :3].T).magnitude())
     share = min(1.0, most_mm / max(way, 1e-9), most_deg / max(turn, 1e-9))
     if share >= 1.0:

@@ -5,7 +5,7 @@ import taichi as ti
 import taichi.math as tm
 import trimesh
 
-from sim.embedding import distance_to
+from sim.distance import signed_distance
 
 AIR_HU = -1000.0
 FAR_MM = 1e6
@@ -50,7 +50,7 @@ def distance_volume(surface: trimesh.Trimesh, spacing_mm: float = 2.0, reach_mm:
     low = surface.vertices.min(axis=0) - reach_mm
     shape = np.ceil((surface.vertices.max(axis=0) + reach_mm - low) / spacing_mm).astype(int) + 1
     points = low + spacing_mm * np.indices(shape).reshape(3, -1).T
-    distance = distance_to(surface, points)
+    distance = signed_distance(surface.vertices, surface.faces, points)[0]
     index_from_mm = np.eye(4)
     index_from_mm[:3] /= spacing_mm
     index_from_mm[:3, 3] = -low / spacing_mm

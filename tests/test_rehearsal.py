@@ -1,0 +1,153 @@
+"""A whole scene: at rest its slice is the CT, pressed it gives way, and twice it gives the same bits."""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from conftest import DATA, ROOT
+
+from scenes.anatomy import load_anatomy, patient_scene, phantom_folder
+from scenes.patient import import_patient, save_patient
+from scenes.reading import read_volume
+from scenes.scene import Press, Scene, load_scene, with_options
+from sim.device import start
+from sim.skinning import Skin
+from studies.rehearsal import Rehearsal
+from ultrasound.probe import image_plane
+
+PATIENTS = {
+    "phantom": None,
+    "crlm left": ("crlm_1004", "crlm_1004_labels/kidneys_provisional.nii.gz", "left"),
+    "crlm right": ("crlm_1004", "crlm_1004_labels/kidneys_provisional.nii.gz", "right"),
+    "totalseg left": ("totalseg/ct.nii.gz", "totalseg/kidneys.nii.gz", "left"),
+    "totalseg right": ("totalseg/ct.nii.gz", "totalseg/kidneys.nii.gz", "right"),
+}
+
+
+def patient_in(name: str, tmp_path: Path) -> tuple[Scene, Path]:
+    """A coarse scene of a patient, and the folder of its files."""
+    if PATIENTS[name] is None:
+        return with_options(
+            load_scene(ROOT / "scenes" / "phantom.toml"), {"tissue.radius_mm": 4.0}
+        ), phantom_folder()
+    if not DATA.is_dir():
+        pytest.skip("no ../shared/data here")
+    ct, labels, side = PATIENTS[name]
+    patient = import_patient(read_volume(DATA / "ct" / ct), read_volume(DATA / "ct" / labels), side=side)
+    save_patient(patient, tmp_path / "patient")
+    return with_options(patient_scene(patient), {"tissue.radius_mm": 4.0}), tmp_path / "patient"
+
+
+def resampled(folder: Path, plane, origin: np.ndarray, pixels: int) -> np.ndarray:
+    """SimpleITK's oblique resample of the patient's CT on a plane given relative to an origin (LPS)."""
+    grid = sitk.Image(pixels, pixels, 1, sitk.sitkFloat32)
+    spacing = np.array([plane.width_mm, plane.depth_mm]) / pixels
+    grid.SetSpacing((*spacing.tolist(), 1.0))
+    grid.SetDirection(plane.world_from_plane[:3, :3].flatten().tolist())
+    first = plane.world_from_plane @ [-plane.width_mm / 2 + spacing[0] / 2, spacing[1] / 2, 0, 1]
+    grid.SetOrigin((first[:3] + origin).tolist())
+    ct = sitk.Cast(sitk.ReadImage(str(folder / "ct.nrrd")), sitk.sitkFloat32)
+    return sitk.GetArrayFromImage(sitk.Resample(ct, grid, sitk.Transform(), sitk.sitkLinear, -1000.0))[0]
+
+
+@pytest.mark.parametrize("name", PATIENTS)
+def test_at_rest_the_slice_is_the_ct(device, tmp_path, name):
+    scene, folder = patient_in(name, tmp_path)
+    scene = scene.model_copy(update={"press": Press(warm_up_steps=0)})
+    rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
+    rehearsal.hand.turn(20, 10, 35)
+    rehearsal.pose = rehearsal.hand.pose()
+    rehearsal.image(350, 40, 60)
+    plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], scene.image.width_mm, 60)
+    inside = rehearsal.slice.in_organ.to_numpy() == 1
+    difference = np.abs(
+        rehearsal.slice.hu.to_numpy() - resampled(folder, plane, rehearsal.origin, scene.image.pixels)
+    )
+    print(f"{name}: mean {difference[inside].mean():.4f} HU, maximum {difference[inside].max():.3f} HU")
+    assert inside.mean() > 0.1
+    # The bar is 5 HU; float32 positions (1e-5 mm) in gradients of 500 HU/mm leave far less.
+    assert difference[inside].mean() < 0.05
+
+
+def test_pressing_moves_the_tissue_and_the_slice_follows(device, tmp_path):
+    scene, folder = patient_in("phantom", tmp_path)
+    rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
+    before = rehearsal.image(350, 40, 60)
+    top = rehearsal.organ_skin.vertices.to_numpy()
+    for step in range(31):
+        rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
+    rehearsal.update_surfaces()
+    moved = rehearsal.organ_skin.vertices.to_numpy() - top
+    assert rehearsal.indentation_mm() == pytest.approx(12.38)
+    assert (moved @ rehearsal.gravity_direction).max() > 6.0
+    assert np.abs(rehearsal.image(350, 40, 60).astype(int) - before).mean() > 10
+    assert 0.7 < rehearsal.volume_ratio() < 1.0
+    assert rehearsal.contacts.measure_penetration() <= 1e-3
+    rehearsal.reset()
+    rehearsal.update_surfaces()
+    assert np.array_equal(rehearsal.image(350, 40, 60), before)
+    assert rehearsal.indentation_mm() == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_pixel_shows_the_tissue_that_is_there_now(device, tmp_path):
+    scene, folder = patient_in("phantom", tmp_path)
+    rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
+    for step in range(31):
+        rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
+    rehearsal.image(350, 40, 60)
+    plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], scene.image.width_mm, 60)
+    pixels = np.argwhere(rehearsal.slice.in_organ.to_numpy() == 1)[::1009]
+    spacing = np.array([plane.width_mm, plane.depth_mm]) / scene.image.pixels
+    local = (pixels[:, ::-1] + 0.5) * spacing - [plane.width_mm / 2, 0]
+    shown_at = np.column_stack([local, np.zeros(len(local)), np.ones(len(local))]) @ plane.world_from_plane.T
+    owner = rehearsal.slice.owner.to_numpy()[pixels[:, 0], pixels[:, 1]]
+    back = rehearsal.embedding.rest_from_world.to_numpy()[owner]
+    rest = np.einsum("nij,nj->ni", back, shown_at)
+    carried = Skin(rehearsal.model, rest).vertices.to_numpy()
+    off = np.linalg.norm(carried - shown_at[:, :3], axis=1)
+    unmoved = np.linalg.norm(rest - shown_at[:, :3], axis=1)
+    assert len(off) > 50 and unmoved.mean() > 2.0
+    # Cells of 8 mm are straight where the clusters bend: under a tenth of the motion on average.
+    assert off.mean() < 0.1 * unmoved.mean()
+
+
+def test_two_runs_of_a_scene_give_the_same_bits(tmp_path):
+    digests = []
+    for _ in range(2):
+        start("cpu")
+        scene, folder = patient_in("phantom", tmp_path)
+        scene = scene.model_copy(update={"press": scene.press.model_copy(update={"warm_up_steps": 20})})
+        rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
+        for step in range(20):
+            rehearsal.advance(rehearsal.scripted_pose(step / 20 * rehearsal.script_length_s()))
+        state = rehearsal.body.snapshot()
+        picture = rehearsal.image(350, 40, 60)
+        digests.append(
+            hashlib.sha256(
+                state.position.tobytes() + state.velocity.tobytes() + picture.tobytes()
+            ).hexdigest()
+        )
+    assert digests[0] == digests[1]
+
+
+def test_a_hand_cannot_outrun_its_speed(device, tmp_path):
+    scene, folder = patient_in("phantom", tmp_path)
+    rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
+    away = rehearsal.pose.copy()
+    away[:3, 3] += [0, -100.0, 0]
+    rehearsal.follow(away)
+    assert np.linalg.norm(rehearsal.pose[:3, 3] - away[:3, 3]) == pytest.approx(100.0 - 150.0 / 60)
+
+
+def test_a_pressed_scene_without_ct_still_moves(device, tmp_path):
+    scene, folder = patient_in("phantom", tmp_path)
+    scene = scene.model_copy(
+        update={"anatomy": scene.anatomy.model_copy(update={"phantom": False, "ct": None})}
+    )
+    rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
+    rehearsal.advance(rehearsal.scripted_pose(1.0))
+    assert rehearsal.slice is None
+    with pytest.raises(ValueError, match="no CT"):
+        rehearsal.image(350, 40, 60)
