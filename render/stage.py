@@ -18,7 +18,7 @@ TUMOUR, SUPPORT, EDGE, FRAME = (0.93, 0.76, 0.28), (0.30, 0.33, 0.36), (0.85, 0.
 LINE_WIDTH = 1.2
 MASKS = 4
 # Organ and tumour have a surface each where the tumour sticks out; they differ by the smoothing of the two.
-SAME_SURFACE_MM = 1.2
+SAME_SURFACE_MM = 1.8
 
 
 def _vector_field(values: np.ndarray):
