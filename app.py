@@ -183,14 +183,11 @@ def open_viewer(rehearsal: "Rehearsal", visible: bool) -> "Viewer":
     from render.window import Window
 
     support, tumour = rehearsal.supports, rehearsal.tumour
-    # Room above the organ for the transducer; the support may reach out of the picture.
-    shown = rehearsal.organ.bounds
-    above = shown - 16.0 * rehearsal.gravity_direction
     return Window(
         Geometry(
             organ_vertices=rehearsal.organ_skin.vertices,
             organ_faces=np.asarray(rehearsal.organ.faces, np.int32),
-            bounds=np.array([np.minimum(shown, above)[0], np.maximum(shown, above)[1]]),
+            bounds=rehearsal.organ.bounds,
             up=-rehearsal.gravity_direction,
             transducer_size_mm=rehearsal.size_mm,
             tumour_vertices=rehearsal.tumour_skin and rehearsal.tumour_skin.vertices,

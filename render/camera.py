@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 FIELD_OF_VIEW_DEG = 28.0
-MARGIN = 0.94
+MARGIN = 1.04
 
 
 class OrbitCamera:
