@@ -3,6 +3,8 @@
 import json
 import os
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING
@@ -200,13 +202,23 @@ def open_viewer(rehearsal: "Rehearsal", visible: bool) -> "Viewer":
     )
 
 
-def run_frame(rehearsal: "Rehearsal", settings: "Settings", move, record: "Record") -> "View":
-    """One frame, on screen and off: move the transducer and step, carry the surfaces, take the picture."""
+def run_frame(
+    rehearsal: "Rehearsal",
+    settings: "Settings",
+    move: Callable[[], None] | None,
+    record: "Record",
+    status: str = "",
+) -> "View":
+    """One frame, on screen and off: move the transducer and step, carry the surfaces, take the picture.
+
+    Without a move, as when frozen, the picture alone is taken anew.
+    """
     from render.viewer import View
     from studies.report import timed
 
-    timed(move, record.step_ms)
-    rehearsal.update_surfaces()
+    if move is not None:
+        timed(move, record.step_ms)
+        rehearsal.update_surfaces()
     picture = timed(
         lambda: rehearsal.image(settings.window_hu, settings.level_hu, settings.depth_mm), record.slice_ms
     )
@@ -222,6 +234,7 @@ def run_frame(rehearsal: "Rehearsal", settings: "Settings", move, record: "Recor
         width_mm=rehearsal.scene.image.width_mm,
         depth_mm=settings.depth_mm,
         readouts=readouts,
+        status=status,
         title=rehearsal.scene.title,
     )
 
@@ -246,7 +259,7 @@ def run_headless(rehearsal: "Rehearsal", arch: str, seconds: float | None, out: 
     animation: list[Image.Image] = []
     for step in tqdm(range(1, steps + 1), desc="press", unit="step"):
         pose = rehearsal.scripted_pose(rehearsal.script_length_s() * step / steps)
-        view = run_frame(rehearsal, settings, lambda pose=pose: rehearsal.advance(pose), record)
+        view = run_frame(rehearsal, settings, partial(rehearsal.advance, pose), record)
         record.watch(rehearsal)
         if step % every == 0 or step == steps:
             picture = Image.fromarray(view.slice_image)
@@ -281,21 +294,20 @@ def run_window(rehearsal: "Rehearsal", out: Path) -> None:
     while viewer.running:
         controls = viewer.read_controls()
         frozen ^= controls.freeze
-        move = steer(rehearsal, controls)
-        if not frozen:
-            view = run_frame(rehearsal, controls.settings, move, record)
+        move = None if frozen else steer(rehearsal, controls)
+        view = run_frame(rehearsal, controls.settings, move, record, "FROZEN" if frozen else "")
         now = perf_counter()
         rate = 0.9 * rate + 0.1 / max(now - before, 1e-6)
         before = now
         view.readouts["frames"] = f"{rate:.0f} /s"
-        viewer.draw(with_status(view, "FROZEN" if frozen else ""))
+        viewer.draw(view)
         if controls.screenshot:
             shots += 1
             Image.fromarray(viewer.picture()).save(out / f"screenshot-{shots:03d}.png")
     viewer.close()
 
 
-def steer(rehearsal: "Rehearsal", controls: "Controls"):
+def steer(rehearsal: "Rehearsal", controls: "Controls") -> Callable[[], None]:
     """Hand the user's input to the hand that holds the transducer and to the solver; the step to take then."""
     step, hand, asked = rehearsal.settings, rehearsal.hand, controls.settings
     step.stiffness, step.iterations, step.substeps = asked.stiffness, asked.iterations, asked.substeps
@@ -308,12 +320,6 @@ def steer(rehearsal: "Rehearsal", controls: "Controls"):
     hand.push(controls.push_mm)
     hand.turn(controls.fan_deg, controls.tilt_deg, controls.roll_deg)
     return lambda: rehearsal.follow(hand.pose())
-
-
-def with_status(view: "View", status: str) -> "View":
-    from dataclasses import replace
-
-    return replace(view, status=status)
 
 
 def empty_folder(folder: Path) -> Path:

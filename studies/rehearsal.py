@@ -167,9 +167,9 @@ class Rehearsal:
             self.tumour_skin.update()
 
     def image(self, window_hu: float, level_hu: float, depth_mm: float) -> np.ndarray:
-        """What the transducer sees now: grey values (rows, columns) uint8."""
+        """What the transducer sees now: grey values (rows, columns) uint8; black in a scene without a CT."""
         if self.slice is None:
-            raise ValueError("this scene has no CT: there is nothing to image")
+            return np.zeros((self.scene.image.pixels, self.scene.image.pixels), np.uint8)
         self.embedding.update()
         plane = image_plane(self.pose, self.size_mm[2], self.scene.image.width_mm, depth_mm)
         self.slice.render(plane, window_hu, level_hu)

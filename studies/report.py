@@ -19,10 +19,8 @@ def timed(work: Callable, into_ms: list[float]):
     return result
 
 
-def spread(values_ms: list[float]) -> dict[str, float] | None:
-    """Mean, standard deviation, minimum, maximum and median; None of nothing."""
-    if not values_ms:
-        return None
+def spread(values_ms: list[float]) -> dict[str, float]:
+    """Mean, standard deviation, minimum, maximum and median."""
     v = np.array(values_ms)
     figures = dict(mean=v.mean(), sd=v.std(), min=v.min(), max=v.max(), median=np.median(v))
     return {name: round(float(value), 4) for name, value in figures.items()}
@@ -48,7 +46,7 @@ class Record:
         self.indentation_max_mm = max(self.indentation_max_mm, rehearsal.indentation_mm())
 
     def report(self, rehearsal: Rehearsal, arch: str) -> dict:
-        """Everything in one dictionary; times in ms are over all steps but the first."""
+        """Everything in one dictionary; times in ms are over all steps but the first, if there are more."""
         settings = rehearsal.settings
         return dict(
             title=rehearsal.scene.title,
@@ -63,8 +61,8 @@ class Record:
             iterations=settings.iterations,
             stiffness=settings.stiffness,
             steps=rehearsal.steps,
-            ms_per_step=spread(self.step_ms[1:]),
-            ms_per_slice=spread(self.slice_ms[1:]),
+            ms_per_step=spread(self.step_ms[1:] or self.step_ms),
+            ms_per_slice=spread(self.slice_ms[1:] or self.slice_ms),
             build_s=round(self.build_s, 3),
             finite=self.finite,
             volume_ratio_min=round(self.volume_ratio_min, 6),
@@ -76,9 +74,9 @@ class Record:
 def summary(report: dict) -> str:
     """The figures that matter, in a few lines for the terminal."""
     step, picture = report["ms_per_step"], report["ms_per_slice"]
-    times = "too few steps to time"
-    if step and picture:
-        times = f"{step['median']:.1f} ms a step, {picture['median']:.1f} ms a slice (medians of {report['steps'] - 1})"
+    times = (
+        f"{step['median']:.1f} ms a step, {picture['median']:.1f} ms a slice (medians of {report['steps']})"
+    )
     return "\n".join(
         [
             f"model     {report['particles']} particles of {report['radius_mm']:g} mm, {report['clusters']} clusters, "

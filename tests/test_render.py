@@ -46,6 +46,11 @@ def test_key_table_has_a_row_for_every_key():
     assert [row.split(" | ")[0] for row in rows] == [f"| {line.key}" for line in KEY_MAP]
 
 
+def test_the_readme_has_the_key_map():
+    readme = Path(__file__).parents[1] / "README.md"
+    assert key_table() in readme.read_text("utf-8")
+
+
 def test_key_map_and_window_agree():
     window = pytest.importorskip("render.window")
     bound = set(window.HELD) | set(window.TOGGLES) | set(window.PRESSED_ONCE) | {"h"}

@@ -237,6 +237,19 @@ def test_a_volume_is_trilinear_between_voxels_and_ends_half_a_voxel_beyond(devic
     assert found.to_numpy() == pytest.approx(np.array(wanted), abs=1e-5)
 
 
+def test_a_volume_of_one_slice_is_sampled_within_its_thickness(device):
+    volume = Volume(np.full((3, 3, 1), 5.0, np.float32), np.eye(4))
+    found = ti.field(ti.f32, 2)
+
+    @ti.kernel
+    def ask():
+        found[0] = volume.sample(ti.Vector([1.2, 0.7, 0.3]))
+        found[1] = volume.sample(ti.Vector([1.2, 0.7, 0.7]))
+
+    ask()
+    assert found.to_numpy() == pytest.approx([5.0, -1000.0])
+
+
 def test_distance_volume_is_signed(device, ball):
     volume = distance_volume(trimesh.creation.icosphere(subdivisions=4, radius=10.0), 1.0)
     values = volume.voxels.to_numpy()

@@ -34,14 +34,15 @@ class Volume:
         value = self.outside
         if (at >= -0.5).all() and (at <= last + 0.5).all():
             clamped = ti.math.clamp(at, 0.0, last)
-            base = ti.min(ti.cast(clamped, ti.i32), ti.cast(last, ti.i32) - 1)
+            base = ti.cast(clamped, ti.i32)
             t = clamped - base
             value = 0.0
             for corner in ti.static(ti.grouped(ti.ndrange(2, 2, 2))):
                 weight = 1.0
                 for axis in ti.static(range(3)):
                     weight *= t[axis] if ti.static(corner[axis] == 1) else 1.0 - t[axis]
-                value += weight * self.voxels[base + corner]
+                # At the last voxel the next one has no weight, but must be there.
+                value += weight * self.voxels[ti.min(base + corner, ti.cast(last, ti.i32))]
         return value
 
 
