@@ -121,7 +121,8 @@ class ShapeContacts:
     def keep_out(self):
         """Leave no particle inside a shape: exact projections of those that the averaging left there.
 
-        Where shapes leave no room for the contact radius, its half, then the centre alone must be clear.
+        Where shapes leave no room for the contact radius, its half, then the centre alone must be clear. Where they
+        overlap, so that each sends a particle into the other, it leaves through that side of a tool which is free.
         """
         for i in range(self.body.count):
             x = self.body.estimate[i]
@@ -138,16 +139,36 @@ class ShapeContacts:
                                 clear = 0
                     if sweep % 2 == 1:
                         radius = radius / 2 if sweep < KEEP_OUT_SWEEPS - 3 else 0.0
+            if clear == 0:
+                x = self.leave_by_a_free_side(x)
             self.body.estimate[i] = x
+
+    @ti.func
+    def leave_by_a_free_side(self, x):
+        """The nearest point that is out of a tool through one of its sides, and out of every other shape as well."""
+        best, least = x, FAR
+        if self.depth_inside(x) > ROUNDING:
+            for s in ti.static(range(len(self.shapes))):
+                if ti.static(self.shapes[s].moves):
+                    for k in range(self.shapes[s].count):
+                        out = self.shapes[s].way_out(x, k)
+                        if (out - x).norm() < least and self.depth_inside(out) <= ROUNDING:
+                            best, least = out, (out - x).norm()
+        return best
+
+    @ti.func
+    def depth_inside(self, x):
+        """How deep x lies inside the shapes [mm]; negative outside."""
+        depth = -FAR
+        for s in ti.static(range(len(self.shapes))):
+            depth = ti.max(depth, -self.shapes[s].surface(x).w)
+        return depth
 
     @ti.kernel
     def measure_penetration(self) -> float:
         """Deepest a particle's centre lies inside a shape at the moment [mm], 0 where none does."""
         self.penetration[None] = 0.0
         for i in range(self.body.count):
-            p = self.body.position[i]
-            for s in ti.static(range(len(self.shapes))):
-                near = self.shapes[s].surface(p)
-                # The maximum of numbers does not depend on the order, so this atomic keeps runs alike.
-                ti.atomic_max(self.penetration[None], -near.w)
+            # The maximum of numbers does not depend on the order, so this atomic keeps runs alike.
+            ti.atomic_max(self.penetration[None], self.depth_inside(self.body.position[i]))
         return self.penetration[None]

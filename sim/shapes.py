@@ -14,6 +14,7 @@ from sim.distance import signed_distance
 
 FAR = 1e6
 FACE, EDGE, VERTEX = 0, 1, 4
+HAIR = 1e-3
 Points = ti.types.ndarray(ti.f32, ndim=2)
 Rows = ti.types.ndarray(ti.i32, ndim=2)
 Floats = ti.types.ndarray(ti.f32, ndim=1)
@@ -113,6 +114,14 @@ class ConvexTool:
     def _set_pose(self, pose: tm.mat4, step_back: tm.mat4):
         self.pose[None] = pose
         self.step_back[None] = step_back
+
+    @ti.func
+    def way_out(self, p, k):
+        """The nearest point to p outside half-space k, which is out of the tool, and a hair more."""
+        pose = self.pose[None]
+        plane = self.half_space[k]
+        local = pose[:3, :3].transpose() @ (p - pose[:3, 3])
+        return p + (plane.w - plane.xyz.dot(local) + HAIR) * (pose[:3, :3] @ plane.xyz)
 
     @ti.func
     def motion(self, p):

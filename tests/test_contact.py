@@ -168,6 +168,21 @@ def test_no_particle_ends_a_step_inside_tool_or_floor(device, ball, speed_mm_s):
     assert deepest < 1e-3
 
 
+def test_a_tool_driven_into_the_floor_leaves_no_particle_in_either(device, ball):
+    tool = ConvexTool.cuboid(np.array([16.0, 8.0, 20.0]))
+    floor = trimesh.creation.box([80, 80, 30])
+    floor.apply_translation([0, 0, -27.1])
+    solver = solver_of(ball, [TriangleMesh(floor.vertices, floor.faces, 4.0), tool], tool=tool)
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    for step in range(60):
+        poses[:, 2, 3] = 23.0 - 0.7 * (step + np.arange(4) / 3)
+        solver.step(StepSettings(), poses)
+        assert solver.contacts.measure_penetration() <= 1e-3
+    # The face is 16 mm under the floor's top.
+    assert poses[-1, 2, 3] - 10.0 < -27.0
+    assert np.isfinite(position(solver)).all()
+
+
 def test_pressing_squeezes_between_tool_and_floor(device, ball):
     tool = ConvexTool.cuboid(np.array([40.0, 40.0, 10.0]))
     solver = solver_of(ball, [Plane(np.array([0.0, 0.0, 1.0]), -12.0), tool], tool=tool)
