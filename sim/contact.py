@@ -7,6 +7,8 @@ from sim.body import Body
 from sim.shapes import FAR
 
 KEEP_OUT_SWEEPS = 8
+# How far around a static shape its distances must be known, in particle radii.
+REACH_RADII = 2.0
 # Float32 positions of a body of 200 mm carry about 1e-5 mm; distances are compared with room for that.
 ROUNDING = 1e-4
 SAFETY = 1e-3
@@ -18,18 +20,21 @@ class ShapeContacts:
 
     ``plane`` (shapes, n): normal and offset of n . x >= offset [mm]. ``push`` (shapes, n): friction (x, y, z) and
     normal (w) displacement so far [mm]. As the clusters keep momentum, the sums of the pushes are the impulses
-    exchanged with the shape, so Coulomb's law holds for them: |friction| <= coefficient * normal.
+    exchanged with the shape, so Coulomb's law holds for them: |friction| <= coefficient * normal. A coefficient of 0
+    takes no memory for pushes and no time.
     """
 
     def __init__(self, body: Body, shapes: list, friction: float) -> None:
         self.body = body
         self.shapes = list(shapes)
         self.friction = friction
+        self.rough = friction > 0
         self.margin = body.rest_body.radius_mm / 2
         # A mesh knows no distances beyond its reach, so "farther than that" is all that can be remembered.
-        self.reach = 2 * body.rest_body.radius_mm
+        self.reach = REACH_RADII * body.rest_body.radius_mm
         self.plane = ti.Vector.field(4, ti.f32, (len(shapes), body.count))
-        self.push = ti.Vector.field(4, ti.f32, (len(shapes), body.count))
+        if self.rough:
+            self.push = ti.Vector.field(4, ti.f32, (len(shapes), body.count))
         self.touched = ti.field(ti.i32, body.count)
         self.found = ti.Vector.field(4, ti.f32, (len(shapes), body.count))
         self.forget()
@@ -61,7 +66,8 @@ class ShapeContacts:
                         plane = tm.vec4(near.xyz, near.xyz.dot(p) - near.w + radius)
                         touched += 1
                 self.plane[s, i] = plane
-                self.push[s, i] = tm.vec4(0.0)
+                if ti.static(self.rough):
+                    self.push[s, i] = tm.vec4(0.0)
             self.touched[i] = touched
 
     @ti.func
@@ -84,38 +90,50 @@ class ShapeContacts:
 
     @ti.func
     def project(self, relaxation_factor: float):
-        """Lines 18-20 for the contact group: averaged pushes out of the shapes, with their friction.
-
-        Friction opposes the particle's motion along the surface since the start of the substep, relative to the
-        shape's own (Macklin 2014, Eq. 24), up to the coefficient times all of the normal push so far.
-        """
+        """Lines 18-20 for the contact group: pushes out of the shapes with their friction, averaged over the shapes."""
         for i in range(self.body.count):
             if self.touched[i] > 0:
                 x = self.body.estimate[i]
-                moved = x - self.body.position[i]
                 change, active = tm.vec3(0.0), 0
                 for s in ti.static(range(len(self.shapes))):
-                    plane, push = self.plane[s, i], self.push[s, i]
-                    depth = plane.w - plane.xyz.dot(x)
-                    if depth > 0.0 or push.w > 0.0:
+                    plane = self.plane[s, i]
+                    depth = ti.max(plane.w - plane.xyz.dot(x), 0.0)
+                    pushed = depth > 0.0
+                    if ti.static(self.rough):
+                        pushed = pushed or self.push[s, i].w > 0.0
+                    if pushed:
                         active += 1
                 # A push beyond the surface would throw the particle off: averaging is undone, no more.
                 share = ti.min(relaxation_factor / ti.cast(ti.max(active, 1), ti.f32), 1.0)
                 for s in ti.static(range(len(self.shapes))):
-                    plane, push = self.plane[s, i], self.push[s, i]
-                    depth = ti.max(plane.w - plane.xyz.dot(x), 0.0)
-                    normal_push = push.w + share * depth
-                    if normal_push > 0.0:
-                        slip = moved - self.shapes[s].motion(x)
-                        slip -= slip.dot(plane.xyz) * plane.xyz
-                        friction = push.xyz - share * slip
-                        limit = self.friction * normal_push
-                        length = friction.norm()
-                        if length > limit:
-                            friction *= limit / length
-                        change += share * depth * plane.xyz + friction - push.xyz
-                        self.push[s, i] = tm.vec4(friction, normal_push)
+                    plane = self.plane[s, i]
+                    depth = share * ti.max(plane.w - plane.xyz.dot(x), 0.0)
+                    change += depth * plane.xyz
+                    if ti.static(self.rough):
+                        change += self.rub(s, i, x, plane.xyz, depth, share)
                 self.body.estimate[i] = x + change
+
+    @ti.func
+    def rub(self, s: ti.template(), i, x, normal, depth, share):
+        """Friction's displacement of particle i by shape s, which pushes it by a further depth now.
+
+        It opposes the motion along the surface since the start of the substep, relative to the shape's own (Macklin
+        2014, Eq. 24), up to the coefficient times all of the normal push so far.
+        """
+        push = self.push[s, i]
+        normal_push = push.w + depth
+        change = tm.vec3(0.0)
+        if normal_push > 0.0:
+            slip = x - self.body.position[i] - self.shapes[s].motion(x)
+            slip -= slip.dot(normal) * normal
+            friction = push.xyz - share * slip
+            limit = self.friction * normal_push
+            length = friction.norm()
+            if length > limit:
+                friction *= limit / length
+            change = friction - push.xyz
+            self.push[s, i] = tm.vec4(friction, normal_push)
+        return change
 
     @ti.func
     def keep_out(self):

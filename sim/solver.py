@@ -12,6 +12,9 @@ from sim.neighbours import ParticleContacts
 from sim.shape_matching import ShapeMatching
 from sim.shapes import ConvexTool
 
+# Far from the origin the scaled masses must still have room in float32.
+MOST_EXPONENT = 30.0
+
 
 @dataclass
 class StepSettings:
@@ -94,7 +97,8 @@ class Solver:
             self.body.estimate[i] = self.body.position[i] + dt * velocity
             if ti.static(self.body.mass_scaled):  # line 4, with the height against gravity
                 height = -gravity.dot(self.body.estimate[i]) / ti.max(gravity.norm(), 1e-12)
-                self.body.mass_scale[i] = ti.exp(-self.body.mass_scaling_per_mm * height)
+                exponent = tm.clamp(self.body.mass_scaling_per_mm * height, -MOST_EXPONENT, MOST_EXPONENT)
+                self.body.mass_scale[i] = ti.exp(-exponent)
 
     @ti.kernel
     def stabilise(self):

@@ -10,7 +10,7 @@ import trimesh
 from scenes.anatomy import Grid, LoadedAnatomy, press_on
 from scenes.scene import PlaneShape, Scene
 from sim.body import Body, fill_body
-from sim.contact import ShapeContacts
+from sim.contact import REACH_RADII, ShapeContacts
 from sim.embedding import Embedding
 from sim.neighbours import ParticleContacts
 from sim.shape_matching import ShapeMatching
@@ -94,13 +94,9 @@ class Rehearsal:
             return Plane(normal, shape.offset_mm / np.linalg.norm(shape.normal) - normal @ self.origin)
         if isinstance(shape, trimesh.Trimesh):
             moved = _shifted(shape, -self.origin)
-            return TriangleMesh(moved.vertices, moved.faces, self.contacts_reach())
+            return TriangleMesh(moved.vertices, moved.faces, REACH_RADII * self.scene.tissue.radius_mm)
         spacing = 1 / np.diag(shape.index_from_mm)[:3]
         return SignedDistanceField(shape.voxels, -spacing * shape.index_from_mm[:3, 3] - self.origin, spacing)
-
-    def contacts_reach(self) -> float:
-        """How far from a static shape its distances must be known [mm]."""
-        return 2 * self.scene.tissue.radius_mm
 
     def _build_surfaces(self) -> None:
         self.organ_skin = Skin(self.model, self.organ.vertices)

@@ -209,3 +209,5 @@ def test_what_a_scene_switches_off_is_not_there(device, block):
     solver = solver_of(block)
     assert not hasattr(solver.body, "mass_scale") and solver.contacts is None and solver.pairs is None
     assert hasattr(solver_of(block, scaling=0.1).body, "mass_scale")
+    floor = Plane(np.array([0.0, 0.0, 1.0]), -8.0)
+    assert not hasattr(solver_of(block, [floor], friction=0.0).contacts, "push")
