@@ -44,7 +44,7 @@ def load_anatomy(scene: Scene, folder: Path) -> LoadedAnatomy:
     anatomy = scene.anatomy
     if anatomy.phantom:
         folder = phantom_folder()
-        anatomy = Anatomy(tumour="tumour.stl")
+        anatomy = Anatomy(tumour="tumour.stl", ct="ct.nrrd")
     return LoadedAnatomy(
         organ=_surface(folder, anatomy.organ),
         tumour=_surface(folder, anatomy.tumour) if anatomy.tumour else None,
@@ -84,7 +84,7 @@ def patient_scene(patient: Patient) -> Scene:
     return Scene(
         image=Image(window_hu=max(brightest - darkest, LEAST_WINDOW_HU), level_hu=(brightest + darkest) / 2),
         title=f"{patient.side.capitalize()} kidney",
-        anatomy=Anatomy(tumour=tumour),
+        anatomy=Anatomy(tumour=tumour, ct="ct.nrrd"),
         shape=(MeshShape(kind="mesh", file="support.stl"),),
     )
 

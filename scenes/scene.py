@@ -35,12 +35,12 @@ class Section(BaseModel):
 
 
 class Anatomy(Section):
-    """The patient's folder, as ``app.py import`` writes it, or the embedded patient."""
+    """The embedded patient, or files beside the scene; without a CT there is no picture."""
 
     phantom: bool = False
     organ: str = "organ.stl"
     tumour: str | None = None
-    ct: str | None = "ct.nrrd"
+    ct: str | None = None
 
 
 class Tissue(Section):

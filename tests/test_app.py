@@ -166,7 +166,6 @@ def test_mistakes_are_one_line_and_exit_status_2(tmp_path):
 def test_an_organ_too_small_for_its_particles_is_refused_in_one_line(tmp_path):
     trimesh.creation.icosphere(subdivisions=2, radius=3.0).export(tmp_path / "organ.stl")
     (tmp_path / "scene.toml").write_text("[anatomy]\n[tissue]\nradius_mm = 20.0\n")
-    sitk.WriteImage(sitk.Image(8, 8, 8, sitk.sitkInt16), str(tmp_path / "ct.nrrd"))
     assert "choose a smaller radius" in refused("rehearse", tmp_path, "--headless", "--out", tmp_path / "out")
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import SimpleITK as sitk
+import trimesh
 from conftest import DATA, ROOT
 
 from scenes.anatomy import load_anatomy, patient_scene, phantom_folder
@@ -150,3 +151,30 @@ def test_a_pressed_scene_without_ct_still_moves(device, tmp_path):
     rehearsal.advance(rehearsal.scripted_pose(1.0))
     assert rehearsal.slice is None
     assert not rehearsal.image(350, 40, 60).any()
+
+
+def test_every_feature_at_once_stays_finite_and_out_of_everything(device, tmp_path):
+    trimesh.creation.icosphere(subdivisions=3, radius=20.0).export(tmp_path / "organ.stl")
+    grid = np.indices((31, 31, 11)).transpose(1, 2, 3, 0) * 2.0 - [30, 30, 34]
+    bed = sitk.GetImageFromArray(
+        (grid[..., 2] + 19.0 - 0.1 * np.abs(grid[..., 0])).transpose(2, 1, 0).astype(np.float32)
+    )
+    bed.SetSpacing((2.0, 2.0, 2.0))
+    bed.SetOrigin((-30.0, -30.0, -34.0))
+    sitk.WriteImage(bed, str(tmp_path / "bed.nrrd"))
+    scene = Scene(
+        anatomy={},
+        tissue=dict(radius_mm=3.0, surface_samples_per_mm2=0.5),
+        solver=dict(relaxation="global", relaxation_factor=1.5, mass_scaling_per_mm=0.02),
+        gravity=dict(direction=(0, 0, -1)),
+        contact=dict(particles=True),
+        shape=(dict(kind="sdf", file="bed.nrrd"), dict(kind="plane", normal=(0, 0.2, 1), offset_mm=-21.0)),
+        press=dict(direction=(0.2, 0, -1), warm_up_steps=20),
+    )
+    rehearsal = Rehearsal(scene, load_anatomy(scene, tmp_path))
+    for step in range(31):
+        rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
+        assert rehearsal.contacts.measure_penetration() <= 1e-3
+    rehearsal.update_surfaces()
+    assert np.isfinite(rehearsal.body.position.to_numpy()).all()
+    assert 0.6 < rehearsal.volume_ratio() < 1.1

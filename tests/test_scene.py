@@ -97,7 +97,7 @@ def test_defaults_are_the_papers_table_1():
 
 def with_ball(folder: Path, **changes) -> Scene:
     trimesh.creation.icosphere(subdivisions=2, radius=10.0).export(folder / "organ.stl")
-    return Scene(anatomy=Anatomy(ct=None), **changes)
+    return Scene(anatomy=Anatomy(), **changes)
 
 
 def test_files_that_a_scene_names_are_checked(tmp_path):
@@ -114,7 +114,7 @@ def test_files_that_a_scene_names_are_checked(tmp_path):
         load_anatomy(scene, tmp_path)
     with_ball(tmp_path)
     with pytest.raises(SceneError, match="ct.nrrd: no such file"):
-        load_anatomy(Scene(anatomy=Anatomy()), tmp_path)
+        load_anatomy(Scene(anatomy=Anatomy(ct="ct.nrrd")), tmp_path)
 
 
 def test_a_ct_keeps_its_place_in_the_patient(tmp_path):
@@ -124,7 +124,7 @@ def test_a_ct_keeps_its_place_in_the_patient(tmp_path):
     image.SetDirection((-1, 0, 0, 0, -1, 0, 0, 0, 1))
     sitk.WriteImage(image, str(tmp_path / "ct.nrrd"))
     with_ball(tmp_path)
-    ct = load_anatomy(Scene(anatomy=Anatomy()), tmp_path).ct
+    ct = load_anatomy(Scene(anatomy=Anatomy(ct="ct.nrrd")), tmp_path).ct
     point = np.array([*image.TransformIndexToPhysicalPoint((3, 4, 2)), 1.0])
     assert ct.index_from_mm @ point == pytest.approx([3, 4, 2, 1])
     assert ct.voxels[3, 4, 2] == image[3, 4, 2]
