@@ -1,5 +1,7 @@
 """Shapes against closed forms, and contacts that leave nothing inside."""
 
+from itertools import pairwise
+
 import igl
 import numpy as np
 import pytest
@@ -98,7 +100,13 @@ def test_triangle_mesh_has_the_exact_distance_and_sign(device, ball, kind):
     mesh = ball if kind == "ball" else notched_block()
     reach = 5.0
     shape = TriangleMesh(mesh.vertices, mesh.faces, reach)
-    points = np.concatenate([scattered(), mesh.vertices, mesh.triangles_center, mesh.vertices * 0.97])
+    along = np.random.default_rng(6).uniform(0.1, 0.9, (20, len(mesh.edges_unique), 1))
+    ends = mesh.vertices[mesh.edges_unique]
+    beside_edges = (ends[:, 0] + along * (ends[:, 1] - ends[:, 0])).reshape(-1, 3)
+    beside_edges += np.random.default_rng(7).normal(0, 0.3, beside_edges.shape)
+    points = np.concatenate(
+        [scattered(), mesh.vertices, mesh.triangles_center, mesh.vertices * 0.97, beside_edges]
+    )
     normals, distance = measured(shape, points)
     exact = igl.signed_distance(points, np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64))[0]
     near = (exact < reach) & (exact > -1.5)
@@ -230,6 +238,16 @@ def test_stabilisation_gets_out_without_adding_velocity(device, ball):
     assert fastest[1] < 0.1
 
 
+def test_stabilisation_moves_position_and_estimate_alike(device, ball):
+    solver = solver_of(ball, [Plane(np.array([0.0, 0.0, 1.0]), -10.0)])
+    solver.begin(1 / 180, ti.Vector([0.0, 0.0, -9810.0]), 12.0)
+    before = position(solver), solver.body.estimate.to_numpy()
+    solver.stabilise()
+    moved = position(solver) - before[0], solver.body.estimate.to_numpy() - before[1]
+    assert moved[0][:, 2].max() > 1.0
+    assert moved[1] == pytest.approx(moved[0], abs=1e-5)
+
+
 def two_blocks(pairs: bool, scaling: float = 0.0) -> tuple[Solver, np.ndarray]:
     """One block over another on a floor, and which particles are the upper one's."""
     lower = trimesh.creation.box([12.0, 12.0, 8.0])
@@ -271,6 +289,51 @@ def test_contacts_of_particles_keep_momentum_of_a_symmetric_hit(device):
     assert v[~upper, 2].mean() < 20
     # Averaging divides a particle's pushes by its own count: pairs of unlike counts leave a little over.
     assert np.abs(v.sum(axis=0) - velocity.sum(axis=0)).max() < 0.1 * np.abs(velocity).sum()
+
+
+def test_neighbours_are_all_that_are_near_in_ascending_order(device):
+    solver, upper = two_blocks(True)
+    x = position(solver)
+    x[upper, 2] -= 7.0
+    solver.body.position.from_numpy(x.astype(np.float32))
+    solver.begin(0.0, ti.Vector([0.0, 0.0, 0.0]), 0.0)
+    count, rows = solver.pairs.neighbour_count.to_numpy(), solver.pairs.neighbour.to_numpy()
+    apart = np.linalg.norm(x[:, None] - x[None], axis=2)
+    clusters = [
+        set(solver.model.cluster.to_numpy()[a:b]) for a, b in pairwise(solver.model.cluster_offset.to_numpy())
+    ]
+    for i in range(len(x)):
+        near = [
+            j
+            for j in np.flatnonzero(apart[i] < solver.pairs.reach)
+            if j != i and not clusters[i] & clusters[j]
+        ]
+        assert rows[i, : count[i]].tolist() == near[:24]
+    assert count.max() > 5
+
+
+def test_a_pair_shares_its_push_by_the_scaled_masses(device):
+    solver, upper = two_blocks(True, scaling=0.5)
+    x = position(solver)
+    x[upper, 2] -= 5.0
+    solver.body.position.from_numpy(x.astype(np.float32))
+    solver.begin(0.0, ti.Vector([0.0, 0.0, -1e-3]), 0.0)
+    pairs = solver.pairs
+
+    @ti.kernel
+    def project():
+        pairs.project(1.0, False)
+
+    project()
+    moved = np.linalg.norm(solver.body.estimate.to_numpy() - x, axis=1)
+    apart = np.linalg.norm(x[upper][:, None] - x[~upper][None], axis=2) < pairs.distance
+    top, bottom = np.flatnonzero(upper), np.flatnonzero(~upper)
+    alone = [(i, j) for i, j in np.argwhere(apart) if apart[i].sum() == 1 and apart[:, j].sum() == 1]
+    assert len(alone) > 3
+    for i, j in alone:
+        # m ~ exp(-k h), each moves by the other's share of both.
+        height = x[top[i], 2] - x[bottom[j], 2]
+        assert moved[bottom[j]] / moved[top[i]] == pytest.approx(np.exp(-0.5 * height), rel=1e-3)
 
 
 def test_scaled_masses_make_the_lower_of_a_pair_the_heavier(device):

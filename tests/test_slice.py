@@ -163,6 +163,27 @@ def test_every_pixel_finds_the_tetrahedron_that_holds_it(device, ball):
             assert least[owner[row, column]] > -1e-4
 
 
+def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(device, ball):
+    def folded(x):
+        return np.column_stack([x[:, 0], x[:, 1], np.abs(x[:, 2] - 1.0)])
+
+    cut, plane, _, embedding = sliced(ball, ramp_image(), folded)
+    corners = embedding.skin.vertices.to_numpy().astype(float)[embedding.tetrahedron.to_numpy()]
+    edges = np.moveaxis(corners[:, :3] - corners[:, 3:], 1, 2)
+    solid = np.abs(np.linalg.det(edges)) > 0.1
+    inverse = np.zeros_like(edges)
+    inverse[solid] = np.linalg.inv(edges[solid])
+    points, owner = pixel_points(plane, 96), cut.owner.to_numpy()
+    overlaps = 0
+    for row, column in np.argwhere(owner != NOWHERE)[::7]:
+        weights = np.einsum("tij,tj->ti", inverse, points[row, column] - corners[:, 3])
+        least = np.minimum(weights.min(axis=1), 1 - weights.sum(axis=1))
+        holds = np.flatnonzero(solid & (least > 1e-3))
+        overlaps += len(holds) > 1
+        assert len(holds) == 0 or owner[row, column] <= holds[0]
+    assert overlaps > 50
+
+
 @pytest.mark.parametrize("squash", [(1, 1, 0), (1, 0, 0), (0, 0, 0), (1, 1, -1), (1, 1, 1e-6)])
 def test_flat_collapsed_and_inverted_tissue_still_gives_a_picture(device, ball, squash):
     cut, _, _, embedding = sliced(ball, ramp_image(), lambda x: x * np.array(squash) + [0, 0, 3.0])
