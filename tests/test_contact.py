@@ -140,6 +140,22 @@ def notched_block() -> trimesh.Trimesh:
     return mesh
 
 
+def test_triangle_mesh_knows_the_sides_of_sharp_edges(device):
+    # A blade: at edges of 10 degrees a neighbouring face's normal alone tells the wrong side.
+    blade = trimesh.convex.convex_hull(
+        [(0, 0, -6), (14, 1.2, -6), (14, -1.2, -6), (0, 0, 6), (14, 1.2, 6), (14, -1.2, 6)]
+    )
+    tilted = trimesh.convex.convex_hull([(0, 0, 0), (12, 8, 0.5), (12, -8, 0.5), (13, 0, -0.5)])
+    for mesh in (blade, tilted):
+        shape = TriangleMesh(mesh.vertices, mesh.faces, 4.0)
+        ends = mesh.vertices[mesh.edges_unique]
+        along = np.random.default_rng(6).uniform(0.02, 0.98, (300, len(ends), 1))
+        points = (ends[:, 0] + along * (ends[:, 1] - ends[:, 0])).reshape(-1, 3)
+        points += np.random.default_rng(7).normal(0, 0.4, points.shape)
+        exact = igl.signed_distance(points, np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64))[0]
+        assert np.abs(measured(shape, points)[1] - exact).max() < 1e-4
+
+
 def test_a_body_laid_in_a_mould_of_its_shape_does_not_move_without_gravity(device, ball):
     outside = trimesh.creation.box([60, 60, 60])
     mould = trimesh.Trimesh(
