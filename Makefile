@@ -18,7 +18,7 @@ test: .venv/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 # The first of PYTHON that is there and of a version that Taichi has wheels for.
 .venv/bin/python:

@@ -18,7 +18,7 @@ from scenes.anatomy import load_anatomy, patient_scene
 from scenes.labels import Side
 from scenes.patient import describe, import_patient, save_patient
 from scenes.reading import PatientError, read_volume
-from scenes.scene import SceneError, load_scene, scene_text, with_options
+from scenes.scene import OPTIONS, SceneError, load_scene, scene_text, with_options
 from sim.sampling import SamplingError
 
 if TYPE_CHECKING:
@@ -82,13 +82,10 @@ def rehearse(
 ) -> None:
     """Press the kidney of SCENE, a scene file or a patient's folder, and see what the transducer sees."""
     path = scene / "scene.toml" if scene.is_dir() else scene
-    options = {
-        "tissue.radius_mm": radius,
-        "tissue.stiffness": stiffness,
-        "solver.substeps": substeps,
-        "solver.iterations": iterations,
-    }
-    loaded = with_options(load_scene(path), options)
+    if scene.is_dir() and not path.is_file():
+        raise Fault(f"{scene}: holds no scene.toml; make a patient's folder of a CT with: app.py import")
+    values = (radius, stiffness, substeps, iterations)
+    loaded = with_options(load_scene(path), dict(zip(OPTIONS, values, strict=True)))
     anatomy = load_anatomy(loaded, path.parent)
     from sim.device import NoDevice, start
 
@@ -103,6 +100,7 @@ def rehearse(
         click.echo("No display: running the scripted press without a window.")
         headless = True
     make_folder(out)
+    click.echo("Building the model.")
     started = perf_counter()
     rehearsal = Rehearsal(loaded, anatomy)
     if headless:
@@ -259,10 +257,10 @@ def run_headless(rehearsal: "Rehearsal", arch: str, seconds: float | None, out: 
     animation: list[Image.Image] = []
     for step in tqdm(range(1, steps + 1), desc="press", unit="step"):
         pose = rehearsal.scripted_pose(rehearsal.script_length_s() * step / steps)
-        view = run_frame(rehearsal, settings, partial(rehearsal.advance, pose), record)
+        view = run_frame(rehearsal, settings, partial(rehearsal.follow, pose), record)
         record.watch(rehearsal)
         if step % every == 0 or step == steps:
-            picture = Image.fromarray(view.slice_image)
+            picture = in_proportion(view)
             picture.save(slices / f"{step:05d}.png")
             if viewer is not None:
                 viewer.draw(view)
@@ -286,8 +284,8 @@ def run_window(rehearsal: "Rehearsal", out: Path) -> None:
     except NoVulkan as reason:
         raise Fault(f"{reason}; install a Vulkan driver, or run with --headless") from None
     record = Record(0.0)
+    click.echo("The window is open; H shows the keys, Esc quits.")
     frozen = False
-    shots = 0
     before = perf_counter()
     rate = 0.0
     view = run_frame(rehearsal, viewer.settings, lambda: rehearsal.advance(rehearsal.pose), record)
@@ -300,10 +298,10 @@ def run_window(rehearsal: "Rehearsal", out: Path) -> None:
         rate = 0.9 * rate + 0.1 / max(now - before, 1e-6)
         before = now
         view.readouts["frames"] = f"{rate:.0f} /s"
+        view.readouts["time"] = f"{rate * rehearsal.settings.time_step_s:.1f} x real"
         viewer.draw(view)
         if controls.screenshot:
-            shots += 1
-            Image.fromarray(viewer.picture()).save(out / f"screenshot-{shots:03d}.png")
+            save_screenshot(viewer.picture(), out)
     viewer.close()
 
 
@@ -320,6 +318,21 @@ def steer(rehearsal: "Rehearsal", controls: "Controls") -> Callable[[], None]:
     hand.push(controls.push_mm)
     hand.turn(controls.fan_deg, controls.tilt_deg, controls.roll_deg)
     return lambda: rehearsal.follow(hand.pose())
+
+
+def save_screenshot(picture: np.ndarray, out: Path) -> None:
+    """Save a picture under the next free number, and say where."""
+    number = 1 + max([int(path.stem[-3:]) for path in out.glob("screenshot-[0-9][0-9][0-9].png")], default=0)
+    path = out / f"screenshot-{number:03d}.png"
+    Image.fromarray(picture).save(path)
+    click.echo(f"Saved {path}")
+
+
+def in_proportion(view: "View") -> Image.Image:
+    """The slice with square pixels, as wide as it was sampled."""
+    picture = Image.fromarray(view.slice_image)
+    height = round(picture.width * view.depth_mm / view.width_mm)
+    return picture.resize((picture.width, height), Image.Resampling.BILINEAR)
 
 
 def empty_folder(folder: Path) -> Path:

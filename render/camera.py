@@ -9,6 +9,7 @@ import numpy as np
 
 FIELD_OF_VIEW_DEG = 28.0
 MARGIN = 1.04
+HOME_DEG = (20.0, 32.0)
 
 
 class OrbitCamera:
@@ -24,10 +25,11 @@ class OrbitCamera:
     def __init__(self, bounds, up, part, aspect: float):
         bounds = np.asarray(bounds, dtype=np.float64)
         self.up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
-        self.target = bounds.mean(axis=0)
+        self._middle = bounds.mean(axis=0)
+        self.target = self._middle
         self.aspect = aspect
         self.part = part
-        self.azimuth_deg, self.elevation_deg = 20.0, 32.0
+        self.azimuth_deg, self.elevation_deg = HOME_DEG
         # The long side of the organ lies across the view: that is how a kidney is looked at.
         flat = np.eye(3) - np.outer(self.up, self.up)
         spread = (bounds[1] - bounds[0]) * np.linalg.norm(flat, axis=1)
@@ -35,6 +37,12 @@ class OrbitCamera:
         self._side = side / np.linalg.norm(side)
         self._ahead = np.cross(self.up, self._side)
         self.distance = self.distance_home = self._distance_that_frames(bounds)
+
+    def go_home(self) -> None:
+        """Back to where it started from."""
+        self.target = self._middle
+        self.azimuth_deg, self.elevation_deg = HOME_DEG
+        self.distance = self.distance_home
 
     def _distance_that_frames(self, bounds: np.ndarray) -> float:
         corners = np.array(

@@ -5,7 +5,6 @@ The scene is a parameter, so that taichi.ui is imported by window.py alone. Leng
 
 import numpy as np
 import taichi as ti
-from scipy.spatial import cKDTree
 
 from render import solids
 from render.camera import OrbitCamera
@@ -17,8 +16,6 @@ KEY_LIGHT, FILL_LIGHT, AMBIENT = (0.82, 0.80, 0.77), (0.17, 0.19, 0.23), (0.17, 
 TUMOUR, SUPPORT, EDGE, FRAME = (0.93, 0.76, 0.28), (0.30, 0.33, 0.36), (0.85, 0.9, 0.94), (0.25, 0.77, 1.0)
 LINE_WIDTH = 1.2
 MASKS = 4
-# Organ and tumour have a surface each where the tumour sticks out; they differ by the smoothing of the two.
-SAME_SURFACE_MM = 1.8
 
 
 def _vector_field(values: np.ndarray):
@@ -40,7 +37,6 @@ class Stage:
         self._tumour = self._support = None
         if geometry.tumour_vertices is not None and geometry.tumour_faces is not None:
             self._tumour = Surface(geometry.tumour_vertices, geometry.tumour_faces, TUMOUR)
-            self._organ.glass_faces = _faces_apart(self._organ, self._tumour)
         if geometry.support_vertices is not None and geometry.support_faces is not None:
             self._support = self._matt_support(geometry.support_vertices, geometry.support_faces)
         self._half_axis_mm = geometry.transducer_size_mm[2] / 2
@@ -143,12 +139,6 @@ def _draw_surface(scene, surface: Surface, ahead: np.ndarray | None = None, two_
         per_vertex_color=surface.colour,
         two_sided=two_sided,
     )
-
-
-def _faces_apart(organ: Surface, tumour: Surface) -> np.ndarray:
-    """The organ's faces (m, 3) but for those that the tumour's own surface lies on, where the two would flicker."""
-    distance, _ = cKDTree(tumour.vertices.to_numpy()).query(organ.vertices.to_numpy())
-    return organ.faces[~(distance[organ.faces] < SAME_SURFACE_MM).all(axis=1)]
 
 
 def _cut(pose: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -74,14 +74,14 @@ class Surface:
 
     Args:
         vertices: ti.Vector.field(3, ti.f32), shape (n,) [mm].
-        faces: int32, shape (m, 3), normals outward; `glass_faces` are those drawn when it is translucent.
+        faces: int32, shape (m, 3), normals outward.
         base: red, green, blue in [0, 1].
         gloss: strength of the sheen; 0 is matt.
     """
 
     def __init__(self, vertices, faces: np.ndarray, base=ORGAN, gloss: float = 0.30):
         self.vertices = vertices
-        self.faces = self.glass_faces = np.ascontiguousarray(faces, dtype=np.int32)
+        self.faces = np.ascontiguousarray(faces, dtype=np.int32)
         self.base, self.gloss = base, gloss
         count = vertices.shape[0]
         start, around = faces_around_vertices(self.faces, count)
@@ -117,6 +117,4 @@ class Surface:
         """Vertex indices of the faces, int32 (3 m,), farthest first along `ahead` if given."""
         if ahead is None:
             return self.faces.reshape(-1)
-        return np.ascontiguousarray(
-            farthest_first(self.vertices.to_numpy(), self.glass_faces, ahead)
-        ).reshape(-1)
+        return np.ascontiguousarray(farthest_first(self.vertices.to_numpy(), self.faces, ahead)).reshape(-1)

@@ -5,7 +5,7 @@ Lengths are in mm, angles in degrees, patient coordinates LPS. Nothing here need
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -26,10 +26,10 @@ KEY_MAP = (
     Key("S", "lift", "lift the transducer"),
     Key("A", "roll_left", "roll about its axis, to the left"),
     Key("D", "roll_right", "roll about its axis, to the right"),
-    Key("Q", "tilt_left", "tilt in the image plane, to the left"),
-    Key("E", "tilt_right", "tilt in the image plane, to the right"),
-    Key("Z", "fan_back", "tilt out of the image plane, back"),
-    Key("C", "fan_forth", "tilt out of the image plane, forth"),
+    Key("Q", "tilt_left", "turn the beam left in the image plane"),
+    Key("E", "tilt_right", "turn the beam right in the image plane"),
+    Key("Z", "fan_back", "tilt out of the image plane, one way"),
+    Key("C", "fan_forth", "tilt out of the image plane, the other way"),
     Key("Right drag", "orbit", "turn the view"),
     Key("Shift + right drag", "pan", "shift the view (or middle drag)"),
     Key("Up", "zoom_in", "zoom in"),
@@ -37,8 +37,8 @@ KEY_MAP = (
     Key("T", "translucent", "organ translucent or solid"),
     Key("X", "cut", "cut the organ along the image plane"),
     Key("F", "freeze", "freeze and go on"),
-    Key("R", "reset", "reset tissue and transducer"),
-    Key("P", "screenshot", "save a picture of the window"),
+    Key("R", "reset", "reset tissue, transducer and view"),
+    Key("P", "screenshot", "save a picture of the window into the --out folder"),
     Key("H", "help", "show or hide this list"),
     Key("Esc", "quit", "quit"),
 )
@@ -63,7 +63,7 @@ def _switch(default: bool, label: str):
 class Settings:
     """What the sliders change. The metadata of a field (label, unit, low, high, group) is all that they are made of."""
 
-    stiffness: float = _slider(0.6, "Stiffness", "", 0.0, 1.0, "Tissue")
+    stiffness: float = _slider(0.6, "Stiffness", "", 0.1, 1.0, "Tissue")
     iterations: int = _slider(9, "Iterations", "", 1, 40, "Tissue")
     substeps: int = _slider(3, "Substeps", "", 1, 10, "Tissue")
     gravity_m_s2: float = _slider(9.81, "Gravity", "m/s2", 0.0, 20.0, "Tissue")
@@ -74,14 +74,6 @@ class Settings:
     cut: bool = _switch(False, "Cut open")
     show_tumour: bool = _switch(True, "Tumour")
     show_support: bool = _switch(True, "Support")
-
-    def check(self) -> None:
-        """Raises ValueError, naming the field, its unit and its range, if a value lies outside its range."""
-        for each in fields(self):
-            value, low, high = getattr(self, each.name), each.metadata["low"], each.metadata["high"]
-            if not low <= value <= high:
-                unit = each.metadata["unit"]
-                raise ValueError(f"{each.name} = {value} is outside [{low}, {high}] {unit}".rstrip())
 
 
 @dataclass(frozen=True)

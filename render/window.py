@@ -207,6 +207,8 @@ class Window:
             self._drag = "pan" if pans else "orbit"
         elif key in PRESSED_ONCE:
             setattr(controls, PRESSED_ONCE[key], True)
+            if controls.reset:
+                self.camera.go_home()
         elif key in TOGGLES:
             setattr(self.settings, TOGGLES[key], not getattr(self.settings, TOGGLES[key]))
         elif key == "h":

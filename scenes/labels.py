@@ -239,6 +239,11 @@ def _check_organ(ct: sitk.Image, piece: LabelledOrgan) -> None:
             f"{name} has a median of {median:.0f} HU: expected soft tissue; check that the labels belong to "
             "this CT and that the CT is in HU"
         )
+    if float(sitk.GetArrayViewFromImage(ct).min()) >= 0:
+        raise PatientError(
+            "the CT holds no value below 0: expected HU, in which fat and air are negative; give the CT first, then "
+            "the labels"
+        )
 
 
 def _physical(image: sitk.Image, indices_zyx: np.ndarray) -> np.ndarray:

@@ -57,7 +57,7 @@ def import_patient(
     organ: Sequence[int] | None = None,
     tumour: Sequence[int] | None = None,
     side: Side | None = None,
-    margin_mm: float = 30.0,
+    margin_mm: float = 60.0,
 ) -> Patient:
     """Cut one organ out of a CT and its label map and build its surfaces and its support.
 

@@ -52,6 +52,10 @@ def read_volume(path: Path) -> sitk.Image:
     elif path.name.lower().endswith(FILE_ENDINGS):
         image = _read_file(path)
     else:
+        if path.suffix.lower() == ".dcm":
+            raise PatientError(
+                f"{path}: is one slice of a DICOM series; give the folder that holds all of them"
+            )
         raise PatientError(
             f"{path}: unknown kind of file; expected a folder with a DICOM series, or a file that ends in "
             f"{', '.join(FILE_ENDINGS)}; convert it"

@@ -11,10 +11,19 @@ from typing import Annotated, Literal
 
 import numpy as np
 import tomli_w
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 Vector3 = tuple[float, float, float]
 Stiffness = Annotated[float, Field(ge=0, le=1)]
+
+
+# The command line's names for single values of a scene.
+OPTIONS = {
+    "tissue.radius_mm": "--radius",
+    "tissue.stiffness": "--stiffness",
+    "solver.substeps": "--substeps",
+    "solver.iterations": "--iterations",
+}
 
 
 class SceneError(ValueError):
@@ -42,9 +51,22 @@ class Anatomy(Section):
     tumour: str | None = None
     ct: str | None = None
 
+    @model_validator(mode="after")
+    def _one_patient(self) -> "Anatomy":
+        if self.phantom and (self.tumour or self.ct or self.organ != "organ.stl"):
+            raise ValueError(
+                "phantom = true is the embedded patient, which has files of its own: name no others"
+            )
+        return self
+
 
 class Tissue(Section):
-    """The tissue model and its sampling; the defaults are the paper's, but for the stiffness, which it fits."""
+    """The tissue model and its sampling; the defaults are the paper's, but for the stiffness, which it fits.
+
+    Particles are ``radius_mm`` apart, chosen from voxels of ``radius_mm / volume_sampling``; clusters are
+    ``cluster_spacing`` radii apart and reach as far. The tissue's stiffness depends on all of these and on the
+    solver's iterations, not on ``stiffness`` alone: that is this method's limitation.
+    """
 
     model: Literal["shape-matching"] = "shape-matching"
     radius_mm: float = Field(2.7, ge=0.5, le=20)
@@ -132,7 +154,7 @@ class Press(Section):
     lateral: Direction | None = None
     warm_up_steps: int = Field(120, ge=0, le=100000)
     stage_steps: int = Field(90, ge=1, le=100000)
-    indentations_mm: tuple[float, ...] = (5.95, 9.48, 12.38)
+    indentations_mm: tuple[Annotated[float, Field(ge=0, le=40)], ...] = (5.95, 9.48, 12.38)
 
 
 class Scene(Section):
@@ -171,15 +193,18 @@ def with_options(scene: Scene, options: dict[str, float | int | None]) -> Scene:
 
     Raises SceneError for a value out of range.
     """
-    values = scene.model_dump()
+    values = scene.model_dump(exclude_unset=True)
     for name, value in options.items():
         if value is not None:
             section, key = name.split(".")
-            values[section][key] = value
+            values.setdefault(section, {})[key] = value
     try:
         return Scene.model_validate(values)
     except ValidationError as error:
-        raise SceneError(f"command line: {_explain(error)}") from None
+        text = _explain(error)
+        for key, option in OPTIONS.items():
+            text = text.replace(key, option)
+        raise SceneError(text) from None
 
 
 def scene_text(scene: Scene) -> str:

@@ -25,6 +25,8 @@ from ultrasound.volume import Volume, distance_volume
 EMBEDDING_CELL_RADII = 2.0
 TURN_DEG_S = 180.0
 AWAY_MM = 200.0
+# Where the tumour sticks out, the organ has the same surface: the tumour's is drawn this far outside it.
+TUMOUR_LIFT_MM = 0.8
 # How far around the organ the tissue in the picture gives way to it.
 SURROUNDINGS_MM = 25.0
 
@@ -100,7 +102,10 @@ class Rehearsal:
 
     def _build_surfaces(self) -> None:
         self.organ_skin = Skin(self.model, self.organ.vertices)
-        self.tumour_skin = None if self.tumour is None else Skin(self.model, self.tumour.vertices)
+        self.tumour_skin = None
+        if self.tumour is not None:
+            drawn = self.tumour.vertices + TUMOUR_LIFT_MM * self.tumour.vertex_normals
+            self.tumour_skin = Skin(self.model, drawn)
 
     def _build_slice(self, anatomy: LoadedAnatomy) -> None:
         image = self.scene.image
@@ -148,7 +153,11 @@ class Rehearsal:
     def follow(self, goal: np.ndarray) -> None:
         """Advance one time step with the transducer going towards a pose, no faster than a hand can."""
         most_mm = self.scene.transducer.speed_mm_s * self.settings.time_step_s
-        self.advance(approached(self.pose, goal, most_mm, TURN_DEG_S * self.settings.time_step_s))
+        pose = approached(self.pose, goal, most_mm, TURN_DEG_S * self.settings.time_step_s)
+        # Between two places of the surface the straight way leads through the organ: go over it.
+        wanted = max(indentation(goal, self.size_mm, self.hand.samples), 0.0)
+        through = indentation(pose, self.size_mm, self.hand.samples) - max(wanted, self.indentation_mm())
+        self.advance(advanced(pose, -through) if through > 0 else pose)
 
     def advance(self, pose: np.ndarray) -> None:
         """Advance one time step, at whose end the transducer has a pose (4, 4)."""
@@ -173,7 +182,7 @@ class Rehearsal:
 
     def indentation_mm(self) -> float:
         """How deep the transducer is pressed into the settled surface; negative above it."""
-        return indentation(self.pose, self.size_mm, self.hand.vertices)
+        return indentation(self.pose, self.size_mm, self.hand.samples)
 
     def volume_ratio(self) -> float:
         """Volume inside the carried surface, as a share of the resting one."""

@@ -60,6 +60,8 @@ class Record:
             substeps=settings.substeps,
             iterations=settings.iterations,
             stiffness=settings.stiffness,
+            slice_width_mm=rehearsal.scene.image.width_mm,
+            slice_depth_mm=rehearsal.scene.image.depth_mm,
             steps=rehearsal.steps,
             ms_per_step=spread(self.step_ms[1:] or self.step_ms),
             ms_per_slice=spread(self.slice_ms[1:] or self.slice_ms),

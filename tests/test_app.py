@@ -88,7 +88,7 @@ def test_a_headless_press_reports_what_it_promises(pressed):
 
 def test_it_leaves_pictures_in_which_the_press_is_seen(pressed):
     slices = [np.asarray(Image.open(path)).astype(int) for path in sorted((pressed / "slices").glob("*.png"))]
-    assert len(slices) >= 3 and slices[0].shape == (512, 512)
+    assert len(slices) >= 3 and slices[0].shape == (768, 512)
     assert np.abs(slices[0] - slices[-1]).mean() > 10
     assert slices[0].std() > 30
     with Image.open(pressed / "press.gif") as animation:
@@ -156,11 +156,13 @@ def test_mistakes_are_one_line_and_exit_status_2(tmp_path):
     assert "reherse" in refused("reherse")
     assert "--arch" in refused("rehearse", "--arch", "abacus")
     assert "--seconds" in refused("rehearse", "--seconds", "-1")
-    assert "tissue.radius_mm = 0.0" in refused("rehearse", "--radius", "0")
+    assert "--radius = 0.0" in refused("rehearse", "--radius", "0")
     (tmp_path / "file").write_text("")
     assert "choose another --out" in refused("rehearse", "--headless", "--out", tmp_path / "file")
     (tmp_path / "scene.toml").write_text("[anatomy]\n[tissue]\nradius_cm = 1\n")
     assert "write radius_mm" in refused("rehearse", tmp_path)
+    (tmp_path / "empty").mkdir()
+    assert "holds no scene.toml" in refused("rehearse", tmp_path / "empty")
 
 
 def test_an_organ_too_small_for_its_particles_is_refused_in_one_line(tmp_path):

@@ -79,7 +79,7 @@ def test_pointing_at_the_organ_puts_the_face_on_it_perpendicular(hand):
     assert (hand.aim @ [0, 0, -10, 1])[:3] == pytest.approx(met, abs=0.15)
     pose = hand.pose()
     assert pose[:3, 2] @ met / 12 > 0.99
-    assert indentation(pose, SIZE, hand.vertices) == pytest.approx(0.0, abs=1e-9)
+    assert indentation(pose, SIZE, hand.samples) == pytest.approx(0.0, abs=1e-9)
     hand.point(np.array([30.0, 0.0, 50.0]), np.array([-1.0, 0.0, 0.0]))
     assert hand.pose() == pytest.approx(pose)
 
@@ -87,15 +87,15 @@ def test_pointing_at_the_organ_puts_the_face_on_it_perpendicular(hand):
 def test_keys_push_and_the_button_presses_until_let_go(hand):
     hand.push(2.0)
     hand.hold(True, 0.25)
-    assert indentation(hand.pose(), SIZE, hand.vertices) == pytest.approx(5.0)
+    assert indentation(hand.pose(), SIZE, hand.samples) == pytest.approx(5.0)
     for _ in range(100):
         hand.hold(True, 0.1)
-    assert indentation(hand.pose(), SIZE, hand.vertices) == pytest.approx(25.0)
+    assert indentation(hand.pose(), SIZE, hand.samples) == pytest.approx(15.0)
     for _ in range(10):
         hand.hold(False, 0.1)
-    assert indentation(hand.pose(), SIZE, hand.vertices) == pytest.approx(2.0)
+    assert indentation(hand.pose(), SIZE, hand.samples) == pytest.approx(2.0)
     hand.push(-5.0)
-    assert indentation(hand.pose(), SIZE, hand.vertices) == pytest.approx(-3.0)
+    assert indentation(hand.pose(), SIZE, hand.samples) == pytest.approx(-3.0)
     hand.reset()
     assert hand.pose() == pytest.approx(hand.home)
 

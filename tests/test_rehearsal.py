@@ -142,6 +142,29 @@ def test_a_hand_cannot_outrun_its_speed(device, tmp_path):
     assert np.linalg.norm(rehearsal.pose[:3, 3] - away[:3, 3]) == pytest.approx(100.0 - 150.0 / 60)
 
 
+def test_the_transducer_goes_over_the_organ_not_through_it(device, tmp_path):
+    scene, folder = patient_in("phantom", tmp_path)
+    rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
+    hand, middle = rehearsal.hand, rehearsal.hand.vertices.mean(axis=0)
+    ends = [
+        middle + side * 30 * np.array(rehearsal.press.lateral) - 60 * rehearsal.gravity_direction
+        for side in (-1, 1)
+    ]
+    hand.point(ends[0], rehearsal.gravity_direction)
+    for _ in range(90):
+        rehearsal.follow(hand.pose())
+    there = rehearsal.pose.copy()
+    hand.point(ends[1], rehearsal.gravity_direction)
+    deepest = -np.inf
+    for _ in range(90):
+        rehearsal.follow(hand.pose())
+        deepest = max(deepest, rehearsal.indentation_mm())
+    assert np.linalg.norm(rehearsal.pose[:3, 3] - there[:3, 3]) > 30
+    assert rehearsal.pose == pytest.approx(hand.pose(), abs=1e-6)
+    # A straight way would cut several millimetres deep into the organ's curve.
+    assert deepest < 0.5
+
+
 def test_a_pressed_scene_without_ct_still_moves(device, tmp_path):
     scene, folder = patient_in("phantom", tmp_path)
     scene = scene.model_copy(

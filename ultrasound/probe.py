@@ -14,7 +14,7 @@ from ultrasound.slice import ImagePlane
 
 # How wide a patch of surface the probe's axis is perpendicular to, as a hand would hold it.
 NORMAL_PATCH_MM = 12.0
-LEAST_DEPTH_MM, MOST_DEPTH_MM = -40.0, 25.0
+LEAST_DEPTH_MM, MOST_DEPTH_MM = -40.0, 15.0
 PRESS_MM_S, RELEASE_MM_S = 12.0, 40.0
 
 
@@ -114,6 +114,12 @@ class Hand:
     turn_deg: np.ndarray = field(default_factory=lambda: np.zeros(3))
     aim: np.ndarray | None = None
 
+    def __post_init__(self) -> None:
+        # The transducer's corners find their way between the vertices: edges and faces count too.
+        corners = self.vertices[self.faces]
+        middles = (corners + np.roll(corners, 1, axis=1)).reshape(-1, 3) / 2
+        self.samples = np.concatenate([self.vertices, corners.mean(axis=1), middles])
+
     def reset(self) -> None:
         """Back to the home pose, untilted and just touching."""
         self.depth_mm, self.pressed_mm, self.turn_deg, self.aim = 0.0, 0.0, np.zeros(3), None
@@ -154,4 +160,4 @@ class Hand:
         )
         pose[:3, 3] = face + self.size_mm[2] / 2 * pose[:3, 2]
         depth = min(self.depth_mm + self.pressed_mm, MOST_DEPTH_MM)
-        return advanced(touching(pose, self.size_mm, self.vertices), depth)
+        return advanced(touching(pose, self.size_mm, self.samples), depth)
