@@ -3,7 +3,6 @@
 import json
 import os
 import sys
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -203,19 +202,19 @@ def open_viewer(rehearsal: "Rehearsal", visible: bool) -> "Viewer":
 def run_frame(
     rehearsal: "Rehearsal",
     settings: "Settings",
-    move: Callable[[], None] | None,
+    pose: np.ndarray | None,
     record: "Record",
     status: str = "",
 ) -> "View":
-    """One frame, on screen and off: move the transducer and step, carry the surfaces, take the picture.
+    """One frame, on screen and off: step with the transducer going to a pose, carry the surfaces, take the picture.
 
-    Without a move, as when frozen, the picture alone is taken anew.
+    Without a pose, as when frozen, the picture alone is taken anew.
     """
     from render.viewer import View
     from studies.report import timed
 
-    if move is not None:
-        timed(move, record.step_ms)
+    if pose is not None:
+        timed(partial(rehearsal.advance, pose), record.step_ms)
         rehearsal.update_surfaces()
     picture = timed(
         lambda: rehearsal.image(settings.window_hu, settings.level_hu, settings.depth_mm), record.slice_ms
@@ -256,8 +255,8 @@ def run_headless(rehearsal: "Rehearsal", arch: str, seconds: float | None, out: 
     frames, slices = empty_folder(out / "frames"), empty_folder(out / "slices")
     animation: list[Image.Image] = []
     for step in tqdm(range(1, steps + 1), desc="press", unit="step"):
-        pose = rehearsal.scripted_pose(rehearsal.script_length_s() * step / steps)
-        view = run_frame(rehearsal, settings, partial(rehearsal.follow, pose), record)
+        goal = rehearsal.scripted_pose(rehearsal.script_length_s() * step / steps)
+        view = run_frame(rehearsal, settings, rehearsal.pose_towards(goal), record)
         record.watch(rehearsal)
         if step % every == 0 or step == steps:
             picture = in_proportion(view)
@@ -288,12 +287,12 @@ def run_window(rehearsal: "Rehearsal", out: Path) -> None:
     frozen = False
     before = perf_counter()
     rate = 0.0
-    view = run_frame(rehearsal, viewer.settings, lambda: rehearsal.advance(rehearsal.pose), record)
+    view = run_frame(rehearsal, viewer.settings, rehearsal.pose, record)
     while viewer.running:
         controls = viewer.read_controls()
         frozen ^= controls.freeze
-        move = None if frozen else steer(rehearsal, controls)
-        view = run_frame(rehearsal, controls.settings, move, record, "FROZEN" if frozen else "")
+        pose = None if frozen else steer(rehearsal, controls)
+        view = run_frame(rehearsal, controls.settings, pose, record, "FROZEN" if frozen else "")
         now = perf_counter()
         rate = 0.9 * rate + 0.1 / max(now - before, 1e-6)
         before = now
@@ -305,8 +304,8 @@ def run_window(rehearsal: "Rehearsal", out: Path) -> None:
     viewer.close()
 
 
-def steer(rehearsal: "Rehearsal", controls: "Controls") -> Callable[[], None]:
-    """Hand the user's input to the hand that holds the transducer and to the solver; the step to take then."""
+def steer(rehearsal: "Rehearsal", controls: "Controls") -> np.ndarray:
+    """Hand the user's input to the hand that holds the transducer and to the solver; the pose to go to then."""
     step, hand, asked = rehearsal.settings, rehearsal.hand, controls.settings
     step.stiffness, step.iterations, step.substeps = asked.stiffness, asked.iterations, asked.substeps
     rehearsal.set_gravity(asked.gravity_m_s2)
@@ -317,7 +316,7 @@ def steer(rehearsal: "Rehearsal", controls: "Controls") -> Callable[[], None]:
     hand.hold(controls.press, step.time_step_s)
     hand.push(controls.push_mm)
     hand.turn(controls.fan_deg, controls.tilt_deg, controls.roll_deg)
-    return lambda: rehearsal.follow(hand.pose())
+    return rehearsal.pose_towards(hand.pose())
 
 
 def save_screenshot(picture: np.ndarray, out: Path) -> None:

@@ -150,14 +150,14 @@ class Rehearsal:
         """How long the scripted press takes [s]."""
         return len(self.press.indentations_mm) * self.press.stage_steps * self.scene.solver.time_step_s
 
-    def follow(self, goal: np.ndarray) -> None:
-        """Advance one time step with the transducer going towards a pose, no faster than a hand can."""
+    def pose_towards(self, goal: np.ndarray) -> np.ndarray:
+        """The transducer's next pose on its way to a goal (4, 4): no faster than a hand, and over the organ."""
         most_mm = self.scene.transducer.speed_mm_s * self.settings.time_step_s
         pose = approached(self.pose, goal, most_mm, TURN_DEG_S * self.settings.time_step_s)
-        # Between two places of the surface the straight way leads through the organ: go over it.
+        # Between two places of the surface the straight way leads through the organ.
         wanted = max(indentation(goal, self.size_mm, self.hand.samples), 0.0)
         through = indentation(pose, self.size_mm, self.hand.samples) - max(wanted, self.indentation_mm())
-        self.advance(advanced(pose, -through) if through > 0 else pose)
+        return advanced(pose, -through) if through > 0 else pose
 
     def advance(self, pose: np.ndarray) -> None:
         """Advance one time step, at whose end the transducer has a pose (4, 4)."""

@@ -138,8 +138,8 @@ def test_a_hand_cannot_outrun_its_speed(device, tmp_path):
     rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
     away = rehearsal.pose.copy()
     away[:3, 3] += [0, -100.0, 0]
-    rehearsal.follow(away)
-    assert np.linalg.norm(rehearsal.pose[:3, 3] - away[:3, 3]) == pytest.approx(100.0 - 150.0 / 60)
+    moved = rehearsal.pose_towards(away)
+    assert np.linalg.norm(moved[:3, 3] - away[:3, 3]) == pytest.approx(100.0 - 150.0 / 60)
 
 
 def test_the_transducer_goes_over_the_organ_not_through_it(device, tmp_path):
@@ -152,12 +152,12 @@ def test_the_transducer_goes_over_the_organ_not_through_it(device, tmp_path):
     ]
     hand.point(ends[0], rehearsal.gravity_direction)
     for _ in range(90):
-        rehearsal.follow(hand.pose())
+        rehearsal.advance(rehearsal.pose_towards(hand.pose()))
     there = rehearsal.pose.copy()
     hand.point(ends[1], rehearsal.gravity_direction)
     deepest = -np.inf
     for _ in range(90):
-        rehearsal.follow(hand.pose())
+        rehearsal.advance(rehearsal.pose_towards(hand.pose()))
         deepest = max(deepest, rehearsal.indentation_mm())
     assert np.linalg.norm(rehearsal.pose[:3, 3] - there[:3, 3]) > 30
     assert rehearsal.pose == pytest.approx(hand.pose(), abs=1e-6)
