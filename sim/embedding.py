@@ -18,7 +18,7 @@ NOWHERE = 2**30
 # Barycentric slack that closes the seams between tetrahedra against rounding.
 SEAM = 1e-5
 PARALLEL = 1e-12
-# Volume times six [mm^3] under which a tetrahedron holds no pixel.
+# Volume times six [mm^3] up to which a tetrahedron holds no pixel.
 FLAT = 1e-3
 
 
@@ -85,7 +85,8 @@ class Embedding:
 
         ``plane_from_world`` takes world [mm] to (u, v, w) with the plane at w = 0; pixel (row, column) is at u =
         first.x + column * pixel.x, v = first.y + row * pixel.y. ``owner`` (rows, columns) i32 comes out. Of
-        tetrahedra that overlap, which a folded mesh has, the one of lowest index is taken, whatever thread was first.
+        tetrahedra that overlap, which a folded mesh has, the one of lowest index is taken, whatever thread was first;
+        those turned inside out, by tissue squeezed shut, are left out.
         """
         for pixel in ti.grouped(owner):
             owner[pixel] = NOWHERE
@@ -96,7 +97,7 @@ class Embedding:
                 p = (plane_from_world @ tm.vec4(self.skin.vertices[self.tetrahedron[t][k]], 1.0)).xyz
                 corner[0, k], corner[1, k], corner[2, k], corner[3, k] = p.x, p.y, p.z, 1.0
                 low, high = ti.min(low, p.z), ti.max(high, p.z)
-            if low <= 0.0 and high >= 0.0 and ti.abs(corner.determinant()) > FLAT:
+            if low <= 0.0 and high >= 0.0 and -corner.determinant() > FLAT:
                 self.mark_pixels(t, corner, pixel_mm, first_mm, owner)
 
     @ti.func

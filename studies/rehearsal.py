@@ -132,8 +132,9 @@ class Rehearsal:
         settled = self.organ_skin.vertices.to_numpy().astype(float)
         faces = np.array(self.organ.faces, np.int64)
         normals = np.array(trimesh.Trimesh(settled, faces, process=False).vertex_normals)
-        home = touching(self.pose, self.size_mm, settled)
-        return Hand(settled, faces, normals, self.size_mm, home, np.array(self.press.lateral))
+        hand = Hand(settled, faces, normals, self.size_mm, self.pose, np.array(self.press.lateral))
+        hand.home = touching(self.pose, self.size_mm, hand.samples)
+        return hand
 
     def set_gravity(self, acceleration_m_s2: float) -> None:
         """Change the acceleration due to gravity; its direction is the scene's."""
