@@ -1,6 +1,6 @@
 """The 3D view: organ, tumour, support, transducer and image plane, handed to a GGUI scene.
 
-The scene is a parameter, so that taichi.ui is imported by window.py alone. Lengths in mm.
+The scene is a parameter, so that window.py alone imports the user interface. Lengths in mm.
 """
 
 import numpy as np

@@ -48,7 +48,7 @@ def load_anatomy(scene: Scene, folder: Path) -> LoadedAnatomy:
     return LoadedAnatomy(
         organ=_surface(folder, anatomy.organ),
         tumour=_surface(folder, anatomy.tumour) if anatomy.tumour else None,
-        ct=_grid(folder, anatomy.ct),
+        ct=_grid(folder, anatomy.ct) if anatomy.ct else None,
         shapes=tuple(_shape(folder, shape) for shape in scene.shape),
     )
 
@@ -134,9 +134,7 @@ def _surface(folder: Path, name: str) -> trimesh.Trimesh:
     return mesh
 
 
-def _grid(folder: Path, name: str | None) -> Grid | None:
-    if name is None:
-        return None
+def _grid(folder: Path, name: str) -> Grid:
     try:
         image = read_volume(folder / name)
     except PatientError as error:
@@ -157,7 +155,6 @@ def _shape(
     if isinstance(shape, MeshShape):
         return _surface(folder, shape.file)
     grid = _grid(folder, shape.file)
-    assert grid is not None
     axes = grid.index_from_mm[:3, :3]
     if not np.allclose(axes, np.diag(np.diag(axes))) or (np.diag(axes) <= 0).any():
         raise SceneError(

@@ -1,132 +1,33 @@
-"""Patient import against synthetic bodies whose organs are known in LPS mm, and against the real data."""
+"""Patient import: a synthetic body whose organs are known in LPS mm, and the real data."""
 
 from pathlib import Path
 
 import igl
 import numpy as np
-import pydicom
 import pytest
 import SimpleITK as sitk
 import trimesh
-from pydicom.dataset import FileDataset, FileMetaDataset
-from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
-from scipy.spatial.transform import Rotation
+from synthetic_body import (
+    DIRECTIONS,
+    LEFT,
+    LEFT_ML,
+    RIGHT,
+    TUMOUR,
+    assert_sound,
+    body,
+    drawn,
+    grid_around,
+    least_gap,
+    mapped,
+    points_of,
+    voxels_to_boundary,
+    with_voxels,
+)
 
 from scenes.patient import PatientError, describe, import_patient, read_volume, save_patient
 from scenes.support import cradle
-from scenes.surfaces import self_intersections, surface_from_mask
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
-
-# Organs of the synthetic body: centre and half-axes in LPS [mm]. Left and right differ in size and place, so
-# that a mirrored, swapped or shifted import cannot pass.
-LEFT = np.array([70.0, 35.0, 12.0]), np.array([25.0, 20.0, 45.0])
-RIGHT = np.array([-62.0, 30.0, -10.0]), np.array([28.0, 22.0, 38.0])
-TUMOUR = np.array([92.0, 30.0, 20.0]), np.array([11.0, 11.0, 11.0])  # sticks out of the left kidney
-BODY = np.array([0.0, 0.0, 0.0]), np.array([160.0, 110.0, 400.0])
-LEFT_ML = 4 / 3 * np.pi * LEFT[1].prod() / 1000
-
-DIRECTIONS = {
-    "identity": np.eye(3),
-    "RAS": np.diag([-1.0, -1.0, 1.0]),
-    "left-handed": np.diag([1.0, 1.0, -1.0]),
-    "slices first": np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]),
-    "oblique": Rotation.from_euler("xyz", [14, -9, 23], degrees=True).as_matrix(),
-}
-SPACINGS = {"thick": (1.3, 1.1, 4.5), "even": (1.5, 1.5, 1.5)}
-
-
-def level(points, solid):
-    """(|p - c| / a) - 1 of an ellipsoid; negative inside."""
-    centre, axes = solid
-    return np.linalg.norm((points - centre) / axes, axis=-1) - 1
-
-
-def grid_around(low, high, spacing, direction=DIRECTIONS["identity"]):
-    """An image of the given spacing and direction that covers the LPS box [low, high], all zero."""
-    corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T @ direction
-    size = np.ceil(np.ptp(corners, axis=0) / spacing).astype(int) + 1
-    image = sitk.Image(size.tolist(), sitk.sitkInt16)
-    image.SetSpacing(list(map(float, spacing)))
-    image.SetDirection(np.asarray(direction).ravel().tolist())
-    image.SetOrigin((direction @ corners.min(axis=0)).tolist())
-    return image
-
-
-def points_of(image):
-    """LPS of every voxel, shape (z, y, x, 3)."""
-    nx, ny, nz = image.GetSize()
-    index = np.stack(np.meshgrid(np.arange(nz), np.arange(ny), np.arange(nx), indexing="ij"), axis=-1)[
-        ..., ::-1
-    ]
-    direction = np.array(image.GetDirection()).reshape(3, 3)
-    return index * np.array(image.GetSpacing()) @ direction.T + np.array(image.GetOrigin())
-
-
-def drawn(image, *solids):
-    """`image` with the i-th solid (value, centre and axes) painted over the earlier ones."""
-    points = points_of(image)
-    voxels = np.full(points.shape[:3], -1000 if solids[0][0] > 9 else 0, np.int16)
-    for value, solid in solids:
-        voxels[level(points, solid) < 0] = value
-    painted = sitk.GetImageFromArray(voxels)
-    painted.CopyInformation(image)
-    return painted
-
-
-def body(direction=DIRECTIONS["identity"], spacing=(3.0, 2.5, 4.0), z=(-90.0, 90.0)):
-    """CT [HU] and labels (1 right, 2 left, 3 tumour of the left) of the synthetic body."""
-    empty = grid_around((-175, -120, z[0]), (175, 120, z[1]), spacing, direction)
-    ct = drawn(empty, (40, BODY), (120, LEFT), (120, RIGHT), (70, TUMOUR))
-    labels = drawn(empty, (1, RIGHT), (2, LEFT), (3, TUMOUR))
-    return ct, labels
-
-
-def with_voxels(image, voxels):
-    changed = sitk.GetImageFromArray(voxels)
-    changed.CopyInformation(image)
-    return changed
-
-
-def mapped(labels, values):
-    """Label map with each value replaced by values[value]."""
-    return with_voxels(labels, np.array(values, np.int16)[sitk.GetArrayFromImage(labels)])
-
-
-def least_gap(support, organ):
-    """Least distance [mm] of 20000 points of the support's surface to the organ; negative inside."""
-    points, _ = trimesh.sample.sample_surface(support, 20000, seed=1)
-    faces = np.asarray(organ.faces, np.int64)
-    return igl.signed_distance(np.ascontiguousarray(points), np.asarray(organ.vertices), faces)[0].min()
-
-
-def label_boundary(voxels):
-    """Faces between inside and outside, in index coordinates (x, y, z): vertices and triangles."""
-    padded = np.pad(voxels, 1)
-    corners = []
-    for axis in range(3):
-        centre = np.argwhere(np.diff(padded.astype(np.int8), axis=axis) != 0) - 1.0
-        centre[:, axis] += 0.5
-        one, two = np.delete(np.eye(3), axis, axis=0) * 0.5
-        corners.append(centre[:, None] + np.array([-one - two, one - two, one + two, two - one]))
-    quads = np.concatenate(corners)
-    first = 4 * np.arange(len(quads))[:, None]
-    return quads.reshape(-1, 3), np.vstack([first + [0, 1, 2], first + [0, 2, 3]])
-
-
-def voxels_to_boundary(surface, mask):
-    """Distance of each vertex from the label's boundary, each axis measured in voxels."""
-    direction = np.array(mask.GetDirection()).reshape(3, 3)
-    index = (surface.vertices - np.array(mask.GetOrigin())) @ direction / np.array(mask.GetSpacing())
-    vertices, faces = label_boundary(sitk.GetArrayFromImage(mask).transpose(2, 1, 0) != 0)
-    squared = igl.point_mesh_squared_distance(np.ascontiguousarray(index), vertices, faces)[0]
-    return np.sqrt(squared)
-
-
-def assert_sound(mesh):
-    assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
-    assert mesh.body_count == 1
-    assert self_intersections(mesh) == 0
 
 
 @pytest.fixture(scope="module")
@@ -137,107 +38,6 @@ def ct_and_labels():
 @pytest.fixture(scope="module")
 def patient(ct_and_labels):
     return import_patient(*ct_and_labels, organ=[2], tumour=[3], margin_mm=20.0)
-
-
-class TestSurface:
-    @pytest.mark.parametrize("spacing", SPACINGS.values(), ids=SPACINGS)
-    @pytest.mark.parametrize("direction", DIRECTIONS.values(), ids=DIRECTIONS)
-    def test_lies_where_the_label_is(self, direction, spacing):
-        centre, axes = LEFT
-        mask = drawn(grid_around(centre - axes - 12, centre + axes + 7, spacing, direction), (1, LEFT))
-        surface = surface_from_mask(mask, faces=2000)
-
-        assert_sound(surface)
-        assert len(surface.faces) == pytest.approx(2000, abs=20)
-        label_ml = sitk.GetArrayViewFromImage(mask).sum() * np.prod(spacing) / 1000
-        assert surface.volume / 1000 == pytest.approx(label_ml, rel=1e-3)
-        assert surface.volume / 1000 == pytest.approx(LEFT_ML, rel=0.03)
-        assert voxels_to_boundary(surface, mask).max() < 1
-        # The label knows each boundary point to half a voxel; the smoothed surface must not be worse than
-        # that against the true ellipsoid, along the normal, where a voxel measures |n| . spacing.
-        gradient = (surface.vertices - centre) / axes**2
-        normal = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
-        off = np.abs(level(surface.vertices, LEFT) / np.linalg.norm(gradient, axis=1))
-        assert (off <= 0.5 * np.abs(normal @ direction) @ np.array(spacing)).all()
-        assert np.abs(surface.center_mass - centre).max() < 0.1 * max(spacing)
-
-    def test_has_no_stairs_between_thick_slices(self):
-        centre, axes = LEFT
-        mask = drawn(grid_around(centre - axes - 9, centre + axes + 9, (0.8, 0.8, 5.0)), (1, LEFT))
-        surface = surface_from_mask(mask)
-        # Stairs would turn the normal by 90 degrees at each of 18 slices; 5000 even triangles of an
-        # ellipsoid with 9 mm as its least radius of curvature turn by about 1.5 mm / 9 mm, 10 degrees.
-        turn = np.degrees(surface.face_adjacency_angles)
-        assert np.percentile(turn, 99) < 15
-        assert np.degrees(surface.face_angles.min(axis=1)).min() > 5
-
-    def test_drops_islands_and_fills_holes(self):
-        centre, axes = LEFT
-        empty = grid_around(centre - axes - 30, centre + axes + 10, (1.5, 1.5, 1.5))
-        island = centre - axes - 15, np.full(3, 5.0)
-        hole = centre, np.full(3, 6.0)
-        surface = surface_from_mask(drawn(empty, (1, LEFT), (1, island), (0, hole)), faces=2000)
-        assert_sound(surface)
-        assert surface.volume / 1000 == pytest.approx(LEFT_ML, rel=0.01)
-
-    def test_empty_mask_is_refused(self):
-        with pytest.raises(ValueError, match="empty"):
-            surface_from_mask(sitk.Image([9, 9, 9], sitk.sitkUInt8))
-
-    def test_same_bits_twice(self):
-        centre, axes = TUMOUR
-        mask = drawn(grid_around(centre - axes - 9, centre + axes + 9, (1.5, 1.5, 1.5)), (1, TUMOUR))
-        first, second = surface_from_mask(mask, 1000), surface_from_mask(mask, 1000)
-        assert np.array_equal(first.vertices, second.vertices)
-        assert np.array_equal(first.faces, second.faces)
-
-    def test_self_intersections_are_found(self):
-        ball = trimesh.creation.icosphere(subdivisions=2)
-        assert self_intersections(ball) == 0
-        ball.vertices[0] = -1.5 * ball.vertices[0]
-        assert self_intersections(ball) > 0
-
-
-class TestSupport:
-    @pytest.mark.parametrize("gravity", [(0, 0, -1), (0, 1, 0), (0.6, 0, -0.8)])
-    def test_lies_under_the_organ_and_clear_of_it(self, gravity):
-        organ = trimesh.creation.icosphere(subdivisions=4)
-        organ.vertices = organ.vertices * (50, 22, 28) + (10, -300, 40)
-        support = cradle(organ, np.array(gravity))
-
-        assert_sound(support)
-        assert len(support.faces) == pytest.approx(5000, abs=50)
-        assert 0.0 < least_gap(support, organ) < 0.35
-        down = np.array(gravity)
-        height = np.ptp(organ.vertices @ down)
-        bottom, top = (organ.vertices @ down).max(), (support.vertices @ down).min()
-        assert bottom - top == pytest.approx(0.35 * height, abs=0.1)
-        assert (support.vertices @ down).max() == pytest.approx(bottom + 8, abs=0.1)
-
-    def test_moulds_the_underside(self):
-        organ = trimesh.creation.icosphere(subdivisions=4, radius=30)
-        support = cradle(organ, np.array([0, 0, -1]), clearance_mm=0.5)
-        # Polar angles up to 40 degrees lie in the mould, well inside of its filleted rim (at 73 degrees).
-        under = organ.vertices[organ.vertices[:, 2] < -30 * np.cos(np.radians(40))]
-        faces = np.asarray(support.faces, np.int64)
-        gap = igl.signed_distance(np.ascontiguousarray(under), np.asarray(support.vertices), faces)[0]
-        assert np.abs(gap - 0.5).max() < 0.15
-
-    def test_organ_can_be_lifted_out(self):
-        leaning = trimesh.creation.icosphere(subdivisions=4, radius=30)
-        leaning.vertices[:, 0] -= leaning.vertices[
-            :, 2
-        ]  # its lower end reaches far under the rim: an undercut
-        up = np.array([0.0, 0.0, 1.0])
-        support = cradle(leaning, -up)
-        for lift in (1.0, 5.0, 20.0):
-            lifted = leaning.copy().apply_translation(lift * up)
-            assert least_gap(support, lifted) > 0
-
-    @pytest.mark.parametrize("gravity", [(0, 0, 0), (np.nan, 0, 1)])
-    def test_gravity_without_direction_is_refused(self, gravity):
-        with pytest.raises(ValueError, match="gravity"):
-            cradle(trimesh.creation.icosphere(radius=30), np.array(gravity))
 
 
 class TestImport:
@@ -408,136 +208,6 @@ class TestSave:
         with pytest.raises(PatientError, match="No space"):
             save_patient(patient, tmp_path / "patient")
         assert list(tmp_path.iterdir()) == []
-
-
-class Series:
-    """A tiny CT series on disk: 6 slices of 12 x 10 voxels, 0.8 x 0.7 mm, 2.5 mm apart, any orientation."""
-
-    size, spacing, gap = (12, 10, 6), (0.8, 0.7), 2.5
-
-    def __init__(self, folder, direction=DIRECTIONS["oblique"], origin=(-31.5, 20.25, -400.0), number=1):
-        self.folder, self.direction, self.origin = folder, direction, np.array(origin)
-        self.uid, self.number = generate_uid(), number
-        nx, ny, nz = self.size
-        self.hounsfield = np.random.default_rng(7).integers(-1000, 1500, (nz, ny, nx))
-
-    def position(self, k):
-        return self.origin + k * self.gap * self.direction[:, 2]
-
-    def write(self, order=range(6), position=None, **tags):
-        self.folder.mkdir(parents=True, exist_ok=True)
-        for n, k in enumerate(order):
-            meta = FileMetaDataset()
-            meta.MediaStorageSOPClassUID, meta.TransferSyntaxUID = CTImageStorage, ExplicitVRLittleEndian
-            meta.MediaStorageSOPInstanceUID = generate_uid()
-            file = self.folder / f"s{self.number}-{n}.dcm"
-            data = FileDataset(str(file), {}, file_meta=meta, preamble=b"\0" * 128)
-            data.SOPClassUID, data.SOPInstanceUID = CTImageStorage, meta.MediaStorageSOPInstanceUID
-            data.Modality, data.SeriesInstanceUID, data.SeriesNumber = "CT", self.uid, self.number
-            data.PatientName, data.PatientID, data.StudyInstanceUID = "Doe^Jane", "4711", self.uid
-            data.ImagePositionPatient = np.round((position or self.position)(k), 6).tolist()
-            data.ImageOrientationPatient = np.round(self.direction[:, :2].T.ravel(), 8).tolist()
-            data.PixelSpacing = [self.spacing[1], self.spacing[0]]
-            data.SliceThickness, data.InstanceNumber = self.gap, 6 - n
-            data.Columns, data.Rows, _ = self.size
-            data.SamplesPerPixel, data.PhotometricInterpretation = 1, "MONOCHROME2"
-            data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 16, 12, 11, 0
-            data.RescaleIntercept, data.RescaleSlope = -1024, 1
-            data.PixelData = (self.hounsfield[k] + 1024).astype("<u2").tobytes()
-            for name, value in tags.items():
-                setattr(data, name, value)
-            pydicom.dcmwrite(file, data, enforce_file_format=True)
-        return self.folder
-
-
-class TestReading:
-    def test_dicom_series(self, tmp_path):
-        series = Series(tmp_path / "ct")
-        series.write(order=(3, 0, 5, 1, 4, 2))
-        (tmp_path / "ct" / "notes.txt").write_text("no slice")
-        image = read_volume(tmp_path / "ct")
-
-        assert np.array_equal(sitk.GetArrayViewFromImage(image), series.hounsfield)
-        np.testing.assert_allclose(image.GetSpacing(), (0.8, 0.7, 2.5), atol=1e-5)
-        np.testing.assert_allclose(image.GetOrigin(), series.origin, atol=1e-5)
-        np.testing.assert_allclose(np.reshape(image.GetDirection(), (3, 3)), series.direction, atol=1e-6)
-        assert not image.GetMetaDataKeys()
-
-    def test_two_series_are_named(self, tmp_path):
-        Series(tmp_path, number=3).write()
-        Series(tmp_path, number=8).write(order=range(4))
-        with pytest.raises(PatientError, match=r"2 series.*series 3 \(CT, 6 files.*series 8 \(CT, 4 files"):
-            read_volume(tmp_path)
-
-    @pytest.mark.parametrize(
-        ("writing", "words"),
-        [
-            ({"Modality": "MR"}, "the modality is MR; expected CT"),
-            ({"order": (0, 1, 2, 4, 5)}, r"s1-2.dcm and s1-3.dcm are 5\.00 mm apart, the others 2\.50 mm"),
-            ({"order": (0, 1, 2, 2, 3)}, "lie at one position"),
-            ({"order": (2,)}, "one slice only"),
-            ({"NumberOfFrames": 2}, "holds 2 frames"),
-        ],
-    )
-    def test_bad_series(self, tmp_path, writing, words):
-        with pytest.raises(PatientError, match=words) as caught:
-            read_volume(Series(tmp_path).write(**writing))
-        assert "Doe" not in str(caught.value) and "4711" not in str(caught.value)
-
-    def test_uneven_and_tilted_series(self, tmp_path):
-        uneven = Series(tmp_path / "uneven", DIRECTIONS["identity"])
-        with pytest.raises(PatientError, match="off an even spacing"):
-            read_volume(uneven.write(position=lambda k: uneven.position(k + 0.02 * k**2)))
-        tilted = Series(tmp_path / "tilted", DIRECTIONS["identity"])
-        with pytest.raises(PatientError, match="gantry tilt"):
-            read_volume(tilted.write(position=lambda k: tilted.position(k) + (0, 0.3 * k, 0)))
-
-    def test_mixed_slices(self, tmp_path):
-        series = Series(tmp_path)
-        series.write(order=range(3))
-        other = pydicom.dcmread(tmp_path / "s1-2.dcm")
-        other.ImageOrientationPatient = [1, 0, 0, 0, 0, -1]
-        other.save_as(tmp_path / "s1-2.dcm")
-        with pytest.raises(PatientError, match="orientation"):
-            read_volume(tmp_path)
-
-    def test_folder_without_dicom(self, tmp_path):
-        with pytest.raises(PatientError, match="no DICOM file"):
-            read_volume(tmp_path)
-        with pytest.raises(PatientError, match="no such file"):
-            read_volume(tmp_path / "absent.nrrd")
-
-    @pytest.mark.parametrize("ending", [".nii", ".nii.gz", ".nrrd", ".mha", ".mhd"])
-    def test_files_keep_their_place(self, tmp_path, ending):
-        image = grid_around((0, 0, 0), (20, 15, 10), (1.0, 1.5, 2.0), DIRECTIONS["oblique"])
-        image = with_voxels(
-            image, np.random.default_rng(3).integers(-900, 900, image.GetSize()[::-1], np.int16)
-        )
-        image.SetMetaData("descrip", "Doe^Jane")
-        sitk.WriteImage(image, str(tmp_path / f"ct{ending}"))
-        again = read_volume(tmp_path / f"ct{ending}")
-        assert np.array_equal(sitk.GetArrayViewFromImage(again), sitk.GetArrayViewFromImage(image))
-        np.testing.assert_allclose(again.GetOrigin(), image.GetOrigin(), atol=1e-4)
-        np.testing.assert_allclose(again.GetDirection(), image.GetDirection(), atol=1e-5)
-        assert not again.GetMetaDataKeys()
-
-    def test_bad_files(self, tmp_path):
-        (tmp_path / "cut.nrrd").write_bytes(b"NRRD0004\nnonsense")
-        (tmp_path / "ct.txt").write_text("text")
-        sitk.WriteImage(sitk.Image([8, 8], sitk.sitkInt16), str(tmp_path / "flat.mha"))
-        sitk.WriteImage(sitk.Image([8, 8, 8], sitk.sitkVectorUInt8, 3), str(tmp_path / "rgb.mha"))
-        holed = with_voxels(sitk.Image([4, 4, 4], sitk.sitkFloat32), np.full((4, 4, 4), np.nan, np.float32))
-        sitk.WriteImage(holed, str(tmp_path / "nan.mha"))
-        for name, words in [
-            ("cut.nrrd", "cannot be read"),
-            ("ct.txt", "unknown kind of file"),
-            ("flat.mha", "expected one 3D volume"),
-            ("rgb.mha", "expected one number"),
-            ("nan.mha", "64 voxels are not finite"),
-        ]:
-            with pytest.raises(PatientError, match=words) as caught:
-                read_volume(tmp_path / name)
-            assert "\n" not in str(caught.value) and name in str(caught.value)
 
 
 REAL = [

@@ -182,6 +182,7 @@ def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(devi
         holds = np.flatnonzero(solid & (least > 1e-3))
         overlaps += len(holds) > 1
         assert len(holds) == 0 or owner[row, column] <= holds[0]
+        assert np.linalg.det(edges[owner[row, column]]) < 0
     assert overlaps > 50
 
 
