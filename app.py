@@ -349,8 +349,10 @@ def smaller(picture: Image.Image) -> Image.Image:
 
 
 def save_animation(pictures: list[Image.Image], path: Path) -> None:
-    """Write an animated GIF that repeats."""
-    first, *others = [picture.convert("P", palette=Image.Palette.ADAPTIVE) for picture in pictures]
+    """Write an animated GIF that repeats; one palette and dithering keep grey grey and rare colours alive."""
+    coloured = [picture.convert("RGB") for picture in pictures]
+    palette = coloured[-1].quantize(method=Image.Quantize.FASTOCTREE)
+    first, *others = [picture.quantize(palette=palette) for picture in coloured]
     first.save(path, save_all=True, append_images=others, duration=1000 // PICTURES_A_SECOND, loop=0)
 
 

@@ -10,8 +10,6 @@ os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 
 import taichi as ti
 
-ARCHES = ("auto", "cuda", "vulkan", "cpu")
-
 
 class NoDevice(RuntimeError):
     """The backend that was asked for is not there; the message is one line."""

@@ -24,7 +24,6 @@ class Skin:
         weight = 1.0 / (distance**2 + LEAST_SQUARED_MM2)
         weight /= weight.sum(axis=1, keepdims=True)
         self.model = model
-        self.rest_points = points
         self.rest = ti.Vector.field(3, ti.f32, len(points))
         self.vertices = ti.Vector.field(3, ti.f32, len(points))
         self.frame = ti.Vector.field(frames, ti.i32, len(points))

@@ -123,7 +123,7 @@ def test_under_an_affine_deformation_it_is_the_pull_back_within_the_skins_error(
     centre = np.einsum("vk,vkj->vj", skin.weight.to_numpy(), model.rest_centres[skin.frame.to_numpy()])
     used = np.unique(cut.owner.to_numpy()[inside])
     vertices = np.unique(embedding.tetrahedron.to_numpy()[used])
-    off = (skin.rest_points - centre)[vertices] @ (np.linalg.inv(shear) @ (shear - u @ vt)).T
+    off = (skin.rest.to_numpy() - centre)[vertices] @ (np.linalg.inv(shear) @ (shear - u @ vt)).T
     bound = np.linalg.norm(off, axis=1).max() * np.linalg.norm(GRADIENT)
     error = np.abs(cut.hu.to_numpy() - wanted)[inside]
     assert error.max() < bound
@@ -203,8 +203,8 @@ def test_what_lies_around_the_organ_gives_way_to_it_and_far_away_stays(device, b
     body.restore(BodyState(x, np.zeros_like(x)))
     model.update_frames()
     embedding.update()
-    moved = embedding.skin.vertices.to_numpy() - embedding.skin.rest_points
-    away = np.linalg.norm(embedding.skin.rest_points, axis=1) - 12.0
+    moved = embedding.skin.vertices.to_numpy() - embedding.skin.rest.to_numpy()
+    away = np.linalg.norm(embedding.skin.rest.to_numpy(), axis=1) - 12.0
     assert np.abs(moved[away < 2 * RADIUS] - shift).max() < 1e-4
     assert np.abs(moved[away > 26.0]).max() < 1e-4
     between = (away > 10.0) & (away < 20.0)
