@@ -55,31 +55,26 @@ def fill_body(
 
 @ti.data_oriented
 class Body:
-    """A rest body and its current state on the device; vectors are float32 fields of shape (n,).
+    """Points that move, and their current state on the device; vectors are float32 fields of shape (n,).
 
-    ``mass_scaling_per_mm`` is k of Algorithm 1, line 4; at 0 there is no ``mass_scale`` (n,).
+    ``rest_points`` (n, 3) float64 [mm] is where they are at rest.
     """
 
-    def __init__(self, rest: RestBody, mass_scaling_per_mm: float = 0.0) -> None:
-        self.rest_body = rest
-        self.count = len(rest.particles)
+    mass_scaled = False
+
+    def __init__(self, rest_points: np.ndarray) -> None:
+        self.rest_points = np.asarray(rest_points, np.float64)
+        self.count = len(rest_points)
         self.rest = ti.Vector.field(3, ti.f32, self.count)
-        self.contact_radius = ti.field(ti.f32, self.count)
         self.position = ti.Vector.field(3, ti.f32, self.count)
         self.velocity = ti.Vector.field(3, ti.f32, self.count)
         self.estimate = ti.Vector.field(3, ti.f32, self.count)
-        self.mass_scaling_per_mm = mass_scaling_per_mm
-        self.mass_scaled = mass_scaling_per_mm > 0
-        if self.mass_scaled:
-            self.mass_scale = ti.field(ti.f32, self.count)
-            self.mass_scale.fill(1.0)
-        self.rest.from_numpy(rest.particles.astype(np.float32))
-        self.contact_radius.from_numpy(rest.contact_radius.astype(np.float32))
+        self.rest.from_numpy(self.rest_points.astype(np.float32))
         self.restore(self.rest_state())
 
     def rest_state(self) -> BodyState:
         """The state at build time: at rest in the rest position."""
-        position = self.rest_body.particles.astype(np.float32)
+        position = self.rest_points.astype(np.float32)
         return BodyState(position, np.zeros_like(position))
 
     def snapshot(self) -> BodyState:
@@ -91,3 +86,22 @@ class Body:
         self.position.from_numpy(state.position)
         self.estimate.from_numpy(state.position)
         self.velocity.from_numpy(state.velocity)
+
+
+@ti.data_oriented
+class ParticleBody(Body):
+    """A body of particles. ``contact_radius`` (n,) [mm]: how near each may come to a shape.
+
+    ``mass_scaling_per_mm`` is k of Algorithm 1, line 4; at 0 there is no ``mass_scale`` (n,).
+    """
+
+    def __init__(self, rest: RestBody, mass_scaling_per_mm: float = 0.0) -> None:
+        super().__init__(rest.particles)
+        self.radius_mm = rest.radius_mm
+        self.contact_radius = ti.field(ti.f32, self.count)
+        self.contact_radius.from_numpy(rest.contact_radius.astype(np.float32))
+        self.mass_scaling_per_mm = mass_scaling_per_mm
+        self.mass_scaled = mass_scaling_per_mm > 0
+        if self.mass_scaled:
+            self.mass_scale = ti.field(ti.f32, self.count)
+            self.mass_scale.fill(1.0)

@@ -3,7 +3,7 @@
 import taichi as ti
 import taichi.math as tm
 
-from sim.body import Body
+from sim.body import ParticleBody
 from sim.shapes import FAR
 
 KEEP_OUT_SWEEPS = 8
@@ -24,14 +24,14 @@ class ShapeContacts:
     takes no memory for pushes and no time.
     """
 
-    def __init__(self, body: Body, shapes: list, friction: float) -> None:
+    def __init__(self, body: ParticleBody, shapes: list, friction: float) -> None:
         self.body = body
         self.shapes = list(shapes)
         self.friction = friction
         self.rough = friction > 0
-        self.margin = body.rest_body.radius_mm / 2
+        self.margin = body.radius_mm / 2
         # A mesh knows no distances beyond its reach, so "farther than that" is all that can be remembered.
-        self.reach = REACH_RADII * body.rest_body.radius_mm
+        self.reach = REACH_RADII * body.radius_mm
         self.plane = ti.Vector.field(4, ti.f32, (len(shapes), body.count))
         if self.rough:
             self.push = ti.Vector.field(4, ti.f32, (len(shapes), body.count))
@@ -136,8 +136,8 @@ class ShapeContacts:
         return change
 
     @ti.func
-    def keep_out(self):
-        """Leave no particle inside a shape: exact projections of those that the averaging left there.
+    def finish(self):
+        """End of a substep: leave no particle inside a shape, by exact projections of those that the averaging left there.
 
         Where shapes leave no room for the contact radius, its half, then the centre alone must be clear. Where they
         overlap, so that each sends a particle into the other, it leaves through that side of a tool which is free.

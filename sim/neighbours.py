@@ -3,7 +3,7 @@
 import taichi as ti
 import taichi.math as tm
 
-from sim.body import Body
+from sim.body import ParticleBody
 from sim.shape_matching import ShapeMatching
 
 MOST_NEIGHBOURS = 24
@@ -19,11 +19,11 @@ class ParticleContacts:
     which threads filled a list reaches a sum.
     """
 
-    def __init__(self, body: Body, model: ShapeMatching, friction: float) -> None:
+    def __init__(self, body: ParticleBody, model: ShapeMatching, friction: float) -> None:
         self.body = body
         self.model = model
         self.friction = friction
-        self.distance = body.rest_body.radius_mm
+        self.distance = body.radius_mm
         # Particles come nearer than they started during the substep, so some are listed before they touch.
         self.reach = 1.5 * self.distance
         self.cell_start = ti.field(ti.i32, CELLS + 1)

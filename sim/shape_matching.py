@@ -1,18 +1,19 @@
-"""The paper's tissue model: overlapping clusters, each matched rigidly to its rest shape (Eqs. 8-12).
-
-A tissue model is rest data, a projection of its constraints (``project``), and frames that carry points
-along (``update_frames``, ``carry``). Solver, contacts, skin and embedding use nothing else of it.
-"""
+"""The paper's tissue model: overlapping clusters, each matched rigidly to its rest shape (Eqs. 8-12)."""
 
 import numpy as np
 import taichi as ti
 import taichi.math as tm
+from scipy.spatial import cKDTree
 
-from sim.body import Body
+from sim.body import ParticleBody
 from sim.rotation import nearest_rotation
 from sim.sampling import Clusters, sample_clusters
 
 RELAXATIONS = ("local", "global")
+# Points are carried by this many clusters at most.
+MOST_FRAMES = 4
+# Keeps the weight of a point on a cluster's very origin finite.
+LEAST_SQUARED_MM2 = 1e-6
 
 
 @ti.data_oriented
@@ -25,12 +26,13 @@ class ShapeMatching:
     gives each of its n clusters 1/n of its mass, under ``global`` the whole of it to each.
     """
 
-    def __init__(self, body: Body, cluster_spacing: float = 3.33, relaxation: str = "local") -> None:
+    def __init__(self, body: ParticleBody, cluster_spacing: float = 3.33, relaxation: str = "local") -> None:
         if relaxation not in RELAXATIONS:
             raise ValueError(f"relaxation is {relaxation!r}: expected one of {', '.join(RELAXATIONS)}")
-        rest = body.rest_body.particles
-        clusters = sample_clusters(rest, cluster_spacing * body.rest_body.radius_mm)
+        rest = body.rest_points
+        clusters = sample_clusters(rest, cluster_spacing * body.radius_mm)
         self.body = body
+        self.groups = ((0, body.count),)
         self.count = len(clusters)
         self.membership_count = len(clusters.members)
         self._allocate(clusters, clusters.transposed(body.count))
@@ -60,8 +62,16 @@ class ShapeMatching:
         self.averaging.from_numpy(averaging.astype(np.float32))
         self.rest_centre.from_numpy(self.rest_centres.astype(np.float32))
 
+    def counts(self) -> dict[str, int]:
+        """Particles, clusters, and memberships of the ones in the others."""
+        return dict(particles=self.body.count, clusters=self.count, memberships=self.membership_count)
+
     @ti.func
-    def project(self, stiffness: float, relaxation_factor: float):
+    def begin(self, dt: float):
+        pass
+
+    @ti.func
+    def project(self, first, last, stiffness: float, relaxation_factor: float, dt: float):
         """One pass over all clusters on the estimates: fit them, then move particles to their goals."""
         self.fit()
         self.move_to_goals(stiffness * relaxation_factor)
@@ -121,9 +131,19 @@ class ShapeMatching:
         """Fit the frames to where the particles are now, for ``carry``."""
         self.fit()
 
+    def attach(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The up to four nearest clusters of points (n, 3) [mm] and their weights (Kavan 2014).
+
+        Weights fall off with the inverse square of the distance from point to cluster origin and sum to 1.
+        """
+        frames = min(MOST_FRAMES, self.count)
+        distance, nearest = cKDTree(self.rest_centres).query(points, list(range(1, frames + 1)))
+        weight = 1.0 / (distance**2 + LEAST_SQUARED_MM2)
+        return nearest, weight / weight.sum(axis=1, keepdims=True)
+
     @ti.kernel
     def carry(self, rest: ti.template(), frame: ti.template(), weight: ti.template(), out: ti.template()):
-        """Points carried by weighted frames; see ``sim.skinning``."""
+        """Points carried by weighted frames (weighted matrix blending)."""
         for v in rest:
             x = tm.vec3(0.0)
             for k in ti.static(range(frame.n)):

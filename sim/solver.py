@@ -6,11 +6,11 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from sim.body import Body
 from sim.contact import ShapeContacts
 from sim.neighbours import ParticleContacts
-from sim.shape_matching import ShapeMatching
 from sim.shapes import ConvexTool
+from sim.surface_contact import SurfaceContacts
+from sim.tissue import TissueModel
 
 # Far from the origin the scaled masses must still have room in float32.
 MOST_EXPONENT = 30.0
@@ -43,14 +43,13 @@ class Solver:
 
     def __init__(
         self,
-        body: Body,
-        model: ShapeMatching,
-        contacts: ShapeContacts | None = None,
+        model: TissueModel,
+        contacts: ShapeContacts | SurfaceContacts | None = None,
         pairs: ParticleContacts | None = None,
         tool: ConvexTool | None = None,
         relaxation: str = "local",
     ) -> None:
-        self.body = body
+        self.body = model.body
         self.model = model
         self.contacts = contacts
         self.pairs = pairs
@@ -74,16 +73,18 @@ class Solver:
             if self.has_contacts:
                 for _ in range(settings.stabilisation_iterations):
                     self.stabilise()
-            for _ in range(settings.iterations - 1):
-                self.iterate(settings.stiffness, settings.relaxation_factor)
-            # An overshoot left by the last pass would be taken for velocity in line 24, and grow.
-            self.iterate(settings.stiffness, 1.0)
+            for iteration in range(settings.iterations):
+                # An overshoot left by the last pass would be taken for velocity in line 24, and grow.
+                factor = settings.relaxation_factor if iteration < settings.iterations - 1 else 1.0
+                for first, last in self.model.groups:
+                    self.iterate(first, last, settings.stiffness, factor, dt)
             self.end(dt)
         self.model.update_frames()
 
     @ti.kernel
     def begin(self, dt: float, gravity: tm.vec3, damping: float):
         self.predict(dt, gravity, damping)
+        self.model.begin(dt)
         if ti.static(self.has_pairs):
             self.pairs.find()  # line 7
         if ti.static(self.has_contacts):
@@ -93,7 +94,8 @@ class Solver:
     def predict(self, dt: float, gravity: tm.vec3, damping: float):
         decay = ti.exp(-damping * dt)
         for i in range(self.body.count):  # lines 1-5
-            velocity = (self.body.velocity[i] + dt * gravity) * decay
+            # Gravity does not decay, or a body at rest would weigh less.
+            velocity = self.body.velocity[i] * decay + dt * gravity
             self.body.estimate[i] = self.body.position[i] + dt * velocity
             if ti.static(self.body.mass_scaled):  # line 4, with the height against gravity
                 height = -gravity.dot(self.body.estimate[i]) / ti.max(gravity.norm(), 1e-12)
@@ -105,8 +107,8 @@ class Solver:
         self.contacts.stabilise()  # lines 10-15
 
     @ti.kernel
-    def iterate(self, stiffness: float, relaxation_factor: float):
-        self.model.project(stiffness, relaxation_factor)  # lines 17-21, group by group
+    def iterate(self, first: int, last: int, stiffness: float, relaxation_factor: float, dt: float):
+        self.model.project(first, last, stiffness, relaxation_factor, dt)  # lines 17-21, group by group
         if ti.static(self.has_pairs):
             self.pairs.project(relaxation_factor, self.relax_globally)
         if ti.static(self.has_contacts):
@@ -115,7 +117,7 @@ class Solver:
     @ti.kernel
     def end(self, dt: float):
         if ti.static(self.has_contacts):
-            self.contacts.keep_out()
+            self.contacts.finish()
         for i in range(self.body.count):  # lines 23-26
             x = self.body.estimate[i]
             self.body.velocity[i] = (x - self.body.position[i]) / dt

@@ -9,7 +9,7 @@ import trimesh
 
 from scenes.anatomy import Grid, LoadedAnatomy, press_on
 from scenes.scene import PlaneShape, Scene
-from sim.body import Body, fill_body
+from sim.body import ParticleBody, fill_body
 from sim.contact import REACH_RADII, ShapeContacts
 from sim.embedding import Embedding
 from sim.neighbours import ParticleContacts
@@ -64,7 +64,7 @@ class Rehearsal:
             tissue.volume_sampling,
             tissue.surface_samples_per_mm2,
         )
-        self.body = Body(rest, solver.mass_scaling_per_mm)
+        self.body = ParticleBody(rest, solver.mass_scaling_per_mm)
         self.model = ShapeMatching(self.body, tissue.cluster_spacing, solver.relaxation)
 
     def _build_solver(self, anatomy: LoadedAnatomy) -> None:
@@ -76,7 +76,7 @@ class Rehearsal:
         pairs = (
             ParticleContacts(self.body, self.model, contact.particle_friction) if contact.particles else None
         )
-        self.solver = Solver(self.body, self.model, self.contacts, pairs, self.tool, solver.relaxation)
+        self.solver = Solver(self.model, self.contacts, pairs, self.tool, solver.relaxation)
         self.settings = StepSettings(
             stiffness=self.scene.tissue.stiffness,
             time_step_s=solver.time_step_s,

@@ -10,7 +10,7 @@ import trimesh
 from conftest import rotation_about
 from test_solver import position, solver_of
 
-from sim.body import Body, fill_body
+from sim.body import ParticleBody, fill_body
 from sim.contact import ShapeContacts
 from sim.neighbours import ParticleContacts
 from sim.shape_matching import ShapeMatching
@@ -270,11 +270,11 @@ def two_blocks(pairs: bool, scaling: float = 0.0) -> tuple[Solver, np.ndarray]:
     upper = lower.copy()
     # Clusters reach 5 mm: nearer bodies would be held together by them.
     upper.apply_translation([0, 0, 14.0])
-    body = Body(fill_body(trimesh.util.concatenate([lower, upper]), 1.5), scaling)
+    body = ParticleBody(fill_body(trimesh.util.concatenate([lower, upper]), 1.5), scaling)
     model = ShapeMatching(body)
     contacts = ShapeContacts(body, [Plane(np.array([0.0, 0.0, 1.0]), -4.0)], 0.35)
-    solver = Solver(body, model, contacts, ParticleContacts(body, model, 0.25) if pairs else None)
-    return solver, body.rest_body.particles[:, 2] > 7
+    solver = Solver(model, contacts, ParticleContacts(body, model, 0.25) if pairs else None)
+    return solver, body.rest_points[:, 2] > 7
 
 
 def test_particles_that_share_no_cluster_keep_their_distance(device):

@@ -7,7 +7,7 @@ import taichi as ti
 import trimesh
 from conftest import rotation_about
 
-from sim.body import Body, BodyState, fill_body
+from sim.body import BodyState, ParticleBody, fill_body
 from sim.embedding import NOWHERE, Embedding, tetrahedra_around
 from sim.shape_matching import ShapeMatching
 from sim.skinning import Skin
@@ -63,11 +63,11 @@ def pixel_points(plane, pixels: int) -> np.ndarray:
 
 
 def sliced(mesh, image: sitk.Image, move=None, pixels: int = 96, outside: str = "gel"):
-    body = Body(fill_body(mesh, RADIUS))
+    body = ParticleBody(fill_body(mesh, RADIUS))
     model = ShapeMatching(body)
     embedding = Embedding(model, mesh, 2 * RADIUS)
     if move is not None:
-        x = move(body.rest_body.particles).astype(np.float32)
+        x = move(body.rest_points).astype(np.float32)
         body.restore(BodyState(x, np.zeros_like(x)))
         model.update_frames()
         embedding.update()
@@ -196,10 +196,10 @@ def test_flat_collapsed_and_inverted_tissue_still_gives_a_picture(device, ball, 
 
 def test_what_lies_around_the_organ_gives_way_to_it_and_far_away_stays(device, ball):
     shift = np.array([0.0, 0.0, 4.0])
-    body = Body(fill_body(ball, RADIUS))
+    body = ParticleBody(fill_body(ball, RADIUS))
     model = ShapeMatching(body)
     embedding = Embedding(model, ball, 2 * RADIUS, margin_mm=25.0)
-    x = (body.rest_body.particles + shift).astype(np.float32)
+    x = (body.rest_points + shift).astype(np.float32)
     body.restore(BodyState(x, np.zeros_like(x)))
     model.update_frames()
     embedding.update()
@@ -227,7 +227,7 @@ def test_tetrahedra_fill_the_organ_without_gaps(ball):
 
 
 def test_skin_weights_fall_off_with_the_inverse_square(device, ball):
-    model = ShapeMatching(Body(fill_body(ball, RADIUS)))
+    model = ShapeMatching(ParticleBody(fill_body(ball, RADIUS)))
     skin = Skin(model, ball.vertices)
     frame, weight = skin.frame.to_numpy(), skin.weight.to_numpy()
     assert frame.shape[1] == 4

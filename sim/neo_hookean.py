@@ -1,0 +1,214 @@
+"""A tissue model true to a material: compressible neo-Hookean tissue on a lattice, node after node to its balance.
+
+The implicit time step is the minimum of |x - target|^2 m / 2 h^2 + elastic and contact energy over the positions
+(Liu et al. 2013, Eq. 3). Each node in turn goes to the minimum for itself with all others held (vertex block descent,
+Chen et al. 2024), over-relaxed. Where nothing moves any more every node is in balance with its neighbours, so what
+the tissue comes to rest at does not depend on iterations, substeps or time step.
+"""
+
+import numpy as np
+import taichi as ti
+import taichi.math as tm
+
+from sim.body import Body
+from sim.lattice import Lattice
+from sim.solver import StepSettings
+from sim.surface_contact import LAYER_MM, SurfaceContacts
+
+# Stiffness, in units of the shear modulus, of deformation that varies inside a cell: between 1, exact for torsion,
+# and (1 + nu), exact for bending.
+HOURGLASS = 1.2
+# Below this volume ratio the energy goes on as its tangent, so that inverted cells find back.
+LEAST_J = 0.2
+# No node moves farther in a pass than this share of a cell.
+MOST_CELLS_A_PASS = 0.5
+LATTICE_SETTINGS = StepSettings(substeps=1, iterations=8, relaxation_factor=1.7, stabilisation_iterations=0)
+
+
+@ti.data_oriented
+class NeoHookean:
+    """W = mu/2 (tr C - 3) - mu ln J + lambda/2 (ln J)^2 on a lattice's cells (Bonet & Wood 2008, Eq. 6.27).
+
+    Nodes are projected colour by colour (``groups``). ``deformation`` (m + 1,) holds F of every cell and follows its
+    nodes; the last row stands for cells that are not there.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        lattice: Lattice,
+        contacts: SurfaceContacts | None = None,
+        young_kpa: float = 15.0,
+        poisson: float = 0.45,
+        density_g_cm3: float = 1.05,
+    ) -> None:
+        starts = [int(v) for v in lattice.colour_start]
+        self.body = body
+        self.lattice = lattice
+        self.contacts = contacts
+        self.has_contacts = contacts is not None
+        self.groups = tuple(zip(starts[:-1], starts[1:], strict=True))
+        self.count = len(lattice.cells)
+        self.most_mm = MOST_CELLS_A_PASS * lattice.cell_mm
+        self.mu = ti.field(ti.f32, ())
+        self.lame = ti.field(ti.f32, ())
+        self._store_nodes(1e-3 * density_g_cm3)
+        self._store_cells()
+        self._store_hourglass()
+        self.set_material(young_kpa, poisson)
+
+    def _store_nodes(self, density_g_mm3: float) -> None:
+        self.target = ti.Vector.field(3, ti.f32, self.body.count)
+        self.mass = ti.field(ti.f32, self.body.count)
+        self.mass.from_numpy((density_g_mm3 * self.lattice.tissue).astype(np.float32))
+
+    def _store_cells(self) -> None:
+        cells, nodes = self.lattice.cells, self.body.count
+        around = np.full((nodes, 8), self.count, np.int32)
+        gradient = np.zeros((nodes, 8, 3), np.float32)
+        for corner in range(8):
+            around[cells[:, corner], corner] = np.arange(self.count)
+            gradient[cells[:, corner], corner] = self.lattice.gradient[:, corner]
+        self.around = ti.field(ti.i32, (nodes, 8))
+        self.around.from_numpy(around)
+        self.gradient = ti.Vector.field(3, ti.f32, (nodes, 8))
+        self.gradient.from_numpy(gradient)
+        self.cell = ti.Vector.field(8, ti.i32, self.count)
+        self.cell.from_numpy(cells.astype(np.int32))
+        self.volume = ti.field(ti.f32, self.count + 1)
+        self.volume.from_numpy(np.append(self.lattice.volume, 0.0).astype(np.float32))
+        self.deformation = ti.Matrix.field(3, 3, ti.f32, self.count + 1)
+        self.deformation.from_numpy(np.tile(np.eye(3, dtype=np.float32), (self.count + 1, 1, 1)))
+
+    def _store_hourglass(self) -> None:
+        """Rows of the hourglass matrix, over the 27 nodes around each node and itself, for a shear modulus of 1."""
+        cells, nodes = self.lattice.cells, self.body.count
+        neighbour = np.tile(np.arange(nodes)[:, None], (1, 27)).astype(np.int32)
+        weight = np.zeros((nodes, 27))
+        corners = np.indices((2, 2, 2)).reshape(3, -1).T
+        for a in range(8):
+            for b in range(8):
+                place = (corners[b] - corners[a] + 1) @ [9, 3, 1]
+                neighbour[cells[:, a], place] = cells[:, b]
+                weight[cells[:, a], place] += HOURGLASS * self.lattice.hourglass[:, a, b]
+        self.neighbour = ti.field(ti.i32, (nodes, 27))
+        self.neighbour.from_numpy(neighbour)
+        self.hourglass = ti.field(ti.f32, (nodes, 27))
+        self.hourglass.from_numpy(weight.astype(np.float32))
+
+    def set_material(self, young_kpa: float, poisson: float) -> None:
+        """Young's modulus and Poisson's ratio; the contact layer is as much stiffer as the tissue is."""
+        # 1 kPa is 1000 g/(mm s^2).
+        self.mu[None] = 1e3 * young_kpa / (2 * (1 + poisson))
+        self.lame[None] = 1e3 * young_kpa * poisson / ((1 + poisson) * (1 - 2 * poisson))
+        if self.contacts is not None:
+            self.contacts.stiffness[None] = young_kpa / LAYER_MM
+
+    def counts(self) -> dict[str, int]:
+        """Nodes and cells, and points of the surface that may touch."""
+        return dict(nodes=self.body.count, cells=self.count, points=self.contacts.count if self.contacts else 0)
+
+    @ti.func
+    def begin(self, dt: float):
+        """Start from where the body is; what the solver predicted is where inertia and gravity draw it."""
+        for i in range(self.body.count):
+            self.target[i] = self.body.estimate[i]
+            self.body.estimate[i] = self.body.position[i]
+        for c in range(self.count):
+            deformation = tm.mat3(0.0)
+            for k in ti.static(range(8)):
+                i = self.cell[c][k]
+                deformation += self.body.estimate[i].outer_product(self.gradient[i, k])
+            self.deformation[c] = deformation
+
+    @ti.func
+    def project(self, first, last, stiffness: float, relaxation_factor: float, dt: float):
+        """Nodes of one colour, each to its balance: a Newton step on its own 3 x 3 system, over-relaxed."""
+        ti.loop_config(block_dim=32)
+        for i in range(first, last):
+            inertia = self.mass[i] / (dt * dt)
+            force = inertia * (self.target[i] - self.body.estimate[i])
+            force, hessian = self.add_cells(i, force, inertia * tm.eye(3))
+            force, hessian = self.add_hourglass(i, force, hessian)
+            factor = relaxation_factor
+            if ti.static(self.has_contacts):
+                pushed, layer = self.contacts.push(i)
+                if layer[0, 0] + layer[1, 1] + layer[2, 2] > 0.0:
+                    factor = 1.0
+                force += pushed
+                hessian += layer
+            change = factor * solve(hessian, force)
+            change *= ti.min(1.0, self.most_mm / ti.max(change.norm(), 1e-12))
+            self.body.estimate[i] += change
+            for k in range(8):
+                c = self.around[i, k]
+                # Not "+=", which is atomic: no other node of this colour has this cell.
+                self.deformation[c] = self.deformation[c] + change.outer_product(self.gradient[i, k])
+            if ti.static(self.has_contacts):
+                self.contacts.follow(i, change)
+
+    @ti.func
+    def add_cells(self, i, force, hessian):
+        """The elastic force of the cells around node i, and its negative derivative by the node's position.
+
+        With B the node's gradient, f = -V (mu F B + (lambda ln J - mu) G / J), where G = dJ/dx = cof(F) B does not
+        depend on the node's own position, so that d^2J/dx^2 = 0.
+        """
+        mu, lame = self.mu[None], self.lame[None]
+        for k in range(8):
+            c = self.around[i, k]
+            b, volume = self.gradient[i, k], self.volume[c]
+            f = self.deformation[c]
+            f1, f2, f3 = column(f, 0), column(f, 1), column(f, 2)
+            f23 = f2.cross(f3)
+            j = f1.dot(f23)
+            g = b.x * f23 + b.y * f3.cross(f1) + b.z * f1.cross(f2)
+            at = ti.max(j, LEAST_J)
+            log_j = ti.log(at) + (j - at) / at
+            pressure = (lame * log_j - mu) / at
+            force -= volume * (mu * (b.x * f1 + b.y * f2 + b.z * f3) + pressure * g)
+            curvature = lame / (at * at) - (pressure / at if j > LEAST_J else 0.0)
+            hessian += (volume * ti.max(curvature, 0.0)) * g.outer_product(g)
+            hessian += (volume * mu * b.dot(b)) * tm.eye(3)
+        return force, hessian
+
+    @ti.func
+    def add_hourglass(self, i, force, hessian):
+        """What deformation that varies inside the cells adds: linear in the positions, blind to rotations."""
+        mu = self.mu[None]
+        x = self.body.estimate[i]
+        pull = tm.vec3(0.0)
+        for k in range(27):
+            pull += self.hourglass[i, k] * (self.body.estimate[self.neighbour[i, k]] - x)
+        return force - mu * pull, hessian + (mu * self.hourglass[i, 13]) * tm.eye(3)
+
+    def update_frames(self) -> None:
+        """Nothing to do: points are carried by the nodes themselves."""
+
+    def attach(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes (n, 8) around points (n, 3) [mm], and their trilinear weights (n, 8)."""
+        return self.lattice.interpolation(points)
+
+    @ti.kernel
+    def carry(self, rest: ti.template(), frame: ti.template(), weight: ti.template(), out: ti.template()):
+        """Points moved by the weighted displacements of their nodes."""
+        for v in rest:
+            x = rest[v]
+            for k in ti.static(range(frame.n)):
+                i = frame[v][k]
+                x += weight[v][k] * (self.body.position[i] - self.body.rest[i])
+            out[v] = x
+
+
+@ti.func
+def column(matrix, k: ti.template()):
+    """Column k of a 3 x 3 matrix."""
+    return tm.vec3(matrix[0, k], matrix[1, k], matrix[2, k])
+
+
+@ti.func
+def solve(matrix, right):
+    """Solution of a 3 x 3 system with positive determinant, by Cramer's rule."""
+    a, b, c = column(matrix, 0), column(matrix, 1), column(matrix, 2)
+    bc = b.cross(c)
+    return tm.vec3(bc.dot(right), c.cross(a).dot(right), a.cross(b).dot(right)) / a.dot(bc)

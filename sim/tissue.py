@@ -1,0 +1,39 @@
+"""What a tissue model is: the interface that solver, contacts, skin and embedding know, and nothing else of it."""
+
+from typing import Protocol
+
+import numpy as np
+import taichi as ti
+
+from sim.body import Body
+
+
+class TissueModel(Protocol):
+    """Rest data, a projection of its constraints on the body's estimates, and a way to carry points along.
+
+    ``groups`` are (first, last) rows of unknowns that are projected one after another, each group at once.
+    ``begin`` and ``project`` are ti.funcs that the solver's kernels inline, so their outermost loops are parallel.
+    """
+
+    body: Body
+    groups: tuple[tuple[int, int], ...]
+
+    def begin(self, dt: float) -> None:
+        """Once a substep [s], when the solver has predicted the estimates."""
+
+    def project(self, first: int, last: int, stiffness: float, relaxation_factor: float, dt: float) -> None:
+        """One pass over a group."""
+
+    def update_frames(self) -> None:
+        """Once a step, when positions are final, for ``carry``."""
+
+    def attach(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Frames (n, k) and weights (n, k) of rest points (n, 3) [mm], for ``carry``."""
+        ...
+
+    def carry(self, rest: ti.Field, frame: ti.Field, weight: ti.Field, out: ti.Field) -> None:
+        """Where attached points are now."""
+
+    def counts(self) -> dict[str, int]:
+        """Its size, for reports: ``particles`` or ``nodes`` first."""
+        ...
