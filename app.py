@@ -17,7 +17,7 @@ from scenes.anatomy import load_anatomy, patient_scene
 from scenes.labels import Side
 from scenes.patient import describe, import_patient, save_patient
 from scenes.reading import PatientError, read_volume
-from scenes.scene import OPTIONS, SceneError, load_scene, scene_text, with_options
+from scenes.scene import OPTIONS, TISSUES, SceneError, load_scene, scene_text, with_options
 from sim.sampling import SamplingError
 
 if TYPE_CHECKING:
@@ -64,27 +64,28 @@ def cli() -> None:
     show_default=True,
     help="Where to compute; auto is CUDA where there is one, else the CPU.",
 )
-@click.option("--radius", type=float, help="Particle radius in mm [the scene's].")
-@click.option("--stiffness", type=float, help="Cluster stiffness, 0 to 1 [the scene's].")
-@click.option("--substeps", type=int, help="Substeps of a time step [the scene's].")
-@click.option("--iterations", type=int, help="Passes over the constraints in a substep [the scene's].")
+@click.option("--model", type=click.Choice(list(TISSUES)), help="Tissue model [the scene's].")
+@click.option("--cell", type=float, help="neo-hookean: width of a cell in mm [the scene's].")
+@click.option("--young-kpa", type=float, help="neo-hookean: Young's modulus in kPa [the scene's].")
+@click.option("--poisson", type=float, help="neo-hookean: Poisson's ratio [the scene's].")
+@click.option("--radius", type=float, help="shape-matching: particle radius in mm [the scene's].")
+@click.option("--stiffness", type=float, help="shape-matching: cluster stiffness, 0 to 1 [the scene's].")
+@click.option("--substeps", type=int, help="Substeps of a time step [the model's].")
+@click.option("--iterations", type=int, help="Passes over the constraints in a substep [the model's].")
 def rehearse(
     scene: Path,
     headless: bool,
     seconds: float | None,
     out: Path,
     arch: str,
-    radius: float | None,
-    stiffness: float | None,
-    substeps: int | None,
-    iterations: int | None,
+    **changes: float | str | None,
 ) -> None:
     """Press the kidney of SCENE, a scene file or a patient's folder, and see what the transducer sees."""
     path = scene / "scene.toml" if scene.is_dir() else scene
     if scene.is_dir() and not path.is_file():
         raise Fault(f"{scene}: holds no scene.toml; make a patient's folder of a CT with: app.py import")
-    values = (radius, stiffness, substeps, iterations)
-    loaded = with_options(load_scene(path), dict(zip(OPTIONS, values, strict=True)))
+    changed = {key: changes[option.strip("-").replace("-", "_")] for key, option in OPTIONS.items()}
+    loaded = with_options(load_scene(path), changed)
     anatomy = load_anatomy(loaded, path.parent)
     from sim.device import NoDevice, start
 
@@ -165,8 +166,10 @@ def settings_of(rehearsal: "Rehearsal") -> "Settings":
     from render.viewer import Settings
 
     scene, step = rehearsal.scene, rehearsal.settings
+    true_to_material = scene.tissue.model == "neo-hookean"
     return Settings(
-        stiffness=step.stiffness,
+        young_kpa=scene.tissue.young_kpa if true_to_material else None,
+        stiffness=None if true_to_material else step.stiffness,
         iterations=step.iterations,
         substeps=step.substeps,
         gravity_m_s2=scene.gravity.acceleration_m_s2,
@@ -219,10 +222,11 @@ def run_frame(
     picture = timed(
         lambda: rehearsal.image(settings.window_hu, settings.level_hu, settings.depth_mm), record.slice_ms
     )
+    size, count = next(iter(rehearsal.model.counts().items()))
     readouts = {
         "step": f"{np.median(record.step_ms[-30:]):.1f} ms",
         "slice": f"{np.median(record.slice_ms[-30:]):.1f} ms",
-        "particles": f"{rehearsal.body.count}",
+        size: f"{count}",
         "indentation": f"{max(rehearsal.indentation_mm(), 0.0):.1f} mm",
     }
     return View(
@@ -307,7 +311,11 @@ def run_window(rehearsal: "Rehearsal", out: Path) -> None:
 def steer(rehearsal: "Rehearsal", controls: "Controls") -> np.ndarray:
     """Hand the user's input to the hand that holds the transducer and to the solver; the pose to go to then."""
     step, hand, asked = rehearsal.settings, rehearsal.hand, controls.settings
-    step.stiffness, step.iterations, step.substeps = asked.stiffness, asked.iterations, asked.substeps
+    step.iterations, step.substeps = asked.iterations, asked.substeps
+    if asked.stiffness is not None:
+        step.stiffness = asked.stiffness
+    if asked.young_kpa is not None:
+        rehearsal.set_young(asked.young_kpa)
     rehearsal.set_gravity(asked.gravity_m_s2)
     if controls.reset:
         rehearsal.reset()

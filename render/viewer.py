@@ -61,9 +61,13 @@ def _switch(default: bool, label: str):
 
 @dataclass
 class Settings:
-    """What the sliders change. The metadata of a field (label, unit, low, high, group) is all that they are made of."""
+    """What the sliders change. The metadata of a field (label, unit, low, high, group) is all that they are made of.
 
-    stiffness: float = _slider(0.6, "Stiffness", "", 0.1, 1.0, "Tissue")
+    A field that is None has no slider: of the first two, each tissue model has one.
+    """
+
+    young_kpa: float | None = _slider(None, "Young's modulus", "kPa", 1.0, 100.0, "Tissue")
+    stiffness: float | None = _slider(None, "Stiffness", "", 0.1, 1.0, "Tissue")
     iterations: int = _slider(9, "Iterations", "", 1, 40, "Tissue")
     substeps: int = _slider(3, "Substeps", "", 1, 10, "Tissue")
     gravity_m_s2: float = _slider(9.81, "Gravity", "m/s2", 0.0, 20.0, "Tissue")

@@ -337,7 +337,8 @@ class Window:
     def _draw_sliders(self) -> None:
         groups: dict[str, list[dataclasses.Field]] = {}
         for each in dataclasses.fields(self.settings):
-            groups.setdefault(each.metadata["group"], []).append(each)
+            if getattr(self.settings, each.name) is not None:
+                groups.setdefault(each.metadata["group"], []).append(each)
         width, height = self._first_size
         boxes = self.layout.sliders([_group_width(members) for members in groups.values()])
         for (name, members), box in zip(groups.items(), boxes, strict=True):

@@ -7,11 +7,20 @@ other than the schema's, and values out of range, each by name.
 import difflib
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tomli_w
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    model_validator,
+)
 
 Vector3 = tuple[float, float, float]
 Stiffness = Annotated[float, Field(ge=0, le=1)]
@@ -19,6 +28,10 @@ Stiffness = Annotated[float, Field(ge=0, le=1)]
 
 # The command line's names for single values of a scene.
 OPTIONS = {
+    "tissue.model": "--model",
+    "tissue.cell_mm": "--cell",
+    "tissue.young_kpa": "--young-kpa",
+    "tissue.poisson": "--poisson",
     "tissue.radius_mm": "--radius",
     "tissue.stiffness": "--stiffness",
     "solver.substeps": "--substeps",
@@ -60,15 +73,25 @@ class Anatomy(Section):
         return self
 
 
-class Tissue(Section):
-    """The tissue model and its sampling; the defaults are the paper's, but for the stiffness, which it fits.
+class NeoHookeanTissue(Section):
+    """Tissue true to a material, on cubic cells. Smaller cells are truer and slower; the material stays the same."""
+
+    model: Literal["neo-hookean"] = "neo-hookean"
+    cell_mm: float = Field(4.0, ge=0.5, le=20)
+    young_kpa: float = Field(15.0, gt=0, le=1e6)
+    poisson: float = Field(0.45, ge=0, le=0.4999)
+    density_g_cm3: float = Field(1.05, gt=0, le=20)
+
+
+class ShapeMatchingTissue(Section):
+    """The paper's tissue model and its sampling; the defaults are the paper's, but for the stiffness, which it fits.
 
     Particles are ``radius_mm`` apart, chosen from voxels of ``radius_mm / volume_sampling``; clusters are
     ``cluster_spacing`` radii apart and reach as far. The tissue's stiffness depends on all of these and on the
     solver's iterations, not on ``stiffness`` alone: that is this method's limitation.
     """
 
-    model: Literal["shape-matching"] = "shape-matching"
+    model: Literal["shape-matching"]
     radius_mm: float = Field(2.7, ge=0.5, le=20)
     stiffness: Stiffness = 0.95
     density_g_cm3: float = Field(1.05, gt=0, le=20)
@@ -77,15 +100,37 @@ class Tissue(Section):
     surface_samples_per_mm2: float = Field(0.0, ge=0, le=10)
 
 
+TISSUES = {"neo-hookean": NeoHookeanTissue, "shape-matching": ShapeMatchingTissue}
+
+
+def _model_of(values: Any) -> str | None:
+    name = values.get("model", "neo-hookean") if isinstance(values, dict) else getattr(values, "model", None)
+    return name if name in TISSUES else None
+
+
+Tissue = Annotated[
+    Annotated[NeoHookeanTissue, Tag("neo-hookean")]
+    | Annotated[ShapeMatchingTissue, Tag("shape-matching")],
+    Discriminator(
+        _model_of,
+        custom_error_type="unknown_model",
+        custom_error_message=f"the model should be one of {', '.join(TISSUES)}",
+    ),
+]
+
+
 class SolverSection(Section):
-    """One time step; the defaults are the paper's Table 1."""
+    """One time step. What is left out is the tissue model's own choice; that of shape matching is the paper's Table 1.
+
+    ``relaxation`` (Eq. 7), ``stabilisation_iterations`` and ``mass_scaling_per_mm`` are shape matching's.
+    """
 
     time_step_s: float = Field(1 / 60, gt=0, le=0.1)
-    substeps: int = Field(3, ge=1, le=100)
-    iterations: int = Field(9, ge=1, le=1000)
-    stabilisation_iterations: int = Field(1, ge=0, le=100)
+    substeps: int | None = Field(None, ge=1, le=100)
+    iterations: int | None = Field(None, ge=1, le=1000)
+    stabilisation_iterations: int | None = Field(None, ge=0, le=100)
     relaxation: Literal["local", "global"] = "local"
-    relaxation_factor: float = Field(1.0, ge=1, le=2)
+    relaxation_factor: float | None = Field(None, ge=1, lt=2)
     damping_per_s: float = Field(12.0, ge=0, le=1000)
     mass_scaling_per_mm: float = Field(0.0, ge=0, le=1)
 
@@ -96,7 +141,7 @@ class Gravity(Section):
 
 
 class Contact(Section):
-    """``particles`` switches contacts of particles with each other on."""
+    """``particles`` switches contacts of shape matching's particles with each other on."""
 
     shape_friction: float = Field(0.35, ge=0, le=10)
     particle_friction: float = Field(0.25, ge=0, le=10)
@@ -162,7 +207,7 @@ class Scene(Section):
 
     title: str = ""
     anatomy: Anatomy
-    tissue: Tissue = Tissue()
+    tissue: Tissue = NeoHookeanTissue()
     solver: SolverSection = SolverSection()
     gravity: Gravity = Gravity()
     contact: Contact = Contact()
@@ -170,6 +215,14 @@ class Scene(Section):
     transducer: Transducer = Transducer()
     image: Image = Image()
     press: Press = Press()
+
+    @model_validator(mode="after")
+    def _particles_exist(self) -> "Scene":
+        if self.contact.particles and self.tissue.model != "shape-matching":
+            raise ValueError(
+                "contact.particles = true needs particles: set tissue.model to shape-matching, or leave it out"
+            )
+        return self
 
 
 def load_scene(path: Path) -> Scene:
@@ -188,12 +241,14 @@ def load_scene(path: Path) -> Scene:
         raise SceneError(f"{path}: {_explain(error)}") from None
 
 
-def with_options(scene: Scene, options: dict[str, float | int | None]) -> Scene:
+def with_options(scene: Scene, options: dict[str, float | int | str | None]) -> Scene:
     """The scene with single values changed, such as ``{"tissue.radius_mm": 3.0}``; None leaves what is there.
 
-    Raises SceneError for a value out of range.
+    Another tissue model starts from its own defaults. Raises SceneError for a value out of range.
     """
     values = scene.model_dump(exclude_unset=True)
+    if options.get("tissue.model") not in (None, scene.tissue.model):
+        values["tissue"] = {}
     for name, value in options.items():
         if value is not None:
             section, key = name.split(".")
@@ -218,10 +273,14 @@ def _explain(error: ValidationError) -> str:
     # A key that is missing under one spelling and unknown under another is one mistake: name the unknown one.
     problems.sort(key=lambda problem: problem["type"] != "extra_forbidden")
     first = problems[0]
-    where = [str(part) for part in first["loc"] if part not in ("plane", "mesh", "sdf")]
+    where = [str(part) for part in first["loc"] if part not in ("plane", "mesh", "sdf", *TISSUES)]
     name = ".".join(where)
     if first["type"] == "extra_forbidden":
         text = f"{name}: unknown key; {_suggest(where)}"
+    elif first["type"] == "value_error" and not name:
+        text = str(first["ctx"]["error"])
+    elif first["type"] == "unknown_model":
+        text = f"{name}.model = {first['input'].get('model')!r}: {first['msg']}"
     elif first["type"] == "missing":
         text = f"{name}: missing"
     else:
@@ -234,6 +293,10 @@ def _suggest(where: list[str]) -> str:
     """What the writer of an unknown key may have meant; a unit other than the schema's is named as such."""
     known = _keys_beside(where)
     key = where[-1]
+    if where[0] == "tissue":
+        for model, section in TISSUES.items():
+            if key in section.model_fields:
+                return f"it belongs to the tissue model {model}"
     stem = key.split("_")[0]
     for name in known:
         if name != key and key.startswith(_quantity(name)) and _quantity(name) != name:
@@ -253,6 +316,8 @@ def _quantity(name: str) -> str:
 def _keys_beside(where: list[str]) -> list[str]:
     section: type[BaseModel] = Scene
     for part in where[:-1]:
+        if part == "tissue":
+            return sorted({key for kind in TISSUES.values() for key in kind.model_fields})
         if part == "shape":
             return sorted(
                 {key for kind in (PlaneShape, MeshShape, DistanceShape) for key in kind.model_fields}

@@ -1,5 +1,6 @@
 """Contacts of particles with shapes: found once a substep, solved with Coulomb friction, never left violated."""
 
+import numpy as np
 import taichi as ti
 import taichi.math as tm
 
@@ -43,6 +44,14 @@ class ShapeContacts:
     def forget(self) -> None:
         """Drop what is known of the particles' distances, after they were moved by another hand."""
         self.found.fill(-FAR)
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """What it carries from step to step: nothing, as distances only save time."""
+        return {}
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Go on after a snapshot."""
+        self.forget()
 
     @ti.func
     def is_clear(self, s: ti.template(), i, p, distance):

@@ -6,6 +6,7 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
+from sim.body import BodyState
 from sim.contact import ShapeContacts
 from sim.neighbours import ParticleContacts
 from sim.shapes import ConvexTool
@@ -32,6 +33,14 @@ class StepSettings:
     relaxation_factor: float = 1.0
     damping: float = 12.0
     gravity: tuple[float, float, float] = (0.0, 0.0, -9810.0)
+
+
+@dataclass(frozen=True)
+class SolverState:
+    """All that steps change: the body's state and what its contacts remember."""
+
+    body: BodyState
+    contacts: dict[str, np.ndarray]
 
 
 @ti.data_oriented
@@ -79,6 +88,17 @@ class Solver:
                 for first, last in self.model.groups:
                     self.iterate(first, last, settings.stiffness, factor, dt)
             self.end(dt)
+        self.model.update_frames()
+
+    def snapshot(self) -> SolverState:
+        """A copy of the current state."""
+        return SolverState(self.body.snapshot(), self.contacts.snapshot() if self.contacts else {})
+
+    def restore(self, state: SolverState) -> None:
+        """Go back to a state; the steps that follow give the same bits as they did from it before."""
+        self.body.restore(state.body)
+        if self.contacts:
+            self.contacts.restore(state.contacts)
         self.model.update_frames()
 
     @ti.kernel

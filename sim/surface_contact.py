@@ -61,6 +61,7 @@ class SurfaceContacts:
         self.found = ti.Vector.field(4, ti.f32, (len(shapes), self.count))
         if self.rough:
             self.stick = ti.Vector.field(3, ti.f32, (len(shapes), self.count))
+        self.remembered = ("plane", "found", "stick") if self.rough else ("plane", "found")
         self.stiffness = ti.field(ti.f32, ())
         self.penetration = ti.field(ti.f32, ())
         self.forget()
@@ -77,6 +78,15 @@ class SurfaceContacts:
         self.found.fill(-FAR)
         if self.rough:
             self.stick.fill(0.0)
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """What it carries from step to step: friction, and the planes that were found."""
+        return {name: getattr(self, name).to_numpy() for name in self.remembered}
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Go back to a snapshot; the steps that follow give the same bits."""
+        for name, values in state.items():
+            getattr(self, name).from_numpy(values)
 
     @ti.func
     def carried(self, field: ti.template(), q):

@@ -9,20 +9,14 @@ import trimesh
 
 from scenes.anatomy import Grid, LoadedAnatomy, press_on
 from scenes.scene import PlaneShape, Scene
-from sim.body import ParticleBody, fill_body
-from sim.contact import REACH_RADII, ShapeContacts
 from sim.embedding import Embedding
-from sim.neighbours import ParticleContacts
-from sim.shape_matching import ShapeMatching
 from sim.shapes import ConvexTool, Plane, SignedDistanceField, TriangleMesh
 from sim.skinning import Skin
-from sim.solver import Solver, StepSettings
+from studies.models import build_solver, embedding_cell_mm, reach_mm, step_settings
 from ultrasound.probe import Hand, advanced, approached, between, image_plane, indentation, pose_at, touching
 from ultrasound.slice import Slice
 from ultrasound.volume import Volume, distance_volume
 
-# The tetrahedra that carry the image plane are "coarse": two particle radii wide.
-EMBEDDING_CELL_RADII = 2.0
 TURN_DEG_S = 180.0
 AWAY_MM = 200.0
 # Where the tumour sticks out, the organ has the same surface: the tumour's is drawn this far outside it.
@@ -44,7 +38,6 @@ class Rehearsal:
         self.tumour = anatomy.tumour and _shifted(anatomy.tumour, -self.origin)
         self.gravity_direction = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
         self.supports = [_shifted(s, -self.origin) for s in anatomy.shapes if isinstance(s, trimesh.Trimesh)]
-        self._build_body()
         self._build_solver(anatomy)
         self._build_surfaces()
         self._build_slice(anatomy)
@@ -53,39 +46,16 @@ class Rehearsal:
         self.pose = self._settle()
         self.hand = self._hand()
         self.pose = self.hand.pose()
-        self.settled = self.body.snapshot()
-
-    def _build_body(self) -> None:
-        tissue, solver = self.scene.tissue, self.scene.solver
-        rest = fill_body(
-            self.organ,
-            tissue.radius_mm,
-            tissue.density_g_cm3,
-            tissue.volume_sampling,
-            tissue.surface_samples_per_mm2,
-        )
-        self.body = ParticleBody(rest, solver.mass_scaling_per_mm)
-        self.model = ShapeMatching(self.body, tissue.cluster_spacing, solver.relaxation)
+        self.settled = self.solver.snapshot()
 
     def _build_solver(self, anatomy: LoadedAnatomy) -> None:
-        contact, solver = self.scene.contact, self.scene.solver
         self.size_mm = np.array(self.scene.transducer.size_mm)
         self.tool = ConvexTool.cuboid(self.size_mm)
-        static = [self._shape(shape) for shape in anatomy.shapes]
-        self.contacts = ShapeContacts(self.body, [*static, self.tool], contact.shape_friction)
-        pairs = (
-            ParticleContacts(self.body, self.model, contact.particle_friction) if contact.particles else None
-        )
-        self.solver = Solver(self.model, self.contacts, pairs, self.tool, solver.relaxation)
-        self.settings = StepSettings(
-            stiffness=self.scene.tissue.stiffness,
-            time_step_s=solver.time_step_s,
-            substeps=solver.substeps,
-            iterations=solver.iterations,
-            stabilisation_iterations=solver.stabilisation_iterations,
-            relaxation_factor=solver.relaxation_factor,
-            damping=solver.damping_per_s,
-        )
+        shapes = [*(self._shape(shape) for shape in anatomy.shapes), self.tool]
+        tissue, section = self.scene.tissue, self.scene.solver
+        self.solver = build_solver(self.organ, tissue, shapes, self.tool, self.scene.contact, section)
+        self.body, self.model, self.contacts = self.solver.body, self.solver.model, self.solver.contacts
+        self.settings = step_settings(tissue, section)
         self.set_gravity(self.scene.gravity.acceleration_m_s2)
 
     def _shape(
@@ -96,7 +66,7 @@ class Rehearsal:
             return Plane(normal, shape.offset_mm / np.linalg.norm(shape.normal) - normal @ self.origin)
         if isinstance(shape, trimesh.Trimesh):
             moved = _shifted(shape, -self.origin)
-            return TriangleMesh(moved.vertices, moved.faces, REACH_RADII * self.scene.tissue.radius_mm)
+            return TriangleMesh(moved.vertices, moved.faces, reach_mm(self.scene.tissue))
         spacing = 1 / np.diag(shape.index_from_mm)[:3]
         return SignedDistanceField(shape.voxels, -spacing * shape.index_from_mm[:3, 3] - self.origin, spacing)
 
@@ -110,7 +80,7 @@ class Rehearsal:
     def _build_slice(self, anatomy: LoadedAnatomy) -> None:
         image = self.scene.image
         margin = SURROUNDINGS_MM if image.outside == "background" else 0.0
-        cell = EMBEDDING_CELL_RADII * self.scene.tissue.radius_mm
+        cell = embedding_cell_mm(self.scene.tissue)
         self.embedding = Embedding(self.model, self.organ, cell, margin)
         self.slice = None
         if anatomy.ct is not None:
@@ -139,6 +109,10 @@ class Rehearsal:
     def set_gravity(self, acceleration_m_s2: float) -> None:
         """Change the acceleration due to gravity; its direction is the scene's."""
         self.settings.gravity = tuple(1000.0 * acceleration_m_s2 * self.gravity_direction)
+
+    def set_young(self, young_kpa: float) -> None:
+        """Change Young's modulus of a tissue that has one."""
+        self.model.set_material(young_kpa, self.scene.tissue.poisson)
 
     def scripted_pose(self, time_s: float) -> np.ndarray:
         """The transducer's pose at a time of the scripted press: just touching at first, then down stage by stage."""
@@ -193,9 +167,7 @@ class Rehearsal:
 
     def reset(self) -> None:
         """Tissue and transducer as they were at the start: settled, and just touching."""
-        self.body.restore(self.settled)
-        self.contacts.forget()
-        self.model.update_frames()
+        self.solver.restore(self.settled)
         self.hand.reset()
         self.pose = self.hand.pose()
         self.steps = 0

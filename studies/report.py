@@ -51,15 +51,12 @@ class Record:
         return dict(
             title=rehearsal.scene.title,
             arch=arch,
-            particles=rehearsal.body.count,
-            clusters=rehearsal.model.count,
-            memberships=rehearsal.model.membership_count,
+            **rehearsal.scene.tissue.model_dump(),
+            **rehearsal.model.counts(),
             tetrahedra=rehearsal.embedding.count,
-            radius_mm=rehearsal.scene.tissue.radius_mm,
             time_step_s=settings.time_step_s,
             substeps=settings.substeps,
             iterations=settings.iterations,
-            stiffness=settings.stiffness,
             slice_width_mm=rehearsal.scene.image.width_mm,
             slice_depth_mm=rehearsal.scene.image.depth_mm,
             steps=rehearsal.steps,
@@ -81,13 +78,25 @@ def summary(report: dict) -> str:
     )
     return "\n".join(
         [
-            f"model     {report['particles']} particles of {report['radius_mm']:g} mm, {report['clusters']} clusters, "
-            f"{report['memberships']} memberships, {report['tetrahedra']} tetrahedra",
+            f"model     {_model_line(report)}",
             f"step      1/{1 / report['time_step_s']:.0f} s in {report['substeps']} substeps of {report['iterations']} "
-            f"iterations, stiffness {report['stiffness']:g}",
+            "iterations",
             f"speed     {times} on {report['arch']}; built in {report['build_s']:.1f} s",
             f"press     {report['indentation_max_mm']:.2f} mm deep; least volume {100 * report['volume_ratio_min']:.1f} %; "
             f"penetration at most {report['max_penetration_mm']:.3f} mm; "
-            f"{'all particles finite' if report['finite'] else 'PARTICLES NOT FINITE'}",
+            f"{'all finite' if report['finite'] else 'NOT FINITE'}",
         ]
+    )
+
+
+def _model_line(report: dict) -> str:
+    if report["model"] == "neo-hookean":
+        return (
+            f"neo-Hookean, E {report['young_kpa']:g} kPa, nu {report['poisson']:g}: {report['cells']} cells of "
+            f"{report['cell_mm']:g} mm, {report['nodes']} nodes, {report['tetrahedra']} tetrahedra"
+        )
+    return (
+        f"shape matching, stiffness {report['stiffness']:g}: {report['particles']} particles of "
+        f"{report['radius_mm']:g} mm, {report['clusters']} clusters, {report['memberships']} memberships, "
+        f"{report['tetrahedra']} tetrahedra"
     )

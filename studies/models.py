@@ -1,0 +1,83 @@
+"""The tissue models as a scene names them: each put on the device with its contacts, ready to step."""
+
+from dataclasses import replace
+
+import trimesh
+
+from scenes.scene import Contact, NeoHookeanTissue, ShapeMatchingTissue, SolverSection
+from sim.body import Body, ParticleBody, RestBody, fill_body
+from sim.contact import REACH_RADII, ShapeContacts
+from sim.lattice import fill_with_cells, surface_points
+from sim.neighbours import ParticleContacts
+from sim.neo_hookean import LATTICE_SETTINGS, NeoHookean
+from sim.shape_matching import ShapeMatching
+from sim.shapes import ConvexTool
+from sim.solver import Solver, StepSettings
+from sim.surface_contact import REACH_MM, SurfaceContacts
+
+AnyTissue = NeoHookeanTissue | ShapeMatchingTissue
+# Points of the surface that can touch are this share of a cell apart.
+POINTS_A_CELL = 0.5
+
+
+def reach_mm(tissue: AnyTissue) -> float:
+    """How far around a static shape its distances must be known."""
+    return REACH_MM if isinstance(tissue, NeoHookeanTissue) else REACH_RADII * tissue.radius_mm
+
+
+def embedding_cell_mm(tissue: AnyTissue) -> float:
+    """Width of the coarse tetrahedra that carry the image plane."""
+    return 1.35 * tissue.cell_mm if isinstance(tissue, NeoHookeanTissue) else 2.0 * tissue.radius_mm
+
+
+def step_settings(tissue: AnyTissue, section: SolverSection) -> StepSettings:
+    """The scene's settings of a step; what it leaves out is the tissue model's own choice."""
+    own = LATTICE_SETTINGS if isinstance(tissue, NeoHookeanTissue) else StepSettings(stiffness=tissue.stiffness)
+    names = ("time_step_s", "substeps", "iterations", "stabilisation_iterations", "relaxation_factor")
+    given = {name: getattr(section, name) for name in names if getattr(section, name) is not None}
+    return replace(own, damping=section.damping_per_s, **given)
+
+
+def build_solver(
+    organ: trimesh.Trimesh,
+    tissue: AnyTissue,
+    shapes: list,
+    tool: ConvexTool,
+    contact: Contact | None = None,
+    section: SolverSection | None = None,
+) -> Solver:
+    """A solver of the organ [mm] among shapes, the tool among them. Raises SamplingError."""
+    contact, section = contact or Contact(), section or SolverSection()
+    if isinstance(tissue, NeoHookeanTissue):
+        return _neo_hookean(organ, tissue, shapes, tool, contact)
+    rest = fill_body(
+        organ, tissue.radius_mm, tissue.density_g_cm3, tissue.volume_sampling, tissue.surface_samples_per_mm2
+    )
+    return shape_matching(rest, tissue, shapes, tool, contact, section)
+
+
+def _neo_hookean(
+    organ: trimesh.Trimesh, tissue: NeoHookeanTissue, shapes: list, tool: ConvexTool, contact: Contact
+) -> Solver:
+    lattice = fill_with_cells(organ, tissue.cell_mm)
+    body = Body(lattice.nodes)
+    points, area_mm2 = surface_points(organ, POINTS_A_CELL * tissue.cell_mm)
+    contacts = SurfaceContacts(body, lattice, points, area_mm2, shapes, contact.shape_friction)
+    model = NeoHookean(body, lattice, contacts, tissue.young_kpa, tissue.poisson, tissue.density_g_cm3)
+    return Solver(model, contacts, tool=tool)
+
+
+def shape_matching(
+    rest: RestBody,
+    tissue: ShapeMatchingTissue,
+    shapes: list,
+    tool: ConvexTool,
+    contact: Contact,
+    section: SolverSection,
+) -> Solver:
+    """The paper's model of particles that were sampled before, which takes seconds."""
+    body = ParticleBody(rest, section.mass_scaling_per_mm)
+    model = ShapeMatching(body, tissue.cluster_spacing, section.relaxation)
+    contacts = ShapeContacts(body, shapes, contact.shape_friction)
+    pairs = ParticleContacts(body, model, contact.particle_friction) if contact.particles else None
+    return Solver(model, contacts, pairs, tool, section.relaxation)
