@@ -66,7 +66,7 @@ class Settings:
     A field that is None has no slider: of the first two, each tissue model has one.
     """
 
-    young_kpa: float | None = _slider(None, "Young's modulus", "kPa", 1.0, 100.0, "Tissue")
+    young_kpa: float | None = _slider(None, "Stiffness", "kPa", 1.0, 100.0, "Tissue")
     stiffness: float | None = _slider(None, "Stiffness", "", 0.1, 1.0, "Tissue")
     iterations: int = _slider(9, "Iterations", "", 1, 40, "Tissue")
     substeps: int = _slider(3, "Substeps", "", 1, 10, "Tissue")

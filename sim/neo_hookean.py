@@ -29,7 +29,7 @@ LATTICE_SETTINGS = StepSettings(substeps=1, iterations=8, relaxation_factor=1.7,
 class NeoHookean:
     """W = mu/2 (tr C - 3) - mu ln J + lambda/2 (ln J)^2 on a lattice's cells (Bonet & Wood 2008, Eq. 6.27).
 
-    Nodes are projected colour by colour (``groups``). ``deformation`` (m + 1,) holds F of every cell and follows its
+    Nodes are projected colour by colour (``groups``); those ``held`` (n,) stay where they are. ``deformation`` (m + 1,) holds F of every cell and follows its
     nodes; the last row stands for cells that are not there.
     """
 
@@ -41,6 +41,7 @@ class NeoHookean:
         young_kpa: float = 15.0,
         poisson: float = 0.45,
         density_g_cm3: float = 1.05,
+        held: np.ndarray | None = None,
     ) -> None:
         starts = [int(v) for v in lattice.colour_start]
         self.body = body
@@ -48,6 +49,10 @@ class NeoHookean:
         self.contacts = contacts
         self.has_contacts = contacts is not None
         self.groups = tuple(zip(starts[:-1], starts[1:], strict=True))
+        self.has_held = held is not None
+        if held is not None:
+            self.held = ti.field(ti.i32, body.count)
+            self.held.from_numpy(np.asarray(held, np.int32))
         self.count = len(lattice.cells)
         self.most_mm = MOST_CELLS_A_PASS * lattice.cell_mm
         self.mu = ti.field(ti.f32, ())
@@ -139,6 +144,8 @@ class NeoHookean:
                 hessian += layer
             change = factor * solve(hessian, force)
             change *= ti.min(1.0, self.most_mm / ti.max(change.norm(), 1e-12))
+            if ti.static(self.has_held):
+                change *= 1.0 - self.held[i]
             self.body.estimate[i] += change
             for k in range(8):
                 c = self.around[i, k]
