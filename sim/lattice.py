@@ -24,6 +24,8 @@ ERSATZ = 0.02
 # Beyond its cells a lattice moves as its outermost cell does, this many cells further at most.
 EXTRAPOLATED_CELLS = 1.0
 MOST_CELLS = 400_000
+# Points of the surface that stand for less than this share of the mean area give it to their neighbours.
+LEAST_AREA = 0.4
 
 
 @dataclass(frozen=True)
@@ -178,7 +180,10 @@ def surface_points(surface: trimesh.Trimesh, spacing_mm: float) -> tuple[np.ndar
     owner = np.unique(bins, axis=0, return_inverse=True)[1].ravel()
     total = np.bincount(owner, area)
     mean = np.column_stack([np.bincount(owner, area * middle[:, axis]) for axis in range(3)]) / total[:, None]
-    on_surface = igl.point_mesh_squared_distance(mean, surface.vertices, np.asarray(surface.faces, np.int64))[
-        2
-    ]
-    return on_surface, total
+    # A bin that the surface only grazes would make a point of little weight, which sinks in deep.
+    whole = total >= LEAST_AREA * total.mean()
+    nearest = cKDTree(mean[whole]).query(mean)[1]
+    on_surface = igl.point_mesh_squared_distance(
+        mean[whole], surface.vertices, np.asarray(surface.faces, np.int64)
+    )[2]
+    return on_surface, np.bincount(nearest, total)

@@ -12,6 +12,7 @@ import taichi.math as tm
 
 from sim.body import Body
 from sim.lattice import Lattice
+from sim.rigid_motion import RigidMotion
 from sim.solver import StepSettings
 from sim.surface_contact import LAYER_MM, SurfaceContacts
 
@@ -60,6 +61,7 @@ class NeoHookean:
         self._store_nodes(1e-3 * density_g_cm3)
         self._store_cells()
         self._store_hourglass()
+        self.rigid = None if self.has_held else RigidMotion(body, self.mass, self.target, contacts)
         self.set_material(young_kpa, poisson)
 
     def _store_nodes(self, density_g_mm3: float) -> None:
@@ -115,10 +117,12 @@ class NeoHookean:
 
     @ti.func
     def begin(self, dt: float):
-        """Start from where the body is; what the solver predicted is where inertia and gravity draw it."""
+        """Start from where the body is, moved rigidly; what the solver predicted is where inertia and gravity draw it."""
         for i in range(self.body.count):
             self.target[i] = self.body.estimate[i]
             self.body.estimate[i] = self.body.position[i]
+        if ti.static(not self.has_held):
+            self.rigid.move(dt)
         for c in range(self.count):
             deformation = tm.mat3(0.0)
             for k in ti.static(range(8)):

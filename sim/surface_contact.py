@@ -164,6 +164,24 @@ class SurfaceContacts:
         return force, stiffness
 
     @ti.func
+    def hold(self, q):
+        """Force [uN] of the shapes on point q as the last substep left it, and its negative derivative (3, 3)."""
+        force, stiffness = tm.vec3(0.0), tm.mat3(0.0)
+        if self.near[q] > 0:
+            layer = 1e3 * self.stiffness[None] * self.area[q]
+            for s in ti.static(range(len(self.shapes))):
+                depth = self.touching(s, q)
+                if depth > 0.0:
+                    normal = self.plane[s, q].xyz
+                    force += layer * depth * normal
+                    along = 0.0
+                    if ti.static(self.rough):
+                        force -= layer * STICK * self.stick[s, q]
+                        along = STICK
+                    stiffness += layer * ((1.0 - along) * normal.outer_product(normal) + along * tm.eye(3))
+        return force, stiffness
+
+    @ti.func
     def follow(self, i, change):
         """Carry the points of node i along when it moves. Nodes of one colour have no point in common."""
         for k in range(self.listed_from[i], self.listed_from[i + 1]):

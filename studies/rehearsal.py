@@ -12,7 +12,7 @@ from scenes.scene import PlaneShape, Scene
 from sim.embedding import Embedding
 from sim.shapes import ConvexTool, Plane, SignedDistanceField, TriangleMesh
 from sim.skinning import Skin
-from studies.models import build_solver, embedding_cell_mm, reach_mm, step_settings
+from studies.models import build_solver, embedding_cell_mm, static_shape, step_settings
 from ultrasound.probe import Hand, advanced, approached, between, image_plane, indentation, pose_at, touching
 from ultrasound.slice import Slice
 from ultrasound.volume import Volume, distance_volume
@@ -65,8 +65,7 @@ class Rehearsal:
             normal = np.array(shape.normal) / np.linalg.norm(shape.normal)
             return Plane(normal, shape.offset_mm / np.linalg.norm(shape.normal) - normal @ self.origin)
         if isinstance(shape, trimesh.Trimesh):
-            moved = _shifted(shape, -self.origin)
-            return TriangleMesh(moved.vertices, moved.faces, reach_mm(self.scene.tissue))
+            return static_shape(_shifted(shape, -self.origin), self.scene.tissue)
         spacing = 1 / np.diag(shape.index_from_mm)[:3]
         return SignedDistanceField(shape.voxels, -spacing * shape.index_from_mm[:3, 3] - self.origin, spacing)
 

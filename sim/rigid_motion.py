@@ -1,0 +1,113 @@
+"""How the whole organ moves as if it were rigid, found at once: node by node that takes hundreds of passes.
+
+A coarse correction with six unknowns: the Newton step of the time step's energy over rotations and translations of all
+nodes, under inertia, gravity and the contacts as the last substep left them. Elastic energy does not see it.
+"""
+
+import numpy as np
+import taichi as ti
+import taichi.math as tm
+
+from sim.body import Body
+from sim.surface_contact import SurfaceContacts
+
+# Sums are made of blocks of so many terms, in an order that no thread changes.
+BLOCK = 64
+
+
+@ti.data_oriented
+class RigidMotion:
+    """Moves a body's estimates rigidly towards ``target`` (n,) [mm], where inertia and gravity draw its ``mass`` (n,) [g].
+
+    Unknowns are the translation and the rotation vector about ``centre``, one of the nodes.
+    """
+
+    def __init__(
+        self, body: Body, mass: ti.Field, target: ti.Field, contacts: SurfaceContacts | None = None
+    ) -> None:
+        self.body = body
+        self.mass = mass
+        self.target = target
+        self.contacts = contacts
+        self.has_contacts = contacts is not None
+        self.terms = body.count + (contacts.count if contacts else 0)
+        self.blocks = -(-self.terms // BLOCK)
+        middle = body.rest_points.mean(axis=0)
+        self.centre = int(np.linalg.norm(body.rest_points - middle, axis=1).argmin())
+        self.force = ti.Vector.field(3, ti.f32, self.blocks)
+        self.torque = ti.Vector.field(3, ti.f32, self.blocks)
+        self.along = ti.Matrix.field(3, 3, ti.f32, self.blocks)
+        self.mixed = ti.Matrix.field(3, 3, ti.f32, self.blocks)
+        self.about = ti.Matrix.field(3, 3, ti.f32, self.blocks)
+        self.rotation = ti.Matrix.field(3, 3, ti.f32, ())
+        self.translation = ti.Vector.field(3, ti.f32, ())
+
+    @ti.func
+    def move(self, dt: float):
+        """One Newton step, and all estimates moved by it."""
+        for block in range(self.blocks):
+            self.sum_block(block, dt)
+        for _ in range(1):
+            self.solve()
+        for i in range(self.body.count):
+            c = self.body.position[self.centre]
+            self.body.estimate[i] = (
+                c + self.translation[None] + self.rotation[None] @ (self.body.position[i] - c)
+            )
+
+    @ti.func
+    def sum_block(self, block, dt: float):
+        """Force, torque and their derivatives of a block's terms, nodes first, then points of contact."""
+        force, torque = tm.vec3(0.0), tm.vec3(0.0)
+        along, mixed, about = tm.mat3(0.0), tm.mat3(0.0), tm.mat3(0.0)
+        centre = self.body.position[self.centre]
+        for term in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.terms)):
+            f, k, arm = tm.vec3(0.0), tm.mat3(0.0), tm.vec3(0.0)
+            if term < self.body.count:
+                inertia = self.mass[term] / (dt * dt)
+                f = inertia * (self.target[term] - self.body.position[term])
+                k = inertia * tm.eye(3)
+                arm = self.body.position[term] - centre
+            elif ti.static(self.has_contacts):
+                f, k = self.contacts.hold(term - self.body.count)
+                arm = self.contacts.point[term - self.body.count] - centre
+            turn = cross_matrix(arm)
+            force += f
+            torque += arm.cross(f)
+            along += k
+            mixed -= k @ turn
+            about -= turn @ k @ turn
+        self.force[block], self.torque[block] = force, torque
+        self.along[block], self.mixed[block], self.about[block] = along, mixed, about
+
+    @ti.func
+    def solve(self):
+        """The 6 x 6 system by its Schur complement; the motion as a rotation and a translation."""
+        force, torque = tm.vec3(0.0), tm.vec3(0.0)
+        along, mixed, about = tm.mat3(0.0), tm.mat3(0.0), tm.mat3(0.0)
+        for block in range(self.blocks):
+            force += self.force[block]
+            torque += self.torque[block]
+            along += self.along[block]
+            mixed += self.mixed[block]
+            about += self.about[block]
+        compliance = along.inverse()
+        schur = about - mixed.transpose() @ compliance @ mixed
+        turn = schur.inverse() @ (torque - mixed.transpose() @ compliance @ force)
+        self.translation[None] = compliance @ (force - mixed @ turn)
+        self.rotation[None] = rotation_by(turn)
+
+
+@ti.func
+def cross_matrix(a):
+    """The matrix of a x."""
+    return tm.mat3(0.0, -a.z, a.y, a.z, 0.0, -a.x, -a.y, a.x, 0.0)
+
+
+@ti.func
+def rotation_by(turn):
+    """Rotation by a vector's length [rad] about it (Rodrigues)."""
+    angle = turn.norm()
+    axis = turn / ti.max(angle, 1e-12)
+    cross = cross_matrix(axis)
+    return tm.eye(3) + ti.sin(angle) * cross + (1.0 - ti.cos(angle)) * (cross @ cross)
