@@ -17,7 +17,7 @@ from scenes.anatomy import load_anatomy, patient_scene
 from scenes.labels import Side
 from scenes.patient import describe, import_patient, save_patient
 from scenes.reading import PatientError, read_volume
-from scenes.scene import OPTIONS, TISSUES, SceneError, load_scene, scene_text, with_options
+from scenes.scene import OPTIONS, TISSUES, NeoHookeanTissue, SceneError, load_scene, scene_text, with_options
 from sim.sampling import SamplingError
 
 if TYPE_CHECKING:
@@ -166,10 +166,10 @@ def settings_of(rehearsal: "Rehearsal") -> "Settings":
     from render.viewer import Settings
 
     scene, step = rehearsal.scene, rehearsal.settings
-    true_to_material = scene.tissue.model == "neo-hookean"
+    tissue = scene.tissue
     return Settings(
-        young_kpa=scene.tissue.young_kpa if true_to_material else None,
-        stiffness=None if true_to_material else step.stiffness,
+        young_kpa=tissue.young_kpa if isinstance(tissue, NeoHookeanTissue) else None,
+        stiffness=None if isinstance(tissue, NeoHookeanTissue) else step.stiffness,
         iterations=step.iterations,
         substeps=step.substeps,
         gravity_m_s2=scene.gravity.acceleration_m_s2,

@@ -100,7 +100,7 @@ class ShapeMatchingTissue(Section):
     surface_samples_per_mm2: float = Field(0.0, ge=0, le=10)
 
 
-TISSUES = {"neo-hookean": NeoHookeanTissue, "shape-matching": ShapeMatchingTissue}
+TISSUES: dict[str, type[BaseModel]] = {"neo-hookean": NeoHookeanTissue, "shape-matching": ShapeMatchingTissue}
 
 
 def _model_of(values: Any) -> str | None:
@@ -109,8 +109,7 @@ def _model_of(values: Any) -> str | None:
 
 
 Tissue = Annotated[
-    Annotated[NeoHookeanTissue, Tag("neo-hookean")]
-    | Annotated[ShapeMatchingTissue, Tag("shape-matching")],
+    Annotated[NeoHookeanTissue, Tag("neo-hookean")] | Annotated[ShapeMatchingTissue, Tag("shape-matching")],
     Discriminator(
         _model_of,
         custom_error_type="unknown_model",

@@ -6,6 +6,9 @@ Chen et al. 2024), over-relaxed. Where nothing moves any more every node is in b
 the tissue comes to rest at does not depend on iterations, substeps or time step.
 """
 
+from itertools import pairwise
+from typing import Any
+
 import numpy as np
 import taichi as ti
 import taichi.math as tm
@@ -47,9 +50,9 @@ class NeoHookean:
         starts = [int(v) for v in lattice.colour_start]
         self.body = body
         self.lattice = lattice
-        self.contacts = contacts
+        self.contacts: Any = contacts
         self.has_contacts = contacts is not None
-        self.groups = tuple(zip(starts[:-1], starts[1:], strict=True))
+        self.groups = tuple(pairwise(starts))
         self.has_held = held is not None
         if held is not None:
             self.held = ti.field(ti.i32, body.count)
@@ -61,7 +64,7 @@ class NeoHookean:
         self._store_nodes(1e-3 * density_g_cm3)
         self._store_cells()
         self._store_hourglass()
-        self.rigid = None if self.has_held else RigidMotion(body, self.mass, self.target, contacts)
+        self.rigid: Any = None if self.has_held else RigidMotion(body, self.mass, self.target, contacts)
         self.set_material(young_kpa, poisson)
 
     def _store_nodes(self, density_g_mm3: float) -> None:
@@ -113,7 +116,9 @@ class NeoHookean:
 
     def counts(self) -> dict[str, int]:
         """Nodes and cells, and points of the surface that may touch."""
-        return dict(nodes=self.body.count, cells=self.count, points=self.contacts.count if self.contacts else 0)
+        return dict(
+            nodes=self.body.count, cells=self.count, points=self.contacts.count if self.contacts else 0
+        )
 
     @ti.func
     def begin(self, dt: float):

@@ -4,6 +4,8 @@ A coarse correction with six unknowns: the Newton step of the time step's energy
 nodes, under inertia, gravity and the contacts as the last substep left them. Elastic energy does not see it.
 """
 
+from typing import Any
+
 import numpy as np
 import taichi as ti
 import taichi.math as tm
@@ -28,7 +30,7 @@ class RigidMotion:
         self.body = body
         self.mass = mass
         self.target = target
-        self.contacts = contacts
+        self.contacts: Any = contacts
         self.has_contacts = contacts is not None
         self.terms = body.count + (contacts.count if contacts else 0)
         self.blocks = -(-self.terms // BLOCK)

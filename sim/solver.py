@@ -1,6 +1,7 @@
 """One time step of the paper's Algorithm 1; line numbers in the comments are those of its listing."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import taichi as ti
@@ -58,9 +59,9 @@ class Solver:
         tool: ConvexTool | None = None,
         relaxation: str = "local",
     ) -> None:
-        self.body = model.body
+        self.body: Any = model.body
         self.model = model
-        self.contacts = contacts
+        self.contacts: Any = contacts
         self.pairs = pairs
         self.tool = tool
         self.relax_globally = relaxation == "global"

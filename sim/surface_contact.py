@@ -118,7 +118,7 @@ class SurfaceContacts:
         """Whether what was last measured from point q to shape s still holds at p."""
         known = self.found[s, q]
         moved = (p - known.xyz).norm()
-        return known.w - moved > NEAR_MM or moved < FRESH_MM and known.w > -FAR
+        return known.w - moved > NEAR_MM or (moved < FRESH_MM and known.w > -FAR)
 
     @ti.func
     def touching(self, s: ti.template(), q):
@@ -159,7 +159,9 @@ class SurfaceContacts:
                             force -= layer * STICK * stick
                             along = STICK * holds
                         stiffness += (
-                            weight * layer * ((1.0 - along) * normal.outer_product(normal) + along * tm.eye(3))
+                            weight
+                            * layer
+                            * ((1.0 - along) * normal.outer_product(normal) + along * tm.eye(3))
                         )
         return force, stiffness
 
@@ -205,7 +207,7 @@ class SurfaceContacts:
                     stick = tm.vec3(0.0)
                     depth = self.touching(s, q)
                     if depth > 0.0:
-                        stick, holds = self.bent(s, q, depth)
+                        stick, _ = self.bent(s, q, depth)
                     self.stick[s, q] = stick
 
     @ti.kernel

@@ -1,5 +1,6 @@
 """What a tissue model is: the interface that solver, contacts, skin and embedding know, and nothing else of it."""
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -15,8 +16,11 @@ class TissueModel(Protocol):
     ``begin`` and ``project`` are ti.funcs that the solver's kernels inline, so their outermost loops are parallel.
     """
 
-    body: Body
-    groups: tuple[tuple[int, int], ...]
+    @property
+    def body(self) -> Body: ...
+
+    @property
+    def groups(self) -> Sequence[tuple[int, int]]: ...
 
     def begin(self, dt: float) -> None:
         """Once a substep [s], when the solver has predicted the estimates."""

@@ -39,7 +39,9 @@ def embedding_cell_mm(tissue: AnyTissue) -> float:
 
 def step_settings(tissue: AnyTissue, section: SolverSection) -> StepSettings:
     """The scene's settings of a step; what it leaves out is the tissue model's own choice."""
-    own = LATTICE_SETTINGS if isinstance(tissue, NeoHookeanTissue) else StepSettings(stiffness=tissue.stiffness)
+    own = (
+        LATTICE_SETTINGS if isinstance(tissue, NeoHookeanTissue) else StepSettings(stiffness=tissue.stiffness)
+    )
     names = ("time_step_s", "substeps", "iterations", "stabilisation_iterations", "relaxation_factor")
     given = {name: getattr(section, name) for name in names if getattr(section, name) is not None}
     return replace(own, damping=section.damping_per_s, **given)

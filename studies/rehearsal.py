@@ -8,8 +8,9 @@ import taichi as ti
 import trimesh
 
 from scenes.anatomy import Grid, LoadedAnatomy, press_on
-from scenes.scene import PlaneShape, Scene
+from scenes.scene import NeoHookeanTissue, PlaneShape, Scene
 from sim.embedding import Embedding
+from sim.neo_hookean import NeoHookean
 from sim.shapes import ConvexTool, Plane, SignedDistanceField, TriangleMesh
 from sim.skinning import Skin
 from studies.models import build_solver, embedding_cell_mm, static_shape, step_settings
@@ -110,8 +111,9 @@ class Rehearsal:
         self.settings.gravity = tuple(1000.0 * acceleration_m_s2 * self.gravity_direction)
 
     def set_young(self, young_kpa: float) -> None:
-        """Change Young's modulus of a tissue that has one."""
-        self.model.set_material(young_kpa, self.scene.tissue.poisson)
+        """Change Young's modulus of a tissue that has one; of others nothing."""
+        if isinstance(self.model, NeoHookean) and isinstance(self.scene.tissue, NeoHookeanTissue):
+            self.model.set_material(young_kpa, self.scene.tissue.poisson)
 
     def scripted_pose(self, time_s: float) -> np.ndarray:
         """The transducer's pose at a time of the scripted press: just touching at first, then down stage by stage."""

@@ -42,7 +42,9 @@ def oracle(rest: np.ndarray, x: np.ndarray, spacing: float, step: float, relaxat
     return x + step * total / count[:, None]
 
 
-def moved_body(mesh, relaxation: str, mass_scaling: float = 0.0) -> tuple[ParticleBody, ShapeMatching, np.ndarray]:
+def moved_body(
+    mesh, relaxation: str, mass_scaling: float = 0.0
+) -> tuple[ParticleBody, ShapeMatching, np.ndarray]:
     body = ParticleBody(fill_body(mesh, 2.0), mass_scaling)
     model = ShapeMatching(body, 3.33, relaxation)
     x = deformed(body.rest_points).astype(np.float32)
