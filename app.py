@@ -19,7 +19,7 @@ from scenes.reading import PatientError, read_volume
 from scenes.scene import OPTIONS, SceneError, load_scene, scene_text, with_options
 from sim.sampling import SamplingError
 from studies.case import CaseError
-from studies.commands import Fault, arch_option, make_folder, start_taichi, validate
+from studies.commands import Fault, arch_option, calibrate, make_folder, start_taichi, validate
 from studies.setup import SetupError
 
 if TYPE_CHECKING:
@@ -126,6 +126,7 @@ def import_command(
 
 
 cli.add_command(validate)
+cli.add_command(calibrate)
 
 
 def label_values(text: str | None, option: str) -> list[int] | None:

@@ -4,11 +4,16 @@ import json
 import os
 from pathlib import Path
 from time import perf_counter
+from typing import TYPE_CHECKING
 
 import click
+from tqdm import tqdm
 
 from studies.case import load_case
 from studies.setup import PRESETS, QUALITIES, choose_setup
+
+if TYPE_CHECKING:
+    from studies.calibration import Calibration
 
 
 class Fault(click.ClickException):
@@ -92,3 +97,96 @@ def validate(
     if json_file is not None:
         json_file.write_text(json.dumps(figures, indent=2) + "\n", "utf-8")
         click.echo(f"\nWrote {json_file}")
+
+
+@click.command()
+@click.argument("cases", metavar="CASE...", type=click.Path(path_type=Path), nargs=-1, required=True)
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for tables and pictures.")
+@click.option("--radii", default="2.2,2.5,2.7,3.0,3.3", show_default=True, help="Particle radii in mm.")
+@click.option(
+    "--hold-out",
+    type=click.Choice(["stages", "beads", "cases"]),
+    default="stages",
+    show_default=True,
+    help="What is not fitted on and judges the fit: each case's deepest stage, every third bead, or the last CASE.",
+)
+@click.option(
+    "--grid",
+    "spacing",
+    type=click.FloatRange(0.01, 0.5),
+    default=0.05,
+    show_default=True,
+    help="Spacing of the stiffnesses tried; around the best it is a fifth of that.",
+)
+@click.option(
+    "--search",
+    "generations",
+    type=click.IntRange(1, 1000),
+    help="Instead of the stiffness alone, search stiffness, over-relaxation and iterations for so many generations.",
+)
+@click.option("--jobs", type=click.IntRange(1, 1024), help="Processes on this machine [one a processor].")
+@click.option("--dask", "address", help="Run on the Dask cluster of this scheduler, such as tcp://host:8786.")
+def calibrate(
+    cases: tuple[Path, ...],
+    out: Path,
+    radii: str,
+    hold_out: str,
+    spacing: float,
+    generations: int | None,
+    jobs: int | None,
+    address: str | None,
+) -> None:
+    """Fit the settings of shape matching to the bead experiments of CASE..., and judge them on what was held out.
+
+    It is the paper's calibration: every stiffness for each particle radius.
+    """
+    radii_mm = numbers(radii, "--radii", 0.5, 20)
+    loaded = [load_case(case) for case in cases]
+    make_folder(out)
+    import sim.device  # noqa: F401  before all that imports Taichi, which it keeps quiet
+    from studies import calibration, workers
+
+    try:
+        split = calibration.split_of(loaded, hold_out)
+        with workers.dask_workers(address) if address else workers.local_workers(jobs) as work:
+            if generations:
+                count = calibration.search_count(len(loaded), len(radii_mm), generations)
+                with tqdm(total=count, desc="calibrate", unit="press") as bar:
+                    found = calibration.search(loaded, split, radii_mm, generations, work, bar.update)
+            else:
+                count = calibration.exhaustive_count(len(loaded), len(radii_mm), spacing)
+                with tqdm(total=count, desc="calibrate", unit="press") as bar:
+                    found = calibration.exhaustive(loaded, split, radii_mm, spacing, work, bar.update)
+    except (calibration.CalibrationError, workers.WorkerError) as error:
+        raise Fault(str(error)) from None
+    write_calibration(found, out, searched=generations is not None)
+
+
+def write_calibration(found: "Calibration", out: Path, searched: bool) -> None:
+    """Tables and pictures into a folder, and what matters of them on the terminal."""
+    from studies import figures
+    from studies.tables import summary_of, tables_of, write_json
+
+    tables = tables_of(found)
+    for table in tables:
+        table.write_csv(out)
+        figures.write_table(table, out / f"{table.name}.png")
+        click.echo(f"\n{table.text()}")
+    write_json(found, tables, out / "calibration.json")
+    figures.write_figure5(found, out / "figure5.png")
+    if searched:
+        figures.write_search(found, out / "search.png")
+    else:
+        figures.write_figure4(found, out / "figure4.png")
+    click.echo(f"\n{summary_of(found)}\nWrote tables, pictures and calibration.json to {out}")
+
+
+def numbers(text: str, option: str, least: float, most: float) -> list[float]:
+    """Different numbers of an option's text, such as "2.2,2.7", in ascending order. Raises Fault."""
+    try:
+        values = sorted({float(value) for value in text.split(",")})
+    except ValueError:
+        values = []
+    if not values or not all(least <= value <= most for value in values):
+        raise Fault(f"{option} is {text!r}: expected numbers from {least:g} to {most:g} such as 2.2,2.7")
+    return values
