@@ -21,6 +21,8 @@ QUARTIC = 4
 # stiffness, over-relaxation and iterations, with Eq. 7's range for the second.
 BOUNDS = ((0.05, 1.0), (1.0, 2.0), (3, 30))
 POPULATION = 5
+# An error this many times the least is that of a body that falls apart, which would spoil the fit for the others.
+TALLEST = 4.0
 
 
 class CalibrationError(ValueError):
@@ -56,9 +58,10 @@ class Trial:
 
 @dataclass(frozen=True)
 class Fit:
-    """A quartic through mean errors over the stiffness, and where it is least within what was tried."""
+    """A quartic through mean errors over a range of the stiffness, and where it is least in that."""
 
     polynomial: Polynomial
+    range: tuple[float, float]
     stiffness: float
     error_mm: float
 
@@ -86,7 +89,7 @@ def split_of(cases: Sequence[Case], hold_out: str) -> Split:
         raise CalibrationError(
             "a case is named twice: what is fitted on would be held out as well; name each once"
         )
-    masks = [np.ones(case.measured.shape[:2], bool) for case in cases]
+    masks: list[np.ndarray] = [np.ones(case.measured.shape[:2], bool) for case in cases]
     if hold_out == "stages":
         for mask in masks:
             mask[-1] = False
@@ -208,15 +211,16 @@ def try_all(
 
 
 def quartic(trials: Sequence[Trial]) -> Fit | None:
-    """The paper's smooth curve through the errors of a radius; None where too few are finite."""
+    """The paper's smooth curve through the errors of a radius up to TALLEST times the least; None of too few of them."""
     at = np.array([(trial.setup.stiffness, trial.fit_mm) for trial in trials])
-    at = at[np.isfinite(at[:, 1])]
+    at = at[np.isfinite(at[:, 1]) & (at[:, 1] <= TALLEST * at[:, 1].min())]
     if len(np.unique(at[:, 0])) <= QUARTIC:
         return None
     polynomial = Polynomial.fit(at[:, 0], at[:, 1], QUARTIC)
-    stiffness = np.linspace(at[:, 0].min(), at[:, 0].max(), 1001)
+    first, last = float(at[:, 0].min()), float(at[:, 0].max())
+    stiffness = np.linspace(first, last, 1001)
     least = np.argmin(polynomial(stiffness))
-    return Fit(polynomial, float(stiffness[least]), float(polynomial(stiffness[least])))
+    return Fit(polynomial, (first, last), float(stiffness[least]), float(polynomial(stiffness[least])))
 
 
 def _setup_at(radius_mm: float, stiffness: float, relaxation_factor: float, iterations: float) -> Setup:

@@ -151,12 +151,14 @@ def calibrate(
         with workers.dask_workers(address) if address else workers.local_workers(jobs) as work:
             if generations:
                 count = calibration.search_count(len(loaded), len(radii_mm), generations)
-                with tqdm(total=count, desc="calibrate", unit="press") as bar:
-                    found = calibration.search(loaded, split, radii_mm, generations, work, bar.update)
             else:
                 count = calibration.exhaustive_count(len(loaded), len(radii_mm), spacing)
-                with tqdm(total=count, desc="calibrate", unit="press") as bar:
+            with tqdm(total=count, desc="calibrate", unit="press") as bar:
+                if generations:
+                    found = calibration.search(loaded, split, radii_mm, generations, work, bar.update)
+                else:
                     found = calibration.exhaustive(loaded, split, radii_mm, spacing, work, bar.update)
+                bar.total = bar.n
     except (calibration.CalibrationError, workers.WorkerError) as error:
         raise Fault(str(error)) from None
     write_calibration(found, out, searched=generations is not None)

@@ -10,13 +10,12 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 
-from studies.calibration import Calibration, Trial, quartic
+from studies.calibration import TALLEST, Calibration, Trial, quartic
 from studies.tables import Table
 
 DPI = 130
-# An error this many times the least is off the picture: a body that falls apart would flatten all others.
-TALLEST = 4.0
 
 
 def write_figure4(calibration: Calibration, path: Path) -> None:
@@ -29,7 +28,7 @@ def write_figure4(calibration: Calibration, path: Path) -> None:
         right.plot(at, [trial.held_out_mm for trial in trials], ".-", color=colour, linewidth=0.8)
         fit = quartic(trials)
         if fit is not None:
-            smooth = np.linspace(min(at), max(at), 200)
+            smooth = np.linspace(*fit.range, 200)
             left.plot(smooth, fit.polynomial(smooth), "-", color=colour, linewidth=1)
             left.plot(fit.stiffness, fit.error_mm, "o", color=colour, markersize=9, fillstyle="none")
     right.axhline(calibration.null_mm(), color="0.4", linestyle="--", label="no motion at all")
@@ -78,11 +77,11 @@ def write_figure5(calibration: Calibration, path: Path) -> None:
 def write_table(table: Table, path: Path) -> None:
     """A table as a picture."""
     cells = table.cells()
-    wide = [max(len(line[column]) for line in cells) + 2 for column in range(len(cells[0]))]
+    wide = [max(len(line[column]) for line in cells) + 3 for column in range(len(cells[0]))]
     figure, axes = plt.subplots(figsize=(0.085 * sum(wide) + 0.4, 0.26 * (len(cells) + 1.5)))
     axes.axis("off")
     drawn = axes.table(
-        cells[1:], colLabels=cells[0], colWidths=[w / sum(wide) for w in wide], bbox=(0, 0, 1, 1)
+        cells[1:], colLabels=cells[0], colWidths=[w / sum(wide) for w in wide], bbox=Bbox.unit()
     )
     drawn.auto_set_font_size(False)
     drawn.set_fontsize(9)

@@ -2,8 +2,8 @@
 
 import csv
 import json
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +13,7 @@ from studies.calibration import Calibration, Trial, quartic
 from studies.report import spread
 
 FIT, HELD_OUT = "fit", "held out"
-BEAD_TABLES = (
-    ("table2", "Bead error, mean (mm)", np.mean),
-    ("table3", "Bead error, standard deviation (mm)", np.std),
-    ("table4", "Bead error, maximum (mm)", np.max),
-)
+Row = list[float | None]
 
 
 @dataclass(frozen=True)
@@ -29,8 +25,8 @@ class Table:
     head: list[str]
     radii_mm: list[float]
     names: list[list[str]]
-    figures: list[list[float | None]]
-    shares: list[list[float | None]] | None = None
+    figures: list[Row]
+    shares: list[Row] = field(default_factory=list)
 
     def cells(self) -> list[list[str]]:
         """All lines as text, the head first."""
@@ -62,31 +58,33 @@ class Table:
 
 def tables_of(calibration: Calibration) -> list[Table]:
     """The paper's Tables 2 to 5, each radius with the settings that fit best there."""
-    radii = list(calibration.trials)
-    best = [calibration.best(radius) for radius in radii]
-    tables = []
-    for name, title, figure in BEAD_TABLES:
-        names, figures, shares = (
-            [["", "", "stiffness"]],
-            [[trial.setup.stiffness for trial in best]],
-            [[None] * len(best)],
-        )
-        for place, stage, part, mask in _rows(calibration):
-            case = calibration.cases[place]
-            depth = case.indentation_mm[stage]
-            row = [float(figure(trial.measured[place].errors[stage][mask])) for trial in best]
-            names.append([case.name, f"{stage} ({depth:.2f} mm)", part])
-            figures.append([rounded(value) for value in row])
-            shares.append(
-                [rounded(100 * value / depth) if name == "table2" and depth > 0 else None for value in row]
-            )
-        if name == "table2":
-            names += [["all", "mean", FIT], ["all", "mean", HELD_OUT]]
-            figures += [[rounded(t.fit_mm) for t in best], [rounded(t.held_out_mm) for t in best]]
-            shares += 2 * [[None] * len(best)]
-        head = ["case", "stage", "beads used for"]
-        tables.append(Table(name, title, head, radii, names, figures, shares if name == "table2" else None))
-    return [*tables, _times(radii, best)]
+    best = [calibration.best(radius) for radius in calibration.trials]
+    means = _bead_table(calibration, best, "table2", "Table 2: bead error, mean (mm)", np.mean)
+    means.names.extend([["all", "mean", FIT], ["all", "mean", HELD_OUT]])
+    means.figures.extend([[rounded(t.fit_mm) for t in best], [rounded(t.held_out_mm) for t in best]])
+    means.shares.extend([[None for _ in best], [None for _ in best]])
+    deviations = _bead_table(
+        calibration, best, "table3", "Table 3: bead error, standard deviation (mm)", np.std
+    )
+    most = _bead_table(calibration, best, "table4", "Table 4: bead error, maximum (mm)", np.max)
+    return [means, replace(deviations, shares=[]), replace(most, shares=[]), _times(calibration, best)]
+
+
+def _bead_table(
+    calibration: Calibration, best: list[Trial], name: str, title: str, figure: Callable[[np.ndarray], float]
+) -> Table:
+    """One figure of the errors of each stage's beads; the stiffness is the first row."""
+    names = [["", "", "stiffness"]]
+    figures: list[Row] = [[trial.setup.stiffness for trial in best]]
+    shares: list[Row] = [[None for _ in best]]
+    for place, stage, part, used in _rows(calibration):
+        case = calibration.cases[place]
+        depth = case.indentation_mm[stage]
+        row = [float(figure(trial.measured[place].errors[stage][used])) for trial in best]
+        names.append([case.name, f"{stage} ({depth:.2f} mm)", part])
+        figures.append([rounded(value) for value in row])
+        shares.append([rounded(100 * value / depth) if depth > 0 else None for value in row])
+    return Table(name, title, ["case", "stage", "part"], list(calibration.trials), names, figures, shares)
 
 
 def summary_of(calibration: Calibration) -> str:
@@ -156,18 +154,13 @@ def _rows(calibration: Calibration) -> Iterator[tuple[int, int, str, np.ndarray]
                     yield place, stage, part, used
 
 
-def _times(radii: list[float], best: list[Trial]) -> Table:
-    """Table 5; as long as several evaluations run at once, a time is that of one CPU thread among others."""
+def _times(calibration: Calibration, best: list[Trial]) -> Table:
+    """Table 5; where several evaluations run at once, a time is that of one CPU thread among others."""
     spreads = [spread([ms for measured in trial.measured for ms in measured.step_ms]) for trial in best]
-    rows = [("mean", "mean"), ("standard deviation", "sd"), ("minimum", "min"), ("maximum", "max")]
-    return Table(
-        name="table5",
-        title="Time of a step in the calibration, on one CPU thread (ms)",
-        head=[""],
-        radii_mm=radii,
-        names=[[name] for name, _ in rows],
-        figures=[[figures[key] for figures in spreads] for _, key in rows],
-    )
+    rows = {"mean": "mean", "standard deviation": "sd", "minimum": "min", "maximum": "max"}
+    title = "Table 5: time of a step in the calibration, on one CPU thread (ms)"
+    figures: list[Row] = [[each[key] for each in spreads] for key in rows.values()]
+    return Table("table5", title, [""], list(calibration.trials), [[name] for name in rows], figures)
 
 
 def _cell(figure: float | None, share: float | None) -> str:
