@@ -16,10 +16,8 @@ from studies.report import timed
 from studies.setup import Setup
 from ultrasound.probe import between
 
-WARM_UP_STEPS = 120
-STAGE_STEPS = 90
-# Of a stage's steps, those in which the probe moves; in the others the tissue comes to rest, as it did for the scan.
-MOVING_STEPS = 60
+# The share of a stage's steps in which the probe moves; in the others the tissue comes to rest, as it did for the scan.
+MOVING = 2 / 3
 # How far back along the press the probe waits while the organ settles.
 AWAY_MM = 60.0
 # Where a case does not say: the paper's. It scales all masses alike.
@@ -60,22 +58,22 @@ class Experiment:
     def run(self, setup: Setup) -> Run:
         """Press the organ from its stress-free shape.
 
-        It settles for 120 steps with the probe away, as at its stage-0 place the probe would be in the way of an organ
-        that is not yet down. Then each stage takes 90 steps: in the first 60 the probe goes evenly to its pose of that
-        stage (to that of stage 0 from straight above it), in the others it rests. The same setup gives the same beads,
-        whatever ran before.
+        It settles for the warm-up's 120 steps with the probe away, as at its stage-0 place the probe would be in the way of
+        an organ that is not yet down. Then each stage takes 90 steps: in the first 60 the probe goes evenly to its pose
+        of that stage (to that of stage 0 from straight above it), in the others it rests. The same setup gives the same
+        beads, whatever ran before.
         """
         self._restore()
         step = self._step_settings(setup)
         pose = self._away()
         run = Run(np.zeros_like(self.case.measured))
-        for _ in range(WARM_UP_STEPS):
+        for _ in range(setup.warm_up_steps):
             self.solver.step(step, between(pose, pose, step.substeps))
+        moving = max(1, round(MOVING * setup.stage_steps))
         for stage, goal in enumerate(self.case.poses):
-            path = between(pose, self._relative(goal), MOVING_STEPS)
-            for n in range(STAGE_STEPS):
-                ends = path[min(n, MOVING_STEPS)], path[min(n + 1, MOVING_STEPS)]
-                poses = between(*ends, step.substeps)
+            path = between(pose, self._relative(goal), moving)
+            for n in range(setup.stage_steps):
+                poses = between(path[min(n, moving)], path[min(n + 1, moving)], step.substeps)
                 timed(lambda: self.solver.step(step, poses), run.step_ms)
             pose = path[-1]
             self.beads.update()

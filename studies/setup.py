@@ -6,7 +6,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Setup:
-    """How a case is computed, whichever it is; the defaults are the paper's Table 1.
+    """How a case is computed, whichever it is; the defaults are the paper's: Table 1 and its calibration's steps.
 
     ``young_kpa`` and ``poisson`` are the case's own where they are None; shape matching has neither.
     """
@@ -18,6 +18,8 @@ class Setup:
     substeps: int = 3
     iterations: int = 9
     time_step_s: float = 1 / 60
+    warm_up_steps: int = 120
+    stage_steps: int = 90
     young_kpa: float | None = None
     poisson: float | None = None
 

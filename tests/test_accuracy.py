@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,7 +10,6 @@ from bead_case import DEPTHS, beads, values, write_case
 from click.testing import CliRunner
 from conftest import rotation_about
 
-import studies.experiment as experiment_module
 from app import cli, main
 from studies.accuracy import (
     bead_errors,
@@ -22,7 +22,7 @@ from studies.accuracy import (
     table,
 )
 from studies.case import Case, load_case
-from studies.experiment import MOVING_STEPS, STAGE_STEPS, Experiment, Run
+from studies.experiment import Experiment, Run
 from studies.setup import PRESETS, QUALITIES, Setup, SetupError, choose_setup
 
 KEYS = {
@@ -40,18 +40,12 @@ KEYS = {
     "finite",
 }
 COARSE = Setup(radius_mm=3.0)
+BRIEF = Setup(radius_mm=3.0, warm_up_steps=12, stage_steps=9)
 
 
 @pytest.fixture
 def case(tmp_path) -> Case:
     return load_case(write_case(tmp_path / "ball"))
-
-
-@pytest.fixture
-def brief(monkeypatch):
-    """Runs of a tenth of the steps."""
-    for name in ("WARM_UP_STEPS", "STAGE_STEPS", "MOVING_STEPS"):
-        monkeypatch.setattr(experiment_module, name, getattr(experiment_module, name) // 10)
 
 
 def test_figures_of_a_stage_by_hand():
@@ -115,53 +109,45 @@ def test_report_and_table_show_these_figures(device, case):
     ]
     assert rows[4].split() == ["all", "0.50", "1.00", f"{null.mean():.2f}", f"{0.5 / null.mean():.2f}"]
     assert sum(int(row.split("(")[1].split()[0]) for row in rows if "bead positions" in row) == 24
-
-
-def test_what_is_not_finite_is_said_and_is_valid_json(device, case):
-    run = Run(np.full_like(case.measured, np.nan), [1.0], finite=False)
-    figures = report(Experiment(case, COARSE), COARSE, run)
+    # What is not finite is said, and is valid JSON.
+    lost = Run(np.full_like(case.measured, np.nan), [1.0], finite=False)
+    figures = report(experiment, COARSE, lost)
     assert figures["finite"] is False and figures["overall_mean_mm"] is None
     json.dumps(figures, allow_nan=False)
-    assert "NOT FINITE" in summary(figures, COARSE)
-    assert "-" in table(case, run.beads)
+    assert "NOT FINITE" in summary(figures, COARSE) and "-" in table(case, lost.beads)
 
 
-def test_the_probe_waits_above_then_goes_to_each_stage_and_rests_there(device, case):
-    experiment = Experiment(case, COARSE)
-    seen = []
-    experiment.solver.step = lambda settings, poses: seen.append(poses)
-    run = experiment.run(COARSE)
-    ends = np.array([poses[-1] for poses in seen])
-    assert len(ends) == 120 + 3 * STAGE_STEPS == 120 + len(run.step_ms)
-    assert np.array_equal(np.concatenate([seen[0][:1], ends[:-1]]), [poses[0] for poses in seen])
-    lowest = ends[:, 2, 3] - case.size_mm[2] / 2 + experiment.origin[2]
-    assert (lowest[:120] > 40).all()
-    for stage, depth in enumerate(DEPTHS):
-        arrived = lowest[120 + stage * STAGE_STEPS + MOVING_STEPS - 1 : 120 + (stage + 1) * STAGE_STEPS]
-        assert arrived == pytest.approx(12.0 - depth)
-
-
-def test_a_pressed_ball_sinks_the_same_every_time_whatever_ran_between(device, brief, case):
-    experiment = Experiment(case, COARSE)
-    first = experiment.run(COARSE)
-    other = experiment.run(replace(COARSE, stiffness=0.4, iterations=5))
-    again = experiment.run(COARSE)
-    assert np.array_equal(first.beads, again.beads) and not np.array_equal(first.beads, other.beads)
-    sunk = (first.beads - case.beads)[:, :, 2].mean(axis=1)
-    # It falls by the 0.2 mm of play at least, and by less than 1 mm; pressed 4 mm, beads sink by some of that.
-    assert first.finite and -1.0 < sunk[0] < -0.15 and -3.0 < sunk[2] - sunk[0] < -0.3
-
-
-def test_a_case_anywhere_is_put_at_the_origin(device, case):
+def test_the_probe_waits_above_then_goes_to_each_stage_and_rests_there_wherever_the_case_is(device, case):
     far = np.array([100.0, -200.0, 1000.0])
     organ, support = (mesh.copy().apply_translation(far) for mesh in (case.organ, case.support))
     poses = case.poses + np.pad(far[:, None], ((0, 1), (3, 0)))
     moved = replace(case, organ=organ, support=support, beads=case.beads + far, poses=poses)
     experiment = Experiment(moved, COARSE)
+    seen = []
+    experiment.solver.step = lambda settings, poses: seen.append(poses)
+    run = experiment.run(COARSE)
     assert np.abs(experiment.body.position.to_numpy()).max() < 12.0
-    assert experiment.beads.vertices.to_numpy() == pytest.approx(case.beads, abs=1e-5)
-    experiment.solver.step = lambda settings, poses: None
-    assert experiment.run(COARSE).beads[0] == pytest.approx(moved.beads, abs=1e-4)
+    assert run.beads[0] == pytest.approx(moved.beads, abs=1e-4)
+    ends = np.array([poses[-1] for poses in seen])
+    assert len(ends) == 120 + 3 * 90 == 120 + len(run.step_ms)
+    assert np.array_equal(np.concatenate([seen[0][:1], ends[:-1]]), [poses[0] for poses in seen])
+    lowest = ends[:, 2, 3] - case.size_mm[2] / 2
+    assert (lowest[:120] > 40).all()
+    way = np.diff(lowest[119:])
+    assert way[:60] == pytest.approx(way[0]) and way[90:150] == pytest.approx(-2.0 / 60)
+    for stage, depth in enumerate(DEPTHS):
+        assert lowest[120 + stage * 90 + 59 : 120 + (stage + 1) * 90] == pytest.approx(12.0 - depth)
+
+
+def test_a_pressed_ball_sinks_the_same_every_time_whatever_ran_between(device, case):
+    experiment = Experiment(case, COARSE)
+    first = experiment.run(BRIEF)
+    other = experiment.run(replace(BRIEF, stiffness=0.4, iterations=5))
+    again = experiment.run(BRIEF)
+    assert np.array_equal(first.beads, again.beads) and not np.array_equal(first.beads, other.beads)
+    sunk = (first.beads - case.beads)[:, :, 2].mean(axis=1)
+    # It falls by the 0.2 mm of play at least, and by less than 1 mm; pressed 4 mm, beads sink by some of that.
+    assert first.finite and -1.0 < sunk[0] < -0.15 and -3.0 < sunk[2] - sunk[0] < -0.3
 
 
 def test_presets_differ_in_radius_alone_and_options_change_them():
@@ -175,17 +161,19 @@ def test_presets_differ_in_radius_alone_and_options_change_them():
         choose_setup("shape-matching", "fast", young_kpa=15.0)
 
 
-def test_validate_twice_prints_and_writes_the_same_but_for_times(brief, tmp_path):
+def test_validate_twice_prints_and_writes_the_same_but_for_times(monkeypatch, tmp_path):
+    brief = partial(choose_setup, warm_up_steps=12, stage_steps=9)
+    monkeypatch.setattr("studies.commands.choose_setup", brief)
     folder = write_case(tmp_path / "ball")
     reports = []
     for name in ("a.json", "new/b.json"):
-        arguments = ["validate", folder, "--radius", 3, "--arch", "cpu", "--json", tmp_path / name]
+        arguments = ["validate", folder, "--radius", 5, "--arch", "cpu", "--json", tmp_path / name]
         done = CliRunner().invoke(cli, [str(argument) for argument in arguments])
         assert done.exit_code == 0 and "1/60 s in 3 substeps of 9 iterations" in done.output
         reports.append(json.loads((tmp_path / name).read_text()))
     times = [figures.pop("ms_per_step") for figures in reports]
     assert times[0].keys() == {"mean", "sd", "min", "max", "median"}
-    assert reports[0] == reports[1] and reports[0]["finite"] and reports[0]["radius_mm"] == 3
+    assert reports[0] == reports[1] and reports[0]["finite"] and reports[0]["radius_mm"] == 5
 
 
 def test_validate_says_mistakes_in_one_line(tmp_path, capsys):
@@ -208,11 +196,11 @@ def test_validate_says_mistakes_in_one_line(tmp_path, capsys):
     assert "stage" in refused(folder)
 
 
-def test_a_real_case_is_pressed(device, brief, data):
+def test_a_real_case_is_pressed(device, data):
     case = load_case(data / "truth" / "bean")
     assert case.measured.shape == (4, 45, 3) and case.young_kpa == 15.0
     # The README of the truth names these displacements.
     assert null_errors(case).mean(axis=1) == pytest.approx([0, 0.86, 1.45, 1.96], abs=0.006)
-    setup = Setup(radius_mm=6.0)
+    setup = replace(BRIEF, radius_mm=6.0)
     run = Experiment(case, setup).run(setup)
     assert run.finite and 0.3 < bead_errors(case, run.beads).mean() < 2.0
