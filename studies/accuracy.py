@@ -84,16 +84,16 @@ def report(experiment: Experiment, setup: Setup, run: Run) -> dict:
     )
 
 
-def summary(report: dict, setup: Setup) -> str:
-    """What was computed and how fast, in a few lines for the terminal."""
-    size = f"{report['particles']} particles of {report['radius_mm']:g} mm"
-    solver = f"1/{1 / report['time_step_s']:.0f} s in {report['substeps']} substeps of {report['iterations']} iterations"
-    finite = "" if report["finite"] else "\nNOT FINITE: the figures below mean nothing"
+def summary(report: dict, model: str) -> str:
+    """What was computed and how fast, in a few lines for the terminal; ``model`` is ``Experiment.describe``'s."""
     time = report["ms_per_step"]
-    return (
-        f"case   {report['case']}\nmodel  {report['model']}, {size}, stiffness {setup.stiffness:g}\nstep   {solver}"
-        f"{finite}\nspeed  {time['median']:.1f} ms a step (median), {time['max']:.1f} at most"
-    )
+    lines = [
+        f"case   {report['case']}",
+        f"model  {report['model']}: {model}",
+        f"step   1/{1 / report['time_step_s']:.0f} s in {report['substeps']} substeps of {report['iterations']} iterations",
+        f"speed  {time['median']:.1f} ms a step (median), {time['max']:.1f} at most",
+    ]
+    return "\n".join(lines if report["finite"] else [*lines, "NOT FINITE: the figures below mean nothing"])
 
 
 def table(case: Case, beads: np.ndarray) -> str:

@@ -61,10 +61,16 @@ arch_option = click.option(
     show_default=True,
     help="A preset of the model, the same for every case; the options below change single values of it.",
 )
-@click.option("--radius", "radius_mm", type=click.FloatRange(0.5, 20), help="Particle radius in mm.")
-@click.option("--stiffness", type=click.FloatRange(0, 1), help="Cluster stiffness.")
-@click.option("--substeps", type=click.IntRange(1, 1000), help="Substeps of a time step.")
-@click.option("--iterations", type=click.IntRange(1, 1000), help="Passes over the constraints in a substep.")
+@click.option(
+    "--radius", "radius_mm", type=click.FloatRange(0.5, 20), help="Particle radius in mm [the preset's]."
+)
+@click.option("--stiffness", type=click.FloatRange(0, 1), help="Cluster stiffness [the preset's].")
+@click.option("--substeps", type=click.IntRange(1, 1000), help="Substeps of a time step [the preset's].")
+@click.option(
+    "--iterations",
+    type=click.IntRange(1, 1000),
+    help="Passes over the constraints in a substep [the preset's].",
+)
 @click.option(
     "--young-kpa",
     type=click.FloatRange(0, 1e6, min_open=True),
@@ -92,11 +98,19 @@ def validate(
     built_s = perf_counter() - started
     run = experiment.run(setup)
     figures = report(experiment, setup, run)
-    click.echo(f"{summary(figures, setup)} on {used}, built in {built_s:.1f} s\n")
+    click.echo(f"{summary(figures, experiment.describe(setup))}\nbuilt  in {built_s:.1f} s, on {used}\n")
     click.echo(table(loaded, run.beads))
     if json_file is not None:
-        json_file.write_text(json.dumps(figures, indent=2) + "\n", "utf-8")
-        click.echo(f"\nWrote {json_file}")
+        write_json(figures, json_file)
+
+
+def write_json(figures: dict, file: Path) -> None:
+    """Write figures to a file and say so. Raises Fault."""
+    try:
+        file.write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", "utf-8")
+    except OSError as error:
+        raise Fault(f"{file}: cannot be written ({error.strerror}); choose another --json") from None
+    click.echo(f"\nWrote {file}")
 
 
 @click.command()

@@ -83,8 +83,12 @@ class Experiment:
         return run
 
     def size(self, setup: Setup) -> dict[str, float]:
-        """How large the model is, under the names of a report."""
+        """How large the model is, under the names of a report: ``radius_mm`` or ``nodes``, and ``particles``."""
         return dict(radius_mm=setup.radius_mm, particles=self.body.count)
+
+    def describe(self, setup: Setup) -> str:
+        """Size and settings that the model does not share with others, for the terminal."""
+        return f"{self.body.count} particles of {setup.radius_mm:g} mm, stiffness {setup.stiffness:g}"
 
     def _restore(self) -> None:
         self.body.restore(self.body.rest_state())

@@ -114,7 +114,7 @@ def test_report_and_table_show_these_figures(device, case):
     figures = report(experiment, COARSE, lost)
     assert figures["finite"] is False and figures["overall_mean_mm"] is None
     json.dumps(figures, allow_nan=False)
-    assert "NOT FINITE" in summary(figures, COARSE) and "-" in table(case, lost.beads)
+    assert "NOT FINITE" in summary(figures, experiment.describe(COARSE)) and "-" in table(case, lost.beads)
 
 
 def test_the_probe_waits_above_then_goes_to_each_stage_and_rests_there_wherever_the_case_is(device, case):

@@ -197,29 +197,25 @@ def test_calibrate_says_mistakes_in_one_line(monkeypatch, cases, tmp_path, capsy
     assert "pip install dask distributed" in refused(a, *out, "--dask", "tcp://127.0.0.1:9")
 
 
-def test_workers_here_and_on_a_cluster_find_the_same_as_one_process(monkeypatch, cases):
+def test_processes_here_and_a_cluster_of_one_worker_find_the_same(cases):
     from distributed import LocalCluster
 
     setup = Setup(radius_mm=5.0, warm_up_steps=6, stage_steps=3)
     pairs = [(cases[0], replace(setup, stiffness=a)) for a in (0.9, 0.5)]
-    monkeypatch.setattr(workers, "_built", {})
-    with local_workers(1) as work:
-        one = list(work(pairs))
-        assert len(workers._built) == 1
-        with pytest.raises(SamplingError, match="choose a smaller radius"):
-            list(work([(cases[0], Setup(radius_mm=20.0))]))
+    too_large = [(cases[0], Setup(radius_mm=20.0))]
     with local_workers(2) as work:
-        two = list(work(pairs))
+        here = list(work(pairs))
+        with pytest.raises(SamplingError, match="choose a smaller radius"):
+            list(work(too_large))
     with (
         LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=None) as cluster,
         dask_workers(cluster.scheduler_address) as work,
     ):
-        three = list(work(pairs))
+        there = list(work(pairs))
         with pytest.raises(SamplingError, match="choose a smaller radius"):
-            list(work([(cases[0], Setup(radius_mm=20.0))]))
-    for others in (two, three):
-        assert all(np.array_equal(a.errors, b.errors) for a, b in zip(one, others, strict=True))
-    assert one[0].errors.mean() != one[1].errors.mean() and np.isfinite(one[0].errors).all()
+            list(work(too_large))
+    assert all(np.array_equal(a.errors, b.errors) for a, b in zip(here, there, strict=True))
+    assert here[0].errors.mean() != here[1].errors.mean() and np.isfinite(here[0].errors).all()
 
 
 def test_a_cluster_without_workers_is_refused():
