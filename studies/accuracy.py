@@ -37,8 +37,8 @@ def stage_figures(
 ) -> list[dict[str, float | None]]:
     """Each stage's mean, standard deviation (of all beads, not of a sample), maximum and share of the probe's travel.
 
-    ``indentation_mm`` (stages,), ``errors`` and ``null`` (stages, n) [mm]. Where the probe has not come any way there is
-    no share.
+    ``indentation_mm`` (stages,), ``errors`` and ``null`` (stages, n) [mm]. Where the probe has not travelled there is no
+    share.
     """
     return [
         dict(
@@ -87,10 +87,11 @@ def report(experiment: Experiment, setup: Setup, run: Run) -> dict:
 def summary(report: dict, model: str) -> str:
     """What was computed and how fast, in a few lines for the terminal; ``model`` is ``Experiment.describe``'s."""
     time = report["ms_per_step"]
+    solver = f"{report['substeps']} substeps of {report['iterations']} iterations"
     lines = [
         f"case   {report['case']}",
         f"model  {report['model']}: {model}",
-        f"step   1/{1 / report['time_step_s']:.0f} s in {report['substeps']} substeps of {report['iterations']} iterations",
+        f"step   1/{1 / report['time_step_s']:.0f} s in {solver}",
         f"speed  {time['median']:.1f} ms a step (median), {time['max']:.1f} at most",
     ]
     return "\n".join(lines if report["finite"] else [*lines, "NOT FINITE: the figures below mean nothing"])
@@ -99,7 +100,8 @@ def summary(report: dict, model: str) -> str:
 def table(case: Case, beads: np.ndarray) -> str:
     """The paper's Tables 2 to 4 for one run's beads (stages, n, 3) [mm], beside what predicting no motion gives.
 
-    The last column is the correlation of error and distance from the probe at that stage; below, the errors by distance.
+    The last column is the correlation of error and distance from the probe at that stage; below are the errors by
+    distance.
     """
     errors, null, distances = bead_errors(case, beads), null_errors(case), probe_distances(case)
     lines = ["stage  indentation   mean  of travel     SD    max  unmoved  ratio  r(distance)"]
@@ -107,7 +109,8 @@ def table(case: Case, beads: np.ndarray) -> str:
         share = "-" if row["percent_of_travel"] is None else f"{row['percent_of_travel']:.0f} %"
         related = correlation(distances[stage], errors[stage])
         lines.append(
-            f"{stage:<5}  {row['indentation_mm']:8.2f} mm  {_plain(row['mean_mm']):>5}  {share:>9}  {_plain(row['sd_mm']):>5}  "
+            f"{stage:<5}  {row['indentation_mm']:8.2f} mm  {_plain(row['mean_mm']):>5}  {share:>9}  "
+            f"{_plain(row['sd_mm']):>5}  "
             f"{_plain(row['max_mm']):>5}  {_against(row['mean_mm'], row['null_mean_mm'])}  {_plain(related):>11}"
         )
     overall = _against(errors.mean(), null.mean())

@@ -1,4 +1,4 @@
-"""The paper's calibration: settings searched for the least mean bead error, and what they are worth on data held out."""
+"""The paper's calibration: settings searched for the least mean bead error, and their worth on data held out."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +12,6 @@ from studies.case import Case
 from studies.setup import Setup
 from studies.workers import Map, Measured
 
-HOLD_OUT = ("stages", "beads", "cases")
 # Of the beads held out, each third: neighbours on a thread are then on either side.
 BEADS_EVERY = 3
 # The grid's spacing over that of the finer look around its best.
@@ -31,7 +30,7 @@ class CalibrationError(ValueError):
 
 @dataclass(frozen=True)
 class Split:
-    """What is fitted on: for each case a mask (stages, n), True where an error counts in the fit; the rest is held out."""
+    """What is fitted on: for each case a mask (stages, n), True where an error counts; the rest is held out."""
 
     fitted: tuple[np.ndarray, ...]
     fitted_name: str
@@ -84,7 +83,7 @@ class Calibration:
 
 
 def split_of(cases: Sequence[Case], hold_out: str) -> Split:
-    """Hold out each case's deepest stage, every third of its beads, or the last of the cases. Raises CalibrationError."""
+    """Hold out each case's deepest stage, every third of its beads, or the last case. Raises CalibrationError."""
     if len({case.digest for case in cases}) < len(cases):
         raise CalibrationError(
             "a case is named twice: what is fitted on would be held out as well; name each once"
@@ -211,7 +210,7 @@ def try_all(
 
 
 def quartic(trials: Sequence[Trial]) -> Fit | None:
-    """The paper's smooth curve through the errors of a radius up to TALLEST times the least; None of too few of them."""
+    """The paper's smooth curve through the errors up to TALLEST times the least; None where these are too few."""
     at = np.array([(trial.setup.stiffness, trial.fit_mm) for trial in trials])
     at = at[np.isfinite(at[:, 1]) & (at[:, 1] <= TALLEST * at[:, 1].min())]
     if len(np.unique(at[:, 0])) <= QUARTIC:

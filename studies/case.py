@@ -154,8 +154,8 @@ class Case:
     """One experiment: float64, mm, in the frame of the organ's stress-free surface.
 
     ``beads`` (n, 3) stress-free, ``measured`` (stages, n, 3), ``poses`` (stages, 4, 4) world from probe,
-    ``indentation_mm`` (stages,), ``press_direction`` (3,) unit, ``size_mm`` (3,), ``gravity`` (3,) in mm/s^2. What is not
-    known of the material is None. ``digest`` names the content of all files.
+    ``indentation_mm`` (stages,), ``press_direction`` (3,) unit, ``size_mm`` (3,), ``gravity`` (3,) in mm/s^2. What is
+    not known of the material is None. ``digest`` names the content of all files.
     """
 
     name: str

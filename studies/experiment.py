@@ -26,7 +26,7 @@ DENSITY_KG_M3 = 1050.0
 
 @dataclass
 class Run:
-    """What one run measured: beads (stages, n, 3) [mm] at each stage's end, each step's time, whether all stayed finite."""
+    """One run: beads (stages, n, 3) [mm] at each stage's end, each stage step's time, whether all stayed finite."""
 
     beads: np.ndarray
     step_ms: list[float] = field(default_factory=list)
@@ -43,7 +43,6 @@ class Experiment:
     def __init__(self, case: Case, setup: Setup, rest: RestBody | None = None) -> None:
         self.case = case
         self.origin = case.organ.bounds.mean(axis=0)
-        self.radius_mm = setup.radius_mm
         self.rest = rest or rest_body(case, setup)
         self.body = Body(self.rest)
         self.model = ShapeMatching(self.body)
@@ -58,10 +57,10 @@ class Experiment:
     def run(self, setup: Setup) -> Run:
         """Press the organ from its stress-free shape.
 
-        It settles for the warm-up's 120 steps with the probe away, as at its stage-0 place the probe would be in the way of
-        an organ that is not yet down. Then each stage takes 90 steps: in the first 60 the probe goes evenly to its pose
-        of that stage (to that of stage 0 from straight above it), in the others it rests. The same setup gives the same
-        beads, whatever ran before.
+        It settles for the warm-up's 120 steps with the probe away, as at its stage-0 place the probe would be in the way
+        of an organ that is not yet down. Then each stage takes 90 steps: in the first 60 the probe goes evenly to its
+        pose of that stage (to that of stage 0 along the press), in the others it rests. The same setup
+        gives the same beads, whatever ran before.
         """
         self._restore()
         step = self._step_settings(setup)

@@ -19,7 +19,7 @@ DPI = 130
 
 
 def write_figure4(calibration: Calibration, path: Path) -> None:
-    """Mean error over the stiffness for each radius, fitted and held out; the lines are quartics, a ring their least."""
+    """Mean error over the stiffness for each radius, fitted and held out; quartics with a ring where they are least."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.6), sharey=True, layout="constrained")
     for colour, radius in zip(_colours(calibration), calibration.trials, strict=True):
         trials = sorted(calibration.trials[radius], key=lambda trial: trial.setup.stiffness)
@@ -109,7 +109,7 @@ def _both(calibration: Calibration, left: Axes, right: Axes, across: str) -> Non
 
 
 def _colours(calibration: Calibration) -> list:
-    return [plt.get_cmap("viridis")(at) for at in np.linspace(0, 0.9, len(calibration.trials))]
+    return [plt.get_cmap("viridis")(at) for at in np.linspace(0, 0.85, len(calibration.trials))]
 
 
 def _save(figure: Figure, path: Path) -> None:

@@ -18,7 +18,7 @@ Row = list[float | None]
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of names and one figure a radius; ``shares`` are the same figures as % of the probe's travel, where given."""
+    """Rows of names and one figure a radius; ``shares``, where given, are these as % of the probe's travel."""
 
     name: str
     title: str

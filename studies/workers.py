@@ -1,4 +1,4 @@
-"""Evaluations of cases in parallel processes, on this machine or on a Dask cluster; the figures do not depend on how many.
+"""Evaluations of cases in parallel processes, here or on a Dask cluster; the figures do not depend on how many.
 
 A process computes on one CPU thread, so that several do not fight for the same ones, and keeps what it has built.
 """
@@ -34,7 +34,7 @@ class WorkerError(RuntimeError):
 
 @dataclass(frozen=True)
 class Measured:
-    """What one evaluation of a case came to: bead errors (stages, n) [mm], times of the steps [ms], the model's size."""
+    """What an evaluation of a case came to: bead errors (stages, n) [mm], times of the steps [ms], the model's size."""
 
     errors: np.ndarray
     step_ms: list[float]
