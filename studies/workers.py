@@ -75,7 +75,7 @@ def local_workers(jobs: int | None = None) -> Iterator[Map]:
 
 @contextmanager
 def dask_workers(address: str) -> Iterator[Map]:
-    """The workers of a running Dask cluster, which must find this project's modules. Raises WorkerError."""
+    """The workers of a running Dask cluster, which have this project in their PYTHONPATH. Raises WorkerError."""
     try:
         from distributed import Client
     except ImportError:
@@ -91,10 +91,10 @@ def dask_workers(address: str) -> Iterator[Map]:
     with client:
         try:
             found = client.run(_ready)
-        except ImportError as error:
+        except Exception as error:  # what fails on a worker comes back as anything
             raise WorkerError(
-                f"--dask {address}: a worker lacks modules ({error}); start workers in this project's folder, with its "
-                f"requirements installed"
+                f"--dask {address}: a worker is not ready ({error}); start workers with this project's requirements "
+                f"installed and its folder in PYTHONPATH"
             ) from None
         if not found:
             raise WorkerError(

@@ -218,15 +218,17 @@ def test_processes_here_and_a_cluster_of_one_worker_find_the_same(cases):
     assert here[0].errors.mean() != here[1].errors.mean() and np.isfinite(here[0].errors).all()
 
 
-def test_a_cluster_without_workers_is_refused():
-    from distributed import LocalCluster
+def test_a_cluster_without_workers_or_with_some_that_lack_modules_is_refused(monkeypatch):
+    import distributed
 
-    with (
-        LocalCluster(n_workers=0, dashboard_address=None) as cluster,
-        pytest.raises(WorkerError, match="has no workers"),
-        dask_workers(cluster.scheduler_address),
-    ):
-        pytest.fail("it went on without workers")
+    def failing(client, work):
+        raise Exception("ModuleNotFoundError(\"No module named 'studies'\")")
+
+    with distributed.LocalCluster(n_workers=0, dashboard_address=None) as cluster:
+        for words in ("has no workers", "No module named 'studies'.*its folder in PYTHONPATH"):
+            with pytest.raises(WorkerError, match=words), dask_workers(cluster.scheduler_address):
+                pytest.fail("it went on without workers")
+            monkeypatch.setattr(distributed.Client, "run", failing)
 
 
 def test_what_is_built_is_kept_and_not_more_than_taichi_bears(monkeypatch, cases):
