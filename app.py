@@ -1,7 +1,6 @@
 """The command line: reads a scene, wires the parts, runs the loop. ``python app.py --help`` lists what it does."""
 
 import json
-import os
 import sys
 from functools import partial
 from pathlib import Path
@@ -19,6 +18,9 @@ from scenes.patient import describe, import_patient, save_patient
 from scenes.reading import PatientError, read_volume
 from scenes.scene import OPTIONS, TISSUES, NeoHookeanTissue, SceneError, load_scene, scene_text, with_options
 from sim.sampling import SamplingError
+from studies.case import CaseError
+from studies.commands import Fault, arch_option, calibrate, make_folder, start_taichi, validate
+from studies.setup import SetupError
 
 if TYPE_CHECKING:
     from render.viewer import Controls, Settings, View, Viewer
@@ -28,10 +30,6 @@ if TYPE_CHECKING:
 EMBEDDED = Path(__file__).parent / "scenes" / "phantom.toml"
 PICTURES_A_SECOND = 10
 ANIMATION_WIDTH = 720
-
-
-class Fault(click.ClickException):
-    """What the user must know, in one line."""
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -57,13 +55,7 @@ def cli() -> None:
     show_default=True,
     help="Folder for pictures and the report.",
 )
-@click.option(
-    "--arch",
-    type=click.Choice(["auto", "cuda", "vulkan", "cpu"]),
-    default="auto",
-    show_default=True,
-    help="Where to compute; auto is CUDA where there is one, else the CPU.",
-)
+@arch_option
 @click.option("--model", type=click.Choice(list(TISSUES)), help="Tissue model [the scene's].")
 @click.option("--cell", type=float, help="neo-hookean: width of a cell in mm [the scene's].")
 @click.option("--young-kpa", type=float, help="neo-hookean: Young's modulus in kPa [the scene's].")
@@ -87,12 +79,7 @@ def rehearse(
     changed = {key: changes[option.strip("-").replace("-", "_")] for key, option in OPTIONS.items()}
     loaded = with_options(load_scene(path), changed)
     anatomy = load_anatomy(loaded, path.parent)
-    from sim.device import NoDevice, start
-
-    try:
-        used = start(arch)
-    except NoDevice as error:
-        raise Fault(f"--arch {arch}: {error}") from None
+    used = start_taichi(arch)
     from render.window import display_available
     from studies.rehearsal import Rehearsal
 
@@ -139,6 +126,10 @@ def import_command(
     click.echo(f"Written to {out}. Rehearse with: python app.py rehearse {out}")
 
 
+cli.add_command(validate)
+cli.add_command(calibrate)
+
+
 def label_values(text: str | None, option: str) -> list[int] | None:
     """Label values of an option's text, such as "1,2"."""
     if text is None:
@@ -147,18 +138,6 @@ def label_values(text: str | None, option: str) -> list[int] | None:
         return [int(value) for value in text.split(",")]
     except ValueError:
         raise Fault(f"{option} is {text!r}: expected whole numbers such as 1 or 1,2") from None
-
-
-def make_folder(folder: Path) -> None:
-    """Make sure that a folder can be written to before time is spent on what goes there."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise Fault(
-            f"{folder}: cannot be made a folder for results ({error.strerror}); choose another --out"
-        ) from None
-    if not os.access(folder, os.W_OK):
-        raise Fault(f"{folder}: cannot be written to; choose another --out")
 
 
 def settings_of(rehearsal: "Rehearsal") -> "Settings":
@@ -373,7 +352,7 @@ def main(arguments: list[str]) -> int:
         return 0
     except click.ClickException as error:
         message = error.format_message()
-    except (SceneError, PatientError, SamplingError) as error:
+    except (SceneError, PatientError, SamplingError, CaseError, SetupError) as error:
         message = str(error)
     except (click.Abort, KeyboardInterrupt):
         click.echo("Stopped.", err=True)

@@ -46,8 +46,8 @@ def load_anatomy(scene: Scene, folder: Path) -> LoadedAnatomy:
         folder = phantom_folder()
         anatomy = Anatomy(tumour="tumour.stl", ct="ct.nrrd")
     return LoadedAnatomy(
-        organ=_surface(folder, anatomy.organ),
-        tumour=_surface(folder, anatomy.tumour) if anatomy.tumour else None,
+        organ=load_surface(folder, anatomy.organ),
+        tumour=load_surface(folder, anatomy.tumour) if anatomy.tumour else None,
         ct=_grid(folder, anatomy.ct) if anatomy.ct else None,
         shapes=tuple(_shape(folder, shape) for shape in scene.shape),
     )
@@ -117,7 +117,8 @@ def _can_write(folder: Path) -> bool:
     return os.access(folder, os.W_OK)
 
 
-def _surface(folder: Path, name: str) -> trimesh.Trimesh:
+def load_surface(folder: Path, name: str) -> trimesh.Trimesh:
+    """Read a closed surface that faces outward [mm]. Raises SceneError with one line."""
     path = folder / name
     if not path.is_file():
         raise SceneError(f"{path}: no such surface file")
@@ -153,7 +154,7 @@ def _shape(
     if isinstance(shape, PlaneShape):
         return shape
     if isinstance(shape, MeshShape):
-        return _surface(folder, shape.file)
+        return load_surface(folder, shape.file)
     grid = _grid(folder, shape.file)
     axes = grid.index_from_mm[:3, :3]
     if not np.allclose(axes, np.diag(np.diag(axes))) or (np.diag(axes) <= 0).any():

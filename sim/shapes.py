@@ -87,24 +87,34 @@ class SignedDistanceField(Static):
 class ConvexTool:
     """A rigid tool that moves: the intersection of half-spaces normal . x <= offset in its own frame.
 
-    ``normals`` (k, 3) unit, ``offsets_mm`` (k,). ``move`` sets its pose at the start and end of a substep.
+    ``normals`` (k, 3) unit, ``offsets_mm`` (k,). ``move`` sets its pose at the start and end of a substep. With an
+    edge radius it is all that a ball of this radius covers which stays within the half-spaces.
     """
 
     moves = True
 
-    def __init__(self, normals: np.ndarray, offsets_mm: np.ndarray) -> None:
+    def __init__(self, normals: np.ndarray, offsets_mm: np.ndarray, edge_radius_mm: float = 0.0) -> None:
         self.count = len(normals)
+        self.edge_radius = float(edge_radius_mm)
+        # The half-spaces of the core, in which the ball's centre stays.
         self.half_space = ti.Vector.field(4, ti.f32, self.count)
-        self.half_space.from_numpy(np.column_stack([normals, offsets_mm]).astype(np.float32))
+        core = np.column_stack([normals, np.asarray(offsets_mm, float) - self.edge_radius])
+        self.half_space.from_numpy(core.astype(np.float32))
         self.pose = ti.Matrix.field(4, 4, ti.f32, ())
         self.step_back = ti.Matrix.field(4, 4, ti.f32, ())
         self.move(np.eye(4), np.eye(4))
 
     @staticmethod
-    def cuboid(size_mm: np.ndarray) -> "ConvexTool":
-        """Three parallel pairs of orthogonal half-spaces about the origin (the paper's transducer)."""
+    def cuboid(size_mm: np.ndarray, edge_radius_mm: float = 0.0) -> "ConvexTool":
+        """Three parallel pairs of orthogonal half-spaces about the origin (the paper's transducer).
+
+        Edges and corners are rounded inside ``size_mm`` (3,). Raises ValueError where the size leaves no room for that.
+        """
         half = np.asarray(size_mm, float) / 2
-        return ConvexTool(np.concatenate([np.eye(3), -np.eye(3)]), np.concatenate([half, half]))
+        if not 0 <= edge_radius_mm <= half.min():
+            raise ValueError(f"an edge radius of {edge_radius_mm:g} mm: expected 0 to {half.min():g} mm")
+        offsets = np.concatenate([half, half])
+        return ConvexTool(np.concatenate([np.eye(3), -np.eye(3)]), offsets, edge_radius_mm)
 
     def move(self, before: np.ndarray, now: np.ndarray) -> None:
         """Poses (4, 4), world from tool [mm], at the start and at the end of the substep."""
@@ -121,7 +131,7 @@ class ConvexTool:
         pose = self.pose[None]
         plane = self.half_space[k]
         local = pose[:3, :3].transpose() @ (p - pose[:3, 3])
-        return p + (plane.w - plane.xyz.dot(local) + HAIR) * (pose[:3, :3] @ plane.xyz)
+        return p + (plane.w + self.edge_radius - plane.xyz.dot(local) + HAIR) * (pose[:3, :3] @ plane.xyz)
 
     @ti.func
     def motion(self, p):
@@ -145,7 +155,7 @@ class ConvexTool:
         distance = outward.norm()
         if distance > 1e-4:
             depth, normal = distance, outward / distance
-        return tm.vec4(rotation @ normal, depth)
+        return tm.vec4(rotation @ normal, depth - self.edge_radius)
 
 
 @ti.data_oriented

@@ -76,6 +76,7 @@ class SurfaceContacts:
     def forget(self) -> None:
         """Drop what is known of distances and of friction, after the body was moved by another hand."""
         self.found.fill(-FAR)
+        self.near.fill(0)
         if self.rough:
             self.stick.fill(0.0)
 

@@ -54,15 +54,23 @@ def build_solver(
     tool: ConvexTool,
     contact: Contact | None = None,
     section: SolverSection | None = None,
+    rest: RestBody | None = None,
 ) -> Solver:
-    """A solver of the organ [mm] among shapes, the tool among them. Raises SamplingError."""
+    """A solver of the organ [mm] among shapes, the tool among them. Raises SamplingError.
+
+    ``rest`` is shape matching's: the organ filled before (``fill``), which takes seconds.
+    """
     contact, section = contact or Contact(), section or SolverSection()
     if isinstance(tissue, NeoHookeanTissue):
         return _neo_hookean(organ, tissue, shapes, tool, contact)
-    rest = fill_body(
+    return _shape_matching(rest or fill(organ, tissue), tissue, shapes, tool, contact, section)
+
+
+def fill(organ: trimesh.Trimesh, tissue: ShapeMatchingTissue) -> RestBody:
+    """The organ [mm] filled with particles. Raises SamplingError."""
+    return fill_body(
         organ, tissue.radius_mm, tissue.density_g_cm3, tissue.volume_sampling, tissue.surface_samples_per_mm2
     )
-    return shape_matching(rest, tissue, shapes, tool, contact, section)
 
 
 def _neo_hookean(
@@ -76,7 +84,7 @@ def _neo_hookean(
     return Solver(model, contacts, tool=tool)
 
 
-def shape_matching(
+def _shape_matching(
     rest: RestBody,
     tissue: ShapeMatchingTissue,
     shapes: list,
@@ -84,7 +92,6 @@ def shape_matching(
     contact: Contact,
     section: SolverSection,
 ) -> Solver:
-    """The paper's model of particles that were sampled before, which takes seconds."""
     body = ParticleBody(rest, section.mass_scaling_per_mm)
     model = ShapeMatching(body, tissue.cluster_spacing, section.relaxation)
     contacts = ShapeContacts(body, shapes, contact.shape_friction)

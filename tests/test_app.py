@@ -129,12 +129,12 @@ def test_options_reach_the_solver(tmp_path):
     assert (report["substeps"], report["iterations"], report["stiffness"]) == (2, 5, 0.7)
 
 
-@pytest.mark.parametrize("command", [(), ("rehearse",), ("import",)])
+@pytest.mark.parametrize("command", [(), ("rehearse",), ("import",), ("validate",), ("calibrate",)])
 def test_help_names_every_option(command):
     done = run(*command, "--help")
     assert done.returncode == 0
     wanted = {
-        (): ("rehearse", "import"),
+        (): ("rehearse", "import", "validate", "calibrate"),
         ("rehearse",): (
             "--headless",
             "--seconds",
@@ -146,6 +146,11 @@ def test_help_names_every_option(command):
             "--iterations",
         ),
         ("import",): ("--out", "--organ", "--tumour", "--side"),
+        ("validate",): (
+            *("--model", "--quality", "--radius", "--stiffness", "--substeps", "--iterations"),
+            *("--young-kpa", "--poisson", "--arch", "--json"),
+        ),
+        ("calibrate",): ("--out", "--radii", "--hold-out", "--grid", "--search", "--jobs", "--dask"),
     }[command]
     assert all(word in done.stdout for word in wanted)
 

@@ -46,22 +46,51 @@ def test_plane(device):
     assert np.abs(normals - normal / 3).max() < 1e-6
 
 
-def test_cuboid_in_any_pose(device):
+@pytest.mark.parametrize("edge_radius", [0.0, 1.0, 3.0])
+def test_cuboid_in_any_pose(device, edge_radius):
     half = np.array([6.0, 3.0, 4.0])
-    tool = ConvexTool.cuboid(2 * half)
+    tool = ConvexTool.cuboid(2 * half, edge_radius)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation_about([1, 1, 0], 40), [2.0, -1.0, 3.0]
     tool.move(pose, pose)
     points = scattered()
     normals, distance = measured(tool, points)
     local = (points - pose[:3, 3]) @ pose[:3, :3]
-    beyond = np.abs(local) - half
-    wanted = np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
+    beyond = np.abs(local) - (half - edge_radius)
+    wanted = np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0) - edge_radius
     assert np.abs(distance - wanted).max() < 2e-5
     # A step along the normal changes the distance by its length, which is what makes it the normal.
     away = np.abs(wanted) > 0.1
     ahead = measured(tool, points + 0.05 * normals)[1]
     assert np.abs(ahead - distance - 0.05)[away & (beyond.max(axis=1) > 0)].max() < 1e-4
+
+
+def test_a_rounded_cuboid_keeps_its_size_and_loses_its_corners(device):
+    tool = ConvexTool.cuboid(np.array([12.0, 6.0, 8.0]), 1.0)
+    distance = measured(tool, np.array([[6.0, 0, 0], [0, -3.0, 0], [6.0, 3.0, 0], [6.0, 3.0, 4.0]]))[1]
+    assert distance == pytest.approx([0, 0, 2**0.5 - 1, 3**0.5 - 1], abs=1e-6)
+
+
+def test_the_way_out_of_a_rounded_cuboid_ends_a_hair_outside_its_face(device):
+    tool = ConvexTool.cuboid(np.array([12.0, 6.0, 8.0]), 1.0)
+    out = ti.Vector.field(3, ti.f32, 6)
+
+    @ti.kernel
+    def ask():
+        for k in range(6):
+            out[k] = tool.way_out(ti.Vector([1.0, 0.5, -0.5]), k)
+
+    ask()
+    for point, k in zip(out.to_numpy(), range(6), strict=True):
+        expected = np.array([1.0, 0.5, -0.5])
+        expected[k % 3] = (1 if k < 3 else -1) * ([6.0, 3.0, 4.0][k % 3] + 1e-3)
+        assert point == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("edge_radius", [-0.1, 3.1])
+def test_an_edge_radius_without_room_is_refused(device, edge_radius):
+    with pytest.raises(ValueError, match="expected 0 to 3 mm"):
+        ConvexTool.cuboid(np.array([12.0, 6.0, 8.0]), edge_radius)
 
 
 def test_a_tool_knows_how_its_material_moved(device):

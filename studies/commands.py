@@ -1,0 +1,222 @@
+"""The commands that measure how true a model is: ``validate`` and ``calibrate``."""
+
+import json
+import os
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+import click
+from tqdm import tqdm
+
+from studies.case import load_case
+from studies.setup import PRESETS, QUALITIES, choose_setup
+
+if TYPE_CHECKING:
+    from studies.calibration import Calibration
+
+
+class Fault(click.ClickException):
+    """What the user must know, in one line."""
+
+
+def start_taichi(arch: str) -> str:
+    """Initialise Taichi where the user wants it; the backend it is. Raises Fault."""
+    from sim.device import NoDevice, start
+
+    try:
+        return start(arch)
+    except NoDevice as error:
+        raise Fault(f"--arch {arch}: {error}") from None
+
+
+def make_folder(folder: Path, option: str = "--out") -> None:
+    """Make sure that a folder can be written to before time is spent on what goes there. Raises Fault."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise Fault(
+            f"{folder}: cannot be made a folder for results ({error.strerror}); choose another {option}"
+        ) from None
+    if not os.access(folder, os.W_OK):
+        raise Fault(f"{folder}: cannot be written to; choose another {option}")
+
+
+arch_option = click.option(
+    "--arch",
+    type=click.Choice(["auto", "cuda", "vulkan", "cpu"]),
+    default="auto",
+    show_default=True,
+    help="Where to compute; auto is CUDA where there is one, else the CPU.",
+)
+
+
+@click.command()
+@click.argument("case", type=click.Path(path_type=Path))
+@click.option("--model", type=click.Choice(list(PRESETS)), default="neo-hookean", show_default=True)
+@click.option(
+    "--quality",
+    type=click.Choice(QUALITIES),
+    default="balanced",
+    show_default=True,
+    help="A preset of the model, the same for every case; the options below change single values of it.",
+)
+@click.option(
+    "--cell",
+    "cell_mm",
+    type=click.FloatRange(0.5, 20),
+    help="neo-hookean: width of a cell in mm [the preset's].",
+)
+@click.option(
+    "--young-kpa",
+    type=click.FloatRange(0, 1e6, min_open=True),
+    help="neo-hookean: Young's modulus in kPa [the case's].",
+)
+@click.option(
+    "--poisson", type=click.FloatRange(0, 0.4999), help="neo-hookean: Poisson's ratio [the case's]."
+)
+@click.option(
+    "--radius",
+    "radius_mm",
+    type=click.FloatRange(0.5, 20),
+    help="shape-matching: particle radius in mm [the preset's].",
+)
+@click.option(
+    "--stiffness", type=click.FloatRange(0, 1), help="shape-matching: cluster stiffness [the preset's]."
+)
+@click.option("--substeps", type=click.IntRange(1, 100), help="Substeps of a time step [the preset's].")
+@click.option(
+    "--iterations",
+    type=click.IntRange(1, 1000),
+    help="Passes over the constraints in a substep [the preset's].",
+)
+@click.option("--time-step", "time_step_s", type=click.FloatRange(1e-4, 0.1), help="Time step in s [1/60].")
+@arch_option
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file.")
+def validate(
+    case: Path, model: str, quality: str, arch: str, json_file: Path | None, **changes: float | None
+) -> None:
+    """Press the organ of CASE, a folder with a bead experiment, and compare the beads with the measured ones."""
+    setup = choose_setup(model, quality, **changes)
+    loaded = load_case(case)
+    if json_file is not None:
+        make_folder(json_file.parent, "--json")
+        if json_file.is_dir():
+            raise Fault(f"{json_file}: is a folder; name a file after --json")
+    used = start_taichi(arch)
+    from studies.accuracy import report, summary, table
+    from studies.experiment import Experiment
+
+    started = perf_counter()
+    experiment = Experiment(loaded, setup)
+    built_s = perf_counter() - started
+    run = experiment.run(setup)
+    figures = report(experiment, setup, run)
+    click.echo(f"{summary(figures, experiment.describe(setup))}\nbuilt  in {built_s:.1f} s, on {used}\n")
+    click.echo(table(loaded, run.beads))
+    if json_file is not None:
+        write_json(figures, json_file)
+
+
+def write_json(figures: dict, file: Path) -> None:
+    """Write figures to a file and say so. Raises Fault."""
+    try:
+        file.write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", "utf-8")
+    except OSError as error:
+        raise Fault(f"{file}: cannot be written ({error.strerror}); choose another --json") from None
+    click.echo(f"\nWrote {file}")
+
+
+@click.command()
+@click.argument("cases", metavar="CASE...", type=click.Path(path_type=Path), nargs=-1, required=True)
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for tables and pictures.")
+@click.option("--radii", default="2.2,2.5,2.7,3.0,3.3", show_default=True, help="Particle radii in mm.")
+@click.option(
+    "--hold-out",
+    type=click.Choice(["stages", "beads", "cases"]),
+    default="stages",
+    show_default=True,
+    help="What is not fitted on and judges the fit: each case's deepest stage, every third bead, or the last CASE.",
+)
+@click.option(
+    "--grid",
+    "spacing",
+    type=click.FloatRange(0.01, 0.5),
+    default=0.05,
+    show_default=True,
+    help="Spacing of the stiffnesses tried; around the best it is a fifth of that.",
+)
+@click.option(
+    "--search",
+    "generations",
+    type=click.IntRange(1, 1000),
+    help="Instead of the stiffness alone, search stiffness, over-relaxation and iterations for so many generations.",
+)
+@click.option("--jobs", type=click.IntRange(1, 1024), help="Processes on this machine [one a processor].")
+@click.option("--dask", "address", help="Run on the Dask cluster of this scheduler, such as tcp://host:8786.")
+def calibrate(
+    cases: tuple[Path, ...],
+    out: Path,
+    radii: str,
+    hold_out: str,
+    spacing: float,
+    generations: int | None,
+    jobs: int | None,
+    address: str | None,
+) -> None:
+    """Fit the settings of shape matching to the bead experiments of CASE..., and judge them on what was held out.
+
+    It is the paper's calibration: every stiffness for each particle radius.
+    """
+    radii_mm = numbers(radii, "--radii", 0.5, 20)
+    loaded = [load_case(case) for case in cases]
+    make_folder(out)
+    import sim.device  # noqa: F401  before all that imports Taichi, which it keeps quiet
+    from studies import calibration, workers
+
+    try:
+        split = calibration.split_of(loaded, hold_out)
+        with workers.dask_workers(address) if address else workers.local_workers(jobs) as work:
+            if generations:
+                count = calibration.search_count(len(loaded), len(radii_mm), generations)
+            else:
+                count = calibration.exhaustive_count(len(loaded), len(radii_mm), spacing)
+            with tqdm(total=count, desc="calibrate", unit="press") as bar:
+                if generations:
+                    found = calibration.search(loaded, split, radii_mm, generations, work, bar.update)
+                else:
+                    found = calibration.exhaustive(loaded, split, radii_mm, spacing, work, bar.update)
+                bar.total = bar.n
+    except (calibration.CalibrationError, workers.WorkerError) as error:
+        raise Fault(str(error)) from None
+    write_calibration(found, out, searched=generations is not None)
+
+
+def write_calibration(found: "Calibration", out: Path, searched: bool) -> None:
+    """Tables and pictures into a folder, and what matters of them on the terminal."""
+    from studies import figures
+    from studies.tables import summary_of, tables_of, write_json
+
+    tables = tables_of(found)
+    for table in tables:
+        table.write_csv(out)
+        figures.write_table(table, out / f"{table.name}.png")
+        click.echo(f"\n{table.text()}")
+    write_json(found, tables, out / "calibration.json")
+    figures.write_figure5(found, out / "figure5.png")
+    if searched:
+        figures.write_search(found, out / "search.png")
+    else:
+        figures.write_figure4(found, out / "figure4.png")
+    click.echo(f"\n{summary_of(found)}\nWrote tables, pictures and calibration.json to {out}")
+
+
+def numbers(text: str, option: str, least: float, most: float) -> list[float]:
+    """Different numbers of an option's text, such as "2.2,2.7", in ascending order. Raises Fault."""
+    try:
+        values = sorted({float(value) for value in text.split(",")})
+    except ValueError:
+        values = []
+    if not values or not all(least <= value <= most for value in values):
+        raise Fault(f"{option} is {text!r}: expected numbers from {least:g} to {most:g} such as 2.2,2.7")
+    return values

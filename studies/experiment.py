@@ -1,0 +1,147 @@
+"""A case put together on the device and pressed: the warm-up, then stage by stage, the beads read at each one's end."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import trimesh
+
+from scenes.scene import Contact, NeoHookeanTissue, ShapeMatchingTissue, SolverSection
+from sim.body import RestBody
+from sim.shapes import ConvexTool
+from sim.skinning import Skin
+from sim.solver import StepSettings
+from studies.case import Case
+from studies.models import build_solver, fill, static_shape, step_settings
+from studies.report import timed
+from studies.setup import Setup, SetupError
+from ultrasound.probe import between
+
+# The share of a stage's steps in which the probe moves; in the others the tissue comes to rest, as it did for the scan.
+MOVING = 2 / 3
+# How far back along the press the probe waits while the organ settles.
+AWAY_MM = 60.0
+# Where a case does not say: the paper's. It scales all masses alike.
+DENSITY_KG_M3 = 1050.0
+
+
+@dataclass
+class Run:
+    """One run: beads (stages, n, 3) [mm] at each stage's end, each stage step's time, whether all stayed finite."""
+
+    beads: np.ndarray
+    step_ms: list[float] = field(default_factory=list)
+    finite: bool = True
+
+
+class Experiment:
+    """A case on the device, which can be run with several setups that share model, size and material.
+
+    Needs Taichi to be initialised. All positions on the device are relative to ``origin``, the middle of the organ.
+    Raises SamplingError and SetupError.
+    """
+
+    def __init__(self, case: Case, setup: Setup, rest: RestBody | None = None) -> None:
+        self.case = case
+        self.origin = case.organ.bounds.mean(axis=0)
+        tissue = tissue_of(case, setup)
+        tool = ConvexTool.cuboid(case.size_mm, case.edge_radius_mm)
+        shapes = [static_shape(_shifted(case.support, -self.origin), tissue), tool]
+        contact = Contact(shape_friction=case.friction)
+        self.solver = build_solver(_organ(case), tissue, shapes, tool, contact, rest=rest)
+        self.body, self.model, self.contacts = self.solver.body, self.solver.model, self.solver.contacts
+        self.beads = Skin(self.model, case.beads - self.origin)
+
+    def run(self, setup: Setup) -> Run:
+        """Press the organ from its stress-free shape.
+
+        It settles for the warm-up's 120 steps with the probe away, as at its stage-0 place the probe would be in the way
+        of an organ that is not yet down. Then each stage takes 90 steps: in the first 60 the probe goes evenly to its
+        pose of that stage (to that of stage 0 along the press), in the others it rests. The same setup
+        gives the same beads, whatever ran before.
+        """
+        self._restore()
+        step = self._step_settings(setup)
+        pose = self._away()
+        run = Run(np.zeros_like(self.case.measured))
+        for _ in range(setup.warm_up_steps):
+            self.solver.step(step, between(pose, pose, step.substeps))
+        moving = max(1, round(MOVING * setup.stage_steps))
+        for stage, goal in enumerate(self.case.poses):
+            path = between(pose, self._relative(goal), moving)
+            for n in range(setup.stage_steps):
+                poses = between(path[min(n, moving)], path[min(n + 1, moving)], step.substeps)
+                timed(lambda: self.solver.step(step, poses), run.step_ms)
+            pose = path[-1]
+            self.beads.update()
+            run.beads[stage] = self.beads.vertices.to_numpy() + self.origin
+            run.finite &= bool(np.isfinite(self.body.position.to_numpy()).all())
+        run.finite &= bool(np.isfinite(run.beads).all())
+        return run
+
+    def size(self, setup: Setup) -> dict[str, float]:
+        """How large the model is, under the names of a report: ``radius_mm`` or ``cell_mm``, ``particles`` or ``nodes``."""
+        own = dict(cell_mm=setup.cell_mm) if setup.model == "neo-hookean" else dict(radius_mm=setup.radius_mm)
+        return {**own, **self.model.counts()}
+
+    def describe(self, setup: Setup) -> str:
+        """Size and settings that the model does not share with others, for the terminal."""
+        tissue, size = tissue_of(self.case, setup), self.model.counts()
+        if isinstance(tissue, NeoHookeanTissue):
+            material = f"E {tissue.young_kpa:g} kPa, nu {tissue.poisson:g}"
+            return f"{size['nodes']} nodes, {size['cells']} cells of {setup.cell_mm:g} mm, {material}"
+        return f"{size['particles']} particles of {setup.radius_mm:g} mm, stiffness {setup.stiffness:g}"
+
+    def _restore(self) -> None:
+        self.body.restore(self.body.rest_state())
+        self.contacts.forget()
+        self.model.update_frames()
+
+    def _step_settings(self, setup: Setup) -> StepSettings:
+        names = ("time_step_s", "substeps", "iterations", "relaxation_factor")
+        section = SolverSection.model_validate({name: getattr(setup, name) for name in names})
+        x, y, z = self.case.gravity.tolist()
+        return replace(step_settings(tissue_of(self.case, setup), section), gravity=(x, y, z))
+
+    def _relative(self, pose: np.ndarray) -> np.ndarray:
+        moved = pose.copy()
+        moved[:3, 3] -= self.origin
+        return moved
+
+    def _away(self) -> np.ndarray:
+        pose = self._relative(self.case.poses[0])
+        pose[:3, 3] -= AWAY_MM * self.case.press_direction
+        return pose
+
+
+def tissue_of(case: Case, setup: Setup) -> NeoHookeanTissue | ShapeMatchingTissue:
+    """The setup's tissue with what is the case's own. Raises SetupError where neither gives the material."""
+    values: dict[str, float | str | None] = dict(
+        model=setup.model, density_g_cm3=(case.density_kg_m3 or DENSITY_KG_M3) / 1000
+    )
+    if setup.model == "shape-matching":
+        values.update(radius_mm=setup.radius_mm, stiffness=setup.stiffness)
+        return ShapeMatchingTissue.model_validate(values)
+    young, poisson = setup.young_kpa or case.young_kpa, setup.poisson
+    if poisson is None:
+        poisson = case.poisson
+    if young is None or poisson is None:
+        raise SetupError(
+            f"{case.name}: the case does not say what its tissue is; give --young-kpa and --poisson"
+        )
+    values.update(cell_mm=setup.cell_mm, young_kpa=young, poisson=poisson)
+    return NeoHookeanTissue.model_validate(values)
+
+
+def rest_body(case: Case, setup: Setup) -> RestBody:
+    """Shape matching's particles of a case; Experiments of one radius can share them."""
+    tissue = tissue_of(case, setup)
+    assert isinstance(tissue, ShapeMatchingTissue)
+    return fill(_organ(case), tissue)
+
+
+def _organ(case: Case) -> trimesh.Trimesh:
+    return _shifted(case.organ, -case.organ.bounds.mean(axis=0))
+
+
+def _shifted(mesh: trimesh.Trimesh, by: np.ndarray) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices + by, mesh.faces, process=False)

@@ -1,0 +1,64 @@
+"""Which model computes a case, and with what: the presets and what may be changed of them."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Setup:
+    """How a case is computed, whichever it is; the defaults are the paper's: Table 1 and its calibration's steps.
+
+    ``radius_mm`` and ``stiffness`` are shape matching's; ``cell_mm``, ``young_kpa`` and ``poisson`` the neo-Hookean
+    model's, of which the last two are the case's own where they are None.
+    """
+
+    model: str = "shape-matching"
+    radius_mm: float = 2.7
+    stiffness: float = 0.95
+    cell_mm: float = 4.0
+    relaxation_factor: float = 1.0
+    substeps: int = 3
+    iterations: int = 9
+    time_step_s: float = 1 / 60
+    warm_up_steps: int = 120
+    stage_steps: int = 90
+    young_kpa: float | None = None
+    poisson: float | None = None
+
+
+NEO_HOOKEAN = Setup("neo-hookean", relaxation_factor=1.7, substeps=1, iterations=8)
+# Each model's presets, which hold for every case and are fitted to none.
+PRESETS = {
+    "neo-hookean": {
+        "fast": replace(NEO_HOOKEAN, cell_mm=6.0),
+        "balanced": replace(NEO_HOOKEAN, cell_mm=4.0),
+        "accurate": replace(NEO_HOOKEAN, cell_mm=2.5, iterations=16),
+    },
+    "shape-matching": {
+        "fast": Setup(radius_mm=3.3),
+        "balanced": Setup(radius_mm=2.7),
+        "accurate": Setup(radius_mm=2.2),
+    },
+}
+# What a setup's values mean nothing to.
+NOT_USED = {
+    "neo-hookean": ("radius_mm", "stiffness"),
+    "shape-matching": ("cell_mm", "young_kpa", "poisson"),
+}
+OPTION_OF = {"radius_mm": "radius", "cell_mm": "cell"}
+QUALITIES = ("fast", "balanced", "accurate")
+
+
+class SetupError(ValueError):
+    """A setup that does not fit its model or case; the message is one line."""
+
+
+def choose_setup(model: str, quality: str, **changes: Any) -> Setup:
+    """A preset with single values changed; None leaves what is there. Raises SetupError."""
+    given = {name: value for name, value in changes.items() if value is not None}
+    for name in given:
+        if name in NOT_USED[model]:
+            raise SetupError(
+                f"--{OPTION_OF.get(name, name.replace('_', '-'))}: {model} has no such setting; leave it out"
+            )
+    return replace(PRESETS[model][quality], **given)
