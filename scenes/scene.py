@@ -275,7 +275,8 @@ def _explain(error: ValidationError) -> str:
     where = [str(part) for part in first["loc"] if part not in ("plane", "mesh", "sdf", *TISSUES)]
     name = ".".join(where)
     if first["type"] == "extra_forbidden":
-        text = f"{name}: unknown key; {_suggest(where)}"
+        owner = _owner(where)
+        text = f"{name}: {owner}" if owner else f"{name}: unknown key; {_suggest(where)}"
     elif first["type"] == "value_error" and not name:
         text = str(first["ctx"]["error"])
     elif first["type"] == "unknown_model":
@@ -288,14 +289,18 @@ def _explain(error: ValidationError) -> str:
     return text + (f" (and {more} more)" if more else "")
 
 
+def _owner(where: list[str]) -> str:
+    """Whose key it is that another tissue model does not have; empty where it is nobody's."""
+    owners = [model for model, section in TISSUES.items() if where[-1] in section.model_fields]
+    if where[0] != "tissue" or not owners:
+        return ""
+    return f"belongs to the tissue model {owners[0]}; choose it with tissue.model, or leave this out"
+
+
 def _suggest(where: list[str]) -> str:
     """What the writer of an unknown key may have meant; a unit other than the schema's is named as such."""
     known = _keys_beside(where)
     key = where[-1]
-    if where[0] == "tissue":
-        for model, section in TISSUES.items():
-            if key in section.model_fields:
-                return f"it belongs to the tissue model {model}"
     stem = key.split("_")[0]
     for name in known:
         if name != key and key.startswith(_quantity(name)) and _quantity(name) != name:

@@ -4,7 +4,7 @@ import numpy as np
 
 from studies.case import Case
 from studies.experiment import Experiment, Run
-from studies.report import spread
+from studies.report import counted, spread
 from studies.setup import Setup
 
 DISTANCE_BANDS = 4
@@ -87,11 +87,11 @@ def report(experiment: Experiment, setup: Setup, run: Run) -> dict:
 def summary(report: dict, model: str) -> str:
     """What was computed and how fast, in a few lines for the terminal; ``model`` is ``Experiment.describe``'s."""
     time = report["ms_per_step"]
-    solver = f"{report['substeps']} substeps of {report['iterations']} iterations"
     lines = [
         f"case   {report['case']}",
         f"model  {report['model']}: {model}",
-        f"step   1/{1 / report['time_step_s']:.0f} s in {solver}",
+        f"step   1/{1 / report['time_step_s']:.0f} s in {counted(report['substeps'], 'substep')} of "
+        f"{counted(report['iterations'], 'iteration')}",
         f"speed  {time['median']:.1f} ms a step (median), {time['max']:.1f} at most",
     ]
     return "\n".join(lines if report["finite"] else [*lines, "NOT FINITE: the figures below mean nothing"])

@@ -26,6 +26,11 @@ def spread(values_ms: list[float]) -> dict[str, float]:
     return {name: round(float(value), 4) for name, value in figures.items()}
 
 
+def counted(number: int, name: str) -> str:
+    """A number of things: "1 substep", "3 substeps"."""
+    return f"{number} {name}{'' if number == 1 else 's'}"
+
+
 @dataclass
 class Record:
     """Figures gathered while a rehearsal runs; the first step and slice, which compile, count as building."""
@@ -79,8 +84,8 @@ def summary(report: dict) -> str:
     return "\n".join(
         [
             f"model     {_model_line(report)}",
-            f"step      1/{1 / report['time_step_s']:.0f} s in {report['substeps']} substeps of {report['iterations']} "
-            "iterations",
+            f"step      1/{1 / report['time_step_s']:.0f} s in {counted(report['substeps'], 'substep')} of "
+            f"{counted(report['iterations'], 'iteration')}",
             f"speed     {times} on {report['arch']}; built in {report['build_s']:.1f} s",
             f"press     {report['indentation_max_mm']:.2f} mm deep; least volume {100 * report['volume_ratio_min']:.1f} %; "
             f"penetration at most {report['max_penetration_mm']:.3f} mm; "

@@ -95,7 +95,7 @@ def test_report_and_table_show_these_figures(device, case):
     off = np.linspace(0, 1, 12)[:, None] * np.array([0.0, 0.0, 1.0])
     run = Run(case.measured + off, step_ms=[1.0, 2.0, 6.0])
     figures = report(experiment, COARSE, run)
-    assert set(figures) == KEYS and figures["case"] == "ball"
+    assert set(figures) == KEYS | {"clusters", "memberships"} and figures["case"] == "ball"
     assert figures["overall_mean_mm"] == pytest.approx(0.5)
     assert figures["ms_per_step"]["median"] == 2 and figures["ms_per_step"]["mean"] == 3
     distances = probe_distances(case)[1:].ravel()
@@ -167,13 +167,13 @@ def test_validate_twice_prints_and_writes_the_same_but_for_times(monkeypatch, tm
     folder = write_case(tmp_path / "ball")
     reports = []
     for name in ("a.json", "new/b.json"):
-        arguments = ["validate", folder, "--radius", 5, "--arch", "cpu", "--json", tmp_path / name]
+        arguments = ["validate", folder, "--cell", 5, "--arch", "cpu", "--json", tmp_path / name]
         done = CliRunner().invoke(cli, [str(argument) for argument in arguments])
-        assert done.exit_code == 0 and "1/60 s in 3 substeps of 9 iterations" in done.output
+        assert done.exit_code == 0 and "1/60 s in 1 substep of 8 iterations" in done.output
         reports.append(json.loads((tmp_path / name).read_text()))
     times = [figures.pop("ms_per_step") for figures in reports]
     assert times[0].keys() == {"mean", "sd", "min", "max", "median"}
-    assert reports[0] == reports[1] and reports[0]["finite"] and reports[0]["radius_mm"] == 5
+    assert reports[0] == reports[1] and reports[0]["finite"] and reports[0]["cell_mm"] == 5
 
 
 def test_validate_says_mistakes_in_one_line(tmp_path, capsys):
@@ -188,8 +188,10 @@ def test_validate_says_mistakes_in_one_line(tmp_path, capsys):
     assert "--model" in refused(folder, "--model", "clay")
     assert "--quality" in refused(folder, "--quality", "best")
     assert "--poisson" in refused(folder, "--poisson", 0.5)
-    assert "has no such setting" in refused(folder, "--young-kpa", 15)
-    assert "choose a smaller radius" in refused(folder, "--radius", 20, "--arch", "cpu")
+    assert "has no such setting" in refused(folder, "--radius", 3)
+    shape_matching = [folder, "--model", "shape-matching"]
+    assert "has no such setting" in refused(*shape_matching, "--young-kpa", 15)
+    assert "choose a smaller radius" in refused(*shape_matching, "--radius", 20, "--arch", "cpu")
     assert "is a folder" in refused(folder, "--json", tmp_path)
     assert "choose another --json" in refused(folder, "--json", folder / "case.toml" / "a.json")
     write_case(tmp_path / "ball", values() | {"stage": []})

@@ -8,7 +8,17 @@ import SimpleITK as sitk
 import trimesh
 
 from scenes.anatomy import load_anatomy, phantom_folder, press_on
-from scenes.scene import Anatomy, Press, Scene, SceneError, load_scene, scene_text, with_options
+from scenes.scene import (
+    Anatomy,
+    Press,
+    Scene,
+    SceneError,
+    ShapeMatchingTissue,
+    load_scene,
+    scene_text,
+    with_options,
+)
+from studies.models import step_settings
 
 PHANTOM = Path(__file__).parents[1] / "scenes" / "phantom.toml"
 
@@ -41,14 +51,20 @@ def refused(tmp_path: Path, text: str) -> str:
         ("[anatomy]\n[gravity]\nacceleration_mm_s2 = 9810", "write acceleration_m_s2"),
         ("[anatomy]\n[tissue]\nstifness = 1", "tissue.stifness: unknown key; did you mean stiffness?"),
         (
-            "[anatomy]\n[tissue]\nstiffness = 2",
+            "[anatomy]\n[tissue]\nmodel = 'shape-matching'\nstiffness = 2",
             "tissue.stiffness = 2: input should be less than or equal to 1",
         ),
         (
-            "[anatomy]\n[tissue]\nradius_mm = '2.7 mm'",
+            "[anatomy]\n[tissue]\nmodel = 'shape-matching'\nradius_mm = '2.7 mm'",
             "tissue.radius_mm = '2.7 mm': input should be a valid number",
         ),
-        ("[anatomy]\n[tissue]\nradius_mm = nan", "tissue.radius_mm"),
+        ("[anatomy]\n[tissue]\ncell_mm = nan", "tissue.cell_mm"),
+        ("[anatomy]\n[tissue]\nstiffness = 1", "belongs to the tissue model shape-matching"),
+        (
+            "[anatomy]\n[tissue]\nmodel = 'mass-springs'",
+            "tissue.model = 'mass-springs': the model should be one of",
+        ),
+        ("[anatomy]\n[contact]\nparticles = true", "contact.particles = true needs particles"),
         ("[anatomy]\n[gravity]\ndirection = [0, 0, 0]", "a direction must not be zero"),
         ("[anatomy]\n[[shape]]\nkind = 'plane'\nnormal = [0, 0, 1]\noffset_cm = 1", "write offset_mm"),
         ("[anatomy]\n[[shape]]\nkind = 'ball'", "'plane', 'mesh', 'sdf'"),
@@ -73,28 +89,31 @@ def test_missing_and_unreadable_files_are_named(tmp_path):
 
 
 def test_a_scene_written_is_the_scene_read(tmp_path):
-    scene = with_options(load_scene(PHANTOM), {"tissue.radius_mm": 3.0, "tissue.stiffness": None})
+    changes = {"tissue.cell_mm": 3.0, "tissue.young_kpa": None}
+    scene = with_options(load_scene(PHANTOM), changes)
     (tmp_path / "a.toml").write_text(scene_text(scene), "utf-8")
     assert load_scene(tmp_path / "a.toml") == scene
-    assert scene.tissue.radius_mm == 3.0
+    assert scene.tissue.cell_mm == 3.0
+    other = with_options(scene, {"tissue.model": "shape-matching", "tissue.radius_mm": 3.3})
+    assert (other.tissue.radius_mm, other.tissue.stiffness) == (3.3, 0.95)
 
 
 def test_options_out_of_range_are_refused():
-    with pytest.raises(SceneError, match=r"^--stiffness = 1.5: input should be"):
-        with_options(load_scene(PHANTOM), {"tissue.stiffness": 1.5})
+    with pytest.raises(SceneError, match=r"^--poisson = 0.5: input should be"):
+        with_options(load_scene(PHANTOM), {"tissue.poisson": 0.5})
+    with pytest.raises(SceneError, match=r"^--radius: belongs to the tissue model .*choose it with --model"):
+        with_options(load_scene(PHANTOM), {"tissue.radius_mm": 3.0})
 
 
-def test_defaults_are_the_papers_table_1():
-    solver, contact, tissue = (
-        Scene(anatomy=Anatomy()).solver,
-        Scene(anatomy=Anatomy()).contact,
-        Scene(anatomy=Anatomy()).tissue,
-    )
-    assert (solver.time_step_s, solver.substeps, solver.iterations) == (1 / 60, 3, 9)
-    assert (solver.relaxation, solver.relaxation_factor, solver.damping_per_s) == ("local", 1.0, 12.0)
+def test_shape_matchings_defaults_are_the_papers_table_1():
+    scene = Scene(anatomy=Anatomy(), tissue=ShapeMatchingTissue(model="shape-matching"))
+    contact, tissue = scene.contact, scene.tissue
+    step = step_settings(tissue, scene.solver)
+    assert (step.time_step_s, step.substeps, step.iterations) == (1 / 60, 3, 9)
+    assert (scene.solver.relaxation, step.relaxation_factor, step.damping) == ("local", 1.0, 12.0)
     assert (tissue.cluster_spacing, tissue.volume_sampling, tissue.density_g_cm3) == (3.33, 4.0, 1.05)
     assert (contact.shape_friction, contact.particle_friction) == (0.35, 0.25)
-    assert Scene(anatomy=Anatomy()).gravity.acceleration_m_s2 == 9.81
+    assert scene.gravity.acceleration_m_s2 == 9.81
 
 
 def with_ball(folder: Path, **changes) -> Scene:
