@@ -77,7 +77,10 @@ def rehearse(
     if scene.is_dir() and not path.is_file():
         raise Fault(f"{scene}: holds no scene.toml; make a patient's folder of a CT with: app.py import")
     changed = {key: changes[option.strip("-").replace("-", "_")] for key, option in OPTIONS.items()}
-    loaded = with_options(load_scene(path), changed)
+    before = load_scene(path)
+    loaded = with_options(before, changed)
+    if changed["tissue.model"] is None and loaded.tissue.model != before.tissue.model:
+        click.echo(f"Tissue model: {loaded.tissue.model}, as the options ask for it.")
     anatomy = load_anatomy(loaded, path.parent)
     used = start_taichi(arch)
     from render.window import display_available

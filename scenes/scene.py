@@ -6,6 +6,7 @@ other than the schema's, and values out of range, each by name.
 
 import difflib
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -243,11 +244,14 @@ def load_scene(path: Path) -> Scene:
 def with_options(scene: Scene, options: dict[str, float | int | str | None]) -> Scene:
     """The scene with single values changed, such as ``{"tissue.radius_mm": 3.0}``; None leaves what is there.
 
-    Another tissue model starts from its own defaults. Raises SceneError for a value out of range.
+    A value that only another tissue model has asks for that model, which starts from its own defaults. Raises
+    SceneError for a value out of range, and for values of two models.
     """
     values = scene.model_dump(exclude_unset=True)
-    if options.get("tissue.model") not in (None, scene.tissue.model):
-        values["tissue"] = {}
+    asked = [name.removeprefix("tissue.") for name, value in options.items() if value is not None]
+    model = options.get("tissue.model") or model_with(asked, scene.tissue.model)
+    if model != scene.tissue.model:
+        values["tissue"] = {"model": model}
     for name, value in options.items():
         if value is not None:
             section, key = name.split(".")
@@ -259,6 +263,13 @@ def with_options(scene: Scene, options: dict[str, float | int | str | None]) -> 
         for key, option in OPTIONS.items():
             text = text.replace(key, option)
         raise SceneError(text) from None
+
+
+def model_with(keys: Iterable[str], usual: str) -> str:
+    """The tissue model that has all of some keys that belong to any: the usual one where it will do."""
+    special = {key for key in keys if any(key in section.model_fields for section in TISSUES.values())}
+    having = [name for name, section in TISSUES.items() if special <= set(section.model_fields)]
+    return having[0] if having and usual not in having else usual
 
 
 def scene_text(scene: Scene) -> str:

@@ -115,10 +115,9 @@ class NeoHookean:
             self.contacts.stiffness[None] = young_kpa / LAYER_MM
 
     def counts(self) -> dict[str, int]:
-        """Nodes and cells, and points of the surface that may touch."""
-        return dict(
-            nodes=self.body.count, cells=self.count, points=self.contacts.count if self.contacts else 0
-        )
+        """Nodes, which are its particles, and cells, and points of the surface that may touch."""
+        nodes, points = self.body.count, self.contacts.count if self.has_contacts else 0
+        return dict(nodes=nodes, particles=nodes, cells=self.count, points=points)
 
     @ti.func
     def begin(self, dt: float):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 from tqdm import tqdm
 
+from scenes.scene import model_with
 from studies.case import load_case
 from studies.setup import PRESETS, QUALITIES, choose_setup
 
@@ -53,7 +54,9 @@ arch_option = click.option(
 
 @click.command()
 @click.argument("case", type=click.Path(path_type=Path))
-@click.option("--model", type=click.Choice(list(PRESETS)), default="neo-hookean", show_default=True)
+@click.option(
+    "--model", type=click.Choice(list(PRESETS)), help="[neo-hookean, or what the options below belong to]"
+)
 @click.option(
     "--quality",
     type=click.Choice(QUALITIES),
@@ -94,10 +97,11 @@ arch_option = click.option(
 @arch_option
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file.")
 def validate(
-    case: Path, model: str, quality: str, arch: str, json_file: Path | None, **changes: float | None
+    case: Path, model: str | None, quality: str, arch: str, json_file: Path | None, **changes: float | None
 ) -> None:
     """Press the organ of CASE, a folder with a bead experiment, and compare the beads with the measured ones."""
-    setup = choose_setup(model, quality, **changes)
+    given = [name for name, value in changes.items() if value is not None]
+    setup = choose_setup(model or model_with(given, "neo-hookean"), quality, **changes)
     loaded = load_case(case)
     if json_file is not None:
         make_folder(json_file.parent, "--json")

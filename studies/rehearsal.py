@@ -22,6 +22,8 @@ TURN_DEG_S = 180.0
 AWAY_MM = 200.0
 # Where the tumour sticks out, the organ has the same surface: the tumour's is drawn this far outside it.
 TUMOUR_LIFT_MM = 0.8
+# Where the organ lies on a support both have the same surface: the support is drawn this far inside its own.
+SUPPORT_SUNK_MM = 0.4
 # How far around the organ the tissue in the picture gives way to it.
 SURROUNDINGS_MM = 25.0
 
@@ -38,7 +40,8 @@ class Rehearsal:
         self.organ = _shifted(anatomy.organ, -self.origin)
         self.tumour = anatomy.tumour and _shifted(anatomy.tumour, -self.origin)
         self.gravity_direction = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
-        self.supports = [_shifted(s, -self.origin) for s in anatomy.shapes if isinstance(s, trimesh.Trimesh)]
+        meshes = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
+        self.supports = [_shrunk(_shifted(mesh, -self.origin), SUPPORT_SUNK_MM) for mesh in meshes]
         self._build_solver(anatomy)
         self._build_surfaces()
         self._build_slice(anatomy)
@@ -177,6 +180,10 @@ class Rehearsal:
 
 def _shifted(mesh: trimesh.Trimesh, by: np.ndarray) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices + by, mesh.faces, process=False)
+
+
+def _shrunk(mesh: trimesh.Trimesh, by_mm: float) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices - by_mm * mesh.vertex_normals, mesh.faces, process=False)
 
 
 def _moved(grid: Grid, origin: np.ndarray) -> np.ndarray:

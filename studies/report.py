@@ -26,6 +26,10 @@ def spread(values_ms: list[float]) -> dict[str, float]:
     return {name: round(float(value), 4) for name, value in figures.items()}
 
 
+# Keys that not every tissue model fills.
+NOT_EVERYWHERE = dict(radius_mm=None, stiffness=None, clusters=0, memberships=0)
+
+
 def counted(number: int, name: str) -> str:
     """A number of things: "1 substep", "3 substeps"."""
     return f"{number} {name}{'' if number == 1 else 's'}"
@@ -56,8 +60,7 @@ class Record:
         return dict(
             title=rehearsal.scene.title,
             arch=arch,
-            **rehearsal.scene.tissue.model_dump(),
-            **rehearsal.model.counts(),
+            **(NOT_EVERYWHERE | rehearsal.scene.tissue.model_dump() | rehearsal.model.counts()),
             tetrahedra=rehearsal.embedding.count,
             time_step_s=settings.time_step_s,
             substeps=settings.substeps,

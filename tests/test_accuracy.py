@@ -188,7 +188,7 @@ def test_validate_says_mistakes_in_one_line(tmp_path, capsys):
     assert "--model" in refused(folder, "--model", "clay")
     assert "--quality" in refused(folder, "--quality", "best")
     assert "--poisson" in refused(folder, "--poisson", 0.5)
-    assert "has no such setting" in refused(folder, "--radius", 3)
+    assert "has no such setting" in refused(folder, "--radius", 3, "--cell", 4)
     shape_matching = [folder, "--model", "shape-matching"]
     assert "has no such setting" in refused(*shape_matching, "--young-kpa", 15)
     assert "choose a smaller radius" in refused(*shape_matching, "--radius", 20, "--arch", "cpu")

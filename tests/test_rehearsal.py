@@ -31,14 +31,14 @@ def patient_in(name: str, tmp_path: Path) -> tuple[Scene, Path]:
     """A coarse scene of a patient, and the folder of its files."""
     if PATIENTS[name] is None:
         return with_options(
-            load_scene(ROOT / "scenes" / "phantom.toml"), {"tissue.radius_mm": 4.0}
+            load_scene(ROOT / "scenes" / "phantom.toml"), {"tissue.cell_mm": 6.0}
         ), phantom_folder()
     if not DATA.is_dir():
         pytest.skip("no ../shared/data here")
     ct, labels, side = PATIENTS[name]
     patient = import_patient(read_volume(DATA / "ct" / ct), read_volume(DATA / "ct" / labels), side=side)
     save_patient(patient, tmp_path / "patient")
-    return with_options(patient_scene(patient), {"tissue.radius_mm": 4.0}), tmp_path / "patient"
+    return with_options(patient_scene(patient), {"tissue.cell_mm": 6.0}), tmp_path / "patient"
 
 
 def resampled(folder: Path, plane, origin: np.ndarray, pixels: int) -> np.ndarray:
@@ -84,8 +84,8 @@ def test_pressing_moves_the_tissue_and_the_slice_follows(device, tmp_path):
     assert rehearsal.indentation_mm() == pytest.approx(12.38)
     assert (moved @ rehearsal.gravity_direction).max() > 6.0
     assert np.abs(rehearsal.image(350, 40, 60).astype(int) - before).mean() > 10
-    assert 0.7 < rehearsal.volume_ratio() < 1.0
-    assert rehearsal.contacts.measure_penetration() <= 1e-3
+    assert 0.97 < rehearsal.volume_ratio() < 1.0
+    assert rehearsal.contacts.measure_penetration() <= 0.5
     rehearsal.reset()
     rehearsal.update_surfaces()
     assert np.array_equal(rehearsal.image(350, 40, 60), before)
@@ -187,7 +187,7 @@ def test_every_feature_at_once_stays_finite_and_out_of_everything(device, tmp_pa
     sitk.WriteImage(bed, str(tmp_path / "bed.nrrd"))
     scene = Scene(
         anatomy={},
-        tissue=dict(radius_mm=3.0, surface_samples_per_mm2=0.5),
+        tissue=dict(model="shape-matching", radius_mm=3.0, surface_samples_per_mm2=0.5),
         solver=dict(relaxation="global", relaxation_factor=1.5, mass_scaling_per_mm=0.02),
         gravity=dict(direction=(0, 0, -1)),
         contact=dict(particles=True),

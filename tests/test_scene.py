@@ -101,8 +101,20 @@ def test_a_scene_written_is_the_scene_read(tmp_path):
 def test_options_out_of_range_are_refused():
     with pytest.raises(SceneError, match=r"^--poisson = 0.5: input should be"):
         with_options(load_scene(PHANTOM), {"tissue.poisson": 0.5})
-    with pytest.raises(SceneError, match=r"^--radius: belongs to the tissue model .*choose it with --model"):
-        with_options(load_scene(PHANTOM), {"tissue.radius_mm": 3.0})
+    both = {"tissue.radius_mm": 3.0, "tissue.cell_mm": 4.0}
+    with pytest.raises(SceneError, match=r"^--radius: belongs to the tissue model shape-matching"):
+        with_options(load_scene(PHANTOM), both)
+
+
+def test_a_value_that_one_model_has_asks_for_that_model():
+    scene = load_scene(PHANTOM)
+    assert with_options(scene, {"tissue.radius_mm": 3.0}).tissue.radius_mm == 3.0
+    assert with_options(scene, {"tissue.cell_mm": 3.0}).tissue.model == "neo-hookean"
+    paper = with_options(scene, {"tissue.model": "shape-matching"})
+    assert with_options(paper, {"tissue.density_g_cm3": 1.0}).tissue.model == "shape-matching"
+    assert with_options(paper, {"tissue.young_kpa": 9.0}).tissue == with_options(
+        scene, {"tissue.young_kpa": 9.0}
+    ).tissue.model_copy(update={"cell_mm": 4.0})
 
 
 def test_shape_matchings_defaults_are_the_papers_table_1():
