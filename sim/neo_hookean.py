@@ -57,6 +57,7 @@ class NeoHookean:
         if held is not None:
             self.held = ti.field(ti.i32, body.count)
             self.held.from_numpy(np.asarray(held, np.int32))
+        self.most_in_group = int(np.diff(starts).max())
         self.count = len(lattice.cells)
         self.most_mm = MOST_CELLS_A_PASS * lattice.cell_mm
         self.mu = ti.field(ti.f32, ())
@@ -138,29 +139,36 @@ class NeoHookean:
     def project(self, first, last, stiffness: float, relaxation_factor: float, dt: float):
         """Nodes of one colour, each to its balance: a Newton step on its own 3 x 3 system, over-relaxed."""
         ti.loop_config(block_dim=32)
-        for i in range(first, last):
-            inertia = self.mass[i] / (dt * dt)
-            force = inertia * (self.target[i] - self.body.estimate[i])
-            force, hessian = self.add_cells(i, force, inertia * tm.eye(3))
-            force, hessian = self.add_hourglass(i, force, hessian)
-            factor = relaxation_factor
-            if ti.static(self.has_contacts):
-                pushed, layer = self.contacts.push(i)
-                if layer[0, 0] + layer[1, 1] + layer[2, 2] > 0.0:
-                    factor = 1.0
-                force += pushed
-                hessian += layer
-            change = factor * solve(hessian, force)
-            change *= ti.min(1.0, self.most_mm / ti.max(change.norm(), 1e-12))
-            if ti.static(self.has_held):
-                change *= 1.0 - self.held[i]
-            self.body.estimate[i] += change
-            for k in range(8):
-                c = self.around[i, k]
-                # Not "+=", which is atomic: no other node of this colour has this cell.
-                self.deformation[c] = self.deformation[c] + change.outer_product(self.gradient[i, k])
-            if ti.static(self.has_contacts):
-                self.contacts.follow(i, change)
+        # A range known when the kernel compiles: on Vulkan any other starts 65536 threads.
+        for k in range(self.most_in_group):
+            if first + k < last:
+                self.relax(first + k, relaxation_factor, dt)
+
+    @ti.func
+    def relax(self, i, relaxation_factor: float, dt: float):
+        """Node i goes to its balance with all others held."""
+        inertia = self.mass[i] / (dt * dt)
+        force = inertia * (self.target[i] - self.body.estimate[i])
+        force, hessian = self.add_cells(i, force, inertia * tm.eye(3))
+        force, hessian = self.add_hourglass(i, force, hessian)
+        factor = relaxation_factor
+        if ti.static(self.has_contacts):
+            pushed, layer = self.contacts.push(i)
+            if layer[0, 0] + layer[1, 1] + layer[2, 2] > 0.0:
+                factor = 1.0
+            force += pushed
+            hessian += layer
+        change = factor * solve(hessian, force)
+        change *= ti.min(1.0, self.most_mm / ti.max(change.norm(), 1e-12))
+        if ti.static(self.has_held):
+            change *= 1.0 - self.held[i]
+        self.body.estimate[i] = self.body.estimate[i] + change
+        for k in range(8):
+            c = self.around[i, k]
+            # Not "+=", which is atomic: no other node of this colour has this cell.
+            self.deformation[c] = self.deformation[c] + change.outer_product(self.gradient[i, k])
+        if ti.static(self.has_contacts):
+            self.contacts.follow(i, change)
 
     @ti.func
     def add_cells(self, i, force, hessian):
