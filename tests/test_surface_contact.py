@@ -221,7 +221,7 @@ def test_a_restored_state_goes_on_with_the_same_bits(device, dome):
 
 def recovers(solver, wanted) -> None:
     """Left alone it rests at the same heights, wherever it stands now, with no cell inverted."""
-    rest(solver, 60, settings_of(16, DOWN), AWAY)
+    rest(solver, 40, settings_of(12, DOWN), AWAY)
     x = position(solver)
     assert np.isfinite(x).all() and jacobians(solver.model.lattice, x).min() > 0.9
     # Friction at the base keeps what the base was spread by: 0.35 of a pressure of 0.2 kPa, over 15 kPa and 24 mm.
@@ -229,9 +229,9 @@ def recovers(solver, wanted) -> None:
 
 
 def test_extremes_are_survived(device, dome):
-    solver = pressed_dome(dome)
+    solver = pressed_dome(dome, 6.0)
     lattice, built = solver.model.lattice, solver.snapshot()
-    rest(solver, 60, settings_of(16, DOWN), AWAY)
+    rest(solver, 40, settings_of(12, DOWN), AWAY)
     wanted = position(solver)
     extremes = (
         dict(time_step_s=0.1),
@@ -240,7 +240,7 @@ def test_extremes_are_survived(device, dome):
     )
     for changed in extremes:
         solver.restore(built)
-        rest(solver, 60, settings_of(**{"iterations": 8, "gravity": DOWN, **changed}), AWAY)
+        rest(solver, 40, settings_of(**{"iterations": 8, "gravity": DOWN, **changed}), AWAY)
         assert jacobians(lattice, position(solver)).min() > 0.5
         recovers(solver, wanted)
     for speed in (0.0, 5000.0):
@@ -255,12 +255,12 @@ def test_extremes_are_survived(device, dome):
 
 @pytest.mark.parametrize("poisson", [0.45, 0.0])
 def test_inverted_cells_find_back(device, dome, poisson):
-    solver = pressed_dome(dome)
+    solver = pressed_dome(dome, 6.0)
     lattice = solver.model.lattice
     solver.model.set_material(YOUNG_KPA, poisson)
-    rest(solver, 60, settings_of(16, DOWN), AWAY)
+    rest(solver, 40, settings_of(12, DOWN), AWAY)
     wanted = position(solver)
-    scrambles = [np.random.default_rng(1).uniform(-mm, mm, lattice.nodes.shape) for mm in (4.0, 8.0)]
+    scrambles = [np.random.default_rng(1).uniform(-mm, mm, lattice.nodes.shape) for mm in (6.0, 12.0)]
     states = [lattice.nodes + s for s in scrambles] + [lattice.nodes * [1, 1, -1], lattice.nodes * [1, 1, 0]]
     for state in states:
         put(solver.model, state)
@@ -269,19 +269,21 @@ def test_inverted_cells_find_back(device, dome, poisson):
         recovers(solver, wanted)
     # Mirrored from side to side it ends lying on its back.
     put(solver.model, lattice.nodes * [-1, 1, 1])
-    rest(solver, 120, settings_of(16, DOWN), AWAY)
+    rest(solver, 60, settings_of(12, DOWN), AWAY)
     assert jacobians(lattice, position(solver)).min() > 0.7
     # A tool that goes through to the plane and below.
     put(solver.model, lattice.nodes)
-    for depth, steps in ((19.0, 60), (19.0, 3)):
+    for depth, steps in ((19.0, 40), (19.0, 3)):
         press(solver, depth, settings_of(8, DOWN), steps)
         rest(solver, 10, settings_of(8, DOWN), np.array([lifted(22.0 - depth)] * 2))
-        assert np.isfinite(position(solver)).all() and np.abs(position(solver)).max() < 30
+        # The skin stays about as wide as twice the dome; it has nowhere else to go.
+        assert np.isfinite(position(solver)).all()
+        assert np.abs(solver.contacts.point.to_numpy()).max() < 24
         recovers(solver, wanted)
 
 
 def test_a_restored_body_is_whole_after_what_is_no_number(device, dome):
-    solver = pressed_dome(dome)
+    solver = pressed_dome(dome, 6.0)
     built = solver.snapshot()
     put(solver.model, np.full(built.body.position.shape, np.nan))
     rest(solver, 2, settings_of(4, DOWN), AWAY)
