@@ -177,7 +177,11 @@ def surface_points(surface: trimesh.Trimesh, spacing_mm: float) -> tuple[np.ndar
     middle = corner.mean(axis=1)
     area = trimesh.triangles.area(corner)
     bins = np.floor((middle - surface.bounds[0]) / spacing_mm).astype(int)
-    owner = np.unique(bins, axis=0, return_inverse=True)[1].ravel()
+    # Faces that look different ways have points of their own: what lies on a table is only what faces it.
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    axis = np.abs(normal).argmax(axis=1)
+    side = 2 * axis + (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] > 0)
+    owner = np.unique(np.column_stack([bins, side]), axis=0, return_inverse=True)[1].ravel()
     total = np.bincount(owner, area)
     mean = np.column_stack([np.bincount(owner, area * middle[:, axis]) for axis in range(3)]) / total[:, None]
     # A bin that the surface only grazes would make a point of little weight, which sinks in deep.

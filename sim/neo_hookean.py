@@ -134,6 +134,8 @@ class NeoHookean:
                 i = self.cell[c][k]
                 deformation += self.body.estimate[i].outer_product(self.gradient[i, k])
             self.deformation[c] = deformation
+        # Every node at the skin adds nothing to it, but nothing times infinity stays.
+        self.deformation[self.count] = tm.eye(3)
 
     @ti.func
     def project(self, first, last, stiffness: float, relaxation_factor: float, dt: float):
