@@ -26,6 +26,11 @@ EXTRAPOLATED_CELLS = 1.0
 MOST_CELLS = 400_000
 # Points of the surface that stand for less than this share of the mean area give it to their neighbours.
 LEAST_AREA = 0.4
+# Neighbours that look another way are farther than any that look the same.
+APART_MM = 1e6
+VOLUME_PASSES = 4
+# What the cells hold may differ from the organ's volume by this share.
+MOST_VOLUME_OFF = 0.1
 
 
 @dataclass(frozen=True)
@@ -82,7 +87,10 @@ def shape_gradients(at: np.ndarray) -> np.ndarray:
 
 
 def fill_with_cells(surface: trimesh.Trimesh, cell_mm: float) -> Lattice:
-    """The lattice of a closed surface [mm]. Raises SamplingError when the cells are too many for a step to end."""
+    """The lattice of a closed surface [mm].
+
+    Raises SamplingError when the cells are too many for a step to end, or too large for the surface's shape.
+    """
     low = surface.bounds[0] - cell_mm / 2
     size = np.ceil((surface.bounds[1] - low) / cell_mm).astype(int)
     if size.prod() > 50 * MOST_CELLS or surface.volume / cell_mm**3 > MOST_CELLS:
@@ -94,6 +102,12 @@ def fill_with_cells(surface: trimesh.Trimesh, cell_mm: float) -> Lattice:
     samples = (np.arange(SAMPLES) + 0.5) / SAMPLES
     samples = np.stack(np.meshgrid(samples, samples, samples, indexing="ij"), axis=-1).reshape(-1, 3)
     places, filled = _filled(surface, low, cell_mm, places, samples)
+    share = cell_mm**3 * filled.mean(axis=1).sum() / surface.volume if len(places) else 0.0
+    if abs(share - 1) > MOST_VOLUME_OFF:
+        raise SamplingError(
+            f"cells of {cell_mm:g} mm hold {100 * share:.0f} % of the organ's {surface.volume / 1000:.3g} ml: "
+            "choose smaller ones"
+        )
     return _assemble(low, cell_mm, size, places, filled, samples)
 
 
@@ -111,7 +125,11 @@ def _filled(
     unique, back = np.unique(grid.reshape(-1, 3), axis=0, return_inverse=True)
     known = signed_distance(surface.vertices, surface.faces, low + cell_mm / 2 * unique)[0]
     distance = known[back.ravel()].reshape(-1, 27) @ _from_halves(samples).T
-    filled[cut] = np.clip(0.5 - distance / (cell_mm / SAMPLES), 0, 1)
+    # Straight interpolation cuts convex surfaces short: they are moved out until the volume is right.
+    out = 0.0
+    for _ in range(VOLUME_PASSES):
+        filled[cut] = np.clip(0.5 - (distance - out) / (cell_mm / SAMPLES), 0, 1)
+        out += (surface.volume - cell_mm**3 * filled.mean(axis=1).sum()) / surface.area
     some = filled.sum(axis=1) > 0
     return places[some], filled[some]
 
@@ -181,12 +199,14 @@ def surface_points(surface: trimesh.Trimesh, spacing_mm: float) -> tuple[np.ndar
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     axis = np.abs(normal).argmax(axis=1)
     side = 2 * axis + (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] > 0)
-    owner = np.unique(np.column_stack([bins, side]), axis=0, return_inverse=True)[1].ravel()
+    keys, owner = np.unique(np.column_stack([bins, side]), axis=0, return_inverse=True)
+    owner = owner.ravel()
     total = np.bincount(owner, area)
     mean = np.column_stack([np.bincount(owner, area * middle[:, axis]) for axis in range(3)]) / total[:, None]
     # A bin that the surface only grazes would make a point of little weight, which sinks in deep.
     whole = total >= LEAST_AREA * total.mean()
-    nearest = cKDTree(mean[whole]).query(mean)[1]
+    apart = np.column_stack([mean, keys[:, 3] * APART_MM])
+    nearest = cKDTree(apart[whole]).query(apart)[1]
     on_surface = igl.point_mesh_squared_distance(
         mean[whole], surface.vertices, np.asarray(surface.faces, np.int64)
     )[2]

@@ -15,6 +15,10 @@ from sim.surface_contact import SurfaceContacts
 
 # Sums are made of blocks of so many terms, in an order that no thread changes.
 BLOCK = 64
+# Share of the moments of inertia and contact that is added, so that the system is never singular.
+LEAST_HOLD = 1e-5
+# No body turns by more in a substep [rad].
+MOST_TURN = 0.5
 
 
 @ti.data_oriented
@@ -95,7 +99,10 @@ class RigidMotion:
             about += self.about[block]
         compliance = along.inverse()
         schur = about - mixed.transpose() @ compliance @ mixed
+        # A body drawn out to a line, or less, has no hold about it.
+        schur += (LEAST_HOLD * about.trace() + 1e-12) * tm.eye(3)
         turn = schur.inverse() @ (torque - mixed.transpose() @ compliance @ force)
+        turn *= ti.min(1.0, MOST_TURN / ti.max(turn.norm(), 1e-12))
         self.translation[None] = compliance @ (force - mixed @ turn)
         self.rotation[None] = rotation_by(turn)
 

@@ -17,6 +17,8 @@ from sim.shapes import FAR
 LAYER_MM = 0.05
 # Along a surface the layer is softer than into it by this factor.
 STICK = 0.5
+# A stick bent to this share of what friction bears holds; beyond, it slides.
+HOLDS = 0.999
 # A plane is kept until the point has moved this far; a shape of 4 mm radius leaves it by 0.003 mm there.
 FRESH_MM = 0.15
 # Points as far as this from a shape may touch it within the step.
@@ -61,7 +63,7 @@ class SurfaceContacts:
         self.found = ti.Vector.field(4, ti.f32, (len(shapes), self.count))
         if self.rough:
             self.stick = ti.Vector.field(3, ti.f32, (len(shapes), self.count))
-        self.remembered = ("plane", "found", "stick") if self.rough else ("plane", "found")
+        self.remembered = ("point", "near", "plane", "found") + ("stick",) * self.rough
         self.stiffness = ti.field(ti.f32, ())
         self.penetration = ti.field(ti.f32, ())
         self.forget()
@@ -180,7 +182,9 @@ class SurfaceContacts:
                     along = 0.0
                     if ti.static(self.rough):
                         force -= layer * STICK * self.stick[s, q]
-                        along = STICK
+                        # What slides is not held.
+                        if self.stick[s, q].norm() < HOLDS * self.friction * depth / STICK:
+                            along = STICK
                     stiffness += layer * ((1.0 - along) * normal.outer_product(normal) + along * tm.eye(3))
         return force, stiffness
 
