@@ -1,7 +1,7 @@
 """How the whole organ moves as if it were rigid, found at once: node by node that takes hundreds of passes.
 
-A coarse correction with six unknowns: the Newton step of the time step's energy over rotations and translations of all
-nodes, under inertia, gravity and the contacts as the last substep left them. Elastic energy does not see it.
+A coarse correction with six unknowns: Newton's steps on the time step's energy over rotations and translations of all
+nodes, under inertia, gravity and the contacts that the last substep knew. Elastic energy does not see it.
 """
 
 from typing import Any
@@ -15,6 +15,7 @@ from sim.surface_contact import SurfaceContacts
 
 # Sums are made of blocks of so many terms, in an order that no thread changes.
 BLOCK = 64
+NEWTON_STEPS = 3
 # Share of the moments of inertia and contact that is added, so that the system is never singular.
 LEAST_HOLD = 1e-5
 # No body turns by more in a substep [rad].
@@ -50,36 +51,49 @@ class RigidMotion:
 
     @ti.func
     def move(self, dt: float):
-        """One Newton step, and all estimates moved by it."""
-        for block in range(self.blocks):
-            self.sum_block(block, dt)
+        """The motion that goes on, then Newton steps, in which contacts close, open, stick and slide; all estimates moved."""
         for _ in range(1):
-            self.solve()
+            self.rotation[None] = tm.eye(3)
+            self.translation[None] = tm.vec3(0.0)
+        for step in ti.static(range(1 + NEWTON_STEPS)):
+            for block in range(self.blocks):
+                self.sum_block(block, dt, step > 0)
+            for _ in range(1):
+                self.solve()
         for i in range(self.body.count):
-            c = self.body.position[self.centre]
-            self.body.estimate[i] = (
-                c + self.translation[None] + self.rotation[None] @ (self.body.position[i] - c)
-            )
+            self.body.estimate[i] = self.moved(self.body.position[i])
 
     @ti.func
-    def sum_block(self, block, dt: float):
-        """Force, torque and their derivatives of a block's terms, nodes first, then points of contact."""
+    def moved(self, x):
+        """Where the motion found so far takes a point."""
+        centre = self.body.position[self.centre]
+        return centre + self.translation[None] + self.rotation[None] @ (x - centre)
+
+    @ti.func
+    def sum_block(self, block, dt: float, newton: ti.template()):
+        """Force, torque and their derivatives of a block's terms, nodes first, then points of contact.
+
+        Without ``newton`` they draw the nodes to where their velocities would take them, whatever is in the way.
+        """
         force, torque = tm.vec3(0.0), tm.vec3(0.0)
         along, mixed, about = tm.mat3(0.0), tm.mat3(0.0), tm.mat3(0.0)
-        centre = self.body.position[self.centre]
+        centre = self.body.position[self.centre] + self.translation[None]
         for term in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.terms)):
-            f, k, arm = tm.vec3(0.0), tm.mat3(0.0), tm.vec3(0.0)
+            f, k, x = tm.vec3(0.0), tm.mat3(0.0), centre
             if term < self.body.count:
                 inertia = self.mass[term] / (dt * dt)
-                f = inertia * (self.target[term] - self.body.position[term])
+                x = self.moved(self.body.position[term])
+                f = inertia * dt * self.body.velocity[term]
+                if ti.static(newton):
+                    f = inertia * (self.target[term] - x)
                 k = inertia * tm.eye(3)
-                arm = self.body.position[term] - centre
-            elif ti.static(self.has_contacts):
-                f, k = self.contacts.hold(term - self.body.count)
-                arm = self.contacts.point[term - self.body.count] - centre
-            turn = cross_matrix(arm)
+            elif ti.static(self.has_contacts and newton):
+                q = term - self.body.count
+                x = self.moved(self.contacts.point[q])
+                f, k = self.contacts.hold(q, x)
+            turn = cross_matrix(x - centre)
             force += f
-            torque += arm.cross(f)
+            torque += turn @ f
             along += k
             mixed -= k @ turn
             about -= turn @ k @ turn
@@ -103,8 +117,8 @@ class RigidMotion:
         schur += (LEAST_HOLD * about.trace() + 1e-12) * tm.eye(3)
         turn = schur.inverse() @ (torque - mixed.transpose() @ compliance @ force)
         turn *= ti.min(1.0, MOST_TURN / ti.max(turn.norm(), 1e-12))
-        self.translation[None] = compliance @ (force - mixed @ turn)
-        self.rotation[None] = rotation_by(turn)
+        self.translation[None] += compliance @ (force - mixed @ turn)
+        self.rotation[None] = rotation_by(turn) @ self.rotation[None]
 
 
 @ti.func

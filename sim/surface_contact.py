@@ -17,8 +17,6 @@ from sim.shapes import FAR
 LAYER_MM = 0.05
 # Along a surface the layer is softer than into it by this factor.
 STICK = 0.5
-# A stick bent to this share of what friction bears holds; beyond, it slides.
-HOLDS = 0.999
 # A plane is kept until the point has moved this far; a shape of 4 mm radius leaves it by 0.003 mm there.
 FRESH_MM = 0.15
 # Points as far as this from a shape may touch it within the step.
@@ -169,23 +167,29 @@ class SurfaceContacts:
         return force, stiffness
 
     @ti.func
-    def hold(self, q):
-        """Force [uN] of the shapes on point q as the last substep left it, and its negative derivative (3, 3)."""
+    def hold(self, q, p):
+        """Force [uN] on point q if it were at p, on the planes that the last substep knew, and its stiffness.
+
+        What slides resists by its friction over its way, which is more than the derivative: then Newton's steps converge.
+        """
         force, stiffness = tm.vec3(0.0), tm.mat3(0.0)
         if self.near[q] > 0:
             layer = 1e3 * self.stiffness[None] * self.area[q]
             for s in ti.static(range(len(self.shapes))):
-                depth = self.touching(s, q)
-                if depth > 0.0:
-                    normal = self.plane[s, q].xyz
+                plane = self.plane[s, q]
+                normal = plane.xyz
+                shift = p - self.shapes[s].motion(p)
+                depth = plane.w - normal.dot(shift)
+                if (self.near[q] >> s) & 1 and depth > 0.0:
                     force += layer * depth * normal
-                    along = 0.0
+                    stiffness += layer * normal.outer_product(normal)
                     if ti.static(self.rough):
-                        force -= layer * STICK * self.stick[s, q]
-                        # What slides is not held.
-                        if self.stick[s, q].norm() < HOLDS * self.friction * depth / STICK:
-                            along = STICK
-                    stiffness += layer * ((1.0 - along) * normal.outer_product(normal) + along * tm.eye(3))
+                        stick = self.stick[s, q] + shift - self.point[q]
+                        stick -= stick.dot(normal) * normal
+                        length = ti.max(stick.norm(), 1e-12)
+                        share = ti.min(self.friction * depth / STICK / length, 1.0)
+                        force -= layer * STICK * share * stick
+                        stiffness += layer * STICK * share * (tm.eye(3) - normal.outer_product(normal))
         return force, stiffness
 
     @ti.func

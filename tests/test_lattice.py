@@ -53,18 +53,19 @@ def test_tissue_has_the_surfaces_volume_and_centre(mesh, cell_mm):
     lattice = fill_with_cells(mesh, cell_mm)
     bound = most_missing(mesh, cell_mm)
     assert bound < 0.03 * mesh.volume
-    assert abs(lattice.tissue.sum() - mesh.volume) < bound
+    # The surface is moved out until the volume is right; edges take a few passes more.
+    assert abs(lattice.tissue.sum() - mesh.volume) < 0.05 * bound
     centre = lattice.tissue @ lattice.nodes / lattice.tissue.sum()
     # What is missing lies on both sides; all of it on one, half the size away, would move the centre so far.
     reach = mesh.extents.max() / 2
     assert np.abs(centre - mesh.center_mass).max() < bound / mesh.volume * reach / 4
 
 
-def test_the_missing_tissue_falls_with_the_square_of_the_cell(ball):
-    missing = [ball.volume - fill_with_cells(ball, cell_mm).tissue.sum() for cell_mm in (4.0, 2.0)]
-    # Of h^2 / 8 the interpolation error's mean is 2 / 3; the samples leave some of it to chance.
-    assert missing[0] == pytest.approx(2 / 3 * most_missing(ball, 4.0), rel=0.1)
-    assert missing[0] / missing[1] == pytest.approx(4.0, rel=0.1)
+def test_cells_too_large_for_the_organ_are_refused(ball):
+    with pytest.raises(SamplingError, match="choose smaller ones"):
+        fill_with_cells(trimesh.creation.box([30.0, 30.0, 0.5]), 5.0)
+    with pytest.raises(SamplingError, match="hold 0 % of"):
+        fill_with_cells(trimesh.creation.icosphere(subdivisions=2, radius=0.5), 20.0)
 
 
 def test_empty_space_in_cut_cells_resists_a_little(mesh):
