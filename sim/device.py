@@ -29,3 +29,8 @@ def start(arch: str = "cpu", **options) -> str:
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(arch=backends[arch], log_level=ti.ERROR, **options)
     return arch
+
+
+def on_cpu() -> bool:
+    """Whether Taichi was started on the CPU."""
+    return ti.cfg.arch in (ti.x64, ti.arm64)

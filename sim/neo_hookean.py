@@ -14,6 +14,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import Body
+from sim.device import on_cpu
 from sim.lattice import Lattice
 from sim.rigid_motion import RigidMotion
 from sim.solver import StepSettings
@@ -24,6 +25,8 @@ from sim.surface_contact import LAYER_MM, SurfaceContacts
 HOURGLASS = 1.2
 # Below this volume ratio the energy goes on as its tangent, so that inverted cells find back.
 LEAST_J = 0.2
+# With fewer nodes, starting threads for eight colours costs a CPU more than they save.
+PARALLEL_NODES = 8000
 # No node moves farther in a pass than this share of a cell.
 MOST_CELLS_A_PASS = 0.5
 LATTICE_SETTINGS = StepSettings(substeps=1, iterations=8, relaxation_factor=1.7, stabilisation_iterations=0)
@@ -33,7 +36,7 @@ LATTICE_SETTINGS = StepSettings(substeps=1, iterations=8, relaxation_factor=1.7,
 class NeoHookean:
     """W = mu/2 (tr C - 3) - mu ln J + lambda/2 (ln J)^2 on a lattice's cells (Bonet & Wood 2008, Eq. 6.27).
 
-    Nodes are projected colour by colour (``groups``); those ``held`` (n,) stay where they are. ``deformation`` (m + 1,) holds F of every cell and follows its
+    Nodes are projected colour by colour, on one core where ``serial`` (the choice is left to their number); those ``held`` (n,) stay where they are. ``deformation`` (m + 1,) holds F of every cell and follows its
     nodes; the last row stands for cells that are not there.
     """
 
@@ -46,13 +49,16 @@ class NeoHookean:
         poisson: float = 0.45,
         density_g_cm3: float = 1.05,
         held: np.ndarray | None = None,
+        serial: bool | None = None,
     ) -> None:
         starts = [int(v) for v in lattice.colour_start]
         self.body = body
         self.lattice = lattice
         self.contacts: Any = contacts
         self.has_contacts = contacts is not None
-        self.groups = tuple(pairwise(starts))
+        self.colours = tuple(pairwise(starts))
+        self.serial = on_cpu() and body.count < PARALLEL_NODES if serial is None else serial
+        self.groups = ((0, body.count),) if self.serial else self.colours
         self.has_held = held is not None
         if held is not None:
             self.held = ti.field(ti.i32, body.count)
@@ -139,12 +145,19 @@ class NeoHookean:
 
     @ti.func
     def project(self, first, last, stiffness: float, relaxation_factor: float, dt: float):
-        """Nodes of one colour, each to its balance: a Newton step on its own 3 x 3 system, over-relaxed."""
-        ti.loop_config(block_dim=32)
-        # A range known when the kernel compiles: on Vulkan any other starts 65536 threads.
-        for k in range(self.most_in_group):
-            if first + k < last:
-                self.relax(first + k, relaxation_factor, dt)
+        """Nodes one after another or a colour at once, which is the same, to their balance: each by a Newton step on its
+        own 3 x 3 system, over-relaxed.
+        """
+        if ti.static(self.serial):
+            ti.loop_config(serialize=True)
+            for i in range(first, last):
+                self.relax(i, relaxation_factor, dt)
+        else:
+            ti.loop_config(block_dim=32)
+            # A range known when the kernel compiles: on Vulkan any other starts 65536 threads.
+            for k in range(self.most_in_group):
+                if first + k < last:
+                    self.relax(first + k, relaxation_factor, dt)
 
     @ti.func
     def relax(self, i, relaxation_factor: float, dt: float):
