@@ -23,7 +23,7 @@ from sim.surface_contact import LAYER_MM, SurfaceContacts
 # Stiffness, in units of the shear modulus, of deformation that varies inside a cell: between 1, exact for torsion,
 # and (1 + nu), exact for bending.
 HOURGLASS = 1.2
-# Below this volume ratio the energy goes on as its tangent, so that inverted cells find back.
+# Below this volume ratio ln J goes on as its tangent, so that inverted cells find back.
 LEAST_J = 0.2
 # With fewer nodes, starting threads for eight colours costs a CPU more than they save.
 PARALLEL_NODES = 8000
@@ -36,8 +36,9 @@ LATTICE_SETTINGS = StepSettings(substeps=1, iterations=8, relaxation_factor=1.7,
 class NeoHookean:
     """W = mu/2 (tr C - 3) - mu ln J + lambda/2 (ln J)^2 on a lattice's cells (Bonet & Wood 2008, Eq. 6.27).
 
-    Nodes are projected colour by colour, on one core where ``serial`` (the choice is left to their number); those ``held`` (n,) stay where they are. ``deformation`` (m + 1,) holds F of every cell and follows its
-    nodes; the last row stands for cells that are not there.
+    Nodes are projected colour by colour, on one core where ``serial`` (left open, their number decides); those ``held``
+    (n,) stay where they are. ``deformation`` (m + 1,) holds F of every cell and follows its nodes; the last row stands
+    for cells that are not there.
     """
 
     def __init__(

@@ -12,7 +12,7 @@ from sim.body import Body
 class TissueModel(Protocol):
     """Rest data, a projection of its constraints on the body's estimates, and a way to carry points along.
 
-    ``groups`` are (first, last) rows of unknowns that are projected one after another, each group at once.
+    One file a model. ``groups`` are (first, last) rows of unknowns that are projected one after another, each group at once.
     ``begin`` and ``project`` are ti.funcs that the solver's kernels inline, so their outermost loops are parallel.
     """
 
