@@ -99,10 +99,23 @@ def fill_with_cells(surface: trimesh.Trimesh, cell_mm: float) -> Lattice:
             "choose larger ones"
         )
     places = np.indices(size).reshape(3, -1).T
-    samples = (np.arange(SAMPLES) + 0.5) / SAMPLES
-    samples = np.stack(np.meshgrid(samples, samples, samples, indexing="ij"), axis=-1).reshape(-1, 3)
+    samples = _samples()
     places, filled = _filled(surface, low, cell_mm, places, samples)
     return _assemble(low, cell_mm, size, places, filled, samples)
+
+
+def fill_block(counts: tuple[int, int, int], cell_mm: float) -> Lattice:
+    """The lattice of a block from the origin on, so many whole cells along each axis."""
+    places = np.indices(counts).reshape(3, -1).T
+    samples = _samples()
+    filled = np.ones((len(places), len(samples)))
+    return _assemble(np.zeros(3), cell_mm, np.array(counts), places, filled, samples)
+
+
+def _samples() -> np.ndarray:
+    """Places (s, 3) in a unit cell at which it is integrated."""
+    at = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    return np.stack(np.meshgrid(at, at, at, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _filled(

@@ -38,6 +38,8 @@ class NeoHookean:
 
     Nodes are projected colour by colour, on one core where ``serial`` (left open, their number decides); those ``held``
     (n,) stay where they are. ``deformation`` (m + 1,) holds F of every cell and follows its nodes; the last row stands
+    Nodes are projected colour by colour (``groups``); those ``held`` (n,) stay where they are, and ``load_g`` (n,) [g]
+    is what hangs at them. ``deformation`` (m + 1,) holds F of every cell and follows its nodes; the last row stands
     for cells that are not there.
     """
 
@@ -51,6 +53,7 @@ class NeoHookean:
         density_g_cm3: float = 1.05,
         held: np.ndarray | None = None,
         serial: bool | None = None,
+        load_g: np.ndarray | float = 0.0,
     ) -> None:
         starts = [int(v) for v in lattice.colour_start]
         self.body = body
@@ -69,16 +72,16 @@ class NeoHookean:
         self.most_mm = MOST_CELLS_A_PASS * lattice.cell_mm
         self.mu = ti.field(ti.f32, ())
         self.lame = ti.field(ti.f32, ())
-        self._store_nodes(1e-3 * density_g_cm3)
+        self._store_nodes(1e-3 * density_g_cm3 * lattice.tissue + load_g)
         self._store_cells()
         self._store_hourglass()
         self.rigid: Any = None if self.has_held else RigidMotion(body, self.mass, self.target, contacts)
         self.set_material(young_kpa, poisson)
 
-    def _store_nodes(self, density_g_mm3: float) -> None:
+    def _store_nodes(self, mass_g: np.ndarray) -> None:
         self.target = ti.Vector.field(3, ti.f32, self.body.count)
         self.mass = ti.field(ti.f32, self.body.count)
-        self.mass.from_numpy((density_g_mm3 * self.lattice.tissue).astype(np.float32))
+        self.mass.from_numpy(mass_g.astype(np.float32))
 
     def _store_cells(self) -> None:
         cells, nodes = self.lattice.cells, self.body.count

@@ -1,0 +1,142 @@
+"""A clamped beam on the lattice of the tissue model: what it comes to rest at, and how it swings."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from sim.body import Body
+from sim.lattice import fill_with_cells
+from sim.neo_hookean import NeoHookean
+from sim.serial import SerialSolver
+from sim.solver import StepSettings
+
+GRAVITY_MM_S2 = 9810.0
+# A pressure wave goes through so many cells in a time step; with more, passes in the tens leave it unbalanced and
+# energy is made of nothing.
+CELLS_A_STEP = 1.0
+PASSES = 20
+# At rest: passes of one step without inertia, doubled until the tip moves less than this from one to the next.
+REST_PASSES = 4000
+REST_RELAXATION = 1.9
+REST_TOLERANCE_MM = 0.005
+MOST_REST_PASSES = 256_000
+# Where Poisson's ratio is higher, the rest position at this one is where the search starts.
+EASY_POISSON = 0.49
+
+
+@dataclass(frozen=True)
+class Material:
+    """Young's modulus [kPa], Poisson's ratio, density [g/cm^3]."""
+
+    young_kpa: float
+    poisson: float
+    density_g_cm3: float
+
+    def pressure_wave_mm_s(self) -> float:
+        """Speed of a pressure wave: the root of (lambda + 2 mu) over the density."""
+        e, nu = 1e3 * self.young_kpa, self.poisson
+        return float(np.sqrt(e * (1 - nu) / ((1 + nu) * (1 - 2 * nu)) / (1e-3 * self.density_g_cm3)))
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Marker displacements (n, 3) [mm] at rest, how far the tip still moved in the last half of the passes [mm]."""
+
+    displacement_mm: np.ndarray
+    left_mm: float
+    passes: int
+
+
+class Cantilever:
+    """A beam of size_mm (height, width, length), clamped at length 0; gravity is against the first axis.
+
+    load_g hangs along the upper edge of the free end. Markers (n, 3) [mm] outside the beam stand on its nearest
+    point and turn with its end.
+    """
+
+    def __init__(
+        self,
+        size_mm: np.ndarray,
+        material: Material,
+        cell_mm: float,
+        load_g: float = 0.0,
+        markers: np.ndarray | None = None,
+    ) -> None:
+        self.material = material
+        size = np.asarray(size_mm, float)
+        markers = size * [0.5, 0.5, 1.0] if markers is None else np.asarray(markers, float)
+        self.markers = np.atleast_2d(markers)
+        lattice = fill_with_cells(trimesh.creation.box(bounds=[np.zeros(3), size]), cell_mm, np.zeros(3))
+        self.cell_mm = cell_mm
+        self.feet = np.clip(self.markers, 0.0, size)
+        self.frame, self.weight = lattice.interpolation(self.feet)
+        self.end = lattice.nodes[:, 2] > size[2] - 1.01 * cell_mm
+        edge = np.column_stack([np.full(31, size[0]), np.linspace(0, size[1], 31), np.full(31, size[2])])
+        node, share = lattice.interpolation(edge)
+        load = np.bincount(node.ravel(), load_g / len(edge) * share.ravel(), len(lattice.nodes))
+        held = lattice.nodes[:, 2] < 1e-6 * size[2]
+        self.body = Body(lattice.nodes)
+        self.model = NeoHookean(
+            self.body, lattice, None, material.young_kpa, material.poisson, material.density_g_cm3, held, load
+        )
+        self.solver = SerialSolver(self.model)
+
+    def displacement(self) -> np.ndarray:
+        """Of the markers (n, 3) [mm], now."""
+        moved = self.body.position.to_numpy().astype(float) - self.body.rest_points
+        feet = np.einsum("nk,nkd->nd", self.weight, moved[self.frame])
+        rest = self.body.rest_points[self.end]
+        now = rest + moved[self.end]
+        turn = Rotation.align_vectors(now - now.mean(axis=0), rest - rest.mean(axis=0))[0]
+        arm = self.markers - self.feet
+        return feet + turn.apply(arm) - arm
+
+    def settings(self, **changes: float) -> StepSettings:
+        """Gravity, no damping, and what else is given."""
+        values = dict(stabilisation_iterations=0, damping=0.0, gravity=(-GRAVITY_MM_S2, 0.0, 0.0)) | changes
+        return StepSettings(**values)
+
+    def rest(self) -> Rest:
+        """Where it comes to rest."""
+        if self.material.poisson > EASY_POISSON:
+            self.model.set_material(self.material.young_kpa, EASY_POISSON)
+            self._settle()
+            self.model.set_material(self.material.young_kpa, self.material.poisson)
+        return self._settle()
+
+    def _settle(self) -> Rest:
+        """Steps too long for inertia to matter, over-relaxed, each of twice the passes of the one before."""
+        passes, total, left = REST_PASSES, 0, np.inf
+        before = self.displacement()
+        while left > REST_TOLERANCE_MM and total < MOST_REST_PASSES:
+            step = self.settings(
+                time_step_s=1.0, substeps=1, iterations=passes, relaxation_factor=REST_RELAXATION
+            )
+            self.solver.step(step)
+            now = self.displacement()
+            left = float(np.abs(now - before).max())
+            before, total, passes = now, total + passes, total + passes
+        return Rest(before, left, total)
+
+    def substeps(self, frame_s: float) -> int:
+        """Time steps in a frame, so that a pressure wave passes CELLS_A_STEP cells in one."""
+        return int(np.ceil(frame_s * self.material.pressure_wave_mm_s() / (CELLS_A_STEP * self.cell_mm)))
+
+    def swing(
+        self, frames: int, frame_s: float, substeps: int | None = None, passes: int = PASSES
+    ) -> np.ndarray:
+        """Marker displacements (frames + 1, n, 3) [mm] after a release from straight, the first at the release."""
+        self.body.restore(self.body.rest_state())
+        step = self.settings(
+            time_step_s=frame_s,
+            substeps=substeps or self.substeps(frame_s),
+            iterations=passes,
+            relaxation_factor=1.0,
+        )
+        traces = [self.displacement()]
+        for _ in range(frames):
+            self.solver.step(step)
+            traces.append(self.displacement())
+        return np.array(traces)
