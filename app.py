@@ -18,6 +18,7 @@ from scenes.patient import describe, import_patient, save_patient
 from scenes.reading import PatientError, read_volume
 from scenes.scene import OPTIONS, TISSUES, NeoHookeanTissue, SceneError, load_scene, scene_text, with_options
 from sim.sampling import SamplingError
+from studies.beam import beam
 from studies.case import CaseError
 from studies.commands import Fault, arch_option, calibrate, make_folder, start_taichi, validate
 from studies.setup import SetupError
@@ -131,6 +132,7 @@ def import_command(
 
 cli.add_command(validate)
 cli.add_command(calibrate)
+cli.add_command(beam)
 
 
 def label_values(text: str | None, option: str) -> list[int] | None:

@@ -78,7 +78,9 @@ def read_capture(path: Path) -> Capture:
         raise BeamError(f"{path}: its name says neither 'gravity' nor 'load' and grams, such as load52")
     table = _table(path)
     if len(table) < HELD_FRAMES + REST_FRAMES:
-        raise BeamError(f"{path}: {len(table)} frames are too few; expected {HELD_FRAMES + REST_FRAMES} at least")
+        raise BeamError(
+            f"{path}: {len(table)} frames are too few; expected {HELD_FRAMES + REST_FRAMES} at least"
+        )
     if not np.isfinite(table).all():
         row = int(np.argwhere(~np.isfinite(table))[0][0])
         raise BeamError(f"{path}: row {row + 2} has a value that is missing or no number")
@@ -98,8 +100,12 @@ def _table(path: Path) -> np.ndarray:
             reader = csv.DictReader(file)
             missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
             if missing:
-                raise BeamError(f"{path}: column {missing[0]} is missing, {len(missing)} of {len(COLUMNS)} in all")
-            return np.array([[_number(row[name]) for name in COLUMNS] for row in reader]).reshape(-1, len(COLUMNS))
+                raise BeamError(
+                    f"{path}: column {missing[0]} is missing, {len(missing)} of {len(COLUMNS)} in all"
+                )
+            return np.array([[_number(row[name]) for name in COLUMNS] for row in reader]).reshape(
+                -1, len(COLUMNS)
+            )
     except (OSError, UnicodeDecodeError) as error:
         raise BeamError(f"{path}: cannot be read ({error})") from None
 
@@ -123,7 +129,9 @@ def oscillation(time_s: np.ndarray, height_mm: np.ndarray) -> Oscillation:
         start = time_s[0] + period * (0.25 + window)
         inside = (time_s >= start) & (time_s <= start + WINDOW_PERIODS * period)
         if time_s[-1] < start + (WINDOW_PERIODS - 0.25) * period:
-            raise BeamError(f"the signal has fewer than {WINDOWS + WINDOW_PERIODS:g} periods of {period:.3g} s")
+            raise BeamError(
+                f"the signal has fewer than {WINDOWS + WINDOW_PERIODS:g} periods of {period:.3g} s"
+            )
         fits.append(_fit(time_s[inside] - start, height_mm[inside], period))
     hz = [fit[0] for fit in fits]
     ratio = np.mean([fit[1] / np.hypot(fit[1], 2 * np.pi * fit[0]) for fit in fits])

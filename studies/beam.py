@@ -1,0 +1,314 @@
+"""The command ``beam``: a clamped silicone beam, recorded by motion capture, against the tissue model."""
+
+import json
+from dataclasses import asdict, dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+import numpy as np
+import trimesh
+from scipy.optimize import brentq
+from tqdm import tqdm
+
+from studies.capture import BeamError, Capture, Oscillation, load_captures, oscillation
+
+if TYPE_CHECKING:
+    from studies.cantilever import Cantilever, Material
+
+BEAM = "beam.stl"
+# Tip markers in the frame of beam.stl [mm]: height, width, length. Balls that stand 6 mm off the surface at the free
+# end: on top, on one side, on the other (where the recordings' authors place them in their own simulation).
+MARKERS_MM = np.array([[36.0, 15.0, 100.0], [24.0, 36.0, 100.0], [6.0, -6.0, 100.0]])
+FRAME_S = 0.01
+# Swings that are computed, in periods that beam theory expects.
+PERIODS = 5.0
+GRAVITY_M_S2 = 9.81
+
+
+@dataclass(frozen=True)
+class Row:
+    """Measured and computed for one load: length of the tip's final displacement [mm], first frequency [Hz].
+
+    Errors of what is measured cover its repeats; ``rest_left_mm`` is what the computed rest still moved when its
+    passes were doubled.
+    """
+
+    load_g: float
+    recordings: int
+    measured_mm: float
+    measured_error_mm: float
+    computed_mm: float
+    theory_mm: float
+    measured_hz: float
+    measured_error_hz: float
+    computed_hz: float
+    theory_hz: float
+    measured_damping_ratio: float
+    computed_damping_ratio: float
+    rest_left_mm: float
+
+
+def theory(size_mm: np.ndarray, material: "Material", load_g: float) -> tuple[float, float]:
+    """Sag [mm] of a Timoshenko cantilever, frequency [Hz] of an Euler-Bernoulli one with a mass at its tip.
+
+    Small deflections, a root that is free to change its width, and for the frequency no shear and no turning mass.
+    """
+    height, width, length = 1e-3 * np.asarray(size_mm, float)
+    young = 1e3 * material.young_kpa
+    area, bending = height * width, young * width * height**3 / 12
+    shear = 5 / 6 * area * young / (2 * (1 + material.poisson))
+    mass = 1e3 * material.density_g_cm3 * area
+    load = 1e-3 * load_g
+    sag = mass * (length**4 / (8 * bending) + length**2 / (2 * shear))
+    sag += load * (length**3 / (3 * bending) + length / shear)
+    ratio = load / (mass * length)
+
+    def condition(b: float) -> float:
+        swing = np.cos(b) * np.sinh(b) - np.sin(b) * np.cosh(b)
+        return float(1 + np.cos(b) * np.cosh(b) + ratio * b * swing)
+
+    root = brentq(condition, 1e-3, 1.9)
+    return 1e3 * GRAVITY_M_S2 * sag, root**2 / (2 * np.pi) * np.sqrt(bending / (mass * length**4))
+
+
+def compare(captures: list[Capture], beam: "Cantilever", size_mm: np.ndarray) -> tuple[Row, np.ndarray]:
+    """One load's row, and the computed height (frames,) [mm] of the markers after the release."""
+    load_g = captures[0].load_g
+    sag, theory_hz = theory(size_mm, beam.material, load_g)
+    rest = beam.rest()
+    height = beam.swing(int(np.ceil(PERIODS / theory_hz / FRAME_S)), FRAME_S)[:, :, 0].mean(axis=1)
+    computed = oscillation(FRAME_S * np.arange(len(height)), height)
+    finals = [mean_length(capture.final_mm()) for capture in captures]
+    swings = [measured_oscillation(capture) for capture in captures]
+    hz = [swing.hz for swing in swings]
+    row = Row(
+        load_g=load_g,
+        recordings=len(captures),
+        measured_mm=float(np.mean(finals)),
+        measured_error_mm=float(np.ptp(finals) / 2),
+        computed_mm=mean_length(rest.displacement_mm),
+        theory_mm=float(sag),
+        measured_hz=float(np.mean(hz)),
+        measured_error_hz=float(max(np.ptp(hz) / 2, *(swing.error_hz for swing in swings))),
+        computed_hz=computed.hz,
+        theory_hz=float(theory_hz),
+        measured_damping_ratio=float(np.mean([swing.damping_ratio for swing in swings])),
+        computed_damping_ratio=computed.damping_ratio,
+        rest_left_mm=rest.left_mm,
+    )
+    return row, height
+
+
+def mean_length(displacement_mm: np.ndarray) -> float:
+    """Mean length [mm] of the markers' displacements (n, 3): it asks for no frame common to capture and beam."""
+    return float(np.linalg.norm(displacement_mm, axis=1).mean())
+
+
+def measured_oscillation(capture: Capture) -> Oscillation:
+    """Of one recording, from its release on. Raises BeamError, naming it."""
+    first = capture.release()
+    try:
+        return oscillation(capture.time_s[first:], capture.height_mm()[first:])
+    except BeamError as error:
+        raise BeamError(f"{capture.name}: {error}") from None
+
+
+def table(rows: list[Row]) -> str:
+    """The rows as text."""
+    lines = [
+        "            tip's final displacement, mm                  first frequency, Hz                     damping ratio",
+        "load, g   measured      computed   off    theory    measured       computed   off    theory   measured",
+    ]
+    for row in rows:
+        lines.append(
+            f"{row.load_g:7.0f}   {row.measured_mm:5.2f} ± {row.measured_error_mm:4.2f}"
+            f"   {row.computed_mm:8.2f} {percent(row.computed_mm, row.measured_mm)}  {row.theory_mm:8.2f}"
+            f"    {row.measured_hz:5.3f} ± {row.measured_error_hz:5.3f}"
+            f"  {row.computed_hz:8.3f} {percent(row.computed_hz, row.measured_hz)} {row.theory_hz:8.3f}"
+            f"   {row.measured_damping_ratio:8.3f}"
+        )
+    return "\n".join(lines)
+
+
+def percent(value: float, reference: float) -> str:
+    """How far a value is off a reference."""
+    return f"{100 * (value / reference - 1):+6.1f}%"
+
+
+def check(
+    size_mm: np.ndarray, material: "Material", cell_mm: float, load_g: float, height: np.ndarray
+) -> str:
+    """How much the frequency and the rest change with time step, passes, cells and Poisson's ratio, as text."""
+    from dataclasses import replace
+
+    from studies.cantilever import PASSES, Cantilever
+
+    frames = len(height) - 1
+
+    def measure(name: str, beam: Cantilever, substeps: int, passes: int = PASSES) -> str:
+        trace = beam.swing(frames, FRAME_S, substeps, passes)[:, :, 0].mean(axis=1)
+        hz = oscillation(FRAME_S * np.arange(frames + 1), trace).hz
+        return f"  {name:26s} {mean_length(beam.rest().displacement_mm):8.3f} mm   {hz:7.4f} Hz"
+
+    beam = Cantilever(size_mm, material, cell_mm, load_g, MARKERS_MM)
+    substeps = beam.substeps(FRAME_S)
+    lines = [
+        f"What the settings change, {load_g:.0f} g:",
+        measure("as above", beam, substeps),
+        measure("half the time step", beam, 2 * substeps),
+        measure("twice the passes", beam, substeps, 2 * PASSES),
+    ]
+    for poisson in (0.45, 0.49):
+        beam = Cantilever(size_mm, replace(material, poisson=poisson), cell_mm, load_g, MARKERS_MM)
+        lines.append(measure(f"Poisson's ratio {poisson:g}", beam, beam.substeps(FRAME_S)))
+    beam = Cantilever(size_mm, replace(material, poisson=0.45), cell_mm / 2, load_g, MARKERS_MM)
+    lines.append(measure(f"the same 0.45, {cell_mm / 2:g} mm cells", beam, beam.substeps(FRAME_S)))
+    return "\n".join(lines)
+
+
+def draw(groups: list[list[Capture]], heights: list[np.ndarray], rows: list[Row], path: Path) -> None:
+    """Tip height against time, measured and computed, a panel a load."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 3.2 * len(rows)), layout="constrained")
+    axes = figure.subplots(len(rows), squeeze=False)[:, 0]
+    for axis, captures, height, row in zip(axes, groups, heights, rows, strict=True):
+        for capture in captures:
+            first = capture.release()
+            axis.plot(
+                capture.time_s[first:] - capture.time_s[first],
+                capture.height_mm()[first:],
+                label=capture.name,
+            )
+        axis.plot(FRAME_S * np.arange(len(height)), height, "k--", lw=1, label="computed, undamped")
+        axis.set_xlim(0, 1.2 * FRAME_S * len(height))
+        axis.set_ylabel("tip height, mm")
+        axis.set_title(
+            f"{row.load_g:.0f} g at the tip: measured {row.measured_hz:.2f} Hz, computed {row.computed_hz:.2f} Hz",
+            loc="left",
+        )
+        axis.grid(alpha=0.3)
+        axis.legend(loc="upper right", fontsize=8)
+    axes[-1].set_xlabel("time since the release, s")
+    figure.savefig(path, dpi=110)
+
+
+def beam_size(folder: Path) -> np.ndarray:
+    """Height, width and length (3,) [mm] of the folder's beam. Raises BeamError."""
+    path = folder / BEAM
+    try:
+        size = np.ptp(trimesh.load_mesh(path).bounds, axis=0)
+    except Exception as error:  # what is no STL fails in many ways
+        raise BeamError(f"{path}: cannot be read as a surface ({error})") from None
+    if size.argmax() != 2:
+        raise BeamError(f"{path}: the beam's length must be along z")
+    return size
+
+
+@click.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option(
+    "--cell",
+    "cell_mm",
+    type=click.FloatRange(1, 30),
+    default=10.0,
+    show_default=True,
+    help="Width of a cell in mm.",
+)
+@click.option(
+    "--young-kpa",
+    type=click.FloatRange(0, 1e6, min_open=True),
+    default=263.8,
+    show_default=True,
+    help="Young's modulus in kPa.",
+)
+@click.option(
+    "--poisson",
+    type=click.FloatRange(0, 0.5, max_open=True),
+    default=0.499,
+    show_default=True,
+    help="Poisson's ratio.",
+)
+@click.option(
+    "--density",
+    type=click.FloatRange(0, 30, min_open=True),
+    default=1.07,
+    show_default=True,
+    help="Density in g/cm^3.",
+)
+@click.option(
+    "--check",
+    "checked",
+    is_flag=True,
+    help="Also show what time step, passes, cells and Poisson's ratio change.",
+)
+@click.option("--json", "json_path", type=click.Path(path_type=Path), help="File for the results.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for the figure, beam.png.")
+def beam(
+    folder: Path,
+    cell_mm: float,
+    young_kpa: float,
+    poisson: float,
+    density: float,
+    checked: bool,
+    json_path: Path | None,
+    out: Path | None,
+) -> None:
+    """Clamp and load the beam of FOLDER (motion capture, beam.stl); compare its tip's rest and first frequency."""
+    try:
+        run(folder, (cell_mm, young_kpa, poisson, density), checked, json_path, out)
+    except BeamError as error:
+        raise click.ClickException(str(error)) from None
+    except OSError as error:
+        raise click.ClickException(f"{error.filename}: cannot be written ({error.strerror})") from None
+
+
+def run(
+    folder: Path,
+    options: tuple[float, float, float, float],
+    checked: bool,
+    json_path: Path | None,
+    out: Path | None,
+) -> None:
+    """Read, compute, print, write. Raises BeamError."""
+    cell_mm, *values = options
+    captures = load_captures(folder)
+    size = beam_size(folder)
+    for path in (out, json_path and json_path.parent):
+        if path is not None:
+            path.mkdir(parents=True, exist_ok=True)
+    from sim.device import start
+
+    start("cpu")
+    from studies.cantilever import PASSES, REST_RELAXATION, Cantilever, Material
+
+    material = Material(*values)
+    groups = [list(group) for _, group in groupby(captures, key=lambda capture: capture.load_g)]
+    rows: list[Row] = []
+    heights = []
+    for group in tqdm(groups, desc="beam", unit="load"):
+        model = Cantilever(size, material, cell_mm, group[0].load_g, MARKERS_MM)
+        row, height = compare(group, model, size)
+        rows.append(row)
+        heights.append(height)
+    settings = dict(
+        **asdict(material),
+        cell_mm=cell_mm,
+        nodes=model.body.count,
+        time_step_s=FRAME_S / model.substeps(FRAME_S),
+        passes=PASSES,
+        damping=0.0,
+        rest_relaxation_factor=REST_RELAXATION,
+    )
+    click.echo(", ".join(f"{name} {value:.4g}" for name, value in settings.items()))
+    click.echo(table(rows))
+    if checked:
+        click.echo(check(size, material, cell_mm, rows[0].load_g, heights[0]))
+    if json_path is not None:
+        report = dict(settings=settings, loads=[asdict(row) for row in rows])
+        json_path.write_text(json.dumps(report, indent=2) + "\n", "utf-8")
+    if out is not None:
+        draw(groups, heights, rows, out / "beam.png")
+        click.echo(f"Wrote {out / 'beam.png'}")
