@@ -1,7 +1,6 @@
 """The command ``beam``: a clamped silicone beam, recorded by motion capture, against the tissue model."""
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +12,7 @@ from scipy.optimize import brentq
 from tqdm import tqdm
 
 from studies.capture import BeamError, Capture, Oscillation, load_captures, oscillation
+from studies.commands import Fault, make_folder, start_taichi, write_json
 
 if TYPE_CHECKING:
     from studies.cantilever import Cantilever, Material
@@ -141,8 +141,6 @@ def check(
     size_mm: np.ndarray, material: "Material", cell_mm: float, load_g: float, height: np.ndarray
 ) -> str:
     """How much the frequency and the rest change with time step, passes, cells and Poisson's ratio, as text."""
-    from dataclasses import replace
-
     from studies.cantilever import PASSES, Cantilever
 
     frames = len(height) - 1
@@ -260,9 +258,7 @@ def beam(
     try:
         run(folder, (cell_mm, young_kpa, poisson, density), checked, json_path, out)
     except BeamError as error:
-        raise click.ClickException(str(error)) from None
-    except OSError as error:
-        raise click.ClickException(f"{error.filename}: cannot be written ({error.strerror})") from None
+        raise Fault(str(error)) from None
 
 
 def run(
@@ -272,16 +268,15 @@ def run(
     json_path: Path | None,
     out: Path | None,
 ) -> None:
-    """Read, compute, print, write. Raises BeamError."""
+    """Read, compute, print, write. Raises BeamError and Fault."""
     cell_mm, *values = options
     captures = load_captures(folder)
     size = beam_size(folder)
-    for path in (out, json_path and json_path.parent):
-        if path is not None:
-            path.mkdir(parents=True, exist_ok=True)
-    from sim.device import start
-
-    start("cpu")
+    if out is not None:
+        make_folder(out)
+    if json_path is not None:
+        make_folder(json_path.parent, "--json")
+    start_taichi("cpu")
     from studies.cantilever import PASSES, REST_RELAXATION, Cantilever, Material
 
     material = Material(*values)
@@ -293,7 +288,7 @@ def run(
         row, height = compare(group, model, size)
         rows.append(row)
         heights.append(height)
-    settings = dict(
+    settings: dict[str, float] = dict(
         **asdict(material),
         cell_mm=cell_mm,
         nodes=model.body.count,
@@ -307,8 +302,7 @@ def run(
     if checked:
         click.echo(check(size, material, cell_mm, rows[0].load_g, heights[0]))
     if json_path is not None:
-        report = dict(settings=settings, loads=[asdict(row) for row in rows])
-        json_path.write_text(json.dumps(report, indent=2) + "\n", "utf-8")
+        write_json(dict(settings=settings, loads=[asdict(row) for row in rows]), json_path)
     if out is not None:
         draw(groups, heights, rows, out / "beam.png")
         click.echo(f"Wrote {out / 'beam.png'}")

@@ -1,16 +1,17 @@
 """A clamped beam on the lattice of the tissue model: what it comes to rest at, and how it swings."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import trimesh
 from scipy.spatial.transform import Rotation
 
 from sim.body import Body
-from sim.lattice import fill_with_cells
+from sim.lattice import fill_block
 from sim.neo_hookean import NeoHookean
 from sim.serial import SerialSolver
 from sim.solver import StepSettings
+from studies.capture import BeamError
 
 GRAVITY_MM_S2 = 9810.0
 # A pressure wave goes through so many cells in a time step; with more, passes in the tens leave it unbalanced and
@@ -22,6 +23,8 @@ REST_PASSES = 4000
 REST_RELAXATION = 1.9
 REST_TOLERANCE_MM = 0.005
 MOST_REST_PASSES = 256_000
+# The beam may differ from a whole number of cells by this.
+WHOLE_MM = 0.01
 # Where Poisson's ratio is higher, the rest position at this one is where the search starts.
 EASY_POISSON = 0.49
 
@@ -53,7 +56,7 @@ class Cantilever:
     """A beam of size_mm (height, width, length), clamped at length 0; gravity is against the first axis.
 
     load_g hangs along the upper edge of the free end. Markers (n, 3) [mm] outside the beam stand on its nearest
-    point and turn with its end.
+    point and turn with its end. Raises BeamError when the cells do not fill it.
     """
 
     def __init__(
@@ -68,7 +71,12 @@ class Cantilever:
         size = np.asarray(size_mm, float)
         markers = size * [0.5, 0.5, 1.0] if markers is None else np.asarray(markers, float)
         self.markers = np.atleast_2d(markers)
-        lattice = fill_with_cells(trimesh.creation.box(bounds=[np.zeros(3), size]), cell_mm, np.zeros(3))
+        counts = np.round(size / cell_mm).astype(int)
+        if np.abs(counts * cell_mm - size).max() > WHOLE_MM:
+            raise BeamError(
+                f"a beam of {size[0]:g} x {size[1]:g} x {size[2]:g} mm is no whole number of {cell_mm:g} mm cells"
+            )
+        lattice = fill_block(tuple(counts), cell_mm)
         self.cell_mm = cell_mm
         self.feet = np.clip(self.markers, 0.0, size)
         self.frame, self.weight = lattice.interpolation(self.feet)
@@ -93,10 +101,10 @@ class Cantilever:
         arm = self.markers - self.feet
         return feet + turn.apply(arm) - arm
 
-    def settings(self, **changes: float) -> StepSettings:
+    def settings(self, **changes: Any) -> StepSettings:
         """Gravity, no damping, and what else is given."""
-        values = dict(stabilisation_iterations=0, damping=0.0, gravity=(-GRAVITY_MM_S2, 0.0, 0.0)) | changes
-        return StepSettings(**values)
+        gravity = (-GRAVITY_MM_S2, 0.0, 0.0)
+        return StepSettings(stabilisation_iterations=0, damping=0.0, gravity=gravity, **changes)
 
     def rest(self) -> Rest:
         """Where it comes to rest."""
