@@ -1,5 +1,6 @@
 """The command ``beam``: a clamped silicone beam, recorded by motion capture, against the tissue model."""
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -73,11 +74,17 @@ def theory(size_mm: np.ndarray, material: "Material", load_g: float) -> tuple[fl
     return 1e3 * GRAVITY_M_S2 * sag, root**2 / (2 * np.pi) * np.sqrt(bending / (mass * length**4))
 
 
-def compare(captures: list[Capture], beam: "Cantilever", size_mm: np.ndarray) -> tuple[Row, np.ndarray]:
-    """One load's row, and the computed height (frames,) [mm] of the markers after the release."""
+def compare(
+    captures: list[Capture], build: Callable[..., "Cantilever"], cell_mm: float
+) -> tuple[Row, np.ndarray]:
+    """One load's row, and the computed height (frames,) [mm] of the markers after the release.
+
+    ``build`` makes a beam of a cell width and a load; the rest is found on cells of half the width.
+    """
     load_g = captures[0].load_g
-    sag, theory_hz = theory(size_mm, beam.material, load_g)
-    rest = beam.rest()
+    beam = build(cell_mm=cell_mm, load_g=load_g)
+    sag, theory_hz = theory(beam.size_mm, beam.material, load_g)
+    rest = build(cell_mm=cell_mm / 2, load_g=load_g).rest()
     height = beam.swing(int(np.ceil(PERIODS / theory_hz / FRAME_S)), FRAME_S)[:, :, 0].mean(axis=1)
     computed = oscillation(FRAME_S * np.arange(len(height)), height)
     finals = [mean_length(capture.final_mm()) for capture in captures]
@@ -137,32 +144,35 @@ def percent(value: float, reference: float) -> str:
     return f"{100 * (value / reference - 1):+6.1f}%"
 
 
-def check(
-    size_mm: np.ndarray, material: "Material", cell_mm: float, load_g: float, height: np.ndarray
-) -> str:
-    """How much the frequency and the rest change with time step, passes, cells and Poisson's ratio, as text."""
-    from studies.cantilever import PASSES, Cantilever
+def check(build: Callable[..., "Cantilever"], cell_mm: float, load_g: float, height: np.ndarray) -> str:
+    """How much rest and frequency change with time step, passes, cells, Poisson's ratio and where the load hangs.
+
+    Rests on cells as wide as those of the motion, so that lines compare.
+    """
+    from studies.cantilever import PASSES
 
     frames = len(height) - 1
 
-    def measure(name: str, beam: Cantilever, substeps: int, passes: int = PASSES) -> str:
-        trace = beam.swing(frames, FRAME_S, substeps, passes)[:, :, 0].mean(axis=1)
+    def line(name: str, beam: "Cantilever", finer: int = 1, passes: int = PASSES) -> str:
+        trace = beam.swing(frames, FRAME_S, finer * beam.substeps(FRAME_S), passes)[:, :, 0].mean(axis=1)
         hz = oscillation(FRAME_S * np.arange(frames + 1), trace).hz
-        return f"  {name:26s} {mean_length(beam.rest().displacement_mm):8.3f} mm   {hz:7.4f} Hz"
+        return f"  {name:32s} {mean_length(beam.rest().displacement_mm):8.3f} mm  {hz:7.4f} Hz"
 
-    beam = Cantilever(size_mm, material, cell_mm, load_g, MARKERS_MM)
-    substeps = beam.substeps(FRAME_S)
+    beam = build(cell_mm=cell_mm, load_g=load_g)
     lines = [
-        f"What the settings change, {load_g:.0f} g:",
-        measure("as above", beam, substeps),
-        measure("half the time step", beam, 2 * substeps),
-        measure("twice the passes", beam, substeps, 2 * PASSES),
+        f"What the settings change, {load_g:.0f} g, cells of {cell_mm:g} mm:",
+        line("as above", beam),
+        line("half the time step", beam, finer=2),
+        line("twice the passes", beam, passes=2 * PASSES),
     ]
     for poisson in (0.45, 0.49):
-        beam = Cantilever(size_mm, replace(material, poisson=poisson), cell_mm, load_g, MARKERS_MM)
-        lines.append(measure(f"Poisson's ratio {poisson:g}", beam, beam.substeps(FRAME_S)))
-    beam = Cantilever(size_mm, replace(material, poisson=0.45), cell_mm / 2, load_g, MARKERS_MM)
-    lines.append(measure(f"the same 0.45, {cell_mm / 2:g} mm cells", beam, beam.substeps(FRAME_S)))
+        changed = replace(beam.material, poisson=poisson)
+        lines.append(line(f"Poisson's ratio {poisson:g}", build(cell_mm, load_g, changed)))
+    changed = replace(beam.material, poisson=0.45)
+    lines.append(line(f"0.45 on cells of {cell_mm / 2:g} mm", build(cell_mm / 2, load_g, changed)))
+    if load_g > 0:
+        middle = beam.size_mm[0] / 2
+        lines.append(line("load across the end's middle", build(cell_mm, load_g, hung_mm=middle)))
     return "\n".join(lines)
 
 
@@ -283,24 +293,31 @@ def run(
     groups = [list(group) for _, group in groupby(captures, key=lambda capture: capture.load_g)]
     rows: list[Row] = []
     heights = []
+
+    def build(
+        cell_mm: float, load_g: float, changed: Material = material, hung_mm: float | None = None
+    ) -> Cantilever:
+        return Cantilever(size, changed, cell_mm, load_g, MARKERS_MM, hung_mm)
+
     for group in tqdm(groups, desc="beam", unit="load"):
-        model = Cantilever(size, material, cell_mm, group[0].load_g, MARKERS_MM)
-        row, height = compare(group, model, size)
+        row, height = compare(group, build, cell_mm)
         rows.append(row)
         heights.append(height)
     settings: dict[str, float] = dict(
         **asdict(material),
         cell_mm=cell_mm,
-        nodes=model.body.count,
-        time_step_s=FRAME_S / model.substeps(FRAME_S),
+        time_step_s=FRAME_S / build(cell_mm, 0.0).substeps(FRAME_S),
         passes=PASSES,
         damping=0.0,
+        rest_cell_mm=cell_mm / 2,
         rest_relaxation_factor=REST_RELAXATION,
+        rest_left_mm=max(row.rest_left_mm for row in rows),
     )
     click.echo(", ".join(f"{name} {value:.4g}" for name, value in settings.items()))
     click.echo(table(rows))
     if checked:
-        click.echo(check(size, material, cell_mm, rows[0].load_g, heights[0]))
+        for load in sorted({0, len(rows) - 1}):
+            click.echo(check(build, cell_mm, rows[load].load_g, heights[load]))
     if json_path is not None:
         write_json(dict(settings=settings, loads=[asdict(row) for row in rows]), json_path)
     if out is not None:

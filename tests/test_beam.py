@@ -140,7 +140,7 @@ def test_one_kernel_for_all_passes_steps_as_many_kernels_do(device):
 
 
 def test_the_command_compares_draws_and_reports(tmp_path, capsys):
-    trimesh.creation.box(bounds=[[0, 0, 0], [30, 30, 100]]).export(tmp_path / "beam.stl")
+    trimesh.creation.box(bounds=[[0, 0, 0], [20, 20, 60]]).export(tmp_path / "beam.stl")
     save(tmp_path / "beam_gravity_a.csv", recording())
     out, report = tmp_path / "out", tmp_path / "beam.json"
     assert main(["beam", str(tmp_path), "--poisson", "0.3", "--json", str(report), "--out", str(out)]) == 0
