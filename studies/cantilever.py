@@ -97,8 +97,10 @@ class Cantilever:
         self.solver = SerialSolver(self.model)
 
     def displacement(self) -> np.ndarray:
-        """Of the markers (n, 3) [mm], now."""
+        """Of the markers (n, 3) [mm], now. Raises BeamError where the computation failed."""
         moved = self.body.position.to_numpy().astype(float) - self.body.rest_points
+        if not np.isfinite(moved).all():
+            raise BeamError("the computed beam flies apart; choose a lower --poisson or a higher --young-kpa")
         feet = np.einsum("nk,nkd->nd", self.weight, moved[self.frame])
         rest = self.body.rest_points[self.end]
         now = rest + moved[self.end]
