@@ -37,10 +37,8 @@ class NeoHookean:
     """W = mu/2 (tr C - 3) - mu ln J + lambda/2 (ln J)^2 on a lattice's cells (Bonet & Wood 2008, Eq. 6.27).
 
     Nodes are projected colour by colour, on one core where ``serial`` (left open, their number decides); those ``held``
-    (n,) stay where they are. ``deformation`` (m + 1,) holds F of every cell and follows its nodes; the last row stands
-    Nodes are projected colour by colour (``groups``); those ``held`` (n,) stay where they are, and ``load_g`` (n,) [g]
-    is what hangs at them. ``deformation`` (m + 1,) holds F of every cell and follows its nodes; the last row stands
-    for cells that are not there.
+    (n,) stay where they are, and ``load_g`` (n,) [g] hangs at them. ``deformation`` (m + 1,) holds F of every cell and
+    follows its nodes; the last row stands for cells that are not there.
     """
 
     def __init__(

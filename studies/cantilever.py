@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from sim.body import Body
 from sim.lattice import fill_block
 from sim.neo_hookean import NeoHookean
-from sim.serial import SerialSolver
-from sim.solver import StepSettings
+from sim.solver import Solver, StepSettings
 from studies.capture import BeamError
 
 GRAVITY_MM_S2 = 9810.0
@@ -91,10 +90,9 @@ class Cantilever:
         load = np.bincount(node.ravel(), load_g / len(line) * share.ravel(), len(lattice.nodes))
         held = lattice.nodes[:, 2] < 1e-6 * size[2]
         self.body = Body(lattice.nodes)
-        self.model = NeoHookean(
-            self.body, lattice, None, material.young_kpa, material.poisson, material.density_g_cm3, held, load
-        )
-        self.solver = SerialSolver(self.model)
+        values = (material.young_kpa, material.poisson, material.density_g_cm3)
+        self.model = NeoHookean(self.body, lattice, None, *values, held, load_g=load)
+        self.solver = Solver(self.model)
 
     def displacement(self) -> np.ndarray:
         """Of the markers (n, 3) [mm], now. Raises BeamError where the computation failed."""
