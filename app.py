@@ -16,11 +16,21 @@ from scenes.anatomy import load_anatomy, patient_scene
 from scenes.labels import Side
 from scenes.patient import describe, import_patient, save_patient
 from scenes.reading import PatientError, read_volume
-from scenes.scene import OPTIONS, TISSUES, NeoHookeanTissue, SceneError, load_scene, scene_text, with_options
+from scenes.scene import (
+    EMBEDDED,
+    OPTIONS,
+    TISSUES,
+    NeoHookeanTissue,
+    SceneError,
+    load_scene,
+    scene_text,
+    with_options,
+)
 from sim.sampling import SamplingError
 from studies.beam import beam
 from studies.case import CaseError
 from studies.commands import Fault, arch_option, calibrate, make_folder, start_taichi, validate
+from studies.reference.command import reference
 from studies.setup import SetupError
 
 if TYPE_CHECKING:
@@ -28,7 +38,6 @@ if TYPE_CHECKING:
     from studies.rehearsal import Rehearsal
     from studies.report import Record
 
-EMBEDDED = Path(__file__).parent / "scenes" / "phantom.toml"
 PICTURES_A_SECOND = 10
 ANIMATION_WIDTH = 720
 
@@ -133,6 +142,7 @@ def import_command(
 cli.add_command(validate)
 cli.add_command(calibrate)
 cli.add_command(beam)
+cli.add_command(reference)
 
 
 def label_values(text: str | None, option: str) -> list[int] | None:

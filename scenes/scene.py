@@ -26,7 +26,8 @@ from pydantic import (
 Vector3 = tuple[float, float, float]
 Stiffness = Annotated[float, Field(ge=0, le=1)]
 
-
+# The scene that the program has with it.
+EMBEDDED = Path(__file__).parent / "phantom.toml"
 # The command line's names for single values of a scene.
 OPTIONS = {
     "tissue.model": "--model",

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 import trimesh
-from conftest import DATA, ROOT
+from conftest import DATA
 
 from scenes.anatomy import load_anatomy, patient_scene, phantom_folder
 from scenes.patient import import_patient, save_patient
 from scenes.reading import read_volume
-from scenes.scene import Press, Scene, load_scene, with_options
+from scenes.scene import EMBEDDED, Press, Scene, load_scene, with_options
 from sim.device import start
 from sim.skinning import Skin
 from studies.rehearsal import Rehearsal
@@ -30,9 +30,7 @@ PATIENTS = {
 def patient_in(name: str, tmp_path: Path) -> tuple[Scene, Path]:
     """A coarse scene of a patient, and the folder of its files."""
     if PATIENTS[name] is None:
-        return with_options(
-            load_scene(ROOT / "scenes" / "phantom.toml"), {"tissue.cell_mm": 6.0}
-        ), phantom_folder()
+        return with_options(load_scene(EMBEDDED), {"tissue.cell_mm": 6.0}), phantom_folder()
     if not DATA.is_dir():
         pytest.skip("no ../shared/data here")
     ct, labels, side = PATIENTS[name]

@@ -9,6 +9,7 @@ import trimesh
 
 from scenes.anatomy import load_anatomy, phantom_folder, press_on
 from scenes.scene import (
+    EMBEDDED,
     Anatomy,
     Press,
     Scene,
@@ -19,8 +20,6 @@ from scenes.scene import (
     with_options,
 )
 from studies.models import step_settings
-
-PHANTOM = Path(__file__).parents[1] / "scenes" / "phantom.toml"
 
 
 def refused(tmp_path: Path, text: str) -> str:
@@ -90,7 +89,7 @@ def test_missing_and_unreadable_files_are_named(tmp_path):
 
 def test_a_scene_written_is_the_scene_read(tmp_path):
     changes = {"tissue.cell_mm": 3.0, "tissue.young_kpa": None}
-    scene = with_options(load_scene(PHANTOM), changes)
+    scene = with_options(load_scene(EMBEDDED), changes)
     (tmp_path / "a.toml").write_text(scene_text(scene), "utf-8")
     assert load_scene(tmp_path / "a.toml") == scene
     assert scene.tissue.cell_mm == 3.0
@@ -100,14 +99,14 @@ def test_a_scene_written_is_the_scene_read(tmp_path):
 
 def test_options_out_of_range_are_refused():
     with pytest.raises(SceneError, match=r"^--poisson = 0.5: input should be"):
-        with_options(load_scene(PHANTOM), {"tissue.poisson": 0.5})
+        with_options(load_scene(EMBEDDED), {"tissue.poisson": 0.5})
     both = {"tissue.radius_mm": 3.0, "tissue.cell_mm": 4.0}
     with pytest.raises(SceneError, match=r"^--radius: belongs to the tissue model shape-matching"):
-        with_options(load_scene(PHANTOM), both)
+        with_options(load_scene(EMBEDDED), both)
 
 
 def test_a_value_that_one_model_has_asks_for_that_model():
-    scene = load_scene(PHANTOM)
+    scene = load_scene(EMBEDDED)
     assert with_options(scene, {"tissue.radius_mm": 3.0}).tissue.radius_mm == 3.0
     assert with_options(scene, {"tissue.cell_mm": 3.0}).tissue.model == "neo-hookean"
     paper = with_options(scene, {"tissue.model": "shape-matching"})
@@ -186,6 +185,6 @@ def test_the_embedded_patient_is_made_once():
     folder = phantom_folder()
     stamp = (folder / "ct.nrrd").stat().st_mtime_ns
     assert phantom_folder() == folder and (folder / "ct.nrrd").stat().st_mtime_ns == stamp
-    anatomy = load_anatomy(load_scene(PHANTOM), PHANTOM.parent)
+    anatomy = load_anatomy(load_scene(EMBEDDED), EMBEDDED.parent)
     assert 150e3 < anatomy.organ.volume < 200e3
     assert anatomy.tumour is not None and len(anatomy.shapes) == 1

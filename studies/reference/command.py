@@ -1,0 +1,40 @@
+"""The command ``reference``: a case for ``validate`` that the project makes itself."""
+
+from pathlib import Path
+
+import click
+import numpy as np
+
+from scenes.anatomy import load_anatomy
+from scenes.scene import EMBEDDED, load_scene
+from studies.commands import Fault, make_folder
+
+
+@click.command()
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder to write the case to.")
+@click.option(
+    "--edge",
+    "edge_mm",
+    type=click.FloatRange(2, 10),
+    default=4.0,
+    show_default=True,
+    help="Length in mm of the elements' edges by the transducer.",
+)
+def reference(out: Path, edge_mm: float) -> None:
+    """Solve the bead experiment on the embedded patient by finite elements: a case for `validate`."""
+    make_folder(out)
+    try:
+        from studies.reference.equilibrium import NotConvergedError
+        from studies.reference.study import Sizes, make_reference
+    except ImportError as error:
+        raise Fault(
+            f"the reference needs {error.name}, which is not installed: pip install -r requirements-dev.txt"
+        ) from None
+    scene = load_scene(EMBEDDED)
+    anatomy = load_anatomy(scene, EMBEDDED.parent)
+    try:
+        case = make_reference(anatomy, np.array(scene.gravity.direction), Sizes(edge_mm), click.echo)
+    except (ValueError, NotConvergedError) as error:
+        raise Fault(f"no reference with edges of {edge_mm:g} mm: {error}; try another --edge") from None
+    case.write(out)
+    click.echo(case.summary())

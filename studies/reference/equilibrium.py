@@ -1,0 +1,174 @@
+"""Newton's method for a solid under its weight and in contact, with sparse direct solves."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csc_matrix
+
+from studies.reference.contact import Contact
+from studies.reference.linear import dissected, solved
+from studies.reference.solid import Solid
+
+LEAST_STRETCH = 0.05
+SEARCHES = 6
+
+
+class NotConvergedError(Exception):
+    """Newton's method found no equilibrium.
+
+    Attributes:
+        state: the displacements that came nearest [mm], shape (nodes, 3); None if there are none.
+        residual: the relative residual there.
+    """
+
+    def __init__(self, message: str, state: np.ndarray | None = None, residual: float = np.inf) -> None:
+        super().__init__(message)
+        self.state, self.residual = state, residual
+
+
+@dataclass
+class Balance:
+    """How far a state is from equilibrium."""
+
+    residual: np.ndarray  # what is left of all forces on the nodes [mN], shape (nodes, 3)
+    forces: float  # sum of the loads', contacts' and constraints' lengths [mN]
+
+    @property
+    def relative(self) -> float:
+        """Sum of the residual's lengths, as a share of the forces'."""
+        return self.size / max(self.forces, 1e-12)
+
+    @property
+    def size(self) -> float:
+        """Sum of the residual's lengths [mN]."""
+        return float(np.linalg.norm(self.residual, axis=1).sum())
+
+
+class Equilibrium:
+    """A solid, what it touches and what it carries.
+
+    Attributes:
+        contacts: obstacles that may touch it.
+        load: forces on the nodes [mN], shape (nodes, 3).
+        fixed: displacements that are given, shape (nodes, 3) bool.
+        tether_kpa_mm2: stiffness per volume that holds each node to where the increment began; the proximal
+            term of a body that nothing else holds.
+    """
+
+    def __init__(
+        self, solid: Solid, contacts: list[Contact], load: np.ndarray, fixed: np.ndarray | None = None
+    ):
+        self.solid, self.contacts, self.load = solid, contacts, load
+        self.fixed = np.zeros(load.shape, bool) if fixed is None else fixed
+        self.tether_kpa_mm2 = 0.0
+        free = ~self.fixed.ravel()
+        order = dissected(solid.rest, solid.nodes_of)
+        order = (3 * order[:, None] + np.arange(3)).ravel()
+        self._order = order[free[order]]
+
+    def balance(self, displacement: np.ndarray, start: np.ndarray) -> Balance:
+        """Forces left over at displacements [mm], shape (nodes, 3), in an increment that began at others."""
+        pushes = [contact.force(displacement)[0] for contact in self.contacts]
+        tether = self.tether_kpa_mm2 * self.solid.volume_share[:, None] * (displacement - start)
+        residual = self.solid.elastic_force(displacement) + tether - self.load - sum(pushes)
+        held = np.where(self.fixed, residual, 0.0)
+        forces = sum(np.linalg.norm(part, axis=1).sum() for part in (self.load, held, *pushes))
+        return Balance(np.where(self.fixed, 0.0, residual), float(forces))
+
+    def tangent(self, displacement: np.ndarray) -> csc_matrix:
+        """Derivative of the residual by the displacements [mN/mm], shape (3 nodes, 3 nodes)."""
+        blocks = self.solid.stiffness(displacement)
+        for contact in self.contacts:
+            contact.add_stiffness(displacement, blocks)
+        matrix = self.solid.assembled(blocks)
+        matrix.setdiag(matrix.diagonal() + np.repeat(self.tether_kpa_mm2 * self.solid.volume_share, 3))
+        return matrix
+
+    def solve(
+        self,
+        guess: np.ndarray,
+        tolerance: float,
+        start: np.ndarray | None = None,
+        most: int = 40,
+    ) -> tuple[np.ndarray, float, int]:
+        """Newton's method with a line search on the work that the residual does along the step.
+
+        Args:
+            guess: displacements to begin with [mm], shape (nodes, 3).
+            tolerance: the relative residual to reach.
+            start: displacements at the beginning of the increment, which the tether holds to [the guess].
+            most: number of iterations after which it gives up.
+
+        Returns:
+            Displacements [mm], shape (nodes, 3), the relative residual that is left, and the number of iterations.
+
+        Raises:
+            NotConvergedError: no equilibrium was found.
+        """
+        if self.solid.least_stretch(guess) <= 0:
+            raise NotConvergedError("the guess turns tissue inside out")
+        start = guess if start is None else start
+        state, balance = guess, self.balance(guess, start)
+        nearest, least = state, np.inf
+        for iteration in range(most + 1):
+            if balance.relative <= tolerance:
+                return state, balance.relative, iteration
+            if balance.relative < least:
+                nearest, least = state, balance.relative
+            state, balance = self._searched(state, balance, self._newton_step(state, balance), start)
+        raise NotConvergedError(f"residual {least:.1e} after {most} iterations", nearest, least)
+
+    def _newton_step(self, state: np.ndarray, balance: Balance) -> np.ndarray:
+        try:
+            step = solved(self.tangent(state), -balance.residual.ravel(), self._order)
+        except RuntimeError as error:
+            raise NotConvergedError(str(error)) from None
+        return step.reshape(state.shape)
+
+    def _searched(
+        self, state: np.ndarray, balance: Balance, step: np.ndarray, start: np.ndarray
+    ) -> tuple[np.ndarray, Balance]:
+        """Somewhere along a step that is neither too far for the work nor, where that can be had, for the residual.
+
+        Without friction the residual's work is the slope of the energy, so the first search is for its valley.
+        Points that stick on one side of the step and slide on the other let Newton's method go to and fro
+        between two states; shorter steps break that.
+        """
+        reach, found = self._in_the_valley(state, step, start)
+        for shorter in (reach / 2, reach / 4, reach / 8):
+            if found.size <= balance.size:
+                break
+            tried = self.balance(state + shorter * step, start)
+            if tried.size < balance.size:
+                reach, found = shorter, tried
+        return state + reach * step, found
+
+    def _in_the_valley(self, state: np.ndarray, step: np.ndarray, start: np.ndarray) -> tuple[float, Balance]:
+        """The share of a step where the work has fallen to half, or all of it if that does not go too far.
+
+        By false position, kept off the ends (Crisfield, *Non-linear Finite Element Analysis of Solids and
+        Structures* 1, 1991, section 9.2.2).
+        """
+        reach = 1.0
+        while self.solid.least_stretch(state + reach * step) <= LEAST_STRETCH:
+            reach /= 2
+        low, high = 0.0, np.inf
+        work_low = before = self._work(state, step, start)[0]
+        work_high = 0.0
+        for _ in range(SEARCHES):
+            work, found = self._work(state + reach * step, step, start)
+            if before >= 0 or abs(work) <= abs(before) / 2 or (work < 0 and high == np.inf):
+                break
+            if work > 0:
+                high, work_high = reach, work
+            else:
+                low, work_low = reach, work
+            share = work_low / (work_low - work_high)
+            reach = low + (high - low) * float(np.clip(share, 0.1, 0.9))
+        else:
+            found = self.balance(state + reach * step, start)
+        return reach, found
+
+    def _work(self, state: np.ndarray, step: np.ndarray, start: np.ndarray) -> tuple[float, Balance]:
+        balance = self.balance(state, start)
+        return float((balance.residual * step).sum()), balance
