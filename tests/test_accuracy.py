@@ -11,6 +11,7 @@ from click.testing import CliRunner
 from conftest import rotation_about
 
 from app import cli, main
+from scenes.scene import TISSUES, SolverSection
 from studies.accuracy import (
     bead_errors,
     correlation,
@@ -23,7 +24,8 @@ from studies.accuracy import (
 )
 from studies.case import Case, load_case
 from studies.experiment import Experiment, Run
-from studies.setup import PRESETS, QUALITIES, Setup, SetupError, choose_setup
+from studies.models import step_settings
+from studies.setup import NOT_USED, PRESETS, QUALITIES, Setup, SetupError, choose_setup
 
 KEYS = {
     "case",
@@ -159,6 +161,17 @@ def test_presets_differ_in_radius_alone_and_options_change_them():
     )
     with pytest.raises(SetupError, match="--young-kpa: shape-matching has no such setting"):
         choose_setup("shape-matching", "fast", young_kpa=15.0)
+
+
+@pytest.mark.parametrize("model", PRESETS)
+def test_a_scene_is_rehearsed_as_balanced_is_validated(model):
+    balanced = choose_setup(model, "balanced")
+    tissue = TISSUES[model].model_validate({"model": model})
+    stepped = step_settings(tissue, SolverSection())
+    for name in ("time_step_s", "substeps", "iterations", "relaxation_factor"):
+        assert getattr(balanced, name) == getattr(stepped, name)
+    for name in {"cell_mm", "radius_mm", "stiffness"} - set(NOT_USED[model]):
+        assert getattr(balanced, name) == getattr(tissue, name)
 
 
 def test_validate_twice_prints_and_writes_the_same_but_for_times(monkeypatch, tmp_path):
