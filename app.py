@@ -27,7 +27,7 @@ from scenes.scene import (
     with_options,
 )
 from sim.sampling import SamplingError
-from studies.beam import beam
+from studies.beam.command import beam
 from studies.case import CaseError
 from studies.commands import Fault, arch_option, calibrate, make_folder, start_taichi, validate
 from studies.reference.command import reference

@@ -9,9 +9,10 @@ import trimesh
 
 from app import main
 from sim.neo_hookean import HOURGLASS
-from studies.beam import MARKERS_MM, mean_length, measured_oscillation, theory
-from studies.cantilever import Cantilever, Material
-from studies.capture import COLUMNS, BeamError, load_captures, oscillation, read_capture
+from studies.beam.cantilever import Cantilever, Material
+from studies.beam.capture import COLUMNS, BeamError, load_captures, oscillation, read_capture
+from studies.beam.command import MARKERS_MM
+from studies.beam.comparison import mean_length, measured_oscillation, theory
 
 FRAMES = 300
 

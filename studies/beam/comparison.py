@@ -1,27 +1,18 @@
-"""The command ``beam``: a clamped silicone beam, recorded by motion capture, against the tissue model."""
+"""A clamped beam as measured, as beam theory has it and as the tissue model computes it: rows, table, figure."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from itertools import groupby
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import click
 import numpy as np
-import trimesh
 from scipy.optimize import brentq
-from tqdm import tqdm
 
-from studies.capture import BeamError, Capture, Oscillation, load_captures, oscillation
-from studies.commands import Fault, make_folder, start_taichi, write_json
+from studies.beam.capture import BeamError, Capture, Oscillation, oscillation
 
 if TYPE_CHECKING:
-    from studies.cantilever import Cantilever, Material
+    from studies.beam.cantilever import Cantilever, Material
 
-BEAM = "beam.stl"
-# Tip markers in the frame of beam.stl [mm]: height, width, length. Balls that stand 6 mm off the surface at the free
-# end: on top, on one side, on the other (where the recordings' authors place them in their own simulation).
-MARKERS_MM = np.array([[36.0, 15.0, 100.0], [24.0, 36.0, 100.0], [6.0, -6.0, 100.0]])
 FRAME_S = 0.01
 # Swings that are computed, in periods that beam theory expects.
 PERIODS = 5.0
@@ -149,7 +140,7 @@ def check(build: Callable[..., "Cantilever"], cell_mm: float, load_g: float, hei
 
     Rests on cells as wide as those of the motion, so that lines compare.
     """
-    from studies.cantilever import PASSES
+    from studies.beam.cantilever import PASSES
 
     frames = len(height) - 1
 
@@ -201,125 +192,3 @@ def draw(groups: list[list[Capture]], heights: list[np.ndarray], rows: list[Row]
         axis.legend(loc="upper right", fontsize=8)
     axes[-1].set_xlabel("time since the release, s")
     figure.savefig(path, dpi=110)
-
-
-def beam_size(folder: Path) -> np.ndarray:
-    """Height, width and length (3,) [mm] of the folder's beam. Raises BeamError."""
-    path = folder / BEAM
-    try:
-        size = np.ptp(trimesh.load_mesh(path).bounds, axis=0)
-    except Exception as error:  # what is no STL fails in many ways
-        raise BeamError(f"{path}: cannot be read as a surface ({error})") from None
-    if size.argmax() != 2:
-        raise BeamError(f"{path}: the beam's length must be along z")
-    return size
-
-
-@click.command()
-@click.argument("folder", type=click.Path(path_type=Path))
-@click.option(
-    "--cell",
-    "cell_mm",
-    type=click.FloatRange(1, 30),
-    default=10.0,
-    show_default=True,
-    help="Width of a cell in mm.",
-)
-@click.option(
-    "--young-kpa",
-    type=click.FloatRange(0, 1e6, min_open=True),
-    default=263.8,
-    show_default=True,
-    help="Young's modulus in kPa.",
-)
-@click.option(
-    "--poisson",
-    type=click.FloatRange(0, 0.5, max_open=True),
-    default=0.499,
-    show_default=True,
-    help="Poisson's ratio.",
-)
-@click.option(
-    "--density",
-    type=click.FloatRange(0, 30, min_open=True),
-    default=1.07,
-    show_default=True,
-    help="Density in g/cm^3.",
-)
-@click.option(
-    "--check",
-    "checked",
-    is_flag=True,
-    help="Also show what time step, passes, cells and Poisson's ratio change.",
-)
-@click.option("--json", "json_path", type=click.Path(path_type=Path), help="File for the results.")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder for the figure, beam.png.")
-def beam(
-    folder: Path,
-    cell_mm: float,
-    young_kpa: float,
-    poisson: float,
-    density: float,
-    checked: bool,
-    json_path: Path | None,
-    out: Path | None,
-) -> None:
-    """Clamp and load the beam of FOLDER (motion capture, beam.stl); compare its tip's rest and first frequency."""
-    try:
-        run(folder, (cell_mm, young_kpa, poisson, density), checked, json_path, out)
-    except BeamError as error:
-        raise Fault(str(error)) from None
-
-
-def run(
-    folder: Path,
-    options: tuple[float, float, float, float],
-    checked: bool,
-    json_path: Path | None,
-    out: Path | None,
-) -> None:
-    """Read, compute, print, write. Raises BeamError and Fault."""
-    cell_mm, *values = options
-    captures = load_captures(folder)
-    size = beam_size(folder)
-    if out is not None:
-        make_folder(out)
-    if json_path is not None:
-        make_folder(json_path.parent, "--json")
-    start_taichi("cpu")
-    from studies.cantilever import PASSES, REST_RELAXATION, Cantilever, Material
-
-    material = Material(*values)
-    groups = [list(group) for _, group in groupby(captures, key=lambda capture: capture.load_g)]
-    rows: list[Row] = []
-    heights = []
-
-    def build(
-        cell_mm: float, load_g: float, changed: Material = material, hung_mm: float | None = None
-    ) -> Cantilever:
-        return Cantilever(size, changed, cell_mm, load_g, MARKERS_MM, hung_mm)
-
-    for group in tqdm(groups, desc="beam", unit="load"):
-        row, height = compare(group, build, cell_mm)
-        rows.append(row)
-        heights.append(height)
-    settings: dict[str, float] = dict(
-        **asdict(material),
-        cell_mm=cell_mm,
-        time_step_s=FRAME_S / build(cell_mm, 0.0).substeps(FRAME_S),
-        passes=PASSES,
-        damping=0.0,
-        rest_cell_mm=cell_mm / 2,
-        rest_relaxation_factor=REST_RELAXATION,
-        rest_left_mm=max(row.rest_left_mm for row in rows),
-    )
-    click.echo(", ".join(f"{name} {value:.4g}" for name, value in settings.items()))
-    click.echo(table(rows))
-    if checked:
-        for load in sorted({0, len(rows) - 1}):
-            click.echo(check(build, cell_mm, rows[load].load_g, heights[load]))
-    if json_path is not None:
-        write_json(dict(settings=settings, loads=[asdict(row) for row in rows]), json_path)
-    if out is not None:
-        draw(groups, heights, rows, out / "beam.png")
-        click.echo(f"Wrote {out / 'beam.png'}")

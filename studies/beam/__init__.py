@@ -1,0 +1,1 @@
+"""A clamped silicone beam, recorded by motion capture, against the tissue model."""
