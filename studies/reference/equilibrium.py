@@ -11,19 +11,13 @@ from studies.reference.solid import Solid
 
 LEAST_STRETCH = 0.05
 SEARCHES = 6
+# Of the tethers that let a body find its way: how much looser or tighter from one to the next, when, and how many.
+LOOSER, EASY_ITERATIONS, TETHERED_ITERATIONS, MOST_TETHERS = 4.0, 6, 12, 80
+TETHERED_TOLERANCE = 1e-4
 
 
 class NotConvergedError(Exception):
-    """Newton's method found no equilibrium.
-
-    Attributes:
-        state: the displacements that came nearest [mm], shape (nodes, 3); None if there are none.
-        residual: the relative residual there.
-    """
-
-    def __init__(self, message: str, state: np.ndarray | None = None, residual: float = np.inf) -> None:
-        super().__init__(message)
-        self.state, self.residual = state, residual
+    """Newton's method found no equilibrium."""
 
 
 @dataclass
@@ -51,8 +45,8 @@ class Equilibrium:
         contacts: obstacles that may touch it.
         load: forces on the nodes [mN], shape (nodes, 3).
         fixed: displacements that are given, shape (nodes, 3) bool.
-        tether_kpa_mm2: stiffness per volume that holds each node to where the increment began; the proximal
-            term of a body that nothing else holds.
+        tether_kpa_mm2: stiffness per volume that holds each node to where it is tethered to: a proximal term.
+        tethered_to: displacements [mm], shape (nodes, 3).
     """
 
     def __init__(
@@ -60,16 +54,16 @@ class Equilibrium:
     ):
         self.solid, self.contacts, self.load = solid, contacts, load
         self.fixed = np.zeros(load.shape, bool) if fixed is None else fixed
-        self.tether_kpa_mm2 = 0.0
+        self.tether_kpa_mm2, self.tethered_to = 0.0, np.zeros_like(solid.rest)
         free = ~self.fixed.ravel()
         order = dissected(solid.rest, solid.nodes_of)
         order = (3 * order[:, None] + np.arange(3)).ravel()
         self._order = order[free[order]]
 
-    def balance(self, displacement: np.ndarray, start: np.ndarray) -> Balance:
-        """Forces left over at displacements [mm], shape (nodes, 3), in an increment that began at others."""
+    def balance(self, displacement: np.ndarray) -> Balance:
+        """Forces left over at displacements [mm], shape (nodes, 3)."""
         pushes = [contact.force(displacement)[0] for contact in self.contacts]
-        tether = self.tether_kpa_mm2 * self.solid.volume_share[:, None] * (displacement - start)
+        tether = self.tether_kpa_mm2 * self.solid.volume_share[:, None] * (displacement - self.tethered_to)
         residual = self.solid.elastic_force(displacement) + tether - self.load - sum(pushes)
         held = np.where(self.fixed, residual, 0.0)
         forces = sum(np.linalg.norm(part, axis=1).sum() for part in (self.load, held, *pushes))
@@ -88,7 +82,6 @@ class Equilibrium:
         self,
         guess: np.ndarray,
         tolerance: float,
-        start: np.ndarray | None = None,
         most: int = 40,
     ) -> tuple[np.ndarray, float, int]:
         """Newton's method with a line search on the work that the residual does along the step.
@@ -96,7 +89,6 @@ class Equilibrium:
         Args:
             guess: displacements to begin with [mm], shape (nodes, 3).
             tolerance: the relative residual to reach.
-            start: displacements at the beginning of the increment, which the tether holds to [the guess].
             most: number of iterations after which it gives up.
 
         Returns:
@@ -107,16 +99,51 @@ class Equilibrium:
         """
         if self.solid.least_stretch(guess) <= 0:
             raise NotConvergedError("the guess turns tissue inside out")
-        start = guess if start is None else start
-        state, balance = guess, self.balance(guess, start)
-        nearest, least = state, np.inf
+        state, balance = guess, self.balance(guess)
+        least = np.inf
         for iteration in range(most + 1):
             if balance.relative <= tolerance:
                 return state, balance.relative, iteration
-            if balance.relative < least:
-                nearest, least = state, balance.relative
-            state, balance = self._searched(state, balance, self._newton_step(state, balance), start)
-        raise NotConvergedError(f"residual {least:.1e} after {most} iterations", nearest, least)
+            least = min(least, balance.relative)
+            state, balance = self._searched(state, balance, self._newton_step(state, balance))
+        raise NotConvergedError(f"residual {least:.1e} after {most} iterations")
+
+    def relaxed(
+        self, state: np.ndarray, tolerance: float, tether_kpa_mm2: float
+    ) -> tuple[np.ndarray, float, int]:
+        """Where a body that is out of balance goes by itself: steps of slow motion, the longer the nearer it is.
+
+        Pseudo-transient continuation (Kelley & Keyes, SIAM J. Numer. Anal. 35, 1998): each step is tethered to where
+        the last one ended, and so is found even where the body jumps. Friction's anchors are carried along.
+
+        Args:
+            state: displacements to begin with [mm], shape (nodes, 3).
+            tolerance: the relative residual to reach without a tether.
+            tether_kpa_mm2: stiffness per volume of the first tether.
+
+        Returns:
+            Displacements [mm], shape (nodes, 3), the relative residual that is left, and the number of steps.
+
+        Raises:
+            NotConvergedError: it came to no end.
+        """
+        for step in range(1, MOST_TETHERS + 1):
+            self.tether_kpa_mm2, self.tethered_to = tether_kpa_mm2, state
+            try:
+                state, _, iterations = self.solve(state, TETHERED_TOLERANCE, most=TETHERED_ITERATIONS)
+            except NotConvergedError:
+                tether_kpa_mm2 *= LOOSER
+                continue
+            finally:
+                self.tether_kpa_mm2 = 0.0
+            for contact in self.contacts:
+                contact.carry(state)
+            left = self.balance(state).relative
+            if left <= tolerance:
+                return state, left, step
+            if iterations <= EASY_ITERATIONS:
+                tether_kpa_mm2 /= LOOSER
+        raise NotConvergedError(f"no rest after {MOST_TETHERS} tethered steps")
 
     def _newton_step(self, state: np.ndarray, balance: Balance) -> np.ndarray:
         try:
@@ -125,25 +152,23 @@ class Equilibrium:
             raise NotConvergedError(str(error)) from None
         return step.reshape(state.shape)
 
-    def _searched(
-        self, state: np.ndarray, balance: Balance, step: np.ndarray, start: np.ndarray
-    ) -> tuple[np.ndarray, Balance]:
+    def _searched(self, state: np.ndarray, balance: Balance, step: np.ndarray) -> tuple[np.ndarray, Balance]:
         """Somewhere along a step that is neither too far for the work nor, where that can be had, for the residual.
 
         Without friction the residual's work is the slope of the energy, so the first search is for its valley.
         Points that stick on one side of the step and slide on the other let Newton's method go to and fro
         between two states; shorter steps break that.
         """
-        reach, found = self._in_the_valley(state, step, start)
+        reach, found = self._in_the_valley(state, step)
         for shorter in (reach / 2, reach / 4, reach / 8):
             if found.size <= balance.size:
                 break
-            tried = self.balance(state + shorter * step, start)
+            tried = self.balance(state + shorter * step)
             if tried.size < balance.size:
                 reach, found = shorter, tried
         return state + reach * step, found
 
-    def _in_the_valley(self, state: np.ndarray, step: np.ndarray, start: np.ndarray) -> tuple[float, Balance]:
+    def _in_the_valley(self, state: np.ndarray, step: np.ndarray) -> tuple[float, Balance]:
         """The share of a step where the work has fallen to half, or all of it if that does not go too far.
 
         By false position, kept off the ends (Crisfield, *Non-linear Finite Element Analysis of Solids and
@@ -153,10 +178,10 @@ class Equilibrium:
         while self.solid.least_stretch(state + reach * step) <= LEAST_STRETCH:
             reach /= 2
         low, high = 0.0, np.inf
-        work_low = before = self._work(state, step, start)[0]
+        work_low = before = self._work(state, step)[0]
         work_high = 0.0
         for _ in range(SEARCHES):
-            work, found = self._work(state + reach * step, step, start)
+            work, found = self._work(state + reach * step, step)
             if before >= 0 or abs(work) <= abs(before) / 2 or (work < 0 and high == np.inf):
                 break
             if work > 0:
@@ -166,9 +191,9 @@ class Equilibrium:
             share = work_low / (work_low - work_high)
             reach = low + (high - low) * float(np.clip(share, 0.1, 0.9))
         else:
-            found = self.balance(state + reach * step, start)
+            found = self.balance(state + reach * step)
         return reach, found
 
-    def _work(self, state: np.ndarray, step: np.ndarray, start: np.ndarray) -> tuple[float, Balance]:
-        balance = self.balance(state, start)
+    def _work(self, state: np.ndarray, step: np.ndarray) -> tuple[float, Balance]:
+        balance = self.balance(state)
         return float((balance.residual * step).sum()), balance

@@ -17,13 +17,12 @@ from studies.reference.obstacles import FAR_MM, DistanceField, RoundedBox
 from studies.reference.solid import Material, Solid
 
 GRAVITY_M_S2, FRICTION = 9.81, 0.35
-STAGE_TOLERANCE, PATH_TOLERANCE, TETHERED_TOLERANCE = 1e-5, 5e-5, 1e-3
-# Stiffness per volume of the proximal term while gravity pulls the kidney into its support; then none.
-TETHERS_KPA_MM2 = (1e-2, 1e-3, 1e-4, 0.0)
-# A point that jumps over an edge may leave no equilibrium on the way: so much residual is then carried on.
-JUMP_TOLERANCE = 1e-3
+STAGE_TOLERANCE, PATH_TOLERANCE = 1e-5, 5e-5
+# First tethers: of the kidney that gravity pulls into its support, and of tissue that jumps round the probe's edge,
+# where there is no equilibrium on the way.
+SETTLING_KPA_MM2, JUMPING_KPA_MM2 = 1e-2, 4.0
 # The transducer starts with small increments, as the first contact grows fastest, and tries longer ones.
-FIRST_INCREMENT_MM, MOST_INCREMENT_MM, LEAST_INCREMENT_MM = 0.3, 1.2, 0.02
+FIRST_INCREMENT_MM, MOST_INCREMENT_MM, LEAST_INCREMENT_MM = 0.3, 1.2, 0.15
 LONGER, EASY_ITERATIONS, MOST_ITERATIONS = 1.4, 7, 15
 TOUCHING_MM = 1e-6
 # A pressure of the size that tissue bears, and no more, tells Newton's method where the first contact is.
@@ -81,6 +80,11 @@ class _Path:
         if easily:
             self.step_mm = min(LONGER * self.step_mm, MOST_INCREMENT_MM)
 
+    def jump(self, state: np.ndarray, depth_mm: float) -> None:
+        """Take a solution that is no continuation: the path goes on from it as it went before."""
+        self.before = state - (self.state - self.before)
+        self.state, self.depth_mm = state, depth_mm
+
 
 class Experiment:
     """One kidney on its support under one press.
@@ -127,23 +131,21 @@ class Experiment:
         # A rest too short for an increment of its own is taken along.
         after = goal if goal - path.depth_mm < 1.1 * path.step_mm else path.depth_mm + path.step_mm
         self._move_probe(path.home_mm - after)
+        guess = path.extrapolated(after) if path.last_mm else self._first_guess(path.state)
+        tolerance = STAGE_TOLERANCE if after == goal else PATH_TOLERANCE
         try:
-            guess = path.extrapolated(after) if path.last_mm else self._first_guess(path.state)
-            tolerance = STAGE_TOLERANCE if after == goal else PATH_TOLERANCE
-            solved, residual, iterations = self.equilibrium.solve(
-                guess, tolerance, path.state, MOST_ITERATIONS
-            )
-        except NotConvergedError as error:
-            path.step_mm = (after - path.depth_mm) / 2
-            if path.step_mm >= LEAST_INCREMENT_MM:
+            solved, residual, steps = self.equilibrium.solve(guess, tolerance, most=MOST_ITERATIONS)
+        except NotConvergedError:
+            if after - path.depth_mm > LEAST_INCREMENT_MM:
+                path.step_mm = (after - path.depth_mm) / 2
                 return self._advance(path, goal)
-            if error.state is None or error.residual > JUMP_TOLERANCE:
-                raise
-            solved, residual, iterations = error.state, error.residual, MOST_ITERATIONS
-        self._report(f"{after:6.2f} mm deep, {iterations} iterations, residual {residual:.0e}")
-        self._carry(solved)
+            solved, residual, steps = self.equilibrium.relaxed(guess, tolerance, JUMPING_KPA_MM2)
+            path.jump(solved, after)
+        else:
+            self._carry(solved)
+            path.go_on(solved, after, steps <= EASY_ITERATIONS)
+        self._report(f"{after:6.2f} mm deep, {steps} steps, residual {residual:.0e}")
         self.worst_residual = max(self.worst_residual, residual)
-        path.go_on(solved, after, iterations <= EASY_ITERATIONS)
         return residual
 
     def _settled(self) -> tuple[np.ndarray, float]:
@@ -154,12 +156,8 @@ class Experiment:
                 raise NotConvergedError("the kidney does not lie over its support")
             state = state - [0.0, 0.0, gap]
         self._carry(state)
-        for tether in TETHERS_KPA_MM2:
-            self.equilibrium.tether_kpa_mm2 = tether
-            tolerance = TETHERED_TOLERANCE if tether else STAGE_TOLERANCE
-            state, residual, iterations = self.equilibrium.solve(state, tolerance)
-            self._report(f"settles, {iterations} iterations, residual {residual:.0e}")
-            self._carry(state)
+        state, residual, steps = self.equilibrium.relaxed(state, STAGE_TOLERANCE, SETTLING_KPA_MM2)
+        self._report(f"at rest in the support, {steps} steps, residual {residual:.0e}")
         return state, residual
 
     def _first_guess(self, state: np.ndarray) -> np.ndarray:
