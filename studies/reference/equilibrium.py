@@ -13,7 +13,8 @@ LEAST_STRETCH = 0.05
 SEARCHES = 6
 # Of the tethers that let a body find its way: how much looser or tighter from one to the next, when, and how many.
 LOOSER, EASY_ITERATIONS, TETHERED_ITERATIONS, MOST_TETHERS = 4.0, 6, 12, 80
-TETHERED_TOLERANCE = 1e-4
+# Their steps are found to within this, and to within this share of what was left.
+TETHERED_TOLERANCE, LESS = 1e-4, 0.1
 
 
 class NotConvergedError(Exception):
@@ -127,10 +128,12 @@ class Equilibrium:
         Raises:
             NotConvergedError: it came to no end.
         """
+        left = np.inf
         for step in range(1, MOST_TETHERS + 1):
+            wanted = min(TETHERED_TOLERANCE, max(tolerance, LESS * left))
             self.tether_kpa_mm2, self.tethered_to = tether_kpa_mm2, state
             try:
-                state, _, iterations = self.solve(state, TETHERED_TOLERANCE, most=TETHERED_ITERATIONS)
+                state, _, iterations = self.solve(state, wanted, most=TETHERED_ITERATIONS)
             except NotConvergedError:
                 tether_kpa_mm2 *= LOOSER
                 continue
