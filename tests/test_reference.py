@@ -183,16 +183,21 @@ def test_a_mesh_fills_a_round_surface_and_is_finer_where_asked(ball):
     assert np.median(lengths[heights > 7]) < 0.6 * np.median(lengths[heights < 0])
 
 
-@pytest.fixture(scope="module")
-def solved_case() -> Case:
-    """A flat ball on a block, pressed by 1 mm: a small case with everything that the large one has."""
+def pressed_ball(indentations_mm: tuple[float, ...]) -> tuple[Experiment, list[trimesh.Trimesh]]:
+    """A flat ball on a block under a press, and both: small, with everything that a kidney's case has."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=12.0)
     ball.apply_scale([1.0, 0.9, 0.7])
     block = trimesh.creation.box([40.0, 40.0, 8.0])
     block.apply_translation([0.0, 0.0, -12.7])
-    press = Press(size_mm=(12.0, 6.0, 8.0), indentations_mm=(0.0, 1.0))
+    press = Press(size_mm=(12.0, 6.0, 8.0), indentations_mm=indentations_mm)
     mesh = tetrahedra(ball, lambda points: np.full(len(points), 6.0))
-    experiment = Experiment(mesh, block, TISSUE, press)
+    return Experiment(mesh, block, TISSUE, press), [ball, block]
+
+
+@pytest.fixture(scope="module")
+def solved_case() -> Case:
+    """The ball pressed by 1 mm."""
+    experiment, (ball, block) = pressed_ball((0.0, 1.0))
     stages = list(experiment.stages())
     made = dict(time_s=1.0, edge_near_probe_mm=6.0)
     beads = blue_noise(ball, count=12)
@@ -203,12 +208,27 @@ def solved_case() -> Case:
         block,
         beads,
         experiment.solid,
-        press,
+        experiment.press,
         0.35,
         stages,
         made,
         dict(kind="analytic"),
     )
+
+
+def test_slow_motion_comes_to_the_same_rest_as_newtons_method(solved_case, monkeypatch):
+    monkeypatch.setattr("studies.reference.experiment.MOST_ITERATIONS", 0)
+    monkeypatch.setattr("studies.reference.experiment.LEAST_INCREMENT_MM", 1.0)
+    monkeypatch.setattr(Experiment, "_first_guess", lambda self, state: state)
+    experiment, _ = pressed_ball((0.0, 0.5, 1.0))
+    *_, last = experiment.stages()
+    pressed = solved_case.stages[-1]
+    assert last.residual <= 1e-5
+    # Friction remembers the way: it lets points rest within the slip at which its elastic stick gives way,
+    # 1.5 times 0.35 of some 3 kPa over 150 kPa/mm.
+    apart = np.linalg.norm(last.displacement_mm - pressed.displacement_mm, axis=1)
+    assert apart.max() < 0.01
+    assert last.probe_force_n[2] == pytest.approx(pressed.probe_force_n[2], rel=0.01)
 
 
 def test_support_and_probe_hold_the_weight(solved_case):
