@@ -1,7 +1,7 @@
 """The bead experiment: a kidney laid into its support, left to its weight, and pressed by a transducer.
 
 z is up, gravity and press go down. The answer depends on the way there, as friction does: lowered until it
-touches, gravity with a fading proximal term, then the transducer in increments.
+touches, settled in slow motion, then the transducer in increments.
 """
 
 from collections.abc import Callable, Iterator
@@ -126,8 +126,11 @@ class Experiment:
                 residual = self._advance(path, goal)
             yield self._stage(goal, path.state, residual)
 
-    def _advance(self, path: "_Path", goal: float) -> float:
-        """One increment towards a goal [mm], shorter where there is no solution; the relative residual."""
+    def _advance(self, path: _Path, goal: float) -> float:
+        """One increment towards a goal [mm], shorter or in slow motion where Newton's method has no solution.
+
+        Returns the relative residual. Raises NotConvergedError.
+        """
         # A rest too short for an increment of its own is taken along.
         after = goal if goal - path.depth_mm < 1.1 * path.step_mm else path.depth_mm + path.step_mm
         self._move_probe(path.home_mm - after)
@@ -166,6 +169,8 @@ class Experiment:
         self.probe.law = replace(stiff, stiffness_kpa_mm=SOFT_KPA_MM)
         try:
             return self.equilibrium.solve(state, SOFT_TOLERANCE, most=MOST_ITERATIONS)[0]
+        except NotConvergedError:
+            return state
         finally:
             self.probe.law = stiff
 
