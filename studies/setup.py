@@ -32,7 +32,7 @@ PRESETS = {
     "neo-hookean": {
         "fast": replace(NEO_HOOKEAN, cell_mm=6.0),
         "balanced": replace(NEO_HOOKEAN, cell_mm=4.0),
-        "accurate": replace(NEO_HOOKEAN, cell_mm=2.5, iterations=16),
+        "accurate": replace(NEO_HOOKEAN, cell_mm=2.0, iterations=12),
     },
     "shape-matching": {
         "fast": Setup(radius_mm=3.3),
