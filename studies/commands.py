@@ -94,10 +94,22 @@ arch_option = click.option(
     help="Passes over the constraints in a substep [the preset's].",
 )
 @click.option("--time-step", "time_step_s", type=click.FloatRange(1e-4, 0.1), help="Time step in s [1/60].")
+@click.option(
+    "--check",
+    "checked",
+    is_flag=True,
+    help="Also show what time step, iterations and size change; takes long.",
+)
 @arch_option
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file.")
 def validate(
-    case: Path, model: str | None, quality: str, arch: str, json_file: Path | None, **changes: float | None
+    case: Path,
+    model: str | None,
+    quality: str,
+    checked: bool,
+    arch: str,
+    json_file: Path | None,
+    **changes: float | None,
 ) -> None:
     """Press the organ of CASE, a folder with a bead experiment, and compare the beads with the measured ones."""
     given = [name for name, value in changes.items() if value is not None]
@@ -110,7 +122,10 @@ def validate(
     used = start_taichi(arch)
     from studies.accuracy import report, summary, table
     from studies.experiment import Experiment
+    from studies.independence import HEAD, changes_of, independence, line
 
+    if checked:
+        changes_of(setup)
     started = perf_counter()
     experiment = Experiment(loaded, setup)
     built_s = perf_counter() - started
@@ -118,6 +133,12 @@ def validate(
     figures = report(experiment, setup, run)
     click.echo(f"{summary(figures, experiment.describe(setup))}\nbuilt  in {built_s:.1f} s, on {used}\n")
     click.echo(table(loaded, run.beads))
+    if checked:
+        click.echo(f"\n{HEAD}")
+        figures["independence"] = []
+        for row in independence(experiment, setup, run.beads):
+            click.echo(line(row))
+            figures["independence"].append(row)
     if json_file is not None:
         write_json(figures, json_file)
 
