@@ -43,6 +43,15 @@ def make_folder(folder: Path, option: str = "--out") -> None:
         raise Fault(f"{folder}: cannot be written to; choose another {option}")
 
 
+def make_place(json_file: Path | None) -> None:
+    """Make sure that the file of --json, where it is asked for, can be written before time is spent. Raises Fault."""
+    if json_file is None:
+        return
+    make_folder(json_file.parent, "--json")
+    if json_file.is_dir():
+        raise Fault(f"{json_file}: is a folder; name a file after --json")
+
+
 arch_option = click.option(
     "--arch",
     type=click.Choice(["auto", "cuda", "vulkan", "cpu"]),
@@ -115,17 +124,14 @@ def validate(
     given = [name for name, value in changes.items() if value is not None]
     setup = choose_setup(model or model_with(given, "neo-hookean"), quality, **changes)
     loaded = load_case(case)
-    if json_file is not None:
-        make_folder(json_file.parent, "--json")
-        if json_file.is_dir():
-            raise Fault(f"{json_file}: is a folder; name a file after --json")
+    make_place(json_file)
     used = start_taichi(arch)
+    from studies import independence
     from studies.accuracy import report, summary, table
     from studies.experiment import Experiment
-    from studies.independence import HEAD, changes_of, independence, line
 
     if checked:
-        changes_of(setup)
+        independence.changes_of(setup)
     started = perf_counter()
     experiment = Experiment(loaded, setup)
     built_s = perf_counter() - started
@@ -133,14 +139,16 @@ def validate(
     figures = report(experiment, setup, run)
     click.echo(f"{summary(figures, experiment.describe(setup))}\nbuilt  in {built_s:.1f} s, on {used}\n")
     click.echo(table(loaded, run.beads))
-    if checked:
-        click.echo(f"\n{HEAD}")
-        figures["independence"] = []
-        for row in independence(experiment, setup, run.beads):
-            click.echo(line(row))
-            figures["independence"].append(row)
-    if json_file is not None:
-        write_json(figures, json_file)
+    try:
+        if checked:
+            figures["independence"] = []
+            click.echo(f"\n{independence.HEAD}")
+            for row in independence.moved(experiment, setup, run.beads):
+                click.echo(independence.line(row))
+                figures["independence"].append(row)
+    finally:
+        if json_file is not None:
+            write_json(figures, json_file)
 
 
 def write_json(figures: dict, file: Path) -> None:

@@ -11,13 +11,14 @@ from studies.setup import OPTION_OF, Setup, SetupError
 
 # Sizes of which a third more and less can be built.
 LEAST_MM, MOST_MM = 0.75, 15.0
+MOST_ITERATIONS = 500
 HEAD = "What the settings change: how far the beads move, mean at each stage, mm"
 
 
 def changes_of(setup: Setup) -> dict[str, Setup]:
-    """Setups that would give the same beads if these were the material's alone, by the name of what is changed.
+    """One setup for each setting that is changed, by name; where only the material counts, none moves the beads.
 
-    The press takes as long with half the time step. Raises SetupError where a size would be out of range.
+    The press takes as long with half the time step. Raises SetupError where a changed value would be out of range.
     """
     size = "cell_mm" if setup.model == "neo-hookean" else "radius_mm"
     things = "cells" if setup.model == "neo-hookean" else "particles"
@@ -25,6 +26,8 @@ def changes_of(setup: Setup) -> dict[str, Setup]:
         raise SetupError(
             f"--check: {things} a third larger and smaller need --{OPTION_OF[size]} from {LEAST_MM:g} to {MOST_MM:g}"
         )
+    if setup.iterations > MOST_ITERATIONS:
+        raise SetupError(f"--check: twice the iterations needs --iterations of {MOST_ITERATIONS} at most")
     halved = replace(
         setup,
         time_step_s=setup.time_step_s / 2,
@@ -42,7 +45,7 @@ def changes_of(setup: Setup) -> dict[str, Setup]:
     }
 
 
-def independence(experiment: Experiment, setup: Setup, beads: np.ndarray) -> Iterator[dict]:
+def moved(experiment: Experiment, setup: Setup, beads: np.ndarray) -> Iterator[dict]:
     """What each change moves, as ``validate --json`` has it.
 
     Args:
@@ -56,11 +59,11 @@ def independence(experiment: Experiment, setup: Setup, beads: np.ndarray) -> Ite
     for name, changed in changes_of(setup).items():
         same = (changed.cell_mm, changed.radius_mm) == (setup.cell_mm, setup.radius_mm)
         other = experiment if same else Experiment(experiment.case, changed)
-        moved = np.linalg.norm(other.run(changed).beads - beads, axis=2)
+        apart = np.linalg.norm(other.run(changed).beads - beads, axis=2)
         yield dict(
             change=name,
-            moved_mean_mm=[rounded(mean) for mean in moved.mean(axis=1)],
-            moved_max_mm=rounded(moved.max()),
+            moved_mean_mm=[rounded(mean) for mean in apart.mean(axis=1)],
+            moved_max_mm=rounded(apart.max()),
         )
 
 

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from app import cli, main
 from studies.case import Case, load_case
 from studies.experiment import Run
-from studies.independence import changes_of, independence
+from studies.independence import changes_of, moved
 from studies.setup import PRESETS, Setup, choose_setup
 
 
@@ -56,7 +56,7 @@ def test_what_moves_is_told_stage_by_stage(tmp_path):
     experiment = Drifting(case, setup)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("studies.independence.Experiment", Drifting)
-        halved, doubled, larger, smaller = independence(experiment, setup, experiment.run(setup).beads)
+        halved, doubled, larger, smaller = moved(experiment, setup, experiment.run(setup).beads)
     count = case.measured.shape[1]
     assert halved["moved_max_mm"] == pytest.approx(0.0, abs=1e-6)
     assert doubled["moved_mean_mm"] == pytest.approx([8.0] * len(case.measured))

@@ -8,14 +8,18 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.optimize import brentq
+from scipy.sparse import csc_matrix, csr_matrix
+from scipy.sparse.csgraph import maximum_bipartite_matching
+from scipy.sparse.linalg import splu
 from skfem import LinearForm, MeshTet, MeshTet2
 
 import app
+from studies.case import load_case
 from studies.reference.case import Case
 from studies.reference.contact import Contact, Law, Surface
 from studies.reference.equilibrium import Equilibrium, NotConvergedError
 from studies.reference.experiment import Experiment, Press
-from studies.reference.linear import dissected
+from studies.reference.linear import _least_cover, dissected
 from studies.reference.mesh import tetrahedra
 from studies.reference.obstacles import DistanceField, Plane, RoundedBox
 from studies.reference.solid import Material, Solid
@@ -167,10 +171,28 @@ def test_friction_of_a_block_that_slides_is_coulombs():
     assert max(ratios) <= 0.35 * (1 + 1e-9)
 
 
-def test_the_order_of_elimination_holds_every_node_once():
-    solid = cube(2)
+def test_the_order_of_elimination_holds_every_node_once_and_leaves_little_fill():
+    solid = cube(4)
+    nodes = len(solid.rest)
     order = dissected(solid.rest, solid.nodes_of)
-    np.testing.assert_array_equal(np.sort(order), np.arange(len(solid.rest)))
+    np.testing.assert_array_equal(np.sort(order), np.arange(nodes))
+    size = solid.nodes_of.shape[1]
+    rows, columns = np.repeat(solid.nodes_of, size, axis=1).ravel(), np.tile(solid.nodes_of, size).ravel()
+    matrix = csc_matrix((np.full(len(rows), -1.0), (rows, columns)), shape=(nodes, nodes))
+    matrix.setdiag(1.0 + np.abs(matrix).sum(axis=0).A1)
+
+    def fill(order: np.ndarray) -> int:
+        return splu(matrix[order][:, order].tocsc(), permc_spec="NATURAL", diag_pivot_thresh=0.0).nnz
+
+    assert fill(order) < 0.7 * fill(np.arange(nodes))
+
+
+def test_a_cut_leaves_no_edge_between_what_it_parts():
+    edges = csr_matrix(np.random.default_rng(0).uniform(size=(30, 40)) < 0.04)
+    rows, columns = _least_cover(edges)
+    assert edges[~rows][:, ~columns].nnz == 0
+    # Koenig: the least cover is as large as the largest matching.
+    assert rows.sum() + columns.sum() == (maximum_bipartite_matching(edges) >= 0).sum() > 10
 
 
 def test_a_mesh_fills_a_round_surface_and_is_finer_where_asked(ball):
@@ -262,6 +284,19 @@ def test_a_case_folder_holds_what_the_format_asks_for(solved_case, tmp_path):
     nodes = len(result["nodes"])
     assert result["displacement"].shape == (2, nodes, 3) and result["tets10"].shape[1] == 10
     assert set(result["surface_faces"].ravel()) <= set(result["surface_nodes"])
+
+
+def test_the_command_writes_a_case_that_validate_reads(solved_case, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr("studies.reference.study.solved", lambda *arguments: solved_case)
+    assert app.main(["reference", "--out", str(tmp_path / "case")]) == 0
+    assert "a coarser mesh is 0.000 mm off" in capsys.readouterr().out
+    case = load_case(tmp_path / "case")
+    np.testing.assert_allclose(case.beads, solved_case.beads, atol=1e-4)
+    np.testing.assert_allclose(case.measured, solved_case.moved_beads, atol=1e-4)
+    for pose, stage in zip(case.poses, solved_case.stages, strict=True):
+        np.testing.assert_allclose(pose[:3, 3], stage.position_mm, atol=1e-6)
+    assert (case.young_kpa, case.poisson, case.density_kg_m3, case.friction) == (15.0, 0.45, 1050.0, 0.35)
+    assert case.organ.volume == pytest.approx(solved_case.kidney.volume, rel=1e-6)
 
 
 def test_the_files_tell_one_deformation(solved_case, tmp_path):

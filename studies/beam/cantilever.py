@@ -113,7 +113,8 @@ class Cantilever:
         return StepSettings(stabilisation_iterations=0, damping=0.0, gravity=gravity, **changes)
 
     def rest(self) -> Rest:
-        """Where it comes to rest."""
+        """Where it comes to rest, from straight."""
+        self.body.restore(self.body.rest_state())
         if self.material.poisson > EASY_POISSON:
             self.model.set_material(self.material.young_kpa, EASY_POISSON)
             self._settle(REST_PASSES)
@@ -122,7 +123,7 @@ class Cantilever:
         return self._settle(REST_PASSES)
 
     def _settle(self, passes: int) -> Rest:
-        """Steps too long for inertia to matter, over-relaxed, each of twice the passes of the one before."""
+        """Steps too long for inertia to matter, over-relaxed, each of as many passes as all before it."""
         total, left = 0, np.inf
         before = self.displacement()
         while left > REST_TOLERANCE_MM and total < MOST_REST_PASSES:
@@ -140,14 +141,14 @@ class Cantilever:
         return int(np.ceil(frame_s * self.material.pressure_wave_mm_s() / (CELLS_A_STEP * self.cell_mm)))
 
     def swing(
-        self, frames: int, frame_s: float, substeps: int | None = None, passes: int = PASSES
+        self, frames: int, frame_s: float, substeps: int | None = None, passes: int | None = None
     ) -> np.ndarray:
         """Marker displacements (frames + 1, n, 3) [mm] after a release from straight, the first at the release."""
         self.body.restore(self.body.rest_state())
         step = self.settings(
             time_step_s=frame_s,
             substeps=substeps or self.substeps(frame_s),
-            iterations=passes,
+            iterations=passes or PASSES,
             relaxation_factor=1.0,
         )
         traces = [self.displacement()]

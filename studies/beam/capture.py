@@ -12,7 +12,7 @@ from scipy.signal import find_peaks
 
 COLUMNS = (
     "t_s",
-    *(f"{end}{k}_{axis}_m" for end in ("tip", "base") for k in (1, 2, 3) for axis in "xyz"),
+    *(f"tip{k}_{axis}_m" for k in (1, 2, 3) for axis in "xyz"),
 )
 # Of the capture's axes x points up: that is how the tip falls. A tip that has fallen so far was let go.
 UP = 0
@@ -32,13 +32,12 @@ class BeamError(ValueError):
 
 @dataclass(frozen=True)
 class Capture:
-    """One recording: time_s (n,), tips_mm and base_mm (n, 3 markers, 3) [mm]; load_g hangs at the tip."""
+    """One recording: time_s (n,), tips_mm (n, 3 markers, 3) [mm]; load_g hangs at the tip."""
 
     name: str
     load_g: float
     time_s: np.ndarray
     tips_mm: np.ndarray
-    base_mm: np.ndarray
 
     def height_mm(self) -> np.ndarray:
         """Mean height (n,) of the tip markers above where they are held."""
@@ -86,17 +85,17 @@ def read_capture(path: Path) -> Capture:
         raise BeamError(f"{path}: row {row + 2} has a value that is missing or no number")
     if (np.diff(table[:, 0]) <= 0).any():
         raise BeamError(f"{path}: the times in t_s do not increase")
-    markers = 1000.0 * table[:, 1:].reshape(-1, 6, 3)
-    capture = Capture(path.stem, float(load[1]) if load else 0.0, table[:, 0], markers[:, :3], markers[:, 3:])
+    tips = 1000.0 * table[:, 1:].reshape(-1, 3, 3)
+    capture = Capture(path.stem, float(load[1]) if load else 0.0, table[:, 0], tips)
     if capture.release() < 0:
         raise BeamError(f"{path}: the tip never falls by {FALLEN_MM} mm, so nothing was released")
     return capture
 
 
 def _table(path: Path) -> np.ndarray:
-    """Values (n, 19) of a recording, NaN where there is no number."""
+    """Values (n, 10) of a recording, NaN where there is no number."""
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
             missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
             if missing:
@@ -106,7 +105,7 @@ def _table(path: Path) -> np.ndarray:
             return np.array([[_number(row[name]) for name in COLUMNS] for row in reader]).reshape(
                 -1, len(COLUMNS)
             )
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise BeamError(f"{path}: cannot be read ({error})") from None
 
 
@@ -130,7 +129,7 @@ def oscillation(time_s: np.ndarray, height_mm: np.ndarray) -> Oscillation:
         inside = (time_s >= start) & (time_s <= start + WINDOW_PERIODS * period)
         if time_s[-1] < start + (WINDOW_PERIODS - 0.25) * period:
             raise BeamError(
-                f"the signal has fewer than {WINDOWS + WINDOW_PERIODS:g} periods of {period:.3g} s"
+                f"the signal has fewer than {WINDOWS + WINDOW_PERIODS - 1:g} periods of {period:.3g} s"
             )
         fits.append(_fit(time_s[inside] - start, height_mm[inside], period))
     hz = [fit[0] for fit in fits]

@@ -3,7 +3,6 @@
 from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 import numpy as np
@@ -11,16 +10,15 @@ import trimesh
 from tqdm import tqdm
 
 from studies.beam.capture import BeamError, load_captures
-from studies.beam.comparison import FRAME_S, Row, check, compare, draw, table
-from studies.commands import Fault, make_folder, start_taichi, write_json
-
-if TYPE_CHECKING:
-    pass
+from studies.beam.comparison import Row, check, compare, draw, table
+from studies.commands import Fault, make_folder, make_place, start_taichi, write_json
 
 BEAM = "beam.stl"
-# Tip markers in the frame of beam.stl [mm]: height, width, length. Balls that stand 6 mm off the surface at the free
-# end: on top, on one side, on the other (where the recordings' authors place them in their own simulation).
-MARKERS_MM = np.array([[36.0, 15.0, 100.0], [24.0, 36.0, 100.0], [6.0, -6.0, 100.0]])
+# Tip markers are balls that stand so far off the surface at the free end: on top, on one side, on the other, at these
+# shares of height and width (where the recordings' authors place them in their own simulation).
+STAND_OFF_MM = 6.0
+MARKERS = np.array([[1.0, 0.5], [0.8, 1.0], [0.2, 0.0]])
+OUTWARD = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 
 @click.command()
@@ -92,29 +90,29 @@ def run(
     size = beam_size(folder)
     if out is not None:
         make_folder(out)
-    if json_path is not None:
-        make_folder(json_path.parent, "--json")
+    make_place(json_path)
     start_taichi("cpu")
-    from studies.beam.cantilever import PASSES, REST_RELAXATION, Cantilever, Material
+    from studies.beam.cantilever import PASSES, REST_RELAXATION, REST_TOLERANCE_MM, Cantilever, Material
 
     material = Material(*values)
     groups = [list(group) for _, group in groupby(captures, key=lambda capture: capture.load_g)]
     rows: list[Row] = []
-    heights = []
+    traces = []
 
     def build(
         cell_mm: float, load_g: float, changed: Material = material, hung_mm: float | None = None
     ) -> Cantilever:
-        return Cantilever(size, changed, cell_mm, load_g, MARKERS_MM, hung_mm)
+        return Cantilever(size, changed, cell_mm, load_g, markers_on(size), hung_mm)
 
     for group in tqdm(groups, desc="beam", unit="load"):
-        row, height = compare(group, build, cell_mm)
+        row, trace = compare(group, build, cell_mm)
         rows.append(row)
-        heights.append(height)
+        traces.append(trace)
+    frame_s = float(traces[0][0, 1])
     settings: dict[str, float] = dict(
         **asdict(material),
         cell_mm=cell_mm,
-        time_step_s=FRAME_S / build(cell_mm, 0.0).substeps(FRAME_S),
+        time_step_s=frame_s / build(cell_mm, 0.0).substeps(frame_s),
         passes=PASSES,
         damping=0.0,
         rest_cell_mm=cell_mm / 2,
@@ -123,14 +121,28 @@ def run(
     )
     click.echo(", ".join(f"{name} {value:.4g}" for name, value in settings.items()))
     click.echo(table(rows))
+    for row in rows:
+        if row.rest_left_mm > REST_TOLERANCE_MM:
+            click.echo(
+                f"{row.load_g:.0f} g: not quite at rest, it moved {row.rest_left_mm:.3f} mm in the last passes"
+            )
     if checked:
-        for load in sorted({0, len(rows) - 1}):
-            click.echo(check(build, cell_mm, rows[load].load_g, heights[load]))
+        for first_or_last in sorted({0, len(rows) - 1}):
+            click.echo(check(build, cell_mm, rows[first_or_last].load_g, traces[first_or_last]))
     if json_path is not None:
         write_json(dict(settings=settings, loads=[asdict(row) for row in rows]), json_path)
     if out is not None:
-        draw(groups, heights, rows, out / "beam.png")
+        try:
+            draw(groups, traces, rows, out / "beam.png")
+        except OSError as error:
+            raise Fault(f"{out}: cannot be written to ({error.strerror}); choose another --out") from None
         click.echo(f"Wrote {out / 'beam.png'}")
+
+
+def markers_on(size_mm: np.ndarray) -> np.ndarray:
+    """Tip markers (3, 3) [mm] in the frame of beam.stl, of a beam of height, width and length (3,)."""
+    across = MARKERS * size_mm[:2] + STAND_OFF_MM * OUTWARD
+    return np.column_stack([across, np.full(len(across), size_mm[2])])
 
 
 def beam_size(folder: Path) -> np.ndarray:

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 FRAME_S = 0.01
 # Swings that are computed, in periods that beam theory expects.
 PERIODS = 5.0
+# The computed beam is looked at as often as the recorded one, or more often where it swings so fast.
+FRAMES_A_PERIOD = 10
 GRAVITY_M_S2 = 9.81
 
 
@@ -45,7 +47,8 @@ class Row:
 def theory(size_mm: np.ndarray, material: "Material", load_g: float) -> tuple[float, float]:
     """Sag [mm] of a Timoshenko cantilever, frequency [Hz] of an Euler-Bernoulli one with a mass at its tip.
 
-    Small deflections, a root that is free to change its width, and for the frequency no shear and no turning mass.
+    Small deflections, a clamped end that is free to change its width, and for the frequency no shear and no turning
+    mass.
     """
     height, width, length = 1e-3 * np.asarray(size_mm, float)
     young = 1e3 * material.young_kpa
@@ -68,7 +71,7 @@ def theory(size_mm: np.ndarray, material: "Material", load_g: float) -> tuple[fl
 def compare(
     captures: list[Capture], build: Callable[..., "Cantilever"], cell_mm: float
 ) -> tuple[Row, np.ndarray]:
-    """One load's row, and the computed height (frames,) [mm] of the markers after the release.
+    """One load's row, and time [s] and computed height [mm] of the markers after the release, shape (2, frames).
 
     ``build`` makes a beam of a cell width and a load; the rest is found on cells of half the width.
     """
@@ -76,8 +79,9 @@ def compare(
     beam = build(cell_mm=cell_mm, load_g=load_g)
     sag, theory_hz = theory(beam.size_mm, beam.material, load_g)
     rest = build(cell_mm=cell_mm / 2, load_g=load_g).rest()
-    height = beam.swing(int(np.ceil(PERIODS / theory_hz / FRAME_S)), FRAME_S)[:, :, 0].mean(axis=1)
-    computed = oscillation(FRAME_S * np.arange(len(height)), height)
+    frame_s = min(FRAME_S, 1 / (FRAMES_A_PERIOD * theory_hz))
+    trace = released(beam, int(np.ceil(PERIODS / theory_hz / frame_s)), frame_s)
+    computed = computed_oscillation(beam, trace)
     finals = [mean_length(capture.final_mm()) for capture in captures]
     swings = [measured_oscillation(capture) for capture in captures]
     hz = [swing.hz for swing in swings]
@@ -96,7 +100,23 @@ def compare(
         computed_damping_ratio=computed.damping_ratio,
         rest_left_mm=rest.left_mm,
     )
-    return row, height
+    return row, trace
+
+
+def released(
+    beam: "Cantilever", frames: int, frame_s: float, finer: int = 1, passes: int | None = None
+) -> np.ndarray:
+    """Time [s] and mean height [mm] of the markers after a release, shape (2, frames + 1)."""
+    height = beam.swing(frames, frame_s, finer * beam.substeps(frame_s), passes)[:, :, 0].mean(axis=1)
+    return np.array([frame_s * np.arange(frames + 1), height])
+
+
+def computed_oscillation(beam: "Cantilever", trace: np.ndarray) -> Oscillation:
+    """Of a computed trace (2, frames). Raises BeamError, naming the beam."""
+    try:
+        return oscillation(*trace)
+    except BeamError as error:
+        raise BeamError(f"the computed beam, E {beam.material.young_kpa:g} kPa: {error}") from None
 
 
 def mean_length(displacement_mm: np.ndarray) -> float:
@@ -135,45 +155,51 @@ def percent(value: float, reference: float) -> str:
     return f"{100 * (value / reference - 1):+6.1f}%"
 
 
-def check(build: Callable[..., "Cantilever"], cell_mm: float, load_g: float, height: np.ndarray) -> str:
-    """How much rest and frequency change with time step, passes, cells, Poisson's ratio and where the load hangs.
+def check(build: Callable[..., "Cantilever"], cell_mm: float, load_g: float, trace: np.ndarray) -> str:
+    """How much the frequency changes with time step and passes; it and the rest with cells, material and load's place.
 
-    Rests on cells as wide as those of the motion, so that lines compare.
+    Args:
+        build: makes a beam of a cell width, a load, a material and a height at which the load hangs.
+        cell_mm: of the motion; the rests are on cells as wide, so that lines compare.
+        load_g: at the tip.
+        trace: of ``compare``, shape (2, frames).
     """
     from studies.beam.cantilever import PASSES
 
-    frames = len(height) - 1
+    frames, frame_s = trace.shape[1] - 1, float(trace[0, 1])
 
-    def line(name: str, beam: "Cantilever", finer: int = 1, passes: int = PASSES) -> str:
-        trace = beam.swing(frames, FRAME_S, finer * beam.substeps(FRAME_S), passes)[:, :, 0].mean(axis=1)
-        hz = oscillation(FRAME_S * np.arange(frames + 1), trace).hz
-        return f"  {name:32s} {mean_length(beam.rest().displacement_mm):8.3f} mm  {hz:7.4f} Hz"
+    def line(name: str, beam: "Cantilever", trace: np.ndarray, rest: bool = True) -> str:
+        sag = f"{mean_length(beam.rest().displacement_mm):8.3f} mm" if rest else " " * 11
+        return f"  {name:32s} {sag}  {computed_oscillation(beam, trace).hz:7.4f} Hz"
+
+    def changed_line(name: str, beam: "Cantilever") -> str:
+        return line(name, beam, released(beam, frames, frame_s))
 
     beam = build(cell_mm=cell_mm, load_g=load_g)
     lines = [
         f"What the settings change, {load_g:.0f} g, cells of {cell_mm:g} mm:",
-        line("as above", beam),
-        line("half the time step", beam, finer=2),
-        line("twice the passes", beam, passes=2 * PASSES),
+        line("as above", beam, trace),
+        line("half the time step", beam, released(beam, frames, frame_s, finer=2), rest=False),
+        line("twice the passes", beam, released(beam, frames, frame_s, passes=2 * PASSES), rest=False),
     ]
     for poisson in (0.45, 0.49):
-        changed = replace(beam.material, poisson=poisson)
-        lines.append(line(f"Poisson's ratio {poisson:g}", build(cell_mm, load_g, changed)))
-    changed = replace(beam.material, poisson=0.45)
-    lines.append(line(f"0.45 on cells of {cell_mm / 2:g} mm", build(cell_mm / 2, load_g, changed)))
+        material = replace(beam.material, poisson=poisson)
+        lines.append(changed_line(f"Poisson's ratio {poisson:g}", build(cell_mm, load_g, material)))
+    material = replace(beam.material, poisson=0.45)
+    lines.append(changed_line(f"0.45 on cells of {cell_mm / 2:g} mm", build(cell_mm / 2, load_g, material)))
     if load_g > 0:
         middle = beam.size_mm[0] / 2
-        lines.append(line("load across the end's middle", build(cell_mm, load_g, hung_mm=middle)))
+        lines.append(changed_line("load across the end's middle", build(cell_mm, load_g, hung_mm=middle)))
     return "\n".join(lines)
 
 
-def draw(groups: list[list[Capture]], heights: list[np.ndarray], rows: list[Row], path: Path) -> None:
-    """Tip height against time, measured and computed, a panel a load."""
+def draw(groups: list[list[Capture]], traces: list[np.ndarray], rows: list[Row], path: Path) -> None:
+    """Tip height against time, measured and computed, a panel a load. Raises OSError."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 3.2 * len(rows)), layout="constrained")
     axes = figure.subplots(len(rows), squeeze=False)[:, 0]
-    for axis, captures, height, row in zip(axes, groups, heights, rows, strict=True):
+    for axis, captures, trace, row in zip(axes, groups, traces, rows, strict=True):
         for capture in captures:
             first = capture.release()
             axis.plot(
@@ -181,8 +207,8 @@ def draw(groups: list[list[Capture]], heights: list[np.ndarray], rows: list[Row]
                 capture.height_mm()[first:],
                 label=capture.name,
             )
-        axis.plot(FRAME_S * np.arange(len(height)), height, "k--", lw=1, label="computed, undamped")
-        axis.set_xlim(0, 1.2 * FRAME_S * len(height))
+        axis.plot(*trace, "k--", lw=1, label="computed, undamped")
+        axis.set_xlim(0, 1.2 * trace[0, -1])
         axis.set_ylabel("tip height, mm")
         axis.set_title(
             f"{row.load_g:.0f} g at the tip: measured {row.measured_hz:.2f} Hz, computed {row.computed_hz:.2f} Hz",

@@ -1,10 +1,11 @@
 """The reference as a case folder, which `validate` reads.
 
-The format is that of the virtual bead experiments that the project is judged on: case.toml, kidney.stl,
-support.stl, beads.csv and result.npz; lengths mm, forces N, z up, the kidney's centre of mass at the origin.
+The format is version 1 of what studies/case.py reads: case.toml, kidney.stl, support.stl, beads.csv, and for a look at
+the solution result.npz; lengths mm, forces N, z up, the kidney's centre of mass at the origin.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -33,10 +34,13 @@ class Case:
     press: Press
     friction: float
     stages: list[Stage]
-    mesh: dict  # how it was made and how good it is, for case.toml's [fem]
+    mesh: dict  # how it was made, for case.toml's [fem]
     provenance: dict
+    to_coarser_mm: np.ndarray | None = (
+        None  # how far the beads are from a coarser mesh's, shape (stages, beads)
+    )
 
-    @property
+    @cached_property
     def moved_beads(self) -> np.ndarray:
         """Where the beads are at each stage [mm], shape (stages, beads, 3)."""
         nodes, shares = self.solid.shares_at(self.beads)
@@ -61,14 +65,15 @@ class Case:
             f"mesh      {len(self.solid.nodes_of)} tetrahedra of 10 nodes, {len(self.solid.rest)} nodes; "
             f"{self.mesh['time_s']:.0f} s"
         ]
-        difference = self.mesh["bead_difference_to_coarser_mesh_mean_mm"]
-        most = self.mesh["bead_difference_to_coarser_mesh_max_mm"]
-        for stage, beads, mean, largest in zip(self.stages, self.moved_beads, difference, most, strict=True):
+        for index, (stage, beads) in enumerate(zip(self.stages, self.moved_beads, strict=True)):
             moved = np.linalg.norm(beads - self.moved_beads[0], axis=1).mean()
             lines.append(
                 f"{stage.indentation_mm:5.2f} mm  beads moved {moved:.2f} mm in the mean, press "
-                f"{-stage.probe_force_n[2]:.2f} N; to a coarser mesh {mean:.3f} mm, at most {largest:.3f}"
+                f"{abs(stage.probe_force_n[2]):.2f} N"
             )
+            if self.to_coarser_mm is not None:
+                apart = self.to_coarser_mm[index]
+                lines[-1] += f"; a coarser mesh is {apart.mean():.3f} mm off, {apart.max():.3f} at most"
         return "\n".join(lines)
 
     def description(self) -> dict:
@@ -138,13 +143,24 @@ class Case:
                 "tets": len(self.solid.nodes_of),
                 "nodes": len(self.solid.rest),
                 "newton_residual_at_stages_max": max(stage.residual for stage in self.stages),
-                "min_det_F": _rounded(min(self.solid.least_stretch(s.displacement_mm) for s in self.stages)),
+                "min_det_F": _rounded(
+                    min(self.solid.least_volume_ratio(s.displacement_mm) for s in self.stages)
+                ),
                 "stage_volume_ratio": [
                     _rounded(self.solid.volume_ratio(s.displacement_mm)) for s in self.stages
                 ],
                 **self.mesh,
+                **self._mesh_error(),
             },
             "provenance": self.provenance,
+        }
+
+    def _mesh_error(self) -> dict:
+        if self.to_coarser_mm is None:
+            return {}
+        return {
+            "bead_difference_to_coarser_mesh_mean_mm": _rounded(self.to_coarser_mm.mean(axis=1)),
+            "bead_difference_to_coarser_mesh_max_mm": _rounded(self.to_coarser_mm.max(axis=1)),
         }
 
     def _stage(self, index: int, from_first: np.ndarray) -> dict:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import click
 import numpy as np
+import trimesh
 
 from scenes.anatomy import load_anatomy
 from scenes.scene import EMBEDDED, load_scene
@@ -25,6 +26,7 @@ def reference(out: Path, edge_mm: float) -> None:
     make_folder(out)
     try:
         from studies.reference.equilibrium import NotConvergedError
+        from studies.reference.solid import MeshError
         from studies.reference.study import Sizes, make_reference
     except ImportError as error:
         raise Fault(
@@ -32,9 +34,15 @@ def reference(out: Path, edge_mm: float) -> None:
         ) from None
     scene = load_scene(EMBEDDED)
     anatomy = load_anatomy(scene, EMBEDDED.parent)
+    support = anatomy.shapes[0]
+    assert isinstance(support, trimesh.Trimesh)
     try:
-        case = make_reference(anatomy, np.array(scene.gravity.direction), Sizes(edge_mm), click.echo)
-    except (ValueError, NotConvergedError) as error:
+        gravity = np.array(scene.gravity.direction)
+        case = make_reference(anatomy.organ, support, gravity, Sizes(edge_mm), click.echo)
+    except (MeshError, NotConvergedError) as error:
         raise Fault(f"no reference with edges of {edge_mm:g} mm: {error}; try another --edge") from None
-    case.write(out)
+    try:
+        case.write(out)
+    except OSError as error:
+        raise Fault(f"{out}: cannot be written to ({error.strerror}); choose another --out") from None
     click.echo(case.summary())

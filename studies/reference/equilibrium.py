@@ -9,10 +9,10 @@ from studies.reference.contact import Contact
 from studies.reference.linear import dissected, solved
 from studies.reference.solid import Solid
 
-LEAST_STRETCH = 0.05
-SEARCHES = 6
-# Of the tethers that let a body find its way: how much looser or tighter from one to the next, when, and how many.
-LOOSER, EASY_ITERATIONS, TETHERED_ITERATIONS, MOST_TETHERS = 4.0, 6, 12, 80
+LEAST_VOLUME_RATIO = 0.05
+SEARCHES, LEAST_REACH = 6, 1e-6
+# Tethers that let a body find its way: each tighter or looser by a factor than the one before, as its iterations tell.
+TETHER_FACTOR, EASY_ITERATIONS, TETHERED_ITERATIONS, MOST_TETHERS = 4.0, 6, 12, 80
 # Their steps are found to within this, and to within this share of what was left.
 TETHERED_TOLERANCE, LESS = 1e-4, 0.1
 
@@ -98,8 +98,8 @@ class Equilibrium:
         Raises:
             NotConvergedError: no equilibrium was found.
         """
-        if self.solid.least_stretch(guess) <= 0:
-            raise NotConvergedError("the guess turns tissue inside out")
+        if self.solid.least_volume_ratio(guess) <= LEAST_VOLUME_RATIO:
+            raise NotConvergedError("the guess turns tissue inside out, or nearly")
         state, balance = guess, self.balance(guess)
         least = np.inf
         for iteration in range(most + 1):
@@ -112,7 +112,7 @@ class Equilibrium:
     def relaxed(
         self, state: np.ndarray, tolerance: float, tether_kpa_mm2: float
     ) -> tuple[np.ndarray, float, int]:
-        """Where a body that is out of balance goes by itself: steps of slow motion, the longer the nearer it is.
+        """Where a body that is out of balance goes by itself: steps of slow motion, longer while they come easily.
 
         Pseudo-transient continuation (Kelley & Keyes, SIAM J. Numer. Anal. 35, 1998): each step is tethered to where
         the last one ended, and so is found even where the body jumps. Friction's anchors are carried along.
@@ -135,7 +135,7 @@ class Equilibrium:
             try:
                 state, _, iterations = self.solve(state, wanted, most=TETHERED_ITERATIONS)
             except NotConvergedError:
-                tether_kpa_mm2 *= LOOSER
+                tether_kpa_mm2 *= TETHER_FACTOR
                 continue
             finally:
                 self.tether_kpa_mm2 = 0.0
@@ -145,7 +145,7 @@ class Equilibrium:
             if left <= tolerance:
                 return state, left, step
             if iterations <= EASY_ITERATIONS:
-                tether_kpa_mm2 /= LOOSER
+                tether_kpa_mm2 /= TETHER_FACTOR
         raise NotConvergedError(f"no rest after {MOST_TETHERS} tethered steps")
 
     def _newton_step(self, state: np.ndarray, balance: Balance) -> np.ndarray:
@@ -178,8 +178,10 @@ class Equilibrium:
         Structures* 1, 1991, section 9.2.2).
         """
         reach = 1.0
-        while self.solid.least_stretch(state + reach * step) <= LEAST_STRETCH:
+        while self.solid.least_volume_ratio(state + reach * step) <= LEAST_VOLUME_RATIO:
             reach /= 2
+            if reach < LEAST_REACH:
+                raise NotConvergedError("the way on turns tissue inside out")
         low, high = 0.0, np.inf
         work_low = before = self._work(state, step)[0]
         work_high = 0.0

@@ -12,7 +12,7 @@ import trimesh
 from skfem import MeshTet2
 
 from studies.reference.contact import Contact, Law, Surface
-from studies.reference.equilibrium import Equilibrium, NotConvergedError
+from studies.reference.equilibrium import LEAST_VOLUME_RATIO, Equilibrium, NotConvergedError
 from studies.reference.obstacles import FAR_MM, DistanceField, RoundedBox
 from studies.reference.solid import Material, Solid
 
@@ -142,7 +142,9 @@ class Experiment:
             if after - path.depth_mm > LEAST_INCREMENT_MM:
                 path.step_mm = (after - path.depth_mm) / 2
                 return self._advance(path, goal)
-            solved, residual, steps = self.equilibrium.relaxed(guess, tolerance, JUMPING_KPA_MM2)
+            sound = self.solid.least_volume_ratio(guess) > LEAST_VOLUME_RATIO
+            start = guess if sound else path.state
+            solved, residual, steps = self.equilibrium.relaxed(start, tolerance, JUMPING_KPA_MM2)
             path.jump(solved, after)
         else:
             self._carry(solved)
@@ -181,6 +183,8 @@ class Experiment:
         # It cannot touch before it has gone as far as it is away.
         while (gap := self.probe.gaps(state).min()) > TOUCHING_MM:
             height -= gap
+            if height < self.probe.surface.points(state)[:, 2].min():
+                raise NotConvergedError("the transducer does not press on the kidney")
             self._move_probe(height)
         return height
 

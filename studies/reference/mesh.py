@@ -13,6 +13,7 @@ from mmgpy import MmgMesh3D
 from skfem import Basis, ElementTetP2, MeshTet, MeshTet2
 
 from studies.reference.obstacles import signed_distance
+from studies.reference.solid import MeshError
 
 GRID_MM = 3.0
 CHORD_OF_SIZE = 0.05
@@ -31,7 +32,7 @@ def tetrahedra(surface: trimesh.Trimesh, size_mm: Callable[[np.ndarray], np.ndar
         The mesh [mm]; all its nodes on the boundary lie on the surface.
 
     Raises:
-        ValueError: the mesh does not fill the surface.
+        MeshError: Mmg fails, or its mesh does not fill the surface.
     """
     axes = [
         np.linspace(low, high, int(np.ceil((high - low) / GRID_MM)) + 1)
@@ -42,18 +43,21 @@ def tetrahedra(surface: trimesh.Trimesh, size_mm: Callable[[np.ndarray], np.ndar
     sizes = size_mm(nodes)
     remesher = MmgMesh3D(nodes, np.ascontiguousarray(grid.t.T, np.int32))
     remesher.set_field("metric", np.ascontiguousarray(sizes[:, None]))
-    remesher.remesh_levelset(
-        signed_distance(surface, nodes)[:, None],
-        hausd=CHORD_OF_SIZE * float(sizes.max()),
-        hgrad=GRADATION,
-        hmin=0.5 * float(sizes.min()),
-        hmax=1.5 * float(sizes.max()),
-        verbose=-1,
-    )
+    try:
+        remesher.remesh_levelset(
+            signed_distance(surface, nodes)[:, None],
+            hausd=CHORD_OF_SIZE * float(sizes.max()),
+            hgrad=GRADATION,
+            hmin=0.5 * float(sizes.min()),
+            hmax=1.5 * float(sizes.max()),
+            verbose=-1,
+        )
+    except RuntimeError as error:
+        raise MeshError(str(error)) from None
     mesh = _curved(_inside(remesher, surface), surface)
     volume = Basis(mesh, ElementTetP2(), intorder=3).dx.sum()
     if abs(volume / surface.volume - 1) > VOLUME_ERROR:
-        raise ValueError(
+        raise MeshError(
             f"the mesh holds {volume:.0f} of {surface.volume:.0f} mm^3: too coarse for this surface"
         )
     return mesh

@@ -32,6 +32,10 @@ class Material:
         return self.young_kpa * self.poisson / ((1 + self.poisson) * (1 - 2 * self.poisson))
 
 
+class MeshError(ValueError):
+    """Why a mesh does not make a body, in one line."""
+
+
 class Solid:
     """A body at rest, free of stress, and the forces of its deformation.
 
@@ -48,7 +52,7 @@ class Solid:
         self.rest = np.ascontiguousarray(self.basis.doflocs.T)
         scale = self.basis.mapping.detDF(self.basis.X)
         if (scale.min(axis=1) * scale.max(axis=1) <= 0).any():
-            raise ValueError("a curved tetrahedron of the mesh is folded over")
+            raise MeshError("a curved tetrahedron of the mesh is folded over")
         self.nodes_of = np.ascontiguousarray(self.basis.element_dofs.T)
         self._weights = np.ascontiguousarray(self.basis.dx)
         # (10, 3, tets, points) -> (tets, points, 10, 3)
@@ -62,8 +66,8 @@ class Solid:
         moved = displacement[self.nodes_of].transpose(0, 2, 1)[:, None]
         return np.eye(3) + moved @ self._gradients
 
-    def least_stretch(self, displacement: np.ndarray) -> float:
-        """Least det F of all Gauss points; not positive: tissue turned inside out."""
+    def least_volume_ratio(self, displacement: np.ndarray) -> float:
+        """Least det F of all Gauss points; not positive where tissue is turned inside out."""
         return float(np.linalg.det(self.deformation(displacement)).min())
 
     def volume_ratio(self, displacement: np.ndarray) -> float:

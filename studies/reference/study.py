@@ -1,14 +1,13 @@
 """Make the reference: the embedded patient's kidney on its support, solved on two meshes."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
 import trimesh
 from skfem import MeshTet2
 
-from scenes.anatomy import LoadedAnatomy
 from studies.reference.case import Case
 from studies.reference.experiment import FRICTION, Experiment, Press
 from studies.reference.mesh import tetrahedra
@@ -36,7 +35,7 @@ class Sizes:
         return Sizes(COARSER * self.near_mm)
 
     def mesh(self, kidney: trimesh.Trimesh, press: Press) -> MeshTet2:
-        """Tetrahedra that fill the kidney, fine where the transducer touches it. Raises ValueError."""
+        """Tetrahedra that fill the kidney, fine where the transducer touches it. Raises MeshError."""
         box = RoundedBox(np.array(press.size_mm), press.edge_mm)
         beside = np.abs(kidney.vertices[:, :2] - press.over_mm) - np.array(press.size_mm[:2]) / 2
         top = kidney.vertices[(beside <= 0).all(axis=1), 2].max()
@@ -50,32 +49,30 @@ class Sizes:
 
 
 def make_reference(
-    anatomy: LoadedAnatomy, gravity: np.ndarray, sizes: Sizes, report: Callable[[str], None]
+    organ: trimesh.Trimesh,
+    mould: trimesh.Trimesh,
+    gravity: np.ndarray,
+    sizes: Sizes,
+    report: Callable[[str], None],
 ) -> Case:
     """The case of the embedded patient, solved on a mesh and, for its error, on a coarser one.
 
     Args:
-        anatomy: organ and moulded support, in LPS [mm].
+        organ: its surface in LPS [mm].
+        mould: the support's surface in LPS [mm].
         gravity: its direction in LPS, shape (3,).
         sizes: of the mesh that the case is made of.
         report: told what happens, a line at a time.
 
     Raises:
-        ValueError: no mesh fills the organ.
+        MeshError: no mesh fills the organ.
         NotConvergedError: no equilibrium was found.
     """
-    mould = anatomy.shapes[0] if anatomy.shapes else None
-    if not isinstance(mould, trimesh.Trimesh):
-        raise ValueError("the scene's first shape is no surface to lay the organ in")
-    kidney, support = laid(anatomy.organ, gravity, anatomy.organ), laid(mould, gravity, anatomy.organ)
+    kidney, support = laid(organ, gravity, organ), laid(mould, gravity, organ)
     beads = blue_noise(kidney)
     coarse = solved(kidney, support, beads, sizes.coarser(), report)
     case = solved(kidney, support, beads, sizes, report)
-    apart = np.linalg.norm(case.moved_beads - coarse.moved_beads, axis=2)
-    case.mesh["coarser_mesh_nodes"] = len(coarse.solid.rest)
-    case.mesh["bead_difference_to_coarser_mesh_mean_mm"] = apart.mean(axis=1).round(4).tolist()
-    case.mesh["bead_difference_to_coarser_mesh_max_mm"] = apart.max(axis=1).round(4).tolist()
-    return case
+    return replace(case, to_coarser_mm=np.linalg.norm(case.moved_beads - coarse.moved_beads, axis=2))
 
 
 def solved(
