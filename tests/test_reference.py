@@ -8,9 +8,6 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.optimize import brentq
-from scipy.sparse import csc_matrix, csr_matrix
-from scipy.sparse.csgraph import maximum_bipartite_matching
-from scipy.sparse.linalg import splu
 from skfem import LinearForm, MeshTet, MeshTet2
 
 import app
@@ -19,7 +16,6 @@ from studies.reference.case import Case
 from studies.reference.contact import Contact, Law, Surface
 from studies.reference.equilibrium import Equilibrium, NotConvergedError
 from studies.reference.experiment import Experiment, Press
-from studies.reference.linear import _least_cover, dissected
 from studies.reference.mesh import tetrahedra
 from studies.reference.obstacles import DistanceField, Plane, RoundedBox
 from studies.reference.solid import Material, Solid
@@ -169,30 +165,6 @@ def test_friction_of_a_block_that_slides_is_coulombs():
     # left between them falls with each increment, and its cosine is lost from the sum.
     assert ratios[-1] == pytest.approx(0.35, abs=1e-3)
     assert max(ratios) <= 0.35 * (1 + 1e-9)
-
-
-def test_the_order_of_elimination_holds_every_node_once_and_leaves_little_fill():
-    solid = cube(4)
-    nodes = len(solid.rest)
-    order = dissected(solid.rest, solid.nodes_of)
-    np.testing.assert_array_equal(np.sort(order), np.arange(nodes))
-    size = solid.nodes_of.shape[1]
-    rows, columns = np.repeat(solid.nodes_of, size, axis=1).ravel(), np.tile(solid.nodes_of, size).ravel()
-    matrix = csc_matrix((np.full(len(rows), -1.0), (rows, columns)), shape=(nodes, nodes))
-    matrix.setdiag(1.0 + np.abs(matrix).sum(axis=0).A1)
-
-    def fill(order: np.ndarray) -> int:
-        return splu(matrix[order][:, order].tocsc(), permc_spec="NATURAL", diag_pivot_thresh=0.0).nnz
-
-    assert fill(order) < 0.7 * fill(np.arange(nodes))
-
-
-def test_a_cut_leaves_no_edge_between_what_it_parts():
-    edges = csr_matrix(np.random.default_rng(0).uniform(size=(30, 40)) < 0.04)
-    rows, columns = _least_cover(edges)
-    assert edges[~rows][:, ~columns].nnz == 0
-    # Koenig: the least cover is as large as the largest matching.
-    assert rows.sum() + columns.sum() == (maximum_bipartite_matching(edges) >= 0).sum() > 10
 
 
 def test_a_mesh_fills_a_round_surface_and_is_finer_where_asked(ball):

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csc_matrix
+from scipy.sparse.linalg import splu
 
 from studies.reference.contact import Contact
-from studies.reference.linear import dissected, solved
 from studies.reference.solid import Solid
 
 LEAST_VOLUME_RATIO = 0.05
@@ -56,10 +56,7 @@ class Equilibrium:
         self.solid, self.contacts, self.load = solid, contacts, load
         self.fixed = np.zeros(load.shape, bool) if fixed is None else fixed
         self.tether_kpa_mm2, self.tethered_to = 0.0, np.zeros_like(solid.rest)
-        free = ~self.fixed.ravel()
-        order = dissected(solid.rest, solid.nodes_of)
-        order = (3 * order[:, None] + np.arange(3)).ravel()
-        self._order = order[free[order]]
+        self._free = np.flatnonzero(~self.fixed.ravel())
 
     def balance(self, displacement: np.ndarray) -> Balance:
         """Forces left over at displacements [mm], shape (nodes, 3)."""
@@ -149,10 +146,21 @@ class Equilibrium:
         raise NotConvergedError(f"no rest after {MOST_TETHERS} tethered steps")
 
     def _newton_step(self, state: np.ndarray, balance: Balance) -> np.ndarray:
+        matrix = self.tangent(state)[self._free][:, self._free].tocsc()
         try:
-            step = solved(self.tangent(state), -balance.residual.ravel(), self._order)
+            # The order is made for little fill: pivots stay on the diagonal unless they vanish.
+            factor = splu(
+                matrix,
+                permc_spec="MMD_AT_PLUS_A",
+                diag_pivot_thresh=1e-3,
+                options=dict(SymmetricMode=True),
+            )
         except RuntimeError as error:
             raise NotConvergedError(str(error)) from None
+        step = np.zeros(state.size)
+        step[self._free] = factor.solve(-balance.residual.ravel()[self._free])
+        if not np.isfinite(step).all():
+            raise NotConvergedError("the system is singular")
         return step.reshape(state.shape)
 
     def _searched(self, state: np.ndarray, balance: Balance, step: np.ndarray) -> tuple[np.ndarray, Balance]:
