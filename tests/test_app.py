@@ -198,13 +198,12 @@ def test_import_refuses_in_one_line_too(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "ct, labels",
+    "ct, labels, side",
     [
-        ("crlm_1004", "crlm_1004_labels/kidneys_provisional.nii.gz"),
-        ("totalseg/ct.nii.gz", "totalseg/kidneys.nii.gz"),
+        ("crlm_1004", "crlm_1004_labels/kidneys_provisional.nii.gz", "left"),
+        ("totalseg/ct.nii.gz", "totalseg/kidneys.nii.gz", "right"),
     ],
 )
-@pytest.mark.parametrize("side", ["left", "right"])
 def test_real_kidneys_come_in_and_give_way(data, tmp_path, ct, labels, side):
     patient = tmp_path / "patient"
     done = run("import", data / "ct" / ct, data / "ct" / labels, "--side", side, "--out", patient)
