@@ -1,6 +1,7 @@
 """The beam: recordings read and measured, and the clamped model against beam theory and the recordings."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -138,12 +139,19 @@ def test_the_command_compares_draws_and_reports(tmp_path, capsys):
     trimesh.creation.box(bounds=[[0, 0, 0], [20, 20, 60]]).export(tmp_path / "beam.stl")
     save(tmp_path / "beam_gravity_a.csv", recording())
     out, report = tmp_path / "out", tmp_path / "beam.json"
-    assert main(["beam", str(tmp_path), "--poisson", "0.3", "--json", str(report), "--out", str(out)]) == 0
+    files = ["--json", str(report), "--out", str(out)]
+    assert main(["beam", str(tmp_path), "--poisson", "0.3", "--check", *files]) == 0
     assert (out / "beam.png").stat().st_size > 10_000
     row = json.loads(report.read_text())["loads"][0]
     assert row["measured_hz"] == pytest.approx(7.0, abs=0.01)
     assert row["computed_hz"] == pytest.approx(row["theory_hz"], rel=0.1)
-    assert "first frequency" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "first frequency" in printed
+    as_above = re.search(r"as above +([\d.]+) mm +([\d.]+) Hz", printed)
+    assert float(as_above[2]) == pytest.approx(row["computed_hz"], abs=1e-4)
+    # Rests on cells twice as wide as the row's: stiffer in bending by the hourglass term, 5% with two cells in the height.
+    assert float(as_above[1]) == pytest.approx(row["computed_mm"], rel=0.1)
+    assert all(f"  {name}  " in printed for name in ("half the time step", "twice the passes"))
 
 
 def test_cells_that_do_not_fill_the_beam_are_refused(device):
