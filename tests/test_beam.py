@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from conftest import rotation_about
 
 from app import main
 from sim.neo_hookean import HOURGLASS
@@ -133,6 +134,15 @@ def test_markers_stand_where_the_recordings_have_them():
     # By hand for the beam of 30 x 30 x 100 mm.
     markers = markers_on(np.array([30.0, 30.0, 100.0]))
     np.testing.assert_allclose(markers, [[36, 15, 100], [24, 36, 100], [6, -6, 100]])
+
+
+def test_markers_turn_with_the_end_that_they_stand_on(device):
+    size = np.array([30.0, 30.0, 100.0])
+    beam = Cantilever(size, Material(263.8, 0.45, 1.07), 10.0, 0.0, markers_on(size))
+    turn = rotation_about([0.3, 1.0, 0.2], 25.0)
+    beam.body.position.from_numpy((beam.body.rest_points @ turn.T).astype(np.float32))
+    # float32 keeps some 1e-5 of 100 mm.
+    np.testing.assert_allclose(beam.displacement(), beam.markers @ turn.T - beam.markers, atol=1e-4)
 
 
 def test_the_command_compares_draws_and_reports(tmp_path, capsys):
