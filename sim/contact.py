@@ -12,6 +12,8 @@ KEEP_OUT_SWEEPS = 8
 REACH_RADII = 2.0
 # Float32 positions of a body of 200 mm carry about 1e-5 mm; distances are compared with room for that.
 ROUNDING = 1e-4
+# A plane is as good as the shape itself as far as this around where it was found: curved with a radius of 2 mm, it is off by ROUNDING.
+EXACT_MM = 0.02
 SAFETY = 1e-3
 
 
@@ -19,7 +21,9 @@ SAFETY = 1e-3
 class ShapeContacts:
     """Contact planes of each particle with each shape, and the push that each has given in this substep.
 
-    ``plane`` (shapes, n): normal and offset of n . x >= offset [mm]. ``push`` (shapes, n): friction (x, y, z) and
+    ``plane`` (n, shapes): normal and offset of the nearest surface, n . x = offset [mm]; of a shape that does not move
+    it is kept while the particle stays near to where it was ``found`` (n, shapes), a point and its distance [mm].
+    ``touched`` (n,): bits of the shapes that may be touched in this substep. ``push`` (n, shapes): friction (x, y, z) and
     normal (w) displacement so far [mm]. As the clusters keep momentum, the sums of the pushes are the impulses
     exchanged with the shape, so Coulomb's law holds for them: |friction| <= coefficient * normal. A coefficient of 0
     takes no memory for pushes and no time.
@@ -31,13 +35,13 @@ class ShapeContacts:
         self.friction = friction
         self.rough = friction > 0
         self.margin = body.radius_mm / 2
-        # A mesh knows no distances beyond its reach, so "farther than that" is all that can be remembered.
+        self.fresh = body.radius_mm / 4
+        # A shape knows no distances beyond its reach, so "farther than that" is all that can be remembered.
         self.reach = REACH_RADII * body.radius_mm
-        self.plane = ti.Vector.field(4, ti.f32, (len(shapes), body.count))
-        if self.rough:
-            self.push = ti.Vector.field(4, ti.f32, (len(shapes), body.count))
+        parts = {"plane": tm.vec4, "push": tm.vec4} if self.rough else {"plane": tm.vec4}
+        self.contact = ti.Struct.field(parts, shape=(body.count, len(shapes)))
         self.touched = ti.field(ti.i32, body.count)
-        self.found = ti.Vector.field(4, ti.f32, (len(shapes), body.count))
+        self.found = ti.Vector.field(4, ti.f32, (body.count, len(shapes)))
         self.forget()
         self.penetration = ti.field(ti.f32, ())
 
@@ -46,81 +50,107 @@ class ShapeContacts:
         self.found.fill(-FAR)
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """What it carries from step to step: nothing, as distances only save time."""
-        return {}
+        """What it carries from step to step: planes, and where they were found."""
+        return dict(plane=self.contact.plane.to_numpy(), found=self.found.to_numpy())
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Go on after a snapshot."""
-        self.forget()
+        """Go back to a snapshot; the steps that follow give the same bits."""
+        self.contact.plane.from_numpy(state["plane"])
+        self.found.from_numpy(state["found"])
 
     @ti.func
     def is_clear(self, s: ti.template(), i, p, distance):
-        """Whether p is farther than a distance from shape s, by what was last measured there (``found``)."""
-        known = self.found[s, i]
-        return known.w - (p - known.xyz).norm() > distance + SAFETY
+        """Whether it is known at once that p, where particle i is, is farther than a distance from shape s."""
+        result = False
+        if ti.static(self.shapes[s].moves):
+            result = self.shapes[s].is_beyond(p, distance)
+        else:
+            known = self.found[i, s]
+            room = known.w - distance - SAFETY
+            result = room > 0.0 and (p - known.xyz).norm_sqr() < room * room
+        return result
+
+    @ti.func
+    def nearest(self, s: ti.template(), i, p, fresh: float):
+        """Normal and distance of shape s from p, where particle i is; from memory if it was measured within ``fresh`` [mm]."""
+        result = tm.vec4(0.0)
+        if ti.static(self.shapes[s].moves):
+            result = self.shapes[s].surface(p)
+        else:
+            if (p - self.found[i, s].xyz).norm_sqr() > fresh * fresh:
+                near = self.shapes[s].surface(p)
+                self.found[i, s] = tm.vec4(p, ti.min(near.w, self.reach))
+                self.contact[i, s].plane = tm.vec4(
+                    near.xyz, near.xyz.dot(p) - near.w + self.body.contact_radius[i]
+                )
+            plane = self.contact[i, s].plane
+            result = tm.vec4(plane.xyz, plane.xyz.dot(p) - plane.w + self.body.contact_radius[i])
+        return result
 
     @ti.func
     def find(self):
-        """Lines 6-9: the plane of each shape that a particle's estimate is near to."""
+        """Lines 6-9: the shapes that each particle's estimate is near to."""
         for i in range(self.body.count):
             p = self.body.estimate[i]
-            radius = self.body.contact_radius[i]
+            reach = self.body.contact_radius[i] + self.margin
             touched = 0
             for s in ti.static(range(len(self.shapes))):
-                plane = tm.vec4(0.0, 0.0, 0.0, -FAR)
-                if ti.static(self.shapes[s].moves) or not self.is_clear(s, i, p, radius + self.margin):
-                    near = self.shapes[s].surface(p)
-                    self.found[s, i] = tm.vec4(p, ti.min(near.w, self.reach))
-                    if near.w < radius + self.margin:
-                        plane = tm.vec4(near.xyz, near.xyz.dot(p) - near.w + radius)
-                        touched += 1
-                self.plane[s, i] = plane
-                if ti.static(self.rough):
-                    self.push[s, i] = tm.vec4(0.0)
+                if not self.is_clear(s, i, p, reach):
+                    near = self.nearest(s, i, p, self.fresh)
+                    if near.w < reach:
+                        touched |= 1 << s
+                        if ti.static(self.shapes[s].moves):
+                            self.contact[i, s].plane = tm.vec4(
+                                near.xyz, near.xyz.dot(p) - near.w + self.body.contact_radius[i]
+                            )
+                        if ti.static(self.rough):
+                            self.contact[i, s].push = tm.vec4(0.0)
             self.touched[i] = touched
 
     @ti.func
-    def stabilise(self):
-        """Lines 11-14: move positions and estimates alike out of what they start in, which adds no velocity."""
-        for i in range(self.body.count):
-            if self.touched[i] > 0:
-                x = self.body.position[i]
-                change, active = tm.vec3(0.0), 0
-                for s in ti.static(range(len(self.shapes))):
-                    plane = self.plane[s, i]
-                    depth = plane.w - plane.xyz.dot(x)
-                    if depth > 0.0:
-                        change += depth * plane.xyz
-                        active += 1
-                if active > 0:
-                    change /= ti.cast(active, ti.f32)
-                    self.body.position[i] = x + change
-                    self.body.estimate[i] += change
+    def depth(self, s: ti.template(), i, x):
+        """How deep particle i, at x, is in the plane of shape s [mm]; less than 0 outside."""
+        plane = self.contact[i, s].plane
+        depth = plane.w - plane.xyz.dot(x)
+        return depth if (self.touched[i] >> s) & 1 else -FAR
 
     @ti.func
-    def project(self, relaxation_factor: float):
-        """Lines 18-20 for the contact group: pushes out of the shapes with their friction, averaged over the shapes."""
+    def stabilise(self, iterations: int):
+        """Lines 10-15: move positions and estimates alike out of what they start in, which adds no velocity."""
         for i in range(self.body.count):
             if self.touched[i] > 0:
-                x = self.body.estimate[i]
-                change, active = tm.vec3(0.0), 0
-                for s in ti.static(range(len(self.shapes))):
-                    plane = self.plane[s, i]
-                    depth = ti.max(plane.w - plane.xyz.dot(x), 0.0)
-                    pushed = depth > 0.0
+                x, moved = self.body.position[i], tm.vec3(0.0)
+                for _ in range(iterations):
+                    change, active = tm.vec3(0.0), 0
+                    for s in ti.static(range(len(self.shapes))):
+                        depth = self.depth(s, i, x + moved)
+                        if depth > 0.0:
+                            change += depth * self.contact[i, s].plane.xyz
+                            active += 1
+                    moved += change / ti.cast(ti.max(active, 1), ti.f32)
+                self.body.position[i] = x + moved
+                self.body.estimate[i] = self.body.estimate[i] + moved
+
+    @ti.func
+    def pushed(self, i, x, relaxation_factor: float):
+        """How far the shapes push particle i, at x, with their friction, averaged over the shapes [mm] (lines 18-20)."""
+        change, active = tm.vec3(0.0), 0
+        for s in ti.static(range(len(self.shapes))):
+            pushes = self.depth(s, i, x) > 0.0
+            if ti.static(self.rough):
+                pushes |= (self.touched[i] >> s) & 1 and self.contact[i, s].push.w > 0.0
+            active += ti.cast(pushes, ti.i32)
+        if active > 0:
+            # A push beyond the surface would throw the particle off: averaging is undone, no more.
+            share = ti.min(relaxation_factor / ti.cast(active, ti.f32), 1.0)
+            for s in ti.static(range(len(self.shapes))):
+                if (self.touched[i] >> s) & 1:
+                    normal = self.contact[i, s].plane.xyz
+                    depth = share * ti.max(self.depth(s, i, x), 0.0)
+                    change += depth * normal
                     if ti.static(self.rough):
-                        pushed = pushed or self.push[s, i].w > 0.0
-                    if pushed:
-                        active += 1
-                # A push beyond the surface would throw the particle off: averaging is undone, no more.
-                share = ti.min(relaxation_factor / ti.cast(ti.max(active, 1), ti.f32), 1.0)
-                for s in ti.static(range(len(self.shapes))):
-                    plane = self.plane[s, i]
-                    depth = share * ti.max(plane.w - plane.xyz.dot(x), 0.0)
-                    change += depth * plane.xyz
-                    if ti.static(self.rough):
-                        change += self.rub(s, i, x, plane.xyz, depth, share)
-                self.body.estimate[i] = x + change
+                        change += self.rub(s, i, x, normal, depth, share)
+        return change
 
     @ti.func
     def rub(self, s: ti.template(), i, x, normal, depth, share):
@@ -129,7 +159,7 @@ class ShapeContacts:
         It opposes the motion along the surface since the start of the substep, relative to the shape's own (Macklin
         2014, Eq. 24), up to the coefficient times all of the normal push so far.
         """
-        push = self.push[s, i]
+        push = self.contact[i, s].push
         normal_push = push.w + depth
         change = tm.vec3(0.0)
         if normal_push > 0.0:
@@ -141,7 +171,7 @@ class ShapeContacts:
             if length > limit:
                 friction *= limit / length
             change = friction - push.xyz
-            self.push[s, i] = tm.vec4(friction, normal_push)
+            self.contact[i, s].push = tm.vec4(friction, normal_push)
         return change
 
     @ti.func
@@ -152,23 +182,36 @@ class ShapeContacts:
         overlap, so that each sends a particle into the other, it leaves through that side of a tool which is free.
         """
         for i in range(self.body.count):
-            x = self.body.estimate[i]
-            radius = self.body.contact_radius[i]
-            clear = 0
-            for sweep in range(KEEP_OUT_SWEEPS):
-                if clear == 0:
-                    clear = 1
-                    for s in ti.static(range(len(self.shapes))):
-                        if not self.is_clear(s, i, x, radius):
-                            near = self.shapes[s].surface(x)
-                            if near.w < radius - ROUNDING:
-                                x += (radius - near.w) * near.xyz
-                                clear = 0
-                    if sweep % 2 == 1:
-                        radius = radius / 2 if sweep < KEEP_OUT_SWEEPS - 3 else 0.0
-            if clear == 0:
-                x = self.leave_by_a_free_side(x)
-            self.body.estimate[i] = x
+            if not self.is_clear_of_all(i, self.body.estimate[i]):
+                self.body.estimate[i] = self.kept_out(i, self.body.estimate[i])
+
+    @ti.func
+    def is_clear_of_all(self, i, x):
+        """Whether it costs next to nothing to tell that particle i touches no shape from x."""
+        result = True
+        for s in ti.static(range(len(self.shapes))):
+            result = result and self.is_clear(s, i, x, self.body.contact_radius[i])
+        return result
+
+    @ti.func
+    def kept_out(self, i, x):
+        """The place outside all shapes that particle i goes to from x."""
+        radius = self.body.contact_radius[i]
+        clear = False
+        for sweep in range(KEEP_OUT_SWEEPS):
+            if not clear:
+                clear = True
+                for s in ti.static(range(len(self.shapes))):
+                    if not self.is_clear(s, i, x, radius):
+                        near = self.nearest(s, i, x, EXACT_MM)
+                        if near.w < radius - ROUNDING:
+                            x += (radius - near.w) * near.xyz
+                            clear = False
+                if sweep % 2 == 1:
+                    radius = radius / 2 if sweep < KEEP_OUT_SWEEPS - 3 else 0.0
+        if not clear:
+            x = self.leave_by_a_free_side(x)
+        return x
 
     @ti.func
     def leave_by_a_free_side(self, x):

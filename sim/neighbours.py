@@ -26,6 +26,8 @@ class ParticleContacts:
         self.distance = body.radius_mm
         # Particles come nearer than they started during the substep, so some are listed before they touch.
         self.reach = 1.5 * self.distance
+        self.patch = ti.field(ti.i32, body.count)
+        self.patch.from_numpy(model.patches.of_particles())
         self.cell_start = ti.field(ti.i32, CELLS + 1)
         self.cell_count = ti.field(ti.i32, CELLS)
         self.sorted = ti.field(ti.i32, body.count)
@@ -45,10 +47,11 @@ class ParticleContacts:
 
     @ti.func
     def share_cluster(self, i, j):
-        a, b = self.model.cluster_offset[i], self.model.cluster_offset[j]
+        p, q = self.patch[i], self.patch[j]
+        a, b = self.model.shared_start[p], self.model.shared_start[q]
         shared = 0
-        while a < self.model.cluster_offset[i + 1] and b < self.model.cluster_offset[j + 1] and shared == 0:
-            ca, cb = self.model.cluster[a], self.model.cluster[b]
+        while a < self.model.shared_start[p + 1] and b < self.model.shared_start[q + 1] and shared == 0:
+            ca, cb = self.model.shared[a], self.model.shared[b]
             if ca == cb:
                 shared = 1
             elif ca < cb:

@@ -25,6 +25,8 @@ from sim.surface_contact import LAYER_MM, SurfaceContacts
 HOURGLASS = 1.2
 # Below this volume ratio ln J goes on as its tangent, so that inverted cells find back.
 LEAST_J = 0.2
+LN2 = 0.6931471805599453
+SQRT_HALF_BITS = 0x3F3504F3
 # With fewer nodes, starting threads for eight colours costs a CPU more than they save.
 PARALLEL_NODES = 8000
 # No node moves farther in a pass than this share of a cell.
@@ -78,26 +80,30 @@ class NeoHookean:
 
     def _store_nodes(self, mass_g: np.ndarray) -> None:
         self.target = ti.Vector.field(3, ti.f32, self.body.count)
+        self.estimate = ti.Vector.field(4, ti.f32, self.body.count)
         self.mass = ti.field(ti.f32, self.body.count)
         self.mass.from_numpy(mass_g.astype(np.float32))
 
     def _store_cells(self) -> None:
         cells, nodes = self.lattice.cells, self.body.count
         around = np.full((nodes, 8), self.count, np.int32)
-        gradient = np.zeros((nodes, 8, 3), np.float32)
+        gradient = np.zeros((nodes, 8, 4))
         for corner in range(8):
             around[cells[:, corner], corner] = np.arange(self.count)
-            gradient[cells[:, corner], corner] = self.lattice.gradient[:, corner]
+            gradient[cells[:, corner], corner, :3] = self.lattice.gradient[:, corner]
+            gradient[cells[:, corner], corner, 3] = self.lattice.volume
         self.around = ti.field(ti.i32, (nodes, 8))
         self.around.from_numpy(around)
-        self.gradient = ti.Vector.field(3, ti.f32, (nodes, 8))
-        self.gradient.from_numpy(gradient)
+        self.gradient = ti.Vector.field(4, ti.f32, (nodes, 8))
+        self.gradient.from_numpy(gradient.astype(np.float32))
+        self.shear = ti.field(ti.f32, nodes)
+        self.shear.from_numpy(
+            (gradient[:, :, 3] * (gradient[:, :, :3] ** 2).sum(axis=2)).sum(axis=1).astype(np.float32)
+        )
         self.cell = ti.Vector.field(8, ti.i32, self.count)
         self.cell.from_numpy(cells.astype(np.int32))
-        self.volume = ti.field(ti.f32, self.count + 1)
-        self.volume.from_numpy(np.append(self.lattice.volume, 0.0).astype(np.float32))
-        self.deformation = ti.Matrix.field(3, 3, ti.f32, self.count + 1)
-        self.deformation.from_numpy(np.tile(np.eye(3, dtype=np.float32), (self.count + 1, 1, 1)))
+        self.deformation = ti.Matrix.field(3, 4, ti.f32, self.count + 1)
+        self.deformation.from_numpy(np.tile(np.eye(3, 4, dtype=np.float32), (self.count + 1, 1, 1)))
 
     def _store_hourglass(self) -> None:
         """Rows of the hourglass matrix, over the 27 nodes around each node and itself, for a shear modulus of 1."""
@@ -137,13 +143,30 @@ class NeoHookean:
         if ti.static(not self.has_held):
             self.rigid.move(dt)
         for c in range(self.count):
-            deformation = tm.mat3(0.0)
+            x, y, z = tm.vec4(0.0), tm.vec4(0.0), tm.vec4(0.0)
             for k in ti.static(range(8)):
                 i = self.cell[c][k]
-                deformation += self.body.estimate[i].outer_product(self.gradient[i, k])
-            self.deformation[c] = deformation
+                b, at = self.gradient[i, k], four(self.body.estimate[i])
+                x += b.x * at
+                y += b.y * at
+                z += b.z * at
+            self.deformation[c] = ti.Matrix.rows([x, y, z])
         # Every node at the skin adds nothing to it, but nothing times infinity stays.
-        self.deformation[self.count] = tm.eye(3)
+        self.deformation[self.count] = ti.Matrix.rows(
+            [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
+        )
+
+    @ti.func
+    def gather(self):
+        """Take over the estimates."""
+        for i in range(self.body.count):
+            self.estimate[i] = four(self.body.estimate[i])
+
+    @ti.func
+    def scatter(self):
+        """Give the estimates back."""
+        for i in range(self.body.count):
+            self.body.estimate[i] = self.estimate[i].xyz
 
     @ti.func
     def project(self, first, last, stiffness: float, relaxation_factor: float, dt: float):
@@ -151,7 +174,6 @@ class NeoHookean:
         own 3 x 3 system, over-relaxed.
         """
         if ti.static(self.serial):
-            ti.loop_config(serialize=True)
             for i in range(first, last):
                 self.relax(i, relaxation_factor, dt)
         else:
@@ -165,62 +187,73 @@ class NeoHookean:
     def relax(self, i, relaxation_factor: float, dt: float):
         """Node i goes to its balance with all others held."""
         inertia = self.mass[i] / (dt * dt)
-        force = inertia * (self.target[i] - self.body.estimate[i])
-        force, hessian = self.add_cells(i, force, inertia * tm.eye(3))
-        force, hessian = self.add_hourglass(i, force, hessian)
+        force, hessian = self.elastic(i)
+        force += inertia * (four(self.target[i]) - self.estimate[i])
+        hessian += inertia * tm.eye(3)
         factor = relaxation_factor
         if ti.static(self.has_contacts):
             pushed, layer = self.contacts.push(i)
             if layer[0, 0] + layer[1, 1] + layer[2, 2] > 0.0:
                 factor = 1.0
-            force += pushed
+            force += four(pushed)
             hessian += layer
-        change = factor * solve(hessian, force)
+        change = factor * solve(hessian, force.xyz)
         change *= ti.min(1.0, self.most_mm / ti.max(change.norm(), 1e-12))
         if ti.static(self.has_held):
             change *= 1.0 - self.held[i]
-        self.body.estimate[i] = self.body.estimate[i] + change
-        for k in range(8):
-            c = self.around[i, k]
-            # Not "+=", which is atomic: no other node of this colour has this cell.
-            self.deformation[c] = self.deformation[c] + change.outer_product(self.gradient[i, k])
+        self.move(i, four(change))
         if ti.static(self.has_contacts):
             self.contacts.follow(i, change)
 
     @ti.func
-    def add_cells(self, i, force, hessian):
-        """The elastic force of the cells around node i, and its negative derivative by the node's position.
+    def move(self, i, change):
+        """Node i moves, and the cells around it follow. No other node of its colour has them."""
+        self.estimate[i] = self.estimate[i] + change
+        for k in range(8):
+            b = self.gradient[i, k]
+            # Not "+=", which is atomic.
+            self.deformation[self.around[i, k]] = self.deformation[self.around[i, k]] + ti.Matrix.rows(
+                [b.x * change, b.y * change, b.z * change]
+            )
+
+    @ti.func
+    def elastic(self, i):
+        """Force [uN] of the cells around node i and of the hourglass, and its negative derivative by the node's position.
 
         With B the node's gradient, f = -V (mu F B + (lambda ln J - mu) G / J), where G = dJ/dx = cof(F) B does not
         depend on the node's own position, so that d^2J/dx^2 = 0.
         """
         mu, lame = self.mu[None], self.lame[None]
+        force = -mu * self.hourglass_pull(i)
+        x, y, z = tm.vec4(0.0), tm.vec4(0.0), tm.vec4(0.0)
         for k in range(8):
-            c = self.around[i, k]
-            b, volume = self.gradient[i, k], self.volume[c]
-            f = self.deformation[c]
-            f1, f2, f3 = column(f, 0), column(f, 1), column(f, 2)
-            f23 = f2.cross(f3)
+            b = self.gradient[i, k]
+            f = self.deformation[self.around[i, k]]
+            f1, f2, f3 = row(f, 0), row(f, 1), row(f, 2)
+            f23 = cross(f2, f3)
             j = f1.dot(f23)
-            g = b.x * f23 + b.y * f3.cross(f1) + b.z * f1.cross(f2)
+            g = b.x * f23 + b.y * cross(f3, f1) + b.z * cross(f1, f2)
             at = ti.max(j, LEAST_J)
-            log_j = ti.log(at) + (j - at) / at
-            pressure = (lame * log_j - mu) / at
-            force -= volume * (mu * (b.x * f1 + b.y * f2 + b.z * f3) + pressure * g)
-            curvature = lame / (at * at) - (pressure / at if j > LEAST_J else 0.0)
-            hessian += (volume * ti.max(curvature, 0.0)) * g.outer_product(g)
-            hessian += (volume * mu * b.dot(b)) * tm.eye(3)
-        return force, hessian
+            one_by = 1.0 / at
+            pressure = (lame * (ln(at) + j * one_by - 1.0) - mu) * one_by
+            force -= b.w * (mu * (b.x * f1 + b.y * f2 + b.z * f3) + pressure * g)
+            curvature = lame * one_by * one_by - (pressure * one_by if j > LEAST_J else 0.0)
+            bent = (b.w * ti.max(curvature, 0.0)) * g
+            x += g.x * bent
+            y += g.y * bent
+            z += g.z * bent
+        # Shear and hourglass resist in all directions alike, wherever the node is.
+        alike = mu * (self.shear[i] + self.hourglass[i, 13])
+        return force, tm.mat3(x.x, x.y, x.z, y.x, y.y, y.z, z.x, z.y, z.z) + alike * tm.eye(3)
 
     @ti.func
-    def add_hourglass(self, i, force, hessian):
-        """What deformation that varies inside the cells adds: linear in the positions, blind to rotations."""
-        mu = self.mu[None]
-        x = self.body.estimate[i]
-        pull = tm.vec3(0.0)
+    def hourglass_pull(self, i):
+        """Force, for a shear modulus of 1, against deformation that varies inside the cells: blind to rotations."""
+        x = self.estimate[i]
+        pull = tm.vec4(0.0)
         for k in range(27):
-            pull += self.hourglass[i, k] * (self.body.estimate[self.neighbour[i, k]] - x)
-        return force - mu * pull, hessian + (mu * self.hourglass[i, 13]) * tm.eye(3)
+            pull += self.hourglass[i, k] * (self.estimate[self.neighbour[i, k]] - x)
+        return pull
 
     def update_frames(self) -> None:
         """Nothing to do: points are carried by the nodes themselves."""
@@ -238,6 +271,36 @@ class NeoHookean:
                 i = frame[v][k]
                 x += weight[v][k] * (self.body.position[i] - self.body.rest[i])
             out[v] = x
+
+
+@ti.func
+def four(vector):
+    """A vector of three as one of four, which compilers have vector units for."""
+    return tm.vec4(vector.x, vector.y, vector.z, 0.0)
+
+
+@ti.func
+def cross(a, b):
+    """Cross product of the first three entries."""
+    return tm.vec4(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x, 0.0)
+
+
+@ti.func
+def row(matrix, k: ti.template()):
+    """Row k of a 3 x 4 matrix."""
+    return tm.vec4(matrix[k, 0], matrix[k, 1], matrix[k, 2], matrix[k, 3])
+
+
+@ti.func
+def ln(x):
+    """Natural logarithm of a normal positive number to float32's rounding; a call of the library's would not inline."""
+    bits = ti.bit_cast(x, ti.i32)
+    exponent = (bits - SQRT_HALF_BITS) >> 23
+    z = ti.bit_cast(bits - (exponent << 23), ti.f32)
+    # The series of 2 artanh(z), |z| < 0.172.
+    z = (z - 1.0) / (z + 1.0)
+    s = z * z
+    return exponent * LN2 + 2.0 * z * (1.0 + s * (1 / 3 + s * (1 / 5 + s * (1 / 7 + s / 9))))
 
 
 @ti.func

@@ -11,6 +11,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import Body
+from sim.rotation import cross_matrix
 from sim.surface_contact import SurfaceContacts
 
 # Sums are made of blocks of so many terms, in an order that no thread changes.
@@ -119,12 +120,6 @@ class RigidMotion:
         turn *= ti.min(1.0, MOST_TURN / ti.max(turn.norm(), 1e-12))
         self.translation[None] += compliance @ (force - mixed @ turn)
         self.rotation[None] = rotation_by(turn) @ self.rotation[None]
-
-
-@ti.func
-def cross_matrix(a):
-    """The matrix of a x."""
-    return tm.mat3(0.0, -a.z, a.y, a.z, 0.0, -a.x, -a.y, a.x, 0.0)
 
 
 @ti.func

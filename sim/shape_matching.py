@@ -1,4 +1,10 @@
-"""The paper's tissue model: overlapping clusters, each matched rigidly to its rest shape (Eqs. 8-12)."""
+"""The paper's tissue model: overlapping clusters, each matched rigidly to its rest shape (Eqs. 8-12).
+
+It computes on patches, particles that are in the same clusters: a cluster's moments are sums of its patches' moments,
+and one averaged frame moves a whole patch. Vectors are four wide, so that compilers use a processor's vector units.
+"""
+
+from typing import Any
 
 import numpy as np
 import taichi as ti
@@ -6,14 +12,19 @@ import taichi.math as tm
 from scipy.spatial import cKDTree
 
 from sim.body import ParticleBody
-from sim.rotation import nearest_rotation
-from sim.sampling import Clusters, sample_clusters
+from sim.contact import ShapeContacts
+from sim.device import on_cpu
+from sim.patches import Patches
+from sim.rotation import rotation_near
+from sim.sampling import Clusters
 
 RELAXATIONS = ("local", "global")
 # Points are carried by this many clusters at most.
 MOST_FRAMES = 4
 # Keeps the weight of a point on a cluster's very origin finite.
 LEAST_SQUARED_MM2 = 1e-6
+# With fewer particles, starting threads costs a CPU more than they save.
+PARALLEL_PARTICLES = 40_000
 
 
 @ti.data_oriented
@@ -24,112 +35,280 @@ class ShapeMatching:
     that hold the particle, ``global`` by the largest such number of all particles. Each keeps the body's linear
     and angular momentum because of the masses with which the clusters are fitted: under ``local`` a particle
     gives each of its n clusters 1/n of its mass, under ``global`` the whole of it to each.
+
+    ``patch_rest`` and ``cluster_rest``: centre [mm] and mass, in units of a particle's. ``moment`` (patches, 4): the
+    columns of the sum of m (x - centre) (x0 - centre0)^T, then the centre. ``frame`` (clusters, 4): the columns of the
+    rotation R, then the translation T [mm] of x = R x0 + T.
     """
 
-    def __init__(self, body: ParticleBody, cluster_spacing: float = 3.33, relaxation: str = "local") -> None:
+    def __init__(
+        self,
+        body: ParticleBody,
+        patches: Patches,
+        contacts: ShapeContacts | None = None,
+        relaxation: str = "local",
+        serial: bool | None = None,
+    ) -> None:
         if relaxation not in RELAXATIONS:
             raise ValueError(f"relaxation is {relaxation!r}: expected one of {', '.join(RELAXATIONS)}")
-        rest = body.rest_points
-        clusters = sample_clusters(rest, cluster_spacing * body.radius_mm)
         self.body = body
+        self.contacts: Any = contacts
+        self.has_contacts = contacts is not None
+        self.serial = on_cpu() and body.count < PARALLEL_PARTICLES if serial is None else serial
         self.groups = ((0, body.count),)
-        self.count = len(clusters)
-        self.membership_count = len(clusters.members)
-        self._allocate(clusters, clusters.transposed(body.count))
-        self._weigh(rest, clusters, relaxation)
+        self.patches = patches
+        self.patch_count = len(patches)
+        self.several = patches.several
+        self.count = int(patches.clusters.members.max()) + 1
+        self.relaxation = relaxation
+        self._allocate(patches, patches.clusters.transposed(self.count))
+        self._store_rest(patches)
         self.update_frames()
 
-    def _allocate(self, clusters: Clusters, memberships: Clusters) -> None:
-        self.member_offset = _int_field(clusters.offsets)
-        self.member = _int_field(clusters.members)
-        self.cluster_offset = _int_field(memberships.offsets)
-        self.cluster = _int_field(memberships.members)
-        self.rotation = ti.Matrix.field(3, 3, ti.f32, self.count)
-        self.translation = ti.Vector.field(3, ti.f32, self.count)
-        self.rest_centre = ti.Vector.field(3, ti.f32, self.count)
-        self.weight = ti.field(ti.f32, self.body.count)
-        self.averaging = ti.field(ti.f32, self.body.count)
+    def _allocate(self, patches: Patches, members: Clusters) -> None:
+        self.patch_start = _int_field(patches.start)
+        self.shared_start = _int_field(patches.clusters.offsets)
+        self.shared = _int_field(patches.clusters.members)
+        self.member_start = _int_field(members.offsets)
+        self.member = _int_field(members.members)
+        row = np.repeat(np.arange(self.count), np.diff(members.offsets))
+        several = np.bincount(row, members.members < patches.several, minlength=self.count)
+        self.several_end = _int_field(members.offsets[:-1] + several)
+        self.estimate = ti.Vector.field(4, ti.f32, self.body.count)
+        self.local = ti.Vector.field(4, ti.f32, self.body.count)
+        self.patch_centre = ti.Vector.field(4, ti.f32, self.patch_count)
+        self.patch_scale = ti.Vector.field(4, ti.f32, self.patch_count)
+        self.patch_rest = ti.Vector.field(4, ti.f32, self.patch_count)
+        self.goal = ti.Matrix.field(4, 4, ti.f32, self.patch_count)
+        self.centre = ti.Vector.field(4, ti.f32, self.patch_count)
+        self.moment = ti.Matrix.field(4, 4, ti.f32, self.patch_count)
+        self.cluster_rest = ti.Vector.field(4, ti.f32, self.count)
+        self.sum = ti.Matrix.field(4, 4, ti.f32, self.count)
+        if self.has_contacts:
+            self.touched = ti.field(ti.i32, self.patch_count)
+            self.patch = _int_field(patches.of_particles())
+        self.frame = ti.Matrix.field(4, 4, ti.f32, self.count)
 
-    def _weigh(self, rest: np.ndarray, clusters: Clusters, relaxation: str) -> None:
-        shared = np.bincount(clusters.members, minlength=len(rest)).astype(float)
-        weight = 1.0 / shared if relaxation == "local" else np.ones(len(rest))
-        averaging = np.ones(len(rest)) if relaxation == "local" else shared / shared.max()
-        row = np.repeat(np.arange(len(clusters)), np.diff(clusters.offsets))
-        w = weight[clusters.members]
-        moment = [np.bincount(row, w * rest[clusters.members, axis]) for axis in range(3)]
-        self.rest_centres = np.stack(moment, axis=1) / np.bincount(row, w)[:, None]
-        self.weight.from_numpy(weight.astype(np.float32))
-        self.averaging.from_numpy(averaging.astype(np.float32))
-        self.rest_centre.from_numpy(self.rest_centres.astype(np.float32))
+    def _store_rest(self, patches: Patches) -> None:
+        shared, sizes = patches.shared, patches.sizes
+        # Of global relaxation's mean, over as many goals as any particle has, those that are not there are no way.
+        share, goals = 1.0 / shared, shared
+        if self.relaxation == "global":
+            share, goals = np.ones(len(shared)), np.full(len(shared), shared.max())
+        rest = self.body.rest_points
+        centre = np.add.reduceat(rest, patches.start[:-1]) / sizes[:, None]
+        mass = share * sizes
+        row = np.repeat(np.arange(len(patches)), shared)
+        member = patches.clusters.members
+        total = np.bincount(member, mass[row])
+        moment = [np.bincount(member, (mass * centre[:, axis])[row]) for axis in range(3)]
+        self.rest_centres = np.stack(moment, axis=1) / total[:, None]
+        local = rest - np.repeat(centre, sizes, axis=0)
+        self.local.from_numpy(np.pad(local, ((0, 0), (0, 1)), constant_values=1.0).astype(np.float32))
+        self.patch_centre.from_numpy(np.pad(centre, ((0, 0), (0, 1))).astype(np.float32))
+        scale = np.column_stack([share, share / mass, 1.0 / goals, shared / goals])
+        self.patch_scale.from_numpy(scale.astype(np.float32))
+        self.patch_rest.from_numpy(np.column_stack([centre, mass]).astype(np.float32))
+        self.cluster_rest.from_numpy(np.column_stack([self.rest_centres, total]).astype(np.float32))
 
     def counts(self) -> dict[str, int]:
         """Particles, clusters, and memberships of the ones in the others."""
-        return dict(particles=self.body.count, clusters=self.count, memberships=self.membership_count)
+        memberships = int(self.patches.sizes @ self.patches.shared)
+        return dict(particles=self.body.count, clusters=self.count, memberships=memberships)
 
     @ti.func
     def begin(self, dt: float):
-        pass
+        """Where masses are scaled they have just changed, and with them the centres."""
+        if ti.static(self.body.mass_scaled):
+            self.weigh_patches()
+            self.weigh_clusters()
+
+    @ti.func
+    def weigh_patches(self):
+        for p in range(self.patch_count):
+            first, last = self.patch_start[p], self.patch_start[p + 1]
+            moment, mass = tm.vec4(0.0), 0.0
+            for k in range(first, last):
+                scale = self.body.mass_scale[k]
+                moment += scale * self.local[k]
+                mass += scale
+            share = self.patch_scale[p].x
+            self.patch_rest[p] = four(self.patch_centre[p].xyz + moment.xyz / mass, mass * share)
+            self.patch_scale[p].y = 1.0 / mass
+
+    @ti.func
+    def weigh_clusters(self):
+        for c in range(self.count):
+            first, last = self.member_start[c], self.member_start[c + 1]
+            origin = self.patch_rest[self.member[first]]
+            moment, mass = tm.vec3(0.0), 0.0
+            for k in range(first, last):
+                rest = self.patch_rest[self.member[k]]
+                moment += rest.w * (rest - origin).xyz
+                mass += rest.w
+            self.cluster_rest[c] = four(origin.xyz + moment / mass, mass)
 
     @ti.func
     def project(self, first, last, stiffness: float, relaxation_factor: float, dt: float):
         """One pass over all clusters on the estimates: fit them, then move particles to their goals."""
-        self.fit()
+        self.fit(False)
+        self.average()
         self.move_to_goals(stiffness * relaxation_factor)
+        if ti.static(self.has_contacts):
+            self.push_out(relaxation_factor)
 
     @ti.func
-    def fit(self):
-        """Least-squares rigid frames of the clusters (Eq. 8), as x = rotation x0 + translation.
+    def gather(self):
+        """Take over the estimates, and note the patches that touch a shape."""
+        self.sum_patches()
+        if ti.static(self.has_contacts):
+            for p in range(self.patch_count):
+                self.touched[p] = 0
+            for i in range(self.body.count):
+                if self.contacts.touched[i] > 0:
+                    self.touched[self.patch[i]] = 1
 
-        Positions enter relative to the cluster's first particle, so that float32 keeps its digits wherever the
-        body is.
+    @ti.func
+    def sum_patches(self):
+        """Centres and moments of the patches where the estimates are."""
+        for p in range(self.several):
+            first, last = self.patch_start[p], self.patch_start[p + 1]
+            reference = four(self.body.estimate[first], 0.0)
+            sums = tm.mat4(0.0)
+            for k in range(first, last):
+                estimate = four(self.body.estimate[k], 0.0)
+                self.estimate[k] = estimate
+                sums += self.moment_of(k, estimate - reference)
+            self.add_moment(p, reference, tm.mat4(0.0), sums)
+        for p in range(self.several, self.patch_count):
+            k = self.patch_start[p]
+            self.estimate[k] = four(self.body.estimate[k], 0.0)
+            self.centre[p] = self.estimate[k]
+
+    @ti.func
+    def scatter(self):
+        """Give the estimates back."""
+        for k in range(self.body.count):
+            self.body.estimate[k] = self.estimate[k].xyz
+
+    @ti.func
+    def moment_of(self, k, moved):
+        """What particle k of the patches adds to its patch's moment (rows: columns of the moment) and sum (last row)."""
+        if ti.static(self.body.mass_scaled):
+            moved *= self.body.mass_scale[k]
+        at = self.local[k]
+        return ti.Matrix.rows([at.x * moved, at.y * moved, at.z * moved, moved])
+
+    @ti.func
+    def add_moment(self, p, centre, moment, sums):
+        """Centre and moment of patch p after its particles moved, by sums over how far: so float32 keeps its digits."""
+        scale, total = self.patch_scale[p], row(sums, 3)
+        if ti.static(self.body.mass_scaled):
+            sums -= (self.patch_rest[p] - self.patch_centre[p]).outer_product(total)
+        self.moment[p] = moment + scale.x * sums
+        self.centre[p] = centre + scale.y * total
+
+    @ti.func
+    def fit(self, anew: ti.template()):
+        """Least-squares rigid frames of the clusters (Eq. 8), near to those before or ``anew``.
+
+        Apart from the sums, whose lengths no processor foresees, several rotations are found at a time.
         """
         for c in range(self.count):
-            first, last = self.member_offset[c], self.member_offset[c + 1]
-            reference = self.body.estimate[self.member[first]]
-            centre0 = self.rest_centre[c]
-            total = 0.0
-            mean, mean0 = tm.vec3(0.0), tm.vec3(0.0)
-            moment = tm.mat3(0.0)
+            first, last = self.member_start[c], self.member_start[c + 1]
+            reference = self.centre[self.member[first]]
+            centre0 = self.cluster_rest[c]
+            x, y, z, total = tm.vec4(0.0), tm.vec4(0.0), tm.vec4(0.0), tm.vec4(0.0)
             for k in range(first, last):
-                i = self.member[k]
-                w = self.weight[i]
-                if ti.static(self.body.mass_scaled):
-                    w *= self.body.mass_scale[i]
-                p = self.body.estimate[i] - reference
-                q = self.body.rest[i] - centre0
-                total += w
-                mean += w * p
-                mean0 += w * q
-                moment += w * p.outer_product(q)
-            mean /= total
-            mean0 /= total
-            moment -= total * mean.outer_product(mean0)
-            rotation = nearest_rotation(moment)
-            self.rotation[c] = rotation
-            self.translation[c] = reference + mean - rotation @ (centre0 + mean0)
+                p = self.member[k]
+                rest = self.patch_rest[p]
+                at = rest - centre0
+                moved = rest.w * (self.centre[p] - reference)
+                x += at.x * moved
+                y += at.y * moved
+                z += at.z * moved
+                total += moved
+            for k in range(first, self.several_end[c]):
+                moment = self.moment[self.member[k]]
+                x += row(moment, 0)
+                y += row(moment, 1)
+                z += row(moment, 2)
+            self.sum[c] = ti.Matrix.rows([x, y, z, reference + total / centre0.w])
+        for c in range(self.count):
+            fitted = self.sum[c]
+            guess = tm.eye(3)
+            if ti.static(not anew):
+                guess = self.frame[c][:3, :3].transpose()
+            rotation = rotation_near(guess, fitted[:3, :3].transpose())
+            origin = fitted[3, :3] - rotation @ self.cluster_rest[c].xyz
+            for axis in ti.static(range(3)):
+                for k in ti.static(range(3)):
+                    self.frame[c][axis, k] = rotation[k, axis]
+                self.frame[c][3, axis] = origin[axis]
+
+    @ti.func
+    def average(self):
+        """The sum of the frames of each patch's clusters: the mean of R_c x0 + T_c is (mean R_c) x0 + mean T_c (Eq. 7)."""
+        for p in range(self.patch_count):
+            frame = tm.mat4(0.0)
+            for k in range(self.shared_start[p], self.shared_start[p + 1]):
+                frame += self.frame[self.shared[k]]
+            x, y, z, centre = row(frame, 0), row(frame, 1), row(frame, 2), self.patch_centre[p]
+            origin = row(frame, 3) + centre.x * x + centre.y * y + centre.z * z
+            self.goal[p] = self.patch_scale[p].z * ti.Matrix.rows([x, y, z, origin])
 
     @ti.func
     def move_to_goals(self, step: float):
-        """Move each estimate by ``step`` times the averaged way to its goals (Eqs. 9, 12 and 7).
+        """Move each estimate by ``step`` times the averaged way to its goals (Eqs. 9 and 12)."""
+        for p in range(self.several):
+            keep = 1.0 - step * self.patch_scale[p].w
+            frame = step * self.goal[p]
+            x, y, z, origin = row(frame, 0), row(frame, 1), row(frame, 2), row(frame, 3)
+            reference = self.centre[p]
+            sums = tm.mat4(0.0)
+            for k in range(self.patch_start[p], self.patch_start[p + 1]):
+                at = self.local[k]
+                estimate = keep * self.estimate[k] + at.x * x + at.y * y + at.z * z + origin
+                self.estimate[k] = estimate
+                sums += self.moment_of(k, estimate - reference)
+            self.add_moment(p, reference, tm.mat4(0.0), sums)
+        for p in range(self.several, self.patch_count):
+            k = self.patch_start[p]
+            keep = 1.0 - step * self.patch_scale[p].w
+            self.estimate[k] = keep * self.estimate[k] + step * row(self.goal[p], 3)
+            self.centre[p] = self.estimate[k]
 
-        The mean of the goals R_c x0 + T_c is (mean R_c) x0 + mean T_c: no data per membership is needed.
-        """
-        for i in range(self.body.count):
-            first, last = self.cluster_offset[i], self.cluster_offset[i + 1]
-            rotation = tm.mat3(0.0)
-            translation = tm.vec3(0.0)
-            for k in range(first, last):
-                c = self.cluster[k]
-                rotation += self.rotation[c]
-                translation += self.translation[c]
-            goal = (rotation @ self.body.rest[i] + translation) / ti.cast(last - first, ti.f32)
-            x = self.body.estimate[i]
-            self.body.estimate[i] = x + step * self.averaging[i] * (goal - x)
+    @ti.func
+    def push_out(self, relaxation_factor: float):
+        """Particles that touch a shape are pushed out of it."""
+        for p in range(self.patch_count):
+            if self.touched[p] > 0:
+                sums = tm.mat4(0.0)
+                for k in range(self.patch_start[p], self.patch_start[p + 1]):
+                    if self.contacts.touched[k] > 0:
+                        estimate = self.estimate[k]
+                        change = four(self.contacts.pushed(k, estimate.xyz, relaxation_factor), 0.0)
+                        self.estimate[k] = estimate + change
+                        sums += self.moment_of(k, change)
+                moment = tm.mat4(0.0)
+                if p < self.several:
+                    moment = self.moment[p]
+                self.add_moment(p, self.centre[p], moment, sums)
 
     @ti.kernel
     def update_frames(self):
-        """Fit the frames to where the particles are now, for ``carry``."""
-        self.fit()
+        """Fit the frames to where the particles are now, for ``carry``; they do not depend on those before."""
+        if ti.static(self.serial):
+            ti.loop_config(serialize=True)
+            for _ in range(1):
+                self.refit()
+        else:
+            self.refit()
+
+    @ti.func
+    def refit(self):
+        self.sum_patches()
+        self.fit(True)
 
     def attach(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The up to four nearest clusters of points (n, 3) [mm] and their weights (Kavan 2014).
@@ -145,11 +324,25 @@ class ShapeMatching:
     def carry(self, rest: ti.template(), frame: ti.template(), weight: ti.template(), out: ti.template()):
         """Points carried by weighted frames (weighted matrix blending)."""
         for v in rest:
-            x = tm.vec3(0.0)
+            x = tm.vec4(0.0)
             for k in ti.static(range(frame.n)):
-                c = frame[v][k]
-                x += weight[v][k] * (self.rotation[c] @ rest[v] + self.translation[c])
-            out[v] = x
+                moved = self.frame[frame[v][k]]
+                for axis in ti.static(range(3)):
+                    x += weight[v][k] * rest[v][axis] * row(moved, axis)
+                x += weight[v][k] * row(moved, 3)
+            out[v] = x.xyz
+
+
+@ti.func
+def row(matrix, k: ti.template()):
+    """Row k of a 4 x 4 matrix."""
+    return tm.vec4(matrix[k, 0], matrix[k, 1], matrix[k, 2], matrix[k, 3])
+
+
+@ti.func
+def four(vector, last):
+    """A vector of three with a fourth entry."""
+    return tm.vec4(vector.x, vector.y, vector.z, last)
 
 
 def _int_field(values: np.ndarray) -> ti.Field:

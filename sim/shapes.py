@@ -1,24 +1,25 @@
-"""Rigid shapes that particles touch: planes, signed distance fields, static triangle meshes and convex tools.
+"""Rigid shapes that particles touch: planes, signed distance fields, of closed surfaces too, and convex tools.
 
 Every shape answers ``surface(p)`` with the outward unit normal (x, y, z) and the signed distance (w) [mm] of
-the nearest surface, negative inside and ``FAR`` where the shape is out of reach, and ``motion(p)`` with how far
-its material at p moved in this substep [mm]. ``moves`` says whether it ever does.
+the nearest surface, negative inside and ``FAR`` where the shape is out of reach, ``motion(p)`` with how far its
+material at p moved in this substep [mm], and ``is_beyond(p, distance)`` with whether it costs next to nothing to tell
+that p is farther than a distance [mm]. ``moves`` says whether it ever does.
 """
 
-import igl
+from itertools import combinations
+
 import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from sim.distance import signed_distance
+from sim.distance import distance_grid
 
 FAR = 1e6
-FACE, EDGE, VERTEX = 0, 1, 4
 HAIR = 1e-3
-Points = ti.types.ndarray(ti.f32, ndim=2)
-Rows = ti.types.ndarray(ti.i32, ndim=2)
-Floats = ti.types.ndarray(ti.f32, ndim=1)
-Integers = ti.types.ndarray(ti.i32, ndim=1)
+# A grid of distances so fine is within 0.005 mm of a support on average, but for its sharp edges.
+GRID_MM = 1.0
+MOST_SUBSTEPS = 100
+Path = ti.types.ndarray(ti.f32, ndim=4)
 
 
 @ti.data_oriented
@@ -30,6 +31,10 @@ class Static:
     @ti.func
     def motion(self, p):
         return tm.vec3(0.0)
+
+    @ti.func
+    def is_beyond(self, p, distance):
+        return False
 
 
 @ti.data_oriented
@@ -60,6 +65,12 @@ class SignedDistanceField(Static):
         self.origin = ti.Vector([float(v) for v in origin_mm])
         self.spacing = ti.Vector([float(v) for v in spacing_mm])
 
+    @staticmethod
+    def of_surface(vertices: np.ndarray, faces: np.ndarray, reach_mm: float) -> "SignedDistanceField":
+        """Distances as far as a reach around a closed surface of vertices (v, 3) [mm] and faces (f, 3)."""
+        distance, origin = distance_grid(vertices, faces, GRID_MM, reach_mm)
+        return SignedDistanceField(distance, origin, np.full(3, GRID_MM))
+
     @ti.func
     def surface(self, p):
         at = (p - self.origin) / self.spacing
@@ -68,19 +79,26 @@ class SignedDistanceField(Static):
         last = ti.Vector([self.shape[0] - 2, self.shape[1] - 2, self.shape[2] - 2])
         if (base >= 0).all() and (base <= last).all():
             t = at - base
-            value, gradient = 0.0, tm.vec3(0.0)
-            for corner in ti.static(ti.grouped(ti.ndrange(2, 2, 2))):
-                w, sign = tm.vec3(0.0), tm.vec3(0.0)
-                for axis in ti.static(range(3)):
-                    w[axis] = t[axis] if ti.static(corner[axis] == 1) else 1.0 - t[axis]
-                    sign[axis] = 1.0 if ti.static(corner[axis] == 1) else -1.0
-                d = self.distance[base + corner]
-                value += w.x * w.y * w.z * d
-                gradient += d * sign * tm.vec3(w.y * w.z, w.x * w.z, w.x * w.y) / self.spacing
+            # Along x first, then y, then z: values at the ends of what is left, and their differences.
+            value, slope = ti.Matrix.zero(ti.f32, 2, 2), ti.Matrix.zero(ti.f32, 2, 2)
+            for j, k in ti.static(ti.ndrange(2, 2)):
+                low = self.distance[base + ti.Vector([0, j, k])]
+                slope[j, k] = self.distance[base + ti.Vector([1, j, k])] - low
+                value[j, k] = low + t.x * slope[j, k]
+            along_x, along_y = slope[0, :] + t.y * (slope[1, :] - slope[0, :]), value[1, :] - value[0, :]
+            ends = value[0, :] + t.y * along_y
+            along = tm.vec3(mixed(along_x, t.z), mixed(along_y, t.z), ends[1] - ends[0])
+            gradient = along / self.spacing
             length = gradient.norm()
             if length > 1e-6:
-                result = tm.vec4(gradient / length, value)
+                result = tm.vec4(gradient / length, mixed(ends, t.z))
         return result
+
+
+@ti.func
+def mixed(ends, t):
+    """Linear between two ends."""
+    return ends[0] + t * (ends[1] - ends[0])
 
 
 @ti.data_oriented
@@ -100,8 +118,10 @@ class ConvexTool:
         self.half_space = ti.Vector.field(4, ti.f32, self.count)
         core = np.column_stack([normals, np.asarray(offsets_mm, float) - self.edge_radius])
         self.half_space.from_numpy(core.astype(np.float32))
+        self.ball_mm = self.edge_radius + _farthest(core)
         self.pose = ti.Matrix.field(4, 4, ti.f32, ())
         self.step_back = ti.Matrix.field(4, 4, ti.f32, ())
+        self.path = ti.Matrix.field(4, 4, ti.f32, (MOST_SUBSTEPS, 2))
         self.move(np.eye(4), np.eye(4))
 
     @staticmethod
@@ -116,14 +136,32 @@ class ConvexTool:
         offsets = np.concatenate([half, half])
         return ConvexTool(np.concatenate([np.eye(3), -np.eye(3)]), offsets, edge_radius_mm)
 
+    def follow(self, poses: np.ndarray) -> None:
+        """Poses (substeps + 1, 4, 4), world from tool [mm], at the start of a time step and at the end of each substep."""
+        self.last_pose = poses[-1]
+        back = poses[:-1] @ np.linalg.inv(poses[1:]) - np.eye(4)
+        self._store_path(np.stack([poses[1:], back], axis=1).astype(np.float32))
+
     def move(self, before: np.ndarray, now: np.ndarray) -> None:
         """Poses (4, 4), world from tool [mm], at the start and at the end of the substep."""
-        self._set_pose(ti.Matrix(now.tolist()), ti.Matrix((before @ np.linalg.inv(now) - np.eye(4)).tolist()))
+        self.follow(np.stack([before, now]))
+        self._go()
 
     @ti.kernel
-    def _set_pose(self, pose: tm.mat4, step_back: tm.mat4):
-        self.pose[None] = pose
-        self.step_back[None] = step_back
+    def _store_path(self, path: Path):
+        for leg in range(path.shape[0]):
+            for k, i, j in ti.static(ti.ndrange(2, 4, 4)):
+                self.path[leg, k][i, j] = path[leg, k, i, j]
+
+    @ti.kernel
+    def _go(self):
+        self.go(0)
+
+    @ti.func
+    def go(self, substep):
+        """To the pose at the end of a substep."""
+        self.pose[None] = self.path[substep, 0]
+        self.step_back[None] = self.path[substep, 1]
 
     @ti.func
     def way_out(self, p, k):
@@ -136,6 +174,18 @@ class ConvexTool:
     @ti.func
     def motion(self, p):
         return -(self.step_back[None] @ tm.vec4(p, 1.0)).xyz
+
+    @ti.func
+    def is_beyond(self, p, distance):
+        pose = self.pose[None]
+        from_middle = p - pose[:3, 3]
+        beyond = from_middle.norm_sqr() > (self.ball_mm + distance) ** 2
+        if not beyond:
+            local = pose[:3, :3].transpose() @ from_middle
+            for k in range(self.count):
+                plane = self.half_space[k]
+                beyond |= plane.xyz.dot(local) - plane.w > distance + self.edge_radius
+        return beyond
 
     @ti.func
     def surface(self, p):
@@ -158,165 +208,10 @@ class ConvexTool:
         return tm.vec4(rotation @ normal, depth - self.edge_radius)
 
 
-@ti.data_oriented
-class TriangleMesh(Static):
-    """A closed static triangle mesh [mm], outward-facing; exact distance and sign (Baerentzen & Aanaes 2005).
-
-    A grid of cells lists the triangles that can be nearest to a point of the cell, as far as ``reach_mm`` outside
-    the surface; cells deep inside list the nearest one of their centre, which is a way out.
-    """
-
-    def __init__(
-        self, vertices: np.ndarray, faces: np.ndarray, reach_mm: float, cell_mm: float = 2.0
-    ) -> None:
-        vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
-        low = vertices.min(axis=0) - reach_mm - cell_mm
-        high = vertices.max(axis=0) + reach_mm + cell_mm
-        self.cell_mm = cell_mm
-        self.shape = tuple(int(v) for v in np.ceil((high - low) / cell_mm))
-        self.origin = ti.Vector(low.tolist())
-        self.cell = ti.Vector.field(3, ti.i32, self.shape)
-        self._store_geometry(vertices, faces)
-        self._list_triangles(vertices, faces, low, reach_mm)
-
-    def _list_triangles(
-        self, vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, reach_mm: float
-    ) -> None:
-        centres = low + self.cell_mm * (np.indices(self.shape).reshape(3, -1).T + 0.5)
-        signed, nearest = signed_distance(vertices, faces, centres)
-        half_diagonal = self.cell_mm * np.sqrt(3) / 2
-        near = np.abs(signed) <= half_diagonal + np.where(signed > 0, reach_mm, half_diagonal)
-        deep = ~near & (signed < 0)
-        # The nearest triangle of any point of a cell is at most this far from the cell's centre.
-        bound = np.where(near, np.abs(signed) + 2 * half_diagonal, -1.0).astype(np.float32)
-        count = np.zeros(len(centres), np.int32)
-        self._count_listed(centres.astype(np.float32), bound, count)
-        count[deep] = 1
-        last = np.cumsum(count, dtype=np.int32)
-        # Away from the surface the whole cell is on one side; near it the triangles decide.
-        side = np.where(np.abs(signed) > half_diagonal, np.sign(signed), 0)
-        cells = np.column_stack([last - count, last, side]).astype(np.int32)
-        listed = np.zeros(last[-1], np.int32)
-        distance = np.zeros(last[-1], np.float32)
-        self._fill_listed(centres.astype(np.float32), bound, cells, listed, distance)
-        listed[last[deep] - 1] = nearest[deep]
-        # Nearest first: the walk along a row ends as soon as the rest cannot be nearer.
-        order = np.lexsort((distance, np.repeat(np.arange(len(count)), count)))
-        self.cell.from_numpy(cells.reshape(*self.shape, 3))
-        self.listed = ti.field(ti.i32, len(listed))
-        self.listed.from_numpy(listed[order])
-        self.listed_distance = ti.field(ti.f32, len(listed))
-        self.listed_distance.from_numpy(distance[order])
-
-    @ti.func
-    def distance_within(self, p, bound, f):
-        """Distance of triangle f from p [mm], FAR where it is more than the bound."""
-        distance = FAR
-        around = self.sphere[f]
-        if (p - around.xyz).norm() <= bound + around.w:
-            distance = from_triangle(p, self.corner[f, 0], self.corner[f, 1], self.corner[f, 2])[0].norm()
-        return distance if distance <= bound else FAR
-
-    @ti.kernel
-    def _count_listed(self, centres: Points, bound: Floats, count: Integers):
-        for cell in range(bound.shape[0]):
-            if bound[cell] >= 0.0:
-                p = tm.vec3(centres[cell, 0], centres[cell, 1], centres[cell, 2])
-                for f in range(self.corner.shape[0]):
-                    if self.distance_within(p, bound[cell], f) < FAR:
-                        count[cell] += 1
-
-    @ti.kernel
-    def _fill_listed(self, centres: Points, bound: Floats, cells: Rows, listed: Integers, distance: Floats):
-        for cell in range(bound.shape[0]):
-            if bound[cell] >= 0.0:
-                p = tm.vec3(centres[cell, 0], centres[cell, 1], centres[cell, 2])
-                at = cells[cell, 0]
-                for f in range(self.corner.shape[0]):
-                    d = self.distance_within(p, bound[cell], f)
-                    if d < FAR:
-                        listed[at] = f
-                        distance[at] = d
-                        at += 1
-
-    def _store_geometry(self, vertices: np.ndarray, faces: np.ndarray) -> None:
-        """Corners and the pseudonormals of each face: of itself, its edges (01, 12, 20) and its vertices."""
-        face_normal = igl.per_face_normals(vertices, faces, np.zeros(3))
-        vertex_normal = np.asarray(
-            igl.per_vertex_normals(vertices, faces, igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE)
-        )
-        edge_sum: dict[tuple[int, int], np.ndarray] = {}
-        for normal, face in zip(face_normal, faces, strict=True):
-            for a, b in zip(face, np.roll(face, -1), strict=True):
-                key = (min(a, b), max(a, b))
-                edge_sum[key] = edge_sum.get(key, np.zeros(3)) + normal
-        edges = np.array(
-            [[edge_sum[min(a, b), max(a, b)] for a, b in zip(f, np.roll(f, -1), strict=True)] for f in faces]
-        )
-        # Two faces folded onto each other leave no direction between them.
-        edges /= np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-12)
-        normals = np.concatenate([face_normal[:, None], edges, vertex_normal[faces]], axis=1)
-        corners = vertices[faces]
-        middle = corners.mean(axis=1)
-        extent = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
-        self.sphere = ti.Vector.field(4, ti.f32, len(faces))
-        self.sphere.from_numpy(np.column_stack([middle, extent]).astype(np.float32))
-        self.corner = ti.Vector.field(3, ti.f32, (len(faces), 3))
-        self.corner.from_numpy(corners.astype(np.float32))
-        self.normal = ti.Vector.field(3, ti.f32, (len(faces), 7))
-        self.normal.from_numpy(normals.astype(np.float32))
-
-    @ti.func
-    def surface(self, p):
-        cell = ti.cast(ti.floor((p - self.origin) / self.cell_mm), ti.i32)
-        result = tm.vec4(0.0, 0.0, 0.0, FAR)
-        size = ti.Vector([self.shape[0], self.shape[1], self.shape[2]])
-        if (cell >= 0).all() and (cell < size).all():
-            entry = self.cell[cell]
-            from_centre = (p - (self.origin + self.cell_mm * (cell + 0.5))).norm()
-            distance, towards, normal = FAR, tm.vec3(0.0), tm.vec3(0.0)
-            k = entry[0]
-            while k < entry[1]:
-                if self.listed_distance[k] > distance + from_centre:
-                    break
-                f = self.listed[k]
-                away, feature = from_triangle(p, self.corner[f, 0], self.corner[f, 1], self.corner[f, 2])
-                d = away.norm()
-                if d < distance:
-                    distance, towards, normal = d, away, self.normal[f, feature]
-                k += 1
-            if entry[1] > entry[0]:
-                side = 1.0 if towards.dot(normal) >= 0.0 else -1.0
-                if entry[2] != 0:
-                    side = ti.cast(entry[2], ti.f32)
-                # On the surface itself the direction has no digits left, the pseudonormal has.
-                if distance > 1e-4:
-                    normal = side * towards / distance
-                result = tm.vec4(normal, side * distance)
-        return result
-
-
-@ti.func
-def from_triangle(p, a, b, c):
-    """Vector from the nearest point of triangle abc to p, and the feature it lies on (Ericson 2005, 5.1.5)."""
-    ab, ac, ap, bp, cp = b - a, c - a, p - a, p - b, p - c
-    d1, d2 = ab.dot(ap), ac.dot(ap)
-    d3, d4 = ab.dot(bp), ac.dot(bp)
-    d5, d6 = ab.dot(cp), ac.dot(cp)
-    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-    nearest, feature = a, VERTEX
-    if d1 <= 0.0 and d2 <= 0.0:
-        nearest, feature = a, VERTEX
-    elif d3 >= 0.0 and d4 <= d3:
-        nearest, feature = b, VERTEX + 1
-    elif d6 >= 0.0 and d5 <= d6:
-        nearest, feature = c, VERTEX + 2
-    elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        nearest, feature = a + d1 / (d1 - d3) * ab, EDGE
-    elif va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
-        nearest, feature = b + (d4 - d3) / ((d4 - d3) + (d5 - d6)) * (c - b), EDGE + 1
-    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        nearest, feature = a + d2 / (d2 - d6) * ac, EDGE + 2
-    else:
-        nearest, feature = a + (vb * ab + vc * ac) / (va + vb + vc), FACE
-    return p - nearest, feature
+def _farthest(half_spaces: np.ndarray) -> float:
+    """How far [mm] the intersection of half-spaces (k, 4), normal and offset, reaches from the origin: to a vertex."""
+    triples = np.array(list(combinations(half_spaces, 3)))
+    crossing = triples[np.abs(np.linalg.det(triples[:, :, :3])) > 1e-9]
+    vertex = np.linalg.solve(crossing[:, :, :3], crossing[:, :, 3:])[:, :, 0]
+    inside = (vertex @ half_spaces[:, :3].T <= half_spaces[:, 3] + 1e-6).all(axis=1)
+    return float(np.linalg.norm(vertex[inside], axis=1).max())

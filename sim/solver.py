@@ -65,6 +65,7 @@ class Solver:
         self.pairs = pairs
         self.tool = tool
         self.relax_globally = relaxation == "global"
+        self.has_tool = tool is not None
         self.has_contacts = contacts is not None
         self.has_pairs = pairs is not None
 
@@ -72,24 +73,38 @@ class Solver:
         """Advance by one time step.
 
         ``tool_poses`` (substeps + 1, 4, 4), world from tool [mm], are the tool's poses at the start of the step
-        and at the end of each substep.
+        and at the end of each substep; without them it stays where it is.
         """
         dt = settings.time_step_s / settings.substeps
         gravity = ti.Vector(list(settings.gravity))
-        for substep in range(settings.substeps):
-            if self.tool is not None and tool_poses is not None:
-                self.tool.move(tool_poses[substep], tool_poses[substep + 1])
-            self.begin(dt, gravity, settings.damping)
-            if self.has_contacts:
-                for _ in range(settings.stabilisation_iterations):
-                    self.stabilise()
-            for iteration in range(settings.iterations):
-                # An overshoot left by the last pass would be taken for velocity in line 24, and grow.
-                factor = settings.relaxation_factor if iteration < settings.iterations - 1 else 1.0
-                for first, last in self.model.groups:
-                    self.iterate(first, last, settings.stiffness, factor, dt)
-            self.end(dt)
+        if self.tool is not None:
+            still = np.stack([self.tool.last_pose] * (settings.substeps + 1))
+            self.tool.follow(still if tool_poses is None else tool_poses)
+        if self.model.serial:
+            self.advance(
+                dt,
+                gravity,
+                settings.damping,
+                settings.substeps,
+                settings.stabilisation_iterations,
+                settings.iterations,
+                settings.stiffness,
+                settings.relaxation_factor,
+            )
+        else:
+            for substep in range(settings.substeps):
+                self._launch_substep(substep, dt, gravity, settings)
+        # The very kernel that follows a restored state: another one may round in another way.
         self.model.update_frames()
+
+    def _launch_substep(self, substep: int, dt: float, gravity: ti.Vector, settings: StepSettings) -> None:
+        """A substep as many kernels, whose loops run in parallel."""
+        self.begin(substep, dt, gravity, settings.damping, settings.stabilisation_iterations)
+        for iteration in range(settings.iterations):
+            factor = last_exact(iteration, settings.iterations, settings.relaxation_factor)
+            for first, last in self.model.groups:
+                self.iterate(first, last, settings.stiffness, factor, dt)
+        self.end(dt)
 
     def snapshot(self) -> SolverState:
         """A copy of the current state."""
@@ -103,13 +118,52 @@ class Solver:
         self.model.update_frames()
 
     @ti.kernel
-    def begin(self, dt: float, gravity: tm.vec3, damping: float):
+    def advance(
+        self,
+        dt: float,
+        gravity: tm.vec3,
+        damping: float,
+        substeps: int,
+        stabilisation_iterations: int,
+        iterations: int,
+        stiffness: float,
+        relaxation_factor: float,
+    ):
+        """A step as one kernel on one core, for bodies so small that starting threads costs more than they save."""
+        ti.loop_config(serialize=True)
+        for substep in range(substeps):
+            self.start(substep, dt, gravity, damping, stabilisation_iterations)
+            for iteration in range(iterations):
+                factor = last_exact(iteration, iterations, relaxation_factor)
+                self.correct(0, self.body.count, stiffness, factor, dt)
+            self.finish(dt)
+
+    @ti.kernel
+    def begin(self, substep: int, dt: float, gravity: tm.vec3, damping: float, stabilisation_iterations: int):
+        self.start(substep, dt, gravity, damping, stabilisation_iterations)
+
+    @ti.kernel
+    def iterate(self, first: int, last: int, stiffness: float, relaxation_factor: float, dt: float):
+        self.correct(first, last, stiffness, relaxation_factor, dt)
+
+    @ti.kernel
+    def end(self, dt: float):
+        self.finish(dt)
+
+    @ti.func
+    def start(self, substep, dt: float, gravity: tm.vec3, damping: float, stabilisation_iterations: int):
+        """Lines 1-15: where the particles would go, what they may touch, and out of what they start in."""
+        if ti.static(self.has_tool):
+            for _ in range(1):
+                self.tool.go(substep)
         self.predict(dt, gravity, damping)
         self.model.begin(dt)
         if ti.static(self.has_pairs):
             self.pairs.find()  # line 7
         if ti.static(self.has_contacts):
             self.contacts.find()  # line 8
+            self.contacts.stabilise(stabilisation_iterations)
+        self.model.gather()
 
     @ti.func
     def predict(self, dt: float, gravity: tm.vec3, damping: float):
@@ -123,23 +177,28 @@ class Solver:
                 exponent = tm.clamp(self.body.mass_scaling_per_mm * height, -MOST_EXPONENT, MOST_EXPONENT)
                 self.body.mass_scale[i] = ti.exp(-exponent)
 
-    @ti.kernel
-    def stabilise(self):
-        self.contacts.stabilise()  # lines 10-15
-
-    @ti.kernel
-    def iterate(self, first: int, last: int, stiffness: float, relaxation_factor: float, dt: float):
-        self.model.project(first, last, stiffness, relaxation_factor, dt)  # lines 17-21, group by group
+    @ti.func
+    def correct(self, first, last, stiffness: float, relaxation_factor: float, dt: float):
+        """Lines 17-21: one iteration, group by group."""
+        self.model.project(first, last, stiffness, relaxation_factor, dt)
         if ti.static(self.has_pairs):
+            self.model.scatter()
             self.pairs.project(relaxation_factor, self.relax_globally)
-        if ti.static(self.has_contacts):
-            self.contacts.project(relaxation_factor)
+            self.model.gather()
 
-    @ti.kernel
-    def end(self, dt: float):
+    @ti.func
+    def finish(self, dt: float):
+        """Lines 23-26: velocities, and where the particles are."""
+        self.model.scatter()
         if ti.static(self.has_contacts):
             self.contacts.finish()
-        for i in range(self.body.count):  # lines 23-26
+        for i in range(self.body.count):
             x = self.body.estimate[i]
             self.body.velocity[i] = (x - self.body.position[i]) / dt
             self.body.position[i] = x
+
+
+@ti.pyfunc
+def last_exact(iteration: int, iterations: int, relaxation_factor: float) -> float:
+    """The relaxation factor of an iteration: an overshoot left by the last would be taken for velocity in line 24, and grow."""
+    return relaxation_factor if iteration < iterations - 1 else 1.0

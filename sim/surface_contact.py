@@ -200,12 +200,8 @@ class SurfaceContacts:
             self.point[q] = self.point[q] + self.listed_weight[k] * change
 
     @ti.func
-    def stabilise(self):
-        pass
-
-    @ti.func
-    def project(self, relaxation_factor: float):
-        pass
+    def stabilise(self, iterations: int):
+        """Nothing to do: what starts inside a shape is pushed out by the layer's force."""
 
     @ti.func
     def finish(self):

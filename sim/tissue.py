@@ -12,12 +12,15 @@ from sim.body import Body
 class TissueModel(Protocol):
     """Rest data, a projection of its constraints on the body's estimates, and a way to carry points along.
 
-    One file a model. ``groups`` are (first, last) rows of unknowns that are projected one after another, each group at once.
-    ``begin`` and ``project`` are ti.funcs that the solver's kernels inline, so their outermost loops are parallel.
+    One file a model. ``serial`` says that it is too small for more than one core of a CPU. ``groups`` are (first, last) rows of unknowns that are projected one after another, each group at once.
+    ``begin`` to ``project`` are ti.funcs that the solver's kernels inline, so their outermost loops are parallel.
     """
 
     @property
     def body(self) -> Body: ...
+
+    @property
+    def serial(self) -> bool: ...
 
     @property
     def groups(self) -> Sequence[tuple[int, int]]: ...
@@ -25,8 +28,14 @@ class TissueModel(Protocol):
     def begin(self, dt: float) -> None:
         """Once a substep [s], when the solver has predicted the estimates."""
 
+    def gather(self) -> None:
+        """Before passes, when something else has moved the estimates."""
+
+    def scatter(self) -> None:
+        """After passes, when something else needs the estimates."""
+
     def project(self, first: int, last: int, stiffness: float, relaxation_factor: float, dt: float) -> None:
-        """One pass over a group."""
+        """One pass over a group, with the contacts of shapes."""
 
     def update_frames(self) -> None:
         """Once a step, when positions are final, for ``carry``."""

@@ -2,34 +2,29 @@
 
 from dataclasses import replace
 
-import numpy as np
 import trimesh
 
 from scenes.scene import Contact, NeoHookeanTissue, ShapeMatchingTissue, SolverSection
 from sim.body import Body, ParticleBody, RestBody, fill_body
 from sim.contact import REACH_RADII, ShapeContacts
-from sim.distance import distance_grid
 from sim.lattice import fill_with_cells, surface_points
 from sim.neighbours import ParticleContacts
 from sim.neo_hookean import LATTICE_SETTINGS, NeoHookean
+from sim.patches import arrange
 from sim.shape_matching import ShapeMatching
-from sim.shapes import ConvexTool, SignedDistanceField, TriangleMesh
+from sim.shapes import ConvexTool, SignedDistanceField
 from sim.solver import Solver, StepSettings
 from sim.surface_contact import REACH_MM, SurfaceContacts
 
 AnyTissue = NeoHookeanTissue | ShapeMatchingTissue
 # Points of the surface that can touch are this share of a cell apart.
 POINTS_A_CELL = 0.5
-# A grid of distances so fine is within 0.005 mm of a support on average, but for its sharp edges.
-GRID_MM = 1.0
 
 
-def static_shape(mesh: trimesh.Trimesh, tissue: AnyTissue) -> TriangleMesh | SignedDistanceField:
-    """What a closed surface [mm] that does not move is to a tissue: exact to particles, which are few; else a grid."""
-    if isinstance(tissue, NeoHookeanTissue):
-        distance, origin = distance_grid(mesh.vertices, mesh.faces, GRID_MM, REACH_MM)
-        return SignedDistanceField(distance, origin, np.full(3, GRID_MM))
-    return TriangleMesh(mesh.vertices, mesh.faces, REACH_RADII * tissue.radius_mm)
+def static_shape(mesh: trimesh.Trimesh, tissue: AnyTissue) -> SignedDistanceField:
+    """What a closed surface [mm] that does not move is to a tissue: distances as far around as it asks for them."""
+    reach_mm = REACH_MM if isinstance(tissue, NeoHookeanTissue) else REACH_RADII * tissue.radius_mm
+    return SignedDistanceField.of_surface(mesh.vertices, mesh.faces, reach_mm)
 
 
 def embedding_cell_mm(tissue: AnyTissue) -> float:
@@ -92,8 +87,9 @@ def _shape_matching(
     contact: Contact,
     section: SolverSection,
 ) -> Solver:
-    body = ParticleBody(rest, section.mass_scaling_per_mm)
-    model = ShapeMatching(body, tissue.cluster_spacing, section.relaxation)
+    arranged, patches = arrange(rest, tissue.cluster_spacing)
+    body = ParticleBody(arranged, section.mass_scaling_per_mm)
     contacts = ShapeContacts(body, shapes, contact.shape_friction)
+    model = ShapeMatching(body, patches, contacts, section.relaxation)
     pairs = ParticleContacts(body, model, contact.particle_friction) if contact.particles else None
     return Solver(model, contacts, pairs, tool, section.relaxation)

@@ -11,7 +11,7 @@ from scenes.anatomy import Grid, LoadedAnatomy, press_on
 from scenes.scene import NeoHookeanTissue, PlaneShape, Scene
 from sim.embedding import Embedding
 from sim.neo_hookean import NeoHookean
-from sim.shapes import ConvexTool, Plane, SignedDistanceField, TriangleMesh
+from sim.shapes import ConvexTool, Plane, SignedDistanceField
 from sim.skinning import Skin
 from studies.models import build_solver, embedding_cell_mm, static_shape, step_settings
 from ultrasound.probe import Hand, advanced, approached, between, image_plane, indentation, pose_at, touching
@@ -62,9 +62,7 @@ class Rehearsal:
         self.settings = step_settings(tissue, section)
         self.set_gravity(self.scene.gravity.acceleration_m_s2)
 
-    def _shape(
-        self, shape: PlaneShape | trimesh.Trimesh | Grid
-    ) -> Plane | TriangleMesh | SignedDistanceField:
+    def _shape(self, shape: PlaneShape | trimesh.Trimesh | Grid) -> Plane | SignedDistanceField:
         if isinstance(shape, PlaneShape):
             normal = np.array(shape.normal) / np.linalg.norm(shape.normal)
             return Plane(normal, shape.offset_mm / np.linalg.norm(shape.normal) - normal @ self.origin)

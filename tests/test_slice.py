@@ -6,10 +6,10 @@ import SimpleITK as sitk
 import taichi as ti
 import trimesh
 from conftest import rotation_about
+from particle_tissue import tissue_of
 
-from sim.body import BodyState, ParticleBody, fill_body
+from sim.body import BodyState
 from sim.embedding import NOWHERE, Embedding, tetrahedra_around
-from sim.shape_matching import ShapeMatching
 from sim.skinning import Skin
 from ultrasound.probe import image_plane, pose_at
 from ultrasound.slice import Slice
@@ -63,8 +63,8 @@ def pixel_points(plane, pixels: int) -> np.ndarray:
 
 
 def sliced(mesh, image: sitk.Image, move=None, pixels: int = 96, outside: str = "gel"):
-    body = ParticleBody(fill_body(mesh, RADIUS))
-    model = ShapeMatching(body)
+    model = tissue_of(mesh, RADIUS)
+    body = model.body
     embedding = Embedding(model, mesh, 2 * RADIUS)
     if move is not None:
         x = move(body.rest_points).astype(np.float32)
@@ -196,8 +196,8 @@ def test_flat_collapsed_and_inverted_tissue_still_gives_a_picture(device, ball, 
 
 def test_what_lies_around_the_organ_gives_way_to_it_and_far_away_stays(device, ball):
     shift = np.array([0.0, 0.0, 4.0])
-    body = ParticleBody(fill_body(ball, RADIUS))
-    model = ShapeMatching(body)
+    model = tissue_of(ball, RADIUS)
+    body = model.body
     embedding = Embedding(model, ball, 2 * RADIUS, margin_mm=25.0)
     x = (body.rest_points + shift).astype(np.float32)
     body.restore(BodyState(x, np.zeros_like(x)))
@@ -227,7 +227,7 @@ def test_tetrahedra_fill_the_organ_without_gaps(ball):
 
 
 def test_skin_weights_fall_off_with_the_inverse_square(device, ball):
-    model = ShapeMatching(ParticleBody(fill_body(ball, RADIUS)))
+    model = tissue_of(ball, RADIUS)
     skin = Skin(model, ball.vertices)
     frame, weight = skin.frame.to_numpy(), skin.weight.to_numpy()
     assert frame.shape[1] == 4
