@@ -32,6 +32,7 @@ from studies.case import CaseError
 from studies.commands import Fault, arch_option, calibrate, make_folder, start_taichi, validate
 from studies.reference.command import reference
 from studies.setup import SetupError
+from studies.study import study
 
 if TYPE_CHECKING:
     from render.viewer import Controls, Settings, View, Viewer
@@ -143,6 +144,7 @@ cli.add_command(validate)
 cli.add_command(calibrate)
 cli.add_command(beam)
 cli.add_command(reference)
+cli.add_command(study)
 
 
 def label_values(text: str | None, option: str) -> list[int] | None:

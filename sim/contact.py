@@ -134,23 +134,31 @@ class ShapeContacts:
     @ti.func
     def pushed(self, i, x, relaxation_factor: float):
         """How far the shapes push particle i, at x, with their friction, averaged over the shapes [mm] (lines 18-20)."""
-        change, active = tm.vec3(0.0), 0
-        for s in ti.static(range(len(self.shapes))):
-            pushes = self.depth(s, i, x) > 0.0
-            if ti.static(self.rough):
-                pushes |= (self.touched[i] >> s) & 1 and self.contact[i, s].push.w > 0.0
-            active += ti.cast(pushes, ti.i32)
-        if active > 0:
-            # A push beyond the surface would throw the particle off: averaging is undone, no more.
-            share = ti.min(relaxation_factor / ti.cast(active, ti.f32), 1.0)
+        touched, active = self.touched[i], 1
+        if touched & (touched - 1) != 0:
+            pushing = 0
             for s in ti.static(range(len(self.shapes))):
-                if (self.touched[i] >> s) & 1:
-                    normal = self.contact[i, s].plane.xyz
-                    depth = share * ti.max(self.depth(s, i, x), 0.0)
-                    change += depth * normal
-                    if ti.static(self.rough):
-                        change += self.rub(s, i, x, normal, depth, share)
+                pushing += ti.cast(self.pushes(s, i, x), ti.i32)
+            active = ti.max(pushing, 1)
+        # A push beyond the surface would throw the particle off: averaging is undone, no more.
+        share = ti.min(relaxation_factor / ti.cast(active, ti.f32), 1.0)
+        change = tm.vec3(0.0)
+        for s in ti.static(range(len(self.shapes))):
+            if (touched >> s) & 1:
+                normal = self.contact[i, s].plane.xyz
+                depth = share * ti.max(self.depth(s, i, x), 0.0)
+                change += depth * normal
+                if ti.static(self.rough):
+                    change += self.rub(s, i, x, normal, depth, share)
         return change
+
+    @ti.func
+    def pushes(self, s: ti.template(), i, x):
+        """Whether shape s pushes particle i, at x, or has done so in this substep."""
+        result = self.depth(s, i, x) > 0.0
+        if ti.static(self.rough):
+            result |= (self.touched[i] >> s) & 1 and self.contact[i, s].push.w > 0.0
+        return result
 
     @ti.func
     def rub(self, s: ti.template(), i, x, normal, depth, share):
@@ -167,9 +175,9 @@ class ShapeContacts:
             slip -= slip.dot(normal) * normal
             friction = push.xyz - share * slip
             limit = self.friction * normal_push
-            length = friction.norm()
-            if length > limit:
-                friction *= limit / length
+            squared = friction.norm_sqr()
+            if squared > limit * limit:
+                friction *= limit / ti.sqrt(squared)
             change = friction - push.xyz
             self.contact[i, s].push = tm.vec4(friction, normal_push)
         return change

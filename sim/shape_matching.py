@@ -219,20 +219,20 @@ class ShapeMatching:
             reference = self.centre[self.member[first]]
             centre0 = self.cluster_rest[c]
             x, y, z, total = tm.vec4(0.0), tm.vec4(0.0), tm.vec4(0.0), tm.vec4(0.0)
-            for k in range(first, last):
-                p = self.member[k]
-                rest = self.patch_rest[p]
-                at = rest - centre0
-                moved = rest.w * (self.centre[p] - reference)
+            several = self.several_end[c]
+            for k in range(first, several):
+                moment = self.moment[self.member[k]]
+                at, moved = self.apart(self.member[k], centre0, reference)
+                x += row(moment, 0) + at.x * moved
+                y += row(moment, 1) + at.y * moved
+                z += row(moment, 2) + at.z * moved
+                total += moved
+            for k in range(several, last):
+                at, moved = self.apart(self.member[k], centre0, reference)
                 x += at.x * moved
                 y += at.y * moved
                 z += at.z * moved
                 total += moved
-            for k in range(first, self.several_end[c]):
-                moment = self.moment[self.member[k]]
-                x += row(moment, 0)
-                y += row(moment, 1)
-                z += row(moment, 2)
             self.sum[c] = ti.Matrix.rows([x, y, z, reference + total / centre0.w])
         for c in range(self.count):
             fitted = self.sum[c]
@@ -245,6 +245,12 @@ class ShapeMatching:
                 for k in ti.static(range(3)):
                     self.frame[c][axis, k] = rotation[k, axis]
                 self.frame[c][3, axis] = origin[axis]
+
+    @ti.func
+    def apart(self, p, centre0, reference):
+        """How far patch p's centre is from a cluster's at rest, and, times its mass, from a reference now."""
+        rest = self.patch_rest[p]
+        return rest - centre0, rest.w * (self.centre[p] - reference)
 
     @ti.func
     def average(self):

@@ -149,8 +149,9 @@ class ConvexTool:
 
     @ti.kernel
     def _store_path(self, path: Path):
+        ti.loop_config(serialize=True)
         for leg in range(path.shape[0]):
-            for k, i, j in ti.static(ti.ndrange(2, 4, 4)):
+            for k, i, j in ti.ndrange(2, 4, 4):
                 self.path[leg, k][i, j] = path[leg, k, i, j]
 
     @ti.kernel

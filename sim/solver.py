@@ -76,14 +76,15 @@ class Solver:
         and at the end of each substep; without them it stays where it is.
         """
         dt = settings.time_step_s / settings.substeps
-        gravity = ti.Vector(list(settings.gravity))
+        gravity = settings.gravity
         if self.tool is not None:
             still = np.stack([self.tool.last_pose] * (settings.substeps + 1))
             self.tool.follow(still if tool_poses is None else tool_poses)
         if self.model.serial:
+            # Three numbers: a vector would take three times as long to hand over.
             self.advance(
                 dt,
-                gravity,
+                *gravity,
                 settings.damping,
                 settings.substeps,
                 settings.stabilisation_iterations,
@@ -97,9 +98,11 @@ class Solver:
         # The very kernel that follows a restored state: another one may round in another way.
         self.model.update_frames()
 
-    def _launch_substep(self, substep: int, dt: float, gravity: ti.Vector, settings: StepSettings) -> None:
+    def _launch_substep(
+        self, substep: int, dt: float, gravity: tuple[float, float, float], settings: StepSettings
+    ) -> None:
         """A substep as many kernels, whose loops run in parallel."""
-        self.begin(substep, dt, gravity, settings.damping, settings.stabilisation_iterations)
+        self.begin(substep, dt, *gravity, settings.damping, settings.stabilisation_iterations)
         for iteration in range(settings.iterations):
             factor = last_exact(iteration, settings.iterations, settings.relaxation_factor)
             for first, last in self.model.groups:
@@ -121,7 +124,9 @@ class Solver:
     def advance(
         self,
         dt: float,
-        gravity: tm.vec3,
+        gravity_x: float,
+        gravity_y: float,
+        gravity_z: float,
         damping: float,
         substeps: int,
         stabilisation_iterations: int,
@@ -132,6 +137,7 @@ class Solver:
         """A step as one kernel on one core, for bodies so small that starting threads costs more than they save."""
         ti.loop_config(serialize=True)
         for substep in range(substeps):
+            gravity = tm.vec3(gravity_x, gravity_y, gravity_z)
             self.start(substep, dt, gravity, damping, stabilisation_iterations)
             for iteration in range(iterations):
                 factor = last_exact(iteration, iterations, relaxation_factor)
@@ -139,7 +145,17 @@ class Solver:
             self.finish(dt)
 
     @ti.kernel
-    def begin(self, substep: int, dt: float, gravity: tm.vec3, damping: float, stabilisation_iterations: int):
+    def begin(
+        self,
+        substep: int,
+        dt: float,
+        gravity_x: float,
+        gravity_y: float,
+        gravity_z: float,
+        damping: float,
+        stabilisation_iterations: int,
+    ):
+        gravity = tm.vec3(gravity_x, gravity_y, gravity_z)
         self.start(substep, dt, gravity, damping, stabilisation_iterations)
 
     @ti.kernel
@@ -192,6 +208,10 @@ class Solver:
         self.model.scatter()
         if ti.static(self.has_contacts):
             self.contacts.finish()
+        self.settle(dt)
+
+    @ti.func
+    def settle(self, dt: float):
         for i in range(self.body.count):
             x = self.body.estimate[i]
             self.body.velocity[i] = (x - self.body.position[i]) / dt

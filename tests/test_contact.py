@@ -271,7 +271,7 @@ def test_stabilisation_moves_position_and_estimate_alike(device, ball):
 
 
 def begin(solver: Solver, gravity: list[float], dt: float = 0.0, stabilisations: int = 0) -> None:
-    solver.begin(0, dt, ti.Vector(gravity), 0.0, stabilisations)
+    solver.begin(0, dt, *gravity, 0.0, stabilisations)
 
 
 def two_blocks(pairs: bool, scaling: float = 0.0) -> tuple[Solver, np.ndarray]:

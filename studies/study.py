@@ -1,0 +1,13 @@
+"""The commands ``study ...``: what Nephron costs, and what cannot break it, measured on the user's machine."""
+
+import click
+
+from studies.timing.command import timing
+
+
+@click.group()
+def study() -> None:
+    """Measure on this machine: tables, CSV, JSON and a picture into a folder."""
+
+
+study.add_command(timing)

@@ -1,0 +1,147 @@
+"""A step in pieces, each a kernel of its own, so that each can be timed: what the paper's Fig. 8 shows."""
+
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import taichi as ti
+import taichi.math as tm
+
+from sim.shape_matching import ShapeMatching
+from sim.solver import Solver, StepSettings, last_exact
+
+# Pieces of a substep before its iterations, of an iteration, and after them; "frames" is once a step.
+BEFORE = ("tool", "predict", "begin", "find contacts", "leave contacts", "gather")
+PASSES = {
+    True: ("fit clusters", "average goals", "move to goals", "contacts"),
+    False: ("tissue and contacts",),
+}
+AFTER = ("scatter", "keep out", "velocities")
+CONTACTS = ("find contacts", "leave contacts", "contacts", "keep out")
+EMPTY_CALLS = 200
+
+
+@ti.data_oriented
+class Phases:
+    """A solver whose steps are taken piece by piece; ``ms`` holds the times of each piece of the last step [ms]."""
+
+    def __init__(self, solver: Solver) -> None:
+        if solver.has_pairs:
+            raise ValueError("phases know no contacts between particles")
+        self.solver: Any = solver
+        self.model: Any = solver.model
+        self.serial = solver.model.serial
+        self.is_matched = isinstance(solver.model, ShapeMatching)
+        self.passes = PASSES[self.is_matched]
+        self.ms: dict[str, float] = {}
+        self.call_ms = self._time_of_a_call()
+
+    def names(self) -> tuple[str, ...]:
+        """All pieces, in their order."""
+        return (*BEFORE, *self.passes, *AFTER, "frames")
+
+    def step(self, settings: StepSettings, tool_poses: np.ndarray) -> None:
+        """One time step, as ``Solver.step`` takes it."""
+        dt = settings.time_step_s / settings.substeps
+        self.ms = dict.fromkeys(self.names(), 0.0)
+        values = (dt, ti.Vector(list(settings.gravity)), settings.damping, settings.stiffness)
+        if self.solver.tool is not None:
+            self.solver.tool.follow(tool_poses)
+        for substep in range(settings.substeps):
+            for name in BEFORE:
+                self._timed(name, substep, 0, 0, 1.0, *values, settings.stabilisation_iterations)
+            for iteration in range(settings.iterations):
+                factor = last_exact(iteration, settings.iterations, settings.relaxation_factor)
+                for first, last in self.model.groups:
+                    for name in self.passes:
+                        self._timed(name, substep, first, last, factor, *values, 0)
+            for name in AFTER:
+                self._timed(name, substep, 0, 0, 1.0, *values, 0)
+        started = perf_counter()
+        self.model.update_frames()
+        ti.sync()
+        self.ms["frames"] = max(1e3 * (perf_counter() - started) - self.call_ms, 0.0)
+
+    def _timed(self, name: str, *values) -> None:
+        started = perf_counter()
+        self._piece(name, *values)
+        ti.sync()
+        self.ms[name] += max(1e3 * (perf_counter() - started) - self.call_ms, 0.0)
+
+    def _time_of_a_call(self) -> float:
+        """What it takes to call a kernel that does nothing [ms]; it is no part of a step that is one kernel."""
+        times = []
+        for _ in range(EMPTY_CALLS):
+            started = perf_counter()
+            self._piece("nothing", 0, 0, 0, 1.0, 0.0, ti.Vector([0.0, 0.0, 0.0]), 0.0, 0.0, 0)
+            ti.sync()
+            times.append(1e3 * (perf_counter() - started))
+        return median(times)
+
+    @ti.kernel
+    def _piece(
+        self,
+        name: ti.template(),
+        substep: int,
+        first: int,
+        last: int,
+        factor: float,
+        dt: float,
+        gravity: tm.vec3,
+        damping: float,
+        stiffness: float,
+        stabilisations: int,
+    ):
+        if ti.static(self.serial):
+            ti.loop_config(serialize=True)
+            for _once in range(1):
+                self._work(
+                    name, substep, first, last, factor, dt, gravity, damping, stiffness, stabilisations
+                )
+        else:
+            self._work(name, substep, first, last, factor, dt, gravity, damping, stiffness, stabilisations)
+
+    @ti.func
+    def _work(
+        self,
+        name: ti.template(),
+        substep,
+        first,
+        last,
+        factor,
+        dt,
+        gravity,
+        damping,
+        stiffness,
+        stabilisations,
+    ):
+        if ti.static(name == "tool" and self.solver.has_tool):
+            for _ in range(1):
+                self.solver.tool.go(substep)
+        if ti.static(name == "predict"):
+            self.solver.predict(dt, gravity, damping)
+        if ti.static(name == "begin"):
+            self.model.begin(dt)
+        if ti.static(name == "find contacts" and self.solver.has_contacts):
+            self.solver.contacts.find()
+        if ti.static(name == "leave contacts" and self.solver.has_contacts):
+            self.solver.contacts.stabilise(stabilisations)
+        if ti.static(name == "gather"):
+            self.model.gather()
+        if ti.static(name == "fit clusters"):
+            self.model.fit(False)
+        if ti.static(name == "average goals"):
+            self.model.average()
+        if ti.static(name == "move to goals"):
+            self.model.move_to_goals(stiffness * factor)
+        if ti.static(name == "contacts" and self.solver.has_contacts):
+            self.model.push_out(factor)
+        if ti.static(name == "tissue and contacts"):
+            self.model.project(first, last, stiffness, factor, dt)
+        if ti.static(name == "scatter"):
+            self.model.scatter()
+        if ti.static(name == "keep out" and self.solver.has_contacts):
+            self.solver.contacts.finish()
+        if ti.static(name == "velocities"):
+            self.solver.settle(dt)
