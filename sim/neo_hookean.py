@@ -28,7 +28,7 @@ LEAST_J = 0.2
 LN2 = 0.6931471805599453
 SQRT_HALF_BITS = 0x3F3504F3
 # With fewer nodes, starting threads for eight colours costs a CPU more than they save.
-PARALLEL_NODES = 8000
+PARALLEL_NODES = 16_000
 # No node moves farther in a pass than this share of a cell.
 MOST_CELLS_A_PASS = 0.5
 LATTICE_SETTINGS = StepSettings(substeps=1, iterations=8, relaxation_factor=1.7, stabilisation_iterations=0)

@@ -24,7 +24,7 @@ MOST_FRAMES = 4
 # Keeps the weight of a point on a cluster's very origin finite.
 LEAST_SQUARED_MM2 = 1e-6
 # With fewer particles, starting threads costs a CPU more than they save.
-PARALLEL_PARTICLES = 40_000
+PARALLEL_PARTICLES = 100_000
 
 
 @ti.data_oriented
