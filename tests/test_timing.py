@@ -19,7 +19,7 @@ from sim.shapes import ConvexTool, Plane
 from sim.solver import Solver, StepSettings
 from studies.setup import Setup
 from studies.timing import bound, command, measure
-from studies.timing.phases import Phases
+from studies.timing.phases import Phases, without_calls
 
 
 def solver_of(model: str, mesh: trimesh.Trimesh) -> Solver:
@@ -49,7 +49,15 @@ def test_a_step_in_pieces_is_the_step(device, ball, model):
     # Compiled otherwise, sums round otherwise: 1e-6 mm a pass at 12 mm, in a hundred passes that do not forget it.
     assert np.abs(ends[1] - ends[0]).max() < 1e-3
     assert tuple(phases.ms) == phases.names()
-    assert sum(phases.ms.values()) > 0 and min(phases.ms.values()) >= 0
+    assert min(phases.ms.values()) > 0
+    assert phases.calls["predict"] == settings.substeps and phases.calls["frames"] == 1
+
+
+def test_pieces_sum_to_the_step_they_are_of():
+    ms, calls = dict(fit=5.0, push=3.0, end=0.5), dict(fit=4, push=4, end=1)
+    # 8.5 ms for 9 calls, 4 ms in one piece: half a millisecond a call.
+    assert without_calls(ms, calls, 4.0) == pytest.approx(dict(fit=3.0, push=1.0, end=0.0))
+    assert sum(without_calls(ms, calls, 9.0).values()) == pytest.approx(9.0)
 
 
 def test_the_bound_in_c_computes_what_shape_matching_does(device, block):

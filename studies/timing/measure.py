@@ -25,7 +25,7 @@ from studies.rehearsal import Rehearsal
 from studies.report import spread, timed
 from studies.setup import Setup
 from studies.timing.bound import Bound, NoBound, Pypbd
-from studies.timing.phases import Phases
+from studies.timing.phases import Phases, without_calls
 from ultrasound.probe import advanced, between
 
 AWAY_MM = 100.0
@@ -103,8 +103,8 @@ def measure(rehearsal: Rehearsal, setup: Setup, share: float, arch: str) -> Pres
     elapsed = []
     for time_s in press(rehearsal, share, lambda s, poses: timed(lambda: solver.step(s, poses), step_ms)):
         elapsed.append(time_s)
-    for _ in press(rehearsal, share, phases.step):
-        pieces.append(phases.ms)
+    for n, _ in enumerate(press(rehearsal, share, phases.step)):
+        pieces.append(without_calls(phases.ms, phases.calls, step_ms[n]))
     case = describe(setup, solver, arch) | dict(ms=spread(step_ms), phases_ms=mean_of(pieces))
     warm_up_s = max(1, round(share * rehearsal.press.warm_up_steps)) * rehearsal.settings.time_step_s
     return Press(setup, case, elapsed, step_ms, pieces, warm_up_s)

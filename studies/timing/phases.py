@@ -1,6 +1,6 @@
 """A step in pieces, each a kernel of its own, so that each can be timed: what the paper's Fig. 8 shows."""
 
-from statistics import median
+from collections.abc import Callable
 from time import perf_counter
 from typing import Any
 
@@ -19,12 +19,14 @@ PASSES = {
 }
 AFTER = ("scatter", "keep out", "velocities")
 CONTACTS = ("find contacts", "leave contacts", "contacts", "keep out")
-EMPTY_CALLS = 200
 
 
 @ti.data_oriented
 class Phases:
-    """A solver whose steps are taken piece by piece; ``ms`` holds the times of each piece of the last step [ms]."""
+    """A solver whose steps are taken piece by piece.
+
+    ``ms`` holds how long each piece of the last step took [ms], with the time of calling it ``calls`` times from Python.
+    """
 
     def __init__(self, solver: Solver) -> None:
         if solver.has_pairs:
@@ -35,7 +37,7 @@ class Phases:
         self.is_matched = isinstance(solver.model, ShapeMatching)
         self.passes = PASSES[self.is_matched]
         self.ms: dict[str, float] = {}
-        self.call_ms = self._time_of_a_call()
+        self.calls: dict[str, int] = {}
 
     def names(self) -> tuple[str, ...]:
         """All pieces, in their order."""
@@ -44,7 +46,7 @@ class Phases:
     def step(self, settings: StepSettings, tool_poses: np.ndarray) -> None:
         """One time step, as ``Solver.step`` takes it."""
         dt = settings.time_step_s / settings.substeps
-        self.ms = dict.fromkeys(self.names(), 0.0)
+        self.ms, self.calls = dict.fromkeys(self.names(), 0.0), dict.fromkeys(self.names(), 0)
         values = (dt, ti.Vector(list(settings.gravity)), settings.damping, settings.stiffness)
         if self.solver.tool is not None:
             self.solver.tool.follow(tool_poses)
@@ -58,26 +60,17 @@ class Phases:
                         self._timed(name, substep, first, last, factor, *values, 0)
             for name in AFTER:
                 self._timed(name, substep, 0, 0, 1.0, *values, 0)
-        started = perf_counter()
-        self.model.update_frames()
-        ti.sync()
-        self.ms["frames"] = max(1e3 * (perf_counter() - started) - self.call_ms, 0.0)
+        self._clocked("frames", self.model.update_frames)
 
     def _timed(self, name: str, *values) -> None:
-        started = perf_counter()
-        self._piece(name, *values)
-        ti.sync()
-        self.ms[name] += max(1e3 * (perf_counter() - started) - self.call_ms, 0.0)
+        self._clocked(name, lambda: self._piece(name, *values))
 
-    def _time_of_a_call(self) -> float:
-        """What it takes to call a kernel that does nothing [ms]; it is no part of a step that is one kernel."""
-        times = []
-        for _ in range(EMPTY_CALLS):
-            started = perf_counter()
-            self._piece("nothing", 0, 0, 0, 1.0, 0.0, ti.Vector([0.0, 0.0, 0.0]), 0.0, 0.0, 0)
-            ti.sync()
-            times.append(1e3 * (perf_counter() - started))
-        return median(times)
+    def _clocked(self, name: str, work: Callable[[], None]) -> None:
+        started = perf_counter()
+        work()
+        ti.sync()
+        self.ms[name] += 1e3 * (perf_counter() - started)
+        self.calls[name] += 1
 
     @ti.kernel
     def _piece(
@@ -145,3 +138,13 @@ class Phases:
             self.solver.contacts.finish()
         if ti.static(name == "velocities"):
             self.solver.settle(dt)
+
+
+def without_calls(ms: dict[str, float], calls: dict[str, int], whole_ms: float) -> dict[str, float]:
+    """Times of pieces [ms] that sum to that of the ``whole`` step, in which they are not called one by one.
+
+    What they take longer together is the calls', all alike.
+    """
+    call_ms = max(sum(ms.values()) - whole_ms, 0.0) / sum(calls.values())
+    own = {name: max(taken - call_ms * calls[name], 0.0) for name, taken in ms.items()}
+    return {name: taken * whole_ms / sum(own.values()) for name, taken in own.items()}
