@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from sim.body import ParticleBody
 from sim.contact import ShapeContacts
 from sim.device import on_cpu
+from sim.four_wide import four, row
 from sim.patches import Patches
 from sim.rotation import rotation_near
 from sim.sampling import Clusters
@@ -36,9 +37,11 @@ class ShapeMatching:
     and angular momentum because of the masses with which the clusters are fitted: under ``local`` a particle
     gives each of its n clusters 1/n of its mass, under ``global`` the whole of it to each.
 
-    ``patch_rest`` and ``cluster_rest``: centre [mm] and mass, in units of a particle's. ``moment`` (patches, 4): the
-    columns of the sum of m (x - centre) (x0 - centre0)^T, then the centre. ``frame`` (clusters, 4): the columns of the
-    rotation R, then the translation T [mm] of x = R x0 + T.
+    Of each patch: ``patch_rest``, its centre [mm] and mass, in units of a particle's, at rest; ``centre`` now; ``moment``,
+    rows that are the columns of the sum of m (x - centre) (x0 - centre0)^T; ``goal``, as ``frame``, the sum over its
+    clusters. Of each cluster: ``cluster_rest``; ``frame``, rows that are the columns of the rotation R, then the
+    translation T [mm] of x = R x0 + T. ``local`` (n,) is where the particles are in their patches at rest, with 1 as the
+    fourth entry.
     """
 
     def __init__(
@@ -55,7 +58,6 @@ class ShapeMatching:
         self.contacts: Any = contacts
         self.has_contacts = contacts is not None
         self.serial = on_cpu() and body.count < PARALLEL_PARTICLES if serial is None else serial
-        self.groups = ((0, body.count),)
         self.patches = patches
         self.patch_count = len(patches)
         self.several = patches.several
@@ -133,7 +135,7 @@ class ShapeMatching:
                 moment += scale * self.local[k]
                 mass += scale
             share = self.patch_scale[p].x
-            self.patch_rest[p] = four(self.patch_centre[p].xyz + moment.xyz / mass, mass * share)
+            self.patch_rest[p] = tm.vec4(self.patch_centre[p].xyz + moment.xyz / mass, mass * share)
             self.patch_scale[p].y = 1.0 / mass
 
     @ti.func
@@ -146,10 +148,10 @@ class ShapeMatching:
                 rest = self.patch_rest[self.member[k]]
                 moment += rest.w * (rest - origin).xyz
                 mass += rest.w
-            self.cluster_rest[c] = four(origin.xyz + moment / mass, mass)
+            self.cluster_rest[c] = tm.vec4(origin.xyz + moment / mass, mass)
 
     @ti.func
-    def project(self, first, last, stiffness: float, relaxation_factor: float, dt: float):
+    def project(self, stiffness: float, relaxation_factor: float, dt: float):
         """One pass over all clusters on the estimates: fit them, then move particles to their goals."""
         self.fit(False)
         self.average()
@@ -173,16 +175,16 @@ class ShapeMatching:
         """Centres and moments of the patches where the estimates are."""
         for p in range(self.several):
             first, last = self.patch_start[p], self.patch_start[p + 1]
-            reference = four(self.body.estimate[first], 0.0)
+            reference = four(self.body.estimate[first])
             sums = tm.mat4(0.0)
             for k in range(first, last):
-                estimate = four(self.body.estimate[k], 0.0)
+                estimate = four(self.body.estimate[k])
                 self.estimate[k] = estimate
                 sums += self.moment_of(k, estimate - reference)
             self.add_moment(p, reference, tm.mat4(0.0), sums)
         for p in range(self.several, self.patch_count):
             k = self.patch_start[p]
-            self.estimate[k] = four(self.body.estimate[k], 0.0)
+            self.estimate[k] = four(self.body.estimate[k])
             self.centre[p] = self.estimate[k]
 
     @ti.func
@@ -293,7 +295,7 @@ class ShapeMatching:
                 for k in range(self.patch_start[p], self.patch_start[p + 1]):
                     if self.contacts.touched[k] > 0:
                         estimate = self.estimate[k]
-                        change = four(self.contacts.pushed(k, estimate.xyz, relaxation_factor), 0.0)
+                        change = four(self.contacts.pushed(k, estimate.xyz, relaxation_factor))
                         self.estimate[k] = estimate + change
                         sums += self.moment_of(k, change)
                 moment = tm.mat4(0.0)
@@ -337,18 +339,6 @@ class ShapeMatching:
                     x += weight[v][k] * rest[v][axis] * row(moved, axis)
                 x += weight[v][k] * row(moved, 3)
             out[v] = x.xyz
-
-
-@ti.func
-def row(matrix, k: ti.template()):
-    """Row k of a 4 x 4 matrix."""
-    return tm.vec4(matrix[k, 0], matrix[k, 1], matrix[k, 2], matrix[k, 3])
-
-
-@ti.func
-def four(vector, last):
-    """A vector of three with a fourth entry."""
-    return tm.vec4(vector.x, vector.y, vector.z, last)
 
 
 def _int_field(values: np.ndarray) -> ti.Field:

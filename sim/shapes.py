@@ -137,7 +137,12 @@ class ConvexTool:
         return ConvexTool(np.concatenate([np.eye(3), -np.eye(3)]), offsets, edge_radius_mm)
 
     def follow(self, poses: np.ndarray) -> None:
-        """Poses (substeps + 1, 4, 4), world from tool [mm], at the start of a time step and at the end of each substep."""
+        """Poses (substeps + 1, 4, 4), world from tool [mm], at the start of a time step and at the end of each substep.
+
+        Raises ValueError for more substeps than there is room for.
+        """
+        if not 1 <= len(poses) - 1 <= MOST_SUBSTEPS:
+            raise ValueError(f"{len(poses) - 1} substeps: expected 1 to {MOST_SUBSTEPS}")
         self.last_pose = poses[-1]
         back = poses[:-1] @ np.linalg.inv(poses[1:]) - np.eye(4)
         self._store_path(np.stack([poses[1:], back], axis=1).astype(np.float32))

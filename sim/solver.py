@@ -76,7 +76,6 @@ class Solver:
         and at the end of each substep; without them it stays where it is.
         """
         dt = settings.time_step_s / settings.substeps
-        gravity = settings.gravity
         if self.tool is not None:
             still = np.stack([self.tool.last_pose] * (settings.substeps + 1))
             self.tool.follow(still if tool_poses is None else tool_poses)
@@ -84,7 +83,7 @@ class Solver:
             # Three numbers: a vector would take three times as long to hand over.
             self.advance(
                 dt,
-                *gravity,
+                *settings.gravity,
                 settings.damping,
                 settings.substeps,
                 settings.stabilisation_iterations,
@@ -94,19 +93,16 @@ class Solver:
             )
         else:
             for substep in range(settings.substeps):
-                self._launch_substep(substep, dt, gravity, settings)
+                self._launch_substep(substep, dt, settings)
         # The very kernel that follows a restored state: another one may round in another way.
         self.model.update_frames()
 
-    def _launch_substep(
-        self, substep: int, dt: float, gravity: tuple[float, float, float], settings: StepSettings
-    ) -> None:
+    def _launch_substep(self, substep: int, dt: float, settings: StepSettings) -> None:
         """A substep as many kernels, whose loops run in parallel."""
-        self.begin(substep, dt, *gravity, settings.damping, settings.stabilisation_iterations)
+        self.begin(substep, dt, *settings.gravity, settings.damping, settings.stabilisation_iterations)
         for iteration in range(settings.iterations):
             factor = last_exact(iteration, settings.iterations, settings.relaxation_factor)
-            for first, last in self.model.groups:
-                self.iterate(first, last, settings.stiffness, factor, dt)
+            self.iterate(settings.stiffness, factor, dt)
         self.end(dt)
 
     def snapshot(self) -> SolverState:
@@ -141,7 +137,7 @@ class Solver:
             self.start(substep, dt, gravity, damping, stabilisation_iterations)
             for iteration in range(iterations):
                 factor = last_exact(iteration, iterations, relaxation_factor)
-                self.correct(0, self.body.count, stiffness, factor, dt)
+                self.correct(stiffness, factor, dt)
             self.finish(dt)
 
     @ti.kernel
@@ -159,8 +155,8 @@ class Solver:
         self.start(substep, dt, gravity, damping, stabilisation_iterations)
 
     @ti.kernel
-    def iterate(self, first: int, last: int, stiffness: float, relaxation_factor: float, dt: float):
-        self.correct(first, last, stiffness, relaxation_factor, dt)
+    def iterate(self, stiffness: float, relaxation_factor: float, dt: float):
+        self.correct(stiffness, relaxation_factor, dt)
 
     @ti.kernel
     def end(self, dt: float):
@@ -194,9 +190,9 @@ class Solver:
                 self.body.mass_scale[i] = ti.exp(-exponent)
 
     @ti.func
-    def correct(self, first, last, stiffness: float, relaxation_factor: float, dt: float):
+    def correct(self, stiffness: float, relaxation_factor: float, dt: float):
         """Lines 17-21: one iteration, group by group."""
-        self.model.project(first, last, stiffness, relaxation_factor, dt)
+        self.model.project(stiffness, relaxation_factor, dt)
         if ti.static(self.has_pairs):
             self.model.scatter()
             self.pairs.project(relaxation_factor, self.relax_globally)
@@ -212,6 +208,7 @@ class Solver:
 
     @ti.func
     def settle(self, dt: float):
+        """Lines 24 and 25."""
         for i in range(self.body.count):
             x = self.body.estimate[i]
             self.body.velocity[i] = (x - self.body.position[i]) / dt

@@ -1,6 +1,5 @@
 """What a tissue model is: the interface that solver, contacts, skin and embedding know, and nothing else of it."""
 
-from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -12,7 +11,7 @@ from sim.body import Body
 class TissueModel(Protocol):
     """Rest data, a projection of its constraints on the body's estimates, and a way to carry points along.
 
-    One file a model. ``serial`` says that it is too small for more than one core of a CPU. ``groups`` are (first, last) rows of unknowns that are projected one after another, each group at once.
+    One file a model. ``serial`` says that it is too small for more than one core of a CPU.
     ``begin`` to ``project`` are ti.funcs that the solver's kernels inline, so their outermost loops are parallel.
     """
 
@@ -21,9 +20,6 @@ class TissueModel(Protocol):
 
     @property
     def serial(self) -> bool: ...
-
-    @property
-    def groups(self) -> Sequence[tuple[int, int]]: ...
 
     def begin(self, dt: float) -> None:
         """Once a substep [s], when the solver has predicted the estimates."""
@@ -34,8 +30,8 @@ class TissueModel(Protocol):
     def scatter(self) -> None:
         """After passes, when something else needs the estimates."""
 
-    def project(self, first: int, last: int, stiffness: float, relaxation_factor: float, dt: float) -> None:
-        """One pass over a group, with the contacts of shapes."""
+    def project(self, stiffness: float, relaxation_factor: float, dt: float) -> None:
+        """One pass over all constraints, those of contact with shapes too."""
 
     def update_frames(self) -> None:
         """Once a step, when positions are final, for ``carry``."""

@@ -105,6 +105,14 @@ def test_a_tool_knows_how_its_material_moved(device):
     assert np.abs(moved.to_numpy() - (now @ material - material)[:3]).max() < 1e-6
 
 
+def test_more_poses_than_a_step_has_room_for_are_refused(device):
+    tool = ConvexTool.cuboid(np.array([4.0, 4.0, 4.0]))
+    tool.follow(np.tile(np.eye(4), (101, 1, 1)))
+    for poses in (1, 102):
+        with pytest.raises(ValueError, match=f"{poses - 1} substeps: expected 1 to 100"):
+            tool.follow(np.tile(np.eye(4), (poses, 1, 1)))
+
+
 def test_signed_distance_field_of_a_sphere(device):
     spacing = 0.5
     axis = np.arange(-16, 16.1, spacing)

@@ -1,9 +1,11 @@
 """Every matrix has a right rotation: a million of all kinds against NumPy's float64 decomposition."""
 
 import numpy as np
+import pytest
 import taichi as ti
+from scipy.spatial.transform import Rotation
 
-from sim.rotation import nearest_rotation
+from sim.rotation import nearest_rotation, rotation_near
 
 COUNT = 1_000_000
 KIND = COUNT // 8
@@ -27,23 +29,40 @@ def matrices() -> np.ndarray:
     return all_kinds.astype(np.float32)
 
 
-def rotations(values: np.ndarray) -> np.ndarray:
+def rotations(values: np.ndarray, guesses: np.ndarray | None = None) -> np.ndarray:
     given = ti.Matrix.field(3, 3, ti.f32, len(values))
+    guess = ti.Matrix.field(3, 3, ti.f32, len(values))
     found = ti.Matrix.field(3, 3, ti.f32, len(values))
     given.from_numpy(values)
+    if guesses is not None:
+        guess.from_numpy(guesses.astype(np.float32))
 
     @ti.kernel
     def extract():
         for i in given:
             found[i] = nearest_rotation(given[i])
 
-    extract()
+    @ti.kernel
+    def extract_near():
+        for i in given:
+            found[i] = rotation_near(guess[i], given[i])
+
+    extract() if guesses is None else extract_near()
     return found.to_numpy().astype(np.float64)
 
 
-def test_every_matrix_gets_the_proper_rotation_that_fits_best(device):
+@pytest.mark.parametrize("guess", [None, "any", "near"])
+def test_every_matrix_gets_the_proper_rotation_that_fits_best(device, guess):
     values = matrices()
-    found = rotations(values)
+    guesses = None
+    if guess == "any":
+        guesses = Rotation.random(COUNT, random_state=2).as_matrix()
+    elif guess == "near":
+        u, _, vt = np.linalg.svd(values.astype(np.float64))
+        u[:, :, 2] *= (np.sign(np.linalg.det(u)) * np.sign(np.linalg.det(vt)))[:, None]
+        turns = Rotation.from_rotvec(0.1 * np.random.default_rng(3).normal(size=(COUNT, 3))).as_matrix()
+        guesses = u @ vt @ turns
+    found = rotations(values, guesses)
     values = values.astype(np.float64)
     largest = np.abs(values).max(axis=(1, 2), keepdims=True)
     values /= np.where(largest > 0, largest, 1.0)

@@ -21,7 +21,7 @@ ROUNDING_MM = 3e-5
 def project(model: ti.template(), stiffness: float, factor: float):
     model.begin(0.0)
     model.gather()
-    model.project(0, 0, stiffness, factor, 0.0)
+    model.project(stiffness, factor, 0.0)
     model.scatter()
 
 

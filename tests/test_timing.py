@@ -75,7 +75,7 @@ def test_the_bound_in_c_computes_what_shape_matching_does(device, block):
         for _once in range(1):
             model.gather()
             for _ in range(iterations):
-                model.project(0, 0, bound.STIFFNESS, 1.0, 0.0)
+                model.project(bound.STIFFNESS, 1.0, 0.0)
             model.scatter()
 
     match(3)

@@ -52,14 +52,13 @@ class Phases:
             self.solver.tool.follow(tool_poses)
         for substep in range(settings.substeps):
             for name in BEFORE:
-                self._timed(name, substep, 0, 0, 1.0, *values, settings.stabilisation_iterations)
+                self._timed(name, substep, 1.0, *values, settings.stabilisation_iterations)
             for iteration in range(settings.iterations):
                 factor = last_exact(iteration, settings.iterations, settings.relaxation_factor)
-                for first, last in self.model.groups:
-                    for name in self.passes:
-                        self._timed(name, substep, first, last, factor, *values, 0)
+                for name in self.passes:
+                    self._timed(name, substep, factor, *values, 0)
             for name in AFTER:
-                self._timed(name, substep, 0, 0, 1.0, *values, 0)
+                self._timed(name, substep, 1.0, *values, 0)
         self._clocked("frames", self.model.update_frames)
 
     def _timed(self, name: str, *values) -> None:
@@ -77,8 +76,6 @@ class Phases:
         self,
         name: ti.template(),
         substep: int,
-        first: int,
-        last: int,
         factor: float,
         dt: float,
         gravity: tm.vec3,
@@ -89,19 +86,15 @@ class Phases:
         if ti.static(self.serial):
             ti.loop_config(serialize=True)
             for _once in range(1):
-                self._work(
-                    name, substep, first, last, factor, dt, gravity, damping, stiffness, stabilisations
-                )
+                self._work(name, substep, factor, dt, gravity, damping, stiffness, stabilisations)
         else:
-            self._work(name, substep, first, last, factor, dt, gravity, damping, stiffness, stabilisations)
+            self._work(name, substep, factor, dt, gravity, damping, stiffness, stabilisations)
 
     @ti.func
     def _work(
         self,
         name: ti.template(),
         substep,
-        first,
-        last,
         factor,
         dt,
         gravity,
@@ -131,7 +124,7 @@ class Phases:
         if ti.static(name == "contacts" and self.solver.has_contacts):
             self.model.push_out(factor)
         if ti.static(name == "tissue and contacts"):
-            self.model.project(first, last, stiffness, factor, dt)
+            self.model.project(stiffness, factor, dt)
         if ti.static(name == "scatter"):
             self.model.scatter()
         if ti.static(name == "keep out" and self.solver.has_contacts):

@@ -11,7 +11,7 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
 from studies.timing.measure import Press
-from studies.timing.phases import CONTACTS
+from studies.timing.phases import AFTER, BEFORE, CONTACTS, PASSES
 
 DPI = 130
 # The paper's Table 5: radius [mm], mean, minimum and maximum [ms].
@@ -23,6 +23,7 @@ PAPER = (
     (3.3, 14.16, 13.67, 15.68),
 )
 FRAME_MS = 1000 / 60
+LEAST_SHARE = 2.0
 
 
 def draw(presses: list[Press], sizes: list[dict], path: Path) -> None:
@@ -56,23 +57,24 @@ def _against_time(axes: Axes, press: Press) -> None:
 
 
 def _pieces(axes: Axes, presses: list[Press]) -> None:
-    """The paper's Figure 8, for every model and size."""
-    names = list(dict.fromkeys(name for press in presses for name in press.case["phases_ms"]))
-    shown = [
-        name
-        for name in names
-        if max(p.case["phases_ms"].get(name, 0) / sum(p.case["phases_ms"].values()) for p in presses) > 0.01
-    ]
-    left = [0.0] * len(presses)
+    """The paper's Figure 8, for every model and size: what takes less than a fiftieth everywhere is the rest."""
+    shares = []
+    for press in presses:
+        phases = press.case["phases_ms"]
+        shares.append({name: 100 * ms / sum(phases.values()) for name, ms in phases.items()})
+    names = [*BEFORE, *PASSES[False], *PASSES[True], *AFTER, "frames"]
+    shown = [name for name in names if max(share.get(name, 0.0) for share in shares) > LEAST_SHARE]
+    left = np.zeros(len(presses))
     for number, name in enumerate(shown):
-        width = [press.case["phases_ms"].get(name, 0.0) for press in presses]
-        axes.barh(range(len(presses)), width, left=left, color=plt.get_cmap("tab20")(number % 20), label=name)
-        left = [a + b for a, b in zip(left, width, strict=True)]
+        width = np.array([share.get(name, 0.0) for share in shares])
+        colour = plt.get_cmap("tab20")(number)
+        axes.barh(range(len(presses)), width, left=left, color=colour, label=name)
+        left += width
+    axes.barh(range(len(presses)), 100 - left, left=left, color="0.8", label="the rest")
     axes.set_yticks(range(len(presses)), [_name(press.case) for press in presses])
     axes.invert_yaxis()
-    axes.set(title="Pieces of a step (the paper's Fig. 8)", xlabel="ms")
-    axes.set_xscale("log" if max(left) > 20 * min(left) else "linear")
-    axes.legend(fontsize=8)
+    axes.set(title="Pieces of a step (the paper's Fig. 8)", xlabel="% of the step", xlim=(0, 100))
+    axes.legend(fontsize=8, ncols=1, loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
 def _name(case: dict) -> str:
