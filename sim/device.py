@@ -10,6 +10,8 @@ os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 
 import taichi as ti
 
+FEW_CORES = 4
+
 
 class NoDevice(RuntimeError):
     """The backend that was asked for is not there; the message is one line."""
@@ -37,3 +39,12 @@ def start(arch: str = "cpu", **options) -> str:
 def on_cpu() -> bool:
     """Whether Taichi was started on the CPU."""
     return ti.cfg.arch in (ti.x64, ti.arm64)
+
+
+def is_too_small(count: int, parallel_from: int) -> bool:
+    """Whether a body of so many particles or nodes steps faster on one core of a CPU than on all of them.
+
+    Of few cores the second never paid: what one has computed the other must fetch. The machine decides, not how many
+    threads Taichi was given, on which no bit of a result may depend.
+    """
+    return on_cpu() and ((os.cpu_count() or 1) < FEW_CORES or count < parallel_from)

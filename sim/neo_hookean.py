@@ -14,7 +14,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import Body
-from sim.device import on_cpu
+from sim.device import is_too_small
 from sim.four_wide import cross, four, row
 from sim.lattice import Lattice
 from sim.rigid_motion import RigidMotion
@@ -62,7 +62,7 @@ class NeoHookean:
         self.contacts: Any = contacts
         self.has_contacts = contacts is not None
         self.colours = tuple(pairwise(starts))
-        self.serial = on_cpu() and body.count < PARALLEL_NODES if serial is None else serial
+        self.serial = is_too_small(body.count, PARALLEL_NODES) if serial is None else serial
         self.has_held = held is not None
         if held is not None:
             self.held = ti.field(ti.i32, body.count)

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from sim.body import ParticleBody
 from sim.contact import ShapeContacts
-from sim.device import on_cpu
+from sim.device import is_too_small
 from sim.four_wide import four, row
 from sim.patches import Patches
 from sim.rotation import rotation_near
@@ -57,7 +57,7 @@ class ShapeMatching:
         self.body = body
         self.contacts: Any = contacts
         self.has_contacts = contacts is not None
-        self.serial = on_cpu() and body.count < PARALLEL_PARTICLES if serial is None else serial
+        self.serial = is_too_small(body.count, PARALLEL_PARTICLES) if serial is None else serial
         self.patches = patches
         self.patch_count = len(patches)
         self.several = patches.several
