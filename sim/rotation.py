@@ -8,16 +8,16 @@ UNIQUE = 1e-3
 # Newton's method errs by the cube of its last turn [rad]: by no more than float32 does.
 LAST_TURN = 0.01
 MOST_TURNS = 3
-JACOBI_SWEEPS = 6
+SQUARINGS = 20
 
 
 @ti.func
 def nearest_rotation(matrix):
     """Proper rotation R (det R = +1) that maximises trace(R^T matrix), the solution of Eq. 8.
 
-    Its quaternion is the eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix (Horn 1987), found by Jacobi's
-    rotations. The entries are divided by the largest one first, so that those of tiny matrices keep their digits. No
-    matrix, no rotation: the identity.
+    Its quaternion is the eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix (Horn 1987). The entries are
+    divided by the largest one first, so that those of tiny matrices keep their digits. No matrix, no rotation: the
+    identity.
     """
     largest = 0.0
     for i, j in ti.static(ti.ndrange(3, 3)):
@@ -48,30 +48,18 @@ def horn_matrix(m):
 
 @ti.func
 def largest_eigenvector(symmetric):
-    """Unit eigenvector (4,) of the largest eigenvalue of a symmetric matrix (4, 4), by cyclic Jacobi (Golub & Van Loan, 8.5)."""
-    a, vectors = symmetric, tm.eye(4)
-    for _ in range(JACOBI_SWEEPS):
-        for p, q in ti.static([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]):
-            if a[p, q] != 0.0:
-                theta = (a[q, q] - a[p, p]) / (2.0 * a[p, q])
-                t = (1.0 if theta >= 0.0 else -1.0) / (ti.abs(theta) + ti.sqrt(theta * theta + 1.0))
-                c = 1.0 / ti.sqrt(t * t + 1.0)
-                s = t * c
-                a[p, p], a[q, q] = a[p, p] - t * a[p, q], a[q, q] + t * a[p, q]
-                a[p, q] = 0.0
-                a[q, p] = 0.0
-                for k in ti.static(range(4)):
-                    if ti.static(k not in (p, q)):
-                        along_p, along_q = a[k, p], a[k, q]
-                        a[k, p], a[k, q] = c * along_p - s * along_q, s * along_p + c * along_q
-                        a[p, k], a[q, k] = a[k, p], a[k, q]
-                    of_p, of_q = vectors[k, p], vectors[k, q]
-                    vectors[k, p], vectors[k, q] = c * of_p - s * of_q, s * of_p + c * of_q
-    best, largest = tm.vec4(vectors[0, 0], vectors[1, 0], vectors[2, 0], vectors[3, 0]), a[0, 0]
+    """Eigenvector (4,), not of unit length, of the largest eigenvalue of a symmetric matrix (4, 4): the power method by squaring.
+
+    Where two eigenvalues are nearer than 2^-SQUARINGS it is of their plane, which is as good to float32.
+    """
+    power = symmetric + symmetric.norm() * tm.eye(4)
+    for _ in range(SQUARINGS):
+        power = power @ power
+        power /= power.trace()
+    best, largest = tm.vec4(power[0, 0], power[1, 0], power[2, 0], power[3, 0]), power[0, 0]
     for k in ti.static(range(1, 4)):
-        if a[k, k] > largest:
-            largest = a[k, k]
-            best = tm.vec4(vectors[0, k], vectors[1, k], vectors[2, k], vectors[3, k])
+        if power[k, k] > largest:
+            best, largest = tm.vec4(power[0, k], power[1, k], power[2, k], power[3, k]), power[k, k]
     return best
 
 

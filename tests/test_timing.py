@@ -100,8 +100,11 @@ def test_memory_is_that_of_the_fields(device, block):
 
 def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, capsys):
     small = Setup(radius_mm=6.0)
+    coarse = Setup("neo-hookean", cell_mm=8.0, substeps=1, iterations=8)
     monkeypatch.setattr(command, "PAPERS", small)
-    monkeypatch.setattr(command, "QUICK_COUNTS", [64, 512])
+    monkeypatch.setattr(command, "_setups", lambda quick: [coarse, small])
+    monkeypatch.setattr(command, "QUICK_COUNTS", [64])
+    monkeypatch.setattr(command, "QUICK_SHARE", 0.02)
     monkeypatch.setattr(measure, "ROUNDS", 2)
     assert app.main(["study", "timing", "--quick", "--out", str(tmp_path)]) == 0
     report = json.loads((tmp_path / "timing.json").read_text())
@@ -114,10 +117,10 @@ def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, cap
     assert matched["radius_mm"] == 6.0 and matched["memberships"] > matched["particles"] > 100
     assert matched["bound_ms"] == report["bound_ms"] and report["cases"][0]["bound_ms"] is None
     assert set(matched["phases_ms"]) >= {"find contacts", "fit clusters", "average goals", "keep out"}
-    assert [size["particles"] for size in report["sizes"]] == [64, 512, 64, 512]
+    assert [size["particles"] for size in report["sizes"]] == [64, 64]
     with (tmp_path / "timing.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 6 and float(rows[1]["median_ms"]) == matched["ms"]["median"]
+    assert len(rows) == 4 and float(rows[1]["median_ms"]) == matched["ms"]["median"]
     assert Image.open(tmp_path / "timing.png").size[0] > 1000
     printed = capsys.readouterr().out
     assert f"{matched['ms']['median']:.2f}" in printed and "Table 5" in printed
