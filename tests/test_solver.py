@@ -183,6 +183,19 @@ def test_a_restored_state_goes_on_with_the_same_bits(device, ball):
     assert ends[0] == ends[1] == ends[2]
 
 
+def test_sliding_over_a_curved_surface_does_not_sink_in(device, ball):
+    solver = solver_of(ball, [bowl()], friction=0.0)
+    radius = solver.body.contact_radius.to_numpy().astype(float)
+    deepest, first = 0.0, position(solver)
+    for step in range(30):
+        angle = 0.1 * step
+        solver.step(StepSettings(gravity=(G * np.sin(angle), 0.0, -G * np.cos(angle)), damping=0.0))
+        deepest = max(deepest, (np.linalg.norm(position(solver), axis=1) + radius - 13.0).max())
+    assert np.linalg.norm(position(solver) - first, axis=1).max() > 1.5
+    # The grid's own distances are off by spacing^2 / 8 times the two curvatures 1 / r, r > 10 mm, towards the inside.
+    assert deepest < 1 / 8 * 2 / 10 + 1e-3
+
+
 def bowl() -> SignedDistanceField:
     """Distances to the inside of a ball of 13 mm, in which one of 12 mm rolls."""
     x, y, z = np.meshgrid(*[np.arange(-20.0, 21.0)] * 3, indexing="ij")
