@@ -5,6 +5,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import ParticleBody
+from sim.free_way import FreeWay
 from sim.shapes import FAR
 
 KEEP_OUT_SWEEPS = 8
@@ -32,6 +33,7 @@ class ShapeContacts:
     def __init__(self, body: ParticleBody, shapes: list, friction: float) -> None:
         self.body = body
         self.shapes = list(shapes)
+        self.free_way = FreeWay(shapes)
         self.friction = friction
         self.rough = friction > 0
         self.margin = body.radius_mm / 2
@@ -89,9 +91,10 @@ class ShapeContacts:
 
     @ti.func
     def find(self):
-        """Lines 6-9: the shapes that each particle's estimate is near to."""
+        """Lines 6-9: the shapes that each particle's estimate is near to; none goes through one by its speed."""
         for i in range(self.body.count):
-            p = self.body.estimate[i]
+            p = self.halted(self.body.position[i], self.body.estimate[i])
+            self.body.estimate[i] = p
             reach = self.body.contact_radius[i] + self.margin
             touched = 0
             for s in ti.static(range(len(self.shapes))):
@@ -106,6 +109,14 @@ class ShapeContacts:
                         if ti.static(self.rough):
                             self.contact[i, s].push = tm.vec4(0.0)
             self.touched[i] = touched
+
+    @ti.func
+    def halted(self, start, end):
+        """The end of a particle's way, or, of a long one that meets a shape, a radius beyond that."""
+        way, most = end - start, self.body.radius_mm
+        if way.norm_sqr() > most * most:
+            way *= self.free_way.share(start, way, most)
+        return start + way
 
     @ti.func
     def depth(self, s: ti.template(), i, x):

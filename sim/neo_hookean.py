@@ -188,7 +188,7 @@ class NeoHookean:
     def relax(self, i, relaxation_factor: float, dt: float):
         """Node i goes to its balance with all others held."""
         inertia = self.mass[i] / (dt * dt)
-        force, hessian = self.elastic(i)
+        force, hessian, least = self.elastic(i)
         force += inertia * (four(self.target[i]) - self.estimate[i])
         hessian += inertia * tm.eye(3)
         factor = relaxation_factor
@@ -198,7 +198,7 @@ class NeoHookean:
                 factor = 1.0
             force += four(pushed)
             hessian += layer
-        change = factor * solve(hessian, force.xyz)
+        change = factor * solve(hessian, force.xyz, least + inertia)
         change *= ti.min(1.0, self.most_mm / ti.max(change.norm(), 1e-12))
         if ti.static(self.has_held):
             change *= 1.0 - self.held[i]
@@ -219,7 +219,8 @@ class NeoHookean:
 
     @ti.func
     def elastic(self, i):
-        """Force [uN] of the cells around node i and of the hourglass, and its negative derivative by the node's position.
+        """Force [uN] of the cells around node i and of the hourglass, its negative derivative by the node's position, and
+        the least eigenvalue of that.
 
         With B the node's gradient, f = -V (mu F B + (lambda ln J - mu) G / J), where G = dJ/dx = cof(F) B does not
         depend on the node's own position, so that d^2J/dx^2 = 0.
@@ -245,7 +246,7 @@ class NeoHookean:
             z += g.z * bent
         # Shear and hourglass resist in all directions alike, wherever the node is.
         alike = mu * (self.shear[i] + self.hourglass[i, 13])
-        return force, tm.mat3(x.x, x.y, x.z, y.x, y.y, y.z, z.x, z.y, z.z) + alike * tm.eye(3)
+        return force, tm.mat3(x.x, x.y, x.z, y.x, y.y, y.z, z.x, z.y, z.z) + alike * tm.eye(3), alike
 
     @ti.func
     def hourglass_pull(self, i):
@@ -287,14 +288,18 @@ def ln(x):
 
 
 @ti.func
-def column(matrix, k: ti.template()):
-    """Column k of a 3 x 3 matrix."""
-    return tm.vec3(matrix[0, k], matrix[1, k], matrix[2, k])
+def solve(matrix, right, least):
+    """Solution of a symmetric 3 x 3 system whose eigenvalues are ``least`` or more, by its square-root-free Cholesky factors.
 
-
-@ti.func
-def solve(matrix, right):
-    """Solution of a 3 x 3 system with positive determinant, by Cramer's rule."""
-    a, b, c = column(matrix, 0), column(matrix, 1), column(matrix, 2)
-    bc = b.cross(c)
-    return tm.vec3(bc.dot(right), c.cross(a).dot(right), a.cross(b).dot(right)) / a.dot(bc)
+    No pivot is less either, but by rounding, where a node torn far away is stiff one way and not the others.
+    """
+    d0 = matrix[0, 0]
+    l10, l20 = matrix[1, 0] / d0, matrix[2, 0] / d0
+    d1 = ti.max(matrix[1, 1] - l10 * matrix[1, 0], least)
+    l21 = (matrix[2, 1] - l20 * matrix[1, 0]) / d1
+    d2 = ti.max(matrix[2, 2] - l20 * matrix[2, 0] - l21 * l21 * d1, least)
+    y1 = right.y - l10 * right.x
+    y2 = right.z - l20 * right.x - l21 * y1
+    z = y2 / d2
+    y = y1 / d1 - l21 * z
+    return tm.vec3(right.x / d0 - l10 * y - l20 * z, y, z)

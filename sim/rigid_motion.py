@@ -12,7 +12,7 @@ import taichi.math as tm
 
 from sim.body import Body
 from sim.rotation import cross_matrix
-from sim.surface_contact import SurfaceContacts
+from sim.surface_contact import NEAR_MM, SurfaceContacts
 
 # Sums are made of blocks of so many terms, in an order that no thread changes.
 BLOCK = 64
@@ -47,8 +47,11 @@ class RigidMotion:
         self.along = ti.Matrix.field(3, 3, ti.f32, self.blocks)
         self.mixed = ti.Matrix.field(3, 3, ti.f32, self.blocks)
         self.about = ti.Matrix.field(3, 3, ti.f32, self.blocks)
+        # How far the body reaches from its centre, at rest.
+        self.extent_mm = float(np.linalg.norm(body.rest_points - middle, axis=1).max())
         self.rotation = ti.Matrix.field(3, 3, ti.f32, ())
         self.translation = ti.Vector.field(3, ti.f32, ())
+        self.share = ti.field(ti.f32, ())
 
     @ti.func
     def move(self, dt: float):
@@ -61,8 +64,23 @@ class RigidMotion:
                 self.sum_block(block, dt, step > 0)
             for _ in range(1):
                 self.solve()
+        for _ in range(1):
+            self.share[None] = 1.0
+        if ti.static(self.has_contacts):
+            for q in range(self.contacts.count):
+                if self.is_long():
+                    start = self.contacts.carried(self.body.position, q)
+                    # The least of numbers does not depend on the order, so this atomic keeps runs alike.
+                    ti.atomic_min(self.share[None], self.contacts.free_share(start, self.moved(start)))
         for i in range(self.body.count):
-            self.body.estimate[i] = self.moved(self.body.position[i])
+            x = self.body.position[i]
+            self.body.estimate[i] = x + self.share[None] * (self.moved(x) - x)
+
+    @ti.func
+    def is_long(self):
+        """Whether any point may be moved so far that it could go through a shape."""
+        turned = (self.rotation[None] - tm.eye(3)).norm() * self.extent_mm
+        return self.translation[None].norm() + turned > NEAR_MM
 
     @ti.func
     def moved(self, x):

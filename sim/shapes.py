@@ -3,7 +3,8 @@
 Every shape answers ``surface(p)`` with the outward unit normal (x, y, z) and the signed distance (w) [mm] of
 the nearest surface, negative inside and ``FAR`` where the shape is out of reach, ``motion(p)`` with how far its
 material at p moved in this substep [mm], and ``is_beyond(p, distance)`` with whether it costs next to nothing to tell
-that p is farther than a distance [mm]. ``moves`` says whether it ever does.
+that p is farther than a distance [mm]. ``moves`` says whether it ever does; those that do not also answer ``room(p)`` with
+a distance [mm] which that of the surface from p is not under, however far it is, negative inside.
 """
 
 from itertools import combinations
@@ -16,6 +17,7 @@ from sim.distance import distance_grid
 
 FAR = 1e6
 HAIR = 1e-3
+HAIR_CELLS = 0.5
 # A grid of distances so fine is within 0.005 mm of a support on average, but for its sharp edges.
 GRID_MM = 1.0
 MOST_SUBSTEPS = 100
@@ -48,7 +50,11 @@ class Plane(Static):
 
     @ti.func
     def surface(self, p):
-        return tm.vec4(self.normal, self.normal.dot(p) - self.offset)
+        return tm.vec4(self.normal, self.room(p))
+
+    @ti.func
+    def room(self, p):
+        return self.normal.dot(p) - self.offset
 
 
 @ti.data_oriented
@@ -93,6 +99,25 @@ class SignedDistanceField(Static):
             if length > 1e-6:
                 result = tm.vec4(gradient / length, mixed(ends, t.z))
         return result
+
+    @ti.func
+    def room(self, p):
+        last = ti.Vector([self.shape[0] - 1, self.shape[1] - 1, self.shape[2] - 1])
+        at = (p - self.origin) / self.spacing
+        inside = tm.clamp(at, 0.0, ti.cast(last, ti.f32))
+        # Beyond the grid what counts is the way to it, and a hair into it.
+        beyond = ((at - inside) * self.spacing).norm()
+        room = beyond + HAIR_CELLS * self.spacing.min()
+        if beyond == 0.0:
+            base = ti.min(ti.cast(inside, ti.i32), last - 1)
+            t = inside - base
+            room = 0.0
+            for corner in ti.static(ti.grouped(ti.ndrange(2, 2, 2))):
+                weight = 1.0
+                for k in ti.static(range(3)):
+                    weight *= t[k] if corner[k] == 1 else 1.0 - t[k]
+                room += weight * self.distance[base + corner]
+        return room
 
 
 @ti.func
@@ -139,10 +164,12 @@ class ConvexTool:
     def follow(self, poses: np.ndarray) -> None:
         """Poses (substeps + 1, 4, 4), world from tool [mm], at the start of a time step and at the end of each substep.
 
-        Raises ValueError for more substeps than there is room for.
+        Raises ValueError for more substeps than there is room for, and for poses that are no numbers.
         """
         if not 1 <= len(poses) - 1 <= MOST_SUBSTEPS:
             raise ValueError(f"{len(poses) - 1} substeps: expected 1 to {MOST_SUBSTEPS}")
+        if not np.isfinite(poses).all():
+            raise ValueError("a pose of the tool is not finite: expected rigid matrices in mm")
         self.last_pose = poses[-1]
         back = poses[:-1] @ np.linalg.inv(poses[1:]) - np.eye(4)
         self._store_path(np.stack([poses[1:], back], axis=1).astype(np.float32))

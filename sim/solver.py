@@ -1,6 +1,7 @@
 """One time step of the paper's Algorithm 1; line numbers in the comments are those of its listing."""
 
 from dataclasses import dataclass
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,20 @@ import taichi.math as tm
 from sim.body import BodyState
 from sim.contact import ShapeContacts
 from sim.neighbours import ParticleContacts
-from sim.shapes import ConvexTool
+from sim.shapes import MOST_SUBSTEPS, ConvexTool
 from sim.surface_contact import SurfaceContacts
 from sim.tissue import TissueModel
 
+# What a step can be told, least and most; more substeps than that have no room on the device.
+RANGES = {
+    "stiffness": (0.0, 1.0),
+    "time_step_s": (1e-6, 10.0),
+    "substeps": (1, MOST_SUBSTEPS),
+    "iterations": (1, 100_000),
+    "stabilisation_iterations": (0, 100_000),
+    "relaxation_factor": (0.0, 2.0),
+    "damping": (0.0, 1e6),
+}
 # Far from the origin the scaled masses must still have room in float32.
 MOST_EXPONENT = 30.0
 
@@ -34,6 +45,15 @@ class StepSettings:
     relaxation_factor: float = 1.0
     damping: float = 12.0
     gravity: tuple[float, float, float] = (0.0, 0.0, -9810.0)
+
+    def check(self) -> None:
+        """Raises ValueError for what no step can be computed with, and names it."""
+        for name, (least, most) in RANGES.items():
+            value = getattr(self, name)
+            if not least <= value <= most:
+                raise ValueError(f"{name} is {value}: expected {least:g} to {most:g}")
+        if not all(map(isfinite, self.gravity)):
+            raise ValueError(f"gravity is {self.gravity}: expected three finite numbers in mm/s^2")
 
 
 @dataclass(frozen=True)
@@ -73,8 +93,10 @@ class Solver:
         """Advance by one time step.
 
         ``tool_poses`` (substeps + 1, 4, 4), world from tool [mm], are the tool's poses at the start of the step
-        and at the end of each substep; without them it stays where it is.
+        and at the end of each substep; without them it stays where it is. Raises ValueError for settings and poses that
+        no step can be computed with, before anything has moved.
         """
+        settings.check()
         dt = settings.time_step_s / settings.substeps
         if self.tool is not None:
             still = np.stack([self.tool.last_pose] * (settings.substeps + 1))

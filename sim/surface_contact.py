@@ -10,6 +10,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import Body
+from sim.free_way import FreeWay
 from sim.lattice import Lattice
 from sim.shapes import FAR
 
@@ -44,6 +45,7 @@ class SurfaceContacts:
     ) -> None:
         self.body = body
         self.shapes = list(shapes)
+        self.free_way = FreeWay(shapes)
         self.friction = friction
         self.rough = friction > 0
         self.count = len(points)
@@ -113,6 +115,11 @@ class SurfaceContacts:
                 if self.found[s, q].w - (p - self.found[s, q].xyz).norm() < NEAR_MM:
                     near |= 1 << s
             self.near[q] = near
+
+    @ti.func
+    def free_share(self, start, end):
+        """Share of a point's way that it can go until it is as deep in a shape as a step ever finds it."""
+        return self.free_way.share(start, end - start, NEAR_MM)
 
     @ti.func
     def is_known(self, s: ti.template(), q, p):

@@ -10,6 +10,7 @@ import trimesh
 from scenes.anatomy import Grid, LoadedAnatomy, press_on
 from scenes.scene import NeoHookeanTissue, PlaneShape, Scene
 from sim.embedding import Embedding
+from sim.guard import Guard
 from sim.neo_hookean import NeoHookean
 from sim.shapes import ConvexTool, Plane, SignedDistanceField
 from sim.skinning import Skin
@@ -43,6 +44,8 @@ class Rehearsal:
         meshes = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
         self.supports = [_shrunk(_shifted(mesh, -self.origin), SUPPORT_SUNK_MM) for mesh in meshes]
         self._build_solver(anatomy)
+        self.guard = Guard(self.solver)
+        self.notice = ""
         self._build_surfaces()
         self._build_slice(anatomy)
         self.press = press_on(scene.press, anatomy, self.gravity_direction)
@@ -50,7 +53,8 @@ class Rehearsal:
         self.pose = self._settle()
         self.hand = self._hand()
         self.pose = self.hand.pose()
-        self.settled = self.solver.snapshot()
+        self.guard.settle()
+        self.settled = self.guard.home
 
     def _build_solver(self, anatomy: LoadedAnatomy) -> None:
         self.size_mm = np.array(self.scene.transducer.size_mm)
@@ -137,8 +141,12 @@ class Rehearsal:
         return advanced(pose, -through) if through > 0 else pose
 
     def advance(self, pose: np.ndarray) -> None:
-        """Advance one time step, at whose end the transducer has a pose (4, 4)."""
+        """Advance one time step, at whose end the transducer has a pose (4, 4).
+
+        ``notice`` says what had to be put right; it is empty after most steps.
+        """
         self.solver.step(self.settings, between(self.pose, pose, self.settings.substeps))
+        self.notice = self.guard.check(self.settings.time_step_s)
         self.pose = pose
         self.steps += 1
 
