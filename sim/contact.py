@@ -112,7 +112,7 @@ class ShapeContacts:
 
     @ti.func
     def halted(self, start, end):
-        """The end of a particle's way, or, of a long one that meets a shape, a radius beyond that."""
+        """The end of a particle's way, or, of a long one that meets a shape, where it does."""
         way, most = end - start, self.body.radius_mm
         if way.norm_sqr() > most * most:
             way *= self.free_way.share(start, way, most)

@@ -3,10 +3,11 @@
 import taichi as ti
 import taichi.math as tm
 
-# Each stride is as long as the room there is, so they are few unless the way grazes a shape.
+# A way ends this deep in a shape [mm], so that a body can slide along one; thinner shapes stop nothing fast.
+DEEP_MM = 1.0
+# Each stride is as long as the room there is: few, but for ways along a surface.
 STRIDES = 32
-# A way with less room than this has met the shape [mm].
-MET_MM = 0.1
+LEAST_STRIDE_MM = 0.01
 
 
 @ti.data_oriented
@@ -17,17 +18,17 @@ class FreeWay:
         self.shapes = [shape for shape in shapes if not shape.moves]
 
     @ti.func
-    def share(self, start, way, slack: float):
-        """Share of a way [mm] from a start that can be gone until a shape is met, and ``slack`` [mm] further: 1 at most."""
+    def share(self, start, way, free: float):
+        """Share of a way [mm] from a start that can be gone until a shape is met; 1 of ways no longer than ``free`` [mm]."""
         length = way.norm()
         share = 1.0
-        if length > slack:
+        if length > free:
             gone = 0.0
             for _ in range(STRIDES):
                 if gone < length:
-                    room = self.room(start + gone / length * way)
-                    gone += room if room > MET_MM else 0.0
-            share = ti.min(1.0, (gone + slack) / length)
+                    stride = self.room(start + gone / length * way) + DEEP_MM
+                    gone += stride if stride > LEAST_STRIDE_MM else 0.0
+            share = ti.min(1.0, ti.max(gone, free) / length)
         return share
 
     @ti.func

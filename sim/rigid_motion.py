@@ -106,10 +106,10 @@ class RigidMotion:
                 if ti.static(newton):
                     f = inertia * (self.target[term] - x)
                 k = inertia * tm.eye(3)
-            elif ti.static(self.has_contacts and newton):
+            elif ti.static(self.has_contacts):
                 q = term - self.body.count
                 x = self.moved(self.contacts.point[q])
-                f, k = self.contacts.hold(q, x)
+                f, k = self.contacts.hold(q, x, newton)
             turn = cross_matrix(x - centre)
             force += f
             torque += turn @ f

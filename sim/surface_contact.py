@@ -118,7 +118,7 @@ class SurfaceContacts:
 
     @ti.func
     def free_share(self, start, end):
-        """Share of a point's way that it can go until it is as deep in a shape as a step ever finds it."""
+        """Share of a point's way that it can go until it meets a shape; ways within which shapes are found are free."""
         return self.free_way.share(start, end - start, NEAR_MM)
 
     @ti.func
@@ -174,7 +174,7 @@ class SurfaceContacts:
         return force, stiffness
 
     @ti.func
-    def hold(self, q, p):
+    def hold(self, q, p, pushing: ti.template()):
         """Force [uN] on point q if it were at p, on the planes that the last substep knew, and its stiffness.
 
         What slides resists by its friction over its way, which is more than the derivative: then Newton's steps converge.
@@ -188,9 +188,10 @@ class SurfaceContacts:
                 shift = p - self.shapes[s].motion(p)
                 depth = plane.w - normal.dot(shift)
                 if (self.near[q] >> s) & 1 and depth > 0.0:
-                    force += layer * depth * normal
                     stiffness += layer * normal.outer_product(normal)
-                    if ti.static(self.rough):
+                    if ti.static(pushing):
+                        force += layer * depth * normal
+                    if ti.static(pushing and self.rough):
                         stick = self.stick[s, q] + shift - self.point[q]
                         stick -= stick.dot(normal) * normal
                         length = ti.max(stick.norm(), 1e-12)

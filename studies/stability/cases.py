@@ -1,0 +1,229 @@
+"""What is done to a body in ``study stability``: some 290 maltreatments of each tissue model, in words and numbers."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+SIZES_MM = (1.0, 1.5, 2.2, 3.3, 5.0, 7.0, 10.0)
+MODELS = ("neo-hookean", "shape-matching")
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Which body: the embedded ``kidney``, an ``ellipsoid``, ``one`` particle or cell, one ``cluster`` or ``two`` balls.
+
+    ``size_mm`` is the particles' radius or the cells' width; masses within it differ by ``mass_ratio``.
+    """
+
+    kind: str
+    size_mm: float | None = None
+    mass_ratio: float = 1.0
+
+
+KIDNEY = Subject("kidney")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One maltreatment: of whom, with which settings of the step, moved how by the transducer, from which state.
+
+    ``settings`` are StepSettings' names, ``material`` young_kpa and poisson; ``probe`` and ``state`` a name in
+    ``motion.PROBES`` and ``motion.STATES`` and its numbers; ``gravity`` and ``heaviest`` multiply the scene's gravity and
+    the mass of one node. ``kind`` is what cases of one sort share.
+    """
+
+    kind: str
+    extreme: str
+    subject: Subject = KIDNEY
+    settings: dict[str, float] = field(default_factory=dict)
+    material: dict[str, float] = field(default_factory=dict)
+    probe: tuple = ("away",)
+    state: tuple = ("settled",)
+    gravity: float = 1.0
+    heaviest: float = 1.0
+
+    @property
+    def name(self) -> str:
+        return f"{self.kind}: {self.extreme}"
+
+
+PRESS = ("press", 12.38)
+
+
+def cases_of(model: str) -> list[Case]:
+    """All cases of a model, those of one body together."""
+    return [
+        *_step_settings(),
+        *(_material() if model == "neo-hookean" else _cluster_stiffness()),
+        *_gravity(),
+        *_probes(),
+        *_states(),
+        *_small(),
+        *_two(),
+        *_masses(model),
+        *_sizes(),
+    ]
+
+
+def quick_cases_of(model: str) -> list[Case]:
+    """The first and the last case of each kind on the kidney, and the small bodies."""
+    chosen: list[Case] = []
+    for kind in dict.fromkeys(case.kind for case in cases_of(model)):
+        alike = [case for case in cases_of(model) if case.kind == kind]
+        if alike[0].subject == KIDNEY:
+            chosen += [alike[0], alike[-1]]
+        elif alike[0].subject.kind == "one":
+            chosen += alike[:3]
+    return chosen
+
+
+def _step_settings() -> Iterator[Case]:
+    for dt in (1e-4, 1e-3, 1 / 240, 1 / 60, 1 / 30, 0.1, 0.3, 1.0):
+        for iterations in (1, 3, 10, 30, 100):
+            settings = dict(time_step_s=dt, iterations=iterations)
+            yield Case("time step", f"{dt:.4g} s, {iterations} iterations", settings=settings, probe=PRESS)
+    for factor in (1.0, 1.25, 1.5, 1.75, 1.9, 2.0):
+        for iterations in (2, 10, 100):
+            settings = dict(relaxation_factor=factor, iterations=iterations)
+            yield Case("over-relaxation", f"{factor:g}, {iterations} iterations", settings=settings, probe=PRESS)
+    for substeps in (1, 2, 5, 20, 100):
+        for iterations in (1, 10):
+            settings = dict(substeps=substeps, iterations=iterations)
+            yield Case("substeps", f"{substeps}, {iterations} iterations", settings=settings, probe=PRESS)
+
+
+def _material() -> Iterator[Case]:
+    for poisson in (0.0, 0.3, 0.45, 0.49, 0.499):
+        for iterations in (1, 8, 100):
+            material, settings = dict(poisson=poisson), dict(iterations=iterations)
+            extreme = f"{poisson:g}, {iterations} iterations"
+            yield Case("Poisson's ratio", extreme, material=material, settings=settings, probe=PRESS)
+    for young in (0.01, 0.1, 1.0, 100.0, 1e4, 1e6):
+        for dt in (1 / 240, 1 / 60, 0.1):
+            material, settings = dict(young_kpa=young), dict(time_step_s=dt)
+            extreme = f"{young:g} kPa, {dt:.4g} s"
+            yield Case("Young's modulus", extreme, material=material, settings=settings, probe=PRESS)
+
+
+def _cluster_stiffness() -> Iterator[Case]:
+    for stiffness in (0.0, 0.01, 0.25, 0.5, 0.75, 1.0):
+        for dt in (1e-3, 1 / 240, 1 / 60, 0.1):
+            settings = dict(stiffness=stiffness, time_step_s=dt)
+            yield Case("stiffness", f"{stiffness:g}, {dt:.4g} s", settings=settings, probe=PRESS)
+
+
+def _gravity() -> Iterator[Case]:
+    for times in (0.0, 0.1, 10.0, 100.0, 1000.0):
+        for dt in (1e-3, 1 / 240, 1 / 60, 0.1, 1.0):
+            yield Case("gravity", f"x {times:g}, {dt:.4g} s", settings=dict(time_step_s=dt), gravity=times)
+
+
+def _probes() -> Iterator[Case]:
+    for depth in (2.0, 10.0, 20.0, 30.0, 40.0):
+        for dt in (1e-3, 1 / 60, 0.1):
+            settings = dict(time_step_s=dt)
+            yield Case("teleported", f"{depth:g} mm deep, {dt:.4g} s", settings=settings, probe=("teleport", depth))
+    for gap in (5.0, 1.0, 0.0, -2.0):
+        for iterations in (3, 30):
+            settings = dict(iterations=iterations)
+            extreme = f"to {gap:g} mm, {iterations} iterations"
+            yield Case("pressed flat", extreme, settings=settings, probe=("flat", gap))
+    for speed in (0.1, 1.0, 10.0):
+        for depth in (5.0, 15.0, 25.0):
+            yield Case("swept", f"{speed:g} m/s, {depth:g} mm deep", probe=("sweep", 1000 * speed, depth))
+    for speed in (10.0, 100.0, 1000.0):
+        for axis, name in enumerate(("lateral", "elevation", "long")):
+            yield Case("spun", f"{speed:g} rad/s, {name} axis", probe=("spin", speed, axis))
+    for name in ("in and out", "jitter", "tumble"):
+        for dt in (1e-3, 1 / 60, 0.1):
+            yield Case(name, f"{dt:.4g} s", settings=dict(time_step_s=dt), probe=(name,))
+
+
+def _states() -> Iterator[Case]:
+    for usual, settings in (("", {}), (", 1 iteration", dict(iterations=1))):
+        for kind, states in STATES.items():
+            for extreme, state in states:
+                yield Case(kind, extreme + usual, settings=settings, state=state)
+
+
+AXES = ("x", "y", "z")
+STATES: dict[str, list[tuple[str, tuple]]] = {
+    "collapsed": [
+        *((f"to a plane, {name}", ("scaled", *(float(k != axis) for k in range(3)))) for axis, name in enumerate(AXES)),
+        *((f"to a line, {name}", ("scaled", *(float(k == axis) for k in range(3)))) for axis, name in enumerate(AXES)),
+        ("to a point", ("scaled", 0.0, 0.0, 0.0)),
+    ],
+    "mirrored": [
+        *((f"in {name}", ("scaled", *(1.0 - 2.0 * (k == axis) for k in range(3)))) for axis, name in enumerate(AXES)),
+        ("through its middle", ("scaled", -1.0, -1.0, -1.0)),
+    ],
+    "scaled": [
+        *((f"x 5 in {name}", ("scaled", *(1.0 + 4.0 * (k == axis) for k in range(3)))) for axis, name in enumerate(AXES)),
+        *((f"x 0.2 in {name}", ("scaled", *(1.0 - 0.8 * (k == axis) for k in range(3)))) for axis, name in enumerate(AXES)),
+        ("x 10", ("scaled", 10.0, 10.0, 10.0)),
+        ("x 0.1", ("scaled", 0.1, 0.1, 0.1)),
+    ],
+    "scattered": [
+        *((f"by {mm:g} mm", ("scattered", mm)) for mm in (1.0, 3.0, 10.0, 30.0, 100.0, 1000.0)),
+        ("over its box", ("boxed",)),
+    ],
+    "thrown": [
+        *((f"10 m/s, {name}", ("thrown", *(1e4 * (k == axis) for k in range(3)))) for axis, name in enumerate(AXES)),
+        *((f"10 m/s, -{name}", ("thrown", *(-1e4 * (k == axis) for k in range(3)))) for axis, name in enumerate(AXES)),
+        ("1000 m/s", ("thrown", 1e6, 0.0, 0.0)),
+        ("each point apart, 1 m/s", ("heated", 1e3)),
+        ("each point apart, 10 m/s", ("heated", 1e4)),
+        *((f"turning 100 rad/s, {name}", ("turning", axis, 100.0)) for axis, name in enumerate(AXES)),
+    ],
+    "displaced": [
+        ("20 mm into the support", ("lifted", -20.0)),
+        ("200 mm under the support", ("lifted", -200.0)),
+        ("1 km up", ("lifted", 1e6)),
+        ("upside down", ("scaled", -1.0, -1.0, 1.0)),
+        ("one point at 1 m", ("one out", 1e3)),
+        ("one point at 1e30 mm", ("one out", 1e30)),
+        ("not a number", ("nothing",)),
+    ],
+}
+
+
+def _small() -> Iterator[Case]:
+    for kind, subject in (("one alone", Subject("one")), ("one cluster", Subject("cluster"))):
+        yield Case(kind, "at rest", subject)
+        yield Case(kind, "pressed", subject, probe=("press", 3.0))
+        yield Case(kind, "teleported into", subject, probe=("teleport", 3.0))
+        for dt in (1e-4, 1.0):
+            yield Case(kind, f"{dt:g} s, 1 iteration", subject, dict(time_step_s=dt, iterations=1))
+        yield Case(kind, "gravity x 1000", subject, gravity=1000.0)
+        yield Case(kind, "collapsed to a point", subject, state=("scaled", 0.0, 0.0, 0.0))
+        yield Case(kind, "mirrored", subject, state=("scaled", 1.0, 1.0, -1.0))
+        yield Case(kind, "scattered by 100 mm", subject, state=("scattered", 100.0))
+        yield Case(kind, "thrown 10 m/s", subject, state=("thrown", 0.0, 0.0, -1e4))
+
+
+def _two() -> Iterator[Case]:
+    two = Subject("two")
+    for extreme, share in (("a quarter", 0.25), ("half", 0.5), ("wholly", 1.0)):
+        for iterations in (1, 9):
+            settings = dict(iterations=iterations)
+            yield Case("two overlapping", f"{extreme}, {iterations} iterations", two, settings, state=("overlapped", share))
+    yield Case("two overlapping", "pressed together", two, probe=("press", 6.0))
+
+
+def _masses(model: str) -> Iterator[Case]:
+    for power in range(1, 7):
+        for name, probe in (("at rest", ("away",)), ("pressed", ("press", 6.0))):
+            ratio = 10.0**power
+            extreme = f"1e{power}, {name}"
+            if model == "neo-hookean":
+                yield Case("mass ratio", extreme, Subject("ellipsoid", 5.0), probe=probe, heaviest=ratio)
+            else:
+                yield Case("mass ratio", extreme, Subject("ellipsoid", 3.3, ratio), probe=probe)
+
+
+def _sizes() -> Iterator[Case]:
+    for size in SIZES_MM:
+        subject = Subject("ellipsoid", size)
+        yield Case("size", f"{size:g} mm, pressed", subject, probe=("press", 8.0))
+        yield Case("size", f"{size:g} mm, 1 iteration", subject, dict(iterations=1), probe=("press", 8.0))
+        yield Case("size", f"{size:g} mm, swept 10 m/s", subject, probe=("sweep", 1e4, 8.0))
+        yield Case("size", f"{size:g} mm, scattered by 3 mm", subject, state=("scattered", 3.0))
