@@ -2,6 +2,7 @@
 
 import click
 
+from studies.stability.command import stability
 from studies.timing.command import timing
 
 
@@ -11,3 +12,4 @@ def study() -> None:
 
 
 study.add_command(timing)
+study.add_command(stability)

@@ -104,7 +104,9 @@ def admit(model: str, subject: Subject) -> Patient:
 
 def _kidney(model: str) -> Patient:
     fast = PRESETS[model]["fast"]
-    size = {"tissue.cell_mm": fast.cell_mm} if model == "neo-hookean" else {"tissue.radius_mm": fast.radius_mm}
+    size = (
+        {"tissue.cell_mm": fast.cell_mm} if model == "neo-hookean" else {"tissue.radius_mm": fast.radius_mm}
+    )
     scene = load_scene(EMBEDDED)
     anatomy = replace(load_anatomy(scene, EMBEDDED.parent), ct=None)
     rehearsal = Rehearsal(with_options(scene, {"tissue.model": model, **size}), anatomy)

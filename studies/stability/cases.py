@@ -1,7 +1,8 @@
 """What is done to a body in ``study stability``: some 290 maltreatments of each tissue model, in words and numbers."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 SIZES_MM = (1.0, 1.5, 2.2, 3.3, 5.0, 7.0, 10.0)
 MODELS = ("neo-hookean", "shape-matching")
@@ -34,8 +35,8 @@ class Case:
     kind: str
     extreme: str
     subject: Subject = KIDNEY
-    settings: dict[str, float] = field(default_factory=dict)
-    material: dict[str, float] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    material: Mapping[str, float] = field(default_factory=dict)
     probe: tuple = ("away",)
     state: tuple = ("settled",)
     gravity: float = 1.0
@@ -79,12 +80,14 @@ def quick_cases_of(model: str) -> list[Case]:
 def _step_settings() -> Iterator[Case]:
     for dt in (1e-4, 1e-3, 1 / 240, 1 / 60, 1 / 30, 0.1, 0.3, 1.0):
         for iterations in (1, 3, 10, 30, 100):
-            settings = dict(time_step_s=dt, iterations=iterations)
+            settings: dict[str, Any] = dict(time_step_s=dt, iterations=iterations)
             yield Case("time step", f"{dt:.4g} s, {iterations} iterations", settings=settings, probe=PRESS)
     for factor in (1.0, 1.25, 1.5, 1.75, 1.9, 2.0):
         for iterations in (2, 10, 100):
             settings = dict(relaxation_factor=factor, iterations=iterations)
-            yield Case("over-relaxation", f"{factor:g}, {iterations} iterations", settings=settings, probe=PRESS)
+            yield Case(
+                "over-relaxation", f"{factor:g}, {iterations} iterations", settings=settings, probe=PRESS
+            )
     for substeps in (1, 2, 5, 20, 100):
         for iterations in (1, 10):
             settings = dict(substeps=substeps, iterations=iterations)
@@ -121,7 +124,9 @@ def _probes() -> Iterator[Case]:
     for depth in (2.0, 10.0, 20.0, 30.0, 40.0):
         for dt in (1e-3, 1 / 60, 0.1):
             settings = dict(time_step_s=dt)
-            yield Case("teleported", f"{depth:g} mm deep, {dt:.4g} s", settings=settings, probe=("teleport", depth))
+            yield Case(
+                "teleported", f"{depth:g} mm deep, {dt:.4g} s", settings=settings, probe=("teleport", depth)
+            )
     for gap in (5.0, 1.0, 0.0, -2.0):
         for iterations in (3, 30):
             settings = dict(iterations=iterations)
@@ -148,17 +153,32 @@ def _states() -> Iterator[Case]:
 AXES = ("x", "y", "z")
 STATES: dict[str, list[tuple[str, tuple]]] = {
     "collapsed": [
-        *((f"to a plane, {name}", ("scaled", *(float(k != axis) for k in range(3)))) for axis, name in enumerate(AXES)),
-        *((f"to a line, {name}", ("scaled", *(float(k == axis) for k in range(3)))) for axis, name in enumerate(AXES)),
+        *(
+            (f"to a plane, {name}", ("scaled", *(float(k != axis) for k in range(3))))
+            for axis, name in enumerate(AXES)
+        ),
+        *(
+            (f"to a line, {name}", ("scaled", *(float(k == axis) for k in range(3))))
+            for axis, name in enumerate(AXES)
+        ),
         ("to a point", ("scaled", 0.0, 0.0, 0.0)),
     ],
     "mirrored": [
-        *((f"in {name}", ("scaled", *(1.0 - 2.0 * (k == axis) for k in range(3)))) for axis, name in enumerate(AXES)),
+        *(
+            (f"in {name}", ("scaled", *(1.0 - 2.0 * (k == axis) for k in range(3))))
+            for axis, name in enumerate(AXES)
+        ),
         ("through its middle", ("scaled", -1.0, -1.0, -1.0)),
     ],
     "scaled": [
-        *((f"x 5 in {name}", ("scaled", *(1.0 + 4.0 * (k == axis) for k in range(3)))) for axis, name in enumerate(AXES)),
-        *((f"x 0.2 in {name}", ("scaled", *(1.0 - 0.8 * (k == axis) for k in range(3)))) for axis, name in enumerate(AXES)),
+        *(
+            (f"x 5 in {name}", ("scaled", *(1.0 + 4.0 * (k == axis) for k in range(3))))
+            for axis, name in enumerate(AXES)
+        ),
+        *(
+            (f"x 0.2 in {name}", ("scaled", *(1.0 - 0.8 * (k == axis) for k in range(3))))
+            for axis, name in enumerate(AXES)
+        ),
         ("x 10", ("scaled", 10.0, 10.0, 10.0)),
         ("x 0.1", ("scaled", 0.1, 0.1, 0.1)),
     ],
@@ -167,8 +187,14 @@ STATES: dict[str, list[tuple[str, tuple]]] = {
         ("over its box", ("boxed",)),
     ],
     "thrown": [
-        *((f"10 m/s, {name}", ("thrown", *(1e4 * (k == axis) for k in range(3)))) for axis, name in enumerate(AXES)),
-        *((f"10 m/s, -{name}", ("thrown", *(-1e4 * (k == axis) for k in range(3)))) for axis, name in enumerate(AXES)),
+        *(
+            (f"10 m/s, {name}", ("thrown", *(1e4 * (k == axis) for k in range(3))))
+            for axis, name in enumerate(AXES)
+        ),
+        *(
+            (f"10 m/s, -{name}", ("thrown", *(-1e4 * (k == axis) for k in range(3))))
+            for axis, name in enumerate(AXES)
+        ),
         ("1000 m/s", ("thrown", 1e6, 0.0, 0.0)),
         ("each point apart, 1 m/s", ("heated", 1e3)),
         ("each point apart, 10 m/s", ("heated", 1e4)),
@@ -205,7 +231,13 @@ def _two() -> Iterator[Case]:
     for extreme, share in (("a quarter", 0.25), ("half", 0.5), ("wholly", 1.0)):
         for iterations in (1, 9):
             settings = dict(iterations=iterations)
-            yield Case("two overlapping", f"{extreme}, {iterations} iterations", two, settings, state=("overlapped", share))
+            yield Case(
+                "two overlapping",
+                f"{extreme}, {iterations} iterations",
+                two,
+                settings,
+                state=("overlapped", share),
+            )
     yield Case("two overlapping", "pressed together", two, probe=("press", 6.0))
 
 

@@ -1,5 +1,6 @@
 """One case: maltreat a body, let go of it, and see what is left."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -43,13 +44,11 @@ class Course:
         self.finite &= finite
         if finite:
             volume = patient.volume_ratio()
-            self.volume_least, self.volume_most = min(self.volume_least, volume), max(self.volume_most, volume)
+            self.volume_least, self.volume_most = (
+                min(self.volume_least, volume),
+                max(self.volume_most, volume),
+            )
             self.kinetic_peak_mj = max(self.kinetic_peak_mj, patient.kinetic_mj())
-
-
-def run_all(model: str, cases: list[Case]) -> list[dict[str, Any]]:
-    """The figures of some cases of a model, in a process of their own or not; the last body is kept for the next ones."""
-    return [run(model, case) for case in cases]
 
 
 def run(model: str, case: Case) -> dict[str, Any]:
@@ -89,7 +88,8 @@ def run(model: str, case: Case) -> dict[str, Any]:
 def _maltreat(patient: Patient, case: Case, course: Course) -> None:
     """From the settled state, under the case's own settings."""
     settings = replace(patient.settings, **case.settings)
-    settings.gravity = tuple(case.gravity * v for v in patient.settings.gravity)
+    x, y, z = patient.settings.gravity
+    settings.gravity = (case.gravity * x, case.gravity * y, case.gravity * z)
     dt = settings.time_step_s
     position, velocity = _state(patient, case)
     patient.solver.restore(patient.settled)
@@ -122,7 +122,7 @@ def _weigh(patient: Patient, heaviest: float) -> None:
         patient.model.mass.from_numpy(mass.astype(np.float32))
 
 
-def _harden(patient: Patient, material: dict[str, float]) -> None:
+def _harden(patient: Patient, material: Mapping[str, float]) -> None:
     if isinstance(patient.model, NeoHookean):
         patient.model.set_material(**{"young_kpa": YOUNG_KPA, "poisson": POISSON, **material})
 
@@ -186,7 +186,9 @@ def _reason(rest_error: float, shape_error: float | None) -> str | None:
     if shape_error is None:
         return None
     if shape_error <= RECOVERED_MM:
-        return f"lies {rest_error:.2g} mm from where it lay, held by friction or its support; its shape is whole"
+        return (
+            f"lies {rest_error:.2g} mm from where it lay, held by friction or its support; its shape is whole"
+        )
     return f"keeps a tangle too small to be put back, or is still on its way: shape {shape_error:.2g} mm off"
 
 
