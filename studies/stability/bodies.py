@@ -128,9 +128,9 @@ def _mesh(model: str, subject: Subject) -> trimesh.Trimesh:
         return trimesh.creation.box(bounds=[[0.0] * 3, [side] * 3])
     if subject.kind == "two":
         ball = trimesh.creation.icosphere(subdivisions=3, radius=BALL_MM)
-        return trimesh.util.concatenate(
-            [ball.copy().apply_translation([x, 0, 0]) for x in (-APART_MM / 2, APART_MM / 2)]
-        )
+        left, right = (ball.vertices + [x, 0.0, 0.0] for x in (-APART_MM / 2, APART_MM / 2))
+        faces = np.concatenate([ball.faces, ball.faces + len(left)])
+        return trimesh.Trimesh(np.concatenate([left, right]), faces, process=False)
     return trimesh.creation.icosphere(subdivisions=4).apply_scale(ELLIPSOID_MM)
 
 

@@ -102,9 +102,9 @@ def _material() -> Iterator[Case]:
             yield Case("Poisson's ratio", extreme, material=material, settings=settings, probe=PRESS)
     for young in (0.01, 0.1, 1.0, 100.0, 1e4, 1e6):
         for dt in (1 / 240, 1 / 60, 0.1):
-            material, settings = dict(young_kpa=young), dict(time_step_s=dt)
+            material, step = dict(young_kpa=young), dict(time_step_s=dt)
             extreme = f"{young:g} kPa, {dt:.4g} s"
-            yield Case("Young's modulus", extreme, material=material, settings=settings, probe=PRESS)
+            yield Case("Young's modulus", extreme, material=material, settings=step, probe=PRESS)
 
 
 def _cluster_stiffness() -> Iterator[Case]:

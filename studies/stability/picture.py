@@ -59,9 +59,16 @@ def _map(axes: Axes, rows: list[dict[str, Any]], model: str):
     for mark, places in at.items():
         symbol, face, edge = MARKS[mark]
         if places:
-            x, y = zip(*places, strict=True)
+            across, down = zip(*places, strict=True)
             axes.scatter(
-                x, y, marker=symbol, s=34, facecolors=face, edgecolors=edge, label=mark, linewidths=1.0
+                across,
+                down,
+                marker=symbol,
+                s=34,
+                facecolors=face,
+                edgecolors=edge,
+                label=mark,
+                linewidths=1.0,
             )
     axes.set_yticks(range(len(kinds)), kinds)
     axes.set_xticks([])
