@@ -16,8 +16,8 @@ from sim.solver import Solver, SolverState
 
 MOST_TETRAHEDRA = 2000
 NEIGHBOURS = 14
-# An edge is torn when it is so many times as long as at rest.
-TORN = 4.0
+# An edge is torn when it is so many times as long as at rest, a tetrahedron flat at this share of its volume.
+TORN, FLAT = 4.0, 0.02
 # What a tool crushes within this distance of it comes back when it goes.
 CRUSHED_MM = 10.0
 # More than this share of the tetrahedra inside out or torn elsewhere is no tissue.
@@ -32,7 +32,9 @@ FARTHEST_MM = 500.0
 
 @dataclass(frozen=True)
 class Health:
-    """What one look at a body found: ``tangled`` is the share of tetrahedra that are inside out or torn, tool apart."""
+    """What one look at a body found: ``tangled`` is the share of tetrahedra, away from the tool, that are torn, flat or
+    inside out.
+    """
 
     finite: bool
     farthest_mm: float
@@ -45,7 +47,7 @@ class Health:
             return "its positions were no numbers any more"
         if self.farthest_mm > FARTHEST_MM:
             return "it had left the scene"
-        return "it was torn or inside out" if self.tangled > MOST_SHARE else ""
+        return "it was torn, flat or inside out" if self.tangled > MOST_SHARE else ""
 
 
 @ti.data_oriented
@@ -72,8 +74,8 @@ class Guard:
             self.corner = ti.Vector.field(4, ti.i32, self.count)
             self.corner.from_numpy(corners.astype(np.int32))
             edges = rest[corners[:, 1:]] - rest[corners[:, :1]]
-            self.right_handed = ti.field(ti.i32, self.count)
-            self.right_handed.from_numpy(np.sign(np.linalg.det(edges)).astype(np.int32))
+            self.per_volume = ti.field(ti.f32, self.count)
+            self.per_volume.from_numpy((1.0 / np.linalg.det(edges)).astype(np.float32))
             self.longest = ti.Vector.field(3, ti.f32, self.count)
             self.longest.from_numpy((TORN * np.linalg.norm(edges, axis=2)).astype(np.float32))
         self.fallbacks = 0
@@ -93,7 +95,11 @@ class Guard:
         patience = max(PATIENCE_STEPS, round(PATIENCE_S / time_step_s))
         if health.fault and (self._steps_tangled == 0 or not health.finite or self._steps_tangled > patience):
             return self._put_back(health.fault, time_step_s)
-        if not health.fault and self._steps_since_good >= max(KEEP_STEPS, round(KEEP_S / time_step_s)):
+        if (
+            not health.fault
+            and health.tangled == 0.0
+            and self._steps_since_good >= max(KEEP_STEPS, round(KEEP_S / time_step_s))
+        ):
             self.good = self.solver.snapshot()
             self._steps_since_good = 0
             self._is_restored = False
@@ -152,7 +158,7 @@ class Guard:
         a = self.body.position[corner[1]] - origin
         b = self.body.position[corner[2]] - origin
         c = self.body.position[corner[3]] - origin
-        broken = a.dot(b.cross(c)) * self.right_handed[t] <= 0.0
+        broken = a.dot(b.cross(c)) * self.per_volume[t] < FLAT
         broken |= a.norm() > longest.x or b.norm() > longest.y or c.norm() > longest.z
         if ti.static(self.has_tool):
             if broken:

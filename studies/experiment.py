@@ -26,11 +26,14 @@ DENSITY_KG_M3 = 1050.0
 
 @dataclass
 class Run:
-    """One run: beads (stages, n, 3) [mm] at each stage's end, each stage step's time, whether all stayed finite."""
+    """One run: beads (stages, n, 3) [mm] at each stage's end, and at the moment when the probe arrives; each stage step's
+    time, whether all stayed finite.
+    """
 
     beads: np.ndarray
     step_ms: list[float] = field(default_factory=list)
     finite: bool = True
+    arriving: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
 
 
 class Experiment:
@@ -59,24 +62,40 @@ class Experiment:
         pose of that stage (to that of stage 0 along the press), in the others it rests. The same setup
         gives the same beads, whatever ran before.
         """
-        self._restore()
-        step = self._step_settings(setup)
+        step = self.prepare(setup)
         pose = self._away()
-        run = Run(np.zeros_like(self.case.measured))
-        for _ in range(setup.warm_up_steps):
-            self.solver.step(step, between(pose, pose, step.substeps))
+        run = Run(np.zeros_like(self.case.measured), arriving=np.zeros_like(self.case.measured))
         moving = max(1, round(MOVING * setup.stage_steps))
         for stage, goal in enumerate(self.case.poses):
-            path = between(pose, self._relative(goal), moving)
+            path = between(pose, self.relative(goal), moving)
             for n in range(setup.stage_steps):
                 poses = between(path[min(n, moving)], path[min(n + 1, moving)], step.substeps)
                 timed(lambda: self.solver.step(step, poses), run.step_ms)
+                if n + 1 == moving:
+                    run.arriving[stage] = self._found()
             pose = path[-1]
-            self.beads.update()
-            run.beads[stage] = self.beads.vertices.to_numpy() + self.origin
+            run.beads[stage] = self._found()
             run.finite &= bool(np.isfinite(self.body.position.to_numpy()).all())
         run.finite &= bool(np.isfinite(run.beads).all())
         return run
+
+    def prepare(self, setup: Setup) -> StepSettings:
+        """From the stress-free shape through the warm-up, the probe away; the settings of its steps."""
+        self._restore()
+        step, pose = self._step_settings(setup), self._away()
+        for _ in range(setup.warm_up_steps):
+            self.solver.step(step, between(pose, pose, step.substeps))
+        return step
+
+    def _found(self) -> np.ndarray:
+        self.beads.update()
+        return self.beads.vertices.to_numpy() + self.origin
+
+    def relative(self, pose: np.ndarray) -> np.ndarray:
+        """A pose (4, 4) of the case's frame, in the device's."""
+        moved = pose.copy()
+        moved[:3, 3] -= self.origin
+        return moved
 
     def size(self, setup: Setup) -> dict[str, float]:
         """How large the model is, under the names of a report: ``radius_mm`` or ``cell_mm``, ``particles`` or ``nodes``."""
@@ -102,13 +121,8 @@ class Experiment:
         x, y, z = self.case.gravity.tolist()
         return replace(step_settings(tissue_of(self.case, setup), section), gravity=(x, y, z))
 
-    def _relative(self, pose: np.ndarray) -> np.ndarray:
-        moved = pose.copy()
-        moved[:3, 3] -= self.origin
-        return moved
-
     def _away(self) -> np.ndarray:
-        pose = self._relative(self.case.poses[0])
+        pose = self.relative(self.case.poses[0])
         pose[:3, 3] -= AWAY_MM * self.case.press_direction
         return pose
 

@@ -4,6 +4,7 @@ import click
 
 from studies.stability.command import stability
 from studies.timing.command import timing
+from studies.trade.command import trade
 
 
 @click.group()
@@ -12,4 +13,5 @@ def study() -> None:
 
 
 study.add_command(timing)
+study.add_command(trade)
 study.add_command(stability)

@@ -1,0 +1,83 @@
+"""The command ``study trade``: what speed costs in accuracy, and which settings are worth their time."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+from tqdm import tqdm
+
+from studies.case import load_case
+from studies.commands import arch_option, make_folder, start_taichi
+from studies.trade.front import preset_of, setup_of
+from studies.trade.sweep import PAPER, setups
+
+EMBEDDED_CASE = Path(__file__).parents[1] / "reference" / "embedded"
+
+
+@click.command()
+@click.argument("cases", metavar="[CASE]...", type=click.Path(path_type=Path), nargs=-1)
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for table and picture.")
+@click.option(
+    "--quick", is_flag=True, help="A handful of settings on the embedded case, in less than a minute."
+)
+@arch_option
+def trade(cases: tuple[Path, ...], out: Path, quick: bool, arch: str) -> None:
+    """Error of the beads against time of a step, over model, resolution, substeps, iterations and relaxation.
+
+    The error is the mean over the embedded patient's bead experiment and those of CASE..., folders as `validate` takes them.
+    """
+    make_folder(out)
+    loaded = [load_case(EMBEDDED_CASE), *(load_case(case) for case in cases)]
+    used = start_taichi(arch)
+    from studies.trade import measure
+    from studies.trade.picture import draw
+
+    tried, rounds = setups(quick), 1 if quick else measure.ROUNDS
+    with tqdm(total=measure.count(loaded, tried, rounds), desc="trade", unit="run") as bar:
+        points = measure.points(loaded, tried, used, rounds, bar.update)
+    report = dict(arch=used, cases=[case.name for case in loaded], points=points)
+    (out / "trade.json").write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", "utf-8")
+    write_csv(points, out / "trade.csv")
+    draw(points, out / "trade.png")
+    click.echo("\n".join(["", *table(points)]))
+    click.echo(f"\nWrote trade.json, trade.csv and trade.png to {out}")
+
+
+def write_csv(points: list[dict[str, Any]], path: Path) -> None:
+    """A line a point; the errors of single cases in columns of their own."""
+    flat = [
+        {name: value for name, value in point.items() if name != "errors_mm"}
+        | {f"error_{name}_mm": value for name, value in point["errors_mm"].items()}
+        for point in points
+    ]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        rows = csv.DictWriter(file, flat[0].keys())
+        rows.writeheader()
+        rows.writerows(flat)
+
+
+def table(points: list[dict[str, Any]]) -> list[str]:
+    """All points, cheapest first: those on the front, the presets and the paper's are marked."""
+    lines = ["model            size, mm  substeps x iterations  relax.  ms a step  error, mm  arriving"]
+    for point in sorted(points, key=lambda point: point["ms_median"]):
+        size = point["cell_mm"] or point["radius_mm"]
+        marks = ["front"] * point["pareto"] + [name for name in (name_of(point),) if name]
+        stiffness = "" if point["stiffness"] is None else f"alpha {point['stiffness']:g} "
+        lines.append(
+            f"{point['model']:15}{size:>10g}{point['substeps']:>14} x {point['iterations']:<6}"
+            f"{point['relaxation_factor']:>8g}{point['ms_median']:>11.2f}{_plain(point['error_mean_mm']):>11}"
+            f"{_plain(point['error_arriving_mm']):>10}  {stiffness}{', '.join(marks)}"
+        )
+    return lines
+
+
+def name_of(point: dict[str, Any]) -> str:
+    """The preset that a point is, or the paper's; empty where it is neither."""
+    setup = setup_of(point)
+    return preset_of(setup) or ("the paper's" if setup in PAPER else "")
+
+
+def _plain(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"

@@ -1,0 +1,66 @@
+"""The picture of ``study trade``: every point by its time and its error, the front, the presets and the paper's."""
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+
+matplotlib.use("Agg")
+
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+
+from studies.trade.command import name_of
+
+DPI = 130
+COLOURS = {"neo-hookean": "tab:blue", "shape-matching": "tab:orange"}
+FRAME_MS = 1000 / 60
+
+
+def draw(points: list[dict[str, Any]], path: Path) -> None:
+    """Write the picture."""
+    points = [point for point in points if point["error_mean_mm"] is not None]
+    figure, axes = plt.subplots(figsize=(11, 7), layout="constrained")
+    for model, colour in COLOURS.items():
+        _model(axes, [point for point in points if point["model"] == model], model, colour)
+    front = sorted((point for point in points if point["pareto"]), key=lambda point: point["ms_median"])
+    ms, error = [p["ms_median"] for p in front], [p["error_mean_mm"] for p in front]
+    axes.plot(ms, error, color="black", linewidth=1.2, label="Pareto front", drawstyle="steps-post")
+    axes.axvline(FRAME_MS, color="0.5", linestyle="--", linewidth=0.8)
+    axes.annotate(" a frame at 60 Hz", (FRAME_MS, axes.get_ylim()[1]), color="0.4", va="top")
+    axes.set(
+        xscale="log",
+        yscale="log",
+        xlabel="time of a step (ms, median)",
+        ylabel="mean error of the beads (mm)",
+    )
+    axes.set_title("What speed costs in accuracy")
+    axes.grid(alpha=0.3, which="both")
+    axes.legend(loc="lower left")
+    figure.savefig(path, dpi=DPI)
+    plt.close(figure)
+
+
+def _model(axes: Axes, points: list[dict[str, Any]], model: str, colour: str) -> None:
+    if not points:
+        return
+    size = np.array([point["cell_mm"] or point["radius_mm"] for point in points])
+    axes.scatter(
+        [point["ms_median"] for point in points],
+        [point["error_mean_mm"] for point in points],
+        s=7 * size,
+        color=colour,
+        alpha=0.55,
+        label=f"{model} (field: size of cells or particles)",
+    )
+    for point in points:
+        name = name_of(point)
+        at = (point["ms_median"], point["error_mean_mm"])
+        if name == "the paper's":
+            axes.scatter(*at, marker="x", color="tab:red", zorder=3)
+            text = f"paper {point['radius_mm']:g} mm"
+            axes.annotate(text, at, xytext=(5, 4), textcoords="offset points", fontsize=8, color="tab:red")
+        elif name:
+            axes.scatter(*at, marker="D", facecolors="none", edgecolors="black", zorder=3)
+            axes.annotate(name, at, xytext=(6, 5), textcoords="offset points", fontsize=10, weight="bold")
