@@ -5,14 +5,14 @@ import sys
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from scenes.anatomy import load_anatomy, patient_scene
+from scenes.anatomy import LoadedAnatomy, load_anatomy, patient_scene
 from scenes.labels import Side
 from scenes.patient import describe, import_patient, save_patient
 from scenes.reading import PatientError, read_volume
@@ -21,6 +21,7 @@ from scenes.scene import (
     OPTIONS,
     TISSUES,
     NeoHookeanTissue,
+    Scene,
     SceneError,
     load_scene,
     scene_text,
@@ -31,13 +32,14 @@ from studies.beam.command import beam
 from studies.case import CaseError
 from studies.commands import Fault, arch_option, calibrate, make_folder, start_taichi, validate
 from studies.reference.command import reference
-from studies.setup import SetupError
+from studies.setup import Setup, SetupError, scene_of
 from studies.study import study
 
 if TYPE_CHECKING:
     from render.viewer import Controls, Settings, View, Viewer
     from studies.rehearsal import Rehearsal
     from studies.report import Record
+    from studies.trade.ladder import Ladder
 
 PICTURES_A_SECOND = 10
 ANIMATION_WIDTH = 720
@@ -75,12 +77,24 @@ def cli() -> None:
 @click.option("--stiffness", type=float, help="shape-matching: cluster stiffness, 0 to 1 [the scene's].")
 @click.option("--substeps", type=int, help="Substeps of a time step [the model's].")
 @click.option("--iterations", type=int, help="Passes over the constraints in a substep [the model's].")
+@click.option(
+    "--budget-ms",
+    type=click.FloatRange(0.01, 10_000),
+    help="Choose size and passes: the truest whose step takes no longer on this machine, measured first.",
+)
+@click.option(
+    "--error-mm",
+    type=click.FloatRange(0, 100),
+    help="Choose size and passes: the fastest whose mean error, as study trade measured it, is no larger.",
+)
 def rehearse(
     scene: Path,
     headless: bool,
     seconds: float | None,
     out: Path,
     arch: str,
+    budget_ms: float | None,
+    error_mm: float | None,
     **changes: float | str | None,
 ) -> None:
     """Press the kidney of SCENE, a scene file or a patient's folder, and see what the transducer sees."""
@@ -93,6 +107,9 @@ def rehearse(
     if changed["tissue.model"] is None and loaded.tissue.model != before.tissue.model:
         click.echo(f"Tissue model: {loaded.tissue.model}, as the options ask for it.")
     anatomy = load_anatomy(loaded, path.parent)
+    budgeted = budget_ms is not None or error_mm is not None
+    if budgeted:
+        refuse_sizes(changed)
     used = start_taichi(arch)
     from render.window import display_available
     from studies.rehearsal import Rehearsal
@@ -103,11 +120,48 @@ def rehearse(
     make_folder(out)
     click.echo("Building the model.")
     started = perf_counter()
-    rehearsal = Rehearsal(loaded, anatomy)
+    if budgeted:
+        rehearsal = build_within(loaded, anatomy, used, changed["tissue.model"], budget_ms, error_mm)
+    else:
+        rehearsal = Rehearsal(loaded, anatomy)
     if headless:
         run_headless(rehearsal, used, seconds, out, perf_counter() - started)
     else:
-        run_window(rehearsal, out)
+        run_window(rehearsal, out, budget_ms)
+
+
+def refuse_sizes(changed: dict[str, float | str | None]) -> None:
+    """Raises Fault where the command line gives both a budget and what the budget is to choose."""
+    for key, value in changed.items():
+        if value is not None and key not in ("tissue.model", "tissue.young_kpa", "tissue.poisson"):
+            raise Fault(f"{OPTIONS[key]}: --budget-ms and --error-mm choose this; leave one of them out")
+
+
+def build_within(
+    scene: Scene,
+    anatomy: LoadedAnatomy,
+    arch: str,
+    model: Any,
+    budget_ms: float | None,
+    error_mm: float | None,
+) -> "Rehearsal":
+    """The rehearsal with the settings that fit the budgets on this machine. Raises Fault."""
+    from studies.rehearsal import Rehearsal
+    from studies.trade.choice import NoPoint, choose, described
+    from studies.trade.front import front_of, load_points
+
+    def build(setup: Setup) -> Rehearsal:
+        start_taichi(arch)
+        return Rehearsal(scene_of(scene, setup), anatomy)
+
+    try:
+        rehearsal, point, step_ms = choose(front_of(load_points(), model), build, budget_ms, error_mm)
+    except NoPoint as reason:
+        raise Fault(str(reason)) from None
+    click.echo(
+        f"Chosen: {described(point.setup)}; a step takes {step_ms:.1f} ms here, expected error {point.error_mean_mm:.2f} mm."
+    )
+    return rehearsal
 
 
 @cli.command("import")
@@ -219,8 +273,10 @@ def run_frame(
         lambda: rehearsal.image(settings.window_hu, settings.level_hu, settings.depth_mm), record.slice_ms
     )
     size, count = next(iter(rehearsal.model.counts().items()))
+    error = rehearsal.expected_error_mm()
     readouts = {
         "step": f"{np.median(record.step_ms[-30:]):.1f} ms",
+        "expected error": "not known" if error is None else f"{error:.2f} mm",
         "slice": f"{np.median(record.slice_ms[-30:]):.1f} ms",
         size: f"{count}",
         "indentation": f"{max(rehearsal.indentation_mm(), 0.0):.1f} mm",
@@ -273,16 +329,22 @@ def run_headless(rehearsal: "Rehearsal", arch: str, seconds: float | None, out: 
     click.echo(f"Wrote {len(animation)} pictures, press.gif and report.json to {out}")
 
 
-def run_window(rehearsal: "Rehearsal", out: Path) -> None:
-    """The interactive loop: input -> transducer -> step -> surfaces and slice -> picture."""
+def run_window(rehearsal: "Rehearsal", out: Path, budget_ms: float | None) -> None:
+    """The interactive loop: input -> transducer -> step -> surfaces and slice -> picture.
+
+    A step that takes longer than its budget, or else than the time that it simulates, makes iterations give way.
+    """
     from render.window import NoVulkan
-    from studies.report import Record
+    from studies.report import Notices, Record
+    from studies.trade.ladder import Ladder
 
     try:
         viewer = open_viewer(rehearsal, visible=True)
     except NoVulkan as reason:
         raise Fault(f"{reason}; install a Vulkan driver, or run with --headless") from None
     record = Record(0.0)
+    ladder = Ladder(budget_ms or 1000 * rehearsal.settings.time_step_s)
+    notices = Notices(click.echo)
     click.echo("The window is open; H shows the keys, Esc quits.")
     frozen = False
     before = perf_counter()
@@ -291,8 +353,14 @@ def run_window(rehearsal: "Rehearsal", out: Path) -> None:
     while viewer.running:
         controls = viewer.read_controls()
         frozen ^= controls.freeze
-        pose = None if frozen else steer(rehearsal, controls)
-        view = run_frame(rehearsal, controls.settings, pose, record, "FROZEN" if frozen else "")
+        pose = None if frozen else steer(rehearsal, controls, ladder)
+        asked = controls.settings.iterations
+        status = "FROZEN" if frozen else notices.shown or ladder.says(asked)
+        view = run_frame(rehearsal, controls.settings, pose, record, status)
+        if pose is not None:
+            notices.tell(rehearsal.notice)
+            if ladder.watch(record.step_ms[-1]):
+                click.echo(ladder.says(asked) or f"Back to all {asked} iterations.")
         now = perf_counter()
         rate = 0.9 * rate + 0.1 / max(now - before, 1e-6)
         before = now
@@ -304,10 +372,10 @@ def run_window(rehearsal: "Rehearsal", out: Path) -> None:
     viewer.close()
 
 
-def steer(rehearsal: "Rehearsal", controls: "Controls") -> np.ndarray:
+def steer(rehearsal: "Rehearsal", controls: "Controls", ladder: "Ladder") -> np.ndarray:
     """Hand the user's input to the hand that holds the transducer and to the solver; the pose to go to then."""
     step, hand, asked = rehearsal.settings, rehearsal.hand, controls.settings
-    step.iterations, step.substeps = asked.iterations, asked.substeps
+    step.iterations, step.substeps = ladder.iterations(asked.iterations), asked.substeps
     if asked.stiffness is not None:
         step.stiffness = asked.stiffness
     if asked.young_kpa is not None:

@@ -15,6 +15,8 @@ from sim.neo_hookean import NeoHookean
 from sim.shapes import ConvexTool, Plane, SignedDistanceField
 from sim.skinning import Skin
 from studies.models import build_solver, embedding_cell_mm, static_shape, step_settings
+from studies.setup import setup_of_scene
+from studies.trade.front import expected_error_mm, load_points
 from ultrasound.probe import Hand, advanced, approached, between, image_plane, indentation, pose_at, touching
 from ultrasound.slice import Slice
 from ultrasound.volume import Volume, distance_volume
@@ -48,6 +50,7 @@ class Rehearsal:
         self.notice = ""
         self._build_surfaces()
         self._build_slice(anatomy)
+        self._points = load_points()
         self.press = press_on(scene.press, anatomy, self.gravity_direction)
         self.steps = 0
         self.pose = self._settle()
@@ -124,8 +127,11 @@ class Rehearsal:
         """The transducer's pose at a time of the scripted press: just touching at first, then down stage by stage."""
         depths = [0.0, *self.press.indentations_mm]
         stage = time_s / self.scene.solver.time_step_s / self.press.stage_steps
-        depth = float(np.interp(stage, np.arange(len(depths)), depths))
-        return advanced(self.hand.home, depth)
+        return self.pose_at_depth(float(np.interp(stage, np.arange(len(depths)), depths)))
+
+    def pose_at_depth(self, depth_mm: float) -> np.ndarray:
+        """The transducer's pose so deep in the organ, along the scripted press."""
+        return advanced(self.hand.home, depth_mm)
 
     def script_length_s(self) -> float:
         """How long the scripted press takes [s]."""
@@ -168,6 +174,12 @@ class Rehearsal:
     def indentation_mm(self) -> float:
         """How deep the transducer is pressed into the settled surface; negative above it."""
         return indentation(self.pose, self.size_mm, self.hand.samples)
+
+    def expected_error_mm(self) -> float | None:
+        """Mean error of beads that was measured with settings like these (``study trade``); None where none were."""
+        step = self.settings
+        setup = setup_of_scene(self.scene, step.substeps, step.iterations, step.relaxation_factor)
+        return expected_error_mm(self._points, setup)
 
     def volume_ratio(self) -> float:
         """Volume inside the carried surface, as a share of the resting one."""

@@ -26,6 +26,8 @@ def spread(values_ms: list[float]) -> dict[str, float]:
     return {name: round(float(value), 4) for name, value in figures.items()}
 
 
+# How long a notice stands in the panel.
+SHOWN_S = 4.0
 # Keys that not every tissue model fills.
 NOT_EVERYWHERE = dict(radius_mm=None, stiffness=None, clusters=0, memberships=0)
 
@@ -43,12 +45,15 @@ class Record:
     step_ms: list[float] = field(default_factory=list)
     slice_ms: list[float] = field(default_factory=list)
     finite: bool = True
+    fallbacks: list[str] = field(default_factory=list)
     volume_ratio_min: float = 1.0
     max_penetration_mm: float = 0.0
     indentation_max_mm: float = 0.0
 
     def watch(self, rehearsal: Rehearsal) -> None:
         """Look at the state at the end of a step; the surfaces must be up to date."""
+        if rehearsal.notice:
+            self.fallbacks.append(rehearsal.notice)
         self.finite &= bool(np.isfinite(rehearsal.body.position.to_numpy()).all())
         self.volume_ratio_min = min(self.volume_ratio_min, rehearsal.volume_ratio())
         self.max_penetration_mm = max(self.max_penetration_mm, rehearsal.contacts.measure_penetration())
@@ -72,6 +77,8 @@ class Record:
             ms_per_slice=spread(self.slice_ms[1:] or self.slice_ms),
             build_s=round(self.build_s, 3),
             finite=self.finite,
+            expected_error_mm=rehearsal.expected_error_mm(),
+            fallbacks=self.fallbacks,
             volume_ratio_min=round(self.volume_ratio_min, 6),
             max_penetration_mm=round(self.max_penetration_mm, 6),
             indentation_max_mm=round(self.indentation_max_mm, 4),
@@ -93,8 +100,35 @@ def summary(report: dict) -> str:
             f"press     {report['indentation_max_mm']:.2f} mm deep; least volume {100 * report['volume_ratio_min']:.1f} %; "
             f"penetration at most {report['max_penetration_mm']:.3f} mm; "
             f"{'all finite' if report['finite'] else 'NOT FINITE'}",
+            f"error     {_error(report['expected_error_mm'])}",
+            *(f"MIND      {text}" for text in report["fallbacks"]),
         ]
     )
+
+
+def _error(expected_mm: float | None) -> str:
+    if expected_mm is None:
+        return "not known: study trade measured no settings like these"
+    return f"{expected_mm:.2f} mm expected, the mean of beads with settings like these (study trade)"
+
+
+class Notices:
+    """Tells the user once, and shows for a while, what the guard had to put right."""
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell = tell
+        self._until = 0.0
+
+    def tell(self, notice: str) -> None:
+        """Take over a step's notice; most are empty."""
+        if notice:
+            self._tell(notice)
+            self._until = perf_counter() + SHOWN_S
+
+    @property
+    def shown(self) -> str:
+        """What the panel says now."""
+        return "TISSUE PUT BACK" if perf_counter() < self._until else ""
 
 
 def _model_line(report: dict) -> str:

@@ -3,6 +3,8 @@
 from dataclasses import dataclass, replace
 from typing import Any
 
+from scenes.scene import NeoHookeanTissue, Scene, with_options
+
 
 @dataclass(frozen=True)
 class Setup:
@@ -51,6 +53,33 @@ QUALITIES = ("fast", "balanced", "accurate")
 
 class SetupError(ValueError):
     """A setup that does not fit its model or case; the message is one line."""
+
+
+def scene_of(scene: Scene, setup: Setup) -> Scene:
+    """A scene with a setup's model, size and passes."""
+    values: dict[str, float | int | str | None] = {
+        "tissue.model": setup.model,
+        "solver.substeps": setup.substeps,
+        "solver.iterations": setup.iterations,
+        "solver.relaxation_factor": setup.relaxation_factor,
+    }
+    if setup.model == "neo-hookean":
+        values["tissue.cell_mm"] = setup.cell_mm
+    else:
+        values |= {"tissue.radius_mm": setup.radius_mm, "tissue.stiffness": setup.stiffness}
+    return with_options(scene, values)
+
+
+def setup_of_scene(scene: Scene, substeps: int, iterations: int, relaxation_factor: float) -> Setup:
+    """The setup that a scene is computed with when its steps have these passes."""
+    tissue = scene.tissue
+    if isinstance(tissue, NeoHookeanTissue):
+        own: dict[str, Any] = dict(cell_mm=tissue.cell_mm)
+    else:
+        own = dict(radius_mm=tissue.radius_mm, stiffness=tissue.stiffness)
+    return Setup(
+        tissue.model, **own, substeps=substeps, iterations=iterations, relaxation_factor=relaxation_factor
+    )
 
 
 def choose_setup(model: str, quality: str, **changes: Any) -> Setup:

@@ -10,7 +10,7 @@ import taichi as ti
 import trimesh
 
 from scenes.anatomy import LoadedAnatomy
-from scenes.scene import Scene, with_options
+from scenes.scene import Scene
 from sim.body import Body, ParticleBody, RestBody
 from sim.contact import ShapeContacts
 from sim.device import start
@@ -23,7 +23,7 @@ from sim.solver import Solver, StepSettings
 from sim.surface_contact import SurfaceContacts
 from studies.rehearsal import Rehearsal
 from studies.report import spread, timed
-from studies.setup import Setup
+from studies.setup import Setup, scene_of
 from studies.timing.bound import Bound, NoBound, Pypbd
 from studies.timing.phases import Phases, without_calls
 from ultrasound.probe import advanced, between
@@ -47,20 +47,6 @@ class Press:
     step_ms: list[float]
     pieces_ms: list[dict[str, float]]
     warm_up_s: float
-
-
-def scene_of(scene: Scene, setup: Setup) -> Scene:
-    """A scene with a setup's model, size and iterations."""
-    values: dict[str, float | int | str | None] = {
-        "tissue.model": setup.model,
-        "solver.substeps": setup.substeps,
-        "solver.iterations": setup.iterations,
-    }
-    if setup.model == "neo-hookean":
-        values["tissue.cell_mm"] = setup.cell_mm
-    else:
-        values |= {"tissue.radius_mm": setup.radius_mm, "tissue.stiffness": setup.stiffness}
-    return with_options(scene, values)
 
 
 def build(scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str) -> Rehearsal:
