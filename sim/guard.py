@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from sim.solver import Solver, SolverState
 
 MOST_TETRAHEDRA = 2000
-NEIGHBOURS = 14
+NEIGHBOURS = 10
 # An edge is torn when it is so many times as long as at rest, a tetrahedron flat at this share of its volume.
 TORN, FLAT = 4.0, 0.02
 # What a tool crushes within this distance of it comes back when it goes.

@@ -74,7 +74,9 @@ class NeoHookean:
         self._store_nodes(1e-3 * density_g_cm3 * lattice.tissue + load_g)
         self._store_cells()
         self._store_hourglass()
-        self.rigid: Any = None if self.has_held else RigidMotion(body, self.mass, self.target, contacts)
+        self.rigid: Any = (
+            None if self.has_held else RigidMotion(body, self.mass, self.target, contacts, self.serial)
+        )
         self.set_material(young_kpa, poisson)
 
     def _store_nodes(self, mass_g: np.ndarray) -> None:

@@ -31,13 +31,19 @@ class RigidMotion:
     """
 
     def __init__(
-        self, body: Body, mass: ti.Field, target: ti.Field, contacts: SurfaceContacts | None = None
+        self,
+        body: Body,
+        mass: ti.Field,
+        target: ti.Field,
+        contacts: SurfaceContacts | None = None,
+        serial: bool = False,
     ) -> None:
         self.body = body
         self.mass = mass
         self.target = target
         self.contacts: Any = contacts
         self.has_contacts = contacts is not None
+        self.serial = serial
         self.terms = body.count + (contacts.count if contacts else 0)
         self.blocks = -(-self.terms // BLOCK)
         middle = body.rest_points.mean(axis=0)
@@ -59,11 +65,13 @@ class RigidMotion:
         for _ in range(1):
             self.rotation[None] = tm.eye(3)
             self.translation[None] = tm.vec3(0.0)
-        for step in ti.static(range(1 + NEWTON_STEPS)):
-            for block in range(self.blocks):
-                self.sum_block(block, dt, step > 0)
-            for _ in range(1):
-                self.solve()
+        if ti.static(self.serial):
+            for step in range(1 + NEWTON_STEPS):
+                self.improve(step > 0, dt)
+        else:
+            # Only outermost loops run in parallel.
+            for step in ti.static(range(1 + NEWTON_STEPS)):
+                self.improve(step > 0, dt)
         for _ in range(1):
             self.share[None] = 1.0
         if ti.static(self.has_contacts):
@@ -83,13 +91,21 @@ class RigidMotion:
         return self.translation[None].norm() + turned > NEAR_MM
 
     @ti.func
+    def improve(self, newton, dt: float):
+        """One more step to the motion."""
+        for block in range(self.blocks):
+            self.sum_block(block, dt, newton)
+        for _ in range(1):
+            self.solve()
+
+    @ti.func
     def moved(self, x):
         """Where the motion found so far takes a point."""
         centre = self.body.position[self.centre]
         return centre + self.translation[None] + self.rotation[None] @ (x - centre)
 
     @ti.func
-    def sum_block(self, block, dt: float, newton: ti.template()):
+    def sum_block(self, block, dt: float, newton):
         """Force, torque and their derivatives of a block's terms, nodes first, then points of contact.
 
         Without ``newton`` they draw the nodes to where their velocities would take them, whatever is in the way.
@@ -103,7 +119,7 @@ class RigidMotion:
                 inertia = self.mass[term] / (dt * dt)
                 x = self.moved(self.body.position[term])
                 f = inertia * dt * self.body.velocity[term]
-                if ti.static(newton):
+                if newton:
                     f = inertia * (self.target[term] - x)
                 k = inertia * tm.eye(3)
             elif ti.static(self.has_contacts):

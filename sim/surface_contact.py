@@ -174,8 +174,9 @@ class SurfaceContacts:
         return force, stiffness
 
     @ti.func
-    def hold(self, q, p, pushing: ti.template()):
-        """Force [uN] on point q if it were at p, on the planes that the last substep knew, and its stiffness.
+    def hold(self, q, p, pushing):
+        """Force [uN] on point q if it were at p, on the planes that the last substep knew, and its stiffness; where it is not
+        ``pushing``, no force, and the stiffness into and off the shapes alone.
 
         What slides resists by its friction over its way, which is more than the derivative: then Newton's steps converge.
         """
@@ -189,15 +190,15 @@ class SurfaceContacts:
                 depth = plane.w - normal.dot(shift)
                 if (self.near[q] >> s) & 1 and depth > 0.0:
                     stiffness += layer * normal.outer_product(normal)
-                    if ti.static(pushing):
+                    if pushing:
                         force += layer * depth * normal
-                    if ti.static(pushing and self.rough):
-                        stick = self.stick[s, q] + shift - self.point[q]
-                        stick -= stick.dot(normal) * normal
-                        length = ti.max(stick.norm(), 1e-12)
-                        share = ti.min(self.friction * depth / STICK / length, 1.0)
-                        force -= layer * STICK * share * stick
-                        stiffness += layer * STICK * share * (tm.eye(3) - normal.outer_product(normal))
+                        if ti.static(self.rough):
+                            stick = self.stick[s, q] + shift - self.point[q]
+                            stick -= stick.dot(normal) * normal
+                            length = ti.max(stick.norm(), 1e-12)
+                            share = ti.min(self.friction * depth / STICK / length, 1.0)
+                            force -= layer * STICK * share * stick
+                            stiffness += layer * STICK * share * (tm.eye(3) - normal.outer_product(normal))
         return force, stiffness
 
     @ti.func
