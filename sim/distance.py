@@ -4,7 +4,6 @@ import igl
 import numpy as np
 from scipy.ndimage import label
 
-
 # Every so manieth point of a grid of distances is computed everywhere, the others as near to the surface as this [mm].
 COARSENESS, EXACT_MM = 3, 5.0
 

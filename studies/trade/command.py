@@ -34,7 +34,7 @@ def trade(cases: tuple[Path, ...], out: Path, quick: bool, arch: str) -> None:
     from studies.trade import measure
     from studies.trade.picture import draw
 
-    tried, rounds = setups(quick), 1 if quick else measure.ROUNDS
+    tried, rounds = setups(quick), 0 if quick else measure.ROUNDS
     with tqdm(total=measure.count(loaded, tried, rounds), desc="trade", unit="run") as bar:
         points = measure.points(loaded, tried, used, rounds, bar.update)
     report = dict(arch=used, cases=[case.name for case in loaded], points=points)

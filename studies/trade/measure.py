@@ -31,17 +31,22 @@ Built = Iterator[tuple[Experiment, list[Setup]]]
 def points(
     cases: list[Case], tried: list[Setup], arch: str, rounds: int, done: Callable[[], Any]
 ) -> list[dict[str, Any]]:
-    """Rows of trade.json: error over all cases, cost on the first. ``done`` is told of each setting's runs."""
+    """Rows of trade.json: error over all cases, cost on the first. ``done`` is told of each setting's runs.
+
+    Without ``rounds`` the cost is that of the steps whose error was measured, at another time for each setting.
+    """
     resting: dict[Setup, dict[str, float]] = {setup: {} for setup in tried}
     arriving: dict[Setup, dict[str, float]] = {setup: {} for setup in tried}
+    ms: dict[Setup, list[float]] = {setup: [] for setup in tried}
     for case in cases:
         for experiment, alike in _built(case, tried, arch):
             for setup in alike:
                 run = experiment.run(setup)
+                if rounds == 0 and case is cases[0]:
+                    ms[setup].append(float(np.median(run.step_ms)))
                 resting[setup][case.name] = _mean_error(case, run.beads, run.finite)
                 arriving[setup][case.name] = _mean_error(case, run.arriving, run.finite)
                 done()
-    ms: dict[Setup, list[float]] = {setup: [] for setup in tried}
     for _ in range(rounds):
         for experiment, alike in _built(cases[0], tried, arch):
             for setup in alike:
