@@ -57,7 +57,7 @@ def _coarsely(
 ) -> np.ndarray:
     """Distances (n,) [mm] of a grid's points, linear between those of every so manieth along each axis."""
     coarse = -(-(shape - 1) // COARSENESS) + 1
-    points = low + COARSENESS * spacing_mm * np.indices(coarse).reshape(3, -1).T
+    points = low + COARSENESS * spacing_mm * np.indices(tuple(coarse)).reshape(3, -1).T
     known = np.sqrt(igl.point_mesh_squared_distance(points, vertices, faces)[0]).reshape(coarse)
     for axis, count in enumerate(shape):
         at = np.arange(count) / COARSENESS

@@ -23,6 +23,7 @@ class ParticleContacts:
         self.body = body
         self.model = model
         self.friction = friction
+        self.rough = friction > 0
         self.distance = body.radius_mm
         # Particles come nearer than they started during the substep, so some are listed before they touch.
         self.reach = 1.5 * self.distance
@@ -129,10 +130,12 @@ class ParticleContacts:
                     if ti.static(self.body.mass_scaled):
                         share = self.body.mass_scale[j] / (self.body.mass_scale[i] + self.body.mass_scale[j])
                     depth = self.distance - gap
-                    slip = moved - (self.body.estimate[j] - self.body.position[j])
-                    slip -= slip.dot(normal) * normal
-                    hold = ti.min(1.0, self.friction * depth / ti.max(slip.norm(), 1e-12))
-                    change += share * (depth * normal - hold * slip)
+                    change += share * depth * normal
+                    if ti.static(self.rough):
+                        slip = moved - (self.body.estimate[j] - self.body.position[j])
+                        slip -= slip.dot(normal) * normal
+                        hold = ti.min(1.0, self.friction * depth / ti.max(slip.norm(), 1e-12))
+                        change -= share * hold * slip
                     contacts += 1
             if contacts > 0:
                 ti.atomic_max(self.most_contacts[None], contacts)

@@ -46,19 +46,21 @@ def build_solver(
     organ: trimesh.Trimesh,
     tissue: AnyTissue,
     shapes: list,
-    tool: ConvexTool,
+    tool: ConvexTool | None,
     contact: Contact | None = None,
     section: SolverSection | None = None,
     rest: RestBody | None = None,
+    serial: bool | None = None,
 ) -> Solver:
     """A solver of the organ [mm] among shapes, the tool among them. Raises SamplingError.
 
-    ``rest`` is shape matching's: the organ filled before (``fill``), which takes seconds.
+    ``rest`` is shape matching's: the organ filled before (``fill``), which takes seconds. ``serial`` says whether a step is
+    one kernel on one core; left open, the body's size and the machine decide.
     """
     contact, section = contact or Contact(), section or SolverSection()
     if isinstance(tissue, NeoHookeanTissue):
-        return _neo_hookean(organ, tissue, shapes, tool, contact)
-    return _shape_matching(rest or fill(organ, tissue), tissue, shapes, tool, contact, section)
+        return _neo_hookean(organ, tissue, shapes, tool, contact, serial)
+    return _shape_matching(rest or fill(organ, tissue), tissue, shapes, tool, contact, section, serial)
 
 
 def fill(organ: trimesh.Trimesh, tissue: ShapeMatchingTissue) -> RestBody:
@@ -69,13 +71,21 @@ def fill(organ: trimesh.Trimesh, tissue: ShapeMatchingTissue) -> RestBody:
 
 
 def _neo_hookean(
-    organ: trimesh.Trimesh, tissue: NeoHookeanTissue, shapes: list, tool: ConvexTool, contact: Contact
+    organ: trimesh.Trimesh,
+    tissue: NeoHookeanTissue,
+    shapes: list,
+    tool: ConvexTool | None,
+    contact: Contact,
+    serial: bool | None,
 ) -> Solver:
     lattice = fill_with_cells(organ, tissue.cell_mm)
     body = Body(lattice.nodes)
-    points, area_mm2 = surface_points(organ, POINTS_A_CELL * tissue.cell_mm)
-    contacts = SurfaceContacts(body, lattice, points, area_mm2, shapes, contact.shape_friction)
-    model = NeoHookean(body, lattice, contacts, tissue.young_kpa, tissue.poisson, tissue.density_g_cm3)
+    contacts = None
+    if shapes:
+        points, area_mm2 = surface_points(organ, POINTS_A_CELL * tissue.cell_mm)
+        contacts = SurfaceContacts(body, lattice, points, area_mm2, shapes, contact.shape_friction)
+    material = (tissue.young_kpa, tissue.poisson, tissue.density_g_cm3)
+    model = NeoHookean(body, lattice, contacts, *material, serial=serial)
     return Solver(model, contacts, tool=tool)
 
 
@@ -83,13 +93,14 @@ def _shape_matching(
     rest: RestBody,
     tissue: ShapeMatchingTissue,
     shapes: list,
-    tool: ConvexTool,
+    tool: ConvexTool | None,
     contact: Contact,
     section: SolverSection,
+    serial: bool | None,
 ) -> Solver:
     arranged, patches = arrange(rest, tissue.cluster_spacing)
     body = ParticleBody(arranged, section.mass_scaling_per_mm)
-    contacts = ShapeContacts(body, shapes, contact.shape_friction)
-    model = ShapeMatching(body, patches, contacts, section.relaxation)
+    contacts = ShapeContacts(body, shapes, contact.shape_friction) if shapes else None
+    model = ShapeMatching(body, patches, contacts, section.relaxation, serial)
     pairs = ParticleContacts(body, model, contact.particle_friction) if contact.particles else None
     return Solver(model, contacts, pairs, tool, section.relaxation)

@@ -2,6 +2,7 @@
 
 import click
 
+from studies.features.command import features
 from studies.stability.command import stability
 from studies.timing.command import timing
 from studies.trade.command import trade
@@ -13,5 +14,6 @@ def study() -> None:
 
 
 study.add_command(timing)
+study.add_command(features)
 study.add_command(trade)
 study.add_command(stability)

@@ -121,10 +121,11 @@ def mean_of(pieces: list[dict[str, float]]) -> dict[str, float]:
     return {name: round(float(np.mean([ms[name] for ms in pieces])), 4) for name in pieces[0]}
 
 
-def memory_mb(solver: Solver) -> float:
-    """What a solver's fields take on the device [MB]: the body's, the model's, its contacts' and their shapes'."""
+def memory_mb(owner: Any, apart: Any = None) -> float:
+    """What a solver's, or another part's, fields take on the device [MB], with all that it refers to, ``apart`` from that."""
     seen: set[int] = set()
-    return _bytes_in(solver, seen) / 1e6
+    _bytes_in(apart, seen)
+    return _bytes_in(owner, seen) / 1e6
 
 
 def _bytes_in(owner: Any, seen: set[int]) -> int:
@@ -135,7 +136,7 @@ def _bytes_in(owner: Any, seen: set[int]) -> int:
         return int(np.prod(owner.shape, dtype=np.int64)) * 4 * _entries(owner)
     if isinstance(owner, list | tuple):
         return sum(_bytes_in(part, seen) for part in owner)
-    if type(owner).__module__.startswith("sim."):
+    if type(owner).__module__.startswith(("sim.", "ultrasound.")):
         return sum(_bytes_in(part, seen) for part in vars(owner).values())
     return 0
 

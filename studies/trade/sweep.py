@@ -4,8 +4,8 @@ from dataclasses import replace
 
 from studies.setup import NEO_HOOKEAN, PRESETS, Setup
 
-CELLS_MM = (8.0, 6.0, 5.0, 4.0, 3.5, 3.0, 2.5, 2.0)
-CELL_ITERATIONS = (2, 4, 8, 12, 20)
+CELLS_MM = (10.0, 8.0, 6.0, 5.0, 4.0, 3.5, 3.0, 2.5, 2.0)
+CELL_ITERATIONS = (1, 2, 4, 8, 12, 20)
 RADII_MM = (2.2, 2.5, 2.7, 3.0, 3.3, 4.0, 5.0)
 # Substeps and iterations; the paper's first.
 PASSES = ((3, 9), (1, 9), (3, 3), (1, 27), (3, 27))

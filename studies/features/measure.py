@@ -1,0 +1,208 @@
+"""What each feature of a scene costs: the same press with it and without, in turn."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import taichi as ti
+import trimesh
+from taichi.profiler.kernel_profiler import get_default_kernel_profiler
+
+from scenes.anatomy import LoadedAnatomy
+from scenes.scene import Contact, Scene, SolverSection, with_options
+from sim.device import start
+from sim.embedding import Embedding
+from sim.shapes import ConvexTool
+from sim.solver import Solver, StepSettings
+from studies.models import AnyTissue, build_solver, embedding_cell_mm, static_shape, step_settings
+from studies.rehearsal import SURROUNDINGS_MM, Rehearsal
+from studies.report import timed
+from studies.timing.measure import memory_mb
+from ultrasound.probe import advanced, between, image_plane, pose_at, touching
+from ultrasound.slice import Slice
+from ultrasound.volume import Volume, distance_volume
+
+# A press so deep, in so many steps; those before it settle.
+PRESS_MM, PRESS_STEPS, SETTLE_STEPS = 8.0, 60, 30
+CALLS = 40
+
+
+@dataclass(frozen=True)
+class Options:
+    """What of a scene takes part in a step; the defaults are the embedded patient's."""
+
+    support: bool = True
+    transducer: bool = True
+    shape_friction: float = 0.35
+    particles: bool = False
+    particle_friction: float = 0.0
+    mass_scaling_per_mm: float = 0.0
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One feature: a step ``having`` it, and the same ``without``."""
+
+    name: str
+    having: Options
+    without: Options
+
+
+BASE = Options()
+EVERYWHERE = (
+    Feature("contact with the support", Options(transducer=False), Options(transducer=False, support=False)),
+    Feature("the transducer", BASE, Options(transducer=False)),
+    Feature("friction on shapes", BASE, Options(shape_friction=0.0)),
+)
+OF_PARTICLES = (
+    Feature("contacts of particles", Options(particles=True), BASE),
+    Feature(
+        "friction of particles", Options(particles=True, particle_friction=0.25), Options(particles=True)
+    ),
+    Feature("scaled masses", Options(mass_scaling_per_mm=0.02), BASE),
+)
+FEATURES = {"neo-hookean": EVERYWHERE, "shape-matching": (*EVERYWHERE, *OF_PARTICLES)}
+
+
+class Body:
+    """A scene's organ and support, of which solvers are made with some features or others. Positions are relative to the
+    middle of the organ [mm].
+    """
+
+    def __init__(self, scene: Scene, anatomy: LoadedAnatomy, tissue: AnyTissue) -> None:
+        self.tissue = tissue
+        self.settings = step_settings(tissue, scene.solver)
+        middle = anatomy.organ.bounds.mean(axis=0)
+        self.organ = _shifted(anatomy.organ, -middle)
+        self.supports = [
+            _shifted(shape, -middle) for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)
+        ]
+        down = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
+        x, y, z = (1e3 * scene.gravity.acceleration_m_s2 * down).tolist()
+        self.settings.gravity = (x, y, z)
+        self.size_mm = np.array(scene.transducer.size_mm)
+        side = np.eye(3)[np.abs(down).argmin()]
+        pose = pose_at(np.zeros(3), down, side, self.size_mm[2])
+        self.home = touching(pose, self.size_mm, self.organ.vertices)
+
+    def solver(self, options: Options, serial: bool | None = None) -> Solver:
+        """A solver with these features."""
+        tool = ConvexTool.cuboid(self.size_mm) if options.transducer else None
+        shapes: list = [static_shape(mesh, self.tissue) for mesh in self.supports] if options.support else []
+        contact = Contact(
+            shape_friction=options.shape_friction,
+            particles=options.particles,
+            particle_friction=options.particle_friction,
+        )
+        section = SolverSection(mass_scaling_per_mm=options.mass_scaling_per_mm)
+        return build_solver(
+            self.organ,
+            self.tissue,
+            [*shapes, tool] if tool else shapes,
+            tool,
+            contact,
+            section,
+            serial=serial,
+        )
+
+    def poses(self, solver: Solver, step: int) -> np.ndarray | None:
+        """The transducer's poses in a step of the press; None without one."""
+        if not solver.has_tool:
+            return None
+        depth = PRESS_MM * np.clip((step + np.array([0, 1]) - SETTLE_STEPS) / PRESS_STEPS, 0, 1)
+        return between(advanced(self.home, depth[0]), advanced(self.home, depth[1]), self.settings.substeps)
+
+
+def body_of(scene: Scene, anatomy: LoadedAnatomy, model: str, size_mm: float) -> Body:
+    """The scene's organ in a tissue model, of cells or particles of a size."""
+    size = {"tissue.cell_mm" if model == "neo-hookean" else "tissue.radius_mm": size_mm}
+    tissue = with_options(scene, {"tissue.model": model, **size}).tissue
+    return Body(scene, anatomy, tissue)
+
+
+def of_step(body: Body, feature: Feature, arch: str) -> dict[str, Any]:
+    """What a feature adds to a step: medians of both ways, stepped in turn, their memory, and their kernels on a GPU."""
+    start(arch)
+    solvers = {"on": body.solver(feature.having), "off": body.solver(feature.without)}
+    ms: dict[str, list[float]] = {name: [] for name in solvers}
+    for step in range(SETTLE_STEPS + PRESS_STEPS):
+        for name, solver in solvers.items():
+            timed(lambda: solver.step(body.settings, body.poses(solver, step)), ms[name])
+    figures: dict[str, Any] = {}
+    for name, solver in solvers.items():
+        figures[f"ms_{name}"] = round(float(np.median(ms[name][SETTLE_STEPS:])), 4)
+        figures[f"mb_{name}"] = round(memory_mb(solver), 4)
+    for name, options in (("on", feature.having), ("off", feature.without)):
+        figures |= {f"{what}_{name}": value for what, value in kernels_of(body, options, arch).items()}
+    return dict(feature=feature.name, **figures)
+
+
+def kernels_of(body: Body, options: Options, arch: str) -> dict[str, int]:
+    """Kernels that a step has where it runs in parallel, as on a GPU, and how often they are launched."""
+    start(arch, kernel_profiler=True)
+    solver = body.solver(options, serial=False)
+    for _ in range(2):
+        ti.sync()
+        ti.profiler.clear_kernel_profiler_info()
+        solver.step(body.settings, body.poses(solver, 0))
+    ti.sync()
+    profiler = get_default_kernel_profiler()
+    profiler._update_records()
+    names = [record.name for record in profiler._traced_records]
+    return dict(kernels=len(set(names)), launches=len(names))
+
+
+def of_frame(scene: Scene, anatomy: LoadedAnatomy, arch: str) -> Iterator[dict[str, Any]]:
+    """What else a frame does, each by itself: the guard, the drawn surfaces and the picture."""
+    start(arch)
+    rehearsal = Rehearsal(scene, anatomy)
+    dt = rehearsal.settings.time_step_s
+    yield _alone("guard", lambda: rehearsal.guard.check(dt), [rehearsal.guard], rehearsal.solver)
+    yield _alone("organ's surface", rehearsal.organ_skin.update, [rehearsal.organ_skin], rehearsal.model)
+    if rehearsal.tumour_skin is not None:
+        yield _alone(
+            "tumour's surface", rehearsal.tumour_skin.update, [rehearsal.tumour_skin], rehearsal.model
+        )
+    if anatomy.ct is None:
+        return
+    image = scene.image
+    ct = Volume(anatomy.ct.voxels, anatomy.ct.index_from_mm @ _shift(rehearsal.origin))
+    plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], image.width_mm, image.depth_mm)
+    for name, margin, outside in (
+        ("picture, organ alone", 0.0, "gel"),
+        ("picture, with surroundings", SURROUNDINGS_MM, "background"),
+    ):
+        embedding = Embedding(rehearsal.model, rehearsal.organ, embedding_cell_mm(scene.tissue), margin)
+        view = Slice(ct, distance_volume(rehearsal.organ), embedding, image.pixels, outside)
+
+        def draw() -> None:
+            embedding.update()
+            view.render(plane, image.window_hu, image.level_hu)
+
+        yield _alone(name, draw, [embedding, view], rehearsal.model)
+
+
+def _alone(name: str, work: Callable[[], Any], owners: list, apart: Any) -> dict[str, Any]:
+    """A piece of a frame that is not there where it is off."""
+    work()
+    ms: list[float] = []
+    for _ in range(CALLS):
+        began = perf_counter()
+        work()
+        ti.sync()
+        ms.append(1e3 * (perf_counter() - began))
+    mb = round(sum(memory_mb(owner, apart) for owner in owners), 4)
+    nothing = dict(ms_off=0.0, mb_off=0.0, kernels_on=None, kernels_off=0, launches_on=None, launches_off=0)
+    return dict(feature=name, ms_on=round(float(np.median(ms)), 4), mb_on=mb, **nothing)
+
+
+def _shifted(mesh: trimesh.Trimesh, by: np.ndarray) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices + by, mesh.faces, process=False)
+
+
+def _shift(origin: np.ndarray) -> np.ndarray:
+    moved = np.eye(4)
+    moved[:3, 3] = origin
+    return moved
