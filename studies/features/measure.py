@@ -1,7 +1,7 @@
 """What each feature of a scene costs: the same press with it and without, in turn."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
@@ -15,7 +15,7 @@ from scenes.scene import Contact, Scene, SolverSection, with_options
 from sim.device import start
 from sim.embedding import Embedding
 from sim.shapes import ConvexTool
-from sim.solver import Solver, StepSettings
+from sim.solver import Solver
 from studies.models import AnyTissue, build_solver, embedding_cell_mm, static_shape, step_settings
 from studies.rehearsal import SURROUNDINGS_MM, Rehearsal
 from studies.report import timed
