@@ -23,8 +23,12 @@ POINTS_A_CELL = 0.5
 
 def static_shape(mesh: trimesh.Trimesh, tissue: AnyTissue) -> SignedDistanceField:
     """What a closed surface [mm] that does not move is to a tissue: distances as far around as it asks for them."""
-    reach_mm = REACH_MM if isinstance(tissue, NeoHookeanTissue) else REACH_RADII * tissue.radius_mm
-    return SignedDistanceField.of_surface(mesh.vertices, mesh.faces, reach_mm)
+    return SignedDistanceField.of_surface(mesh.vertices, mesh.faces, reach_of(tissue))
+
+
+def reach_of(tissue: AnyTissue) -> float:
+    """How far around a shape a tissue asks for its distance [mm]."""
+    return REACH_MM if isinstance(tissue, NeoHookeanTissue) else REACH_RADII * tissue.radius_mm
 
 
 def embedding_cell_mm(tissue: AnyTissue) -> float:

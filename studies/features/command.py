@@ -31,7 +31,9 @@ COLUMNS = (
 @click.argument("scene", type=click.Path(path_type=Path), default=EMBEDDED, required=False)
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for table and picture.")
 @click.option(
-    "--quick", is_flag=True, help="Shape matching alone, at its fastest preset, in less than a minute."
+    "--quick",
+    is_flag=True,
+    help="Shape matching alone, coarse, not in turn, no kernels counted: in less than a minute.",
 )
 @arch_option
 def features(scene: Path, out: Path, quick: bool, arch: str) -> None:
@@ -53,9 +55,8 @@ def features(scene: Path, out: Path, quick: bool, arch: str) -> None:
             preset = PRESETS[model]["fast" if quick else "balanced"]
             size = preset.cell_mm if model == "neo-hookean" else preset.radius_mm
             body = measure.body_of(loaded, anatomy, model, size)
-            for feature in measure.FEATURES[model]:
-                rows.append(dict(model=model) | measure.of_step(body, feature, used))
-                bar.update()
+            found = measure.of_steps(body, measure.FEATURES[model], used, quick, bar.update)
+            rows += [dict(model=model) | row for row in found]
         rows += [dict(model="frame") | row for row in measure.of_frame(loaded, anatomy, used)]
         bar.update()
     rows = [{name: row[name] for name in COLUMNS} for row in rows]

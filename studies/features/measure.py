@@ -11,12 +11,13 @@ import trimesh
 from taichi.profiler.kernel_profiler import get_default_kernel_profiler
 
 from scenes.anatomy import LoadedAnatomy
-from scenes.scene import Contact, Scene, SolverSection, with_options
+from scenes.scene import Contact, Scene, ShapeMatchingTissue, SolverSection, with_options
 from sim.device import start
+from sim.distance import distance_grid
 from sim.embedding import Embedding
-from sim.shapes import ConvexTool
+from sim.shapes import GRID_MM, ConvexTool, SignedDistanceField
 from sim.solver import Solver
-from studies.models import AnyTissue, build_solver, embedding_cell_mm, static_shape, step_settings
+from studies.models import AnyTissue, build_solver, embedding_cell_mm, fill, reach_of, step_settings
 from studies.rehearsal import SURROUNDINGS_MM, Rehearsal
 from studies.report import timed
 from studies.timing.measure import memory_mb
@@ -27,6 +28,7 @@ from ultrasound.volume import Volume, distance_volume
 # A press so deep, in so many steps; those before it settle.
 PRESS_MM, PRESS_STEPS, SETTLE_STEPS = 8.0, 60, 30
 CALLS = 40
+NOT_COUNTED: dict[str, Any] = dict(kernels=None, launches=None)
 
 
 @dataclass(frozen=True)
@@ -76,9 +78,13 @@ class Body:
         self.settings = step_settings(tissue, scene.solver)
         middle = anatomy.organ.bounds.mean(axis=0)
         self.organ = _shifted(anatomy.organ, -middle)
+        reach_mm = reach_of(tissue)
         self.supports = [
-            _shifted(shape, -middle) for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)
+            distance_grid(shape.vertices - middle, shape.faces, GRID_MM, reach_mm)
+            for shape in anatomy.shapes
+            if isinstance(shape, trimesh.Trimesh)
         ]
+        self.rest = fill(self.organ, tissue) if isinstance(tissue, ShapeMatchingTissue) else None
         down = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
         x, y, z = (1e3 * scene.gravity.acceleration_m_s2 * down).tolist()
         self.settings.gravity = (x, y, z)
@@ -90,7 +96,9 @@ class Body:
     def solver(self, options: Options, serial: bool | None = None) -> Solver:
         """A solver with these features."""
         tool = ConvexTool.cuboid(self.size_mm) if options.transducer else None
-        shapes: list = [static_shape(mesh, self.tissue) for mesh in self.supports] if options.support else []
+        shapes: list = []
+        if options.support:
+            shapes = [SignedDistanceField(*grid, np.full(3, GRID_MM)) for grid in self.supports]
         contact = Contact(
             shape_friction=options.shape_friction,
             particles=options.particles,
@@ -122,21 +130,44 @@ def body_of(scene: Scene, anatomy: LoadedAnatomy, model: str, size_mm: float) ->
     return Body(scene, anatomy, tissue)
 
 
-def of_step(body: Body, feature: Feature, arch: str) -> dict[str, Any]:
-    """What a feature adds to a step: medians of both ways, stepped in turn, their memory, and their kernels on a GPU."""
+def of_steps(
+    body: Body, features: tuple[Feature, ...], arch: str, quick: bool, done: Callable[[], Any]
+) -> list[dict[str, Any]]:
+    """What each feature adds to a step: medians with it and without, memory, and kernels where they run in parallel.
+
+    Both ways are stepped in turn, unless ``quick``: then each way is stepped once, and no kernels are counted.
+    """
+    counted: dict[Options, dict[str, Any]] = {}
+    alone: dict[Options, dict[str, float]] = {}
+    rows = []
+    for feature in features:
+        ways = {"on": feature.having, "off": feature.without}
+        for options in ways.values():
+            if quick and options not in alone:
+                alone[options] = _stepped(body, [options], arch)[0]
+            if options not in counted:
+                counted[options] = NOT_COUNTED if quick else kernels_of(body, options, arch)
+        stepped = [alone[o] for o in ways.values()] if quick else _stepped(body, list(ways.values()), arch)
+        row: dict[str, Any] = dict(feature=feature.name)
+        for (way, options), figures in zip(ways.items(), stepped, strict=True):
+            row |= {f"{name}_{way}": value for name, value in (figures | counted[options]).items()}
+        rows.append(row)
+        done()
+    return rows
+
+
+def _stepped(body: Body, ways: list[Options], arch: str) -> list[dict[str, Any]]:
+    """Median time of a step [ms] through a press and memory [MB] of some solvers, stepped in turn."""
     start(arch)
-    solvers = {"on": body.solver(feature.having), "off": body.solver(feature.without)}
-    ms: dict[str, list[float]] = {name: [] for name in solvers}
+    solvers = [body.solver(options) for options in ways]
+    ms: list[list[float]] = [[] for _ in solvers]
     for step in range(SETTLE_STEPS + PRESS_STEPS):
-        for name, solver in solvers.items():
-            timed(lambda: solver.step(body.settings, body.poses(solver, step)), ms[name])
-    figures: dict[str, Any] = {}
-    for name, solver in solvers.items():
-        figures[f"ms_{name}"] = round(float(np.median(ms[name][SETTLE_STEPS:])), 4)
-        figures[f"mb_{name}"] = round(memory_mb(solver), 4)
-    for name, options in (("on", feature.having), ("off", feature.without)):
-        figures |= {f"{what}_{name}": value for what, value in kernels_of(body, options, arch).items()}
-    return dict(feature=feature.name, **figures)
+        for solver, into in zip(solvers, ms, strict=True):
+            timed(lambda: solver.step(body.settings, body.poses(solver, step)), into)
+    return [
+        dict(ms=round(float(np.median(into[SETTLE_STEPS:])), 4), mb=round(memory_mb(solver), 4))
+        for solver, into in zip(solvers, ms, strict=True)
+    ]
 
 
 def kernels_of(body: Body, options: Options, arch: str) -> dict[str, int]:
