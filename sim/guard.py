@@ -41,20 +41,37 @@ class Health:
     tangled: float
 
     @property
+    def is_lost(self) -> bool:
+        """Whether there is nothing to wait for."""
+        return not self.finite or self.farthest_mm > FARTHEST_MM
+
+    @property
     def fault(self) -> str:
         """What is wrong with the tissue, in words; empty where it is well."""
         if not self.finite:
             return "its positions were no numbers any more"
-        if self.farthest_mm > FARTHEST_MM:
+        if self.is_lost:
             return "it had left the scene"
         return "it was torn, flat or inside out" if self.tangled > MOST_SHARE else ""
+
+
+@dataclass(frozen=True)
+class Watch:
+    """What a guard remembers between steps: the last good state, how long ago it was, how long the tissue has been tangled,
+    and whether that state has been put back since.
+    """
+
+    good: SolverState
+    steps_since_good: int = 0
+    steps_tangled: int = 0
+    is_restored: bool = False
 
 
 @ti.data_oriented
 class Guard:
     """Looks at a solver's body after each step; ``fallbacks`` counts how often it had to put it back.
 
-    ``good`` is a state from which rehearsal can go on, ``home`` the one to go back to where that fails.
+    ``home`` is the state to go back to where the last good one leads to the same fault again.
     """
 
     def __init__(self, solver: Solver) -> None:
@@ -83,37 +100,34 @@ class Guard:
 
     def settle(self) -> None:
         """Take the body's state for the one to come home to."""
-        self.home = self.good = self.solver.snapshot()
-        self._steps_since_good = self._steps_tangled = 0
-        self._is_restored = False
+        self.home = self.solver.snapshot()
+        self.watch = Watch(self.home)
 
     def check(self, time_step_s: float) -> str:
         """Look at the body after a step; where it is no tissue any more put it back and say so, else an empty text."""
         health = self.health()
-        self._steps_since_good += 1
-        self._steps_tangled = self._steps_tangled + 1 if health.tangled > MOST_SHARE else 0
+        is_tangled = health.tangled > MOST_SHARE
+        watch = replace(
+            self.watch,
+            steps_since_good=self.watch.steps_since_good + 1,
+            steps_tangled=self.watch.steps_tangled + 1 if is_tangled else 0,
+        )
         patience = max(PATIENCE_STEPS, round(PATIENCE_S / time_step_s))
-        if health.fault and (self._steps_tangled == 0 or not health.finite or self._steps_tangled > patience):
+        if health.is_lost or watch.steps_tangled > patience:
             return self._put_back(health.fault, time_step_s)
-        if (
-            not health.fault
-            and health.tangled == 0.0
-            and self._steps_since_good >= max(KEEP_STEPS, round(KEEP_S / time_step_s))
-        ):
-            self.good = self.solver.snapshot()
-            self._steps_since_good = 0
-            self._is_restored = False
+        if health.tangled == 0.0 and watch.steps_since_good >= max(KEEP_STEPS, round(KEEP_S / time_step_s)):
+            watch = Watch(self.solver.snapshot())
+        self.watch = watch
         return ""
 
     def _put_back(self, fault: str, time_step_s: float) -> str:
         """The last good state, at rest, so that what led here does not go on; where it led here before, home."""
-        state, where = self.good, f"as it was {self._steps_since_good * time_step_s:.1f} s before"
-        if self._is_restored:
+        state, where = self.watch.good, f"as it was {self.watch.steps_since_good * time_step_s:.1f} s before"
+        if self.watch.is_restored:
             state, where = self.home, "as it was at the start"
         still = replace(state.body, velocity=np.zeros_like(state.body.velocity))
         self.solver.restore(SolverState(still, state.contacts))
-        self.good, self._is_restored = state, True
-        self._steps_since_good = self._steps_tangled = 0
+        self.watch = Watch(state, is_restored=True)
         self.fallbacks += 1
         return f"Tissue put back, {where}: {fault}"
 

@@ -3,6 +3,8 @@
 The window, the headless run and every measurement go through this class, so that they compute the same.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import taichi as ti
 import trimesh
@@ -10,10 +12,11 @@ import trimesh
 from scenes.anatomy import Grid, LoadedAnatomy, press_on
 from scenes.scene import NeoHookeanTissue, PlaneShape, Scene
 from sim.embedding import Embedding
-from sim.guard import Guard
+from sim.guard import Guard, Watch
 from sim.neo_hookean import NeoHookean
 from sim.shapes import ConvexTool, Plane, SignedDistanceField
 from sim.skinning import Skin
+from sim.solver import SolverState
 from studies.models import build_solver, embedding_cell_mm, static_shape, step_settings
 from studies.setup import setup_of_scene
 from studies.trade.front import expected_error_mm, load_points
@@ -29,6 +32,16 @@ TUMOUR_LIFT_MM = 0.8
 SUPPORT_SUNK_MM = 0.4
 # How far around the organ the tissue in the picture gives way to it.
 SURROUNDINGS_MM = 25.0
+
+
+@dataclass(frozen=True)
+class RehearsalState:
+    """All that frames change: the tissue, what its guard remembers, the transducer's pose (4, 4)."""
+
+    solver: SolverState
+    watch: Watch
+    pose: np.ndarray
+    steps: int
 
 
 class Rehearsal:
@@ -57,7 +70,7 @@ class Rehearsal:
         self.hand = self._hand()
         self.pose = self.hand.pose()
         self.guard.settle()
-        self.settled = self.guard.home
+        self.settled = self.snapshot()
 
     def _build_solver(self, anatomy: LoadedAnatomy) -> None:
         self.size_mm = np.array(self.scene.transducer.size_mm)
@@ -156,6 +169,16 @@ class Rehearsal:
         self.pose = pose
         self.steps += 1
 
+    def snapshot(self) -> RehearsalState:
+        """A copy of the current state."""
+        return RehearsalState(self.solver.snapshot(), self.guard.watch, self.pose, self.steps)
+
+    def restore(self, state: RehearsalState) -> None:
+        """Go back to a state; the steps that follow give the same bits as they did from it before."""
+        self.solver.restore(state.solver)
+        self.guard.watch = state.watch
+        self.pose, self.steps = state.pose, state.steps
+
     def update_surfaces(self) -> None:
         """Carry the surfaces that are drawn to where the body is."""
         self.organ_skin.update()
@@ -189,10 +212,8 @@ class Rehearsal:
 
     def reset(self) -> None:
         """Tissue and transducer as they were at the start: settled, and just touching."""
-        self.solver.restore(self.settled)
+        self.restore(self.settled)
         self.hand.reset()
-        self.pose = self.hand.pose()
-        self.steps = 0
         ti.sync()
 
 

@@ -1,0 +1,78 @@
+"""The command ``study soak``: an hour of rehearsal, accelerated."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+from tqdm import tqdm
+
+from scenes.anatomy import load_anatomy
+from scenes.scene import EMBEDDED, load_scene
+from studies.commands import arch_option, make_folder, start_taichi
+from studies.setup import PRESETS
+
+HOUR, QUICK_MINUTES = 60, 1
+
+
+@click.command()
+@click.argument("scene", type=click.Path(path_type=Path), default=EMBEDDED, required=False)
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for table and picture.")
+@click.option(
+    "--minutes", type=click.IntRange(1, 6000), default=HOUR, show_default=True, help="Simulated minutes."
+)
+@click.option("--quick", is_flag=True, help="One simulated minute of each model.")
+@arch_option
+def soak(scene: Path, out: Path, minutes: int, quick: bool, arch: str) -> None:
+    """An hour of rehearsal in SCENE, faster than real: does the rest shape drift, memory grow, a replay differ?"""
+    make_folder(out)
+    path = scene / "scene.toml" if scene.is_dir() else scene
+    loaded = load_scene(path)
+    anatomy = load_anatomy(loaded, path.parent)
+    used = start_taichi(arch)
+    from studies.soak import measure
+    from studies.soak.picture import draw
+
+    minutes = QUICK_MINUTES if quick else minutes
+    setups = [presets["fast"] for presets in PRESETS.values()]
+    runs = []
+    with tqdm(
+        total=len(setups) * (minutes + min(minutes, measure.REPLAYED_MINUTES)), desc="soak", unit="min"
+    ) as bar:
+        for setup in setups:
+            runs.append(measure.soak(loaded, anatomy, setup, minutes, used, bar.update))
+    (out / "soak.json").write_text(json.dumps(dict(arch=used, runs=runs), indent=2) + "\n", "utf-8")
+    write_csv(runs, out / "soak.csv")
+    draw(runs, out / "soak.png")
+    click.echo("\n".join(["", *table(runs)]))
+    click.echo(f"\nWrote soak.json, soak.csv and soak.png to {out}")
+
+
+def write_csv(runs: list[dict[str, Any]], path: Path) -> None:
+    """A line a model and minute."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        rows = csv.DictWriter(file, ["model", *runs[0]["minutes"][0]])
+        rows.writeheader()
+        for run in runs:
+            rows.writerows(dict(model=run["model"]) | row for row in run["minutes"])
+
+
+def table(runs: list[dict[str, Any]]) -> list[str]:
+    """The first and the last minute of each model, and what must be equal."""
+    lines = ["model            minute  moved, mm  shape, mm  volume  ms a step  memory, MB"]
+    for run in runs:
+        for row in dict.fromkeys((0, len(run["minutes"]) // 2, len(run["minutes"]) - 1)):
+            at = run["minutes"][row]
+            lines.append(
+                f"{run['model']:<17}{at['minute']:>6}{at['moved_mm']:>11.3f}{at['shape_mm']:>11.4f}{at['volume_ratio']:>8.4f}"
+                f"{at['ms_median']:>11.2f}{at['memory_mb']:>12.1f}"
+            )
+    for run in runs:
+        most = max(row["shape_mm"] for row in run["minutes"])
+        lines.append(
+            f"{run['model']}: shape at most {most:.4f} mm from the first rest; memory {run['memory_growth_mb']:+.1f} MB; replay "
+            f"{'bit for bit the same' if run['replay_equal'] else 'DIFFERS'}; reset "
+            f"{'bit for bit the same' if run['reset_equal'] else 'DIFFERS'}; put back {run['fallbacks']} times"
+        )
+    return lines

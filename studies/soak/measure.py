@@ -1,0 +1,119 @@
+"""Hours of rehearsal without a window, faster than real: does anything drift, grow or differ?"""
+
+import hashlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import psutil
+from scipy.spatial.transform import Rotation
+
+from scenes.anatomy import LoadedAnatomy
+from scenes.scene import Scene
+from sim.device import start
+from studies.rehearsal import Rehearsal, RehearsalState
+from studies.report import timed
+from studies.setup import Setup, scene_of
+from ultrasound.probe import advanced
+
+SEED = 20161130
+# Each minute: rehearsal, then the transducer away while the tissue comes to rest.
+MINUTE_S, REHEARSED_S = 60.0, 50.0
+# A new place to go to so often; as far to the sides, as oblique and as deep as that.
+CHANGE_S = 1.5
+ASIDE_MM, OBLIQUE_DEG, DEEPEST_MM = (20.0, 10.0), 20.0, 12.0
+AWAY_MM = 100.0
+# So much of the end is computed again from a snapshot.
+REPLAYED_MINUTES = 2
+
+
+def soak(
+    scene: Scene, anatomy: LoadedAnatomy, setup: Setup, minutes: int, arch: str, done: Callable[[], Any]
+) -> dict[str, Any]:
+    """Rehearse for some minutes of simulated time; figures of each, and whether its end can be replayed bit for bit."""
+    start(arch)
+    rehearsal = Rehearsal(scene_of(scene, setup), replace(anatomy, ct=None))
+    first = rehearsal.snapshot()
+    replayed = min(REPLAYED_MINUTES, minutes)
+    rows, kept = [], first
+    for minute in range(minutes):
+        if minute == minutes - replayed:
+            kept = rehearsal.snapshot()
+        rows.append(_minute(rehearsal, minute, first))
+        done()
+    ended = digest(rehearsal)
+    rehearsal.restore(kept)
+    for minute in range(minutes - replayed, minutes):
+        _minute(rehearsal, minute, first)
+        done()
+    again = digest(rehearsal)
+    rehearsal.restore(first)
+    return dict(
+        model=setup.model,
+        minutes=rows,
+        digest=ended,
+        replay_equal=ended == again,
+        reset_equal=_equal(first, rehearsal.snapshot()),
+        fallbacks=sum(row["fallbacks"] for row in rows),
+        memory_growth_mb=round(rows[-1]["memory_mb"] - rows[min(1, len(rows) - 1)]["memory_mb"], 3),
+    )
+
+
+def _minute(rehearsal: Rehearsal, minute: int, first: RehearsalState) -> dict[str, Any]:
+    """One minute of rehearsal, and how far from its first rest the tissue then lies."""
+    dt = rehearsal.settings.time_step_s
+    ms: list[float] = []
+    fallbacks, finite = 0, True
+    goals = _goals(rehearsal, minute)
+    for step in range(round(MINUTE_S / dt)):
+        if step * dt >= REHEARSED_S:
+            goal = advanced(rehearsal.hand.home, -AWAY_MM)
+        elif step % round(CHANGE_S / dt) == 0:
+            goal = next(goals)
+        timed(lambda: rehearsal.advance(rehearsal.pose_towards(goal)), ms)
+        fallbacks += bool(rehearsal.notice)
+    position = rehearsal.body.position.to_numpy().astype(float)
+    finite = bool(np.isfinite(position).all())
+    rest = first.solver.body.position.astype(float)
+    rehearsal.update_surfaces()
+    return dict(
+        minute=minute + 1,
+        moved_mm=round(float(np.linalg.norm(position - rest, axis=1).mean()), 6),
+        shape_mm=round(_shape_mm(position, rest), 6),
+        volume_ratio=round(rehearsal.volume_ratio(), 6),
+        tangled=rehearsal.guard.health().tangled,
+        finite=finite,
+        fallbacks=fallbacks,
+        ms_median=round(float(np.median(ms)), 4),
+        memory_mb=round(psutil.Process().memory_info().rss / 1e6, 3),
+    )
+
+
+def _goals(rehearsal: Rehearsal, minute: int) -> Iterator[np.ndarray]:
+    """Poses over the organ and in it, the same for every minute of one number."""
+    random = np.random.default_rng([SEED, minute])
+    home = rehearsal.hand.home
+    while True:
+        goal = advanced(home, random.uniform(-5.0, DEEPEST_MM))
+        goal[:3, 3] += home[:3, :2] @ (random.uniform(-1, 1, 2) * ASIDE_MM)
+        oblique = Rotation.from_rotvec(np.radians(OBLIQUE_DEG) * random.uniform(-1, 1, 3))
+        goal[:3, :3] = home[:3, :3] @ oblique.as_matrix()
+        yield goal
+
+
+def _shape_mm(position: np.ndarray, rest: np.ndarray) -> float:
+    """Mean distance (n, 3) [mm] of points from where they were, after they were turned and moved to fit."""
+    a, b = position - position.mean(axis=0), rest - rest.mean(axis=0)
+    return float(np.linalg.norm(Rotation.align_vectors(b, a)[0].apply(a) - b, axis=1).mean())
+
+
+def digest(rehearsal: Rehearsal) -> str:
+    """A short name of the body's state: other bits, another name."""
+    state = rehearsal.solver.snapshot().body
+    return hashlib.sha256(state.position.tobytes() + state.velocity.tobytes()).hexdigest()[:16]
+
+
+def _equal(first: RehearsalState, second: RehearsalState) -> bool:
+    a, b = first.solver.body, second.solver.body
+    return bool((a.position == b.position).all() and (a.velocity == b.velocity).all())
