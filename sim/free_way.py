@@ -1,7 +1,8 @@
 """How far a point can go before it meets a shape, so that nothing fast passes through what it should lie on."""
 
 import taichi as ti
-import taichi.math as tm
+
+from sim.shapes import FAR
 
 # A way ends this deep in a shape [mm], so that a body can slide along one; thinner shapes stop nothing fast.
 DEEP_MM = 1.0
@@ -34,7 +35,7 @@ class FreeWay:
     @ti.func
     def room(self, p):
         """A ball of this radius [mm] around p meets no shape."""
-        room = tm.inf
+        room = FAR
         for s in ti.static(range(len(self.shapes))):
             room = ti.min(room, self.shapes[s].room(p))
         return room

@@ -26,8 +26,8 @@ MOST_SHARE = 0.005
 PATIENCE_S, PATIENCE_STEPS = 2.0, 120
 # How often a good state is kept.
 KEEP_S, KEEP_STEPS = 1.0, 60
-# A point so far from where the body was at first has left the scene.
-FARTHEST_MM = 500.0
+# A point so far from where the body was at first has left the scene, and one so far is nowhere.
+FARTHEST_MM, NO_PLACE_MM = 500.0, 1e12
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ class Guard:
         # Counts and maxima do not depend on the order, so these atomics keep runs alike.
         for i in range(self.body.count):
             away = (self.body.position[i] - self.middle).norm()
-            if away < tm.inf:
+            if away < NO_PLACE_MM:
                 ti.atomic_max(self.reach[None], away)
             else:
                 self.broken[None][0] += 1

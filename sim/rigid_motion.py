@@ -146,14 +146,21 @@ class RigidMotion:
             along += self.along[block]
             mixed += self.mixed[block]
             about += self.about[block]
-        compliance = along.inverse()
+        compliance = inverse_of(along)
         schur = about - mixed.transpose() @ compliance @ mixed
         # A body drawn out to a line, or less, has no hold about it.
         schur += (LEAST_HOLD * about.trace() + 1e-12) * tm.eye(3)
-        turn = schur.inverse() @ (torque - mixed.transpose() @ compliance @ force)
+        turn = inverse_of(schur) @ (torque - mixed.transpose() @ compliance @ force)
         turn *= ti.min(1.0, MOST_TURN / ti.max(turn.norm(), 1e-12))
         self.translation[None] += compliance @ (force - mixed @ turn)
         self.rotation[None] = rotation_by(turn) @ self.rotation[None]
+
+
+@ti.func
+def inverse_of(matrix):
+    """Inverse of a positive definite 3 x 3 matrix, in units of its trace: a determinant may have no room in float32."""
+    unit = 1.0 / matrix.trace()
+    return unit * (unit * matrix).inverse()
 
 
 @ti.func
