@@ -1,0 +1,113 @@
+"""A scene pays only for what it declares: what is off is neither compiled nor allocated; and a soak ends as it began."""
+
+import json
+
+import pytest
+import taichi as ti
+import trimesh
+from bead_case import RADIUS, bowl
+from PIL import Image
+
+import app
+from scenes.anatomy import LoadedAnatomy
+from scenes.scene import EMBEDDED, Press, load_scene
+from sim.body import ParticleBody
+from sim.contact import ShapeContacts
+from sim.neighbours import ParticleContacts
+from sim.shape_matching import ShapeMatching
+from sim.shapes import ConvexTool, SignedDistanceField
+from sim.surface_contact import SurfaceContacts
+from studies.features import command, measure
+from studies.setup import NEO_HOOKEAN, Setup
+from studies.soak import measure as soak
+from studies.timing.measure import memory_mb
+
+SIZES = {"neo-hookean": 6.0, "shape-matching": 4.0}
+# What only the feature has kernels use.
+OWN = {
+    "contact with the support": [(SignedDistanceField, "surface"), (SignedDistanceField, "room")],
+    "the transducer": [(ConvexTool, "surface"), (ConvexTool, "motion")],
+    "friction on shapes": [(SurfaceContacts, "bent"), (ShapeContacts, "rub")],
+    "contacts of particles": [(ParticleContacts, "find"), (ParticleContacts, "project")],
+    "scaled masses": [(ShapeMatching, "weigh_patches"), (ShapeMatching, "weigh_clusters")],
+}
+
+
+def small_anatomy() -> LoadedAnatomy:
+    """A ball in a bowl, on the back as patients are."""
+    mould = bowl()
+    mould.vertices = mould.vertices[:, [0, 2, 1]] * [1, -1, 1]
+    mould.fix_normals()
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
+    return LoadedAnatomy(ball, None, None, (mould,))
+
+
+def body_of(model: str) -> measure.Body:
+    return measure.body_of(load_scene(EMBEDDED), small_anatomy(), model, SIZES[model])
+
+
+@pytest.mark.parametrize("model", list(measure.FEATURES))
+def test_what_is_off_is_not_compiled_and_not_allocated(device, monkeypatch, model):
+    body = body_of(model)
+
+    def compiled(*_):
+        raise AssertionError("compiled")
+
+    for feature in measure.FEATURES[model]:
+        if feature.name in OWN:
+            on, off = body.solver(feature.having), body.solver(feature.without)
+            assert memory_mb(off) < memory_mb(on), feature.name
+            with monkeypatch.context() as forbidden:
+                for owner, name in OWN[feature.name]:
+                    forbidden.setattr(owner, name, compiled)
+                off.step(body.settings, body.poses(off, 0))
+                with pytest.raises(ti.TaichiCompilationError, match="compiled"):
+                    on.step(body.settings, body.poses(on, 0))
+
+
+def test_scaled_masses_that_are_off_take_no_field(device):
+    body = body_of("shape-matching")
+    assert not hasattr(body.solver(measure.BASE).body, "mass_scale")
+    on = body.solver(measure.Options(mass_scaling_per_mm=0.02)).body
+    assert isinstance(on, ParticleBody) and hasattr(on, "mass_scale")
+
+
+def test_kernels_are_counted_where_a_step_is_parallel():
+    body = body_of("shape-matching")
+    base = measure.kernels_of(body, measure.BASE, "cpu")
+    # Every iteration launches its own kernels.
+    assert base["launches"] > body.settings.substeps * body.settings.iterations
+    assert base["launches"] > base["kernels"] > 10
+    ti.reset()
+
+
+def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(command, "load_anatomy", lambda scene, folder: small_anatomy())
+    monkeypatch.setattr(measure, "PRESS_STEPS", 3)
+    monkeypatch.setitem(measure.FEATURES, "shape-matching", measure.EVERYWHERE[2:])
+    assert app.main(["study", "features", "--quick", "--out", str(tmp_path)]) == 0
+    rows = json.loads((tmp_path / "features.json").read_text())["features"]
+    assert [row["feature"] for row in rows] == [
+        "friction on shapes",
+        "guard",
+        "organ's surface",
+    ]
+    for row in rows:
+        assert row["mb_on"] > row["mb_off"] and row["ms_on"] > 0
+    assert (tmp_path / "features.csv").is_file()
+    assert Image.open(tmp_path / "features.png").size[0] > 1000
+    assert "what is off" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("setup", [NEO_HOOKEAN, Setup(radius_mm=4.0)], ids=lambda setup: setup.model)
+def test_a_soak_ends_where_it_began_and_replays(setup, monkeypatch):
+    monkeypatch.setattr(soak, "REST_S", 4.0)
+    scene = load_scene(EMBEDDED).model_copy(update={"press": Press(warm_up_steps=60)})
+    told = []
+    found = soak.soak(scene, small_anatomy(), setup, 3, 7.0, "cpu", lambda: told.append(1))
+    assert len(found["minutes"]) == 3 and len(told) == 5
+    assert found["replay_equal"] and found["reset_equal"] and found["fallbacks"] == 0
+    for row in found["minutes"]:
+        assert row["finite"] and row["shape_mm"] < 1.0 and abs(row["volume_ratio"] - 1) < 0.1
+    assert found["minutes"][0]["moved_mm"] != found["minutes"][1]["moved_mm"]
+    ti.reset()
