@@ -12,10 +12,9 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from scenes.anatomy import LoadedAnatomy, load_anatomy, patient_scene
-from scenes.labels import Side
-from scenes.patient import describe, import_patient, save_patient
-from scenes.reading import PatientError, read_volume
+from scenes.anatomy import LoadedAnatomy, load_anatomy
+from scenes.command import import_patient_command
+from scenes.reading import PatientError
 from scenes.scene import (
     EMBEDDED,
     OPTIONS,
@@ -24,7 +23,6 @@ from scenes.scene import (
     Scene,
     SceneError,
     load_scene,
-    scene_text,
     with_options,
 )
 from sim.sampling import SamplingError
@@ -40,9 +38,6 @@ if TYPE_CHECKING:
     from studies.rehearsal import Rehearsal
     from studies.report import Record
     from studies.trade.ladder import Ladder
-
-PICTURES_A_SECOND = 10
-ANIMATION_WIDTH = 720
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -164,51 +159,12 @@ def build_within(
     return rehearsal
 
 
-@cli.command("import")
-@click.argument("ct", type=click.Path(path_type=Path))
-@click.argument("labels", type=click.Path(path_type=Path))
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    required=True,
-    help="Folder to write the patient to; new or empty.",
-)
-@click.option("--organ", help="Label values of the organ, such as 1 or 1,2 [all but the tumour's].")
-@click.option("--tumour", help="Label values of the tumour [none].")
-@click.option(
-    "--side", type=click.Choice(["left", "right"]), help="Which kidney, where the labels hold both."
-)
-def import_command(
-    ct: Path, labels: Path, out: Path, organ: str | None, tumour: str | None, side: Side | None
-) -> None:
-    """Make a patient's folder, with a scene, out of a CT (DICOM folder, NIfTI, NRRD, MHA) and its LABELS."""
-    patient = import_patient(
-        read_volume(ct),
-        read_volume(labels),
-        label_values(organ, "--organ"),
-        label_values(tumour, "--tumour"),
-        side,
-    )
-    save_patient(patient, out, {"scene.toml": scene_text(patient_scene(patient))})
-    click.echo(describe(patient))
-    click.echo(f"Written to {out}. Rehearse with: python app.py rehearse {out}")
-
-
+cli.add_command(import_patient_command)
 cli.add_command(validate)
 cli.add_command(calibrate)
 cli.add_command(beam)
 cli.add_command(reference)
 cli.add_command(study)
-
-
-def label_values(text: str | None, option: str) -> list[int] | None:
-    """Label values of an option's text, such as "1,2"."""
-    if text is None:
-        return None
-    try:
-        return [int(value) for value in text.split(",")]
-    except ValueError:
-        raise Fault(f"{option} is {text!r}: expected whole numbers such as 1 or 1,2") from None
 
 
 def settings_of(rehearsal: "Rehearsal") -> "Settings":
@@ -294,6 +250,7 @@ def run_frame(
 
 def run_headless(rehearsal: "Rehearsal", arch: str, seconds: float | None, out: Path, build_s: float) -> None:
     """The scripted press without a screen: frames, slices, an animated picture and report.json."""
+    from render.pictures import PICTURES_A_SECOND, empty_folder, in_proportion, save_animation, smaller
     from render.window import NoVulkan
     from studies.report import Record, summary
 
@@ -397,35 +354,6 @@ def save_screenshot(picture: np.ndarray, out: Path) -> None:
     path = out / f"screenshot-{number:03d}.png"
     Image.fromarray(picture).save(path)
     click.echo(f"Saved {path}")
-
-
-def in_proportion(view: "View") -> Image.Image:
-    """The slice with square pixels, as wide as it was sampled."""
-    picture = Image.fromarray(view.slice_image)
-    height = round(picture.width * view.depth_mm / view.width_mm)
-    return picture.resize((picture.width, height), Image.Resampling.BILINEAR)
-
-
-def empty_folder(folder: Path) -> Path:
-    """A folder without the pictures of an earlier run."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for picture in folder.glob("[0-9]*.png"):
-        picture.unlink()
-    return folder
-
-
-def smaller(picture: Image.Image) -> Image.Image:
-    """A picture no wider than the animation."""
-    width = min(ANIMATION_WIDTH, picture.width)
-    return picture.resize((width, round(picture.height * width / picture.width)), Image.Resampling.LANCZOS)
-
-
-def save_animation(pictures: list[Image.Image], path: Path) -> None:
-    """Write an animated GIF that repeats; one palette and dithering keep grey grey and rare colours alive."""
-    coloured = [picture.convert("RGB") for picture in pictures]
-    palette = coloured[-1].quantize(method=Image.Quantize.FASTOCTREE)
-    first, *others = [picture.quantize(palette=palette) for picture in coloured]
-    first.save(path, save_all=True, append_images=others, duration=1000 // PICTURES_A_SECOND, loop=0)
 
 
 def main(arguments: list[str]) -> int:
