@@ -79,7 +79,7 @@ class NeoHookeanTissue(Section):
     """Tissue true to a material, on cubic cells. Smaller cells are truer and slower; the material stays the same."""
 
     model: Literal["neo-hookean"] = "neo-hookean"
-    cell_mm: float = Field(4.0, ge=0.5, le=20)
+    cell_mm: float = Field(3.5, ge=0.5, le=20)
     young_kpa: float = Field(15.0, gt=0, le=1e6)
     poisson: float = Field(0.45, ge=0, le=0.4999)
     density_g_cm3: float = Field(1.05, gt=0, le=20)

@@ -32,7 +32,7 @@ SQRT_HALF_BITS = 0x3F3504F3
 PARALLEL_NODES = 16_000
 # No node moves farther in a pass than this share of a cell.
 MOST_CELLS_A_PASS = 0.5
-LATTICE_SETTINGS = StepSettings(substeps=1, iterations=8, relaxation_factor=1.7, stabilisation_iterations=0)
+LATTICE_SETTINGS = StepSettings(substeps=1, iterations=4, relaxation_factor=1.7, stabilisation_iterations=0)
 
 
 @ti.data_oriented

@@ -18,14 +18,11 @@ NEAR = 1.6
 
 @dataclass(frozen=True)
 class Point:
-    """Settings and what they came to: median of a step [ms] on the machine that measured, mean error of the beads [mm],
-    and that at the moments when the transducer arrives.
-    """
+    """Settings and what they came to: median of a step [ms] on the machine that measured, mean error of the beads [mm]."""
 
     setup: Setup
     ms_median: float
     error_mean_mm: float
-    error_arriving_mm: float
     pareto: bool
 
 
@@ -37,7 +34,6 @@ def load_points(path: Path = MEASURED) -> list[Point]:
             setup_of(row),
             row["ms_median"],
             row["error_mean_mm"],
-            row["error_arriving_mm"],
             bool(row["pareto"]),
         )
         for row in rows

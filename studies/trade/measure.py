@@ -33,6 +33,8 @@ def points(
 ) -> list[dict[str, Any]]:
     """Rows of trade.json: error over all cases, cost on the first. ``done`` is told of each setting's runs.
 
+    Each stage counts twice: when the transducer arrives, as the surgeon sees it on the way, and when it has rested.
+
     Without ``rounds`` the cost is that of the steps whose error was measured, at another time for each setting.
     """
     resting: dict[Setup, dict[str, float]] = {setup: {} for setup in tried}
@@ -53,7 +55,7 @@ def points(
                 ms[setup].append(_time(experiment, setup))
                 done()
     cost = np.array([np.median(ms[setup]) for setup in tried])
-    error = np.array([np.mean(list(resting[setup].values())) for setup in tried])
+    error = np.array([np.mean([*resting[setup].values(), *arriving[setup].values()]) for setup in tried])
     best = pareto(cost, error)
     return [_row(setup, cost[k], best[k], resting[setup], arriving[setup]) for k, setup in enumerate(tried)]
 
@@ -99,7 +101,8 @@ def _row(
         **settings,
         time_step_s=setup.time_step_s,
         ms_median=round(float(ms), 4),
-        error_mean_mm=_finite(float(np.mean(list(resting.values())))),
+        error_mean_mm=_finite(float(np.mean([*resting.values(), *arriving.values()]))),
+        error_resting_mm=_finite(float(np.mean(list(resting.values())))),
         error_arriving_mm=_finite(float(np.mean(list(arriving.values())))),
         errors_mm={name: _finite(value) for name, value in resting.items()},
         pareto=bool(best),
