@@ -11,7 +11,8 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
-from studies.trade.command import name_of
+from studies.trade.front import preset_of, setup_of
+from studies.trade.sweep import PAPER
 
 DPI = 130
 COLOURS = {"neo-hookean": "tab:blue", "shape-matching": "tab:orange"}
@@ -37,7 +38,7 @@ def draw(points: list[dict[str, Any]], path: Path) -> None:
     )
     axes.set_title("What speed costs in accuracy")
     axes.grid(alpha=0.3, which="both")
-    axes.legend(loc="lower left")
+    axes.legend(loc="center right")
     figure.savefig(path, dpi=DPI)
     plt.close(figure)
 
@@ -52,15 +53,22 @@ def _model(axes: Axes, points: list[dict[str, Any]], model: str, colour: str) ->
         s=7 * size,
         color=colour,
         alpha=0.55,
-        label=f"{model} (field: size of cells or particles)",
+        label=f"{model} (area: size of cells or particles)",
     )
-    for point in points:
-        name = name_of(point)
+    papers = [point for point in points if setup_of(point) in PAPER]
+    for k, point in enumerate(papers):
         at = (point["ms_median"], point["error_mean_mm"])
-        if name == "the paper's":
-            axes.scatter(*at, marker="x", color="tab:red", zorder=3)
-            text = f"paper {point['radius_mm']:g} mm"
-            axes.annotate(text, at, xytext=(5, 4), textcoords="offset points", fontsize=8, color="tab:red")
-        elif name:
+        label = "the paper's radii (mm), with its best stiffness" if k == 0 else None
+        axes.scatter(*at, marker="x", color="tab:red", zorder=3, label=label)
+        text = f"{point['radius_mm']:g}"
+        axes.annotate(
+            text, at, xytext=(0, 6), textcoords="offset points", fontsize=9, color="tab:red", ha="center"
+        )
+    for point in points:
+        name = preset_of(setup_of(point))
+        if name:
+            at = (point["ms_median"], point["error_mean_mm"])
             axes.scatter(*at, marker="D", facecolors="none", edgecolors="black", zorder=3)
-            axes.annotate(name, at, xytext=(6, 5), textcoords="offset points", fontsize=10, weight="bold")
+            axes.annotate(
+                name, at, xytext=(0, -15), textcoords="offset points", fontsize=10, weight="bold", ha="center"
+            )
