@@ -182,7 +182,7 @@ def test_validate_twice_prints_and_writes_the_same_but_for_times(monkeypatch, tm
     for name in ("a.json", "new/b.json"):
         arguments = ["validate", folder, "--cell", 5, "--arch", "cpu", "--json", tmp_path / name]
         done = CliRunner().invoke(cli, [str(argument) for argument in arguments])
-        assert done.exit_code == 0 and "1/60 s in 1 substep of 8 iterations" in done.output
+        assert done.exit_code == 0 and "1/60 s in 1 substep of 4 iterations" in done.output
         reports.append(json.loads((tmp_path / name).read_text()))
     times = [figures.pop("ms_per_step") for figures in reports]
     assert times[0].keys() == {"mean", "sd", "min", "max", "median"}
