@@ -15,7 +15,7 @@ from matplotlib.colors import LogNorm
 DPI = 130
 LEAST_MM, MOST_MM = 0.01, 100.0
 MARKS = {
-    "put back": ("o", "none", "black"),
+    "put back": ("o", "none", "orange"),
     "whole, elsewhere": (".", "white", "white"),
     "not finite": ("X", "red", "red"),
 }
