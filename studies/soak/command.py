@@ -23,8 +23,9 @@ HOUR = 60
     "--minutes", type=click.IntRange(1, 6000), default=HOUR, show_default=True, help="Simulated minutes."
 )
 @click.option("--quick", is_flag=True, help="A quarter of a simulated minute of each model.")
+@click.option("--model", type=click.Choice(list(PRESETS)), help="One tissue model [both].")
 @arch_option
-def soak(scene: Path, out: Path, minutes: int, quick: bool, arch: str) -> None:
+def soak(scene: Path, out: Path, minutes: int, quick: bool, model: str | None, arch: str) -> None:
     """An hour of rehearsal in SCENE, faster than real: does the rest shape drift, memory grow, a replay differ?"""
     make_folder(out)
     path = scene / "scene.toml" if scene.is_dir() else scene
@@ -35,7 +36,7 @@ def soak(scene: Path, out: Path, minutes: int, quick: bool, arch: str) -> None:
     from studies.soak.picture import draw
 
     minutes, minute_s = (1, measure.QUICK_MINUTE_S) if quick else (minutes, measure.MINUTE_S)
-    setups = [presets["fast"] for presets in PRESETS.values()]
+    setups = [presets["fast"] for name, presets in PRESETS.items() if model in (None, name)]
     runs = []
     with tqdm(
         total=len(setups) * (minutes + min(minutes, measure.REPLAYED_MINUTES)), desc="soak", unit="min"
