@@ -16,7 +16,11 @@ from sim.surface_contact import NEAR_MM, SurfaceContacts
 
 # Sums are made of blocks of so many terms, in an order that no thread changes.
 BLOCK = 64
-NEWTON_STEPS = 3
+# Newton's steps go on until one moves no node by more than this [mm], but are no more than so many; in parallel each of
+# them is three kernels, whether it has something to do or not.
+ENOUGH_MM = 1e-4
+NEWTON_STEPS = 12
+NEWTON_STEPS_IN_PARALLEL = 3
 # Share of the moments of inertia and contact that is added, so that the system is never singular.
 LEAST_HOLD = 1e-5
 # No body turns by more in a substep [rad].
@@ -57,6 +61,7 @@ class RigidMotion:
         self.extent_mm = float(np.linalg.norm(body.rest_points - middle, axis=1).max())
         self.rotation = ti.Matrix.field(3, 3, ti.f32, ())
         self.translation = ti.Vector.field(3, ti.f32, ())
+        self.change_mm = ti.field(ti.f32, ())
         self.share = ti.field(ti.f32, ())
 
     @ti.func
@@ -67,10 +72,11 @@ class RigidMotion:
             self.translation[None] = tm.vec3(0.0)
         if ti.static(self.serial):
             for step in range(1 + NEWTON_STEPS):
-                self.improve(step > 0, dt)
+                if step < 2 or self.change_mm[None] > ENOUGH_MM:
+                    self.improve(step > 0, dt)
         else:
             # Only outermost loops run in parallel.
-            for step in ti.static(range(1 + NEWTON_STEPS)):
+            for step in ti.static(range(1 + NEWTON_STEPS_IN_PARALLEL)):
                 self.improve(step > 0, dt)
         for _ in range(1):
             self.share[None] = 1.0
@@ -152,7 +158,9 @@ class RigidMotion:
         schur += (LEAST_HOLD * about.trace() + 1e-12) * tm.eye(3)
         turn = inverse_of(schur) @ (torque - mixed.transpose() @ compliance @ force)
         turn *= ti.min(1.0, MOST_TURN / ti.max(turn.norm(), 1e-12))
-        self.translation[None] += compliance @ (force - mixed @ turn)
+        shift = compliance @ (force - mixed @ turn)
+        self.change_mm[None] = shift.norm() + turn.norm() * self.extent_mm
+        self.translation[None] += shift
         self.rotation[None] = rotation_by(turn) @ self.rotation[None]
 
 

@@ -18,6 +18,7 @@ from lattice_tissue import (
     settings_of,
     tissue_of,
 )
+from scipy.linalg import polar
 from scipy.optimize import brentq
 
 from sim.body import Body
@@ -265,7 +266,8 @@ def test_uniaxial_compression_between_frictionless_plates(device, block):
         q, stress = uniaxial(stretch, poisson)
         inside = (np.abs(lattice.nodes) < [12, 10, 8]).all(axis=1)
         known = np.column_stack([lattice.nodes[inside], np.ones(inside.sum())])
-        measured = np.linalg.lstsq(known, x[inside], rcond=None)[0][:3]
+        # Without friction nothing holds the block from turning between the plates: what counts is how it is stretched.
+        measured = polar(np.linalg.lstsq(known, x[inside], rcond=None)[0][:3].T)[1]
         # What is wrong is the section: as the cells round its edges off, the faces stand out; and what is empty resists.
         whole = (np.abs(lattice.nodes[lattice.cells][:, :, 2].mean(axis=1)) < 3).nonzero()[0]
         area_mm2 = (
