@@ -1,6 +1,7 @@
 """Start Taichi on one backend, quietly. Fields of an earlier start are gone afterwards."""
 
 import contextlib
+import functools
 import io
 import os
 
@@ -9,8 +10,23 @@ os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "False")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 
 import taichi as ti
+from taichi.lang import kernel_impl
+from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 FEW_CORES = 4
+
+
+def _place(context: ASTTransformerContext, node) -> str:
+    """Where an expression stands, for the case of an error in it."""
+    line = context.src[node.lineno - 1]
+    return f'File "{context.file}", line {node.lineno + context.lineno_offset}, in {context.func.func.__name__}:\n{line}\n'
+
+
+# To build a kernel Taichi reads the source of a function at each call of it, and draws each expression's place with a
+# caret, whether there is an error or not: together nearly half of the time.
+ASTTransformerContext.get_pos_info = _place
+kernel_impl.getsourcelines = functools.cache(kernel_impl.getsourcelines)
+kernel_impl.getsourcefile = functools.cache(kernel_impl.getsourcefile)
 
 
 class NoDevice(RuntimeError):
