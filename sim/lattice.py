@@ -129,9 +129,9 @@ def _filled(
     cut = centre > -reach
     halves = np.indices((3, 3, 3)).reshape(3, -1).T
     grid = 2 * places[cut][:, None] + halves
-    unique, back = np.unique(grid.reshape(-1, 3), axis=0, return_inverse=True)
+    unique, back = _different_rows(grid.reshape(-1, 3))
     known = signed_distance(surface.vertices, surface.faces, low + cell_mm / 2 * unique)[0]
-    distance = known[back.ravel()].reshape(-1, 27) @ _from_halves(samples).T
+    distance = known[back].reshape(-1, 27) @ _from_halves(samples).T
     # Straight interpolation cuts convex surfaces short: they are moved out until the volume is right.
     out = 0.0
     for step in range(VOLUME_PASSES):
@@ -212,8 +212,7 @@ def surface_points(surface: trimesh.Trimesh, spacing_mm: float) -> tuple[np.ndar
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     axis = np.abs(normal).argmax(axis=1)
     side = 2 * axis + (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] > 0)
-    keys, owner = np.unique(np.column_stack([bins, side]), axis=0, return_inverse=True)
-    owner = owner.ravel()
+    keys, owner = _different_rows(np.column_stack([bins, side]))
     total = np.bincount(owner, area)
     mean = np.column_stack([np.bincount(owner, area * middle[:, axis]) for axis in range(3)]) / total[:, None]
     # A bin that the surface only grazes would make a point of little weight, which sinks in deep.
@@ -224,3 +223,14 @@ def surface_points(surface: trimesh.Trimesh, spacing_mm: float) -> tuple[np.ndar
         mean[whole], surface.vertices, np.asarray(surface.faces, np.int64)
     )[2]
     return on_surface, np.bincount(nearest, total)
+
+
+def _different_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The different ones of rows (n, k) of whole numbers, in order, and which of them each row (n,) is.
+
+    One number a row: they sort ten times as fast as rows do.
+    """
+    least = rows.min(axis=0)
+    shape = tuple(rows.max(axis=0) - least + 1)
+    keys, which = np.unique(np.ravel_multi_index(tuple((rows - least).T), shape), return_inverse=True)
+    return np.column_stack(np.unravel_index(keys, shape)) + least, which
