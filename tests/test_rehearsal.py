@@ -20,10 +20,8 @@ from ultrasound.probe import image_plane
 
 PATIENTS = {
     "phantom": None,
-    "crlm left": ("crlm_1004", "crlm_1004_labels/kidneys_provisional.nii.gz", "left"),
     "crlm right": ("crlm_1004", "crlm_1004_labels/kidneys_provisional.nii.gz", "right"),
     "totalseg left": ("totalseg/ct.nii.gz", "totalseg/kidneys.nii.gz", "left"),
-    "totalseg right": ("totalseg/ct.nii.gz", "totalseg/kidneys.nii.gz", "right"),
 }
 
 
