@@ -47,6 +47,7 @@ def body_of(model: str) -> measure.Body:
 
 
 @pytest.mark.parametrize("model", list(measure.FEATURES))
+@pytest.mark.filterwarnings("ignore:.*Calling non-taichi function:SyntaxWarning")
 def test_what_is_off_is_not_compiled_and_not_allocated(device, monkeypatch, model):
     body = body_of(model)
 

@@ -107,7 +107,10 @@ def _radii(axes: Axes, matched: list[Press]) -> None:
 
 
 def _sizes(axes: Axes, sizes: list[dict]) -> None:
-    for model, name in (("shape-matching", "shape matching, 3 x 9"), ("neo-hookean", "neo-Hookean, 1 x 8")):
+    for model, name, label in (
+        ("shape-matching", "shape matching, 3 x 9", dict(xytext=(4, -9))),
+        ("neo-hookean", "neo-Hookean, 1 x 8", dict(xytext=(-4, 5), ha="right")),
+    ):
         rows = [size for size in sizes if size["model"] == model]
         axes.loglog(
             [row["particles"] for row in rows], [row["ms"]["median"] for row in rows], "o-", label=name
@@ -117,8 +120,8 @@ def _sizes(axes: Axes, sizes: list[dict]) -> None:
                 f"{row['memory_mb']:.0f} MB",
                 (row["particles"], row["ms"]["median"]),
                 fontsize=7,
-                xytext=(4, -9),
                 textcoords="offset points",
+                **label,
             )
     axes.axhline(FRAME_MS, color="0.6", linestyle=":", label="1/60 s")
     axes.set(

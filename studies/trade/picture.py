@@ -66,7 +66,8 @@ def _model(axes: Axes, points: list[dict[str, Any]], model: str, colour: str) ->
         )
     for point in points:
         name = preset_of(setup_of(point))
-        if name:
+        # Shape matching's are the paper's particles, of which the finer are not the truer.
+        if name and point["pareto"]:
             at = (point["ms_median"], point["error_mean_mm"])
             axes.scatter(*at, marker="D", facecolors="none", edgecolors="black", zorder=3)
             axes.annotate(
