@@ -232,7 +232,7 @@ def run_frame(
     error = rehearsal.expected_error_mm()
     readouts = {
         "step": f"{np.median(record.step_ms[-30:]):.1f} ms",
-        "expected error": "not known" if error is None else f"{error:.2f} mm",
+        "error": "not known" if error is None else f"± {error:.2f} mm",
         "slice": f"{np.median(record.slice_ms[-30:]):.1f} ms",
         size: f"{count}",
         "indentation": f"{max(rehearsal.indentation_mm(), 0.0):.1f} mm",
@@ -316,7 +316,7 @@ def run_window(rehearsal: "Rehearsal", out: Path, budget_ms: float | None) -> No
         view = run_frame(rehearsal, controls.settings, pose, record, status)
         if pose is not None:
             notices.tell(rehearsal.notice)
-            if ladder.watch(record.step_ms[-1]):
+            if ladder.watch(record.step_ms[-1]) and ladder.says(asked) != status:
                 click.echo(ladder.says(asked) or f"Back to all {asked} iterations.")
         now = perf_counter()
         rate = 0.9 * rate + 0.1 / max(now - before, 1e-6)
