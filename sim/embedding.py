@@ -35,7 +35,11 @@ class Embedding:
         vertices, tetrahedra = tetrahedra_around(surface, cell_mm, margin_mm)
         # A tetrahedron that holds tissue reaches this far out: all of its vertices must follow it wholly.
         wholly = np.sqrt(3) * cell_mm
-        beyond = np.maximum(signed_distance(surface.vertices, surface.faces, vertices)[0] - wholly, 0.0)
+        outside = np.maximum(signed_distance(surface.vertices, surface.faces, vertices)[0], 0.0)
+        beyond = np.maximum(outside - wholly, 0.0)
+        # Where surroundings fold over each other or over the organ, what is nearer to it, or of it, is taken.
+        layer = np.ceil(outside[tetrahedra].min(axis=1) / cell_mm)
+        tetrahedra = tetrahedra[np.argsort(layer, kind="stable")]
         share = np.clip(1.0 - beyond / max(margin_mm - wholly, cell_mm), 0.0, 1.0)
         self.skin = Skin(model, vertices)
         self.share = ti.field(ti.f32, len(vertices))

@@ -211,6 +211,22 @@ def test_what_lies_around_the_organ_gives_way_to_it_and_far_away_stays(device, b
     assert 0.5 < moved[between, 2].mean() < 3.5
 
 
+def test_surroundings_that_fold_over_the_organ_do_not_cover_it(device, ball):
+    embedding = Embedding(tissue_of(ball, RADIUS), ball, 2 * RADIUS, margin_mm=25.0)
+    cut = Slice(volume_of(ramp_image()), distance_volume(ball, 1.0), embedding, 96)
+    plane = oblique_plane()
+    cut.render(plane, 350.0, 40.0)
+    organ, owner = cut.in_organ.to_numpy(), cut.owner.to_numpy()
+    vertices = embedding.skin.vertices.to_numpy()
+    outside = np.linalg.norm(embedding.skin.rest.to_numpy(), axis=1) > 12.0 + 2 * RADIUS * np.sqrt(3)
+    vertices[outside & (vertices[:, 2] > 0)] -= [0.0, 0.0, 26.0]
+    embedding.skin.vertices.from_numpy(vertices)
+    embedding._invert()
+    cut.render(plane, 350.0, 40.0)
+    assert organ.sum() > 1000 and (cut.owner.to_numpy() != owner)[organ == 0].sum() > 100
+    assert (cut.owner.to_numpy() == owner)[organ == 1].all()
+
+
 def test_tetrahedra_fill_the_organ_without_gaps(ball):
     vertices, tetrahedra = tetrahedra_around(ball, 4.0)
     corners = vertices[tetrahedra]
