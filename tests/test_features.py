@@ -31,6 +31,17 @@ OWN = {
     "contacts of particles": [(ParticleContacts, "find"), (ParticleContacts, "project")],
     "scaled masses": [(ShapeMatching, "weigh_patches"), (ShapeMatching, "weigh_clusters")],
 }
+# Options, and the features that none of them has.
+WITHOUT = (
+    (
+        measure.Options(support=False, transducer=False),
+        ("contact with the support", "the transducer", "friction on shapes"),
+    ),
+    (
+        measure.Options(shape_friction=0.0),
+        ("friction on shapes", "contacts of particles", "scaled masses"),
+    ),
+)
 
 
 def small_anatomy() -> LoadedAnatomy:
@@ -61,9 +72,14 @@ def test_what_is_off_is_not_compiled_and_not_allocated(device, monkeypatch, mode
             with monkeypatch.context() as forbidden:
                 for owner, name in OWN[feature.name]:
                     forbidden.setattr(owner, name, compiled)
-                off.step(body.settings, body.poses(off, 0))
                 with pytest.raises(ti.TaichiCompilationError, match="compiled"):
                     on.step(body.settings, body.poses(on, 0))
+    for options, names in WITHOUT:
+        off = body.solver(options)
+        with monkeypatch.context() as forbidden:
+            for owner, method in [part for name in names for part in OWN[name]]:
+                forbidden.setattr(owner, method, compiled)
+            off.step(body.settings, body.poses(off, 0))
 
 
 def test_scaled_masses_that_are_off_take_no_field(device):

@@ -1,4 +1,4 @@
-"""Every matrix has a right rotation: a million of all kinds against NumPy's float64 decomposition."""
+"""Every matrix has a right rotation: a million of all kinds, a third from each start, against NumPy's float64."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from sim.rotation import nearest_rotation, rotation_near
 
-COUNT = 1_000_000
+COUNT = 336_000
 KIND = COUNT // 8
 # An SVD in float32 leaves some tens of units in the last place (6e-8).
 ROUNDING = 4e-6
