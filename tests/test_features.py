@@ -101,7 +101,7 @@ def test_kernels_are_counted_where_a_step_is_parallel():
 def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(command, "load_anatomy", lambda scene, folder: small_anatomy())
     monkeypatch.setattr(measure, "PRESS_STEPS", 3)
-    monkeypatch.setitem(measure.FEATURES, "shape-matching", measure.EVERYWHERE[2:])
+    monkeypatch.setitem(measure.FEATURES, "neo-hookean", measure.EVERYWHERE[2:])
     assert app.main(["study", "features", "--quick", "--out", str(tmp_path)]) == 0
     rows = json.loads((tmp_path / "features.json").read_text())["features"]
     assert [row["feature"] for row in rows] == [

@@ -33,7 +33,7 @@ COLUMNS = (
 @click.option(
     "--quick",
     is_flag=True,
-    help="Shape matching alone, coarse, not in turn, no kernels counted: in less than a minute.",
+    help="Neo-Hookean alone, coarse, not in turn, no kernels counted: in less than a minute.",
 )
 @arch_option
 def features(scene: Path, out: Path, quick: bool, arch: str) -> None:
@@ -46,7 +46,7 @@ def features(scene: Path, out: Path, quick: bool, arch: str) -> None:
     from studies.features import measure
     from studies.features.picture import draw
 
-    models = ["shape-matching"] if quick else list(measure.FEATURES)
+    models = ["neo-hookean"] if quick else list(measure.FEATURES)
     rows: list[dict[str, Any]] = []
     with tqdm(
         total=sum(len(measure.FEATURES[model]) for model in models) + 1, desc="features", unit="feature"

@@ -20,7 +20,7 @@ BATCH = 12
 
 @click.command()
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for table and picture.")
-@click.option("--quick", is_flag=True, help="Two cases of each kind, in less than a minute.")
+@click.option("--quick", is_flag=True, help="One case of each kind, in less than a minute.")
 @click.option("--jobs", type=click.IntRange(1, 1024), help="Processes on this machine [one a processor].")
 def stability(out: Path, quick: bool, jobs: int | None) -> None:
     """What no scene should do to its tissue: each model at the extremes, then let go of."""
