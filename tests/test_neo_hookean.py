@@ -21,7 +21,7 @@ from lattice_tissue import (
 from scipy.linalg import polar
 from scipy.optimize import brentq
 
-from sim.body import Body
+from sim.body import Body, BodyState
 from sim.lattice import ERSATZ, Lattice, fill_with_cells
 from sim.neo_hookean import HOURGLASS, LEAST_J, NeoHookean, ln
 from sim.shapes import ConvexTool, Plane
@@ -229,6 +229,21 @@ def test_a_held_skin_makes_the_inside_affine_with_the_closed_form_stress(device,
     if wanted == "simple shear":
         assert power[0, 1] == pytest.approx(volume * energy.mu * 0.4, rel=1e-4)
     assert np.abs(power - volume * p).max() < rounding(energy, affine) * len(x) ** 0.5 * 13
+
+
+def test_a_fast_spin_is_found_whole_at_once(device, ball):
+    """Inertia alone draws nodes from x to x + w x r, w = 1 rad a step: the nearest rigid motion is a turn by atan(1)."""
+    model = tissue_of(ball, 4.0).model
+    x, mass = model.lattice.nodes, model.mass.to_numpy().astype(float)
+    centre = mass @ x / mass.sum()
+    velocity = np.cross([0.0, 0.0, 1.0 / DT], x - centre) + [30.0, 0.0, 0.0]
+    model.body.restore(BodyState(x.astype(np.float32), velocity.astype(np.float32)))
+    model.body.estimate.from_numpy((x + DT * velocity).astype(np.float32))
+    begin(model, DT)
+    found = model.body.estimate.to_numpy()
+    wanted = centre + (x - centre) @ rotation_about([0, 0, 1], 45).T + DT * np.array([30.0, 0.0, 0.0])
+    # Each Newton step leaves 1 - sqrt(2) of the angle before it, so that after one of 1e-4 mm less than that is left.
+    assert np.abs(found - wanted).max() < 2e-4
 
 
 def uniaxial(stretch: float, poisson: float) -> tuple[float, float]:
