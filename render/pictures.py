@@ -1,7 +1,8 @@
-"""Pictures as files: slices and frames of a run, and its animation."""
+"""Pictures as files: what the scanner showed, frames of a run, and its animation."""
 
 from pathlib import Path
 
+import numpy as np
 from PIL import Image
 
 from render.viewer import View
@@ -10,11 +11,18 @@ PICTURES_A_SECOND = 10
 ANIMATION_WIDTH = 720
 
 
-def in_proportion(view: View) -> Image.Image:
-    """The slice with square pixels, as wide as it was sampled."""
-    picture = Image.fromarray(view.slice_image)
-    height = round(picture.width * view.depth_mm / view.width_mm)
-    return picture.resize((picture.width, height), Image.Resampling.BILINEAR)
+def in_proportion(picture: np.ndarray, width_mm: float, depth_mm: float) -> Image.Image:
+    """A picture of a plane with square pixels, as long on its longer side as it was sampled."""
+    scale = max(picture.shape) / max(width_mm, depth_mm)
+    size = max(1, round(width_mm * scale)), max(1, round(depth_mm * scale))
+    return Image.fromarray(picture).resize(size, Image.Resampling.BILINEAR)
+
+
+def side_by_side(view: View) -> Image.Image:
+    """The pictures of a view in a row, with square pixels."""
+    pictures = [in_proportion(picture, view.width_mm, view.depth_mm) for picture in view.pictures.values()]
+    row = np.concatenate([np.asarray(picture) for picture in pictures], axis=1)
+    return Image.fromarray(row)
 
 
 def empty_folder(folder: Path) -> Path:

@@ -75,11 +75,11 @@ def image_plane_frame(width_mm: float, depth_mm: float) -> np.ndarray:
     return corners[[0, 1, 1, 2, 2, 3, 3, 0]]
 
 
-def sampled(slice_image: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """Grey values in [0, 1] of the slice at the vertices of `image_plane_grid`, shape (rows * columns,)."""
-    down = np.linspace(0, slice_image.shape[0] - 1, rows).round().astype(np.intp)
-    across = np.linspace(0, slice_image.shape[1] - 1, columns).round().astype(np.intp)
-    return slice_image[down[:, None], across].reshape(-1) / 255.0
+def sampled(picture: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """Grey values in [0, 1] of a picture at the vertices of `image_plane_grid`, shape (rows * columns,)."""
+    down = np.linspace(0, picture.shape[0] - 1, rows).round().astype(np.intp)
+    across = np.linspace(0, picture.shape[1] - 1, columns).round().astype(np.intp)
+    return picture[down[:, None], across].reshape(-1) / 255.0
 
 
 def placed(points: np.ndarray, pose: np.ndarray) -> np.ndarray:

@@ -116,13 +116,13 @@ class Stage:
 
     def _draw_image_plane(self, scene, view: View, key: np.ndarray) -> None:
         face = np.array(view.transducer_pose, dtype=np.float64)
-        face[:3, 3] -= face[:3, 2] * self._half_axis_mm
+        face[:3, 3] -= face[:3, 2] * (self._half_axis_mm - view.above_mm)
         points = solids.placed(self._plane * [view.width_mm, 1.0, view.depth_mm], face)
         toward = key - points
         # Facing the key light everywhere, the plane is evenly bright: its grey is the slice's, not the light's.
         _fill(self._plane_points, points)
         _fill(self._plane_normals, toward / np.linalg.norm(toward, axis=1, keepdims=True))
-        grey = solids.sampled(view.slice_image, PLANE_ROWS, PLANE_COLUMNS)
+        grey = solids.sampled(next(iter(view.pictures.values())), PLANE_ROWS, PLANE_COLUMNS)
         _fill(self._plane_colours, np.repeat(grey[:, None], 3, axis=1))
         _fill(self._frame_points, solids.placed(solids.image_plane_frame(view.width_mm, view.depth_mm), face))
         scene.mesh(

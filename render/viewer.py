@@ -10,6 +10,12 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from ultrasound.array import Mode, Rung
+
+ECHO, TGC = "Echo", "Gain over depth"
+# Groups of settings that stand beside the picture, as on a scanner.
+ASIDE = (ECHO, TGC)
+
 
 class Key(NamedTuple):
     """One line of the key map: `key` as it is printed, `action` (its name in the code), `text` for the reader."""
@@ -34,6 +40,13 @@ KEY_MAP = (
     Key("Shift + right drag", "pan", "shift the view (or middle drag)"),
     Key("Up", "zoom_in", "zoom in"),
     Key("Down", "zoom_out", "zoom out"),
+    Key("B", "mode", "echo and CT, echo alone, CT alone"),
+    Key("V", "rung", "echo: how much of it is computed"),
+    Key("O", "outline", "outline of the tumour in the picture"),
+    Key("G", "show_scanner", "the scanner's sliders, gain over depth among them"),
+    Key("Click on picture", "measure", "calliper from click to click, in mm"),
+    Key("Left, Right", "cine", "while frozen: the last ten seconds, picture by picture"),
+    Key("I", "export", "save the picture as PNG and as DICOM into the --out folder"),
     Key("T", "translucent", "organ translucent or solid"),
     Key("X", "cut", "cut the organ along the image plane"),
     Key("F", "freeze", "freeze and go on"),
@@ -59,11 +72,15 @@ def _switch(default: bool, label: str):
     return _slider(default, label, "", False, True, "View")
 
 
+def _level(number: int):
+    return _slider(50, f"{number}", "", 0, 100, TGC)
+
+
 @dataclass
 class Settings:
-    """What the sliders change. The metadata of a field (label, unit, low, high, group) is all that they are made of.
+    """What the user sets. The metadata of a field (label, unit, low, high, group) is all that its slider is made of.
 
-    A field that is None has no slider: of the first two, each tissue model has one.
+    A field that is None or has no metadata has no slider: of the first two, each tissue model has one.
     """
 
     young_kpa: float | None = _slider(None, "Stiffness", "kPa", 1.0, 100.0, "Tissue")
@@ -71,13 +88,29 @@ class Settings:
     iterations: int = _slider(9, "Iterations", "", 1, 40, "Tissue")
     substeps: int = _slider(3, "Substeps", "", 1, 10, "Tissue")
     gravity_m_s2: float = _slider(9.81, "Gravity", "m/s2", 0.0, 20.0, "Tissue")
+    depth_mm: int = _slider(60, "Depth", "mm", 20, 160, "Picture")
     window_hu: int = _slider(350, "Window", "HU", 1, 2000, "Picture")
     level_hu: int = _slider(40, "Level", "HU", -500, 500, "Picture")
-    depth_mm: int = _slider(60, "Depth", "mm", 20, 120, "Picture")
+    gain_percent: int = _slider(50, "Gain", "%", 0, 100, ECHO)
+    dyn_range_db: int = _slider(60, "Range", "dB", 20, 120, ECHO)
+    frequency_mhz: float = _slider(7.5, "Freq.", "MHz", 2.0, 15.0, ECHO)
+    focus_percent: int = _slider(40, "Focus", "%", 0, 100, ECHO)
+    tgc_1: int = _level(1)
+    tgc_2: int = _level(2)
+    tgc_3: int = _level(3)
+    tgc_4: int = _level(4)
+    tgc_5: int = _level(5)
+    tgc_6: int = _level(6)
+    tgc_7: int = _level(7)
+    tgc_8: int = _level(8)
     translucent: bool = _switch(True, "Translucent")
     cut: bool = _switch(False, "Cut open")
     show_tumour: bool = _switch(True, "Tumour")
     show_support: bool = _switch(True, "Support")
+    outline: bool = _switch(False, "Outline")
+    show_scanner: bool = False
+    mode: Mode = "both"
+    rung: Rung = "speckle"
 
 
 @dataclass(frozen=True)
@@ -94,6 +127,8 @@ class Geometry:
     """Direction opposite to gravity, shape (3,)."""
     transducer_size_mm: np.ndarray = field(default_factory=lambda: np.array([40.0, 10.0, 20.0]))
     """The cuboid, shape (3,): x lateral and to the marked side, y elevation, z axis. The image leaves at z = -size/2."""
+    frequency_range_mhz: tuple[float, float] = (2.0, 15.0)
+    """What the probe can be set to."""
     tumour_vertices: Any = None
     """As organ_vertices, or None."""
     tumour_faces: np.ndarray | None = None
@@ -108,10 +143,20 @@ class View:
 
     transducer_pose: np.ndarray
     """World from transducer [mm], shape (4, 4)."""
-    slice_image: np.ndarray
-    """Grey values, uint8, shape (rows = depth, columns = lateral, local x growing to the right)."""
+    pictures: dict[str, np.ndarray]
+    """Name -> grey values, uint8, shape (rows = depth, columns = lateral, local x growing to the right); the first is the one that
+    the 3D view shows on the image plane."""
     width_mm: float
     depth_mm: float
+    above_mm: float = 0.0
+    """How much of the depth lies behind the middle of the array's face."""
+    focus_mm: float | None = None
+    outline_mm: np.ndarray | None = None
+    """Line segments on the plane, shape (n, 2, 2) [mm]: x from the middle to the right, y down from the face."""
+    calliper_mm: tuple[tuple[float, float], ...] = ()
+    """Up to two points on the plane [mm]."""
+    captions: tuple[str, str, str] = ("", "", "")
+    """What is said around the pictures: the probe, above; the echo's and the CT's settings, below."""
     readouts: dict[str, str] = field(default_factory=dict)
     """Name -> text with its unit, in the order of display: {"step": "9.1 ms"}."""
     status: str = ""
@@ -143,6 +188,11 @@ class Controls:
     fan_deg: float = 0.0
     """Out of the image plane (about local x); positive swings the beam towards +y."""
     reset: bool = False
+    pointed_mm: tuple[float, float] | None = None
+    """The place on the image plane that was clicked on in a picture."""
+    cine: int = 0
+    """Pictures to go on (or back, negative) in those of the last seconds."""
+    export: bool = False
     freeze: bool = False
     """The freeze key went down: the app toggles."""
     screenshot: bool = False

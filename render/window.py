@@ -22,13 +22,19 @@ from taichi.ui.utils import get_field_info
 
 from render import frame
 from render.camera import FIELD_OF_VIEW_DEG, OrbitCamera
+from render.layout import ASIDE_WIDTH, Layout
+from render.panel import CALLIPER, OUTLINE, Panel, calliper_segments, draw_segments, paste_picture
+from render.sliders import boxes_of, draw_sliders
 from render.stage import Stage
 from render.viewer import KEY_MAP, Controls, Geometry, Settings, View
+from ultrasound.array import MODES, RUNGS
 
 PUSH_MM_S, ROLL_DEG_S, TILT_DEG_S, ZOOM_S = 15.0, 45.0, 30.0, 0.5
 READOUT_PERIOD_S, FRAMES_A_SECOND = 0.25, 60
-PRESSED_ONCE = {"r": "reset", "f": "freeze", "p": "screenshot", ti.ui.ESCAPE: "quit"}
-TOGGLES = {"t": "translucent", "x": "cut"}
+PRESSED_ONCE = {"r": "reset", "f": "freeze", "p": "screenshot", "i": "export", ti.ui.ESCAPE: "quit"}
+TOGGLES = {"t": "translucent", "x": "cut", "o": "outline", "g": "show_scanner"}
+CYCLES = {"b": ("mode", MODES), "v": ("rung", RUNGS)}
+CINE = {ti.ui.LEFT: -1, ti.ui.RIGHT: 1}
 HELD = {
     "w": ("push_mm", PUSH_MM_S),
     "s": ("push_mm", -PUSH_MM_S),
@@ -71,16 +77,6 @@ def _put_image(canvas, pixels: np.ndarray) -> None:
     canvas.canvas.set_image(get_field_info(pixels.view(np.uint32)[..., 0]))
 
 
-def _group_width(members: list[dataclasses.Field]) -> float:
-    """Pixels that a group of sliders needs: Dear ImGui's glyphs are 7 wide, its labels get 35 % of the box."""
-    longest = max(7 * len(_label(member)) for member in members)
-    return longest + 46 if isinstance(members[0].metadata["low"], bool) else (longest + 16) / 0.35
-
-
-def _label(member: dataclasses.Field) -> str:
-    return f"{member.metadata['label']} {member.metadata['unit']}".strip()
-
-
 class Window:
     """A `Viewer` on GGUI. `ti.init` comes before it, and one window is open at a time.
 
@@ -107,7 +103,7 @@ class Window:
         if visible and not display_available():
             raise RuntimeError("no display to open a window on")
         self.settings = settings or Settings()
-        self.layout = frame.Layout(*size)
+        self.layout = Layout(*size)
         # GGUI goes on to measure sliders in shares of the size that the window was opened with.
         self._first_size = size
         self._visible = visible
@@ -122,12 +118,14 @@ class Window:
         self._view: View | None = None
         self._quit = False
         self._help_shown = False
+        self._frequency_range_mhz = geometry.frequency_range_mhz
         self._warm_up = 2
         self._drag: str | None = None
         self._cursor: np.ndarray | None = None
         self._pressing = False
         self._at_press: tuple[np.ndarray, tuple] | None = None
         self._boxes_placed = 0
+        self._slider_places: tuple = ()
         self._last_read = time.perf_counter()
         self._lens = ti.ui.Camera()
         part = self.layout.window_coordinates(self.layout.scene)
@@ -140,7 +138,7 @@ class Window:
         width, height = self.layout.width, self.layout.height
         self._pixels = np.full((width, height, 4), 255, dtype=np.uint8)
         self._page = self._pixels.transpose(1, 0, 2)[::-1]
-        self._drawn_panel: tuple[frame.Panel, bool] | None = None
+        self._drawn_panel: tuple[Panel, bool] | None = None
         self._drawn_readouts: dict[str, str] | None = None
         self._readouts_at = 0.0
 
@@ -186,6 +184,17 @@ class Window:
             return not (left <= x <= right and bottom <= y <= top)
         return inside
 
+    def _place_in_picture(self) -> tuple[float, float] | None:
+        """The place on the image plane [mm] under the mouse."""
+        if self._cursor is None or self._drawn_panel is None:
+            return None
+        panel = self._drawn_panel[0]
+        column, row = self._cursor[0] * self.layout.width, (1 - self._cursor[1]) * self.layout.height
+        for box in panel.boxes(self.layout):
+            if box.left <= column < box.right and box.top <= row < box.bottom:
+                return panel.to_plane(box, column, row)
+        return None
+
     def _read_events(self, controls: Controls) -> None:
         for event in self._window.get_events(ti.ui.PRESS):
             self._key_down(event.key, controls)
@@ -200,6 +209,7 @@ class Window:
         if key == ti.ui.LMB:
             self._pressing = self._over_scene()
             self._at_press = None
+            controls.pointed_mm = self._place_in_picture()
             if not self._pressing and self._cursor is not None:
                 self._at_press = self._cursor, dataclasses.astuple(self.settings)
         elif key in (ti.ui.RMB, ti.ui.MMB) and self._over_scene():
@@ -211,6 +221,12 @@ class Window:
                 self.camera.go_home()
         elif key in TOGGLES:
             setattr(self.settings, TOGGLES[key], not getattr(self.settings, TOGGLES[key]))
+        elif key in CYCLES:
+            name, values = CYCLES[key]
+            at = values.index(getattr(self.settings, name))
+            setattr(self.settings, name, values[(at + 1) % len(values)])
+        elif key in CINE:
+            controls.cine += CINE[key]
         elif key == "h":
             self._help_shown = not self._help_shown
 
@@ -275,7 +291,7 @@ class Window:
         size = self._window.get_window_shape()
         if tuple(size) == (self.layout.width, self.layout.height) or min(size) < 200:
             return
-        self.layout = frame.Layout(*size)
+        self.layout = Layout(*size)
         self._boxes_placed += 1
         self._start_pixels()
         self.camera.aspect = size[0] / size[1]
@@ -294,22 +310,27 @@ class Window:
         self._draw_sliders()
 
     def _compose(self, view: View) -> None:
-        settings = self.settings
-        panel = frame.Panel(
+        panel = Panel(
+            tuple(view.pictures),
             view.width_mm,
             view.depth_mm,
-            settings.window_hu,
-            settings.level_hu,
+            view.above_mm,
+            view.focus_mm,
+            view.captions,
             view.title,
             view.status,
             view.marked_side,
+            ASIDE_WIDTH if self.settings.show_scanner else 0,
         )
         if self._drawn_panel != (panel, self._help_shown):
             lines = [(key.key, key.text) for key in KEY_MAP] if self._help_shown else None
             self._page[:, :, :3] = frame.backdrop(self.layout, panel, lines)
             self._drawn_panel, self._drawn_readouts = (panel, self._help_shown), None
-        box = self.layout.picture_box(view.width_mm, view.depth_mm)
-        frame.paste_slice(self._page, box, view.slice_image)
+        for box, picture in zip(panel.boxes(self.layout), view.pictures.values(), strict=True):
+            paste_picture(self._page, box, picture)
+            if view.outline_mm is not None:
+                draw_segments(self._page, panel, box, view.outline_mm, OUTLINE)
+            draw_segments(self._page, panel, box, calliper_segments(panel, box, view.calliper_mm), CALLIPER)
         self._compose_readouts(dict(view.readouts))
 
     def _compose_readouts(self, readouts: dict[str, str]) -> None:
@@ -335,25 +356,8 @@ class Window:
         self._scene.set_camera(self._lens)
 
     def _draw_sliders(self) -> None:
-        groups: dict[str, list[dataclasses.Field]] = {}
-        for each in dataclasses.fields(self.settings):
-            if getattr(self.settings, each.name) is not None:
-                groups.setdefault(each.metadata["group"], []).append(each)
-        width, height = self._first_size
-        boxes = self.layout.sliders([_group_width(members) for members in groups.values()])
-        for (name, members), box in zip(groups.items(), boxes, strict=True):
-            place = (box.left / width, box.top / height, box.width / width, box.height / height)
-            with self._gui.sub_window(f"{name}##{self._boxes_placed}", *place):
-                for member in members:
-                    self._draw_slider(member)
-
-    def _draw_slider(self, member: dataclasses.Field) -> None:
-        value, about = getattr(self.settings, member.name), member.metadata
-        label = _label(member)
-        if isinstance(about["low"], bool):
-            value = self._gui.checkbox(label, bool(value))
-        elif isinstance(about["low"], int):
-            value = self._gui.slider_int(label, int(value), about["low"], about["high"])
-        else:
-            value = self._gui.slider_float(label, float(value), about["low"], about["high"])
-        setattr(self.settings, member.name, value)
+        places = tuple(boxes_of(self.settings, self.layout).items())
+        if places != self._slider_places:
+            self._slider_places, self._boxes_placed = places, self._boxes_placed + 1
+        size, mhz = self._first_size, self._frequency_range_mhz
+        draw_sliders(self._gui, self.settings, self.layout, size, self._boxes_placed, mhz)

@@ -3,7 +3,7 @@
 import hashlib
 import os
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,17 @@ HERE = Path(__file__).parent
 CACHE = HERE.parent / ".cache"
 FAT_HU = -110.0
 LEAST_WINDOW_HU = 150.0
+# What the parts of the embedded kidney are for sound; an import numbers them on from the tumour.
+TISSUE_OF_PART: dict[int, str] = {
+    Label.CORTEX: "cortex",
+    Label.MEDULLA: "medulla",
+    Label.SINUS_FAT: "sinus",
+    Label.COLLECTING_SYSTEM: "urine",
+    Label.VESSEL: "vessel",
+}
+PHANTOM_TISSUES = {"1": "kidney", "2": "tumour"} | {
+    str(i + 3): t for i, t in enumerate(TISSUE_OF_PART.values())
+}
 
 
 @dataclass(frozen=True)
@@ -37,6 +48,9 @@ class LoadedAnatomy:
     tumour: trimesh.Trimesh | None
     ct: Grid | None
     shapes: tuple[PlaneShape | trimesh.Trimesh | Grid, ...]
+    labels: Grid | None = None
+    tissues: dict[int, str] = field(default_factory=dict)
+    """Which tissue each label is."""
 
 
 def load_anatomy(scene: Scene, folder: Path) -> LoadedAnatomy:
@@ -44,12 +58,14 @@ def load_anatomy(scene: Scene, folder: Path) -> LoadedAnatomy:
     anatomy = scene.anatomy
     if anatomy.phantom:
         folder = phantom_folder()
-        anatomy = Anatomy(tumour="tumour.stl", ct="ct.nrrd")
+        anatomy = Anatomy(tumour="tumour.stl", ct="ct.nrrd", labels="labels.nrrd", tissues=PHANTOM_TISSUES)
     return LoadedAnatomy(
         organ=load_surface(folder, anatomy.organ),
         tumour=load_surface(folder, anatomy.tumour) if anatomy.tumour else None,
         ct=_grid(folder, anatomy.ct) if anatomy.ct else None,
         shapes=tuple(_shape(folder, shape) for shape in scene.shape),
+        labels=_labels(folder, anatomy),
+        tissues={int(label): tissue for label, tissue in anatomy.tissues.items()},
     )
 
 
@@ -84,14 +100,17 @@ def patient_scene(patient: Patient) -> Scene:
     return Scene(
         image=Image(window_hu=max(brightest - darkest, LEAST_WINDOW_HU), level_hu=(brightest + darkest) / 2),
         title=f"{patient.side.capitalize()} kidney",
-        anatomy=Anatomy(tumour=tumour, ct="ct.nrrd"),
+        anatomy=Anatomy(tumour=tumour, ct="ct.nrrd", labels="labels.nrrd", tissues=_named(patient.tissues)),
         shape=(MeshShape(kind="mesh", file="support.stl"),),
     )
 
 
 def phantom_folder() -> Path:
     """Folder of the embedded patient, imported like any other on first use and whenever its sources changed."""
-    sources = [HERE / f"{name}.py" for name in ("phantom", "abdomen", "patient", "surfaces", "support")]
+    sources = [
+        HERE / f"{name}.py"
+        for name in ("phantom", "abdomen", "anatomy", "labels", "patient", "surfaces", "support")
+    ]
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]
     for root in (CACHE, Path(tempfile.gettempdir()) / "nephron"):
         folder = root / f"phantom-{digest}"
@@ -99,7 +118,7 @@ def phantom_folder() -> Path:
             return folder
         if _can_write(root):
             ct, labels = make_phantom()
-            patient = import_patient(ct, labels, tumour=[Label.TUMOUR], side="left")
+            patient = import_patient(ct, labels, tumour=[Label.TUMOUR], side="left", tissues=TISSUE_OF_PART)
             try:
                 save_patient(patient, folder)
             except PatientError:
@@ -107,6 +126,10 @@ def phantom_folder() -> Path:
                     raise
             return folder
     raise SceneError(f"{CACHE}: cannot be written; the embedded patient needs a folder for its files")
+
+
+def _named(tissues: dict[int, str]) -> dict[str, str]:
+    return {str(label): tissue for label, tissue in tissues.items()}
 
 
 def _can_write(folder: Path) -> bool:
@@ -146,6 +169,20 @@ def _grid(folder: Path, name: str) -> Grid:
     mm_from_index[:3, :3] = direction * image.GetSpacing()
     mm_from_index[:3, 3] = image.GetOrigin()
     return Grid(voxels, np.linalg.inv(mm_from_index))
+
+
+def _labels(folder: Path, anatomy: Anatomy) -> Grid | None:
+    """The label map, on the CT's grid."""
+    if anatomy.labels is None or anatomy.ct is None:
+        return None
+    labels, ct = _grid(folder, anatomy.labels), _grid(folder, anatomy.ct)
+    if labels.voxels.shape != ct.voxels.shape or not np.allclose(
+        labels.index_from_mm, ct.index_from_mm, atol=1e-3
+    ):
+        raise SceneError(
+            f"{folder / anatomy.labels}: is on another grid than {anatomy.ct}; expected the same"
+        )
+    return labels
 
 
 def _shape(

@@ -33,6 +33,7 @@ class LabelledOrgan:
     centre_x_mm: float  # LPS
     mask: np.ndarray  # bool, axes (z, y, x), shape of the CT; tumour included
     tumour: np.ndarray  # bool, same shape
+    labels: np.ndarray  # label values of the voxels in it, 0 elsewhere, same shape
 
     def side_of(self, midline_x_mm: float) -> Side:
         return "left" if self.centre_x_mm > midline_x_mm else "right"
@@ -150,6 +151,7 @@ def _pieces(
                 centre_x_mm=float(_physical(ct, np.argwhere(mask))[0].mean()),
                 mask=mask,
                 tumour=mask & np.isin(values, tumour_values),
+                labels=np.where(mask, values, 0),
             )
         )
     return sorted(pieces, key=lambda piece: piece.centre_x_mm)

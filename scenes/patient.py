@@ -26,7 +26,7 @@ from scenes.surfaces import surface_from_mask
 
 __all__ = ["Patient", "PatientError", "describe", "import_patient", "read_volume", "save_patient"]
 
-ORGAN, TUMOUR = 1, 2
+ORGAN, TUMOUR, FIRST_PART = 1, 2, 3
 SUPINE_GRAVITY = np.array([0.0, 1.0, 0.0])  # as the CT was taken: on the back, posterior is down
 AIR_HU = -1000
 PADDING_BELOW_HU = -1024
@@ -40,7 +40,8 @@ class Patient:
     """One organ with what surrounds it; meshes in LPS [mm], watertight, normals outward."""
 
     ct: sitk.Image  # int16 [HU], cropped around the organ, original voxels and direction
-    labels: sitk.Image  # uint8 on the grid of `ct`: 1 = organ, 2 = tumour
+    labels: sitk.Image  # uint8 on the grid of `ct`: a tissue each
+    tissues: dict[int, str]  # what the labels are: 1 = kidney, 2 = tumour, and more where the import was told
     organ: trimesh.Trimesh  # tumour included
     tumour: trimesh.Trimesh | None
     support: trimesh.Trimesh
@@ -58,6 +59,7 @@ def import_patient(
     tumour: Sequence[int] | None = None,
     side: Side | None = None,
     margin_mm: float = 60.0,
+    tissues: Mapping[int, str] | None = None,
 ) -> Patient:
     """Cut one organ out of a CT and its label map and build its surfaces and its support.
 
@@ -69,6 +71,7 @@ def import_patient(
         side: which kidney, where the label map holds both, and a check where it holds one; needed where the
             CT does not show the body's whole width.
         margin_mm: CT kept around the organ [mm].
+        tissues: label values of parts of the organ, and the tissue that each is for sound (`ultrasound/tissues.toml`).
 
     Raises:
         PatientError: one line that says what was found, what was expected and what to do.
@@ -76,7 +79,8 @@ def import_patient(
     if not margin_mm >= 0:
         raise PatientError(f"the margin is {margin_mm} mm: expected 0 or more")
     piece, told_side = labelled_organ(ct, labels, organ, tumour, side)
-    cropped_ct, cropped_labels = _crop(ct, piece, margin_mm)
+    codes = {value: FIRST_PART + i for i, value in enumerate(sorted(tissues or {}))}
+    cropped_ct, cropped_labels = _crop(ct, piece, margin_mm, codes)
     organ_surface = _surface(cropped_labels != 0, "organ", FACES)
     try:
         support = cradle(organ_surface, SUPINE_GRAVITY)
@@ -86,6 +90,7 @@ def import_patient(
     return Patient(
         ct=cropped_ct,
         labels=cropped_labels,
+        tissues={ORGAN: "kidney", TUMOUR: "tumour"} | {codes[v]: name for v, name in (tissues or {}).items()},
         organ=organ_surface,
         tumour=_tumour_surface(cropped_labels, voxel_ml) if piece.tumour.any() else None,
         support=support,
@@ -167,8 +172,10 @@ def _image(voxels: np.ndarray, like: sitk.Image) -> sitk.Image:
     return image
 
 
-def _crop(ct: sitk.Image, piece: LabelledOrgan, margin_mm: float) -> tuple[sitk.Image, sitk.Image]:
-    """CT and labels around the organ, on one grid, padding replaced by air."""
+def _crop(
+    ct: sitk.Image, piece: LabelledOrgan, margin_mm: float, codes: Mapping[int, int]
+) -> tuple[sitk.Image, sitk.Image]:
+    """CT and labels around the organ, on one grid, padding replaced by air; parts of the organ get their codes."""
     box = ndimage.find_objects(piece.mask.astype(np.uint8))[0][::-1]
     rim = [int(np.ceil(margin_mm / s)) for s in ct.GetSpacing()]
     window = tuple(
@@ -178,7 +185,10 @@ def _crop(ct: sitk.Image, piece: LabelledOrgan, margin_mm: float) -> tuple[sitk.
     around = ct[window]
     hounsfield = np.clip(np.rint(sitk.GetArrayFromImage(around)), -32768, 32767).astype(np.int16)
     hounsfield[hounsfield < PADDING_BELOW_HU] = AIR_HU
-    marked = np.where(piece.tumour, TUMOUR, np.where(piece.mask, ORGAN, 0))[window[::-1]].astype(np.uint8)
+    marked = piece.mask[window[::-1]].astype(np.uint8) * np.uint8(ORGAN)
+    for value, code in codes.items():
+        marked[piece.labels[window[::-1]] == value] = code
+    marked[piece.tumour[window[::-1]]] = TUMOUR
     return _image(hounsfield, around), _image(marked, around)
 
 

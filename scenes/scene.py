@@ -6,7 +6,7 @@ other than the schema's, and values out of range, each by name.
 
 import difflib
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,9 +25,12 @@ from pydantic import (
 
 Vector3 = tuple[float, float, float]
 Stiffness = Annotated[float, Field(ge=0, le=1)]
+Length = Annotated[float, Field(gt=0, le=500)]
 
 # The scene that the program has with it.
 EMBEDDED = Path(__file__).parent / "phantom.toml"
+# The same patient, pressed with a transducer of the paper's size as deep as the paper does; what studies measure.
+PAPER = Path(__file__).parent / "paper.toml"
 # The command line's names for single values of a scene.
 OPTIONS = {
     "tissue.model": "--model",
@@ -38,6 +41,9 @@ OPTIONS = {
     "tissue.stiffness": "--stiffness",
     "solver.substeps": "--substeps",
     "solver.iterations": "--iterations",
+    "transducer.probe": "--probe",
+    "image.mode": "--picture",
+    "image.rung": "--rung",
 }
 
 
@@ -59,16 +65,22 @@ class Section(BaseModel):
 
 
 class Anatomy(Section):
-    """The embedded patient, or files beside the scene; without a CT there is no picture."""
+    """The embedded patient, or files beside the scene; without a CT there is no picture.
+
+    ``tissues`` says what each value of ``labels`` is for sound: a tissue of ``ultrasound/tissues.toml``.
+    """
 
     phantom: bool = False
     organ: str = "organ.stl"
     tumour: str | None = None
     ct: str | None = None
+    labels: str | None = None
+    tissues: dict[Annotated[str, Field(pattern=r"^[1-9]\d*$")], str] = {}
 
     @model_validator(mode="after")
     def _one_patient(self) -> "Anatomy":
-        if self.phantom and (self.tumour or self.ct or self.organ != "organ.stl"):
+        named = self.tumour or self.ct or self.labels or self.tissues or self.organ != "organ.stl"
+        if self.phantom and named:
             raise ValueError(
                 "phantom = true is the embedded patient, which has files of its own: name no others"
             )
@@ -170,21 +182,32 @@ class DistanceShape(Section):
 
 
 class Transducer(Section):
-    """A cuboid: lateral x elevation x length; it moves at most as fast as a hand does."""
+    """A probe, by the name of one that comes with the program or of a file beside the scene; it moves as fast as a hand.
 
-    size_mm: tuple[float, float, float] = (40.0, 10.0, 20.0)
+    It is a cuboid, lateral x elevation x length: the probe's housing, unless ``size_mm`` says otherwise.
+    """
+
+    probe: str = "linear"
+    size_mm: tuple[Length, Length, Length] | None = None
     speed_mm_s: float = Field(150.0, gt=0, le=2000)
 
 
 class Image(Section):
-    """The ultrasound panel: a linear array's plane and the CT window."""
+    """The ultrasound panel: which picture, how much of the ladder of realism, and the CT window.
 
-    width_mm: float = Field(40.0, gt=0, le=300)
-    depth_mm: float = Field(60.0, gt=0, le=300)
+    The depth is the probe's, unless it is given. Sound leaves where the organ is nearer to the array than ``contact_gap_mm``; with
+    ``contact`` "tissue", where anything but gas is.
+    """
+
+    mode: Literal["ct", "b-mode", "both"] = "both"
+    rung: Literal["reflection", "speckle", "elevation"] = "speckle"
+    depth_mm: float | None = Field(None, ge=5, le=300)
     pixels: int = Field(512, ge=16, le=4096)
     window_hu: float = Field(350.0, gt=0, le=10000)
     level_hu: float = Field(40.0, ge=-2000, le=4000)
     outside: Literal["background", "gel", "air"] = "background"
+    contact: Literal["organ", "tissue"] = "organ"
+    contact_gap_mm: float = Field(1.0, ge=0, le=20)
 
 
 class Press(Section):
@@ -242,7 +265,7 @@ def load_scene(path: Path) -> Scene:
         raise SceneError(f"{path}: {_explain(error)}") from None
 
 
-def with_options(scene: Scene, options: dict[str, float | int | str | None]) -> Scene:
+def with_options(scene: Scene, options: Mapping[str, float | int | str | None]) -> Scene:
     """The scene with single values changed, such as ``{"tissue.radius_mm": 3.0}``; None leaves what is there.
 
     A value that only another tissue model has asks for that model, which starts from its own defaults. Raises

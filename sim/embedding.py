@@ -14,7 +14,6 @@ import trimesh
 from sim.distance import signed_distance
 from sim.skinning import Skin
 
-NOWHERE = 2**30
 # Barycentric slack that closes the seams between tetrahedra against rounding.
 SEAM = 1e-5
 PARALLEL = 1e-12
@@ -29,6 +28,9 @@ class Embedding:
     ``tetrahedron`` (m,) holds four vertex indices each, of a rest mesh that fills space without gaps (Kuhn's six
     tetrahedra a cell). Around the body the vertices follow it less and less, to nothing at ``margin_mm``, so that
     what lies around the organ gives way to it without a gap; ``share`` (n,) is how far each follows.
+
+    ``rest_from_plane`` (m + 1,) takes (u, v, w) of an image plane [mm] to where the material there was at rest, for each
+    tetrahedron that ``locate_on_plane`` found on it; the last is for what no tetrahedron holds, which does not move.
     """
 
     def __init__(self, model, surface: trimesh.Trimesh, cell_mm: float, margin_mm: float = 0.0) -> None:
@@ -47,14 +49,13 @@ class Embedding:
         self.count = len(tetrahedra)
         self.tetrahedron = ti.Vector.field(4, ti.i32, self.count)
         self.tetrahedron.from_numpy(tetrahedra.astype(np.int32))
-        self.rest_from_world = ti.Matrix.field(3, 4, ti.f32, self.count)
-        self._invert()
+        self.on_plane = ti.Vector.field(3, ti.f32, len(vertices))
+        self.rest_from_plane = ti.Matrix.field(3, 4, ti.f32, self.count + 1)
 
     def update(self) -> None:
         """Carry the vertices to where the body is now."""
         self.skin.update()
         self._fade()
-        self._invert()
 
     @ti.kernel
     def _fade(self):
@@ -63,51 +64,43 @@ class Embedding:
             self.skin.vertices[v] = rest + self.share[v] * (self.skin.vertices[v] - rest)
 
     @ti.kernel
-    def _invert(self):
-        """The affine map of each tetrahedron from where it is to where it was at rest; one squashed flat has none."""
-        for t in range(self.count):
-            corner = self.tetrahedron[t]
-            x3, r3 = self.skin.vertices[corner[3]], self.skin.rest[corner[3]]
-            edges, rest_edges = tm.mat3(0.0), tm.mat3(0.0)
-            for k in ti.static(range(3)):
-                x, r = self.skin.vertices[corner[k]] - x3, self.skin.rest[corner[k]] - r3
-                for axis in ti.static(range(3)):
-                    edges[axis, k], rest_edges[axis, k] = x[axis], r[axis]
-            if ti.abs(edges.determinant()) > FLAT:
-                linear = rest_edges @ edges.inverse()
-                offset = r3 - linear @ x3
-                for i in ti.static(range(3)):
-                    for j in ti.static(range(3)):
-                        self.rest_from_world[t][i, j] = linear[i, j]
-                    self.rest_from_world[t][i, 3] = offset[i]
-
-    @ti.kernel
     def locate_on_plane(
-        self, plane_from_world: tm.mat4, pixel_mm: tm.vec2, first_mm: tm.vec2, owner: ti.template()
+        self,
+        plane_from_world: tm.mat4,
+        world_from_plane: tm.mat4,
+        pixel_mm: tm.vec2,
+        first_mm: tm.vec2,
+        owner: ti.template(),
     ):
-        """Which tetrahedron holds each pixel of an image plane; NOWHERE where none does.
+        """Which tetrahedron holds each pixel of an image plane; ``count``, one more than the last, where none does.
 
-        ``plane_from_world`` takes world [mm] to (u, v, w) with the plane at w = 0; pixel (row, column) is at u =
+        The two matrices take world [mm] to (u, v, w), with the plane at w = 0, and back; pixel (row, column) is at u =
         first.x + column * pixel.x, v = first.y + row * pixel.y. ``owner`` (rows, columns) i32 comes out. Of
         tetrahedra that overlap, which a folded mesh has, the one of lowest index is taken, whatever thread was first;
-        those turned inside out, by tissue squeezed shut, are left out.
+        those turned inside out, by tissue squeezed shut, and those squashed flat are left out.
         """
         for pixel in ti.grouped(owner):
-            owner[pixel] = NOWHERE
+            owner[pixel] = self.count
+        self.rest_from_plane[self.count] = world_from_plane[:3, :]
+        for v in self.on_plane:
+            self.on_plane[v] = (plane_from_world @ tm.vec4(self.skin.vertices[v], 1.0)).xyz
         for t in range(self.count):
-            corner = tm.mat4(0.0)
-            low, high = 1e30, -1e30
-            for k in ti.static(range(4)):
-                p = (plane_from_world @ tm.vec4(self.skin.vertices[self.tetrahedron[t][k]], 1.0)).xyz
-                corner[0, k], corner[1, k], corner[2, k], corner[3, k] = p.x, p.y, p.z, 1.0
-                low, high = ti.min(low, p.z), ti.max(high, p.z)
-            if low <= 0.0 and high >= 0.0 and -corner.determinant() > FLAT:
-                self.mark_pixels(t, corner, pixel_mm, first_mm, owner)
+            node = self.tetrahedron[t]
+            w = ti.Vector([self.on_plane[node[k]].z for k in ti.static(range(4))])
+            if w.min() <= 0.0 and w.max() >= 0.0:
+                corner, rest = tm.mat4(0.0), ti.Matrix.zero(ti.f32, 3, 4)
+                for k in ti.static(range(4)):
+                    p, r = self.on_plane[node[k]], self.skin.rest[node[k]]
+                    corner[0, k], corner[1, k], corner[2, k], corner[3, k] = p.x, p.y, p.z, 1.0
+                    rest[0, k], rest[1, k], rest[2, k] = r.x, r.y, r.z
+                if -corner.determinant() > FLAT:
+                    weights = corner.inverse()
+                    self.rest_from_plane[t] = rest @ weights
+                    self.mark_pixels(t, corner, weights, pixel_mm, first_mm, owner)
 
     @ti.func
-    def mark_pixels(self, t, corner, pixel_mm, first_mm, owner: ti.template()):
+    def mark_pixels(self, t, corner, weights, pixel_mm, first_mm, owner: ti.template()):
         """Row by row, the span of columns in which all four barycentric coordinates are positive."""
-        weights = corner.inverse()
         bottom, top = 1e30, -1e30
         for a, b in ti.static([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]):
             wa, wb = corner[2, a], corner[2, b]
@@ -135,10 +128,32 @@ class Embedding:
             for column in range(first, last + 1):
                 ti.atomic_min(owner[row, column], t)
 
-    @ti.func
-    def rest_point(self, t, p):
-        """Where the material at p [mm], which lies in tetrahedron t, was at rest [mm]."""
-        return self.rest_from_world[t] @ tm.vec4(p, 1.0)
+
+@ti.data_oriented
+class Unmoved:
+    """The embedding of what does not move: one piece holds all, and every point is where it was at rest."""
+
+    count = 1
+
+    def __init__(self) -> None:
+        self.rest_from_plane = ti.Matrix.field(3, 4, ti.f32, 1)
+
+    def update(self) -> None:
+        """Nothing is to be carried."""
+
+    @ti.kernel
+    def locate_on_plane(
+        self,
+        plane_from_world: tm.mat4,
+        world_from_plane: tm.mat4,
+        pixel_mm: tm.vec2,
+        first_mm: tm.vec2,
+        owner: ti.template(),
+    ):
+        """As ``Embedding.locate_on_plane``."""
+        for pixel in ti.grouped(owner):
+            owner[pixel] = 0
+        self.rest_from_plane[0] = world_from_plane[:3, :]
 
 
 def tetrahedra_around(

@@ -18,11 +18,21 @@ from sim.shapes import ConvexTool, Plane, SignedDistanceField
 from sim.skinning import Skin
 from sim.solver import SolverState
 from studies.models import build_solver, embedding_cell_mm, static_shape, step_settings
-from studies.setup import setup_of_scene
+from studies.setup import probe_of, setup_of_scene
 from studies.trade.front import expected_error_mm, load_points
-from ultrasound.probe import Hand, advanced, approached, between, image_plane, indentation, pose_at, touching
-from ultrasound.slice import Slice
-from ultrasound.volume import Volume, distance_volume
+from ultrasound.array import Mode, Probe, Rung
+from ultrasound.outline import section
+from ultrasound.probe import (
+    Hand,
+    advanced,
+    approached,
+    between,
+    image_plane,
+    indentation,
+    pose_at,
+    touching,
+)
+from ultrasound.scanner import Anatomy, Scanner
 
 TURN_DEG_S = 180.0
 AWAY_MM = 200.0
@@ -32,6 +42,8 @@ TUMOUR_LIFT_MM = 0.8
 SUPPORT_SUNK_MM = 0.4
 # How far around the organ the tissue in the picture gives way to it.
 SURROUNDINGS_MM = 25.0
+# Places along each side of a picture whose rest is asked for.
+REST_PLACES = 48
 
 
 @dataclass(frozen=True)
@@ -50,8 +62,9 @@ class Rehearsal:
     Needs Taichi to be initialised; a new one for another scene needs it initialised anew, which frees the old.
     """
 
-    def __init__(self, scene: Scene, anatomy: LoadedAnatomy) -> None:
+    def __init__(self, scene: Scene, anatomy: LoadedAnatomy, probe: Probe | None = None) -> None:
         self.scene = scene
+        self.probe = probe or probe_of(scene)
         self.origin = anatomy.organ.bounds.mean(axis=0)
         self.organ = _shifted(anatomy.organ, -self.origin)
         self.tumour = anatomy.tumour and _shifted(anatomy.tumour, -self.origin)
@@ -62,7 +75,7 @@ class Rehearsal:
         self.guard = Guard(self.solver)
         self.notice = ""
         self._build_surfaces()
-        self._build_slice(anatomy)
+        self._build_scanner(anatomy)
         self._points = load_points()
         self.press = press_on(scene.press, anatomy, self.gravity_direction)
         self.steps = 0
@@ -73,7 +86,7 @@ class Rehearsal:
         self.settled = self.snapshot()
 
     def _build_solver(self, anatomy: LoadedAnatomy) -> None:
-        self.size_mm = np.array(self.scene.transducer.size_mm)
+        self.size_mm = np.array(self.probe.housing_mm)
         self.tool = ConvexTool.cuboid(self.size_mm)
         shapes = [*(self._shape(shape) for shape in anatomy.shapes), self.tool]
         tissue, section = self.scene.tissue, self.scene.solver
@@ -98,15 +111,15 @@ class Rehearsal:
             drawn = self.tumour.vertices + TUMOUR_LIFT_MM * self.tumour.vertex_normals
             self.tumour_skin = Skin(self.model, drawn)
 
-    def _build_slice(self, anatomy: LoadedAnatomy) -> None:
+    def _build_scanner(self, anatomy: LoadedAnatomy) -> None:
         image = self.scene.image
         margin = SURROUNDINGS_MM if image.outside == "background" else 0.0
-        cell = embedding_cell_mm(self.scene.tissue)
-        self.embedding = Embedding(self.model, self.organ, cell, margin)
-        self.slice = None
+        self.embedding = Embedding(self.model, self.organ, embedding_cell_mm(self.scene.tissue), margin)
+        self.scanner = None
         if anatomy.ct is not None:
-            ct = Volume(anatomy.ct.voxels, _moved(anatomy.ct, self.origin))
-            self.slice = Slice(ct, distance_volume(self.organ), self.embedding, image.pixels, image.outside)
+            scanned = scanned_anatomy(self.organ, anatomy, self.origin)
+            around = image.outside, image.contact, image.contact_gap_mm
+            self.scanner = Scanner(scanned, self.embedding, self.probe, image.pixels, *around)
 
     def _settle(self) -> np.ndarray:
         """Let the organ come to rest on its support, the transducer far away: the paper's warm-up."""
@@ -185,14 +198,26 @@ class Rehearsal:
         if self.tumour_skin is not None:
             self.tumour_skin.update()
 
-    def image(self, window_hu: float, level_hu: float, depth_mm: float) -> np.ndarray:
-        """What the transducer sees now: grey values (rows, columns) uint8; black in a scene without a CT."""
-        if self.slice is None:
-            return np.zeros((self.scene.image.pixels, self.scene.image.pixels), np.uint8)
-        self.embedding.update()
-        plane = image_plane(self.pose, self.size_mm[2], self.scene.image.width_mm, depth_mm)
-        self.slice.render(plane, window_hu, level_hu)
-        return self.slice.grey.to_numpy()
+    def look(
+        self, probe: Probe, mode: Mode, rung: Rung, window_hu: float, level_hu: float
+    ) -> dict[str, np.ndarray]:
+        """What the scanner shows now, by name (``Scanner.look``); black in a scene without a CT."""
+        if self.scanner is None:
+            return {"no CT": np.zeros((self.scene.image.pixels, self.scene.image.pixels), np.uint8)}
+        plane = image_plane(self.pose, self.size_mm[2], *probe.extent_mm)
+        return self.scanner.look(plane, probe, mode, rung, window_hu, level_hu)
+
+    def rest_grid(self) -> np.ndarray | None:
+        """Where the tissue of the picture taken last was at rest, evenly over it, (n, n, 3) [mm]; None without a CT."""
+        return None if self.scanner is None else self.scanner.plane.rest_grid(REST_PLACES)
+
+    def tumour_outline(self) -> np.ndarray | None:
+        """Where the image plane cuts the tumour: segments (n, 2, 2) on the plane [mm]; None without a tumour."""
+        if self.tumour is None or self.tumour_skin is None:
+            return None
+        plane = image_plane(self.pose, self.size_mm[2], 1.0, 1.0)
+        vertices = self.tumour_skin.vertices.to_numpy()
+        return section(vertices, self.tumour.faces, np.linalg.inv(plane.world_from_plane))
 
     def indentation_mm(self) -> float:
         """How deep the transducer is pressed into the settled surface; negative above it."""
@@ -225,8 +250,11 @@ def _shrunk(mesh: trimesh.Trimesh, by_mm: float) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices - by_mm * mesh.vertex_normals, mesh.faces, process=False)
 
 
-def _moved(grid: Grid, origin: np.ndarray) -> np.ndarray:
-    """The grid's map from positions relative to an origin."""
+def scanned_anatomy(organ: trimesh.Trimesh, anatomy: LoadedAnatomy, origin: np.ndarray) -> Anatomy:
+    """What there is to scan, with an origin that the organ has already been moved to. Needs a CT."""
+    ct, labels = anatomy.ct, anatomy.labels
+    assert ct is not None
     shift = np.eye(4)
     shift[:3, 3] = origin
-    return grid.index_from_mm @ shift
+    marks = None if labels is None else labels.voxels.astype(np.uint8)
+    return Anatomy(organ, ct.voxels, ct.index_from_mm @ shift, marks, anatomy.tissues)

@@ -70,8 +70,11 @@ class Record:
             time_step_s=settings.time_step_s,
             substeps=settings.substeps,
             iterations=settings.iterations,
-            slice_width_mm=rehearsal.scene.image.width_mm,
-            slice_depth_mm=rehearsal.scene.image.depth_mm,
+            probe=rehearsal.probe.transducer_name,
+            picture=rehearsal.scene.image.mode,
+            rung=rehearsal.scene.image.rung,
+            slice_width_mm=rehearsal.probe.extent_mm[0],
+            slice_depth_mm=rehearsal.probe.depth_mm,
             steps=rehearsal.steps,
             ms_per_step=spread(self.step_ms[1:] or self.step_ms),
             ms_per_slice=spread(self.slice_ms[1:] or self.slice_ms),
@@ -89,7 +92,7 @@ def summary(report: dict) -> str:
     """The figures that matter, in a few lines for the terminal."""
     step, picture = report["ms_per_step"], report["ms_per_slice"]
     times = (
-        f"{step['median']:.1f} ms a step, {picture['median']:.1f} ms a slice (medians of {report['steps']})"
+        f"{step['median']:.1f} ms a step, {picture['median']:.1f} ms a picture (medians of {report['steps']})"
     )
     return "\n".join(
         [
@@ -97,6 +100,7 @@ def summary(report: dict) -> str:
             f"step      1/{1 / report['time_step_s']:.0f} s in {counted(report['substeps'], 'substep')} of "
             f"{counted(report['iterations'], 'iteration')}",
             f"speed     {times} on {report['arch']}; built in {report['build_s']:.1f} s",
+            f"probe     {report['probe']}; picture {report['picture']}, echo as far as {report['rung']}",
             f"press     {report['indentation_max_mm']:.2f} mm deep; least volume {100 * report['volume_ratio_min']:.1f} %; "
             f"penetration at most {report['max_penetration_mm']:.3f} mm; "
             f"{'all finite' if report['finite'] else 'NOT FINITE'}",

@@ -1,9 +1,11 @@
-"""Which model computes a case, and with what: the presets and what may be changed of them."""
+"""Which model computes a case or a scene, under which probe: the presets, and what may be changed of them."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from scenes.scene import NeoHookeanTissue, Scene, with_options
+from ultrasound.array import Probe, load_probe
 
 
 @dataclass(frozen=True)
@@ -92,3 +94,13 @@ def choose_setup(model: str, quality: str, **changes: Any) -> Setup:
                 f"--{OPTION_OF.get(name, name.replace('_', '-'))}: {model} has no such setting; leave it out"
             )
     return replace(PRESETS[model][quality], **given)
+
+
+def probe_of(scene: Scene, folder: Path | None = None) -> Probe:
+    """The probe that a scene names, with the scene's own depth and housing where it gives them. Raises ProbeError.
+
+    A file is looked for in a folder, the scene's.
+    """
+    own = {"depth_mm": scene.image.depth_mm, "housing_mm": scene.transducer.size_mm}
+    given = {key: value for key, value in own.items() if value is not None}
+    return load_probe(scene.transducer.probe, folder).model_copy(update=given)

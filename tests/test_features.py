@@ -10,7 +10,7 @@ from PIL import Image
 
 import app
 from scenes.anatomy import LoadedAnatomy
-from scenes.scene import EMBEDDED, Press, load_scene
+from scenes.scene import PAPER, Press, load_scene
 from sim.body import ParticleBody
 from sim.contact import ShapeContacts
 from sim.neighbours import ParticleContacts
@@ -54,7 +54,7 @@ def small_anatomy() -> LoadedAnatomy:
 
 
 def body_of(model: str) -> measure.Body:
-    return measure.body_of(load_scene(EMBEDDED), small_anatomy(), model, SIZES[model])
+    return measure.body_of(load_scene(PAPER), small_anatomy(), model, SIZES[model])
 
 
 @pytest.mark.parametrize("model", list(measure.FEATURES))
@@ -119,7 +119,7 @@ def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, cap
 @pytest.mark.parametrize("setup", [NEO_HOOKEAN, Setup(radius_mm=4.0)], ids=lambda setup: setup.model)
 def test_a_soak_ends_where_it_began_and_replays(setup, monkeypatch):
     monkeypatch.setattr(soak, "REST_S", 4.0)
-    scene = load_scene(EMBEDDED).model_copy(update={"press": Press(warm_up_steps=60)})
+    scene = load_scene(PAPER).model_copy(update={"press": Press(warm_up_steps=60)})
     told = []
     found = soak.soak(scene, small_anatomy(), setup, 3, 7.0, "cpu", lambda: told.append(1))
     assert len(found["minutes"]) == 3 and len(told) == 5

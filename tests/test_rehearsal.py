@@ -8,16 +8,18 @@ import pytest
 import SimpleITK as sitk
 import trimesh
 from conftest import DATA
+from slicing import organ_mask
 
 from scenes.anatomy import load_anatomy, patient_scene, phantom_folder
 from scenes.patient import import_patient, save_patient
 from scenes.reading import read_volume
-from scenes.scene import EMBEDDED, Press, Scene, load_scene, with_options
+from scenes.scene import PAPER, Press, Scene, load_scene, with_options
 from sim.device import start
 from sim.skinning import Skin
 from studies.rehearsal import Rehearsal
 from ultrasound.probe import image_plane
 
+LOOK = ("both", "speckle", 350, 40)
 PATIENTS = {
     "phantom": None,
     "crlm right": ("crlm_1004", "crlm_1004_labels/kidneys_provisional.nii.gz", "right"),
@@ -28,7 +30,7 @@ PATIENTS = {
 def patient_in(name: str, tmp_path: Path) -> tuple[Scene, Path]:
     """A coarse scene of a patient, and the folder of its files."""
     if PATIENTS[name] is None:
-        return with_options(load_scene(EMBEDDED), {"tissue.cell_mm": 6.0}), phantom_folder()
+        return with_options(load_scene(PAPER), {"tissue.cell_mm": 6.0}), phantom_folder()
     if not DATA.is_dir():
         pytest.skip("no ../shared/data here")
     ct, labels, side = PATIENTS[name]
@@ -56,12 +58,11 @@ def test_at_rest_the_slice_is_the_ct(device, tmp_path, name):
     rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
     rehearsal.hand.turn(20, 10, 35)
     rehearsal.pose = rehearsal.hand.pose()
-    rehearsal.image(350, 40, 60)
-    plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], scene.image.width_mm, 60)
-    inside = rehearsal.slice.in_organ.to_numpy() == 1
-    difference = np.abs(
-        rehearsal.slice.hu.to_numpy() - resampled(folder, plane, rehearsal.origin, scene.image.pixels)
-    )
+    rehearsal.look(rehearsal.probe, *LOOK)
+    plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], *rehearsal.probe.extent_mm)
+    cut = rehearsal.scanner.slice
+    inside = organ_mask(cut)
+    difference = np.abs(cut.hu.to_numpy() - resampled(folder, plane, rehearsal.origin, scene.image.pixels))
     print(f"{name}: mean {difference[inside].mean():.4f} HU, maximum {difference[inside].max():.3f} HU")
     assert inside.mean() > 0.1
     # The bar is 5 HU; float32 positions (1e-5 mm) in gradients of 500 HU/mm leave far less.
@@ -71,7 +72,7 @@ def test_at_rest_the_slice_is_the_ct(device, tmp_path, name):
 def test_pressing_moves_the_tissue_and_the_slice_follows(device, tmp_path):
     scene, folder = patient_in("phantom", tmp_path)
     rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
-    before = rehearsal.image(350, 40, 60)
+    before = rehearsal.look(rehearsal.probe, *LOOK)
     top = rehearsal.organ_skin.vertices.to_numpy()
     for step in range(31):
         rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
@@ -79,12 +80,15 @@ def test_pressing_moves_the_tissue_and_the_slice_follows(device, tmp_path):
     moved = rehearsal.organ_skin.vertices.to_numpy() - top
     assert rehearsal.indentation_mm() == pytest.approx(12.38)
     assert (moved @ rehearsal.gravity_direction).max() > 6.0
-    assert np.abs(rehearsal.image(350, 40, 60).astype(int) - before).mean() > 10
+    pressed = rehearsal.look(rehearsal.probe, *LOOK)
+    assert list(pressed) == ["B-mode", "CT"]
+    assert all(np.abs(pressed[name].astype(int) - before[name]).mean() > 10 for name in before)
     assert 0.97 < rehearsal.volume_ratio() < 1.0
     assert rehearsal.contacts.measure_penetration() <= 0.5
     rehearsal.reset()
     rehearsal.update_surfaces()
-    assert np.array_equal(rehearsal.image(350, 40, 60), before)
+    after = rehearsal.look(rehearsal.probe, *LOOK)
+    assert all(np.array_equal(after[name], before[name]) for name in before)
     assert rehearsal.indentation_mm() == pytest.approx(0.0, abs=1e-6)
 
 
@@ -93,15 +97,13 @@ def test_a_pixel_shows_the_tissue_that_is_there_now(device, tmp_path):
     rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
     for step in range(31):
         rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
-    rehearsal.image(350, 40, 60)
-    plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], scene.image.width_mm, 60)
-    pixels = np.argwhere(rehearsal.slice.in_organ.to_numpy() == 1)[::1009]
+    rehearsal.look(rehearsal.probe, *LOOK)
+    plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], *rehearsal.probe.extent_mm)
+    pixels = np.argwhere(organ_mask(rehearsal.scanner.slice))[::1009]
     spacing = np.array([plane.width_mm, plane.depth_mm]) / scene.image.pixels
     local = (pixels[:, ::-1] + 0.5) * spacing - [plane.width_mm / 2, 0]
     shown_at = np.column_stack([local, np.zeros(len(local)), np.ones(len(local))]) @ plane.world_from_plane.T
-    owner = rehearsal.slice.owner.to_numpy()[pixels[:, 0], pixels[:, 1]]
-    back = rehearsal.embedding.rest_from_world.to_numpy()[owner]
-    rest = np.einsum("nij,nj->ni", back, shown_at)
+    rest = rehearsal.scanner.plane.rest_grid(scene.image.pixels)[pixels[:, 0], pixels[:, 1]]
     carried = Skin(rehearsal.model, rest).vertices.to_numpy()
     off = np.linalg.norm(carried - shown_at[:, :3], axis=1)
     unmoved = np.linalg.norm(rest - shown_at[:, :3], axis=1)
@@ -120,10 +122,12 @@ def test_two_runs_of_a_scene_give_the_same_bits(tmp_path):
         for step in range(20):
             rehearsal.advance(rehearsal.scripted_pose(step / 20 * rehearsal.script_length_s()))
         state = rehearsal.body.snapshot()
-        picture = rehearsal.image(350, 40, 60)
+        pictures = rehearsal.look(rehearsal.probe, *LOOK)
         digests.append(
             hashlib.sha256(
-                state.position.tobytes() + state.velocity.tobytes() + picture.tobytes()
+                state.position.tobytes()
+                + state.velocity.tobytes()
+                + b"".join(p.tobytes() for p in pictures.values())
             ).hexdigest()
         )
     assert digests[0] == digests[1]
@@ -168,8 +172,8 @@ def test_a_pressed_scene_without_ct_still_moves(device, tmp_path):
     )
     rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
     rehearsal.advance(rehearsal.scripted_pose(1.0))
-    assert rehearsal.slice is None
-    assert not rehearsal.image(350, 40, 60).any()
+    assert rehearsal.scanner is None and rehearsal.rest_grid() is None
+    assert not any(picture.any() for picture in rehearsal.look(rehearsal.probe, *LOOK).values())
 
 
 def test_every_feature_at_once_stays_finite_and_out_of_everything(device, tmp_path):

@@ -7,10 +7,12 @@ import taichi as ti
 import trimesh
 from conftest import rotation_about
 from particle_tissue import tissue_of
+from slicing import organ_mask
 
 from sim.body import BodyState
-from sim.embedding import NOWHERE, Embedding, tetrahedra_around
+from sim.embedding import Embedding, Unmoved, tetrahedra_around
 from sim.skinning import Skin
+from ultrasound.plane import PlaneInTissue
 from ultrasound.probe import image_plane, pose_at
 from ultrasound.slice import Slice
 from ultrasound.volume import Volume, distance_volume
@@ -71,9 +73,10 @@ def sliced(mesh, image: sitk.Image, move=None, pixels: int = 96, outside: str = 
         body.restore(BodyState(x, np.zeros_like(x)))
         model.update_frames()
         embedding.update()
-    cut = Slice(volume_of(image), distance_volume(mesh, 1.0), embedding, pixels, outside)
+    cut = Slice(volume_of(image), distance_volume(mesh, 1.0), PlaneInTissue(embedding, pixels), outside)
     plane = oblique_plane()
-    cut.render(plane, 350.0, 40.0)
+    cut.plane.take(plane)
+    cut.render(350.0, 40.0)
     return cut, plane, model, embedding
 
 
@@ -88,7 +91,7 @@ def test_at_rest_it_is_an_oblique_resample_of_the_ct(device, ball, outside):
     resampled = sitk.GetArrayFromImage(
         sitk.Resample(image, grid, sitk.Transform(), sitk.sitkLinear, -1000.0)
     )[0]
-    hu, inside = cut.hu.to_numpy(), cut.in_organ.to_numpy() == 1
+    hu, inside = cut.hu.to_numpy(), organ_mask(cut)
     assert 0.3 < inside.mean() < 0.9
     # float32 positions of 15 mm carry 1e-6 mm, a barycentric map ten times that; noise of 100 HU/mm.
     assert np.abs(hu - resampled)[inside].max() < 0.05
@@ -103,7 +106,7 @@ def test_under_a_rigid_motion_it_is_the_exact_pull_back(device, ball):
     turn, shift = rotation_about([1, -1, 2], 20), np.array([1.5, -1.0, 2.0])
     cut, plane, _, _ = sliced(ball, ramp_image(), lambda x: x @ turn.T + shift)
     wanted = ((pixel_points(plane, 96) - shift) @ turn) @ GRADIENT
-    inside = cut.in_organ.to_numpy() == 1
+    inside = organ_mask(cut)
     assert inside.mean() > 0.3
     # Frames fitted in float32 turn by 1e-6 at 12 mm; the ramp has 14 HU/mm.
     assert np.abs(cut.hu.to_numpy() - wanted)[inside].max() < 14 * 1e-4
@@ -115,13 +118,13 @@ def test_under_an_affine_deformation_it_is_the_pull_back_within_the_skins_error(
     shift = np.array([0.5, 0.0, -1.0])
     cut, plane, model, embedding = sliced(ball, ramp_image(), lambda x: x @ shear.T + shift)
     wanted = ((pixel_points(plane, 96) - shift) @ np.linalg.inv(shear).T) @ GRADIENT
-    inside = cut.in_organ.to_numpy() == 1
+    inside = organ_mask(cut)
     # A vertex at X goes to R X + (F - R) c, with c the weighted mean of its clusters' centres, instead of to F X: it
     # is off by (F - R)(X - c). Pulled back, that is an error of F^-1 (F - R)(X - c) at most, in any tetrahedron.
     u, _, vt = np.linalg.svd(shear)
     skin = embedding.skin
     centre = np.einsum("vk,vkj->vj", skin.weight.to_numpy(), model.rest_centres[skin.frame.to_numpy()])
-    used = np.unique(cut.owner.to_numpy()[inside])
+    used = np.unique(cut.plane.owner.to_numpy()[inside])
     vertices = np.unique(embedding.tetrahedron.to_numpy()[used])
     off = (skin.rest.to_numpy() - centre)[vertices] @ (np.linalg.inv(shear) @ (shear - u @ vt)).T
     bound = np.linalg.norm(off, axis=1).max() * np.linalg.norm(GRADIENT)
@@ -135,7 +138,7 @@ def test_under_an_affine_deformation_it_is_the_pull_back_within_the_skins_error(
 def test_the_picture_is_the_window(device, ball):
     cut, _, _, _ = sliced(ball, noisy_image())
     wanted = np.clip((cut.hu.to_numpy().astype(float) - 40) / 350 + 0.5, 0, 1) * 255
-    assert np.abs(cut.grey.to_numpy() - wanted).max() <= 0.51
+    assert np.abs(cut.render(350.0, 40.0) - wanted).max() <= 0.51
 
 
 def test_an_unknown_outside_is_refused(device, ball):
@@ -152,12 +155,12 @@ def test_every_pixel_finds_the_tetrahedron_that_holds_it(device, ball):
     corners = vertices[embedding.tetrahedron.to_numpy()]
     edges = np.moveaxis(corners[:, :3] - corners[:, 3:], 1, 2)
     inverse = np.linalg.inv(edges)
-    owner = cut.owner.to_numpy()
+    owner = cut.plane.owner.to_numpy()
     points = pixel_points(plane, 96)
     for row, column in np.random.default_rng(5).integers(0, 96, (300, 2)):
         weights = np.einsum("tij,tj->ti", inverse, points[row, column] - corners[:, 3])
         least = np.minimum(weights.min(axis=1), 1 - weights.sum(axis=1))
-        if owner[row, column] == NOWHERE:
+        if owner[row, column] == embedding.count:
             assert least.max() < 1e-4
         else:
             assert least[owner[row, column]] > -1e-4
@@ -174,9 +177,9 @@ def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(devi
     solid = np.linalg.det(edges) < -0.1
     inverse = np.zeros_like(edges)
     inverse[solid] = np.linalg.inv(edges[solid])
-    points, owner = pixel_points(plane, 96), cut.owner.to_numpy()
+    points, owner = pixel_points(plane, 96), cut.plane.owner.to_numpy()
     overlaps = 0
-    for row, column in np.argwhere(owner != NOWHERE)[::3]:
+    for row, column in np.argwhere(owner != embedding.count)[::3]:
         weights = np.einsum("tij,tj->ti", inverse, points[row, column] - corners[:, 3])
         least = np.minimum(weights.min(axis=1), 1 - weights.sum(axis=1))
         holds = np.flatnonzero(solid & (least > 1e-3))
@@ -189,8 +192,8 @@ def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(devi
 @pytest.mark.parametrize("squash", [(1, 1, 0), (1, 0, 0), (0, 0, 0), (1, 1, -1), (1, 1, 1e-6)])
 def test_flat_collapsed_and_inverted_tissue_still_gives_a_picture(device, ball, squash):
     cut, _, _, embedding = sliced(ball, ramp_image(), lambda x: x * np.array(squash) + [0, 0, 3.0])
-    owner = cut.owner.to_numpy()
-    assert ((owner == NOWHERE) | ((owner >= 0) & (owner < embedding.count))).all()
+    owner = cut.plane.owner.to_numpy()
+    assert ((owner >= 0) & (owner <= embedding.count)).all()
     assert np.isfinite(cut.hu.to_numpy()).all()
 
 
@@ -213,18 +216,83 @@ def test_what_lies_around_the_organ_gives_way_to_it_and_far_away_stays(device, b
 
 def test_surroundings_that_fold_over_the_organ_do_not_cover_it(device, ball):
     embedding = Embedding(tissue_of(ball, RADIUS), ball, 2 * RADIUS, margin_mm=25.0)
-    cut = Slice(volume_of(ramp_image()), distance_volume(ball, 1.0), embedding, 96)
-    plane = oblique_plane()
-    cut.render(plane, 350.0, 40.0)
-    organ, owner = cut.in_organ.to_numpy(), cut.owner.to_numpy()
+    cut = Slice(volume_of(ramp_image()), distance_volume(ball, 1.0), PlaneInTissue(embedding, 96))
+    cut.plane.take(oblique_plane())
+    organ, owner = organ_mask(cut), cut.plane.owner.to_numpy()
     vertices = embedding.skin.vertices.to_numpy()
     outside = np.linalg.norm(embedding.skin.rest.to_numpy(), axis=1) > 12.0 + 2 * RADIUS * np.sqrt(3)
     vertices[outside & (vertices[:, 2] > 0)] -= [0.0, 0.0, 26.0]
     embedding.skin.vertices.from_numpy(vertices)
-    embedding._invert()
-    cut.render(plane, 350.0, 40.0)
-    assert organ.sum() > 1000 and (cut.owner.to_numpy() != owner)[organ == 0].sum() > 100
-    assert (cut.owner.to_numpy() == owner)[organ == 1].all()
+    cut.plane.take(oblique_plane())
+    assert organ.sum() > 1000 and (cut.plane.owner.to_numpy() != owner)[~organ].sum() > 100
+    assert (cut.plane.owner.to_numpy() == owner)[organ].all()
+
+
+def test_what_does_not_move_is_shown_where_it_lies(device, ball):
+    cut = Slice(volume_of(noisy_image()), distance_volume(ball, 1.0), PlaneInTissue(Unmoved(), 96))
+    plane = oblique_plane()
+    cut.plane.take(plane)
+    cut.render(350.0, 40.0)
+    assert np.abs(cut.plane.rest_grid(96) - pixel_points(plane, 96)).max() < 1e-4
+    still, _, _, _ = sliced(ball, noisy_image(), outside="background")
+    assert np.abs(cut.hu.to_numpy() - still.hu.to_numpy()).max() < 0.05
+
+
+def test_a_volume_of_vectors_is_sampled_as_each_of_its_parts(device):
+    voxels = np.random.default_rng(2).normal(size=(5, 4, 3, 2)).astype(np.float32)
+    index_from_mm = np.eye(4)
+    index_from_mm[:3, :3] = rotation_about([1, 2, 3], 30) * 0.8
+    whole, parts = Volume(voxels, index_from_mm), [Volume(voxels[..., k], index_from_mm) for k in range(2)]
+    points = np.random.default_rng(3).uniform(-1.0, 4.0, (200, 3)).astype(np.float32)
+    given, found = ti.Vector.field(3, ti.f32, len(points)), ti.Vector.field(2, ti.f32, len(points))
+    apart = ti.Vector.field(2, ti.f32, len(points))
+    given.from_numpy(points)
+
+    @ti.kernel
+    def ask():
+        for i in given:
+            found[i] = whole.sample(given[i])
+            for k in ti.static(range(2)):
+                apart[i][k] = parts[k].sample(given[i])
+
+    ask()
+    # The compiler may fuse the same sums differently: rounding of values of 4, at a place rounded to 1e-6 of a voxel.
+    assert found.to_numpy() == pytest.approx(apart.to_numpy(), abs=1e-5)
+    assert (found.to_numpy() != -1000.0).any() and (found.to_numpy() == -1000.0).any()
+
+
+def test_the_slope_of_a_volume_is_that_of_its_trilinear_value(device):
+    voxels = np.random.default_rng(4).normal(size=(6, 5, 4, 3)).astype(np.float32)
+    index_from_mm = np.eye(4)
+    index_from_mm[:3, :3] = rotation_about([3, 1, 2], 40) * [1.3, 0.7, 0.9]
+    volume = Volume(voxels, index_from_mm)
+    inside = np.random.default_rng(5).uniform([0.1] * 3, [4.9, 3.9, 2.9], (300, 3))
+    # Away from voxel centres, where the slope jumps, by more than the step of the differences.
+    inside = inside[(np.abs(inside - np.rint(inside)) > 0.02).all(axis=1)]
+    points = inside @ np.linalg.inv(index_from_mm[:3, :3]).T
+    given, slope = ti.Vector.field(3, ti.f32, len(points)), ti.Vector.field(3, ti.f32, len(points))
+    given.from_numpy(points.astype(np.float32))
+
+    @ti.kernel
+    def ask():
+        for i in given:
+            slope[i] = volume.slope(given[i])
+
+    ask()
+
+    def value(p):
+        at = p @ index_from_mm[:3, :3].T
+        base = np.floor(at).astype(int)
+        t, total = at - base, np.zeros(len(p))
+        for corner in np.ndindex(2, 2, 2):
+            weight = np.prod(np.where(corner, t, 1 - t), axis=1)
+            total += weight * voxels[(*(base + corner).T, 0)]
+        return total
+
+    step = 1e-4 * np.eye(3)
+    wanted = np.column_stack([(value(points + h) - value(points - h)) / 2e-4 for h in step])
+    # Along one axis a trilinear value is a cubic at most; float32 of values of 4 over a voxel.
+    assert slope.to_numpy() == pytest.approx(wanted, abs=1e-4)
 
 
 def test_tetrahedra_fill_the_organ_without_gaps(ball):

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 import app
-from scenes.scene import EMBEDDED, load_scene
+from scenes.scene import PAPER, load_scene
 from sim.neo_hookean import LATTICE_SETTINGS
 from studies.case import load_case
 from studies.experiment import Experiment
@@ -47,7 +47,7 @@ def test_the_presets_are_points_of_the_measured_front():
     assert np.diff([p.ms_median for p in chosen]).min() > 0
     assert np.diff([p.error_mean_mm for p in chosen]).max() < 0
     assert {p.setup.model for p in front_of(points, "shape-matching")} == {"shape-matching"}
-    scene = load_scene(EMBEDDED)
+    scene = load_scene(PAPER)
     assert scene.tissue.cell_mm == PRESETS["neo-hookean"]["balanced"].cell_mm
     assert LATTICE_SETTINGS.iterations == PRESETS["neo-hookean"]["balanced"].iterations
 
@@ -81,7 +81,7 @@ def test_settings_near_measured_ones_have_an_expected_error():
 
 def test_a_scene_has_the_settings_of_the_setup_it_was_made_with():
     for setup in (PRESETS["neo-hookean"]["fast"], Setup(radius_mm=3.0, stiffness=0.5, substeps=2)):
-        scene = scene_of(load_scene(EMBEDDED), setup)
+        scene = scene_of(load_scene(PAPER), setup)
         step = scene.solver
         assert setup_of_scene(scene, step.substeps, step.iterations, step.relaxation_factor) == setup
 

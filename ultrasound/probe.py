@@ -10,7 +10,7 @@ import igl
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from ultrasound.slice import ImagePlane
+from ultrasound.plane import ImagePlane
 
 # How wide a patch of surface the probe's axis is perpendicular to, as a hand would hold it.
 NORMAL_PATCH_MM = 12.0
@@ -34,12 +34,14 @@ def pose_at(
     return pose
 
 
-def image_plane(pose: np.ndarray, length_mm: float, width_mm: float, depth_mm: float) -> ImagePlane:
+def image_plane(
+    pose: np.ndarray, length_mm: float, width_mm: float, depth_mm: float, above_mm: float = 0.0
+) -> ImagePlane:
     """The plane under the transducer's face: x to the marked side, y down into the tissue, origin at the face."""
     plane_in_transducer = np.array(
         [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, -length_mm / 2], [0.0, 0.0, 0.0, 1.0]]
     )
-    return ImagePlane(pose @ plane_in_transducer, width_mm, depth_mm)
+    return ImagePlane(pose @ plane_in_transducer, width_mm, depth_mm, above_mm)
 
 
 def indentation(pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray) -> float:

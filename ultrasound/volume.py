@@ -15,35 +15,70 @@ FAR_MM = 1e6
 class Volume:
     """Voxels (nx, ny, nz) float32 with the affine map (4, 4) that takes mm to voxel indices.
 
-    Index (0, 0, 0) is the centre of the first voxel. ``outside`` is the value beyond the outer half voxel.
+    Index (0, 0, 0) is the centre of the first voxel. ``outside`` is the value beyond the outer half voxel. With a last
+    axis (nx, ny, nz, c) every voxel holds a vector of c values, which are sampled together.
     """
 
     def __init__(self, voxels: np.ndarray, index_from_mm: np.ndarray, outside: float = AIR_HU) -> None:
-        self.shape = voxels.shape
+        # Between the last voxel and the next there is no weight, but the next must be there.
+        thin = [(0, 1 if n == 1 else 0) for n in voxels.shape[:3]]
+        filled = np.pad(np.asarray(voxels, np.float32), thin + [(0, 0)] * (voxels.ndim - 3), mode="edge")
+        self.shape, self.count = voxels.shape[:3], filled.shape[:3]
         self.outside = float(outside)
-        self.voxels = ti.field(ti.f32, self.shape)
-        self.voxels.from_numpy(np.ascontiguousarray(voxels, np.float32))
+        self.strides = self.count[1] * self.count[2], self.count[2]
+        flat = np.ascontiguousarray(filled).reshape(-1, *voxels.shape[3:])
+        if voxels.ndim == 4:
+            self.voxels = ti.Vector.field(voxels.shape[3], ti.f32, len(flat))
+        else:
+            self.voxels = ti.field(ti.f32, len(flat))
+        self.voxels.from_numpy(flat)
         self.linear = ti.Matrix(index_from_mm[:3, :3].tolist())
         self.offset = ti.Vector(index_from_mm[:3, 3].tolist())
 
     @ti.func
-    def sample(self, p):
-        """Trilinear value at p [mm]."""
+    def place(self, p):
+        """Where p [mm] lies: the first of the eight voxels around it, the way on to the next ones (0 to 1), whether inside."""
         at = self.linear @ p + self.offset
         last = tm.vec3(self.shape[0] - 1, self.shape[1] - 1, self.shape[2] - 1)
-        value = self.outside
-        if (at >= -0.5).all() and (at <= last + 0.5).all():
-            clamped = ti.math.clamp(at, 0.0, last)
-            base = ti.cast(clamped, ti.i32)
-            t = clamped - base
-            value = 0.0
-            for corner in ti.static(ti.grouped(ti.ndrange(2, 2, 2))):
-                weight = 1.0
-                for axis in ti.static(range(3)):
-                    weight *= t[axis] if ti.static(corner[axis] == 1) else 1.0 - t[axis]
-                # At the last voxel the next one has no weight, but must be there.
-                value += weight * self.voxels[ti.min(base + corner, ti.cast(last, ti.i32))]
+        inside = (at >= -0.5).all() and (at <= last + 0.5).all()
+        clamped = tm.clamp(at, 0.0, last)
+        most = ti.Vector([self.count[0] - 2, self.count[1] - 2, self.count[2] - 2])
+        base = ti.min(ti.cast(clamped, ti.i32), most)
+        return base.x * self.strides[0] + base.y * self.strides[1] + base.z, clamped - base, inside
+
+    @ti.func
+    def sample(self, p):
+        """Trilinear value at p [mm]."""
+        first, t, inside = self.place(p)
+        value = self.voxels[0] * 0.0 + self.outside
+        if inside:
+            x, y = ti.static(self.strides)
+            low = tm.mix(self.along_z(first, t.z), self.along_z(first + y, t.z), t.y)
+            high = tm.mix(self.along_z(first + x, t.z), self.along_z(first + x + y, t.z), t.y)
+            value = tm.mix(low, high, t.x)
         return value
+
+    @ti.func
+    def along_z(self, voxel, t):
+        return tm.mix(self.voxels[voxel], self.voxels[voxel + 1], t)
+
+    @ti.func
+    def slope(self, p):
+        """Gradient [1/mm] of the trilinear first value at p [mm]; zero outside."""
+        first, t, inside = self.place(p)
+        along = tm.vec3(0.0)
+        if inside:
+            x, y = ti.static(self.strides)
+            low = tm.vec4([self.voxels[first + i][0] for i in ti.static((0, y, x, x + y))])
+            high = tm.vec4([self.voxels[first + i + 1][0] for i in ti.static((0, y, x, x + y))])
+            at_y = tm.mix(
+                tm.vec2(high.x - low.x, high.z - low.z), tm.vec2(high.y - low.y, high.w - low.w), t.y
+            )
+            ends = tm.mix(low, high, t.z)
+            along.z = tm.mix(at_y.x, at_y.y, t.x)
+            along.y = tm.mix(ends.y - ends.x, ends.w - ends.z, t.x)
+            along.x = tm.mix(ends.z, ends.w, t.y) - tm.mix(ends.x, ends.y, t.y)
+        return self.linear.transpose() @ along
 
 
 def distance_volume(surface: trimesh.Trimesh, spacing_mm: float = 2.0, reach_mm: float = 6.0) -> Volume:

@@ -18,12 +18,13 @@ from sim.embedding import Embedding
 from sim.shapes import GRID_MM, ConvexTool, SignedDistanceField
 from sim.solver import Solver
 from studies.models import AnyTissue, build_solver, embedding_cell_mm, fill, reach_of, step_settings
-from studies.rehearsal import SURROUNDINGS_MM, Rehearsal
+from studies.rehearsal import SURROUNDINGS_MM, Rehearsal, scanned_anatomy
 from studies.report import timed
+from studies.setup import probe_of
 from studies.timing.measure import memory_mb
+from ultrasound.array import Mode, Rung
 from ultrasound.probe import advanced, between, image_plane, pose_at, touching
-from ultrasound.slice import Slice
-from ultrasound.volume import Volume, distance_volume
+from ultrasound.scanner import Scanner
 
 # A press so deep, in so many steps; those before it settle.
 PRESS_MM, PRESS_STEPS, SETTLE_STEPS = 8.0, 60, 30
@@ -88,7 +89,7 @@ class Body:
         down = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
         x, y, z = (1e3 * scene.gravity.acceleration_m_s2 * down).tolist()
         self.settings.gravity = (x, y, z)
-        self.size_mm = np.array(scene.transducer.size_mm)
+        self.size_mm = np.array(probe_of(scene).housing_mm)
         side = np.eye(3)[np.abs(down).argmin()]
         pose = pose_at(np.zeros(3), down, side, self.size_mm[2])
         self.home = touching(pose, self.size_mm, self.organ.vertices)
@@ -198,21 +199,31 @@ def of_frame(scene: Scene, anatomy: LoadedAnatomy, arch: str) -> Iterator[dict[s
         )
     if anatomy.ct is None:
         return
-    image = scene.image
-    ct = Volume(anatomy.ct.voxels, anatomy.ct.index_from_mm @ _shift(rehearsal.origin))
-    plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], image.width_mm, image.depth_mm)
-    for name, margin, outside in (
-        ("picture, organ alone", 0.0, "gel"),
-        ("picture, with surroundings", SURROUNDINGS_MM, "background"),
-    ):
-        embedding = Embedding(rehearsal.model, rehearsal.organ, embedding_cell_mm(scene.tissue), margin)
-        view = Slice(ct, distance_volume(rehearsal.organ), embedding, image.pixels, outside)
+    yield from _pictures(rehearsal, anatomy)
+
+
+def _pictures(rehearsal: Rehearsal, anatomy: LoadedAnatomy) -> Iterator[dict[str, Any]]:
+    """The rungs of the picture's ladder, each with all that it needs."""
+    image, probe = rehearsal.scene.image, rehearsal.probe
+    scanned = scanned_anatomy(rehearsal.organ, anatomy, rehearsal.origin)
+    plane = image_plane(rehearsal.pose_at_depth(1.0), probe.housing_mm[2], *probe.extent_mm)
+    ladder: tuple[tuple[str, float, str, Mode, Rung], ...] = (
+        ("CT, organ alone", 0.0, "gel", "ct", "speckle"),
+        ("CT", SURROUNDINGS_MM, "background", "ct", "speckle"),
+        ("echo: reflection, attenuation", SURROUNDINGS_MM, "background", "b-mode", "reflection"),
+        ("echo: and speckle", SURROUNDINGS_MM, "background", "b-mode", "speckle"),
+        ("echo: and elevation", SURROUNDINGS_MM, "background", "b-mode", "elevation"),
+        ("echo and CT", SURROUNDINGS_MM, "background", "both", "speckle"),
+    )
+    for name, margin, outside, mode, rung in ladder:
+        cell = embedding_cell_mm(rehearsal.scene.tissue)
+        embedding = Embedding(rehearsal.model, rehearsal.organ, cell, margin)
+        scanner = Scanner(scanned, embedding, probe, image.pixels, outside)
 
         def draw() -> None:
-            embedding.update()
-            view.render(plane, image.window_hu, image.level_hu)
+            scanner.look(plane, probe, mode, rung, image.window_hu, image.level_hu)
 
-        yield _alone(name, draw, [embedding, view], rehearsal.model)
+        yield _alone(f"picture, {name}", draw, [embedding, scanner], rehearsal.model)
 
 
 def _alone(name: str, work: Callable[[], Any], owners: list, apart: Any) -> dict[str, Any]:
@@ -231,9 +242,3 @@ def _alone(name: str, work: Callable[[], Any], owners: list, apart: Any) -> dict
 
 def _shifted(mesh: trimesh.Trimesh, by: np.ndarray) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices + by, mesh.faces, process=False)
-
-
-def _shift(origin: np.ndarray) -> np.ndarray:
-    moved = np.eye(4)
-    moved[:3, 3] = origin
-    return moved

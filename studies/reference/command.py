@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 
 from scenes.anatomy import load_anatomy
-from scenes.scene import EMBEDDED, load_scene
+from scenes.scene import PAPER, load_scene
 from studies.commands import Fault, make_folder
 
 
@@ -32,8 +32,8 @@ def reference(out: Path, edge_mm: float) -> None:
         raise Fault(
             f"the reference needs {error.name}, which is not installed: pip install -r requirements-dev.txt"
         ) from None
-    scene = load_scene(EMBEDDED)
-    anatomy = load_anatomy(scene, EMBEDDED.parent)
+    scene = load_scene(PAPER)
+    anatomy = load_anatomy(scene, PAPER.parent)
     support = anatomy.shapes[0]
     assert isinstance(support, trimesh.Trimesh)
     try:

@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 
 from scenes.anatomy import load_anatomy
-from scenes.scene import EMBEDDED, Contact, SolverSection, load_scene, with_options
+from scenes.scene import PAPER, Contact, SolverSection, load_scene, with_options
 from sim.body import Body, ParticleBody, RestBody
 from sim.contact import ShapeContacts
 from sim.device import start
@@ -107,8 +107,8 @@ def _kidney(model: str) -> Patient:
     size = (
         {"tissue.cell_mm": fast.cell_mm} if model == "neo-hookean" else {"tissue.radius_mm": fast.radius_mm}
     )
-    scene = load_scene(EMBEDDED)
-    anatomy = replace(load_anatomy(scene, EMBEDDED.parent), ct=None)
+    scene = load_scene(PAPER)
+    anatomy = replace(load_anatomy(scene, PAPER.parent), ct=None)
     rehearsal = Rehearsal(with_options(scene, {"tissue.model": model, **size}), anatomy)
     # What is measured from is where the tissue does not move any more.
     away = advanced(rehearsal.hand.home, -AWAY_MM)
@@ -139,7 +139,7 @@ def _filled(
 ) -> tuple[Solver, StepSettings]:
     size = subject.size_mm or SIZE_MM[model]
     name = "tissue.cell_mm" if model == "neo-hookean" else "tissue.radius_mm"
-    tissue = with_options(load_scene(EMBEDDED), {"tissue.model": model, name: size}).tissue
+    tissue = with_options(load_scene(PAPER), {"tissue.model": model, name: size}).tissue
     scaling = np.log(subject.mass_ratio) / np.ptp(mesh.bounds[:, 2])
     section = SolverSection(mass_scaling_per_mm=min(float(scaling), 1.0))
     contact = Contact(particles=subject.kind == "two" and model == "shape-matching")

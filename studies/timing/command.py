@@ -9,7 +9,7 @@ import click
 from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy
-from scenes.scene import EMBEDDED, load_scene
+from scenes.scene import PAPER, load_scene
 from studies.commands import arch_option, make_folder, start_taichi
 from studies.setup import PRESETS, Setup
 
@@ -35,7 +35,7 @@ COLUMNS = (
 
 
 @click.command()
-@click.argument("scene", type=click.Path(path_type=Path), default=EMBEDDED, required=False)
+@click.argument("scene", type=click.Path(path_type=Path), default=PAPER, required=False)
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for tables and pictures.")
 @click.option("--quick", is_flag=True, help="Fewer sizes and shorter presses, in less than a minute.")
 @arch_option

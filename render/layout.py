@@ -1,0 +1,119 @@
+"""Where each part of the window lies. Pixels count from the top left."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+PANEL_SHARE = 0.37
+TITLE_HEIGHT = 42
+STRIP_HEIGHT, READOUT_SHARE = 144, 0.19
+HEADER_HEIGHT, FOOTER_HEIGHT = 74, 34
+RULER_WIDTH, WEDGE_WIDTH, PICTURE_GAP = 46, 34, 10
+ASIDE_WIDTH = 186
+
+
+class Rect(NamedTuple):
+    """Pixels: left, top, width, height."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    @property
+    def right(self) -> int:
+        return self.left + self.width
+
+    @property
+    def bottom(self) -> int:
+        return self.top + self.height
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Rows and columns, to index a picture."""
+        return slice(self.top, self.bottom), slice(self.left, self.right)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where each part of the window lies, for a window of width x height pixels."""
+
+    width: int
+    height: int
+
+    @property
+    def panel(self) -> Rect:
+        width = round(self.width * PANEL_SHARE)
+        return Rect(self.width - width, 0, width, self.height)
+
+    @property
+    def strip(self) -> Rect:
+        """Sliders and read-outs, beneath the 3D view."""
+        height = min(STRIP_HEIGHT, self.height // 3)
+        return Rect(0, self.height - height, self.panel.left, height)
+
+    @property
+    def title(self) -> Rect:
+        return Rect(0, 0, self.panel.left, TITLE_HEIGHT)
+
+    @property
+    def scene(self) -> Rect:
+        """The 3D view."""
+        return Rect(0, TITLE_HEIGHT, self.panel.left, self.strip.top - TITLE_HEIGHT)
+
+    @property
+    def readouts(self) -> Rect:
+        width = round(self.strip.width * READOUT_SHARE)
+        return Rect(self.strip.right - width, self.strip.top, width, self.strip.height)
+
+    def sliders(self, widths: list[float]) -> list[Rect]:
+        """Boxes for groups of sliders, side by side in the strip; `widths` share out the room."""
+        gap = 6
+        room = self.readouts.left - gap * (len(widths) + 1)
+        edges = np.concatenate([[0.0], np.cumsum(widths)]) / sum(widths) * room
+        return [
+            Rect(
+                round(gap * (i + 1) + edges[i]),
+                self.strip.top + gap,
+                round(edges[i + 1] - edges[i]),
+                self.strip.height - 2 * gap,
+            )
+            for i in range(len(widths))
+        ]
+
+    @property
+    def help(self) -> Rect:
+        width, height = min(560, self.scene.width - 24), min(446, self.scene.height - 24)
+        return Rect(
+            (self.scene.width - width) // 2, self.scene.top + (self.scene.height - height) // 2, width, height
+        )
+
+    def picture_boxes(self, count: int, width_mm: float, depth_mm: float, aside_px: int = 0) -> list[Rect]:
+        """The largest boxes side by side in the panel with the shape of the image plane; ruler, texts and what is aside left free.
+
+        Raises ValueError unless both lengths are positive.
+        """
+        if not (width_mm > 0 and depth_mm > 0):
+            raise ValueError(f"image plane of {width_mm} x {depth_mm} mm: both lengths must be positive")
+        room_x = self.panel.width - RULER_WIDTH - WEDGE_WIDTH - aside_px
+        room_y = self.panel.height - HEADER_HEIGHT - FOOTER_HEIGHT
+        scale = min((room_x - (count - 1) * PICTURE_GAP) / count / width_mm, room_y / depth_mm)
+        width, height = max(1, round(width_mm * scale - 0.5)), max(1, round(depth_mm * scale))
+        left = self.panel.left + RULER_WIDTH + (room_x - count * width - (count - 1) * PICTURE_GAP) // 2
+        return [Rect(left + i * (width + PICTURE_GAP), HEADER_HEIGHT, width, height) for i in range(count)]
+
+    def aside(self, heights: list[int]) -> list[Rect]:
+        """Boxes of the scanner's sliders, one under the other at the panel's right edge."""
+        tops = np.cumsum([HEADER_HEIGHT, *(height + 6 for height in heights[:-1])])
+        left = self.panel.right - ASIDE_WIDTH
+        return [Rect(left, int(top), ASIDE_WIDTH - 8, h) for top, h in zip(tops, heights, strict=True)]
+
+    def window_coordinates(self, rect: Rect) -> tuple[float, float, float, float]:
+        """Left, bottom, right, top with (0, 0) at the bottom left and (1, 1) at the top right of the window."""
+        return (
+            rect.left / self.width,
+            1 - rect.bottom / self.height,
+            rect.right / self.width,
+            1 - rect.top / self.height,
+        )

@@ -1,0 +1,153 @@
+"""The ultrasound panel as on a scanner: pictures, ruler, focus, marker dot, settings, outline and calliper. NumPy and Pillow.
+
+Pixels count from the top left. Places on the image plane are (u, v) [mm]: u from the middle to the right, v down from the face.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from render.layout import Layout, Rect
+
+PANEL, LINE = (8, 9, 11), (44, 50, 58)
+TEXT, QUIET = (222, 227, 232), (132, 142, 153)
+MARK, ALERT = (64, 196, 255), (255, 176, 46)
+OUTLINE, CALLIPER = (237, 194, 71), (120, 230, 140)
+CROSS_PX = 5
+
+
+@dataclass(frozen=True)
+class Panel:
+    """What the panel says around its pictures. All of it stays the same for many frames.
+
+    ``captions`` are the probe's name, above, and what the echo and the CT are shown with, below. ``aside_px`` is left free at
+    the right of the pictures.
+    """
+
+    names: tuple[str, ...]
+    width_mm: float
+    depth_mm: float
+    above_mm: float = 0.0
+    focus_mm: float | None = None
+    captions: tuple[str, str, str] = ("", "", "")
+    title: str = ""
+    status: str = ""
+    marked_side: str = "right"
+    aside_px: int = 0
+
+    def boxes(self, layout: Layout) -> list[Rect]:
+        """Where the pictures lie, one for each name."""
+        return layout.picture_boxes(len(self.names), self.width_mm, self.depth_mm, self.aside_px)
+
+    def to_pixels(self, box: Rect, places_mm: np.ndarray) -> np.ndarray:
+        """Columns and rows (..., 2), as fractions, of places (..., 2) on the plane."""
+        share = (places_mm + [self.width_mm / 2, self.above_mm]) / [self.width_mm, self.depth_mm]
+        return share * [box.width, box.height] + [box.left, box.top]
+
+    def to_plane(self, box: Rect, column: float, row: float) -> tuple[float, float]:
+        """The place on the plane [mm] under a pixel."""
+        across, down = (column - box.left) / box.width, (row - box.top) / box.height
+        return (across - 0.5) * self.width_mm, down * self.depth_mm - self.above_mm
+
+
+@lru_cache(maxsize=16)
+def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """The font of all texts."""
+    return ImageFont.load_default(size=size)
+
+
+def ruler_ticks(panel: Panel, box: Rect) -> list[tuple[int, int | None]]:
+    """Ticks every 5 mm of depth under the face: (row in pixels, whole centimetres or None between them)."""
+    ticks = []
+    for half_cm in range(int((panel.depth_mm - panel.above_mm) / 5.0 + 1e-9) + 1):
+        share = (panel.above_mm + half_cm * 5.0) / panel.depth_mm
+        ticks.append((box.top + round(share * (box.height - 1)), half_cm // 2 if half_cm % 2 == 0 else None))
+    return ticks
+
+
+def marker_centre(box: Rect, marked_side: str) -> tuple[int, int]:
+    """Centre (x, y) of the marker dot, above the picture at its marked side. Raises ValueError for another side."""
+    if marked_side not in ("left", "right"):
+        raise ValueError(f"marked_side is {marked_side!r}: it must be 'left' or 'right'")
+    return (box.left + 9 if marked_side == "left" else box.right - 10), box.top - 12
+
+
+def paste_picture(page: np.ndarray, box: Rect, picture: np.ndarray) -> None:
+    """Put a picture, uint8 (rows, columns), into its box; one of the box's own size is not resampled."""
+    if picture.shape != (box.height, box.width):
+        resized = Image.fromarray(picture).resize((box.width, box.height), Image.Resampling.BILINEAR)
+        picture = np.asarray(resized)
+    rows, columns = box.slices
+    for channel in range(3):
+        page[rows, columns, channel] = picture
+
+
+def draw_segments(page: np.ndarray, panel: Panel, box: Rect, segments_mm: np.ndarray, colour) -> None:
+    """Draw line segments (n, 2, 2) of the plane [mm] over the picture in a box, as far as they are in it."""
+    if len(segments_mm) == 0:
+        return
+    start, end = np.moveaxis(panel.to_pixels(box, np.asarray(segments_mm, float)), 1, 0)
+    count = int(np.ceil(np.abs(end - start).max())) + 1
+    along = np.linspace(0.0, 1.0, count + 1)[:, None, None]
+    column, row = np.floor(start + along * (end - start)).astype(int).reshape(-1, 2).T
+    inside = (column >= box.left) & (column < box.right) & (row >= box.top) & (row < box.bottom)
+    page[row[inside], column[inside], :3] = colour
+
+
+def calliper_segments(panel: Panel, box: Rect, points_mm: tuple[tuple[float, float], ...]) -> np.ndarray:
+    """A cross at each of up to two points and the line between them, (n, 2, 2) [mm]."""
+    reach = CROSS_PX * np.array([panel.width_mm / box.width, panel.depth_mm / box.height])
+    segments = []
+    for point in np.array(points_mm, float).reshape(-1, 2):
+        segments += [[point - reach * axis, point + reach * axis] for axis in np.eye(2)]
+    if len(points_mm) == 2:
+        segments.append(list(np.array(points_mm, float)))
+    return np.array(segments).reshape(-1, 2, 2)
+
+
+def draw_panel(draw: ImageDraw.ImageDraw, layout: Layout, panel: Panel) -> None:
+    """All of the panel but its pictures."""
+    area, boxes = layout.panel, panel.boxes(layout)
+    draw.rectangle([area.left, area.top, area.right, area.bottom], fill=PANEL)
+    draw.line([(area.left, 0), (area.left, area.bottom)], fill=LINE)
+    probe, echo, ct = panel.captions
+    depth = f"Depth {(panel.depth_mm - panel.above_mm) / 10:.1f} cm"
+    draw.text((area.left + 16, 12), probe, font=font(17), fill=TEXT)
+    draw.text((area.right - 16, 13), depth, font=font(14), fill=TEXT, anchor="ra")
+    draw.text((area.left + 16, area.bottom - 25), echo, font=font(14), fill=QUIET)
+    draw.text((area.right - 16, area.bottom - 25), ct, font=font(14), fill=QUIET, anchor="ra")
+    if panel.status:
+        draw.text(((area.left + area.right) // 2, 40), panel.status, font=font(17), fill=ALERT, anchor="mm")
+    _draw_ruler(draw, panel, boxes[0])
+    _draw_wedge(draw, boxes[-1])
+    for name, box in zip(panel.names, boxes, strict=True):
+        x, y = marker_centre(box, panel.marked_side)
+        draw.ellipse([x - 6, y - 6, x + 6, y + 6], fill=MARK)
+        left, anchor = (box.left, "lm") if panel.marked_side == "right" else (box.right, "rm")
+        draw.text((left, y), name, font=font(14), fill=TEXT, anchor=anchor)
+
+
+def _draw_ruler(draw: ImageDraw.ImageDraw, panel: Panel, box: Rect) -> None:
+    x = box.left - 6
+    for row, centimetres in ruler_ticks(panel, box):
+        length = 5 if centimetres is None else 10
+        draw.line([(x - length, row), (x, row)], fill=QUIET if centimetres is None else TEXT)
+        if centimetres:
+            draw.text((x - 15, row), str(centimetres), font=font(13), fill=TEXT, anchor="rm")
+        elif centimetres == 0:
+            draw.text((x - 15, row), "cm", font=font(12), fill=QUIET, anchor="rm")
+    if panel.focus_mm is not None:
+        row = panel.to_pixels(box, np.array([0.0, panel.focus_mm]))[1]
+        draw.polygon([(x + 4, row), (x - 4, row - 5), (x - 4, row + 5)], fill=ALERT)
+
+
+def _draw_wedge(draw: ImageDraw.ImageDraw, box: Rect) -> None:
+    """The grey scale, white at the top, as a scanner shows it beside its picture."""
+    height = min(128, box.height)
+    for i in range(height):
+        grey = 255 - i * 255 // max(1, height - 1)
+        draw.line([(box.right + 12, box.top + i), (box.right + 19, box.top + i)], fill=(grey, grey, grey))

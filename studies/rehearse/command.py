@@ -1,0 +1,143 @@
+"""The command ``rehearse``: press a kidney, in a window or without one."""
+
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from scenes.anatomy import LoadedAnatomy, load_anatomy
+from scenes.scene import EMBEDDED, OPTIONS, TISSUES, Scene, load_scene, with_options
+from studies.commands import Fault, arch_option, make_folder, start_taichi
+from studies.setup import Setup, probe_of, scene_of
+from ultrasound.array import MODES, RUNGS, Probe
+
+if TYPE_CHECKING:
+    from studies.rehearsal import Rehearsal
+
+# What a budget leaves to the user.
+MATERIAL = ("tissue.model", "tissue.young_kpa", "tissue.poisson")
+
+
+@click.command()
+@click.argument("scene", type=click.Path(path_type=Path), default=EMBEDDED, required=False)
+@click.option(
+    "--headless", is_flag=True, help="No window: run the scripted press, write pictures and a report."
+)
+@click.option(
+    "--seconds", type=click.FloatRange(0.02, 3600), help="Simulated seconds for the press [the scene's]."
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("out"),
+    show_default=True,
+    help="Folder for pictures and the report.",
+)
+@arch_option
+@click.option("--model", type=click.Choice(list(TISSUES)), help="Tissue model [the scene's].")
+@click.option("--cell", type=float, help="neo-hookean: width of a cell in mm [the scene's].")
+@click.option("--young-kpa", type=float, help="neo-hookean: Young's modulus in kPa [the scene's].")
+@click.option("--poisson", type=float, help="neo-hookean: Poisson's ratio [the scene's].")
+@click.option("--radius", type=float, help="shape-matching: particle radius in mm [the scene's].")
+@click.option("--stiffness", type=float, help="shape-matching: cluster stiffness, 0 to 1 [the scene's].")
+@click.option("--substeps", type=int, help="Substeps of a time step [the model's].")
+@click.option("--iterations", type=int, help="Passes over the constraints in a substep [the model's].")
+@click.option("--probe", help="Probe, by its name or as a file [the scene's].")
+@click.option("--picture", type=click.Choice(MODES), help="Echo, CT or both [the scene's].")
+@click.option("--rung", type=click.Choice(RUNGS), help="How much of the echo is computed [the scene's].")
+@click.option(
+    "--budget-ms",
+    type=click.FloatRange(0.01, 10_000),
+    help="Choose size and passes: the truest whose step takes no longer on this machine, measured first.",
+)
+@click.option(
+    "--error-mm",
+    type=click.FloatRange(0, 100),
+    help="Choose size and passes: the fastest whose mean error, as study trade measured it, is no larger.",
+)
+def rehearse(
+    scene: Path,
+    headless: bool,
+    seconds: float | None,
+    out: Path,
+    arch: str,
+    budget_ms: float | None,
+    error_mm: float | None,
+    **changes: float | str | None,
+) -> None:
+    """Press the kidney of SCENE, a scene file or a patient's folder, and see what the transducer sees."""
+    path = scene / "scene.toml" if scene.is_dir() else scene
+    if scene.is_dir() and not path.is_file():
+        raise Fault(f"{scene}: holds no scene.toml; make a patient's folder of a CT with: app.py import")
+    changed = {key: changes[option.strip("-").replace("-", "_")] for key, option in OPTIONS.items()}
+    if changed["transducer.probe"] and Path(str(changed["transducer.probe"])).is_file():
+        changed["transducer.probe"] = str(Path(str(changed["transducer.probe"])).resolve())
+    before = load_scene(path)
+    loaded = with_options(before, changed)
+    if changed["tissue.model"] is None and loaded.tissue.model != before.tissue.model:
+        click.echo(f"Tissue model: {loaded.tissue.model}, as the options ask for it.")
+    anatomy = load_anatomy(loaded, path.parent)
+    probe = probe_of(loaded, path.parent)
+    budgeted = budget_ms is not None or error_mm is not None
+    if budgeted:
+        refuse_sizes(changed)
+    used = start_taichi(arch)
+    from render.window import display_available
+    from studies.rehearsal import Rehearsal
+
+    if not headless and not display_available():
+        click.echo("No display: running the scripted press without a window.")
+        headless = True
+    make_folder(out)
+    click.echo("Building the model.")
+    started = perf_counter()
+    if budgeted:
+        model = changed["tissue.model"]
+        rehearsal = build_within(loaded, anatomy, probe, used, model, budget_ms, error_mm)
+    else:
+        rehearsal = Rehearsal(loaded, anatomy, probe)
+    if headless:
+        from studies.rehearse.headless import run_headless
+
+        run_headless(rehearsal, used, seconds, out, perf_counter() - started)
+    else:
+        from studies.rehearse.loop import run_window
+
+        run_window(rehearsal, out, budget_ms)
+
+
+def refuse_sizes(changed: dict[str, float | str | None]) -> None:
+    """Raises Fault where the command line gives both a budget and what the budget is to choose."""
+    for key, value in changed.items():
+        chosen = key.startswith(("tissue.", "solver.")) and key not in MATERIAL
+        if value is not None and chosen:
+            raise Fault(f"{OPTIONS[key]}: --budget-ms and --error-mm choose this; leave one of them out")
+
+
+def build_within(
+    scene: Scene,
+    anatomy: LoadedAnatomy,
+    probe: Probe,
+    arch: str,
+    model: Any,
+    budget_ms: float | None,
+    error_mm: float | None,
+) -> "Rehearsal":
+    """The rehearsal with the settings that fit the budgets on this machine. Raises Fault."""
+    from studies.rehearsal import Rehearsal
+    from studies.trade.choice import NoPoint, choose, described
+    from studies.trade.front import front_of, load_points
+
+    def build(setup: Setup) -> Rehearsal:
+        start_taichi(arch)
+        return Rehearsal(scene_of(scene, setup), anatomy, probe)
+
+    try:
+        rehearsal, point, step_ms = choose(front_of(load_points(), model), build, budget_ms, error_mm)
+    except NoPoint as reason:
+        raise Fault(str(reason)) from None
+    click.echo(
+        f"Chosen: {described(point.setup)}; a step takes {step_ms:.1f} ms here, expected error {point.error_mean_mm:.2f} mm."
+    )
+    return rehearsal

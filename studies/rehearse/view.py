@@ -1,0 +1,133 @@
+"""What one frame of a rehearsal shows: pictures, read-outs, and what the sliders start from."""
+
+from functools import partial
+
+import numpy as np
+
+from render.viewer import Geometry, Settings, View, Viewer
+from scenes.scene import NeoHookeanTissue
+from studies.rehearsal import Rehearsal
+from studies.report import Record, timed
+from ultrasound.array import TGC_SLIDERS, Probe
+
+TGC = tuple(f"tgc_{i + 1}" for i in range(TGC_SLIDERS))
+
+
+def settings_of(rehearsal: Rehearsal) -> Settings:
+    """What the sliders start from."""
+    scene, step, probe = rehearsal.scene, rehearsal.settings, rehearsal.probe
+    tissue = scene.tissue
+    settings = Settings(
+        young_kpa=tissue.young_kpa if isinstance(tissue, NeoHookeanTissue) else None,
+        stiffness=None if isinstance(tissue, NeoHookeanTissue) else step.stiffness,
+        iterations=step.iterations,
+        substeps=step.substeps,
+        gravity_m_s2=scene.gravity.acceleration_m_s2,
+        window_hu=round(scene.image.window_hu),
+        level_hu=round(scene.image.level_hu),
+        depth_mm=round(probe.depth_mm),
+        gain_percent=round(probe.gain_percent),
+        dyn_range_db=round(probe.dyn_range_db),
+        frequency_mhz=probe.frequency_mhz,
+        focus_percent=round(probe.focus_depth_percent),
+        mode=scene.image.mode,
+        rung=scene.image.rung,
+    )
+    for name, value in zip(TGC, probe.time_gain_compensation, strict=True):
+        setattr(settings, name, round(value))
+    return settings
+
+
+def probe_as_set(probe: Probe, settings: Settings) -> Probe:
+    """The probe with the scanner set as the sliders are."""
+    low, high = probe.frequency_range_mhz
+    return probe.model_copy(
+        update=dict(
+            depth_mm=float(settings.depth_mm),
+            gain_percent=float(settings.gain_percent),
+            dyn_range_db=float(settings.dyn_range_db),
+            frequency_mhz=min(max(settings.frequency_mhz, low), high),
+            focus_depth_percent=float(settings.focus_percent),
+            time_gain_compensation=tuple(float(getattr(settings, name)) for name in TGC),
+        )
+    )
+
+
+def open_viewer(rehearsal: Rehearsal, visible: bool) -> Viewer:
+    """The window, or its off-screen twin. Raises NoVulkan."""
+    from render.window import Window
+
+    support, tumour = rehearsal.supports, rehearsal.tumour
+    return Window(
+        Geometry(
+            organ_vertices=rehearsal.organ_skin.vertices,
+            organ_faces=np.asarray(rehearsal.organ.faces, np.int32),
+            bounds=rehearsal.organ.bounds,
+            up=-rehearsal.gravity_direction,
+            transducer_size_mm=rehearsal.size_mm,
+            frequency_range_mhz=rehearsal.probe.frequency_range_mhz,
+            tumour_vertices=rehearsal.tumour_skin and rehearsal.tumour_skin.vertices,
+            tumour_faces=None if tumour is None else np.asarray(tumour.faces, np.int32),
+            support_vertices=np.asarray(support[0].vertices, np.float32) if support else None,
+            support_faces=np.asarray(support[0].faces, np.int32) if support else None,
+        ),
+        settings_of(rehearsal),
+        visible=visible,
+    )
+
+
+def take_view(
+    rehearsal: Rehearsal,
+    settings: Settings,
+    pose: np.ndarray | None,
+    record: Record,
+    status: str = "",
+) -> View:
+    """One frame, on screen and off: step with the transducer going to a pose, carry the surfaces, take the pictures.
+
+    Without a pose, as when frozen, the pictures alone are taken anew.
+    """
+    if pose is not None:
+        timed(partial(rehearsal.advance, pose), record.step_ms)
+        rehearsal.update_surfaces()
+    probe = probe_as_set(rehearsal.probe, settings)
+    shown = settings.mode, settings.rung, settings.window_hu, settings.level_hu
+    pictures = timed(partial(rehearsal.look, probe, *shown), record.slice_ms)
+    width, depth, above = probe.extent_mm
+    return View(
+        transducer_pose=rehearsal.pose,
+        pictures=pictures,
+        width_mm=width,
+        depth_mm=depth,
+        above_mm=above,
+        focus_mm=None if settings.mode == "ct" else probe.focus_mm,
+        outline_mm=rehearsal.tumour_outline() if settings.outline else None,
+        captions=captions(probe, settings),
+        readouts=readouts(rehearsal, record),
+        status=status,
+        title=rehearsal.scene.title,
+    )
+
+
+def captions(probe: Probe, settings: Settings) -> tuple[str, str, str]:
+    """The probe, and what echo and CT are shown with."""
+    echo = f"{probe.frequency_mhz:.1f} MHz   G {probe.gain_percent:.0f} %   DR {probe.dyn_range_db:.0f} dB   {settings.rung}"
+    ct = f"W {settings.window_hu}   L {settings.level_hu} HU"
+    return (
+        probe.transducer_name,
+        "" if settings.mode == "ct" else echo,
+        "" if settings.mode == "b-mode" else ct,
+    )
+
+
+def readouts(rehearsal: Rehearsal, record: Record) -> dict[str, str]:
+    """Name -> figure with its unit."""
+    size, count = next(iter(rehearsal.model.counts().items()))
+    error = rehearsal.expected_error_mm()
+    return {
+        "step": f"{np.median(record.step_ms[-30:]):.1f} ms" if record.step_ms else "",
+        "error": "not known" if error is None else f"± {error:.2f} mm",
+        "picture": f"{np.median(record.slice_ms[-30:]):.1f} ms",
+        size: f"{count}",
+        "indentation": f"{max(rehearsal.indentation_mm(), 0.0):.1f} mm",
+    }

@@ -1,0 +1,103 @@
+"""The command ``scan``: pictures of an anatomy at rest for a list of probe poses."""
+
+import json
+from pathlib import Path
+from time import perf_counter
+
+import click
+import numpy as np
+from tqdm import tqdm
+
+from scenes.anatomy import load_anatomy
+from scenes.scene import load_scene, with_options
+from studies.commands import Fault, arch_option, make_folder, start_taichi
+from studies.scan.poses import load_poses
+from studies.setup import probe_of
+from ultrasound.array import MODES, RUNGS
+
+
+@click.command()
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option(
+    "--pose", "poses", type=click.Path(path_type=Path), required=True, help="Poses of the probe, JSON or CSV."
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, help="Folder for the pictures and scan.json."
+)
+@click.option("--probe", help="Probe, by its name or as a file [the scene's].")
+@click.option("--picture", type=click.Choice(MODES), help="Echo, CT or both [the scene's].")
+@click.option("--rung", type=click.Choice(RUNGS), help="How much of the echo is computed [the scene's].")
+@click.option(
+    "--contact",
+    type=click.Choice(["tissue", "organ"]),
+    default="tissue",
+    show_default=True,
+    help="What lets sound in where it touches the array: anything but gas, as the CT has it, or the organ alone.",
+)
+@click.option("--dicom", is_flag=True, help="Each echo picture as DICOM too.")
+@arch_option
+def scan(
+    scene: Path,
+    poses: Path,
+    out: Path,
+    probe: str | None,
+    picture: str | None,
+    rung: str | None,
+    contact: str,
+    dicom: bool,
+    arch: str,
+) -> None:
+    """Pictures of SCENE, a scene file or a patient's folder, as it lies in the CT: no body, no window.
+
+    For each pose of a file, what the probe shows there. Writes PNG pictures and scan.json, which says how large their pixels are.
+    """
+    path = scene / "scene.toml" if scene.is_dir() else scene
+    if probe and Path(probe).is_file():
+        probe = str(Path(probe).resolve())
+    options = {"transducer.probe": probe, "image.mode": picture, "image.rung": rung}
+    loaded = with_options(load_scene(path), options)
+    placed = load_poses(poses)
+    anatomy = load_anatomy(loaded, path.parent)
+    if anatomy.ct is None:
+        raise Fault(f"{path}: has no CT: expected anatomy.ct, of which pictures are made")
+    held, image = probe_of(loaded, path.parent), loaded.image
+    used = start_taichi(arch)
+    from render.pictures import in_proportion
+    from sim.embedding import Unmoved
+    from studies.rehearsal import scanned_anatomy
+    from ultrasound.dicom_image import save_dicom
+    from ultrasound.plane import ImagePlane
+    from ultrasound.scanner import ECHO, Scanner
+
+    make_folder(out)
+    scanned = scanned_anatomy(anatomy.organ, anatomy, np.zeros(3))
+    scanner = Scanner(scanned, Unmoved(), held, image.pixels, "background", contact, image.contact_gap_mm)
+    width, depth, above = held.extent_mm
+    rows, ms = [], []
+    for name, pose in tqdm(placed.items(), desc="scan", unit="pose"):
+        began = perf_counter()
+        plane = ImagePlane(pose, width, depth, above)
+        shown = scanner.look(plane, held, image.mode, image.rung, image.window_hu, image.level_hu)
+        ms.append(1000 * (perf_counter() - began))
+        for kind, grey in shown.items():
+            square = in_proportion(grey, width, depth)
+            file = out / f"{name}-{kind.lower()}.png"
+            square.save(file)
+            spacing = depth / square.height, width / square.width
+            if dicom and kind == ECHO:
+                save_dicom(file.with_suffix(".dcm"), np.asarray(square), spacing, held)
+            rows.append(
+                dict(pose=name, picture=kind, file=file.name, row_mm=spacing[0], column_mm=spacing[1])
+            )
+    report = dict(
+        probe=held.model_dump(by_alias=True),
+        rung=image.rung,
+        contact=contact,
+        above_mm=above,
+        arch=used,
+        pictures=rows,
+    )
+    (out / "scan.json").write_text(json.dumps(report, indent=2) + "\n", "utf-8")
+    click.echo(
+        f"Wrote {len(rows)} pictures of {len(placed)} poses and scan.json to {out}; {np.median(ms):.1f} ms a pose (median)."
+    )

@@ -1,0 +1,169 @@
+"""What sound meets in a CT: impedance, attenuation and backscatter of every voxel, from labels and HU. NumPy.
+
+Where a voxel has a label, its tissue's values hold (``tissues.toml``), for contrast agent raises HU by iodine, not by density; but fat
+and stones within a kidney are told by HU, which no agent lowers to fat's nor, in parenchyma, raises to a stone's.
+"""
+
+import tomllib
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+TISSUES = Path(__file__).parent / "tissues.toml"
+# Amplitude of renal cortex against a perfect reflector: its speckle lies some 16 dB under the echo of fat on kidney.
+CORTEX_DB = -38.0
+# Labels have steps of a voxel, where tissue has none.
+SMOOTHING_VOXELS = 0.8
+FAT_BELOW_HU = -30.0
+STONE_ABOVE_MEDIAN_HU = 130.0
+NECROSIS_BELOW_MEDIAN_HU = 40.0
+# Fat in a hollow of the kidney no wider than twice this is the sinus's.
+HOLLOW_MM = 10.0
+# Tissues that hold fat and stones which no label tells.
+KIDNEY = ("kidney", "cortex", "medulla", "sinus", "urine")
+SEED = 20160101
+LEAST_HU, MOST_HU = -1024, 3071
+
+IMPEDANCE, ATTENUATION, BACKSCATTER = range(3)
+
+
+@cache
+def tissue_table() -> dict[str, dict]:
+    """Tissue -> its values, as the file has them, and "hounsfield"."""
+    return tomllib.loads(TISSUES.read_text("utf-8"))
+
+
+def impedance_of_hu(hu: np.ndarray) -> np.ndarray:
+    """Acoustic impedance [MRayl] of HU: density by Schneider's piecewise fit (k-Wave's ``hounsfield2density``), speed of sound
+    from density by Mast 2000, for soft tissue."""
+    h = np.asarray(hu, np.float32) + np.float32(1000)
+    pieces = [h < 930, h < 1098, h < 1260]
+    slope = np.select(pieces, [1.025793065, 0.9082709691, 0.5108369316], 0.6625370912).astype(np.float32)
+    offset = np.select(pieces, [-5.680404011, 103.6151457, 539.9977189], 348.8555178).astype(np.float32)
+    density = np.maximum(slope * h + offset, np.float32(1.2))
+    return density * (density + np.float32(349)) / np.float32(0.893e6)
+
+
+def properties(
+    hu: np.ndarray,
+    labels: np.ndarray | None = None,
+    tissue_of_label: Mapping[int, str] | None = None,
+    spacing_mm: np.ndarray | None = None,
+) -> np.ndarray:
+    """Impedance [MRayl], attenuation [dB/cm/MHz] and backscattered amplitude (1 for a perfect reflector) of voxels (..., 3), float32.
+
+    ``hu`` and ``labels``, whole numbers, have the same shape; 0 and labels without a tissue go by HU.
+    Raises KeyError for a tissue that the table does not have.
+    """
+    spacing = np.ones(3) if spacing_mm is None else np.asarray(spacing_mm, float)
+    values = _by_hounsfield(hu)
+    texture = _Texture(hu.shape, spacing)
+    level = values[..., BACKSCATTER]
+    level += texture.of(tissue_table()["hounsfield"], ...)
+    labelled = _labelled(hu, labels, tissue_of_label or {}, spacing)
+    stone = labelled.pop("stone", None)
+    for tissue, where in labelled.items():
+        table = tissue_table()[tissue]
+        values[where, IMPEDANCE] = table["impedance_mrayl"]
+        values[where, ATTENUATION] = table["attenuation_db_cm_mhz"]
+        level[where] = table["backscatter_db"] + texture.of(table, where)
+    values[..., BACKSCATTER] = np.float32(10) ** ((level + np.float32(CORTEX_DB)) / np.float32(20))
+    for channel in range(3):
+        values[..., channel] = ndimage.gaussian_filter(values[..., channel], SMOOTHING_VOXELS, truncate=2.5)
+    if stone is not None:
+        _add_stones(values, stone)
+    return values
+
+
+def _add_stones(values: np.ndarray, stone: np.ndarray) -> None:
+    """Stones as hard as they are: smoothed like the rest, one of a few voxels would be soft."""
+    table = tissue_table()["stone"]
+    share = np.minimum(
+        2 * ndimage.gaussian_filter(stone.astype(np.float32), SMOOTHING_VOXELS, truncate=2.5), 1
+    )
+    level = 10 ** ((table["backscatter_db"] + CORTEX_DB) / 20)
+    for channel, value in enumerate((table["impedance_mrayl"], table["attenuation_db_cm_mhz"], level)):
+        values[..., channel] += share * (np.float32(value) - values[..., channel])
+
+
+def _by_hounsfield(hu: np.ndarray) -> np.ndarray:
+    """Values (..., 3) of HU, backscatter in dB; by a table of whole HU, of which a large CT has few."""
+    table = tissue_table()["hounsfield"]
+    every = np.arange(LEAST_HU, MOST_HU + 1)
+    attenuation = np.interp(every, table["hu"], table["attenuation_db_cm_mhz"])
+    level = np.interp(every, table["hu"], table["backscatter_db"])
+    values = np.column_stack([impedance_of_hu(every), attenuation, level]).astype(np.float32)
+    # A CT's noise is not the tissue's.
+    smooth = ndimage.gaussian_filter(np.asarray(hu, np.float32), SMOOTHING_VOXELS, truncate=2.5)
+    return values[np.clip(np.rint(smooth), LEAST_HU, MOST_HU).astype(np.int16) - LEAST_HU]
+
+
+def _labelled(
+    hu: np.ndarray, labels: np.ndarray | None, tissue_of_label: Mapping[int, str], spacing_mm: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Tissue -> which voxels are of it; fat and stones within the kidney last, so that they win."""
+    if labels is None or not tissue_of_label:
+        return {}
+    for tissue in tissue_of_label.values():
+        if tissue not in tissue_table() or tissue == "hounsfield":
+            known = ", ".join(name for name in tissue_table() if name != "hounsfield")
+            raise KeyError(f"no tissue {tissue!r}; known: {known}")
+    found: dict[str, np.ndarray] = {}
+    for value, tissue in tissue_of_label.items():
+        here = labels == value
+        found[tissue] = found[tissue] | here if tissue in found else here
+    kidney = [found[tissue] for tissue in KIDNEY if tissue in found]
+    if "sinus" not in found and kidney:
+        found["sinus"] = _hollow(np.logical_or.reduce(kidney), spacing_mm) & (hu < FAT_BELOW_HU)
+    for tissue, here in _parts_by_hounsfield(hu, kidney, found.get("tumour")).items():
+        found[tissue] = found[tissue] | here if tissue in found else here
+    return {tissue: where for tissue, where in found.items() if where.any()}
+
+
+def _hollow(kidney: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
+    """What a kidney encloses besides itself: its closing by a ball of HOLLOW_MM, without it."""
+    rim = np.ceil(HOLLOW_MM / spacing_mm).astype(int) + 1
+    box = ndimage.find_objects(kidney.astype(np.uint8))[0]
+    part = np.pad(kidney[box], [(int(r), int(r)) for r in rim])
+    grown = ndimage.distance_transform_edt(~part, sampling=spacing_mm) <= HOLLOW_MM
+    closed = ndimage.distance_transform_edt(grown, sampling=spacing_mm) > HOLLOW_MM
+    hollow = np.zeros_like(kidney)
+    inner = tuple(slice(int(r), n - int(r)) for r, n in zip(rim, part.shape, strict=True))
+    hollow[box] = (closed & ~part)[inner]
+    return hollow
+
+
+def _parts_by_hounsfield(
+    hu: np.ndarray, kidney: list[np.ndarray], tumour: np.ndarray | None
+) -> dict[str, np.ndarray]:
+    """Fat and stones of a kidney, and what of a tumour takes up no contrast agent."""
+    parts: dict[str, np.ndarray] = {}
+    if kidney:
+        inside = np.logical_or.reduce(kidney)
+        if inside.any():
+            parts["sinus"] = inside & (hu < FAT_BELOW_HU)
+            parts["stone"] = inside & (hu > np.median(hu[inside]) + STONE_ABOVE_MEDIAN_HU)
+    if tumour is not None and tumour.any():
+        parts["necrosis"] = tumour & (hu < np.median(hu[tumour]) - NECROSIS_BELOW_MEDIAN_HU)
+    return parts
+
+
+class _Texture:
+    """Unevenness [dB] of backscatter over a distance, the same for the same voxels on every machine."""
+
+    def __init__(self, shape: tuple[int, ...], spacing_mm: np.ndarray) -> None:
+        self.shape, self.spacing_mm = shape, spacing_mm
+        self.made: dict[float, np.ndarray] = {}
+
+    def of(self, table: dict, where: Any) -> np.ndarray:
+        """SD ``texture_db`` over ``texture_mm``, at some voxels; one field serves all tissues of one distance."""
+        distance = float(table["texture_mm"])
+        if distance not in self.made:
+            noise = np.random.default_rng(SEED).standard_normal(self.shape, dtype=np.float32)
+            noise = ndimage.gaussian_filter(noise, distance / 2 / self.spacing_mm, truncate=2, mode="wrap")
+            self.made[distance] = noise / max(float(noise.std()), 1e-6)
+        return np.float32(table["texture_db"]) * self.made[distance][where]

@@ -1,0 +1,190 @@
+"""The array of a probe and the scanner's settings: probe files, scanlines, and the way back from a pixel to its line.
+
+A probe file is TOML with PLUS's names (TransducerGeometry, DepthMm, FrequencyMhz, ...), each with its unit. Places on the image
+plane are (u, v) [mm]: u to the marked side, v down into the tissue, the origin at the middle of the array's face.
+"""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic.alias_generators import to_pascal
+
+PROBES = Path(__file__).parent / "probes"
+SOUND_MM_US = 1.54
+FWHM_OF_SD = float(np.sqrt(8 * np.log(2)))
+GAIN_RANGE_DB, TGC_RANGE_DB, TGC_SLIDERS = 60.0, 24.0, 8
+
+Mode = Literal["both", "b-mode", "ct"]
+MODES: tuple[Mode, ...] = ("both", "b-mode", "ct")
+# The echo's ladder of realism: reflection and attenuation; and speckle and point spread; and the thickness of the plane.
+Rung = Literal["reflection", "speckle", "elevation"]
+RUNGS: tuple[Rung, ...] = ("reflection", "speckle", "elevation")
+
+Percent = Annotated[float, Field(ge=0, le=100)]
+
+
+class ProbeError(ValueError):
+    """A probe file that cannot be used; the message is one line."""
+
+
+class Probe(BaseModel):
+    """One probe with the scanner's settings, as its file has them in PLUS's spelling (``frequency_mhz`` is FrequencyMhz).
+
+    ``housing_mm`` is the cuboid that touches: lateral x elevation x length. ``elevation_width_mm`` is the thickness of the image
+    plane, and ``focal_zone_mm`` how far from the focus the beam is wider by sqrt(2). ``depth_compensation_db_cm_mhz`` is the
+    gain over depth that the scanner adds by itself, to which the sliders of ``time_gain_compensation`` [%] come.
+    """
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, alias_generator=to_pascal, populate_by_name=True
+    )
+
+    transducer_name: str = Field(min_length=1, max_length=60)
+    transducer_geometry: Literal["LINEAR", "CURVILINEAR", "PHASED"] = "LINEAR"
+    housing_mm: tuple[float, float, float] = (40.0, 10.0, 20.0)
+    transducer_width_mm: float = Field(40.0, gt=0, le=300)
+    radius_start_mm: float = Field(0.0, ge=0, le=300)
+    theta_start_deg: float = Field(0.0, ge=-80, le=0)
+    theta_stop_deg: float = Field(0.0, ge=0, le=80)
+    number_of_scanlines: int = Field(192, ge=8, le=1024)
+    number_of_samples_per_scanline: int = Field(640, ge=32, le=4096)
+    frequency_range_mhz: tuple[float, float] = (2.0, 15.0)
+    frequency_mhz: float = Field(7.5, ge=1, le=40)
+    depth_mm: float = Field(60.0, ge=5, le=300)
+    focus_depth_percent: Percent = 40.0
+    f_number: float = Field(2.5, ge=0.5, le=20)
+    focal_zone_mm: float = Field(15.0, gt=0, le=300)
+    elevation_width_mm: float = Field(2.0, gt=0, le=20)
+    pulse_cycles: float = Field(2.0, ge=1, le=20)
+    gain_percent: Percent = 56.0
+    dyn_range_db: float = Field(60.0, ge=20, le=120)
+    time_gain_compensation: tuple[Percent, ...] = (50.0,) * TGC_SLIDERS
+    depth_compensation_db_cm_mhz: float = Field(0.85, ge=0, le=5)
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "Probe":
+        if min(self.housing_mm) <= 0:
+            raise ValueError(f"HousingMm = {list(self.housing_mm)}: expected three positive lengths in mm")
+        if len(self.time_gain_compensation) != TGC_SLIDERS:
+            raise ValueError(
+                f"TimeGainCompensation has {len(self.time_gain_compensation)} values: expected {TGC_SLIDERS}, from the face down"
+            )
+        low, high = self.frequency_range_mhz
+        if not 1 <= low <= self.frequency_mhz <= high <= 40:
+            raise ValueError(
+                f"FrequencyMhz = {self.frequency_mhz:g} is outside FrequencyRangeMhz = {low:g} to {high:g}"
+            )
+        if self.transducer_geometry != "LINEAR" and self.theta_stop_deg - self.theta_start_deg < 1:
+            raise ValueError("a sector needs ThetaStartDeg < 0 < ThetaStopDeg, at least 1 degree apart")
+        if self.transducer_geometry == "CURVILINEAR" and self.radius_start_mm <= 0:
+            raise ValueError("a curvilinear array needs its radius: RadiusStartMm > 0")
+        return self
+
+    @property
+    def wavelength_mm(self) -> float:
+        return SOUND_MM_US / self.frequency_mhz
+
+    @property
+    def sample_mm(self) -> float:
+        """Depth from one sample to the next."""
+        return self.depth_mm / self.number_of_samples_per_scanline
+
+    @property
+    def radius_mm(self) -> float:
+        """Radius of the array's face; 0 where all lines leave from one point."""
+        return self.radius_start_mm if self.transducer_geometry == "CURVILINEAR" else 0.0
+
+    @property
+    def focus_mm(self) -> float:
+        return self.depth_mm * self.focus_depth_percent / 100
+
+    @property
+    def extent_mm(self) -> tuple[float, float, float]:
+        """Width and depth of the box around the picture, and how much of the depth lies behind the face's middle."""
+        if self.transducer_geometry == "LINEAR":
+            return self.transducer_width_mm, self.depth_mm, 0.0
+        reach = self.radius_mm + self.depth_mm
+        left, right = np.radians([self.theta_start_deg, self.theta_stop_deg])
+        half = reach * max(np.sin(right), np.sin(-left))
+        above = self.radius_mm * (1 - np.cos(max(right, -left)))
+        return float(2 * half), float(self.depth_mm + above), float(above)
+
+    def line_angles(self) -> np.ndarray:
+        """Angle of each scanline from straight down [rad], shape (lines,)."""
+        start, stop = np.radians([self.theta_start_deg, self.theta_stop_deg])
+        if self.transducer_geometry == "LINEAR":
+            start = stop = 0.0
+        return start + (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines * (stop - start)
+
+    def scanlines(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where each line leaves the face [mm] and its unit direction, each (lines, 2) on the image plane."""
+        angle = self.line_angles()
+        direction = np.column_stack([np.sin(angle), np.cos(angle)])
+        if self.transducer_geometry == "LINEAR":
+            share = (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines - 0.5
+            return np.column_stack([share * self.transducer_width_mm, np.zeros_like(share)]), direction
+        return self.radius_mm * (direction - [0.0, 1.0]), direction
+
+    def elements(self) -> np.ndarray:
+        """Places on the face that must touch for sound to leave, (lines, 2) [mm]: those where the lines leave, or across the array."""
+        share = (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines - 0.5
+        if self.transducer_geometry == "PHASED":
+            return np.column_stack([share * self.transducer_width_mm, np.zeros_like(share)])
+        return self.scanlines()[0]
+
+    def line_spacing_mm(self, depth_mm: np.ndarray) -> np.ndarray:
+        """Distance of neighbouring lines at depths [mm]."""
+        if self.transducer_geometry == "LINEAR":
+            return np.full_like(depth_mm, self.transducer_width_mm / self.number_of_scanlines)
+        step = np.radians(self.theta_stop_deg - self.theta_start_deg) / self.number_of_scanlines
+        return (self.radius_mm + depth_mm) * step
+
+    def beam_coordinates(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Scanline (a fraction of an index between two) and depth along it [mm] of places on the plane [mm]."""
+        if self.transducer_geometry == "LINEAR":
+            line = (u / self.transducer_width_mm + 0.5) * self.number_of_scanlines - 0.5
+            return line, np.array(v, float)
+        depth = np.hypot(u, v + self.radius_mm) - self.radius_mm
+        start, stop = np.radians([self.theta_start_deg, self.theta_stop_deg])
+        share = (np.arctan2(u, v + self.radius_mm) - start) / (stop - start)
+        return share * self.number_of_scanlines - 0.5, depth
+
+    def gain_db(self) -> np.ndarray:
+        """What the scanner adds at each sample of a line [dB], shape (samples,): gain, its own over depth, and the sliders'."""
+        depth = (np.arange(self.number_of_samples_per_scanline) + 0.5) * self.sample_mm
+        own = 2 * self.depth_compensation_db_cm_mhz * self.frequency_mhz * depth / 10
+        places = (np.arange(TGC_SLIDERS) + 0.5) * self.depth_mm / TGC_SLIDERS
+        sliders = np.interp(depth, places, self.time_gain_compensation)
+        return own + (self.gain_percent - 50) / 100 * GAIN_RANGE_DB + (sliders - 50) / 100 * TGC_RANGE_DB
+
+
+def load_probe(name: str, folder: Path | None = None) -> Probe:
+    """The probe of a file in a folder, or one that comes with the program, by its name. Raises ProbeError."""
+    own = PROBES / f"{name}.toml"
+    path = own if own.is_file() else (folder or Path()) / name
+    try:
+        return Probe.model_validate(tomllib.loads(path.read_text("utf-8")))
+    except FileNotFoundError:
+        known = ", ".join(sorted(each.stem for each in PROBES.glob("*.toml")))
+        raise ProbeError(f"{path}: no such probe file; known by name: {known}") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ProbeError(f"{path}: cannot be read as a probe file ({str(error).splitlines()[0]})") from None
+    except ValidationError as error:
+        raise ProbeError(f"{path}: {explained(error)}") from None
+
+
+def explained(error: ValidationError) -> str:
+    """The first of the problems, in words that name the key."""
+    first = error.errors(include_url=False)[0]
+    key = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "value_error":
+        return str(first["ctx"]["error"])
+    if first["type"] == "extra_forbidden":
+        known = ", ".join(to_pascal(name) for name in Probe.model_fields)
+        return f"{key}: unknown key; known here: {known}"
+    if first["type"] == "missing":
+        return f"{key}: missing"
+    return f"{key} = {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}"

@@ -1,0 +1,98 @@
+"""A picture as a DICOM Ultrasound Image that names nobody (PS3.3 A.6.4, with the US modules of C.8.5.5 and C.8.5.6)."""
+
+from pathlib import Path
+
+import numpy as np
+from pydicom import Dataset
+from pydicom.dataset import FileMetaDataset
+from pydicom.uid import ExplicitVRLittleEndian, UltrasoundImageStorage, generate_uid
+from pydicom.valuerep import DS
+
+from ultrasound.array import Probe
+
+# What the standard wants present though it is unknown (its type 2).
+EMPTY = (
+    "PatientName",
+    "PatientID",
+    "PatientBirthDate",
+    "PatientSex",
+    "StudyDate",
+    "StudyTime",
+    "ReferringPhysicianName",
+    "StudyID",
+    "AccessionNumber",
+    "SeriesNumber",
+    "Laterality",
+    "InstanceNumber",
+    "PatientOrientation",
+)
+TRANSDUCER_TYPES = {"LINEAR": "LINEAR", "CURVILINEAR": "CURVED LINEAR", "PHASED": "SECTOR_PHASED"}
+REGION_2D, REGION_TISSUE, CENTIMETRES = 1, 1, 3
+
+
+def save_dicom(
+    path: Path, picture: np.ndarray, spacing_mm: tuple[float, float], probe: Probe | None = None
+) -> None:
+    """Write grey values (rows, columns) uint8 with the distance of neighbouring rows and that of neighbouring columns [mm].
+
+    A probe, whose ``extent_mm`` the picture then shows, adds what it is and where the middle of its face is.
+    Raises ValueError where picture or distances are none, and OSError where the file cannot be written.
+    """
+    if picture.dtype != np.uint8 or picture.ndim != 2 or picture.size == 0:
+        raise ValueError(f"a picture of {picture.dtype} {picture.shape}: expected uint8 (rows, columns)")
+    if len(spacing_mm) != 2 or not all(0 < each < np.inf for each in spacing_mm):
+        raise ValueError(
+            f"spacing {spacing_mm}: expected the distances of rows and of columns in mm, above 0"
+        )
+
+    data = Dataset()
+    for keyword in EMPTY:
+        setattr(data, keyword, None)
+    data.PatientIdentityRemoved = "YES"
+    data.DeidentificationMethod = "Nothing of the patient is written"
+    data.SOPClassUID = UltrasoundImageStorage
+    # Without a prefix they are random UUIDs, which tell nothing of patient, machine or time.
+    for keyword in ("SOPInstanceUID", "SeriesInstanceUID", "StudyInstanceUID"):
+        setattr(data, keyword, generate_uid(prefix=None))
+    data.Modality = "US"
+    data.Manufacturer = "Nephron"
+    # No examination made this picture; its tissue comes from the pixels of another.
+    data.ImageType = ["DERIVED", "SECONDARY"]
+    data.DerivationDescription = "Simulated, not for diagnosis"
+    data.SyntheticData = "YES"
+    data.BurnedInAnnotation = "NO"
+    data.LossyImageCompression = "00"
+    # Not of this IOD, which has the region's deltas, but what ITK reads.
+    data.PixelSpacing = [DS(float(each), auto_format=True) for each in spacing_mm]
+    data.SequenceOfUltrasoundRegions = [_region(picture.shape, spacing_mm, probe)]
+    if probe is not None:
+        data.TransducerType = TRANSDUCER_TYPES[probe.transducer_geometry]
+        data.DepthOfScanField = round(probe.depth_mm)
+
+    data.file_meta = FileMetaDataset()
+    data.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    data.set_pixel_data(picture, "MONOCHROME2", bits_stored=8, generate_instance_uid=False)
+    data.save_as(path, enforce_file_format=True)
+
+
+def _region(shape: tuple[int, ...], spacing_mm: tuple[float, float], probe: Probe | None) -> Dataset:
+    """The whole picture as one region; its reference is the pixel that holds the middle of the face, where (u, v) is 0 [cm]."""
+    rows, columns = shape
+    row_cm, column_cm = (float(each) / 10 for each in spacing_mm)
+    region = Dataset()
+    region.RegionSpatialFormat = REGION_2D
+    region.RegionDataType = REGION_TISSUE
+    region.RegionFlags = 0
+    region.RegionLocationMinX0, region.RegionLocationMinY0 = 0, 0
+    region.RegionLocationMaxX1, region.RegionLocationMaxY1 = columns - 1, rows - 1
+    region.PhysicalUnitsXDirection = region.PhysicalUnitsYDirection = CENTIMETRES
+    region.PhysicalDeltaX, region.PhysicalDeltaY = column_cm, row_cm
+    if probe is not None:
+        region.TransducerFrequency = round(probe.frequency_mhz * 1000)
+        above_cm = probe.extent_mm[2] / 10
+        column, row = columns // 2, int(above_cm / row_cm)
+        region.ReferencePixelX0, region.ReferencePixelY0 = column, row
+        # Its centre is off the face's middle by a part of a pixel.
+        region.ReferencePixelPhysicalValueX = (column + 0.5 - columns / 2) * column_cm
+        region.ReferencePixelPhysicalValueY = (row + 0.5) * row_cm - above_cm
+    return region

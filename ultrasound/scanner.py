@@ -1,0 +1,103 @@
+"""The scanner: what a probe at a pose shows of tissue, as CT, as echo, or both on the same plane."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import trimesh
+
+from sim.embedding import Embedding, Unmoved
+from ultrasound.acoustics import properties
+from ultrasound.array import Mode, Probe, Rung
+from ultrasound.bmode import BMode
+from ultrasound.plane import ImagePlane, PlaneInTissue
+from ultrasound.slice import Slice
+from ultrasound.volume import Volume, distance_volume
+
+# What is around the organ where the picture shows no CT there [MRayl].
+AROUND = {"background": None, "gel": 1.5, "air": 4e-4}
+CT, ECHO = "CT", "B-mode"
+SHOWN: dict[Mode, tuple[str, ...]] = {"ct": (CT,), "b-mode": (ECHO,), "both": (ECHO, CT)}
+
+
+@dataclass(frozen=True)
+class Anatomy:
+    """What is scanned, all in one frame [mm] in which it is at rest.
+
+    ``hu`` (nx, ny, nz) and ``labels``, on the same grid, with ``index_from_mm`` (4, 4); ``tissues`` says which tissue a label is.
+    """
+
+    organ: trimesh.Trimesh
+    hu: np.ndarray
+    index_from_mm: np.ndarray
+    labels: np.ndarray | None = None
+    tissues: Mapping[int, str] = field(default_factory=dict)
+
+    @property
+    def voxel_mm(self) -> np.ndarray:
+        """Distance of neighbouring voxels along each axis of the grid."""
+        return np.linalg.norm(np.linalg.inv(self.index_from_mm[:3, :3]), axis=0)
+
+
+class Scanner:
+    """Pictures of ``pixels`` x ``pixels`` of an anatomy that an embedding carries along.
+
+    ``outside`` (see ``Slice``), ``contact`` and ``contact_gap_mm`` (see ``BMode``) say what lies around the organ and what lets
+    sound in. What a mode needs is made when it is first asked for.
+    """
+
+    def __init__(
+        self,
+        anatomy: Anatomy,
+        embedding: Embedding | Unmoved,
+        probe: Probe,
+        pixels: int = 512,
+        outside: str = "background",
+        contact: str = "organ",
+        contact_gap_mm: float = 1.0,
+    ) -> None:
+        self.anatomy = anatomy
+        self.embedding = embedding
+        self.probe = probe
+        self.plane = PlaneInTissue(embedding, pixels)
+        self.outside, self.contact, self.contact_gap_mm = outside, contact, contact_gap_mm
+
+    @cached_property
+    def slice(self) -> Slice:
+        """The CT's side of the scanner."""
+        ct = Volume(self.anatomy.hu, self.anatomy.index_from_mm)
+        return Slice(ct, self._organ, self.plane, self.outside)
+
+    @cached_property
+    def bmode(self) -> BMode:
+        """The echo's side of the scanner."""
+        anatomy, voxel_mm = self.anatomy, self.anatomy.voxel_mm
+        values = properties(anatomy.hu, anatomy.labels, anatomy.tissues, voxel_mm)
+        tissue = Volume(values, anatomy.index_from_mm, outside=0.0)
+        return BMode(
+            tissue,
+            self._organ,
+            self.plane,
+            self.probe,
+            float(voxel_mm.mean()),
+            self.contact,
+            self.contact_gap_mm,
+            AROUND[self.outside],
+        )
+
+    @cached_property
+    def _organ(self) -> Volume:
+        return distance_volume(self.anatomy.organ)
+
+    def look(
+        self, plane: ImagePlane, probe: Probe, mode: Mode, rung: Rung, window_hu: float, level_hu: float
+    ) -> dict[str, np.ndarray]:
+        """Grey values (pixels, pixels) uint8 of what a mode shows of a plane, by name, the first the one that matters."""
+        self.embedding.update()
+        self.plane.take(plane)
+        show = {
+            CT: lambda: self.slice.render(window_hu, level_hu),
+            ECHO: lambda: self.bmode.render(probe, rung),
+        }
+        return {name: show[name]() for name in SHOWN[mode]}

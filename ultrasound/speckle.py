@@ -1,0 +1,54 @@
+"""Speckle that lives in the tissue: scatterers as complex noise of the rest position, so that it travels and stretches with it.
+
+Scatterers much smaller than the wavelength and many in a resolution cell give circular complex Gaussian echoes (Goodman 1975); what
+the pulse makes of white ones is noise of the pulse's own correlation. So the noise has the axial width of the point-spread
+function built in, and the carrier's phase, which no magnitude shows, is left out: samples 0.1 mm apart could not hold it.
+"""
+
+import numpy as np
+import taichi as ti
+import taichi.math as tm
+
+SIZE_BITS = 6
+SIZE = 1 << SIZE_BITS
+# Entries of the noise in one standard deviation of its correlation kernel.
+PITCHES = 1.25
+SEED = 20130629
+# Real and imaginary part share the two halves of a word, so that the block stays in a core's cache.
+UNIT = 1 / 4096
+
+
+def noise_block() -> np.ndarray:
+    """Periodic complex Gaussian noise (SIZE, SIZE, SIZE, 2) float32 of unit mean square, the same on every machine.
+
+    White noise convolved with a Gaussian of PITCHES entries SD: two places d entries apart correlate by exp(-d^2 / (4 PITCHES^2)).
+    """
+    white = np.random.default_rng(SEED).standard_normal((2, SIZE, SIZE, SIZE))
+    frequency = 2 * np.pi * np.fft.fftfreq(SIZE)
+    kernel = np.exp(-0.5 * (PITCHES * frequency) ** 2)
+    spectrum = np.fft.fftn(white, axes=(1, 2, 3)) * (kernel[:, None, None] * kernel[:, None] * kernel)
+    noise = np.fft.ifftn(spectrum, axes=(1, 2, 3)).real
+    noise /= np.sqrt((noise**2).sum(axis=0).mean())
+    return np.ascontiguousarray(np.moveaxis(noise, 0, -1), np.float32)
+
+
+@ti.data_oriented
+class Speckle:
+    """The noise block on the device. Each block of space holds it, shifted by a hash of the block, so that it nowhere repeats."""
+
+    def __init__(self) -> None:
+        real, imaginary = np.rint(noise_block().reshape(-1, 2).T / UNIT).astype(np.int32)
+        self.noise = ti.field(ti.i32, SIZE**3)
+        self.noise.from_numpy((imaginary << 16) | (real & 0xFFFF))
+
+    @ti.func
+    def at(self, rest, sd_mm):
+        """Echo (2,), real and imaginary, of the scatterers at a place at rest [mm], correlated over ``sd_mm``."""
+        cell = ti.floor(rest * (PITCHES / sd_mm), ti.i32)
+        block = cell >> SIZE_BITS
+        key = (block.x * 73856093) ^ (block.y * 19349663) ^ (block.z * 83492791)
+        key = (key ^ ((key >> 15) & 0x1FFFF)) * 0x2C1B3C6D
+        shift = ti.Vector([key >> 2, key >> 10, key >> 18])
+        local = (cell + shift) & (SIZE - 1)
+        word = self.noise[(((local.x << SIZE_BITS) | local.y) << SIZE_BITS) | local.z]
+        return UNIT * tm.vec2((word << 16) >> 16, word >> 16)
