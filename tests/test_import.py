@@ -83,6 +83,15 @@ class TestImport:
         with pytest.raises(PatientError, match="no (left|right) kidney"):
             labelled_organ(ct, only_one, None, None, "left" if side == "right" else "right")
 
+    def test_parts_of_the_organ_keep_their_tissue(self, ct_and_labels):
+        ct, labels = ct_and_labels
+        values = sitk.GetArrayFromImage(labels).astype(np.int16)
+        kidney = np.argwhere(values == 2)
+        values[tuple(kidney[len(kidney) // 2])] = 7
+        found = import_patient(ct, with_voxels(labels, values), [2, 7], [3], margin_mm=20.0, tissues={7: "urine"})
+        assert found.tissues == {1: "kidney", 2: "tumour", 3: "urine"}
+        assert (sitk.GetArrayViewFromImage(found.labels) == 3).sum() == 1
+
     def test_labels_on_another_grid(self, ct_and_labels):
         from scenes.labels import labelled_organ
 
@@ -99,7 +108,7 @@ class TestImport:
         import scenes.patient as module
 
         organ, _ = module.labelled_organ(with_voxels(ct, voxels), labels, [2], [3], None)
-        cropped, marked = module._crop(with_voxels(ct, voxels), organ, 300.0)
+        cropped, marked = module._crop(with_voxels(ct, voxels), organ, 300.0, {})
         assert sitk.GetArrayViewFromImage(cropped).min() == -1000
         assert not sitk.GetArrayViewFromImage(marked)[
             points_of(marked)[..., 0] < 0

@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from render import frame, solids
+from render import frame, panel, solids
 from render.camera import OrbitCamera
+from render.layout import HEADER_HEIGHT, RULER_WIDTH, Layout, Rect
+from render.panel import Panel
 from render.viewer import KEY_MAP, Controls, Geometry, NullViewer, Settings, View, key_table
 
 BOUNDS = np.array([[-54.0, -33.0, -21.0], [54.0, 27.0, 21.0]])
-LAYOUT = frame.Layout(1280, 720)
+LAYOUT = Layout(1280, 720)
 
 
 def _camera(up=(0.0, 0.0, 1.0)) -> OrbitCamera:
@@ -28,7 +30,7 @@ def _view(**changes) -> View:
     rows, columns = np.indices((96, 64))
     grey = ((rows * 2 + columns) % 256).astype(np.uint8)
     return View(
-        **{"transducer_pose": pose, "slice_image": grey, "width_mm": 40.0, "depth_mm": 60.0} | changes
+        **{"transducer_pose": pose, "pictures": {"CT": grey}, "width_mm": 40.0, "depth_mm": 60.0} | changes
     )
 
 
@@ -53,7 +55,7 @@ def test_the_readme_has_the_key_map():
 
 def test_key_map_and_window_agree():
     window = pytest.importorskip("render.window")
-    bound = set(window.HELD) | set(window.TOGGLES) | set(window.PRESSED_ONCE) | {"h"}
+    bound = set(window.HELD) | set(window.TOGGLES) | set(window.PRESSED_ONCE) | set(window.CYCLES) | {"h"}
     printed = {line.key.lower() for line in KEY_MAP if len(line.key) == 1}
     assert {key for key in bound if len(key) == 1} == printed
     actions = {line.action for line in KEY_MAP}
@@ -62,7 +64,7 @@ def test_key_map_and_window_agree():
 
 
 def test_defaults_lie_in_their_ranges_and_every_setting_can_become_a_slider():
-    for each in dataclasses.fields(Settings):
+    for each in (setting for setting in dataclasses.fields(Settings) if setting.metadata):
         default = each.metadata["high"] if each.default is None else each.default
         assert each.metadata["low"] <= default <= each.metadata["high"]
         assert {"label", "unit", "low", "high", "group"} <= set(each.metadata)
@@ -129,10 +131,10 @@ def test_up_is_up_and_the_tissue_follows_a_pan():
 
 
 def test_slice_of_the_size_of_its_box_appears_unchanged_and_nothing_else_is_written():
-    box = LAYOUT.picture_box(40.0, 60.0)
+    box = LAYOUT.picture_boxes(1, 40.0, 60.0)[0]
     grey = np.random.default_rng(2).integers(0, 256, (box.height, box.width), dtype=np.uint8)
     picture = np.full((720, 1280, 4), 7, dtype=np.uint8)
-    frame.paste_slice(picture, box, grey)
+    panel.paste_picture(picture, box, grey)
     assert np.array_equal(picture[box.slices][..., :3], np.repeat(grey[..., None], 3, axis=2))
     assert np.all(picture[..., 3] == 7)
     picture[box.slices] = 7
@@ -140,11 +142,11 @@ def test_slice_of_the_size_of_its_box_appears_unchanged_and_nothing_else_is_writ
 
 
 def test_resampled_slice_keeps_its_sides():
-    box = LAYOUT.picture_box(40.0, 60.0)
+    box = LAYOUT.picture_boxes(1, 40.0, 60.0)[0]
     grey = np.zeros((512, 512), dtype=np.uint8)
     grey[:256, :256] = 200
     picture = np.zeros((720, 1280, 3), dtype=np.uint8)
-    frame.paste_slice(picture, box, grey)
+    panel.paste_picture(picture, box, grey)
     inside = picture[box.slices][..., 0]
     rows, columns = box.height // 2, box.width // 2
     assert np.all(inside[: rows - 2, : columns - 2] == 200)
@@ -153,22 +155,22 @@ def test_resampled_slice_keeps_its_sides():
 
 @pytest.mark.parametrize(("width_mm", "depth_mm"), [(40.0, 60.0), (40.0, 20.0), (40.0, 120.0), (60.0, 45.0)])
 def test_picture_box_has_the_shape_of_the_image_plane_and_stays_in_the_panel(width_mm, depth_mm):
-    box = LAYOUT.picture_box(width_mm, depth_mm)
-    assert box.left >= LAYOUT.panel.left + frame.RULER_WIDTH and box.right <= LAYOUT.panel.right
-    assert box.top >= frame.HEADER_HEIGHT and box.bottom <= LAYOUT.panel.bottom
+    box = LAYOUT.picture_boxes(1, width_mm, depth_mm)[0]
+    assert box.left >= LAYOUT.panel.left + RULER_WIDTH and box.right <= LAYOUT.panel.right
+    assert box.top >= HEADER_HEIGHT and box.bottom <= LAYOUT.panel.bottom
     # Each side is rounded to whole pixels: half a pixel on either.
     assert abs(box.width * depth_mm - box.height * width_mm) <= 0.5 * (width_mm + depth_mm)
 
 
 def test_image_plane_without_extent_is_refused():
     with pytest.raises(ValueError, match="positive"):
-        LAYOUT.picture_box(40.0, 0.0)
+        LAYOUT.picture_boxes(1, 40.0, 0.0)[0]
 
 
 @pytest.mark.parametrize("depth_mm", [20.0, 60.0, 87.0, 120.0])
 def test_ruler_ticks_stand_at_their_depth(depth_mm):
-    box = LAYOUT.picture_box(40.0, depth_mm)
-    ticks = frame.ruler_ticks(depth_mm, box)
+    box = LAYOUT.picture_boxes(1, 40.0, depth_mm)[0]
+    ticks = panel.ruler_ticks(Panel(("CT",), 40.0, depth_mm), box)
     assert len(ticks) == int(depth_mm // 5) + 1
     for i, (row, centimetres) in enumerate(ticks):
         depth = (row - box.top) / (box.height - 1) * depth_mm
@@ -177,19 +179,19 @@ def test_ruler_ticks_stand_at_their_depth(depth_mm):
 
 
 def test_ruler_is_drawn_where_its_ticks_say():
-    panel = frame.Panel(40.0, 60.0, 350, 40)
-    box = LAYOUT.picture_box(40.0, 60.0)
-    picture = frame.backdrop(LAYOUT, panel)
+    drawn_with = Panel(("CT",), 40.0, 60.0)
+    box = LAYOUT.picture_boxes(1, 40.0, 60.0)[0]
+    picture = frame.backdrop(LAYOUT, drawn_with)
     column = picture[box.top : box.bottom, box.left - 8]
-    drawn = {box.top + int(row) for row in np.flatnonzero(np.any(column != frame.PANEL, axis=1))}
-    assert drawn == {row for row, _ in frame.ruler_ticks(60.0, box)}
+    drawn = {box.top + int(row) for row in np.flatnonzero(np.any(column != panel.PANEL, axis=1))}
+    assert drawn == {row for row, _ in panel.ruler_ticks(drawn_with, box)}
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_marker_dot_is_on_the_marked_side(side):
-    picture = frame.backdrop(LAYOUT, frame.Panel(40.0, 60.0, 350, 40, marked_side=side))
-    box = LAYOUT.picture_box(40.0, 60.0)
-    columns = np.flatnonzero(np.any(np.all(picture == frame.MARK, axis=2), axis=0))
+    picture = frame.backdrop(LAYOUT, Panel(("CT",), 40.0, 60.0, marked_side=side))
+    box = LAYOUT.picture_boxes(1, 40.0, 60.0)[0]
+    columns = np.flatnonzero(np.any(np.all(picture == panel.MARK, axis=2), axis=0))
     middle = (box.left + box.right) / 2
     assert len(columns) > 0
     assert np.all(columns < middle) if side == "left" else np.all(columns > middle)
@@ -197,7 +199,7 @@ def test_marker_dot_is_on_the_marked_side(side):
 
 def test_unknown_marked_side_is_refused():
     with pytest.raises(ValueError, match="marked_side"):
-        frame.backdrop(LAYOUT, frame.Panel(40.0, 60.0, 350, 40, marked_side="top"))
+        frame.backdrop(LAYOUT, Panel(("CT",), 40.0, 60.0, marked_side="top"))
 
 
 def test_parts_of_the_window_do_not_overlap():
@@ -216,8 +218,8 @@ def test_readouts_and_status_change_the_picture():
     assert np.any(
         frame.readout_picture(LAYOUT, {"Step": "9 ms"}) != frame.readout_picture(LAYOUT, {"Step": "8 ms"})
     )
-    plain = frame.backdrop(LAYOUT, frame.Panel(40.0, 60.0, 350, 40))
-    frozen = frame.backdrop(LAYOUT, frame.Panel(40.0, 60.0, 350, 40, status="FROZEN"))
+    plain = frame.backdrop(LAYOUT, Panel(("CT",), 40.0, 60.0))
+    frozen = frame.backdrop(LAYOUT, Panel(("CT",), 40.0, 60.0, status="FROZEN"))
     changed = np.argwhere(np.any(plain != frozen, axis=2))
     assert len(changed) > 0 and changed[:, 1].min() > LAYOUT.panel.left
 
@@ -330,8 +332,8 @@ def test_organ_never_covers_the_panel_the_title_or_the_readouts(window):
     red = _organ_pixels(picture)
     layout = opened.layout
     assert red[layout.scene.slices][:, -1].any(), "the organ does not reach the panel: this proves nothing"
-    expected = frame.backdrop(layout, frame.Panel(40.0, 60.0, 350, 40))
-    frame.paste_slice(expected, layout.picture_box(40.0, 60.0), _view().slice_image)
+    expected = frame.backdrop(layout, Panel(("CT",), 40.0, 60.0))
+    panel.paste_picture(expected, layout.picture_boxes(1, 40.0, 60.0)[0], _view().pictures["CT"])
     for rect in (layout.panel, layout.title):
         assert np.array_equal(picture[rect.slices], expected[rect.slices])
     assert np.array_equal(picture[layout.readouts.slices], frame.readout_picture(layout, {}))
