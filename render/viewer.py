@@ -83,17 +83,17 @@ class Settings:
     A field that is None or has no metadata has no slider: of the first two, each tissue model has one.
     """
 
-    young_kpa: float | None = _slider(None, "Stiffness", "kPa", 1.0, 100.0, "Tissue")
+    young_kpa: float | None = _slider(None, "Stiff.", "kPa", 1.0, 100.0, "Tissue")
     stiffness: float | None = _slider(None, "Stiffness", "", 0.1, 1.0, "Tissue")
     iterations: int = _slider(9, "Iterations", "", 1, 40, "Tissue")
     substeps: int = _slider(3, "Substeps", "", 1, 10, "Tissue")
-    gravity_m_s2: float = _slider(9.81, "Gravity", "m/s2", 0.0, 20.0, "Tissue")
+    gravity_m_s2: float = _slider(9.81, "g", "m/s2", 0.0, 20.0, "Tissue")
     depth_mm: int = _slider(60, "Depth", "mm", 20, 160, "Picture")
-    window_hu: int = _slider(350, "Window", "HU", 1, 2000, "Picture")
-    level_hu: int = _slider(40, "Level", "HU", -500, 500, "Picture")
+    window_hu: int = _slider(350, "W", "HU", 1, 2000, "Picture")
+    level_hu: int = _slider(40, "L", "HU", -500, 500, "Picture")
     gain_percent: int = _slider(50, "Gain", "%", 0, 100, ECHO)
-    dyn_range_db: int = _slider(60, "Range", "dB", 20, 120, ECHO)
-    frequency_mhz: float = _slider(7.5, "Freq.", "MHz", 2.0, 15.0, ECHO)
+    dyn_range_db: int = _slider(60, "DR", "dB", 20, 120, ECHO)
+    frequency_mhz: float = _slider(7.5, "", "MHz", 2.0, 15.0, ECHO)
     focus_percent: int = _slider(40, "Focus", "%", 0, 100, ECHO)
     tgc_1: int = _level(1)
     tgc_2: int = _level(2)

@@ -88,7 +88,9 @@ class TestImport:
         values = sitk.GetArrayFromImage(labels).astype(np.int16)
         kidney = np.argwhere(values == 2)
         values[tuple(kidney[len(kidney) // 2])] = 7
-        found = import_patient(ct, with_voxels(labels, values), [2, 7], [3], margin_mm=20.0, tissues={7: "urine"})
+        found = import_patient(
+            ct, with_voxels(labels, values), [2, 7], [3], margin_mm=20.0, tissues={7: "urine"}
+        )
         assert found.tissues == {1: "kidney", 2: "tumour", 3: "urine"}
         assert (sitk.GetArrayViewFromImage(found.labels) == 3).sum() == 1
 

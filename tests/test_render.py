@@ -12,7 +12,7 @@ import trimesh
 
 from render import frame, panel, solids
 from render.camera import OrbitCamera
-from render.layout import HEADER_HEIGHT, RULER_WIDTH, Layout, Rect
+from render.layout import HEADER_HEIGHT, RULER_WIDTH, Layout
 from render.panel import Panel
 from render.viewer import KEY_MAP, Controls, Geometry, NullViewer, Settings, View, key_table
 

@@ -15,6 +15,8 @@ from ultrasound.plane import ImagePlane
 # How wide a patch of surface the probe's axis is perpendicular to, as a hand would hold it.
 NORMAL_PATCH_MM = 12.0
 LEAST_DEPTH_MM, MOST_DEPTH_MM = -40.0, 15.0
+# How deep a hand presses, in lengths of the transducer: what holds it must stay out of the tissue.
+MOST_LENGTHS = 1.5
 PRESS_MM_S, RELEASE_MM_S = 12.0, 40.0
 
 
@@ -121,6 +123,7 @@ class Hand:
         corners = self.vertices[self.faces]
         middles = (corners + np.roll(corners, 1, axis=1)).reshape(-1, 3) / 2
         self.samples = np.concatenate([self.vertices, corners.mean(axis=1), middles])
+        self.most_mm = min(MOST_DEPTH_MM, MOST_LENGTHS * float(self.size_mm[2]))
 
     def reset(self) -> None:
         """Back to the home pose, untilted and just touching."""
@@ -141,12 +144,12 @@ class Hand:
 
     def push(self, depth_mm: float) -> None:
         """Press in by a depth [mm], or lift where negative."""
-        self.depth_mm = float(np.clip(self.depth_mm + depth_mm, LEAST_DEPTH_MM, MOST_DEPTH_MM))
+        self.depth_mm = float(np.clip(self.depth_mm + depth_mm, LEAST_DEPTH_MM, self.most_mm))
 
     def hold(self, pressing: bool, time_s: float) -> None:
         """Press further while the button is held, let go when it is not."""
         speed = PRESS_MM_S if pressing else -RELEASE_MM_S
-        self.pressed_mm = float(np.clip(self.pressed_mm + speed * time_s, 0.0, MOST_DEPTH_MM))
+        self.pressed_mm = float(np.clip(self.pressed_mm + speed * time_s, 0.0, self.most_mm))
 
     def turn(self, fan_deg: float, tilt_deg: float, roll_deg: float) -> None:
         """Turn about the transducer's x, y and z axes [degrees]; fan and tilt end where a hand's do."""
@@ -161,5 +164,5 @@ class Hand:
             pose[:3, :3] @ Rotation.from_euler("zyx", self.turn_deg[::-1], degrees=True).as_matrix()
         )
         pose[:3, 3] = face + self.size_mm[2] / 2 * pose[:3, 2]
-        depth = min(self.depth_mm + self.pressed_mm, MOST_DEPTH_MM)
+        depth = min(self.depth_mm + self.pressed_mm, self.most_mm)
         return advanced(touching(pose, self.size_mm, self.samples), depth)

@@ -2,7 +2,6 @@
 
 from collections import deque
 from dataclasses import dataclass, field
-from time import perf_counter
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -12,39 +11,42 @@ from render.viewer import View
 KEPT_S, MOST_FRAMES = 10.0, 600
 
 
+@dataclass(frozen=True)
+class Frame:
+    """A view, when it was there [s], and where its tissue was at rest (rows, columns, 3) [mm]; None without a CT."""
+
+    time_s: float
+    view: View
+    rest: np.ndarray | None
+
+
 @dataclass
 class Cine:
-    """The last KEPT_S seconds of views, each with where its tissue was at rest (rows, columns, 3) [mm]."""
+    """The frames of the last KEPT_S seconds. ``back`` says how many before the newest is looked at."""
 
-    frames: deque[tuple[float, View, np.ndarray | None]] = field(
-        default_factory=lambda: deque(maxlen=MOST_FRAMES)
-    )
+    frames: deque[Frame] = field(default_factory=lambda: deque(maxlen=MOST_FRAMES))
     back: int = 0
 
-    def keep(self, view: View, rest: np.ndarray | None, now: float | None = None) -> None:
-        """Add a view, now the newest, and let go of those that are too old."""
-        now = perf_counter() if now is None else now
-        self.frames.append((now, view, rest))
-        while now - self.frames[0][0] > KEPT_S:
+    def keep(self, frame: Frame) -> None:
+        """Add a frame, now the newest, and let go of those that are too old."""
+        self.frames.append(frame)
+        while frame.time_s - self.frames[0].time_s > KEPT_S:
             self.frames.popleft()
         self.back = 0
 
-    def moved(self, frames: int) -> View:
-        """The view so many on from the one that was shown last (back, negative), as far as there are any."""
-        self.back = int(np.clip(self.back - frames, 0, len(self.frames) - 1))
-        return self._shown[1]
-
-    def age_s(self) -> float:
-        """How much older than the newest view the one shown is, negative [s]."""
-        return self._shown[0] - self.frames[-1][0]
-
-    def rest_places(self) -> np.ndarray | None:
-        """Where the tissue of the view shown was at rest."""
-        return self._shown[2]
+    def go(self, frames: int) -> None:
+        """Look so many frames on (back, negative), as far as there are any."""
+        self.back = int(np.clip(self.back - frames, 0, max(len(self.frames) - 1, 0)))
 
     @property
-    def _shown(self) -> tuple[float, View, np.ndarray | None]:
+    def shown(self) -> Frame:
+        """The frame that is looked at."""
         return self.frames[-1 - self.back]
+
+    @property
+    def age_s(self) -> float:
+        """How much older than the newest frame the one looked at is, negative [s]."""
+        return self.shown.time_s - self.frames[-1].time_s
 
 
 @dataclass
@@ -58,14 +60,14 @@ class Calliper:
         if place_mm is not None:
             self.points = (place_mm,) if len(self.points) == 2 else (*self.points, place_mm)
 
-    def readouts(self, view: View, rest: np.ndarray | None) -> dict[str, str]:
+    def readouts(self, frame: Frame) -> dict[str, str]:
         """The distance of the points as the tissue lies, and of the same tissue at rest."""
         if len(self.points) < 2:
             return {}
         start, end = np.array(self.points)
         found = {"calliper": f"{np.linalg.norm(end - start):.1f} mm"}
-        if rest is not None:
-            places = at_rest(rest, np.array(self.points), view)
+        if frame.rest is not None:
+            places = at_rest(frame.rest, np.array(self.points), frame.view)
             found["at rest"] = f"{np.linalg.norm(places[1] - places[0]):.1f} mm"
         return found
 

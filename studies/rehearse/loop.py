@@ -13,7 +13,7 @@ from render.viewer import Controls, View, Viewer
 from render.window import NoVulkan
 from studies.commands import Fault
 from studies.rehearsal import Rehearsal
-from studies.rehearse.cine import Calliper, Cine
+from studies.rehearse.cine import Calliper, Cine, Frame
 from studies.rehearse.view import open_viewer, take_view
 from studies.report import Notices, Record
 from studies.trade.ladder import Ladder
@@ -75,22 +75,35 @@ class Loop:
         if controls.freeze:
             self.frozen = not self.frozen
         pose = None if self.frozen else steer(self.rehearsal, controls, self.ladder)
+        shown = self._looked_back(controls) or self._taken(controls, pose)
+        if controls.reset:
+            self.calliper.points = ()
+        self.calliper.point(controls.pointed_mm)
+        speed = self.rate * self.rehearsal.settings.time_step_s
+        figures = {"frames": f"{self.rate:.0f} /s", "time": f"{speed:.1f} x real"}
+        figures |= self.calliper.readouts(shown)
+        view = shown.view
+        return replace(view, calliper_mm=self.calliper.points, readouts=view.readouts | figures)
+
+    def _looked_back(self, controls: Controls) -> Frame | None:
+        """A frame of the last seconds, where the user is looking at one."""
+        if self.frozen:
+            self.cine.go(controls.cine)
+        if not self.frozen or self.cine.back == 0:
+            return None
+        frame = self.cine.shown
+        return replace(frame, view=replace(frame.view, status=f"FROZEN   {self.cine.age_s:.1f} s"))
+
+    def _taken(self, controls: Controls, pose: np.ndarray | None) -> Frame:
+        """A new frame. A frozen one shows the same tissue with the scanner set anew, and is not kept."""
         asked = controls.settings.iterations
         status = "FROZEN" if self.frozen else self.notices.shown or self.ladder.says(asked)
-        if self.frozen and self.cine.frames:
-            view = replace(self.cine.moved(controls.cine), status=f"FROZEN   {self.cine.age_s():.1f} s")
-        else:
-            view = take_view(self.rehearsal, controls.settings, pose, self.record, status)
-            self.cine.keep(view, self.rehearsal.rest_grid())
+        view = take_view(self.rehearsal, controls.settings, pose, self.record, status)
+        frame = Frame(perf_counter(), view, self.rehearsal.rest_grid())
         if pose is not None:
+            self.cine.keep(frame)
             self._tell(asked, status)
-        self.calliper.point(controls.pointed_mm)
-        figures = {
-            "frames": f"{self.rate:.0f} /s",
-            "time": f"{self.rate * self.rehearsal.settings.time_step_s:.1f} x real",
-        }
-        figures |= self.calliper.readouts(view, self.cine.rest_places())
-        return replace(view, calliper_mm=self.calliper.points, readouts=view.readouts | figures)
+        return frame
 
     def _tell(self, asked: int, status: str) -> None:
         self.notices.tell(self.rehearsal.notice)
