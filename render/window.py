@@ -20,17 +20,16 @@ import numpy as np
 import taichi as ti
 from taichi.ui.utils import get_field_info
 
-from render import frame
 from render.camera import FIELD_OF_VIEW_DEG, OrbitCamera
-from render.layout import ASIDE_WIDTH, Layout
-from render.panel import CALLIPER, OUTLINE, Panel, calliper_segments, draw_segments, paste_picture
+from render.layout import Layout
+from render.page import Page
 from render.sliders import boxes_of, draw_sliders
 from render.stage import Stage
-from render.viewer import KEY_MAP, Controls, Geometry, Settings, View
+from render.viewer import Controls, Geometry, Settings, View
 from ultrasound.array import MODES, RUNGS
 
 PUSH_MM_S, ROLL_DEG_S, TILT_DEG_S, ZOOM_S = 15.0, 45.0, 30.0, 0.5
-READOUT_PERIOD_S, FRAMES_A_SECOND = 0.25, 60
+FRAMES_A_SECOND = 60
 PRESSED_ONCE = {"r": "reset", "f": "freeze", "p": "screenshot", "i": "export", ti.ui.ESCAPE: "quit"}
 TOGGLES = {"t": "translucent", "x": "cut", "o": "outline", "g": "show_scanner"}
 CYCLES = {"b": ("mode", MODES), "v": ("rung", RUNGS)}
@@ -131,16 +130,7 @@ class Window:
         part = self.layout.window_coordinates(self.layout.scene)
         self.camera = OrbitCamera(geometry.bounds, geometry.up, part, size[0] / size[1])
         self._stage = Stage(geometry, self.camera)
-        self._start_pixels()
-
-    def _start_pixels(self) -> None:
-        # GGUI wants columns first, bottom up, RGBA; frame.py writes rows, top down, through this view of the memory.
-        width, height = self.layout.width, self.layout.height
-        self._pixels = np.full((width, height, 4), 255, dtype=np.uint8)
-        self._page = self._pixels.transpose(1, 0, 2)[::-1]
-        self._drawn_panel: tuple[Panel, bool] | None = None
-        self._drawn_readouts: dict[str, str] | None = None
-        self._readouts_at = 0.0
+        self._page = Page(self.layout)
 
     # What the user does
 
@@ -186,14 +176,10 @@ class Window:
 
     def _place_in_picture(self) -> tuple[float, float] | None:
         """The place on the image plane [mm] under the mouse."""
-        if self._cursor is None or self._drawn_panel is None:
+        if self._cursor is None:
             return None
-        panel = self._drawn_panel[0]
         column, row = self._cursor[0] * self.layout.width, (1 - self._cursor[1]) * self.layout.height
-        for box in panel.boxes(self.layout):
-            if box.left <= column < box.right and box.top <= row < box.bottom:
-                return panel.to_plane(box, column, row)
-        return None
+        return self._page.place_at(column, row)
 
     def _read_events(self, controls: Controls) -> None:
         for event in self._window.get_events(ti.ui.PRESS):
@@ -293,13 +279,13 @@ class Window:
             return
         self.layout = Layout(*size)
         self._boxes_placed += 1
-        self._start_pixels()
+        self._page = Page(self.layout)
         self.camera.aspect = size[0] / size[1]
         self.camera.part = self.layout.window_coordinates(self.layout.scene)
 
     def _submit(self, view: View) -> None:
-        self._compose(view)
-        _put_image(self._canvas, self._pixels)
+        self._page.compose(view, self.settings, self._help_shown, self._visible)
+        _put_image(self._canvas, self._page.pixels)
         self._aim()
         rects = [self.layout.panel, self.layout.title, self.layout.strip] + (
             [self.layout.help] if self._help_shown else []
@@ -308,40 +294,6 @@ class Window:
         self._stage.draw(self._scene, view, self.settings, masked)
         self._canvas.scene(self._scene)
         self._draw_sliders()
-
-    def _compose(self, view: View) -> None:
-        panel = Panel(
-            tuple(view.pictures),
-            view.width_mm,
-            view.depth_mm,
-            view.above_mm,
-            view.focus_mm,
-            view.captions,
-            view.title,
-            view.status,
-            view.marked_side,
-            ASIDE_WIDTH if self.settings.show_scanner else 0,
-        )
-        if self._drawn_panel != (panel, self._help_shown):
-            lines = [(key.key, key.text) for key in KEY_MAP] if self._help_shown else None
-            self._page[:, :, :3] = frame.backdrop(self.layout, panel, lines)
-            self._drawn_panel, self._drawn_readouts = (panel, self._help_shown), None
-        for box, picture in zip(panel.boxes(self.layout), view.pictures.values(), strict=True):
-            paste_picture(self._page, box, picture)
-            if view.outline_mm is not None:
-                draw_segments(self._page, panel, box, view.outline_mm, OUTLINE)
-            draw_segments(self._page, panel, box, calliper_segments(panel, box, view.calliper_mm), CALLIPER)
-        self._compose_readouts(dict(view.readouts))
-
-    def _compose_readouts(self, readouts: dict[str, str]) -> None:
-        now = time.perf_counter()
-        # On a screen, figures that change every frame cannot be read; a kept picture shows its own frame's figures.
-        waits = self._visible and now - self._readouts_at < READOUT_PERIOD_S
-        if self._drawn_readouts is not None and (waits or readouts == self._drawn_readouts):
-            return
-        rows, columns = self.layout.readouts.slices
-        self._page[rows, columns, :3] = frame.readout_picture(self.layout, readouts)
-        self._drawn_readouts, self._readouts_at = readouts, now
 
     def _aim(self) -> None:
         _, up, ahead = self.camera.axes()

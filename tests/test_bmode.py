@@ -166,7 +166,7 @@ def test_an_interface_echoes_what_it_reflects_from_where_it_is(request, size, ti
         true = depth - u[lines] * np.tan(np.radians(tilt))
         assert np.abs(found - true).max() < axial_sd_mm(probe) / cosine
         assert width == pytest.approx(axial_sd_mm(probe), rel=1e-3)
-        # Equal impedance reflects nothing, whatever else differs.
+        # Equal impedance reflects nothing.
         tank.fill(TISSUE, interface(0.1, 1.0, blur, tilt, depth))
         assert tank.look(probe).max() < SILENT_DB
 
@@ -188,10 +188,9 @@ def test_an_interface_in_lossy_tissue_is_as_loud_as_what_reaches_it(fine, before
     probe = probe_of()
     fine.fill(interface(FAT, TISSUE, 0.4), interface(before, behind, 0.4))
     found, amplitude, _ = peaks(fine.look(probe), probe)
-    # As at normal incidence above; and depth, to an SD of the pulse, counts by the round trip's loss.
     wanted = REFLECTION * 10 ** (-0.2 * before * probe.frequency_mhz * 40.0 / 20)
-    depth_share = 0.2 * before * probe.frequency_mhz / 8.69 * axial_sd_mm(probe)
-    assert amplitude == pytest.approx(wanted, rel=0.015 + depth_share)
+    # As at normal incidence above; and depth, to an SD of the pulse, counts by the round trip's loss.
+    assert amplitude == pytest.approx(wanted, rel=0.015 + 0.2 * before * probe.frequency_mhz / 8.69 * 0.0872)
     assert np.abs(found - 40.0).max() < axial_sd_mm(probe)
 
 
@@ -250,9 +249,8 @@ def test_a_wire_is_drawn_as_wide_as_the_focus_makes_it(endless, focus_percent, t
     endless.bmode.real.from_numpy(np.repeat(profile[:, None], SAMPLES, axis=1).astype(np.float32))
     endless.bmode.imaginary.fill(0.0)
     endless.bmode._spread()
-    decibel = endless.bmode.decibel.to_numpy().astype(float)
     for depth in (8.0, 16.0, 32.0, 56.0, 72.0):
-        line = decibel[:, int(depth / 0.125)]
+        line = endless.bmode.decibel.to_numpy()[:, int(depth / 0.125)].astype(float)
         near = line > line.max() - 6.0
         found = np.sqrt(-10 / np.log(10) / np.polyfit(u[near], line[near], 2)[0])
         formula = 1.54 / 7.5 * 3.0 / FWHM * np.sqrt(1 + ((depth - 0.8 * focus_percent) / 20.0) ** 2)
@@ -319,9 +317,8 @@ def test_a_still_probe_shows_the_same_bits_also_after_it_was_away(fine, rung):
     fine.fill(interface(FAT, TISSUE, 0.4, 20.0), 0.5, 0.1)
     first, picture = fine.look(probe, rung), fine.picture
     again = fine.look(probe, rung)
-    away = fine.look(probe_of(frequency_mhz=5.0), rung, (2.0, 1.0, 3.0))
+    assert np.abs(fine.look(probe_of(frequency_mhz=5.0), rung, (2.0, 1.0, 3.0)) - first).max() > 1.0
     back = fine.look(probe, rung)
-    assert np.abs(away - first).max() > 1.0
     assert (again == first).all() and (back == first).all() and (fine.picture == picture).all()
 
 
@@ -362,16 +359,13 @@ def test_tissue_and_probe_moved_alike_give_the_same_picture(moved, elevation):
 def test_tracked_speckle_moves_as_the_tissue_does(moved, across, along, shear):
     (tank, move), probe = moved, probe_of(**SMALL)
     tank.fill(attenuation=0.5, backscatter=0.1)
-    strain, shift, frames = (
-        np.array([[across, shear, 0], [0, along, 0], [0, 0, 0]]),
-        np.array([-0.3, 0.4, 0.0]),
-        [],
-    )
+    strain, shift = np.array([[across, shear, 0], [0, along, 0], [0, 0, 0]]), np.array([-0.3, 0.4, 0.0])
+    frames = []
     for share in (0, 1):
         move(np.eye(3) + share * strain, share * shift)
         frames.append(10 ** (tank.look(probe, "speckle", (0.0, -10.0, 0.4)) / 20))
     size = np.array([16.0 / LINES, 20.0 / SAMPLES])
-    half, found, wanted = (18, 24), [], []
+    half, found, wanted = (18, 48), [], []
     for place in np.mgrid[-6:6.1:1.5, -6:6.1:1.5].reshape(2, -1).T:
         at = np.rint((place + [8, 10]) / size - 0.5).astype(int)
         block = tuple(slice(i - h, i + h + 1) for i, h in zip(at, half, strict=True))
@@ -385,11 +379,8 @@ def test_tracked_speckle_moves_as_the_tissue_does(moved, across, along, shear):
 
 
 def test_a_target_off_the_plane_is_dimmed_as_the_thick_plane_weighs_it():
-    probe, tank = (
-        probe_of(elevation_width_mm=4.0),
-        Tank((BOUNDLESS, BOUNDLESS, 0.05), (1, 1, 321), (0, 0, -8.0)),
-    )
-    thickness = 4.0 / FWHM
+    probe, thickness = probe_of(elevation_width_mm=4.0), 4.0 / FWHM
+    tank = Tank((BOUNDLESS, BOUNDLESS, 0.05), (1, 1, 321), (0, 0, -8.0))
     assert elevation_sd_mm(probe) == pytest.approx(thickness)
     tank.fill(backscatter=0.1)
     uniform = tank.look(probe, "elevation")

@@ -12,6 +12,8 @@ import pytest
 from conftest import ROOT
 from PIL import Image
 
+from render.panel import CALLIPER
+
 pytestmark = pytest.mark.skipif(
     not (shutil.which("Xvfb") and shutil.which("xdotool")), reason="needs Xvfb and xdotool"
 )
@@ -19,6 +21,8 @@ START_S, REST_S = 120, 90
 # The slice and what is drawn of organ and transducer, and how much two pictures of a still one differ at most.
 PANEL, SCENE = np.s_[80:640, 860:1240], np.s_[60:570, 20:780]
 STILL = 0.5
+# Two places on the echo where it stands beside the CT.
+ECHO_TOP, ECHO_FOOT = (950, 150), (950, 400)
 
 
 class Screen:
@@ -36,6 +40,8 @@ class Screen:
                 "rehearse",
                 "--radius",
                 "4",
+                "--picture",
+                "ct",
                 "--arch",
                 "cpu",
                 "--out",
@@ -131,5 +137,24 @@ def test_the_mouse_moves_and_presses_the_transducer(screen):
     assert np.abs(pressed - second)[SCENE].mean() > 0.5, "pressing does not move the transducer in"
     let_go = screen.at_rest()
     assert np.abs(let_go - second)[PANEL].mean() < 0.5 * np.abs(pressed - second)[PANEL].mean()
+    screen.do("key", "--window", screen.window, "b")
+    both = screen.at_rest()
+    assert np.abs(both - let_go)[PANEL].mean() > 5.0, "the key for the echo changes nothing"
+    screen.do("key", "--window", screen.window, "f")
+    for place in (ECHO_TOP, ECHO_FOOT):
+        screen.point(*place)
+        time.sleep(1.0)
+        screen.do("mousedown", 1)
+        time.sleep(0.5)
+        screen.do("mouseup", 1)
+    measured = screen.picture()
+    green = (measured == CALLIPER).all(axis=2)[PANEL]
+    assert green.sum() > 100, "two clicks on the echo draw no calliper"
+    screen.do("key", "--window", screen.window, "i")
+    exported = screen.out / "001-b-mode.dcm"
+    end = time.monotonic() + 20
+    while not exported.exists() and time.monotonic() < end:
+        time.sleep(0.5)
+    assert exported.exists() and (screen.out / "001-ct.png").exists()
     screen.do("key", "--window", screen.window, "Escape")
     assert screen.program.wait(timeout=20) == 0

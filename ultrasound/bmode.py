@@ -251,7 +251,8 @@ class BMode:
 
     @ti.kernel
     def _spread(self):
-        for line, packet in ti.ndrange(self.lines, self.samples // LANES):
+        # Line by line at one depth, so that what neighbours share stays in the nearest cache.
+        for packet, line in ti.ndrange(self.samples // LANES, self.lines):
             first = packet * LANES
             real, imaginary = Packet(0.0), Packet(0.0)
             half = self.half[packet]

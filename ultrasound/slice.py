@@ -5,7 +5,7 @@ import taichi as ti
 import taichi.math as tm
 
 from ultrasound.plane import Picture, PlaneInTissue
-from ultrasound.volume import AIR_HU, Volume
+from ultrasound.volume import AIR_HU, LANES, Lanes, Volume
 
 OUTSIDES = ("background", "gel", "air")
 OUTSIDE_HU = {"background": 0.0, "gel": 0.0, "air": AIR_HU}
@@ -43,16 +43,24 @@ class Slice:
     def _sample(
         self, pixel_mm: tm.vec2, first_mm: tm.vec2, window_hu: float, level_hu: float, picture: Picture
     ):
-        for row, column in self.hu:
-            rest = self.plane.rest_at(row, column, pixel_mm, first_mm)
-            hu = self.outside_hu
-            if ti.static(self.show_background):
-                hu = self.ct.sample(rest)
-            elif self.in_organ(row, column, rest):
-                hu = self.ct.sample(rest)
-            self.hu[row, column] = hu
-            bright = (hu - level_hu) / window_hu + 0.5
-            picture[row, column] = ti.cast(tm.clamp(bright, 0.0, 1.0) * 255.0 + 0.5, ti.u8)
+        last = self.plane.pixels - 1
+        for row, packet in ti.ndrange(self.plane.pixels, (last + LANES) // LANES):
+            first = packet * LANES
+            x, y, z = Lanes(0.0), Lanes(0.0), Lanes(0.0)
+            for lane in ti.static(range(LANES)):
+                rest = self.plane.rest_at(row, ti.min(first + lane, last), pixel_mm, first_mm)
+                x[lane], y[lane], z[lane] = rest.x, rest.y, rest.z
+            hu = self.ct.sample_lanes(x, y, z)
+            if ti.static(not self.show_background):
+                for lane in ti.static(range(LANES)):
+                    rest = tm.vec3(x[lane], y[lane], z[lane])
+                    if not self.in_organ(row, ti.min(first + lane, last), rest):
+                        hu[lane] = self.outside_hu
+            grey = ti.min(ti.max((hu - level_hu) / window_hu + 0.5, 0.0), 1.0) * 255.0 + 0.5
+            for lane in ti.static(range(LANES)):
+                if first + lane <= last:
+                    self.hu[row, first + lane] = hu[lane]
+                    picture[row, first + lane] = ti.cast(grey[lane], ti.u8)
 
     @ti.func
     def in_organ(self, row, column, rest):

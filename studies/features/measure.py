@@ -10,6 +10,8 @@ import taichi as ti
 import trimesh
 from taichi.profiler.kernel_profiler import get_default_kernel_profiler
 
+from render.layout import Layout
+from render.page import Page
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Contact, Scene, ShapeMatchingTissue, SolverSection, with_options
 from sim.device import start
@@ -19,7 +21,8 @@ from sim.shapes import GRID_MM, ConvexTool, SignedDistanceField
 from sim.solver import Solver
 from studies.models import AnyTissue, build_solver, embedding_cell_mm, fill, reach_of, step_settings
 from studies.rehearsal import SURROUNDINGS_MM, Rehearsal, scanned_anatomy
-from studies.report import timed
+from studies.rehearse.view import settings_of, take_view
+from studies.report import Record, timed
 from studies.setup import probe_of
 from studies.timing.measure import memory_mb
 from ultrasound.array import Mode, Rung
@@ -200,6 +203,7 @@ def of_frame(scene: Scene, anatomy: LoadedAnatomy, arch: str) -> Iterator[dict[s
     if anatomy.ct is None:
         return
     yield from _pictures(rehearsal, anatomy)
+    yield _whole_frame(rehearsal)
 
 
 def _pictures(rehearsal: Rehearsal, anatomy: LoadedAnatomy) -> Iterator[dict[str, Any]]:
@@ -224,6 +228,22 @@ def _pictures(rehearsal: Rehearsal, anatomy: LoadedAnatomy) -> Iterator[dict[str
             scanner.look(plane, probe, mode, rung, image.window_hu, image.level_hu)
 
         yield _alone(f"picture, {name}", draw, [embedding, scanner], rehearsal.model)
+
+
+def _whole_frame(rehearsal: Rehearsal) -> dict[str, Any]:
+    """All that a frame does but drawing the 3D view: a step under the pressing transducer, skin, echo, window's picture."""
+    rehearsal.reset()
+    settings, record, page = settings_of(rehearsal), Record(0.0), Page(Layout(1280, 720))
+    settings.mode = "b-mode"
+    poses = [
+        rehearsal.pose_at_depth(depth)
+        for depth in np.linspace(0.0, rehearsal.press.indentations_mm[0], CALLS + 1)
+    ]
+
+    def go_on() -> None:
+        page.compose(take_view(rehearsal, settings, poses.pop(0), record), settings, patient=True)
+
+    return _alone("whole frame, with the echo", go_on, [rehearsal.scanner], rehearsal.model)
 
 
 def _alone(name: str, work: Callable[[], Any], owners: list, apart: Any) -> dict[str, Any]:

@@ -1,0 +1,75 @@
+"""The full-window picture that lies behind the 3D view, kept up to date with as little drawing as a frame needs."""
+
+import time
+
+import numpy as np
+
+from render import frame
+from render.layout import ASIDE_WIDTH, Layout
+from render.panel import CALLIPER, OUTLINE, Panel, calliper_segments, draw_segments, paste_picture
+from render.viewer import KEY_MAP, Settings, View
+
+READOUT_PERIOD_S = 0.25
+
+
+def panel_of(view: View, settings: Settings) -> Panel:
+    """What the panel says of a view."""
+    return Panel(
+        tuple(view.pictures),
+        view.width_mm,
+        view.depth_mm,
+        view.above_mm,
+        view.focus_mm,
+        view.captions,
+        view.title,
+        view.status,
+        view.marked_side,
+        ASIDE_WIDTH if settings.show_scanner else 0,
+    )
+
+
+class Page:
+    """``pixels`` uint8 (width, height, 4) as GGUI wants them: columns first, bottom up."""
+
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+        self.pixels = np.full((layout.width, layout.height, 4), 255, dtype=np.uint8)
+        # frame.py and panel.py write rows, top down, through this view of the memory.
+        self._page = self.pixels.transpose(1, 0, 2)[::-1]
+        self.panel: Panel | None = None
+        self._help_shown = False
+        self._readouts: dict[str, str] | None = None
+        self._readouts_at = 0.0
+
+    def compose(
+        self, view: View, settings: Settings, help_shown: bool = False, patient: bool = False
+    ) -> None:
+        """Put a view on the page. A ``patient`` one lets read-outs stand long enough to be read."""
+        panel = panel_of(view, settings)
+        if (self.panel, self._help_shown) != (panel, help_shown):
+            lines = [(key.key, key.text) for key in KEY_MAP] if help_shown else None
+            self._page[:, :, :3] = frame.backdrop(self.layout, panel, lines)
+            self.panel, self._help_shown, self._readouts = panel, help_shown, None
+        for box, picture in zip(panel.boxes(self.layout), view.pictures.values(), strict=True):
+            paste_picture(self._page, box, picture)
+            if view.outline_mm is not None:
+                draw_segments(self._page, panel, box, view.outline_mm, OUTLINE)
+            draw_segments(self._page, panel, box, calliper_segments(panel, box, view.calliper_mm), CALLIPER)
+        self._compose_readouts(dict(view.readouts), patient)
+
+    def _compose_readouts(self, readouts: dict[str, str], patient: bool) -> None:
+        now = time.perf_counter()
+        # On a screen, figures that change every frame cannot be read; a kept picture shows its own frame's figures.
+        waits = patient and now - self._readouts_at < READOUT_PERIOD_S
+        if self._readouts is not None and (waits or readouts == self._readouts):
+            return
+        rows, columns = self.layout.readouts.slices
+        self._page[rows, columns, :3] = frame.readout_picture(self.layout, readouts)
+        self._readouts, self._readouts_at = readouts, now
+
+    def place_at(self, column: float, row: float) -> tuple[float, float] | None:
+        """The place on the image plane [mm] that a pixel of one of the pictures shows."""
+        for box in self.panel.boxes(self.layout) if self.panel else []:
+            if box.left <= column < box.right and box.top <= row < box.bottom:
+                return self.panel.to_plane(box, column, row) if self.panel else None
+        return None

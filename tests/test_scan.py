@@ -1,0 +1,126 @@
+"""Pictures without a body: poses that are read or refused, and what the command leaves."""
+
+import json
+
+import numpy as np
+import pytest
+from conftest import rotation_about
+from PIL import Image
+
+import app
+from scenes.anatomy import load_surface, phantom_folder
+from scenes.scene import EMBEDDED
+from studies.scan.poses import PoseError, load_poses
+
+
+def pose_on_tumour() -> np.ndarray:
+    """On the embedded kidney's tumour: y into it, x to the head."""
+    folder = phantom_folder()
+    organ, tumour = load_surface(folder, "organ.stl"), load_surface(folder, "tumour.stl")
+    inward = organ.center_mass - tumour.center_mass
+    inward /= np.linalg.norm(inward)
+    face = organ.vertices[
+        np.argmin(organ.vertices @ inward + 0.3 * np.linalg.norm(organ.vertices - tumour.center_mass, axis=1))
+    ]
+    x = np.cross(inward, [1.0, 0.0, 0.0])
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.column_stack([x, inward, np.cross(x, inward)]), face
+    return pose
+
+
+def refused(tmp_path, text: str, name: str = "poses.json") -> str:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(PoseError) as error:
+        load_poses(tmp_path / name)
+    assert "\n" not in str(error.value) and name in str(error.value)
+    return str(error.value)
+
+
+def test_poses_of_both_formats_are_the_same(tmp_path):
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation_about([1, 2, 3], 40), [1.0, -2.0, 3.0]
+    (tmp_path / "a.json").write_text(
+        json.dumps([dict(name="first", probe_to_patient=pose.tolist()), dict(probe_to_patient=pose.tolist())])
+    )
+    (tmp_path / "a.csv").write_text("# row by row\n" + ",".join(map(str, pose.ravel())) + "\n")
+    named, numbered = load_poses(tmp_path / "a.json"), load_poses(tmp_path / "a.csv")
+    assert list(named) == ["first", "0002"] and list(numbered) == ["0001"]
+    assert np.array_equal(named["first"], pose) and np.array_equal(numbered["0001"], pose)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{", "not valid JSON"),
+        ("[]", "holds no poses"),
+        ('[{"probe_to_patient": [[1, 0, 0, 0]]}]', "pose 1, probe_to_patient"),
+        ('[{"matrix": []}]', "pose 1"),
+        (json.dumps([dict(probe_to_patient=np.diag([1.0, 1, 2, 1]).tolist())]), "pose 1 is not rigid"),
+        (json.dumps([dict(probe_to_patient=np.diag([1.0, 1, -1, 1]).tolist())]), "determinant -1"),
+        (json.dumps([dict(name="a", probe_to_patient=np.eye(4).tolist())] * 2), "'a' is there twice"),
+        (json.dumps([dict(name="../a", probe_to_patient=np.eye(4).tolist())]), "pose 1, name"),
+    ],
+)
+def test_poses_that_cannot_be_used_are_refused_in_one_line(tmp_path, text, words):
+    assert words in refused(tmp_path, text)
+
+
+def test_a_table_with_another_number_of_columns_is_refused(tmp_path):
+    assert "pose 1: 3 numbers" in refused(tmp_path, "1,2,3", "poses.csv")
+    assert "expected sixteen" in refused(tmp_path, "a,b", "poses.csv")
+    with pytest.raises(PoseError, match="no such file"):
+        load_poses(tmp_path / "none.json")
+
+
+def test_scan_leaves_a_picture_of_each_pose_and_mode(tmp_path, capsys):
+    away = pose_on_tumour()
+    away[:3, 3] -= 30 * away[:3, 1]
+    poses = [
+        dict(name="on", probe_to_patient=pose_on_tumour().tolist()),
+        dict(name="off", probe_to_patient=away.tolist()),
+    ]
+    (tmp_path / "poses.json").write_text(json.dumps(poses))
+    out = tmp_path / "out"
+    command = [
+        "scan",
+        str(EMBEDDED),
+        "--pose",
+        tmp_path / "poses.json",
+        "--out",
+        out,
+        "--contact",
+        "organ",
+        "--dicom",
+    ]
+    assert app.main([str(part) for part in [*command, "--arch", "cpu"]]) == 0
+    report = json.loads((out / "scan.json").read_text())
+    assert [row["file"] for row in report["pictures"]] == [
+        "on-b-mode.png",
+        "on-ct.png",
+        "off-b-mode.png",
+        "off-ct.png",
+    ]
+    assert report["probe"]["FrequencyMhz"] == 9.0
+    shown = {path.stem: np.asarray(Image.open(path)).astype(int) for path in out.glob("*.png")}
+    row = report["pictures"][0]
+    rows, columns = shown["on-b-mode"].shape
+    assert (rows * row["row_mm"], columns * row["column_mm"]) == pytest.approx((40.0, 16.0))
+    assert shown["on-b-mode"].mean() > 40 and shown["off-b-mode"].max() == 0 and shown["off-ct"].max() > 0
+    assert (out / "on-b-mode.dcm").is_file() and not (out / "on-ct.dcm").exists()
+
+
+def test_an_unknown_probe_is_named_with_those_that_are_known(tmp_path, capsys):
+    (tmp_path / "poses.json").write_text(json.dumps([dict(probe_to_patient=np.eye(4).tolist())]))
+    command = [
+        "scan",
+        str(EMBEDDED),
+        "--pose",
+        str(tmp_path / "poses.json"),
+        "--out",
+        str(tmp_path),
+        "--probe",
+        "x.toml",
+    ]
+    assert app.main(command) == 2
+    assert "known by name: curvilinear, drop-in, linear, phased" in capsys.readouterr().err
