@@ -9,8 +9,10 @@ PANEL_SHARE = 0.37
 TITLE_HEIGHT = 42
 STRIP_HEIGHT, READOUT_SHARE = 160, 0.19
 HEADER_HEIGHT, FOOTER_HEIGHT = 74, 34
-RULER_WIDTH, WEDGE_WIDTH, PICTURE_GAP = 46, 34, 10
+RULER_WIDTH, WEDGE_WIDTH, PICTURE_GAP, NAME_HEIGHT = 46, 34, 10, 26
 ASIDE_WIDTH = 186
+# How much larger pictures one under the other must be than side by side.
+BELOW_FROM = 1.2
 
 
 class Rect(NamedTuple):
@@ -90,18 +92,26 @@ class Layout:
         )
 
     def picture_boxes(self, count: int, width_mm: float, depth_mm: float, aside_px: int = 0) -> list[Rect]:
-        """The largest boxes side by side in the panel with the shape of the image plane; ruler, texts and what is aside left free.
+        """The largest boxes in the panel with the shape of the image plane, side by side or one under the other.
 
-        Raises ValueError unless both lengths are positive.
+        Ruler, texts and what is aside are left free. Raises ValueError unless both lengths are positive.
         """
         if not (width_mm > 0 and depth_mm > 0):
             raise ValueError(f"image plane of {width_mm} x {depth_mm} mm: both lengths must be positive")
         room_x = self.panel.width - RULER_WIDTH - WEDGE_WIDTH - aside_px
         room_y = self.panel.height - HEADER_HEIGHT - FOOTER_HEIGHT
-        scale = min((room_x - (count - 1) * PICTURE_GAP) / count / width_mm, room_y / depth_mm)
-        width, height = max(1, round(width_mm * scale - 0.5)), max(1, round(depth_mm * scale))
-        left = self.panel.left + RULER_WIDTH + (room_x - count * width - (count - 1) * PICTURE_GAP) // 2
-        return [Rect(left + i * (width + PICTURE_GAP), HEADER_HEIGHT, width, height) for i in range(count)]
+        beside = min((room_x - (count - 1) * PICTURE_GAP) / count / width_mm, room_y / depth_mm)
+        below = min(room_x / width_mm, (room_y - (count - 1) * NAME_HEIGHT) / count / depth_mm)
+        # Places at one depth are easier to compare where they are at one height.
+        rows = count if below > BELOW_FROM * beside else 1
+        columns, scale = count // rows, below if rows > 1 else beside
+        width, height = max(1, round(width_mm * scale)), max(1, round(depth_mm * scale))
+        left = self.panel.left + RULER_WIDTH + (room_x - columns * width - (columns - 1) * PICTURE_GAP) // 2
+        return [
+            Rect(left + i * (width + PICTURE_GAP), HEADER_HEIGHT + j * (height + NAME_HEIGHT), width, height)
+            for j in range(rows)
+            for i in range(columns)
+        ]
 
     def aside(self, heights: list[int]) -> list[Rect]:
         """Boxes of the scanner's sliders, one under the other at the panel's right edge."""

@@ -17,7 +17,7 @@ PANEL, LINE = (8, 9, 11), (44, 50, 58)
 TEXT, QUIET = (222, 227, 232), (132, 142, 153)
 MARK, ALERT = (64, 196, 255), (255, 176, 46)
 OUTLINE, CALLIPER = (237, 194, 71), (120, 230, 140)
-CROSS_PX = 5
+CROSS_PX, NUMBER_PX = 5, 16
 
 
 @dataclass(frozen=True)
@@ -133,10 +133,12 @@ def draw_panel(draw: ImageDraw.ImageDraw, layout: Layout, panel: Panel) -> None:
 
 def _draw_ruler(draw: ImageDraw.ImageDraw, panel: Panel, box: Rect) -> None:
     x = box.left - 6
+    # Where centimetres are small, not each of them has room for its number.
+    every = int(np.ceil(NUMBER_PX / (10.0 * box.height / panel.depth_mm)))
     for row, centimetres in ruler_ticks(panel, box):
         length = 5 if centimetres is None else 10
         draw.line([(x - length, row), (x, row)], fill=QUIET if centimetres is None else TEXT)
-        if centimetres:
+        if centimetres and centimetres % every == 0:
             draw.text((x - 15, row), str(centimetres), font=font(13), fill=TEXT, anchor="rm")
         elif centimetres == 0:
             draw.text((x - 15, row), "cm", font=font(12), fill=QUIET, anchor="rm")

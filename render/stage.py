@@ -40,14 +40,15 @@ class Stage:
         if geometry.support_vertices is not None and geometry.support_faces is not None:
             self._support = self._matt_support(geometry.support_vertices, geometry.support_faces)
         self._half_axis_mm = geometry.transducer_size_mm[2] / 2
-        self._probe = solids.transducer(geometry.transducer_size_mm)
+        self._probe = solids.transducer(geometry.transducer_size_mm, geometry.transducer_radius_mm)
         self._probe_vertices, self._probe_normals, self._probe_colours = map(_vector_field, self._probe[:3])
-        self._probe_edges = solids.cuboid_edges(geometry.transducer_size_mm)
+        self._probe_edges = solids.edges(geometry.transducer_size_mm, geometry.transducer_radius_mm)
         self._edge_points = _vector_field(self._probe_edges)
         self._plane, self._plane_indices = solids.image_plane_grid(PLANE_ROWS, PLANE_COLUMNS)
-        self._plane_points, self._plane_normals = _vector_field(self._plane), _vector_field(self._plane)
-        self._plane_colours = _vector_field(np.ones((len(self._plane), 3)))
-        self._frame_points = _vector_field(np.zeros((8, 3)))
+        self._plane_points, self._plane_normals, self._plane_colours = (
+            _vector_field(np.ones((len(self._plane), 3))) for _ in range(3)
+        )
+        self._frame_points = _vector_field(np.zeros((2 * solids.FRAME_SIDES, 3)))
         self._mask_points, self._mask_normals = (_vector_field(np.ones((6 * MASKS, 3))) for _ in range(2))
         self._mask_colours = _vector_field(np.zeros((6 * MASKS, 4)))
         self._mask_indices = np.arange(6 * MASKS, dtype=np.int32)
@@ -116,15 +117,16 @@ class Stage:
 
     def _draw_image_plane(self, scene, view: View, key: np.ndarray) -> None:
         face = np.array(view.transducer_pose, dtype=np.float64)
-        face[:3, 3] -= face[:3, 2] * (self._half_axis_mm - view.above_mm)
-        points = solids.placed(self._plane * [view.width_mm, 1.0, view.depth_mm], face)
+        face[:3, 3] -= face[:3, 2] * self._half_axis_mm
+        places = solids.on_plane(self._plane, view)
+        points = solids.placed(solids.standing(places), face)
         toward = key - points
         # Facing the key light everywhere, the plane is evenly bright: its grey is the slice's, not the light's.
         _fill(self._plane_points, points)
         _fill(self._plane_normals, toward / np.linalg.norm(toward, axis=1, keepdims=True))
-        grey = solids.sampled(next(iter(view.pictures.values())), PLANE_ROWS, PLANE_COLUMNS)
+        grey = solids.sampled(next(iter(view.pictures.values())), places, view)
         _fill(self._plane_colours, np.repeat(grey[:, None], 3, axis=1))
-        _fill(self._frame_points, solids.placed(solids.image_plane_frame(view.width_mm, view.depth_mm), face))
+        _fill(self._frame_points, solids.placed(solids.image_plane_frame(view), face))
         scene.mesh(
             self._plane_points, self._plane_indices, self._plane_normals, per_vertex_color=self._plane_colours
         )

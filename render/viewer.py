@@ -127,6 +127,8 @@ class Geometry:
     """Direction opposite to gravity, shape (3,)."""
     transducer_size_mm: np.ndarray = field(default_factory=lambda: np.array([40.0, 10.0, 20.0]))
     """The cuboid, shape (3,): x lateral and to the marked side, y elevation, z axis. The image leaves at z = -size/2."""
+    transducer_radius_mm: float = 0.0
+    """Radius of a curved face, in the x-z plane; 0 where it is flat."""
     frequency_range_mhz: tuple[float, float] = (2.0, 15.0)
     """What the probe can be set to."""
     tumour_vertices: Any = None
@@ -150,6 +152,8 @@ class View:
     depth_mm: float
     above_mm: float = 0.0
     """How much of the depth lies behind the middle of the array's face."""
+    sector: tuple[float, float, float] | None = None
+    """Radius of the array's face [mm] and the angles of the first and last line [rad], where lines fan out."""
     focus_mm: float | None = None
     outline_mm: np.ndarray | None = None
     """Line segments on the plane, shape (n, 2, 2) [mm]: x from the middle to the right, y down from the face."""

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import trimesh
 
 from scenes.scene import Contact, NeoHookeanTissue, ShapeMatchingTissue, SolverSection
@@ -15,15 +16,32 @@ from sim.shape_matching import ShapeMatching
 from sim.shapes import ConvexTool, SignedDistanceField
 from sim.solver import Solver, StepSettings
 from sim.surface_contact import REACH_MM, SurfaceContacts
+from ultrasound.array import Probe
 
 AnyTissue = NeoHookeanTissue | ShapeMatchingTissue
 # Points of the surface that can touch are this share of a cell apart.
 POINTS_A_CELL = 0.5
+# Flats that stand for the arc of a curved array: of 60 mm and 60 degrees, they are nowhere 0.1 mm off it.
+ARC_FLATS = 11
 
 
 def static_shape(mesh: trimesh.Trimesh, tissue: AnyTissue) -> SignedDistanceField:
     """What a closed surface [mm] that does not move is to a tissue: distances as far around as it asks for them."""
     return SignedDistanceField.of_surface(mesh.vertices, mesh.faces, reach_of(tissue))
+
+
+def tool_of(probe: Probe) -> ConvexTool:
+    """What touches the tissue: the probe's housing, its face an arc of flats where the array is curved."""
+    size = np.array(probe.housing_mm)
+    if probe.radius_mm == 0:
+        return ConvexTool.cuboid(size)
+    angle = np.radians(np.linspace(probe.theta_start_deg, probe.theta_stop_deg, ARC_FLATS))
+    arc = np.column_stack([np.sin(angle), np.zeros(ARC_FLATS), -np.cos(angle)])
+    centre = np.array([0.0, 0.0, probe.radius_mm - size[2] / 2])
+    # All sides of the cuboid but the one that the arc takes the place of.
+    sides = np.concatenate([np.eye(3), -np.eye(3)[:2]])
+    offsets = np.concatenate([size / 2, size[:2] / 2, arc @ centre + probe.radius_mm])
+    return ConvexTool(np.concatenate([sides, arc]), offsets)
 
 
 def reach_of(tissue: AnyTissue) -> float:

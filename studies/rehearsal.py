@@ -14,10 +14,10 @@ from scenes.scene import NeoHookeanTissue, PlaneShape, Scene
 from sim.embedding import Embedding
 from sim.guard import Guard, Watch
 from sim.neo_hookean import NeoHookean
-from sim.shapes import ConvexTool, Plane, SignedDistanceField
+from sim.shapes import Plane, SignedDistanceField
 from sim.skinning import Skin
 from sim.solver import SolverState
-from studies.models import build_solver, embedding_cell_mm, static_shape, step_settings
+from studies.models import build_solver, embedding_cell_mm, static_shape, step_settings, tool_of
 from studies.setup import probe_of, setup_of_scene
 from studies.trade.front import expected_error_mm, load_points
 from ultrasound.array import Mode, Probe, Rung
@@ -87,7 +87,7 @@ class Rehearsal:
 
     def _build_solver(self, anatomy: LoadedAnatomy) -> None:
         self.size_mm = np.array(self.probe.housing_mm)
-        self.tool = ConvexTool.cuboid(self.size_mm)
+        self.tool = tool_of(self.probe)
         shapes = [*(self._shape(shape) for shape in anatomy.shapes), self.tool]
         tissue, section = self.scene.tissue, self.scene.solver
         self.solver = build_solver(self.organ, tissue, shapes, self.tool, self.scene.contact, section)
@@ -136,8 +136,9 @@ class Rehearsal:
         settled = self.organ_skin.vertices.to_numpy().astype(float)
         faces = np.array(self.organ.faces, np.int64)
         normals = np.array(trimesh.Trimesh(settled, faces, process=False).vertex_normals)
-        hand = Hand(settled, faces, normals, self.size_mm, self.pose, np.array(self.press.lateral))
-        hand.home = touching(self.pose, self.size_mm, hand.samples)
+        radius = self.probe.radius_mm
+        hand = Hand(settled, faces, normals, self.size_mm, self.pose, np.array(self.press.lateral), radius)
+        hand.home = touching(self.pose, self.size_mm, hand.samples, radius)
         return hand
 
     def set_gravity(self, acceleration_m_s2: float) -> None:
@@ -168,8 +169,8 @@ class Rehearsal:
         most_mm = self.scene.transducer.speed_mm_s * self.settings.time_step_s
         pose = approached(self.pose, goal, most_mm, TURN_DEG_S * self.settings.time_step_s)
         # Between two places of the surface the straight way leads through the organ.
-        wanted = max(indentation(goal, self.size_mm, self.hand.samples), 0.0)
-        through = indentation(pose, self.size_mm, self.hand.samples) - max(wanted, self.indentation_mm())
+        wanted = max(self._indentation(goal), 0.0)
+        through = self._indentation(pose) - max(wanted, self.indentation_mm())
         return advanced(pose, -through) if through > 0 else pose
 
     def advance(self, pose: np.ndarray) -> None:
@@ -221,7 +222,10 @@ class Rehearsal:
 
     def indentation_mm(self) -> float:
         """How deep the transducer is pressed into the settled surface; negative above it."""
-        return indentation(self.pose, self.size_mm, self.hand.samples)
+        return self._indentation(self.pose)
+
+    def _indentation(self, pose: np.ndarray) -> float:
+        return indentation(pose, self.size_mm, self.hand.samples, self.probe.radius_mm)
 
     def expected_error_mm(self) -> float | None:
         """Mean error of beads that was measured with settings like these (``study trade``); None where none were."""

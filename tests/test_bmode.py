@@ -16,7 +16,7 @@ from sim.embedding import Embedding, Unmoved
 from ultrasound.array import Probe
 from ultrasound.bmode import BMode
 from ultrasound.plane import PlaneInTissue
-from ultrasound.point_spread import axial_sd_mm, elevation_sd_mm, lateral_sd_mm
+from ultrasound.point_spread import MOST_LINES, axial_sd_mm, elevation_sd_mm, lateral_sd_mm
 from ultrasound.probe import image_plane, pose_at
 from ultrasound.volume import Volume
 
@@ -28,7 +28,7 @@ FWHM = np.sqrt(8 * np.log(2))
 # The least that lines hold is 20 log10(1e-9).
 SILENT_DB = -179.9
 BOUNDLESS = 1e4
-# No gain, so that 0 dB is all of the sound; 0.125 mm a sample, and 0.5 mm from look to look.
+# No gain: 0 dB is all of the sound; 0.125 mm a sample, and 0.5 mm from look to look.
 SCANNER = dict(gain_percent=50.0, dyn_range_db=60.0, depth_compensation_db_cm_mhz=0.0, depth_mm=80.0)
 ARRAY = dict(number_of_scanlines=LINES, number_of_samples_per_scanline=SAMPLES, housing_mm=(40.0, 10.0, 20.0))
 BEAM = dict(frequency_mhz=7.5, focus_depth_percent=40.0, f_number=3.0, focal_zone_mm=20.0, pulse_cycles=2.0)
@@ -83,10 +83,10 @@ class Tank:
         return self.bmode.decibel.to_numpy().astype(float)
 
 
-def flat_tank(voxel_mm: float, **settings) -> Tank:
+def flat_tank(voxel: float, **settings) -> Tank:
     """Fields of x and y alone: 100 mm wide, from 15 mm behind the probe's face to 90 mm before it."""
-    size, count = (voxel_mm, voxel_mm, BOUNDLESS), (int(100 / voxel_mm), int(105 / voxel_mm), 1)
-    return Tank(size, count, (voxel_mm / 2 - 50, -15.0, 0.0), **settings)
+    count = (int(100 / voxel), int(105 / voxel), 1)
+    return Tank((voxel, voxel, BOUNDLESS), count, (voxel / 2 - 50, -15.0, 0.0), **settings)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -162,9 +162,11 @@ def test_an_interface_echoes_what_it_reflects_from_where_it_is(request, size, ti
         # Looks that differ by less than 3e-4 are no part of it: of a Gaussian's flanks, where the next differs by less than
         # half as much, 6e-4 each of 0.08. Slopes of trilinear voxels point a few degrees off, which counts by tan(t) / 2.
         assert amplitude == pytest.approx(REFLECTION * np.sqrt(cosine), rel=0.05 if tilt else 0.015)
-        # Within an SD of the pulse, square to the interface; that SD to the float32 of logarithms.
-        true = depth - u[lines] * np.tan(np.radians(tilt))
-        assert np.abs(found - true).max() < axial_sd_mm(probe) / cosine
+        # Impedance steps by more, relatively, where it is lower: a Gaussian's middle comes R SD / sqrt(pi) nearer, and a
+        # voxel widens it by 1 / sqrt(6). One line is off by up to an SD of the pulse, square to the interface.
+        nearer = REFLECTION * np.hypot(blur, tank.voxel_mm / np.sqrt(6)) / np.sqrt(np.pi) / cosine
+        off = found - depth + u[lines] * np.tan(np.radians(tilt)) + nearer
+        assert abs(off.mean()) < 0.02 and np.abs(off).max() < axial_sd_mm(probe) / cosine
         assert width == pytest.approx(axial_sd_mm(probe), rel=1e-3)
         # Equal impedance reflects nothing.
         tank.fill(TISSUE, interface(0.1, 1.0, blur, tilt, depth))
@@ -226,13 +228,13 @@ def test_behind_a_cyst_the_echo_is_brighter_by_what_it_does_not_take(fine):
 
 
 def test_beyond_the_ct_nothing_reflects():
-    probe, tank = probe_of(), Tank((BOUNDLESS, 0.5, BOUNDLESS), (1, 40, 1), (0, 0.25, 0), contact="organ")
+    tank = Tank((BOUNDLESS, 0.5, BOUNDLESS), (1, 40, 1), (0, 0.25, 0), contact="organ")
     tank.fill(backscatter=0.1)
     for beyond in (0.3, 2.0):
-        decibel, y = tank.look(probe, at=(0.0, -beyond, 0.0)), depths(probe) - beyond
+        decibel, y = tank.look(probe_of(), at=(0.0, -beyond, 0.0)), depths(probe_of()) - beyond
         # At the edges a look is half in, half out.
         assert np.abs(decibel[:, (y > 0.5) & (y < 19.5)] + 20.0).max() < 0.01
-        assert decibel[:, y > 20.5].max() < SILENT_DB
+        assert decibel.max() < -19.99 and decibel[:, y > 20.5].max() < SILENT_DB
 
 
 @pytest.mark.parametrize("focus_percent", [20.0, 40.0, 70.0])
@@ -259,13 +261,14 @@ def test_a_wire_is_drawn_as_wide_as_the_focus_makes_it(endless, focus_percent, t
 
 
 @pytest.mark.parametrize("frequency, cycles", [(5.0, 2.0), (3.0, 3.0), (7.5, 4.0)])
-def test_an_interface_is_as_long_as_the_pulse(fine, frequency, cycles):
+def test_an_interface_is_as_long_as_the_pulse_and_as_loud_on_every_rung(fine, frequency, cycles):
     probe = probe_of(frequency_mhz=frequency, pulse_cycles=cycles)
     fine.fill(interface(FAT, TISSUE, 0.4))
     for rung in RUNGS:
-        # The echo of n cycles is n / 2 wavelengths long: full width at half maximum.
-        wanted = cycles * 1.54 / frequency / 2 / FWHM
-        assert peaks(fine.look(probe, rung), probe)[2] == pytest.approx(wanted, rel=1e-3)
+        # n cycles echo over n / 2 wavelengths: full width at half maximum.
+        _, amplitude, width = peaks(fine.look(probe, rung), probe)
+        assert width == pytest.approx(cycles * 1.54 / frequency / 2 / FWHM, rel=1e-3)
+        assert amplitude == pytest.approx(REFLECTION, rel=0.015)
 
 
 @pytest.mark.parametrize("rung", RUNGS[1:])
@@ -273,8 +276,8 @@ def test_speckle_is_rayleigh(endless, rung):
     probe = probe_of()
     endless.fill(backscatter=0.1)
     # Four SD apart intensities correlate by exp(-8).
-    along = int(np.ceil(4 * axial_sd_mm(probe) / probe.sample_mm))
-    across = int(np.ceil(4 * lateral_sd_mm(probe, depths(probe)).max() / (40.0 / LINES)))
+    along = int(4 * axial_sd_mm(probe) / 0.125) + 1
+    across = int(4 * lateral_sd_mm(probe, depths(probe)).max() / (40.0 / LINES)) + 1
     amplitude = 10 ** (endless.look(probe, rung, (3.0, 7.0, 0.4))[::across, ::along].ravel() / 20)
     assert len(amplitude) > 2000
     scale = np.sqrt((amplitude**2).mean() / 2)
@@ -288,11 +291,14 @@ def test_the_mean_square_of_speckle_is_the_backscatter_squared(endless, geometry
     endless.fill(backscatter=0.1)
     turns = Rotation.random(12, random_state=5).as_matrix()
     echoes = [endless.look(probe, rung, place.uniform(-50, 50, 3), *turn[:2]) for turn in turns]
-    squares = (10 ** (np.array(echoes) / 10)).mean(axis=(0, 1)) / 0.1**2
-    # Noise ends where its block of 64 entries does: what the kernel adds up, 1.4 entries apart in the mean, has no correlation
-    # across, which takes 4 % at most. Of 3000 cells in the block and 12 pictures an SD of 1 % is left, of an eighth 2 %.
-    assert squares.mean() == pytest.approx(1.0, abs=0.05)
-    assert squares.reshape(8, -1).mean(axis=1) == pytest.approx(np.ones(8), abs=0.08)
+    squares = (10 ** (np.array(echoes) / 10)).mean(axis=0) / 0.1**2
+    # What the kernel adds up lies 1.4 entries apart in the mean where lines are dense: noise ends at the borders of blocks of
+    # 64, which takes 3 % of it there, and, held over entries, is 5 % short aslant to them. Sampling has an SD of 1 to 3 %.
+    inner, ends = squares[MOST_LINES:-MOST_LINES], squares[[0, 1, 2, -3, -2, -1]]
+    assert inner.mean() == pytest.approx(1.0, abs=0.05)
+    assert inner.mean(axis=0).reshape(8, -1).mean(axis=1) == pytest.approx(np.ones(8), abs=0.12)
+    # At the array's ends, where half of the kernel has no lines to take from, to 0.6 dB.
+    assert ends.mean() == pytest.approx(1.0, abs=0.14)
 
 
 def test_speckle_correlates_as_the_point_spread_function_does(endless):
@@ -316,10 +322,9 @@ def test_a_still_probe_shows_the_same_bits_also_after_it_was_away(fine, rung):
     probe = probe_of()
     fine.fill(interface(FAT, TISSUE, 0.4, 20.0), 0.5, 0.1)
     first, picture = fine.look(probe, rung), fine.picture
-    again = fine.look(probe, rung)
+    assert (fine.look(probe, rung) == first).all()
     assert np.abs(fine.look(probe_of(frequency_mhz=5.0), rung, (2.0, 1.0, 3.0)) - first).max() > 1.0
-    back = fine.look(probe, rung)
-    assert (again == first).all() and (back == first).all() and (fine.picture == picture).all()
+    assert (fine.look(probe, rung) == first).all() and (fine.picture == picture).all()
 
 
 @pytest.fixture(scope="module")
@@ -349,8 +354,7 @@ def test_tissue_and_probe_moved_alike_give_the_same_picture(moved, elevation):
     move(turn, shift)
     again = tank.look(probe, "speckle", turn @ face + shift, turn @ [0, 1, 0], turn @ [1, 0, 0])
     u, v = np.meshgrid(probe.scanlines()[0][:, 0], depths(probe) - 10.0, indexing="ij")
-    # Places are right to 1e-5 mm, noise is held over 0.06 mm: 5 in 10^4 samples fall into another entry, and some ten lines
-    # see each of them.
+    # Places are right to 1e-5 mm, noise is held over 0.06 mm: 5 in 10^4 samples take another entry, and ten lines see each.
     assert (np.abs(again - first)[np.hypot(u, v) < 10.5] < 0.01).mean() > 0.99
     assert np.abs(tank.look(probe, "speckle", face) - first).mean() > 3.0
 
@@ -372,10 +376,9 @@ def test_tracked_speckle_moves_as_the_tissue_does(moved, across, along, shear):
         blocks = [frame[block] - frame[block].mean() for frame in frames]
         found.append(-phase_cross_correlation(*blocks, upsample_factor=20, normalization=None)[0] * size)
         wanted.append(strain[:2, :2] @ ((at + 0.5) * size - [8, 10]) + shift[:2])
-    errors = np.linalg.norm(np.subtract(found, wanted), axis=1)
+    errors, ways = (np.linalg.norm(each, axis=1) for each in (np.subtract(found, wanted), wanted))
     # The skin follows an affine map to strain times the way to a cluster's centre, 2 % of 2 mm; the search steps by 0.004 mm.
-    assert errors.mean() < 0.05 < 0.2 < np.linalg.norm(wanted, axis=1).mean()
-    assert errors.max() < 0.2
+    assert errors.mean() < 0.05 and errors.max() < 0.2 < ways.mean()
 
 
 def test_a_target_off_the_plane_is_dimmed_as_the_thick_plane_weighs_it():

@@ -5,6 +5,8 @@ import pytest
 import trimesh
 from conftest import rotation_about
 
+from studies.models import tool_of
+from ultrasound.array import load_probe
 from ultrasound.probe import Hand, advanced, approached, between, image_plane, indentation, pose_at, touching
 
 SIZE = np.array([10.0, 6.0, 20.0])
@@ -110,3 +112,35 @@ def test_turns_are_about_the_transducers_own_axes(hand, turn, axis):
 def test_tilts_end_where_a_hand_does(hand):
     hand.turn(500, -500, 500)
     assert hand.turn_deg == pytest.approx([60, -60, 500])
+
+
+def test_a_curved_face_touches_where_its_arc_does():
+    size, radius = np.array([66.0, 16.0, 30.0]), 60.0
+    pose = pose_at(np.zeros(3), np.array([0, 0, -1.0]), np.array([1.0, 0, 0]), size[2])
+    # A plane is touched by the middle of the arc; a bump beside it, as high as the arc is there, at the same time.
+    bump = np.array([20.0, 0.0, radius - np.sqrt(radius**2 - 20.0**2)])
+    assert indentation(pose, size, np.zeros((1, 3)), radius) == pytest.approx(0.0)
+    assert indentation(pose, size, bump[None], radius) == pytest.approx(0.0)
+    assert indentation(pose, size, bump[None]) == pytest.approx(bump[2])
+    lifted = touching(pose, size, np.array([bump + [0, 0, 5.0]]), radius)
+    assert lifted[:3, 3] - pose[:3, 3] == pytest.approx([0, 0, 5.0])
+
+
+def test_the_tool_of_a_curved_array_is_its_arc_to_a_tenth_of_a_millimetre(device):
+    probe = load_probe("curvilinear")
+    tool = tool_of(probe)
+    planes = tool.half_space.to_numpy().astype(float)
+    angle = np.radians(np.linspace(probe.theta_start_deg, probe.theta_stop_deg, 61))
+    centre = np.array([0.0, 0.0, probe.radius_mm - probe.housing_mm[2] / 2])
+    arc = centre + probe.radius_mm * np.column_stack([np.sin(angle), 0 * angle, -np.cos(angle)])
+    outside = (arc @ planes[:, :3].T - planes[:, 3]).max(axis=1)
+    assert np.all(outside <= 1e-4) and np.all(outside > -0.1)
+    assert arc[30] == pytest.approx([0, 0, -15.0])
+
+
+def test_a_probe_of_short_housing_is_not_pushed_in_beyond_what_holds_it(hand):
+    hand.push(100.0)
+    assert hand.depth_mm == hand.most_mm == 15.0
+    short = Hand(hand.vertices, hand.faces, hand.normals, np.array([16.0, 9.0, 6.0]), hand.home, hand.lateral)
+    short.push(100.0)
+    assert short.depth_mm == 9.0

@@ -227,21 +227,102 @@ def test_readouts_and_status_change_the_picture():
 # Solids
 
 
-def test_cuboid_faces_outward():
-    solid = solids.cuboid((40.0, 10.0, 20.0))
+@pytest.mark.parametrize("kind", ["cuboid", "curved"])
+def test_solids_face_outward(kind):
+    size = (40.0, 10.0, 20.0)
+    solid = solids.cuboid(size)
+    if kind == "curved":
+        parts = solids.transducer(size, radius=25.0)
+        lens = np.flatnonzero((parts.colours == solids.LENS).all(axis=1))
+        inside = np.isin(parts.indices.reshape(-1, 3), lens).all(axis=1)
+        middle = parts.vertices[lens].mean(axis=0)
+        faces = parts.indices.reshape(-1, 3)[inside] - lens[0]
+        solid = solids.Solid(
+            parts.vertices[lens] - middle, parts.normals[lens], parts.colours[lens], faces.reshape(-1)
+        )
+        # The arc's middle is the lowest, where the image starts.
+        assert parts.vertices[:, 2].min() == pytest.approx(-10.0)
     a, b, c = (solid.vertices[solid.indices.reshape(-1, 3)[:, i]] for i in range(3))
     centre = (a + b + c) / 3
     assert np.all(np.einsum("ij,ij->i", np.cross(b - a, c - a), centre) > 0)
     assert np.all(np.einsum("ij,ij->i", solid.normals, solid.vertices) > 0)
 
 
-def test_image_plane_grid_carries_the_slice_the_right_way_round():
-    vertices, indices = solids.image_plane_grid(6, 4)
+def test_image_plane_carries_the_picture_the_right_way_round():
+    shares, indices = solids.image_plane_grid(6, 4)
     grey = np.zeros((60, 40), dtype=np.uint8)
     grey[0, -1] = 255
-    bright = vertices[solids.sampled(grey, 6, 4) == 1.0]
-    assert np.allclose(bright, [[0.5, 0.0, 0.0]])
-    assert indices.max() == len(vertices) - 1 and len(indices) == 6 * 5 * 3
+    view = _view(pictures={"CT": grey})
+    places = solids.on_plane(shares, view)
+    bright = solids.standing(places)[solids.sampled(grey, places, view) == 1.0]
+    assert np.allclose(bright, [[20.0, 0.0, 0.0]])
+    assert indices.max() == len(shares) - 1 and len(indices) == 6 * 5 * 3
+
+
+def test_a_sector_fans_out_from_its_arc():
+    radius, half, depth = 60.0, np.radians(30), 120.0
+    above, width = radius * (1 - np.cos(half)), 2 * (radius + depth) * np.sin(half)
+    grey = np.zeros((180, 180), dtype=np.uint8)
+    view = _view(
+        pictures={"B-mode": grey},
+        width_mm=width,
+        depth_mm=depth + above,
+        above_mm=above,
+        sector=(radius, -half, half),
+    )
+    places = solids.on_plane(np.array([[0.5, 0.0], [0.5, 1.0], [1.0, 0.0], [1.0, 1.0]]), view)
+    wanted = [[0, 0], [0, depth], [30, -above], [width / 2, (radius + depth) * np.cos(half) - radius]]
+    assert places == pytest.approx(np.array(wanted), abs=1e-9)
+    # The deepest place of the middle line is the middle of the last row.
+    grey[-1, 88:92] = 255
+    assert list(solids.sampled(grey, places, view)) == [0.0, 1.0, 0.0, 0.0]
+    frame_points = solids.image_plane_frame(view)
+    assert frame_points.shape == (2 * solids.FRAME_SIDES, 3) and frame_points[:, 2].min() < -depth
+
+
+@pytest.mark.parametrize(("width_mm", "depth_mm"), [(16.0, 40.0), (40.0, 60.0), (180.0, 128.0)])
+def test_two_pictures_share_the_panel_without_overlap_as_large_as_they_can_be(width_mm, depth_mm):
+    boxes = LAYOUT.picture_boxes(2, width_mm, depth_mm)
+    taken = np.zeros((720, 1280), int)
+    for box in boxes:
+        taken[box.slices] += 1
+        assert box.left >= LAYOUT.panel.left + RULER_WIDTH and box.bottom <= LAYOUT.panel.bottom
+        assert abs(box.width * depth_mm - box.height * width_mm) <= width_mm + depth_mm
+    assert taken.max() == 1 and boxes[0][2:] == boxes[1][2:]
+    stacked = boxes[0].left == boxes[1].left
+    assert stacked == (width_mm > depth_mm)
+
+
+def test_a_place_in_a_picture_is_found_again_under_its_pixel():
+    shown = Panel(("B-mode", "CT"), 40.0, 68.0, above_mm=8.0)
+    for box in shown.boxes(LAYOUT):
+        column, row = shown.to_pixels(box, np.array([-7.0, 31.0]))
+        assert shown.to_plane(box, column, row) == pytest.approx((-7.0, 31.0))
+        # Zero depth is the face's middle, an eighth of 68 mm below the top.
+        assert shown.to_pixels(box, np.zeros(2))[1] == pytest.approx(box.top + 8 / 68 * box.height)
+
+
+def test_segments_are_drawn_where_they_are_and_nowhere_else():
+    shown = Panel(("CT",), 40.0, 60.0)
+    box = shown.boxes(LAYOUT)[0]
+    page = np.zeros((720, 1280, 4), np.uint8)
+    panel.draw_segments(
+        page, shown, box, np.array([[[-10.0, 20.0], [10.0, 20.0]], [[0.0, 50.0], [0.0, 90.0]]]), (1, 2, 3)
+    )
+    rows, columns = np.nonzero((page[..., :3] == (1, 2, 3)).all(axis=2))
+    level = shown.to_pixels(box, np.array([0.0, 20.0]))[1]
+    assert set(rows[rows < level + 5]) == {int(level)}
+    across = columns[rows == int(level)]
+    left, right = (shown.to_pixels(box, np.array([u, 20.0]))[0] for u in (-10.0, 10.0))
+    assert (
+        across.min() == int(left)
+        and across.max() == int(right)
+        and len(set(across)) == int(right) - int(left) + 1
+    )
+    # What leaves the picture ends at its edge.
+    assert rows.max() == box.bottom - 1 and page[..., 3].max() == 0
+    panel.draw_segments(page, shown, box, np.empty((0, 2, 2)), (9, 9, 9))
+    assert not (page == 9).any()
 
 
 # Front ends

@@ -98,6 +98,14 @@ class Probe(BaseModel):
         return self.radius_start_mm if self.transducer_geometry == "CURVILINEAR" else 0.0
 
     @property
+    def sector(self) -> tuple[float, float, float] | None:
+        """Radius of the face [mm], first and last angle [rad], of lines that fan out; None of parallel ones."""
+        if self.transducer_geometry == "LINEAR":
+            return None
+        start, stop = np.radians([self.theta_start_deg, self.theta_stop_deg])
+        return self.radius_mm, float(start), float(stop)
+
+    @property
     def focus_mm(self) -> float:
         return self.depth_mm * self.focus_depth_percent / 100
 

@@ -46,26 +46,31 @@ def image_plane(
     return ImagePlane(pose @ plane_in_transducer, width_mm, depth_mm, above_mm)
 
 
-def indentation(pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray) -> float:
+def indentation(pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray, radius_mm: float = 0.0) -> float:
     """How deep the transducer's face is below the highest point (n, 3) of the settled surface under it [mm].
 
-    Negative above the surface; -inf where the transducer's footprint misses it.
+    Negative above the surface; -inf where the transducer's footprint misses it. The face is flat, or an arc of a radius.
     """
     local = (surface - pose[:3, 3]) @ pose[:3, :3]
     half = np.asarray(size_mm) / 2
     under = (np.abs(local[:, :2]) <= half[:2]).all(axis=1)
-    return float((local[under, 2] + half[2]).max()) if under.any() else -np.inf
+    behind = sagitta(local[under, 0], radius_mm)
+    return float((local[under, 2] + half[2] - behind).max()) if under.any() else -np.inf
 
 
-def touching(pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray) -> np.ndarray:
+def sagitta(x_mm: np.ndarray, radius_mm: float) -> np.ndarray:
+    """How far a face of a radius (0: flat) lies behind its middle, at lateral places [mm]."""
+    if radius_mm == 0:
+        return np.zeros_like(x_mm)
+    return radius_mm - np.sqrt(np.maximum(radius_mm**2 - x_mm**2, 0.0))
+
+
+def touching(
+    pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray, radius_mm: float = 0.0
+) -> np.ndarray:
     """The pose moved along its axis to where it just touches the settled surface (n, 3)."""
-    half = np.asarray(size_mm) / 2
-    local = (surface - pose[:3, 3]) @ pose[:3, :3]
-    under = (np.abs(local[:, :2]) <= half[:2]).all(axis=1)
-    moved = pose.copy()
-    if under.any():
-        moved[:3, 3] += pose[:3, 2] * (local[under, 2].max() + half[2])
-    return moved
+    depth = indentation(pose, size_mm, surface, radius_mm)
+    return advanced(pose, -depth) if np.isfinite(depth) else pose.copy()
 
 
 def advanced(pose: np.ndarray, depth_mm: float) -> np.ndarray:
@@ -104,7 +109,7 @@ class Hand:
     """What holds the transducer: where on the settled organ it aims, how it is turned, how deep it presses.
 
     ``vertices`` (n, 3), ``faces`` (m, 3) and ``normals`` (n, 3) are the settled surface [mm]; ``home`` is the pose it
-    starts from. ``depth_mm`` is what keys push, ``pressed_mm`` what a held button adds until it is let go.
+    starts from. ``radius_mm`` is that of a curved face. ``depth_mm`` is what keys push, ``pressed_mm`` what a held button adds until it is let go.
     """
 
     vertices: np.ndarray
@@ -113,6 +118,7 @@ class Hand:
     size_mm: np.ndarray
     home: np.ndarray
     lateral: np.ndarray
+    radius_mm: float = 0.0
     depth_mm: float = 0.0
     pressed_mm: float = 0.0
     turn_deg: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -165,4 +171,4 @@ class Hand:
         )
         pose[:3, 3] = face + self.size_mm[2] / 2 * pose[:3, 2]
         depth = min(self.depth_mm + self.pressed_mm, self.most_mm)
-        return advanced(touching(pose, self.size_mm, self.samples), depth)
+        return advanced(touching(pose, self.size_mm, self.samples, self.radius_mm), depth)
