@@ -90,7 +90,9 @@ def test_a_headless_press_reports_what_it_promises(pressed):
     assert 0.95 < report["volume_ratio_min"] <= 1.01
     assert report["max_penetration_mm"] <= 0.8
     assert report["indentation_max_mm"] == pytest.approx(6.0, abs=1e-3)
-    assert (report["picture"], report["rung"]) == ("both", "speckle") and report["probe"].startswith("Drop-in")
+    assert (report["picture"], report["rung"]) == ("both", "speckle") and report["probe"].startswith(
+        "Drop-in"
+    )
 
 
 def test_it_leaves_pictures_in_which_the_press_is_seen(pressed):

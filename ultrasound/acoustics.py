@@ -126,6 +126,8 @@ def _labelled(
 
 def _hollow(kidney: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
     """What a kidney encloses besides itself: its closing by a ball of HOLLOW_MM, without it."""
+    if not kidney.any():
+        return kidney
     rim = np.ceil(HOLLOW_MM / spacing_mm).astype(int) + 1
     box = ndimage.find_objects(kidney.astype(np.uint8))[0]
     part = np.pad(kidney[box], [(int(r), int(r)) for r in rim])

@@ -167,7 +167,7 @@ class BMode:
             near, rest = self.look(linear, row, column, start, planes, elevation_sd)
             loss_db, passed, amplitude = 0.0, 1.0, 1.0
             # An interface: its steps added up, their mean depth, how squarely it is met; what was before it, and where.
-            steps, middle, squarely = 0.0, 0.0, 0.0
+            steps, middle, squarely, thick = 0.0, 0.0, 0.0, 0.0
             before, loud_before, begins = near, amplitude, 0.0
             stride_mm = stride * sample_mm
             for k in range(self.samples // stride):
@@ -175,14 +175,14 @@ class BMode:
                 row, column = self.plane.pixel_near(place, pixel_mm, first_mm)
                 linear_far = self.plane.map_of(row, column)
                 far, rest_far = self.look(linear_far, row, column, place, planes, elevation_sd)
+                # Beyond the CT nothing is known: nothing scatters, nothing reflects.
                 if far.x < 1e-6:
-                    # Beyond the CT nothing is known: nothing scatters, nothing reflects.
                     far.x = near.x
-                step = (far.x - near.x) / (far.x + near.x)
+                elif near.x < 1e-6:
+                    near.x = far.x
+                step = (far.x - near.x) / ti.max(far.x + near.x, 1e-6)
                 if steps != 0.0 and (
-                    step * steps <= 0.0
-                    or ti.abs(step) < LEAST_REFLECTION
-                    or k * stride_mm - begins > self.interface_mm
+                    step * steps <= 0.0 or ti.abs(step) < LEAST_REFLECTION or thick > self.interface_mm
                 ):
                     reflection, depth = (near.x - before.x) / (near.x + before.x), middle / steps
                     # A blurred interface is one step at its middle, with the tissue before it up to there.
@@ -192,13 +192,16 @@ class BMode:
                         rung, line, depth, loud * self.heard(line, depth, aperture), sample_mm, axial_sd
                     )
                     passed *= 1.0 - reflection * reflection
-                    steps, middle, squarely = 0.0, 0.0, 0.0
+                    steps, middle, squarely, thick = 0.0, 0.0, 0.0, 0.0
                 if steps == 0.0:
                     before, loud_before, begins = near, amplitude, k * stride_mm
                 if ti.abs(step) >= LEAST_REFLECTION:
                     steps += step
                     middle += step * (k + 0.5) * stride_mm
-                    squarely += step * self.squareness(0.5 * (rest + rest_far), linear_far, direction)
+                    square = self.squareness(0.5 * (rest + rest_far), linear_far, direction)
+                    squarely += step * square
+                    # Across the interface, however aslant the beam goes through it.
+                    thick += square * square * stride_mm
                 # There and back, over the stride in cm.
                 loss_db += (near.y + far.y) * frequency_mhz * stride_mm / 10.0
                 amplitude_far = passed * ti.exp(-loss_db / DB)
@@ -228,7 +231,11 @@ class BMode:
         """Root of the cosine between beam and the normal of an interface: Lambert's law for the intensity (Wein 2008)."""
         # The gradient at rest, carried into the deformed tissue by the inverse transpose of the deformation gradient.
         slope = linear[:, :3].transpose() @ self.tissue.slope(rest)
-        return ti.sqrt(ti.abs(slope.x * direction.x + slope.y * direction.y) / ti.max(slope.norm(), 1e-12))
+        # An interface thinner than the way from look to look has no slope halfway: taken as square.
+        square, steep = 1.0, slope.norm()
+        if steep > 1e-9:
+            square = ti.sqrt(ti.abs(slope.x * direction.x + slope.y * direction.y) / steep)
+        return square
 
     @ti.func
     def reflect(self, rung: ti.template(), line, depth_mm, loud, sample_mm, axial_sd):
@@ -260,9 +267,11 @@ class BMode:
                 # At the array's ends the lines beyond are taken as those before, mirrored.
                 m = ti.abs(line + k)
                 m = ti.min(m, 2 * (self.lines - 1) - m)
+                # Conjugate, so that noise does not add up with itself; reflections are real.
+                turned = 1.0 if m == line + k else -1.0
                 weight = self.packet(self.weight, k + MOST_LINES, first)
                 real += weight * self.packet(self.real, m, first)
-                imaginary += weight * self.packet(self.imaginary, m, first)
+                imaginary += turned * weight * self.packet(self.imaginary, m, first)
             loudness = Packet([self.loudness[first + i] for i in ti.static(range(LANES))])
             envelope = loudness * ti.sqrt(real * real + imaginary * imaginary)
             gain = Packet([self.gain[first + i] for i in ti.static(range(LANES))])

@@ -14,6 +14,7 @@ SIZE = 1 << SIZE_BITS
 # Entries of the noise in one standard deviation of its correlation kernel.
 PITCHES = 1.25
 SEED = 20130629
+OFF_ZERO = 0.37
 # Real and imaginary part share the two halves of a word, so that the block stays in a core's cache.
 UNIT = 1 / 4096
 
@@ -44,7 +45,8 @@ class Speckle:
     @ti.func
     def at(self, rest, sd_mm):
         """Echo (2,), real and imaginary, of the scatterers at a place at rest [mm], correlated over ``sd_mm``."""
-        cell = ti.floor(rest * (PITCHES / sd_mm), ti.i32)
+        # Cells do not border on the planes through 0, where many places lie exactly and rounding would choose for them.
+        cell = ti.floor(rest * (PITCHES / sd_mm) + OFF_ZERO, ti.i32)
         block = cell >> SIZE_BITS
         key = (block.x * 73856093) ^ (block.y * 19349663) ^ (block.z * 83492791)
         key = (key ^ ((key >> 15) & 0x1FFFF)) * 0x2C1B3C6D
