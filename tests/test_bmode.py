@@ -245,8 +245,8 @@ def test_a_wire_is_drawn_as_wide_as_the_focus_makes_it(endless, focus_percent, t
     axial = 2 * 1.54 / 7.5 / 2 / FWHM
     u = probe.scanlines()[0][:, 0] - probe.scanlines()[0][LINES // 2, 0]
     profile = (u == 0).astype(float) if thin else np.exp(-0.5 * (u / axial) ** 2)
-    endless.bmode.real.from_numpy(np.repeat(profile[:, None], SAMPLES, axis=1).astype(np.float32))
-    endless.bmode.imaginary.fill(0.0)
+    endless.bmode.beams.real.from_numpy(np.repeat(profile[:, None], SAMPLES, axis=1).astype(np.float32))
+    endless.bmode.beams.imaginary.fill(0.0)
     endless.bmode._spread()
     for depth in (8.0, 16.0, 32.0, 56.0, 72.0):
         line = endless.bmode.decibel.to_numpy()[:, int(depth / 0.125)].astype(float)
