@@ -17,7 +17,20 @@ from studies.scan.command import scan
 from studies.scan.poses import PoseError
 from studies.setup import SetupError
 from studies.study import study
+from ultrasound.acoustics import TissueError
 from ultrasound.array import ProbeError
+
+# What is wrong with a file or a value, said in one line.
+MENDED_BY_USER = (
+    SceneError,
+    PatientError,
+    PoseError,
+    ProbeError,
+    TissueError,
+    SamplingError,
+    CaseError,
+    SetupError,
+)
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -41,7 +54,7 @@ def main(arguments: list[str]) -> int:
         return 0
     except click.ClickException as error:
         message = error.format_message()
-    except (SceneError, PatientError, PoseError, ProbeError, SamplingError, CaseError, SetupError) as error:
+    except MENDED_BY_USER as error:
         message = str(error)
     except (click.Abort, KeyboardInterrupt):
         click.echo("Stopped.", err=True)

@@ -88,7 +88,7 @@ class Settings:
     iterations: int = _slider(9, "Iterations", "", 1, 40, "Tissue")
     substeps: int = _slider(3, "Substeps", "", 1, 10, "Tissue")
     gravity_m_s2: float = _slider(9.81, "g", "m/s2", 0.0, 20.0, "Tissue")
-    depth_mm: int = _slider(60, "Depth", "mm", 20, 160, "Picture")
+    depth_mm: int = _slider(60, "Depth", "mm", 5, 300, "Picture")
     window_hu: int = _slider(350, "W", "HU", 1, 2000, "Picture")
     level_hu: int = _slider(40, "L", "HU", -500, 500, "Picture")
     gain_percent: int = _slider(50, "Gain", "%", 0, 100, ECHO)

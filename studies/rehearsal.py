@@ -260,5 +260,5 @@ def scanned_anatomy(organ: trimesh.Trimesh, anatomy: LoadedAnatomy, origin: np.n
     assert ct is not None
     shift = np.eye(4)
     shift[:3, 3] = origin
-    marks = None if labels is None else labels.voxels.astype(np.uint8)
+    marks = None if labels is None else labels.voxels.astype(np.int32)
     return Anatomy(organ, ct.voxels, ct.index_from_mm @ shift, marks, anatomy.tissues)

@@ -10,6 +10,7 @@ from ultrasound.acoustics import (
     FAT_BELOW_HU,
     IMPEDANCE,
     STONE_ABOVE_MEDIAN_HU,
+    TissueError,
     impedance_of_hu,
     properties,
     tissue_table,
@@ -139,7 +140,9 @@ def test_fat_in_a_kidneys_hollow_is_sinus_and_fat_around_it_is_not():
 def test_an_unknown_tissue_is_refused_with_those_known():
     hu, labels = labelled()
     for name in ("spleen", "hounsfield"):
-        with pytest.raises(KeyError, match=f"no tissue '{name}'; known: ") as refused:
+        with pytest.raises(
+            TissueError, match=f"label 1 is '{name}': no tissue of that name; known: "
+        ) as refused:
             properties(hu, labels, {1: name})
         assert all(tissue in str(refused.value) for tissue in TISSUES)
 

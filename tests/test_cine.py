@@ -20,6 +20,13 @@ def test_the_last_ten_seconds_are_kept_and_no_more():
     assert times[-1] == 399 / 25 and times[-1] - times[0] == pytest.approx(KEPT_S, abs=1 / 25)
 
 
+def test_of_a_fast_machine_thirty_frames_a_second_are_kept():
+    cine = Cine()
+    for k in range(1200):
+        cine.keep(frame_at(k / 120))
+    assert 280 <= len(cine.frames) <= 301
+
+
 def test_going_back_and_on_ends_at_the_ends_and_a_new_frame_is_the_newest():
     cine = Cine()
     for k in range(5):

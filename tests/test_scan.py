@@ -1,6 +1,7 @@
 """Pictures without a body: poses that are read or refused, and what the command leaves."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -124,3 +125,25 @@ def test_an_unknown_probe_is_named_with_those_that_are_known(tmp_path, capsys):
     ]
     assert app.main(command) == 2
     assert "known by name: curvilinear, drop-in, linear, phased" in capsys.readouterr().err
+
+
+def test_a_label_of_no_known_tissue_is_refused_in_one_line(tmp_path, capsys):
+    folder = tmp_path / "patient"
+    shutil.copytree(phantom_folder(), folder)
+    (folder / "scene.toml").write_text(
+        '[anatomy]\nct = "ct.nrrd"\nlabels = "labels.nrrd"\ntissues = {1 = "kidny"}\n'
+    )
+    (tmp_path / "poses.json").write_text(json.dumps([dict(probe_to_patient=np.eye(4).tolist())]))
+    command = [
+        "scan",
+        str(folder),
+        "--pose",
+        str(tmp_path / "poses.json"),
+        "--out",
+        str(tmp_path),
+        "--arch",
+        "cpu",
+    ]
+    assert app.main(command) == 2
+    told = capsys.readouterr().err
+    assert "label 1 is 'kidny'" in told and "cortex" in told and len(told.strip().splitlines()) == 1

@@ -31,10 +31,24 @@ LEAST_HU, MOST_HU = -1024, 3071
 IMPEDANCE, ATTENUATION, BACKSCATTER = range(3)
 
 
+class TissueError(ValueError):
+    """A tissue that the table does not have; the message is one line."""
+
+
 @cache
 def tissue_table() -> dict[str, dict]:
     """Tissue -> its values, as the file has them, and "hounsfield"."""
     return tomllib.loads(TISSUES.read_text("utf-8"))
+
+
+def check_tissues(tissue_of_label: Mapping[int, str]) -> None:
+    """Raises TissueError for a label of a tissue that the table does not have."""
+    known = [name for name in tissue_table() if name != "hounsfield"]
+    for label, tissue in tissue_of_label.items():
+        if tissue not in known:
+            raise TissueError(
+                f"anatomy.tissues: label {label} is {tissue!r}: no tissue of that name; known: {', '.join(known)}"
+            )
 
 
 def impedance_of_hu(hu: np.ndarray) -> np.ndarray:
@@ -57,8 +71,9 @@ def properties(
     """Impedance [MRayl], attenuation [dB/cm/MHz] and backscattered amplitude (1 for a perfect reflector) of voxels (..., 3), float32.
 
     ``hu`` and ``labels``, whole numbers, have the same shape; 0 and labels without a tissue go by HU.
-    Raises KeyError for a tissue that the table does not have.
+    Raises TissueError.
     """
+    check_tissues(tissue_of_label or {})
     spacing = np.ones(3) if spacing_mm is None else np.asarray(spacing_mm, float)
     values = _by_hounsfield(hu)
     texture = _Texture(hu.shape, spacing)
@@ -108,10 +123,6 @@ def _labelled(
     """Tissue -> which voxels are of it; fat and stones within the kidney last, so that they win."""
     if labels is None or not tissue_of_label:
         return {}
-    for tissue in tissue_of_label.values():
-        if tissue not in tissue_table() or tissue == "hounsfield":
-            known = ", ".join(name for name in tissue_table() if name != "hounsfield")
-            raise KeyError(f"no tissue {tissue!r}; known: {known}")
     found: dict[str, np.ndarray] = {}
     for value, tissue in tissue_of_label.items():
         here = labels == value

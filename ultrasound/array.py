@@ -50,7 +50,7 @@ class Probe(BaseModel):
     theta_start_deg: float = Field(0.0, ge=-80, le=0)
     theta_stop_deg: float = Field(0.0, ge=0, le=80)
     number_of_scanlines: int = Field(192, ge=8, le=1024)
-    number_of_samples_per_scanline: int = Field(640, ge=32, le=4096)
+    number_of_samples_per_scanline: int = Field(640, ge=32, le=4096, multiple_of=16)
     frequency_range_mhz: tuple[float, float] = (2.0, 15.0)
     frequency_mhz: float = Field(7.5, ge=1, le=40)
     depth_mm: float = Field(60.0, ge=5, le=300)

@@ -16,6 +16,7 @@ from ultrasound.plane import Picture, PlaneInTissue
 from ultrasound.point_spread import MOST_LINES, axial_sd_mm, elevation_sd_mm, lateral_weights
 from ultrasound.volume import Volume
 
+# A probe's samples are a multiple of this.
 LANES = 16
 Packet = ti.types.vector(LANES, ti.f32)
 # Samples from one look into the tissue to the next, the longer one if it is no farther than a voxel: that is how fast tissue changes.
@@ -45,8 +46,6 @@ class BMode:
         around: float | None = None,
     ) -> None:
         shape = probe.number_of_scanlines, probe.number_of_samples_per_scanline
-        if shape[1] % LANES:
-            raise ValueError(f"{shape[1]} samples a line: expected a multiple of {LANES}")
         self.plane, self.voxel_mm = plane, voxel_mm
         self.beams = Beams(tissue, organ, plane, shape, voxel_mm, contact, contact_gap_mm, around)
         self.lines, self.samples = shape

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from sim.embedding import Embedding, Unmoved
-from ultrasound.acoustics import properties
+from ultrasound.acoustics import check_tissues, properties
 from ultrasound.array import Mode, Probe, Rung
 from ultrasound.bmode import BMode
 from ultrasound.plane import ImagePlane, PlaneInTissue
@@ -44,7 +44,7 @@ class Scanner:
     """Pictures of ``pixels`` x ``pixels`` of an anatomy that an embedding carries along.
 
     ``outside`` (see ``Slice``), ``contact`` and ``contact_gap_mm`` (see ``BMode``) say what lies around the organ and what lets
-    sound in. What a mode needs is made when it is first asked for.
+    sound in. What a mode needs is made when it is first asked for. Raises TissueError.
     """
 
     def __init__(
@@ -57,6 +57,7 @@ class Scanner:
         contact: str = "organ",
         contact_gap_mm: float = 1.0,
     ) -> None:
+        check_tissues(anatomy.tissues)
         self.anatomy = anatomy
         self.embedding = embedding
         self.probe = probe

@@ -8,7 +8,7 @@ from scipy.ndimage import map_coordinates
 
 from render.viewer import View
 
-KEPT_S, MOST_FRAMES = 10.0, 600
+KEPT_S, KEPT_A_SECOND = 10.0, 30
 
 
 @dataclass(frozen=True)
@@ -24,15 +24,17 @@ class Frame:
 class Cine:
     """The frames of the last KEPT_S seconds. ``back`` says how many before the newest is looked at."""
 
-    frames: deque[Frame] = field(default_factory=lambda: deque(maxlen=MOST_FRAMES))
+    frames: deque[Frame] = field(default_factory=deque)
     back: int = 0
 
     def keep(self, frame: Frame) -> None:
-        """Add a frame, now the newest, and let go of those that are too old."""
+        """Add a frame, now the newest, and let go of those that are too old; of a fast machine's not each is kept."""
+        self.back = 0
+        if self.frames and frame.time_s - self.frames[-1].time_s < 0.99 / KEPT_A_SECOND:
+            return
         self.frames.append(frame)
         while frame.time_s - self.frames[0].time_s > KEPT_S:
             self.frames.popleft()
-        self.back = 0
 
     def go(self, frames: int) -> None:
         """Look so many frames on (back, negative), as far as there are any."""
