@@ -36,7 +36,7 @@ REPORTED = {
     "max_penetration_mm",
 }
 SHORT = ("--seconds", "0.3", "--cell", "7", "--arch", "cpu")
-PAPER = ("--seconds", "0.3", "--radius", "5", "--arch", "cpu")
+PAPER = ("--seconds", "0.3", "--radius", "5", "--picture", "ct", "--arch", "cpu")
 
 
 def run(*arguments, **environment) -> subprocess.CompletedProcess:
@@ -106,14 +106,23 @@ def test_it_leaves_pictures_in_which_the_press_is_seen(pressed):
 
 
 def test_without_a_display_it_runs_headless_by_itself_and_says_so(tmp_path):
-    done = run(*SHORT, "--out", tmp_path)
+    done = run(*SHORT, "--picture", "ct", "--out", tmp_path)
     assert done.returncode == 0 and "No display" in done.stdout
     assert (tmp_path / "report.json").is_file()
 
 
 def test_without_vulkan_it_says_so_in_one_line_and_still_writes_slices_and_report(tmp_path):
     nowhere = "/nonexistent"
-    done = run("--headless", *SHORT, "--out", tmp_path, VK_ICD_FILENAMES=nowhere, VK_DRIVER_FILES=nowhere)
+    done = run(
+        "--headless",
+        *SHORT,
+        "--picture",
+        "ct",
+        "--out",
+        tmp_path,
+        VK_ICD_FILENAMES=nowhere,
+        VK_DRIVER_FILES=nowhere,
+    )
     assert done.returncode == 0, done.stderr
     assert sum("no Vulkan driver" in line for line in done.stdout.splitlines()) == 1
     assert (tmp_path / "report.json").is_file() and list((tmp_path / "slices").glob("*.png"))

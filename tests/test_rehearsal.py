@@ -20,6 +20,7 @@ from studies.rehearsal import Rehearsal
 from ultrasound.probe import image_plane
 
 LOOK = ("both", "speckle", 350, 40)
+LOOK_AT_CT = ("ct", "speckle", 350, 40)
 PATIENTS = {
     "phantom": None,
     "crlm right": ("crlm_1004", "crlm_1004_labels/kidneys_provisional.nii.gz", "right"),
@@ -58,7 +59,7 @@ def test_at_rest_the_slice_is_the_ct(device, tmp_path, name):
     rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
     rehearsal.hand.turn(20, 10, 35)
     rehearsal.pose = rehearsal.hand.pose()
-    rehearsal.look(rehearsal.probe, *LOOK)
+    rehearsal.look(rehearsal.probe, *LOOK_AT_CT)
     plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], *rehearsal.probe.extent_mm)
     cut = rehearsal.scanner.slice
     inside = organ_mask(cut)
@@ -97,7 +98,7 @@ def test_a_pixel_shows_the_tissue_that_is_there_now(device, tmp_path):
     rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
     for step in range(31):
         rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
-    rehearsal.look(rehearsal.probe, *LOOK)
+    rehearsal.look(rehearsal.probe, *LOOK_AT_CT)
     plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], *rehearsal.probe.extent_mm)
     pixels = np.argwhere(organ_mask(rehearsal.scanner.slice))[::1009]
     spacing = np.array([plane.width_mm, plane.depth_mm]) / scene.image.pixels
