@@ -11,14 +11,19 @@ import taichi as ti
 import taichi.math as tm
 import trimesh
 
+from sim.device import is_too_small
 from sim.distance import signed_distance
 from sim.skinning import Skin
 
 # Barycentric slack that closes the seams between tetrahedra against rounding.
 SEAM = 1e-5
+SEAM_MM = 1e-2
 PARALLEL = 1e-12
 # Volume times six [mm^3] up to which a tetrahedron holds no pixel.
 FLAT = 1e-3
+FAR_MM = 1e9
+# Fewer tetrahedra than these one core of a CPU finds faster by itself.
+PARALLEL_FROM = 1_000_000
 
 
 @ti.data_oriented
@@ -63,15 +68,14 @@ class Embedding:
             rest = self.skin.rest[v]
             self.skin.vertices[v] = rest + self.share[v] * (self.skin.vertices[v] - rest)
 
-    @ti.kernel
     def locate_on_plane(
         self,
-        plane_from_world: tm.mat4,
-        world_from_plane: tm.mat4,
-        pixel_mm: tm.vec2,
-        first_mm: tm.vec2,
-        owner: ti.template(),
-    ):
+        plane_from_world: ti.Matrix,
+        world_from_plane: ti.Matrix,
+        pixel_mm: ti.Matrix,
+        first_mm: ti.Matrix,
+        owner: ti.Field,
+    ) -> None:
         """Which tetrahedron holds each pixel of an image plane; ``count``, one more than the last, where none does.
 
         The two matrices take world [mm] to (u, v, w), with the plane at w = 0, and back; pixel (row, column) is at u =
@@ -79,27 +83,57 @@ class Embedding:
         tetrahedra that overlap, which a folded mesh has, the one of lowest index is taken, whatever thread was first;
         those turned inside out, by tissue squeezed shut, and those squashed flat are left out.
         """
+        serial = is_too_small(self.count, PARALLEL_FROM)
+        self._locate(serial, plane_from_world, world_from_plane, pixel_mm, first_mm, owner)
+
+    @ti.kernel
+    def _locate(
+        self,
+        serial: ti.template(),
+        plane_from_world: tm.mat4,
+        world_from_plane: tm.mat4,
+        pixel_mm: tm.vec2,
+        first_mm: tm.vec2,
+        owner: ti.template(),
+    ):
         for pixel in ti.grouped(owner):
             owner[pixel] = self.count
         self.rest_from_plane[self.count] = world_from_plane[:3, :]
         for v in self.on_plane:
             self.on_plane[v] = (plane_from_world @ tm.vec4(self.skin.vertices[v], 1.0)).xyz
-        for t in range(self.count):
+        ti.loop_config(serialize=serial)
+        for n in range(self.count):
+            # One after the other, the last that marks a pixel is the lowest.
+            t = self.count - 1 - n
             node = self.tetrahedron[t]
             w = ti.Vector([self.on_plane[node[k]].z for k in ti.static(range(4))])
             if w.min() <= 0.0 and w.max() >= 0.0:
-                corner, rest = tm.mat4(0.0), ti.Matrix.zero(ti.f32, 3, 4)
-                for k in ti.static(range(4)):
-                    p, r = self.on_plane[node[k]], self.skin.rest[node[k]]
-                    corner[0, k], corner[1, k], corner[2, k], corner[3, k] = p.x, p.y, p.z, 1.0
-                    rest[0, k], rest[1, k], rest[2, k] = r.x, r.y, r.z
-                if -corner.determinant() > FLAT:
-                    weights = corner.inverse()
-                    self.rest_from_plane[t] = rest @ weights
-                    self.mark_pixels(t, corner, weights, pixel_mm, first_mm, owner)
+                self.mark(serial, t, node, pixel_mm, first_mm, owner)
 
     @ti.func
-    def mark_pixels(self, t, corner, weights, pixel_mm, first_mm, owner: ti.template()):
+    def mark(self, serial: ti.template(), t, node, pixel_mm, first_mm, owner: ti.template()):
+        """Mark the pixels of a tetrahedron that the plane cuts, and where at rest they are, if any are in the picture."""
+        corner, rest = tm.mat4(0.0), ti.Matrix.zero(ti.f32, 3, 4)
+        low, high = tm.vec2(FAR_MM), tm.vec2(-FAR_MM)
+        for k in ti.static(range(4)):
+            p, r = self.on_plane[node[k]], self.skin.rest[node[k]]
+            corner[0, k], corner[1, k], corner[2, k], corner[3, k] = p.x, p.y, p.z, 1.0
+            rest[0, k], rest[1, k], rest[2, k] = r.x, r.y, r.z
+            low, high = ti.min(low, p.xy), ti.max(high, p.xy)
+        last_mm = first_mm + tm.vec2(owner.shape[1] - 1, owner.shape[0] - 1) * pixel_mm
+        if (
+            (high >= first_mm - SEAM_MM).all()
+            and (low <= last_mm + SEAM_MM).all()
+            and -corner.determinant() > FLAT
+        ):
+            weights = corner.inverse()
+            self.rest_from_plane[t] = rest @ weights
+            self.mark_pixels(serial, t, corner, weights, pixel_mm, first_mm, owner)
+
+    @ti.func
+    def mark_pixels(
+        self, serial: ti.template(), t, corner, weights, pixel_mm, first_mm, owner: ti.template()
+    ):
         """Row by row, the span of columns in which all four barycentric coordinates are positive."""
         bottom, top = 1e30, -1e30
         for a, b in ti.static([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]):
@@ -126,7 +160,10 @@ class Embedding:
             first = ti.max(ti.cast(ti.ceil(left), ti.i32), 0)
             last = ti.min(ti.cast(ti.floor(right), ti.i32), owner.shape[1] - 1)
             for column in range(first, last + 1):
-                ti.atomic_min(owner[row, column], t)
+                if ti.static(serial):
+                    owner[row, column] = t
+                else:
+                    ti.atomic_min(owner[row, column], t)
 
 
 @ti.data_oriented

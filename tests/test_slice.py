@@ -187,6 +187,12 @@ def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(devi
         assert len(holds) == 0 or owner[row, column] <= holds[0]
         assert np.linalg.det(edges[owner[row, column]]) < 0
     assert overlaps > 50
+    # One after the other or in parallel: the same.
+    matrices = [ti.Matrix(m.tolist()) for m in (np.linalg.inv(plane.world_from_plane), plane.world_from_plane)]
+    for serial in (False, True):
+        cut.plane.owner.fill(-1)
+        embedding._locate(serial, *matrices, cut.plane.pixel_mm, cut.plane.first_mm, cut.plane.owner)
+        assert np.array_equal(cut.plane.owner.to_numpy(), owner)
 
 
 @pytest.mark.parametrize("squash", [(1, 1, 0), (1, 0, 0), (0, 0, 0), (1, 1, -1), (1, 1, 1e-6)])
