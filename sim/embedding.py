@@ -54,7 +54,9 @@ class Embedding:
         self.count = len(tetrahedra)
         self.tetrahedron = ti.Vector.field(4, ti.i32, self.count)
         self.tetrahedron.from_numpy(tetrahedra.astype(np.int32))
-        self.on_plane = ti.Vector.field(3, ti.f32, len(vertices))
+        self.on_plane = ti.Vector.field(2, ti.f32, len(vertices))
+        # Apart, so that what all tetrahedra are asked for stays in a core's nearest cache.
+        self.above_plane = ti.field(ti.f32, len(vertices))
         self.rest_from_plane = ti.Matrix.field(3, 4, ti.f32, self.count + 1)
 
     def update(self) -> None:
@@ -100,13 +102,14 @@ class Embedding:
             owner[pixel] = self.count
         self.rest_from_plane[self.count] = world_from_plane[:3, :]
         for v in self.on_plane:
-            self.on_plane[v] = (plane_from_world @ tm.vec4(self.skin.vertices[v], 1.0)).xyz
+            place = plane_from_world @ tm.vec4(self.skin.vertices[v], 1.0)
+            self.on_plane[v], self.above_plane[v] = place.xy, place.z
         ti.loop_config(serialize=serial)
         for n in range(self.count):
             # One after the other, the last that marks a pixel is the lowest.
             t = self.count - 1 - n
             node = self.tetrahedron[t]
-            w = ti.Vector([self.on_plane[node[k]].z for k in ti.static(range(4))])
+            w = ti.Vector([self.above_plane[node[k]] for k in ti.static(range(4))])
             if w.min() <= 0.0 and w.max() >= 0.0:
                 self.mark(serial, t, node, pixel_mm, first_mm, owner)
 
@@ -117,9 +120,9 @@ class Embedding:
         low, high = tm.vec2(FAR_MM), tm.vec2(-FAR_MM)
         for k in ti.static(range(4)):
             p, r = self.on_plane[node[k]], self.skin.rest[node[k]]
-            corner[0, k], corner[1, k], corner[2, k], corner[3, k] = p.x, p.y, p.z, 1.0
+            corner[0, k], corner[1, k], corner[2, k], corner[3, k] = p.x, p.y, self.above_plane[node[k]], 1.0
             rest[0, k], rest[1, k], rest[2, k] = r.x, r.y, r.z
-            low, high = ti.min(low, p.xy), ti.max(high, p.xy)
+            low, high = ti.min(low, p), ti.max(high, p)
         last_mm = first_mm + tm.vec2(owner.shape[1] - 1, owner.shape[0] - 1) * pixel_mm
         if (
             (high >= first_mm - SEAM_MM).all()

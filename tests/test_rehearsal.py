@@ -63,7 +63,7 @@ def test_at_rest_the_slice_is_the_ct(device, tmp_path, name):
     plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], *rehearsal.probe.extent_mm)
     cut = rehearsal.scanner.slice
     inside = organ_mask(cut)
-    difference = np.abs(cut.hu.to_numpy() - resampled(folder, plane, rehearsal.origin, scene.image.pixels))
+    difference = np.abs(cut.hounsfield() - resampled(folder, plane, rehearsal.origin, scene.image.pixels))
     print(f"{name}: mean {difference[inside].mean():.4f} HU, maximum {difference[inside].max():.3f} HU")
     assert inside.mean() > 0.1
     # The bar is 5 HU; float32 positions (1e-5 mm) in gradients of 500 HU/mm leave far less.

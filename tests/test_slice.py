@@ -91,7 +91,7 @@ def test_at_rest_it_is_an_oblique_resample_of_the_ct(device, ball, outside):
     resampled = sitk.GetArrayFromImage(
         sitk.Resample(image, grid, sitk.Transform(), sitk.sitkLinear, -1000.0)
     )[0]
-    hu, inside = cut.hu.to_numpy(), organ_mask(cut)
+    hu, inside = cut.hounsfield(), organ_mask(cut)
     assert 0.3 < inside.mean() < 0.9
     # float32 positions of 15 mm carry 1e-6 mm, a barycentric map ten times that; noise of 100 HU/mm.
     assert np.abs(hu - resampled)[inside].max() < 0.05
@@ -109,7 +109,7 @@ def test_under_a_rigid_motion_it_is_the_exact_pull_back(device, ball):
     inside = organ_mask(cut)
     assert inside.mean() > 0.3
     # Frames fitted in float32 turn by 1e-6 at 12 mm; the ramp has 14 HU/mm.
-    assert np.abs(cut.hu.to_numpy() - wanted)[inside].max() < 14 * 1e-4
+    assert np.abs(cut.hounsfield() - wanted)[inside].max() < 14 * 1e-4
 
 
 @pytest.mark.parametrize("stretch", [0.05, 0.15])
@@ -128,7 +128,7 @@ def test_under_an_affine_deformation_it_is_the_pull_back_within_the_skins_error(
     vertices = np.unique(embedding.tetrahedron.to_numpy()[used])
     off = (skin.rest.to_numpy() - centre)[vertices] @ (np.linalg.inv(shear) @ (shear - u @ vt)).T
     bound = np.linalg.norm(off, axis=1).max() * np.linalg.norm(GRADIENT)
-    error = np.abs(cut.hu.to_numpy() - wanted)[inside]
+    error = np.abs(cut.hounsfield() - wanted)[inside]
     assert error.max() < bound
     # Were the tissue taken as undeformed, it would be wrong by far more than that on average.
     undeformed = np.abs(pixel_points(plane, 96) @ GRADIENT - wanted)[inside]
@@ -137,7 +137,7 @@ def test_under_an_affine_deformation_it_is_the_pull_back_within_the_skins_error(
 
 def test_the_picture_is_the_window(device, ball):
     cut, _, _, _ = sliced(ball, noisy_image())
-    wanted = np.clip((cut.hu.to_numpy().astype(float) - 40) / 350 + 0.5, 0, 1) * 255
+    wanted = np.clip((cut.hounsfield().astype(float) - 40) / 350 + 0.5, 0, 1) * 255
     assert np.abs(cut.render(350.0, 40.0) - wanted).max() <= 0.51
 
 
@@ -188,7 +188,9 @@ def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(devi
         assert np.linalg.det(edges[owner[row, column]]) < 0
     assert overlaps > 50
     # One after the other or in parallel: the same.
-    matrices = [ti.Matrix(m.tolist()) for m in (np.linalg.inv(plane.world_from_plane), plane.world_from_plane)]
+    matrices = [
+        ti.Matrix(m.tolist()) for m in (np.linalg.inv(plane.world_from_plane), plane.world_from_plane)
+    ]
     for serial in (False, True):
         cut.plane.owner.fill(-1)
         embedding._locate(serial, *matrices, cut.plane.pixel_mm, cut.plane.first_mm, cut.plane.owner)
@@ -200,7 +202,7 @@ def test_flat_collapsed_and_inverted_tissue_still_gives_a_picture(device, ball, 
     cut, _, _, embedding = sliced(ball, ramp_image(), lambda x: x * np.array(squash) + [0, 0, 3.0])
     owner = cut.plane.owner.to_numpy()
     assert ((owner >= 0) & (owner <= embedding.count)).all()
-    assert np.isfinite(cut.hu.to_numpy()).all()
+    assert np.isfinite(cut.hounsfield()).all()
 
 
 def test_what_lies_around_the_organ_gives_way_to_it_and_far_away_stays(device, ball):
@@ -241,7 +243,7 @@ def test_what_does_not_move_is_shown_where_it_lies(device, ball):
     cut.render(350.0, 40.0)
     assert np.abs(cut.plane.rest_grid(96) - pixel_points(plane, 96)).max() < 1e-4
     still, _, _, _ = sliced(ball, noisy_image(), outside="background")
-    assert np.abs(cut.hu.to_numpy() - still.hu.to_numpy()).max() < 0.05
+    assert np.abs(cut.hounsfield() - still.hounsfield()).max() < 0.05
 
 
 def test_a_volume_of_vectors_is_sampled_as_each_of_its_parts(device):

@@ -4,8 +4,8 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from ultrasound.plane import Picture, PlaneInTissue
-from ultrasound.volume import AIR_HU, LANES, Lanes, Volume
+from ultrasound.plane import LANES, Picture, PlaneInTissue
+from ultrasound.volume import AIR_HU, Volume
 
 OUTSIDES = ("background", "gel", "air")
 OUTSIDE_HU = {"background": 0.0, "gel": 0.0, "air": AIR_HU}
@@ -28,39 +28,53 @@ class Slice:
         self.plane = plane
         self.show_background = outside == "background"
         self.outside_hu = OUTSIDE_HU[outside]
-        self.hu = ti.field(ti.f32, (plane.pixels, plane.pixels))
+        self.packets = (plane.pixels + LANES - 1) // LANES
 
     def render(self, window_hu: float, level_hu: float) -> np.ndarray:
-        """Grey values (pixels, pixels) uint8, 0 to 255 over the window, of the plane that was taken last; ``hu`` is what they show.
+        """Grey values (pixels, pixels) uint8, 0 to 255 over the window, of the plane that was taken last.
 
         Pixels are sampled at their centres.
         """
         picture = np.empty((self.plane.pixels, self.plane.pixels), np.uint8)
-        self._sample(self.plane.pixel_mm, self.plane.first_mm, window_hu, level_hu, picture)
+        self._render(self.plane.pixel_mm, self.plane.first_mm, window_hu, level_hu, picture)
         return picture
 
+    def hounsfield(self) -> np.ndarray:
+        """HU (pixels, pixels) float32 of the plane that was taken last."""
+        values = np.empty((self.plane.pixels, self.plane.pixels), np.float32)
+        self._hounsfield(self.plane.pixel_mm, self.plane.first_mm, values)
+        return values
+
     @ti.kernel
-    def _sample(
+    def _render(
         self, pixel_mm: tm.vec2, first_mm: tm.vec2, window_hu: float, level_hu: float, picture: Picture
     ):
-        last = self.plane.pixels - 1
-        for row, packet in ti.ndrange(self.plane.pixels, (last + LANES) // LANES):
-            first = packet * LANES
-            x, y, z = Lanes(0.0), Lanes(0.0), Lanes(0.0)
-            for lane in ti.static(range(LANES)):
-                rest = self.plane.rest_at(row, ti.min(first + lane, last), pixel_mm, first_mm)
-                x[lane], y[lane], z[lane] = rest.x, rest.y, rest.z
-            hu = self.ct.sample_lanes(x, y, z)
-            if ti.static(not self.show_background):
-                for lane in ti.static(range(LANES)):
-                    rest = tm.vec3(x[lane], y[lane], z[lane])
-                    if not self.in_organ(row, ti.min(first + lane, last), rest):
-                        hu[lane] = self.outside_hu
+        for row, packet in ti.ndrange(self.plane.pixels, self.packets):
+            hu = self.sample(row, packet * LANES, pixel_mm, first_mm)
             grey = ti.min(ti.max((hu - level_hu) / window_hu + 0.5, 0.0), 1.0) * 255.0 + 0.5
             for lane in ti.static(range(LANES)):
-                if first + lane <= last:
-                    self.hu[row, first + lane] = hu[lane]
-                    picture[row, first + lane] = ti.cast(grey[lane], ti.u8)
+                if packet * LANES + lane < self.plane.pixels:
+                    picture[row, packet * LANES + lane] = ti.cast(grey[lane], ti.u8)
+
+    @ti.kernel
+    def _hounsfield(self, pixel_mm: tm.vec2, first_mm: tm.vec2, values: ti.types.ndarray(ti.f32, ndim=2)):
+        for row, packet in ti.ndrange(self.plane.pixels, self.packets):
+            hu = self.sample(row, packet * LANES, pixel_mm, first_mm)
+            for lane in ti.static(range(LANES)):
+                if packet * LANES + lane < self.plane.pixels:
+                    values[row, packet * LANES + lane] = hu[lane]
+
+    @ti.func
+    def sample(self, row, first, pixel_mm, first_mm):
+        """HU of LANES pixels of a row."""
+        x, y, z = self.plane.rest_lanes(row, first, pixel_mm, first_mm)
+        hu = self.ct.sample_lanes(x, y, z)
+        if ti.static(not self.show_background):
+            for lane in ti.static(range(LANES)):
+                column = ti.min(first + lane, self.plane.pixels - 1)
+                if not self.in_organ(row, column, tm.vec3(x[lane], y[lane], z[lane])):
+                    hu[lane] = self.outside_hu
+        return hu
 
     @ti.func
     def in_organ(self, row, column, rest):

@@ -6,11 +6,9 @@ import taichi.math as tm
 import trimesh
 
 from sim.distance import signed_distance
+from ultrasound.plane import LANES, Lanes
 
 AIR_HU = -1000.0
-# Places that are sampled together where there are many in a row.
-LANES = 8
-Lanes = ti.types.vector(LANES, ti.f32)
 FAR_MM = 1e6
 
 
