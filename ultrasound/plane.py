@@ -73,7 +73,10 @@ class PlaneInTissue:
 
     @ti.func
     def rest_lanes(self, row, first, pixel_mm, first_mm):
-        """As ``rest_at``, of LANES pixels of a row, each axis by itself; those beyond the picture are its last."""
+        """As ``rest_at``, of LANES pixels of a row, each axis by itself, and whether they are on one line at rest too.
+
+        Those beyond the picture are its last.
+        """
         last = self.pixels - 1
         x, y, z = Lanes(0.0), Lanes(0.0), Lanes(0.0)
         owner = self.owner[row, first]
@@ -90,7 +93,7 @@ class PlaneInTissue:
             for lane in ti.static(range(LANES)):
                 rest = self.rest_at(row, ti.min(first + lane, last), pixel_mm, first_mm)
                 x[lane], y[lane], z[lane] = rest.x, rest.y, rest.z
-        return x, y, z
+        return x, y, z, alike
 
     @ti.func
     def pixel_near(self, place, pixel_mm, first_mm):

@@ -67,8 +67,8 @@ class Slice:
     @ti.func
     def sample(self, row, first, pixel_mm, first_mm):
         """HU of LANES pixels of a row."""
-        x, y, z = self.plane.rest_lanes(row, first, pixel_mm, first_mm)
-        hu = self.ct.sample_lanes(x, y, z)
+        x, y, z, in_line = self.plane.rest_lanes(row, first, pixel_mm, first_mm)
+        hu = self.ct.sample_lanes(x, y, z, in_line)
         if ti.static(not self.show_background):
             for lane in ti.static(range(LANES)):
                 column = ti.min(first + lane, self.plane.pixels - 1)

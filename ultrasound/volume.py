@@ -60,37 +60,31 @@ class Volume:
         return value
 
     @ti.func
-    def sample_lanes(self, x, y, z):
-        """Trilinear values at LANES places [mm], one a lane: vector units do the sums of all at once."""
+    def sample_lanes(self, x, y, z, in_line):
+        """Trilinear values at LANES places [mm], one a lane; ``in_line`` says that they are evenly spaced on a line."""
         a, o = self.linear, self.offset
-        i = a[0, 0] * x + a[0, 1] * y + a[0, 2] * z + o[0]
-        j = a[1, 0] * x + a[1, 1] * y + a[1, 2] * z + o[1]
-        k = a[2, 0] * x + a[2, 1] * y + a[2, 2] * z + o[2]
-        first_i, along_i, inside_i = self.lanes_along(0, i)
-        first_j, tj, inside_j = self.lanes_along(1, j)
-        first_k, tk, inside_k = self.lanes_along(2, k)
+        first_i, along_i, off_i = self.lanes_along(0, a[0, 0] * x + a[0, 1] * y + a[0, 2] * z + o[0])
+        first_j, along_j, off_j = self.lanes_along(1, a[1, 0] * x + a[1, 1] * y + a[1, 2] * z + o[1])
+        first_k, along_k, off_k = self.lanes_along(2, a[2, 0] * x + a[2, 1] * y + a[2, 2] * z + o[2])
         first = first_i * self.strides[0] + first_j * self.strides[1] + first_k
         low, high = Lanes(0.0), Lanes(0.0)
-        if first.min() == first.max():
-            # A picture has many pixels a voxel: a row of them lies between the same eight.
-            low = self.between(first[0], 0, tj, tk)
-            high = self.between(first[0], self.strides[0], tj, tk)
+        if in_line and first[0] == first[LANES - 1]:
+            # A picture has many pixels a voxel: both ends of a line between the same eight, all of it is.
+            low = self.between(first[0], 0, along_j, along_k)
+            high = self.between(first[0], self.strides[0], along_j, along_k)
         else:
-            low = self.lanes_between(first, 0, tj, tk)
-            high = self.lanes_between(first, self.strides[0], tj, tk)
+            low = self.lanes_between(first, 0, along_j, along_k)
+            high = self.lanes_between(first, self.strides[0], along_j, along_k)
         value = low + along_i * (high - low)
-        for lane in ti.static(range(LANES)):
-            if not (inside_i[lane] and inside_j[lane] and inside_k[lane]):
-                value[lane] = self.outside
-        return value
+        off = ti.max(ti.max(off_i, off_j), off_k)
+        return ti.select(off <= 0.5, value, self.outside)
 
     @ti.func
     def lanes_along(self, axis: ti.template(), at):
-        """Along one axis: the voxels before places (in voxels), the way on to the next, whether inside."""
-        last = self.shape[axis] - 1
-        clamped = ti.min(ti.max(at, 0.0), float(last))
+        """Along one axis: the voxels before places (in voxels), the way on to the next, how far outside the voxels' centres."""
+        clamped = ti.min(ti.max(at, 0.0), float(self.shape[axis] - 1))
         base = ti.min(ti.cast(clamped, ti.i32), self.count[axis] - 2)
-        return base, clamped - base, (at >= -0.5) & (at <= last + 0.5)
+        return base, clamped - base, ti.abs(at - clamped)
 
     @ti.func
     def between(self, voxel, shift: ti.template(), tj, tk):
