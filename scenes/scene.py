@@ -207,7 +207,7 @@ class Image(Section):
     level_hu: float = Field(40.0, ge=-2000, le=4000)
     outside: Literal["background", "gel", "air"] = "background"
     contact: Literal["organ", "tissue"] = "organ"
-    contact_gap_mm: float = Field(1.0, ge=0, le=20)
+    contact_gap_mm: float = Field(1.5, ge=0, le=20)
 
 
 class Press(Section):

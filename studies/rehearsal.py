@@ -4,6 +4,7 @@ The window, the headless run and every measurement go through this class, so tha
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import taichi as ti
@@ -214,11 +215,18 @@ class Rehearsal:
 
     def tumour_outline(self) -> np.ndarray | None:
         """Where the image plane cuts the tumour: segments (n, 2, 2) on the plane [mm]; None without a tumour."""
-        if self.tumour is None or self.tumour_skin is None:
+        if self.tumour is None:
             return None
+        self._tumour_border.update()
         plane = image_plane(self.pose, self.size_mm[2], 1.0, 1.0)
-        vertices = self.tumour_skin.vertices.to_numpy()
+        vertices = self._tumour_border.vertices.to_numpy()
         return section(vertices, self.tumour.faces, np.linalg.inv(plane.world_from_plane))
+
+    @cached_property
+    def _tumour_border(self) -> Skin:
+        """The tumour's surface where it is; the one that is drawn is lifted off it."""
+        assert self.tumour is not None
+        return Skin(self.model, self.tumour.vertices)
 
     def indentation_mm(self) -> float:
         """How deep the transducer is pressed into the settled surface; negative above it."""

@@ -15,6 +15,7 @@ from scenes.patient import import_patient, save_patient
 from scenes.reading import read_volume
 from scenes.scene import PAPER, Press, Scene, load_scene, with_options
 from sim.device import start
+from sim.distance import signed_distance
 from sim.skinning import Skin
 from studies.rehearsal import Rehearsal
 from ultrasound.probe import image_plane
@@ -202,3 +203,17 @@ def test_every_feature_at_once_stays_finite_and_out_of_everything(device, tmp_pa
     rehearsal.update_surfaces()
     assert np.isfinite(rehearsal.body.position.to_numpy()).all()
     assert 0.6 < rehearsal.volume_ratio() < 1.1
+
+
+def test_the_outline_is_the_tumours_border_not_what_is_drawn_of_it(device, tmp_path):
+    scene, folder = patient_in("phantom", tmp_path)
+    rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
+    for _ in range(20):
+        rehearsal.advance(rehearsal.pose_at_depth(6.0))
+    outline = rehearsal.tumour_outline()
+    plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], 1.0, 1.0)
+    flat = np.column_stack([outline.reshape(-1, 2), np.zeros(2 * len(outline)), np.ones(2 * len(outline))])
+    carried = Skin(rehearsal.model, rehearsal.tumour.vertices).vertices.to_numpy()
+    border = trimesh.Trimesh(carried, rehearsal.tumour.faces, process=False)
+    away = signed_distance(border.vertices, border.faces, (flat @ plane.world_from_plane.T)[:, :3])[0]
+    assert len(outline) > 20 and np.abs(away).max() < 1e-3

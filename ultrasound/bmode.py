@@ -42,7 +42,7 @@ class BMode:
         probe: Probe,
         voxel_mm: float,
         contact: str = "organ",
-        contact_gap_mm: float = 1.0,
+        contact_gap_mm: float = 1.5,
         around: float | None = None,
     ) -> None:
         shape = probe.number_of_scanlines, probe.number_of_samples_per_scanline

@@ -55,7 +55,7 @@ class Scanner:
         pixels: int = 512,
         outside: str = "background",
         contact: str = "organ",
-        contact_gap_mm: float = 1.0,
+        contact_gap_mm: float = 1.5,
     ) -> None:
         check_tissues(anatomy.tissues)
         self.anatomy = anatomy
