@@ -63,7 +63,7 @@ class Tank:
         self.tissue = Volume(np.zeros((*count, 3)), index_from_mm, outside=0.0)
         organ = organ or Volume(np.full((1, 1, 1), -1.0), np.diag([1e-6, 1e-6, 1e-6, 1.0]))
         self.plane = PlaneInTissue(embedding or Unmoved(), PIXELS)
-        self.bmode = BMode(self.tissue, organ, self.plane, probe_of(), voxel_mm.min(), contact)
+        self.bmode = BMode(self.tissue, organ, self.plane, probe_of(), voxel_mm.min(), contact, 1.0)
 
     def fill(self, impedance=TISSUE, attenuation=0.0, backscatter=0.0) -> None:
         """Each a number or a function of x, y, z [mm]."""
