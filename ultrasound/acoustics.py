@@ -13,18 +13,13 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from ultrasound.recognition import recognised
+
 TISSUES = Path(__file__).parent / "tissues.toml"
 # Amplitude of renal cortex against a perfect reflector: its speckle lies some 16 dB under the echo of fat on kidney.
 CORTEX_DB = -38.0
 # Labels have steps of a voxel, where tissue has none.
 SMOOTHING_VOXELS = 0.8
-FAT_BELOW_HU = -30.0
-STONE_ABOVE_MEDIAN_HU = 130.0
-NECROSIS_BELOW_MEDIAN_HU = 40.0
-# Fat in a hollow of the kidney no wider than twice this is the sinus's.
-HOLLOW_MM = 10.0
-# Tissues that hold fat and stones which no label tells.
-KIDNEY = ("kidney", "cortex", "medulla", "sinus", "urine")
 SEED = 20160101
 LEAST_HU, MOST_HU = -1024, 3071
 
@@ -120,49 +115,14 @@ def _by_hounsfield(hu: np.ndarray) -> np.ndarray:
 def _labelled(
     hu: np.ndarray, labels: np.ndarray | None, tissue_of_label: Mapping[int, str], spacing_mm: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Tissue -> which voxels are of it; fat and stones within the kidney last, so that they win."""
-    if labels is None or not tissue_of_label:
-        return {}
+    """Tissue -> which voxels are of it, by label and by what HU and shape tell besides, in the order in which they win."""
     found: dict[str, np.ndarray] = {}
-    for value, tissue in tissue_of_label.items():
+    for value, tissue in tissue_of_label.items() if labels is not None else ():
         here = labels == value
         found[tissue] = found[tissue] | here if tissue in found else here
-    kidney = [found[tissue] for tissue in KIDNEY if tissue in found]
-    if "sinus" not in found and kidney:
-        found["sinus"] = _hollow(np.logical_or.reduce(kidney), spacing_mm) & (hu < FAT_BELOW_HU)
-    for tissue, here in _parts_by_hounsfield(hu, kidney, found.get("tumour")).items():
+    for tissue, here in recognised(hu, found, spacing_mm).items():
         found[tissue] = found[tissue] | here if tissue in found else here
     return {tissue: where for tissue, where in found.items() if where.any()}
-
-
-def _hollow(kidney: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """What a kidney encloses besides itself: its closing by a ball of HOLLOW_MM, without it."""
-    if not kidney.any():
-        return kidney
-    rim = np.ceil(HOLLOW_MM / spacing_mm).astype(int) + 1
-    box = ndimage.find_objects(kidney.astype(np.uint8))[0]
-    part = np.pad(kidney[box], [(int(r), int(r)) for r in rim])
-    grown = ndimage.distance_transform_edt(~part, sampling=spacing_mm) <= HOLLOW_MM
-    closed = ndimage.distance_transform_edt(grown, sampling=spacing_mm) > HOLLOW_MM
-    hollow = np.zeros_like(kidney)
-    inner = tuple(slice(int(r), n - int(r)) for r, n in zip(rim, part.shape, strict=True))
-    hollow[box] = (closed & ~part)[inner]
-    return hollow
-
-
-def _parts_by_hounsfield(
-    hu: np.ndarray, kidney: list[np.ndarray], tumour: np.ndarray | None
-) -> dict[str, np.ndarray]:
-    """Fat and stones of a kidney, and what of a tumour takes up no contrast agent."""
-    parts: dict[str, np.ndarray] = {}
-    if kidney:
-        inside = np.logical_or.reduce(kidney)
-        if inside.any():
-            parts["sinus"] = inside & (hu < FAT_BELOW_HU)
-            parts["stone"] = inside & (hu > np.median(hu[inside]) + STONE_ABOVE_MEDIAN_HU)
-    if tumour is not None and tumour.any():
-        parts["necrosis"] = tumour & (hu < np.median(hu[tumour]) - NECROSIS_BELOW_MEDIAN_HU)
-    return parts
 
 
 class _Texture:
