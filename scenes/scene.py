@@ -340,6 +340,8 @@ def _suggest(where: list[str]) -> str:
     for name in known:
         if name != key and key.startswith(_quantity(name)) and _quantity(name) != name:
             return f"the unit is in the key: write {name}"
+    if where == ["image", "width_mm"]:
+        return "the picture is as wide as the probe's array (TransducerWidthMm in its file): leave this out"
     close = difflib.get_close_matches(key, known, n=1) or [name for name in known if name.startswith(stem)]
     return f"did you mean {close[0]}?" if close else f"known here: {', '.join(known)}"
 

@@ -71,6 +71,7 @@ class Record:
             substeps=settings.substeps,
             iterations=settings.iterations,
             probe=rehearsal.probe.transducer_name,
+            probe_settings=rehearsal.probe.model_dump(by_alias=True),
             picture=rehearsal.scene.image.mode,
             rung=rehearsal.scene.image.rung,
             slice_width_mm=rehearsal.probe.extent_mm[0],

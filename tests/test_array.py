@@ -1,7 +1,6 @@
 """Probe files, the geometry of scanlines, what of the array touches, and from lines to the picture."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -57,10 +56,14 @@ GOOD = 'TransducerName = "x"\n'
 WRONG = {
     "an unknown key": (
         GOOD + "FrequencyMHz = 7.5\n",
-        "FrequencyMHz: unknown key; known here: .*FrequencyMhz",
+        "FrequencyMHz: unknown key; did you mean FrequencyMhz",
     ),
     "a wrong type": (GOOD + 'DepthMm = "deep"\n', "DepthMm = 'deep': input should be a valid number"),
     "a missing name": ("DepthMm = 60.0\n", "TransducerName: missing"),
+    "an array wider than its housing": (
+        GOOD + "TransducerWidthMm = 50\n",
+        "the array is 49.7 mm wide, HousingMm 40: it must fit in",
+    ),
     "an unknown geometry": (
         GOOD + 'TransducerGeometry = "CONVEX"\n',
         "TransducerGeometry = 'CONVEX': input should be",
@@ -103,11 +106,8 @@ def test_a_wrong_probe_file_is_refused_with_a_line_that_names_the_key(tmp_path, 
 
 def test_a_missing_probe_file_is_told_with_those_known(tmp_path):
     for folder in (tmp_path, None):
-        with pytest.raises(
-            ProbeError, match="no such probe file; known by name: " + ", ".join(KNOWN)
-        ) as refused:
+        with pytest.raises(ProbeError, match="'none' is no file, and known by name are " + ", ".join(KNOWN)):
             load_probe("none", folder)
-        assert str((folder or Path()) / "none") in str(refused.value)
 
 
 def test_bytes_that_are_no_text_are_refused(tmp_path):

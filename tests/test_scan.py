@@ -54,6 +54,7 @@ def test_poses_of_both_formats_are_the_same(tmp_path):
     ("text", "words"),
     [
         ("{", "not valid JSON"),
+        (" ", "is empty"),
         ("[]", "holds no poses"),
         ('[{"probe_to_patient": [[1, 0, 0, 0]]}]', "pose 1, probe_to_patient"),
         ('[{"matrix": []}]', "pose 1"),
@@ -107,6 +108,10 @@ def test_scan_leaves_a_picture_of_each_pose_and_mode(tmp_path, capsys):
     row = report["pictures"][0]
     rows, columns = shown["on-b-mode"].shape
     assert (rows * row["row_mm"], columns * row["column_mm"]) == pytest.approx((40.0, 16.0))
+    image_to_probe = np.array(row["image_to_probe"])
+    corners = image_to_probe @ np.array([[-0.5, -0.5, 0, 1], [columns - 0.5, rows - 0.5, 0, 1]]).T
+    assert pytest.approx(np.array([[-8.0, 0.0], [8.0, 40.0]])) == corners[:2].T
+    assert np.array(row["probe_to_patient"]) == pytest.approx(pose_on_tumour())
     assert shown["on-b-mode"].mean() > 40 and shown["off-b-mode"].max() == 0 and shown["off-ct"].max() > 0
     assert (out / "on-b-mode.dcm").is_file() and not (out / "on-ct.dcm").exists()
 
@@ -124,7 +129,7 @@ def test_an_unknown_probe_is_named_with_those_that_are_known(tmp_path, capsys):
         "x.toml",
     ]
     assert app.main(command) == 2
-    assert "known by name: curvilinear, drop-in, linear, phased" in capsys.readouterr().err
+    assert "known by name are curvilinear, drop-in, linear, phased" in capsys.readouterr().err
 
 
 def test_a_label_of_no_known_tissue_is_refused_in_one_line(tmp_path, capsys):

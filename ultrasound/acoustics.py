@@ -117,9 +117,9 @@ def _labelled(
 ) -> dict[str, np.ndarray]:
     """Tissue -> which voxels are of it, by label and by what HU and shape tell besides, in the order in which they win."""
     found: dict[str, np.ndarray] = {}
-    for value, tissue in tissue_of_label.items() if labels is not None else ():
-        here = labels == value
-        found[tissue] = found[tissue] | here if tissue in found else here
+    if labels is not None:
+        for tissue in dict.fromkeys(tissue_of_label.values()):
+            found[tissue] = np.isin(labels, [v for v, name in tissue_of_label.items() if name == tissue])
     for tissue, here in recognised(hu, found, spacing_mm).items():
         found[tissue] = found[tissue] | here if tissue in found else here
     return {tissue: where for tissue, where in found.items() if where.any()}

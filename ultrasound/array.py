@@ -4,6 +4,7 @@ A probe file is TOML with PLUS's names (TransducerGeometry, DepthMm, FrequencyMh
 plane are (u, v) [mm]: u to the marked side, v down into the tissue, the origin at the middle of the array's face.
 """
 
+import difflib
 import tomllib
 from pathlib import Path
 from typing import Annotated, Literal
@@ -81,6 +82,11 @@ class Probe(BaseModel):
             raise ValueError("a sector needs ThetaStartDeg < 0 < ThetaStopDeg, at least 1 degree apart")
         if self.transducer_geometry == "CURVILINEAR" and self.radius_start_mm <= 0:
             raise ValueError("a curvilinear array needs its radius: RadiusStartMm > 0")
+        array = np.ptp(self.elements()[:, 0])
+        if array > self.housing_mm[0]:
+            raise ValueError(
+                f"the array is {array:.1f} mm wide, HousingMm {self.housing_mm[0]:g}: it must fit in"
+            )
         return self
 
     @property
@@ -177,7 +183,7 @@ def load_probe(name: str, folder: Path | None = None) -> Probe:
         return Probe.model_validate(tomllib.loads(path.read_text("utf-8")))
     except FileNotFoundError:
         known = ", ".join(sorted(each.stem for each in PROBES.glob("*.toml")))
-        raise ProbeError(f"{path}: no such probe file; known by name: {known}") from None
+        raise ProbeError(f"transducer.probe: {name!r} is no file, and known by name are {known}") from None
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ProbeError(f"{path}: cannot be read as a probe file ({str(error).splitlines()[0]})") from None
     except ValidationError as error:
@@ -191,8 +197,11 @@ def explained(error: ValidationError) -> str:
     if first["type"] == "value_error":
         return str(first["ctx"]["error"])
     if first["type"] == "extra_forbidden":
-        known = ", ".join(to_pascal(name) for name in Probe.model_fields)
-        return f"{key}: unknown key; known here: {known}"
+        known = [to_pascal(name) for name in Probe.model_fields]
+        close = difflib.get_close_matches(key, known, n=1)
+        return f"{key}: unknown key; " + (
+            f"did you mean {close[0]}?" if close else f"known: {', '.join(known)}"
+        )
     if first["type"] == "missing":
         return f"{key}: missing"
     return f"{key} = {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}"

@@ -31,7 +31,8 @@ def recognised(
             found["vessel"] = _vessels(hu, everything | bone)
         if "sinus" not in labelled:
             found["sinus"] = hollow(kidney, spacing_mm) & (hu < FAT_BELOW_HU)
-        found["sinus"] = found.get("sinus", False) | (kidney & (hu < FAT_BELOW_HU))
+        fat = kidney & (hu < FAT_BELOW_HU)
+        found["sinus"] = found["sinus"] | fat if "sinus" in found else fat
         found["stone"] = kidney & (hu > median + STONE_ABOVE_MEDIAN_HU)
     tumour = labelled.get("tumour")
     if tumour is not None and tumour.any():

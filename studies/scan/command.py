@@ -16,6 +16,14 @@ from studies.setup import probe_of
 from ultrasound.array import MODES, RUNGS
 
 
+def image_to_probe(spacing_mm: tuple[float, float], width_mm: float, above_mm: float) -> np.ndarray:
+    """The matrix (4, 4) that takes pixels (column, row, 0), counted from the first one's centre, to the probe's axes [mm]."""
+    row_mm, column_mm = spacing_mm
+    matrix = np.diag([column_mm, row_mm, 1.0, 1.0])
+    matrix[:2, 3] = column_mm / 2 - width_mm / 2, row_mm / 2 - above_mm
+    return matrix
+
+
 @click.command()
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option(
@@ -87,13 +95,21 @@ def scan(
             if dicom and kind == ECHO:
                 save_dicom(file.with_suffix(".dcm"), np.asarray(square), spacing, held)
             rows.append(
-                dict(pose=name, picture=kind, file=file.name, row_mm=spacing[0], column_mm=spacing[1])
+                dict(
+                    pose=name,
+                    picture=kind,
+                    file=file.name,
+                    row_mm=spacing[0],
+                    column_mm=spacing[1],
+                    probe_to_patient=pose.tolist(),
+                    image_to_probe=image_to_probe(spacing, width, above).tolist(),
+                )
             )
     report = dict(
         probe=held.model_dump(by_alias=True),
         rung=image.rung,
         contact=contact,
-        above_mm=above,
+        contact_gap_mm=image.contact_gap_mm,
         arch=used,
         pictures=rows,
     )

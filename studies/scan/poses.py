@@ -51,6 +51,8 @@ def load_poses(path: Path) -> dict[str, np.ndarray]:
 
 def _of_json(path: Path, text: str) -> list[tuple[str, np.ndarray]]:
     try:
+        if not text.strip():
+            raise PoseError(f"{path}: is empty; expected a list of poses")
         poses = TypeAdapter(list[_Pose]).validate_python(json.loads(text))
     except json.JSONDecodeError as error:
         raise PoseError(f"{path}: not valid JSON: {error}") from None

@@ -1,0 +1,69 @@
+"""Tissues that no label tells: bone with its marrow, blood with contrast agent."""
+
+import numpy as np
+
+from ultrasound.acoustics import ATTENUATION, IMPEDANCE, properties, tissue_table
+from ultrasound.recognition import bones, recognised
+
+SPACING = np.array([0.9, 0.9, 0.9])
+FAT, MARROW, SHELL, CORTEX, BLOOD = -100.0, 150.0, 600.0, 180.0, 200.0
+
+
+def ball(centre_mm: tuple[float, float, float], radius_mm: float) -> np.ndarray:
+    place = np.moveaxis(np.indices((80, 70, 60)), 0, -1) * SPACING - centre_mm
+    return np.linalg.norm(place, axis=-1) <= radius_mm
+
+
+def abdomen() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """HU of fat with a bone cut by the CT's border, a kidney and a vessel, all but the fat as bright as contrast agent makes them."""
+    hu = np.full((80, 70, 60), FAT, np.float32)
+    bone, kidney, vessel = (
+        ball((0.0, 30.0, 27.0), 16.0),
+        ball((50.0, 30.0, 27.0), 14.0),
+        ball((30.0, 55.0, 27.0), 6.0),
+    )
+    hu[bone] = SHELL
+    hu[ball((0.0, 30.0, 27.0), 14.0)] = MARROW
+    hu[kidney], hu[vessel] = CORTEX, BLOOD
+    return hu + np.random.default_rng(0).normal(0, 10, hu.shape).astype(np.float32), bone, kidney, vessel
+
+
+def test_a_bone_is_filled_with_its_marrow_even_where_the_ct_ends_and_is_no_larger_than_it_is():
+    hu, bone, _, _ = abdomen()
+    found = bones(hu, SPACING)
+    # Found in blocks of 1.8 mm: a rim of one of them may be missing or too much.
+    assert (found & ball((0.0, 30.0, 27.0), 14.0)).sum() > 0.99 * ball((0.0, 30.0, 27.0), 14.0).sum()
+    assert (
+        not (found & ~ball((0.0, 30.0, 27.0), 16.0 + 2 * 1.8 * np.sqrt(3))).any()
+        and (found & bone).sum() > 0.9 * bone.sum()
+    )
+
+
+def test_what_is_bright_by_contrast_agent_is_no_bone_and_outside_the_labels_blood():
+    hu, bone, kidney, vessel = abdomen()
+    found = recognised(hu, {"kidney": kidney}, SPACING)
+    assert not (found["bone"] & (kidney | vessel)).any()
+    assert (found["vessel"] & vessel).sum() > 0.6 * vessel.sum()
+    assert not (found["vessel"] & (kidney | bone)).any()
+
+
+def test_without_contrast_agent_nothing_is_taken_for_blood():
+    hu, _, kidney, _ = abdomen()
+    hu[kidney] -= CORTEX - 30.0
+    assert "vessel" not in recognised(hu, {"kidney": kidney}, SPACING)
+
+
+def test_a_bright_speck_is_no_bone():
+    hu = np.full((80, 70, 60), 40.0, np.float32)
+    hu[ball((30.0, 30.0, 27.0), 3.0)] = 900.0
+    assert not bones(hu, SPACING).any()
+    hu[ball((30.0, 30.0, 27.0), 7.0)] = 900.0
+    assert bones(hu, SPACING).any()
+
+
+def test_marrow_takes_the_sound_that_bone_takes():
+    hu, _, _, _ = abdomen()
+    values = properties(hu, spacing_mm=SPACING)[4, 33, 30]
+    table = tissue_table()["bone"]
+    assert abs(values[IMPEDANCE] - table["impedance_mrayl"]) < 0.01
+    assert abs(values[ATTENUATION] - table["attenuation_db_cm_mhz"]) < 0.01
