@@ -93,7 +93,7 @@ def test_the_region_has_what_the_standard_requires(file):
     [("LINEAR", "LINEAR"), ("CURVILINEAR", "CURVED LINEAR"), ("PHASED", "SECTOR_PHASED")],
 )
 def test_a_probe_is_told_in_the_standards_terms_and_units(tmp_path, geometry, kind):
-    sector = {"radius_start_mm": 50.0, "theta_start_deg": -30.0, "theta_stop_deg": 30.0}
+    sector = {"radius_start_mm": 35.0, "theta_start_deg": -30.0, "theta_stop_deg": 30.0}
     probe = Probe(
         transducer_name="any", transducer_geometry=geometry, frequency_mhz=3.5, depth_mm=129.6, **sector
     )
