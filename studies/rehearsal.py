@@ -4,7 +4,6 @@ The window, the headless run and every measurement go through this class, so tha
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import taichi as ti
@@ -107,8 +106,9 @@ class Rehearsal:
 
     def _build_surfaces(self) -> None:
         self.organ_skin = Skin(self.model, self.organ.vertices)
-        self.tumour_skin = None
+        self.tumour_skin = self._tumour_border = None
         if self.tumour is not None:
+            self._tumour_border = Skin(self.model, self.tumour.vertices)
             drawn = self.tumour.vertices + TUMOUR_LIFT_MM * self.tumour.vertex_normals
             self.tumour_skin = Skin(self.model, drawn)
 
@@ -118,7 +118,7 @@ class Rehearsal:
         self.embedding = Embedding(self.model, self.organ, embedding_cell_mm(self.scene.tissue), margin)
         self.scanner = None
         if anatomy.ct is not None:
-            scanned = scanned_anatomy(self.organ, anatomy, self.origin)
+            scanned = scanned_anatomy(self.organ, anatomy.ct, anatomy, self.origin)
             around = image.outside, image.contact, image.contact_gap_mm
             self.scanner = Scanner(scanned, self.embedding, self.probe, image.pixels, *around)
 
@@ -215,18 +215,12 @@ class Rehearsal:
 
     def tumour_outline(self) -> np.ndarray | None:
         """Where the image plane cuts the tumour: segments (n, 2, 2) on the plane [mm]; None without a tumour."""
-        if self.tumour is None:
+        if self.tumour is None or self._tumour_border is None:
             return None
         self._tumour_border.update()
         plane = image_plane(self.pose, self.size_mm[2], 1.0, 1.0)
         vertices = self._tumour_border.vertices.to_numpy()
         return section(vertices, self.tumour.faces, np.linalg.inv(plane.world_from_plane))
-
-    @cached_property
-    def _tumour_border(self) -> Skin:
-        """The tumour's surface where it is; the one that is drawn is lifted off it."""
-        assert self.tumour is not None
-        return Skin(self.model, self.tumour.vertices)
 
     def indentation_mm(self) -> float:
         """How deep the transducer is pressed into the settled surface; negative above it."""
@@ -262,10 +256,9 @@ def _shrunk(mesh: trimesh.Trimesh, by_mm: float) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices - by_mm * mesh.vertex_normals, mesh.faces, process=False)
 
 
-def scanned_anatomy(organ: trimesh.Trimesh, anatomy: LoadedAnatomy, origin: np.ndarray) -> Anatomy:
-    """What there is to scan, with an origin that the organ has already been moved to. Needs a CT."""
-    ct, labels = anatomy.ct, anatomy.labels
-    assert ct is not None
+def scanned_anatomy(organ: trimesh.Trimesh, ct: Grid, anatomy: LoadedAnatomy, origin: np.ndarray) -> Anatomy:
+    """What there is to scan, with an origin that the organ has already been moved to."""
+    labels = anatomy.labels
     shift = np.eye(4)
     shift[:3, 3] = origin
     marks = None if labels is None else labels.voxels.astype(np.int32)

@@ -27,7 +27,7 @@ from studies.setup import probe_of
 from studies.timing.measure import memory_mb
 from ultrasound.array import Mode, Rung
 from ultrasound.probe import advanced, between, image_plane, pose_at, touching
-from ultrasound.scanner import Scanner
+from ultrasound.scanner import Anatomy, Scanner
 
 # A press so deep, in so many steps; those before it settle.
 PRESS_MM, PRESS_STEPS, SETTLE_STEPS = 8.0, 60, 30
@@ -202,14 +202,13 @@ def of_frame(scene: Scene, anatomy: LoadedAnatomy, arch: str) -> Iterator[dict[s
         )
     if anatomy.ct is None:
         return
-    yield from _pictures(rehearsal, anatomy)
+    yield from _pictures(rehearsal, scanned_anatomy(rehearsal.organ, anatomy.ct, anatomy, rehearsal.origin))
     yield _whole_frame(rehearsal)
 
 
-def _pictures(rehearsal: Rehearsal, anatomy: LoadedAnatomy) -> Iterator[dict[str, Any]]:
+def _pictures(rehearsal: Rehearsal, scanned: Anatomy) -> Iterator[dict[str, Any]]:
     """The rungs of the picture's ladder, each with all that it needs."""
     image, probe = rehearsal.scene.image, rehearsal.probe
-    scanned = scanned_anatomy(rehearsal.organ, anatomy, rehearsal.origin)
     plane = image_plane(rehearsal.pose_at_depth(1.0), probe.housing_mm[2], *probe.extent_mm)
     ladder: tuple[tuple[str, float, str, Mode, Rung], ...] = (
         ("CT, organ alone", 0.0, "gel", "ct", "speckle"),

@@ -78,7 +78,7 @@ def scan(
     from ultrasound.scanner import ECHO, Scanner
 
     make_folder(out)
-    scanned = scanned_anatomy(anatomy.organ, anatomy, np.zeros(3))
+    scanned = scanned_anatomy(anatomy.organ, anatomy.ct, anatomy, np.zeros(3))
     scanner = Scanner(scanned, Unmoved(), held, image.pixels, "background", contact, image.contact_gap_mm)
     width, depth, above = held.extent_mm
     rows, ms = [], []
