@@ -39,6 +39,15 @@ def test_a_bone_is_filled_with_its_marrow_even_where_the_ct_ends_and_is_no_large
     )
 
 
+def test_a_bone_in_the_cts_corner_of_which_no_cut_shows_a_whole_ring_is_filled_too():
+    hu = np.full((80, 70, 60), FAT, np.float32)
+    hu[ball((0.0, 0.0, 0.0), 25.0)] = SHELL
+    hu[ball((0.0, 0.0, 0.0), 22.0)] = MARROW
+    found = bones(hu, SPACING)
+    assert found[ball((0.0, 0.0, 0.0), 22.0)].mean() > 0.99
+    assert not (found & ~ball((0.0, 0.0, 0.0), 25.0 + 2 * 1.8 * np.sqrt(3))).any()
+
+
 def test_what_is_bright_by_contrast_agent_is_no_bone_and_outside_the_labels_blood():
     hu, bone, kidney, vessel = abdomen()
     found = recognised(hu, {"kidney": kidney}, SPACING)

@@ -11,7 +11,9 @@ from PIL import Image
 import app
 from scenes.anatomy import load_surface, phantom_folder
 from scenes.scene import EMBEDDED
+from studies.scan.command import image_to_probe
 from studies.scan.poses import PoseError, load_poses
+from ultrasound.array import load_probe
 
 
 def pose_on_tumour() -> np.ndarray:
@@ -73,6 +75,14 @@ def test_a_table_with_another_number_of_columns_is_refused(tmp_path):
     assert "expected sixteen" in refused(tmp_path, "a,b", "poses.csv")
     with pytest.raises(PoseError, match="no such file"):
         load_poses(tmp_path / "none.json")
+
+
+def test_a_pixel_is_where_its_matrix_says():
+    width, depth, above = load_probe("curvilinear").extent_mm
+    matrix = image_to_probe((depth / 300, width / 400), width, above)
+    # The middle of the last row is the deepest place of the middle line; the first pixel's corner lies behind the face.
+    assert matrix @ [199.5, 299.5, 0, 1] == pytest.approx([0.0, depth - above, 0, 1])
+    assert matrix @ [-0.5, -0.5, 0, 1] == pytest.approx([-width / 2, -above, 0, 1])
 
 
 def test_scan_leaves_a_picture_of_each_pose_and_mode(tmp_path, capsys):
