@@ -5,7 +5,7 @@ import sys
 import click
 
 from scenes.command import import_patient_command
-from scenes.reading import PatientError
+from scenes.reading.error import PatientError
 from scenes.scene import SceneError
 from sim.sampling import SamplingError
 from studies.beam.command import beam

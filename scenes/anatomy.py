@@ -3,32 +3,38 @@
 import hashlib
 import os
 import tempfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import SimpleITK as sitk
 import trimesh
 
-from scenes.patient import Patient, import_patient, save_patient
+from scenes.organ import GROWN, PARENCHYMA
+from scenes.patient import Patient, import_patient, tissue_codes
+from scenes.patient_folder import save_patient
 from scenes.phantom import Label, make_phantom
-from scenes.reading import PatientError, read_volume
+from scenes.reading.error import PatientError
+from scenes.reading.files import file_volume
+from scenes.reading.labels import LabelMap
+from scenes.reading.volume import Volume
 from scenes.scene import Anatomy, DistanceShape, Image, MeshShape, PlaneShape, Press, Scene, SceneError
 
 HERE = Path(__file__).parent
 CACHE = HERE.parent / ".cache"
 FAT_HU = -110.0
 LEAST_WINDOW_HU = 150.0
-# What the parts of the embedded kidney are for sound; an import numbers them on from the tumour.
+# What the parts of the embedded kidney are for sound.
 TISSUE_OF_PART: dict[int, str] = {
     Label.CORTEX: "cortex",
     Label.MEDULLA: "medulla",
     Label.SINUS_FAT: "sinus",
     Label.COLLECTING_SYSTEM: "urine",
     Label.VESSEL: "vessel",
+    Label.TUMOUR: "tumour",
 }
-PHANTOM_TISSUES = {"1": "kidney", "2": "tumour"} | {
-    str(i + 3): t for i, t in enumerate(TISSUE_OF_PART.values())
+PHANTOM_TISSUES = {
+    str(code): tissue for tissue, code in tissue_codes(list(TISSUE_OF_PART.values())).items()
 }
 
 
@@ -94,7 +100,8 @@ def press_on(press: Press, anatomy: LoadedAnatomy, gravity: np.ndarray) -> Press
 def patient_scene(patient: Patient) -> Scene:
     """The scene that an import writes beside the patient's files: on the back, on the moulded support."""
     tumour = None if patient.tumour is None else "tumour.stl"
-    hu = sitk.GetArrayViewFromImage(patient.ct)[sitk.GetArrayViewFromImage(patient.labels) > 0]
+    own = [code for code, tissue in patient.tissues.items() if tissue in (*PARENCHYMA, *GROWN)]
+    hu = sitk.GetArrayViewFromImage(patient.ct)[np.isin(sitk.GetArrayViewFromImage(patient.labels), own)]
     # From fat to the brightest of the organ, whatever contrast agent it holds.
     darkest, brightest = FAT_HU, round(float(np.percentile(hu, 99)), -1)
     return Scene(
@@ -107,18 +114,15 @@ def patient_scene(patient: Patient) -> Scene:
 
 def phantom_folder() -> Path:
     """Folder of the embedded patient, imported like any other on first use and whenever its sources changed."""
-    sources = [
-        HERE / f"{name}.py"
-        for name in ("phantom", "abdomen", "anatomy", "labels", "patient", "surfaces", "support")
-    ]
+    names = "phantom", "abdomen", "anatomy", "organ", "patient", "surfaces", "support", "reading/labels"
+    sources = [HERE / f"{name}.py" for name in names]
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]
     for root in (CACHE, Path(tempfile.gettempdir()) / "nephron"):
         folder = root / f"phantom-{digest}"
         if folder.is_dir():
             return folder
         if _can_write(root):
-            ct, labels = make_phantom()
-            patient = import_patient(ct, labels, tumour=[Label.TUMOUR], side="left", tissues=TISSUE_OF_PART)
+            patient = _phantom_patient()
             try:
                 save_patient(patient, folder)
             except PatientError:
@@ -126,6 +130,17 @@ def phantom_folder() -> Path:
                     raise
             return folder
     raise SceneError(f"{CACHE}: cannot be written; the embedded patient needs a folder for its files")
+
+
+def _phantom_patient() -> Patient:
+    """The embedded patient: its organ is all that it has labelled."""
+    ct, image = make_phantom()
+    labels = LabelMap.of(image)
+    named = {
+        value: replace(segment, tissue=TISSUE_OF_PART[value]) for value, segment in labels.segments.items()
+    }
+    own = [value for value in named if value != Label.TUMOUR]
+    return import_patient(Volume.of(ct), replace(labels, segments=named), own, side="left")
 
 
 def _named(tissues: dict[int, str]) -> dict[str, str]:
@@ -159,16 +174,18 @@ def load_surface(folder: Path, name: str) -> trimesh.Trimesh:
 
 
 def _grid(folder: Path, name: str) -> Grid:
+    path = folder / name
+    if not path.is_file():
+        raise SceneError(f"{path}: no such file; check the scene")
     try:
-        image = read_volume(folder / name)
+        volume = file_volume(path)
+        found = volume.read()
     except PatientError as error:
         raise SceneError(str(error)) from None
-    voxels = np.ascontiguousarray(sitk.GetArrayFromImage(image).transpose(2, 1, 0), np.float32)
     mm_from_index = np.eye(4)
-    direction = np.array(image.GetDirection()).reshape(3, 3)
-    mm_from_index[:3, :3] = direction * image.GetSpacing()
-    mm_from_index[:3, 3] = image.GetOrigin()
-    return Grid(voxels, np.linalg.inv(mm_from_index))
+    mm_from_index[:3, :3] = volume.grid.direction * volume.grid.spacing
+    mm_from_index[:3, 3] = volume.grid.origin
+    return Grid(np.ascontiguousarray(found.transpose(2, 1, 0), np.float32), np.linalg.inv(mm_from_index))
 
 
 def _labels(folder: Path, anatomy: Anatomy) -> Grid | None:

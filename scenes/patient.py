@@ -1,17 +1,13 @@
-"""Patient import: a CT and a label map become an organ's surface, its tumour, its support, its CT.
+"""Patient import: a CT and its labels become an organ's surface, what is in it, its support, its CT.
 
 Everything stays in patient coordinates: LPS [mm], +x to the patient's left, +y posterior, +z to the head, as
-DICOM has them and as SimpleITK reads every format. Voxels are cropped, never resampled.
+DICOM has them. Voxels are cropped, and resampled only where a series is tilted or unevenly spaced.
 """
 
 from __future__ import annotations
 
-import os
-import secrets
-import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import cast
 
 import numpy as np
@@ -19,177 +15,234 @@ import SimpleITK as sitk
 import trimesh
 from scipy import ndimage
 
-from scenes.labels import LabelledOrgan, Side, labelled_organ
-from scenes.reading import PatientError, read_volume
+from scenes.organ import GROWN, INNER, PARENCHYMA, Organ, check_volume, midline_x, organs, single_out
+from scenes.reading.error import PatientError
+from scenes.reading.grid import Box, VoxelGrid
+from scenes.reading.labels import LabelMap, nearest
+from scenes.reading.names import Side
+from scenes.reading.volume import Volume
 from scenes.support import cradle
 from scenes.surfaces import surface_from_mask
 
-__all__ = ["Patient", "PatientError", "describe", "import_patient", "read_volume", "save_patient"]
-
-ORGAN, TUMOUR, FIRST_PART = 1, 2, 3
 SUPINE_GRAVITY = np.array([0.0, 1.0, 0.0])  # as the CT was taken: on the back, posterior is down
-AIR_HU = -1000
-PADDING_BELOW_HU = -1024
-# Faces of a surface grow with its area, so that a tumour is meshed as finely as a kidney of this volume.
-FACES, FACES_AT_ML = 5000, 150.0
+PLAUSIBLE_ORGAN_HU = (-150.0, 600.0)
+CUT_AREA_MM2 = 100.0  # a pole that just grazes the border is whole to within the thickness of a slice
+LEAST_OVERLAP = 0.99
+# Vessels and the collecting system are modelled as far as this from the organ: its pedicle.
+PEDICLE_MM = 15.0
+# Faces of a surface grow with its area, so that a tumour is meshed as finely as a kidney of this area; what branches, finer.
+FACES, FACES_AT_MM2 = 5000, 17000.0
 LEAST_FACES = 500
+BRANCHING = 3.0
+# Of the label's area, which is all steps.
+SMOOTH_AREA = 2 / 3
+# What has a surface of its own: tissue -> file.
+PARTS = {"tumour": "tumour", "cyst": "cyst", "urine": "collecting-system", "vessel": "vessels"}
 
 
 @dataclass(frozen=True)
 class Patient:
-    """One organ with what surrounds it; meshes in LPS [mm], watertight, normals outward."""
+    """One organ with what is in it and around it; meshes in LPS [mm], watertight, normals outward."""
 
     ct: sitk.Image  # int16 [HU], cropped around the organ, original voxels and direction
     labels: sitk.Image  # uint8 on the grid of `ct`: a tissue each
     tissues: dict[int, str]  # what the labels are: 1 = kidney, 2 = tumour, and more where the import was told
-    organ: trimesh.Trimesh  # tumour included
-    tumour: trimesh.Trimesh | None
+    organ: trimesh.Trimesh  # tumours and cysts included
+    parts: dict[str, trimesh.Trimesh]  # PARTS that are there, by tissue
     support: trimesh.Trimesh
     side: Side
-    organ_volume_ml: float  # of the label, tumour included
-    tumour_volume_ml: float  # of the label; 0 without a tumour
-    extent_mm: tuple[float, float, float]  # of the organ along x, y, z
-    spacing_mm: tuple[float, float, float]  # of the voxels along the image's own axes
+    volumes_ml: dict[str, float]  # of the labels: "organ" with all that is in it, and each part
+    spacing_mm: tuple[float, float, float]  # of the CT's voxels along the image's own axes
+    notes: tuple[str, ...] = field(default=())  # what was chosen, left out, resampled
+
+    @property
+    def tumour(self) -> trimesh.Trimesh | None:
+        return self.parts.get("tumour")
+
+
+def tissue_codes(tissues: Sequence[str]) -> dict[str, int]:
+    """The value that each tissue has in a patient's label map: 1 = kidney, 2 = tumour, the rest by name from 3."""
+    others = sorted(set(tissues) - {"kidney", "tumour"})
+    return {"kidney": 1, "tumour": 2} | {tissue: code for code, tissue in enumerate(others, start=3)}
 
 
 def import_patient(
-    ct: sitk.Image,
-    labels: sitk.Image,
+    ct: Volume,
+    labels: LabelMap,
     organ: Sequence[int] | None = None,
-    tumour: Sequence[int] | None = None,
     side: Side | None = None,
     margin_mm: float = 60.0,
-    tissues: Mapping[int, str] | None = None,
 ) -> Patient:
     """Cut one organ out of a CT and its label map and build its surfaces and its support.
 
     Args:
-        ct: scalar 3D image [HU].
-        labels: label map, whole numbers, 0 = nothing; on another grid it is resampled by nearest neighbour.
-        organ: label values that together are the organ; None: every value that is not the tumour's.
-        tumour: label values of the tumour, which becomes part of the organ; None: no tumour.
-        side: which kidney, where the label map holds both, and a check where it holds one; needed where the
-            CT does not show the body's whole width.
+        ct: scalar volume [HU]; read where the organ is.
+        labels: what is labelled, on any grid; surfaces are made on it, and the CT's labels by nearest neighbour.
+        organ: label values that together are the organ; None: those of a kidney by their names, or all that are nothing else.
+        side: which kidney, where the label map holds both, and a check where it holds one; needed where neither the CT
+            shows the body's whole width nor the labels say the side.
         margin_mm: CT kept around the organ [mm].
-        tissues: label values of parts of the organ, and the tissue that each is for sound (`ultrasound/tissues.toml`).
 
     Raises:
         PatientError: one line that says what was found, what was expected and what to do.
     """
     if not margin_mm >= 0:
         raise PatientError(f"the margin is {margin_mm} mm: expected 0 or more")
-    piece, told_side = labelled_organ(ct, labels, organ, tumour, side)
-    codes = {value: FIRST_PART + i for i, value in enumerate(sorted(tissues or {}))}
-    cropped_ct, cropped_labels = _crop(ct, piece, margin_mm, codes)
-    organ_surface = _surface(cropped_labels != 0, "organ", FACES)
+    pieces = organs(labels, organ)
+    slab, hounsfield = _level(ct, pieces, margin_mm)
+    heights = np.concatenate([piece.grid.corners()[:, 2] for piece in pieces])
+    midline = midline_x(ct.grid.part(slab), hounsfield, heights.min(), heights.max())
+    piece, told_side = single_out(pieces, midline, side)
+    check_volume(piece)
+    _check_overlap(ct.grid, piece)
+    grid, voxels = _cropped(ct.grid, slab, hounsfield, piece, margin_mm)
+    on_ct = nearest(piece.grid, piece.mask, grid)
+    _check_place(ct.grid, grid, on_ct, voxels, piece)
+    marks, tissues = _marks(labels, piece, grid, on_ct)
+
+    surface = _surface(piece.grid.image(piece.mask.astype(np.uint8)), "organ", FACES)
+    parts, volumes = _parts(labels, piece)
     try:
-        support = cradle(organ_surface, SUPINE_GRAVITY)
+        support = cradle(surface, SUPINE_GRAVITY)
     except ValueError as error:
         raise PatientError(f"no support fits under the organ: {error}; check the organ's label") from error
-    voxel_ml = float(np.prod(ct.GetSpacing())) / 1000.0
     return Patient(
-        ct=cropped_ct,
-        labels=cropped_labels,
-        tissues={ORGAN: "kidney", TUMOUR: "tumour"} | {codes[v]: name for v, name in (tissues or {}).items()},
-        organ=organ_surface,
-        tumour=_tumour_surface(cropped_labels, voxel_ml) if piece.tumour.any() else None,
+        ct=grid.image(voxels),
+        labels=grid.image(marks),
+        tissues=tissues,
+        organ=surface,
+        parts=parts,
         support=support,
         side=told_side,
-        organ_volume_ml=piece.volume_ml,
-        tumour_volume_ml=float(piece.tumour.sum() * voxel_ml),
-        extent_mm=tuple(organ_surface.extents.tolist()),
-        spacing_mm=tuple(ct.GetSpacing()),
+        volumes_ml={"organ": piece.volume_ml, **volumes},
+        spacing_mm=tuple(grid.spacing.tolist()),
+        notes=ct.notes,
     )
 
 
-def save_patient(patient: Patient, folder: Path, texts: Mapping[str, str] | None = None) -> None:
-    """Write ct.nrrd, labels.nrrd, organ.stl, support.stl and, if there is one, tumour.stl: all or nothing.
-
-    Nothing of the source but voxels and geometry is written. `texts` are further files, name to content (the
-    scene), that appear together with the rest.
-
-    Raises:
-        PatientError: the folder exists and is not empty, or cannot be written.
-    """
-    folder = Path(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise PatientError(f"{folder}: exists and is not an empty folder; choose another folder or remove it")
-    partial = folder.parent / f".{folder.name}.partial-{secrets.token_hex(4)}"
-    try:
-        partial.mkdir(parents=True)
-        try:
-            _write(patient, partial, texts or {})
-            if folder.exists():
-                folder.rmdir()
-            os.replace(partial, folder)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
-    except (OSError, RuntimeError) as error:
-        reason = getattr(error, "strerror", None) or "the files could not be written"
-        raise PatientError(f"{folder}: {reason}; choose a folder that can be written") from error
+def _level(ct: Volume, pieces: list[Organ], margin_mm: float) -> tuple[Box, np.ndarray]:
+    """The box of a CT at the height of all organs, and its HU: enough to tell sides and to crop from."""
+    if max(_overlap(ct.grid, piece) for piece in pieces) == 0:
+        raise PatientError(
+            "the labels lie outside the CT, with 0 % of the organ in it: expected both to overlap in patient coordinates; "
+            "choose labels that were drawn on this CT"
+        )
+    corners = ct.grid.corners()
+    places = np.concatenate([piece.grid.corners() for piece in pieces])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    low[2], high[2] = places[:, 2].min() - margin_mm, places[:, 2].max() + margin_mm
+    box = ct.grid.box_around(low, high)
+    return box, ct.hounsfield(box)
 
 
-def describe(patient: Patient) -> str:
-    """What was found, for the terminal: several lines without a name, date or path."""
-    size = " x ".join(str(n) for n in patient.ct.GetSize())
-    spacing = " x ".join(f"{s:.2f}" for s in patient.spacing_mm)
-    extent = " x ".join(f"{e:.0f}" for e in patient.extent_mm)
-    tumour = "none"
-    if patient.tumour is not None:
-        tumour = f"{patient.tumour_volume_ml:.1f} ml, {len(patient.tumour.faces)} faces"
-    surface_ml = patient.organ.volume / 1000
-    return "\n".join(
-        [
-            f"organ     {patient.side} kidney, {patient.organ_volume_ml:.1f} ml (surface {surface_ml:.1f})",
-            f"extent    {extent} mm (right-left x front-back x foot-head)",
-            f"surface   {len(patient.organ.faces)} faces, watertight",
-            f"tumour    {tumour}",
-            f"support   {len(patient.support.faces)} faces, under the organ of a patient lying supine",
-            f"CT        {size} voxels of {spacing} mm",
-        ]
+def _overlap(grid: VoxelGrid, piece: Organ) -> float:
+    """Share of an organ's voxels that lie within a grid."""
+    indices = np.argwhere(piece.mask)[:, ::-1]
+    found = grid.index(piece.grid.place(indices[:: max(1, len(indices) // 200_000)]))
+    return float(((found >= -0.5) & (found <= np.array(grid.size) - 0.5)).all(axis=1).mean())
+
+
+def _check_overlap(grid: VoxelGrid, piece: Organ) -> None:
+    share = _overlap(grid, piece)
+    if share < LEAST_OVERLAP:
+        raise PatientError(
+            f"{piece.title} lies in the CT with {share:.0%} of its voxels: expected a whole organ; choose a CT that shows all of "
+            "it, or the labels that were drawn on this one"
+        )
+
+
+def _cropped(
+    grid: VoxelGrid, slab: Box, hounsfield: np.ndarray, piece: Organ, margin_mm: float
+) -> tuple[VoxelGrid, np.ndarray]:
+    """The CT around the organ: its grid and its HU (z, y, x)."""
+    found = grid.index(piece.grid.corners())
+    rim = margin_mm / grid.spacing
+    low = np.floor(found.min(axis=0) - rim).astype(int)
+    high = np.ceil(found.max(axis=0) + rim).astype(int) + 1
+    box = tuple(
+        slice(max(int(a), s.start), min(int(b), s.stop)) for a, b, s in zip(low, high, slab, strict=True)
     )
+    inner = tuple(slice(b.start - s.start, b.stop - s.start) for b, s in zip(box, slab, strict=True))
+    return grid.part(cast(Box, box)), np.ascontiguousarray(hounsfield[inner[::-1]])
 
 
-def _write(patient: Patient, folder: Path, texts: Mapping[str, str]) -> None:
-    sitk.WriteImage(_bare(patient.ct), str(folder / "ct.nrrd"), useCompression=True)
-    sitk.WriteImage(_bare(patient.labels), str(folder / "labels.nrrd"), useCompression=True)
-    patient.organ.export(folder / "organ.stl")
-    patient.support.export(folder / "support.stl")
-    if patient.tumour is not None:
-        patient.tumour.export(folder / "tumour.stl")
-    for name, text in texts.items():
-        (folder / name).write_text(text, encoding="utf-8")
+def _check_place(
+    whole: VoxelGrid, grid: VoxelGrid, on_ct: np.ndarray, hounsfield: np.ndarray, piece: Organ
+) -> None:
+    """Refuse what is no whole organ in soft tissue."""
+    first = np.rint(whole.index(grid.origin)).astype(int)
+    for axis in range(3):
+        at_border = {0: first[axis] == 0, -1: first[axis] + grid.size[axis] == whole.size[axis]}
+        ends = [on_ct.take(end, axis=2 - axis).sum() for end, there in at_border.items() if there]
+        cut = max(ends, default=0) * np.prod(grid.spacing) / grid.spacing[axis]
+        if cut > CUT_AREA_MM2:
+            raise PatientError(
+                f"{piece.title} is cut off at the border of the CT over {cut / 100:.1f} cm2: expected a whole "
+                "organ; choose a CT that shows all of it"
+            )
+    median = float(np.median(hounsfield[on_ct])) if on_ct.any() else 0.0
+    if not PLAUSIBLE_ORGAN_HU[0] <= median <= PLAUSIBLE_ORGAN_HU[1]:
+        raise PatientError(
+            f"{piece.title} has a median of {median:.0f} HU: expected soft tissue; check that the labels belong to "
+            "this CT and that the CT is in HU"
+        )
+    if float(hounsfield.min()) >= 0:
+        raise PatientError(
+            "the CT holds no value below 0: expected HU, in which fat and air are negative; give the CT first, then "
+            "the labels"
+        )
 
 
-def _bare(image: sitk.Image) -> sitk.Image:
-    """Voxels and geometry without the metadata dictionary, which names patients and scanners."""
-    return _image(sitk.GetArrayViewFromImage(image), like=image)
+def _marks(
+    labels: LabelMap, piece: Organ, grid: VoxelGrid, on_ct: np.ndarray
+) -> tuple[np.ndarray, dict[int, str]]:
+    """Tissue codes (z, y, x) of the cropped CT, and what they are: the organ's own, and of other organs all that is there."""
+    values = nearest(labels.grid, labels.values, grid)
+    tissue_of = {v: s.tissue for v, s in labels.segments.items()}
+    present = {tissue_of.get(int(v)) for v in np.unique(values)} - {None}
+    codes = tissue_codes([tissue for tissue in present if tissue])
+    marks = on_ct.astype(np.uint8)
+    for value, tissue in tissue_of.items():
+        if tissue is not None and tissue != "kidney":
+            here = values == value
+            marks[here & on_ct if tissue in (*GROWN, *PARENCHYMA) else here] = codes[tissue]
+    return marks, {code: tissue for tissue, code in codes.items()}
 
 
-def _image(voxels: np.ndarray, like: sitk.Image) -> sitk.Image:
-    image = sitk.GetImageFromArray(voxels)
-    image.CopyInformation(like)
-    return image
+def _parts(labels: LabelMap, piece: Organ) -> tuple[dict[str, trimesh.Trimesh], dict[str, float]]:
+    """Surface and volume [ml] of what is told apart in the organ, and of its vessels and collecting system near it."""
+    surfaces, volumes = {}, {}
+    for tissue, name in PARTS.items():
+        values = labels.of_tissues(tissue)
+        if not values:
+            continue
+        grid, inside = _near(labels, piece, values) if tissue in INNER else (piece.grid, piece.mask & np.isin(piece.values, values))
+        if not inside.any():
+            if tissue == "tumour":
+                raise PatientError(
+                    f"the tumour's label has no voxel in this kidney ({piece.title}): expected a tumour of it; choose "
+                    "the other side or leave the tumour out"
+                )
+            continue
+        voxel_ml = float(np.prod(grid.spacing)) / 1000.0
+        surface = _bodies(grid, inside, tissue)
+        if surface is not None:
+            surfaces[tissue], volumes[tissue] = surface, float(inside.sum() * voxel_ml)
+    return surfaces, volumes
 
 
-def _crop(
-    ct: sitk.Image, piece: LabelledOrgan, margin_mm: float, codes: Mapping[int, int]
-) -> tuple[sitk.Image, sitk.Image]:
-    """CT and labels around the organ, on one grid, padding replaced by air; parts of the organ get their codes."""
-    box = ndimage.find_objects(piece.mask.astype(np.uint8))[0][::-1]
-    rim = [int(np.ceil(margin_mm / s)) for s in ct.GetSpacing()]
-    window = tuple(
-        slice(max(0, axis.start - r), min(n, axis.stop + r))
-        for axis, r, n in zip(box, rim, ct.GetSize(), strict=True)
-    )
-    around = ct[window]
-    hounsfield = np.clip(np.rint(sitk.GetArrayFromImage(around)), -32768, 32767).astype(np.int16)
-    hounsfield[hounsfield < PADDING_BELOW_HU] = AIR_HU
-    marked = piece.mask[window[::-1]].astype(np.uint8) * np.uint8(ORGAN)
-    for value, code in codes.items():
-        marked[piece.labels[window[::-1]] == value] = code
-    marked[piece.tumour[window[::-1]]] = TUMOUR
-    return _image(hounsfield, around), _image(marked, around)
+def _near(labels: LabelMap, piece: Organ, values: list[int]) -> tuple[VoxelGrid, np.ndarray]:
+    """Where labels lie within PEDICLE_MM of the organ."""
+    start = np.rint(labels.grid.index(piece.grid.origin)).astype(int)
+    rim = np.ceil(PEDICLE_MM / labels.grid.spacing).astype(int)
+    low = np.maximum(start - rim, 0)
+    high = np.minimum(start + piece.grid.size + rim, labels.grid.size)
+    x, y, z = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+    organ = np.zeros([a.stop - a.start for a in (z, y, x)], bool)
+    at = start - low
+    organ[tuple(slice(int(a), int(a) + n) for a, n in zip(at[::-1], piece.mask.shape, strict=True))] = piece.mask
+    distance = ndimage.distance_transform_edt(~organ, sampling=labels.grid.spacing[::-1])
+    return labels.grid.part((x, y, z)), (distance <= PEDICLE_MM) & np.isin(labels.values[z, y, x], values)
 
 
 def _surface(mask: sitk.Image, name: str, faces: int) -> trimesh.Trimesh:
@@ -199,15 +252,29 @@ def _surface(mask: sitk.Image, name: str, faces: int) -> trimesh.Trimesh:
         raise PatientError(f"the {name} has no surface: {error}; check the {name}'s label") from error
 
 
-def _tumour_surface(labels: sitk.Image, voxel_ml: float) -> trimesh.Trimesh:
-    """Surface of the tumour; several tumours of one kidney are bodies of one mesh, specks are left out."""
-    labelled, _ = ndimage.label(sitk.GetArrayViewFromImage(labels) == TUMOUR)
+def _bodies(grid: VoxelGrid, inside: np.ndarray, tissue: str) -> trimesh.Trimesh | None:
+    """Surface of a part; its several bodies are bodies of one mesh, specks are left out. None: too thin, and not needed."""
+    labelled, _ = ndimage.label(inside)
     sizes = np.bincount(labelled.ravel())[1:]
+    finer = BRANCHING if tissue in INNER else 1.0
     surfaces = []
     for n in np.flatnonzero(sizes >= 0.1 * sizes.max()):
-        faces = FACES * (sizes[n] * voxel_ml / FACES_AT_ML) ** (2 / 3)
-        body = _image((labelled == n + 1).astype(np.uint8), labels)
-        surfaces.append(_surface(body, "tumour", int(np.clip(faces, LEAST_FACES, FACES))))
-    if len(surfaces) == 1:
-        return surfaces[0]
-    return cast(trimesh.Trimesh, trimesh.util.concatenate(surfaces))
+        body = labelled == n + 1
+        faces = np.clip(finer * FACES * _area_mm2(grid, body) / FACES_AT_MM2, LEAST_FACES, FACES)
+        try:
+            name = PARTS[tissue].replace("-", " ")
+            surfaces.append(_surface(grid.image(body.astype(np.uint8)), name, int(faces)))
+        except PatientError:
+            if tissue in GROWN:
+                raise
+    if not surfaces:
+        return None
+    return surfaces[0] if len(surfaces) == 1 else cast(trimesh.Trimesh, trimesh.util.concatenate(surfaces))
+
+
+def _area_mm2(grid: VoxelGrid, inside: np.ndarray) -> float:
+    """Area of a label's surface, about."""
+    padded = np.pad(inside, 1)
+    steps = [int((np.diff(padded.view(np.int8), axis=axis) != 0).sum()) for axis in range(3)]
+    faces_mm2 = (np.prod(grid.spacing) / grid.spacing)[::-1]
+    return float(SMOOTH_AREA * np.dot(steps, faces_mm2))

@@ -1,0 +1,56 @@
+"""A CT from whatever a hospital sends: DICOM folders, DICOMDIR, zip archives, NIfTI, NRRD, MetaImage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import SimpleITK as sitk
+
+from scenes.reading.error import PatientError
+from scenes.reading.files import ITK, NIFTI, file_volume, is_volume_file
+from scenes.reading.headers import Found
+from scenes.reading.progress import Progress, silent
+from scenes.reading.series import dicom_found, series_volume
+from scenes.reading.volume import Volume
+
+
+def open_ct(
+    path: Path, series: str | None = None, referenced: str = "", progress: Progress = silent
+) -> Volume:
+    """Find a CT and say where its voxels are; they are read when they are asked for.
+
+    Args:
+        path: a folder with DICOM files, in subfolders too; a DICOMDIR; a zip archive of DICOM files; an enhanced CT;
+            a .nii, .nii.gz, .nrrd, .nhdr, .mha or .mhd file.
+        series: number or uid (or its end) of the series, where there are several.
+        referenced: uid of the series that labels were drawn on, which is the best guess.
+
+    Raises:
+        PatientError: nothing readable, or nothing that is one whole, upright CT; a line for the user.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise PatientError(f"{path}: no such file or folder; check the path")
+    if path.is_file() and is_volume_file(path):
+        if series is not None:
+            raise PatientError(f"{path}: holds no series; leave --series out")
+        return file_volume(path)
+    return series_volume(path, dicom_or_words(path, progress), series, referenced, progress)
+
+
+def dicom_or_words(path: Path, progress: Progress) -> Found:
+    """The DICOM in a folder or file; for a file that is none, which kinds are known."""
+    try:
+        return dicom_found(path, progress)
+    except PatientError as error:
+        if path.is_file() and "no DICOM file" in str(error):
+            raise PatientError(
+                f"{path}: unknown kind of file; expected DICOM (a folder, a DICOMDIR or a zip archive), or a file that ends in "
+                f"{', '.join((*NIFTI, *ITK))}; convert it"
+            ) from None
+        raise
+
+
+def read_volume(path: Path) -> sitk.Image:
+    """A whole volume: of a CT series HU, of a file what is in it. Raises PatientError."""
+    return open_ct(path).image()

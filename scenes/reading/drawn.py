@@ -1,0 +1,168 @@
+"""Labels from whatever draws them: label maps, one file an organ, 3D Slicer's .seg.nrrd, DICOM-SEG, RTSTRUCT."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+import SimpleITK as sitk
+
+from scenes.reading.contours import read_contours, referenced_series
+from scenes.reading.ct import dicom_or_words
+from scenes.reading.error import PatientError
+from scenes.reading.files import ITK, NIFTI, file_volume, is_volume_file, itk_header, itk_layers
+from scenes.reading.grid import VoxelGrid
+from scenes.reading.headers import Found, read_header
+from scenes.reading.labels import LabelMap, Segment, whole_numbers
+from scenes.reading.names import is_far, side_of, tissue_of
+from scenes.reading.progress import Progress, silent
+from scenes.reading.secrets import secrets_of
+from scenes.reading.segmentation import read_segmentation
+
+SLICER_KEY = re.compile(r"Segment(\d+)_Name$")
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """Labels that were found; contours are filled once the CT is known."""
+
+    maps: Callable[[VoxelGrid], list[LabelMap]]
+    referenced: str = ""  # uid of the series that they were drawn on, where they say
+    notes: tuple[str, ...] = ()
+    secrets: frozenset[str] = frozenset()
+
+
+def open_labels(path: Path, wanted: Collection[str] = (), progress: Progress = silent) -> Drawing:
+    """Read labels.
+
+    Args:
+        path: a label map or .seg.nrrd file, a folder with a file for each organ, a DICOM-SEG or RTSTRUCT, or a folder
+            or archive that holds one.
+        wanted: names of files of a folder that are read though their names say nothing.
+
+    Raises:
+        PatientError: nothing readable, no labels, none marked; a line for the user.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise PatientError(f"{path}: no such file or folder; check the path")
+    if path.is_file() and is_volume_file(path):
+        return _file(path)
+    organs = sorted(file for file in path.iterdir() if is_volume_file(file)) if path.is_dir() else []
+    if organs:
+        return _one_an_organ(path, organs, wanted, progress)
+    drawing = drawing_of(dicom_or_words(path, progress))
+    if drawing is None:
+        raise PatientError(
+            f"{path}: holds no labels; expected a DICOM segmentation or structure set, or label maps; choose another"
+        )
+    return drawing
+
+
+def drawing_of(found: Found) -> Drawing | None:
+    """The labels among DICOM files; None where there are none. Raises PatientError where there are several."""
+    objects = [*found.segmentations, *found.structure_sets]
+    if len(objects) > 1:
+        names = ", ".join(item.name for item in objects[:6])
+        raise PatientError(
+            f"{len(objects)} segmentations and structure sets were found: {names}; expected one; give its file as LABELS"
+        )
+    if found.segmentations:
+        maps, notes, referenced = read_segmentation(objects[0])
+        return Drawing(lambda _: maps, referenced, tuple(notes), secrets_of(objects[0]))
+    if found.structure_sets:
+        item = objects[0]
+        referenced = referenced_series(read_header(item, tags=["ReferencedFrameOfReferenceSequence"]))
+        return Drawing(lambda ct: read_contours(item, ct), referenced, (), secrets_of(item))
+    return None
+
+
+def _file(path: Path) -> Drawing:
+    if path.name.lower().endswith(NIFTI):
+        volume = file_volume(path)
+        maps = [_map(path, volume.grid, volume.read())]
+        return Drawing(lambda _: maps, secrets=volume.secrets)
+    header = itk_header(path)
+    names = _slicer_names(header)
+    kept = {str(n): header.GetMetaData(n) for n in header.GetMetaDataKeys() if not n.startswith(("NRRD_", "ITK_", "Segment"))}
+    secrets = frozenset(text for text in kept.values() if text)
+    if not names and header.GetNumberOfComponents() == 1:
+        volume = file_volume(path)
+        maps = [_map(path, volume.grid, volume.read())]
+    else:
+        maps = _slicer_maps(path, VoxelGrid.of(header), names)
+    return Drawing(lambda _: maps, secrets=secrets)
+
+
+def _map(path: Path, grid: VoxelGrid, voxels) -> LabelMap:
+    """A label map; one of a single value is called as its file where that says what it is."""
+    values = whole_numbers(voxels, str(path))
+    one = LabelMap.valued(grid, values)
+    stem = _stem(path)
+    if len(one.segments) == 1 and (tissue_of(stem) or side_of(stem)):
+        (value,) = one.segments
+        return LabelMap.valued(grid, values, {value: stem})
+    return one
+
+
+def _slicer_names(header: sitk.ImageFileReader) -> dict[tuple[int, int], Segment]:
+    """Segments of 3D Slicer's header, by layer and value."""
+    found = {}
+    for key in header.GetMetaDataKeys():
+        number = SLICER_KEY.match(key)
+        if number is None:
+            continue
+
+        def value(what: str, usual: str, start: str = f"Segment{number.group(1)}_") -> str:
+            return header.GetMetaData(start + what) if header.HasMetaDataKey(start + what) else usual
+
+        colour = tuple(float(c) for c in re.findall(r"\d+\.?\d*", value("Color", ""))[:3])
+        layer, label = int(value("Layer", "0")), int(value("LabelValue", "1"))
+        named = Segment.named(header.GetMetaData(key), label, colour if len(colour) == 3 else None)
+        found[layer, label] = named
+    return found
+
+
+def _slicer_maps(path: Path, grid: VoxelGrid, names: dict[tuple[int, int], Segment]) -> list[LabelMap]:
+    maps = []
+    for layer, voxels in enumerate(itk_layers(path)):
+        if not voxels.any():
+            continue
+        one = LabelMap.valued(grid, whole_numbers(voxels, str(path)))
+        known = {v: names.get((layer, v), s) for v, s in one.segments.items()}
+        maps.append(LabelMap(one.grid, one.values, known))
+    if not maps:
+        raise PatientError(f"{path}: is empty, no voxel is marked; expected an organ; choose another file")
+    return maps
+
+
+def _one_an_organ(folder: Path, files: list[Path], wanted: Collection[str], progress: Progress) -> Drawing:
+    """One file an organ, as TotalSegmentator leaves them: named by their files, and empty where an organ is not there."""
+    asked = {word.casefold() for word in wanted}
+    near = [f for f in files if _stem(f).casefold() in asked or not is_far(_stem(f))]
+    maps, secrets = [], set()
+    for file in progress(near, "labels"):
+        volume = file_volume(file)
+        secrets |= volume.secrets
+        voxels = volume.read()
+        if not voxels.any():
+            continue
+        # Other numbers than 0 and 1 are shares, or an image among the labels.
+        values = whole_numbers(voxels, str(file))
+        one = LabelMap.single(volume.grid, values > 0, Segment.named(_stem(file)))
+        if one is not None:
+            maps.append(one)
+    if not maps:
+        raise PatientError(f"{folder}: all {len(near)} label files are empty; expected an organ; choose other labels")
+    return Drawing(lambda _: maps, secrets=frozenset(secrets))
+
+
+def _stem(path: Path) -> str:
+    """A file's name without the ending of its kind."""
+    name = path.name
+    for ending in (".seg.nrrd", ".nii.gz", *NIFTI, *ITK):
+        if name.lower().endswith(ending):
+            return name[: -len(ending)]
+    return name

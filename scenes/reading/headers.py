@@ -1,0 +1,246 @@
+"""The headers of DICOM files: which slice of which series lies where. Pixels stay where they are."""
+
+from __future__ import annotations
+
+import warnings
+import zlib
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, BinaryIO
+
+import numpy as np
+import pydicom
+from pydicom import config
+from pydicom.dataset import Dataset
+
+from scenes.reading.error import PatientError
+from scenes.reading.source import MAGIC, MAGIC_AT, Item
+
+# A value that breaks the standard is found where it matters, and warnings would print it.
+config.settings.reading_validation_mode = config.IGNORE
+
+CT_CLASSES = {
+    "1.2.840.10008.5.1.4.1.1.2",
+    "1.2.840.10008.5.1.4.1.1.2.1",  # enhanced
+    "1.2.840.10008.5.1.4.1.1.2.2",  # legacy converted enhanced
+}
+SEGMENTATIONS = {"1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7"}
+STRUCTURE_SET = "1.2.840.10008.5.1.4.1.1.481.3"
+MOST_PIXELS = 8192 * 8192
+# A deflated data set names its syntax in the first bytes; after them it may be a bomb.
+DEFLATED, META_LENGTH_AT, MOST_INFLATED = b"1.2.840.10008.1.2.1.99", 140, 2 * 2**30
+TAGS = """SOPClassUID SOPInstanceUID Modality SeriesInstanceUID SeriesNumber InstanceNumber ImageType FrameOfReferenceUID
+ImagePositionPatient ImageOrientationPatient PixelSpacing Rows Columns NumberOfFrames RescaleSlope RescaleIntercept RescaleType
+PixelPaddingValue PixelPaddingRangeLimit BurnedInAnnotation SamplesPerPixel SharedFunctionalGroupsSequence
+PerFrameFunctionalGroupsSequence""".split()
+LOCALIZERS = {"LOCALIZER", "SCOUT", "TOPOGRAM"}
+# Third and fourth values of ImageType whose pixels are no HU.
+NOT_HU = {"PERFUSION", "RCBF", "RCBV", "MTT", "TTP", "ANGIO", "DENSITY_MAP", "MAT_FRACTION", "MAT_SPECIFIC", "EFF_ATOMIC_NUM"}
+
+
+@dataclass(frozen=True)
+class Slice:
+    """One slice of a CT: a file, or a frame of one."""
+
+    item: Item
+    frame: int | None  # None in a file with one slice
+    number: int | None  # InstanceNumber, or the frame's number from 1
+    sop: str
+    position: np.ndarray  # (3,) middle of the first pixel, LPS [mm]
+    row: np.ndarray  # (3,) along which the column index grows
+    column: np.ndarray  # (3,) along which the row index grows
+    spacing: tuple[float, float]  # along row and column [mm]
+    columns: int
+    rows: int
+    slope: float
+    intercept: float
+    padding: tuple[int, int] | None  # raw values between which pixels mean nothing
+
+    @property
+    def label(self) -> str:
+        """How errors name it."""
+        return f"slice {'without a number' if self.number is None else self.number} ({self.item.name})"
+
+
+@dataclass
+class Series:
+    """The slices of one SeriesInstanceUID, in the order of their files."""
+
+    uid: str
+    number: str
+    frame_of_reference: str = ""
+    slices: list[Slice] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)  # slices that cannot be used, a line each
+    localizers: int = 0
+
+
+@dataclass
+class Found:
+    """What DICOM files hold."""
+
+    series: dict[str, Series] = field(default_factory=dict)
+    segmentations: list[Item] = field(default_factory=list)  # DICOM-SEG
+    structure_sets: list[Item] = field(default_factory=list)  # RTSTRUCT
+    others: dict[str, int] = field(default_factory=dict)  # what else there is, by modality
+
+
+def read_headers(items: list[Item], progress: Callable[[Iterable[Item]], Iterable[Item]] = iter) -> Found:
+    """Sort DICOM files by what they are. Raises PatientError where one is cut off."""
+    found = Found()
+    for item in progress(items):
+        header = read_header(item)
+        sop_class = str(header.get("SOPClassUID", ""))
+        if sop_class in SEGMENTATIONS:
+            found.segmentations.append(item)
+        elif sop_class == STRUCTURE_SET:
+            found.structure_sets.append(item)
+        elif sop_class in CT_CLASSES:
+            _add_slices(found, item, header)
+        elif sop_class != "1.2.840.10008.1.3.10":  # a DICOMDIR
+            what = str(header.get("Modality") or "files of no known kind")
+            found.others[what] = found.others.get(what, 0) + 1
+    return found
+
+
+def read_header(item: Item, tags: list[str] | None = TAGS) -> Dataset:
+    """A file's elements but its pixels, all of them with tags None. Raises PatientError."""
+    with item.open() as file:
+        return parsed(file, item.name, stop_before_pixels=True, specific_tags=tags)
+
+
+def parsed(file: BinaryIO, name: str, **options: Any) -> Dataset:
+    """A DICOM data set, read with pydicom's options; memory is bounded and faults are in words. Raises PatientError."""
+    try:
+        start = file.read(4096)
+        file.seek(0)
+        if DEFLATED in start:
+            _check_inflated(file, name, start)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return pydicom.dcmread(file, force=start[MAGIC_AT : MAGIC_AT + 4] != MAGIC, **options)
+    except PatientError:
+        raise
+    except Exception as error:  # a parser's faults are many; all of them are the file's
+        raise PatientError(
+            f"{name}: a damaged DICOM file ({type(error).__name__}); copy or export it again"
+        ) from error
+
+
+def _check_inflated(file: BinaryIO, name: str, start: bytes) -> None:
+    """Refuse a deflated data set that would fill the memory."""
+    meta_length = int.from_bytes(start[META_LENGTH_AT : META_LENGTH_AT + 4], "little")
+    file.seek(META_LENGTH_AT + 4 + meta_length)
+    inflater, size = zlib.decompressobj(-zlib.MAX_WBITS), 0
+    while (chunk := file.read(1 << 16)) and not inflater.eof:
+        while chunk:
+            size += len(inflater.decompress(chunk, 1 << 22))
+            chunk = inflater.unconsumed_tail
+            if size > MOST_INFLATED:
+                raise PatientError(f"{name}: inflates to more than 2 GiB; expected one CT; export it uncompressed")
+    file.seek(0)
+
+
+def _add_slices(found: Found, item: Item, header: Dataset) -> None:
+    uid = str(header.get("SeriesInstanceUID") or "")
+    number = header.get("SeriesNumber")
+    series = found.series.setdefault(uid, Series(uid, "without a number" if number is None else str(number)))
+    series.frame_of_reference = str(header.get("FrameOfReferenceUID") or "")
+    try:
+        for slice_ in _slices(item, header):
+            if slice_ is None:
+                series.localizers += 1
+            else:
+                series.slices.append(slice_)
+    except PatientError as error:
+        series.faults.append(str(error))
+    except Exception as error:  # values that are no numbers, and groups that are not there
+        series.faults.append(f"{item.name}: its header cannot be understood ({type(error).__name__})")
+
+
+def _slices(item: Item, header: Dataset) -> Iterator[Slice | None]:
+    """The slices of one file; None for what shows a view and no slice."""
+    if str(header.get("BurnedInAnnotation", "NO")).upper() == "YES":
+        raise PatientError(f"{item.name}: has text burned into its pixels, which may name the patient")
+    if int(header.get("SamplesPerPixel", 1)) != 1:
+        raise PatientError(f"{item.name}: has colours; expected HU")
+    frames = header.get("PerFrameFunctionalGroupsSequence")
+    if frames is None:
+        if int(header.get("NumberOfFrames") or 1) > 1:
+            raise PatientError(f"{item.name}: holds {header.NumberOfFrames} frames, and not where they lie")
+        yield _slice(item, None, header.get("InstanceNumber"), [header], header)
+        return
+    shared = (header.get("SharedFunctionalGroupsSequence") or [Dataset()])[0]
+    if len(frames) != int(header.get("NumberOfFrames") or 1):
+        raise PatientError(f"{item.name}: says {header.get('NumberOfFrames')} frames, and where {len(frames)} of them lie")
+    for n, frame in enumerate(frames):
+        yield _slice(item, n, n + 1, [*_groups(frame), *_groups(shared), header], header)
+
+
+def _groups(functional: Dataset) -> list[Dataset]:
+    """The single items of functional groups: each a macro's values."""
+    return [element.value[0] for element in functional if element.VR == "SQ" and element.value]
+
+
+def _slice(item: Item, frame: int | None, number: Any, groups: list[Dataset], header: Dataset) -> Slice | None:
+    def value(name: str, usual: Any = None) -> Any:
+        found = (group.get(name) for group in groups if group.get(name) not in (None, ""))
+        return next(found, usual)
+
+    kind = {str(word).upper() for word in [*(value("ImageType") or []), *(value("FrameType") or [])]}
+    if kind & LOCALIZERS:
+        return None
+    if kind & NOT_HU:
+        raise PatientError(
+            f"{item.name}: its pixels are {', '.join(sorted(kind & NOT_HU))}; expected HU; give the CT that it was made from"
+        )
+    row, column = _orientation(item, value("ImageOrientationPatient"))
+    vertical, horizontal = _numbers(item, "PixelSpacing", value("PixelSpacing"), 2)
+    rows, columns = int(header.get("Rows", 0)), int(header.get("Columns", 0))
+    if min(vertical, horizontal) <= 0 or not 2 <= rows * columns <= MOST_PIXELS:
+        raise PatientError(f"{item.name}: {columns} x {rows} pixels of {horizontal:g} x {vertical:g} mm")
+    slope, intercept = float(value("RescaleSlope", 1)), float(value("RescaleIntercept", 0))
+    if not np.isfinite([slope, intercept]).all() or slope == 0:
+        raise PatientError(f"{item.name}: RescaleSlope is {slope:g} and RescaleIntercept {intercept:g}")
+    return Slice(
+        item=item,
+        frame=frame,
+        number=None if number in (None, "") else int(number),
+        sop=str(header.get("SOPInstanceUID", "")),
+        position=_numbers(item, "ImagePositionPatient", value("ImagePositionPatient"), 3),
+        row=row,
+        column=column,
+        spacing=(horizontal, vertical),
+        columns=columns,
+        rows=rows,
+        slope=slope,
+        intercept=intercept,
+        padding=_padding(header),
+    )
+
+
+def _numbers(item: Item, name: str, found: Any, count: int) -> np.ndarray:
+    if found is None:
+        raise PatientError(f"{item.name}: says no {name}")
+    numbers = np.array([float(n) for n in found] if isinstance(found, Iterable) else [])
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        raise PatientError(f"{item.name}: {name} is not {count} numbers")
+    return numbers
+
+
+def _orientation(item: Item, found: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors along a slice's rows and columns, at right angles."""
+    both = _numbers(item, "ImageOrientationPatient", found, 6).reshape(2, 3)
+    lengths = np.linalg.norm(both, axis=1)
+    if np.abs(lengths - 1).max() > 0.01 or abs(both[0] @ both[1]) > 0.01:
+        raise PatientError(f"{item.name}: ImageOrientationPatient is not two directions at right angles")
+    row = both[0] / lengths[0]
+    column = both[1] - (both[1] @ row) * row
+    return row, column / np.linalg.norm(column)
+
+
+def _padding(header: Dataset) -> tuple[int, int] | None:
+    if header.get("PixelPaddingValue") in (None, ""):
+        return None
+    one = int(header.PixelPaddingValue)
+    other = int(header.get("PixelPaddingRangeLimit") or one)
+    return min(one, other), max(one, other)

@@ -1,0 +1,59 @@
+"""What a segment's name says: which tissue it is for sound, and on which side it should lie."""
+
+import re
+from typing import Literal
+
+Side = Literal["left", "right"]
+
+# In this order: a renal mass is a tumour and a kidney cyst a cyst before either is a kidney. "" is known, and no tissue of ours.
+TISSUE_OF_NAME: tuple[tuple[str, str], ...] = (
+    ("", r"adrenal|suprarenal|gall ?bladder|cystic duct"),
+    ("tumour", r"tumou?r|\bmass\b|lesion|neoplas|carcinoma|cancer|malignan|\b[cp]?rcc\b|\bgtv"),
+    ("cyst", r"\bcysts?\b"),
+    ("stone", r"\bstones?\b|calcul|lithiasis"),
+    ("urine", r"collecting|renal pelvis|pelvis renal|pelvical|caly[xc]|calic|ureter|urinary|urine"),
+    ("vessel", r"arter|\bveins?\b|venous|vessel|vascul|aorta|vena cava|\bivc\b"),
+    ("medulla", r"medulla|pyramid"),
+    ("cortex", r"renal cortex|kidney cortex|cortex of (the )?kidney"),
+    ("sinus", r"renal sinus|sinus fat"),
+    ("kidney", r"kidneys?\b|\brenal\b|\bren\b|\bniere|\brein\b"),
+    ("liver", r"\bliver\b|hepat"),
+    ("bone", r"vertebra|\bribs?\b|\bbones?\b|\bspine\b|sacrum|\bhip\b|femur|sternum|scapula|humerus|clavicula|costal"),
+    ("muscle", r"muscle|psoas|autochthon|gluteus|quadratus"),
+    ("fat", r"\bfat\b|adipose"),
+)  # fmt: skip
+# Organs that TotalSegmentator names, too far from a kidney to be in its picture.
+FAR = (
+    r"brain|skull|face|heart|atri(um|al)|ventric|myocard|lung|pulmon|humerus|clavic|scapula|femur|sacrum|\bhips?\b|"
+    r"vertebrae (c\d|t[1-8]\b)|rib (left|right) [1-7]\b|trachea|o?esophagus|thyroid|prostate|bladder|gluteus|"
+    r"brachiocephal|subclavian|carotid|sternum|costal|spinal cord|iliac (artery|vena)"
+)
+SIDE_OF_NAME: tuple[tuple[Side, str], ...] = (
+    ("left", r"\b(left|lt|l|links|gauche|sinister|sinistra)\b"),
+    ("right", r"\b(right|rt|r|rechts|droite?|dexter|dextra)\b"),
+)
+
+
+def tissue_of(name: str) -> str | None:
+    """The tissue of a segment's name (``ultrasound/tissues.toml``); None where it says none."""
+    plain = _plain(name)
+    found = next((tissue for tissue, pattern in TISSUE_OF_NAME if re.search(pattern, plain)), "")
+    return found or None
+
+
+def is_far(name: str) -> bool:
+    """Whether what is named lies far from every kidney."""
+    return re.search(FAR, _plain(name)) is not None
+
+
+def side_of(name: str) -> Side | None:
+    """The side that a segment's name says, such as kidney_left or "Kidney R"; None where it says none, or both."""
+    plain = _plain(name)
+    found = [side for side, pattern in SIDE_OF_NAME if re.search(pattern, plain)]
+    return found[0] if len(found) == 1 else None
+
+
+def _plain(name: str) -> str:
+    """Small letters, one space between words: kidneyL, kidney_L and "Kidney-L" are the same."""
+    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
+    return re.sub(r"[\W_]+", " ", apart).strip().lower()
