@@ -33,9 +33,7 @@ TISSUE_OF_PART: dict[int, str] = {
     Label.VESSEL: "vessel",
     Label.TUMOUR: "tumour",
 }
-PHANTOM_TISSUES = {
-    str(code): tissue for tissue, code in tissue_codes(list(TISSUE_OF_PART.values())).items()
-}
+PHANTOM_TISSUES = {str(code): tissue for tissue, code in tissue_codes(list(TISSUE_OF_PART.values())).items()}
 
 
 @dataclass(frozen=True)

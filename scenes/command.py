@@ -26,15 +26,27 @@ LABEL = "Names or values of the labels, such as 3 or kidney_cyst_left,7"
 @click.command("import")
 @click.argument("ct", type=click.Path(path_type=Path))
 @click.argument("labels", type=click.Path(path_type=Path), nargs=-1)
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder to write the patient to; new or empty.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="Folder to write the patient to; new or empty.",
+)
 @click.option("--organ", help=f"{LABEL} that are the organ [those named as a kidney; without names, all].")
 @click.option("--tumour", help=f"{LABEL} of the tumour [by name].")
 @click.option("--cyst", help=f"{LABEL} of cysts [by name].")
 @click.option("--vessels", help=f"{LABEL} of blood vessels [by name].")
 @click.option("--collecting", help=f"{LABEL} of the collecting system [by name].")
-@click.option("--side", type=click.Choice(["left", "right"]), help="Which kidney, where the labels hold both.")
-@click.option("--series", help="Number of the CT series, or the end of its uid, where there are several [the best guess].")
-def import_patient_command(ct: Path, labels: tuple[Path, ...], out: Path, side: Side | None, series: str | None, **words: str | None) -> None:
+@click.option(
+    "--side", type=click.Choice(["left", "right"]), help="Which kidney, where the labels hold both."
+)
+@click.option(
+    "--series",
+    help="Number of the CT series, or the end of its uid, where there are several [the best guess].",
+)
+def import_patient_command(
+    ct: Path, labels: tuple[Path, ...], out: Path, side: Side | None, series: str | None, **words: str | None
+) -> None:
     """Make a patient's folder, with a scene, out of a CT and its LABELS.
 
     CT: a folder with DICOM, a DICOMDIR or zip archive, a NIfTI, NRRD or MHA file. LABELS: label maps, a folder with a file
@@ -46,8 +58,19 @@ def import_patient_command(ct: Path, labels: tuple[Path, ...], out: Path, side: 
     texts = {"scene.toml": scene_text(patient_scene(patient))}
     searched = save_patient(patient, out, texts, lambda folder: draw_check(patient, rows, folder), private)
     click.echo(told(rows))
-    click.echo(told([("private", f"{searched} names, ids, dates, uids and paths of the source are in none of the files")]))
-    click.echo(f"Written to {out}. Look at {out / 'check.png'}, then rehearse with: python app.py rehearse {out}")
+    click.echo(
+        told(
+            [
+                (
+                    "private",
+                    f"{searched} names, ids, dates, uids and paths of the source are in none of the files",
+                )
+            ]
+        )
+    )
+    click.echo(
+        f"Written to {out}. Look at {out / 'check.png'}, then rehearse with: python app.py rehearse {out}"
+    )
 
 
 def _imported(

@@ -11,13 +11,21 @@ def facts(patient: Patient) -> list[tuple[str, str]]:
     spacing = " x ".join(f"{s:.2f}" for s in patient.spacing_mm)
     extent = " x ".join(f"{e:.0f}" for e in patient.organ.extents)
     rows = [
-        ("organ", f"{patient.side} kidney, {patient.volumes_ml['organ']:.1f} ml (surface {patient.organ.volume / 1000:.1f})"),
+        (
+            "organ",
+            f"{patient.side} kidney, {patient.volumes_ml['organ']:.1f} ml (surface {patient.organ.volume / 1000:.1f})",
+        ),
         ("extent", f"{extent} mm (right-left x front-back x foot-head)"),
         ("surface", f"{len(patient.organ.faces)} faces, watertight"),
     ]
     for tissue, name in PARTS.items():
         if tissue in patient.parts:
-            rows.append((name.replace("-system", ""), f"{patient.volumes_ml[tissue]:.1f} ml, {len(patient.parts[tissue].faces)} faces"))
+            rows.append(
+                (
+                    name.replace("-system", ""),
+                    f"{patient.volumes_ml[tissue]:.1f} ml, {len(patient.parts[tissue].faces)} faces",
+                )
+            )
         elif tissue == "tumour":
             rows.append((name, "none"))
     rows.append(("support", f"{len(patient.support.faces)} faces, {SUPINE}"))

@@ -132,7 +132,13 @@ def _level(ct: Volume, pieces: list[Organ], margin_mm: float) -> tuple[Box, np.n
     low, high = corners.min(axis=0), corners.max(axis=0)
     low[2], high[2] = places[:, 2].min() - margin_mm, places[:, 2].max() + margin_mm
     box = ct.grid.box_around(low, high)
-    return box, ct.hounsfield(box)
+    hounsfield = ct.hounsfield(box)
+    if hounsfield.min() >= 0:
+        raise PatientError(
+            "the CT holds no value below 0: expected HU, in which fat and air are negative; give the CT first, then "
+            "the labels"
+        )
+    return box, hounsfield
 
 
 def _overlap(grid: VoxelGrid, piece: Organ) -> float:
@@ -186,11 +192,6 @@ def _check_place(
             f"{piece.title} has a median of {median:.0f} HU: expected soft tissue; check that the labels belong to "
             "this CT and that the CT is in HU"
         )
-    if float(hounsfield.min()) >= 0:
-        raise PatientError(
-            "the CT holds no value below 0: expected HU, in which fat and air are negative; give the CT first, then "
-            "the labels"
-        )
 
 
 def _marks(
@@ -212,11 +213,15 @@ def _marks(
 def _parts(labels: LabelMap, piece: Organ) -> tuple[dict[str, trimesh.Trimesh], dict[str, float]]:
     """Surface and volume [ml] of what is told apart in the organ, and of its vessels and collecting system near it."""
     surfaces, volumes = {}, {}
-    for tissue, name in PARTS.items():
+    for tissue in PARTS:
         values = labels.of_tissues(tissue)
         if not values:
             continue
-        grid, inside = _near(labels, piece, values) if tissue in INNER else (piece.grid, piece.mask & np.isin(piece.values, values))
+        grid, inside = (
+            _near(labels, piece, values)
+            if tissue in INNER
+            else (piece.grid, piece.mask & np.isin(piece.values, values))
+        )
         if not inside.any():
             if tissue == "tumour":
                 raise PatientError(
@@ -240,7 +245,9 @@ def _near(labels: LabelMap, piece: Organ, values: list[int]) -> tuple[VoxelGrid,
     x, y, z = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
     organ = np.zeros([a.stop - a.start for a in (z, y, x)], bool)
     at = start - low
-    organ[tuple(slice(int(a), int(a) + n) for a, n in zip(at[::-1], piece.mask.shape, strict=True))] = piece.mask
+    organ[tuple(slice(int(a), int(a) + n) for a, n in zip(at[::-1], piece.mask.shape, strict=True))] = (
+        piece.mask
+    )
     distance = ndimage.distance_transform_edt(~organ, sampling=labels.grid.spacing[::-1])
     return labels.grid.part((x, y, z)), (distance <= PEDICLE_MM) & np.isin(labels.values[z, y, x], values)
 

@@ -65,7 +65,11 @@ def _colour(roi: Dataset) -> tuple[float, float, float] | None:
 
 def _contours(roi: Dataset) -> list[np.ndarray]:
     """Points (n, 3) of each closed contour, LPS [mm]."""
-    closed = [c for c in roi.get("ContourSequence") or [] if c.get("ContourGeometricType") in ("CLOSED_PLANAR", "CLOSEDPLANAR_XOR")]
+    closed = [
+        c
+        for c in roi.get("ContourSequence") or []
+        if c.get("ContourGeometricType") in ("CLOSED_PLANAR", "CLOSEDPLANAR_XOR")
+    ]
     points = [np.array(c.ContourData, float).reshape(-1, 3) for c in closed]
     if sum(map(len, points)) > MOST_POINTS or not all(np.isfinite(p).all() for p in points):
         raise ValueError

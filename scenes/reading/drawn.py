@@ -86,7 +86,11 @@ def _file(path: Path) -> Drawing:
         return Drawing(lambda _: maps, secrets=volume.secrets)
     header = itk_header(path)
     names = _slicer_names(header)
-    kept = {str(n): header.GetMetaData(n) for n in header.GetMetaDataKeys() if not n.startswith(("NRRD_", "ITK_", "Segment"))}
+    kept = {
+        str(n): header.GetMetaData(n)
+        for n in header.GetMetaDataKeys()
+        if not n.startswith(("NRRD_", "ITK_", "Segment"))
+    }
     secrets = frozenset(text for text in kept.values() if text)
     if not names and header.GetNumberOfComponents() == 1:
         volume = file_volume(path)
@@ -142,7 +146,8 @@ def _one_an_organ(folder: Path, files: list[Path], wanted: Collection[str], prog
     """One file an organ, as TotalSegmentator leaves them: named by their files, and empty where an organ is not there."""
     asked = {word.casefold() for word in wanted}
     near = [f for f in files if _stem(f).casefold() in asked or not is_far(_stem(f))]
-    maps, secrets = [], set()
+    maps: list[LabelMap] = []
+    secrets: set[str] = set()
     for file in progress(near, "labels"):
         volume = file_volume(file)
         secrets |= volume.secrets
@@ -155,7 +160,9 @@ def _one_an_organ(folder: Path, files: list[Path], wanted: Collection[str], prog
         if one is not None:
             maps.append(one)
     if not maps:
-        raise PatientError(f"{folder}: all {len(near)} label files are empty; expected an organ; choose other labels")
+        raise PatientError(
+            f"{folder}: all {len(near)} label files are empty; expected an organ; choose other labels"
+        )
     return Drawing(lambda _: maps, secrets=frozenset(secrets))
 
 

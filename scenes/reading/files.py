@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import nibabel
 import numpy as np
@@ -51,7 +51,9 @@ def _nifti(path: Path) -> Volume:
     while len(shape) > 3 and shape[-1] == 1:
         shape = shape[:-1]
     if len(shape) != 3:
-        raise PatientError(f"{path}: the image has {' x '.join(map(str, shape))} voxels; expected one 3D volume; export one volume")
+        raise PatientError(
+            f"{path}: the image has {' x '.join(map(str, shape))} voxels; expected one 3D volume; export one volume"
+        )
     if kind.fields or kind.kind not in "iuf":
         raise PatientError(f"{path}: each voxel holds a {kind}; expected one number; export a scalar volume")
     grid = _nifti_grid(path, header, shape).checked(str(path))
@@ -70,7 +72,11 @@ def _nifti(path: Path) -> Volume:
             raise _cut_off(path) from error
         return np.concatenate(planes)
 
-    texts = [str(header[key].item(), "latin-1").strip("\0 ") for key in ("descrip", "aux_file", "intent_name", "db_name") if key in header]
+    texts = [
+        str(header[key].item(), "latin-1").strip("\0 ")
+        for key in ("descrip", "aux_file", "intent_name", "db_name")
+        if key in header
+    ]
     return Volume(str(path), grid, read_box, secrets=frozenset(text for text in texts if text))
 
 
@@ -103,7 +109,7 @@ def _nifti_grid(path: Path, header: Any, shape: tuple[int, ...]) -> VoxelGrid:
         raise PatientError(
             f"{path}: says no orientation (sform and qform codes are 0), so left may be right; export it again with its orientation"
         )
-    code, affine = given[0]
+    affine = given[0][1]
     if len(given) == 2:
         corners = np.array(np.meshgrid(*[(0, n - 1) for n in shape], [1])).reshape(4, -1)
         apart = np.abs((given[0][1] - given[1][1]) @ corners).max()
@@ -113,13 +119,15 @@ def _nifti_grid(path: Path, header: Any, shape: tuple[int, ...]) -> VoxelGrid:
                 raise PatientError(
                     f"{path}: sform and qform place it up to {apart:.1f} mm apart; expected one place; export it again"
                 )
-            code, affine = scanner[0]
+            affine = scanner[0][1]
     scale = MM_OF_UNIT.get(unit, 1.0)
     columns = RAS_TO_LPS @ affine[:3, :3] * scale
     spacing = np.linalg.norm(columns, axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
         direction = columns / spacing
-    return VoxelGrid(tuple(shape), spacing, RAS_TO_LPS @ affine[:3, 3] * scale, direction)
+    return VoxelGrid(
+        cast(tuple[int, int, int], tuple(shape)), spacing, RAS_TO_LPS @ affine[:3, 3] * scale, direction
+    )
 
 
 def _itk(path: Path) -> Volume:
@@ -127,7 +135,9 @@ def _itk(path: Path) -> Volume:
     kind = sitk.GetPixelIDValueAsString(reader.GetPixelID())
     if reader.GetNumberOfComponents() != 1 or "complex" in kind:
         raise PatientError(f"{path}: each voxel holds a {kind}; expected one number; export a scalar volume")
-    texts = [reader.GetMetaData(key) for key in reader.GetMetaDataKeys() if not key.startswith(("NRRD_", "ITK_"))]
+    texts = [
+        reader.GetMetaData(key) for key in reader.GetMetaDataKeys() if not key.startswith(("NRRD_", "ITK_"))
+    ]
     grid = VoxelGrid.of(reader)
     return Volume(str(path), grid, lambda box: _itk_box(path, box), secrets=frozenset(t for t in texts if t))
 
@@ -147,7 +157,9 @@ def itk_header(path: Path) -> sitk.ImageFileReader:
         size = " x ".join(map(str, reader.GetSize()))
         raise PatientError(f"{path}: the image has {size} voxels; expected one 3D volume; export one volume")
     if path.suffix.lower() in (".nrrd", ".nhdr") and not reader.HasMetaDataKey("NRRD_space"):
-        raise PatientError(f"{path}: says no space (such as left-posterior-superior), so left may be right; export it again")
+        raise PatientError(
+            f"{path}: says no space (such as left-posterior-superior), so left may be right; export it again"
+        )
     _check_size(path, VoxelGrid.of(reader).checked(str(path)), 1, packed=True)
     return reader
 
@@ -198,11 +210,13 @@ def _check_data_file(path: Path) -> None:
         name = value.strip()
         if name.upper() == "LOCAL":
             return
-        file = (path.parent / name).resolve()
-        if name.upper().startswith("LIST") or "%" in name or not file.is_relative_to(path.parent.resolve()):
+        beside = (path.parent / name).resolve()
+        if name.upper().startswith("LIST") or "%" in name or not beside.is_relative_to(path.parent.resolve()):
             raise PatientError(
                 f"{path}: its voxels lie in {name[:60]!r}; expected one file beside it; convert it to one NRRD file"
             )
-        if not file.is_file():
-            raise PatientError(f"{path}: its voxels should lie in {name[:60]!r}, which is not there; copy both files")
+        if not beside.is_file():
+            raise PatientError(
+                f"{path}: its voxels should lie in {name[:60]!r}, which is not there; copy both files"
+            )
         return

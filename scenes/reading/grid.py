@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 import SimpleITK as sitk
 
 from scenes.reading.error import PatientError
@@ -64,11 +65,11 @@ class VoxelGrid:
             )
         return self
 
-    def place(self, indices: np.ndarray) -> np.ndarray:
+    def place(self, indices: npt.ArrayLike) -> np.ndarray:
         """LPS [mm] of voxel indices (n, 3) in the order x, y, z."""
         return np.asarray(indices) * self.spacing @ self.direction.T + self.origin
 
-    def index(self, places: np.ndarray) -> np.ndarray:
+    def index(self, places: npt.ArrayLike) -> np.ndarray:
         """Voxel indices (n, 3), with fractions, of places in LPS [mm]."""
         return (np.asarray(places) - self.origin) @ self.direction / self.spacing
 

@@ -29,13 +29,45 @@ STRUCTURE_SET = "1.2.840.10008.5.1.4.1.1.481.3"
 MOST_PIXELS = 8192 * 8192
 # A deflated data set names its syntax in the first bytes; after them it may be a bomb.
 DEFLATED, META_LENGTH_AT, MOST_INFLATED = b"1.2.840.10008.1.2.1.99", 140, 2 * 2**30
-TAGS = """SOPClassUID SOPInstanceUID Modality SeriesInstanceUID SeriesNumber InstanceNumber ImageType FrameOfReferenceUID
-ImagePositionPatient ImageOrientationPatient PixelSpacing Rows Columns NumberOfFrames RescaleSlope RescaleIntercept RescaleType
-PixelPaddingValue PixelPaddingRangeLimit BurnedInAnnotation SamplesPerPixel SharedFunctionalGroupsSequence
-PerFrameFunctionalGroupsSequence""".split()
+TAGS = [
+    "SOPClassUID",
+    "SOPInstanceUID",
+    "Modality",
+    "SeriesInstanceUID",
+    "SeriesNumber",
+    "InstanceNumber",
+    "ImageType",
+    "FrameOfReferenceUID",
+    "ImagePositionPatient",
+    "ImageOrientationPatient",
+    "PixelSpacing",
+    "Rows",
+    "Columns",
+    "NumberOfFrames",
+    "RescaleSlope",
+    "RescaleIntercept",
+    "RescaleType",
+    "PixelPaddingValue",
+    "PixelPaddingRangeLimit",
+    "BurnedInAnnotation",
+    "SamplesPerPixel",
+    "SharedFunctionalGroupsSequence",
+    "PerFrameFunctionalGroupsSequence",
+]
 LOCALIZERS = {"LOCALIZER", "SCOUT", "TOPOGRAM"}
 # Third and fourth values of ImageType whose pixels are no HU.
-NOT_HU = {"PERFUSION", "RCBF", "RCBV", "MTT", "TTP", "ANGIO", "DENSITY_MAP", "MAT_FRACTION", "MAT_SPECIFIC", "EFF_ATOMIC_NUM"}
+NOT_HU = {
+    "PERFUSION",
+    "RCBF",
+    "RCBV",
+    "MTT",
+    "TTP",
+    "ANGIO",
+    "DENSITY_MAP",
+    "MAT_FRACTION",
+    "MAT_SPECIFIC",
+    "EFF_ATOMIC_NUM",
+}
 
 
 @dataclass(frozen=True)
@@ -136,7 +168,9 @@ def _check_inflated(file: BinaryIO, name: str, start: bytes) -> None:
             size += len(inflater.decompress(chunk, 1 << 22))
             chunk = inflater.unconsumed_tail
             if size > MOST_INFLATED:
-                raise PatientError(f"{name}: inflates to more than 2 GiB; expected one CT; export it uncompressed")
+                raise PatientError(
+                    f"{name}: inflates to more than 2 GiB; expected one CT; export it uncompressed"
+                )
     file.seek(0)
 
 
@@ -171,7 +205,9 @@ def _slices(item: Item, header: Dataset) -> Iterator[Slice | None]:
         return
     shared = (header.get("SharedFunctionalGroupsSequence") or [Dataset()])[0]
     if len(frames) != int(header.get("NumberOfFrames") or 1):
-        raise PatientError(f"{item.name}: says {header.get('NumberOfFrames')} frames, and where {len(frames)} of them lie")
+        raise PatientError(
+            f"{item.name}: says {header.get('NumberOfFrames')} frames, and where {len(frames)} of them lie"
+        )
     for n, frame in enumerate(frames):
         yield _slice(item, n, n + 1, [*_groups(frame), *_groups(shared), header], header)
 
@@ -181,7 +217,9 @@ def _groups(functional: Dataset) -> list[Dataset]:
     return [element.value[0] for element in functional if element.VR == "SQ" and element.value]
 
 
-def _slice(item: Item, frame: int | None, number: Any, groups: list[Dataset], header: Dataset) -> Slice | None:
+def _slice(
+    item: Item, frame: int | None, number: Any, groups: list[Dataset], header: Dataset
+) -> Slice | None:
     def value(name: str, usual: Any = None) -> Any:
         found = (group.get(name) for group in groups if group.get(name) not in (None, ""))
         return next(found, usual)

@@ -75,7 +75,9 @@ class LabelMap:
 
     def called(self, words: Sequence[str]) -> list[int]:
         """Values of the segments that words, names or numbers, call."""
-        return [value for value, segment in self.segments.items() if any(segment.called(word) for word in words)]
+        return [
+            value for value, segment in self.segments.items() if any(segment.called(word) for word in words)
+        ]
 
     def listed(self) -> str:
         """What there is, for errors."""
@@ -126,7 +128,9 @@ def with_tissues(
     def told(segment: Segment) -> Segment:
         found = [option for option, words in said.items() if any(segment.called(word) for word in words)]
         if len(found) > 1:
-            raise PatientError(f"label {segment} is given as {' and as '.join(found)}: give it as one of them")
+            raise PatientError(
+                f"label {segment} is given as {' and as '.join(found)}: give it as one of them"
+            )
         if found and found[0] != "organ":
             return replace(segment, tissue=found[0])
         if segment.tissue in chosen:

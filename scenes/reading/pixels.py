@@ -44,7 +44,9 @@ class _File:
             if one.padding:
                 values[_padded(raw, one.padding)] = AIR_HU
         if values.shape != (one.rows, one.columns):
-            raise PatientError(f"{self.item.name}: its pixels are {values.shape}, its header says {(one.rows, one.columns)}")
+            raise PatientError(
+                f"{self.item.name}: its pixels are {values.shape}, its header says {(one.rows, one.columns)}"
+            )
         return np.clip(np.rint(values), LEAST_HU, MOST_HU).astype(np.int16)
 
     def _raw(self, one: Slice) -> np.ndarray | None:

@@ -16,7 +16,6 @@ from scenes.reading.source import Item
 
 # A voxel of a fractional segment is in it from this share on.
 HALF = 0.5
-RAW = {"allow_missing_positions": True, "combine_segments": False}
 
 
 def read_segmentation(item: Item) -> tuple[list[LabelMap], list[str], str]:
@@ -40,7 +39,9 @@ def read_segmentation(item: Item) -> tuple[list[LabelMap], list[str], str]:
             "patient's coordinates; export it as a label map, for example NRRD"
         ) from error
     if not found:
-        raise PatientError(f"{item.name}: is empty, no voxel is marked; expected an organ; choose another file")
+        raise PatientError(
+            f"{item.name}: is empty, no voxel is marked; expected an organ; choose another file"
+        )
     fractional = segmentation.segmentation_type == hd.seg.SegmentationTypeValues.FRACTIONAL
     notes = [f"fractional segments were cut at {HALF:.0%}"] if fractional else []
     referenced = data.get("ReferencedSeriesSequence") or []
@@ -60,10 +61,10 @@ def _maps(name: str, segmentation: hd.seg.Segmentation) -> list[LabelMap]:
         if segment.tissue is None:
             meaning = segmentation.get_segment_description(number).segmented_property_type.meaning
             segment = Segment(segment.name, segment.value, Segment.named(meaning).tissue, segment.side)
-        volume = segmentation.get_volume(segment_numbers=[number], **RAW)
+        volume = segmentation.get_volume(segment_numbers=[number], allow_missing_positions=True)
         one = LabelMap.single(
             VoxelGrid(
-                tuple(int(n) for n in volume.spatial_shape),
+                volume.spatial_shape,
                 np.array(volume.spacing),
                 np.array(volume.position),
                 np.array(volume.direction),

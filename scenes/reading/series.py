@@ -11,7 +11,7 @@ from scenes.reading.headers import Found, Series, Slice, read_headers
 from scenes.reading.progress import Progress
 from scenes.reading.secrets import secrets_of
 from scenes.reading.source import items_of
-from scenes.reading.stack import Stack, stacked
+from scenes.reading.stack import stacked
 from scenes.reading.volume import Volume
 
 # Slices in another view than this share of their series are scouts that do not say so.
@@ -80,10 +80,13 @@ def _chosen(
     ranked = sorted(candidates, key=lambda s: _rank(s, referenced), reverse=True)
     numbers = [s.number for s in candidates]
     listed = "; ".join(
-        _described(s, numbers.count(s.number) > 1) for s in sorted(candidates, key=lambda s: (len(s.number), s.number))
+        _described(s, numbers.count(s.number) > 1)
+        for s in sorted(candidates, key=lambda s: (len(s.number), s.number))
     )
     if wanted is not None:
-        matching = [s for s in candidates if s.number == wanted or (len(wanted) >= UID_END and s.uid.endswith(wanted))]
+        matching = [
+            s for s in candidates if s.number == wanted or (len(wanted) >= UID_END and s.uid.endswith(wanted))
+        ]
         if len(matching) != 1:
             what = "no series" if not matching else f"{len(matching)} series"
             raise PatientError(
@@ -98,7 +101,9 @@ def _chosen(
         if best.uid == referenced
         else "it shows most of the body in the thinnest slices"
     )
-    return best, [f"series {best.number} of {len(candidates)} was taken: {why}; there are: {listed}; --series N takes another"]
+    return best, [
+        f"series {best.number} of {len(candidates)} was taken: {why}; there are: {listed}; --series N takes another"
+    ]
 
 
 def _rank(series: Series, referenced: str) -> tuple:

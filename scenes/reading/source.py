@@ -7,6 +7,7 @@ import os
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO, cast
 
@@ -138,7 +139,7 @@ def _of_archive(path: Path) -> list[Item]:
     def opened(entry: zipfile.ZipInfo) -> BinaryIO:
         return io.BytesIO(_unpacked(path, archive, entry, MOST_FILE_BYTES))
 
-    return [Item(entry.filename, lambda entry=entry: opened(entry), None) for entry in found]
+    return [Item(entry.filename, partial(opened, entry), None) for entry in found]
 
 
 def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:

@@ -37,7 +37,9 @@ class Stack:
     slices: list[Slice]
     grid: VoxelGrid
     planes: np.ndarray  # (n,) place of each slice along the grid's third axis, in voxels from its first
-    sideways: np.ndarray  # (n, 2) how far each slice's first pixel is from the grid's, in pixels along row and column
+    sideways: (
+        np.ndarray
+    )  # (n, 2) how far each slice's first pixel is from the grid's, in pixels along row and column
     notes: tuple[str, ...]
 
     def read(self, box: Box, progress: Callable[[Iterable[Slice]], Iterable[Slice]] = iter) -> np.ndarray:
@@ -138,7 +140,8 @@ def _once(name: str, slices: list[Slice], normal: np.ndarray, notes: list[str]) 
 
 def _same(one: Slice, other: Slice) -> bool:
     sideways = np.abs(one.position - other.position).max() <= SAME_PLACE_MM
-    return bool(sideways) and np.array_equal(*hounsfield([one, other]))
+    mine, its = hounsfield([one, other])
+    return bool(sideways) and np.array_equal(mine, its)
 
 
 def _at(one: Slice, normal: np.ndarray) -> str:
@@ -207,5 +210,8 @@ def _upright(
     notes.append(
         f"the gantry was tilted by {angle:.1f} degrees: slices shifted back in their planes by up to {np.abs(offsets).max():.1f} mm"
     )
-    return first.position + axes @ low, (offsets - low) / spacing, (size[0] + int(extra[0]), size[1] + int(extra[1]))
-
+    return (
+        first.position + axes @ low,
+        (offsets - low) / spacing,
+        (size[0] + int(extra[0]), size[1] + int(extra[1])),
+    )
