@@ -3,6 +3,7 @@
 import click
 
 from studies.features.command import features
+from studies.intake.command import intake
 from studies.soak.command import soak
 from studies.stability.command import stability
 from studies.timing.command import timing
@@ -19,3 +20,4 @@ study.add_command(features)
 study.add_command(trade)
 study.add_command(stability)
 study.add_command(soak)
+study.add_command(intake)

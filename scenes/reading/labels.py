@@ -58,8 +58,8 @@ class LabelMap:
     @classmethod
     def valued(cls, grid: VoxelGrid, values: np.ndarray, names: Mapping[int, str] | None = None) -> LabelMap:
         """A label map whose values have names, or none."""
-        present = [int(v) for v in np.flatnonzero(np.bincount(values.ravel())) if v]
-        return cls(grid, values, {v: Segment.named((names or {}).get(v, ""), v) for v in present})
+        found = {v: Segment.named((names or {}).get(v, ""), v) for v in present(values)}
+        return cls(grid, values, found)
 
     @classmethod
     def single(cls, grid: VoxelGrid, inside: np.ndarray, segment: Segment) -> LabelMap | None:
@@ -152,8 +152,16 @@ def merged(maps: list[LabelMap]) -> LabelMap:
     for code, (one, value, _) in enumerate(pieces, start=1):
         inside, box = _onto(grid, one.grid, one.values == value)
         values[box[::-1]][inside] = code
-    present = set(np.flatnonzero(np.bincount(values.ravel())).tolist())
-    return LabelMap(grid, values, {n: piece[2] for n, piece in enumerate(pieces, start=1) if n in present})
+    left = set(present(values))
+    return LabelMap(grid, values, {n: piece[2] for n, piece in enumerate(pieces, start=1) if n in left})
+
+
+def present(values: np.ndarray) -> list[int]:
+    """The values but 0 that occur, a plane at a time: counting widens them eightfold."""
+    there = np.zeros(1 + np.iinfo(values.dtype).max, bool)
+    for plane in values:
+        there[plane.ravel()] = True
+    return [int(v) for v in np.flatnonzero(there) if v]
 
 
 def box_of(inside: np.ndarray) -> Box | None:
