@@ -1,4 +1,4 @@
-"""The 3D view: organ, tumour, support, transducer and image plane, handed to a GGUI scene.
+"""The 3D view: organ, what is in it, support, transducer and image plane, handed to a GGUI scene.
 
 The scene is a parameter, so that window.py alone imports the user interface. Lengths in mm.
 """
@@ -14,6 +14,7 @@ from render.viewer import Geometry, Settings, View
 PLANE_ROWS, PLANE_COLUMNS = 96, 64
 KEY_LIGHT, FILL_LIGHT, AMBIENT = (0.82, 0.80, 0.77), (0.17, 0.19, 0.23), (0.17, 0.17, 0.19)
 TUMOUR, SUPPORT, EDGE, FRAME = (0.93, 0.76, 0.28), (0.30, 0.33, 0.36), (0.85, 0.9, 0.94), (0.25, 0.77, 1.0)
+PARTS = {"cyst": (0.30, 0.60, 0.86), "urine": (0.62, 0.74, 0.33), "vessel": (0.80, 0.16, 0.20)}
 LINE_WIDTH = 1.2
 MASKS = 4
 
@@ -35,6 +36,9 @@ class Stage:
         self.camera = camera
         self._organ = Surface(geometry.organ_vertices, geometry.organ_faces)
         self._tumour = self._support = None
+        self._parts = [
+            Surface(vertices, faces, PARTS[tissue]) for tissue, (vertices, faces) in geometry.parts.items()
+        ]
         if geometry.tumour_vertices is not None and geometry.tumour_faces is not None:
             self._tumour = Surface(geometry.tumour_vertices, geometry.tumour_faces, TUMOUR)
         if geometry.support_vertices is not None and geometry.support_faces is not None:
@@ -78,9 +82,11 @@ class Stage:
             # A reduced mesh has slivers that face the wrong way, which would show as black specks.
             _draw_surface(scene, self._support, two_sided=True)
         self._draw_transducer(scene, view.transducer_pose)
-        if self._tumour is not None and settings.show_tumour:
-            self._tumour.shade(eye, key)
-            _draw_surface(scene, self._tumour)
+        inner = self._parts if settings.show_parts else []
+        for surface in [*inner, self._tumour] if settings.show_tumour else inner:
+            if surface is not None:
+                surface.shade(eye, key)
+                _draw_surface(scene, surface)
         self._draw_image_plane(scene, view, key)
         cut = _cut(view.transducer_pose, eye) if settings.cut else None
         opacity = GLASS if settings.translucent else SOLID

@@ -106,6 +106,7 @@ class Settings:
     translucent: bool = _switch(True, "Translucent")
     cut: bool = _switch(False, "Cut open")
     show_tumour: bool = _switch(True, "Tumour")
+    show_parts: bool = _switch(True, "Vessels")
     show_support: bool = _switch(True, "Support")
     outline: bool = _switch(False, "Outline")
     show_scanner: bool = False
@@ -134,6 +135,8 @@ class Geometry:
     tumour_vertices: Any = None
     """As organ_vertices, or None."""
     tumour_faces: np.ndarray | None = None
+    parts: dict[str, tuple[Any, np.ndarray]] = field(default_factory=dict)
+    """What else is in the organ: tissue -> vertices and triangles, as the organ's."""
     support_vertices: np.ndarray | None = None
     """Fixed [mm], shape (k, 3), or None."""
     support_faces: np.ndarray | None = None

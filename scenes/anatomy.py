@@ -5,20 +5,32 @@ import os
 import tempfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import SimpleITK as sitk
 import trimesh
 
+from scenes.hilum import hilum
 from scenes.organ import GROWN, PARENCHYMA
-from scenes.patient import Patient, import_patient, tissue_codes
+from scenes.patient import PARTS, Patient, import_patient, tissue_codes
 from scenes.patient_folder import save_patient
 from scenes.phantom import Label, make_phantom
 from scenes.reading.error import PatientError
 from scenes.reading.files import file_volume
 from scenes.reading.labels import LabelMap
 from scenes.reading.volume import Volume
-from scenes.scene import Anatomy, DistanceShape, Image, MeshShape, PlaneShape, Press, Scene, SceneError
+from scenes.scene import (
+    Anatomy,
+    Attachment,
+    DistanceShape,
+    Image,
+    MeshShape,
+    PlaneShape,
+    Press,
+    Scene,
+    SceneError,
+)
 
 HERE = Path(__file__).parent
 CACHE = HERE.parent / ".cache"
@@ -33,6 +45,7 @@ TISSUE_OF_PART: dict[int, str] = {
     Label.VESSEL: "vessel",
     Label.TUMOUR: "tumour",
 }
+PHANTOM_PARTS: tuple[Literal["urine", "vessel"], ...] = ("urine", "vessel")
 PHANTOM_TISSUES = {str(code): tissue for tissue, code in tissue_codes(list(TISSUE_OF_PART.values())).items()}
 
 
@@ -55,6 +68,8 @@ class LoadedAnatomy:
     labels: Grid | None = None
     tissues: dict[int, str] = field(default_factory=dict)
     """Which tissue each label is."""
+    parts: dict[str, trimesh.Trimesh] = field(default_factory=dict)
+    """Surfaces of cysts, vessels and collecting system, by tissue."""
 
 
 def load_anatomy(scene: Scene, folder: Path) -> LoadedAnatomy:
@@ -62,7 +77,10 @@ def load_anatomy(scene: Scene, folder: Path) -> LoadedAnatomy:
     anatomy = scene.anatomy
     if anatomy.phantom:
         folder = phantom_folder()
-        anatomy = Anatomy(tumour="tumour.stl", ct="ct.nrrd", labels="labels.nrrd", tissues=PHANTOM_TISSUES)
+        parts = {tissue: f"{PARTS[tissue]}.stl" for tissue in PHANTOM_PARTS}
+        anatomy = Anatomy(
+            tumour="tumour.stl", parts=parts, ct="ct.nrrd", labels="labels.nrrd", tissues=PHANTOM_TISSUES
+        )
     return LoadedAnatomy(
         organ=load_surface(folder, anatomy.organ),
         tumour=load_surface(folder, anatomy.tumour) if anatomy.tumour else None,
@@ -70,6 +88,7 @@ def load_anatomy(scene: Scene, folder: Path) -> LoadedAnatomy:
         shapes=tuple(_shape(folder, shape) for shape in scene.shape),
         labels=_labels(folder, anatomy),
         tissues={int(label): tissue for label, tissue in anatomy.tissues.items()},
+        parts={tissue: load_surface(folder, file) for tissue, file in anatomy.parts.items()},
     )
 
 
@@ -105,7 +124,16 @@ def patient_scene(patient: Patient) -> Scene:
     return Scene(
         image=Image(window_hu=max(brightest - darkest, LEAST_WINDOW_HU), level_hu=(brightest + darkest) / 2),
         title=f"{patient.side.capitalize()} kidney",
-        anatomy=Anatomy(tumour=tumour, ct="ct.nrrd", labels="labels.nrrd", tissues=_named(patient.tissues)),
+        anatomy=Anatomy.model_validate(
+            dict(
+                tumour=tumour,
+                parts={tissue: f"{PARTS[tissue]}.stl" for tissue in patient.parts if tissue != "tumour"},
+                ct="ct.nrrd",
+                labels="labels.nrrd",
+                tissues=_named(patient.tissues),
+            )
+        ),
+        attachment=Attachment(at_mm=hilum(patient.organ, patient.side)),
         shape=(MeshShape(kind="mesh", file="support.stl"),),
     )
 

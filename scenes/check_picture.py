@@ -163,7 +163,7 @@ def _draw_surfaces(axes, surfaces: dict[str, trimesh.Trimesh]) -> None:
     axes.set_proj_type("ortho")
     axes.view_init(elev=12, azim=-105)
     axes.set_axis_off()
-    axes.set_title("surface, from the front", color="white", fontsize=11, y=1.02)
+    axes.set_title("surface, from the front", color="white", fontsize=11, y=1.06)
     x, y, z = (low + high) / 2
     gap = 0.09 * (high - low).max()
     for letter, place in {

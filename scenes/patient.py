@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import cast
 
 import numpy as np
@@ -15,10 +16,11 @@ import SimpleITK as sitk
 import trimesh
 from scipy import ndimage
 
+from scenes.bed import bed_of_file, bed_of_labels
 from scenes.organ import GROWN, INNER, PARENCHYMA, Organ, check_volume, midline_x, organs, single_out
 from scenes.reading.error import PatientError
 from scenes.reading.grid import Box, VoxelGrid
-from scenes.reading.labels import LabelMap, nearest
+from scenes.reading.labels import LabelMap, nearest, present
 from scenes.reading.names import Side
 from scenes.reading.volume import Volume
 from scenes.support import cradle
@@ -72,6 +74,7 @@ def import_patient(
     organ: Sequence[int] | None = None,
     side: Side | None = None,
     margin_mm: float = 60.0,
+    support: str = "mould",
 ) -> Patient:
     """Cut one organ out of a CT and its label map and build its surfaces and its support.
 
@@ -82,6 +85,8 @@ def import_patient(
         side: which kidney, where the label map holds both, and a check where it holds one; needed where neither the CT
             shows the body's whole width nor the labels say the side.
         margin_mm: CT kept around the organ [mm].
+        support: what the organ lies on: a "mould" of its underside, the bed that surrounding "labels" make, or a file with a
+            surface.
 
     Raises:
         PatientError: one line that says what was found, what was expected and what to do.
@@ -102,22 +107,30 @@ def import_patient(
 
     surface = _surface(piece.grid.image(piece.mask.astype(np.uint8)), "organ", FACES)
     parts, volumes = _parts(labels, piece)
-    try:
-        support = cradle(surface, SUPINE_GRAVITY)
-    except ValueError as error:
-        raise PatientError(f"no support fits under the organ: {error}; check the organ's label") from error
     return Patient(
         ct=grid.image(voxels),
         labels=grid.image(marks),
         tissues=tissues,
         organ=surface,
         parts=parts,
-        support=support,
+        support=_support(support, surface, labels, piece),
         side=told_side,
         volumes_ml={"organ": piece.volume_ml, **volumes},
         spacing_mm=tuple(grid.spacing.tolist()),
         notes=ct.notes,
     )
+
+
+def _support(kind: str, organ: trimesh.Trimesh, labels: LabelMap, piece: Organ) -> trimesh.Trimesh:
+    if kind == "labels":
+        own = [int(value) for value in np.unique(piece.values[piece.mask])]
+        return bed_of_labels(organ, labels, [*own, *labels.of_tissues(*INNER)], SUPINE_GRAVITY)
+    if kind != "mould":
+        return bed_of_file(Path(kind), organ)
+    try:
+        return cradle(organ, SUPINE_GRAVITY)
+    except ValueError as error:
+        raise PatientError(f"no support fits under the organ: {error}; check the organ's label") from error
 
 
 def _level(ct: Volume, pieces: list[Organ], margin_mm: float) -> tuple[Box, np.ndarray]:
@@ -199,12 +212,12 @@ def _marks(
 ) -> tuple[np.ndarray, dict[int, str]]:
     """Tissue codes (z, y, x) of the cropped CT, and what they are: the organ's own, and of other organs all that is there."""
     values = nearest(labels.grid, labels.values, grid)
-    tissue_of = {v: s.tissue for v, s in labels.segments.items()}
-    present = {tissue_of.get(int(v)) for v in np.unique(values)} - {None}
-    codes = tissue_codes([tissue for tissue in present if tissue])
+    there = set(present(values))
+    tissue_of = {v: s.tissue for v, s in labels.segments.items() if v in there and s.tissue}
+    codes = tissue_codes(list(tissue_of.values()))
     marks = on_ct.astype(np.uint8)
     for value, tissue in tissue_of.items():
-        if tissue is not None and tissue != "kidney":
+        if tissue != "kidney":
             here = values == value
             marks[here & on_ct if tissue in (*GROWN, *PARENCHYMA) else here] = codes[tissue]
     return marks, {code: tissue for tissue, code in codes.items()}

@@ -67,19 +67,22 @@ class Section(BaseModel):
 class Anatomy(Section):
     """The embedded patient, or files beside the scene; without a CT there is no picture.
 
-    ``tissues`` says what each value of ``labels`` is for sound: a tissue of ``ultrasound/tissues.toml``.
+    ``parts`` are surfaces of what else is in the organ, by tissue. ``tissues`` says what each value of ``labels`` is for sound: a tissue of ``ultrasound/tissues.toml``.
     """
 
     phantom: bool = False
     organ: str = "organ.stl"
     tumour: str | None = None
+    parts: dict[Literal["cyst", "urine", "vessel"], str] = {}
     ct: str | None = None
     labels: str | None = None
     tissues: dict[Annotated[str, Field(pattern=r"^[1-9]\d*$")], str] = {}
 
     @model_validator(mode="after")
     def _one_patient(self) -> "Anatomy":
-        named = self.tumour or self.ct or self.labels or self.tissues or self.organ != "organ.stl"
+        named = (
+            self.tumour or self.parts or self.ct or self.labels or self.tissues or self.organ != "organ.stl"
+        )
         if self.phantom and named:
             raise ValueError(
                 "phantom = true is the embedded patient, which has files of its own: name no others"
@@ -161,6 +164,19 @@ class Contact(Section):
     particles: bool = False
 
 
+class Attachment(Section):
+    """Tissue that stays where it is, such as the hilum by its vessels: all within ``radius_mm`` of ``at_mm``; 0: none."""
+
+    at_mm: Vector3 | None = None
+    radius_mm: float = Field(0.0, ge=0, le=100)
+
+    @model_validator(mode="after")
+    def _somewhere(self) -> "Attachment":
+        if self.radius_mm > 0 and self.at_mm is None:
+            raise ValueError("attachment.radius_mm needs a place: give attachment.at_mm, or leave both out")
+        return self
+
+
 class PlaneShape(Section):
     kind: Literal["plane"]
     normal: Direction
@@ -235,6 +251,7 @@ class Scene(Section):
     solver: SolverSection = SolverSection()
     gravity: Gravity = Gravity()
     contact: Contact = Contact()
+    attachment: Attachment = Attachment()
     shape: tuple[Annotated[PlaneShape | MeshShape | DistanceShape, Field(discriminator="kind")], ...] = ()
     transducer: Transducer = Transducer()
     image: Image = Image()
@@ -245,6 +262,10 @@ class Scene(Section):
         if self.contact.particles and self.tissue.model != "shape-matching":
             raise ValueError(
                 "contact.particles = true needs particles: set tissue.model to shape-matching, or leave it out"
+            )
+        if self.attachment.radius_mm > 0 and self.tissue.model != "neo-hookean":
+            raise ValueError(
+                "attachment.radius_mm holds nodes: set tissue.model to neo-hookean, or the radius to 0"
             )
         return self
 

@@ -48,7 +48,7 @@ def cradle(
         ValueError: gravity without direction, depth out of range, organ not watertight, or no shape found
             that stays clear of the organ.
     """
-    frame = _gravity_frame(np.asarray(gravity_direction, float))
+    frame = gravity_frame(np.asarray(gravity_direction, float))
     if not 0 < depth_fraction < 1:
         raise ValueError(f"depth_fraction is {depth_fraction}: expected more than 0 and less than 1")
     if not organ.is_watertight:
@@ -62,12 +62,12 @@ def cradle(
     block_low = np.append(bed.min(axis=0)[:2] - wall_mm, low[2] - floor_mm)
     block_high = np.append(bed.max(axis=0)[:2] + wall_mm, top)
 
-    grid = _grid(block_low, block_high, grid_mm)
-    gap = _distance_to_swept(upright, organ_faces, grid)
+    grid = grid_over(block_low, block_high, grid_mm)
+    gap = distance_to_swept(upright, organ_faces, grid)
     gap_wanted = clearance_mm
     for _ in range(ATTEMPTS):
         level = _carved_block(grid, gap - gap_wanted, block_low, block_high, fillet_mm)
-        support = _contour(level, grid, faces)
+        support = contour(level, grid, faces)
         least = least_gap(support.vertices, support.faces, upright, organ_faces)
         if least >= 0.25 * clearance_mm:
             return trimesh.Trimesh(support.vertices @ frame, support.faces, process=False)
@@ -101,7 +101,7 @@ def least_gap(
     return float(min(gaps))
 
 
-def _gravity_frame(gravity: np.ndarray) -> np.ndarray:
+def gravity_frame(gravity: np.ndarray) -> np.ndarray:
     """Right-handed rotation whose rows are two level axes and the way up; patient axes where they fit."""
     length = np.linalg.norm(gravity)
     if gravity.shape != (3,) or not np.isfinite(length) or length == 0:
@@ -113,14 +113,14 @@ def _gravity_frame(gravity: np.ndarray) -> np.ndarray:
     return np.array([level, np.cross(up, level), up])
 
 
-def _grid(low: np.ndarray, high: np.ndarray, step: float) -> tuple[np.ndarray, ...]:
+def grid_over(low: np.ndarray, high: np.ndarray, step: float) -> tuple[np.ndarray, ...]:
     """Axes of a grid around the block, one cell of air at every side; the block's faces lie between nodes."""
     return tuple(
         np.arange(start - 1.5 * step, end + 2.0 * step, step) for start, end in zip(low, high, strict=True)
     )
 
 
-def _distance_to_swept(vertices: np.ndarray, faces: np.ndarray, grid: tuple[np.ndarray, ...]) -> np.ndarray:
+def distance_to_swept(vertices: np.ndarray, faces: np.ndarray, grid: tuple[np.ndarray, ...]) -> np.ndarray:
     """Distance [mm] from the grid's nodes to the organ swept upwards without end; negative inside.
 
     The distance to a union is the least of the distances to its parts, and the copy of the organ raised by t
@@ -141,20 +141,20 @@ def _carved_block(
 ) -> np.ndarray:
     """Level function of block minus cavity, negative in the material, its convex edges rounded."""
     x, y, z = np.meshgrid(*grid, indexing="ij", sparse=True)
-    sides = _round_meet(
+    sides = round_meet(
         np.maximum(low[0] - x, x - high[0]), np.maximum(low[1] - y, y - high[1]), radius=fillet
     )
     walls = np.maximum(sides, low[2] - z)
-    return _round_meet(_round_meet(walls, z - high[2], radius=0.25 * fillet), -cavity, radius=fillet)
+    return round_meet(round_meet(walls, z - high[2], radius=0.25 * fillet), -cavity, radius=fillet)
 
 
-def _round_meet(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
+def round_meet(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
     """Intersection of two solids given by signed distances, their common edge rounded to `radius`."""
     corner = np.hypot(np.maximum(a + radius, 0.0), np.maximum(b + radius, 0.0)) - radius
     return np.minimum(np.maximum(a, b), -radius) + np.maximum(corner + radius, 0.0)
 
 
-def _contour(level: np.ndarray, grid: tuple[np.ndarray, ...], faces: int) -> trimesh.Trimesh:
+def contour(level: np.ndarray, grid: tuple[np.ndarray, ...], faces: int) -> trimesh.Trimesh:
     """Zero level on the grid, decimated, one body, normals outward."""
     step = grid[0][1] - grid[0][0]
     clear = 1e-3 * step  # a level of exactly zero at a node gives triangles of no area

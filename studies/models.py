@@ -1,6 +1,6 @@
 """The tissue models as a scene names them: each put on the device with its contacts, ready to step."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
@@ -12,6 +12,7 @@ from sim.lattice import fill_with_cells, surface_points
 from sim.neighbours import ParticleContacts
 from sim.neo_hookean import LATTICE_SETTINGS, NeoHookean
 from sim.patches import arrange
+from sim.sampling import SamplingError
 from sim.shape_matching import ShapeMatching
 from sim.shapes import ConvexTool, SignedDistanceField
 from sim.solver import Solver, StepSettings
@@ -23,6 +24,25 @@ AnyTissue = NeoHookeanTissue | ShapeMatchingTissue
 POINTS_A_CELL = 0.5
 # Flats that stand for the arc of a curved array: of 60 mm and 60 degrees, they are nowhere 0.1 mm off it.
 ARC_FLATS = 11
+
+
+@dataclass(frozen=True)
+class Held:
+    """Tissue that stays where it is: all within a distance [mm] of a place (3,) [mm]."""
+
+    at_mm: np.ndarray
+    radius_mm: float
+
+    def nodes(self, nodes: np.ndarray) -> np.ndarray:
+        """Which nodes (n, 3) are held. Raises SamplingError where there are none, or where all are."""
+        apart = np.linalg.norm(nodes - self.at_mm, axis=1)
+        held = apart <= self.radius_mm
+        if held.all() or not held.any():
+            raise SamplingError(
+                f"attachment.radius_mm = {self.radius_mm:g} holds {'all' if held.all() else 'none'} of the organ, which lies "
+                f"{apart.min():.1f} to {apart.max():.1f} mm from attachment.at_mm: choose another radius or place"
+            )
+        return held
 
 
 def static_shape(mesh: trimesh.Trimesh, tissue: AnyTissue) -> SignedDistanceField:
@@ -73,15 +93,16 @@ def build_solver(
     section: SolverSection | None = None,
     rest: RestBody | None = None,
     serial: bool | None = None,
+    held: Held | None = None,
 ) -> Solver:
     """A solver of the organ [mm] among shapes, the tool among them. Raises SamplingError.
 
-    ``rest`` is shape matching's: the organ filled before (``fill``), which takes seconds. ``serial`` says whether a step is
+    ``held`` is the neo-Hookean model's; ``rest`` is shape matching's: the organ filled before (``fill``), which takes seconds. ``serial`` says whether a step is
     one kernel on one core; left open, the body's size and the machine decide.
     """
     contact, section = contact or Contact(), section or SolverSection()
     if isinstance(tissue, NeoHookeanTissue):
-        return _neo_hookean(organ, tissue, shapes, tool, contact, serial)
+        return _neo_hookean(organ, tissue, shapes, tool, contact, serial, held)
     return _shape_matching(rest or fill(organ, tissue), tissue, shapes, tool, contact, section, serial)
 
 
@@ -99,6 +120,7 @@ def _neo_hookean(
     tool: ConvexTool | None,
     contact: Contact,
     serial: bool | None,
+    held: Held | None,
 ) -> Solver:
     lattice = fill_with_cells(organ, tissue.cell_mm)
     body = Body(lattice.nodes)
@@ -107,7 +129,8 @@ def _neo_hookean(
         points, area_mm2 = surface_points(organ, POINTS_A_CELL * tissue.cell_mm)
         contacts = SurfaceContacts(body, lattice, points, area_mm2, shapes, contact.shape_friction)
     material = (tissue.young_kpa, tissue.poisson, tissue.density_g_cm3)
-    model = NeoHookean(body, lattice, contacts, *material, serial=serial)
+    nodes = None if held is None else held.nodes(lattice.nodes)
+    model = NeoHookean(body, lattice, contacts, *material, held=nodes, serial=serial)
     return Solver(model, contacts, tool=tool)
 
 

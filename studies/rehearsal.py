@@ -17,7 +17,7 @@ from sim.neo_hookean import NeoHookean
 from sim.shapes import Plane, SignedDistanceField
 from sim.skinning import Skin
 from sim.solver import SolverState
-from studies.models import build_solver, embedding_cell_mm, static_shape, step_settings, tool_of
+from studies.models import Held, build_solver, embedding_cell_mm, static_shape, step_settings, tool_of
 from studies.setup import probe_of, setup_of_scene
 from studies.trade.front import expected_error_mm, load_points
 from ultrasound.array import Mode, Probe, Rung
@@ -68,6 +68,7 @@ class Rehearsal:
         self.origin = anatomy.organ.bounds.mean(axis=0)
         self.organ = _shifted(anatomy.organ, -self.origin)
         self.tumour = anatomy.tumour and _shifted(anatomy.tumour, -self.origin)
+        self.parts = {tissue: _shifted(part, -self.origin) for tissue, part in anatomy.parts.items()}
         self.gravity_direction = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
         meshes = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
         self.supports = [_shrunk(_shifted(mesh, -self.origin), SUPPORT_SUNK_MM) for mesh in meshes]
@@ -90,10 +91,19 @@ class Rehearsal:
         self.tool = tool_of(self.probe)
         shapes = [*(self._shape(shape) for shape in anatomy.shapes), self.tool]
         tissue, section = self.scene.tissue, self.scene.solver
-        self.solver = build_solver(self.organ, tissue, shapes, self.tool, self.scene.contact, section)
+        held = self._held()
+        self.solver = build_solver(
+            self.organ, tissue, shapes, self.tool, self.scene.contact, section, held=held
+        )
         self.body, self.model, self.contacts = self.solver.body, self.solver.model, self.solver.contacts
         self.settings = step_settings(tissue, section)
         self.set_gravity(self.scene.gravity.acceleration_m_s2)
+
+    def _held(self) -> Held | None:
+        attachment = self.scene.attachment
+        if attachment.radius_mm == 0 or attachment.at_mm is None:
+            return None
+        return Held(np.array(attachment.at_mm) - self.origin, attachment.radius_mm)
 
     def _shape(self, shape: PlaneShape | trimesh.Trimesh | Grid) -> Plane | SignedDistanceField:
         if isinstance(shape, PlaneShape):
@@ -111,6 +121,7 @@ class Rehearsal:
             self._tumour_border = Skin(self.model, self.tumour.vertices)
             drawn = self.tumour.vertices + TUMOUR_LIFT_MM * self.tumour.vertex_normals
             self.tumour_skin = Skin(self.model, drawn)
+        self.part_skins = {tissue: Skin(self.model, part.vertices) for tissue, part in self.parts.items()}
 
     def _build_scanner(self, anatomy: LoadedAnatomy) -> None:
         image = self.scene.image
@@ -199,6 +210,8 @@ class Rehearsal:
         self.organ_skin.update()
         if self.tumour_skin is not None:
             self.tumour_skin.update()
+        for skin in self.part_skins.values():
+            skin.update()
 
     def look(
         self, probe: Probe, mode: Mode, rung: Rung, window_hu: float, level_hu: float

@@ -32,6 +32,7 @@ class Drawing:
     referenced: str = ""  # uid of the series that they were drawn on, where they say
     notes: tuple[str, ...] = ()
     secrets: frozenset[str] = frozenset()
+    frame_of_reference: str = ""  # DICOM's uid, where they have one
 
 
 def open_labels(path: Path, wanted: Collection[str] = (), progress: Progress = silent) -> Drawing:
@@ -71,7 +72,8 @@ def drawing_of(found: Found) -> Drawing | None:
         )
     if found.segmentations:
         maps, notes, referenced = read_segmentation(objects[0])
-        return Drawing(lambda _: maps, referenced, tuple(notes), secrets_of(objects[0]))
+        frame = str(read_header(objects[0]).get("FrameOfReferenceUID") or "")
+        return Drawing(lambda _: maps, referenced, tuple(notes), secrets_of(objects[0]), frame)
     if found.structure_sets:
         item = objects[0]
         referenced = referenced_series(read_header(item, tags=["ReferencedFrameOfReferenceSequence"]))

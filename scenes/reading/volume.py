@@ -30,8 +30,12 @@ class Volume:
     @classmethod
     def of(cls, image: sitk.Image, name: str = "the image") -> Volume:
         """A volume that is in memory already."""
-        voxels = sitk.GetArrayViewFromImage(image)
-        return cls(name, VoxelGrid.of(image), lambda box: np.array(voxels[box[::-1]]))
+        # A view does not keep its image alive.
+        return cls(
+            name,
+            VoxelGrid.of(image),
+            lambda box: np.array(sitk.GetArrayViewFromImage(image)[box[::-1]]),
+        )
 
     def read(self, box: Box | None = None) -> np.ndarray:
         """Voxels (z, y, x) of a box, all of them without one. Raises PatientError, too where one is no number."""

@@ -69,6 +69,10 @@ def open_viewer(rehearsal: Rehearsal, visible: bool) -> Viewer:
             frequency_range_mhz=rehearsal.probe.frequency_range_mhz,
             tumour_vertices=rehearsal.tumour_skin and rehearsal.tumour_skin.vertices,
             tumour_faces=None if tumour is None else np.asarray(tumour.faces, np.int32),
+            parts={
+                tissue: (skin.vertices, np.asarray(rehearsal.parts[tissue].faces, np.int32))
+                for tissue, skin in rehearsal.part_skins.items()
+            },
             support_vertices=np.asarray(support[0].vertices, np.float32) if support else None,
             support_faces=np.asarray(support[0].faces, np.int32) if support else None,
         ),

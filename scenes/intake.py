@@ -1,0 +1,90 @@
+"""From paths and the user's words to a patient: finds CT and labels, puts them together, remembers what is private."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from scenes.patient import Patient, import_patient
+from scenes.reading.ct import dicom_or_words, open_ct
+from scenes.reading.drawn import Drawing, drawing_of, open_labels
+from scenes.reading.error import PatientError
+from scenes.reading.labels import LabelMap, merged, with_tissues
+from scenes.reading.names import Side
+from scenes.reading.progress import Progress, silent
+from scenes.reading.volume import Volume
+from scenes.seed import grown
+
+DRAFT = "DRAFT: the organ was grown from a seed and drawn by nobody; check every outline in check.png"
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the user asked for: paths, and words on labels, by names or values."""
+
+    ct: Path
+    labels: Sequence[Path] = ()
+    organ: Sequence[str] = ()
+    tissues: Mapping[str, Sequence[str]] = field(default_factory=dict)  # tissue -> labels
+    side: Side | None = None
+    series: str | None = None
+    seed_mm: np.ndarray | None = None  # (3,) LPS; instead of labels
+    support: str = "mould"
+
+
+def take_in(request: Request, progress: Progress = silent) -> tuple[Patient, set[str]]:
+    """Import a patient, and what of its source none of its files may hold. Raises PatientError."""
+    if request.seed_mm is not None:
+        if request.labels or request.organ or request.tissues:
+            raise PatientError(
+                "--seed grows the organ where there are no labels: give it, or labels, not both"
+            )
+        drawings: list[Drawing] = []
+        volume = open_ct(request.ct, request.series, progress=progress)
+        labels = grown(volume, request.seed_mm)
+        notes: tuple[str, ...] = (DRAFT,)
+    else:
+        volume, drawings, labels = _with_labels(request, progress)
+        notes = tuple(note for drawing in drawings for note in drawing.notes)
+    organ = labels.called(request.organ) if request.organ else None
+    patient = import_patient(volume, labels, organ, request.side, support=request.support)
+    private = set(volume.secrets).union(*(drawing.secrets for drawing in drawings))
+    return replace(patient, notes=(*notes, *patient.notes)), private | _paths(request)
+
+
+def _with_labels(request: Request, progress: Progress) -> tuple[Volume, list[Drawing], LabelMap]:
+    words = [*request.organ, *(word for several in request.tissues.values() for word in several)]
+    drawings = [open_labels(path, words, progress) for path in request.labels]
+    drawings = drawings or [_beside(request.ct, progress)]
+    referenced = next((drawing.referenced for drawing in drawings if drawing.referenced), "")
+    volume = open_ct(request.ct, request.series, referenced, progress)
+    for drawing in drawings:
+        frames = {drawing.frame_of_reference, volume.frame_of_reference} - {""}
+        if len(frames) > 1:
+            raise PatientError(
+                f"{request.ct}: the labels were drawn in another frame of reference than this series; expected the CT that they "
+                "were drawn on; choose it with --series, or give its folder"
+            )
+    maps = [one for drawing in drawings for one in drawing.maps(volume.grid)]
+    return volume, drawings, merged(with_tissues(maps, request.organ, request.tissues))
+
+
+def _beside(ct: Path, progress: Progress) -> Drawing:
+    """The labels that lie with a CT."""
+    if not ct.exists():
+        raise PatientError(f"{ct}: no such file or folder; check the path")
+    found = drawing_of(dicom_or_words(ct, progress)) if ct.is_dir() else None
+    if found is None:
+        raise PatientError(
+            f"{ct}: no labels lie with this CT; give a file or folder with LABELS, or --seed X,Y,Z for a draft"
+        )
+    return found
+
+
+def _paths(request: Request) -> set[str]:
+    """The paths of the source, as they are and as they were given."""
+    given = [request.ct, *request.labels]
+    return {str(path.resolve()) for path in given} | {str(path) for path in given if len(path.parts) > 1}
