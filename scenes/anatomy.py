@@ -123,7 +123,7 @@ def patient_scene(patient: Patient) -> Scene:
     darkest, brightest = FAT_HU, round(float(np.percentile(hu, 99)), -1)
     return Scene(
         image=Image(window_hu=max(brightest - darkest, LEAST_WINDOW_HU), level_hu=(brightest + darkest) / 2),
-        title=f"{patient.side.capitalize()} kidney",
+        title=f"{patient.side.capitalize()} kidney{' (draft)' if patient.draft else ''}",
         anatomy=Anatomy.model_validate(
             dict(
                 tumour=tumour,

@@ -57,7 +57,7 @@ def draw_check(patient: Patient, rows: list[tuple[str, str]], folder: Path) -> N
     grid = figure.add_gridspec(2, 3, hspace=0.08, wspace=0.06)
     grid.update(left=0.03, right=0.97, top=0.92, bottom=0.02)
     figure.suptitle(
-        f"{patient.side.upper()} KIDNEY: is this the side, the organ and the way up that you expect?",
+        f"{patient.side.upper()} KIDNEY{' (DRAFT, grown from a seed)' if patient.draft else ''}: is this the side, the organ and the way up that you expect?",
         color="white",
         fontsize=15,
     )

@@ -9,7 +9,7 @@ from scenes.anatomy import patient_scene
 from scenes.check_picture import draw_check
 from scenes.facts import facts, told
 from scenes.intake import Request, take_in
-from scenes.patient_folder import save_patient
+from scenes.patient_folder import check_folder, save_patient
 from scenes.reading.error import PatientError
 from scenes.reading.names import Side
 from scenes.reading.progress import bar
@@ -59,6 +59,7 @@ def import_patient_command(
     CT: a folder with DICOM, a DICOMDIR or zip archive, a NIfTI, NRRD or MHA file. LABELS: label maps, a folder with a file
     an organ, DICOM-SEG, RTSTRUCT; without them those that lie with the CT.
     """
+    check_folder(out)
     tissues = {TISSUE_OPTIONS[o]: label_words(text, o) for o, text in words.items() if text is not None}
     own = [] if organ is None else label_words(organ, "organ")
     place = None if seed is None else place_mm(seed)

@@ -2,33 +2,27 @@
 
 from scenes.patient import PARTS, Patient
 
-SUPINE = "under the organ of a patient lying supine"
+DRAFT = "grown from a seed and drawn by nobody: check every outline in check.png"
 
 
 def facts(patient: Patient) -> list[tuple[str, str]]:
     """What was found: a word and a line each."""
+    volumes = patient.volumes_ml
     size = " x ".join(str(n) for n in patient.ct.GetSize())
     spacing = " x ".join(f"{s:.2f}" for s in patient.spacing_mm)
     extent = " x ".join(f"{e:.0f}" for e in patient.organ.extents)
-    rows = [
-        (
-            "organ",
-            f"{patient.side} kidney, {patient.volumes_ml['organ']:.1f} ml (surface {patient.organ.volume / 1000:.1f})",
-        ),
-        ("extent", f"{extent} mm (right-left x front-back x foot-head)"),
-        ("surface", f"{len(patient.organ.faces)} faces, watertight"),
-    ]
+    surface_ml = patient.organ.volume / 1000
+    rows = [("DRAFT", DRAFT)] if patient.draft else []
+    rows.append(("organ", f"{patient.side} kidney, {volumes['organ']:.1f} ml (surface {surface_ml:.1f})"))
+    rows.append(("extent", f"{extent} mm (right-left x front-back x foot-head)"))
+    rows.append(("surface", f"{len(patient.organ.faces)} faces, watertight"))
     for tissue, name in PARTS.items():
+        word = name.replace("-system", "")
         if tissue in patient.parts:
-            rows.append(
-                (
-                    name.replace("-system", ""),
-                    f"{patient.volumes_ml[tissue]:.1f} ml, {len(patient.parts[tissue].faces)} faces",
-                )
-            )
+            rows.append((word, f"{volumes[tissue]:.1f} ml, {len(patient.parts[tissue].faces)} faces"))
         elif tissue == "tumour":
-            rows.append((name, "none"))
-    rows.append(("support", f"{len(patient.support.faces)} faces, {SUPINE}"))
+            rows.append((word, "none"))
+    rows.append(("support", f"{len(patient.support.faces)} faces, for a patient lying supine"))
     rows.append(("CT", f"{size} voxels of {spacing} mm"))
     return rows + [("note", note) for note in patient.notes]
 

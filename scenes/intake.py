@@ -18,8 +18,6 @@ from scenes.reading.progress import Progress, silent
 from scenes.reading.volume import Volume
 from scenes.seed import grown
 
-DRAFT = "DRAFT: the organ was grown from a seed and drawn by nobody; check every outline in check.png"
-
 
 @dataclass(frozen=True)
 class Request:
@@ -45,14 +43,15 @@ def take_in(request: Request, progress: Progress = silent) -> tuple[Patient, set
         drawings: list[Drawing] = []
         volume = open_ct(request.ct, request.series, progress=progress)
         labels = grown(volume, request.seed_mm)
-        notes: tuple[str, ...] = (DRAFT,)
+        notes: tuple[str, ...] = ()
     else:
         volume, drawings, labels = _with_labels(request, progress)
         notes = tuple(note for drawing in drawings for note in drawing.notes)
     organ = labels.called(request.organ) if request.organ else None
     patient = import_patient(volume, labels, organ, request.side, support=request.support)
     private = set(volume.secrets).union(*(drawing.secrets for drawing in drawings))
-    return replace(patient, notes=(*notes, *patient.notes)), private | _paths(request)
+    is_draft = request.seed_mm is not None
+    return replace(patient, notes=(*patient.notes, *notes), draft=is_draft), private | _paths(request)
 
 
 def _with_labels(request: Request, progress: Progress) -> tuple[Volume, list[Drawing], LabelMap]:

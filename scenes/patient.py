@@ -17,6 +17,7 @@ import trimesh
 from scipy import ndimage
 
 from scenes.bed import bed_of_file, bed_of_labels
+from scenes.cautions import cautions
 from scenes.organ import GROWN, INNER, PARENCHYMA, Organ, check_volume, midline_x, organs, single_out
 from scenes.reading.error import PatientError
 from scenes.reading.grid import Box, VoxelGrid
@@ -55,7 +56,8 @@ class Patient:
     side: Side
     volumes_ml: dict[str, float]  # of the labels: "organ" with all that is in it, and each part
     spacing_mm: tuple[float, float, float]  # of the CT's voxels along the image's own axes
-    notes: tuple[str, ...] = field(default=())  # what was chosen, left out, resampled
+    notes: tuple[str, ...] = field(default=())  # what was chosen, left out, resampled, or looks wrong
+    draft: bool = False  # grown from a seed, and drawn by nobody
 
     @property
     def tumour(self) -> trimesh.Trimesh | None:
@@ -97,6 +99,7 @@ def import_patient(
     slab, hounsfield = _level(ct, pieces, margin_mm)
     heights = np.concatenate([piece.grid.corners()[:, 2] for piece in pieces])
     midline = midline_x(ct.grid.part(slab), hounsfield, heights.min(), heights.max())
+    warned = cautions(ct.grid.part(slab), hounsfield, labels, midline)
     piece, told_side = single_out(pieces, midline, side)
     check_volume(piece)
     _check_overlap(ct.grid, piece)
@@ -117,7 +120,7 @@ def import_patient(
         side=told_side,
         volumes_ml={"organ": piece.volume_ml, **volumes},
         spacing_mm=tuple(grid.spacing.tolist()),
-        notes=ct.notes,
+        notes=(*warned, *ct.notes),
     )
 
 

@@ -48,9 +48,7 @@ def save_patient(
     Raises:
         PatientError: the folder exists and is not empty, cannot be written, or would have held something private.
     """
-    folder = Path(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise PatientError(f"{folder}: exists and is not an empty folder; choose another folder or remove it")
+    check_folder(folder)
     partial = folder.parent / f".{folder.name}.partial-{secrets.token_hex(4)}"
     try:
         partial.mkdir(parents=True)
@@ -68,6 +66,15 @@ def save_patient(
         reason = getattr(error, "strerror", None) or "the files could not be written"
         raise PatientError(f"{folder}: {reason}; choose a folder that can be written") from error
     return searched
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder that cannot become a patient's, before the work. Raises PatientError."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise PatientError(f"{folder}: exists and is not an empty folder; choose another folder or remove it")
+    above = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK):
+        raise PatientError(f"{folder}: cannot be made in {above}; choose a folder that can be written")
 
 
 def _write(patient: Patient, folder: Path, texts: dict[str, str]) -> None:

@@ -1,0 +1,69 @@
+"""The checking picture shows what was imported where it is, the way up that its letters say."""
+
+import matplotlib.image
+import numpy as np
+import pytest
+from synthetic_body import LEFT, TUMOUR, body, with_voxels
+
+from scenes.check_picture import COLOUR, PIXEL_MM, VIEWS, _bounds, _cut, draw_check
+from scenes.facts import facts
+from scenes.patient import import_patient
+from scenes.reading.labels import LabelMap
+from scenes.reading.volume import Volume
+
+LETTER = {(1, 0, 0): "L", (-1, 0, 0): "R", (0, 1, 0): "P", (0, -1, 0): "A", (0, 0, 1): "S", (0, 0, -1): "I"}
+NAMES = {2: "kidney_left", 3: "tumour"}
+
+
+@pytest.fixture(scope="module")
+def patient():
+    ct, labels = body(spacing=(3.0, 3.0, 3.0))
+    return import_patient(Volume.of(ct), LabelMap.of(labels, NAMES), side="left", margin_mm=30.0)
+
+
+@pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
+def test_letters_are_those_of_the_axes(view):
+    right, down = np.array(view.right), np.array(view.down)
+    assert view.letters == tuple(LETTER[tuple(axis)] for axis in (-right, right, -down, down))
+    # Seen from the feet, the front and the left: what is ahead comes towards the viewer.
+    towards = {"axial": (0, 0, -1), "coronal": (0, -1, 0), "sagittal": (1, 0, 0)}[view.name.split(",")[0]]
+    assert np.array_equal(-np.cross(right, down), towards)
+
+
+@pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
+def test_a_spot_is_drawn_on_its_side(patient, view):
+    """A bright spot to the left, front and head of the middle appears where the letters say."""
+    low, high = _bounds(patient.ct)
+    spot = (low + high) / 2 + [18.0, -15.0, 21.0]
+    voxels = np.zeros(patient.ct.GetSize()[::-1], np.int16)
+    voxels[patient.ct.TransformPhysicalPointToIndex(spot.tolist())[::-1]] = 1000
+    right, down = np.array(view.right, float), np.array(view.down, float)
+    spans = [sorted((low @ axis, high @ axis)) for axis in (right, down)]
+    picture = _cut(with_voxels(patient.ct, voxels), right, down, spans, spot)
+    row, column = np.unravel_index(picture.argmax(), picture.shape)
+    assert column * PIXEL_MM + spans[0][0] == pytest.approx(spot @ right, abs=2.0)  # a voxel is 3 mm
+    assert row * PIXEL_MM + spans[1][0] == pytest.approx(spot @ down, abs=2.0)
+
+
+def test_outlines_and_surfaces_are_in_the_picture(patient, tmp_path):
+    draw_check(patient, facts(patient), tmp_path)
+    picture = matplotlib.image.imread(tmp_path / "check.png")[..., :3]
+    assert picture.shape[:2] == (960, 1300)
+    half = picture.shape[0] // 2
+    for name in ("organ", "tumour"):
+        wanted = np.array([int(COLOUR[name][n : n + 2], 16) for n in (1, 3, 5)]) / 255
+        shown = np.abs(picture - wanted).max(axis=2) < 0.1
+        assert shown[:half].sum() > 300, name
+    # In the axial cut the tumour lies to the picture's right of the kidney: on the patient's left.
+    axial = picture[:half, : picture.shape[1] // 3]
+    middle = {}
+    for name in ("organ", "tumour"):
+        wanted = np.array([int(COLOUR[name][n : n + 2], 16) for n in (1, 3, 5)]) / 255
+        middle[name] = np.argwhere(np.abs(axial - wanted).max(axis=2) < 0.1).mean(axis=0)
+    assert middle["tumour"][1] > middle["organ"][1] + 20 and TUMOUR[0][0] > LEFT[0][0]
+
+
+def test_the_file_says_nothing_of_its_maker(patient, tmp_path):
+    draw_check(patient, facts(patient), tmp_path)
+    content = (tmp_path / "check.png").read_bytes()
+    assert not any(word in content for word in (b"tEXt", b"iTXt", b"eXIf", str(tmp_path).encode()))
