@@ -48,7 +48,15 @@ def take_in(request: Request, progress: Progress = silent) -> tuple[Patient, set
         volume, drawings, labels = _with_labels(request, progress)
         notes = tuple(note for drawing in drawings for note in drawing.notes)
     organ = labels.called(request.organ) if request.organ else None
-    patient = import_patient(volume, labels, organ, request.side, support=request.support)
+    patient = import_patient(
+        volume,
+        labels,
+        organ,
+        request.side,
+        support=request.support,
+        needed=set(request.tissues),
+        progress=progress,
+    )
     private = set(volume.secrets).union(*(drawing.secrets for drawing in drawings))
     is_draft = request.seed_mm is not None
     return replace(patient, notes=(*patient.notes, *notes), draft=is_draft), private | _paths(request)

@@ -6,7 +6,7 @@ DICOM has them. Voxels are cropped, and resampled only where a series is tilted 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
@@ -23,6 +23,7 @@ from scenes.reading.error import PatientError
 from scenes.reading.grid import Box, VoxelGrid
 from scenes.reading.labels import LabelMap, nearest, present
 from scenes.reading.names import Side
+from scenes.reading.progress import Progress, silent
 from scenes.reading.volume import Volume
 from scenes.support import cradle
 from scenes.surfaces import surface_from_mask
@@ -77,6 +78,8 @@ def import_patient(
     side: Side | None = None,
     margin_mm: float = 60.0,
     support: str = "mould",
+    needed: Collection[str] = (),
+    progress: Progress = silent,
 ) -> Patient:
     """Cut one organ out of a CT and its label map and build its surfaces and its support.
 
@@ -89,6 +92,8 @@ def import_patient(
         margin_mm: CT kept around the organ [mm].
         support: what the organ lies on: a "mould" of its underside, the bed that surrounding "labels" make, or a file with a
             surface.
+        needed: tissues that must be in the organ, because the user said where they are.
+        progress: shows how far it is.
 
     Raises:
         PatientError: one line that says what was found, what was expected and what to do.
@@ -109,7 +114,7 @@ def import_patient(
     marks, tissues = _marks(labels, piece, grid, on_ct)
 
     surface = _surface(piece.grid.image(piece.mask.astype(np.uint8)), "organ", FACES)
-    parts, volumes = _parts(labels, piece)
+    parts, volumes = _parts(labels, piece, needed, progress)
     return Patient(
         ct=grid.image(voxels),
         labels=grid.image(marks),
@@ -226,10 +231,12 @@ def _marks(
     return marks, {code: tissue for tissue, code in codes.items()}
 
 
-def _parts(labels: LabelMap, piece: Organ) -> tuple[dict[str, trimesh.Trimesh], dict[str, float]]:
+def _parts(
+    labels: LabelMap, piece: Organ, needed: Collection[str], progress: Progress
+) -> tuple[dict[str, trimesh.Trimesh], dict[str, float]]:
     """Surface and volume [ml] of what is told apart in the organ, and of its vessels and collecting system near it."""
     surfaces, volumes = {}, {}
-    for tissue in PARTS:
+    for tissue in progress(PARTS, "surfaces"):
         values = labels.of_tissues(tissue)
         if not values:
             continue
@@ -239,10 +246,10 @@ def _parts(labels: LabelMap, piece: Organ) -> tuple[dict[str, trimesh.Trimesh], 
             else (piece.grid, piece.mask & np.isin(piece.values, values))
         )
         if not inside.any():
-            if tissue == "tumour":
+            if tissue in needed:
                 raise PatientError(
-                    f"the tumour's label has no voxel in this kidney ({piece.title}): expected a tumour of it; choose "
-                    "the other side or leave the tumour out"
+                    f"the {tissue}'s label has no voxel in this kidney ({piece.title}): expected one of it; choose "
+                    f"the other side or leave the {tissue} out"
                 )
             continue
         voxel_ml = float(np.prod(grid.spacing)) / 1000.0

@@ -50,7 +50,8 @@ def label_map(labels, organ=(), **tissues):
 
 
 def imported(ct, labels, organ=(), side=None, margin_mm=60.0, **tissues):
-    return import_patient(Volume.of(ct), *label_map(labels, organ, **tissues), side, margin_mm)
+    labelled = label_map(labels, organ, **tissues)
+    return import_patient(Volume.of(ct), *labelled, side, margin_mm, needed=set(tissues))
 
 
 def found(ct, labels, organ=(), side=None, **tissues):
@@ -237,7 +238,7 @@ class TestImportRefuses:
     def test_organ_that_is_no_soft_tissue(self, ct_and_labels):
         ct, labels = ct_and_labels
         with pytest.raises(PatientError, match="soft tissue"):
-            imported(ct + 1024, labels, organ=[2])
+            imported(ct + 800, labels, organ=[2])
 
 
 class TestSave:

@@ -7,20 +7,24 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import SimpleITK as sitk
 
 from scenes.reading.contours import read_contours, referenced_series
 from scenes.reading.ct import dicom_or_words
 from scenes.reading.error import PatientError
 from scenes.reading.files import ITK, NIFTI, file_volume, is_volume_file, itk_header, itk_layers
-from scenes.reading.grid import VoxelGrid
+from scenes.reading.grid import Box, VoxelGrid
 from scenes.reading.headers import Found, read_header
-from scenes.reading.labels import LabelMap, Segment, whole_numbers
+from scenes.reading.labels import LabelMap, Segment, box_of, whole_numbers
 from scenes.reading.names import is_far, side_of, tissue_of
 from scenes.reading.progress import Progress, silent
 from scenes.reading.secrets import secrets_of
 from scenes.reading.segmentation import read_segmentation
+from scenes.reading.volume import Volume
 
+# An import keeps 60 mm around its organ, and a probe sees as far.
+NEAR_MM = 80.0
 SLICER_KEY = re.compile(r"Segment(\d+)_Name$")
 
 
@@ -148,24 +152,48 @@ def _one_an_organ(folder: Path, files: list[Path], wanted: Collection[str], prog
     """One file an organ, as TotalSegmentator leaves them: named by their files, and empty where an organ is not there."""
     asked = {word.casefold() for word in wanted}
     near = [f for f in files if _stem(f).casefold() in asked or not is_far(_stem(f))]
+    # Kidneys first: of the rest, what is near them is read.
+    near.sort(key=lambda file: tissue_of(_stem(file)) != "kidney")
     maps: list[LabelMap] = []
     secrets: set[str] = set()
+    around: np.ndarray | None = None
     for file in progress(near, "labels"):
         volume = file_volume(file)
         secrets |= volume.secrets
-        voxels = volume.read()
-        if not voxels.any():
-            continue
-        # Other numbers than 0 and 1 are shares, or an image among the labels.
-        values = whole_numbers(voxels, str(file))
-        one = LabelMap.single(volume.grid, values > 0, Segment.named(_stem(file)))
+        is_kidney = tissue_of(_stem(file)) == "kidney"
+        box = volume.grid.whole()
+        if around is not None and not is_kidney:
+            box = volume.grid.box_around(around[0], around[1])
+        one = _organ(file, volume, box)
         if one is not None:
             maps.append(one)
+        if is_kidney:
+            places = [m.grid.corners() for m in maps]
+            around = _around(np.concatenate(places)) if places else None
     if not maps:
         raise PatientError(
             f"{folder}: all {len(near)} label files are empty; expected an organ; choose other labels"
         )
     return Drawing(lambda _: maps, secrets=frozenset(secrets))
+
+
+def _around(places: np.ndarray) -> np.ndarray:
+    """Corners (2, 3) of the box of LPS [mm] that a picture of what is at places can show."""
+    return np.array([places.min(axis=0) - NEAR_MM, places.max(axis=0) + NEAR_MM])
+
+
+def _organ(file: Path, volume: Volume, box: Box) -> LabelMap | None:
+    """What one file marks in a box; None where that is nothing."""
+    if any(a.start == a.stop for a in box):
+        return None
+    voxels = volume.read(box)
+    marked = box_of(voxels)
+    if marked is None:
+        return None
+    # Other numbers than whole ones are shares, or an image among the labels.
+    values = whole_numbers(voxels[marked[::-1]], str(file))
+    grid = volume.grid.part(box).part(marked)
+    return LabelMap.single(grid, values > 0, Segment.named(_stem(file)))
 
 
 def _stem(path: Path) -> str:
