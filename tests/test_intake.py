@@ -1,0 +1,177 @@
+"""The command import from end to end: what a hospital sends becomes a patient's folder that names nobody."""
+
+import numpy as np
+import pytest
+from dicom_series import PERSON, Series, write_segmentation, write_structures, zipped
+from synthetic_body import BODY, DIRECTIONS, LEFT, RIGHT, TUMOUR, level
+
+from app import main
+from scenes.anatomy import load_anatomy
+from scenes.command import place_mm
+from scenes.intake import Request, take_in
+from scenes.patient_folder import save_patient, telling
+from scenes.reading.error import PatientError
+from scenes.scene import load_scene
+
+SPINE = np.array([0.0, 70.0, 0.0]), np.array([22.0, 20.0, 400.0])
+ORIGIN = (-175.0, -120.0, -56.0)
+SIZE = (438, 343, 36)
+
+
+def hounsfield(places):
+    """HU of the synthetic body, with a spine."""
+    found = np.full(places.shape[:-1], -1000.0)
+    for value, solid in ((40, BODY), (500, SPINE), (120, LEFT), (120, RIGHT), (70, TUMOUR)):
+        found[level(places, solid) < 0] = value
+    return found
+
+
+@pytest.fixture(scope="module")
+def hospital(tmp_path_factory):
+    """A DICOM folder as a hospital sends it: a CT and a segmentation of it."""
+    folder = tmp_path_factory.mktemp("hospital") / "Doe_Jane"
+    series = Series(
+        folder / "ct", DIRECTIONS["identity"], size=SIZE, gap=3.5, field=hounsfield, origin=ORIGIN
+    )
+    series.write()
+    places = np.stack([series.places(k) for k in range(SIZE[2])])
+    masks = {
+        "Left kidney": level(places, LEFT) < 0,
+        "Right kidney": level(places, RIGHT) < 0,
+        "Renal mass": level(places, TUMOUR) < 0,
+    }
+    masks["Left kidney"] &= ~masks["Renal mass"]
+    write_segmentation(folder / "seg" / "labels.dcm", series, masks)
+    return folder, series
+
+
+@pytest.fixture(scope="module")
+def written(hospital, tmp_path_factory):
+    """What the command leaves of it."""
+    out = tmp_path_factory.mktemp("patients") / "a"
+    assert main(["import", str(hospital[0]), "--side", "left", "--out", str(out)]) == 0
+    return out
+
+
+def test_the_folder_is_a_scene(written):
+    scene = load_scene(written / "scene.toml")
+    anatomy = load_anatomy(scene, written)
+    assert scene.title == "Left kidney"
+    np.testing.assert_allclose(anatomy.tumour.center_mass, TUMOUR[0], atol=1.0)
+    assert anatomy.organ.center_mass[0] > 0 and anatomy.ct is not None
+    assert scene.attachment.at_mm is not None and scene.attachment.radius_mm == 0
+    assert {file.name for file in written.iterdir()} == {
+        "check.png", "ct.nrrd", "labels.nrrd", "organ.stl", "scene.toml", "support.stl", "tumour.stl",
+    }  # fmt: skip
+    assert [entry.name for entry in written.parent.iterdir()] == ["a"]
+
+
+def test_nothing_names_the_patient(written, hospital):
+    folder, series = hospital
+    secrets = [*PERSON.values(), "Doe", "Jane", series.uid, series.frame_of_reference, series.study]
+    secrets += [str(folder), "Doe_Jane", *series.sops]
+    words = [value for value in secrets if len(value) > 3]
+    assert len(words) > 40
+    for file in written.iterdir():
+        content = file.read_bytes()
+        assert not [word for word in words if word.encode() in content], file.name
+
+
+def test_the_terminal_names_nobody_and_tells_the_facts(hospital, tmp_path, capfd):
+    assert main(["import", str(hospital[0]), "--side", "right", "--out", str(tmp_path / "b")]) == 0
+    said = capfd.readouterr()
+    assert "right kidney" in said.out and "none is in the files" in said.out
+    for text in ("Doe", "Jane", "4711", "19600229", hospital[1].uid):
+        assert text not in said.out + said.err
+
+
+def test_what_was_read_is_known_to_be_private(hospital):
+    folder, series = hospital
+    _, private = take_in(Request(folder, side="left"))
+    assert {"Doe^Jane", "Doe", "Jane", "19600229", "A1234567", series.uid, series.sops[0]} <= private
+    assert str(folder.resolve()) in private
+
+
+def test_contours_on_an_archive(hospital, tmp_path):
+    folder, series = hospital
+    angle = np.linspace(0, 2 * np.pi, 90, endpoint=False)
+    contours = []
+    for k in range(SIZE[2]):
+        z = series.positions(k)[2]
+        share = 1 - ((z - LEFT[0][2]) / LEFT[1][2]) ** 2
+        if share > 0.01:
+            x, y = (
+                LEFT[0][i] + LEFT[1][i] * np.sqrt(share) * f(angle) for i, f in ((0, np.cos), (1, np.sin))
+            )
+            contours.append(np.column_stack([x, y, np.full(90, z)]))
+    structures = write_structures(tmp_path / "rt.dcm", {"Kidney_L": contours, "External": []}, series.uid)
+    archive = zipped(folder / "ct", tmp_path / "ct.zip")
+    patient, _ = take_in(Request(archive, [structures]))
+    assert patient.side == "left"
+    assert patient.volumes_ml["organ"] == pytest.approx(4 / 3 * np.pi * LEFT[1].prod() / 1000, rel=0.02)
+    np.testing.assert_allclose(patient.organ.center_mass, LEFT[0], atol=0.5)
+
+
+def test_labels_of_another_examination(hospital, tmp_path):
+    folder, _series = hospital
+    other = Series(tmp_path / "ct", DIRECTIONS["identity"], size=(20, 20, 6), origin=ORIGIN, field=hounsfield)
+    other.write()
+    with pytest.raises(PatientError, match="another frame of reference"):
+        take_in(Request(tmp_path / "ct", [folder / "seg"]))
+    with pytest.raises(PatientError, match="no labels lie with this CT.*--seed"):
+        take_in(Request(tmp_path / "ct"))
+
+
+class TestPrivate:
+    @pytest.fixture(scope="class")
+    def patient(self, hospital):
+        return take_in(Request(hospital[0], side="left"))[0]
+
+    @pytest.mark.parametrize("secret", ["Doe", "Doe^Jane", "19600229", "1.2.826.0.1.3680043.8.498.1", "Ünal"])
+    def test_a_file_that_would_name_somebody_is_not_written(self, patient, tmp_path, secret):
+        texts = {"scene.toml": f'title = "kidney of {secret}"\n'}
+        with pytest.raises(PatientError, match=r"scene\.toml would have held something") as caught:
+            save_patient(patient, tmp_path / "p", texts, private={secret, "Nobody"})
+        assert secret not in str(caught.value) and list(tmp_path.iterdir()) == []
+        assert save_patient(patient, tmp_path / "p", {"scene.toml": ""}, private={secret, "Nobody"}) == 2
+
+    def test_headers_of_images_and_surfaces_are_searched(self, patient, tmp_path):
+        def draw(folder):
+            organ = folder / "organ.stl"
+            organ.write_bytes(b"solid of Doe".ljust(80) + organ.read_bytes()[80:])
+
+        with pytest.raises(PatientError, match=r"organ\.stl would have held"):
+            save_patient(patient, tmp_path / "p", draw=draw, private={"Doe"})
+        assert list(tmp_path.iterdir()) == []
+
+    def test_words_of_every_file_name_nobody(self):
+        assert telling("Doe") and telling("Left^Doe") and telling("123456") and telling("1.2.3")
+        assert not any(map(telling, ["", "7", "AB", "12345", "kidney", "Left Kidney", "STL"]))
+
+    def test_an_interrupted_import_leaves_nothing(self, patient, tmp_path):
+        def draw(_):
+            raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            save_patient(patient, tmp_path / "p", draw=draw)
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_the_folder_is_checked_before_the_work(tmp_path, capfd):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "precious.txt").write_text("mine")
+    assert main(["import", "nowhere", "--out", str(tmp_path / "mine")]) == 2
+    assert "exists and is not an empty folder" in capfd.readouterr().err
+    assert main(["import", "nowhere", "--out", str(tmp_path / "mine" / "precious.txt" / "p")]) == 2
+    assert "cannot be made in" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["", "1,2", "1,2,3,4", "a,b,c", "1,2,nan"])
+def test_a_seed_is_three_numbers(text):
+    with pytest.raises(PatientError, match="three numbers X,Y,Z"):
+        place_mm(text)
+
+
+def test_a_seed_or_labels(tmp_path):
+    with pytest.raises(PatientError, match="not both"):
+        take_in(Request(tmp_path, [tmp_path], seed_mm=np.zeros(3)))
