@@ -5,10 +5,6 @@ from pathlib import Path
 import click
 import numpy as np
 
-from scenes.anatomy import patient_scene
-from scenes.check_picture import draw_check
-from scenes.facts import facts, told
-from scenes.intake import Request, take_in
 from scenes.patient_folder import check_folder, save_patient
 from scenes.reading.error import PatientError
 from scenes.reading.names import Side
@@ -60,6 +56,12 @@ def import_patient_command(
     an organ, DICOM-SEG, RTSTRUCT; without them those that lie with the CT.
     """
     check_folder(out)
+    # What draws and what reads segmentations takes half a second that no other command should wait for.
+    from scenes.anatomy import patient_scene
+    from scenes.check_picture import draw_check
+    from scenes.facts import facts, told
+    from scenes.intake import Request, take_in
+
     tissues = {TISSUE_OPTIONS[o]: label_words(text, o) for o, text in words.items() if text is not None}
     own = [] if organ is None else label_words(organ, "organ")
     place = None if seed is None else place_mm(seed)

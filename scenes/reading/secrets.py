@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from pydicom.dataset import Dataset
 
+from scenes.reading.error import PatientError
 from scenes.reading.headers import read_header
 from scenes.reading.source import Item
 
@@ -23,7 +24,14 @@ PERSONAL_KEYWORDS = (
 
 def secrets_of(item: Item) -> frozenset[str]:
     """Every name, id, date, institution, uid and private text of one DICOM file."""
-    return frozenset(text for text in _texts(read_header(item, tags=None)) if text)
+    try:
+        return frozenset(text for text in _texts(read_header(item, tags=None)) if text)
+    except PatientError:
+        raise
+    except Exception as error:  # a value's faults are many; all of them are the file's
+        raise PatientError(
+            f"{item.name}: a damaged DICOM file ({type(error).__name__}); copy or export it again"
+        ) from error
 
 
 def _texts(data: Dataset) -> Iterator[str]:
