@@ -10,8 +10,8 @@ import numpy as np
 
 from scenes.patient import Patient, import_patient
 from scenes.reading.ct import dicom_or_words, open_ct
-from scenes.reading.drawn import Drawing, drawing_of, open_labels
 from scenes.reading.error import PatientError
+from scenes.reading.label_files import Drawing, drawing_of, open_labels
 from scenes.reading.labels import LabelMap, merged, with_tissues
 from scenes.reading.names import Side
 from scenes.reading.progress import Progress, silent

@@ -36,7 +36,7 @@ SEED_BALL_MM, OFF_SEED_MM = 4.5, 6.0
 VOLUME_ML = (40.0, 450.0)
 # A surface is a tissue's end where 2 to 4 mm outside it HU differ by this share of the region's contrast to fat.
 EDGE_SHARE = 0.25
-# Measured on five kidneys: at least 0.79 and 0.69; on a spleen and a kidney in one: at most 0.82 and 0.61.
+# The kidneys that this was made on lie above both; a spleen and a kidney grown into one, under the second.
 LEAST_EDGE, LEAST_SOLIDITY = 0.75, 0.65
 ELSEWHERE = "give a point deeper in the parenchyma, or draw labels"
 

@@ -12,7 +12,7 @@ from synthetic_body import BODY, LEFT, RIGHT, drawn, grid_around, voxels_to_boun
 import scenes.patient
 from scenes.patient import import_patient
 from scenes.reading.ct import open_ct
-from scenes.reading.drawn import open_labels
+from scenes.reading.label_files import open_labels
 from scenes.reading.labels import merged, with_tissues
 
 # Axes of the voxels along the patient's in any order and sense, 48 in all, half of them left-handed.

@@ -26,8 +26,8 @@ from pydicom.uid import DeflatedExplicitVRLittleEndian, generate_uid
 from synthetic_body import DIRECTIONS, grid_around, with_voxels
 
 from scenes.reading.ct import open_ct, read_volume
-from scenes.reading.drawn import open_labels
 from scenes.reading.error import PatientError
+from scenes.reading.label_files import open_labels
 from scenes.reading.volume import Volume
 
 AIR = -1000
@@ -226,7 +226,7 @@ class TestRealData:
     def test_perfusion_map(self, data):
         file = data / SYNTAXES / "CT0012.fragmented_no_bot_jpeg_baseline.51.dcm"
         said = refusal(file)
-        assert "PERFUSION" in said and said.count(file.name) == 1
+        assert "PERFUSION" in said and said.count(file.name) == 0
 
     @pytest.mark.parametrize(
         ("folder", "words"),

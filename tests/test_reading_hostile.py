@@ -22,9 +22,9 @@ from dicom_series import (
 )
 from pydicom.uid import DeflatedExplicitVRLittleEndian
 
-from scenes.reading import headers, source
+from scenes.reading import dicom_file, source
 from scenes.reading.ct import open_ct
-from scenes.reading.drawn import open_labels
+from scenes.reading.label_files import open_labels
 
 MIB = 2**20
 # What reading a refused file may take at its peak.
@@ -123,12 +123,12 @@ class TestDicom:
 
     @pytest.mark.parametrize("honest", [True, False])
     def test_deflated_bomb(self, tmp_path, refused, honest, monkeypatch):
-        monkeypatch.setattr(headers, "MOST_INFLATED", 64 * MIB)
+        monkeypatch.setattr(dicom_file, "MOST_INFLATED", 64 * MIB)
         save(Series(tmp_path).slice(0, syntax=DeflatedExplicitVRLittleEndian), tmp_path / "bomb.dcm")
         assert "inflates to more than" in refused(inflating(tmp_path / "bomb.dcm", honest))
 
     def test_deflated_medium(self, tmp_path, refused, monkeypatch):
-        monkeypatch.setattr(headers, "MOST_INFLATED", 64 * MIB)
+        monkeypatch.setattr(dicom_file, "MOST_INFLATED", 64 * MIB)
         listed = listing_dicomdir(tmp_path / "cd", ["IM1"])
         data = pydicom.dcmread(listed)
         data.file_meta.TransferSyntaxUID = DeflatedExplicitVRLittleEndian

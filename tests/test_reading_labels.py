@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from synthetic_body import DIRECTIONS, drawn, grid_around, level
 
 from scenes.reading.ct import open_ct
-from scenes.reading.drawn import open_labels
 from scenes.reading.error import PatientError
 from scenes.reading.grid import VoxelGrid
+from scenes.reading.label_files import open_labels
 from scenes.reading.labels import LabelMap, Segment, merged, with_tissues
 from scenes.reading.names import is_far, side_of, tissue_of
 

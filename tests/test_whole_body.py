@@ -6,7 +6,7 @@ import SimpleITK as sitk
 
 from scenes.phantom import make_phantom
 from scenes.reading.ct import open_ct
-from scenes.reading.drawn import open_labels
+from scenes.reading.label_files import open_labels
 from studies.intake.whole_body import GAP_MM, PIXELS, write_whole_body
 
 

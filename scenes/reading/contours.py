@@ -6,9 +6,9 @@ import numpy as np
 from pydicom.dataset import Dataset
 from skimage.draw import polygon
 
+from scenes.reading.dicom_file import parsed
 from scenes.reading.error import PatientError
 from scenes.reading.grid import VoxelGrid
-from scenes.reading.headers import parsed
 from scenes.reading.labels import LabelMap, Segment
 from scenes.reading.source import Item
 
@@ -48,10 +48,13 @@ def read_contours(item: Item, ct: VoxelGrid) -> list[LabelMap]:
 
 def referenced_series(data: Dataset) -> str:
     """The uid of the series that a structure set was drawn on; empty where it does not say."""
-    for frame in data.get("ReferencedFrameOfReferenceSequence") or []:
-        for study in frame.get("RTReferencedStudySequence") or []:
-            for series in study.get("RTReferencedSeriesSequence") or []:
-                return str(series.get("SeriesInstanceUID", ""))
+    try:
+        for frame in data.get("ReferencedFrameOfReferenceSequence") or []:
+            for study in frame.get("RTReferencedStudySequence") or []:
+                for series in study.get("RTReferencedSeriesSequence") or []:
+                    return str(series.get("SeriesInstanceUID", ""))
+    except Exception:  # a parser's faults are many; without it the best series is taken
+        return ""
     return ""
 
 
@@ -79,6 +82,11 @@ def _contours(roi: Dataset) -> list[np.ndarray]:
 def _filled(name: str, contours: list[np.ndarray], ct: VoxelGrid) -> tuple[VoxelGrid, np.ndarray]:
     """A region's voxels, and their grid: a CT's pixels, on the planes of its contours."""
     places = [ct.index(points) for points in contours]
+    ends = np.array(ct.size)
+    if any((place < -ends).any() or (place > 2 * ends).any() for place in places):
+        raise PatientError(
+            f"{name}: contours lie far outside this CT; expected contours on it; give the CT that they were drawn on"
+        )
     heights = np.array([place[:, 2].mean() for place in places])
     if max(np.ptp(place[:, 2]) for place in places) > 1:
         raise PatientError(

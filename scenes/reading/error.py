@@ -3,3 +3,6 @@
 
 class PatientError(ValueError):
     """One line for the user: which file, what was found, what was expected, what to do."""
+
+    def __init__(self, line: str) -> None:
+        super().__init__("".join(letter if letter.isprintable() else "?" for letter in line))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
+import re
 import warnings
-import zlib
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,6 +16,9 @@ from scenes.reading.error import PatientError
 from scenes.reading.grid import Box, VoxelGrid
 from scenes.reading.volume import Volume
 
+# What is wrong is said in an error.
+logging.getLogger("nibabel").setLevel(logging.CRITICAL)
+
 NIFTI = (".nii", ".nii.gz")
 ITK = (".nrrd", ".nhdr", ".mha", ".mhd")
 MOST_BYTES = 8 * 2**30
@@ -24,7 +28,8 @@ SLAB_VOXELS = 8_000_000
 MM_OF_UNIT = {"meter": 1000.0, "micron": 0.001}
 SCANNER_CODE = 1
 RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0])
-HEADER_BYTES = 1 << 16
+HEADER_BYTES, HEADER_LINE = 1 << 22, 1 << 16
+NRRD = (".nrrd", ".nhdr")
 
 
 def is_volume_file(path: Path) -> bool:
@@ -68,7 +73,7 @@ def _nifti(path: Path) -> Volume:
             for k in range(z.start, z.stop, slabs):
                 part = image.dataobj[(x, y, slice(k, min(k + slabs, z.stop)), *last)]
                 planes.append(_narrow(np.asarray(part)).T)
-        except (OSError, EOFError, ValueError, zlib.error) as error:
+        except Exception as error:  # a parser's faults are many; all of them are the file's
             raise _cut_off(path) from error
         return np.concatenate(planes)
 
@@ -135,17 +140,16 @@ def _itk(path: Path) -> Volume:
     kind = sitk.GetPixelIDValueAsString(reader.GetPixelID())
     if reader.GetNumberOfComponents() != 1 or "complex" in kind:
         raise PatientError(f"{path}: each voxel holds a {kind}; expected one number; export a scalar volume")
-    texts = [
-        reader.GetMetaData(key) for key in reader.GetMetaDataKeys() if not key.startswith(("NRRD_", "ITK_"))
-    ]
+    texts = [text for key, text in metadata(reader).items() if not key.startswith(("NRRD_", "ITK_"))]
     grid = VoxelGrid.of(reader)
     return Volume(str(path), grid, lambda box: _itk_box(path, box), secrets=frozenset(t for t in texts if t))
 
 
 def itk_header(path: Path) -> sitk.ImageFileReader:
     """The header of an NRRD or MetaImage file, of one component or several. Raises PatientError."""
-    _check_data_file(path)
+    data_file = _data_file(path)
     reader = sitk.ImageFileReader()
+    reader.SetImageIO("NrrdImageIO" if path.suffix.lower() in NRRD else "MetaImageIO")
     reader.SetFileName(str(path))
     try:
         reader.ReadImageInformation()
@@ -160,7 +164,8 @@ def itk_header(path: Path) -> sitk.ImageFileReader:
         raise PatientError(
             f"{path}: says no space (such as left-posterior-superior), so left may be right; export it again"
         )
-    _check_size(path, VoxelGrid.of(reader).checked(str(path)), 1, packed=True)
+    grid = VoxelGrid.of(reader).checked(str(path))
+    _check_size(path, grid, _bytes_of(reader), packed=True, held=data_file.stat().st_size)
     return reader
 
 
@@ -188,10 +193,10 @@ def _cut_off(path: Path) -> PatientError:
     return PatientError(f"{path}: cannot be read to its end; expected a whole file; copy or export it again")
 
 
-def _check_size(path: Path, grid: VoxelGrid, voxel_bytes: int, packed: bool) -> None:
+def _check_size(path: Path, grid: VoxelGrid, voxel_bytes: int, packed: bool, held: int | None = None) -> None:
     """Refuse a header that claims more than the file can hold, or than the memory should."""
     claimed = float(np.prod(np.array(grid.size, float))) * voxel_bytes
-    held = path.stat().st_size * (MOST_PACKED if packed else 1)
+    held = (path.stat().st_size if held is None else held) * (MOST_PACKED if packed else 1)
     if claimed > min(held, MOST_BYTES):
         size = " x ".join(map(str, grid.size))
         raise PatientError(
@@ -199,24 +204,55 @@ def _check_size(path: Path, grid: VoxelGrid, voxel_bytes: int, packed: bool) -> 
         )
 
 
-def _check_data_file(path: Path) -> None:
-    """Refuse a header whose voxels lie in another folder, or in several files."""
+def _data_file(path: Path) -> Path:
+    """The file with a header's voxels: the same, or one beside it. Raises PatientError: elsewhere, or several."""
+    nrrd = path.suffix.lower() in NRRD
+    found: list[str] = []
+    dimensions: list[str] = []
     with path.open("rb") as file:
-        header = file.read(HEADER_BYTES).split(b"\n\n")[0].decode("latin-1")
-    for line in header.splitlines():
-        key, _, value = line.partition(":" if path.suffix.lower() in (".nrrd", ".nhdr") else "=")
-        if key.strip().lower().replace(" ", "") not in ("datafile", "elementdatafile"):
-            continue
-        name = value.strip()
-        if name.upper() == "LOCAL":
-            return
-        beside = (path.parent / name).resolve()
-        if name.upper().startswith("LIST") or "%" in name or not beside.is_relative_to(path.parent.resolve()):
-            raise PatientError(
-                f"{path}: its voxels lie in {name[:60]!r}; expected one file beside it; convert it to one NRRD file"
-            )
-        if not beside.is_file():
-            raise PatientError(
-                f"{path}: its voxels should lie in {name[:60]!r}, which is not there; copy both files"
-            )
-        return
+        while len(line := file.readline(HEADER_LINE)) < HEADER_LINE and file.tell() < HEADER_BYTES:
+            text = line.decode("latin-1")
+            if not line or (nrrd and not text.strip("\r\n")):
+                break
+            colon, equals = text.find(":"), text.find("=")
+            at = min((a for a in (colon, colon if nrrd else equals) if a >= 0), default=-1)
+            key, value = text[:at].strip().lower().replace(" ", ""), text[at + 1 :].strip(" \t\r\n=")
+            if at >= 0 and key == "ndims":
+                dimensions.append(value)
+            if at >= 0 and key in ("datafile", "elementdatafile"):
+                found.append(value)
+                if not nrrd:
+                    break
+        else:
+            raise PatientError(f"{path}: its header has no end; expected a few lines; export it again")
+    if not nrrd and (len(found) != 1 or dimensions != ["3"]):
+        raise PatientError(
+            f"{path}: its header says {' and '.join(dimensions)[:20] or 'no'} dimensions; expected one 3D volume, and where its "
+            "voxels lie; export one volume"
+        )
+    if found in ([], ["LOCAL"], ["local"]):
+        return path
+    name = found[0]
+    plain = name.isprintable() and len(name) < 256 and not name.upper().startswith("LIST") and "%" not in name
+    beside = (path.parent / name).resolve() if plain else path
+    if not plain or len(found) > 1 or not beside.is_relative_to(path.parent.resolve()):
+        raise PatientError(
+            f"{path}: its voxels lie in {name[:60]!r}; expected one file beside it; convert it to one NRRD file"
+        )
+    if not beside.is_file():
+        raise PatientError(
+            f"{path}: its voxels should lie in {name[:60]!r}, which is not there; copy both files"
+        )
+    return beside
+
+
+def metadata(reader: sitk.ImageFileReader) -> dict[str, str]:
+    """What a header says; keys that are no text say nothing."""
+    return {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys() if key.isprintable()}
+
+
+def _bytes_of(reader: sitk.ImageFileReader) -> int:
+    """Bytes of one voxel with all its components."""
+    kind = sitk.GetPixelIDValueAsString(reader.GetPixelID())
+    bits = re.search(r"(\d+)-bit", kind)
+    return reader.GetNumberOfComponents() * (int(bits[1]) // 8 if bits else 8)

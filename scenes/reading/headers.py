@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import warnings
-import zlib
+import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
-import pydicom
-from pydicom import config
-from pydicom.dataset import Dataset
+from pydicom.dataset import Dataset, FileDataset
 
+from scenes.reading.dicom_file import is_directory, parsed, text_of
 from scenes.reading.error import PatientError
-from scenes.reading.source import MAGIC, MAGIC_AT, Item
-
-# A value that breaks the standard is found where it matters, and warnings would print it.
-config.settings.reading_validation_mode = config.IGNORE
+from scenes.reading.source import Item
 
 CT_CLASSES = {
     "1.2.840.10008.5.1.4.1.1.2",
@@ -27,8 +22,6 @@ CT_CLASSES = {
 SEGMENTATIONS = {"1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7"}
 STRUCTURE_SET = "1.2.840.10008.5.1.4.1.1.481.3"
 MOST_PIXELS = 8192 * 8192
-# A deflated data set names its syntax in the first bytes; after them it may be a bomb.
-DEFLATED, META_LENGTH_AT, MOST_INFLATED = b"1.2.840.10008.1.2.1.99", 140, 2 * 2**30
 TAGS = [
     "SOPClassUID",
     "SOPInstanceUID",
@@ -54,6 +47,7 @@ TAGS = [
     "SharedFunctionalGroupsSequence",
     "PerFrameFunctionalGroupsSequence",
 ]
+MODALITY = re.compile("[A-Z]{2,8}")
 LOCALIZERS = {"LOCALIZER", "SCOUT", "TOPOGRAM"}
 # Third and fourth values of ImageType whose pixels are no HU.
 NOT_HU = {
@@ -86,6 +80,7 @@ class Slice:
     rows: int
     slope: float
     intercept: float
+    is_rescaled: bool  # whether its header says how stored values become HU
     padding: tuple[int, int] | None  # raw values between which pixels mean nothing
 
     @property
@@ -121,64 +116,37 @@ def read_headers(items: list[Item], progress: Callable[[Iterable[Item]], Iterabl
     found = Found()
     for item in progress(items):
         header = read_header(item)
-        sop_class = str(header.get("SOPClassUID", ""))
+        sop_class = text_of(item.name, header, "SOPClassUID")
+        if not sop_class and is_directory(header):
+            continue
         if sop_class in SEGMENTATIONS:
             found.segmentations.append(item)
         elif sop_class == STRUCTURE_SET:
             found.structure_sets.append(item)
         elif sop_class in CT_CLASSES:
             _add_slices(found, item, header)
-        elif sop_class != "1.2.840.10008.1.3.10":  # a DICOMDIR
-            what = str(header.get("Modality") or "files of no known kind")
+        elif not sop_class and header.preamble is not None:
+            raise PatientError(
+                f"{item.name}: a damaged DICOM file (it says not what it is); copy or export it again"
+            )
+        else:
+            what = text_of(item.name, header, "Modality")
+            # Anything else may be free text, which may name the patient.
+            what = what if MODALITY.fullmatch(what) else "files of no known kind"
             found.others[what] = found.others.get(what, 0) + 1
     return found
 
 
-def read_header(item: Item, tags: list[str] | None = TAGS) -> Dataset:
+def read_header(item: Item, tags: list[str] | None = TAGS) -> FileDataset:
     """A file's elements but its pixels, all of them with tags None. Raises PatientError."""
     with item.open() as file:
         return parsed(file, item.name, stop_before_pixels=True, specific_tags=tags)
 
 
-def parsed(file: BinaryIO, name: str, **options: Any) -> Dataset:
-    """A DICOM data set, read with pydicom's options; memory is bounded and faults are in words. Raises PatientError."""
-    try:
-        start = file.read(4096)
-        file.seek(0)
-        if DEFLATED in start:
-            _check_inflated(file, name, start)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return pydicom.dcmread(file, force=start[MAGIC_AT : MAGIC_AT + 4] != MAGIC, **options)
-    except PatientError:
-        raise
-    except Exception as error:  # a parser's faults are many; all of them are the file's
-        raise PatientError(
-            f"{name}: a damaged DICOM file ({type(error).__name__}); copy or export it again"
-        ) from error
-
-
-def _check_inflated(file: BinaryIO, name: str, start: bytes) -> None:
-    """Refuse a deflated data set that would fill the memory."""
-    meta_length = int.from_bytes(start[META_LENGTH_AT : META_LENGTH_AT + 4], "little")
-    file.seek(META_LENGTH_AT + 4 + meta_length)
-    inflater, size = zlib.decompressobj(-zlib.MAX_WBITS), 0
-    while (chunk := file.read(1 << 16)) and not inflater.eof:
-        while chunk:
-            size += len(inflater.decompress(chunk, 1 << 22))
-            chunk = inflater.unconsumed_tail
-            if size > MOST_INFLATED:
-                raise PatientError(
-                    f"{name}: inflates to more than 2 GiB; expected one CT; export it uncompressed"
-                )
-    file.seek(0)
-
-
 def _add_slices(found: Found, item: Item, header: Dataset) -> None:
-    uid = str(header.get("SeriesInstanceUID") or "")
-    number = header.get("SeriesNumber")
-    series = found.series.setdefault(uid, Series(uid, "without a number" if number is None else str(number)))
-    series.frame_of_reference = str(header.get("FrameOfReferenceUID") or "")
+    uid, number = text_of(item.name, header, "SeriesInstanceUID"), text_of(item.name, header, "SeriesNumber")
+    series = found.series.setdefault(uid, Series(uid, number if number.isdecimal() else "without a number"))
+    series.frame_of_reference = text_of(item.name, header, "FrameOfReferenceUID")
     try:
         for slice_ in _slices(item, header):
             if slice_ is None:
@@ -252,6 +220,7 @@ def _slice(
         rows=rows,
         slope=slope,
         intercept=intercept,
+        is_rescaled=value("RescaleIntercept") is not None,
         padding=_padding(header),
     )
 
@@ -280,5 +249,6 @@ def _padding(header: Dataset) -> tuple[int, int] | None:
     if header.get("PixelPaddingValue") in (None, ""):
         return None
     one = int(header.PixelPaddingValue)
-    other = int(header.get("PixelPaddingRangeLimit") or one)
+    limit = header.get("PixelPaddingRangeLimit")
+    other = one if limit in (None, "") else int(limit)
     return min(one, other), max(one, other)

@@ -11,8 +11,9 @@ import SimpleITK as sitk
 from pydicom.dataset import Dataset
 from pydicom.pixels import pixel_array
 
+from scenes.reading.dicom_file import parsed
 from scenes.reading.error import PatientError
-from scenes.reading.headers import Slice, parsed
+from scenes.reading.headers import Slice
 from scenes.reading.source import Item
 from scenes.reading.volume import AIR_HU, LEAST_HU, MOST_HU
 

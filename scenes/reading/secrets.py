@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from pydicom.dataelem import DataElement
 from pydicom.dataset import Dataset
 
-from scenes.reading.error import PatientError
 from scenes.reading.headers import read_header
 from scenes.reading.source import Item
 
@@ -23,35 +23,37 @@ PERSONAL_KEYWORDS = (
 
 
 def secrets_of(item: Item) -> frozenset[str]:
-    """Every name, id, date, institution, uid and private text of one DICOM file."""
-    try:
-        return frozenset(text for text in _texts(read_header(item, tags=None)) if text)
-    except PatientError:
-        raise
-    except Exception as error:  # a value's faults are many; all of them are the file's
-        raise PatientError(
-            f"{item.name}: a damaged DICOM file ({type(error).__name__}); copy or export it again"
-        ) from error
+    """Every name, id, date, institution, uid and private text of one DICOM file; of what cannot be parsed, its bytes."""
+    return frozenset(text for text in _texts(read_header(item, tags=None)) if text)
 
 
 def _texts(data: Dataset) -> Iterator[str]:
-    for element in data:
+    for tag in sorted(data.keys()):
+        try:
+            element = data[tag]
+            nested = list(element.value) if element.VR == "SQ" else []
+        except Exception:  # a parser's faults are many
+            yield from _plain(getattr(data.get_item(tag), "value", None))
+            continue
         if element.VR == "SQ":
-            for nested in element.value:
-                yield from _texts(nested)
+            for one in nested:
+                yield from _texts(one)
             continue
         personal = element.tag.is_private or any(word in element.keyword for word in PERSONAL_KEYWORDS)
         if element.VR in NAMING or (element.VR in FREE_TEXT and personal):
             yield from _words(element)
 
 
-def _words(element) -> Iterator[str]:
-    several = element.value if element.VM > 1 else [element.value]
-    for value in several:
-        text = value.decode("latin-1") if isinstance(value, bytes) else str(value)
-        text = text.strip("\0 ")
-        if not text.isprintable() or text.startswith(STANDARD_UID):
-            continue
+def _words(element: DataElement) -> Iterator[str]:
+    for value in element.value if element.VM > 1 else [element.value]:
+        for text in _plain(value):
+            yield text
+            if element.VR == "PN":
+                yield from (part for part in text.replace("=", "^").split("^") if part)
+
+
+def _plain(value: object) -> Iterator[str]:
+    """A value as text, where it is text that names somebody."""
+    text = (value.decode("latin-1") if isinstance(value, bytes) else str(value)).strip("\0 ")
+    if text.isprintable() and not text.startswith(STANDARD_UID):
         yield text
-        if element.VR == "PN":
-            yield from (part for part in text.replace("=", "^").split("^") if part)

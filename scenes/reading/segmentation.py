@@ -8,9 +8,9 @@ import warnings
 import highdicom as hd
 import numpy as np
 
+from scenes.reading.dicom_file import parsed
 from scenes.reading.error import PatientError
 from scenes.reading.grid import VoxelGrid
-from scenes.reading.headers import parsed
 from scenes.reading.labels import LabelMap, Segment
 from scenes.reading.source import Item
 

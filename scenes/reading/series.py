@@ -43,8 +43,9 @@ def series_volume(
     series, notes = _chosen(path, candidates, wanted, referenced)
     if series.faults:
         more = len(series.faults) - 1
+        fault = series.faults[0].removeprefix(f"{path.name}: ")
         raise PatientError(
-            f"{path}: {series.faults[0]}{f' (and {more} more files of this series)' if more else ''}; "
+            f"{path}: {fault}{f' (and {more} more files of this series)' if more else ''}; "
             "export the series again"
         )
     slices, left_out = _one_view(series)
@@ -53,6 +54,8 @@ def series_volume(
     if found.others:
         others = ", ".join(f"{count} {what}" for what, count in sorted(found.others.items()))
         notes.append(f"left out, no CT slices: {others}")
+    if not all(one.is_rescaled for one in slices):
+        notes.append("CAUTION: the files do not say how their values become HU; they were taken as HU")
     stack = stacked(str(path), slices)
     return Volume(
         name=str(path),

@@ -11,16 +11,13 @@ from functools import partial
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO, cast
 
-import pydicom
-from pydicom.errors import InvalidDicomError
-
+from scenes.reading.dicom_file import MAGIC, MAGIC_AT, looks_like_dicom, parsed
 from scenes.reading.error import PatientError
 
 MOST_FILES = 100_000
 # One file of an archive may be a whole enhanced CT; the archive, several series.
 MOST_FILE_BYTES = 2 * 2**30
 MOST_ARCHIVE_BYTES = 16 * 2**30
-MAGIC_AT, MAGIC = 128, b"DICM"
 
 
 @dataclass(frozen=True)
@@ -63,11 +60,6 @@ def _begins_as_dicom(item: Item) -> bool:
         ) from error
 
 
-def looks_like_dicom(start: bytes) -> bool:
-    """Whether a file's first 132 bytes are DICOM's: a preamble, or a data set without one (group 8, little endian)."""
-    return start[MAGIC_AT:] == MAGIC or (start[:2] in (b"\x08\x00", b"\x02\x00") and start[3:4] == b"\x00")
-
-
 def _of_folder(folder: Path) -> list[Item]:
     items: list[Item] = []
     for root, folders, files in os.walk(folder):
@@ -89,8 +81,9 @@ def _of_directory_file(path: Path) -> list[Item]:
     items = []
     for parts in _listed(path):
         name = "/".join(parts)
-        file = (root / Path(*parts)).resolve()
-        if any(part in ("..", "") or _leads_outside(part) for part in parts) or not file.is_relative_to(root):
+        plain = all(part.isprintable() and 0 < len(part) < 256 and not _leads_outside(part) for part in parts)
+        file = (root / Path(*parts)).resolve() if plain else root
+        if not plain or not file.is_relative_to(root):
             raise PatientError(
                 f"{path}: lists {name!r}, which lies outside its folder; expected files beside it; "
                 "give the folder of the slices instead"
@@ -109,20 +102,26 @@ def _of_directory_file(path: Path) -> list[Item]:
 def _listed(path: Path) -> list[list[str]]:
     """The ReferencedFileID of each image record."""
     try:
-        records = pydicom.dcmread(path).get("DirectoryRecordSequence") or []
+        with path.open("rb") as file:
+            if not looks_like_dicom(file.read(MAGIC_AT + len(MAGIC))):
+                raise ValueError
+            file.seek(0)
+            records = parsed(file, str(path)).get("DirectoryRecordSequence") or []
         names = [record.get("ReferencedFileID") for record in records]
-    except (InvalidDicomError, OSError, EOFError, ValueError, AttributeError, NotImplementedError) as error:
+        return [[name] if isinstance(name, str) else [str(part) for part in name] for name in names if name]
+    except PatientError:
+        raise
+    except Exception as error:  # a parser's faults are many; all of them are the file's
         raise PatientError(
             f"{path}: cannot be read as a DICOMDIR; give the folder of the slices instead"
         ) from error
-    return [[name] if isinstance(name, str) else [str(part) for part in name] for name in names if name]
 
 
 def _of_archive(path: Path) -> list[Item]:
     try:
         archive = zipfile.ZipFile(path)
         entries = [entry for entry in archive.infolist() if not entry.is_dir()]
-    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
+    except Exception as error:  # a parser's faults are many; all of them are the archive's
         raise PatientError(f"{path}: a broken archive ({error}); copy or export it again") from error
     if len(entries) > MOST_FILES:
         raise PatientError(f"{path}: holds {len(entries)} files; expected at most {MOST_FILES}")

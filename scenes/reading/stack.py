@@ -23,6 +23,10 @@ from scenes.reading.volume import AIR_HU
 UNEVEN = 0.1
 # Part of a pixel by which slices may be shifted sideways before they are shifted back.
 SIDEWAYS = 0.25
+# Pixels by which a slice may lie off the line of a tilted stack.
+OUT_OF_LINE = 1.0
+# Gantries tilt by 30 degrees at most.
+MOST_TILT = 45.0
 # Gaps between slices, as parts of the usual one, that are resampled; beyond them something is missing or double.
 GAPS = (0.5, 1.5)
 PARALLEL = 1e-3
@@ -99,7 +103,7 @@ def stacked(name: str, slices: list[Slice]) -> Stack:
     along = np.array([s.position @ normal for s in slices])
     _check_gaps(name, slices, along)
     planes, gap = _even(along, notes)
-    origin, sideways, size = _upright(slices, normal, notes)
+    origin, sideways, size = _upright(name, slices, normal, notes)
     direction = np.column_stack([slices[0].row, slices[0].column, normal])
     planes_count = int(np.floor(planes[-1] + UNEVEN)) + 1
     grid = VoxelGrid((*size, planes_count), np.array([*slices[0].spacing, gap]), origin, direction)
@@ -191,7 +195,7 @@ def _even(along: np.ndarray, notes: list[str]) -> tuple[np.ndarray, float]:
 
 
 def _upright(
-    slices: list[Slice], normal: np.ndarray, notes: list[str]
+    name: str, slices: list[Slice], normal: np.ndarray, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
     """Origin of an upright grid that holds all slices, their places on it in pixels, and its columns and rows."""
     first = slices[0]
@@ -202,11 +206,25 @@ def _upright(
     size = first.columns, first.rows
     if np.abs(offsets).max() <= SIDEWAYS * spacing.min():
         return first.position, np.zeros((len(slices), 2)), size
+    along = (positions - first.position) @ normal
+    lean = np.median(
+        np.diff(offsets, axis=0) / np.diff(along)[:, None], axis=0
+    )  # a tilt's, the same everywhere
+    off = offsets - along[:, None] * lean
+    off = np.abs(off - np.median(off, axis=0)).max(axis=1)
+    worst = int(np.argmax(off))
+    if off[worst] > OUT_OF_LINE * spacing.min():
+        raise PatientError(
+            f"{name}: {slices[worst].label} lies {off[worst]:.1f} mm to the side of its neighbours; expected slices in one "
+            "line; take out the wrong slice, or export the series again"
+        )
+    angle = float(np.degrees(np.arctan(np.linalg.norm(lean))))
+    if angle > MOST_TILT:
+        raise PatientError(
+            f"{name}: its slices lean by {angle:.1f} degrees; expected at most {MOST_TILT:g}; export the series again"
+        )
     low, high = offsets.min(axis=0), offsets.max(axis=0)
     extra = np.ceil((high - low) / spacing - 1e-6).astype(int)
-    step = offsets[-1] - offsets[0]
-    rise = float((positions[-1] - positions[0]) @ normal)
-    angle = np.degrees(np.arctan2(np.linalg.norm(step), rise))
     notes.append(
         f"the gantry was tilted by {angle:.1f} degrees: slices shifted back in their planes by up to {np.abs(offsets).max():.1f} mm"
     )

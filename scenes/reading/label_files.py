@@ -13,7 +13,7 @@ import SimpleITK as sitk
 from scenes.reading.contours import read_contours, referenced_series
 from scenes.reading.ct import dicom_or_words
 from scenes.reading.error import PatientError
-from scenes.reading.files import ITK, NIFTI, file_volume, is_volume_file, itk_header, itk_layers
+from scenes.reading.files import ITK, NIFTI, file_volume, is_volume_file, itk_header, itk_layers, metadata
 from scenes.reading.grid import Box, VoxelGrid
 from scenes.reading.headers import Found, read_header
 from scenes.reading.labels import LabelMap, Segment, box_of, whole_numbers
@@ -92,11 +92,7 @@ def _file(path: Path) -> Drawing:
         return Drawing(lambda _: maps, secrets=volume.secrets)
     header = itk_header(path)
     names = _slicer_names(header)
-    kept = {
-        str(n): header.GetMetaData(n)
-        for n in header.GetMetaDataKeys()
-        if not n.startswith(("NRRD_", "ITK_", "Segment"))
-    }
+    kept = {n: text for n, text in metadata(header).items() if not n.startswith(("NRRD_", "ITK_", "Segment"))}
     secrets = frozenset(text for text in kept.values() if text)
     if not names and header.GetNumberOfComponents() == 1:
         volume = file_volume(path)
@@ -120,7 +116,7 @@ def _map(path: Path, grid: VoxelGrid, voxels) -> LabelMap:
 def _slicer_names(header: sitk.ImageFileReader) -> dict[tuple[int, int], Segment]:
     """Segments of 3D Slicer's header, by layer and value."""
     found = {}
-    for key in header.GetMetaDataKeys():
+    for key in metadata(header):
         number = SLICER_KEY.match(key)
         if number is None:
             continue
@@ -129,9 +125,13 @@ def _slicer_names(header: sitk.ImageFileReader) -> dict[tuple[int, int], Segment
             return header.GetMetaData(start + what) if header.HasMetaDataKey(start + what) else usual
 
         colour = tuple(float(c) for c in re.findall(r"\d+\.?\d*", value("Color", ""))[:3])
-        layer, label = int(value("Layer", "0")), int(value("LabelValue", "1"))
-        named = Segment.named(header.GetMetaData(key), label, colour if len(colour) == 3 else None)
-        found[layer, label] = named
+        layer, label = value("Layer", "0"), value("LabelValue", "1")
+        if not (layer.isdecimal() and label.isdecimal()):
+            raise PatientError(
+                f"{header.GetFileName()}: {key} has no whole LabelValue and Layer; export it again from 3D Slicer"
+            )
+        rgb = (colour[0], colour[1], colour[2]) if len(colour) == 3 else None
+        found[int(layer), int(label)] = Segment.named(header.GetMetaData(key), int(label), rgb)
     return found
 
 
