@@ -6,6 +6,7 @@ import pytest
 import trimesh
 from synthetic_body import LEFT, TUMOUR, assert_sound, body, drawn, least_gap, level
 
+from scenes.bed import bed_of_file, bed_of_labels
 from scenes.patient import SUPINE_GRAVITY, import_patient
 from scenes.reading.error import PatientError
 from scenes.reading.labels import LabelMap
@@ -53,11 +54,11 @@ class TestBedOfLabels:
         off = np.abs(level(beside, MUSCLE)) * MUSCLE[1].min()
         assert np.percentile(off, 90) < 2.5  # a voxel
 
-    def test_nothing_under_the_organ(self, ct_and_labels):
-        ct, labels = ct_and_labels
+    def test_nothing_under_the_organ(self, ct_and_labels, mould):
+        _, labels = ct_and_labels
         aside = drawn(labels, (4, (MUSCLE[0] - [60, 0, 0], MUSCLE[1])), (2, LEFT), (3, TUMOUR))
         with pytest.raises(PatientError, match=r"lies under \d+% of the organ: expected 50% or more"):
-            import_patient(ct, LabelMap.of(aside, NAMES), margin_mm=10.0, support="labels")
+            bed_of_labels(mould.organ, LabelMap.of(aside, NAMES), [2, 3], SUPINE_GRAVITY)
 
 
 class TestBedOfFile:
@@ -72,8 +73,7 @@ class TestBedOfFile:
         np.testing.assert_allclose(again.support.bounds, slab.bounds, atol=1e-4)
         assert np.array_equal(again.organ.vertices, mould.organ.vertices)
 
-    def test_what_is_no_support(self, ct_and_labels, tmp_path):
-        ct, labels = ct_and_labels
+    def test_what_is_no_support(self, mould, tmp_path):
         inside, far, open_ = (trimesh.creation.box([40.0, 40.0, 40.0]) for _ in range(3))
         inside.apply_translation(LEFT[0])
         far.apply_translation([-300.0, 0, 0])
@@ -89,7 +89,6 @@ class TestBedOfFile:
             ("text", "cannot be read as a surface|holds no triangles"),
             ("absent", "no such file"),
         ]:
-            file = str(tmp_path / f"{name}.stl")
             with pytest.raises(PatientError, match=words) as caught:
-                import_patient(ct, LabelMap.of(labels, NAMES), margin_mm=10.0, support=file)
+                bed_of_file(tmp_path / f"{name}.stl", mould.organ)
             assert "\n" not in str(caught.value) and f"{name}.stl" in str(caught.value)

@@ -53,6 +53,12 @@ def written(hospital, tmp_path_factory):
     return out
 
 
+@pytest.fixture(scope="module")
+def taken_in(hospital):
+    """The patient, and what is private of it."""
+    return take_in(Request(hospital[0], side="left"))
+
+
 def test_the_folder_is_a_scene(written):
     scene = load_scene(written / "scene.toml")
     anatomy = load_anatomy(scene, written)
@@ -85,9 +91,9 @@ def test_the_terminal_names_nobody_and_tells_the_facts(hospital, tmp_path, capfd
         assert text not in said.out + said.err
 
 
-def test_what_was_read_is_known_to_be_private(hospital):
+def test_what_was_read_is_known_to_be_private(hospital, taken_in):
     folder, series = hospital
-    _, private = take_in(Request(folder, side="left"))
+    private = taken_in[1]
     assert {"Doe^Jane", "Doe", "Jane", "19600229", "A1234567", series.uid, series.sops[0]} <= private
     assert str(folder.resolve()) in private
 
@@ -124,8 +130,8 @@ def test_labels_of_another_examination(hospital, tmp_path):
 
 class TestPrivate:
     @pytest.fixture(scope="class")
-    def patient(self, hospital):
-        return take_in(Request(hospital[0], side="left"))[0]
+    def patient(self, taken_in):
+        return taken_in[0]
 
     @pytest.mark.parametrize("secret", ["Doe", "Doe^Jane", "19600229", "1.2.826.0.1.3680043.8.498.1", "Ünal"])
     def test_a_file_that_would_name_somebody_is_not_written(self, patient, tmp_path, secret):
