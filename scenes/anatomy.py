@@ -13,7 +13,8 @@ import trimesh
 
 from scenes.hilum import hilum
 from scenes.organ import GROWN, PARENCHYMA
-from scenes.patient import PARTS, Patient, import_patient, tissue_codes
+from scenes.parts import PARTS
+from scenes.patient import Patient, import_patient, tissue_codes
 from scenes.patient_folder import save_patient
 from scenes.phantom import Label, make_phantom
 from scenes.reading.error import PatientError
@@ -140,7 +141,17 @@ def patient_scene(patient: Patient) -> Scene:
 
 def phantom_folder() -> Path:
     """Folder of the embedded patient, imported like any other on first use and whenever its sources changed."""
-    names = "phantom", "abdomen", "anatomy", "organ", "patient", "surfaces", "support", "reading/labels"
+    names = (
+        "phantom",
+        "abdomen",
+        "anatomy",
+        "organ",
+        "patient",
+        "parts",
+        "surfaces",
+        "support",
+        "reading/labels",
+    )
     sources = [HERE / f"{name}.py" for name in names]
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]
     for root in (CACHE, Path(tempfile.gettempdir()) / "nephron"):

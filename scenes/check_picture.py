@@ -5,17 +5,22 @@ from __future__ import annotations
 import textwrap
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import SimpleITK as sitk
 import trimesh
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from scenes.facts import told
 from scenes.patient import Patient
+from scenes.reading.grid import VoxelGrid
+from scenes.reading.labels import Colour
 
 BACKGROUND = "#101014"
 PIXEL_MM = 0.5
@@ -29,7 +34,16 @@ COLOUR = {
     "support": "#9a9a9a",
 }
 WORD = {"organ": "kidney", "urine": "collecting system", "vessel": "vessels"}
+LEAST_BRIGHT = 0.85
 TEXT_WIDTH = 92
+# White with a black rim, to be read on bone and on air.
+LETTER: dict[str, Any] = dict(
+    color="white",
+    weight="bold",
+    ha="center",
+    va="center",
+    path_effects=[withStroke(linewidth=3, foreground="black")],
+)
 LIGHT = np.array([-0.4, -0.8, 0.45])  # from the front, the patient's right and above
 
 
@@ -56,26 +70,41 @@ def draw_check(patient: Patient, rows: list[tuple[str, str]], folder: Path) -> N
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 3, hspace=0.08, wspace=0.06)
     grid.update(left=0.03, right=0.97, top=0.92, bottom=0.02)
-    figure.suptitle(
-        f"{patient.side.upper()} KIDNEY{' (DRAFT, grown from a seed)' if patient.draft else ''}: is this the side, the organ and the way up that you expect?",
-        color="white",
-        fontsize=15,
-    )
+    draft = " (DRAFT, grown from a seed)" if patient.draft else ""
+    question = "is this the side, the organ and the way up that you expect?"
+    figure.suptitle(f"{patient.side.upper()} KIDNEY{draft}: {question}", color="white", fontsize=15)
+    colours = colours_of(patient)
     surfaces = {"organ": patient.organ, **patient.parts}
     middle = (patient.tumour or patient.organ).bounds.mean(axis=0)
     for n, view in enumerate(VIEWS):
-        _draw_cut(figure.add_subplot(grid[0, n]), view, patient, surfaces, middle)
-    _draw_surfaces(figure.add_subplot(grid[1, 0], projection="3d", facecolor=BACKGROUND), surfaces)
+        _draw_cut(figure.add_subplot(grid[0, n]), view, patient, surfaces, middle, colours)
+    _draw_surfaces(figure.add_subplot(grid[1, 0], projection="3d", facecolor=BACKGROUND), surfaces, colours)
     words = figure.add_subplot(grid[1, 1:])
     words.axis("off")
-    _draw_words(words, rows, [*surfaces, "support"])
+    _draw_words(words, rows, {name: colours[name] for name in [*surfaces, "support"]})
     figure.savefig(
         folder / "check.png", dpi=100, facecolor=figure.get_facecolor(), metadata={"Software": None}
     )
 
 
+def colours_of(patient: Patient) -> dict[str, Colour]:
+    """What organ, parts and support are drawn in: their files' own colours, made bright enough for a dark ground."""
+    own = {name: _bright(colour) for name, colour in patient.colours.items()}
+    return {name: to_rgb(colour) for name, colour in COLOUR.items()} | own
+
+
+def _bright(colour: Colour) -> Colour:
+    scale = max(1.0, LEAST_BRIGHT / max(*colour, 1e-3))
+    return colour[0] * scale, colour[1] * scale, colour[2] * scale
+
+
 def _draw_cut(
-    axes: Axes, view: View, patient: Patient, surfaces: dict[str, trimesh.Trimesh], middle: np.ndarray
+    axes: Axes,
+    view: View,
+    patient: Patient,
+    surfaces: dict[str, trimesh.Trimesh],
+    middle: np.ndarray,
+    colours: dict[str, Colour],
 ) -> None:
     right, down = np.array(view.right, float), np.array(view.down, float)
     low, high = _bounds(patient.ct)
@@ -90,32 +119,17 @@ def _draw_cut(
         section = surface.section(np.cross(right, down), middle)
         for line in [] if section is None else section.discrete:
             axes.plot(
-                line @ right, line @ down, color=COLOUR[name], linewidth=1.4 if name != "support" else 0.8
+                line @ right, line @ down, color=colours[name], linewidth=1.4 if name != "support" else 0.8
             )
     axes.set(xlim=extent[:2], ylim=extent[2:], xticks=[], yticks=[])
     axes.set_title(view.name, color="white", fontsize=11)
     for letter, place in zip(view.letters, ((0.03, 0.5), (0.97, 0.5), (0.5, 0.97), (0.5, 0.03)), strict=True):
-        axes.text(
-            *place,
-            letter,
-            transform=axes.transAxes,
-            color="white",
-            fontsize=17,
-            weight="bold",
-            ha="center",
-            va="center",
-        )
+        axes.text(*place, letter, transform=axes.transAxes, fontsize=17, **LETTER)
 
 
 def _bounds(image: sitk.Image) -> tuple[np.ndarray, np.ndarray]:
-    size = image.GetSize()
-    corners = [
-        image.TransformIndexToPhysicalPoint(
-            [n if far else 0 for n, far in zip(np.subtract(size, 1).tolist(), ends, strict=True)]
-        )
-        for ends in np.ndindex(2, 2, 2)
-    ]
-    return np.min(corners, axis=0), np.max(corners, axis=0)
+    corners = VoxelGrid.of(image).corners()
+    return corners.min(axis=0), corners.max(axis=0)
 
 
 def _cut(
@@ -139,22 +153,15 @@ def _cut(
     return sitk.GetArrayFromImage(cut)[0]
 
 
-def _draw_surfaces(axes, surfaces: dict[str, trimesh.Trimesh]) -> None:
+def _draw_surfaces(axes: Any, surfaces: dict[str, trimesh.Trimesh], colours: dict[str, Colour]) -> None:
     """The surfaces from the front, a little from the patient's right and above."""
-    low, high = (
-        np.min([s.bounds[0] for s in surfaces.values()], axis=0),
-        np.max([s.bounds[1] for s in surfaces.values()], axis=0),
-    )
+    corners = np.concatenate([surface.bounds for surface in surfaces.values()])
+    low, high = corners.min(axis=0), corners.max(axis=0)
     light = LIGHT / np.linalg.norm(LIGHT)
     for name, surface in reversed(surfaces.items()):
         shade = 0.35 + 0.65 * np.clip(surface.face_normals @ light, 0, 1)
-        colour = np.array([int(COLOUR[name][n : n + 2], 16) / 255 for n in (1, 3, 5)])
-        faces = np.column_stack(
-            [
-                shade[:, None] * colour,
-                np.full(len(shade), 0.45 if name == "organ" and len(surfaces) > 1 else 1.0),
-            ]
-        )
+        opacity = 0.45 if name == "organ" and len(surfaces) > 1 else 1.0
+        faces = np.column_stack([shade[:, None] * np.array(colours[name]), np.full(len(shade), opacity)])
         axes.add_collection3d(
             Poly3DCollection(surface.triangles, facecolors=faces, edgecolors=faces, linewidths=0.2)
         )
@@ -172,31 +179,16 @@ def _draw_surfaces(axes, surfaces: dict[str, trimesh.Trimesh]) -> None:
         "S": (x, y, high[2] + gap),
         "I": (x, y, low[2] - gap),
     }.items():
-        axes.text(*place, letter, color="white", fontsize=15, weight="bold", ha="center", va="center")
+        axes.text(*place, letter, fontsize=15, **LETTER)
 
 
-def _draw_words(axes: Axes, rows: list[tuple[str, str]], shown: list[str]) -> None:
+def _draw_words(axes: Axes, rows: list[tuple[str, str]], shown: dict[str, Colour]) -> None:
     lines = []
     for word, line in rows:
         wrapped = textwrap.wrap(line, TEXT_WIDTH - 11) or [""]
         lines += [(word, wrapped[0]), *(("", more) for more in wrapped[1:])]
-    axes.text(
-        0.03,
-        0.9,
-        told(lines),
-        color="white",
-        family="monospace",
-        fontsize=10.5,
-        va="top",
-        transform=axes.transAxes,
-    )
-    for n, name in enumerate(shown):
-        place = 0.03 + 0.3 * (n % 3), 0.12 - 0.06 * (n // 3)
-        axes.text(
-            *place,
-            WORD.get(name, name),
-            color=COLOUR[name],
-            fontsize=12,
-            weight="bold",
-            transform=axes.transAxes,
-        )
+    place: dict[str, Any] = dict(transform=axes.transAxes)
+    axes.text(0.03, 0.9, told(lines), color="white", family="monospace", fontsize=10.5, va="top", **place)
+    for n, (name, colour) in enumerate(shown.items()):
+        left, low = 0.03 + 0.3 * (n % 3), 0.12 - 0.06 * (n // 3)
+        axes.text(left, low, WORD.get(name, name), color=colour, fontsize=12, weight="bold", **place)

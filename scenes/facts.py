@@ -1,6 +1,7 @@
 """What an import found, in the words of the terminal and of the checking picture. No name, date or path."""
 
-from scenes.patient import PARTS, Patient
+from scenes.parts import PARTS
+from scenes.patient import Patient
 
 DRAFT = "grown from a seed and drawn by nobody: check every outline in check.png"
 

@@ -14,34 +14,23 @@ from typing import cast
 import numpy as np
 import SimpleITK as sitk
 import trimesh
-from scipy import ndimage
 
 from scenes.bed import bed_of_file, bed_of_labels
 from scenes.cautions import cautions
 from scenes.organ import GROWN, INNER, PARENCHYMA, Organ, check_volume, midline_x, organs, single_out
+from scenes.parts import colours_of_labels, organ_surface, part_surfaces
 from scenes.reading.error import PatientError
 from scenes.reading.grid import Box, VoxelGrid
-from scenes.reading.labels import LabelMap, nearest, present
+from scenes.reading.labels import Colour, LabelMap, nearest, present
 from scenes.reading.names import Side
 from scenes.reading.progress import Progress, silent
 from scenes.reading.volume import Volume
 from scenes.support import cradle
-from scenes.surfaces import surface_from_mask
 
 SUPINE_GRAVITY = np.array([0.0, 1.0, 0.0])  # as the CT was taken: on the back, posterior is down
 PLAUSIBLE_ORGAN_HU = (-150.0, 600.0)
 CUT_AREA_MM2 = 100.0  # a pole that just grazes the border is whole to within the thickness of a slice
 LEAST_OVERLAP = 0.99
-# Vessels and the collecting system are modelled as far as this from the organ: its pedicle.
-PEDICLE_MM = 15.0
-# Faces of a surface grow with its area, so that a tumour is meshed as finely as a kidney of this area; what branches, finer.
-FACES, FACES_AT_MM2 = 5000, 17000.0
-LEAST_FACES = 500
-BRANCHING = 3.0
-# Of the label's area, which is all steps.
-SMOOTH_AREA = 2 / 3
-# What has a surface of its own: tissue -> file.
-PARTS = {"tumour": "tumour", "cyst": "cyst", "urine": "collecting-system", "vessel": "vessels"}
 
 
 @dataclass(frozen=True)
@@ -58,6 +47,7 @@ class Patient:
     volumes_ml: dict[str, float]  # of the labels: "organ" with all that is in it, and each part
     spacing_mm: tuple[float, float, float]  # of the CT's voxels along the image's own axes
     notes: tuple[str, ...] = field(default=())  # what was chosen, left out, resampled, or looks wrong
+    colours: dict[str, Colour] = field(default_factory=dict)  # of organ and parts, where labels have one
     draft: bool = False  # grown from a seed, and drawn by nobody
 
     @property
@@ -113,8 +103,8 @@ def import_patient(
     _check_place(ct.grid, grid, on_ct, voxels, piece)
     marks, tissues = _marks(labels, piece, grid, on_ct)
 
-    surface = _surface(piece.grid.image(piece.mask.astype(np.uint8)), "organ", FACES)
-    parts, volumes = _parts(labels, piece, needed, progress)
+    surface = organ_surface(piece)
+    parts, volumes = part_surfaces(labels, piece, needed, progress)
     return Patient(
         ct=grid.image(voxels),
         labels=grid.image(marks),
@@ -126,6 +116,7 @@ def import_patient(
         volumes_ml={"organ": piece.volume_ml, **volumes},
         spacing_mm=tuple(grid.spacing.tolist()),
         notes=(*warned, *ct.notes),
+        colours=colours_of_labels(labels, [*parts]),
     )
 
 
@@ -229,82 +220,3 @@ def _marks(
             here = values == value
             marks[here & on_ct if tissue in (*GROWN, *PARENCHYMA) else here] = codes[tissue]
     return marks, {code: tissue for tissue, code in codes.items()}
-
-
-def _parts(
-    labels: LabelMap, piece: Organ, needed: Collection[str], progress: Progress
-) -> tuple[dict[str, trimesh.Trimesh], dict[str, float]]:
-    """Surface and volume [ml] of what is told apart in the organ, and of its vessels and collecting system near it."""
-    surfaces, volumes = {}, {}
-    for tissue in progress(PARTS, "surfaces"):
-        values = labels.of_tissues(tissue)
-        if not values:
-            continue
-        grid, inside = (
-            _near(labels, piece, values)
-            if tissue in INNER
-            else (piece.grid, piece.mask & np.isin(piece.values, values))
-        )
-        if not inside.any():
-            if tissue in needed:
-                raise PatientError(
-                    f"the {tissue}'s label has no voxel in this kidney ({piece.title}): expected one of it; choose "
-                    f"the other side or leave the {tissue} out"
-                )
-            continue
-        voxel_ml = float(np.prod(grid.spacing)) / 1000.0
-        surface = _bodies(grid, inside, tissue)
-        if surface is not None:
-            surfaces[tissue], volumes[tissue] = surface, float(inside.sum() * voxel_ml)
-    return surfaces, volumes
-
-
-def _near(labels: LabelMap, piece: Organ, values: list[int]) -> tuple[VoxelGrid, np.ndarray]:
-    """Where labels lie within PEDICLE_MM of the organ."""
-    start = np.rint(labels.grid.index(piece.grid.origin)).astype(int)
-    rim = np.ceil(PEDICLE_MM / labels.grid.spacing).astype(int)
-    low = np.maximum(start - rim, 0)
-    high = np.minimum(start + piece.grid.size + rim, labels.grid.size)
-    x, y, z = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-    organ = np.zeros([a.stop - a.start for a in (z, y, x)], bool)
-    at = start - low
-    organ[tuple(slice(int(a), int(a) + n) for a, n in zip(at[::-1], piece.mask.shape, strict=True))] = (
-        piece.mask
-    )
-    distance = ndimage.distance_transform_edt(~organ, sampling=labels.grid.spacing[::-1])
-    return labels.grid.part((x, y, z)), (distance <= PEDICLE_MM) & np.isin(labels.values[z, y, x], values)
-
-
-def _surface(mask: sitk.Image, name: str, faces: int) -> trimesh.Trimesh:
-    try:
-        return surface_from_mask(mask, faces)
-    except ValueError as error:
-        raise PatientError(f"the {name} has no surface: {error}; check the {name}'s label") from error
-
-
-def _bodies(grid: VoxelGrid, inside: np.ndarray, tissue: str) -> trimesh.Trimesh | None:
-    """Surface of a part; its several bodies are bodies of one mesh, specks are left out. None: too thin, and not needed."""
-    labelled, _ = ndimage.label(inside)
-    sizes = np.bincount(labelled.ravel())[1:]
-    finer = BRANCHING if tissue in INNER else 1.0
-    surfaces = []
-    for n in np.flatnonzero(sizes >= 0.1 * sizes.max()):
-        body = labelled == n + 1
-        faces = np.clip(finer * FACES * _area_mm2(grid, body) / FACES_AT_MM2, LEAST_FACES, FACES)
-        try:
-            name = PARTS[tissue].replace("-", " ")
-            surfaces.append(_surface(grid.image(body.astype(np.uint8)), name, int(faces)))
-        except PatientError:
-            if tissue in GROWN:
-                raise
-    if not surfaces:
-        return None
-    return surfaces[0] if len(surfaces) == 1 else cast(trimesh.Trimesh, trimesh.util.concatenate(surfaces))
-
-
-def _area_mm2(grid: VoxelGrid, inside: np.ndarray) -> float:
-    """Area of a label's surface, about."""
-    padded = np.pad(inside, 1)
-    steps = [int((np.diff(padded.view(np.int8), axis=axis) != 0).sum()) for axis in range(3)]
-    faces_mm2 = (np.prod(grid.spacing) / grid.spacing)[::-1]
-    return float(SMOOTH_AREA * np.dot(steps, faces_mm2))

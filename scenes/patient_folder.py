@@ -13,7 +13,8 @@ from pathlib import Path
 
 import SimpleITK as sitk
 
-from scenes.patient import PARTS, Patient
+from scenes.parts import PARTS
+from scenes.patient import Patient
 from scenes.reading.error import PatientError
 from scenes.scene import Anatomy, Scene, scene_text
 

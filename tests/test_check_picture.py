@@ -1,11 +1,13 @@
 """The checking picture shows what was imported where it is, the way up that its letters say."""
 
+from dataclasses import replace
+
 import matplotlib.image
 import numpy as np
 import pytest
 from synthetic_body import LEFT, TUMOUR, body, with_voxels
 
-from scenes.check_picture import COLOUR, PIXEL_MM, VIEWS, _bounds, _cut, draw_check
+from scenes.check_picture import COLOUR, PIXEL_MM, VIEWS, _bounds, _cut, colours_of, draw_check
 from scenes.facts import facts
 from scenes.patient import import_patient
 from scenes.reading.labels import LabelMap
@@ -61,6 +63,13 @@ def test_outlines_and_surfaces_are_in_the_picture(patient, tmp_path):
         wanted = np.array([int(COLOUR[name][n : n + 2], 16) for n in (1, 3, 5)]) / 255
         middle[name] = np.argwhere(np.abs(axial - wanted).max(axis=2) < 0.1).mean(axis=0)
     assert middle["tumour"][1] > middle["organ"][1] + 20 and TUMOUR[0][0] > LEFT[0][0]
+
+
+def test_files_own_colours_are_shown_brightly(patient):
+    own = replace(patient, colours={"organ": (0.2, 0.1, 0.1), "tumour": (0.0, 1.0, 0.5)})
+    assert colours_of(own)["organ"] == pytest.approx((0.85, 0.425, 0.425))
+    assert colours_of(own)["tumour"] == (0.0, 1.0, 0.5)
+    assert colours_of(own)["support"] == colours_of(patient)["support"]
 
 
 def test_the_file_says_nothing_of_its_maker(patient, tmp_path):

@@ -16,6 +16,9 @@ from scenes.reading.names import Side, side_of, tissue_of
 PAINTED = (None, "fat", "muscle", "bone", "liver", "kidney", "cortex", "medulla", "sinus", "vessel", "urine", "cyst", "tumour", "necrosis", "stone")  # fmt: skip
 
 
+Colour = tuple[float, float, float]  # red, green, blue, 0 to 1
+
+
 @dataclass(frozen=True)
 class Segment:
     """One thing that is labelled."""
@@ -24,12 +27,10 @@ class Segment:
     value: int | None  # in its file, where values tell things apart
     tissue: str | None  # by its name, or the user's word; None: HU tell
     side: Side | None  # by its name
-    colour: tuple[float, float, float] | None = None  # red, green, blue, 0 to 1, where the file gives one
+    colour: Colour | None = None  # where the file gives one
 
     @classmethod
-    def named(
-        cls, name: str, value: int | None = None, colour: tuple[float, float, float] | None = None
-    ) -> Segment:
+    def named(cls, name: str, value: int | None = None, colour: Colour | None = None) -> Segment:
         """A segment whose name says what it is."""
         return cls(name, value, tissue_of(name), side_of(name), colour)
 

@@ -1,0 +1,121 @@
+"""Surfaces of an organ and of what is told apart in it: tumours, cysts, vessels, collecting system."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import cast
+
+import numpy as np
+import SimpleITK as sitk
+import trimesh
+from scipy import ndimage
+
+from scenes.organ import GROWN, INNER, Organ
+from scenes.reading.error import PatientError
+from scenes.reading.grid import VoxelGrid
+from scenes.reading.labels import Colour, LabelMap
+from scenes.reading.progress import Progress
+from scenes.surfaces import surface_from_mask
+
+# Vessels and the collecting system are modelled as far as this from the organ: its pedicle.
+PEDICLE_MM = 15.0
+# Faces of a surface grow with its area, so that a tumour is meshed as finely as a kidney of this area; what branches, finer.
+FACES, FACES_AT_MM2 = 5000, 17000.0
+LEAST_FACES = 500
+BRANCHING = 3.0
+# Of the label's area, which is all steps.
+SMOOTH_AREA = 2 / 3
+# What has a surface of its own: tissue -> file.
+PARTS = {"tumour": "tumour", "cyst": "cyst", "urine": "collecting-system", "vessel": "vessels"}
+
+
+def organ_surface(piece: Organ) -> trimesh.Trimesh:
+    """Surface of the organ with all that grows on it. Raises PatientError."""
+    return _surface(piece.grid.image(piece.mask.astype(np.uint8)), "organ", FACES)
+
+
+def part_surfaces(
+    labels: LabelMap, piece: Organ, needed: Collection[str], progress: Progress
+) -> tuple[dict[str, trimesh.Trimesh], dict[str, float]]:
+    """Surface and volume [ml] of what is told apart in the organ, and of its vessels and collecting system near it.
+
+    Raises PatientError where a needed tissue is not there, or what the user must see has no surface.
+    """
+    surfaces, volumes = {}, {}
+    for tissue in progress(PARTS, "surfaces"):
+        values = labels.of_tissues(tissue)
+        if not values:
+            continue
+        grid, inside = piece.grid, piece.mask & np.isin(piece.values, values)
+        if tissue in INNER:
+            grid, inside = _near(labels, piece, values)
+        if not inside.any():
+            if tissue in needed:
+                raise PatientError(
+                    f"the {tissue}'s label has no voxel in this kidney ({piece.title}): expected one of it; choose "
+                    f"the other side or leave the {tissue} out"
+                )
+            continue
+        voxel_ml = float(np.prod(grid.spacing)) / 1000.0
+        surface = _bodies(grid, inside, tissue)
+        if surface is not None:
+            surfaces[tissue], volumes[tissue] = surface, float(inside.sum() * voxel_ml)
+    return surfaces, volumes
+
+
+def colours_of_labels(labels: LabelMap, tissues: Sequence[str]) -> dict[str, Colour]:
+    """What their files draw the organ and its parts in."""
+    found = {s.tissue: s.colour for s in reversed(labels.segments.values()) if s.tissue and s.colour}
+    named = {"organ": found.get("kidney"), **{tissue: found.get(tissue) for tissue in tissues}}
+    return {name: colour for name, colour in named.items() if colour}
+
+
+def _near(labels: LabelMap, piece: Organ, values: list[int]) -> tuple[VoxelGrid, np.ndarray]:
+    """Where labels lie within PEDICLE_MM of the organ."""
+    start = np.rint(labels.grid.index(piece.grid.origin)).astype(int)
+    rim = np.ceil(PEDICLE_MM / labels.grid.spacing).astype(int)
+    low = np.maximum(start - rim, 0)
+    high = np.minimum(start + piece.grid.size + rim, labels.grid.size)
+    x, y, z = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+    organ = np.zeros([a.stop - a.start for a in (z, y, x)], bool)
+    at = start - low
+    organ[tuple(slice(int(a), int(a) + n) for a, n in zip(at[::-1], piece.mask.shape, strict=True))] = (
+        piece.mask
+    )
+    distance = ndimage.distance_transform_edt(~organ, sampling=labels.grid.spacing[::-1])
+    return labels.grid.part((x, y, z)), (distance <= PEDICLE_MM) & np.isin(labels.values[z, y, x], values)
+
+
+def _surface(mask: sitk.Image, name: str, faces: int) -> trimesh.Trimesh:
+    try:
+        return surface_from_mask(mask, faces)
+    except ValueError as error:
+        raise PatientError(f"the {name} has no surface: {error}; check the {name}'s label") from error
+
+
+def _bodies(grid: VoxelGrid, inside: np.ndarray, tissue: str) -> trimesh.Trimesh | None:
+    """Surface of a part; its several bodies are bodies of one mesh, specks are left out. None: too thin, and not needed."""
+    labelled, _ = ndimage.label(inside)
+    sizes = np.bincount(labelled.ravel())[1:]
+    finer = BRANCHING if tissue in INNER else 1.0
+    surfaces = []
+    for n in np.flatnonzero(sizes >= 0.1 * sizes.max()):
+        body = labelled == n + 1
+        faces = np.clip(finer * FACES * _area_mm2(grid, body) / FACES_AT_MM2, LEAST_FACES, FACES)
+        try:
+            name = PARTS[tissue].replace("-", " ")
+            surfaces.append(_surface(grid.image(body.astype(np.uint8)), name, int(faces)))
+        except PatientError:
+            if tissue in GROWN:
+                raise
+    if not surfaces:
+        return None
+    return surfaces[0] if len(surfaces) == 1 else cast(trimesh.Trimesh, trimesh.util.concatenate(surfaces))
+
+
+def _area_mm2(grid: VoxelGrid, inside: np.ndarray) -> float:
+    """Area of a label's surface, about."""
+    padded = np.pad(inside, 1)
+    steps = [int((np.diff(padded.view(np.int8), axis=axis) != 0).sum()) for axis in range(3)]
+    faces_mm2 = (np.prod(grid.spacing) / grid.spacing)[::-1]
+    return float(SMOOTH_AREA * np.dot(steps, faces_mm2))
