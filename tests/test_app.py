@@ -170,7 +170,7 @@ def test_help_names_every_option(command, capsys):
             "--substeps",
             "--iterations",
         ),
-        ("import",): ("--out", "--organ", "--tumour", "--side"),
+        ("import",): ("--out", "--organ", "--tumour", "--side", "--series", "--seed", "--support"),
         ("validate",): (
             *("--model", "--quality", "--radius", "--stiffness", "--substeps", "--iterations"),
             *("--young-kpa", "--poisson", "--arch", "--json"),
@@ -214,8 +214,8 @@ def test_import_refuses_in_one_line_too(tmp_path):
     image = sitk.Image(8, 8, 8, sitk.sitkInt16)
     sitk.WriteImage(image, str(tmp_path / "ct.nrrd"))
     volume = tmp_path / "ct.nrrd"
-    assert "--organ is 'kidney'" in refused(
-        "import", volume, volume, "--organ", "kidney", "--out", tmp_path / "o"
+    assert "--organ is '1,,2'" in refused(
+        "import", volume, volume, "--organ", "1,,2", "--out", tmp_path / "o"
     )
     assert not (tmp_path / "o").exists()
 
