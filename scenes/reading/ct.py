@@ -7,7 +7,7 @@ from pathlib import Path
 import SimpleITK as sitk
 
 from scenes.reading.error import PatientError
-from scenes.reading.files import ITK, NIFTI, file_volume, is_volume_file
+from scenes.reading.files import ENDINGS, file_volume, is_volume_file
 from scenes.reading.headers import Found
 from scenes.reading.progress import Progress, silent
 from scenes.reading.series import dicom_found, series_volume
@@ -46,7 +46,7 @@ def dicom_or_words(path: Path, progress: Progress) -> Found:
         if path.is_file() and "no DICOM file" in str(error):
             raise PatientError(
                 f"{path}: unknown kind of file; expected DICOM (a folder, a DICOMDIR or a zip archive), or a file that ends in "
-                f"{', '.join((*NIFTI, *ITK))}; convert it"
+                f"{', '.join(ENDINGS)}; convert it"
             ) from None
         raise
 

@@ -13,9 +13,10 @@ import SimpleITK as sitk
 from scenes.reading.contours import read_contours, referenced_series
 from scenes.reading.ct import dicom_or_words
 from scenes.reading.error import PatientError
-from scenes.reading.files import ITK, NIFTI, file_volume, is_volume_file, itk_header, itk_layers, metadata
+from scenes.reading.files import ENDINGS, NIFTI, file_volume, is_volume_file
 from scenes.reading.grid import Box, VoxelGrid
 from scenes.reading.headers import Found, read_header
+from scenes.reading.itk_files import itk_header, itk_layers, metadata
 from scenes.reading.labels import LabelMap, Segment, box_of, whole_numbers
 from scenes.reading.names import is_far, side_of, tissue_of
 from scenes.reading.progress import Progress, silent
@@ -199,7 +200,7 @@ def _organ(file: Path, volume: Volume, box: Box) -> LabelMap | None:
 def _stem(path: Path) -> str:
     """A file's name without the ending of its kind."""
     name = path.name
-    for ending in (".seg.nrrd", ".nii.gz", *NIFTI, *ITK):
+    for ending in (".seg.nrrd", ".nii.gz", *ENDINGS):
         if name.lower().endswith(ending):
             return name[: -len(ending)]
     return name
