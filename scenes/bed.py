@@ -11,7 +11,15 @@ from scipy import ndimage
 from scenes.reading.error import PatientError
 from scenes.reading.grid import VoxelGrid
 from scenes.reading.labels import LabelMap, nearest
-from scenes.support import contour, distance_to_swept, gravity_frame, grid_over, least_gap, round_meet
+from scenes.support import (
+    clear_of,
+    contour,
+    distance_to_swept,
+    gravity_frame,
+    grid_over,
+    least_gap,
+    round_meet,
+)
 
 # The organ rests on what lies under it within this distance; what is between is fat, and part of the bed.
 REACH_MM = 40.0
@@ -23,7 +31,6 @@ SMOOTHING_VOXELS = 1.5
 LEAST_UNDER = 0.5
 LEAST_ML = 2.0
 FACES = 5000
-ATTEMPTS = 4
 # A support may touch the organ at rest, but not hold it squeezed.
 MOST_OVERLAP_MM = 0.5
 
@@ -58,7 +65,16 @@ def bed_of_labels(
             "what it lies on, or leave --support out for a mould"
         )
     level = _smooth_distance((tissue & (gap > 0)) | under)
-    return _clear_of(organ, level, gap, grid, top, frame)
+    level = round_meet(level, np.broadcast_to(grid[2] - top, gap.shape), radius=FILLET_MM)
+
+    def carved(gap_mm: float) -> trimesh.Trimesh:
+        return contour(_closed(round_meet(level, gap_mm - gap, radius=FILLET_MM)), grid, FACES)
+
+    try:
+        bed = clear_of(upright, faces, carved, CLEARANCE_MM)
+    except ValueError as error:
+        raise PatientError(f"no bed of labels fits: {error}; leave --support out for a mould") from error
+    return trimesh.Trimesh(bed.vertices @ frame, bed.faces, process=False)
 
 
 def _tissue(labels: LabelMap, own: list[int], grid: tuple[np.ndarray, ...], frame: np.ndarray) -> np.ndarray:
@@ -81,32 +97,6 @@ def _smooth_distance(solid: np.ndarray) -> np.ndarray:
     """Distance [mm] to a solid's surface, negative inside, without its steps."""
     apart = ndimage.distance_transform_edt(~solid) - ndimage.distance_transform_edt(solid)
     return GRID_MM * ndimage.gaussian_filter(apart, SMOOTHING_VOXELS)
-
-
-def _clear_of(
-    organ: trimesh.Trimesh,
-    tissue: np.ndarray,
-    gap: np.ndarray,
-    grid: tuple[np.ndarray, ...],
-    top: float,
-    frame: np.ndarray,
-) -> trimesh.Trimesh:
-    """The bed's surface, nowhere nearer to the organ than a quarter of the clearance."""
-    upright = organ.vertices.view(np.ndarray) @ frame.T
-    faces = organ.faces.view(np.ndarray).astype(np.int64)
-    height = np.broadcast_to(grid[2] - top, gap.shape)
-    wanted = CLEARANCE_MM
-    least = -np.inf
-    for _ in range(ATTEMPTS):
-        solid = round_meet(round_meet(tissue, height, radius=FILLET_MM), wanted - gap, radius=FILLET_MM)
-        bed = contour(_closed(solid), grid, FACES)
-        least = least_gap(bed.vertices, bed.faces, upright, faces)
-        if least >= 0.25 * CLEARANCE_MM:
-            return trimesh.Trimesh(bed.vertices @ frame, bed.faces, process=False)
-        wanted += CLEARANCE_MM - least
-    raise PatientError(
-        f"the bed of labels stays only {least:.2f} mm clear of the organ, expected {CLEARANCE_MM} mm; leave --support out for a mould"
-    )
 
 
 def _closed(level: np.ndarray) -> np.ndarray:

@@ -7,6 +7,8 @@ filleted.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import igl
 import numpy as np
 import trimesh
@@ -15,6 +17,8 @@ from skimage.measure import marching_cubes
 from scenes.surfaces import decimate
 
 ATTEMPTS = 4
+# Part of the clearance that must be left everywhere.
+LEAST_CLEARANCE = 0.25
 
 
 def cradle(
@@ -64,15 +68,31 @@ def cradle(
 
     grid = grid_over(block_low, block_high, grid_mm)
     gap = distance_to_swept(upright, organ_faces, grid)
-    gap_wanted = clearance_mm
+
+    def carved(gap_mm: float) -> trimesh.Trimesh:
+        return contour(_carved_block(grid, gap - gap_mm, block_low, block_high, fillet_mm), grid, faces)
+
+    support = clear_of(upright, organ_faces, carved, clearance_mm)
+    return trimesh.Trimesh(support.vertices @ frame, support.faces, process=False)
+
+
+def clear_of(
+    organ_vertices: np.ndarray,
+    organ_faces: np.ndarray,
+    carved: Callable[[float], trimesh.Trimesh],
+    clearance_mm: float,
+) -> trimesh.Trimesh:
+    """A support that an organ at rest does not touch, carved as deep as that takes. Raises ValueError.
+
+    Chords of a decimated mould bulge towards the organ; what is missing is carved deeper.
+    """
+    gap_mm = clearance_mm
     for _ in range(ATTEMPTS):
-        level = _carved_block(grid, gap - gap_wanted, block_low, block_high, fillet_mm)
-        support = contour(level, grid, faces)
-        least = least_gap(support.vertices, support.faces, upright, organ_faces)
-        if least >= 0.25 * clearance_mm:
-            return trimesh.Trimesh(support.vertices @ frame, support.faces, process=False)
-        # Chords of the decimated mould bulge towards the organ; carve deeper by what is missing.
-        gap_wanted += clearance_mm - least
+        support = carved(gap_mm)
+        least = least_gap(support.vertices, support.faces, organ_vertices, organ_faces)
+        if least >= LEAST_CLEARANCE * clearance_mm:
+            return support
+        gap_mm += clearance_mm - least
     raise ValueError(
         f"the support stays only {least:.2f} mm clear of the organ, {clearance_mm} mm were wanted"
     )
