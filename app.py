@@ -1,6 +1,8 @@
 """The command line. ``python app.py --help`` lists what it does."""
 
+import signal
 import sys
+import threading
 
 import click
 
@@ -45,10 +47,17 @@ for command in (rehearse, import_patient_command, scan, validate, calibrate, bea
     cli.add_command(command)
 
 
+def _stop_in_order() -> None:
+    """Asked to end, clean up as after Ctrl-C: no half of a patient's folder stays."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+
 def main(arguments: list[str]) -> int:
     """Run a command line; what the user must mend is one line, and the exit status 2."""
     if not arguments or (arguments[0].startswith("-") and arguments[0] not in ("-h", "--help")):
         arguments = ["rehearse", *arguments]
+    _stop_in_order()
     try:
         cli.main(args=arguments, prog_name="app.py", standalone_mode=False)
         return 0

@@ -36,7 +36,7 @@ from scenes.scene import (
 HERE = Path(__file__).parent
 CACHE = HERE.parent / ".cache"
 FAT_HU = -110.0
-LEAST_WINDOW_HU = 150.0
+LEAST_WINDOW_HU = 310.0  # to 200 HU, or an unenhanced kidney is white
 # What the parts of the embedded kidney are for sound.
 TISSUE_OF_PART: dict[int, str] = {
     Label.CORTEX: "cortex",
@@ -121,9 +121,10 @@ def patient_scene(patient: Patient) -> Scene:
     own = [code for code, tissue in patient.tissues.items() if tissue in (*PARENCHYMA, *GROWN)]
     hu = sitk.GetArrayViewFromImage(patient.ct)[np.isin(sitk.GetArrayViewFromImage(patient.labels), own)]
     # From fat to the brightest of the organ, whatever contrast agent it holds.
-    darkest, brightest = FAT_HU, round(float(np.percentile(hu, 99)), -1)
+    darkest = FAT_HU
+    brightest = max(round(float(np.percentile(hu, 99)), -1), darkest + LEAST_WINDOW_HU)
     return Scene(
-        image=Image(window_hu=max(brightest - darkest, LEAST_WINDOW_HU), level_hu=(brightest + darkest) / 2),
+        image=Image(window_hu=brightest - darkest, level_hu=(brightest + darkest) / 2),
         title=f"{patient.side.capitalize()} kidney{' (draft)' if patient.draft else ''}",
         anatomy=Anatomy.model_validate(
             dict(

@@ -1,11 +1,13 @@
-"""What looks mirrored or upside down in a CT and its labels: said loudly, for the import goes on."""
+"""What looks wrong in a CT and its labels, or was taken for what it may not be: said loudly, for the import goes on."""
 
 from __future__ import annotations
 
 import numpy as np
+from scipy import ndimage
 
+from scenes.organ import Organ
 from scenes.reading.grid import VoxelGrid
-from scenes.reading.labels import LabelMap
+from scenes.reading.labels import LabelMap, listed
 
 BONE_ABOVE_HU, BODY_ABOVE_HU = 300, -300
 COARSE_MM = 3.0
@@ -14,9 +16,12 @@ LEAST_BONE_ML = 15.0
 AHEAD_MM = 10.0
 # The liver's middle is on the right, but it reaches over.
 LIVER_LEFT_MM = 15.0
+# So near its surface an organ's label holds little fat where it was drawn on this CT; its sinus lies deeper.
+SHELL_MM, FAT_BELOW_HU, MOST_FAT = 4.0, -60, 0.05
+LEAST_LEFT_OUT_ML = 0.5
 
 
-def cautions(
+def turned(
     grid: VoxelGrid, hounsfield: np.ndarray, labels: LabelMap, midline: float | None
 ) -> tuple[str, ...]:
     """Lines for the user: bones in front of the body's middle, a liver on the left.
@@ -26,7 +31,7 @@ def cautions(
     found = []
     if _bones_ahead(grid, hounsfield):
         found.append(
-            "CAUTION: the bones lie in front of the body's middle, not behind it; the CT may be turned over; compare check.png "
+            "the bones lie in front of the body's middle, not behind it; the CT may be turned over; compare check.png "
             "with the patient"
         )
     liver = np.isin(labels.values, labels.of_tissues("liver"))
@@ -35,7 +40,7 @@ def cautions(
         places = labels.grid.place(np.argwhere(liver[::step, ::step, ::step])[:, ::-1] * step)
         if len(places) and places[:, 0].mean() > midline + LIVER_LEFT_MM:
             found.append(
-                "CAUTION: the liver lies on the patient's left; CT and labels may be mirrored; compare check.png with the patient"
+                "the liver lies on the patient's left; CT and labels may be mirrored; compare check.png with the patient"
             )
     return tuple(found)
 
@@ -48,3 +53,43 @@ def _bones_ahead(grid: VoxelGrid, hounsfield: np.ndarray) -> bool:
         return False
     bone_y, body_y = (grid.place(np.argwhere(there)[:, ::-1] * step)[:, 1].mean() for there in (bone, body))
     return bool(bone_y < body_y - AHEAD_MM)
+
+
+def in_fat(
+    grid: VoxelGrid, hounsfield: np.ndarray, organ: np.ndarray, parenchyma: np.ndarray
+) -> tuple[str, ...]:
+    """A line where much of an organ's rim is fat or gas: its label belongs to another CT, or is shifted or mirrored.
+
+    Of the organ (z, y, x) the parenchyma counts: a tumour may hold fat.
+    """
+    depth = ndimage.distance_transform_edt(organ, sampling=grid.spacing[::-1])
+    rim = hounsfield[parenchyma & (depth <= SHELL_MM)]
+    share = float((rim < FAT_BELOW_HU).mean()) if len(rim) else 0.0
+    if share <= MOST_FAT:
+        return ()
+    return (
+        f"{share:.0%} of the organ's rim is fat or gas in the CT; the labels may be shifted, mirrored or of another CT; "
+        "compare the outlines in check.png",
+    )
+
+
+def taken(labels: LabelMap, piece: Organ, is_named: bool) -> tuple[str, ...]:
+    """Lines on labels without a meaning: all taken as the organ, or left out though they touch it."""
+    found = []
+    unnamed = [value for value in piece.present if not labels.segments[value].name]
+    if not is_named and len(unnamed) > 1:
+        names = listed([str(labels.segments[value]) for value in unnamed])
+        found.append(
+            f"labels {names} say nothing, and were all taken as the kidney; say otherwise with --organ, --tumour, --cyst"
+        )
+    around = ndimage.binary_dilation(piece.mask, iterations=2) & ~piece.mask
+    beside = [v for v in np.unique(piece.values[around]).tolist() if v and labels.segments[v].tissue is None]
+    voxel_ml = float(np.prod(labels.grid.spacing)) / 1000
+    left_out = [(v, float((labels.values == v).sum()) * voxel_ml) for v in beside]
+    told = [f"{labels.segments[v]} ({ml:.1f} ml)" for v, ml in left_out if ml >= LEAST_LEFT_OUT_ML]
+    if told:
+        found.append(
+            f"labels beside the organ say no tissue, and were left out: {listed(told)}; if one is the patient's tumour or cyst, "
+            "give --tumour or --cyst"
+        )
+    return tuple(found)

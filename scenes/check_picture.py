@@ -22,7 +22,7 @@ from scenes.patient import Patient
 from scenes.reading.grid import VoxelGrid
 from scenes.reading.labels import Colour
 
-BACKGROUND = "#101014"
+BACKGROUND, WARNING = "#101014", "#ffb000"
 PIXEL_MM = 0.5
 WINDOW_HU, LEVEL_HU = 400.0, 50.0
 COLOUR = {
@@ -35,7 +35,7 @@ COLOUR = {
 }
 WORD = {"organ": "kidney", "urine": "collecting system", "vessel": "vessels"}
 LEAST_BRIGHT = 0.85
-TEXT_WIDTH = 92
+TEXT_WIDTH = 56
 # White with a black rim, to be read on bone and on air.
 LETTER: dict[str, Any] = dict(
     color="white",
@@ -62,6 +62,7 @@ VIEWS = (
     View("coronal, from the front", (1, 0, 0), (0, 0, -1), ("R", "L", "S", "I")),
     View("sagittal, from the left", (0, 1, 0), (0, 0, -1), ("A", "P", "S", "I")),
 )
+WHOLE = View("coronal, the whole width", (1, 0, 0), (0, 0, -1), ("R", "L", "S", "I"))
 
 
 def draw_check(patient: Patient, rows: list[tuple[str, str]], folder: Path) -> None:
@@ -72,14 +73,19 @@ def draw_check(patient: Patient, rows: list[tuple[str, str]], folder: Path) -> N
     grid.update(left=0.03, right=0.97, top=0.92, bottom=0.02)
     draft = " (DRAFT, grown from a seed)" if patient.draft else ""
     question = "is this the side, the organ and the way up that you expect?"
-    figure.suptitle(f"{patient.side.upper()} KIDNEY{draft}: {question}", color="white", fontsize=15)
+    colour = "white"
+    if patient.cautions:
+        question, colour = "read the CAUTION, and compare with the patient", WARNING
+    figure.suptitle(f"{patient.side.upper()} KIDNEY{draft}: {question}", color=colour, fontsize=15)
     colours = colours_of(patient)
     surfaces = {"organ": patient.organ, **patient.parts}
     middle = (patient.tumour or patient.organ).bounds.mean(axis=0)
+    around = {"support": patient.support, **surfaces}
     for n, view in enumerate(VIEWS):
-        _draw_cut(figure.add_subplot(grid[0, n]), view, patient, surfaces, middle, colours)
+        _draw_cut(figure.add_subplot(grid[0, n]), view, patient.ct, around, middle, colours)
     _draw_surfaces(figure.add_subplot(grid[1, 0], projection="3d", facecolor=BACKGROUND), surfaces, colours)
-    words = figure.add_subplot(grid[1, 1:])
+    _draw_cut(figure.add_subplot(grid[1, 1]), WHOLE, patient.overview, surfaces, middle, colours)
+    words = figure.add_subplot(grid[1, 2])
     words.axis("off")
     _draw_words(words, rows, {name: colours[name] for name in [*surfaces, "support"]})
     figure.savefig(
@@ -101,21 +107,21 @@ def _bright(colour: Colour) -> Colour:
 def _draw_cut(
     axes: Axes,
     view: View,
-    patient: Patient,
+    ct: sitk.Image,
     surfaces: dict[str, trimesh.Trimesh],
     middle: np.ndarray,
     colours: dict[str, Colour],
 ) -> None:
     right, down = np.array(view.right, float), np.array(view.down, float)
-    low, high = _bounds(patient.ct)
+    low, high = _bounds(ct)
     spans = [sorted((low @ axis, high @ axis)) for axis in (right, down)]
-    picture = _cut(patient.ct, right, down, spans, middle)
+    picture = _cut(ct, right, down, spans, middle)
     black = LEVEL_HU - WINDOW_HU / 2
     extent = (*spans[0], spans[1][1], spans[1][0])
     axes.imshow(
         picture, cmap="gray", vmin=black, vmax=black + WINDOW_HU, extent=extent, interpolation="bilinear"
     )
-    for name, surface in {"support": patient.support, **surfaces}.items():
+    for name, surface in surfaces.items():
         section = surface.section(np.cross(right, down), middle)
         for line in [] if section is None else section.discrete:
             axes.plot(
@@ -188,7 +194,7 @@ def _draw_words(axes: Axes, rows: list[tuple[str, str]], shown: dict[str, Colour
         wrapped = textwrap.wrap(line, TEXT_WIDTH - 11) or [""]
         lines += [(word, wrapped[0]), *(("", more) for more in wrapped[1:])]
     place: dict[str, Any] = dict(transform=axes.transAxes)
-    axes.text(0.03, 0.9, told(lines), color="white", family="monospace", fontsize=10.5, va="top", **place)
+    axes.text(0.0, 0.95, told(lines), color="white", family="monospace", fontsize=8.5, va="top", **place)
     for n, (name, colour) in enumerate(shown.items()):
-        left, low = 0.03 + 0.3 * (n % 3), 0.12 - 0.06 * (n // 3)
-        axes.text(left, low, WORD.get(name, name), color=colour, fontsize=12, weight="bold", **place)
+        left, low = 0.5 * (n % 2), 0.12 - 0.055 * (n // 2)
+        axes.text(left, low, WORD.get(name, name), color=colour, fontsize=11, weight="bold", **place)

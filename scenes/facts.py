@@ -14,6 +14,7 @@ def facts(patient: Patient) -> list[tuple[str, str]]:
     extent = " x ".join(f"{e:.0f}" for e in patient.organ.extents)
     surface_ml = patient.organ.volume / 1000
     rows = [("DRAFT", DRAFT)] if patient.draft else []
+    rows += [("CAUTION", line) for line in patient.cautions]
     rows.append(("organ", f"{patient.side} kidney, {volumes['organ']:.1f} ml (surface {surface_ml:.1f})"))
     rows.append(("extent", f"{extent} mm (right-left x front-back x foot-head)"))
     rows.append(("surface", f"{len(patient.organ.faces)} faces, watertight"))
@@ -22,7 +23,7 @@ def facts(patient: Patient) -> list[tuple[str, str]]:
         if tissue in patient.parts:
             rows.append((word, f"{volumes[tissue]:.1f} ml, {len(patient.parts[tissue].faces)} faces"))
         elif tissue == "tumour":
-            rows.append((word, "none"))
+            rows.append((word, "none labelled as one"))
     rows.append(("support", f"{len(patient.support.faces)} faces, for a patient lying supine"))
     rows.append(("CT", f"{size} voxels of {spacing} mm"))
     return rows + [("note", note) for note in patient.notes]

@@ -35,6 +35,8 @@ class Request:
 
 def take_in(request: Request, progress: Progress = silent) -> tuple[Patient, set[str]]:
     """Import a patient, and what of its source none of its files may hold. Raises PatientError."""
+    if not request.ct.exists():
+        raise PatientError(f"{request.ct}: no such file or folder; check the path")
     if request.seed_mm is not None:
         if request.labels or request.organ or request.tissues:
             raise PatientError(
@@ -81,8 +83,6 @@ def _with_labels(request: Request, progress: Progress) -> tuple[Volume, list[Dra
 
 def _beside(ct: Path, progress: Progress) -> Drawing:
     """The labels that lie with a CT."""
-    if not ct.exists():
-        raise PatientError(f"{ct}: no such file or folder; check the path")
     found = drawing_of(dicom_or_words(ct, progress)) if ct.is_dir() else None
     if found is None:
         raise PatientError(

@@ -19,6 +19,7 @@ ORGAN_FROM_ML = 20.0  # a connected piece from this volume on is an organ, below
 BODY_ABOVE_HU = -300.0
 BODY_WIDTH_MM = 150.0
 MIDLINE_MARGIN_MM = 10.0
+CORNERS = np.ones((3, 3, 3), bool)
 KIDNEYS_APART_MM = 60.0  # nearer pieces may both be of one kidney
 COARSE_MM = 4.0
 # Vessels and the collecting system are of the organ where they lie in a hollow of it no wider than twice this.
@@ -35,7 +36,8 @@ class Organ:
     grid: VoxelGrid
     values: np.ndarray  # label values of all voxels of the box (z, y, x)
     mask: np.ndarray  # bool: the organ
-    names: list[str]  # of its labels
+    present: list[int]  # label values of the organ that occur in it
+    names: list[str]  # and what they are called
     named_sides: set[Side]  # what these say
     volume_ml: float
     centre_x_mm: float  # LPS
@@ -69,13 +71,28 @@ def organs(labels: LabelMap, organ: Sequence[int] | None = None) -> list[Organ]:
     if box is None:
         raise PatientError(f"the labels hold no voxel of an organ: {labels.listed()}; choose other labels")
     part = box[::-1]
-    parts, count = ndimage.label(wanted[part], np.ones((3, 3, 3)))
+    parts, count = ndimage.label(wanted[part])
     voxel_ml = float(np.prod(labels.grid.spacing)) / 1000.0
     volumes = np.bincount(parts.ravel(), minlength=count + 1) * voxel_ml
-    of_organ = [n for n in np.unique(parts[np.isin(labels.values[part], own)]) if n]
+    of_organ = [int(n) for n in np.unique(parts[np.isin(labels.values[part], own)]) if n]
     large = [n for n in of_organ if volumes[n] >= ORGAN_FROM_ML] or [max(of_organ, key=lambda n: volumes[n])]
-    pieces = [_piece(labels, labels.grid.part(box), labels.values[part], parts == n, own) for n in large]
+    masks = [_with_touching(parts, n, of_organ) for n in large]
+    pieces = [_piece(labels, labels.grid.part(box), labels.values[part], mask, own) for mask in masks]
     return sorted(pieces, key=lambda piece: piece.centre_x_mm)
+
+
+def _with_touching(parts: np.ndarray, n: int, of_organ: list[int]) -> np.ndarray:
+    """Part n, with tumours and cysts that touch it by edges or corners alone, and the voxels that bridge them.
+
+    A surface needs a common face, or what hangs by a corner falls off it.
+    """
+    mask = parts == n
+    around = ndimage.binary_dilation(mask, CORNERS)
+    for other in np.unique(parts[around & ~mask]).tolist():
+        if other and other not in of_organ:
+            grown = parts == other
+            mask |= grown | (around & ndimage.binary_dilation(grown, CORNERS) & (parts == 0))
+    return mask
 
 
 def _organ_values(labels: LabelMap, organ: Sequence[int] | None) -> list[int]:
@@ -111,6 +128,7 @@ def _piece(labels: LabelMap, grid: VoxelGrid, values: np.ndarray, mask: np.ndarr
         grid=grid.part(box),
         values=around,
         mask=inside,
+        present=present,
         names=[str(segment) for segment in segments],
         named_sides={segment.side for segment in segments if segment.side},
         volume_ml=float(inside.sum() * np.prod(grid.spacing)) / 1000.0,
@@ -163,8 +181,10 @@ def single_out(pieces: list[Organ], midline: float | None, side: Side | None) ->
     if midline is None or len(chosen) > 1:
         split = midline is not None and len({p.side_of(midline) for p in chosen}) == len(chosen)
         advice = "--side left or --side right, or --organ with" if split else "--organ with"
+        where = f" on the {side}" if side and midline is not None else ""
         raise PatientError(
-            f"{len(chosen)} organs are labelled, expected one, found: {found}; give {advice} the label of one"
+            f"{len(chosen)} organs are labelled{where}, expected one, found: {found}; give {advice} the label of one; labels that "
+            "touch are taken together, and a label in two pieces has an empty slice"
         )
     lies: Side = chosen[0].side_of(midline)
     if chosen[0].named_sides == {"right" if lies == "left" else "left"}:

@@ -52,8 +52,8 @@ def part_surfaces(
         if not inside.any():
             if tissue in needed:
                 raise PatientError(
-                    f"the {tissue}'s label has no voxel in this kidney ({piece.title}): expected one of it; choose "
-                    f"the other side or leave the {tissue} out"
+                    f"the {tissue} does not touch {piece.title}: expected one of this kidney; choose the other side, or leave out "
+                    f"which label is its {tissue}"
                 )
             continue
         voxel_ml = float(np.prod(grid.spacing)) / 1000.0

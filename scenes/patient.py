@@ -7,7 +7,7 @@ DICOM has them. Voxels are cropped, and resampled only where a series is tilted 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import cast
 
@@ -16,7 +16,7 @@ import SimpleITK as sitk
 import trimesh
 
 from scenes.bed import bed_of_file, bed_of_labels
-from scenes.cautions import cautions
+from scenes.cautions import in_fat, taken, turned
 from scenes.organ import GROWN, INNER, PARENCHYMA, Organ, check_volume, midline_x, organs, single_out
 from scenes.parts import colours_of_labels, organ_surface, part_surfaces
 from scenes.reading.error import PatientError
@@ -31,6 +31,10 @@ SUPINE_GRAVITY = np.array([0.0, 1.0, 0.0])  # as the CT was taken: on the back, 
 PLAUSIBLE_ORGAN_HU = (-150.0, 600.0)
 CUT_AREA_MM2 = 100.0  # a pole that just grazes the border is whole to within the thickness of a slice
 LEAST_OVERLAP = 0.99
+MOST_VOLUME_OFF = 0.05
+OVERVIEW_MM = 1.5
+# A CT of a body holds fat, if not air, and much that is brighter.
+FAT_HU, LEAST_SPAN_HU = -60, 200
 
 
 @dataclass(frozen=True)
@@ -45,8 +49,12 @@ class Patient:
     support: trimesh.Trimesh
     side: Side
     volumes_ml: dict[str, float]  # of the labels: "organ" with all that is in it, and each part
+    overview: (
+        sitk.Image
+    )  # int16 [HU], the CT's whole width at the organ's level, coarse; not kept in a folder
     spacing_mm: tuple[float, float, float]  # of the CT's voxels along the image's own axes
-    notes: tuple[str, ...] = field(default=())  # what was chosen, left out, resampled, or looks wrong
+    notes: tuple[str, ...] = ()  # what was chosen, left out, resampled
+    cautions: tuple[str, ...] = ()  # what looks wrong
     colours: dict[str, Colour] = field(default_factory=dict)  # of organ and parts, where labels have one
     draft: bool = False  # grown from a seed, and drawn by nobody
 
@@ -94,7 +102,6 @@ def import_patient(
     slab, hounsfield = _level(ct, pieces, margin_mm)
     heights = np.concatenate([piece.grid.corners()[:, 2] for piece in pieces])
     midline = midline_x(ct.grid.part(slab), hounsfield, heights.min(), heights.max())
-    warned = cautions(ct.grid.part(slab), hounsfield, labels, midline)
     piece, told_side = single_out(pieces, midline, side)
     check_volume(piece)
     _check_overlap(ct.grid, piece)
@@ -102,8 +109,14 @@ def import_patient(
     on_ct = nearest(piece.grid, piece.mask, grid)
     _check_place(ct.grid, grid, on_ct, voxels, piece)
     marks, tissues = _marks(labels, piece, grid, on_ct)
+    warned = (
+        *turned(ct.grid.part(slab), hounsfield, labels, midline),
+        *in_fat(grid, voxels, on_ct, marks == tissue_codes([])["kidney"]),
+        *taken(labels, piece, organ is not None),
+    )
 
     surface = organ_surface(piece)
+    _check_surface(surface, piece)
     parts, volumes = part_surfaces(labels, piece, needed, progress)
     return Patient(
         ct=grid.image(voxels),
@@ -114,8 +127,10 @@ def import_patient(
         support=_support(support, surface, labels, piece),
         side=told_side,
         volumes_ml={"organ": piece.volume_ml, **volumes},
+        overview=_overview(ct.grid.part(slab), hounsfield),
         spacing_mm=tuple(grid.spacing.tolist()),
-        notes=(*warned, *ct.notes),
+        notes=ct.notes,
+        cautions=warned,
         colours=colours_of_labels(labels, [*parts]),
     )
 
@@ -145,12 +160,19 @@ def _level(ct: Volume, pieces: list[Organ], margin_mm: float) -> tuple[Box, np.n
     low[2], high[2] = places[:, 2].min() - margin_mm, places[:, 2].max() + margin_mm
     box = ct.grid.box_around(low, high)
     hounsfield = ct.hounsfield(box)
-    if hounsfield.min() >= 0:
+    low, high = int(hounsfield.min()), int(hounsfield.max())
+    if low > FAT_HU or high - low < LEAST_SPAN_HU:
         raise PatientError(
-            "the CT holds no value below 0: expected HU, in which fat and air are negative; give the CT first, then "
-            "the labels"
+            f"the CT holds values from {low} to {high}: expected HU, fat about -100 and air -1000; give the CT first, then the "
+            "labels, and export it with its rescale and without normalising"
         )
     return box, hounsfield
+
+
+def _overview(grid: VoxelGrid, hounsfield: np.ndarray) -> sitk.Image:
+    step = np.maximum(1, np.rint(OVERVIEW_MM / grid.spacing)).astype(int)
+    coarse = np.ascontiguousarray(hounsfield[:: step[2], :: step[1], :: step[0]])
+    return replace(grid, size=coarse.shape[::-1], spacing=grid.spacing * step).image(coarse)
 
 
 def _overlap(grid: VoxelGrid, piece: Organ) -> float:
@@ -203,6 +225,16 @@ def _check_place(
         raise PatientError(
             f"{piece.title} has a median of {median:.0f} HU: expected soft tissue; check that the labels belong to "
             "this CT and that the CT is in HU"
+        )
+
+
+def _check_surface(surface: trimesh.Trimesh, piece: Organ) -> None:
+    """Refuse a surface that leaves out some of its label."""
+    found_ml = surface.volume / 1000
+    if found_ml < (1 - MOST_VOLUME_OFF) * piece.volume_ml:
+        raise PatientError(
+            f"{piece.title} has {piece.volume_ml:.1f} ml, and its surface encloses {found_ml:.1f}: expected all of it; parts of it "
+            "hang together by a thread; mend the label, or name the organ's own with --organ"
         )
 
 

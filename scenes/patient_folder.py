@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import re
 import secrets
@@ -50,6 +51,8 @@ def save_patient(
         PatientError: the folder exists and is not empty, cannot be written, or would have held something private.
     """
     check_folder(folder)
+    for left in folder.parent.glob(f".{glob.escape(folder.name)}.partial-*"):  # of a run that was killed
+        shutil.rmtree(left, ignore_errors=True)
     partial = folder.parent / f".{folder.name}.partial-{secrets.token_hex(4)}"
     try:
         partial.mkdir(parents=True)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from synthetic_body import LEFT, TUMOUR, body, with_voxels
 
-from scenes.check_picture import COLOUR, PIXEL_MM, VIEWS, _bounds, _cut, colours_of, draw_check
+from scenes.check_picture import COLOUR, PIXEL_MM, VIEWS, WHOLE, _bounds, _cut, colours_of, draw_check
 from scenes.facts import facts
 from scenes.patient import import_patient
 from scenes.reading.labels import LabelMap
@@ -23,7 +23,7 @@ def patient():
     return import_patient(Volume.of(ct), LabelMap.of(labels, NAMES), side="left", margin_mm=30.0)
 
 
-@pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
+@pytest.mark.parametrize("view", [*VIEWS, WHOLE], ids=lambda view: view.name)
 def test_letters_are_those_of_the_axes(view):
     right, down = np.array(view.right), np.array(view.down)
     assert view.letters == tuple(LETTER[tuple(axis)] for axis in (-right, right, -down, down))

@@ -191,7 +191,7 @@ class TestImportRefuses:
             ({"organ": [5]}, "label 5 is not in the label map: it holds 1, 2, 3; give one of these"),
             ({"tumour": [8], "organ": [1]}, "tumour's label 8 is not"),
             ({"organ": [1, 3], "tumour": [3]}, "label 3 is given as organ and as tumour"),
-            ({"organ": [1], "tumour": [3]}, "no voxel in this kidney"),
+            ({"organ": [1], "tumour": [3]}, "the tumour does not touch the organ"),
             ({"organ": [1], "side": "left"}, "no left kidney is labelled, found: label 1, right"),
             ({"organ": [3]}, r"has 5\.\d ml: expected 20 to 2000 ml"),
             ({"organ": [2], "margin_mm": -1.0}, "margin"),
@@ -324,3 +324,56 @@ def test_support_like_that_of_the_bead_experiments(case):
         for m in (support, expected)
     ]
     assert np.abs(gaps[0] - gaps[1]).mean() < 0.1
+
+
+class TestCautions:
+    """What looks wrong is said, though the import goes on."""
+
+    def test_a_body_as_it_should_be(self, patient):
+        assert patient.cautions == () and patient.notes == ()
+
+    def test_turned_over_or_mirrored(self, ct_and_labels):
+        ct, labels = ct_and_labels
+        spine = np.array([0.0, 75.0, 0.0]), np.array([22.0, 18.0, 400.0])
+        liver = np.array([-60.0, -40.0, 20.0]), np.array([40.0, 30.0, 50.0])
+        for sign, words in ((1, []), (-1, ["bones lie in front", "liver lies on the patient's left"])):
+            voxels = sitk.GetArrayFromImage(ct)
+            voxels[level(points_of(ct), (sign * spine[0], spine[1])) < 0] = 500
+            marked = drawn(labels, (4, (liver[0] * [sign, 1, 1], liver[1])), (2, LEFT))
+            patient = imported(with_voxels(ct, voxels), marked, [2], margin_mm=20.0, liver=[4])
+            assert len(patient.cautions) == len(words)
+            assert all(word in line for word, line in zip(words, patient.cautions, strict=True))
+
+    def test_labels_shifted_into_fat(self, ct_and_labels):
+        ct, labels = ct_and_labels
+        voxels = sitk.GetArrayFromImage(ct)
+        voxels[voxels == 40] = -100
+        assert not imported(with_voxels(ct, voxels), labels, [2], margin_mm=20.0, tumour=[3]).cautions
+        shifted = sitk.Image(labels)
+        shifted.SetOrigin(np.add(labels.GetOrigin(), (0, 8.0, 0)).tolist())
+        (said,) = imported(with_voxels(ct, voxels), shifted, [2], margin_mm=20.0, tumour=[3]).cautions
+        assert "of the organ's rim is fat or gas" in said
+
+    def test_labels_without_a_meaning(self, ct_and_labels):
+        (said,) = imported(*ct_and_labels, side="left", margin_mm=20.0).cautions
+        assert "labels 2, 3 say nothing, and were all taken as the kidney" in said
+        (said,) = imported(*ct_and_labels, organ=[2], margin_mm=20.0).cautions
+        assert "were left out: 3 (5." in said and "--tumour" in said
+
+
+def test_what_touches_by_a_corner_is_held_and_what_only_touches_is_no_part(ct_and_labels):
+    """Of two organs that touch by a corner neither is the other's, but a tumour that does is the kidney's."""
+    ct, _ = ct_and_labels
+    grid = VoxelGrid.of(ct)
+    values = np.zeros(grid.size[::-1], np.uint8)
+    x, y, z = (int(n) for n in grid.index(LEFT[0][None])[0])
+    values[z - 8 : z + 8, y - 8 : y + 8, x - 8 : x + 8] = 1
+    values[z + 8 : z + 13, y + 8 : y + 13, x + 8 : x + 13] = 2
+    apart = organs(LabelMap.valued(grid, values), [1, 2])
+    assert [piece.mask.sum() for piece in apart] == [16**3]
+    label = LabelMap.valued(grid, values, {1: "kidney", 2: "tumour"})
+    (piece,) = organs(label)
+    assert 16**3 + 5**3 < piece.mask.sum() <= 16**3 + 5**3 + 8
+    patient = import_patient(Volume.of(ct), label, side="left", margin_mm=10.0)
+    assert patient.organ.body_count == 1
+    assert patient.organ.volume / 1000 == pytest.approx(patient.volumes_ml["organ"], rel=0.02)

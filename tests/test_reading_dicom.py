@@ -170,7 +170,7 @@ class TestChoice:
         volume = assert_whole(thin, tmp_path)
         assert len(volume.notes) == 1
         for words in (
-            "series 3 of 2",
+            "of 2 series, number 3",
             "series 3 (CT, 6 slices, 1.25 mm apart)",
             "series 8 (CT, 3 slices, 5.00 mm",
         ):
@@ -199,7 +199,7 @@ class TestChoice:
         picture = series.slice(0, Modality="OT", SOPClassUID="1.2.840.10008.5.1.4.1.1.7")
         save(picture, tmp_path / "picture.dcm")
         notes = " ".join(assert_whole(series, tmp_path).notes)
-        assert "1 localisers were left out" in notes and "left out, no CT slices: 1 OT" in notes
+        assert "left out, localisers: 1" in notes and "left out, no CT slices: 1 OT" in notes
 
     @pytest.mark.parametrize("number", ["", "4.5", "Doe^Jane"])
     def test_number_that_is_none(self, tmp_path, number):
@@ -311,7 +311,7 @@ class TestGeometry:
         series.write()
         shutil.copy(tmp_path / "s1-3.dcm", tmp_path / "copy.dcm")
         notes = assert_whole(series, tmp_path).notes
-        assert len(notes) == 1 and "1 slices are there twice" in notes[0] and "slice 4" in notes[0]
+        assert len(notes) == 1 and "there twice, alike, and taken once" in notes[0] and "slice 4" in notes[0]
 
     def test_conflict(self, tmp_path):
         series = Series(tmp_path)

@@ -148,7 +148,7 @@ def _add_slices(found: Found, item: Item, header: Dataset) -> None:
     series = found.series.setdefault(uid, Series(uid, number if number.isdecimal() else "without a number"))
     series.frame_of_reference = text_of(item.name, header, "FrameOfReferenceUID")
     try:
-        for slice_ in _slices(item, header):
+        for slice_ in slices_of(item, header):
             if slice_ is None:
                 series.localizers += 1
             else:
@@ -159,7 +159,7 @@ def _add_slices(found: Found, item: Item, header: Dataset) -> None:
         series.faults.append(f"{item.name}: its header cannot be understood ({type(error).__name__})")
 
 
-def _slices(item: Item, header: Dataset) -> Iterator[Slice | None]:
+def slices_of(item: Item, header: Dataset) -> Iterator[Slice | None]:
     """The slices of one file; None for what shows a view and no slice."""
     if str(header.get("BurnedInAnnotation", "NO")).upper() == "YES":
         raise PatientError(f"{item.name}: has text burned into its pixels, which may name the patient")

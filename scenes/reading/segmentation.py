@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
+from dataclasses import replace
 
 import highdicom as hd
 import numpy as np
@@ -11,11 +12,16 @@ import numpy as np
 from scenes.reading.dicom_file import parsed
 from scenes.reading.error import PatientError
 from scenes.reading.grid import VoxelGrid
+from scenes.reading.headers import read_header, slices_of
 from scenes.reading.labels import LabelMap, Segment
+from scenes.reading.names import tissue_of
 from scenes.reading.source import Item
+from scenes.reading.stack import stacked
 
 # A voxel of a fractional segment is in it from this share on.
 HALF = 0.5
+# What stands for wholly inside where a segment is straightened; beyond its frames there is air.
+FULL_HU = 1000.0
 
 
 def read_segmentation(item: Item) -> tuple[list[LabelMap], list[str], str]:
@@ -30,7 +36,7 @@ def read_segmentation(item: Item) -> tuple[list[LabelMap], list[str], str]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             segmentation = hd.seg.Segmentation.from_dataset(data, copy=False)
-            found = _maps(item.name, segmentation)
+            found = _maps(item, segmentation)
     except PatientError:
         raise
     except Exception as error:  # a parser's faults are many; all of them are the file's
@@ -48,30 +54,43 @@ def read_segmentation(item: Item) -> tuple[list[LabelMap], list[str], str]:
     return found, notes, str(referenced[0].get("SeriesInstanceUID", "")) if referenced else ""
 
 
-def _maps(name: str, segmentation: hd.seg.Segmentation) -> list[LabelMap]:
+def _maps(item: Item, segmentation: hd.seg.Segmentation) -> list[LabelMap]:
     if segmentation.get("FrameOfReferenceUID") is None:
         raise PatientError(
-            f"{name}: has no frame of reference, so it was drawn on no volume; expected labels of a CT; choose another file"
+            f"{item.name}: has no frame of reference, so it was drawn on no volume; expected labels of a CT; choose another file"
         )
+    is_upright = segmentation.get_volume_geometry(allow_missing_positions=True) is not None
+    read = _upright if is_upright else _tilted
     maps = []
     for number in segmentation.segment_numbers:
         if number == 0:  # background of a label map
             continue
-        segment = Segment.named(segmentation.get_segment_description(number).segment_label, int(number))
+        described = segmentation.get_segment_description(number)
+        segment = Segment.named(described.segment_label, int(number))
         if segment.tissue is None:
-            meaning = segmentation.get_segment_description(number).segmented_property_type.meaning
-            segment = Segment(segment.name, segment.value, Segment.named(meaning).tissue, segment.side)
-        volume = segmentation.get_volume(segment_numbers=[number], allow_missing_positions=True)
-        one = LabelMap.single(
-            VoxelGrid(
-                volume.spatial_shape,
-                np.array(volume.spacing),
-                np.array(volume.position),
-                np.array(volume.direction),
-            ).checked(name),
-            np.asarray(volume.array[..., 0] >= HALF).T,
-            segment,
-        )
+            segment = replace(segment, tissue=tissue_of(described.segmented_property_type.meaning))
+        one = LabelMap.single(*read(item, segmentation, int(number)), segment)
         if one is not None:
             maps.append(one)
     return maps
+
+
+def _upright(item: Item, segmentation: hd.seg.Segmentation, number: int) -> tuple[VoxelGrid, np.ndarray]:
+    """A segment's grid, and which of its voxels (z, y, x) it holds."""
+    volume = segmentation.get_volume(segment_numbers=[number], allow_missing_positions=True)
+    place = np.array(volume.spacing), np.array(volume.position), np.array(volume.direction)
+    grid = VoxelGrid(volume.spatial_shape, *place).checked(item.name)
+    return grid, np.asarray(volume.array[..., 0] >= HALF).T
+
+
+def _tilted(item: Item, segmentation: hd.seg.Segmentation, number: int) -> tuple[VoxelGrid, np.ndarray]:
+    """The same of frames that lean, as a tilted gantry's slices do: straightened as those are, as if they were HU."""
+    most = float(segmentation.get("MaximumFractionalValue") or 1)
+    frames = segmentation.PerFrameFunctionalGroupsSequence
+    own = [
+        replace(one, slope=FULL_HU / most, intercept=0.0)
+        for one, frame in zip(slices_of(item, read_header(item)), frames, strict=True)
+        if one is not None and frame.SegmentIdentificationSequence[0].ReferencedSegmentNumber == number
+    ]
+    stack = stacked(item.name, own)
+    return stack.grid, stack.read(stack.grid.whole()) >= HALF * FULL_HU

@@ -50,12 +50,12 @@ def series_volume(
         )
     slices, left_out = _one_view(series)
     if series.localizers + left_out:
-        notes.append(f"{series.localizers + left_out} localisers were left out")
+        notes.append(f"left out, localisers: {series.localizers + left_out}")
     if found.others:
         others = ", ".join(f"{count} {what}" for what, count in sorted(found.others.items()))
         notes.append(f"left out, no CT slices: {others}")
     if not all(one.is_rescaled for one in slices):
-        notes.append("CAUTION: the files do not say how their values become HU; they were taken as HU")
+        notes.append("the files do not say how their values become HU: they were taken as HU")
     stack = stacked(str(path), slices)
     return Volume(
         name=str(path),
@@ -99,13 +99,13 @@ def _chosen(
     best = ranked[0]
     if len(candidates) == 1:
         return best, []
-    why = (
-        "the labels were drawn on it"
-        if best.uid == referenced
-        else "it shows most of the body in the thinnest slices"
-    )
+    why = "it shows most of the body in the thinnest slices"
+    if best.uid == referenced:
+        why = "the labels were drawn on it"
+    elif _rank(best, "")[:-1] == _rank(ranked[1], "")[:-1]:
+        why = "of several that are alike the lowest number"
     return best, [
-        f"series {best.number} of {len(candidates)} was taken: {why}; there are: {listed}; --series N takes another"
+        f"of {len(candidates)} series, number {best.number} was taken: {why}; there are: {listed}; --series N takes another"
     ]
 
 

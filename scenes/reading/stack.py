@@ -95,6 +95,7 @@ def stacked(name: str, slices: list[Slice]) -> Stack:
         )
     _check_alike(name, slices)
     normal = np.cross(slices[0].row, slices[0].column)
+    _check_phases(name, slices, normal)
     notes: list[str] = []
     slices = sorted(slices, key=lambda s: (float(s.position @ normal), s.number or 0))
     slices = _once(name, slices, normal, notes)
@@ -123,6 +124,29 @@ def _check_alike(name: str, slices: list[Slice]) -> None:
             )
 
 
+def _check_phases(name: str, slices: list[Slice], normal: np.ndarray) -> None:
+    """Refuse several phases in one series: every place is there as often."""
+    places, counts = np.unique([round(float(s.position @ normal), 2) for s in slices], return_counts=True)
+    often = int(counts.min())
+    if (
+        len(places) > 2
+        and often > 1
+        and len({s.sop for s in slices}) == len(slices)
+        and not _alike(slices, normal)
+    ):
+        raise PatientError(
+            f"{name}: all {len(places)} positions are there {often} times: several phases in one series; expected one; put the slices "
+            "of one phase, which their acquisition numbers or times tell apart, in a folder of their own"
+        )
+
+
+def _alike(slices: list[Slice], normal: np.ndarray) -> bool:
+    """Whether the first two slices at one place are the same."""
+    first = min(slices, key=lambda s: float(s.position @ normal))
+    twin = [s for s in slices if abs((s.position - first.position) @ normal) < SAME_PLACE_MM][:2]
+    return len(twin) == 2 and _same(*twin)
+
+
 def _once(name: str, slices: list[Slice], normal: np.ndarray, notes: list[str]) -> list[Slice]:
     """Slices that lie at one place: copies are left out, others in conflict."""
     kept, copies = [slices[0]], []
@@ -138,7 +162,7 @@ def _once(name: str, slices: list[Slice], normal: np.ndarray, notes: list[str]) 
             )
     if copies:
         named = ", ".join(one.label for one in copies[:3]) + (" and others" if len(copies) > 3 else "")
-        notes.append(f"{len(copies)} slices are there twice, alike, and were taken once: {named}")
+        notes.append(f"there twice, alike, and taken once: {named}")
     return kept
 
 
