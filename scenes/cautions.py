@@ -8,6 +8,7 @@ from scipy import ndimage
 from scenes.organ import Organ
 from scenes.reading.grid import VoxelGrid
 from scenes.reading.labels import LabelMap, listed
+from scenes.reading.names import is_understood
 
 BONE_ABOVE_HU, BODY_ABOVE_HU = 300, -300
 COARSE_MM = 3.0
@@ -83,7 +84,8 @@ def taken(labels: LabelMap, piece: Organ, is_named: bool) -> tuple[str, ...]:
             f"labels {names} say nothing, and were all taken as the kidney; say otherwise with --organ, --tumour, --cyst"
         )
     around = ndimage.binary_dilation(piece.mask, iterations=2) & ~piece.mask
-    beside = [v for v in np.unique(piece.values[around]).tolist() if v and labels.segments[v].tissue is None]
+    unsaid = {v for v, s in labels.segments.items() if s.tissue is None and not is_understood(s.name)}
+    beside = [v for v in np.unique(piece.values[around]).tolist() if v in unsaid]
     voxel_ml = float(np.prod(labels.grid.spacing)) / 1000
     left_out = [(v, float((labels.values == v).sum()) * voxel_ml) for v in beside]
     told = [f"{labels.segments[v]} ({ml:.1f} ml)" for v, ml in left_out if ml >= LEAST_LEFT_OUT_ML]

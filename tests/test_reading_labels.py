@@ -3,6 +3,7 @@
 import gzip
 import shutil
 
+import nibabel
 import numpy as np
 import pytest
 import SimpleITK as sitk
@@ -367,3 +368,22 @@ class TestTogether:
         plain = LabelMap.of(drawn(grid_around((-33, 18, -401), (-22, 30, -385), (1, 1, 1)), (5, KIDNEY)))
         (told,) = with_tissues([plain], ["5"], {})
         assert told.segments[5].tissue == "kidney"
+
+
+def test_names_in_a_nifti_header(tmp_path):
+    """TotalSegmentator's one file of all organs carries their names in an extension."""
+    table = "".join(
+        f'<Label Key="{n}" Red="1"><![CDATA[{name}]]></Label>'
+        for n, name in ((3, "kidney_left"), (5, "liver"))
+    )
+    values = np.zeros((6, 6, 6), np.uint8)
+    values[1:3], values[4:] = 3, 5
+    image = nibabel.Nifti1Image(values, np.eye(4))
+    image.set_sform(np.eye(4), code=1)
+    image.header.extensions.append(nibabel.nifti1.Nifti1Extension(0, f"<CaretExtension>{table}".encode()))
+    nibabel.save(image, tmp_path / "all.nii.gz")
+    (one,) = open_labels(tmp_path / "all.nii.gz").maps(None)
+    assert {v: (s.name, s.tissue, s.side) for v, s in one.segments.items()} == {
+        3: ("kidney_left", "kidney", "left"),
+        5: ("liver", "liver", None),
+    }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from scenes.reading.headers import Found, read_header
 from scenes.reading.itk_files import itk_header, itk_layers, metadata
 from scenes.reading.labels import LabelMap, Segment, box_of, whole_numbers
 from scenes.reading.names import is_far, side_of, tissue_of
+from scenes.reading.nifti import label_names
 from scenes.reading.progress import Progress, silent
 from scenes.reading.secrets import secrets_of
 from scenes.reading.segmentation import read_segmentation
@@ -89,7 +90,7 @@ def drawing_of(found: Found) -> Drawing | None:
 def _file(path: Path) -> Drawing:
     if path.name.lower().endswith(NIFTI):
         volume = file_volume(path)
-        maps = [_map(path, volume.grid, volume.read())]
+        maps = [_map(path, volume.grid, volume.read(), label_names(path))]
         return Drawing(lambda _: maps, secrets=volume.secrets)
     header = itk_header(path)
     names = _slicer_names(header)
@@ -103,10 +104,12 @@ def _file(path: Path) -> Drawing:
     return Drawing(lambda _: maps, secrets=secrets)
 
 
-def _map(path: Path, grid: VoxelGrid, voxels) -> LabelMap:
+def _map(path: Path, grid: VoxelGrid, voxels: np.ndarray, names: Mapping[int, str] | None = None) -> LabelMap:
     """A label map; one of a single value is called as its file where that says what it is."""
     values = whole_numbers(voxels, str(path))
-    one = LabelMap.valued(grid, values)
+    one = LabelMap.valued(grid, values, names)
+    if names:
+        return one
     stem = _stem(path)
     if len(one.segments) == 1 and (tissue_of(stem) or side_of(stem)):
         (value,) = one.segments

@@ -7,7 +7,7 @@ Side = Literal["left", "right"]
 
 # In this order: a renal mass is a tumour and a kidney cyst a cyst before either is a kidney. "" is known, and no tissue of ours.
 TISSUE_OF_NAME: tuple[tuple[str, str], ...] = (
-    ("", r"adrenal|suprarenal|gall ?bladder|cystic duct"),
+    ("", r"adrenal|suprarenal|gall ?bladder|cystic duct|spleen|milz|pancrea|stomach|colon|bowel|duoden|intestin|diaphragm|lymph|skin|\bbody\b|external"),
     ("tumour", r"tumou?r|tumeur|\bmass\b|\bmasse\b|raumforderung|lesion|läsion|neoplas|carcinom|karzinom|cancer|krebs|malignan|\b[cp]?rcc\b|\bgtv"),
     ("cyst", r"\bcysts?\b|zyste|\bkyste|\bquiste"),
     ("stone", r"\bstones?\b|calcul|lithiasis|nierenstein"),
@@ -39,6 +39,11 @@ def tissue_of(name: str) -> str | None:
     plain = _plain(name)
     found = next((tissue for tissue, pattern in TISSUE_OF_NAME if re.search(pattern, plain)), "")
     return found or None
+
+
+def is_understood(name: str) -> bool:
+    """Whether a name is one of ours, or of an organ that is none of a kidney's tissues."""
+    return bool(name) and any(re.search(pattern, _plain(name)) for _, pattern in TISSUE_OF_NAME)
 
 
 def is_far(name: str) -> bool:

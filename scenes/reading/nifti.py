@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import warnings
 from pathlib import Path
 from typing import Any, cast
@@ -19,6 +20,9 @@ from scenes.reading.volume import Volume
 logging.getLogger("nibabel").setLevel(logging.CRITICAL)
 
 SLAB_VOXELS = 8_000_000
+# Not parsed as XML: all that is wanted is the names, and an extension may be anything.
+LABEL_ENTRY = re.compile(r'<Label\s[^<>]*?Key="(\d{1,5})"[^<>]*>(?:<!\[CDATA\[)?([^<>\]]{1,200})')
+MOST_NAMES_BYTES = 1 << 20
 MM_OF_UNIT = {"meter": 1000.0, "micron": 0.001}
 SCANNER_CODE = 1
 RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0])
@@ -62,6 +66,21 @@ def nifti_volume(path: Path) -> Volume:
         if key in header
     ]
     return Volume(str(path), grid, read_box, secrets=frozenset(text for text in texts if text))
+
+
+def label_names(path: Path) -> dict[int, str]:
+    """Names of label values, where a header's extension has Connectome Workbench's table of them, as TotalSegmentator writes."""
+    try:
+        image: Any = nibabel.load(path)
+        texts = [extension.get_content() for extension in image.header.extensions]
+    except Exception:  # a damaged extension names nothing
+        return {}
+    found: dict[int, str] = {}
+    for text in texts:
+        plain = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
+        for key, name in LABEL_ENTRY.findall(plain[:MOST_NAMES_BYTES]):
+            found[int(key)] = name.strip()
+    return found
 
 
 def _narrow(voxels: np.ndarray) -> np.ndarray:

@@ -86,11 +86,13 @@ def _upright(item: Item, segmentation: hd.seg.Segmentation, number: int) -> tupl
 def _tilted(item: Item, segmentation: hd.seg.Segmentation, number: int) -> tuple[VoxelGrid, np.ndarray]:
     """The same of frames that lean, as a tilted gantry's slices do: straightened as those are, as if they were HU."""
     most = float(segmentation.get("MaximumFractionalValue") or 1)
-    frames = segmentation.PerFrameFunctionalGroupsSequence
+    shared = segmentation.SharedFunctionalGroupsSequence[0].get("SegmentIdentificationSequence")
+    groups = segmentation.PerFrameFunctionalGroupsSequence
+    told = [frame.get("SegmentIdentificationSequence", shared)[0] for frame in groups]
     own = [
         replace(one, slope=FULL_HU / most, intercept=0.0)
-        for one, frame in zip(slices_of(item, read_header(item)), frames, strict=True)
-        if one is not None and frame.SegmentIdentificationSequence[0].ReferencedSegmentNumber == number
+        for one, frame in zip(slices_of(item, read_header(item)), told, strict=True)
+        if one is not None and frame.ReferencedSegmentNumber == number
     ]
     stack = stacked(item.name, own)
     return stack.grid, stack.read(stack.grid.whole()) >= HALF * FULL_HU
