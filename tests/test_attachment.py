@@ -74,6 +74,17 @@ def test_the_hilum_is_the_hollow_of_the_medial_side():
         assert hilum(dented, side) == pytest.approx((medial * 20.0, 4.0, 6.0), abs=5.0)
 
 
+def test_a_deeper_hollow_of_the_other_side_is_no_hilum():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=30.0)
+    dented = ball.vertices.copy()
+    for at, reach in (([-38.0, 4.0, 6.0], 18), ([38.0, 0.0, 0.0], 26)):
+        away = np.linalg.norm(ball.vertices - at, axis=1)
+        dented[away < reach, 0] -= np.sign(at[0]) * (reach - away[away < reach])
+    mesh = trimesh.Trimesh(dented, ball.faces, process=False)
+    assert hilum(mesh, "left") == pytest.approx((-20.0, 4.0, 6.0), abs=5.0)
+    assert hilum(mesh, "right") == pytest.approx((12.0, 0.0, 0.0), abs=5.0)
+
+
 def test_the_embedded_kidneys_hilum(phantom_hilum):
     """Where its vessels leave it: scenes/phantom.py puts its sinus 7 mm to the midline of the kidney's middle."""
     organ, found = phantom_hilum

@@ -60,6 +60,12 @@ class TestBedOfLabels:
         with pytest.raises(PatientError, match=r"lies under \d+% of the organ: expected 50% or more"):
             bed_of_labels(mould.organ, LabelMap.of(aside, NAMES), [2, 3], SUPINE_GRAVITY)
 
+    def test_ends_at_half_of_the_organs_height(self, ct_and_labels, mould):
+        """Though tissue goes on around it; less what the rounded rim takes."""
+        around = drawn(ct_and_labels[1], (4, (LEFT[0], LEFT[1] + 30)), (2, LEFT), (3, TUMOUR))
+        bed = bed_of_labels(mould.organ, LabelMap.of(around, NAMES), [2, 3], SUPINE_GRAVITY)
+        assert 0 <= bed.bounds[0, 1] - mould.organ.bounds[:, 1].mean() < 4
+
 
 class TestBedOfFile:
     def test_is_taken_as_it_is(self, ct_and_labels, mould, tmp_path):
@@ -92,3 +98,14 @@ class TestBedOfFile:
             with pytest.raises(PatientError, match=words) as caught:
                 bed_of_file(tmp_path / f"{name}.stl", mould.organ)
             assert "\n" not in str(caught.value) and f"{name}.stl" in str(caught.value)
+
+
+def test_a_surface_that_faces_inward(tmp_path):
+    ball = trimesh.creation.icosphere(radius=20.0)
+    ball.apply_translation(LEFT[0])
+    box = trimesh.creation.box([40.0, 10.0, 40.0])
+    box.apply_translation(LEFT[0] + [0, 26, 0])
+    box.invert()
+    box.export(tmp_path / "in.stl")
+    with pytest.raises(PatientError, match="faces outward"):
+        bed_of_file(tmp_path / "in.stl", ball)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import matplotlib.image
 import numpy as np
 import pytest
-from synthetic_body import LEFT, TUMOUR, body, with_voxels
+from synthetic_body import LEFT, TUMOUR, body, points_of, with_voxels
 
 from scenes.check_picture import COLOUR, PIXEL_MM, VIEWS, WHOLE, _bounds, _cut, colours_of, draw_check
 from scenes.facts import facts
@@ -76,3 +76,41 @@ def test_the_file_says_nothing_of_its_maker(patient, tmp_path):
     draw_check(patient, facts(patient), tmp_path)
     content = (tmp_path / "check.png").read_bytes()
     assert not any(word in content for word in (b"tEXt", b"iTXt", b"eXIf", str(tmp_path).encode()))
+
+
+def panel_of(picture, n):
+    """One of the three cuts, and its middle's column and row."""
+    height, width = picture.shape[:2]
+    return (
+        picture[: height // 2, n * width // 3 : (n + 1) * width // 3],
+        (0.03 + 0.94 * (n + 0.5) / 3 - n / 3) * width,
+        0.297 * height,
+    )
+
+
+def test_ct_lies_under_its_letters(patient, tmp_path):
+    """A block on the patient's left, in front and above: right and up, right and up, left and up."""
+    places = points_of(patient.ct)
+    block = ((places > (85, 5, 14)) & (places < (105, 32, 40))).all(axis=-1)
+    bright = with_voxels(patient.ct, np.where(block, 1000, -1000).astype(np.int16))
+    draw_check(replace(patient, ct=bright), facts(patient), tmp_path)
+    picture = matplotlib.image.imread(tmp_path / "check.png")[..., :3]
+    for n, sense in enumerate((1, 1, -1)):
+        panel, column, row = panel_of(picture, n)
+        at = np.median(np.argwhere(panel.min(axis=2) > 0.97), axis=0)
+        assert sense * (at[1] - column) > 15 and row - at[0] > 15, n
+
+
+def test_outlines_lie_under_their_letters(patient, tmp_path):
+    """The tumour is in all cuts, to the left, in front and above the kidney's middle."""
+    draw_check(patient, facts(patient), tmp_path)
+    picture = matplotlib.image.imread(tmp_path / "check.png")[..., :3]
+    for n, sense in enumerate((1, 1, -1)):
+        panel, middle = panel_of(picture, n)[0], {}
+        for name in ("organ", "tumour"):
+            wanted = np.array([int(COLOUR[name][k : k + 2], 16) for k in (1, 3, 5)]) / 255
+            shown = np.argwhere(np.abs(panel - wanted).max(axis=2) < 0.1)
+            assert len(shown) > 60, (n, name)
+            middle[name] = shown.mean(axis=0)
+        down, right = middle["tumour"] - middle["organ"]
+        assert sense * right > 3 and down < -3, n

@@ -1,16 +1,23 @@
 """The command import from end to end: what a hospital sends becomes a patient's folder that names nobody."""
 
+import nibabel
 import numpy as np
 import pytest
+import SimpleITK as sitk
 from dicom_series import PERSON, Series, write_segmentation, write_structures, zipped
+from pydicom.dataset import Dataset
 from synthetic_body import BODY, DIRECTIONS, LEFT, RIGHT, TUMOUR, level
 
 from app import main
 from scenes.anatomy import load_anatomy
 from scenes.command import place_mm
-from scenes.intake import Request, take_in
+from scenes.intake import Request, _with_labels, take_in
 from scenes.patient_folder import save_patient, telling
+from scenes.reading.ct import open_ct
 from scenes.reading.error import PatientError
+from scenes.reading.label_files import open_labels
+from scenes.reading.labels import LabelMap
+from scenes.reading.progress import silent
 from scenes.scene import load_scene
 
 SPINE = np.array([0.0, 70.0, 0.0]), np.array([22.0, 20.0, 400.0])
@@ -181,3 +188,76 @@ def test_a_seed_is_three_numbers(text):
 def test_a_seed_or_labels(tmp_path):
     with pytest.raises(PatientError, match="not both"):
         take_in(Request(tmp_path, [tmp_path], seed_mm=np.zeros(3)))
+
+
+def test_the_series_that_labels_were_drawn_on(tmp_path):
+    """Though another shows more."""
+    thin = Series(tmp_path / "ct", number=3, gap=1.25, size=(12, 10, 12))
+    thick = Series(
+        tmp_path / "ct", number=8, gap=5.0, size=(12, 10, 3), frame_of_reference=thin.frame_of_reference
+    )
+    thin.write()
+    thick.write()
+    seg = write_segmentation(tmp_path / "seg.dcm", thick, {"Kidney": np.ones((3, 10, 12))})
+    assert _with_labels(Request(tmp_path / "ct", [seg]), silent)[0].grid.spacing[2] == pytest.approx(5.0)
+
+
+def test_each_source_is_private(hospital, taken_in):
+    """The CT's header by itself, and the labels'."""
+    folder, series = hospital
+    for said in (open_ct(folder / "ct").secrets, open_labels(folder / "seg").secrets):
+        assert {"Doe^Jane", "Doe", "Jane", "19600229", "A1234567", series.study} <= said
+
+
+def test_what_labels_say_and_paths_are_private(hospital, taken_in, tmp_path, monkeypatch):
+    monkeypatch.setattr("scenes.intake.import_patient", lambda *_, **__: taken_in[0])
+    monkeypatch.chdir(tmp_path)
+    made = nibabel.Nifti1Image(np.ones((5, 5, 5), np.uint8), np.eye(4))
+    made.header["descrip"] = b"drawn by Roe"
+    nibabel.save(made, tmp_path / "kidney.nii.gz")
+    given = type(tmp_path)("../") / tmp_path.name / "kidney.nii.gz"
+    private = take_in(Request(hospital[0] / "ct", [given]))[1]
+    assert {"drawn by Roe", "Doe^Jane", str(given), str(tmp_path.resolve() / "kidney.nii.gz")} <= private
+
+
+def test_a_seed_makes_a_draft(hospital, taken_in, monkeypatch):
+    labels = LabelMap.of(sitk.Image([4, 4, 4], sitk.sitkUInt8) + 1)
+    monkeypatch.setattr("scenes.intake.grown", lambda ct, seed: labels)
+    monkeypatch.setattr("scenes.intake.import_patient", lambda ct, labels, *_, **__: taken_in[0])
+    assert take_in(Request(hospital[0] / "ct", seed_mm=LEFT[0]))[0].draft and not taken_in[0].draft
+
+
+def test_what_one_header_says(tmp_path):
+    """Also in sequences, in private groups, in lists and in free text."""
+
+    def edit(data, _):
+        inner = Dataset()
+        inner.PatientName = "Roe^Ann"
+        data.RequestAttributesSequence, data.ImageComments = [inner], "calls himself Jim"
+        data.OtherPatientIDs, data.InstitutionName = ["X-1", "X-22"], "St Elsewhere"
+        data.private_block(0x0099, "MAKER", create=True).add_new(1, "LO", "Ward 12")
+
+    secrets = open_ct(Series(tmp_path).write(edit=edit)).secrets
+    assert {"Roe^Ann", "Roe", "Ann", "calls himself Jim", "X-22", "St Elsewhere", "Ward 12"} <= secrets
+
+
+class TestSearch:
+    @pytest.mark.parametrize("encoding", ["utf-8", "utf-16-le", "latin-1"])
+    def test_any_file_in_any_encoding(self, taken_in, tmp_path, encoding):
+        def draw(folder):
+            (folder / "check.png").write_bytes(b"\0\1" + "Özgür Ünal".encode(encoding) + b"\2")
+
+        with pytest.raises(PatientError, match=r"check\.png would have held"):
+            save_patient(taken_in[0], tmp_path / "p", draw=draw, private={"Özgür Ünal"})
+
+    def test_packed_voxels_are_searched(self, taken_in, tmp_path):
+        def draw(folder):
+            words = sitk.GetImageFromArray(np.frombuffer(b"\0\0of Doe^Jane\0", np.uint8).reshape(1, 1, -1))
+            sitk.WriteImage(words, str(folder / "labels.nrrd"), useCompression=True)
+
+        with pytest.raises(PatientError, match=r"labels\.nrrd would have held"):
+            save_patient(taken_in[0], tmp_path / "p", draw=draw, private={"Doe^Jane"})
+
+    def test_a_word_within_another_names_nobody(self, taken_in, tmp_path):
+        texts = {"scene.toml": 'title = "monroe\'s doer"\n'}
+        assert save_patient(taken_in[0], tmp_path / "p", texts, private={"roe", "doe"}) == 2
