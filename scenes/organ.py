@@ -168,7 +168,7 @@ def single_out(pieces: list[Organ], midline: float | None, side: Side | None) ->
     if midline is None and len(pieces) == 2 and ends[1] - ends[0] > KIDNEYS_APART_MM:
         midline = 0.5 * sum(ends)
     found = _named(pieces, midline)
-    unsure = midline is None or all(abs(p.centre_x_mm - midline) < MIDLINE_MARGIN_MM for p in pieces)
+    unsure = midline is None or abs(pieces[0].centre_x_mm - midline) < MIDLINE_MARGIN_MM
     if unsure and len(pieces) == 1:
         return pieces[0], _told(pieces[0], side, found)
     chosen = pieces if side is None or midline is None else [p for p in pieces if p.side_of(midline) == side]

@@ -23,6 +23,7 @@ from synthetic_body import (
     with_voxels,
 )
 
+import scenes.patient
 from scenes.facts import facts, told
 from scenes.organ import midline_x, organs, single_out
 from scenes.patient import import_patient
@@ -71,6 +72,13 @@ def patient(ct_and_labels):
     return imported(*ct_and_labels, organ=[2], tumour=[3], margin_mm=20.0)
 
 
+@pytest.fixture
+def without_support(monkeypatch):
+    """A mould takes a second, and is tested by itself."""
+    monkeypatch.setattr(scenes.patient, "_support", lambda kind, organ, labels, piece: organ)
+
+
+@pytest.mark.usefixtures("patient", "without_support")
 class TestImport:
     def test_finds_the_organ(self, patient, ct_and_labels):
         ct, labels = ct_and_labels
@@ -326,6 +334,7 @@ def test_support_like_that_of_the_bead_experiments(case):
     assert np.abs(gaps[0] - gaps[1]).mean() < 0.1
 
 
+@pytest.mark.usefixtures("patient", "without_support")
 class TestCautions:
     """What looks wrong is said, though the import goes on."""
 

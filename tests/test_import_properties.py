@@ -43,7 +43,7 @@ def _without_the_support(monkeypatch):
     monkeypatch.setattr(scenes.patient, "_support", lambda kind, organ, labels, piece: organ)
 
 
-@settings(max_examples=8, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=5, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(
     ct_grid=grids((-175, -120, -75), (175, 120, 95)),
     label_grid=grids((25, -5, -55), (115, 75, 80)),

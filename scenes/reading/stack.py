@@ -197,7 +197,7 @@ def _check_gaps(name: str, slices: list[Slice], along: np.ndarray) -> None:
             f"{name}: {pair(int(np.argmin(gaps)))}; expected one stack, no gap under {least:g} times the usual; "
             "two acquisitions may overlap here: take one out"
         )
-    if usual > MOST_GAP_MM:
+    if usual > MOST_GAP_MM + SAME_PLACE_MM:
         raise PatientError(
             f"{name}: slices are {usual:.1f} mm apart; expected at most {MOST_GAP_MM:g} mm; choose a thinner series"
         )
