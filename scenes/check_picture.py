@@ -176,7 +176,7 @@ def _draw_surfaces(axes: Any, surfaces: dict[str, trimesh.Trimesh], colours: dic
     axes.set_proj_type("ortho")
     axes.view_init(elev=12, azim=-105)
     axes.set_axis_off()
-    axes.set_title("surface, from the front", color="white", fontsize=11, y=1.06)
+    axes.set_title("surface, from the front", color="white", fontsize=11, y=1.12)
     x, y, z = (low + high) / 2
     gap = 0.09 * (high - low).max()
     for letter, place in {
