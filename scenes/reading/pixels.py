@@ -57,7 +57,7 @@ class _File:
             warnings.simplefilter("ignore")
             try:
                 return pixel_array(self.data, **options)
-            except (NotImplementedError, RuntimeError):
+            except RuntimeError:
                 return None
             except Exception as error:
                 raise self._fault(type(error).__name__) from error
