@@ -28,7 +28,7 @@ from scenes.facts import facts, told
 from scenes.organ import midline_x, organs, single_out
 from scenes.patient import import_patient
 from scenes.patient_folder import save_patient
-from scenes.reading.ct import open_ct, read_volume
+from scenes.reading.ct import open_ct
 from scenes.reading.error import PatientError
 from scenes.reading.grid import VoxelGrid
 from scenes.reading.labels import LabelMap, with_tissues
@@ -261,7 +261,7 @@ class TestSave:
         assert names == {"ct.nrrd", "labels.nrrd", "organ.stl", "tumour.stl", "support.stl", "scene.toml"}
         assert [entry.name for entry in folder.parent.iterdir()] == ["patient"]
         for name in ("ct", "labels"):
-            again, image = read_volume(folder / f"{name}.nrrd"), getattr(patient, name)
+            again, image = open_ct(folder / f"{name}.nrrd").image(), getattr(patient, name)
             assert np.array_equal(sitk.GetArrayViewFromImage(again), sitk.GetArrayViewFromImage(image))
             np.testing.assert_allclose(again.GetOrigin(), image.GetOrigin(), atol=1e-6)
             np.testing.assert_allclose(again.GetDirection(), image.GetDirection(), atol=1e-9)
@@ -300,7 +300,7 @@ REAL = [
 class TestRealData:
     @pytest.mark.parametrize(("ct", "labels", "value", "side", "volume_ml"), REAL)
     def test_kidney(self, ct, labels, value, side, volume_ml):
-        labels = read_volume(DATA / "ct" / labels)
+        labels = open_ct(DATA / "ct" / labels).image()
         patient = import_patient(open_ct(DATA / "ct" / ct), *label_map(labels, [value]))
         assert patient.side == side
         assert patient.organ.volume / 1000 == pytest.approx(volume_ml, rel=0.01)

@@ -25,7 +25,7 @@ from dicom_series import (
 from pydicom.uid import DeflatedExplicitVRLittleEndian, generate_uid
 from synthetic_body import DIRECTIONS, grid_around, with_voxels
 
-from scenes.reading.ct import open_ct, read_volume
+from scenes.reading.ct import open_ct
 from scenes.reading.error import PatientError
 from scenes.reading.label_files import open_labels
 from scenes.reading.volume import Volume
@@ -92,7 +92,7 @@ class TestFiles:
         marked.SetMetaData("descrip", "Doe^Jane")
         sitk.WriteImage(marked, str(tmp_path / f"ct{ending}"))
         assert_same(open_ct(tmp_path / f"ct{ending}"), image)
-        assert not read_volume(tmp_path / f"ct{ending}").GetMetaDataKeys()
+        assert not open_ct(tmp_path / f"ct{ending}").image().GetMetaDataKeys()
 
     @pytest.mark.parametrize("ending", [".nrrd", ".nhdr", ".mha", ".mhd"])
     def test_packed(self, tmp_path, ending):

@@ -13,7 +13,7 @@ from slicing import organ_mask
 from scenes.anatomy import load_anatomy, patient_scene, phantom_folder
 from scenes.patient import import_patient
 from scenes.patient_folder import save_patient
-from scenes.reading.ct import open_ct, read_volume
+from scenes.reading.ct import open_ct
 from scenes.reading.labels import LabelMap
 from scenes.scene import PAPER, Press, Scene, load_scene, with_options
 from sim.device import start
@@ -39,7 +39,7 @@ def patient_in(name: str, tmp_path: Path) -> tuple[Scene, Path]:
         pytest.skip("no ../shared/data here")
     ct, labels, side = PATIENTS[name]
     patient = import_patient(
-        open_ct(DATA / "ct" / ct), LabelMap.of(read_volume(DATA / "ct" / labels)), side=side
+        open_ct(DATA / "ct" / ct), LabelMap.of(open_ct(DATA / "ct" / labels).image()), side=side
     )
     save_patient(patient, tmp_path / "patient")
     return with_options(patient_scene(patient), {"tissue.cell_mm": 6.0}), tmp_path / "patient"

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import SimpleITK as sitk
-
 from scenes.reading.error import PatientError
 from scenes.reading.files import ENDINGS, file_volume, is_volume_file
 from scenes.reading.headers import Found
@@ -49,8 +47,3 @@ def dicom_or_words(path: Path, progress: Progress) -> Found:
                 f"{', '.join(ENDINGS)}; convert it"
             ) from None
         raise
-
-
-def read_volume(path: Path) -> sitk.Image:
-    """A whole volume: of a CT series HU, of a file what is in it. Raises PatientError."""
-    return open_ct(path).image()
