@@ -17,16 +17,20 @@ from studies.reference.command import reference
 from studies.rehearse.command import rehearse
 from studies.scan.command import scan
 from studies.scan.poses import PoseError
+from studies.session.file import SessionError
 from studies.setup import SetupError
 from studies.study import study
 from ultrasound.acoustics import TissueError
 from ultrasound.array import ProbeError
+from ultrasound.sweep import SweepError
 
 # What is wrong with a file or a value, said in one line.
 MENDED_BY_USER = (
     SceneError,
     PatientError,
     PoseError,
+    SessionError,
+    SweepError,
     ProbeError,
     TissueError,
     SamplingError,

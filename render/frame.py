@@ -11,10 +11,11 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from render.layout import Layout, Rect
-from render.panel import LINE, MARK, QUIET, TEXT, Panel, draw_panel, font
+from render.panel import ALERT, LINE, MARK, QUIET, TEXT, Panel, draw_panel, font
 
 BACKDROP_TOP, BACKDROP_FOOT = (30, 35, 42), (13, 15, 19)
-STRIP = (17, 20, 24)
+STRIP, FINDINGS = (17, 20, 24), (20, 24, 29)
+HELP_COLUMNS, HELP_KEY_PX = 2, 104
 
 
 def backdrop(layout: Layout, panel: Panel, help_lines: Iterable[tuple[str, str]] | None = None) -> np.ndarray:
@@ -44,12 +45,14 @@ def _draw_help(draw: ImageDraw.ImageDraw, box: Rect, lines: list[tuple[str, str]
     draw.rounded_rectangle(
         [box.left, box.top, box.right - 1, box.bottom - 1], radius=8, fill=(22, 26, 31), outline=LINE
     )
-    pitch = (box.height - 28) / max(1, len(lines))
-    size = int(np.clip(pitch * 0.68, 9, 15))
+    rows = max(1, -(-len(lines) // HELP_COLUMNS))
+    pitch = (box.height - 28) / rows
+    size = int(np.clip(pitch * 0.68, 9, 13))
     for i, (key, text) in enumerate(lines):
-        y = box.top + 14 + (i + 0.5) * pitch
-        draw.text((box.left + 176, y), key, font=font(size), fill=MARK, anchor="rm")
-        draw.text((box.left + 196, y), text, font=font(size), fill=TEXT, anchor="lm")
+        y = box.top + 14 + (i % rows + 0.5) * pitch
+        x = box.left + i // rows * box.width // HELP_COLUMNS
+        draw.text((x + HELP_KEY_PX, y), key, font=font(size), fill=MARK, anchor="rm")
+        draw.text((x + HELP_KEY_PX + 12, y), text, font=font(size), fill=TEXT, anchor="lm")
 
 
 def readout_picture(layout: Layout, readouts: Mapping[str, str]) -> np.ndarray:
@@ -58,9 +61,26 @@ def readout_picture(layout: Layout, readouts: Mapping[str, str]) -> np.ndarray:
     image = Image.new("RGB", (box.width, box.height), STRIP)
     draw = ImageDraw.Draw(image)
     draw.line([(0, 0), (box.width, 0)], fill=LINE)
-    pitch = min(21.0, (box.height - 14) / max(1, len(readouts)))
-    for i, (name, value) in enumerate(readouts.items()):
-        y = 7 + (i + 0.5) * pitch
-        draw.text((8, y), name, font=font(13), fill=QUIET, anchor="lm")
-        draw.text((box.width - 14, y), value, font=font(14), fill=TEXT, anchor="rm")
+    _draw_figures(draw, box, readouts, "", min(21.0, (box.height - 14) / max(1, len(readouts))))
     return np.asarray(image)
+
+
+def findings_picture(layout: Layout, findings: Mapping[str, str], alert: str = "") -> np.ndarray:
+    """Names and values, uint8, shape of layout.findings; the one that ``alert`` names stands out."""
+    box = layout.findings
+    image = Image.new("RGB", (box.width, box.height), FINDINGS)
+    draw = ImageDraw.Draw(image)
+    draw.rectangle([0, 0, box.width - 1, box.height - 1], outline=ALERT if alert else LINE)
+    _draw_figures(draw, box, findings, alert, (box.height - 14) / max(8, len(findings)))
+    return np.asarray(image)
+
+
+def _draw_figures(
+    draw: ImageDraw.ImageDraw, box: Rect, figures: Mapping[str, str], alert: str, pitch: float
+) -> None:
+    for i, (name, value) in enumerate(figures.items()):
+        y = 7 + (i + 0.5) * pitch
+        draw.text((8, y), name, font=font(13), fill=ALERT if name == alert else QUIET, anchor="lm")
+        draw.text(
+            (box.width - 14, y), value, font=font(14), fill=ALERT if name == alert else TEXT, anchor="rm"
+        )

@@ -11,6 +11,7 @@ STRIP_HEIGHT, READOUT_SHARE = 184, 0.19
 HEADER_HEIGHT, FOOTER_HEIGHT = 74, 34
 RULER_WIDTH, WEDGE_WIDTH, PICTURE_GAP, NAME_HEIGHT = 46, 34, 10, 26
 ASIDE_WIDTH = 186
+FINDINGS_GAP, FINDINGS_WIDTH, FINDINGS_HEIGHT = 10, 178, 190
 # How much larger pictures one under the other must be than side by side.
 BELOW_FROM = 1.2
 
@@ -69,6 +70,11 @@ class Layout:
         width = round(self.strip.width * READOUT_SHARE)
         return Rect(self.strip.right - width, self.strip.top, width, self.strip.height)
 
+    @property
+    def findings(self) -> Rect:
+        """What the surgeon looks for, over the 3D view's corner."""
+        return Rect(FINDINGS_GAP, self.title.bottom + FINDINGS_GAP, FINDINGS_WIDTH, FINDINGS_HEIGHT)
+
     def sliders(self, widths: list[float]) -> list[Rect]:
         """Boxes for groups of sliders, side by side in the strip; `widths` share out the room."""
         gap = 6
@@ -86,7 +92,7 @@ class Layout:
 
     @property
     def help(self) -> Rect:
-        width, height = min(560, self.scene.width - 24), min(446, self.scene.height - 24)
+        width, height = min(790, self.scene.width - 24), min(400, self.scene.height - 24)
         return Rect(
             (self.scene.width - width) // 2, self.scene.top + (self.scene.height - height) // 2, width, height
         )

@@ -6,10 +6,12 @@ import numpy as np
 
 from render import frame
 from render.layout import ASIDE_WIDTH, Layout
-from render.panel import CALLIPER, OUTLINE, Panel, calliper_segments, draw_segments, paste_picture
+from render.panel import BEFORE, CALLIPER, OUTLINE, Panel, calliper_segments, draw_segments, paste_picture
 from render.viewer import KEY_MAP, Settings, View
 
 READOUT_PERIOD_S = 0.25
+
+Figures = tuple[dict[str, str], dict[str, str], str]
 
 
 def panel_of(view: View, settings: Settings) -> Panel:
@@ -38,8 +40,8 @@ class Page:
         self._page = self.pixels.transpose(1, 0, 2)[::-1]
         self.panel: Panel | None = None
         self._help_shown = False
-        self._readouts: dict[str, str] | None = None
-        self._readouts_at = 0.0
+        self._figures: Figures | None = None
+        self._figures_at = 0.0
 
     def compose(
         self, view: View, settings: Settings, help_shown: bool = False, patient: bool = False
@@ -49,23 +51,29 @@ class Page:
         if (self.panel, self._help_shown) != (panel, help_shown):
             lines = [(key.key, key.text) for key in KEY_MAP] if help_shown else None
             self._page[:, :, :3] = frame.backdrop(self.layout, panel, lines)
-            self.panel, self._help_shown, self._readouts = panel, help_shown, None
+            self.panel, self._help_shown, self._figures = panel, help_shown, None
         for box, picture in zip(panel.boxes(self.layout), view.pictures.values(), strict=True):
             paste_picture(self._page, box, picture)
+            if view.outline_before_mm is not None:
+                draw_segments(self._page, panel, box, view.outline_before_mm, BEFORE)
             if view.outline_mm is not None:
                 draw_segments(self._page, panel, box, view.outline_mm, OUTLINE)
             draw_segments(self._page, panel, box, calliper_segments(panel, box, view.calliper_mm), CALLIPER)
-        self._compose_readouts(dict(view.readouts), patient)
+        self._compose_figures((dict(view.readouts), dict(view.findings), view.alert), patient)
 
-    def _compose_readouts(self, readouts: dict[str, str], patient: bool) -> None:
+    def _compose_figures(self, figures: Figures, patient: bool) -> None:
         now = time.perf_counter()
         # On a screen, figures that change every frame cannot be read; a kept picture shows its own frame's figures.
-        waits = patient and now - self._readouts_at < READOUT_PERIOD_S
-        if self._readouts is not None and (waits or readouts == self._readouts):
+        waits = patient and now - self._figures_at < READOUT_PERIOD_S
+        if self._figures is not None and (waits or figures == self._figures):
             return
+        readouts, findings, alert = figures
         rows, columns = self.layout.readouts.slices
         self._page[rows, columns, :3] = frame.readout_picture(self.layout, readouts)
-        self._readouts, self._readouts_at = readouts, now
+        if findings and not self._help_shown:
+            rows, columns = self.layout.findings.slices
+            self._page[rows, columns, :3] = frame.findings_picture(self.layout, findings, alert)
+        self._figures, self._figures_at = figures, now
 
     def place_at(self, column: float, row: float) -> tuple[float, float] | None:
         """The place on the image plane [mm] that a pixel of one of the pictures shows."""

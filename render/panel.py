@@ -16,7 +16,7 @@ from render.layout import Layout, Rect
 PANEL, LINE = (8, 9, 11), (44, 50, 58)
 TEXT, QUIET = (222, 227, 232), (132, 142, 153)
 MARK, ALERT = (64, 196, 255), (255, 176, 46)
-OUTLINE, CALLIPER = (237, 194, 71), (120, 230, 140)
+OUTLINE, BEFORE, CALLIPER = (237, 194, 71), (150, 128, 196), (120, 230, 140)
 CROSS_PX, NUMBER_PX = 5, 16
 
 

@@ -16,7 +16,7 @@ KEY_LIGHT, FILL_LIGHT, AMBIENT = (0.82, 0.80, 0.77), (0.17, 0.19, 0.23), (0.17, 
 TUMOUR, SUPPORT, EDGE, FRAME = (0.93, 0.76, 0.28), (0.30, 0.33, 0.36), (0.85, 0.9, 0.94), (0.25, 0.77, 1.0)
 PARTS = {"cyst": (0.30, 0.60, 0.86), "urine": (0.62, 0.74, 0.33), "vessel": (0.80, 0.16, 0.20)}
 LINE_WIDTH = 1.2
-MASKS = 4
+MASKS = 5
 
 
 def _vector_field(values: np.ndarray):
@@ -90,6 +90,7 @@ class Stage:
         self._draw_image_plane(scene, view, key)
         cut = _cut(view.transducer_pose, eye) if settings.cut else None
         opacity = GLASS if settings.translucent else SOLID
+        self._organ.tint(view.seen)
         self._organ.shade(eye, key, opacity, cut)
         _draw_surface(scene, self._organ, ahead if opacity < SOLID or cut is not None else None)
 

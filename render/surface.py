@@ -8,7 +8,7 @@ the faces are sent farthest first.
 import numpy as np
 import taichi as ti
 
-ORGAN = (0.66, 0.27, 0.23)
+ORGAN, TINT = (0.66, 0.27, 0.23), (0.24, 0.60, 0.36)
 SOLID, GLASS = 1.0, 0.30
 CUT_EDGE_MM = 0.4
 
@@ -33,6 +33,7 @@ def _shade(
     gloss: ti.f32,
     cut_point: ti.math.vec3,
     cut_normal: ti.math.vec3,
+    tint: ti.template(),
     normal: ti.template(),
     colour: ti.template(),
 ):
@@ -51,7 +52,8 @@ def _shade(
         if cut_normal.norm() > 0.5:
             # Not clamped: blending clamps each pixel, and a linear alpha is cut along the plane, not along faces.
             alpha = 0.5 - (vertices[v] - cut_point).dot(cut_normal) / CUT_EDGE_MM
-        grey = base * (1.0 - 0.25 * rim) + sheen
+        tinted = base + tint[v] * (ti.Vector(TINT) - base)
+        grey = tinted * (1.0 - 0.25 * rim) + sheen
         colour[v] = ti.Vector([grey[0], grey[1], grey[2], alpha])
 
 
@@ -87,6 +89,8 @@ class Surface:
         start, around = faces_around_vertices(self.faces, count)
         self.normal = ti.Vector.field(3, ti.f32, shape=count)
         self.colour = ti.Vector.field(4, ti.f32, shape=count)
+        self._tint = ti.field(ti.f32, shape=count)
+        self._tinted: np.ndarray | None = None
         self._area_normal = ti.Vector.field(3, ti.f32, shape=len(self.faces))
         self._faces = ti.Vector.field(3, ti.i32, shape=len(self.faces))
         self._start = ti.field(ti.i32, shape=count + 1)
@@ -109,9 +113,19 @@ class Surface:
             float(opacity),
             float(self.gloss),
             *(ti.math.vec3(*map(float, each)) for each in (point, side)),
+            self._tint,
             self.normal,
             self.colour,
         )
+
+    def tint(self, vertices: np.ndarray | None) -> None:
+        """Which vertices (n,) bool are shown in TINT; None: none of them."""
+        if vertices is not self._tinted:
+            self._tinted = vertices
+            if vertices is None:
+                self._tint.fill(0.0)
+            else:
+                self._tint.from_numpy(vertices.astype(np.float32))
 
     def indices(self, ahead: np.ndarray | None = None) -> np.ndarray:
         """Vertex indices of the faces, int32 (3 m,), farthest first along `ahead` if given."""

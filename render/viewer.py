@@ -43,15 +43,22 @@ KEY_MAP = (
     Key("B", "mode", "echo and CT, echo alone, CT alone"),
     Key("V", "rung", "echo: how much of it is computed"),
     Key("O", "outline", "outline of the tumour in the picture"),
-    Key("G", "show_scanner", "the scanner's sliders, gain over depth among them"),
+    Key("G", "show_scanner", "the scanner's sliders, gain over depth too"),
     Key("Click on picture", "measure", "calliper from click to click, in mm"),
-    Key("Left, Right", "cine", "while frozen: the last ten seconds, picture by picture"),
-    Key("I", "export", "save the picture as PNG and as DICOM into the --out folder"),
+    Key("Left, Right", "cine", "while frozen: through the last ten seconds"),
+    Key("I", "export", "save the picture as PNG and as DICOM"),
     Key("T", "translucent", "organ translucent or solid"),
     Key("X", "cut", "cut the organ along the image plane"),
     Key("F", "freeze", "freeze and go on"),
+    Key("U", "undo", "undo the last press, turn or way"),
+    Key("Y", "redo", "take the last undo back"),
+    Key("M", "bookmark", "bookmark this moment"),
+    Key("J", "to_bookmark", "go to the last bookmark, then to earlier ones"),
+    Key("L", "sweep", "begin to record a tracked sweep, or end it"),
+    Key("K", "take_over", "lead the transducer from here on, in a replay"),
+    Key("N", "show_seen", "what has been in the picture, in green"),
     Key("R", "reset", "reset tissue, transducer and view"),
-    Key("P", "screenshot", "save a picture of the window into the --out folder"),
+    Key("P", "screenshot", "save a picture of the window"),
     Key("H", "help", "show or hide this list"),
     Key("Esc", "quit", "quit"),
 )
@@ -110,6 +117,7 @@ class Settings:
     show_support: bool = _switch(True, "Support")
     outline: bool = _switch(False, "Outline")
     show_scanner: bool = False
+    show_seen: bool = False
     mode: Mode = "both"
     rung: Rung = "speckle"
 
@@ -160,12 +168,20 @@ class View:
     focus_mm: float | None = None
     outline_mm: np.ndarray | None = None
     """Line segments on the plane, shape (n, 2, 2) [mm]: x from the middle to the right, y down from the face."""
+    outline_before_mm: np.ndarray | None = None
+    """The same of where it was in the CT."""
+    seen: np.ndarray | None = None
+    """Which vertices of the organ lie in tissue that has been in the picture, bool, shape (n,)."""
     calliper_mm: tuple[tuple[float, float], ...] = ()
     """Up to two points on the plane [mm]."""
     captions: tuple[str, str, str] = ("", "", "")
     """What is said around the pictures: the probe, above; the echo's and the CT's settings, below."""
     readouts: dict[str, str] = field(default_factory=dict)
     """Name -> text with its unit, in the order of display: {"step": "9.1 ms"}."""
+    findings: dict[str, str] = field(default_factory=dict)
+    """The same of what the surgeon looks for: {"to tumour": "4.2 mm"}."""
+    alert: str = ""
+    """Which of them is more than it should be."""
     status: str = ""
     """A short word over the picture, such as FROZEN."""
     title: str = ""
@@ -195,6 +211,13 @@ class Controls:
     fan_deg: float = 0.0
     """Out of the image plane (about local x); positive swings the beam towards +y."""
     reset: bool = False
+    undo: bool = False
+    redo: bool = False
+    bookmark: bool = False
+    to_bookmark: bool = False
+    sweep: bool = False
+    """The key that begins and ends a sweep went down."""
+    take_over: bool = False
     pointed_mm: tuple[float, float] | None = None
     """The place on the image plane that was clicked on in a picture."""
     cine: int = 0

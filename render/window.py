@@ -30,8 +30,20 @@ from ultrasound.array import MODES, RUNGS
 
 PUSH_MM_S, ROLL_DEG_S, TILT_DEG_S, ZOOM_S = 15.0, 45.0, 30.0, 0.5
 FRAMES_A_SECOND = 60
-PRESSED_ONCE = {"r": "reset", "f": "freeze", "p": "screenshot", "i": "export", ti.ui.ESCAPE: "quit"}
-TOGGLES = {"t": "translucent", "x": "cut", "o": "outline", "g": "show_scanner"}
+PRESSED_ONCE = {
+    "r": "reset",
+    "f": "freeze",
+    "p": "screenshot",
+    "i": "export",
+    "u": "undo",
+    "y": "redo",
+    "m": "bookmark",
+    "j": "to_bookmark",
+    "l": "sweep",
+    "k": "take_over",
+    ti.ui.ESCAPE: "quit",
+}
+TOGGLES = {"t": "translucent", "x": "cut", "o": "outline", "g": "show_scanner", "n": "show_seen"}
 CYCLES = {"b": ("mode", MODES), "v": ("rung", RUNGS)}
 CINE = {ti.ui.LEFT: -1, ti.ui.RIGHT: 1}
 HELD = {
@@ -287,9 +299,11 @@ class Window:
         self._page.compose(view, self.settings, self._help_shown, self._visible)
         _put_image(self._canvas, self._page.pixels)
         self._aim()
-        rects = [self.layout.panel, self.layout.title, self.layout.strip] + (
-            [self.layout.help] if self._help_shown else []
-        )
+        rects = [self.layout.panel, self.layout.title, self.layout.strip]
+        if self._help_shown:
+            rects.append(self.layout.help)
+        elif view.findings:
+            rects.append(self.layout.findings)
         masked = [self.layout.window_coordinates(rect) for rect in rects]
         self._stage.draw(self._scene, view, self.settings, masked)
         self._canvas.scene(self._scene)

@@ -93,6 +93,20 @@ def load_anatomy(scene: Scene, folder: Path) -> LoadedAnatomy:
     )
 
 
+def fingerprint(anatomy: LoadedAnatomy) -> str:
+    """A short name of what a rehearsal's body and pictures are made of: other surfaces or voxels, another name."""
+    digest = hashlib.sha256()
+    parts = [anatomy.parts[name] for name in sorted(anatomy.parts)]
+    for each in (anatomy.organ, anatomy.tumour, *parts, anatomy.ct, anatomy.labels, *anatomy.shapes):
+        if isinstance(each, trimesh.Trimesh):
+            digest.update(np.ascontiguousarray(each.vertices).tobytes() + each.faces.tobytes())
+        elif isinstance(each, Grid):
+            digest.update(np.ascontiguousarray(each.voxels).tobytes() + each.index_from_mm.tobytes())
+        else:
+            digest.update(repr(each).encode())
+    return digest.hexdigest()[:16]
+
+
 def press_on(press: Press, anatomy: LoadedAnatomy, gravity: np.ndarray) -> Press:
     """A press with what it leaves open filled in.
 

@@ -200,12 +200,14 @@ class DistanceShape(Section):
 class Transducer(Section):
     """A probe, by the name of one that comes with the program or of a file beside the scene; it moves as fast as a hand.
 
-    It is a cuboid, lateral x elevation x length: the probe's housing, unless ``size_mm`` says otherwise.
+    It is a cuboid, lateral x elevation x length: the probe's housing, unless ``size_mm`` says otherwise. The window warns where it
+    squeezes the tissue before it by more than ``compression_warning_mm``.
     """
 
     probe: str = "linear"
     size_mm: tuple[Length, Length, Length] | None = None
     speed_mm_s: float = Field(150.0, gt=0, le=2000)
+    compression_warning_mm: float = Field(8.0, gt=0, le=100)
 
 
 class Image(Section):

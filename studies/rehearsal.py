@@ -3,6 +3,7 @@
 The window, the headless run and every measurement go through this class, so that they compute the same.
 """
 
+import hashlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,7 @@ from studies.trade.front import expected_error_mm, load_points
 from ultrasound.array import Mode, Probe, Rung
 from ultrasound.outline import section
 from ultrasound.probe import (
+    Grip,
     Hand,
     advanced,
     approached,
@@ -48,12 +50,13 @@ REST_PLACES = 48
 
 @dataclass(frozen=True)
 class RehearsalState:
-    """All that frames change: the tissue, what its guard remembers, the transducer's pose (4, 4)."""
+    """All that frames change: the tissue, what its guard remembers, the transducer's pose (4, 4), the hand that holds it."""
 
     solver: SolverState
     watch: Watch
     pose: np.ndarray
     steps: int
+    grip: Grip
 
 
 class Rehearsal:
@@ -197,13 +200,13 @@ class Rehearsal:
 
     def snapshot(self) -> RehearsalState:
         """A copy of the current state."""
-        return RehearsalState(self.solver.snapshot(), self.guard.watch, self.pose, self.steps)
+        return RehearsalState(self.solver.snapshot(), self.guard.watch, self.pose, self.steps, self.hand.grip)
 
     def restore(self, state: RehearsalState) -> None:
         """Go back to a state; the steps that follow give the same bits as they did from it before."""
         self.solver.restore(state.solver)
         self.guard.watch = state.watch
-        self.pose, self.steps = state.pose, state.steps
+        self.pose, self.steps, self.hand.grip = state.pose, state.steps, state.grip
 
     def update_surfaces(self) -> None:
         """Carry the surfaces that are drawn to where the body is."""
@@ -226,14 +229,23 @@ class Rehearsal:
         """Where the tissue of the picture taken last was at rest, evenly over it, (n, n, 3) [mm]; None without a CT."""
         return None if self.scanner is None else self.scanner.plane.rest_grid(REST_PLACES)
 
-    def tumour_outline(self) -> np.ndarray | None:
-        """Where the image plane cuts the tumour: segments (n, 2, 2) on the plane [mm]; None without a tumour."""
-        if self.tumour is None or self._tumour_border is None:
+    def tumour_outline(self, at_rest: bool = False) -> np.ndarray | None:
+        """Where the image plane cuts the tumour as it lies, or as it lay in the CT: segments (n, 2, 2) on the plane [mm].
+
+        None without a tumour.
+        """
+        if self.tumour is None:
             return None
-        self._tumour_border.update()
         plane = image_plane(self.pose, self.size_mm[2], 1.0, 1.0)
-        vertices = self._tumour_border.vertices.to_numpy()
+        vertices = np.asarray(self.tumour.vertices) if at_rest else self.tumour_vertices()
         return section(vertices, self.tumour.faces, np.linalg.inv(plane.world_from_plane))
+
+    def tumour_vertices(self) -> np.ndarray:
+        """Where the tumour's surface is now (n, 3) [mm]; none of an organ without one."""
+        if self._tumour_border is None:
+            return np.zeros((0, 3))
+        self._tumour_border.update()
+        return self._tumour_border.vertices.to_numpy().astype(float)
 
     def indentation_mm(self) -> float:
         """How deep the transducer is pressed into the settled surface; negative above it."""
@@ -257,8 +269,12 @@ class Rehearsal:
     def reset(self) -> None:
         """Tissue and transducer as they were at the start: settled, and just touching."""
         self.restore(self.settled)
-        self.hand.reset()
         ti.sync()
+
+    def digest(self) -> str:
+        """A short name of the tissue's state: other bits, another name."""
+        state = self.body.snapshot()
+        return hashlib.sha256(state.position.tobytes() + state.velocity.tobytes()).hexdigest()[:16]
 
 
 def _shifted(mesh: trimesh.Trimesh, by: np.ndarray) -> trimesh.Trimesh:
@@ -275,4 +291,5 @@ def scanned_anatomy(organ: trimesh.Trimesh, ct: Grid, anatomy: LoadedAnatomy, or
     shift = np.eye(4)
     shift[:3, 3] = origin
     marks = None if labels is None else labels.voxels.astype(np.int32)
-    return Anatomy(organ, ct.voxels, ct.index_from_mm @ shift, marks, anatomy.tissues)
+    tumour = anatomy.tumour and _shifted(anatomy.tumour, -origin)
+    return Anatomy(organ, ct.voxels, ct.index_from_mm @ shift, marks, anatomy.tissues, tumour)

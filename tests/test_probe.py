@@ -7,7 +7,17 @@ from conftest import rotation_about
 
 from studies.models import tool_of
 from ultrasound.array import load_probe
-from ultrasound.probe import Hand, advanced, approached, between, image_plane, indentation, pose_at, touching
+from ultrasound.probe import (
+    Grip,
+    Hand,
+    advanced,
+    approached,
+    between,
+    image_plane,
+    indentation,
+    pose_at,
+    touching,
+)
 
 SIZE = np.array([10.0, 6.0, 20.0])
 
@@ -98,7 +108,7 @@ def test_keys_push_and_the_button_presses_until_let_go(hand):
     assert indentation(hand.pose(), SIZE, hand.samples) == pytest.approx(2.0)
     hand.push(-5.0)
     assert indentation(hand.pose(), SIZE, hand.samples) == pytest.approx(-3.0)
-    hand.reset()
+    hand.grip = Grip()
     assert hand.pose() == pytest.approx(hand.home)
 
 

@@ -11,9 +11,9 @@ from PIL import Image
 import app
 from scenes.anatomy import load_surface, phantom_folder
 from scenes.scene import EMBEDDED
-from studies.scan.command import image_to_probe
 from studies.scan.poses import PoseError, load_poses
 from ultrasound.array import load_probe
+from ultrasound.plane import image_to_probe
 
 
 def pose_on_tumour() -> np.ndarray:

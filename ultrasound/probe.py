@@ -104,6 +104,16 @@ def approached(pose: np.ndarray, goal: np.ndarray, most_mm: float, most_deg: flo
     return moved
 
 
+@dataclass(frozen=True)
+class Grip:
+    """What of a hand changes: how deep it presses [mm], how it is turned (3,) [degrees], where it aims (4, 4), home where None."""
+
+    depth_mm: float = 0.0
+    pressed_mm: float = 0.0
+    turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    aim: np.ndarray | None = None
+
+
 @dataclass
 class Hand:
     """What holds the transducer: where on the settled organ it aims, how it is turned, how deep it presses.
@@ -131,9 +141,22 @@ class Hand:
         self.samples = np.concatenate([self.vertices, corners.mean(axis=1), middles])
         self.most_mm = min(MOST_DEPTH_MM, MOST_LENGTHS * float(self.size_mm[2]))
 
-    def reset(self) -> None:
-        """Back to the home pose, untilted and just touching."""
-        self.depth_mm, self.pressed_mm, self.turn_deg, self.aim = 0.0, 0.0, np.zeros(3), None
+    @property
+    def grip(self) -> Grip:
+        """How it holds the transducer now; set, it holds it so."""
+        fan, tilt, roll = map(float, self.turn_deg)
+        return Grip(self.depth_mm, self.pressed_mm, (fan, tilt, roll), self.aim)
+
+    @grip.setter
+    def grip(self, grip: Grip) -> None:
+        self.depth_mm, self.pressed_mm = grip.depth_mm, grip.pressed_mm
+        self.turn_deg, self.aim = np.array(grip.turn_deg), grip.aim
+
+    def take(self, pose: np.ndarray) -> None:
+        """Hold a transducer as it is at a pose (4, 4), as if pressed in by a button that is then let go."""
+        depth = indentation(pose, self.size_mm, self.samples, self.radius_mm)
+        pressed = float(np.clip(depth, 0.0, self.most_mm)) if np.isfinite(depth) else 0.0
+        self.grip = Grip(depth - pressed if np.isfinite(depth) else 0.0, pressed, aim=pose.copy())
 
     def point(self, origin: np.ndarray, direction: np.ndarray) -> None:
         """Aim where a ray [mm] first meets the settled organ, perpendicular to its surface; a miss changes nothing."""

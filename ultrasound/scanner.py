@@ -11,6 +11,7 @@ from sim.embedding import Embedding, Unmoved
 from ultrasound.acoustics import check_tissues, properties
 from ultrasound.array import Mode, Probe, Rung
 from ultrasound.bmode import BMode
+from ultrasound.marks import Marks
 from ultrasound.plane import ImagePlane, PlaneInTissue
 from ultrasound.slice import Slice
 from ultrasound.volume import Volume, distance_volume
@@ -33,6 +34,7 @@ class Anatomy:
     index_from_mm: np.ndarray
     labels: np.ndarray | None = None
     tissues: Mapping[int, str] = field(default_factory=dict)
+    tumour: trimesh.Trimesh | None = None
 
     @property
     def voxel_mm(self) -> np.ndarray:
@@ -86,6 +88,12 @@ class Scanner:
             self.contact_gap_mm,
             AROUND[self.outside],
         )
+
+    @cached_property
+    def marks(self) -> Marks:
+        """What the pictures show, in truth."""
+        tumour = self.anatomy.tumour
+        return Marks(self.plane, self._organ, None if tumour is None else distance_volume(tumour, 1.0))
 
     @cached_property
     def _organ(self) -> Volume:

@@ -5,12 +5,15 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import click
+from pydantic import ValidationError
 
-from scenes.anatomy import LoadedAnatomy, load_anatomy
+from scenes.anatomy import LoadedAnatomy, fingerprint, load_anatomy
 from scenes.scene import EMBEDDED, OPTIONS, TISSUES, Scene, load_scene, with_options
 from studies.commands import Fault, arch_option, make_folder, start_taichi
+from studies.session.file import Log, SessionError, read_log
+from studies.session.scene import scene_of_log
 from studies.setup import Setup, probe_of, scene_of
-from ultrasound.array import MODES, RUNGS, Probe
+from ultrasound.array import MODES, RUNGS, Probe, explained
 
 if TYPE_CHECKING:
     from studies.rehearsal import Rehearsal
@@ -25,8 +28,16 @@ MATERIAL = ("tissue.model", "tissue.young_kpa", "tissue.poisson")
     "--headless", is_flag=True, help="No window: run the scripted press, write pictures and a report."
 )
 @click.option(
-    "--seconds", type=click.FloatRange(0.02, 3600), help="Simulated seconds for the press [the scene's]."
+    "--seconds",
+    type=click.FloatRange(0.02, 3600),
+    help="Simulated seconds without a window [the scene's press].",
 )
+@click.option(
+    "--replay",
+    type=click.Path(path_type=Path),
+    help="A session recorded before, of this SCENE: the same once more, bit for bit.",
+)
+@click.option("--at", type=click.FloatRange(0), default=0.0, help="With --replay: open it at this second.")
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
@@ -60,6 +71,8 @@ def rehearse(
     scene: Path,
     headless: bool,
     seconds: float | None,
+    replay: Path | None,
+    at: float,
     out: Path,
     arch: str,
     budget_ms: float | None,
@@ -74,11 +87,14 @@ def rehearse(
     if changed["transducer.probe"] and Path(str(changed["transducer.probe"])).is_file():
         changed["transducer.probe"] = str(Path(str(changed["transducer.probe"])).resolve())
     before = load_scene(path)
-    loaded = with_options(before, changed)
+    log = session_of(replay, at, changed, budget_ms, error_mm)
+    loaded = with_options(before, changed) if log is None else as_recorded(log, before)
     if changed["tissue.model"] is None and loaded.tissue.model != before.tissue.model:
         click.echo(f"Tissue model: {loaded.tissue.model}, as the options ask for it.")
     anatomy = load_anatomy(loaded, path.parent)
-    probe = probe_of(loaded, path.parent)
+    probe = probe_of(loaded, path.parent) if log is None else recorded_probe(log)
+    if log is not None:
+        check_anatomy(log, anatomy, before.title)
     budgeted = budget_ms is not None or error_mm is not None
     if budgeted:
         refuse_sizes(changed)
@@ -97,14 +113,60 @@ def rehearse(
         rehearsal = build_within(loaded, anatomy, probe, used, model, budget_ms, error_mm)
     else:
         rehearsal = Rehearsal(loaded, anatomy, probe)
+    from studies.rehearse.run import Run
+
+    run = Run(rehearsal, anatomy, used, out, budget_ms)
     if headless:
-        from studies.rehearse.headless import run_headless
-
-        run_headless(rehearsal, used, seconds, out, perf_counter() - started)
+        run.headless(log, at, seconds, perf_counter() - started)
     else:
-        from studies.rehearse.loop import run_window
+        run.in_window(log, at)
 
-        run_window(rehearsal, out, budget_ms)
+
+def session_of(
+    replay: Path | None,
+    at_s: float,
+    changed: dict[str, float | str | None],
+    budget_ms: float | None,
+    error_mm: float | None,
+) -> Log | None:
+    """The session to be replayed, where one is. Raises Fault, where other options would make another of it, SessionError."""
+    if replay is None:
+        if at_s > 0:
+            raise Fault("--at: says where to open a session; name its file with --replay")
+        return None
+    given: dict[str, Any] = {"--budget-ms": budget_ms, "--error-mm": error_mm}
+    given |= {option: changed[key] for key, option in OPTIONS.items()}
+    for option, value in given.items():
+        if value is not None:
+            raise Fault(f"{option}: a replay computes what was recorded; leave it out")
+    return read_log(replay)
+
+
+def as_recorded(log: Log, scene: Scene) -> Scene:
+    """A scene's patient with all else as a session has it. Raises SessionError."""
+    try:
+        return scene_of_log(log.header, scene)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        raise SessionError(f"the session's scene cannot be used: {where}: {first['msg'].lower()}") from None
+
+
+def recorded_probe(log: Log) -> Probe:
+    """The probe of a session. Raises SessionError."""
+    try:
+        return Probe.model_validate(log.header.probe)
+    except ValidationError as error:
+        raise SessionError(f"the session's probe cannot be used: {explained(error)}") from None
+
+
+def check_anatomy(log: Log, anatomy: LoadedAnatomy, title: str) -> None:
+    """Raises SessionError where a session is of another patient than an anatomy."""
+    if fingerprint(anatomy) != log.header.anatomy:
+        raise SessionError(
+            f"the session is of other anatomy ({log.header.title or 'no title'}) than this scene's ({title or 'no title'}): name "
+            "its scene or patient's folder before --replay; a patient imported anew is another one"
+        )
 
 
 def refuse_sizes(changed: dict[str, float | str | None]) -> None:

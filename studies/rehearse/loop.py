@@ -5,54 +5,39 @@ from pathlib import Path
 from time import perf_counter
 
 import click
-import numpy as np
-from PIL import Image
 
-from render.pictures import in_proportion
 from render.viewer import Controls, View, Viewer
-from render.window import NoVulkan
-from studies.commands import Fault
 from studies.rehearsal import Rehearsal
 from studies.rehearse.cine import Calliper, Cine, Frame
-from studies.rehearse.view import open_viewer, take_view
+from studies.rehearse.drivers import Driver
+from studies.rehearse.instruments import Instruments
+from studies.rehearse.saving import save_pictures, save_screenshot
+from studies.rehearse.sweeping import Sweeping
+from studies.rehearse.view import probe_as_set, take_view
 from studies.report import Notices, Record
-from studies.trade.ladder import Ladder
-from ultrasound.array import Probe
-from ultrasound.dicom_image import save_dicom
-from ultrasound.scanner import ECHO
 
-
-def run_window(rehearsal: Rehearsal, out: Path, budget_ms: float | None) -> None:
-    """The interactive loop: input -> transducer -> step -> surfaces and slice -> picture.
-
-    A step that takes longer than its budget, or else than the time that it simulates, makes iterations give way.
-    """
-    try:
-        viewer = open_viewer(rehearsal, visible=True)
-    except NoVulkan as reason:
-        raise Fault(f"{reason}; install a Vulkan driver, or run with --headless") from None
-    record = Record(0.0)
-    ladder = Ladder(budget_ms or 1000 * rehearsal.settings.time_step_s)
-    notices = Notices(click.echo)
-    click.echo("The window is open; H shows the keys, Esc quits.")
-    Loop(rehearsal, viewer, out, record, ladder, notices).run()
-    viewer.close()
+# How long what was done is said.
+SAID_S = 2.0
 
 
 @dataclass
 class Loop:
-    """The frames of one session in a window."""
+    """The frames of one rehearsal in a window, led by a driver."""
 
     rehearsal: Rehearsal
     viewer: Viewer
     out: Path
     record: Record
-    ladder: Ladder
+    driver: Driver
     notices: Notices
+    instruments: Instruments
+    sweeping: Sweeping
     cine: Cine = field(default_factory=Cine)
     calliper: Calliper = field(default_factory=Calliper)
     frozen: bool = False
     rate: float = 0.0
+    _said: str = ""
+    _said_until: float = 0.0
 
     def run(self) -> None:
         """Go on until the window is closed."""
@@ -71,19 +56,32 @@ class Loop:
                 save_pictures(view, self.rehearsal.probe, self.out)
 
     def frame(self, controls: Controls) -> View:
-        """One frame: what the user did, a step unless frozen, and what is to be seen."""
+        """One frame: what the user did, a moment unless frozen, and what is to be seen."""
         if controls.freeze:
             self.frozen = not self.frozen
-        pose = None if self.frozen else steer(self.rehearsal, controls, self.ladder)
-        shown = self._looked_back(controls) or self._taken(controls, pose)
         if controls.reset:
             self.calliper.points = ()
         self.calliper.point(controls.pointed_mm)
+        shown = self._looked_back(controls) or self._taken(controls)
+        if controls.sweep:
+            self._say(self.sweeping.toggle(self.out))
         speed = self.rate * self.rehearsal.settings.time_step_s
         figures = {"frames": f"{self.rate:.0f} /s", "time": f"{speed:.1f} x real"}
         figures |= self.calliper.readouts(shown)
-        view = shown.view
-        return replace(view, calliper_mm=self.calliper.points, readouts=view.readouts | figures)
+        view = self.instruments.onto(shown.view, controls.settings)
+        return replace(
+            view,
+            calliper_mm=self.calliper.points,
+            readouts=view.readouts | figures,
+            status=self._status(view),
+        )
+
+    def _status(self, view: View) -> str:
+        return self._said if perf_counter() < self._said_until else view.status
+
+    def _say(self, text: str) -> None:
+        if text:
+            self._said, self._said_until = text.upper(), perf_counter() + SAID_S
 
     def _looked_back(self, controls: Controls) -> Frame | None:
         """A frame of the last seconds, where the user is looking at one."""
@@ -94,58 +92,26 @@ class Loop:
         frame = self.cine.shown
         return replace(frame, view=replace(frame.view, status=f"FROZEN   {self.cine.age_s:.1f} s"))
 
-    def _taken(self, controls: Controls, pose: np.ndarray | None) -> Frame:
+    def _taken(self, controls: Controls) -> Frame:
         """A new frame. A frozen one shows the same tissue with the scanner set anew, and is not kept."""
-        asked = controls.settings.iterations
-        status = "FROZEN" if self.frozen else self.notices.shown or self.ladder.says(asked)
+        if self.frozen:
+            view = take_view(self.rehearsal, controls.settings, None, self.record, "FROZEN")
+            return Frame(perf_counter(), view, self.rehearsal.rest_grid())
+        pose = self.driver.move(controls)
+        self._say(self.driver.take_said())
+        status = self.notices.shown or self.driver.status
         view = take_view(self.rehearsal, controls.settings, pose, self.record, status)
-        frame = Frame(perf_counter(), view, self.rehearsal.rest_grid())
         if pose is not None:
-            self.cine.keep(frame)
-            self._tell(asked, status)
+            self.notices.tell(self.rehearsal.notice)
+            self._tell(self.driver.stepped(self.record.step_ms[-1]))
+        probe = probe_as_set(self.rehearsal.probe, controls.settings)
+        self.instruments.watch(self.driver.session, probe, pose)
+        self.sweeping.watch(self.driver.session.time_s, view, probe)
+        self._tell(self.driver.watch())
+        frame = Frame(perf_counter(), view, self.rehearsal.rest_grid())
+        self.cine.keep(frame)
         return frame
 
-    def _tell(self, asked: int, status: str) -> None:
-        self.notices.tell(self.rehearsal.notice)
-        if self.ladder.watch(self.record.step_ms[-1]) and self.ladder.says(asked) != status:
-            click.echo(self.ladder.says(asked) or f"Back to all {asked} iterations.")
-
-
-def steer(rehearsal: Rehearsal, controls: Controls, ladder: Ladder) -> np.ndarray:
-    """Hand the user's input to the hand that holds the transducer and to the solver; the pose to go to then."""
-    step, hand, asked = rehearsal.settings, rehearsal.hand, controls.settings
-    step.iterations, step.substeps = ladder.iterations(asked.iterations), asked.substeps
-    if asked.stiffness is not None:
-        step.stiffness = asked.stiffness
-    if asked.young_kpa is not None:
-        rehearsal.set_young(asked.young_kpa)
-    rehearsal.set_gravity(asked.gravity_m_s2)
-    if controls.reset:
-        rehearsal.reset()
-    elif controls.ray is not None:
-        hand.point(*controls.ray)
-    hand.hold(controls.press, step.time_step_s)
-    hand.push(controls.push_mm)
-    hand.turn(controls.fan_deg, controls.tilt_deg, controls.roll_deg)
-    return rehearsal.pose_towards(hand.pose())
-
-
-def save_screenshot(picture: np.ndarray, out: Path) -> None:
-    """Save a picture under the next free number, and say where."""
-    number = 1 + max([int(path.stem[-3:]) for path in out.glob("screenshot-[0-9][0-9][0-9].png")], default=0)
-    path = out / f"screenshot-{number:03d}.png"
-    Image.fromarray(picture).save(path)
-    click.echo(f"Saved {path}")
-
-
-def save_pictures(view: View, probe: Probe, out: Path) -> None:
-    """Save what the scanner shows as PNG, an echo as DICOM too, under the next free number, and say where."""
-    number = 1 + max([int(path.stem[:3]) for path in out.glob("[0-9][0-9][0-9]-*.png")], default=0)
-    for name, picture in view.pictures.items():
-        path = out / f"{number:03d}-{name.lower()}.png"
-        image = in_proportion(picture, view.width_mm, view.depth_mm)
-        image.save(path)
-        spacing = view.depth_mm / image.height, view.width_mm / image.width
-        if name == ECHO:
-            save_dicom(path.with_suffix(".dcm"), np.asarray(image), spacing, probe)
-        click.echo(f"Saved {path}{' and .dcm' if name == ECHO else ''}")
+    def _tell(self, news: str) -> None:
+        if news:
+            click.echo(news)

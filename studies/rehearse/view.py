@@ -108,6 +108,7 @@ def take_view(
         sector=probe.sector,
         focus_mm=None if settings.mode == "ct" else probe.focus_mm,
         outline_mm=rehearsal.tumour_outline() if settings.outline else None,
+        outline_before_mm=rehearsal.tumour_outline(at_rest=True) if settings.outline else None,
         captions=captions(probe, settings),
         readouts=readouts(rehearsal, record),
         status=status,

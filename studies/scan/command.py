@@ -16,14 +16,6 @@ from studies.setup import probe_of
 from ultrasound.array import MODES, RUNGS
 
 
-def image_to_probe(spacing_mm: tuple[float, float], width_mm: float, above_mm: float) -> np.ndarray:
-    """The matrix (4, 4) that takes pixels (column, row, 0), counted from the first one's centre, to the probe's axes [mm]."""
-    row_mm, column_mm = spacing_mm
-    matrix = np.diag([column_mm, row_mm, 1.0, 1.0])
-    matrix[:2, 3] = column_mm / 2 - width_mm / 2, row_mm / 2 - above_mm
-    return matrix
-
-
 @click.command()
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option(
@@ -74,7 +66,7 @@ def scan(
     from sim.embedding import Unmoved
     from studies.rehearsal import scanned_anatomy
     from ultrasound.dicom_image import save_dicom
-    from ultrasound.plane import ImagePlane
+    from ultrasound.plane import ImagePlane, image_to_probe
     from ultrasound.scanner import ECHO, Scanner
 
     make_folder(out)

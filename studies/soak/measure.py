@@ -1,6 +1,5 @@
 """Hours of rehearsal without a window, faster than real: does anything drift, grow or differ?"""
 
-import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -51,12 +50,12 @@ def soak(
             kept = rehearsal.snapshot()
         rows.append(_minute(rehearsal, minute, minute_s, first))
         done()
-    ended = digest(rehearsal)
+    ended = rehearsal.digest()
     rehearsal.restore(kept)
     for minute in range(minutes - replayed, minutes):
         _minute(rehearsal, minute, minute_s, first)
         done()
-    again = digest(rehearsal)
+    again = rehearsal.digest()
     rehearsal.restore(first)
     return dict(
         model=setup.model,
@@ -115,12 +114,6 @@ def _shape_mm(position: np.ndarray, rest: np.ndarray) -> float:
     """Mean distance (n, 3) [mm] of points from where they were, after they were turned and moved to fit."""
     a, b = position - position.mean(axis=0), rest - rest.mean(axis=0)
     return float(np.linalg.norm(Rotation.align_vectors(b, a)[0].apply(a) - b, axis=1).mean())
-
-
-def digest(rehearsal: Rehearsal) -> str:
-    """A short name of the body's state: other bits, another name."""
-    state = rehearsal.solver.snapshot().body
-    return hashlib.sha256(state.position.tobytes() + state.velocity.tobytes()).hexdigest()[:16]
 
 
 def _equal(first: RehearsalState, second: RehearsalState) -> bool:

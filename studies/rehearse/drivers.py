@@ -1,0 +1,97 @@
+"""Who leads the transducer in a rehearsal: the user (``live.py``), a recorded session, or the scene's script."""
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+
+from render.viewer import Controls
+from studies.rehearse.live import Live
+from studies.session.recorded import Recorded
+from studies.session.replay import Replay
+from studies.session.session import Session
+
+
+class Driver(Protocol):
+    """For each moment: ``move``, then, where that gave a pose, the step and ``stepped``; then ``watch``."""
+
+    @property
+    def session(self) -> Session: ...
+
+    @property
+    def status(self) -> str: ...
+
+    def move(self, controls: Controls) -> np.ndarray | None: ...
+
+    def stepped(self, step_ms: float) -> str: ...
+
+    def watch(self) -> str: ...
+
+    def take_said(self) -> str: ...
+
+
+class Played:
+    """A recorded session in the window, until it is over or the user takes over: from then on ``lead()``."""
+
+    def __init__(self, replay: Replay, lead: Callable[[], Live]) -> None:
+        self.replay, self._lead = replay, lead
+        self.live: Live | None = None
+        self._said = ""
+
+    @property
+    def session(self) -> Session:
+        return self.live.session if self.live else self.replay.session
+
+    @property
+    def status(self) -> str:
+        return self.live.status if self.live else f"REPLAY   {self.replay.time_s:.1f} s   K leads from here"
+
+    def move(self, controls: Controls) -> np.ndarray | None:
+        if self.live is None and (controls.take_over or self.replay.is_over):
+            self._said = "Yours now" if controls.take_over else "The replay is over: yours now"
+            self.live = self._lead()
+        if self.live is not None:
+            return self.live.move(controls)
+        pose, settings = self.replay.move()
+        for name, value in settings.items():
+            setattr(controls.settings, name, value)
+        return pose
+
+    def stepped(self, step_ms: float) -> str:
+        if self.live is not None:
+            return self.live.stepped(step_ms)
+        differed = self.replay.differs_s
+        self.replay.stepped()
+        if self.replay.differs_s is not None and differed is None:
+            return f"Mind: from {self.replay.differs_s:.0f} s on the tissue is not bit for bit the recorded one's."
+        return ""
+
+    def watch(self) -> str:
+        return self.live.watch() if self.live else ""
+
+    def take_said(self) -> str:
+        said, self._said = self._said, ""
+        return said or (self.live.take_said() if self.live else "")
+
+
+class Scripted:
+    """The scene's scripted press, in so many steps."""
+
+    def __init__(self, session: Session, recorded: Recorded | None, steps: int) -> None:
+        self.session, self.recorded, self.steps = session, recorded, steps
+        self.status = ""
+
+    def move(self, controls: Controls) -> np.ndarray | None:
+        rehearsal = self.session.rehearsal
+        share = (self.session.moment + 1) / self.steps
+        return rehearsal.pose_towards(rehearsal.scripted_pose(rehearsal.script_length_s() * share))
+
+    def stepped(self, step_ms: float) -> str:
+        self.session.stepped()
+        return ""
+
+    def watch(self) -> str:
+        return self.recorded.watch() if self.recorded else ""
+
+    def take_said(self) -> str:
+        return ""

@@ -1,0 +1,102 @@
+"""What the window reads off a rehearsal while it goes on: figures four times a second, and what has been in the picture."""
+
+from dataclasses import asdict, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from render.viewer import Settings, View
+from studies.readings import Reading, read
+from studies.rehearsal import Rehearsal
+from studies.session.session import Session
+from studies.session.summary import Course
+from ultrasound.array import Probe
+from ultrasound.coverage import PLACES, Coverage
+
+READ_S, LOOK_S = 0.25, 1 / 30
+MARGIN_MM = 5.0
+COMPRESSION = "compression"
+
+
+class Instruments:
+    """``reading`` is the latest; ``coverage`` is of the whole session."""
+
+    def __init__(self, rehearsal: Rehearsal) -> None:
+        self.rehearsal = rehearsal
+        self.reading: Reading | None = None
+        step_s = rehearsal.settings.time_step_s
+        self._read_every, self._look_every = (max(1, round(s / step_s)) for s in (READ_S, LOOK_S))
+        self.course = Course(rehearsal.scene.transducer.compression_warning_mm, step_s)
+        self._seen: np.ndarray | None = None
+        self._touches = np.ones(rehearsal.probe.number_of_scanlines, bool)
+
+    @cached_property
+    def coverage(self) -> Coverage:
+        return Coverage(self.rehearsal.organ, self.rehearsal.tumour, MARGIN_MM)
+
+    def watch(self, session: Session, probe: Probe, pose: np.ndarray | None) -> None:
+        """Look at a moment (its step's pose, None of a way back) whose pictures were taken, and note a new reading in the session."""
+        if session.moment % self._look_every == 0 and self.rehearsal.scanner is not None:
+            image = self.rehearsal.scene.image
+            gap = image.contact_gap_mm if image.contact == "organ" else None
+            rest = self.rehearsal.scanner.plane.rest_grid(PLACES)
+            self._touches = self.coverage.look(rest, probe, gap)
+        if session.moment % self._read_every == 0 or self.reading is None:
+            self.reading = read(self.rehearsal, probe, self._touches)
+            self._seen = self.coverage.at(np.asarray(self.rehearsal.organ.vertices))
+            session.note("reading", self.figures())
+        self.course.add(pose, self.reading.compression_mm)
+
+    def figures(self) -> dict[str, Any]:
+        """The reading and the shares seen so far, rounded, for the record."""
+        values = asdict(self.reading) if self.reading is not None else {}
+        values |= {f"seen_{target}": self.coverage.share(target) for target in self.coverage.targets}
+        return {name: None if value is None else round(value, 4) for name, value in values.items()}
+
+    def summary(self, bookmarks: int = 0) -> dict[str, Any]:
+        """How the rehearsal went so far."""
+        target = "margin" if "margin" in self.coverage.targets else "organ"
+        return self.course.summary(self.figures(), self.coverage.gaps(target), bookmarks)
+
+    @property
+    def is_too_deep(self) -> bool:
+        """Whether the tissue is squeezed by more than the scene's limit."""
+        limit = self.rehearsal.scene.transducer.compression_warning_mm
+        return self.reading is not None and self.reading.compression_mm > limit
+
+    def onto(self, view: View, settings: Settings) -> View:
+        """A view with what was read."""
+        status = view.status
+        if self.is_too_deep and self.reading is not None and not status:
+            status = f"TISSUE SQUEEZED BY {self.reading.compression_mm:.0f} mm"
+        return replace(
+            view,
+            findings=self.findings(),
+            alert=COMPRESSION if self.is_too_deep else "",
+            seen=self._seen if settings.show_seen else None,
+            status=status,
+        )
+
+    def findings(self) -> dict[str, str]:
+        """Name -> figure with its unit."""
+        reading = self.reading
+        if reading is None:
+            return {}
+        found = {COMPRESSION: f"{reading.compression_mm:.1f} mm", "contact": f"{reading.contact_mm2:.0f} mm2"}
+        if reading.to_tumour_mm is None:
+            return found | {"organ seen": self._share("organ")}
+        found |= {
+            "to tumour": f"{reading.to_tumour_mm:.1f} mm",
+            "tumour depth": f"{reading.tumour_depth_mm:.1f} mm",
+            "tumour shift": f"{reading.tumour_shift_mm:.1f} mm",
+            "in view": "not cut" if reading.in_view is None else f"{100 * reading.in_view:.0f} %",
+            "margin": f"{reading.margin_mm:.1f} mm" if reading.in_view and reading.margin_mm else "",
+        }
+        return found | {
+            "tumour seen": self._share("tumour"),
+            f"+{MARGIN_MM:.0f} mm seen": self._share("margin"),
+        }
+
+    def _share(self, target: str) -> str:
+        return f"{100 * self.coverage.share(target):.0f} %"

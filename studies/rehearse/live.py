@@ -1,0 +1,124 @@
+"""What the user does, made into the moments of a session: the transducer led, actions undone, places marked."""
+
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+
+from render.viewer import Controls
+from studies.session.history import History
+from studies.session.recorded import Recorded
+from studies.session.replay import set_solver
+from studies.session.session import Session
+from studies.trade.ladder import Ladder
+
+# A transducer that goes no farther than this in a step rests [mm].
+STILL_MM = 1e-3
+Ray = tuple[np.ndarray, np.ndarray]
+
+
+@dataclass
+class Live:
+    """The rehearsal led by the user, a ``Driver``. After a way back the transducer stays until the user moves it."""
+
+    session: Session
+    ladder: Ladder
+    recorded: Recorded | None = None
+    waits: bool = False
+    _ray: Ray | None = field(default=None, init=False)
+    _said: str = field(default="", init=False)
+    _asked: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        self.history = History(self.session)
+
+    @property
+    def status(self) -> str:
+        return self.ladder.says(self._asked)
+
+    def move(self, controls: Controls) -> np.ndarray | None:
+        """The pose to step to, None where this moment goes back to another."""
+        self.session.tell("settings", asdict(controls.settings))
+        if self._go_back(controls):
+            self.waits, self._ray = True, controls.ray
+            return None
+        self._set_solver(controls)
+        if self.waits and self._ray is None:
+            self._ray = controls.ray
+        self.waits = self.waits and not acts(controls, self._ray)
+        rehearsal = self.session.rehearsal
+        pose = rehearsal.pose if self.waits else self._steered(controls)
+        moves = bool(np.abs(pose - rehearsal.pose).max() > STILL_MM)
+        self.history.watch(moves, controls.press)
+        return pose
+
+    def _go_back(self, controls: Controls) -> bool:
+        """Undo, redo, reset or a bookmark, where one of these was asked for and there is something to go to."""
+        if controls.bookmark:
+            self._said = f"Bookmark {self.history.set_bookmark()}"
+        if controls.reset:
+            self.history.reset()
+            return True
+        if controls.undo:
+            return self._tried(self.history.undo(), "undo")
+        if controls.redo:
+            return self._tried(self.history.redo(), "redo")
+        if controls.to_bookmark:
+            number = self.history.to_bookmark()
+            self._said = f"Bookmark {number}" if number else "No bookmark: M sets one"
+            return number > 0
+        return False
+
+    def _tried(self, done: bool, what: str) -> bool:
+        self._said = what if done else f"Nothing to {what}"
+        return done
+
+    def take_said(self) -> str:
+        """What there was to say since this was last asked."""
+        said, self._said = self._said, ""
+        return said
+
+    def _set_solver(self, controls: Controls) -> None:
+        asked = controls.settings
+        self._asked = asked.iterations
+        values = dict(
+            iterations=self.ladder.iterations(asked.iterations),
+            substeps=asked.substeps,
+            stiffness=asked.stiffness,
+            young_kpa=asked.young_kpa,
+            gravity_m_s2=asked.gravity_m_s2,
+        )
+        given = {name: value for name, value in values.items() if value is not None}
+        self.session.tell("solver", given)
+        set_solver(self.session.rehearsal, given)
+
+    def _steered(self, controls: Controls) -> np.ndarray:
+        """Hand the user's input to the hand that holds the transducer; the pose to go to then."""
+        rehearsal = self.session.rehearsal
+        hand = rehearsal.hand
+        if controls.ray is not None:
+            hand.point(*controls.ray)
+        hand.hold(controls.press, rehearsal.settings.time_step_s)
+        hand.push(controls.push_mm)
+        hand.turn(controls.fan_deg, controls.tilt_deg, controls.roll_deg)
+        return rehearsal.pose_towards(hand.pose())
+
+    def stepped(self, step_ms: float) -> str:
+        """The rehearsal has just advanced to the pose of a move, in so many ms; what the terminal has to say of it."""
+        self.session.stepped()
+        before = self.status
+        if self.ladder.watch(step_ms) and self.status != before:
+            return self.status or f"Back to all {self._asked} iterations."
+        return ""
+
+    def watch(self) -> str:
+        """After each moment: let the session's file keep up; what the terminal has to say of it."""
+        return self.recorded.watch() if self.recorded is not None else ""
+
+
+def acts(controls: Controls, ray: Ray | None) -> bool:
+    """Whether the user does anything but keep the mouse on a ray."""
+    moved = controls.ray is not None and not (
+        ray is not None and all(np.array_equal(a, b) for a, b in zip(controls.ray, ray, strict=True))
+    )
+    turns = controls.push_mm, controls.fan_deg, controls.tilt_deg, controls.roll_deg
+    return moved or controls.press or any(turns)

@@ -1,0 +1,141 @@
+"""A rehearsal from its first moment to its last: who leads it, what is recorded of it, and what is said at its end."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+from tqdm import tqdm
+
+from render.viewer import Settings
+from render.window import NoVulkan
+from scenes.anatomy import LoadedAnatomy
+from studies.commands import Fault
+from studies.rehearsal import Rehearsal, RehearsalState
+from studies.rehearse.drivers import Played, Scripted
+from studies.rehearse.headless import run_headless
+from studies.rehearse.instruments import Instruments
+from studies.rehearse.live import Live
+from studies.rehearse.loop import Loop
+from studies.rehearse.sweeping import Sweeping
+from studies.rehearse.view import open_viewer, settings_of
+from studies.report import Notices, Record
+from studies.session.file import Log
+from studies.session.recorded import Recorded, record
+from studies.session.replay import Replay
+from studies.session.session import Session
+from studies.session.summary import in_words
+from studies.trade.ladder import Ladder
+
+
+@dataclass
+class Run:
+    """One rehearsal, its anatomy, and the folder for what comes of it."""
+
+    rehearsal: Rehearsal
+    anatomy: LoadedAnatomy
+    arch: str
+    out: Path
+    budget_ms: float | None = None
+    recorded: Recorded | None = None
+
+    def in_window(self, log: Log | None, at_s: float) -> None:
+        """Led by the user, in a window; with a log by that first. Raises Fault, SessionError."""
+        try:
+            viewer = open_viewer(self.rehearsal, visible=True)
+        except NoVulkan as reason:
+            raise Fault(f"{reason}; install a Vulkan driver, or run with --headless") from None
+        replay = None if log is None else self._replay(log, at_s, viewer.settings)
+        driver = self._live() if replay is None else Played(replay, self._take_over)
+        instruments, sweeping = Instruments(self.rehearsal), Sweeping(self.rehearsal)
+        notices = Notices(click.echo)
+        click.echo("The window is open; H shows the keys, Esc quits.")
+        loop = Loop(self.rehearsal, viewer, self.out, Record(0.0), driver, notices, instruments, sweeping)
+        try:
+            loop.run()
+        finally:
+            viewer.close()
+            _say(sweeping.end())
+            live = driver.live if isinstance(driver, Played) else driver
+            self._end(instruments, len(live.history.bookmarks) if live else 0)
+            _say(_verdict(replay))
+
+    def headless(self, log: Log | None, at_s: float, seconds: float | None, build_s: float) -> None:
+        """Led by the scene's script, or by a log. Raises SessionError."""
+        rehearsal, settings = self.rehearsal, settings_of(self.rehearsal)
+        instruments = Instruments(rehearsal)
+        replay = None if log is None else self._replay(log, at_s, settings)
+        if replay is None:
+            step_s = rehearsal.settings.time_step_s
+            steps = max(1, round((seconds or rehearsal.script_length_s()) / step_s))
+            session = Session(rehearsal)
+            driver: Scripted | Played = Scripted(session, self._record(session), steps)
+        else:
+            steps = len(replay.log.poses) - replay.session.moment
+            if seconds:
+                steps = min(steps, max(1, round(seconds / rehearsal.settings.time_step_s)))
+            driver = Played(replay, self._take_over)
+        try:
+            run_headless(rehearsal, driver, steps, settings, instruments, self.arch, self.out, build_s)
+        finally:
+            self._end(instruments, 0)
+            _say(_verdict(replay))
+
+    def _live(self, begins: RehearsalState | None = None) -> Live:
+        ladder = Ladder(self.budget_ms or 1000 * self.rehearsal.settings.time_step_s)
+        session = Session(self.rehearsal)
+        return Live(session, ladder, self._record(session, begins), waits=begins is not None)
+
+    def _take_over(self) -> Live:
+        """The user leads on from where a replay is: a session of its own."""
+        self.rehearsal.hand.take(self.rehearsal.pose)
+        return self._live(self.rehearsal.snapshot())
+
+    def _record(self, session: Session, begins: RehearsalState | None = None) -> Recorded | None:
+        try:
+            self.recorded = record(session, self.anatomy, self.arch, self.out, begins)
+        except OSError as error:
+            click.echo(
+                f"Mind: this session is not recorded: {self.out} cannot be written to ({error.strerror})"
+            )
+        return self.recorded
+
+    def _replay(self, log: Log, at_s: float, settings: Settings) -> Replay:
+        replay = Replay(self.rehearsal, log)
+        if log.header.arch != self.arch:
+            click.echo(
+                f"Mind: recorded on {log.header.arch}, replayed on {self.arch}: the same to the eye, not to the bit."
+            )
+        aim = min(round(at_s / log.header.time_step_s), len(log.poses))
+        if aim > 0:
+            with tqdm(total=aim, desc=f"to {at_s:g} s", unit="step") as bar:
+                replay.open_at(at_s, bar.update)
+        for name, value in replay.settings_until_now().items():
+            setattr(settings, name, value)
+        return replay
+
+    def _end(self, instruments: Instruments, bookmarks: int) -> None:
+        if instruments.reading is None:
+            return
+        summary = instruments.summary(bookmarks)
+        click.echo(in_words(summary))
+        if self.recorded is not None:
+            self.recorded.close(summary)
+            path = self.recorded.recording.path
+            click.echo(self.recorded.recording.fault or f"Recorded: replay it with rehearse --replay {path}")
+
+
+def _verdict(replay: Replay | None) -> str:
+    """Whether a replay was the recorded session."""
+    if replay is None or replay.compared == 0:
+        return ""
+    if replay.differs_s is not None:
+        return (
+            f"replay    differs from {replay.differs_s:.1f} s on: other bits, of another backend or version"
+        )
+    state = replay.rehearsal.digest()
+    return f"replay    identical in all {replay.compared} states compared, to {replay.time_s:.1f} s; state {state}"
+
+
+def _say(text: str) -> None:
+    if text:
+        click.echo(text)

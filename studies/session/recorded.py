@@ -1,0 +1,65 @@
+"""A rehearsal that is recorded: its file, and when lines and whole states go to it."""
+
+from pathlib import Path
+from typing import Any
+
+from scenes.anatomy import LoadedAnatomy, fingerprint
+from studies.rehearsal import RehearsalState
+from studies.session.file import Header, Recording
+from studies.session.session import Session
+from studies.session.state import to_text
+
+# A whole state is written so often: from one to the next, at most, is computed anew where a session is opened in its midst.
+STATE_S = 60.0
+# What of a scene stands in the patient's folder, and may name files.
+NOT_RECORDED: dict[str, Any] = {"anatomy": True, "shape": True, "title": True, "transducer": {"probe"}}
+
+
+class Recorded:
+    """A session with its file; ``watch`` after each moment."""
+
+    def __init__(self, session: Session, recording: Recording) -> None:
+        self.session = session
+        self.recording = recording
+        session.recorder = recording
+        step_s = session.rehearsal.settings.time_step_s
+        self._line_every, self._state_every = max(1, round(1 / step_s)), max(1, round(STATE_S / step_s))
+
+    def watch(self) -> str:
+        """Write the line of a second that is over; what went wrong with the file, once."""
+        if self.recording.moments < self._line_every:
+            return ""
+        before = self.recording.fault
+        moment, rehearsal = self.session.moment, self.session.rehearsal
+        is_due = moment % self._state_every < self._line_every
+        self.recording.line(rehearsal.digest(), to_text(rehearsal.snapshot()) if is_due else None)
+        return self.recording.fault if self.recording.fault != before else ""
+
+    def close(self, summary: dict[str, Any]) -> None:
+        """Write what is left, with the state, from which the session can go on another day."""
+        rehearsal = self.session.rehearsal
+        self.recording.line(rehearsal.digest())
+        self.recording.close(summary, to_text(rehearsal.snapshot()))
+
+
+def record(
+    session: Session,
+    anatomy: LoadedAnatomy,
+    arch: str,
+    folder: Path,
+    begins: RehearsalState | None = None,
+) -> Recorded:
+    """Record a session from here on under the next free number of a folder. Raises OSError."""
+    rehearsal = session.rehearsal
+    header = Header(
+        title=rehearsal.scene.title,
+        anatomy=fingerprint(anatomy),
+        scene=rehearsal.scene.model_dump(mode="json", exclude=NOT_RECORDED),
+        probe=rehearsal.probe.model_dump(mode="json", by_alias=True),
+        arch=arch,
+        time_step_s=rehearsal.settings.time_step_s,
+        begins=None if begins is None else to_text(begins),
+    )
+    taken = [int(path.stem[-3:]) for path in folder.glob("session-[0-9][0-9][0-9].jsonl")]
+    path = folder / f"session-{1 + max(taken, default=0):03d}.jsonl"
+    return Recorded(session, Recording(path, header))

@@ -1,0 +1,133 @@
+"""A recorded session once more, with the same bits."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from scenes.scene import NeoHookeanTissue
+from studies.rehearsal import Rehearsal
+from studies.session.file import Log, SessionError
+from studies.session.session import SETTLED, Session
+from studies.session.state import StateError, from_text
+
+
+class Replay:
+    """Drives a rehearsal through a log. ``differs_s`` is when its tissue first was not the recorded one's, None so far.
+
+    Raises SessionError where the log's states are of another body.
+    """
+
+    def __init__(self, rehearsal: Rehearsal, log: Log) -> None:
+        self.rehearsal, self.log = rehearsal, log
+        self.session = Session(rehearsal)
+        self.compared = 0
+        self.differs_s: float | None = None
+        backs = [
+            (moment, event.value) for moment, e in log.events.items() for event in e if event.kind == "back"
+        ]
+        if not all(isinstance(to, int) and SETTLED <= to <= moment for moment, to in backs):
+            raise SessionError("the session goes back to a moment that had not been: its file is damaged")
+        self._backs = backs
+        if log.header.begins is not None:
+            rehearsal.restore(self._state(log.header.begins))
+
+    @property
+    def is_over(self) -> bool:
+        return self.session.moment >= len(self.log.poses)
+
+    @property
+    def time_s(self) -> float:
+        return self.session.time_s
+
+    def open_at(self, seconds: float, done: Callable[[int], Any] = lambda moments: None) -> None:
+        """Go to a time, by way of the last state before it that all which follows can be had from."""
+        aim = min(round(seconds / self.log.header.time_step_s), len(self.log.poses))
+        start = max(
+            (moment for moment in self.log.states if moment <= aim and self._holds(moment)), default=0
+        )
+        if start > 0:
+            for moment in range(start):
+                self._set(moment)
+            self.rehearsal.restore(self._state(self.log.states[start]))
+            self.session.moment = start
+        done(start)
+        while self.session.moment < aim:
+            pose, _ = self.move()
+            if pose is not None:
+                self.rehearsal.advance(pose)
+                self.stepped()
+            done(1)
+        self.rehearsal.update_surfaces()
+
+    def move(self) -> tuple[np.ndarray | None, dict[str, Any]]:
+        """The pose to step to, None where this moment was a way back; and the pictures' settings that changed.
+
+        ``stepped`` comes after the step. Raises SessionError where the log is over.
+        """
+        moment = self.session.moment
+        if self.is_over:
+            raise SessionError("the session is over")
+        if any(to == moment for _, to in self._backs):
+            self.session.keep()
+        back, settings = self._set(moment)
+        if back is not None:
+            self.session.go_back(back)
+            self._compare()
+            return None, settings
+        return self.log.poses[moment], settings
+
+    def stepped(self) -> None:
+        """The rehearsal has just advanced to the pose of a move."""
+        self.session.stepped()
+        self._compare()
+
+    def _set(self, moment: int) -> tuple[int | None, dict[str, Any]]:
+        """Set solver and tissue as a moment has them; where it goes back to, and its pictures' settings."""
+        back: int | None = None
+        settings: dict[str, Any] = {}
+        for event in self.log.events.get(moment, []):
+            if event.kind == "solver":
+                set_solver(self.rehearsal, event.value)
+            elif event.kind == "settings":
+                settings |= event.value
+            elif event.kind == "back":
+                back = event.value
+        return back, settings
+
+    def settings_until_now(self) -> dict[str, Any]:
+        """The pictures' settings as they have become since the beginning."""
+        settings: dict[str, Any] = {}
+        for moment in sorted(m for m in self.log.events if m <= self.session.moment):
+            for event in self.log.events[moment]:
+                settings |= event.value if event.kind == "settings" else {}
+        return settings
+
+    def _compare(self) -> None:
+        digest = self.log.digests.get(self.session.moment)
+        if digest is None:
+            return
+        self.compared += 1
+        if self.differs_s is None and digest != self.rehearsal.digest():
+            self.differs_s = self.time_s
+
+    def _holds(self, start: int) -> bool:
+        """Whether nothing after a moment goes back to before it."""
+        return all(moment < start or to >= start or to == SETTLED for moment, to in self._backs)
+
+    def _state(self, text: str):
+        try:
+            return from_text(text, self.rehearsal.settled)
+        except StateError as error:
+            raise SessionError(f"the session holds {error}: it is damaged, or of another body") from None
+
+
+def set_solver(rehearsal: Rehearsal, values: dict[str, Any]) -> None:
+    """Set what a step is told, as recorded."""
+    step = rehearsal.settings
+    for name in ("iterations", "substeps", "stiffness"):
+        setattr(step, name, values.get(name, getattr(step, name)))
+    if "young_kpa" in values and isinstance(rehearsal.scene.tissue, NeoHookeanTissue):
+        rehearsal.set_young(values["young_kpa"])
+    if "gravity_m_s2" in values:
+        rehearsal.set_gravity(values["gravity_m_s2"])

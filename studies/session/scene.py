@@ -1,0 +1,12 @@
+"""The scene of a recorded session: the patient from the scene's own files, all else as it was recorded."""
+
+from scenes.scene import Scene
+from studies.session.file import Header
+
+
+def scene_of_log(header: Header, scene: Scene) -> Scene:
+    """The patient of a scene, with all else as it was recorded. Raises ValidationError."""
+    values = scene.model_dump(mode="json", exclude_unset=True)
+    for name, section in header.scene.items():
+        values[name] = section
+    return Scene.model_validate(values)

@@ -1,0 +1,76 @@
+"""A rehearsal as a row of moments, each a step or a way back to an earlier one: what undo, bookmarks and replay stand on."""
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from studies.rehearsal import Rehearsal, RehearsalState
+
+# The moment before the first: tissue settled, transducer just touching.
+SETTLED = -1
+
+
+class Recorder(Protocol):
+    """What is told of each moment."""
+
+    def note(self, kind: str, value: Any) -> None: ...
+
+    def moment(self, pose: np.ndarray | None) -> None: ...
+
+
+class Session:
+    """``moment`` counts what has happened to a rehearsal since the session began, ways back too: no two states share one.
+
+    ``recorder``, where there is one, is told of all, so that the same session can be had again.
+    """
+
+    def __init__(self, rehearsal: Rehearsal, recorder: Recorder | None = None) -> None:
+        self.rehearsal = rehearsal
+        self.recorder = recorder
+        self.moment = 0
+        self.kept: dict[int, RehearsalState] = {SETTLED: rehearsal.settled}
+        self._told: dict[str, Any] = {}
+
+    @property
+    def time_s(self) -> float:
+        """Simulated time since the session began."""
+        return self.moment * self.rehearsal.settings.time_step_s
+
+    def tell(self, kind: str, values: dict[str, Any]) -> None:
+        """Note those of some values that are not as they were told last."""
+        new = {name: value for name, value in values.items() if self._told.get(f"{kind}.{name}") != value}
+        if new:
+            self._told |= {f"{kind}.{name}": value for name, value in new.items()}
+            self.note(kind, new)
+
+    def note(self, kind: str, value: Any) -> None:
+        """Note something of the moment to come."""
+        if self.recorder is not None:
+            self.recorder.note(kind, value)
+
+    def stepped(self) -> None:
+        """The rehearsal has just advanced by a step."""
+        self._on(self.rehearsal.pose)
+
+    def go_back(self, moment: int) -> None:
+        """Tissue and probe as they were at a moment that was kept; the time goes on."""
+        self.note("back", moment)
+        self.rehearsal.restore(self.kept[moment])
+        self.rehearsal.update_surfaces()
+        self._on(None)
+
+    def keep(self) -> int:
+        """Keep the state of this moment, to be gone back to; which moment it is."""
+        if self.moment not in self.kept:
+            self.kept[self.moment] = self.rehearsal.snapshot()
+        return self.moment
+
+    def forget(self, is_needed: Callable[[int], bool]) -> None:
+        """Let go of what was kept and is no longer needed."""
+        self.kept = {moment: s for moment, s in self.kept.items() if moment == SETTLED or is_needed(moment)}
+
+    def _on(self, pose: np.ndarray | None) -> None:
+        if self.recorder is not None:
+            self.recorder.moment(pose)
+        self.moment += 1

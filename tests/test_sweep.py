@@ -1,0 +1,535 @@
+"""Tracked sweeps: what PLUS wrote comes back line for line, chains of transforms as by hand, and damaged files are refused in words."""
+
+import zlib
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from ultrasound.sweep import ORIENTATIONS, Sweep, SweepError, load_constants, matrix_of, transform_text
+from ultrasound.sweep_file import SweepWriter, read_sweep, write_sweep
+
+SAMPLES = ("NwirePhantomFreehand", "SpinePhantomFreehand", "SlidingProbeTrackingData")
+SPINE_XML = "us/PlusDeviceSet_SpinePhantomFreehandReconstructionOnly.xml"
+PIXELS = np.arange(24, dtype=np.uint8).reshape(2, 3, 4)
+QUARTER_TURN = np.array([[0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 30], [0, 0, 0, 1.0]])
+SCALED = np.array([[0.5, 0, 0, 1], [0, 0.25, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1.0]])
+
+
+def parts_of(path) -> tuple[list[bytes], bytes]:
+    """Lines of the header, and the pixels as they stand in the file."""
+    header, end, pixels = path.read_bytes().partition(b"ElementDataFile = LOCAL\n")
+    return (header + end).splitlines(keepends=True), pixels
+
+
+def file_of(path, pixels=bytes(12), raw="", **changed):
+    """A small metafile of one frame of 4 x 3 pixels, with fields changed, or left out where None; ``raw`` comes before the end."""
+    fields = {
+        "ObjectType": "Image",
+        "NDims": "3",
+        "DimSize": "4 3 1",
+        "Kinds": "domain domain list",
+        "ElementType": "MET_UCHAR",
+        "UltrasoundImageOrientation": "MF",
+        "Seq_Frame0000_Timestamp": "1.5",
+    } | changed
+    end = {"ElementDataFile": fields.pop("ElementDataFile", "LOCAL")}
+    lines = [f"{name} = {text}\n" for name, text in (fields | end).items() if text is not None]
+    lines.insert(-1, raw)
+    path.write_bytes("".join(lines).encode("latin-1") + pixels)
+    return path
+
+
+def frame_of(**fields) -> Sweep:
+    return Sweep(np.zeros((1, 0, 0), np.uint8), [{name: str(text) for name, text in fields.items()}], {})
+
+
+def tracked(**matrices) -> dict[str, str]:
+    """Fields of a frame whose transforms are OK."""
+    fields = {}
+    for name, matrix in matrices.items():
+        fields |= {f"{name}Transform": transform_text(matrix), f"{name}TransformStatus": "OK"}
+    return fields
+
+
+@pytest.mark.parametrize("sample", SAMPLES)
+def test_what_plus_wrote_comes_back_line_for_line(data, tmp_path, sample):
+    source, copy = data / f"us/{sample}.igs.mha", tmp_path / "copy.igs.mha"
+    sweep = read_sweep(source)
+    write_sweep(copy, sweep)
+    (before, pixels), (after, copied) = parts_of(source), parts_of(copy)
+    size = next((index for index, line in enumerate(before) if line.startswith(b"CompressedDataSize")), None)
+    if size is not None:
+        assert int(after[size].split()[2]) == len(copied)
+        assert len(after[size]) == len(before[size])
+        assert zlib.decompress(copied) == zlib.decompress(pixels) == sweep.images.tobytes()
+        before[size] = after[size]
+    assert after == before
+    assert np.array_equal(read_sweep(copy).images, sweep.images)
+
+
+def test_a_sweep_of_poses_alone(data):
+    sweep = read_sweep(data / "us/SlidingProbeTrackingData.igs.mha")
+    assert len(sweep) == 85
+    assert sweep.images.shape == (85, 0, 0)
+    assert not sweep.is_image_ok(0)
+    assert sweep.times_s[0] == 167.1779999999853
+    assert np.all(np.diff(sweep.times_s) > 0)
+    # ReferenceToTracker is the identity.
+    assert sweep.transform("Probe", "Reference", 0)[:3, 3] == pytest.approx(
+        [91.98129272, -50.49953842, -10.98241711]
+    )
+
+
+def test_a_chain_is_the_product_of_its_transforms(tmp_path):
+    sweep = frame_of(**tracked(ImageToProbe=SCALED, ProbeToTracker=QUARTER_TURN, ReferenceToTracker=SCALED))
+    # Pixel (4, 8): in Probe (3, 4, 3), in Tracker (10 - 4, 20 + 3, 33), in Reference ((6 - 1) / 0.5, (23 - 2) / 0.25, 30).
+    assert sweep.transform("Image", "Tracker", 0) @ [4, 8, 0, 1] == pytest.approx([6, 23, 33, 1])
+    assert sweep.transform("Image", "Reference", 0) @ [4, 8, 0, 1] == pytest.approx([10, 84, 30, 1])
+    assert sweep.transform("Reference", "Image", 0) @ [10, 84, 30, 1] == pytest.approx([4, 8, 0, 1])
+    assert np.array_equal(sweep.transform("Probe", "Probe", 0), np.eye(4))
+
+
+def test_the_shortest_chain_is_taken():
+    turn, shift = QUARTER_TURN, SCALED
+    sweep = frame_of(**tracked(AToB=turn, AToC=shift, BToE=turn, CToD=shift, DToE=shift))
+    assert np.array_equal(sweep.transform("A", "E", 0), turn @ turn)
+    assert np.array_equal(sweep.transform("B", "D", 0), np.linalg.inv(shift) @ turn)
+
+
+@pytest.mark.parametrize("name, start", [("ToolToTracker", "Tool"), ("StylusTopToTracker", "StylusTop")])
+def test_a_to_within_a_word_is_none(name, start):
+    sweep = frame_of(**tracked(**{name: SCALED}))
+    assert np.array_equal(sweep.transform(start, "Tracker", 0), SCALED)
+
+
+def test_the_spine_with_its_calibration(data):
+    sweep = read_sweep(data / "us/SpinePhantomFreehand.igs.mha")
+    sweep.constant = load_constants(data / SPINE_XML)
+    assert list(sweep.constant) == ["ImageToProbe", "PhantomToReference"]
+    assert sweep.constant["ImageToProbe"][0] == pytest.approx([-0.00157821, 0.0785919, -0.00803285, 15.3978])
+    for frame in (0, 20):
+        fields = sweep.frames[frame]
+        probe, reference = (
+            np.array(fields[f"{name}ToTrackerTransform"].split(), float).reshape(4, 4)
+            for name in ("Probe", "Reference")
+        )
+        expected = np.linalg.inv(reference) @ probe @ sweep.constant["ImageToProbe"]
+        assert sweep.transform("Image", "Reference", frame) == pytest.approx(expected, abs=1e-9)
+        phantom = np.linalg.inv(sweep.constant["PhantomToReference"]) @ expected
+        assert sweep.transform("Image", "Phantom", frame) == pytest.approx(phantom, abs=1e-9)
+
+
+def test_a_stylus_unseen_is_none_and_the_probe_does_not_need_it(data):
+    sweep = read_sweep(data / "us/NwirePhantomFreehand.igs.mha")
+    assert all(sweep.transform("Stylus", "Reference", frame) is None for frame in range(len(sweep)))
+    assert sweep.transform("Probe", "Reference", 0).shape == (4, 4)
+    assert all(sweep.is_image_ok(frame) for frame in range(len(sweep)))
+
+
+@pytest.mark.parametrize(
+    "status", [{}, {"AToBTransformStatus": "INVALID"}, {"AToBTransformStatus": "MISSING"}]
+)
+def test_a_status_that_is_not_ok_is_none(status):
+    fields = {"AToBTransform": transform_text(SCALED), **status}
+    assert frame_of(**fields).transform("B", "A", 0) is None
+
+
+def test_names_that_nothing_joins_are_told():
+    sweep = frame_of(**tracked(ImageToProbe=SCALED))
+    with pytest.raises(
+        SweepError, match="frame 0: no chain of transforms from Image to World, of ImageToProbe$"
+    ):
+        sweep.transform("Image", "World", 0)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "1 0 0",
+        "a " * 16,
+        "nan " * 16,
+        "1 0 0 0 0 1 0 0 0 0 1 0 0 0 1 1",
+        "1 0 0 0 0 1 0 inf 0 0 1 0 0 0 0 1",
+    ],
+)
+def test_a_transform_that_is_none(text):
+    sweep = frame_of(AToBTransform=text, AToBTransformStatus="OK")
+    with pytest.raises(
+        SweepError, match=r"^frame 0: AToBTransform = .*expected sixteen finite numbers.*[^\n]$"
+    ):
+        sweep.transform("A", "B", 0)
+
+
+def test_a_transform_without_an_inverse():
+    sweep = frame_of(**tracked(AToB=np.diag([1.0, 1, 0, 1])))
+    assert sweep.transform("A", "B", 0)[2, 2] == 0
+    with pytest.raises(SweepError, match="AToB has no inverse"):
+        sweep.transform("B", "A", 0)
+
+
+@pytest.mark.parametrize("text", ["", "soon", "nan", "inf"])
+def test_a_timestamp_that_is_none(text):
+    with pytest.raises(SweepError, match="frame 0: Timestamp = .*expected a finite number"):
+        _ = frame_of(Timestamp=text).times_s
+
+
+def test_images_and_frames_go_together():
+    with pytest.raises(SweepError, match=r"expected uint8 \(1, rows, columns\)"):
+        Sweep(PIXELS, [{}], {})
+
+
+@pytest.mark.parametrize("status, ok", [("OK", True), ("INVALID", False), (None, True)])
+def test_an_images_status(status, ok):
+    sweep = Sweep(PIXELS[:1], [{} if status is None else {"ImageStatus": status}], {})
+    assert sweep.is_image_ok(0) == ok
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_every_orientation_becomes_mf(tmp_path, orientation):
+    upright, far_first = PIXELS[0], PIXELS[0].T
+    stored = {  # by what the column's index grows towards, and the row's
+        "MF": upright,
+        "MN": upright[::-1],
+        "UF": upright[:, ::-1],
+        "UN": upright[::-1, ::-1],
+        "FM": far_first,
+        "FU": far_first[::-1],
+        "NM": far_first[:, ::-1],
+        "NU": far_first[::-1, ::-1],
+    }[orientation[:2]]
+    rows, columns = stored.shape
+    source = file_of(
+        tmp_path / "in.igs.mha",
+        stored.tobytes(),
+        DimSize=f"{columns} {rows} 1",
+        UltrasoundImageOrientation=orientation,
+    )
+    sweep = read_sweep(source)
+    assert np.array_equal(sweep.images, [upright])
+    write_sweep(tmp_path / "out.igs.mha", sweep)
+    again = read_sweep(tmp_path / "out.igs.mha")
+    assert np.array_equal(again.images, [upright])
+    assert again.fields["DimSize"] == "4 3 1"
+    assert again.fields["UltrasoundImageOrientation"] == ("MFA" if orientation == "MFA" else "MF")
+
+
+SQUEEZED = zlib.compress(bytes(12))
+HOSTILE = {
+    "no such element": (dict(ElementType="MET_USHORT"), "ElementType = 'MET_USHORT': expected MET_UCHAR"),
+    "element type gone": (dict(ElementType=None), "ElementType = ''"),
+    "colour": (dict(ElementNumberOfChannels="3"), "ElementNumberOfChannels = '3': expected 1"),
+    "descending": (
+        dict(UltrasoundImageOrientation="MFD"),
+        "UltrasoundImageOrientation = 'MFD': expected MF or",
+    ),
+    "orientation unknown": (dict(UltrasoundImageOrientation="XX"), "UltrasoundImageOrientation = 'XX'"),
+    "orientation gone": (dict(UltrasoundImageOrientation=None), "UltrasoundImageOrientation = ''"),
+    "four dimensions": (dict(NDims="4"), "NDims = '4'"),
+    "a vector": (dict(Kinds="vector domain domain"), "Kinds = "),
+    "text pixels": (dict(BinaryData="False"), "BinaryData = 'False'"),
+    "compressed somehow": (dict(CompressedData="Perhaps"), "CompressedData = 'Perhaps'"),
+    "another file": (dict(ElementDataFile="other.raw"), "ElementDataFile = 'other.raw': expected LOCAL"),
+    "no end": (dict(ElementDataFile=None, pixels=b""), "no ElementDataFile = LOCAL"),
+    "no sweep": (dict(ObjectType="Mesh"), "expected ObjectType = Image"),
+    "no size": (dict(DimSize=None), "DimSize = ''"),
+    "size of two": (dict(DimSize="4 3"), "DimSize = '4 3'"),
+    "size of words": (dict(DimSize="4 3 one"), "DimSize = '4 3 one'"),
+    "negative": (dict(DimSize="4 3 -1"), "DimSize = '4 3 -1'"),
+    "huge": (dict(DimSize="99999 99999 1"), "DimSize = '99999 99999 1'"),
+    "digits beyond int": (dict(DimSize="4 3 " + "9" * 5000), "DimSize = "),
+    "no frame": (dict(DimSize="4 3 0"), "DimSize = '4 3 0'"),
+    "poses for ever": (dict(DimSize="0 0 999999999"), "DimSize has 999999999 frames, but 1 have fields"),
+    "too few frames": (dict(DimSize="4 3 2"), "DimSize has 2 frames, but 1 have fields"),
+    "too many frames": (dict(Seq_Frame0001_A="b"), "DimSize has 1 frames, but 2 have fields"),
+    "a gap": (dict(DimSize="4 3 2", Seq_Frame0002_A="b"), "2 have fields, the last is 2"),
+    "no number": (dict(Seq_FrameABCD_A="b"), "'Seq_FrameABCD_A': expected Seq_Frame0000_Name"),
+    "no field": (dict(Seq_Frame0000="b"), "'Seq_Frame0000': expected"),
+    "twice": (dict(raw="NDims = 3\n"), "'NDims' stands twice"),
+    "no equals": (dict(raw="what is this\n"), "'what is this.n': expected Name = value"),
+    "no name": (dict(raw=" = 3\n"), "expected Name = value"),
+    "short": (dict(pixels=bytes(11)), "11 bytes of pixels: expected 12"),
+    "long": (dict(pixels=bytes(13)), "13 bytes of pixels: expected 12"),
+}
+
+
+def squeezed(pixels: bytes, size: str | None = None) -> dict:
+    return dict(pixels=pixels, CompressedData="True", CompressedDataSize=size or str(len(pixels)))
+
+
+HOSTILE |= {
+    "no zlib": (squeezed(b"nonsense"), "no zlib data"),
+    "bad checksum": (squeezed(SQUEEZED[:-1] + b"x"), "no zlib data"),
+    "cut off": (squeezed(SQUEEZED[:-4]), "expected 12"),
+    "size too small": (squeezed(SQUEEZED, "3"), "CompressedDataSize = '3'"),
+    "size none": (squeezed(SQUEEZED, "some"), "CompressedDataSize = 'some'"),
+    "left over": (squeezed(SQUEEZED + b"x"), "expected 12"),
+    "a bomb": (squeezed(zlib.compress(bytes(10_000_000))), "bytes are there for 12"),
+    "a small bomb": (
+        squeezed(zlib.compress(bytes(10_000))),
+        "13 bytes of pixels or more in the zlib data: expected 12",
+    ),
+    "fewer": (squeezed(zlib.compress(bytes(11))), "11 bytes of pixels or more in the zlib data: expected 12"),
+}
+
+
+@pytest.mark.parametrize("changed, words", HOSTILE.values(), ids=HOSTILE.keys())
+def test_damaged_files_are_refused_in_words(tmp_path, changed, words):
+    path = file_of(tmp_path / "damaged.igs.mha", **changed)
+    with pytest.raises(SweepError, match=words) as caught:
+        read_sweep(path)
+    assert str(caught.value).startswith("damaged.igs.mha: ")
+    assert len(str(caught.value).splitlines()) == 1
+    assert str(tmp_path) not in str(caught.value)
+
+
+def test_the_file_that_damage_is_done_to_is_whole(tmp_path):
+    assert read_sweep(file_of(tmp_path / "a.mha")).times_s == 1.5
+    assert read_sweep(file_of(tmp_path / "b.mha", **squeezed(SQUEEZED))).images.shape == (1, 3, 4)
+
+
+def test_a_header_without_end_is_not_read_to_the_end(tmp_path, monkeypatch):
+    monkeypatch.setattr("ultrasound.sweep_file.HEADER_LIMIT", 1 << 16)
+    path = tmp_path / "endless.igs.mha"
+    with path.open("wb") as file:
+        file.write(b"ObjectType = Image\nA = ")
+        file.truncate(10 << 30)  # sparse
+    with pytest.raises(SweepError, match=f"in the first {1 << 16} bytes"):
+        read_sweep(path)
+
+
+def test_what_is_no_file_is_refused(tmp_path):
+    for path in (tmp_path / "none.igs.mha", tmp_path):
+        with pytest.raises(SweepError, match=f"^{path.name}: "):
+            read_sweep(path)
+
+
+@pytest.mark.parametrize("end", ["", "\r"])
+def test_bytes_beyond_ascii_and_spaces_stay(tmp_path, end):
+    source = file_of(tmp_path / "in.igs.mha", Note="  Grüße\xa0= \x85 " + end, Seq_Frame0000_FrameNumber="7 ")
+    write_sweep(tmp_path / "out.igs.mha", read_sweep(source), compress=False)
+    lines, pixels = parts_of(tmp_path / "out.igs.mha")
+    assert f"Note =   Grüße\xa0= \x85 {end}\n".encode("latin-1") in lines
+    assert b"Seq_Frame0000_FrameNumber = 7 \n" in lines
+    assert pixels == bytes(12)
+
+
+def written(path, count=3, **options):
+    """A sweep of moving transforms, the second unseen, as its writer makes it."""
+    with SweepWriter(path, **options) as writer:
+        for frame in range(count):
+            probe = None if frame == 1 else QUARTER_TURN * [1, 1, 1, frame] + np.diag([0.0, 0, 0, 1 - frame])
+            image = None if frame == 0 else PIXELS[0] + np.uint8(frame)
+            writer.add(image, {"ProbeToReference": probe}, frame / 3, {"FrameNumber": str(frame)})
+    return path
+
+
+def test_the_header_of_a_new_sweep(tmp_path):
+    lines, pixels = parts_of(written(tmp_path / "new.igs.mha", fields={"Note": "a"}))
+    assert (
+        b"".join(lines).decode()
+        == f"""ObjectType = Image
+NDims = 3
+AnatomicalOrientation = RAI
+BinaryData = True
+BinaryDataByteOrderMSB = False
+CenterOfRotation = 0 0 0
+CompressedData = True
+CompressedDataSize = {len(pixels)}
+DimSize = 4 3 3
+Kinds = domain domain list
+ElementSpacing = 1 1 1
+ElementType = MET_UCHAR
+Offset = 0 0 0
+TransformMatrix = 1 0 0 0 1 0 0 0 1
+UltrasoundImageOrientation = MF
+UltrasoundImageType = BRIGHTNESS
+Note = a
+Seq_Frame0000_ProbeToReferenceTransform = 0 -1 0 0 1 0 0 0 0 0 1 0 0 0 0 1
+Seq_Frame0000_ProbeToReferenceTransformStatus = OK
+Seq_Frame0000_Timestamp = 0.0
+Seq_Frame0000_FrameNumber = 0
+Seq_Frame0000_ImageStatus = INVALID
+Seq_Frame0001_ProbeToReferenceTransform = 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1
+Seq_Frame0001_ProbeToReferenceTransformStatus = INVALID
+Seq_Frame0001_Timestamp = 0.3333333333333333
+Seq_Frame0001_FrameNumber = 1
+Seq_Frame0001_ImageStatus = OK
+Seq_Frame0002_ProbeToReferenceTransform = 0 -1 0 20 1 0 0 40 0 0 1 60 0 0 0 1
+Seq_Frame0002_ProbeToReferenceTransformStatus = OK
+Seq_Frame0002_Timestamp = 0.6666666666666666
+Seq_Frame0002_FrameNumber = 2
+Seq_Frame0002_ImageStatus = OK
+ElementDataFile = LOCAL
+"""
+    )
+
+
+def test_what_the_writer_wrote_reads_back(tmp_path):
+    sweep = read_sweep(written(tmp_path / "new.igs.mha"))
+    assert np.array_equal(sweep.images, [np.zeros((3, 4)), PIXELS[0] + 1, PIXELS[0] + 2])
+    assert [sweep.is_image_ok(frame) for frame in range(3)] == [False, True, True]
+    assert sweep.transform("Probe", "Reference", 1) is None
+    assert np.array_equal(sweep.transform("Probe", "Reference", 2)[:3, 3], [20, 40, 60])
+    assert np.array_equal(sweep.times_s, [0, 1 / 3, 2 / 3])
+
+
+@pytest.mark.parametrize("compress", [True, False])
+def test_frame_by_frame_and_at_once_give_the_same_bytes(tmp_path, compress):
+    one = written(tmp_path / "one.igs.mha", compress=compress).read_bytes()
+    assert written(tmp_path / "one.igs.mha", compress=compress).read_bytes() == one
+    sweep = read_sweep(tmp_path / "one.igs.mha")
+    write_sweep(tmp_path / "two.igs.mha", sweep, compress)
+    assert (tmp_path / "two.igs.mha").read_bytes() == one
+    # A sweep that no file was read for gets the same header.
+    write_sweep(tmp_path / "three.igs.mha", Sweep(sweep.images, sweep.frames, {}), compress)
+    assert (tmp_path / "three.igs.mha").read_bytes() == one
+
+
+@pytest.mark.parametrize("compress", [True, False])
+def test_simpleitk_reads_the_pixels(tmp_path, compress):
+    path = written(tmp_path / "new.mha", compress=compress)
+    assert np.array_equal(sitk.GetArrayFromImage(sitk.ReadImage(path)), read_sweep(path).images)
+
+
+def test_poses_alone_are_written_as_plus_does(tmp_path):
+    with SweepWriter(tmp_path / "poses.igs.mha") as writer:
+        writer.add(None, {"ProbeToReference": SCALED}, 0.5)
+        writer.add(None, {"ProbeToReference": SCALED}, 1.0)
+    sweep = read_sweep(tmp_path / "poses.igs.mha")
+    assert sweep.images.shape == (2, 0, 0)
+    names = ("DimSize", "ElementType", "CompressedData", "UltrasoundImageOrientation", "UltrasoundImageType")
+    assert [sweep.fields[name] for name in names] == ["0 0 2", "MET_OTHER", "False", "XX", "XX"]
+    assert "CompressedDataSize" not in sweep.fields
+
+
+def test_more_frames_than_four_digits_count(tmp_path):
+    path = tmp_path / "long.igs.mha"
+    with SweepWriter(path) as writer:
+        for frame in range(10_002):
+            writer.add(np.full((1, 1), frame % 251, np.uint8), {}, frame / 100)
+        assert writer.count == 10_002
+    sweep = read_sweep(path)
+    assert b"\nSeq_Frame9999_Timestamp = 99.99\n" in path.read_bytes()
+    assert b"\nSeq_Frame10001_Timestamp = 100.01\n" in path.read_bytes()
+    assert np.array_equal(sweep.images.ravel(), np.arange(10_002) % 251)
+    assert np.array_equal(sweep.times_s, np.arange(10_002) / 100)
+
+
+def test_after_an_exception_all_is_as_before(tmp_path):
+    path = tmp_path / "a.igs.mha"
+    path.write_text("what stood here")
+
+    def images():
+        yield PIXELS[0]
+        raise RuntimeError("stop")
+
+    with pytest.raises(RuntimeError, match="stop"), SweepWriter(path) as writer:
+        list(map(writer.add, images(), [{}], [0.0]))
+    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+    assert path.read_text() == "what stood here"
+
+
+def test_a_file_that_cannot_be_put_in_place_leaves_nothing(tmp_path):
+    (tmp_path / "a.igs.mha").mkdir()
+    with pytest.raises(OSError, match="irectory"):
+        written(tmp_path / "a.igs.mha")
+    assert [each.name for each in tmp_path.iterdir()] == ["a.igs.mha"]
+
+
+def test_a_sweep_without_frames_is_none(tmp_path):
+    with pytest.raises(SweepError, match="without frames"), SweepWriter(tmp_path / "a.igs.mha"):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+REFUSED = {
+    "of floats": ((PIXELS[0] / 2, {}, 0.0), "image of float64"),
+    "of colours": ((PIXELS, {}, 0.0), r"image of uint8 \(2, 3, 4\): expected"),
+    "empty": ((PIXELS[0, :0], {}, 0.0), "image of uint8"),
+    "of another size": ((PIXELS[0, :2], {}, 0.0), r"expected uint8 \(3, 4\)"),
+    "time": ((PIXELS[0], {}, np.nan), "time nan"),
+    "name": ((PIXELS[0], {"Probe": SCALED}, 0.0), "'Probe': expected a name such as"),
+    "no affine": ((PIXELS[0], {"AToB": SCALED[:3]}, 0.0), "expected sixteen finite numbers"),
+    "not finite": ((PIXELS[0], {"AToB": SCALED * np.nan}, 0.0), "expected sixteen finite numbers"),
+    "two lines": ((PIXELS[0], {}, 0.0, {"Note": "a\nDimSize = 1 1 1"}), "expected one line"),
+    "equals": ((PIXELS[0], {}, 0.0, {"a=b": "c"}), "no = in the name"),
+    "beyond Latin-1": ((PIXELS[0], {}, 0.0, {"Note": "\u03bcm"}), "beyond Latin-1"),
+}
+
+
+@pytest.mark.parametrize("arguments, words", REFUSED.values(), ids=REFUSED.keys())
+def test_a_frame_refused_leaves_the_others(tmp_path, arguments, words):
+    with SweepWriter(tmp_path / "a.igs.mha") as writer:
+        writer.add(PIXELS[0], {}, 1.0)
+        with pytest.raises(SweepError, match=words):
+            writer.add(*arguments)
+    sweep = read_sweep(tmp_path / "a.igs.mha")
+    assert len(sweep) == 1
+    assert np.array_equal(sweep.images, PIXELS[:1])
+
+
+def test_a_frame_beyond_the_limit_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("ultrasound.sweep_file.PIXEL_LIMIT", 30)
+    with SweepWriter(tmp_path / "a.igs.mha") as writer:
+        writer.add(None, {}, 0.0)
+        writer.add(PIXELS[0], {}, 1.0)
+        with pytest.raises(SweepError, match="frame 2: more than 30 bytes"):
+            writer.add(None, {}, 2.0)
+    assert len(read_sweep(tmp_path / "a.igs.mha")) == 2
+
+
+XML = "<PlusConfiguration><CoordinateDefinitions>{}</CoordinateDefinitions></PlusConfiguration>"
+ONE = '<Transform From="Image" To="Probe" Matrix="{}"/>'
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("no XML", "no XML"),
+        ("<a/>", "no CoordinateDefinitions"),
+        (XML.format(""), "no CoordinateDefinitions"),
+        (XML.format(ONE.format("1 0")), "ImageToProbe Matrix = '1 0': expected sixteen"),
+        (XML.format('<Transform To="Probe"/>'), "Transform 'ToProbe'"),
+        (XML.format(ONE.format(transform_text(SCALED)) * 2), "Transform .*each pair once"),
+        ('<?xml version="1.0" encoding="none"?><a/>', "no XML"),
+        ('<?xml version="1.0" encoding="shift_jis"?><a/>', "no XML"),
+        (" " * (1 << 22) + "<a/>", "more than 4 MB"),
+    ],
+)
+def test_a_configuration_that_is_none(tmp_path, text, words):
+    path = tmp_path / "plus.xml"
+    path.write_text(text)
+    with pytest.raises(SweepError, match=f"^plus.xml: {words}"):
+        load_constants(path)
+    with pytest.raises(SweepError, match=r"^none.xml: "):
+        load_constants(tmp_path / "none.xml")
+
+
+@given(arrays(np.float64, (3, 4), elements=st.floats(allow_nan=False, allow_infinity=False)))
+@settings(max_examples=20, deadline=None)
+def test_the_text_of_a_transform_is_exact(upper):
+    matrix = np.vstack([upper, [0, 0, 0, 1]])
+    text = transform_text(matrix)
+    assert np.array_equal(matrix_of(text, "it"), matrix)
+    assert "-0" not in text.split()
+
+
+TEXTS = st.text(st.characters(max_codepoint=255, exclude_characters="\n"), max_size=20)
+NAMES = st.sampled_from(["Timestamp", "AToBTransform", "Seq_Frame0000_x", "Two words", "é", "_"])
+
+
+@given(st.lists(st.dictionaries(NAMES, TEXTS, min_size=1), min_size=1, max_size=4), st.booleans(), st.data())
+@settings(max_examples=20, deadline=None)
+def test_whatever_stands_in_a_sweep_comes_back(tmp_path_factory, frames, compress, data):
+    images = data.draw(arrays(np.uint8, (len(frames), 3, 2)))
+    path = tmp_path_factory.mktemp("sweep") / "any.igs.mha"
+    write_sweep(path, Sweep(images, frames, {"Note": "a"}), compress)
+    again = read_sweep(path)
+    assert again.frames == frames
+    assert [list(each) for each in again.frames] == [list(each) for each in frames]
+    assert np.array_equal(again.images, images)

@@ -1,0 +1,138 @@
+"""What of the organ has been in the picture: its tissue by where it was at rest, looked at through the deformed body.
+
+A place counts as seen where the picture's lines went through it from elements that touched the organ. Shadows are not asked for.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from scipy.ndimage import distance_transform_edt, label, map_coordinates
+
+from sim.distance import distance_grid, signed_distance
+from ultrasound.array import Probe
+
+VOXEL_MM = 1.5
+# Distances from the organ are known so far around it.
+REACH_MM = 6.0
+# Places of a picture that are asked where they were at rest, along each side.
+PLACES = 96
+# Smaller gaps than this are of the voxels [ml].
+LEAST_GAP_ML = 0.05
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A coherent part of a target that was not seen: how large, where its middle is (3,) [mm], and how thick at most."""
+
+    volume_ml: float
+    centre_mm: np.ndarray
+    thickness_mm: float
+
+
+class Coverage:
+    """``seen`` (nx, ny, nz): voxels of the resting organ and around it that were in the picture; ``targets`` the same for each target.
+
+    ``organ`` and ``tumour`` are closed surfaces at rest [mm]; ``margin_mm`` is how much of the organ around the tumour must be seen.
+    """
+
+    def __init__(
+        self, organ: trimesh.Trimesh, tumour: trimesh.Trimesh | None = None, margin_mm: float = 5.0
+    ) -> None:
+        self.distance, self.low_mm = distance_grid(organ.vertices, organ.faces, VOXEL_MM, REACH_MM)
+        self.targets = {"organ": self.distance < 0}
+        if tumour is not None:
+            around = self._around(tumour, margin_mm)
+            self.targets["tumour"] = around < 0
+            self.targets["margin"] = (around < margin_mm) & ((self.distance < 0) | (around < 0))
+        self.seen = np.zeros(self.distance.shape, bool)
+
+    def _around(self, tumour: trimesh.Trimesh, margin_mm: float) -> np.ndarray:
+        """Signed distances [mm] of the voxels near a tumour, and far ones of all others."""
+        around = np.full(self.distance.shape, np.inf)
+        low, high = self._indices(tumour.bounds + np.array([[-margin_mm], [margin_mm]]))
+        low = np.maximum(np.floor(low).astype(int), 0)
+        high = np.minimum(np.ceil(high).astype(int) + 1, self.distance.shape)
+        box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        places = self.low_mm + VOXEL_MM * (np.indices(high - low).reshape(3, -1).T + low)
+        around[box] = signed_distance(tumour.vertices, tumour.faces, places)[0].reshape(high - low)
+        return around
+
+    def _indices(self, places_mm: np.ndarray) -> np.ndarray:
+        return (places_mm - self.low_mm) / VOXEL_MM
+
+    def forget(self) -> None:
+        """Nothing was seen yet."""
+        self.seen[:] = False
+
+    def look(self, rest_mm: np.ndarray, probe: Probe, gap_mm: float | None) -> np.ndarray:
+        """Add what a picture shows; which of its lines touch.
+
+        ``rest_mm`` (n, n, 3) is where the tissue was at rest at places evenly over the picture (``PlaneInTissue.rest_grid``). Lines
+        whose element is nearer to the organ than ``gap_mm`` touch; without it, all.
+        """
+        lines, in_picture = _lines_of(probe, len(rest_mm))
+        touches = np.ones(probe.number_of_scanlines, bool)
+        if gap_mm is not None:
+            touches = self._distance_at(rest_mm[_elements_of(probe, len(rest_mm))]) <= gap_mm
+        shown = in_picture & touches[lines]
+        for places in _thick(rest_mm, probe.elevation_width_mm):
+            index = np.rint(self._indices(places[shown])).astype(int)
+            inside = ((index >= 0) & (index < self.seen.shape)).all(axis=1)
+            self.seen[tuple(index[inside].T)] = True
+        return touches
+
+    def _distance_at(self, places_mm: np.ndarray) -> np.ndarray:
+        at = self._indices(places_mm).T
+        return map_coordinates(self.distance, at, order=1, mode="constant", cval=np.inf)
+
+    def share(self, target: str) -> float:
+        """How much of a target was seen, 0 to 1; not a number without that target."""
+        mask = self.targets.get(target)
+        return float(self.seen[mask].mean()) if mask is not None and mask.any() else float("nan")
+
+    def gaps(self, target: str) -> list[Gap]:
+        """What of a target was not seen, the largest part first."""
+        missing = self.targets[target] & ~self.seen
+        parts, count = label(missing)
+        thickness = 2 * VOXEL_MM * distance_transform_edt(missing)
+        found = []
+        for part in range(1, count + 1):
+            mask = parts == part
+            volume = float(mask.sum()) * VOXEL_MM**3 / 1000
+            if volume >= LEAST_GAP_ML:
+                centre = self.low_mm + VOXEL_MM * np.argwhere(mask).mean(axis=0)
+                found.append(Gap(volume, centre, float(thickness[mask].max())))
+        return sorted(found, key=lambda gap: -gap.volume_ml)
+
+    def at(self, places_mm: np.ndarray) -> np.ndarray:
+        """Whether the tissue at places (n, 3) at rest was seen."""
+        index = np.clip(np.rint(self._indices(places_mm)).astype(int), 0, np.array(self.seen.shape) - 1)
+        return self.seen[tuple(index.T)]
+
+
+def _lines_of(probe: Probe, places: int) -> tuple[np.ndarray, np.ndarray]:
+    """Which line each place (n, n) of a picture is on, and whether it is in the picture."""
+    width, depth, above = probe.extent_mm
+    share = np.linspace(0.0, 1.0, places)
+    line, along = probe.beam_coordinates(*np.meshgrid(width * (share - 0.5), depth * share - above))
+    nearest, last = np.rint(line).astype(int), probe.number_of_scanlines - 1
+    inside = (nearest >= 0) & (nearest <= last) & (along >= 0) & (along <= probe.depth_mm)
+    return np.clip(nearest, 0, last), inside
+
+
+def _elements_of(probe: Probe, places: int) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of the place of a picture nearest to each element."""
+    width, depth, above = probe.extent_mm
+    share = (probe.elements() + [width / 2, above]) / [width, depth]
+    column, row = np.clip(np.rint(share * (places - 1)).astype(int), 0, places - 1).T
+    return row, column
+
+
+def _thick(rest_mm: np.ndarray, width_mm: float) -> list[np.ndarray]:
+    """The plane's tissue (n, n, 3) [mm] over its thickness, no farther apart than voxels are."""
+    down, across = np.gradient(rest_mm, axis=(0, 1))
+    normal = np.cross(across, down)
+    normal /= np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-9)
+    count = 1 + int(np.ceil(width_mm / VOXEL_MM))
+    return [rest_mm + off * normal for off in np.linspace(-width_mm / 2, width_mm / 2, count)]

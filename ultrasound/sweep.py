@@ -1,0 +1,204 @@
+"""A tracked ultrasound sweep: pictures, and where probe and patient were at each of them (what an IGSIO sequence metafile holds).
+
+A transform is named by what it takes to what, ``ImageToProbe``: a point (x, y, z, 1) of Image times it is the same point of Probe.
+Image is in pixels (column, row, 0) of orientation MF, every other system in mm.
+"""
+
+import re
+import reprlib
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+# As IGSIO has it: the To of a name is followed by what is no small letter, so ToolToTracker has one.
+TRANSFORM_NAME = re.compile(r"(\w+?)To((?![a-z])\w+)")
+TRANSFORM_FIELD = re.compile(r"(\w+?To(?![a-z])\w+)Transform")
+CONFIGURATION_LIMIT = 1 << 22
+# What the column's index grows towards and what the row's does: (un)marked side, far or near. U with F, and M with N, make a
+# left-handed picture, whose own third axis IGSIO has descending; a third letter moves no pixel of a single slice.
+ORIENTATIONS = {each: each for each in ("MF", "MN", "UF", "UN", "FM", "NM", "FU", "NU")}
+ORIENTATIONS |= {f"{each}A": each for each in ORIENTATIONS} | {"UFD": "UF", "MND": "MN"}
+
+
+class SweepError(ValueError):
+    """A sweep that cannot be used; the message is one line."""
+
+
+@dataclass
+class Sweep:
+    """Pictures and poses of one sweep (IGSIO sequence metafile).
+
+    ``images`` is uint8 (n, rows, columns) in orientation MF: columns grow to the marked side, rows away from the face; (n, 0, 0)
+    where there are poses alone. It may be read-only. ``frames`` are each frame's fields and ``fields`` the header's, as their
+    texts and in the file's order. ``constant`` are transforms (4, 4) that hold in all frames, by name (see ``load_constants``).
+
+    Raises SweepError where pictures and frames do not go together.
+    """
+
+    images: np.ndarray
+    frames: list[dict[str, str]]
+    fields: dict[str, str]
+    constant: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.images.dtype != np.uint8 or self.images.ndim != 3 or len(self.images) != len(self.frames):
+            raise SweepError(
+                f"images of {self.images.dtype} {self.images.shape}: expected uint8 ({len(self.frames)}, rows, columns)"
+            )
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def times_s(self) -> np.ndarray:
+        """Time of each frame (n,) [s]; SweepError where a timestamp is missing or no finite number."""
+        return np.array([self._time(frame) for frame in range(len(self))])
+
+    def transform(self, start: str, end: str, frame: int) -> np.ndarray | None:
+        """Matrix (4, 4) from ``start`` to ``end``, as "Image" and "Reference", along the shortest chain of the frame's transforms.
+
+        None where the chain needs one that the tracker did not see, so whose status is not OK. Raises SweepError where no
+        chain joins the two, or where one of it is no affine matrix.
+        """
+        fields = self.frames[frame]
+        tracked = [match[1] for key in fields if (match := TRANSFORM_FIELD.fullmatch(key))]
+        names = [*tracked, *(name for name in self.constant if name not in tracked)]
+        chain = shortest_chain(names, start, end)
+        if chain is None:
+            there = ", ".join(names) or "none"
+            raise SweepError(f"frame {frame}: no chain of transforms from {start} to {end}, of {there}")
+        matrix = np.eye(4)
+        for name, inverted in chain:
+            step = self._tracked(name, frame) if name in tracked else self.constant[name]
+            if step is None:
+                return None
+            matrix = (_inverse(step, f"frame {frame}: {name}") if inverted else step) @ matrix
+        return matrix
+
+    def is_image_ok(self, frame: int) -> bool:
+        """Whether there are pixels, and no status that says they are none."""
+        return self.images[frame].size > 0 and _is_ok(self.frames[frame].get("ImageStatus", "OK"))
+
+    def _time(self, frame: int) -> float:
+        text = self.frames[frame].get("Timestamp", "")
+        try:
+            time_s = float(text)
+        except ValueError:
+            time_s = np.nan
+        if not np.isfinite(time_s):
+            raise SweepError(
+                f"frame {frame}: Timestamp = {reprlib.repr(text)}: expected a finite number of seconds"
+            )
+        return time_s
+
+    def _tracked(self, name: str, frame: int) -> np.ndarray | None:
+        fields = self.frames[frame]
+        # What a tracker did not see still stands in the file, as a matrix that means nothing.
+        if not _is_ok(fields.get(f"{name}TransformStatus", "")):
+            return None
+        return matrix_of(fields[f"{name}Transform"], f"frame {frame}: {name}Transform")
+
+
+def shortest_chain(names: Iterable[str], start: str, end: str) -> list[tuple[str, bool]] | None:
+    """The transforms from ``start`` to ``end``, each with whether it is to be inverted; None where none join them."""
+    steps: dict[str, list[tuple[str, str, bool]]] = {}
+    for name in names:
+        if match := TRANSFORM_NAME.fullmatch(name):
+            a, b = match.groups()
+            steps.setdefault(a, []).append((b, name, False))
+            steps.setdefault(b, []).append((a, name, True))
+    chains: dict[str, list[tuple[str, bool]]] = {start: []}
+    front = deque([start])
+    while front and end not in chains:
+        here = front.popleft()
+        for there, name, inverted in steps.get(here, []):
+            if there not in chains:
+                chains[there] = [*chains[here], (name, inverted)]
+                front.append(there)
+    return chains.get(end)
+
+
+def turned(images: np.ndarray, orientation: str) -> np.ndarray:
+    """Images (n, rows, columns) of one of the ORIENTATIONS in MF."""
+    column, row = tuple(ORIENTATIONS[orientation])
+    if column in "FN":
+        images, column, row = images.transpose(0, 2, 1), row, column
+    return np.ascontiguousarray(images[:, :: -1 if row == "N" else 1, :: -1 if column == "U" else 1])
+
+
+def load_constants(path: Path) -> dict[str, np.ndarray]:
+    """The transforms (4, 4) of a PLUS configuration's CoordinateDefinitions, by name: {"ImageToProbe": ...} [mm, Image in pixels].
+
+    Raises SweepError in one line for a file that cannot be read, that has none, or one of them wrong.
+    """
+    try:
+        return _constants_of(_configuration(path))
+    except SweepError as error:
+        raise SweepError(f"{path.name}: {error}") from error
+
+
+def transform_text(matrix: np.ndarray) -> str:
+    """Sixteen numbers row by row that read back to the same float64; SweepError where it is no affine matrix (4, 4)."""
+    affine = _affine(np.asarray(matrix, float), "a transform", reprlib.repr(np.asarray(matrix).tolist()))
+    # Adding 0 takes the sign of a negative zero, which no tracker means.
+    return " ".join(repr(float(number) + 0.0).removesuffix(".0") for number in affine.flat)
+
+
+def matrix_of(text: str, what: str) -> np.ndarray:
+    """Affine matrix (4, 4) of sixteen numbers row by row; SweepError, which names ``what``, where they are none."""
+    try:
+        numbers = np.array(text.split(), float)
+    except ValueError:
+        numbers = np.empty(0)
+    return _affine(numbers.reshape(4, 4) if numbers.size == 16 else numbers, what, reprlib.repr(text))
+
+
+def _affine(matrix: np.ndarray, what: str, found: str) -> np.ndarray:
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or (matrix[3] != [0, 0, 0, 1]).any():
+        raise SweepError(
+            f"{what} = {found}: expected sixteen finite numbers row by row, the last row 0 0 0 1"
+        )
+    return matrix
+
+
+def _inverse(matrix: np.ndarray, what: str) -> np.ndarray:
+    try:
+        return np.linalg.inv(matrix)
+    except np.linalg.LinAlgError as error:
+        raise SweepError(f"{what} has no inverse") from error
+
+
+def _is_ok(status: str) -> bool:
+    return status.strip().upper() == "OK"
+
+
+def _configuration(path: Path) -> ElementTree.Element:
+    try:
+        with path.open("rb") as file:
+            content = file.read(CONFIGURATION_LIMIT + 1)
+    except OSError as error:
+        raise SweepError(f"{error.strerror}") from error
+    if len(content) > CONFIGURATION_LIMIT:
+        raise SweepError(f"more than {CONFIGURATION_LIMIT >> 20} MB: expected a PLUS configuration")
+    try:
+        return ElementTree.fromstring(content)
+    except (ElementTree.ParseError, LookupError, ValueError) as error:
+        raise SweepError(f"no XML: {error}") from error
+
+
+def _constants_of(configuration: ElementTree.Element) -> dict[str, np.ndarray]:
+    constants: dict[str, np.ndarray] = {}
+    for each in configuration.iterfind("CoordinateDefinitions/Transform"):
+        name = f"{each.get('From', '')}To{each.get('To', '')}"
+        if not TRANSFORM_NAME.fullmatch(name) or name in constants:
+            raise SweepError(
+                f"Transform {reprlib.repr(name)}: expected From and To, each pair once, To with a capital"
+            )
+        constants[name] = matrix_of(each.get("Matrix", ""), f"{name} Matrix")
+    if not constants:
+        raise SweepError("no CoordinateDefinitions with a Transform")
+    return constants

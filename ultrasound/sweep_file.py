@@ -1,0 +1,299 @@
+"""Sweeps as IGSIO sequence metafiles (.igs.mha) of PLUS and 3D Slicer: a MetaImage of frames whose header has their poses and times."""
+
+import os
+import re
+import reprlib
+import secrets
+import shutil
+import tempfile
+import zlib
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from ultrasound.sweep import ORIENTATIONS, TRANSFORM_NAME, Sweep, SweepError, transform_text, turned
+
+HEADER_LIMIT = 64 << 20
+PIXEL_LIMIT = (1 << 32) - 1  # PLUS counts a sweep's bytes in 32 bits.
+FRAME_FIELD = re.compile(r"Seq_Frame([0-9]{4,9})_(.+)", re.DOTALL)
+# What a sweep with pixels must have; what is not required is the first of these where it is missing.
+PIXEL_FORMAT = {
+    "NDims": ("3",),
+    "Kinds": ("domain domain list", "domain domain time"),
+    "ElementType": ("MET_UCHAR",),
+    "ElementNumberOfChannels": ("1",),
+    "BinaryData": ("True",),
+    "CompressedData": ("False", "True"),
+    "UltrasoundImageOrientation": tuple(ORIENTATIONS),
+}
+REQUIRED = ("ElementType", "UltrasoundImageOrientation")
+NEW_HEADER = {
+    "ObjectType": "Image",
+    "NDims": "3",
+    "AnatomicalOrientation": "RAI",
+    "BinaryData": "True",
+    "BinaryDataByteOrderMSB": "False",
+    "CenterOfRotation": "0 0 0",
+    "CompressedData": "",
+    "CompressedDataSize": "",
+    "DimSize": "",
+    "Kinds": "domain domain list",
+    "ElementSpacing": "1 1 1",
+    "ElementType": "MET_UCHAR",
+    "Offset": "0 0 0",
+    "TransformMatrix": "1 0 0 0 1 0 0 0 1",
+    "UltrasoundImageOrientation": "MF",
+    "UltrasoundImageType": "BRIGHTNESS",
+}
+NO_PIXELS = {"ElementType": "MET_OTHER", "UltrasoundImageOrientation": "XX", "UltrasoundImageType": "XX"}
+
+
+def read_sweep(path: Path) -> Sweep:
+    """The pictures, turned to MF, and fields of a sequence metafile.
+
+    Raises SweepError in one line, with the file's name, for one that cannot be read, is damaged, or holds what is no B-mode
+    sweep of 8 bits. Times and transforms are only read when the sweep is asked for them.
+    """
+    try:
+        with path.open("rb") as file:
+            return _read(file)
+    except (OSError, SweepError) as error:
+        raise SweepError(f"{path.name}: {error.strerror if isinstance(error, OSError) else error}") from error
+
+
+def write_sweep(path: Path, sweep: Sweep, compress: bool = True) -> None:
+    """Write a sweep; one that was read keeps its header's lines. The same sweep gives the same bytes, and nothing is added.
+
+    Raises SweepError for a sweep that no file can hold, and OSError; then what stood at ``path`` stands there still.
+    """
+    with SweepWriter(path, sweep.fields, compress) as writer:
+        for image, fields in zip(sweep.images, sweep.frames, strict=True):
+            writer.append(image if image.size else None, fields)
+
+
+class SweepWriter:
+    """Writes a sweep frame by frame, of which only the fields stay in memory; ``close`` makes the file, all or nothing.
+
+    ``fields`` come to PLUS's own, or stand for them where they are those of a sweep that was read. As a context manager it
+    closes at the end, and leaves nothing behind after an exception. ``count`` is the number of frames so far.
+    """
+
+    def __init__(self, path: Path, fields: dict[str, str] | None = None, compress: bool = True) -> None:
+        self.path, self.count = path, 0
+        given = fields or {}
+        self._header = dict(given) if "ObjectType" in given else NEW_HEADER | given
+        self._shape: tuple[int, int] | None = None
+        self._lines, self._black_due = bytearray(), 0
+        self._compress = zlib.compressobj() if compress else None
+        # A file without a name goes away by itself, even with a process that is killed.
+        self._pixels = tempfile.TemporaryFile(dir=path.parent)
+
+    def __enter__(self) -> "SweepWriter":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self.close()
+        self._pixels.close()
+
+    def add(
+        self,
+        image: np.ndarray | None,
+        transforms: dict[str, np.ndarray | None],
+        time_s: float,
+        extra: dict[str, str] | None = None,
+    ) -> None:
+        """One frame: image uint8 (rows, columns) in MF, transforms (4, 4) by name ("ProbeToReference"), time [s].
+
+        None for a transform or the image says that it was not seen: its status is INVALID. Raises SweepError as ``append`` does.
+        """
+        fields: dict[str, str] = {}
+        for name, matrix in transforms.items():
+            if not TRANSFORM_NAME.fullmatch(name):
+                raise SweepError(f"transform {reprlib.repr(name)}: expected a name such as ProbeToReference")
+            fields[f"{name}Transform"] = transform_text(np.eye(4) if matrix is None else matrix)
+            fields[f"{name}TransformStatus"] = "INVALID" if matrix is None else "OK"
+        if not np.isfinite(time_s):
+            raise SweepError(f"frame {self.count}: time {time_s}: expected a finite number of seconds")
+        fields["Timestamp"] = repr(float(time_s))
+        fields |= extra or {}
+        fields["ImageStatus"] = "INVALID" if image is None else "OK"
+        self.append(image, fields)
+
+    def append(self, image: np.ndarray | None, fields: dict[str, str]) -> None:
+        """One frame with its fields as texts; a picture that is None is black.
+
+        Raises SweepError where image or texts do not fit into the file, which then goes on without this frame.
+        """
+        shape = self._shape_with(image)
+        lines = b"".join(_line(f"Seq_Frame{self.count:04}_{name}", text) for name, text in fields.items())
+        self._shape, self.count = shape, self.count + 1
+        self._lines += lines
+        if image is None:
+            self._black_due += 1
+        else:
+            self._put_black()
+            self._put(image.tobytes())
+
+    def close(self) -> None:
+        """Put header and pixels together in the file; SweepError where there is no frame. A second time does nothing."""
+        if self._pixels.closed:
+            return
+        with self._pixels:
+            if not self.count:
+                raise SweepError("a sweep without frames")
+            self._put_black()
+            if self._compress and self._shape:
+                self._pixels.write(self._compress.flush())
+            header = b"".join(_line(*each) for each in self._filled_header().items())
+            header += self._lines + b"ElementDataFile = LOCAL\n"
+            if len(header) > HEADER_LIMIT:
+                raise SweepError(f"a header of {len(header)} bytes: at most {HEADER_LIMIT} can be read again")
+            self._put_together(header)
+
+    def _shape_with(self, image: np.ndarray | None) -> tuple[int, int] | None:
+        shape = self._shape
+        if image is not None:
+            shape = shape or image.shape
+            if image.dtype != np.uint8 or image.ndim != 2 or image.size == 0 or image.shape != shape:
+                found, expected = f"{image.dtype} {image.shape}", self._shape or "(rows, columns)"
+                raise SweepError(f"frame {self.count}: image of {found}: expected uint8 {expected}")
+        if shape and (self.count + 1) * shape[0] * shape[1] > PIXEL_LIMIT:
+            raise SweepError(f"frame {self.count}: more than {PIXEL_LIMIT} bytes of pixels")
+        return shape
+
+    def _put_black(self) -> None:
+        """The pictures that are owed, as soon as their size is known."""
+        if self._shape:
+            black = bytes(self._shape[0] * self._shape[1])
+            for _ in range(self._black_due):
+                self._put(black)
+            self._black_due = 0
+
+    def _put(self, pixels: bytes) -> None:
+        self._pixels.write(self._compress.compress(pixels) if self._compress else pixels)
+
+    def _filled_header(self) -> dict[str, str]:
+        rows, columns = self._shape or (0, 0)
+        header = dict(self._header)
+        size = f"{columns} {rows} {self.count}"
+        # A text that says the same stays as it was, with PLUS's spaces.
+        if header.get("DimSize", "").split() != size.split():
+            header["DimSize"] = size
+        if not self._shape:
+            header |= NO_PIXELS
+        elif ORIENTATIONS.get(header.get("UltrasoundImageOrientation", "").strip()) != "MF":
+            header["UltrasoundImageOrientation"] = "MF"
+        if self._compress and self._shape:
+            header["CompressedData"] = "True"
+            header["CompressedDataSize"] = str(self._pixels.tell()).ljust(
+                len(header.get("CompressedDataSize", ""))
+            )
+        else:
+            header["CompressedData"] = "False"
+            header.pop("CompressedDataSize", None)
+        return header
+
+    def _put_together(self, header: bytes) -> None:
+        partial = self.path.with_name(f".{self.path.name}.partial-{secrets.token_hex(4)}")
+        try:
+            with partial.open("xb") as file:
+                file.write(header)
+                self._pixels.seek(0)
+                shutil.copyfileobj(self._pixels, file, 1 << 20)
+            os.replace(partial, self.path)
+        finally:
+            partial.unlink(missing_ok=True)
+
+
+def _line(name: str, text: str) -> bytes:
+    if "=" in name or name != name.strip() or not name or "\n" in name + text:
+        raise SweepError(f"field {reprlib.repr(name + ' = ' + text)}: expected one line, no = in the name")
+    try:
+        return f"{name} = {text}\n".encode("latin-1")
+    except UnicodeEncodeError as error:
+        raise SweepError(f"field {reprlib.repr(name)}: a character beyond Latin-1") from error
+
+
+def _read(file: BinaryIO) -> Sweep:
+    fields, numbered = _read_header(file)
+    columns, rows, count = _dimensions(fields)
+    last = max(numbered, default=-1)
+    if len(numbered) != count or last != count - 1:
+        raise SweepError(f"DimSize has {count} frames, but {len(numbered)} have fields, the last is {last}")
+    frames = [numbered[each] for each in range(count)]
+    if columns * rows == 0:
+        return Sweep(np.empty((count, 0, 0), np.uint8), frames, fields)
+    for name, accepted in PIXEL_FORMAT.items():
+        text = fields.get(name, "" if name in REQUIRED else accepted[0])
+        if " ".join(text.split()) not in accepted:
+            raise SweepError(f"{name} = {reprlib.repr(text)}: expected {' or '.join(accepted)}")
+    orientation = fields["UltrasoundImageOrientation"].strip()
+    pixels = np.frombuffer(_read_pixels(file, fields, columns * rows * count), np.uint8)
+    if ORIENTATIONS[orientation] != "MF":
+        fields["UltrasoundImageOrientation"] = "MF"
+    return Sweep(turned(pixels.reshape(count, rows, columns), orientation), frames, fields)
+
+
+def _read_header(file: BinaryIO) -> tuple[dict[str, str], dict[int, dict[str, str]]]:
+    """The header's own fields, and each frame's by its number; the file then stands at the pixels."""
+    fields: dict[str, str] = {}
+    frames: dict[int, dict[str, str]] = {}
+    while True:
+        name, text = _read_line(file)
+        if not fields and (name, text.strip()) != ("ObjectType", "Image"):
+            raise SweepError(f"starts with {reprlib.repr(name)}: expected ObjectType = Image")
+        if name == "ElementDataFile":
+            if text.strip() != "LOCAL":
+                raise SweepError(f"ElementDataFile = {reprlib.repr(text)}: expected LOCAL")
+            return fields, frames
+        into, key = fields, name
+        if name.startswith("Seq_Frame"):
+            if not (match := FRAME_FIELD.fullmatch(name)):
+                raise SweepError(f"field {reprlib.repr(name)}: expected Seq_Frame0000_Name")
+            into, key = frames.setdefault(int(match[1]), {}), match[2]
+        if key in into:
+            raise SweepError(f"field {reprlib.repr(name)} stands twice")
+        into[key] = text
+
+
+def _read_line(file: BinaryIO) -> tuple[str, str]:
+    start = file.tell()
+    line = file.readline(HEADER_LIMIT - start).decode("latin-1")
+    if not line:
+        raise SweepError(f"no ElementDataFile = LOCAL in the first {start} bytes")
+    name, equals, text = line.removesuffix("\n").partition("=")
+    if not equals or not name.strip():
+        raise SweepError(f"byte {start}: {reprlib.repr(line)}: expected Name = value")
+    return name.strip(), text.removeprefix(" ")
+
+
+def _dimensions(fields: dict[str, str]) -> tuple[int, int, int]:
+    text = fields.get("DimSize", "")
+    if not re.fullmatch(r"\s*[0-9]{1,9}\s+[0-9]{1,9}\s+[0-9]{1,9}\s*", text):
+        raise SweepError(f"DimSize = {reprlib.repr(text)}: expected columns rows frames")
+    columns, rows, count = map(int, text.split())
+    if not count or columns * rows * count > PIXEL_LIMIT:
+        raise SweepError(f"DimSize = {reprlib.repr(text)}: expected 1 frame to {PIXEL_LIMIT} bytes of them")
+    return columns, rows, count
+
+
+def _read_pixels(file: BinaryIO, fields: dict[str, str], size: int) -> bytes:
+    found = os.fstat(file.fileno()).st_size - file.tell()
+    if fields.get("CompressedData", "").strip() != "True":
+        if found != size:
+            raise SweepError(f"{found} bytes of pixels: expected {size}")
+        return file.read(size)
+    text = fields.get("CompressedDataSize", "")
+    # Deflate makes nothing longer by more than five bytes in some thousands.
+    if text.strip() != str(found) or found > size + size // 1000 + 1024:
+        raise SweepError(f"CompressedDataSize = {reprlib.repr(text)}, but {found} bytes are there for {size}")
+    decoder = zlib.decompressobj()
+    try:
+        pixels = decoder.decompress(file.read(found), size + 1)
+    except zlib.error as error:
+        raise SweepError(f"the pixels are no zlib data: {error}") from error
+    if len(pixels) != size or not decoder.eof or decoder.unused_data:
+        raise SweepError(f"{len(pixels)} bytes of pixels or more in the zlib data: expected {size}")
+    return pixels
