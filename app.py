@@ -13,6 +13,7 @@ from sim.sampling import SamplingError
 from studies.beam.command import beam
 from studies.case import CaseError
 from studies.commands import calibrate, validate
+from studies.freehand.command import reconstruct
 from studies.reference.command import reference
 from studies.rehearse.command import rehearse
 from studies.scan.command import scan
@@ -47,7 +48,17 @@ def cli() -> None:
     """
 
 
-for command in (rehearse, import_patient_command, scan, validate, calibrate, beam, reference, study):
+for command in (
+    rehearse,
+    import_patient_command,
+    scan,
+    reconstruct,
+    validate,
+    calibrate,
+    beam,
+    reference,
+    study,
+):
     cli.add_command(command)
 
 

@@ -5,16 +5,10 @@ from typing import Any
 
 import igl
 import numpy as np
-from scipy.spatial import cKDTree
 
 from studies.rehearsal import Rehearsal
 from ultrasound.array import Probe
 from ultrasound.face import face_points, pressing
-
-# The tumour's vertices nearest to the organ's are looked at closely.
-CLOSEST = 40
-# Every so manieth point of the face is asked how far the tumour is.
-EVERY = 7
 
 
 @dataclass(frozen=True)
@@ -60,21 +54,24 @@ def read(rehearsal: Rehearsal, probe: Probe, touches: np.ndarray) -> Reading:
 
 
 def _to_tumour_mm(rehearsal: Rehearsal, probe: Probe, tumour: np.ndarray) -> float:
-    points = face_points(rehearsal.size_mm, probe.radius_mm)[0][::EVERY]
+    points = face_points(rehearsal.size_mm, probe.radius_mm)[0]
     places = points @ rehearsal.pose[:3, :3].T + rehearsal.pose[:3, 3]
-    return float(np.sqrt(_squared_mm2(places, tumour, rehearsal.tumour.faces).min()))  # type: ignore[union-attr]
+    return float(np.sqrt(_nearest(places, tumour, rehearsal.tumour.faces)[0].min()))  # type: ignore[union-attr]
 
 
 def _depth_mm(tumour: np.ndarray, organ: np.ndarray, faces: np.ndarray) -> float:
     """How far the nearest vertex of a tumour is under the organ's surface."""
-    near = np.argsort(cKDTree(organ).query(tumour)[0])[:CLOSEST]
-    return float(np.sqrt(_squared_mm2(tumour[near], organ, faces).min()))
+    squared, face, near = _nearest(tumour, organ, faces)
+    a, b, c = np.moveaxis(organ[faces[face]], 1, 0)
+    outside = np.einsum("ij,ij->i", tumour - near, np.cross(b - a, c - a)) > 0
+    return float(np.sqrt(np.where(outside, 0.0, squared).min()))
 
 
-def _squared_mm2(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def _nearest(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Of points (n, 3): squared distances to a surface, the nearest faces and the points on them."""
     return igl.point_mesh_squared_distance(
         np.ascontiguousarray(points), np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64)
-    )[0]
+    )
 
 
 def _in_picture(outline_mm: np.ndarray, probe: Probe, touches: np.ndarray) -> dict[str, Any]:
@@ -86,5 +83,5 @@ def _in_picture(outline_mm: np.ndarray, probe: Probe, touches: np.ndarray) -> di
     last = probe.number_of_scanlines - 1
     aside = np.minimum(line + 0.5, last + 0.5 - line) * probe.line_spacing_mm(np.maximum(depth, 0.0))
     margin = np.minimum(aside, probe.depth_mm - depth)
-    shown = (margin >= 0) & touches[np.clip(np.rint(line).astype(int), 0, last)]
+    shown = (margin >= 0) & (depth >= 0) & touches[np.clip(np.rint(line).astype(int), 0, last)]
     return dict(in_view=float(length[shown].sum() / length.sum()), margin_mm=float(margin.min()))

@@ -23,6 +23,7 @@ from studies.setup import probe_of, setup_of_scene
 from studies.trade.front import expected_error_mm, load_points
 from ultrasound.array import Mode, Probe, Rung
 from ultrasound.outline import section
+from ultrasound.plane import ImagePlane
 from ultrasound.probe import (
     Grip,
     Hand,
@@ -222,8 +223,11 @@ class Rehearsal:
         """What the scanner shows now, by name (``Scanner.look``); black in a scene without a CT."""
         if self.scanner is None:
             return {"no CT": np.zeros((self.scene.image.pixels, self.scene.image.pixels), np.uint8)}
-        plane = image_plane(self.pose, self.size_mm[2], *probe.extent_mm)
-        return self.scanner.look(plane, probe, mode, rung, window_hu, level_hu)
+        return self.scanner.look(self.image_plane(probe), probe, mode, rung, window_hu, level_hu)
+
+    def image_plane(self, probe: Probe | None = None) -> ImagePlane:
+        """The plane that the transducer shows now, as far as its probe, or another set like it, sees."""
+        return image_plane(self.pose, self.size_mm[2], *(probe or self.probe).extent_mm)
 
     def rest_grid(self) -> np.ndarray | None:
         """Where the tissue of the picture taken last was at rest, evenly over it, (n, n, 3) [mm]; None without a CT."""
@@ -236,7 +240,7 @@ class Rehearsal:
         """
         if self.tumour is None:
             return None
-        plane = image_plane(self.pose, self.size_mm[2], 1.0, 1.0)
+        plane = self.image_plane()
         vertices = np.asarray(self.tumour.vertices) if at_rest else self.tumour_vertices()
         return section(vertices, self.tumour.faces, np.linalg.inv(plane.world_from_plane))
 

@@ -3,6 +3,7 @@
 import click
 
 from studies.features.command import features
+from studies.freehand.study_command import freehand
 from studies.intake.command import intake
 from studies.soak.command import soak
 from studies.stability.command import stability
@@ -21,3 +22,4 @@ study.add_command(trade)
 study.add_command(stability)
 study.add_command(soak)
 study.add_command(intake)
+study.add_command(freehand)

@@ -13,7 +13,6 @@ from scenes.anatomy import load_surface, phantom_folder
 from scenes.scene import EMBEDDED
 from studies.scan.poses import PoseError, load_poses
 from ultrasound.array import load_probe
-from ultrasound.plane import image_to_probe
 
 
 def pose_on_tumour() -> np.ndarray:
@@ -78,8 +77,9 @@ def test_a_table_with_another_number_of_columns_is_refused(tmp_path):
 
 
 def test_a_pixel_is_where_its_matrix_says():
-    width, depth, above = load_probe("curvilinear").extent_mm
-    matrix = image_to_probe((depth / 300, width / 400), width, above)
+    probe = load_probe("curvilinear")
+    width, depth, above = probe.extent_mm
+    matrix = probe.image_to_probe(300, 400)
     # The middle of the last row is the deepest place of the middle line; the first pixel's corner lies behind the face.
     assert matrix @ [199.5, 299.5, 0, 1] == pytest.approx([0.0, depth - above, 0, 1])
     assert matrix @ [-0.5, -0.5, 0, 1] == pytest.approx([-width / 2, -above, 0, 1])

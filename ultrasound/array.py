@@ -126,6 +126,16 @@ class Probe(BaseModel):
         above = self.radius_mm * (1 - np.cos(max(right, -left)))
         return float(2 * half), float(self.depth_mm + above), float(above)
 
+    def image_to_probe(self, rows: int, columns: int) -> np.ndarray:
+        """The matrix (4, 4) that takes pixels (column, row, 0) of its picture, counted from the first one's centre, to its axes [mm].
+
+        The probe's axes are PLUS's: the origin in the middle of the array's face, x to the marked side, y away into the tissue.
+        """
+        width, depth, above = self.extent_mm
+        matrix = np.diag([width / columns, depth / rows, 1.0, 1.0])
+        matrix[:2, 3] = width / columns / 2 - width / 2, depth / rows / 2 - above
+        return matrix
+
     def line_angles(self) -> np.ndarray:
         """Angle of each scanline from straight down [rad], shape (lines,)."""
         start, stop = np.radians([self.theta_start_deg, self.theta_stop_deg])

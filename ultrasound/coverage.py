@@ -3,7 +3,10 @@
 A place counts as seen where the picture's lines went through it from elements that touched the organ. Shadows are not asked for.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
 
 import numpy as np
 import trimesh
@@ -17,6 +20,8 @@ VOXEL_MM = 1.5
 REACH_MM = 6.0
 # Places of a picture that are asked where they were at rest, along each side.
 PLACES = 96
+# To so much of its length at rest tissue may be squeezed and still leave no voxel between two places.
+SQUEEZED = 0.7
 # Smaller gaps than this are of the voxels [ml].
 LEAST_GAP_ML = 0.05
 
@@ -71,15 +76,21 @@ class Coverage:
         ``rest_mm`` (n, n, 3) is where the tissue was at rest at places evenly over the picture (``PlaneInTissue.rest_grid``). Lines
         whose element is nearer to the organ than ``gap_mm`` touch; without it, all.
         """
-        lines, in_picture = _lines_of(probe, len(rest_mm))
+        count = len(rest_mm)
+        lines, in_picture = _lines_of(probe, count)
         touches = np.ones(probe.number_of_scanlines, bool)
         if gap_mm is not None:
-            touches = self._distance_at(rest_mm[_elements_of(probe, len(rest_mm))]) <= gap_mm
-        shown = in_picture & touches[lines]
-        for places in _thick(rest_mm, probe.elevation_width_mm):
-            index = np.rint(self._indices(places[shown])).astype(int)
-            inside = ((index >= 0) & (index < self.seen.shape)).all(axis=1)
-            self.seen[tuple(index[inside].T)] = True
+            touches = self._distance_at(rest_mm[_elements_of(probe, count)]) <= gap_mm
+        shown = np.flatnonzero(in_picture & touches[lines])
+        # One axis after the other, in voxels.
+        at = ((rest_mm.reshape(-1, 3) - self.low_mm) / VOXEL_MM).astype(np.float32).T.copy()
+        near = np.ones(len(shown), bool)
+        for along, last in zip(at, np.array(self.seen.shape) - 1, strict=True):
+            near &= np.abs(along[shown] - last / 2) < (last + 1) / 2 + probe.elevation_width_mm / VOXEL_MM
+        for part in _parts(at, shown[near], probe, count):
+            index = np.rint(part).astype(np.int32)
+            x, y, z = index[:, _within(index, self.seen.shape)]
+            self.seen[x, y, z] = True
         return touches
 
     def _distance_at(self, places_mm: np.ndarray) -> np.ndarray:
@@ -111,6 +122,7 @@ class Coverage:
         return self.seen[tuple(index.T)]
 
 
+@lru_cache(maxsize=4)
 def _lines_of(probe: Probe, places: int) -> tuple[np.ndarray, np.ndarray]:
     """Which line each place (n, n) of a picture is on, and whether it is in the picture."""
     width, depth, above = probe.extent_mm
@@ -129,10 +141,35 @@ def _elements_of(probe: Probe, places: int) -> tuple[np.ndarray, np.ndarray]:
     return row, column
 
 
-def _thick(rest_mm: np.ndarray, width_mm: float) -> list[np.ndarray]:
-    """The plane's tissue (n, n, 3) [mm] over its thickness, no farther apart than voxels are."""
-    down, across = np.gradient(rest_mm, axis=(0, 1))
-    normal = np.cross(across, down)
-    normal /= np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-9)
-    count = 1 + int(np.ceil(width_mm / VOXEL_MM))
-    return [rest_mm + off * normal for off in np.linspace(-width_mm / 2, width_mm / 2, count)]
+def _within(index: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Which indices (3, n) are of a grid."""
+    x, y, z = index
+    return (x >= 0) & (y >= 0) & (z >= 0) & (x < shape[0]) & (y < shape[1]) & (z < shape[2])
+
+
+def _parts(at: np.ndarray, shown: np.ndarray, probe: Probe, count: int) -> Iterator[np.ndarray]:
+    """Middles (3, n) of the parts of what places of a picture stand for, its thickness too, no larger than voxels are.
+
+    ``at`` (3, count * count) are all places at rest [voxels], ``shown`` those that count.
+    """
+    width, depth, _ = probe.extent_mm
+    row, column = np.divmod(shown, count)
+    first, last = count * np.maximum(row - 1, 0), count * np.minimum(row + 1, count - 1)
+    down = (at[:, last + column] - at[:, first + column]) * (count / (last - first)).astype(np.float32)
+    first, last = np.maximum(column - 1, 0), np.minimum(column + 1, count - 1)
+    across = (at[:, count * row + last] - at[:, count * row + first]) / (last - first).astype(np.float32)
+    normal = np.stack([across[k - 2] * down[k - 1] - across[k - 1] * down[k - 2] for k in range(3)])
+    normal *= probe.elevation_width_mm / VOXEL_MM / np.maximum(np.sqrt((normal**2).sum(axis=0)), 1e-9)
+    spacing = np.array([width, depth]) / (count - 1) / SQUEEZED
+    sizes = [*spacing, probe.elevation_width_mm]
+    middle = at[:, shown]
+    for shares in product(*(_middles(int(np.ceil(size / VOXEL_MM))) for size in sizes)):
+        place = middle
+        for share, along in zip(shares, (across, down, normal), strict=True):
+            place = place + share * along if share else place
+        yield place
+
+
+def _middles(count: int) -> list[float]:
+    """Of so many equal parts of a length of 1 about 0."""
+    return [(k + 0.5) / count - 0.5 for k in range(count)]

@@ -9,6 +9,8 @@ from ultrasound.probe import sagitta
 SPACING_MM = 0.75
 # Nearer to the face than this the surface touches; so far through it contacts let none.
 TOUCH_MM = 0.5
+# Barycentric slack that closes the seams between triangles against rounding.
+SEAM = 1e-9
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ def _weights(corners: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.nd
     second = _cross(to, (c - a)[:, None]) / safe[:, None]
     third = _cross((b - a)[:, None], to) / safe[:, None]
     weights = np.stack([1 - second - third, second, third], axis=-1)
-    return weights, (weights >= 0).all(axis=-1) & (np.abs(twice) >= 1e-12)[:, None]
+    return weights, (weights >= -SEAM).all(axis=-1) & (np.abs(twice) >= 1e-12)[:, None]
 
 
 def _upward(corners: np.ndarray) -> np.ndarray:

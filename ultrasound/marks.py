@@ -1,6 +1,5 @@
 """What each pixel of a picture is: outside, organ or tumour, or a bead in it. The truth beside a sweep."""
 
-from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -8,16 +7,8 @@ import taichi as ti
 import taichi.math as tm
 
 from ultrasound.plane import Picture, PlaneInTissue
+from ultrasound.sweep import Mark
 from ultrasound.volume import Volume
-
-
-class Mark(IntEnum):
-    """Values of a picture of marks; the beads' are FIRST_BEAD and up, in their order."""
-
-    OUTSIDE = 0
-    ORGAN = 1
-    TUMOUR = 2
-    FIRST_BEAD = 10
 
 
 @ti.data_oriented
@@ -63,5 +54,5 @@ class Marks:
                 if ti.static(self.beads > 0):
                     for k in range(self.beads):
                         if (rest - self.bead[k]).norm_sqr() < self.radius_mm**2:
-                            mark = Mark.FIRST_BEAD + k
+                            mark = mark % Mark.BEAD + Mark.BEAD * (k + 1)
             picture[row, column] = ti.cast(mark, ti.u8)

@@ -112,16 +112,5 @@ class PlaneInTissue:
         return self.owner[row, column] < self.embedding.count
 
 
-def image_to_probe(spacing_mm: tuple[float, float], width_mm: float, above_mm: float) -> np.ndarray:
-    """The matrix (4, 4) that takes pixels (column, row, 0), counted from the first one's centre, to the probe's axes [mm].
-
-    ``spacing_mm`` is the distance of rows and that of columns.
-    """
-    row_mm, column_mm = spacing_mm
-    matrix = np.diag([column_mm, row_mm, 1.0, 1.0])
-    matrix[:2, 3] = column_mm / 2 - width_mm / 2, row_mm / 2 - above_mm
-    return matrix
-
-
 def _matrix(values: np.ndarray) -> ti.Matrix:
     return ti.Matrix(np.asarray(values, float).tolist())

@@ -40,10 +40,19 @@ def image_plane(
     pose: np.ndarray, length_mm: float, width_mm: float, depth_mm: float, above_mm: float = 0.0
 ) -> ImagePlane:
     """The plane under the transducer's face: x to the marked side, y down into the tissue, origin at the face."""
-    plane_in_transducer = np.array(
+    return ImagePlane(pose @ _face(length_mm), width_mm, depth_mm, above_mm)
+
+
+def held_at(world_from_plane: np.ndarray, length_mm: float) -> np.ndarray:
+    """The pose of a transducer whose image plane (4, 4) is there: PLUS's axes of a probe are the plane's."""
+    return world_from_plane @ np.linalg.inv(_face(length_mm))
+
+
+def _face(length_mm: float) -> np.ndarray:
+    """The image plane's axes in the transducer's."""
+    return np.array(
         [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, -length_mm / 2], [0.0, 0.0, 0.0, 1.0]]
     )
-    return ImagePlane(pose @ plane_in_transducer, width_mm, depth_mm, above_mm)
 
 
 def indentation(pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray, radius_mm: float = 0.0) -> float:

@@ -9,6 +9,7 @@ import reprlib
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from enum import IntEnum
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -22,6 +23,15 @@ CONFIGURATION_LIMIT = 1 << 22
 # left-handed picture, whose own third axis IGSIO has descending; a third letter moves no pixel of a single slice.
 ORIENTATIONS = {each: each for each in ("MF", "MN", "UF", "UN", "FM", "NM", "FU", "NU")}
 ORIENTATIONS |= {f"{each}A": each for each in ORIENTATIONS} | {"UFD": "UF", "MND": "MN"}
+
+
+class Mark(IntEnum):
+    """Pixels of a sweep of marks, the truth beside a sweep of Nephron's. To what it is in, a bead adds its number times BEAD."""
+
+    OUTSIDE = 0
+    ORGAN = 1
+    TUMOUR = 2
+    BEAD = 4
 
 
 class SweepError(ValueError):

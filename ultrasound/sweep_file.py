@@ -15,6 +15,7 @@ import numpy as np
 from ultrasound.sweep import ORIENTATIONS, TRANSFORM_NAME, Sweep, SweepError, transform_text, turned
 
 HEADER_LIMIT = 64 << 20
+FAST = 1  # Of zlib: speckle packs no better with more time, and a sweep is written while it is taken.
 PIXEL_LIMIT = (1 << 32) - 1  # PLUS counts a sweep's bytes in 32 bits.
 FRAME_FIELD = re.compile(r"Seq_Frame([0-9]{4,9})_(.+)", re.DOTALL)
 # What a sweep with pixels must have; what is not required is the first of these where it is missing.
@@ -85,7 +86,7 @@ class SweepWriter:
         self._header = dict(given) if "ObjectType" in given else NEW_HEADER | given
         self._shape: tuple[int, int] | None = None
         self._lines, self._black_due = bytearray(), 0
-        self._compress = zlib.compressobj() if compress else None
+        self._compress = zlib.compressobj(FAST) if compress else None
         # A file without a name goes away by itself, even with a process that is killed.
         self._pixels = tempfile.TemporaryFile(dir=path.parent)
 

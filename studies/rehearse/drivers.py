@@ -37,6 +37,7 @@ class Played:
         self.replay, self._lead = replay, lead
         self.live: Live | None = None
         self._said = ""
+        self._has_warned = False
 
     @property
     def session(self) -> Session:
@@ -60,9 +61,9 @@ class Played:
     def stepped(self, step_ms: float) -> str:
         if self.live is not None:
             return self.live.stepped(step_ms)
-        differed = self.replay.differs_s
         self.replay.stepped()
-        if self.replay.differs_s is not None and differed is None:
+        if self.replay.differs_s is not None and not self._has_warned:
+            self._has_warned = True
             return f"Mind: from {self.replay.differs_s:.0f} s on the tissue is not bit for bit the recorded one's."
         return ""
 

@@ -46,9 +46,13 @@ class Live:
             self._ray = controls.ray
         self.waits = self.waits and not acts(controls, self._ray)
         rehearsal = self.session.rehearsal
+        held = rehearsal.hand.grip
         pose = rehearsal.pose if self.waits else self._steered(controls)
         moves = bool(np.abs(pose - rehearsal.pose).max() > STILL_MM)
+        # What is kept here is gone back to: with the hand as it was before this input.
+        rehearsal.hand.grip, grip = held, rehearsal.hand.grip
         self.history.watch(moves, controls.press)
+        rehearsal.hand.grip = grip
         return pose
 
     def _go_back(self, controls: Controls) -> bool:

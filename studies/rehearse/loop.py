@@ -106,7 +106,7 @@ class Loop:
             self._tell(self.driver.stepped(self.record.step_ms[-1]))
         probe = probe_as_set(self.rehearsal.probe, controls.settings)
         self.instruments.watch(self.driver.session, probe, pose)
-        self.sweeping.watch(self.driver.session.time_s, view, probe)
+        self._say(self.sweeping.watch(self.driver.session.time_s, view, probe))
         self._tell(self.driver.watch())
         frame = Frame(perf_counter(), view, self.rehearsal.rest_grid())
         self.cine.keep(frame)

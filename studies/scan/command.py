@@ -15,6 +15,8 @@ from studies.scan.poses import load_poses
 from studies.setup import probe_of
 from ultrasound.array import MODES, RUNGS
 
+FRAMES_A_SECOND = 30
+
 
 @click.command()
 @click.argument("scene", type=click.Path(path_type=Path))
@@ -35,6 +37,11 @@ from ultrasound.array import MODES, RUNGS
     help="What lets sound in where it touches the array: anything but gas, as the CT has it, or the organ alone.",
 )
 @click.option("--dicom", is_flag=True, help="Each echo picture as DICOM too.")
+@click.option(
+    "--sweep",
+    is_flag=True,
+    help="All as one tracked sweep too, as PLUS writes them, with the truth beside it.",
+)
 @arch_option
 def scan(
     scene: Path,
@@ -45,6 +52,7 @@ def scan(
     rung: str | None,
     contact: str,
     dicom: bool,
+    sweep: bool,
     arch: str,
 ) -> None:
     """Pictures of SCENE, a scene file or a patient's folder, as it lies in the CT: no body, no window.
@@ -66,19 +74,24 @@ def scan(
     from sim.embedding import Unmoved
     from studies.rehearsal import scanned_anatomy
     from ultrasound.dicom_image import save_dicom
-    from ultrasound.plane import ImagePlane, image_to_probe
+    from ultrasound.marked_sweep import MarkedSweep
+    from ultrasound.plane import ImagePlane
     from ultrasound.scanner import ECHO, Scanner
 
     make_folder(out)
     scanned = scanned_anatomy(anatomy.organ, anatomy.ct, anatomy, np.zeros(3))
     scanner = Scanner(scanned, Unmoved(), held, image.pixels, "background", contact, image.contact_gap_mm)
     width, depth, above = held.extent_mm
+    swept = MarkedSweep(out, "sweep") if sweep else None
     rows, ms = [], []
     for name, pose in tqdm(placed.items(), desc="scan", unit="pose"):
         began = perf_counter()
         plane = ImagePlane(pose, width, depth, above)
         shown = scanner.look(plane, held, image.mode, image.rung, image.window_hu, image.level_hu)
         ms.append(1000 * (perf_counter() - began))
+        if swept is not None:
+            grey = next(iter(shown.values()))
+            swept.add(grey, scanner.marks.render(), held, pose, swept.count / FRAMES_A_SECOND)
         for kind, grey in shown.items():
             square = in_proportion(grey, width, depth)
             file = out / f"{name}-{kind.lower()}.png"
@@ -94,7 +107,7 @@ def scan(
                     row_mm=spacing[0],
                     column_mm=spacing[1],
                     probe_to_patient=pose.tolist(),
-                    image_to_probe=image_to_probe(spacing, width, above).tolist(),
+                    image_to_probe=held.image_to_probe(square.height, square.width).tolist(),
                 )
             )
     report = dict(
@@ -105,6 +118,8 @@ def scan(
         arch=used,
         pictures=rows,
     )
+    if swept is not None:
+        swept.close()
     (out / "scan.json").write_text(json.dumps(report, indent=2) + "\n", "utf-8")
     click.echo(
         f"Wrote {len(rows)} pictures of {len(placed)} poses and scan.json to {out}; {np.median(ms):.1f} ms a pose (median)."

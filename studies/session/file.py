@@ -152,7 +152,11 @@ class Recording:
         self._write(End(summary=summary, state=state))
         self._disk.shutdown()
         self._look()
-        self._file.close()
+        try:
+            self._file.close()
+        except OSError as error:
+            # What a full disk did not take is tried once more.
+            self._fail(error)
 
     def _write(self, line: BaseModel) -> None:
         self._look()
@@ -166,7 +170,11 @@ class Recording:
 
     def _look(self) -> None:
         error = self._written.exception() if self._written is not None else None
-        if error is not None and not self.fault:
+        if error is not None:
+            self._fail(error)
+
+    def _fail(self, error: BaseException) -> None:
+        if not self.fault:
             self.fault = f"{self.path.name}: no longer written ({getattr(error, 'strerror', None) or error})"
 
 
@@ -178,10 +186,10 @@ def read_log(path: Path) -> Log:
             raise SessionError(
                 f"{name}: is larger than any session; expected a file that rehearse has written"
             )
-        lines = path.read_text("utf-8").split("\n")
+        lines = path.read_bytes().split(b"\n")
     except FileNotFoundError:
         raise SessionError(f"{path}: no such session file") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise SessionError(f"{name}: cannot be read as a session ({str(error).splitlines()[0]})") from None
     header = _header(name, lines[0])
     log = Log(header, np.zeros((0, 4, 4)))
@@ -199,14 +207,14 @@ def read_log(path: Path) -> Log:
     return log
 
 
-def _header(name: str, line: str) -> Header:
+def _header(name: str, line: bytes) -> Header:
     try:
         values = json.loads(line)
         version = values.get("nephron_session", VERSION) if isinstance(values, dict) else None
         if version != VERSION:
             raise SessionError(f"{name}: not a session, or of another version; expected nephron_session = 1")
         return Header.model_validate(values)
-    except (ValueError, ValidationError) as error:
+    except (ValueError, RecursionError) as error:
         if isinstance(error, SessionError):
             raise
         raise SessionError(
@@ -214,11 +222,11 @@ def _header(name: str, line: str) -> Header:
         ) from None
 
 
-def _line_of(name: str, number: int, line: str) -> Second | End:
+def _line_of(name: str, number: int, line: bytes) -> Second | End:
     try:
         values = json.loads(line)
         return End.model_validate(values) if "summary" in values else Second.model_validate(values)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         what = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
         raise SessionError(
             f"{name}: line {number} is damaged ({what}); what comes before it can be had by deleting from it on"

@@ -35,8 +35,7 @@ class History:
         self._began_s = self.session.time_s
         self._before.append(self.session.keep())
         self.undone.clear()
-        needed = {*self._before, *self.bookmarks}
-        self.session.forget(needed.__contains__)
+        self._forget()
 
     def undo(self) -> bool:
         """Go to before the last action; whether there was one."""
@@ -78,3 +77,8 @@ class History:
     def _go(self, moment: int) -> None:
         self.session.go_back(moment)
         self._acted_s = -LONGEST_S
+        self._forget()
+
+    def _forget(self) -> None:
+        needed = {*self._before, *self.undone, *self.bookmarks}
+        self.session.forget(needed.__contains__)

@@ -28,6 +28,8 @@ class Replay:
         ]
         if not all(isinstance(to, int) and SETTLED <= to <= moment for moment, to in backs):
             raise SessionError("the session goes back to a moment that had not been: its file is damaged")
+        if {moment for moment, _ in backs} != set(np.flatnonzero(np.isnan(log.poses).any(axis=(1, 2)))):
+            raise SessionError("the session has a moment without a pose: its file is damaged")
         self._backs = backs
         if log.header.begins is not None:
             rehearsal.restore(self._state(log.header.begins))

@@ -2,7 +2,9 @@
 
 import base64
 import io
+import struct
 import zipfile
+import zlib
 from dataclasses import asdict
 from typing import Any
 
@@ -14,9 +16,14 @@ from sim.solver import SolverState
 from studies.rehearsal import RehearsalState
 from ultrasound.probe import Grip
 
-NUMBERS = ("steps", "steps_since_good", "steps_tangled", "is_restored")
-# Of one array: a body of a million particles has less.
+# Of all arrays: a body of a million particles has less.
 MOST_BYTES = 1 << 30
+
+# What NumPy and zipfile raise for what they cannot read.
+UNREADABLE = (
+    *(ValueError, LookupError, TypeError, RuntimeError, OSError, EOFError, MemoryError),
+    *(zipfile.BadZipFile, zlib.error, struct.error),
+)
 
 
 class StateError(ValueError):
@@ -50,11 +57,20 @@ def from_text(text: str, like: RehearsalState) -> RehearsalState:
         watch = Watch(_solver(arrays, "good", like.solver), since_good, tangled, bool(restored))
         turn = tuple(map(float, arrays["grip.turn_deg"].reshape(3)))
         depth, pressed = float(arrays["grip.depth_mm"]), float(arrays["grip.pressed_mm"])
-        grip = Grip(depth, pressed, turn, arrays.get("grip.aim"))  # type: ignore[arg-type]
-        pose = arrays["pose"].reshape(4, 4)
-    except (ValueError, KeyError, zipfile.BadZipFile, OSError, EOFError) as error:
-        raise StateError(f"a state that cannot be used ({str(error).splitlines()[0]})") from None
+        aim = _pose(arrays, "grip.aim") if "grip.aim" in arrays else None
+        grip = Grip(depth, pressed, turn, aim)  # type: ignore[arg-type]
+        pose = _pose(arrays, "pose")
+    except UNREADABLE as error:
+        what = str(error) or type(error).__name__
+        raise StateError(f"a state that cannot be used ({what.splitlines()[0]})") from None
     return RehearsalState(now, watch, pose, steps, grip)
+
+
+def _pose(arrays: dict[str, np.ndarray], name: str) -> np.ndarray:
+    pose = arrays[name]
+    if pose.shape != (4, 4) or pose.dtype != float or not np.isfinite(pose).all():
+        raise StateError(f"{name} is no pose")
+    return pose
 
 
 def _of_solver(name: str, state: SolverState) -> dict[str, np.ndarray]:

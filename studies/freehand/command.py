@@ -1,0 +1,195 @@
+"""The command ``reconstruct``: a tracked sweep made into a volume, and compared with the patient."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from tqdm import tqdm
+
+from scenes.anatomy import LoadedAnatomy, load_anatomy
+from scenes.scene import Scene, load_scene
+from studies.commands import Fault, arch_option, make_folder, start_taichi
+from studies.freehand.files import save_volumes
+from studies.freehand.picture import save_picture
+from studies.freehand.rebuild import Path as SweepPath
+from studies.freehand.rebuild import Places, Rebuilt, lit, path_of, rebuild
+from studies.setup import probe_of
+from ultrasound.marked_sweep import marks_beside
+from ultrasound.reconstruction import METHODS
+from ultrasound.sweep import Sweep, load_constants
+from ultrasound.sweep_file import read_sweep
+
+MOST_REACH_MM = 5.0
+
+
+@click.command()
+@click.argument("sweep", type=click.Path(path_type=Path))
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, help="Folder for the volume and the report."
+)
+@click.option(
+    "--scene",
+    type=click.Path(path_type=Path),
+    help="Scene or patient's folder that the sweep is of: compare with it.",
+)
+@click.option(
+    "--config",
+    type=click.Path(path_type=Path),
+    help="PLUS configuration (XML) with ImageToProbe, where the sweep has none.",
+)
+@click.option(
+    "--reference",
+    default="Reference",
+    show_default=True,
+    help="Coordinate system of the volume, as PLUS names it.",
+)
+@click.option(
+    "--method",
+    type=click.Choice(METHODS),
+    default="smooth",
+    show_default=True,
+    help="How pixels become voxels.",
+)
+@click.option(
+    "--spacing-mm", type=click.FloatRange(0.05, 10), default=0.5, show_default=True, help="Width of a voxel."
+)
+@click.option(
+    "--reach-mm",
+    type=click.FloatRange(0, 20),
+    help="Gaps up to twice as wide are filled [as wide as most pictures are apart].",
+)
+@click.option(
+    "--undo-compression",
+    is_flag=True,
+    help="Press the scene's organ once more on the tracked way, and put each pixel where its tissue was at rest.",
+)
+@arch_option
+def reconstruct(
+    sweep: Path,
+    out: Path,
+    scene: Path | None,
+    config: Path | None,
+    reference: str,
+    method: str,
+    spacing_mm: float,
+    reach_mm: float | None,
+    undo_compression: bool,
+    arch: str,
+) -> None:
+    """Make a volume of SWEEP, a tracked sweep (.igs.mha) of Nephron's or of PLUS.
+
+    Writes volume.nrrd, volume.png and report.json; beside a sweep of marks (SWEEP-marks.igs.mha, which a rehearsal records) the
+    organ and tumour as they were seen, in labels.nrrd.
+    """
+    if undo_compression and scene is None:
+        raise Fault("--undo-compression: presses the organ of a scene; name it with --scene")
+    pictures = read_sweep(sweep)
+    pictures.constant |= load_constants(config) if config else {}
+    marks = marks_beside(sweep)
+    path = path_of(pictures, reference)
+    patient = _patient(scene)
+    make_folder(out)
+    if reach_mm is None:
+        reach_mm = usual_reach_mm(path, spacing_mm)
+    places = None
+    if undo_compression and patient is not None:
+        places = _unsqueezed(patient, pictures, path, reference, arch)
+    with tqdm(total=len(path.frames), desc="reconstruct", unit="picture") as bar:
+        try:
+            rebuilt = rebuild(
+                pictures, path, lit(pictures.images), spacing_mm, method, reach_mm, marks, places, bar.update
+            )
+        except ValueError as error:
+            raise Fault(f"{sweep.name}: {error}") from None
+    report = dict(
+        method=method,
+        spacing_mm=spacing_mm,
+        reach_mm=reach_mm,
+        reference=reference,
+        undo_compression=undo_compression,
+        **_of_path(pictures, path),
+        shape=list(rebuilt.box.shape),
+        agreement=_agreement(rebuilt, patient),
+    )
+    save_volumes(rebuilt, out)
+    save_picture(rebuilt, out / "volume.png")
+    (out / "report.json").write_text(json.dumps(report, indent=2) + "\n", "utf-8")
+    click.echo(in_words(report))
+    click.echo(f"Wrote volume.nrrd, volume.png and report.json to {out}")
+
+
+def usual_reach_mm(path: SweepPath, spacing_mm: float) -> float:
+    """So far that most gaps between pictures close, and two voxels at least [mm]."""
+    usual = float(np.percentile(path.steps_mm, 95)) if len(path.frames) > 1 else 0.0
+    return max(2 * spacing_mm, min(usual, MOST_REACH_MM))
+
+
+def _patient(scene: Path | None) -> tuple[Scene, LoadedAnatomy, Path] | None:
+    if scene is None:
+        return None
+    path = scene / "scene.toml" if scene.is_dir() else scene
+    loaded = load_scene(path)
+    return loaded, load_anatomy(loaded, path.parent), path.parent
+
+
+def _unsqueezed(
+    patient: tuple[Scene, LoadedAnatomy, Path], pictures: Sweep, path: SweepPath, reference: str, arch: str
+) -> Places:
+    scene, anatomy, folder = patient
+    start_taichi(arch)
+    from studies.freehand.unsqueeze import Unsqueezed
+    from studies.rehearsal import Rehearsal
+
+    click.echo("Building the model.")
+    rehearsal = Rehearsal(scene, anatomy, probe_of(scene, folder))
+    return Unsqueezed(rehearsal, pictures, path, reference)
+
+
+def _of_path(pictures: Sweep, path: SweepPath) -> dict[str, Any]:
+    """How many pictures there are, how far apart and how fast the probe went."""
+    steps = path.steps_mm
+    waits = np.diff(pictures.times_s[path.frames])
+    speed = steps[waits > 0] / waits[waits > 0]
+    return dict(
+        frames=len(pictures),
+        used=len(path.frames),
+        way_mm=round(float(steps.sum()), 3),
+        between_median_mm=round(float(np.median(steps)), 4) if len(steps) else 0.0,
+        between_max_mm=round(float(steps.max()), 4) if len(steps) else 0.0,
+        speed_median_mm_s=round(float(np.median(speed)), 3) if len(speed) else 0.0,
+        speed_max_mm_s=round(float(speed.max()), 3) if len(speed) else 0.0,
+    )
+
+
+def _agreement(rebuilt: Rebuilt, patient: tuple[Scene, LoadedAnatomy, Path] | None) -> dict[str, Any]:
+    if patient is None or not rebuilt.regions:
+        return {}
+    from studies.freehand.compare import compared
+
+    anatomy = patient[1]
+    surfaces = {"organ": anatomy.organ} | ({"tumour": anatomy.tumour} if anatomy.tumour is not None else {})
+    return compared(rebuilt, surfaces)
+
+
+def in_words(report: dict[str, Any]) -> str:
+    """The figures that matter, in a few lines for the terminal."""
+    lines = [
+        f"pictures  {report['used']} of {report['frames']} with a pose, {report['between_median_mm']:.2f} mm apart (median; at most "
+        f"{report['between_max_mm']:.2f}), {report['speed_median_mm_s']:.0f} mm/s",
+        f"volume    {' x '.join(map(str, report['shape']))} voxels of {report['spacing_mm']:g} mm, {report['method']}"
+        + (", compression undone" if report["undo_compression"] else ""),
+    ]
+    for name, figures in report["agreement"].items():
+        part = figures["scanned_part"]
+        lines.append(
+            f"{name:<9} {100 * figures['scanned']:.0f} % scanned"
+            + (
+                f"; of that Dice {part['dice']:.3f}, HD95 {part['hd95_mm']:.2f} mm, volume {part['volume_percent']:+.1f} %, "
+                f"centroid {part['centroid_mm']:.2f} mm off"
+                if part
+                else ""
+            )
+        )
+    return "\n".join(lines)

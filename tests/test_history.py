@@ -1,0 +1,437 @@
+"""Undo, redo and bookmarks, on a tissue of a few numbers; and what the user's hands make of them."""
+
+import base64
+import hashlib
+import io
+import zipfile
+from contextlib import suppress
+from dataclasses import fields, is_dataclass, replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from render.viewer import Controls, Settings
+from scenes.scene import NeoHookeanTissue
+from sim.body import BodyState
+from sim.guard import Watch
+from sim.solver import SolverState, StepSettings
+from studies.rehearsal import RehearsalState
+from studies.rehearse.live import Live
+from studies.session import state
+from studies.session.history import MOST_UNDONE, History
+from studies.session.session import SETTLED, Session
+from studies.session.state import StateError, from_text, to_text
+from studies.session.summary import Course, in_words
+from studies.trade.ladder import Ladder
+from ultrasound.coverage import Gap
+from ultrasound.probe import Grip, Hand, approached, pose_at, touching
+
+# A power of two, so that times are exact: 4 steps are PAUSE_S, 40 are LONGEST_S.
+STEP_S = 1 / 8
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+class Numbers:
+    """A rehearsal whose tissue is two points, moved by all that a step is told; the hand over it, and its ball, are real."""
+
+    def __init__(self) -> None:
+        self.settings = StepSettings(time_step_s=STEP_S)
+        self.scene = SimpleNamespace(tissue=NeoHookeanTissue())
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=12.0)
+        vertices, faces = np.array(ball.vertices), np.array(ball.faces, np.int64)
+        size = np.array([16.0, 9.0, 6.0])
+        home = touching(pose_at(np.array([0, 0, 12.0]), DOWN, np.eye(3)[0], 6.0), size, vertices)
+        self.hand = Hand(vertices, faces, np.array(ball.vertex_normals), size, home, np.eye(3)[0])
+        self.pose = self.hand.pose()
+        self.young_kpa, self.steps = 15.0, 0
+        self.position = np.arange(6, dtype=np.float32).reshape(2, 3)
+        self.velocity = np.zeros((2, 3), np.float32)
+        self.contacts = {"plane": np.zeros((2, 4), np.float32)}
+        self.watch = Watch(self._solver())
+        self.settled = self.snapshot()
+
+    def _solver(self) -> SolverState:
+        return SolverState(BodyState(self.position, self.velocity), self.contacts)
+
+    def snapshot(self) -> RehearsalState:
+        return RehearsalState(self._solver(), self.watch, self.pose, self.steps, self.hand.grip)
+
+    def restore(self, state: RehearsalState) -> None:
+        self.position, self.velocity = state.solver.body.position, state.solver.body.velocity
+        self.contacts, self.watch = state.solver.contacts, state.watch
+        self.pose, self.steps, self.hand.grip = state.pose, state.steps, state.grip
+
+    def advance(self, pose: np.ndarray) -> None:
+        """Each step turns on what was told, on the contacts, and on what the guard remembers."""
+        told = 1e-3 * self.young_kpa + 1e-2 * self.settings.iterations + 1e-3 * self.settings.gravity[2]
+        drawn = self.contacts["plane"][:, :3] + 0.01 * (self.watch.steps_since_good % 7)
+        self.velocity = (0.9 * self.velocity + told + drawn + 0.01 * pose[:3, 3]).astype(np.float32)
+        self.position = (0.99 * self.position + STEP_S * self.velocity).astype(np.float32)
+        self.contacts = {"plane": np.sin(np.pad(self.position, ((0, 0), (0, 1))))}
+        since = self.watch.steps_since_good + 1
+        self.watch = Watch(self._solver()) if since > 11 else replace(self.watch, steps_since_good=since)
+        self.pose = pose
+        self.steps += 1
+
+    def pose_towards(self, goal: np.ndarray) -> np.ndarray:
+        return approached(self.pose, goal, 150.0 * STEP_S, 180.0 * STEP_S)
+
+    def set_young(self, young_kpa: float) -> None:
+        self.young_kpa = young_kpa
+
+    def set_gravity(self, acceleration_m_s2: float) -> None:
+        self.settings.gravity = (0.0, 0.0, 1000.0 * acceleration_m_s2)
+
+    def update_surfaces(self) -> None: ...
+
+    def digest(self) -> str:
+        return hashlib.sha256(self.position.tobytes() + self.velocity.tobytes()).hexdigest()[:16]
+
+
+class Told:
+    """A recorder that lists what it is told."""
+
+    def __init__(self) -> None:
+        self.notes: list[tuple[str, Any]] = []
+        self.poses: list[np.ndarray | None] = []
+
+    def note(self, kind: str, value: Any) -> None:
+        self.notes.append((kind, value))
+
+    def moment(self, pose: np.ndarray | None) -> None:
+        self.poses.append(pose)
+
+    def of(self, kind: str) -> list[Any]:
+        return [value for each, value in self.notes if each == kind]
+
+
+@pytest.fixture
+def history() -> History:
+    return History(Session(Numbers(), Told()))
+
+
+def go(history: History, steps: int = 1, acting: bool = True, pressing: bool = False) -> str:
+    """So many steps in which the user acts or rests; the digest after them."""
+    for _ in range(steps):
+        history.watch(acting, pressing)
+        history.session.rehearsal.advance(history.session.rehearsal.pose)
+        history.session.stepped()
+    return history.session.rehearsal.digest()
+
+
+def act(history: History) -> str:
+    """An action of its own: some steps after a rest."""
+    go(history, 5, acting=False)
+    return go(history, 3)
+
+
+def begun(history: History) -> list[int]:
+    return sorted(set(history.session.kept) - {SETTLED})
+
+
+def now(history: History) -> str:
+    return history.session.rehearsal.digest()
+
+
+def test_input_after_a_pause_begins_an_action(history):
+    go(history, 1)
+    go(history, 3, acting=False)
+    go(history, 1)  # 0.5 s after the last input: the same action
+    assert begun(history) == [0]
+    go(history, 4, acting=False)
+    go(history, 1)  # 0.625 s
+    assert begun(history) == [0, 9]
+
+
+def test_a_press_begins_an_action_once(history):
+    go(history, 3)
+    go(history, 4, pressing=True)
+    go(history, 2)
+    go(history, 2, pressing=True)
+    assert begun(history) == [0, 3, 9]
+
+
+def test_an_action_lasts_five_seconds_at_most(history):
+    go(history, 41)
+    assert begun(history) == [0]
+    go(history, 41)
+    assert begun(history) == [0, 41]
+
+
+def test_undo_goes_before_the_last_action_and_redo_back(history):
+    states = [now(history), act(history), act(history)]
+    before = go(history, 5, acting=False)
+    last = go(history, 3)
+    assert history.undo() and now(history) == before
+    assert history.undo() and history.undo() and not history.undo()
+    assert history.redo() and history.redo() and history.redo() and not history.redo()
+    assert now(history) == last and len(set(states)) == 3
+
+
+def test_time_goes_on_with_every_way_back(history):
+    act(history)
+    history.undo()
+    history.redo()
+    history.redo()
+    assert history.session.moment == 10 and history.session.time_s == 10 * STEP_S
+    told = history.session.recorder
+    assert [pose is None for pose in told.poses] == [False] * 8 + [True] * 2
+    assert told.of("back") == [5, 8]
+
+
+def test_a_new_action_after_an_undo_clears_redo_and_can_be_undone_itself(history):
+    act(history)
+    history.undo()
+    before = now(history)
+    go(history, 1)  # at once: an undo ends the action
+    assert not history.redo()
+    assert history.undo() and now(history) == before
+
+
+def test_forty_actions_can_be_undone_and_no_more(history):
+    states = []
+    for _ in range(MOST_UNDONE + 3):
+        states.append(go(history, 5, acting=False))
+        go(history, 2)
+    assert MOST_UNDONE == 40 and len(history.session.kept) == 41
+    for before in states[:2:-1]:
+        assert history.undo() and now(history) == before
+    assert not history.undo()
+    assert all(history.redo() for _ in range(40)) and not history.redo()
+
+
+def test_a_reset_can_be_undone(history):
+    settled = now(history)
+    pressed = act(history)
+    history.reset()
+    assert now(history) == settled != pressed
+    assert history.undo() and now(history) == pressed
+
+
+def test_bookmarks_are_gone_to_last_first_then_round(history):
+    assert history.to_bookmark() == 0 and history.session.moment == 0
+    marked = []
+    for number in (1, 2, 3):
+        marked.append(act(history))
+        assert history.set_bookmark() == number
+    left = act(history)
+    for number in (3, 2, 1, 3):
+        assert history.to_bookmark() == number and now(history) == marked[number - 1]
+    for expected in (marked[0], marked[1], marked[2], left):
+        assert history.undo() and now(history) == expected
+    history.set_bookmark()
+    assert history.to_bookmark() == 4
+    assert history.session.recorder.of("bookmark") == [1, 2, 3, 4]
+
+
+def test_a_bookmark_outlives_the_undo_states(history):
+    marked = act(history)
+    history.set_bookmark()
+    for _ in range(MOST_UNDONE + 5):
+        act(history)
+    assert len(history.session.kept) == 1 + 1 + MOST_UNDONE
+    assert history.to_bookmark() == 1 and now(history) == marked
+
+
+def test_undo_and_redo_in_turn_keep_no_more_and_more(history):
+    for _ in range(3):
+        act(history)
+    for _ in range(50):
+        history.undo()
+        history.undo()
+        history.redo()
+        history.redo()
+    # The settled state, three to be undone, and the two that were redone last at most.
+    assert len(history.session.kept) <= 6
+
+
+def live_of(told: Told | None = None) -> Live:
+    return Live(Session(Numbers(), told), Ladder(1e6))
+
+
+def step(live: Live, step_ms: float = 0.0, **did: Any) -> np.ndarray | None:
+    """A moment in which the user did something."""
+    settings = did.pop("settings", None) or Settings(young_kpa=15.0)
+    pose = live.move(Controls(settings, **did))
+    if pose is not None:
+        live.session.rehearsal.advance(pose)
+        live.stepped(step_ms)
+    return pose
+
+
+def ray(x_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    return np.array([x_mm, 0.0, 60.0]), DOWN
+
+
+def pressed_then_undone(at: Any) -> Live:
+    """The mouse went to x = 5 mm, pressed there, and the press was undone."""
+    live = live_of()
+    for _ in range(8):
+        step(live, ray=ray(5.0))
+    for _ in range(5):
+        step(live, ray=ray(5.0), press=True)
+    assert step(live, ray=at, undo=True) is None and live.take_said() == "undo"
+    return live
+
+
+DID = [
+    dict(ray=ray(2.0)),
+    dict(press=True),
+    *({name: 0.5} for name in ("push_mm", "fan_deg", "tilt_deg", "roll_deg")),
+]
+
+
+@pytest.mark.parametrize("did", DID, ids=lambda did: next(iter(did)))
+def test_after_an_undo_the_transducer_stays_until_the_user_acts(did):
+    live = pressed_then_undone(ray(3.0))
+    undone = live.session.rehearsal.pose
+    for _ in range(10):
+        assert np.array_equal(step(live, ray=ray(3.0)), undone)
+    assert not np.array_equal(step(live, **{"ray": ray(3.0)} | did), undone)
+    assert not live.waits
+    step(live, ray=ray(-4.0))
+    assert not np.array_equal(step(live, ray=ray(-4.0)), undone)
+
+
+def test_a_mouse_that_comes_back_into_the_view_is_no_act():
+    live = pressed_then_undone(None)
+    undone = live.session.rehearsal.pose
+    step(live)
+    assert np.array_equal(step(live, ray=ray(3.0)), undone)
+    assert np.array_equal(step(live), undone)
+    assert not np.array_equal(step(live, ray=ray(3.5)), undone)
+
+
+def test_a_way_back_gives_the_hand_as_it_was_before_the_input():
+    live = live_of()
+    for _ in range(8):
+        step(live, ray=ray(5.0))
+    hand = live.session.rehearsal.hand
+    before, pose = hand.grip, live.session.rehearsal.pose
+    step(live, ray=ray(-5.0), fan_deg=7.0, push_mm=0.5, press=True)
+    assert hand.grip.turn_deg == (7.0, 0.0, 0.0)
+    step(live, undo=True)
+    grip = hand.grip
+    assert (grip.depth_mm, grip.pressed_mm, grip.turn_deg) == (0.0, 0.0, (0.0, 0.0, 0.0))
+    assert np.array_equal(grip.aim, before.aim)
+    assert np.array_equal(live.session.rehearsal.pose, pose)
+
+
+def test_the_iterations_that_were_done_are_recorded_not_those_asked_for():
+    told = Told()
+    live = live_of(told)
+    live.ladder.rung = 2
+    step(live, settings=Settings(young_kpa=15.0, iterations=10))
+    assert told.of("solver")[0]["iterations"] == live.session.rehearsal.settings.iterations == 5
+    assert told.of("settings")[0]["iterations"] == 10
+    live.ladder.rung = 3
+    step(live, settings=Settings(young_kpa=15.0, iterations=10))
+    assert told.of("solver")[1:] == [{"iterations": 3}] and len(told.of("settings")) == 1
+    assert live.status == "FASTER, LESS EXACT: 3 of 10 iterations"
+
+
+def test_a_step_that_is_too_slow_is_said_once():
+    live = Live(Session(Numbers()), Ladder(5.0))
+    live.move(Controls(Settings(young_kpa=15.0, iterations=8)))
+    said = [live.stepped(step_ms) for step_ms in [9.0] * 21]
+    assert [text for text in said if text] == ["FASTER, LESS EXACT: 6 of 8 iterations"]
+
+
+def test_only_what_changes_is_told():
+    told = Told()
+    live = live_of(told)
+    settings = Settings(young_kpa=15.0)
+    for young_kpa, gain in ((15.0, 50), (15.0, 50), (30.0, 50), (30.0, 70)):
+        settings.young_kpa, settings.gain_percent = young_kpa, gain
+        step(live, settings=settings)
+    assert told.of("solver")[1:] == [{"young_kpa": 30.0}]
+    assert told.of("settings")[1:] == [{"young_kpa": 30.0}, {"gain_percent": 70}]
+    assert live.session.rehearsal.young_kpa == 30.0
+
+
+def test_a_way_back_to_nowhere_is_said_and_no_moment_is_lost():
+    live, said = live_of(), []
+    for key in ("undo", "redo", "to_bookmark", "bookmark", "to_bookmark"):
+        step(live, **{key: True})
+        said.append(live.take_said())
+    nothing = ["Nothing to undo", "Nothing to redo", "No bookmark: M sets one"]
+    assert said == [*nothing, "Bookmark 1", "Bookmark 1"] and live.take_said() == ""
+    assert live.session.moment == 5 and live.session.rehearsal.steps == 3
+
+
+def arrays_of(state: Any) -> list[np.ndarray]:
+    """All that a state holds, depth first."""
+    if isinstance(state, dict):
+        return [array for _, each in sorted(state.items()) for array in arrays_of(each)]
+    if is_dataclass(state):
+        return [array for each in fields(state) for array in arrays_of(getattr(state, each.name))]
+    return [np.asarray(state)]
+
+
+@pytest.mark.parametrize("aim", [None, np.diag([-0.0, 1 / 3, 5e-324, 1.0])])
+def test_a_state_as_text_keeps_every_bit(aim):
+    numbers = Numbers()
+    for _ in range(15):
+        numbers.advance(numbers.pose_towards(np.eye(4)))
+    numbers.watch = replace(numbers.watch, steps_tangled=3, is_restored=True)
+    numbers.velocity = np.array([[-0.0, 1e-45, np.inf], [np.nan, 1 / 3, -7]], np.float32)
+    numbers.hand.grip = Grip(0.1, 2.3, (1 / 3, -4.0, 5.0), aim)
+    before = numbers.snapshot()
+    pairs = list(zip(arrays_of(before), arrays_of(from_text(to_text(before), numbers.settled)), strict=True))
+    # Now and when last good: position, velocity and contacts; the watch's three; pose, steps; the hand's four.
+    assert len(pairs) == 2 * 3 + 3 + 2 + 4
+    assert all(old.dtype == new.dtype and old.tobytes() == new.tobytes() for old, new in pairs)
+
+
+def packed(**arrays: np.ndarray) -> str:
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return base64.b64encode(file.getvalue()).decode()
+
+
+def test_what_is_no_state_of_this_body_is_refused(monkeypatch):
+    numbers, random = Numbers(), np.random.default_rng(0)
+    text = to_text(numbers.snapshot())
+    whole = base64.b64decode(text)
+    arrays = dict(np.load(io.BytesIO(whole)))
+    hostile = ["", "no state", text[:-40], packed(), packed(**arrays | {"pose": np.full((4, 4), np.nan)})]
+    for name, array in arrays.items():
+        others = np.array(["a"]), np.array([{}]), np.stack([array, array])
+        hostile += [packed(**arrays | {name: other}) for other in others]
+        hostile.append(packed(**{key: values for key, values in arrays.items() if key != name}))
+    huge, npy = io.BytesIO(), io.BytesIO()
+    np.lib.format.write_array_header_1_0(npy, dict(descr="<f8", fortran_order=False, shape=(10**15,)))
+    with zipfile.ZipFile(huge, "w") as members:
+        members.writestr("pose.npy", npy.getvalue())
+    for each in [*hostile, base64.b64encode(huge.getvalue()).decode()]:
+        with pytest.raises(StateError, match=r"^[^\n]+$"):
+            from_text(each, numbers.settled)
+    for _ in range(300):
+        flipped = bytearray(whole)
+        flipped[random.integers(len(whole))] ^= 1 << random.integers(8)
+        with suppress(StateError):
+            assert to_text(from_text(base64.b64encode(flipped).decode(), numbers.settled)) == text
+    monkeypatch.setattr(state, "MOST_BYTES", 500)
+    with pytest.raises(StateError, match="too large"):
+        from_text(text, numbers.settled)
+
+
+def test_a_course_counts_presses_ways_and_time_over_the_limit():
+    course = Course(warning_mm=8.0, step_s=STEP_S)
+    pose = np.eye(4)
+    # Squeezed over 1 mm is a press, until it is less than 0.5 mm.
+    for compression_mm in (0.0, 1.0, 1.1, 0.6, 1.2, 0.5, 0.9, 1.5, 9.0, 8.0, 8.5):
+        course.add(pose, compression_mm)
+    assert (course.presses, course.compression_mm, course.too_deep_s) == (2, 9.0, 2 * STEP_S)
+    assert course.path_mm == course.fastest_mm_s == 0.0
+    for at_mm in ([3.0, 4.0, 0.0], [3.0, 4.0, 1.0], None, [90.0, 0.0, 0.0], [90.0, 0.0, 2.0]):
+        pose[:3, 3] = at_mm or 0.0
+        course.add(None if at_mm is None else pose, 0.0)
+    # 5 mm, 1 mm, a way back, whose leap is no way of the transducer, 2 mm.
+    assert (course.path_mm, course.fastest_mm_s, course.went_back) == (8.0, 5.0 / STEP_S, 1)
+    figures = course.summary({"seen_organ": 0.25, "contact_mm2": 3.0}, [Gap(1.5, np.zeros(3), 2.0)], 4)
+    assert (figures["duration_s"], figures["bookmarks"], figures["seen_organ"]) == (2.0, 4, 0.25)
+    assert "contact_mm2" not in figures and "2 presses" in in_words(figures) and "1.5 ml" in in_words(figures)

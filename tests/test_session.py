@@ -1,0 +1,410 @@
+"""A session recorded, read and replayed: the same bits, whatever became of the file and wherever it is opened."""
+
+import errno
+import io
+from collections.abc import Iterator
+from contextlib import redirect_stderr
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import taichi as ti
+import trimesh
+from test_history import STEP_S, Numbers, ray, step
+
+import app
+from render.viewer import Controls, NullViewer, Settings, View
+from scenes.anatomy import LoadedAnatomy, load_anatomy, phantom_folder
+from scenes.scene import EMBEDDED, Scene, load_scene, with_options
+from sim.device import start
+from studies.models import step_settings
+from studies.rehearsal import Rehearsal
+from studies.rehearse import run
+from studies.rehearse.drivers import Played
+from studies.rehearse.live import Live
+from studies.rehearse.view import settings_of
+from studies.session import recorded
+from studies.session.file import Event, Header, Log, Recording, SessionError, pack, read_log, unpack
+from studies.session.recorded import Recorded, record
+from studies.session.replay import Replay
+from studies.session.scene import scene_of_log
+from studies.session.session import Session
+from studies.setup import probe_of
+from studies.trade.ladder import Ladder
+
+SECOND = round(1 / STEP_S)
+
+
+def header() -> Header:
+    return Header(anatomy="0", scene={}, probe={}, arch="x64", time_step_s=STEP_S)
+
+
+def live_into(path: Path) -> Live:
+    session = Session(Numbers())
+    return Live(session, Ladder(1e6), Recorded(session, Recording(path, header())))
+
+
+def lead(live: Live, moments: int, seed: int) -> str:
+    """A user who does all there is to do, at random; the tissue's digest at the end."""
+    random = np.random.default_rng(seed)
+    settings = Settings(young_kpa=15.0)
+    pressing = False
+    for _ in range(moments):
+        pressing ^= random.random() < 0.1
+        settings.young_kpa = float(random.choice([5.0, 15.0, 1 / 3])) if random.random() < 0.05 else 15.0
+        settings.iterations = int(random.integers(1, 20)) if random.random() < 0.1 else settings.iterations
+        live.ladder.rung = int(random.integers(4))
+        keys = ("undo", "redo", "reset", "bookmark", "to_bookmark")
+        did = {key: bool(random.random() < 0.04) for key in keys}
+        x_mm = float(random.uniform(-8, 8))
+        step(live, settings=settings, ray=ray(x_mm) if random.random() < 0.2 else None, press=pressing, **did)
+        live.watch()
+    return live.session.rehearsal.digest()
+
+
+def written(path: Path, moments: int = 100, seed: int = 0) -> str:
+    live = live_into(path)
+    digest = lead(live, moments, seed)
+    live.recorded.close({"presses": 1})
+    return digest
+
+
+def played(log: Log, at_s: float = 0.0) -> Replay:
+    """A replay opened at a time and played to its end."""
+    replay = Replay(Numbers(), log)
+    replay.open_at(at_s)
+    while not replay.is_over:
+        pose, _ = replay.move()
+        if pose is not None:
+            replay.rehearsal.advance(pose)
+            replay.stepped()
+    return replay
+
+
+@pytest.fixture
+def often(monkeypatch) -> None:
+    """Whole states every two seconds."""
+    monkeypatch.setattr(recorded, "STATE_S", 2.0)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_session_replays_from_its_beginning_and_from_anywhere(often, tmp_path, seed):
+    digest = written(tmp_path / "session", 150, seed)
+    log = read_log(tmp_path / "session")
+    assert len(log.poses) == 150 and len(log.states) == 10 and log.summary == {"presses": 1}
+    assert {event.kind for each in log.events.values() for event in each} >= {"back", "solver", "settings"}
+    for at_s in (0.0, 3.0, 7.6, 9.999, 13.0, 1000.0):
+        replay = played(log, at_s)
+        assert replay.differs_s is None and replay.rehearsal.digest() == digest, at_s
+        assert replay.compared >= 10 - at_s
+    replay = played(replace(log, states={}), 9.0)
+    assert replay.differs_s is None and replay.compared == len(log.digests) == 19
+    assert replay.rehearsal.digest() == digest
+
+
+def marked_then_gone_to(path: Path) -> Log:
+    """A bookmark at moment 5, gone to at moment 30; a whole state after every 8 moments of 48."""
+    live = live_into(path)
+    for moment in range(48):
+        step(live, ray=ray(moment % 7 - 3.0), bookmark=moment == 5, to_bookmark=moment == 30)
+        live.watch()
+    live.recorded.close({})
+    return read_log(path)
+
+
+def test_a_state_that_a_later_way_back_goes_behind_is_not_begun_at(monkeypatch, tmp_path):
+    monkeypatch.setattr(recorded, "STATE_S", 1.0)
+    log = marked_then_gone_to(tmp_path / "session")
+    assert sorted(log.states) == [8, 16, 24, 32, 40, 48]
+    for moment, begun_at in ((5, 0), (25, 0), (30, 0), (31, 0), (32, 32), (47, 40)):
+        began: list[int] = []
+        replay = Replay(Numbers(), log)
+        replay.open_at(moment * STEP_S, began.append)
+        assert began == [begun_at] + [1] * (moment - begun_at) and replay.session.moment == moment
+    assert played(log, 25 * STEP_S).differs_s is None
+
+
+@pytest.mark.parametrize("at_back", [False, True])
+def test_a_digest_that_differs_is_said_with_its_second_once(tmp_path, at_back):
+    live = live_into(tmp_path / "session")
+    for moment in range(50):
+        step(live, reset=at_back and moment == 3 * SECOND - 1)
+        live.watch()
+    live.recorded.close({})
+    log = read_log(tmp_path / "session")
+    for moment in (3 * SECOND, 5 * SECOND):
+        log.digests[moment] = "another"
+    driver, said = Played(Replay(Numbers(), log), lambda: None), []
+    while not driver.replay.is_over:
+        pose = driver.move(Controls(Settings()))
+        if pose is not None:
+            driver.replay.rehearsal.advance(pose)
+            said.append(driver.stepped(0.0))
+    assert driver.replay.differs_s == 3.0
+    assert [text for text in said if text] == [
+        "Mind: from 3 s on the tissue is not bit for bit the recorded one's."
+    ]
+
+
+@pytest.mark.parametrize(
+    ("events", "no_pose"), [([-2], 3), ([4], 3), (["1"], 3), ([None], 3), ([], 3), ([1], 5)]
+)
+def test_a_way_back_to_nowhere_and_a_moment_without_a_pose_are_refused(tmp_path, events, no_pose):
+    written(tmp_path / "session", 20)
+    log = read_log(tmp_path / "session")
+    log.events |= {3: [Event(at=3, kind="back", value=to) for to in events]}
+    log.poses[no_pose] = np.nan
+    with pytest.raises(SessionError, match="damaged"):
+        Replay(Numbers(), log)
+
+
+def test_a_state_of_another_body_is_refused(tmp_path):
+    written(tmp_path / "session", 20)
+    log = read_log(tmp_path / "session")
+    log.header.begins = log.states[20]
+    other = Numbers()
+    other.settled.solver.contacts["plane"] = np.zeros((3, 4), np.float32)
+    with pytest.raises(SessionError, match="another body"):
+        Replay(other, log)
+
+
+def test_poses_keep_every_bit_and_ways_back_are_no_numbers():
+    random = np.random.default_rng(1)
+    poses: list[np.ndarray | None] = [np.vstack([random.normal(size=(3, 4)), np.eye(4)[3]]) for _ in range(9)]
+    poses[2][0] = [-0.0, 5e-324, 1e308, 1 / 3]
+    poses[4] = None
+    back = unpack(pack(poses))
+    assert np.isnan(back[4, :3]).all()
+    assert all(back[i].tobytes() == pose.tobytes() for i, pose in enumerate(poses) if pose is not None)
+
+
+def test_the_file_is_on_the_disk_each_second(tmp_path):
+    live = live_into(tmp_path / "session")
+    for second in range(1, 4):
+        digest = lead(live, SECOND, second)
+        live.recorded.recording._written.result(10)
+        log = read_log(tmp_path / "session")
+        assert len(log.poses) == second * SECOND and log.digests[second * SECOND] == digest
+        assert log.summary is None and log.length_s == second
+    live.recorded.close({})
+
+
+def test_of_a_file_that_a_crash_cut_all_whole_seconds_are_read(tmp_path):
+    written(tmp_path / "session", 41)
+    whole = (tmp_path / "session").read_bytes()
+    ends = [at for at, byte in enumerate(whole, 1) if byte == ord("\n")]
+    assert len(ends) == 8
+    moments = [0, 8, 16, 24, 32, 40, 41, 41]
+    cuts = {*range(ends[4] - 3, len(whole), 7), *ends, *(end - 1 for end in ends[1:])}
+    for cut in cuts:
+        (tmp_path / "session").write_bytes(whole[:cut])
+        log = read_log(tmp_path / "session")
+        assert len(log.poses) == moments[sum(end <= cut for end in ends) - 1]
+        assert (log.summary is None) == (cut < len(whole))
+    # What a disk may leave where the power went: zeros, or anything else.
+    for rest in (bytes(500), b"\xff\xfe\xc3", whole[ends[3] : ends[4] - 1] + b"\xc3"):
+        (tmp_path / "session").write_bytes(whole[: ends[4]] + rest)
+        assert len(read_log(tmp_path / "session").poses) == 32
+    for cut in range(0, ends[0] - 1, 9):
+        (tmp_path / "session").write_bytes(whole[:cut])
+        with pytest.raises(SessionError):
+            read_log(tmp_path / "session")
+
+
+def damaged(line: bytes) -> Iterator[bytes]:
+    yield line[:-20]
+    yield b""
+    yield line.replace(b'"digest"', b'"digits"')
+    yield line.replace(b'"at":8', b'"at":9')
+    yield b'{"at":8,"poses":"","digest":"0"}'
+    yield line.replace(b'"poses":"', b'"poses":"AAAA')
+    for stranger in (b"\xc3", b"\0", b"["):
+        yield line[:10] + stranger + line[11:]
+    yield from (b"3", b"null", b'"summary"', b"[" * 100_000)
+
+
+def test_a_damaged_line_is_named_by_its_number(tmp_path):
+    written(tmp_path / "session", 41)
+    lines = (tmp_path / "session").read_bytes().split(b"\n")
+    for line in damaged(lines[2]):
+        (tmp_path / "session").write_bytes(b"\n".join([*lines[:2], line, *lines[3:]]))
+        with pytest.raises(SessionError, match="^session: line 3 "):
+            read_log(tmp_path / "session")
+    (tmp_path / "session").write_bytes(b"\n".join([*lines[:2], *lines[3:]]))
+    with pytest.raises(SessionError, match="line 3 does not follow"):
+        read_log(tmp_path / "session")
+
+
+def test_what_is_no_session_is_said_so_in_one_line(tmp_path):
+    version_2 = header().model_dump_json().replace('"nephron_session":1', '"nephron_session":2').encode()
+    no_time = header().model_dump_json().replace("0.125", "0").encode()
+    strangers = b"", b"\x89PNG\r\n\x1a\n\0\0", b'{"scene": {}}\n', b"[1, 2]\n", b"[" * 100_000
+    for content in (*strangers, version_2, no_time):
+        (tmp_path / "file").write_bytes(content)
+        with pytest.raises(SessionError, match=r"^file: [^\n]+$"):
+            read_log(tmp_path / "file")
+    for path in (tmp_path / "none", tmp_path):
+        with pytest.raises(SessionError):
+            read_log(path)
+
+
+class FullDisk(io.RawIOBase):
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_full_disk_leaves_the_rehearsal_going_and_is_said_once(tmp_path):
+    live = live_into(tmp_path / "session")
+    said = []
+    for moment in range(50):
+        if moment == 20:
+            live.recorded.recording._written.result(10)
+            live.recorded.recording._file = io.TextIOWrapper(io.BufferedWriter(FullDisk()))
+        step(live)
+        said.append(live.watch())
+    live.recorded.close({})
+    assert [text for text in said if text] == ["session: no longer written (No space left on device)"]
+    assert live.recorded.recording.fault == "session: no longer written (No space left on device)"
+    assert live.session.moment == 50 and len(read_log(tmp_path / "session").poses) == 16
+
+
+def recorded_at(folder: Path, ball: trimesh.Trimesh) -> Recorded:
+    """Numbers recorded in a scene whose files have a patient's name."""
+    numbers = Numbers()
+    files = dict(organ="/home/doe/organ.stl", tumour="doe.stl", ct="doe/ct.nrrd", labels="doe/labels.nrrd")
+    shape = (dict(kind="mesh", file="/home/doe/table.stl"),)
+    probe = dict(probe="/home/doe/probe.toml")
+    numbers.scene = Scene(anatomy=files, shape=shape, tissue=dict(cell_mm=7.0), transducer=probe)
+    numbers.probe = probe_of(load_scene(EMBEDDED), EMBEDDED.parent)
+    kept = record(Session(numbers), LoadedAnatomy(ball, None, None, ()), "x64", folder)
+    lead(Live(kept.session, Ladder(1e6), kept), 30, 0)
+    kept.close({})
+    return kept
+
+
+def refused(*arguments: Any) -> str:
+    """The one line with which a rehearsal is refused."""
+    with redirect_stderr(io.StringIO()) as told:
+        assert app.main(["rehearse", *map(str, arguments)]) == 2
+    (line,) = told.getvalue().strip().splitlines()
+    return line
+
+
+def test_a_session_names_no_path_and_is_written_over_none(tmp_path, ball):
+    paths = [recorded_at(tmp_path, ball).recording.path for _ in range(2)]
+    assert [path.name for path in paths] == ["session-001.jsonl", "session-002.jsonl"]
+    text = paths[0].read_text()
+    assert not any(word in text for word in ("doe", ".stl", ".toml", ".nrrd", str(tmp_path)))
+    assert "/" not in text.splitlines()[0] and "\\" not in text
+
+
+def test_a_session_is_refused_with_another_patient_and_with_options_of_its_own(tmp_path, ball):
+    path = recorded_at(tmp_path, ball).recording.path
+    assert "other anatomy (no title)" in refused("--replay", path)
+    for option, value in (("--cell", 7), ("--probe", "linear"), ("--budget-ms", 5), ("--iterations", 3)):
+        assert refused("--replay", path, option, value).startswith(f"nephron: {option}: a replay computes")
+    assert refused("--at", 3).startswith("nephron: --at: ")
+    assert "no such session file" in refused("--replay", tmp_path / "none")
+
+
+def test_the_scene_of_a_session_is_the_patients_with_all_else_as_recorded(tmp_path, ball):
+    embedded = load_scene(EMBEDDED)
+    scene = scene_of_log(read_log(recorded_at(tmp_path, ball).recording.path).header, embedded)
+    assert scene.tissue.cell_mm == 7.0 != embedded.tissue.cell_mm
+    assert (scene.anatomy, scene.shape, scene.title) == (embedded.anatomy, embedded.shape, embedded.title)
+
+
+class Watched(NullViewer):
+    """A window that draws nothing, and keeps what each frame showed, but for frozen ones."""
+
+    def __init__(self, settings: Settings, script: Any) -> None:
+        super().__init__(settings, script)
+        self.seen: list[tuple] = []
+        self.is_frozen = False
+
+    def read_controls(self) -> Controls:
+        controls = super().read_controls()
+        self.is_frozen ^= controls.freeze
+        return controls
+
+    def draw(self, view: View) -> None:
+        if not self.is_frozen:
+            self.seen.append((view.transducer_pose.tobytes(), *(p.tobytes() for p in view.pictures.values())))
+
+
+@pytest.fixture(scope="module")
+def built() -> Iterator[tuple[Rehearsal, LoadedAnatomy]]:
+    """The embedded patient, coarse and with small pictures."""
+    start("cpu")
+    scene = with_options(load_scene(EMBEDDED), {"tissue.cell_mm": 8.0, "image.mode": "b-mode"})
+    short = dict(press=scene.press.model_copy(update={"warm_up_steps": 20}))
+    small = dict(image=scene.image.model_copy(update={"pixels": 32}))
+    anatomy = load_anatomy(scene, phantom_folder())
+    yield Rehearsal(scene.model_copy(update=short | small), anatomy), anatomy
+    ti.reset()
+
+
+def rehearsed(built, monkeypatch, out: Path, script: Any, log: Log | None = None, at_s: float = 0.0):
+    """What a rehearsal showed, frame by frame, the tissue's digest at its end, and what it recorded."""
+    rehearsal, anatomy = built
+    scene = rehearsal.scene
+    rehearsal.reset()
+    rehearsal.settings = step_settings(scene.tissue, scene.solver)
+    rehearsal.set_gravity(scene.gravity.acceleration_m_s2)
+    rehearsal.set_young(scene.tissue.young_kpa)
+    settings = settings_of(rehearsal)
+    viewer = Watched(settings, script(settings))
+    monkeypatch.setattr(run, "open_viewer", lambda rehearsal, visible: viewer)
+    # A budget that no step keeps: the ladder goes down.
+    each = run.Run(rehearsal, anatomy, "cpu", out, budget_ms=0.01)
+    each.in_window(log, at_s)
+    return viewer.seen, rehearsal.digest(), each.recorded and read_log(each.recorded.recording.path)
+
+
+def user(settings: Settings, frames: int = 150) -> Iterator[Controls]:
+    """All there is to do, in 140 moments and ten frozen frames."""
+    for frame in range(frames):
+        settings.young_kpa = 40.0 if 30 <= frame < 50 else 15.0
+        settings.iterations = 3 if 40 <= frame < 60 else 8
+        settings.gain_percent = 40 if frame < 85 else 75
+        over = np.array([0.1 * (frame % 100) - 5.0, -80.0, 3.0]), np.array([0.0, 1.0, 0.0])
+        keys = dict(undo=frame in (70, 71, 140), redo=frame == 72, bookmark=frame in (20, 98))
+        keys |= dict(to_bookmark=frame in (110, 112), reset=frame == 130, freeze=frame in (80, 90))
+        at = over if frame % 40 < 30 else None
+        fan_deg = 0.5 * (frame % 7 == 0)
+        yield Controls(settings, at, press=frame % 40 > 15, fan_deg=fan_deg, quit=frame == frames - 1, **keys)
+
+
+def watching(frames: int, take_over_at: int = -1) -> Any:
+    def script(settings: Settings) -> Iterator[Controls]:
+        for frame in range(frames):
+            press = 0 <= take_over_at < frame
+            yield Controls(settings, take_over=frame == take_over_at, press=press, quit=frame == frames - 1)
+
+    return script
+
+
+def test_a_rehearsal_is_replayed_to_the_bit_and_the_pixel(built, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(recorded, "STATE_S", 1.0)
+    seen, end, log = rehearsed(built, monkeypatch, tmp_path, user)
+    assert len(seen) == len(log.poses) == 140 and len(set(seen)) > 120 and log.summary["went_back"] == 7
+    told = [event.value for events in log.events.values() for event in events if event.kind == "solver"]
+    assert len({values["iterations"] for values in told if "iterations" in values}) > 2
+    for at, states in ((0, log.states), (0, {}), (80, {}), (125, log.states)):
+        replayed = replace(log, states=states)
+        shown, again, _ = rehearsed(built, monkeypatch, tmp_path, watching(140 - at), replayed, at / 60)
+        assert shown == seen[at:] and again == end and "identical in all" in capsys.readouterr().out
+
+
+def test_a_session_that_goes_on_from_a_replay_is_one_too(built, monkeypatch, tmp_path, capsys):
+    _, _, first = rehearsed(built, monkeypatch, tmp_path, partial(user, frames=60))
+    led, end, second = rehearsed(built, monkeypatch, tmp_path, watching(60, 20), first, 0.5)
+    assert len(second.poses) == 40 and second.header.begins
+    shown, again, _ = rehearsed(built, monkeypatch, tmp_path, watching(40), second)
+    assert shown == led[20:] and again == end and "identical in all 1 states" in capsys.readouterr().out
