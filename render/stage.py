@@ -85,12 +85,14 @@ class Stage:
         inner = self._parts if settings.show_parts else []
         for surface in [*inner, self._tumour] if settings.show_tumour else inner:
             if surface is not None:
+                if surface is self._tumour:
+                    surface.tint(view.seen.get("tumour"))
                 surface.shade(eye, key)
                 _draw_surface(scene, surface)
         self._draw_image_plane(scene, view, key)
         cut = _cut(view.transducer_pose, eye) if settings.cut else None
         opacity = GLASS if settings.translucent else SOLID
-        self._organ.tint(view.seen)
+        self._organ.tint(view.seen.get("organ"))
         self._organ.shade(eye, key, opacity, cut)
         _draw_surface(scene, self._organ, ahead if opacity < SOLID or cut is not None else None)
 

@@ -170,8 +170,8 @@ class View:
     """Line segments on the plane, shape (n, 2, 2) [mm]: x from the middle to the right, y down from the face."""
     outline_before_mm: np.ndarray | None = None
     """The same of where it was in the CT."""
-    seen: np.ndarray | None = None
-    """Which vertices of the organ lie in tissue that has been in the picture, bool, shape (n,)."""
+    seen: dict[str, np.ndarray] = field(default_factory=dict)
+    """Which vertices of "organ" and "tumour" lie in tissue that has been in the picture, bool, shape (n,)."""
     calliper_mm: tuple[tuple[float, float], ...] = ()
     """Up to two points on the plane [mm]."""
     captions: tuple[str, str, str] = ("", "", "")

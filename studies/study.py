@@ -5,6 +5,7 @@ import click
 from studies.features.command import features
 from studies.freehand.study_command import freehand
 from studies.intake.command import intake
+from studies.replay.command import replay
 from studies.soak.command import soak
 from studies.stability.command import stability
 from studies.timing.command import timing
@@ -23,3 +24,4 @@ study.add_command(stability)
 study.add_command(soak)
 study.add_command(intake)
 study.add_command(freehand)
+study.add_command(replay)

@@ -1,4 +1,4 @@
-"""Freehand 3D ultrasound: what a tracker gets wrong, and how well what is found agrees with the truth."""
+"""What a tracker gets wrong of a probe's poses."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from ultrasound.tracking import TrackingErrors, tracked
 
-FRAMES, VOXEL = 4000, 0.5
+FRAMES = 4000
 # Estimates are off by a standard error now and then, hardly ever by four.
 SIGMAS = 4.0
 EVERYTHING = TrackingErrors(0.5, 1.0, 2.0, 3.0, 0.1)

@@ -164,7 +164,7 @@ def check_anatomy(log: Log, anatomy: LoadedAnatomy, title: str) -> None:
     """Raises SessionError where a session is of another patient than an anatomy."""
     if fingerprint(anatomy) != log.header.anatomy:
         raise SessionError(
-            f"the session is of other anatomy ({log.header.title or 'no title'}) than this scene's ({title or 'no title'}): name "
+            f"the session is of other anatomy than this scene's ({title or 'no title'}): name "
             "its scene or patient's folder before --replay; a patient imported anew is another one"
         )
 

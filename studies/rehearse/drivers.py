@@ -1,15 +1,17 @@
 """Who leads the transducer in a rehearsal: the user (``live.py``), a recorded session, or the scene's script."""
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
-from render.viewer import Controls
+from render.viewer import Controls, Settings
 from studies.rehearse.live import Live
+from studies.session.file import SessionError
 from studies.session.recorded import Recorded
 from studies.session.replay import Replay
 from studies.session.session import Session
+from ultrasound.array import MODES, RUNGS
 
 
 class Driver(Protocol):
@@ -54,8 +56,7 @@ class Played:
         if self.live is not None:
             return self.live.move(controls)
         pose, settings = self.replay.move()
-        for name, value in settings.items():
-            setattr(controls.settings, name, value)
+        set_settings(controls.settings, settings)
         return pose
 
     def stepped(self, step_ms: float) -> str:
@@ -73,6 +74,19 @@ class Played:
     def take_said(self) -> str:
         said, self._said = self._said, ""
         return said or (self.live.take_said() if self.live else "")
+
+
+def set_settings(settings: Settings, values: dict[str, Any]) -> None:
+    """Set what a session says. Raises SessionError for what is no setting, or none that there can be."""
+    for name, value in values.items():
+        usual = getattr(settings, name, None)
+        known = {"mode": MODES, "rung": RUNGS}.get(name)
+        fits = value in known if known else isinstance(value, type(usual)) or usual is None or value is None
+        if not hasattr(settings, name) or not fits:
+            raise SessionError(
+                f"the session sets {name} to {value!r}, which it cannot be: its file is damaged"
+            )
+        setattr(settings, name, value)
 
 
 class Scripted:

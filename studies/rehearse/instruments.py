@@ -27,9 +27,18 @@ class Instruments:
         self.reading: Reading | None = None
         step_s = rehearsal.settings.time_step_s
         self._read_every, self._look_every = (max(1, round(s / step_s)) for s in (READ_S, LOOK_S))
-        self.course = Course(rehearsal.scene.transducer.compression_warning_mm, step_s)
-        self._seen: np.ndarray | None = None
+        self.course = self._new_course()
+        self._seen: dict[str, np.ndarray] = {}
         self._touches = np.ones(rehearsal.probe.number_of_scanlines, bool)
+
+    def _new_course(self) -> Course:
+        step_s = self.rehearsal.settings.time_step_s
+        return Course(self.rehearsal.scene.transducer.compression_warning_mm, step_s)
+
+    def begin_anew(self) -> None:
+        """Nothing was seen or done yet."""
+        self.course = self._new_course()
+        self.coverage.forget()
 
     @cached_property
     def coverage(self) -> Coverage:
@@ -44,7 +53,12 @@ class Instruments:
             self._touches = self.coverage.look(rest, probe, gap)
         if session.moment % self._read_every == 0 or self.reading is None:
             self.reading = read(self.rehearsal, probe, self._touches)
-            self._seen = self.coverage.at(np.asarray(self.rehearsal.organ.vertices))
+            surfaces = {"organ": self.rehearsal.organ, "tumour": self.rehearsal.tumour}
+            self._seen = {
+                name: self.coverage.at(np.asarray(surface.vertices))
+                for name, surface in surfaces.items()
+                if surface is not None
+            }
             session.note("reading", self.figures())
         self.course.add(pose, self.reading.compression_mm)
 
@@ -74,7 +88,7 @@ class Instruments:
             view,
             findings=self.findings(),
             alert=COMPRESSION if self.is_too_deep else "",
-            seen=self._seen if settings.show_seen else None,
+            seen=self._seen if settings.show_seen else {},
             status=status,
         )
 

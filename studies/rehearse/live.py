@@ -51,7 +51,7 @@ class Live:
         moves = bool(np.abs(pose - rehearsal.pose).max() > STILL_MM)
         # What is kept here is gone back to: with the hand as it was before this input.
         rehearsal.hand.grip, grip = held, rehearsal.hand.grip
-        self.history.watch(moves, controls.press)
+        self.history.watch(moves or controls.press, controls.press)
         rehearsal.hand.grip = grip
         return pose
 

@@ -42,7 +42,7 @@ class Loop:
     def run(self) -> None:
         """Go on until the window is closed."""
         before = perf_counter()
-        take_view(self.rehearsal, self.viewer.settings, self.rehearsal.pose, self.record)
+        take_view(self.rehearsal, self.viewer.settings, None, self.record)
         while self.viewer.running:
             controls = self.viewer.read_controls()
             view = self.frame(controls)
@@ -57,7 +57,8 @@ class Loop:
 
     def frame(self, controls: Controls) -> View:
         """One frame: what the user did, a moment unless frozen, and what is to be seen."""
-        if controls.freeze:
+        goes_back = controls.reset or controls.undo or controls.redo or controls.to_bookmark
+        if controls.freeze or (self.frozen and goes_back):
             self.frozen = not self.frozen
         if controls.reset:
             self.calliper.points = ()

@@ -11,7 +11,7 @@ from render.window import NoVulkan
 from scenes.anatomy import LoadedAnatomy
 from studies.commands import Fault
 from studies.rehearsal import Rehearsal, RehearsalState
-from studies.rehearse.drivers import Played, Scripted
+from studies.rehearse.drivers import Played, Scripted, set_settings
 from studies.rehearse.headless import run_headless
 from studies.rehearse.instruments import Instruments
 from studies.rehearse.live import Live
@@ -38,6 +38,9 @@ class Run:
     budget_ms: float | None = None
     recorded: Recorded | None = None
 
+    def __post_init__(self) -> None:
+        self.instruments = Instruments(self.rehearsal)
+
     def in_window(self, log: Log | None, at_s: float) -> None:
         """Led by the user, in a window; with a log by that first. Raises Fault, SessionError."""
         try:
@@ -46,23 +49,24 @@ class Run:
             raise Fault(f"{reason}; install a Vulkan driver, or run with --headless") from None
         replay = None if log is None else self._replay(log, at_s, viewer.settings)
         driver = self._live() if replay is None else Played(replay, self._take_over)
-        instruments, sweeping = Instruments(self.rehearsal), Sweeping(self.rehearsal)
+        sweeping = Sweeping(self.rehearsal)
         notices = Notices(click.echo)
         click.echo("The window is open; H shows the keys, Esc quits.")
-        loop = Loop(self.rehearsal, viewer, self.out, Record(0.0), driver, notices, instruments, sweeping)
+        loop = Loop(
+            self.rehearsal, viewer, self.out, Record(0.0), driver, notices, self.instruments, sweeping
+        )
         try:
             loop.run()
         finally:
             viewer.close()
             _say(sweeping.end())
             live = driver.live if isinstance(driver, Played) else driver
-            self._end(instruments, len(live.history.bookmarks) if live else 0)
+            self._end(len(live.history.bookmarks) if live else 0)
             _say(_verdict(replay))
 
     def headless(self, log: Log | None, at_s: float, seconds: float | None, build_s: float) -> None:
         """Led by the scene's script, or by a log. Raises SessionError."""
         rehearsal, settings = self.rehearsal, settings_of(self.rehearsal)
-        instruments = Instruments(rehearsal)
         replay = None if log is None else self._replay(log, at_s, settings)
         if replay is None:
             step_s = rehearsal.settings.time_step_s
@@ -73,11 +77,15 @@ class Run:
             steps = len(replay.log.poses) - replay.session.moment
             if seconds:
                 steps = min(steps, max(1, round(seconds / rehearsal.settings.time_step_s)))
+            if steps == 0:
+                raise Fault(
+                    f"--at {at_s:g}: the session is over at {replay.log.length_s:.1f} s; name an earlier second"
+                )
             driver = Played(replay, self._take_over)
         try:
-            run_headless(rehearsal, driver, steps, settings, instruments, self.arch, self.out, build_s)
+            run_headless(rehearsal, driver, steps, settings, self.instruments, self.arch, self.out, build_s)
         finally:
-            self._end(instruments, 0)
+            self._end(0)
             _say(_verdict(replay))
 
     def _live(self, begins: RehearsalState | None = None) -> Live:
@@ -88,6 +96,7 @@ class Run:
     def _take_over(self) -> Live:
         """The user leads on from where a replay is: a session of its own."""
         self.rehearsal.hand.take(self.rehearsal.pose)
+        self.instruments.begin_anew()
         return self._live(self.rehearsal.snapshot())
 
     def _record(self, session: Session, begins: RehearsalState | None = None) -> Recorded | None:
@@ -109,14 +118,11 @@ class Run:
         if aim > 0:
             with tqdm(total=aim, desc=f"to {at_s:g} s", unit="step") as bar:
                 replay.open_at(at_s, bar.update)
-        for name, value in replay.settings_until_now().items():
-            setattr(settings, name, value)
+        set_settings(settings, replay.settings_until_now())
         return replay
 
-    def _end(self, instruments: Instruments, bookmarks: int) -> None:
-        if instruments.reading is None:
-            return
-        summary = instruments.summary(bookmarks)
+    def _end(self, bookmarks: int) -> None:
+        summary = self.instruments.summary(bookmarks)
         click.echo(in_words(summary))
         if self.recorded is not None:
             self.recorded.close(summary)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 VERSION = 1
 # Of a pose, all but its last row.
@@ -36,7 +36,6 @@ class Header(_Line):
     """What is rehearsed. ``anatomy`` is the fingerprint of the files that a scene names, which are not in here."""
 
     nephron_session: Literal[1] = 1
-    title: str = ""
     anatomy: str
     scene: dict[str, Any]
     probe: dict[str, Any]
@@ -46,22 +45,48 @@ class Header(_Line):
     """The state that it begins with, where that is not the settled one."""
 
 
+class SolverValues(_Line):
+    """What a step is told; what is left out stays as it was."""
+
+    iterations: int | None = Field(None, ge=1, le=1000)
+    substeps: int | None = Field(None, ge=1, le=100)
+    stiffness: float | None = Field(None, ge=0, le=1)
+    young_kpa: float | None = Field(None, gt=0, le=1e6)
+    gravity_m_s2: float | None = Field(None, ge=0, le=100)
+
+
+# What the value of each kind of event is.
+VALUES: dict[str, TypeAdapter] = {
+    "settings": TypeAdapter(dict[str, bool | int | float | str | None]),
+    "solver": TypeAdapter(SolverValues),
+    "back": TypeAdapter(int),
+    "bookmark": TypeAdapter(int),
+    "reading": TypeAdapter(dict[str, float | None]),
+    "state": TypeAdapter(str),
+}
+Kind = Literal["settings", "solver", "back", "bookmark", "reading", "state"]
+
+
 class Event(_Line):
     """Something of the moment ``at``, before its step."""
 
     at: int = Field(ge=0)
-    kind: Literal["settings", "solver", "back", "bookmark", "reading", "sweep"]
+    kind: Kind
     value: Any
+
+    @model_validator(mode="after")
+    def _of_its_kind(self) -> "Event":
+        VALUES[self.kind].validate_python(self.value, strict=True)
+        return self
 
 
 class Second(_Line):
-    """Moments from ``at`` on: their poses, packed; the digest and sometimes the state after the last of them."""
+    """Moments from ``at`` on: their poses, packed; the tissue's digest after the last of them."""
 
     at: int = Field(ge=0)
     poses: str
     events: list[Event] = []
     digest: str
-    state: str | None = None
 
 
 class End(_Line):
@@ -129,7 +154,7 @@ class Recording:
         """How many there are since the last line."""
         return len(self._poses)
 
-    def note(self, kind: Any, value: Any) -> None:
+    def note(self, kind: Kind, value: Any) -> None:
         """Something of the moment to come."""
         self._events.append(Event(at=self._at + len(self._poses), kind=kind, value=value))
 
@@ -137,13 +162,11 @@ class Recording:
         """A moment: the pose of its step, None for a way back."""
         self._poses.append(pose)
 
-    def line(self, digest: str, state: str | None = None) -> None:
-        """Write what there is since the last line, with the tissue's digest now and, where it is given, its state."""
+    def line(self, digest: str) -> None:
+        """Write what there is since the last line, with the tissue's digest now."""
         if not self._poses:
             return
-        self._write(
-            Second(at=self._at, poses=pack(self._poses), events=self._events, digest=digest, state=state)
-        )
+        self._write(Second(at=self._at, poses=pack(self._poses), events=self._events, digest=digest))
         self._at += len(self._poses)
         self._poses, self._events = [], []
 
@@ -246,9 +269,9 @@ def _poses_of(name: str, number: int, second: Second, expected: int) -> np.ndarr
 
 
 def _file_away(second: Second, count: int, log: Log) -> None:
-    after = second.at + count
     for event in second.events:
-        log.events.setdefault(event.at, []).append(event)
-    log.digests[after] = second.digest
-    if second.state is not None:
-        log.states[after] = second.state
+        if event.kind == "state":
+            log.states[event.at] = event.value
+        else:
+            log.events.setdefault(event.at, []).append(event)
+    log.digests[second.at + count] = second.digest

@@ -3,6 +3,7 @@
 from collections import deque
 
 from studies.session.session import SETTLED, Session
+from studies.session.state import to_text
 
 MOST_UNDONE = 40
 # Input that comes sooner than this after the last goes on with the same action; an action takes no longer than that.
@@ -33,6 +34,7 @@ class History:
 
     def _begin(self) -> None:
         self._began_s = self.session.time_s
+        self._at = 0
         self._before.append(self.session.keep())
         self.undone.clear()
         self._forget()
@@ -60,19 +62,23 @@ class History:
 
     def set_bookmark(self) -> int:
         """Keep this moment; how many bookmarks there are now."""
-        self.bookmarks.append(self.session.keep())
+        moment = self.session.keep()
+        self.bookmarks.append(moment)
         self._at = 0
         self.session.note("bookmark", len(self.bookmarks))
+        # However much later it is gone to, a replay need not compute all from here on.
+        self.session.note("state", to_text(self.session.kept[moment]))
         return len(self.bookmarks)
 
     def to_bookmark(self) -> int:
         """Go to the last bookmark, or the one before where this was the last way; its number, 0 where there is none."""
         if not self.bookmarks:
             return 0
-        self._at = (self._at - 1) % len(self.bookmarks)
+        at = (self._at - 1) % len(self.bookmarks)
         self._begin()
-        self._go(self.bookmarks[self._at])
-        return self._at + 1
+        self._at = at
+        self._go(self.bookmarks[at])
+        return at + 1
 
     def _go(self, moment: int) -> None:
         self.session.go_back(moment)

@@ -30,9 +30,11 @@ class Recorded:
         if self.recording.moments < self._line_every:
             return ""
         before = self.recording.fault
-        moment, rehearsal = self.session.moment, self.session.rehearsal
-        is_due = moment % self._state_every < self._line_every
-        self.recording.line(rehearsal.digest(), to_text(rehearsal.snapshot()) if is_due else None)
+        session, rehearsal = self.session, self.session.rehearsal
+        moment = session.moment
+        self.recording.line(rehearsal.digest())
+        if moment % self._state_every < self._line_every:
+            session.note("state", to_text(rehearsal.snapshot()))
         return self.recording.fault if self.recording.fault != before else ""
 
     def close(self, summary: dict[str, Any]) -> None:
@@ -52,7 +54,6 @@ def record(
     """Record a session from here on under the next free number of a folder. Raises OSError."""
     rehearsal = session.rehearsal
     header = Header(
-        title=rehearsal.scene.title,
         anatomy=fingerprint(anatomy),
         scene=rehearsal.scene.model_dump(mode="json", exclude=NOT_RECORDED),
         probe=rehearsal.probe.model_dump(mode="json", by_alias=True),

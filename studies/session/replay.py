@@ -42,8 +42,8 @@ class Replay:
     def time_s(self) -> float:
         return self.session.time_s
 
-    def open_at(self, seconds: float, done: Callable[[int], Any] = lambda moments: None) -> None:
-        """Go to a time, by way of the last state before it that all which follows can be had from."""
+    def open_at(self, seconds: float, done: Callable[[int], Any] = lambda moments: None) -> float:
+        """Go to a time, by way of the last state before it that all which follows can be had from; of what time that is [s]."""
         aim = min(round(seconds / self.log.header.time_step_s), len(self.log.poses))
         start = max(
             (moment for moment in self.log.states if moment <= aim and self._holds(moment)), default=0
@@ -61,6 +61,7 @@ class Replay:
                 self.stepped()
             done(1)
         self.rehearsal.update_surfaces()
+        return start * self.log.header.time_step_s
 
     def move(self) -> tuple[np.ndarray | None, dict[str, Any]]:
         """The pose to step to, None where this moment was a way back; and the pictures' settings that changed.
@@ -74,6 +75,8 @@ class Replay:
             self.session.keep()
         back, settings = self._set(moment)
         if back is not None:
+            if back not in self.session.kept:
+                self.session.kept[back] = self._state(self.log.states[back])
             self.session.go_back(back)
             self._compare()
             return None, settings
@@ -115,7 +118,10 @@ class Replay:
 
     def _holds(self, start: int) -> bool:
         """Whether nothing after a moment goes back to before it."""
-        return all(moment < start or to >= start or to == SETTLED for moment, to in self._backs)
+        return all(
+            moment < start or to >= start or to == SETTLED or to in self.log.states
+            for moment, to in self._backs
+        )
 
     def _state(self, text: str):
         try:

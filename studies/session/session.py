@@ -6,6 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from studies.rehearsal import Rehearsal, RehearsalState
+from studies.session.file import Kind
 
 # The moment before the first: tissue settled, transducer just touching.
 SETTLED = -1
@@ -14,7 +15,7 @@ SETTLED = -1
 class Recorder(Protocol):
     """What is told of each moment."""
 
-    def note(self, kind: str, value: Any) -> None: ...
+    def note(self, kind: Kind, value: Any) -> None: ...
 
     def moment(self, pose: np.ndarray | None) -> None: ...
 
@@ -37,14 +38,14 @@ class Session:
         """Simulated time since the session began."""
         return self.moment * self.rehearsal.settings.time_step_s
 
-    def tell(self, kind: str, values: dict[str, Any]) -> None:
+    def tell(self, kind: Kind, values: dict[str, Any]) -> None:
         """Note those of some values that are not as they were told last."""
         new = {name: value for name, value in values.items() if self._told.get(f"{kind}.{name}") != value}
         if new:
             self._told |= {f"{kind}.{name}": value for name, value in new.items()}
             self.note(kind, new)
 
-    def note(self, kind: str, value: Any) -> None:
+    def note(self, kind: Kind, value: Any) -> None:
         """Note something of the moment to come."""
         if self.recorder is not None:
             self.recorder.note(kind, value)

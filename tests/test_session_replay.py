@@ -1,0 +1,110 @@
+"""A real rehearsal recorded in a window that draws nothing, and replayed: the same bits and pixels."""
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import taichi as ti
+
+from render.viewer import Controls, NullViewer, Settings, View
+from scenes.anatomy import LoadedAnatomy, load_anatomy, phantom_folder
+from scenes.scene import EMBEDDED, load_scene, with_options
+from sim.device import start
+from studies.models import step_settings
+from studies.rehearsal import Rehearsal
+from studies.rehearse import run
+from studies.rehearse.view import settings_of
+from studies.session import recorded
+from studies.session.file import Log, read_log
+
+
+class Watched(NullViewer):
+    """A window that draws nothing, and keeps what each frame showed, but for frozen ones."""
+
+    def __init__(self, settings: Settings, script: Any) -> None:
+        super().__init__(settings, script)
+        self.seen: list[tuple] = []
+        self.is_frozen = False
+
+    def read_controls(self) -> Controls:
+        controls = super().read_controls()
+        self.is_frozen ^= controls.freeze
+        return controls
+
+    def draw(self, view: View) -> None:
+        if not self.is_frozen:
+            self.seen.append((view.transducer_pose.tobytes(), *(p.tobytes() for p in view.pictures.values())))
+
+
+@pytest.fixture(scope="module")
+def built() -> Iterator[tuple[Rehearsal, LoadedAnatomy]]:
+    """The embedded patient, coarse and with small pictures."""
+    start("cpu")
+    scene = with_options(load_scene(EMBEDDED), {"tissue.cell_mm": 8.0, "image.mode": "b-mode"})
+    short = dict(press=scene.press.model_copy(update={"warm_up_steps": 20}))
+    small = dict(image=scene.image.model_copy(update={"pixels": 32}))
+    anatomy = load_anatomy(scene, phantom_folder())
+    yield Rehearsal(scene.model_copy(update=short | small), anatomy), anatomy
+    ti.reset()
+
+
+def rehearsed(built, monkeypatch, out: Path, script: Any, log: Log | None = None, at_s: float = 0.0):
+    """What a rehearsal showed, frame by frame, the tissue's digest at its end, and what it recorded."""
+    rehearsal, anatomy = built
+    scene = rehearsal.scene
+    rehearsal.reset()
+    rehearsal.settings = step_settings(scene.tissue, scene.solver)
+    rehearsal.set_gravity(scene.gravity.acceleration_m_s2)
+    rehearsal.set_young(scene.tissue.young_kpa)
+    settings = settings_of(rehearsal)
+    viewer = Watched(settings, script(settings))
+    monkeypatch.setattr(run, "open_viewer", lambda rehearsal, visible: viewer)
+    # A budget that no step keeps: the ladder goes down.
+    each = run.Run(rehearsal, anatomy, "cpu", out, budget_ms=0.01)
+    each.in_window(log, at_s)
+    return viewer.seen, rehearsal.digest(), each.recorded and read_log(each.recorded.recording.path)
+
+
+def user(settings: Settings, frames: int = 150) -> Iterator[Controls]:
+    """All there is to do, in 140 moments and ten frozen frames."""
+    for frame in range(frames):
+        settings.young_kpa = 40.0 if 30 <= frame < 50 else 15.0
+        settings.iterations = 3 if 40 <= frame < 60 else 8
+        settings.gain_percent = 40 if frame < 85 else 75
+        over = np.array([0.1 * (frame % 100) - 5.0, -80.0, 3.0]), np.array([0.0, 1.0, 0.0])
+        keys = dict(undo=frame in (70, 71, 140), redo=frame == 72, bookmark=frame in (20, 98))
+        keys |= dict(to_bookmark=frame in (110, 112), reset=frame == 130, freeze=frame in (80, 90))
+        at = over if frame % 40 < 30 else None
+        fan_deg = 0.5 * (frame % 7 == 0)
+        yield Controls(settings, at, press=frame % 40 > 15, fan_deg=fan_deg, quit=frame == frames - 1, **keys)
+
+
+def watching(frames: int, take_over_at: int = -1) -> Any:
+    def script(settings: Settings) -> Iterator[Controls]:
+        for frame in range(frames):
+            press = 0 <= take_over_at < frame
+            yield Controls(settings, take_over=frame == take_over_at, press=press, quit=frame == frames - 1)
+
+    return script
+
+
+def test_a_rehearsal_is_replayed_to_the_bit_and_the_pixel(built, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(recorded, "STATE_S", 1.0)
+    seen, end, log = rehearsed(built, monkeypatch, tmp_path, user)
+    assert len(seen) == len(log.poses) == 140 and len(set(seen)) > 120 and log.summary["went_back"] == 7
+    told = [event.value for events in log.events.values() for event in events if event.kind == "solver"]
+    assert len({values["iterations"] for values in told if "iterations" in values}) > 2
+    for at in (0, 125):
+        shown, again, _ = rehearsed(built, monkeypatch, tmp_path, watching(140 - at), log, at / 60)
+        assert shown == seen[at:] and again == end and "identical in all" in capsys.readouterr().out
+
+
+def test_a_session_that_goes_on_from_a_replay_is_one_too(built, monkeypatch, tmp_path, capsys):
+    _, _, first = rehearsed(built, monkeypatch, tmp_path, partial(user, frames=60))
+    led, end, second = rehearsed(built, monkeypatch, tmp_path, watching(60, 20), first, 0.5)
+    assert len(second.poses) == 40 and second.header.begins
+    shown, again, _ = rehearsed(built, monkeypatch, tmp_path, watching(40), second)
+    assert shown == led[20:] and again == end and "identical in all 1 states" in capsys.readouterr().out
