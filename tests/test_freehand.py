@@ -2,7 +2,7 @@
 
 import csv
 from dataclasses import replace
-from types import SimpleNamespace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,7 +13,6 @@ from PIL import Image
 
 from scenes.anatomy import Grid, LoadedAnatomy
 from scenes.scene import PlaneShape, Scene, with_options
-from sim.embedding import Unmoved
 from studies.freehand import experiment, measure, unsqueeze
 from studies.freehand.agreement import agreement
 from studies.freehand.compare import compared, inside, wider
@@ -23,10 +22,7 @@ from studies.freehand.picture import save_picture
 from studies.freehand.rebuild import Rebuilt, lit, path_of, rebuild
 from studies.freehand.study_command import table, write_csv
 from studies.freehand.study_picture import draw
-from studies.freehand.unsqueeze import Unsqueezed
 from studies.setup import PRESETS
-from ultrasound.array import load_probe
-from ultrasound.probe import held_at, image_plane, pose_at
 from ultrasound.reconstruction import VoxelBox
 from ultrasound.sweep import Mark, Sweep, SweepError
 
@@ -130,20 +126,23 @@ def test_frames_without_pose_or_picture_are_left_out(marked):
     # 0.8 mm each, and 1.6 over the three gaps.
     assert sorted(path.steps_mm.round(6))[-4:] == [0.8, 1.6, 1.6, 1.6]
     rebuilt = rebuild(sweep, path, ALL, 1.0, "smooth", 2.0)
+    # The box holds every pixel, and no voxel more.
+    places = np.concatenate([places_of(poses()[frame]).reshape(-1, 3) for frame in path.frames])
+    last = rebuilt.box.origin_mm + np.array(rebuilt.box.shape) - 1
+    assert rebuilt.box.origin_mm == pytest.approx(places.min(axis=0))
+    assert ((last >= places.max(axis=0)) & (last < places.max(axis=0) + 1)).all()
     assert rebuilt.grey[rebuilt.known] == pytest.approx(90) and not rebuilt.regions and not rebuilt.beads
 
 
 def test_only_the_sector_that_is_lit_counts():
     images = np.where(SECTOR, np.uint8(120), np.uint8(0)) * np.ones((len(poses()), 1, 1), np.uint8)
-    images[0] = 0
-    mask = lit(images)
+    sweep = swept(images)
+    mask = lit(np.concatenate([0 * images[:1], images]))
     assert np.array_equal(mask, SECTOR)
-    sweep = swept(images[1:])
-    sweep = replace(sweep, images=np.where(SECTOR, images[1:], np.uint8(0)))
     rebuilt = rebuild(sweep, path_of(sweep, "Reference"), mask, 1.0, "smooth", 2.0)
     assert rebuilt.grey[rebuilt.known] == pytest.approx(120)
     # Voxels on the border count as soon as a pixel is in them: half a voxel farther out on average, and gaps are closed.
-    volume, sides = SECTOR.sum() * 0.4 * 0.8 * len(images[1:]), 2 * (46 + 48) * 46 + 2 * 46 * 48
+    volume, sides = SECTOR.sum() * 0.4 * 0.8 * len(images), 2 * (46 + 48) * 46 + 2 * 46 * 48
     assert volume < rebuilt.known.sum() < volume + 0.6 * sides
     small = replace(sweep, images=sweep.images[:, :20])
     tight = rebuild(small, path_of(small, "Reference"), SECTOR[:20], 1.0, "smooth", 2.0)
@@ -180,7 +179,7 @@ def test_a_wider_box_leaves_all_where_it_was():
     box = a_box()
     region = near(box.places(), [-2.0, 12.0, 60.0], 5.0)
     rebuilt = Rebuilt(box, region * np.float32(7), region, {"organ": region})
-    around = trimesh.creation.box([50.0, 61.0, 72.0]).apply_translation([3.0, 11.0, 52.0])
+    around = trimesh.creation.box([50.0, 60.0, 72.0]).apply_translation([3.0, 11.0, 52.0])
     grown = wider(rebuilt, around)
     at, before = grown.box.places(), box.places()[region]
     for volume in (grown.regions["organ"], grown.known, grown.grey == 7):
@@ -188,7 +187,7 @@ def test_a_wider_box_leaves_all_where_it_was():
     low, high = at.reshape(-1, 3).min(axis=0), at.reshape(-1, 3).max(axis=0)
     assert (low < around.bounds[0]).all() and (high > around.bounds[1]).all()
     # None of the block's faces goes through a voxel's centre.
-    assert inside(around, grown.box).sum() == 50 * 61 * 72
+    assert inside(around, grown.box).sum() == 50 * 60 * 72
     within = wider(rebuilt, trimesh.creation.box([2.0] * 3).apply_translation([0.0, 16.0, 55.0]))
     assert within.box.shape == box.shape
 
@@ -255,80 +254,44 @@ def test_the_picture_shows_the_cuts_through_the_tumour(tmp_path, marked):
     assert all(part.sum() > 20 for part in np.array_split(yellow[0], 3)) and yellow[1].sum() == 0
 
 
-def test_a_probe_is_held_where_its_image_plane_is():
-    pose = pose_at(np.array([9.0, -4, 17]), np.array([0.3, -0.2, -1]), np.array([1, 0.5, 0.2]), 30.0)
-    assert held_at(image_plane(pose, 22.0, 40, 50, 6).world_from_plane, 22.0) == pytest.approx(pose)
-
-
-class Still:
-    """What undoing asks of a rehearsal, whose tissue never moves; it remembers how the probe did."""
-
-    def __init__(self, origin: np.ndarray, length_mm: float) -> None:
-        self.embedding, self.origin, self.size_mm = Unmoved(), origin, np.array([40.0, 10.0, length_mm])
-        self.settings, self.way = SimpleNamespace(time_step_s=1 / 60), []
-
-    def advance(self, pose: np.ndarray) -> None:
-        self.pose = pose
-        self.way.append(pose)
-
-
-def test_undoing_takes_the_tracked_way_and_finds_still_tissue_where_the_tracker_says(device):
-    probe = load_probe("curvilinear")
-    on_probe, way = probe.image_to_probe(32, 32), poses()[::20]
-    sweep = sweep_of(np.zeros((len(way), 32, 32), np.uint8), way, np.array([0.0, 0.1, 9.0]), on_probe)
-    still = Still(np.array([-61.0, 112.0, 1240.0]), 20.0)
-    places = Unsqueezed(still, sweep, path_of(sweep, "Reference"), "Reference")
-    begun = len(still.way)
-    assert begun == (unsqueeze.COMES_S + unsqueeze.WAITS_S) * 60
-    row, column = np.indices((32, 32))
-    pixels = np.stack([column, row, 0 * row, 1 + 0 * row], axis=-1)
-    for frame, pose in enumerate(way):
-        # Float32 of 1300 mm, less its origin.
-        expected = (pixels @ (pose @ on_probe).T)[..., :3]
-        assert places(frame) == pytest.approx(expected, abs=1e-3)
-        face = still.pose @ [0, 0, -10.0, 1]
-        assert face[:3] + still.origin == pytest.approx(pose[:3, 3])
-    # 0.1 s, and a pause of 8.9 s cut to 2.
-    assert len(still.way) - begun == 6 + 120
-    assert np.linalg.norm(still.way[0][:3, 3] - still.way[begun - 1][:3, 3]) == pytest.approx(29.0)
-
-
-def test_what_no_probe_can_press_again_is_refused(device):
-    sweep = sweep_of(np.zeros((1, 32, 30), np.uint8), np.eye(4)[None], np.zeros(1), ON_PROBE)
-    with pytest.raises(SweepError, match="32 x 30 pixels: expected a sweep that Nephron recorded"):
-        Unsqueezed(Still(np.zeros(3), 20.0), sweep, path_of(sweep, "Reference"), "Reference")
+MIDDLE = np.array([-40.0, 25.0, 310.0])
 
 
 def block_patient() -> LoadedAnatomy:
     """A soft block of 36 x 28 x 52 mm on a plane, a ball of 8 mm in it beside its middle."""
-    middle = np.array([-40.0, 25.0, 310.0])
-    organ = trimesh.creation.box([36.0, 28.0, 52.0]).subdivide().subdivide().subdivide()
-    tumour = trimesh.creation.icosphere(subdivisions=3, radius=8.0).apply_translation(middle + [2, -4, 3])
+    organ = trimesh.creation.box([36.0, 28.0, 52.0]).subdivide().subdivide().apply_translation(MIDDLE)
+    tumour = trimesh.creation.icosphere(subdivisions=2, radius=8.0).apply_translation(MIDDLE + [2, -4, 3])
     index_from_mm = np.diag([1 / 4, 1 / 4, 1 / 4, 1.0])
-    index_from_mm[:3, 3] = (40 - middle) / 4
+    index_from_mm[:3, 3] = (40 - MIDDLE) / 4
     ct = Grid(np.full((20, 20, 20), 40, np.float32), index_from_mm)
     support = PlaneShape(kind="plane", normal=(0.0, -1.0, 0.0), offset_mm=-39.0)
-    return LoadedAnatomy(organ.apply_translation(middle), tumour, ct, (support,))
+    return LoadedAnatomy(organ, tumour, ct, (support,))
 
 
 @pytest.fixture(scope="module")
 def runs() -> list[dict]:
     """Figures of the block with and without the tumour, as ``study freehand`` makes them."""
-    scene = with_options(Scene(), {"press.warm_up_steps": 40})
-    setup = replace(PRESETS["neo-hookean"]["balanced"], cell_mm=6.0)
-    block = block_patient()
+    held = {"attachment.at_mm": tuple(MIDDLE + [0, 14, 0]), "attachment.radius_mm": 20.0}
+    down = {"press.warm_up_steps": 40, "gravity.direction": (0.0, 1.0, 0.0)}
+    scene = with_options(Scene(anatomy=dict(phantom=True)), held | down)
+    setup = replace(PRESETS["neo-hookean"]["balanced"], cell_mm=7.0)
+    block, made = block_patient(), []
+    few = dict(PROBE="linear", PIXELS=64, EVERY=2, DEPTHS_MM=(9, 0.0, 9, 4.0, 9))
     with pytest.MonkeyPatch.context() as patch:
         for module, values in (
-            (measure, dict(PROBE="linear", PIXELS=64, EVERY=2, DEPTHS_MM=(9, 0.0, 9, 4.0, 9))),
-            (measure, dict(SWEPT={"calibration_mm": (1.0, 2.0, 3.0), "lost": (0.1, 0.2, 0.3)})),
+            (measure, few),
             (experiment, dict(SPEED_MM_S=30.0)),
+            (unsqueeze, dict(FROM_MM=6.0, COMES_S=0.2, WAITS_S=0.3)),
         ):
             for name, value in values.items():
                 patch.setattr(module, name, value)
-        made = []
-        for patient, anatomy in (("with", block), ("without", replace(block, tumour=None))):
-            done = []
-            figures = measure.measure(scene, anatomy, setup, "cpu", True, lambda: done.append(1))
+        for patient, tumour, swept_over in (
+            ("with", block.tumour, {"calibration_mm": (1.0, 2.0, 3.0), "lost": (0.1, 0.2, 0.3)}),
+            ("without", None, {"lost": (0.1, 0.2, 0.3)}),
+        ):
+            patch.setattr(measure, "SWEPT", swept_over)
+            anatomy, done = replace(block, tumour=tumour), []
+            figures = measure.measure(scene, anatomy, setup, "cpu", True, partial(done.append, 1))
             assert len(done) == measure.count_of(anatomy, True)
             made.append(dict(patient=patient) | figures)
     return made
@@ -347,12 +310,14 @@ def test_at_rest_the_bar_is_met(runs):
 
 
 def test_a_probe_calibrated_wrong_shifts_all_alike(runs):
-    for run in runs:
-        none, calibration, lost = run["noise"]
-        assert none["landmarks"]["mean_mm"] < 0.5 and lost["lost"] == 0.3
-        # The quick run takes the third of the sizes.
-        assert calibration["calibration_mm"] == 3.0
-        assert calibration["landmarks"]["mean_mm"] == pytest.approx(3.0, abs=0.1)
+    # The quick run takes the third of the sizes.
+    none, calibration, lost = runs[0]["noise"]
+    assert (calibration["calibration_mm"], lost["lost"]) == (3.0, 0.3)
+    assert none["landmarks"]["mean_mm"] < 0.5
+    assert calibration["landmarks"]["mean_mm"] == pytest.approx(3.0, abs=0.1)
+    # Gaps of pictures lost, 2 mm apart, are wider than what is closed.
+    assert lost["organ"]["scanned"] < none["organ"]["scanned"] == 1.0
+    assert [row["lost"] for row in runs[1]["noise"]] == [0.0, 0.3]
 
 
 def test_undoing_the_press_puts_the_tissue_back(runs):
@@ -378,24 +343,23 @@ def test_the_study_tells_and_draws_both(runs, tmp_path):
         line for line in lines if line.startswith("pressed 4 mm") and "undone" in line and "tumour" in line
     )
     assert f"{row['dice']:.3f}" in told and f"{row['centroid_mm']:.2f}" in told
-    # Head, then two methods, three of the noise and two by two of the press; of two regions, or of one.
-    assert len(lines) == 2 + 2 * (2 + 3 + 4) + 2 + (2 + 3)
+    # Two lines of head, then two methods, three of the noise or two, and two by two of the press; of two regions, or of one.
+    assert len(lines) == 2 + 2 * (2 + 3 + 4) + 2 + (2 + 2)
     assert sum(line.startswith("every third picture, no error") for line in lines) == 3
     write_csv(runs, tmp_path / "a.csv")
     with (tmp_path / "a.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(lines) - 4 and {row["patient"] for row in rows} == {"with", "without"}
     assert float(rows[-1]["lost"]) == 0.3 and rows[-1]["depth_mm"] == ""
-    draw(runs, tmp_path / "both.png")
     # A press that took the tumour out of the pictures, and one under which nothing was found.
     gone, lost = dict(runs[0]["compression"][2]), dict(runs[0]["compression"][3])
     del gone["tumour"]
     nothing = dict(dice=0.0, hd95_mm=None, volume_percent=-100.0, centroid_mm=None)
     lost["tumour"] = dict(scanned=0.1, whole=nothing, scanned_part=nothing)
     out = runs[0] | dict(compression=[gone, lost])
-    draw([runs[1], out], tmp_path / "gone.png")
     assert sum("-100.0" in line for line in table(out)) == 1
-    first, second = (
-        np.asarray(Image.open(tmp_path / f"{name}.png")).astype(int) for name in ("both", "gone")
-    )
-    assert first.shape == second.shape and np.abs(first - second).mean() > 0.1
+    draw([*runs, out], tmp_path / "all.png")
+    drawn = np.asarray(Image.open(tmp_path / "all.png").convert("RGB")).astype(int)
+    # The colours of the three: curves, and marks of the press.
+    for colour in ([31, 119, 180], [255, 127, 14], [44, 160, 44]):
+        assert (np.abs(drawn - colour).sum(axis=-1) < 9).sum() > 100

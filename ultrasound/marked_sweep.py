@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from ultrasound.array import Probe
-from ultrasound.sweep import Sweep
+from ultrasound.sweep import Sweep, SweepError
 from ultrasound.sweep_file import SweepWriter, read_sweep
 
 SUFFIX, MARKS = ".igs.mha", "-marks.igs.mha"
@@ -41,7 +41,11 @@ class MarkedSweep:
     def close(self) -> None:
         """Write both files. Raises OSError, SweepError."""
         self._marks.close()
-        self._pictures.close()
+        try:
+            self._pictures.close()
+        except (OSError, SweepError):
+            self._marks.path.unlink(missing_ok=True)
+            raise
 
 
 def marks_beside(sweep: Path) -> Sweep | None:

@@ -15,8 +15,8 @@ import numpy as np
 from scipy import ndimage
 
 METHODS = ("nearest", "smooth")
-# Making a volume of so many takes some 13 GB.
-MOST_VOXELS = 200_000_000
+# Making a volume of so many takes some 4 GB.
+MOST_VOXELS = 64_000_000
 # Standard deviation [voxels] of the Gaussian that rounds off the steps that single lines leave in gaps.
 ROUNDING_VOXELS = 1.0
 

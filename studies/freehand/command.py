@@ -89,6 +89,7 @@ def reconstruct(
     pictures.constant |= load_constants(config) if config else {}
     marks = marks_beside(sweep)
     path = path_of(pictures, reference)
+    about = _of_path(pictures, path)
     patient = _patient(scene)
     make_folder(out)
     if reach_mm is None:
@@ -99,7 +100,7 @@ def reconstruct(
     with tqdm(total=len(path.frames), desc="reconstruct", unit="picture") as bar:
         try:
             rebuilt = rebuild(
-                pictures, path, lit(pictures.images), spacing_mm, method, reach_mm, marks, places, bar.update
+                pictures, path, lit(pictures.images), spacing_mm, method, reach_mm, marks, places, done=bar.update
             )
         except ValueError as error:
             raise Fault(f"{sweep.name}: {error}") from None
@@ -109,7 +110,7 @@ def reconstruct(
         reach_mm=reach_mm,
         reference=reference,
         undo_compression=undo_compression,
-        **_of_path(pictures, path),
+        **about,
         shape=list(rebuilt.box.shape),
         agreement=_agreement(rebuilt, patient),
     )
@@ -186,10 +187,12 @@ def in_words(report: dict[str, Any]) -> str:
         lines.append(
             f"{name:<9} {100 * figures['scanned']:.0f} % scanned"
             + (
-                f"; of that Dice {part['dice']:.3f}, HD95 {part['hd95_mm']:.2f} mm, volume {part['volume_percent']:+.1f} %, "
+                ""
+                if not part
+                else "; of that nothing found"
+                if part["centroid_mm"] is None
+                else f"; of that Dice {part['dice']:.3f}, HD95 {part['hd95_mm']:.2f} mm, volume {part['volume_percent']:+.1f} %, "
                 f"centroid {part['centroid_mm']:.2f} mm off"
-                if part
-                else ""
             )
         )
     return "\n".join(lines)

@@ -1,5 +1,6 @@
 """A rebuilt sweep against the patient that it was taken of: the surfaces of the scene, as they lie in the CT."""
 
+import math
 from dataclasses import asdict
 from typing import Any
 
@@ -50,6 +51,9 @@ def compared(
             continue
         all_of = wider(rebuilt, surface)
         truth = inside(surface, all_of.box)
+        if not truth.any():
+            # It falls between the centres of voxels.
+            continue
         spacing = rebuilt.box.spacing_mm
         region = all_of.regions[name]
         seen = truth & all_of.known
@@ -76,5 +80,8 @@ def landmark_errors(rebuilt: Rebuilt, beads_mm: np.ndarray) -> list[float]:
     return [float(np.linalg.norm(place - beads_mm[bead])) for bead, place in rebuilt.beads.items()]
 
 
-def _rounded(figures: Agreement) -> dict[str, float]:
-    return {name: round(value, 4) for name, value in asdict(figures).items()}
+def _rounded(figures: Agreement) -> dict[str, float | None]:
+    """None for what cannot be measured, where nothing was found."""
+    return {
+        name: round(value, 4) if math.isfinite(value) else None for name, value in asdict(figures).items()
+    }

@@ -89,10 +89,13 @@ def table(run: dict[str, Any]) -> list[str]:
         f"{'sweep':<38}region  scanned   Dice  HD95, mm  volume, %  centroid, mm  landmarks, mm",
     ]
     for row in rows_of(run):
-        landmarks = "" if row["landmarks_mm"] is None else f"{row['landmarks_mm']:.2f}"
+        hd95, centroid, landmarks = (
+            "" if row[name] is None else f"{row[name]:.2f}"
+            for name in ("hd95_mm", "centroid_mm", "landmarks_mm")
+        )
         lines.append(
-            f"{_named(row):<38}{row['region']:<8}{100 * row['scanned']:>5.0f} %{row['dice']:>8.3f}{row['hd95_mm']:>10.2f}"
-            f"{row['volume_percent']:>+11.1f}{row['centroid_mm']:>14.2f}{landmarks:>15}"
+            f"{_named(row):<38}{row['region']:<8}{100 * row['scanned']:>5.0f} %{row['dice']:>8.3f}{hd95:>10}"
+            f"{row['volume_percent']:>+11.1f}{centroid:>14}{landmarks:>15}"
         )
     return lines
 

@@ -39,7 +39,7 @@ def _against_noise(axes: Axes, runs: list[dict[str, Any]], name: str, label: str
         colour = f"C{number}"
         axes.plot(at, [row["landmarks"]["mean_mm"] for row in rows], "o-", color=colour, label=run["patient"])
         if "tumour" in rows[0]:
-            tumour = [row["tumour"]["scanned_part"]["centroid_mm"] for row in rows]
+            tumour = [(row["tumour"]["scanned_part"] or {}).get("centroid_mm") for row in rows]
             axes.plot(at, tumour, "s--", color=colour, alpha=0.6)
     axes.set_xlabel(label)
     axes.set_ylabel("mm")
@@ -53,7 +53,10 @@ def _against_compression(axes: Axes, runs: list[dict[str, Any]], name: str) -> N
     for number, run in enumerate(runs):
         for undone, style in ((False, "o-"), (True, "s--")):
             rows = [row for row in run["compression"] if row["undone"] == undone]
-            rows = [row for row in rows if row["tumour"]["scanned_part"] and row["landmarks"]["count"]]
+            # A press may take the tumour out of the pictures.
+            rows = [
+                row for row in rows if row.get("tumour", {}).get("scanned_part") and row["landmarks"]["count"]
+            ]
             values = [
                 row["landmarks"]["mean_mm"] if name == "landmarks" else row["tumour"]["scanned_part"][name]
                 for row in rows

@@ -1,5 +1,6 @@
 """Sweeps that the user records in the window."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from ultrasound.marked_sweep import MarkedSweep
 from ultrasound.sweep import SweepError
 
 FRAME_S = 1 / 30
+SWEEP = re.compile(r"sweep-([0-9]{3,9})\.igs\.mha")
 
 
 class Sweeping:
@@ -27,12 +29,12 @@ class Sweeping:
             return self.end()
         if self.rehearsal.scanner is None:
             return "No CT, no sweep"
-        taken = [int(path.name[6:9]) for path in out.glob("sweep-[0-9][0-9][0-9].igs.mha")]
+        taken = [int(found[1]) for path in out.glob("sweep-*") if (found := SWEEP.fullmatch(path.name))]
         stem = f"sweep-{1 + max(taken, default=0):03d}"
         try:
             self._sweep = MarkedSweep(out, stem)
         except OSError as error:
-            return f"{stem} cannot be written: {error.strerror}"
+            return f"{stem} cannot be written: {_words(error)}"
         self._due_s = 0.0
         return f"{stem}: L ends it"
 
@@ -44,7 +46,7 @@ class Sweeping:
         try:
             sweep.close()
         except (OSError, SweepError) as error:
-            return f"No sweep: {error}"
+            return f"No sweep: {_words(error)}"
         return f"{sweep.name}: {sweep.count} pictures"
 
     def watch(self, time_s: float, view: View, probe: Probe) -> str:
@@ -57,8 +59,13 @@ class Sweeping:
         try:
             self._sweep.add(picture, marks, probe, probe_in_patient(self.rehearsal), time_s)
         except (OSError, SweepError) as error:
-            return f"{self.end()}: {error}"
+            said = self.end()
+            return said if _words(error) in said else f"{said}: {_words(error)}"
         return ""
+
+
+def _words(error: OSError | SweepError) -> str:
+    return error.strerror or str(error) if isinstance(error, OSError) else str(error)
 
 
 def probe_in_patient(rehearsal: Rehearsal) -> np.ndarray:
