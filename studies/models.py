@@ -54,14 +54,14 @@ def tool_of(probe: Probe) -> ConvexTool:
     """What touches the tissue: the probe's housing, its face an arc of flats where the array is curved."""
     size = np.array(probe.housing_mm)
     if probe.radius_mm == 0:
-        return ConvexTool.cuboid(size)
+        return ConvexTool.cuboid(size, probe.edge_radius_mm)
     angle = np.radians(np.linspace(probe.theta_start_deg, probe.theta_stop_deg, ARC_FLATS))
     arc = np.column_stack([np.sin(angle), np.zeros(ARC_FLATS), -np.cos(angle)])
     centre = np.array([0.0, 0.0, probe.radius_mm - size[2] / 2])
     # All sides of the cuboid but the one that the arc takes the place of.
     sides = np.concatenate([np.eye(3), -np.eye(3)[:2]])
     offsets = np.concatenate([size / 2, size[:2] / 2, arc @ centre + probe.radius_mm])
-    return ConvexTool(np.concatenate([sides, arc]), offsets)
+    return ConvexTool(np.concatenate([sides, arc]), offsets, probe.edge_radius_mm)
 
 
 def reach_of(tissue: AnyTissue) -> float:

@@ -34,7 +34,8 @@ class ProbeError(ValueError):
 class Probe(BaseModel):
     """One probe with the scanner's settings, as its file has them in PLUS's spelling (``frequency_mhz`` is FrequencyMhz).
 
-    ``housing_mm`` is the cuboid that touches: lateral x elevation x length. ``elevation_width_mm`` is the thickness of the image
+    ``housing_mm`` is the cuboid that touches: lateral x elevation x length, its edges rounded by ``edge_radius_mm``: sharp ones
+    plough through tissue that they are led over. ``elevation_width_mm`` is the thickness of the image
     plane, and ``focal_zone_mm`` how far from the focus the beam is wider by sqrt(2). ``depth_compensation_db_cm_mhz`` is the
     gain over depth that the scanner adds by itself, to which the sliders of ``time_gain_compensation`` [%] come.
     """
@@ -46,6 +47,7 @@ class Probe(BaseModel):
     transducer_name: str = Field(min_length=1, max_length=60)
     transducer_geometry: Literal["LINEAR", "CURVILINEAR", "PHASED"] = "LINEAR"
     housing_mm: tuple[float, float, float] = (40.0, 10.0, 20.0)
+    edge_radius_mm: float = Field(0.0, ge=0, le=20)
     transducer_width_mm: float = Field(40.0, gt=0, le=300)
     radius_start_mm: float = Field(0.0, ge=0, le=300)
     theta_start_deg: float = Field(0.0, ge=-80, le=0)
@@ -72,6 +74,10 @@ class Probe(BaseModel):
         if len(self.time_gain_compensation) != TGC_SLIDERS:
             raise ValueError(
                 f"TimeGainCompensation has {len(self.time_gain_compensation)} values: expected {TGC_SLIDERS}, from the face down"
+            )
+        if self.edge_radius_mm > min(self.housing_mm) / 2:
+            raise ValueError(
+                f"EdgeRadiusMm = {self.edge_radius_mm:g}: expected at most half of the least of HousingMm, {min(self.housing_mm) / 2:g}"
             )
         low, high = self.frequency_range_mhz
         if not 1 <= low <= self.frequency_mhz <= high <= 40:

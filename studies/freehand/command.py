@@ -15,11 +15,13 @@ from studies.freehand.files import save_volumes
 from studies.freehand.picture import save_picture
 from studies.freehand.rebuild import Path as SweepPath
 from studies.freehand.rebuild import Places, Rebuilt, lit, path_of, rebuild
+from studies.freehand.tracker import with_errors
 from studies.setup import probe_of
 from ultrasound.marked_sweep import marks_beside
 from ultrasound.reconstruction import METHODS
 from ultrasound.sweep import Sweep, load_constants
-from ultrasound.sweep_file import read_sweep
+from ultrasound.sweep_file import read_sweep, write_sweep
+from ultrasound.tracking import TrackingErrors
 
 MOST_REACH_MM = 5.0
 
@@ -65,6 +67,24 @@ MOST_REACH_MM = 5.0
     is_flag=True,
     help="Press the scene's organ once more on the tracked way, and put each pixel where its tissue was at rest.",
 )
+@click.option(
+    "--noise-mm", type=click.FloatRange(0), default=0.0, help="Add a tracker's noise: SD of each coordinate."
+)
+@click.option(
+    "--noise-deg", type=click.FloatRange(0), default=0.0, help="The same of the angle about each axis."
+)
+@click.option(
+    "--calibration-mm",
+    type=click.FloatRange(0),
+    default=0.0,
+    help="Image off the probe by so much, in all frames.",
+)
+@click.option(
+    "--calibration-deg", type=click.FloatRange(0), default=0.0, help="Image turned on the probe by so much."
+)
+@click.option("--latency-s", type=click.FloatRange(0), default=0.0, help="Poses of so much earlier.")
+@click.option("--lost", type=click.FloatRange(0, 1), default=0.0, help="Share of frames without a pose.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Of these errors.")
 @arch_option
 def reconstruct(
     sweep: Path,
@@ -76,22 +96,29 @@ def reconstruct(
     spacing_mm: float,
     reach_mm: float | None,
     undo_compression: bool,
+    seed: int,
     arch: str,
+    **tracker: float,
 ) -> None:
     """Make a volume of SWEEP, a tracked sweep (.igs.mha) of Nephron's or of PLUS.
 
     Writes volume.nrrd, volume.png and report.json; beside a sweep of marks (SWEEP-marks.igs.mha, which a rehearsal records) the
-    organ and tumour as they were seen, in labels.nrrd.
+    organ and tumour as they were seen, in labels.nrrd. With a tracker's errors, the sweep that has them is left as tracked.igs.mha.
     """
     if undo_compression and scene is None:
         raise Fault("--undo-compression: presses the organ of a scene; name it with --scene")
     pictures = read_sweep(sweep)
     pictures.constant |= load_constants(config) if config else {}
     marks = marks_beside(sweep)
+    errors = TrackingErrors(**tracker)
+    if errors != TrackingErrors():
+        pictures = with_errors(pictures, reference, errors, seed)
     path = path_of(pictures, reference)
     about = _of_path(pictures, path)
     patient = _patient(scene)
     make_folder(out)
+    if errors != TrackingErrors():
+        write_sweep(out / "tracked.igs.mha", pictures)
     if reach_mm is None:
         reach_mm = usual_reach_mm(path, spacing_mm)
     places = None
@@ -100,7 +127,15 @@ def reconstruct(
     with tqdm(total=len(path.frames), desc="reconstruct", unit="picture") as bar:
         try:
             rebuilt = rebuild(
-                pictures, path, lit(pictures.images), spacing_mm, method, reach_mm, marks, places, done=bar.update
+                pictures,
+                path,
+                lit(pictures.images),
+                spacing_mm,
+                method,
+                reach_mm,
+                marks,
+                places,
+                done=bar.update,
             )
         except ValueError as error:
             raise Fault(f"{sweep.name}: {error}") from None
@@ -110,6 +145,7 @@ def reconstruct(
         reach_mm=reach_mm,
         reference=reference,
         undo_compression=undo_compression,
+        tracker=tracker,
         **about,
         shape=list(rebuilt.box.shape),
         agreement=_agreement(rebuilt, patient),

@@ -12,6 +12,7 @@ from studies.freehand.unsqueeze import come, shifted
 from studies.readings import read
 from studies.rehearsal import Rehearsal, scanned_anatomy
 from ultrasound.array import Probe
+from ultrasound.bmode import source_of_pixels
 from ultrasound.marks import Marks
 from ultrasound.plane import ImagePlane, PlaneInTissue
 from ultrasound.probe import advanced, touching
@@ -37,6 +38,8 @@ class Truth:
     beads_mm: np.ndarray
     compression_mm: float = 0.0
     on_probe: np.ndarray = field(default_factory=lambda: np.eye(4))
+    mask: np.ndarray | None = None
+    """Pixels (rows, columns) that the probe shows; None: all."""
 
 
 def beads_of(organ: trimesh.Trimesh, tumour: trimesh.Trimesh | None) -> np.ndarray:
@@ -141,7 +144,8 @@ def _truth(
     images: np.ndarray, poses: np.ndarray, times_s: np.ndarray, probe: Probe, beads_mm: np.ndarray
 ) -> Truth:
     on_probe = probe.image_to_probe(*images.shape[1:])
-    return Truth(sweep_of(images, poses, times_s, on_probe), poses, beads_mm, on_probe=on_probe)
+    mask = source_of_pixels(probe, images.shape[1])[..., 0] > -1.0
+    return Truth(sweep_of(images, poses, times_s, on_probe), poses, beads_mm, on_probe=on_probe, mask=mask)
 
 
 def sweep_of(

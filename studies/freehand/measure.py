@@ -1,7 +1,7 @@
 """How true a volume made of a tracked sweep is: of the resting kidney, against noise, and against compression."""
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,8 @@ PROBE = "curvilinear"
 SPACING_MM, REACH_MM, PIXELS = 1.0, 2.0, 192
 # Of the resting sweep every so manieth picture, for the curves.
 EVERY = 3
+# How far around the hilum the organ is held, or a probe that glides would roll it away.
+HELD_MM = 15.0
 DEPTHS_MM = (0.5, 2.0, 4.0, 6.0, 8.0)
 # One error at a time, then all of a good optical and of a poor electromagnetic tracker.
 SWEPT: dict[str, tuple[float, ...]] = {
@@ -91,13 +93,11 @@ def noise_curves(
     truth: Truth, surfaces: dict[str, trimesh.Trimesh], quick: bool, done: Callable[[], Any]
 ) -> list[dict[str, Any]]:
     """Figures of the resting sweep, as trackers of one error each have it."""
-    few = Truth(
-        sweep_of(
-            truth.sweep.images[::EVERY], truth.poses[::EVERY], truth.sweep.times_s[::EVERY], truth.on_probe
-        ),
-        truth.poses[::EVERY],
-        truth.beads_mm,
-        on_probe=truth.on_probe,
+    times = truth.sweep.times_s[::EVERY]
+    few = replace(
+        truth,
+        sweep=sweep_of(truth.sweep.images[::EVERY], truth.poses[::EVERY], times, truth.on_probe),
+        poses=truth.poses[::EVERY],
     )
     trials = [TrackingErrors()] + [
         TrackingErrors(**{name: size}) for name, sizes in SWEPT.items() for size in _sizes(sizes, quick)
@@ -115,7 +115,9 @@ def compression(
 ) -> list[dict[str, Any]]:
     """Figures of sweeps over the tumour, pressed in more and more: as they are, and with the compression undone."""
     start(arch)
-    rehearsal = Rehearsal(with_options(scene_of(scene, setup), {"image.pixels": PIXELS}), anatomy)
+    small = with_options(scene_of(scene, setup), {"image.pixels": PIXELS})
+    held = scene.attachment.model_copy(update={"radius_mm": HELD_MM if scene.attachment.at_mm else 0.0})
+    rehearsal = Rehearsal(small.model_copy(update={"attachment": held}), anatomy)
     surfaces = surfaces_of(anatomy)
     rows = []
     for depth in _depths(quick):
@@ -139,8 +141,6 @@ def _row(
 ) -> dict[str, Any]:
     sweep = sweep_of(truth.sweep.images, poses, truth.sweep.times_s, truth.on_probe)
     path = path_of(sweep, REFERENCE)
-    everywhere = np.ones(sweep.images.shape[1:], bool)
-    rebuilt = rebuild(
-        sweep, path, everywhere, SPACING_MM, method, REACH_MM, sweep, places=places, with_grey=False
-    )
+    mask = np.ones(sweep.images.shape[1:], bool) if truth.mask is None else truth.mask
+    rebuilt = rebuild(sweep, path, mask, SPACING_MM, method, REACH_MM, sweep, places=places, with_grey=False)
     return compared(rebuilt, surfaces, truth.beads_mm)

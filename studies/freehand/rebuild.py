@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.ndimage import find_objects
+from scipy.ndimage import binary_erosion, find_objects
 
 from ultrasound.reconstruction import Reconstruction, VoxelBox
 from ultrasound.sweep import Mark, Sweep, SweepError
@@ -97,7 +97,7 @@ def rebuild(
     if not with_grey:
         channels.pop(GREY)
     gathered = {name: Reconstruction(box, method) for name in channels}
-    beads = _Beads()
+    beads = _Beads(mask)
     for k, frame in enumerate(path.frames):
         at = None if places is None else places(int(frame))
         for name, is_of in channels.items():
@@ -107,7 +107,7 @@ def rebuild(
             else:
                 gathered[name].add_points(values[mask], at[mask])
         if marks is not None:
-            beads.add(marks.images[frame], path.matrices[k], at)
+            beads.add(marks.images[frame], path.matrices[k], at, k in (0, len(path.frames) - 1))
         done()
     volumes = {name: each.volume(reach_mm) for name, each in gathered.items()}
     known = next(iter(volumes.values()))[1]
@@ -127,12 +127,14 @@ def _channels(marks: Sweep | None) -> dict[str, Callable[[np.ndarray], np.ndarra
 
 
 class _Beads:
-    """Gathers where the pixels of each bead are."""
+    """Gathers where the pixels of each bead are. One that the pictures' edge cuts, or the sweep's end, has no middle."""
 
-    def __init__(self) -> None:
+    def __init__(self, mask: np.ndarray) -> None:
+        self._edge = ~binary_erosion(mask)
         self._sums: dict[int, np.ndarray] = {}
+        self._cut: set[int] = set()
 
-    def add(self, marks: np.ndarray, matrix: np.ndarray, at: np.ndarray | None) -> None:
+    def add(self, marks: np.ndarray, matrix: np.ndarray, at: np.ndarray | None, is_end: bool) -> None:
         """A picture of marks (rows, columns): where its pixels are by a matrix, or one by one (rows, columns, 3) [mm]."""
         rows, columns = np.nonzero(marks >= Mark.BEAD)
         if at is not None:
@@ -141,11 +143,13 @@ class _Beads:
             pixels = np.column_stack([columns, rows, np.zeros(len(rows)), np.ones(len(rows))])
             places = pixels @ matrix[:3].T
         beads = marks[rows, columns] // Mark.BEAD - 1
+        cut = beads if is_end else beads[self._edge[rows, columns]]
+        self._cut |= set(cut.tolist())
         for bead in map(int, np.unique(beads)):
             own = places[beads == bead]
             self._sums[bead] = self._sums.get(bead, np.zeros(4)) + np.append(own.sum(axis=0), len(own))
 
     @property
     def middles(self) -> dict[int, np.ndarray]:
-        """Mean place (3,) [mm] of each bead's pixels, by its place in their order."""
-        return {bead: total[:3] / total[3] for bead, total in self._sums.items()}
+        """Mean place (3,) [mm] of the pixels of each bead that was seen whole, by its place in their order."""
+        return {bead: total[:3] / total[3] for bead, total in self._sums.items() if bead not in self._cut}

@@ -1,5 +1,6 @@
 """The picture of ``study freehand``: error against noise and against compression."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ def _against_noise(axes: Axes, runs: list[dict[str, Any]], name: str, label: str
         colour = f"C{number}"
         axes.plot(at, [row["landmarks"]["mean_mm"] for row in rows], "o-", color=colour, label=run["patient"])
         if "tumour" in rows[0]:
-            tumour = [(row["tumour"]["scanned_part"] or {}).get("centroid_mm") for row in rows]
+            tumour = [(row["tumour"]["scanned_part"] or {}).get("centroid_mm", math.nan) for row in rows]
             axes.plot(at, tumour, "s--", color=colour, alpha=0.6)
     axes.set_xlabel(label)
     axes.set_ylabel("mm")

@@ -1,0 +1,30 @@
+"""A recorded sweep as a tracker with errors would have written it."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ultrasound.sweep import Sweep, SweepError, transform_text
+from ultrasound.tracking import TrackingErrors, tracked
+
+
+def with_errors(sweep: Sweep, reference: str, errors: TrackingErrors, seed: int) -> Sweep:
+    """The sweep with a tracker's errors on the poses of its probe; frames without a pose keep none.
+
+    Raises SweepError where poses or times cannot be used.
+    """
+    poses = [sweep.transform("Probe", reference, frame) for frame in range(len(sweep))]
+    known = [frame for frame, pose in enumerate(poses) if pose is not None]
+    if not known:
+        raise SweepError(f"no frame has a pose of the probe in {reference}, on which errors could be put")
+    try:
+        found = tracked(
+            np.stack([pose for pose in poses if pose is not None]), sweep.times_s[known], errors, seed
+        )
+    except ValueError as error:
+        raise SweepError(f"errors of a tracker cannot be put on this sweep: {error}") from None
+    name, frames = f"ProbeTo{reference}Transform", [dict(fields) for fields in sweep.frames]
+    for frame, pose in zip(known, found, strict=True):
+        frames[frame][name] = transform_text(np.eye(4) if pose is None else pose)
+        frames[frame][f"{name}Status"] = "INVALID" if pose is None else "OK"
+    return replace(sweep, frames=frames)
