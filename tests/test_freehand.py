@@ -19,7 +19,7 @@ from studies.freehand.compare import compared, inside, wider
 from studies.freehand.experiment import sweep_of
 from studies.freehand.files import save_volumes
 from studies.freehand.picture import save_picture
-from studies.freehand.rebuild import Rebuilt, lit, path_of, rebuild
+from studies.freehand.rebuild import Rebuilt, lit, rebuild, track_of
 from studies.freehand.study_command import table, write_csv
 from studies.freehand.study_picture import draw
 from studies.setup import PRESETS
@@ -87,7 +87,7 @@ def check_balls(rebuilt: Rebuilt, off_mm: float) -> None:
 @pytest.mark.parametrize(("method", "off_mm"), [("smooth", 0.1), ("nearest", 0.5)])
 def test_balls_come_back_where_they_are(marked, method, off_mm):
     # Nearest voxels are off by up to half of one, all to one side where pictures lie as evenly as the voxels.
-    rebuilt = rebuild(marked, path_of(marked, "Reference"), ALL, 1.0, method, 2.0, marked, with_grey=False)
+    rebuilt = rebuild(marked, track_of(marked, "Reference"), ALL, 1.0, method, 2.0, marked, with_grey=False)
     check_balls(rebuilt, off_mm)
     assert sorted(rebuilt.beads) == [0, 1]
     # Some hundred pixels in a ball of 2 mm, of 0.5 x 0.8 x 0.8 mm: the mean of their middles is off by less than a tenth of one.
@@ -103,7 +103,7 @@ def test_what_was_squeezed_comes_back_as_it_was_at_rest(device, marked):
         return CENTRE + (places_of(way[frame]) - CENTRE) @ np.linalg.inv(now_from_rest).T
 
     squeezed = swept(np.stack([marks_at(at_rest(frame)) for frame in range(len(way))]))
-    path = path_of(squeezed, "Reference")
+    path = track_of(squeezed, "Reference")
     seen, undone = (
         rebuild(squeezed, path, ALL, 1.0, "smooth", 2.0, squeezed, places, with_grey=False)
         for places in (None, at_rest)
@@ -120,7 +120,7 @@ def test_frames_without_pose_or_picture_are_left_out(marked):
     images[[3, 20]] = 255
     sweep = swept(images, lost=(3, 11))
     sweep.frames[20]["ImageStatus"] = "INVALID"
-    path = path_of(sweep, "Reference")
+    path = track_of(sweep, "Reference")
     assert set(range(len(images))) - set(path.frames) == {3, 11, 20}
     assert path.matrices[3] == pytest.approx(poses()[4] @ ON_PROBE)
     # 0.8 mm each, and 1.6 over the three gaps.
@@ -139,20 +139,20 @@ def test_only_the_sector_that_is_lit_counts():
     sweep = swept(images)
     mask = lit(np.concatenate([0 * images[:1], images]))
     assert np.array_equal(mask, SECTOR)
-    rebuilt = rebuild(sweep, path_of(sweep, "Reference"), mask, 1.0, "smooth", 2.0)
+    rebuilt = rebuild(sweep, track_of(sweep, "Reference"), mask, 1.0, "smooth", 2.0)
     assert rebuilt.grey[rebuilt.known] == pytest.approx(120)
     # Voxels on the border count as soon as a pixel is in them: half a voxel farther out on average, and gaps are closed.
     volume, sides = SECTOR.sum() * 0.4 * 0.8 * len(images), 2 * (46 + 48) * 46 + 2 * 46 * 48
     assert volume < rebuilt.known.sum() < volume + 0.6 * sides
     small = replace(sweep, images=sweep.images[:, :20])
-    tight = rebuild(small, path_of(small, "Reference"), SECTOR[:20], 1.0, "smooth", 2.0)
+    tight = rebuild(small, track_of(small, "Reference"), SECTOR[:20], 1.0, "smooth", 2.0)
     assert np.prod(tight.box.shape) < 0.6 * np.prod(rebuilt.box.shape)
 
 
 def test_sweeps_that_make_no_volume_are_refused_in_words(marked):
-    path = path_of(marked, "Reference")
+    path = track_of(marked, "Reference")
     with pytest.raises(SweepError, match="valid pose in Reference, of 58 frames"):
-        path_of(swept(marked.images, lost=tuple(range(58))), "Reference")
+        track_of(swept(marked.images, lost=tuple(range(58))), "Reference")
     with pytest.raises(SweepError, match="black"):
         rebuild(marked, path, ~ALL, 1.0, "smooth", 2.0)
     with pytest.raises(SweepError, match=r"marks of \(58, 60, 91\): expected \(58, 60, 92\)"):
@@ -240,7 +240,7 @@ def test_files_have_each_voxel_at_its_place(tmp_path):
 
 
 def test_the_picture_shows_the_cuts_through_the_tumour(tmp_path, marked):
-    path = path_of(marked, "Reference")
+    path = track_of(marked, "Reference")
     rebuilt = rebuild(replace(marked, images=marked.images * 60), path, ALL, 1.0, "smooth", 2.0, marked)
     save_picture(rebuilt, tmp_path / "with.png")
     save_picture(replace(rebuilt, regions={}), tmp_path / "without.png")

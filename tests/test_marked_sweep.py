@@ -21,7 +21,7 @@ from sim.distance import signed_distance
 from sim.embedding import Unmoved
 from studies.freehand import unsqueeze
 from studies.freehand.experiment import sweep_of
-from studies.freehand.rebuild import path_of
+from studies.freehand.rebuild import track_of
 from studies.freehand.unsqueeze import Unsqueezed
 from studies.rehearse.sweeping import Sweeping, probe_in_patient
 from ultrasound import reconstruction
@@ -212,7 +212,7 @@ def test_undoing_takes_the_tracked_way_and_finds_still_tissue_where_the_tracker_
     on_probe, way = probe.image_to_probe(32, 32), over_tumour()[::5]
     sweep = sweep_of(np.zeros((len(way), 32, 32), np.uint8), way, np.array([0.0, 0.1, 9.0]), on_probe)
     still = Still(np.array([-61.0, 112.0, 1240.0]), 20.0)
-    places = Unsqueezed(still, sweep, path_of(sweep, "Reference"), "Reference")
+    places = Unsqueezed(still, sweep, track_of(sweep, "Reference"), "Reference")
     begun = len(still.way)
     assert begun == (unsqueeze.COMES_S + unsqueeze.WAITS_S) * 60
     row, column = np.indices((32, 32))
@@ -231,7 +231,7 @@ def test_undoing_takes_the_tracked_way_and_finds_still_tissue_where_the_tracker_
 def test_what_no_probe_can_press_again_is_refused(device):
     sweep = sweep_of(np.zeros((1, 32, 30), np.uint8), np.eye(4)[None], np.zeros(1), np.eye(4))
     with pytest.raises(SweepError, match="32 x 30 pixels: expected a sweep that Nephron recorded"):
-        Unsqueezed(Still(np.zeros(3), 20.0), sweep, path_of(sweep, "Reference"), "Reference")
+        Unsqueezed(Still(np.zeros(3), 20.0), sweep, track_of(sweep, "Reference"), "Reference")
 
 
 @pytest.fixture(scope="module")

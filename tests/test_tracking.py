@@ -5,6 +5,9 @@ import pytest
 from conftest import rotation_about
 from scipy.spatial.transform import Rotation
 
+from studies.freehand.experiment import sweep_of
+from studies.freehand.tracker import with_errors
+from ultrasound.sweep import Sweep, SweepError
 from ultrasound.tracking import TrackingErrors, tracked
 
 FRAMES = 4000
@@ -167,3 +170,39 @@ def test_poses_without_their_times_are_refused():
         tracked(poses, times[:4], TrackingErrors())
     with pytest.raises(ValueError, match="grow"):
         tracked(poses, times[::-1], TrackingErrors())
+
+
+def recorded(count: int = 6) -> Sweep:
+    """A sweep along x whose third frame has no pose."""
+    poses: list[np.ndarray | None] = list(sweep(count)[0])
+    poses[2] = None
+    return sweep_of(np.ones((count, 4, 4), np.uint8), poses, np.arange(count) / 30, np.eye(4))
+
+
+def test_a_recorded_sweep_gets_the_errors_of_a_tracker_and_keeps_what_it_had_lost():
+    before, errors = recorded(), TrackingErrors(noise_mm=1.0, calibration_mm=2.0)
+    after = with_errors(before, "Reference", errors, seed=3)
+    known = [0, 1, 3, 4, 5]
+    poses = np.stack([before.transform("Probe", "Reference", k) for k in known])
+    expected = tracked(poses, before.times_s[known], errors, 3)
+    for k, pose in zip(known, expected, strict=True):
+        assert np.array_equal(after.transform("Probe", "Reference", k), pose)
+        assert not np.allclose(pose, before.transform("Probe", "Reference", k))
+    assert after.transform("Probe", "Reference", 2) is None
+    # The picture goes with the probe, and the sweep that was recorded stays as it was.
+    assert np.array_equal(after.transform("Image", "Reference", 4), expected[3])
+    assert before.frames == recorded().frames
+
+
+def test_frames_that_the_tracker_loses_have_no_pose():
+    after = with_errors(recorded(), "Reference", TrackingErrors(lost=1.0), 0)
+    assert all(after.transform("Probe", "Reference", k) is None for k in range(len(after)))
+    with pytest.raises(SweepError, match="no frame has a pose"):
+        with_errors(after, "Reference", TrackingErrors(noise_mm=1.0), 0)
+
+
+def test_errors_on_times_that_do_not_grow_are_refused():
+    still = recorded()
+    still.frames[4]["Timestamp"] = still.frames[3]["Timestamp"]
+    with pytest.raises(SweepError, match="times"):
+        with_errors(still, "Reference", TrackingErrors(latency_s=0.1), 0)

@@ -13,8 +13,7 @@ from scenes.scene import Scene, load_scene
 from studies.commands import Fault, arch_option, make_folder, start_taichi
 from studies.freehand.files import save_volumes
 from studies.freehand.picture import save_picture
-from studies.freehand.rebuild import Path as SweepPath
-from studies.freehand.rebuild import Places, Rebuilt, lit, path_of, rebuild
+from studies.freehand.rebuild import Places, Rebuilt, Track, lit, rebuild, track_of
 from studies.freehand.tracker import with_errors
 from studies.setup import probe_of
 from ultrasound.marked_sweep import marks_beside
@@ -113,22 +112,22 @@ def reconstruct(
     errors = TrackingErrors(**tracker)
     if errors != TrackingErrors():
         pictures = with_errors(pictures, reference, errors, seed)
-    path = path_of(pictures, reference)
-    about = _of_path(pictures, path)
+    track = track_of(pictures, reference)
+    about = _of_track(pictures, track)
     patient = _patient(scene)
     make_folder(out)
     if errors != TrackingErrors():
         write_sweep(out / "tracked.igs.mha", pictures)
     if reach_mm is None:
-        reach_mm = usual_reach_mm(path, spacing_mm)
+        reach_mm = usual_reach_mm(track, spacing_mm)
     places = None
     if undo_compression and patient is not None:
-        places = _unsqueezed(patient, pictures, path, reference, arch)
-    with tqdm(total=len(path.frames), desc="reconstruct", unit="picture") as bar:
+        places = _unsqueezed(patient, pictures, track, reference, arch)
+    with tqdm(total=len(track.frames), desc="reconstruct", unit="picture") as bar:
         try:
             rebuilt = rebuild(
                 pictures,
-                path,
+                track,
                 lit(pictures.images),
                 spacing_mm,
                 method,
@@ -157,9 +156,9 @@ def reconstruct(
     click.echo(f"Wrote volume.nrrd, volume.png and report.json to {out}")
 
 
-def usual_reach_mm(path: SweepPath, spacing_mm: float) -> float:
+def usual_reach_mm(track: Track, spacing_mm: float) -> float:
     """So far that most gaps between pictures close, and two voxels at least [mm]."""
-    usual = float(np.percentile(path.steps_mm, 95)) if len(path.frames) > 1 else 0.0
+    usual = float(np.percentile(track.steps_mm, 95)) if len(track.frames) > 1 else 0.0
     return max(2 * spacing_mm, min(usual, MOST_REACH_MM))
 
 
@@ -172,7 +171,7 @@ def _patient(scene: Path | None) -> tuple[Scene, LoadedAnatomy, Path] | None:
 
 
 def _unsqueezed(
-    patient: tuple[Scene, LoadedAnatomy, Path], pictures: Sweep, path: SweepPath, reference: str, arch: str
+    patient: tuple[Scene, LoadedAnatomy, Path], pictures: Sweep, track: Track, reference: str, arch: str
 ) -> Places:
     scene, anatomy, folder = patient
     start_taichi(arch)
@@ -181,17 +180,17 @@ def _unsqueezed(
 
     click.echo("Building the model.")
     rehearsal = Rehearsal(scene, anatomy, probe_of(scene, folder))
-    return Unsqueezed(rehearsal, pictures, path, reference)
+    return Unsqueezed(rehearsal, pictures, track, reference)
 
 
-def _of_path(pictures: Sweep, path: SweepPath) -> dict[str, Any]:
+def _of_track(pictures: Sweep, track: Track) -> dict[str, Any]:
     """How many pictures there are, how far apart and how fast the probe went."""
-    steps = path.steps_mm
-    waits = np.diff(pictures.times_s[path.frames])
+    steps = track.steps_mm
+    waits = np.diff(pictures.times_s[track.frames])
     speed = steps[waits > 0] / waits[waits > 0]
     return dict(
         frames=len(pictures),
-        used=len(path.frames),
+        used=len(track.frames),
         way_mm=round(float(steps.sum()), 3),
         between_median_mm=round(float(np.median(steps)), 4) if len(steps) else 0.0,
         between_max_mm=round(float(steps.max()), 4) if len(steps) else 0.0,

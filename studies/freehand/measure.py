@@ -12,7 +12,7 @@ from scenes.scene import Scene, with_options
 from sim.device import start
 from studies.freehand.compare import compared
 from studies.freehand.experiment import Truth, pressed, resting, sweep_of
-from studies.freehand.rebuild import Places, path_of, rebuild
+from studies.freehand.rebuild import Places, rebuild, track_of
 from studies.freehand.unsqueeze import Unsqueezed
 from studies.rehearsal import Rehearsal
 from studies.setup import Setup, scene_of
@@ -123,8 +123,8 @@ def compression(
     for depth in _depths(quick):
         truth = pressed(rehearsal, depth)
         rehearsal.reset()
-        path = path_of(truth.sweep, REFERENCE)
-        unsqueezed = Unsqueezed(rehearsal, truth.sweep, path, REFERENCE)
+        track = track_of(truth.sweep, REFERENCE)
+        unsqueezed = Unsqueezed(rehearsal, truth.sweep, track, REFERENCE)
         for undone, places in ((False, None), (True, unsqueezed)):
             row = dict(depth_mm=depth, compression_mm=round(truth.compression_mm, 4), undone=undone)
             rows.append(row | _row(truth, truth.poses, surfaces, places))
@@ -140,7 +140,7 @@ def _row(
     method: str = "smooth",
 ) -> dict[str, Any]:
     sweep = sweep_of(truth.sweep.images, poses, truth.sweep.times_s, truth.on_probe)
-    path = path_of(sweep, REFERENCE)
+    track = track_of(sweep, REFERENCE)
     mask = np.ones(sweep.images.shape[1:], bool) if truth.mask is None else truth.mask
-    rebuilt = rebuild(sweep, path, mask, SPACING_MM, method, REACH_MM, sweep, places=places, with_grey=False)
+    rebuilt = rebuild(sweep, track, mask, SPACING_MM, method, REACH_MM, sweep, places=places, with_grey=False)
     return compared(rebuilt, surfaces, truth.beads_mm)

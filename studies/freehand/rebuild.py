@@ -17,8 +17,8 @@ Places = Callable[[int], np.ndarray]
 
 
 @dataclass(frozen=True)
-class Path:
-    """Which frames of a sweep have picture and pose: ``frames`` (n,), and image to reference ``matrices`` (n, 4, 4)."""
+class Track:
+    """Where a probe was: which frames of a sweep have picture and pose: ``frames`` (n,), and image to reference ``matrices`` (n, 4, 4)."""
 
     frames: np.ndarray
     matrices: np.ndarray
@@ -40,7 +40,7 @@ class Rebuilt:
     beads: dict[int, np.ndarray] = field(default_factory=dict)
 
 
-def path_of(sweep: Sweep, reference: str) -> Path:
+def track_of(sweep: Sweep, reference: str) -> Track:
     """Where the pictures of a sweep are in a coordinate system. Raises SweepError where it has none, or none with a pose."""
     found = [(k, sweep.transform("Image", reference, k)) for k in range(len(sweep)) if sweep.is_image_ok(k)]
     usable = [(k, matrix) for k, matrix in found if matrix is not None]
@@ -48,7 +48,7 @@ def path_of(sweep: Sweep, reference: str) -> Path:
         raise SweepError(
             f"no picture with a valid pose in {reference}, of {len(sweep)} frames: expected status OK in some"
         )
-    return Path(np.array([k for k, _ in usable]), np.stack([matrix for _, matrix in usable]))
+    return Track(np.array([k for k, _ in usable]), np.stack([matrix for _, matrix in usable]))
 
 
 def lit(images: np.ndarray) -> np.ndarray:
@@ -56,17 +56,17 @@ def lit(images: np.ndarray) -> np.ndarray:
     return images.max(axis=0) > 0
 
 
-def corners_of(path: Path, mask: np.ndarray) -> np.ndarray:
+def corners_of(track: Track, mask: np.ndarray) -> np.ndarray:
     """Corners (4 n, 3) [mm] of the part of the pictures (rows, columns) that a mask keeps."""
     rows, columns = find_objects(mask.astype(np.uint8))[0]
     u, v = (np.array([s.start, s.stop - 1], float) for s in (columns, rows))
     pixels = np.array([[x, y, 0.0, 1.0] for x in u for y in v])
-    return (pixels @ path.matrices.transpose(0, 2, 1))[..., :3].reshape(-1, 3)
+    return (pixels @ track.matrices.transpose(0, 2, 1))[..., :3].reshape(-1, 3)
 
 
 def rebuild(
     sweep: Sweep,
-    path: Path,
+    track: Track,
     mask: np.ndarray,
     spacing_mm: float,
     method: str,
@@ -88,7 +88,7 @@ def rebuild(
         )
     if not mask.any():
         raise SweepError("all pictures are black: there is nothing to put together")
-    corners = corners_of(path, mask)
+    corners = corners_of(track, mask)
     if places is not None:
         # What was squeezed is farther apart at rest.
         corners = np.concatenate([corners - reach_mm - 10.0, corners + reach_mm + 10.0])
@@ -98,16 +98,16 @@ def rebuild(
         channels.pop(GREY)
     gathered = {name: Reconstruction(box, method) for name in channels}
     beads = _Beads(mask)
-    for k, frame in enumerate(path.frames):
+    for k, frame in enumerate(track.frames):
         at = None if places is None else places(int(frame))
         for name, is_of in channels.items():
             values = sweep.images[frame] if is_of is None else is_of(marks.images[frame])  # type: ignore[union-attr]
             if at is None:
-                gathered[name].add(values, path.matrices[k], mask)
+                gathered[name].add(values, track.matrices[k], mask)
             else:
                 gathered[name].add_points(values[mask], at[mask])
         if marks is not None:
-            beads.add(marks.images[frame], path.matrices[k], at, k in (0, len(path.frames) - 1))
+            beads.add(marks.images[frame], track.matrices[k], at, k in (0, len(track.frames) - 1))
         done()
     volumes = {name: each.volume(reach_mm) for name, each in gathered.items()}
     known = next(iter(volumes.values()))[1]

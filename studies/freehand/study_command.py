@@ -14,7 +14,6 @@ from studies.commands import Fault, arch_option, make_folder, start_taichi
 from studies.setup import PRESETS
 
 SWEPT = ("noise_mm", "noise_deg", "calibration_mm", "calibration_deg", "latency_s", "lost")
-FIGURES = ("dice", "hd95_mm", "volume_percent", "centroid_mm")
 
 
 @click.command()

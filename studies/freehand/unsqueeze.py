@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from studies.freehand.rebuild import Path
+from studies.freehand.rebuild import Track
 from studies.rehearsal import Rehearsal
 from ultrasound.plane import ImagePlane, PlaneInTissue
 from ultrasound.probe import advanced, between, held_at, image_plane
@@ -15,19 +15,19 @@ LONGEST_S = 2.0
 
 
 class Unsqueezed:
-    """Called with the frames of a path in their order, it gives where the tissue at each pixel (rows, columns, 3) was at rest (LPS, mm).
+    """Called with the frames of a track in their order, it gives where the tissue at each pixel (rows, columns, 3) was at rest (LPS, mm).
 
     Raises SweepError for a sweep that has no probe, or pictures with other than as many rows as columns.
     """
 
-    def __init__(self, rehearsal: Rehearsal, sweep: Sweep, path: Path, reference: str) -> None:
+    def __init__(self, rehearsal: Rehearsal, sweep: Sweep, track: Track, reference: str) -> None:
         rows, columns = sweep.images.shape[1:]
         if rows != columns:
             raise SweepError(f"pictures of {rows} x {columns} pixels: expected a sweep that Nephron recorded")
         self.rehearsal, self.times_s = rehearsal, sweep.times_s
         self.plane = PlaneInTissue(rehearsal.embedding, rows)
         self._poses, self._on_probe = {}, {}
-        for frame in map(int, path.frames):
+        for frame in map(int, track.frames):
             probe, on_probe = (
                 sweep.transform("Probe", reference, frame),
                 sweep.transform("Image", "Probe", frame),
@@ -36,7 +36,7 @@ class Unsqueezed:
                 raise SweepError(f"frame {frame}: no pose of the probe, which is to be pressed again")
             self._on_probe[frame] = on_probe
             self._poses[frame] = held_at(shifted(probe, -rehearsal.origin), rehearsal.size_mm[2])
-        self._frame = int(path.frames[0])
+        self._frame = int(track.frames[0])
         come(rehearsal, self._poses[self._frame])
 
     def __call__(self, frame: int) -> np.ndarray:

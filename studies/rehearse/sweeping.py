@@ -51,6 +51,9 @@ class Sweeping:
 
     def watch(self, time_s: float, view: View, probe: Probe) -> str:
         """Add what is seen now, where a sweep goes on and a frame is due; what there is to say."""
+        if time_s < self._due_s - FRAME_S - 1e-9:
+            # A replay was taken over: another session, with a time of its own.
+            return self.end()
         if self._sweep is None or time_s < self._due_s - 1e-9 or self.rehearsal.scanner is None:
             return ""
         self._due_s = time_s + FRAME_S
@@ -58,9 +61,12 @@ class Sweeping:
         marks = self.rehearsal.scanner.marks.render()
         try:
             self._sweep.add(picture, marks, probe, probe_in_patient(self.rehearsal), time_s)
-        except (OSError, SweepError) as error:
-            said = self.end()
-            return said if _words(error) in said else f"{said}: {_words(error)}"
+        except SweepError as error:
+            return f"{self.end()}: {error}"
+        except OSError as error:
+            # A frame that was half written would be in the file.
+            self._sweep = None
+            return f"No sweep: {_words(error)}"
         return ""
 
 
