@@ -103,6 +103,12 @@ class Guard:
         self.home = self.solver.snapshot()
         self.watch = Watch(self.home)
 
+    def keep(self) -> None:
+        """Take the body's state now for the last good one, where it is well."""
+        health = self.health()
+        if health.tangled == 0.0 and not health.is_lost:
+            self.watch = Watch(self.solver.snapshot())
+
     def check(self, time_step_s: float) -> str:
         """Look at the body after a step; where it is no tissue any more put it back and say so, else an empty text."""
         health = self.health()

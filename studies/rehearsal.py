@@ -209,6 +209,10 @@ class Rehearsal:
         self.guard.watch = state.watch
         self.pose, self.steps, self.hand.grip = state.pose, state.steps, state.grip
 
+    def keep_good(self) -> None:
+        """Take the tissue, where it is well, for what its guard would put back."""
+        self.guard.keep()
+
     def update_surfaces(self) -> None:
         """Carry the surfaces that are drawn to where the body is."""
         self.organ_skin.update()

@@ -230,3 +230,17 @@ def test_a_pose_that_is_no_number_is_refused(device, ball):
     poses[-1, 0, 3] = np.nan
     with pytest.raises(ValueError, match="not finite"):
         solver.step(settings, poses)
+
+
+def test_tissue_is_kept_for_good_when_asked_for_but_not_what_is_none(device, ball):
+    solver, settings = solver_of("neo-hookean", ball, [floor()])
+    guard = Guard(solver)
+    for _ in range(5):
+        solver.step(settings)
+        guard.check(DT)
+    guard.keep()
+    kept = position(solver.body)
+    assert np.array_equal(guard.watch.good.body.position, kept) and guard.watch.steps_since_good == 0
+    put(solver, np.zeros_like(kept))
+    guard.keep()
+    assert np.array_equal(guard.watch.good.body.position, kept)

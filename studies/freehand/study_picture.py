@@ -28,6 +28,7 @@ def draw(runs: list[dict[str, Any]], path: Path) -> None:
         _against_noise(axes, runs, name, label)
     for axes, figure_name in zip(panels[6:], ("centroid_mm", "dice", "landmarks"), strict=True):
         _against_compression(axes, runs, figure_name)
+    figure.legend(*panels[6].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
     figure.suptitle("Volumes of tracked sweeps against the truth")
     figure.savefig(path, dpi=DPI)
 
@@ -68,5 +69,3 @@ def _against_compression(axes: Axes, runs: list[dict[str, Any]], name: str) -> N
     axes.set_title(titles[name] + ", of the part scanned", fontsize=9)
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.3)
-    if name == "centroid_mm":
-        axes.legend(fontsize=7)

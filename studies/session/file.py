@@ -272,6 +272,5 @@ def _file_away(second: Second, count: int, log: Log) -> None:
     for event in second.events:
         if event.kind == "state":
             log.states[event.at] = event.value
-        else:
-            log.events.setdefault(event.at, []).append(event)
+        log.events.setdefault(event.at, []).append(event)
     log.digests[second.at + count] = second.digest

@@ -3,7 +3,6 @@
 from collections import deque
 
 from studies.session.session import SETTLED, Session
-from studies.session.state import to_text
 
 MOST_UNDONE = 40
 # Input that comes sooner than this after the last goes on with the same action; an action takes no longer than that.
@@ -62,12 +61,11 @@ class History:
 
     def set_bookmark(self) -> int:
         """Keep this moment; how many bookmarks there are now."""
-        moment = self.session.keep()
-        self.bookmarks.append(moment)
+        # However much later it is gone to, a replay need not compute all from here on.
+        self.session.store()
+        self.bookmarks.append(self.session.keep())
         self._at = 0
         self.session.note("bookmark", len(self.bookmarks))
-        # However much later it is gone to, a replay need not compute all from here on.
-        self.session.note("state", to_text(self.session.kept[moment]))
         return len(self.bookmarks)
 
     def to_bookmark(self) -> int:

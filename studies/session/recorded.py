@@ -34,7 +34,7 @@ class Recorded:
         moment = session.moment
         self.recording.line(rehearsal.digest())
         if moment % self._state_every < self._line_every:
-            session.note("state", to_text(rehearsal.snapshot()))
+            session.store()
         return self.recording.fault if self.recording.fault != before else ""
 
     def close(self, summary: dict[str, Any]) -> None:

@@ -71,9 +71,9 @@ class Replay:
         moment = self.session.moment
         if self.is_over:
             raise SessionError("the session is over")
+        back, settings = self._set(moment)
         if any(to == moment for _, to in self._backs):
             self.session.keep()
-        back, settings = self._set(moment)
         if back is not None:
             if back not in self.session.kept:
                 self.session.kept[back] = self._state(self.log.states[back])
@@ -98,6 +98,8 @@ class Replay:
                 settings |= event.value
             elif event.kind == "back":
                 back = event.value
+            elif event.kind == "state":
+                self.rehearsal.keep_good()
         return back, settings
 
     def settings_until_now(self) -> dict[str, Any]:

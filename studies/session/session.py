@@ -7,6 +7,7 @@ import numpy as np
 
 from studies.rehearsal import Rehearsal, RehearsalState
 from studies.session.file import Kind
+from studies.session.state import to_text
 
 # The moment before the first: tissue settled, transducer just touching.
 SETTLED = -1
@@ -66,6 +67,14 @@ class Session:
         if self.moment not in self.kept:
             self.kept[self.moment] = self.rehearsal.snapshot()
         return self.moment
+
+    def store(self) -> None:
+        """Note the whole state of this moment, from which the session can be had without all that was before.
+
+        Its tissue becomes what its guard would put back, so that it need not be noted twice; a replay does the same.
+        """
+        self.rehearsal.keep_good()
+        self.note("state", to_text(self.rehearsal.snapshot()))
 
     def forget(self, is_needed: Callable[[int], bool]) -> None:
         """Let go of what was kept and is no longer needed."""

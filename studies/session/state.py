@@ -35,7 +35,7 @@ def to_text(state: RehearsalState) -> str:
     watch = state.watch
     arrays: dict[str, Any] = {
         **_of_solver("now", state.solver),
-        **_of_solver("good", watch.good),
+        **({} if _is_same(watch.good, state.solver) else _of_solver("good", watch.good)),
         "pose": state.pose,
         **{f"grip.{name}": value for name, value in asdict(state.grip).items() if value is not None},
         "numbers": [state.steps, watch.steps_since_good, watch.steps_tangled, watch.is_restored],
@@ -54,7 +54,8 @@ def from_text(text: str, like: RehearsalState) -> RehearsalState:
         arrays = dict(np.load(io.BytesIO(packed.fp.getvalue()), allow_pickle=False))  # type: ignore[union-attr]
         now = _solver(arrays, "now", like.solver)
         steps, since_good, tangled, restored = map(int, arrays["numbers"])
-        watch = Watch(_solver(arrays, "good", like.solver), since_good, tangled, bool(restored))
+        good = _solver(arrays, "good", like.solver) if "good.position" in arrays else now
+        watch = Watch(good, since_good, tangled, bool(restored))
         turn = tuple(map(float, arrays["grip.turn_deg"].reshape(3)))
         depth, pressed = float(arrays["grip.depth_mm"]), float(arrays["grip.pressed_mm"])
         aim = _pose(arrays, "grip.aim") if "grip.aim" in arrays else None
@@ -71,6 +72,11 @@ def _pose(arrays: dict[str, np.ndarray], name: str) -> np.ndarray:
     if pose.shape != (4, 4) or pose.dtype != float or not np.isfinite(pose).all():
         raise StateError(f"{name} is no pose")
     return pose
+
+
+def _is_same(one: SolverState, other: SolverState) -> bool:
+    arrays = zip(_of_solver("", one).values(), _of_solver("", other).values(), strict=True)
+    return all(np.array_equal(a, b) for a, b in arrays)
 
 
 def _of_solver(name: str, state: SolverState) -> dict[str, np.ndarray]:
