@@ -80,6 +80,9 @@ def main(arguments: list[str]) -> int:
         message = error.format_message()
     except MENDED_BY_USER as error:
         message = str(error)
+    except OSError as error:
+        # A disk that is full or a file that is in the way, where no command had better words.
+        message = f"{error.filename or 'a file'}: {error.strerror or error}"
     except (click.Abort, KeyboardInterrupt):
         click.echo("Stopped.", err=True)
         return 130

@@ -21,7 +21,7 @@ import taichi as ti
 from taichi.ui.utils import get_field_info
 
 from render.camera import FIELD_OF_VIEW_DEG, OrbitCamera
-from render.layout import Layout
+from render.layout import Layout, Rect
 from render.page import Page
 from render.sliders import boxes_of, draw_sliders
 from render.stage import Stage
@@ -181,10 +181,16 @@ class Window:
         left, bottom, right, top = self.layout.window_coordinates(self.layout.scene)
         x, y = self._cursor
         inside = left <= x <= right and bottom <= y <= top
-        if inside and self._help_shown:
-            left, bottom, right, top = self.layout.window_coordinates(self.layout.help)
-            return not (left <= x <= right and bottom <= y <= top)
+        for over in self._over_view():
+            left, bottom, right, top = self.layout.window_coordinates(over)
+            inside = inside and not (left <= x <= right and bottom <= y <= top)
         return inside
+
+    def _over_view(self) -> list[Rect]:
+        """What lies over the 3D view now."""
+        if self._help_shown:
+            return [self.layout.help]
+        return [self.layout.findings] if self._view is not None and self._view.findings else []
 
     def _place_in_picture(self) -> tuple[float, float] | None:
         """The place on the image plane [mm] under the mouse."""
@@ -299,11 +305,7 @@ class Window:
         self._page.compose(view, self.settings, self._help_shown, self._visible)
         _put_image(self._canvas, self._page.pixels)
         self._aim()
-        rects = [self.layout.panel, self.layout.title, self.layout.strip]
-        if self._help_shown:
-            rects.append(self.layout.help)
-        elif view.findings:
-            rects.append(self.layout.findings)
+        rects = [self.layout.panel, self.layout.title, self.layout.strip, *self._over_view()]
         masked = [self.layout.window_coordinates(rect) for rect in rects]
         self._stage.draw(self._scene, view, self.settings, masked)
         self._canvas.scene(self._scene)

@@ -239,7 +239,7 @@ def test_tissue_is_kept_for_good_when_asked_for_but_not_what_is_none(device, bal
         solver.step(settings)
         guard.check(DT)
     guard.keep()
-    kept = position(solver.body)
+    kept = position(solver)
     assert np.array_equal(guard.watch.good.body.position, kept) and guard.watch.steps_since_good == 0
     put(solver, np.zeros_like(kept))
     guard.keep()

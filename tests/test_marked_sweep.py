@@ -170,7 +170,7 @@ def test_a_picture_of_another_size_ends_a_sweep_with_what_there_is(tmp_path):
 
 def test_both_files_or_none(tmp_path):
     rehearsal, view = recording()
-    sweep = MarkedSweep(tmp_path, "s")
+    sweep = MarkedSweep(tmp_path, "s", rehearsal.probe)
     picture = view.pictures["B-mode"]
     sweep.add(picture, picture % 3, rehearsal.probe, probe_in_patient(rehearsal), 0.0)
     # The pictures find a folder where their file should be.
@@ -239,7 +239,8 @@ def swept(tmp_path_factory) -> Path:
     """A sweep over the embedded patient's tumour, with marks by its surfaces."""
     folder = tmp_path_factory.mktemp("swept")
     organ, tumour = (load_surface(phantom_folder(), f"{name}.stl") for name in ("organ", "tumour"))
-    probe, sweep = load_probe("drop-in"), MarkedSweep(folder, "over")
+    probe = load_probe("drop-in")
+    sweep = MarkedSweep(folder, "over", probe)
     row, column = np.indices((64, 64))
     pixels = np.stack([column, row, 0 * row, 1 + 0 * row], axis=-1).reshape(-1, 4)
     way = over_tumour()

@@ -9,14 +9,22 @@ from ultrasound.sweep import Sweep, SweepError
 from ultrasound.sweep_file import SweepWriter, read_sweep
 
 SUFFIX, MARKS = ".igs.mha", "-marks.igs.mha"
+# In the header: what took the pictures.
+PROBE_FIELD = "TransducerName"
 
 
 class MarkedSweep:
-    """Writes STEM.igs.mha and STEM-marks.igs.mha into a folder, both or none. Reference is the patient (LPS, mm). Raises OSError."""
+    """Writes STEM.igs.mha and STEM-marks.igs.mha into a folder, both or none; the header names the probe.
 
-    def __init__(self, folder: Path, stem: str) -> None:
+    Reference is the patient (LPS, mm). Raises OSError.
+    """
+
+    def __init__(self, folder: Path, stem: str, probe: Probe) -> None:
         self.name = f"{stem}{SUFFIX}"
-        self._pictures, self._marks = (SweepWriter(folder / f"{stem}{end}") for end in (SUFFIX, MARKS))
+        fields = {PROBE_FIELD: probe.transducer_name}
+        self._pictures, self._marks = (
+            SweepWriter(folder / f"{stem}{end}", fields) for end in (SUFFIX, MARKS)
+        )
 
     @property
     def count(self) -> int:

@@ -10,6 +10,8 @@ from ultrasound.plane import Picture, PlaneInTissue
 from ultrasound.sweep import Mark
 from ultrasound.volume import Volume
 
+MOST_BEADS = 255 // Mark.BEAD
+
 
 @ti.data_oriented
 class Marks:
@@ -30,6 +32,8 @@ class Marks:
         self.tumour: Any = tumour
         self.has_tumour = tumour is not None
         self.beads = 0 if beads is None else len(beads)
+        if self.beads > MOST_BEADS:
+            raise ValueError(f"{self.beads} beads: a pixel has room for {MOST_BEADS}")
         if beads is not None:
             self.bead = ti.Vector.field(3, ti.f32, len(beads))
             self.bead.from_numpy(np.asarray(beads, np.float32))

@@ -16,7 +16,7 @@ from studies.freehand.picture import save_picture
 from studies.freehand.rebuild import Places, Rebuilt, Track, lit, rebuild, track_of
 from studies.freehand.tracker import with_errors
 from studies.setup import probe_of
-from ultrasound.marked_sweep import marks_beside
+from ultrasound.marked_sweep import PROBE_FIELD, marks_beside
 from ultrasound.reconstruction import METHODS
 from ultrasound.sweep import Sweep, load_constants
 from ultrasound.sweep_file import read_sweep, write_sweep
@@ -109,7 +109,10 @@ def reconstruct(
     pictures = read_sweep(sweep)
     pictures.constant |= load_constants(config) if config else {}
     marks = marks_beside(sweep)
-    errors = TrackingErrors(**tracker)
+    try:
+        errors = TrackingErrors(**tracker)
+    except ValueError as error:
+        raise Fault(f"errors of a tracker: {error}") from None
     if errors != TrackingErrors():
         pictures = with_errors(pictures, reference, errors, seed)
     track = track_of(pictures, reference)
@@ -138,6 +141,7 @@ def reconstruct(
             )
         except ValueError as error:
             raise Fault(f"{sweep.name}: {error}") from None
+    save_volumes(rebuilt, out)
     report = dict(
         method=method,
         spacing_mm=spacing_mm,
@@ -149,7 +153,6 @@ def reconstruct(
         shape=list(rebuilt.box.shape),
         agreement=_agreement(rebuilt, patient),
     )
-    save_volumes(rebuilt, out)
     save_picture(rebuilt, out / "volume.png")
     (out / "report.json").write_text(json.dumps(report, indent=2) + "\n", "utf-8")
     click.echo(in_words(report))
@@ -179,7 +182,14 @@ def _unsqueezed(
     from studies.rehearsal import Rehearsal
 
     click.echo("Building the model.")
-    rehearsal = Rehearsal(scene, anatomy, probe_of(scene, folder))
+    probe = probe_of(scene, folder)
+    taken_with = pictures.fields.get(PROBE_FIELD, probe.transducer_name)
+    if taken_with != probe.transducer_name:
+        raise Fault(
+            f"--undo-compression: the sweep was taken with the probe {taken_with}, the scene has {probe.transducer_name}: "
+            "set transducer.probe in the scene"
+        )
+    rehearsal = Rehearsal(scene, anatomy, probe)
     return Unsqueezed(rehearsal, pictures, track, reference)
 
 
@@ -206,7 +216,11 @@ def _agreement(rebuilt: Rebuilt, patient: tuple[Scene, LoadedAnatomy, Path] | No
 
     anatomy = patient[1]
     surfaces = {"organ": anatomy.organ} | ({"tumour": anatomy.tumour} if anatomy.tumour is not None else {})
-    return compared(rebuilt, surfaces)
+    try:
+        return compared(rebuilt, surfaces)
+    except ValueError as error:
+        click.echo(f"Not compared with the whole organ: {error}")
+        return {}
 
 
 def in_words(report: dict[str, Any]) -> str:

@@ -13,7 +13,7 @@ from studies.readings import read
 from studies.rehearsal import Rehearsal, scanned_anatomy
 from ultrasound.array import Probe
 from ultrasound.bmode import source_of_pixels
-from ultrasound.marks import Marks
+from ultrasound.marks import MOST_BEADS, Marks
 from ultrasound.plane import ImagePlane, PlaneInTissue
 from ultrasound.probe import advanced, touching
 from ultrasound.scanner import Scanner
@@ -53,7 +53,10 @@ def beads_of(organ: trimesh.Trimesh, tumour: trimesh.Trimesh | None) -> np.ndarr
     )
     near = grid[np.linalg.norm(grid - middle, axis=1) < BEADS_WITHIN_MM]
     depth = -signed_distance(organ.vertices, organ.faces, near)[0]
-    return near[depth > 2 * BEAD_RADIUS_MM]
+    inside = near[depth > 2 * BEAD_RADIUS_MM]
+    # Of more than there is room for, those nearest to the middle.
+    nearest = np.argsort(np.linalg.norm(inside - middle, axis=1), kind="stable")[:MOST_BEADS]
+    return inside[np.sort(nearest)]
 
 
 def resting(anatomy: LoadedAnatomy, probe: Probe, direction: np.ndarray, pixels: int) -> Truth:

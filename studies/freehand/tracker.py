@@ -27,4 +27,12 @@ def with_errors(sweep: Sweep, reference: str, errors: TrackingErrors, seed: int)
     for frame, pose in zip(known, found, strict=True):
         frames[frame][name] = transform_text(np.eye(4) if pose is None else pose)
         frames[frame][f"{name}Status"] = "INVALID" if pose is None else "OK"
-    return replace(sweep, frames=frames)
+    after = replace(sweep, frames=frames)
+    first, pose = next(
+        ((frame, pose) for frame, pose in zip(known, found, strict=True) if pose is not None), (0, None)
+    )
+    if pose is not None and not np.array_equal(pose, after.transform("Probe", reference, first)):  # type: ignore[arg-type]
+        raise SweepError(
+            f"the sweep holds {reference}ToProbe, on which no errors can be put: expected {name}"
+        )
+    return after

@@ -34,6 +34,10 @@ class Unsqueezed:
             )
             if probe is None or on_probe is None:
                 raise SweepError(f"frame {frame}: no pose of the probe, which is to be pressed again")
+            if not np.allclose(on_probe[:3, :3], np.diag([on_probe[0, 0], on_probe[1, 1], 1.0]), atol=1e-6):
+                raise SweepError(
+                    f"frame {frame}: ImageToProbe turns the picture: expected a sweep of Nephron's"
+                )
             self._on_probe[frame] = on_probe
             self._poses[frame] = held_at(shifted(probe, -rehearsal.origin), rehearsal.size_mm[2])
         self._frame = int(track.frames[0])

@@ -1,6 +1,7 @@
 """Who leads the transducer in a rehearsal: the user (``live.py``), a recorded session, or the scene's script."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import fields
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,6 +13,8 @@ from studies.session.recorded import Recorded
 from studies.session.replay import Replay
 from studies.session.session import Session
 from ultrasound.array import MODES, RUNGS
+
+CHOICES: dict[str, tuple[str, ...]] = {"mode": MODES, "rung": RUNGS}
 
 
 class Driver(Protocol):
@@ -78,15 +81,26 @@ class Played:
 
 def set_settings(settings: Settings, values: dict[str, Any]) -> None:
     """Set what a session says. Raises SessionError for what is no setting, or none that there can be."""
+    known = {each.name: each.metadata for each in fields(settings)}
     for name, value in values.items():
-        usual = getattr(settings, name, None)
-        known = {"mode": MODES, "rung": RUNGS}.get(name)
-        fits = value in known if known else isinstance(value, type(usual)) or usual is None or value is None
-        if not hasattr(settings, name) or not fits:
+        if name not in known or not _fits(getattr(settings, name), value, name, known[name]):
             raise SessionError(
                 f"the session sets {name} to {value!r}, which it cannot be: its file is damaged"
             )
         setattr(settings, name, value)
+
+
+def _fits(usual: Any, value: Any, name: str, about: Mapping[str, Any]) -> bool:
+    """Whether a value is of a setting's kind and within its slider."""
+    if name in CHOICES:
+        return value in CHOICES[name]
+    if value is None:
+        return usual is None
+    if isinstance(usual, bool) or isinstance(value, bool):
+        return type(value) is type(usual)
+    if not isinstance(value, int if isinstance(usual, int) else (int, float)):
+        return False
+    return not about or bool(about["low"] <= value <= about["high"])
 
 
 class Scripted:

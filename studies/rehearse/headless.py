@@ -16,6 +16,9 @@ from studies.rehearse.instruments import Instruments
 from studies.rehearse.view import open_viewer, probe_as_set, take_view
 from studies.report import Record, summary
 
+# An animation is in memory before it is written: of a long session it has fewer pictures.
+MOST_SHOWN = 400
+
 
 def run_headless(
     rehearsal: Rehearsal,
@@ -37,6 +40,7 @@ def run_headless(
     every = max(1, round(1 / (PICTURES_A_SECOND * rehearsal.settings.time_step_s)))
     frames, slices = empty_folder(out / "frames"), empty_folder(out / "slices")
     animation: list[Image.Image] = []
+    shown_every = every * (1 + steps // every // MOST_SHOWN)
     for step in tqdm(range(1, steps + 1), desc="press", unit="step"):
         pose = driver.move(Controls(settings))
         view = take_view(rehearsal, settings, pose, record)
@@ -52,12 +56,13 @@ def run_headless(
                 viewer.draw(instruments.onto(view, settings))
                 picture = Image.fromarray(viewer.picture())
                 picture.save(frames / f"{step:05d}.png")
-            animation.append(smaller(picture))
+            if step % shown_every == 0 or step == steps:
+                animation.append(smaller(picture))
     save_animation(animation, out / "press.gif")
     report = record.report(rehearsal, arch) | dict(reading=instruments.figures())
     (out / "report.json").write_text(json.dumps(report, indent=2) + "\n", "utf-8")
     click.echo(summary(report))
-    click.echo(f"Wrote {len(animation)} pictures, press.gif and report.json to {out}")
+    click.echo(f"Wrote {-(-steps // every)} pictures, press.gif and report.json to {out}")
 
 
 def _tell(news: str) -> None:

@@ -12,7 +12,7 @@ from studies.rehearsal import Rehearsal
 from studies.session.session import Session
 from studies.session.summary import Course
 from ultrasound.array import Probe
-from ultrasound.coverage import PLACES, Coverage
+from ultrasound.coverage import PLACES, Coverage, Gap
 
 READ_S, LOOK_S = 0.25, 1 / 30
 MARGIN_MM = 5.0
@@ -29,6 +29,7 @@ class Instruments:
         self._read_every, self._look_every = (max(1, round(s / step_s)) for s in (READ_S, LOOK_S))
         self.course = self._new_course()
         self._seen: dict[str, np.ndarray] = {}
+        self._findings: dict[str, str] = {}
         self._touches = np.ones(rehearsal.probe.number_of_scanlines, bool)
 
     def _new_course(self) -> Course:
@@ -48,9 +49,8 @@ class Instruments:
         """Look at a moment (its step's pose, None of a way back) whose pictures were taken, and note a new reading in the session."""
         if session.moment % self._look_every == 0 and self.rehearsal.scanner is not None:
             image = self.rehearsal.scene.image
-            gap = image.contact_gap_mm if image.contact == "organ" else None
             rest = self.rehearsal.scanner.plane.rest_grid(PLACES)
-            self._touches = self.coverage.look(rest, probe, gap)
+            self._touches = self.coverage.look(rest, probe, image.contact_gap_mm)
         if session.moment % self._read_every == 0 or self.reading is None:
             self.reading = read(self.rehearsal, probe, self._touches)
             surfaces = {"organ": self.rehearsal.organ, "tumour": self.rehearsal.tumour}
@@ -60,18 +60,22 @@ class Instruments:
                 if surface is not None
             }
             session.note("reading", self.figures())
+            self._findings = self.findings()
         self.course.add(pose, self.reading.compression_mm)
 
     def figures(self) -> dict[str, Any]:
         """The reading and the shares seen so far, rounded, for the record."""
         values = asdict(self.reading) if self.reading is not None else {}
-        values |= {f"seen_{target}": self.coverage.share(target) for target in self.coverage.targets}
+        if self.rehearsal.scanner is not None:
+            values |= {f"seen_{target}": self.coverage.share(target) for target in self.coverage.targets}
         return {name: None if value is None else round(value, 4) for name, value in values.items()}
 
     def summary(self, bookmarks: int = 0) -> dict[str, Any]:
         """How the rehearsal went so far."""
-        target = "margin" if "margin" in self.coverage.targets else "organ"
-        return self.course.summary(self.figures(), self.coverage.gaps(target), bookmarks)
+        gaps: list[Gap] = []
+        if self.rehearsal.scanner is not None:
+            gaps = self.coverage.gaps("margin" if "margin" in self.coverage.targets else "organ")
+        return self.course.summary(self.figures(), gaps, bookmarks)
 
     @property
     def is_too_deep(self) -> bool:
@@ -86,7 +90,7 @@ class Instruments:
             status = f"TISSUE SQUEEZED BY {self.reading.compression_mm:.0f} mm"
         return replace(
             view,
-            findings=self.findings(),
+            findings=self._findings,
             alert=COMPRESSION if self.is_too_deep else "",
             seen=self._seen if settings.show_seen else {},
             status=status,
@@ -99,7 +103,7 @@ class Instruments:
             return {}
         found = {COMPRESSION: f"{reading.compression_mm:.1f} mm", "contact": f"{reading.contact_mm2:.0f} mm2"}
         if reading.to_tumour_mm is None:
-            return found | {"organ seen": self._share("organ")}
+            return found if self.rehearsal.scanner is None else found | {"organ seen": self._share("organ")}
         found |= {
             "to tumour": f"{reading.to_tumour_mm:.1f} mm",
             "tumour depth": f"{reading.tumour_depth_mm:.1f} mm",

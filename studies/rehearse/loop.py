@@ -50,26 +50,33 @@ class Loop:
             self.rate = 0.9 * self.rate + 0.1 / max(now - before, 1e-6)
             before = now
             self.viewer.draw(view)
-            if controls.screenshot:
-                save_screenshot(self.viewer.picture(), self.out)
-            if controls.export:
-                save_pictures(view, self.rehearsal.probe, self.out)
+            try:
+                self._save(controls, view)
+            except OSError as error:
+                self._say(f"Not saved: {error.strerror}")
+
+    def _save(self, controls: Controls, view: View) -> None:
+        """What the user wants as files. Raises OSError."""
+        if controls.screenshot:
+            save_screenshot(self.viewer.picture(), self.out)
+        if controls.export:
+            save_pictures(view, probe_as_set(self.rehearsal.probe, controls.settings), self.out)
 
     def frame(self, controls: Controls) -> View:
         """One frame: what the user did, a moment unless frozen, and what is to be seen."""
-        goes_back = controls.reset or controls.undo or controls.redo or controls.to_bookmark
-        if controls.freeze or (self.frozen and goes_back):
+        ends_freeze = (controls.reset, controls.undo, controls.redo, controls.bookmark, controls.to_bookmark)
+        if controls.freeze or (self.frozen and (any(ends_freeze) or controls.take_over)):
             self.frozen = not self.frozen
         if controls.reset:
             self.calliper.points = ()
         self.calliper.point(controls.pointed_mm)
         shown = self._looked_back(controls) or self._taken(controls)
         if controls.sweep:
-            self._say(self.sweeping.toggle(self.out))
+            self._announce(self.sweeping.toggle(self.out))
         speed = self.rate * self.rehearsal.settings.time_step_s
         figures = {"frames": f"{self.rate:.0f} /s", "time": f"{speed:.1f} x real"}
         figures |= self.calliper.readouts(shown)
-        view = self.instruments.onto(shown.view, controls.settings)
+        view = shown.view
         return replace(
             view,
             calliper_mm=self.calliper.points,
@@ -78,7 +85,14 @@ class Loop:
         )
 
     def _status(self, view: View) -> str:
-        return self._said if perf_counter() < self._said_until else view.status
+        if perf_counter() < self._said_until:
+            return self._said
+        return view.status or self.sweeping.status
+
+    def _announce(self, text: str) -> None:
+        """Say something in the window and in the terminal."""
+        self._say(text)
+        self._tell(text)
 
     def _say(self, text: str) -> None:
         if text:
@@ -97,6 +111,7 @@ class Loop:
         """A new frame. A frozen one shows the same tissue with the scanner set anew, and is not kept."""
         if self.frozen:
             view = take_view(self.rehearsal, controls.settings, None, self.record, "FROZEN")
+            view = self.instruments.onto(view, controls.settings)
             return Frame(perf_counter(), view, self.rehearsal.rest_grid())
         pose = self.driver.move(controls)
         self._say(self.driver.take_said())
@@ -107,8 +122,9 @@ class Loop:
             self._tell(self.driver.stepped(self.record.step_ms[-1]))
         probe = probe_as_set(self.rehearsal.probe, controls.settings)
         self.instruments.watch(self.driver.session, probe, pose)
-        self._say(self.sweeping.watch(self.driver.session.time_s, view, probe))
+        self._announce(self.sweeping.watch(self.driver.session.time_s, view, probe))
         self._tell(self.driver.watch())
+        view = self.instruments.onto(view, controls.settings)
         frame = Frame(perf_counter(), view, self.rehearsal.rest_grid())
         self.cine.keep(frame)
         return frame

@@ -79,7 +79,7 @@ class Run:
                 steps = min(steps, max(1, round(seconds / rehearsal.settings.time_step_s)))
             if steps == 0:
                 raise Fault(
-                    f"--at {at_s:g}: the session is over at {replay.log.length_s:.1f} s; name an earlier second"
+                    f"the session has nothing after {at_s:g} s: it is {replay.log.length_s:.1f} s long"
                 )
             driver = Played(replay, self._take_over)
         try:
@@ -138,8 +138,7 @@ def _verdict(replay: Replay | None) -> str:
         return (
             f"replay    differs from {replay.differs_s:.1f} s on: other bits, of another backend or version"
         )
-    state = replay.rehearsal.digest()
-    return f"replay    identical in all {replay.compared} states compared, to {replay.time_s:.1f} s; state {state}"
+    return f"replay    identical in all {replay.compared} states compared, to {replay.time_s:.1f} s; state {replay.state}"
 
 
 def _say(text: str) -> None:

@@ -22,6 +22,7 @@ class Sweeping:
         self.rehearsal = rehearsal
         self._sweep: MarkedSweep | None = None
         self._due_s = 0.0
+        self._shows = ""
 
     def toggle(self, out: Path) -> str:
         """Begin a sweep under the next free number of a folder, or end the one that goes on; what there is to say."""
@@ -32,11 +33,16 @@ class Sweeping:
         taken = [int(found[1]) for path in out.glob("sweep-*") if (found := SWEEP.fullmatch(path.name))]
         stem = f"sweep-{1 + max(taken, default=0):03d}"
         try:
-            self._sweep = MarkedSweep(out, stem)
+            self._sweep = MarkedSweep(out, stem, self.rehearsal.probe)
         except OSError as error:
             return f"{stem} cannot be written: {_words(error)}"
-        self._due_s = 0.0
+        self._due_s, self._shows = 0.0, ""
         return f"{stem}: L ends it"
+
+    @property
+    def status(self) -> str:
+        """What stands in the panel while a sweep goes on."""
+        return "" if self._sweep is None else f"SWEEP   {self._sweep.count} pictures   L ends it"
 
     def end(self) -> str:
         """End the sweep, where there is one; what there is to say."""
@@ -57,7 +63,11 @@ class Sweeping:
         if self._sweep is None or time_s < self._due_s - 1e-9 or self.rehearsal.scanner is None:
             return ""
         self._due_s = time_s + FRAME_S
-        picture = next(iter(view.pictures.values()))
+        name, picture = next(iter(view.pictures.items()))
+        if name != (self._shows or name):
+            # Echo and CT in one sweep would be no volume of either.
+            return self.end()
+        self._shows = name
         marks = self.rehearsal.scanner.marks.render()
         try:
             self._sweep.add(picture, marks, probe, probe_in_patient(self.rehearsal), time_s)

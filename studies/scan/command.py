@@ -82,7 +82,7 @@ def scan(
     scanned = scanned_anatomy(anatomy.organ, anatomy.ct, anatomy, np.zeros(3))
     scanner = Scanner(scanned, Unmoved(), held, image.pixels, "background", contact, image.contact_gap_mm)
     width, depth, above = held.extent_mm
-    swept = MarkedSweep(out, "sweep") if sweep else None
+    swept = MarkedSweep(out, "sweep", held) if sweep else None
     rows, ms = [], []
     for name, pose in tqdm(placed.items(), desc="scan", unit="pose"):
         began = perf_counter()

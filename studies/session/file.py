@@ -9,13 +9,14 @@ import base64
 import json
 import os
 import zlib
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from typing_extensions import TypedDict
 
 VERSION = 1
 # Of a pose, all but its last row.
@@ -45,14 +46,15 @@ class Header(_Line):
     """The state that it begins with, where that is not the settled one."""
 
 
-class SolverValues(_Line):
+class SolverValues(TypedDict, total=False):
     """What a step is told; what is left out stays as it was."""
 
-    iterations: int | None = Field(None, ge=1, le=1000)
-    substeps: int | None = Field(None, ge=1, le=100)
-    stiffness: float | None = Field(None, ge=0, le=1)
-    young_kpa: float | None = Field(None, gt=0, le=1e6)
-    gravity_m_s2: float | None = Field(None, ge=0, le=100)
+    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)  # type: ignore[misc]
+    iterations: Annotated[int, Field(ge=1, le=1000)]
+    substeps: Annotated[int, Field(ge=1, le=100)]
+    stiffness: Annotated[float, Field(ge=0, le=1)]
+    young_kpa: Annotated[float, Field(gt=0, le=1e6)]
+    gravity_m_s2: Annotated[float, Field(ge=0, le=100)]
 
 
 # What the value of each kind of event is.
@@ -129,6 +131,8 @@ def unpack(text: str) -> np.ndarray:
     rows = np.frombuffer(raw, "<f8").reshape(-1, NUMBERS)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows.reshape(-1, 3, 4)
+    if np.isinf(poses).any():
+        raise ValueError("a pose that is not finite")
     return poses
 
 
@@ -146,7 +150,6 @@ class Recording:
         self._events: list[Event] = []
         self._file = path.open("x", encoding="utf-8")
         self._disk = ThreadPoolExecutor(1, "session")
-        self._written: Future | None = None
         self._write(header)
 
     @property
@@ -174,7 +177,6 @@ class Recording:
         """Write the end, and wait for the disk."""
         self._write(End(summary=summary, state=state))
         self._disk.shutdown()
-        self._look()
         try:
             self._file.close()
         except OSError as error:
@@ -182,21 +184,20 @@ class Recording:
             self._fail(error)
 
     def _write(self, line: BaseModel) -> None:
-        self._look()
-        if not self.fault:
-            self._written = self._disk.submit(self._put, line)
+        self._disk.submit(self._put, line)
 
     def _put(self, line: BaseModel) -> None:
-        self._file.write(line.model_dump_json(exclude_none=True) + "\n")
-        self._file.flush()
-        os.fsync(self._file.fileno())
-
-    def _look(self) -> None:
-        error = self._written.exception() if self._written is not None else None
-        if error is not None:
+        """On the disk's own thread; after a fault nothing more, or a line would be missing in between."""
+        if self.fault:
+            return
+        try:
+            self._file.write(line.model_dump_json(exclude_none=True) + "\n")
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        except (OSError, ValueError) as error:
             self._fail(error)
 
-    def _fail(self, error: BaseException) -> None:
+    def _fail(self, error: OSError | ValueError) -> None:
         if not self.fault:
             self.fault = f"{self.path.name}: no longer written ({getattr(error, 'strerror', None) or error})"
 

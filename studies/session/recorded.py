@@ -1,5 +1,6 @@
 """A rehearsal that is recorded: its file, and when lines and whole states go to it."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from studies.session.state import to_text
 
 # A whole state is written so often: from one to the next, at most, is computed anew where a session is opened in its midst.
 STATE_S = 60.0
+NAME = re.compile(r"session-([0-9]{3,9})\.jsonl")
 # What of a scene stands in the patient's folder, and may name files.
 NOT_RECORDED: dict[str, Any] = {"anatomy": True, "shape": True, "title": True, "transducer": {"probe"}}
 
@@ -22,20 +24,20 @@ class Recorded:
         self.session = session
         self.recording = recording
         session.recorder = recording
+        self._has_told = False
         step_s = session.rehearsal.settings.time_step_s
         self._line_every, self._state_every = max(1, round(1 / step_s)), max(1, round(STATE_S / step_s))
 
     def watch(self) -> str:
         """Write the line of a second that is over; what went wrong with the file, once."""
-        if self.recording.moments < self._line_every:
-            return ""
-        before = self.recording.fault
         session, rehearsal = self.session, self.session.rehearsal
-        moment = session.moment
-        self.recording.line(rehearsal.digest())
-        if moment % self._state_every < self._line_every:
-            session.store()
-        return self.recording.fault if self.recording.fault != before else ""
+        if self.recording.moments >= self._line_every:
+            self.recording.line(rehearsal.digest())
+            if session.moment % self._state_every < self._line_every:
+                session.store()
+        news = "" if self._has_told else self.recording.fault
+        self._has_told = bool(self.recording.fault)
+        return news
 
     def close(self, summary: dict[str, Any]) -> None:
         """Write what is left, with the state, from which the session can go on another day."""
@@ -61,6 +63,6 @@ def record(
         time_step_s=rehearsal.settings.time_step_s,
         begins=None if begins is None else to_text(begins),
     )
-    taken = [int(path.stem[-3:]) for path in folder.glob("session-[0-9][0-9][0-9].jsonl")]
+    taken = [int(found[1]) for path in folder.glob("session-*") if (found := NAME.fullmatch(path.name))]
     path = folder / f"session-{1 + max(taken, default=0):03d}.jsonl"
     return Recorded(session, Recording(path, header))

@@ -13,7 +13,8 @@ from studies.session.state import StateError, from_text
 
 
 class Replay:
-    """Drives a rehearsal through a log. ``differs_s`` is when its tissue first was not the recorded one's, None so far.
+    """Drives a rehearsal through a log. ``differs_s`` is when its tissue first was not the recorded one's, None so far; ``state`` its
+    digest when it was compared last.
 
     Raises SessionError where the log's states are of another body.
     """
@@ -22,6 +23,7 @@ class Replay:
         self.rehearsal, self.log = rehearsal, log
         self.session = Session(rehearsal)
         self.compared = 0
+        self.state = ""
         self.differs_s: float | None = None
         backs = [
             (moment, event.value) for moment, e in log.events.items() for event in e if event.kind == "back"
@@ -115,7 +117,8 @@ class Replay:
         if digest is None:
             return
         self.compared += 1
-        if self.differs_s is None and digest != self.rehearsal.digest():
+        self.state = self.rehearsal.digest()
+        if self.differs_s is None and digest != self.state:
             self.differs_s = self.time_s
 
     def _holds(self, start: int) -> bool:
