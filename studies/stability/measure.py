@@ -18,7 +18,6 @@ from ultrasound.probe import advanced
 RECOVERED_MM = 0.1
 # Long enough for the guard's patience and for what was thrown to come down and to rest.
 RELEASE_STEPS, LIFT_STEPS, LOOK_EVERY = 300, 240, 30
-STILL_MM_S = 0.05
 LEAST_STEPS, LEAST_S = 40, 0.04
 LIFT_MM = 400.0
 AWAY_MM = 200.0
