@@ -330,7 +330,11 @@ def test_more_frames_than_four_digits_count(tmp_path):
     assert np.array_equal(sweep.times_s, np.arange(10_002) / 100)
 
 
-@given(arrays(np.float64, (3, 4), elements=st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False)))
+@given(
+    arrays(
+        np.float64, (3, 4), elements=st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False)
+    )
+)
 @settings(max_examples=20, deadline=None)
 def test_the_text_of_a_transform_is_exact(upper):
     matrix = np.vstack([upper, [0, 0, 0, 1]])
