@@ -71,7 +71,8 @@ def recorded_session(
     rehearsal = Rehearsal(scene_of(scene, setup), anatomy)
     session = Session(rehearsal)
     # What a step costs would otherwise have its say, and another session would be recorded each time.
-    live = Live(session, Ladder(np.inf), record(session, anatomy, arch, out))
+    recorded = record(session, anatomy, arch, out)
+    live = Live(session, Ladder(np.inf), recorded)
     moments = round(60 * minutes / rehearsal.settings.time_step_s)
     for controls in chance(rehearsal, settings_of(rehearsal), moments):
         pose = live.move(controls)
@@ -80,9 +81,8 @@ def recorded_session(
             live.stepped(0.0)
         live.watch()
         done(1)
-    assert live.recorded is not None
-    live.recorded.close({})
-    return live.recorded.recording.path, rehearsal.digest()
+    recorded.close({})
+    return recorded.recording.path, rehearsal.digest()
 
 
 def replayed(
