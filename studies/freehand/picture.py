@@ -38,5 +38,8 @@ def _draw_cut(axes: Axes, rebuilt: Rebuilt, axis: int, across: int, down: int, i
     axes.set_title(f"{AXES[axis]} = {place:.1f} mm", color="white", fontsize=10)
     axes.set_xlabel(f"{AXES[across]}, mm", color="white", fontsize=9)
     axes.set_ylabel(f"{AXES[down]}, mm", color="white", fontsize=9)
+    if axis == 2:
+        # As radiologists look at it: the front is up.
+        axes.invert_yaxis()
     axes.tick_params(colors="white", labelsize=8)
     axes.set_facecolor("black")

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,9 @@ from scenes.anatomy import load_anatomy
 from scenes.scene import EMBEDDED, load_scene
 from studies.commands import Fault, arch_option, make_folder, start_taichi
 from studies.setup import PRESETS
+from ultrasound.tracking import TrackingErrors
 
-SWEPT = ("noise_mm", "noise_deg", "calibration_mm", "calibration_deg", "latency_s", "lost")
+SWEPT = tuple(each.name for each in fields(TrackingErrors))
 
 
 @click.command()
