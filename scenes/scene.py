@@ -10,22 +10,13 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import tomli_w
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Discriminator,
-    Field,
-    Tag,
-    ValidationError,
-    model_validator,
-)
+from pydantic import BaseModel, Discriminator, Field, Tag, ValidationError, model_validator
 
-Vector3 = tuple[float, float, float]
+from scenes.section import Direction, Length, Section, Vector3
+from scenes.trocar import Trocar
+
 Stiffness = Annotated[float, Field(ge=0, le=1)]
-Length = Annotated[float, Field(gt=0, le=500)]
 
 # The scene that the program has with it.
 EMBEDDED = Path(__file__).parent / "phantom.toml"
@@ -51,19 +42,6 @@ class SceneError(ValueError):
     """A scene that cannot be used; the message is one line that says where, what was found and what to do."""
 
 
-def _not_zero(vector: Vector3) -> Vector3:
-    if np.linalg.norm(vector) < 1e-9:
-        raise ValueError("a direction must not be zero")
-    return vector
-
-
-Direction = Annotated[Vector3, AfterValidator(_not_zero)]
-
-
-class Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
 class Anatomy(Section):
     """The embedded patient, or files beside the scene; without a CT there is no picture.
 
@@ -73,10 +51,10 @@ class Anatomy(Section):
     phantom: bool = False
     organ: str = "organ.stl"
     tumour: str | None = None
-    parts: dict[Literal["cyst", "urine", "vessel"], str] = {}
+    parts: dict[Literal["cyst", "urine", "vessel"], str] = Field(default_factory=dict)
     ct: str | None = None
     labels: str | None = None
-    tissues: dict[Annotated[str, Field(pattern=r"^[1-9]\d*$")], str] = {}
+    tissues: dict[Annotated[str, Field(pattern=r"^[1-9]\d*$")], str] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _one_patient(self) -> "Anatomy":
@@ -256,6 +234,7 @@ class Scene(Section):
     attachment: Attachment = Attachment()
     shape: tuple[Annotated[PlaneShape | MeshShape | DistanceShape, Field(discriminator="kind")], ...] = ()
     transducer: Transducer = Transducer()
+    trocar: Trocar = Trocar()
     image: Image = Image()
     press: Press = Press()
 
@@ -371,7 +350,7 @@ def _suggest(where: list[str]) -> str:
 
 def _quantity(name: str) -> str:
     """A key without its unit: radius_mm -> radius."""
-    for unit in ("_mm2", "_mm", "_m_s2", "_mm_s", "_g_cm3", "_per_mm", "_per_s", "_hu", "_s"):
+    for unit in ("_mm2", "_mm", "_m_s2", "_mm_s", "_g_cm3", "_per_mm", "_per_s", "_deg", "_hu", "_s"):
         if name.endswith(unit):
             return name[: -len(unit)]
     return name

@@ -16,7 +16,8 @@ import trimesh
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from scenes.anatomy import load_surface
-from scenes.scene import Direction, SceneError, Vector3
+from scenes.scene import SceneError
+from scenes.section import Direction, Vector3
 from sim.distance import signed_distance
 
 UNITS = ("_mm", "_kPa")

@@ -169,16 +169,25 @@ class Hand:
 
     def point(self, origin: np.ndarray, direction: np.ndarray) -> None:
         """Aim where a ray [mm] first meets the settled organ, perpendicular to its surface; a miss changes nothing."""
-        # Not its first=True, which invents a hit where there is none.
-        hits = igl.ray_mesh_intersect(np.array(origin), np.array(direction), self.vertices, self.faces)
-        if hits:
-            self.aim_at(np.array(origin) + hits[0][1] * np.array(direction))
+        place = self.met(origin, direction)
+        if place is not None:
+            self.aim_at(place)
 
     def aim_at(self, target: np.ndarray) -> None:
         """Aim at a point of the surface [mm], perpendicular to the patch around it."""
-        distance = np.linalg.norm(self.vertices - target, axis=1)
-        outward = np.exp(-((distance / NORMAL_PATCH_MM) ** 2)) @ self.normals
-        self.aim = pose_at(target, -outward, self.lateral, self.size_mm[2])
+        self.aim = pose_at(target, -self.outward(target), self.lateral, self.size_mm[2])
+
+    def outward(self, place: np.ndarray) -> np.ndarray:
+        """Unit normal (3,) of the patch of surface around a place [mm]."""
+        distance = np.linalg.norm(self.vertices - place, axis=1)
+        normal = np.exp(-((distance / NORMAL_PATCH_MM) ** 2)) @ self.normals
+        return normal / np.linalg.norm(normal)
+
+    def met(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
+        """Where a ray [mm] first meets the settled organ (3,), None where it misses."""
+        # Not its first=True, which invents a hit where there is none.
+        hits = igl.ray_mesh_intersect(np.array(origin), np.array(direction), self.vertices, self.faces)
+        return np.array(origin) + hits[0][1] * np.array(direction) if hits else None
 
     def push(self, depth_mm: float) -> None:
         """Press in by a depth [mm], or lift where negative."""
