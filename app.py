@@ -14,6 +14,8 @@ from studies.beam.command import beam
 from studies.case import CaseError
 from studies.commands import calibrate, validate
 from studies.freehand.command import reconstruct
+from studies.plan.command import plan
+from studies.plan.file import PlanError
 from studies.reference.command import reference
 from studies.rehearse.command import rehearse
 from studies.scan.command import scan
@@ -30,6 +32,7 @@ MENDED_BY_USER = (
     SceneError,
     PatientError,
     PoseError,
+    PlanError,
     SessionError,
     SweepError,
     ProbeError,
@@ -51,6 +54,7 @@ def cli() -> None:
 for command in (
     rehearse,
     import_patient_command,
+    plan,
     scan,
     reconstruct,
     validate,

@@ -5,6 +5,7 @@ import click
 from studies.features.command import features
 from studies.freehand.study_command import freehand
 from studies.intake.command import intake
+from studies.plan.study_command import plan_study
 from studies.replay.command import replay
 from studies.soak.command import soak
 from studies.stability.command import stability
@@ -25,3 +26,4 @@ study.add_command(soak)
 study.add_command(intake)
 study.add_command(freehand)
 study.add_command(replay)
+study.add_command(plan_study)

@@ -1,0 +1,48 @@
+"""A plan's sweep over the organ: the way of the face's middle, and the outline of the probe where it is to go next.
+
+The scene is a parameter, so that window.py alone imports the user interface. Lengths in mm.
+"""
+
+import numpy as np
+import taichi as ti
+
+from render import solids
+from render.viewer import Guidance
+
+MOST_SEGMENTS = 2000
+TO_GO, GONE, GOAL = (1.0, 0.72, 0.20), (0.30, 0.75, 0.42), (1.0, 0.86, 0.45)
+WIDTH, GOAL_WIDTH = 2.6, 1.8
+
+
+class GuideLines:
+    """The fields of what is drawn; of a longer way every so manieth segment is."""
+
+    def __init__(self, edges: np.ndarray) -> None:
+        self._edges = edges
+        self._goal = ti.Vector.field(3, ti.f32, len(edges))
+        self._way, self._colours = (ti.Vector.field(3, ti.f32, 2 * MOST_SEGMENTS) for _ in range(2))
+        self._shown: tuple[int, int] = (0, 0)
+
+    def draw(self, scene, guidance: Guidance) -> None:
+        """Hand the lines to a scene."""
+        key = id(guidance.way_mm), int(guidance.gone.sum())
+        if key != self._shown:
+            self._fill(guidance)
+            self._shown = key
+        scene.lines(self._way, WIDTH, per_vertex_color=self._colours)
+        if guidance.goal is not None:
+            self._goal.from_numpy(solids.placed(self._edges, guidance.goal).astype(np.float32))
+            scene.lines(self._goal, GOAL_WIDTH, color=GOAL)
+
+    def _fill(self, guidance: Guidance) -> None:
+        every = -(-len(guidance.way_mm) // MOST_SEGMENTS)
+        segments, gone = guidance.way_mm[::every], guidance.gone[::every]
+        # What is left over has no length.
+        points = np.repeat(segments[-1:, 1:], 2 * MOST_SEGMENTS, axis=1)[0].astype(np.float32)
+        colours = np.tile(np.float32(GONE), (2 * MOST_SEGMENTS, 1))
+        points[: 2 * len(segments)] = segments.reshape(-1, 3)
+        colours[: 2 * len(segments)] = np.where(
+            np.repeat(gone, 2)[:, None], np.float32(GONE), np.float32(TO_GO)
+        )
+        self._way.from_numpy(points)
+        self._colours.from_numpy(colours)

@@ -1,0 +1,73 @@
+"""Sweeps that nobody planned, to hold a planned one against: straight, row by row, and by chance."""
+
+from functools import partial
+
+import numpy as np
+
+from studies.freehand.unsqueeze import shifted
+from studies.plan.candidate import half_size, passes_needed
+from studies.plan.file import Sweep
+from studies.plan.trial import Trial
+from studies.plan.way import Layout, Way, gliding, layout_towards
+from ultrasound.coverage import VOXEL_MM
+from ultrasound.probe import held_at
+
+# How deep an unplanned sweep presses: in the middle of what a scene's press begins with; by chance up to twice as deep.
+DEPTH_MM = 3.0
+
+
+def straight(trial: Trial) -> Way:
+    """One pass over the target's middle, straight down on the organ."""
+    layout, half = _seen_from_above(trial)
+    return _rows(trial, layout, half, 1)
+
+
+def row_by_row(trial: Trial) -> Way:
+    """As many passes side by side, straight down, as the target is wide."""
+    layout, half = _seen_from_above(trial)
+    return _rows(trial, layout, half, passes_needed(half[0], trial.rehearsal.probe))
+
+
+def by_chance(trial: Trial, count: int, seed: int) -> Way:
+    """Passes anywhere over the target, each with a heading and depth of its own, square to the surface."""
+    layout, half = _seen_from_above(trial)
+    chance = np.random.default_rng(seed)
+    passes: list[np.ndarray] = []
+    while len(passes) < count:
+        aside, ahead = chance.uniform(-half, half)
+        turned = layout.turned((0.0, 0.0), chance.uniform(-180.0, 180.0))
+        centre = layout.centre + aside * layout.lateral + ahead * layout.ahead
+        one = Layout(centre, turned.outward, turned.ahead, turned.lateral)
+        depth = chance.uniform(0.0, 2 * DEPTH_MM)
+        passes += gliding(trial.rehearsal.hand, one, np.zeros(1), -half[1], half[1], depth, 1.0).passes
+    return Way(tuple(passes))
+
+
+def planned(trial: Trial, sweep: Sweep) -> Way:
+    """The sweep of a plan."""
+    origin, length = trial.rehearsal.origin, trial.rehearsal.size_mm[2]
+    return Way(
+        tuple(np.stack([held_at(shifted(pose, -origin), length) for pose in each]) for each in sweep.poses())
+    )
+
+
+def _seen_from_above(trial: Trial) -> tuple[Layout, np.ndarray]:
+    """The target's middle as the scene's press meets it, and half of its size across and along (2,) [mm]."""
+    coverage, press = trial.coverage, trial.rehearsal.press
+    places = coverage.low_mm + VOXEL_MM * np.argwhere(coverage.targets[trial.target])
+    layout = layout_towards(places.mean(axis=0), -np.array(press.direction), np.array(press.lateral))
+    return layout, half_size(layout, places)
+
+
+def _rows(trial: Trial, layout: Layout, half: np.ndarray, count: int) -> Way:
+    width = trial.rehearsal.probe.extent_mm[0]
+    aside = width * (np.arange(count) - (count - 1) / 2)
+    return gliding(trial.rehearsal.hand, layout, aside, -half[1], half[1], DEPTH_MM, 0.0)
+
+
+UNPLANNED = {"straight": straight, "row by row": row_by_row}
+
+
+def random_ways(count: int, seeds: range) -> list:
+    """Ways by chance, as ``Workers.go_ways`` takes them."""
+    return [partial(by_chance, count=count, seed=seed) for seed in seeds]

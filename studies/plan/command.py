@@ -1,0 +1,112 @@
+"""The command ``plan``: where to move the probe so that a target is seen, with little pressing and through a trocar."""
+
+from pathlib import Path
+
+import click
+from pydantic import ValidationError
+from tqdm import tqdm
+
+from scenes.anatomy import load_anatomy
+from scenes.scene import EMBEDDED, load_scene, with_options
+from scenes.trocar import Trocar
+from studies.commands import Fault, make_folder
+from studies.plan.file import TARGETS, write_plan
+from studies.setup import probe_of
+
+# Candidates are no more than these.
+MOST_CANDIDATES = 4
+
+
+@click.command()
+@click.argument("scene", type=click.Path(path_type=Path), default=EMBEDDED, required=False)
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="File for the plan, JSON.")
+@click.option(
+    "--target",
+    type=click.Choice(TARGETS),
+    help="What must be seen: the tumour, the tumour with its margin, or the whole organ [margin, or organ without a tumour].",
+)
+@click.option(
+    "--margin-mm",
+    type=click.FloatRange(0, 30),
+    default=5.0,
+    show_default=True,
+    help="How much around the tumour is to be seen.",
+)
+@click.option(
+    "--trocar", nargs=3, type=float, help="Where the instrument comes in: x y z, LPS, mm [the scene's]."
+)
+@click.option(
+    "--cone-deg", type=float, help="How far the shaft may lean from its middle direction [the scene's]."
+)
+@click.option(
+    "--wrist-deg", type=float, help="How far the probe may look aside from the shaft [the scene's]."
+)
+@click.option("--probe", help="Probe, by its name or as a file [the scene's].")
+@click.option(
+    "--speed-mm-s",
+    type=click.FloatRange(1, 100),
+    default=10.0,
+    show_default=True,
+    help="How fast the sweep will be gone.",
+)
+@click.option(
+    "--trials",
+    type=click.IntRange(MOST_CANDIDATES, 100_000),
+    default=160,
+    show_default=True,
+    help="Scans that the search may make.",
+)
+@click.option("--jobs", type=click.IntRange(1, 256), help="Processes [as many as there are processors].")
+def plan(
+    scene: Path,
+    out: Path,
+    target: str | None,
+    margin_mm: float,
+    trocar: tuple[float, float, float] | None,
+    cone_deg: float | None,
+    wrist_deg: float | None,
+    probe: str | None,
+    speed_mm_s: float,
+    trials: int,
+    jobs: int | None,
+) -> None:
+    """Plan a sweep over SCENE, a scene file or a patient's folder: poses that show the target on the deforming organ."""
+    path = scene / "scene.toml" if scene.is_dir() else scene
+    if probe and Path(probe).is_file():
+        probe = str(Path(probe).resolve())
+    loaded = with_options(load_scene(path), {"transducer.probe": probe})
+    port = trocar_of(loaded.trocar, trocar, cone_deg, wrist_deg)
+    anatomy = load_anatomy(loaded, path.parent)
+    held = probe_of(loaded, path.parent)
+    make_folder(out.parent)
+    if out.is_dir():
+        raise Fault(f"{out}: is a folder; name a file after --out")
+    from studies.plan.make import make_plan
+    from studies.plan.workers import Ground, workers
+
+    if port.at_mm is None:
+        click.echo("No trocar is given: every way in counts as free.")
+    aim = target or ("organ" if anatomy.tumour is None else "margin")
+    ground = Ground(loaded, anatomy, held, aim, margin_mm, port)
+    with workers(ground, jobs) as crew, tqdm(total=trials + MOST_CANDIDATES, desc="plan", unit="scan") as bar:
+        made = make_plan(ground, crew, speed_mm_s, trials, bar.update)
+        bar.update(bar.total - bar.n)
+    write_plan(made, out)
+    click.echo("\n".join(made.why))
+    click.echo(
+        f"Wrote {len(made.sweeps)} sweeps to {out}; follow the first with: app.py rehearse SCENE --plan {out}"
+    )
+
+
+def trocar_of(
+    scenes: Trocar, at_mm: tuple[float, float, float] | None, cone_deg: float | None, wrist_deg: float | None
+) -> Trocar:
+    """The scene's trocar with what the command line changes. Raises Fault."""
+    given = {"at_mm": at_mm, "cone_deg": cone_deg, "wrist_deg": wrist_deg}
+    values = scenes.model_dump() | {name: value for name, value in given.items() if value is not None}
+    try:
+        return Trocar.model_validate(values)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        option = str(first["loc"][0]).replace("at_mm", "trocar").replace("_", "-")
+        raise Fault(f"--{option} = {first['input']!r}: {first['msg'].lower()}") from None

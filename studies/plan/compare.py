@@ -1,0 +1,55 @@
+"""A planned sweep against those that nobody planned, all on a finer model than the one it was planned on."""
+
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from scenes.anatomy import LoadedAnatomy
+from scenes.scene import Scene
+from studies.plan.baselines import UNPLANNED, planned, random_ways
+from studies.plan.make import make_plan
+from studies.plan.score import score
+from studies.plan.trial import Parts
+from studies.plan.workers import Gone, Ground, workers
+from studies.setup import PRESETS, probe_of, scene_of
+
+TARGET, MARGIN_MM, SPEED_MM_S = "margin", 5.0, 10.0
+SEEDS = range(5)
+PLANNED_ON, JUDGED_ON = "balanced", "accurate"
+
+
+def count_of(trials: int, candidates: int) -> int:
+    """How often ``compare`` says that something is done."""
+    return trials + candidates + 1 + len(UNPLANNED) + len(SEEDS)
+
+
+def compare(
+    scene: Scene, anatomy: LoadedAnatomy, trials: int, jobs: int | None, done: Callable[[], Any]
+) -> dict[str, Any]:
+    """Plan for the tumour and its margin, and go planned, straight and random sweeps. Raises PlanError."""
+    presets, probe = PRESETS["neo-hookean"], probe_of(scene)
+    ground = Ground(scene_of(scene, presets[PLANNED_ON]), anatomy, probe, TARGET, MARGIN_MM, scene.trocar)
+    with workers(ground, jobs) as crew:
+        plan = make_plan(ground, crew, SPEED_MM_S, trials, done)
+    sweep = plan.sweeps[0]
+    ways = [partial(planned, sweep=sweep), *UNPLANNED.values(), *random_ways(len(sweep.passes), SEEDS)]
+    gone: list[Gone] = []
+    with workers(replace(ground, scene=scene_of(scene, presets[JUDGED_ON])), jobs) as crew:
+        for one in crew.go_ways(ways, SPEED_MM_S):
+            gone.append(one)
+            done()
+    rows = [_row(name, [one]) for name, one in zip(["planned", *UNPLANNED], gone, strict=False)]
+    rows.append(_row("random", gone[len(rows) :]))
+    return dict(plan=sweep.name, why=plan.why, probe=probe.transducer_name, planned_on=plan.model, rows=rows)
+
+
+def _row(name: str, gone: list[Gone]) -> dict[str, Any]:
+    """Means over several sweeps, and of how many."""
+    parts = [asdict(one.parts) for one in gone]
+    means = Parts(**{key: float(np.mean([each[key] for each in parts])) for key in parts[0]})
+    return dict(
+        sweep=name, count=len(gone), **asdict(means), score=float(np.mean([score(one.parts) for one in gone]))
+    )

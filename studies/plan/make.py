@@ -1,0 +1,67 @@
+"""A plan made: candidates searched on the deforming organ, gone slowly once more, and ranked."""
+
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from scenes.anatomy import fingerprint
+from studies.plan.file import Plan, PlanError, Sweep
+from studies.plan.score import in_words, points, score, why
+from studies.plan.search import SEED, Search, ranked, search
+from studies.plan.workers import Gone, Ground, Workers
+
+DIGITS = 6
+
+
+def make_plan(
+    ground: Ground, workers: Workers, speed_mm_s: float, trials: int, done: Callable[[], Any]
+) -> Plan:
+    """The plan of a ground. Raises PlanError where no way is found."""
+    start = workers.start()
+    searches = search(start.candidates, workers, trials, done)
+    rows = [row for row in ranked(searches, workers, speed_mm_s, done) if row[1].passes]
+    if not rows or rows[0][1].parts.reachable < 1.0:
+        raise PlanError(
+            "no sweep was found that an instrument through the trocar can hold all along; move the trocar, widen its cone, "
+            "or give the search more --trials"
+        )
+    return Plan(
+        anatomy=fingerprint(ground.anatomy),
+        target=ground.target,  # type: ignore[arg-type]
+        margin_mm=ground.margin_mm,
+        speed_mm_s=speed_mm_s,
+        probe=ground.probe.model_dump(by_alias=True, mode="json"),
+        trocar=ground.trocar,
+        model=start.model,
+        seed=SEED,
+        why=_reasons(rows),
+        sweeps=[_sweep(*row) for row in rows],
+    )
+
+
+def _reasons(rows: list[tuple[Search, Gone]]) -> list[str]:
+    first, winner = rows[0][0].candidate.name, rows[0][1].parts
+    said = [f"{first}: {in_words(winner)}; {score(winner):.1f} points"]
+    for one, gone in rows[1:]:
+        said.append(
+            f"before {one.candidate.name} ({score(gone.parts):.1f} points): {why(winner, gone.parts)}"
+        )
+    return said
+
+
+def _sweep(one: Search, gone: Gone) -> Sweep:
+    return Sweep(
+        name=one.candidate.name,
+        score=round(score(gone.parts), DIGITS),
+        parts=_rounded(asdict(gone.parts)),
+        points=_rounded(points(gone.parts)),
+        values=_rounded(one.values),
+        trials=one.trials,
+        passes=[np.round(each, DIGITS).tolist() for each in gone.passes],
+    )
+
+
+def _rounded(values: dict[str, float]) -> dict[str, float]:
+    return {name: round(value, DIGITS) for name, value in values.items()}

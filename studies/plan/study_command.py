@@ -1,0 +1,66 @@
+"""The command ``study plan``: what planning a sweep is worth."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from tqdm import tqdm
+
+from scenes.anatomy import load_anatomy
+from scenes.scene import EMBEDDED, load_scene
+from studies.commands import make_folder
+
+CANDIDATES = 4
+
+
+@click.command("plan")
+@click.argument("scenes", type=click.Path(path_type=Path), nargs=-1)
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the figures.")
+@click.option(
+    "--trials",
+    type=click.IntRange(CANDIDATES, 100_000),
+    default=160,
+    show_default=True,
+    help="Scans a search.",
+)
+@click.option("--jobs", type=click.IntRange(1, 256), help="Processes [as many as there are processors].")
+def plan_study(scenes: tuple[Path, ...], out: Path, trials: int, jobs: int | None) -> None:
+    """Planned against straight and random sweeps over the tumour and 5 mm around it, of SCENES [the embedded patient].
+
+    A kidney without a tumour is given one.
+    """
+    make_folder(out)
+    from studies.plan.compare import compare, count_of
+    from studies.plan.virtual_tumour import with_tumour
+
+    runs = []
+    patients = scenes or (EMBEDDED,)
+    with tqdm(total=len(patients) * count_of(trials, CANDIDATES), desc="plan", unit="scan") as bar:
+        for number, each in enumerate(patients, 1):
+            path = each / "scene.toml" if each.is_dir() else each
+            scene = load_scene(path)
+            anatomy = with_tumour(load_anatomy(scene, path.parent), np.array(scene.gravity.direction))
+            run = compare(scene, anatomy, trials, jobs, bar.update)
+            runs.append(dict(patient=scene.title or f"patient {number}") | run)
+            bar.update(number * bar.total // len(patients) - bar.n)
+    (out / "plan.json").write_text(json.dumps(dict(trials=trials, runs=runs), indent=2) + "\n", "utf-8")
+    click.echo("\n".join(["", *(line for run in runs for line in table(run))]))
+    click.echo(f"\nWrote plan.json to {out}")
+
+
+def table(run: dict[str, Any]) -> list[str]:
+    """The figures of one patient."""
+    lines = [
+        f"{run['patient']}, {run['probe']}: {run['plan']}",
+        f"{'sweep':<14}seen  squeezed, mean and most, mm  lines touching  aside of square  path, mm  reachable  points",
+    ]
+    for row in run["rows"]:
+        name = row["sweep"] if row["count"] == 1 else f"{row['sweep']} ({row['count']})"
+        lines.append(
+            f"{name:<14}{100 * row['seen']:>3.0f} %{row['compression_mean_mm']:>20.1f}{row['compression_max_mm']:>10.1f}"
+            f"{100 * row['contact']:>14.0f} %{row['incidence_deg']:>12.0f} deg{row['path_mm']:>10.0f}"
+            f"{100 * row['reachable']:>9.0f} %{row['score']:>8.1f}"
+        )
+    return [*lines, ""]

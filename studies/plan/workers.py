@@ -1,0 +1,140 @@
+"""Trials of ways in parallel processes; the figures do not depend on how many.
+
+A process computes on one CPU thread, so that several do not fight for the same ones, and keeps the model that it has built.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+from joblib import Parallel, cpu_count, delayed, parallel_config
+
+import sim.device  # before all that imports Taichi, which it keeps quiet
+from scenes.anatomy import LoadedAnatomy, fingerprint
+from scenes.scene import Scene
+from scenes.trocar import Trocar
+from studies.plan.candidate import Candidate, candidates_of
+from studies.plan.file import PlanError
+from studies.plan.reach import Reach
+from studies.plan.trial import Parts, Trial
+from studies.plan.way import Way
+from studies.rehearsal import Rehearsal
+from ultrasound.array import Probe
+from ultrasound.coverage import VOXEL_MM, Coverage
+from ultrasound.probe import image_plane
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What a plan is made for. ``target`` is one of ``studies.plan.file.TARGETS``."""
+
+    scene: Scene
+    anatomy: LoadedAnatomy
+    probe: Probe
+    target: str
+    margin_mm: float
+    trocar: Trocar
+
+    @property
+    def bare(self) -> "Ground":
+        """Without the pictures, which no trial asks for."""
+        return replace(self, anatomy=replace(self.anatomy, ct=None, labels=None, parts={}))
+
+
+@dataclass(frozen=True)
+class Gone:
+    """What a way was worth, and its passes (n, 4, 4): probe in the patient, in PLUS's axes (LPS, mm)."""
+
+    parts: Parts
+    passes: list[np.ndarray]
+
+
+@dataclass(frozen=True)
+class Start:
+    """The candidates of a ground, and what its tissue is computed with."""
+
+    candidates: list[Candidate]
+    model: dict[str, float | int | str]
+
+
+# A candidate, its numbers, and the speed on its passes [mm/s].
+Task = tuple[Candidate, dict[str, float], float]
+
+
+class Workers:
+    """Processes that try ways on one ground."""
+
+    def __init__(self, ground: Ground) -> None:
+        self.ground = ground.bare
+        self._key = fingerprint(self.ground.anatomy) + repr((ground.scene, ground.probe, ground.target))
+
+    def start(self) -> Start:
+        """What there is to search. Raises PlanError."""
+        return next(self._all([delayed(_start)(self._key, self.ground)]))
+
+    def go(self, tasks: Sequence[Task]) -> Iterator[Gone]:
+        """In the order of the tasks, as they are done."""
+        return self._all([delayed(_go)(self._key, self.ground, *task) for task in tasks])
+
+    def go_ways(self, ways: Sequence[Callable[[Trial], Way]], speed_mm_s: float) -> Iterator[Gone]:
+        """The same of ways that are not candidates': each is made in its process."""
+        return self._all([delayed(_go_way)(self._key, self.ground, way, speed_mm_s) for way in ways])
+
+    def _all(self, calls: list) -> Iterator:
+        return Parallel(batch_size=1, return_as="generator")(calls)
+
+
+@contextmanager
+def workers(ground: Ground, jobs: int | None = None) -> Iterator[Workers]:
+    """Processes on this machine, as many as it has processors where ``jobs`` is None."""
+    with parallel_config(backend="loky", n_jobs=jobs or cpu_count()):
+        yield Workers(ground)
+
+
+_built: dict[str, Trial] = {}
+
+
+def _trial(key: str, ground: Ground, speed_mm_s: float) -> Trial:
+    """The trial of a ground, built once in a process. Raises PlanError."""
+    if key not in _built:
+        _built.clear()
+        if ground.target != "organ" and ground.anatomy.tumour is None:
+            raise PlanError(
+                f"--target {ground.target}: this scene has no tumour; expected organ, or another scene"
+            )
+        sim.device.start("cpu", cpu_max_num_threads=1)
+        rehearsal = Rehearsal(ground.scene, ground.anatomy, ground.probe)
+        coverage = Coverage(rehearsal.organ, rehearsal.tumour, ground.margin_mm)
+        middle = coverage.low_mm + VOXEL_MM * np.argwhere(coverage.targets[ground.target]).mean(axis=0)
+        reach = Reach(ground.trocar, rehearsal.hand, rehearsal.origin, middle)
+        _built[key] = Trial(rehearsal, coverage, ground.target, reach, speed_mm_s)
+    _built[key].speed_mm_s = speed_mm_s
+    return _built[key]
+
+
+def _start(key: str, ground: Ground) -> Start:
+    trial = _trial(key, ground, 1.0)
+    rehearsal, step = trial.rehearsal, trial.rehearsal.settings
+    passes = dict(time_step_s=step.time_step_s, substeps=step.substeps, iterations=step.iterations)
+    model = rehearsal.scene.tissue.model_dump(mode="json") | passes | rehearsal.model.counts()
+    return Start(candidates_of(rehearsal, trial.coverage, trial.target, trial.reach), model)
+
+
+def _go(key: str, ground: Ground, candidate: Candidate, values: dict[str, float], speed_mm_s: float) -> Gone:
+    return _go_way(key, ground, lambda trial: candidate.way(trial.rehearsal.hand, values), speed_mm_s)
+
+
+def _go_way(key: str, ground: Ground, make: Callable[[Trial], Way], speed_mm_s: float) -> Gone:
+    trial = _trial(key, ground, speed_mm_s)
+    way = make(trial)
+    parts = trial.run(way)
+    return Gone(
+        parts, [np.stack([_in_patient(trial.rehearsal, pose) for pose in each]) for each in way.passes]
+    )
+
+
+def _in_patient(rehearsal: Rehearsal, pose: np.ndarray) -> np.ndarray:
+    placed = image_plane(pose, rehearsal.size_mm[2], 1.0, 1.0).world_from_plane.copy()
+    placed[:3, 3] += rehearsal.origin
+    return placed

@@ -1,0 +1,134 @@
+"""A plan followed by hand: where the probe is to go next, and how well it went there."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from render.viewer import Guidance
+from studies.freehand.unsqueeze import shifted
+from studies.plan.file import Plan, PlanError
+from studies.rehearsal import Rehearsal
+from ultrasound.array import Probe
+from ultrasound.probe import held_at
+
+# Nearer than this a pose counts as gone through; a turn by so many degrees is as far as one millimetre.
+NEAR_MM, DEG_A_MM = 6.0, 3.0
+# So many poses are looked ahead for the one that the probe is at.
+AHEAD = 6
+
+
+@dataclass
+class Guide:
+    """The sweep of a plan that is shown, and the way along it so far. ``number`` says which sweep; one past the last is none."""
+
+    rehearsal: Rehearsal
+    plan: Plan
+    number: int = 0
+    _off: list[tuple[float, float]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """Nothing of the sweep was gone yet."""
+        self.at, self._off = 0, []
+        shown = self.number < len(self.plan.sweeps)
+        length, origin = self.rehearsal.size_mm[2], self.rehearsal.origin
+        self._passes = [
+            np.stack([held_at(shifted(pose, -origin), length) for pose in each])
+            for each in (self.plan.sweeps[self.number].poses() if shown else [])
+        ]
+        self._poses = np.concatenate(self._passes) if shown else np.zeros((0, 4, 4))
+        faces = [each[:, :3, 3] - length / 2 * each[:, :3, 2] for each in self._passes]
+        segments = [np.stack([each[:-1], each[1:]], axis=1) for each in faces]
+        # The pose at the end of each segment, by its place in the whole sweep.
+        starts = np.cumsum([0] + [len(each) for each in self._passes])
+        ends = [start + np.arange(1, len(each)) for start, each in zip(starts, faces, strict=False)]
+        self._segments = np.concatenate(segments) if segments else np.zeros((0, 2, 3))
+        self._ends = np.concatenate(ends) if ends else np.zeros(0, int)
+
+    def next_sweep(self) -> str:
+        """Show the plan's next sweep, after the last none; what there is to say."""
+        self.number = (self.number + 1) % (len(self.plan.sweeps) + 1)
+        self.begin_anew()
+        if self.number == len(self.plan.sweeps):
+            return "Plan hidden"
+        sweep = self.plan.sweeps[self.number]
+        return f"Plan {self.number + 1}: {sweep.name}, sees {100 * sweep.parts['seen']:.0f} %"
+
+    def watch(self, pose: np.ndarray) -> None:
+        """Where the transducer is now (4, 4)."""
+        ahead = self._poses[self.at : self.at + AHEAD]
+        if len(ahead) == 0:
+            return
+        off = self._distance(pose, ahead)
+        nearest = int(np.argmin(off[:, 0] + off[:, 1] / DEG_A_MM))
+        if off[nearest, 0] + off[nearest, 1] / DEG_A_MM <= NEAR_MM:
+            self._off.append((float(off[nearest, 0]), float(off[nearest, 1])))
+            self.at += nearest + 1
+
+    def _distance(self, pose: np.ndarray, others: np.ndarray) -> np.ndarray:
+        """How far a pose is from others (n, 4, 4): of the face's middle [mm], and of the turn [degrees]; (n, 2)."""
+        length = self.rehearsal.size_mm[2]
+        face = pose[:3, 3] - length / 2 * pose[:3, 2]
+        faces = others[:, :3, 3] - length / 2 * others[:, :3, 2]
+        cosine = (np.einsum("nij,ij->n", others[:, :3, :3], pose[:3, :3]) - 1) / 2
+        return np.column_stack(
+            [np.linalg.norm(faces - face, axis=1), np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))]
+        )
+
+    @property
+    def followed(self) -> float:
+        """Share of the sweep that is behind, 0 to 1."""
+        return self.at / len(self._poses) if len(self._poses) else 0.0
+
+    def figures(self) -> dict[str, float]:
+        """For the record; nothing where no sweep is shown."""
+        if len(self._poses) == 0:
+            return {}
+        off = np.mean(self._off, axis=0) if self._off else np.zeros(2)
+        return dict(plan_followed=self.followed, plan_off_mm=float(off[0]), plan_off_deg=float(off[1]))
+
+    def findings(self) -> dict[str, str]:
+        """For the window."""
+        figures = self.figures()
+        if not figures:
+            return {}
+        off = f"{figures['plan_off_mm']:.1f} mm, {figures['plan_off_deg']:.0f} deg" if self._off else ""
+        return {"plan": f"{100 * self.followed:.0f} %", "off the plan": off}
+
+    def guidance(self) -> Guidance | None:
+        """What is drawn of it."""
+        if len(self._poses) == 0:
+            return None
+        goal = self._poses[self.at] if self.at < len(self._poses) else None
+        return Guidance(goal, self._segments, self._ends < self.at)
+
+    def in_words(self, seen: float | None) -> str:
+        """How it went, for the terminal; ``seen`` is the share of the target that was seen. Empty where no sweep is shown."""
+        figures = self.figures()
+        if not figures:
+            return ""
+        sweep = self.plan.sweeps[self.number]
+        text = f"plan      {sweep.name}: {100 * figures['plan_followed']:.0f} % of it followed"
+        if self._off:
+            text += f", {figures['plan_off_mm']:.1f} mm and {figures['plan_off_deg']:.0f} degrees beside it"
+        if seen is not None:
+            text += (
+                f"; {self.plan.target} seen {100 * seen:.0f} % (planned {100 * sweep.parts['seen']:.0f} %)"
+            )
+        return text
+
+
+def check_plan(plan: Plan, anatomy: str, probe: Probe) -> None:
+    """Raises PlanError where a plan is for other anatomy than that of a fingerprint, or for another probe."""
+    if plan.anatomy != anatomy:
+        raise PlanError(
+            "the plan is of other anatomy than this scene's: name its scene or patient's folder before --plan; "
+            "a patient imported anew is another one"
+        )
+    planned = plan.probe.get("TransducerName"), plan.probe.get("HousingMm")
+    if planned != (probe.transducer_name, list(probe.housing_mm)):
+        raise PlanError(
+            f"the plan is for the probe {planned[0]!r}, found {probe.transducer_name!r}: choose it with --probe, or plan anew"
+        )
