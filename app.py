@@ -6,6 +6,7 @@ import threading
 
 import click
 
+from render.keys import KeysError
 from scenes.command import import_patient_command
 from scenes.reading.error import PatientError
 from scenes.scene import SceneError
@@ -15,7 +16,7 @@ from studies.case import CaseError
 from studies.commands import calibrate, validate
 from studies.freehand.command import reconstruct
 from studies.reference.command import reference
-from studies.rehearse.command import rehearse
+from studies.rehearse.command import keys_command, rehearse
 from studies.scan.command import scan
 from studies.scan.poses import PoseError
 from studies.session.file import SessionError
@@ -37,6 +38,7 @@ MENDED_BY_USER = (
     SamplingError,
     CaseError,
     SetupError,
+    KeysError,
 )
 
 
@@ -50,6 +52,7 @@ def cli() -> None:
 
 for command in (
     rehearse,
+    keys_command,
     import_patient_command,
     scan,
     reconstruct,
