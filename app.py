@@ -6,6 +6,7 @@ import threading
 
 import click
 
+from render.keys import KeysError
 from scenes.command import import_patient_command
 from scenes.reading.error import PatientError
 from scenes.scene import SceneError
@@ -17,7 +18,7 @@ from studies.freehand.command import reconstruct
 from studies.plan.command import plan
 from studies.plan.file import PlanError
 from studies.reference.command import reference
-from studies.rehearse.command import rehearse
+from studies.rehearse.command import keys_command, rehearse
 from studies.scan.command import scan
 from studies.scan.poses import PoseError
 from studies.session.file import SessionError
@@ -40,6 +41,7 @@ MENDED_BY_USER = (
     SamplingError,
     CaseError,
     SetupError,
+    KeysError,
 )
 
 
@@ -53,6 +55,7 @@ def cli() -> None:
 
 for command in (
     rehearse,
+    keys_command,
     import_patient_command,
     plan,
     scan,

@@ -18,7 +18,12 @@ STRIP, FINDINGS = (17, 20, 24), (20, 24, 29)
 HELP_COLUMNS, HELP_KEY_PX = 2, 104
 
 
-def backdrop(layout: Layout, panel: Panel, help_lines: Iterable[tuple[str, str]] | None = None) -> np.ndarray:
+def backdrop(
+    layout: Layout,
+    panel: Panel,
+    help_lines: Iterable[tuple[str, str]] | None = None,
+    help_key: str = "H",
+) -> np.ndarray:
     """All that stays the same from frame to frame, uint8, shape (height, width, 3); the help is drawn if given."""
     fade = np.linspace(0, 1, layout.scene.height)[:, None]
     rows = (1 - fade) * np.array(BACKDROP_TOP) + fade * np.array(BACKDROP_FOOT)
@@ -27,7 +32,7 @@ def backdrop(layout: Layout, panel: Panel, help_lines: Iterable[tuple[str, str]]
     picture[layout.scene.slices] = np.round(rows).astype(np.uint8)[:, None]
     image = Image.fromarray(picture)
     draw = ImageDraw.Draw(image)
-    _draw_title(draw, layout, panel)
+    _draw_title(draw, layout, panel, help_key)
     draw_panel(draw, layout, panel)
     for y in (layout.title.bottom - 1, layout.strip.top):
         draw.line([(0, y), (layout.strip.right, y)], fill=LINE)
@@ -36,9 +41,9 @@ def backdrop(layout: Layout, panel: Panel, help_lines: Iterable[tuple[str, str]]
     return np.array(image)
 
 
-def _draw_title(draw: ImageDraw.ImageDraw, layout: Layout, panel: Panel) -> None:
+def _draw_title(draw: ImageDraw.ImageDraw, layout: Layout, panel: Panel, help_key: str) -> None:
     draw.text((16, 12), panel.title or "Nephron", font=font(17), fill=TEXT)
-    draw.text((layout.scene.right - 16, 15), "H  all keys", font=font(13), fill=QUIET, anchor="ra")
+    draw.text((layout.scene.right - 16, 15), f"{help_key}  all keys", font=font(13), fill=QUIET, anchor="ra")
 
 
 def _draw_help(draw: ImageDraw.ImageDraw, box: Rect, lines: list[tuple[str, str]]) -> None:

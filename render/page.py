@@ -5,9 +5,10 @@ import time
 import numpy as np
 
 from render import frame
+from render.keys import Keys
 from render.layout import ASIDE_WIDTH, Layout
 from render.panel import BEFORE, CALLIPER, OUTLINE, Panel, calliper_segments, draw_segments, paste_picture
-from render.viewer import KEY_MAP, Settings, View
+from render.viewer import Settings, View
 
 READOUT_PERIOD_S = 0.25
 
@@ -33,8 +34,8 @@ def panel_of(view: View, settings: Settings) -> Panel:
 class Page:
     """``pixels`` uint8 (width, height, 4) as GGUI wants them: columns first, bottom up."""
 
-    def __init__(self, layout: Layout) -> None:
-        self.layout = layout
+    def __init__(self, layout: Layout, keys: Keys | None = None) -> None:
+        self.layout, self.keys = layout, keys or Keys()
         self.pixels = np.full((layout.width, layout.height, 4), 255, dtype=np.uint8)
         # frame.py and panel.py write rows, top down, through this view of the memory.
         self._page = self.pixels.transpose(1, 0, 2)[::-1]
@@ -49,8 +50,8 @@ class Page:
         """Put a view on the page. A ``patient`` one lets read-outs stand long enough to be read."""
         panel = panel_of(view, settings)
         if (self.panel, self._help_shown) != (panel, help_shown):
-            lines = [(key.key, key.text) for key in KEY_MAP] if help_shown else None
-            self._page[:, :, :3] = frame.backdrop(self.layout, panel, lines)
+            lines = self.keys.lines() if help_shown else None
+            self._page[:, :, :3] = frame.backdrop(self.layout, panel, lines, self.keys.of["help"])
             self.panel, self._help_shown, self._figures = panel, help_shown, None
         for box, picture in zip(panel.boxes(self.layout), view.pictures.values(), strict=True):
             paste_picture(self._page, box, picture)

@@ -45,7 +45,8 @@ KEY_MAP = (
     Key("O", "outline", "outline of the tumour in the picture"),
     Key("G", "show_scanner", "the scanner's sliders, gain over depth too"),
     Key("Click on picture", "measure", "calliper from click to click, in mm"),
-    Key("Left, Right", "cine", "while frozen: through the last ten seconds"),
+    Key("Left", "cine_back", "while frozen: back through the last ten seconds"),
+    Key("Right", "cine_forth", "while frozen: forth again"),
     Key("I", "export", "save the picture as PNG and as DICOM"),
     Key("T", "translucent", "organ translucent or solid"),
     Key("X", "cut", "cut the organ along the image plane"),
@@ -202,6 +203,10 @@ class Controls:
     """Origin [mm] and unit direction under the mouse, world, each (3,); None off the 3D view or while the view turns."""
     press: bool = False
     """The button that presses the transducer in is held."""
+    press_share: float = 1.0
+    """How far a press goes, as a share of the deepest: less under a trigger that is pulled halfway."""
+    slide_mm: tuple[float, float] = (0.0, 0.0)
+    """Over the organ's surface, along the transducer's own x (lateral) and y (elevation)."""
     push_mm: float = 0.0
     """Along the transducer's axis, positive into the tissue, negative lifts."""
     roll_deg: float = 0.0
@@ -227,6 +232,8 @@ class Controls:
     """The freeze key went down: the app toggles."""
     screenshot: bool = False
     quit: bool = False
+    news: str = ""
+    """What a device has to say, such as that it was unplugged."""
 
 
 class Viewer(Protocol):

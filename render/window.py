@@ -20,42 +20,18 @@ import numpy as np
 import taichi as ti
 from taichi.ui.utils import get_field_info
 
+from render.actions import begin, hold
 from render.camera import FIELD_OF_VIEW_DEG, OrbitCamera
+from render.gamepad import Gamepad
+from render.keys import Keys
 from render.layout import Layout, Rect
 from render.page import Page
 from render.sliders import boxes_of, draw_sliders
 from render.stage import Stage
 from render.viewer import Controls, Geometry, Settings, View
-from ultrasound.array import MODES, RUNGS
 
-PUSH_MM_S, ROLL_DEG_S, TILT_DEG_S, ZOOM_S = 15.0, 45.0, 30.0, 0.5
+ZOOM_S = 0.5
 FRAMES_A_SECOND = 60
-PRESSED_ONCE = {
-    "r": "reset",
-    "f": "freeze",
-    "p": "screenshot",
-    "i": "export",
-    "u": "undo",
-    "y": "redo",
-    "m": "bookmark",
-    "j": "to_bookmark",
-    "l": "sweep",
-    "k": "take_over",
-    ti.ui.ESCAPE: "quit",
-}
-TOGGLES = {"t": "translucent", "x": "cut", "o": "outline", "g": "show_scanner", "n": "show_seen"}
-CYCLES = {"b": ("mode", MODES), "v": ("rung", RUNGS)}
-CINE = {ti.ui.LEFT: -1, ti.ui.RIGHT: 1}
-HELD = {
-    "w": ("push_mm", PUSH_MM_S),
-    "s": ("push_mm", -PUSH_MM_S),
-    "a": ("roll_deg", ROLL_DEG_S),
-    "d": ("roll_deg", -ROLL_DEG_S),
-    "q": ("tilt_deg", TILT_DEG_S),
-    "e": ("tilt_deg", -TILT_DEG_S),
-    "z": ("fan_deg", -TILT_DEG_S),
-    "c": ("fan_deg", TILT_DEG_S),
-}
 
 
 class NoVulkan(RuntimeError):
@@ -97,6 +73,8 @@ class Window:
         size: width, height in pixels.
         visible: a real window, at most FRAMES_A_SECOND; else off-screen, where nothing is drawn before `picture` asks.
         name: in the title bar.
+        keys: which key does what.
+        gamepad: what is read beside mouse and keys, if anything.
 
     Raises:
         NoVulkan: no Vulkan loader, driver or device.
@@ -110,10 +88,13 @@ class Window:
         size=(1280, 720),
         visible=True,
         name="Nephron",
+        keys: Keys | None = None,
+        gamepad: Gamepad | None = None,
     ):
         if visible and not display_available():
             raise RuntimeError("no display to open a window on")
         self.settings = settings or Settings()
+        self.keys, self._gamepad = keys or Keys(), gamepad
         self.layout = Layout(*size)
         # GGUI goes on to measure sliders in shares of the size that the window was opened with.
         self._first_size = size
@@ -142,7 +123,7 @@ class Window:
         part = self.layout.window_coordinates(self.layout.scene)
         self.camera = OrbitCamera(geometry.bounds, geometry.up, part, size[0] / size[1])
         self._stage = Stage(geometry, self.camera)
-        self._page = Page(self.layout)
+        self._page = Page(self.layout, self.keys)
 
     # What the user does
 
@@ -158,13 +139,17 @@ class Window:
             return controls
         self._read_cursor()
         self._read_events(controls)
-        self._move_camera(elapsed)
-        for key, (name, rate) in HELD.items():
-            if self._window.is_pressed(key):
-                setattr(controls, name, getattr(controls, name) + rate * elapsed)
+        held = [action for action, key in self.keys.held() if self._window.is_pressed(key)]
+        for action in held:
+            hold(action, controls, elapsed)
+        self._move_camera(held, elapsed)
         controls.press = self._pressing
         if self._drag is None and self._over_scene():
             controls.ray = self.camera.ray(self._cursor)
+        if self._gamepad is not None:
+            self._gamepad.read(controls, elapsed)
+        if controls.reset:
+            self.camera.go_home()
         self._quit = self._quit or controls.quit
         return controls
 
@@ -219,20 +204,10 @@ class Window:
         elif key in (ti.ui.RMB, ti.ui.MMB) and self._over_scene():
             pans = key == ti.ui.MMB or self._window.is_pressed(ti.ui.SHIFT)
             self._drag = "pan" if pans else "orbit"
-        elif key in PRESSED_ONCE:
-            setattr(controls, PRESSED_ONCE[key], True)
-            if controls.reset:
-                self.camera.go_home()
-        elif key in TOGGLES:
-            setattr(self.settings, TOGGLES[key], not getattr(self.settings, TOGGLES[key]))
-        elif key in CYCLES:
-            name, values = CYCLES[key]
-            at = values.index(getattr(self.settings, name))
-            setattr(self.settings, name, values[(at + 1) % len(values)])
-        elif key in CINE:
-            controls.cine += CINE[key]
-        elif key == "h":
+        elif (action := self.keys.action_of(key)) == "help":
             self._help_shown = not self._help_shown
+        else:
+            begin(action, controls)
 
     def _put_sliders_back(self) -> None:
         """A drag that changed no setting may have moved a box of sliders: GGUI can only place a new one."""
@@ -244,13 +219,13 @@ class Window:
         if moved and settings == dataclasses.astuple(self.settings):
             self._boxes_placed += 1
 
-    def _move_camera(self, elapsed: float) -> None:
+    def _move_camera(self, held: list[str], elapsed: float) -> None:
         if self._drag == "orbit":
             self.camera.orbit(*self._moved)
         elif self._drag == "pan":
             self.camera.pan(*self._moved)
-        for key, sense in ((ti.ui.UP, -1.0), (ti.ui.DOWN, 1.0)):
-            if self._window.is_pressed(key):
+        for action, sense in (("zoom_in", -1.0), ("zoom_out", 1.0)):
+            if action in held:
                 self.camera.zoom(np.exp(sense * elapsed / ZOOM_S))
 
     # What is drawn
@@ -297,7 +272,7 @@ class Window:
             return
         self.layout = Layout(*size)
         self._boxes_placed += 1
-        self._page = Page(self.layout)
+        self._page = Page(self.layout, self.keys)
         self.camera.aspect = size[0] / size[1]
         self.camera.part = self.layout.window_coordinates(self.layout.scene)
 

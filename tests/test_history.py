@@ -276,6 +276,7 @@ DID = [
     dict(ray=ray(2.0)),
     dict(press=True),
     *({name: 0.5} for name in ("push_mm", "fan_deg", "tilt_deg", "roll_deg")),
+    dict(slide_mm=(0.0, 0.5)),
 ]
 
 
@@ -352,6 +353,36 @@ def test_a_way_back_to_nowhere_is_said_and_no_moment_is_lost():
     for key in ("undo", "redo", "to_bookmark", "bookmark", "to_bookmark"):
         step(live, **{key: True})
         said.append(live.take_said())
-    nothing = ["Nothing to undo", "Nothing to redo", "No bookmark: M sets one"]
+    nothing = ["Nothing to undo", "Nothing to redo", "No bookmark: {bookmark} sets one"]
     assert said == [*nothing, "Bookmark 1", "Bookmark 1"] and live.take_said() == ""
     assert live.session.moment == 5 and live.session.rehearsal.steps == 3
+
+
+def face(live: Live) -> np.ndarray:
+    """Where the hand aims."""
+    return (live.session.rehearsal.hand.aim @ [0, 0, -3.0, 1])[:3]
+
+
+def test_after_a_slide_the_mouse_leads_only_once_it_moves():
+    live = live_of()
+    for _ in range(4):
+        step(live, ray=ray(2.0))
+    for _ in range(10):
+        step(live, ray=ray(2.0), slide_mm=(-0.5, 0.2))
+    # On the ball of 12 mm 5.4 mm of way, of which some is height.
+    slid = face(live)
+    assert slid[0] == pytest.approx(-3.0, abs=0.4) and slid[1] == pytest.approx(2.0, abs=0.3)
+    step(live, ray=ray(2.0))
+    assert np.array_equal(face(live), slid)
+    step(live, ray=ray(2.5))
+    assert face(live)[:2] == pytest.approx([2.5, 0.0])
+    step(live, ray=ray(2.5))
+    assert face(live)[:2] == pytest.approx([2.5, 0.0])
+
+
+def test_a_press_by_a_share_goes_no_deeper():
+    live = live_of()
+    for _ in range(30):
+        step(live, press=True, press_share=0.5)
+    hand = live.session.rehearsal.hand
+    assert hand.pressed_mm == pytest.approx(hand.most_mm / 2)

@@ -82,7 +82,7 @@ def test_a_recorded_sweep_says_where_each_pixel_is(tmp_path):
     rehearsal, view = recording()
     sweeping, places, pictures = Sweeping(rehearsal), [], []
     assert sweeping.watch(0.0, view, rehearsal.probe) == "" and sweeping.end() == ""
-    assert sweeping.toggle(tmp_path) == "sweep-001: L ends it"
+    assert sweeping.toggle(tmp_path) == "sweep-001: {sweep} ends it"
     for step in range(8):
         # A step of 1/60 s: every other is a frame, the first among them.
         assert sweeping.watch(5.0 + step / 60, view, rehearsal.probe) == ""
@@ -110,7 +110,7 @@ def test_a_recorded_sweep_says_where_each_pixel_is(tmp_path):
     ]
     assert marks_beside(tmp_path / "sweep-001-marks.igs.mha") is None
     # Times of a sweep are those of the rehearsal, and a new one begins at once, whenever the last ended.
-    assert sweeping.toggle(tmp_path) == "sweep-002: L ends it"
+    assert sweeping.toggle(tmp_path) == "sweep-002: {sweep} ends it"
     sweeping.watch(1.0, view, rehearsal.probe)
     assert sweeping.end() == "sweep-002.igs.mha: 1 pictures"
     assert read_sweep(tmp_path / "sweep-002.igs.mha").times_s == [1.0]

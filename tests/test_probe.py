@@ -154,3 +154,71 @@ def test_a_probe_of_short_housing_is_not_pushed_in_beyond_what_holds_it(hand):
     short = Hand(hand.vertices, hand.faces, hand.normals, np.array([16.0, 9.0, 6.0]), hand.home, hand.lateral)
     short.push(100.0)
     assert short.depth_mm == 9.0
+
+
+def test_a_press_goes_as_deep_as_its_share_and_gives_way_where_that_falls(hand):
+    for share, depth in ((0.4, 6.0), (0.8, 12.0), (0.2, 3.0)):
+        for _ in range(20):
+            hand.hold(True, 0.1, share)
+        assert hand.pressed_mm == pytest.approx(depth)
+    hand.hold(True, 0.1, 1.0)
+    assert hand.pressed_mm == pytest.approx(3.0 + 1.2)
+    hand.hold(True, 0.1, 0.0)
+    assert hand.pressed_mm == pytest.approx(4.2 - 4.0)
+
+
+RADIUS = 30.0
+
+
+@pytest.fixture
+def rider() -> Hand:
+    """A hand on top of a fine sphere."""
+    sphere = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    vertices, faces = np.array(sphere.vertices), np.array(sphere.faces, np.int64)
+    top = pose_at(np.array([0, 0, RADIUS]), np.array([0, 0, -1.0]), np.array([1.0, 0, 0]), SIZE[2])
+    return Hand(vertices, faces, np.array(sphere.vertex_normals), SIZE, top, np.array([1.0, 0, 0]))
+
+
+def slid(hand: Hand, lateral_mm: float, elevation_mm: float, steps: int = 50) -> np.ndarray:
+    """Where the face is aimed at after so many equal steps."""
+    for _ in range(steps):
+        hand.slide(lateral_mm / steps, elevation_mm / steps)
+    return (hand.aim @ [0, 0, -SIZE[2] / 2, 1])[:3]
+
+
+def on_the_arc(towards: np.ndarray, way_mm: float) -> np.ndarray:
+    angle = way_mm / RADIUS
+    return RADIUS * (np.sin(angle) * np.asarray(towards, float) + np.cos(angle) * np.array([0, 0, 1.0]))
+
+
+# A step d along the tangent becomes R atan(d / R), 0.01 % less for 0.6 mm; the sphere's edges are 2.2 mm long, so that its
+# faces lie up to 2.2^2 / (8 R) = 0.02 mm under it, and their smoothed normals tilt a step by no more than that over an edge.
+@pytest.mark.parametrize(
+    ("lateral", "elevation"), [(20.0, 0.0), (-20.0, 0.0), (0.0, 20.0), (0.0, -20.0), (9.0, -12.0)]
+)
+def test_a_slide_goes_so_far_over_the_surface(rider, lateral, elevation):
+    way = np.hypot(lateral, elevation)
+    towards = np.array([lateral, elevation, 0.0]) / way
+    assert slid(rider, lateral, elevation) == pytest.approx(on_the_arc(towards, way), abs=0.2)
+    normal = on_the_arc(towards, way) / RADIUS
+    assert rider.aim[:3, 2] @ normal > np.cos(np.radians(0.5))
+
+
+def test_a_slide_goes_on_where_the_surface_looks_along_the_hands_lateral(rider):
+    way = np.radians(150) * RADIUS
+    assert slid(rider, way, 0.0, 150) == pytest.approx(on_the_arc([1, 0, 0], way), abs=0.8)
+
+
+@pytest.mark.parametrize(
+    ("turned", "towards"), [((0, 0, 90), [0, 1, 0]), ((0, 0, -90), [0, -1, 0]), ((0, 50, 0), [1, 0, 0])]
+)
+def test_a_slide_follows_the_turned_picture(rider, turned, towards):
+    rider.turn(*turned)
+    assert slid(rider, 15.0, 0.0) == pytest.approx(on_the_arc(towards, 15.0), abs=0.2)
+
+
+def test_a_slide_goes_over_the_surface_not_with_the_depth(rider):
+    rider.push(4.0)
+    rider.turn(20.0, -10.0, 0.0)
+    assert np.linalg.norm(slid(rider, 5.0, 5.0)) == pytest.approx(RADIUS, abs=0.03)
+    assert (rider.depth_mm, tuple(rider.turn_deg)) == (4.0, (20.0, -10.0, 0.0))

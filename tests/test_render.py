@@ -53,16 +53,6 @@ def test_the_readme_has_the_key_map():
     assert key_table() in readme.read_text("utf-8")
 
 
-def test_key_map_and_window_agree():
-    window = pytest.importorskip("render.window")
-    bound = set(window.HELD) | set(window.TOGGLES) | set(window.PRESSED_ONCE) | set(window.CYCLES) | {"h"}
-    printed = {line.key.lower() for line in KEY_MAP if len(line.key) == 1}
-    assert {key for key in bound if len(key) == 1} == printed
-    actions = {line.action for line in KEY_MAP}
-    assert set(window.TOGGLES.values()) | set(window.PRESSED_ONCE.values()) <= actions
-    assert set(window.PRESSED_ONCE.values()) <= {each.name for each in dataclasses.fields(Controls)}
-
-
 def test_defaults_lie_in_their_ranges_and_every_setting_can_become_a_slider():
     for each in (setting for setting in dataclasses.fields(Settings) if setting.metadata):
         default = each.metadata["high"] if each.default is None else each.default

@@ -11,7 +11,7 @@ from PIL import Image
 import app
 from scenes.anatomy import load_surface, phantom_folder
 from scenes.scene import EMBEDDED
-from studies.scan.poses import PoseError, load_poses
+from studies.scan.poses import PoseError, TimedPoses, load_poses, load_timed_poses
 from ultrasound.array import load_probe
 
 
@@ -74,6 +74,46 @@ def test_a_table_with_another_number_of_columns_is_refused(tmp_path):
     assert "expected sixteen" in refused(tmp_path, "a,b", "poses.csv")
     with pytest.raises(PoseError, match="no such file"):
         load_poses(tmp_path / "none.json")
+
+
+def test_poses_with_times_of_both_formats_are_the_same(tmp_path):
+    poses = np.stack([np.eye(4)] * 3)
+    poses[:, 0, 3] = [1.0, 2.0, 4.0]
+    times = [10.0, 10.5, 12.0]
+    rows = [
+        dict(time_s=time, probe_to_patient=pose.tolist()) for time, pose in zip(times, poses, strict=True)
+    ]
+    (tmp_path / "a.json").write_text(json.dumps(rows))
+    lines = [",".join(map(str, [time, *pose.ravel()])) for time, pose in zip(times, poses, strict=True)]
+    (tmp_path / "a.csv").write_text("\n".join(lines))
+    for name in ("a.json", "a.csv"):
+        timed = load_timed_poses(tmp_path / name)
+        assert np.array_equal(timed.times_s, times) and np.array_equal(timed.poses, poses)
+        assert timed.length_s == 2.0
+        assert np.array_equal(list(load_poses(tmp_path / name).values()), poses)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a.csv", "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1", "pose 1 has no time"),
+        ("a.json", json.dumps([dict(probe_to_patient=np.eye(4).tolist())]), "pose 1 has no time"),
+        ("a.json", json.dumps([dict(time_s="soon", probe_to_patient=np.eye(4).tolist())]), "pose 1, time_s"),
+        ("a.csv", "nan,1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1", "pose 1: begins with nan"),
+        ("a.csv", "0,1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1\n1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1", "pose 2: 16 numbers"),
+        ("a.csv", "5,1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1\n" * 2, "pose 2 at 5 s is no later"),
+    ],
+)
+def test_times_that_cannot_be_used_are_refused_in_one_line(tmp_path, name, text, words):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(PoseError, match=words) as error:
+        load_timed_poses(tmp_path / name)
+    assert "\n" not in str(error.value) and name in str(error.value)
+
+
+def test_times_that_go_back_are_no_way():
+    with pytest.raises(PoseError, match="pose 3 at 1 s is no later than the one before, at 2 s"):
+        TimedPoses(np.array([0.0, 2.0, 1.0]), [None] * 3)
 
 
 def test_a_pixel_is_where_its_matrix_says():

@@ -10,13 +10,16 @@ import pytest
 import taichi as ti
 
 from render.viewer import Controls, NullViewer, Settings, View
+from render.window import NoVulkan
 from scenes.anatomy import LoadedAnatomy, load_anatomy, phantom_folder
 from scenes.scene import EMBEDDED, load_scene, with_options
 from sim.device import start
 from studies.models import step_settings
 from studies.rehearsal import Rehearsal
-from studies.rehearse import run
+from studies.rehearse import headless, run
+from studies.rehearse.sweeping import probe_in_patient
 from studies.rehearse.view import settings_of
+from studies.scan.poses import TimedPoses
 from studies.session import recorded
 from studies.session.file import Log, read_log
 
@@ -61,7 +64,7 @@ def rehearsed(built, monkeypatch, out: Path, script: Any, log: Log | None = None
     rehearsal.set_young(scene.tissue.young_kpa)
     settings = settings_of(rehearsal)
     viewer = Watched(settings, script(settings))
-    monkeypatch.setattr(run, "open_viewer", lambda rehearsal, visible: viewer)
+    monkeypatch.setattr(run, "open_viewer", lambda *_, **__: viewer)
     # A budget that no step keeps: the ladder goes down.
     each = run.Run(rehearsal, anatomy, "cpu", out, budget_ms=0.01)
     each.in_window(log, at_s)
@@ -108,3 +111,32 @@ def test_a_session_that_goes_on_from_a_replay_is_one_too(built, monkeypatch, tmp
     assert len(second.poses) == 40 and second.header.begins
     shown, again, _ = rehearsed(built, monkeypatch, tmp_path, watching(40), second)
     assert shown == led[20:] and again == end and "identical in all 1 states" in capsys.readouterr().out
+
+
+def test_a_tracked_file_is_followed_headless_and_replayed(built, monkeypatch, tmp_path, capsys):
+    rehearsal, anatomy = built
+    rehearsal.reset()
+    monkeypatch.setattr(headless, "open_viewer", no_vulkan)
+    poses = [probe_in_patient(rehearsal)]
+    for _ in range(30):
+        rehearsal.hand.slide(0.3, -0.1)
+        rehearsal.pose = rehearsal.hand.pose()
+        poses.append(probe_in_patient(rehearsal))
+    rehearsal.reset()
+    # The slides, 9.5 mm, in half a second.
+    track = TimedPoses(
+        np.linspace(2.0, 2.5, 31), [None if 8 <= k < 12 else pose for k, pose in enumerate(poses)]
+    )
+    tracked = run.Run(rehearsal, anatomy, "cpu", tmp_path, budget_ms=0.01, track=track)
+    tracked.headless(None, 0.0, None, 0.0)
+    log = read_log(tracked.recorded.recording.path)
+    assert len(log.poses) == 31 and probe_in_patient(rehearsal) == pytest.approx(poses[-1])
+    told = [event.value for events in log.events.values() for event in events if event.kind == "solver"]
+    assert len({values["iterations"] for values in told if "iterations" in values}) == 1
+    rehearsal.reset()
+    run.Run(rehearsal, anatomy, "cpu", tmp_path).headless(log, 0.0, None, 0.0)
+    assert "identical in all 1 states" in capsys.readouterr().out
+
+
+def no_vulkan(rehearsal: Rehearsal, visible: bool) -> None:
+    raise NoVulkan("none")

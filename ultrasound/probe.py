@@ -106,11 +106,16 @@ def approached(pose: np.ndarray, goal: np.ndarray, most_mm: float, most_deg: flo
     share = min(1.0, most_mm / max(way, 1e-9), most_deg / max(turn, 1e-9))
     if share >= 1.0:
         return goal.copy()
-    turns = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([pose[:3, :3], goal[:3, :3]])))
-    moved = np.eye(4)
-    moved[:3, :3] = turns([share]).as_matrix()[0]
-    moved[:3, 3] = pose[:3, 3] + share * (goal[:3, 3] - pose[:3, 3])
-    return moved
+    return interpolated(pose, goal, share)
+
+
+def interpolated(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
+    """The pose a share (0 to 1) of the way from start to end: straight in position, the short way round in angle."""
+    turns = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([start[:3, :3], end[:3, :3]])))
+    pose = np.eye(4)
+    pose[:3, :3] = turns([share]).as_matrix()[0]
+    pose[:3, 3] = start[:3, 3] + share * (end[:3, 3] - start[:3, 3])
+    return pose
 
 
 @dataclass(frozen=True)
@@ -173,9 +178,10 @@ class Hand:
         if place is not None:
             self.aim_at(place)
 
-    def aim_at(self, target: np.ndarray) -> None:
-        """Aim at a point of the surface [mm], perpendicular to the patch around it."""
-        self.aim = pose_at(target, -self.outward(target), self.lateral, self.size_mm[2])
+    def aim_at(self, target: np.ndarray, lateral: np.ndarray | None = None) -> None:
+        """Aim at a point of the surface [mm], perpendicular to the patch around it; x is nearest to ``lateral``."""
+        lateral = self.lateral if lateral is None else lateral
+        self.aim = pose_at(target, -self.outward(target), lateral, self.size_mm[2])
 
     def outward(self, place: np.ndarray) -> np.ndarray:
         """Unit normal (3,) of the patch of surface around a place [mm]."""
@@ -189,14 +195,27 @@ class Hand:
         hits = igl.ray_mesh_intersect(np.array(origin), np.array(direction), self.vertices, self.faces)
         return np.array(origin) + hits[0][1] * np.array(direction) if hits else None
 
+    def slide(self, lateral_mm: float, elevation_mm: float) -> None:
+        """Move the aim over the surface, along the turned transducer's own x and y."""
+        aim = self.home if self.aim is None else self.aim
+        outward = aim[:3, 2]
+        along = self._turned(aim)[:3, :2]
+        along = along - np.outer(outward, outward @ along)
+        along /= np.linalg.norm(along, axis=0)
+        wanted = _face_centre(aim, self.size_mm[2]) + along @ [lateral_mm, elevation_mm]
+        _, _, nearest = igl.point_mesh_squared_distance(wanted[None], self.vertices, self.faces)
+        # With the hand's own lateral it would turn about where the surface looks along that, and come back.
+        self.aim_at(nearest.reshape(3), aim[:3, 0])
+
     def push(self, depth_mm: float) -> None:
         """Press in by a depth [mm], or lift where negative."""
         self.depth_mm = float(np.clip(self.depth_mm + depth_mm, LEAST_DEPTH_MM, self.most_mm))
 
-    def hold(self, pressing: bool, time_s: float) -> None:
-        """Press further while the button is held, let go when it is not."""
-        speed = PRESS_MM_S if pressing else -RELEASE_MM_S
-        self.pressed_mm = float(np.clip(self.pressed_mm + speed * time_s, 0.0, self.most_mm))
+    def hold(self, pressing: bool, time_s: float, share: float = 1.0) -> None:
+        """Press further while the button is held, to a share of the deepest; let go when it is not."""
+        goal = share * self.most_mm if pressing else 0.0
+        least, most = self.pressed_mm - RELEASE_MM_S * time_s, self.pressed_mm + PRESS_MM_S * time_s
+        self.pressed_mm = float(np.clip(goal, least, most))
 
     def turn(self, fan_deg: float, tilt_deg: float, roll_deg: float) -> None:
         """Turn about the transducer's x, y and z axes [degrees]; fan and tilt end where a hand's do."""
@@ -205,11 +224,17 @@ class Hand:
 
     def pose(self) -> np.ndarray:
         """The pose that the hand wants now: turned about the face's centre, touching, then pressed in."""
-        pose = (self.home if self.aim is None else self.aim).copy()
-        face = pose[:3, 3] - self.size_mm[2] / 2 * pose[:3, 2]
-        pose[:3, :3] = (
-            pose[:3, :3] @ Rotation.from_euler("zyx", self.turn_deg[::-1], degrees=True).as_matrix()
-        )
-        pose[:3, 3] = face + self.size_mm[2] / 2 * pose[:3, 2]
+        pose = self._turned(self.home if self.aim is None else self.aim)
         depth = min(self.depth_mm + self.pressed_mm, self.most_mm)
         return advanced(touching(pose, self.size_mm, self.samples, self.radius_mm), depth)
+
+    def _turned(self, aim: np.ndarray) -> np.ndarray:
+        pose, length = aim.copy(), self.size_mm[2]
+        turn = Rotation.from_euler("zyx", self.turn_deg[::-1], degrees=True).as_matrix()
+        pose[:3, :3] = aim[:3, :3] @ turn
+        pose[:3, 3] = _face_centre(aim, length) + length / 2 * pose[:3, 2]
+        return pose
+
+
+def _face_centre(pose: np.ndarray, length_mm: float) -> np.ndarray:
+    return pose[:3, 3] - length_mm / 2 * pose[:3, 2]

@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any
 import click
 from pydantic import ValidationError
 
+from render.keys import Keys, keys_text, load_keys
 from scenes.anatomy import LoadedAnatomy, fingerprint, load_anatomy
 from scenes.scene import EMBEDDED, OPTIONS, TISSUES, Scene, load_scene, with_options
 from studies.commands import Fault, arch_option, make_folder, start_taichi
+from studies.rehearse.track_file import PROBE_IN_PATIENT, check_near, load_track
 from studies.session.file import Log, SessionError, read_log
 from studies.session.scene import scene_of_log
 from studies.setup import Setup, probe_of, scene_of
@@ -38,6 +40,22 @@ MATERIAL = ("tissue.model", "tissue.young_kpa", "tissue.poisson")
     help="A session recorded before, of this SCENE: the same once more, bit for bit.",
 )
 @click.option("--at", type=click.FloatRange(0), default=0.0, help="With --replay: open it at this second.")
+@click.option(
+    "--track",
+    "track_file",
+    type=click.Path(path_type=Path),
+    help="A probe's way to be followed: a tracked sweep (.igs.mha), or poses with times (CSV, JSON).",
+)
+@click.option(
+    "--track-from", help=f"With --track: the sweep's transform from probe to patient [{PROBE_IN_PATIENT}]."
+)
+@click.option("--gamepad", is_flag=True, help="A gamepad leads beside mouse and keys.")
+@click.option(
+    "--keys",
+    "keys_file",
+    type=click.Path(path_type=Path),
+    help="Keys and buttons of your own: a TOML file as app.py keys prints it.",
+)
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
@@ -73,6 +91,10 @@ def rehearse(
     seconds: float | None,
     replay: Path | None,
     at: float,
+    track_file: Path | None,
+    track_from: str | None,
+    gamepad: bool,
+    keys_file: Path | None,
     out: Path,
     arch: str,
     budget_ms: float | None,
@@ -87,6 +109,9 @@ def rehearse(
     if changed["transducer.probe"] and Path(str(changed["transducer.probe"])).is_file():
         changed["transducer.probe"] = str(Path(str(changed["transducer.probe"])).resolve())
     before = load_scene(path)
+    keys = load_keys(keys_file) if keys_file is not None else Keys()
+    refuse_inputs(track_file, track_from, replay, gamepad and headless)
+    track = load_track(track_file, track_from) if track_file is not None else None
     log = session_of(replay, at, changed, budget_ms, error_mm)
     loaded = with_options(before, changed) if log is None else as_recorded(log, before)
     if changed["tissue.model"] is None and loaded.tissue.model != before.tissue.model:
@@ -95,6 +120,8 @@ def rehearse(
     probe = probe_of(loaded, path.parent) if log is None else recorded_probe(log)
     if log is not None:
         check_anatomy(log, anatomy, before.title)
+    if track is not None and track_file is not None:
+        check_near(track, anatomy.organ.vertices, track_file)
     budgeted = budget_ms is not None or error_mm is not None
     if budgeted:
         refuse_sizes(changed)
@@ -115,11 +142,29 @@ def rehearse(
         rehearsal = Rehearsal(loaded, anatomy, probe)
     from studies.rehearse.run import Run
 
-    run = Run(rehearsal, anatomy, used, out, budget_ms)
+    run = Run(rehearsal, anatomy, used, out, budget_ms, track=track, keys=keys, gamepad=gamepad)
     if headless:
         run.headless(log, at, seconds, perf_counter() - started)
     else:
         run.in_window(log, at)
+
+
+@click.command("keys")
+def keys_command() -> None:
+    """Print which key does what, as a file to be changed and given to rehearse --keys."""
+    click.echo(keys_text(), nl=False)
+
+
+def refuse_inputs(
+    track: Path | None, track_from: str | None, replay: Path | None, gamepad_without_window: bool
+) -> None:
+    """Raises Fault where what is to lead the transducer does not go together."""
+    if track is None and track_from is not None:
+        raise Fault("--track-from: says what of a tracked sweep is the probe; name its file with --track")
+    if track is not None and replay is not None:
+        raise Fault("--track: a replay goes the recorded way; leave out --track or --replay")
+    if gamepad_without_window:
+        raise Fault("--gamepad: leads in a window; leave out --gamepad or --headless")
 
 
 def session_of(

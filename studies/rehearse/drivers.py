@@ -50,7 +50,11 @@ class Played:
 
     @property
     def status(self) -> str:
-        return self.live.status if self.live else f"REPLAY   {self.replay.time_s:.1f} s   K leads from here"
+        return (
+            self.live.status
+            if self.live
+            else f"REPLAY   {self.replay.time_s:.1f} s   {{take_over}} leads from here"
+        )
 
     def move(self, controls: Controls) -> np.ndarray | None:
         if self.live is None and (controls.take_over or self.replay.is_over):

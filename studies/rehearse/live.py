@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from render.viewer import Controls
+from studies.rehearse.tracked import Follower, Tracked, TrackOver
 from studies.session.history import History
 from studies.session.recorded import Recorded
 from studies.session.replay import set_solver
@@ -18,42 +19,76 @@ Ray = tuple[np.ndarray, np.ndarray]
 
 @dataclass
 class Live:
-    """The rehearsal led by the user, a ``Driver``. After a way back the transducer stays until the user moves it."""
+    """The rehearsal led by the user, a ``Driver``: by a probe that is tracked, else by mouse, keys and gamepad.
+
+    After a way back the transducer stays until the user moves it.
+    """
 
     session: Session
     ladder: Ladder
     recorded: Recorded | None = None
     waits: bool = False
+    tracked: Tracked | None = None
     _ray: Ray | None = field(default=None, init=False)
+    _left: Ray | None = field(default=None, init=False)
     _said: str = field(default="", init=False)
     _asked: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
         self.history = History(self.session)
+        self._follower = None if self.tracked is None else Follower(self.tracked, self.session.rehearsal)
+        if self.waits:
+            self._wait(None)
 
     @property
     def status(self) -> str:
+        if self._follower is not None and self._follower.is_lost:
+            return "TRACKING LOST"
         return self.ladder.says(self._asked)
 
     def move(self, controls: Controls) -> np.ndarray | None:
         """The pose to step to, None where this moment goes back to another."""
         self.session.tell("settings", asdict(controls.settings))
         if self._go_back(controls):
-            self.waits, self._ray = True, controls.ray
+            self._wait(controls.ray)
             return None
         self._set_solver(controls)
+        rehearsal = self.session.rehearsal
+        held, follower = rehearsal.hand.grip, self._follower
+        pose = self._led(controls) if follower is None else self._followed(follower, controls)
+        moves = bool(np.abs(pose - rehearsal.pose).max() > STILL_MM)
+        presses = controls.press and follower is None
+        # What is kept here is gone back to: with the hand as it was before this input.
+        rehearsal.hand.grip, grip = held, rehearsal.hand.grip
+        self.history.watch(moves or presses, presses)
+        rehearsal.hand.grip = grip
+        return pose
+
+    def _wait(self, ray: Ray | None) -> None:
+        """The transducer stays until the user moves it."""
+        self.waits, self._ray = True, ray
+        if self._follower is not None:
+            self._follower.wait()
+
+    def _followed(self, follower: Follower, controls: Controls) -> np.ndarray:
+        """The next pose on the way to where the probe is tracked."""
+        rehearsal = self.session.rehearsal
+        try:
+            goal = follower.goal()
+        except TrackOver as over:
+            self._follower, self._said = None, str(over)
+            self._wait(controls.ray)
+            return rehearsal.pose
+        pose = rehearsal.pose if goal is None else rehearsal.pose_towards(goal)
+        rehearsal.hand.take(pose)
+        return pose
+
+    def _led(self, controls: Controls) -> np.ndarray:
+        """The next pose as mouse, keys and gamepad have it."""
         if self.waits and self._ray is None:
             self._ray = controls.ray
         self.waits = self.waits and not acts(controls, self._ray)
-        rehearsal = self.session.rehearsal
-        held = rehearsal.hand.grip
-        pose = rehearsal.pose if self.waits else self._steered(controls)
-        moves = bool(np.abs(pose - rehearsal.pose).max() > STILL_MM)
-        # What is kept here is gone back to: with the hand as it was before this input.
-        rehearsal.hand.grip, grip = held, rehearsal.hand.grip
-        self.history.watch(moves or controls.press, controls.press)
-        rehearsal.hand.grip = grip
-        return pose
+        return self.session.rehearsal.pose if self.waits else self._steered(controls)
 
     def _go_back(self, controls: Controls) -> bool:
         """Undo, redo, reset or a bookmark, where one of these was asked for and there is something to go to."""
@@ -68,7 +103,7 @@ class Live:
             return self._tried(self.history.redo(), "redo")
         if controls.to_bookmark:
             number = self.history.to_bookmark()
-            self._said = f"Bookmark {number}" if number else "No bookmark: M sets one"
+            self._said = f"Bookmark {number}" if number else "No bookmark: {bookmark} sets one"
             return number > 0
         return False
 
@@ -99,9 +134,13 @@ class Live:
         """Hand the user's input to the hand that holds the transducer; the pose to go to then."""
         rehearsal = self.session.rehearsal
         hand = rehearsal.hand
-        if controls.ray is not None:
+        if any(controls.slide_mm):
+            hand.slide(*controls.slide_mm)
+            self._left = controls.ray
+        elif controls.ray is not None and mouse_moved(controls.ray, self._left):
             hand.point(*controls.ray)
-        hand.hold(controls.press, rehearsal.settings.time_step_s)
+            self._left = None
+        hand.hold(controls.press, rehearsal.settings.time_step_s, controls.press_share)
         hand.push(controls.push_mm)
         hand.turn(controls.fan_deg, controls.tilt_deg, controls.roll_deg)
         return rehearsal.pose_towards(hand.pose())
@@ -121,8 +160,12 @@ class Live:
 
 def acts(controls: Controls, ray: Ray | None) -> bool:
     """Whether the user does anything but keep the mouse on a ray."""
-    moved = controls.ray is not None and not (
-        ray is not None and all(np.array_equal(a, b) for a, b in zip(controls.ray, ray, strict=True))
-    )
     turns = controls.push_mm, controls.fan_deg, controls.tilt_deg, controls.roll_deg
-    return moved or controls.press or any(turns)
+    return mouse_moved(controls.ray, ray) or controls.press or any(turns) or any(controls.slide_mm)
+
+
+def mouse_moved(ray: Ray | None, before: Ray | None) -> bool:
+    """Whether the mouse is on a ray, and on another than before."""
+    if ray is None or before is None:
+        return ray is not None
+    return not all(np.array_equal(a, b) for a, b in zip(ray, before, strict=True))

@@ -6,6 +6,7 @@ from time import perf_counter
 
 import click
 
+from render.keys import Keys
 from render.viewer import Controls, View, Viewer
 from studies.rehearsal import Rehearsal
 from studies.rehearse.cine import Calliper, Cine, Frame
@@ -34,6 +35,7 @@ class Loop:
     sweeping: Sweeping
     cine: Cine = field(default_factory=Cine)
     calliper: Calliper = field(default_factory=Calliper)
+    keys: Keys = field(default_factory=Keys)
     frozen: bool = False
     rate: float = 0.0
     _said: str = ""
@@ -70,6 +72,7 @@ class Loop:
         if controls.reset:
             self.calliper.points = ()
         self.calliper.point(controls.pointed_mm)
+        self._announce(controls.news)
         shown = self._looked_back(controls) or self._taken(controls)
         if controls.sweep:
             self._announce(self.sweeping.toggle(self.out))
@@ -87,7 +90,7 @@ class Loop:
     def _status(self, view: View) -> str:
         if perf_counter() < self._said_until:
             return self._said
-        return view.status or self.sweeping.status
+        return self.keys.worded(view.status or self.sweeping.status)
 
     def _announce(self, text: str) -> None:
         """Say something in the window and in the terminal."""
@@ -96,7 +99,7 @@ class Loop:
 
     def _say(self, text: str) -> None:
         if text:
-            self._said, self._said_until = text.upper(), perf_counter() + SAID_S
+            self._said, self._said_until = self.keys.worded(text).upper(), perf_counter() + SAID_S
 
     def _looked_back(self, controls: Controls) -> Frame | None:
         """A frame of the last seconds, where the user is looking at one."""
@@ -131,4 +134,4 @@ class Loop:
 
     def _tell(self, news: str) -> None:
         if news:
-            click.echo(news)
+            click.echo(self.keys.worded(news))

@@ -1,11 +1,14 @@
 """A rehearsal from its first moment to its last: who leads it, what is recorded of it, and what is said at its end."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import click
+import numpy as np
 from tqdm import tqdm
 
+from render.gamepad import Gamepad, SdlPads
+from render.keys import Keys
 from render.viewer import Settings
 from render.window import NoVulkan
 from scenes.anatomy import LoadedAnatomy
@@ -17,8 +20,10 @@ from studies.rehearse.instruments import Instruments
 from studies.rehearse.live import Live
 from studies.rehearse.loop import Loop
 from studies.rehearse.sweeping import Sweeping
+from studies.rehearse.tracked import PlayedPoses, Tracked
 from studies.rehearse.view import open_viewer, settings_of
 from studies.report import Notices, Record
+from studies.scan.poses import TimedPoses
 from studies.session.file import Log
 from studies.session.recorded import Recorded, record
 from studies.session.replay import Replay
@@ -29,7 +34,10 @@ from studies.trade.ladder import Ladder
 
 @dataclass
 class Run:
-    """One rehearsal, its anatomy, and the folder for what comes of it."""
+    """One rehearsal, its anatomy, the folder for what comes of it, and what leads beside the mouse.
+
+    ``tracked`` is a probe that is tracked now, ``track`` the way of one that was.
+    """
 
     rehearsal: Rehearsal
     anatomy: LoadedAnatomy
@@ -37,24 +45,28 @@ class Run:
     out: Path
     budget_ms: float | None = None
     recorded: Recorded | None = None
+    tracked: Tracked | None = None
+    track: TimedPoses | None = None
+    keys: Keys = field(default_factory=Keys)
+    gamepad: bool = False
 
     def __post_init__(self) -> None:
         self.instruments = Instruments(self.rehearsal)
 
     def in_window(self, log: Log | None, at_s: float) -> None:
         """Led by the user, in a window; with a log by that first. Raises Fault, SessionError."""
+        pad = Gamepad(SdlPads(), self.keys.buttons) if self.gamepad else None
         try:
-            viewer = open_viewer(self.rehearsal, visible=True)
+            viewer = open_viewer(self.rehearsal, visible=True, keys=self.keys, gamepad=pad)
         except NoVulkan as reason:
             raise Fault(f"{reason}; install a Vulkan driver, or run with --headless") from None
         replay = None if log is None else self._replay(log, at_s, viewer.settings)
         driver = self._live() if replay is None else Played(replay, self._take_over)
         sweeping = Sweeping(self.rehearsal)
         notices = Notices(click.echo)
-        click.echo("The window is open; H shows the keys, Esc quits.")
-        loop = Loop(
-            self.rehearsal, viewer, self.out, Record(0.0), driver, notices, self.instruments, sweeping
-        )
+        click.echo(self.keys.worded("The window is open; {help} shows the keys, {quit} quits."))
+        parts = driver, notices, self.instruments, sweeping
+        loop = Loop(self.rehearsal, viewer, self.out, Record(0.0), *parts, keys=self.keys)
         try:
             loop.run()
         finally:
@@ -65,18 +77,24 @@ class Run:
             _say(_verdict(replay))
 
     def headless(self, log: Log | None, at_s: float, seconds: float | None, build_s: float) -> None:
-        """Led by the scene's script, or by a log. Raises SessionError."""
+        """Led by the scene's script, a log, or a tracked file, as long as that is. Raises SessionError."""
         rehearsal, settings = self.rehearsal, settings_of(self.rehearsal)
         replay = None if log is None else self._replay(log, at_s, settings)
-        if replay is None:
-            step_s = rehearsal.settings.time_step_s
+        step_s = rehearsal.settings.time_step_s
+        driver: Scripted | Played | Live
+        if self.track is not None:
+            length_s = self.track.length_s if seconds is None else min(seconds, self.track.length_s)
+            # A moment at 0 s, and one at the end; no step is too slow, so that the bits do not turn on the machine.
+            steps = 1 + int(length_s / step_s + 1e-9)
+            driver = self._live(budget_ms=np.inf)
+        elif replay is None:
             steps = max(1, round((seconds or rehearsal.script_length_s()) / step_s))
             session = Session(rehearsal)
-            driver: Scripted | Played = Scripted(session, self._record(session), steps)
+            driver = Scripted(session, self._record(session), steps)
         else:
             steps = len(replay.log.poses) - replay.session.moment
             if seconds:
-                steps = min(steps, max(1, round(seconds / rehearsal.settings.time_step_s)))
+                steps = min(steps, max(1, round(seconds / step_s)))
             if steps == 0:
                 raise Fault(
                     f"the session has nothing after {at_s:g} s: it is {replay.log.length_s:.1f} s long"
@@ -88,10 +106,12 @@ class Run:
             self._end(0)
             _say(_verdict(replay))
 
-    def _live(self, begins: RehearsalState | None = None) -> Live:
-        ladder = Ladder(self.budget_ms or 1000 * self.rehearsal.settings.time_step_s)
+    def _live(self, begins: RehearsalState | None = None, budget_ms: float | None = None) -> Live:
+        ladder = Ladder(budget_ms or self.budget_ms or 1000 * self.rehearsal.settings.time_step_s)
         session = Session(self.rehearsal)
-        return Live(session, ladder, self._record(session, begins), waits=begins is not None)
+        tracked = self.tracked if self.track is None else PlayedPoses(self.track, session)
+        waits = begins is not None
+        return Live(session, ladder, self._record(session, begins), waits=waits, tracked=tracked)
 
     def _take_over(self) -> Live:
         """The user leads on from where a replay is: a session of its own."""

@@ -37,12 +37,12 @@ class Sweeping:
         except OSError as error:
             return f"{stem} cannot be written: {_words(error)}"
         self._due_s, self._shows = 0.0, ""
-        return f"{stem}: L ends it"
+        return f"{stem}: {{sweep}} ends it"
 
     @property
     def status(self) -> str:
         """What stands in the panel while a sweep goes on."""
-        return "" if self._sweep is None else f"SWEEP   {self._sweep.count} pictures   L ends it"
+        return "" if self._sweep is None else f"SWEEP   {self._sweep.count} pictures   {{sweep}} ends it"
 
     def end(self) -> str:
         """End the sweep, where there is one; what there is to say."""

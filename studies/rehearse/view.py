@@ -4,6 +4,8 @@ from functools import partial
 
 import numpy as np
 
+from render.gamepad import Gamepad
+from render.keys import Keys
 from render.viewer import Geometry, Settings, View, Viewer
 from scenes.scene import NeoHookeanTissue
 from studies.rehearsal import Rehearsal
@@ -53,7 +55,9 @@ def probe_as_set(probe: Probe, settings: Settings) -> Probe:
     )
 
 
-def open_viewer(rehearsal: Rehearsal, visible: bool) -> Viewer:
+def open_viewer(
+    rehearsal: Rehearsal, visible: bool, keys: Keys | None = None, gamepad: Gamepad | None = None
+) -> Viewer:
     """The window, or its off-screen twin. Raises NoVulkan."""
     from render.window import Window
 
@@ -78,6 +82,8 @@ def open_viewer(rehearsal: Rehearsal, visible: bool) -> Viewer:
         ),
         settings_of(rehearsal),
         visible=visible,
+        keys=keys,
+        gamepad=gamepad,
     )
 
 

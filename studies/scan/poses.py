@@ -1,8 +1,9 @@
-"""Files of probe poses: where the pictures of ``scan`` are taken."""
+"""Files of probe poses: where the pictures of ``scan`` are taken, and what way a rehearsal follows."""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -19,9 +20,37 @@ class _Pose(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     name: str = Field("", max_length=40, pattern=r"^[A-Za-z0-9_-]*$")
+    time_s: float | None = None
     probe_to_patient: Annotated[
         list[Annotated[list[float], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)
     ]
+
+
+class _Placed(NamedTuple):
+    name: str
+    time_s: float | None
+    pose: np.ndarray
+
+
+@dataclass(frozen=True)
+class TimedPoses:
+    """Poses (4, 4) of a probe, None where it was not seen, at times (n,) [s] that grow. Raises PoseError where they do not."""
+
+    times_s: np.ndarray
+    poses: list[np.ndarray | None]
+
+    def __post_init__(self) -> None:
+        back = np.flatnonzero(np.diff(self.times_s) <= 0)
+        if back.size:
+            number = int(back[0]) + 1
+            raise PoseError(
+                f"pose {number + 1} at {self.times_s[number]:g} s is no later than the one before, at "
+                f"{self.times_s[number - 1]:g} s; expected times that grow"
+            )
+
+    @property
+    def length_s(self) -> float:
+        return float(self.times_s[-1] - self.times_s[0])
 
 
 def load_poses(path: Path) -> dict[str, np.ndarray]:
@@ -29,8 +58,33 @@ def load_poses(path: Path) -> dict[str, np.ndarray]:
 
     The probe's axes are PLUS's: the origin in the middle of the array's face, x to the marked side, y away into the tissue,
     z = x cross y. JSON holds a list of {"name": ..., "probe_to_patient": 4 x 4}; CSV sixteen numbers a line, row by row. Poses
-    without a name are numbered.
+    without a name are numbered. Times, where there are some, change nothing.
     """
+    poses: dict[str, np.ndarray] = {}
+    for number, placed in enumerate(_read(path), 1):
+        if placed.name in poses:
+            raise PoseError(
+                f"{path}: pose {number}: the name {placed.name!r} is there twice; names must differ"
+            )
+        poses[placed.name or f"{number:04d}"] = placed.pose
+    return poses
+
+
+def load_timed_poses(path: Path) -> TimedPoses:
+    """The poses of such a file with their times [s]: in JSON "time_s" of each, in CSV a number before the sixteen. Raises PoseError."""
+    placed = _read(path)
+    for number, each in enumerate(placed, 1):
+        if each.time_s is None:
+            raise PoseError(
+                f"{path}: pose {number} has no time; expected time_s in JSON, or in CSV seconds and sixteen numbers a line"
+            )
+    try:
+        return TimedPoses(np.array([each.time_s for each in placed]), [each.pose for each in placed])
+    except PoseError as error:
+        raise PoseError(f"{path}: {error}") from None
+
+
+def _read(path: Path) -> list[_Placed]:
     try:
         text = path.read_text("utf-8")
     except FileNotFoundError:
@@ -38,18 +92,14 @@ def load_poses(path: Path) -> dict[str, np.ndarray]:
     except (OSError, UnicodeDecodeError) as error:
         raise PoseError(f"{path}: cannot be read as poses ({str(error).splitlines()[0]})") from None
     found = _of_csv(path, text) if path.suffix.lower() == ".csv" else _of_json(path, text)
-    poses: dict[str, np.ndarray] = {}
-    for number, (name, pose) in enumerate(found, 1):
-        _check_rigid(path, number, pose)
-        if name in poses:
-            raise PoseError(f"{path}: pose {number}: the name {name!r} is there twice; names must differ")
-        poses[name or f"{number:04d}"] = pose
-    if not poses:
+    for number, placed in enumerate(found, 1):
+        check_rigid(f"{path}: pose {number}", placed.pose)
+    if not found:
         raise PoseError(f"{path}: holds no poses; expected at least one")
-    return poses
+    return found
 
 
-def _of_json(path: Path, text: str) -> list[tuple[str, np.ndarray]]:
+def _of_json(path: Path, text: str) -> list[_Placed]:
     try:
         if not text.strip():
             raise PoseError(f"{path}: is empty; expected a list of poses")
@@ -66,22 +116,28 @@ def _of_json(path: Path, text: str) -> list[tuple[str, np.ndarray]]:
         raise PoseError(
             f"{path}: {where}{first['msg'].lower()}; expected a list of poses with probe_to_patient, 4 rows of 4 numbers"
         ) from None
-    return [(pose.name, np.array(pose.probe_to_patient)) for pose in poses]
+    return [_Placed(pose.name, pose.time_s, np.array(pose.probe_to_patient)) for pose in poses]
 
 
-def _of_csv(path: Path, text: str) -> list[tuple[str, np.ndarray]]:
+def _of_csv(path: Path, text: str) -> list[_Placed]:
     rows = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    expected = "expected sixteen, row by row, or before them the time in s"
     try:
         numbers = [[float(value) for value in line.replace(";", ",").split(",")] for line in rows]
     except ValueError as error:
-        raise PoseError(f"{path}: {error}; expected sixteen numbers a line") from None
+        raise PoseError(f"{path}: {error}; {expected}") from None
     for number, row in enumerate(numbers, 1):
-        if len(row) != 16:
-            raise PoseError(f"{path}: pose {number}: {len(row)} numbers; expected sixteen, row by row")
-    return [("", np.array(row).reshape(4, 4)) for row in numbers]
+        if len(row) not in (16, 17) or len(row) != len(numbers[0]):
+            raise PoseError(f"{path}: pose {number}: {len(row)} numbers; {expected}, as in each line")
+        if not np.isfinite(row[0]):
+            raise PoseError(f"{path}: pose {number}: begins with {row[0]}; expected a finite number")
+    return [
+        _Placed("", row[0] if len(row) == 17 else None, np.array(row[-16:]).reshape(4, 4)) for row in numbers
+    ]
 
 
-def _check_rigid(path: Path, number: int, pose: np.ndarray) -> None:
+def check_rigid(what: str, pose: np.ndarray) -> None:
+    """Raises PoseError, which says of what, where a matrix (4, 4) is no rigid pose."""
     axes = pose[:3, :3]
     off = np.abs(axes.T @ axes - np.eye(3)).max()
     if not (
@@ -91,6 +147,6 @@ def _check_rigid(path: Path, number: int, pose: np.ndarray) -> None:
         and np.allclose(pose[3], [0, 0, 0, 1])
     ):
         raise PoseError(
-            f"{path}: pose {number} is not rigid: expected three right-handed unit axes at right angles (found an error of "
+            f"{what} is not rigid: expected three right-handed unit axes at right angles (found an error of "
             f"{off:.2g}, determinant {np.linalg.det(axes):.3g}) and a last row of 0 0 0 1"
         )

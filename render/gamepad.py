@@ -1,0 +1,139 @@
+"""A gamepad beside mouse and keys: it fills the same controls. pygame's SDL reads it, without a window of its own."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from render.actions import TILT_DEG_S, begin, hold
+from render.keys import BUTTONS
+from render.viewer import Controls
+
+SLIDE_MM_S = 40.0
+# A stick at rest is not quite at 0; a worn trigger neither. A stick moves finely near its middle.
+DEAD_STICK, DEAD_TRIGGER = 0.15, 0.05
+STICK_POWER = 2.0
+# SDL's game controllers, whatever their make: axes of the sticks (down is positive) and of the right trigger.
+LEFT_X, LEFT_Y, RIGHT_X, RIGHT_Y, RIGHT_TRIGGER = 0, 1, 2, 3, 5
+FULL = 32767
+
+
+@dataclass(frozen=True)
+class PadState:
+    """Sticks (right and up are positive) from -1 to 1, the right trigger from 0 to 1, buttons by their names."""
+
+    left: tuple[float, float] = (0.0, 0.0)
+    right: tuple[float, float] = (0.0, 0.0)
+    trigger: float = 0.0
+    held: frozenset[str] = frozenset()
+    """Down now."""
+    pressed: tuple[str, ...] = ()
+    """Went down since the last time, even if they are up again."""
+
+
+class Pads(Protocol):
+    """Where gamepads are plugged in and out."""
+
+    def read(self) -> PadState | None:
+        """The state of one that is plugged in, None where there is none."""
+        ...
+
+
+class Gamepad:
+    """Left stick: over the surface; right: tilt and fan; right trigger: press; ``buttons`` are action -> button."""
+
+    def __init__(self, pads: Pads, buttons: Mapping[str, str]) -> None:
+        self._pads, self._buttons = pads, buttons
+        self._is_there: bool | None = None
+
+    def read(self, controls: Controls, seconds: float) -> None:
+        """Add to the controls what was done in so many seconds."""
+        state = self._pads.read()
+        self._watch(state is not None, controls)
+        if state is None:
+            return
+        x, y = shaped(*state.left)
+        controls.slide_mm = (SLIDE_MM_S * seconds * x, SLIDE_MM_S * seconds * y)
+        x, y = shaped(*state.right)
+        controls.tilt_deg -= TILT_DEG_S * seconds * x
+        controls.fan_deg += TILT_DEG_S * seconds * y
+        if state.trigger > DEAD_TRIGGER and not controls.press:
+            controls.press, controls.press_share = True, _beyond(state.trigger, DEAD_TRIGGER)
+        for action, button in self._buttons.items():
+            if button in state.pressed:
+                begin(action, controls)
+            if button in state.held:
+                hold(action, controls, seconds)
+
+    def _watch(self, is_there: bool, controls: Controls) -> None:
+        if is_there == self._is_there:
+            return
+        if is_there:
+            controls.news = "Gamepad ready"
+        elif self._is_there is None:
+            controls.news = "No gamepad is plugged in: mouse and keys lead until one is"
+        else:
+            controls.news = "Gamepad unplugged: mouse and keys lead"
+        self._is_there = is_there
+
+
+def shaped(x: float, y: float) -> tuple[float, float]:
+    """A stick without its dead zone, fine near the middle; its direction stays, and its length is 1 at most."""
+    length = math.hypot(x, y)
+    if length <= DEAD_STICK:
+        return 0.0, 0.0
+    share = _beyond(length, DEAD_STICK) ** STICK_POWER / length
+    return share * x, share * y
+
+
+def _beyond(value: float, dead: float) -> float:
+    return (min(value, 1.0) - dead) / (1.0 - dead)
+
+
+class SdlPads:
+    """The first gamepad that SDL knows the layout of."""
+
+    def __init__(self) -> None:
+        # GGUI has the window: SDL gets a display that shows nothing, and so never the focus.
+        os.environ.update(
+            SDL_VIDEODRIVER="dummy", SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS="1", PYGAME_HIDE_SUPPORT_PROMPT="1"
+        )
+        import pygame
+        from pygame._sdl2 import controller
+
+        pygame.display.init()
+        controller.init()
+        self._pygame, self._controller = pygame, controller
+        self._pad: controller.Controller | None = None
+
+    def read(self) -> PadState | None:
+        events = self._pygame.event.get()
+        if self._pad is not None and not self._pad.attached():
+            self._pad.quit()
+            self._pad = None
+        if self._pad is None:
+            known = filter(self._controller.is_controller, range(self._controller.get_count()))
+            first = next(known, None)
+            self._pad = None if first is None else self._controller.Controller(first)
+        return None if self._pad is None else self._state(self._pad, events)
+
+    def _state(self, pad, events) -> PadState:
+        axes = [max(-1.0, pad.get_axis(axis) / FULL) for axis in range(RIGHT_TRIGGER + 1)]
+        # Of gamepads that are not read there are no events.
+        down = [event.button for event in events if event.type == self._pygame.CONTROLLERBUTTONDOWN]
+        held = frozenset(name for number, name in enumerate(BUTTONS) if pad.get_button(number))
+        return PadState(
+            (axes[LEFT_X], -axes[LEFT_Y]),
+            (axes[RIGHT_X], -axes[RIGHT_Y]),
+            axes[RIGHT_TRIGGER],
+            held,
+            tuple(BUTTONS[number] for number in down if number < len(BUTTONS)),
+        )
+
+    def close(self) -> None:
+        """Give the gamepad back."""
+        self._controller.quit()
+        self._pygame.display.quit()

@@ -1,0 +1,135 @@
+"""Keys and gamepad buttons: one map for what they do, what the help says, and the user's own file."""
+
+import dataclasses
+import subprocess
+import sys
+
+import pytest
+from conftest import ROOT
+
+import app
+from render.actions import ACTIONS, BY_MOUSE, CYCLES, HELD, STEPS, begin, hold
+from render.keys import KEYS, USUAL_BUTTONS, USUAL_KEYS, VIEW_ALONE, Keys, KeysError, keys_text, load_keys
+from render.viewer import KEY_MAP, Controls, Settings
+
+
+def file_of(tmp_path, text: str):
+    path = tmp_path / "keys.toml"
+    path.write_text(text)
+    return path
+
+
+def refused(tmp_path, text: str) -> str:
+    with pytest.raises(KeysError) as error:
+        load_keys(file_of(tmp_path, text))
+    assert "\n" not in str(error.value) and "keys.toml: " in str(error.value)
+    return str(error.value)
+
+
+def test_every_action_does_one_thing():
+    flags = {
+        each.name for each in dataclasses.fields(Controls) if each.default is False and each.name != "press"
+    }
+    switches = {each.name for each in dataclasses.fields(Settings) if isinstance(each.default, bool)}
+    does = [*BY_MOUSE, *HELD, *STEPS, *CYCLES, *VIEW_ALONE, "help"]
+    for line in KEY_MAP:
+        kinds = does.count(line.action) + (line.action in flags) + (line.action in switches)
+        assert kinds == 1, line.action
+    assert flags <= set(ACTIONS), "controls that no key reaches"
+
+
+def test_an_action_changes_what_it_is_named_for():
+    controls = Controls(Settings())
+    for action in ("undo", "sweep", "cut", "translucent", "mode", "cine_back", "cine_back", "cine_forth"):
+        begin(action, controls)
+    settings = controls.settings
+    assert controls.undo and controls.sweep and not controls.redo and controls.cine == -1
+    assert settings.cut and not settings.translucent and settings.mode == "b-mode"
+    begin("mode", controls)
+    begin("mode", controls)
+    assert settings.mode == "both"
+    before = dataclasses.replace(controls)
+    for action in ("push", "help", "zoom_in", ""):
+        begin(action, controls)
+    assert controls == before
+    for action in ("lift", "roll_left", "tilt_right", "fan_forth", "undo"):
+        hold(action, controls, 0.1)
+    assert (controls.push_mm, controls.roll_deg, controls.tilt_deg, controls.fan_deg) == pytest.approx(
+        (-1.5, 4.5, -3, 3)
+    )
+
+
+def test_the_printed_file_is_the_usual_map(tmp_path, capsys):
+    assert app.main(["keys"]) == 0
+    printed = capsys.readouterr().out
+    assert printed == keys_text()
+    keys = load_keys(file_of(tmp_path, printed))
+    assert keys.of == USUAL_KEYS and keys.buttons == USUAL_BUTTONS
+    assert load_keys(file_of(tmp_path, "")).of == USUAL_KEYS
+
+
+def test_a_file_changes_behaviour_help_and_words(tmp_path):
+    keys = load_keys(
+        file_of(
+            tmp_path,
+            '[keys]\npush = "i"\nexport = "w"\nfreeze = "space"\nhelp = "/"\n[gamepad]\nundo = "guide"\nredo = "b"\n',
+        )
+    )
+    assert [keys.action_of(key) for key in ("i", "w", " ", "f", "/", "Escape")] == [
+        "push",
+        "export",
+        "freeze",
+        "",
+        "help",
+        "quit",
+    ]
+    assert dict(keys.held())["push"] == "i" and dict(keys.held())["zoom_in"] == "Up"
+    lines = {text: key for key, text in keys.lines()}
+    assert lines["push the transducer in"] == "I" and lines["freeze and go on"] == "Space"
+    assert [key for key, _ in keys.lines()][:2] == ["Mouse", "Left button"] and len(keys.lines()) == len(
+        KEY_MAP
+    )
+    assert keys.worded("{help} shows, {quit} quits {so} {}") == "/ shows, Esc quits {so} {}"
+    assert keys.buttons["undo"] == "Guide" and keys.buttons["redo"] == "B"
+
+
+def test_every_usual_key_is_a_key_and_there_once():
+    assert set(USUAL_KEYS.values()) <= set(KEYS) and len(set(USUAL_KEYS.values())) == len(USUAL_KEYS)
+    assert [Keys().action_of(KEYS[key]) for key in USUAL_KEYS.values()] == list(USUAL_KEYS)
+    assert len(set(KEYS.values())) == len(KEYS)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('[keys]\npusch = "i"', "keys.pusch: no such action; did you mean push?"),
+        ('[keys]\npush = "F13"', "keys.push = 'F13': no such key; known: A B"),
+        ('[keys]\npush = "Spce"', "did you mean Space?"),
+        ('[keys]\npush = "u"', "keys: push and undo are both on U; give one another"),
+        ('[keys]\npush = "1"\nlift = "1"', "keys: push and lift are both on 1"),
+        ('[keys]\npoint = "m"', "keys.point: is done with the mouse; leave it out"),
+        ('[gamepad]\nundo = "A"', "gamepad: freeze and undo are both on A"),
+        ('[gamepad]\nundo = "Q"', "gamepad.undo = 'Q': no such button"),
+        ('[gamepad]\nzoom_in = "Guide"', "gamepad.zoom_in: no such action"),
+        ('[gamepad]\npress = "Guide"', "gamepad.press: is done with the mouse"),
+        ("[keys]\npush = 1", "keys.push = 1: expected a text"),
+        ('[kesy]\npush = "i"', "kesy: unknown; expected the sections"),
+        ('push = "i"', "push: unknown; expected the sections"),
+        ("[keys", "cannot be read as a TOML file"),
+    ],
+)
+def test_a_file_that_cannot_be_used_is_refused_in_words(tmp_path, text, words):
+    assert words in refused(tmp_path, text)
+
+
+def test_the_command_line_refuses_in_one_line(tmp_path, capsys):
+    assert app.main(["rehearse", "--keys", str(tmp_path / "none.toml")]) == 2
+    assert "no such file of keys; app.py keys prints one" in capsys.readouterr().err
+    assert app.main(["rehearse", "--gamepad", "--headless"]) == 2
+    assert "--gamepad: leads in a window" in capsys.readouterr().err
+
+
+def test_the_program_starts_without_pygame_and_taichi():
+    asked = "import sys, app, render.gamepad; print({'pygame', 'taichi'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, cwd=ROOT)
+    assert done.stdout.strip() == "set()", done.stderr
