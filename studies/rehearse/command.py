@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from scenes.anatomy import LoadedAnatomy, fingerprint, load_anatomy
 from scenes.scene import EMBEDDED, OPTIONS, TISSUES, Scene, load_scene, with_options
 from studies.commands import Fault, arch_option, make_folder, start_taichi
+from studies.link.options import link_options, opened_link
 from studies.session.file import Log, SessionError, read_log
 from studies.session.scene import scene_of_log
 from studies.setup import Setup, probe_of, scene_of
@@ -67,6 +68,7 @@ MATERIAL = ("tissue.model", "tissue.young_kpa", "tissue.poisson")
     type=click.FloatRange(0, 100),
     help="Choose size and passes: the fastest whose mean error, as study trade measured it, is no larger.",
 )
+@link_options
 def rehearse(
     scene: Path,
     headless: bool,
@@ -77,6 +79,9 @@ def rehearse(
     arch: str,
     budget_ms: float | None,
     error_mm: float | None,
+    link: bool,
+    link_host: str | None,
+    link_port: int | None,
     **changes: float | str | None,
 ) -> None:
     """Press the kidney of SCENE, a scene file or a patient's folder, and see what the transducer sees."""
@@ -98,6 +103,7 @@ def rehearse(
     budgeted = budget_ms is not None or error_mm is not None
     if budgeted:
         refuse_sizes(changed)
+    server = opened_link(link, link_host, link_port)
     used = start_taichi(arch)
     from render.window import display_available
     from studies.rehearsal import Rehearsal
@@ -115,7 +121,7 @@ def rehearse(
         rehearsal = Rehearsal(loaded, anatomy, probe)
     from studies.rehearse.run import Run
 
-    run = Run(rehearsal, anatomy, used, out, budget_ms)
+    run = Run(rehearsal, anatomy, used, out, budget_ms, link=server)
     if headless:
         run.headless(log, at, seconds, perf_counter() - started)
     else:

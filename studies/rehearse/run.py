@@ -10,6 +10,7 @@ from render.viewer import Settings
 from render.window import NoVulkan
 from scenes.anatomy import LoadedAnatomy
 from studies.commands import Fault
+from studies.link.server import Server
 from studies.rehearsal import Rehearsal, RehearsalState
 from studies.rehearse.drivers import Played, Scripted, set_settings
 from studies.rehearse.headless import run_headless
@@ -37,6 +38,7 @@ class Run:
     out: Path
     budget_ms: float | None = None
     recorded: Recorded | None = None
+    link: Server | None = None
 
     def __post_init__(self) -> None:
         self.instruments = Instruments(self.rehearsal)
@@ -53,7 +55,15 @@ class Run:
         notices = Notices(click.echo)
         click.echo("The window is open; H shows the keys, Esc quits.")
         loop = Loop(
-            self.rehearsal, viewer, self.out, Record(0.0), driver, notices, self.instruments, sweeping
+            self.rehearsal,
+            viewer,
+            self.out,
+            Record(0.0),
+            driver,
+            notices,
+            self.instruments,
+            sweeping,
+            link=self.link,
         )
         try:
             loop.run()
@@ -83,7 +93,9 @@ class Run:
                 )
             driver = Played(replay, self._take_over)
         try:
-            run_headless(rehearsal, driver, steps, settings, self.instruments, self.arch, self.out, build_s)
+            run_headless(
+                rehearsal, driver, steps, settings, self.instruments, self.arch, self.out, build_s, self.link
+            )
         finally:
             self._end(0)
             _say(_verdict(replay))
