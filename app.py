@@ -13,6 +13,7 @@ from sim.sampling import SamplingError
 from studies.beam.command import beam
 from studies.case import CaseError
 from studies.commands import calibrate, validate
+from studies.export.command import export
 from studies.freehand.command import reconstruct
 from studies.reference.command import reference
 from studies.rehearse.command import rehearse
@@ -51,6 +52,7 @@ def cli() -> None:
 for command in (
     rehearse,
     import_patient_command,
+    export,
     scan,
     reconstruct,
     validate,
