@@ -46,7 +46,7 @@ KEY_MAP = (
     Key("G", "show_scanner", "the scanner's sliders, gain over depth too"),
     Key("Click on picture", "measure", "calliper from click to click, in mm"),
     Key("Left, Right", "cine", "while frozen: through the last ten seconds"),
-    Key("I", "export", "save the picture as PNG and as DICOM"),
+    Key("I", "export", "save the picture (PNG, DICOM) and the organ as it lies (PLY)"),
     Key("T", "translucent", "organ translucent or solid"),
     Key("X", "cut", "cut the organ along the image plane"),
     Key("F", "freeze", "freeze and go on"),
