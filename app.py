@@ -14,6 +14,7 @@ from sim.sampling import SamplingError
 from studies.beam.command import beam
 from studies.case import CaseError
 from studies.commands import calibrate, validate
+from studies.export.command import export
 from studies.freehand.command import reconstruct
 from studies.plan.command import plan
 from studies.plan.file import PlanError
@@ -58,6 +59,7 @@ for command in (
     keys_command,
     import_patient_command,
     plan,
+    export,
     scan,
     reconstruct,
     validate,

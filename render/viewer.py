@@ -47,7 +47,7 @@ KEY_MAP = (
     Key("Click on picture", "measure", "calliper from click to click, in mm"),
     Key("Left", "cine_back", "while frozen: back through the last ten seconds"),
     Key("Right", "cine_forth", "while frozen: forth again"),
-    Key("I", "export", "save the picture as PNG and as DICOM"),
+    Key("I", "export", "save the picture (PNG, DICOM) and the organ as it lies (PLY)"),
     Key("T", "translucent", "organ translucent or solid"),
     Key("X", "cut", "cut the organ along the image plane"),
     Key("F", "freeze", "freeze and go on"),

@@ -75,13 +75,7 @@ class LoadedAnatomy:
 
 def load_anatomy(scene: Scene, folder: Path) -> LoadedAnatomy:
     """Read the files that a scene names, relative to ``folder``. Raises SceneError with one line."""
-    anatomy = scene.anatomy
-    if anatomy.phantom:
-        folder = phantom_folder()
-        parts = {tissue: f"{PARTS[tissue]}.stl" for tissue in PHANTOM_PARTS}
-        anatomy = Anatomy(
-            tumour="tumour.stl", parts=parts, ct="ct.nrrd", labels="labels.nrrd", tissues=PHANTOM_TISSUES
-        )
+    folder, anatomy = files_of(scene, folder)
     return LoadedAnatomy(
         organ=load_surface(folder, anatomy.organ),
         tumour=load_surface(folder, anatomy.tumour) if anatomy.tumour else None,
@@ -90,6 +84,16 @@ def load_anatomy(scene: Scene, folder: Path) -> LoadedAnatomy:
         labels=_labels(folder, anatomy),
         tissues={int(label): tissue for label, tissue in anatomy.tissues.items()},
         parts={tissue: load_surface(folder, file) for tissue, file in anatomy.parts.items()},
+    )
+
+
+def files_of(scene: Scene, folder: Path) -> tuple[Path, Anatomy]:
+    """A scene's files and the folder that they are in: its own, or the embedded patient's. Raises SceneError."""
+    if not scene.anatomy.phantom:
+        return folder, scene.anatomy
+    parts = {tissue: f"{PARTS[tissue]}.stl" for tissue in PHANTOM_PARTS}
+    return phantom_folder(), Anatomy(
+        tumour="tumour.stl", parts=parts, ct="ct.nrrd", labels="labels.nrrd", tissues=PHANTOM_TISSUES
     )
 
 

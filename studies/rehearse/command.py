@@ -11,6 +11,7 @@ from render.keys import Keys, keys_text, load_keys
 from scenes.anatomy import LoadedAnatomy, fingerprint, load_anatomy
 from scenes.scene import EMBEDDED, OPTIONS, TISSUES, Scene, load_scene, with_options
 from studies.commands import Fault, arch_option, make_folder, start_taichi
+from studies.link.options import link_options, opened_link
 from studies.rehearse.track_file import PROBE_IN_PATIENT, check_near, load_track
 from studies.session.file import Log, SessionError, read_log
 from studies.session.scene import scene_of_log
@@ -85,6 +86,7 @@ MATERIAL = ("tissue.model", "tissue.young_kpa", "tissue.poisson")
     type=click.FloatRange(0, 100),
     help="Choose size and passes: the fastest whose mean error, as study trade measured it, is no larger.",
 )
+@link_options
 def rehearse(
     scene: Path,
     headless: bool,
@@ -99,6 +101,9 @@ def rehearse(
     arch: str,
     budget_ms: float | None,
     error_mm: float | None,
+    link: bool,
+    link_host: str | None,
+    link_port: int | None,
     **changes: float | str | None,
 ) -> None:
     """Press the kidney of SCENE, a scene file or a patient's folder, and see what the transducer sees."""
@@ -125,6 +130,7 @@ def rehearse(
     budgeted = budget_ms is not None or error_mm is not None
     if budgeted:
         refuse_sizes(changed)
+    server = opened_link(link, link_host, link_port)
     used = start_taichi(arch)
     from render.window import display_available
     from studies.rehearsal import Rehearsal
@@ -142,7 +148,7 @@ def rehearse(
         rehearsal = Rehearsal(loaded, anatomy, probe)
     from studies.rehearse.run import Run
 
-    run = Run(rehearsal, anatomy, used, out, budget_ms, track=track, keys=keys, gamepad=gamepad)
+    run = Run(rehearsal, anatomy, used, out, budget_ms, track=track, keys=keys, gamepad=gamepad, link=server)
     if headless:
         run.headless(log, at, seconds, perf_counter() - started)
     else:

@@ -10,9 +10,12 @@ from tqdm import tqdm
 from render.pictures import PICTURES_A_SECOND, empty_folder, save_animation, side_by_side, smaller
 from render.viewer import Controls, Settings, Viewer
 from render.window import NoVulkan
+from studies.link.live import send_live
+from studies.link.server import Server
 from studies.rehearsal import Rehearsal
 from studies.rehearse.drivers import Driver
 from studies.rehearse.instruments import Instruments
+from studies.rehearse.saving import save_surfaces
 from studies.rehearse.view import open_viewer, probe_as_set, take_view
 from studies.report import Record, summary
 
@@ -29,6 +32,7 @@ def run_headless(
     arch: str,
     out: Path,
     build_s: float,
+    link: Server | None = None,
 ) -> None:
     """So many moments that a driver leads: frames, slices, an animated picture and report.json."""
     try:
@@ -46,7 +50,9 @@ def run_headless(
         view = take_view(rehearsal, settings, pose, record)
         if pose is not None:
             _tell(driver.stepped(record.step_ms[-1]))
-        instruments.watch(driver.session, probe_as_set(rehearsal.probe, settings), pose)
+        probe = probe_as_set(rehearsal.probe, settings)
+        instruments.watch(driver.session, probe, pose)
+        send_live(link, rehearsal, view, probe, driver.session.time_s)
         _tell(driver.watch())
         record.watch(rehearsal)
         if step % every == 0 or step == steps:
@@ -59,6 +65,7 @@ def run_headless(
             if step % shown_every == 0 or step == steps:
                 animation.append(smaller(picture))
     save_animation(animation, out / "press.gif")
+    save_surfaces(rehearsal, out)
     report = record.report(rehearsal, arch) | dict(reading=instruments.figures())
     (out / "report.json").write_text(json.dumps(report, indent=2) + "\n", "utf-8")
     click.echo(summary(report))

@@ -8,11 +8,13 @@ import click
 
 from render.keys import Keys
 from render.viewer import Controls, View, Viewer
+from studies.link.live import send_live
+from studies.link.server import Server
 from studies.rehearsal import Rehearsal
 from studies.rehearse.cine import Calliper, Cine, Frame
 from studies.rehearse.drivers import Driver
 from studies.rehearse.instruments import Instruments
-from studies.rehearse.saving import save_pictures, save_screenshot
+from studies.rehearse.saving import save_pictures, save_screenshot, save_surfaces
 from studies.rehearse.sweeping import Sweeping
 from studies.rehearse.view import probe_as_set, take_view
 from studies.report import Notices, Record
@@ -36,6 +38,7 @@ class Loop:
     cine: Cine = field(default_factory=Cine)
     calliper: Calliper = field(default_factory=Calliper)
     keys: Keys = field(default_factory=Keys)
+    link: Server | None = None
     frozen: bool = False
     rate: float = 0.0
     _said: str = ""
@@ -62,7 +65,10 @@ class Loop:
         if controls.screenshot:
             save_screenshot(self.viewer.picture(), self.out)
         if controls.export:
-            save_pictures(view, probe_as_set(self.rehearsal.probe, controls.settings), self.out)
+            begin = save_pictures(view, probe_as_set(self.rehearsal.probe, controls.settings), self.out)
+            # Of a picture that is looked back at, the tissue has gone on.
+            if not (self.frozen and self.cine.back):
+                save_surfaces(self.rehearsal, self.out, begin)
 
     def frame(self, controls: Controls) -> View:
         """One frame: what the user did, a moment unless frozen, and what is to be seen."""
@@ -114,6 +120,8 @@ class Loop:
         """A new frame. A frozen one shows the same tissue with the scanner set anew, and is not kept."""
         if self.frozen:
             view = take_view(self.rehearsal, controls.settings, None, self.record, "FROZEN")
+            probe = probe_as_set(self.rehearsal.probe, controls.settings)
+            send_live(self.link, self.rehearsal, view, probe, self.driver.session.time_s)
             view = self.instruments.onto(view, controls.settings)
             return Frame(perf_counter(), view, self.rehearsal.rest_grid())
         pose = self.driver.move(controls)
@@ -125,6 +133,7 @@ class Loop:
             self._tell(self.driver.stepped(self.record.step_ms[-1]))
         probe = probe_as_set(self.rehearsal.probe, controls.settings)
         self.instruments.watch(self.driver.session, probe, pose)
+        send_live(self.link, self.rehearsal, view, probe, self.driver.session.time_s)
         self._announce(self.sweeping.watch(self.driver.session.time_s, view, probe))
         self._tell(self.driver.watch())
         view = self.instruments.onto(view, controls.settings)

@@ -13,6 +13,7 @@ from render.viewer import Settings
 from render.window import NoVulkan
 from scenes.anatomy import LoadedAnatomy
 from studies.commands import Fault
+from studies.link.server import Server
 from studies.rehearsal import Rehearsal, RehearsalState
 from studies.rehearse.drivers import Played, Scripted, set_settings
 from studies.rehearse.headless import run_headless
@@ -49,6 +50,7 @@ class Run:
     track: TimedPoses | None = None
     keys: Keys = field(default_factory=Keys)
     gamepad: bool = False
+    link: Server | None = None
 
     def __post_init__(self) -> None:
         self.instruments = Instruments(self.rehearsal)
@@ -66,7 +68,7 @@ class Run:
         notices = Notices(click.echo)
         click.echo(self.keys.worded("The window is open; {help} shows the keys, {quit} quits."))
         parts = driver, notices, self.instruments, sweeping
-        loop = Loop(self.rehearsal, viewer, self.out, Record(0.0), *parts, keys=self.keys)
+        loop = Loop(self.rehearsal, viewer, self.out, Record(0.0), *parts, keys=self.keys, link=self.link)
         try:
             loop.run()
         finally:
@@ -101,7 +103,9 @@ class Run:
                 )
             driver = Played(replay, self._take_over)
         try:
-            run_headless(rehearsal, driver, steps, settings, self.instruments, self.arch, self.out, build_s)
+            run_headless(
+                rehearsal, driver, steps, settings, self.instruments, self.arch, self.out, build_s, self.link
+            )
         finally:
             self._end(0)
             _say(_verdict(replay))

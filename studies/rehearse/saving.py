@@ -4,10 +4,13 @@ from pathlib import Path
 
 import click
 import numpy as np
+import trimesh
 from PIL import Image
 
 from render.pictures import in_proportion
 from render.viewer import View
+from scenes.surface_files import save_surface
+from studies.rehearsal import Rehearsal
 from ultrasound.array import Probe
 from ultrasound.dicom_image import save_dicom
 from ultrasound.scanner import ECHO
@@ -21,8 +24,8 @@ def save_screenshot(picture: np.ndarray, out: Path) -> None:
     click.echo(f"Saved {path}")
 
 
-def save_pictures(view: View, probe: Probe, out: Path) -> None:
-    """Save what the scanner shows as PNG, an echo as DICOM too, under the next free number, and say where."""
+def save_pictures(view: View, probe: Probe, out: Path) -> str:
+    """Save what the scanner shows as PNG, an echo as DICOM too, under the next free number, and say where; how their names begin."""
     number = 1 + max([int(path.stem[:3]) for path in out.glob("[0-9][0-9][0-9]-*.png")], default=0)
     for name, picture in view.pictures.items():
         path = out / f"{number:03d}-{name.lower()}.png"
@@ -32,3 +35,15 @@ def save_pictures(view: View, probe: Probe, out: Path) -> None:
         if name == ECHO:
             save_dicom(path.with_suffix(".dcm"), np.asarray(image), spacing, probe)
         click.echo(f"Saved {path}{' and .dcm' if name == ECHO else ''}")
+    return f"{number:03d}-"
+
+
+def save_surfaces(rehearsal: Rehearsal, out: Path, begin: str = "") -> None:
+    """Save organ and tumour as they lie (PLY, mm, LPS), and say where; their vertices are those of the surfaces at rest, in order."""
+    lying = {"organ": (rehearsal.organ, rehearsal.organ_skin.vertices.to_numpy())}
+    if rehearsal.tumour is not None:
+        lying["tumour"] = rehearsal.tumour, rehearsal.tumour_vertices()
+    for name, (rest, vertices) in lying.items():
+        path = out / f"{begin}{name}.ply"
+        save_surface(trimesh.Trimesh(vertices + rehearsal.origin, rest.faces, process=False), path)
+        click.echo(f"Saved {path}")

@@ -1,0 +1,74 @@
+"""The command ``export``: a scene's surfaces and volumes, for other programs."""
+
+from pathlib import Path
+
+import click
+import SimpleITK as sitk
+import trimesh
+
+from scenes.anatomy import LoadedAnatomy, files_of, load_anatomy
+from scenes.parts import PARTS
+from scenes.patient_folder import check_folder
+from scenes.reading.files import file_volume
+from scenes.scene import Scene, load_scene
+from scenes.surface_files import FORMATS, save_surface
+from studies.commands import Fault, make_folder
+
+
+@click.command()
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, help="Folder to write to; new or empty."
+)
+@click.option(
+    "--format",
+    "suffix",
+    type=click.Choice(FORMATS),
+    default="stl",
+    show_default=True,
+    help="Of the surfaces; PLY keeps the order of their vertices.",
+)
+def export(scene: Path, out: Path, suffix: str) -> None:
+    """Write what is in SCENE, a scene file or a patient's folder: surfaces as STL or PLY, CT and label map as NRRD.
+
+    All is in mm, in the patient's LPS, at rest. As they lie when they are pressed, rehearse writes them.
+    """
+    path = scene / "scene.toml" if scene.is_dir() else scene
+    check_folder(out)
+    loaded = load_scene(path)
+    anatomy = load_anatomy(loaded, path.parent)
+    make_folder(out)
+    named = surfaces(anatomy)
+    for name, surface in named.items():
+        save_surface(surface, out / f"{name}.{suffix}")
+    volumes = save_volumes(loaded, path.parent, out)
+    click.echo(
+        f"Wrote to {out}, in mm, LPS: {', '.join([*(f'{name}.{suffix}' for name in named), *volumes])}"
+    )
+    without = sum(not isinstance(shape, trimesh.Trimesh) for shape in anatomy.shapes)
+    if without:
+        click.echo(f"Left out: {without} of what the organ lies on, as planes and distances are no surfaces.")
+
+
+def surfaces(anatomy: LoadedAnatomy) -> dict[str, trimesh.Trimesh]:
+    """The surfaces of an anatomy, by the names of their files: organ, tumour, parts, support, support-2, ..."""
+    found = {"organ": anatomy.organ}
+    if anatomy.tumour is not None:
+        found["tumour"] = anatomy.tumour
+    found |= {PARTS[tissue]: part for tissue, part in anatomy.parts.items()}
+    supports = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
+    return found | {"support" if n == 1 else f"support-{n}": each for n, each in enumerate(supports, 1)}
+
+
+def save_volumes(scene: Scene, folder: Path, out: Path) -> list[str]:
+    """Write the voxels of CT and label map as their files have them, without metadata; the names of the files. Raises Fault."""
+    folder, files = files_of(scene, folder)
+    wanted = {"ct.nrrd": files.ct, "labels.nrrd": files.labels}
+    written = {name: file for name, file in wanted.items() if file}
+    for name, file in written.items():
+        image = file_volume(folder / file).image()
+        try:
+            sitk.WriteImage(image, str(out / name), useCompression=True)
+        except RuntimeError:
+            raise Fault(f"{out / name}: cannot be written; make space, or choose another --out") from None
+    return list(written)

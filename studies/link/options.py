@@ -1,0 +1,50 @@
+"""The options of ``rehearse`` that open the link, and the link that they open."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import click
+
+from studies.commands import Fault
+
+if TYPE_CHECKING:
+    from studies.link.server import Server
+
+HOST, PORT = "127.0.0.1", 18944
+OPTIONS = (
+    click.option("--link", is_flag=True, help="Send the live picture and the probe's pose over OpenIGTLink."),
+    click.option("--link-host", help=f"With --link: the address of this machine to be reached at [{HOST}]."),
+    click.option("--link-port", type=click.IntRange(1, 65535), help=f"With --link: its port [{PORT}]."),
+)
+
+
+def link_options(command: Callable) -> Callable:
+    """Give a command --link, --link-host and --link-port."""
+    for option in reversed(OPTIONS):
+        command = option(command)
+    return command
+
+
+def opened_link(link: bool, host: str | None, port: int | None) -> "Server | None":
+    """The server that the options ask for, which closes when the command ends. Raises Fault."""
+    if not link:
+        for option, value in {"--link-host": host, "--link-port": port}.items():
+            if value is not None:
+                raise Fault(f"{option}: says where --link is to be reached; add --link, or leave it out")
+        return None
+    from studies.link.server import Server
+
+    host, port = host or HOST, port or PORT
+    try:
+        server = Server(host, port, click.echo)
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or "no name of a machine"
+        raise Fault(
+            f"--link: {host} port {port} cannot be opened ({reason}); end the program that has it, or choose another --link-host or "
+            "--link-port"
+        ) from None
+    click.get_current_context().with_resource(server)
+    click.echo(f"The link is open: OpenIGTLink on {host}, port {port}.")
+    if not server.is_private:
+        click.echo("Mind: whoever reaches this machine over the network can read the picture.")
+    return server

@@ -1,0 +1,204 @@
+"""The loops around a rehearsal, with a fake one: what goes to the link and into files."""
+
+import json
+import socket
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import app
+import studies.rehearsal
+from render.viewer import Controls, Settings, View
+from render.window import NoVulkan
+from studies.rehearse import command, headless, loop, run
+from studies.rehearse.loop import Loop
+from studies.rehearse.view import probe_as_set
+from ultrasound.array import load_probe
+
+STEP_S = 0.25
+
+
+class Moments:
+    """A driver, a rehearsal and its instruments in one, of which each moment is one mm further; a replay that sets the depth."""
+
+    def __init__(self) -> None:
+        self.probe, self.origin = load_probe("linear"), np.array([100.0, 200.0, 300.0])
+        self.settings, self.notice, self.status, self.moment = SimpleNamespace(time_step_s=STEP_S), "", "", 0
+
+    @property
+    def session(self) -> SimpleNamespace:
+        return SimpleNamespace(time_s=self.moment * STEP_S)
+
+    def move(self, controls: Controls) -> np.ndarray:
+        self.moment += 1
+        controls.settings.depth_mm = 50 + self.moment
+        return np.eye(4)
+
+    def image_plane(self) -> SimpleNamespace:
+        place = np.eye(4)
+        place[0, 3] = self.moment
+        return SimpleNamespace(world_from_plane=place)
+
+    def take_view(self, rehearsal, settings, pose, record, status="") -> View:
+        record.step_ms.append(1.0)
+        grey = np.full((4, 4), self.moment + 100 * (status == "FROZEN"), np.uint8)
+        probe = probe_as_set(self.probe, settings)
+        width, depth, _ = probe.extent_mm
+        return View(np.eye(4), {"B-mode": grey, "CT": 255 - grey}, width, depth, status=status)
+
+    def rest_grid(self) -> None: ...
+    def stepped(self, step_ms: float) -> str:
+        return ""
+
+    def watch(self, *_) -> str:
+        return ""
+
+    def onto(self, view: View, settings: Settings) -> View:
+        return view
+
+    def take_said(self) -> str:
+        return ""
+
+    def tell(self, notice: str) -> None: ...
+    def figures(self) -> dict:
+        return {}
+
+    @property
+    def shown(self) -> str:
+        return ""
+
+
+class Recorded:
+    """A record of nothing."""
+
+    def __init__(self, build_s: float) -> None:
+        self.step_ms: list[float] = []
+
+    def watch(self, rehearsal: Moments) -> None: ...
+    def report(self, rehearsal: Moments, arch: str) -> dict:
+        return {}
+
+
+@pytest.fixture
+def sent() -> list:
+    return []
+
+
+@pytest.fixture
+def looping(monkeypatch, tmp_path, sent) -> Loop:
+    moments = Moments()
+    monkeypatch.setattr(loop, "take_view", moments.take_view)
+    link = SimpleNamespace(show=sent.append)
+    return Loop(
+        moments, None, tmp_path, Recorded(0.0), moments, moments, moments, moments, frozen=False, link=link
+    )
+
+
+def test_each_frame_goes_to_the_link_as_it_is_shown(looping, sent):
+    settings = Settings()
+    views = [looping.frame(Controls(settings)) for _ in range(3)]
+    for number, (live, view) in enumerate(zip(sent, views, strict=True), 1):
+        assert live.grey is view.pictures["B-mode"] and live.time_s == number * STEP_S
+        assert np.array_equal(live.probe_in_patient[:3, 3], [100.0 + number, 200.0, 300.0])
+        # The depth that the replay has just set, not that of the frame before.
+        assert live.image_to_probe[1, 1] == pytest.approx(view.depth_mm / 4) == (50 + number) / 4
+
+
+def test_a_frozen_picture_is_sent_as_the_scanner_is_set_and_one_looked_back_at_is_not(looping, sent):
+    settings = Settings()
+    looping.frame(Controls(settings))
+    looping.cine.frames.append(looping.cine.frames[-1])
+    settings.depth_mm = 80
+    looping.frame(Controls(settings, freeze=True))
+    assert sent[-1].grey[0, 0] == 101 and sent[-1].image_to_probe[1, 1] == 20 and len(sent) == 2
+    looping.frame(Controls(settings, cine=-1))
+    assert len(sent) == 2
+
+
+def test_without_a_link_the_loop_goes_on(looping, sent):
+    looping.link = None
+    looping.frame(Controls(Settings()))
+    assert sent == []
+
+
+def test_the_export_key_saves_the_tissue_beside_its_picture(looping, monkeypatch, tmp_path):
+    begins: list[str] = []
+    monkeypatch.setattr(loop, "save_surfaces", lambda rehearsal, out, begin: begins.append(begin))
+    settings = Settings()
+    for _ in range(2):
+        controls = Controls(settings, export=True)
+        looping._save(controls, looping.frame(controls))
+    looping.cine.frames.append(looping.cine.frames[-1])
+    looping._save(Controls(settings, export=True), looping.frame(Controls(settings, freeze=True)))
+    assert begins == ["001-", "002-", "003-"] and (tmp_path / "003-b-mode.dcm").is_file()
+    # What is looked back at lay otherwise than the tissue does now.
+    looping._save(Controls(settings, export=True), looping.frame(Controls(settings, cine=-1)))
+    assert len(begins) == 3 and (tmp_path / "004-b-mode.png").is_file()
+
+
+def test_without_a_window_pictures_go_to_the_link_and_the_tissue_into_the_folder(monkeypatch, tmp_path, sent):
+    def no_viewer(rehearsal, visible):
+        raise NoVulkan("no Vulkan")
+
+    moments, saved = Moments(), []
+    monkeypatch.setattr(headless, "open_viewer", no_viewer)
+    monkeypatch.setattr(headless, "take_view", moments.take_view)
+    monkeypatch.setattr(headless, "Record", Recorded)
+    monkeypatch.setattr(headless, "summary", lambda report: "")
+    monkeypatch.setattr(headless, "save_surfaces", lambda rehearsal, out: saved.append((moments.moment, out)))
+    link = SimpleNamespace(show=sent.append)
+    headless.run_headless(moments, moments, 3, Settings(), moments, "cpu", tmp_path, 0.0, link)
+    assert [live.grey[0, 0] for live in sent] == [1, 2, 3] and sent[-1].time_s == 3 * STEP_S
+    assert [live.image_to_probe[1, 1] for live in sent] == [51 / 4, 52 / 4, 53 / 4]
+    assert saved == [(3, tmp_path)] and json.loads((tmp_path / "report.json").read_text()) == {"reading": {}}
+
+
+def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path, sent):
+    link, given = SimpleNamespace(show=sent.append), []
+    viewer = SimpleNamespace(close=lambda: None, settings=Settings())
+    monkeypatch.setattr(run, "Instruments", lambda rehearsal: None)
+    monkeypatch.setattr(run, "open_viewer", lambda rehearsal, visible: viewer)
+    monkeypatch.setattr(run, "settings_of", lambda rehearsal: Settings())
+    monkeypatch.setattr(run, "Loop", lambda *_, link: given.append(link) or SimpleNamespace(run=lambda: None))
+    monkeypatch.setattr(run, "run_headless", lambda *arguments: given.append(arguments[-1]))
+    monkeypatch.setattr(run, "Session", lambda rehearsal: None)
+    for name in ("_live", "_record", "_end"):
+        monkeypatch.setattr(run.Run, name, lambda *_: None)
+    each = run.Run(Moments(), None, "cpu", tmp_path, link=link)
+    each.in_window(None, 0.0)
+    each.headless(None, 0.0, 1.0, 0.0)
+    assert given == [link, link]
+
+
+def test_the_command_opens_the_link_for_as_long_as_it_runs(monkeypatch, tmp_path, capsys):
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        port = listening.getsockname()[1]
+    reached: list[bool] = []
+
+    def headless_run(each: run.Run, *_) -> None:
+        socket.create_connection(("127.0.0.1", port), 5).close()
+        reached.append(each.link is not None and each.link.port == port)
+
+    monkeypatch.setattr(command, "start_taichi", lambda arch: "cpu")
+    monkeypatch.setattr(studies.rehearsal, "Rehearsal", lambda *_: None)
+    monkeypatch.setattr(run, "Instruments", lambda rehearsal: None)
+    monkeypatch.setattr(run.Run, "headless", headless_run)
+    line = [
+        "rehearse",
+        "--headless",
+        "--out",
+        str(tmp_path),
+        "--arch",
+        "cpu",
+        "--link",
+        "--link-port",
+        str(port),
+    ]
+    assert app.main(line) == 0 and reached == [True]
+    with socket.create_server(("127.0.0.1", port)):
+        capsys.readouterr()
+        assert app.main(line) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and f"port {port} cannot be opened" in told and reached == [True]
