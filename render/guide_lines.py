@@ -10,7 +10,8 @@ from render import solids
 from render.viewer import Guidance
 
 MOST_SEGMENTS = 2000
-TO_GO, GONE, GOAL = (1.0, 0.72, 0.20), (0.30, 0.75, 0.42), (1.0, 0.86, 0.45)
+TO_GO, GONE = np.float32([1.0, 0.72, 0.20]), np.float32([0.30, 0.75, 0.42])
+GOAL = (1.0, 0.86, 0.45)
 WIDTH, GOAL_WIDTH = 2.6, 1.8
 
 
@@ -39,10 +40,10 @@ class GuideLines:
         segments, gone = guidance.way_mm[::every], guidance.gone[::every]
         # What is left over has no length.
         points = np.repeat(segments[-1:, 1:], 2 * MOST_SEGMENTS, axis=1)[0].astype(np.float32)
-        colours = np.tile(np.float32(GONE), (2 * MOST_SEGMENTS, 1))
+        colours = np.tile(GONE, (2 * MOST_SEGMENTS, 1))
         points[: 2 * len(segments)] = segments.reshape(-1, 3)
         colours[: 2 * len(segments)] = np.where(
-            np.repeat(gone, 2)[:, None], np.float32(GONE), np.float32(TO_GO)
+            np.repeat(gone, 2)[:, None], GONE, TO_GO
         )
         self._way.from_numpy(points)
         self._colours.from_numpy(colours)

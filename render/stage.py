@@ -8,6 +8,7 @@ import taichi as ti
 
 from render import solids
 from render.camera import OrbitCamera
+from render.guide_lines import GuideLines
 from render.surface import GLASS, SOLID, Surface
 from render.viewer import Geometry, Settings, View
 
@@ -48,6 +49,7 @@ class Stage:
         self._probe_vertices, self._probe_normals, self._probe_colours = map(_vector_field, self._probe[:3])
         self._probe_edges = solids.edges(geometry.transducer_size_mm, geometry.transducer_radius_mm)
         self._edge_points = _vector_field(self._probe_edges)
+        self._guide: GuideLines | None = None
         self._plane, self._plane_indices = solids.image_plane_grid(PLANE_ROWS, PLANE_COLUMNS)
         self._plane_points, self._plane_normals, self._plane_colours = (
             _vector_field(np.ones((len(self._plane), 3))) for _ in range(3)
@@ -90,6 +92,9 @@ class Stage:
                 surface.shade(eye, key)
                 _draw_surface(scene, surface)
         self._draw_image_plane(scene, view, key)
+        if view.guidance is not None:
+            self._guide = self._guide or GuideLines(self._probe_edges)
+            self._guide.draw(scene, view.guidance)
         cut = _cut(view.transducer_pose, eye) if settings.cut else None
         opacity = GLASS if settings.translucent else SOLID
         self._organ.tint(view.seen.get("organ"))

@@ -56,6 +56,10 @@ KEY_MAP = (
     Key("M", "bookmark", "bookmark this moment"),
     Key("J", "to_bookmark", "go to the last bookmark, then to earlier ones"),
     Key("L", "sweep", "begin to record a tracked sweep, or end it"),
+    Key("1", "plan_tumour", "plan a sweep that shows the tumour"),
+    Key("2", "plan_margin", "plan a sweep that shows the tumour and 5 mm around it"),
+    Key("3", "plan_organ", "plan a sweep that shows the whole kidney"),
+    Key("0", "next_plan", "the plan's next sweep, after the last none"),
     Key("K", "take_over", "lead the transducer from here on, in a replay"),
     Key("N", "show_seen", "what has been in the picture, in green"),
     Key("R", "reset", "reset tissue, transducer and view"),
@@ -152,6 +156,18 @@ class Geometry:
 
 
 @dataclass(frozen=True)
+class Guidance:
+    """A plan's sweep, to be followed."""
+
+    goal: np.ndarray | None
+    """Where the transducer is to go next, world from transducer [mm], shape (4, 4); None where all of the sweep is behind."""
+    way_mm: np.ndarray
+    """The way of the face's middle, segments of shape (n, 2, 3)."""
+    gone: np.ndarray
+    """Which of them are behind, bool, shape (n,)."""
+
+
+@dataclass(frozen=True)
 class View:
     """What changes each frame."""
 
@@ -173,6 +189,7 @@ class View:
     """The same of where it was in the CT."""
     seen: dict[str, np.ndarray] = field(default_factory=dict)
     """Which vertices of "organ" and "tumour" lie in tissue that has been in the picture, bool, shape (n,)."""
+    guidance: Guidance | None = None
     calliper_mm: tuple[tuple[float, float], ...] = ()
     """Up to two points on the plane [mm]."""
     captions: tuple[str, str, str] = ("", "", "")
@@ -223,6 +240,10 @@ class Controls:
     sweep: bool = False
     """The key that begins and ends a sweep went down."""
     take_over: bool = False
+    plan_tumour: bool = False
+    plan_margin: bool = False
+    plan_organ: bool = False
+    next_plan: bool = False
     pointed_mm: tuple[float, float] | None = None
     """The place on the image plane that was clicked on in a picture."""
     cine: int = 0

@@ -1,6 +1,7 @@
 """The file of a plan: sweeps over a target, the best first, with what each was worth. JSON; patient coordinates LPS, mm."""
 
 import json
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,6 +12,7 @@ from scenes.trocar import Trocar
 
 TARGETS = ("tumour", "margin", "organ")
 MOST_POSES = 20_000
+NAME = re.compile(r"plan-([0-9]{3,9})\.json")
 # How far the axes of a pose may be from orthonormal: what six digits in a file leave.
 RIGID = 1e-3
 
@@ -70,6 +72,12 @@ class Plan(_Part):
 def write_plan(plan: Plan, path: Path) -> None:
     """Write a plan; the same plan makes the same bytes. Raises OSError."""
     path.write_text(json.dumps(plan.model_dump(mode="json"), indent=1) + "\n", "utf-8")
+
+
+def next_free(folder: Path) -> Path:
+    """The place of the next plan in a folder."""
+    taken = [int(found[1]) for path in folder.glob("plan-*.json") if (found := NAME.fullmatch(path.name))]
+    return folder / f"plan-{1 + max(taken, default=0):03d}.json"
 
 
 def read_plan(path: Path) -> Plan:

@@ -12,6 +12,7 @@ from scenes.anatomy import LoadedAnatomy, fingerprint, load_anatomy
 from scenes.scene import EMBEDDED, OPTIONS, TISSUES, Scene, load_scene, with_options
 from studies.commands import Fault, arch_option, make_folder, start_taichi
 from studies.link.options import link_options, opened_link
+from studies.plan.file import Plan, PlanError, read_plan
 from studies.rehearse.track_file import PROBE_IN_PATIENT, check_near, load_track
 from studies.session.file import Log, SessionError, read_log
 from studies.session.scene import scene_of_log
@@ -58,6 +59,9 @@ MATERIAL = ("tissue.model", "tissue.young_kpa", "tissue.poisson")
     help="Keys and buttons of your own: a TOML file as app.py keys prints it.",
 )
 @click.option(
+    "--plan", "plan_file", type=click.Path(path_type=Path), help="A sweep to follow: a file of app.py plan."
+)
+@click.option(
     "--out",
     type=click.Path(path_type=Path),
     default=Path("out"),
@@ -97,6 +101,7 @@ def rehearse(
     track_from: str | None,
     gamepad: bool,
     keys_file: Path | None,
+    plan_file: Path | None,
     out: Path,
     arch: str,
     budget_ms: float | None,
@@ -117,6 +122,7 @@ def rehearse(
     keys = load_keys(keys_file) if keys_file is not None else Keys()
     refuse_inputs(track_file, track_from, replay, gamepad and headless)
     track = load_track(track_file, track_from) if track_file is not None else None
+    plan = read_plan(plan_file) if plan_file is not None else None
     log = session_of(replay, at, changed, budget_ms, error_mm)
     loaded = with_options(before, changed) if log is None else as_recorded(log, before)
     if changed["tissue.model"] is None and loaded.tissue.model != before.tissue.model:
@@ -127,6 +133,8 @@ def rehearse(
         check_anatomy(log, anatomy, before.title)
     if track is not None and track_file is not None:
         check_near(track, anatomy.organ.vertices, track_file)
+    if plan is not None:
+        check_plan(plan, fingerprint(anatomy), probe)
     budgeted = budget_ms is not None or error_mm is not None
     if budgeted:
         refuse_sizes(changed)
@@ -148,7 +156,18 @@ def rehearse(
         rehearsal = Rehearsal(loaded, anatomy, probe)
     from studies.rehearse.run import Run
 
-    run = Run(rehearsal, anatomy, used, out, budget_ms, track=track, keys=keys, gamepad=gamepad, link=server)
+    run = Run(
+        rehearsal,
+        anatomy,
+        used,
+        out,
+        budget_ms,
+        track=track,
+        keys=keys,
+        gamepad=gamepad,
+        link=server,
+        plan=plan,
+    )
     if headless:
         run.headless(log, at, seconds, perf_counter() - started)
     else:
@@ -217,6 +236,20 @@ def check_anatomy(log: Log, anatomy: LoadedAnatomy, title: str) -> None:
         raise SessionError(
             f"the session is of other anatomy than this scene's ({title or 'no title'}): name "
             "its scene or patient's folder before --replay; a patient imported anew is another one"
+        )
+
+
+def check_plan(plan: Plan, anatomy: str, probe: Probe) -> None:
+    """Raises PlanError where a plan is for other anatomy than that of a fingerprint, or for another probe."""
+    if plan.anatomy != anatomy:
+        raise PlanError(
+            "the plan is of other anatomy than this scene's: name its scene or patient's folder before --plan; "
+            "a patient imported anew is another one"
+        )
+    planned = plan.probe.get("TransducerName"), plan.probe.get("HousingMm")
+    if planned != (probe.transducer_name, list(probe.housing_mm)):
+        raise PlanError(
+            f"the plan is for the probe {planned[0]!r}, found {probe.transducer_name!r}: choose it with --probe, or plan anew"
         )
 
 

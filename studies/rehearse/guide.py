@@ -6,9 +6,8 @@ import numpy as np
 
 from render.viewer import Guidance
 from studies.freehand.unsqueeze import shifted
-from studies.plan.file import Plan, PlanError
+from studies.plan.file import Plan
 from studies.rehearsal import Rehearsal
-from ultrasound.array import Probe
 from ultrasound.probe import held_at
 
 # Nearer than this a pose counts as gone through; a turn by so many degrees is as far as one millimetre.
@@ -51,6 +50,10 @@ class Guide:
         """Show the plan's next sweep, after the last none; what there is to say."""
         self.number = (self.number + 1) % (len(self.plan.sweeps) + 1)
         self.begin_anew()
+        return self.said()
+
+    def said(self) -> str:
+        """Which sweep is shown, for the user."""
         if self.number == len(self.plan.sweeps):
             return "Plan hidden"
         sweep = self.plan.sweeps[self.number]
@@ -118,17 +121,3 @@ class Guide:
                 f"; {self.plan.target} seen {100 * seen:.0f} % (planned {100 * sweep.parts['seen']:.0f} %)"
             )
         return text
-
-
-def check_plan(plan: Plan, anatomy: str, probe: Probe) -> None:
-    """Raises PlanError where a plan is for other anatomy than that of a fingerprint, or for another probe."""
-    if plan.anatomy != anatomy:
-        raise PlanError(
-            "the plan is of other anatomy than this scene's: name its scene or patient's folder before --plan; "
-            "a patient imported anew is another one"
-        )
-    planned = plan.probe.get("TransducerName"), plan.probe.get("HousingMm")
-    if planned != (probe.transducer_name, list(probe.housing_mm)):
-        raise PlanError(
-            f"the plan is for the probe {planned[0]!r}, found {probe.transducer_name!r}: choose it with --probe, or plan anew"
-        )

@@ -9,6 +9,7 @@ import numpy as np
 from render.viewer import Settings, View
 from studies.readings import Reading, read
 from studies.rehearsal import Rehearsal
+from studies.rehearse.guide import Guide
 from studies.session.session import Session
 from studies.session.summary import Course
 from ultrasound.array import Probe
@@ -20,10 +21,11 @@ COMPRESSION = "compression"
 
 
 class Instruments:
-    """``reading`` is the latest; ``coverage`` is of the whole session."""
+    """``reading`` is the latest; ``coverage`` is of the whole session; ``guide`` is the plan that is followed, if any."""
 
-    def __init__(self, rehearsal: Rehearsal) -> None:
-        self.rehearsal = rehearsal
+    def __init__(self, rehearsal: Rehearsal, guide: Guide | None = None) -> None:
+        self.rehearsal, self.guide = rehearsal, guide
+        self.margin_mm = MARGIN_MM if guide is None else guide.plan.margin_mm
         self.reading: Reading | None = None
         step_s = rehearsal.settings.time_step_s
         self._read_every, self._look_every = (max(1, round(s / step_s)) for s in (READ_S, LOOK_S))
@@ -40,10 +42,12 @@ class Instruments:
         """Nothing was seen or done yet."""
         self.course = self._new_course()
         self.coverage.forget()
+        if self.guide is not None:
+            self.guide.begin_anew()
 
     @cached_property
     def coverage(self) -> Coverage:
-        return Coverage(self.rehearsal.organ, self.rehearsal.tumour, MARGIN_MM)
+        return Coverage(self.rehearsal.organ, self.rehearsal.tumour, self.margin_mm)
 
     def watch(self, session: Session, probe: Probe, pose: np.ndarray | None) -> None:
         """Look at a moment (its step's pose, None of a way back) whose pictures were taken, and note a new reading in the session."""
@@ -51,6 +55,8 @@ class Instruments:
             image = self.rehearsal.scene.image
             rest = self.rehearsal.scanner.plane.rest_grid(PLACES)
             self._touches = self.coverage.look(rest, probe, image.contact_gap_mm)
+        if self.guide is not None:
+            self.guide.watch(self.rehearsal.pose)
         if session.moment % self._read_every == 0 or self.reading is None:
             self.reading = read(self.rehearsal, probe, self._touches)
             surfaces = {"organ": self.rehearsal.organ, "tumour": self.rehearsal.tumour}
@@ -68,6 +74,8 @@ class Instruments:
         values = asdict(self.reading) if self.reading is not None else {}
         if self.rehearsal.scanner is not None:
             values |= {f"seen_{target}": self.coverage.share(target) for target in self.coverage.targets}
+        if self.guide is not None:
+            values |= self.guide.figures()
         return {name: None if value is None else round(value, 4) for name, value in values.items()}
 
     def summary(self, bookmarks: int = 0) -> dict[str, Any]:
@@ -93,11 +101,15 @@ class Instruments:
             findings=self._findings,
             alert=COMPRESSION if self.is_too_deep else "",
             seen=self._seen if settings.show_seen else {},
+            guidance=self.guide.guidance() if self.guide is not None else None,
             status=status,
         )
 
     def findings(self) -> dict[str, str]:
         """Name -> figure with its unit."""
+        return self._of_tissue() | (self.guide.findings() if self.guide is not None else {})
+
+    def _of_tissue(self) -> dict[str, str]:
         reading = self.reading
         if reading is None:
             return {}
@@ -113,7 +125,7 @@ class Instruments:
         }
         return found | {
             "tumour seen": self._share("tumour"),
-            f"+{MARGIN_MM:.0f} mm seen": self._share("margin"),
+            f"+{self.margin_mm:.0f} mm seen": self._share("margin"),
         }
 
     def _share(self, target: str) -> str:

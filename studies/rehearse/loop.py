@@ -14,6 +14,7 @@ from studies.rehearsal import Rehearsal
 from studies.rehearse.cine import Calliper, Cine, Frame
 from studies.rehearse.drivers import Driver
 from studies.rehearse.instruments import Instruments
+from studies.rehearse.planning import Plans
 from studies.rehearse.saving import save_pictures, save_screenshot, save_surfaces
 from studies.rehearse.sweeping import Sweeping
 from studies.rehearse.view import probe_as_set, take_view
@@ -35,6 +36,7 @@ class Loop:
     notices: Notices
     instruments: Instruments
     sweeping: Sweeping
+    plans: Plans
     cine: Cine = field(default_factory=Cine)
     calliper: Calliper = field(default_factory=Calliper)
     keys: Keys = field(default_factory=Keys)
@@ -79,6 +81,7 @@ class Loop:
             self.calliper.points = ()
         self.calliper.point(controls.pointed_mm)
         self._announce(controls.news)
+        self._announce(self.plans.watch(controls))
         shown = self._looked_back(controls) or self._taken(controls)
         if controls.sweep:
             self._announce(self.sweeping.toggle(self.out))
@@ -96,7 +99,7 @@ class Loop:
     def _status(self, view: View) -> str:
         if perf_counter() < self._said_until:
             return self._said
-        return self.keys.worded(view.status or self.sweeping.status)
+        return self.keys.worded(view.status or self.sweeping.status or self.plans.status)
 
     def _announce(self, text: str) -> None:
         """Say something in the window and in the terminal."""

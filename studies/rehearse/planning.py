@@ -1,14 +1,21 @@
-"""A plan made while the rehearsal goes on: the search runs in processes of its own, this thread only waits for them."""
+"""Plans in the window: one made while the rehearsal goes on, and which of its sweeps is shown."""
 
 import threading
 from pathlib import Path
 
 from joblib import cpu_count
 
-from studies.plan.file import Plan, PlanError, write_plan
+from render.viewer import Controls
+from scenes.anatomy import LoadedAnatomy
+from studies.plan.file import Plan, PlanError, next_free, write_plan
+from studies.plan.make import make_plan
 from studies.plan.workers import Ground, workers
+from studies.rehearsal import Rehearsal
+from studies.rehearse.guide import Guide
+from studies.rehearse.instruments import Instruments
 
 TRIALS, SPEED_MM_S = 160, 10.0
+TARGET_OF = {"plan_tumour": "tumour", "plan_margin": "margin", "plan_organ": "organ"}
 
 
 class _Stopped(Exception):
@@ -16,45 +23,100 @@ class _Stopped(Exception):
 
 
 class Planning:
-    """One search for a plan. ``plan`` is there when it is found, ``fault`` where there was none to find."""
+    """One search for a plan. It runs in processes of its own; this thread of it only waits for them.
+
+    Once it ``is_over``, ``plan`` is there, or ``fault`` says why not.
+    """
 
     def __init__(self, ground: Ground, path: Path, trials: int = TRIALS) -> None:
-        self.path, self.plan, self.fault = path, None, ""
-        self._ground, self._trials, self._done, self._ends = ground, trials, 0, False
+        self.plan: Plan | None = None
+        self.fault = ""
+        self._ground, self._path, self._trials = ground, path, trials
+        self._done, self._ends = 0, False
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     @property
-    def status(self) -> str:
-        """What stands in the panel meanwhile."""
-        return (
-            f"PLANNING   {100 * min(self._done / self._trials, 1.0):.0f} %" if self._thread.is_alive() else ""
-        )
-
-    @property
     def is_over(self) -> bool:
         return not self._thread.is_alive()
+
+    @property
+    def share(self) -> float:
+        """How much of it is done, 0 to 1."""
+        return min(self._done / self._trials, 1.0)
 
     def stop(self) -> None:
         """Let go of the search; what was found is lost."""
         self._ends = True
 
     def _run(self) -> None:
-        from studies.plan.make import make_plan
-
         try:
             # One processor is left to the rehearsal.
             with workers(self._ground, max(1, cpu_count() - 1)) as crew:
-                self.plan: Plan | None = make_plan(self._ground, crew, SPEED_MM_S, self._trials, self._count)
-            write_plan(self.plan, self.path)
+                plan = make_plan(self._ground, crew, SPEED_MM_S, self._trials, self._count)
+            write_plan(plan, self._path)
+            self.plan = plan
         except PlanError as error:
             self.fault = str(error)
         except OSError as error:
-            self.fault = f"{self.path.name} cannot be written: {error.strerror}"
+            self.fault = f"{self._path.name} cannot be written: {error.strerror}"
         except _Stopped:
-            pass
+            self.fault = "No plan: it was stopped"
 
     def _count(self) -> None:
         if self._ends:
             raise _Stopped
         self._done += 1
+
+
+class Plans:
+    """What the user asks of plans; the instruments' guide is the one that is followed."""
+
+    def __init__(
+        self, rehearsal: Rehearsal, anatomy: LoadedAnatomy, instruments: Instruments, out: Path
+    ) -> None:
+        self.rehearsal, self.anatomy, self.instruments, self.out = rehearsal, anatomy, instruments, out
+        self._planning: Planning | None = None
+
+    @property
+    def status(self) -> str:
+        """What stands in the panel while a plan is made."""
+        return "" if self._planning is None else f"PLANNING   {100 * self._planning.share:.0f} %"
+
+    def watch(self, controls: Controls) -> str:
+        """What the user asks for now, and a search that is over; what there is to say."""
+        guide = self.instruments.guide
+        if controls.reset and guide is not None:
+            guide.begin_anew()
+        if controls.next_plan:
+            return guide.next_sweep() if guide is not None else "No plan: {plan_margin} makes one"
+        for action, target in TARGET_OF.items():
+            if getattr(controls, action):
+                return self._begin(target)
+        return self._ended()
+
+    def stop(self) -> None:
+        """Let go of a search that goes on."""
+        if self._planning is not None:
+            self._planning.stop()
+
+    def _begin(self, target: str) -> str:
+        if self._planning is not None:
+            return "A plan is being made"
+        if target != "organ" and self.rehearsal.tumour is None:
+            return "No tumour, no plan for it: {plan_organ} plans for the kidney"
+        scene, margin_mm = self.rehearsal.scene, self.instruments.margin_mm
+        ground = Ground(scene, self.anatomy, self.rehearsal.probe, target, margin_mm, scene.trocar)
+        self._planning = Planning(ground, next_free(self.out))
+        return f"Planning for the {target}"
+
+    def _ended(self) -> str:
+        planning = self._planning
+        if planning is None or not planning.is_over:
+            return ""
+        self._planning = None
+        if planning.plan is None:
+            return planning.fault
+        guide = Guide(self.rehearsal, planning.plan)
+        self.instruments.guide = guide
+        return guide.said()

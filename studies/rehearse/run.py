@@ -14,12 +14,15 @@ from render.window import NoVulkan
 from scenes.anatomy import LoadedAnatomy
 from studies.commands import Fault
 from studies.link.server import Server
+from studies.plan.file import Plan
 from studies.rehearsal import Rehearsal, RehearsalState
 from studies.rehearse.drivers import Played, Scripted, set_settings
+from studies.rehearse.guide import Guide
 from studies.rehearse.headless import run_headless
 from studies.rehearse.instruments import Instruments
 from studies.rehearse.live import Live
 from studies.rehearse.loop import Loop
+from studies.rehearse.planning import Plans
 from studies.rehearse.sweeping import Sweeping
 from studies.rehearse.tracked import PlayedPoses, Tracked
 from studies.rehearse.view import open_viewer, settings_of
@@ -51,9 +54,11 @@ class Run:
     keys: Keys = field(default_factory=Keys)
     gamepad: bool = False
     link: Server | None = None
+    plan: Plan | None = None
 
     def __post_init__(self) -> None:
-        self.instruments = Instruments(self.rehearsal)
+        guide = None if self.plan is None else Guide(self.rehearsal, self.plan)
+        self.instruments = Instruments(self.rehearsal, guide)
 
     def in_window(self, log: Log | None, at_s: float) -> None:
         """Led by the user, in a window; with a log by that first. Raises Fault, SessionError."""
@@ -68,11 +73,15 @@ class Run:
         notices = Notices(click.echo)
         click.echo(self.keys.worded("The window is open; {help} shows the keys, {quit} quits."))
         parts = driver, notices, self.instruments, sweeping
-        loop = Loop(self.rehearsal, viewer, self.out, Record(0.0), *parts, keys=self.keys, link=self.link)
+        plans = Plans(self.rehearsal, self.anatomy, self.instruments, self.out)
+        loop = Loop(
+            self.rehearsal, viewer, self.out, Record(0.0), *parts, plans, keys=self.keys, link=self.link
+        )
         try:
             loop.run()
         finally:
             viewer.close()
+            plans.stop()
             _say(sweeping.end())
             live = driver.live if isinstance(driver, Played) else driver
             self._end(len(live.history.bookmarks) if live else 0)
@@ -148,6 +157,9 @@ class Run:
     def _end(self, bookmarks: int) -> None:
         summary = self.instruments.summary(bookmarks)
         click.echo(in_words(summary))
+        guide = self.instruments.guide
+        if guide is not None:
+            _say(guide.in_words(summary.get(f"seen_{guide.plan.target}")))
         if self.recorded is not None:
             self.recorded.close(summary)
             path = self.recorded.recording.path
