@@ -112,7 +112,6 @@ class SdlPads:
     def read(self) -> PadState | None:
         events = self._pygame.event.get()
         if self._pad is not None and not self._pad.attached():
-            self._pad.quit()
             self._pad = None
         if self._pad is None:
             known = filter(self._controller.is_controller, range(self._controller.get_count()))

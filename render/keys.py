@@ -13,8 +13,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from render.actions import ACTIONS, BY_MOUSE, HELD
 from render.viewer import KEY_MAP
 
-# A key as it is printed -> as GGUI names it.
-KEYS = {each: each.lower() for each in string.ascii_uppercase + string.digits + ",.-/;'[]="}
+# A key as it is printed -> as GGUI names it, which hears no digits and no punctuation.
+KEYS = {each: each.lower() for each in string.ascii_uppercase}
 KEYS |= {each: each for each in ("Up", "Down", "Left", "Right", "Return")}
 KEYS |= {"Esc": "Escape", "Space": " ", "Backspace": "BackSpace"}
 # In the order of SDL's game controllers.
@@ -38,8 +38,7 @@ USUAL_BUTTONS = {
 VIEW_ALONE = ("zoom_in", "zoom_out")
 
 HEAD = """# The keys of Nephron's window: change some, leave out the rest, and give the file to rehearse --keys.
-# A key is a letter or a digit, where a US keyboard has it, one of {marks} or
-# {named}.
+# A key is a letter, where a US keyboard has it, or {named}.
 # A gamepad's button is {buttons}.
 """
 
@@ -103,9 +102,8 @@ def load_keys(path: Path) -> Keys:
 
 def keys_text() -> str:
     """The usual keys as the TOML file that ``load_keys`` reads."""
-    marks = " ".join(key for key in KEYS if key in string.punctuation)
     named = ", ".join(key for key in KEYS if len(key) > 1)
-    head = HEAD.format(marks=marks, named=named, buttons=", ".join(BUTTONS))
+    head = HEAD.format(named=named, buttons=", ".join(BUTTONS))
     rows = [f'{line.action} = "{line.key}"  # {line.text}' for line in KEY_MAP if line.action in ACTIONS]
     pad = [f'{action} = "{button}"' for action, button in USUAL_BUTTONS.items()]
     return "\n".join([head, "[keys]", *rows, "", "[gamepad]", *pad, ""])

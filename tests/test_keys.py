@@ -10,7 +10,8 @@ from conftest import ROOT
 import app
 from render.actions import ACTIONS, BY_MOUSE, CYCLES, HELD, STEPS, begin, hold
 from render.keys import KEYS, USUAL_BUTTONS, USUAL_KEYS, VIEW_ALONE, Keys, KeysError, keys_text, load_keys
-from render.viewer import KEY_MAP, Controls, Settings
+from render.viewer import KEY_MAP, Controls, NullViewer, Settings
+from studies.rehearse.loop import Loop
 
 
 def file_of(tmp_path, text: str):
@@ -52,11 +53,36 @@ def test_an_action_changes_what_it_is_named_for():
     for action in ("push", "help", "zoom_in", ""):
         begin(action, controls)
     assert controls == before
-    for action in ("lift", "roll_left", "tilt_right", "fan_forth", "undo"):
-        hold(action, controls, 0.1)
-    assert (controls.push_mm, controls.roll_deg, controls.tilt_deg, controls.fan_deg) == pytest.approx(
-        (-1.5, 4.5, -3, 3)
-    )
+
+
+@pytest.mark.parametrize(
+    ("action", "name", "a_second"),
+    [
+        ("push", "push_mm", 15.0),
+        ("lift", "push_mm", -15.0),
+        ("roll_left", "roll_deg", 45.0),
+        ("roll_right", "roll_deg", -45.0),
+        ("tilt_left", "tilt_deg", 30.0),
+        ("tilt_right", "tilt_deg", -30.0),
+        ("fan_back", "fan_deg", -30.0),
+        ("fan_forth", "fan_deg", 30.0),
+    ],
+)
+def test_a_held_action_goes_on_with_time(action, name, a_second):
+    controls = Controls(Settings(), **{name: 1.0})
+    hold(action, controls, 0.1)
+    assert controls == Controls(controls.settings, **{name: pytest.approx(1.0 + 0.1 * a_second)})
+    hold("undo", controls, 0.1)
+    assert not controls.undo
+
+
+def test_what_is_said_names_the_users_keys(tmp_path, capsys):
+    keys = Keys(of=USUAL_KEYS | {"sweep": "Space"})
+    parts = [None] * 4
+    loop = Loop(None, NullViewer(), tmp_path, None, *parts, keys=keys)
+    loop._announce("sweep-001: {sweep} ends it")
+    assert capsys.readouterr().out == "sweep-001: Space ends it\n"
+    assert loop._status(None) == "SWEEP-001: SPACE ENDS IT"
 
 
 def test_the_printed_file_is_the_usual_map(tmp_path, capsys):
@@ -72,10 +98,10 @@ def test_a_file_changes_behaviour_help_and_words(tmp_path):
     keys = load_keys(
         file_of(
             tmp_path,
-            '[keys]\npush = "i"\nexport = "w"\nfreeze = "space"\nhelp = "/"\n[gamepad]\nundo = "guide"\nredo = "b"\n',
+            '[keys]\npush = "i"\nexport = "w"\nfreeze = "space"\nhelp = "Return"\n[gamepad]\nundo = "guide"\nredo = "b"\n',
         )
     )
-    assert [keys.action_of(key) for key in ("i", "w", " ", "f", "/", "Escape")] == [
+    assert [keys.action_of(key) for key in ("i", "w", " ", "f", "Return", "Escape")] == [
         "push",
         "export",
         "freeze",
@@ -89,7 +115,7 @@ def test_a_file_changes_behaviour_help_and_words(tmp_path):
     assert [key for key, _ in keys.lines()][:2] == ["Mouse", "Left button"] and len(keys.lines()) == len(
         KEY_MAP
     )
-    assert keys.worded("{help} shows, {quit} quits {so} {}") == "/ shows, Esc quits {so} {}"
+    assert keys.worded("{help} shows, {quit} quits {so} {}") == "Return shows, Esc quits {so} {}"
     assert keys.buttons["undo"] == "Guide" and keys.buttons["redo"] == "B"
 
 
@@ -104,9 +130,10 @@ def test_every_usual_key_is_a_key_and_there_once():
     [
         ('[keys]\npusch = "i"', "keys.pusch: no such action; did you mean push?"),
         ('[keys]\npush = "F13"', "keys.push = 'F13': no such key; known: A B"),
+        ('[keys]\npush = "1"', "keys.push = '1': no such key; known: A B"),
         ('[keys]\npush = "Spce"', "did you mean Space?"),
         ('[keys]\npush = "u"', "keys: push and undo are both on U; give one another"),
-        ('[keys]\npush = "1"\nlift = "1"', "keys: push and lift are both on 1"),
+        ('[keys]\npush = "Space"\nlift = "space"', "keys: push and lift are both on Space"),
         ('[keys]\npoint = "m"', "keys.point: is done with the mouse; leave it out"),
         ('[gamepad]\nundo = "A"', "gamepad: freeze and undo are both on A"),
         ('[gamepad]\nundo = "Q"', "gamepad.undo = 'Q': no such button"),

@@ -89,7 +89,9 @@ def watching(frames: int, take_over_at: int = -1) -> Any:
     def script(settings: Settings) -> Iterator[Controls]:
         for frame in range(frames):
             press = 0 <= take_over_at < frame
-            yield Controls(settings, take_over=frame == take_over_at, press=press, quit=frame == frames - 1)
+            news = "Gamepad ready" if frame == 0 else ""
+            last = frame == frames - 1
+            yield Controls(settings, take_over=frame == take_over_at, press=press, quit=last, news=news)
 
     return script
 
@@ -110,7 +112,9 @@ def test_a_session_that_goes_on_from_a_replay_is_one_too(built, monkeypatch, tmp
     led, end, second = rehearsed(built, monkeypatch, tmp_path, watching(60, 20), first, 0.5)
     assert len(second.poses) == 40 and second.header.begins
     shown, again, _ = rehearsed(built, monkeypatch, tmp_path, watching(40), second)
-    assert shown == led[20:] and again == end and "identical in all 1 states" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert shown == led[20:] and again == end and "identical in all 1 states" in told
+    assert told.count("Gamepad ready") == 2
 
 
 def test_a_tracked_file_is_followed_headless_and_replayed(built, monkeypatch, tmp_path, capsys):

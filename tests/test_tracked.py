@@ -199,8 +199,12 @@ def test_a_file_goes_by_the_sessions_time_and_then_the_user_leads():
     step(live, ray=ray(4.0))
     assert live.take_said() == "The tracked file is over: yours now" and live.status == ""
     assert np.array_equal(steps(live, 4, ray=ray(4.0)), shown[-1])
-    step(live, ray=ray(4.0), fan_deg=1.0)
-    assert at(live) != pytest.approx(shown[-1])
+    # A hand that fans by a degree turns what it has taken over where it is.
+    step(live, fan_deg=1.0)
+    turned = shown[-1][:3, :3].T @ at(live)[:3, :3]
+    assert np.degrees(np.arccos((np.trace(turned) - 1) / 2)) == pytest.approx(1.0, abs=1e-3)
+    assert np.linalg.norm(at(live)[:3, 3] - shown[-1][:3, 3]) < 1.0
+    assert steps(live, 4, ray=ray(-4.0))[0, 3] < Patient.origin[0]
 
 
 def test_time_goes_on_through_ways_back():

@@ -33,6 +33,8 @@ class Screen:
         self.shots = 0
         self.environment = os.environ | {"DISPLAY": display}
         self.environment.pop("WAYLAND_DISPLAY", None)
+        keys = out / "keys.toml"
+        keys.write_text('[keys]\nfreeze = "Space"\nexport = "E"\ntilt_right = "I"\n')
         self.program = subprocess.Popen(
             [
                 sys.executable,
@@ -44,6 +46,8 @@ class Screen:
                 "ct",
                 "--arch",
                 "cpu",
+                "--keys",
+                str(keys),
                 "--out",
                 str(out),
             ],
@@ -140,7 +144,7 @@ def test_the_mouse_moves_and_presses_the_transducer(screen):
     screen.do("key", "--window", screen.window, "b")
     both = screen.at_rest()
     assert np.abs(both - let_go)[PANEL].mean() > 5.0, "the key for the echo changes nothing"
-    screen.do("key", "--window", screen.window, "f")
+    screen.do("key", "--window", screen.window, "space")
     for place in (ECHO_TOP, ECHO_FOOT):
         screen.point(*place)
         time.sleep(1.0)
@@ -150,7 +154,7 @@ def test_the_mouse_moves_and_presses_the_transducer(screen):
     measured = screen.picture()
     green = (measured == CALLIPER).all(axis=2)[PANEL]
     assert green.sum() > 100, "two clicks on the echo draw no calliper"
-    screen.do("key", "--window", screen.window, "i")
+    screen.do("key", "--window", screen.window, "e")
     exported = screen.out / "001-b-mode.dcm"
     end = time.monotonic() + 20
     while not exported.exists() and time.monotonic() < end:
