@@ -253,7 +253,13 @@ def test_what_is_no_transform_is_passed_over(server, client):
     assert np.allclose(server.hand.pose(), np.diag([-1, -1, 1, 1]))
 
 
-@pytest.mark.parametrize("sent", [b"", b"\0" * 30])
+class Late:
+    """A client that was let in while the server closed."""
+
+    is_here = False
+
+
+@pytest.mark.parametrize("sent", [b"", b"\0" * 30], ids=["silent", "half a header"])
 def test_closing_ends_at_once_and_frees_the_port(said, sent):
     server = Server("127.0.0.1", 0, said.append)
     port, before = server.port, threading.active_count()
@@ -264,9 +270,13 @@ def test_closing_ends_at_once_and_frees_the_port(said, sent):
         server.close()
         assert time.monotonic() - began < 1
         assert connection.recv(1) == b""
+        # Nobody waits for a client that stays.
+        assert soon(lambda: threading.active_count() < before)
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", port), SOON_S)
-    assert soon(lambda: threading.active_count() < before) and said == []
+    late = Late()
+    server.enter(late)
+    assert server.newer(late, None) is None and said == []
     Server("127.0.0.1", port, said.append).close()
 
 
@@ -297,7 +307,8 @@ def test_a_pose_goes_stale(said):
     hand = server_module.HandPose(said.append, lambda: now[0])
     hand.take(HAND, pose())
     now[0] += STALE_S
-    assert hand.pose() is not None
+    hand.take("ProbeToReference", np.eye(4))
+    assert np.allclose(hand.pose()[:3, 3], [-12.0, 80.5, -333.25])
     now[0] += 1e-3
     assert hand.pose() is None
     hand.take(HAND, np.eye(4))
@@ -380,7 +391,7 @@ def test_a_link_that_cannot_be_is_refused_in_words(server):
         assert done.exit_code == 1 and f"{option}: " in done.output and "add --link" in done.output
     taken = CliRunner().invoke(linking, ["--link", "--link-port", str(server.port)])
     assert taken.exit_code == 1 and f"port {server.port} cannot be opened" in taken.output
-    for host in ("no such machine", "203.0.113.7", "a" * 70):
+    for host in ("no such machine", "203.0.113.7", "ä" * 70):
         done = CliRunner().invoke(linking, ["--link", "--link-host", host])
         assert done.exit_code == 1 and "choose another --link-host" in done.output, done.output
     assert CliRunner().invoke(linking, ["--link", "--link-port", "0"]).exit_code == 2
