@@ -2,6 +2,7 @@
 
 from render.viewer import KEY_MAP, Controls
 from ultrasound.array import MODES, RUNGS
+from ultrasound.coverage import TARGETS
 
 PUSH_MM_S, ROLL_DEG_S, TILT_DEG_S = 15.0, 45.0, 30.0
 # While held: what of the controls changes, and how much in a second.
@@ -18,7 +19,7 @@ HELD = {
 # The rest begins as the key goes down: steps through pictures, settings of several values, settings that are on or off,
 # and what the controls name as the action is named.
 STEPS = {"cine_back": -1, "cine_forth": 1}
-CYCLES = {"mode": MODES, "rung": RUNGS}
+CYCLES = {"mode": MODES, "rung": RUNGS, "plan_for": TARGETS}
 # What is the mouse's alone.
 BY_MOUSE = ("point", "press", "orbit", "pan", "measure")
 ACTIONS = tuple(line.action for line in KEY_MAP if line.action not in BY_MOUSE)

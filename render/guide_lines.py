@@ -10,7 +10,7 @@ from render import solids
 from render.viewer import Guidance
 
 MOST_SEGMENTS = 2000
-TO_GO, GONE = np.float32([1.0, 0.72, 0.20]), np.float32([0.30, 0.75, 0.42])
+TO_GO, GONE = np.array([1.0, 0.72, 0.20], np.float32), np.array([0.30, 0.75, 0.42], np.float32)
 GOAL = (1.0, 0.86, 0.45)
 WIDTH, GOAL_WIDTH = 2.6, 1.8
 
@@ -42,8 +42,6 @@ class GuideLines:
         points = np.repeat(segments[-1:, 1:], 2 * MOST_SEGMENTS, axis=1)[0].astype(np.float32)
         colours = np.tile(GONE, (2 * MOST_SEGMENTS, 1))
         points[: 2 * len(segments)] = segments.reshape(-1, 3)
-        colours[: 2 * len(segments)] = np.where(
-            np.repeat(gone, 2)[:, None], GONE, TO_GO
-        )
+        colours[: 2 * len(segments)] = np.where(np.repeat(gone, 2)[:, None], GONE, TO_GO)
         self._way.from_numpy(points)
         self._colours.from_numpy(colours)

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ultrasound.array import Mode, Rung
+from ultrasound.coverage import Target
 
 ECHO, TGC = "Echo", "Gain over depth"
 # Groups of settings that stand beside the picture, as on a scanner.
@@ -56,10 +57,9 @@ KEY_MAP = (
     Key("M", "bookmark", "bookmark this moment"),
     Key("J", "to_bookmark", "go to the last bookmark, then to earlier ones"),
     Key("L", "sweep", "begin to record a tracked sweep, or end it"),
-    Key("1", "plan_tumour", "plan a sweep that shows the tumour"),
-    Key("2", "plan_margin", "plan a sweep that shows the tumour and 5 mm around it"),
-    Key("3", "plan_organ", "plan a sweep that shows the whole kidney"),
-    Key("0", "next_plan", "the plan's next sweep, after the last none"),
+    Key("Space", "plan_for", "what a plan is for: the tumour and its margin, the tumour, the whole kidney"),
+    Key("Return", "plan", "plan a sweep that shows it"),
+    Key("Backspace", "next_plan", "the plan's next sweep, after the last none"),
     Key("K", "take_over", "lead the transducer from here on, in a replay"),
     Key("N", "show_seen", "what has been in the picture, in green"),
     Key("R", "reset", "reset tissue, transducer and view"),
@@ -121,10 +121,12 @@ class Settings:
     show_parts: bool = _switch(True, "Vessels")
     show_support: bool = _switch(True, "Support")
     outline: bool = _switch(False, "Outline")
+    margin_mm: int = _slider(5, "Margin", "mm", 0, 20, "View")
     show_scanner: bool = False
     show_seen: bool = False
     mode: Mode = "both"
     rung: Rung = "speckle"
+    plan_for: Target = "margin"
 
 
 @dataclass(frozen=True)
@@ -240,9 +242,7 @@ class Controls:
     sweep: bool = False
     """The key that begins and ends a sweep went down."""
     take_over: bool = False
-    plan_tumour: bool = False
-    plan_margin: bool = False
-    plan_organ: bool = False
+    plan: bool = False
     next_plan: bool = False
     pointed_mm: tuple[float, float] | None = None
     """The place on the image plane that was clicked on in a picture."""

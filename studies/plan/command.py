@@ -10,8 +10,9 @@ from scenes.anatomy import load_anatomy
 from scenes.scene import EMBEDDED, load_scene, with_options
 from scenes.trocar import Trocar
 from studies.commands import Fault, make_folder
-from studies.plan.file import TARGETS, write_plan
+from studies.plan.file import write_plan
 from studies.setup import probe_of
+from ultrasound.coverage import TARGETS, Target
 
 # Candidates are no more than these.
 MOST_CANDIDATES = 4
@@ -60,7 +61,7 @@ MOST_CANDIDATES = 4
 def plan(
     scene: Path,
     out: Path,
-    target: str | None,
+    target: Target | None,
     margin_mm: float,
     trocar: tuple[float, float, float] | None,
     cone_deg: float | None,
@@ -86,7 +87,7 @@ def plan(
 
     if port.at_mm is None:
         click.echo("No trocar is given: every way in counts as free.")
-    aim = target or ("organ" if anatomy.tumour is None else "margin")
+    aim: Target = target or ("organ" if anatomy.tumour is None else "margin")
     ground = Ground(loaded, anatomy, held, aim, margin_mm, port)
     with workers(ground, jobs) as crew, tqdm(total=trials + MOST_CANDIDATES, desc="plan", unit="scan") as bar:
         made = make_plan(ground, crew, speed_mm_s, trials, bar.update)

@@ -15,8 +15,10 @@ from studies.plan.score import score
 from studies.plan.trial import Parts
 from studies.plan.workers import Gone, Ground, workers
 from studies.setup import PRESETS, probe_of, scene_of
+from ultrasound.coverage import Target
 
-TARGET, MARGIN_MM, SPEED_MM_S = "margin", 5.0, 10.0
+TARGET: Target = "margin"
+MARGIN_MM, SPEED_MM_S = 5.0, 10.0
 SEEDS = range(5)
 PLANNED_ON, JUDGED_ON = "balanced", "accurate"
 

@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from scenes.trocar import Trocar
+from ultrasound.coverage import Target
 
-TARGETS = ("tumour", "margin", "organ")
 MOST_POSES = 20_000
 NAME = re.compile(r"plan-([0-9]{3,9})\.json")
 # How far the axes of a pose may be from orthonormal: what six digits in a file leave.
@@ -58,7 +58,7 @@ class Plan(_Part):
 
     nephron_plan: Literal[1] = 1
     anatomy: str
-    target: Literal["tumour", "margin", "organ"]
+    target: Target
     margin_mm: float
     speed_mm_s: float = Field(gt=0)
     probe: dict[str, Any]

@@ -29,7 +29,7 @@ def make_plan(
         )
     return Plan(
         anatomy=fingerprint(ground.anatomy),
-        target=ground.target,  # type: ignore[arg-type]
+        target=ground.target,
         margin_mm=ground.margin_mm,
         speed_mm_s=speed_mm_s,
         probe=ground.probe.model_dump(by_alias=True, mode="json"),

@@ -21,18 +21,18 @@ from studies.plan.trial import Parts, Trial
 from studies.plan.way import Way
 from studies.rehearsal import Rehearsal
 from ultrasound.array import Probe
-from ultrasound.coverage import VOXEL_MM, Coverage
+from ultrasound.coverage import VOXEL_MM, Coverage, Target
 from ultrasound.probe import image_plane
 
 
 @dataclass(frozen=True)
 class Ground:
-    """What a plan is made for. ``target`` is one of ``studies.plan.file.TARGETS``."""
+    """What a plan is made for. ``target`` is one of ``ultrasound.coverage.TARGETS``."""
 
     scene: Scene
     anatomy: LoadedAnatomy
     probe: Probe
-    target: str
+    target: Target
     margin_mm: float
     trocar: Trocar
 

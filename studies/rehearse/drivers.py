@@ -13,8 +13,9 @@ from studies.session.recorded import Recorded
 from studies.session.replay import Replay
 from studies.session.session import Session
 from ultrasound.array import MODES, RUNGS
+from ultrasound.coverage import TARGETS
 
-CHOICES: dict[str, tuple[str, ...]] = {"mode": MODES, "rung": RUNGS}
+CHOICES: dict[str, tuple[str, ...]] = {"mode": MODES, "rung": RUNGS, "plan_for": TARGETS}
 
 
 class Driver(Protocol):

@@ -45,6 +45,14 @@ class Instruments:
         if self.guide is not None:
             self.guide.begin_anew()
 
+    def follow(self, guide: Guide) -> None:
+        """Follow a plan from now on; what was seen stays so."""
+        self.guide = guide
+        if guide.plan.margin_mm != self.margin_mm:
+            self.margin_mm, seen = guide.plan.margin_mm, self.coverage.seen
+            del self.coverage
+            self.coverage.seen = seen
+
     @cached_property
     def coverage(self) -> Coverage:
         return Coverage(self.rehearsal.organ, self.rehearsal.tumour, self.margin_mm)

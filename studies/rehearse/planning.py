@@ -5,7 +5,7 @@ from pathlib import Path
 
 from joblib import cpu_count
 
-from render.viewer import Controls
+from render.viewer import Controls, Settings
 from scenes.anatomy import LoadedAnatomy
 from studies.plan.file import Plan, PlanError, next_free, write_plan
 from studies.plan.make import make_plan
@@ -13,9 +13,14 @@ from studies.plan.workers import Ground, workers
 from studies.rehearsal import Rehearsal
 from studies.rehearse.guide import Guide
 from studies.rehearse.instruments import Instruments
+from ultrasound.coverage import Target
 
 TRIALS, SPEED_MM_S = 160, 10.0
-TARGET_OF = {"plan_tumour": "tumour", "plan_margin": "margin", "plan_organ": "organ"}
+NAMED: dict[Target, str] = {
+    "margin": "the tumour and its margin",
+    "tumour": "the tumour",
+    "organ": "the whole kidney",
+}
 
 
 class _Stopped(Exception):
@@ -77,6 +82,7 @@ class Plans:
     ) -> None:
         self.rehearsal, self.anatomy, self.instruments, self.out = rehearsal, anatomy, instruments, out
         self._planning: Planning | None = None
+        self._plan_for: Target = Settings().plan_for
 
     @property
     def status(self) -> str:
@@ -89,26 +95,28 @@ class Plans:
         if controls.reset and guide is not None:
             guide.begin_anew()
         if controls.next_plan:
-            return guide.next_sweep() if guide is not None else "No plan: {plan_margin} makes one"
-        for action, target in TARGET_OF.items():
-            if getattr(controls, action):
-                return self._begin(target)
-        return self._ended()
+            return guide.next_sweep() if guide is not None else "No plan: {plan} makes one"
+        if controls.plan:
+            return self._begin(controls.settings)
+        return self._chosen(controls.settings) or self._ended()
+
+    def _chosen(self, settings: Settings) -> str:
+        before, self._plan_for = self._plan_for, settings.plan_for
+        return "" if settings.plan_for == before else f"A plan for {NAMED[settings.plan_for]}: {{plan}}"
 
     def stop(self) -> None:
         """Let go of a search that goes on."""
         if self._planning is not None:
             self._planning.stop()
 
-    def _begin(self, target: str) -> str:
+    def _begin(self, settings: Settings) -> str:
         if self._planning is not None:
             return "A plan is being made"
-        if target != "organ" and self.rehearsal.tumour is None:
-            return "No tumour, no plan for it: {plan_organ} plans for the kidney"
-        scene, margin_mm = self.rehearsal.scene, self.instruments.margin_mm
-        ground = Ground(scene, self.anatomy, self.rehearsal.probe, target, margin_mm, scene.trocar)
+        target = settings.plan_for if self.rehearsal.tumour is not None else "organ"
+        scene, probe = self.rehearsal.scene, self.rehearsal.probe
+        ground = Ground(scene, self.anatomy, probe, target, float(settings.margin_mm), scene.trocar)
         self._planning = Planning(ground, next_free(self.out))
-        return f"Planning for the {target}"
+        return f"Planning for {NAMED[target]}"
 
     def _ended(self) -> str:
         planning = self._planning
@@ -118,5 +126,5 @@ class Plans:
         if planning.plan is None:
             return planning.fault
         guide = Guide(self.rehearsal, planning.plan)
-        self.instruments.guide = guide
+        self.instruments.follow(guide)
         return guide.said()
