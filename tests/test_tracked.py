@@ -215,6 +215,10 @@ def test_time_goes_on_through_ways_back():
     for _ in range(4):
         step(live, reset=True)
     assert np.array_equal(played.pose(), pose_at(way(), 10 * STEP_S))
+    # 0.57 - 0.07 is less than a half by rounding.
+    half = PlayedPoses(TimedPoses(np.array([0.07, 0.57]), [placed(0.0), placed(1.0)]), Session(Patient()))
+    half.session.moment = 4
+    assert half.poses.length_s < 0.5 and np.array_equal(half.pose(), placed(1.0))
     session.moment = 16
     assert played.pose() is not None
     session.moment = 17
