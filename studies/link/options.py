@@ -37,7 +37,7 @@ def opened_link(link: bool, host: str | None, port: int | None) -> "Server | Non
     host, port = host or HOST, port or PORT
     try:
         server = Server(host, port, click.echo)
-    except (OSError, UnicodeError) as error:
+    except (OSError, TypeError) as error:  # TypeError: a text that no name of a machine can be
         reason = getattr(error, "strerror", None) or "no name of a machine"
         raise Fault(
             f"--link: {host} port {port} cannot be opened ({reason}); end the program that has it, or choose another --link-host or "

@@ -53,7 +53,7 @@ MOST_CANDIDATES = 4
 @click.option(
     "--trials",
     type=click.IntRange(MOST_CANDIDATES, 100_000),
-    default=160,
+    default=96,
     show_default=True,
     help="Scans that the search may make.",
 )
@@ -89,7 +89,10 @@ def plan(
         click.echo("No trocar is given: every way in counts as free.")
     aim: Target = target or ("organ" if anatomy.tumour is None else "margin")
     ground = Ground(loaded, anatomy, held, aim, margin_mm, port)
-    with workers(ground, jobs) as crew, tqdm(total=trials + MOST_CANDIDATES, desc="plan", unit="scan") as bar:
+    with (
+        workers(ground, jobs) as crew,
+        tqdm(total=trials + 2 * MOST_CANDIDATES, desc="plan", unit="scan") as bar,
+    ):
         made = make_plan(ground, crew, speed_mm_s, trials, bar.update)
         bar.update(bar.total - bar.n)
     write_plan(made, out)

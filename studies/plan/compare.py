@@ -11,8 +11,8 @@ from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
 from studies.plan.baselines import UNPLANNED, planned, random_ways
 from studies.plan.make import make_plan
+from studies.plan.parts import Parts
 from studies.plan.score import score
-from studies.plan.trial import Parts
 from studies.plan.workers import Gone, Ground, workers
 from studies.setup import PRESETS, probe_of, scene_of
 from ultrasound.coverage import Target
@@ -25,7 +25,7 @@ PLANNED_ON, JUDGED_ON = "balanced", "accurate"
 
 def count_of(trials: int, candidates: int) -> int:
     """How often ``compare`` says that something is done."""
-    return trials + candidates + 1 + len(UNPLANNED) + len(SEEDS)
+    return trials + 2 * candidates + 1 + len(UNPLANNED) + len(SEEDS)
 
 
 def compare(

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from scenes.anatomy import fingerprint
+from studies.plan.evolution import SEED, Search
 from studies.plan.file import Plan, PlanError, Sweep
 from studies.plan.score import in_words, points, score, why
-from studies.plan.search import SEED, Search, ranked, search
+from studies.plan.search import ranked, search
 from studies.plan.workers import Gone, Ground, Workers
 
 DIGITS = 6

@@ -1,15 +1,15 @@
 """One figure out of what a way was worth, and in words why one is better than another."""
 
-from studies.plan.trial import Parts
+from studies.plan.parts import Parts
 
 # Points for each part: the whole target seen is 100, and what it costs is taken off.
 POINTS = {
     "seen": 100.0,
-    "compression_mean_mm": -3.0,
+    "compression_mean_mm": -2.0,
     "over_limit": -50.0,
-    "contact": 10.0,
-    "incidence_deg": -0.2,
-    "path_mm": -0.03,
+    "contact": 5.0,
+    "incidence_deg": -0.1,
+    "path_mm": -0.01,
 }
 # A way that cannot be gone is worth less than any that can.
 UNREACHABLE = -300.0

@@ -21,7 +21,7 @@ CANDIDATES = 4
 @click.option(
     "--trials",
     type=click.IntRange(CANDIDATES, 100_000),
-    default=160,
+    default=96,
     show_default=True,
     help="Scans a search.",
 )

@@ -1,10 +1,10 @@
 """A way of the probe tried on the deforming organ, without a screen: what it sees of a target, and what that costs."""
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
+from studies.plan.parts import Parts, faces_of, incidence_deg
 from studies.plan.reach import Reach
 from studies.plan.way import Way
 from studies.rehearsal import Rehearsal
@@ -14,30 +14,9 @@ from ultrasound.plane import PlaneInTissue
 from ultrasound.probe import advanced, between
 
 # Between two passes the probe is lifted so far from the settled surface, and is at its place after so many steps at the latest.
-LIFT_MM, MOST_STEPS = 10.0, 240
+LIFT_MM, MOST_STEPS = 6.0, 240
 # A turn by so many degrees takes as long as a way of one millimetre.
 DEG_A_MM = 1.5
-
-
-@dataclass(frozen=True)
-class Parts:
-    """What a way was worth. Means are over its poses; a way that touches nothing has none."""
-
-    seen: float
-    """Share of the target that was in the picture, 0 to 1."""
-    compression_mean_mm: float
-    compression_max_mm: float
-    over_limit: float
-    """Share of poses at which the tissue is squeezed by more than the scene's warning, or had to be put right."""
-    contact: float
-    """Share of the picture's lines that touch."""
-    incidence_deg: float
-    """Angle between the probe's axis and the settled surface's normal."""
-    path_mm: float
-    """Of the face's middle, between passes too."""
-    time_s: float
-    reachable: float
-    """Share of poses that the trocar lets an instrument hold."""
 
 
 class Trial:
@@ -99,7 +78,7 @@ class Trial:
         self._steps_taken += 1
 
     def _face(self, pose: np.ndarray) -> np.ndarray:
-        return pose[:3, 3] - self.rehearsal.size_mm[2] / 2 * pose[:3, 2]
+        return faces_of(self.rehearsal.hand, pose[None])[0]
 
     def _steps(self, start: np.ndarray, end: np.ndarray) -> int:
         cosine = (np.einsum("ij,ij->", start[:3, :3], end[:3, :3]) - 1) / 2
@@ -126,7 +105,7 @@ class Trial:
 
     def _parts(self, way: Way) -> Parts:
         if not self._squeezed:
-            return Parts(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+            return Parts.nothing()
         squeezed, limit = np.array(self._squeezed), self.rehearsal.scene.transducer.compression_warning_mm
         return Parts(
             seen=self.coverage.share(self.target),
@@ -134,12 +113,8 @@ class Trial:
             compression_max_mm=float(squeezed.max()),
             over_limit=float(((squeezed > limit) | self._troubled).mean()),
             contact=float(np.mean(self._touching)),
-            incidence_deg=float(np.mean([self._incidence_deg(pose) for pose in way.poses])),
+            incidence_deg=incidence_deg(self.rehearsal.hand, way.poses),
             path_mm=self._way_mm,
             time_s=self._steps_taken * self.rehearsal.settings.time_step_s,
             reachable=float(self.reach(way.poses).mean()),
         )
-
-    def _incidence_deg(self, pose: np.ndarray) -> float:
-        cosine = self.rehearsal.hand.outward(self._face(pose)) @ pose[:3, 2]
-        return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))

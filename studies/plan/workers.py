@@ -15,9 +15,12 @@ from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.scene import Scene
 from scenes.trocar import Trocar
 from studies.plan.candidate import Candidate, candidates_of
+from studies.plan.evolution import foreseen
 from studies.plan.file import PlanError
+from studies.plan.forecast import Forecast
+from studies.plan.parts import Parts
 from studies.plan.reach import Reach
-from studies.plan.trial import Parts, Trial
+from studies.plan.trial import Trial
 from studies.plan.way import Way
 from studies.rehearsal import Rehearsal
 from ultrasound.array import Probe
@@ -73,6 +76,10 @@ class Workers:
         """What there is to search. Raises PlanError."""
         return next(self._all([delayed(_start)(self._key, self.ground)]))
 
+    def foresee(self, candidates: Sequence[Candidate]) -> Iterator[np.ndarray]:
+        """Where the search of each is to begin, shares (n,) of its ranges."""
+        return self._all([delayed(_foreseen)(self._key, self.ground, each) for each in candidates])
+
     def go(self, tasks: Sequence[Task]) -> Iterator[Gone]:
         """In the order of the tasks, as they are done."""
         return self._all([delayed(_go)(self._key, self.ground, *task) for task in tasks])
@@ -119,6 +126,13 @@ def _start(key: str, ground: Ground) -> Start:
     passes = dict(time_step_s=step.time_step_s, substeps=step.substeps, iterations=step.iterations)
     model = rehearsal.scene.tissue.model_dump(mode="json") | passes | rehearsal.model.counts()
     return Start(candidates_of(rehearsal, trial.coverage, trial.target, trial.reach), model)
+
+
+def _foreseen(key: str, ground: Ground, candidate: Candidate) -> np.ndarray:
+    trial = _trial(key, ground, 1.0)
+    trial.rehearsal.reset()
+    forecast = Forecast(trial.rehearsal, trial.coverage, trial.target, trial.reach)
+    return foreseen(candidate, lambda values: forecast.parts(candidate.way(forecast.hand, values)))
 
 
 def _go(key: str, ground: Ground, candidate: Candidate, values: dict[str, float], speed_mm_s: float) -> Gone:

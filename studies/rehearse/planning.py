@@ -15,7 +15,7 @@ from studies.rehearse.guide import Guide
 from studies.rehearse.instruments import Instruments
 from ultrasound.coverage import Target
 
-TRIALS, SPEED_MM_S = 160, 10.0
+TRIALS, SPEED_MM_S = 96, 10.0
 NAMED: dict[Target, str] = {
     "margin": "the tumour and its margin",
     "tumour": "the tumour",
