@@ -149,8 +149,8 @@ def _glide(side: str, count: int, layout: Layout, half: np.ndarray, width: float
 def _rock(side: str, count: int, layout: Layout, half: np.ndarray, width: float) -> Candidate:
     own = {
         "ahead_mm": Quantity(-half[1], half[1], 0.0),
-        "first_deg": Quantity(-70.0, 0.0, -35.0),
-        "last_deg": Quantity(0.0, 70.0, 35.0),
+        "first_deg": Quantity(-45.0, 0.0, -30.0),
+        "last_deg": Quantity(0.0, 45.0, 30.0),
     }
     name = f"rocking in {'one place' if count == 1 else f'{count} places'} {side}"
     return Candidate(name, "rock", count, layout, _about(half) | own | _apart(count, width))

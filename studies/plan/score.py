@@ -8,7 +8,7 @@ POINTS = {
     "compression_mean_mm": -2.0,
     "over_limit": -50.0,
     "contact": 5.0,
-    "incidence_deg": -0.1,
+    "incidence_deg": -0.2,
     "path_mm": -0.01,
 }
 # A way that cannot be gone is worth less than any that can.
