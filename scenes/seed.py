@@ -162,9 +162,10 @@ def _grown_back(core: np.ndarray, body: np.ndarray, radius: int) -> np.ndarray:
     voxels = np.pad(core, rim)
     part = tuple(slice(a.start - rim, a.stop + rim) for a in cast(Box, box_of(voxels))[::-1])
     dilated = sitk.BinaryDilate(sitk.GetImageFromArray(voxels[part]), [radius] * 3)
-    opened = dilated & sitk.GetImageFromArray(np.pad(body, rim)[part])
-    closed = sitk.BinaryFillhole(sitk.BinaryMorphologicalClosing(opened, [CLOSING] * 3))
-    voxels[part] = sitk.GetArrayViewFromImage(closed)
+    region = dilated & sitk.GetImageFromArray(np.pad(body, rim)[part])
+    if _ml(sitk.GetArrayViewFromImage(region)) <= VOLUME_ML[1]:  # else it leaks, and more so when closed
+        region = sitk.BinaryFillhole(sitk.BinaryMorphologicalClosing(region, [CLOSING] * 3))
+    voxels[part] = sitk.GetArrayViewFromImage(region)
     return voxels[(slice(rim, -rim),) * 3] > 0
 
 

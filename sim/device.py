@@ -4,16 +4,20 @@ import contextlib
 import functools
 import io
 import os
+import textwrap
+from types import SimpleNamespace
 
 # Before Taichi is imported: no banner, and no look on the network for newer versions.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "False")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 
 import taichi as ti
-from taichi.lang import kernel_impl
+from taichi.lang import impl, kernel_impl, snode
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 FEW_CORES = 4
+# Taichi drops compiled kernels from 100 MB on. A rehearsal leaves 4 MB for each patient and each choice of settings.
+CACHE_BYTES = 1 << 30
 
 
 def _place(context: ASTTransformerContext, node) -> str:
@@ -22,11 +26,16 @@ def _place(context: ASTTransformerContext, node) -> str:
     return f'File "{context.file}", line {node.lineno + context.lineno_offset}, in {context.func.func.__name__}:\n{line}\n'
 
 
-# To build a kernel Taichi reads the source of a function at each call of it, and draws each expression's place with a
-# caret, whether there is an error or not: together nearly half of the time.
+# To build a kernel Taichi reads the source of a function at each call of it and wraps each of its lines, draws each
+# expression's place with a caret, and writes the whole stack down for each field, whether there is an error or not:
+# together more than half of the time.
 ASTTransformerContext.get_pos_info = _place
 kernel_impl.getsourcelines = functools.cache(kernel_impl.getsourcelines)
 kernel_impl.getsourcefile = functools.cache(kernel_impl.getsourcefile)
+kernel_impl.textwrap = SimpleNamespace(
+    fill=functools.cache(textwrap.fill), dedent=functools.cache(textwrap.dedent)
+)
+impl.get_traceback = snode.get_traceback = lambda stacklevel=1: ""
 
 
 class NoDevice(RuntimeError):
@@ -47,6 +56,7 @@ def start(arch: str = "cpu", **options) -> str:
     if arch != "vulkan":
         # LLVM does it again: kernels run as fast, and large ones compile in a tenth of the time.
         options = {"advanced_optimization": False, **options}
+    options = {"offline_cache_max_size_of_files": CACHE_BYTES, **options}
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(arch=backends[arch], log_level=ti.ERROR, **options)
     return arch

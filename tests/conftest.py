@@ -13,6 +13,11 @@ DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 ROOT = Path(__file__).resolve().parents[1]
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest first: no worker is left with it when the others have ended."""
+    items.sort(key=lambda item: item.path.stem != "test_window")
+
+
 @pytest.fixture
 def device():
     """Taichi on the CPU, with nothing left of an earlier test."""

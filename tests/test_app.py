@@ -66,10 +66,11 @@ def refused(*arguments) -> str:
 
 @pytest.fixture(scope="module")
 def pressed(tmp_path_factory) -> Path:
-    """The folder of a short headless press of the embedded patient."""
+    """The folder of a short press of the embedded patient, with what was said: no command, no display, no choice of picture."""
     out = tmp_path_factory.mktemp("press")
-    done = run("rehearse", "--headless", *SHORT, "--out", out)
+    done = run(*SHORT, "--out", out)
     assert done.returncode == 0, done.stderr
+    (out / "said.txt").write_text(done.stdout)
     return out
 
 
@@ -105,15 +106,15 @@ def test_it_leaves_pictures_in_which_the_press_is_seen(pressed):
         assert animation.n_frames == len(slices)
 
 
-def test_without_a_display_it_runs_headless_by_itself_and_says_so(tmp_path):
-    done = run(*SHORT, "--picture", "ct", "--out", tmp_path)
-    assert done.returncode == 0 and "No display" in done.stdout
-    assert (tmp_path / "report.json").is_file()
+def test_without_a_display_it_runs_headless_by_itself_and_says_so(pressed):
+    assert "No display" in (pressed / "said.txt").read_text()
+    assert len(list((pressed / "frames").glob("*.png"))) == len(list((pressed / "slices").glob("*.png")))
 
 
 def test_without_vulkan_it_says_so_in_one_line_and_still_writes_slices_and_report(tmp_path):
     nowhere = "/nonexistent"
     done = run(
+        "rehearse",
         "--headless",
         *SHORT,
         "--picture",
@@ -124,6 +125,7 @@ def test_without_vulkan_it_says_so_in_one_line_and_still_writes_slices_and_repor
         VK_DRIVER_FILES=nowhere,
     )
     assert done.returncode == 0, done.stderr
+    assert "No display" not in done.stdout
     assert sum("no Vulkan driver" in line for line in done.stdout.splitlines()) == 1
     assert (tmp_path / "report.json").is_file() and list((tmp_path / "slices").glob("*.png"))
     assert not list((tmp_path / "frames").glob("*.png"))

@@ -86,6 +86,13 @@ class TestSynthetic:
         assert dice(placed(labels, VoxelGrid.of(ct)), truth) > 1 - ONE_VOXEL
         assert labels.segments == {1: DRAFT} and labels.segments[1].tissue == "kidney"
 
+    def test_sinus_that_opens_to_the_outside_is_filled(self):
+        sinus = CENTRE, np.array([8.0, 8.0, 12.0])
+        hilum = CENTRE + [-20.0, 0.0, 0.0], np.array([20.0, 3.0, 3.0])
+        ct = scanned([(150.0, KIDNEY), (FAT_HU, sinus), (FAT_HU, hilum)])
+        found = placed(grown(Volume.of(ct), CENTRE + [12.0, -6.0, -30.0]), VoxelGrid.of(ct))
+        assert found[level(points_of(ct), sinus) < 0].all()
+
     @pytest.mark.parametrize("direction", ["RAS", "oblique"])
     def test_lies_where_the_kidney_is(self, direction):
         ct = scanned([(150.0, KIDNEY)], direction=direction)

@@ -18,6 +18,8 @@ pytestmark = pytest.mark.skipif(
     not (shutil.which("Xvfb") and shutil.which("xdotool")), reason="needs Xvfb and xdotool"
 )
 START_S, REST_S = 120, 90
+# How long a picture is waited for before its key is pressed again, and how far apart two pictures are at least.
+ASK_S, APART_S = 2.0, 1.0
 # The slice and what is drawn of organ and transducer, and how much two pictures of a still one differ at most.
 PANEL, SCENE = np.s_[80:640, 860:1240], np.s_[60:570, 20:780]
 STILL = 0.5
@@ -30,7 +32,6 @@ class Screen:
 
     def __init__(self, display: str, out: Path) -> None:
         self.out = out
-        self.shots = 0
         self.environment = os.environ | {"DISPLAY": display}
         self.environment.pop("WAYLAND_DISPLAY", None)
         keys = out / "keys.toml"
@@ -93,16 +94,23 @@ class Screen:
 
     def picture(self) -> np.ndarray:
         """What the window shows, saved by its own screenshot key."""
-        self.shots += 1
-        path = self.out / f"screenshot-{self.shots:03d}.png"
+        before = len(self._screenshots())
         end = time.monotonic() + 20
-        while not path.exists() and time.monotonic() < end:
+        while time.monotonic() < end:
             self.do("key", "--window", self.window, "p")
-            time.sleep(1.0)
-        self.shots = len(list(self.out.glob("screenshot-*.png")))
-        last = self.out / f"screenshot-{self.shots:03d}.png"
-        time.sleep(0.5)
-        return np.asarray(Image.open(last).convert("RGB")).astype(int)
+            asked = time.monotonic()
+            while time.monotonic() < asked + ASK_S:
+                time.sleep(0.1)
+                if len(self._screenshots()) > before:
+                    # Not sooner: what moves slowly is not to be taken for still.
+                    time.sleep(max(0.0, asked + APART_S - time.monotonic()))
+                    return np.asarray(Image.open(self._screenshots()[-1]).convert("RGB")).astype(int)
+        pytest.fail("the screenshot key leaves no picture")
+
+    def _screenshots(self) -> list[Path]:
+        """Those that are written to their end."""
+        paths = sorted(self.out.glob("screenshot-*.png"))
+        return [path for path in paths if path.read_bytes()[-8:-4] == b"IEND"]
 
 
 @pytest.fixture

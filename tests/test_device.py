@@ -1,0 +1,43 @@
+"""What Taichi is started with, and what it still says of a kernel that is wrong."""
+
+import pytest
+import taichi as ti
+
+import sim.device
+from sim.device import start
+
+
+def test_compiled_kernels_of_many_patients_are_kept(device):
+    assert ti.cfg.offline_cache and ti.cfg.offline_cache_max_size_of_files == sim.device.CACHE_BYTES
+    start("cpu", offline_cache_max_size_of_files=7)
+    assert ti.cfg.offline_cache_max_size_of_files == 7
+
+
+def test_a_field_is_made_without_the_stack_being_written_down(device, monkeypatch):
+    def written(*_):
+        raise AssertionError("the stack was written down")
+
+    monkeypatch.setattr("traceback.format_list", written)
+    ti.field(int, 3).fill(1)
+    ti.Vector.field(3, float, 3).fill(1)
+
+
+def test_an_error_in_a_kernel_names_file_line_and_function(device):
+    @ti.func
+    def inner(value):
+        return value + not_defined_anywhere  # noqa: F821
+
+    @ti.kernel
+    def outer() -> int:
+        total = 0
+
+        total += inner(1)
+        return total
+
+    for _ in range(2):
+        with pytest.raises(ti.TaichiCompilationError, match="not_defined_anywhere") as error:
+            outer()
+        told = str(error.value)
+        line = inner.func.func.__code__.co_firstlineno + 2
+        assert f'"{__file__}", line {line}, in inner:' in told and "return value + not_defined" in told
+        assert f"line {outer._primal.func.__code__.co_firstlineno + 4}, in outer:" in told
