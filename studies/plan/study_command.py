@@ -9,7 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy
-from scenes.scene import EMBEDDED, load_scene
+from scenes.scene import EMBEDDED, load_scene, with_options
 from studies.commands import make_folder
 
 CANDIDATES = 4
@@ -25,13 +25,16 @@ CANDIDATES = 4
     show_default=True,
     help="Scans a search.",
 )
+@click.option("--probe", default="drop-in", show_default=True, help="Probe, by its name or as a file.")
 @click.option("--jobs", type=click.IntRange(1, 256), help="Processes [as many as there are processors].")
-def plan_study(scenes: tuple[Path, ...], out: Path, trials: int, jobs: int | None) -> None:
+def plan_study(scenes: tuple[Path, ...], out: Path, trials: int, probe: str, jobs: int | None) -> None:
     """Planned against straight and random sweeps over the tumour and 5 mm around it, of SCENES [the embedded patient].
 
     A kidney without a tumour is given one.
     """
     make_folder(out)
+    if Path(probe).is_file():
+        probe = str(Path(probe).resolve())
     from studies.plan.compare import compare, count_of
     from studies.plan.virtual_tumour import with_tumour
 
@@ -40,7 +43,7 @@ def plan_study(scenes: tuple[Path, ...], out: Path, trials: int, jobs: int | Non
     with tqdm(total=len(patients) * count_of(trials, CANDIDATES), desc="plan", unit="scan") as bar:
         for number, each in enumerate(patients, 1):
             path = each / "scene.toml" if each.is_dir() else each
-            scene = load_scene(path)
+            scene = with_options(load_scene(path), {"transducer.probe": probe})
             anatomy = with_tumour(load_anatomy(scene, path.parent), np.array(scene.gravity.direction))
             run = compare(scene, anatomy, trials, jobs, bar.update)
             runs.append(dict(patient=scene.title or f"patient {number}") | run)
