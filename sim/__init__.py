@@ -1,0 +1,5 @@
+import os
+
+# Before Taichi is imported, by whichever module: no banner, and no look on the network for newer versions.
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "False")
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")

@@ -7,10 +7,6 @@ import os
 import textwrap
 from types import SimpleNamespace
 
-# Before Taichi is imported: no banner, and no look on the network for newer versions.
-os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "False")
-os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
-
 import taichi as ti
 from taichi.lang import impl, kernel_impl, snode
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext

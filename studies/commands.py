@@ -204,7 +204,6 @@ def calibrate(
     radii_mm = numbers(radii, "--radii", 0.5, 20)
     loaded = [load_case(case) for case in cases]
     make_folder(out)
-    import sim.device  # noqa: F401  before all that imports Taichi, which it keeps quiet
     from studies import calibration, workers
 
     try:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from joblib import Parallel, cpu_count, delayed, parallel_config
 
-import sim.device  # before all that imports Taichi, which it keeps quiet
+import sim.device
 from sim.body import RestBody
 from studies.accuracy import bead_errors
 from studies.case import Case

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from joblib import Parallel, cpu_count, delayed, parallel_config
 
-import sim.device  # before all that imports Taichi, which it keeps quiet
+import sim.device
 from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.scene import Scene
 from scenes.trocar import Trocar

@@ -55,7 +55,6 @@ def _figures(given: dict[str, list[Case]], jobs: int) -> Iterator[list[dict[str,
 
 
 def _run(model: str, cases: list[Case]) -> list[dict[str, Any]]:
-    import sim.device  # noqa: F401  before all that imports Taichi, which it keeps quiet
     from studies.stability.measure import run
 
     return [run(model, case) for case in cases]
