@@ -2,7 +2,7 @@
 
 from render.viewer import KEY_MAP, Controls
 from ultrasound.array import MODES, RUNGS
-from ultrasound.coverage import TARGETS
+from ultrasound.target import TARGETS
 
 PUSH_MM_S, ROLL_DEG_S, TILT_DEG_S = 15.0, 45.0, 30.0
 # While held: what of the controls changes, and how much in a second.

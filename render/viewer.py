@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ultrasound.array import Mode, Rung
-from ultrasound.coverage import Target
+from ultrasound.target import Target
 
 ECHO, TGC = "Echo", "Gain over depth"
 # Groups of settings that stand beside the picture, as on a scanner.

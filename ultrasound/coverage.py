@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
-from typing import Literal, get_args
 
 import numpy as np
 import trimesh
@@ -16,9 +15,6 @@ from scipy.ndimage import distance_transform_edt, label, map_coordinates
 from sim.distance import distance_grid, signed_distance
 from ultrasound.array import Probe
 
-# What of a patient there may be to see: the tumour with a margin, the tumour, the organ.
-Target = Literal["margin", "tumour", "organ"]
-TARGETS: tuple[Target, ...] = get_args(Target)
 VOXEL_MM = 1.5
 # Distances from the organ are known so far around it.
 REACH_MM = 6.0

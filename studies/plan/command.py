@@ -12,7 +12,7 @@ from scenes.trocar import Trocar
 from studies.commands import Fault, make_folder
 from studies.plan.file import write_plan
 from studies.setup import probe_of
-from ultrasound.coverage import TARGETS, Target
+from ultrasound.target import TARGETS, Target
 
 # Candidates are no more than these.
 MOST_CANDIDATES = 4

@@ -15,7 +15,7 @@ from studies.plan.parts import Parts
 from studies.plan.score import score
 from studies.plan.workers import Gone, Ground, workers
 from studies.setup import PRESETS, probe_of, scene_of
-from ultrasound.coverage import Target
+from ultrasound.target import Target
 
 TARGET: Target = "margin"
 MARGIN_MM, SPEED_MM_S = 5.0, 10.0

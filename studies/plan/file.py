@@ -9,12 +9,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from scenes.trocar import Trocar
-from ultrasound.coverage import Target
+from ultrasound.target import Target
 
 MOST_POSES = 20_000
 NAME = re.compile(r"plan-([0-9]{3,9})\.json")
 # How far the axes of a pose may be from orthonormal: what six digits in a file leave.
 RIGID = 1e-3
+# What a plan begins with.
+MARK = b'"nephron_plan"'
 
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
 Pose = Annotated[list[Row], Field(min_length=4, max_length=4)]
@@ -78,6 +80,14 @@ def next_free(folder: Path) -> Path:
     """The place of the next plan in a folder."""
     taken = [int(found[1]) for path in folder.glob("plan-*.json") if (found := NAME.fullmatch(path.name))]
     return folder / f"plan-{1 + max(taken, default=0):03d}.json"
+
+
+def is_plan(path: Path) -> bool:
+    """Whether a file says of itself that it is a plan."""
+    try:
+        return MARK in path.read_bytes()[:100]
+    except OSError:
+        return False
 
 
 def read_plan(path: Path) -> Plan:

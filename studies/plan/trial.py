@@ -6,6 +6,7 @@ import numpy as np
 
 from studies.plan.parts import Parts, faces_of, incidence_deg
 from studies.plan.reach import Reach
+from studies.plan.track import DEG_A_MM, LIFT_MM
 from studies.plan.way import Way
 from studies.rehearsal import Rehearsal
 from ultrasound.coverage import PLACES, Coverage
@@ -13,10 +14,8 @@ from ultrasound.face import pressing
 from ultrasound.plane import PlaneInTissue
 from ultrasound.probe import advanced, between
 
-# Between two passes the probe is lifted so far from the settled surface, and is at its place after so many steps at the latest.
-LIFT_MM, MOST_STEPS = 6.0, 240
-# A turn by so many degrees takes as long as a way of one millimetre.
-DEG_A_MM = 1.5
+# Between two passes the probe is over its next place after so many steps at the latest.
+MOST_STEPS = 240
 
 
 class Trial:

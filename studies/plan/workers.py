@@ -24,13 +24,14 @@ from studies.plan.trial import Trial
 from studies.plan.way import Way
 from studies.rehearsal import Rehearsal
 from ultrasound.array import Probe
-from ultrasound.coverage import VOXEL_MM, Coverage, Target
+from ultrasound.coverage import VOXEL_MM, Coverage
 from ultrasound.probe import image_plane
+from ultrasound.target import Target
 
 
 @dataclass(frozen=True)
 class Ground:
-    """What a plan is made for. ``target`` is one of ``ultrasound.coverage.TARGETS``."""
+    """What a plan is made for. ``target`` is one of ``ultrasound.target.TARGETS``."""
 
     scene: Scene
     anatomy: LoadedAnatomy

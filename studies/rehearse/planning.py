@@ -13,7 +13,7 @@ from studies.plan.workers import Ground, workers
 from studies.rehearsal import Rehearsal
 from studies.rehearse.guide import Guide
 from studies.rehearse.instruments import Instruments
-from ultrasound.coverage import Target
+from ultrasound.target import Target
 
 TRIALS, SPEED_MM_S = 96, 10.0
 NAMED: dict[Target, str] = {

@@ -5,6 +5,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from studies.plan.file import is_plan, read_plan
+from studies.plan.track import timed_poses
 from studies.scan.poses import PoseError, TimedPoses, check_rigid, load_timed_poses
 from ultrasound.sweep import TRANSFORM_NAME, SweepError
 from ultrasound.sweep_file import read_sweep
@@ -15,15 +17,18 @@ FAR_MM = 50.0
 
 
 def load_track(path: Path, name: str | None = None) -> TimedPoses:
-    """The way of a probe in the patient, of a tracked sweep (.igs.mha) or a file of poses with times.
+    """The way of a probe in the patient, of a tracked sweep (.igs.mha), the first sweep of a plan, or a file of poses with times.
 
     ``name`` is the sweep's transform that takes the probe to the patient, ProbeToReference where it is None. Raises PoseError,
-    SweepError.
+    SweepError, PlanError.
     """
     if path.suffix.lower() == ".mha":
         return _of_sweep(path, name or PROBE_IN_PATIENT)
     if name is not None:
         raise PoseError(f"--track-from {name}: {path.name} is no sweep (.igs.mha), whose transforms it names")
+    if is_plan(path):
+        plan = read_plan(path)
+        return timed_poses(plan.sweeps[0], plan.speed_mm_s)
     return load_timed_poses(path)
 
 
