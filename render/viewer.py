@@ -103,6 +103,7 @@ class Settings:
     depth_mm: int = _slider(60, "Depth", "mm", 5, 300, "Picture")
     window_hu: int = _slider(350, "W", "HU", 1, 2000, "Picture")
     level_hu: int = _slider(40, "L", "HU", -500, 500, "Picture")
+    margin_mm: int = _slider(5, "Margin", "mm", 0, 20, "Picture")
     gain_percent: int = _slider(50, "Gain", "%", 0, 100, ECHO)
     dyn_range_db: int = _slider(60, "DR", "dB", 20, 120, ECHO)
     frequency_mhz: float = _slider(7.5, "", "MHz", 2.0, 15.0, ECHO)
@@ -121,7 +122,6 @@ class Settings:
     show_parts: bool = _switch(True, "Vessels")
     show_support: bool = _switch(True, "Support")
     outline: bool = _switch(False, "Outline")
-    margin_mm: int = _slider(5, "Margin", "mm", 0, 20, "View")
     show_scanner: bool = False
     show_seen: bool = False
     mode: Mode = "both"

@@ -1,19 +1,22 @@
 """A plan followed by hand: where the probe is to go next, and how well it went there."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from render.viewer import Guidance
 from studies.freehand.unsqueeze import shifted
 from studies.plan.file import Plan
+from studies.plan.parts import faces_of
 from studies.rehearsal import Rehearsal
-from ultrasound.probe import held_at
+from ultrasound.probe import advanced, held_at, indentation
 
-# Nearer than this a pose counts as gone through; a turn by so many degrees is as far as one millimetre.
+# Nearer to the sweep than this it is followed; a turn by so many degrees is as far as one millimetre.
 NEAR_MM, DEG_A_MM = 6.0, 3.0
-# So many poses are looked ahead for the one that the probe is at.
+# So many poses on from where the probe was it may be now.
 AHEAD = 6
+# So far above the organ the way is drawn.
+ABOVE_MM = 1.5
 
 
 @dataclass
@@ -23,28 +26,36 @@ class Guide:
     rehearsal: Rehearsal
     plan: Plan
     number: int = 0
-    _off: list[tuple[float, float]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.begin_anew()
 
     def begin_anew(self) -> None:
         """Nothing of the sweep was gone yet."""
-        self.at, self._off = 0, []
+        # Which pose the probe was at last, and how near each that it was at came: (mm, degrees).
+        self.at = -1
+        self._off: dict[int, tuple[float, float]] = {}
         shown = self.number < len(self.plan.sweeps)
         length, origin = self.rehearsal.size_mm[2], self.rehearsal.origin
-        self._passes = [
+        passes = [
             np.stack([held_at(shifted(pose, -origin), length) for pose in each])
             for each in (self.plan.sweeps[self.number].poses() if shown else [])
         ]
-        self._poses = np.concatenate(self._passes) if shown else np.zeros((0, 4, 4))
-        faces = [each[:, :3, 3] - length / 2 * each[:, :3, 2] for each in self._passes]
-        segments = [np.stack([each[:-1], each[1:]], axis=1) for each in faces]
+        self._poses = np.concatenate(passes) if shown else np.zeros((0, 4, 4))
+        self._faces = faces_of(self.rehearsal.hand, self._poses)
+        drawn = [np.stack([self._above(pose) for pose in each]) for each in passes]
+        segments = [np.stack([each[:-1], each[1:]], axis=1) for each in drawn]
         # The pose at the end of each segment, by its place in the whole sweep.
-        starts = np.cumsum([0] + [len(each) for each in self._passes])
-        ends = [start + np.arange(1, len(each)) for start, each in zip(starts, faces, strict=False)]
+        starts = np.cumsum([0] + [len(each) for each in drawn])
+        ends = [start + np.arange(1, len(each)) for start, each in zip(starts, drawn, strict=False)]
         self._segments = np.concatenate(segments) if segments else np.zeros((0, 2, 3))
         self._ends = np.concatenate(ends) if ends else np.zeros(0, int)
+
+    def _above(self, pose: np.ndarray) -> np.ndarray:
+        """The face's middle (3,) as far outside as the settled organ reaches there."""
+        hand = self.rehearsal.hand
+        depth = indentation(pose, hand.size_mm, hand.samples, hand.radius_mm)
+        return faces_of(hand, advanced(pose, -max(depth, 0.0) - ABOVE_MM)[None])[0]
 
     def next_sweep(self) -> str:
         """Show the plan's next sweep, after the last none; what there is to say."""
@@ -61,35 +72,29 @@ class Guide:
 
     def watch(self, pose: np.ndarray) -> None:
         """Where the transducer is now (4, 4)."""
-        ahead = self._poses[self.at : self.at + AHEAD]
-        if len(ahead) == 0:
+        first = max(self.at, 0)
+        window = slice(first, first + AHEAD + 1)
+        if len(self._poses) == 0:
             return
-        off = self._distance(pose, ahead)
-        nearest = int(np.argmin(off[:, 0] + off[:, 1] / DEG_A_MM))
-        if off[nearest, 0] + off[nearest, 1] / DEG_A_MM <= NEAR_MM:
-            self._off.append((float(off[nearest, 0]), float(off[nearest, 1])))
-            self.at += nearest + 1
-
-    def _distance(self, pose: np.ndarray, others: np.ndarray) -> np.ndarray:
-        """How far a pose is from others (n, 4, 4): of the face's middle [mm], and of the turn [degrees]; (n, 2)."""
-        length = self.rehearsal.size_mm[2]
-        face = pose[:3, 3] - length / 2 * pose[:3, 2]
-        faces = others[:, :3, 3] - length / 2 * others[:, :3, 2]
-        cosine = (np.einsum("nij,ij->n", others[:, :3, :3], pose[:3, :3]) - 1) / 2
-        return np.column_stack(
-            [np.linalg.norm(faces - face, axis=1), np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))]
-        )
+        off_mm = np.linalg.norm(self._faces[window] - faces_of(self.rehearsal.hand, pose[None]), axis=1)
+        cosine = (np.einsum("nij,ij->n", self._poses[window, :3, :3], pose[:3, :3]) - 1) / 2
+        off_deg = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        nearest = int(np.argmin(off_mm + off_deg / DEG_A_MM))
+        off = float(off_mm[nearest]), float(off_deg[nearest])
+        if off[0] + off[1] / DEG_A_MM <= NEAR_MM:
+            self.at = first + nearest
+            self._off[self.at] = min(off, self._off.get(self.at, off))
 
     @property
     def followed(self) -> float:
         """Share of the sweep that is behind, 0 to 1."""
-        return self.at / len(self._poses) if len(self._poses) else 0.0
+        return (self.at + 1) / len(self._poses) if len(self._poses) else 0.0
 
     def figures(self) -> dict[str, float]:
         """For the record; nothing where no sweep is shown."""
         if len(self._poses) == 0:
             return {}
-        off = np.mean(self._off, axis=0) if self._off else np.zeros(2)
+        off = np.mean(list(self._off.values()), axis=0) if self._off else np.zeros(2)
         return dict(plan_followed=self.followed, plan_off_mm=float(off[0]), plan_off_deg=float(off[1]))
 
     def findings(self) -> dict[str, str]:
@@ -97,15 +102,15 @@ class Guide:
         figures = self.figures()
         if not figures:
             return {}
-        off = f"{figures['plan_off_mm']:.1f} mm, {figures['plan_off_deg']:.0f} deg" if self._off else ""
-        return {"plan": f"{100 * self.followed:.0f} %", "off the plan": off}
+        off = f"{figures['plan_off_mm']:.1f} mm {figures['plan_off_deg']:.0f} deg" if self._off else ""
+        return {"plan": f"{100 * self.followed:.0f} %", "off plan": off}
 
     def guidance(self) -> Guidance | None:
         """What is drawn of it."""
         if len(self._poses) == 0:
             return None
-        goal = self._poses[self.at] if self.at < len(self._poses) else None
-        return Guidance(goal, self._segments, self._ends < self.at)
+        goal = self._poses[self.at + 1] if self.at + 1 < len(self._poses) else None
+        return Guidance(goal, self._segments, self._ends <= self.at)
 
     def in_words(self, seen: float | None) -> str:
         """How it went, for the terminal; ``seen`` is the share of the target that was seen. Empty where no sweep is shown."""
