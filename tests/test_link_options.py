@@ -12,8 +12,8 @@ from studies.link.options import link_options, opened_link
 
 @click.command()
 @link_options
-def linking(link: bool, link_host: str | None, link_port: int | None) -> None:
-    server = opened_link(link, link_host, link_port)
+def linking(link: bool, link_host: str | None, link_leads: bool, link_port: int | None) -> None:
+    server = opened_link(link, link_host, link_port, link_leads)
     if server is not None:
         joined(server).close()
         click.echo(f"on {server.server_address[0]}")
@@ -40,6 +40,8 @@ def test_a_link_that_cannot_be_is_refused_in_words(server):
     for option, value in (("--link-host", "127.0.0.1"), ("--link-port", "18944")):
         done = CliRunner().invoke(linking, [option, value])
         assert done.exit_code == 1 and f"{option}: " in done.output and "add --link" in done.output
+    done = CliRunner().invoke(linking, ["--link-leads"])
+    assert done.exit_code == 1 and "--link-leads: " in done.output and "add --link" in done.output
     taken = CliRunner().invoke(linking, ["--link", "--link-port", str(server.port)])
     assert taken.exit_code == 1 and f"port {server.port} cannot be opened" in taken.output
     for host in ("no such machine", "203.0.113.7", "ä" * 70):

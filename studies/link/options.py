@@ -14,23 +14,32 @@ HOST, PORT = "127.0.0.1", 18944
 OPTIONS = (
     click.option("--link", is_flag=True, help="Send the live picture and the probe's pose over OpenIGTLink."),
     click.option("--link-host", help=f"With --link: the address of this machine to be reached at [{HOST}]."),
+    click.option(
+        "--link-leads",
+        is_flag=True,
+        help="With --link: the probe goes where a client says that it is, by the transform HandToReference.",
+    ),
     click.option("--link-port", type=click.IntRange(1, 65535), help=f"With --link: its port [{PORT}]."),
 )
 
 
 def link_options(command: Callable) -> Callable:
-    """Give a command --link, --link-host and --link-port."""
+    """Give a command --link, --link-host, --link-leads and --link-port."""
     for option in reversed(OPTIONS):
         command = option(command)
     return command
 
 
-def opened_link(link: bool, host: str | None, port: int | None) -> "Server | None":
+def opened_link(link: bool, host: str | None, port: int | None, leads: bool = False) -> "Server | None":
     """The server that the options ask for, which closes when the command ends. Raises Fault."""
     if not link:
-        for option, value in {"--link-host": host, "--link-port": port}.items():
+        for option, value in {
+            "--link-host": host,
+            "--link-port": port,
+            "--link-leads": leads or None,
+        }.items():
             if value is not None:
-                raise Fault(f"{option}: says where --link is to be reached; add --link, or leave it out")
+                raise Fault(f"{option}: is about the link, which is off; add --link, or leave it out")
         return None
     from studies.link.server import Server
 

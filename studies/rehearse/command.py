@@ -5,25 +5,29 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import click
-from pydantic import ValidationError
 
 from render.keys import Keys, keys_text, load_keys
 from scenes.anatomy import LoadedAnatomy, fingerprint, load_anatomy
 from scenes.scene import EMBEDDED, OPTIONS, TISSUES, Scene, load_scene, with_options
 from studies.commands import Fault, arch_option, make_folder, start_taichi
 from studies.link.options import link_options, opened_link
-from studies.plan.file import Plan, PlanError, read_plan
+from studies.plan.file import read_plan
+from studies.rehearse.checks import (
+    as_recorded,
+    check_anatomy,
+    check_plan,
+    recorded_probe,
+    refuse_headless,
+    refuse_inputs,
+    refuse_sizes,
+    session_of,
+)
 from studies.rehearse.track_file import PROBE_IN_PATIENT, check_near, load_track
-from studies.session.file import Log, SessionError, read_log
-from studies.session.scene import scene_of_log
 from studies.setup import Setup, probe_of, scene_of
-from ultrasound.array import MODES, RUNGS, Probe, explained
+from ultrasound.array import MODES, RUNGS, Probe
 
 if TYPE_CHECKING:
     from studies.rehearsal import Rehearsal
-
-# What a budget leaves to the user.
-MATERIAL = ("tissue.model", "tissue.young_kpa", "tissue.poisson")
 
 
 @click.command()
@@ -109,6 +113,7 @@ def rehearse(
     link: bool,
     link_host: str | None,
     link_port: int | None,
+    link_leads: bool,
     **changes: float | str | None,
 ) -> None:
     """Press the kidney of SCENE, a scene file or a patient's folder, and see what the transducer sees."""
@@ -120,7 +125,8 @@ def rehearse(
         changed["transducer.probe"] = str(Path(str(changed["transducer.probe"])).resolve())
     before = load_scene(path)
     keys = load_keys(keys_file) if keys_file is not None else Keys()
-    refuse_inputs(track_file, track_from, replay, gamepad and headless)
+    refuse_inputs(track_file, track_from, replay, link_leads)
+    refuse_headless(headless, gamepad, link_leads)
     track = load_track(track_file, track_from) if track_file is not None else None
     plan = read_plan(plan_file) if plan_file is not None else None
     log = session_of(replay, at, changed, budget_ms, error_mm)
@@ -138,7 +144,7 @@ def rehearse(
     budgeted = budget_ms is not None or error_mm is not None
     if budgeted:
         refuse_sizes(changed)
-    server = opened_link(link, link_host, link_port)
+    server = opened_link(link, link_host, link_port, link_leads)
     used = start_taichi(arch)
     from render.window import display_available
     from studies.rehearsal import Rehearsal
@@ -166,6 +172,7 @@ def rehearse(
         keys=keys,
         gamepad=gamepad,
         link=server,
+        tracked=server.hand if server is not None and link_leads else None,
         plan=plan,
     )
     if headless:
@@ -178,87 +185,6 @@ def rehearse(
 def keys_command() -> None:
     """Print which key does what, as a file to be changed and given to rehearse --keys."""
     click.echo(keys_text(), nl=False)
-
-
-def refuse_inputs(
-    track: Path | None, track_from: str | None, replay: Path | None, gamepad_without_window: bool
-) -> None:
-    """Raises Fault where what is to lead the transducer does not go together."""
-    if track is None and track_from is not None:
-        raise Fault("--track-from: says what of a tracked sweep is the probe; name its file with --track")
-    if track is not None and replay is not None:
-        raise Fault("--track: a replay goes the recorded way; leave out --track or --replay")
-    if gamepad_without_window:
-        raise Fault("--gamepad: leads in a window; leave out --gamepad or --headless")
-
-
-def session_of(
-    replay: Path | None,
-    at_s: float,
-    changed: dict[str, float | str | None],
-    budget_ms: float | None,
-    error_mm: float | None,
-) -> Log | None:
-    """The session to be replayed, where one is. Raises Fault, where other options would make another of it, SessionError."""
-    if replay is None:
-        if at_s > 0:
-            raise Fault("--at: says where to open a session; name its file with --replay")
-        return None
-    given: dict[str, Any] = {"--budget-ms": budget_ms, "--error-mm": error_mm}
-    given |= {option: changed[key] for key, option in OPTIONS.items()}
-    for option, value in given.items():
-        if value is not None:
-            raise Fault(f"{option}: a replay computes what was recorded; leave it out")
-    return read_log(replay)
-
-
-def as_recorded(log: Log, scene: Scene) -> Scene:
-    """A scene's patient with all else as a session has it. Raises SessionError."""
-    try:
-        return scene_of_log(log.header, scene)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(map(str, first["loc"]))
-        raise SessionError(f"the session's scene cannot be used: {where}: {first['msg'].lower()}") from None
-
-
-def recorded_probe(log: Log) -> Probe:
-    """The probe of a session. Raises SessionError."""
-    try:
-        return Probe.model_validate(log.header.probe)
-    except ValidationError as error:
-        raise SessionError(f"the session's probe cannot be used: {explained(error)}") from None
-
-
-def check_anatomy(log: Log, anatomy: LoadedAnatomy, title: str) -> None:
-    """Raises SessionError where a session is of another patient than an anatomy."""
-    if fingerprint(anatomy) != log.header.anatomy:
-        raise SessionError(
-            f"the session is of other anatomy than this scene's ({title or 'no title'}): name "
-            "its scene or patient's folder before --replay; a patient imported anew is another one"
-        )
-
-
-def check_plan(plan: Plan, anatomy: str, probe: Probe) -> None:
-    """Raises PlanError where a plan is for other anatomy than that of a fingerprint, or for another probe."""
-    if plan.anatomy != anatomy:
-        raise PlanError(
-            "the plan is of other anatomy than this scene's: name its scene or patient's folder before --plan; "
-            "a patient imported anew is another one"
-        )
-    planned = plan.probe.get("TransducerName"), plan.probe.get("HousingMm")
-    if planned != (probe.transducer_name, list(probe.housing_mm)):
-        raise PlanError(
-            f"the plan is for the probe {planned[0]!r}, found {probe.transducer_name!r}: choose it with --probe, or plan anew"
-        )
-
-
-def refuse_sizes(changed: dict[str, float | str | None]) -> None:
-    """Raises Fault where the command line gives both a budget and what the budget is to choose."""
-    for key, value in changed.items():
-        chosen = key.startswith(("tissue.", "solver.")) and key not in MATERIAL
-        if value is not None and chosen:
-            raise Fault(f"{OPTIONS[key]}: --budget-ms and --error-mm choose this; leave one of them out")
 
 
 def build_within(

@@ -1,0 +1,108 @@
+"""What of a command line does not go together, or not with this patient."""
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from scenes.anatomy import LoadedAnatomy, fingerprint
+from scenes.scene import OPTIONS, Scene
+from studies.commands import Fault
+from studies.plan.file import Plan, PlanError
+from studies.session.file import Log, SessionError, read_log
+from studies.session.scene import scene_of_log
+from ultrasound.array import Probe, explained
+
+# What a budget leaves to the user.
+MATERIAL = ("tissue.model", "tissue.young_kpa", "tissue.poisson")
+
+
+def refuse_inputs(
+    track: Path | None,
+    track_from: str | None,
+    replay: Path | None,
+    link_leads: bool,
+) -> None:
+    """Raises Fault where what is to lead the transducer does not go together."""
+    if track is None and track_from is not None:
+        raise Fault("--track-from: says what of a tracked sweep is the probe; name its file with --track")
+    if track is not None and replay is not None:
+        raise Fault("--track: a replay goes the recorded way; leave out --track or --replay")
+    if link_leads and (track is not None or replay is not None):
+        raise Fault("--link-leads: a file leads already; leave it out, or --track and --replay")
+
+
+def refuse_headless(headless: bool, gamepad: bool, link_leads: bool) -> None:
+    """Raises Fault where what leads in a window alone is asked for without one."""
+    for option, given in {"--gamepad": gamepad, "--link-leads": link_leads}.items():
+        if headless and given:
+            raise Fault(f"{option}: leads in a window; leave out {option} or --headless")
+
+
+def session_of(
+    replay: Path | None,
+    at_s: float,
+    changed: dict[str, float | str | None],
+    budget_ms: float | None,
+    error_mm: float | None,
+) -> Log | None:
+    """The session to be replayed, where one is. Raises Fault, where other options would make another of it, SessionError."""
+    if replay is None:
+        if at_s > 0:
+            raise Fault("--at: says where to open a session; name its file with --replay")
+        return None
+    given: dict[str, Any] = {"--budget-ms": budget_ms, "--error-mm": error_mm}
+    given |= {option: changed[key] for key, option in OPTIONS.items()}
+    for option, value in given.items():
+        if value is not None:
+            raise Fault(f"{option}: a replay computes what was recorded; leave it out")
+    return read_log(replay)
+
+
+def as_recorded(log: Log, scene: Scene) -> Scene:
+    """A scene's patient with all else as a session has it. Raises SessionError."""
+    try:
+        return scene_of_log(log.header, scene)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        raise SessionError(f"the session's scene cannot be used: {where}: {first['msg'].lower()}") from None
+
+
+def recorded_probe(log: Log) -> Probe:
+    """The probe of a session. Raises SessionError."""
+    try:
+        return Probe.model_validate(log.header.probe)
+    except ValidationError as error:
+        raise SessionError(f"the session's probe cannot be used: {explained(error)}") from None
+
+
+def check_anatomy(log: Log, anatomy: LoadedAnatomy, title: str) -> None:
+    """Raises SessionError where a session is of another patient than an anatomy."""
+    if fingerprint(anatomy) != log.header.anatomy:
+        raise SessionError(
+            f"the session is of other anatomy than this scene's ({title or 'no title'}): name "
+            "its scene or patient's folder before --replay; a patient imported anew is another one"
+        )
+
+
+def check_plan(plan: Plan, anatomy: str, probe: Probe) -> None:
+    """Raises PlanError where a plan is for other anatomy than that of a fingerprint, or for another probe."""
+    if plan.anatomy != anatomy:
+        raise PlanError(
+            "the plan is of other anatomy than this scene's: name its scene or patient's folder before --plan; "
+            "a patient imported anew is another one"
+        )
+    planned = plan.probe.get("TransducerName"), plan.probe.get("HousingMm")
+    if planned != (probe.transducer_name, list(probe.housing_mm)):
+        raise PlanError(
+            f"the plan is for the probe {planned[0]!r}, found {probe.transducer_name!r}: choose it with --probe, or plan anew"
+        )
+
+
+def refuse_sizes(changed: dict[str, float | str | None]) -> None:
+    """Raises Fault where the command line gives both a budget and what the budget is to choose."""
+    for key, value in changed.items():
+        chosen = key.startswith(("tissue.", "solver.")) and key not in MATERIAL
+        if value is not None and chosen:
+            raise Fault(f"{OPTIONS[key]}: --budget-ms and --error-mm choose this; leave one of them out")
