@@ -71,7 +71,8 @@ class Workers:
 
     def __init__(self, ground: Ground) -> None:
         self.ground = ground.bare
-        self._key = fingerprint(self.ground.anatomy) + repr((ground.scene, ground.probe, ground.target))
+        made_of = ground.scene, ground.probe, ground.target, ground.margin_mm, ground.trocar
+        self._key = fingerprint(self.ground.anatomy) + repr(made_of)
 
     def start(self) -> Start:
         """What there is to search. Raises PlanError."""
