@@ -77,8 +77,8 @@ def test_a_held_action_goes_on_with_time(action, name, a_second):
 
 
 def test_what_is_said_names_the_users_keys(tmp_path, capsys):
-    keys = Keys(of=USUAL_KEYS | {"sweep": "Space"})
-    parts = [None] * 4
+    keys = Keys(of=USUAL_KEYS | {"sweep": "Space", "plan_for": "L"})
+    parts = [None] * 5
     loop = Loop(None, NullViewer(), tmp_path, None, *parts, keys=keys)
     loop._announce("sweep-001: {sweep} ends it")
     assert capsys.readouterr().out == "sweep-001: Space ends it\n"
@@ -98,13 +98,15 @@ def test_a_file_changes_behaviour_help_and_words(tmp_path):
     keys = load_keys(
         file_of(
             tmp_path,
-            '[keys]\npush = "i"\nexport = "w"\nfreeze = "space"\nhelp = "Return"\n[gamepad]\nundo = "guide"\nredo = "b"\n',
+            '[keys]\npush = "i"\nexport = "w"\nfreeze = "space"\nhelp = "Return"\nplan_for = "f"\nplan = "h"\n[gamepad]\nundo = "guide"\nredo = "b"\n',
         )
     )
-    assert [keys.action_of(key) for key in ("i", "w", " ", "f", "Return", "Escape")] == [
+    assert [keys.action_of(key) for key in ("i", "w", " ", "f", "h", "F1", "Return", "Escape")] == [
         "push",
         "export",
         "freeze",
+        "plan_for",
+        "plan",
         "",
         "help",
         "quit",

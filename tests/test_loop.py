@@ -90,9 +90,7 @@ def looping(monkeypatch, tmp_path, sent) -> Loop:
     moments = Moments()
     monkeypatch.setattr(loop, "take_view", moments.take_view)
     link = SimpleNamespace(show=sent.append)
-    return Loop(
-        moments, None, tmp_path, Recorded(0.0), moments, moments, moments, moments, frozen=False, link=link
-    )
+    return Loop(moments, None, tmp_path, Recorded(0.0), *[moments] * 5, frozen=False, link=link)
 
 
 def test_each_frame_goes_to_the_link_as_it_is_shown(looping, sent):
@@ -157,10 +155,11 @@ def test_without_a_window_pictures_go_to_the_link_and_the_tissue_into_the_folder
 def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path, sent):
     link, given = SimpleNamespace(show=sent.append), []
     viewer = SimpleNamespace(close=lambda: None, settings=Settings())
-    monkeypatch.setattr(run, "Instruments", lambda rehearsal: None)
-    monkeypatch.setattr(run, "open_viewer", lambda rehearsal, visible: viewer)
+    monkeypatch.setattr(run, "Instruments", lambda rehearsal, guide: None)
+    monkeypatch.setattr(run, "open_viewer", lambda rehearsal, **_: viewer)
     monkeypatch.setattr(run, "settings_of", lambda rehearsal: Settings())
-    monkeypatch.setattr(run, "Loop", lambda *_, link: given.append(link) or SimpleNamespace(run=lambda: None))
+    looping = SimpleNamespace(run=lambda: None)
+    monkeypatch.setattr(run, "Loop", lambda *_, keys, link: given.append(link) or looping)
     monkeypatch.setattr(run, "run_headless", lambda *arguments: given.append(arguments[-1]))
     monkeypatch.setattr(run, "Session", lambda rehearsal: None)
     for name in ("_live", "_record", "_end"):
@@ -183,7 +182,7 @@ def test_the_command_opens_the_link_for_as_long_as_it_runs(monkeypatch, tmp_path
 
     monkeypatch.setattr(command, "start_taichi", lambda arch: "cpu")
     monkeypatch.setattr(studies.rehearsal, "Rehearsal", lambda *_: None)
-    monkeypatch.setattr(run, "Instruments", lambda rehearsal: None)
+    monkeypatch.setattr(run, "Instruments", lambda rehearsal, guide: None)
     monkeypatch.setattr(run.Run, "headless", headless_run)
     line = [
         "rehearse",

@@ -76,7 +76,8 @@ def candidates_of(rehearsal: Rehearsal, coverage: Coverage, target: str, reach: 
         count = passes_needed(half[0], rehearsal.probe)
         found.append(_glide(side, count, layout, half, width))
         if side == list(outwards)[-1]:
-            found.append(_glide(side, min(count + 1, MOST_PASSES), layout, half, width))
+            if count < MOST_PASSES:
+                found.append(_glide(side, count + 1, layout, half, width))
             found.append(_rock(side, count, layout, half, width))
     return found
 

@@ -1,5 +1,6 @@
 """The command ``plan``: where to move the probe so that a target is seen, with little pressing and through a trocar."""
 
+import math
 from pathlib import Path
 
 import click
@@ -10,12 +11,19 @@ from scenes.anatomy import load_anatomy
 from scenes.scene import EMBEDDED, load_scene, with_options
 from scenes.trocar import Trocar
 from studies.commands import Fault, make_folder
-from studies.plan.file import write_plan
+from studies.plan.file import FASTEST_MM_S, MOST_MARGIN_MM, SLOWEST_MM_S, write_plan
 from studies.setup import probe_of
 from ultrasound.target import TARGETS, Target
 
 # Candidates are no more than these.
 MOST_CANDIDATES = 4
+
+
+def refuse_nan(context: click.Context, option: click.Parameter, value: float) -> float:
+    """Raises BadParameter for what a range of click's lets through."""
+    if math.isnan(value):
+        raise click.BadParameter("nan is no number", context, option)
+    return value
 
 
 @click.command()
@@ -28,7 +36,8 @@ MOST_CANDIDATES = 4
 )
 @click.option(
     "--margin-mm",
-    type=click.FloatRange(0, 30),
+    type=click.FloatRange(0, MOST_MARGIN_MM),
+    callback=refuse_nan,
     default=5.0,
     show_default=True,
     help="How much around the tumour is to be seen.",
@@ -45,7 +54,8 @@ MOST_CANDIDATES = 4
 @click.option("--probe", help="Probe, by its name or as a file [the scene's].")
 @click.option(
     "--speed-mm-s",
-    type=click.FloatRange(1, 100),
+    type=click.FloatRange(SLOWEST_MM_S, FASTEST_MM_S),
+    callback=refuse_nan,
     default=10.0,
     show_default=True,
     help="How fast the sweep will be gone.",

@@ -11,7 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from scenes.trocar import Trocar
 from ultrasound.target import Target
 
-MOST_POSES = 20_000
+MOST_POSES, MOST_MARGIN_MM = 20_000, 30.0
+SLOWEST_MM_S, FASTEST_MM_S = 1.0, 100.0
 NAME = re.compile(r"plan-([0-9]{3,9})\.json")
 # How far the axes of a pose may be from orthonormal: what six digits in a file leave.
 RIGID = 1e-3
@@ -39,15 +40,25 @@ class Sweep(_Part):
     points: dict[str, float]
     values: dict[str, float]
     trials: int
-    passes: list[Annotated[list[Pose], Field(min_length=1, max_length=MOST_POSES)]] = Field(min_length=1)
+    passes: list[Annotated[list[Pose], Field(min_length=2, max_length=MOST_POSES)]] = Field(min_length=1)
+
+    @field_validator("parts")
+    @classmethod
+    def _say_what_is_seen(cls, parts: dict[str, float]) -> dict[str, float]:
+        if "seen" not in parts:
+            raise ValueError("seen is missing: expected the share of the target that the sweep shows")
+        return parts
 
     @field_validator("passes")
     @classmethod
     def _are_rigid(cls, passes: list[list[Pose]]) -> list[list[Pose]]:
-        axes = np.array([pose for each in passes for pose in each])[:, :3, :3]
+        poses = np.array([pose for each in passes for pose in each])
+        axes = poses[:, :3, :3]
         off = np.abs(np.swapaxes(axes, 1, 2) @ axes - np.eye(3)).max()
-        if off > RIGID or (np.linalg.det(axes) < 0).any():
-            raise ValueError("a pose is not rigid: expected three right-handed unit axes at right angles")
+        if off > RIGID or (np.linalg.det(axes) < 0).any() or (poses[:, 3] != [0, 0, 0, 1]).any():
+            raise ValueError(
+                "a pose is not rigid: expected three right-handed unit axes at right angles, and 0 0 0 1 below"
+            )
         return passes
 
     def poses(self) -> list[np.ndarray]:
@@ -61,8 +72,8 @@ class Plan(_Part):
     nephron_plan: Literal[1] = 1
     anatomy: str
     target: Target
-    margin_mm: float
-    speed_mm_s: float = Field(gt=0)
+    margin_mm: float = Field(ge=0, le=MOST_MARGIN_MM)
+    speed_mm_s: float = Field(ge=SLOWEST_MM_S, le=FASTEST_MM_S)
     probe: dict[str, Any]
     trocar: Trocar
     model: dict[str, float | int | str]

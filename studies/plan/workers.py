@@ -4,6 +4,7 @@ A process computes on one CPU thread, so that several do not fight for the same 
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -67,7 +68,7 @@ Task = tuple[Candidate, dict[str, float], float]
 
 
 class Workers:
-    """Processes that try ways on one ground."""
+    """Processes that try ways on one ground. All that they do may raise PlanError."""
 
     def __init__(self, ground: Ground) -> None:
         self.ground = ground.bare
@@ -91,7 +92,12 @@ class Workers:
         return self._all([delayed(_go_way)(self._key, self.ground, way, speed_mm_s) for way in ways])
 
     def _all(self, calls: list) -> Iterator:
-        return Parallel(batch_size=1, return_as="generator")(calls)
+        try:
+            yield from Parallel(batch_size=1, return_as="generator")(calls)
+        except BrokenProcessPool:
+            raise PlanError(
+                "a process of the search was ended, perhaps for want of memory; close other programs, or give fewer --jobs"
+            ) from None
 
 
 @contextmanager
@@ -115,6 +121,10 @@ def _trial(key: str, ground: Ground, speed_mm_s: float) -> Trial:
         sim.device.start("cpu", cpu_max_num_threads=1)
         rehearsal = Rehearsal(ground.scene, ground.anatomy, ground.probe)
         coverage = Coverage(rehearsal.organ, rehearsal.tumour, ground.margin_mm)
+        if not coverage.targets[ground.target].any():
+            raise PlanError(
+                f"--target {ground.target}: it is smaller than a voxel of {VOXEL_MM:g} mm; expected a larger one"
+            )
         middle = coverage.low_mm + VOXEL_MM * np.argwhere(coverage.targets[ground.target]).mean(axis=0)
         reach = Reach(ground.trocar, rehearsal.hand, rehearsal.origin, middle)
         _built[key] = Trial(rehearsal, coverage, ground.target, reach, speed_mm_s)

@@ -1,0 +1,97 @@
+"""A ball under a probe, plans over it, and what stands for the processes that try them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import trimesh
+
+from scenes.trocar import Trocar
+from studies.plan.file import Plan, Sweep
+from studies.plan.parts import Parts
+from studies.plan.way import Layout, layout_towards
+from ultrasound.array import load_probe
+from ultrasound.probe import Hand, image_plane, pose_at
+
+R = 30.0
+SIZE = np.array([16.0, 9.0, 20.0])
+ORIGIN = np.array([100.0, -200.0, 300.0])
+X, Y, Z = np.eye(3)
+# The ball's facets lie up to 2.2^2 / (8 R) = 0.02 mm inside it, and its patches' normals half a degree beside its radii.
+FACET_MM, NORMAL_DEG = 0.03, 0.5
+GOOD = Parts(
+    seen=0.9,
+    compression_mean_mm=1.0,
+    compression_max_mm=2.0,
+    over_limit=0.0,
+    contact=0.8,
+    incidence_deg=10.0,
+    path_mm=60.0,
+    time_s=6.0,
+    reachable=1.0,
+)
+
+
+def hand_on(mesh: trimesh.Trimesh, size_mm: np.ndarray = SIZE) -> Hand:
+    """A hand over a settled surface, straight above its origin."""
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces, np.int64)
+    return Hand(vertices, faces, np.array(mesh.vertex_normals), size_mm, pose_at(R * Z, -Z, X, size_mm[2]), X)
+
+
+def big_ball() -> trimesh.Trimesh:
+    return trimesh.creation.icosphere(subdivisions=4, radius=R)
+
+
+def from_above() -> Layout:
+    return layout_towards(np.zeros(3), Z, X)
+
+
+def faces_in(poses: np.ndarray, length_mm: float = SIZE[2]) -> np.ndarray:
+    """The middles (n, 3) of the face, by matrices."""
+    return (poses @ [0.0, 0.0, -length_mm / 2, 1.0])[:, :3]
+
+
+def straight_pass(count: int, aside_mm: float = 0.0, step_mm: float = 1.0) -> np.ndarray:
+    """Poses (n, 4, 4) that look down from the plane z = 0 and go on along y."""
+    places = np.column_stack([np.full(count, aside_mm), step_mm * np.arange(count), np.zeros(count)])
+    return np.stack([pose_at(place, -Z, X, SIZE[2]) for place in places])
+
+
+def in_patient(poses: np.ndarray) -> list:
+    """A pass as a plan has it: PLUS's axes, LPS."""
+    placed = np.stack([image_plane(pose, SIZE[2], 1.0, 1.0).world_from_plane for pose in poses])
+    placed[:, :3, 3] += ORIGIN
+    return placed.tolist()
+
+
+def sweep_of(*passes: np.ndarray, name: str = "two passes", seen: float = 0.75) -> Sweep:
+    parts = dict(vars(GOOD), seen=seen)
+    return Sweep(
+        name=name,
+        score=50.0,
+        parts=parts,
+        points=dict(seen=75.0),
+        values=dict(depth_mm=1.5),
+        trials=8,
+        passes=[in_patient(each) for each in passes],
+    )
+
+
+def plan_of(*sweeps: Sweep, **changes) -> Plan:
+    values = dict(
+        anatomy="a" * 16,
+        target="margin",
+        margin_mm=5.0,
+        speed_mm_s=10.0,
+        probe=load_probe("linear").model_dump(by_alias=True, mode="json"),
+        trocar=Trocar(),
+        model=dict(cell_mm=8.0, model="neo-hookean"),
+        seed=1,
+        why=["two passes: sees most"],
+        sweeps=list(sweeps) or [sweep_of(straight_pass(4))],
+    )
+    return Plan(**(values | changes))
+
+
+def over_ball() -> SimpleNamespace:
+    """What a guide and a plan's poses ask of a rehearsal."""
+    return SimpleNamespace(size_mm=SIZE, origin=ORIGIN, settings=SimpleNamespace(time_step_s=0.05))
