@@ -22,14 +22,14 @@ class GuideLines:
         self._edges = edges
         self._goal = ti.Vector.field(3, ti.f32, len(edges))
         self._way, self._colours = (ti.Vector.field(3, ti.f32, 2 * MOST_SEGMENTS) for _ in range(2))
-        self._shown: tuple[int, int] = (0, 0)
+        self._shown = np.zeros((0, 2, 3)), 0
 
     def draw(self, scene, guidance: Guidance) -> None:
         """Hand the lines to a scene."""
-        key = id(guidance.way_mm), int(guidance.gone.sum())
-        if key != self._shown:
+        way, gone = guidance.way_mm, int(guidance.gone.sum())
+        if self._shown[0] is not way or self._shown[1] != gone:
             self._fill(guidance)
-            self._shown = key
+            self._shown = way, gone
         scene.lines(self._way, WIDTH, per_vertex_color=self._colours)
         if guidance.goal is not None:
             self._goal.from_numpy(solids.placed(self._edges, guidance.goal).astype(np.float32))

@@ -56,8 +56,8 @@ class Planning:
 
     def _run(self) -> None:
         try:
-            # One processor is left to the rehearsal.
-            with workers(self._ground, max(1, cpu_count() - 1)) as crew:
+            # One processor is left to the rehearsal. A single process would be this one, which has the window's Taichi.
+            with workers(self._ground, max(2, cpu_count() - 1)) as crew:
                 plan = make_plan(self._ground, crew, SPEED_MM_S, self._trials, self._count)
             write_plan(plan, self._path)
             self.plan = plan

@@ -1,0 +1,261 @@
+"""A plan followed: the guide, its lines, the keys, and what the instruments make of it."""
+
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import taichi as ti
+import trimesh
+from conftest import rotation_about
+from plan_ball import SIZE, Z, over_ball, plan_of, straight_pass, sweep_of
+
+from render import guide_lines, solids
+from render.actions import begin
+from render.guide_lines import GONE, TO_GO, GuideLines
+from render.keys import Keys
+from render.viewer import Controls, Guidance, Settings, View
+from studies.readings import Reading
+from studies.rehearse import instruments
+from studies.rehearse.guide import AHEAD, NEAR_MM, Guide
+from studies.rehearse.instruments import Instruments
+from ultrasound.array import load_probe
+from ultrasound.target import TARGETS
+
+FIRST, SECOND = straight_pass(4, step_mm=2.0), straight_pass(3, 20.0, 2.0)
+
+
+def guide_of(*sweeps) -> Guide:
+    return Guide(over_ball(), plan_of(*(sweeps or [sweep_of(FIRST, SECOND)])))
+
+
+def turned(pose: np.ndarray, degrees: float) -> np.ndarray:
+    """About the face's middle."""
+    turn, face = np.eye(4), np.eye(4)
+    turn[:3, :3], face[2, 3] = rotation_about([1, 1, 0], degrees), -SIZE[2] / 2
+    return pose @ face @ turn @ np.linalg.inv(face)
+
+
+# Followed
+
+
+def test_a_plan_followed_exactly_is_followed_wholly_with_nothing_off():
+    guide = guide_of()
+    for number, pose in enumerate([*FIRST, *SECOND]):
+        assert guide.guidance().goal == pytest.approx(pose)
+        assert guide.followed == pytest.approx(number / 7)
+        guide.watch(pose)
+    assert guide.figures() == pytest.approx(dict(plan_followed=1.0, plan_off_mm=0.0, plan_off_deg=0.0))
+    assert guide.guidance().goal is None and guide.guidance().gone.all()
+    assert guide.findings() == {"plan": "100 %", "off the plan": "0.0 mm, 0 deg"}
+    assert guide.in_words(0.5) == (
+        "plan      two passes: 100 % of it followed, 0.0 mm and 0 degrees beside it; margin seen 50 % (planned 75 %)"
+    )
+    guide.watch(SECOND[-1])
+    assert guide.followed == 1.0
+
+
+def test_how_far_beside_it_went_is_the_faces_middles_way_and_the_turn():
+    guide = guide_of()
+    for number, pose in enumerate([*FIRST, *SECOND]):
+        beside = turned(pose, 9.0 if number % 2 else 3.0)
+        beside[:3, 3] += [0.6, 0.0, -0.8]
+        guide.watch(beside)
+    figures = guide.figures()
+    assert figures["plan_followed"] == 1.0 and figures["plan_off_mm"] == pytest.approx(1.0)
+    assert figures["plan_off_deg"] == pytest.approx((4 * 3 + 3 * 9) / 7)
+
+
+def test_the_way_that_is_drawn_is_each_pass_and_not_between_them():
+    guide = guide_of()
+    places = [[0.0, 2 * n, 0.0] for n in range(4)], [[20.0, 2 * n, 0.0] for n in range(3)]
+    segments = [[a, b] for each in places for a, b in pairwise(each)]
+    assert guide.guidance().way_mm == pytest.approx(np.array(segments))
+    gone = []
+    for pose in [*FIRST, *SECOND]:
+        guide.watch(pose)
+        gone.append(guide.guidance().gone.sum())
+    assert gone == [0, 1, 2, 3, 3, 4, 5]
+
+
+def test_poses_may_be_skipped_but_not_too_many_and_none_is_gone_back_to():
+    long = straight_pass(30, step_mm=5.0)
+    guide = guide_of(sweep_of(long))
+    guide.watch(long[3])
+    assert guide.at == 4 and guide.guidance().goal == pytest.approx(long[4])
+    guide.watch(long[0])
+    guide.watch(long[4 + AHEAD + 1])
+    assert guide.at == 4
+    guide.watch(long[4 + AHEAD - 1])
+    assert guide.at == 4 + AHEAD
+
+
+@pytest.mark.parametrize(
+    ("mm", "degrees", "near"),
+    [(5.9, 0, True), (6.1, 0, False), (0, 17.9, True), (0, 18.1, False), (3.1, 9, False)],
+)
+def test_what_is_near_is_a_way_and_a_turn_together(mm, degrees, near):
+    assert NEAR_MM == 6.0
+    guide = guide_of(sweep_of(straight_pass(2, step_mm=50.0)))
+    beside = turned(straight_pass(1)[0], degrees)
+    beside[0, 3] += mm
+    guide.watch(beside)
+    assert (guide.at == 1) == near
+
+
+def test_the_sweeps_are_shown_in_turn_and_then_none():
+    guide = guide_of(sweep_of(FIRST), sweep_of(SECOND, name="rocking in one place", seen=0.6))
+    assert guide.said() == "Plan 1: two passes, sees 75 %"
+    guide.watch(FIRST[0])
+    assert guide.next_sweep() == "Plan 2: rocking in one place, sees 60 %"
+    assert guide.at == 0 and guide.guidance().goal == pytest.approx(SECOND[0])
+    assert guide.next_sweep() == "Plan hidden"
+    guide.watch(FIRST[0])
+    assert guide.guidance() is None and guide.figures() == {} == guide.findings()
+    assert guide.in_words(0.5) == "" and guide.followed == 0.0
+    assert guide.next_sweep() == "Plan 1: two passes, sees 75 %" and len(guide.guidance().way_mm) == 3
+
+
+def test_a_way_begun_anew_is_forgotten():
+    guide = guide_of()
+    assert guide.findings() == {"plan": "0 %", "off the plan": ""}
+    assert guide.in_words(None) == "plan      two passes: 0 % of it followed"
+    guide.watch(FIRST[0])
+    guide.begin_anew()
+    assert guide.at == 0 and guide.figures()["plan_followed"] == 0 and not guide.guidance().gone.any()
+    assert guide.findings()["off the plan"] == ""
+
+
+# Its lines
+
+
+class Drawn:
+    """A scene that keeps what it is given."""
+
+    def __init__(self) -> None:
+        self.given: list[tuple[np.ndarray, dict]] = []
+
+    def lines(self, points, width, **colours) -> None:
+        colours = {
+            name: getattr(each, "to_numpy", lambda each=each: each)() for name, each in colours.items()
+        }
+        self.given.append((points.to_numpy().astype(float), colours))
+
+
+EDGES = solids.edges(SIZE, 0.0)
+
+
+def drawn(lines: GuideLines, guidance: Guidance) -> tuple[np.ndarray, np.ndarray, list]:
+    """Segments (n, 2, 3) that have a length, their colours (n, 3), and what else was drawn."""
+    scene = Drawn()
+    lines.draw(scene, guidance)
+    (points, colours), *more = scene.given
+    segments, each = points.reshape(-1, 2, 3), colours["per_vertex_color"].reshape(-1, 2, 3)
+    long = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1) > 0
+    assert np.array_equal(each[:, 0], each[:, 1])
+    return segments[long], each[long, 0], more
+
+
+def test_the_lines_are_the_way_and_what_is_behind_has_another_colour(device):
+    guide, lines = guide_of(), GuideLines(EDGES)
+    for pose in [None, *FIRST[:3]]:
+        if pose is not None:
+            guide.watch(pose)
+        guidance = guide.guidance()
+        segments, colours, (goal,) = drawn(lines, guidance)
+        assert segments == pytest.approx(guidance.way_mm)
+        assert np.array_equal(colours, np.where(guidance.gone[:, None], GONE, TO_GO))
+        assert goal[0] == pytest.approx(solids.placed(EDGES, guidance.goal), abs=1e-5)
+    for pose in [FIRST[3], *SECOND]:
+        guide.watch(pose)
+    _, colours, more = drawn(lines, guide.guidance())
+    assert (colours == GONE).all() and more == []
+
+
+def test_of_two_sweeps_shown_one_after_the_other_each_has_its_own_lines(device):
+    """Arrays that are freed leave their identity to others."""
+    lines, goal = GuideLines(EDGES), np.eye(4)
+    for number in range(20):
+        way = np.array([[[number, 0.0, 0.0], [number, 1.0, 0.0]]])
+        segments, _, _ = drawn(lines, Guidance(goal, way, np.zeros(1, bool)))
+        assert segments == pytest.approx(way)
+        del way
+
+
+def test_of_a_longer_way_than_there_are_lines_every_second_segment_is_drawn(device, monkeypatch):
+    monkeypatch.setattr(guide_lines, "MOST_SEGMENTS", 10)
+    way = np.arange(15 * 6, dtype=float).reshape(15, 2, 3)
+    gone = np.arange(15) < 7
+    segments, colours, _ = drawn(GuideLines(EDGES), Guidance(None, way, gone))
+    assert segments == pytest.approx(way[::2])
+    assert np.array_equal(colours, np.where(gone[::2, None], GONE, TO_GO))
+
+
+# Keys
+
+
+def test_the_keys_are_those_that_the_window_hears():
+    keys = Keys()
+    heard = {ti.ui.SPACE: "plan_for", ti.ui.RETURN: "plan", ti.ui.BACKSPACE: "next_plan"}
+    assert {key: keys.action_of(key) for key in heard} == heard
+    controls, targets = Controls(Settings()), []
+    begin("plan", controls)
+    assert controls.plan and not controls.next_plan
+    begin("next_plan", controls)
+    assert controls.next_plan
+    for _ in TARGETS:
+        begin("plan_for", controls)
+        targets.append(controls.settings.plan_for)
+    assert targets == [*TARGETS[1:], TARGETS[0]] and Settings().plan_for == TARGETS[0]
+
+
+# In the instruments
+
+
+@pytest.fixture
+def rehearsal() -> SimpleNamespace:
+    organ = trimesh.creation.icosphere(subdivisions=3, radius=25.0)
+    tumour = trimesh.creation.icosphere(subdivisions=3, radius=6.0).apply_translation(12 * Z)
+    image = SimpleNamespace(contact_gap_mm=None)
+    scene = SimpleNamespace(image=image, transducer=SimpleNamespace(compression_warning_mm=8.0))
+    plane = SimpleNamespace(rest_grid=lambda count: np.full((count, count, 3), 500.0, np.float32))
+    return SimpleNamespace(
+        **vars(over_ball()) | dict(organ=organ, tumour=tumour, scene=scene, probe=load_probe("linear")),
+        scanner=SimpleNamespace(plane=plane),
+        pose=FIRST[0],
+    )
+
+
+@pytest.fixture
+def watching(monkeypatch, rehearsal) -> Instruments:
+    monkeypatch.setattr(instruments, "read", lambda *_: Reading(1.0, 20.0))
+    return Instruments(rehearsal, Guide(rehearsal, plan_of(sweep_of(FIRST, SECOND), margin_mm=8.0)))
+
+
+def test_the_instruments_watch_the_guide_and_record_it(watching, rehearsal):
+    noted: list[dict] = []
+    session = SimpleNamespace(moment=0, note=lambda name, figures: noted.append(figures))
+    for pose in FIRST:
+        rehearsal.pose = pose
+        watching.watch(session, rehearsal.probe, pose)
+        session.moment += 5
+    assert [round(each["plan_followed"], 3) for each in noted] == [round(n / 7, 3) for n in (1, 2, 3, 4)]
+    assert all(each["plan_off_mm"] == 0 and "seen_margin" in each for each in noted)
+    view = watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings())
+    assert view.guidance.goal == pytest.approx(SECOND[0]) and view.findings["plan"] == "57 %"
+    watching.begin_anew()
+    assert watching.guide.at == 0
+    watching.guide = None
+    assert watching.onto(view, Settings()).guidance is None and "plan_followed" not in watching.figures()
+
+
+def test_another_plan_brings_its_margin_and_what_was_seen_stays(watching, rehearsal):
+    volume = watching.coverage.targets["margin"].sum()
+    watching.coverage.seen[watching.coverage.targets["tumour"]] = True
+    before = watching.coverage
+    watching.follow(Guide(rehearsal, plan_of(margin_mm=8.0)))
+    assert watching.coverage is before
+    watching.follow(Guide(rehearsal, plan_of(margin_mm=2.0)))
+    assert watching.margin_mm == 2.0 and watching.coverage.targets["margin"].sum() < volume / 2
+    assert watching.coverage.share("tumour") == 1.0 and watching.guide.plan.margin_mm == 2.0
+    assert Instruments(rehearsal).margin_mm == instruments.MARGIN_MM
