@@ -131,8 +131,3 @@ class SdlPads:
             held,
             tuple(BUTTONS[number] for number in down if number < len(BUTTONS)),
         )
-
-    def close(self) -> None:
-        """Give the gamepad back."""
-        self._controller.quit()
-        self._pygame.display.quit()

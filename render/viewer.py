@@ -60,7 +60,7 @@ KEY_MAP = (
     Key("Space", "plan_for", "what a plan is for: the tumour and its margin, the tumour, the whole kidney"),
     Key("Return", "plan", "plan a sweep that shows it"),
     Key("Backspace", "next_plan", "the plan's next sweep, after the last none"),
-    Key("K", "take_over", "lead the transducer from here on, in a replay"),
+    Key("K", "take_over", "lead the transducer from here on, where a replay or a tracked probe does"),
     Key("N", "show_seen", "what has been in the picture, in green"),
     Key("R", "reset", "reset tissue, transducer and view"),
     Key("P", "screenshot", "save a picture of the window"),

@@ -22,7 +22,7 @@ from studies.plan.candidate import (
     passes_needed,
     shallowest,
 )
-from studies.plan.command import MOST_CANDIDATES
+from studies.plan.file import MOST_SWEEPS
 from studies.plan.way import layout_towards
 from studies.plan.workers import _in_patient
 from ultrasound.array import load_probe
@@ -74,7 +74,7 @@ def test_directions_are_units_evenly_around():
 def test_a_tumour_on_top_is_looked_at_from_above_only(rehearsal):
     found = found_for(rehearsal, 18.0 * Z)
     assert [each.motion for each in found] == ["glide", "glide", "rock"]
-    assert all(each.name.endswith("from above") for each in found)
+    assert all(each.side == "from above" for each in found)
     assert [each.count for each in found] == [1, 2, 1]
     for each in found:
         assert each.layout.outward == pytest.approx(Z) and each.layout.lateral == pytest.approx(X)
@@ -85,11 +85,11 @@ def test_a_tumour_on_top_is_looked_at_from_above_only(rehearsal):
 def test_a_tumour_at_the_side_is_looked_at_from_there_too(rehearsal, aside):
     found = found_for(rehearsal, 18.0 * aside_by(aside))
     assert [each.motion for each in found] == ["glide", "glide", "glide", "rock"]
-    assert len(found) <= MOST_CANDIDATES
+    assert len(found) <= MOST_SWEEPS
     assert found[0].layout.outward == pytest.approx(Z)
     for each in found[1:]:
         assert angle_deg(each.layout.outward, aside_by(aside)) < GRAIN_DEG
-        assert each.name.endswith("from the nearest side")
+        assert each.side == "from the nearest side"
 
 
 def test_no_side_is_looked_at_from_under_the_organ(rehearsal):
@@ -108,7 +108,7 @@ def test_the_nearest_side_is_one_that_can_be_reached(rehearsal):
     assert outward[1] < -0.1
     assert shallowest(rehearsal.hand, centre, Z, lambda poses: ~everywhere(poses), X) is None
     nowhere = found_for(rehearsal, centre, lambda poses: ~everywhere(poses))
-    assert len(nowhere) == 3 and all("from above" in each.name for each in nowhere)
+    assert len(nowhere) == 3 and all(each.side == "from above" for each in nowhere)
 
 
 def test_half_of_a_target_is_measured_across_and_along():
@@ -118,8 +118,8 @@ def test_half_of_a_target_is_measured_across_and_along():
 
 
 def test_passes_are_as_many_as_the_target_is_wide_in_pictures():
-    assert passes_needed(0.4 * WIDTH, PROBE) == 1
-    counts = [passes_needed(half, PROBE) for half in np.arange(1.0, 200.0)]
+    assert passes_needed(0.4 * WIDTH, WIDTH) == 1
+    counts = [passes_needed(half, WIDTH) for half in np.arange(1.0, 200.0)]
     assert sorted(counts) == counts and counts[-1] == MOST_PASSES and set(np.diff(counts)) == {0, 1}
 
 
@@ -129,7 +129,7 @@ def test_no_two_candidates_are_the_same_where_passes_are_at_their_most(rehearsal
     )
     found = candidates_of(narrow, coverage_of(18.0 * Z), "organ", everywhere)
     assert {each.count for each in found} == {MOST_PASSES}
-    assert len({each.name for each in found}) == len(found) == 3
+    assert len({each.named(each.count) for each in found}) == len(found) == 3
 
 
 @pytest.mark.parametrize("radius", [7.0, 12.0])
@@ -200,7 +200,7 @@ def test_straight_sweeps_look_down_and_cover_the_target_side_by_side(trial):
     assert np.array([one[0], one[-1]])[:, :3, 2] == pytest.approx(np.stack([Z, Z]))
     assert faces_in(one)[:, 0] == pytest.approx(0, abs=VOXEL_MM / 2)
     assert faces_in(one)[[0, -1], 1] == pytest.approx([-12, 12], abs=VOXEL_MM)
-    assert len(rows) == passes_needed(12.0, PROBE) == 2
+    assert len(rows) == passes_needed(12.0, WIDTH) == 2
     aside = [faces_in(each)[0, 0] for each in rows]
     assert np.diff(aside) == pytest.approx([WIDTH]) and np.mean(aside) == pytest.approx(0, abs=VOXEL_MM / 2)
 

@@ -17,14 +17,13 @@ from scenes.scene import Scene
 from scenes.trocar import Trocar
 from studies.plan import compare, evolution
 from studies.plan.candidate import Candidate, Quantity
-from studies.plan.command import MOST_CANDIDATES
 from studies.plan.evolution import GENERATION, NEAR, Search, foreseen
-from studies.plan.file import PlanError, read_plan, write_plan
+from studies.plan.file import PlanError, read_plan, scans_of, write_plan
 from studies.plan.make import make_plan
 from studies.plan.parts import Parts
 from studies.plan.score import score
 from studies.plan.search import FIRST, TRIAL_MM_S, ranked, search
-from studies.plan.study_command import CANDIDATES, table
+from studies.plan.study_command import table
 from studies.plan.workers import Gone, Ground, Start, Workers, workers
 from ultrasound.array import load_probe
 
@@ -152,16 +151,16 @@ def test_a_forecasts_best_is_no_worse_than_where_it_began():
 def test_all_trials_are_made_and_counted(trials):
     crew, done = Counting(four()), []
     searches = search(crew.candidates, crew, trials, lambda: done.append(1))
-    made = Counter(each.name for each, _, _ in crew.tasks)
+    made = Counter(each.side for each, _, _ in crew.tasks)
     assert sum(made.values()) == len(crew.tasks) == trials and len(done) == trials + 4
-    assert {one.candidate.name: one.trials for one in searches} == made
+    assert {one.candidate.side: one.trials for one in searches} == made
     assert {speed for _, _, speed in crew.tasks} == {TRIAL_MM_S} and crew.foreseen == 4
 
 
 def test_the_better_half_has_the_rest():
     crew = Counting(four())
     searches = search(crew.candidates, crew, 96, lambda: None)
-    trials = {one.candidate.name: one.trials for one in searches}
+    trials = {one.candidate.side: one.trials for one in searches}
     # Whole generations of all four until no more than the rest is left.
     first = GENERATION * -(-int(FIRST * 96) // (4 * GENERATION))
     half = (96 - 4 * first) // 2
@@ -183,8 +182,8 @@ def test_two_searches_try_the_same():
     one, two = Counting(four()), Counting(four())
     for crew in (one, two):
         search(crew.candidates, crew, 70, lambda: None)
-    assert [(each.name, values) for each, values, _ in one.tasks] == [
-        (each.name, values) for each, values, _ in two.tasks
+    assert [(each.side, values) for each, values, _ in one.tasks] == [
+        (each.side, values) for each, values, _ in two.tasks
     ]
 
 
@@ -193,7 +192,7 @@ def test_the_best_of_each_is_gone_once_more_and_ranked():
     searches = search(crew.candidates, crew, 48, lambda: None)
     crew.tasks.clear()
     rows = ranked(searches, crew, 12.0, lambda: done.append(1))
-    assert [one.candidate.name for one, _ in rows] == ["sweep 1", "sweep 3", "sweep 2", "sweep 0"]
+    assert [one.candidate.side for one, _ in rows] == ["sweep 1", "sweep 3", "sweep 2", "sweep 0"]
     assert len(done) == 4 and {speed for _, _, speed in crew.tasks} == {12.0}
     assert all(gone.parts == worth(one.values, one.candidate.count / 100) for one, gone in rows)
     # One that had no trial has no numbers to be gone with.
@@ -207,9 +206,11 @@ def test_the_best_of_each_is_gone_once_more_and_ranked():
 def test_a_plan_is_the_ranked_sweeps_with_what_they_are_for(tmp_path):
     ground, done = ground_of(trocar=Trocar(cone_deg=33)), []
     plans = [make_plan(ground, Counting(four()), 12.0, 96, lambda: done.append(1)) for _ in range(2)]
-    assert len(done) == 2 * (96 + 2 * MOST_CANDIDATES), "what the command's progress bar expects"
+    assert len(done) == 2 * scans_of(96), "what the command's progress bar expects"
     plan = plans[0]
-    assert [each.name for each in plan.sweeps] == ["sweep 1", "sweep 3", "sweep 2", "sweep 0"]
+    assert [each.name.split("passes ")[-1].removeprefix("one pass ") for each in plan.sweeps] == [
+        *("sweep 1", "sweep 3", "sweep 2", "sweep 0")
+    ]
     scores = [each.score for each in plan.sweeps]
     assert scores == sorted(scores, reverse=True) and sum(each.trials for each in plan.sweeps) == 96
     for each in plan.sweeps:

@@ -100,7 +100,9 @@ class _Client(BaseRequestHandler):
     is_here = False
 
     def setup(self) -> None:
-        self.request.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        # A client that is gone already is found out when it is written to.
+        with suppress(OSError):
+            self.request.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.server.enter(self)
         Thread(target=self._listen, daemon=True).start()
 

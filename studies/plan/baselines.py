@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 
 from studies.freehand.unsqueeze import shifted
-from studies.plan.candidate import half_size, passes_needed
+from studies.plan.candidate import half_size, passes_needed, width_mm
 from studies.plan.file import Sweep
 from studies.plan.trial import Trial
 from studies.plan.way import Layout, Way, gliding, layout_towards
@@ -25,7 +25,7 @@ def straight(trial: Trial) -> Way:
 def row_by_row(trial: Trial) -> Way:
     """As many passes side by side, straight down, as the target is wide."""
     layout, half = _seen_from_above(trial)
-    return _rows(trial, layout, half, passes_needed(half[0], trial.rehearsal.probe))
+    return _rows(trial, layout, half, passes_needed(half[0], width_mm(trial.rehearsal, layout)))
 
 
 def by_chance(trial: Trial, count: int, seed: int) -> Way:
@@ -60,7 +60,7 @@ def _seen_from_above(trial: Trial) -> tuple[Layout, np.ndarray]:
 
 
 def _rows(trial: Trial, layout: Layout, half: np.ndarray, count: int) -> Way:
-    width = trial.rehearsal.probe.extent_mm[0]
+    width = width_mm(trial.rehearsal, layout)
     aside = width * (np.arange(count) - (count - 1) / 2)
     return gliding(trial.rehearsal.hand, layout, aside, -half[1], half[1], DEPTH_MM, 0.0)
 

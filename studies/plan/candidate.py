@@ -8,15 +8,12 @@ import numpy as np
 from studies.plan.reach import Reach
 from studies.plan.way import FAR_MM, Layout, Way, gliding, layout_towards, pose_over, rocking
 from studies.rehearsal import Rehearsal
-from ultrasound.array import Probe
 from ultrasound.coverage import VOXEL_MM, Coverage
 from ultrasound.probe import Hand
 
 # Sides of the organ that are looked at, no farther round than this from above (its cosine), and how much two differ.
 SIDES, ROUND, APART_DEG = 300, 0.1, 20.0
 MOST_PASSES = 6
-# How many passes a target takes, in widths of the picture.
-OVERLAP = 0.9
 
 
 class Quantity(NamedTuple):
@@ -31,11 +28,17 @@ class Quantity(NamedTuple):
 class Candidate:
     """``motion`` is "glide" or "rock", ``count`` how many passes; ``layout`` is where they lie before they are leant and turned."""
 
-    name: str
+    side: str
     motion: str
     count: int
     layout: Layout
     quantities: dict[str, Quantity]
+
+    def named(self, count: int) -> str:
+        """What a sweep of it is called that has so many passes."""
+        if self.motion == "glide":
+            return f"{'one pass' if count == 1 else f'{count} passes'} {self.side}"
+        return f"rocking in {'one place' if count == 1 else f'{count} places'} {self.side}"
 
     def start(self) -> np.ndarray:
         """Where the search begins, shares (n,) of the ranges."""
@@ -72,8 +75,8 @@ def candidates_of(rehearsal: Rehearsal, coverage: Coverage, target: str, reach: 
     for side, outward in outwards.items():
         layout = layout_towards(centre, outward, np.array(rehearsal.press.lateral))
         half = half_size(layout, places)
-        width = rehearsal.probe.extent_mm[0]
-        count = passes_needed(half[0], rehearsal.probe)
+        width = width_mm(rehearsal, layout)
+        count = passes_needed(half[0], width)
         found.append(_glide(side, count, layout, half, width))
         if side == list(outwards)[-1]:
             if count < MOST_PASSES:
@@ -87,9 +90,17 @@ def half_size(layout: Layout, places: np.ndarray) -> np.ndarray:
     return np.abs((places - layout.centre) @ np.column_stack([layout.lateral, layout.ahead])).max(axis=0)
 
 
-def passes_needed(half_mm: float, probe: Probe) -> int:
-    """How many passes of a probe's picture cover so much to either side."""
-    return int(np.clip(np.ceil(2 * half_mm / probe.extent_mm[0] * OVERLAP), 1, MOST_PASSES))
+def width_mm(rehearsal: Rehearsal, layout: Layout) -> float:
+    """How wide the picture is at a layout's centre, where the probe looks on it from outside."""
+    top = rehearsal.hand.met(layout.centre + FAR_MM * layout.outward, -layout.outward)
+    depth = 0.0 if top is None else float((top - layout.centre) @ layout.outward)
+    probe = rehearsal.probe
+    return float(probe.number_of_scanlines * probe.line_spacing_mm(np.array([max(depth, 0.0)]))[0])
+
+
+def passes_needed(half_mm: float, width: float) -> int:
+    """How many passes of a picture so wide cover so much to either side."""
+    return int(np.clip(np.ceil(2 * half_mm / width), 1, MOST_PASSES))
 
 
 def shallowest(
@@ -131,10 +142,6 @@ def _apart(count: int, width: float) -> dict[str, Quantity]:
     return {} if count == 1 else {"apart_mm": Quantity(0.4 * width, 1.1 * width, 0.8 * width)}
 
 
-def _passes(count: int) -> str:
-    return "one pass" if count == 1 else f"{count} passes"
-
-
 def _glide(side: str, count: int, layout: Layout, half: np.ndarray, width: float) -> Candidate:
     far = half[1]
     own = {
@@ -142,9 +149,7 @@ def _glide(side: str, count: int, layout: Layout, half: np.ndarray, width: float
         "end_mm": Quantity(0.0, 1.4 * far, 0.8 * far),
         "follow": Quantity(0.0, 1.0, 0.5),
     }
-    return Candidate(
-        f"{_passes(count)} {side}", "glide", count, layout, _about(half) | own | _apart(count, width)
-    )
+    return Candidate(side, "glide", count, layout, _about(half) | own | _apart(count, width))
 
 
 def _rock(side: str, count: int, layout: Layout, half: np.ndarray, width: float) -> Candidate:
@@ -153,5 +158,4 @@ def _rock(side: str, count: int, layout: Layout, half: np.ndarray, width: float)
         "first_deg": Quantity(-45.0, 0.0, -30.0),
         "last_deg": Quantity(0.0, 45.0, 30.0),
     }
-    name = f"rocking in {'one place' if count == 1 else f'{count} places'} {side}"
-    return Candidate(name, "rock", count, layout, _about(half) | own | _apart(count, width))
+    return Candidate(side, "rock", count, layout, _about(half) | own | _apart(count, width))

@@ -11,12 +11,9 @@ from scenes.anatomy import load_anatomy
 from scenes.scene import EMBEDDED, load_scene, with_options
 from scenes.trocar import Trocar
 from studies.commands import Fault, make_folder
-from studies.plan.file import FASTEST_MM_S, MOST_MARGIN_MM, SLOWEST_MM_S, write_plan
+from studies.plan.file import FASTEST_MM_S, MOST_MARGIN_MM, MOST_SWEEPS, SLOWEST_MM_S, scans_of, write_plan
 from studies.setup import probe_of
 from ultrasound.target import TARGETS, Target
-
-# Candidates are no more than these.
-MOST_CANDIDATES = 4
 
 
 def refuse_nan(context: click.Context, option: click.Parameter, value: float) -> float:
@@ -62,7 +59,7 @@ def refuse_nan(context: click.Context, option: click.Parameter, value: float) ->
 )
 @click.option(
     "--trials",
-    type=click.IntRange(MOST_CANDIDATES, 100_000),
+    type=click.IntRange(MOST_SWEEPS, 100_000),
     default=96,
     show_default=True,
     help="Scans that the search may make.",
@@ -101,7 +98,7 @@ def plan(
     ground = Ground(loaded, anatomy, held, aim, margin_mm, port)
     with (
         workers(ground, jobs) as crew,
-        tqdm(total=trials + 2 * MOST_CANDIDATES, desc="plan", unit="scan") as bar,
+        tqdm(total=scans_of(trials), desc="plan", unit="scan") as bar,
     ):
         made = make_plan(ground, crew, speed_mm_s, trials, bar.update)
         bar.update(bar.total - bar.n)

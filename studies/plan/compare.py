@@ -10,6 +10,7 @@ import numpy as np
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
 from studies.plan.baselines import UNPLANNED, planned, random_ways
+from studies.plan.file import scans_of
 from studies.plan.make import make_plan
 from studies.plan.parts import Parts
 from studies.plan.score import score
@@ -25,9 +26,9 @@ PLANNED_ON = PRESETS["neo-hookean"]["balanced"]
 JUDGED_ON = replace(PLANNED_ON, cell_mm=2.7, iterations=8)
 
 
-def count_of(trials: int, candidates: int) -> int:
+def count_of(trials: int) -> int:
     """How often ``compare`` says that something is done."""
-    return trials + 2 * candidates + 1 + len(UNPLANNED) + len(SEEDS)
+    return scans_of(trials) + 1 + len(UNPLANNED) + len(SEEDS)
 
 
 def compare(

@@ -12,6 +12,8 @@ from scenes.trocar import Trocar
 from ultrasound.target import Target
 
 MOST_POSES, MOST_MARGIN_MM = 20_000, 30.0
+# Kinds of sweep that are compared, at most.
+MOST_SWEEPS = 4
 SLOWEST_MM_S, FASTEST_MM_S = 1.0, 100.0
 NAME = re.compile(r"plan-([0-9]{3,9})\.json")
 # How far the axes of a pose may be from orthonormal: what six digits in a file leave.
@@ -85,6 +87,11 @@ class Plan(_Part):
 def write_plan(plan: Plan, path: Path) -> None:
     """Write a plan; the same plan makes the same bytes. Raises OSError."""
     path.write_text(json.dumps(plan.model_dump(mode="json"), indent=1) + "\n", "utf-8")
+
+
+def scans_of(trials: int) -> int:
+    """How much a search with so many trials has to do at most: it foresees each kind of sweep, and goes the best of it slowly."""
+    return trials + 2 * MOST_SWEEPS
 
 
 def next_free(folder: Path) -> Path:

@@ -43,18 +43,20 @@ def make_plan(
 
 
 def _reasons(rows: list[tuple[Search, Gone]]) -> list[str]:
-    first, winner = rows[0][0].candidate.name, rows[0][1].parts
-    said = [f"{first}: {in_words(winner)}; {score(winner):.1f} points"]
+    winner = rows[0][1].parts
+    said = [f"{_name(*rows[0])}: {in_words(winner)}; {score(winner):.1f} points"]
     for one, gone in rows[1:]:
-        said.append(
-            f"before {one.candidate.name} ({score(gone.parts):.1f} points): {why(winner, gone.parts)}"
-        )
+        said.append(f"before {_name(one, gone)} ({score(gone.parts):.1f} points): {why(winner, gone.parts)}")
     return said
+
+
+def _name(one: Search, gone: Gone) -> str:
+    return one.candidate.named(len(gone.passes))
 
 
 def _sweep(one: Search, gone: Gone) -> Sweep:
     return Sweep(
-        name=one.candidate.name,
+        name=_name(one, gone),
         score=round(score(gone.parts), DIGITS),
         parts=_rounded(asdict(gone.parts)),
         points=_rounded(points(gone.parts)),

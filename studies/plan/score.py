@@ -5,7 +5,7 @@ from studies.plan.parts import Parts
 # Points for each part: the whole target seen is 100, and what it costs is taken off.
 POINTS = {
     "seen": 100.0,
-    "compression_mean_mm": -2.0,
+    "compression_mean_mm": -3.0,
     "over_limit": -50.0,
     "contact": 5.0,
     "incidence_deg": -0.2,

@@ -11,8 +11,7 @@ from tqdm import tqdm
 from scenes.anatomy import load_anatomy
 from scenes.scene import EMBEDDED, load_scene, with_options
 from studies.commands import make_folder
-
-CANDIDATES = 4
+from studies.plan.file import MOST_SWEEPS
 
 
 @click.command("plan")
@@ -20,7 +19,7 @@ CANDIDATES = 4
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the figures.")
 @click.option(
     "--trials",
-    type=click.IntRange(CANDIDATES, 100_000),
+    type=click.IntRange(MOST_SWEEPS, 100_000),
     default=96,
     show_default=True,
     help="Scans a search.",
@@ -40,7 +39,7 @@ def plan_study(scenes: tuple[Path, ...], out: Path, trials: int, probe: str, job
 
     runs = []
     patients = scenes or (EMBEDDED,)
-    with tqdm(total=len(patients) * count_of(trials, CANDIDATES), desc="plan", unit="scan") as bar:
+    with tqdm(total=len(patients) * count_of(trials), desc="plan", unit="scan") as bar:
         for number, each in enumerate(patients, 1):
             path = each / "scene.toml" if each.is_dir() else each
             scene = with_options(load_scene(path), {"transducer.probe": probe})

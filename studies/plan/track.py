@@ -1,4 +1,4 @@
-"""A plan's sweep as the way of a tracked probe: it can be followed by a machine, and scanned."""
+"""A plan's sweep as the way of a tracked probe, to be followed by a machine."""
 
 from itertools import pairwise
 

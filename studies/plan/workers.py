@@ -4,12 +4,14 @@ A process computes on one CPU thread, so that several do not fight for the same 
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import BrokenExecutor, CancelledError
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
-from joblib import Parallel, cpu_count, delayed, parallel_config
+from joblib import cpu_count
+from joblib.externals.loky import ProcessPoolExecutor
+from joblib.externals.loky.process_executor import ShutdownExecutorError
 
 import sim.device
 from scenes.anatomy import LoadedAnatomy, fingerprint
@@ -70,31 +72,37 @@ Task = tuple[Candidate, dict[str, float], float]
 class Workers:
     """Processes that try ways on one ground. All that they do may raise PlanError."""
 
-    def __init__(self, ground: Ground) -> None:
-        self.ground = ground.bare
+    def __init__(self, ground: Ground, pool: ProcessPoolExecutor) -> None:
+        self.ground, self._pool = ground.bare, pool
         made_of = ground.scene, ground.probe, ground.target, ground.margin_mm, ground.trocar
         self._key = fingerprint(self.ground.anatomy) + repr(made_of)
 
     def start(self) -> Start:
         """What there is to search. Raises PlanError."""
-        return next(self._all([delayed(_start)(self._key, self.ground)]))
+        return next(self._all(_start, [()]))
 
     def foresee(self, candidates: Sequence[Candidate]) -> Iterator[np.ndarray]:
         """Where the search of each is to begin, shares (n,) of its ranges."""
-        return self._all([delayed(_foreseen)(self._key, self.ground, each) for each in candidates])
+        return self._all(_foreseen, [(each,) for each in candidates])
 
     def go(self, tasks: Sequence[Task]) -> Iterator[Gone]:
         """In the order of the tasks, as they are done."""
-        return self._all([delayed(_go)(self._key, self.ground, *task) for task in tasks])
+        return self._all(_go, tasks)
 
     def go_ways(self, ways: Sequence[Callable[[Trial], Way]], speed_mm_s: float) -> Iterator[Gone]:
         """The same of ways that are not candidates': each is made in its process."""
-        return self._all([delayed(_go_way)(self._key, self.ground, way, speed_mm_s) for way in ways])
+        return self._all(_go_way, [(way, speed_mm_s) for way in ways])
 
-    def _all(self, calls: list) -> Iterator:
+    def stop(self) -> None:
+        """End the processes; whoever waits for them gets a PlanError."""
+        self._pool.shutdown(wait=False, kill_workers=True)
+
+    def _all(self, function: Callable, tasks: Sequence[tuple]) -> Iterator:
         try:
-            yield from Parallel(batch_size=1, return_as="generator")(calls)
-        except BrokenProcessPool:
+            futures = [self._pool.submit(function, self._key, self.ground, *task) for task in tasks]
+            for future in futures:
+                yield future.result()
+        except (BrokenExecutor, ShutdownExecutorError, CancelledError):
             raise PlanError(
                 "a process of the search was ended, perhaps for want of memory; close other programs, or give fewer --jobs"
             ) from None
@@ -102,9 +110,15 @@ class Workers:
 
 @contextmanager
 def workers(ground: Ground, jobs: int | None = None) -> Iterator[Workers]:
-    """Processes on this machine, as many as it has processors where ``jobs`` is None."""
-    with parallel_config(backend="loky", n_jobs=jobs or cpu_count()):
-        yield Workers(ground)
+    """Processes on this machine, as many as it has processors where ``jobs`` is None.
+
+    One is a process of its own too: this one may have a Taichi that is in use.
+    """
+    pool = ProcessPoolExecutor(jobs or cpu_count())
+    try:
+        yield Workers(ground, pool)
+    finally:
+        pool.shutdown(wait=False, kill_workers=True)
 
 
 _built: dict[str, Trial] = {}

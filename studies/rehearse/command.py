@@ -11,7 +11,7 @@ from scenes.anatomy import LoadedAnatomy, fingerprint, load_anatomy
 from scenes.scene import EMBEDDED, OPTIONS, TISSUES, Scene, load_scene, with_options
 from studies.commands import Fault, arch_option, make_folder, start_taichi
 from studies.link.options import link_options, opened_link
-from studies.plan.file import read_plan
+from studies.plan.file import is_plan, read_plan
 from studies.rehearse.checks import (
     as_recorded,
     check_anatomy,
@@ -126,7 +126,6 @@ def rehearse(
     before = load_scene(path)
     keys = load_keys(keys_file) if keys_file is not None else Keys()
     refuse_inputs(track_file, track_from, replay, link_leads)
-    refuse_headless(headless, gamepad, link_leads)
     track = load_track(track_file, track_from) if track_file is not None else None
     plan = read_plan(plan_file) if plan_file is not None else None
     log = session_of(replay, at, changed, budget_ms, error_mm)
@@ -139,6 +138,8 @@ def rehearse(
         check_anatomy(log, anatomy, before.title)
     if track is not None and track_file is not None:
         check_near(track, anatomy.organ.vertices, track_file)
+        if is_plan(track_file):
+            check_plan(read_plan(track_file), fingerprint(anatomy), probe)
     if plan is not None:
         check_plan(plan, fingerprint(anatomy), probe)
     budgeted = budget_ms is not None or error_mm is not None
@@ -152,6 +153,7 @@ def rehearse(
     if not headless and not display_available():
         click.echo("No display: running the scripted press without a window.")
         headless = True
+    refuse_headless(headless, gamepad, link_leads)
     make_folder(out)
     click.echo("Building the model.")
     started = perf_counter()

@@ -11,8 +11,8 @@ from studies.plan.parts import faces_of
 from studies.rehearsal import Rehearsal
 from ultrasound.probe import advanced, held_at, indentation
 
-# Nearer to the sweep than this it is followed; a turn by so many degrees is as far as one millimetre.
-NEAR_MM, DEG_A_MM = 6.0, 3.0
+# Nearer to the sweep than this in place, or in angle, it is followed; half of both is as near.
+NEAR_MM, NEAR_DEG = 6.0, 18.0
 # So many poses on from where the probe was it may be now.
 AHEAD = 6
 # So far above the organ the way is drawn.
@@ -79,31 +79,39 @@ class Guide:
         off_mm = np.linalg.norm(self._faces[window] - faces_of(self.rehearsal.hand, pose[None]), axis=1)
         cosine = (np.einsum("nij,ij->n", self._poses[window, :3, :3], pose[:3, :3]) - 1) / 2
         off_deg = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        nearest = int(np.argmin(off_mm + off_deg / DEG_A_MM))
-        off = float(off_mm[nearest]), float(off_deg[nearest])
-        if off[0] + off[1] / DEG_A_MM <= NEAR_MM:
+        off = off_mm / NEAR_MM + off_deg / NEAR_DEG
+        nearest = int(np.argmin(off))
+        if off[nearest] <= 1.0:
             self.at = first + nearest
-            self._off[self.at] = min(off, self._off.get(self.at, off))
+            beside = float(off_mm[nearest]), float(off_deg[nearest])
+            self._off[self.at] = min(beside, self._off.get(self.at, beside))
 
     @property
     def followed(self) -> float:
         """Share of the sweep that is behind, 0 to 1."""
         return (self.at + 1) / len(self._poses) if len(self._poses) else 0.0
 
-    def figures(self) -> dict[str, float]:
+    def figures(self) -> dict[str, float | None]:
         """For the record; nothing where no sweep is shown."""
         if len(self._poses) == 0:
             return {}
-        off = np.mean(list(self._off.values()), axis=0) if self._off else np.zeros(2)
-        return dict(plan_followed=self.followed, plan_off_mm=float(off[0]), plan_off_deg=float(off[1]))
+        off = self._beside() or (None, None)
+        return dict(plan_followed=self.followed, plan_off_mm=off[0], plan_off_deg=off[1])
+
+    def _beside(self) -> tuple[float, float] | None:
+        """How far beside the sweep the probe went, on average (mm, degrees); None where it did not yet."""
+        if not self._off:
+            return None
+        off_mm, off_deg = np.mean(list(self._off.values()), axis=0)
+        return float(off_mm), float(off_deg)
 
     def findings(self) -> dict[str, str]:
         """For the window."""
-        figures = self.figures()
-        if not figures:
+        if len(self._poses) == 0:
             return {}
-        off = f"{figures['plan_off_mm']:.1f} mm {figures['plan_off_deg']:.0f} deg" if self._off else ""
-        return {"plan": f"{100 * self.followed:.0f} %", "off plan": off}
+        off = self._beside()
+        beside = f"{off[0]:.1f} mm {off[1]:.0f} deg" if off else ""
+        return {"plan": f"{100 * self.followed:.0f} %", "off plan": beside}
 
     def guidance(self) -> Guidance | None:
         """What is drawn of it."""
@@ -114,13 +122,12 @@ class Guide:
 
     def in_words(self, seen: float | None) -> str:
         """How it went, for the terminal; ``seen`` is the share of the target that was seen. Empty where no sweep is shown."""
-        figures = self.figures()
-        if not figures:
+        if len(self._poses) == 0:
             return ""
         sweep = self.plan.sweeps[self.number]
-        text = f"plan      {sweep.name}: {100 * figures['plan_followed']:.0f} % of it followed"
-        if self._off:
-            text += f", {figures['plan_off_mm']:.1f} mm and {figures['plan_off_deg']:.0f} degrees beside it"
+        text = f"plan      {sweep.name}: {100 * self.followed:.0f} % of it followed"
+        if off := self._beside():
+            text += f", {off[0]:.1f} mm and {off[1]:.0f} degrees beside it"
         if seen is not None:
             text += (
                 f"; {self.plan.target} seen {100 * seen:.0f} % (planned {100 * sweep.parts['seen']:.0f} %)"

@@ -52,6 +52,9 @@ class Live:
         if self._go_back(controls):
             self._wait(controls.ray)
             return None
+        if controls.take_over and self._follower is not None:
+            self._follower, self._said = None, "Yours now"
+            self.session.rehearsal.hand.take(self.session.rehearsal.pose)
         self._set_solver(controls)
         rehearsal = self.session.rehearsal
         held, follower = rehearsal.hand.grip, self._follower

@@ -7,12 +7,14 @@ from joblib import cpu_count
 
 from render.viewer import Controls, Settings
 from scenes.anatomy import LoadedAnatomy
-from studies.plan.file import Plan, PlanError, next_free, write_plan
+from scenes.scene import Scene, with_options
+from studies.plan.file import Plan, PlanError, next_free, scans_of, write_plan
 from studies.plan.make import make_plan
-from studies.plan.workers import Ground, workers
+from studies.plan.workers import Ground, Workers, workers
 from studies.rehearsal import Rehearsal
 from studies.rehearse.guide import Guide
 from studies.rehearse.instruments import Instruments
+from studies.rehearse.view import probe_as_set
 from ultrasound.target import Target
 
 TRIALS, SPEED_MM_S = 96, 10.0
@@ -23,10 +25,6 @@ NAMED: dict[Target, str] = {
 }
 
 
-class _Stopped(Exception):
-    """The window was closed."""
-
-
 class Planning:
     """One search for a plan. It runs in processes of its own; this thread of it only waits for them.
 
@@ -34,10 +32,11 @@ class Planning:
     """
 
     def __init__(self, ground: Ground, path: Path, trials: int = TRIALS) -> None:
+        self.path, self.fault = path, ""
         self.plan: Plan | None = None
-        self.fault = ""
-        self._ground, self._path, self._trials = ground, path, trials
-        self._done, self._ends = 0, False
+        self._ground, self._trials, self._done = ground, trials, 0
+        self._workers: Workers | None = None
+        self._stops = False
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -48,29 +47,32 @@ class Planning:
     @property
     def share(self) -> float:
         """How much of it is done, 0 to 1."""
-        return min(self._done / self._trials, 1.0)
+        return min(self._done / scans_of(self._trials), 1.0)
 
     def stop(self) -> None:
         """Let go of the search; what was found is lost."""
-        self._ends = True
+        self._stops = True
+        if self._workers is not None:
+            self._workers.stop()
+        self._thread.join()
 
     def _run(self) -> None:
         try:
-            # One processor is left to the rehearsal. A single process would be this one, which has the window's Taichi.
-            with workers(self._ground, max(2, cpu_count() - 1)) as crew:
-                plan = make_plan(self._ground, crew, SPEED_MM_S, self._trials, self._count)
-            write_plan(plan, self._path)
+            # One processor is left to the rehearsal.
+            with workers(self._ground, max(1, cpu_count() - 1)) as self._workers:
+                plan = make_plan(self._ground, self._workers, SPEED_MM_S, self._trials, self._count)
+            write_plan(plan, self.path)
             self.plan = plan
         except PlanError as error:
             self.fault = str(error)
         except OSError as error:
-            self.fault = f"{self._path.name} cannot be written: {error.strerror}"
-        except _Stopped:
-            self.fault = "No plan: it was stopped"
+            self.fault = f"{self.path.name} cannot be written: {error.strerror}"
+        except Exception as error:  # whatever a process may send back: the rehearsal goes on
+            self.fault = f"No plan: the search failed ({error})"
 
     def _count(self) -> None:
-        if self._ends:
-            raise _Stopped
+        if self._stops:
+            raise PlanError("No plan: it was stopped")
         self._done += 1
 
 
@@ -113,7 +115,7 @@ class Plans:
         if self._planning is not None:
             return "A plan is being made"
         target = settings.plan_for if self.rehearsal.tumour is not None else "organ"
-        scene, probe = self.rehearsal.scene, self.rehearsal.probe
+        scene, probe = as_set(self.rehearsal.scene, settings), probe_as_set(self.rehearsal.probe, settings)
         ground = Ground(scene, self.anatomy, probe, target, float(settings.margin_mm), scene.trocar)
         self._planning = Planning(ground, next_free(self.out))
         return f"Planning for {NAMED[target]}"
@@ -127,4 +129,16 @@ class Plans:
             return planning.fault
         guide = Guide(self.rehearsal, planning.plan)
         self.instruments.follow(guide)
-        return guide.said()
+        return f"{guide.said()} ({planning.path.name})"
+
+
+def as_set(scene: Scene, settings: Settings) -> Scene:
+    """A scene with its tissue, passes and gravity as the sliders are."""
+    values = {
+        "tissue.young_kpa": settings.young_kpa,
+        "tissue.stiffness": settings.stiffness,
+        "solver.iterations": settings.iterations,
+        "solver.substeps": settings.substeps,
+        "gravity.acceleration_m_s2": settings.gravity_m_s2,
+    }
+    return with_options(scene, values)
