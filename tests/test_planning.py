@@ -10,12 +10,15 @@ from plan_ball import over_ball, plan_of, straight_pass, sweep_of
 
 from render.viewer import Controls, Settings
 from scenes.scene import Scene
-from studies.plan.file import PlanError, read_plan
+from studies.plan.file import PlanError, read_plan, scans_of
 from studies.rehearse import planning
 from studies.rehearse.guide import Guide
 from studies.rehearse.planning import TRIALS, Plans
+from studies.rehearse.view import probe_as_set
+from ultrasound.array import load_probe
 
 LONGEST_S = 10.0
+PROBE = load_probe("drop-in")
 
 
 class Search:
@@ -31,10 +34,10 @@ class Search:
     @contextmanager
     def workers(self, ground, jobs):
         self.jobs.append(jobs)
-        yield "crew"
+        yield self
 
     def make(self, ground, crew, speed_mm_s, trials, done):
-        assert crew == "crew" and trials == TRIALS
+        assert crew is self and trials == TRIALS
         self.grounds.append(ground)
         for _ in range(4):
             assert self.let.acquire(timeout=LONGEST_S)
@@ -58,7 +61,7 @@ def searching(monkeypatch) -> Search:
 
 @pytest.fixture
 def plans(tmp_path) -> Plans:
-    held = SimpleNamespace(**vars(over_ball()), tumour="a tumour", scene=Scene(anatomy={}), probe="a probe")
+    held = SimpleNamespace(**vars(over_ball()), tumour="a tumour", scene=Scene(anatomy={}), probe=PROBE)
     followed = SimpleNamespace(guide=None)
     followed.follow = lambda guide: setattr(followed, "guide", guide)
     return Plans(held, "anatomy", followed, tmp_path)
@@ -80,10 +83,10 @@ def test_a_plan_is_made_while_the_rehearsal_goes_on_and_then_followed(searching,
     assert said(plans, plan=True, settings=Settings(margin_mm=7)) == "Planning for the tumour and its margin"
     assert said(plans) == "" and plans.status == "PLANNING   0 %"
     searching.go(3)
-    assert plans.status == f"PLANNING   {300 / TRIALS:.0f} %"
+    assert plans.status == f"PLANNING   {300 / scans_of(TRIALS):.0f} %"
     assert said(plans, plan=True) == "A plan is being made"
     searching.go(1)
-    assert ended(plans) == "Plan 1: two passes, sees 75 %"
+    assert ended(plans) == "Plan 1: two passes, sees 75 % (plan-001.json)"
     assert plans.status == "" and said(plans) == "" and len(searching.grounds) == 1
     guide = plans.instruments.guide
     assert isinstance(guide, Guide) and read_plan(tmp_path / "plan-001.json") == guide.plan
@@ -92,8 +95,9 @@ def test_a_plan_is_made_while_the_rehearsal_goes_on_and_then_followed(searching,
         "margin",
         7.0,
         "anatomy",
-        "a probe",
+        probe_as_set(PROBE, Settings(margin_mm=7)),
     )
+    assert ground.scene.solver.iterations == Settings().iterations
     assert said(plans, plan=True) == "Planning for the tumour and its margin"
     searching.go(4)
     ended(plans)
