@@ -1,6 +1,6 @@
 """A plan followed by hand: where the probe is to go next, and how well it went there."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,8 +10,9 @@ from studies.plan.file import Plan
 from studies.rehearsal import Rehearsal
 from ultrasound.probe import held_at
 
-# Nearer than this a pose counts as gone through; a turn by so many degrees is as far as one millimetre.
-NEAR_MM, DEG_A_MM = 6.0, 3.0
+# A probe farther than this from the sweep is elsewhere; nearer than that to a pose it is there. A turn by so many degrees is as far
+# as one millimetre.
+NEAR_MM, THERE_MM, DEG_A_MM = 6.0, 1.0, 3.0
 # So many poses are looked ahead for the one that the probe is at.
 AHEAD = 6
 
@@ -23,14 +24,13 @@ class Guide:
     rehearsal: Rehearsal
     plan: Plan
     number: int = 0
-    _off: list[tuple[float, float]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.begin_anew()
 
     def begin_anew(self) -> None:
         """Nothing of the sweep was gone yet."""
-        self.at, self._off = 0, []
+        self.at = 0
         shown = self.number < len(self.plan.sweeps)
         length, origin = self.rehearsal.size_mm[2], self.rehearsal.origin
         self._passes = [
@@ -38,6 +38,8 @@ class Guide:
             for each in (self.plan.sweeps[self.number].poses() if shown else [])
         ]
         self._poses = np.concatenate(self._passes) if shown else np.zeros((0, 4, 4))
+        # How far the probe was from each pose when it was nearest to it, in mm and degrees, and both together.
+        self._off, self._far = np.zeros((len(self._poses), 2)), np.full(len(self._poses), np.inf)
         faces = [each[:, :3, 3] - length / 2 * each[:, :3, 2] for each in self._passes]
         segments = [np.stack([each[:-1], each[1:]], axis=1) for each in faces]
         # The pose at the end of each segment, by its place in the whole sweep.
@@ -61,14 +63,16 @@ class Guide:
 
     def watch(self, pose: np.ndarray) -> None:
         """Where the transducer is now (4, 4)."""
-        ahead = self._poses[self.at : self.at + AHEAD]
-        if len(ahead) == 0:
-            return
-        off = self._distance(pose, ahead)
-        nearest = int(np.argmin(off[:, 0] + off[:, 1] / DEG_A_MM))
-        if off[nearest, 0] + off[nearest, 1] / DEG_A_MM <= NEAR_MM:
-            self._off.append((float(off[nearest, 0]), float(off[nearest, 1])))
-            self.at += nearest + 1
+        first = max(self.at - AHEAD, 0)
+        off = self._distance(pose, self._poses[first : self.at + AHEAD])
+        far = off[:, 0] + off[:, 1] / DEG_A_MM
+        places = first + np.flatnonzero(far < self._far[first : self.at + AHEAD])
+        self._off[places], self._far[places] = off[places - first], far[places - first]
+        ahead = far[self.at - first :]
+        if len(ahead) and ahead.min() <= NEAR_MM:
+            nearest = self.at + int(np.argmin(ahead))
+            is_at_end = nearest == first + int(np.argmin(far)) == len(self._poses) - 1
+            self.at = nearest + int(is_at_end or ahead.min() <= THERE_MM)
 
     def _distance(self, pose: np.ndarray, others: np.ndarray) -> np.ndarray:
         """How far a pose is from others (n, 4, 4): of the face's middle [mm], and of the turn [degrees]; (n, 2)."""
@@ -89,7 +93,7 @@ class Guide:
         """For the record; nothing where no sweep is shown."""
         if len(self._poses) == 0:
             return {}
-        off = np.mean(self._off, axis=0) if self._off else np.zeros(2)
+        off = self._off[: self.at].mean(axis=0) if self.at else np.zeros(2)
         return dict(plan_followed=self.followed, plan_off_mm=float(off[0]), plan_off_deg=float(off[1]))
 
     def findings(self) -> dict[str, str]:
@@ -97,7 +101,7 @@ class Guide:
         figures = self.figures()
         if not figures:
             return {}
-        off = f"{figures['plan_off_mm']:.1f} mm, {figures['plan_off_deg']:.0f} deg" if self._off else ""
+        off = f"{figures['plan_off_mm']:.1f} mm, {figures['plan_off_deg']:.0f} deg" if self.at else ""
         return {"plan": f"{100 * self.followed:.0f} %", "off the plan": off}
 
     def guidance(self) -> Guidance | None:
@@ -114,7 +118,7 @@ class Guide:
             return ""
         sweep = self.plan.sweeps[self.number]
         text = f"plan      {sweep.name}: {100 * figures['plan_followed']:.0f} % of it followed"
-        if self._off:
+        if self.at:
             text += f", {figures['plan_off_mm']:.1f} mm and {figures['plan_off_deg']:.0f} degrees beside it"
         if seen is not None:
             text += (
