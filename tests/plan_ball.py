@@ -93,5 +93,8 @@ def plan_of(*sweeps: Sweep, **changes) -> Plan:
 
 
 def over_ball() -> SimpleNamespace:
-    """What a guide and a plan's poses ask of a rehearsal."""
-    return SimpleNamespace(size_mm=SIZE, origin=ORIGIN, settings=SimpleNamespace(time_step_s=0.05))
+    """What a guide and a plan's poses ask of a rehearsal; its organ is far below all ways."""
+    far = big_ball().apply_translation([0.0, 0.0, -1000.0])
+    return SimpleNamespace(
+        size_mm=SIZE, origin=ORIGIN, hand=hand_on(far), settings=SimpleNamespace(time_step_s=0.05)
+    )

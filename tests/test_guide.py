@@ -17,9 +17,10 @@ from render.keys import Keys
 from render.viewer import Controls, Guidance, Settings, View
 from studies.readings import Reading
 from studies.rehearse import instruments
-from studies.rehearse.guide import AHEAD, NEAR_MM, Guide
+from studies.rehearse.guide import ABOVE_MM, AHEAD, DEG_BESIDE_A_MM, NEAR_MM, Guide
 from studies.rehearse.instruments import Instruments
 from ultrasound.array import load_probe
+from ultrasound.probe import advanced
 from ultrasound.target import TARGETS
 
 FIRST, SECOND = straight_pass(4, step_mm=2.0), straight_pass(3, 20.0, 2.0)
@@ -47,7 +48,7 @@ def test_a_plan_followed_exactly_is_followed_wholly_with_nothing_off():
         guide.watch(pose)
     assert guide.figures() == pytest.approx(dict(plan_followed=1.0, plan_off_mm=0.0, plan_off_deg=0.0))
     assert guide.guidance().goal is None and guide.guidance().gone.all()
-    assert guide.findings() == {"plan": "100 %", "off the plan": "0.0 mm, 0 deg"}
+    assert guide.findings() == {"plan": "100 %", "off plan": "0.0 mm 0 deg"}
     assert guide.in_words(0.5) == (
         "plan      two passes: 100 % of it followed, 0.0 mm and 0 degrees beside it; margin seen 50 % (planned 75 %)"
     )
@@ -56,8 +57,9 @@ def test_a_plan_followed_exactly_is_followed_wholly_with_nothing_off():
 
 
 def test_how_far_beside_it_went_is_the_faces_middles_way_and_the_turn():
-    guide = guide_of()
-    for number, pose in enumerate([*FIRST, *SECOND]):
+    sparse = straight_pass(7, step_mm=9.0)
+    guide = guide_of(sweep_of(sparse))
+    for number, pose in enumerate(sparse):
         beside = turned(pose, 9.0 if number % 2 else 3.0)
         beside[:3, 3] += [0.6, 0.0, -0.8]
         guide.watch(beside)
@@ -66,11 +68,41 @@ def test_how_far_beside_it_went_is_the_faces_middles_way_and_the_turn():
     assert figures["plan_off_deg"] == pytest.approx((4 * 3 + 3 * 9) / 7)
 
 
+@pytest.mark.parametrize("offset", [0.0, 2.0])
+def test_each_pose_is_judged_where_it_was_nearest_and_none_is_behind_before(offset):
+    """In tenths of a step, from above the first: one that is gone to exactly is behind from a millimetre before it on, any other
+    where the next is nearer, and the last where the one before it is not."""
+    guide = guide_of(sweep_of(straight_pass(11, step_mm=1.5)))
+    (begin,) = straight_pass(1, offset)
+    for height in np.arange(8.0, 1.0, -0.25):
+        guide.watch(advanced(begin, -height))
+        assert guide.at == 0
+    for number, pose in enumerate(straight_pass(101, offset, 0.15)):
+        guide.watch(pose)
+        if offset == 0:
+            assert guide.at == min((number + 6) // 10 + 1, 11)
+        elif number % 10 != 5:
+            assert guide.at == (number + 5) // 10 + (number > 95)
+    off = dict(plan_followed=1.0, plan_off_mm=offset, plan_off_deg=0.0)
+    assert guide.figures() == pytest.approx(off, abs=1e-6)
+
+
+def test_rocking_is_judged_where_each_pose_was_nearest_too():
+    rocked = np.stack([turned(straight_pass(1)[0], angle) for angle in np.arange(-30.0, 31.0, 2.0)])
+    guide = guide_of(sweep_of(rocked))
+    for angle in np.arange(-30.0, 30.1, 0.5):
+        guide.watch(turned(straight_pass(1)[0], angle))
+        assert (angle + 30) / 2 < guide.at <= (angle + 30) / 2 + 3
+    assert guide.figures() == pytest.approx(
+        dict(plan_followed=1.0, plan_off_mm=0.0, plan_off_deg=0.0), abs=1e-4
+    )
+
+
 def test_the_way_that_is_drawn_is_each_pass_and_not_between_them():
     guide = guide_of()
     places = [[0.0, 2 * n, 0.0] for n in range(4)], [[20.0, 2 * n, 0.0] for n in range(3)]
     segments = [[a, b] for each in places for a, b in pairwise(each)]
-    assert guide.guidance().way_mm == pytest.approx(np.array(segments))
+    assert guide.guidance().way_mm == pytest.approx(np.array(segments) + [0, 0, ABOVE_MM])
     gone = []
     for pose in [*FIRST, *SECOND]:
         guide.watch(pose)
@@ -95,12 +127,13 @@ def test_poses_may_be_skipped_but_not_too_many_and_none_is_gone_back_to():
     [(5.9, 0, True), (6.1, 0, False), (0, 17.9, True), (0, 18.1, False), (3.1, 9, False)],
 )
 def test_what_is_near_is_a_way_and_a_turn_together(mm, degrees, near):
-    assert NEAR_MM == 6.0
-    guide = guide_of(sweep_of(straight_pass(2, step_mm=50.0)))
-    beside = turned(straight_pass(1)[0], degrees)
+    assert (NEAR_MM, DEG_BESIDE_A_MM) == (6.0, 3.0)
+    sparse = straight_pass(4, step_mm=50.0)
+    guide = guide_of(sweep_of(sparse))
+    beside = turned(sparse[2], degrees)
     beside[0, 3] += mm
     guide.watch(beside)
-    assert (guide.at == 1) == near
+    assert guide.at == (2 if near else 0)
 
 
 def test_the_sweeps_are_shown_in_turn_and_then_none():
@@ -118,12 +151,12 @@ def test_the_sweeps_are_shown_in_turn_and_then_none():
 
 def test_a_way_begun_anew_is_forgotten():
     guide = guide_of()
-    assert guide.findings() == {"plan": "0 %", "off the plan": ""}
+    assert guide.findings() == {"plan": "0 %", "off plan": ""}
     assert guide.in_words(None) == "plan      two passes: 0 % of it followed"
     guide.watch(FIRST[0])
     guide.begin_anew()
     assert guide.at == 0 and guide.figures()["plan_followed"] == 0 and not guide.guidance().gone.any()
-    assert guide.findings()["off the plan"] == ""
+    assert guide.findings()["off plan"] == ""
 
 
 # Its lines

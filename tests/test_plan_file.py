@@ -14,7 +14,7 @@ from scenes.trocar import Trocar
 from studies.plan import workers
 from studies.plan.command import trocar_of
 from studies.plan.file import PlanError, is_plan, next_free, read_plan, write_plan
-from studies.plan.track import LIFT_MM, LIFTED_MM_S, timed_poses
+from studies.plan.track import COMES_S, LIFT_MM, LIFTED_MM_S, timed_poses
 from studies.rehearse.command import check_plan
 from studies.rehearse.track_file import load_track
 from ultrasound.array import load_probe
@@ -157,15 +157,16 @@ def test_a_sweep_as_a_track_goes_at_its_speed_and_is_lifted_between_passes(tmp_p
     track = load_track(tmp_path / "plan.json")
     places = np.array([pose[:3, 3] for pose in track.poses]) - ORIGIN
     up = [0, 0, LIFT_MM]
-    expected = [up, [0, 0, 0], [0, 1.5, 0], [0, 3, 0], [0, 3, LIFT_MM]]
+    expected = [up, up, [0, 0, 0], [0, 1.5, 0], [0, 3, 0], [0, 3, LIFT_MM]]
     expected += [[9, 0, LIFT_MM], [9, 0, 0], [9, 1, 0], [9, 1, LIFT_MM]]
     assert places == pytest.approx(np.array(expected, float))
     way = np.linalg.norm(np.diff(places, axis=0), axis=1)
     speeds = way / np.diff(track.times_s)
-    assert speeds[[1, 2, 6]] == pytest.approx(5.0) and speeds[[3, 4, 7]] == pytest.approx(LIFTED_MM_S)
+    assert speeds[[1, 2, 3, 6, 7]] == pytest.approx(5.0) and speeds[[4, 5, 8]] == pytest.approx(LIFTED_MM_S)
+    assert track.times_s[:2].tolist() == [0.0, COMES_S]
     turned = sweep_of(straight_pass(2, step_mm=0.0))
     turned.passes[0][1] = (np.array(turned.passes[0][1]) @ TURNED).tolist()
-    assert np.diff(timed_poses(turned, 5.0).times_s)[1] == pytest.approx(40 / 1.5 / 5.0)
+    assert np.diff(timed_poses(turned, 5.0).times_s)[2] == pytest.approx(40 / 1.5 / 5.0)
 
 
 # The trocar, and the command line

@@ -10,19 +10,21 @@ from studies.scan.poses import TimedPoses
 
 # Between two passes the probe is backed out so far, and goes so fast.
 LIFT_MM, LIFTED_MM_S = 6.0, 60.0
+# So long the probe has to come over the first pose, from wherever it was.
+COMES_S = 1.0
 # A turn by so many degrees takes as long as a way of one millimetre.
 DEG_A_MM = 1.5
 
 
 def timed_poses(sweep: Sweep, speed_mm_s: float) -> TimedPoses:
-    """The sweep from above its first pose, at a speed on its passes, lifted between them."""
+    """The sweep from a wait above its first pose, at a speed on its passes, lifted between them."""
     poses: list[np.ndarray] = []
     speeds: list[float] = []
     for each in sweep.poses():
         poses += [lifted(each[0]), *each, lifted(each[-1])]
         speeds += [LIFTED_MM_S, speed_mm_s, *(speed_mm_s for _ in each[1:]), LIFTED_MM_S]
     lasts = [_length_mm(a, b) / speed for (a, b), speed in zip(pairwise(poses), speeds[1:], strict=True)]
-    return TimedPoses(np.concatenate([[0.0], np.cumsum(lasts)]), list(poses))
+    return TimedPoses(np.cumsum([0.0, COMES_S, *lasts]), [poses[0], *poses])
 
 
 def lifted(pose: np.ndarray) -> np.ndarray:

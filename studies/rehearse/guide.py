@@ -11,9 +11,11 @@ from studies.plan.parts import faces_of
 from studies.rehearsal import Rehearsal
 from ultrasound.probe import advanced, held_at, indentation
 
-# Nearer to the sweep than this in place, or in angle, it is followed; half of both is as near.
-NEAR_MM, NEAR_DEG = 6.0, 18.0
-# So many poses on from where the probe was it may be now.
+# A probe farther than this from the sweep is elsewhere; nearer than that to a pose it is there.
+NEAR_MM, THERE_MM = 6.0, 1.0
+# A turn beside the sweep by so many degrees is as far beside it as one millimetre.
+DEG_BESIDE_A_MM = 3.0
+# So many poses are looked ahead for the one that the probe is at.
 AHEAD = 6
 # So far above the organ the way is drawn.
 ABOVE_MM = 1.5
@@ -32,9 +34,7 @@ class Guide:
 
     def begin_anew(self) -> None:
         """Nothing of the sweep was gone yet."""
-        # Which pose the probe was at last, and how near each that it was at came: (mm, degrees).
-        self.at = -1
-        self._off: dict[int, tuple[float, float]] = {}
+        self.at = 0
         shown = self.number < len(self.plan.sweeps)
         length, origin = self.rehearsal.size_mm[2], self.rehearsal.origin
         passes = [
@@ -42,7 +42,8 @@ class Guide:
             for each in (self.plan.sweeps[self.number].poses() if shown else [])
         ]
         self._poses = np.concatenate(passes) if shown else np.zeros((0, 4, 4))
-        self._faces = faces_of(self.rehearsal.hand, self._poses)
+        # How far the probe was from each pose when it was nearest to it, in mm and degrees, and both together.
+        self._off, self._far = np.zeros((len(self._poses), 2)), np.full(len(self._poses), np.inf)
         drawn = [np.stack([self._above(pose) for pose in each]) for each in passes]
         segments = [np.stack([each[:-1], each[1:]], axis=1) for each in drawn]
         # The pose at the end of each segment, by its place in the whole sweep.
@@ -72,24 +73,28 @@ class Guide:
 
     def watch(self, pose: np.ndarray) -> None:
         """Where the transducer is now (4, 4)."""
-        first = max(self.at, 0)
-        window = slice(first, first + AHEAD + 1)
-        if len(self._poses) == 0:
-            return
-        off_mm = np.linalg.norm(self._faces[window] - faces_of(self.rehearsal.hand, pose[None]), axis=1)
-        cosine = (np.einsum("nij,ij->n", self._poses[window, :3, :3], pose[:3, :3]) - 1) / 2
-        off_deg = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        off = off_mm / NEAR_MM + off_deg / NEAR_DEG
-        nearest = int(np.argmin(off))
-        if off[nearest] <= 1.0:
-            self.at = first + nearest
-            beside = float(off_mm[nearest]), float(off_deg[nearest])
-            self._off[self.at] = min(beside, self._off.get(self.at, beside))
+        first = max(self.at - AHEAD, 0)
+        off = self._distance(pose, self._poses[first : self.at + AHEAD])
+        far = off[:, 0] + off[:, 1] / DEG_BESIDE_A_MM
+        places = first + np.flatnonzero(far < self._far[first : self.at + AHEAD])
+        self._off[places], self._far[places] = off[places - first], far[places - first]
+        ahead = far[self.at - first :]
+        if len(ahead) and ahead.min() <= NEAR_MM:
+            nearest = self.at + int(np.argmin(ahead))
+            is_at_end = nearest == first + int(np.argmin(far)) == len(self._poses) - 1
+            self.at = nearest + int(is_at_end or ahead.min() <= THERE_MM)
+
+    def _distance(self, pose: np.ndarray, others: np.ndarray) -> np.ndarray:
+        """How far a pose is from others (n, 4, 4): of the face's middle [mm], and of the turn [degrees]; (n, 2)."""
+        hand = self.rehearsal.hand
+        away = np.linalg.norm(faces_of(hand, others) - faces_of(hand, pose[None]), axis=1)
+        cosine = (np.einsum("nij,ij->n", others[:, :3, :3], pose[:3, :3]) - 1) / 2
+        return np.column_stack([away, np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))])
 
     @property
     def followed(self) -> float:
         """Share of the sweep that is behind, 0 to 1."""
-        return (self.at + 1) / len(self._poses) if len(self._poses) else 0.0
+        return self.at / len(self._poses) if len(self._poses) else 0.0
 
     def figures(self) -> dict[str, float | None]:
         """For the record; nothing where no sweep is shown."""
@@ -100,9 +105,9 @@ class Guide:
 
     def _beside(self) -> tuple[float, float] | None:
         """How far beside the sweep the probe went, on average (mm, degrees); None where it did not yet."""
-        if not self._off:
+        if self.at == 0:
             return None
-        off_mm, off_deg = np.mean(list(self._off.values()), axis=0)
+        off_mm, off_deg = self._off[: self.at].mean(axis=0)
         return float(off_mm), float(off_deg)
 
     def findings(self) -> dict[str, str]:
@@ -117,8 +122,8 @@ class Guide:
         """What is drawn of it."""
         if len(self._poses) == 0:
             return None
-        goal = self._poses[self.at + 1] if self.at + 1 < len(self._poses) else None
-        return Guidance(goal, self._segments, self._ends <= self.at)
+        goal = self._poses[self.at] if self.at < len(self._poses) else None
+        return Guidance(goal, self._segments, self._ends < self.at)
 
     def in_words(self, seen: float | None) -> str:
         """How it went, for the terminal; ``seen`` is the share of the target that was seen. Empty where no sweep is shown."""
