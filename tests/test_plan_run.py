@@ -2,7 +2,8 @@
 
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -60,6 +61,19 @@ def folder_of_ball(folder: Path) -> Path:
     return folder
 
 
+class Here:
+    """Instead of processes this one, where what they build stays."""
+
+    def __init__(self, jobs: int) -> None: ...
+
+    def submit(self, function: Callable, *arguments: object) -> Future:
+        done: Future = Future()
+        done.set_result(function(*arguments))
+        return done
+
+    def shutdown(self, **_: bool) -> None: ...
+
+
 @dataclass
 class Made:
     """A patient's folder with ``plan.json`` in it, what the commands said that made and followed it, and a trial of its ground."""
@@ -76,6 +90,7 @@ def made(tmp_path_factory) -> Iterator[Made]:
     folder = folder_of_ball(tmp_path_factory.mktemp("ball"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evolution, "FORECASTS", 8)
+        patch.setattr(workers, "ProcessPoolExecutor", Here)
         patch.setattr(headless, "open_viewer", lambda *_, **__: None)
         said = planned_into(folder / "plan.json")
         follow = ["--track", folder / "plan.json", "--plan", folder / "plan.json"]
