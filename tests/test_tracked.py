@@ -220,7 +220,7 @@ def test_time_goes_on_through_ways_back():
     half.session.moment = 4
     assert half.poses.length_s < 0.5 and np.array_equal(half.pose(), placed(1.0))
     session.moment = 16
-    assert played.pose() is not None
+    assert isinstance(played.pose(), np.ndarray)
     session.moment = 17
     with pytest.raises(TrackOver):
         played.pose()

@@ -93,11 +93,16 @@ def check_plan(plan: Plan, anatomy: str, probe: Probe) -> None:
             "the plan is of other anatomy than this scene's: name its scene or patient's folder before --plan; "
             "a patient imported anew is another one"
         )
-    planned = plan.probe.get("TransducerName"), plan.probe.get("HousingMm")
-    if planned != (probe.transducer_name, list(probe.housing_mm)):
+    planned = _probe_said(plan.probe.get("TransducerName"), plan.probe.get("HousingMm"))
+    found = _probe_said(probe.transducer_name, probe.housing_mm)
+    if planned != found:
         raise PlanError(
-            f"the plan is for the probe {planned[0]!r}, found {probe.transducer_name!r}: choose it with --probe, or plan anew"
+            f"the plan is for the probe {planned}, found {found}: choose it with --probe, or plan anew"
         )
+
+
+def _probe_said(name: Any, housing_mm: Any) -> str:
+    return f"{name!r} of {' x '.join(f'{each:g}' for each in housing_mm or ())} mm"
 
 
 def refuse_sizes(changed: dict[str, float | str | None]) -> None:

@@ -92,7 +92,7 @@ class Plans:
         return "" if self._planning is None else f"PLANNING   {100 * self._planning.share:.0f} %"
 
     def watch(self, controls: Controls) -> str:
-        """What the user asks for now, and a search that is over; what there is to say."""
+        """What the user has asked for, and a search that is over; what there is to say."""
         guide = self.instruments.guide
         if controls.reset and guide is not None:
             guide.begin_anew()
