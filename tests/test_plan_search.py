@@ -278,8 +278,8 @@ def test_a_process_keeps_no_ground_for_another():
         ground_of(scene=Scene(anatomy={}, tissue=dict(cell_mm=8.0))),
         ground_of(anatomy=LoadedAnatomy(trimesh.creation.box([9.0] * 3), None, None, ())),
     ]
-    assert len({Workers(each, None)._key for each in grounds}) == len(grounds)
-    assert Workers(ground_of(), None)._key == Workers(grounds[0], None)._key
+    assert len({Workers(each, 1)._key for each in grounds}) == len(grounds)
+    assert Workers(ground_of(), 1)._key == Workers(grounds[0], 1)._key
 
 
 def _end(key: str, ground: Ground) -> None:
@@ -298,7 +298,7 @@ def test_one_process_is_not_this_one():
 
 def test_who_waits_for_processes_that_are_stopped_is_told():
     with workers(ground_of(), 1) as crew:
-        waiting = crew._all(_sleep, [()] * 3)
+        waiting = crew._all(_sleep, [()] * 9)
         threading.Timer(0.5, crew.stop).start()
         with pytest.raises(PlanError, match="was ended"):
             list(waiting)

@@ -3,10 +3,12 @@
 A process computes on one CPU thread, so that several do not fight for the same ones, and keeps the model that it has built.
 """
 
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError
+from concurrent.futures import BrokenExecutor, CancelledError, Future
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 from joblib import cpu_count
@@ -72,8 +74,8 @@ Task = tuple[Candidate, dict[str, float], float]
 class Workers:
     """Processes that try ways on one ground. All that they do may raise PlanError."""
 
-    def __init__(self, ground: Ground, pool: ProcessPoolExecutor) -> None:
-        self.ground, self._pool = ground.bare, pool
+    def __init__(self, ground: Ground, jobs: int) -> None:
+        self.ground, self._jobs, self._pool = ground.bare, jobs, ProcessPoolExecutor(jobs)
         made_of = ground.scene, ground.probe, ground.target, ground.margin_mm, ground.trocar
         self._key = fingerprint(self.ground.anatomy) + repr(made_of)
 
@@ -98,10 +100,16 @@ class Workers:
         self._pool.shutdown(wait=False, kill_workers=True)
 
     def _all(self, function: Callable, tasks: Sequence[tuple]) -> Iterator:
+        waiting: deque[Future] = deque()
+        left = iter(tasks)
         try:
-            futures = [self._pool.submit(function, self._key, self.ground, *task) for task in tasks]
-            for future in futures:
-                yield future.result()
+            while True:
+                # With more than its processes soon take, loky's own thread falls over where it is stopped.
+                for task in islice(left, 2 * self._jobs - len(waiting)):
+                    waiting.append(self._pool.submit(function, self._key, self.ground, *task))
+                if not waiting:
+                    return
+                yield waiting.popleft().result()
         except (BrokenExecutor, ShutdownExecutorError, CancelledError):
             raise PlanError(
                 "a process of the search was ended, perhaps for want of memory; close other programs, or give fewer --jobs"
@@ -114,11 +122,11 @@ def workers(ground: Ground, jobs: int | None = None) -> Iterator[Workers]:
 
     One is a process of its own too: this one may have a Taichi that is in use.
     """
-    pool = ProcessPoolExecutor(jobs or cpu_count())
+    crew = Workers(ground, jobs or cpu_count())
     try:
-        yield Workers(ground, pool)
+        yield crew
     finally:
-        pool.shutdown(wait=False, kill_workers=True)
+        crew.stop()
 
 
 _built: dict[str, Trial] = {}

@@ -99,7 +99,9 @@ class Loop:
     def _status(self, view: View) -> str:
         if perf_counter() < self._said_until:
             return self._said
-        return self.keys.worded(view.status or self.sweeping.status or self.plans.status)
+        return self.keys.worded(
+            "   ".join(filter(None, [view.status or self.sweeping.status, self.plans.status]))
+        )
 
     def _announce(self, text: str) -> None:
         """Say something in the window and in the terminal."""
