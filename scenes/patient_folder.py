@@ -18,6 +18,8 @@ from scenes.parts import PARTS
 from scenes.patient import Patient
 from scenes.reading.error import PatientError
 from scenes.scene import Anatomy, Scene, scene_text
+from scenes.surface_files import save_surface
+from scenes.volume_files import save_image
 
 # Shorter texts, such as the id 7, say nothing, and numbers under six digits are in every file.
 LEAST_TEXT, LEAST_DIGITS = 3, 6
@@ -25,7 +27,7 @@ LEAST_TEXT, LEAST_DIGITS = 3, 6
 SURE_BYTES = 7
 ENCODINGS = ("utf-8", "utf-16-le", "latin-1")
 STL_HEADER, GZIP = 80, 31  # bytes; zlib's code
-COMMON = "left right kidney cyst vessels collecting system STL ITK NRRD complete type int short unsigned char gzip space"
+COMMON = "left right kidney cyst vessels collecting system STL LPS ITK NRRD complete type int short unsigned char gzip space"
 
 
 def save_patient(
@@ -66,9 +68,8 @@ def save_patient(
             os.replace(partial, folder)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
-    except (OSError, RuntimeError) as error:
-        reason = getattr(error, "strerror", None) or "the files could not be written"
-        raise PatientError(f"{folder}: {reason}; choose a folder that can be written") from error
+    except OSError as error:
+        raise PatientError(f"{folder}: {error.strerror}; choose a folder that can be written") from error
     return searched
 
 
@@ -85,11 +86,11 @@ def _write(patient: Patient, folder: Path, texts: dict[str, str]) -> None:
     for name, image in (("ct", patient.ct), ("labels", patient.labels)):
         bare = sitk.GetImageFromArray(sitk.GetArrayViewFromImage(image))  # without metadata
         bare.CopyInformation(image)
-        sitk.WriteImage(bare, str(folder / f"{name}.nrrd"), useCompression=True)
-    patient.organ.export(folder / "organ.stl")
-    patient.support.export(folder / "support.stl")
+        save_image(bare, folder / f"{name}.nrrd")
+    save_surface(patient.organ, folder / "organ.stl")
+    save_surface(patient.support, folder / "support.stl")
     for tissue, surface in patient.parts.items():
-        surface.export(folder / f"{PARTS[tissue]}.stl")
+        save_surface(surface, folder / f"{PARTS[tissue]}.stl")
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
 

@@ -17,7 +17,11 @@ def save_surface(surface: trimesh.Trimesh, path: Path) -> None:
     Coordinates are float32 there. A PLY keeps the order of the vertices, an STL has none. Raises OSError.
     """
     bare = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
-    path.write_bytes(WRITERS[path.suffix.removeprefix(".")](bare))
+    written = WRITERS[path.suffix.removeprefix(".")](bare)
+    try:
+        path.write_bytes(written)
+    except OSError as error:  # a full disk's error does not say which file
+        raise OSError(error.errno, error.strerror, str(path)) from None
 
 
 def _stl(surface: trimesh.Trimesh) -> bytes:

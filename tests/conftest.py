@@ -1,5 +1,7 @@
 """Shared by all tests: a fresh Taichi for each, small bodies, and the place of the optional real data."""
 
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +46,23 @@ def ball() -> trimesh.Trimesh:
 def block() -> trimesh.Trimesh:
     """A block of 24 x 20 x 16 mm about the origin."""
     return trimesh.creation.box([24.0, 20.0, 16.0])
+
+
+@pytest.fixture
+def bytes_to_a_file() -> Callable[[int], AbstractContextManager[None]]:
+    """While it lasts no file grows beyond so many bytes, as on a disk that is full."""
+    resource = pytest.importorskip("resource", reason="no limits of files on this system")
+
+    @contextmanager
+    def limited(most: int) -> Iterator[None]:
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    return limited
 
 
 def rotation_about(axis: list[float], degrees: float) -> np.ndarray:

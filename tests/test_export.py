@@ -13,6 +13,7 @@ from conftest import rotation_about
 
 import app
 from scenes.surface_files import FORMATS, save_surface
+from scenes.volume_files import save_image
 from studies.rehearse.saving import save_surfaces
 
 # Far from the origin, as a patient's organ is.
@@ -167,3 +168,15 @@ def test_what_cannot_be_exported_is_refused_in_one_line(patient, tmp_path):
     (broken / "ct.nrrd").write_bytes(b"NRRD0004\nnothing\n")
     (broken / "scene.toml").write_text("[anatomy]\nct = 'ct.nrrd'\n")
     assert "ct.nrrd" in refused(broken, "--out", tmp_path / "a") and not (tmp_path / "a").exists()
+
+
+def test_a_full_disk_is_one_line(patient, tmp_path, bytes_to_a_file):
+    told = io.StringIO()
+    # The surfaces have room for 64 KB; a volume of noise has not.
+    voxels = np.random.default_rng(5).integers(0, 255, (50, 50, 50)).astype(np.uint8)
+    with bytes_to_a_file(65536), pytest.raises(OSError, match="make space") as caught:
+        save_image(sitk.GetImageFromArray(voxels), tmp_path / "a.nrrd")
+    assert caught.value.filename == str(tmp_path / "a.nrrd")
+    with bytes_to_a_file(100), redirect_stderr(told):
+        assert app.main(["export", str(patient), "--out", str(tmp_path / "out")]) == 2
+    assert told.getvalue().count("\n") == 1 and "organ.stl" in told.getvalue()

@@ -267,6 +267,8 @@ class TestSave:
             np.testing.assert_allclose(again.GetDirection(), image.GetDirection(), atol=1e-9)
         organ = trimesh.load(folder / "organ.stl")
         assert organ.is_watertight and organ.volume == pytest.approx(patient.organ.volume, rel=1e-5)
+        # Without it 3D Slicer takes a surface's coordinates for RAS.
+        assert all(file.read_bytes().startswith(b"SPACE=LPS") for file in folder.glob("*.stl"))
         for file in folder.iterdir():
             content = file.read_bytes()
             assert b"Doe" not in content and str(tmp_path).encode() not in content
@@ -279,11 +281,16 @@ class TestSave:
             save_patient(patient, tmp_path / "precious.txt")
         assert [entry.name for entry in tmp_path.iterdir()] == ["precious.txt"]
 
-    def test_interrupted_leaves_nothing(self, patient, tmp_path, monkeypatch):
-        monkeypatch.setattr(
-            trimesh.Trimesh, "export", lambda *_: (_ for _ in ()).throw(OSError(28, "No space"))
-        )
+    def test_interrupted_leaves_nothing(self, patient, tmp_path):
+        def full(_folder):
+            raise OSError(28, "No space")
+
         with pytest.raises(PatientError, match="No space"):
+            save_patient(patient, tmp_path / "patient", draw=full)
+        assert list(tmp_path.iterdir()) == []
+
+    def test_a_disk_that_is_full_is_told_and_leaves_nothing(self, patient, tmp_path, bytes_to_a_file):
+        with bytes_to_a_file(100), pytest.raises(PatientError, match="make space"):
             save_patient(patient, tmp_path / "patient")
         assert list(tmp_path.iterdir()) == []
 

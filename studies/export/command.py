@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import click
-import SimpleITK as sitk
 import trimesh
 
 from scenes.anatomy import LoadedAnatomy, files_of, load_anatomy
@@ -12,7 +11,8 @@ from scenes.patient_folder import check_folder
 from scenes.reading.files import file_volume
 from scenes.scene import Scene, load_scene
 from scenes.surface_files import FORMATS, save_surface
-from studies.commands import Fault, make_folder
+from scenes.volume_files import save_image
+from studies.commands import make_folder
 
 
 @click.command()
@@ -61,14 +61,10 @@ def surfaces(anatomy: LoadedAnatomy) -> dict[str, trimesh.Trimesh]:
 
 
 def save_volumes(scene: Scene, folder: Path, out: Path) -> list[str]:
-    """Write the voxels of CT and label map as their files have them, without metadata; the names of the files. Raises Fault."""
+    """Write the voxels of CT and label map as their files have them, without metadata; the names of the files. Raises OSError."""
     folder, files = files_of(scene, folder)
     wanted = {"ct.nrrd": files.ct, "labels.nrrd": files.labels}
     written = {name: file for name, file in wanted.items() if file}
     for name, file in written.items():
-        image = file_volume(folder / file).image()
-        try:
-            sitk.WriteImage(image, str(out / name), useCompression=True)
-        except RuntimeError:
-            raise Fault(f"{out / name}: cannot be written; make space, or choose another --out") from None
+        save_image(file_volume(folder / file).image(), out / name)
     return list(written)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import SimpleITK as sitk
 
+from scenes.volume_files import save_image
 from studies.freehand.rebuild import Rebuilt
 from ultrasound.reconstruction import VoxelBox
 from ultrasound.sweep import Mark
@@ -22,8 +23,8 @@ def save_volumes(rebuilt: Rebuilt, out: Path) -> None:
 
 
 def save_volume(voxels: np.ndarray, box: VoxelBox, path: Path) -> None:
-    """Write voxels (x, y, z) on a box along the axes of LPS [mm], compressed; the suffix says the format."""
+    """Write voxels (x, y, z) on a box along the axes of LPS [mm], compressed; the suffix says the format. Raises OSError."""
     image = sitk.GetImageFromArray(np.ascontiguousarray(voxels.transpose(2, 1, 0)))
     image.SetOrigin([float(each) for each in box.origin_mm])
     image.SetSpacing([box.spacing_mm] * 3)
-    sitk.WriteImage(image, str(path), useCompression=True)
+    save_image(image, path)
