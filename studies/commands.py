@@ -1,10 +1,11 @@
 """The commands that measure how true a model is: ``validate`` and ``calibrate``."""
 
 import json
+import math
 import os
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 from tqdm import tqdm
@@ -19,6 +20,16 @@ if TYPE_CHECKING:
 
 class Fault(click.ClickException):
     """What the user must know, in one line."""
+
+
+class NumberRange(click.FloatRange):
+    """Numbers between two; click's own range lets nan through."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value} is no number", param, ctx)
+        return number
 
 
 def start_taichi(arch: str) -> str:
@@ -76,33 +87,29 @@ arch_option = click.option(
 @click.option(
     "--cell",
     "cell_mm",
-    type=click.FloatRange(0.5, 20),
+    type=NumberRange(0.5, 20),
     help="neo-hookean: width of a cell in mm [the preset's].",
 )
 @click.option(
     "--young-kpa",
-    type=click.FloatRange(0, 1e6, min_open=True),
+    type=NumberRange(0, 1e6, min_open=True),
     help="neo-hookean: Young's modulus in kPa [the case's].",
 )
-@click.option(
-    "--poisson", type=click.FloatRange(0, 0.4999), help="neo-hookean: Poisson's ratio [the case's]."
-)
+@click.option("--poisson", type=NumberRange(0, 0.4999), help="neo-hookean: Poisson's ratio [the case's].")
 @click.option(
     "--radius",
     "radius_mm",
-    type=click.FloatRange(0.5, 20),
+    type=NumberRange(0.5, 20),
     help="shape-matching: particle radius in mm [the preset's].",
 )
-@click.option(
-    "--stiffness", type=click.FloatRange(0, 1), help="shape-matching: cluster stiffness [the preset's]."
-)
+@click.option("--stiffness", type=NumberRange(0, 1), help="shape-matching: cluster stiffness [the preset's].")
 @click.option("--substeps", type=click.IntRange(1, 100), help="Substeps of a time step [the preset's].")
 @click.option(
     "--iterations",
     type=click.IntRange(1, 1000),
     help="Passes over the constraints in a substep [the preset's].",
 )
-@click.option("--time-step", "time_step_s", type=click.FloatRange(1e-4, 0.1), help="Time step in s [1/60].")
+@click.option("--time-step", "time_step_s", type=NumberRange(1e-4, 0.1), help="Time step in s [1/60].")
 @click.option(
     "--check",
     "checked",
@@ -174,7 +181,7 @@ def write_json(figures: dict, file: Path) -> None:
 @click.option(
     "--grid",
     "spacing",
-    type=click.FloatRange(0.01, 0.5),
+    type=NumberRange(0.01, 0.5),
     default=0.05,
     show_default=True,
     help="Spacing of the stiffnesses tried; around the best it is a fifth of that.",

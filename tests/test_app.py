@@ -5,9 +5,11 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from contextlib import redirect_stderr
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 import SimpleITK as sitk
@@ -200,6 +202,22 @@ def test_mistakes_are_one_line(tmp_path):
     assert "write cell_mm" in refused("rehearse", tmp_path)
     (tmp_path / "empty").mkdir()
     assert "holds no scene.toml" in refused("rehearse", tmp_path / "empty")
+
+
+def ranges(group: click.Group) -> Iterator[click.FloatRange]:
+    for command in group.commands.values():
+        if isinstance(command, click.Group):
+            yield from ranges(command)
+        yield from (each.type for each in command.params if isinstance(each.type, click.FloatRange))
+
+
+def test_no_range_of_numbers_lets_one_through_that_is_none():
+    found = list(ranges(app.cli))
+    assert len(found) > 20
+    for each in found:
+        for word in ("nan", "inf", "-inf"):
+            with pytest.raises(click.BadParameter):
+                each.convert(word, None, None)
 
 
 def test_an_organ_too_small_for_its_particles_is_refused_in_one_line(tmp_path):

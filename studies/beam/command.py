@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from studies.beam.capture import BeamError, load_captures
 from studies.beam.comparison import Row, check, compare, draw, table
-from studies.commands import Fault, make_folder, make_place, start_taichi, write_json
+from studies.commands import Fault, NumberRange, make_folder, make_place, start_taichi, write_json
 
 BEAM = "beam.stl"
 # Tip markers are balls that stand so far off the surface at the free end: on top, on one side, on the other, at these
@@ -26,28 +26,28 @@ OUTWARD = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 @click.option(
     "--cell",
     "cell_mm",
-    type=click.FloatRange(1, 30),
+    type=NumberRange(1, 30),
     default=10.0,
     show_default=True,
     help="Width of a cell in mm.",
 )
 @click.option(
     "--young-kpa",
-    type=click.FloatRange(0, 1e6, min_open=True),
+    type=NumberRange(0, 1e6, min_open=True),
     default=263.8,
     show_default=True,
     help="Young's modulus in kPa.",
 )
 @click.option(
     "--poisson",
-    type=click.FloatRange(0, 0.5, max_open=True),
+    type=NumberRange(0, 0.5, max_open=True),
     default=0.499,
     show_default=True,
     help="Poisson's ratio.",
 )
 @click.option(
     "--density",
-    type=click.FloatRange(0, 30, min_open=True),
+    type=NumberRange(0, 30, min_open=True),
     default=1.07,
     show_default=True,
     help="Density in g/cm^3.",

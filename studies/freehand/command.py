@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.scene import Scene, load_scene
-from studies.commands import Fault, arch_option, make_folder, start_taichi
+from studies.commands import Fault, NumberRange, arch_option, make_folder, start_taichi
 from studies.freehand.files import save_volumes
 from studies.freehand.picture import save_picture
 from studies.freehand.rebuild import Places, Rebuilt, Track, lit, rebuild, track_of
@@ -54,11 +54,11 @@ MOST_REACH_MM = 5.0
     help="How pixels become voxels.",
 )
 @click.option(
-    "--spacing-mm", type=click.FloatRange(0.05, 10), default=0.5, show_default=True, help="Width of a voxel."
+    "--spacing-mm", type=NumberRange(0.05, 10), default=0.5, show_default=True, help="Width of a voxel."
 )
 @click.option(
     "--reach-mm",
-    type=click.FloatRange(0, 20),
+    type=NumberRange(0, 20),
     help="Gaps up to twice as wide are filled [as wide as most pictures are apart].",
 )
 @click.option(
@@ -67,22 +67,20 @@ MOST_REACH_MM = 5.0
     help="Press the scene's organ once more on the tracked way, and put each pixel where its tissue was at rest.",
 )
 @click.option(
-    "--noise-mm", type=click.FloatRange(0), default=0.0, help="Add a tracker's noise: SD of each coordinate."
+    "--noise-mm", type=NumberRange(0), default=0.0, help="Add a tracker's noise: SD of each coordinate."
 )
-@click.option(
-    "--noise-deg", type=click.FloatRange(0), default=0.0, help="The same of the angle about each axis."
-)
+@click.option("--noise-deg", type=NumberRange(0), default=0.0, help="The same of the angle about each axis.")
 @click.option(
     "--calibration-mm",
-    type=click.FloatRange(0),
+    type=NumberRange(0),
     default=0.0,
     help="Image off the probe by so much, in all frames.",
 )
 @click.option(
-    "--calibration-deg", type=click.FloatRange(0), default=0.0, help="Image turned on the probe by so much."
+    "--calibration-deg", type=NumberRange(0), default=0.0, help="Image turned on the probe by so much."
 )
-@click.option("--latency-s", type=click.FloatRange(0), default=0.0, help="Poses of so much earlier.")
-@click.option("--lost", type=click.FloatRange(0, 1), default=0.0, help="Share of frames without a pose.")
+@click.option("--latency-s", type=NumberRange(0), default=0.0, help="Poses of so much earlier.")
+@click.option("--lost", type=NumberRange(0, 1), default=0.0, help="Share of frames without a pose.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of these errors.")
 @arch_option
 def reconstruct(

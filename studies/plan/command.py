@@ -1,6 +1,5 @@
 """The command ``plan``: where to move the probe so that a target is seen, with little pressing and through a trocar."""
 
-import math
 from pathlib import Path
 
 import click
@@ -10,17 +9,10 @@ from tqdm import tqdm
 from scenes.anatomy import load_anatomy
 from scenes.scene import EMBEDDED, load_scene, with_options
 from scenes.trocar import Trocar
-from studies.commands import Fault, make_folder
+from studies.commands import Fault, NumberRange, make_folder
 from studies.plan.file import FASTEST_MM_S, MOST_MARGIN_MM, MOST_SWEEPS, SLOWEST_MM_S, scans_of, write_plan
 from studies.setup import probe_of
 from ultrasound.target import TARGETS, Target
-
-
-def refuse_nan(context: click.Context, option: click.Parameter, value: float) -> float:
-    """Raises BadParameter for what a range of click's lets through."""
-    if math.isnan(value):
-        raise click.BadParameter("nan is no number", context, option)
-    return value
 
 
 @click.command()
@@ -33,8 +25,7 @@ def refuse_nan(context: click.Context, option: click.Parameter, value: float) ->
 )
 @click.option(
     "--margin-mm",
-    type=click.FloatRange(0, MOST_MARGIN_MM),
-    callback=refuse_nan,
+    type=NumberRange(0, MOST_MARGIN_MM),
     default=5.0,
     show_default=True,
     help="How much around the tumour is to be seen.",
@@ -51,8 +42,7 @@ def refuse_nan(context: click.Context, option: click.Parameter, value: float) ->
 @click.option("--probe", help="Probe, by its name or as a file [the scene's].")
 @click.option(
     "--speed-mm-s",
-    type=click.FloatRange(SLOWEST_MM_S, FASTEST_MM_S),
-    callback=refuse_nan,
+    type=NumberRange(SLOWEST_MM_S, FASTEST_MM_S),
     default=10.0,
     show_default=True,
     help="How fast the sweep will be gone.",

@@ -8,7 +8,7 @@ import trimesh
 
 from scenes.anatomy import load_anatomy
 from scenes.scene import PAPER, load_scene
-from studies.commands import Fault, make_folder
+from studies.commands import Fault, NumberRange, make_folder
 
 
 @click.command()
@@ -16,7 +16,7 @@ from studies.commands import Fault, make_folder
 @click.option(
     "--edge",
     "edge_mm",
-    type=click.FloatRange(2, 10),
+    type=NumberRange(2, 10),
     default=4.0,
     show_default=True,
     help="Length in mm of the elements' edges by the transducer.",

@@ -9,7 +9,7 @@ import click
 from render.keys import Keys, keys_text, load_keys
 from scenes.anatomy import LoadedAnatomy, fingerprint, load_anatomy
 from scenes.scene import EMBEDDED, OPTIONS, TISSUES, Scene, load_scene, with_options
-from studies.commands import Fault, arch_option, make_folder, start_taichi
+from studies.commands import Fault, NumberRange, arch_option, make_folder, start_taichi
 from studies.link.options import link_options, opened_link
 from studies.plan.file import is_plan, read_plan
 from studies.rehearse.checks import (
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--seconds",
-    type=click.FloatRange(0.02, 3600),
+    type=NumberRange(0.02, 3600),
     help="Simulated seconds without a window [the scene's press].",
 )
 @click.option(
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path),
     help="A session recorded before, of this SCENE: the same once more, bit for bit.",
 )
-@click.option("--at", type=click.FloatRange(0), default=0.0, help="With --replay: open it at this second.")
+@click.option("--at", type=NumberRange(0), default=0.0, help="With --replay: open it at this second.")
 @click.option(
     "--track",
     "track_file",
@@ -86,12 +86,12 @@ if TYPE_CHECKING:
 @click.option("--rung", type=click.Choice(RUNGS), help="How much of the echo is computed [the scene's].")
 @click.option(
     "--budget-ms",
-    type=click.FloatRange(0.01, 10_000),
+    type=NumberRange(0.01, 10_000),
     help="Choose size and passes: the truest whose step takes no longer on this machine, measured first.",
 )
 @click.option(
     "--error-mm",
-    type=click.FloatRange(0, 100),
+    type=NumberRange(0, 100),
     help="Choose size and passes: the fastest whose mean error, as study trade measured it, is no larger.",
 )
 @link_options

@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy
 from scenes.scene import EMBEDDED, load_scene
-from studies.commands import arch_option, make_folder, start_taichi
+from studies.commands import NumberRange, arch_option, make_folder, start_taichi
 from studies.setup import PRESETS, QUALITIES
 
 
@@ -19,7 +19,7 @@ from studies.setup import PRESETS, QUALITIES
     "--out", type=click.Path(path_type=Path), required=True, help="Folder for the session and the figures."
 )
 @click.option(
-    "--minutes", type=click.FloatRange(0.05, 600), default=10.0, show_default=True, help="Simulated minutes."
+    "--minutes", type=NumberRange(0.05, 600), default=10.0, show_default=True, help="Simulated minutes."
 )
 @click.option(
     "--model",
