@@ -130,12 +130,17 @@ def decimate(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
     """
     if len(surface.faces) <= faces:
         return surface
-    vertices = np.asfortranarray(surface.vertices)
-    triangles = np.asfortranarray(surface.faces, np.int32)
-    free = trimesh.Trimesh(*igl.qslim(vertices, triangles, faces, False)[:2], process=False)
-    if self_intersections(free) == 0:
-        return free
-    return trimesh.Trimesh(*igl.qslim(vertices, triangles, faces, True)[:2], process=False)
+    for without_crossings in (False, True):
+        vertices, triangles, _, _ = igl.qslim(
+            np.asfortranarray(surface.vertices),
+            np.asfortranarray(surface.faces, np.int32),
+            faces,
+            without_crossings,
+        )
+        coarse = trimesh.Trimesh(vertices, triangles, process=False)
+        if self_intersections(coarse) == 0:
+            break
+    return coarse
 
 
 def _even_triangles(coarse: trimesh.Trimesh, fine: trimesh.Trimesh, passes: int = 8) -> trimesh.Trimesh:
