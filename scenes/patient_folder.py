@@ -69,7 +69,8 @@ def save_patient(
         finally:
             shutil.rmtree(partial, ignore_errors=True)
     except OSError as error:
-        raise PatientError(f"{folder}: {error.strerror}; choose a folder that can be written") from error
+        reason = error.strerror or "its files cannot be written"
+        raise PatientError(f"{folder}: {reason}; choose a folder that can be written") from error
     return searched
 
 

@@ -12,5 +12,5 @@ def save_image(image: sitk.Image, path: Path) -> None:
         sitk.WriteImage(image, str(path), useCompression=True)
         sitk.ReadImage(str(path))  # as ITK does not notice a disk that is full from the last bytes on
     except RuntimeError:  # all that ITK tells, in many lines
-        reason = "cannot be written; make space, or choose another folder"
+        reason = "cannot be written whole (is the disk full?)"
         raise OSError(errno.EIO, reason, str(path)) from None

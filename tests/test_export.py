@@ -174,7 +174,7 @@ def test_a_full_disk_is_one_line(patient, tmp_path, bytes_to_a_file):
     told = io.StringIO()
     # The surfaces have room for 64 KB; a volume of noise has not.
     voxels = np.random.default_rng(5).integers(0, 255, (50, 50, 50)).astype(np.uint8)
-    with bytes_to_a_file(65536), pytest.raises(OSError, match="make space") as caught:
+    with bytes_to_a_file(65536), pytest.raises(OSError, match="is the disk full") as caught:
         save_image(sitk.GetImageFromArray(voxels), tmp_path / "a.nrrd")
     assert caught.value.filename == str(tmp_path / "a.nrrd")
     with bytes_to_a_file(100), redirect_stderr(told):

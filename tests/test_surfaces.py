@@ -20,7 +20,7 @@ from synthetic_body import (
 )
 
 from scenes.support import cradle
-from scenes.surfaces import self_intersections, surface_from_mask
+from scenes.surfaces import decimate, self_intersections, surface_from_mask
 
 
 class TestSurface:
@@ -80,6 +80,17 @@ class TestSurface:
         assert self_intersections(ball) == 0
         ball.vertices[0] = -1.5 * ball.vertices[0]
         assert self_intersections(ball) > 0
+
+    def test_walls_close_to_each_other_stay_apart(self):
+        """A ball folded into a bowl: thinned without regard to the other wall, each wall goes through it."""
+        ball = trimesh.creation.icosphere(subdivisions=3, radius=10.0)
+        x, y, z = ball.vertices.T
+        bowl = trimesh.Trimesh(
+            np.column_stack([x, y, np.where(z < 0, -0.95 * z, z)]), ball.faces, process=False
+        )
+        thin = decimate(bowl, 120)
+        assert len(thin.faces) == 120 and thin.is_watertight
+        assert self_intersections(bowl) == self_intersections(thin) == 0
 
 
 class TestSupport:
