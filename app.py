@@ -3,32 +3,38 @@
 import signal
 import sys
 import threading
+from importlib import import_module
 
 import click
 
 from render.keys import KeysError
-from scenes.command import import_patient_command
 from scenes.reading.error import PatientError
 from scenes.scene import SceneError
 from sim.sampling import SamplingError
-from studies.beam.command import beam
 from studies.case import CaseError
-from studies.commands import calibrate, validate
-from studies.export.command import export
-from studies.freehand.command import reconstruct
-from studies.plan.command import plan
 from studies.plan.file import PlanError
-from studies.reference.command import reference
-from studies.rehearse.command import keys_command, rehearse
-from studies.scan.command import scan
 from studies.scan.poses import PoseError
 from studies.session.file import SessionError
 from studies.setup import SetupError
-from studies.study import study
 from ultrasound.acoustics import TissueError
 from ultrasound.array import ProbeError
 from ultrasound.sweep import SweepError
 
+# Where each command is; only the one that is called is imported, for the others' libraries take seconds to load.
+COMMANDS = {
+    "rehearse": "studies.rehearse.command:rehearse",
+    "keys": "studies.rehearse.command:keys_command",
+    "import": "scenes.command:import_patient_command",
+    "plan": "studies.plan.command:plan",
+    "export": "studies.export.command:export",
+    "scan": "studies.scan.command:scan",
+    "reconstruct": "studies.freehand.command:reconstruct",
+    "validate": "studies.commands:validate",
+    "calibrate": "studies.commands:calibrate",
+    "beam": "studies.beam.command:beam",
+    "reference": "studies.reference.command:reference",
+    "study": "studies.study:study",
+}
 # What is wrong with a file or a value, said in one line.
 MENDED_BY_USER = (
     SceneError,
@@ -46,29 +52,25 @@ MENDED_BY_USER = (
 )
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+class Commands(click.Group):
+    """Commands that are imported when they are called."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        if name not in COMMANDS:
+            return None
+        module, command = COMMANDS[name].split(":")
+        return getattr(import_module(module), command)
+
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 def cli() -> None:
     """Nephron: rehearse ultrasound on a patient's own deformable kidney.
 
     Without a command it is `rehearse` on the embedded patient.
     """
-
-
-for command in (
-    rehearse,
-    keys_command,
-    import_patient_command,
-    plan,
-    export,
-    scan,
-    reconstruct,
-    validate,
-    calibrate,
-    beam,
-    reference,
-    study,
-):
-    cli.add_command(command)
 
 
 def _stop_in_order() -> None:

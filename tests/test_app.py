@@ -205,7 +205,9 @@ def test_mistakes_are_one_line(tmp_path):
 
 
 def ranges(group: click.Group) -> Iterator[click.FloatRange]:
-    for command in group.commands.values():
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
         if isinstance(command, click.Group):
             yield from ranges(command)
         yield from (each.type for each in command.params if isinstance(each.type, click.FloatRange))
