@@ -20,6 +20,7 @@ from scenes.phantom import Label, make_phantom
 from scenes.reading.error import PatientError
 from scenes.reading.files import file_volume
 from scenes.reading.labels import LabelMap
+from scenes.reading.progress import Told, untold
 from scenes.reading.volume import Volume
 from scenes.scene import (
     Anatomy,
@@ -73,9 +74,9 @@ class LoadedAnatomy:
     """Surfaces of cysts, vessels and collecting system, by tissue."""
 
 
-def load_anatomy(scene: Scene, folder: Path) -> LoadedAnatomy:
+def load_anatomy(scene: Scene, folder: Path, told: Told = untold) -> LoadedAnatomy:
     """Read the files that a scene names, relative to ``folder``. Raises SceneError with one line."""
-    folder, anatomy = files_of(scene, folder)
+    folder, anatomy = files_of(scene, folder, told)
     return LoadedAnatomy(
         organ=load_surface(folder, anatomy.organ),
         tumour=load_surface(folder, anatomy.tumour) if anatomy.tumour else None,
@@ -87,12 +88,12 @@ def load_anatomy(scene: Scene, folder: Path) -> LoadedAnatomy:
     )
 
 
-def files_of(scene: Scene, folder: Path) -> tuple[Path, Anatomy]:
+def files_of(scene: Scene, folder: Path, told: Told = untold) -> tuple[Path, Anatomy]:
     """A scene's files and the folder that they are in: its own, or the embedded patient's. Raises SceneError."""
     if not scene.anatomy.phantom:
         return folder, scene.anatomy
     parts = {tissue: f"{PARTS[tissue]}.stl" for tissue in PHANTOM_PARTS}
-    return phantom_folder(), Anatomy(
+    return phantom_folder(told), Anatomy(
         tumour="tumour.stl", parts=parts, ct="ct.nrrd", labels="labels.nrrd", tissues=PHANTOM_TISSUES
     )
 
@@ -158,7 +159,7 @@ def patient_scene(patient: Patient) -> Scene:
     )
 
 
-def phantom_folder() -> Path:
+def phantom_folder(told: Told = untold) -> Path:
     """Folder of the embedded patient, imported like any other on first use and whenever its sources changed."""
     names = (
         "phantom",
@@ -178,7 +179,7 @@ def phantom_folder() -> Path:
         if folder.is_dir():
             return folder
         if _can_write(root):
-            patient = _phantom_patient()
+            patient = _phantom_patient(told)
             try:
                 save_patient(patient, folder)
             except PatientError:
@@ -188,9 +189,11 @@ def phantom_folder() -> Path:
     raise SceneError(f"{CACHE}: cannot be written; the embedded patient needs a folder for its files")
 
 
-def _phantom_patient() -> Patient:
+def _phantom_patient(told: Told) -> Patient:
     """The embedded patient: its organ is all that it has labelled."""
+    told("Making the embedded patient, this once: its CT")
     ct, image = make_phantom()
+    told("Making the embedded patient, this once: its surfaces")
     labels = LabelMap.of(image)
     named = {
         value: replace(segment, tissue=TISSUE_OF_PART[value]) for value, segment in labels.segments.items()

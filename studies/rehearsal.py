@@ -11,6 +11,7 @@ import taichi as ti
 import trimesh
 
 from scenes.anatomy import Grid, LoadedAnatomy, press_on
+from scenes.reading.progress import Told, untold
 from scenes.scene import NeoHookeanTissue, PlaneShape, Scene
 from sim.embedding import Embedding
 from sim.guard import Guard, Watch
@@ -63,10 +64,18 @@ class RehearsalState:
 class Rehearsal:
     """A scene on the device. All positions are mm relative to ``origin``, the middle of the resting organ (LPS).
 
-    Needs Taichi to be initialised; a new one for another scene needs it initialised anew, which frees the old.
+    Needs Taichi to be initialised; a new one for another scene needs it initialised anew, which frees the old. ``told`` hears
+    what is being made; one that ``shows_echo`` from its first frame on gets ready for it meanwhile.
     """
 
-    def __init__(self, scene: Scene, anatomy: LoadedAnatomy, probe: Probe | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        anatomy: LoadedAnatomy,
+        probe: Probe | None = None,
+        told: Told = untold,
+        shows_echo: bool = False,
+    ) -> None:
         self.scene = scene
         self.probe = probe or probe_of(scene)
         self.origin = anatomy.organ.bounds.mean(axis=0)
@@ -76,14 +85,19 @@ class Rehearsal:
         self.gravity_direction = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
         meshes = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
         self.supports = [_shrunk(_shifted(mesh, -self.origin), SUPPORT_SUNK_MM) for mesh in meshes]
+        told("Building the model: tissue and contacts")
         self._build_solver(anatomy)
         self.guard = Guard(self.solver)
         self.notice = ""
+        told("Building the model: surfaces")
         self._build_surfaces()
         self._build_scanner(anatomy)
+        if shows_echo and self.scanner is not None:
+            self.scanner.foresee_echo()
         self._points = load_points()
         self.press = press_on(scene.press, anatomy, self.gravity_direction)
         self.steps = 0
+        told("Building the model: the tissue comes to rest")
         self.pose = self._settle()
         self.hand = self._hand()
         self.pose = self.hand.pose()

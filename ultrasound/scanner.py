@@ -1,6 +1,7 @@
 """The scanner: what a probe at a pose shows of tissue, as CT, as echo, or both on the same plane."""
 
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -65,6 +66,16 @@ class Scanner:
         self.probe = probe
         self.plane = PlaneInTissue(embedding, pixels)
         self.outside, self.contact, self.contact_gap_mm = outside, contact, contact_gap_mm
+        self._values: Future[np.ndarray] | None = None
+
+    def foresee_echo(self) -> Future[np.ndarray]:
+        """Begin with what an echo needs, on a thread of its own, while other things are made."""
+        if self._values is None:
+            anatomy, worker = self.anatomy, ThreadPoolExecutor(1)
+            voxels = anatomy.hu, anatomy.labels, anatomy.tissues, anatomy.voxel_mm
+            self._values = worker.submit(properties, *voxels)
+            worker.shutdown(wait=False)
+        return self._values
 
     @cached_property
     def slice(self) -> Slice:
@@ -75,15 +86,14 @@ class Scanner:
     @cached_property
     def bmode(self) -> BMode:
         """The echo's side of the scanner."""
-        anatomy, voxel_mm = self.anatomy, self.anatomy.voxel_mm
-        values = properties(anatomy.hu, anatomy.labels, anatomy.tissues, voxel_mm)
-        tissue = Volume(values, anatomy.index_from_mm, outside=0.0)
+        values, self._values = self.foresee_echo().result(), None
+        tissue = Volume(values, self.anatomy.index_from_mm, outside=0.0)
         return BMode(
             tissue,
             self._organ,
             self.plane,
             self.probe,
-            float(voxel_mm.mean()),
+            float(self.anatomy.voxel_mm.mean()),
             self.contact,
             self.contact_gap_mm,
             AROUND[self.outside],

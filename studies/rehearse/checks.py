@@ -8,7 +8,9 @@ from pydantic import ValidationError
 from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.scene import OPTIONS, Scene
 from studies.commands import Fault
-from studies.plan.file import Plan, PlanError
+from studies.plan.file import Plan, PlanError, is_plan, read_plan
+from studies.rehearse.track_file import check_near
+from studies.scan.poses import TimedPoses
 from studies.session.file import Log, SessionError, read_log
 from studies.session.scene import scene_of_log
 from ultrasound.array import Probe, explained
@@ -84,6 +86,13 @@ def check_anatomy(log: Log, anatomy: LoadedAnatomy, title: str) -> None:
             f"the session is of other anatomy than this scene's ({title or 'no title'}): name "
             "its scene or patient's folder before --replay; a patient imported anew is another one"
         )
+
+
+def check_track(track: TimedPoses, path: Path, anatomy: LoadedAnatomy, probe: Probe) -> None:
+    """Raises PoseError where a track is far from the organ, PlanError where it is a plan for other anatomy or another probe."""
+    check_near(track, anatomy.organ.vertices, path)
+    if is_plan(path):
+        check_plan(read_plan(path), fingerprint(anatomy), probe)
 
 
 def check_plan(plan: Plan, anatomy: str, probe: Probe) -> None:

@@ -8,21 +8,23 @@ import click
 
 from render.keys import Keys, keys_text, load_keys
 from scenes.anatomy import LoadedAnatomy, fingerprint, load_anatomy
+from scenes.reading.progress import Stages, Told
 from scenes.scene import EMBEDDED, OPTIONS, TISSUES, Scene, load_scene, with_options
 from studies.commands import Fault, NumberRange, arch_option, make_folder, start_taichi
 from studies.link.options import link_options, opened_link
-from studies.plan.file import is_plan, read_plan
+from studies.plan.file import read_plan
 from studies.rehearse.checks import (
     as_recorded,
     check_anatomy,
     check_plan,
+    check_track,
     recorded_probe,
     refuse_headless,
     refuse_inputs,
     refuse_sizes,
     session_of,
 )
-from studies.rehearse.track_file import PROBE_IN_PATIENT, check_near, load_track
+from studies.rehearse.track_file import PROBE_IN_PATIENT, load_track
 from studies.setup import Setup, probe_of, scene_of
 from ultrasound.array import MODES, RUNGS, Probe
 
@@ -132,36 +134,32 @@ def rehearse(
     loaded = with_options(before, changed) if log is None else as_recorded(log, before)
     if changed["tissue.model"] is None and loaded.tissue.model != before.tissue.model:
         click.echo(f"Tissue model: {loaded.tissue.model}, as the options ask for it.")
-    anatomy = load_anatomy(loaded, path.parent)
     probe = probe_of(loaded, path.parent) if log is None else recorded_probe(log)
-    if log is not None:
-        check_anatomy(log, anatomy, before.title)
-    if track is not None and track_file is not None:
-        check_near(track, anatomy.organ.vertices, track_file)
-        if is_plan(track_file):
-            check_plan(read_plan(track_file), fingerprint(anatomy), probe)
-    if plan is not None:
-        check_plan(plan, fingerprint(anatomy), probe)
     budgeted = budget_ms is not None or error_mm is not None
     if budgeted:
         refuse_sizes(changed)
-    server = opened_link(link, link_host, link_port, link_leads)
-    used = start_taichi(arch)
-    from render.window import display_available
-    from studies.rehearsal import Rehearsal
-
-    if not headless and not display_available():
-        click.echo("No display: running the scripted press without a window.")
-        headless = True
+    headless = headless or not found_display()
     refuse_headless(headless, gamepad, link_leads)
     make_folder(out)
-    click.echo("Building the model.")
-    started = perf_counter()
-    if budgeted:
-        model = changed["tissue.model"]
-        rehearsal = build_within(loaded, anatomy, probe, used, model, budget_ms, error_mm)
-    else:
-        rehearsal = Rehearsal(loaded, anatomy, probe)
+    used = start_taichi(arch)
+    server = opened_link(link, link_host, link_port, link_leads)
+    with Stages() as told:
+        anatomy = load_anatomy(loaded, path.parent, told)
+        if log is not None:
+            check_anatomy(log, anatomy, before.title)
+        if track is not None and track_file is not None:
+            check_track(track, track_file, anatomy, probe)
+        if plan is not None:
+            check_plan(plan, fingerprint(anatomy), probe)
+        started, chosen = perf_counter(), ""
+        if budgeted:
+            model = changed["tissue.model"]
+            rehearsal, chosen = built_within(loaded, anatomy, probe, used, told, model, budget_ms, error_mm)
+        else:
+            rehearsal = built(loaded, anatomy, probe, told)
+        build_s = perf_counter() - started
+    if chosen:
+        click.echo(chosen)
     from studies.rehearse.run import Run
 
     run = Run(
@@ -178,7 +176,7 @@ def rehearse(
         plan=plan,
     )
     if headless:
-        run.headless(log, at, seconds, perf_counter() - started)
+        run.headless(log, at, seconds, build_s)
     else:
         run.in_window(log, at)
 
@@ -189,29 +187,50 @@ def keys_command() -> None:
     click.echo(keys_text(), nl=False)
 
 
-def build_within(
+def found_display() -> bool:
+    """Whether there is a screen for a window; says so where there is none."""
+    from render.window import display_available
+
+    found = display_available()
+    if not found:
+        click.echo("No display: running the scripted press without a window.")
+    return found
+
+
+def built(scene: Scene, anatomy: LoadedAnatomy, probe: Probe, told: Told) -> "Rehearsal":
+    """The rehearsal, with all compiled that its first frame takes."""
+    from studies.rehearsal import Rehearsal
+    from studies.rehearse.view import settings_of, take_view
+    from studies.report import Record
+
+    rehearsal = Rehearsal(scene, anatomy, probe, told, shows_echo=scene.image.mode != "ct")
+    told("Building the model: the first picture")
+    take_view(rehearsal, settings_of(rehearsal), None, Record(0.0))
+    return rehearsal
+
+
+def built_within(
     scene: Scene,
     anatomy: LoadedAnatomy,
     probe: Probe,
     arch: str,
+    told: Told,
     model: Any,
     budget_ms: float | None,
     error_mm: float | None,
-) -> "Rehearsal":
-    """The rehearsal with the settings that fit the budgets on this machine. Raises Fault."""
-    from studies.rehearsal import Rehearsal
+) -> tuple["Rehearsal", str]:
+    """The rehearsal with the settings that fit the budgets on this machine, and which they are. Raises Fault."""
     from studies.trade.choice import NoPoint, choose, described
     from studies.trade.front import front_of, load_points
 
-    def build(setup: Setup) -> Rehearsal:
+    def build(setup: Setup) -> "Rehearsal":
         start_taichi(arch)
-        return Rehearsal(scene_of(scene, setup), anatomy, probe)
+        return built(scene_of(scene, setup), anatomy, probe, told)
 
     try:
         rehearsal, point, step_ms = choose(front_of(load_points(), model), build, budget_ms, error_mm)
     except NoPoint as reason:
         raise Fault(str(reason)) from None
-    click.echo(
+    return rehearsal, (
         f"Chosen: {described(point.setup)}; a step takes {step_ms:.1f} ms here, expected error {point.error_mean_mm:.2f} mm."
     )
-    return rehearsal

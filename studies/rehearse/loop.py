@@ -49,7 +49,6 @@ class Loop:
     def run(self) -> None:
         """Go on until the window is closed."""
         before = perf_counter()
-        take_view(self.rehearsal, self.viewer.settings, None, self.record)
         while self.viewer.running:
             controls = self.viewer.read_controls()
             view = self.frame(controls)
