@@ -15,7 +15,8 @@ from render.panel import ALERT, LINE, MARK, QUIET, TEXT, Panel, draw_panel, font
 
 BACKDROP_TOP, BACKDROP_FOOT = (30, 35, 42), (13, 15, 19)
 STRIP, FINDINGS = (17, 20, 24), (20, 24, 29)
-HELP_COLUMNS, HELP_KEY_PX = 2, 104
+HELP_COLUMNS, HELP_GAP_PX, FIGURES_GAP_PX = 2, 36, 20
+LEAST_FONT_PX = 8
 
 
 def backdrop(
@@ -37,27 +38,41 @@ def backdrop(
     for y in (layout.title.bottom - 1, layout.strip.top):
         draw.line([(0, y), (layout.strip.right, y)], fill=LINE)
     if help_lines is not None:
-        _draw_help(draw, layout.help, list(help_lines))
+        _draw_help(draw, layout, list(help_lines))
     return np.array(image)
 
 
 def _draw_title(draw: ImageDraw.ImageDraw, layout: Layout, panel: Panel, help_key: str) -> None:
-    draw.text((16, 12), panel.title or "Nephron", font=font(17), fill=TEXT)
-    draw.text((layout.scene.right - 16, 15), f"{help_key}  all keys", font=font(13), fill=QUIET, anchor="ra")
+    px, middle = layout.px, layout.title.height // 2
+    draw.text((px(16), middle), panel.title or "Nephron", font=font(px(17)), fill=TEXT, anchor="lm")
+    right = layout.scene.right - px(16)
+    draw.text((right, middle), f"{help_key}  all keys", font=font(px(14)), fill=TEXT, anchor="rm")
 
 
-def _draw_help(draw: ImageDraw.ImageDraw, box: Rect, lines: list[tuple[str, str]]) -> None:
-    draw.rounded_rectangle(
-        [box.left, box.top, box.right - 1, box.bottom - 1], radius=8, fill=(22, 26, 31), outline=LINE
-    )
+def _draw_help(draw: ImageDraw.ImageDraw, layout: Layout, lines: list[tuple[str, str]]) -> None:
+    box, px = layout.help, layout.px
+    corners = [box.left, box.top, box.right - 1, box.bottom - 1]
+    draw.rounded_rectangle(corners, radius=px(8), fill=(22, 26, 31), outline=LINE)
     rows = max(1, -(-len(lines) // HELP_COLUMNS))
-    pitch = (box.height - 28) / rows
-    size = int(np.clip(pitch * 0.68, 9, 13))
+    pitch = (box.height - px(28)) / rows
+    width = box.width // HELP_COLUMNS
+    size = help_size(lines, width - px(HELP_GAP_PX), int(min(0.75 * pitch, px(16))))
+    key_width = max(font(size).getlength(key) for key, _ in lines)
     for i, (key, text) in enumerate(lines):
-        y = box.top + 14 + (i % rows + 0.5) * pitch
-        x = box.left + i // rows * box.width // HELP_COLUMNS
-        draw.text((x + HELP_KEY_PX, y), key, font=font(size), fill=MARK, anchor="rm")
-        draw.text((x + HELP_KEY_PX + 12, y), text, font=font(size), fill=TEXT, anchor="lm")
+        y = box.top + px(14) + (i % rows + 0.5) * pitch
+        x = box.left + px(12) + i // rows * width + key_width
+        draw.text((x, y), key, font=font(size), fill=MARK, anchor="rm")
+        draw.text((x + px(12), y), text, font=font(size), fill=TEXT, anchor="lm")
+
+
+def help_size(lines: Iterable[tuple[str, str]], width: int, most: int) -> int:
+    """The largest size of font, up to the most, at which the longest key and the longest text fit side by side."""
+    keys, texts = zip(*lines, strict=True)
+    for size in range(most, LEAST_FONT_PX, -1):
+        longest = [max(font(size).getlength(each) for each in column) for column in (keys, texts)]
+        if sum(longest) <= width:
+            return size
+    return LEAST_FONT_PX
 
 
 def readout_picture(layout: Layout, readouts: Mapping[str, str]) -> np.ndarray:
@@ -66,7 +81,8 @@ def readout_picture(layout: Layout, readouts: Mapping[str, str]) -> np.ndarray:
     image = Image.new("RGB", (box.width, box.height), STRIP)
     draw = ImageDraw.Draw(image)
     draw.line([(0, 0), (box.width, 0)], fill=LINE)
-    _draw_figures(draw, box, readouts, "", min(21.0, (box.height - 14) / max(1, len(readouts))))
+    pitch = min(layout.px(21), (box.height - 14) / max(1, len(readouts)))
+    _draw_figures(draw, box, readouts, "", pitch)
     return np.asarray(image)
 
 
@@ -83,9 +99,17 @@ def findings_picture(layout: Layout, findings: Mapping[str, str], alert: str = "
 def _draw_figures(
     draw: ImageDraw.ImageDraw, box: Rect, figures: Mapping[str, str], alert: str, pitch: float
 ) -> None:
+    size = figures_size(figures, box.width - FIGURES_GAP_PX, int(0.68 * pitch))
     for i, (name, value) in enumerate(figures.items()):
         y = 7 + (i + 0.5) * pitch
-        draw.text((8, y), name, font=font(13), fill=ALERT if name == alert else QUIET, anchor="lm")
-        draw.text(
-            (box.width - 14, y), value, font=font(14), fill=ALERT if name == alert else TEXT, anchor="rm"
-        )
+        colours = (ALERT, ALERT) if name == alert else (QUIET, TEXT)
+        draw.text((8, y), name, font=font(size), fill=colours[0], anchor="lm")
+        draw.text((box.width - 12, y), value, font=font(size), fill=colours[1], anchor="rm")
+
+
+def figures_size(figures: Mapping[str, str], width: int, most: int) -> int:
+    """The largest size of font, up to the most, at which each name fits beside its value."""
+    for size in range(most, LEAST_FONT_PX, -1):
+        if all(font(size).getlength(f"{name}  {value}") <= width for name, value in figures.items()):
+            return size
+    return LEAST_FONT_PX

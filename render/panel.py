@@ -54,7 +54,7 @@ class Panel:
         return (across - 0.5) * self.width_mm, down * self.depth_mm - self.above_mm
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     """The font of all texts."""
     return ImageFont.load_default(size=size)
@@ -69,11 +69,12 @@ def ruler_ticks(panel: Panel, box: Rect) -> list[tuple[int, int | None]]:
     return ticks
 
 
-def marker_centre(box: Rect, marked_side: str) -> tuple[int, int]:
+def marker_centre(layout: Layout, box: Rect, marked_side: str) -> tuple[int, int]:
     """Centre (x, y) of the marker dot, above the picture at its marked side. Raises ValueError for another side."""
     if marked_side not in ("left", "right"):
         raise ValueError(f"marked_side is {marked_side!r}: it must be 'left' or 'right'")
-    return (box.left + 9 if marked_side == "left" else box.right - 10), box.top - 12
+    x = box.left + layout.px(9) if marked_side == "left" else box.right - layout.px(10)
+    return x, box.top - layout.px(12)
 
 
 def paste_picture(page: np.ndarray, box: Rect, picture: np.ndarray) -> None:
@@ -111,45 +112,49 @@ def calliper_segments(panel: Panel, box: Rect, points_mm: tuple[tuple[float, flo
 
 def draw_panel(draw: ImageDraw.ImageDraw, layout: Layout, panel: Panel) -> None:
     """All of the panel but its pictures."""
-    area, boxes = layout.panel, panel.boxes(layout)
+    area, boxes, px = layout.panel, panel.boxes(layout), layout.px
     draw.rectangle([area.left, area.top, area.right, area.bottom], fill=PANEL)
     draw.line([(area.left, 0), (area.left, area.bottom)], fill=LINE)
     probe, echo, ct = panel.captions
     depth = f"Depth {(panel.depth_mm - panel.above_mm) / 10:.1f} cm"
-    draw.text((area.left + 16, 12), probe, font=font(17), fill=TEXT)
-    draw.text((area.right - 16, 13), depth, font=font(14), fill=TEXT, anchor="ra")
-    draw.text((area.left + 16, area.bottom - 25), echo, font=font(14), fill=QUIET)
-    draw.text((area.right - 16, area.bottom - 25), ct, font=font(14), fill=QUIET, anchor="ra")
+    left, right, foot = area.left + px(16), area.right - px(16), area.bottom - px(17)
+    draw.text((left, px(12)), probe, font=font(px(17)), fill=TEXT)
+    draw.text((right, px(13)), depth, font=font(px(15)), fill=TEXT, anchor="ra")
+    draw.text((left, foot), echo, font=font(px(14)), fill=QUIET, anchor="lm")
+    draw.text((right, foot), ct, font=font(px(14)), fill=QUIET, anchor="rm")
     if panel.status:
-        draw.text(((area.left + area.right) // 2, 40), panel.status, font=font(17), fill=ALERT, anchor="mm")
-    _draw_ruler(draw, panel, boxes[0])
-    _draw_wedge(draw, boxes[-1])
+        middle = (area.left + area.right) // 2, px(40)
+        draw.text(middle, panel.status, font=font(px(17)), fill=ALERT, anchor="mm")
+    _draw_ruler(draw, layout, panel, boxes[0])
+    _draw_wedge(draw, layout, boxes[-1])
     for name, box in zip(panel.names, boxes, strict=True):
-        x, y = marker_centre(box, panel.marked_side)
-        draw.ellipse([x - 6, y - 6, x + 6, y + 6], fill=MARK)
+        x, y = marker_centre(layout, box, panel.marked_side)
+        radius = px(6)
+        draw.ellipse([x - radius, y - radius, x + radius, y + radius], fill=MARK)
         left, anchor = (box.left, "lm") if panel.marked_side == "right" else (box.right, "rm")
-        draw.text((left, y), name, font=font(14), fill=TEXT, anchor=anchor)
+        draw.text((left, y), name, font=font(px(15)), fill=TEXT, anchor=anchor)
 
 
-def _draw_ruler(draw: ImageDraw.ImageDraw, panel: Panel, box: Rect) -> None:
-    x = box.left - 6
+def _draw_ruler(draw: ImageDraw.ImageDraw, layout: Layout, panel: Panel, box: Rect) -> None:
+    px, x = layout.px, box.left - layout.px(6)
     # Where centimetres are small, not each of them has room for its number.
-    every = int(np.ceil(NUMBER_PX / (10.0 * box.height / panel.depth_mm)))
+    every = int(np.ceil(px(NUMBER_PX) / (10.0 * box.height / panel.depth_mm)))
     for row, centimetres in ruler_ticks(panel, box):
-        length = 5 if centimetres is None else 10
+        length = px(5 if centimetres is None else 10)
         draw.line([(x - length, row), (x, row)], fill=QUIET if centimetres is None else TEXT)
         if centimetres and centimetres % every == 0:
-            draw.text((x - 15, row), str(centimetres), font=font(13), fill=TEXT, anchor="rm")
+            draw.text((x - px(15), row), str(centimetres), font=font(px(14)), fill=TEXT, anchor="rm")
         elif centimetres == 0:
-            draw.text((x - 15, row), "cm", font=font(12), fill=QUIET, anchor="rm")
+            draw.text((x - px(15), row), "cm", font=font(px(13)), fill=QUIET, anchor="rm")
     if panel.focus_mm is not None:
         row = panel.to_pixels(box, np.array([0.0, panel.focus_mm]))[1]
-        draw.polygon([(x + 4, row), (x - 4, row - 5), (x - 4, row + 5)], fill=ALERT)
+        draw.polygon([(x + px(4), row), (x - px(4), row - px(5)), (x - px(4), row + px(5))], fill=ALERT)
 
 
-def _draw_wedge(draw: ImageDraw.ImageDraw, box: Rect) -> None:
+def _draw_wedge(draw: ImageDraw.ImageDraw, layout: Layout, box: Rect) -> None:
     """The grey scale, white at the top, as a scanner shows it beside its picture."""
-    height = min(128, box.height)
+    height = min(layout.px(128), box.height)
+    left, right = box.right + layout.px(12), box.right + layout.px(19)
     for i in range(height):
         grey = 255 - i * 255 // max(1, height - 1)
-        draw.line([(box.right + 12, box.top + i), (box.right + 19, box.top + i)], fill=(grey, grey, grey))
+        draw.line([(left, box.top + i), (right, box.top + i)], fill=(grey, grey, grey))

@@ -9,10 +9,7 @@ The only file that imports taichi.ui. How one frame is put together:
 """
 
 import atexit
-import ctypes
 import dataclasses
-import os
-import sys
 import time
 from pathlib import Path
 
@@ -22,9 +19,10 @@ from taichi.ui.utils import get_field_info
 
 from render.actions import begin, hold
 from render.camera import FIELD_OF_VIEW_DEG, OrbitCamera
+from render.display import display_available
 from render.gamepad import Gamepad
 from render.keys import Keys
-from render.layout import Layout, Rect
+from render.layout import FULL_SIZE, Layout, Rect
 from render.page import Page
 from render.sliders import boxes_of, draw_sliders
 from render.stage import Stage
@@ -36,24 +34,6 @@ FRAMES_A_SECOND = 60
 
 class NoVulkan(RuntimeError):
     """There is no Vulkan driver that Taichi could draw with."""
-
-
-def display_available() -> bool:
-    """Whether a window can be opened. GLFW ends the process where it cannot, so this asks the X server first."""
-    if sys.platform in ("win32", "darwin"):
-        return True
-    if not os.environ.get("DISPLAY"):
-        return False
-    try:
-        x11 = ctypes.CDLL("libX11.so.6")
-    except OSError:
-        return False
-    x11.XOpenDisplay.restype = ctypes.c_void_p
-    x11.XCloseDisplay.argtypes = [ctypes.c_void_p]
-    connection = x11.XOpenDisplay(None)
-    if connection:
-        x11.XCloseDisplay(connection)
-    return bool(connection)
 
 
 def _put_image(canvas, pixels: np.ndarray) -> None:
@@ -85,7 +65,7 @@ class Window:
         self,
         geometry: Geometry,
         settings: Settings | None = None,
-        size=(1280, 720),
+        size: tuple[int, int] = FULL_SIZE,
         visible=True,
         name="Nephron",
         keys: Keys | None = None,

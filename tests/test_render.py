@@ -12,7 +12,10 @@ import trimesh
 
 from render import frame, panel, solids
 from render.camera import OrbitCamera
-from render.layout import RULER_WIDTH, Layout
+from render.display import display_available, fitted, window_size
+from render.frame import backdrop
+from render.keys import Keys
+from render.layout import FULL_SIZE, RULER_WIDTH, Layout
 from render.panel import Panel
 from render.viewer import KEY_MAP, Controls, Geometry, NullViewer, Settings, View, key_table
 
@@ -363,9 +366,32 @@ def test_missing_vulkan_is_said_and_not_died_of():
 @pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="these always have a display")
 @pytest.mark.parametrize("display", [None, ":4242"])
 def test_no_display_is_noticed(monkeypatch, display):
-    window = pytest.importorskip("render.window")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     if display:
         monkeypatch.setenv("DISPLAY", display)
-    assert not window.display_available()
+    assert not display_available() and window_size() == FULL_SIZE
+
+
+@pytest.mark.parametrize(
+    ("screen", "size"),
+    [
+        ((1920, 1080), (1280, 720)),
+        ((3840, 2160), (2560, 1440)),
+        ((1366, 768), (1201, 676)),
+        ((1080, 1920), (1080, 608)),
+    ],
+)
+def test_a_window_fits_its_screen(screen, size):
+    assert fitted(*screen) == size
+
+
+def test_all_keys_fit_into_the_help_of_any_window():
+    lines = Keys().lines()
+    for size in ((1024, 600), (1202, 676), (1280, 720), (1920, 1080), (2560, 1440)):
+        layout = Layout(*size)
+        bare, helped = (backdrop(layout, Panel(("CT",), 40.0, 60.0), shown) for shown in (None, lines))
+        written = np.argwhere((bare != helped).any(axis=2))
+        box = layout.help
+        assert (written.min(axis=0) >= [box.top, box.left]).all()
+        assert (written.max(axis=0) < [box.bottom, box.right]).all()

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from render.display import display_available
 from render.keys import Keys, keys_text, load_keys
 from scenes.anatomy import LoadedAnatomy, fingerprint, load_anatomy
 from scenes.reading.progress import Stages, Told
@@ -189,8 +190,6 @@ def keys_command() -> None:
 
 def found_display() -> bool:
     """Whether there is a screen for a window; says so where there is none."""
-    from render.window import display_available
-
     found = display_available()
     if not found:
         click.echo("No display: running the scripted press without a window.")

@@ -4,8 +4,10 @@ from functools import partial
 
 import numpy as np
 
+from render.display import window_size
 from render.gamepad import Gamepad
 from render.keys import Keys
+from render.layout import FULL_SIZE
 from render.viewer import Geometry, Settings, View, Viewer
 from scenes.scene import NeoHookeanTissue
 from studies.rehearsal import Rehearsal
@@ -81,7 +83,8 @@ def open_viewer(
             support_faces=np.asarray(support[0].faces, np.int32) if support else None,
         ),
         settings_of(rehearsal),
-        visible=visible,
+        window_size() if visible else FULL_SIZE,
+        visible,
         keys=keys,
         gamepad=gamepad,
     )

@@ -1,0 +1,52 @@
+"""The screen that a window would open on, asked of the system itself: GLFW ends the process where there is none."""
+
+import ctypes
+import os
+import sys
+
+from render.layout import FULL_SIZE
+
+# A window takes so much of a screen's height, and of a small one as much as its title and a task bar leave.
+SHARE, MOST_SHARE = 2 / 3, 0.88
+
+
+def display_available() -> bool:
+    """Whether a window can be opened."""
+    return sys.platform in ("win32", "darwin") or _of_x11() is not None
+
+
+def window_size() -> tuple[int, int]:
+    """Width and height in pixels that suit the screen: FULL_SIZE where nothing is known of it."""
+    screen = None
+    if sys.platform == "win32":
+        metrics = ctypes.windll.user32.GetSystemMetrics
+        screen = metrics(0), metrics(1)
+    elif sys.platform != "darwin":
+        screen = _of_x11()
+    return FULL_SIZE if screen is None else fitted(*screen)
+
+
+def fitted(width: int, height: int) -> tuple[int, int]:
+    """The size of a window on a screen of so many pixels."""
+    tall = max(SHARE * height, min(FULL_SIZE[1], MOST_SHARE * height))
+    tall = min(tall, width * FULL_SIZE[1] / FULL_SIZE[0])
+    return round(tall * FULL_SIZE[0] / FULL_SIZE[1]), round(tall)
+
+
+def _of_x11() -> tuple[int, int] | None:
+    """Width and height of the X server's screen."""
+    if not os.environ.get("DISPLAY"):
+        return None
+    try:
+        x11 = ctypes.CDLL("libX11.so.6")
+    except OSError:
+        return None
+    x11.XOpenDisplay.restype = ctypes.c_void_p
+    connection = x11.XOpenDisplay(None)
+    if not connection:
+        return None
+    server = ctypes.c_void_p(connection)
+    screen = x11.XDefaultScreen(server)
+    size = x11.XDisplayWidth(server, screen), x11.XDisplayHeight(server, screen)
+    x11.XCloseDisplay(server)
+    return size
