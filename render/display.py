@@ -3,6 +3,7 @@
 import ctypes
 import os
 import sys
+from functools import cache
 
 from render.layout import FULL_SIZE
 
@@ -12,7 +13,7 @@ SHARE, MOST_SHARE = 2 / 3, 0.88
 
 def display_available() -> bool:
     """Whether a window can be opened."""
-    return sys.platform in ("win32", "darwin") or _of_x11() is not None
+    return sys.platform in ("win32", "darwin") or _of_x11(os.environ.get("DISPLAY")) is not None
 
 
 def window_size() -> tuple[int, int]:
@@ -22,7 +23,7 @@ def window_size() -> tuple[int, int]:
         metrics = ctypes.windll.user32.GetSystemMetrics
         screen = metrics(0), metrics(1)
     elif sys.platform != "darwin":
-        screen = _of_x11()
+        screen = _of_x11(os.environ.get("DISPLAY"))
     return FULL_SIZE if screen is None else fitted(*screen)
 
 
@@ -33,9 +34,10 @@ def fitted(width: int, height: int) -> tuple[int, int]:
     return round(tall * FULL_SIZE[0] / FULL_SIZE[1]), round(tall)
 
 
-def _of_x11() -> tuple[int, int] | None:
-    """Width and height of the X server's screen."""
-    if not os.environ.get("DISPLAY"):
+@cache
+def _of_x11(display: str | None) -> tuple[int, int] | None:
+    """Width and height of an X server's screen. It is asked once: one that nobody is connected to may begin anew."""
+    if not display:
         return None
     try:
         x11 = ctypes.CDLL("libX11.so.6")
