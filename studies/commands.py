@@ -1,75 +1,28 @@
 """The commands that measure how true a model is: ``validate`` and ``calibrate``."""
 
-import json
-import math
-import os
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 from tqdm import tqdm
 
 from scenes.scene import model_with
 from studies.case import load_case
+from studies.command_line import (
+    Fault,
+    NumberRange,
+    arch_option,
+    make_folder,
+    make_place,
+    numbers,
+    save_figures,
+    start_taichi,
+)
 from studies.setup import PRESETS, QUALITIES, choose_setup
 
 if TYPE_CHECKING:
     from studies.calibration import Calibration
-
-
-class Fault(click.ClickException):
-    """What the user must know, in one line."""
-
-
-class NumberRange(click.FloatRange):
-    """Numbers between two; click's own range lets nan through."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        number = super().convert(value, param, ctx)
-        if not math.isfinite(number):
-            self.fail(f"{value} is no number", param, ctx)
-        return number
-
-
-def start_taichi(arch: str) -> str:
-    """Initialise Taichi where the user wants it; the backend it is. Raises Fault."""
-    from sim.device import NoDevice, start
-
-    try:
-        return start(arch)
-    except NoDevice as error:
-        raise Fault(f"--arch {arch}: {error}") from None
-
-
-def make_folder(folder: Path, option: str = "--out") -> None:
-    """Make sure that a folder can be written to before time is spent on what goes there. Raises Fault."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise Fault(
-            f"{folder}: cannot be made a folder for results ({error.strerror}); choose another {option}"
-        ) from None
-    if not os.access(folder, os.W_OK):
-        raise Fault(f"{folder}: cannot be written to; choose another {option}")
-
-
-def make_place(json_file: Path | None) -> None:
-    """Make sure that the file of --json, where it is asked for, can be written before time is spent. Raises Fault."""
-    if json_file is None:
-        return
-    make_folder(json_file.parent, "--json")
-    if json_file.is_dir():
-        raise Fault(f"{json_file}: is a folder; name a file after --json")
-
-
-arch_option = click.option(
-    "--arch",
-    type=click.Choice(["auto", "cuda", "vulkan", "cpu"]),
-    default="auto",
-    show_default=True,
-    help="Where to compute; auto is CUDA where there is one, else the CPU.",
-)
 
 
 @click.command()
@@ -155,16 +108,7 @@ def validate(
                 figures["independence"].append(row)
     finally:
         if json_file is not None:
-            write_json(figures, json_file)
-
-
-def write_json(figures: dict, file: Path) -> None:
-    """Write figures to a file and say so. Raises Fault."""
-    try:
-        file.write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", "utf-8")
-    except OSError as error:
-        raise Fault(f"{file}: cannot be written ({error.strerror}); choose another --json") from None
-    click.echo(f"\nWrote {file}")
+            save_figures(figures, json_file)
 
 
 @click.command()
@@ -248,14 +192,3 @@ def write_calibration(found: "Calibration", out: Path, searched: bool) -> None:
     else:
         figures.write_figure4(found, out / "figure4.png")
     click.echo(f"\n{summary_of(found)}\nWrote tables, pictures and calibration.json to {out}")
-
-
-def numbers(text: str, option: str, least: float, most: float) -> list[float]:
-    """Different numbers of an option's text, such as "2.2,2.7", in ascending order. Raises Fault."""
-    try:
-        values = sorted({float(value) for value in text.split(",")})
-    except ValueError:
-        values = []
-    if not values or not all(least <= value <= most for value in values):
-        raise Fault(f"{option} is {text!r}: expected numbers from {least:g} to {most:g} such as 2.2,2.7")
-    return values

@@ -102,7 +102,7 @@ def test_kernels_are_counted_where_a_step_is_parallel():
 
 
 def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(command, "load_anatomy", lambda scene, folder: small_anatomy())
+    monkeypatch.setattr(command, "load_patient", lambda scene: (load_scene(scene), small_anatomy()))
     monkeypatch.setattr(measure, "PRESS_STEPS", 3)
     monkeypatch.setitem(measure.FEATURES, "neo-hookean", measure.EVERYWHERE[2:])
     assert app.main(["study", "features", "--quick", "--out", str(tmp_path)]) == 0

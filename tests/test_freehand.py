@@ -20,8 +20,9 @@ from studies.freehand.experiment import sweep_of
 from studies.freehand.files import save_volumes
 from studies.freehand.picture import save_picture
 from studies.freehand.rebuild import Rebuilt, lit, rebuild, track_of
-from studies.freehand.study_command import table, write_csv
+from studies.freehand.study_command import rows_of, table
 from studies.freehand.study_picture import draw
+from studies.results import write_csv
 from studies.setup import PRESETS
 from ultrasound.reconstruction import VoxelBox
 from ultrasound.sweep import Mark, Sweep, SweepError
@@ -346,7 +347,7 @@ def test_the_study_tells_and_draws_both(runs, tmp_path):
     # Two lines of head, then two methods, three of the noise or two, and two by two of the press; of two regions, or of one.
     assert len(lines) == 2 + 2 * (2 + 3 + 4) + 2 + (2 + 2)
     assert sum(line.startswith("every third picture, no error") for line in lines) == 3
-    write_csv(runs, tmp_path / "a.csv")
+    write_csv([row for run in runs for row in rows_of(run)], tmp_path / "a.csv")
     with (tmp_path / "a.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(lines) - 4 and {row["patient"] for row in rows} == {"with", "without"}

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from studies.beam.capture import BeamError, load_captures
 from studies.beam.comparison import Row, check, compare, draw, table
-from studies.commands import Fault, NumberRange, make_folder, make_place, start_taichi, write_json
+from studies.command_line import Fault, NumberRange, make_folder, make_place, save_figures, start_taichi
 
 BEAM = "beam.stl"
 # Tip markers are balls that stand so far off the surface at the free end: on top, on one side, on the other, at these
@@ -130,7 +130,7 @@ def run(
         for first_or_last in sorted({0, len(rows) - 1}):
             click.echo(check(build, cell_mm, rows[first_or_last].load_g, traces[first_or_last]))
     if json_path is not None:
-        write_json(dict(settings=settings, loads=[asdict(row) for row in rows]), json_path)
+        save_figures(dict(settings=settings, loads=[asdict(row) for row in rows]), json_path)
     if out is not None:
         try:
             draw(groups, traces, rows, out / "beam.png")

@@ -12,7 +12,7 @@ from scenes.reading.files import file_volume
 from scenes.scene import Scene, load_scene
 from scenes.surface_files import FORMATS, save_surface
 from scenes.volume_files import save_image
-from studies.commands import make_folder
+from studies.command_line import make_folder, scene_file
 
 
 @click.command()
@@ -33,7 +33,7 @@ def export(scene: Path, out: Path, suffix: str) -> None:
 
     All is in mm, in the patient's LPS, at rest. As they lie when they are pressed, rehearse writes them.
     """
-    path = scene / "scene.toml" if scene.is_dir() else scene
+    path = scene_file(scene)
     check_folder(out)
     loaded = load_scene(path)
     anatomy = load_anatomy(loaded, path.parent)

@@ -1,16 +1,14 @@
 """The command ``study features``: what each feature of a scene costs, on and off."""
 
-import csv
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 from tqdm import tqdm
 
-from scenes.anatomy import load_anatomy
-from scenes.scene import PAPER, load_scene
-from studies.commands import arch_option, make_folder, start_taichi
+from scenes.scene import PAPER
+from studies.command_line import arch_option, load_patient, make_folder, start_taichi
+from studies.results import write_csv, write_json
 from studies.setup import PRESETS
 
 COLUMNS = (
@@ -39,9 +37,7 @@ COLUMNS = (
 def features(scene: Path, out: Path, quick: bool, arch: str) -> None:
     """What each feature of SCENE costs in time, memory and kernels: the same press with it and without, in turn."""
     make_folder(out)
-    path = scene / "scene.toml" if scene.is_dir() else scene
-    loaded = load_scene(path)
-    anatomy = load_anatomy(loaded, path.parent)
+    loaded, anatomy = load_patient(scene)
     used = start_taichi(arch)
     from studies.features import measure
     from studies.features.picture import draw
@@ -60,19 +56,11 @@ def features(scene: Path, out: Path, quick: bool, arch: str) -> None:
         rows += [dict(model="frame") | row for row in measure.of_frame(loaded, anatomy, used)]
         bar.update()
     rows = [{name: row[name] for name in COLUMNS} for row in rows]
-    (out / "features.json").write_text(json.dumps(dict(arch=used, features=rows), indent=2) + "\n", "utf-8")
+    write_json(dict(arch=used, features=rows), out / "features.json")
     write_csv(rows, out / "features.csv")
     draw(rows, out / "features.png")
     click.echo("\n".join(["", *table(rows)]))
     click.echo(f"\nWrote features.json, features.csv and features.png to {out}")
-
-
-def write_csv(rows: list[dict[str, Any]], path: Path) -> None:
-    """A line a feature."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        lines = csv.DictWriter(file, COLUMNS)
-        lines.writeheader()
-        lines.writerows(rows)
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:

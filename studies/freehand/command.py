@@ -1,6 +1,5 @@
 """The command ``reconstruct``: a tracked sweep made into a volume, and compared with the patient."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +9,12 @@ from tqdm import tqdm
 
 from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.scene import Scene, load_scene
-from studies.commands import Fault, NumberRange, arch_option, make_folder, start_taichi
+from studies.command_line import Fault, NumberRange, arch_option, make_folder, scene_file, start_taichi
 from studies.freehand.files import save_volumes
 from studies.freehand.picture import save_picture
 from studies.freehand.rebuild import Places, Rebuilt, Track, lit, rebuild, track_of
 from studies.freehand.tracker import with_errors
+from studies.results import write_json
 from studies.setup import probe_of
 from ultrasound.marked_sweep import PROBE_FIELD, marks_beside
 from ultrasound.reconstruction import METHODS
@@ -152,7 +152,7 @@ def reconstruct(
         agreement=_agreement(rebuilt, patient),
     )
     save_picture(rebuilt, out / "volume.png")
-    (out / "report.json").write_text(json.dumps(report, indent=2) + "\n", "utf-8")
+    write_json(report, out / "report.json")
     click.echo(in_words(report))
     click.echo(f"Wrote volume.nrrd, volume.png and report.json to {out}")
 
@@ -166,7 +166,7 @@ def usual_reach_mm(track: Track, spacing_mm: float) -> float:
 def _patient(scene: Path | None) -> tuple[Scene, LoadedAnatomy, Path] | None:
     if scene is None:
         return None
-    path = scene / "scene.toml" if scene.is_dir() else scene
+    path = scene_file(scene)
     loaded = load_scene(path)
     return loaded, load_anatomy(loaded, path.parent), path.parent
 

@@ -1,7 +1,5 @@
 """The command ``study freehand``: how true a volume made of a tracked sweep is."""
 
-import csv
-import json
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -9,9 +7,9 @@ from typing import Any
 import click
 from tqdm import tqdm
 
-from scenes.anatomy import load_anatomy
-from scenes.scene import EMBEDDED, load_scene
-from studies.commands import Fault, arch_option, make_folder, start_taichi
+from scenes.scene import EMBEDDED
+from studies.command_line import Fault, arch_option, load_patient, make_folder, start_taichi
+from studies.results import write_csv, write_json
 from studies.setup import PRESETS
 from ultrasound.tracking import TrackingErrors
 
@@ -28,11 +26,9 @@ def freehand(scenes: tuple[Path, ...], out: Path, quick: bool, arch: str) -> Non
     make_folder(out)
     loaded = []
     for scene in scenes or (EMBEDDED,):
-        path = scene / "scene.toml" if scene.is_dir() else scene
-        one = load_scene(path)
-        anatomy = load_anatomy(one, path.parent)
+        one, anatomy = load_patient(scene)
         if anatomy.ct is None:
-            raise Fault(f"{path}: has no CT: expected anatomy.ct, which a sweep shows")
+            raise Fault(f"{scene}: has no CT: expected anatomy.ct, which a sweep shows")
         loaded.append((one, anatomy))
     used = start_taichi(arch)
     from studies.freehand.measure import count_of, measure
@@ -45,8 +41,8 @@ def freehand(scenes: tuple[Path, ...], out: Path, quick: bool, arch: str) -> Non
         for number, (one, anatomy) in enumerate(loaded, 1):
             figures = measure(one, anatomy, setup, used, quick, bar.update)
             runs.append(dict(patient=one.title or f"patient {number}") | figures)
-    (out / "freehand.json").write_text(json.dumps(dict(arch=used, runs=runs), indent=2) + "\n", "utf-8")
-    write_csv(runs, out / "freehand.csv")
+    write_json(dict(arch=used, runs=runs), out / "freehand.json")
+    write_csv([row for run in runs for row in rows_of(run)], out / "freehand.csv")
     draw(runs, out / "freehand.png")
     click.echo("\n".join(["", *(line for run in runs for line in table(run))]))
     click.echo(f"\nWrote freehand.json, freehand.csv and freehand.png to {out}")
@@ -70,16 +66,6 @@ def rows_of(run: dict[str, Any]) -> list[dict[str, Any]]:
                         | about
                     )
     return lines
-
-
-def write_csv(runs: list[dict[str, Any]], path: Path) -> None:
-    """A line a volume and region."""
-    rows = [row for run in runs for row in rows_of(run)]
-    columns = list(dict.fromkeys(name for row in rows for name in row))
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns)
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def table(run: dict[str, Any]) -> list[str]:

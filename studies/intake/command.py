@@ -13,7 +13,7 @@ import click
 import psutil
 from tqdm import tqdm
 
-from studies.commands import make_folder
+from studies.command_line import make_folder
 from studies.intake.whole_body import write_whole_body
 
 APP = Path(__file__).resolve().parents[2] / "app.py"

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from studies.commands import Fault
+from studies.command_line import Fault
 
 if TYPE_CHECKING:
     from studies.link.server import Server

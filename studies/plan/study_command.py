@@ -1,6 +1,5 @@
 """The command ``study plan``: what planning a sweep is worth."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +9,9 @@ from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy
 from scenes.scene import EMBEDDED, load_scene, with_options
-from studies.commands import make_folder
+from studies.command_line import make_folder, probe_named, scene_file
 from studies.plan.file import MOST_SWEEPS
+from studies.results import write_json
 
 
 @click.command("plan")
@@ -32,8 +32,6 @@ def plan_study(scenes: tuple[Path, ...], out: Path, trials: int, probe: str, job
     A kidney without a tumour is given one.
     """
     make_folder(out)
-    if Path(probe).is_file():
-        probe = str(Path(probe).resolve())
     from studies.plan.compare import compare, count_of
     from studies.plan.virtual_tumour import with_tumour
 
@@ -41,13 +39,13 @@ def plan_study(scenes: tuple[Path, ...], out: Path, trials: int, probe: str, job
     patients = scenes or (EMBEDDED,)
     with tqdm(total=len(patients) * count_of(trials), desc="plan", unit="scan") as bar:
         for number, each in enumerate(patients, 1):
-            path = each / "scene.toml" if each.is_dir() else each
-            scene = with_options(load_scene(path), {"transducer.probe": probe})
+            path = scene_file(each)
+            scene = with_options(load_scene(path), {"transducer.probe": probe_named(probe)})
             anatomy = with_tumour(load_anatomy(scene, path.parent), np.array(scene.gravity.direction))
             run = compare(scene, anatomy, trials, jobs, bar.update)
             runs.append(dict(patient=scene.title or f"patient {number}") | run)
             bar.update(number * bar.total // len(patients) - bar.n)
-    (out / "plan.json").write_text(json.dumps(dict(trials=trials, runs=runs), indent=2) + "\n", "utf-8")
+    write_json(dict(trials=trials, runs=runs), out / "plan.json")
     click.echo("\n".join(["", *(line for run in runs for line in table(run))]))
     click.echo(f"\nWrote plan.json to {out}")
 

@@ -8,7 +8,7 @@ import trimesh
 
 from scenes.anatomy import load_anatomy
 from scenes.scene import PAPER, load_scene
-from studies.commands import Fault, NumberRange, make_folder
+from studies.command_line import Fault, NumberRange, make_folder
 
 
 @click.command()

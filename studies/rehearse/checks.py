@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.scene import OPTIONS, Scene
-from studies.commands import Fault
+from studies.command_line import Fault
 from studies.plan.file import Plan, PlanError, is_plan, read_plan
 from studies.rehearse.track_file import check_near
 from studies.scan.poses import TimedPoses

@@ -11,7 +11,15 @@ from render.keys import Keys, keys_text, load_keys
 from scenes.anatomy import LoadedAnatomy, fingerprint, load_anatomy
 from scenes.reading.progress import Stages, Told
 from scenes.scene import EMBEDDED, OPTIONS, TISSUES, Scene, load_scene, with_options
-from studies.commands import Fault, NumberRange, arch_option, make_folder, start_taichi
+from studies.command_line import (
+    Fault,
+    NumberRange,
+    arch_option,
+    make_folder,
+    probe_named,
+    scene_file,
+    start_taichi,
+)
 from studies.link.options import link_options, opened_link
 from studies.plan.file import read_plan
 from studies.rehearse.checks import (
@@ -117,15 +125,12 @@ def rehearse(
     link_host: str | None,
     link_port: int | None,
     link_leads: bool,
-    **changes: float | str | None,
+    **changes: Any,
 ) -> None:
     """Press the kidney of SCENE, a scene file or a patient's folder, and see what the transducer sees."""
-    path = scene / "scene.toml" if scene.is_dir() else scene
-    if scene.is_dir() and not path.is_file():
-        raise Fault(f"{scene}: holds no scene.toml; make a patient's folder of a CT with: app.py import")
+    path = scene_file(scene)
     changed = {key: changes[option.strip("-").replace("-", "_")] for key, option in OPTIONS.items()}
-    if changed["transducer.probe"] and Path(str(changed["transducer.probe"])).is_file():
-        changed["transducer.probe"] = str(Path(str(changed["transducer.probe"])).resolve())
+    changed["transducer.probe"] = probe_named(changed["transducer.probe"])
     before = load_scene(path)
     keys = load_keys(keys_file) if keys_file is not None else Keys()
     refuse_inputs(track_file, track_from, replay, link_leads)

@@ -12,7 +12,7 @@ from render.keys import Keys
 from render.viewer import Settings
 from render.window import NoVulkan
 from scenes.anatomy import LoadedAnatomy
-from studies.commands import Fault
+from studies.command_line import Fault
 from studies.link.server import Server
 from studies.plan.file import Plan
 from studies.rehearsal import Rehearsal, RehearsalState

@@ -1,15 +1,14 @@
 """The command ``study replay``: is a recorded session, computed again, the same to the bit?"""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 from tqdm import tqdm
 
-from scenes.anatomy import load_anatomy
-from scenes.scene import EMBEDDED, load_scene
-from studies.commands import NumberRange, arch_option, make_folder, start_taichi
+from scenes.scene import EMBEDDED
+from studies.command_line import NumberRange, arch_option, load_patient, make_folder, start_taichi
+from studies.results import write_json
 from studies.setup import PRESETS, QUALITIES
 
 
@@ -39,9 +38,7 @@ from studies.setup import PRESETS, QUALITIES
 def replay(scene: Path, out: Path, minutes: float, model: str, quality: str, arch: str) -> None:
     """Record a session in SCENE, led by chance, and compute it again from its file: twice, and once from its middle."""
     make_folder(out)
-    path = scene / "scene.toml" if scene.is_dir() else scene
-    loaded = load_scene(path)
-    anatomy = load_anatomy(loaded, path.parent)
+    loaded, anatomy = load_patient(scene)
     used = start_taichi(arch)
     from studies.replay.measure import measure
 
@@ -50,7 +47,7 @@ def replay(scene: Path, out: Path, minutes: float, model: str, quality: str, arc
     with tqdm(total=total, desc="replay", unit="step") as bar:
         found = measure(loaded, anatomy, setup, minutes, used, out, bar.update)
     figures = dict(arch=used, model=model, quality=quality) | found
-    (out / "replay.json").write_text(json.dumps(figures, indent=2) + "\n", "utf-8")
+    write_json(figures, out / "replay.json")
     click.echo("\n".join(["", *lines_of(figures)]))
     click.echo(f"\nWrote {found['file']} and replay.json to {out}")
 

@@ -1,16 +1,14 @@
 """The command ``study soak``: an hour of rehearsal, accelerated."""
 
-import csv
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 from tqdm import tqdm
 
-from scenes.anatomy import load_anatomy
-from scenes.scene import PAPER, load_scene
-from studies.commands import arch_option, make_folder, start_taichi
+from scenes.scene import PAPER
+from studies.command_line import arch_option, load_patient, make_folder, start_taichi
+from studies.results import write_csv, write_json
 from studies.setup import PRESETS
 
 HOUR = 60
@@ -28,9 +26,7 @@ HOUR = 60
 def soak(scene: Path, out: Path, minutes: int, quick: bool, model: str | None, arch: str) -> None:
     """An hour of rehearsal in SCENE, faster than real: does the rest shape drift, memory grow, a replay differ?"""
     make_folder(out)
-    path = scene / "scene.toml" if scene.is_dir() else scene
-    loaded = load_scene(path)
-    anatomy = load_anatomy(loaded, path.parent)
+    loaded, anatomy = load_patient(scene)
     used = start_taichi(arch)
     from studies.soak import measure
     from studies.soak.picture import draw
@@ -43,20 +39,11 @@ def soak(scene: Path, out: Path, minutes: int, quick: bool, model: str | None, a
     ) as bar:
         for setup in setups:
             runs.append(measure.soak(loaded, anatomy, setup, minutes, minute_s, used, bar.update))
-    (out / "soak.json").write_text(json.dumps(dict(arch=used, runs=runs), indent=2) + "\n", "utf-8")
-    write_csv(runs, out / "soak.csv")
+    write_json(dict(arch=used, runs=runs), out / "soak.json")
+    write_csv([dict(model=run["model"]) | row for run in runs for row in run["minutes"]], out / "soak.csv")
     draw(runs, out / "soak.png")
     click.echo("\n".join(["", *table(runs)]))
     click.echo(f"\nWrote soak.json, soak.csv and soak.png to {out}")
-
-
-def write_csv(runs: list[dict[str, Any]], path: Path) -> None:
-    """A line a model and minute."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.DictWriter(file, ["model", *runs[0]["minutes"][0]])
-        rows.writeheader()
-        for run in runs:
-            rows.writerows(dict(model=run["model"]) | row for row in run["minutes"])
 
 
 def table(runs: list[dict[str, Any]]) -> list[str]:

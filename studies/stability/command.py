@@ -1,7 +1,5 @@
 """The command ``study stability``: every tissue model at the extremes, and what is left when they are over."""
 
-import csv
-import json
 from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path
@@ -11,7 +9,8 @@ import click
 from joblib import Parallel, delayed
 from tqdm import tqdm
 
-from studies.commands import make_folder
+from studies.command_line import make_folder
+from studies.results import write_csv, write_json
 from studies.stability.cases import MODELS, Case, cases_of, quick_cases_of
 
 # Cases that a process takes at a time: those of one body, which it then need not build anew.
@@ -33,9 +32,7 @@ def stability(out: Path, quick: bool, jobs: int | None) -> None:
         for found in _figures(given, jobs or -1):
             rows += found
             bar.update(len(found))
-    (out / "stability.json").write_text(
-        json.dumps(dict(cases=rows), indent=2, allow_nan=False) + "\n", "utf-8"
-    )
+    write_json(dict(cases=rows), out / "stability.json")
     write_csv(rows, out / "stability.csv")
     draw(rows, out / "stability.png")
     click.echo("\n".join(["", *table(rows), "", *summary(rows)]))
@@ -58,14 +55,6 @@ def _run(model: str, cases: list[Case]) -> list[dict[str, Any]]:
     from studies.stability.measure import run
 
     return [run(model, case) for case in cases]
-
-
-def write_csv(rows: list[dict[str, Any]], path: Path) -> None:
-    """A line a case."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        lines = csv.DictWriter(file, rows[0].keys())
-        lines.writeheader()
-        lines.writerows(rows)
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:

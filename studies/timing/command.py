@@ -1,16 +1,14 @@
 """The command ``study timing``: the paper's Figures 7 and 8 and its Table 5 for this machine, and what bounds them."""
 
-import csv
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 from tqdm import tqdm
 
-from scenes.anatomy import load_anatomy
-from scenes.scene import PAPER, load_scene
-from studies.commands import arch_option, make_folder, start_taichi
+from scenes.scene import PAPER
+from studies.command_line import arch_option, load_patient, make_folder, start_taichi
+from studies.results import write_csv, write_json
 from studies.setup import PRESETS, Setup
 
 RADII_MM = (2.2, 2.5, 2.7, 3.0, 3.3)
@@ -42,9 +40,7 @@ COLUMNS = (
 def timing(scene: Path, out: Path, quick: bool, arch: str) -> None:
     """How long a time step of SCENE takes: against time, by its pieces, by size, and against a plain loop in C."""
     make_folder(out)
-    path = scene / "scene.toml" if scene.is_dir() else scene
-    loaded = load_scene(path)
-    anatomy = load_anatomy(loaded, path.parent)
+    loaded, anatomy = load_patient(scene)
     used = start_taichi(arch)
     from studies.timing import measure
     from studies.timing.picture import draw
@@ -68,8 +64,8 @@ def timing(scene: Path, out: Path, quick: bool, arch: str) -> None:
     bound_ms = comparison.get("bound_ms")
     cases = [press.case | dict(bound_ms=bound_ms if press.setup == PAPERS else None) for press in presses]
     report = dict(arch=used, cases=cases, bound_ms=bound_ms, comparison=comparison, sizes=sizes)
-    (out / "timing.json").write_text(json.dumps(report, indent=2) + "\n", "utf-8")
-    write_csv(cases + sizes, out / "timing.csv")
+    write_json(report, out / "timing.json")
+    write_csv([_flat(case) for case in cases + sizes], out / "timing.csv")
     draw(presses, sizes, out / "timing.png")
     click.echo("\n".join(["", *table(cases, sizes), *pieces(cases), *against(comparison), *missing]))
     click.echo(f"\nWrote timing.json, timing.csv and timing.png to {out}")
@@ -82,14 +78,9 @@ def _setups(quick: bool) -> list[Setup]:
     return [*presets.values(), *(Setup(radius_mm=radius) for radius in RADII_MM)]
 
 
-def write_csv(cases: list[dict], path: Path) -> None:
-    """A line a case: its size, and mean, SD, min, max and median of its steps [ms]."""
-    figures = ("mean", "sd", "min", "max", "median")
-    with path.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file)
-        rows.writerow([*COLUMNS, *(f"{name}_ms" for name in figures)])
-        for case in cases:
-            rows.writerow([case[name] for name in COLUMNS] + [case["ms"][name] for name in figures])
+def _flat(case: dict) -> dict[str, Any]:
+    """A case's size, and mean, SD, min, max and median of its steps [ms]."""
+    return {name: case[name] for name in COLUMNS} | {f"{name}_ms": ms for name, ms in case["ms"].items()}
 
 
 def table(cases: list[dict], sizes: list[dict]) -> list[str]:

@@ -1,7 +1,5 @@
 """The command ``study trade``: what speed costs in accuracy, and which settings are worth their time."""
 
-import csv
-import json
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +7,8 @@ import click
 from tqdm import tqdm
 
 from studies.case import load_case
-from studies.commands import arch_option, make_folder, start_taichi
+from studies.command_line import arch_option, make_folder, start_taichi
+from studies.results import write_csv, write_json
 from studies.trade.front import preset_of, setup_of
 from studies.trade.sweep import PAPER, setups
 
@@ -38,24 +37,17 @@ def trade(cases: tuple[Path, ...], out: Path, quick: bool, arch: str) -> None:
     with tqdm(total=measure.count(loaded, tried, rounds), desc="trade", unit="run") as bar:
         points = measure.points(loaded, tried, used, rounds, bar.update)
     report = dict(arch=used, cases=[case.name for case in loaded], points=points)
-    (out / "trade.json").write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", "utf-8")
-    write_csv(points, out / "trade.csv")
+    write_json(report, out / "trade.json")
+    write_csv([_flat(point) for point in points], out / "trade.csv")
     draw(points, out / "trade.png")
     click.echo("\n".join(["", *table(points)]))
     click.echo(f"\nWrote trade.json, trade.csv and trade.png to {out}")
 
 
-def write_csv(points: list[dict[str, Any]], path: Path) -> None:
-    """A line a point; the errors of single cases in columns of their own."""
-    flat = [
-        {name: value for name, value in point.items() if name != "errors_mm"}
-        | {f"error_{name}_mm": value for name, value in point["errors_mm"].items()}
-        for point in points
-    ]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.DictWriter(file, flat[0].keys())
-        rows.writeheader()
-        rows.writerows(flat)
+def _flat(point: dict[str, Any]) -> dict[str, Any]:
+    """A point with the errors of single cases in columns of their own."""
+    errors = {f"error_{name}_mm": value for name, value in point["errors_mm"].items()}
+    return {name: value for name, value in point.items() if name != "errors_mm"} | errors
 
 
 def table(points: list[dict[str, Any]]) -> list[str]:

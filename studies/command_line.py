@@ -1,0 +1,106 @@
+"""What commands share: their faults, the numbers, scenes and folders that they take, and the start of Taichi."""
+
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+
+from scenes.anatomy import LoadedAnatomy, load_anatomy
+from scenes.scene import Scene, load_scene
+from studies.results import write_json
+
+
+class Fault(click.ClickException):
+    """What the user must know, in one line."""
+
+
+class NumberRange(click.FloatRange):
+    """Numbers between two; click's own range lets nan through."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value} is no number", param, ctx)
+        return number
+
+
+def start_taichi(arch: str) -> str:
+    """Initialise Taichi where the user wants it; the backend it is. Raises Fault."""
+    from sim.device import NoDevice, start
+
+    try:
+        return start(arch)
+    except NoDevice as error:
+        raise Fault(f"--arch {arch}: {error}") from None
+
+
+def make_folder(folder: Path, option: str = "--out") -> None:
+    """Make sure that a folder can be written to before time is spent on what goes there. Raises Fault."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise Fault(
+            f"{folder}: cannot be made a folder for results ({error.strerror}); choose another {option}"
+        ) from None
+    if not os.access(folder, os.W_OK):
+        raise Fault(f"{folder}: cannot be written to; choose another {option}")
+
+
+def make_place(json_file: Path | None) -> None:
+    """Make sure that the file of --json, where it is asked for, can be written before time is spent. Raises Fault."""
+    if json_file is None:
+        return
+    make_folder(json_file.parent, "--json")
+    if json_file.is_dir():
+        raise Fault(f"{json_file}: is a folder; name a file after --json")
+
+
+def save_figures(figures: dict[str, Any], json_file: Path) -> None:
+    """Write figures to the file of --json and say so. Raises Fault."""
+    try:
+        write_json(figures, json_file)
+    except OSError as error:
+        raise Fault(f"{json_file}: cannot be written ({error.strerror}); choose another --json") from None
+    click.echo(f"\nWrote {json_file}")
+
+
+def scene_file(scene: Path) -> Path:
+    """The scene's file, where a patient's folder may be named instead. Raises Fault where the folder holds none."""
+    path = scene / "scene.toml" if scene.is_dir() else scene
+    if scene.is_dir() and not path.is_file():
+        raise Fault(f"{scene}: holds no scene.toml; make a patient's folder of a CT with: app.py import")
+    return path
+
+
+def load_patient(scene: Path) -> tuple[Scene, LoadedAnatomy]:
+    """A scene file or a patient's folder, and the anatomy that it names. Raises Fault, SceneError."""
+    path = scene_file(scene)
+    loaded = load_scene(path)
+    return loaded, load_anatomy(loaded, path.parent)
+
+
+def probe_named(probe: str | None) -> str | None:
+    """A probe as --probe names it: a file by its whole path, as a scene's own would be looked for beside the scene."""
+    return str(Path(probe).resolve()) if probe and Path(probe).is_file() else probe
+
+
+def numbers(text: str, option: str, least: float, most: float) -> list[float]:
+    """Different numbers of an option's text, such as "2.2,2.7", in ascending order. Raises Fault."""
+    try:
+        values = sorted({float(value) for value in text.split(",")})
+    except ValueError:
+        values = []
+    if not values or not all(least <= value <= most for value in values):
+        raise Fault(f"{option} is {text!r}: expected numbers from {least:g} to {most:g} such as 2.2,2.7")
+    return values
+
+
+arch_option = click.option(
+    "--arch",
+    type=click.Choice(["auto", "cuda", "vulkan", "cpu"]),
+    default="auto",
+    show_default=True,
+    help="Where to compute; auto is CUDA where there is one, else the CPU.",
+)
