@@ -11,7 +11,7 @@ from sim.shapes import ConvexTool
 from sim.skinning import Skin
 from sim.solver import StepSettings
 from studies.case import Case
-from studies.models import build_solver, fill, static_shape, step_settings
+from studies.models import build_solver, fill, moved_by, static_shape, step_settings
 from studies.report import timed
 from studies.setup import Setup, SetupError
 from ultrasound.probe import between
@@ -48,7 +48,7 @@ class Experiment:
         self.origin = case.organ.bounds.mean(axis=0)
         tissue = tissue_of(case, setup)
         tool = ConvexTool.cuboid(case.size_mm, case.edge_radius_mm)
-        shapes = [static_shape(_shifted(case.support, -self.origin), tissue), tool]
+        shapes = [static_shape(moved_by(case.support, -self.origin), tissue), tool]
         contact = Contact(shape_friction=case.friction)
         self.solver = build_solver(_organ(case), tissue, shapes, tool, contact, rest=rest)
         self.body, self.model, self.contacts = self.solver.body, self.solver.model, self.solver.contacts
@@ -154,8 +154,4 @@ def rest_body(case: Case, setup: Setup) -> RestBody:
 
 
 def _organ(case: Case) -> trimesh.Trimesh:
-    return _shifted(case.organ, -case.organ.bounds.mean(axis=0))
-
-
-def _shifted(mesh: trimesh.Trimesh, by: np.ndarray) -> trimesh.Trimesh:
-    return trimesh.Trimesh(mesh.vertices + by, mesh.faces, process=False)
+    return moved_by(case.organ, -case.organ.bounds.mean(axis=0))

@@ -19,7 +19,15 @@ from sim.neo_hookean import NeoHookean
 from sim.shapes import Plane, SignedDistanceField
 from sim.skinning import Skin
 from sim.solver import SolverState
-from studies.models import Held, build_solver, embedding_cell_mm, static_shape, step_settings, tool_of
+from studies.models import (
+    Held,
+    build_solver,
+    embedding_cell_mm,
+    moved_by,
+    static_shape,
+    step_settings,
+    tool_of,
+)
 from studies.setup import probe_of, setup_of_scene
 from studies.trade.front import expected_error_mm, load_points
 from ultrasound.array import Mode, Probe, Rung
@@ -79,12 +87,12 @@ class Rehearsal:
         self.scene = scene
         self.probe = probe or probe_of(scene)
         self.origin = anatomy.organ.bounds.mean(axis=0)
-        self.organ = _shifted(anatomy.organ, -self.origin)
-        self.tumour = anatomy.tumour and _shifted(anatomy.tumour, -self.origin)
-        self.parts = {tissue: _shifted(part, -self.origin) for tissue, part in anatomy.parts.items()}
+        self.organ = moved_by(anatomy.organ, -self.origin)
+        self.tumour = anatomy.tumour and moved_by(anatomy.tumour, -self.origin)
+        self.parts = {tissue: moved_by(part, -self.origin) for tissue, part in anatomy.parts.items()}
         self.gravity_direction = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
         meshes = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
-        self.supports = [_shrunk(_shifted(mesh, -self.origin), SUPPORT_SUNK_MM) for mesh in meshes]
+        self.supports = [_shrunk(moved_by(mesh, -self.origin), SUPPORT_SUNK_MM) for mesh in meshes]
         told("Building the model: tissue and contacts")
         self._build_solver(anatomy)
         self.guard = Guard(self.solver)
@@ -128,7 +136,7 @@ class Rehearsal:
             normal = np.array(shape.normal) / np.linalg.norm(shape.normal)
             return Plane(normal, shape.offset_mm / np.linalg.norm(shape.normal) - normal @ self.origin)
         if isinstance(shape, trimesh.Trimesh):
-            return static_shape(_shifted(shape, -self.origin), self.scene.tissue)
+            return static_shape(moved_by(shape, -self.origin), self.scene.tissue)
         spacing = 1 / np.diag(shape.index_from_mm)[:3]
         return SignedDistanceField(shape.voxels, -spacing * shape.index_from_mm[:3, 3] - self.origin, spacing)
 
@@ -299,10 +307,6 @@ class Rehearsal:
         return hashlib.sha256(state.position.tobytes() + state.velocity.tobytes()).hexdigest()[:16]
 
 
-def _shifted(mesh: trimesh.Trimesh, by: np.ndarray) -> trimesh.Trimesh:
-    return trimesh.Trimesh(mesh.vertices + by, mesh.faces, process=False)
-
-
 def _shrunk(mesh: trimesh.Trimesh, by_mm: float) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices - by_mm * mesh.vertex_normals, mesh.faces, process=False)
 
@@ -313,5 +317,5 @@ def scanned_anatomy(organ: trimesh.Trimesh, ct: Grid, anatomy: LoadedAnatomy, or
     shift = np.eye(4)
     shift[:3, 3] = origin
     marks = None if labels is None else labels.voxels.astype(np.int32)
-    tumour = anatomy.tumour and _shifted(anatomy.tumour, -origin)
+    tumour = anatomy.tumour and moved_by(anatomy.tumour, -origin)
     return Anatomy(organ, ct.voxels, ct.index_from_mm @ shift, marks, anatomy.tissues, tumour)

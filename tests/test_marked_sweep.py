@@ -19,11 +19,12 @@ from scenes.anatomy import load_surface, phantom_folder
 from scenes.scene import EMBEDDED
 from sim.distance import signed_distance
 from sim.embedding import Unmoved
+from studies.coordinates import probe_in_patient
 from studies.freehand import unsqueeze
 from studies.freehand.experiment import sweep_of
 from studies.freehand.rebuild import track_of
 from studies.freehand.unsqueeze import Unsqueezed
-from studies.rehearse.sweeping import Sweeping, probe_in_patient
+from studies.rehearse.sweeping import Sweeping
 from ultrasound import reconstruction
 from ultrasound.array import load_probe
 from ultrasound.marked_sweep import MarkedSweep, marks_beside

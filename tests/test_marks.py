@@ -8,7 +8,7 @@ import trimesh
 from conftest import rotation_about
 
 from sim.embedding import Unmoved
-from studies.rehearse.sweeping import probe_in_patient
+from studies.coordinates import probe_in_patient
 from ultrasound.array import load_probe
 from ultrasound.marks import Marks
 from ultrasound.plane import ImagePlane, PlaneInTissue

@@ -10,6 +10,7 @@ from plan_ball import FACET_MM, ORIGIN, SIZE, X, Y, Z, big_ball, faces_in, hand_
 
 from scenes.anatomy import LoadedAnatomy
 from sim.distance import signed_distance
+from studies.coordinates import probe_in_patient
 from studies.plan import virtual_tumour
 from studies.plan.baselines import by_chance, planned, random_ways, row_by_row, straight
 from studies.plan.candidate import (
@@ -24,7 +25,6 @@ from studies.plan.candidate import (
 )
 from studies.plan.file import MOST_SWEEPS
 from studies.plan.way import layout_towards
-from studies.plan.workers import _in_patient
 from ultrasound.array import load_probe
 from ultrasound.coverage import VOXEL_MM, Coverage
 
@@ -222,7 +222,7 @@ def test_sweeps_by_chance_are_the_seeds_and_over_the_target(trial):
 
 def test_a_plans_poses_are_the_ways_in_the_patient(rehearsal):
     way = glide_of(rehearsal, 2).way(rehearsal.hand, values_of(glide_of(rehearsal, 2)))
-    placed = np.stack([_in_patient(rehearsal, pose) for pose in way.poses])
+    placed = np.stack([probe_in_patient(rehearsal, pose) for pose in way.poses])
     # PLUS's axes of a probe: x to the marked side, y into the tissue, from the middle of the face.
     assert placed[:, :3, 3] == pytest.approx(faces_in(way.poses) + ORIGIN)
     assert placed[:, :3, 0] == pytest.approx(way.poses[:, :3, 0])

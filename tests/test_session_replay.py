@@ -14,10 +14,10 @@ from render.window import NoVulkan
 from scenes.anatomy import LoadedAnatomy, load_anatomy, phantom_folder
 from scenes.scene import EMBEDDED, load_scene, with_options
 from sim.device import start
+from studies.coordinates import probe_in_patient
 from studies.models import step_settings
 from studies.rehearsal import Rehearsal
 from studies.rehearse import headless, run
-from studies.rehearse.sweeping import probe_in_patient
 from studies.rehearse.view import settings_of
 from studies.scan.poses import TimedPoses
 from studies.session import recorded

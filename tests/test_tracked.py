@@ -11,10 +11,10 @@ from test_history import STEP_S, Numbers, ray, step
 from test_session import header
 
 import app
+from studies.coordinates import probe_in_patient
 from studies.rehearse.live import Live
-from studies.rehearse.sweeping import probe_in_patient
 from studies.rehearse.track_file import check_near, load_track
-from studies.rehearse.tracked import PlayedPoses, TrackOver, has_moved, pose_at
+from studies.rehearse.tracked import PlayedPoses, TrackOver, has_moved, pose_at_time
 from studies.scan.poses import PoseError, TimedPoses
 from studies.session.file import Recording, read_log
 from studies.session.recorded import Recorded
@@ -166,7 +166,7 @@ def test_between_two_poses_it_is_even_in_place_and_angle():
     track = way()
     for time, share in ((0.0, 0.0), (0.25, 1.0), (0.1, 0.4), (1.1, 4.4), (2.0, 8.0), (5.0, 8.0)):
         expected = placed(1.5 * share - 6.0, fan_deg=4.0 * share)
-        assert pose_at(track, time) == pytest.approx(expected), time
+        assert pose_at_time(track, time) == pytest.approx(expected), time
 
 
 def test_beside_a_frame_that_is_lost_it_is_lost():
@@ -182,9 +182,9 @@ def test_beside_a_frame_that_is_lost_it_is_lost():
         1.76: False,
         2.0: False,
     }
-    assert {time: pose_at(track, time) is not None for time in known} == known
+    assert {time: pose_at_time(track, time) is not None for time in known} == known
     alone = TimedPoses(np.array([7.0]), [placed(1.0)])
-    assert np.array_equal(pose_at(alone, 0.0), placed(1.0))
+    assert np.array_equal(pose_at_time(alone, 0.0), placed(1.0))
 
 
 def test_a_file_goes_by_the_sessions_time_and_then_the_user_leads():
@@ -214,7 +214,7 @@ def test_time_goes_on_through_ways_back():
     steps(live, 6)
     for _ in range(4):
         step(live, reset=True)
-    assert np.array_equal(played.pose(), pose_at(way(), 10 * STEP_S))
+    assert np.array_equal(played.pose(), pose_at_time(way(), 10 * STEP_S))
     # 0.57 - 0.07 is less than a half by rounding.
     half = PlayedPoses(TimedPoses(np.array([0.07, 0.57]), [placed(0.0), placed(1.0)]), Session(Patient()))
     half.session.moment = 4

@@ -19,7 +19,7 @@ from sim.distance import distance_grid
 from sim.embedding import Embedding
 from sim.shapes import GRID_MM, ConvexTool, SignedDistanceField
 from sim.solver import Solver
-from studies.models import AnyTissue, build_solver, embedding_cell_mm, fill, reach_of, step_settings
+from studies.models import AnyTissue, build_solver, embedding_cell_mm, fill, moved_by, reach_of, step_settings
 from studies.rehearsal import SURROUNDINGS_MM, Rehearsal, scanned_anatomy
 from studies.rehearse.view import settings_of, take_view
 from studies.report import Record, timed
@@ -81,7 +81,7 @@ class Body:
         self.tissue = tissue
         self.settings = step_settings(tissue, scene.solver)
         middle = anatomy.organ.bounds.mean(axis=0)
-        self.organ = _shifted(anatomy.organ, -middle)
+        self.organ = moved_by(anatomy.organ, -middle)
         reach_mm = reach_of(tissue)
         self.supports = [
             distance_grid(shape.vertices - middle, shape.faces, GRID_MM, reach_mm)
@@ -257,7 +257,3 @@ def _alone(name: str, work: Callable[[], Any], owners: list, apart: Any) -> dict
     mb = round(sum(memory_mb(owner, apart) for owner in owners), 4)
     nothing = dict(ms_off=0.0, mb_off=0.0, kernels_on=None, kernels_off=0, launches_on=None, launches_off=0)
     return dict(feature=name, ms_on=round(float(np.median(ms)), 4), mb_on=mb, **nothing)
-
-
-def _shifted(mesh: trimesh.Trimesh, by: np.ndarray) -> trimesh.Trimesh:
-    return trimesh.Trimesh(mesh.vertices + by, mesh.faces, process=False)

@@ -8,7 +8,8 @@ import trimesh
 from scenes.anatomy import LoadedAnatomy
 from sim.distance import signed_distance
 from sim.embedding import Unmoved
-from studies.freehand.unsqueeze import come, shifted
+from studies.coordinates import probe_in_patient
+from studies.freehand.unsqueeze import come
 from studies.readings import read
 from studies.rehearsal import Rehearsal, scanned_anatomy
 from ultrasound.array import Probe
@@ -110,7 +111,7 @@ def pressed(rehearsal: Rehearsal, depth_mm: float) -> Truth:
             rehearsal.embedding.update()
             rehearsal.scanner.plane.take(rehearsal.image_plane())
             images.append(marks.render())
-            poses.append(shifted(rehearsal.image_plane().world_from_plane, rehearsal.origin))
+            poses.append(probe_in_patient(rehearsal))
             squeezed.append(read(rehearsal, probe, touches).compression_mm)
     times = np.arange(len(poses)) * every * rehearsal.settings.time_step_s
     truth = _truth(np.stack(images), np.stack(poses), times, probe, beads + rehearsal.origin)

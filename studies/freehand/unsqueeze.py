@@ -2,10 +2,11 @@
 
 import numpy as np
 
+from studies.coordinates import transducer_at
 from studies.freehand.rebuild import Track
 from studies.rehearsal import Rehearsal
 from ultrasound.plane import ImagePlane, PlaneInTissue
-from ultrasound.probe import advanced, between, held_at, image_plane
+from ultrasound.probe import advanced, between, image_plane
 from ultrasound.sweep import Sweep, SweepError
 
 # The probe comes from so far above its first place, in so long, and waits so long there for the tissue to come to rest.
@@ -39,7 +40,7 @@ class Unsqueezed:
                     f"frame {frame}: ImageToProbe turns the picture: expected a sweep of Nephron's"
                 )
             self._on_probe[frame] = on_probe
-            self._poses[frame] = held_at(shifted(probe, -rehearsal.origin), rehearsal.size_mm[2])
+            self._poses[frame] = transducer_at(rehearsal, probe)
         self._frame = int(track.frames[0])
         come(rehearsal, self._poses[self._frame])
 
@@ -72,10 +73,3 @@ def go(rehearsal: Rehearsal, pose: np.ndarray, seconds: float) -> None:
     steps = max(1, round(seconds / rehearsal.settings.time_step_s))
     for step in between(rehearsal.pose, pose, steps)[1:]:
         rehearsal.advance(step)
-
-
-def shifted(pose: np.ndarray, by_mm: np.ndarray) -> np.ndarray:
-    """A pose (4, 4) moved by (3,) [mm]."""
-    moved = pose.copy()
-    moved[:3, 3] += by_mm
-    return moved

@@ -1,10 +1,10 @@
 """A rehearsal's picture on the link."""
 
 from render.viewer import View
+from studies.coordinates import probe_in_patient
 from studies.link.messages import LivePicture
 from studies.link.server import Server
 from studies.rehearsal import Rehearsal
-from studies.rehearse.sweeping import probe_in_patient
 from ultrasound.array import Probe
 
 

@@ -4,13 +4,12 @@ from functools import partial
 
 import numpy as np
 
-from studies.freehand.unsqueeze import shifted
+from studies.coordinates import transducer_at
 from studies.plan.candidate import half_size, passes_needed, width_mm
 from studies.plan.file import Sweep
 from studies.plan.trial import Trial
 from studies.plan.way import Layout, Way, gliding, layout_towards
 from ultrasound.coverage import VOXEL_MM
-from ultrasound.probe import held_at
 
 # How deep an unplanned sweep presses: in the middle of what a scene's press begins with; by chance up to twice as deep.
 DEPTH_MM = 3.0
@@ -45,9 +44,8 @@ def by_chance(trial: Trial, count: int, seed: int) -> Way:
 
 def planned(trial: Trial, sweep: Sweep) -> Way:
     """The sweep of a plan."""
-    origin, length = trial.rehearsal.origin, trial.rehearsal.size_mm[2]
     return Way(
-        tuple(np.stack([held_at(shifted(pose, -origin), length) for pose in each]) for each in sweep.poses())
+        tuple(np.stack([transducer_at(trial.rehearsal, pose) for pose in each]) for each in sweep.poses())
     )
 
 

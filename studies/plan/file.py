@@ -1,7 +1,6 @@
 """The file of a plan: sweeps over a target, the best first, with what each was worth. JSON; patient coordinates LPS, mm."""
 
 import json
-import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -9,13 +8,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from scenes.trocar import Trocar
+from studies.numbering import next_number
 from ultrasound.target import Target
 
 MOST_POSES, MOST_MARGIN_MM = 20_000, 30.0
 # Kinds of sweep that are compared, at most.
 MOST_SWEEPS = 4
 SLOWEST_MM_S, FASTEST_MM_S = 1.0, 100.0
-NAME = re.compile(r"plan-([0-9]{3,9})\.json")
+NAME = r"plan-([0-9]{3,9})\.json"
 # How far the axes of a pose may be from orthonormal: what six digits in a file leave.
 RIGID = 1e-3
 # What a plan begins with.
@@ -96,8 +96,7 @@ def scans_of(trials: int) -> int:
 
 def next_free(folder: Path) -> Path:
     """The place of the next plan in a folder."""
-    taken = [int(found[1]) for path in folder.glob("plan-*.json") if (found := NAME.fullmatch(path.name))]
-    return folder / f"plan-{1 + max(taken, default=0):03d}.json"
+    return folder / f"plan-{next_number(folder, NAME):03d}.json"
 
 
 def is_plan(path: Path) -> bool:

@@ -19,6 +19,7 @@ import sim.device
 from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.scene import Scene
 from scenes.trocar import Trocar
+from studies.coordinates import probe_in_patient
 from studies.plan.candidate import Candidate, candidates_of
 from studies.plan.evolution import foreseen
 from studies.plan.file import PlanError
@@ -30,7 +31,6 @@ from studies.plan.way import Way
 from studies.rehearsal import Rehearsal
 from ultrasound.array import Probe
 from ultrasound.coverage import VOXEL_MM, Coverage
-from ultrasound.probe import image_plane
 from ultrasound.target import Target
 
 
@@ -178,11 +178,5 @@ def _go_way(key: str, ground: Ground, make: Callable[[Trial], Way], speed_mm_s: 
     way = make(trial)
     parts = trial.run(way)
     return Gone(
-        parts, [np.stack([_in_patient(trial.rehearsal, pose) for pose in each]) for each in way.passes]
+        parts, [np.stack([probe_in_patient(trial.rehearsal, pose) for pose in each]) for each in way.passes]
     )
-
-
-def _in_patient(rehearsal: Rehearsal, pose: np.ndarray) -> np.ndarray:
-    placed = image_plane(pose, rehearsal.size_mm[2], 1.0, 1.0).world_from_plane.copy()
-    placed[:3, 3] += rehearsal.origin
-    return placed

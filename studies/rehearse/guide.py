@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from render.viewer import Guidance
-from studies.freehand.unsqueeze import shifted
+from studies.coordinates import transducer_at
 from studies.plan.file import Plan
 from studies.plan.parts import faces_of
 from studies.rehearsal import Rehearsal
-from ultrasound.probe import advanced, held_at, indentation
+from ultrasound.probe import advanced, indentation
 
 # A probe farther than this from the sweep is elsewhere; nearer than that to a pose it is there.
 NEAR_MM, THERE_MM = 6.0, 1.0
@@ -36,9 +36,8 @@ class Guide:
         """Nothing of the sweep was gone yet."""
         self.at = 0
         shown = self.number < len(self.plan.sweeps)
-        length, origin = self.rehearsal.size_mm[2], self.rehearsal.origin
         passes = [
-            np.stack([held_at(shifted(pose, -origin), length) for pose in each])
+            np.stack([transducer_at(self.rehearsal, pose) for pose in each])
             for each in (self.plan.sweeps[self.number].poses() if shown else [])
         ]
         self._poses = np.concatenate(passes) if shown else np.zeros((0, 4, 4))

@@ -10,23 +10,25 @@ from PIL import Image
 from render.pictures import in_proportion
 from render.viewer import View
 from scenes.surface_files import save_surface
+from studies.numbering import next_number
 from studies.rehearsal import Rehearsal
 from ultrasound.array import Probe
 from ultrasound.dicom_image import save_dicom
 from ultrasound.scanner import ECHO
 
+SCREENSHOT, PICTURE = r"screenshot-([0-9]{3,9})\.png", r"([0-9]{3,9})-.*\.png"
+
 
 def save_screenshot(picture: np.ndarray, out: Path) -> None:
     """Save a picture under the next free number, and say where."""
-    number = 1 + max([int(path.stem[-3:]) for path in out.glob("screenshot-[0-9][0-9][0-9].png")], default=0)
-    path = out / f"screenshot-{number:03d}.png"
+    path = out / f"screenshot-{next_number(out, SCREENSHOT):03d}.png"
     Image.fromarray(picture).save(path)
     click.echo(f"Saved {path}")
 
 
 def save_pictures(view: View, probe: Probe, out: Path) -> str:
     """Save what the scanner shows as PNG, an echo as DICOM too, under the next free number, and say where; how their names begin."""
-    number = 1 + max([int(path.stem[:3]) for path in out.glob("[0-9][0-9][0-9]-*.png")], default=0)
+    number = next_number(out, PICTURE)
     for name, picture in view.pictures.items():
         path = out / f"{number:03d}-{name.lower()}.png"
         image = in_proportion(picture, view.width_mm, view.depth_mm)

@@ -1,18 +1,17 @@
 """Sweeps that the user records in the window."""
 
-import re
 from pathlib import Path
 
-import numpy as np
-
 from render.viewer import View
+from studies.coordinates import probe_in_patient
+from studies.numbering import next_number
 from studies.rehearsal import Rehearsal
 from ultrasound.array import Probe
 from ultrasound.marked_sweep import MarkedSweep
 from ultrasound.sweep import SweepError
 
 FRAME_S = 1 / 30
-SWEEP = re.compile(r"sweep-([0-9]{3,9})\.igs\.mha")
+NAME = r"sweep-([0-9]{3,9})\.igs\.mha"
 
 
 class Sweeping:
@@ -30,8 +29,7 @@ class Sweeping:
             return self.end()
         if self.rehearsal.scanner is None:
             return "No CT, no sweep"
-        taken = [int(found[1]) for path in out.glob("sweep-*") if (found := SWEEP.fullmatch(path.name))]
-        stem = f"sweep-{1 + max(taken, default=0):03d}"
+        stem = f"sweep-{next_number(out, NAME):03d}"
         try:
             self._sweep = MarkedSweep(out, stem, self.rehearsal.probe)
         except OSError as error:
@@ -82,10 +80,3 @@ class Sweeping:
 
 def _words(error: OSError | SweepError) -> str:
     return error.strerror or str(error) if isinstance(error, OSError) else str(error)
-
-
-def probe_in_patient(rehearsal: Rehearsal) -> np.ndarray:
-    """The pose (4, 4) of the probe, in PLUS's axes, in the patient (LPS, mm)."""
-    pose = rehearsal.image_plane().world_from_plane.copy()
-    pose[:3, 3] += rehearsal.origin
-    return pose

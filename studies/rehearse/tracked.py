@@ -5,11 +5,11 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from studies.freehand.unsqueeze import shifted
+from studies.coordinates import transducer_at
 from studies.rehearsal import Rehearsal
 from studies.scan.poses import TimedPoses
 from studies.session.session import Session
-from ultrasound.probe import held_at, interpolated
+from ultrasound.probe import interpolated
 
 # A probe that is held still moves no farther than this: a hand's tremor, and a tracker's noise.
 STILL_MM, STILL_DEG = 3.0, 3.0
@@ -40,10 +40,10 @@ class PlayedPoses:
         # A sum of steps is not to miss the last pose by rounding.
         if self.session.time_s > self.poses.length_s + 1e-9:
             raise TrackOver("The tracked file is over: yours now")
-        return pose_at(self.poses, self.session.time_s)
+        return pose_at_time(self.poses, self.session.time_s)
 
 
-def pose_at(poses: TimedPoses, time_s: float) -> np.ndarray | None:
+def pose_at_time(poses: TimedPoses, time_s: float) -> np.ndarray | None:
     """The pose (4, 4) so long after the first, between two in position and angle; None where one of the two was not seen."""
     times, last = poses.times_s - poses.times_s[0], len(poses.times_s) - 1
     after = min(int(np.searchsorted(times, time_s)), last)
@@ -75,7 +75,7 @@ class Follower:
         self.is_lost = pose is None
         if pose is None or self._is_waiting(pose):
             return None
-        return held_at(shifted(pose, -self.rehearsal.origin), self.rehearsal.size_mm[2])
+        return transducer_at(self.rehearsal, pose)
 
     def _is_waiting(self, pose: np.ndarray) -> bool:
         if self._waits:

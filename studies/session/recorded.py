@@ -1,20 +1,19 @@
 """A rehearsal that is recorded: its file, and when lines and whole states go to it."""
 
-import re
 from pathlib import Path
 from typing import Any
 
 from scenes.anatomy import LoadedAnatomy, fingerprint
+from studies.numbering import next_number
 from studies.rehearsal import RehearsalState
 from studies.session.file import Header, Recording
+from studies.session.scene import recorded_values
 from studies.session.session import Session
 from studies.session.state import to_text
 
 # A whole state is written so often: from one to the next, at most, is computed anew where a session is opened in its midst.
 STATE_S = 60.0
-NAME = re.compile(r"session-([0-9]{3,9})\.jsonl")
-# What of a scene stands in the patient's folder, and may name files.
-NOT_RECORDED: dict[str, Any] = {"anatomy": True, "shape": True, "title": True, "transducer": {"probe"}}
+NAME = r"session-([0-9]{3,9})\.jsonl"
 
 
 class Recorded:
@@ -57,12 +56,11 @@ def record(
     rehearsal = session.rehearsal
     header = Header(
         anatomy=fingerprint(anatomy),
-        scene=rehearsal.scene.model_dump(mode="json", exclude=NOT_RECORDED),
+        scene=recorded_values(rehearsal.scene),
         probe=rehearsal.probe.model_dump(mode="json", by_alias=True),
         arch=arch,
         time_step_s=rehearsal.settings.time_step_s,
         begins=None if begins is None else to_text(begins),
     )
-    taken = [int(found[1]) for path in folder.glob("session-*") if (found := NAME.fullmatch(path.name))]
-    path = folder / f"session-{1 + max(taken, default=0):03d}.jsonl"
+    path = folder / f"session-{next_number(folder, NAME):03d}.jsonl"
     return Recorded(session, Recording(path, header))
