@@ -4,7 +4,7 @@ import numpy as np
 
 from studies.case import Case
 from studies.experiment import Experiment, Run
-from studies.report import counted, spread
+from studies.results import counted, rounded, spread
 from studies.setup import Setup
 
 DISTANCE_BANDS = 4
@@ -58,11 +58,6 @@ def correlation(first: np.ndarray, second: np.ndarray) -> float | None:
     a, b = first.ravel() - first.mean(), second.ravel() - second.mean()
     scale = np.linalg.norm(a) * np.linalg.norm(b)
     return rounded(a @ b / scale) if scale > 1e-12 else None
-
-
-def rounded(value: float) -> float | None:
-    """As reports have it, in which rounding of the last bits is not seen; None for what JSON has no number for."""
-    return round(float(value), 6) if np.isfinite(value) else None
 
 
 def report(experiment: Experiment, setup: Setup, run: Run) -> dict:

@@ -11,9 +11,10 @@ from sim.shapes import ConvexTool
 from sim.skinning import Skin
 from sim.solver import StepSettings
 from studies.case import Case
-from studies.models import build_solver, fill, moved_by, static_shape, step_settings
-from studies.report import timed
+from studies.models import AnyTissue, build_solver, fill, static_shape, step_settings
 from studies.setup import Setup, SetupError
+from studies.stopwatch import timed
+from studies.surfaces import moved_by
 from ultrasound.probe import between
 
 # The share of a stage's steps in which the probe moves; in the others the tissue comes to rest, as it did for the scan.
@@ -99,8 +100,7 @@ class Experiment:
 
     def size(self, setup: Setup) -> dict[str, float]:
         """How large the model is, under the names of a report: ``radius_mm`` or ``cell_mm``, ``particles`` or ``nodes``."""
-        own = dict(cell_mm=setup.cell_mm) if setup.model == "neo-hookean" else dict(radius_mm=setup.radius_mm)
-        return {**own, **self.model.counts()}
+        return {setup.size_name: setup.size_mm, **self.model.counts()}
 
     def describe(self, setup: Setup) -> str:
         """Size and settings that the model does not share with others, for the terminal."""
@@ -127,7 +127,7 @@ class Experiment:
         return pose
 
 
-def tissue_of(case: Case, setup: Setup) -> NeoHookeanTissue | ShapeMatchingTissue:
+def tissue_of(case: Case, setup: Setup) -> AnyTissue:
     """The setup's tissue with what is the case's own. Raises SetupError where neither gives the material."""
     values: dict[str, float | str | None] = dict(
         model=setup.model, density_g_cm3=(case.density_kg_m3 or DENSITY_KG_M3) / 1000

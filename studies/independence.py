@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from studies.accuracy import rounded
 from studies.experiment import Experiment
+from studies.results import rounded
 from studies.setup import OPTION_OF, Setup, SetupError
 
 # Sizes of which a third more and less can be built.
@@ -20,9 +20,9 @@ def changes_of(setup: Setup) -> dict[str, Setup]:
 
     The press takes as long with half the time step. Raises SetupError where a changed value would be out of range.
     """
-    size = "cell_mm" if setup.model == "neo-hookean" else "radius_mm"
+    size = setup.size_name
     things = "cells" if setup.model == "neo-hookean" else "particles"
-    if not LEAST_MM <= getattr(setup, size) <= MOST_MM:
+    if not LEAST_MM <= setup.size_mm <= MOST_MM:
         raise SetupError(
             f"--check: {things} a third larger and smaller need --{OPTION_OF[size]} from {LEAST_MM:g} to {MOST_MM:g}"
         )

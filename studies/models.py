@@ -45,11 +45,6 @@ class Held:
         return held
 
 
-def moved_by(mesh: trimesh.Trimesh, by_mm: np.ndarray) -> trimesh.Trimesh:
-    """A surface moved by (3,) [mm], its vertices and faces in the order that they had."""
-    return trimesh.Trimesh(mesh.vertices + by_mm, mesh.faces, process=False)
-
-
 def static_shape(mesh: trimesh.Trimesh, tissue: AnyTissue) -> SignedDistanceField:
     """What a closed surface [mm] that does not move is to a tissue: distances as far around as it asks for them."""
     return SignedDistanceField.of_surface(mesh.vertices, mesh.faces, reach_of(tissue))

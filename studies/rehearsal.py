@@ -23,12 +23,12 @@ from studies.models import (
     Held,
     build_solver,
     embedding_cell_mm,
-    moved_by,
     static_shape,
     step_settings,
     tool_of,
 )
 from studies.setup import probe_of, setup_of_scene
+from studies.surfaces import moved_by, volume_mm3
 from studies.trade.front import expected_error_mm, load_points
 from ultrasound.array import Mode, Probe, Rung
 from ultrasound.outline import section
@@ -292,9 +292,8 @@ class Rehearsal:
 
     def volume_ratio(self) -> float:
         """Volume inside the carried surface, as a share of the resting one."""
-        carried = self.organ_skin.vertices.to_numpy()[self.organ.faces].astype(float)
-        volume = np.einsum("ij,ij->", carried[:, 0], np.cross(carried[:, 1], carried[:, 2])) / 6
-        return float(volume / self.organ.volume)
+        carried = self.organ_skin.vertices.to_numpy()
+        return float(volume_mm3(carried, self.organ.faces) / self.organ.volume)
 
     def reset(self) -> None:
         """Tissue and transducer as they were at the start: settled, and just touching."""

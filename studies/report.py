@@ -1,40 +1,14 @@
 """What a headless run measured, as ``report.json`` has it."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from time import perf_counter
 
 import numpy as np
-import taichi as ti
 
 from studies.rehearsal import Rehearsal
+from studies.results import counted, spread
 
-
-def timed(work: Callable, into_ms: list[float]):
-    """Do some work, wait for the device, and add the milliseconds that it took."""
-    start = perf_counter()
-    result = work()
-    ti.sync()
-    into_ms.append(1000 * (perf_counter() - start))
-    return result
-
-
-def spread(values_ms: list[float]) -> dict[str, float]:
-    """Mean, standard deviation, minimum, maximum and median."""
-    v = np.array(values_ms)
-    figures = dict(mean=v.mean(), sd=v.std(), min=v.min(), max=v.max(), median=np.median(v))
-    return {name: round(float(value), 4) for name, value in figures.items()}
-
-
-# How long a notice stands in the panel.
-SHOWN_S = 4.0
 # Keys that not every tissue model fills.
 NOT_EVERYWHERE = dict(radius_mm=None, stiffness=None, clusters=0, memberships=0)
-
-
-def counted(number: int, name: str) -> str:
-    """A number of things: "1 substep", "3 substeps"."""
-    return f"{number} {name}{'' if number == 1 else 's'}"
 
 
 @dataclass
@@ -115,25 +89,6 @@ def _error(expected_mm: float | None) -> str:
     if expected_mm is None:
         return "not known: study trade measured no settings like these"
     return f"{expected_mm:.2f} mm expected, the mean of beads with settings like these (study trade)"
-
-
-class Notices:
-    """Tells the user once, and shows for a while, what the guard had to put right."""
-
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell = tell
-        self._until = 0.0
-
-    def tell(self, notice: str) -> None:
-        """Take over a step's notice; most are empty."""
-        if notice:
-            self._tell(notice)
-            self._until = perf_counter() + SHOWN_S
-
-    @property
-    def shown(self) -> str:
-        """What the panel says now."""
-        return "TISSUE PUT BACK" if perf_counter() < self._until else ""
 
 
 def _model_line(report: dict) -> str:

@@ -1,9 +1,28 @@
-"""Figures as files: JSON and CSV."""
+"""Figures as reports have them, and their files: JSON and CSV."""
 
 import csv
 import json
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+
+
+def rounded(value: float | None) -> float | None:
+    """As files have it, in which rounding of the last bits is not seen; None for what JSON has no number for."""
+    return None if value is None or not np.isfinite(value) else round(float(value), 6)
+
+
+def spread(values: list[float]) -> dict[str, float]:
+    """Mean, standard deviation, minimum, maximum and median."""
+    v = np.array(values)
+    figures = dict(mean=v.mean(), sd=v.std(), min=v.min(), max=v.max(), median=np.median(v))
+    return {name: round(float(value), 4) for name, value in figures.items()}
+
+
+def counted(number: int, name: str) -> str:
+    """A number of things: "1 substep", "3 substeps"."""
+    return f"{number} {name}{'' if number == 1 else 's'}"
 
 
 def write_json(figures: dict[str, Any], path: Path) -> None:

@@ -29,6 +29,16 @@ class Setup:
     young_kpa: float | None = None
     poisson: float | None = None
 
+    @property
+    def size_name(self) -> str:
+        """Which of these values is the size of the model's parts."""
+        return "cell_mm" if self.model == "neo-hookean" else "radius_mm"
+
+    @property
+    def size_mm(self) -> float:
+        """Width of a cell, or radius of a particle."""
+        return self.cell_mm if self.model == "neo-hookean" else self.radius_mm
+
 
 NEO_HOOKEAN = Setup("neo-hookean", cell_mm=3.5, relaxation_factor=1.7, substeps=1, iterations=4)
 # Each model's presets, which hold for every case. The first model's are points of the front that ``study trade`` measures,
@@ -62,14 +72,13 @@ def scene_of(scene: Scene, setup: Setup) -> Scene:
     """A scene with a setup's model, size and passes."""
     values: dict[str, float | int | str | None] = {
         "tissue.model": setup.model,
+        f"tissue.{setup.size_name}": setup.size_mm,
         "solver.substeps": setup.substeps,
         "solver.iterations": setup.iterations,
         "solver.relaxation_factor": setup.relaxation_factor,
     }
-    if setup.model == "neo-hookean":
-        values["tissue.cell_mm"] = setup.cell_mm
-    else:
-        values |= {"tissue.radius_mm": setup.radius_mm, "tissue.stiffness": setup.stiffness}
+    if setup.model == "shape-matching":
+        values["tissue.stiffness"] = setup.stiffness
     return with_options(scene, values)
 
 

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from studies.accuracy import rounded
 from studies.calibration import Calibration, Trial, quartic
-from studies.report import spread
+from studies.results import rounded, spread
 
 FIT, HELD_OUT = "fit", "held out"
 Row = list[float | None]

@@ -77,15 +77,15 @@ def test_a_small_body_is_maltreated_let_go_and_measured(model):
 
 
 def test_two_bodies_are_fitted_apart(device):
-    patient = bodies.admit("shape-matching", Subject("two"))
-    assert sorted(np.concatenate(patient.parts)) == list(range(patient.body.count))
-    assert min(len(part) for part in patient.parts) > 0.4 * patient.body.count
-    turned = patient.body.rest_points.copy()
-    turned[patient.parts[1]] = turned[patient.parts[1]] @ np.diag([-1.0, -1.0, 1.0]) + [5.0, 3.0, 1.0]
-    assert measure._apart(turned, patient.body.rest_points).mean() > 1.0
-    state = patient.solver.snapshot().body
-    patient.body.restore(type(state)(turned.astype(np.float32), state.velocity))
-    assert measure._shape_error(patient) < 1e-4
+    specimen = bodies.prepared("shape-matching", Subject("two"))
+    assert sorted(np.concatenate(specimen.parts)) == list(range(specimen.body.count))
+    assert min(len(part) for part in specimen.parts) > 0.4 * specimen.body.count
+    turned = specimen.body.rest_points.copy()
+    turned[specimen.parts[1]] = turned[specimen.parts[1]] @ np.diag([-1.0, -1.0, 1.0]) + [5.0, 3.0, 1.0]
+    assert measure._apart(turned, specimen.body.rest_points).mean() > 1.0
+    state = specimen.solver.snapshot().body
+    specimen.body.restore(type(state)(turned.astype(np.float32), state.velocity))
+    assert measure._shape_error(specimen) < 1e-4
 
 
 def test_reasons_tell_place_from_shape():

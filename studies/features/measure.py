@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -19,11 +18,13 @@ from sim.distance import distance_grid
 from sim.embedding import Embedding
 from sim.shapes import GRID_MM, ConvexTool, SignedDistanceField
 from sim.solver import Solver
-from studies.models import AnyTissue, build_solver, embedding_cell_mm, fill, moved_by, reach_of, step_settings
+from studies.models import AnyTissue, build_solver, embedding_cell_mm, fill, reach_of, step_settings
 from studies.rehearsal import SURROUNDINGS_MM, Rehearsal, scanned_anatomy
 from studies.rehearse.view import settings_of, take_view
-from studies.report import Record, timed
+from studies.report import Record
 from studies.setup import probe_of
+from studies.stopwatch import timed
+from studies.surfaces import moved_by
 from studies.timing.measure import memory_mb
 from ultrasound.array import Mode, Rung
 from ultrasound.probe import advanced, between, image_plane, pose_at, touching
@@ -250,10 +251,7 @@ def _alone(name: str, work: Callable[[], Any], owners: list, apart: Any) -> dict
     work()
     ms: list[float] = []
     for _ in range(CALLS):
-        began = perf_counter()
-        work()
-        ti.sync()
-        ms.append(1e3 * (perf_counter() - began))
+        timed(work, ms)
     mb = round(sum(memory_mb(owner, apart) for owner in owners), 4)
     nothing = dict(ms_off=0.0, mb_off=0.0, kernels_on=None, kernels_off=0, launches_on=None, launches_off=0)
     return dict(feature=name, ms_on=round(float(np.median(ms)), 4), mb_on=mb, **nothing)

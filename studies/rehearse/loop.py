@@ -14,11 +14,12 @@ from studies.rehearsal import Rehearsal
 from studies.rehearse.cine import Calliper, Cine, Frame
 from studies.rehearse.drivers import Driver
 from studies.rehearse.instruments import Instruments
+from studies.rehearse.notices import Notices
 from studies.rehearse.planning import Plans
 from studies.rehearse.saving import save_pictures, save_screenshot, save_surfaces
 from studies.rehearse.sweeping import Sweeping
 from studies.rehearse.view import probe_as_set, take_view
-from studies.report import Notices, Record
+from studies.report import Record
 
 # How long what was done is said.
 SAID_S = 2.0

@@ -22,11 +22,12 @@ from studies.rehearse.headless import run_headless
 from studies.rehearse.instruments import Instruments
 from studies.rehearse.live import Live
 from studies.rehearse.loop import Loop
+from studies.rehearse.notices import Notices
 from studies.rehearse.planning import Plans
 from studies.rehearse.sweeping import Sweeping
 from studies.rehearse.tracked import PlayedPoses, Tracked
 from studies.rehearse.view import open_viewer, settings_of
-from studies.report import Notices, Record
+from studies.report import Record
 from studies.scan.poses import TimedPoses
 from studies.session.file import Log
 from studies.session.recorded import Recorded, record

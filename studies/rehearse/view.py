@@ -11,7 +11,8 @@ from render.layout import FULL_SIZE
 from render.viewer import Geometry, Settings, View, Viewer
 from scenes.scene import NeoHookeanTissue
 from studies.rehearsal import Rehearsal
-from studies.report import Record, timed
+from studies.report import Record
+from studies.stopwatch import timed
 from ultrasound.array import TGC_SLIDERS, Probe
 
 TGC = tuple(f"tgc_{i + 1}" for i in range(TGC_SLIDERS))

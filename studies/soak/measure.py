@@ -12,8 +12,8 @@ from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
 from sim.device import start
 from studies.rehearsal import Rehearsal, RehearsalState
-from studies.report import timed
 from studies.setup import Setup, scene_of
+from studies.stopwatch import timed
 from ultrasound.probe import advanced
 
 SEED = 20161130

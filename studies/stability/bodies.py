@@ -25,6 +25,7 @@ from studies.rehearsal import Rehearsal
 from studies.setup import PRESETS
 from studies.stability.cases import Subject
 from studies.stability.motion import AWAY_MM
+from studies.surfaces import volume_mm3
 from ultrasound.probe import advanced, pose_at, touching
 
 # Bodies other than the kidney lie on a plane [mm].
@@ -37,7 +38,7 @@ DOWN = (0.0, 0.0, -9810.0)
 SETTLE_STEPS, MOST_SETTLES, STILL_MM_S = 180, 20, 0.05
 
 
-class Patient:
+class Specimen:
     """A body at rest in its scene. ``home`` is the transducer's pose (4, 4) where it just touches, ``parts`` the indices of
     the points of each separate piece, ``mass`` (n,) [g], ``rest`` (n, 3) [mm] where the points came to rest.
     """
@@ -68,9 +69,7 @@ class Patient:
     def volume_ratio(self) -> float:
         """Volume inside the carried surface, as a share of the resting one."""
         self.skin.update()
-        corner = self.skin.vertices.to_numpy().astype(float)[self.faces]
-        volume = np.einsum("ij,ij->", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6
-        return float(volume / self.volume)
+        return volume_mm3(self.skin.vertices.to_numpy(), self.faces) / self.volume
 
     def kinetic_mj(self) -> float:
         """Kinetic energy now [mJ]."""
@@ -78,7 +77,7 @@ class Patient:
         return float(0.5e-6 * self.mass @ (velocity**2).sum(axis=1))
 
 
-def admit(model: str, subject: Subject) -> Patient:
+def prepared(model: str, subject: Subject) -> Specimen:
     """Put a body on a fresh device and let it come to rest."""
     start("cpu")
     if subject.kind == "kidney":
@@ -97,17 +96,15 @@ def admit(model: str, subject: Subject) -> Patient:
     surface = skin.vertices.to_numpy().astype(float)
     top = surface[:, :2].mean(axis=0)
     pose = pose_at(np.array([*top, 100.0]), np.array([0.0, 0, -1]), np.array([1.0, 0, 0]), TRANSDUCER_MM[2])
-    patient = Patient(solver, skin, mesh, settings, touching(pose, TRANSDUCER_MM, surface))
+    specimen = Specimen(solver, skin, mesh, settings, touching(pose, TRANSDUCER_MM, surface))
     if subject.kind == "two":
-        patient.parts = [np.flatnonzero(solver.body.rest_points[:, 0] * side > 0) for side in (-1, 1)]
-    return patient
+        specimen.parts = [np.flatnonzero(solver.body.rest_points[:, 0] * side > 0) for side in (-1, 1)]
+    return specimen
 
 
-def _kidney(model: str) -> Patient:
+def _kidney(model: str) -> Specimen:
     fast = PRESETS[model]["fast"]
-    size = (
-        {"tissue.cell_mm": fast.cell_mm} if model == "neo-hookean" else {"tissue.radius_mm": fast.radius_mm}
-    )
+    size = {f"tissue.{fast.size_name}": fast.size_mm}
     scene = load_scene(PAPER)
     anatomy = replace(load_anatomy(scene, PAPER.parent), ct=None)
     rehearsal = Rehearsal(with_options(scene, {"tissue.model": model, **size}), anatomy)
@@ -115,7 +112,7 @@ def _kidney(model: str) -> Patient:
     away = advanced(rehearsal.hand.home, -AWAY_MM)
     for _ in range(SETTLE_STEPS):
         rehearsal.advance(away)
-    return Patient(
+    return Specimen(
         rehearsal.solver, rehearsal.organ_skin, rehearsal.organ, rehearsal.settings, rehearsal.hand.home
     )
 

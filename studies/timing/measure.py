@@ -22,8 +22,9 @@ from sim.shapes import Plane
 from sim.solver import Solver, StepSettings
 from sim.surface_contact import SurfaceContacts
 from studies.rehearsal import Rehearsal
-from studies.report import spread, timed
+from studies.results import spread
 from studies.setup import Setup, scene_of
+from studies.stopwatch import timed
 from studies.timing.bound import Bound, NoBound, Pypbd
 from studies.timing.phases import Phases, without_calls
 from ultrasound.probe import advanced, between

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 
 from studies.rehearsal import Rehearsal
-from studies.report import timed
 from studies.setup import Setup
+from studies.stopwatch import timed
 from studies.trade.front import Point
 
 # A press so deep, in so many steps, tells what a step costs here.
@@ -71,9 +71,5 @@ def trial_ms(rehearsal: Rehearsal) -> float:
 
 def described(setup: Setup) -> str:
     """Settings in words."""
-    size = (
-        f"cells of {setup.cell_mm:g} mm"
-        if setup.model == "neo-hookean"
-        else f"particles of {setup.radius_mm:g} mm"
-    )
-    return f"{setup.model}, {size}, {setup.substeps} x {setup.iterations} passes"
+    parts = "cells" if setup.model == "neo-hookean" else "particles"
+    return f"{setup.model}, {parts} of {setup.size_mm:g} mm, {setup.substeps} x {setup.iterations} passes"

@@ -12,18 +12,14 @@ from sim.device import start
 from studies.accuracy import bead_errors
 from studies.case import Case
 from studies.experiment import Experiment, rest_body
-from studies.report import timed
-from studies.setup import Setup
+from studies.results import rounded
+from studies.setup import NOT_USED, Setup
+from studies.stopwatch import timed
 from studies.trade.front import SETTINGS, pareto
-from studies.trade.sweep import size_mm
 from ultrasound.probe import between
 
 # The machine's speed changes in minutes: every setting is timed in each round, and the median counts.
 ROUNDS, TIMED_STEPS = 3, 45
-NOT_USED: dict[str, tuple[str, ...]] = {
-    "neo-hookean": ("radius_mm", "stiffness"),
-    "shape-matching": ("cell_mm",),
-}
 
 Built = Iterator[tuple[Experiment, list[Setup]]]
 
@@ -68,7 +64,7 @@ def count(cases: list[Case], tried: list[Setup], rounds: int) -> int:
 def _built(case: Case, tried: list[Setup], arch: str) -> Built:
     """Each model and size on a device of its own, with the settings that share it."""
     rest: RestBody | None
-    for (model, _), alike in groupby(tried, key=lambda setup: (setup.model, size_mm(setup))):
+    for (model, _), alike in groupby(tried, key=lambda setup: (setup.model, setup.size_mm)):
         group = list(alike)
         start(arch)
         rest = rest_body(case, group[0]) if model == "shape-matching" else None
@@ -101,13 +97,9 @@ def _row(
         **settings,
         time_step_s=setup.time_step_s,
         ms_median=round(float(ms), 4),
-        error_mean_mm=_finite(float(np.mean([*resting.values(), *arriving.values()]))),
-        error_resting_mm=_finite(float(np.mean(list(resting.values())))),
-        error_arriving_mm=_finite(float(np.mean(list(arriving.values())))),
-        errors_mm={name: _finite(value) for name, value in resting.items()},
+        error_mean_mm=rounded(float(np.mean([*resting.values(), *arriving.values()]))),
+        error_resting_mm=rounded(float(np.mean(list(resting.values())))),
+        error_arriving_mm=rounded(float(np.mean(list(arriving.values())))),
+        errors_mm={name: rounded(value) for name, value in resting.items()},
         pareto=bool(best),
     )
-
-
-def _finite(value: float) -> float | None:
-    return round(float(value), 6) if np.isfinite(value) else None

@@ -1,0 +1,42 @@
+"""Figures as reports have them, and surfaces."""
+
+import csv
+import math
+
+import pytest
+import trimesh
+
+from studies.results import rounded, spread, write_csv, write_json
+from studies.surfaces import moved_by, volume_mm3
+
+
+def test_what_json_has_no_number_for_is_none():
+    assert [rounded(value) for value in (None, math.nan, math.inf, 1 / 3)] == [None, None, None, 0.333333]
+
+
+def test_a_spread_is_of_all_values_and_not_of_a_sample():
+    assert spread([1.0, 2.0, 6.0]) == dict(
+        mean=3.0, sd=round(math.sqrt(14 / 3), 4), min=1.0, max=6.0, median=2.0
+    )
+
+
+def test_no_file_holds_what_is_no_json(tmp_path):
+    write_json({"mm": 1.5}, tmp_path / "a.json")
+    assert (tmp_path / "a.json").read_text() == '{\n  "mm": 1.5\n}\n'
+    with pytest.raises(ValueError, match="JSON compliant"):
+        write_json({"mm": math.nan}, tmp_path / "b.json")
+
+
+def test_a_row_may_lack_what_others_have(tmp_path):
+    write_csv([dict(a=1, b=2), dict(c=3, a=4)], tmp_path / "a.csv")
+    with (tmp_path / "a.csv").open(newline="") as file:
+        assert list(csv.reader(file)) == [["a", "b", "c"], ["1", "2", ""], ["4", "", "3"]]
+
+
+def test_a_surface_holds_the_same_volume_wherever_it_is():
+    box = trimesh.creation.box((2.0, 3.0, 4.0))
+    far = moved_by(box, [100.0, -50.0, 7.0])
+    assert far.bounds.mean(axis=0) == pytest.approx([100.0, -50.0, 7.0])
+    # 24 mm^3, less what is lost where the corners' products of 1e6 mm^3 cancel.
+    assert volume_mm3(far.vertices, far.faces) == pytest.approx(24.0, abs=1e-8)
+    assert volume_mm3(box.vertices, box.faces[:, ::-1]) == pytest.approx(-24.0)
