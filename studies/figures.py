@@ -2,12 +2,8 @@
 
 from pathlib import Path
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")
-
-from matplotlib import pyplot as plt
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
@@ -20,7 +16,8 @@ DPI = 130
 
 def write_figure4(calibration: Calibration, path: Path) -> None:
     """Mean error over the stiffness for each radius, fitted and held out; quartics with a ring where they are least."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.6), sharey=True, layout="constrained")
+    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
     for colour, radius in zip(_colours(calibration), calibration.trials, strict=True):
         trials = sorted(calibration.trials[radius], key=lambda trial: trial.setup.stiffness)
         at = [trial.setup.stiffness for trial in trials]
@@ -33,12 +30,13 @@ def write_figure4(calibration: Calibration, path: Path) -> None:
             left.plot(fit.stiffness, fit.error_mm, "o", color=colour, markersize=9, fillstyle="none")
     right.axhline(calibration.null_mm(), color="0.4", linestyle="--", label="no motion at all")
     _both(calibration, left, right, "stiffness α")
-    _save(figure, path)
+    figure.savefig(path, dpi=DPI, bbox_inches="tight")
 
 
 def write_search(calibration: Calibration, path: Path) -> None:
     """Error of the best setup so far over the evaluations, fitted and held out."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.6), sharey=True, layout="constrained")
+    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
     for colour, (radius, trials) in zip(_colours(calibration), calibration.trials.items(), strict=True):
         best = best_so_far(trials)
         left.plot([trial.fit_mm for trial in trials], ".", color=colour, alpha=0.35, markersize=4)
@@ -48,7 +46,7 @@ def write_search(calibration: Calibration, path: Path) -> None:
         right.plot([trial.held_out_mm for trial in best], color=colour, drawstyle="steps-post")
     right.axhline(calibration.null_mm(), color="0.4", linestyle="--", label="no motion at all")
     _both(calibration, left, right, "setups tried")
-    _save(figure, path)
+    figure.savefig(path, dpi=DPI, bbox_inches="tight")
 
 
 def best_so_far(trials: list[Trial]) -> list[Trial]:
@@ -61,7 +59,8 @@ def best_so_far(trials: list[Trial]) -> list[Trial]:
 
 def write_figure5(calibration: Calibration, path: Path) -> None:
     """Particles and clusters over the radius, for each case."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4), layout="constrained")
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
     radii = list(calibration.trials)
     for place, case in enumerate(calibration.cases):
         measured = [calibration.trials[radius][0].measured[place] for radius in radii]
@@ -71,14 +70,15 @@ def write_figure5(calibration: Calibration, path: Path) -> None:
         axes.set(xlabel="particle radius (mm)", ylabel=what, ylim=(0, None))
         axes.grid(alpha=0.3)
         axes.legend()
-    _save(figure, path)
+    figure.savefig(path, dpi=DPI, bbox_inches="tight")
 
 
 def write_table(table: Table, path: Path) -> None:
     """A table as a picture."""
     cells = table.cells()
     wide = [max(len(line[column]) for line in cells) + 3 for column in range(len(cells[0]))]
-    figure, axes = plt.subplots(figsize=(0.085 * sum(wide) + 0.4, 0.26 * (len(cells) + 1.5)))
+    figure = Figure(figsize=(0.085 * sum(wide) + 0.4, 0.26 * (len(cells) + 1.5)))
+    axes = figure.subplots()
     axes.axis("off")
     drawn = axes.table(
         cells[1:], colLabels=cells[0], colWidths=[w / sum(wide) for w in wide], bbox=Bbox.unit()
@@ -89,7 +89,7 @@ def write_table(table: Table, path: Path) -> None:
         cell.set_linewidth(0.3)
         cell.set_text_props(ha="left", weight="bold" if row == 0 else "normal")
     axes.set_title(table.title, fontsize=10)
-    _save(figure, path)
+    figure.savefig(path, dpi=DPI, bbox_inches="tight")
 
 
 def _both(calibration: Calibration, left: Axes, right: Axes, across: str) -> None:
@@ -109,9 +109,4 @@ def _both(calibration: Calibration, left: Axes, right: Axes, across: str) -> Non
 
 
 def _colours(calibration: Calibration) -> list:
-    return [plt.get_cmap("viridis")(at) for at in np.linspace(0, 0.85, len(calibration.trials))]
-
-
-def _save(figure: Figure, path: Path) -> None:
-    figure.savefig(path, dpi=DPI, bbox_inches="tight")
-    plt.close(figure)
+    return [colormaps["viridis"](at) for at in np.linspace(0, 0.85, len(calibration.trials))]

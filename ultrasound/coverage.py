@@ -102,6 +102,10 @@ class Coverage:
         mask = self.targets.get(target)
         return float(self.seen[mask].mean()) if mask is not None and mask.any() else float("nan")
 
+    def places(self, target: str) -> np.ndarray:
+        """The middles (n, 3) of a target's voxels [mm]."""
+        return self.low_mm + VOXEL_MM * np.argwhere(self.targets[target])
+
     def gaps(self, target: str) -> list[Gap]:
         """What of a target was not seen, the largest part first."""
         missing = self.targets[target] & ~self.seen

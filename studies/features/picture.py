@@ -3,11 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-from matplotlib import pyplot as plt
+from matplotlib.figure import Figure
 
 DPI = 130
 COLOURS = {"neo-hookean": "tab:blue", "shape-matching": "tab:orange", "frame": "tab:green"}
@@ -15,9 +11,8 @@ COLOURS = {"neo-hookean": "tab:blue", "shape-matching": "tab:orange", "frame": "
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
     """Write the picture."""
-    figure, panels = plt.subplots(
-        1, 2, figsize=(12, 0.34 * len(rows) + 1.6), layout="constrained", sharey=True
-    )
+    figure = Figure(figsize=(12, 0.34 * len(rows) + 1.6), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
     names = [f"{row['feature']}  ({row['model']})" for row in rows]
     colours = [COLOURS[row["model"]] for row in rows]
     for axes, what, unit in zip(panels, ("ms", "mb"), ("time (ms)", "memory (MB)"), strict=True):
@@ -33,4 +28,3 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     panels[0].invert_yaxis()
     figure.suptitle("What each feature adds; what is off adds nothing")
     figure.savefig(path, dpi=DPI)
-    plt.close(figure)

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from studies.freehand.rebuild import Rebuilt
@@ -19,7 +18,6 @@ def save_picture(rebuilt: Rebuilt, path: Path) -> None:
     where = np.argwhere(of if of.any() else rebuilt.known)
     middle = where.mean(axis=0).round().astype(int) if len(where) else np.array(rebuilt.box.shape) // 2
     figure = Figure(figsize=(12, 4.4), facecolor="#101014", layout="constrained")
-    FigureCanvasAgg(figure)
     for axis, (across, down) in enumerate(((1, 2), (0, 2), (0, 1))):
         _draw_cut(figure.add_subplot(1, 3, axis + 1), rebuilt, axis, across, down, int(middle[axis]))
     figure.savefig(path, dpi=110)

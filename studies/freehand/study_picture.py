@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 DPI = 130
@@ -22,7 +21,6 @@ LABEL = {
 def draw(runs: list[dict[str, Any]], path: Path) -> None:
     """Write the picture."""
     figure = Figure(figsize=(13, 9.5), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = figure.subplots(3, 3).ravel()
     for axes, (name, label) in zip(panels, LABEL.items(), strict=False):
         _against_noise(axes, runs, name, label)

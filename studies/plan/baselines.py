@@ -9,7 +9,6 @@ from studies.plan.candidate import half_size, passes_needed, width_mm
 from studies.plan.file import Sweep
 from studies.plan.trial import Trial
 from studies.plan.way import Layout, Way, gliding, layout_towards
-from ultrasound.coverage import VOXEL_MM
 
 # How deep an unplanned sweep presses: in the middle of what a scene's press begins with; by chance up to twice as deep.
 DEPTH_MM = 3.0
@@ -52,7 +51,7 @@ def planned(trial: Trial, sweep: Sweep) -> Way:
 def _seen_from_above(trial: Trial) -> tuple[Layout, np.ndarray]:
     """The target's middle as the scene's press meets it, and half of its size across and along (2,) [mm]."""
     coverage, press = trial.coverage, trial.rehearsal.press
-    places = coverage.low_mm + VOXEL_MM * np.argwhere(coverage.targets[trial.target])
+    places = coverage.places(trial.target)
     layout = layout_towards(places.mean(axis=0), -np.array(press.direction), np.array(press.lateral))
     return layout, half_size(layout, places)
 

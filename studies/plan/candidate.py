@@ -8,7 +8,7 @@ import numpy as np
 from studies.plan.reach import Reach
 from studies.plan.way import FAR_MM, Layout, Way, gliding, layout_towards, pose_over, rocking
 from studies.rehearsal import Rehearsal
-from ultrasound.coverage import VOXEL_MM, Coverage
+from ultrasound.coverage import Coverage
 from ultrasound.probe import Hand
 
 # Sides of the organ that are looked at, no farther round than this from above (its cosine), and how much two differ.
@@ -64,7 +64,7 @@ class Candidate:
 
 def candidates_of(rehearsal: Rehearsal, coverage: Coverage, target: str, reach: Reach) -> list[Candidate]:
     """What may cover a target: from above and from the side where it lies shallowest, gliding and rocking."""
-    places = coverage.low_mm + VOXEL_MM * np.argwhere(coverage.targets[target])
+    places = coverage.places(target)
     centre = places.mean(axis=0)
     above = -np.array(rehearsal.press.direction)
     outwards = {"from above": above}

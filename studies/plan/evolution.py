@@ -19,12 +19,14 @@ FORECASTS, GENERATION = 240, 8
 
 @dataclass
 class Search:
-    """One candidate's search, the best of it so far; the same trials give the same."""
+    """One candidate's search; the same trials give the same.
+
+    ``best`` (n,) are the best shares so far of the candidate's ranges; none before the first trial.
+    """
 
     candidate: Candidate
     start: np.ndarray
     sigma: float
-    values: dict[str, float] = field(default_factory=dict)
     best: np.ndarray = field(default_factory=lambda: np.zeros(0))
     score: float = -np.inf
     trials: int = 0
@@ -41,6 +43,11 @@ class Search:
         )
         self._strategy = cma.CMAEvolutionStrategy(self.start, self.sigma, options)
 
+    @property
+    def values(self) -> dict[str, float]:
+        """The candidate's numbers of the best so far."""
+        return self.candidate.values(self.best)
+
     def ask(self) -> list[np.ndarray]:
         """The next generation; the first has the start in it."""
         asked = self._strategy.ask()
@@ -52,7 +59,6 @@ class Search:
         best = int(np.argmax(scores))
         if scores[best] > self.score:
             self.score, self.best = scores[best], asked[best]
-            self.values = self.candidate.values(self.best)
         if len(asked) == GENERATION:
             self._strategy.tell(asked, [-each for each in scores])
 

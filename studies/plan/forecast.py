@@ -25,7 +25,7 @@ class Forecast:
         self.rehearsal, self.reach = rehearsal, reach
         self.hand = copy.copy(rehearsal.hand)
         self.hand.samples = self.hand.vertices
-        places = coverage.low_mm + VOXEL_MM * np.argwhere(coverage.targets[target])
+        places = coverage.places(target)
         settled = Skin(rehearsal.model, places[:: -(-len(places) // PLACES)])
         settled.update()
         self._places = settled.vertices.to_numpy().astype(float)

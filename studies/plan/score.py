@@ -39,7 +39,7 @@ def score(parts: Parts) -> float:
 
 def in_words(parts: Parts) -> str:
     """All parts in one line."""
-    return ", ".join(SAID[name].format(_figure(parts, name)) for name in POINTS if name in SAID)
+    return ", ".join(_said(parts, name) for name in POINTS)
 
 
 def why(winner: Parts, other: Parts) -> str:
@@ -57,8 +57,4 @@ def why(winner: Parts, other: Parts) -> str:
 
 
 def _said(parts: Parts, name: str) -> str:
-    return SAID[name].format(_figure(parts, name))
-
-
-def _figure(parts: Parts, name: str) -> float:
-    return getattr(parts, name) * (100 if name in SHARES else 1)
+    return SAID[name].format(getattr(parts, name) * (100 if name in SHARES else 1))

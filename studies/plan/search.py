@@ -54,7 +54,7 @@ def ranked(
     searches: list[Search], workers: Workers, speed_mm_s: float, done: Callable[[], Any]
 ) -> list[tuple[Search, Gone]]:
     """The best of each candidate gone once more, as fast as it will be; the best of these first."""
-    tried = [one for one in searches if one.values]
+    tried = [one for one in searches if one.trials]
     rows = []
     for one, gone in zip(
         tried, workers.go([(each.candidate, each.values, speed_mm_s) for each in tried]), strict=True

@@ -3,11 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-from matplotlib import pyplot as plt
+from matplotlib.figure import Figure
 
 DPI = 130
 SHOWN = (
@@ -20,7 +16,8 @@ SHOWN = (
 
 def draw(runs: list[dict[str, Any]], path: Path) -> None:
     """Write the picture."""
-    figure, panels = plt.subplots(2, 2, figsize=(11, 7), layout="constrained", sharex=True)
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    panels = figure.subplots(2, 2, sharex=True)
     for axes, (name, label) in zip(panels.ravel(), SHOWN, strict=True):
         for run in runs:
             at = [row["minute"] for row in run["minutes"]]
@@ -33,4 +30,3 @@ def draw(runs: list[dict[str, Any]], path: Path) -> None:
     panels[0, 0].legend()
     figure.suptitle("An hour of rehearsal" if len(runs[0]["minutes"]) == 60 else "Rehearsal without end")
     figure.savefig(path, dpi=DPI)
-    plt.close(figure)

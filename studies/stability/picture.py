@@ -3,14 +3,10 @@
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")
-
-from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 
 DPI = 130
 LEAST_MM, MOST_MM = 0.01, 100.0
@@ -30,19 +26,15 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         for kind in kinds
         for model in models
     )
-    figure, panels = plt.subplots(
-        len(models),
-        1,
-        figsize=(max(9.0, 0.26 * most + 4), 0.3 * len(kinds) * len(models) + 2),
-        layout="constrained",
-    )
+    size = max(9.0, 0.26 * most + 4), 0.3 * len(kinds) * len(models) + 2
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(len(models), squeeze=False)[:, 0]
     shown = None
-    for axes, model in zip(np.atleast_1d(panels), models, strict=True):
+    for axes, model in zip(panels, models, strict=True):
         shown = _map(axes, [row for row in rows if row["model"] == model], model)
     if shown is not None:
-        figure.colorbar(shown, ax=panels, label="distance from rest after release (mm)", shrink=0.6)
+        figure.colorbar(shown, ax=list(panels), label="distance from rest after release (mm)", shrink=0.6)
     figure.savefig(path, dpi=DPI)
-    plt.close(figure)
 
 
 def _map(axes: Axes, rows: list[dict[str, Any]], model: str):

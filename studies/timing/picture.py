@@ -2,13 +2,10 @@
 
 from pathlib import Path
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")
-
-from matplotlib import pyplot as plt
+from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from studies.timing.measure import Press
 from studies.timing.phases import AFTER, BEFORE, CONTACTS, PASSES
@@ -28,14 +25,14 @@ LEAST_SHARE = 2.0
 
 def draw(presses: list[Press], sizes: list[dict], path: Path) -> None:
     """Write the picture."""
-    figure, panels = plt.subplots(2, 2, figsize=(13, 9), layout="constrained")
+    figure = Figure(figsize=(13, 9), layout="constrained")
+    panels = figure.subplots(2, 2)
     matched = [press for press in presses if press.case["model"] == "shape-matching"]
     _against_time(panels[0, 0], matched[0])
     _pieces(panels[0, 1], presses)
     _radii(panels[1, 0], matched)
     _sizes(panels[1, 1], sizes)
     figure.savefig(path, dpi=DPI)
-    plt.close(figure)
 
 
 def _against_time(axes: Axes, press: Press) -> None:
@@ -67,7 +64,7 @@ def _pieces(axes: Axes, presses: list[Press]) -> None:
     left = np.zeros(len(presses))
     for number, name in enumerate(shown):
         width = np.array([share.get(name, 0.0) for share in shares])
-        colour = plt.get_cmap("tab20")(number)
+        colour = colormaps["tab20"](number)
         axes.barh(range(len(presses)), width, left=left, color=colour, label=name)
         left += width
     axes.barh(range(len(presses)), 100 - left, left=left, color="0.8", label="the rest")

@@ -3,13 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")
-
-from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from studies.trade.front import preset_of, setup_of
 from studies.trade.sweep import PAPER
@@ -22,7 +18,8 @@ FRAME_MS = 1000 / 60
 def draw(points: list[dict[str, Any]], path: Path) -> None:
     """Write the picture."""
     points = [point for point in points if point["error_mean_mm"] is not None]
-    figure, axes = plt.subplots(figsize=(11, 7), layout="constrained")
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    axes = figure.subplots()
     for model, colour in COLOURS.items():
         _model(axes, [point for point in points if point["model"] == model], model, colour)
     front = sorted((point for point in points if point["pareto"]), key=lambda point: point["ms_median"])
@@ -40,7 +37,6 @@ def draw(points: list[dict[str, Any]], path: Path) -> None:
     axes.grid(alpha=0.3, which="both")
     axes.legend(loc="center right")
     figure.savefig(path, dpi=DPI)
-    plt.close(figure)
 
 
 def _model(axes: Axes, points: list[dict[str, Any]], model: str, colour: str) -> None:
