@@ -210,12 +210,10 @@ def _of_track(pictures: Sweep, track: Track) -> dict[str, Any]:
 def _agreement(rebuilt: Rebuilt, patient: tuple[Scene, LoadedAnatomy, Path] | None) -> dict[str, Any]:
     if patient is None or not rebuilt.regions:
         return {}
-    from studies.freehand.compare import compared
+    from studies.freehand.compare import compared, surfaces_of
 
-    anatomy = patient[1]
-    surfaces = {"organ": anatomy.organ} | ({"tumour": anatomy.tumour} if anatomy.tumour is not None else {})
     try:
-        return compared(rebuilt, surfaces)
+        return compared(rebuilt, surfaces_of(patient[1]))
     except ValueError as error:
         click.echo(f"Not compared with the whole organ: {error}")
         return {}

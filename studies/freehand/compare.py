@@ -7,10 +7,16 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from scenes.anatomy import LoadedAnatomy
 from sim.distance import signed_distance
 from studies.freehand.agreement import Agreement, agreement
 from studies.freehand.rebuild import Rebuilt
 from ultrasound.reconstruction import VoxelBox
+
+
+def surfaces_of(anatomy: LoadedAnatomy) -> dict[str, trimesh.Trimesh]:
+    """What a sweep is compared with, by name."""
+    return {"organ": anatomy.organ} | ({"tumour": anatomy.tumour} if anatomy.tumour is not None else {})
 
 
 def inside(surface: trimesh.Trimesh, box: VoxelBox) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Freehand sweeps of which the truth is known: a slow one of the resting kidney, and ones pressed in, over the tumour."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import trimesh
@@ -25,22 +25,24 @@ FRAMES_A_SECOND = 30
 # The slow sweep: so fast, its probe so far above the organ, which it passes by so much at either end.
 SPEED_MM_S, ABOVE_MM, BEYOND_MM = 10.0, 12.0, 4.0
 # The pressed one begins and ends that far beside the tumour.
-BESIDE_MM, PRESSED_FRAMES_A_SECOND = 4.0, 30
+BESIDE_MM = 4.0
 # Virtual beads, as the paper's: around the tumour, apart from each other and under the surface.
 BEAD_RADIUS_MM, BEADS_APART_MM, BEADS_WITHIN_MM = 1.5, 9.0, 24.0
 
 
 @dataclass
 class Truth:
-    """A sweep of ``Mark`` pictures with the true poses (n, 4, 4) of the probe in the patient, and its beads (k, 3) at rest (LPS, mm)."""
+    """A sweep of ``Mark`` pictures with the true poses (n, 4, 4) of the probe in the patient, and its beads (k, 3) at rest (LPS, mm).
+
+    ``on_probe`` (4, 4) is ImageToProbe, ``mask`` says which pixels (rows, columns) the probe shows.
+    """
 
     sweep: Sweep
     poses: np.ndarray
     beads_mm: np.ndarray
+    on_probe: np.ndarray
+    mask: np.ndarray
     compression_mm: float = 0.0
-    on_probe: np.ndarray = field(default_factory=lambda: np.eye(4))
-    mask: np.ndarray | None = None
-    """Pixels (rows, columns) that the probe shows; None: all."""
 
 
 def beads_of(organ: trimesh.Trimesh, tumour: trimesh.Trimesh | None) -> np.ndarray:
@@ -103,7 +105,7 @@ def pressed(rehearsal: Rehearsal, depth_mm: float) -> Truth:
     touches = np.ones(probe.number_of_scanlines, bool)
     come(rehearsal, way[0])
     images, poses, squeezed = [], [], []
-    every = round(1 / (PRESSED_FRAMES_A_SECOND * rehearsal.settings.time_step_s))
+    every = round(1 / (FRAMES_A_SECOND * rehearsal.settings.time_step_s))
     for step, pose in enumerate(way):
         rehearsal.advance(pose)
         if step % every == 0:
@@ -149,7 +151,7 @@ def _truth(
 ) -> Truth:
     on_probe = probe.image_to_probe(*images.shape[1:])
     mask = source_of_pixels(probe, images.shape[1])[..., 0] > -1.0
-    return Truth(sweep_of(images, poses, times_s, on_probe), poses, beads_mm, on_probe=on_probe, mask=mask)
+    return Truth(sweep_of(images, poses, times_s, on_probe), poses, beads_mm, on_probe, mask)
 
 
 def sweep_of(

@@ -10,7 +10,7 @@ import trimesh
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene, with_options
 from sim.device import start
-from studies.freehand.compare import compared
+from studies.freehand.compare import compared, surfaces_of
 from studies.freehand.experiment import Truth, pressed, resting, sweep_of
 from studies.freehand.rebuild import Places, rebuild, track_of
 from studies.freehand.unsqueeze import Unsqueezed
@@ -37,11 +37,6 @@ SWEPT: dict[str, tuple[float, ...]] = {
     "latency_s": (0.05, 0.1, 0.2, 0.4),
     "lost": (0.1, 0.25, 0.5, 0.75),
 }
-
-
-def surfaces_of(anatomy: LoadedAnatomy) -> dict[str, trimesh.Trimesh]:
-    """What a sweep is compared with, by name."""
-    return {"organ": anatomy.organ} | ({"tumour": anatomy.tumour} if anatomy.tumour is not None else {})
 
 
 def measure(
@@ -141,6 +136,7 @@ def _row(
 ) -> dict[str, Any]:
     sweep = sweep_of(truth.sweep.images, poses, truth.sweep.times_s, truth.on_probe)
     track = track_of(sweep, REFERENCE)
-    mask = np.ones(sweep.images.shape[1:], bool) if truth.mask is None else truth.mask
-    rebuilt = rebuild(sweep, track, mask, SPACING_MM, method, REACH_MM, sweep, places=places, with_grey=False)
+    rebuilt = rebuild(
+        sweep, track, truth.mask, SPACING_MM, method, REACH_MM, sweep, places=places, with_grey=False
+    )
     return compared(rebuilt, surfaces, truth.beads_mm)

@@ -12,6 +12,7 @@ from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
 from sim.device import start
 from studies.rehearsal import Rehearsal, RehearsalState
+from studies.rigid_fit import apart_after_fit
 from studies.setup import Setup, scene_of
 from studies.stopwatch import timed
 from ultrasound.probe import advanced
@@ -72,7 +73,7 @@ def _minute(rehearsal: Rehearsal, minute: int, minute_s: float, first: Rehearsal
     """One minute of rehearsal, and how far from its first rest the tissue then lies."""
     dt = rehearsal.settings.time_step_s
     ms: list[float] = []
-    fallbacks, finite = 0, True
+    fallbacks = 0
     goals = _goals(rehearsal, minute)
     for step in range(round(minute_s / dt)):
         if step * dt >= minute_s - REST_S:
@@ -82,16 +83,15 @@ def _minute(rehearsal: Rehearsal, minute: int, minute_s: float, first: Rehearsal
         timed(lambda: rehearsal.advance(rehearsal.pose_towards(goal)), ms)
         fallbacks += bool(rehearsal.notice)
     position = rehearsal.body.position.to_numpy().astype(float)
-    finite = bool(np.isfinite(position).all())
     rest = first.solver.body.position.astype(float)
     rehearsal.update_surfaces()
     return dict(
         minute=minute + 1,
         moved_mm=round(float(np.linalg.norm(position - rest, axis=1).mean()), 6),
-        shape_mm=round(_shape_mm(position, rest), 6),
+        shape_mm=round(float(apart_after_fit(position, rest).mean()), 6),
         volume_ratio=round(rehearsal.volume_ratio(), 6),
         tangled=rehearsal.guard.health().tangled,
-        finite=finite,
+        finite=bool(np.isfinite(position).all()),
         fallbacks=fallbacks,
         ms_median=round(float(np.median(ms)), 4),
         memory_mb=round(psutil.Process().memory_info().rss / 1e6, 3),
@@ -108,12 +108,6 @@ def _goals(rehearsal: Rehearsal, minute: int) -> Iterator[np.ndarray]:
         oblique = Rotation.from_rotvec(np.radians(OBLIQUE_DEG) * random.uniform(-1, 1, 3))
         goal[:3, :3] = home[:3, :3] @ oblique.as_matrix()
         yield goal
-
-
-def _shape_mm(position: np.ndarray, rest: np.ndarray) -> float:
-    """Mean distance (n, 3) [mm] of points from where they were, after they were turned and moved to fit."""
-    a, b = position - position.mean(axis=0), rest - rest.mean(axis=0)
-    return float(np.linalg.norm(Rotation.align_vectors(b, a)[0].apply(a) - b, axis=1).mean())
 
 
 def _equal(first: RehearsalState, second: RehearsalState) -> bool:

@@ -1,25 +1,19 @@
 """The bodies that ``study stability`` maltreats: each settled, with its guard, its transducer and its skin."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import trimesh
 
 from scenes.anatomy import load_anatomy
 from scenes.scene import PAPER, Contact, SolverSection, load_scene, with_options
-from sim.body import Body, ParticleBody, RestBody
-from sim.contact import ShapeContacts
 from sim.device import start
 from sim.guard import Guard
-from sim.lattice import fill_block, surface_points
 from sim.neo_hookean import LATTICE_SETTINGS, NeoHookean
-from sim.patches import arrange
-from sim.shape_matching import ShapeMatching
 from sim.shapes import ConvexTool, Plane
 from sim.skinning import Skin
 from sim.solver import Solver, StepSettings
-from sim.surface_contact import SurfaceContacts
+from studies.blocks import DENSITY, block_of_cells, block_of_particles
 from studies.models import build_solver, step_settings
 from studies.rehearsal import Rehearsal
 from studies.setup import PRESETS
@@ -32,7 +26,6 @@ from ultrasound.probe import advanced, pose_at, touching
 ELLIPSOID_MM, BALL_MM, APART_MM = (30.0, 18.0, 15.0), 12.0, 40.0
 SIZE_MM = {"neo-hookean": 6.0, "shape-matching": 3.3}
 TRANSDUCER_MM = np.array([20.0, 6.0, 20.0])
-DENSITY = 1.05e-3
 DOWN = (0.0, 0.0, -9810.0)
 # So many steps at a time, until nothing moves any more.
 SETTLE_STEPS, MOST_SETTLES, STILL_MM_S = 180, 20, 0.05
@@ -148,16 +141,9 @@ def _block(model: str, side: int, shapes: list, tool: ConvexTool) -> tuple[Solve
     """A cell or a particle alone, or two of them along each edge, which are one cluster."""
     size = SIZE_MM[model]
     if model == "neo-hookean":
-        lattice = fill_block((side, side, side), size)
-        body: Any = Body(lattice.nodes)
-        block = trimesh.creation.box(bounds=[[0.0] * 3, [side * size] * 3])
-        contacts: Any = SurfaceContacts(body, lattice, *surface_points(block, size / 2), shapes, 0.35)
-        return Solver(NeoHookean(body, lattice, contacts), contacts, tool=tool), replace(LATTICE_SETTINGS)
-    at = size * (np.indices((side, side, side)).reshape(3, -1).T + (0.5 if side > 1 else 0.0))
-    rest, patches = arrange(RestBody(at, DENSITY * size**3, size, np.full(len(at), size / 2)), 3.33)
-    body = ParticleBody(rest)
-    contacts = ShapeContacts(body, shapes, 0.35)
-    return Solver(ShapeMatching(body, patches, contacts), contacts, tool=tool), StepSettings()
+        return block_of_cells(side, size, shapes, tool), replace(LATTICE_SETTINGS)
+    points = size * (np.indices((side, side, side)).reshape(3, -1).T + (0.5 if side > 1 else 0.0))
+    return block_of_particles(points, size, shapes, tool), StepSettings()
 
 
 def _settle(solver: Solver, settings: StepSettings, tool: ConvexTool) -> None:

@@ -5,12 +5,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sim.body import BodyState
 from sim.neo_hookean import NeoHookean
 from sim.solver import SolverState, StepSettings
 from studies.results import rounded
+from studies.rigid_fit import apart_after_fit
 from studies.stability.bodies import Specimen, prepared
 from studies.stability.cases import Case, Subject
 from studies.stability.motion import AWAY_MM, PROBES, STATES
@@ -169,15 +169,9 @@ def _shape_error(specimen: Specimen) -> float:
     wanted = specimen.body.rest_points
     if not np.isfinite(position).all():
         return np.inf
-    return float(np.concatenate([_apart(position[part], wanted[part]) for part in specimen.parts]).mean())
-
-
-def _apart(position: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Distances (n,) [mm] of points from wanted ones, after they were turned and moved to fit."""
-    position, wanted = position - position.mean(axis=0), wanted - wanted.mean(axis=0)
-    if len(wanted) > 1:
-        position = Rotation.align_vectors(wanted, position)[0].apply(position)
-    return np.linalg.norm(position - wanted, axis=1)
+    return float(
+        np.concatenate([apart_after_fit(position[part], wanted[part]) for part in specimen.parts]).mean()
+    )
 
 
 def _reason(rest_error: float, shape_error: float | None) -> str | None:

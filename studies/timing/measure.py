@@ -7,20 +7,16 @@ from typing import Any
 import numpy as np
 import psutil
 import taichi as ti
-import trimesh
 
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
-from sim.body import Body, ParticleBody, RestBody
-from sim.contact import ShapeContacts
+from sim.body import ParticleBody
 from sim.device import start
-from sim.lattice import fill_block, surface_points
-from sim.neo_hookean import LATTICE_SETTINGS, NeoHookean
-from sim.patches import arrange
+from sim.neo_hookean import LATTICE_SETTINGS
 from sim.shape_matching import ShapeMatching
 from sim.shapes import Plane
 from sim.solver import Solver, StepSettings
-from sim.surface_contact import SurfaceContacts
+from studies.blocks import block_of_cells, block_of_particles
 from studies.rehearsal import Rehearsal
 from studies.results import spread
 from studies.setup import Setup, scene_of
@@ -30,9 +26,8 @@ from studies.timing.phases import Phases, without_calls
 from ultrasound.probe import advanced, between
 
 AWAY_MM = 100.0
-# A block's particles are as far apart as the paper's smallest, and its clusters as wide.
-BLOCK_RADIUS_MM, CLUSTER_SPACING = 2.2, 3.33
-DENSITY = 1.05e-3
+# A block's particles are as far apart as the paper's smallest.
+BLOCK_RADIUS_MM, BLOCK_CELL_MM = 2.2, 4.0
 # Of the memory that is free, a block takes at most this share.
 MOST_MEMORY = 0.6
 ROUNDS, STEPS_A_ROUND = 9, 5
@@ -159,22 +154,12 @@ def compare(rehearsal: Rehearsal) -> tuple[dict[str, Any], list[str]]:
     alone = Solver(ShapeMatching(model.body, model.patches))
     pose = rehearsal.scripted_pose(rehearsal.script_length_s())
     poses = between(pose, pose, settings.substeps)
-    runs: dict[str, Callable[[], float]] = {
+    others, missing = _others(model, passes)
+    runs = {
         "step_ms": lambda: _one(lambda: solver.step(settings, poses)),
         "without_contacts_ms": lambda: _one(lambda: alone.step(replace(settings, gravity=(0.0, 0.0, 0.0)))),
+        **others,
     }
-    missing = []
-    try:
-        bound = Bound(model)
-        runs["bound_1_core_ms"] = lambda: bound.run(passes, 1)
-        runs["bound_2_cores_ms"] = lambda: bound.run(passes, 2)
-    except NoBound as reason:
-        missing.append(str(reason))
-    try:
-        other = Pypbd(model)
-        runs["pypbd_1_core_ms"] = lambda: other.run(passes)
-    except NoBound as reason:
-        missing.append(str(reason))
     times: dict[str, list[float]] = {name: [] for name in runs}
     held = solver.snapshot()
     for _ in range(ROUNDS):
@@ -192,6 +177,24 @@ def compare(rehearsal: Rehearsal) -> tuple[dict[str, Any], list[str]]:
         times_pypbd=_ratio(figures.get("pypbd_1_core_ms"), figures["without_contacts_ms"]),
     )
     return figures, missing
+
+
+def _others(model: ShapeMatching, passes: int) -> tuple[dict[str, Callable[[], float]], list[str]]:
+    """What the step is compared with, as far as it is on this machine, and what of it is not."""
+    runs: dict[str, Callable[[], float]] = {}
+    missing = []
+    try:
+        bound = Bound(model)
+        runs["bound_1_core_ms"] = lambda: bound.run(passes, 1)
+        runs["bound_2_cores_ms"] = lambda: bound.run(passes, 2)
+    except NoBound as reason:
+        missing.append(str(reason))
+    try:
+        other = Pypbd(model)
+        runs["pypbd_1_core_ms"] = lambda: other.run(passes)
+    except NoBound as reason:
+        missing.append(str(reason))
+    return runs, missing
 
 
 def _one(work: Callable[[], None]) -> float:
@@ -226,22 +229,14 @@ def sweep(counts: list[int], arch: str, steps: int) -> Iterator[dict[str, Any]]:
 
 def _block_of_particles(count: int) -> tuple[Solver, StepSettings, Setup]:
     side = max(4, round(count ** (1 / 3)))
-    at = BLOCK_RADIUS_MM * np.indices((side, side, side)).reshape(3, -1).T
-    mass = DENSITY * BLOCK_RADIUS_MM**3
-    rest = RestBody(at, mass, BLOCK_RADIUS_MM, np.full(len(at), BLOCK_RADIUS_MM / 2))
-    rest, patches = arrange(rest, CLUSTER_SPACING)
-    body = ParticleBody(rest)
-    contacts = ShapeContacts(body, [Plane(np.array([0.0, 0.0, 1.0]), -BLOCK_RADIUS_MM / 2)], 0.35)
-    setup = Setup(radius_mm=BLOCK_RADIUS_MM)
-    return Solver(ShapeMatching(body, patches, contacts), contacts), StepSettings(), setup
+    points = BLOCK_RADIUS_MM * np.indices((side, side, side)).reshape(3, -1).T
+    floor = Plane(np.array([0.0, 0.0, 1.0]), -BLOCK_RADIUS_MM / 2)
+    solver = block_of_particles(points, BLOCK_RADIUS_MM, [floor])
+    return solver, StepSettings(), Setup(radius_mm=BLOCK_RADIUS_MM)
 
 
 def _block_of_cells(count: int) -> tuple[Solver, StepSettings, Setup]:
-    side, cell_mm = max(2, round(count ** (1 / 3)) - 1), 4.0
-    lattice = fill_block((side, side, side), cell_mm)
-    body = Body(lattice.nodes)
-    block = trimesh.creation.box(bounds=[[0.0] * 3, [side * cell_mm] * 3])
-    points, area = surface_points(block, cell_mm / 2)
-    contacts = SurfaceContacts(body, lattice, points, area, [Plane(np.array([0.0, 0.0, 1.0]), 0.0)], 0.35)
-    setup = Setup("neo-hookean", cell_mm=cell_mm, substeps=1, iterations=8)
-    return Solver(NeoHookean(body, lattice, contacts), contacts), LATTICE_SETTINGS, setup
+    side = max(2, round(count ** (1 / 3)) - 1)
+    solver = block_of_cells(side, BLOCK_CELL_MM, [Plane(np.array([0.0, 0.0, 1.0]), 0.0)])
+    setup = Setup("neo-hookean", cell_mm=BLOCK_CELL_MM, substeps=1, iterations=8)
+    return solver, LATTICE_SETTINGS, setup
