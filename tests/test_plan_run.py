@@ -76,7 +76,7 @@ class Here:
 
 @dataclass
 class Made:
-    """A patient's folder with ``plan.json`` in it, what the commands said that made and followed it, and a trial of its ground."""
+    """A patient's folder with ``plan.json`` in it, what the commands said that made and followed it, and a trial of its problem."""
 
     folder: Path
     plan: Plan

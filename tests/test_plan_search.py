@@ -25,7 +25,7 @@ from studies.plan.parts import Parts
 from studies.plan.score import score
 from studies.plan.search import FIRST, TRIAL_MM_S, ranked, search
 from studies.plan.study_command import table
-from studies.plan.workers import Gone, Ground, Start, Workers, _trial, workers
+from studies.plan.workers import Outcome, Problem, SearchSpace, Workers, _trial, workers
 from ultrasound.array import load_probe
 
 BEST = dict(a_mm=-3.0, b_mm=7.0, c_deg=20.0)
@@ -51,33 +51,33 @@ class Counting(Workers):
         self.tasks: list[tuple[Candidate, dict[str, float], float]] = []
         self.foreseen = 0
 
-    def start(self) -> Start:
-        return Start(self.candidates, dict(model="neo-hookean", cell_mm=8.0))
+    def search_space(self) -> SearchSpace:
+        return SearchSpace(self.candidates, dict(model="neo-hookean", cell_mm=8.0))
 
     def foresee(self, candidates) -> Iterator[np.ndarray]:
         for each in candidates:
             self.foreseen += 1
             yield each.start()
 
-    def go(self, tasks) -> Iterator[Gone]:
+    def go(self, tasks) -> Iterator[Outcome]:
         for each, values, speed in tasks:
             self.tasks.append((each, values, speed))
             parts = replace(worth(values, each.count / 100), reachable=self.reachable)
-            yield Gone(parts, [straight_pass(4)] * self.ways)
+            yield Outcome(parts, [straight_pass(4)] * self.ways)
 
-    def go_ways(self, ways, speed_mm_s) -> Iterator[Gone]:
+    def go_ways(self, ways, speed_mm_s) -> Iterator[Outcome]:
         for number, _ in enumerate(ways):
-            yield Gone(replace(GOOD, seen=0.1 * number), [straight_pass(4)])
+            yield Outcome(replace(GOOD, seen=0.1 * number), [straight_pass(4)])
 
 
 def four() -> list[Candidate]:
     return [candidate(f"sweep {n}", handicap) for n, handicap in enumerate((0.3, 0.0, 0.2, 0.1))]
 
 
-def ground_of(**changes) -> Ground:
+def problem_of(**changes) -> Problem:
     anatomy = LoadedAnatomy(big_ball(), None, None, ())
     values = dict(scene=Scene(anatomy={}), anatomy=anatomy, probe=load_probe("linear"), target="organ")
-    return Ground(**(values | dict(margin_mm=5.0, trocar=Trocar()) | changes))
+    return Problem(**(values | dict(margin_mm=5.0, trocar=Trocar()) | changes))
 
 
 # Evolution
@@ -195,7 +195,7 @@ def test_the_best_of_each_is_gone_once_more_and_ranked():
     rows = ranked(searches, crew, 12.0, lambda: done.append(1))
     assert [one.candidate.side for one, _ in rows] == ["sweep 1", "sweep 3", "sweep 2", "sweep 0"]
     assert len(done) == 4 and {speed for _, _, speed in crew.tasks} == {12.0}
-    assert all(gone.parts == worth(one.values, one.candidate.count / 100) for one, gone in rows)
+    assert all(outcome.parts == worth(one.values, one.candidate.count / 100) for one, outcome in rows)
     # One that had no trial has no numbers to be gone with.
     untried = Search(candidate("untried"), np.zeros(3), NEAR)
     assert len(ranked([*searches, untried], crew, 12.0, lambda: None)) == 4
@@ -205,8 +205,8 @@ def test_the_best_of_each_is_gone_once_more_and_ranked():
 
 
 def test_a_plan_is_the_ranked_sweeps_with_what_they_are_for(tmp_path):
-    ground, done = ground_of(trocar=Trocar(cone_deg=33)), []
-    plans = [make_plan(ground, Counting(four()), 12.0, 96, lambda: done.append(1)) for _ in range(2)]
+    problem, done = problem_of(trocar=Trocar(cone_deg=33)), []
+    plans = [make_plan(problem, Counting(four()), 12.0, 96, lambda: done.append(1)) for _ in range(2)]
     assert len(done) == 2 * scans_of(96), "what the command's progress bar expects"
     plan = plans[0]
     assert [each.name.split("passes ")[-1].removeprefix("one pass ") for each in plan.sweeps] == [
@@ -218,7 +218,7 @@ def test_a_plan_is_the_ranked_sweeps_with_what_they_are_for(tmp_path):
         assert each.score == pytest.approx(sum(each.points.values()), abs=1e-5)
         assert each.score == pytest.approx(score(Parts(**each.parts)), abs=1e-3)
         assert np.array(each.passes[0]) == pytest.approx(straight_pass(4), abs=1e-6)
-    assert plan.anatomy == fingerprint(ground.anatomy) and plan.trocar.cone_deg == 33
+    assert plan.anatomy == fingerprint(problem.anatomy) and plan.trocar.cone_deg == 33
     assert (plan.target, plan.margin_mm, plan.speed_mm_s) == ("organ", 5.0, 12.0)
     assert len(plan.why) == 4 and " sweep 1: sees " in plan.why[0]
     assert [line.split(" (")[0][-7:] for line in plan.why[1:]] == [f"sweep {n}" for n in (3, 2, 0)]
@@ -231,10 +231,10 @@ def test_a_plan_is_the_ranked_sweeps_with_what_they_are_for(tmp_path):
 @pytest.mark.parametrize("crew", [Counting(four(), reachable=0.95), Counting(four(), ways=0), Counting([])])
 def test_where_no_sweep_can_be_held_that_is_said(crew):
     if not crew.candidates:
-        crew.start = lambda: Start([], {})
+        crew.search_space = lambda: SearchSpace([], {})
         crew.go = lambda tasks: iter(())
     with pytest.raises(PlanError, match="no sweep was found.*move the trocar, widen its cone") as error:
-        make_plan(ground_of(), crew, 10.0, 4 if crew.candidates else 0, lambda: None)
+        make_plan(problem_of(), crew, 10.0, 4 if crew.candidates else 0, lambda: None)
     assert "\n" not in str(error.value)
 
 
@@ -242,7 +242,7 @@ def test_a_comparison_counts_what_it_does_and_means_its_sweeps_by_chance(monkeyp
     jobs: list[int | None] = []
 
     class Crew(Counting):
-        def __init__(self, ground: Ground, count: int | None) -> None:
+        def __init__(self, problem: Problem, count: int | None) -> None:
             super().__init__(four())
             jobs.append(count)
 
@@ -253,7 +253,7 @@ def test_a_comparison_counts_what_it_does_and_means_its_sweeps_by_chance(monkeyp
 
     monkeypatch.setattr(compare, "workers", Crew)
     done: list[int] = []
-    run = compare.compare(Scene(anatomy={}), ground_of().anatomy, 40, 3, lambda: done.append(1))
+    run = compare.compare(Scene(anatomy={}), problem_of().anatomy, 40, 3, lambda: done.append(1))
     assert len(done) == compare.count_of(40) and jobs == [3, 3]
     rows = {row["sweep"]: row for row in run["rows"]}
     assert list(rows) == ["planned", "straight", "row by row", "random"]
@@ -269,47 +269,47 @@ def test_a_comparison_counts_what_it_does_and_means_its_sweeps_by_chance(monkeyp
 
 def test_a_process_keeps_no_ground_for_another():
     """What it has built is found by all that a trial turns on."""
-    grounds = [
-        ground_of(),
-        ground_of(margin_mm=6.0),
-        ground_of(target="tumour"),
-        ground_of(trocar=Trocar(at_mm=(0, 0, 90))),
-        ground_of(probe=load_probe("drop-in")),
-        ground_of(scene=Scene(anatomy={}, tissue=dict(cell_mm=8.0))),
-        ground_of(anatomy=LoadedAnatomy(trimesh.creation.box([9.0] * 3), None, None, ())),
+    problems = [
+        problem_of(),
+        problem_of(margin_mm=6.0),
+        problem_of(target="tumour"),
+        problem_of(trocar=Trocar(at_mm=(0, 0, 90))),
+        problem_of(probe=load_probe("drop-in")),
+        problem_of(scene=Scene(anatomy={}, tissue=dict(cell_mm=8.0))),
+        problem_of(anatomy=LoadedAnatomy(trimesh.creation.box([9.0] * 3), None, None, ())),
     ]
-    assert len({Workers(each, 1)._key for each in grounds}) == len(grounds)
-    assert Workers(ground_of(), 1)._key == Workers(grounds[0], 1)._key
+    assert len({Workers(each, 1)._key for each in problems}) == len(problems)
+    assert Workers(problem_of(), 1)._key == Workers(problems[0], 1)._key
 
 
-def _end(key: str, ground: Ground) -> None:
+def _end(key: str, problem: Problem) -> None:
     os._exit(1)
 
 
-def _process(key: str, ground: Ground) -> int:
+def _process(key: str, problem: Problem) -> int:
     return os.getpid()
 
 
 def test_one_process_is_not_this_one():
     """Taichi would be started anew under whatever this one computes."""
-    with workers(ground_of(), 1) as crew:
+    with workers(problem_of(), 1) as crew:
         assert os.getpid() not in crew._all(_process, [()])
 
 
 def test_who_waits_for_processes_that_are_stopped_is_told():
-    with workers(ground_of(), 1) as crew:
+    with workers(problem_of(), 1) as crew:
         waiting = crew._all(_sleep, [()] * 9)
         threading.Timer(0.5, crew.stop).start()
         with pytest.raises(PlanError, match="was ended"):
             list(waiting)
 
 
-def _sleep(key: str, ground: Ground) -> None:
+def _sleep(key: str, problem: Problem) -> None:
     time.sleep(60)
 
 
 def test_a_process_that_is_ended_is_said_in_one_line():
-    with workers(ground_of(), 2) as crew, pytest.raises(PlanError) as error:
+    with workers(problem_of(), 2) as crew, pytest.raises(PlanError) as error:
         list(crew._all(_end, [()]))
     assert "a process of the search was ended" in str(error.value) and "\n" not in str(error.value)
 
@@ -320,15 +320,15 @@ def test_a_target_without_a_voxel_is_refused(monkeypatch, target, margin):
     built = SimpleNamespace(organ=big_ball(), tumour=speck, hand=hand_on(big_ball()), origin=np.zeros(3))
     monkeypatch.setattr("studies.plan.workers.Rehearsal", lambda *_: built)
     monkeypatch.setattr("sim.device.start", lambda *_, **__: "cpu")
-    anatomy = replace(ground_of().anatomy, tumour=speck)
+    anatomy = replace(problem_of().anatomy, tumour=speck)
     # Not in a process of its own, which would build a rehearsal.
     with pytest.raises(PlanError, match=f"--target {target}: it is smaller than a voxel of 1.5 mm"):
-        _trial("speck", ground_of(anatomy=anatomy, target=target, margin_mm=margin), 10.0)
+        _trial("speck", problem_of(anatomy=anatomy, target=target, margin_mm=margin), 10.0)
 
 
 def test_no_pictures_go_to_the_processes():
     grid = SimpleNamespace(voxels=np.zeros((2, 2, 2)))
-    anatomy = replace(ground_of().anatomy, ct=grid, labels=grid, parts=dict(vessel=big_ball()))
-    bare = ground_of(anatomy=anatomy).bare
+    anatomy = replace(problem_of().anatomy, ct=grid, labels=grid, parts=dict(vessel=big_ball()))
+    bare = problem_of(anatomy=anatomy).bare
     assert bare.anatomy.ct is None and bare.anatomy.labels is None and bare.anatomy.parts == {}
     assert bare.anatomy.organ is anatomy.organ

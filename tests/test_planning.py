@@ -25,7 +25,7 @@ class Search:
     """Stands for ``make_plan``: it makes as many trials as it is let, and then what it is told."""
 
     def __init__(self, monkeypatch) -> None:
-        self.let, self.grounds, self.jobs = threading.Semaphore(0), [], []
+        self.let, self.problems, self.jobs = threading.Semaphore(0), [], []
         self.end: Exception | None = None
         self.is_stopped = False
         self.counted = threading.Semaphore(0)
@@ -33,20 +33,20 @@ class Search:
         monkeypatch.setattr(planning, "workers", self.workers)
 
     @contextmanager
-    def workers(self, ground, jobs):
+    def workers(self, problem, jobs):
         self.jobs.append(jobs)
         yield self
 
-    def make(self, ground, crew, speed_mm_s, trials, done):
+    def make(self, problem, crew, speed_mm_s, trials, done):
         assert crew is self and trials == TRIALS
-        self.grounds.append(ground)
+        self.problems.append(problem)
         for _ in range(4):
             assert self.let.acquire(timeout=LONGEST_S)
             done()
             self.counted.release()
         if self.end is not None:
             raise self.end
-        return plan_of(sweep_of(straight_pass(4)), sweep_of(straight_pass(3)), margin_mm=ground.margin_mm)
+        return plan_of(sweep_of(straight_pass(4)), sweep_of(straight_pass(3)), margin_mm=problem.margin_mm)
 
     def stop(self) -> None:
         self.is_stopped = True
@@ -91,17 +91,17 @@ def test_a_plan_is_made_while_the_rehearsal_goes_on_and_then_followed(searching,
     assert said(plans, plan=True) == "A plan is being made"
     searching.go(1)
     assert ended(plans) == "Plan 1: two passes, sees 75 % (plan-001.json)"
-    assert plans.status == "" and said(plans) == "" and len(searching.grounds) == 1
+    assert plans.status == "" and said(plans) == "" and len(searching.problems) == 1
     guide = plans.instruments.guide
     assert isinstance(guide, Guide) and read_plan(tmp_path / "plan-001.json") == guide.plan
-    (ground,) = searching.grounds
-    assert (ground.target, ground.margin_mm, ground.anatomy, ground.probe) == (
+    (problem,) = searching.problems
+    assert (problem.target, problem.margin_mm, problem.anatomy, problem.probe) == (
         "margin",
         7.0,
         "anatomy",
         probe_as_set(PROBE, Settings(margin_mm=7)),
     )
-    assert ground.scene.solver.iterations == Settings().iterations
+    assert problem.scene.solver.iterations == Settings().iterations
     assert said(plans, plan=True) == "Planning for the tumour and its margin"
     searching.go(4)
     ended(plans)
@@ -157,7 +157,7 @@ def test_what_a_plan_is_for_is_said_and_an_organ_without_a_tumour_is_planned_for
     assert said(plans, settings=settings, plan=True) == "Planning for the whole kidney"
     searching.go(4)
     ended(plans)
-    assert searching.grounds[0].target == "organ"
+    assert searching.problems[0].target == "organ"
 
 
 def test_sweeps_are_shown_in_turn_and_begun_anew_with_the_rehearsal(plans):

@@ -78,17 +78,17 @@ def plan(
     if out.is_dir():
         raise Fault(f"{out}: is a folder; name a file after --out")
     from studies.plan.make import make_plan
-    from studies.plan.workers import Ground, workers
+    from studies.plan.workers import Problem, workers
 
     if port.at_mm is None:
         click.echo("No trocar is given: every way in counts as free.")
     aim: Target = target or ("organ" if anatomy.tumour is None else "margin")
-    ground = Ground(loaded, anatomy, held, aim, margin_mm, port)
+    problem = Problem(loaded, anatomy, held, aim, margin_mm, port)
     with (
-        workers(ground, jobs) as crew,
+        workers(problem, jobs) as crew,
         tqdm(total=scans_of(trials), desc="plan", unit="scan") as bar,
     ):
-        made = make_plan(ground, crew, speed_mm_s, trials, bar.update)
+        made = make_plan(problem, crew, speed_mm_s, trials, bar.update)
         bar.update(bar.total - bar.n)
     write_plan(made, out)
     click.echo("\n".join(made.why))

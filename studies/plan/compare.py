@@ -14,7 +14,7 @@ from studies.plan.file import scans_of
 from studies.plan.make import make_plan
 from studies.plan.parts import Parts
 from studies.plan.score import score
-from studies.plan.workers import Gone, Ground, workers
+from studies.plan.workers import Outcome, Problem, workers
 from studies.setup import PRESETS, probe_of, scene_of
 from ultrasound.target import Target
 
@@ -36,18 +36,18 @@ def compare(
 ) -> dict[str, Any]:
     """Plan for the tumour and its margin, and go planned, straight and random sweeps. Raises PlanError."""
     probe = probe_of(scene)
-    ground = Ground(scene_of(scene, PLANNED_ON), anatomy, probe, TARGET, MARGIN_MM, scene.trocar)
-    with workers(ground, jobs) as crew:
-        plan = make_plan(ground, crew, SPEED_MM_S, trials, done)
+    problem = Problem(scene_of(scene, PLANNED_ON), anatomy, probe, TARGET, MARGIN_MM, scene.trocar)
+    with workers(problem, jobs) as crew:
+        plan = make_plan(problem, crew, SPEED_MM_S, trials, done)
     sweep = plan.sweeps[0]
     ways = [partial(planned, sweep=sweep), *UNPLANNED.values(), *random_ways(len(sweep.passes), SEEDS)]
-    gone: list[Gone] = []
-    with workers(replace(ground, scene=scene_of(scene, JUDGED_ON)), jobs) as crew:
+    outcomes: list[Outcome] = []
+    with workers(replace(problem, scene=scene_of(scene, JUDGED_ON)), jobs) as crew:
         for one in crew.go_ways(ways, SPEED_MM_S):
-            gone.append(one)
+            outcomes.append(one)
             done()
-    rows = [_row(name, [one]) for name, one in zip(["planned", *UNPLANNED], gone, strict=False)]
-    rows.append(_row("random", gone[len(rows) :]))
+    rows = [_row(name, [one]) for name, one in zip(["planned", *UNPLANNED], outcomes, strict=False)]
+    rows.append(_row("random", outcomes[len(rows) :]))
     return dict(
         plan=sweep.name,
         why=plan.why,
@@ -59,10 +59,13 @@ def compare(
     )
 
 
-def _row(name: str, gone: list[Gone]) -> dict[str, Any]:
+def _row(name: str, outcomes: list[Outcome]) -> dict[str, Any]:
     """Means over several sweeps, and of how many."""
-    parts = [asdict(one.parts) for one in gone]
+    parts = [asdict(one.parts) for one in outcomes]
     means = Parts(**{key: float(np.mean([each[key] for each in parts])) for key in parts[0]})
     return dict(
-        sweep=name, count=len(gone), **asdict(means), score=float(np.mean([score(one.parts) for one in gone]))
+        sweep=name,
+        count=len(outcomes),
+        **asdict(means),
+        score=float(np.mean([score(one.parts) for one in outcomes])),
     )

@@ -11,17 +11,17 @@ from studies.plan.evolution import SEED, Search
 from studies.plan.file import Plan, PlanError, Sweep
 from studies.plan.score import in_words, points, score, why
 from studies.plan.search import ranked, search
-from studies.plan.workers import Gone, Ground, Workers
+from studies.plan.workers import Outcome, Problem, Workers
 
 DIGITS = 6
 
 
 def make_plan(
-    ground: Ground, workers: Workers, speed_mm_s: float, trials: int, done: Callable[[], Any]
+    problem: Problem, workers: Workers, speed_mm_s: float, trials: int, done: Callable[[], Any]
 ) -> Plan:
-    """The plan of a ground. Raises PlanError where no way is found."""
-    start = workers.start()
-    searches = search(start.candidates, workers, trials, done)
+    """The plan that solves a problem. Raises PlanError where no way is found."""
+    space = workers.search_space()
+    searches = search(space.candidates, workers, trials, done)
     rows = [row for row in ranked(searches, workers, speed_mm_s, done) if row[1].passes]
     if not rows or rows[0][1].parts.reachable < 1.0:
         raise PlanError(
@@ -29,40 +29,42 @@ def make_plan(
             "or give the search more --trials"
         )
     return Plan(
-        anatomy=fingerprint(ground.anatomy),
-        target=ground.target,
-        margin_mm=ground.margin_mm,
+        anatomy=fingerprint(problem.anatomy),
+        target=problem.target,
+        margin_mm=problem.margin_mm,
         speed_mm_s=speed_mm_s,
-        probe=ground.probe.model_dump(by_alias=True, mode="json"),
-        trocar=ground.trocar,
-        model=start.model,
+        probe=problem.probe.model_dump(by_alias=True, mode="json"),
+        trocar=problem.trocar,
+        model=space.model,
         seed=SEED,
         why=_reasons(rows),
         sweeps=[_sweep(*row) for row in rows],
     )
 
 
-def _reasons(rows: list[tuple[Search, Gone]]) -> list[str]:
+def _reasons(rows: list[tuple[Search, Outcome]]) -> list[str]:
     winner = rows[0][1].parts
     said = [f"{_name(*rows[0])}: {in_words(winner)}; {score(winner):.1f} points"]
-    for one, gone in rows[1:]:
-        said.append(f"before {_name(one, gone)} ({score(gone.parts):.1f} points): {why(winner, gone.parts)}")
+    for one, outcome in rows[1:]:
+        said.append(
+            f"before {_name(one, outcome)} ({score(outcome.parts):.1f} points): {why(winner, outcome.parts)}"
+        )
     return said
 
 
-def _name(one: Search, gone: Gone) -> str:
-    return one.candidate.named(len(gone.passes))
+def _name(one: Search, outcome: Outcome) -> str:
+    return one.candidate.named(len(outcome.passes))
 
 
-def _sweep(one: Search, gone: Gone) -> Sweep:
+def _sweep(one: Search, outcome: Outcome) -> Sweep:
     return Sweep(
-        name=_name(one, gone),
-        score=round(score(gone.parts), DIGITS),
-        parts=_rounded(asdict(gone.parts)),
-        points=_rounded(points(gone.parts)),
+        name=_name(one, outcome),
+        score=round(score(outcome.parts), DIGITS),
+        parts=_rounded(asdict(outcome.parts)),
+        points=_rounded(points(outcome.parts)),
         values=_rounded(one.values),
         trials=one.trials,
-        passes=[np.round(each, DIGITS).tolist() for each in gone.passes],
+        passes=[np.round(each, DIGITS).tolist() for each in outcome.passes],
     )
 
 

@@ -6,7 +6,7 @@ from typing import Any
 from studies.plan.candidate import Candidate
 from studies.plan.evolution import NEAR, Search
 from studies.plan.score import score
-from studies.plan.workers import Gone, Workers
+from studies.plan.workers import Outcome, Workers
 
 # The share of all trials in which the candidates are compared; the better half of them has the rest.
 FIRST = 0.5
@@ -40,8 +40,8 @@ def _generation(active: list[Search], workers: Workers, most: int, done: Callabl
         for shares in generation
     ]
     scores = []
-    for gone in workers.go(tasks):
-        scores.append(score(gone.parts))
+    for outcome in workers.go(tasks):
+        scores.append(score(outcome.parts))
         done()
     for one, generation in zip(active, asked, strict=True):
         if generation:
@@ -52,13 +52,13 @@ def _generation(active: list[Search], workers: Workers, most: int, done: Callabl
 
 def ranked(
     searches: list[Search], workers: Workers, speed_mm_s: float, done: Callable[[], Any]
-) -> list[tuple[Search, Gone]]:
+) -> list[tuple[Search, Outcome]]:
     """The best of each candidate gone once more, as fast as it will be; the best of these first."""
     tried = [one for one in searches if one.trials]
     rows = []
-    for one, gone in zip(
+    for one, outcome in zip(
         tried, workers.go([(each.candidate, each.values, speed_mm_s) for each in tried]), strict=True
     ):
-        rows.append((one, gone))
+        rows.append((one, outcome))
         done()
     return sorted(rows, key=lambda row: -score(row[1].parts))

@@ -35,8 +35,8 @@ from ultrasound.target import Target
 
 
 @dataclass(frozen=True)
-class Ground:
-    """What a plan is made for. ``target`` is one of ``ultrasound.target.TARGETS``."""
+class Problem:
+    """What a plan is to solve: see a target of a patient. ``target`` is one of ``ultrasound.target.TARGETS``."""
 
     scene: Scene
     anatomy: LoadedAnatomy
@@ -46,13 +46,13 @@ class Ground:
     trocar: Trocar
 
     @property
-    def bare(self) -> "Ground":
+    def bare(self) -> "Problem":
         """Without the pictures, which no trial asks for."""
         return replace(self, anatomy=replace(self.anatomy, ct=None, labels=None, parts={}))
 
 
 @dataclass(frozen=True)
-class Gone:
+class Outcome:
     """What a way was worth, and its passes (n, 4, 4): probe in the patient, in PLUS's axes (LPS, mm)."""
 
     parts: Parts
@@ -60,8 +60,8 @@ class Gone:
 
 
 @dataclass(frozen=True)
-class Start:
-    """The candidates of a ground, and what its tissue is computed with."""
+class SearchSpace:
+    """The candidates for a problem, and what its tissue is computed with."""
 
     candidates: list[Candidate]
     model: dict[str, float | int | str]
@@ -72,26 +72,26 @@ Task = tuple[Candidate, dict[str, float], float]
 
 
 class Workers:
-    """Processes that try ways on one ground. All that they do may raise PlanError."""
+    """Processes that try ways for one problem. All that they do may raise PlanError."""
 
-    def __init__(self, ground: Ground, jobs: int) -> None:
-        self.ground, self._jobs, self._pool = ground.bare, jobs, ProcessPoolExecutor(jobs)
-        made_of = ground.scene, ground.probe, ground.target, ground.margin_mm, ground.trocar
-        self._key = fingerprint(self.ground.anatomy) + repr(made_of)
+    def __init__(self, problem: Problem, jobs: int) -> None:
+        self.problem, self._jobs, self._pool = problem.bare, jobs, ProcessPoolExecutor(jobs)
+        made_of = problem.scene, problem.probe, problem.target, problem.margin_mm, problem.trocar
+        self._key = fingerprint(self.problem.anatomy) + repr(made_of)
 
-    def start(self) -> Start:
+    def search_space(self) -> SearchSpace:
         """What there is to search. Raises PlanError."""
-        return next(self._all(_start, [()]))
+        return next(self._all(_search_space, [()]))
 
     def foresee(self, candidates: Sequence[Candidate]) -> Iterator[np.ndarray]:
         """Where the search of each is to begin, shares (n,) of its ranges."""
         return self._all(_foreseen, [(each,) for each in candidates])
 
-    def go(self, tasks: Sequence[Task]) -> Iterator[Gone]:
+    def go(self, tasks: Sequence[Task]) -> Iterator[Outcome]:
         """In the order of the tasks, as they are done."""
         return self._all(_go, tasks)
 
-    def go_ways(self, ways: Sequence[Callable[[Trial], Way]], speed_mm_s: float) -> Iterator[Gone]:
+    def go_ways(self, ways: Sequence[Callable[[Trial], Way]], speed_mm_s: float) -> Iterator[Outcome]:
         """The same of ways that are not candidates': each is made in its process."""
         return self._all(_go_way, [(way, speed_mm_s) for way in ways])
 
@@ -106,7 +106,7 @@ class Workers:
             while True:
                 # With more than its processes soon take, loky's own thread falls over where it is stopped.
                 for task in islice(left, 2 * self._jobs - len(waiting)):
-                    waiting.append(self._pool.submit(function, self._key, self.ground, *task))
+                    waiting.append(self._pool.submit(function, self._key, self.problem, *task))
                 if not waiting:
                     return
                 yield waiting.popleft().result()
@@ -117,12 +117,12 @@ class Workers:
 
 
 @contextmanager
-def workers(ground: Ground, jobs: int | None = None) -> Iterator[Workers]:
+def workers(problem: Problem, jobs: int | None = None) -> Iterator[Workers]:
     """Processes on this machine, as many as it has processors where ``jobs`` is None.
 
     One is a process of its own too: this one may have a Taichi that is in use.
     """
-    crew = Workers(ground, jobs or cpu_count())
+    crew = Workers(problem, jobs or cpu_count())
     try:
         yield crew
     finally:
@@ -132,51 +132,53 @@ def workers(ground: Ground, jobs: int | None = None) -> Iterator[Workers]:
 _built: dict[str, Trial] = {}
 
 
-def _trial(key: str, ground: Ground, speed_mm_s: float) -> Trial:
-    """The trial of a ground, built once in a process. Raises PlanError."""
+def _trial(key: str, problem: Problem, speed_mm_s: float) -> Trial:
+    """The trial of a problem, built once in a process. Raises PlanError."""
     if key not in _built:
         _built.clear()
-        if ground.target != "organ" and ground.anatomy.tumour is None:
+        if problem.target != "organ" and problem.anatomy.tumour is None:
             raise PlanError(
-                f"--target {ground.target}: this scene has no tumour; expected organ, or another scene"
+                f"--target {problem.target}: this scene has no tumour; expected organ, or another scene"
             )
         sim.device.start("cpu", cpu_max_num_threads=1)
-        rehearsal = Rehearsal(ground.scene, ground.anatomy, ground.probe)
-        coverage = Coverage(rehearsal.organ, rehearsal.tumour, ground.margin_mm)
-        if not coverage.targets[ground.target].any():
+        rehearsal = Rehearsal(problem.scene, problem.anatomy, problem.probe)
+        coverage = Coverage(rehearsal.organ, rehearsal.tumour, problem.margin_mm)
+        if not coverage.targets[problem.target].any():
             raise PlanError(
-                f"--target {ground.target}: it is smaller than a voxel of {VOXEL_MM:g} mm; expected a larger one"
+                f"--target {problem.target}: it is smaller than a voxel of {VOXEL_MM:g} mm; expected a larger one"
             )
-        middle = coverage.low_mm + VOXEL_MM * np.argwhere(coverage.targets[ground.target]).mean(axis=0)
-        reach = Reach(ground.trocar, rehearsal.hand, rehearsal.origin, middle)
-        _built[key] = Trial(rehearsal, coverage, ground.target, reach, speed_mm_s)
+        middle = coverage.low_mm + VOXEL_MM * np.argwhere(coverage.targets[problem.target]).mean(axis=0)
+        reach = Reach(problem.trocar, rehearsal.hand, rehearsal.origin, middle)
+        _built[key] = Trial(rehearsal, coverage, problem.target, reach, speed_mm_s)
     _built[key].speed_mm_s = speed_mm_s
     return _built[key]
 
 
-def _start(key: str, ground: Ground) -> Start:
-    trial = _trial(key, ground, 1.0)
+def _search_space(key: str, problem: Problem) -> SearchSpace:
+    trial = _trial(key, problem, 1.0)
     rehearsal, step = trial.rehearsal, trial.rehearsal.settings
     passes = dict(time_step_s=step.time_step_s, substeps=step.substeps, iterations=step.iterations)
     model = rehearsal.scene.tissue.model_dump(mode="json") | passes | rehearsal.model.counts()
-    return Start(candidates_of(rehearsal, trial.coverage, trial.target, trial.reach), model)
+    return SearchSpace(candidates_of(rehearsal, trial.coverage, trial.target, trial.reach), model)
 
 
-def _foreseen(key: str, ground: Ground, candidate: Candidate) -> np.ndarray:
-    trial = _trial(key, ground, 1.0)
+def _foreseen(key: str, problem: Problem, candidate: Candidate) -> np.ndarray:
+    trial = _trial(key, problem, 1.0)
     trial.rehearsal.reset()
     forecast = Forecast(trial.rehearsal, trial.coverage, trial.target, trial.reach)
     return foreseen(candidate, lambda values: forecast.parts(candidate.way(forecast.hand, values)))
 
 
-def _go(key: str, ground: Ground, candidate: Candidate, values: dict[str, float], speed_mm_s: float) -> Gone:
-    return _go_way(key, ground, lambda trial: candidate.way(trial.rehearsal.hand, values), speed_mm_s)
+def _go(
+    key: str, problem: Problem, candidate: Candidate, values: dict[str, float], speed_mm_s: float
+) -> Outcome:
+    return _go_way(key, problem, lambda trial: candidate.way(trial.rehearsal.hand, values), speed_mm_s)
 
 
-def _go_way(key: str, ground: Ground, make: Callable[[Trial], Way], speed_mm_s: float) -> Gone:
-    trial = _trial(key, ground, speed_mm_s)
+def _go_way(key: str, problem: Problem, make: Callable[[Trial], Way], speed_mm_s: float) -> Outcome:
+    trial = _trial(key, problem, speed_mm_s)
     way = make(trial)
     parts = trial.run(way)
-    return Gone(
+    return Outcome(
         parts, [np.stack([probe_in_patient(trial.rehearsal, pose) for pose in each]) for each in way.passes]
     )

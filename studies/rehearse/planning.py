@@ -10,7 +10,7 @@ from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene, with_options
 from studies.plan.file import Plan, PlanError, next_free, scans_of, write_plan
 from studies.plan.make import make_plan
-from studies.plan.workers import Ground, Workers, workers
+from studies.plan.workers import Problem, Workers, workers
 from studies.rehearsal import Rehearsal
 from studies.rehearse.guide import Guide
 from studies.rehearse.instruments import Instruments
@@ -31,10 +31,10 @@ class Planning:
     Once it ``is_over``, ``plan`` is there, or ``fault`` says why not.
     """
 
-    def __init__(self, ground: Ground, path: Path, trials: int = TRIALS) -> None:
+    def __init__(self, problem: Problem, path: Path, trials: int = TRIALS) -> None:
         self.path, self.fault = path, ""
         self.plan: Plan | None = None
-        self._ground, self._trials, self._done = ground, trials, 0
+        self._problem, self._trials, self._done = problem, trials, 0
         self._workers: Workers | None = None
         self._stops = False
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -59,8 +59,8 @@ class Planning:
     def _run(self) -> None:
         try:
             # One processor is left to the rehearsal.
-            with workers(self._ground, max(1, cpu_count() - 1)) as self._workers:
-                plan = make_plan(self._ground, self._workers, SPEED_MM_S, self._trials, self._count)
+            with workers(self._problem, max(1, cpu_count() - 1)) as self._workers:
+                plan = make_plan(self._problem, self._workers, SPEED_MM_S, self._trials, self._count)
             write_plan(plan, self.path)
             self.plan = plan
         except PlanError as error:
@@ -116,8 +116,8 @@ class Plans:
             return "A plan is being made"
         target = settings.plan_for if self.rehearsal.tumour is not None else "organ"
         scene, probe = as_set(self.rehearsal.scene, settings), probe_as_set(self.rehearsal.probe, settings)
-        ground = Ground(scene, self.anatomy, probe, target, float(settings.margin_mm), scene.trocar)
-        self._planning = Planning(ground, next_free(self.out))
+        problem = Problem(scene, self.anatomy, probe, target, float(settings.margin_mm), scene.trocar)
+        self._planning = Planning(problem, next_free(self.out))
         return f"Planning for {NAMED[target]}"
 
     def _ended(self) -> str:
