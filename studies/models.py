@@ -97,8 +97,8 @@ def build_solver(
 ) -> Solver:
     """A solver of the organ [mm] among shapes, the tool among them. Raises SamplingError.
 
-    ``held`` is the neo-Hookean model's; ``rest`` is shape matching's: the organ filled before (``fill``), which takes seconds. ``serial`` says whether a step is
-    one kernel on one core; left open, the body's size and the machine decide.
+    ``held`` is the neo-Hookean model's; ``rest`` is shape matching's: the organ filled before (``fill``), which takes seconds.
+    ``serial`` says whether a step is one kernel on one core; left open, the body's size and the machine decide.
     """
     contact, section = contact or Contact(), section or SolverSection()
     if isinstance(tissue, NeoHookeanTissue):

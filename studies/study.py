@@ -18,12 +18,5 @@ def study() -> None:
     """Measure on this machine: tables, CSV, JSON and a picture into a folder."""
 
 
-study.add_command(timing)
-study.add_command(features)
-study.add_command(trade)
-study.add_command(stability)
-study.add_command(soak)
-study.add_command(intake)
-study.add_command(freehand)
-study.add_command(replay)
-study.add_command(plan_study)
+for command in (timing, features, trade, stability, soak, intake, freehand, replay, plan_study):
+    study.add_command(command)

@@ -10,7 +10,7 @@ import trimesh
 from tqdm import tqdm
 
 from studies.beam.capture import BeamError, load_captures
-from studies.beam.comparison import Row, check, compare, draw, table
+from studies.beam.comparison import check, compare, draw, table
 from studies.command_line import Fault, NumberRange, make_folder, make_place, save_figures, start_taichi
 
 BEAM = "beam.stl"
@@ -96,18 +96,14 @@ def run(
 
     material = Material(*values)
     groups = [list(group) for _, group in groupby(captures, key=lambda capture: capture.load_g)]
-    rows: list[Row] = []
-    traces = []
 
     def build(
         cell_mm: float, load_g: float, changed: Material = material, hung_mm: float | None = None
     ) -> Cantilever:
         return Cantilever(size, changed, cell_mm, load_g, markers_on(size), hung_mm)
 
-    for group in tqdm(groups, desc="beam", unit="load"):
-        row, trace = compare(group, build, cell_mm)
-        rows.append(row)
-        traces.append(trace)
+    compared = [compare(group, build, cell_mm) for group in tqdm(groups, desc="beam", unit="load")]
+    rows, traces = [row for row, _ in compared], [trace for _, trace in compared]
     frame_s = float(traces[0][0, 1])
     settings: dict[str, float] = dict(
         **asdict(material),

@@ -107,10 +107,7 @@ def reconstruct(
     pictures = read_sweep(sweep)
     pictures.constant |= load_constants(config) if config else {}
     marks = marks_beside(sweep)
-    try:
-        errors = TrackingErrors(**tracker)
-    except ValueError as error:
-        raise Fault(f"errors of a tracker: {error}") from None
+    errors = _errors_of(tracker)
     if errors != TrackingErrors():
         pictures = with_errors(pictures, reference, errors, seed)
     track = track_of(pictures, reference)
@@ -119,31 +116,23 @@ def reconstruct(
     make_folder(out)
     if errors != TrackingErrors():
         write_sweep(out / "tracked.igs.mha", pictures)
-    if reach_mm is None:
-        reach_mm = usual_reach_mm(track, spacing_mm)
+    settings: dict[str, Any] = dict(
+        method=method,
+        spacing_mm=spacing_mm,
+        reach_mm=usual_reach_mm(track, spacing_mm) if reach_mm is None else reach_mm,
+    )
     places = None
     if undo_compression and patient is not None:
         places = _unsqueezed(patient, pictures, track, reference, arch)
     with tqdm(total=len(track.frames), desc="reconstruct", unit="picture") as bar:
         try:
-            rebuilt = rebuild(
-                pictures,
-                track,
-                lit(pictures.images),
-                spacing_mm,
-                method,
-                reach_mm,
-                marks,
-                places,
-                done=bar.update,
-            )
+            seen = lit(pictures.images)
+            rebuilt = rebuild(pictures, track, seen, **settings, marks=marks, places=places, done=bar.update)
         except ValueError as error:
             raise Fault(f"{sweep.name}: {error}") from None
     save_volumes(rebuilt, out)
     report = dict(
-        method=method,
-        spacing_mm=spacing_mm,
-        reach_mm=reach_mm,
+        **settings,
         reference=reference,
         undo_compression=undo_compression,
         tracker=tracker,
@@ -155,6 +144,13 @@ def reconstruct(
     write_json(report, out / "report.json")
     click.echo(in_words(report))
     click.echo(f"Wrote volume.nrrd, volume.png and report.json to {out}")
+
+
+def _errors_of(tracker: dict[str, float]) -> TrackingErrors:
+    try:
+        return TrackingErrors(**tracker)
+    except ValueError as error:
+        raise Fault(f"errors of a tracker: {error}") from None
 
 
 def usual_reach_mm(track: Track, spacing_mm: float) -> float:

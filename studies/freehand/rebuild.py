@@ -79,8 +79,9 @@ def rebuild(
     """Put the pictures of a sweep together.
 
     ``marks`` are the same frames with ``Mark`` values. ``places`` says where each frame's pixels are, asked for in the order of frames;
-    without it they are where the tracker says. Without grey values there must be marks. Raises SweepError where marks and pictures do not go together, ValueError as
-    ``VoxelBox.around``.
+    without it they are where the tracker says. Without grey values there must be marks. ``done`` is told of each frame.
+
+    Raises SweepError where marks and pictures do not go together, ValueError as ``VoxelBox.around``.
     """
     if marks is not None and marks.images.shape != sweep.images.shape:
         raise SweepError(

@@ -22,22 +22,28 @@ class Driver(Protocol):
     """For each moment: ``move``, then, where that gave a pose, the step and ``stepped``; then ``watch``."""
 
     @property
-    def session(self) -> Session: ...
+    def session(self) -> Session:
+        """The session that the moments are of."""
 
     @property
-    def status(self) -> str: ...
+    def status(self) -> str:
+        """What stands in the panel; empty where there is nothing to say."""
 
-    def move(self, controls: Controls) -> np.ndarray | None: ...
+    def move(self, controls: Controls) -> np.ndarray | None:
+        """The pose (4, 4) to step to; None where this moment goes back to another."""
 
-    def stepped(self, step_ms: float) -> str: ...
+    def stepped(self, step_ms: float) -> str:
+        """The rehearsal has just advanced to that pose, in so many ms; what the terminal has to say of it."""
 
-    def watch(self) -> str: ...
+    def watch(self) -> str:
+        """After each moment: what the terminal has to say of it."""
 
-    def take_said(self) -> str: ...
+    def take_said(self) -> str:
+        """What there was to say to the user since this was last asked."""
 
 
 class Played:
-    """A recorded session in the window, until it is over or the user takes over: from then on ``lead()``."""
+    """A recorded session, a ``Driver``, until it is over or the user takes over: from then on ``lead()``."""
 
     def __init__(self, replay: Replay, lead: Callable[[], Live]) -> None:
         self.replay, self._lead = replay, lead
@@ -51,11 +57,9 @@ class Played:
 
     @property
     def status(self) -> str:
-        return (
-            self.live.status
-            if self.live
-            else f"REPLAY   {self.replay.time_s:.1f} s   {{take_over}} leads from here"
-        )
+        if self.live is not None:
+            return self.live.status
+        return f"REPLAY   {self.replay.time_s:.1f} s   {{take_over}} leads from here"
 
     def move(self, controls: Controls) -> np.ndarray | None:
         if self.live is None and (controls.take_over or self.replay.is_over):
@@ -109,7 +113,7 @@ def _fits(usual: Any, value: Any, name: str, about: Mapping[str, Any]) -> bool:
 
 
 class Scripted:
-    """The scene's scripted press, in so many steps."""
+    """The scene's scripted press in so many steps, a ``Driver``."""
 
     def __init__(self, session: Session, recorded: Recorded | None, steps: int) -> None:
         self.session, self.recorded, self.steps = session, recorded, steps

@@ -55,6 +55,7 @@ class Instruments:
 
     @cached_property
     def coverage(self) -> Coverage:
+        """What has been in the picture; made when it is first asked for."""
         return Coverage(self.rehearsal.organ, self.rehearsal.tumour, self.margin_mm)
 
     def watch(self, session: Session, probe: Probe, pose: np.ndarray | None) -> None:

@@ -7,7 +7,7 @@ from time import perf_counter
 import click
 
 from render.keys import Keys
-from render.viewer import Controls, View, Viewer
+from render.viewer import Controls, Settings, View, Viewer
 from studies.link.live import send_live
 from studies.link.server import Server
 from studies.rehearsal import Rehearsal
@@ -125,10 +125,7 @@ class Loop:
         """A new frame. A frozen one shows the same tissue with the scanner set anew, and is not kept."""
         if self.frozen:
             view = take_view(self.rehearsal, controls.settings, None, self.record, "FROZEN")
-            probe = probe_as_set(self.rehearsal.probe, controls.settings)
-            send_live(self.link, self.rehearsal, view, probe, self.driver.session.time_s)
-            view = self.instruments.onto(view, controls.settings)
-            return Frame(perf_counter(), view, self.rehearsal.rest_grid())
+            return self._sent(view, controls.settings)
         pose = self.driver.move(controls)
         self._say(self.driver.take_said())
         status = self.notices.shown or self.driver.status
@@ -138,13 +135,17 @@ class Loop:
             self._tell(self.driver.stepped(self.record.step_ms[-1]))
         probe = probe_as_set(self.rehearsal.probe, controls.settings)
         self.instruments.watch(self.driver.session, probe, pose)
-        send_live(self.link, self.rehearsal, view, probe, self.driver.session.time_s)
         self._announce(self.sweeping.watch(self.driver.session.time_s, view, probe))
         self._tell(self.driver.watch())
-        view = self.instruments.onto(view, controls.settings)
-        frame = Frame(perf_counter(), view, self.rehearsal.rest_grid())
+        frame = self._sent(view, controls.settings)
         self.cine.keep(frame)
         return frame
+
+    def _sent(self, view: View, settings: Settings) -> Frame:
+        """A view sent over the link, and with what the instruments read."""
+        probe = probe_as_set(self.rehearsal.probe, settings)
+        send_live(self.link, self.rehearsal, view, probe, self.driver.session.time_s)
+        return Frame(perf_counter(), self.instruments.onto(view, settings), self.rehearsal.rest_grid())
 
     def _tell(self, news: str) -> None:
         if news:

@@ -42,6 +42,7 @@ class Planning:
 
     @property
     def is_over(self) -> bool:
+        """Whether the search has ended, with a plan or without one."""
         return not self._thread.is_alive()
 
     @property

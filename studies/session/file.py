@@ -87,7 +87,7 @@ class Second(_Line):
 
     at: int = Field(ge=0)
     poses: str
-    events: list[Event] = []
+    events: list[Event] = Field(default_factory=list)
     digest: str
 
 

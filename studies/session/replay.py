@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from scenes.scene import NeoHookeanTissue
-from studies.rehearsal import Rehearsal
+from studies.rehearsal import Rehearsal, RehearsalState
 from studies.session.file import Log, SessionError
 from studies.session.session import SETTLED, Session
 from studies.session.state import StateError, from_text
@@ -38,10 +38,12 @@ class Replay:
 
     @property
     def is_over(self) -> bool:
+        """Whether there is no moment left."""
         return self.session.moment >= len(self.log.poses)
 
     @property
     def time_s(self) -> float:
+        """Simulated time since the session began."""
         return self.session.time_s
 
     def open_at(self, seconds: float, done: Callable[[int], Any] = lambda moments: None) -> float:
@@ -128,7 +130,7 @@ class Replay:
             for moment, to in self._backs
         )
 
-    def _state(self, text: str):
+    def _state(self, text: str) -> RehearsalState:
         try:
             return from_text(text, self.rehearsal.settled)
         except StateError as error:

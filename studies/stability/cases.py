@@ -44,6 +44,7 @@ class Case:
 
     @property
     def name(self) -> str:
+        """The kind and its extreme, which no two cases of a model share."""
         return f"{self.kind}: {self.extreme}"
 
 
