@@ -27,9 +27,8 @@ from studies.models import (
     step_settings,
     tool_of,
 )
-from studies.setup import probe_of, setup_of_scene
+from studies.setup import probe_of
 from studies.surfaces import moved_by, volume_mm3
-from studies.trade.front import expected_error_mm, load_points
 from ultrasound.array import Mode, Probe, Rung
 from ultrasound.outline import section
 from ultrasound.plane import ImagePlane
@@ -102,7 +101,6 @@ class Rehearsal:
         self._build_scanner(anatomy)
         if shows_echo and self.scanner is not None:
             self.scanner.foresee_echo()
-        self._points = load_points()
         self.press = press_on(scene.press, anatomy, self.gravity_direction)
         self.steps = 0
         told("Building the model: the tissue comes to rest")
@@ -283,12 +281,6 @@ class Rehearsal:
 
     def _indentation(self, pose: np.ndarray) -> float:
         return indentation(pose, self.size_mm, self.hand.samples, self.probe.radius_mm)
-
-    def expected_error_mm(self) -> float | None:
-        """Mean error of beads that was measured with settings like these (``study trade``); None where none were."""
-        step = self.settings
-        setup = setup_of_scene(self.scene, step.substeps, step.iterations, step.relaxation_factor)
-        return expected_error_mm(self._points, setup)
 
     def volume_ratio(self) -> float:
         """Volume inside the carried surface, as a share of the resting one."""

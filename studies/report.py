@@ -6,9 +6,18 @@ import numpy as np
 
 from studies.rehearsal import Rehearsal
 from studies.results import counted, spread
+from studies.setup import setup_of_scene
+from studies.trade.front import expected_error_mm, load_points
 
 # Keys that not every tissue model fills.
 NOT_EVERYWHERE = dict(radius_mm=None, stiffness=None, clusters=0, memberships=0)
+
+
+def expected_error_of(rehearsal: Rehearsal) -> float | None:
+    """Mean error of beads [mm] that ``study trade`` measured with settings like a rehearsal's; None where it measured none."""
+    step = rehearsal.settings
+    setup = setup_of_scene(rehearsal.scene, step.substeps, step.iterations, step.relaxation_factor)
+    return expected_error_mm(load_points(), setup)
 
 
 @dataclass
@@ -55,7 +64,7 @@ class Record:
             ms_per_slice=spread(self.slice_ms[1:] or self.slice_ms),
             build_s=round(self.build_s, 3),
             finite=self.finite,
-            expected_error_mm=rehearsal.expected_error_mm(),
+            expected_error_mm=expected_error_of(rehearsal),
             fallbacks=self.fallbacks,
             volume_ratio_min=round(self.volume_ratio_min, 6),
             max_penetration_mm=round(self.max_penetration_mm, 6),

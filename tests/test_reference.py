@@ -17,12 +17,28 @@ from studies.reference.contact import Contact, Law, Surface
 from studies.reference.equilibrium import Equilibrium, NotConvergedError
 from studies.reference.experiment import Experiment, Press
 from studies.reference.mesh import tetrahedra
-from studies.reference.obstacles import DistanceField, Plane, RoundedBox
+from studies.reference.obstacles import DistanceField, RoundedBox
 from studies.reference.solid import Material, Solid
 from studies.reference.study import blue_noise, laid
 
 SIDE_MM = 10.0
 TISSUE = Material()
+
+
+class Plane:
+    """The half space below a plane through a point [mm]; the normal points out of it."""
+
+    def __init__(self, point: np.ndarray, normal: np.ndarray) -> None:
+        self._normal = np.asarray(normal, float) / np.linalg.norm(normal)
+        self._height = float(self._normal @ point)
+
+    def gap(self, points: np.ndarray) -> np.ndarray:
+        """Height above the plane [mm], shape (n,)."""
+        return points @ self._normal - self._height
+
+    def slopes(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The normal, shape (n, 3), and zeros, shape (n, 3, 3)."""
+        return np.tile(self._normal, (len(points), 1)), np.zeros((len(points), 3, 3))
 
 
 def cube(cells: int, distortion_mm: float = 0.0) -> Solid:

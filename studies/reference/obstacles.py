@@ -8,22 +8,6 @@ from scipy.ndimage import spline_filter
 FAR_MM = 1e3
 
 
-class Plane:
-    """The half space below a plane through a point [mm]; the normal points out of it."""
-
-    def __init__(self, point: np.ndarray, normal: np.ndarray) -> None:
-        self._normal = np.asarray(normal, float) / np.linalg.norm(normal)
-        self._height = float(self._normal @ point)
-
-    def gap(self, points: np.ndarray) -> np.ndarray:
-        """Height above the plane [mm], shape (n,)."""
-        return points @ self._normal - self._height
-
-    def slopes(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The normal, shape (n, 3), and zeros, shape (n, 3, 3)."""
-        return np.tile(self._normal, (len(points), 1)), np.zeros((len(points), 3, 3))
-
-
 class RoundedBox:
     """A box about the origin whose edges and corners are rounded inside its full size [mm].
 

@@ -11,7 +11,7 @@ from render.layout import FULL_SIZE
 from render.viewer import Geometry, Settings, View, Viewer
 from scenes.scene import NeoHookeanTissue
 from studies.rehearsal import Rehearsal
-from studies.report import Record
+from studies.report import Record, expected_error_of
 from studies.stopwatch import timed
 from ultrasound.array import TGC_SLIDERS, Probe
 
@@ -140,7 +140,7 @@ def captions(probe: Probe, settings: Settings) -> tuple[str, str, str]:
 def readouts(rehearsal: Rehearsal, record: Record) -> dict[str, str]:
     """Name -> figure with its unit."""
     size, count = next(iter(rehearsal.model.counts().items()))
-    error = rehearsal.expected_error_mm()
+    error = expected_error_of(rehearsal)
     return {
         "step": f"{np.median(record.step_ms[-30:]):.1f} ms" if record.step_ms else "",
         "error": "not known" if error is None else f"± {error:.2f} mm",

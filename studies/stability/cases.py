@@ -151,35 +151,27 @@ def _states() -> Iterator[Case]:
                 yield Case(kind, extreme + usual, settings=settings, state=state)
 
 
+def _each_axis(extreme: str, name: str, along: float, across: float) -> list[tuple[str, tuple]]:
+    """A state once for each axis, by its number along that and across it."""
+    return [
+        (extreme.format(axis), (name, *(along if each == axis else across for each in AXES))) for axis in AXES
+    ]
+
+
 AXES = ("x", "y", "z")
 STATES: dict[str, list[tuple[str, tuple]]] = {
     "collapsed": [
-        *(
-            (f"to a plane, {name}", ("scaled", *(float(k != axis) for k in range(3))))
-            for axis, name in enumerate(AXES)
-        ),
-        *(
-            (f"to a line, {name}", ("scaled", *(float(k == axis) for k in range(3))))
-            for axis, name in enumerate(AXES)
-        ),
+        *_each_axis("to a plane, {}", "scaled", 0.0, 1.0),
+        *_each_axis("to a line, {}", "scaled", 1.0, 0.0),
         ("to a point", ("scaled", 0.0, 0.0, 0.0)),
     ],
     "mirrored": [
-        *(
-            (f"in {name}", ("scaled", *(1.0 - 2.0 * (k == axis) for k in range(3))))
-            for axis, name in enumerate(AXES)
-        ),
+        *_each_axis("in {}", "scaled", -1.0, 1.0),
         ("through its middle", ("scaled", -1.0, -1.0, -1.0)),
     ],
     "scaled": [
-        *(
-            (f"x 5 in {name}", ("scaled", *(1.0 + 4.0 * (k == axis) for k in range(3))))
-            for axis, name in enumerate(AXES)
-        ),
-        *(
-            (f"x 0.2 in {name}", ("scaled", *(1.0 - 0.8 * (k == axis) for k in range(3))))
-            for axis, name in enumerate(AXES)
-        ),
+        *_each_axis("x 5 in {}", "scaled", 5.0, 1.0),
+        *_each_axis("x 0.2 in {}", "scaled", 1.0 - 0.8, 1.0),
         ("x 10", ("scaled", 10.0, 10.0, 10.0)),
         ("x 0.1", ("scaled", 0.1, 0.1, 0.1)),
     ],
@@ -188,14 +180,8 @@ STATES: dict[str, list[tuple[str, tuple]]] = {
         ("over its box", ("boxed",)),
     ],
     "thrown": [
-        *(
-            (f"10 m/s, {name}", ("thrown", *(1e4 * (k == axis) for k in range(3))))
-            for axis, name in enumerate(AXES)
-        ),
-        *(
-            (f"10 m/s, -{name}", ("thrown", *(-1e4 * (k == axis) for k in range(3))))
-            for axis, name in enumerate(AXES)
-        ),
+        *_each_axis("10 m/s, {}", "thrown", 1e4, 0.0),
+        *_each_axis("10 m/s, -{}", "thrown", -1e4, 0.0),
         ("1000 m/s", ("thrown", 1e6, 0.0, 0.0)),
         ("each point apart, 1 m/s", ("heated", 1e3)),
         ("each point apart, 10 m/s", ("heated", 1e4)),

@@ -1,7 +1,9 @@
 """The points that ``study trade`` found, and which of them is best for a budget of time or of error."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -26,19 +28,12 @@ class Point:
     pareto: bool
 
 
-def load_points(path: Path = MEASURED) -> list[Point]:
+@lru_cache
+def load_points() -> tuple[Point, ...]:
     """What was measured, cheapest first."""
-    rows = json.loads(path.read_text("utf-8"))["points"]
-    found = [
-        Point(
-            setup_of(row),
-            row["ms_median"],
-            row["error_mean_mm"],
-            bool(row["pareto"]),
-        )
-        for row in rows
-    ]
-    return sorted(found, key=lambda point: point.ms_median)
+    rows = json.loads(MEASURED.read_text("utf-8"))["points"]
+    found = [Point(setup_of(row), row["ms_median"], row["error_mean_mm"], row["pareto"]) for row in rows]
+    return tuple(sorted(found, key=lambda point: point.ms_median))
 
 
 def setup_of(row: dict[str, Any]) -> Setup:
@@ -59,7 +54,7 @@ def pareto(ms: np.ndarray, error: np.ndarray) -> np.ndarray:
     return np.logical_not((no_worse & better).any(axis=0))
 
 
-def front_of(points: list[Point], model: str | None) -> list[Point]:
+def front_of(points: Sequence[Point], model: str | None) -> list[Point]:
     """The front, cheapest first: of all models, or of one alone."""
     if model is None:
         return [point for point in points if point.pareto]
@@ -70,7 +65,7 @@ def front_of(points: list[Point], model: str | None) -> list[Point]:
     return [point for point, is_best in zip(own, best, strict=True) if is_best]
 
 
-def expected_error_mm(points: list[Point], setup: Setup) -> float | None:
+def expected_error_mm(points: Sequence[Point], setup: Setup) -> float | None:
     """The mean error of the nearest settings that were measured; None where none is near.
 
     Half a size or double the passes are equally far.
