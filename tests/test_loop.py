@@ -60,13 +60,8 @@ class Moments:
     def take_said(self) -> str:
         return ""
 
-    def tell(self, notice: str) -> None: ...
     def figures(self) -> dict:
         return {}
-
-    @property
-    def shown(self) -> str:
-        return ""
 
 
 class Recorded:
@@ -90,7 +85,7 @@ def looping(monkeypatch, tmp_path, sent) -> Loop:
     moments = Moments()
     monkeypatch.setattr(loop, "take_view", moments.take_view)
     link = SimpleNamespace(show=sent.append)
-    return Loop(moments, None, tmp_path, Recorded(0.0), *[moments] * 5, frozen=False, link=link)
+    return Loop(moments, None, tmp_path, Recorded(0.0), *[moments] * 4, frozen=False, link=link)
 
 
 def test_each_frame_goes_to_the_link_as_it_is_shown(looping, sent):
@@ -112,6 +107,18 @@ def test_a_frozen_picture_is_sent_as_the_scanner_is_set_and_one_looked_back_at_i
     assert sent[-1].grey[0, 0] == 101 and sent[-1].image_to_probe[1, 1] == 20 and len(sent) == 2
     looping.frame(Controls(settings, cine=-1))
     assert len(sent) == 2
+
+
+def test_what_the_guard_put_back_is_told_and_stands_in_the_panel_for_a_while(looping, monkeypatch, capsys):
+    clock = [100.0]
+    monkeypatch.setattr(loop, "perf_counter", lambda: clock[0])
+    looping.rehearsal.notice = "Tissue put back"
+    assert looping.frame(Controls(Settings())).status == ""
+    looping.rehearsal.notice = ""
+    shown = []
+    for clock[0] in (103.9, 104.1):
+        shown.append(looping.frame(Controls(Settings())).status)
+    assert shown == ["TISSUE PUT BACK", ""] and capsys.readouterr().out == "Tissue put back\n"
 
 
 def test_without_a_link_the_loop_goes_on(looping, sent):

@@ -14,15 +14,14 @@ from studies.rehearsal import Rehearsal
 from studies.rehearse.cine import Calliper, Cine, Frame
 from studies.rehearse.drivers import Driver
 from studies.rehearse.instruments import Instruments
-from studies.rehearse.notices import Notices
 from studies.rehearse.planning import Plans
 from studies.rehearse.saving import save_pictures, save_screenshot, save_surfaces
 from studies.rehearse.sweeping import Sweeping
 from studies.rehearse.view import probe_as_set, take_view
 from studies.report import Record
 
-# How long what was done is said.
-SAID_S = 2.0
+# How long what was done is said, and that the guard put the tissue back.
+SAID_S, PUT_BACK_S = 2.0, 4.0
 
 
 @dataclass
@@ -34,7 +33,6 @@ class Loop:
     out: Path
     record: Record
     driver: Driver
-    notices: Notices
     instruments: Instruments
     sweeping: Sweeping
     plans: Plans
@@ -46,6 +44,7 @@ class Loop:
     rate: float = 0.0
     _said: str = ""
     _said_until: float = 0.0
+    _put_back_until: float = 0.0
 
     def run(self) -> None:
         """Go on until the window is closed."""
@@ -128,10 +127,12 @@ class Loop:
             return self._sent(view, controls.settings)
         pose = self.driver.move(controls)
         self._say(self.driver.take_said())
-        status = self.notices.shown or self.driver.status
+        status = "TISSUE PUT BACK" if perf_counter() < self._put_back_until else self.driver.status
         view = take_view(self.rehearsal, controls.settings, pose, self.record, status)
         if pose is not None:
-            self.notices.tell(self.rehearsal.notice)
+            if self.rehearsal.notice:
+                self._tell(self.rehearsal.notice)
+                self._put_back_until = perf_counter() + PUT_BACK_S
             self._tell(self.driver.stepped(self.record.step_ms[-1]))
         probe = probe_as_set(self.rehearsal.probe, controls.settings)
         self.instruments.watch(self.driver.session, probe, pose)

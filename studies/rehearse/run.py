@@ -22,7 +22,6 @@ from studies.rehearse.headless import run_headless
 from studies.rehearse.instruments import Instruments
 from studies.rehearse.live import Live
 from studies.rehearse.loop import Loop
-from studies.rehearse.notices import Notices
 from studies.rehearse.planning import Plans
 from studies.rehearse.sweeping import Sweeping
 from studies.rehearse.tracked import PlayedPoses, Tracked
@@ -71,13 +70,10 @@ class Run:
         replay = None if log is None else self._replay(log, at_s, viewer.settings)
         driver = self._live() if replay is None else Played(replay, self._take_over)
         sweeping = Sweeping(self.rehearsal)
-        notices = Notices(click.echo)
         click.echo(self.keys.worded("The window is open; {help} shows the keys, {quit} quits."))
-        parts = driver, notices, self.instruments, sweeping
         plans = Plans(self.rehearsal, self.anatomy, self.instruments, self.out)
-        loop = Loop(
-            self.rehearsal, viewer, self.out, Record(0.0), *parts, plans, keys=self.keys, link=self.link
-        )
+        parts = driver, self.instruments, sweeping, plans
+        loop = Loop(self.rehearsal, viewer, self.out, Record(0.0), *parts, keys=self.keys, link=self.link)
         try:
             loop.run()
         finally:
