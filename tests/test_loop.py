@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import app
-import studies.rehearsal
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
 from studies.rehearse import command, headless, loop, run
@@ -188,7 +187,7 @@ def test_the_command_opens_the_link_for_as_long_as_it_runs(monkeypatch, tmp_path
         reached.append(each.link is not None and each.link.port == port)
 
     monkeypatch.setattr(command, "start_taichi", lambda arch: "cpu")
-    monkeypatch.setattr(studies.rehearsal, "Rehearsal", lambda *_: None)
+    monkeypatch.setattr(command, "built", lambda *_: None)
     monkeypatch.setattr(run, "Instruments", lambda rehearsal, guide: None)
     monkeypatch.setattr(run.Run, "headless", headless_run)
     line = [
