@@ -21,7 +21,7 @@ def expected_error_of(rehearsal: Rehearsal) -> float | None:
 
 
 @dataclass
-class Record:
+class Tally:
     """Figures gathered while a rehearsal runs; the first step and slice, which compile, count as building."""
 
     build_s: float

@@ -290,7 +290,7 @@ def runs() -> list[dict]:
             ("with", block.tumour, {"calibration_mm": (1.0, 2.0, 3.0), "lost": (0.1, 0.2, 0.3)}),
             ("without", None, {"lost": (0.1, 0.2, 0.3)}),
         ):
-            patch.setattr(measure, "SWEPT", swept_over)
+            patch.setattr(measure, "VARIED", swept_over)
             anatomy, done = replace(block, tumour=tumour), []
             figures = measure.measure(scene, anatomy, setup, "cpu", True, partial(done.append, 1))
             assert len(done) == measure.count_of(anatomy, True)

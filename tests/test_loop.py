@@ -39,8 +39,8 @@ class Moments:
         place[0, 3] = self.moment
         return SimpleNamespace(world_from_plane=place)
 
-    def take_view(self, rehearsal, settings, pose, record, status="") -> View:
-        record.step_ms.append(1.0)
+    def take_view(self, rehearsal, settings, pose, tally, status="") -> View:
+        tally.step_ms.append(1.0)
         grey = np.full((4, 4), self.moment + 100 * (status == "FROZEN"), np.uint8)
         probe = probe_as_set(self.probe, settings)
         width, depth, _ = probe.extent_mm
@@ -63,8 +63,8 @@ class Moments:
         return {}
 
 
-class Recorded:
-    """A record of nothing."""
+class Nothing:
+    """A tally of nothing."""
 
     def __init__(self, build_s: float) -> None:
         self.step_ms: list[float] = []
@@ -84,7 +84,7 @@ def looping(monkeypatch, tmp_path, sent) -> Loop:
     moments = Moments()
     monkeypatch.setattr(loop, "take_view", moments.take_view)
     link = SimpleNamespace(show=sent.append)
-    return Loop(moments, None, tmp_path, Recorded(0.0), *[moments] * 4, frozen=False, link=link)
+    return Loop(moments, None, tmp_path, Nothing(0.0), *[moments] * 4, frozen=False, link=link)
 
 
 def test_each_frame_goes_to_the_link_as_it_is_shown(looping, sent):
@@ -148,7 +148,7 @@ def test_without_a_window_pictures_go_to_the_link_and_the_tissue_into_the_folder
     moments, saved = Moments(), []
     monkeypatch.setattr(headless, "open_viewer", no_viewer)
     monkeypatch.setattr(headless, "take_view", moments.take_view)
-    monkeypatch.setattr(headless, "Record", Recorded)
+    monkeypatch.setattr(headless, "Tally", Nothing)
     monkeypatch.setattr(headless, "summary", lambda report: "")
     monkeypatch.setattr(headless, "save_surfaces", lambda rehearsal, out: saved.append((moments.moment, out)))
     link = SimpleNamespace(show=sent.append)

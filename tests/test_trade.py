@@ -14,7 +14,7 @@ from sim.neo_hookean import LATTICE_SETTINGS
 from studies.case import load_case
 from studies.experiment import Experiment
 from studies.setup import NEO_HOOKEAN, PRESETS, QUALITIES, Setup, scene_of, setup_of_scene
-from studies.trade import choice, command, sweep
+from studies.trade import choice, command
 from studies.trade.front import Point, expected_error_mm, front_of, load_points, pareto, preset_of
 from studies.trade.ladder import RUNGS, STEPS_DOWN, STEPS_UP, Ladder
 
@@ -155,7 +155,7 @@ def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, cap
         replace(NEO_HOOKEAN, cell_mm=10.0, iterations=2, warm_up_steps=20, stage_steps=12),
         Setup(radius_mm=7.0, warm_up_steps=20, stage_steps=12),
     )
-    monkeypatch.setattr(sweep, "QUICK", tried)
+    monkeypatch.setattr("studies.trade.tried.QUICK", tried)
     assert app.main(["study", "trade", "--quick", "--out", str(tmp_path)]) == 0
     report = json.loads((tmp_path / "trade.json").read_text())
     assert [p["model"] for p in report["points"]] == ["neo-hookean", "shape-matching"]

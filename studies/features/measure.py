@@ -21,7 +21,7 @@ from sim.solver import Solver
 from studies.models import AnyTissue, build_solver, embedding_cell_mm, fill, reach_of, step_settings
 from studies.rehearsal import SURROUNDINGS_MM, Rehearsal, scanned_anatomy
 from studies.rehearse.view import settings_of, take_view
-from studies.report import Record
+from studies.report import Tally
 from studies.setup import probe_of
 from studies.stopwatch import timed
 from studies.surfaces import moved_by
@@ -233,7 +233,7 @@ def _pictures(rehearsal: Rehearsal, scanned: Anatomy) -> Iterator[dict[str, Any]
 def _whole_frame(rehearsal: Rehearsal) -> dict[str, Any]:
     """All that a frame does but drawing the 3D view: a step under the pressing transducer, skin, echo, window's picture."""
     rehearsal.reset()
-    settings, record, page = settings_of(rehearsal), Record(0.0), Page(Layout(1280, 720))
+    settings, tally, page = settings_of(rehearsal), Tally(0.0), Page(Layout(1280, 720))
     settings.mode = "b-mode"
     poses = [
         rehearsal.pose_at_depth(depth)
@@ -241,7 +241,7 @@ def _whole_frame(rehearsal: Rehearsal) -> dict[str, Any]:
     ]
 
     def go_on() -> None:
-        page.compose(take_view(rehearsal, settings, poses.pop(0), record), settings, patient=True)
+        page.compose(take_view(rehearsal, settings, poses.pop(0), tally), settings, patient=True)
 
     return _alone("whole frame, with the echo", go_on, [rehearsal.scanner], rehearsal.model)
 

@@ -48,12 +48,10 @@ class Truth:
 def beads_of(organ: trimesh.Trimesh, tumour: trimesh.Trimesh | None) -> np.ndarray:
     """Places (k, 3) of beads [mm], on a grid around the middle of the tumour or the organ."""
     middle = (tumour or organ).center_mass
-    steps = np.arange(
-        -np.ceil(BEADS_WITHIN_MM / BEADS_APART_MM), np.ceil(BEADS_WITHIN_MM / BEADS_APART_MM) + 1
-    )
-    grid = middle + BEADS_APART_MM * np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(
-        -1, 3
-    )
+    most = np.ceil(BEADS_WITHIN_MM / BEADS_APART_MM)
+    steps = np.arange(-most, most + 1)
+    cells = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
+    grid = middle + BEADS_APART_MM * cells
     near = grid[np.linalg.norm(grid - middle, axis=1) < BEADS_WITHIN_MM]
     depth = -signed_distance(organ.vertices, organ.faces, near)[0]
     inside = near[depth > 2 * BEAD_RADIUS_MM]

@@ -29,7 +29,7 @@ EVERY = 3
 HELD_MM = 15.0
 DEPTHS_MM = (0.5, 2.0, 4.0, 6.0, 8.0)
 # One error at a time, then all of a good optical and of a poor electromagnetic tracker.
-SWEPT: dict[str, tuple[float, ...]] = {
+VARIED: dict[str, tuple[float, ...]] = {
     "noise_mm": (0.25, 0.5, 1.0, 2.0),
     "noise_deg": (0.25, 0.5, 1.0, 2.0),
     "calibration_mm": (0.5, 1.0, 2.0, 4.0),
@@ -73,7 +73,7 @@ def measure(
 def count_of(anatomy: LoadedAnatomy, quick: bool) -> int:
     """How often ``measure`` says that something is done."""
     depths = 0 if anatomy.tumour is None else len(_depths(quick))
-    return len(METHODS) + 1 + sum(len(_sizes(values, quick)) for values in SWEPT.values()) + depths
+    return len(METHODS) + 1 + sum(len(_sizes(values, quick)) for values in VARIED.values()) + depths
 
 
 def _sizes(values: tuple[float, ...], quick: bool) -> tuple[float, ...]:
@@ -95,7 +95,7 @@ def noise_curves(
         poses=truth.poses[::EVERY],
     )
     trials = [TrackingErrors()] + [
-        TrackingErrors(**{name: size}) for name, sizes in SWEPT.items() for size in _sizes(sizes, quick)
+        TrackingErrors(**{name: size}) for name, sizes in VARIED.items() for size in _sizes(sizes, quick)
     ]
     rows = []
     for errors in trials:

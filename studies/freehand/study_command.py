@@ -13,7 +13,7 @@ from studies.results import write_csv, write_json
 from studies.setup import PRESETS
 from ultrasound.tracking import TrackingErrors
 
-SWEPT = tuple(each.name for each in fields(TrackingErrors))
+VARIED = tuple(each.name for each in fields(TrackingErrors))
 
 
 @click.command()
@@ -93,5 +93,5 @@ def _named(row: dict[str, Any]) -> str:
     if row["sweep"] == "compression":
         undone = ", undone" if row["undone"] else ""
         return f"pressed {row['depth_mm']:g} mm, squeezed {row['compression_mm']:.1f}{undone}"
-    swept = [f"{name} {row[name]:g}" for name in SWEPT if row[name]]
-    return ", ".join(swept) or "every third picture, no error"
+    varied = [f"{name} {row[name]:g}" for name in VARIED if row[name]]
+    return ", ".join(varied) or "every third picture, no error"

@@ -205,11 +205,11 @@ def built(scene: Scene, anatomy: LoadedAnatomy, probe: Probe, told: Told) -> "Re
     """The rehearsal, with all compiled that its first frame takes."""
     from studies.rehearsal import Rehearsal
     from studies.rehearse.view import settings_of, take_view
-    from studies.report import Record
+    from studies.report import Tally
 
     rehearsal = Rehearsal(scene, anatomy, probe, told, shows_echo=scene.image.mode != "ct")
     told("Building the model: the first picture")
-    take_view(rehearsal, settings_of(rehearsal), None, Record(0.0))
+    take_view(rehearsal, settings_of(rehearsal), None, Tally(0.0))
     return rehearsal
 
 

@@ -17,7 +17,7 @@ from studies.rehearse.drivers import Driver
 from studies.rehearse.instruments import Instruments
 from studies.rehearse.saving import save_surfaces
 from studies.rehearse.view import open_viewer, probe_as_set, take_view
-from studies.report import Record, summary
+from studies.report import Tally, summary
 
 # An animation is in memory before it is written: of a long session it has fewer pictures.
 MOST_SHOWN = 400
@@ -40,21 +40,21 @@ def run_headless(
     except NoVulkan as reason:
         click.echo(f"{reason}; writing the pictures and the report without 3D frames.")
         viewer = None
-    record = Record(build_s)
+    tally = Tally(build_s)
     every = max(1, round(1 / (PICTURES_A_SECOND * rehearsal.settings.time_step_s)))
     frames, slices = empty_folder(out / "frames"), empty_folder(out / "slices")
     animation: list[Image.Image] = []
     shown_every = every * (1 + steps // every // MOST_SHOWN)
     for step in tqdm(range(1, steps + 1), desc="press", unit="step"):
         pose = driver.move(Controls(settings))
-        view = take_view(rehearsal, settings, pose, record)
+        view = take_view(rehearsal, settings, pose, tally)
         if pose is not None:
-            _tell(driver.stepped(record.step_ms[-1]))
+            _tell(driver.stepped(tally.step_ms[-1]))
         probe = probe_as_set(rehearsal.probe, settings)
         instruments.watch(driver.session, probe, pose)
         send_live(link, rehearsal, view, probe, driver.session.time_s)
         _tell(driver.watch())
-        record.watch(rehearsal)
+        tally.watch(rehearsal)
         if step % every == 0 or step == steps:
             picture = side_by_side(view)
             picture.save(slices / f"{step:05d}.png")
@@ -66,7 +66,7 @@ def run_headless(
                 animation.append(smaller(picture))
     save_animation(animation, out / "press.gif")
     save_surfaces(rehearsal, out)
-    report = record.report(rehearsal, arch) | dict(reading=instruments.figures())
+    report = tally.report(rehearsal, arch) | dict(reading=instruments.figures())
     (out / "report.json").write_text(json.dumps(report, indent=2) + "\n", "utf-8")
     click.echo(summary(report))
     click.echo(f"Wrote {-(-steps // every)} pictures, press.gif and report.json to {out}")

@@ -18,7 +18,7 @@ from studies.rehearse.planning import Plans
 from studies.rehearse.saving import save_pictures, save_screenshot, save_surfaces
 from studies.rehearse.sweeping import Sweeping
 from studies.rehearse.view import probe_as_set, take_view
-from studies.report import Record
+from studies.report import Tally
 
 # How long what was done is said, and that the guard put the tissue back.
 SAID_S, PUT_BACK_S = 2.0, 4.0
@@ -31,7 +31,7 @@ class Loop:
     rehearsal: Rehearsal
     viewer: Viewer
     out: Path
-    record: Record
+    tally: Tally
     driver: Driver
     instruments: Instruments
     sweeping: Sweeping
@@ -123,17 +123,17 @@ class Loop:
     def _taken(self, controls: Controls) -> Frame:
         """A new frame. A frozen one shows the same tissue with the scanner set anew, and is not kept."""
         if self.frozen:
-            view = take_view(self.rehearsal, controls.settings, None, self.record, "FROZEN")
+            view = take_view(self.rehearsal, controls.settings, None, self.tally, "FROZEN")
             return self._sent(view, controls.settings)
         pose = self.driver.move(controls)
         self._say(self.driver.take_said())
         status = "TISSUE PUT BACK" if perf_counter() < self._put_back_until else self.driver.status
-        view = take_view(self.rehearsal, controls.settings, pose, self.record, status)
+        view = take_view(self.rehearsal, controls.settings, pose, self.tally, status)
         if pose is not None:
             if self.rehearsal.notice:
                 self._tell(self.rehearsal.notice)
                 self._put_back_until = perf_counter() + PUT_BACK_S
-            self._tell(self.driver.stepped(self.record.step_ms[-1]))
+            self._tell(self.driver.stepped(self.tally.step_ms[-1]))
         probe = probe_as_set(self.rehearsal.probe, controls.settings)
         self.instruments.watch(self.driver.session, probe, pose)
         self._announce(self.sweeping.watch(self.driver.session.time_s, view, probe))

@@ -26,7 +26,7 @@ from studies.rehearse.planning import Plans
 from studies.rehearse.sweeping import Sweeping
 from studies.rehearse.tracked import PlayedPoses, Tracked
 from studies.rehearse.view import open_viewer, settings_of
-from studies.report import Record
+from studies.report import Tally
 from studies.scan.poses import TimedPoses
 from studies.session.file import Log
 from studies.session.recorded import Recorded, record
@@ -73,7 +73,7 @@ class Run:
         click.echo(self.keys.worded("The window is open; {help} shows the keys, {quit} quits."))
         plans = Plans(self.rehearsal, self.anatomy, self.instruments, self.out)
         parts = driver, self.instruments, sweeping, plans
-        loop = Loop(self.rehearsal, viewer, self.out, Record(0.0), *parts, keys=self.keys, link=self.link)
+        loop = Loop(self.rehearsal, viewer, self.out, Tally(0.0), *parts, keys=self.keys, link=self.link)
         try:
             loop.run()
         finally:

@@ -11,7 +11,7 @@ from render.layout import FULL_SIZE
 from render.viewer import Geometry, Settings, View, Viewer
 from scenes.scene import NeoHookeanTissue
 from studies.rehearsal import Rehearsal
-from studies.report import Record, expected_error_of
+from studies.report import Tally, expected_error_of
 from studies.stopwatch import timed
 from ultrasound.array import TGC_SLIDERS, Probe
 
@@ -95,7 +95,7 @@ def take_view(
     rehearsal: Rehearsal,
     settings: Settings,
     pose: np.ndarray | None,
-    record: Record,
+    tally: Tally,
     status: str = "",
 ) -> View:
     """One frame, on screen and off: step with the transducer going to a pose, carry the surfaces, take the pictures.
@@ -103,11 +103,11 @@ def take_view(
     Without a pose, as when frozen, the pictures alone are taken anew.
     """
     if pose is not None:
-        timed(partial(rehearsal.advance, pose), record.step_ms)
+        timed(partial(rehearsal.advance, pose), tally.step_ms)
         rehearsal.update_surfaces()
     probe = probe_as_set(rehearsal.probe, settings)
     shown = settings.mode, settings.rung, settings.window_hu, settings.level_hu
-    pictures = timed(partial(rehearsal.look, probe, *shown), record.slice_ms)
+    pictures = timed(partial(rehearsal.look, probe, *shown), tally.slice_ms)
     width, depth, above = probe.extent_mm
     return View(
         transducer_pose=rehearsal.pose,
@@ -120,7 +120,7 @@ def take_view(
         outline_mm=rehearsal.tumour_outline() if settings.outline else None,
         outline_before_mm=rehearsal.tumour_outline(at_rest=True) if settings.outline else None,
         captions=captions(probe, settings),
-        readouts=readouts(rehearsal, record),
+        readouts=readouts(rehearsal, tally),
         status=status,
         title=rehearsal.scene.title,
     )
@@ -137,14 +137,14 @@ def captions(probe: Probe, settings: Settings) -> tuple[str, str, str]:
     )
 
 
-def readouts(rehearsal: Rehearsal, record: Record) -> dict[str, str]:
+def readouts(rehearsal: Rehearsal, tally: Tally) -> dict[str, str]:
     """Name -> figure with its unit."""
     size, count = next(iter(rehearsal.model.counts().items()))
     error = expected_error_of(rehearsal)
     return {
-        "step": f"{np.median(record.step_ms[-30:]):.1f} ms" if record.step_ms else "",
+        "step": f"{np.median(tally.step_ms[-30:]):.1f} ms" if tally.step_ms else "",
         "error": "not known" if error is None else f"± {error:.2f} mm",
-        "picture": f"{np.median(record.slice_ms[-30:]):.1f} ms",
+        "picture": f"{np.median(tally.slice_ms[-30:]):.1f} ms",
         size: f"{count}",
         "indentation": f"{max(rehearsal.indentation_mm(), 0.0):.1f} mm",
     }

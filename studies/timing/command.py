@@ -57,7 +57,7 @@ def timing(scene: Path, out: Path, quick: bool, arch: str) -> None:
             if setup == PAPERS:
                 comparison, missing = measure.compare(rehearsal)
             bar.update()
-        for size in measure.sweep(counts, used, QUICK_STEPS if quick else STEPS):
+        for size in measure.blocks(counts, used, QUICK_STEPS if quick else STEPS):
             sizes.append(size)
             bar.update()
         bar.total = bar.n

@@ -207,7 +207,7 @@ def _ratio(first: float | None, second: float | None) -> float | None:
     return round(first / second, 3) if first and second else None
 
 
-def sweep(counts: list[int], arch: str, steps: int) -> Iterator[dict[str, Any]]:
+def blocks(counts: list[int], arch: str, steps: int) -> Iterator[dict[str, Any]]:
     """Blocks of about so many particles or nodes at rest on a plane, smallest first, while there is memory for them."""
     for make in (_block_of_cells, _block_of_particles):
         each_mb = 0.0

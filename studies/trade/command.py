@@ -10,7 +10,7 @@ from studies.case import load_case
 from studies.command_line import arch_option, make_folder, start_taichi
 from studies.results import write_csv, write_json
 from studies.trade.front import preset_of, setup_of
-from studies.trade.sweep import PAPER, setups
+from studies.trade.tried import PAPER, setups
 
 EMBEDDED_CASE = Path(__file__).parents[1] / "reference" / "embedded"
 

@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from sim.body import RestBody
 from sim.device import start
 from studies.accuracy import bead_errors
 from studies.case import Case
-from studies.experiment import Experiment, rest_body
+from studies.experiment import Experiment
 from studies.results import rounded
 from studies.setup import NOT_USED, Setup
 from studies.stopwatch import timed
@@ -63,12 +62,10 @@ def count(cases: list[Case], tried: list[Setup], rounds: int) -> int:
 
 def _built(case: Case, tried: list[Setup], arch: str) -> Built:
     """Each model and size on a device of its own, with the settings that share it."""
-    rest: RestBody | None
-    for (model, _), alike in groupby(tried, key=lambda setup: (setup.model, setup.size_mm)):
+    for _, alike in groupby(tried, key=lambda setup: (setup.model, setup.size_mm)):
         group = list(alike)
         start(arch)
-        rest = rest_body(case, group[0]) if model == "shape-matching" else None
-        yield Experiment(case, group[0], rest), group
+        yield Experiment(case, group[0]), group
 
 
 def _mean_error(case: Case, beads: np.ndarray, finite: bool) -> float:

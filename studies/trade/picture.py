@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from studies.trade.front import preset_of, setup_of
-from studies.trade.sweep import PAPER
+from studies.trade.tried import PAPER
 
 DPI = 130
 COLOURS = {"neo-hookean": "tab:blue", "shape-matching": "tab:orange"}
