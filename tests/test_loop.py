@@ -2,6 +2,7 @@
 
 import json
 import socket
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -54,7 +55,7 @@ class Moments:
         return ""
 
     def onto(self, view: View, settings: Settings) -> View:
-        return view
+        return replace(view, alert="read")
 
     def take_said(self) -> str:
         return ""
@@ -92,7 +93,10 @@ def test_each_frame_goes_to_the_link_as_it_is_shown(looping, sent):
     views = [looping.frame(Controls(settings)) for _ in range(3)]
     for number, (live, view) in enumerate(zip(sent, views, strict=True), 1):
         assert live.grey is view.pictures["B-mode"] and live.time_s == number * STEP_S
-        assert np.array_equal(live.probe_in_patient[:3, 3], [100.0 + number, 200.0, 300.0])
+        assert (
+            np.array_equal(live.probe_in_patient[:3, 3], [100.0 + number, 200.0, 300.0])
+            and view.alert == "read"
+        )
         # The depth that the replay has just set, not that of the frame before.
         assert live.image_to_probe[1, 1] == pytest.approx(view.depth_mm / 4) == (50 + number) / 4
 

@@ -1,12 +1,15 @@
-"""Figures as reports have them, and surfaces."""
+"""Figures as reports have them, surfaces, and shapes that are compared."""
 
 import csv
 import math
 
+import numpy as np
 import pytest
 import trimesh
+from conftest import rotation_about
 
 from studies.results import rounded, spread, write_csv, write_json
+from studies.rigid_fit import apart_after_fit
 from studies.surfaces import moved_by, volume_mm3
 
 
@@ -40,3 +43,14 @@ def test_a_surface_holds_the_same_volume_wherever_it_is():
     # 24 mm^3, less what is lost where the corners' products of 1e6 mm^3 cancel.
     assert volume_mm3(far.vertices, far.faces) == pytest.approx(24.0, abs=1e-8)
     assert volume_mm3(box.vertices, box.faces[:, ::-1]) == pytest.approx(-24.0)
+
+
+def test_a_shape_is_compared_whatever_its_place_and_turn():
+    wanted = np.random.default_rng(3).normal(size=(20, 3))
+    moved = wanted @ rotation_about([1.0, 2.0, -1.0], 115.0).T + [30.0, -7.0, 1.0]
+    assert apart_after_fit(moved, wanted) == pytest.approx(np.zeros(20), abs=1e-12)
+    # Twice as large about its middle: each point is as far off as it was from there.
+    assert apart_after_fit(2 * moved, wanted) == pytest.approx(
+        np.linalg.norm(wanted - wanted.mean(axis=0), axis=1)
+    )
+    assert apart_after_fit(moved[:1], wanted[:1]) == pytest.approx([0.0])

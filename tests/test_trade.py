@@ -3,16 +3,18 @@
 import csv
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 import app
-from scenes.scene import PAPER, load_scene
+from scenes.scene import EMBEDDED, PAPER, load_scene
 from sim.neo_hookean import LATTICE_SETTINGS
 from studies.case import load_case
 from studies.experiment import Experiment
+from studies.report import expected_error_of
 from studies.setup import NEO_HOOKEAN, PRESETS, QUALITIES, Setup, scene_of, setup_of_scene
 from studies.trade import choice, command
 from studies.trade.front import Point, expected_error_mm, front_of, load_points, pareto, preset_of
@@ -77,6 +79,18 @@ def test_settings_near_measured_ones_have_an_expected_error():
     assert expected_error_mm(points, replace(NEO_HOOKEAN, cell_mm=12.0)) is None
     assert expected_error_mm(points, replace(NEO_HOOKEAN, iterations=80)) is None
     assert expected_error_mm(points, Setup()) is None
+
+
+def test_a_rehearsals_expected_error_is_of_the_passes_that_it_takes_now():
+    setup = PRESETS["neo-hookean"]["balanced"]
+    scene = scene_of(load_scene(EMBEDDED), setup)
+    passes = {name: getattr(setup, name) for name in ("substeps", "iterations", "relaxation_factor")}
+    measured = {point.setup: point.error_mean_mm for point in load_points()}
+    rehearsal = SimpleNamespace(scene=scene, settings=SimpleNamespace(**passes))
+    assert expected_error_of(rehearsal) == measured[setup]
+    for changed in (dict(substeps=40), dict(iterations=900), dict(relaxation_factor=9.0)):
+        rehearsal.settings = SimpleNamespace(**(passes | changed))
+        assert expected_error_of(rehearsal) is None
 
 
 def test_a_scene_has_the_settings_of_the_setup_it_was_made_with():

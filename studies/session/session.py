@@ -53,14 +53,14 @@ class Session:
 
     def stepped(self) -> None:
         """The rehearsal has just advanced by a step."""
-        self._on(self.rehearsal.pose)
+        self._end_moment(self.rehearsal.pose)
 
     def go_back(self, moment: int) -> None:
         """Tissue and probe as they were at a moment that was kept; the time goes on."""
         self.note("back", moment)
         self.rehearsal.restore(self.kept[moment])
         self.rehearsal.update_surfaces()
-        self._on(None)
+        self._end_moment(None)
 
     def keep(self) -> int:
         """Keep the state of this moment, to be gone back to; which moment it is."""
@@ -80,7 +80,7 @@ class Session:
         """Let go of what was kept and is no longer needed."""
         self.kept = {moment: s for moment, s in self.kept.items() if moment == SETTLED or is_needed(moment)}
 
-    def _on(self, pose: np.ndarray | None) -> None:
+    def _end_moment(self, pose: np.ndarray | None) -> None:
         if self.recorder is not None:
             self.recorder.moment(pose)
         self.moment += 1
