@@ -9,8 +9,8 @@ import numpy as np
 import trimesh
 from tqdm import tqdm
 
-from studies.beam.capture import BeamError, load_captures
-from studies.beam.comparison import check, compare, draw, table
+from studies.beam.capture import BeamError, Capture, load_captures
+from studies.beam.comparison import Row, check, compare, draw, table
 from studies.command_line import Fault, NumberRange, make_folder, make_place, save_figures, start_taichi
 
 BEAM = "beam.stl"
@@ -128,11 +128,16 @@ def run(
     if json_path is not None:
         save_figures(dict(settings=settings, loads=[asdict(row) for row in rows]), json_path)
     if out is not None:
-        try:
-            draw(groups, traces, rows, out / "beam.png")
-        except OSError as error:
-            raise Fault(f"{out}: cannot be written to ({error.strerror}); choose another --out") from None
-        click.echo(f"Wrote {out / 'beam.png'}")
+        save_picture(groups, traces, rows, out)
+
+
+def save_picture(groups: list[list[Capture]], traces: list[np.ndarray], rows: list[Row], out: Path) -> None:
+    """Draw beam.png into a folder and say so. Raises Fault."""
+    try:
+        draw(groups, traces, rows, out / "beam.png")
+    except OSError as error:
+        raise Fault(f"{out}: cannot be written to ({error.strerror}); choose another --out") from None
+    click.echo(f"Wrote {out / 'beam.png'}")
 
 
 def markers_on(size_mm: np.ndarray) -> np.ndarray:
