@@ -11,6 +11,7 @@ def test_the_next_number_is_one_more_than_the_highest(tmp_path):
         "screenshot-12.png",
         "screenshot-0x9.png",
         "my-screenshot-044.png",
+        "screenshot-050.png.part",
         "013-ct.png",
     ):
         (tmp_path / name).touch()
