@@ -40,6 +40,8 @@ Rotation = Annotated[tuple[Vector3, Vector3, Vector3], AfterValidator(_proper)]
 
 
 class Section(BaseModel):
+    """A table of case.toml. Keys that are not listed are a laboratory's own, but none of ours in another unit."""
+
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
 
     @model_validator(mode="after")

@@ -42,6 +42,7 @@ class Live:
 
     @property
     def status(self) -> str:
+        """What stands in the panel: that the tracker sees no probe, or which iterations give way."""
         if self._follower is not None and self._follower.is_lost:
             return "TRACKING LOST"
         return self.ladder.says(self._asked)
