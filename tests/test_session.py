@@ -321,3 +321,13 @@ def test_the_scene_of_a_session_is_the_patients_with_all_else_as_recorded(tmp_pa
     scene = scene_of_log(read_log(recorded_at(tmp_path, ball).recording.path).header, embedded)
     assert scene.tissue.cell_mm == 7.0 != embedded.tissue.cell_mm
     assert (scene.anatomy, scene.shape, scene.title) == (embedded.anatomy, embedded.shape, embedded.title)
+
+
+def test_what_a_session_says_of_a_patient_or_of_files_is_not_believed(tmp_path, ball):
+    embedded = load_scene(EMBEDDED)
+    header = read_log(recorded_at(tmp_path, ball).recording.path).header
+    planted = dict(title="another", anatomy=dict(phantom=False, organ="other.stl"), shape=[])
+    planted["transducer"] = header.scene["transducer"] | dict(probe="other.toml", speed_mm_s=33.0)
+    scene = scene_of_log(header.model_copy(update=dict(scene=header.scene | planted)), embedded)
+    assert (scene.anatomy, scene.shape, scene.title) == (embedded.anatomy, embedded.shape, embedded.title)
+    assert scene.transducer.probe == embedded.transducer.probe and scene.transducer.speed_mm_s == 33.0
