@@ -111,3 +111,12 @@ def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, cap
     assert Image.open(tmp_path / "stability.png").size[0] > 900
     printed = capsys.readouterr().out
     assert "2 cases, 2 finite; 2 came back to within 0.1 mm, 1 after the tissue was put back" in printed
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_state_along_an_axis_is_what_its_name_says(model):
+    states = {case.name: case.state for case in cases_of(model)}
+    assert states["collapsed: to a plane, x"] == ("scaled", 0.0, 1.0, 1.0)
+    assert states["collapsed: to a line, y"] == ("scaled", 0.0, 1.0, 0.0)
+    assert states["mirrored: in z"] == ("scaled", 1.0, 1.0, -1.0)
+    assert states["thrown: 10 m/s, -y"] == ("thrown", 0.0, -1e4, 0.0)
