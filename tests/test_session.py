@@ -323,11 +323,11 @@ def test_the_scene_of_a_session_is_the_patients_with_all_else_as_recorded(tmp_pa
     assert (scene.anatomy, scene.shape, scene.title) == (embedded.anatomy, embedded.shape, embedded.title)
 
 
-def test_what_a_session_says_of_a_patient_or_of_files_is_not_believed(tmp_path, ball):
-    embedded = load_scene(EMBEDDED)
+@pytest.mark.parametrize("own", [load_scene(EMBEDDED), Scene(anatomy={"phantom": True})])
+def test_what_a_session_says_of_a_patient_or_of_files_is_not_believed(tmp_path, ball, own):
     header = read_log(recorded_at(tmp_path, ball).recording.path).header
     planted = dict(title="another", anatomy=dict(phantom=False, organ="other.stl"), shape=[])
     planted["transducer"] = header.scene["transducer"] | dict(probe="other.toml", speed_mm_s=33.0)
-    scene = scene_of_log(header.model_copy(update=dict(scene=header.scene | planted)), embedded)
-    assert (scene.anatomy, scene.shape, scene.title) == (embedded.anatomy, embedded.shape, embedded.title)
-    assert scene.transducer.probe == embedded.transducer.probe and scene.transducer.speed_mm_s == 33.0
+    scene = scene_of_log(header.model_copy(update=dict(scene=header.scene | planted)), own)
+    assert (scene.anatomy, scene.shape, scene.title) == (own.anatomy, own.shape, own.title)
+    assert scene.transducer.probe == own.transducer.probe and scene.transducer.speed_mm_s == 33.0
