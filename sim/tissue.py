@@ -6,6 +6,8 @@ import numpy as np
 import taichi as ti
 
 from sim.body import Body
+from sim.contact import ShapeContacts
+from sim.surface_contact import SurfaceContacts
 
 
 class TissueModel(Protocol):
@@ -17,6 +19,9 @@ class TissueModel(Protocol):
 
     @property
     def body(self) -> Body: ...
+
+    @property
+    def contacts(self) -> ShapeContacts | SurfaceContacts | None: ...
 
     @property
     def serial(self) -> bool: ...

@@ -108,9 +108,7 @@ def build_solver(
 
 def fill(organ: trimesh.Trimesh, tissue: ShapeMatchingTissue) -> RestBody:
     """The organ [mm] filled with particles. Raises SamplingError."""
-    return fill_body(
-        organ, tissue.radius_mm, tissue.density_g_cm3, tissue.volume_sampling, tissue.surface_samples_per_mm2
-    )
+    return fill_body(organ, tissue.radius_mm, tissue.volume_sampling, tissue.surface_samples_per_mm2)
 
 
 def _neo_hookean(
@@ -131,7 +129,7 @@ def _neo_hookean(
     material = (tissue.young_kpa, tissue.poisson, tissue.density_g_cm3)
     nodes = None if held is None else held.nodes(lattice.nodes)
     model = NeoHookean(body, lattice, contacts, *material, held=nodes, serial=serial)
-    return Solver(model, contacts, tool=tool)
+    return Solver(model, tool=tool)
 
 
 def _shape_matching(
@@ -147,5 +145,5 @@ def _shape_matching(
     body = ParticleBody(arranged, section.mass_scaling_per_mm)
     contacts = ShapeContacts(body, shapes, contact.shape_friction) if shapes else None
     model = ShapeMatching(body, patches, contacts, section.relaxation, serial)
-    pairs = ParticleContacts(body, model, contact.particle_friction) if contact.particles else None
-    return Solver(model, contacts, pairs, tool, section.relaxation)
+    pairs = ParticleContacts(model, contact.particle_friction) if contact.particles else None
+    return Solver(model, pairs, tool)

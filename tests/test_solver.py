@@ -25,8 +25,8 @@ def solver_of(
     serial=None,
 ):
     model = tissue_of(mesh, radius, shapes, friction, relaxation, scaling, serial=serial)
-    particle_contacts = ParticleContacts(model.body, model, 0.25) if pairs else None
-    return Solver(model, model.contacts, particle_contacts, tool, relaxation)
+    particle_contacts = ParticleContacts(model, 0.25) if pairs else None
+    return Solver(model, particle_contacts, tool)
 
 
 def position(solver: Solver) -> np.ndarray:

@@ -56,7 +56,7 @@ def push(contacts: ti.template(), out: ti.template()):
 
 def contact_force(solver, settings) -> np.ndarray:
     """Sum (3,) of what the shapes exert where the body is [uN]."""
-    solver.begin(0, settings.time_step_s, *settings.gravity, settings.damping, 0)
+    solver.launch_start(0, settings.time_step_s, *settings.gravity, settings.damping, 0)
     out = ti.Vector.field(3, ti.f32, solver.body.count)
     push(solver.contacts, out)
     return out.to_numpy().astype(float).sum(axis=0)

@@ -155,12 +155,12 @@ def _block(model: str, side: int, shapes: list, tool: ConvexTool) -> tuple[Solve
         body: Any = Body(lattice.nodes)
         block = trimesh.creation.box(bounds=[[0.0] * 3, [side * size] * 3])
         contacts: Any = SurfaceContacts(body, lattice, *surface_points(block, size / 2), shapes, 0.35)
-        return Solver(NeoHookean(body, lattice, contacts), contacts, tool=tool), replace(LATTICE_SETTINGS)
+        return Solver(NeoHookean(body, lattice, contacts), tool=tool), replace(LATTICE_SETTINGS)
     at = size * (np.indices((side, side, side)).reshape(3, -1).T + (0.5 if side > 1 else 0.0))
-    rest, patches = arrange(RestBody(at, DENSITY * size**3, size, np.full(len(at), size / 2)), 3.33)
+    rest, patches = arrange(RestBody(at, size, np.full(len(at), size / 2)), 3.33)
     body = ParticleBody(rest)
     contacts = ShapeContacts(body, shapes, 0.35)
-    return Solver(ShapeMatching(body, patches, contacts), contacts, tool=tool), StepSettings()
+    return Solver(ShapeMatching(body, patches, contacts), tool=tool), StepSettings()
 
 
 def _settle(solver: Solver, settings: StepSettings, tool: ConvexTool) -> None:

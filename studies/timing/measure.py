@@ -31,7 +31,6 @@ from ultrasound.probe import advanced, between
 AWAY_MM = 100.0
 # A block's particles are as far apart as the paper's smallest, and its clusters as wide.
 BLOCK_RADIUS_MM, CLUSTER_SPACING = 2.2, 3.33
-DENSITY = 1.05e-3
 # Of the memory that is free, a block takes at most this share.
 MOST_MEMORY = 0.6
 ROUNDS, STEPS_A_ROUND = 9, 5
@@ -226,13 +225,12 @@ def sweep(counts: list[int], arch: str, steps: int) -> Iterator[dict[str, Any]]:
 def _block_of_particles(count: int) -> tuple[Solver, StepSettings, Setup]:
     side = max(4, round(count ** (1 / 3)))
     at = BLOCK_RADIUS_MM * np.indices((side, side, side)).reshape(3, -1).T
-    mass = DENSITY * BLOCK_RADIUS_MM**3
-    rest = RestBody(at, mass, BLOCK_RADIUS_MM, np.full(len(at), BLOCK_RADIUS_MM / 2))
+    rest = RestBody(at, BLOCK_RADIUS_MM, np.full(len(at), BLOCK_RADIUS_MM / 2))
     rest, patches = arrange(rest, CLUSTER_SPACING)
     body = ParticleBody(rest)
     contacts = ShapeContacts(body, [Plane(np.array([0.0, 0.0, 1.0]), -BLOCK_RADIUS_MM / 2)], 0.35)
     setup = Setup(radius_mm=BLOCK_RADIUS_MM)
-    return Solver(ShapeMatching(body, patches, contacts), contacts), StepSettings(), setup
+    return Solver(ShapeMatching(body, patches, contacts)), StepSettings(), setup
 
 
 def _block_of_cells(count: int) -> tuple[Solver, StepSettings, Setup]:
@@ -243,4 +241,4 @@ def _block_of_cells(count: int) -> tuple[Solver, StepSettings, Setup]:
     points, area = surface_points(block, cell_mm / 2)
     contacts = SurfaceContacts(body, lattice, points, area, [Plane(np.array([0.0, 0.0, 1.0]), 0.0)], 0.35)
     setup = Setup("neo-hookean", cell_mm=cell_mm, substeps=1, iterations=8)
-    return Solver(NeoHookean(body, lattice, contacts), contacts), LATTICE_SETTINGS, setup
+    return Solver(NeoHookean(body, lattice, contacts)), LATTICE_SETTINGS, setup
