@@ -171,6 +171,7 @@ class Guard:
 
     @ti.func
     def is_broken(self, t):
+        """Whether tetrahedron t is torn, flat or inside out, and not by the tool."""
         corner, longest = self.corner[t], self.longest[t]
         origin = self.body.position[corner[0]]
         a = self.body.position[corner[1]] - origin

@@ -39,15 +39,18 @@ class ParticleContacts:
 
     @ti.func
     def cell_of(self, p):
+        """The cell (3,) of the endless grid that a place lies in."""
         return ti.cast(ti.floor(p / self.reach), ti.i32)
 
     @ti.func
     def hash(self, cell):
+        """The list, of CELLS, that a cell's particles are in (Teschner 2003)."""
         mixed = (cell.x * 73856093) ^ (cell.y * 19349663) ^ (cell.z * 83492791)
         return mixed & (CELLS - 1)
 
     @ti.func
     def share_cluster(self, i, j):
+        """Whether two particles have a cluster in common; both rows of clusters ascend."""
         p, q = self.patch[i], self.patch[j]
         a, b = self.model.shared_start[p], self.model.shared_start[q]
         shared = 0
@@ -83,6 +86,7 @@ class ParticleContacts:
 
     @ti.func
     def list_neighbours(self, i):
+        """Write the row of particle i; how many it holds."""
         p = self.body.estimate[i]
         count = 0
         for near in ti.grouped(ti.ndrange((-1, 2), (-1, 2), (-1, 2))):

@@ -109,8 +109,13 @@ class NeoHookean:
         self.neighbour = field_of(neighbour)
         self.hourglass = field_of(weight)
 
+    def set_young(self, young_kpa: float) -> None:
+        """Change Young's modulus [kPa], Poisson's ratio stays."""
+        self.set_material(young_kpa, self.poisson)
+
     def set_material(self, young_kpa: float, poisson: float) -> None:
-        """Young's modulus and Poisson's ratio; the contact layer is as much stiffer as the tissue is."""
+        """Change Young's modulus [kPa] and Poisson's ratio; the contact layer is as much stiffer as the tissue is."""
+        self.poisson = poisson
         # 1 kPa is 1000 g/(mm s^2).
         self.mu[None] = 1e3 * young_kpa / (2 * (1 + poisson))
         self.lame[None] = 1e3 * young_kpa * poisson / ((1 + poisson) * (1 - 2 * poisson))

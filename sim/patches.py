@@ -12,7 +12,8 @@ from sim.sampling import Clusters, offsets_of, sample_clusters
 class Patches:
     """Particles ``start[p]`` to ``start[p + 1]`` of a body are patch p; row p of ``clusters`` lists the clusters it is in.
 
-    The ``several`` first patches have more than one particle, the others one. Of a kidney's memberships of particles in clusters, as many of patches in clusters are left as two in five.
+    The ``several`` first patches have more than one particle, the others one. Where a kidney has five memberships of particles in
+    clusters, it has two of patches.
     """
 
     start: np.ndarray

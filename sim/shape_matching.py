@@ -122,6 +122,7 @@ class ShapeMatching:
 
     @ti.func
     def weigh_patches(self):
+        """Masses and centres of the patches at rest, by the scaled masses of their particles."""
         for p in range(self.patch_count):
             first, last = self.patch_start[p], self.patch_start[p + 1]
             moment, mass = tm.vec4(0.0), 0.0
@@ -135,6 +136,7 @@ class ShapeMatching:
 
     @ti.func
     def weigh_clusters(self):
+        """The same of the clusters, by their patches'."""
         for c in range(self.count):
             first, last = self.member_start[c], self.member_start[c + 1]
             origin = self.patch_rest[self.member[first]]

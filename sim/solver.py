@@ -168,15 +168,18 @@ class Solver:
         damping: float,
         stabilisation_iterations: int,
     ):
+        """``start`` as a kernel of its own."""
         gravity = tm.vec3(gravity_x, gravity_y, gravity_z)
         self.start(substep, dt, gravity, damping, stabilisation_iterations)
 
     @ti.kernel
     def launch_correct(self, stiffness: float, relaxation_factor: float, dt: float):
+        """``correct`` as a kernel of its own."""
         self.correct(stiffness, relaxation_factor, dt)
 
     @ti.kernel
     def launch_finish(self, dt: float):
+        """``finish`` as a kernel of its own."""
         self.finish(dt)
 
     @ti.func
@@ -196,8 +199,9 @@ class Solver:
 
     @ti.func
     def predict(self, dt: float, gravity: tm.vec3, damping: float):
+        """Lines 1-5: estimates, and scaled masses where there are any."""
         decay = ti.exp(-damping * dt)
-        for i in range(self.body.count):  # lines 1-5
+        for i in range(self.body.count):
             # Gravity does not decay, or a body at rest would weigh less.
             velocity = self.body.velocity[i] * decay + dt * gravity
             self.body.estimate[i] = self.body.position[i] + dt * velocity

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import trimesh
 
-from scenes.scene import Contact, NeoHookeanTissue, ShapeMatchingTissue, SolverSection
+from scenes.scene import Contact, SolverSection
+from scenes.tissue import TISSUES, NeoHookeanTissue, ShapeMatchingTissue, TissueSection
 from sim.body import RestBody
 from sim.shapes import ConvexTool
 from sim.skinning import Skin
@@ -13,7 +14,7 @@ from sim.solver import StepSettings
 from studies.case import Case
 from studies.models import build_solver, fill, static_shape, step_settings
 from studies.report import timed
-from studies.setup import Setup, SetupError
+from studies.setup import BUILT, MATERIAL, NOT_USED, Setup, SetupError
 from ultrasound.probe import between
 
 # The share of a stage's steps in which the probe moves; in the others the tissue comes to rest, as it did for the scan.
@@ -50,7 +51,7 @@ class Experiment:
         tool = ConvexTool.cuboid(case.size_mm, case.edge_radius_mm)
         shapes = [static_shape(_shifted(case.support, -self.origin), tissue), tool]
         contact = Contact(shape_friction=case.friction)
-        self.solver = build_solver(_organ(case), tissue, shapes, tool, contact, rest=rest)
+        self.solver = build_solver(rest or _organ(case), tissue, shapes, tool, contact)
         self.body, self.model, self.contacts = self.solver.body, self.solver.model, self.solver.contacts
         self.beads = Skin(self.model, case.beads - self.origin)
 
@@ -99,8 +100,7 @@ class Experiment:
 
     def size(self, setup: Setup) -> dict[str, float]:
         """How large the model is, under the names of a report: ``radius_mm`` or ``cell_mm``, ``particles`` or ``nodes``."""
-        own = dict(cell_mm=setup.cell_mm) if setup.model == "neo-hookean" else dict(radius_mm=setup.radius_mm)
-        return {**own, **self.model.counts()}
+        return {setup.size: setup.size_mm, **self.model.counts()}
 
     def describe(self, setup: Setup) -> str:
         """Size and settings that the model does not share with others, for the terminal."""
@@ -127,23 +127,18 @@ class Experiment:
         return pose
 
 
-def tissue_of(case: Case, setup: Setup) -> NeoHookeanTissue | ShapeMatchingTissue:
+def tissue_of(case: Case, setup: Setup) -> TissueSection:
     """The setup's tissue with what is the case's own. Raises SetupError where neither gives the material."""
-    values: dict[str, float | str | None] = dict(
-        model=setup.model, density_g_cm3=(case.density_kg_m3 or DENSITY_KG_M3) / 1000
-    )
-    if setup.model == "shape-matching":
-        values.update(radius_mm=setup.radius_mm, stiffness=setup.stiffness)
-        return ShapeMatchingTissue.model_validate(values)
-    young, poisson = setup.young_kpa or case.young_kpa, setup.poisson
-    if poisson is None:
-        poisson = case.poisson
-    if young is None or poisson is None:
+    material = {name: getattr(case, name) for name in MATERIAL}
+    given = {name: getattr(setup, name) for name in (*BUILT, *MATERIAL)}
+    values = material | {name: value for name, value in given.items() if value is not None}
+    own = {name: value for name, value in values.items() if name not in NOT_USED[setup.model]}
+    if None in own.values():
         raise SetupError(
             f"{case.name}: the case does not say what its tissue is; give --young-kpa and --poisson"
         )
-    values.update(cell_mm=setup.cell_mm, young_kpa=young, poisson=poisson)
-    return NeoHookeanTissue.model_validate(values)
+    density = (case.density_kg_m3 or DENSITY_KG_M3) / 1000
+    return TISSUES[setup.model].model_validate(dict(model=setup.model, density_g_cm3=density, **own))
 
 
 def rest_body(case: Case, setup: Setup) -> RestBody:

@@ -97,6 +97,7 @@ class Probe(BaseModel):
 
     @property
     def wavelength_mm(self) -> float:
+        """Of the sound in soft tissue."""
         return SOUND_MM_US / self.frequency_mhz
 
     @property
@@ -119,6 +120,7 @@ class Probe(BaseModel):
 
     @property
     def focus_mm(self) -> float:
+        """Depth of the focus."""
         return self.depth_mm * self.focus_depth_percent / 100
 
     @property

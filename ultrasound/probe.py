@@ -131,7 +131,8 @@ class Hand:
     """What holds the transducer: where on the settled organ it aims, how it is turned, how deep it presses.
 
     ``vertices`` (n, 3), ``faces`` (m, 3) and ``normals`` (n, 3) are the settled surface [mm]; ``home`` is the pose it
-    starts from. ``radius_mm`` is that of a curved face. ``depth_mm`` is what keys push, ``pressed_mm`` what a held button adds until it is let go.
+    starts from. ``radius_mm`` is that of a curved face. ``depth_mm`` is what keys push, ``pressed_mm`` what a held button
+    adds until it is let go.
     """
 
     vertices: np.ndarray

@@ -102,10 +102,12 @@ class Volume:
 
     @ti.func
     def lanes_of(self, first, shift: ti.template()):
+        """The voxels ``shift`` after those of the lanes."""
         return Lanes([self.voxels[first[lane] + shift] for lane in ti.static(range(LANES))])
 
     @ti.func
     def along_z(self, voxel, t):
+        """Linear between a voxel and the next."""
         return tm.mix(self.voxels[voxel], self.voxels[voxel + 1], t)
 
     @ti.func

@@ -53,8 +53,7 @@ def features(scene: Path, out: Path, quick: bool, arch: str) -> None:
     ) as bar:
         for model in models:
             preset = PRESETS[model]["fast" if quick else "balanced"]
-            size = preset.cell_mm if model == "neo-hookean" else preset.radius_mm
-            body = measure.body_of(loaded, anatomy, model, size)
+            body = measure.body_of(loaded, anatomy, model, preset.size_mm)
             found = measure.of_steps(body, measure.FEATURES[model], used, quick, bar.update)
             rows += [dict(model=model) | row for row in found]
         rows += [dict(model="frame") | row for row in measure.of_frame(loaded, anatomy, used)]

@@ -8,7 +8,8 @@ import click
 
 from render.keys import Keys, keys_text, load_keys
 from scenes.anatomy import LoadedAnatomy, fingerprint, load_anatomy
-from scenes.scene import EMBEDDED, OPTIONS, TISSUES, Scene, load_scene, with_options
+from scenes.scene import EMBEDDED, OPTIONS, Scene, load_scene, with_options
+from scenes.tissue import TISSUES
 from studies.commands import Fault, NumberRange, arch_option, make_folder, start_taichi
 from studies.link.options import link_options, opened_link
 from studies.plan.file import is_plan, read_plan

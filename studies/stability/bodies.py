@@ -8,6 +8,7 @@ import trimesh
 
 from scenes.anatomy import load_anatomy
 from scenes.scene import PAPER, Contact, SolverSection, load_scene, with_options
+from scenes.tissue import TISSUES
 from sim.body import Body, ParticleBody, RestBody
 from sim.contact import ShapeContacts
 from sim.device import start
@@ -104,10 +105,7 @@ def admit(model: str, subject: Subject) -> Patient:
 
 
 def _kidney(model: str) -> Patient:
-    fast = PRESETS[model]["fast"]
-    size = (
-        {"tissue.cell_mm": fast.cell_mm} if model == "neo-hookean" else {"tissue.radius_mm": fast.radius_mm}
-    )
+    size = {f"tissue.{TISSUES[model].SIZE}": PRESETS[model]["fast"].size_mm}
     scene = load_scene(PAPER)
     anatomy = replace(load_anatomy(scene, PAPER.parent), ct=None)
     rehearsal = Rehearsal(with_options(scene, {"tissue.model": model, **size}), anatomy)
@@ -139,8 +137,8 @@ def _filled(
     model: str, subject: Subject, mesh: trimesh.Trimesh, shapes: list, tool: ConvexTool
 ) -> tuple[Solver, StepSettings]:
     size = subject.size_mm or SIZE_MM[model]
-    name = "tissue.cell_mm" if model == "neo-hookean" else "tissue.radius_mm"
-    tissue = with_options(load_scene(PAPER), {"tissue.model": model, name: size}).tissue
+    options: dict[str, str | float | None] = {"tissue.model": model, f"tissue.{TISSUES[model].SIZE}": size}
+    tissue = with_options(load_scene(PAPER), options).tissue
     scaling = np.log(subject.mass_ratio) / np.ptp(mesh.bounds[:, 2])
     section = SolverSection(mass_scaling_per_mm=min(float(scaling), 1.0))
     contact = Contact(particles=subject.kind == "two" and model == "shape-matching")

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from scenes.tissue import TISSUES
 from studies.rehearsal import Rehearsal
 from studies.report import timed
 from studies.setup import Setup
@@ -71,9 +72,5 @@ def trial_ms(rehearsal: Rehearsal) -> float:
 
 def described(setup: Setup) -> str:
     """Settings in words."""
-    size = (
-        f"cells of {setup.cell_mm:g} mm"
-        if setup.model == "neo-hookean"
-        else f"particles of {setup.radius_mm:g} mm"
-    )
+    size = f"{TISSUES[setup.model].PIECES} of {setup.size_mm:g} mm"
     return f"{setup.model}, {size}, {setup.substeps} x {setup.iterations} passes"

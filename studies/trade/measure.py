@@ -13,17 +13,12 @@ from studies.accuracy import bead_errors
 from studies.case import Case
 from studies.experiment import Experiment, rest_body
 from studies.report import timed
-from studies.setup import Setup
+from studies.setup import NOT_USED, Setup
 from studies.trade.front import SETTINGS, pareto
-from studies.trade.sweep import size_mm
 from ultrasound.probe import between
 
 # The machine's speed changes in minutes: every setting is timed in each round, and the median counts.
 ROUNDS, TIMED_STEPS = 3, 45
-NOT_USED: dict[str, tuple[str, ...]] = {
-    "neo-hookean": ("radius_mm", "stiffness"),
-    "shape-matching": ("cell_mm",),
-}
 
 Built = Iterator[tuple[Experiment, list[Setup]]]
 
@@ -68,7 +63,7 @@ def count(cases: list[Case], tried: list[Setup], rounds: int) -> int:
 def _built(case: Case, tried: list[Setup], arch: str) -> Built:
     """Each model and size on a device of its own, with the settings that share it."""
     rest: RestBody | None
-    for (model, _), alike in groupby(tried, key=lambda setup: (setup.model, size_mm(setup))):
+    for (model, _), alike in groupby(tried, key=lambda setup: (setup.model, setup.size_mm)):
         group = list(alike)
         start(arch)
         rest = rest_body(case, group[0]) if model == "shape-matching" else None

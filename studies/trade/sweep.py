@@ -45,10 +45,5 @@ def setups(quick: bool) -> list[Setup]:
     return _sorted([*cells, *around, *particles, *stiff, *relaxed, *PAPER, *named])
 
 
-def size_mm(setup: Setup) -> float:
-    """Width of a cell, or radius of a particle."""
-    return setup.cell_mm if setup.model == "neo-hookean" else setup.radius_mm
-
-
 def _sorted(given: list[Setup]) -> list[Setup]:
-    return sorted(dict.fromkeys(given), key=lambda setup: (setup.model, -size_mm(setup)))
+    return sorted(dict.fromkeys(given), key=lambda setup: (setup.model, -setup.size_mm))
