@@ -108,7 +108,8 @@ class Experiment:
         if isinstance(tissue, NeoHookeanTissue):
             material = f"E {tissue.young_kpa:g} kPa, nu {tissue.poisson:g}"
             return f"{size['nodes']} nodes, {size['cells']} cells of {setup.cell_mm:g} mm, {material}"
-        return f"{size['particles']} particles of {setup.radius_mm:g} mm, stiffness {setup.stiffness:g}"
+        pieces = tissue.PIECES
+        return f"{size[pieces]} {pieces} of {setup.size_mm:g} mm, stiffness {setup.stiffness:g}"
 
     def _restore(self) -> None:
         self.body.restore(self.body.rest_state())

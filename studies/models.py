@@ -67,13 +67,15 @@ class Kind:
 
     ``build`` puts its solver together and raises SamplingError; ``settings`` is its own choice of a step for a tissue;
     ``reach_mm`` is how far around a shape a tissue asks for its distance, and the coarse tetrahedra that carry the image
-    plane are ``embedding_sizes`` sizes of the tissue wide.
+    plane are ``embedding_sizes`` sizes of the tissue wide. ``reported`` is its line of a report, with names of its section and
+    of its counts.
     """
 
     build: Callable[[Parts], Solver]
     settings: Callable[[Any], StepSettings]
     reach_mm: Callable[[Any], float]
     embedding_sizes: float
+    reported: str
 
 
 def static_shape(mesh: trimesh.Trimesh, tissue: TissueSection) -> SignedDistanceField:
@@ -161,11 +163,20 @@ def _shape_matching(parts: Parts) -> Solver:
 
 # All models, by the names of ``scenes.tissue``: a new one is added here.
 KINDS = {
-    "neo-hookean": Kind(_neo_hookean, lambda _: LATTICE_SETTINGS, lambda _: REACH_MM, embedding_sizes=1.35),
+    "neo-hookean": Kind(
+        build=_neo_hookean,
+        settings=lambda tissue: LATTICE_SETTINGS,
+        reach_mm=lambda tissue: REACH_MM,
+        embedding_sizes=1.35,
+        reported="neo-Hookean, E {young_kpa:g} kPa, nu {poisson:g}: {cells} cells of {cell_mm:g} mm, {nodes} nodes, "
+        "{tetrahedra} tetrahedra",
+    ),
     "shape-matching": Kind(
-        _shape_matching,
-        lambda tissue: StepSettings(stiffness=tissue.stiffness),
-        lambda tissue: REACH_RADII * tissue.radius_mm,
+        build=_shape_matching,
+        settings=lambda tissue: StepSettings(stiffness=tissue.stiffness),
+        reach_mm=lambda tissue: REACH_RADII * tissue.radius_mm,
         embedding_sizes=2.0,
+        reported="shape matching, stiffness {stiffness:g}: {particles} particles of {radius_mm:g} mm, {clusters} clusters, "
+        "{memberships} memberships, {tetrahedra} tetrahedra",
     ),
 }

@@ -7,6 +7,7 @@ from time import perf_counter
 import numpy as np
 import taichi as ti
 
+from studies.models import KINDS
 from studies.rehearsal import Rehearsal
 
 
@@ -97,7 +98,7 @@ def summary(report: dict) -> str:
     )
     return "\n".join(
         [
-            f"model     {_model_line(report)}",
+            f"model     {KINDS[report['model']].reported.format(**report)}",
             f"step      1/{1 / report['time_step_s']:.0f} s in {counted(report['substeps'], 'substep')} of "
             f"{counted(report['iterations'], 'iteration')}",
             f"speed     {times} on {report['arch']}; built in {report['build_s']:.1f} s",
@@ -134,16 +135,3 @@ class Notices:
     def shown(self) -> str:
         """What the panel says now."""
         return "TISSUE PUT BACK" if perf_counter() < self._until else ""
-
-
-def _model_line(report: dict) -> str:
-    if report["model"] == "neo-hookean":
-        return (
-            f"neo-Hookean, E {report['young_kpa']:g} kPa, nu {report['poisson']:g}: {report['cells']} cells of "
-            f"{report['cell_mm']:g} mm, {report['nodes']} nodes, {report['tetrahedra']} tetrahedra"
-        )
-    return (
-        f"shape matching, stiffness {report['stiffness']:g}: {report['particles']} particles of "
-        f"{report['radius_mm']:g} mm, {report['clusters']} clusters, {report['memberships']} memberships, "
-        f"{report['tetrahedra']} tetrahedra"
-    )
