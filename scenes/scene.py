@@ -8,15 +8,14 @@ import difflib
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tomli_w
-from pydantic import BaseModel, Discriminator, Field, Tag, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from scenes.section import Direction, Length, Section, Vector3
+from scenes.tissue import TISSUES, NeoHookeanTissue, Tissue
 from scenes.trocar import Trocar
-
-Stiffness = Annotated[float, Field(ge=0, le=1)]
 
 # The scene that the program has with it.
 EMBEDDED = Path(__file__).parent / "phantom.toml"
@@ -66,51 +65,6 @@ class Anatomy(Section):
                 "phantom = true is the embedded patient, which has files of its own: name no others"
             )
         return self
-
-
-class NeoHookeanTissue(Section):
-    """Tissue true to a material, on cubic cells. Smaller cells are truer and slower; the material stays the same."""
-
-    model: Literal["neo-hookean"] = "neo-hookean"
-    cell_mm: float = Field(3.5, ge=0.5, le=20)
-    young_kpa: float = Field(15.0, gt=0, le=1e6)
-    poisson: float = Field(0.45, ge=0, le=0.4999)
-    density_g_cm3: float = Field(1.05, gt=0, le=20)
-
-
-class ShapeMatchingTissue(Section):
-    """The paper's tissue model and its sampling; the defaults are the paper's, but for the stiffness, which it fits.
-
-    Particles are ``radius_mm`` apart, chosen from voxels of ``radius_mm / volume_sampling``; clusters are
-    ``cluster_spacing`` radii apart and reach as far. The tissue's stiffness depends on all of these and on the
-    solver's iterations, not on ``stiffness`` alone: that is this method's limitation.
-    """
-
-    model: Literal["shape-matching"]
-    radius_mm: float = Field(2.7, ge=0.5, le=20)
-    stiffness: Stiffness = 0.95
-    density_g_cm3: float = Field(1.05, gt=0, le=20)
-    volume_sampling: float = Field(4.0, ge=1, le=8)
-    cluster_spacing: float = Field(3.33, ge=1, le=20)
-    surface_samples_per_mm2: float = Field(0.0, ge=0, le=10)
-
-
-TISSUES: dict[str, type[BaseModel]] = {"neo-hookean": NeoHookeanTissue, "shape-matching": ShapeMatchingTissue}
-
-
-def _model_of(values: Any) -> str | None:
-    name = values.get("model", "neo-hookean") if isinstance(values, dict) else getattr(values, "model", None)
-    return name if name in TISSUES else None
-
-
-Tissue = Annotated[
-    Annotated[NeoHookeanTissue, Tag("neo-hookean")] | Annotated[ShapeMatchingTissue, Tag("shape-matching")],
-    Discriminator(
-        _model_of,
-        custom_error_type="unknown_model",
-        custom_error_message=f"the model should be one of {', '.join(TISSUES)}",
-    ),
-]
 
 
 class SolverSection(Section):

@@ -7,6 +7,7 @@ import taichi as ti
 import trimesh
 
 from sim.distance import signed_distance
+from sim.fields import field_of
 from sim.sampling import sample_particles
 
 
@@ -14,12 +15,11 @@ from sim.sampling import sample_particles
 class RestBody:
     """The body as it was built; nothing changes it.
 
-    particles (n, 3) float64 [mm], in the frame of the surface; particle_mass [g], the same for all;
-    contact_radius (n,) [mm]: how near a particle's centre may come to a shape.
+    particles (n, 3) float64 [mm], in the frame of the surface, all of one mass; contact_radius (n,) [mm]: how near a
+    particle's centre may come to a shape.
     """
 
     particles: np.ndarray
-    particle_mass: float
     radius_mm: float
     contact_radius: np.ndarray
 
@@ -35,11 +35,10 @@ class BodyState:
 def fill_body(
     surface: trimesh.Trimesh,
     radius_mm: float,
-    density_g_cm3: float = 1.05,
     volume_sampling: float = 4.0,
     surface_samples_per_mm2: float = 0.0,
 ) -> RestBody:
-    """Particles that fill a closed surface [mm] and share its mass equally.
+    """Particles that fill a closed surface [mm].
 
     A particle touches a shape where the surface above it would: its contact radius is its depth under the
     surface, at most the particle radius, so that a body laid in a mould of its own shape rests without being
@@ -49,8 +48,7 @@ def fill_body(
         surface.vertices, surface.faces, radius_mm, volume_sampling, surface_samples_per_mm2
     )
     depth = -signed_distance(surface.vertices, surface.faces, particles)[0]
-    mass_g = density_g_cm3 * 1e-3 * surface.volume
-    return RestBody(particles, mass_g / len(particles), radius_mm, np.clip(depth, 0.0, radius_mm))
+    return RestBody(particles, radius_mm, np.clip(depth, 0.0, radius_mm))
 
 
 @ti.data_oriented
@@ -65,11 +63,10 @@ class Body:
     def __init__(self, rest_points: np.ndarray) -> None:
         self.rest_points = np.asarray(rest_points, np.float64)
         self.count = len(rest_points)
-        self.rest = ti.Vector.field(3, ti.f32, self.count)
         self.position = ti.Vector.field(3, ti.f32, self.count)
         self.velocity = ti.Vector.field(3, ti.f32, self.count)
         self.estimate = ti.Vector.field(3, ti.f32, self.count)
-        self.rest.from_numpy(self.rest_points.astype(np.float32))
+        self.rest = field_of(self.rest_points, 1)
         self.restore(self.rest_state())
 
     def rest_state(self) -> BodyState:
@@ -98,8 +95,7 @@ class ParticleBody(Body):
     def __init__(self, rest: RestBody, mass_scaling_per_mm: float = 0.0) -> None:
         super().__init__(rest.particles)
         self.radius_mm = rest.radius_mm
-        self.contact_radius = ti.field(ti.f32, self.count)
-        self.contact_radius.from_numpy(rest.contact_radius.astype(np.float32))
+        self.contact_radius = field_of(rest.contact_radius)
         self.mass_scaling_per_mm = mass_scaling_per_mm
         self.mass_scaled = mass_scaling_per_mm > 0
         if self.mass_scaled:

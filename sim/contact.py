@@ -13,7 +13,7 @@ KEEP_OUT_SWEEPS = 8
 REACH_RADII = 2.0
 # Float32 positions of a body of 200 mm carry about 1e-5 mm; distances are compared with room for that.
 ROUNDING = 1e-4
-# A plane is as good as the shape itself as far as this around where it was found: curved with a radius of 2 mm, it is off by ROUNDING.
+# A plane is as good as the shape itself so far around where it was found: a shape of 2 mm radius leaves it by ROUNDING there.
 EXACT_MM = 0.02
 SAFETY = 1e-3
 

@@ -13,7 +13,9 @@ import trimesh
 
 from sim.device import is_too_small
 from sim.distance import signed_distance
+from sim.fields import field_of
 from sim.skinning import Skin
+from sim.tissue import TissueModel
 
 # Barycentric slack that closes the seams between tetrahedra against rounding.
 SEAM = 1e-5
@@ -38,7 +40,9 @@ class Embedding:
     tetrahedron that ``locate_on_plane`` found on it; the last is for what no tetrahedron holds, which does not move.
     """
 
-    def __init__(self, model, surface: trimesh.Trimesh, cell_mm: float, margin_mm: float = 0.0) -> None:
+    def __init__(
+        self, model: TissueModel, surface: trimesh.Trimesh, cell_mm: float, margin_mm: float = 0.0
+    ) -> None:
         vertices, tetrahedra = tetrahedra_around(surface, cell_mm, margin_mm)
         # A tetrahedron that holds tissue reaches this far out: all of its vertices must follow it wholly.
         wholly = np.sqrt(3) * cell_mm
@@ -49,11 +53,9 @@ class Embedding:
         tetrahedra = tetrahedra[np.argsort(layer, kind="stable")]
         share = np.clip(1.0 - beyond / max(margin_mm - wholly, cell_mm), 0.0, 1.0)
         self.skin = Skin(model, vertices)
-        self.share = ti.field(ti.f32, len(vertices))
-        self.share.from_numpy(share.astype(np.float32))
+        self.share = field_of(share)
         self.count = len(tetrahedra)
-        self.tetrahedron = ti.Vector.field(4, ti.i32, self.count)
-        self.tetrahedron.from_numpy(tetrahedra.astype(np.int32))
+        self.tetrahedron = field_of(tetrahedra, 1)
         self.on_plane = ti.Vector.field(2, ti.f32, len(vertices))
         # Apart, so that what all tetrahedra are asked for stays in a core's nearest cache.
         self.above_plane = ti.field(ti.f32, len(vertices))

@@ -12,6 +12,7 @@ import taichi as ti
 import taichi.math as tm
 from scipy.spatial import cKDTree
 
+from sim.fields import field_of
 from sim.solver import Solver, SolverState
 
 MOST_TETRAHEDRA = 2000
@@ -88,13 +89,10 @@ class Guard:
         self.reach = ti.field(ti.f32, ())
         self.broken = ti.Vector.field(2, ti.i32, ())
         if self.has_tetrahedra:
-            self.corner = ti.Vector.field(4, ti.i32, self.count)
-            self.corner.from_numpy(corners.astype(np.int32))
             edges = rest[corners[:, 1:]] - rest[corners[:, :1]]
-            self.per_volume = ti.field(ti.f32, self.count)
-            self.per_volume.from_numpy((1.0 / np.linalg.det(edges)).astype(np.float32))
-            self.longest = ti.Vector.field(3, ti.f32, self.count)
-            self.longest.from_numpy((TORN * np.linalg.norm(edges, axis=2)).astype(np.float32))
+            self.corner = field_of(corners, 1)
+            self.per_volume = field_of(1.0 / np.linalg.det(edges))
+            self.longest = field_of(TORN * np.linalg.norm(edges, axis=2), 1)
         self.fallbacks = 0
         self.settle()
 
@@ -173,6 +171,7 @@ class Guard:
 
     @ti.func
     def is_broken(self, t):
+        """Whether tetrahedron t is torn, flat or inside out, and not by the tool."""
         corner, longest = self.corner[t], self.longest[t]
         origin = self.body.position[corner[0]]
         a = self.body.position[corner[1]] - origin

@@ -3,7 +3,7 @@
 import taichi as ti
 import taichi.math as tm
 
-from sim.body import ParticleBody
+from sim.fields import field_of
 from sim.shape_matching import ShapeMatching
 
 MOST_NEIGHBOURS = 24
@@ -19,16 +19,16 @@ class ParticleContacts:
     which threads filled a list reaches a sum.
     """
 
-    def __init__(self, body: ParticleBody, model: ShapeMatching, friction: float) -> None:
-        self.body = body
+    def __init__(self, model: ShapeMatching, friction: float) -> None:
+        self.body = body = model.body
         self.model = model
+        self.relax_globally = model.relaxation == "global"
         self.friction = friction
         self.rough = friction > 0
         self.distance = body.radius_mm
         # Particles come nearer than they started during the substep, so some are listed before they touch.
         self.reach = 1.5 * self.distance
-        self.patch = ti.field(ti.i32, body.count)
-        self.patch.from_numpy(model.patches.of_particles())
+        self.patch = field_of(model.patches.of_particles())
         self.cell_start = ti.field(ti.i32, CELLS + 1)
         self.cell_count = ti.field(ti.i32, CELLS)
         self.sorted = ti.field(ti.i32, body.count)
@@ -39,15 +39,18 @@ class ParticleContacts:
 
     @ti.func
     def cell_of(self, p):
+        """The cell (3,) of the endless grid that a place lies in."""
         return ti.cast(ti.floor(p / self.reach), ti.i32)
 
     @ti.func
     def hash(self, cell):
+        """The list, of CELLS, that a cell's particles are in (Teschner 2003)."""
         mixed = (cell.x * 73856093) ^ (cell.y * 19349663) ^ (cell.z * 83492791)
         return mixed & (CELLS - 1)
 
     @ti.func
     def share_cluster(self, i, j):
+        """Whether two particles have a cluster in common; both rows of clusters ascend."""
         p, q = self.patch[i], self.patch[j]
         a, b = self.model.shared_start[p], self.model.shared_start[q]
         shared = 0
@@ -83,6 +86,7 @@ class ParticleContacts:
 
     @ti.func
     def list_neighbours(self, i):
+        """Write the row of particle i; how many it holds."""
         p = self.body.estimate[i]
         count = 0
         for near in ti.grouped(ti.ndrange((-1, 2), (-1, 2), (-1, 2))):
@@ -113,7 +117,7 @@ class ParticleContacts:
         return ti.min(count + 1, MOST_NEIGHBOURS)
 
     @ti.func
-    def project(self, relaxation_factor: float, relax_globally: ti.template()):
+    def project(self, relaxation_factor: float):
         """Lines 18-20 for the group of pairs: C = distance - |x_i - x_j| <= 0 and its friction, gathered."""
         self.most_contacts[None] = 0
         for i in range(self.body.count):
@@ -139,11 +143,11 @@ class ParticleContacts:
                     contacts += 1
             if contacts > 0:
                 ti.atomic_max(self.most_contacts[None], contacts)
-                if ti.static(not relax_globally):
+                if ti.static(not self.relax_globally):
                     change /= ti.cast(contacts, ti.f32)
             self.change[i] = relaxation_factor * change
         for i in range(self.body.count):
-            if ti.static(relax_globally):
+            if ti.static(self.relax_globally):
                 self.body.estimate[i] += self.change[i] / ti.cast(ti.max(self.most_contacts[None], 1), ti.f32)
             else:
                 self.body.estimate[i] += self.change[i]

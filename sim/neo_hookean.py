@@ -15,6 +15,7 @@ import taichi.math as tm
 
 from sim.body import Body
 from sim.device import is_too_small
+from sim.fields import field_of
 from sim.four_wide import cross, four, row
 from sim.lattice import Lattice
 from sim.rigid_motion import RigidMotion
@@ -65,13 +66,14 @@ class NeoHookean:
         self.serial = is_too_small(body.count, PARALLEL_NODES) if serial is None else serial
         self.has_held = held is not None
         if held is not None:
-            self.held = ti.field(ti.i32, body.count)
-            self.held.from_numpy(np.asarray(held, np.int32))
+            self.held = field_of(held)
         self.count = len(lattice.cells)
         self.most_mm = MOST_CELLS_A_PASS * lattice.cell_mm
         self.mu = ti.field(ti.f32, ())
         self.lame = ti.field(ti.f32, ())
-        self._store_nodes(1e-3 * density_g_cm3 * lattice.tissue + load_g)
+        self.target = ti.Vector.field(3, ti.f32, body.count)
+        self.estimate = ti.Vector.field(4, ti.f32, body.count)
+        self.mass = field_of(1e-3 * density_g_cm3 * lattice.tissue + load_g)
         self._store_cells()
         self._store_hourglass()
         self.rigid: Any = (
@@ -79,37 +81,24 @@ class NeoHookean:
         )
         self.set_material(young_kpa, poisson)
 
-    def _store_nodes(self, mass_g: np.ndarray) -> None:
-        self.target = ti.Vector.field(3, ti.f32, self.body.count)
-        self.estimate = ti.Vector.field(4, ti.f32, self.body.count)
-        self.mass = ti.field(ti.f32, self.body.count)
-        self.mass.from_numpy(mass_g.astype(np.float32))
-
     def _store_cells(self) -> None:
         cells, nodes = self.lattice.cells, self.body.count
-        around = np.full((nodes, 8), self.count, np.int32)
+        around = np.full((nodes, 8), self.count)
         gradient = np.zeros((nodes, 8, 4))
         for corner in range(8):
             around[cells[:, corner], corner] = np.arange(self.count)
             gradient[cells[:, corner], corner, :3] = self.lattice.gradient[:, corner]
             gradient[cells[:, corner], corner, 3] = self.lattice.volume
-        self.around = ti.field(ti.i32, (nodes, 8))
-        self.around.from_numpy(around)
-        self.gradient = ti.Vector.field(4, ti.f32, (nodes, 8))
-        self.gradient.from_numpy(gradient.astype(np.float32))
-        self.shear = ti.field(ti.f32, nodes)
-        self.shear.from_numpy(
-            (gradient[:, :, 3] * (gradient[:, :, :3] ** 2).sum(axis=2)).sum(axis=1).astype(np.float32)
-        )
-        self.cell = ti.Vector.field(8, ti.i32, self.count)
-        self.cell.from_numpy(cells.astype(np.int32))
-        self.deformation = ti.Matrix.field(3, 4, ti.f32, self.count + 1)
-        self.deformation.from_numpy(np.tile(np.eye(3, 4, dtype=np.float32), (self.count + 1, 1, 1)))
+        self.around = field_of(around)
+        self.gradient = field_of(gradient, 1)
+        self.shear = field_of((gradient[:, :, 3] * (gradient[:, :, :3] ** 2).sum(axis=2)).sum(axis=1))
+        self.cell = field_of(cells, 1)
+        self.deformation = field_of(np.tile(np.eye(3, 4), (self.count + 1, 1, 1)), 2)
 
     def _store_hourglass(self) -> None:
         """Rows of the hourglass matrix, over the 27 nodes around each node and itself, for a shear modulus of 1."""
         cells, nodes = self.lattice.cells, self.body.count
-        neighbour = np.tile(np.arange(nodes)[:, None], (1, 27)).astype(np.int32)
+        neighbour = np.tile(np.arange(nodes)[:, None], (1, 27))
         weight = np.zeros((nodes, 27))
         corners = np.indices((2, 2, 2)).reshape(3, -1).T
         for a in range(8):
@@ -117,13 +106,16 @@ class NeoHookean:
                 place = (corners[b] - corners[a] + 1) @ [9, 3, 1]
                 neighbour[cells[:, a], place] = cells[:, b]
                 weight[cells[:, a], place] += HOURGLASS * self.lattice.hourglass[:, a, b]
-        self.neighbour = ti.field(ti.i32, (nodes, 27))
-        self.neighbour.from_numpy(neighbour)
-        self.hourglass = ti.field(ti.f32, (nodes, 27))
-        self.hourglass.from_numpy(weight.astype(np.float32))
+        self.neighbour = field_of(neighbour)
+        self.hourglass = field_of(weight)
+
+    def set_young(self, young_kpa: float) -> None:
+        """Change Young's modulus [kPa], Poisson's ratio stays."""
+        self.set_material(young_kpa, self.poisson)
 
     def set_material(self, young_kpa: float, poisson: float) -> None:
-        """Young's modulus and Poisson's ratio; the contact layer is as much stiffer as the tissue is."""
+        """Change Young's modulus [kPa] and Poisson's ratio; the contact layer is as much stiffer as the tissue is."""
+        self.poisson = poisson
         # 1 kPa is 1000 g/(mm s^2).
         self.mu[None] = 1e3 * young_kpa / (2 * (1 + poisson))
         self.lame[None] = 1e3 * young_kpa * poisson / ((1 + poisson) * (1 - 2 * poisson))

@@ -5,14 +5,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sim.body import RestBody
-from sim.sampling import Clusters, sample_clusters
+from sim.sampling import Clusters, offsets_of, sample_clusters
 
 
 @dataclass(frozen=True)
 class Patches:
     """Particles ``start[p]`` to ``start[p + 1]`` of a body are patch p; row p of ``clusters`` lists the clusters it is in.
 
-    The ``several`` first patches have more than one particle, the others one. Of a kidney's memberships of particles in clusters, as many of patches in clusters are left as two in five.
+    The ``several`` first patches have more than one particle, the others one. Where a kidney has five memberships of particles in
+    clusters, it has two of patches.
     """
 
     start: np.ndarray
@@ -59,10 +60,6 @@ def arrange(rest: RestBody, cluster_spacing: float) -> tuple[RestBody, Patches]:
     order = np.argsort(patch, kind="stable")
     found = list(number)
     members = [np.frombuffer(found[p], rows.members.dtype) for p in sequence]
-    shared = Clusters(_starts([len(row) for row in members]), np.concatenate(members))
+    shared = Clusters(offsets_of([len(row) for row in members]), np.concatenate(members))
     arranged = replace(rest, particles=rest.particles[order], contact_radius=rest.contact_radius[order])
-    return arranged, Patches(_starts(np.bincount(patch)), shared)
-
-
-def _starts(lengths: np.ndarray | list[int]) -> np.ndarray:
-    return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+    return arranged, Patches(offsets_of(np.bincount(patch)), shared)

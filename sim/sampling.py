@@ -35,7 +35,7 @@ class Clusters:
         cluster = np.repeat(np.arange(len(self), dtype=np.int32), np.diff(self.offsets))
         order = np.argsort(self.members, kind="stable")
         counts = np.bincount(self.members, minlength=particle_count)
-        return Clusters(_offsets(counts), cluster[order])
+        return Clusters(offsets_of(counts), cluster[order])
 
 
 def sample_particles(
@@ -80,7 +80,7 @@ def sample_clusters(particles: np.ndarray, spacing_mm: float) -> Clusters:
             near = np.sort(tree.query_ball_point(particles[i], spacing_mm))
             free[near] = False
             rows.append(near.astype(np.int32))
-    return Clusters(_offsets([len(row) for row in rows]), np.concatenate(rows))
+    return Clusters(offsets_of([len(row) for row in rows]), np.concatenate(rows))
 
 
 def occupied_voxels(vertices: np.ndarray, faces: np.ndarray, pitch: float) -> tuple[np.ndarray, np.ndarray]:
@@ -158,5 +158,6 @@ def _clear_near(
         occupied[near[:, 0], near[:, 1], near[:, 2]] = False
 
 
-def _offsets(counts: list[int] | np.ndarray) -> np.ndarray:
+def offsets_of(counts: list[int] | np.ndarray) -> np.ndarray:
+    """Where each of rows of so many entries starts (n,), and where the last ends: int32 (n + 1,)."""
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from sim.body import ParticleBody
 from sim.contact import ShapeContacts
 from sim.device import is_too_small
+from sim.fields import field_of
 from sim.four_wide import four, row
 from sim.patches import Patches
 from sim.rotation import rotation_near
@@ -68,27 +69,22 @@ class ShapeMatching:
         self.update_frames()
 
     def _allocate(self, patches: Patches, members: Clusters) -> None:
-        self.patch_start = _int_field(patches.start)
-        self.shared_start = _int_field(patches.clusters.offsets)
-        self.shared = _int_field(patches.clusters.members)
-        self.member_start = _int_field(members.offsets)
-        self.member = _int_field(members.members)
+        self.patch_start = field_of(patches.start)
+        self.shared_start = field_of(patches.clusters.offsets)
+        self.shared = field_of(patches.clusters.members)
+        self.member_start = field_of(members.offsets)
+        self.member = field_of(members.members)
         row = np.repeat(np.arange(self.count), np.diff(members.offsets))
         several = np.bincount(row, members.members < patches.several, minlength=self.count)
-        self.several_end = _int_field(members.offsets[:-1] + several)
+        self.several_end = field_of(members.offsets[:-1] + several.astype(np.int32))
         self.estimate = ti.Vector.field(4, ti.f32, self.body.count)
-        self.local = ti.Vector.field(4, ti.f32, self.body.count)
-        self.patch_centre = ti.Vector.field(4, ti.f32, self.patch_count)
-        self.patch_scale = ti.Vector.field(4, ti.f32, self.patch_count)
-        self.patch_rest = ti.Vector.field(4, ti.f32, self.patch_count)
         self.goal = ti.Matrix.field(4, 4, ti.f32, self.patch_count)
         self.centre = ti.Vector.field(4, ti.f32, self.patch_count)
         self.moment = ti.Matrix.field(4, 4, ti.f32, self.patch_count)
-        self.cluster_rest = ti.Vector.field(4, ti.f32, self.count)
         self.sum = ti.Matrix.field(4, 4, ti.f32, self.count)
         if self.has_contacts:
             self.touched = ti.field(ti.i32, self.patch_count)
-            self.patch = _int_field(patches.of_particles())
+            self.patch = field_of(patches.of_particles())
         self.frame = ti.Matrix.field(4, 4, ti.f32, self.count)
 
     def _store_rest(self, patches: Patches) -> None:
@@ -106,12 +102,11 @@ class ShapeMatching:
         moment = [np.bincount(member, (mass * centre[:, axis])[row]) for axis in range(3)]
         self.rest_centres = np.stack(moment, axis=1) / total[:, None]
         local = rest - np.repeat(centre, sizes, axis=0)
-        self.local.from_numpy(np.pad(local, ((0, 0), (0, 1)), constant_values=1.0).astype(np.float32))
-        self.patch_centre.from_numpy(np.pad(centre, ((0, 0), (0, 1))).astype(np.float32))
-        scale = np.column_stack([share, share / mass, 1.0 / goals, shared / goals])
-        self.patch_scale.from_numpy(scale.astype(np.float32))
-        self.patch_rest.from_numpy(np.column_stack([centre, mass]).astype(np.float32))
-        self.cluster_rest.from_numpy(np.column_stack([self.rest_centres, total]).astype(np.float32))
+        self.local = field_of(np.pad(local, ((0, 0), (0, 1)), constant_values=1.0), 1)
+        self.patch_centre = field_of(np.pad(centre, ((0, 0), (0, 1))), 1)
+        self.patch_scale = field_of(np.column_stack([share, share / mass, 1.0 / goals, shared / goals]), 1)
+        self.patch_rest = field_of(np.column_stack([centre, mass]), 1)
+        self.cluster_rest = field_of(np.column_stack([self.rest_centres, total]), 1)
 
     def counts(self) -> dict[str, int]:
         """Particles, clusters, and memberships of the ones in the others."""
@@ -127,6 +122,7 @@ class ShapeMatching:
 
     @ti.func
     def weigh_patches(self):
+        """Masses and centres of the patches at rest, by the scaled masses of their particles."""
         for p in range(self.patch_count):
             first, last = self.patch_start[p], self.patch_start[p + 1]
             moment, mass = tm.vec4(0.0), 0.0
@@ -140,6 +136,7 @@ class ShapeMatching:
 
     @ti.func
     def weigh_clusters(self):
+        """The same of the clusters, by their patches'."""
         for c in range(self.count):
             first, last = self.member_start[c], self.member_start[c + 1]
             origin = self.patch_rest[self.member[first]]
@@ -339,9 +336,3 @@ class ShapeMatching:
                     x += weight[v][k] * rest[v][axis] * row(moved, axis)
                 x += weight[v][k] * row(moved, 3)
             out[v] = x.xyz
-
-
-def _int_field(values: np.ndarray) -> ti.Field:
-    field = ti.field(ti.i32, len(values))
-    field.from_numpy(np.asarray(values, np.int32))
-    return field

@@ -14,6 +14,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.distance import distance_grid
+from sim.fields import field_of
 
 FAR = 1e6
 HAIR = 1e-3
@@ -66,8 +67,7 @@ class SignedDistanceField(Static):
 
     def __init__(self, distance: np.ndarray, origin_mm: np.ndarray, spacing_mm: np.ndarray) -> None:
         self.shape = distance.shape
-        self.distance = ti.field(ti.f32, self.shape)
-        self.distance.from_numpy(np.ascontiguousarray(distance, np.float32))
+        self.distance = field_of(distance)
         self.origin = ti.Vector([float(v) for v in origin_mm])
         self.spacing = ti.Vector([float(v) for v in spacing_mm])
 
@@ -140,9 +140,8 @@ class ConvexTool:
         self.count = len(normals)
         self.edge_radius = float(edge_radius_mm)
         # The half-spaces of the core, in which the ball's centre stays.
-        self.half_space = ti.Vector.field(4, ti.f32, self.count)
         core = np.column_stack([normals, np.asarray(offsets_mm, float) - self.edge_radius])
-        self.half_space.from_numpy(core.astype(np.float32))
+        self.half_space = field_of(core, 1)
         self.ball_mm = self.edge_radius + _farthest(core)
         self.pose = ti.Matrix.field(4, 4, ti.f32, ())
         self.step_back = ti.Matrix.field(4, 4, ti.f32, ())

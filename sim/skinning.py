@@ -3,6 +3,7 @@
 import numpy as np
 import taichi as ti
 
+from sim.fields import field_of
 from sim.tissue import TissueModel
 
 
@@ -17,13 +18,10 @@ class Skin:
         points = np.asarray(points, np.float64)
         frame, weight = model.attach(points)
         self.model = model
-        self.rest = ti.Vector.field(3, ti.f32, len(points))
         self.vertices = ti.Vector.field(3, ti.f32, len(points))
-        self.frame = ti.Vector.field(frame.shape[1], ti.i32, len(points))
-        self.weight = ti.Vector.field(frame.shape[1], ti.f32, len(points))
-        self.rest.from_numpy(points.astype(np.float32))
-        self.frame.from_numpy(frame.astype(np.int32))
-        self.weight.from_numpy(weight.astype(np.float32))
+        self.rest = field_of(points, 1)
+        self.frame = field_of(frame, 1)
+        self.weight = field_of(weight, 1)
         self.update()
 
     def update(self) -> None:

@@ -9,10 +9,8 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import BodyState
-from sim.contact import ShapeContacts
 from sim.neighbours import ParticleContacts
 from sim.shapes import MOST_SUBSTEPS, ConvexTool
-from sim.surface_contact import SurfaceContacts
 from sim.tissue import TissueModel
 
 # What a step can be told, least and most; more substeps than that have no room on the device.
@@ -66,7 +64,7 @@ class SolverState:
 
 @ti.data_oriented
 class Solver:
-    """Steps one body with its tissue model, its contacts and at most one moving tool.
+    """Steps one body with its tissue model, that one's contacts with shapes, contacts of pairs of particles and a moving tool.
 
     What is None does not exist: no kernel is compiled and no memory taken for it.
     """
@@ -74,19 +72,16 @@ class Solver:
     def __init__(
         self,
         model: TissueModel,
-        contacts: ShapeContacts | SurfaceContacts | None = None,
         pairs: ParticleContacts | None = None,
         tool: ConvexTool | None = None,
-        relaxation: str = "local",
     ) -> None:
         self.body: Any = model.body
         self.model = model
-        self.contacts: Any = contacts
+        self.contacts: Any = model.contacts
         self.pairs = pairs
         self.tool = tool
-        self.relax_globally = relaxation == "global"
         self.has_tool = tool is not None
-        self.has_contacts = contacts is not None
+        self.has_contacts = model.contacts is not None
         self.has_pairs = pairs is not None
 
     def step(self, settings: StepSettings, tool_poses: np.ndarray | None = None) -> None:
@@ -121,11 +116,11 @@ class Solver:
 
     def _launch_substep(self, substep: int, dt: float, settings: StepSettings) -> None:
         """A substep as many kernels, whose loops run in parallel."""
-        self.begin(substep, dt, *settings.gravity, settings.damping, settings.stabilisation_iterations)
+        self.launch_start(substep, dt, *settings.gravity, settings.damping, settings.stabilisation_iterations)
         for iteration in range(settings.iterations):
             factor = last_exact(iteration, settings.iterations, settings.relaxation_factor)
-            self.iterate(settings.stiffness, factor, dt)
-        self.end(dt)
+            self.launch_correct(settings.stiffness, factor, dt)
+        self.launch_finish(dt)
 
     def snapshot(self) -> SolverState:
         """A copy of the current state."""
@@ -163,7 +158,7 @@ class Solver:
             self.finish(dt)
 
     @ti.kernel
-    def begin(
+    def launch_start(
         self,
         substep: int,
         dt: float,
@@ -173,15 +168,18 @@ class Solver:
         damping: float,
         stabilisation_iterations: int,
     ):
+        """``start`` as a kernel of its own."""
         gravity = tm.vec3(gravity_x, gravity_y, gravity_z)
         self.start(substep, dt, gravity, damping, stabilisation_iterations)
 
     @ti.kernel
-    def iterate(self, stiffness: float, relaxation_factor: float, dt: float):
+    def launch_correct(self, stiffness: float, relaxation_factor: float, dt: float):
+        """``correct`` as a kernel of its own."""
         self.correct(stiffness, relaxation_factor, dt)
 
     @ti.kernel
-    def end(self, dt: float):
+    def launch_finish(self, dt: float):
+        """``finish`` as a kernel of its own."""
         self.finish(dt)
 
     @ti.func
@@ -201,8 +199,9 @@ class Solver:
 
     @ti.func
     def predict(self, dt: float, gravity: tm.vec3, damping: float):
+        """Lines 1-5: estimates, and scaled masses where there are any."""
         decay = ti.exp(-damping * dt)
-        for i in range(self.body.count):  # lines 1-5
+        for i in range(self.body.count):
             # Gravity does not decay, or a body at rest would weigh less.
             velocity = self.body.velocity[i] * decay + dt * gravity
             self.body.estimate[i] = self.body.position[i] + dt * velocity
@@ -217,7 +216,7 @@ class Solver:
         self.model.project(stiffness, relaxation_factor, dt)
         if ti.static(self.has_pairs):
             self.model.scatter()
-            self.pairs.project(relaxation_factor, self.relax_globally)
+            self.pairs.project(relaxation_factor)
             self.model.gather()
 
     @ti.func

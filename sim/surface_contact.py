@@ -10,6 +10,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import Body
+from sim.fields import field_of
 from sim.free_way import FreeWay
 from sim.lattice import Lattice
 from sim.shapes import FAR
@@ -53,11 +54,9 @@ class SurfaceContacts:
         self.point = ti.Vector.field(3, ti.f32, self.count)
         self.start = ti.Vector.field(3, ti.f32, self.count)
         self.near = ti.field(ti.i32, self.count)
-        self.area = _field(ti.f32, area_mm2)
-        self.node = ti.Vector.field(8, ti.i32, self.count)
-        self.weight = ti.Vector.field(8, ti.f32, self.count)
-        self.node.from_numpy(nodes.astype(np.int32))
-        self.weight.from_numpy(weights.astype(np.float32))
+        self.area = field_of(area_mm2)
+        self.node = field_of(nodes, 1)
+        self.weight = field_of(weights, 1)
         self._list_by_node(nodes, weights)
         self.plane = ti.Vector.field(4, ti.f32, (len(shapes), self.count))
         self.found = ti.Vector.field(4, ti.f32, (len(shapes), self.count))
@@ -71,9 +70,9 @@ class SurfaceContacts:
     def _list_by_node(self, nodes: np.ndarray, weights: np.ndarray) -> None:
         order = np.argsort(nodes.ravel(), kind="stable")
         offset = np.searchsorted(nodes.ravel()[order], np.arange(self.body.count + 1))
-        self.listed_from = _field(ti.i32, offset)
-        self.listed = _field(ti.i32, order // 8)
-        self.listed_weight = _field(ti.f32, weights.ravel()[order])
+        self.listed_from = field_of(offset)
+        self.listed = field_of(order // 8)
+        self.listed_weight = field_of(weights.ravel()[order])
 
     def forget(self) -> None:
         """Drop what is known of distances and of friction, after the body was moved by another hand."""
@@ -234,9 +233,3 @@ class SurfaceContacts:
                 # The maximum of numbers does not depend on the order, so this atomic keeps runs alike.
                 ti.atomic_max(self.penetration[None], -self.shapes[s].surface(p).w)
         return self.penetration[None]
-
-
-def _field(kind, values: np.ndarray) -> ti.Field:
-    field = ti.field(kind, len(values))
-    field.from_numpy(np.asarray(values, np.int32 if kind == ti.i32 else np.float32))
-    return field

@@ -1,11 +1,17 @@
-"""What a tissue model is: the interface that solver, contacts, skin and embedding know, and nothing else of it."""
+"""What a tissue model is: the interface that solver, contacts, skin and embedding know, and nothing else of it.
 
-from typing import Protocol
+A new one is a file of this folder with its class, its section of a scene file in ``scenes.tissue``, what its solver is put
+together from in ``studies.models.KINDS`` and its presets in ``studies.setup.PRESETS``; the tests of all models then are its own.
+"""
+
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import taichi as ti
 
 from sim.body import Body
+from sim.contact import ShapeContacts
+from sim.surface_contact import SurfaceContacts
 
 
 class TissueModel(Protocol):
@@ -17,6 +23,9 @@ class TissueModel(Protocol):
 
     @property
     def body(self) -> Body: ...
+
+    @property
+    def contacts(self) -> ShapeContacts | SurfaceContacts | None: ...
 
     @property
     def serial(self) -> bool: ...
@@ -46,3 +55,11 @@ class TissueModel(Protocol):
     def counts(self) -> dict[str, int]:
         """Its size, for reports: ``particles`` or ``nodes`` first."""
         ...
+
+
+@runtime_checkable
+class MaterialModel(Protocol):
+    """A tissue model of a material, which can be changed between steps."""
+
+    def set_young(self, young_kpa: float) -> None:
+        """Change Young's modulus [kPa]."""

@@ -13,8 +13,8 @@ from sim.shapes import ConvexTool
 from sim.solver import Solver
 from sim.surface_contact import SurfaceContacts
 
-# The paper's friction, width of a cluster in radii, and density [g/mm^3].
-FRICTION, CLUSTER_SPACING, DENSITY = 0.35, 3.33, 1.05e-3
+# The paper's friction, and width of a cluster in radii.
+FRICTION, CLUSTER_SPACING = 0.35, 3.33
 
 
 def block_of_cells(side: int, cell_mm: float, shapes: list, tool: ConvexTool | None = None) -> Solver:
@@ -23,15 +23,15 @@ def block_of_cells(side: int, cell_mm: float, shapes: list, tool: ConvexTool | N
     body = Body(lattice.nodes)
     cube = trimesh.creation.box(bounds=[[0.0] * 3, [side * cell_mm] * 3])
     contacts = SurfaceContacts(body, lattice, *surface_points(cube, cell_mm / 2), shapes, FRICTION)
-    return Solver(NeoHookean(body, lattice, contacts), contacts, tool=tool)
+    return Solver(NeoHookean(body, lattice, contacts), tool=tool)
 
 
 def block_of_particles(
     points_mm: np.ndarray, radius_mm: float, shapes: list, tool: ConvexTool | None = None
 ) -> Solver:
     """Particles at points (n, 3), a radius apart from each other, among shapes, the tool among them."""
-    rest = RestBody(points_mm, DENSITY * radius_mm**3, radius_mm, np.full(len(points_mm), radius_mm / 2))
+    rest = RestBody(points_mm, radius_mm, np.full(len(points_mm), radius_mm / 2))
     arranged, patches = arrange(rest, CLUSTER_SPACING)
     body = ParticleBody(arranged)
     contacts = ShapeContacts(body, shapes, FRICTION)
-    return Solver(ShapeMatching(body, patches, contacts), contacts, tool=tool)
+    return Solver(ShapeMatching(body, patches, contacts), tool=tool)

@@ -5,14 +5,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import trimesh
 
-from scenes.scene import Contact, NeoHookeanTissue, ShapeMatchingTissue, SolverSection
+from scenes.scene import Contact, SolverSection
+from scenes.tissue import TISSUES, NeoHookeanTissue, ShapeMatchingTissue, TissueSection
 from sim.body import RestBody
 from sim.shapes import ConvexTool
 from sim.skinning import Skin
 from sim.solver import StepSettings
 from studies.case import Case
-from studies.models import AnyTissue, build_solver, fill, static_shape, step_settings
-from studies.setup import Setup, SetupError
+from studies.models import build_solver, fill, static_shape, step_settings
+from studies.setup import BUILT, MATERIAL, NOT_USED, Setup, SetupError
 from studies.stopwatch import timed
 from studies.surfaces import moved_by
 from ultrasound.probe import between
@@ -51,7 +52,7 @@ class Experiment:
         tool = ConvexTool.cuboid(case.size_mm, case.edge_radius_mm)
         shapes = [static_shape(moved_by(case.support, -self.origin), tissue), tool]
         contact = Contact(shape_friction=case.friction)
-        self.solver = build_solver(_organ(case), tissue, shapes, tool, contact, rest=rest)
+        self.solver = build_solver(rest or _organ(case), tissue, shapes, tool, contact)
         self.body, self.model, self.contacts = self.solver.body, self.solver.model, self.solver.contacts
         self.beads = Skin(self.model, case.beads - self.origin)
 
@@ -108,7 +109,8 @@ class Experiment:
         if isinstance(tissue, NeoHookeanTissue):
             material = f"E {tissue.young_kpa:g} kPa, nu {tissue.poisson:g}"
             return f"{size['nodes']} nodes, {size['cells']} cells of {setup.cell_mm:g} mm, {material}"
-        return f"{size['particles']} particles of {setup.radius_mm:g} mm, stiffness {setup.stiffness:g}"
+        pieces = tissue.PIECES
+        return f"{size[pieces]} {pieces} of {setup.size_mm:g} mm, stiffness {setup.stiffness:g}"
 
     def _restore(self) -> None:
         self.body.restore(self.body.rest_state())
@@ -127,23 +129,18 @@ class Experiment:
         return pose
 
 
-def tissue_of(case: Case, setup: Setup) -> AnyTissue:
+def tissue_of(case: Case, setup: Setup) -> TissueSection:
     """The setup's tissue with what is the case's own. Raises SetupError where neither gives the material."""
-    values: dict[str, float | str | None] = dict(
-        model=setup.model, density_g_cm3=(case.density_kg_m3 or DENSITY_KG_M3) / 1000
-    )
-    if setup.model == "shape-matching":
-        values.update(radius_mm=setup.radius_mm, stiffness=setup.stiffness)
-        return ShapeMatchingTissue.model_validate(values)
-    young, poisson = setup.young_kpa or case.young_kpa, setup.poisson
-    if poisson is None:
-        poisson = case.poisson
-    if young is None or poisson is None:
+    material = {name: getattr(case, name) for name in MATERIAL}
+    given = {name: getattr(setup, name) for name in (*BUILT, *MATERIAL)}
+    values = material | {name: value for name, value in given.items() if value is not None}
+    own = {name: value for name, value in values.items() if name not in NOT_USED[setup.model]}
+    if None in own.values():
         raise SetupError(
             f"{case.name}: the case does not say what its tissue is; give --young-kpa and --poisson"
         )
-    values.update(cell_mm=setup.cell_mm, young_kpa=young, poisson=poisson)
-    return NeoHookeanTissue.model_validate(values)
+    density = (case.density_kg_m3 or DENSITY_KG_M3) / 1000
+    return TISSUES[setup.model].model_validate(dict(model=setup.model, density_g_cm3=density, **own))
 
 
 def rest_body(case: Case, setup: Setup) -> RestBody:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from scenes.tissue import TISSUES
 from studies.experiment import Experiment
 from studies.results import rounded
 from studies.setup import OPTION_OF, Setup, SetupError
@@ -20,11 +21,10 @@ def changes_of(setup: Setup) -> dict[str, Setup]:
 
     The press takes as long with half the time step. Raises SetupError where a changed value would be out of range.
     """
-    size = setup.size_name
-    things = "cells" if setup.model == "neo-hookean" else "particles"
+    things = TISSUES[setup.model].PIECES
     if not LEAST_MM <= setup.size_mm <= MOST_MM:
         raise SetupError(
-            f"--check: {things} a third larger and smaller need --{OPTION_OF[size]} from {LEAST_MM:g} to {MOST_MM:g}"
+            f"--check: {things} a third larger and smaller need --{OPTION_OF[setup.size_name]} from {LEAST_MM:g} to {MOST_MM:g}"
         )
     if setup.iterations > MOST_ITERATIONS:
         raise SetupError(f"--check: twice the iterations needs --iterations of {MOST_ITERATIONS} at most")
@@ -35,7 +35,7 @@ def changes_of(setup: Setup) -> dict[str, Setup]:
         stage_steps=2 * setup.stage_steps,
     )
     sizes = {
-        f"{things} a third {word}": replace(setup, **{size: round(share * getattr(setup, size), 3)})
+        f"{things} a third {word}": setup.sized(round(share * setup.size_mm, 3))
         for word, share in (("larger", 4 / 3), ("smaller", 2 / 3))
     }
     return {

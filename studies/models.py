@@ -1,11 +1,14 @@
 """The tissue models as a scene names them: each put on the device with its contacts, ready to step."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import trimesh
 
-from scenes.scene import Contact, NeoHookeanTissue, ShapeMatchingTissue, SolverSection
+from scenes.scene import Contact, SolverSection
+from scenes.tissue import ShapeMatchingTissue, TissueSection
 from sim.body import Body, ParticleBody, RestBody, fill_body
 from sim.contact import REACH_RADII, ShapeContacts
 from sim.lattice import fill_with_cells, surface_points
@@ -19,7 +22,6 @@ from sim.solver import Solver, StepSettings
 from sim.surface_contact import REACH_MM, SurfaceContacts
 from ultrasound.array import Probe
 
-AnyTissue = NeoHookeanTissue | ShapeMatchingTissue
 # Points of the surface that can touch are this share of a cell apart.
 POINTS_A_CELL = 0.5
 # Flats that stand for the arc of a curved array: of 60 mm and 60 degrees, they are nowhere 0.1 mm off it.
@@ -45,9 +47,40 @@ class Held:
         return held
 
 
-def static_shape(mesh: trimesh.Trimesh, tissue: AnyTissue) -> SignedDistanceField:
+@dataclass(frozen=True)
+class Parts:
+    """What a solver is put together from: an organ [mm] of a tissue among shapes, the tool among them (``build_solver``)."""
+
+    organ: Any
+    tissue: Any
+    shapes: list
+    tool: ConvexTool | None
+    contact: Contact
+    section: SolverSection
+    serial: bool | None
+    held: Held | None
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What is asked of a tissue model besides its ``TissueModel``.
+
+    ``build`` puts its solver together and raises SamplingError; ``settings`` is its own choice of a step for a tissue;
+    ``reach_mm`` is how far around a shape a tissue asks for its distance, and the coarse tetrahedra that carry the image
+    plane are ``embedding_sizes`` sizes of the tissue wide. ``reported`` is its line of a report, with names of its section and
+    of its counts.
+    """
+
+    build: Callable[[Parts], Solver]
+    settings: Callable[[Any], StepSettings]
+    reach_mm: Callable[[Any], float]
+    embedding_sizes: float
+    reported: str
+
+
+def static_shape(mesh: trimesh.Trimesh, tissue: TissueSection) -> SignedDistanceField:
     """What a closed surface [mm] that does not move is to a tissue: distances as far around as it asks for them."""
-    return SignedDistanceField.of_surface(mesh.vertices, mesh.faces, reach_of(tissue))
+    return SignedDistanceField.of_surface(mesh.vertices, mesh.faces, KINDS[tissue.model].reach_mm(tissue))
 
 
 def tool_of(probe: Probe) -> ConvexTool:
@@ -64,88 +97,86 @@ def tool_of(probe: Probe) -> ConvexTool:
     return ConvexTool(np.concatenate([sides, arc]), offsets, probe.edge_radius_mm)
 
 
-def reach_of(tissue: AnyTissue) -> float:
-    """How far around a shape a tissue asks for its distance [mm]."""
-    return REACH_MM if isinstance(tissue, NeoHookeanTissue) else REACH_RADII * tissue.radius_mm
-
-
-def embedding_cell_mm(tissue: AnyTissue) -> float:
+def embedding_cell_mm(tissue: TissueSection) -> float:
     """Width of the coarse tetrahedra that carry the image plane."""
-    return 1.35 * tissue.cell_mm if isinstance(tissue, NeoHookeanTissue) else 2.0 * tissue.radius_mm
+    return KINDS[tissue.model].embedding_sizes * tissue.size_mm
 
 
-def step_settings(tissue: AnyTissue, section: SolverSection) -> StepSettings:
+def step_settings(tissue: TissueSection, section: SolverSection) -> StepSettings:
     """The scene's settings of a step; what it leaves out is the tissue model's own choice."""
-    own = (
-        LATTICE_SETTINGS if isinstance(tissue, NeoHookeanTissue) else StepSettings(stiffness=tissue.stiffness)
-    )
     names = ("time_step_s", "substeps", "iterations", "stabilisation_iterations", "relaxation_factor")
     given = {name: getattr(section, name) for name in names if getattr(section, name) is not None}
-    return replace(own, damping=section.damping_per_s, **given)
+    return replace(KINDS[tissue.model].settings(tissue), damping=section.damping_per_s, **given)
 
 
 def build_solver(
-    organ: trimesh.Trimesh,
-    tissue: AnyTissue,
+    organ: trimesh.Trimesh | RestBody,
+    tissue: TissueSection,
     shapes: list,
     tool: ConvexTool | None,
     contact: Contact | None = None,
     section: SolverSection | None = None,
-    rest: RestBody | None = None,
     serial: bool | None = None,
     held: Held | None = None,
 ) -> Solver:
     """A solver of the organ [mm] among shapes, the tool among them. Raises SamplingError.
 
-    ``held`` is the neo-Hookean model's; ``rest`` is shape matching's: the organ filled before (``fill``), which takes seconds.
-    ``serial`` says whether a step is one kernel on one core; left open, the body's size and the machine decide.
+    Shape matching also takes an organ that was filled before (``fill``), which takes seconds; ``held`` is the neo-Hookean
+    model's. ``serial`` says whether a step is one kernel on one core; left open, the body's size and the machine decide.
     """
-    contact, section = contact or Contact(), section or SolverSection()
-    if isinstance(tissue, NeoHookeanTissue):
-        return _neo_hookean(organ, tissue, shapes, tool, contact, serial, held)
-    return _shape_matching(rest or fill(organ, tissue), tissue, shapes, tool, contact, section, serial)
+    section = section or SolverSection()
+    parts = Parts(organ, tissue, shapes, tool, contact or Contact(), section, serial, held)
+    return KINDS[tissue.model].build(parts)
 
 
 def fill(organ: trimesh.Trimesh, tissue: ShapeMatchingTissue) -> RestBody:
     """The organ [mm] filled with particles. Raises SamplingError."""
-    return fill_body(
-        organ, tissue.radius_mm, tissue.density_g_cm3, tissue.volume_sampling, tissue.surface_samples_per_mm2
-    )
+    return fill_body(organ, tissue.radius_mm, tissue.volume_sampling, tissue.surface_samples_per_mm2)
 
 
-def _neo_hookean(
-    organ: trimesh.Trimesh,
-    tissue: NeoHookeanTissue,
-    shapes: list,
-    tool: ConvexTool | None,
-    contact: Contact,
-    serial: bool | None,
-    held: Held | None,
-) -> Solver:
+def _neo_hookean(parts: Parts) -> Solver:
+    organ, tissue = parts.organ, parts.tissue
     lattice = fill_with_cells(organ, tissue.cell_mm)
     body = Body(lattice.nodes)
     contacts = None
-    if shapes:
+    if parts.shapes:
         points, area_mm2 = surface_points(organ, POINTS_A_CELL * tissue.cell_mm)
-        contacts = SurfaceContacts(body, lattice, points, area_mm2, shapes, contact.shape_friction)
+        contacts = SurfaceContacts(
+            body, lattice, points, area_mm2, parts.shapes, parts.contact.shape_friction
+        )
     material = (tissue.young_kpa, tissue.poisson, tissue.density_g_cm3)
-    nodes = None if held is None else held.nodes(lattice.nodes)
-    model = NeoHookean(body, lattice, contacts, *material, held=nodes, serial=serial)
-    return Solver(model, contacts, tool=tool)
+    held = None if parts.held is None else parts.held.nodes(lattice.nodes)
+    model = NeoHookean(body, lattice, contacts, *material, held=held, serial=parts.serial)
+    return Solver(model, tool=parts.tool)
 
 
-def _shape_matching(
-    rest: RestBody,
-    tissue: ShapeMatchingTissue,
-    shapes: list,
-    tool: ConvexTool | None,
-    contact: Contact,
-    section: SolverSection,
-    serial: bool | None,
-) -> Solver:
-    arranged, patches = arrange(rest, tissue.cluster_spacing)
+def _shape_matching(parts: Parts) -> Solver:
+    contact, section = parts.contact, parts.section
+    rest = parts.organ if isinstance(parts.organ, RestBody) else fill(parts.organ, parts.tissue)
+    arranged, patches = arrange(rest, parts.tissue.cluster_spacing)
     body = ParticleBody(arranged, section.mass_scaling_per_mm)
-    contacts = ShapeContacts(body, shapes, contact.shape_friction) if shapes else None
-    model = ShapeMatching(body, patches, contacts, section.relaxation, serial)
-    pairs = ParticleContacts(body, model, contact.particle_friction) if contact.particles else None
-    return Solver(model, contacts, pairs, tool, section.relaxation)
+    contacts = ShapeContacts(body, parts.shapes, contact.shape_friction) if parts.shapes else None
+    model = ShapeMatching(body, patches, contacts, section.relaxation, parts.serial)
+    pairs = ParticleContacts(model, contact.particle_friction) if contact.particles else None
+    return Solver(model, pairs, parts.tool)
+
+
+# All models, by the names of ``scenes.tissue``: a new one is added here.
+KINDS = {
+    "neo-hookean": Kind(
+        build=_neo_hookean,
+        settings=lambda tissue: LATTICE_SETTINGS,
+        reach_mm=lambda tissue: REACH_MM,
+        embedding_sizes=1.35,
+        reported="neo-Hookean, E {young_kpa:g} kPa, nu {poisson:g}: {cells} cells of {cell_mm:g} mm, {nodes} nodes, "
+        "{tetrahedra} tetrahedra",
+    ),
+    "shape-matching": Kind(
+        build=_shape_matching,
+        settings=lambda tissue: StepSettings(stiffness=tissue.stiffness),
+        reach_mm=lambda tissue: REACH_RADII * tissue.radius_mm,
+        embedding_sizes=2.0,
+        reported="shape matching, stiffness {stiffness:g}: {particles} particles of {radius_mm:g} mm, {clusters} clusters, "
+        "{memberships} memberships, {tetrahedra} tetrahedra",
+    ),
+}

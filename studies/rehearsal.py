@@ -12,21 +12,14 @@ import trimesh
 
 from scenes.anatomy import Grid, LoadedAnatomy, press_on
 from scenes.reading.progress import Told, untold
-from scenes.scene import NeoHookeanTissue, PlaneShape, Scene
+from scenes.scene import PlaneShape, Scene
 from sim.embedding import Embedding
 from sim.guard import Guard, Watch
-from sim.neo_hookean import NeoHookean
 from sim.shapes import Plane, SignedDistanceField
 from sim.skinning import Skin
 from sim.solver import SolverState
-from studies.models import (
-    Held,
-    build_solver,
-    embedding_cell_mm,
-    static_shape,
-    step_settings,
-    tool_of,
-)
+from sim.tissue import MaterialModel
+from studies.models import Held, build_solver, embedding_cell_mm, static_shape, step_settings, tool_of
 from studies.setup import probe_of
 from studies.surfaces import moved_by, volume_mm3
 from ultrasound.array import Mode, Probe, Rung
@@ -183,8 +176,8 @@ class Rehearsal:
 
     def set_young(self, young_kpa: float) -> None:
         """Change Young's modulus of a tissue that has one; of others nothing."""
-        if isinstance(self.model, NeoHookean) and isinstance(self.scene.tissue, NeoHookeanTissue):
-            self.model.set_material(young_kpa, self.scene.tissue.poisson)
+        if isinstance(self.model, MaterialModel):
+            self.model.set_young(young_kpa)
 
     def scripted_pose(self, time_s: float) -> np.ndarray:
         """The transducer's pose at a time of the scripted press: just touching at first, then down stage by stage."""

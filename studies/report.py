@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from studies.models import KINDS
 from studies.rehearsal import Rehearsal
 from studies.results import counted, spread
 from studies.setup import setup_of_scene
@@ -80,7 +81,7 @@ def summary(report: dict) -> str:
     )
     return "\n".join(
         [
-            f"model     {_model_line(report)}",
+            f"model     {KINDS[report['model']].reported.format(**report)}",
             f"step      1/{1 / report['time_step_s']:.0f} s in {counted(report['substeps'], 'substep')} of "
             f"{counted(report['iterations'], 'iteration')}",
             f"speed     {times} on {report['arch']}; built in {report['build_s']:.1f} s",
@@ -98,16 +99,3 @@ def _error(expected_mm: float | None) -> str:
     if expected_mm is None:
         return "not known: study trade measured no settings like these"
     return f"{expected_mm:.2f} mm expected, the mean of beads with settings like these (study trade)"
-
-
-def _model_line(report: dict) -> str:
-    if report["model"] == "neo-hookean":
-        return (
-            f"neo-Hookean, E {report['young_kpa']:g} kPa, nu {report['poisson']:g}: {report['cells']} cells of "
-            f"{report['cell_mm']:g} mm, {report['nodes']} nodes, {report['tetrahedra']} tetrahedra"
-        )
-    return (
-        f"shape matching, stiffness {report['stiffness']:g}: {report['particles']} particles of "
-        f"{report['radius_mm']:g} mm, {report['clusters']} clusters, {report['memberships']} memberships, "
-        f"{report['tetrahedra']} tetrahedra"
-    )

@@ -4,7 +4,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from scenes.scene import NeoHookeanTissue, Scene, with_options
+from scenes.scene import Scene, with_options
+from scenes.tissue import TISSUES
 from ultrasound.array import Probe, load_probe
 
 
@@ -31,13 +32,18 @@ class Setup:
 
     @property
     def size_name(self) -> str:
-        """Which of these values is the size of the model's parts."""
-        return "cell_mm" if self.model == "neo-hookean" else "radius_mm"
+        """Which of the values says how fine the model is."""
+        return TISSUES[self.model].SIZE
 
     @property
     def size_mm(self) -> float:
-        """Width of a cell, or radius of a particle."""
-        return self.cell_mm if self.model == "neo-hookean" else self.radius_mm
+        """How fine the model is: width of a cell, or radius of a particle."""
+        return getattr(self, self.size_name)
+
+    def sized(self, size_mm: float) -> "Setup":
+        """The same of another size."""
+        values: dict[str, Any] = {self.size_name: size_mm}
+        return replace(self, **values)
 
 
 NEO_HOOKEAN = Setup("neo-hookean", cell_mm=3.5, relaxation_factor=1.7, substeps=1, iterations=4)
@@ -55,10 +61,11 @@ PRESETS = {
         "accurate": Setup(radius_mm=2.2),
     },
 }
-# What a setup's values mean nothing to.
+# A setup's values that only some models have: of how the tissue is built, and of what it is made.
+BUILT, MATERIAL = ("radius_mm", "stiffness", "cell_mm"), ("young_kpa", "poisson")
 NOT_USED = {
-    "neo-hookean": ("radius_mm", "stiffness"),
-    "shape-matching": ("cell_mm", "young_kpa", "poisson"),
+    model: tuple(name for name in (*BUILT, *MATERIAL) if name not in section.model_fields)
+    for model, section in TISSUES.items()
 }
 OPTION_OF = {"radius_mm": "radius", "cell_mm": "cell"}
 QUALITIES = ("fast", "balanced", "accurate")
@@ -77,20 +84,16 @@ def scene_of(scene: Scene, setup: Setup) -> Scene:
         "solver.iterations": setup.iterations,
         "solver.relaxation_factor": setup.relaxation_factor,
     }
-    if setup.model == "shape-matching":
-        values["tissue.stiffness"] = setup.stiffness
-    return with_options(scene, values)
+    built = {f"tissue.{name}": getattr(setup, name) for name in BUILT if name not in NOT_USED[setup.model]}
+    return with_options(scene, values | built)
 
 
 def setup_of_scene(scene: Scene, substeps: int, iterations: int, relaxation_factor: float) -> Setup:
     """The setup that a scene is computed with when its steps have these passes."""
     tissue = scene.tissue
-    if isinstance(tissue, NeoHookeanTissue):
-        own: dict[str, Any] = dict(cell_mm=tissue.cell_mm)
-    else:
-        own = dict(radius_mm=tissue.radius_mm, stiffness=tissue.stiffness)
+    built = {name: getattr(tissue, name) for name in BUILT if name not in NOT_USED[tissue.model]}
     return Setup(
-        tissue.model, **own, substeps=substeps, iterations=iterations, relaxation_factor=relaxation_factor
+        tissue.model, **built, substeps=substeps, iterations=iterations, relaxation_factor=relaxation_factor
     )
 
 

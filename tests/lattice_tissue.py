@@ -38,7 +38,7 @@ def tissue_of(
         contacts = SurfaceContacts(body, lattice, points, area, shapes, friction)
     held = None if held is None else held(lattice.nodes)
     model = NeoHookean(body, lattice, contacts, YOUNG_KPA, poisson, 1e3 * DENSITY, held)
-    return Solver(model, contacts, tool=next((s for s in shapes if isinstance(s, ConvexTool)), None))
+    return Solver(model, tool=next((s for s in shapes if isinstance(s, ConvexTool)), None))
 
 
 def put(model: NeoHookean, x: np.ndarray) -> None:

@@ -11,7 +11,8 @@ from click.testing import CliRunner
 from conftest import rotation_about
 
 from app import cli, main
-from scenes.scene import TISSUES, SolverSection
+from scenes.scene import SolverSection
+from scenes.tissue import TISSUES
 from studies.accuracy import (
     bead_errors,
     correlation,

@@ -279,7 +279,7 @@ def test_stabilisation_moves_position_and_estimate_alike(device, ball):
 
 
 def begin(solver: Solver, gravity: list[float], dt: float = 0.0, stabilisations: int = 0) -> None:
-    solver.begin(0, dt, *gravity, 0.0, stabilisations)
+    solver.launch_start(0, dt, *gravity, 0.0, stabilisations)
 
 
 def two_blocks(pairs: bool, scaling: float = 0.0) -> tuple[Solver, np.ndarray]:
@@ -356,7 +356,7 @@ def test_a_pair_shares_its_push_by_the_scaled_masses(device):
 
     @ti.kernel
     def project():
-        pairs.project(1.0, False)
+        pairs.project(1.0)
 
     project()
     moved = np.linalg.norm(solver.body.estimate.to_numpy() - x, axis=1)

@@ -36,7 +36,7 @@ def solver_of(model: str, mesh: trimesh.Trimesh, shapes: list) -> tuple[Solver, 
         return lattice_tissue(mesh, 4.0, shapes, friction=0.35), settings_of(8, DOWN)
     tissue = particle_tissue(mesh, shapes=shapes)
     moving = next((shape for shape in shapes if shape.moves), None)
-    return Solver(tissue, tissue.contacts, tool=moving), StepSettings(gravity=DOWN)
+    return Solver(tissue, tool=moving), StepSettings(gravity=DOWN)
 
 
 def put(solver: Solver, x: np.ndarray, velocity=(0.0, 0.0, 0.0)) -> None:

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from render.viewer import Controls, Settings
-from scenes.scene import NeoHookeanTissue
+from scenes.tissue import NeoHookeanTissue
 from sim.body import BodyState
 from sim.guard import Watch
 from sim.solver import SolverState, StepSettings

@@ -14,11 +14,11 @@ from scenes.scene import (
     Press,
     Scene,
     SceneError,
-    ShapeMatchingTissue,
     load_scene,
     scene_text,
     with_options,
 )
+from scenes.tissue import ShapeMatchingTissue
 from studies.models import step_settings
 
 

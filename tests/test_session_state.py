@@ -88,6 +88,6 @@ def test_a_course_counts_presses_ways_and_time_over_the_limit():
         course.add(None if at_mm is None else pose, 0.0)
     # 5 mm, 1 mm, a way back, whose leap is no way of the transducer, 2 mm.
     assert (course.path_mm, course.fastest_mm_s, course.went_back) == (8.0, 5.0 / STEP_S, 1)
-    figures = course.summary({"seen_organ": 0.25, "contact_mm2": 3.0}, [Gap(1.5, np.zeros(3), 2.0)], 4)
+    figures = course.summary({"seen_organ": 0.25, "contact_mm2": 3.0}, [Gap(1.5, 2.0)], 4)
     assert (figures["duration_s"], figures["bookmarks"], figures["seen_organ"]) == (2.0, 4, 0.25)
     assert "contact_mm2" not in figures and "2 presses" in in_words(figures) and "1.5 ml" in in_words(figures)

@@ -25,8 +25,8 @@ def solver_of(
     serial=None,
 ):
     model = tissue_of(mesh, radius, shapes, friction, relaxation, scaling, serial=serial)
-    particle_contacts = ParticleContacts(model.body, model, 0.25) if pairs else None
-    return Solver(model, model.contacts, particle_contacts, tool, relaxation)
+    particle_contacts = ParticleContacts(model, 0.25) if pairs else None
+    return Solver(model, particle_contacts, tool)
 
 
 def position(solver: Solver) -> np.ndarray:
@@ -151,11 +151,11 @@ def test_without_friction_a_slope_holds_nothing(device, block):
     assert slide(block, 10.0, friction=0.0)[0] == pytest.approx(np.sin(np.radians(10)), rel=0.02)
 
 
-def pressed(mesh, threads: int, pairs: bool, serial: bool) -> bytes:
+def pressed(mesh, threads: int, serial: bool) -> bytes:
     start("cpu", cpu_max_num_threads=threads)
     tool = ConvexTool.cuboid(np.array([10.0, 6.0, 10.0]))
     floor = Plane(np.array([0.0, 0.0, 1.0]), -12.0)
-    solver = solver_of(mesh, [floor, tool], tool=tool, pairs=pairs, serial=serial)
+    solver = solver_of(mesh, [floor, tool], tool=tool, pairs=True, serial=serial)
     poses = np.tile(np.eye(4), (4, 1, 1))
     for step in range(20):
         poses[:, 2, 3] = 17.0 - 0.3 * (step + np.arange(4) / 3)
@@ -163,24 +163,10 @@ def pressed(mesh, threads: int, pairs: bool, serial: bool) -> bytes:
     return position(solver).tobytes() + solver.body.velocity.to_numpy().tobytes()
 
 
-@pytest.mark.parametrize("pairs, serial", [(True, True), (True, False), (False, False)])
-def test_two_runs_give_the_same_bits_whatever_the_threads(ball, pairs, serial):
-    assert pressed(ball, 1, pairs, serial) == pressed(ball, 2, pairs, serial)
+@pytest.mark.parametrize("serial", [True, False])
+def test_pairs_give_the_same_bits_whatever_the_threads(ball, serial):
+    assert pressed(ball, 1, serial) == pressed(ball, 2, serial)
     ti.reset()
-
-
-def test_a_restored_state_goes_on_with_the_same_bits(device, ball):
-    solver = solver_of(ball, [bowl()])
-    for _ in range(5):
-        solver.step(StepSettings())
-    state = solver.snapshot()
-    ends = []
-    for _ in range(3):
-        for _ in range(5):
-            solver.step(StepSettings())
-        ends.append(position(solver).tobytes())
-        solver.restore(state)
-    assert ends[0] == ends[1] == ends[2]
 
 
 def test_sliding_over_a_curved_surface_does_not_sink_in(device, ball):

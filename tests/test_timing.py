@@ -27,7 +27,7 @@ def solver_of(model: str, mesh: trimesh.Trimesh) -> Solver:
     if model == "neo-hookean":
         return lattice_tissue(mesh, 4.0, shapes, friction=0.35)
     tissue = particle_tissue(mesh, shapes=shapes)
-    return Solver(tissue, tissue.contacts, tool=shapes[1])
+    return Solver(tissue, tool=shapes[1])
 
 
 @pytest.mark.parametrize("model", ["neo-hookean", "shape-matching"])
@@ -90,7 +90,7 @@ def test_memory_is_that_of_the_fields(device, block):
     solver = Solver(tissue)
     n = tissue.body.count
     body = (4 * 3 + 1) * 4 * n
-    pairs = ParticleContacts(tissue.body, tissue, 0.25)
+    pairs = ParticleContacts(tissue, 0.25)
     grown = Solver(tissue, pairs=pairs)
     own = 4 * (2**15 + 1 + 2**15 + 3 * n + 24 * n + 3 * n + 1)
     assert 1e6 * (measure.memory_mb(grown) - measure.memory_mb(solver)) == pytest.approx(own)

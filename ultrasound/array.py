@@ -7,7 +7,7 @@ plane are (u, v) [mm]: u to the marked side, v down into the tissue, the origin 
 import difflib
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -19,10 +19,10 @@ FWHM_OF_SD = float(np.sqrt(8 * np.log(2)))
 GAIN_RANGE_DB, TGC_RANGE_DB, TGC_SLIDERS = 60.0, 24.0, 8
 
 Mode = Literal["both", "b-mode", "ct"]
-MODES: tuple[Mode, ...] = ("both", "b-mode", "ct")
+MODES: tuple[Mode, ...] = get_args(Mode)
 # The echo's ladder of realism: reflection and attenuation; and speckle and point spread; and the thickness of the plane.
 Rung = Literal["reflection", "speckle", "elevation"]
-RUNGS: tuple[Rung, ...] = ("reflection", "speckle", "elevation")
+RUNGS: tuple[Rung, ...] = get_args(Rung)
 
 Percent = Annotated[float, Field(ge=0, le=100)]
 
@@ -97,6 +97,7 @@ class Probe(BaseModel):
 
     @property
     def wavelength_mm(self) -> float:
+        """Of the sound in soft tissue."""
         return SOUND_MM_US / self.frequency_mhz
 
     @property
@@ -119,6 +120,7 @@ class Probe(BaseModel):
 
     @property
     def focus_mm(self) -> float:
+        """Depth of the focus."""
         return self.depth_mm * self.focus_depth_percent / 100
 
     @property

@@ -61,6 +61,7 @@ class Interface:
 
     @ti.func
     def depth_mm(self):
+        """Its middle."""
         return self.middle / self.steps
 
     @ti.func
@@ -116,7 +117,7 @@ class Beams:
             self.touching[i + 1] = self.touching[i] + near
 
     @ti.func
-    def look(self, linear, row, column, place, planes: ti.template(), elevation_sd: ti.f32):
+    def look(self, planes: ti.template(), linear, row, column, place, elevation_sd: ti.f32):
         """Impedance, attenuation and backscatter at a place (u, v) of the plane, and where its tissue was at rest."""
         rest = linear @ tm.vec4(place, 0.0, 1.0)
         found = tm.vec3(0.0)
@@ -152,7 +153,7 @@ class Beams:
                 self.real[line, i] = 0.0
             row, column = self.plane.pixel_near(start, pixel_mm, first_mm)
             linear = self.plane.map_of(row, column)
-            near, rest = self.look(linear, row, column, start, planes, elevation_sd)
+            near, rest = self.look(planes, linear, row, column, start, elevation_sd)
             loss_db, passed, loud = 0.0, 1.0, 1.0
             interface = Interface()
             interface.begin(near, 0.0, loud)
@@ -161,7 +162,7 @@ class Beams:
                 place = start + (depth + stride_mm) * direction
                 row, column = self.plane.pixel_near(place, pixel_mm, first_mm)
                 linear_far = self.plane.map_of(row, column)
-                far, rest_far = self.look(linear_far, row, column, place, planes, elevation_sd)
+                far, rest_far = self.look(planes, linear_far, row, column, place, elevation_sd)
                 # Beyond the CT nothing is known: nothing scatters, nothing reflects.
                 if far.x < 1e-6:
                     far.x = near.x

@@ -19,7 +19,7 @@ from ultrasound.volume import Volume
 # A probe's samples are a multiple of this.
 LANES = 16
 Packet = ti.types.vector(LANES, ti.f32)
-# Samples from one look into the tissue to the next, the longer one if it is no farther than a voxel: that is how fast tissue changes.
+# Samples from one look into the tissue to the next: the more, if they are no longer than a voxel, for so fast tissue changes.
 STRIDES = (8, 4)
 SILENCE = 1e-9
 
@@ -133,6 +133,7 @@ class BMode:
 
     @ti.func
     def packet(self, field: ti.template(), row, first):
+        """LANES entries of a row of a field."""
         return Packet([field[row, first + i] for i in ti.static(range(LANES))])
 
     @ti.kernel

@@ -28,10 +28,9 @@ LEAST_GAP_ML = 0.05
 
 @dataclass(frozen=True)
 class Gap:
-    """A coherent part of a target that was not seen: how large, where its middle is (3,) [mm], and how thick at most."""
+    """A coherent part of a target that was not seen: how large, and how thick at most."""
 
     volume_ml: float
-    centre_mm: np.ndarray
     thickness_mm: float
 
 
@@ -116,8 +115,7 @@ class Coverage:
             mask = parts == part
             volume = float(mask.sum()) * VOXEL_MM**3 / 1000
             if volume >= LEAST_GAP_ML:
-                centre = self.low_mm + VOXEL_MM * np.argwhere(mask).mean(axis=0)
-                found.append(Gap(volume, centre, float(thickness[mask].max())))
+                found.append(Gap(volume, float(thickness[mask].max())))
         return sorted(found, key=lambda gap: -gap.volume_ml)
 
     def at(self, places_mm: np.ndarray) -> np.ndarray:

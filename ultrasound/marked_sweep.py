@@ -28,6 +28,7 @@ class MarkedSweep:
 
     @property
     def count(self) -> int:
+        """Frames so far."""
         return self._pictures.count
 
     def add(

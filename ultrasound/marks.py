@@ -6,6 +6,7 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
+from sim.fields import field_of
 from ultrasound.plane import Picture, PlaneInTissue
 from ultrasound.sweep import Mark
 from ultrasound.volume import Volume
@@ -35,8 +36,7 @@ class Marks:
         if self.beads > MOST_BEADS:
             raise ValueError(f"{self.beads} beads: a pixel has room for {MOST_BEADS}")
         if beads is not None:
-            self.bead = ti.Vector.field(3, ti.f32, len(beads))
-            self.bead.from_numpy(np.asarray(beads, np.float32))
+            self.bead = field_of(np.asarray(beads, float), 1)
 
     def render(self) -> np.ndarray:
         """Marks (pixels, pixels) uint8."""

@@ -30,10 +30,14 @@ def pose_at(
         across = np.eye(3)[np.argmin(np.abs(z))]
         x = across - np.dot(across, z) * z
     x /= np.linalg.norm(x)
-    pose = np.eye(4)
-    pose[:3, :3] = np.column_stack([x, np.cross(z, x), z])
-    pose[:3, 3] = np.asarray(face_centre, float) + length_mm / 2 * z
-    return pose
+    return rigid(np.column_stack([x, np.cross(z, x), z]), np.asarray(face_centre, float) + length_mm / 2 * z)
+
+
+def rigid(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Matrices (..., 4, 4) of rotations (..., 3, 3) and positions (..., 3)."""
+    matrix = np.zeros((*position.shape[:-1], 4, 4))
+    matrix[..., :3, :3], matrix[..., :3, 3], matrix[..., 3, 3] = rotation, position, 1.0
+    return matrix
 
 
 def image_plane(
@@ -90,13 +94,8 @@ def advanced(pose: np.ndarray, depth_mm: float) -> np.ndarray:
 
 
 def between(start: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
-    """Poses (count + 1, 4, 4) evenly from start to end: straight in position, the short way round in angle."""
-    at = np.linspace(0.0, 1.0, count + 1)
-    poses = np.tile(np.eye(4), (count + 1, 1, 1))
-    turns = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([start[:3, :3], end[:3, :3]])))
-    poses[:, :3, :3] = turns(at).as_matrix()
-    poses[:, :3, 3] = start[:3, 3] + at[:, None] * (end[:3, 3] - start[:3, 3])
-    return poses
+    """Poses (count + 1, 4, 4) evenly from start to end, as ``interpolated``."""
+    return interpolated(start, end, np.linspace(0.0, 1.0, count + 1))
 
 
 def approached(pose: np.ndarray, goal: np.ndarray, most_mm: float, most_deg: float) -> np.ndarray:
@@ -104,18 +103,17 @@ def approached(pose: np.ndarray, goal: np.ndarray, most_mm: float, most_deg: flo
     way = float(np.linalg.norm(goal[:3, 3] - pose[:3, 3]))
     turn = np.degrees(Rotation.from_matrix(goal[:3, :3] @ pose[:3, :3].T).magnitude())
     share = min(1.0, most_mm / max(way, 1e-9), most_deg / max(turn, 1e-9))
-    if share >= 1.0:
-        return goal.copy()
-    return interpolated(pose, goal, share)
+    return goal.copy() if share >= 1.0 else interpolated(pose, goal, share)
 
 
-def interpolated(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
-    """The pose a share (0 to 1) of the way from start to end: straight in position, the short way round in angle."""
+def interpolated(start: np.ndarray, end: np.ndarray, share: float | np.ndarray) -> np.ndarray:
+    """The pose (4, 4), or poses (n, 4, 4), at a share (0 to 1), or shares (n,), of the way from start to end.
+
+    It is straight in position, and the short way round in angle.
+    """
     turns = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([start[:3, :3], end[:3, :3]])))
-    pose = np.eye(4)
-    pose[:3, :3] = turns([share]).as_matrix()[0]
-    pose[:3, 3] = start[:3, 3] + share * (end[:3, 3] - start[:3, 3])
-    return pose
+    way = np.asarray(share)[..., None] * (end[:3, 3] - start[:3, 3])
+    return rigid(turns(share).as_matrix(), start[:3, 3] + way)
 
 
 @dataclass(frozen=True)
@@ -133,7 +131,8 @@ class Hand:
     """What holds the transducer: where on the settled organ it aims, how it is turned, how deep it presses.
 
     ``vertices`` (n, 3), ``faces`` (m, 3) and ``normals`` (n, 3) are the settled surface [mm]; ``home`` is the pose it
-    starts from. ``radius_mm`` is that of a curved face. ``depth_mm`` is what keys push, ``pressed_mm`` what a held button adds until it is let go.
+    starts from. ``radius_mm`` is that of a curved face. ``depth_mm`` is what keys push, ``pressed_mm`` what a held button
+    adds until it is let go.
     """
 
     vertices: np.ndarray

@@ -7,7 +7,7 @@ import taichi.math as tm
 from ultrasound.plane import LANES, Picture, PlaneInTissue
 from ultrasound.volume import AIR_HU, Volume
 
-OUTSIDES = ("background", "gel", "air")
+# What the picture shows of all that is not the organ; the background is the CT itself.
 OUTSIDE_HU = {"background": 0.0, "gel": 0.0, "air": AIR_HU}
 
 
@@ -21,8 +21,8 @@ class Slice:
     """
 
     def __init__(self, ct: Volume, organ: Volume, plane: PlaneInTissue, outside: str = "background") -> None:
-        if outside not in OUTSIDES:
-            raise ValueError(f"outside is {outside!r}: expected one of {', '.join(OUTSIDES)}")
+        if outside not in OUTSIDE_HU:
+            raise ValueError(f"outside is {outside!r}: expected one of {', '.join(OUTSIDE_HU)}")
         self.ct = ct
         self.organ = organ
         self.plane = plane

@@ -9,6 +9,8 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
+from sim.fields import field_of
+
 SIZE_BITS = 6
 SIZE = 1 << SIZE_BITS
 # Entries of the noise in one standard deviation of its correlation kernel.
@@ -39,8 +41,7 @@ class Speckle:
 
     def __init__(self) -> None:
         real, imaginary = np.rint(noise_block().reshape(-1, 2).T / UNIT).astype(np.int32)
-        self.noise = ti.field(ti.i32, SIZE**3)
-        self.noise.from_numpy((imaginary << 16) | (real & 0xFFFF))
+        self.noise = field_of((imaginary << 16) | (real & 0xFFFF))
 
     @ti.func
     def at(self, rest, sd_mm):

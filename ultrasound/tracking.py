@@ -6,6 +6,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from ultrasound.probe import rigid
+
 
 @dataclass(frozen=True)
 class TrackingErrors:
@@ -60,25 +62,18 @@ def _delayed(poses: np.ndarray, times: np.ndarray, latency_s: float) -> np.ndarr
     earlier = np.maximum(times - latency_s, times[0])
     turns = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(earlier)
     places = [np.interp(earlier, times, poses[:, axis, 3]) for axis in range(3)]
-    return _rigid(turns.as_matrix(), np.stack(places, axis=1))
+    return rigid(turns.as_matrix(), np.stack(places, axis=1))
 
 
 def _noisy(poses: np.ndarray, errors: TrackingErrors, draw: np.random.Generator) -> np.ndarray:
     shifts = errors.noise_mm * draw.standard_normal((len(poses), 3))
     turns = np.radians(errors.noise_deg) * draw.standard_normal((len(poses), 3))
     turned = poses[:, :3, :3] @ Rotation.from_rotvec(turns).as_matrix()
-    return _rigid(turned, poses[:, :3, 3] + shifts)
+    return rigid(turned, poses[:, :3, 3] + shifts)
 
 
 def _calibration(errors: TrackingErrors, draw: np.random.Generator) -> np.ndarray:
     """The map (4, 4) from where the image is taken to be to where it is."""
     direction, axis = (v / np.linalg.norm(v) for v in draw.standard_normal((2, 3)))
     turn = Rotation.from_rotvec(np.radians(errors.calibration_deg) * axis)
-    return _rigid(turn.as_matrix(), errors.calibration_mm * direction)
-
-
-def _rigid(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Matrices (..., 4, 4) of rotations (..., 3, 3) and positions (..., 3)."""
-    matrix = np.zeros((*position.shape[:-1], 4, 4))
-    matrix[..., :3, :3], matrix[..., :3, 3], matrix[..., 3, 3] = rotation, position, 1.0
-    return matrix
+    return rigid(turn.as_matrix(), errors.calibration_mm * direction)

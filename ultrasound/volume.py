@@ -6,6 +6,7 @@ import taichi.math as tm
 import trimesh
 
 from sim.distance import signed_distance
+from sim.fields import field_of
 from ultrasound.plane import LANES, Lanes
 
 AIR_HU = -1000.0
@@ -27,12 +28,8 @@ class Volume:
         self.shape, self.count = voxels.shape[:3], filled.shape[:3]
         self.outside = float(outside)
         self.strides = self.count[1] * self.count[2], self.count[2]
-        flat = np.ascontiguousarray(filled).reshape(-1, *voxels.shape[3:])
-        if voxels.ndim == 4:
-            self.voxels = ti.Vector.field(voxels.shape[3], ti.f32, len(flat))
-        else:
-            self.voxels = ti.field(ti.f32, len(flat))
-        self.voxels.from_numpy(flat)
+        flat = filled.reshape(-1, *voxels.shape[3:])
+        self.voxels = field_of(flat, voxels.ndim - 3)
         self.linear = ti.Matrix(index_from_mm[:3, :3].tolist())
         self.offset = ti.Vector(index_from_mm[:3, 3].tolist())
 
@@ -105,10 +102,12 @@ class Volume:
 
     @ti.func
     def lanes_of(self, first, shift: ti.template()):
+        """The voxels ``shift`` after those of the lanes."""
         return Lanes([self.voxels[first[lane] + shift] for lane in ti.static(range(LANES))])
 
     @ti.func
     def along_z(self, voxel, t):
+        """Linear between a voxel and the next."""
         return tm.mix(self.voxels[voxel], self.voxels[voxel + 1], t)
 
     @ti.func

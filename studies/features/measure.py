@@ -12,13 +12,14 @@ from taichi.profiler.kernel_profiler import get_default_kernel_profiler
 from render.layout import Layout
 from render.page import Page
 from scenes.anatomy import LoadedAnatomy
-from scenes.scene import Contact, Scene, ShapeMatchingTissue, SolverSection, with_options
+from scenes.scene import Contact, Scene, SolverSection, with_options
+from scenes.tissue import TISSUES, ShapeMatchingTissue, TissueSection
 from sim.device import start
 from sim.distance import distance_grid
 from sim.embedding import Embedding
 from sim.shapes import GRID_MM, ConvexTool, SignedDistanceField
 from sim.solver import Solver
-from studies.models import AnyTissue, build_solver, embedding_cell_mm, fill, reach_of, step_settings
+from studies.models import KINDS, build_solver, embedding_cell_mm, fill, step_settings
 from studies.rehearsal import SURROUNDINGS_MM, Rehearsal, scanned_anatomy
 from studies.rehearse.view import settings_of, take_view
 from studies.report import Tally
@@ -78,18 +79,18 @@ class Body:
     middle of the organ [mm].
     """
 
-    def __init__(self, scene: Scene, anatomy: LoadedAnatomy, tissue: AnyTissue) -> None:
+    def __init__(self, scene: Scene, anatomy: LoadedAnatomy, tissue: TissueSection) -> None:
         self.tissue = tissue
         self.settings = step_settings(tissue, scene.solver)
         middle = anatomy.organ.bounds.mean(axis=0)
         self.organ = moved_by(anatomy.organ, -middle)
-        reach_mm = reach_of(tissue)
+        reach_mm = KINDS[tissue.model].reach_mm(tissue)
         self.supports = [
             distance_grid(shape.vertices - middle, shape.faces, GRID_MM, reach_mm)
             for shape in anatomy.shapes
             if isinstance(shape, trimesh.Trimesh)
         ]
-        self.rest = fill(self.organ, tissue) if isinstance(tissue, ShapeMatchingTissue) else None
+        self.filled = fill(self.organ, tissue) if isinstance(tissue, ShapeMatchingTissue) else self.organ
         down = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
         x, y, z = (1e3 * scene.gravity.acceleration_m_s2 * down).tolist()
         self.settings.gravity = (x, y, z)
@@ -111,7 +112,7 @@ class Body:
         )
         section = SolverSection(mass_scaling_per_mm=options.mass_scaling_per_mm)
         return build_solver(
-            self.organ,
+            self.filled,
             self.tissue,
             [*shapes, tool] if tool else shapes,
             tool,
@@ -130,8 +131,8 @@ class Body:
 
 def body_of(scene: Scene, anatomy: LoadedAnatomy, model: str, size_mm: float) -> Body:
     """The scene's organ in a tissue model, of cells or particles of a size."""
-    size = {"tissue.cell_mm" if model == "neo-hookean" else "tissue.radius_mm": size_mm}
-    tissue = with_options(scene, {"tissue.model": model, **size}).tissue
+    options: dict[str, str | float | None] = {"tissue.model": model, f"tissue.{TISSUES[model].SIZE}": size_mm}
+    tissue = with_options(scene, options).tissue
     return Body(scene, anatomy, tissue)
 
 

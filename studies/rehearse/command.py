@@ -10,7 +10,8 @@ from render.display import display_available
 from render.keys import Keys, keys_text, load_keys
 from scenes.anatomy import LoadedAnatomy, fingerprint, load_anatomy
 from scenes.reading.progress import Stages, Told
-from scenes.scene import EMBEDDED, OPTIONS, TISSUES, Scene, load_scene, with_options
+from scenes.scene import EMBEDDED, OPTIONS, Scene, load_scene, with_options
+from scenes.tissue import TISSUES
 from studies.command_line import (
     Fault,
     NumberRange,

@@ -9,7 +9,6 @@ from render.gamepad import Gamepad
 from render.keys import Keys
 from render.layout import FULL_SIZE
 from render.viewer import Geometry, Settings, View, Viewer
-from scenes.scene import NeoHookeanTissue
 from studies.rehearsal import Rehearsal
 from studies.report import Tally, expected_error_of
 from studies.stopwatch import timed
@@ -23,8 +22,8 @@ def settings_of(rehearsal: Rehearsal) -> Settings:
     scene, step, probe = rehearsal.scene, rehearsal.settings, rehearsal.probe
     tissue = scene.tissue
     settings = Settings(
-        young_kpa=tissue.young_kpa if isinstance(tissue, NeoHookeanTissue) else None,
-        stiffness=None if isinstance(tissue, NeoHookeanTissue) else step.stiffness,
+        young_kpa=getattr(tissue, "young_kpa", None),
+        stiffness=step.stiffness if hasattr(tissue, "stiffness") else None,
         iterations=step.iterations,
         substeps=step.substeps,
         gravity_m_s2=scene.gravity.acceleration_m_s2,

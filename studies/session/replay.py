@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from scenes.scene import NeoHookeanTissue
 from studies.rehearsal import Rehearsal, RehearsalState
 from studies.session.file import Log, SessionError
 from studies.session.session import SETTLED, Session
@@ -142,7 +141,7 @@ def set_solver(rehearsal: Rehearsal, values: dict[str, Any]) -> None:
     step = rehearsal.settings
     for name in ("iterations", "substeps", "stiffness"):
         setattr(step, name, values.get(name, getattr(step, name)))
-    if "young_kpa" in values and isinstance(rehearsal.scene.tissue, NeoHookeanTissue):
+    if "young_kpa" in values:
         rehearsal.set_young(values["young_kpa"])
     if "gravity_m_s2" in values:
         rehearsal.set_gravity(values["gravity_m_s2"])

@@ -7,13 +7,14 @@ import trimesh
 
 from scenes.anatomy import load_anatomy
 from scenes.scene import PAPER, Contact, SolverSection, load_scene, with_options
+from scenes.tissue import TISSUES
 from sim.device import start
 from sim.guard import Guard
 from sim.neo_hookean import LATTICE_SETTINGS, NeoHookean
 from sim.shapes import ConvexTool, Plane
 from sim.skinning import Skin
 from sim.solver import Solver, StepSettings
-from studies.blocks import DENSITY, block_of_cells, block_of_particles
+from studies.blocks import block_of_cells, block_of_particles
 from studies.models import build_solver, step_settings
 from studies.rehearsal import Rehearsal
 from studies.setup import PRESETS
@@ -26,6 +27,7 @@ from ultrasound.probe import advanced, pose_at, touching
 ELLIPSOID_MM, BALL_MM, APART_MM = (30.0, 18.0, 15.0), 12.0, 40.0
 SIZE_MM = {"neo-hookean": 6.0, "shape-matching": 3.3}
 TRANSDUCER_MM = np.array([20.0, 6.0, 20.0])
+DENSITY = 1.05e-3
 DOWN = (0.0, 0.0, -9810.0)
 # So many steps at a time, until nothing moves any more.
 SETTLE_STEPS, MOST_SETTLES, STILL_MM_S = 180, 20, 0.05
@@ -129,8 +131,8 @@ def _filled(
     model: str, subject: Subject, mesh: trimesh.Trimesh, shapes: list, tool: ConvexTool
 ) -> tuple[Solver, StepSettings]:
     size = subject.size_mm or SIZE_MM[model]
-    name = "tissue.cell_mm" if model == "neo-hookean" else "tissue.radius_mm"
-    tissue = with_options(load_scene(PAPER), {"tissue.model": model, name: size}).tissue
+    options: dict[str, str | float | None] = {"tissue.model": model, f"tissue.{TISSUES[model].SIZE}": size}
+    tissue = with_options(load_scene(PAPER), options).tissue
     scaling = np.log(subject.mass_ratio) / np.ptp(mesh.bounds[:, 2])
     section = SolverSection(mass_scaling_per_mm=min(float(scaling), 1.0))
     contact = Contact(particles=subject.kind == "two" and model == "shape-matching")

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from scenes.tissue import TISSUES
 from studies.rehearsal import Rehearsal
 from studies.setup import Setup
 from studies.stopwatch import timed
@@ -71,5 +72,5 @@ def trial_ms(rehearsal: Rehearsal) -> float:
 
 def described(setup: Setup) -> str:
     """Settings in words."""
-    parts = "cells" if setup.model == "neo-hookean" else "particles"
-    return f"{setup.model}, {parts} of {setup.size_mm:g} mm, {setup.substeps} x {setup.iterations} passes"
+    size = f"{TISSUES[setup.model].PIECES} of {setup.size_mm:g} mm"
+    return f"{setup.model}, {size}, {setup.substeps} x {setup.iterations} passes"

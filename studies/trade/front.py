@@ -73,10 +73,8 @@ def expected_error_mm(points: Sequence[Point], setup: Setup) -> float | None:
 
     def away(point: Point) -> float:
         other = point.setup
-        if other.model == "neo-hookean":
-            size = np.log(setup.cell_mm / other.cell_mm)
-        else:
-            size = np.log(setup.radius_mm / other.radius_mm) + (setup.stiffness - other.stiffness)
+        # Of a model without one the stiffness is the same in all setups.
+        size = np.log(setup.size_mm / other.size_mm) + (setup.stiffness - other.stiffness)
         passes = np.log(setup.substeps * setup.iterations / (other.substeps * other.iterations))
         return abs(size) + abs(passes) + 0.1 * abs(setup.relaxation_factor - other.relaxation_factor)
 

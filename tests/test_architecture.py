@@ -1,0 +1,171 @@
+"""The layers of the house: which folder may import which, no module in a circle, and no file too long to read."""
+
+import ast
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from conftest import ROOT
+
+LAYERS = ("app", "studies", "render", "ultrasound", "sim", "scenes")
+# app -> studies -> render -> ultrasound -> sim, and scenes is data: what a layer must not know, and which libraries.
+FORBIDDEN = {
+    "scenes": {"app", "studies", "render", "ultrasound", "sim", "taichi"},
+    "sim": {"app", "studies", "render", "ultrasound", "scenes"},
+    "ultrasound": {"app", "studies", "render", "scenes"},
+    "render": {"app", "studies", "scenes"},
+    "studies": {"app"},
+}
+# What of other layers the screen may name: which choices there are, and the folder itself, which keeps Taichi quiet.
+# Solvers, bodies and scanners stay out: it is handed arrays.
+KNOWN_TO_RENDER = {"sim", "ultrasound.array", "ultrasound.target"}
+MOST_LINES = 400
+
+
+class Import(NamedTuple):
+    """One import, wherever it stands, also within a function: module ``name`` by ``module``."""
+
+    module: str
+    name: str
+    file: str
+    line: int
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line} imports {self.name}"
+
+
+def module_of(path: Path) -> str:
+    """The name of a file of the project: scenes/reading/ct.py -> scenes.reading.ct."""
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """All of the program, by name."""
+    files = (file for layer in LAYERS for file in (ROOT / layer).rglob("*.py"))
+    return {module_of(path): path for path in (ROOT / "app.py", *sorted(files))}
+
+
+@cache
+def nodes() -> list[tuple[str, str, ast.AST]]:
+    """All that the program's sources consist of, each with its module and file."""
+    return [
+        (module, path.relative_to(ROOT).as_posix(), node)
+        for module, path in modules().items()
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+    ]
+
+
+@cache
+def imports() -> list[Import]:
+    """All imports of the program; ``from a import b`` names a.b where that is a module, else a."""
+    found = []
+    for module, file, node in nodes():
+        if isinstance(node, ast.Import):
+            names = [each.name for each in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file}:{node.lineno} imports by dots: write the whole name"
+            inner = [f"{node.module}.{each.name}" for each in node.names]
+            names = [name if name in modules() else str(node.module) for name in inner]
+        else:
+            continue
+        found += [Import(module, name, file, node.lineno) for name in dict.fromkeys(names)]
+    return found
+
+
+def layer_of(name: str) -> str:
+    return name.partition(".")[0]
+
+
+def listed(wrong: list) -> str:
+    return "\n" + "\n".join(map(str, wrong))
+
+
+def test_the_program_is_found():
+    assert {layer_of(name) for name in modules()} == set(LAYERS)
+    # One that stands in a function.
+    assert Import("studies.commands", "studies.workers", "studies/commands.py", 0) in {
+        each._replace(line=0) for each in imports()
+    }
+    assert {"taichi.ui.utils", "sim.embedding"} <= {each.name for each in imports()}
+
+
+@pytest.mark.parametrize("layer", FORBIDDEN)
+def test_imports_go_one_way(layer):
+    wrong = [
+        each
+        for each in imports()
+        if layer_of(each.module) == layer and layer_of(each.name) in FORBIDDEN[layer]
+    ]
+    assert not wrong, f"{layer} must not know {', '.join(sorted(FORBIDDEN[layer]))}:{listed(wrong)}"
+
+
+def test_the_screen_is_handed_arrays():
+    wrong = [
+        each
+        for each in imports()
+        if layer_of(each.module) == "render"
+        and layer_of(each.name) in ("sim", "ultrasound")
+        and each.name not in KNOWN_TO_RENDER
+    ]
+    assert not wrong, f"render knows {', '.join(sorted(KNOWN_TO_RENDER))} alone:{listed(wrong)}"
+
+
+def test_one_file_knows_the_window_library():
+    found = [str(each) for each in imports() if f"{each.name}.".startswith("taichi.ui.")]
+    found += [
+        f"{file}:{node.lineno} uses {ast.unparse(node)}"
+        for _, file, node in nodes()
+        if isinstance(node, ast.Attribute) and ast.unparse(node) in ("ti.ui", "taichi.ui")
+    ]
+    wrong = [each for each in found if not each.startswith("render/window.py:")]
+    assert len(wrong) < len(found), (
+        "render/window.py does not use taichi.ui: what is looked for here is wrong"
+    )
+    assert not wrong, f"taichi.ui belongs to render/window.py:{listed(wrong)}"
+
+
+def test_no_module_imports_itself_in_a_circle():
+    graph: dict[str, set[str]] = {name: set() for name in modules()}
+    for each in imports():
+        if each.name in graph and each.name != each.module:
+            graph[each.module].add(each.name)
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        # graphlib lists a circle from what is imported to what imports it.
+        steps = {(name, module) for name, module in pairwise(error.args[1])}
+        pytest.fail("modules in a circle:" + listed([e for e in imports() if (e.name, e.module) in steps]))
+
+
+def test_a_name_with_an_underscore_stays_in_its_module():
+    wrong = [
+        f"{file}:{node.lineno} imports {each.name}"
+        for _, file, node in nodes()
+        if isinstance(node, ast.ImportFrom) and layer_of(str(node.module)) in LAYERS
+        for each in node.names
+        if each.name.startswith("_")
+    ]
+    # Of attributes those that a class of the program has; a library's may be all there is.
+    own = {node.name for _, _, node in nodes() if isinstance(node, ast.FunctionDef)}
+    attributes = [(file, node) for _, file, node in nodes() if isinstance(node, ast.Attribute)]
+    own |= {node.attr for _, node in attributes if isinstance(node.ctx, ast.Store)}
+    wrong += [
+        f"{file}:{node.lineno} uses {ast.unparse(node)}"
+        for file, node in attributes
+        if node.attr in own
+        and node.attr.startswith("_")
+        and not node.attr.startswith("__")
+        and ast.unparse(node.value) not in ("self", "cls")
+    ]
+    assert not wrong, f"private to another module:{listed(wrong)}"
+
+
+def test_no_file_is_too_long_to_read():
+    files = [*modules().values(), *sorted((ROOT / "tests").glob("*.py"))]
+    lines = {path.relative_to(ROOT).as_posix(): len(path.read_text("utf-8").splitlines()) for path in files}
+    wrong = [f"{file}:{count}" for file, count in lines.items() if count > MOST_LINES]
+    assert not wrong, f"more than {MOST_LINES} lines:{listed(wrong)}"

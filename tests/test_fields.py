@@ -1,0 +1,22 @@
+"""Arrays on the device are the arrays that they were."""
+
+import numpy as np
+import pytest
+
+from sim.fields import field_of
+
+
+@pytest.mark.parametrize("within", [0, 1, 2])
+@pytest.mark.parametrize("kind", [np.float64, np.float32, np.int64, np.uint8, bool])
+def test_a_field_holds_an_array(device, kind, within):
+    values = np.random.default_rng(0).integers(0, 2 if kind is bool else 100, (5, 4, 3)).astype(kind)
+    field = field_of(values, within)
+    assert field.shape == values.shape[: 3 - within]
+    found = field.to_numpy()
+    assert found.dtype == (np.float32 if np.issubdtype(kind, np.floating) else np.int32)
+    assert np.array_equal(found, values)
+
+
+def test_the_order_in_memory_does_not_matter(device):
+    values = np.arange(12.0).reshape(3, 4)
+    assert np.array_equal(field_of(values.T).to_numpy(), values.T)
