@@ -1,7 +1,7 @@
 """Load what a scene names: surfaces, CT and labels of a patient's folder, or of the embedded patient."""
 
+import contextlib
 import hashlib
-import os
 import tempfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -173,19 +173,22 @@ def phantom_folder() -> Path:
     )
     sources = [HERE / f"{name}.py" for name in names]
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]
-    for root in (CACHE, Path(tempfile.gettempdir()) / "nephron"):
-        folder = root / f"phantom-{digest}"
-        if folder.is_dir():
+    places = [root / f"phantom-{digest}" for root in (CACHE, Path(tempfile.gettempdir()) / "nephron")]
+    there = next((folder for folder in places if folder.is_dir()), None)
+    return there or _saved_in_one_of(places, _phantom_patient())
+
+
+def _saved_in_one_of(places: list[Path], patient: Patient) -> Path:
+    """The first folder that a patient could be saved in. Raises SceneError."""
+    for folder in places:
+        with contextlib.suppress(PatientError):
+            save_patient(patient, folder)
+        if folder.is_dir():  # also where another process was first
             return folder
-        if _can_write(root):
-            patient = _phantom_patient()
-            try:
-                save_patient(patient, folder)
-            except PatientError:
-                if not folder.is_dir():
-                    raise
-            return folder
-    raise SceneError(f"{CACHE}: cannot be written; the embedded patient needs a folder for its files")
+    roots = " and ".join(str(folder.parent) for folder in places)
+    raise SceneError(
+        f"{roots}: the embedded patient's files can be written to neither; free 20 MB in one of them"
+    )
 
 
 def _phantom_patient() -> Patient:
@@ -201,14 +204,6 @@ def _phantom_patient() -> Patient:
 
 def _named(tissues: dict[int, str]) -> dict[str, str]:
     return {str(label): tissue for label, tissue in tissues.items()}
-
-
-def _can_write(folder: Path) -> bool:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return False
-    return os.access(folder, os.W_OK)
 
 
 def load_surface(folder: Path, name: str) -> trimesh.Trimesh:

@@ -6,6 +6,8 @@ import trimesh
 from trimesh.exchange.ply import export_ply
 from trimesh.exchange.stl import export_stl
 
+from scenes.whole_files import whole
+
 # What 3D Slicer looks for in an STL's header and in a PLY's comments.
 SPACE = b"SPACE=LPS"
 STL_HEADER_BYTES = 80
@@ -17,11 +19,8 @@ def save_surface(surface: trimesh.Trimesh, path: Path) -> None:
     Coordinates are float32 there. A PLY keeps the order of the vertices, an STL has none. Raises OSError.
     """
     bare = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
-    written = WRITERS[path.suffix.removeprefix(".")](bare)
-    try:
-        path.write_bytes(written)
-    except OSError as error:  # a full disk's error does not say which file
-        raise OSError(error.errno, error.strerror, str(path)) from None
+    with whole(path) as partial:
+        partial.write_bytes(WRITERS[path.suffix.removeprefix(".")](bare))
 
 
 def _stl(surface: trimesh.Trimesh) -> bytes:

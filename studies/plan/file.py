@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from scenes.trocar import Trocar
+from scenes.whole_files import whole
 from ultrasound.target import Target
 
 MOST_POSES, MOST_MARGIN_MM = 20_000, 30.0
@@ -86,7 +87,8 @@ class Plan(_Part):
 
 def write_plan(plan: Plan, path: Path) -> None:
     """Write a plan; the same plan makes the same bytes. Raises OSError."""
-    path.write_text(json.dumps(plan.model_dump(mode="json"), indent=1) + "\n", "utf-8")
+    with whole(path) as partial:
+        partial.write_text(json.dumps(plan.model_dump(mode="json"), indent=1) + "\n", "utf-8")
 
 
 def scans_of(trials: int) -> int:
