@@ -16,6 +16,7 @@ from scenes.scene import (
     SceneError,
     ShapeMatchingTissue,
     load_scene,
+    scene_file,
     scene_text,
     with_options,
 )
@@ -189,3 +190,20 @@ def test_the_embedded_patient_is_made_once():
     anatomy = load_anatomy(load_scene(EMBEDDED), EMBEDDED.parent)
     assert 150e3 < anatomy.organ.volume < 200e3
     assert anatomy.tumour is not None and len(anatomy.shapes) == 1
+
+
+def test_a_folder_is_its_scene_and_without_one_is_refused(tmp_path):
+    with pytest.raises(SceneError, match=r"holds no scene\.toml; make"):
+        scene_file(tmp_path)
+    (tmp_path / "scene.toml").write_text("")
+    assert scene_file(tmp_path) == scene_file(tmp_path / "scene.toml") == tmp_path / "scene.toml"
+
+
+def test_a_probes_file_is_named_from_where_the_program_was_started(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.toml").write_text("")
+    probes = [
+        with_options(load_scene(EMBEDDED), {"transducer.probe": name}).transducer.probe
+        for name in ("mine.toml", "linear")
+    ]
+    assert probes == [str((tmp_path / "mine.toml").resolve()), "linear"]

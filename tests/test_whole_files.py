@@ -46,7 +46,7 @@ def test_a_folder_takes_the_place_of_an_empty_one_alone(tmp_path):
     path = tmp_path / "a"
     path.mkdir()
     made(path, "first")
-    with pytest.raises(OSError) as caught:
+    with pytest.raises(OSError, match="a'$") as caught:
         made(path, "second")
     assert caught.value.filename == str(path)
     assert [each.name for each in tmp_path.iterdir()] == ["a"] and (path / "b").read_text() == "first"

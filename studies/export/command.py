@@ -9,7 +9,7 @@ from scenes.anatomy import LoadedAnatomy, files_of, load_anatomy
 from scenes.parts import PARTS
 from scenes.patient_folder import check_folder, new_folder
 from scenes.reading.files import file_volume
-from scenes.scene import Scene, load_scene
+from scenes.scene import Scene, load_scene, scene_file
 from scenes.surface_files import FORMATS, save_surface
 from scenes.volume_files import save_image
 
@@ -32,7 +32,7 @@ def export(scene: Path, out: Path, suffix: str) -> None:
 
     All is in mm, in the patient's LPS, at rest. As they lie when they are pressed, rehearse writes them.
     """
-    path = scene / "scene.toml" if scene.is_dir() else scene
+    path = scene_file(scene)
     check_folder(out)
     loaded = load_scene(path)
     anatomy = load_anatomy(loaded, path.parent)

@@ -9,7 +9,7 @@ import click
 from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy
-from scenes.scene import PAPER, load_scene
+from scenes.scene import PAPER, load_scene, scene_file
 from studies.commands import arch_option, make_folder, start_taichi
 from studies.setup import PRESETS
 
@@ -39,7 +39,7 @@ COLUMNS = (
 def features(scene: Path, out: Path, quick: bool, arch: str) -> None:
     """What each feature of SCENE costs in time, memory and kernels: the same press with it and without, in turn."""
     make_folder(out)
-    path = scene / "scene.toml" if scene.is_dir() else scene
+    path = scene_file(scene)
     loaded = load_scene(path)
     anatomy = load_anatomy(loaded, path.parent)
     used = start_taichi(arch)

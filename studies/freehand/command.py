@@ -9,7 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from scenes.anatomy import LoadedAnatomy, load_anatomy
-from scenes.scene import Scene, load_scene
+from scenes.scene import Scene, load_scene, scene_file
 from studies.commands import Fault, NumberRange, arch_option, make_folder, start_taichi
 from studies.freehand.files import save_volumes
 from studies.freehand.picture import save_picture
@@ -166,7 +166,7 @@ def usual_reach_mm(track: Track, spacing_mm: float) -> float:
 def _patient(scene: Path | None) -> tuple[Scene, LoadedAnatomy, Path] | None:
     if scene is None:
         return None
-    path = scene / "scene.toml" if scene.is_dir() else scene
+    path = scene_file(scene)
     loaded = load_scene(path)
     return loaded, load_anatomy(loaded, path.parent), path.parent
 

@@ -10,7 +10,7 @@ import click
 from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy
-from scenes.scene import EMBEDDED, load_scene
+from scenes.scene import EMBEDDED, load_scene, scene_file
 from studies.commands import Fault, arch_option, make_folder, start_taichi
 from studies.setup import PRESETS
 from ultrasound.tracking import TrackingErrors
@@ -28,7 +28,7 @@ def freehand(scenes: tuple[Path, ...], out: Path, quick: bool, arch: str) -> Non
     make_folder(out)
     loaded = []
     for scene in scenes or (EMBEDDED,):
-        path = scene / "scene.toml" if scene.is_dir() else scene
+        path = scene_file(scene)
         one = load_scene(path)
         anatomy = load_anatomy(one, path.parent)
         if anatomy.ct is None:

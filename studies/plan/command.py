@@ -7,7 +7,7 @@ from pydantic import ValidationError
 from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy
-from scenes.scene import EMBEDDED, load_scene, with_options
+from scenes.scene import EMBEDDED, load_scene, scene_file, with_options
 from scenes.trocar import Trocar
 from studies.commands import Fault, NumberRange, make_folder
 from studies.plan.file import FASTEST_MM_S, MOST_MARGIN_MM, MOST_SWEEPS, SLOWEST_MM_S, scans_of, write_plan
@@ -69,9 +69,7 @@ def plan(
     jobs: int | None,
 ) -> None:
     """Plan a sweep over SCENE, a scene file or a patient's folder: poses that show the target on the deforming organ."""
-    path = scene / "scene.toml" if scene.is_dir() else scene
-    if probe and Path(probe).is_file():
-        probe = str(Path(probe).resolve())
+    path = scene_file(scene)
     loaded = with_options(load_scene(path), {"transducer.probe": probe})
     port = trocar_of(loaded.trocar, trocar, cone_deg, wrist_deg)
     anatomy = load_anatomy(loaded, path.parent)

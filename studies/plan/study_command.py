@@ -9,7 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy
-from scenes.scene import EMBEDDED, load_scene, with_options
+from scenes.scene import EMBEDDED, load_scene, scene_file, with_options
 from studies.commands import make_folder
 from studies.plan.file import MOST_SWEEPS
 
@@ -32,8 +32,6 @@ def plan_study(scenes: tuple[Path, ...], out: Path, trials: int, probe: str, job
     A kidney without a tumour is given one.
     """
     make_folder(out)
-    if Path(probe).is_file():
-        probe = str(Path(probe).resolve())
     from studies.plan.compare import compare, count_of
     from studies.plan.virtual_tumour import with_tumour
 
@@ -41,7 +39,7 @@ def plan_study(scenes: tuple[Path, ...], out: Path, trials: int, probe: str, job
     patients = scenes or (EMBEDDED,)
     with tqdm(total=len(patients) * count_of(trials), desc="plan", unit="scan") as bar:
         for number, each in enumerate(patients, 1):
-            path = each / "scene.toml" if each.is_dir() else each
+            path = scene_file(each)
             scene = with_options(load_scene(path), {"transducer.probe": probe})
             anatomy = with_tumour(load_anatomy(scene, path.parent), np.array(scene.gravity.direction))
             run = compare(scene, anatomy, trials, jobs, bar.update)

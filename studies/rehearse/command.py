@@ -8,7 +8,7 @@ import click
 
 from render.keys import Keys, keys_text, load_keys
 from scenes.anatomy import LoadedAnatomy, fingerprint, load_anatomy
-from scenes.scene import EMBEDDED, OPTIONS, TISSUES, Scene, load_scene, with_options
+from scenes.scene import EMBEDDED, OPTIONS, TISSUES, Scene, load_scene, scene_file, with_options
 from studies.commands import Fault, NumberRange, arch_option, make_folder, start_taichi
 from studies.link.options import link_options, opened_link
 from studies.plan.file import is_plan, read_plan
@@ -117,12 +117,8 @@ def rehearse(
     **changes: float | str | None,
 ) -> None:
     """Press the kidney of SCENE, a scene file or a patient's folder, and see what the transducer sees."""
-    path = scene / "scene.toml" if scene.is_dir() else scene
-    if scene.is_dir() and not path.is_file():
-        raise Fault(f"{scene}: holds no scene.toml; make a patient's folder of a CT with: app.py import")
+    path = scene_file(scene)
     changed = {key: changes[option.strip("-").replace("-", "_")] for key, option in OPTIONS.items()}
-    if changed["transducer.probe"] and Path(str(changed["transducer.probe"])).is_file():
-        changed["transducer.probe"] = str(Path(str(changed["transducer.probe"])).resolve())
     before = load_scene(path)
     keys = load_keys(keys_file) if keys_file is not None else Keys()
     refuse_inputs(track_file, track_from, replay, link_leads)

@@ -8,7 +8,7 @@ import click
 from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy
-from scenes.scene import EMBEDDED, load_scene
+from scenes.scene import EMBEDDED, load_scene, scene_file
 from studies.commands import NumberRange, arch_option, make_folder, start_taichi
 from studies.setup import PRESETS, QUALITIES
 
@@ -39,7 +39,7 @@ from studies.setup import PRESETS, QUALITIES
 def replay(scene: Path, out: Path, minutes: float, model: str, quality: str, arch: str) -> None:
     """Record a session in SCENE, led by chance, and compute it again from its file: twice, and once from its middle."""
     make_folder(out)
-    path = scene / "scene.toml" if scene.is_dir() else scene
+    path = scene_file(scene)
     loaded = load_scene(path)
     anatomy = load_anatomy(loaded, path.parent)
     used = start_taichi(arch)

@@ -9,7 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy
-from scenes.scene import load_scene, with_options
+from scenes.scene import load_scene, scene_file, with_options
 from studies.commands import Fault, arch_option, make_folder, start_taichi
 from studies.scan.poses import load_poses
 from studies.setup import probe_of
@@ -59,9 +59,7 @@ def scan(
 
     For each pose of a file, what the probe shows there. Writes PNG pictures and scan.json, which says how large their pixels are.
     """
-    path = scene / "scene.toml" if scene.is_dir() else scene
-    if probe and Path(probe).is_file():
-        probe = str(Path(probe).resolve())
+    path = scene_file(scene)
     options = {"transducer.probe": probe, "image.mode": picture, "image.rung": rung}
     loaded = with_options(load_scene(path), options)
     placed = load_poses(poses)

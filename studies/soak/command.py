@@ -9,7 +9,7 @@ import click
 from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy
-from scenes.scene import PAPER, load_scene
+from scenes.scene import PAPER, load_scene, scene_file
 from studies.commands import arch_option, make_folder, start_taichi
 from studies.setup import PRESETS
 
@@ -28,7 +28,7 @@ HOUR = 60
 def soak(scene: Path, out: Path, minutes: int, quick: bool, model: str | None, arch: str) -> None:
     """An hour of rehearsal in SCENE, faster than real: does the rest shape drift, memory grow, a replay differ?"""
     make_folder(out)
-    path = scene / "scene.toml" if scene.is_dir() else scene
+    path = scene_file(scene)
     loaded = load_scene(path)
     anatomy = load_anatomy(loaded, path.parent)
     used = start_taichi(arch)

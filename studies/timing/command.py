@@ -9,7 +9,7 @@ import click
 from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy
-from scenes.scene import PAPER, load_scene
+from scenes.scene import PAPER, load_scene, scene_file
 from studies.commands import arch_option, make_folder, start_taichi
 from studies.setup import PRESETS, Setup
 
@@ -42,7 +42,7 @@ COLUMNS = (
 def timing(scene: Path, out: Path, quick: bool, arch: str) -> None:
     """How long a time step of SCENE takes: against time, by its pieces, by size, and against a plain loop in C."""
     make_folder(out)
-    path = scene / "scene.toml" if scene.is_dir() else scene
+    path = scene_file(scene)
     loaded = load_scene(path)
     anatomy = load_anatomy(loaded, path.parent)
     used = start_taichi(arch)
