@@ -42,6 +42,19 @@ def test_without_a_home_taichi_starts():
     assert done.returncode == 0
 
 
+def test_a_driver_that_is_missing_is_one_refusal_and_prints_nothing():
+    program = "import sim.device; sim.device.start('vulkan')"
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env=os.environ | {"VK_DRIVER_FILES": "/nonexistent", "VK_ICD_FILENAMES": "/nonexistent"},
+        cwd=Path(sim.device.__file__).parents[1],
+        capture_output=True,
+        text=True,
+    )
+    *above, last = done.stderr.splitlines()
+    assert "no vulkan device or driver; use --arch cpu" in last and not any("RHI" in line for line in above)
+
+
 def test_a_field_is_made_without_the_stack_being_written_down(device, monkeypatch):
     def written(*_):
         raise AssertionError("the stack was written down")

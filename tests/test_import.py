@@ -35,7 +35,7 @@ from scenes.reading.grid import VoxelGrid
 from scenes.reading.labels import LabelMap, with_tissues
 from scenes.reading.volume import Volume
 from scenes.scene import SceneError
-from scenes.support import cradle
+from scenes.support import mould
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -350,7 +350,7 @@ class TestRealData:
 def test_support_like_that_of_the_bead_experiments(case):
     organ = trimesh.load(DATA / "truth" / case / "kidney.stl")
     expected = trimesh.load(DATA / "truth" / case / "support.stl")
-    support = cradle(organ, np.array([0.0, 0.0, -1.0]))
+    support = mould(organ, np.array([0.0, 0.0, -1.0]))
     assert_sound(support)
     np.testing.assert_allclose(support.bounds[:, 2], expected.bounds[:, 2], atol=0.1)
     # The mould itself: organ's underside, away from the rim, as far from our support as from theirs.

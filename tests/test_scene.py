@@ -8,6 +8,7 @@ import SimpleITK as sitk
 import trimesh
 
 from scenes.anatomy import load_anatomy, phantom_folder, press_on
+from scenes.reading.error import PatientError
 from scenes.scene import (
     EMBEDDED,
     Anatomy,
@@ -138,13 +139,13 @@ def test_files_that_a_scene_names_are_checked(tmp_path):
     scene = with_ball(tmp_path)
     assert load_anatomy(scene, tmp_path).organ.is_watertight
     trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]).export(tmp_path / "organ.stl")
-    with pytest.raises(SceneError, match="organ.stl: is not a closed surface"):
+    with pytest.raises(PatientError, match="organ.stl: is not a closed surface"):
         load_anatomy(scene, tmp_path)
     (tmp_path / "organ.stl").write_text("solid nothing")
-    with pytest.raises(SceneError, match="organ.stl"):
+    with pytest.raises(PatientError, match="organ.stl"):
         load_anatomy(scene, tmp_path)
     (tmp_path / "organ.stl").unlink()
-    with pytest.raises(SceneError, match="organ.stl: no such surface file"):
+    with pytest.raises(PatientError, match="organ.stl: no such surface file"):
         load_anatomy(scene, tmp_path)
     with_ball(tmp_path)
     with pytest.raises(SceneError, match="ct.nrrd: no such file"):
