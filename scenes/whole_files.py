@@ -17,7 +17,7 @@ def whole(path: Path) -> Iterator[Path]:
     partial = path.with_name(f".{secrets.token_hex(4)}.partial-{path.name}")
     try:
         yield partial
-        if partial.is_dir() and path.exists():
+        if partial.is_dir() and path.exists():  # which Windows would not replace
             path.rmdir()
         os.replace(partial, path)
     except OSError as error:  # a full disk's error does not say which file
