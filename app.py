@@ -1,5 +1,6 @@
 """The command line. ``python app.py --help`` lists what it does."""
 
+import errno
 import signal
 import sys
 import threading
@@ -79,6 +80,14 @@ def _stop_in_order() -> None:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
+def _told(error: OSError) -> str:
+    """What is wrong with a disk or a file, where no command had better words."""
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    advice = "free some space" if full else "check that it can be read and written"
+    where = error.filename or "what was to be written"
+    return f"{where}: {error.strerror or error}; {advice}, or choose another place"
+
+
 def main(arguments: list[str]) -> int:
     """Run a command line; what the user must mend is one line, and the exit status 2."""
     if not arguments or (arguments[0].startswith("-") and arguments[0] not in ("-h", "--help")):
@@ -92,8 +101,9 @@ def main(arguments: list[str]) -> int:
     except MENDED_BY_USER as error:
         message = str(error)
     except OSError as error:
-        # A disk that is full or a file that is in the way, where no command had better words.
-        message = f"{error.filename or 'a file'}: {error.strerror or error}"
+        message = _told(error)
+    except MemoryError:
+        message = "the memory is full: close other programs, or take a smaller volume, larger cells or particles, or fewer --jobs"
     except (click.Abort, KeyboardInterrupt):
         click.echo("Stopped.", err=True)
         return 130

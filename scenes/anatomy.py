@@ -1,7 +1,7 @@
 """Load what a scene names: surfaces, CT and labels of a patient's folder, or of the embedded patient."""
 
+import contextlib
 import hashlib
-import os
 import tempfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -33,6 +33,7 @@ from scenes.scene import (
     Scene,
     SceneError,
 )
+from scenes.surface_files import load_surface
 
 HERE = Path(__file__).parent
 CACHE = HERE.parent / ".cache"
@@ -75,16 +76,16 @@ class LoadedAnatomy:
 
 
 def load_anatomy(scene: Scene, folder: Path, told: Told = untold) -> LoadedAnatomy:
-    """Read the files that a scene names, relative to ``folder``. Raises SceneError with one line."""
+    """Read the files that a scene names, relative to ``folder``. Raises SceneError, PatientError."""
     folder, anatomy = files_of(scene, folder, told)
     return LoadedAnatomy(
-        organ=load_surface(folder, anatomy.organ),
-        tumour=load_surface(folder, anatomy.tumour) if anatomy.tumour else None,
+        organ=load_surface(folder / anatomy.organ),
+        tumour=load_surface(folder / anatomy.tumour) if anatomy.tumour else None,
         ct=_grid(folder, anatomy.ct) if anatomy.ct else None,
         shapes=tuple(_shape(folder, shape) for shape in scene.shape),
         labels=_labels(folder, anatomy),
         tissues={int(label): tissue for label, tissue in anatomy.tissues.items()},
-        parts={tissue: load_surface(folder, file) for tissue, file in anatomy.parts.items()},
+        parts={tissue: load_surface(folder / file) for tissue, file in anatomy.parts.items()},
     )
 
 
@@ -151,7 +152,7 @@ def patient_scene(patient: Patient) -> Scene:
                 parts={tissue: f"{PARTS[tissue]}.stl" for tissue in patient.parts if tissue != "tumour"},
                 ct="ct.nrrd",
                 labels="labels.nrrd",
-                tissues=_named(patient.tissues),
+                tissues={str(code): tissue for code, tissue in patient.tissues.items()},
             )
         ),
         attachment=Attachment(at_mm=hilum(patient.organ, patient.side)),
@@ -174,19 +175,22 @@ def phantom_folder(told: Told = untold) -> Path:
     )
     sources = [HERE / f"{name}.py" for name in names]
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]
-    for root in (CACHE, Path(tempfile.gettempdir()) / "nephron"):
-        folder = root / f"phantom-{digest}"
-        if folder.is_dir():
+    places = [root / f"phantom-{digest}" for root in (CACHE, Path(tempfile.gettempdir()) / "nephron")]
+    there = next((folder for folder in places if folder.is_dir()), None)
+    return there or _saved_in_one_of(places, _phantom_patient(told))
+
+
+def _saved_in_one_of(places: list[Path], patient: Patient) -> Path:
+    """The first folder that a patient could be saved in. Raises SceneError."""
+    for folder in places:
+        with contextlib.suppress(PatientError):
+            save_patient(patient, folder)
+        if folder.is_dir():  # also where another process was first
             return folder
-        if _can_write(root):
-            patient = _phantom_patient(told)
-            try:
-                save_patient(patient, folder)
-            except PatientError:
-                if not folder.is_dir():
-                    raise
-            return folder
-    raise SceneError(f"{CACHE}: cannot be written; the embedded patient needs a folder for its files")
+    roots = " and ".join(str(folder.parent) for folder in places)
+    raise SceneError(
+        f"{roots}: the embedded patient's files can be written to neither; free 20 MB in one of them"
+    )
 
 
 def _phantom_patient(told: Told) -> Patient:
@@ -202,49 +206,17 @@ def _phantom_patient(told: Told) -> Patient:
     return import_patient(Volume.of(ct), replace(labels, segments=named), own, side="left")
 
 
-def _named(tissues: dict[int, str]) -> dict[str, str]:
-    return {str(label): tissue for label, tissue in tissues.items()}
-
-
-def _can_write(folder: Path) -> bool:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return False
-    return os.access(folder, os.W_OK)
-
-
-def load_surface(folder: Path, name: str) -> trimesh.Trimesh:
-    """Read a closed surface that faces outward [mm]. Raises SceneError with one line."""
-    path = folder / name
-    if not path.is_file():
-        raise SceneError(f"{path}: no such surface file")
-    try:
-        mesh = trimesh.load_mesh(path)
-    except Exception as error:  # trimesh's readers raise whatever their parsers do
-        raise SceneError(f"{path}: cannot be read as a surface ({type(error).__name__})") from None
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise SceneError(f"{path}: holds no triangles; expected a closed surface")
-    if not np.isfinite(mesh.vertices).all():
-        raise SceneError(f"{path}: has vertices that are not finite")
-    if not mesh.is_watertight or mesh.volume <= 0:
-        raise SceneError(f"{path}: is not a closed surface that faces outward; repair it and try again")
-    return mesh
-
-
 def _grid(folder: Path, name: str) -> Grid:
     path = folder / name
     if not path.is_file():
         raise SceneError(f"{path}: no such file; check the scene")
-    try:
-        volume = file_volume(path)
-        found = volume.read()
-    except PatientError as error:
-        raise SceneError(str(error)) from None
+    volume = file_volume(path)
     mm_from_index = np.eye(4)
     mm_from_index[:3, :3] = volume.grid.direction * volume.grid.spacing
     mm_from_index[:3, 3] = volume.grid.origin
-    return Grid(np.ascontiguousarray(found.transpose(2, 1, 0), np.float32), np.linalg.inv(mm_from_index))
+    return Grid(
+        np.ascontiguousarray(volume.read().transpose(2, 1, 0), np.float32), np.linalg.inv(mm_from_index)
+    )
 
 
 def _labels(folder: Path, anatomy: Anatomy) -> Grid | None:
@@ -267,7 +239,7 @@ def _shape(
     if isinstance(shape, PlaneShape):
         return shape
     if isinstance(shape, MeshShape):
-        return load_surface(folder, shape.file)
+        return load_surface(folder / shape.file)
     grid = _grid(folder, shape.file)
     axes = grid.index_from_mm[:3, :3]
     if not np.allclose(axes, np.diag(np.diag(axes))) or (np.diag(axes) <= 0).any():

@@ -12,6 +12,8 @@ from scenes.reading.error import PatientError
 from scenes.reading.grid import VoxelGrid
 from scenes.reading.labels import LabelMap, nearest
 from scenes.support import (
+    CLEARANCE_MM,
+    GRID_MM,
     clear_of,
     contour,
     distance_to_swept,
@@ -20,17 +22,17 @@ from scenes.support import (
     least_gap,
     round_meet,
 )
+from scenes.surface_files import load_surface
 
 # The organ rests on what lies under it within this distance; what is between is fat, and part of the bed.
 REACH_MM = 40.0
 # How far around the organ the bed goes, and how high up its sides, as a share of the organ's height.
 WALL_MM, HEIGHT = 20.0, 0.5
-CLEARANCE_MM, FILLET_MM, GRID_MM = 0.3, 3.0, 1.0
+FILLET_MM = 3.0
 # A label's steps are a voxel's, and no anatomy.
 SMOOTHING_VOXELS = 1.5
 LEAST_UNDER = 0.5
 LEAST_ML = 2.0
-FACES = 5000
 # A support may touch the organ at rest, but not hold it squeezed.
 MOST_OVERLAP_MM = 0.5
 
@@ -68,7 +70,7 @@ def bed_of_labels(
     level = round_meet(level, np.broadcast_to(grid[2] - top, gap.shape), radius=FILLET_MM)
 
     def carved(gap_mm: float) -> trimesh.Trimesh:
-        return contour(_closed(round_meet(level, gap_mm - gap, radius=FILLET_MM)), grid, FACES)
+        return contour(_closed(round_meet(level, gap_mm - gap, radius=FILLET_MM)), grid)
 
     try:
         bed = clear_of(upright, faces, carved, CLEARANCE_MM)
@@ -111,25 +113,12 @@ def _closed(level: np.ndarray) -> np.ndarray:
 
 
 def bed_of_file(path: Path, organ: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A support of the user's own [mm], LPS. Raises PatientError where it is no closed surface, or holds the organ squeezed."""
+    """A support of the user's own [mm], LPS. Raises PatientError where it is no closed surface, holds the organ squeezed, or is far from it."""
     if not path.is_file():
         raise PatientError(
             f"{path}: no such file; give a surface for --support: mould, labels, or an STL, PLY or OBJ file"
         )
-    try:
-        bed = trimesh.load_mesh(path)
-    except Exception as error:  # trimesh's readers raise whatever their parsers do
-        raise PatientError(
-            f"{path}: cannot be read as a surface ({type(error).__name__}); export it as STL"
-        ) from error
-    if not isinstance(bed, trimesh.Trimesh) or len(bed.faces) == 0 or not np.isfinite(bed.vertices).all():
-        raise PatientError(
-            f"{path}: holds no triangles, or some that are no numbers; expected a closed surface in mm, LPS"
-        )
-    if not bed.is_watertight or bed.volume <= 0:
-        raise PatientError(
-            f"{path}: is not a closed surface that faces outward; repair it, for example in 3D Slicer"
-        )
+    bed = load_surface(path)
     gap = least_gap(bed.vertices, bed.faces.astype(np.int64), organ.vertices, organ.faces.astype(np.int64))
     if gap < -MOST_OVERLAP_MM:
         raise PatientError(

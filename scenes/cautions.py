@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from scenes.organ import Organ
+from scenes.organ import BODY_ABOVE_HU, Organ
 from scenes.reading.grid import VoxelGrid
 from scenes.reading.labels import LabelMap, listed
 from scenes.reading.names import is_understood
 
-BONE_ABOVE_HU, BODY_ABOVE_HU = 300, -300
+BONE_ABOVE_HU = 300
 COARSE_MM = 3.0
 LEAST_BONE_ML = 15.0
 # Bones of a trunk at the kidneys, spine and ribs, lie on the whole behind the middle of the body.
@@ -86,8 +86,7 @@ def taken(labels: LabelMap, piece: Organ, is_named: bool) -> tuple[str, ...]:
     around = ndimage.binary_dilation(piece.mask, iterations=2) & ~piece.mask
     unsaid = {v for v, s in labels.segments.items() if s.tissue is None and not is_understood(s.name)}
     beside = [v for v in np.unique(piece.values[around]).tolist() if v in unsaid]
-    voxel_ml = float(np.prod(labels.grid.spacing)) / 1000
-    left_out = [(v, float((labels.values == v).sum()) * voxel_ml) for v in beside]
+    left_out = [(v, float((labels.values == v).sum()) * labels.grid.voxel_ml) for v in beside]
     told = [f"{labels.segments[v]} ({ml:.1f} ml)" for v, ml in left_out if ml >= LEAST_LEFT_OUT_ML]
     if told:
         found.append(

@@ -21,6 +21,7 @@ from scenes.facts import told
 from scenes.patient import Patient
 from scenes.reading.grid import VoxelGrid
 from scenes.reading.labels import Colour
+from scenes.reading.volume import AIR_HU
 
 BACKGROUND, WARNING = "#101014", "#ffb000"
 PIXEL_MM = 0.5
@@ -113,9 +114,9 @@ def _draw_cut(
     colours: dict[str, Colour],
 ) -> None:
     right, down = np.array(view.right, float), np.array(view.down, float)
-    low, high = _bounds(ct)
+    low, high = VoxelGrid.of(ct).bounds()
     spans = [sorted((low @ axis, high @ axis)) for axis in (right, down)]
-    picture = _cut(ct, right, down, spans, middle)
+    picture = cut(ct, right, down, spans, middle)
     black = LEVEL_HU - WINDOW_HU / 2
     extent = (*spans[0], spans[1][1], spans[1][0])
     axes.imshow(
@@ -133,30 +134,16 @@ def _draw_cut(
         axes.text(*place, letter, transform=axes.transAxes, fontsize=17, **LETTER)
 
 
-def _bounds(image: sitk.Image) -> tuple[np.ndarray, np.ndarray]:
-    corners = VoxelGrid.of(image).corners()
-    return corners.min(axis=0), corners.max(axis=0)
-
-
-def _cut(
+def cut(
     image: sitk.Image, right: np.ndarray, down: np.ndarray, spans: list[list[float]], middle: np.ndarray
 ) -> np.ndarray:
     """HU on a plane through the middle, across two spans [mm]."""
     across = np.cross(right, down)
     origin = right * spans[0][0] + down * spans[1][0] + across * (middle @ across)
-    size = [int((high - low) / PIXEL_MM) + 1 for low, high in spans]
-    direction = np.column_stack([right, down, across])
-    cut = sitk.Resample(
-        image,
-        [*size, 1],
-        sitk.Transform(),
-        sitk.sitkLinear,
-        origin.tolist(),
-        [PIXEL_MM] * 3,
-        direction.ravel().tolist(),
-        -1000.0,
-    )
-    return sitk.GetArrayFromImage(cut)[0]
+    width, height = (int((high - low) / PIXEL_MM) + 1 for low, high in spans)
+    axes = np.column_stack([right, down, across])
+    plane = VoxelGrid((width, height, 1), np.full(3, PIXEL_MM), origin, axes)
+    return plane.sampled(image, sitk.sitkLinear, AIR_HU)[0]
 
 
 def _draw_surfaces(axes: Any, surfaces: dict[str, trimesh.Trimesh], colours: dict[str, Colour]) -> None:

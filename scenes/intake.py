@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from scenes.patient import Patient, import_patient
-from scenes.reading.ct import dicom_or_words, open_ct
+from scenes.reading.ct import open_ct
 from scenes.reading.error import PatientError
 from scenes.reading.label_files import Drawing, drawing_of, open_labels
 from scenes.reading.labels import LabelMap, merged, with_tissues
 from scenes.reading.names import Side
 from scenes.reading.progress import Progress, silent
+from scenes.reading.series import dicom_found
 from scenes.reading.volume import Volume
 from scenes.seed import grown
 
@@ -47,7 +48,7 @@ def take_in(request: Request, progress: Progress = silent) -> tuple[Patient, set
         labels = grown(volume, request.seed_mm)
         notes: tuple[str, ...] = ()
     else:
-        volume, drawings, labels = _with_labels(request, progress)
+        volume, drawings, labels = with_labels(request, progress)
         notes = tuple(note for drawing in drawings for note in drawing.notes)
     organ = labels.called(request.organ) if request.organ else None
     patient = import_patient(
@@ -64,7 +65,8 @@ def take_in(request: Request, progress: Progress = silent) -> tuple[Patient, set
     return replace(patient, notes=(*patient.notes, *notes), draft=is_draft), private | _paths(request)
 
 
-def _with_labels(request: Request, progress: Progress) -> tuple[Volume, list[Drawing], LabelMap]:
+def with_labels(request: Request, progress: Progress) -> tuple[Volume, list[Drawing], LabelMap]:
+    """A CT, the labels found for it, and one map of them all with the user's words on it. Raises PatientError."""
     words = [*request.organ, *(word for several in request.tissues.values() for word in several)]
     drawings = [open_labels(path, words, progress) for path in request.labels]
     drawings = drawings or [_beside(request.ct, progress)]
@@ -83,7 +85,7 @@ def _with_labels(request: Request, progress: Progress) -> tuple[Volume, list[Dra
 
 def _beside(ct: Path, progress: Progress) -> Drawing:
     """The labels that lie with a CT."""
-    found = drawing_of(dicom_or_words(ct, progress)) if ct.is_dir() else None
+    found = drawing_of(dicom_found(ct, progress)) if ct.is_dir() else None
     if found is None:
         raise PatientError(
             f"{ct}: no labels lie with this CT; give a file or folder with LABELS, or --seed X,Y,Z for a draft"

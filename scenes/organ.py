@@ -72,8 +72,7 @@ def organs(labels: LabelMap, organ: Sequence[int] | None = None) -> list[Organ]:
         raise PatientError(f"the labels hold no voxel of an organ: {labels.listed()}; choose other labels")
     part = box[::-1]
     parts, count = ndimage.label(wanted[part])
-    voxel_ml = float(np.prod(labels.grid.spacing)) / 1000.0
-    volumes = np.bincount(parts.ravel(), minlength=count + 1) * voxel_ml
+    volumes = np.bincount(parts.ravel(), minlength=count + 1) * labels.grid.voxel_ml
     of_organ = [int(n) for n in np.unique(parts[np.isin(labels.values[part], own)]) if n]
     large = [n for n in of_organ if volumes[n] >= ORGAN_FROM_ML] or [max(of_organ, key=lambda n: volumes[n])]
     masks = [_with_touching(parts, n, of_organ) for n in large]
@@ -120,7 +119,7 @@ def _piece(labels: LabelMap, grid: VoxelGrid, values: np.ndarray, mask: np.ndarr
     inside, around = mask[z, y, x], values[z, y, x]
     inner = np.isin(around, [v for v in labels.of_tissues(*INNER) if v not in own])
     if inner.any():
-        inside = inside | (inner & _hollow(inside, grid.spacing[::-1]))
+        inside = inside | (inner & hollow(inside, grid.spacing[::-1]))
     present = [int(v) for v in np.unique(around[inside]) if int(v) in own]
     segments = [labels.segments[v] for v in present]
     indices = np.argwhere(inside).mean(axis=0)[::-1] + [a.start for a in box]
@@ -131,12 +130,12 @@ def _piece(labels: LabelMap, grid: VoxelGrid, values: np.ndarray, mask: np.ndarr
         present=present,
         names=[str(segment) for segment in segments],
         named_sides={segment.side for segment in segments if segment.side},
-        volume_ml=float(inside.sum() * np.prod(grid.spacing)) / 1000.0,
+        volume_ml=float(inside.sum() * grid.voxel_ml),
         centre_x_mm=float(grid.place(indices[None])[0, 0]),
     )
 
 
-def _hollow(mask: np.ndarray, spacing: np.ndarray) -> np.ndarray:
+def hollow(mask: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     """What a mask (z, y, x) encloses: its closing by a ball of HOLLOW_MM."""
     rim = [(int(n), int(n)) for n in np.ceil(HOLLOW_MM / spacing) + 1]
     grown = ndimage.distance_transform_edt(~np.pad(mask, rim), sampling=spacing) <= HOLLOW_MM

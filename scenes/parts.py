@@ -48,7 +48,7 @@ def part_surfaces(
             continue
         grid, inside = piece.grid, piece.mask & np.isin(piece.values, values)
         if tissue in INNER:
-            grid, inside = _near(labels, piece, values)
+            grid, inside = near_organ(labels, piece, values)
         if not inside.any():
             if tissue in needed:
                 raise PatientError(
@@ -56,10 +56,9 @@ def part_surfaces(
                     f"which label is its {tissue}"
                 )
             continue
-        voxel_ml = float(np.prod(grid.spacing)) / 1000.0
-        surface = _bodies(grid, inside, tissue)
+        surface = bodies(grid, inside, tissue)
         if surface is not None:
-            surfaces[tissue], volumes[tissue] = surface, float(inside.sum() * voxel_ml)
+            surfaces[tissue], volumes[tissue] = surface, float(inside.sum() * grid.voxel_ml)
     return surfaces, volumes
 
 
@@ -70,7 +69,7 @@ def colours_of_labels(labels: LabelMap, tissues: Sequence[str]) -> dict[str, Col
     return {name: colour for name, colour in named.items() if colour}
 
 
-def _near(labels: LabelMap, piece: Organ, values: list[int]) -> tuple[VoxelGrid, np.ndarray]:
+def near_organ(labels: LabelMap, piece: Organ, values: list[int]) -> tuple[VoxelGrid, np.ndarray]:
     """Where labels lie within PEDICLE_MM of the organ."""
     start = np.rint(labels.grid.index(piece.grid.origin)).astype(int)
     rim = np.ceil(PEDICLE_MM / labels.grid.spacing).astype(int)
@@ -93,7 +92,7 @@ def _surface(mask: sitk.Image, name: str, faces: int) -> trimesh.Trimesh:
         raise PatientError(f"the {name} has no surface: {error}; check the {name}'s label") from error
 
 
-def _bodies(grid: VoxelGrid, inside: np.ndarray, tissue: str) -> trimesh.Trimesh | None:
+def bodies(grid: VoxelGrid, inside: np.ndarray, tissue: str) -> trimesh.Trimesh | None:
     """Surface of a part; its several bodies are bodies of one mesh, specks are left out. None: too thin, and not needed."""
     labelled, _ = ndimage.label(inside)
     sizes = np.bincount(labelled.ravel())[1:]

@@ -25,7 +25,7 @@ from scenes.reading.labels import Colour, LabelMap, nearest, present
 from scenes.reading.names import Side
 from scenes.reading.progress import Progress, silent
 from scenes.reading.volume import Volume
-from scenes.support import cradle
+from scenes.support import mould
 
 SUPINE_GRAVITY = np.array([0.0, 1.0, 0.0])  # as the CT was taken: on the back, posterior is down
 PLAUSIBLE_ORGAN_HU = (-150.0, 600.0)
@@ -142,7 +142,7 @@ def _support(kind: str, organ: trimesh.Trimesh, labels: LabelMap, piece: Organ) 
     if kind != "mould":
         return bed_of_file(Path(kind), organ)
     try:
-        return cradle(organ, SUPINE_GRAVITY)
+        return mould(organ, SUPINE_GRAVITY)
     except ValueError as error:
         raise PatientError(f"no support fits under the organ: {error}; check the organ's label") from error
 
@@ -154,16 +154,15 @@ def _level(ct: Volume, pieces: list[Organ], margin_mm: float) -> tuple[Box, np.n
             "the labels lie outside the CT, with 0 % of the organ in it: expected both to overlap in patient coordinates; "
             "choose labels that were drawn on this CT"
         )
-    corners = ct.grid.corners()
     places = np.concatenate([piece.grid.corners() for piece in pieces])
-    low, high = corners.min(axis=0), corners.max(axis=0)
+    low, high = ct.grid.bounds()
     low[2], high[2] = places[:, 2].min() - margin_mm, places[:, 2].max() + margin_mm
     box = ct.grid.box_around(low, high)
     hounsfield = ct.hounsfield(box)
-    low, high = int(hounsfield.min()), int(hounsfield.max())
-    if low > FAT_HU or high - low < LEAST_SPAN_HU:
+    darkest, brightest = int(hounsfield.min()), int(hounsfield.max())
+    if darkest > FAT_HU or brightest - darkest < LEAST_SPAN_HU:
         raise PatientError(
-            f"the CT holds values from {low} to {high}: expected HU, fat about -100 and air -1000; give the CT first, then the "
+            f"the CT holds values from {darkest} to {brightest}: expected HU, fat about -100 and air -1000; give the CT first, then the "
             "labels, and export it with its rescale and without normalising"
         )
     return box, hounsfield

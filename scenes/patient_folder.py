@@ -5,10 +5,10 @@ from __future__ import annotations
 import glob
 import os
 import re
-import secrets
 import shutil
 import zlib
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
@@ -18,15 +18,16 @@ from scenes.parts import PARTS
 from scenes.patient import Patient
 from scenes.reading.error import PatientError
 from scenes.scene import Anatomy, Scene, scene_text
-from scenes.surface_files import save_surface
+from scenes.surface_files import STL_HEADER_BYTES, save_surface
 from scenes.volume_files import save_image
+from scenes.whole_files import whole
 
 # Shorter texts, such as the id 7, say nothing, and numbers under six digits are in every file.
 LEAST_TEXT, LEAST_DIGITS = 3, 6
 # Longer ones cannot be in voxels or triangles by chance.
 SURE_BYTES = 7
 ENCODINGS = ("utf-8", "utf-16-le", "latin-1")
-STL_HEADER, GZIP = 80, 31  # bytes; zlib's code
+GZIP = 31  # zlib's code
 COMMON = "left right kidney cyst vessels collecting system STL LPS ITK NRRD complete type int short unsigned char gzip space"
 
 
@@ -52,26 +53,26 @@ def save_patient(
     Raises:
         PatientError: the folder exists and is not empty, cannot be written, or would have held something private.
     """
+    with new_folder(folder) as partial:
+        _write(patient, partial, texts or {})
+        if draw is not None:
+            draw(partial)
+        return _searched(partial, private)
+
+
+@contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """A place to write a folder's files to; they appear together, once all are there. Raises PatientError."""
     check_folder(folder)
-    for left in folder.parent.glob(f".{glob.escape(folder.name)}.partial-*"):  # of a run that was killed
+    for left in folder.parent.glob(f".*.partial-{glob.escape(folder.name)}"):  # of a run that was killed
         shutil.rmtree(left, ignore_errors=True)
-    partial = folder.parent / f".{folder.name}.partial-{secrets.token_hex(4)}"
     try:
-        partial.mkdir(parents=True)
-        try:
-            _write(patient, partial, texts or {})
-            if draw is not None:
-                draw(partial)
-            searched = _searched(partial, private)
-            if folder.exists():
-                folder.rmdir()
-            os.replace(partial, folder)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with whole(folder) as partial:
+            partial.mkdir()
+            yield partial
     except OSError as error:
-        reason = error.strerror or "its files cannot be written"
-        raise PatientError(f"{folder}: {reason}; choose a folder that can be written") from error
-    return searched
+        raise PatientError(f"{folder}: {error.strerror}; choose a folder that can be written") from error
 
 
 def check_folder(folder: Path) -> None:
@@ -128,7 +129,7 @@ def _contents(file: Path) -> tuple[bytes, bytes]:
     if file.suffix == ".nrrd":
         header, _, packed = content.partition(b"\n\n")
         return header, header + zlib.decompress(packed, wbits=GZIP)
-    return (content if file.suffix == ".toml" else content[:STL_HEADER]), content
+    return (content if file.suffix == ".toml" else content[:STL_HEADER_BYTES]), content
 
 
 def _holds(words: bytes, everything: bytes, text: str) -> bool:

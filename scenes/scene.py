@@ -205,6 +205,16 @@ class Scene(Section):
         return self
 
 
+def scene_file(named: Path) -> Path:
+    """The scene file that a path names: itself, or that of a patient's folder. Raises SceneError."""
+    if not named.is_dir():
+        return named
+    path = named / "scene.toml"
+    if not path.is_file():
+        raise SceneError(f"{named}: holds no scene.toml; make a patient's folder of a CT with: app.py import")
+    return path
+
+
 def load_scene(path: Path) -> Scene:
     """Read a scene file. Raises SceneError with one line that names the file, the key and the mend."""
     try:
@@ -224,8 +234,9 @@ def load_scene(path: Path) -> Scene:
 def with_options(scene: Scene, options: Mapping[str, float | int | str | None]) -> Scene:
     """The scene with single values changed, such as ``{"tissue.radius_mm": 3.0}``; None leaves what is there.
 
-    A value that only another tissue model has asks for that model, which starts from its own defaults. Raises
-    SceneError for a value out of range, and for values of two models.
+    A value that only another tissue model has asks for that model, which starts from its own defaults. A probe's file is named
+    from where the program was started, not from beside the scene. Raises SceneError for a value out of range, and for values of
+    two models.
     """
     values = scene.model_dump(exclude_unset=True)
     asked = [name.removeprefix("tissue.") for name, value in options.items() if value is not None]
@@ -235,7 +246,8 @@ def with_options(scene: Scene, options: Mapping[str, float | int | str | None]) 
     for name, value in options.items():
         if value is not None:
             section, key = name.split(".")
-            values.setdefault(section, {})[key] = value
+            is_file = name == "transducer.probe" and Path(str(value)).is_file()
+            values.setdefault(section, {})[key] = str(Path(str(value)).resolve()) if is_file else value
     try:
         return Scene.model_validate(values)
     except ValidationError as error:

@@ -67,8 +67,7 @@ def grown(ct: Volume, seed_mm: np.ndarray) -> LabelMap:
 def _check_in(grid: VoxelGrid, seed: np.ndarray) -> None:
     index = grid.index(seed[None])[0]
     if not ((index >= -0.5) & (index <= np.array(grid.size) - 0.5)).all():
-        low, high = grid.corners().min(axis=0), grid.corners().max(axis=0)
-        spans = ", ".join(f"{a:.0f} to {b:.0f}" for a, b in zip(low, high, strict=True))
+        spans = ", ".join(f"{a:.0f} to {b:.0f}" for a, b in zip(*grid.bounds(), strict=True))
         advice = "give x,y,z in LPS mm (in RAS x and y have the other sign)"
         raise _refusal(seed, f"it lies outside the CT, which spans {spans}", advice)
 

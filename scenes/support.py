@@ -16,61 +16,57 @@ from skimage.measure import marching_cubes
 
 from scenes.surfaces import decimate
 
+# Part of the organ's height, along gravity, that lies in the mould.
+DEPTH = 0.35
+CLEARANCE_MM = 0.3
+# Least width of the block around the mould, and its thickness under the organ's lowest point.
+WALL_MM, FLOOR_MM = 12.0, 8.0
+# Radius of the mould's rim and of the block's edges.
+FILLET_MM = 4.0
+# Spacing of the grid that a shape is sampled on.
+GRID_MM = 1.0
+FACES = 5000
 ATTEMPTS = 4
 # Part of the clearance that must be left everywhere.
 LEAST_CLEARANCE = 0.25
 
 
-def cradle(
+def mould(
     organ: trimesh.Trimesh,
     gravity_direction: np.ndarray,
-    depth_fraction: float = 0.35,
-    clearance_mm: float = 0.3,
-    fillet_mm: float = 4.0,
-    wall_mm: float = 12.0,
-    floor_mm: float = 8.0,
-    grid_mm: float = 1.0,
-    faces: int = 5000,
+    clearance_mm: float = CLEARANCE_MM,
 ) -> trimesh.Trimesh:
     """Rigid block with a mould of the organ's underside, which the organ at rest does not touch.
 
     Args:
         organ: watertight surface at rest, normals outward; vertices [mm], shape (vertex_count, 3).
         gravity_direction: the way that things fall, shape (3,), any length but zero.
-        depth_fraction: part of the organ's height, along gravity, that lies in the mould, in (0, 1).
         clearance_mm: gap between organ at rest and mould [mm]; the least gap is at least a quarter of it.
-        fillet_mm: radius of the mould's rim and of the block's edges [mm].
-        wall_mm: least width of block around the mould [mm].
-        floor_mm: thickness of block under the organ's lowest point [mm].
-        grid_mm: spacing of the grid that the shape is sampled on [mm].
-        faces: wanted number of triangles.
 
     Returns:
         Watertight mesh of one body, normals outward; same frame as `organ`, [mm].
 
     Raises:
-        ValueError: gravity without direction, depth out of range, organ not watertight, or no shape found
+        ValueError: gravity without direction, organ not watertight, or no shape found
             that stays clear of the organ.
     """
     frame = gravity_frame(np.asarray(gravity_direction, float))
-    if not 0 < depth_fraction < 1:
-        raise ValueError(f"depth_fraction is {depth_fraction}: expected more than 0 and less than 1")
     if not organ.is_watertight:
         raise ValueError("the organ's surface is not watertight: a support cannot be moulded on it")
     upright = organ.vertices.view(np.ndarray) @ frame.T
     organ_faces = organ.faces.view(np.ndarray).astype(np.int64)
 
     low, high = upright.min(axis=0), upright.max(axis=0)
-    top = low[2] + depth_fraction * (high[2] - low[2])
+    top = low[2] + DEPTH * (high[2] - low[2])
     bed = upright[upright[:, 2] <= top]
-    block_low = np.append(bed.min(axis=0)[:2] - wall_mm, low[2] - floor_mm)
-    block_high = np.append(bed.max(axis=0)[:2] + wall_mm, top)
+    block_low = np.append(bed.min(axis=0)[:2] - WALL_MM, low[2] - FLOOR_MM)
+    block_high = np.append(bed.max(axis=0)[:2] + WALL_MM, top)
 
-    grid = grid_over(block_low, block_high, grid_mm)
+    grid = grid_over(block_low, block_high, GRID_MM)
     gap = distance_to_swept(upright, organ_faces, grid)
 
     def carved(gap_mm: float) -> trimesh.Trimesh:
-        return contour(_carved_block(grid, gap - gap_mm, block_low, block_high, fillet_mm), grid, faces)
+        return contour(_carved_block(grid, gap - gap_mm, block_low, block_high, FILLET_MM), grid)
 
     support = clear_of(upright, organ_faces, carved, clearance_mm)
     return trimesh.Trimesh(support.vertices @ frame, support.faces, process=False)
@@ -174,8 +170,8 @@ def round_meet(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
     return np.minimum(np.maximum(a, b), -radius) + np.maximum(corner + radius, 0.0)
 
 
-def contour(level: np.ndarray, grid: tuple[np.ndarray, ...], faces: int) -> trimesh.Trimesh:
-    """Zero level on the grid, decimated, one body, normals outward."""
+def contour(level: np.ndarray, grid: tuple[np.ndarray, ...]) -> trimesh.Trimesh:
+    """Zero level on the grid, of about FACES triangles, one body, normals outward."""
     step = grid[0][1] - grid[0][0]
     clear = 1e-3 * step  # a level of exactly zero at a node gives triangles of no area
     level = np.where(level < 0, np.minimum(level, -clear), np.maximum(level, clear))
@@ -183,4 +179,4 @@ def contour(level: np.ndarray, grid: tuple[np.ndarray, ...], faces: int) -> trim
     fine = trimesh.Trimesh(vertices + [axis[0] for axis in grid], triangles, process=False)
     if fine.volume < 0:
         fine.invert()
-    return decimate(fine, faces)
+    return decimate(fine, FACES)

@@ -2,13 +2,42 @@
 
 from pathlib import Path
 
+import numpy as np
 import trimesh
 from trimesh.exchange.ply import export_ply
 from trimesh.exchange.stl import export_stl
 
+from scenes.reading.error import PatientError
+from scenes.whole_files import whole
+
 # What 3D Slicer looks for in an STL's header and in a PLY's comments.
 SPACE = b"SPACE=LPS"
 STL_HEADER_BYTES = 80
+
+
+def load_surface(path: Path) -> trimesh.Trimesh:
+    """Read a closed surface that faces outward [mm, LPS]. Raises PatientError."""
+    if not path.is_file():
+        raise PatientError(f"{path}: no such surface file; give an STL, PLY or OBJ file")
+    try:
+        surface = trimesh.load_mesh(path)
+    except Exception as error:  # trimesh's readers raise whatever their parsers do
+        raise PatientError(
+            f"{path}: cannot be read as a surface ({type(error).__name__}); export it as STL"
+        ) from None
+    if (
+        not isinstance(surface, trimesh.Trimesh)
+        or len(surface.faces) == 0
+        or not np.isfinite(surface.vertices).all()
+    ):
+        raise PatientError(
+            f"{path}: holds no triangles, or some that are no numbers; expected a closed surface in mm, LPS"
+        )
+    if not surface.is_watertight or surface.volume <= 0:
+        raise PatientError(
+            f"{path}: is not a closed surface that faces outward; repair it, for example in 3D Slicer"
+        )
+    return surface
 
 
 def save_surface(surface: trimesh.Trimesh, path: Path) -> None:
@@ -17,11 +46,8 @@ def save_surface(surface: trimesh.Trimesh, path: Path) -> None:
     Coordinates are float32 there. A PLY keeps the order of the vertices, an STL has none. Raises OSError.
     """
     bare = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
-    written = WRITERS[path.suffix.removeprefix(".")](bare)
-    try:
-        path.write_bytes(written)
-    except OSError as error:  # a full disk's error does not say which file
-        raise OSError(error.errno, error.strerror, str(path)) from None
+    with whole(path) as partial:
+        partial.write_bytes(WRITERS[path.suffix.removeprefix(".")](bare))
 
 
 def _stl(surface: trimesh.Trimesh) -> bytes:

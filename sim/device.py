@@ -5,8 +5,11 @@ import functools
 import io
 import os
 import sys
+import tempfile
 import textwrap
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import taichi as ti
 from taichi.lang import impl, kernel_impl, snode
@@ -15,6 +18,7 @@ from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 FEW_CORES = 4
 # Taichi drops compiled kernels from 100 MB on. A rehearsal leaves 4 MB for each patient and each choice of settings.
 CACHE_BYTES = 1 << 30
+TEMPORARY = Path(tempfile.gettempdir()) / "nephron" / "kernels"
 
 
 def _place(context: ASTTransformerContext, node) -> str:
@@ -52,15 +56,44 @@ def start(arch: str = "cpu", **options) -> str:
     backends = {"cuda": ti.cuda, "vulkan": ti.vulkan, "cpu": ti.cpu}
     if arch == "auto":
         arch = "cuda" if ti.lang.misc.is_arch_supported(ti.cuda) else "cpu"
-    elif arch != "cpu" and not ti.lang.misc.is_arch_supported(backends[arch]):
+    elif arch != "cpu" and not _is_there(backends[arch]):
         raise NoDevice(f"this machine has no {arch} device or driver; use --arch cpu or --arch auto")
     if arch != "vulkan":
         # LLVM does it again: kernels run as fast, and large ones compile in a tenth of the time.
         options = {"advanced_optimization": False, **options}
-    options = {"offline_cache_max_size_of_files": CACHE_BYTES, **options}
+    options = {
+        "offline_cache_file_path": str(_kernel_folder()),
+        "offline_cache_max_size_of_files": CACHE_BYTES,
+        **options,
+    }
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(arch=backends[arch], log_level=ti.ERROR, **options)
     return arch
+
+
+def _is_there(backend: Any) -> bool:
+    """Whether a backend has a device and a driver; what a driver that is missing prints goes nowhere."""
+    told, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        return bool(ti.lang.misc.is_arch_supported(backend))
+    finally:
+        os.dup2(told, 2)
+        os.close(told)
+        os.close(nowhere)
+
+
+def _kernel_folder() -> Path:
+    """Where compiled kernels are kept for the next run: where Taichi keeps them, or else a temporary folder.
+
+    Of a folder that cannot be made or written Taichi crashes as the process ends, even when it is told to keep nothing.
+    """
+    usual = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or impl.default_cfg().offline_cache_file_path)
+    try:
+        usual.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return TEMPORARY
+    return usual if os.access(usual, os.W_OK) else TEMPORARY
 
 
 def on_cpu() -> bool:

@@ -9,7 +9,11 @@ from dataclasses import dataclass
 
 import igl
 import numpy as np
+import psutil
 from scipy.spatial import cKDTree
+
+# What a fine voxel takes while it is asked whether it is inside: indices and places in 64 bits, and the answer.
+VOXEL_BYTES = 80
 
 
 class SamplingError(ValueError):
@@ -50,9 +54,12 @@ def sample_particles(
 
     ``vertices`` (v, 3) [mm] and ``faces`` (f, 3) are the surface; the voxels are ``radius_mm /
     volume_sampling`` wide. Surface samples, where asked for, are drawn from ``seed`` and come first, so that thin
-    parts keep their boundary. Sorted along a space-filling curve. Raises SamplingError when nothing fits.
+    parts keep their boundary. Sorted along a space-filling curve. Raises SamplingError when nothing fits,
+    or when there is not enough memory.
     """
     pitch = radius_mm / volume_sampling
+    count = float(np.prod(np.ceil(np.ptp(vertices, axis=0) / pitch)))
+    check_memory(VOXEL_BYTES * count, f"particles of {radius_mm:g} mm radius", "choose larger ones")
     origin, occupied = occupied_voxels(vertices, faces, pitch)
     surface = _surface_particles(vertices, faces, radius_mm, surface_samples_per_mm2, seed)
     _clear_near(occupied, origin, pitch, surface, radius_mm)
@@ -81,6 +88,15 @@ def sample_clusters(particles: np.ndarray, spacing_mm: float) -> Clusters:
             free[near] = False
             rows.append(near.astype(np.int32))
     return Clusters(offsets_of([len(row) for row in rows]), np.concatenate(rows))
+
+
+def check_memory(needed_bytes: float, what: str, advice: str) -> None:
+    """Raises SamplingError where something takes more memory than is free."""
+    free = psutil.virtual_memory().available
+    if needed_bytes > free:
+        raise SamplingError(
+            f"{what} take {needed_bytes / 1e9:.1f} GB in this organ, and {free / 1e9:.1f} GB are free: {advice}"
+        )
 
 
 def occupied_voxels(vertices: np.ndarray, faces: np.ndarray, pitch: float) -> tuple[np.ndarray, np.ndarray]:

@@ -15,9 +15,9 @@ import numpy as np
 import trimesh
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from scenes.anatomy import load_surface
-from scenes.scene import SceneError
+from scenes.reading.error import PatientError
 from scenes.section import Direction, Vector3
+from scenes.surface_files import load_surface
 from sim.distance import signed_distance
 
 UNITS = ("_mm", "_kPa")
@@ -240,8 +240,8 @@ def _explain(error: ValidationError) -> str:
 
 def _surface(folder: Path, name: str) -> trimesh.Trimesh:
     try:
-        return load_surface(folder, name)
-    except SceneError as error:
+        return load_surface(folder / name)
+    except PatientError as error:
         raise CaseError(str(error)) from None
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from scenes.anatomy import LoadedAnatomy, load_anatomy
-from scenes.scene import Scene, load_scene
+from scenes.scene import Scene, load_scene, scene_file
 from studies.results import write_json
 
 
@@ -66,24 +66,11 @@ def save_figures(figures: dict[str, Any], json_file: Path) -> None:
     click.echo(f"\nWrote {json_file}")
 
 
-def scene_file(scene: Path) -> Path:
-    """The scene's file, where a patient's folder may be named instead. Raises Fault where the folder holds none."""
-    path = scene / "scene.toml" if scene.is_dir() else scene
-    if scene.is_dir() and not path.is_file():
-        raise Fault(f"{scene}: holds no scene.toml; make a patient's folder of a CT with: app.py import")
-    return path
-
-
 def load_patient(scene: Path) -> tuple[Scene, LoadedAnatomy]:
-    """A scene file or a patient's folder, and the anatomy that it names. Raises Fault, SceneError."""
+    """A scene file or a patient's folder, and the anatomy that it names. Raises SceneError, PatientError."""
     path = scene_file(scene)
     loaded = load_scene(path)
     return loaded, load_anatomy(loaded, path.parent)
-
-
-def probe_named(probe: str | None) -> str | None:
-    """A probe as --probe names it: a file by its whole path, as a scene's own would be looked for beside the scene."""
-    return str(Path(probe).resolve()) if probe and Path(probe).is_file() else probe
 
 
 def numbers(text: str, option: str, least: float, most: float) -> list[float]:

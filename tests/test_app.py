@@ -1,5 +1,6 @@
 """The command line as a user meets it: what it writes, and one clear line for each mistake."""
 
+import errno
 import io
 import json
 import os
@@ -202,6 +203,25 @@ def test_mistakes_are_one_line(tmp_path):
     assert "write cell_mm" in refused("rehearse", tmp_path)
     (tmp_path / "empty").mkdir()
     assert "holds no scene.toml" in refused("rehearse", tmp_path / "empty")
+
+
+@pytest.mark.parametrize(
+    "fault, words",
+    [
+        (
+            OSError(errno.ENOSPC, "No space left on device"),
+            "what was to be written: No space left on device; free some",
+        ),
+        (OSError(errno.EACCES, "Permission denied", "a.json"), "a.json: Permission denied; check"),
+        (MemoryError(), "larger cells"),
+    ],
+)
+def test_what_a_machine_lacks_is_one_line(fault, words, monkeypatch):
+    def fails():
+        raise fault
+
+    monkeypatch.setattr("studies.rehearse.command.keys_text", fails)
+    assert words in refused("keys")
 
 
 def ranges(group: click.Group) -> Iterator[click.FloatRange]:

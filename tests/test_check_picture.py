@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from synthetic_body import LEFT, TUMOUR, body, points_of, with_voxels
 
-from scenes.check_picture import COLOUR, PIXEL_MM, VIEWS, WHOLE, _bounds, _cut, colours_of, draw_check
+from scenes.check_picture import COLOUR, PIXEL_MM, VIEWS, WHOLE, colours_of, cut, draw_check
 from scenes.facts import facts
 from scenes.patient import import_patient
+from scenes.reading.grid import VoxelGrid
 from scenes.reading.labels import LabelMap
 from scenes.reading.volume import Volume
 
@@ -35,13 +36,13 @@ def test_letters_are_those_of_the_axes(view):
 @pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
 def test_a_spot_is_drawn_on_its_side(patient, view):
     """A bright spot to the left, front and head of the middle appears where the letters say."""
-    low, high = _bounds(patient.ct)
+    low, high = VoxelGrid.of(patient.ct).bounds()
     spot = (low + high) / 2 + [18.0, -15.0, 21.0]
     voxels = np.zeros(patient.ct.GetSize()[::-1], np.int16)
     voxels[patient.ct.TransformPhysicalPointToIndex(spot.tolist())[::-1]] = 1000
     right, down = np.array(view.right, float), np.array(view.down, float)
     spans = [sorted((low @ axis, high @ axis)) for axis in (right, down)]
-    picture = _cut(with_voxels(patient.ct, voxels), right, down, spans, spot)
+    picture = cut(with_voxels(patient.ct, voxels), right, down, spans, spot)
     row, column = np.unravel_index(picture.argmax(), picture.shape)
     assert column * PIXEL_MM + spans[0][0] == pytest.approx(spot @ right, abs=2.0)  # a voxel is 3 mm
     assert row * PIXEL_MM + spans[1][0] == pytest.approx(spot @ down, abs=2.0)

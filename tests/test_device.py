@@ -1,5 +1,10 @@
 """What Taichi is started with, and what it still says of a kernel that is wrong."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import taichi as ti
 
@@ -11,6 +16,43 @@ def test_compiled_kernels_of_many_patients_are_kept(device):
     assert ti.cfg.offline_cache and ti.cfg.offline_cache_max_size_of_files == sim.device.CACHE_BYTES
     start("cpu", offline_cache_max_size_of_files=7)
     assert ti.cfg.offline_cache_max_size_of_files == 7
+
+
+@pytest.mark.parametrize("name", ["a file in the way", "new"])
+def test_kernels_are_kept_where_they_can_be(tmp_path, name):
+    (tmp_path / "a file in the way").write_text("")
+    program = "import sim.device, taichi as ti; sim.device.start(); print(ti.cfg.offline_cache_file_path); ti.field(int, 3).fill(1)"
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env=os.environ | {"TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path / name)},
+        cwd=Path(sim.device.__file__).parents[1],
+        capture_output=True,
+        text=True,
+    )
+    kept = tmp_path / name if name == "new" else sim.device.TEMPORARY
+    # Of a folder that it cannot write Taichi would crash at the end.
+    assert (done.returncode, done.stdout) == (0, f"{kept}\n"), done.stderr
+
+
+def test_without_a_home_taichi_starts():
+    without = {name: value for name, value in os.environ.items() if name != "HOME"}
+    done = subprocess.run(
+        [sys.executable, "-c", "import sim, taichi"], env=without, cwd=Path(sim.device.__file__).parents[1]
+    )
+    assert done.returncode == 0
+
+
+def test_a_driver_that_is_missing_is_one_refusal_and_prints_nothing():
+    program = "import sim.device; sim.device.start('vulkan')"
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env=os.environ | {"VK_DRIVER_FILES": "/nonexistent", "VK_ICD_FILENAMES": "/nonexistent"},
+        cwd=Path(sim.device.__file__).parents[1],
+        capture_output=True,
+        text=True,
+    )
+    *above, last = done.stderr.splitlines()
+    assert "no vulkan device or driver; use --arch cpu" in last and not any("RHI" in line for line in above)
 
 
 def test_a_field_is_made_without_the_stack_being_written_down(device, monkeypatch):

@@ -24,6 +24,7 @@ from synthetic_body import (
 )
 
 import scenes.patient
+from scenes import anatomy
 from scenes.facts import facts, told
 from scenes.organ import midline_x, organs, single_out
 from scenes.patient import import_patient
@@ -33,7 +34,8 @@ from scenes.reading.error import PatientError
 from scenes.reading.grid import VoxelGrid
 from scenes.reading.labels import LabelMap, with_tissues
 from scenes.reading.volume import Volume
-from scenes.support import cradle
+from scenes.scene import SceneError
+from scenes.support import mould
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -286,7 +288,7 @@ class TestSave:
         def full(_folder):
             raise OSError(*fault)
 
-        with pytest.raises(PatientError, match="(No space|files cannot be written); choose a folder"):
+        with pytest.raises(PatientError, match="(No space|cannot be written); choose a folder"):
             save_patient(patient, tmp_path / "patient", draw=full)
         assert list(tmp_path.iterdir()) == []
 
@@ -294,6 +296,27 @@ class TestSave:
         with bytes_to_a_file(100), pytest.raises(PatientError, match="is the disk full.*; choose a folder"):
             save_patient(patient, tmp_path / "patient")
         assert list(tmp_path.iterdir()) == []
+
+    def test_what_a_killed_run_left_is_removed(self, patient, tmp_path):
+        (tmp_path / ".0a1b2c3d.partial-patient").mkdir()
+        (tmp_path / ".0a1b2c3d.partial-another").mkdir()
+        save_patient(patient, tmp_path / "patient")
+        assert {each.name for each in tmp_path.iterdir()} == {"patient", ".0a1b2c3d.partial-another"}
+
+    def test_the_embedded_patient_is_saved_where_it_can_be(self, patient, tmp_path, monkeypatch):
+        monkeypatch.setattr(anatomy, "_phantom_patient", lambda: patient)
+        monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path / "temporary"))
+        cache = tmp_path / "cache"
+        cache.write_text("a file in the way")
+        monkeypatch.setattr(anatomy, "CACHE", cache)
+        folder = anatomy.phantom_folder()
+        assert folder.parent == tmp_path / "temporary" / "nephron" and (folder / "organ.stl").is_file()
+        monkeypatch.setattr(anatomy, "_phantom_patient", lambda: pytest.fail("made twice"))
+        assert anatomy.phantom_folder() == folder
+        monkeypatch.setattr(anatomy, "_phantom_patient", lambda: patient)
+        monkeypatch.setattr("tempfile.gettempdir", lambda: str(cache))
+        with pytest.raises(SceneError, match="can be written to neither; free"):
+            anatomy.phantom_folder()
 
 
 REAL = [
@@ -327,7 +350,7 @@ class TestRealData:
 def test_support_like_that_of_the_bead_experiments(case):
     organ = trimesh.load(DATA / "truth" / case / "kidney.stl")
     expected = trimesh.load(DATA / "truth" / case / "support.stl")
-    support = cradle(organ, np.array([0.0, 0.0, -1.0]))
+    support = mould(organ, np.array([0.0, 0.0, -1.0]))
     assert_sound(support)
     np.testing.assert_allclose(support.bounds[:, 2], expected.bounds[:, 2], atol=0.1)
     # The mould itself: organ's underside, away from the rim, as far from our support as from theirs.

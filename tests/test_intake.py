@@ -11,7 +11,7 @@ from synthetic_body import BODY, DIRECTIONS, LEFT, RIGHT, TUMOUR, level
 from app import main
 from scenes.anatomy import load_anatomy
 from scenes.command import place_mm
-from scenes.intake import Request, _with_labels, take_in
+from scenes.intake import Request, take_in, with_labels
 from scenes.patient_folder import save_patient, telling
 from scenes.reading.ct import open_ct
 from scenes.reading.error import PatientError
@@ -199,7 +199,7 @@ def test_the_series_that_labels_were_drawn_on(tmp_path):
     thin.write()
     thick.write()
     seg = write_segmentation(tmp_path / "seg.dcm", thick, {"Kidney": np.ones((3, 10, 12))})
-    assert _with_labels(Request(tmp_path / "ct", [seg]), silent)[0].grid.spacing[2] == pytest.approx(5.0)
+    assert with_labels(Request(tmp_path / "ct", [seg]), silent)[0].grid.spacing[2] == pytest.approx(5.0)
 
 
 def test_each_source_is_private(hospital, taken_in):

@@ -15,8 +15,9 @@ import SimpleITK as sitk
 from conftest import rotation_about
 
 import app
-from scenes.anatomy import load_surface, phantom_folder
+from scenes.anatomy import phantom_folder
 from scenes.scene import EMBEDDED
+from scenes.surface_files import load_surface
 from sim.distance import signed_distance
 from sim.embedding import Unmoved
 from studies.coordinates import probe_in_patient
@@ -183,7 +184,7 @@ def test_both_files_or_none(tmp_path):
 
 def over_tumour() -> np.ndarray:
     """Poses over the embedded patient's tumour, 1.5 mm apart, seen from in front; x is not along an axis."""
-    middle = load_surface(phantom_folder(), "tumour.stl").center_mass
+    middle = load_surface(phantom_folder() / "tumour.stl").center_mass
     pose = np.eye(4)
     pose[:3, :3] = rotation_about([0, 1, 0], 20)
     way = np.tile(pose, (14, 1, 1))
@@ -239,7 +240,7 @@ def test_what_no_probe_can_press_again_is_refused(device):
 def swept(tmp_path_factory) -> Path:
     """A sweep over the embedded patient's tumour, with marks by its surfaces."""
     folder = tmp_path_factory.mktemp("swept")
-    organ, tumour = (load_surface(phantom_folder(), f"{name}.stl") for name in ("organ", "tumour"))
+    organ, tumour = (load_surface(phantom_folder() / f"{name}.stl") for name in ("organ", "tumour"))
     probe = load_probe("drop-in")
     sweep = MarkedSweep(folder, "over", probe)
     row, column = np.indices((64, 64))
@@ -273,7 +274,7 @@ def test_reconstruct_makes_a_volume_and_compares_it(swept, tmp_path, capsys):
     )
     volume, labels = (sitk.ReadImage(str(tmp_path / "out" / f"{name}.nrrd")) for name in ("volume", "labels"))
     assert list(volume.GetSize()) == report["shape"] == list(labels.GetSize())
-    middle = load_surface(phantom_folder(), "tumour.stl").center_mass
+    middle = load_surface(phantom_folder() / "tumour.stl").center_mass
     at = volume.TransformPhysicalPointToIndex(middle.tolist())
     assert (volume[at], labels[at]) == (40 + 80 * Mark.TUMOUR, Mark.TUMOUR)
     assert (tmp_path / "out" / "volume.png").stat().st_size > 10_000
@@ -347,7 +348,7 @@ def test_scan_leaves_a_sweep_at_the_poses_of_its_file(tmp_path):
         assert at == pytest.approx(pose @ probe.image_to_probe(rows, rows), abs=1e-9)
     assert np.diff(sweep.times_s) == pytest.approx(1 / 30) and sweep.images.std() > 10
     # The tumour's middle, 20 mm before the face, lies half a step beside the two last pictures.
-    middle = load_surface(phantom_folder(), "tumour.stl").center_mass
+    middle = load_surface(phantom_folder() / "tumour.stl").center_mass
     column, row, aside, _ = np.linalg.inv(sweep.transform("Image", "Reference", 1)) @ [*middle, 1]
     assert abs(aside) == pytest.approx(0.75) and marks.images[1, round(row), round(column)] == Mark.TUMOUR
     assert np.argwhere(marks.images == Mark.TUMOUR).size and (marks.images[1][0] == Mark.OUTSIDE).any()

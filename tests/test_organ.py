@@ -8,8 +8,8 @@ from synthetic_body import BODY, LEFT, RIGHT, body, drawn, grid_around, with_vox
 from test_import import found, imported
 
 import scenes.patient
-from scenes.organ import _hollow, midline_x, organs
-from scenes.parts import PEDICLE_MM, _bodies, _near, colours_of_labels
+from scenes.organ import hollow, midline_x, organs
+from scenes.parts import PEDICLE_MM, bodies, colours_of_labels, near_organ
 from scenes.patient import import_patient
 from scenes.reading.error import PatientError
 from scenes.reading.grid import VoxelGrid
@@ -60,8 +60,8 @@ class TestOrgan:
         mask = (np.linalg.norm((points - (9, 12, 11)) / (10, 12, 11), axis=-1) < 1) & (
             np.linalg.norm(places - (0, 12, 11), axis=-1) > 7
         )
-        wide = _hollow(np.pad(mask, 20), np.full(3, 2.0))[20:-20, 20:-20, 20:-20]
-        assert np.array_equal(_hollow(mask, np.full(3, 2.0)), wide) and wide.sum() > mask.sum()
+        wide = hollow(np.pad(mask, 20), np.full(3, 2.0))[20:-20, 20:-20, 20:-20]
+        assert np.array_equal(hollow(mask, np.full(3, 2.0)), wide) and wide.sum() > mask.sum()
 
     def test_kidney_halves_without_a_body(self):
         """Two pieces near each other may be one kidney's: no midline lies between them."""
@@ -96,7 +96,7 @@ class TestParts:
 
     def test_vessels_as_far_as_the_pedicle(self, labels):
         (piece,) = organs(labels)
-        grid, inside = _near(labels, piece, [1])
+        grid, inside = near_organ(labels, piece, [1])
         organ = piece.grid.place(np.argwhere(piece.mask)[:, ::-1])
         everything = labels.grid.place(np.argwhere(labels.values == 1)[:, ::-1])
         near = cKDTree(organ).query(everything)[0] <= PEDICLE_MM
@@ -107,7 +107,7 @@ class TestParts:
         empty = grid_around((-40, -20, -20), (60, 20, 20), (1.5, 1.5, 1.5))
         balls = [(np.array([x, 0.0, 0.0]), np.full(3, r)) for x, r in ((-20, 14), (18, 10), (50, 3))]
         image = drawn(empty, *((1, ball) for ball in balls))
-        surface = _bodies(VoxelGrid.of(image), sitk.GetArrayFromImage(image) > 0, "tumour")
+        surface = bodies(VoxelGrid.of(image), sitk.GetArrayFromImage(image) > 0, "tumour")
         assert surface.body_count == 2 and surface.bounds[1, 0] == pytest.approx(28, abs=1.5)
 
     def test_the_first_colour_counts(self):

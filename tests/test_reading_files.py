@@ -1,6 +1,7 @@
 """Volumes in files, in detail: values, what is private, where a box is."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from synthetic_body import DIRECTIONS, grid_around, with_voxels
 from test_reading import AIR, ENDINGS, RAS, affine_of, nifti, noise, written
 
 from scenes.reading.ct import open_ct
+from scenes.reading.error import PatientError
 from scenes.reading.grid import VoxelGrid
 from scenes.reading.label_files import open_labels
 
@@ -31,6 +33,18 @@ class TestFiles:
             marked.SetMetaData("descrip", "Doe^Jane")
             written(path, marked)
         assert "Doe^Jane" in open_ct(path).secrets and "Doe^Jane" in open_labels(path).secrets
+
+    def test_what_no_memory_holds_is_refused_with_what_it_takes(self, tmp_path, monkeypatch):
+        ct = open_ct(written(tmp_path / "ct.mha", noise()))
+        needed = 5 * np.prod(ct.grid.size)
+        monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=needed - 1))
+        with pytest.raises(
+            PatientError, match=r"ct\.mha: takes 0\.0 GB to read, and 0\.0 GB are free; close"
+        ):
+            ct.read()
+        assert ct.read((slice(0, 2),) * 3).shape == (2, 2, 2)
+        monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=needed))
+        assert ct.read().size == needed / 5
 
 
 class TestNifti:

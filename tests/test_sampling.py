@@ -1,5 +1,7 @@
 """Particles and clusters by the paper's greedy method."""
 
+from types import SimpleNamespace
+
 import igl
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from sim.body import fill_body
+from sim.lattice import fill_with_cells
 from sim.sampling import SamplingError, occupied_voxels, sample_clusters, sample_particles
 
 
@@ -86,3 +89,22 @@ def test_counts_on_a_real_kidney_are_those_of_the_papers_scale(data, radius, par
     found = sample_particles(kidney.vertices, kidney.faces, radius)
     assert len(found) == pytest.approx(particles, rel=0.01)
     assert 100 < len(sample_clusters(found, 3.33 * radius)) < 450
+
+
+def test_what_no_memory_holds_is_refused_with_what_it_takes(ball, monkeypatch):
+    def free(count):
+        monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=count))
+
+    # A box of 24 mm in voxels of 0.5 mm: 48 each way, of 80 bytes.
+    free(80 * 48**3 - 1)
+    with pytest.raises(
+        SamplingError, match=r"of 2 mm radius take 0\.0 GB .*, and 0\.0 GB are free: choose larger"
+    ):
+        sample_particles(ball.vertices, ball.faces, 2.0, 4)
+    free(80 * 48**3)
+    assert len(sample_particles(ball.vertices, ball.faces, 2.0, 4)) > 100
+    free(9000 * ball.volume / 8 - 1)
+    with pytest.raises(SamplingError, match="cells of 2 mm take"):
+        fill_with_cells(ball, 2.0)
+    free(9000 * ball.volume / 8 + 1)
+    assert fill_with_cells(ball, 2.0).cell_mm == 2

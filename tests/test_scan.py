@@ -9,8 +9,9 @@ from conftest import rotation_about
 from PIL import Image
 
 import app
-from scenes.anatomy import load_surface, phantom_folder
+from scenes.anatomy import phantom_folder
 from scenes.scene import EMBEDDED
+from scenes.surface_files import load_surface
 from studies.scan.poses import PoseError, TimedPoses, load_poses, load_timed_poses
 from ultrasound.array import load_probe
 
@@ -18,7 +19,7 @@ from ultrasound.array import load_probe
 def pose_on_tumour() -> np.ndarray:
     """On the embedded kidney's tumour: y into it, x to the head."""
     folder = phantom_folder()
-    organ, tumour = load_surface(folder, "organ.stl"), load_surface(folder, "tumour.stl")
+    organ, tumour = load_surface(folder / "organ.stl"), load_surface(folder / "tumour.stl")
     inward = organ.center_mass - tumour.center_mass
     inward /= np.linalg.norm(inward)
     face = organ.vertices[

@@ -8,6 +8,7 @@ import SimpleITK as sitk
 import trimesh
 
 from scenes.anatomy import load_anatomy, phantom_folder, press_on
+from scenes.reading.error import PatientError
 from scenes.scene import (
     EMBEDDED,
     Anatomy,
@@ -15,6 +16,7 @@ from scenes.scene import (
     Scene,
     SceneError,
     load_scene,
+    scene_file,
     scene_text,
     with_options,
 )
@@ -137,13 +139,13 @@ def test_files_that_a_scene_names_are_checked(tmp_path):
     scene = with_ball(tmp_path)
     assert load_anatomy(scene, tmp_path).organ.is_watertight
     trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]).export(tmp_path / "organ.stl")
-    with pytest.raises(SceneError, match="organ.stl: is not a closed surface"):
+    with pytest.raises(PatientError, match="organ.stl: is not a closed surface"):
         load_anatomy(scene, tmp_path)
     (tmp_path / "organ.stl").write_text("solid nothing")
-    with pytest.raises(SceneError, match="organ.stl"):
+    with pytest.raises(PatientError, match="organ.stl"):
         load_anatomy(scene, tmp_path)
     (tmp_path / "organ.stl").unlink()
-    with pytest.raises(SceneError, match="organ.stl: no such surface file"):
+    with pytest.raises(PatientError, match="organ.stl: no such surface file"):
         load_anatomy(scene, tmp_path)
     with_ball(tmp_path)
     with pytest.raises(SceneError, match="ct.nrrd: no such file"):
@@ -189,3 +191,20 @@ def test_the_embedded_patient_is_made_once():
     anatomy = load_anatomy(load_scene(EMBEDDED), EMBEDDED.parent)
     assert 150e3 < anatomy.organ.volume < 200e3
     assert anatomy.tumour is not None and len(anatomy.shapes) == 1
+
+
+def test_a_folder_is_its_scene_and_without_one_is_refused(tmp_path):
+    with pytest.raises(SceneError, match=r"holds no scene\.toml; make"):
+        scene_file(tmp_path)
+    (tmp_path / "scene.toml").write_text("")
+    assert scene_file(tmp_path) == scene_file(tmp_path / "scene.toml") == tmp_path / "scene.toml"
+
+
+def test_a_probes_file_is_named_from_where_the_program_was_started(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.toml").write_text("")
+    probes = [
+        with_options(load_scene(EMBEDDED), {"transducer.probe": name}).transducer.probe
+        for name in ("mine.toml", "linear")
+    ]
+    assert probes == [str((tmp_path / "mine.toml").resolve()), "linear"]

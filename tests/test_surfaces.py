@@ -19,7 +19,7 @@ from synthetic_body import (
     voxels_to_boundary,
 )
 
-from scenes.support import cradle
+from scenes.support import mould
 from scenes.surfaces import decimate, self_intersections, surface_from_mask
 
 
@@ -98,7 +98,7 @@ class TestSupport:
     def test_lies_under_the_organ_and_clear_of_it(self, gravity):
         organ = trimesh.creation.icosphere(subdivisions=4)
         organ.vertices = organ.vertices * (50, 22, 28) + (10, -300, 40)
-        support = cradle(organ, np.array(gravity))
+        support = mould(organ, np.array(gravity))
 
         assert_sound(support)
         assert len(support.faces) == pytest.approx(5000, abs=50)
@@ -111,7 +111,7 @@ class TestSupport:
 
     def test_moulds_the_underside(self):
         organ = trimesh.creation.icosphere(subdivisions=4, radius=30)
-        support = cradle(organ, np.array([0, 0, -1]), clearance_mm=0.5)
+        support = mould(organ, np.array([0, 0, -1]), clearance_mm=0.5)
         # Polar angles up to 40 degrees lie in the mould, well inside of its filleted rim (at 73 degrees).
         under = organ.vertices[organ.vertices[:, 2] < -30 * np.cos(np.radians(40))]
         faces = np.asarray(support.faces, np.int64)
@@ -124,7 +124,7 @@ class TestSupport:
             :, 2
         ]  # its lower end reaches far under the rim: an undercut
         up = np.array([0.0, 0.0, 1.0])
-        support = cradle(leaning, -up)
+        support = mould(leaning, -up)
         for lift in (1.0, 5.0, 20.0):
             lifted = leaning.copy().apply_translation(lift * up)
             assert least_gap(support, lifted) > 0
@@ -132,4 +132,4 @@ class TestSupport:
     @pytest.mark.parametrize("gravity", [(0, 0, 0), (np.nan, 0, 1)])
     def test_gravity_without_direction_is_refused(self, gravity):
         with pytest.raises(ValueError, match="gravity"):
-            cradle(trimesh.creation.icosphere(radius=30), np.array(gravity))
+            mould(trimesh.creation.icosphere(radius=30), np.array(gravity))

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from scenes.reading.error import PatientError
-from scenes.reading.files import ENDINGS, file_volume, is_volume_file
-from scenes.reading.headers import Found
+from scenes.reading.files import file_volume, is_volume_file
 from scenes.reading.progress import Progress, silent
 from scenes.reading.series import dicom_found, series_volume
 from scenes.reading.volume import Volume
@@ -26,24 +25,10 @@ def open_ct(
     Raises:
         PatientError: nothing readable, or nothing that is one whole, upright CT; a line for the user.
     """
-    path = Path(path)
     if not path.exists():
         raise PatientError(f"{path}: no such file or folder; check the path")
     if path.is_file() and is_volume_file(path):
         if series is not None:
             raise PatientError(f"{path}: holds no series; leave --series out")
         return file_volume(path)
-    return series_volume(path, dicom_or_words(path, progress), series, referenced, progress)
-
-
-def dicom_or_words(path: Path, progress: Progress) -> Found:
-    """The DICOM in a folder or file; for a file that is none, which kinds are known."""
-    try:
-        return dicom_found(path, progress)
-    except PatientError as error:
-        if path.is_file() and "no DICOM file" in str(error):
-            raise PatientError(
-                f"{path}: unknown kind of file; expected DICOM (a folder, a DICOMDIR or a zip archive), or a file that ends in "
-                f"{', '.join(ENDINGS)}; convert it"
-            ) from None
-        raise
+    return series_volume(path, dicom_found(path, progress), series, referenced, progress)

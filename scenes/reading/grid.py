@@ -80,6 +80,16 @@ class VoxelGrid:
             np.array(np.meshgrid(*[(a.start, a.stop - 1) for a in box], indexing="ij")).reshape(3, -1).T
         )
 
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and greatest LPS [mm] of voxel centres, (3,) each."""
+        corners = self.corners()
+        return corners.min(axis=0), corners.max(axis=0)
+
+    @property
+    def voxel_ml(self) -> float:
+        """Volume of a voxel [ml]."""
+        return float(np.prod(self.spacing)) / 1000
+
     def whole(self) -> Box:
         """The box of all voxels."""
         x, y, z = (slice(0, n) for n in self.size)
@@ -106,6 +116,20 @@ class VoxelGrid:
         image.SetOrigin(self.origin.tolist())
         image.SetDirection(self.direction.ravel().tolist())
         return image
+
+    def sampled(self, image: sitk.Image, interpolator: int, beyond: float) -> np.ndarray:
+        """What an image holds at these voxels (z, y, x), and beyond it a value."""
+        found = sitk.Resample(
+            image,
+            list(self.size),
+            sitk.Transform(),
+            interpolator,
+            self.origin.tolist(),
+            self.spacing.tolist(),
+            self.direction.ravel().tolist(),
+            beyond,
+        )
+        return sitk.GetArrayFromImage(found)
 
     def same_as(self, other: VoxelGrid) -> bool:
         """Whether size and, to a hundredth of a voxel, all corners agree: files round their geometry."""

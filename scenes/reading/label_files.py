@@ -11,7 +11,6 @@ import numpy as np
 import SimpleITK as sitk
 
 from scenes.reading.contours import read_contours, referenced_series
-from scenes.reading.ct import dicom_or_words
 from scenes.reading.error import PatientError
 from scenes.reading.files import ENDINGS, NIFTI, file_volume, is_volume_file
 from scenes.reading.grid import Box, VoxelGrid
@@ -23,6 +22,7 @@ from scenes.reading.nifti import label_names
 from scenes.reading.progress import Progress, silent
 from scenes.reading.secrets import secrets_of
 from scenes.reading.segmentation import read_segmentation
+from scenes.reading.series import dicom_found
 from scenes.reading.volume import Volume
 
 # An import keeps 60 mm around its organ, and a probe sees as far.
@@ -52,7 +52,6 @@ def open_labels(path: Path, wanted: Collection[str] = (), progress: Progress = s
     Raises:
         PatientError: nothing readable, no labels, none marked; a line for the user.
     """
-    path = Path(path)
     if not path.exists():
         raise PatientError(f"{path}: no such file or folder; check the path")
     if path.is_file() and is_volume_file(path):
@@ -60,7 +59,7 @@ def open_labels(path: Path, wanted: Collection[str] = (), progress: Progress = s
     organs = sorted(file for file in path.iterdir() if is_volume_file(file)) if path.is_dir() else []
     if organs:
         return _one_an_organ(path, organs, wanted, progress)
-    drawing = drawing_of(dicom_or_words(path, progress))
+    drawing = drawing_of(dicom_found(path, progress))
     if drawing is None:
         raise PatientError(
             f"{path}: holds no labels; expected a DICOM segmentation or structure set, or label maps; choose another"

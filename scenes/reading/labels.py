@@ -182,17 +182,8 @@ def nearest(grid: VoxelGrid, voxels: np.ndarray, onto: VoxelGrid) -> np.ndarray:
     """Voxels (z, y, x) of one grid on another, by nearest neighbour; 0 beyond the first grid."""
     if grid.same_as(onto):
         return voxels
-    found = sitk.Resample(
-        grid.image(voxels.astype(np.uint8) if voxels.dtype == bool else voxels),
-        list(onto.size),
-        sitk.Transform(),
-        sitk.sitkNearestNeighbor,
-        onto.origin.tolist(),
-        onto.spacing.tolist(),
-        onto.direction.ravel().tolist(),
-        0,
-    )
-    return sitk.GetArrayFromImage(found).astype(voxels.dtype)
+    image = grid.image(voxels.astype(np.uint8) if voxels.dtype == bool else voxels)
+    return onto.sampled(image, sitk.sitkNearestNeighbor, 0).astype(voxels.dtype)
 
 
 def _widened(grid: VoxelGrid, maps: Iterable[LabelMap]) -> VoxelGrid:
@@ -211,6 +202,6 @@ def _onto(grid: VoxelGrid, own: VoxelGrid, inside: np.ndarray) -> tuple[np.ndarr
     if grid.part((x, y, z)).same_as(own):
         return inside, (x, y, z)
     reach = 0.5 * np.abs(own.direction) @ own.spacing
-    corners = own.corners()
-    box = grid.box_around(corners.min(axis=0) - reach, corners.max(axis=0) + reach)
+    low, high = own.bounds()
+    box = grid.box_around(low - reach, high + reach)
     return nearest(own, inside, grid.part(box)), box

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from scenes.reading.error import PatientError
+from scenes.reading.files import ENDINGS
 from scenes.reading.headers import Found, Series, Slice, read_headers
 from scenes.reading.progress import Progress
 from scenes.reading.secrets import secrets_of
@@ -21,8 +22,13 @@ UID_END = 6
 
 
 def dicom_found(path: Path, progress: Progress) -> Found:
-    """What the DICOM files of a folder, DICOMDIR or archive hold. Raises PatientError."""
+    """What the DICOM files of a folder, DICOMDIR or archive hold. Raises PatientError where there are none."""
     items = items_of(path)
+    if not items and path.is_file():
+        raise PatientError(
+            f"{path}: unknown kind of file; expected DICOM (a folder, a DICOMDIR or a zip archive), or a file that ends in "
+            f"{', '.join(ENDINGS)}; convert it"
+        )
     if not items:
         raise PatientError(
             f"{path}: no DICOM file in there; give the folder that holds the slices, or a NIfTI, NRRD or MHA file"

@@ -7,12 +7,11 @@ import trimesh
 
 from scenes.anatomy import LoadedAnatomy, files_of, load_anatomy
 from scenes.parts import PARTS
-from scenes.patient_folder import check_folder
+from scenes.patient_folder import check_folder, new_folder
 from scenes.reading.files import file_volume
-from scenes.scene import Scene, load_scene
+from scenes.scene import Scene, load_scene, scene_file
 from scenes.surface_files import FORMATS, save_surface
 from scenes.volume_files import save_image
-from studies.command_line import make_folder, scene_file
 
 
 @click.command()
@@ -37,11 +36,11 @@ def export(scene: Path, out: Path, suffix: str) -> None:
     check_folder(out)
     loaded = load_scene(path)
     anatomy = load_anatomy(loaded, path.parent)
-    make_folder(out)
     named = surfaces(anatomy)
-    for name, surface in named.items():
-        save_surface(surface, out / f"{name}.{suffix}")
-    volumes = save_volumes(loaded, path.parent, out)
+    with new_folder(out) as partial:
+        for name, surface in named.items():
+            save_surface(surface, partial / f"{name}.{suffix}")
+        volumes = save_volumes(loaded, path.parent, partial)
     click.echo(
         f"Wrote to {out}, in mm, LPS: {', '.join([*(f'{name}.{suffix}' for name in named), *volumes])}"
     )

@@ -8,8 +8,8 @@ import numpy as np
 from tqdm import tqdm
 
 from scenes.anatomy import LoadedAnatomy, load_anatomy
-from scenes.scene import Scene, load_scene
-from studies.command_line import Fault, NumberRange, arch_option, make_folder, scene_file, start_taichi
+from scenes.scene import Scene, load_scene, scene_file
+from studies.command_line import Fault, NumberRange, arch_option, make_folder, start_taichi
 from studies.freehand.files import save_volumes
 from studies.freehand.picture import save_picture
 from studies.freehand.rebuild import Places, Rebuilt, Track, lit, rebuild, track_of

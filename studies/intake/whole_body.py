@@ -11,11 +11,13 @@ from pydicom.dataset import FileDataset, FileMetaDataset
 from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
 
 from scenes.phantom import make_phantom
+from scenes.reading.grid import VoxelGrid
+from scenes.reading.volume import AIR_HU
 
 PIXELS, PIXEL_MM = 512, 0.78
 GAP_MM = 0.75
 HALF_WIDTH_MM, HALF_DEPTH_MM = 170.0, 115.0
-AIR_HU, BODY_HU, NOISE_HU = -1000, 40, 12.0
+BODY_HU, NOISE_HU = 40, 12.0
 SEED = 20160101
 
 
@@ -54,18 +56,8 @@ def _body(place: np.ndarray, middle_y: float) -> np.ndarray:
 
 
 def _plane(image: sitk.Image, place: np.ndarray, method: int, beyond: float) -> np.ndarray:
-    spacing = [PIXEL_MM, PIXEL_MM, GAP_MM]
-    plane = sitk.Resample(
-        image,
-        [PIXELS, PIXELS, 1],
-        sitk.Transform(),
-        method,
-        place.tolist(),
-        spacing,
-        np.eye(3).ravel().tolist(),
-        beyond,
-    )
-    return sitk.GetArrayFromImage(plane)[0]
+    plane = VoxelGrid((PIXELS, PIXELS, 1), np.array([PIXEL_MM, PIXEL_MM, GAP_MM]), place, np.eye(3))
+    return plane.sampled(image, method, beyond)[0]
 
 
 def _write_slice(file: Path, k: int, place: np.ndarray, pixels: np.ndarray, series: str, frame: str) -> None:

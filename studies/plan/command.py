@@ -7,9 +7,9 @@ from pydantic import ValidationError
 from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy
-from scenes.scene import EMBEDDED, load_scene, with_options
+from scenes.scene import EMBEDDED, load_scene, scene_file, with_options
 from scenes.trocar import Trocar
-from studies.command_line import Fault, NumberRange, make_folder, probe_named, scene_file
+from studies.command_line import Fault, NumberRange, make_folder
 from studies.plan.file import FASTEST_MM_S, MOST_MARGIN_MM, MOST_SWEEPS, SLOWEST_MM_S, scans_of, write_plan
 from studies.setup import probe_of
 from ultrasound.target import TARGETS, Target
@@ -70,7 +70,7 @@ def plan(
 ) -> None:
     """Plan a sweep over SCENE, a scene file or a patient's folder: poses that show the target on the deforming organ."""
     path = scene_file(scene)
-    loaded = with_options(load_scene(path), {"transducer.probe": probe_named(probe)})
+    loaded = with_options(load_scene(path), {"transducer.probe": probe})
     port = trocar_of(loaded.trocar, trocar, cone_deg, wrist_deg)
     anatomy = load_anatomy(loaded, path.parent)
     held = probe_of(loaded, path.parent)

@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from scenes.trocar import Trocar
+from scenes.whole_files import whole
 from studies.numbering import next_number
 from ultrasound.target import Target
 
@@ -86,7 +87,8 @@ class Plan(_Part):
 
 def write_plan(plan: Plan, path: Path) -> None:
     """Write a plan; the same plan makes the same bytes. Raises OSError."""
-    path.write_text(json.dumps(plan.model_dump(mode="json"), indent=1) + "\n", "utf-8")
+    with whole(path) as partial:
+        partial.write_text(json.dumps(plan.model_dump(mode="json"), indent=1) + "\n", "utf-8")
 
 
 def scans_of(trials: int) -> int:

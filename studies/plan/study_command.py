@@ -8,8 +8,8 @@ import numpy as np
 from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy
-from scenes.scene import EMBEDDED, load_scene, with_options
-from studies.command_line import make_folder, probe_named, scene_file
+from scenes.scene import EMBEDDED, load_scene, scene_file, with_options
+from studies.command_line import make_folder
 from studies.plan.file import MOST_SWEEPS
 from studies.results import write_json
 
@@ -40,7 +40,7 @@ def plan_study(scenes: tuple[Path, ...], out: Path, trials: int, probe: str, job
     with tqdm(total=len(patients) * count_of(trials), desc="plan", unit="scan") as bar:
         for number, each in enumerate(patients, 1):
             path = scene_file(each)
-            scene = with_options(load_scene(path), {"transducer.probe": probe_named(probe)})
+            scene = with_options(load_scene(path), {"transducer.probe": probe})
             anatomy = with_tumour(load_anatomy(scene, path.parent), np.array(scene.gravity.direction))
             run = compare(scene, anatomy, trials, jobs, bar.update)
             runs.append(dict(patient=scene.title or f"patient {number}") | run)

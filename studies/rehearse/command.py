@@ -10,17 +10,9 @@ from render.display import display_available
 from render.keys import Keys, keys_text, load_keys
 from scenes.anatomy import LoadedAnatomy, fingerprint, load_anatomy
 from scenes.reading.progress import Stages, Told
-from scenes.scene import EMBEDDED, OPTIONS, Scene, load_scene, with_options
+from scenes.scene import EMBEDDED, OPTIONS, Scene, load_scene, scene_file, with_options
 from scenes.tissue import TISSUES
-from studies.command_line import (
-    Fault,
-    NumberRange,
-    arch_option,
-    make_folder,
-    probe_named,
-    scene_file,
-    start_taichi,
-)
+from studies.command_line import Fault, NumberRange, arch_option, make_folder, start_taichi
 from studies.link.options import link_options, opened_link
 from studies.plan.file import read_plan
 from studies.rehearse.checks import (
@@ -131,7 +123,6 @@ def rehearse(
     """Press the kidney of SCENE, a scene file or a patient's folder, and see what the transducer sees."""
     path = scene_file(scene)
     changed = {key: changes[option.strip("-").replace("-", "_")] for key, option in OPTIONS.items()}
-    changed["transducer.probe"] = probe_named(changed["transducer.probe"])
     before = load_scene(path)
     keys = load_keys(keys_file) if keys_file is not None else Keys()
     refuse_inputs(track_file, track_from, replay, link_leads)

@@ -3,17 +3,19 @@
 import json
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import click
 import numpy as np
 from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy
-from scenes.scene import load_scene, with_options
-from studies.command_line import Fault, arch_option, make_folder, probe_named, scene_file, start_taichi
+from scenes.scene import load_scene, scene_file, with_options
+from scenes.whole_files import whole
+from studies.command_line import Fault, arch_option, make_folder, start_taichi
 from studies.scan.poses import load_poses
 from studies.setup import probe_of
-from ultrasound.array import MODES, RUNGS
+from ultrasound.array import MODES, RUNGS, Probe
 
 FRAMES_A_SECOND = 30
 
@@ -60,7 +62,7 @@ def scan(
     For each pose of a file, what the probe shows there. Writes PNG pictures and scan.json, which says how large their pixels are.
     """
     path = scene_file(scene)
-    options = {"transducer.probe": probe_named(probe), "image.mode": picture, "image.rung": rung}
+    options = {"transducer.probe": probe, "image.mode": picture, "image.rung": rung}
     loaded = with_options(load_scene(path), options)
     placed = load_poses(poses)
     anatomy = load_anatomy(loaded, path.parent)
@@ -68,13 +70,11 @@ def scan(
         raise Fault(f"{path}: has no CT: expected anatomy.ct, of which pictures are made")
     held, image = probe_of(loaded, path.parent), loaded.image
     used = start_taichi(arch)
-    from render.pictures import in_proportion
     from sim.embedding import Unmoved
     from studies.rehearsal import scanned_anatomy
-    from ultrasound.dicom_image import save_dicom
     from ultrasound.marked_sweep import MarkedSweep
     from ultrasound.plane import ImagePlane
-    from ultrasound.scanner import ECHO, Scanner
+    from ultrasound.scanner import Scanner
 
     make_folder(out)
     scanned = scanned_anatomy(anatomy.organ, anatomy.ct, anatomy, np.zeros(3))
@@ -90,24 +90,12 @@ def scan(
         if swept is not None:
             grey = next(iter(shown.values()))
             swept.add(grey, scanner.marks.render(), held, pose, swept.count / FRAMES_A_SECOND)
-        for kind, grey in shown.items():
-            square = in_proportion(grey, width, depth)
-            file = out / f"{name}-{kind.lower()}.png"
-            square.save(file)
-            spacing = depth / square.height, width / square.width
-            if dicom and kind == ECHO:
-                save_dicom(file.with_suffix(".dcm"), np.asarray(square), spacing, held)
-            rows.append(
-                dict(
-                    pose=name,
-                    picture=kind,
-                    file=file.name,
-                    row_mm=spacing[0],
-                    column_mm=spacing[1],
-                    probe_to_patient=pose.tolist(),
-                    image_to_probe=held.image_to_probe(square.height, square.width).tolist(),
-                )
-            )
+        rows += [
+            dict(pose=name, probe_to_patient=pose.tolist()) | row
+            for row in save_pictures(shown, held, out, name, dicom)
+        ]
+    if swept is not None:
+        swept.close()
     report = dict(
         probe=held.model_dump(by_alias=True),
         rung=image.rung,
@@ -116,9 +104,34 @@ def scan(
         arch=used,
         pictures=rows,
     )
-    if swept is not None:
-        swept.close()
-    (out / "scan.json").write_text(json.dumps(report, indent=2) + "\n", "utf-8")
+    with whole(out / "scan.json") as partial:
+        partial.write_text(json.dumps(report, indent=2) + "\n", "utf-8")
     click.echo(
         f"Wrote {len(rows)} pictures of {len(placed)} poses and scan.json to {out}; {np.median(ms):.1f} ms a pose (median)."
     )
+
+
+def save_pictures(
+    shown: dict[str, np.ndarray], probe: Probe, out: Path, name: str, dicom: bool
+) -> list[dict[str, Any]]:
+    """Write what is shown (rows, columns) of a pose, by kind, with square pixels; what scan.json says of each. Raises OSError."""
+    from render.pictures import in_proportion
+    from ultrasound.dicom_image import save_dicom
+    from ultrasound.scanner import ECHO
+
+    width, depth, _ = probe.extent_mm
+    rows: list[dict[str, Any]] = []
+    for kind, grey in shown.items():
+        picture = in_proportion(grey, width, depth)
+        file = out / f"{name}-{kind.lower()}.png"
+        picture.save(file)
+        spacing = depth / picture.height, width / picture.width
+        if dicom and kind == ECHO:
+            save_dicom(file.with_suffix(".dcm"), np.asarray(picture), spacing, probe)
+        to_probe = probe.image_to_probe(picture.height, picture.width).tolist()
+        rows.append(
+            dict(
+                picture=kind, file=file.name, row_mm=spacing[0], column_mm=spacing[1], image_to_probe=to_probe
+            )
+        )
+    return rows
