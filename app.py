@@ -28,6 +28,7 @@ from studies.study import study
 from ultrasound.acoustics import TissueError
 from ultrasound.array import ProbeError
 from ultrasound.sweep import SweepError
+from version import VERSION
 
 # What is wrong with a file or a value, said in one line.
 MENDED_BY_USER = (
@@ -47,6 +48,7 @@ MENDED_BY_USER = (
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(VERSION, prog_name="nephron")
 def cli() -> None:
     """Nephron: rehearse ultrasound on a patient's own deformable kidney.
 
@@ -79,7 +81,7 @@ def _stop_in_order() -> None:
 
 def main(arguments: list[str]) -> int:
     """Run a command line; what the user must mend is one line, and the exit status 2."""
-    if not arguments or (arguments[0].startswith("-") and arguments[0] not in ("-h", "--help")):
+    if not arguments or (arguments[0].startswith("-") and arguments[0] not in ("-h", "--help", "--version")):
         arguments = ["rehearse", *arguments]
     _stop_in_order()
     try:

@@ -8,6 +8,7 @@ import numpy as np
 import taichi as ti
 
 from studies.rehearsal import Rehearsal
+from version import VERSION
 
 
 def timed(work: Callable, into_ms: list[float]):
@@ -63,6 +64,7 @@ class Record:
         """Everything in one dictionary; times in ms are over all steps but the first, if there are more."""
         settings = rehearsal.settings
         return dict(
+            version=VERSION,
             title=rehearsal.scene.title,
             arch=arch,
             **(NOT_EVERYWHERE | rehearsal.scene.tissue.model_dump() | rehearsal.model.counts()),

@@ -9,9 +9,10 @@ from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.scene import OPTIONS, Scene
 from studies.commands import Fault
 from studies.plan.file import Plan, PlanError
-from studies.session.file import Log, SessionError, read_log
+from studies.session.file import Header, Log, SessionError, read_log
 from studies.session.scene import scene_of_log
 from ultrasound.array import Probe, explained
+from version import VERSION
 
 # What a budget leaves to the user.
 MATERIAL = ("tissue.model", "tissue.young_kpa", "tissue.poisson")
@@ -84,6 +85,15 @@ def check_anatomy(log: Log, anatomy: LoadedAnatomy, title: str) -> None:
             f"the session is of other anatomy than this scene's ({title or 'no title'}): name "
             "its scene or patient's folder before --replay; a patient imported anew is another one"
         )
+
+
+def origin_in_words(header: Header, arch: str) -> str:
+    """Why a replay may not be bit for bit what was recorded; nothing where the backend and the version, if it is known, are the same."""
+    if header.version not in (None, VERSION):
+        return f"Mind: recorded by version {header.version}, replayed by {VERSION}: what changed between them may show."
+    if header.arch != arch:
+        return f"Mind: recorded on {header.arch}, replayed on {arch}: the same to the eye, not to the bit."
+    return ""
 
 
 def check_plan(plan: Plan, anatomy: str, probe: Probe) -> None:

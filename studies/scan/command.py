@@ -14,6 +14,7 @@ from studies.commands import Fault, arch_option, make_folder, start_taichi
 from studies.scan.poses import load_poses
 from studies.setup import probe_of
 from ultrasound.array import MODES, RUNGS
+from version import VERSION
 
 FRAMES_A_SECOND = 30
 
@@ -111,6 +112,7 @@ def scan(
                 )
             )
     report = dict(
+        version=VERSION,
         probe=held.model_dump(by_alias=True),
         rung=image.rung,
         contact=contact,
