@@ -53,7 +53,7 @@ def dry_run(target: str, *variables: str) -> str:
     """What make would do, without an environment of ours."""
     if shutil.which("make") is None:
         pytest.skip("no make here")
-    command = ["make", "-n", "-B", target, *variables]
+    command = ["make", "-n", "-B", "--no-print-directory", target, *variables]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     return done.stdout
