@@ -1,12 +1,19 @@
-# make run   press the embedded patient's kidney, in a window or, without a display, into out/
-# make test  everything that must hold before a change lands
+# make run       press the embedded patient's kidney, in a window or, without a display, into out/
+# make test      everything that must hold before a change lands
+# make audit     whether anything pinned here is known to be vulnerable, as PyPI knows it
+# make licences  the table of THIRD_PARTY.md anew
 # Each makes what it needs: an environment in .venv and, as root on Debian or Ubuntu, the system packages.
+# On Windows they are for Git's bash.
 
-PYTHON ?= python3 python3.13 python3.12 python3.11
-BIN := .venv/bin
+PYTHON ?= python3 python3.13 python3.12 python3.11 python
+SCRIPTS := $(if $(filter Windows_NT,$(OS)),Scripts,bin)
+BIN := .venv/$(SCRIPTS)
+RELEASE := .cache/release/$(SCRIPTS)
+SHIPPED := .cache/shipped/$(SCRIPTS)
+INSTALL := -m pip install --quiet --disable-pip-version-check
 ARGS ?=
 
-.PHONY: run test clean
+.PHONY: run test audit licences clean
 .DELETE_ON_ERROR:
 
 run: .venv/.run
@@ -20,8 +27,20 @@ test: .venv/.dev
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
+# Strict: a package that the service does not know is a failure, not a package without a fault.
+audit: .cache/release/.tools
+	$(RELEASE)/pip-audit --strict -r requirements-dev.txt -r requirements-release.txt
+
+# In an environment of nothing else, so that the table has what requirements.txt brings and no more.
+licences: .cache/release/.tools
+	$(BIN)/python -m venv --clear .cache/shipped
+	$(SHIPPED)/python $(INSTALL) -r requirements.txt
+	sed '/^| Name/,$$d' THIRD_PARTY.md > .cache/shipped/THIRD_PARTY.md
+	$(RELEASE)/pip-licenses --python $(SHIPPED)/python --from=mixed --format=markdown --with-urls >> .cache/shipped/THIRD_PARTY.md
+	mv .cache/shipped/THIRD_PARTY.md THIRD_PARTY.md
+
 # The first of PYTHON that is there and of a version that Taichi has wheels for.
-.venv/bin/python:
+.venv/pyvenv.cfg:
 	@for python in $(PYTHON); do \
 	    $$python -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null || continue; \
 	    $$python -c 'import ensurepip, venv' 2>/dev/null || sh .ci/system-packages venv; \
@@ -29,12 +48,17 @@ test: .venv/.dev
 	done; \
 	echo "Nephron needs Python 3.11, 3.12 or 3.13, found none; install one or name it: make PYTHON=/path/to/python3.12"; exit 1
 
-.venv/.run: requirements.txt .venv/bin/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt
+.venv/.run: requirements.txt .venv/pyvenv.cfg
+	$(BIN)/python $(INSTALL) -r requirements.txt
 	@touch $@
 
 .venv/.dev: requirements-dev.txt .venv/.run
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
+	$(BIN)/python $(INSTALL) -r requirements-dev.txt
+	@touch $@
+
+.cache/release/.tools: requirements-release.txt .venv/pyvenv.cfg
+	$(BIN)/python -m venv --clear .cache/release
+	$(RELEASE)/python $(INSTALL) -r requirements-release.txt
 	@touch $@
 
 clean:

@@ -20,6 +20,7 @@ from studies.setup import SetupError
 from ultrasound.acoustics import TissueError
 from ultrasound.array import ProbeError
 from ultrasound.sweep import SweepError
+from version import VERSION
 
 # Where each command is; only the one that is called is imported, for the others' libraries take seconds to load.
 COMMANDS = {
@@ -67,6 +68,7 @@ class Commands(click.Group):
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(VERSION, prog_name="nephron")
 def cli() -> None:
     """Nephron: rehearse ultrasound on a patient's own deformable kidney.
 
@@ -90,7 +92,7 @@ def _told(error: OSError) -> str:
 
 def main(arguments: list[str]) -> int:
     """Run a command line; what the user must mend is one line, and the exit status 2."""
-    if not arguments or (arguments[0].startswith("-") and arguments[0] not in ("-h", "--help")):
+    if not arguments or (arguments[0].startswith("-") and arguments[0] not in ("-h", "--help", "--version")):
         arguments = ["rehearse", *arguments]
     _stop_in_order()
     try:

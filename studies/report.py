@@ -9,6 +9,7 @@ from studies.rehearsal import Rehearsal
 from studies.results import counted, spread
 from studies.setup import setup_of_scene
 from studies.trade.front import expected_error_mm, load_points
+from version import VERSION
 
 # Keys that not every tissue model fills.
 NOT_EVERYWHERE = dict(radius_mm=None, stiffness=None, clusters=0, memberships=0)
@@ -47,6 +48,7 @@ class Tally:
         """Everything in one dictionary; times in ms are over all steps but the first, if there are more."""
         settings = rehearsal.settings
         return dict(
+            version=VERSION,
             title=rehearsal.scene.title,
             arch=arch,
             **(NOT_EVERYWHERE | rehearsal.scene.tissue.model_dump() | rehearsal.model.counts()),

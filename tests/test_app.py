@@ -19,6 +19,7 @@ from conftest import ROOT
 from PIL import Image
 
 import app
+from version import VERSION
 
 REPORTED = {
     "particles",
@@ -80,6 +81,7 @@ def pressed(tmp_path_factory) -> Path:
 def test_a_headless_press_reports_what_it_promises(pressed):
     report = json.loads((pressed / "report.json").read_text())
     assert set(report) >= REPORTED
+    assert report["version"] == VERSION
     assert report["finite"] is True and report["arch"] == "cpu" and report["cell_mm"] == 7
     assert report["particles"] == report["nodes"] > report["cells"] > 300
     for name in ("ms_per_step", "ms_per_slice"):

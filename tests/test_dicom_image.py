@@ -14,6 +14,7 @@ import SimpleITK as sitk
 
 from ultrasound.array import Probe, load_probe
 from ultrasound.dicom_image import save_dicom
+from version import VERSION
 
 # Not square, an odd number of bytes, and spacings that no decimal string holds whole.
 PICTURE = np.random.default_rng(3).integers(0, 256, (9, 7), np.uint8)
@@ -138,6 +139,7 @@ def test_it_says_that_it_is_simulated_and_names_nobody(file):
         "DerivationDescription": "Simulated, not for diagnosis",
         "Modality": "US",
         "Manufacturer": "Nephron",
+        "SoftwareVersions": VERSION,
         "PatientIdentityRemoved": "YES",
         "DeidentificationMethod": "Nothing of the patient is written",
         "TransducerType": "LINEAR",

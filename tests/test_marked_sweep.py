@@ -32,6 +32,7 @@ from ultrasound.marked_sweep import MarkedSweep, marks_beside
 from ultrasound.probe import held_at, image_plane, pose_at
 from ultrasound.sweep import Mark, SweepError
 from ultrasound.sweep_file import read_sweep, write_sweep
+from version import VERSION
 
 SPINE, NWIRE = "SpinePhantomFreehand", "NwirePhantomFreehand"
 SPINE_XML = "us/PlusDeviceSet_SpinePhantomFreehandReconstructionOnly.xml"
@@ -107,6 +108,7 @@ def test_a_recorded_sweep_says_where_each_pixel_is(tmp_path):
         assert at[:3] == pytest.approx(place, abs=1e-6)
     marks = marks_beside(tmp_path / "sweep-001.igs.mha")
     assert np.array_equal(marks.images, sweep.images % 3)
+    assert sweep.fields["NephronVersion"] == marks.fields["NephronVersion"] == VERSION
     assert [frame["ProbeToReferenceTransform"] for frame in marks.frames] == [
         frame["ProbeToReferenceTransform"] for frame in sweep.frames
     ]
@@ -260,6 +262,7 @@ def test_reconstruct_makes_a_volume_and_compares_it(swept, tmp_path, capsys):
     assert app.main([str(part) for part in command]) == 0
     report = json.loads((tmp_path / "out" / "report.json").read_text(), parse_constant=pytest.fail)
     assert (report["frames"], report["used"], report["method"]) == (14, 14, "smooth")
+    assert report["version"] == VERSION
     assert report["way_mm"] == pytest.approx(13 * 1.5) and report["between_max_mm"] == pytest.approx(1.5)
     assert report["speed_median_mm_s"] == report["speed_max_mm_s"] == pytest.approx(15.0)
     # Two voxels, which is more than pictures are apart.

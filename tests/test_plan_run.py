@@ -20,6 +20,7 @@ from studies.plan.trial import Trial
 from studies.plan.way import Way, gliding, layout_towards
 from studies.rehearse import headless
 from ultrasound.probe import advanced, indentation
+from version import VERSION
 
 R = 25.0
 TRIALS, SPEED_MM_S = 4, 60.0
@@ -135,6 +136,7 @@ def test_the_plans_figures_are_those_of_its_sweep_tried_again(made):
     assert parts.pop("time_s") == pytest.approx(sweep.parts["time_s"], abs=steps_s)
     assert parts == pytest.approx({name: sweep.parts[name] for name in parts}, abs=1e-2)
     assert sweep.parts["reachable"] == 1.0 and sweep.parts["seen"] > 0
+    assert made.plan.version == VERSION
 
 
 def test_the_poses_of_a_plan_lie_about_the_organ_in_the_patient(made):

@@ -14,6 +14,7 @@ from scenes.scene import EMBEDDED
 from scenes.surface_files import load_surface
 from studies.scan.poses import PoseError, TimedPoses, load_poses, load_timed_poses
 from ultrasound.array import load_probe
+from version import VERSION
 
 
 def pose_on_tumour() -> np.ndarray:
@@ -154,7 +155,7 @@ def test_scan_leaves_a_picture_of_each_pose_and_mode(tmp_path, capsys):
         "off-b-mode.png",
         "off-ct.png",
     ]
-    assert report["probe"]["FrequencyMhz"] == 9.0
+    assert report["probe"]["FrequencyMhz"] == 9.0 and report["version"] == VERSION
     shown = {path.stem: np.asarray(Image.open(path)).astype(int) for path in out.glob("*.png")}
     row = report["pictures"][0]
     rows, columns = shown["on-b-mode"].shape

@@ -22,6 +22,7 @@ from studies.rehearse.view import settings_of
 from studies.scan.poses import TimedPoses
 from studies.session import recorded
 from studies.session.file import Log, read_log
+from version import VERSION
 
 
 class Watched(NullViewer):
@@ -110,11 +111,13 @@ def test_a_rehearsal_is_replayed_to_the_bit_and_the_pixel(built, monkeypatch, tm
 def test_a_session_that_goes_on_from_a_replay_is_one_too(built, monkeypatch, tmp_path, capsys):
     _, _, first = rehearsed(built, monkeypatch, tmp_path, partial(user, frames=60))
     led, end, second = rehearsed(built, monkeypatch, tmp_path, watching(60, 20), first, 0.5)
-    assert len(second.poses) == 40 and second.header.begins
+    assert len(second.poses) == 40 and second.header.begins and second.header.version == VERSION
+    assert "recorded by version" not in capsys.readouterr().out
+    second.header.version = "0.9"
     shown, again, _ = rehearsed(built, monkeypatch, tmp_path, watching(40), second)
     told = capsys.readouterr().out
     assert shown == led[20:] and again == end and "identical in all 1 states" in told
-    assert told.count("Gamepad ready") == 2
+    assert told.count("Gamepad ready") == 1 and f"recorded by version 0.9, replayed by {VERSION}" in told
 
 
 def test_a_tracked_file_is_followed_headless_and_replayed(built, monkeypatch, tmp_path, capsys):

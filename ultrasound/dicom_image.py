@@ -9,6 +9,7 @@ from pydicom.uid import ExplicitVRLittleEndian, UltrasoundImageStorage, generate
 from pydicom.valuerep import DS
 
 from ultrasound.array import Probe
+from version import VERSION
 
 # What the standard wants present though it is unknown (its type 2).
 EMPTY = (
@@ -56,6 +57,7 @@ def save_dicom(
         setattr(data, keyword, generate_uid(prefix=None))
     data.Modality = "US"
     data.Manufacturer = "Nephron"
+    data.SoftwareVersions = VERSION
     # No examination made this picture; its tissue comes from the pixels of another.
     data.ImageType = ["DERIVED", "SECONDARY"]
     data.DerivationDescription = "Simulated, not for diagnosis"

@@ -7,21 +7,22 @@ import numpy as np
 from ultrasound.array import Probe
 from ultrasound.sweep import Sweep, SweepError
 from ultrasound.sweep_file import SweepWriter, read_sweep
+from version import VERSION
 
 SUFFIX, MARKS = ".igs.mha", "-marks.igs.mha"
-# In the header: what took the pictures.
-PROBE_FIELD = "TransducerName"
+# In the header: what took the pictures, and which version of Nephron.
+PROBE_FIELD, VERSION_FIELD = "TransducerName", "NephronVersion"
 
 
 class MarkedSweep:
-    """Writes STEM.igs.mha and STEM-marks.igs.mha into a folder, both or none; the header names the probe.
+    """Writes STEM.igs.mha and STEM-marks.igs.mha into a folder, both or none; the header names the probe and the version.
 
     Reference is the patient (LPS, mm). Raises OSError.
     """
 
     def __init__(self, folder: Path, stem: str, probe: Probe) -> None:
         self.name = f"{stem}{SUFFIX}"
-        fields = {PROBE_FIELD: probe.transducer_name}
+        fields = {PROBE_FIELD: probe.transducer_name, VERSION_FIELD: VERSION}
         self._pictures, self._marks = (
             SweepWriter(folder / f"{stem}{end}", fields) for end in (SUFFIX, MARKS)
         )

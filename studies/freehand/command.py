@@ -21,6 +21,7 @@ from ultrasound.reconstruction import METHODS
 from ultrasound.sweep import Sweep, load_constants
 from ultrasound.sweep_file import read_sweep, write_sweep
 from ultrasound.tracking import TrackingErrors
+from version import VERSION
 
 MOST_REACH_MM = 5.0
 
@@ -132,6 +133,7 @@ def reconstruct(
             raise Fault(f"{sweep.name}: {error}") from None
     save_volumes(rebuilt, out)
     report = dict(
+        version=VERSION,
         **settings,
         reference=reference,
         undo_compression=undo_compression,

@@ -70,9 +70,10 @@ class Sweep(_Part):
 
 
 class Plan(_Part):
-    """``anatomy`` is the fingerprint of the patient's files (``scenes.anatomy``); ``why`` says why the first sweep is first."""
+    """``version`` is the Nephron that made it; ``anatomy`` is the fingerprint of the patient's files (``scenes.anatomy``); ``why`` says why the first sweep is first."""
 
     nephron_plan: Literal[1] = 1
+    version: str | None = None
     anatomy: str
     target: Target
     margin_mm: float = Field(ge=0, le=MOST_MARGIN_MM)

@@ -12,6 +12,7 @@ from studies.plan.file import Plan, PlanError, Sweep
 from studies.plan.score import in_words, points, score, why
 from studies.plan.search import ranked, search
 from studies.plan.workers import Outcome, Problem, Workers
+from version import VERSION
 
 DIGITS = 6
 
@@ -29,6 +30,7 @@ def make_plan(
             "or give the search more --trials"
         )
     return Plan(
+        version=VERSION,
         anatomy=fingerprint(problem.anatomy),
         target=problem.target,
         margin_mm=problem.margin_mm,

@@ -11,9 +11,10 @@ from studies.command_line import Fault
 from studies.plan.file import Plan, PlanError, is_plan, read_plan
 from studies.rehearse.track_file import check_near
 from studies.scan.poses import TimedPoses
-from studies.session.file import Log, SessionError, read_log
+from studies.session.file import Header, Log, SessionError, read_log
 from studies.session.scene import scene_of_log
 from ultrasound.array import Probe, explained
+from version import VERSION
 
 # What a budget leaves to the user.
 MATERIAL = ("tissue.model", "tissue.young_kpa", "tissue.poisson")
@@ -93,6 +94,15 @@ def check_track(track: TimedPoses, path: Path, anatomy: LoadedAnatomy, probe: Pr
     check_near(track, anatomy.organ.vertices, path)
     if is_plan(path):
         check_plan(read_plan(path), fingerprint(anatomy), probe)
+
+
+def origin_in_words(header: Header, arch: str) -> str:
+    """Why a replay may not be bit for bit what was recorded; nothing where the backend and the version, if it is known, are the same."""
+    if header.version not in (None, VERSION):
+        return f"Mind: recorded by version {header.version}, replayed by {VERSION}: what changed between them may show."
+    if header.arch != arch:
+        return f"Mind: recorded on {header.arch}, replayed on {arch}: the same to the eye, not to the bit."
+    return ""
 
 
 def check_plan(plan: Plan, anatomy: str, probe: Probe) -> None:

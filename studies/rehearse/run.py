@@ -16,6 +16,7 @@ from studies.command_line import Fault
 from studies.link.server import Server
 from studies.plan.file import Plan
 from studies.rehearsal import Rehearsal, RehearsalState
+from studies.rehearse.checks import origin_in_words
 from studies.rehearse.drivers import Played, Scripted, set_settings
 from studies.rehearse.guide import Guide
 from studies.rehearse.headless import run_headless
@@ -140,10 +141,7 @@ class Run:
 
     def _replay(self, log: Log, at_s: float, settings: Settings) -> Replay:
         replay = Replay(self.rehearsal, log)
-        if log.header.arch != self.arch:
-            click.echo(
-                f"Mind: recorded on {log.header.arch}, replayed on {self.arch}: the same to the eye, not to the bit."
-            )
+        _say(origin_in_words(log.header, self.arch))
         aim = min(round(at_s / log.header.time_step_s), len(log.poses))
         if aim > 0:
             with tqdm(total=aim, desc=f"to {at_s:g} s", unit="step") as bar:

@@ -16,6 +16,7 @@ from studies.command_line import Fault, arch_option, make_folder, start_taichi
 from studies.scan.poses import load_poses
 from studies.setup import probe_of
 from ultrasound.array import MODES, RUNGS, Probe
+from version import VERSION
 
 FRAMES_A_SECOND = 30
 
@@ -97,6 +98,7 @@ def scan(
     if swept is not None:
         swept.close()
     report = dict(
+        version=VERSION,
         probe=held.model_dump(by_alias=True),
         rung=image.rung,
         contact=contact,

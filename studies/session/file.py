@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from typing_extensions import TypedDict
 
-VERSION = 1
+FORMAT = 1
 # Of a pose, all but its last row.
 NUMBERS = 12
 MOST_SECOND = 1_000_000
@@ -34,9 +34,10 @@ class _Line(BaseModel):
 
 
 class Header(_Line):
-    """What is rehearsed. ``anatomy`` is the fingerprint of the files that a scene names, which are not in here."""
+    """What is rehearsed, by which version of Nephron. ``anatomy`` is the fingerprint of the files that a scene names, not in here."""
 
     nephron_session: Literal[1] = 1
+    version: str | None = Field(None, pattern=r"^[0-9A-Za-z.+-]{1,40}$")
     anatomy: str
     scene: dict[str, Any]
     probe: dict[str, Any]
@@ -234,9 +235,9 @@ def read_log(path: Path) -> Log:
 def _header(name: str, line: bytes) -> Header:
     try:
         values = json.loads(line)
-        version = values.get("nephron_session", VERSION) if isinstance(values, dict) else None
-        if version != VERSION:
-            raise SessionError(f"{name}: not a session, or of another version; expected nephron_session = 1")
+        found = values.get("nephron_session", FORMAT) if isinstance(values, dict) else None
+        if found != FORMAT:
+            raise SessionError(f"{name}: not a session, or of another format; expected nephron_session = 1")
         return Header.model_validate(values)
     except (ValueError, RecursionError) as error:
         if isinstance(error, SessionError):

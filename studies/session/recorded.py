@@ -10,6 +10,7 @@ from studies.session.file import Header, Recording
 from studies.session.scene import recorded_values
 from studies.session.session import Session
 from studies.session.state import to_text
+from version import VERSION
 
 # A whole state is written so often: from one to the next, at most, is computed anew where a session is opened in its midst.
 STATE_S = 60.0
@@ -55,6 +56,7 @@ def record(
     """Record a session from here on under the next free number of a folder. Raises OSError."""
     rehearsal = session.rehearsal
     header = Header(
+        version=VERSION,
         anatomy=fingerprint(anatomy),
         scene=recorded_values(rehearsal.scene),
         probe=rehearsal.probe.model_dump(mode="json", by_alias=True),
