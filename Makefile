@@ -49,11 +49,13 @@ licences: .cache/release/.tools
 	echo "Nephron needs Python 3.11, 3.12 or 3.13, found none; install one or name it: make PYTHON=/path/to/python3.12"; exit 1
 
 .venv/.run: requirements.txt .venv/pyvenv.cfg
-	$(BIN)/python $(INSTALL) -r requirements.txt
+	@echo "Installing what Nephron needs into .venv: a minute or two, once."
+	@$(BIN)/python $(INSTALL) -r requirements.txt
 	@touch $@
 
 .venv/.dev: requirements-dev.txt .venv/.run
-	$(BIN)/python $(INSTALL) -r requirements-dev.txt
+	@echo "Installing what the tests need."
+	@$(BIN)/python $(INSTALL) -r requirements-dev.txt
 	@touch $@
 
 .cache/release/.tools: requirements-release.txt .venv/pyvenv.cfg

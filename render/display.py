@@ -7,8 +7,8 @@ from functools import cache
 
 from render.layout import FULL_SIZE
 
-# A window takes so much of a screen's height, and of a small one as much as its title and a task bar leave.
-SHARE, MOST_SHARE = 2 / 3, 0.88
+# So much of a small screen's height a window takes, as its title and a task bar leave; its width is a multiple of STEP.
+SHARE, STEP = 0.88, 64
 
 
 def display_available() -> bool:
@@ -28,10 +28,10 @@ def window_size() -> tuple[int, int]:
 
 
 def fitted(width: int, height: int) -> tuple[int, int]:
-    """The size of a window on a screen of so many pixels."""
-    tall = max(SHARE * height, min(FULL_SIZE[1], MOST_SHARE * height))
-    tall = min(tall, width * FULL_SIZE[1] / FULL_SIZE[0])
-    return round(tall * FULL_SIZE[0] / FULL_SIZE[1]), round(tall)
+    """The size of a window on a screen of so many pixels: FULL_SIZE, or as large as there is room for."""
+    room = min(width, SHARE * height * FULL_SIZE[0] / FULL_SIZE[1])
+    wide = min(FULL_SIZE[0], int(room) // STEP * STEP)
+    return wide, wide * FULL_SIZE[1] // FULL_SIZE[0]
 
 
 @cache
