@@ -298,16 +298,16 @@ class TestSave:
         assert {each.name for each in tmp_path.iterdir()} == {"patient", ".0a1b2c3d.partial-another"}
 
     def test_the_embedded_patient_is_saved_where_it_can_be(self, patient, tmp_path, monkeypatch):
-        monkeypatch.setattr(anatomy, "_phantom_patient", lambda: patient)
+        monkeypatch.setattr(anatomy, "_phantom_patient", lambda told: patient)
         monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path / "temporary"))
         cache = tmp_path / "cache"
         cache.write_text("a file in the way")
         monkeypatch.setattr(anatomy, "CACHE", cache)
         folder = anatomy.phantom_folder()
         assert folder.parent == tmp_path / "temporary" / "nephron" and (folder / "organ.stl").is_file()
-        monkeypatch.setattr(anatomy, "_phantom_patient", lambda: pytest.fail("made twice"))
+        monkeypatch.setattr(anatomy, "_phantom_patient", lambda told: pytest.fail("made twice"))
         assert anatomy.phantom_folder() == folder
-        monkeypatch.setattr(anatomy, "_phantom_patient", lambda: patient)
+        monkeypatch.setattr(anatomy, "_phantom_patient", lambda told: patient)
         monkeypatch.setattr("tempfile.gettempdir", lambda: str(cache))
         with pytest.raises(SceneError, match="can be written to neither; free"):
             anatomy.phantom_folder()
