@@ -192,6 +192,7 @@ def test_the_command_opens_the_link_for_as_long_as_it_runs(monkeypatch, tmp_path
 
     monkeypatch.setattr(command, "start_taichi", lambda arch: "cpu")
     monkeypatch.setattr(command, "built", lambda *_: None)
+    monkeypatch.setattr(command, "compile_picture", lambda rehearsal: None)
     monkeypatch.setattr(run, "Instruments", lambda rehearsal, guide: None)
     monkeypatch.setattr(run.Run, "headless", headless_run)
     line = [

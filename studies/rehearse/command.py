@@ -156,6 +156,8 @@ def rehearse(
         else:
             rehearsal = built(loaded, anatomy, probe, told)
         build_s = perf_counter() - started
+        told("Building the model: the first picture")
+        compile_picture(rehearsal)
     if chosen:
         click.echo(chosen)
     from studies.rehearse.run import Run
@@ -194,15 +196,18 @@ def found_display() -> bool:
 
 
 def built(scene: Scene, anatomy: LoadedAnatomy, probe: Probe, told: Told) -> "Rehearsal":
-    """The rehearsal, with all compiled that its first frame takes."""
+    """The rehearsal of a scene."""
     from studies.rehearsal import Rehearsal
+
+    return Rehearsal(scene, anatomy, probe, told, shows_echo=scene.image.mode != "ct")
+
+
+def compile_picture(rehearsal: "Rehearsal") -> None:
+    """Take a picture that nobody sees, so that the first frame need not wait for its kernels."""
     from studies.rehearse.view import settings_of, take_view
     from studies.report import Tally
 
-    rehearsal = Rehearsal(scene, anatomy, probe, told, shows_echo=scene.image.mode != "ct")
-    told("Building the model: the first picture")
     take_view(rehearsal, settings_of(rehearsal), None, Tally(0.0))
-    return rehearsal
 
 
 def built_within(
