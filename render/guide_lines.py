@@ -8,6 +8,7 @@ import taichi as ti
 
 from render import solids
 from render.viewer import Guidance
+from sim.fields import fill
 
 MOST_SEGMENTS = 2000
 TO_GO, GONE = np.array([1.0, 0.72, 0.20], np.float32), np.array([0.30, 0.75, 0.42], np.float32)
@@ -32,7 +33,7 @@ class GuideLines:
             self._shown = way, gone
         scene.lines(self._way, WIDTH, per_vertex_color=self._colours)
         if guidance.goal is not None:
-            self._goal.from_numpy(solids.placed(self._edges, guidance.goal).astype(np.float32))
+            fill(self._goal, solids.placed(self._edges, guidance.goal))
             scene.lines(self._goal, GOAL_WIDTH, color=GOAL)
 
     def _fill(self, guidance: Guidance) -> None:
@@ -43,5 +44,5 @@ class GuideLines:
         colours = np.tile(GONE, (2 * MOST_SEGMENTS, 1))
         points[: 2 * len(segments)] = segments.reshape(-1, 3)
         colours[: 2 * len(segments)] = np.where(np.repeat(gone, 2)[:, None], GONE, TO_GO)
-        self._way.from_numpy(points)
-        self._colours.from_numpy(colours)
+        fill(self._way, points)
+        fill(self._colours, colours)

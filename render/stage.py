@@ -4,13 +4,13 @@ The scene is a parameter, so that window.py alone imports the user interface. Le
 """
 
 import numpy as np
-import taichi as ti
 
 from render import solids
 from render.camera import OrbitCamera
 from render.guide_lines import GuideLines
 from render.surface import GLASS, SOLID, Surface
 from render.viewer import Geometry, Settings, View
+from sim.fields import field_of, fill
 
 PLANE_ROWS, PLANE_COLUMNS = 96, 64
 KEY_LIGHT, FILL_LIGHT, AMBIENT = (0.82, 0.80, 0.77), (0.17, 0.19, 0.23), (0.17, 0.17, 0.19)
@@ -18,16 +18,6 @@ TUMOUR, SUPPORT, EDGE, FRAME = (0.93, 0.76, 0.28), (0.30, 0.33, 0.36), (0.85, 0.
 PARTS = {"cyst": (0.30, 0.60, 0.86), "urine": (0.62, 0.74, 0.33), "vessel": (0.80, 0.16, 0.20)}
 LINE_WIDTH = 1.2
 MASKS = 5
-
-
-def _vector_field(values: np.ndarray):
-    field = ti.Vector.field(values.shape[1], ti.f32, shape=len(values))
-    _fill(field, values)
-    return field
-
-
-def _fill(field, values: np.ndarray) -> None:
-    field.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
 class Stage:
@@ -46,21 +36,25 @@ class Stage:
             self._support = self._matt_support(geometry.support_vertices, geometry.support_faces)
         self._half_axis_mm = geometry.transducer_size_mm[2] / 2
         self._probe = solids.transducer(geometry.transducer_size_mm, geometry.transducer_radius_mm)
-        self._probe_vertices, self._probe_normals, self._probe_colours = map(_vector_field, self._probe[:3])
+        self._probe_vertices, self._probe_normals, self._probe_colours = (
+            field_of(each, within=1) for each in self._probe[:3]
+        )
         self._probe_edges = solids.edges(geometry.transducer_size_mm, geometry.transducer_radius_mm)
-        self._edge_points = _vector_field(self._probe_edges)
+        self._edge_points = field_of(self._probe_edges, within=1)
         self._guide: GuideLines | None = None
         self._plane, self._plane_indices = solids.image_plane_grid(PLANE_ROWS, PLANE_COLUMNS)
         self._plane_points, self._plane_normals, self._plane_colours = (
-            _vector_field(np.ones((len(self._plane), 3))) for _ in range(3)
+            field_of(np.ones((len(self._plane), 3)), within=1) for _ in range(3)
         )
-        self._frame_points = _vector_field(np.zeros((2 * solids.FRAME_SIDES, 3)))
-        self._mask_points, self._mask_normals = (_vector_field(np.ones((6 * MASKS, 3))) for _ in range(2))
-        self._mask_colours = _vector_field(np.zeros((6 * MASKS, 4)))
+        self._frame_points = field_of(np.zeros((2 * solids.FRAME_SIDES, 3)), within=1)
+        self._mask_points, self._mask_normals = (
+            field_of(np.ones((6 * MASKS, 3)), within=1) for _ in range(2)
+        )
+        self._mask_colours = field_of(np.zeros((6 * MASKS, 4)), within=1)
         self._mask_indices = np.arange(6 * MASKS, dtype=np.int32)
 
     def _matt_support(self, vertices: np.ndarray, faces: np.ndarray) -> Surface:
-        support = Surface(_vector_field(np.asarray(vertices)), faces, SUPPORT, gloss=0.0)
+        support = Surface(field_of(vertices, within=1), faces, SUPPORT, gloss=0.0)
         # It neither moves nor shines, so its colours are worked out once, as seen from far above.
         above = self.camera.target + 10.0 * self.camera.distance_home * self.camera.up
         support.shade(above, above)
@@ -114,16 +108,16 @@ class Stage:
                 [left, top],
             ]
         depth = 1.02 * self.camera.near_far()[0]
-        _fill(self._mask_points, self.camera.eye() + depth * self.camera.direction(corners.reshape(-1, 2)))
+        fill(self._mask_points, self.camera.eye() + depth * self.camera.direction(corners.reshape(-1, 2)))
         scene.mesh(
             self._mask_points, self._mask_indices, self._mask_normals, per_vertex_color=self._mask_colours
         )
 
     def _draw_transducer(self, scene, pose: np.ndarray) -> None:
         probe = self._probe
-        _fill(self._probe_vertices, solids.placed(probe.vertices, pose))
-        _fill(self._probe_normals, probe.normals @ pose[:3, :3].T)
-        _fill(self._edge_points, solids.placed(self._probe_edges, pose))
+        fill(self._probe_vertices, solids.placed(probe.vertices, pose))
+        fill(self._probe_normals, probe.normals @ pose[:3, :3].T)
+        fill(self._edge_points, solids.placed(self._probe_edges, pose))
         scene.mesh(
             self._probe_vertices, probe.indices, self._probe_normals, per_vertex_color=self._probe_colours
         )
@@ -136,11 +130,11 @@ class Stage:
         points = solids.placed(solids.standing(places), face)
         toward = key - points
         # Facing the key light everywhere, the plane is evenly bright: its grey is the slice's, not the light's.
-        _fill(self._plane_points, points)
-        _fill(self._plane_normals, toward / np.linalg.norm(toward, axis=1, keepdims=True))
+        fill(self._plane_points, points)
+        fill(self._plane_normals, toward / np.linalg.norm(toward, axis=1, keepdims=True))
         grey = solids.sampled(next(iter(view.pictures.values())), places, view)
-        _fill(self._plane_colours, np.repeat(grey[:, None], 3, axis=1))
-        _fill(self._frame_points, solids.placed(solids.image_plane_frame(view), face))
+        fill(self._plane_colours, np.repeat(grey[:, None], 3, axis=1))
+        fill(self._frame_points, solids.placed(solids.image_plane_frame(view), face))
         scene.mesh(
             self._plane_points, self._plane_indices, self._plane_normals, per_vertex_color=self._plane_colours
         )

@@ -8,6 +8,8 @@ the faces are sent farthest first.
 import numpy as np
 import taichi as ti
 
+from sim.fields import fill
+
 ORGAN, TINT = (0.66, 0.27, 0.23), (0.24, 0.60, 0.36)
 SOLID, GLASS = 1.0, 0.30
 CUT_EDGE_MM = 0.4
@@ -95,9 +97,9 @@ class Surface:
         self._faces = ti.Vector.field(3, ti.i32, shape=len(self.faces))
         self._start = ti.field(ti.i32, shape=count + 1)
         self._around = ti.field(ti.i32, shape=len(around))
-        self._faces.from_numpy(self.faces)
-        self._start.from_numpy(start)
-        self._around.from_numpy(around)
+        fill(self._faces, self.faces)
+        fill(self._start, start)
+        fill(self._around, around)
 
     def shade(self, eye, light, opacity: float = SOLID, cut=None) -> None:
         """Bring normals and colours up to date. `cut`: point and unit normal (3,) of the side to take away
@@ -125,7 +127,7 @@ class Surface:
             if vertices is None:
                 self._tint.fill(0.0)
             else:
-                self._tint.from_numpy(vertices.astype(np.float32))
+                fill(self._tint, vertices.astype(np.float32))
 
     def indices(self, ahead: np.ndarray | None = None) -> np.ndarray:
         """Vertex indices of the faces, int32 (3 m,), farthest first along `ahead` if given."""

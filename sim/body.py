@@ -7,7 +7,7 @@ import taichi as ti
 import trimesh
 
 from sim.distance import signed_distance
-from sim.fields import field_of
+from sim.fields import field_of, fill
 from sim.sampling import sample_particles
 
 
@@ -80,9 +80,9 @@ class Body:
 
     def restore(self, state: BodyState) -> None:
         """Go back to a state; the steps that follow give the same bits as they did from it before."""
-        self.position.from_numpy(state.position)
-        self.estimate.from_numpy(state.position)
-        self.velocity.from_numpy(state.velocity)
+        fill(self.position, state.position)
+        fill(self.estimate, state.position)
+        fill(self.velocity, state.velocity)
 
 
 @ti.data_oriented

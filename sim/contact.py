@@ -5,6 +5,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import ParticleBody
+from sim.fields import fill
 from sim.free_way import FreeWay
 from sim.shapes import FAR
 
@@ -57,8 +58,8 @@ class ShapeContacts:
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Go back to a snapshot; the steps that follow give the same bits."""
-        self.contact.plane.from_numpy(state["plane"])
-        self.found.from_numpy(state["found"])
+        fill(self.contact.plane, state["plane"])
+        fill(self.found, state["found"])
 
     @ti.func
     def is_clear(self, s: ti.template(), i, p, distance):

@@ -10,7 +10,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import Body
-from sim.fields import field_of
+from sim.fields import field_of, fill
 from sim.free_way import FreeWay
 from sim.lattice import Lattice
 from sim.shapes import FAR
@@ -88,7 +88,7 @@ class SurfaceContacts:
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Go back to a snapshot; the steps that follow give the same bits."""
         for name, values in state.items():
-            getattr(self, name).from_numpy(values)
+            fill(getattr(self, name), values)
 
     @ti.func
     def carried(self, field: ti.template(), q):

@@ -10,6 +10,7 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
+from sim.fields import fill
 from ultrasound.array import RUNGS, Probe, Rung
 from ultrasound.beam import DB, Beams
 from ultrasound.plane import Picture, PlaneInTissue
@@ -87,20 +88,20 @@ class BMode:
 
     def _make_tables(self, probe: Probe) -> None:
         """What depends on the probe's settings alone, made anew when these change."""
-        self.gain.from_numpy(probe.gain_db().astype(np.float32))
+        fill(self.gain, probe.gain_db())
         fixed = probe.model_dump(exclude={"gain_percent", "dyn_range_db", "time_gain_compensation"})
         if self._tables_of == tuple(fixed.items()):
             return
         self._tables_of = tuple(fixed.items())
         start, direction = probe.scanlines()
-        self.beams.start.from_numpy(start.astype(np.float32))
-        self.beams.direction.from_numpy(direction.astype(np.float32))
-        self.beams.element.from_numpy(probe.elements().astype(np.float32))
+        fill(self.beams.start, start)
+        fill(self.beams.direction, direction)
+        fill(self.beams.element, probe.elements())
         weights, half, loudness = lateral_weights(probe)
-        self.weight.from_numpy(weights.astype(np.float32))
-        self.half.from_numpy(half.reshape(-1, LANES).max(axis=1).astype(np.int32))
-        self.beams.loudness.from_numpy(loudness.astype(np.float32))
-        self.source.from_numpy(source_of_pixels(probe, self.plane.pixels))
+        fill(self.weight, weights)
+        fill(self.half, half.reshape(-1, LANES).max(axis=1))
+        fill(self.beams.loudness, loudness)
+        fill(self.source, source_of_pixels(probe, self.plane.pixels))
 
     @ti.kernel
     def _add(self):

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import cma
 import numpy as np
 
 from studies.plan.candidate import Candidate
@@ -32,6 +31,9 @@ class Search:
     trials: int = 0
 
     def __post_init__(self) -> None:
+        # A window that makes no plan need not wait for it: two seconds, with all that it imports.
+        import cma
+
         chance = np.random.default_rng(SEED)
         # Left to itself it would draw from, and seed, the one generator that all share.
         options = dict(

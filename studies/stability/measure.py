@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from sim.body import BodyState
+from sim.fields import fill
 from sim.neo_hookean import NeoHookean
 from sim.solver import SolverState, StepSettings
 from studies.results import rounded
@@ -118,7 +119,7 @@ def _weigh(specimen: Specimen, heaviest: float) -> None:
     if isinstance(specimen.model, NeoHookean):
         mass = specimen.mass.copy()
         mass[len(mass) // 2] *= heaviest
-        specimen.model.mass.from_numpy(mass.astype(np.float32))
+        fill(specimen.model.mass, mass)
 
 
 def _harden(specimen: Specimen, material: Mapping[str, float]) -> None:
