@@ -28,6 +28,14 @@ def device():
     ti.reset()
 
 
+@pytest.fixture(scope="module")
+def one_device():
+    """Taichi on the CPU, for all tests of a file that keep nothing on it."""
+    start("cpu")
+    yield
+    ti.reset()
+
+
 @pytest.fixture
 def data() -> Path:
     """The folder of real data, which the project stands without."""

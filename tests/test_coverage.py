@@ -8,6 +8,8 @@ from conftest import rotation_about
 from ultrasound.array import load_probe
 from ultrasound.coverage import PLACES, VOXEL_MM, Coverage
 
+pytestmark = pytest.mark.usefixtures("one_device")
+
 R = 20.0
 # u along x, v along -z, the thickness along y.
 UPRIGHT = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]]).T
@@ -38,7 +40,7 @@ def on_picture(coverage: Coverage, axes: np.ndarray, origin) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def organ() -> Coverage:
+def organ(one_device) -> Coverage:
     return Coverage(big_ball())
 
 

@@ -92,13 +92,12 @@ def test_scaled_masses_that_are_off_take_no_field(device):
     assert isinstance(on, ParticleBody) and hasattr(on, "mass_scale")
 
 
-def test_kernels_are_counted_where_a_step_is_parallel():
+def test_kernels_are_counted_where_a_step_is_parallel(device):
     body = body_of("shape-matching")
     base = measure.kernels_of(body, measure.BASE, "cpu")
     # Every iteration launches its own kernels.
     assert base["launches"] > body.settings.substeps * body.settings.iterations
     assert base["launches"] > base["kernels"] > 10
-    ti.reset()
 
 
 def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, capsys):

@@ -28,6 +28,8 @@ from studies.plan.way import layout_towards
 from ultrasound.array import load_probe
 from ultrasound.coverage import VOXEL_MM, Coverage
 
+pytestmark = pytest.mark.usefixtures("one_device")
+
 R, WIDTH = 30.0, 16.0
 PROBE = load_probe("linear").model_copy(update=dict(transducer_width_mm=WIDTH))
 # Directions of a Fibonacci spiral are no farther from any than this.
@@ -39,7 +41,7 @@ def everywhere(poses: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def rehearsal() -> SimpleNamespace:
+def rehearsal(one_device) -> SimpleNamespace:
     press = SimpleNamespace(direction=(0.0, 0.0, -1.0), lateral=(1.0, 0.0, 0.0))
     return SimpleNamespace(hand=hand_on(big_ball()), press=press, probe=PROBE, size_mm=SIZE, origin=ORIGIN)
 

@@ -15,6 +15,8 @@ from ultrasound.array import load_probe
 from ultrasound.coverage import VOXEL_MM, Coverage
 from ultrasound.probe import pose_at
 
+pytestmark = pytest.mark.usefixtures("one_device")
+
 
 class Unmoved:
     """A skin of tissue that has not settled."""

@@ -5,7 +5,7 @@ import taichi as ti
 import taichi.math as tm
 import trimesh
 
-from sim.distance import signed_distance
+from sim.distance import distance_grid
 from sim.fields import field_of
 from ultrasound.plane import LANES, Lanes
 
@@ -130,12 +130,9 @@ class Volume:
 
 
 def distance_volume(surface: trimesh.Trimesh, spacing_mm: float = 2.0, reach_mm: float = 6.0) -> Volume:
-    """Signed distances [mm] to a closed surface, negative inside, as far as ``reach_mm`` around it; FAR_MM beyond."""
-    low = surface.vertices.min(axis=0) - reach_mm
-    shape = np.ceil((surface.vertices.max(axis=0) + reach_mm - low) / spacing_mm).astype(int) + 1
-    points = low + spacing_mm * np.indices(shape).reshape(3, -1).T
-    distance = signed_distance(surface.vertices, surface.faces, points)[0]
+    """Signed distances [mm] to a closed surface, negative inside, as far as ``reach_mm`` around it (``distance_grid``); FAR_MM beyond."""
+    distance, low = distance_grid(surface.vertices, surface.faces, spacing_mm, reach_mm)
     index_from_mm = np.eye(4)
     index_from_mm[:3] /= spacing_mm
     index_from_mm[:3, 3] = -low / spacing_mm
-    return Volume(distance.reshape(shape), index_from_mm, outside=FAR_MM)
+    return Volume(distance, index_from_mm, outside=FAR_MM)
