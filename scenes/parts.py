@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import cast
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor
+from contextlib import contextmanager
+from typing import TypeAlias, cast
 
 import numpy as np
 import SimpleITK as sitk
 import trimesh
+from joblib import cpu_count
+from joblib.externals.loky import ProcessPoolExecutor
 from scipy import ndimage
 
 from scenes.organ import GROWN, INNER, Organ
@@ -25,8 +29,12 @@ LEAST_FACES = 500
 BRANCHING = 3.0
 # Of the label's area, which is all steps.
 SMOOTH_AREA = 2 / 3
+# Surfaces of less area than this are made before a process for them is there.
+ASIDE_FROM_MM2 = 5000.0
 # What has a surface of its own: tissue -> file.
 PARTS = {"tumour": "tumour", "cyst": "cyst", "urine": "collecting-system", "vessel": "vessels"}
+# Where parts are: tissue -> grid and which of its voxels.
+Found: TypeAlias = dict[str, tuple[VoxelGrid, np.ndarray]]
 
 
 def organ_surface(piece: Organ) -> trimesh.Trimesh:
@@ -34,32 +42,50 @@ def organ_surface(piece: Organ) -> trimesh.Trimesh:
     return _surface(piece.grid.image(piece.mask.astype(np.uint8)), "organ", FACES)
 
 
-def part_surfaces(
-    labels: LabelMap, piece: Organ, needed: Collection[str], progress: Progress
-) -> tuple[dict[str, trimesh.Trimesh], dict[str, float]]:
-    """Surface and volume [ml] of what is told apart in the organ, and of its vessels and collecting system near it.
-
-    Raises PatientError where a needed tissue is not there, or what the user must see has no surface.
+def parts_of(labels: LabelMap, piece: Organ, needed: Collection[str]) -> Found:
+    """What is told apart in the organ, and its vessels and collecting system near it. Raises PatientError where a needed
+    tissue is not there.
     """
-    surfaces, volumes = {}, {}
-    for tissue in progress(PARTS, "surfaces"):
+    found = {}
+    for tissue in PARTS:
         values = labels.of_tissues(tissue)
         if not values:
             continue
         grid, inside = piece.grid, piece.mask & np.isin(piece.values, values)
         if tissue in INNER:
             grid, inside = near_organ(labels, piece, values)
-        if not inside.any():
-            if tissue in needed:
-                raise PatientError(
-                    f"the {tissue} does not touch {piece.title}: expected one of this kidney; choose the other side, or leave out "
-                    f"which label is its {tissue}"
-                )
-            continue
-        surface = bodies(grid, inside, tissue)
-        if surface is not None:
-            surfaces[tissue], volumes[tissue] = surface, float(inside.sum() * grid.voxel_ml)
-    return surfaces, volumes
+        if inside.any():
+            found[tissue] = grid, inside
+        elif tissue in needed:
+            raise PatientError(
+                f"the {tissue} does not touch {piece.title}: expected one of this kidney; choose the other side, or leave out "
+                f"which label is its {tissue}"
+            )
+    return found
+
+
+@contextmanager
+def surfaces_aside(found: Found) -> Iterator[Callable[[Progress], dict[str, trimesh.Trimesh]]]:
+    """Starts on the surfaces of parts, in processes of their own where that is worth it, and gives what waits for them:
+    surfaces of all parts that have one. Raises PatientError where what the user must see has none.
+    """
+    jobs = min(cpu_count(), len(found))
+    if jobs < 2 or sum(_area_mm2(*part) for part in found.values()) < ASIDE_FROM_MM2:
+        yield lambda progress: _there((t, bodies(*found[t], t)) for t in progress(found, "surfaces"))
+        return
+    with ProcessPoolExecutor(jobs) as pool:
+        # The last ones take longest.
+        made = {tissue: pool.submit(bodies, *found[tissue], tissue) for tissue in reversed(found)}
+        try:
+            yield lambda progress: _there((t, made[t].result()) for t in progress(found, "surfaces"))
+        except BrokenExecutor:
+            raise PatientError(
+                "a process that made surfaces was ended, perhaps for want of memory; close other programs and try again"
+            ) from None
+
+
+def _there(made: Iterable[tuple[str, trimesh.Trimesh | None]]) -> dict[str, trimesh.Trimesh]:
+    return {tissue: surface for tissue, surface in made if surface is not None}
 
 
 def colours_of_labels(labels: LabelMap, tissues: Sequence[str]) -> dict[str, Colour]:
@@ -110,6 +136,11 @@ def bodies(grid: VoxelGrid, inside: np.ndarray, tissue: str) -> trimesh.Trimesh 
     if not surfaces:
         return None
     return surfaces[0] if len(surfaces) == 1 else cast(trimesh.Trimesh, trimesh.util.concatenate(surfaces))
+
+
+def volume_ml(grid: VoxelGrid, inside: np.ndarray) -> float:
+    """Volume of a label [ml]."""
+    return float(inside.sum() * grid.voxel_ml)
 
 
 def _area_mm2(grid: VoxelGrid, inside: np.ndarray) -> float:

@@ -18,7 +18,7 @@ import trimesh
 from scenes.bed import bed_of_file, bed_of_labels
 from scenes.cautions import in_fat, taken, turned
 from scenes.organ import GROWN, INNER, PARENCHYMA, Organ, check_volume, midline_x, organs, single_out
-from scenes.parts import colours_of_labels, organ_surface, part_surfaces
+from scenes.parts import colours_of_labels, organ_surface, parts_of, surfaces_aside, volume_ml
 from scenes.reading.error import PatientError
 from scenes.reading.grid import Box, VoxelGrid
 from scenes.reading.labels import Colour, LabelMap, nearest, present
@@ -115,18 +115,21 @@ def import_patient(
         *taken(labels, piece, organ is not None),
     )
 
-    surface = organ_surface(piece)
-    _check_surface(surface, piece)
-    parts, volumes = part_surfaces(labels, piece, needed, progress)
+    found = parts_of(labels, piece, needed)
+    with surfaces_aside(found) as parts_made:
+        surface = organ_surface(piece)
+        _check_surface(surface, piece)
+        bed = _support(support, surface, labels, piece)
+        parts = parts_made(progress)
     return Patient(
         ct=grid.image(voxels),
         labels=grid.image(marks),
         tissues=tissues,
         organ=surface,
         parts=parts,
-        support=_support(support, surface, labels, piece),
+        support=bed,
         side=told_side,
-        volumes_ml={"organ": piece.volume_ml, **volumes},
+        volumes_ml={"organ": piece.volume_ml, **{part: volume_ml(*found[part]) for part in parts}},
         overview=_overview(ct.grid.part(slab), hounsfield),
         spacing_mm=tuple(grid.spacing.tolist()),
         notes=ct.notes,
