@@ -99,7 +99,7 @@ def prepared(model: str, subject: Subject) -> Specimen:
 
 def _kidney(model: str) -> Specimen:
     fast = PRESETS[model]["fast"]
-    size = {f"tissue.{fast.size_name}": fast.size_mm}
+    size = {f"tissue.{fast.tissue.SIZE}": fast.size_mm}
     scene = load_scene(PAPER)
     anatomy = replace(load_anatomy(scene, PAPER.parent), ct=None)
     rehearsal = Rehearsal(with_options(scene, {"tissue.model": model, **size}), anatomy)

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.trade.front import preset_of, setup_of
+from studies.trade.front import preset_of, setup_of_row
 from studies.trade.tried import PAPER
 
 DPI = 130
@@ -51,7 +51,7 @@ def _model(axes: Axes, points: list[dict[str, Any]], model: str, colour: str) ->
         alpha=0.55,
         label=f"{model} (area: size of cells or particles)",
     )
-    papers = [point for point in points if setup_of(point) in PAPER]
+    papers = [point for point in points if setup_of_row(point) in PAPER]
     for k, point in enumerate(papers):
         at = (point["ms_median"], point["error_mean_mm"])
         label = "the paper's radii (mm), with its best stiffness" if k == 0 else None
@@ -61,7 +61,7 @@ def _model(axes: Axes, points: list[dict[str, Any]], model: str, colour: str) ->
             text, at, xytext=(0, 6), textcoords="offset points", fontsize=9, color="tab:red", ha="center"
         )
     for point in points:
-        name = preset_of(setup_of(point))
+        name = preset_of(setup_of_row(point))
         # Shape matching's are the paper's particles, of which the finer are not the truer.
         if name and point["pareto"]:
             at = (point["ms_median"], point["error_mean_mm"])
