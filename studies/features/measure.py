@@ -72,7 +72,10 @@ OF_PARTICLES = (
     ),
     Feature("scaled masses", Options(mass_scaling_per_mm=0.02), BASE),
 )
-FEATURES = {"neo-hookean": EVERYWHERE, "shape-matching": (*EVERYWHERE, *OF_PARTICLES)}
+FEATURES = {
+    model: (*EVERYWHERE, *OF_PARTICLES) if section.CAN_TOUCH_ITSELF else EVERYWHERE
+    for model, section in TISSUES.items()
+}
 
 
 class Body:

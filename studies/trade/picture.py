@@ -11,7 +11,6 @@ from studies.trade.front import preset_of, setup_of_row
 from studies.trade.tried import PAPER
 
 DPI = 130
-COLOURS = {"neo-hookean": "tab:blue", "shape-matching": "tab:orange"}
 FRAME_MS = 1000 / 60
 
 
@@ -20,8 +19,8 @@ def draw(points: list[dict[str, Any]], path: Path) -> None:
     points = [point for point in points if point["error_mean_mm"] is not None]
     figure = Figure(figsize=(11, 7), layout="constrained")
     axes = figure.subplots()
-    for model, colour in COLOURS.items():
-        _model(axes, [point for point in points if point["model"] == model], model, colour)
+    for model in sorted({point["model"] for point in points}):
+        _model(axes, [point for point in points if point["model"] == model], model)
     front = sorted((point for point in points if point["pareto"]), key=lambda point: point["ms_median"])
     ms, error = [p["ms_median"] for p in front], [p["error_mean_mm"] for p in front]
     axes.plot(ms, error, color="black", linewidth=1.2, label="Pareto front", drawstyle="steps-post")
@@ -39,15 +38,12 @@ def draw(points: list[dict[str, Any]], path: Path) -> None:
     figure.savefig(path, dpi=DPI)
 
 
-def _model(axes: Axes, points: list[dict[str, Any]], model: str, colour: str) -> None:
-    if not points:
-        return
+def _model(axes: Axes, points: list[dict[str, Any]], model: str) -> None:
     size = np.array([point["cell_mm"] or point["radius_mm"] for point in points])
     axes.scatter(
         [point["ms_median"] for point in points],
         [point["error_mean_mm"] for point in points],
         s=7 * size,
-        color=colour,
         alpha=0.55,
         label=f"{model} (area: size of cells or particles)",
     )
