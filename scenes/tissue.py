@@ -15,13 +15,13 @@ USUAL = "neo-hookean"
 
 
 class TissueSection(Section):
-    """What a model is told, a section of a scene file; a subclass is a model that a scene can name.
+    """What a model is told: a section of a scene file. Each subclass is a model that a scene can name.
 
     ``BUILT_BY`` is its ``sim.tissue.TissueModel``, imported when it is built. ``SIZE`` is the key that says how fine it is,
-    ``PIECES`` what that is the size of: both are names of its counts or keys. ``REPORTED`` is its line of a report, with names
-    of keys and counts. ``STEP`` is its own choice of a step, by names of the solver's section, where that of the paper does not
-    suit; ``PRESETS`` are what each quality changes of keys and step. ``CAN_TOUCH_ITSELF`` and ``CAN_BE_HELD`` say whether it has
-    contacts of particles, and an attachment.
+    ``PIECES`` what that is the size of, among its counts. ``REPORTED`` is its line of a report, with names of keys and counts.
+    ``STEP`` is its own choice of a step, by names of the solver's section, where it is not the paper's; ``PRESETS`` are what each
+    quality changes of keys and step, from coarse to fine. ``CAN_TOUCH_ITSELF``: it takes contacts of particles;
+    ``CAN_BE_HELD``: an attachment.
     """
 
     BUILT_BY: ClassVar[str]

@@ -38,26 +38,26 @@ class Held:
 class Parts:
     """What a tissue model is made of: an organ [mm] among shapes, and all that a scene says of the tissue.
 
-    ``organ`` is a closed surface (or what the model itself made of one before); ``tissue`` has the model's own parameters by the
-    names of its section. ``serial`` says whether a step is one kernel on one core; left open, size and machine decide.
+    ``organ`` is a closed surface, or what the model itself takes in its stead; ``tissue`` has the model's parameters by the names
+    of its section; ``friction`` is Coulomb's coefficient on shapes. ``serial`` says whether a step is one kernel on one core; left
+    open, size and machine decide. ``relaxation`` and ``mass_scaling_per_mm`` are shape matching's.
     """
 
     organ: Any
     tissue: Any
     shapes: list
-    friction: float = 0.35
-    held: Held | None = None
-    serial: bool | None = None
-    relaxation: str = "local"
-    mass_scaling_per_mm: float = 0.0
+    friction: float
+    held: Held | None
+    serial: bool | None
+    relaxation: str
+    mass_scaling_per_mm: float
 
 
 class TissueModel(Protocol):
     """Rest data, a projection of its constraints on the body's estimates, and a way to carry points along.
 
     One file a model. ``serial`` says that it is too small for more than one core of a CPU. The coarse tetrahedra that carry the
-    image plane are ``EMBEDDING_SIZES`` sizes of the tissue wide.
-    ``begin`` to ``project`` are ti.funcs that the solver's kernels inline, so their outermost loops are parallel.
+    image plane are ``EMBEDDING_SIZES`` sizes of the tissue wide. ``begin`` to ``project`` are ti.funcs that the solver's kernels inline, so their outermost loops are parallel.
     """
 
     EMBEDDING_SIZES: ClassVar[float]

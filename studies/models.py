@@ -73,16 +73,8 @@ def build_solver(
     kernel on one core; left open, the body's size and the machine decide.
     """
     contact, section = contact or Contact(), section or SolverSection()
-    parts = Parts(
-        organ,
-        tissue,
-        shapes,
-        contact.shape_friction,
-        held,
-        serial,
-        section.relaxation,
-        section.mass_scaling_per_mm,
-    )
+    scaling = section.mass_scaling_per_mm
+    parts = Parts(organ, tissue, shapes, contact.shape_friction, held, serial, section.relaxation, scaling)
     model: Any = model_of(tissue).make(parts)
     pairs = ParticleContacts(model, contact.particle_friction) if contact.particles else None
     return Solver(model, pairs, tool)

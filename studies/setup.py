@@ -9,15 +9,12 @@ from scenes.scene import OPTIONS, Scene, with_options
 from scenes.tissue import QUALITIES, TISSUES
 from ultrasound.array import Probe, load_probe
 
-# What a case or a scene says of its tissue itself, unless it is given.
-MATERIAL = ("young_kpa", "poisson", "density_g_cm3")
-
 
 @dataclass(frozen=True)
 class Setup:
     """How a case is computed, whichever it is; the defaults are the paper's: Table 1 and its calibration's steps.
 
-    ``tissue`` is its model's section of a scene file, a ``TissueSection``; what that leaves open of MATERIAL is the case's own.
+    ``tissue`` is its model's section of a scene file, a ``TissueSection``; what that leaves open of the material is the case's own.
     """
 
     tissue: Any
@@ -80,12 +77,13 @@ def option_of(name: str) -> str:
 
 
 def scene_of(scene: Scene, setup: Setup) -> Scene:
-    """A scene with a setup's model, size and passes; the material stays the scene's."""
+    """A scene with a setup's model, size and passes; what its tissue leaves open stays the scene's."""
     passes = {
         f"solver.{name}": getattr(setup, name) for name in ("substeps", "iterations", "relaxation_factor")
     }
-    tissue = {f"tissue.{name}": value for name, value in setup.tissue if name not in MATERIAL}
-    return with_options(scene, tissue | passes)
+    told = setup.tissue.model_dump(exclude_unset=True) | {setup.tissue.SIZE: setup.size_mm}
+    tissue = {f"tissue.{name}": value for name, value in told.items()}
+    return with_options(scene, tissue | passes | {"tissue.model": setup.model})
 
 
 def setup_of_scene(scene: Scene, substeps: int, iterations: int, relaxation_factor: float) -> Setup:

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 import app
-from scenes.scene import EMBEDDED, PAPER, SolverSection, load_scene
+from scenes.scene import EMBEDDED, PAPER, SolverSection, load_scene, with_options
 from scenes.tissue import QUALITIES
 from sim.neo_hookean import LATTICE_SETTINGS
 from studies.case import load_case
@@ -102,6 +102,8 @@ def test_a_scene_has_the_settings_of_the_setup_it_was_made_with():
         scene = scene_of(load_scene(PAPER), setup)
         step = scene.solver
         assert setup_of_scene(scene, step.substeps, step.iterations, step.relaxation_factor) == setup
+    of_its_own = scene_of(with_options(scene, {"tissue.cluster_spacing": 4.0}), setup)
+    assert of_its_own.tissue.cluster_spacing == 4.0
 
 
 class Machine:
