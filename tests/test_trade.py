@@ -80,6 +80,9 @@ def test_settings_near_measured_ones_have_an_expected_error():
     assert expected_error_mm(points, setup_of("neo-hookean", cell_mm=12.0)) is None
     assert expected_error_mm(points, setup_of("neo-hookean", iterations=80)) is None
     assert expected_error_mm(points, setup_of("shape-matching")) is None
+    soft = [Point(setup_of("shape-matching", stiffness=0.3), 1, 0.7, True)]
+    assert expected_error_mm(soft, setup_of("shape-matching", stiffness=0.4)) == 0.7
+    assert expected_error_mm(soft, setup_of("shape-matching", stiffness=0.9)) is None
 
 
 def test_a_rehearsals_expected_error_is_of_the_passes_that_it_takes_now():
@@ -96,10 +99,10 @@ def test_a_rehearsals_expected_error_is_of_the_passes_that_it_takes_now():
 
 def test_a_scene_has_the_settings_of_the_setup_it_was_made_with():
     for setup in (
-        PRESETS["neo-hookean"]["fast"],
+        PRESETS["neo-hookean"]["balanced"],
         setup_of("shape-matching", radius_mm=3.0, stiffness=0.5, substeps=2),
     ):
-        scene = scene_of(load_scene(PAPER), setup)
+        scene = scene_of(with_options(load_scene(PAPER), {"tissue.cell_mm": 9.0}), setup)
         step = scene.solver
         assert setup_of_scene(scene, step.substeps, step.iterations, step.relaxation_factor) == setup
     of_its_own = scene_of(with_options(scene, {"tissue.cluster_spacing": 4.0}), setup)
