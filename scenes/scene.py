@@ -193,14 +193,16 @@ class Scene(Section):
     press: Press = Press()
 
     @model_validator(mode="after")
-    def _particles_exist(self) -> "Scene":
-        if self.contact.particles and self.tissue.model != "shape-matching":
+    def _suits_its_tissue(self) -> "Scene":
+        if self.contact.particles and not self.tissue.CAN_TOUCH_ITSELF:
+            able = " or ".join(name for name, section in TISSUES.items() if section.CAN_TOUCH_ITSELF)
             raise ValueError(
-                "contact.particles = true needs particles: set tissue.model to shape-matching, or leave it out"
+                f"contact.particles = true needs particles: set tissue.model to {able}, or leave it out"
             )
-        if self.attachment.radius_mm > 0 and self.tissue.model != "neo-hookean":
+        if self.attachment.radius_mm > 0 and not self.tissue.CAN_BE_HELD:
+            able = " or ".join(name for name, section in TISSUES.items() if section.CAN_BE_HELD)
             raise ValueError(
-                "attachment.radius_mm holds nodes: set tissue.model to neo-hookean, or the radius to 0"
+                f"attachment.radius_mm holds nodes: set tissue.model to {able}, or the radius to 0"
             )
         return self
 
@@ -275,7 +277,7 @@ def _explain(error: ValidationError) -> str:
     # A key that is missing under one spelling and unknown under another is one mistake: name the unknown one.
     problems.sort(key=lambda problem: problem["type"] != "extra_forbidden")
     first = problems[0]
-    where = [str(part) for part in first["loc"] if part not in ("plane", "mesh", "sdf", *TISSUES)]
+    where = [str(part) for part in first["loc"] if part not in ("plane", "mesh", "sdf")]
     name = ".".join(where)
     if first["type"] == "extra_forbidden":
         owner = _owner(where)

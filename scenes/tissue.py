@@ -1,21 +1,44 @@
 """The tissue models as a scene names them: what each is told, and which there are."""
 
-from typing import Annotated, Any, ClassVar, Literal, TypeAlias, get_args
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
-from pydantic import Discriminator, Field, Tag
+from pydantic import BeforeValidator, Field, SerializeAsAny
+from pydantic_core import PydanticCustomError
 
 from scenes.section import Section
 
 Stiffness = Annotated[float, Field(ge=0, le=1)]
+QUALITIES = ("fast", "balanced", "accurate")
+# What a scene's tissue is where it does not say.
+USUAL = "neo-hookean"
 
 
 class TissueSection(Section):
-    """What every model is told. ``SIZE`` is the key that says how fine it is, ``PIECES`` what that is the size of."""
+    """What a model is told: a section of a scene file. Each subclass is a model that a scene can name.
 
+    ``BUILT_BY`` is its ``sim.tissue.TissueModel``, imported when it is built. ``SIZE`` is the key that says how fine it is,
+    ``PIECES`` what that is the size of, among its counts. ``REPORTED`` is its line of a report, with names of keys and counts.
+    ``STEP`` is its own choice of a step, by names of the solver's section, where it is not the paper's; ``PRESETS`` are what each
+    quality changes of keys and step, from coarse to fine. ``CAN_TOUCH_ITSELF``: it takes contacts of particles;
+    ``CAN_BE_HELD``: an attachment.
+    """
+
+    BUILT_BY: ClassVar[str]
     SIZE: ClassVar[str]
     PIECES: ClassVar[str]
+    REPORTED: ClassVar[str]
+    STEP: ClassVar[Mapping[str, Any]] = {}
+    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]]
+    CAN_TOUCH_ITSELF: ClassVar[bool] = False
+    CAN_BE_HELD: ClassVar[bool] = False
 
     model: str
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        super().__pydantic_init_subclass__(**kwargs)
+        TISSUES[get_args(cls.model_fields["model"].annotation)[0]] = cls
 
     @property
     def size_mm(self) -> float:
@@ -23,10 +46,24 @@ class TissueSection(Section):
         return getattr(self, self.SIZE)
 
 
-class NeoHookeanTissue(TissueSection):
-    """Tissue true to a material, on cubic cells. Smaller cells are truer and slower; the material stays the same."""
+# All models by name, in the order in which they stand here.
+TISSUES: dict[str, type[TissueSection]] = {}
 
+
+class NeoHookeanTissue(TissueSection):
+    """Tissue true to a material, on cubic cells. Smaller cells are truer and slower; the material stays the same.
+
+    The presets are points of the front that ``study trade`` measures.
+    """
+
+    BUILT_BY = "sim.neo_hookean:NeoHookean"
     SIZE, PIECES = "cell_mm", "cells"
+    REPORTED = (
+        "neo-Hookean, E {young_kpa:g} kPa, nu {poisson:g}: {cells} cells of {cell_mm:g} mm, {nodes} nodes"
+    )
+    STEP: ClassVar = dict(substeps=1, iterations=4, relaxation_factor=1.7, stabilisation_iterations=0)
+    PRESETS: ClassVar = dict(fast=dict(cell_mm=5.0), balanced={}, accurate=dict(cell_mm=2.0, iterations=12))
+    CAN_BE_HELD = True
 
     model: Literal["neo-hookean"] = "neo-hookean"
     cell_mm: float = Field(3.5, ge=0.5, le=20)
@@ -41,10 +78,17 @@ class ShapeMatchingTissue(TissueSection):
     Particles are ``radius_mm`` apart, chosen from voxels of ``radius_mm / volume_sampling``; clusters are
     ``cluster_spacing`` radii apart and reach as far. The tissue's stiffness depends on all of these and on the
     solver's iterations, not on ``stiffness`` alone: that is this method's limitation. Nor does ``density_g_cm3`` change
-    its motion, for all particles weigh the same.
+    its motion, for all particles weigh the same. The presets are the paper's particles.
     """
 
+    BUILT_BY = "sim.shape_matching:ShapeMatching"
     SIZE, PIECES = "radius_mm", "particles"
+    REPORTED = (
+        "shape matching, stiffness {stiffness:g}: {particles} particles of {radius_mm:g} mm, {clusters} clusters, "
+        "{memberships} memberships"
+    )
+    PRESETS: ClassVar = dict(fast=dict(radius_mm=3.3), balanced={}, accurate=dict(radius_mm=2.2))
+    CAN_TOUCH_ITSELF = True
 
     model: Literal["shape-matching"]
     radius_mm: float = Field(2.7, ge=0.5, le=20)
@@ -55,25 +99,14 @@ class ShapeMatchingTissue(TissueSection):
     surface_samples_per_mm2: float = Field(0.0, ge=0, le=10)
 
 
-# All models: a new one is added here, under its name.
-AnyTissue: TypeAlias = (
-    Annotated[NeoHookeanTissue, Tag("neo-hookean")] | Annotated[ShapeMatchingTissue, Tag("shape-matching")]
-)
-TISSUES: dict[str, type[TissueSection]] = {
-    tag.tag: section for section, tag in map(get_args, get_args(AnyTissue))
-}
+def _of_its_model(values: Any) -> Any:
+    """A scene's values as the section of the model that they name."""
+    if not isinstance(values, dict):
+        return values
+    name = values.get("model", USUAL)
+    if not isinstance(name, str) or name not in TISSUES:
+        raise PydanticCustomError("unknown_model", f"the model should be one of {', '.join(TISSUES)}")
+    return TISSUES[name].model_validate(values)
 
 
-def _model_of(values: Any) -> str | None:
-    name = values.get("model", "neo-hookean") if isinstance(values, dict) else getattr(values, "model", None)
-    return name if name in TISSUES else None
-
-
-Tissue = Annotated[
-    AnyTissue,
-    Discriminator(
-        _model_of,
-        custom_error_type="unknown_model",
-        custom_error_message=f"the model should be one of {', '.join(TISSUES)}",
-    ),
-]
+Tissue = Annotated[SerializeAsAny[TissueSection], BeforeValidator(_of_its_model)]

@@ -7,7 +7,7 @@ the tissue comes to rest at does not depend on iterations, substeps or time step
 """
 
 from itertools import pairwise
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import taichi as ti
@@ -17,10 +17,11 @@ from sim.body import Body
 from sim.device import is_too_small
 from sim.fields import field_of
 from sim.four_wide import cross, four, row
-from sim.lattice import Lattice
+from sim.lattice import Lattice, fill_with_cells, surface_points
 from sim.rigid_motion import RigidMotion
 from sim.solver import StepSettings
-from sim.surface_contact import LAYER_MM, SurfaceContacts
+from sim.surface_contact import LAYER_MM, REACH_MM, SurfaceContacts
+from sim.tissue import Parts
 
 # Stiffness, in units of the shear modulus, of deformation that varies inside a cell: between 1, exact for torsion,
 # and (1 + nu), exact for bending.
@@ -31,6 +32,8 @@ LN2 = 0.6931471805599453
 SQRT_HALF_BITS = 0x3F3504F3
 # With fewer nodes, starting threads for eight colours costs a CPU more than they save.
 PARALLEL_NODES = 16_000
+# Points of the surface that can touch are this share of a cell apart.
+POINTS_A_CELL = 0.5
 # No node moves farther in a pass than this share of a cell.
 MOST_CELLS_A_PASS = 0.5
 LATTICE_SETTINGS = StepSettings(substeps=1, iterations=4, relaxation_factor=1.7, stabilisation_iterations=0)
@@ -44,6 +47,27 @@ class NeoHookean:
     (n,) stay where they are, and ``load_g`` (n,) [g] hangs at them. ``deformation`` (m + 1,) has the columns of every
     cell's F as rows and follows its nodes; the last stands for cells that are not there.
     """
+
+    EMBEDDING_SIZES: ClassVar[float] = 1.35
+
+    @classmethod
+    def make(cls, parts: Parts) -> "NeoHookean":
+        """Cells that fill the organ, and points of its surface where there is something to touch. Raises SamplingError."""
+        tissue = parts.tissue
+        lattice = fill_with_cells(parts.organ, tissue.cell_mm)
+        body = Body(lattice.nodes)
+        contacts = None
+        if parts.shapes:
+            points, area_mm2 = surface_points(parts.organ, POINTS_A_CELL * tissue.cell_mm)
+            contacts = SurfaceContacts(body, lattice, points, area_mm2, parts.shapes, parts.friction)
+        material = (tissue.young_kpa, tissue.poisson, tissue.density_g_cm3)
+        held = None if parts.held is None else parts.held.nodes(lattice.nodes)
+        return cls(body, lattice, contacts, *material, held=held, serial=parts.serial)
+
+    @staticmethod
+    def reach_mm(tissue: Any) -> float:
+        """As far as its contacts look, whatever the cells [mm]."""
+        return REACH_MM
 
     def __init__(
         self,

@@ -4,21 +4,23 @@ It computes on patches, particles that are in the same clusters: a cluster's mom
 and one averaged frame moves a whole patch. Vectors are four wide, so that compilers use a processor's vector units.
 """
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import taichi as ti
 import taichi.math as tm
+import trimesh
 from scipy.spatial import cKDTree
 
-from sim.body import ParticleBody
-from sim.contact import ShapeContacts
+from sim.body import ParticleBody, RestBody, fill_body
+from sim.contact import REACH_RADII, ShapeContacts
 from sim.device import is_too_small
 from sim.fields import field_of
 from sim.four_wide import four, row
-from sim.patches import Patches
+from sim.patches import Patches, arrange
 from sim.rotation import rotation_near
 from sim.sampling import Clusters
+from sim.tissue import Parts
 
 RELAXATIONS = ("local", "global")
 # Points are carried by this many clusters at most.
@@ -44,6 +46,22 @@ class ShapeMatching:
     translation T [mm] of x = R x0 + T. ``local`` (n,) is where the particles are in their patches at rest, with 1 as the
     fourth entry.
     """
+
+    EMBEDDING_SIZES: ClassVar[float] = 2.0
+
+    @classmethod
+    def make(cls, parts: Parts) -> "ShapeMatching":
+        """Particles that fill the organ, or of an organ that was filled before, in clusters. Raises SamplingError."""
+        rest = parts.organ if isinstance(parts.organ, RestBody) else fill(parts.organ, parts.tissue)
+        arranged, patches = arrange(rest, parts.tissue.cluster_spacing)
+        body = ParticleBody(arranged, parts.mass_scaling_per_mm)
+        contacts = ShapeContacts(body, parts.shapes, parts.friction) if parts.shapes else None
+        return cls(body, patches, contacts, parts.relaxation, parts.serial)
+
+    @staticmethod
+    def reach_mm(tissue: Any) -> float:
+        """As far as particles of its radius look [mm]."""
+        return REACH_RADII * tissue.radius_mm
 
     def __init__(
         self,
@@ -336,3 +354,8 @@ class ShapeMatching:
                     x += weight[v][k] * rest[v][axis] * row(moved, axis)
                 x += weight[v][k] * row(moved, 3)
             out[v] = x.xyz
+
+
+def fill(organ: trimesh.Trimesh, tissue: Any) -> RestBody:
+    """The organ [mm] filled with a tissue's particles, which takes seconds. Raises SamplingError."""
+    return fill_body(organ, tissue.radius_mm, tissue.volume_sampling, tissue.surface_samples_per_mm2)

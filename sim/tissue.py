@@ -1,25 +1,76 @@
 """What a tissue model is: the interface that solver, contacts, skin and embedding know, and nothing else of it.
 
-A new one is a file of this folder with its class, its section of a scene file in ``scenes.tissue``, what its solver is put
-together from in ``studies.models.KINDS`` and its presets in ``studies.setup.PRESETS``; the tests of all models then are its own.
+How another one is added is in docs/adding-a-tissue-model.md.
 """
 
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import taichi as ti
 
 from sim.body import Body
 from sim.contact import ShapeContacts
+from sim.sampling import SamplingError
 from sim.surface_contact import SurfaceContacts
+
+
+@dataclass(frozen=True)
+class Held:
+    """Tissue that stays where it is: all within a distance [mm] of a place (3,) [mm]."""
+
+    at_mm: np.ndarray
+    radius_mm: float
+
+    def nodes(self, nodes: np.ndarray) -> np.ndarray:
+        """Which nodes (n, 3) are held. Raises SamplingError where there are none, or where all are."""
+        apart = np.linalg.norm(nodes - self.at_mm, axis=1)
+        held = apart <= self.radius_mm
+        if held.all() or not held.any():
+            raise SamplingError(
+                f"attachment.radius_mm = {self.radius_mm:g} holds {'all' if held.all() else 'none'} of the organ, which lies "
+                f"{apart.min():.1f} to {apart.max():.1f} mm from attachment.at_mm: choose another radius or place"
+            )
+        return held
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What a tissue model is made of: an organ [mm] among shapes, and all that a scene says of the tissue.
+
+    ``organ`` is a closed surface, or what the model itself takes in its stead; ``tissue`` has the model's parameters by the names
+    of its section; ``friction`` is Coulomb's coefficient on shapes. ``serial`` says whether a step is one kernel on one core; left
+    open, size and machine decide. ``relaxation`` and ``mass_scaling_per_mm`` are shape matching's.
+    """
+
+    organ: Any
+    tissue: Any
+    shapes: list
+    friction: float
+    held: Held | None
+    serial: bool | None
+    relaxation: str
+    mass_scaling_per_mm: float
 
 
 class TissueModel(Protocol):
     """Rest data, a projection of its constraints on the body's estimates, and a way to carry points along.
 
-    One file a model. ``serial`` says that it is too small for more than one core of a CPU.
-    ``begin`` to ``project`` are ti.funcs that the solver's kernels inline, so their outermost loops are parallel.
+    One file a model. ``serial`` says that it is too small for more than one core of a CPU. The coarse tetrahedra that carry the
+    image plane are ``EMBEDDING_SIZES`` sizes of the tissue wide. ``begin`` to ``project`` are ti.funcs that the solver's kernels inline, so their outermost loops are parallel.
     """
+
+    EMBEDDING_SIZES: ClassVar[float]
+
+    @classmethod
+    def make(cls, parts: Parts) -> "TissueModel":
+        """The organ at rest, with its contacts. Raises SamplingError."""
+        ...
+
+    @staticmethod
+    def reach_mm(tissue: Any) -> float:
+        """How far around a shape that does not move a tissue asks for its distance [mm]."""
+        ...
 
     @property
     def body(self) -> Body: ...

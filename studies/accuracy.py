@@ -84,7 +84,7 @@ def summary(report: dict, model: str) -> str:
     time = report["ms_per_step"]
     lines = [
         f"case   {report['case']}",
-        f"model  {report['model']}: {model}",
+        f"model  {model}",
         f"step   1/{1 / report['time_step_s']:.0f} s in {counted(report['substeps'], 'substep')} of "
         f"{counted(report['iterations'], 'iteration')}",
         f"speed  {time['median']:.1f} ms a step (median), {time['max']:.1f} at most",

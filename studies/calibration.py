@@ -1,7 +1,7 @@
 """The paper's calibration: settings searched for the least mean bead error, and their worth on data held out."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -9,9 +9,11 @@ from scipy.optimize import differential_evolution
 
 from studies.accuracy import null_errors
 from studies.case import Case
-from studies.setup import Setup
+from studies.setup import Setup, setup_of
 from studies.workers import Map, Measured
 
+# The model that the paper calibrates.
+MODEL = "shape-matching"
 # Of the beads held out, each third: neighbours on a thread are then on either side.
 BEADS_EVERY = 3
 # The grid's spacing over that of the finer look around its best.
@@ -123,17 +125,21 @@ def exhaustive(
     """
     grid = stiffness_grid(spacing)
     trials = try_all(
-        cases, split, [Setup(radius_mm=r, stiffness=a) for r in radii_mm for a in grid], workers, done
+        cases,
+        split,
+        [setup_of(MODEL, radius_mm=r, stiffness=a) for r in radii_mm for a in grid],
+        workers,
+        done,
     )
-    by_radius = {r: [trial for trial in trials if trial.setup.radius_mm == r] for r in radii_mm}
+    by_radius = {r: [trial for trial in trials if trial.setup.tissue.radius_mm == r] for r in radii_mm}
     coarse = Calibration(tuple(cases), split, by_radius)
     finer = [
-        Setup(radius_mm=r, stiffness=a)
+        setup_of(MODEL, radius_mm=r, stiffness=a)
         for r in radii_mm
-        for a in finer_grid(coarse.best(r).setup.stiffness, spacing)
+        for a in finer_grid(coarse.best(r).setup.tissue.stiffness, spacing)
     ]
     for trial in try_all(cases, split, finer, workers, done):
-        by_radius[trial.setup.radius_mm].append(trial)
+        by_radius[trial.setup.tissue.radius_mm].append(trial)
     return coarse
 
 
@@ -211,7 +217,7 @@ def try_all(
 
 def quartic(trials: Sequence[Trial]) -> Fit | None:
     """The paper's smooth curve through the errors up to TALLEST times the least; None where these are too few."""
-    at = np.array([(trial.setup.stiffness, trial.fit_mm) for trial in trials])
+    at = np.array([(trial.setup.tissue.stiffness, trial.fit_mm) for trial in trials])
     at = at[np.isfinite(at[:, 1]) & (at[:, 1] <= TALLEST * at[:, 1].min())]
     if len(np.unique(at[:, 0])) <= QUARTIC:
         return None
@@ -223,8 +229,9 @@ def quartic(trials: Sequence[Trial]) -> Fit | None:
 
 
 def _setup_at(radius_mm: float, stiffness: float, relaxation_factor: float, iterations: float) -> Setup:
-    return replace(
-        Setup(radius_mm=radius_mm),
+    return setup_of(
+        MODEL,
+        radius_mm=radius_mm,
         stiffness=float(stiffness),
         relaxation_factor=float(relaxation_factor),
         iterations=round(iterations),

@@ -8,6 +8,7 @@ import click
 from tqdm import tqdm
 
 from scenes.scene import model_with
+from scenes.tissue import QUALITIES, TISSUES, USUAL
 from studies.case import load_case
 from studies.command_line import (
     Fault,
@@ -19,7 +20,7 @@ from studies.command_line import (
     save_figures,
     start_taichi,
 )
-from studies.setup import PRESETS, QUALITIES, choose_setup
+from studies.setup import choose_setup
 
 if TYPE_CHECKING:
     from studies.calibration import Calibration
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("case", type=click.Path(path_type=Path))
 @click.option(
-    "--model", type=click.Choice(list(PRESETS)), help="[neo-hookean, or what the options below belong to]"
+    "--model", type=click.Choice(list(TISSUES)), help=f"[{USUAL}, or what the options below belong to]"
 )
 @click.option(
     "--quality",
@@ -82,7 +83,7 @@ def validate(
 ) -> None:
     """Press the organ of CASE, a folder with a bead experiment, and compare the beads with the measured ones."""
     given = [name for name, value in changes.items() if value is not None]
-    setup = choose_setup(model or model_with(given, "neo-hookean"), quality, **changes)
+    setup = choose_setup(model or model_with(given, USUAL), quality, **changes)
     loaded = load_case(case)
     make_place(json_file)
     used = start_taichi(arch)

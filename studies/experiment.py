@@ -6,14 +6,15 @@ import numpy as np
 import trimesh
 
 from scenes.scene import Contact, SolverSection
-from scenes.tissue import TISSUES, NeoHookeanTissue, ShapeMatchingTissue, TissueSection
+from scenes.tissue import TissueSection
 from sim.body import RestBody
+from sim.shape_matching import fill
 from sim.shapes import ConvexTool
 from sim.skinning import Skin
 from sim.solver import StepSettings
 from studies.case import Case
-from studies.models import build_solver, fill, static_shape, step_settings
-from studies.setup import BUILT, MATERIAL, NOT_USED, Setup, SetupError
+from studies.models import build_solver, static_shape, step_settings
+from studies.setup import Setup, SetupError
 from studies.stopwatch import timed
 from studies.surfaces import moved_by
 from ultrasound.probe import between
@@ -101,16 +102,12 @@ class Experiment:
 
     def size(self, setup: Setup) -> dict[str, float]:
         """How large the model is, under the names of a report: ``radius_mm`` or ``cell_mm``, ``particles`` or ``nodes``."""
-        return {setup.size_name: setup.size_mm, **self.model.counts()}
+        return {setup.tissue.SIZE: setup.size_mm, **self.model.counts()}
 
     def describe(self, setup: Setup) -> str:
-        """Size and settings that the model does not share with others, for the terminal."""
-        tissue, size = tissue_of(self.case, setup), self.model.counts()
-        if isinstance(tissue, NeoHookeanTissue):
-            material = f"E {tissue.young_kpa:g} kPa, nu {tissue.poisson:g}"
-            return f"{size['nodes']} nodes, {size['cells']} cells of {setup.cell_mm:g} mm, {material}"
-        pieces = tissue.PIECES
-        return f"{size[pieces]} {pieces} of {setup.size_mm:g} mm, stiffness {setup.stiffness:g}"
+        """Size and settings in the model's own words, for the terminal."""
+        tissue = tissue_of(self.case, setup)
+        return tissue.REPORTED.format(**tissue.model_dump(), **self.model.counts())
 
     def _restore(self) -> None:
         self.body.restore(self.body.rest_state())
@@ -131,23 +128,20 @@ class Experiment:
 
 def tissue_of(case: Case, setup: Setup) -> TissueSection:
     """The setup's tissue with what is the case's own. Raises SetupError where neither gives the material."""
-    material = {name: getattr(case, name) for name in MATERIAL}
-    given = {name: getattr(setup, name) for name in (*BUILT, *MATERIAL)}
-    values = material | {name: value for name, value in given.items() if value is not None}
-    own = {name: value for name, value in values.items() if name not in NOT_USED[setup.model]}
-    if None in own.values():
+    tissue, density = setup.tissue, (case.density_kg_m3 or DENSITY_KG_M3) / 1000
+    material = dict(young_kpa=case.young_kpa, poisson=case.poisson, density_g_cm3=density)
+    told = {name: value for name, value in material.items() if name in type(tissue).model_fields}
+    told |= tissue.model_dump(exclude_unset=True)
+    if None in told.values():
         raise SetupError(
             f"{case.name}: the case does not say what its tissue is; give --young-kpa and --poisson"
         )
-    density = (case.density_kg_m3 or DENSITY_KG_M3) / 1000
-    return TISSUES[setup.model].model_validate(dict(model=setup.model, density_g_cm3=density, **own))
+    return type(tissue).model_validate(told)
 
 
 def rest_body(case: Case, setup: Setup) -> RestBody:
     """Shape matching's particles of a case; Experiments of one radius can share them."""
-    tissue = tissue_of(case, setup)
-    assert isinstance(tissue, ShapeMatchingTissue)
-    return fill(_organ(case), tissue)
+    return fill(_organ(case), setup.tissue)
 
 
 def _organ(case: Case) -> trimesh.Trimesh:

@@ -19,8 +19,8 @@ def write_figure4(calibration: Calibration, path: Path) -> None:
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
     for colour, radius in zip(_colours(calibration), calibration.trials, strict=True):
-        trials = sorted(calibration.trials[radius], key=lambda trial: trial.setup.stiffness)
-        at = [trial.setup.stiffness for trial in trials]
+        trials = sorted(calibration.trials[radius], key=lambda trial: trial.setup.tissue.stiffness)
+        at = [trial.setup.tissue.stiffness for trial in trials]
         left.plot(at, [trial.fit_mm for trial in trials], ".", color=colour, label=f"{radius:g} mm")
         right.plot(at, [trial.held_out_mm for trial in trials], ".-", color=colour, linewidth=0.8)
         fit = quartic(trials)

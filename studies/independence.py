@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from scenes.tissue import TISSUES
 from studies.experiment import Experiment
 from studies.results import rounded
-from studies.setup import OPTION_OF, Setup, SetupError
+from studies.setup import Setup, SetupError, option_of
 
 # Sizes of which a third more and less can be built.
 LEAST_MM, MOST_MM = 0.75, 15.0
@@ -21,10 +20,10 @@ def changes_of(setup: Setup) -> dict[str, Setup]:
 
     The press takes as long with half the time step. Raises SetupError where a changed value would be out of range.
     """
-    things = TISSUES[setup.model].PIECES
+    things = setup.tissue.PIECES
     if not LEAST_MM <= setup.size_mm <= MOST_MM:
         raise SetupError(
-            f"--check: {things} a third larger and smaller need --{OPTION_OF[setup.size_name]} from {LEAST_MM:g} to {MOST_MM:g}"
+            f"--check: {things} a third larger and smaller need {option_of(setup.tissue.SIZE)} from {LEAST_MM:g} to {MOST_MM:g}"
         )
     if setup.iterations > MOST_ITERATIONS:
         raise SetupError(f"--check: twice the iterations needs --iterations of {MOST_ITERATIONS} at most")
@@ -57,7 +56,7 @@ def moved(experiment: Experiment, setup: Setup, beads: np.ndarray) -> Iterator[d
         ``change``, its name; ``moved_mean_mm``, a number a stage; ``moved_max_mm``.
     """
     for name, changed in changes_of(setup).items():
-        same = (changed.cell_mm, changed.radius_mm) == (setup.cell_mm, setup.radius_mm)
+        same = changed.size_mm == setup.size_mm
         other = experiment if same else Experiment(experiment.case, changed)
         apart = np.linalg.norm(other.run(changed).beads - beads, axis=2)
         yield dict(

@@ -18,8 +18,8 @@ from sim.guard import Guard, Watch
 from sim.shapes import Plane, SignedDistanceField
 from sim.skinning import Skin
 from sim.solver import SolverState
-from sim.tissue import MaterialModel
-from studies.models import Held, build_solver, embedding_cell_mm, static_shape, step_settings, tool_of
+from sim.tissue import Held, MaterialModel
+from studies.models import build_solver, embedding_cell_mm, static_shape, step_settings, tool_of
 from studies.setup import probe_of
 from studies.surfaces import moved_by, volume_mm3
 from ultrasound.array import Mode, Probe, Rung

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from studies.models import KINDS
+from scenes.tissue import TISSUES
 from studies.rehearsal import Rehearsal
 from studies.results import counted, spread
 from studies.setup import setup_of_scene
@@ -83,7 +83,7 @@ def summary(report: dict) -> str:
     )
     return "\n".join(
         [
-            f"model     {KINDS[report['model']].reported.format(**report)}",
+            f"model     {TISSUES[report['model']].REPORTED.format(**report)}, {report['tetrahedra']} tetrahedra",
             f"step      1/{1 / report['time_step_s']:.0f} s in {counted(report['substeps'], 'substep')} of "
             f"{counted(report['iterations'], 'iteration')}",
             f"speed     {times} on {report['arch']}; built in {report['build_s']:.1f} s",

@@ -74,7 +74,7 @@ def _bead_table(
 ) -> Table:
     """One figure of the errors of each stage's beads; the stiffness is the first row."""
     names = [["", "", "stiffness"]]
-    figures: list[Row] = [[trial.setup.stiffness for trial in best]]
+    figures: list[Row] = [[trial.setup.tissue.stiffness for trial in best]]
     shares: list[Row] = [[None for _ in best]]
     for place, stage, part, used in _rows(calibration):
         case = calibration.cases[place]
@@ -94,7 +94,7 @@ def summary_of(calibration: Calibration) -> str:
     for radius in calibration.trials:
         best = calibration.best(radius)
         lines.append(
-            f"{f'{radius:g} mm':8}{best.setup.stiffness:<11.3f}{best.setup.relaxation_factor:<12.2f}"
+            f"{f'{radius:g} mm':8}{best.setup.tissue.stiffness:<11.3f}{best.setup.relaxation_factor:<12.2f}"
             f"{best.setup.iterations:<12}{best.fit_mm:>6.2f} mm{best.held_out_mm:>10.2f} mm"
         )
     lines.append(f"Held out, beads left where stage 0 has them: {calibration.null_mm():.2f} mm.")
@@ -136,7 +136,7 @@ def _radius(calibration: Calibration, radius: float) -> dict:
 def _trial(trial: Trial) -> dict:
     setup = trial.setup
     return dict(
-        stiffness=setup.stiffness,
+        stiffness=setup.tissue.stiffness,
         relaxation_factor=setup.relaxation_factor,
         iterations=setup.iterations,
         fit_mm=rounded(trial.fit_mm),

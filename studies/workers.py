@@ -47,7 +47,7 @@ Map = Callable[[Sequence[tuple[Case, Setup]]], Iterator[Measured]]
 
 def evaluate(case: Case, setup: Setup) -> Measured:
     """Run a case in this process; errors are infinite where the result is not finite."""
-    key = (case.digest, setup.radius_mm)
+    key = (case.digest, setup.tissue.radius_mm)
     with _turn:
         if key not in _built:
             _build(key, case, setup)

@@ -15,6 +15,7 @@ from app import main
 from sim.sampling import SamplingError
 from studies.accuracy import null_errors
 from studies.calibration import (
+    MODEL,
     CalibrationError,
     Trial,
     exhaustive,
@@ -28,7 +29,7 @@ from studies.calibration import (
 )
 from studies.case import Case, load_case
 from studies.figures import best_so_far
-from studies.setup import Setup
+from studies.setup import Setup, setup_of
 from studies.workers import Measured, WorkerError, dask_workers, local_workers
 
 BEST = {3.0: 0.62, 4.0: 0.33}
@@ -46,10 +47,12 @@ def cases(tmp_path) -> list[Case]:
 
 def pretended(case: Case, setup: Setup) -> Measured:
     """Errors as if each radius had a best stiffness; the last stage has another, which must not be seen in a fit."""
-    off = np.array([setup.stiffness - BEST[setup.radius_mm]] * 2 + [setup.stiffness - 0.9])
+    off = np.array(
+        [setup.tissue.stiffness - BEST[setup.tissue.radius_mm]] * 2 + [setup.tissue.stiffness - 0.9]
+    )
     errors = 0.2 + off[:, None] ** 2 + np.linspace(0, 0.1, case.measured.shape[1])
     errors += 0.05 * (setup.relaxation_factor - 1) + 0.001 * (setup.iterations - 9) ** 2
-    return Measured(errors, [1.0, 2.0, 6.0], round(1000 / setup.radius_mm), 7)
+    return Measured(errors, [1.0, 2.0, 6.0], round(1000 / setup.tissue.radius_mm), 7)
 
 
 def pretending(pairs):
@@ -91,15 +94,15 @@ def test_the_exhaustive_search_finds_the_best_of_what_is_fitted_on_and_judges_it
     assert sum(told) == exhaustive_count(2, 2, 0.1) == 2 * 2 * 18
     for radius, best in BEST.items():
         trial = found.best(radius)
-        assert trial.setup.stiffness == pytest.approx(best, abs=0.011)
+        assert trial.setup.tissue.stiffness == pytest.approx(best, abs=0.011)
         assert trial.fit_mm == pytest.approx(0.25, abs=2e-4)
-        assert trial.held_out_mm == pytest.approx(0.25 + (trial.setup.stiffness - 0.9) ** 2)
+        assert trial.held_out_mm == pytest.approx(0.25 + (trial.setup.tissue.stiffness - 0.9) ** 2)
     null = np.mean([null_errors(case)[-1].mean() for case in cases])
     assert found.null_mm() == pytest.approx(null)
 
 
 def trial(stiffness: float, fit_mm: float) -> Trial:
-    return Trial(Setup(stiffness=stiffness), (), fit_mm, 0.0)
+    return Trial(setup_of(MODEL, stiffness=stiffness), (), fit_mm, 0.0)
 
 
 def test_a_quartic_is_found_again_and_its_least_too():
@@ -117,7 +120,7 @@ def test_a_search_of_several_settings_finds_them_the_same_each_time(cases):
     split = split_of(cases, "stages")
     first, again = (search(cases, split, [3.0], 12, pretending, told.append) for _ in range(2))
     best = first.best(3.0).setup
-    assert best.iterations in (8, 9, 10) and best.stiffness == pytest.approx(0.62, abs=0.1)
+    assert best.iterations in (8, 9, 10) and best.tissue.stiffness == pytest.approx(0.62, abs=0.1)
     assert [t.setup for t in first.trials[3.0]] == [t.setup for t in again.trials[3.0]]
     assert sum(told) == 2 * search_count(2, 1, 12) and len(first.trials[3.0]) == 15 * 13
     course = [t.fit_mm for t in best_so_far(first.trials[3.0])]
@@ -145,7 +148,8 @@ def test_calibrate_leaves_tables_pictures_and_json(monkeypatch, cases, tmp_path,
         "ball",
     ]
     best = found["radii"][0]["best"]
-    setup = Setup(
+    setup = setup_of(
+        MODEL,
         radius_mm=3.0,
         **{name: best[name] for name in ("stiffness", "relaxation_factor", "iterations")},
     )
@@ -200,9 +204,9 @@ def test_calibrate_says_mistakes_in_one_line(monkeypatch, cases, tmp_path, capsy
 def test_processes_here_and_a_cluster_of_one_worker_find_the_same(cases):
     from distributed import LocalCluster
 
-    setup = Setup(radius_mm=5.0, warm_up_steps=6, stage_steps=3)
-    pairs = [(cases[0], replace(setup, stiffness=a)) for a in (0.9, 0.5)]
-    too_large = [(cases[0], Setup(radius_mm=20.0))]
+    setup = setup_of(MODEL, radius_mm=5.0, warm_up_steps=6, stage_steps=3)
+    pairs = [(cases[0], setup.but(stiffness=a)) for a in (0.9, 0.5)]
+    too_large = [(cases[0], setup_of(MODEL, radius_mm=20.0))]
     with local_workers(2) as work:
         here = list(work(pairs))
         with pytest.raises(SamplingError, match="choose a smaller radius"):
@@ -239,7 +243,7 @@ def test_what_is_built_is_kept_and_not_more_than_taichi_bears(monkeypatch, cases
     monkeypatch.setattr(workers, "rest_body", lambda case, setup: filled.append(case.digest))
     monkeypatch.setattr(workers, "Experiment", lambda case, setup, rest: None)
     for radius in (2.0, 3.0, 4.0, 5.0, 6.0, 2.0, 6.0):
-        setup = Setup(radius_mm=radius)
+        setup = setup_of(MODEL, radius_mm=radius)
         key = (cases[0].digest, radius)
         if key not in workers._built:
             workers._build(key, cases[0], setup)

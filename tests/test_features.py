@@ -19,7 +19,7 @@ from sim.shape_matching import ShapeMatching
 from sim.shapes import ConvexTool, SignedDistanceField
 from sim.surface_contact import SurfaceContacts
 from studies.features import command, measure
-from studies.setup import NEO_HOOKEAN, Setup
+from studies.setup import PRESETS, setup_of
 from studies.soak import measure as soak
 from studies.timing.measure import memory_mb
 
@@ -118,7 +118,11 @@ def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, cap
     assert "what is off" not in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("setup", [NEO_HOOKEAN, Setup(radius_mm=4.0)], ids=lambda setup: setup.model)
+@pytest.mark.parametrize(
+    "setup",
+    [PRESETS["neo-hookean"]["balanced"], setup_of("shape-matching", radius_mm=4.0)],
+    ids=lambda setup: setup.model,
+)
 def test_a_soak_ends_where_it_began_and_replays(setup, monkeypatch):
     monkeypatch.setattr(soak, "REST_S", 4.0)
     scene = load_scene(PAPER).model_copy(update={"press": Press(warm_up_steps=60)})

@@ -275,7 +275,7 @@ def runs() -> list[dict]:
     held = {"attachment.at_mm": tuple(MIDDLE + [0, 14, 0]), "attachment.radius_mm": 20.0}
     down = {"press.warm_up_steps": 40, "gravity.direction": (0.0, 1.0, 0.0)}
     scene = with_options(Scene(anatomy=dict(phantom=True)), held | down)
-    setup = replace(PRESETS["neo-hookean"]["balanced"], cell_mm=7.0)
+    setup = PRESETS["neo-hookean"]["balanced"].but(cell_mm=7.0)
     block, made = block_patient(), []
     few = dict(PROBE="linear", PIXELS=64, EVERY=2, DEPTHS_MM=(9, 0.0, 9, 4.0, 9))
     with pytest.MonkeyPatch.context() as patch:

@@ -1,7 +1,6 @@
 """What the settings change, by hand and on the command line."""
 
 import json
-from dataclasses import fields
 from functools import partial
 
 import pytest
@@ -12,21 +11,21 @@ from app import cli, main
 from studies.case import Case, load_case
 from studies.experiment import Run
 from studies.independence import changes_of, moved
-from studies.setup import PRESETS, Setup, choose_setup
+from studies.setup import PRESETS, Setup, choose_setup, setup_of
+
+
+def values_of(setup: Setup) -> dict[str, object]:
+    return vars(setup) | setup.tissue.model_dump() | dict(tissue=None)
 
 
 @pytest.mark.parametrize("model", PRESETS)
 def test_each_change_is_of_one_setting(model):
     setup = choose_setup(model, "balanced")
     different = {
-        name: {
-            field.name
-            for field in fields(Setup)
-            if getattr(changed, field.name) != getattr(setup, field.name)
-        }
+        name: {key for key, value in values_of(changed).items() if values_of(setup)[key] != value}
         for name, changed in changes_of(setup).items()
     }
-    size = {"neo-hookean": "cell_mm", "shape-matching": "radius_mm"}[model]
+    size = setup.tissue.SIZE
     assert list(different.values()) == [
         {"time_step_s", "warm_up_steps", "stage_steps"},
         {"iterations"},
@@ -41,18 +40,18 @@ class Drifting:
     """Stands for an Experiment: its beads drift along x by what the setup has of iterations, steps and cells."""
 
     def __init__(self, case: Case, setup: Setup) -> None:
-        self.case, self.cell_mm = case, setup.cell_mm
+        self.case, self.cell_mm = case, setup.size_mm
 
     def run(self, setup: Setup) -> Run:
-        assert setup.cell_mm == self.cell_mm
+        assert setup.size_mm == self.cell_mm
         beads = self.case.measured.copy()
         beads[..., 0] += setup.iterations + 100 * setup.stage_steps * setup.time_step_s
-        beads[-1, 0, 0] += setup.cell_mm
+        beads[-1, 0, 0] += setup.size_mm
         return Run(beads)
 
 
 def test_what_moves_is_told_stage_by_stage(tmp_path):
-    case, setup = load_case(write_case(tmp_path / "ball")), Setup("neo-hookean", cell_mm=6.0, iterations=8)
+    case, setup = load_case(write_case(tmp_path / "ball")), setup_of("neo-hookean", cell_mm=6.0, iterations=8)
     experiment = Drifting(case, setup)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("studies.independence.Experiment", Drifting)
@@ -76,7 +75,7 @@ def test_validate_prints_and_writes_what_the_settings_change(monkeypatch, tmp_pa
     done = CliRunner().invoke(cli, [str(argument) for argument in arguments])
     assert done.exit_code == 0, done.output
     rows = json.loads(file.read_text())["independence"]
-    assert [row["change"] for row in rows] == list(changes_of(Setup("neo-hookean")))
+    assert [row["change"] for row in rows] == list(changes_of(setup_of("neo-hookean")))
     assert all(f"  {row['change']}  " in done.output for row in rows)
     # Of what the real one computed: the ball's beads come to another place, but not far.
     assert all(0 < row["moved_max_mm"] < 1 for row in rows[:2])

@@ -201,6 +201,7 @@ def test_every_feature_at_once_stays_finite_and_out_of_everything(device, tmp_pa
         press=dict(direction=(0.2, 0, -1), warm_up_steps=20),
     )
     rehearsal = Rehearsal(scene, load_anatomy(scene, tmp_path))
+    assert rehearsal.model.relaxation == "global"
     for step in range(31):
         rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
         assert rehearsal.contacts.measure_penetration() <= 1e-3

@@ -15,12 +15,13 @@ from scenes.scene import (
     Press,
     Scene,
     SceneError,
+    SolverSection,
     load_scene,
     scene_file,
     scene_text,
     with_options,
 )
-from scenes.tissue import ShapeMatchingTissue
+from scenes.tissue import NeoHookeanTissue, ShapeMatchingTissue
 from studies.models import step_settings
 
 
@@ -65,7 +66,9 @@ def refused(tmp_path: Path, text: str) -> str:
             "[anatomy]\n[tissue]\nmodel = 'mass-springs'",
             "tissue.model = 'mass-springs': the model should be one of",
         ),
-        ("[anatomy]\n[contact]\nparticles = true", "contact.particles = true needs particles"),
+        ("tissue = 3\n[anatomy]", "tissue = 3: input should be a valid dictionary"),
+        ("[anatomy]\n[tissue]\nmodel = [3]", "tissue.model = [3]: the model should be one of"),
+        ("[anatomy]\n[contact]\nparticles = true", "needs particles: set tissue.model to shape-matching, or"),
         ("[anatomy]\n[gravity]\ndirection = [0, 0, 0]", "a direction must not be zero"),
         ("[anatomy]\n[[shape]]\nkind = 'plane'\nnormal = [0, 0, 1]\noffset_cm = 1", "write offset_mm"),
         ("[anatomy]\n[[shape]]\nkind = 'ball'", "'plane', 'mesh', 'sdf'"),
@@ -128,6 +131,14 @@ def test_shape_matchings_defaults_are_the_papers_table_1():
     assert (tissue.cluster_spacing, tissue.volume_sampling, tissue.density_g_cm3) == (3.33, 4.0, 1.05)
     assert (contact.shape_friction, contact.particle_friction) == (0.35, 0.25)
     assert scene.gravity.acceleration_m_s2 == 9.81
+
+
+def test_a_step_is_as_the_scene_says_then_as_its_tissue_does_then_the_papers():
+    soft = ShapeMatchingTissue(model="shape-matching", stiffness=0.5)
+    step = step_settings(soft, SolverSection(iterations=5))
+    assert (step.stiffness, step.iterations, step.substeps) == (0.5, 5, 3)
+    step = step_settings(NeoHookeanTissue(), SolverSection(iterations=5))
+    assert (step.iterations, step.substeps, step.relaxation_factor) == (5, 1, 1.7)
 
 
 def with_ball(folder: Path, **changes) -> Scene:

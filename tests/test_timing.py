@@ -17,7 +17,7 @@ from sim.neighbours import ParticleContacts
 from sim.neo_hookean import LATTICE_SETTINGS
 from sim.shapes import ConvexTool, Plane
 from sim.solver import Solver, StepSettings
-from studies.setup import Setup
+from studies.setup import setup_of
 from studies.timing import bound, command, measure
 from studies.timing.phases import Phases, without_calls
 
@@ -99,8 +99,8 @@ def test_memory_is_that_of_the_fields(device, block):
 
 
 def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, capsys):
-    small = Setup(radius_mm=6.0)
-    coarse = Setup("neo-hookean", cell_mm=8.0, substeps=1, iterations=8)
+    small = setup_of("shape-matching", radius_mm=6.0)
+    coarse = setup_of("neo-hookean", cell_mm=8.0, substeps=1, iterations=8)
     monkeypatch.setattr(command, "PAPERS", small)
     monkeypatch.setattr(command, "_setups", lambda quick: [coarse, small])
     monkeypatch.setattr(command, "QUICK_COUNTS", [64])

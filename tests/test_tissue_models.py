@@ -11,7 +11,7 @@ import trimesh
 from conftest import rotation_about
 
 from scenes.scene import SolverSection
-from scenes.tissue import TISSUES, TissueSection
+from scenes.tissue import QUALITIES, TISSUES, TissueSection
 from sim.body import BodyState
 from sim.device import start
 from sim.embedding import Embedding
@@ -20,8 +20,8 @@ from sim.shapes import ConvexTool, Plane
 from sim.skinning import Skin
 from sim.solver import Solver, SolverState, StepSettings
 from sim.tissue import MaterialModel
-from studies.models import KINDS, build_solver, embedding_cell_mm, static_shape, step_settings
-from studies.setup import PRESETS, QUALITIES
+from studies.models import build_solver, embedding_cell_mm, static_shape, step_settings
+from studies.setup import PRESETS
 
 G, RADIUS_MM = 9810.0, 12.0
 # Float32 keeps places up to 16 mm from the origin so well.
@@ -117,12 +117,12 @@ def laid(both) -> Subject:
     return both[1]
 
 
-def test_a_model_is_known_to_all_or_to_none():
-    assert set(TISSUES) == set(KINDS) == set(PRESETS)
-    for model, presets in PRESETS.items():
-        assert set(presets) == set(QUALITIES)
-        assert {setup.model for setup in presets.values()} == {model}
-        assert tissue_of(model).size_mm > 0
+def test_a_model_has_presets_from_coarse_to_fine():
+    for model in TISSUES:
+        presets = [PRESETS[model][quality] for quality in QUALITIES]
+        assert {setup.model for setup in presets} == {model}
+        assert np.diff([setup.size_mm for setup in presets]).max() < 0
+        assert PRESETS[model]["balanced"].tissue == tissue_of(model)
 
 
 def test_it_tells_its_size(free):
@@ -131,7 +131,7 @@ def test_it_tells_its_size(free):
     assert (
         first in ("particles", "nodes") and count == free.solver.body.count and free.tissue.PIECES in counts
     )
-    assert str(count) in KINDS[free.model].reported.format(**free.tissue.model_dump(), **counts, tetrahedra=1)
+    assert str(count) in free.tissue.REPORTED.format(**free.tissue.model_dump(), **counts)
     finer = tissue_of(free.model, **{free.tissue.SIZE: 0.8 * free.tissue.size_mm})
     assert embedding_cell_mm(finer) == pytest.approx(0.8 * embedding_cell_mm(free.tissue))
     # Its distances are known beyond the 24 mm of the ball.

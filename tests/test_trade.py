@@ -2,7 +2,6 @@
 
 import csv
 import json
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,19 +9,21 @@ import pytest
 from PIL import Image
 
 import app
-from scenes.scene import EMBEDDED, PAPER, load_scene
+from scenes.scene import EMBEDDED, PAPER, SolverSection, load_scene, with_options
+from scenes.tissue import QUALITIES
 from sim.neo_hookean import LATTICE_SETTINGS
 from studies.case import load_case
 from studies.experiment import Experiment
+from studies.models import step_settings
 from studies.report import expected_error_of
-from studies.setup import NEO_HOOKEAN, PRESETS, QUALITIES, Setup, scene_of, setup_of_scene
+from studies.setup import PRESETS, Setup, scene_of, setup_of, setup_of_scene
 from studies.trade import choice, command
 from studies.trade.front import Point, expected_error_mm, front_of, load_points, pareto, preset_of
 from studies.trade.ladder import RUNGS, STEPS_DOWN, STEPS_UP, Ladder
 
 
 def point(ms: float, error: float, cell: float = 4.0) -> Point:
-    return Point(replace(NEO_HOOKEAN, cell_mm=cell), ms, error, True)
+    return Point(setup_of("neo-hookean", cell_mm=cell), ms, error, True)
 
 
 def test_the_front_is_what_nothing_beats():
@@ -50,8 +51,8 @@ def test_the_presets_are_points_of_the_measured_front():
     assert np.diff([p.error_mean_mm for p in chosen]).max() < 0
     assert {p.setup.model for p in front_of(points, "shape-matching")} == {"shape-matching"}
     scene = load_scene(PAPER)
-    assert scene.tissue.cell_mm == PRESETS["neo-hookean"]["balanced"].cell_mm
-    assert LATTICE_SETTINGS.iterations == PRESETS["neo-hookean"]["balanced"].iterations
+    assert scene.tissue.cell_mm == PRESETS["neo-hookean"]["balanced"].size_mm
+    assert step_settings(scene.tissue, SolverSection()) == LATTICE_SETTINGS
 
 
 def test_what_was_measured_is_measured_again(device):
@@ -63,7 +64,7 @@ def test_what_was_measured_is_measured_again(device):
         for r in rows
         if r["pareto"]
         and r["model"] == setup.model
-        and r["cell_mm"] == setup.cell_mm
+        and r["cell_mm"] == setup.size_mm
         and r["iterations"] == setup.iterations
     )
     run = Experiment(case, setup).run(setup)
@@ -74,11 +75,14 @@ def test_what_was_measured_is_measured_again(device):
 
 def test_settings_near_measured_ones_have_an_expected_error():
     points = [point(1, 0.3, 6.0), point(2, 0.2, 4.0)]
-    assert expected_error_mm(points, replace(NEO_HOOKEAN, cell_mm=4.3)) == 0.2
-    assert expected_error_mm(points, replace(NEO_HOOKEAN, cell_mm=5.6)) == 0.3
-    assert expected_error_mm(points, replace(NEO_HOOKEAN, cell_mm=12.0)) is None
-    assert expected_error_mm(points, replace(NEO_HOOKEAN, iterations=80)) is None
-    assert expected_error_mm(points, Setup()) is None
+    assert expected_error_mm(points, setup_of("neo-hookean", cell_mm=4.3)) == 0.2
+    assert expected_error_mm(points, setup_of("neo-hookean", cell_mm=5.6)) == 0.3
+    assert expected_error_mm(points, setup_of("neo-hookean", cell_mm=12.0)) is None
+    assert expected_error_mm(points, setup_of("neo-hookean", iterations=80)) is None
+    assert expected_error_mm(points, setup_of("shape-matching")) is None
+    soft = [Point(setup_of("shape-matching", stiffness=0.3), 1, 0.7, True)]
+    assert expected_error_mm(soft, setup_of("shape-matching", stiffness=0.4)) == 0.7
+    assert expected_error_mm(soft, setup_of("shape-matching", stiffness=0.9)) is None
 
 
 def test_a_rehearsals_expected_error_is_of_the_passes_that_it_takes_now():
@@ -94,10 +98,15 @@ def test_a_rehearsals_expected_error_is_of_the_passes_that_it_takes_now():
 
 
 def test_a_scene_has_the_settings_of_the_setup_it_was_made_with():
-    for setup in (PRESETS["neo-hookean"]["fast"], Setup(radius_mm=3.0, stiffness=0.5, substeps=2)):
-        scene = scene_of(load_scene(PAPER), setup)
+    for setup in (
+        PRESETS["neo-hookean"]["balanced"],
+        setup_of("shape-matching", radius_mm=3.0, stiffness=0.5, substeps=2),
+    ):
+        scene = scene_of(with_options(load_scene(PAPER), {"tissue.cell_mm": 9.0}), setup)
         step = scene.solver
         assert setup_of_scene(scene, step.substeps, step.iterations, step.relaxation_factor) == setup
+    of_its_own = scene_of(with_options(scene, {"tissue.cluster_spacing": 4.0}), setup)
+    assert of_its_own.tissue.cluster_spacing == 4.0
 
 
 class Machine:
@@ -109,8 +118,8 @@ class Machine:
         monkeypatch.setattr(choice, "trial_ms", lambda rehearsal: rehearsal)
 
     def build(self, setup: Setup):
-        self.built.append(setup.cell_mm)
-        return self.slower * 10 / setup.cell_mm
+        self.built.append(setup.size_mm)
+        return self.slower * 10 / setup.size_mm
 
 
 FRONT = [point(10 / cell, cell / 10, cell) for cell in (10.0, 5.0, 2.0, 1.0)]
@@ -120,15 +129,15 @@ def test_a_time_budget_takes_the_truest_that_keeps_it(monkeypatch):
     for slower, budget, wanted in ((1.0, 5.0, 2.0), (2.0, 5.0, 5.0), (0.4, 5.0, 1.0), (1.0, 1.5, 10.0)):
         machine = Machine(monkeypatch, slower)
         _, chosen, here_ms = choice.choose(FRONT, machine.build, budget, None)
-        assert chosen.setup.cell_mm == wanted
+        assert chosen.setup.size_mm == wanted
         assert here_ms <= budget and machine.built[-1] == wanted and len(machine.built) <= 2
 
 
 def test_an_error_budget_takes_the_fastest_that_keeps_it(monkeypatch):
     machine = Machine(monkeypatch, 1.0)
-    assert choice.choose(FRONT, machine.build, None, 0.4)[1].setup.cell_mm == 2.0
+    assert choice.choose(FRONT, machine.build, None, 0.4)[1].setup.size_mm == 2.0
     # With time for more, both take the truest.
-    assert choice.choose(FRONT, machine.build, 20.0, 0.4)[1].setup.cell_mm == 1.0
+    assert choice.choose(FRONT, machine.build, 20.0, 0.4)[1].setup.size_mm == 1.0
 
 
 def test_budgets_that_nothing_keeps_are_refused_in_words(monkeypatch):
@@ -166,8 +175,8 @@ def test_a_slow_step_loses_iterations_rung_by_rung_and_gets_them_back():
 
 def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, capsys):
     tried = (
-        replace(NEO_HOOKEAN, cell_mm=10.0, iterations=2, warm_up_steps=20, stage_steps=12),
-        Setup(radius_mm=7.0, warm_up_steps=20, stage_steps=12),
+        setup_of("neo-hookean", cell_mm=10.0, iterations=2, warm_up_steps=20, stage_steps=12),
+        setup_of("shape-matching", radius_mm=7.0, warm_up_steps=20, stage_steps=12),
     )
     monkeypatch.setattr("studies.trade.tried.QUICK", tried)
     assert app.main(["study", "trade", "--quick", "--out", str(tmp_path)]) == 0

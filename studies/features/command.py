@@ -7,6 +7,7 @@ import click
 from tqdm import tqdm
 
 from scenes.scene import PAPER
+from scenes.tissue import USUAL
 from studies.command_line import arch_option, load_patient, make_folder, start_taichi
 from studies.results import write_csv, write_json
 from studies.setup import PRESETS
@@ -42,7 +43,7 @@ def features(scene: Path, out: Path, quick: bool, arch: str) -> None:
     from studies.features import measure
     from studies.features.picture import draw
 
-    models = ["neo-hookean"] if quick else list(measure.FEATURES)
+    models = [USUAL] if quick else list(measure.FEATURES)
     rows: list[dict[str, Any]] = []
     with tqdm(
         total=sum(len(measure.FEATURES[model]) for model in models) + 1, desc="features", unit="feature"

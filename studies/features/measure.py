@@ -17,9 +17,10 @@ from scenes.tissue import TISSUES, ShapeMatchingTissue, TissueSection
 from sim.device import start
 from sim.distance import distance_grid
 from sim.embedding import Embedding
+from sim.shape_matching import fill
 from sim.shapes import GRID_MM, ConvexTool, SignedDistanceField
 from sim.solver import Solver
-from studies.models import KINDS, build_solver, embedding_cell_mm, fill, step_settings
+from studies.models import build_solver, embedding_cell_mm, model_of, step_settings
 from studies.rehearsal import SURROUNDINGS_MM, Rehearsal, scanned_anatomy
 from studies.rehearse.view import settings_of, take_view
 from studies.report import Tally
@@ -71,7 +72,10 @@ OF_PARTICLES = (
     ),
     Feature("scaled masses", Options(mass_scaling_per_mm=0.02), BASE),
 )
-FEATURES = {"neo-hookean": EVERYWHERE, "shape-matching": (*EVERYWHERE, *OF_PARTICLES)}
+FEATURES = {
+    model: (*EVERYWHERE, *OF_PARTICLES) if section.CAN_TOUCH_ITSELF else EVERYWHERE
+    for model, section in TISSUES.items()
+}
 
 
 class Body:
@@ -84,7 +88,7 @@ class Body:
         self.settings = step_settings(tissue, scene.solver)
         middle = anatomy.organ.bounds.mean(axis=0)
         self.organ = moved_by(anatomy.organ, -middle)
-        reach_mm = KINDS[tissue.model].reach_mm(tissue)
+        reach_mm = model_of(tissue).reach_mm(tissue)
         self.supports = [
             distance_grid(shape.vertices - middle, shape.faces, GRID_MM, reach_mm)
             for shape in anatomy.shapes

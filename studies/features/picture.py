@@ -6,7 +6,6 @@ from typing import Any
 from matplotlib.figure import Figure
 
 DPI = 130
-COLOURS = {"neo-hookean": "tab:blue", "shape-matching": "tab:orange", "frame": "tab:green"}
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
@@ -14,7 +13,8 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     figure = Figure(figsize=(12, 0.34 * len(rows) + 1.6), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     names = [f"{row['feature']}  ({row['model']})" for row in rows]
-    colours = [COLOURS[row["model"]] for row in rows]
+    models = list(dict.fromkeys(row["model"] for row in rows))
+    colours = [f"C{models.index(row['model'])}" for row in rows]
     for axes, what, unit in zip(panels, ("ms", "mb"), ("time (ms)", "memory (MB)"), strict=True):
         added = [row[f"{what}_on"] - row[f"{what}_off"] for row in rows]
         axes.barh(range(len(rows)), added, color=colours)

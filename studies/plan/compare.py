@@ -23,7 +23,7 @@ MARGIN_MM, SPEED_MM_S = 5.0, 10.0
 SEEDS = range(3)
 PLANNED_ON = PRESETS["neo-hookean"]["balanced"]
 # Another grid, and more passes: a plan that suits its own model alone does not do well here.
-JUDGED_ON = replace(PLANNED_ON, cell_mm=2.7, iterations=8)
+JUDGED_ON = PLANNED_ON.but(cell_mm=2.7, iterations=8)
 
 
 def count_of(trials: int) -> int:
@@ -53,7 +53,7 @@ def compare(
         why=plan.why,
         probe=probe.transducer_name,
         planned_on=plan.model,
-        judged_on=dict(cell_mm=JUDGED_ON.cell_mm, iterations=JUDGED_ON.iterations),
+        judged_on=dict(cell_mm=JUDGED_ON.size_mm, iterations=JUDGED_ON.iterations),
         speed_mm_s=SPEED_MM_S,
         rows=rows,
     )

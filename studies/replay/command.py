@@ -7,9 +7,10 @@ import click
 from tqdm import tqdm
 
 from scenes.scene import EMBEDDED
+from scenes.tissue import QUALITIES, TISSUES, USUAL
 from studies.command_line import NumberRange, arch_option, load_patient, make_folder, start_taichi
 from studies.results import write_json
-from studies.setup import PRESETS, QUALITIES
+from studies.setup import PRESETS
 
 
 @click.command()
@@ -22,8 +23,8 @@ from studies.setup import PRESETS, QUALITIES
 )
 @click.option(
     "--model",
-    type=click.Choice(list(PRESETS)),
-    default="neo-hookean",
+    type=click.Choice(list(TISSUES)),
+    default=USUAL,
     show_default=True,
     help="Tissue model.",
 )

@@ -21,7 +21,7 @@ HOUR = 60
     "--minutes", type=click.IntRange(1, 6000), default=HOUR, show_default=True, help="Simulated minutes."
 )
 @click.option("--quick", is_flag=True, help="A quarter of a simulated minute of each model.")
-@click.option("--model", type=click.Choice(list(PRESETS)), help="One tissue model [both].")
+@click.option("--model", type=click.Choice(list(PRESETS)), help="One tissue model [all].")
 @arch_option
 def soak(scene: Path, out: Path, minutes: int, quick: bool, model: str | None, arch: str) -> None:
     """An hour of rehearsal in SCENE, faster than real: does the rest shape drift, memory grow, a replay differ?"""

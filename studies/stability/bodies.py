@@ -99,7 +99,7 @@ def prepared(model: str, subject: Subject) -> Specimen:
 
 def _kidney(model: str) -> Specimen:
     fast = PRESETS[model]["fast"]
-    size = {f"tissue.{fast.size_name}": fast.size_mm}
+    size = {f"tissue.{fast.tissue.SIZE}": fast.size_mm}
     scene = load_scene(PAPER)
     anatomy = replace(load_anatomy(scene, PAPER.parent), ct=None)
     rehearsal = Rehearsal(with_options(scene, {"tissue.model": model, **size}), anatomy)
@@ -135,7 +135,7 @@ def _filled(
     tissue = with_options(load_scene(PAPER), options).tissue
     scaling = np.log(subject.mass_ratio) / np.ptp(mesh.bounds[:, 2])
     section = SolverSection(mass_scaling_per_mm=min(float(scaling), 1.0))
-    contact = Contact(particles=subject.kind == "two" and model == "shape-matching")
+    contact = Contact(particles=subject.kind == "two" and tissue.CAN_TOUCH_ITSELF)
     return build_solver(mesh, tissue, shapes, tool, contact, section), step_settings(tissue, section)
 
 

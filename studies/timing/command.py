@@ -9,13 +9,13 @@ from tqdm import tqdm
 from scenes.scene import PAPER
 from studies.command_line import arch_option, load_patient, make_folder, start_taichi
 from studies.results import write_csv, write_json
-from studies.setup import PRESETS, Setup
+from studies.setup import PRESETS, Setup, setup_of
 
 RADII_MM = (2.2, 2.5, 2.7, 3.0, 3.3)
 COUNTS = [1_000, 4_000, 16_000, 64_000, 250_000, 1_000_000]
 QUICK_COUNTS = [1_000, 4_000, 16_000]
 # The size on which the paper says its figures are, and which is compared with other programs.
-PAPERS = Setup(radius_mm=2.2)
+PAPERS = setup_of("shape-matching", radius_mm=2.2)
 STEPS, QUICK_STEPS, QUICK_SHARE = 7, 3, 0.1
 COLUMNS = (
     "model",
@@ -75,7 +75,7 @@ def _setups(quick: bool) -> list[Setup]:
     presets = PRESETS["neo-hookean"]
     if quick:
         return [presets["balanced"], PAPERS]
-    return [*presets.values(), *(Setup(radius_mm=radius) for radius in RADII_MM)]
+    return [*presets.values(), *(setup_of("shape-matching", radius_mm=radius) for radius in RADII_MM)]
 
 
 def _flat(case: dict) -> dict[str, Any]:
@@ -115,7 +115,7 @@ def against(figures: dict) -> list[str]:
     if not figures:
         return []
     lines = [
-        f"\nIn turn, {PAPERS.radius_mm:g} mm, medians: a step with all contacts {figures['step_ms']:.2f} ms, without any "
+        f"\nIn turn, {PAPERS.size_mm:g} mm, medians: a step with all contacts {figures['step_ms']:.2f} ms, without any "
         f"{figures['without_contacts_ms']:.2f} ms"
     ]
     if figures["bound_ms"]:

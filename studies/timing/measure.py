@@ -19,7 +19,7 @@ from sim.solver import Solver, StepSettings
 from studies.blocks import block_of_cells, block_of_particles
 from studies.rehearsal import Rehearsal
 from studies.results import spread
-from studies.setup import Setup, scene_of
+from studies.setup import Setup, scene_of, setup_of
 from studies.stopwatch import timed
 from studies.timing.bound import Bound, NoBound, Pypbd
 from studies.timing.phases import Phases, without_calls
@@ -95,11 +95,10 @@ def measure(rehearsal: Rehearsal, setup: Setup, share: float, arch: str) -> Pres
 def describe(setup: Setup, solver: Solver, arch: str) -> dict[str, Any]:
     """What was timed, under the names of timing.json."""
     counts = solver.model.counts()
-    matched = setup.model == "shape-matching"
     return dict(
         model=setup.model,
-        radius_mm=setup.radius_mm if matched else None,
-        cell_mm=None if matched else setup.cell_mm,
+        radius_mm=getattr(setup.tissue, "radius_mm", None),
+        cell_mm=getattr(setup.tissue, "cell_mm", None),
         particles=counts["particles"],
         clusters=counts.get("clusters"),
         memberships=counts.get("memberships"),
@@ -232,11 +231,11 @@ def _block_of_particles(count: int) -> tuple[Solver, StepSettings, Setup]:
     points = BLOCK_RADIUS_MM * np.indices((side, side, side)).reshape(3, -1).T
     floor = Plane(np.array([0.0, 0.0, 1.0]), -BLOCK_RADIUS_MM / 2)
     solver = block_of_particles(points, BLOCK_RADIUS_MM, [floor])
-    return solver, StepSettings(), Setup(radius_mm=BLOCK_RADIUS_MM)
+    return solver, StepSettings(), setup_of("shape-matching", radius_mm=BLOCK_RADIUS_MM)
 
 
 def _block_of_cells(count: int) -> tuple[Solver, StepSettings, Setup]:
     side = max(2, round(count ** (1 / 3)) - 1)
     solver = block_of_cells(side, BLOCK_CELL_MM, [Plane(np.array([0.0, 0.0, 1.0]), 0.0)])
-    setup = Setup("neo-hookean", cell_mm=BLOCK_CELL_MM, substeps=1, iterations=8)
+    setup = setup_of("neo-hookean", cell_mm=BLOCK_CELL_MM, iterations=8)
     return solver, LATTICE_SETTINGS, setup

@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from scenes.tissue import TISSUES
 from studies.rehearsal import Rehearsal
 from studies.setup import Setup
 from studies.stopwatch import timed
@@ -72,5 +71,5 @@ def trial_ms(rehearsal: Rehearsal) -> float:
 
 def described(setup: Setup) -> str:
     """Settings in words."""
-    size = f"{TISSUES[setup.model].PIECES} of {setup.size_mm:g} mm"
+    size = f"{setup.tissue.PIECES} of {setup.size_mm:g} mm"
     return f"{setup.model}, {size}, {setup.substeps} x {setup.iterations} passes"

@@ -9,7 +9,7 @@ from tqdm import tqdm
 from studies.case import load_case
 from studies.command_line import arch_option, make_folder, start_taichi
 from studies.results import write_csv, write_json
-from studies.trade.front import preset_of, setup_of
+from studies.trade.front import preset_of, setup_of_row
 from studies.trade.tried import PAPER, setups
 
 EMBEDDED_CASE = Path(__file__).parents[1] / "reference" / "embedded"
@@ -67,7 +67,7 @@ def table(points: list[dict[str, Any]]) -> list[str]:
 
 def name_of(point: dict[str, Any]) -> str:
     """The preset that a point is, or the paper's; empty where it is neither."""
-    setup = setup_of(point)
+    setup = setup_of_row(point)
     return preset_of(setup) or ("the paper's" if setup in PAPER else "")
 
 

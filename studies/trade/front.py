@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from studies.setup import PRESETS, Setup
+from studies.setup import PRESETS, Setup, setup_of
 
 # Written by ``study trade``, copied here whole.
 MEASURED = Path(__file__).with_name("points.json")
@@ -32,14 +32,14 @@ class Point:
 def load_points() -> tuple[Point, ...]:
     """What was measured, cheapest first."""
     rows = json.loads(MEASURED.read_text("utf-8"))["points"]
-    found = [Point(setup_of(row), row["ms_median"], row["error_mean_mm"], row["pareto"]) for row in rows]
+    found = [Point(setup_of_row(row), row["ms_median"], row["error_mean_mm"], row["pareto"]) for row in rows]
     return tuple(sorted(found, key=lambda point: point.ms_median))
 
 
-def setup_of(row: dict[str, Any]) -> Setup:
+def setup_of_row(row: dict[str, Any]) -> Setup:
     """The settings of a row of trade.json."""
     given = {name: row[name] for name in SETTINGS if row[name] is not None}
-    return Setup(model=row["model"], **given)
+    return setup_of(row["model"], **given)
 
 
 def preset_of(setup: Setup) -> str:
@@ -73,10 +73,12 @@ def expected_error_mm(points: Sequence[Point], setup: Setup) -> float | None:
 
     def away(point: Point) -> float:
         other = point.setup
-        # Of a model without one the stiffness is the same in all setups.
-        size = np.log(setup.size_mm / other.size_mm) + (setup.stiffness - other.stiffness)
+        size = np.log(setup.size_mm / other.size_mm) + stiffness_of(setup) - stiffness_of(other)
         passes = np.log(setup.substeps * setup.iterations / (other.substeps * other.iterations))
         return abs(size) + abs(passes) + 0.1 * abs(setup.relaxation_factor - other.relaxation_factor)
+
+    def stiffness_of(setup: Setup) -> float:
+        return getattr(setup.tissue, "stiffness", 0.0)
 
     own = [point for point in points if point.setup.model == setup.model]
     nearest = min(own, key=away, default=None)

@@ -12,7 +12,7 @@ from studies.accuracy import bead_errors
 from studies.case import Case
 from studies.experiment import Experiment
 from studies.results import rounded
-from studies.setup import NOT_USED, Setup
+from studies.setup import Setup
 from studies.stopwatch import timed
 from studies.trade.front import SETTINGS, pareto
 from ultrasound.probe import between
@@ -88,7 +88,7 @@ def _time(experiment: Experiment, setup: Setup) -> float:
 def _row(
     setup: Setup, ms: float, best: bool, resting: dict[str, float], arriving: dict[str, float]
 ) -> dict[str, Any]:
-    settings = {name: None if name in NOT_USED[setup.model] else getattr(setup, name) for name in SETTINGS}
+    settings = {name: getattr(setup, name, getattr(setup.tissue, name, None)) for name in SETTINGS}
     return dict(
         model=setup.model,
         **settings,

@@ -7,11 +7,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.trade.front import preset_of, setup_of
+from studies.trade.front import preset_of, setup_of_row
 from studies.trade.tried import PAPER
 
 DPI = 130
-COLOURS = {"neo-hookean": "tab:blue", "shape-matching": "tab:orange"}
 FRAME_MS = 1000 / 60
 
 
@@ -20,8 +19,8 @@ def draw(points: list[dict[str, Any]], path: Path) -> None:
     points = [point for point in points if point["error_mean_mm"] is not None]
     figure = Figure(figsize=(11, 7), layout="constrained")
     axes = figure.subplots()
-    for model, colour in COLOURS.items():
-        _model(axes, [point for point in points if point["model"] == model], model, colour)
+    for model in sorted({point["model"] for point in points}):
+        _model(axes, [point for point in points if point["model"] == model], model)
     front = sorted((point for point in points if point["pareto"]), key=lambda point: point["ms_median"])
     ms, error = [p["ms_median"] for p in front], [p["error_mean_mm"] for p in front]
     axes.plot(ms, error, color="black", linewidth=1.2, label="Pareto front", drawstyle="steps-post")
@@ -39,19 +38,16 @@ def draw(points: list[dict[str, Any]], path: Path) -> None:
     figure.savefig(path, dpi=DPI)
 
 
-def _model(axes: Axes, points: list[dict[str, Any]], model: str, colour: str) -> None:
-    if not points:
-        return
+def _model(axes: Axes, points: list[dict[str, Any]], model: str) -> None:
     size = np.array([point["cell_mm"] or point["radius_mm"] for point in points])
     axes.scatter(
         [point["ms_median"] for point in points],
         [point["error_mean_mm"] for point in points],
         s=7 * size,
-        color=colour,
         alpha=0.55,
         label=f"{model} (area: size of cells or particles)",
     )
-    papers = [point for point in points if setup_of(point) in PAPER]
+    papers = [point for point in points if setup_of_row(point) in PAPER]
     for k, point in enumerate(papers):
         at = (point["ms_median"], point["error_mean_mm"])
         label = "the paper's radii (mm), with its best stiffness" if k == 0 else None
@@ -61,7 +57,7 @@ def _model(axes: Axes, points: list[dict[str, Any]], model: str, colour: str) ->
             text, at, xytext=(0, 6), textcoords="offset points", fontsize=9, color="tab:red", ha="center"
         )
     for point in points:
-        name = preset_of(setup_of(point))
+        name = preset_of(setup_of_row(point))
         # Shape matching's are the paper's particles, of which the finer are not the truer.
         if name and point["pareto"]:
             at = (point["ms_median"], point["error_mean_mm"])
