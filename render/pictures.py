@@ -9,7 +9,7 @@ from render.viewer import View
 
 PICTURES_A_SECOND = 15
 ANIMATION_WIDTH = 960
-ANIMATION_QUALITY = 70
+ANIMATION_QUALITY = 85
 
 
 def in_proportion(picture: np.ndarray, width_mm: float, depth_mm: float) -> Image.Image:
@@ -41,7 +41,7 @@ def smaller(picture: Image.Image) -> Image.Image:
 
 
 def save_animation(pictures: list[Image.Image], path: Path) -> None:
-    """Write an animated WebP that repeats: in all colours, where a GIF has 256, and a quarter of its size."""
+    """Write an animated WebP that repeats: in all colours, where a GIF has 256, and a third of its size."""
     first, *others = [picture.convert("RGB") for picture in pictures]
     first.save(
         path,
