@@ -50,7 +50,9 @@ def import_patient_command(
     support: str,
     **words: str | None,
 ) -> None:
-    """Make a patient's folder, with a scene, out of a CT and its LABELS.
+    """Make a patient's folder out of a CT and its LABELS.
+
+    The folder holds the scene to rehearse in.
 
     CT: a folder with DICOM, a DICOMDIR or zip archive, a NIfTI, NRRD or MHA file. LABELS: label maps, a folder with a file
     an organ, DICOM-SEG, RTSTRUCT; without them those that lie with the CT.

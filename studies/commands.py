@@ -81,7 +81,10 @@ def validate(
     json_file: Path | None,
     **changes: float | None,
 ) -> None:
-    """Press the organ of CASE, a folder with a bead experiment, and compare the beads with the measured ones."""
+    """Compare with the bead experiment of CASE, a folder.
+
+    The organ is pressed as in the experiment, and its beads compared with the measured ones.
+    """
     given = [name for name, value in changes.items() if value is not None]
     setup = choose_setup(model or model_with(given, USUAL), quality, **changes)
     loaded = load_case(case)
@@ -149,9 +152,9 @@ def calibrate(
     jobs: int | None,
     address: str | None,
 ) -> None:
-    """Fit the settings of shape matching to the bead experiments of CASE..., and judge them on what was held out.
+    """Fit shape matching to bead experiments, as the paper did.
 
-    It is the paper's calibration: every stiffness for each particle radius.
+    Every stiffness is tried for each particle radius, on the folders CASE..., and judged on what was held out.
     """
     radii_mm = numbers(radii, "--radii", 0.5, 20)
     loaded = [load_case(case) for case in cases]

@@ -15,7 +15,7 @@ from studies.trade.command import trade
 
 @click.group()
 def study() -> None:
-    """Measure on this machine: tables, CSV, JSON and a picture into a folder."""
+    """Measure on this machine: tables and a picture in a folder."""
 
 
 for command in (timing, features, trade, stability, soak, intake, freehand, replay, plan_study):

@@ -107,7 +107,7 @@ def test_it_leaves_pictures_in_which_the_press_is_seen(pressed):
     assert len(slices) >= 3 and slices[0].shape == (512, 2 * 205)
     assert np.abs(slices[0] - slices[-1]).mean() > 10
     assert slices[0].std() > 30
-    with Image.open(pressed / "press.gif") as animation:
+    with Image.open(pressed / "press.webp") as animation:
         assert animation.n_frames == len(slices)
 
 

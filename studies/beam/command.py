@@ -70,7 +70,10 @@ def beam(
     json_path: Path | None,
     out: Path | None,
 ) -> None:
-    """Clamp and load the beam of FOLDER (motion capture, beam.stl); compare its tip's rest and first frequency."""
+    """Compare with the silicone beam of FOLDER (motion capture).
+
+    The beam (beam.stl) is clamped and loaded; compared are where its tip comes to rest and its first frequency.
+    """
     try:
         run(folder, (cell_mm, young_kpa, poisson, density), checked, json_path, out)
     except BeamError as error:

@@ -28,8 +28,9 @@ from scenes.volume_files import save_image
     help="Of the surfaces; PLY keeps the order of their vertices.",
 )
 def export(scene: Path, out: Path, suffix: str) -> None:
-    """Write what is in SCENE, a scene file or a patient's folder: surfaces as STL or PLY, CT and label map as NRRD.
+    """Write surfaces, CT and labels of SCENE as files.
 
+    SCENE is a scene file or a patient's folder; surfaces become STL or PLY, CT and label map NRRD.
     All is in mm, in the patient's LPS, at rest. As they lie when they are pressed, rehearse writes them.
     """
     path = scene_file(scene)

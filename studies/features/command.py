@@ -36,7 +36,10 @@ COLUMNS = (
 )
 @arch_option
 def features(scene: Path, out: Path, quick: bool, arch: str) -> None:
-    """What each feature of SCENE costs in time, memory and kernels: the same press with it and without, in turn."""
+    """Measure what each feature of SCENE costs.
+
+    In time, memory and kernels: the same press with it and without, in turn.
+    """
     make_folder(out)
     loaded, anatomy = load_patient(scene)
     used = start_taichi(arch)

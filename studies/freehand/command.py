@@ -98,9 +98,9 @@ def reconstruct(
     arch: str,
     **tracker: float,
 ) -> None:
-    """Make a volume of SWEEP, a tracked sweep (.igs.mha) of Nephron's or of PLUS.
+    """Make a volume of SWEEP, a tracked sweep (.igs.mha).
 
-    Writes volume.nrrd, volume.png and report.json; beside a sweep of marks (SWEEP-marks.igs.mha, which a rehearsal records) the
+    The sweep is Nephron's or PLUS's. Writes volume.nrrd, volume.png and report.json; beside a sweep of marks (SWEEP-marks.igs.mha, which a rehearsal records) the
     organ and tumour as they were seen, in labels.nrrd. With a tracker's errors, the sweep that has them is left as tracked.igs.mha.
     """
     if undo_compression and scene is None:

@@ -22,7 +22,10 @@ VARIED = tuple(each.name for each in fields(TrackingErrors))
 @click.option("--quick", is_flag=True, help="One size of each error and two depths.")
 @arch_option
 def freehand(scenes: tuple[Path, ...], out: Path, quick: bool, arch: str) -> None:
-    """Volumes of tracked sweeps of SCENES [the embedded patient], against the truth: at rest, with a tracker's errors, pressed."""
+    """Compare volumes of tracked sweeps with the truth.
+
+    Of SCENES [the embedded patient]: at rest, with a tracker's errors, pressed.
+    """
     make_folder(out)
     loaded = []
     for scene in scenes or (EMBEDDED,):

@@ -33,7 +33,10 @@ TUMOUR_OF_PHANTOM = "6"
 )
 @click.option("--runs", type=click.IntRange(1, 20), default=3, show_default=True)
 def intake(out: Path, slices: int, runs: int) -> None:
-    """Import a synthetic trunk of 512 x 512 pixels a slice, from DICOM and NIfTI labels: seconds and memory."""
+    """Measure an import: seconds and memory.
+
+    Of a synthetic trunk of 512 x 512 pixels a slice, from DICOM and NIfTI labels.
+    """
     make_folder(out)
     with tempfile.TemporaryDirectory() as temporary:
         body = write_whole_body(

@@ -68,7 +68,10 @@ def plan(
     trials: int,
     jobs: int | None,
 ) -> None:
-    """Plan a sweep over SCENE, a scene file or a patient's folder: poses that show the target on the deforming organ."""
+    """Plan a sweep over SCENE that shows the target.
+
+    SCENE is a scene file or a patient's folder; the plan's poses show the target on the deforming organ.
+    """
     path = scene_file(scene)
     loaded = with_options(load_scene(path), {"transducer.probe": probe})
     port = trocar_of(loaded.trocar, trocar, cone_deg, wrist_deg)

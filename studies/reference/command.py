@@ -22,7 +22,10 @@ from studies.command_line import Fault, NumberRange, make_folder
     help="Length in mm of the elements' edges by the transducer.",
 )
 def reference(out: Path, edge_mm: float) -> None:
-    """Solve the bead experiment on the embedded patient by finite elements: a case for `validate`."""
+    """Make a bead experiment by finite elements, for `validate`.
+
+    It presses the embedded patient's kidney.
+    """
     make_folder(out)
     try:
         from studies.reference.equilibrium import NotConvergedError

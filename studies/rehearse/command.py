@@ -120,7 +120,10 @@ def rehearse(
     link_leads: bool,
     **changes: Any,
 ) -> None:
-    """Press the kidney of SCENE, a scene file or a patient's folder, and see what the transducer sees."""
+    """Press the kidney of SCENE and see what the probe sees.
+
+    SCENE is a scene file or a patient's folder; without one it is the embedded patient.
+    """
     path = scene_file(scene)
     changed = {key: changes[option.strip("-").replace("-", "_")] for key, option in OPTIONS.items()}
     before = load_scene(path)
@@ -183,7 +186,7 @@ def rehearse(
 
 @click.command("keys")
 def keys_command() -> None:
-    """Print which key does what, as a file to be changed and given to rehearse --keys."""
+    """Print the keys as a file to change, for rehearse --keys."""
     click.echo(keys_text(), nl=False)
 
 

@@ -20,7 +20,7 @@ from studies.rehearse.view import open_viewer, probe_as_set, take_view
 from studies.report import Tally, summary
 
 # An animation is in memory before it is written: of a long session it has fewer pictures.
-MOST_SHOWN = 400
+MOST_SHOWN = 240
 
 
 def run_headless(
@@ -64,12 +64,12 @@ def run_headless(
                 picture.save(frames / f"{step:05d}.png")
             if step % shown_every == 0 or step == steps:
                 animation.append(smaller(picture))
-    save_animation(animation, out / "press.gif")
+    save_animation(animation, out / "press.webp")
     save_surfaces(rehearsal, out)
     report = tally.report(rehearsal, arch) | dict(reading=instruments.figures())
     (out / "report.json").write_text(json.dumps(report, indent=2) + "\n", "utf-8")
     click.echo(summary(report))
-    click.echo(f"Wrote {-(-steps // every)} pictures, press.gif and report.json to {out}")
+    click.echo(f"Wrote {-(-steps // every)} pictures, press.webp and report.json to {out}")
 
 
 def _tell(news: str) -> None:

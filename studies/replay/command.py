@@ -37,7 +37,10 @@ from studies.setup import PRESETS
 )
 @arch_option
 def replay(scene: Path, out: Path, minutes: float, model: str, quality: str, arch: str) -> None:
-    """Record a session in SCENE, led by chance, and compute it again from its file: twice, and once from its middle."""
+    """Record a session in SCENE and compute it again.
+
+    It is led by chance; from its file it is computed twice, and once from its middle.
+    """
     make_folder(out)
     loaded, anatomy = load_patient(scene)
     used = start_taichi(arch)

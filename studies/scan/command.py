@@ -58,8 +58,9 @@ def scan(
     sweep: bool,
     arch: str,
 ) -> None:
-    """Pictures of SCENE, a scene file or a patient's folder, as it lies in the CT: no body, no window.
+    """Take pictures of SCENE at a list of probe poses.
 
+    SCENE is a scene file or a patient's folder. It lies as in the CT: no body, no window.
     For each pose of a file, what the probe shows there. Writes PNG pictures and scan.json, which says how large their pixels are.
     """
     path = scene_file(scene)

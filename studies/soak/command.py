@@ -24,7 +24,10 @@ HOUR = 60
 @click.option("--model", type=click.Choice(list(PRESETS)), help="One tissue model [all].")
 @arch_option
 def soak(scene: Path, out: Path, minutes: int, quick: bool, model: str | None, arch: str) -> None:
-    """An hour of rehearsal in SCENE, faster than real: does the rest shape drift, memory grow, a replay differ?"""
+    """Rehearse for an hour in SCENE, faster than real.
+
+    Does the rest shape drift, memory grow, a replay differ?
+    """
     make_folder(out)
     loaded, anatomy = load_patient(scene)
     used = start_taichi(arch)

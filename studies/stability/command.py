@@ -22,7 +22,10 @@ BATCH = 12
 @click.option("--quick", is_flag=True, help="One case of each kind, in less than a minute.")
 @click.option("--jobs", type=click.IntRange(1, 1024), help="Processes on this machine [one a processor].")
 def stability(out: Path, quick: bool, jobs: int | None) -> None:
-    """What no scene should do to its tissue: each model at the extremes, then let go of."""
+    """Maltreat the tissue, let go, and see whether it recovers.
+
+    What no scene should do to its tissue, to each model: extremes of settings, tool and state.
+    """
     make_folder(out)
     from studies.stability.picture import draw
 

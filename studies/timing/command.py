@@ -38,7 +38,10 @@ COLUMNS = (
 @click.option("--quick", is_flag=True, help="Fewer sizes and shorter presses, in less than a minute.")
 @arch_option
 def timing(scene: Path, out: Path, quick: bool, arch: str) -> None:
-    """How long a time step of SCENE takes: against time, by its pieces, by size, and against a plain loop in C."""
+    """Measure how long a time step of SCENE takes.
+
+    Against time, by its pieces, by size, and against a plain loop in C.
+    """
     make_folder(out)
     loaded, anatomy = load_patient(scene)
     used = start_taichi(arch)

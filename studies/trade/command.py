@@ -23,8 +23,9 @@ EMBEDDED_CASE = Path(__file__).parents[1] / "reference" / "embedded"
 )
 @arch_option
 def trade(cases: tuple[Path, ...], out: Path, quick: bool, arch: str) -> None:
-    """Error of the beads against time of a step, over model, resolution, substeps, iterations and relaxation.
+    """Measure the error of beads against the time of a step.
 
+    Over model, resolution, substeps, iterations and relaxation.
     The error is the mean over the embedded patient's bead experiment and those of CASE..., folders as `validate` takes them.
     """
     make_folder(out)
