@@ -16,7 +16,9 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--renew-pictures", action="store_true", help="store the pictures of test_pictures.py anew")
+    parser.addoption(
+        "--renew-pictures", action="store_true", help="store the pictures of test_pictures.py anew"
+    )
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

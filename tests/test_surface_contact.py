@@ -147,6 +147,17 @@ def test_what_a_tool_holds_moves_with_it(device, dome):
     assert (np.abs(moved - aside) < 2 * most)[held].all()
 
 
+def test_what_lets_go_forgets_how_it_was_bent(device, dome):
+    solver = pressed_dome(dome)
+    press(solver, 2.0, settings_of(20, DOWN), 30)
+    poses = np.array([lifted(20.0), lifted(20.0)])
+    poses[1, 0, 3] = 0.1
+    solver.step(settings_of(20, DOWN), poses)
+    assert (np.linalg.norm(solver.contacts.stick.to_numpy()[1], axis=1) > 1e-3).sum() > 3
+    rest(solver, 2, settings_of(20, DOWN), AWAY)
+    assert (solver.contacts.stick.to_numpy()[1] == 0).all()
+
+
 def beads(solver, x: np.ndarray) -> np.ndarray:
     """Where the same points inside the dome are, whatever the cells, when the nodes are at x."""
     points = np.random.default_rng(0).uniform(-11, 11, (800, 3))
