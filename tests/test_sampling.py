@@ -43,7 +43,7 @@ def test_voxels_lie_evenly_within_the_surfaces_bounds(ball):
 
 def test_surface_samples_are_as_many_as_asked_for(ball):
     # So few that none is within the radius of another.
-    particles = sample_particles(ball.vertices, ball.faces, 1.0, 2, surface_samples_per_mm2=0.01)
+    particles = sample_particles(ball.vertices, ball.faces, 0.5, 1, surface_samples_per_mm2=0.01)
     on = np.abs(igl.signed_distance(particles, ball.vertices, ball.faces)[0]) < 1e-6
     assert on.sum() == int(0.01 * ball.area) == 18
 

@@ -11,7 +11,7 @@ from slicing import organ_mask
 from sim.body import BodyState
 from sim.embedding import Embedding, Unmoved, tetrahedra_around
 from sim.skinning import Skin
-from ultrasound.plane import PlaneInTissue
+from ultrasound.plane import ImagePlane, PlaneInTissue
 from ultrasound.probe import image_plane, pose_at
 from ultrasound.slice import Slice
 from ultrasound.volume import Volume, distance_volume
@@ -163,6 +163,28 @@ def test_every_pixel_finds_the_tetrahedron_that_holds_it(device, ball):
             assert least.max() < 1e-4
         else:
             assert least[owner[row, column]] > -1e-4
+
+
+@pytest.mark.parametrize(
+    "direction, lateral", [((0, 0, -1), (1, 0, 0)), ((0, -1, -1), (1, 0, 0)), ((1, 1, 1), (1, -1, 0))]
+)
+def test_no_pixel_falls_between_tetrahedra_where_the_plane_goes_along_their_sides(
+    device, ball, direction, lateral
+):
+    embedding = Embedding(tissue_of(ball, RADIUS), ball, 2 * RADIUS)
+    vertices = embedding.skin.rest.to_numpy().astype(float)
+    centre = vertices[np.linalg.norm(vertices, axis=1).argmin()]
+    # Through a vertex amid the ball, with pixels on the edges: 4 mm are 8 of them.
+    pose = pose_at(np.zeros(3), np.array(direction, float), np.array(lateral, float), 20.0)
+    plane = PlaneInTissue(embedding, 33)
+    axes = image_plane(pose, 20.0, 16.5, 16.5).world_from_plane
+    for out in np.eye(3):
+        world = axes.copy()
+        # Each of the probe's axes in turn is square to the plane.
+        world[:3, :3] = np.roll(axes[:3, :3], int(out.argmax()), axis=1)
+        world[:3, 3] = centre - world[:3, :3] @ [0.0, 8.25, 0.0]
+        plane.take(ImagePlane(world, 16.5, 16.5))
+        assert (plane.owner.to_numpy() < embedding.count).all()
 
 
 def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(device, ball):
