@@ -1,6 +1,5 @@
 """Shapes against closed forms, and contacts that leave nothing inside."""
 
-
 import igl
 import numpy as np
 import pytest
