@@ -7,8 +7,8 @@ import trimesh
 from lattice_tissue import DENSITY, YOUNG_KPA, G, jacobians, lifted, position, put, settings_of, tissue_of
 
 from sim.body import BodyState
-from sim.shapes import ConvexTool, Plane
-from sim.surface_contact import LAYER_MM, NEAR_MM, STICK
+from sim.shapes import ConvexTool, Plane, SignedDistanceField
+from sim.surface_contact import LAYER_MM, NEAR_MM, REACH_MM, STICK
 
 FRICTION = 0.35
 UP = np.array([0.0, 0.0, 1.0])
@@ -127,6 +127,17 @@ def test_a_shape_out_of_reach_exerts_nothing(device, block):
         off = np.abs(position(beside) - fallen).max()
         assert off > 0.01 if reaches else off < 256 * ULP_MM
         assert (np.abs(contact_force(beside, settings_of(8))).max() > 0) == reaches
+
+
+def test_a_shape_whose_distances_end_is_met_by_what_came_from_beyond_them(device, dome):
+    table = trimesh.creation.box([40.0, 40.0, 10.0])
+    table.apply_translation([0.0, 0.0, -11.0])
+    solver = tissue_of(dome, 4.0, [SignedDistanceField.of_surface(table.vertices, table.faces, REACH_MM)])
+    # Its lowest points, at z = -6, are 15, then 1 mm above the table, whose distances are known 6 mm around it.
+    for above, is_near in ((15.0, False), (1.0, True), (15.0, False)):
+        put(solver.model, solver.body.rest_points + [0.0, 0.0, above])
+        solver.launch_start(0, 1e-3, 0.0, 0.0, 0.0, 0.0, 0)
+        assert (solver.contacts.near.to_numpy() > 0).any() == is_near
 
 
 def test_what_a_tool_holds_moves_with_it(device, dome):
