@@ -11,7 +11,7 @@ from particle_tissue import tissue_of as particle_tissue
 from sim.body import BodyState
 from sim.free_way import DEEP_MM, FreeWay
 from sim.guard import CRUSHED_MM, PATIENCE_STEPS, Guard, tetrahedra_among
-from sim.shapes import GRID_MM, ConvexTool, Plane, SignedDistanceField
+from sim.shapes import GRID_MM, HAIR_CELLS, ConvexTool, Plane, SignedDistanceField
 from sim.solver import Solver, StepSettings
 
 DOWN = (0.0, 0.0, -G)
@@ -188,6 +188,19 @@ def test_room_is_no_more_than_the_distance(device, ball):
     assert (out.to_numpy() <= true + np.sqrt(3) / 2 * GRID_MM).all()
     near = np.abs(true) < 3.0
     assert out.to_numpy()[near] == pytest.approx(true[near], abs=0.1)
+
+
+def test_room_beyond_a_grid_is_the_way_to_it_whatever_its_spacing(device):
+    spacing = np.array([0.5, 1.0, 2.0])
+    grid = np.moveaxis(np.indices((65, 33, 17)), 0, -1) * spacing - 16.0
+    shape = SignedDistanceField(np.linalg.norm(grid, axis=-1) - 12.0, np.full(3, -16.0), spacing)
+    points = np.random.default_rng(2).uniform(-40, 40, (2000, 3))
+    points = points[(np.abs(points) > 16.0).any(axis=1)]
+    out = ti.field(ti.f32, len(points))
+    look(shape, field_of(points), out)
+    way = np.linalg.norm(points - np.clip(points, -16.0, 16.0), axis=1)
+    # And a hair into it, so that ways end in the grid.
+    assert out.to_numpy() == pytest.approx(way + HAIR_CELLS * 0.5, abs=1e-4)
 
 
 def test_a_body_on_few_points_stands_still(device):
