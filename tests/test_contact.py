@@ -144,8 +144,9 @@ def test_a_closed_surface_becomes_its_distances(device, ball):
 
 
 @pytest.mark.parametrize("edge_radius", [0.0, 1.0])
-def test_a_tool_is_beyond_a_distance_only_where_it_is(device, edge_radius):
-    tool = ConvexTool.cuboid(np.array([12.0, 6.0, 8.0]), edge_radius)
+@pytest.mark.parametrize("offsets", [(6.0, 3.0, 4.0, 6.0, 3.0, 4.0), (2.0, 3.0, 1.5, 9.0, 5.0, 4.0)])
+def test_a_tool_is_beyond_a_distance_only_where_it_is(device, edge_radius, offsets):
+    tool = ConvexTool(np.concatenate([np.eye(3), -np.eye(3)]), np.array(offsets), edge_radius)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation_about([1, 2, 0], 50), [1.0, -2.0, 3.0]
     tool.move(pose, pose)

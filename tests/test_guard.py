@@ -10,7 +10,7 @@ from particle_tissue import tissue_of as particle_tissue
 
 from sim.body import BodyState
 from sim.free_way import DEEP_MM, FreeWay
-from sim.guard import CRUSHED_MM, PATIENCE_STEPS, Guard, tetrahedra_among
+from sim.guard import CRUSHED_MM, PATIENCE_S, PATIENCE_STEPS, TORN, Guard, tetrahedra_among
 from sim.shapes import GRID_MM, HAIR_CELLS, ConvexTool, Plane, SignedDistanceField
 from sim.solver import Solver, StepSettings
 
@@ -95,6 +95,31 @@ def test_a_tangle_is_given_time_and_then_put_back(device, ball, model):
         assert said[:-1] == [""] * PATIENCE_STEPS
         assert "torn, flat or inside out" in said[-1]
         assert guard.health().tangled == 0.0
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_tissue_is_torn_where_an_edge_is_as_many_times_its_own_length_as_that_takes(device, ball, model):
+    solver, _ = solver_of(model, ball, [floor()])
+    guard = Guard(solver)
+    for share, tangled in ((0.99, 0.0), (1.01, 1.0)):
+        put(solver, share * TORN * solver.body.rest_points)
+        assert guard.health().tangled == tangled
+
+
+def test_a_tangle_that_was_undone_is_given_its_time_again(device, ball):
+    solver, _ = solver_of("neo-hookean", ball, [floor()])
+    guard = Guard(solver)
+    rest = solver.body.rest_points
+    for _ in range(2):
+        put(solver, rest * [1, 1, -1])
+        assert [guard.check(DT) for _ in range(PATIENCE_STEPS)] == [""] * PATIENCE_STEPS
+        put(solver, rest)
+        assert guard.check(DT) == ""
+    # Of short steps there are more in the time that it is given.
+    put(solver, rest * [1, 1, -1])
+    count = round(PATIENCE_S / (DT / 3))
+    assert count > PATIENCE_STEPS and [guard.check(DT / 3) for _ in range(count)] == [""] * count
+    assert "inside out" in guard.check(DT / 3)
 
 
 def test_what_the_tool_crushes_is_no_tangle(device, ball):
