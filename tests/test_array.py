@@ -232,6 +232,14 @@ def test_gas_lets_no_sound_in(tank):
     assert decibel[u > 0.5, :8].max() < SILENT_DB
 
 
+@pytest.mark.parametrize("height, dark", [(0.2, False), (0.8, True)])
+def test_sound_crosses_half_of_the_gap_to_tissue(tank, height, dark):
+    tank.fill(lambda x, y, z: np.where(y < 0.0, 4e-4, TISSUE), 0.0, 0.1)
+    # Of a gap of 1 mm; tissue begins within the voxel of 0.5 mm about y = 0.
+    decibel = tank.look(probe_of(), at=(0.0, -height, 0.0))
+    assert decibel.max() < SILENT_DB if dark else decibel.max() > -20.0
+
+
 def pixel_places(geometry: str) -> tuple[np.ndarray, np.ndarray]:
     """u, v [mm] of the centres of a picture's pixels, 80 mm deep."""
     radius, reach_deg = {"LINEAR": (0.0, 0.0), "CURVILINEAR": (60.0, 25.0), "PHASED": (0.0, 40.0)}[geometry]
