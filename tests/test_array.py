@@ -161,6 +161,15 @@ def test_the_extent_is_the_box_around_all_lines(geometry):
     assert depth - above == pytest.approx(ends[:, 1].max(), rel=1e-4)
 
 
+def test_a_pictures_pixels_are_where_its_matrix_takes_them():
+    probe = load_probe("curvilinear")
+    width, depth, above = probe.extent_mm
+    matrix = probe.image_to_probe(rows=50, columns=80)
+    corners = np.array([[-0.5, -0.5, 0, 1], [79.5, -0.5, 0, 1], [-0.5, 49.5, 0, 1]])
+    places = [[-width / 2, -above, 0, 1], [width / 2, -above, 0, 1], [-width / 2, depth - above, 0, 1]]
+    assert corners @ matrix.T == pytest.approx(np.array(places))
+
+
 def test_gain_is_the_sum_of_knob_course_and_sliders():
     sliders = (10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0)
     probe = probe_of(

@@ -125,6 +125,24 @@ def test_pushed_patches_know_where_their_particles_are(device, block, relaxation
         assert np.abs(moment[p][:3, :3] - wanted).max() < 7 * patches.sizes[p] * ROUNDING_MM
 
 
+@pytest.mark.parametrize("factor, left", [(0.4, 0.6), (1.0, 0.0), (1.7, 0.0)])
+def test_a_push_goes_as_far_as_the_relaxation_factor_but_not_beyond_the_surface(device, block, factor, left):
+    model = tissue_of(block, shapes=[Plane(np.array([0.0, 0.0, 1.0]), -7.5)], friction=0.0)
+    body, contacts = model.body, model.contacts
+
+    @ti.kernel
+    def pressed():
+        contacts.find()
+        model.gather()
+        model.project(0.0, factor, 0.0)
+
+    pressed()
+    depth = body.contact_radius.to_numpy() - 7.5 - body.rest_points[:, 2]
+    moved = model.estimate.to_numpy()[:, 2] - body.rest_points[:, 2]
+    assert (depth > 0.4).sum() > 20
+    assert np.abs(moved - (1 - left) * np.maximum(depth, 0.0)).max() < ROUNDING_MM
+
+
 def test_collapsed_flat_and_inverted_bodies_come_back_to_finite_shapes(device, block):
     body, model, _ = moved_body(block, "local")
     rest = body.rest_points

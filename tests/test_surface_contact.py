@@ -223,6 +223,15 @@ def test_forces_and_stiffnesses_are_the_laws_of_the_layer(device, dome):
     assert (np.abs(pushed - wanted).max(axis=(0, 2)) < 1e-3 * np.abs(wanted).max(axis=(0, 2))).all()
 
 
+def test_points_are_where_their_nodes_carry_them_whatever_was_over_relaxed(device, dome):
+    solver = pressed_dome(dome)
+    press(solver, 2.0, settings_of(4, DOWN), 5)
+    contacts = solver.contacts
+    carried = np.einsum("pk,pkd->pd", contacts.weight.to_numpy(), position(solver)[contacts.node.to_numpy()])
+    # A pass adds eight changes to a point, each with its rounding.
+    assert np.abs(contacts.point.to_numpy() - carried).max() < 4 * 8 * ULP_MM
+
+
 def test_what_lets_go_forgets_how_it_was_bent(device, dome):
     solver = pressed_dome(dome)
     press(solver, 2.0, settings_of(20, DOWN), 30)
