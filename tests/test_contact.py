@@ -128,7 +128,11 @@ def test_signed_distance_field_of_a_sphere(device, spacing):
     outward = points / np.linalg.norm(points, axis=1, keepdims=True)
     # A gradient is one of half a voxel off at most, over r.
     assert (normals * outward).sum(axis=1).min() > np.cos(max(spacing) * np.sqrt(3) / 2 / 4)
-    assert measured(field, np.full((1, 3), 40.0))[1][0] == FAR
+    # It is known up to its last points, and not beyond.
+    for axis in np.eye(3):
+        for sign in (-1, 1):
+            assert measured(field, sign * 15.9 * axis[None])[1][0] == pytest.approx(6.9, abs=0.02)
+            assert measured(field, sign * 16.1 * axis[None])[1][0] == FAR
 
 
 def test_a_closed_surface_becomes_its_distances(device, ball):
