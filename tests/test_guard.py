@@ -204,6 +204,17 @@ def test_a_way_ends_where_it_meets_a_shape(device):
     assert share_of(shapes[1:], [0, 0, 40.0], [0, 0, -200.0], 3.0) == 1.0
 
 
+def test_of_several_shapes_the_first_on_the_way_ends_it(device):
+    wall = Plane(np.array([-1.0, 0.0, 0.0]), -30.0)
+    for shapes in ([floor(), wall], [wall, floor()]):
+        assert share_of(shapes, [0, 0, 40.0], [0, 0, -200.0], 3.0) == pytest.approx(
+            (52 + DEEP_MM) / 200, abs=1e-3
+        )
+        assert share_of(shapes, [0, 0, 40.0], [200.0, 0, 0], 3.0) == pytest.approx(
+            (30 + DEEP_MM) / 200, abs=1e-3
+        )
+
+
 def test_room_is_no_more_than_the_distance(device, ball):
     shape = SignedDistanceField.of_surface(ball.vertices, ball.faces, 4.0)
     points = np.random.default_rng(1).uniform(-40, 40, (2000, 3))
