@@ -65,6 +65,20 @@ def test_the_slice_is_windowed_as_asked_for(device):
     assert np.ptp(wanted) > 50 and np.abs(picture - wanted).max() <= 0.51
 
 
+def test_each_look_is_at_where_the_body_is_now(device):
+    class Followed(Unmoved):
+        looks = 0
+
+        def update(self) -> None:
+            self.looks += 1
+
+    embedding = Followed()
+    scanner = Scanner(anatomy(), embedding, PROBE, PIXELS)
+    for looks in (1, 2):
+        scanner.look(plane_at(), PROBE, "ct", "speckle", 400.0, 20.0)
+        assert embedding.looks == looks
+
+
 @pytest.mark.parametrize("gap", [1.0, 4.0])
 def test_sound_enters_as_near_to_the_organ_as_asked_for(device, gap):
     scanner = Scanner(anatomy(), Unmoved(), PROBE, PIXELS, contact_gap_mm=gap)
