@@ -118,6 +118,13 @@ def test_fat_and_stones_within_a_kidney_are_known_by_their_hu(kidney, hu, width,
     )
 
 
+def test_a_stone_scatters_as_the_table_says():
+    hu, labels = labelled()
+    hu[block(6)] = ENHANCED_HU + STONE_ABOVE_MEDIAN_HU + 50
+    level = tissue_table()["stone"]["backscatter_db"] + CORTEX_DB
+    assert properties(hu, labels, {1: "kidney"})[12, 12, 12, BACKSCATTER] == pytest.approx(10 ** (level / 20))
+
+
 def test_what_of_a_tumour_takes_up_no_agent_is_necrosis():
     hu, labels = labelled()
     hu[block(6)] = 30.0

@@ -161,6 +161,15 @@ def test_the_extent_is_the_box_around_all_lines(geometry):
     assert depth - above == pytest.approx(ends[:, 1].max(), rel=1e-4)
 
 
+def test_a_pictures_pixels_are_where_its_matrix_takes_them():
+    probe = load_probe("curvilinear")
+    width, depth, above = probe.extent_mm
+    matrix = probe.image_to_probe(rows=50, columns=80)
+    corners = np.array([[-0.5, -0.5, 0, 1], [79.5, -0.5, 0, 1], [-0.5, 49.5, 0, 1]])
+    places = [[-width / 2, -above, 0, 1], [width / 2, -above, 0, 1], [-width / 2, depth - above, 0, 1]]
+    assert corners @ matrix.T == pytest.approx(np.array(places))
+
+
 def test_gain_is_the_sum_of_knob_course_and_sliders():
     sliders = (10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0)
     probe = probe_of(
@@ -230,6 +239,14 @@ def test_gas_lets_no_sound_in(tank):
     # A voxel is half tissue and half gas.
     assert np.abs(decibel[u < -0.5, :8] + 20.0).max() < 1e-3
     assert decibel[u > 0.5, :8].max() < SILENT_DB
+
+
+@pytest.mark.parametrize("height, dark", [(0.2, False), (0.8, True)])
+def test_sound_crosses_half_of_the_gap_to_tissue(tank, height, dark):
+    tank.fill(lambda x, y, z: np.where(y < 0.0, 4e-4, TISSUE), 0.0, 0.1)
+    # Of a gap of 1 mm; tissue begins within the voxel of 0.5 mm about y = 0.
+    decibel = tank.look(probe_of(), at=(0.0, -height, 0.0))
+    assert decibel.max() < SILENT_DB if dark else decibel.max() > -20.0
 
 
 def pixel_places(geometry: str) -> tuple[np.ndarray, np.ndarray]:

@@ -129,6 +129,20 @@ def test_lines_that_do_not_touch_show_nothing(organ, shift):
     assert seen.max() == pytest.approx(edges[1], abs=VOXEL_MM / 2 + 0.42)
 
 
+def test_the_first_and_last_places_stand_for_as_much_as_the_others(organ):
+    probe, count = PROBE.model_copy(update=dict(transducer_width_mm=36.0, depth_mm=36.0)), 8
+    organ.forget()
+    few = np.linspace(0, PLACES - 1, count).astype(int)
+    organ.look(places(probe, UPRIGHT, (0, 0, 18))[np.ix_(few, few)], probe, None)
+    u, v, _ = on_picture(organ, UPRIGHT, (0, 0, 18))
+    # Half a place beyond the ends, less half of a part: of those there is one a voxel where tissue is squeezed by 0.7.
+    spacing = 36.0 / (count - 1)
+    beyond = spacing / 2 * (1 - 1 / np.ceil(spacing / 0.7 / VOXEL_MM))
+    ends = [u[organ.seen].min() + 18, v[organ.seen].min(), v[organ.seen].max() - 36]
+    # A voxel is seen from any place in it; steps of 13 or 14 of the 95 are off by 3 % of half a place.
+    assert ends == pytest.approx([-beyond, -beyond, beyond], abs=VOXEL_MM / 2 + 0.1)
+
+
 def test_off_the_organ_nothing_is_seen(organ):
     organ.forget()
     assert not organ.look(places(PROBE, UPRIGHT, (0, 0, R + 3)), PROBE, 1.5).any()
@@ -206,6 +220,8 @@ def test_seen_at_places_adds_up_and_is_forgotten(organ):
     sweep(organ, 5, 12)
     assert organ.seen[once].all()
     assert organ.at(np.array([[-5.0, 3, 4], [2.5, 3, 4], [8, -2, 1], [16, 0, 0]])).tolist() == [1, 0, 1, 0]
+    off = np.random.default_rng(3).uniform(-0.49, 0.49, (*organ.seen.shape, 3)) * VOXEL_MM
+    assert np.array_equal(organ.at((centres(organ) + off).reshape(-1, 3)), organ.seen.ravel())
     assert len(organ.gaps("organ")) == 3
     organ.forget()
     assert organ.share("organ") == 0 and not organ.at(np.zeros((1, 3))).any()

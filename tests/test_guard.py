@@ -10,8 +10,8 @@ from particle_tissue import tissue_of as particle_tissue
 
 from sim.body import BodyState
 from sim.free_way import DEEP_MM, FreeWay
-from sim.guard import CRUSHED_MM, PATIENCE_STEPS, Guard, tetrahedra_among
-from sim.shapes import GRID_MM, ConvexTool, Plane, SignedDistanceField
+from sim.guard import CRUSHED_MM, KEEP_STEPS, PATIENCE_S, PATIENCE_STEPS, TORN, Guard, tetrahedra_among
+from sim.shapes import GRID_MM, HAIR_CELLS, ConvexTool, Plane, SignedDistanceField
 from sim.solver import Solver, StepSettings
 
 DOWN = (0.0, 0.0, -G)
@@ -97,6 +97,32 @@ def test_a_tangle_is_given_time_and_then_put_back(device, ball, model):
         assert guard.health().tangled == 0.0
 
 
+@pytest.mark.parametrize("model", MODELS)
+def test_tissue_is_torn_where_an_edge_is_as_many_times_its_own_length_as_that_takes(device, ball, model):
+    solver, _ = solver_of(model, ball, [floor()])
+    guard = Guard(solver)
+    for share, tangled in ((0.99, 0.0), (1.01, 1.0)):
+        put(solver, share * TORN * solver.body.rest_points)
+        assert guard.health().tangled == tangled
+
+
+def test_a_tangle_that_was_undone_is_given_its_time_again(device, ball):
+    solver, _ = solver_of("neo-hookean", ball, [floor()])
+    guard = Guard(solver)
+    rest = solver.body.rest_points
+    # Undone too early for a good state to be kept, which would begin anew as well.
+    for count in (KEEP_STEPS - 10, PATIENCE_STEPS):
+        put(solver, rest * [1, 1, -1])
+        assert [guard.check(DT) for _ in range(count)] == [""] * count
+        put(solver, rest)
+        assert guard.check(DT) == ""
+    # Of short steps there are more in the time that it is given.
+    put(solver, rest * [1, 1, -1])
+    count = round(PATIENCE_S / (DT / 3))
+    assert count > PATIENCE_STEPS and [guard.check(DT / 3) for _ in range(count)] == [""] * count
+    assert "inside out" in guard.check(DT / 3)
+
+
 def test_what_the_tool_crushes_is_no_tangle(device, ball):
     box = tool()
     solver, _ = solver_of("neo-hookean", ball, [floor(), box])
@@ -178,6 +204,17 @@ def test_a_way_ends_where_it_meets_a_shape(device):
     assert share_of(shapes[1:], [0, 0, 40.0], [0, 0, -200.0], 3.0) == 1.0
 
 
+def test_of_several_shapes_the_first_on_the_way_ends_it(device):
+    wall = Plane(np.array([-1.0, 0.0, 0.0]), -30.0)
+    for shapes in ([floor(), wall], [wall, floor()]):
+        assert share_of(shapes, [0, 0, 40.0], [0, 0, -200.0], 3.0) == pytest.approx(
+            (52 + DEEP_MM) / 200, abs=1e-3
+        )
+        assert share_of(shapes, [0, 0, 40.0], [200.0, 0, 0], 3.0) == pytest.approx(
+            (30 + DEEP_MM) / 200, abs=1e-3
+        )
+
+
 def test_room_is_no_more_than_the_distance(device, ball):
     shape = SignedDistanceField.of_surface(ball.vertices, ball.faces, 4.0)
     points = np.random.default_rng(1).uniform(-40, 40, (2000, 3))
@@ -188,6 +225,19 @@ def test_room_is_no_more_than_the_distance(device, ball):
     assert (out.to_numpy() <= true + np.sqrt(3) / 2 * GRID_MM).all()
     near = np.abs(true) < 3.0
     assert out.to_numpy()[near] == pytest.approx(true[near], abs=0.1)
+
+
+def test_room_beyond_a_grid_is_the_way_to_it_whatever_its_spacing(device):
+    spacing = np.array([0.5, 1.0, 2.0])
+    grid = np.moveaxis(np.indices((65, 33, 17)), 0, -1) * spacing - 16.0
+    shape = SignedDistanceField(np.linalg.norm(grid, axis=-1) - 12.0, np.full(3, -16.0), spacing)
+    points = np.random.default_rng(2).uniform(-40, 40, (2000, 3))
+    points = points[(np.abs(points) > 16.0).any(axis=1)]
+    out = ti.field(ti.f32, len(points))
+    look(shape, field_of(points), out)
+    way = np.linalg.norm(points - np.clip(points, -16.0, 16.0), axis=1)
+    # And a hair into it, so that ways end in the grid.
+    assert out.to_numpy() == pytest.approx(way + HAIR_CELLS * 0.5, abs=1e-4)
 
 
 def test_a_body_on_few_points_stands_still(device):

@@ -145,6 +145,18 @@ def test_interpolation_is_exact_for_linear_fields_inside(mesh):
     assert np.abs(carried - points @ F.T - OFFSET).max() < 1e-12
 
 
+def test_points_outside_all_cells_go_with_the_nearest(ball):
+    lattice = fill_with_cells(ball, 3.0)
+    points = np.random.default_rng(6).uniform(-16, 16, (500, 3))
+    nodes, _ = lattice.interpolation(points)
+    low, high = (lattice.nodes[lattice.cells].min(axis=1), lattice.nodes[lattice.cells].max(axis=1))
+    apart = np.linalg.norm(points[:, None] - (low + high) / 2, axis=2)
+    inside = ((points[:, None] >= low) & (points[:, None] <= high)).all(axis=2)
+    nearest = np.where(inside.any(axis=1), inside.argmax(axis=1), apart.argmin(axis=1))
+    assert 100 < inside.any(axis=1).sum() < 400
+    assert np.array_equal(nodes, lattice.cells[nearest])
+
+
 def test_extrapolation_ends_after_a_cell(ball):
     lattice = fill_with_cells(ball, 3.0)
     direction = np.random.default_rng(4).normal(size=(300, 3))
@@ -174,6 +186,13 @@ def test_surface_points_share_the_area_and_lie_on_the_surface(mesh):
     samples = trimesh.sample.sample_surface(mesh, 2000, seed=1)[0]
     nearest = np.linalg.norm(samples[:, None] - points[None], axis=2).min(axis=1)
     assert nearest.max() < 2.0 * np.sqrt(3) + 1.0
+
+
+def test_a_thin_plate_has_points_on_both_of_its_sides():
+    plate = trimesh.creation.box([20.0, 20.0, 0.5])
+    points, area = surface_points(plate, 4.0)
+    for side in (-0.25, 0.25):
+        assert area[np.abs(points[:, 2] - side) < 1e-9].sum() >= 400.0 - 1e-9
 
 
 def test_the_points_forces_are_the_surfaces(ball):

@@ -28,7 +28,7 @@ from studies.freehand.unsqueeze import Unsqueezed
 from studies.rehearse.sweeping import Sweeping
 from ultrasound import reconstruction
 from ultrasound.array import load_probe
-from ultrasound.marked_sweep import MarkedSweep, marks_beside
+from ultrasound.marked_sweep import MARKS, SUFFIX, MarkedSweep, marks_beside
 from ultrasound.probe import held_at, image_plane, pose_at
 from ultrasound.sweep import Mark, SweepError
 from ultrasound.sweep_file import read_sweep, write_sweep
@@ -192,6 +192,19 @@ def over_tumour() -> np.ndarray:
     way = np.tile(pose, (14, 1, 1))
     way[:, :3, 3] = middle + [0, -20, 0] + (np.arange(14) - 6.5)[:, None] * 1.5 * pose[:3, 2]
     return way
+
+
+def test_the_matrices_of_a_frame_are_of_its_rows_and_columns(tmp_path):
+    probe, pose = load_probe("curvilinear"), np.eye(4)
+    pose[:3, 3] = 3.0, -2.0, 7.0
+    sweep = MarkedSweep(tmp_path, "sweep", probe)
+    sweep.add(*np.zeros((2, 50, 80), np.uint8), probe, pose, 0.0)
+    sweep.close()
+    for end in (SUFFIX, MARKS):
+        read = read_sweep(tmp_path / f"sweep{end}")
+        assert read.images.shape == (1, 50, 80)
+        assert np.array_equal(read.transform("Image", "Probe", 0), probe.image_to_probe(50, 80))
+        assert np.array_equal(read.transform("Probe", "Reference", 0), pose)
 
 
 def test_a_probe_is_held_where_its_image_plane_is():

@@ -93,6 +93,13 @@ def test_balls_are_marked_as_large_as_the_plane_cuts_them(device):
         assert np.array_equal(shown[np.abs(distance) > 0.2], distance[np.abs(distance) > 0.2] < 0)
 
 
+def test_where_beads_overlap_the_last_is_marked(device):
+    beads = np.array([in_world(0, 20, 0), in_world(1, 20, 0), in_world(0.5, 20.8, 0)])
+    marks = Marks(taken(), distance_volume(ball(20, 2, 25, 6)), beads=beads, radius_mm=2.4).render()
+    assert set(np.unique(marks)) == {0, *(Mark.ORGAN + Mark.BEAD * k for k in range(4))}
+    assert (marks[np.hypot(U - 0.5, V - 20.8) < 2.3] == Mark.ORGAN + 3 * Mark.BEAD).all()
+
+
 def test_marks_are_of_where_tissue_was_at_rest(device):
     embedding = Unmoved()
     plane = taken(embedding)

@@ -110,6 +110,13 @@ def test_force_and_hessian_are_the_energys_derivatives(device, noise_mm):
         assert np.linalg.eigvalsh(hessian).min() > 0
 
 
+def test_another_youngs_modulus_leaves_poissons_ratio_and_stiffens_the_contact_layer(device, block):
+    model = tissue_of(block, 8.0, [Plane(np.array([0.0, 0.0, 1.0]), -8.0)], poisson=0.3).model
+    model.set_young(2 * YOUNG_KPA)
+    found = model.mu[None], model.lame[None], model.contacts.stiffness[None]
+    assert found == pytest.approx([2 * each for each in (*lame_of(0.3), YOUNG_KPA / LAYER_MM)], rel=1e-6)
+
+
 def test_the_logarithm_is_exact_to_rounding(device):
     values = np.concatenate([np.geomspace(LEAST_J, 1e30, 4000), 1 + np.linspace(-0.4, 0.4, 4001)]).astype(
         np.float32

@@ -13,6 +13,7 @@ from ultrasound.probe import (
     advanced,
     approached,
     between,
+    held_at,
     image_plane,
     indentation,
     pose_at,
@@ -42,6 +43,12 @@ def test_image_plane_starts_at_the_face_with_x_to_the_marked_side_and_y_down():
     assert plane.world_from_plane @ [7, 0, 0, 1] == pytest.approx([8, 2, 3, 1])
     assert plane.world_from_plane @ [0, 9, 0, 1] == pytest.approx([1, 2, -6, 1])
     assert np.linalg.det(plane.world_from_plane[:3, :3]) == pytest.approx(1.0)
+
+
+def test_a_probe_is_held_where_its_image_plane_lies():
+    pose = pose_at(np.array([3.0, -2.0, 7.0]), np.array([1.0, 2.0, -1.5]), np.array([0.3, 1.0, 0.2]), SIZE[2])
+    plane = image_plane(pose, SIZE[2], 30.0, 40.0)
+    assert held_at(plane.world_from_plane, SIZE[2]) == pytest.approx(pose)
 
 
 def test_touching_pressing_and_measuring_agree(ball):
@@ -117,6 +124,61 @@ def test_turns_are_about_the_transducers_own_axes(hand, turn, axis):
     hand.turn(*turn)
     turned = hand.home[:3, :3].T @ hand.pose()[:3, :3]
     assert turned == pytest.approx(rotation_about(list(np.eye(3)[axis]), 8))
+
+
+def held_aslant(hand: Hand) -> np.ndarray:
+    """The aim of a hand that holds the probe where no axis of it is one of the world's."""
+    hand.aim_at(np.array([6.0, -4.0, 9.6]), np.array([1.0, 2.0, 0.5]))
+    return hand.aim
+
+
+def test_turns_follow_one_another_fan_then_tilt_then_roll_about_axes_that_turn_along(hand):
+    aim = held_aslant(hand)
+    hand.turn(20.0, -30.0, 50.0)
+    fan, tilt, roll = (
+        rotation_about(list(np.eye(3)[axis]), degrees) for axis, degrees in enumerate((20.0, -30.0, 50.0))
+    )
+    assert hand.pose()[:3, :3] == pytest.approx(aim[:3, :3] @ fan @ tilt @ roll)
+
+
+def test_a_turned_probe_still_looks_from_where_it_is_aimed(hand):
+    aim = held_aslant(hand)
+    hand.turn(25.0, -35.0, 10.0)
+    pose = hand.pose()
+    from_aim = pose[:3, 3] - (aim @ [0, 0, -SIZE[2] / 2, 1])[:3]
+    # Touching and pressing move it along its axis alone.
+    assert np.cross(from_aim, pose[:3, 2]) == pytest.approx(np.zeros(3), abs=1e-9)
+
+
+def test_a_probe_is_held_as_it_is_taken(hand):
+    aim = held_aslant(hand)
+    for depth in (-5.0, 0.0, 3.0, 15.0):
+        pose = advanced(touching(aim, SIZE, hand.samples), depth)
+        hand.take(pose)
+        assert hand.pose() == pytest.approx(pose)
+        for _ in range(100):
+            hand.hold(False, 0.1)
+        assert indentation(hand.pose(), SIZE, hand.samples) == pytest.approx(min(depth, 0.0), abs=1e-9)
+
+
+def test_a_hand_with_a_curved_probe_touches_with_its_arc(hand):
+    size, radius = np.array([20.0, 6.0, 20.0]), 25.0
+    curved = Hand(hand.vertices, hand.faces, hand.normals, size, hand.home, hand.lateral, radius)
+    held_aslant(curved)
+    curved.push(2.0)
+    assert indentation(curved.pose(), size, curved.samples, radius) == pytest.approx(2.0)
+    curved.turn(0.0, 20.0, 0.0)
+    assert indentation(curved.pose(), size, curved.samples, radius) == pytest.approx(2.0)
+
+
+def test_normals_count_by_a_gaussian_of_their_distance(hand):
+    for away in (6.0, 12.0, 24.0):
+        hand.vertices, hand.normals = (
+            np.array([[0.0, 0, 0], [away, 0, 0]]),
+            np.array([[0.0, 0, 1], [1, 0, 0]]),
+        )
+        other = np.exp(-((away / 12.0) ** 2))
+        assert hand.outward(np.zeros(3)) == pytest.approx([other, 0, 1] / np.hypot(other, 1))
 
 
 def test_tilts_end_where_a_hand_does(hand):

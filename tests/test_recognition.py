@@ -1,9 +1,12 @@
 """Tissues that no label tells: bone with its marrow, blood with contrast agent."""
 
+from itertools import permutations
+
 import numpy as np
+import pytest
 
 from ultrasound.acoustics import ATTENUATION, IMPEDANCE, properties, tissue_table
-from ultrasound.recognition import bones, recognised
+from ultrasound.recognition import bones, hollow, recognised
 
 SPACING = np.array([0.9, 0.9, 0.9])
 FAT, MARROW, SHELL, CORTEX, BLOOD = -100.0, 150.0, 600.0, 180.0, 200.0
@@ -37,6 +40,37 @@ def test_a_bone_is_filled_with_its_marrow_even_where_the_ct_ends_and_is_no_large
         not (found & ~ball((0.0, 30.0, 27.0), 16.0 + 2 * 1.8 * np.sqrt(3))).any()
         and (found & bone).sum() > 0.9 * bone.sum()
     )
+
+
+@pytest.mark.parametrize("spacing", list(permutations((0.6, 0.9, 1.8))))
+def test_a_bone_is_found_where_it_lies_whatever_its_voxels(spacing):
+    places = np.moveaxis(np.indices(np.ceil(60 / np.array(spacing)).astype(int)), 0, -1) * spacing
+    away = np.linalg.norm(places - [24.0, 30.0, 35.0], axis=-1)
+    found = bones(np.select([away < 14.0, away < 16.0], [MARROW, SHELL], FAT), np.array(spacing))
+    # A rim of a block of 1.8 mm may be missing or too much, as above.
+    assert found[away < 14.0].mean() > 0.99 and not found[away > 16.0 + 2 * 1.8 * np.sqrt(3)].any()
+
+
+def test_what_has_a_label_is_no_bone():
+    hu, bone, kidney, _ = abdomen()
+    muscle = bone & (np.arange(70)[:, None] < 34)
+    found = recognised(hu, {"kidney": kidney, "muscle": muscle}, SPACING)["bone"]
+    assert not (found & muscle).any() and found[bone & ~muscle].mean() > 0.9
+
+
+@pytest.mark.parametrize("across, down", list(permutations(range(3), 2)))
+@pytest.mark.parametrize("width, closed", [(17.0, True), (23.0, False)])
+def test_a_groove_is_a_hollow_where_no_ball_of_20_mm_goes_in(across, down, width, closed):
+    spacing = np.array([1.0, 2.0, 0.5])
+    places = np.moveaxis(np.indices((60 / spacing).astype(int) + 1), 0, -1) * spacing - 30.0
+    groove = (np.abs(places[..., across]) < width / 2) & (places[..., down] > -20.0)
+    found = hollow(~groove, spacing)
+    assert not (found & ~groove).any()
+    # Amid the groove: at a width of 17 mm a ball on its open end reaches 5 mm in, and where one goes in it touches the walls.
+    along = np.delete(places, [across, down], -1)[..., 0]
+    deep = (np.abs(places[..., across]) < width / 2 - 2.0) & (np.abs(along) < 5.0)
+    deep &= (places[..., down] > -5.0) & (places[..., down] < 20.0)
+    assert found[deep].all() if closed else not found[deep].any()
 
 
 def test_a_bone_in_the_cts_corner_of_which_no_cut_shows_a_whole_ring_is_filled_too():

@@ -31,6 +31,23 @@ def test_occupied_voxels_have_the_volume_of_the_surface(ball):
     assert occupied.sum() * pitch**3 == pytest.approx(ball.volume, rel=0.01)
 
 
+def test_voxels_lie_evenly_within_the_surfaces_bounds(ball):
+    ball = ball.copy().apply_translation([3.0, -1.0, 2.0])
+    for pitch in (0.7, 1.0):
+        origin, occupied = occupied_voxels(ball.vertices, ball.faces, pitch)
+        last = origin + pitch * (np.array(occupied.shape) - 1)
+        # As far within the bounds on one side as on the other, and no more than half a voxel.
+        assert origin - ball.bounds[0] == pytest.approx(ball.bounds[1] - last, abs=1e-9)
+        assert (origin - ball.bounds[0] <= pitch / 2 + 1e-9).all()
+
+
+def test_surface_samples_are_as_many_as_asked_for(ball):
+    # So few that none is within the radius of another.
+    particles = sample_particles(ball.vertices, ball.faces, 0.5, 1, surface_samples_per_mm2=0.01)
+    on = np.abs(igl.signed_distance(particles, ball.vertices, ball.faces)[0]) < 1e-6
+    assert on.sum() == int(0.01 * ball.area) == 18
+
+
 def test_surface_samples_put_particles_on_the_surface(ball):
     particles = sample_particles(ball.vertices, ball.faces, 2.0, 4, surface_samples_per_mm2=2.0)
     depth = np.abs(igl.signed_distance(particles, ball.vertices, ball.faces)[0])
@@ -51,7 +68,9 @@ def test_clusters_cover_and_overlap(ball):
     shared = np.bincount(clusters.members, minlength=len(particles))
     assert shared.min() >= 1 and shared.mean() > 2
     for c in range(len(clusters)):
-        members = particles[clusters.members[clusters.offsets[c] : clusters.offsets[c + 1]]]
+        row = clusters.members[clusters.offsets[c] : clusters.offsets[c + 1]]
+        assert (np.diff(row) > 0).all()
+        members = particles[row]
         assert cKDTree(members).query_ball_point(members, spacing, return_length=True).max() == len(members)
 
 

@@ -12,6 +12,7 @@ from sim.body import BodyState, ParticleBody, fill_body
 from sim.patches import arrange
 from sim.sampling import sample_clusters
 from sim.shape_matching import ShapeMatching
+from sim.shapes import Plane
 
 # Positions up to 15 mm in float32 carry 1e-6 mm; a sum over 100 members and an SVD leave some ten times that.
 ROUNDING_MM = 3e-5
@@ -92,6 +93,54 @@ def test_a_rigid_motion_is_no_deformation(device, block):
     project(model, 1.0, 1.0)
     # At 100 mm float32 carries 1e-5 mm.
     assert np.abs(body.estimate.to_numpy() - turned).max() < 10 * ROUNDING_MM
+
+
+@pytest.mark.parametrize("relaxation", ["local", "global"])
+def test_pushed_patches_know_where_their_particles_are(device, block, relaxation):
+    model = tissue_of(block, shapes=[Plane(np.array([0.2, -0.1, 1.0]), -5.0)], relaxation=relaxation)
+    patches, several = model.patches, model.patches.several
+    x = deformed(model.body.rest_points) * 0.9 - [4.0, -2.0, 7.0]
+    model.body.restore(BodyState(x.astype(np.float32), np.zeros(x.shape, np.float32)))
+    model.update_frames()
+
+    @ti.kernel
+    def pressed():
+        model.begin(0.0)
+        model.contacts.find()
+        model.gather()
+        model.project(0.9, 1.0, 0.0)
+
+    pressed()
+    estimate = model.estimate.to_numpy()[:, :3].astype(float)
+    touched = np.bincount(patches.of_particles(), model.contacts.touched.to_numpy() > 0)
+    assert 10 < (touched[:several] > 0).sum() < several - 10
+    centre = np.add.reduceat(estimate, patches.start[:-1]) / patches.sizes[:, None]
+    assert np.abs(model.centre.to_numpy()[:, :3] - centre).max() < ROUNDING_MM
+    share = 1 / patches.shared if relaxation == "local" else np.ones(len(patches))
+    rest, moment = model.body.rest_points, model.moment.to_numpy()
+    for p in range(several):
+        of = slice(patches.start[p], patches.start[p + 1])
+        wanted = share[p] * (rest[of] - rest[of].mean(axis=0)).T @ (estimate[of] - centre[p])
+        # Each of a patch's particles rounds times its lever, which is at most 7 mm.
+        assert np.abs(moment[p][:3, :3] - wanted).max() < 7 * patches.sizes[p] * ROUNDING_MM
+
+
+@pytest.mark.parametrize("factor, left", [(0.4, 0.6), (1.0, 0.0), (1.7, 0.0)])
+def test_a_push_goes_as_far_as_the_relaxation_factor_but_not_beyond_the_surface(device, block, factor, left):
+    model = tissue_of(block, shapes=[Plane(np.array([0.0, 0.0, 1.0]), -7.5)], friction=0.0)
+    body, contacts = model.body, model.contacts
+
+    @ti.kernel
+    def pressed():
+        contacts.find()
+        model.gather()
+        model.project(0.0, factor, 0.0)
+
+    pressed()
+    depth = body.contact_radius.to_numpy() - 7.5 - body.rest_points[:, 2]
+    moved = model.estimate.to_numpy()[:, 2] - body.rest_points[:, 2]
+    assert (depth > 0.4).sum() > 20
+    assert np.abs(moved - (1 - left) * np.maximum(depth, 0.0)).max() < ROUNDING_MM
 
 
 def test_collapsed_flat_and_inverted_bodies_come_back_to_finite_shapes(device, block):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 import taichi as ti
+import taichi.math as tm
 from conftest import rotation_about
 from particle_tissue import tissue_of
 from slicing import organ_mask
@@ -11,7 +12,7 @@ from slicing import organ_mask
 from sim.body import BodyState
 from sim.embedding import Embedding, Unmoved, tetrahedra_around
 from sim.skinning import Skin
-from ultrasound.plane import PlaneInTissue
+from ultrasound.plane import ImagePlane, PlaneInTissue
 from ultrasound.probe import image_plane, pose_at
 from ultrasound.slice import Slice
 from ultrasound.volume import Volume, distance_volume
@@ -140,15 +141,58 @@ def test_the_picture_is_the_window(device, ball):
     assert np.abs(cut.render(350.0, 40.0) - wanted).max() <= 0.51
 
 
+def bent(x: np.ndarray) -> np.ndarray:
+    return x + 0.03 * x[:, [1, 2, 0]] ** 2
+
+
+# Of few pixels some that are drawn together are in the organ and others beyond all tissue; 20 are no multiple of those.
+@pytest.mark.parametrize("pixels, outside", [(96, "background"), (20, "gel")])
+def test_pixels_drawn_together_show_what_each_shows_alone(device, ball, pixels, outside):
+    cut, _, _, _ = sliced(ball, ramp_image(), bent, pixels, outside)
+    alone = np.zeros((pixels, pixels), np.float32)
+
+    @ti.kernel
+    def ask(pixel_mm: tm.vec2, first_mm: tm.vec2, alone: ti.types.ndarray(ti.f32, ndim=2)):
+        for row, column in ti.ndrange(pixels, pixels):
+            alone[row, column] = cut.ct.sample(cut.plane.rest_at(row, column, pixel_mm, first_mm))
+
+    ask(cut.plane.pixel_mm, cut.plane.first_mm, alone)
+    if outside == "gel":
+        alone[~organ_mask(cut)] = 0.0
+    # Places of 15 mm in float32 carry 1e-6 mm, maps ten times that; the ramp has 14 HU/mm.
+    assert np.abs(cut.hounsfield() - alone).max() < 14 * 1e-4
+
+
+def test_the_pixel_near_a_place_is_the_nearest(device):
+    plane = PlaneInTissue(Unmoved(), 24)
+    plane.take(ImagePlane(np.eye(4), 30.0, 18.0, 4.0))
+    places = np.random.default_rng(6).uniform([-20, -8], [20, 18], (300, 2)).astype(np.float32)
+    found = np.zeros((300, 2), np.int32)
+
+    @ti.kernel
+    def ask(
+        pixel_mm: tm.vec2,
+        first_mm: tm.vec2,
+        places: ti.types.ndarray(ti.f32, ndim=2),
+        found: ti.types.ndarray(ti.i32, ndim=2),
+    ):
+        for i in range(300):
+            at = tm.vec2(places[i, 0], places[i, 1])
+            found[i, 0], found[i, 1] = plane.pixel_near(at, pixel_mm, first_mm)
+
+    ask(plane.pixel_mm, plane.first_mm, places, found)
+    middles = (np.arange(24) + 0.5) / 24
+    u, v = middles * 30.0 - 15.0, middles * 18.0 - 4.0
+    assert np.array_equal(found[:, 0], np.abs(places[:, 1:] - v).argmin(axis=1))
+    assert np.array_equal(found[:, 1], np.abs(places[:, :1] - u).argmin(axis=1))
+
+
 def test_an_unknown_outside_is_refused(device, ball):
     with pytest.raises(ValueError, match="'water'.*background, gel, air"):
         sliced(ball, noisy_image(), outside="water")
 
 
 def test_every_pixel_finds_the_tetrahedron_that_holds_it(device, ball):
-    def bent(x):
-        return x + 0.03 * x[:, [1, 2, 0]] ** 2
-
     cut, plane, _, embedding = sliced(ball, ramp_image(), bent)
     vertices = embedding.skin.vertices.to_numpy().astype(float)
     corners = vertices[embedding.tetrahedron.to_numpy()]
@@ -163,6 +207,28 @@ def test_every_pixel_finds_the_tetrahedron_that_holds_it(device, ball):
             assert least.max() < 1e-4
         else:
             assert least[owner[row, column]] > -1e-4
+
+
+@pytest.mark.parametrize(
+    "direction, lateral", [((0, 0, -1), (1, 0, 0)), ((0, -1, -1), (1, 0, 0)), ((1, 1, 1), (1, -1, 0))]
+)
+def test_no_pixel_falls_between_tetrahedra_where_the_plane_goes_along_their_sides(
+    device, ball, direction, lateral
+):
+    embedding = Embedding(tissue_of(ball, RADIUS), ball, 2 * RADIUS)
+    vertices = embedding.skin.rest.to_numpy().astype(float)
+    centre = vertices[np.linalg.norm(vertices, axis=1).argmin()]
+    # Through a vertex amid the ball, with pixels on the edges: 4 mm are 8 of them.
+    pose = pose_at(np.zeros(3), np.array(direction, float), np.array(lateral, float), 20.0)
+    plane = PlaneInTissue(embedding, 33)
+    axes = image_plane(pose, 20.0, 16.5, 16.5).world_from_plane
+    for out in np.eye(3):
+        world = axes.copy()
+        # Each of the probe's axes in turn is square to the plane.
+        world[:3, :3] = np.roll(axes[:3, :3], int(out.argmax()), axis=1)
+        world[:3, 3] = centre - world[:3, :3] @ [0.0, 8.25, 0.0]
+        plane.take(ImagePlane(world, 16.5, 16.5))
+        assert (plane.owner.to_numpy() < embedding.count).all()
 
 
 def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(device, ball):

@@ -169,6 +169,19 @@ def test_pairs_give_the_same_bits_whatever_the_threads(ball, serial):
     ti.reset()
 
 
+@pytest.mark.parametrize("serial", [True, False])
+def test_the_tool_goes_along_its_poses_and_stays_where_it_came_to(device, block, serial):
+    tool = ConvexTool.cuboid(np.array([4.0, 4.0, 4.0]))
+    solver = solver_of(block, [tool], tool=tool, serial=serial)
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, :3, 3] = 30.0 + np.array([[0.0], [0.5], [1.5], [3.5]]) * [1.0, -2.0, 3.0]
+    for given, motion in ((poses, [2.0, -4.0, 6.0]), (None, [0.0] * 3)):
+        solver.step(StepSettings(substeps=3, iterations=1), given)
+        assert np.array_equal(tool.pose.to_numpy(), poses[-1].astype(np.float32))
+        # Back to where it was a substep before.
+        assert tool.step_back.to_numpy()[:3, 3] == pytest.approx(-np.array(motion), abs=1e-5)
+
+
 def test_sliding_over_a_curved_surface_does_not_sink_in(device, ball):
     solver = solver_of(ball, [bowl()], friction=0.0)
     radius = solver.body.contact_radius.to_numpy().astype(float)

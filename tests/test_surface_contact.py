@@ -7,8 +7,8 @@ import trimesh
 from lattice_tissue import DENSITY, YOUNG_KPA, G, jacobians, lifted, position, put, settings_of, tissue_of
 
 from sim.body import BodyState
-from sim.shapes import ConvexTool, Plane
-from sim.surface_contact import LAYER_MM, NEAR_MM, STICK
+from sim.shapes import ConvexTool, Plane, SignedDistanceField
+from sim.surface_contact import LAYER_MM, NEAR_MM, REACH_MM, STICK
 
 FRICTION = 0.35
 UP = np.array([0.0, 0.0, 1.0])
@@ -129,6 +129,17 @@ def test_a_shape_out_of_reach_exerts_nothing(device, block):
         assert (np.abs(contact_force(beside, settings_of(8))).max() > 0) == reaches
 
 
+def test_a_shape_whose_distances_end_is_met_by_what_came_from_beyond_them(device, dome):
+    table = trimesh.creation.box([40.0, 40.0, 10.0])
+    table.apply_translation([0.0, 0.0, -11.0])
+    solver = tissue_of(dome, 4.0, [SignedDistanceField.of_surface(table.vertices, table.faces, REACH_MM)])
+    # Its lowest points, at z = -6, are 15, then 1 mm above the table, whose distances are known 6 mm around it.
+    for above, is_near in ((15.0, False), (1.0, True), (15.0, False)):
+        put(solver.model, solver.body.rest_points + [0.0, 0.0, above])
+        solver.launch_start(0, 1e-3, 0.0, 0.0, 0.0, 0.0, 0)
+        assert (solver.contacts.near.to_numpy() > 0).any() == is_near
+
+
 def test_what_a_tool_holds_moves_with_it(device, dome):
     solver = pressed_dome(dome)
     press(solver, 2.0, settings_of(20, DOWN), 30)
@@ -145,6 +156,91 @@ def test_what_a_tool_holds_moves_with_it(device, dome):
     assert held.sum() > 3 and most[held].max() < aside / 2
     # They go the tool's way but for the bending of their sticks, at most friction times depth over STICK each way.
     assert (np.abs(moved - aside) < 2 * most)[held].all()
+
+
+@ti.kernel
+def ask(contacts: ti.template(), pushed: ti.template(), held: ti.template(), at: ti.template()):
+    """Forces, as rows 0, and stiffnesses of ``push`` at each node, and of ``hold`` of each point at a place."""
+    for i in pushed:
+        force, stiffness = contacts.push(i)
+        for row in ti.static(range(3)):
+            pushed[i][0, row] = force[row]
+            for column in ti.static(range(3)):
+                pushed[i][1 + row, column] = stiffness[row, column]
+    for q in held:
+        force, stiffness = contacts.hold(q, at[q], True)
+        for row in ti.static(range(3)):
+            held[q][0, row] = force[row]
+            for column in ti.static(range(3)):
+                held[q][1 + row, column] = stiffness[row, column]
+
+
+def layer_of(contacts, s: int, x: np.ndarray, shifted: np.ndarray, slid: np.ndarray):
+    """Force (p, 3) [uN] and stiffness (p, 3, 3) of shape s on points at x (p, 3) in float64, where its planes were shifted by so
+    much since they were found and points slid on it by ``slid`` (p, 3); which touch, and which of these slide.
+    """
+    plane, near = contacts.plane.to_numpy()[s].astype(float), (contacts.near.to_numpy() >> s & 1) == 1
+    normal, stick = plane[:, :3], contacts.stick.to_numpy()[s].astype(float) + slid
+    depth = np.where(near, np.maximum(plane[:, 3] - ((x - shifted) * normal).sum(axis=1), 0.0), 0.0)
+    stick -= (stick * normal).sum(axis=1, keepdims=True) * normal
+    share = np.minimum(FRICTION * depth / STICK / np.maximum(np.linalg.norm(stick, axis=1), 1e-12), 1.0)
+    layer = np.where(depth > 0, 1e3 * YOUNG_KPA / LAYER_MM * contacts.area.to_numpy(), 0.0)
+    force = layer[:, None] * (depth[:, None] * normal - STICK * share[:, None] * stick)
+    out = np.einsum("pi,pj->pij", normal, normal)
+    stiffness = layer[:, None, None] * (out + (STICK * share)[:, None, None] * (np.eye(3) - out))
+    return force, stiffness, depth > 0, (depth > 0) & (share < 1)
+
+
+def test_forces_and_stiffnesses_are_the_laws_of_the_layer(device, dome):
+    solver = pressed_dome(dome)
+    contacts, tool = solver.contacts, solver.tool
+    press(solver, 2.0, settings_of(20, DOWN), 30)
+    motion = np.array([0.02, -0.01, -0.03])
+    poses = np.array([lifted(20.0), lifted(20.0)])
+    poses[1, :3, 3] += motion
+    tool.move(*poses)
+    known = contacts.point.to_numpy().astype(float)
+    places = known + np.random.default_rng(9).normal(0, 0.02, known.shape)
+    at = ti.Vector.field(3, ti.f32, contacts.count)
+    at.from_numpy(places.astype(np.float32))
+    pushed, held = (ti.Matrix.field(4, 3, ti.f32, n) for n in (solver.body.count, contacts.count))
+    ask(contacts, pushed, held, at)
+    # Rounding of 1e-6 mm is a few thousandths of a percent of the deepest, and of the longest stick.
+    pushed, held = (each.to_numpy().astype(float) for each in (pushed, held))
+    ways = np.zeros(3), motion
+    laws = [layer_of(contacts, s, places, way, places - known - way) for s, way in enumerate(ways)]
+    assert all(law[2].sum() > 5 for law in laws) and 3 < sum(law[3].sum() for law in laws) < 100
+    wanted = np.concatenate([sum(law[0] for law in laws)[:, None], sum(law[1] for law in laws)], axis=1)
+    assert (np.abs(held - wanted).max(axis=(0, 2)) < 1e-3 * np.abs(wanted).max(axis=(0, 2))).all()
+    # At the nodes: of points where they are, on planes that were found where the shapes are.
+    start = contacts.start.to_numpy().astype(float)
+    laws = [layer_of(contacts, s, known, np.zeros(3), known - start - way) for s, way in enumerate(ways)]
+    weight, node = contacts.weight.to_numpy().astype(float), contacts.node.to_numpy()
+    wanted = np.zeros_like(pushed)
+    for law in laws:
+        np.add.at(wanted[:, 0], node, weight[..., None] * law[0][:, None])
+        np.add.at(wanted[:, 1:], node, (weight**2)[..., None, None] * law[1][:, None])
+    assert (np.abs(pushed - wanted).max(axis=(0, 2)) < 1e-3 * np.abs(wanted).max(axis=(0, 2))).all()
+
+
+def test_points_are_where_their_nodes_carry_them_whatever_was_over_relaxed(device, dome):
+    solver = pressed_dome(dome)
+    press(solver, 2.0, settings_of(4, DOWN), 5)
+    contacts = solver.contacts
+    carried = np.einsum("pk,pkd->pd", contacts.weight.to_numpy(), position(solver)[contacts.node.to_numpy()])
+    # A pass adds eight changes to a point, each with its rounding.
+    assert np.abs(contacts.point.to_numpy() - carried).max() < 4 * 8 * ULP_MM
+
+
+def test_what_lets_go_forgets_how_it_was_bent(device, dome):
+    solver = pressed_dome(dome)
+    press(solver, 2.0, settings_of(20, DOWN), 30)
+    poses = np.array([lifted(20.0), lifted(20.0)])
+    poses[1, 0, 3] = 0.1
+    solver.step(settings_of(20, DOWN), poses)
+    assert (np.linalg.norm(solver.contacts.stick.to_numpy()[1], axis=1) > 1e-3).sum() > 3
+    rest(solver, 2, settings_of(20, DOWN), AWAY)
+    assert (solver.contacts.stick.to_numpy()[1] == 0).all()
 
 
 def beads(solver, x: np.ndarray) -> np.ndarray:

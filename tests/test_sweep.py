@@ -211,6 +211,7 @@ def test_every_orientation_becomes_mf(tmp_path, orientation):
     )
     sweep = read_sweep(source)
     assert np.array_equal(sweep.images, [upright])
+    assert ORIENTATIONS[sweep.fields["UltrasoundImageOrientation"]] == "MF"
     write_sweep(tmp_path / "out.igs.mha", sweep)
     again = read_sweep(tmp_path / "out.igs.mha")
     assert np.array_equal(again.images, [upright])

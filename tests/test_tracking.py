@@ -60,6 +60,14 @@ def test_noise_turns_the_probe_about_its_own_origin():
     assert np.linalg.norm(turns_deg(found, poses), axis=1).min() > 0
 
 
+def test_noise_turns_about_the_probes_own_axes_whatever_its_pose():
+    poses, times = sweep(50)
+    upright = np.tile(np.eye(4), (50, 1, 1))
+    errors = TrackingErrors(noise_deg=3.0)
+    turns = [turns_deg(np.array(tracked(way, times, errors)), way) for way in (poses, upright)]
+    np.testing.assert_allclose(*turns, atol=1e-9)
+
+
 def test_calibration_is_one_shift_and_turn_of_the_image_against_the_probe():
     poses, _ = sweep()
     found = reported(TrackingErrors(calibration_mm=2.5, calibration_deg=4.0))
