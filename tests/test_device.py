@@ -9,7 +9,7 @@ import pytest
 import taichi as ti
 
 import sim.device
-from sim.device import start
+from sim.device import NoDevice, start
 
 
 def test_compiled_kernels_of_many_patients_are_kept(device):
@@ -53,6 +53,15 @@ def test_a_driver_that_is_missing_is_one_refusal_and_prints_nothing():
     )
     *above, last = done.stderr.splitlines()
     assert "no vulkan device or driver; use --arch cpu" in last and not any("RHI" in line for line in above)
+
+
+def test_a_driver_that_computes_wrongly_is_refused(device, monkeypatch):
+    assert sim.device.counts_right()
+    monkeypatch.setattr("sim.device._count", lambda count, least: None)
+    assert not sim.device.counts_right()
+    # Where there is no driver at all, that is the refusal.
+    with pytest.raises(NoDevice, match="computes wrongly|no vulkan device"):
+        start("vulkan")
 
 
 def test_a_field_is_made_without_the_stack_being_written_down(device, monkeypatch):
