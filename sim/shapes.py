@@ -13,7 +13,7 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from sim.distance import distance_grid
+from sim.distance_grid import distance_grid
 from sim.fields import field_of
 
 FAR = 1e6

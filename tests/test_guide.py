@@ -264,7 +264,7 @@ def watching(monkeypatch, rehearsal) -> Instruments:
     return Instruments(rehearsal, Guide(rehearsal, plan_of(sweep_of(FIRST, SECOND), margin_mm=8.0)))
 
 
-def test_the_instruments_watch_the_guide_and_record_it(watching, rehearsal):
+def test_the_instruments_watch_the_guide_and_record_it(watching, rehearsal, device):
     noted: list[dict] = []
     session = SimpleNamespace(moment=0, note=lambda name, figures: noted.append(figures))
     for pose in FIRST:
@@ -281,7 +281,7 @@ def test_the_instruments_watch_the_guide_and_record_it(watching, rehearsal):
     assert watching.onto(view, Settings()).guidance is None and "plan_followed" not in watching.figures()
 
 
-def test_another_plan_brings_its_margin_and_what_was_seen_stays(watching, rehearsal):
+def test_another_plan_brings_its_margin_and_what_was_seen_stays(watching, rehearsal, device):
     volume = watching.coverage.targets["margin"].sum()
     watching.coverage.seen[watching.coverage.targets["tumour"]] = True
     before = watching.coverage

@@ -12,7 +12,8 @@ import numpy as np
 import trimesh
 from scipy.ndimage import distance_transform_edt, label, map_coordinates
 
-from sim.distance import distance_grid, signed_distance
+from sim.distance import signed_distance
+from sim.distance_grid import distance_grid
 from ultrasound.array import Probe
 
 VOXEL_MM = 1.5

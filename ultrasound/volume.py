@@ -5,7 +5,7 @@ import taichi as ti
 import taichi.math as tm
 import trimesh
 
-from sim.distance import distance_grid
+from sim.distance_grid import distance_grid
 from sim.fields import field_of
 from ultrasound.plane import LANES, Lanes
 

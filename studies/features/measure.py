@@ -15,7 +15,7 @@ from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Contact, Scene, SolverSection, with_options
 from scenes.tissue import TISSUES, ShapeMatchingTissue, TissueSection
 from sim.device import start
-from sim.distance import distance_grid
+from sim.distance_grid import distance_grid
 from sim.embedding import Embedding
 from sim.shape_matching import fill
 from sim.shapes import GRID_MM, ConvexTool, SignedDistanceField

@@ -5,7 +5,7 @@ import copy
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from sim.distance import distance_grid
+from sim.distance_grid import distance_grid
 from sim.skinning import Skin
 from studies.plan.parts import Parts, incidence_deg, path_mm
 from studies.plan.reach import Reach
