@@ -18,7 +18,7 @@ from studies.scan.poses import PoseError
 from studies.session.file import SessionError
 from studies.setup import SetupError
 from ultrasound.acoustics import TissueError
-from ultrasound.array import ProbeError
+from ultrasound.probe import ProbeError
 from ultrasound.sweep import SweepError
 from version import VERSION
 

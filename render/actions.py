@@ -1,7 +1,7 @@
 """What the actions of the key map do to the controls and settings, by whichever key or button they come."""
 
 from render.viewer import KEY_MAP, Controls
-from ultrasound.array import MODES, RUNGS
+from ultrasound.probe import MODES, RUNGS
 from ultrasound.target import TARGETS
 
 PUSH_MM_S, ROLL_DEG_S, TILT_DEG_S = 15.0, 45.0, 30.0

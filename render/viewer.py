@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ultrasound.array import Mode, Rung
+from ultrasound.probe import Mode, Rung
 from ultrasound.target import Target
 
 ECHO, TGC = "Echo", "Gain over depth"

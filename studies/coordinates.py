@@ -3,7 +3,7 @@
 import numpy as np
 
 from studies.rehearsal import Rehearsal
-from ultrasound.probe import held_at, image_plane
+from ultrasound.hand import held_at, image_plane
 
 
 def probe_in_patient(rehearsal: Rehearsal, pose: np.ndarray | None = None) -> np.ndarray:

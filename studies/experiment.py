@@ -17,7 +17,7 @@ from studies.models import build_solver, static_shape, step_settings
 from studies.setup import Setup, SetupError
 from studies.stopwatch import timed
 from studies.surfaces import moved_by
-from ultrasound.probe import between
+from ultrasound.hand import between
 
 # The share of a stage's steps in which the probe moves; in the others the tissue comes to rest, as it did for the scan.
 MOVING = 2 / 3

@@ -14,7 +14,7 @@ from sim.neighbours import ParticleContacts
 from sim.shapes import ConvexTool, SignedDistanceField
 from sim.solver import Solver, StepSettings
 from sim.tissue import Held, Parts, TissueModel
-from ultrasound.array import Probe
+from ultrasound.probe import Probe
 
 # Flats that stand for the arc of a curved array: of 60 mm and 60 degrees, they are nowhere 0.1 mm off it.
 ARC_FLATS = 11

@@ -7,8 +7,8 @@ import igl
 import numpy as np
 
 from studies.rehearsal import Rehearsal
-from ultrasound.array import Probe
 from ultrasound.face import face_points, pressing
+from ultrasound.probe import Probe
 
 
 @dataclass(frozen=True)

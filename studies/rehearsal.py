@@ -22,10 +22,7 @@ from sim.tissue import Held, MaterialModel
 from studies.models import build_solver, embedding_cell_mm, static_shape, step_settings, tool_of
 from studies.setup import probe_of
 from studies.surfaces import moved_by, volume_mm3
-from ultrasound.array import Mode, Probe, Rung
-from ultrasound.outline import section
-from ultrasound.plane import ImagePlane
-from ultrasound.probe import (
+from ultrasound.hand import (
     Grip,
     Hand,
     advanced,
@@ -36,6 +33,9 @@ from ultrasound.probe import (
     pose_at,
     touching,
 )
+from ultrasound.outline import section
+from ultrasound.plane import ImagePlane
+from ultrasound.probe import Mode, Probe, Rung
 from ultrasound.scanner import Anatomy, Scanner
 
 TURN_DEG_S = 180.0

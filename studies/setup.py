@@ -7,7 +7,7 @@ from typing import Any
 
 from scenes.scene import OPTIONS, Scene, with_options
 from scenes.tissue import QUALITIES, TISSUES
-from ultrasound.array import Probe, load_probe
+from ultrasound.probe import Probe, load_probe
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from scenes.trocar import Trocar
 from studies.plan.file import Plan, Sweep
 from studies.plan.parts import Parts
 from studies.plan.way import Layout, layout_towards
-from ultrasound.array import load_probe
-from ultrasound.probe import Hand, image_plane, pose_at
+from ultrasound.hand import Hand, image_plane, pose_at
+from ultrasound.probe import load_probe
 
 R = 30.0
 SIZE = np.array([16.0, 9.0, 20.0])

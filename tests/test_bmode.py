@@ -13,11 +13,11 @@ from skimage.registration import phase_cross_correlation
 from sim.body import BodyState
 from sim.device import start
 from sim.embedding import Embedding, Unmoved
-from ultrasound.array import Probe
 from ultrasound.bmode import BMode
+from ultrasound.hand import image_plane, pose_at
 from ultrasound.plane import PlaneInTissue
 from ultrasound.point_spread import MOST_LINES, axial_sd_mm, elevation_sd_mm, lateral_sd_mm
-from ultrasound.probe import image_plane, pose_at
+from ultrasound.probe import Probe
 from ultrasound.volume import Volume
 
 LINES, SAMPLES, PIXELS = 192, 640, 256

@@ -5,8 +5,8 @@ import pytest
 import trimesh
 from conftest import rotation_about
 
-from ultrasound.array import load_probe
 from ultrasound.coverage import PLACES, VOXEL_MM, Coverage
+from ultrasound.probe import load_probe
 
 pytestmark = pytest.mark.usefixtures("one_device")
 

@@ -12,8 +12,8 @@ import pydicom
 import pytest
 import SimpleITK as sitk
 
-from ultrasound.array import Probe, load_probe
 from ultrasound.dicom_image import save_dicom
+from ultrasound.probe import Probe, load_probe
 from version import VERSION
 
 # Not square, an odd number of bytes, and spacings that no decimal string holds whole.

@@ -21,7 +21,7 @@ from scenes.trocar import Trocar
 from studies.plan.file import Plan, Sweep
 from studies.scan.poses import load_poses, load_timed_poses
 from studies.session.file import End, Event, Header, Second
-from ultrasound.array import Probe
+from ultrasound.probe import Probe
 
 DOCS = ROOT / "docs"
 PAGES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))

@@ -18,8 +18,8 @@ from studies.readings import Reading
 from studies.rehearse import instruments
 from studies.rehearse.guide import ABOVE_MM, AHEAD, DEG_BESIDE_A_MM, NEAR_MM, Guide
 from studies.rehearse.instruments import Instruments
-from ultrasound.array import load_probe
-from ultrasound.probe import advanced
+from ultrasound.hand import advanced
+from ultrasound.probe import load_probe
 from ultrasound.target import TARGETS
 
 FIRST, SECOND = straight_pass(4, step_mm=2.0), straight_pass(3, 20.0, 2.0)

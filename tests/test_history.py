@@ -19,7 +19,7 @@ from studies.rehearse.live import Live
 from studies.session.history import MOST_UNDONE, History
 from studies.session.session import SETTLED, Session
 from studies.trade.ladder import Ladder
-from ultrasound.probe import Hand, approached, pose_at, touching
+from ultrasound.hand import Hand, approached, pose_at, touching
 
 # A power of two, so that times are exact: 4 steps are PAUSE_S, 40 are LONGEST_S.
 STEP_S = 1 / 8

@@ -19,7 +19,7 @@ from studies.link.hand import HAND, STALE_S
 from studies.link.live import send_live
 from studies.link.messages import IMAGE, IMAGE_TO_PROBE, PROBE, LivePicture, packed
 from studies.link.server import Server
-from ultrasound.array import Probe, load_probe
+from ultrasound.probe import Probe, load_probe
 
 # One of 3 x 5 pixels is 277 bytes.
 ROWS, COLUMNS = 3, 5

@@ -14,7 +14,7 @@ from render.window import NoVulkan
 from studies.rehearse import command, headless, loop, run
 from studies.rehearse.loop import Loop
 from studies.rehearse.view import probe_as_set
-from ultrasound.array import load_probe
+from ultrasound.probe import load_probe
 
 STEP_S = 0.25
 

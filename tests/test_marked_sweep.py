@@ -27,9 +27,9 @@ from studies.freehand.rebuild import track_of
 from studies.freehand.unsqueeze import Unsqueezed
 from studies.rehearse.sweeping import Sweeping
 from ultrasound import reconstruction
-from ultrasound.array import load_probe
+from ultrasound.hand import held_at, image_plane, pose_at
 from ultrasound.marked_sweep import MARKS, SUFFIX, MarkedSweep, marks_beside
-from ultrasound.probe import held_at, image_plane, pose_at
+from ultrasound.probe import load_probe
 from ultrasound.sweep import Mark, SweepError
 from ultrasound.sweep_file import read_sweep, write_sweep
 from version import VERSION

@@ -9,10 +9,10 @@ from conftest import rotation_about
 
 from sim.embedding import Unmoved
 from studies.coordinates import probe_in_patient
-from ultrasound.array import load_probe
+from ultrasound.hand import image_plane, pose_at
 from ultrasound.marks import Marks
 from ultrasound.plane import ImagePlane, PlaneInTissue
-from ultrasound.probe import image_plane, pose_at
+from ultrasound.probe import load_probe
 from ultrasound.scanner import Anatomy, Scanner
 from ultrasound.sweep import Mark
 from ultrasound.volume import distance_volume

@@ -6,8 +6,8 @@ import trimesh
 from conftest import rotation_about
 from scipy.spatial.distance import cdist
 
+from ultrasound.hand import image_plane, pose_at
 from ultrasound.outline import section
-from ultrasound.probe import image_plane, pose_at
 
 RADIUS = 12.0
 

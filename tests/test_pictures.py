@@ -20,10 +20,10 @@ from render.viewer import Geometry, Settings, View
 from sim.device import start
 from sim.embedding import Embedding
 from sim.skinning import Skin
-from ultrasound.array import Probe
+from ultrasound.hand import held_at, image_plane, pose_at
 from ultrasound.outline import section
 from ultrasound.plane import ImagePlane
-from ultrasound.probe import held_at, image_plane, pose_at
+from ultrasound.probe import Probe
 from ultrasound.scanner import CT, ECHO, Anatomy, Scanner
 
 STORED = Path(__file__).parent / "pictures"

@@ -13,7 +13,7 @@ from studies.plan.parts import Parts, faces_of, incidence_deg, path_mm
 from studies.plan.reach import NEAR_MM, Reach
 from studies.plan.score import POINTS, SAID, in_words, points, score, why
 from studies.plan.way import STEP_DEG, STEP_MM, Layout, Way, fanned, gliding, layout_towards, rocking
-from ultrasound.probe import Hand, advanced, pose_at
+from ultrasound.hand import Hand, advanced, pose_at
 
 
 @pytest.fixture(scope="module")

@@ -25,8 +25,8 @@ from studies.plan.candidate import (
 )
 from studies.plan.file import MOST_SWEEPS
 from studies.plan.way import layout_towards
-from ultrasound.array import load_probe
 from ultrasound.coverage import VOXEL_MM, Coverage
+from ultrasound.probe import load_probe
 
 pytestmark = pytest.mark.usefixtures("one_device")
 

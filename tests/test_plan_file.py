@@ -17,7 +17,7 @@ from studies.plan.file import PlanError, is_plan, next_free, read_plan, write_pl
 from studies.plan.track import COMES_S, LIFT_MM, LIFTED_MM_S, timed_poses
 from studies.rehearse.command import check_plan
 from studies.rehearse.track_file import load_track
-from ultrasound.array import load_probe
+from ultrasound.probe import load_probe
 
 BALL = """
 [anatomy]

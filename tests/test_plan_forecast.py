@@ -11,9 +11,9 @@ from studies.plan import forecast
 from studies.plan.forecast import Forecast
 from studies.plan.parts import Parts
 from studies.plan.way import Way, fanned
-from ultrasound.array import load_probe
 from ultrasound.coverage import VOXEL_MM, Coverage
-from ultrasound.probe import pose_at
+from ultrasound.hand import pose_at
+from ultrasound.probe import load_probe
 
 pytestmark = pytest.mark.usefixtures("one_device")
 

@@ -19,7 +19,7 @@ from studies.plan.file import Plan, read_plan
 from studies.plan.trial import Trial
 from studies.plan.way import Way, gliding, layout_towards
 from studies.rehearse import headless
-from ultrasound.probe import advanced, indentation
+from ultrasound.hand import advanced, indentation
 from version import VERSION
 
 R = 25.0

@@ -26,7 +26,7 @@ from studies.plan.score import score
 from studies.plan.search import FIRST, TRIAL_MM_S, ranked, search
 from studies.plan.study_command import table
 from studies.plan.workers import Outcome, Problem, SearchSpace, Workers, _trial, workers
-from ultrasound.array import load_probe
+from ultrasound.probe import load_probe
 
 BEST = dict(a_mm=-3.0, b_mm=7.0, c_deg=20.0)
 RANGES = dict(a_mm=Quantity(-10, 10, 0), b_mm=Quantity(0, 8, 2), c_deg=Quantity(-45, 45, -30))

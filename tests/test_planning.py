@@ -15,7 +15,7 @@ from studies.rehearse import planning
 from studies.rehearse.guide import Guide
 from studies.rehearse.planning import TRIALS, Plans
 from studies.rehearse.view import probe_as_set
-from ultrasound.array import load_probe
+from ultrasound.probe import load_probe
 
 LONGEST_S = 10.0
 PROBE = load_probe("drop-in")

@@ -6,8 +6,8 @@ import taichi as ti
 from test_bmode import LINES, flat_tank, probe_of
 
 from sim.device import start
-from ultrasound.array import Probe
 from ultrasound.point_spread import MOST_LINES, REACH_SD, axial_sd_mm, lateral_sd_mm, lateral_weights
+from ultrasound.probe import Probe
 
 GEOMETRIES = {
     "LINEAR": {"transducer_width_mm": 40.0},

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from studies.readings import read
-from ultrasound.array import load_probe
+from ultrasound.probe import load_probe
 
 LINEAR, CURVED = load_probe("linear"), load_probe("curvilinear")
 NOWHERE = np.zeros((0, 2, 2))

@@ -20,7 +20,7 @@ from sim.device import start
 from sim.distance import signed_distance
 from sim.skinning import Skin
 from studies.rehearsal import Rehearsal
-from ultrasound.probe import image_plane
+from ultrasound.hand import image_plane
 
 LOOK = ("both", "speckle", 350, 40)
 LOOK_AT_CT = ("ct", "speckle", 350, 40)

@@ -13,7 +13,7 @@ from scenes.anatomy import phantom_folder
 from scenes.scene import EMBEDDED
 from scenes.surface_files import load_surface
 from studies.scan.poses import PoseError, TimedPoses, load_poses, load_timed_poses
-from ultrasound.array import load_probe
+from ultrasound.probe import load_probe
 from version import VERSION
 
 

@@ -7,9 +7,9 @@ from conftest import rotation_about
 
 from sim.embedding import Unmoved
 from ultrasound.acoustics import CORTEX_DB
-from ultrasound.array import Probe
+from ultrasound.hand import image_plane, pose_at
 from ultrasound.plane import ImagePlane
-from ultrasound.probe import image_plane, pose_at
+from ultrasound.probe import Probe
 from ultrasound.scanner import CT, Anatomy, Scanner
 
 PIXELS, RADIUS, REACH = 64, 12.0, 20.0

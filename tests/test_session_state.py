@@ -15,7 +15,7 @@ from studies.session import state
 from studies.session.state import StateError, from_text, to_text
 from studies.session.summary import Course, in_words
 from ultrasound.coverage import Gap
-from ultrasound.probe import Grip
+from ultrasound.hand import Grip
 
 
 def arrays_of(state: Any) -> list[np.ndarray]:

@@ -12,8 +12,8 @@ from slicing import organ_mask
 from sim.body import BodyState
 from sim.embedding import Embedding, Unmoved, tetrahedra_around
 from sim.skinning import Skin
+from ultrasound.hand import image_plane, pose_at
 from ultrasound.plane import ImagePlane, PlaneInTissue
-from ultrasound.probe import image_plane, pose_at
 from ultrasound.slice import Slice
 from ultrasound.volume import Volume, distance_volume
 

@@ -13,7 +13,7 @@ from studies.rigid_fit import apart_after_fit
 from studies.stability import bodies, command, measure
 from studies.stability.cases import MODELS, Case, Subject, cases_of, quick_cases_of
 from studies.stability.motion import PROBES, STATES
-from ultrasound.probe import advanced
+from ultrasound.hand import advanced
 
 ONE = Subject("one")
 

@@ -21,7 +21,7 @@ from studies.session.recorded import Recorded
 from studies.session.replay import Replay
 from studies.session.session import Session
 from studies.trade.ladder import Ladder
-from ultrasound.probe import image_plane
+from ultrasound.hand import image_plane
 from ultrasound.sweep import SweepError
 from ultrasound.sweep_file import SweepWriter
 

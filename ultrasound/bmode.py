@@ -11,10 +11,10 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.fields import fill
-from ultrasound.array import RUNGS, Probe, Rung
 from ultrasound.beam import DB, Beams
 from ultrasound.plane import Picture, PlaneInTissue
 from ultrasound.point_spread import MOST_LINES, axial_sd_mm, elevation_sd_mm, lateral_weights
+from ultrasound.probe import RUNGS, Probe, Rung
 from ultrasound.volume import Volume
 
 # A probe's samples are a multiple of this.

@@ -14,7 +14,7 @@ from scipy.ndimage import distance_transform_edt, label, map_coordinates
 
 from sim.distance import signed_distance
 from sim.distance_grid import distance_grid
-from ultrasound.array import Probe
+from ultrasound.probe import Probe
 
 VOXEL_MM = 1.5
 # Distances from the organ are known so far around it.

@@ -8,7 +8,7 @@ from pydicom.dataset import FileMetaDataset
 from pydicom.uid import ExplicitVRLittleEndian, UltrasoundImageStorage, generate_uid
 from pydicom.valuerep import DS
 
-from ultrasound.array import Probe
+from ultrasound.probe import Probe
 from version import VERSION
 
 # What the standard wants present though it is unknown (its type 2).

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ultrasound.probe import sagitta
+from ultrasound.hand import sagitta
 
 SPACING_MM = 0.75
 # Nearer to the face than this the surface touches; so far through it contacts let none.

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ultrasound.array import Probe
+from ultrasound.probe import Probe
 from ultrasound.sweep import Sweep, SweepError
 from ultrasound.sweep_file import SweepWriter, read_sweep
 from version import VERSION

@@ -6,7 +6,7 @@ sl(z) = sf sqrt(1 + ((z - zf) / zR)^2), with sf from the f-number (full width at
 
 import numpy as np
 
-from ultrasound.array import FWHM_OF_SD, Probe
+from ultrasound.probe import FWHM_OF_SD, Probe
 
 # Where the kernel across the lines ends, in standard deviations and in lines.
 REACH_SD, MOST_LINES = 2.5, 24

@@ -1,239 +1,225 @@
-"""The transducer: its pose, and how a hand moves it over the organ.
+"""The array of a probe and the scanner's settings: probe files, scanlines, and the way back from a pixel to its line.
 
-A pose is a rigid (4, 4) matrix, world from transducer [mm]. The transducer is a cuboid about its origin: x lateral
-to the marked side, y elevation, z along its axis; the image leaves its face at z = -length / 2 along -z.
+A probe file is TOML with PLUS's names (TransducerGeometry, DepthMm, FrequencyMhz, ...), each with its unit. Places on the image
+plane are (u, v) [mm]: u to the marked side, v down into the tissue, the origin at the middle of the array's face.
 """
 
-from dataclasses import dataclass, field
+import difflib
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal, get_args
 
-import igl
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic.alias_generators import to_pascal
 
-from ultrasound.plane import ImagePlane
+PROBES = Path(__file__).parent / "probes"
+SOUND_MM_US = 1.54
+FWHM_OF_SD = float(np.sqrt(8 * np.log(2)))
+GAIN_RANGE_DB, TGC_RANGE_DB, TGC_SLIDERS = 60.0, 24.0, 8
 
-# How wide a patch of surface the probe's axis is perpendicular to, as a hand would hold it.
-NORMAL_PATCH_MM = 12.0
-LEAST_DEPTH_MM, MOST_DEPTH_MM = -40.0, 15.0
-# How deep a hand presses, in lengths of the transducer: what holds it must stay out of the tissue.
-MOST_LENGTHS = 1.5
-PRESS_MM_S, RELEASE_MM_S = 12.0, 40.0
+Mode = Literal["both", "b-mode", "ct"]
+MODES: tuple[Mode, ...] = get_args(Mode)
+# The echo's ladder of realism: reflection and attenuation; and speckle and point spread; and the thickness of the plane.
+Rung = Literal["reflection", "speckle", "elevation"]
+RUNGS: tuple[Rung, ...] = get_args(Rung)
 
-
-def pose_at(
-    face_centre: np.ndarray, direction: np.ndarray, lateral: np.ndarray, length_mm: float
-) -> np.ndarray:
-    """Pose whose face is centred at a point [mm] and looks along ``direction``; x is nearest to ``lateral``."""
-    z = -np.asarray(direction, float) / np.linalg.norm(direction)
-    x = np.asarray(lateral, float) - np.dot(lateral, z) * z
-    if np.linalg.norm(x) < 1e-6:
-        across = np.eye(3)[np.argmin(np.abs(z))]
-        x = across - np.dot(across, z) * z
-    x /= np.linalg.norm(x)
-    return rigid(np.column_stack([x, np.cross(z, x), z]), np.asarray(face_centre, float) + length_mm / 2 * z)
+Percent = Annotated[float, Field(ge=0, le=100)]
 
 
-def rigid(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Matrices (..., 4, 4) of rotations (..., 3, 3) and positions (..., 3)."""
-    matrix = np.zeros((*position.shape[:-1], 4, 4))
-    matrix[..., :3, :3], matrix[..., :3, 3], matrix[..., 3, 3] = rotation, position, 1.0
-    return matrix
+class ProbeError(ValueError):
+    """A probe file that cannot be used; the message is one line."""
 
 
-def image_plane(
-    pose: np.ndarray, length_mm: float, width_mm: float, depth_mm: float, above_mm: float = 0.0
-) -> ImagePlane:
-    """The plane under the transducer's face: x to the marked side, y down into the tissue, origin at the face."""
-    return ImagePlane(pose @ _face(length_mm), width_mm, depth_mm, above_mm)
+class Probe(BaseModel):
+    """One probe with the scanner's settings, as its file has them in PLUS's spelling (``frequency_mhz`` is FrequencyMhz).
 
+    ``housing_mm`` is the cuboid that touches: lateral x elevation x length, its edges rounded by ``edge_radius_mm``: sharp ones
+    plough through tissue that they are led over. ``elevation_width_mm`` is the thickness of the image
+    plane, and ``focal_zone_mm`` how far from the focus the beam is wider by sqrt(2). ``depth_compensation_db_cm_mhz`` is the
+    gain over depth that the scanner adds by itself, to which the sliders of ``time_gain_compensation`` [%] come.
+    """
 
-def held_at(world_from_plane: np.ndarray, length_mm: float) -> np.ndarray:
-    """The pose of a transducer whose image plane (4, 4) is there: PLUS's axes of a probe are the plane's."""
-    return world_from_plane @ np.linalg.inv(_face(length_mm))
-
-
-def _face(length_mm: float) -> np.ndarray:
-    """The image plane's axes in the transducer's."""
-    return np.array(
-        [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, -length_mm / 2], [0.0, 0.0, 0.0, 1.0]]
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, alias_generator=to_pascal, populate_by_name=True
     )
 
+    transducer_name: str = Field(min_length=1, max_length=60)
+    transducer_geometry: Literal["LINEAR", "CURVILINEAR", "PHASED"] = "LINEAR"
+    housing_mm: tuple[float, float, float] = (40.0, 10.0, 20.0)
+    edge_radius_mm: float = Field(0.0, ge=0, le=20)
+    transducer_width_mm: float = Field(40.0, gt=0, le=300)
+    radius_start_mm: float = Field(0.0, ge=0, le=300)
+    theta_start_deg: float = Field(0.0, ge=-80, le=0)
+    theta_stop_deg: float = Field(0.0, ge=0, le=80)
+    number_of_scanlines: int = Field(192, ge=8, le=1024)
+    number_of_samples_per_scanline: int = Field(640, ge=32, le=4096, multiple_of=16)
+    frequency_range_mhz: tuple[float, float] = (2.0, 15.0)
+    frequency_mhz: float = Field(7.5, ge=1, le=40)
+    depth_mm: float = Field(60.0, ge=5, le=300)
+    focus_depth_percent: Percent = 40.0
+    f_number: float = Field(2.5, ge=0.5, le=20)
+    focal_zone_mm: float = Field(15.0, gt=0, le=300)
+    elevation_width_mm: float = Field(2.0, gt=0, le=20)
+    pulse_cycles: float = Field(2.0, ge=1, le=20)
+    gain_percent: Percent = 56.0
+    dyn_range_db: float = Field(60.0, ge=20, le=120)
+    time_gain_compensation: tuple[Percent, ...] = (50.0,) * TGC_SLIDERS
+    depth_compensation_db_cm_mhz: float = Field(0.85, ge=0, le=5)
 
-def indentation(pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray, radius_mm: float = 0.0) -> float:
-    """How deep the transducer's face is below the highest point (n, 3) of the settled surface under it [mm].
-
-    Negative above the surface; -inf where the transducer's footprint misses it. The face is flat, or an arc of a radius.
-    """
-    local = (surface - pose[:3, 3]) @ pose[:3, :3]
-    half = np.asarray(size_mm) / 2
-    under = (np.abs(local[:, :2]) <= half[:2]).all(axis=1)
-    behind = sagitta(local[under, 0], radius_mm)
-    return float((local[under, 2] + half[2] - behind).max()) if under.any() else -np.inf
-
-
-def sagitta(x_mm: np.ndarray, radius_mm: float) -> np.ndarray:
-    """How far a face of a radius (0: flat) lies behind its middle, at lateral places [mm]."""
-    if radius_mm == 0:
-        return np.zeros_like(x_mm)
-    return radius_mm - np.sqrt(np.maximum(radius_mm**2 - x_mm**2, 0.0))
-
-
-def touching(
-    pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray, radius_mm: float = 0.0
-) -> np.ndarray:
-    """The pose moved along its axis to where it just touches the settled surface (n, 3)."""
-    depth = indentation(pose, size_mm, surface, radius_mm)
-    return advanced(pose, -depth) if np.isfinite(depth) else pose.copy()
-
-
-def advanced(pose: np.ndarray, depth_mm: float) -> np.ndarray:
-    """The pose moved by a depth along the way it looks [mm]."""
-    moved = pose.copy()
-    moved[:3, 3] -= depth_mm * pose[:3, 2]
-    return moved
-
-
-def between(start: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
-    """Poses (count + 1, 4, 4) evenly from start to end, as ``interpolated``."""
-    return interpolated(start, end, np.linspace(0.0, 1.0, count + 1))
-
-
-def approached(pose: np.ndarray, goal: np.ndarray, most_mm: float, most_deg: float) -> np.ndarray:
-    """The pose moved towards a goal by at most a distance [mm] and an angle [degrees]."""
-    way = float(np.linalg.norm(goal[:3, 3] - pose[:3, 3]))
-    turn = np.degrees(Rotation.from_matrix(goal[:3, :3] @ pose[:3, :3].T).magnitude())
-    share = min(1.0, most_mm / max(way, 1e-9), most_deg / max(turn, 1e-9))
-    return goal.copy() if share >= 1.0 else interpolated(pose, goal, share)
-
-
-def interpolated(start: np.ndarray, end: np.ndarray, share: float | np.ndarray) -> np.ndarray:
-    """The pose (4, 4), or poses (n, 4, 4), at a share (0 to 1), or shares (n,), of the way from start to end.
-
-    It is straight in position, and the short way round in angle.
-    """
-    turns = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([start[:3, :3], end[:3, :3]])))
-    way = np.asarray(share)[..., None] * (end[:3, 3] - start[:3, 3])
-    return rigid(turns(share).as_matrix(), start[:3, 3] + way)
-
-
-@dataclass(frozen=True)
-class Grip:
-    """What of a hand changes: how deep it presses [mm], how it is turned (3,) [degrees], where it aims (4, 4), home where None."""
-
-    depth_mm: float = 0.0
-    pressed_mm: float = 0.0
-    turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    aim: np.ndarray | None = None
-
-
-@dataclass
-class Hand:
-    """What holds the transducer: where on the settled organ it aims, how it is turned, how deep it presses.
-
-    ``vertices`` (n, 3), ``faces`` (m, 3) and ``normals`` (n, 3) are the settled surface [mm]; ``home`` is the pose it
-    starts from. ``radius_mm`` is that of a curved face. ``depth_mm`` is what keys push, ``pressed_mm`` what a held button
-    adds until it is let go.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    normals: np.ndarray
-    size_mm: np.ndarray
-    home: np.ndarray
-    lateral: np.ndarray
-    radius_mm: float = 0.0
-    depth_mm: float = 0.0
-    pressed_mm: float = 0.0
-    turn_deg: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    aim: np.ndarray | None = None
-
-    def __post_init__(self) -> None:
-        # The transducer's corners find their way between the vertices: edges and faces count too.
-        corners = self.vertices[self.faces]
-        middles = (corners + np.roll(corners, 1, axis=1)).reshape(-1, 3) / 2
-        self.samples = np.concatenate([self.vertices, corners.mean(axis=1), middles])
-        self.most_mm = min(MOST_DEPTH_MM, MOST_LENGTHS * float(self.size_mm[2]))
+    @model_validator(mode="after")
+    def _fits_together(self) -> "Probe":
+        if min(self.housing_mm) <= 0:
+            raise ValueError(f"HousingMm = {list(self.housing_mm)}: expected three positive lengths in mm")
+        if len(self.time_gain_compensation) != TGC_SLIDERS:
+            raise ValueError(
+                f"TimeGainCompensation has {len(self.time_gain_compensation)} values: expected {TGC_SLIDERS}, from the face down"
+            )
+        if self.edge_radius_mm > min(self.housing_mm) / 2:
+            raise ValueError(
+                f"EdgeRadiusMm = {self.edge_radius_mm:g}: expected at most half of the least of HousingMm, {min(self.housing_mm) / 2:g}"
+            )
+        low, high = self.frequency_range_mhz
+        if not 1 <= low <= self.frequency_mhz <= high <= 40:
+            raise ValueError(
+                f"FrequencyMhz = {self.frequency_mhz:g} is outside FrequencyRangeMhz = {low:g} to {high:g}"
+            )
+        if self.transducer_geometry != "LINEAR" and self.theta_stop_deg - self.theta_start_deg < 1:
+            raise ValueError("a sector needs ThetaStartDeg < 0 < ThetaStopDeg, at least 1 degree apart")
+        if self.transducer_geometry == "CURVILINEAR" and self.radius_start_mm <= 0:
+            raise ValueError("a curvilinear array needs its radius: RadiusStartMm > 0")
+        array = np.ptp(self.elements()[:, 0])
+        if array > self.housing_mm[0]:
+            raise ValueError(
+                f"the array is {array:.1f} mm wide, HousingMm {self.housing_mm[0]:g}: it must fit in"
+            )
+        return self
 
     @property
-    def grip(self) -> Grip:
-        """How it holds the transducer now; set, it holds it so."""
-        fan, tilt, roll = map(float, self.turn_deg)
-        return Grip(self.depth_mm, self.pressed_mm, (fan, tilt, roll), self.aim)
+    def wavelength_mm(self) -> float:
+        """Of the sound in soft tissue."""
+        return SOUND_MM_US / self.frequency_mhz
 
-    @grip.setter
-    def grip(self, grip: Grip) -> None:
-        self.depth_mm, self.pressed_mm = grip.depth_mm, grip.pressed_mm
-        self.turn_deg, self.aim = np.array(grip.turn_deg), grip.aim
+    @property
+    def sample_mm(self) -> float:
+        """Depth from one sample to the next."""
+        return self.depth_mm / self.number_of_samples_per_scanline
 
-    def take(self, pose: np.ndarray) -> None:
-        """Hold a transducer as it is at a pose (4, 4), as if pressed in by a button that is then let go."""
-        depth = indentation(pose, self.size_mm, self.samples, self.radius_mm)
-        pressed = float(np.clip(depth, 0.0, self.most_mm)) if np.isfinite(depth) else 0.0
-        self.grip = Grip(depth - pressed if np.isfinite(depth) else 0.0, pressed, aim=pose.copy())
+    @property
+    def radius_mm(self) -> float:
+        """Radius of the array's face; 0 where all lines leave from one point."""
+        return self.radius_start_mm if self.transducer_geometry == "CURVILINEAR" else 0.0
 
-    def point(self, origin: np.ndarray, direction: np.ndarray) -> None:
-        """Aim where a ray [mm] first meets the settled organ, perpendicular to its surface; a miss changes nothing."""
-        place = self.met(origin, direction)
-        if place is not None:
-            self.aim_at(place)
+    @property
+    def sector(self) -> tuple[float, float, float] | None:
+        """Radius of the face [mm], first and last angle [rad], of lines that fan out; None of parallel ones."""
+        if self.transducer_geometry == "LINEAR":
+            return None
+        start, stop = np.radians([self.theta_start_deg, self.theta_stop_deg])
+        return self.radius_mm, float(start), float(stop)
 
-    def aim_at(self, target: np.ndarray, lateral: np.ndarray | None = None) -> None:
-        """Aim at a point of the surface [mm], perpendicular to the patch around it; x is nearest to ``lateral``."""
-        lateral = self.lateral if lateral is None else lateral
-        self.aim = pose_at(target, -self.outward(target), lateral, self.size_mm[2])
+    @property
+    def focus_mm(self) -> float:
+        """Depth of the focus."""
+        return self.depth_mm * self.focus_depth_percent / 100
 
-    def outward(self, place: np.ndarray) -> np.ndarray:
-        """Unit normal (3,) of the patch of surface around a place [mm]."""
-        distance = np.linalg.norm(self.vertices - place, axis=1)
-        normal = np.exp(-((distance / NORMAL_PATCH_MM) ** 2)) @ self.normals
-        return normal / np.linalg.norm(normal)
+    @property
+    def extent_mm(self) -> tuple[float, float, float]:
+        """Width and depth of the box around the picture, and how much of the depth lies behind the face's middle."""
+        if self.transducer_geometry == "LINEAR":
+            return self.transducer_width_mm, self.depth_mm, 0.0
+        reach = self.radius_mm + self.depth_mm
+        left, right = np.radians([self.theta_start_deg, self.theta_stop_deg])
+        half = reach * max(np.sin(right), np.sin(-left))
+        above = self.radius_mm * (1 - np.cos(max(right, -left)))
+        return float(2 * half), float(self.depth_mm + above), float(above)
 
-    def met(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
-        """Where a ray [mm] first meets the settled organ (3,), None where it misses."""
-        # Not its first=True, which invents a hit where there is none.
-        hits = igl.ray_mesh_intersect(np.array(origin), np.array(direction), self.vertices, self.faces)
-        return np.array(origin) + hits[0][1] * np.array(direction) if hits else None
+    def image_to_probe(self, rows: int, columns: int) -> np.ndarray:
+        """The matrix (4, 4) that takes pixels (column, row, 0) of its picture, counted from the first one's centre, to its axes [mm].
 
-    def slide(self, lateral_mm: float, elevation_mm: float) -> None:
-        """Move the aim over the surface, along the turned transducer's own x and y."""
-        aim = self.home if self.aim is None else self.aim
-        outward = aim[:3, 2]
-        along = self._turned(aim)[:3, :2]
-        along = along - np.outer(outward, outward @ along)
-        along /= np.linalg.norm(along, axis=0)
-        wanted = _face_centre(aim, self.size_mm[2]) + along @ [lateral_mm, elevation_mm]
-        _, _, nearest = igl.point_mesh_squared_distance(wanted[None], self.vertices, self.faces)
-        # With the hand's own lateral it would turn about where the surface looks along that, and come back.
-        self.aim_at(nearest.reshape(3), aim[:3, 0])
+        The probe's axes are PLUS's: the origin in the middle of the array's face, x to the marked side, y away into the tissue.
+        """
+        width, depth, above = self.extent_mm
+        matrix = np.diag([width / columns, depth / rows, 1.0, 1.0])
+        matrix[:2, 3] = width / columns / 2 - width / 2, depth / rows / 2 - above
+        return matrix
 
-    def push(self, depth_mm: float) -> None:
-        """Press in by a depth [mm], or lift where negative."""
-        self.depth_mm = float(np.clip(self.depth_mm + depth_mm, LEAST_DEPTH_MM, self.most_mm))
+    def line_angles(self) -> np.ndarray:
+        """Angle of each scanline from straight down [rad], shape (lines,)."""
+        start, stop = np.radians([self.theta_start_deg, self.theta_stop_deg])
+        if self.transducer_geometry == "LINEAR":
+            start = stop = 0.0
+        return start + (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines * (stop - start)
 
-    def hold(self, pressing: bool, time_s: float, share: float = 1.0) -> None:
-        """Press further while the button is held, to a share of the deepest; let go when it is not."""
-        goal = share * self.most_mm if pressing else 0.0
-        least, most = self.pressed_mm - RELEASE_MM_S * time_s, self.pressed_mm + PRESS_MM_S * time_s
-        self.pressed_mm = float(np.clip(goal, least, most))
+    def scanlines(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where each line leaves the face [mm] and its unit direction, each (lines, 2) on the image plane."""
+        angle = self.line_angles()
+        direction = np.column_stack([np.sin(angle), np.cos(angle)])
+        if self.transducer_geometry == "LINEAR":
+            share = (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines - 0.5
+            return np.column_stack([share * self.transducer_width_mm, np.zeros_like(share)]), direction
+        return self.radius_mm * (direction - [0.0, 1.0]), direction
 
-    def turn(self, fan_deg: float, tilt_deg: float, roll_deg: float) -> None:
-        """Turn about the transducer's x, y and z axes [degrees]; fan and tilt end where a hand's do."""
-        self.turn_deg = self.turn_deg + [fan_deg, tilt_deg, roll_deg]
-        self.turn_deg[:2] = np.clip(self.turn_deg[:2], -60.0, 60.0)
+    def elements(self) -> np.ndarray:
+        """Places on the face that must touch for sound to leave, (lines, 2) [mm]: those where the lines leave, or across the array."""
+        share = (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines - 0.5
+        if self.transducer_geometry == "PHASED":
+            return np.column_stack([share * self.transducer_width_mm, np.zeros_like(share)])
+        return self.scanlines()[0]
 
-    def pose(self) -> np.ndarray:
-        """The pose that the hand wants now: turned about the face's centre, touching, then pressed in."""
-        pose = self._turned(self.home if self.aim is None else self.aim)
-        depth = min(self.depth_mm + self.pressed_mm, self.most_mm)
-        return advanced(touching(pose, self.size_mm, self.samples, self.radius_mm), depth)
+    def line_spacing_mm(self, depth_mm: np.ndarray) -> np.ndarray:
+        """Distance of neighbouring lines at depths [mm]."""
+        if self.transducer_geometry == "LINEAR":
+            return np.full_like(depth_mm, self.transducer_width_mm / self.number_of_scanlines)
+        step = np.radians(self.theta_stop_deg - self.theta_start_deg) / self.number_of_scanlines
+        return (self.radius_mm + depth_mm) * step
 
-    def _turned(self, aim: np.ndarray) -> np.ndarray:
-        pose, length = aim.copy(), self.size_mm[2]
-        turn = Rotation.from_euler("zyx", self.turn_deg[::-1], degrees=True).as_matrix()
-        pose[:3, :3] = aim[:3, :3] @ turn
-        pose[:3, 3] = _face_centre(aim, length) + length / 2 * pose[:3, 2]
-        return pose
+    def beam_coordinates(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Scanline (a fraction of an index between two) and depth along it [mm] of places on the plane [mm]."""
+        if self.transducer_geometry == "LINEAR":
+            line = (u / self.transducer_width_mm + 0.5) * self.number_of_scanlines - 0.5
+            return line, np.array(v, float)
+        depth = np.hypot(u, v + self.radius_mm) - self.radius_mm
+        start, stop = np.radians([self.theta_start_deg, self.theta_stop_deg])
+        share = (np.arctan2(u, v + self.radius_mm) - start) / (stop - start)
+        return share * self.number_of_scanlines - 0.5, depth
+
+    def gain_db(self) -> np.ndarray:
+        """What the scanner adds at each sample of a line [dB], shape (samples,): gain, its own over depth, and the sliders'."""
+        depth = (np.arange(self.number_of_samples_per_scanline) + 0.5) * self.sample_mm
+        own = 2 * self.depth_compensation_db_cm_mhz * self.frequency_mhz * depth / 10
+        places = (np.arange(TGC_SLIDERS) + 0.5) * self.depth_mm / TGC_SLIDERS
+        sliders = np.interp(depth, places, self.time_gain_compensation)
+        return own + (self.gain_percent - 50) / 100 * GAIN_RANGE_DB + (sliders - 50) / 100 * TGC_RANGE_DB
 
 
-def _face_centre(pose: np.ndarray, length_mm: float) -> np.ndarray:
-    return pose[:3, 3] - length_mm / 2 * pose[:3, 2]
+def load_probe(name: str, folder: Path | None = None) -> Probe:
+    """The probe of a file in a folder, or one that comes with the program, by its name. Raises ProbeError."""
+    own = PROBES / f"{name}.toml"
+    path = own if own.is_file() else (folder or Path()) / name
+    try:
+        return Probe.model_validate(tomllib.loads(path.read_text("utf-8")))
+    except FileNotFoundError:
+        known = ", ".join(sorted(each.stem for each in PROBES.glob("*.toml")))
+        raise ProbeError(f"transducer.probe: {name!r} is no file, and known by name are {known}") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ProbeError(f"{path}: cannot be read as a probe file ({str(error).splitlines()[0]})") from None
+    except ValidationError as error:
+        raise ProbeError(f"{path}: {explained(error)}") from None
+
+
+def explained(error: ValidationError) -> str:
+    """The first of the problems, in words that name the key."""
+    first = error.errors(include_url=False)[0]
+    key = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "value_error":
+        return str(first["ctx"]["error"])
+    if first["type"] == "extra_forbidden":
+        known = [to_pascal(name) for name in Probe.model_fields]
+        close = difflib.get_close_matches(key, known, n=1)
+        return f"{key}: unknown key; " + (
+            f"did you mean {close[0]}?" if close else f"known: {', '.join(known)}"
+        )
+    if first["type"] == "missing":
+        return f"{key}: missing"
+    return f"{key} = {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}"

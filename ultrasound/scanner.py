@@ -10,10 +10,10 @@ import trimesh
 
 from sim.embedding import Embedding, Unmoved
 from ultrasound.acoustics import check_tissues, properties
-from ultrasound.array import Mode, Probe, Rung
 from ultrasound.bmode import BMode
 from ultrasound.marks import Marks
 from ultrasound.plane import ImagePlane, PlaneInTissue
+from ultrasound.probe import Mode, Probe, Rung
 from ultrasound.slice import Slice
 from ultrasound.volume import Volume, distance_volume
 

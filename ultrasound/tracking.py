@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from ultrasound.probe import rigid
+from ultrasound.hand import rigid
 
 
 @dataclass(frozen=True)

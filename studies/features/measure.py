@@ -28,8 +28,8 @@ from studies.setup import probe_of
 from studies.stopwatch import timed
 from studies.surfaces import moved_by
 from studies.timing.measure import memory_mb
-from ultrasound.array import Mode, Rung
-from ultrasound.probe import advanced, between, image_plane, pose_at, touching
+from ultrasound.hand import advanced, between, image_plane, pose_at, touching
+from ultrasound.probe import Mode, Rung
 from ultrasound.scanner import Anatomy, Scanner
 
 # A press so deep, in so many steps; those before it settle.

@@ -12,11 +12,11 @@ from studies.coordinates import probe_in_patient
 from studies.freehand.unsqueeze import come
 from studies.readings import read
 from studies.rehearsal import Rehearsal, scanned_anatomy
-from ultrasound.array import Probe
 from ultrasound.bmode import source_of_pixels
+from ultrasound.hand import advanced, touching
 from ultrasound.marks import MOST_BEADS, Marks
 from ultrasound.plane import ImagePlane, PlaneInTissue
-from ultrasound.probe import advanced, touching
+from ultrasound.probe import Probe
 from ultrasound.scanner import Scanner
 from ultrasound.sweep import Sweep, transform_text
 from ultrasound.volume import distance_volume

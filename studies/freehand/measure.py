@@ -16,7 +16,7 @@ from studies.freehand.rebuild import Places, rebuild, track_of
 from studies.freehand.unsqueeze import Unsqueezed
 from studies.rehearsal import Rehearsal
 from studies.setup import Setup, scene_of
-from ultrasound.array import load_probe
+from ultrasound.probe import load_probe
 from ultrasound.reconstruction import METHODS
 from ultrasound.tracking import TrackingErrors, tracked
 

@@ -5,8 +5,8 @@ import numpy as np
 from studies.coordinates import transducer_at
 from studies.freehand.rebuild import Track
 from studies.rehearsal import Rehearsal
+from ultrasound.hand import advanced, between, image_plane
 from ultrasound.plane import ImagePlane, PlaneInTissue
-from ultrasound.probe import advanced, between, image_plane
 from ultrasound.sweep import Sweep, SweepError
 
 # The probe comes from so far above its first place, in so long, and waits so long there for the tissue to come to rest.

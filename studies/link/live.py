@@ -5,7 +5,7 @@ from studies.coordinates import probe_in_patient
 from studies.link.messages import LivePicture
 from studies.link.server import Server
 from studies.rehearsal import Rehearsal
-from ultrasound.array import Probe
+from ultrasound.probe import Probe
 
 
 def send_live(link: Server | None, rehearsal: Rehearsal, view: View, probe: Probe, time_s: float) -> None:

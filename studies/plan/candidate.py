@@ -9,7 +9,7 @@ from studies.plan.reach import Reach
 from studies.plan.way import FAR_MM, Layout, Way, gliding, layout_towards, pose_over, rocking
 from studies.rehearsal import Rehearsal
 from ultrasound.coverage import Coverage
-from ultrasound.probe import Hand
+from ultrasound.hand import Hand
 
 # Sides of the organ that are looked at, no farther round than this from above (its cosine), and how much two differ.
 SIDES, ROUND, APART_DEG = 300, 0.1, 20.0

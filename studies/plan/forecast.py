@@ -12,7 +12,7 @@ from studies.plan.reach import Reach
 from studies.plan.way import Way
 from studies.rehearsal import Rehearsal
 from ultrasound.coverage import REACH_MM, VOXEL_MM, Coverage
-from ultrasound.probe import image_plane
+from ultrasound.hand import image_plane
 
 # Of the target no more places than these are asked for, and of the array no more elements.
 PLACES, ELEMENTS = 1500, 32

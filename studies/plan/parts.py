@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ultrasound.probe import Hand
+from ultrasound.hand import Hand
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import igl
 import numpy as np
 
 from scenes.trocar import Trocar
-from ultrasound.probe import Hand
+from ultrasound.hand import Hand
 
 # The shaft may touch the organ so far from where it holds the probe [mm].
 NEAR_MM = 2.0

@@ -11,8 +11,8 @@ from studies.plan.way import Way
 from studies.rehearsal import Rehearsal
 from ultrasound.coverage import PLACES, Coverage
 from ultrasound.face import pressing
+from ultrasound.hand import advanced, between
 from ultrasound.plane import PlaneInTissue
-from ultrasound.probe import advanced, between
 
 # Between two passes the probe is over its next place after so many steps at the latest.
 MOST_STEPS = 240

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ultrasound.probe import Hand, advanced, pose_at, touching
+from ultrasound.hand import Hand, advanced, pose_at, touching
 
 # Poses of a pass are no farther apart than this.
 STEP_MM, STEP_DEG = 1.5, 2.0

@@ -29,8 +29,8 @@ from studies.plan.reach import Reach
 from studies.plan.trial import Trial
 from studies.plan.way import Way
 from studies.rehearsal import Rehearsal
-from ultrasound.array import Probe
 from ultrasound.coverage import VOXEL_MM, Coverage
+from ultrasound.probe import Probe
 from ultrasound.target import Target
 
 

@@ -13,7 +13,7 @@ from studies.rehearse.track_file import check_near
 from studies.scan.poses import TimedPoses
 from studies.session.file import Header, Log, SessionError, read_log
 from studies.session.scene import scene_of_log
-from ultrasound.array import Probe, explained
+from ultrasound.probe import Probe, explained
 from version import VERSION
 
 # What a budget leaves to the user.

@@ -28,7 +28,7 @@ from studies.rehearse.checks import (
 )
 from studies.rehearse.track_file import PROBE_IN_PATIENT, load_track
 from studies.setup import Setup, probe_of, scene_of
-from ultrasound.array import MODES, RUNGS, Probe
+from ultrasound.probe import MODES, RUNGS, Probe
 
 if TYPE_CHECKING:
     from studies.rehearsal import Rehearsal

@@ -12,7 +12,7 @@ from studies.session.file import SessionError
 from studies.session.recorded import Recorded
 from studies.session.replay import Replay
 from studies.session.session import Session
-from ultrasound.array import MODES, RUNGS
+from ultrasound.probe import MODES, RUNGS
 from ultrasound.target import TARGETS
 
 CHOICES: dict[str, tuple[str, ...]] = {"mode": MODES, "rung": RUNGS, "plan_for": TARGETS}

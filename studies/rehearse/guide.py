@@ -9,7 +9,7 @@ from studies.coordinates import transducer_at
 from studies.plan.file import Plan
 from studies.plan.parts import faces_of
 from studies.rehearsal import Rehearsal
-from ultrasound.probe import advanced, indentation
+from ultrasound.hand import advanced, indentation
 
 # A probe farther than this from the sweep is elsewhere; nearer than that to a pose it is there.
 NEAR_MM, THERE_MM = 6.0, 1.0

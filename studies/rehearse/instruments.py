@@ -12,8 +12,8 @@ from studies.rehearsal import Rehearsal
 from studies.rehearse.guide import Guide
 from studies.session.session import Session
 from studies.session.summary import Course
-from ultrasound.array import Probe
 from ultrasound.coverage import PLACES, Coverage, Gap
+from ultrasound.probe import Probe
 
 READ_S, LOOK_S = 0.25, 1 / 30
 MARGIN_MM = 5.0

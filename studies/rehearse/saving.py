@@ -12,8 +12,8 @@ from render.viewer import View
 from scenes.surface_files import save_surface
 from studies.numbering import next_number
 from studies.rehearsal import Rehearsal
-from ultrasound.array import Probe
 from ultrasound.dicom_image import save_dicom
+from ultrasound.probe import Probe
 from ultrasound.scanner import ECHO
 
 SCREENSHOT, PICTURE = r"screenshot-([0-9]{3,9})\.png", r"([0-9]{3,9})-.*\.png"

@@ -6,8 +6,8 @@ from render.viewer import View
 from studies.coordinates import probe_in_patient
 from studies.numbering import next_number
 from studies.rehearsal import Rehearsal
-from ultrasound.array import Probe
 from ultrasound.marked_sweep import MarkedSweep
+from ultrasound.probe import Probe
 from ultrasound.sweep import SweepError
 
 FRAME_S = 1 / 30

@@ -9,7 +9,7 @@ from studies.coordinates import transducer_at
 from studies.rehearsal import Rehearsal
 from studies.scan.poses import TimedPoses
 from studies.session.session import Session
-from ultrasound.probe import interpolated
+from ultrasound.hand import interpolated
 
 # A probe that is held still moves no farther than this: a hand's tremor, and a tracker's noise.
 STILL_MM, STILL_DEG = 3.0, 3.0

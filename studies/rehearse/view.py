@@ -12,7 +12,7 @@ from render.viewer import Geometry, Settings, View, Viewer
 from studies.rehearsal import Rehearsal
 from studies.report import Tally, expected_error_of
 from studies.stopwatch import timed
-from ultrasound.array import TGC_SLIDERS, Probe
+from ultrasound.probe import TGC_SLIDERS, Probe
 
 TGC = tuple(f"tgc_{i + 1}" for i in range(TGC_SLIDERS))
 

@@ -15,7 +15,7 @@ from scenes.whole_files import whole
 from studies.command_line import Fault, arch_option, make_folder, start_taichi
 from studies.scan.poses import load_poses
 from studies.setup import probe_of
-from ultrasound.array import MODES, RUNGS, Probe
+from ultrasound.probe import MODES, RUNGS, Probe
 from version import VERSION
 
 FRAMES_A_SECOND = 30

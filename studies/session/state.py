@@ -14,7 +14,7 @@ from sim.body import BodyState
 from sim.guard import Watch
 from sim.solver import SolverState
 from studies.rehearsal import RehearsalState
-from ultrasound.probe import Grip
+from ultrasound.hand import Grip
 
 # Of all arrays: a body of a million particles has less.
 MOST_BYTES = 1 << 30

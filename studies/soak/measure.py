@@ -15,7 +15,7 @@ from studies.rehearsal import Rehearsal, RehearsalState
 from studies.rigid_fit import apart_after_fit
 from studies.setup import Setup, scene_of
 from studies.stopwatch import timed
-from ultrasound.probe import advanced
+from ultrasound.hand import advanced
 
 SEED = 20161130
 # At each minute's end the transducer is away, and the tissue comes to rest.

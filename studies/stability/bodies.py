@@ -21,7 +21,7 @@ from studies.setup import PRESETS
 from studies.stability.cases import Subject
 from studies.stability.motion import AWAY_MM
 from studies.surfaces import volume_mm3
-from ultrasound.probe import advanced, pose_at, touching
+from ultrasound.hand import advanced, pose_at, touching
 
 # Bodies other than the kidney lie on a plane [mm].
 ELLIPSOID_MM, BALL_MM, APART_MM = (30.0, 18.0, 15.0), 12.0, 40.0

@@ -15,7 +15,7 @@ from studies.rigid_fit import apart_after_fit
 from studies.stability.bodies import Specimen, prepared
 from studies.stability.cases import Case, Subject
 from studies.stability.motion import AWAY_MM, PROBES, STATES
-from ultrasound.probe import advanced
+from ultrasound.hand import advanced
 
 RECOVERED_MM = 0.1
 # Long enough for the guard's patience and for what was thrown to come down and to rest.

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ultrasound.probe import advanced
+from ultrasound.hand import advanced
 
 AWAY_MM = 200.0
 # How far to both sides a sweep goes, and how deep what spins and shakes is on average [mm].

@@ -23,7 +23,7 @@ from studies.setup import Setup, scene_of, setup_of
 from studies.stopwatch import timed
 from studies.timing.bound import Bound, NoBound, Pypbd
 from studies.timing.phases import Phases, without_calls
-from ultrasound.probe import advanced, between
+from ultrasound.hand import advanced, between
 
 AWAY_MM = 100.0
 # A block's particles are as far apart as the paper's smallest.

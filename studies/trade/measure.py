@@ -15,7 +15,7 @@ from studies.results import rounded
 from studies.setup import Setup
 from studies.stopwatch import timed
 from studies.trade.front import SETTINGS, pareto
-from ultrasound.probe import between
+from ultrasound.hand import between
 
 # The machine's speed changes in minutes: every setting is timed in each round, and the median counts.
 ROUNDS, TIMED_STEPS = 3, 45
