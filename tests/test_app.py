@@ -141,6 +141,8 @@ def test_options_reach_the_solver(tmp_path):
         "rehearse",
         "--headless",
         *PAPER,
+        "--seconds",
+        0.3,
         "--substeps",
         2,
         "--iterations",
