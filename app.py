@@ -6,20 +6,27 @@ import sys
 import threading
 from importlib import import_module
 
-import click
+try:
+    import click
 
-from render.keys import KeysError
-from scenes.reading.error import PatientError
-from scenes.scene import SceneError
-from sim.sampling import SamplingError
-from studies.case import CaseError
-from studies.plan.file import PlanError
-from studies.scan.poses import PoseError
-from studies.session.file import SessionError
-from studies.setup import SetupError
-from ultrasound.acoustics import TissueError
-from ultrasound.probe import ProbeError
-from ultrasound.sweep import SweepError
+    from render.keys import KeysError
+    from scenes.reading.error import PatientError
+    from scenes.scene import SceneError
+    from sim.sampling import SamplingError
+    from studies.case import CaseError
+    from studies.plan.file import PlanError
+    from studies.scan.poses import PoseError
+    from studies.session.file import SessionError
+    from studies.setup import SetupError
+    from ultrasound.acoustics import TissueError
+    from ultrasound.probe import ProbeError
+    from ultrasound.sweep import SweepError
+except ModuleNotFoundError as missing:
+    sys.exit(
+        f"nephron: {missing.name} is not installed for this Python; run make run once, then use the Python of its environment: "
+        ". .venv/bin/activate (Windows: .venv\\Scripts\\activate)"
+    )
+
 from version import VERSION
 
 # Where each command is; only the one that is called is imported, for the others' libraries take seconds to load.

@@ -222,8 +222,10 @@ def load_scene(path: Path) -> Scene:
     try:
         values = tomllib.loads(path.read_text("utf-8"))
     except FileNotFoundError:
-        raise SceneError(f"{path}: no such scene file") from None
-    except (OSError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path}: no such scene file or patient's folder") from None
+    except UnicodeDecodeError:
+        raise SceneError(f"{path}: is no text; give a scene file (TOML) or a patient's folder") from None
+    except OSError as error:
         raise SceneError(f"{path}: cannot be read as a scene ({_first_line(error)})") from None
     except tomllib.TOMLDecodeError as error:
         raise SceneError(f"{path}: not valid TOML: {_first_line(error)}") from None

@@ -136,6 +136,13 @@ def test_without_vulkan_it_says_so_in_one_line_and_still_writes_slices_and_repor
     assert not list((tmp_path / "frames").glob("*.png"))
 
 
+def test_a_python_without_the_packages_is_one_line():
+    bare = [sys.executable, "-S", str(ROOT / "app.py"), "--version"]
+    done = subprocess.run(bare, capture_output=True, text=True, cwd=ROOT, timeout=60)
+    (line,) = done.stderr.splitlines()
+    assert done.returncode == 1 and "is not installed for this Python; run make run once" in line
+
+
 def test_options_reach_the_solver(tmp_path):
     done = run(
         "rehearse",

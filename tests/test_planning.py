@@ -154,6 +154,8 @@ def test_what_a_plan_is_for_is_said_and_an_organ_without_a_tumour_is_planned_for
     settings.plan_for = "tumour"
     said(plans, settings=settings)
     plans.rehearsal.tumour = None
+    settings.plan_for = "margin"
+    assert said(plans, settings=settings) == "No tumour here. A plan for the whole kidney: {plan}"
     assert said(plans, settings=settings, plan=True) == "Planning for the whole kidney"
     searching.go(4)
     ended(plans)

@@ -86,7 +86,7 @@ def test_missing_and_unreadable_files_are_named(tmp_path):
     with pytest.raises(SceneError, match="no such scene file"):
         load_scene(tmp_path / "none.toml")
     (tmp_path / "b.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(SceneError, match="cannot be read"):
+    with pytest.raises(SceneError, match="is no text; give a scene file"):
         load_scene(tmp_path / "b.toml")
     with pytest.raises(SceneError, match="cannot be read"):
         load_scene(tmp_path)

@@ -105,7 +105,13 @@ class Plans:
 
     def _chosen(self, settings: Settings) -> str:
         before, self._plan_for = self._plan_for, settings.plan_for
-        return "" if settings.plan_for == before else f"A plan for {NAMED[settings.plan_for]}: {{plan}}"
+        if settings.plan_for == before:
+            return ""
+        there = "" if self.rehearsal.tumour is not None else "No tumour here. "
+        return f"{there}A plan for {NAMED[self._target(settings)]}: {{plan}}"
+
+    def _target(self, settings: Settings) -> Target:
+        return settings.plan_for if self.rehearsal.tumour is not None else "organ"
 
     def stop(self) -> None:
         """Let go of a search that goes on."""
@@ -115,7 +121,7 @@ class Plans:
     def _begin(self, settings: Settings) -> str:
         if self._planning is not None:
             return "A plan is being made"
-        target = settings.plan_for if self.rehearsal.tumour is not None else "organ"
+        target = self._target(settings)
         scene, probe = as_set(self.rehearsal.scene, settings), probe_as_set(self.rehearsal.probe, settings)
         problem = Problem(scene, self.anatomy, probe, target, float(settings.margin_mm), scene.trocar)
         self._planning = Planning(problem, next_free(self.out))

@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from time import time
 
 import click
 import numpy as np
+from psutil import Process
 from tqdm import tqdm
 
 from render.gamepad import Gamepad, SdlPads
@@ -71,7 +73,11 @@ class Run:
         replay = None if log is None else self._replay(log, at_s, viewer.settings)
         driver = self._live() if replay is None else Played(replay, self._take_over)
         sweeping = Sweeping(self.rehearsal)
-        click.echo(self.keys.worded("The window is open; {help} shows the keys, {quit} quits."))
+        after_s = time() - Process().create_time()
+        told = (
+            f"The window is open, {after_s:.0f} s after the start; {{help}} shows the keys, {{quit}} quits."
+        )
+        click.echo(self.keys.worded(told))
         plans = Plans(self.rehearsal, self.anatomy, self.instruments, self.out)
         parts = driver, self.instruments, sweeping, plans
         loop = Loop(self.rehearsal, viewer, self.out, Tally(0.0), *parts, keys=self.keys, link=self.link)
