@@ -127,7 +127,7 @@ class Surface:
             if vertices is None:
                 self._tint.fill(0.0)
             else:
-                fill(self._tint, vertices.astype(np.float32))
+                fill(self._tint, vertices)
 
     def indices(self, ahead: np.ndarray | None = None) -> np.ndarray:
         """Vertex indices of the faces, int32 (3 m,), farthest first along `ahead` if given."""
