@@ -33,7 +33,7 @@ class GuideLines:
             self._shown = way, gone
         scene.lines(self._way, WIDTH, per_vertex_color=self._colours)
         if guidance.goal is not None:
-            fill(self._goal, solids.placed(self._edges, guidance.goal))
+            fill((self._goal, solids.placed(self._edges, guidance.goal)))
             scene.lines(self._goal, GOAL_WIDTH, color=GOAL)
 
     def _fill(self, guidance: Guidance) -> None:
@@ -44,5 +44,4 @@ class GuideLines:
         colours = np.tile(GONE, (2 * MOST_SEGMENTS, 1))
         points[: 2 * len(segments)] = segments.reshape(-1, 3)
         colours[: 2 * len(segments)] = np.where(np.repeat(gone, 2)[:, None], GONE, TO_GO)
-        fill(self._way, points)
-        fill(self._colours, colours)
+        fill((self._way, points), (self._colours, colours))

@@ -10,7 +10,7 @@ from render.camera import OrbitCamera
 from render.guide_lines import GuideLines
 from render.surface import GLASS, SOLID, Surface
 from render.viewer import Geometry, Settings, View
-from sim.fields import field_of, fill
+from sim.fields import field_of, fields_of, fill
 
 PLANE_ROWS, PLANE_COLUMNS = 96, 64
 KEY_LIGHT, FILL_LIGHT, AMBIENT = (0.82, 0.80, 0.77), (0.17, 0.19, 0.23), (0.17, 0.17, 0.19)
@@ -36,21 +36,18 @@ class Stage:
             self._support = self._matt_support(geometry.support_vertices, geometry.support_faces)
         self._half_axis_mm = geometry.transducer_size_mm[2] / 2
         self._probe = solids.transducer(geometry.transducer_size_mm, geometry.transducer_radius_mm)
-        self._probe_vertices, self._probe_normals, self._probe_colours = (
-            field_of(each, within=1) for each in self._probe[:3]
-        )
+        self._probe_vertices, self._probe_normals, self._probe_colours = fields_of(*self._probe[:3], within=1)
         self._probe_edges = solids.edges(geometry.transducer_size_mm, geometry.transducer_radius_mm)
         self._edge_points = field_of(self._probe_edges, within=1)
         self._guide: GuideLines | None = None
         self._plane, self._plane_indices = solids.image_plane_grid(PLANE_ROWS, PLANE_COLUMNS)
-        self._plane_points, self._plane_normals, self._plane_colours = (
-            field_of(np.ones((len(self._plane), 3)), within=1) for _ in range(3)
+        self._plane_points, self._plane_normals, self._plane_colours = fields_of(
+            *np.ones((3, len(self._plane), 3)), within=1
         )
         self._frame_points = field_of(np.zeros((2 * solids.FRAME_SIDES, 3)), within=1)
-        self._mask_points, self._mask_normals = (
-            field_of(np.ones((6 * MASKS, 3)), within=1) for _ in range(2)
+        self._mask_points, self._mask_normals, self._mask_colours = fields_of(
+            *np.ones((2, 6 * MASKS, 3)), np.zeros((6 * MASKS, 4)), within=1
         )
-        self._mask_colours = field_of(np.zeros((6 * MASKS, 4)), within=1)
         self._mask_indices = np.arange(6 * MASKS, dtype=np.int32)
 
     def _matt_support(self, vertices: np.ndarray, faces: np.ndarray) -> Surface:
@@ -108,16 +105,18 @@ class Stage:
                 [left, top],
             ]
         depth = 1.02 * self.camera.near_far()[0]
-        fill(self._mask_points, self.camera.eye() + depth * self.camera.direction(corners.reshape(-1, 2)))
+        fill((self._mask_points, self.camera.eye() + depth * self.camera.direction(corners.reshape(-1, 2))))
         scene.mesh(
             self._mask_points, self._mask_indices, self._mask_normals, per_vertex_color=self._mask_colours
         )
 
     def _draw_transducer(self, scene, pose: np.ndarray) -> None:
         probe = self._probe
-        fill(self._probe_vertices, solids.placed(probe.vertices, pose))
-        fill(self._probe_normals, probe.normals @ pose[:3, :3].T)
-        fill(self._edge_points, solids.placed(self._probe_edges, pose))
+        fill(
+            (self._probe_vertices, solids.placed(probe.vertices, pose)),
+            (self._probe_normals, probe.normals @ pose[:3, :3].T),
+            (self._edge_points, solids.placed(self._probe_edges, pose)),
+        )
         scene.mesh(
             self._probe_vertices, probe.indices, self._probe_normals, per_vertex_color=self._probe_colours
         )
@@ -130,11 +129,13 @@ class Stage:
         points = solids.placed(solids.standing(places), face)
         toward = key - points
         # Facing the key light everywhere, the plane is evenly bright: its grey is the slice's, not the light's.
-        fill(self._plane_points, points)
-        fill(self._plane_normals, toward / np.linalg.norm(toward, axis=1, keepdims=True))
         grey = solids.sampled(next(iter(view.pictures.values())), places, view)
-        fill(self._plane_colours, np.repeat(grey[:, None], 3, axis=1))
-        fill(self._frame_points, solids.placed(solids.image_plane_frame(view), face))
+        fill(
+            (self._plane_points, points),
+            (self._plane_normals, toward / np.linalg.norm(toward, axis=1, keepdims=True)),
+            (self._plane_colours, np.repeat(grey[:, None], 3, axis=1)),
+            (self._frame_points, solids.placed(solids.image_plane_frame(view), face)),
+        )
         scene.mesh(
             self._plane_points, self._plane_indices, self._plane_normals, per_vertex_color=self._plane_colours
         )

@@ -97,9 +97,7 @@ class Surface:
         self._faces = ti.Vector.field(3, ti.i32, shape=len(self.faces))
         self._start = ti.field(ti.i32, shape=count + 1)
         self._around = ti.field(ti.i32, shape=len(around))
-        fill(self._faces, self.faces)
-        fill(self._start, start)
-        fill(self._around, around)
+        fill((self._faces, self.faces), (self._start, start), (self._around, around))
 
     def shade(self, eye, light, opacity: float = SOLID, cut=None) -> None:
         """Bring normals and colours up to date. `cut`: point and unit normal (3,) of the side to take away
@@ -127,7 +125,7 @@ class Surface:
             if vertices is None:
                 self._tint.fill(0.0)
             else:
-                fill(self._tint, vertices)
+                fill((self._tint, vertices))
 
     def indices(self, ahead: np.ndarray | None = None) -> np.ndarray:
         """Vertex indices of the faces, int32 (3 m,), farthest first along `ahead` if given."""

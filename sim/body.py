@@ -66,8 +66,8 @@ class Body:
         self.position = ti.Vector.field(3, ti.f32, self.count)
         self.velocity = ti.Vector.field(3, ti.f32, self.count)
         self.estimate = ti.Vector.field(3, ti.f32, self.count)
-        self.rest = field_of(self.rest_points, 1)
-        self.restore(self.rest_state())
+        self.rest = ti.Vector.field(3, ti.f32, self.count)
+        self._put(self.rest_state(), (self.rest, self.rest_points))
 
     def rest_state(self) -> BodyState:
         """The state at build time: at rest in the rest position."""
@@ -80,9 +80,11 @@ class Body:
 
     def restore(self, state: BodyState) -> None:
         """Go back to a state; the steps that follow give the same bits as they did from it before."""
-        fill(self.position, state.position)
-        fill(self.estimate, state.position)
-        fill(self.velocity, state.velocity)
+        self._put(state)
+
+    def _put(self, state: BodyState, *others: tuple[ti.Field, np.ndarray]) -> None:
+        at, speed = state.position, state.velocity
+        fill((self.position, at), (self.estimate, at), (self.velocity, speed), *others)
 
 
 @ti.data_oriented

@@ -58,8 +58,7 @@ class ShapeContacts:
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Go back to a snapshot; the steps that follow give the same bits."""
-        fill(self.contact.plane, state["plane"])
-        fill(self.found, state["found"])
+        fill((self.contact.plane, state["plane"]), (self.found, state["found"]))
 
     @ti.func
     def is_clear(self, s: ti.template(), i, p, distance):

@@ -12,7 +12,7 @@ import taichi as ti
 import taichi.math as tm
 from scipy.spatial import cKDTree
 
-from sim.fields import field_of
+from sim.fields import field_of, fields_of
 from sim.solver import Solver, SolverState
 
 MOST_TETRAHEDRA = 2000
@@ -90,9 +90,8 @@ class Guard:
         self.broken = ti.Vector.field(2, ti.i32, ())
         if self.has_tetrahedra:
             edges = rest[corners[:, 1:]] - rest[corners[:, :1]]
-            self.corner = field_of(corners, 1)
             self.per_volume = field_of(1.0 / np.linalg.det(edges))
-            self.longest = field_of(TORN * np.linalg.norm(edges, axis=2), 1)
+            self.corner, self.longest = fields_of(corners, TORN * np.linalg.norm(edges, axis=2), within=1)
         self.fallbacks = 0
         self.settle()
 

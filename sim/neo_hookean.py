@@ -15,7 +15,7 @@ import taichi.math as tm
 
 from sim.body import Body
 from sim.device import is_too_small
-from sim.fields import field_of
+from sim.fields import field_of, fields_of
 from sim.four_wide import cross, four, row
 from sim.lattice import Lattice, fill_with_cells, surface_points
 from sim.rigid_motion import RigidMotion
@@ -113,10 +113,9 @@ class NeoHookean:
             around[cells[:, corner], corner] = np.arange(self.count)
             gradient[cells[:, corner], corner, :3] = self.lattice.gradient[:, corner]
             gradient[cells[:, corner], corner, 3] = self.lattice.volume
-        self.around = field_of(around)
-        self.gradient = field_of(gradient, 1)
-        self.shear = field_of((gradient[:, :, 3] * (gradient[:, :, :3] ** 2).sum(axis=2)).sum(axis=1))
-        self.cell = field_of(cells, 1)
+        shear = (gradient[:, :, 3] * (gradient[:, :, :3] ** 2).sum(axis=2)).sum(axis=1)
+        self.around, self.shear = fields_of(around, shear)
+        self.gradient, self.cell = fields_of(gradient, cells, within=1)
         self.deformation = field_of(np.tile(np.eye(3, 4), (self.count + 1, 1, 1)), 2)
 
     def _store_hourglass(self) -> None:
@@ -130,8 +129,7 @@ class NeoHookean:
                 place = (corners[b] - corners[a] + 1) @ [9, 3, 1]
                 neighbour[cells[:, a], place] = cells[:, b]
                 weight[cells[:, a], place] += HOURGLASS * self.lattice.hourglass[:, a, b]
-        self.neighbour = field_of(neighbour)
-        self.hourglass = field_of(weight)
+        self.neighbour, self.hourglass = fields_of(neighbour, weight)
 
     def set_young(self, young_kpa: float) -> None:
         """Change Young's modulus [kPa], Poisson's ratio stays."""

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from sim.body import ParticleBody, RestBody, fill_body
 from sim.contact import REACH_RADII, ShapeContacts
 from sim.device import is_too_small
-from sim.fields import field_of
+from sim.fields import field_of, fields_of
 from sim.four_wide import four, row
 from sim.patches import Patches, arrange
 from sim.rotation import rotation_near
@@ -87,14 +87,14 @@ class ShapeMatching:
         self.update_frames()
 
     def _allocate(self, patches: Patches, members: Clusters) -> None:
-        self.patch_start = field_of(patches.start)
-        self.shared_start = field_of(patches.clusters.offsets)
-        self.shared = field_of(patches.clusters.members)
-        self.member_start = field_of(members.offsets)
-        self.member = field_of(members.members)
         row = np.repeat(np.arange(self.count), np.diff(members.offsets))
         several = np.bincount(row, members.members < patches.several, minlength=self.count)
-        self.several_end = field_of(members.offsets[:-1] + several.astype(np.int32))
+        self.patch_start, self.shared_start, self.shared = fields_of(
+            patches.start, patches.clusters.offsets, patches.clusters.members
+        )
+        self.member_start, self.member, self.several_end = fields_of(
+            members.offsets, members.members, members.offsets[:-1] + several.astype(np.int32)
+        )
         self.estimate = ti.Vector.field(4, ti.f32, self.body.count)
         self.goal = ti.Matrix.field(4, 4, ti.f32, self.patch_count)
         self.centre = ti.Vector.field(4, ti.f32, self.patch_count)
@@ -120,11 +120,14 @@ class ShapeMatching:
         moment = [np.bincount(member, (mass * centre[:, axis])[row]) for axis in range(3)]
         self.rest_centres = np.stack(moment, axis=1) / total[:, None]
         local = rest - np.repeat(centre, sizes, axis=0)
-        self.local = field_of(np.pad(local, ((0, 0), (0, 1)), constant_values=1.0), 1)
-        self.patch_centre = field_of(np.pad(centre, ((0, 0), (0, 1))), 1)
-        self.patch_scale = field_of(np.column_stack([share, share / mass, 1.0 / goals, shared / goals]), 1)
-        self.patch_rest = field_of(np.column_stack([centre, mass]), 1)
-        self.cluster_rest = field_of(np.column_stack([self.rest_centres, total]), 1)
+        self.local, self.patch_centre, self.patch_scale, self.patch_rest, self.cluster_rest = fields_of(
+            np.pad(local, ((0, 0), (0, 1)), constant_values=1.0),
+            np.pad(centre, ((0, 0), (0, 1))),
+            np.column_stack([share, share / mass, 1.0 / goals, shared / goals]),
+            np.column_stack([centre, mass]),
+            np.column_stack([self.rest_centres, total]),
+            within=1,
+        )
 
     def counts(self) -> dict[str, int]:
         """Particles, clusters, and memberships of the ones in the others."""

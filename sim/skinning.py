@@ -3,7 +3,7 @@
 import numpy as np
 import taichi as ti
 
-from sim.fields import field_of
+from sim.fields import fields_of
 from sim.tissue import TissueModel
 
 
@@ -19,9 +19,7 @@ class Skin:
         frame, weight = model.attach(points)
         self.model = model
         self.vertices = ti.Vector.field(3, ti.f32, len(points))
-        self.rest = field_of(points, 1)
-        self.frame = field_of(frame, 1)
-        self.weight = field_of(weight, 1)
+        self.rest, self.frame, self.weight = fields_of(points, frame, weight, within=1)
         self.update()
 
     def update(self) -> None:

@@ -10,7 +10,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import Body
-from sim.fields import field_of, fill
+from sim.fields import fields_of, fill
 from sim.free_way import FreeWay
 from sim.lattice import Lattice
 from sim.shapes import FAR
@@ -54,10 +54,10 @@ class SurfaceContacts:
         self.point = ti.Vector.field(3, ti.f32, self.count)
         self.start = ti.Vector.field(3, ti.f32, self.count)
         self.near = ti.field(ti.i32, self.count)
-        self.area = field_of(area_mm2)
-        self.node = field_of(nodes, 1)
-        self.weight = field_of(weights, 1)
-        self._list_by_node(nodes, weights)
+        self.node, self.weight = fields_of(nodes, weights, within=1)
+        self.area, self.listed_from, self.listed, self.listed_weight = fields_of(
+            area_mm2, *_by_node(nodes, weights, body.count)
+        )
         self.plane = ti.Vector.field(4, ti.f32, (len(shapes), self.count))
         self.found = ti.Vector.field(4, ti.f32, (len(shapes), self.count))
         if self.rough:
@@ -66,13 +66,6 @@ class SurfaceContacts:
         self.stiffness = ti.field(ti.f32, ())
         self.penetration = ti.field(ti.f32, ())
         self.forget()
-
-    def _list_by_node(self, nodes: np.ndarray, weights: np.ndarray) -> None:
-        order = np.argsort(nodes.ravel(), kind="stable")
-        offset = np.searchsorted(nodes.ravel()[order], np.arange(self.body.count + 1))
-        self.listed_from = field_of(offset)
-        self.listed = field_of(order // 8)
-        self.listed_weight = field_of(weights.ravel()[order])
 
     def forget(self) -> None:
         """Drop what is known of distances and of friction, after the body was moved by another hand."""
@@ -87,8 +80,7 @@ class SurfaceContacts:
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Go back to a snapshot; the steps that follow give the same bits."""
-        for name, values in state.items():
-            fill(getattr(self, name), values)
+        fill(*((getattr(self, name), values) for name, values in state.items()))
 
     @ti.func
     def carried(self, field: ti.template(), q):
@@ -233,3 +225,10 @@ class SurfaceContacts:
                 # The maximum of numbers does not depend on the order, so this atomic keeps runs alike.
                 ti.atomic_max(self.penetration[None], -self.shapes[s].surface(p).w)
         return self.penetration[None]
+
+
+def _by_node(nodes: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points (n, 8) by their nodes: where each node's points begin in a list, that list, and their weights in it."""
+    order = np.argsort(nodes.ravel(), kind="stable")
+    begins = np.searchsorted(nodes.ravel()[order], np.arange(count + 1))
+    return begins, order // 8, weights.ravel()[order]

@@ -1,8 +1,10 @@
 """Shared by all tests: a fresh Taichi for each, small bodies, and the place of the optional real data."""
 
+import inspect
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ import taichi as ti
 import trimesh
 
 from sim.device import start
+from sim.solver import Solver, SolverState
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 ROOT = Path(__file__).resolve().parents[1]
@@ -42,6 +45,28 @@ def one_device():
     ti.reset()
 
 
+@pytest.fixture(scope="module")
+def kept(one_device) -> Callable[..., Solver]:
+    """Calls a function that makes a body's solver, or, where a test of the file has called it so before, puts that one back.
+
+    What is put back is what steps change; a tool stays where it is.
+    """
+    made: dict[Any, tuple[Solver, SolverState]] = {}
+
+    def keep(make: Callable[..., Solver], *args, **named) -> Solver:
+        bound = inspect.signature(make).bind(*args, **named)
+        bound.apply_defaults()
+        call = make, *bound.arguments.values()
+        if call not in made:
+            solver = make(*args, **named)
+            made[call] = solver, solver.snapshot()
+        solver, state = made[call]
+        solver.restore(state)
+        return solver
+
+    return keep
+
+
 @pytest.fixture
 def data() -> Path:
     """The folder of real data, which the project stands without."""
@@ -50,13 +75,13 @@ def data() -> Path:
     return DATA
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def ball() -> trimesh.Trimesh:
     """A ball of 12 mm radius about the origin."""
     return trimesh.creation.icosphere(subdivisions=3, radius=12.0)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def block() -> trimesh.Trimesh:
     """A block of 24 x 20 x 16 mm about the origin."""
     return trimesh.creation.box([24.0, 20.0, 16.0])

@@ -6,7 +6,7 @@ import pytest
 import taichi as ti
 import trimesh
 from conftest import rotation_about
-from test_solver import position, solver_of
+from test_solver import on_floor, position, solver_of
 
 from sim.shapes import FAR, ConvexTool, Plane, SignedDistanceField
 from sim.solver import Solver, StepSettings
@@ -36,7 +36,7 @@ def begin(solver: Solver, gravity: list[float], dt: float = 0.0, stabilisations:
     solver.launch_start(0, dt, *gravity, 0.0, stabilisations)
 
 
-def test_plane(device):
+def test_plane(one_device):
     normal = np.array([1.0, 2.0, 2.0])
     points = scattered()
     normals, distance = measured(Plane(normal, 6.0), points)
@@ -45,7 +45,7 @@ def test_plane(device):
 
 
 @pytest.mark.parametrize("edge_radius", [0.0, 1.0, 3.0])
-def test_cuboid_in_any_pose(device, edge_radius):
+def test_cuboid_in_any_pose(one_device, edge_radius):
     half = np.array([6.0, 3.0, 4.0])
     tool = ConvexTool.cuboid(2 * half, edge_radius)
     pose = np.eye(4)
@@ -63,13 +63,13 @@ def test_cuboid_in_any_pose(device, edge_radius):
     assert np.abs(ahead - distance - 0.05)[away & (beyond.max(axis=1) > 0)].max() < 1e-4
 
 
-def test_a_rounded_cuboid_keeps_its_size_and_loses_its_corners(device):
+def test_a_rounded_cuboid_keeps_its_size_and_loses_its_corners(one_device):
     tool = ConvexTool.cuboid(np.array([12.0, 6.0, 8.0]), 1.0)
     distance = measured(tool, np.array([[6.0, 0, 0], [0, -3.0, 0], [6.0, 3.0, 0], [6.0, 3.0, 4.0]]))[1]
     assert distance == pytest.approx([0, 0, 2**0.5 - 1, 3**0.5 - 1], abs=1e-6)
 
 
-def test_the_way_out_of_a_rounded_cuboid_ends_a_hair_outside_its_face(device):
+def test_the_way_out_of_a_rounded_cuboid_ends_a_hair_outside_its_face(one_device):
     tool = ConvexTool.cuboid(np.array([12.0, 6.0, 8.0]), 1.0)
     out = ti.Vector.field(3, ti.f32, 6)
 
@@ -86,12 +86,12 @@ def test_the_way_out_of_a_rounded_cuboid_ends_a_hair_outside_its_face(device):
 
 
 @pytest.mark.parametrize("edge_radius", [-0.1, 3.1])
-def test_an_edge_radius_without_room_is_refused(device, edge_radius):
+def test_an_edge_radius_without_room_is_refused(one_device, edge_radius):
     with pytest.raises(ValueError, match="expected 0 to 3 mm"):
         ConvexTool.cuboid(np.array([12.0, 6.0, 8.0]), edge_radius)
 
 
-def test_a_tool_knows_how_its_material_moved(device):
+def test_a_tool_knows_how_its_material_moved(one_device):
     tool = ConvexTool.cuboid(np.array([4.0, 4.0, 4.0]))
     before, now = np.eye(4), np.eye(4)
     now[:3, :3], now[:3, 3] = rotation_about([0, 0, 1], 3), [0.5, 0.0, -0.2]
@@ -107,7 +107,7 @@ def test_a_tool_knows_how_its_material_moved(device):
     assert np.abs(moved.to_numpy() - (now @ material - material)[:3]).max() < 1e-6
 
 
-def test_more_poses_than_a_step_has_room_for_are_refused(device):
+def test_more_poses_than_a_step_has_room_for_are_refused(one_device):
     tool = ConvexTool.cuboid(np.array([4.0, 4.0, 4.0]))
     tool.follow(np.tile(np.eye(4), (101, 1, 1)))
     for poses in (1, 102):
@@ -116,7 +116,7 @@ def test_more_poses_than_a_step_has_room_for_are_refused(device):
 
 
 @pytest.mark.parametrize("spacing", [(0.5, 0.5, 0.5), (0.5, 0.4, 0.8)])
-def test_signed_distance_field_of_a_sphere(device, spacing):
+def test_signed_distance_field_of_a_sphere(one_device, spacing):
     axes = [np.arange(-16, 16.1, step) for step in spacing]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     field = SignedDistanceField(np.linalg.norm(grid, axis=-1) - 9, np.full(3, -16.0), np.array(spacing))
@@ -135,7 +135,7 @@ def test_signed_distance_field_of_a_sphere(device, spacing):
             assert measured(field, sign * 16.1 * axis[None])[1][0] == FAR
 
 
-def test_a_closed_surface_becomes_its_distances(device, ball):
+def test_a_closed_surface_becomes_its_distances(one_device, ball):
     shape = SignedDistanceField.of_surface(ball.vertices, ball.faces, 5.0)
     points = scattered()
     _, distance = measured(shape, points)
@@ -149,7 +149,7 @@ def test_a_closed_surface_becomes_its_distances(device, ball):
 
 @pytest.mark.parametrize("edge_radius", [0.0, 1.0])
 @pytest.mark.parametrize("offsets", [(6.0, 3.0, 4.0, 6.0, 3.0, 4.0), (2.0, 3.0, 1.5, 9.0, 5.0, 4.0)])
-def test_a_tool_is_beyond_a_distance_only_where_it_is(device, edge_radius, offsets):
+def test_a_tool_is_beyond_a_distance_only_where_it_is(one_device, edge_radius, offsets):
     tool = ConvexTool(np.concatenate([np.eye(3), -np.eye(3)]), np.array(offsets), edge_radius)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation_about([1, 2, 0], 50), [1.0, -2.0, 3.0]
@@ -171,7 +171,7 @@ def test_a_tool_is_beyond_a_distance_only_where_it_is(device, edge_radius, offse
     assert told.sum() > 0.9 * (distance > 2.0).sum()
 
 
-def test_a_body_laid_in_a_mould_of_its_shape_does_not_move_without_gravity(device, ball):
+def test_a_body_laid_in_a_mould_of_its_shape_does_not_move_without_gravity(one_device, ball):
     outside = trimesh.creation.box([60, 60, 60])
     mould = trimesh.Trimesh(
         np.concatenate([outside.vertices, ball.vertices]),
@@ -186,14 +186,16 @@ def test_a_body_laid_in_a_mould_of_its_shape_does_not_move_without_gravity(devic
     assert np.abs(position(solver) - before).max() < 1 / 8 * 2 / 10 + chord
 
 
-@pytest.mark.parametrize("speed_mm_s", [20.0, 400.0, 5000.0])
-def test_no_particle_ends_a_step_inside_tool_or_floor(device, ball, speed_mm_s):
+def under_a_tool(mesh) -> Solver:
+    """A body on a slab 10 mm thick, its top 12.5 mm under the body's middle, and a tool."""
     tool = ConvexTool.cuboid(np.array([30.0, 8.0, 20.0]))
-    floor = trimesh.creation.box([80, 80, 10])
-    floor.apply_translation([0, 0, -17.5])
-    solver = solver_of(
-        ball, [SignedDistanceField.of_surface(floor.vertices, floor.faces, 4.0), tool], tool=tool
-    )
+    slab = trimesh.creation.box([80, 80, 10]).apply_translation([0, 0, -17.5])
+    return solver_of(mesh, [SignedDistanceField.of_surface(slab.vertices, slab.faces, 4.0), tool], tool=tool)
+
+
+@pytest.mark.parametrize("speed_mm_s", [20.0, 400.0, 5000.0])
+def test_no_particle_ends_a_step_inside_tool_or_floor(kept, ball, speed_mm_s):
+    solver = kept(under_a_tool, ball)
     height, deepest = 25.0, 0.0
     while height > 8.0:
         poses = np.tile(np.eye(4), (4, 1, 1))
@@ -211,7 +213,7 @@ def test_no_particle_ends_a_step_inside_tool_or_floor(device, ball, speed_mm_s):
     assert deepest < 1e-3
 
 
-def test_a_tool_driven_into_the_floor_leaves_no_particle_in_either(device, ball):
+def test_a_tool_driven_into_the_floor_leaves_no_particle_in_either(one_device, ball):
     tool = ConvexTool.cuboid(np.array([16.0, 8.0, 20.0]))
     floor = trimesh.creation.box([80, 80, 30])
     floor.apply_translation([0, 0, -27.1])
@@ -228,7 +230,7 @@ def test_a_tool_driven_into_the_floor_leaves_no_particle_in_either(device, ball)
     assert np.isfinite(position(solver)).all()
 
 
-def test_pressing_squeezes_between_tool_and_floor(device, ball):
+def test_pressing_squeezes_between_tool_and_floor(one_device, ball):
     tool = ConvexTool.cuboid(np.array([40.0, 40.0, 10.0]))
     solver = solver_of(ball, [Plane(np.array([0.0, 0.0, 1.0]), -12.0), tool], tool=tool)
     poses = np.tile(np.eye(4), (4, 1, 1))
@@ -241,7 +243,7 @@ def test_pressing_squeezes_between_tool_and_floor(device, ball):
     assert np.ptp(x[:, 0]) > wide
 
 
-def test_a_dragged_tool_drags_the_surface_by_its_friction(device, block):
+def test_a_dragged_tool_drags_the_surface_by_its_friction(one_device, block):
     moved = {}
     for friction in (0.0, 0.5):
         tool = ConvexTool.cuboid(np.array([60.0, 60.0, 10.0]))
@@ -288,14 +290,19 @@ def oracle_of_pushes(solver: Solver, x: np.ndarray, motion: np.ndarray, passes: 
     return x, slid, several
 
 
-@pytest.mark.parametrize("factor", [1.0, 1.6])
-def test_pushes_and_friction_are_the_oracles(device, block, factor):
+def in_a_corner(mesh) -> Solver:
+    """A body over a floor, at a wall and under a tool."""
     floor, wall = Plane(np.array([0.1, 0.0, 1.0]), -6.5), Plane(np.array([-1.0, 0.2, 0.0]), -10.0)
     tool = ConvexTool.cuboid(np.array([14.0, 12.0, 8.0]))
-    solver = solver_of(block, [floor, wall, tool], tool=tool)
+    return solver_of(mesh, [floor, wall, tool], tool=tool)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.6])
+def test_pushes_and_friction_are_the_oracles(kept, block, factor):
+    solver = kept(in_a_corner, block)
     before, now = np.eye(4), np.eye(4)
     before[2, 3], now[:3, 3] = 11.6, [0.3, -0.2, 11.3]
-    tool.follow(np.stack([before, now]))
+    solver.tool.follow(np.stack([before, now]))
     body, contacts = solver.body, solver.contacts
     body.velocity.from_numpy(np.random.default_rng(8).normal(0, 20, (body.count, 3)).astype(np.float32))
 
@@ -318,11 +325,10 @@ def test_pushes_and_friction_are_the_oracles(device, block, factor):
         assert np.abs(body.estimate.to_numpy() - wanted).max() < 2e-5
 
 
-def test_stabilisation_gets_out_without_adding_velocity(device, ball):
-    floor = Plane(np.array([0.0, 0.0, 1.0]), -10.0)
+def test_stabilisation_gets_out_without_adding_velocity(kept, ball):
     fastest = []
     for passes in (0, 4):
-        solver = solver_of(ball, [floor], friction=0.0)
+        solver = kept(on_floor, ball, -10.0, 0.0)
         settings = StepSettings(
             gravity=(0, 0, 0), damping=0.0, stabilisation_iterations=passes, stiffness=0.0
         )
@@ -334,7 +340,7 @@ def test_stabilisation_gets_out_without_adding_velocity(device, ball):
     assert fastest[1] < 0.1
 
 
-def test_stabilisation_moves_position_and_estimate_alike(device, ball):
+def test_stabilisation_moves_position_and_estimate_alike(one_device, ball):
     solver = solver_of(ball, [Plane(np.array([0.0, 0.0, 1.0]), -10.0)])
     ends = []
     for passes in (0, 4):

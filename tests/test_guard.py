@@ -1,5 +1,7 @@
 """A guard sees what no tissue is, waits for what heals, and puts back the rest; fast bodies do not pass through shapes."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import taichi as ti
@@ -24,19 +26,32 @@ def floor() -> Plane:
 
 
 def tool() -> ConvexTool:
-    box = ConvexTool.cuboid(np.array([10.0, 6.0, 10.0]))
-    away = np.eye(4)
-    away[2, 3] = 200.0
-    box.move(away, away)
-    return box
+    return ConvexTool.cuboid(np.array([10.0, 6.0, 10.0]))
 
 
-def solver_of(model: str, mesh: trimesh.Trimesh, shapes: list) -> tuple[Solver, StepSettings]:
+def away(solver: Solver) -> None:
+    """The tool far from the body."""
+    far = np.eye(4)
+    far[2, 3] = 200.0
+    solver.tool.move(far, far)
+
+
+def thick() -> SignedDistanceField:
+    """A floor that is a block 30 mm thick."""
+    block = trimesh.creation.box(bounds=[[-40, -40, -42.0], [40, 40, -12.0]])
+    return SignedDistanceField.of_surface(block.vertices, block.faces, 6.0)
+
+
+def solver_of(model: str, mesh: trimesh.Trimesh, *shapes: Callable) -> Solver:
+    made = [shape() for shape in shapes]
     if model == "neo-hookean":
-        return lattice_tissue(mesh, 4.0, shapes, friction=0.35), settings_of(8, DOWN)
-    tissue = particle_tissue(mesh, shapes=shapes)
-    moving = next((shape for shape in shapes if shape.moves), None)
-    return Solver(tissue, tool=moving), StepSettings(gravity=DOWN)
+        return lattice_tissue(mesh, 4.0, made, friction=0.35)
+    moving = next((shape for shape in made if shape.moves), None)
+    return Solver(particle_tissue(mesh, shapes=made), tool=moving)
+
+
+def settings(model: str) -> StepSettings:
+    return settings_of(8, DOWN) if model == "neo-hookean" else StepSettings(gravity=DOWN)
 
 
 def put(solver: Solver, x: np.ndarray, velocity=(0.0, 0.0, 0.0)) -> None:
@@ -58,14 +73,13 @@ def test_tetrahedra_are_small_and_none_is_flat():
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_a_guard_lets_tissue_be_pressed_and_puts_back_what_is_none(device, ball, model):
-    box = tool()
-    solver, settings = solver_of(model, ball, [floor(), box])
+def test_a_guard_lets_tissue_be_pressed_and_puts_back_what_is_none(kept, ball, model):
+    solver = kept(solver_of, model, ball, floor, tool)
     guard = Guard(solver)
-    poses = np.tile(np.eye(4), (settings.substeps + 1, 1, 1))
+    poses = np.tile(np.eye(4), (settings(model).substeps + 1, 1, 1))
     for step in range(90):
         poses[:, 2, 3] = 17.0 - 4.0 * min(step / 60, 1.0)
-        solver.step(settings, poses)
+        solver.step(settings(model), poses)
         assert guard.check(DT) == ""
     assert guard.health().finite and guard.health().tangled == 0.0
     good = guard.watch.good.body
@@ -83,8 +97,9 @@ def test_a_guard_lets_tissue_be_pressed_and_puts_back_what_is_none(device, ball,
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_a_tangle_is_given_time_and_then_put_back(device, ball, model):
-    solver, _ = solver_of(model, ball, [floor(), tool()])
+def test_a_tangle_is_given_time_and_then_put_back(kept, ball, model):
+    solver = kept(solver_of, model, ball, floor, tool)
+    away(solver)
     guard = Guard(solver)
     mirrored = solver.body.rest_points * [1, 1, -1]
     flat = solver.body.rest_points * [1, 1, 1e-3]
@@ -98,16 +113,16 @@ def test_a_tangle_is_given_time_and_then_put_back(device, ball, model):
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_tissue_is_torn_where_an_edge_is_as_many_times_its_own_length_as_that_takes(device, ball, model):
-    solver, _ = solver_of(model, ball, [floor()])
+def test_tissue_is_torn_where_an_edge_is_as_many_times_its_own_length_as_that_takes(kept, ball, model):
+    solver = kept(solver_of, model, ball, floor)
     guard = Guard(solver)
     for share, tangled in ((0.99, 0.0), (1.01, 1.0)):
         put(solver, share * TORN * solver.body.rest_points)
         assert guard.health().tangled == tangled
 
 
-def test_a_tangle_that_was_undone_is_given_its_time_again(device, ball):
-    solver, _ = solver_of("neo-hookean", ball, [floor()])
+def test_a_tangle_that_was_undone_is_given_its_time_again(kept, ball):
+    solver = kept(solver_of, "neo-hookean", ball, floor)
     guard = Guard(solver)
     rest = solver.body.rest_points
     # Undone too early for a good state to be kept, which would begin anew as well.
@@ -123,13 +138,12 @@ def test_a_tangle_that_was_undone_is_given_its_time_again(device, ball):
     assert "inside out" in guard.check(DT / 3)
 
 
-def test_what_the_tool_crushes_is_no_tangle(device, ball):
-    box = tool()
-    solver, _ = solver_of("neo-hookean", ball, [floor(), box])
+def test_what_the_tool_crushes_is_no_tangle(kept, ball):
+    solver = kept(solver_of, "neo-hookean", ball, floor, tool)
     guard = Guard(solver)
     put(solver, solver.body.rest_points * [1, 1, -1])
     at = np.eye(4)
-    box.move(at, at)
+    solver.tool.move(at, at)
     # Everything is inside out: what counts is more than 10 mm from the tool's faces, or from the ball about its corners.
     half = np.array([5.0, 3.0, 5.0])
     at = solver.body.rest_points[guard.corner.to_numpy()[:, 0]] * [1, 1, -1]
@@ -140,26 +154,24 @@ def test_what_the_tool_crushes_is_no_tangle(device, ball):
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_a_torn_point_ends_no_step_as_no_number(device, ball, model):
-    solver, settings = solver_of(model, ball, [floor()])
+def test_a_torn_point_ends_no_step_as_no_number(kept, ball, model):
+    solver = kept(solver_of, model, ball, floor)
     for mm in (100.0, 1000.0):
         put(solver, solver.body.rest_points + np.random.default_rng(0).normal(0, mm, (solver.body.count, 3)))
         for _ in range(5):
-            solver.step(settings)
+            solver.step(settings(model))
         assert np.isfinite(position(solver)).all(), mm
 
 
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("velocity", [(0, 0, -1e4), (1e3, 0, -1e6)])
-def test_nothing_fast_goes_through_a_floor(device, ball, model, velocity):
+def test_nothing_fast_goes_through_a_floor(kept, ball, model, velocity):
     # Of a block 30 mm thick and of the half-space alike, from 100 mm above.
-    block = trimesh.creation.box(bounds=[[-40, -40, -42.0], [40, 40, -12.0]])
-    thick = SignedDistanceField.of_surface(block.vertices, block.faces, 6.0)
-    for shape in (floor(), thick):
-        solver, settings = solver_of(model, ball, [shape])
+    for shape in (floor, thick):
+        solver = kept(solver_of, model, ball, shape)
         put(solver, solver.body.rest_points + [0, 0, 100.0], velocity)
         for _ in range(20):
-            solver.step(settings)
+            solver.step(settings(model))
         # It meets the floor within 1 mm and sinks in by what a step of contact leaves.
         assert position(solver)[:, 2].min() > -12.0 - 6.0, shape
 
@@ -189,7 +201,7 @@ def share_of(shapes: list, start, way, free: float) -> float:
     return float(out[0])
 
 
-def test_a_way_ends_where_it_meets_a_shape(device):
+def test_a_way_ends_where_it_meets_a_shape(one_device):
     shapes = [floor(), ConvexTool.cuboid(np.array([10.0, 6.0, 10.0]))]
     # From 52 mm above the floor, 200 mm down: 52 mm and the depth at which it may be felt.
     assert share_of(shapes, [0, 0, 40.0], [0, 0, -200.0], 3.0) == pytest.approx(
@@ -204,7 +216,7 @@ def test_a_way_ends_where_it_meets_a_shape(device):
     assert share_of(shapes[1:], [0, 0, 40.0], [0, 0, -200.0], 3.0) == 1.0
 
 
-def test_of_several_shapes_the_first_on_the_way_ends_it(device):
+def test_of_several_shapes_the_first_on_the_way_ends_it(one_device):
     wall = Plane(np.array([-1.0, 0.0, 0.0]), -30.0)
     for shapes in ([floor(), wall], [wall, floor()]):
         assert share_of(shapes, [0, 0, 40.0], [0, 0, -200.0], 3.0) == pytest.approx(
@@ -215,7 +227,7 @@ def test_of_several_shapes_the_first_on_the_way_ends_it(device):
         )
 
 
-def test_room_is_no_more_than_the_distance(device, ball):
+def test_room_is_no_more_than_the_distance(one_device, ball):
     shape = SignedDistanceField.of_surface(ball.vertices, ball.faces, 4.0)
     points = np.random.default_rng(1).uniform(-40, 40, (2000, 3))
     out = ti.field(ti.f32, len(points))
@@ -227,7 +239,7 @@ def test_room_is_no_more_than_the_distance(device, ball):
     assert out.to_numpy()[near] == pytest.approx(true[near], abs=0.1)
 
 
-def test_room_beyond_a_grid_is_the_way_to_it_whatever_its_spacing(device):
+def test_room_beyond_a_grid_is_the_way_to_it_whatever_its_spacing(one_device):
     spacing = np.array([0.5, 1.0, 2.0])
     grid = np.moveaxis(np.indices((65, 33, 17)), 0, -1) * spacing - 16.0
     shape = SignedDistanceField(np.linalg.norm(grid, axis=-1) - 12.0, np.full(3, -16.0), spacing)
@@ -240,15 +252,14 @@ def test_room_beyond_a_grid_is_the_way_to_it_whatever_its_spacing(device):
     assert out.to_numpy() == pytest.approx(way + HAIR_CELLS * 0.5, abs=1e-4)
 
 
-def test_a_body_on_few_points_stands_still(device):
+def test_a_body_on_few_points_stands_still(one_device):
     egg = trimesh.creation.icosphere(subdivisions=4).apply_scale((30.0, 18.0, 15.0))
     solver = lattice_tissue(egg, 5.0, [Plane(np.array([0.0, 0.0, 1.0]), -15.0)], friction=0.35)
-    settings = settings_of(8, DOWN)
     for _ in range(150):
-        solver.step(settings)
+        solver.step(settings("neo-hookean"))
     last = position(solver)
     for _ in range(20):
-        solver.step(settings)
+        solver.step(settings("neo-hookean"))
         # Positions of 30 mm have 2e-6 mm in float32, which a step of 1/60 s makes 1e-4 mm/s; it shook with 4 mm/s once.
         assert np.abs(solver.body.velocity.to_numpy()).max() < 0.05
     assert np.abs(position(solver) - last).max() < 0.01
@@ -266,31 +277,31 @@ def test_a_body_on_few_points_stands_still(device):
         (dict(gravity=(0.0, float("inf"), 0.0)), "gravity is"),
     ],
 )
-def test_settings_of_no_step_are_named(device, ball, changed, named):
-    solver, _ = solver_of("shape-matching", ball, [floor()])
+def test_settings_of_no_step_are_named(kept, ball, changed, named):
+    solver = kept(solver_of, "shape-matching", ball, floor)
     before = position(solver)
     with pytest.raises(ValueError, match=named.replace("(", r"\(")):
         solver.step(StepSettings(**changed))
     assert (position(solver) == before).all()
 
 
-def test_a_pose_that_is_no_number_is_refused(device, ball):
-    solver, settings = solver_of("shape-matching", ball, [floor(), tool()])
-    poses = np.tile(np.eye(4), (settings.substeps + 1, 1, 1))
+def test_a_pose_that_is_no_number_is_refused(kept, ball):
+    solver = kept(solver_of, "shape-matching", ball, floor, tool)
+    poses = np.tile(np.eye(4), (settings("shape-matching").substeps + 1, 1, 1))
     poses[-1, 0, 3] = np.nan
     with pytest.raises(ValueError, match="not finite"):
-        solver.step(settings, poses)
+        solver.step(settings("shape-matching"), poses)
 
 
-def test_tissue_is_kept_for_good_when_asked_for_but_not_what_is_none(device, ball):
-    solver, settings = solver_of("neo-hookean", ball, [floor()])
+def test_tissue_is_kept_for_good_when_asked_for_but_not_what_is_none(kept, ball):
+    solver = kept(solver_of, "neo-hookean", ball, floor)
     guard = Guard(solver)
     for _ in range(5):
-        solver.step(settings)
+        solver.step(settings("neo-hookean"))
         guard.check(DT)
     guard.keep()
-    kept = position(solver)
-    assert np.array_equal(guard.watch.good.body.position, kept) and guard.watch.steps_since_good == 0
-    put(solver, np.zeros_like(kept))
+    good = position(solver)
+    assert np.array_equal(guard.watch.good.body.position, good) and guard.watch.steps_since_good == 0
+    put(solver, np.zeros_like(good))
     guard.keep()
-    assert np.array_equal(guard.watch.good.body.position, kept)
+    assert np.array_equal(guard.watch.good.body.position, good)

@@ -85,7 +85,7 @@ def rounding(energy: Energy, x: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("noise_mm", [0.25, 0.8, 2.0])
-def test_force_and_hessian_are_the_energys_derivatives(device, noise_mm):
+def test_force_and_hessian_are_the_energys_derivatives(one_device, noise_mm):
     lattice = small_lattice()
     model = NeoHookean(Body(lattice.nodes), lattice)
     x = deformed(lattice.nodes, noise_mm)
@@ -110,14 +110,14 @@ def test_force_and_hessian_are_the_energys_derivatives(device, noise_mm):
         assert np.linalg.eigvalsh(hessian).min() > 0
 
 
-def test_another_youngs_modulus_leaves_poissons_ratio_and_stiffens_the_contact_layer(device, block):
+def test_another_youngs_modulus_leaves_poissons_ratio_and_stiffens_the_contact_layer(one_device, block):
     model = tissue_of(block, 8.0, [Plane(np.array([0.0, 0.0, 1.0]), -8.0)], poisson=0.3).model
     model.set_young(2 * YOUNG_KPA)
     found = model.mu[None], model.lame[None], model.contacts.stiffness[None]
     assert found == pytest.approx([2 * each for each in (*lame_of(0.3), YOUNG_KPA / LAYER_MM)], rel=1e-6)
 
 
-def test_the_logarithm_is_exact_to_rounding(device):
+def test_the_logarithm_is_exact_to_rounding(one_device):
     values = np.concatenate([np.geomspace(LEAST_J, 1e30, 4000), 1 + np.linspace(-0.4, 0.4, 4001)]).astype(
         np.float32
     )
@@ -135,7 +135,7 @@ def test_the_logarithm_is_exact_to_rounding(device):
     assert (np.abs(found.to_numpy() - wanted) <= 4 * EPS * np.maximum(np.abs(wanted), 0.35)).all()
 
 
-def test_a_turned_state_has_turned_forces(device):
+def test_a_turned_state_has_turned_forces(one_device):
     lattice = small_lattice()
     model, energy = NeoHookean(Body(lattice.nodes), lattice), Energy(lattice, 0.45)
     x = deformed(lattice.nodes)
@@ -151,7 +151,7 @@ def test_a_turned_state_has_turned_forces(device):
     assert np.abs(forces_of(model, rest)[0]).max() < rounding(energy, rest)
 
 
-def test_forces_go_on_smoothly_into_inversion(device, block):
+def test_forces_go_on_smoothly_into_inversion(one_device, block):
     lattice = fill_with_cells(block, 8.0)
     model, energy = NeoHookean(Body(lattice.nodes), lattice), Energy(lattice, 0.45)
     jumps = []
@@ -169,7 +169,7 @@ def test_forces_go_on_smoothly_into_inversion(device, block):
 
 
 @pytest.mark.parametrize("with_held", [False, True])
-def test_a_pass_is_a_gauss_seidel_sweep_of_the_colours(device, with_held):
+def test_a_pass_is_a_gauss_seidel_sweep_of_the_colours(one_device, with_held):
     lattice, factor = small_lattice(), 1.7
     held = np.random.default_rng(5).uniform(size=len(lattice.nodes)) < 0.3 if with_held else None
     # On one core and by colours.
@@ -211,7 +211,7 @@ def shear(amount: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("wanted", ["simple shear", "any"])
-def test_a_held_skin_makes_the_inside_affine_with_the_closed_form_stress(device, block, wanted):
+def test_a_held_skin_makes_the_inside_affine_with_the_closed_form_stress(one_device, block, wanted):
     lattice = fill_with_cells(block, 3.0)
     cut = lattice.volume < 3.0**3 * (1 - 1e-9)
     held = np.zeros(len(lattice.nodes), bool)
@@ -238,7 +238,7 @@ def test_a_held_skin_makes_the_inside_affine_with_the_closed_form_stress(device,
     assert np.abs(power - volume * p).max() < rounding(energy, affine) * len(x) ** 0.5 * 13
 
 
-def test_a_fast_spin_is_found_whole_at_once(device, ball):
+def test_a_fast_spin_is_found_whole_at_once(one_device, ball):
     """Inertia alone draws nodes from x to x + w x r, w = 1 rad a step: the nearest rigid motion is a turn by atan(1)."""
     model = tissue_of(ball, 4.0).model
     x, mass = model.lattice.nodes, model.mass.to_numpy().astype(float)
@@ -260,7 +260,7 @@ def uniaxial(stretch: float, poisson: float) -> tuple[float, float]:
     return q, mu * (stretch - 1 / stretch) + lame * np.log(q * q * stretch) / stretch
 
 
-def test_uniaxial_compression_between_frictionless_plates(device, block):
+def test_uniaxial_compression_between_frictionless_plates(one_device, block):
     cell, gap = 4.0, 12.0
     plate = ConvexTool.cuboid(np.array([80.0, 80.0, 40.0]))
     solver = tissue_of(block, cell, [Plane(np.array([0.0, 0.0, 1.0]), -8.0), plate])
@@ -340,7 +340,7 @@ def beam_error(poisson: float, cell: float, side: float = 8.0, span: float = 40.
     return empty + edges + inside + poisson**2 * side / span
 
 
-def test_a_cantilevers_sag_is_beam_theorys(device):
+def test_a_cantilevers_sag_is_beam_theorys(one_device):
     coarse, fine = 1 - sag(0.0, 4.0, 700), 1 - sag(0.0, 8 / 3, 1200)
     assert abs(coarse) < beam_error(0.0, 4.0) < 0.25
     assert abs(fine) < beam_error(0.0, 8 / 3) < 0.12
@@ -348,5 +348,5 @@ def test_a_cantilevers_sag_is_beam_theorys(device):
     assert coarse > 1.8 * fine > 0
 
 
-def test_a_cantilever_of_nearly_incompressible_tissue_does_not_lock(device):
+def test_a_cantilever_of_nearly_incompressible_tissue_does_not_lock(one_device):
     assert abs(1 - sag(0.45, 8 / 3, 1500)) < beam_error(0.45, 8 / 3) < 0.15

@@ -13,23 +13,27 @@ from sim.shapes import Plane
 from sim.solver import Solver, StepSettings
 
 
-def two_blocks(pairs: bool, scaling: float = 0.0) -> tuple[Solver, np.ndarray]:
-    """One block over another on a floor, and which particles are the upper one's."""
+def two_blocks(pairs: bool, scaling: float = 0.0, floor: bool = True) -> Solver:
+    """One block over another, on a floor."""
     lower = trimesh.creation.box([12.0, 12.0, 8.0])
     upper = lower.copy()
     # Clusters reach 5 mm: nearer bodies would be held together by them.
     upper.apply_translation([0, 0, 14.0])
-    floor = Plane(np.array([0.0, 0.0, 1.0]), -4.0)
-    solver = solver_of(
-        trimesh.util.concatenate([lower, upper]), [floor], radius=1.5, scaling=scaling, pairs=pairs
-    )
-    return solver, solver.body.rest_points[:, 2] > 7
+    shapes = [Plane(np.array([0.0, 0.0, 1.0]), -4.0)] * floor
+    both = trimesh.util.concatenate([lower, upper])
+    return solver_of(both, shapes, radius=1.5, scaling=scaling, pairs=pairs)
 
 
-def test_particles_that_share_no_cluster_keep_their_distance(device):
+def of_upper(solver: Solver) -> np.ndarray:
+    """Which particles (n,) are the upper block's."""
+    return solver.body.rest_points[:, 2] > 7
+
+
+def test_particles_that_share_no_cluster_keep_their_distance(kept):
     height = {}
     for pairs in (False, True):
-        solver, upper = two_blocks(pairs)
+        solver = kept(two_blocks, pairs)
+        upper = of_upper(solver)
         for _ in range(40):
             solver.step(StepSettings(iterations=30))
         x = position(solver)
@@ -42,9 +46,9 @@ def test_particles_that_share_no_cluster_keep_their_distance(device):
     assert height[False] < 4.0
 
 
-def test_contacts_of_particles_keep_momentum_of_a_symmetric_hit(device):
-    solver, upper = two_blocks(True)
-    solver.contacts, solver.has_contacts = None, False
+def test_contacts_of_particles_keep_momentum_of_a_symmetric_hit(kept):
+    solver = kept(two_blocks, True, floor=False)
+    upper = of_upper(solver)
     velocity = np.where(upper[:, None], [0, 0, -150.0], [0, 0, 150.0])
     solver.body.velocity.from_numpy(velocity.astype(np.float32))
     for _ in range(6):
@@ -56,8 +60,9 @@ def test_contacts_of_particles_keep_momentum_of_a_symmetric_hit(device):
     assert np.abs(v.sum(axis=0) - velocity.sum(axis=0)).max() < 0.1 * np.abs(velocity).sum()
 
 
-def test_neighbours_are_all_that_are_near_in_ascending_order(device):
-    solver, upper = two_blocks(True)
+def test_neighbours_are_all_that_are_near_in_ascending_order(kept):
+    solver = kept(two_blocks, True)
+    upper = of_upper(solver)
     x = position(solver)
     x[upper, 2] -= 7.0
     solver.body.position.from_numpy(x.astype(np.float32))
@@ -105,7 +110,7 @@ def pairs_pass(solver: Solver, moved: np.ndarray, factor: float) -> tuple[np.nda
 
 
 @pytest.mark.parametrize("relaxation, scaling", [("local", 0.0), ("global", 0.0), ("local", 0.5)])
-def test_a_pass_over_pairs_is_the_oracles(device, relaxation, scaling):
+def test_a_pass_over_pairs_is_the_oracles(one_device, relaxation, scaling):
     lower = trimesh.creation.box([9.0, 9.0, 6.0])
     upper = lower.copy().apply_translation([0, 0, 12.0])
     both = trimesh.util.concatenate([lower, upper])
@@ -141,8 +146,9 @@ def test_a_pass_over_pairs_is_the_oracles(device, relaxation, scaling):
     assert most[0] > most[1]
 
 
-def test_a_pair_shares_its_push_by_the_scaled_masses(device):
-    solver, upper = two_blocks(True, scaling=0.5)
+def test_a_pair_shares_its_push_by_the_scaled_masses(kept):
+    solver = kept(two_blocks, True, scaling=0.5, floor=False)
+    upper = of_upper(solver)
     x = position(solver)
     x[upper, 2] -= 5.0
     solver.body.position.from_numpy(x.astype(np.float32))
@@ -165,11 +171,11 @@ def test_a_pair_shares_its_push_by_the_scaled_masses(device):
         assert moved[bottom[j]] / moved[top[i]] == pytest.approx(np.exp(-0.5 * height), rel=1e-3)
 
 
-def test_scaled_masses_make_the_lower_of_a_pair_the_heavier(device):
+def test_scaled_masses_make_the_lower_of_a_pair_the_heavier(kept):
     moved = {}
     for scaling in (0.0, 0.5):
-        solver, upper = two_blocks(True, scaling)
-        solver.contacts, solver.has_contacts = None, False
+        solver = kept(two_blocks, True, scaling, floor=False)
+        upper = of_upper(solver)
         start = position(solver)
         start[upper, 2] -= 6.0
         solver.body.position.from_numpy(start.astype(np.float32))

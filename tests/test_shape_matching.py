@@ -7,6 +7,7 @@ import pytest
 import taichi as ti
 from conftest import rotation_about
 from particle_tissue import tissue_of
+from test_solver import on_floor, solver_of
 
 from sim.body import BodyState, ParticleBody, fill_body
 from sim.patches import arrange
@@ -53,9 +54,9 @@ def oracle(model: ShapeMatching, x: np.ndarray, step: float, mass: np.ndarray | 
 
 
 def moved_body(
-    mesh, relaxation: str, mass_scaling: float = 0.0
+    kept, mesh, relaxation: str, mass_scaling: float = 0.0
 ) -> tuple[ParticleBody, ShapeMatching, np.ndarray]:
-    model = tissue_of(mesh, relaxation=relaxation, scaling=mass_scaling)
+    model = kept(solver_of, mesh, relaxation=relaxation, scaling=mass_scaling).model
     body = model.body
     x = deformed(body.rest_points).astype(np.float32)
     body.restore(BodyState(x, np.zeros_like(x)))
@@ -65,8 +66,8 @@ def moved_body(
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
 @pytest.mark.parametrize("stiffness, factor", [(1.0, 1.0), (0.4, 1.0), (0.9, 1.7)])
-def test_a_pass_is_the_oracles(device, block, relaxation, stiffness, factor):
-    body, model, x = moved_body(block, relaxation)
+def test_a_pass_is_the_oracles(kept, block, relaxation, stiffness, factor):
+    body, model, x = moved_body(kept, block, relaxation)
     project(model, stiffness, factor)
     wanted = oracle(model, x, stiffness * factor)
     assert np.abs(wanted - x).max() > 0.3
@@ -74,8 +75,8 @@ def test_a_pass_is_the_oracles(device, block, relaxation, stiffness, factor):
 
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
-def test_a_pass_keeps_linear_and_angular_momentum(device, block, relaxation):
-    body, model, x = moved_body(block, relaxation)
+def test_a_pass_keeps_linear_and_angular_momentum(kept, block, relaxation):
+    body, model, x = moved_body(kept, block, relaxation)
     project(model, 0.8, 1.0)
     change = body.estimate.to_numpy() - x
     # Each of n particles contributes its rounding, which adds like a random walk; the angular sum has lever arms.
@@ -86,8 +87,8 @@ def test_a_pass_keeps_linear_and_angular_momentum(device, block, relaxation):
     assert np.abs(turning).max() < ROUNDING_MM * n**0.5 * 3 * np.abs(x - x.mean(axis=0)).max()
 
 
-def test_a_rigid_motion_is_no_deformation(device, block):
-    body, model, _ = moved_body(block, "local")
+def test_a_rigid_motion_is_no_deformation(kept, block):
+    body, model, _ = moved_body(kept, block, "local")
     turned = body.rest_points @ rotation_about([0, 1, 1], 130).T + [100.0, 20.0, -50.0]
     body.estimate.from_numpy(turned.astype(np.float32))
     project(model, 1.0, 1.0)
@@ -96,7 +97,7 @@ def test_a_rigid_motion_is_no_deformation(device, block):
 
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
-def test_pushed_patches_know_where_their_particles_are(device, block, relaxation):
+def test_pushed_patches_know_where_their_particles_are(one_device, block, relaxation):
     model = tissue_of(block, shapes=[Plane(np.array([0.2, -0.1, 1.0]), -5.0)], relaxation=relaxation)
     patches, several = model.patches, model.patches.several
     x = deformed(model.body.rest_points) * 0.9 - [4.0, -2.0, 7.0]
@@ -125,26 +126,26 @@ def test_pushed_patches_know_where_their_particles_are(device, block, relaxation
         assert np.abs(moment[p][:3, :3] - wanted).max() < 7 * patches.sizes[p] * ROUNDING_MM
 
 
+@ti.kernel
+def push_out(model: ti.template(), factor: float):
+    model.contacts.find()
+    model.gather()
+    model.project(0.0, factor, 0.0)
+
+
 @pytest.mark.parametrize("factor, left", [(0.4, 0.6), (1.0, 0.0), (1.7, 0.0)])
-def test_a_push_goes_as_far_as_the_relaxation_factor_but_not_beyond_the_surface(device, block, factor, left):
-    model = tissue_of(block, shapes=[Plane(np.array([0.0, 0.0, 1.0]), -7.5)], friction=0.0)
-    body, contacts = model.body, model.contacts
-
-    @ti.kernel
-    def pressed():
-        contacts.find()
-        model.gather()
-        model.project(0.0, factor, 0.0)
-
-    pressed()
+def test_a_push_goes_as_far_as_the_relaxation_factor_but_not_beyond_the_surface(kept, block, factor, left):
+    model = kept(on_floor, block, -7.5, 0.0).model
+    body = model.body
+    push_out(model, factor)
     depth = body.contact_radius.to_numpy() - 7.5 - body.rest_points[:, 2]
     moved = model.estimate.to_numpy()[:, 2] - body.rest_points[:, 2]
     assert (depth > 0.4).sum() > 20
     assert np.abs(moved - (1 - left) * np.maximum(depth, 0.0)).max() < ROUNDING_MM
 
 
-def test_collapsed_flat_and_inverted_bodies_come_back_to_finite_shapes(device, block):
-    body, model, _ = moved_body(block, "local")
+def test_collapsed_flat_and_inverted_bodies_come_back_to_finite_shapes(kept, block):
+    body, model, _ = moved_body(kept, block, "local")
     rest = body.rest_points
     for squash in (
         np.zeros((3, 3)),
@@ -160,8 +161,8 @@ def test_collapsed_flat_and_inverted_bodies_come_back_to_finite_shapes(device, b
 
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
-def test_scaled_masses_pull_the_clusters_towards_the_heavier(device, block, relaxation):
-    body, model, x = moved_body(block, relaxation, mass_scaling=0.1)
+def test_scaled_masses_pull_the_clusters_towards_the_heavier(kept, block, relaxation):
+    body, model, x = moved_body(kept, block, relaxation, mass_scaling=0.1)
     mass = np.exp(-0.1 * body.rest_points[:, 2]).astype(np.float32)
     body.mass_scale.from_numpy(mass)
     project(model, 1.0, 1.0)
@@ -170,8 +171,8 @@ def test_scaled_masses_pull_the_clusters_towards_the_heavier(device, block, rela
     assert np.abs(body.estimate.to_numpy() - wanted).max() < ROUNDING_MM
 
 
-def test_frames_do_not_depend_on_those_before(device, block):
-    body, model, x = moved_body(block, "local")
+def test_frames_do_not_depend_on_those_before(kept, block):
+    body, model, x = moved_body(kept, block, "local")
     first = model.frame.to_numpy()
     body.restore(BodyState(-x[::-1].astype(np.float32), np.zeros(x.shape, np.float32)))
     model.update_frames()
@@ -200,6 +201,6 @@ def test_patches_hold_each_membership_of_the_clusters(block):
     assert (patches.sizes[: patches.several] > 1).all() and (patches.sizes[patches.several :] == 1).all()
 
 
-def test_an_unknown_relaxation_is_refused_by_name(device, block):
+def test_an_unknown_relaxation_is_refused_by_name(one_device, block):
     with pytest.raises(ValueError, match="'loose'.*local, global"):
         tissue_of(block, relaxation="loose")

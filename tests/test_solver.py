@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-import taichi as ti
 from particle_tissue import tissue_of
 
-from sim.device import start
 from sim.neighbours import ParticleContacts
 from sim.shapes import ConvexTool, Plane, SignedDistanceField
 from sim.solver import Solver, StepSettings
@@ -29,13 +27,23 @@ def solver_of(
     return Solver(model, particle_contacts, tool)
 
 
+def on_floor(mesh, height_mm: float, friction: float = 0.35) -> Solver:
+    """A body over a plane."""
+    return solver_of(mesh, [Plane(np.array([0.0, 0.0, 1.0]), height_mm)], friction)
+
+
+def in_bowl(mesh) -> Solver:
+    """A body in ``bowl``, which it slides in without friction."""
+    return solver_of(mesh, [bowl()], friction=0.0)
+
+
 def position(solver: Solver) -> np.ndarray:
     return solver.body.position.to_numpy().astype(np.float64)
 
 
 @pytest.mark.parametrize("damping", [0.0, 12.0])
-def test_a_falling_body_falls_as_the_scheme_says(device, block, damping):
-    solver = solver_of(block)
+def test_a_falling_body_falls_as_the_scheme_says(kept, block, damping):
+    solver = kept(solver_of, block)
     settings = StepSettings(damping=damping, stiffness=0.9)
     start_at = position(solver)
     steps = 30
@@ -54,10 +62,10 @@ def test_a_falling_body_falls_as_the_scheme_says(device, block, damping):
     assert np.abs(moved - [0, 0, fallen]).max() < 6e-5 * 9**0.5 * (n**3 / 3) ** 0.5
 
 
-def test_without_damping_the_scheme_is_first_order_in_the_exact_parabola(device, block):
+def test_without_damping_the_scheme_is_first_order_in_the_exact_parabola(kept, block):
     errors = []
     for substeps in (2, 4):
-        solver = solver_of(block)
+        solver = kept(solver_of, block)
         z = position(solver)[:, 2].mean()
         for _ in range(12):
             solver.step(StepSettings(damping=0.0, substeps=substeps))
@@ -67,8 +75,8 @@ def test_without_damping_the_scheme_is_first_order_in_the_exact_parabola(device,
 
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
-def test_linear_momentum_is_kept_without_contact_and_gravity(device, block, relaxation):
-    solver = solver_of(block, relaxation=relaxation)
+def test_linear_momentum_is_kept_without_contact_and_gravity(kept, block, relaxation):
+    solver = kept(solver_of, block, relaxation=relaxation)
     x = position(solver)
     velocity = np.cross([0.0, 2.0, 9.0], x) + 40 * np.sin(x[:, [1, 2, 0]]) + [100.0, 50.0, 20.0]
     solver.body.velocity.from_numpy(velocity.astype(np.float32))
@@ -83,11 +91,11 @@ def test_linear_momentum_is_kept_without_contact_and_gravity(device, block, rela
     assert np.abs(later.sum(axis=0) - velocity.sum(axis=0)).max() < 3 * rounding
 
 
-def test_angular_momentum_is_kept_to_the_order_of_the_scheme(device, block):
+def test_angular_momentum_is_kept_to_the_order_of_the_scheme(kept, block):
     turning, steps, time_step = 10.0, 8, 1 / 60
     lost = []
     for substeps in (4, 8):
-        solver = solver_of(block)
+        solver = kept(solver_of, block)
         x = position(solver)
         velocity = np.cross([0.0, 0.0, turning], x - x.mean(axis=0))
         solver.body.velocity.from_numpy(velocity.astype(np.float32))
@@ -101,7 +109,7 @@ def test_angular_momentum_is_kept_to_the_order_of_the_scheme(device, block):
     assert lost == pytest.approx(wanted, rel=0.25)
 
 
-def test_stiffness_one_moves_a_small_body_rigidly(device):
+def test_stiffness_one_moves_a_small_body_rigidly(one_device):
     import trimesh
 
     # A ball of one cluster: nothing in it can deform.
@@ -117,10 +125,10 @@ def test_stiffness_one_moves_a_small_body_rigidly(device):
     assert np.abs(lengths[0] - lengths[1]).max() < 1e-4
 
 
-def slide(block, slope_deg: float, friction: float = 0.35) -> tuple[float, float]:
+def slide(kept, block, slope_deg: float, friction: float = 0.35) -> tuple[float, float]:
     """Acceleration down a slope over 0.2 s, as a share of g, and the speed then [mm/s]; it starts from rest."""
     angle = np.radians(slope_deg)
-    solver = solver_of(block, [Plane(np.array([0.0, 0.0, 1.0]), -8.0)], friction)
+    solver = kept(on_floor, block, -8.0, friction)
     settings = StepSettings(
         gravity=(G * np.sin(angle), 0.0, -G * np.cos(angle)), damping=0.0, stiffness=1.0, iterations=30
     )
@@ -132,45 +140,27 @@ def slide(block, slope_deg: float, friction: float = 0.35) -> tuple[float, float
     return (speeds[1] - speeds[0]) / 0.2 / G, speeds[1]
 
 
-def test_sliding_starts_at_the_friction_angle(device, block):
+def test_sliding_starts_at_the_friction_angle(kept, block):
     critical = np.degrees(np.arctan(0.35))
     # Without friction either slope would give it more than 1000 mm/s by then.
-    assert abs(slide(block, critical - 0.5)[1]) < 5.0
-    assert slide(block, critical + 0.5)[1] > 10.0
+    assert abs(slide(kept, block, critical - 0.5)[1]) < 5.0
+    assert slide(kept, block, critical + 0.5)[1] > 10.0
 
 
 @pytest.mark.parametrize("slope_deg", [25.0, 35.0])
-def test_beyond_it_the_block_accelerates_by_coulombs_law(device, block, slope_deg):
+def test_beyond_it_the_block_accelerates_by_coulombs_law(kept, block, slope_deg):
     angle = np.radians(slope_deg)
     wanted = np.sin(angle) - 0.35 * np.cos(angle)
     # The block rocks and settles while it slides: 5 %.
-    assert slide(block, slope_deg)[0] == pytest.approx(wanted, rel=0.05)
+    assert slide(kept, block, slope_deg)[0] == pytest.approx(wanted, rel=0.05)
 
 
-def test_without_friction_a_slope_holds_nothing(device, block):
-    assert slide(block, 10.0, friction=0.0)[0] == pytest.approx(np.sin(np.radians(10)), rel=0.02)
-
-
-def pressed(mesh, threads: int, serial: bool) -> bytes:
-    start("cpu", cpu_max_num_threads=threads)
-    tool = ConvexTool.cuboid(np.array([10.0, 6.0, 10.0]))
-    floor = Plane(np.array([0.0, 0.0, 1.0]), -12.0)
-    solver = solver_of(mesh, [floor, tool], tool=tool, pairs=True, serial=serial)
-    poses = np.tile(np.eye(4), (4, 1, 1))
-    for step in range(20):
-        poses[:, 2, 3] = 17.0 - 0.3 * (step + np.arange(4) / 3)
-        solver.step(StepSettings(), poses)
-    return position(solver).tobytes() + solver.body.velocity.to_numpy().tobytes()
+def test_without_friction_a_slope_holds_nothing(kept, block):
+    assert slide(kept, block, 10.0, friction=0.0)[0] == pytest.approx(np.sin(np.radians(10)), rel=0.02)
 
 
 @pytest.mark.parametrize("serial", [True, False])
-def test_pairs_give_the_same_bits_whatever_the_threads(ball, serial):
-    assert pressed(ball, 1, serial) == pressed(ball, 2, serial)
-    ti.reset()
-
-
-@pytest.mark.parametrize("serial", [True, False])
-def test_the_tool_goes_along_its_poses_and_stays_where_it_came_to(device, block, serial):
+def test_the_tool_goes_along_its_poses_and_stays_where_it_came_to(kept, block, serial):
     tool = ConvexTool.cuboid(np.array([4.0, 4.0, 4.0]))
     solver = solver_of(block, [tool], tool=tool, serial=serial)
     poses = np.tile(np.eye(4), (4, 1, 1))
@@ -182,8 +172,8 @@ def test_the_tool_goes_along_its_poses_and_stays_where_it_came_to(device, block,
         assert tool.step_back.to_numpy()[:3, 3] == pytest.approx(-np.array(motion), abs=1e-5)
 
 
-def test_sliding_over_a_curved_surface_does_not_sink_in(device, ball):
-    solver = solver_of(ball, [bowl()], friction=0.0)
+def test_sliding_over_a_curved_surface_does_not_sink_in(kept, ball):
+    solver = kept(in_bowl, ball)
     radius = solver.body.contact_radius.to_numpy().astype(float)
     deepest, first = 0.0, position(solver)
     for step in range(30):
@@ -204,9 +194,8 @@ def bowl() -> SignedDistanceField:
 
 @pytest.mark.parametrize("iterations", [1, 2, 9, 10])
 @pytest.mark.parametrize("factor", [1.0, 1.5, 2.0])
-def test_over_relaxation_is_stable(device, ball, iterations, factor):
-    floor = Plane(np.array([0.0, 0.0, 1.0]), -12.0)
-    solver = solver_of(ball, [floor])
+def test_over_relaxation_is_stable(kept, ball, iterations, factor):
+    solver = kept(on_floor, ball, -12.0)
     settings = StepSettings(stiffness=1.0, iterations=iterations, relaxation_factor=factor, damping=0.0)
     for _ in range(40):
         solver.step(settings)
@@ -214,19 +203,18 @@ def test_over_relaxation_is_stable(device, ball, iterations, factor):
     assert np.abs(solver.body.velocity.to_numpy()).max() < 2000
 
 
-def test_over_relaxation_converges_faster(device, ball):
+def test_over_relaxation_converges_faster(kept, ball):
     sag = []
     for factor in (1.0, 1.8):
-        solver = solver_of(ball, [Plane(np.array([0.0, 0.0, 1.0]), -12.0)], radius=1.5)
+        solver = kept(on_floor, ball, -12.0)
         for _ in range(60):
             solver.step(StepSettings(stiffness=1.0, relaxation_factor=factor, iterations=5))
         sag.append(24.0 - np.ptp(position(solver)[:, 2]))
     assert sag[1] < 0.8 * sag[0]
 
 
-def test_what_a_scene_switches_off_is_not_there(device, block):
-    solver = solver_of(block)
+def test_what_a_scene_switches_off_is_not_there(kept, block):
+    solver = kept(solver_of, block)
     assert not hasattr(solver.body, "mass_scale") and solver.contacts is None and solver.pairs is None
     assert hasattr(solver_of(block, scaling=0.1).body, "mass_scale")
-    floor = Plane(np.array([0.0, 0.0, 1.0]), -8.0)
-    assert not hasattr(solver_of(block, [floor], friction=0.0).contacts, "push")
+    assert not hasattr(kept(on_floor, block, -8.0, 0.0).contacts, "push")

@@ -88,20 +88,22 @@ class BMode:
 
     def _make_tables(self, probe: Probe) -> None:
         """What depends on the probe's settings alone, made anew when these change."""
-        fill(self.gain, probe.gain_db())
+        fill((self.gain, probe.gain_db()))
         fixed = probe.model_dump(exclude={"gain_percent", "dyn_range_db", "time_gain_compensation"})
         if self._tables_of == tuple(fixed.items()):
             return
         self._tables_of = tuple(fixed.items())
         start, direction = probe.scanlines()
-        fill(self.beams.start, start)
-        fill(self.beams.direction, direction)
-        fill(self.beams.element, probe.elements())
         weights, half, loudness = lateral_weights(probe)
-        fill(self.weight, weights)
-        fill(self.half, half.reshape(-1, LANES).max(axis=1))
-        fill(self.beams.loudness, loudness)
-        fill(self.source, source_of_pixels(probe, self.plane.pixels))
+        fill(
+            (self.beams.start, start),
+            (self.beams.direction, direction),
+            (self.beams.element, probe.elements()),
+            (self.beams.loudness, loudness),
+            (self.weight, weights),
+            (self.half, half.reshape(-1, LANES).max(axis=1)),
+            (self.source, source_of_pixels(probe, self.plane.pixels)),
+        )
 
     @ti.kernel
     def _add(self):

@@ -119,7 +119,7 @@ def _weigh(specimen: Specimen, heaviest: float) -> None:
     if isinstance(specimen.model, NeoHookean):
         mass = specimen.mass.copy()
         mass[len(mass) // 2] *= heaviest
-        fill(specimen.model.mass, mass)
+        fill((specimen.model.mass, mass))
 
 
 def _harden(specimen: Specimen, material: Mapping[str, float]) -> None:
