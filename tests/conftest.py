@@ -12,7 +12,6 @@ import taichi as ti
 import trimesh
 
 from sim.device import start
-from sim.solver import Solver, SolverState
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 ROOT = Path(__file__).resolve().parents[1]
@@ -46,23 +45,24 @@ def one_device():
 
 
 @pytest.fixture(scope="module")
-def kept(one_device) -> Callable[..., Solver]:
-    """Calls a function that makes a body's solver, or, where a test of the file has called it so before, puts that one back.
+def kept(one_device) -> Callable:
+    """Calls a function that makes something on the device, or, where a test of the file has called it so before, gives that again.
 
-    What is put back is what steps change; a tool stays where it is.
+    What has a ``snapshot`` is put back as it was made; a tool stays where it is.
     """
-    made: dict[Any, tuple[Solver, SolverState]] = {}
+    made: dict[Any, tuple[Any, Any]] = {}
 
-    def keep(make: Callable[..., Solver], *args, **named) -> Solver:
+    def keep(make: Callable, *args, **named) -> Any:
         bound = inspect.signature(make).bind(*args, **named)
         bound.apply_defaults()
         call = make, *bound.arguments.values()
         if call not in made:
-            solver = make(*args, **named)
-            made[call] = solver, solver.snapshot()
-        solver, state = made[call]
-        solver.restore(state)
-        return solver
+            thing = make(*args, **named)
+            made[call] = thing, thing.snapshot() if hasattr(thing, "snapshot") else None
+        thing, state = made[call]
+        if state is not None:
+            thing.restore(state)
+        return thing
 
     return keep
 

@@ -1,5 +1,8 @@
 """The slice: at rest the CT itself, deformed the analytic pull-back; the embedding against brute force."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 import SimpleITK as sitk
@@ -11,6 +14,7 @@ from slicing import organ_mask
 
 from sim.body import BodyState
 from sim.embedding import Embedding, Unmoved, tetrahedra_around
+from sim.shape_matching import ShapeMatching
 from sim.skinning import Skin
 from ultrasound.hand import image_plane, pose_at
 from ultrasound.plane import ImagePlane, PlaneInTissue
@@ -64,26 +68,51 @@ def pixel_points(plane, pixels: int) -> np.ndarray:
     return (local @ plane.world_from_plane.T)[..., :3]
 
 
-def sliced(mesh, image: sitk.Image, move=None, pixels: int = 96, outside: str = "gel"):
+@dataclass(frozen=True)
+class Embedded:
+    """A body with what carries an image plane, at rest or moved by another hand."""
+
+    model: ShapeMatching
+    embedding: Embedding
+
+    def snapshot(self) -> BodyState:
+        return self.model.body.snapshot()
+
+    def restore(self, state: BodyState) -> None:
+        self.model.body.restore(state)
+        self.model.update_frames()
+        self.embedding.update()
+
+    def move(self, to: np.ndarray) -> None:
+        """All particles (n, 3) to other places."""
+        self.restore(BodyState(to.astype(np.float32), np.zeros(to.shape, np.float32)))
+
+
+def embedded(mesh, margin_mm: float = 0.0) -> Embedded:
     model = tissue_of(mesh, RADIUS)
-    body = model.body
-    embedding = Embedding(model, mesh, 2 * RADIUS)
+    return Embedded(model, Embedding(model, mesh, 2 * RADIUS, margin_mm))
+
+
+def cut_of(embedding: Embedding | Unmoved, mesh, image: Callable, pixels: int, outside: str) -> Slice:
+    organ = distance_volume(mesh, 1.0)
+    return Slice(volume_of(image()), organ, PlaneInTissue(embedding, pixels), outside)
+
+
+def sliced(kept, mesh, image: Callable, move=None, pixels: int = 96, outside: str = "gel"):
+    body = kept(embedded, mesh)
     if move is not None:
-        x = move(body.rest_points).astype(np.float32)
-        body.restore(BodyState(x, np.zeros_like(x)))
-        model.update_frames()
-        embedding.update()
-    cut = Slice(volume_of(image), distance_volume(mesh, 1.0), PlaneInTissue(embedding, pixels), outside)
+        body.move(move(body.model.body.rest_points))
+    cut = kept(cut_of, body.embedding, mesh, image, pixels, outside)
     plane = oblique_plane()
     cut.plane.take(plane)
     cut.render(350.0, 40.0)
-    return cut, plane, model, embedding
+    return cut, plane, body.model, body.embedding
 
 
 @pytest.mark.parametrize("outside", ["gel", "air", "background"])
-def test_at_rest_it_is_an_oblique_resample_of_the_ct(device, ball, outside):
+def test_at_rest_it_is_an_oblique_resample_of_the_ct(kept, ball, outside):
     image = noisy_image()
-    cut, plane, _, _ = sliced(ball, image, outside=outside)
+    cut, plane, _, _ = sliced(kept, ball, noisy_image, outside=outside)
     grid = sitk.Image(96, 96, 1, sitk.sitkFloat32)
     grid.SetSpacing((plane.width_mm / 96, plane.depth_mm / 96, 1.0))
     grid.SetDirection(plane.world_from_plane[:3, :3].flatten().tolist())
@@ -102,9 +131,9 @@ def test_at_rest_it_is_an_oblique_resample_of_the_ct(device, ball, outside):
     assert (in_ball ^ inside).mean() < 0.02
 
 
-def test_under_a_rigid_motion_it_is_the_exact_pull_back(device, ball):
+def test_under_a_rigid_motion_it_is_the_exact_pull_back(kept, ball):
     turn, shift = rotation_about([1, -1, 2], 20), np.array([1.5, -1.0, 2.0])
-    cut, plane, _, _ = sliced(ball, ramp_image(), lambda x: x @ turn.T + shift)
+    cut, plane, _, _ = sliced(kept, ball, ramp_image, lambda x: x @ turn.T + shift)
     wanted = ((pixel_points(plane, 96) - shift) @ turn) @ GRADIENT
     inside = organ_mask(cut)
     assert inside.mean() > 0.3
@@ -113,10 +142,10 @@ def test_under_a_rigid_motion_it_is_the_exact_pull_back(device, ball):
 
 
 @pytest.mark.parametrize("stretch", [0.05, 0.15])
-def test_under_an_affine_deformation_it_is_the_pull_back_within_the_skins_error(device, ball, stretch):
+def test_under_an_affine_deformation_it_is_the_pull_back_within_the_skins_error(kept, ball, stretch):
     shear = np.eye(3) + stretch * np.array([[0.6, 0.5, 0.0], [0.0, -1.0, 0.3], [0.2, 0.0, 0.4]])
     shift = np.array([0.5, 0.0, -1.0])
-    cut, plane, model, embedding = sliced(ball, ramp_image(), lambda x: x @ shear.T + shift)
+    cut, plane, model, embedding = sliced(kept, ball, ramp_image, lambda x: x @ shear.T + shift)
     wanted = ((pixel_points(plane, 96) - shift) @ np.linalg.inv(shear).T) @ GRADIENT
     inside = organ_mask(cut)
     # A vertex at X goes to R X + (F - R) c, with c the weighted mean of its clusters' centres, instead of to F X: it
@@ -135,8 +164,8 @@ def test_under_an_affine_deformation_it_is_the_pull_back_within_the_skins_error(
     assert error.mean() < 0.35 * undeformed.mean()
 
 
-def test_the_picture_is_the_window(device, ball):
-    cut, _, _, _ = sliced(ball, noisy_image())
+def test_the_picture_is_the_window(kept, ball):
+    cut, _, _, _ = sliced(kept, ball, noisy_image)
     wanted = np.clip((cut.hounsfield().astype(float) - 40) / 350 + 0.5, 0, 1) * 255
     assert np.abs(cut.render(350.0, 40.0) - wanted).max() <= 0.51
 
@@ -147,8 +176,8 @@ def bent(x: np.ndarray) -> np.ndarray:
 
 # Of few pixels some that are drawn together are in the organ and others beyond all tissue; 20 are no multiple of those.
 @pytest.mark.parametrize("pixels, outside", [(96, "background"), (20, "gel")])
-def test_pixels_drawn_together_show_what_each_shows_alone(device, ball, pixels, outside):
-    cut, _, _, _ = sliced(ball, ramp_image(), bent, pixels, outside)
+def test_pixels_drawn_together_show_what_each_shows_alone(kept, ball, pixels, outside):
+    cut, _, _, _ = sliced(kept, ball, ramp_image, bent, pixels, outside)
     alone = np.zeros((pixels, pixels), np.float32)
 
     @ti.kernel
@@ -163,7 +192,7 @@ def test_pixels_drawn_together_show_what_each_shows_alone(device, ball, pixels, 
     assert np.abs(cut.hounsfield() - alone).max() < 14 * 1e-4
 
 
-def test_the_pixel_near_a_place_is_the_nearest(device):
+def test_the_pixel_near_a_place_is_the_nearest(one_device):
     plane = PlaneInTissue(Unmoved(), 24)
     plane.take(ImagePlane(np.eye(4), 30.0, 18.0, 4.0))
     places = np.random.default_rng(6).uniform([-20, -8], [20, 18], (300, 2)).astype(np.float32)
@@ -187,13 +216,13 @@ def test_the_pixel_near_a_place_is_the_nearest(device):
     assert np.array_equal(found[:, 1], np.abs(places[:, :1] - u).argmin(axis=1))
 
 
-def test_an_unknown_outside_is_refused(device, ball):
+def test_an_unknown_outside_is_refused(kept, ball):
     with pytest.raises(ValueError, match="'water'.*background, gel, air"):
-        sliced(ball, noisy_image(), outside="water")
+        sliced(kept, ball, noisy_image, outside="water")
 
 
-def test_every_pixel_finds_the_tetrahedron_that_holds_it(device, ball):
-    cut, plane, _, embedding = sliced(ball, ramp_image(), bent)
+def test_every_pixel_finds_the_tetrahedron_that_holds_it(kept, ball):
+    cut, plane, _, embedding = sliced(kept, ball, ramp_image, bent)
     vertices = embedding.skin.vertices.to_numpy().astype(float)
     corners = vertices[embedding.tetrahedron.to_numpy()]
     edges = np.moveaxis(corners[:, :3] - corners[:, 3:], 1, 2)
@@ -213,9 +242,9 @@ def test_every_pixel_finds_the_tetrahedron_that_holds_it(device, ball):
     "direction, lateral", [((0, 0, -1), (1, 0, 0)), ((0, -1, -1), (1, 0, 0)), ((1, 1, 1), (1, -1, 0))]
 )
 def test_no_pixel_falls_between_tetrahedra_where_the_plane_goes_along_their_sides(
-    device, ball, direction, lateral
+    kept, ball, direction, lateral
 ):
-    embedding = Embedding(tissue_of(ball, RADIUS), ball, 2 * RADIUS)
+    embedding = kept(embedded, ball).embedding
     vertices = embedding.skin.rest.to_numpy().astype(float)
     centre = vertices[np.linalg.norm(vertices, axis=1).argmin()]
     # Through a vertex amid the ball, with pixels on the edges: 4 mm are 8 of them.
@@ -231,11 +260,11 @@ def test_no_pixel_falls_between_tetrahedra_where_the_plane_goes_along_their_side
         assert (plane.owner.to_numpy() < embedding.count).all()
 
 
-def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(device, ball):
+def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(kept, ball):
     def folded(x):
         return x - np.column_stack([0 * x[:, 0], 0 * x[:, 0], 10.0 * (x[:, 2] > 1.0)])
 
-    cut, plane, _, embedding = sliced(ball, ramp_image(), folded)
+    cut, plane, _, embedding = sliced(kept, ball, ramp_image, folded)
     corners = embedding.skin.vertices.to_numpy().astype(float)[embedding.tetrahedron.to_numpy()]
     edges = np.moveaxis(corners[:, :3] - corners[:, 3:], 1, 2)
     # What is turned inside out is not taken: the tissue that it was squeezed into is there too.
@@ -263,22 +292,18 @@ def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(devi
 
 
 @pytest.mark.parametrize("squash", [(1, 1, 0), (1, 0, 0), (0, 0, 0), (1, 1, -1), (1, 1, 1e-6)])
-def test_flat_collapsed_and_inverted_tissue_still_gives_a_picture(device, ball, squash):
-    cut, _, _, embedding = sliced(ball, ramp_image(), lambda x: x * np.array(squash) + [0, 0, 3.0])
+def test_flat_collapsed_and_inverted_tissue_still_gives_a_picture(kept, ball, squash):
+    cut, _, _, embedding = sliced(kept, ball, ramp_image, lambda x: x * np.array(squash) + [0, 0, 3.0])
     owner = cut.plane.owner.to_numpy()
     assert ((owner >= 0) & (owner <= embedding.count)).all()
     assert np.isfinite(cut.hounsfield()).all()
 
 
-def test_what_lies_around_the_organ_gives_way_to_it_and_far_away_stays(device, ball):
+def test_what_lies_around_the_organ_gives_way_to_it_and_far_away_stays(kept, ball):
     shift = np.array([0.0, 0.0, 4.0])
-    model = tissue_of(ball, RADIUS)
-    body = model.body
-    embedding = Embedding(model, ball, 2 * RADIUS, margin_mm=25.0)
-    x = (body.rest_points + shift).astype(np.float32)
-    body.restore(BodyState(x, np.zeros_like(x)))
-    model.update_frames()
-    embedding.update()
+    body = kept(embedded, ball, margin_mm=25.0)
+    body.move(body.model.body.rest_points + shift)
+    embedding = body.embedding
     moved = embedding.skin.vertices.to_numpy() - embedding.skin.rest.to_numpy()
     away = np.linalg.norm(embedding.skin.rest.to_numpy(), axis=1) - 12.0
     assert np.abs(moved[away < 2 * RADIUS] - shift).max() < 1e-4
@@ -287,9 +312,9 @@ def test_what_lies_around_the_organ_gives_way_to_it_and_far_away_stays(device, b
     assert 0.5 < moved[between, 2].mean() < 3.5
 
 
-def test_surroundings_that_fold_over_the_organ_do_not_cover_it(device, ball):
-    embedding = Embedding(tissue_of(ball, RADIUS), ball, 2 * RADIUS, margin_mm=25.0)
-    cut = Slice(volume_of(ramp_image()), distance_volume(ball, 1.0), PlaneInTissue(embedding, 96))
+def test_surroundings_that_fold_over_the_organ_do_not_cover_it(kept, ball):
+    embedding = kept(embedded, ball, margin_mm=25.0).embedding
+    cut = cut_of(embedding, ball, ramp_image, 96, "background")
     cut.plane.take(oblique_plane())
     organ, owner = organ_mask(cut), cut.plane.owner.to_numpy()
     vertices = embedding.skin.vertices.to_numpy()
@@ -301,13 +326,13 @@ def test_surroundings_that_fold_over_the_organ_do_not_cover_it(device, ball):
     assert (cut.plane.owner.to_numpy() == owner)[organ].all()
 
 
-def test_what_does_not_move_is_shown_where_it_lies(device, ball):
-    cut = Slice(volume_of(noisy_image()), distance_volume(ball, 1.0), PlaneInTissue(Unmoved(), 96))
+def test_what_does_not_move_is_shown_where_it_lies(kept, ball):
+    cut = cut_of(Unmoved(), ball, noisy_image, 96, "background")
     plane = oblique_plane()
     cut.plane.take(plane)
     cut.render(350.0, 40.0)
     assert np.abs(cut.plane.rest_grid(96) - pixel_points(plane, 96)).max() < 1e-4
-    still, _, _, _ = sliced(ball, noisy_image(), outside="background")
+    still, _, _, _ = sliced(kept, ball, noisy_image, outside="background")
     assert np.abs(cut.hounsfield() - still.hounsfield()).max() < 0.05
 
 
@@ -326,8 +351,8 @@ def test_tetrahedra_fill_the_organ_without_gaps(ball):
         assert least.max() > -1e-9
 
 
-def test_skin_weights_fall_off_with_the_inverse_square(device, ball):
-    model = tissue_of(ball, RADIUS)
+def test_skin_weights_fall_off_with_the_inverse_square(kept, ball):
+    model = kept(embedded, ball).model
     skin = Skin(model, ball.vertices)
     frame, weight = skin.frame.to_numpy(), skin.weight.to_numpy()
     assert frame.shape[1] == 4
