@@ -1,13 +1,18 @@
-"""Of particles that touch each other, too, no bit depends on how many threads there are."""
+"""What gives the same bits although Taichi was started anew, with as many threads or another number."""
+
+import hashlib
 
 import numpy as np
 import pytest
 import taichi as ti
+from test_rehearsal import LOOK, patient_in
 from test_solver import position, solver_of
 
+from scenes.anatomy import load_anatomy
 from sim.device import start
 from sim.shapes import ConvexTool, Plane
 from sim.solver import StepSettings
+from studies.rehearsal import Rehearsal
 
 
 def pressed(mesh, threads: int, serial: bool) -> bytes:
@@ -25,4 +30,26 @@ def pressed(mesh, threads: int, serial: bool) -> bytes:
 @pytest.mark.parametrize("serial", [True, False])
 def test_pairs_give_the_same_bits_whatever_the_threads(ball, serial):
     assert pressed(ball, 1, serial) == pressed(ball, 2, serial)
+    ti.reset()
+
+
+def test_two_runs_of_a_scene_give_the_same_bits(tmp_path):
+    digests = []
+    for _ in range(2):
+        start("cpu")
+        scene, folder = patient_in("phantom", tmp_path)
+        scene = scene.model_copy(update={"press": scene.press.model_copy(update={"warm_up_steps": 20})})
+        rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
+        for step in range(20):
+            rehearsal.advance(rehearsal.scripted_pose(step / 20 * rehearsal.script_length_s()))
+        state = rehearsal.body.snapshot()
+        pictures = rehearsal.look(rehearsal.probe, *LOOK)
+        digests.append(
+            hashlib.sha256(
+                state.position.tobytes()
+                + state.velocity.tobytes()
+                + b"".join(p.tobytes() for p in pictures.values())
+            ).hexdigest()
+        )
+    assert digests[0] == digests[1]
     ti.reset()
