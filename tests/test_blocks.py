@@ -21,13 +21,13 @@ def lowest_mm(solver, settings: StepSettings) -> float:
     return float(solver.body.position.to_numpy()[:, 2].min())
 
 
-def test_a_particle_of_a_block_is_half_a_radius_thick_to_either_side(device):
+def test_a_particle_of_a_block_is_half_a_radius_thick_to_either_side(one_device):
     points = 2.0 * np.indices((3, 3, 3)).reshape(3, -1).T + [0.0, 0.0, 1.0]
     # A hundredth of a diameter: what contacts leave.
     assert lowest_mm(block_of_particles(points, 2.0, [FLOOR]), StepSettings()) == pytest.approx(0.0, abs=0.02)
 
 
-def test_a_block_of_cells_lies_on_its_nodes(device):
+def test_a_block_of_cells_lies_on_its_nodes(one_device):
     solver = block_of_cells(2, 4.0, [FLOOR])
     assert np.ptp(solver.body.rest_points, axis=0) == pytest.approx([8.0] * 3)
     assert lowest_mm(solver, replace(LATTICE_SETTINGS)) == pytest.approx(-1.0, abs=0.02)

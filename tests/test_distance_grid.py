@@ -36,7 +36,7 @@ SURFACES = {
 
 @pytest.mark.parametrize("spacing_mm", [0.7, 2.0])
 @pytest.mark.parametrize("surface", SURFACES)
-def test_distances_are_those_to_the_nearest_face(device, surface, spacing_mm):
+def test_distances_are_those_to_the_nearest_face(one_device, surface, spacing_mm):
     mesh = SURFACES[surface]
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64)
     distance, low = distance_grid(vertices, faces, spacing_mm, 8.0)

@@ -8,7 +8,7 @@ from sim.fields import field_of
 
 @pytest.mark.parametrize("within", [0, 1, 2])
 @pytest.mark.parametrize("kind", [np.float64, np.float32, np.int64, np.uint8, bool])
-def test_a_field_holds_an_array(device, kind, within):
+def test_a_field_holds_an_array(one_device, kind, within):
     values = np.random.default_rng(0).integers(0, 2 if kind is bool else 100, (5, 4, 3)).astype(kind)
     field = field_of(values, within)
     assert field.shape == values.shape[: 3 - within]
@@ -17,6 +17,6 @@ def test_a_field_holds_an_array(device, kind, within):
     assert np.array_equal(found, values)
 
 
-def test_the_order_in_memory_does_not_matter(device):
+def test_the_order_in_memory_does_not_matter(one_device):
     values = np.arange(12.0).reshape(3, 4)
     assert np.array_equal(field_of(values.T).to_numpy(), values.T)

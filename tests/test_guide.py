@@ -188,7 +188,7 @@ def drawn(lines: GuideLines, guidance: Guidance) -> tuple[np.ndarray, np.ndarray
     return segments[long], each[long, 0], more
 
 
-def test_the_lines_are_the_way_and_what_is_behind_has_another_colour(device):
+def test_the_lines_are_the_way_and_what_is_behind_has_another_colour(one_device):
     guide, lines = guide_of(), GuideLines(EDGES)
     for pose in [None, *FIRST[:3]]:
         if pose is not None:
@@ -204,7 +204,7 @@ def test_the_lines_are_the_way_and_what_is_behind_has_another_colour(device):
     assert (colours == GONE).all() and more == []
 
 
-def test_of_two_sweeps_shown_one_after_the_other_each_has_its_own_lines(device):
+def test_of_two_sweeps_shown_one_after_the_other_each_has_its_own_lines(one_device):
     """Arrays that are freed leave their identity to others."""
     lines, goal = GuideLines(EDGES), np.eye(4)
     for number in range(20):
@@ -214,7 +214,7 @@ def test_of_two_sweeps_shown_one_after_the_other_each_has_its_own_lines(device):
         del way
 
 
-def test_of_a_longer_way_than_there_are_lines_every_second_segment_is_drawn(device, monkeypatch):
+def test_of_a_longer_way_than_there_are_lines_every_second_segment_is_drawn(one_device, monkeypatch):
     monkeypatch.setattr(guide_lines, "MOST_SEGMENTS", 10)
     way = np.arange(15 * 6, dtype=float).reshape(15, 2, 3)
     gone = np.arange(15) < 7
@@ -264,7 +264,7 @@ def watching(monkeypatch, rehearsal) -> Instruments:
     return Instruments(rehearsal, Guide(rehearsal, plan_of(sweep_of(FIRST, SECOND), margin_mm=8.0)))
 
 
-def test_the_instruments_watch_the_guide_and_record_it(watching, rehearsal, device):
+def test_the_instruments_watch_the_guide_and_record_it(watching, rehearsal, one_device):
     noted: list[dict] = []
     session = SimpleNamespace(moment=0, note=lambda name, figures: noted.append(figures))
     for pose in FIRST:
@@ -281,7 +281,7 @@ def test_the_instruments_watch_the_guide_and_record_it(watching, rehearsal, devi
     assert watching.onto(view, Settings()).guidance is None and "plan_followed" not in watching.figures()
 
 
-def test_another_plan_brings_its_margin_and_what_was_seen_stays(watching, rehearsal, device):
+def test_another_plan_brings_its_margin_and_what_was_seen_stays(watching, rehearsal, one_device):
     volume = watching.coverage.targets["margin"].sum()
     watching.coverage.seen[watching.coverage.targets["tumour"]] = True
     before = watching.coverage

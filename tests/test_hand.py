@@ -198,7 +198,7 @@ def test_a_curved_face_touches_where_its_arc_does():
     assert lifted[:3, 3] - pose[:3, 3] == pytest.approx([0, 0, 5.0])
 
 
-def test_the_tool_of_a_curved_array_is_its_arc_to_a_tenth_of_a_millimetre(device):
+def test_the_tool_of_a_curved_array_is_its_arc_to_a_tenth_of_a_millimetre(one_device):
     probe = load_probe("curvilinear")
     tool = tool_of(probe)
     planes = tool.half_space.to_numpy().astype(float)

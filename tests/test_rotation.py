@@ -52,7 +52,7 @@ def rotations(values: np.ndarray, guesses: np.ndarray | None = None) -> np.ndarr
 
 
 @pytest.mark.parametrize("guess", [None, "any", "near"])
-def test_every_matrix_gets_the_proper_rotation_that_fits_best(device, guess):
+def test_every_matrix_gets_the_proper_rotation_that_fits_best(one_device, guess):
     values = matrices()
     guesses = None
     if guess == "any":
@@ -82,5 +82,5 @@ def test_every_matrix_gets_the_proper_rotation_that_fits_best(device, guess):
     assert np.abs(found - u @ vt)[unique].max() < 10 * ROUNDING
 
 
-def test_of_nothing_it_is_the_identity(device):
+def test_of_nothing_it_is_the_identity(one_device):
     assert np.array_equal(rotations(np.zeros((2, 3, 3), np.float32)), np.stack([np.eye(3)] * 2))
