@@ -5,6 +5,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from studies.results import save_figure
+
 DPI = 130
 
 
@@ -27,4 +29,4 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     panels[0].set_yticks(range(len(rows)), names)
     panels[0].invert_yaxis()
     figure.suptitle("What each feature adds; what is off adds nothing")
-    figure.savefig(path, dpi=DPI)
+    save_figure(figure, path, dpi=DPI)

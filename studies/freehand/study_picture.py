@@ -7,6 +7,8 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from studies.results import save_figure
+
 DPI = 130
 LABEL = {
     "noise_mm": "noise of the position, mm",
@@ -28,7 +30,7 @@ def draw(runs: list[dict[str, Any]], path: Path) -> None:
         _against_compression(axes, runs, figure_name)
     figure.legend(*panels[6].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
     figure.suptitle("Volumes of tracked sweeps against the truth")
-    figure.savefig(path, dpi=DPI)
+    save_figure(figure, path, dpi=DPI)
 
 
 def _against_noise(axes: Axes, runs: list[dict[str, Any]], name: str, label: str) -> None:

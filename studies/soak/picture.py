@@ -5,6 +5,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from studies.results import save_figure
+
 DPI = 130
 SHOWN = (
     ("shape_mm", "shape from the first rest (mm)"),
@@ -29,4 +31,4 @@ def draw(runs: list[dict[str, Any]], path: Path) -> None:
         axes.set_xlabel("simulated minutes")
     panels[0, 0].legend()
     figure.suptitle("An hour of rehearsal" if len(runs[0]["minutes"]) == 60 else "Rehearsal without end")
-    figure.savefig(path, dpi=DPI)
+    save_figure(figure, path, dpi=DPI)

@@ -8,6 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
+from studies.results import save_figure
+
 DPI = 130
 LEAST_MM, MOST_MM = 0.01, 100.0
 MARKS = {
@@ -34,7 +36,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         shown = _map(axes, [row for row in rows if row["model"] == model], model)
     if shown is not None:
         figure.colorbar(shown, ax=list(panels), label="distance from rest after release (mm)", shrink=0.6)
-    figure.savefig(path, dpi=DPI)
+    save_figure(figure, path, dpi=DPI)
 
 
 def _map(axes: Axes, rows: list[dict[str, Any]], model: str):
