@@ -285,7 +285,7 @@ def recorded_at(folder: Path, ball: trimesh.Trimesh) -> Recorded:
     shape = (dict(kind="mesh", file="/home/doe/table.stl"),)
     probe = dict(probe="/home/doe/probe.toml")
     numbers.scene = Scene(anatomy=files, shape=shape, tissue=dict(cell_mm=7.0), transducer=probe)
-    numbers.probe = probe_of(load_scene(EMBEDDED), EMBEDDED.parent)
+    numbers.probe = probe_of(load_scene(EMBEDDED))
     kept = record(Session(numbers), LoadedAnatomy(ball, None, None, ()), "x64", folder)
     lead(Live(kept.session, Ladder(1e6), kept), 30, 0)
     kept.close({})

@@ -30,7 +30,7 @@ from studies.surfaces import moved_by
 from studies.timing.measure import memory_mb
 from ultrasound.hand import advanced, between, image_plane, pose_at, touching
 from ultrasound.probe import Mode, Rung
-from ultrasound.scanner import Anatomy, Scanner
+from ultrasound.scanner import ScannedAnatomy, Scanner
 
 # A press so deep, in so many steps; those before it settle.
 PRESS_MM, PRESS_STEPS, SETTLE_STEPS = 8.0, 60, 30
@@ -212,7 +212,7 @@ def of_frame(scene: Scene, anatomy: LoadedAnatomy, arch: str) -> Iterator[dict[s
     yield _whole_frame(rehearsal)
 
 
-def _pictures(rehearsal: Rehearsal, scanned: Anatomy) -> Iterator[dict[str, Any]]:
+def _pictures(rehearsal: Rehearsal, scanned: ScannedAnatomy) -> Iterator[dict[str, Any]]:
     """The rungs of the picture's ladder, each with all that it needs."""
     image, probe = rehearsal.scene.image, rehearsal.probe
     plane = image_plane(rehearsal.pose_at_depth(1.0), probe.housing_mm[2], *probe.extent_mm)
