@@ -23,7 +23,7 @@ from scenes.reading.labels import LabelMap
 from scenes.reading.progress import Told, untold
 from scenes.reading.volume import Volume
 from scenes.scene import (
-    Anatomy,
+    AnatomyFiles,
     Attachment,
     DistanceShape,
     Image,
@@ -89,12 +89,12 @@ def load_anatomy(scene: Scene, folder: Path, told: Told = untold) -> LoadedAnato
     )
 
 
-def files_of(scene: Scene, folder: Path, told: Told = untold) -> tuple[Path, Anatomy]:
+def files_of(scene: Scene, folder: Path, told: Told = untold) -> tuple[Path, AnatomyFiles]:
     """A scene's files and the folder that they are in: its own, or the embedded patient's. Raises SceneError."""
     if not scene.anatomy.phantom:
         return folder, scene.anatomy
     parts = {tissue: f"{PARTS[tissue]}.stl" for tissue in PHANTOM_PARTS}
-    return phantom_folder(told), Anatomy(
+    return phantom_folder(told), AnatomyFiles(
         tumour="tumour.stl", parts=parts, ct="ct.nrrd", labels="labels.nrrd", tissues=PHANTOM_TISSUES
     )
 
@@ -146,7 +146,7 @@ def patient_scene(patient: Patient) -> Scene:
     return Scene(
         image=Image(window_hu=brightest - darkest, level_hu=(brightest + darkest) / 2),
         title=f"{patient.side.capitalize()} kidney{' (draft)' if patient.draft else ''}",
-        anatomy=Anatomy.model_validate(
+        anatomy=AnatomyFiles.model_validate(
             dict(
                 tumour=tumour,
                 parts={tissue: f"{PARTS[tissue]}.stl" for tissue in patient.parts if tissue != "tumour"},
@@ -219,7 +219,7 @@ def _grid(folder: Path, name: str) -> Grid:
     )
 
 
-def _labels(folder: Path, anatomy: Anatomy) -> Grid | None:
+def _labels(folder: Path, anatomy: AnatomyFiles) -> Grid | None:
     """The label map, on the CT's grid."""
     if anatomy.labels is None or anatomy.ct is None:
         return None

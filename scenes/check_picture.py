@@ -32,7 +32,7 @@ COLOUR = {
     "cyst": "#4dd2ff",
     "urine": "#b6ff6b",
     "vessel": "#ff3b5c",
-    "support": "#9a9a9a",
+    "support": "#b99cff",
 }
 WORD = {"organ": "kidney", "urine": "collecting system", "vessel": "vessels"}
 LEAST_BRIGHT = 0.85
@@ -46,6 +46,10 @@ LETTER: dict[str, Any] = dict(
     path_effects=[withStroke(linewidth=3, foreground="black")],
 )
 LIGHT = np.array([-0.4, -0.8, 0.45])  # from the front, the patient's right and above
+# From where surfaces are looked at, and to which side of the patient their light is turned.
+AZIMUTH = {"from the front": (-105, np.ones(3)), "from behind": (75, np.array([-1.0, -1.0, 1.0]))}
+# An overview is worth a panel that shows so many times the width.
+WIDER = 1.2
 
 
 @dataclass(frozen=True)
@@ -84,8 +88,11 @@ def draw_check(patient: Patient, rows: list[tuple[str, str]], folder: Path) -> N
     around = {"support": patient.support, **surfaces}
     for n, view in enumerate(VIEWS):
         _draw_cut(figure.add_subplot(grid[0, n]), view, patient.ct, around, middle, colours)
-    _draw_surfaces(figure.add_subplot(grid[1, 0], projection="3d", facecolor=BACKGROUND), surfaces, colours)
-    _draw_cut(figure.add_subplot(grid[1, 1]), WHOLE, patient.overview, surfaces, middle, colours)
+    _draw_surfaces(_solid(figure, grid[1, 0]), "from the front", surfaces, colours)
+    if is_wider(patient.overview, patient.ct):
+        _draw_cut(figure.add_subplot(grid[1, 1]), WHOLE, patient.overview, surfaces, middle, colours)
+    else:
+        _draw_surfaces(_solid(figure, grid[1, 1]), "from behind", surfaces, colours)
     words = figure.add_subplot(grid[1, 2])
     words.axis("off")
     _draw_words(words, rows, {name: colours[name] for name in [*surfaces, "support"]})
@@ -125,9 +132,7 @@ def _draw_cut(
     for name, surface in surfaces.items():
         section = surface.section(np.cross(right, down), middle)
         for line in [] if section is None else section.discrete:
-            axes.plot(
-                line @ right, line @ down, color=colours[name], linewidth=1.4 if name != "support" else 0.8
-            )
+            axes.plot(line @ right, line @ down, color=colours[name], linewidth=1.4)
     axes.set(xlim=extent[:2], ylim=extent[2:], xticks=[], yticks=[])
     axes.set_title(view.name, color="white", fontsize=11)
     for letter, place in zip(view.letters, ((0.03, 0.5), (0.97, 0.5), (0.5, 0.97), (0.5, 0.03)), strict=True):
@@ -146,11 +151,26 @@ def cut(
     return plane.sampled(image, sitk.sitkLinear, AIR_HU)[0]
 
 
-def _draw_surfaces(axes: Any, surfaces: dict[str, trimesh.Trimesh], colours: dict[str, Colour]) -> None:
-    """The surfaces from the front, a little from the patient's right and above."""
+def is_wider(overview: sitk.Image, ct: sitk.Image) -> bool:
+    """Whether an overview shows more of the body's width than a CT that was cut out of it."""
+    width_mm, shown_mm = (
+        np.ptp([corner[0] for corner in VoxelGrid.of(each).bounds()]) for each in (overview, ct)
+    )
+    return bool(width_mm > WIDER * shown_mm)
+
+
+def _solid(figure: Figure, place: Any) -> Any:
+    return figure.add_subplot(place, projection="3d", facecolor=BACKGROUND)
+
+
+def _draw_surfaces(
+    axes: Any, view: str, surfaces: dict[str, trimesh.Trimesh], colours: dict[str, Colour]
+) -> None:
+    """The surfaces from the front or from behind, a little from aside and above."""
+    azimuth_deg, towards = AZIMUTH[view]
     corners = np.concatenate([surface.bounds for surface in surfaces.values()])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    light = LIGHT / np.linalg.norm(LIGHT)
+    light = towards * LIGHT / np.linalg.norm(LIGHT)
     for name, surface in reversed(surfaces.items()):
         shade = 0.35 + 0.65 * np.clip(surface.face_normals @ light, 0, 1)
         opacity = 0.45 if name == "organ" and len(surfaces) > 1 else 1.0
@@ -161,9 +181,9 @@ def _draw_surfaces(axes: Any, surfaces: dict[str, trimesh.Trimesh], colours: dic
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.set_box_aspect(high - low, zoom=1.1)
     axes.set_proj_type("ortho")
-    axes.view_init(elev=12, azim=-105)
+    axes.view_init(elev=12, azim=azimuth_deg)
     axes.set_axis_off()
-    axes.set_title("surface, from the front", color="white", fontsize=11, y=1.12)
+    axes.set_title(f"surface, {view}", color="white", fontsize=11, y=1.12)
     x, y, z = (low + high) / 2
     gap = 0.09 * (high - low).max()
     for letter, place in {

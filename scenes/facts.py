@@ -1,6 +1,7 @@
 """What an import found, in the words of the terminal and of the checking picture. No name, date or path."""
 
-from scenes.parts import PARTS
+from scenes.organ import INNER
+from scenes.parts import PARTS, PEDICLE_MM
 from scenes.patient import Patient
 
 DRAFT = "grown from a seed and drawn by nobody: check every outline in check.png"
@@ -21,7 +22,8 @@ def facts(patient: Patient) -> list[tuple[str, str]]:
     for tissue, name in PARTS.items():
         word = name.replace("-system", "")
         if tissue in patient.parts:
-            rows.append((word, f"{volumes[tissue]:.1f} ml, {len(patient.parts[tissue].faces)} faces"))
+            where = f", as labelled, {PEDICLE_MM:g} mm from the organ at most" if tissue in INNER else ""
+            rows.append((word, f"{volumes[tissue]:.1f} ml, {len(patient.parts[tissue].faces)} faces{where}"))
         elif tissue == "tumour":
             rows.append((word, "none labelled as one"))
     rows.append(("support", f"{len(patient.support.faces)} faces, for a patient lying supine"))

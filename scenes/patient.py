@@ -96,25 +96,14 @@ def import_patient(
     Raises:
         PatientError: one line that says what was found, what was expected and what to do.
     """
-    if not margin_mm >= 0:
-        raise PatientError(f"the margin is {margin_mm} mm: expected 0 or more")
-    pieces = organs(labels, organ)
-    slab, hounsfield = _level(ct, pieces, margin_mm)
-    heights = np.concatenate([piece.grid.corners()[:, 2] for piece in pieces])
-    midline = midline_x(ct.grid.part(slab), hounsfield, heights.min(), heights.max())
-    piece, told_side = single_out(pieces, midline, side)
-    check_volume(piece)
-    _check_overlap(ct.grid, piece)
-    grid, voxels = _cropped(ct.grid, slab, hounsfield, piece, margin_mm)
-    on_ct = nearest(piece.grid, piece.mask, grid)
-    _check_place(ct.grid, grid, on_ct, voxels, piece)
-    marks, tissues = _marks(labels, piece, grid, on_ct)
+    at = _located(ct, labels, organ, side, margin_mm)
+    piece = at.piece
+    marks, tissues = _marks(labels, piece, at.grid, at.on_ct)
     warned = (
-        *turned(ct.grid.part(slab), hounsfield, labels, midline),
-        *in_fat(grid, voxels, on_ct, marks == tissue_codes([])["kidney"]),
+        *turned(at.level, at.level_hu, labels, at.midline),
+        *in_fat(at.grid, at.hounsfield, at.on_ct, marks == tissue_codes([])["kidney"]),
         *taken(labels, piece, organ is not None),
     )
-
     found = parts_of(labels, piece, needed)
     with surfaces_aside(found) as parts_made:
         surface = organ_surface(piece)
@@ -122,20 +111,54 @@ def import_patient(
         bed = _support(support, surface, labels, piece)
         parts = parts_made(progress)
     return Patient(
-        ct=grid.image(voxels),
-        labels=grid.image(marks),
+        ct=at.grid.image(at.hounsfield),
+        labels=at.grid.image(marks),
         tissues=tissues,
         organ=surface,
         parts=parts,
         support=bed,
-        side=told_side,
+        side=at.side,
         volumes_ml={"organ": piece.volume_ml, **{part: volume_ml(*found[part]) for part in parts}},
-        overview=_overview(ct.grid.part(slab), hounsfield),
-        spacing_mm=tuple(grid.spacing.tolist()),
+        overview=_overview(at.level, at.level_hu),
+        spacing_mm=tuple(at.grid.spacing.tolist()),
         notes=ct.notes,
         cautions=warned,
         colours=colours_of_labels(labels, [*parts]),
     )
+
+
+@dataclass(frozen=True)
+class _Located:
+    """An organ in its CT: ``level`` is the CT at the height of all organs, ``grid`` the part around this one, each with its HU."""
+
+    piece: Organ
+    side: Side
+    midline: float | None
+    level: VoxelGrid
+    level_hu: np.ndarray
+    grid: VoxelGrid
+    hounsfield: np.ndarray
+    on_ct: np.ndarray  # which voxels of that part are the organ
+
+
+def _located(
+    ct: Volume, labels: LabelMap, organ: Sequence[int] | None, side: Side | None, margin_mm: float
+) -> _Located:
+    """The one organ that is asked for, whole and in soft tissue. Raises PatientError."""
+    if not margin_mm >= 0:
+        raise PatientError(f"the margin is {margin_mm} mm: expected 0 or more")
+    pieces = organs(labels, organ)
+    slab, level_hu = _level(ct, pieces, margin_mm)
+    level = ct.grid.part(slab)
+    heights = np.concatenate([piece.grid.corners()[:, 2] for piece in pieces])
+    midline = midline_x(level, level_hu, heights.min(), heights.max())
+    piece, told_side = single_out(pieces, midline, side)
+    check_volume(piece)
+    _check_overlap(ct.grid, piece)
+    grid, hounsfield = _cropped(ct.grid, slab, level_hu, piece, margin_mm)
+    on_ct = nearest(piece.grid, piece.mask, grid)
+    _check_place(ct.grid, grid, on_ct, hounsfield, piece)
+    return _Located(piece, told_side, midline, level, level_hu, grid, hounsfield, on_ct)
 
 
 def _support(kind: str, organ: trimesh.Trimesh, labels: LabelMap, piece: Organ) -> trimesh.Trimesh:

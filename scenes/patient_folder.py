@@ -17,7 +17,7 @@ import SimpleITK as sitk
 from scenes.parts import PARTS
 from scenes.patient import Patient
 from scenes.reading.error import PatientError
-from scenes.scene import Anatomy, Scene, scene_text
+from scenes.scene import AnatomyFiles, Scene, scene_text
 from scenes.surface_files import STL_HEADER_BYTES, save_surface
 from scenes.volume_files import save_image
 from scenes.whole_files import whole
@@ -119,7 +119,7 @@ def telling(text: str) -> bool:
 
 @cache
 def _common_words() -> frozenset[str]:
-    written = scene_text(Scene(anatomy=Anatomy(phantom=True))) + COMMON
+    written = scene_text(Scene(anatomy=AnatomyFiles(phantom=True))) + COMMON
     return frozenset(re.findall(r"[^\W\d]+", written.lower().replace("_", " ")))
 
 

@@ -4,7 +4,6 @@ Lengths are mm in patient coordinates (LPS), times s, angles degrees. ``load_sce
 other than the schema's, and values out of range, each by name.
 """
 
-import difflib
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -16,6 +15,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from scenes.section import Direction, Length, Section, Vector3
 from scenes.tissue import TISSUES, NeoHookeanTissue, Tissue
 from scenes.trocar import Trocar
+from validation import explained, meant
 
 # The scene that the program has with it.
 EMBEDDED = Path(__file__).parent / "phantom.toml"
@@ -41,7 +41,7 @@ class SceneError(ValueError):
     """A scene that cannot be used; the message is one line that says where, what was found and what to do."""
 
 
-class Anatomy(Section):
+class AnatomyFiles(Section):
     """The embedded patient, or files beside the scene; without a CT there is no picture.
 
     ``parts`` are surfaces of what else is in the organ, by tissue. ``tissues`` says what each value of ``labels`` is for sound: a tissue of ``ultrasound/tissues.toml``.
@@ -56,7 +56,7 @@ class Anatomy(Section):
     tissues: dict[Annotated[str, Field(pattern=r"^[1-9]\d*$")], str] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _one_patient(self) -> "Anatomy":
+    def _one_patient(self) -> "AnatomyFiles":
         named = (
             self.tumour or self.parts or self.ct or self.labels or self.tissues or self.organ != "organ.stl"
         )
@@ -180,7 +180,7 @@ class Scene(Section):
     """A whole scene. ``shape`` lists what does not move: the support first."""
 
     title: str = ""
-    anatomy: Anatomy
+    anatomy: AnatomyFiles
     tissue: Tissue = NeoHookeanTissue()
     solver: SolverSection = SolverSection()
     gravity: Gravity = Gravity()
@@ -218,7 +218,9 @@ def scene_file(named: Path) -> Path:
 
 
 def load_scene(path: Path) -> Scene:
-    """Read a scene file. Raises SceneError with one line that names the file, the key and the mend."""
+    """Read a scene file; a probe's file is named by its whole path. Raises SceneError with one line that names the file, the key and
+    the mend.
+    """
     try:
         values = tomllib.loads(path.read_text("utf-8"))
     except FileNotFoundError:
@@ -230,9 +232,18 @@ def load_scene(path: Path) -> Scene:
     except tomllib.TOMLDecodeError as error:
         raise SceneError(f"{path}: not valid TOML: {_first_line(error)}") from None
     try:
-        return Scene.model_validate(values)
+        return _with_probe_beside(path, Scene.model_validate(values))
     except ValidationError as error:
         raise SceneError(f"{path}: {_explain(error)}") from None
+
+
+def _with_probe_beside(path: Path, scene: Scene) -> Scene:
+    """A scene that names its probe's file from anywhere; probes that come with the program have names without a suffix."""
+    named = path.parent / scene.transducer.probe
+    if not named.suffix:
+        return scene
+    transducer = scene.transducer.model_copy(update={"probe": str(named.resolve())})
+    return scene.model_copy(update={"transducer": transducer})
 
 
 def with_options(scene: Scene, options: Mapping[str, float | int | str | None]) -> Scene:
@@ -275,25 +286,12 @@ def scene_text(scene: Scene) -> str:
 
 
 def _explain(error: ValidationError) -> str:
-    problems = error.errors(include_url=False)
-    # A key that is missing under one spelling and unknown under another is one mistake: name the unknown one.
-    problems.sort(key=lambda problem: problem["type"] != "extra_forbidden")
-    first = problems[0]
-    where = [str(part) for part in first["loc"] if part not in ("plane", "mesh", "sdf")]
-    name = ".".join(where)
-    if first["type"] == "extra_forbidden":
-        owner = _owner(where)
-        text = f"{name}: {owner}" if owner else f"{name}: unknown key; {_suggest(where)}"
-    elif first["type"] == "value_error" and not name:
-        text = str(first["ctx"]["error"])
-    elif first["type"] == "unknown_model":
-        text = f"{name}.model = {first['input'].get('model')!r}: {first['msg']}"
-    elif first["type"] == "missing":
-        text = f"{name}: missing"
-    else:
-        text = f"{name} = {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}"
-    more = len(problems) - 1
-    return text + (f" (and {more} more)" if more else "")
+    return explained(error, _unknown, tags=("plane", "mesh", "sdf"))
+
+
+def _unknown(where: list[str]) -> str:
+    """What is to be done about a key that is unknown here."""
+    return _owner(where) or f"unknown key; {_suggest(where)}"
 
 
 def _owner(where: list[str]) -> str:
@@ -308,14 +306,12 @@ def _suggest(where: list[str]) -> str:
     """What the writer of an unknown key may have meant; a unit other than the schema's is named as such."""
     known = _keys_beside(where)
     key = where[-1]
-    stem = key.split("_")[0]
     for name in known:
         if name != key and key.startswith(_quantity(name)) and _quantity(name) != name:
             return f"the unit is in the key: write {name}"
     if where == ["image", "width_mm"]:
         return "the picture is as wide as the probe's array (TransducerWidthMm in its file): leave this out"
-    close = difflib.get_close_matches(key, known, n=1) or [name for name in known if name.startswith(stem)]
-    return f"did you mean {close[0]}?" if close else f"known here: {', '.join(known)}"
+    return meant(key, known)
 
 
 def _quantity(name: str) -> str:

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import BeforeValidator, Field, SerializeAsAny
-from pydantic_core import PydanticCustomError
 
 from scenes.section import Section
 
@@ -105,7 +104,7 @@ def _of_its_model(values: Any) -> Any:
         return values
     name = values.get("model", USUAL)
     if not isinstance(name, str) or name not in TISSUES:
-        raise PydanticCustomError("unknown_model", f"the model should be one of {', '.join(TISSUES)}")
+        raise ValueError(f"tissue.model = {name!r}: the model should be one of {', '.join(TISSUES)}")
     return TISSUES[name].model_validate(values)
 
 

@@ -19,6 +19,7 @@ from scenes.reading.error import PatientError
 from scenes.section import Direction, Vector3
 from scenes.surface_files import load_surface
 from sim.distance import signed_distance
+from validation import explained
 
 UNITS = ("_mm", "_kPa")
 # Between the nominal indentation and where the probe was found.
@@ -223,19 +224,7 @@ def _read_file(folder: Path) -> CaseFile:
     except (OSError, UnicodeDecodeError) as error:
         raise CaseError(f"{path}: cannot be read ({error}); expected TOML in UTF-8") from None
     except ValidationError as error:
-        raise CaseError(f"{path}: {_explain(error)}") from None
-
-
-def _explain(error: ValidationError) -> str:
-    """The first problem: the field, what was found, what was expected."""
-    first = error.errors(include_url=False)[0]
-    name = ".".join(str(part) for part in first["loc"])
-    message = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "missing":
-        return f"{name}: missing; add it"
-    if first["type"] == "value_error" and isinstance(first["input"], dict):
-        return f"{name}: {message}" if name else message
-    return f"{name} = {first['input']!r}: {message[0].lower()}{message[1:]}; correct it"
+        raise CaseError(f"{path}: {explained(error)}; correct it there") from None
 
 
 def _surface(folder: Path, name: str) -> trimesh.Trimesh:

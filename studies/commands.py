@@ -182,14 +182,14 @@ def calibrate(
 def write_calibration(found: "Calibration", out: Path, searched: bool) -> None:
     """Tables and pictures into a folder, and what matters of them on the terminal."""
     from studies import figures
-    from studies.tables import summary_of, tables_of, write_json
+    from studies.tables import summary_of, tables_of, write_calibration
 
     tables = tables_of(found)
     for table in tables:
         table.write_csv(out)
         figures.write_table(table, out / f"{table.name}.png")
         click.echo(f"\n{table.text()}")
-    write_json(found, tables, out / "calibration.json")
+    write_calibration(found, tables, out / "calibration.json")
     figures.write_figure5(found, out / "figure5.png")
     if searched:
         figures.write_search(found, out / "search.png")

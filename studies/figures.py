@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
 from studies.calibration import TALLEST, Calibration, Trial, quartic
+from studies.results import save_figure
 from studies.tables import Table
 
 DPI = 130
@@ -30,7 +31,7 @@ def write_figure4(calibration: Calibration, path: Path) -> None:
             left.plot(fit.stiffness, fit.error_mm, "o", color=colour, markersize=9, fillstyle="none")
     right.axhline(calibration.null_mm(), color="0.4", linestyle="--", label="no motion at all")
     _both(calibration, left, right, "stiffness α")
-    figure.savefig(path, dpi=DPI, bbox_inches="tight")
+    save_figure(figure, path, dpi=DPI, bbox_inches="tight")
 
 
 def write_search(calibration: Calibration, path: Path) -> None:
@@ -46,7 +47,7 @@ def write_search(calibration: Calibration, path: Path) -> None:
         right.plot([trial.held_out_mm for trial in best], color=colour, drawstyle="steps-post")
     right.axhline(calibration.null_mm(), color="0.4", linestyle="--", label="no motion at all")
     _both(calibration, left, right, "setups tried")
-    figure.savefig(path, dpi=DPI, bbox_inches="tight")
+    save_figure(figure, path, dpi=DPI, bbox_inches="tight")
 
 
 def best_so_far(trials: list[Trial]) -> list[Trial]:
@@ -70,7 +71,7 @@ def write_figure5(calibration: Calibration, path: Path) -> None:
         axes.set(xlabel="particle radius (mm)", ylabel=what, ylim=(0, None))
         axes.grid(alpha=0.3)
         axes.legend()
-    figure.savefig(path, dpi=DPI, bbox_inches="tight")
+    save_figure(figure, path, dpi=DPI, bbox_inches="tight")
 
 
 def write_table(table: Table, path: Path) -> None:
@@ -89,7 +90,7 @@ def write_table(table: Table, path: Path) -> None:
         cell.set_linewidth(0.3)
         cell.set_text_props(ha="left", weight="bold" if row == 0 else "normal")
     axes.set_title(table.title, fontsize=10)
-    figure.savefig(path, dpi=DPI, bbox_inches="tight")
+    save_figure(figure, path, dpi=DPI, bbox_inches="tight")
 
 
 def _both(calibration: Calibration, left: Axes, right: Axes, across: str) -> None:

@@ -36,7 +36,7 @@ from ultrasound.hand import (
 from ultrasound.outline import section
 from ultrasound.plane import ImagePlane
 from ultrasound.probe import Mode, Probe, Rung
-from ultrasound.scanner import Anatomy, Scanner
+from ultrasound.scanner import ScannedAnatomy, Scanner
 
 TURN_DEG_S = 180.0
 AWAY_MM = 200.0
@@ -295,11 +295,13 @@ def _shrunk(mesh: trimesh.Trimesh, by_mm: float) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices - by_mm * mesh.vertex_normals, mesh.faces, process=False)
 
 
-def scanned_anatomy(organ: trimesh.Trimesh, ct: Grid, anatomy: LoadedAnatomy, origin: np.ndarray) -> Anatomy:
+def scanned_anatomy(
+    organ: trimesh.Trimesh, ct: Grid, anatomy: LoadedAnatomy, origin: np.ndarray
+) -> ScannedAnatomy:
     """What there is to scan, with an origin that the organ has already been moved to."""
     labels = anatomy.labels
     shift = np.eye(4)
     shift[:3, 3] = origin
     marks = None if labels is None else labels.voxels.astype(np.int32)
     tumour = anatomy.tumour and moved_by(anatomy.tumour, -origin)
-    return Anatomy(organ, ct.voxels, ct.index_from_mm @ shift, marks, anatomy.tissues, tumour)
+    return ScannedAnatomy(organ, ct.voxels, ct.index_from_mm @ shift, marks, anatomy.tissues, tumour)

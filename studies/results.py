@@ -3,9 +3,14 @@
 import csv
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from scenes.whole_files import whole
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def rounded(value: float | None) -> float | None:
@@ -27,13 +32,21 @@ def counted(number: int, name: str) -> str:
 
 def write_json(figures: dict[str, Any], path: Path) -> None:
     """Write figures as JSON. Raises ValueError for a number that JSON has none for, OSError."""
-    path.write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", "utf-8")
+    text = json.dumps(figures, indent=2, allow_nan=False) + "\n"
+    with whole(path) as partial:
+        partial.write_text(text, "utf-8")
 
 
 def write_csv(rows: list[dict[str, Any]], path: Path) -> None:
     """Write a line a row under all names that rows have, in their order; a row without one leaves it empty. Raises OSError."""
     names = dict.fromkeys(name for row in rows for name in row)
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with whole(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         lines = csv.DictWriter(file, list(names))
         lines.writeheader()
         lines.writerows(rows)
+
+
+def save_figure(figure: "Figure", path: Path, **options: Any) -> None:
+    """Write a figure with Matplotlib's options. Raises OSError."""
+    with whole(path) as partial:
+        figure.savefig(partial, **options)

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import Any
 
 from scenes.scene import OPTIONS, Scene, with_options
@@ -98,11 +97,8 @@ def choose_setup(model: str, quality: str, **changes: Any) -> Setup:
     )
 
 
-def probe_of(scene: Scene, folder: Path | None = None) -> Probe:
-    """The probe that a scene names, with the scene's own depth and housing where it gives them. Raises ProbeError.
-
-    A file is looked for in a folder, the scene's.
-    """
+def probe_of(scene: Scene) -> Probe:
+    """The probe that a scene names, with the scene's own depth and housing where it gives them. Raises ProbeError."""
     own = {"depth_mm": scene.image.depth_mm, "housing_mm": scene.transducer.size_mm}
     given = {key: value for key, value in own.items() if value is not None}
-    return load_probe(scene.transducer.probe, folder).model_copy(update=given)
+    return load_probe(scene.transducer.probe).model_copy(update=given)

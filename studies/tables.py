@@ -1,15 +1,15 @@
 """What a calibration found, as the paper's Tables 2 to 5: text for the terminal, CSV, and JSON with all trials."""
 
 import csv
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from scenes.whole_files import whole
 from studies.calibration import Calibration, Trial, quartic
-from studies.results import rounded, spread
+from studies.results import rounded, spread, write_json
 
 FIT, HELD_OUT = "fit", "held out"
 Row = list[float | None]
@@ -51,7 +51,10 @@ class Table:
         if self.shares:
             columns += [f"{radius:g} mm, % of travel" for radius in self.radii_mm]
             rows = [row + shares for row, shares in zip(rows, self.shares, strict=True)]
-        with (folder / f"{self.name}.csv").open("w", newline="", encoding="utf-8") as file:
+        with (
+            whole(folder / f"{self.name}.csv") as partial,
+            partial.open("w", newline="", encoding="utf-8") as file,
+        ):
             csv.writer(file).writerows([columns, *rows])
 
 
@@ -101,7 +104,7 @@ def summary_of(calibration: Calibration) -> str:
     return "\n".join([*lines, "The fit is no accuracy: what was not fitted on is the column held out."])
 
 
-def write_json(calibration: Calibration, tables: list[Table], path: Path) -> None:
+def write_calibration(calibration: Calibration, tables: list[Table], path: Path) -> None:
     """Everything in one file: the split, every trial, the fits and the tables."""
     split = calibration.split
     found = dict(
@@ -112,7 +115,7 @@ def write_json(calibration: Calibration, tables: list[Table], path: Path) -> Non
         radii=[_radius(calibration, radius) for radius in calibration.trials],
         tables=[asdict(table) for table in tables],
     )
-    path.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n", "utf-8")
+    write_json(found, path)
 
 
 def _radius(calibration: Calibration, radius: float) -> dict:

@@ -6,7 +6,7 @@ import trimesh
 
 from scenes.anatomy import LoadedAnatomy, load_anatomy, phantom_folder
 from scenes.hilum import hilum
-from scenes.scene import PAPER, Anatomy, Attachment, Scene, SceneError, load_scene, with_options
+from scenes.scene import PAPER, AnatomyFiles, Attachment, Scene, SceneError, load_scene, with_options
 from sim.sampling import SamplingError
 from studies.rehearsal import Rehearsal
 
@@ -17,7 +17,7 @@ def hanging(radius_mm: float, at=AT) -> Rehearsal:
     """A ball that lies on nothing: without an attachment it falls."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=15.0)
     scene = Scene(
-        anatomy=Anatomy(),
+        anatomy=AnatomyFiles(),
         attachment=Attachment(at_mm=at, radius_mm=radius_mm),
         press={"warm_up_steps": 0},
     )

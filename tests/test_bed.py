@@ -24,17 +24,12 @@ def ct_and_labels():
 
 
 @pytest.fixture(scope="module")
-def mould(ct_and_labels):
+def patient(ct_and_labels):
     ct, labels = ct_and_labels
-    return import_patient(ct, LabelMap.of(labels, NAMES), margin_mm=10.0)
+    return import_patient(ct, LabelMap.of(labels, NAMES), margin_mm=10.0, support="labels")
 
 
 class TestBedOfLabels:
-    @pytest.fixture(scope="class")
-    def patient(self, ct_and_labels):
-        ct, labels = ct_and_labels
-        return import_patient(ct, LabelMap.of(labels, NAMES), margin_mm=10.0, support="labels")
-
     def test_lies_on_the_muscle_with_the_fat_between(self, patient):
         assert_sound(patient.support)
         assert 0 < least_gap(patient.support, patient.organ) < 1.0
@@ -54,21 +49,21 @@ class TestBedOfLabels:
         off = np.abs(level(beside, MUSCLE)) * MUSCLE[1].min()
         assert np.percentile(off, 90) < 2.5  # a voxel
 
-    def test_nothing_under_the_organ(self, ct_and_labels, mould):
+    def test_nothing_under_the_organ(self, ct_and_labels, patient):
         _, labels = ct_and_labels
         aside = drawn(labels, (4, (MUSCLE[0] - [60, 0, 0], MUSCLE[1])), (2, LEFT), (3, TUMOUR))
         with pytest.raises(PatientError, match=r"lies under \d+% of the organ: expected 50% or more"):
-            bed_of_labels(mould.organ, LabelMap.of(aside, NAMES), [2, 3], SUPINE_GRAVITY)
+            bed_of_labels(patient.organ, LabelMap.of(aside, NAMES), [2, 3], SUPINE_GRAVITY)
 
-    def test_ends_at_half_of_the_organs_height(self, ct_and_labels, mould):
+    def test_ends_at_half_of_the_organs_height(self, ct_and_labels, patient):
         """Though tissue goes on around it; less what the rounded rim takes."""
         around = drawn(ct_and_labels[1], (4, (LEFT[0], LEFT[1] + 30)), (2, LEFT), (3, TUMOUR))
-        bed = bed_of_labels(mould.organ, LabelMap.of(around, NAMES), [2, 3], SUPINE_GRAVITY)
-        assert 0 <= bed.bounds[0, 1] - mould.organ.bounds[:, 1].mean() < 4
+        bed = bed_of_labels(patient.organ, LabelMap.of(around, NAMES), [2, 3], SUPINE_GRAVITY)
+        assert 0 <= bed.bounds[0, 1] - patient.organ.bounds[:, 1].mean() < 4
 
 
 class TestBedOfFile:
-    def test_is_taken_as_it_is(self, ct_and_labels, mould, tmp_path):
+    def test_is_taken_as_it_is(self, ct_and_labels, patient, tmp_path):
         ct, labels = ct_and_labels
         slab = trimesh.creation.box([80.0, 10.0, 120.0])
         slab.apply_translation([70.0, LEFT[0][1] + LEFT[1][1] + 6.0, 12.0])
@@ -77,9 +72,9 @@ class TestBedOfFile:
             ct, LabelMap.of(labels, NAMES), margin_mm=10.0, support=str(tmp_path / "slab.stl")
         )
         np.testing.assert_allclose(again.support.bounds, slab.bounds, atol=1e-4)
-        assert np.array_equal(again.organ.vertices, mould.organ.vertices)
+        assert np.array_equal(again.organ.vertices, patient.organ.vertices)
 
-    def test_what_is_no_support(self, mould, tmp_path):
+    def test_what_is_no_support(self, patient, tmp_path):
         inside, far, open_ = (trimesh.creation.box([40.0, 40.0, 40.0]) for _ in range(3))
         inside.apply_translation(LEFT[0])
         far.apply_translation([-300.0, 0, 0])
@@ -96,7 +91,7 @@ class TestBedOfFile:
             ("absent", "no such file"),
         ]:
             with pytest.raises(PatientError, match=words) as caught:
-                bed_of_file(tmp_path / f"{name}.stl", mould.organ)
+                bed_of_file(tmp_path / f"{name}.stl", patient.organ)
             assert "\n" not in str(caught.value) and f"{name}.stl" in str(caught.value)
 
 

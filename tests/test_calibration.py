@@ -4,6 +4,7 @@ import csv
 import json
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,14 +36,16 @@ from studies.workers import Measured, WorkerError, dask_workers, local_workers
 BEST = {3.0: 0.62, 4.0: 0.33}
 
 
-@pytest.fixture
-def cases(tmp_path) -> list[Case]:
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory) -> list[Path]:
     """Two experiments that differ in what was measured."""
-    places = beads()
-    return [
-        load_case(write_case(tmp_path / name, places=places * scale))
-        for name, scale in (("a", 1.0), ("b", [1, 1, 0.9]))
-    ]
+    place, scales = tmp_path_factory.mktemp("cases"), {"a": 1.0, "b": [1, 1, 0.9]}
+    return [write_case(place / name, places=beads() * scale) for name, scale in scales.items()]
+
+
+@pytest.fixture(scope="module")
+def cases(folders) -> list[Case]:
+    return [load_case(folder) for folder in folders]
 
 
 def pretended(case: Case, setup: Setup) -> Measured:
@@ -133,12 +136,11 @@ def pretended_workers(jobs=None):
 
 
 @pytest.mark.parametrize("searched", [False, True])
-def test_calibrate_leaves_tables_pictures_and_json(monkeypatch, cases, tmp_path, capsys, searched):
+def test_calibrate_leaves_tables_pictures_and_json(monkeypatch, folders, cases, tmp_path, capsys, searched):
     monkeypatch.setattr(workers, "local_workers", pretended_workers)
     out = tmp_path / "out"
     more = ["--search", "2"] if searched else ["--grid", "0.1"]
-    folders = [str(tmp_path / name) for name in "ab"]
-    assert main(["calibrate", *folders, "--radii", "4,3", "--out", str(out), *more]) == 0
+    assert main(["calibrate", *map(str, folders), "--radii", "4,3", "--out", str(out), *more]) == 0
     said = capsys.readouterr().out
     assert "Fitted on all stages but the deepest; held out: the deepest stage." in said
     assert "The fit is no accuracy" in said
@@ -180,14 +182,14 @@ def test_calibrate_leaves_tables_pictures_and_json(monkeypatch, cases, tmp_path,
         assert np.asarray(Image.open(out / name).convert("L")).std() > 5
 
 
-def test_calibrate_says_mistakes_in_one_line(monkeypatch, cases, tmp_path, capsys):
+def test_calibrate_says_mistakes_in_one_line(monkeypatch, folders, tmp_path, capsys):
     def refused(*arguments) -> str:
         assert main(["calibrate", *map(str, arguments)]) == 2
         line = capsys.readouterr().err.strip()
         assert line.startswith("nephron: ") and "\n" not in line
         return line
 
-    a, out = tmp_path / "a", ("--out", tmp_path / "out")
+    a, out = folders[0], ("--out", tmp_path / "out")
     assert "--out" in refused(a)
     assert "CASE" in refused(*out)
     assert "holds no case.toml" in refused(tmp_path, *out)

@@ -64,7 +64,7 @@ def test_the_digest_tells_contents_apart(tmp_path):
 @pytest.mark.parametrize(
     "path, value, words",
     [
-        ("probe", None, "probe: missing; add it"),
+        ("probe", None, "probe: missing; correct it there"),
         ("stage.1.position", None, "stage.1.position: missing"),
         ("units.length", "cm", "units.length = 'cm': input should be 'mm'"),
         ("units.acceleration", "mm/s^2", "units.acceleration = 'mm/s^2': input should be 'm/s^2'"),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from synthetic_body import LEFT, TUMOUR, body, points_of, with_voxels
 
-from scenes.check_picture import COLOUR, PIXEL_MM, VIEWS, WHOLE, colours_of, cut, draw_check
+from scenes.check_picture import COLOUR, PIXEL_MM, VIEWS, WHOLE, colours_of, cut, draw_check, is_wider
 from scenes.facts import facts
 from scenes.patient import import_patient
 from scenes.reading.grid import VoxelGrid
@@ -115,3 +115,14 @@ def test_outlines_lie_under_their_letters(patient, tmp_path):
             middle[name] = shown.mean(axis=0)
         down, right = middle["tumour"] - middle["organ"]
         assert sense * right > 3 and down < -3, n
+
+
+def test_the_whole_width_is_shown_where_it_is_wider_than_the_cuts(patient, tmp_path):
+    """Else the surface is shown once more: below the middle it is shaded, and has no grey in it."""
+    assert is_wider(patient.overview, patient.ct) and not is_wider(patient.ct, patient.ct)
+    grey = []
+    for each in (patient, replace(patient, overview=patient.ct)):
+        draw_check(each, facts(each), tmp_path)
+        panel = matplotlib.image.imread(tmp_path / "check.png")[560:, 460:840, :3]
+        grey.append(((np.ptp(panel, axis=2) < 0.01) & (panel[..., 0] > 0.3)).sum())
+    assert grey[0] > 20 * grey[1]

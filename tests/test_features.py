@@ -124,11 +124,12 @@ def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, cap
     ids=lambda setup: setup.model,
 )
 def test_a_soak_ends_where_it_began_and_replays(setup, monkeypatch):
-    monkeypatch.setattr(soak, "REST_S", 4.0)
+    monkeypatch.setattr(soak, "REST_S", 3.0)
+    monkeypatch.setattr(soak, "REPLAYED_MINUTES", 1)
     scene = load_scene(PAPER).model_copy(update={"press": Press(warm_up_steps=60)})
     told = []
-    found = soak.soak(scene, small_anatomy(), setup, 3, 7.0, "cpu", lambda: told.append(1))
-    assert len(found["minutes"]) == 3 and len(told) == 5
+    found = soak.soak(scene, small_anatomy(), setup, 2, 5.0, "cpu", lambda: told.append(1))
+    assert len(found["minutes"]) == 2 and len(told) == 3
     assert found["replay_equal"] and found["reset_equal"] and found["fallbacks"] == 0
     for row in found["minutes"]:
         assert row["finite"] and row["shape_mm"] < 1.0 and abs(row["volume_ratio"] - 1) < 0.1

@@ -2,10 +2,8 @@
 
 import io
 import json
-import resource
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr
+from contextlib import redirect_stderr
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -48,17 +46,6 @@ def refused(*arguments) -> str:
     lines = [line for line in told.getvalue().strip().splitlines() if "picture/s" not in line]
     assert status == 2 and len(lines) == 1 and lines[0].startswith("nephron: "), told.getvalue()
     return lines[0]
-
-
-@contextmanager
-def little_room(size: int) -> Iterator[None]:
-    """No file can grow over a size, as on a disk that is full."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def recording(pixels: int = 24) -> tuple[SimpleNamespace, SimpleNamespace]:
@@ -143,13 +130,13 @@ def test_a_sweep_without_frames_or_ct_leaves_words_and_no_file(tmp_path):
 
 
 @pytest.mark.parametrize("marks_too", [False, True])
-def test_a_full_disk_ends_a_sweep_in_words_and_leaves_nothing(tmp_path, marks_too):
+def test_a_full_disk_ends_a_sweep_in_words_and_leaves_nothing(tmp_path, marks_too, bytes_to_a_file):
     rehearsal, view = recording(pixels=256)
     if marks_too:
         rehearsal.scanner.marks.render = lambda: view.pictures["B-mode"]
     sweeping = Sweeping(rehearsal)
     sweeping.toggle(tmp_path)
-    with little_room(150_000):
+    with bytes_to_a_file(150_000):
         # Noise: 65 kB each, of which two have room.
         said = [sweeping.watch(k / 30, view, rehearsal.probe) for k in range(5)]
     assert said == ["", "", f"No sweep: {FULL}", "", ""]

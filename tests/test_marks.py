@@ -13,7 +13,7 @@ from ultrasound.hand import image_plane, pose_at
 from ultrasound.marks import Marks
 from ultrasound.plane import ImagePlane, PlaneInTissue
 from ultrasound.probe import load_probe
-from ultrasound.scanner import Anatomy, Scanner
+from ultrasound.scanner import ScannedAnatomy, Scanner
 from ultrasound.sweep import Mark
 from ultrasound.volume import distance_volume
 
@@ -166,7 +166,7 @@ def test_the_matrices_beside_a_picture_lead_to_what_it_shows(device):
         trimesh.creation.icosphere(subdivisions=3, radius=r).apply_translation(tumour - rehearsal.origin)
         for r in (30.0, 12.0)
     )
-    scanner = Scanner(Anatomy(organ, hu, index_from_mm, tumour=mass), Unmoved(), probe, PIXELS)
+    scanner = Scanner(ScannedAnatomy(organ, hu, index_from_mm, tumour=mass), Unmoved(), probe, PIXELS)
     picture = scanner.look(plane_of(rehearsal, probe), probe, "ct", "speckle", 1000.0, -500.0)["CT"].astype(
         float
     )

@@ -24,7 +24,7 @@ from ultrasound.hand import held_at, image_plane, pose_at
 from ultrasound.outline import section
 from ultrasound.plane import ImagePlane
 from ultrasound.probe import Probe
-from ultrasound.scanner import CT, ECHO, Anatomy, Scanner
+from ultrasound.scanner import CT, ECHO, ScannedAnatomy, Scanner
 
 STORED = Path(__file__).parent / "pictures"
 PIXELS, WIDTH, DEPTH = 256, 36.0, 30.0
@@ -51,7 +51,7 @@ SMALL_WINDOW, WINDOW = (640, 360), (1280, 720)
 BLOCK, FRAMED = 8, 10.0
 
 
-def anatomy() -> Anatomy:
+def anatomy() -> ScannedAnatomy:
     """A ball of uneven tissue with a tumour, in fat."""
     axis = np.arange(-20.0, 20.1)
     places = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
@@ -62,7 +62,9 @@ def anatomy() -> Anatomy:
     index_from_mm = np.eye(4)
     index_from_mm[:3, 3] = 20.0
     organ = trimesh.creation.icosphere(subdivisions=3, radius=ORGAN)
-    return Anatomy(organ, np.rint(hu).astype(np.int16), index_from_mm, labels, {1: "kidney", 2: "tumour"})
+    return ScannedAnatomy(
+        organ, np.rint(hu).astype(np.int16), index_from_mm, labels, {1: "kidney", 2: "tumour"}
+    )
 
 
 class Scene:

@@ -53,7 +53,7 @@ def test_a_probe_goes_through_plus_names_and_back(tmp_path):
     texts = {key: list(value) if isinstance(value, tuple) else value for key, value in named.items()}
     written = "\n".join(f"{key} = {value!r}" for key, value in texts.items())
     (tmp_path / "mine.toml").write_text(written)
-    assert load_probe("mine.toml", tmp_path) == probe
+    assert load_probe(str(tmp_path / "mine.toml")) == probe
 
 
 GOOD = 'TransducerName = "x"\n'
@@ -103,21 +103,20 @@ def test_a_wrong_probe_file_is_refused_with_a_line_that_names_the_key(tmp_path, 
     text, line = WRONG[wrong]
     (tmp_path / "mine.toml").write_text(text)
     with pytest.raises(ProbeError, match=line) as refused:
-        load_probe("mine.toml", tmp_path)
+        load_probe(str(tmp_path / "mine.toml"))
     message = str(refused.value)
     assert "\n" not in message and message.startswith(str(tmp_path / "mine.toml"))
 
 
-def test_a_missing_probe_file_is_told_with_those_known(tmp_path):
-    for folder in (tmp_path, None):
-        with pytest.raises(ProbeError, match="'none' is no file, and known by name are " + ", ".join(KNOWN)):
-            load_probe("none", folder)
+def test_a_missing_probe_file_is_told_with_those_known():
+    with pytest.raises(ProbeError, match="'none' is no file, and known by name are " + ", ".join(KNOWN)):
+        load_probe("none")
 
 
 def test_bytes_that_are_no_text_are_refused(tmp_path):
     (tmp_path / "mine.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ProbeError, match=re.escape("cannot be read as a probe file")):
-        load_probe("mine.toml", tmp_path)
+        load_probe(str(tmp_path / "mine.toml"))
 
 
 @pytest.mark.parametrize("geometry", list(GEOMETRIES))

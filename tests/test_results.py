@@ -7,10 +7,14 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import rotation_about
+from matplotlib.figure import Figure
 
-from studies.results import rounded, spread, write_csv, write_json
+from studies.pictures import save_pictures
+from studies.results import rounded, save_figure, spread, write_csv, write_json
 from studies.rigid_fit import apart_after_fit
 from studies.surfaces import moved_by, volume_mm3
+from ultrasound.probe import load_probe
+from ultrasound.scanner import ECHO
 
 
 def test_what_json_has_no_number_for_is_none():
@@ -34,6 +38,29 @@ def test_a_row_may_lack_what_others_have(tmp_path):
     write_csv([dict(a=1, b=2), dict(c=3, a=4)], tmp_path / "a.csv")
     with (tmp_path / "a.csv").open(newline="") as file:
         assert list(csv.reader(file)) == [["a", "b", "c"], ["1", "2", ""], ["4", "", "3"]]
+
+
+def test_a_full_disk_leaves_what_was_there(tmp_path, bytes_to_a_file):
+    """Of figures, tables, pictures and DICOM, and nothing that is half written."""
+    figure, probe = Figure(), load_probe("linear")
+    figure.subplots().plot(np.arange(100))
+    grey = {ECHO: np.random.default_rng(4).integers(0, 255, (64, 64), np.uint8)}
+    writers = {
+        "a.json": lambda: write_json({"mm": [1.5] * 999}, tmp_path / "a.json"),
+        "a.csv": lambda: write_csv([dict(mm=1.5)] * 999, tmp_path / "a.csv"),
+        "a.png": lambda: save_figure(figure, tmp_path / "a.png"),
+        "a-b-mode.png": lambda: save_pictures(grey, 40.0, 40.0, probe, tmp_path / "a"),
+    }
+    for name in writers:
+        (tmp_path / name).write_text("before")
+    with bytes_to_a_file(1000):
+        for name, write in writers.items():
+            with pytest.raises(OSError, match=name):
+                write()
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == dict.fromkeys(writers, "before")
+    with bytes_to_a_file(4800), pytest.raises(OSError, match="a-b-mode.dcm"):
+        writers["a-b-mode.png"]()
+    assert {path.name for path in tmp_path.iterdir()} == set(writers)
 
 
 def test_a_surface_holds_the_same_volume_wherever_it_is():

@@ -10,7 +10,7 @@ from ultrasound.acoustics import CORTEX_DB
 from ultrasound.hand import image_plane, pose_at
 from ultrasound.plane import ImagePlane
 from ultrasound.probe import Probe
-from ultrasound.scanner import CT, Anatomy, Scanner
+from ultrasound.scanner import CT, ScannedAnatomy, Scanner
 
 PIXELS, RADIUS, REACH = 64, 12.0, 20.0
 PROBE = Probe(
@@ -28,7 +28,7 @@ UPRIGHT = np.eye(3)
 FAT_HU, KIDNEY_HU = -90, 32
 
 
-def anatomy(spacing=(1.0, 1.0, 1.0), turn: np.ndarray = UPRIGHT, around_hu: int = FAT_HU) -> Anatomy:
+def anatomy(spacing=(1.0, 1.0, 1.0), turn: np.ndarray = UPRIGHT, around_hu: int = FAT_HU) -> ScannedAnatomy:
     """A ball of kidney, in a grid of voxels 40 mm along each edge."""
     mm_from_index = np.eye(4)
     mm_from_index[:3, :3] = turn * spacing
@@ -38,7 +38,7 @@ def anatomy(spacing=(1.0, 1.0, 1.0), turn: np.ndarray = UPRIGHT, around_hu: int 
     labels = (np.linalg.norm(at, axis=-1) < RADIUS).astype(np.int16)
     organ = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
     hu = np.where(labels, KIDNEY_HU, around_hu).astype(np.int16)
-    return Anatomy(organ, hu, np.linalg.inv(mm_from_index), labels, {1: "kidney"})
+    return ScannedAnatomy(organ, hu, np.linalg.inv(mm_from_index), labels, {1: "kidney"})
 
 
 def plane_at(above: float = 0.0) -> ImagePlane:

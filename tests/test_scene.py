@@ -11,7 +11,7 @@ from scenes.anatomy import load_anatomy, phantom_folder, press_on
 from scenes.reading.error import PatientError
 from scenes.scene import (
     EMBEDDED,
-    Anatomy,
+    AnatomyFiles,
     Press,
     Scene,
     SceneError,
@@ -23,6 +23,8 @@ from scenes.scene import (
 )
 from scenes.tissue import NeoHookeanTissue, ShapeMatchingTissue
 from studies.models import step_settings
+from studies.setup import probe_of
+from ultrasound.probe import ProbeError
 
 
 def refused(tmp_path: Path, text: str) -> str:
@@ -123,7 +125,7 @@ def test_a_value_that_one_model_has_asks_for_that_model():
 
 
 def test_shape_matchings_defaults_are_the_papers_table_1():
-    scene = Scene(anatomy=Anatomy(), tissue=ShapeMatchingTissue(model="shape-matching"))
+    scene = Scene(anatomy=AnatomyFiles(), tissue=ShapeMatchingTissue(model="shape-matching"))
     contact, tissue = scene.contact, scene.tissue
     step = step_settings(tissue, scene.solver)
     assert (step.time_step_s, step.substeps, step.iterations) == (1 / 60, 3, 9)
@@ -143,7 +145,7 @@ def test_a_step_is_as_the_scene_says_then_as_its_tissue_does_then_the_papers():
 
 def with_ball(folder: Path, **changes) -> Scene:
     trimesh.creation.icosphere(subdivisions=2, radius=10.0).export(folder / "organ.stl")
-    return Scene(anatomy=Anatomy(), **changes)
+    return Scene(anatomy=AnatomyFiles(), **changes)
 
 
 def test_files_that_a_scene_names_are_checked(tmp_path):
@@ -160,7 +162,7 @@ def test_files_that_a_scene_names_are_checked(tmp_path):
         load_anatomy(scene, tmp_path)
     with_ball(tmp_path)
     with pytest.raises(SceneError, match="ct.nrrd: no such file"):
-        load_anatomy(Scene(anatomy=Anatomy(ct="ct.nrrd")), tmp_path)
+        load_anatomy(Scene(anatomy=AnatomyFiles(ct="ct.nrrd")), tmp_path)
 
 
 def test_a_ct_keeps_its_place_in_the_patient(tmp_path):
@@ -170,7 +172,7 @@ def test_a_ct_keeps_its_place_in_the_patient(tmp_path):
     image.SetDirection((-1, 0, 0, 0, -1, 0, 0, 0, 1))
     sitk.WriteImage(image, str(tmp_path / "ct.nrrd"))
     with_ball(tmp_path)
-    ct = load_anatomy(Scene(anatomy=Anatomy(ct="ct.nrrd")), tmp_path).ct
+    ct = load_anatomy(Scene(anatomy=AnatomyFiles(ct="ct.nrrd")), tmp_path).ct
     point = np.array([*image.TransformIndexToPhysicalPoint((3, 4, 2)), 1.0])
     assert ct.index_from_mm @ point == pytest.approx([3, 4, 2, 1])
     assert ct.voxels[3, 4, 2] == image[3, 4, 2]
@@ -219,3 +221,18 @@ def test_a_probes_file_is_named_from_where_the_program_was_started(tmp_path, mon
         for name in ("mine.toml", "linear")
     ]
     assert probes == [str((tmp_path / "mine.toml").resolve()), "linear"]
+
+
+def test_a_scenes_probes_file_lies_beside_it(tmp_path, monkeypatch):
+    """Wherever the program is started, and whoever asks for the probe."""
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes" / "mine.toml").write_text('TransducerName = "mine"')
+    (tmp_path / "mine.toml").write_text('TransducerName = "another"')
+    (tmp_path / "scenes" / "a.toml").write_text('[anatomy]\n[transducer]\nprobe = "mine.toml"')
+    monkeypatch.chdir(tmp_path)
+    scene = load_scene(Path("scenes/a.toml"))
+    monkeypatch.chdir(tmp_path.parent)
+    assert probe_of(with_options(scene, {"tissue.cell_mm": 5.0})).transducer_name == "mine"
+    (tmp_path / "scenes" / "mine.toml").unlink()
+    with pytest.raises(ProbeError, match="scenes.*mine.toml' is no file, and known by name are"):
+        probe_of(scene)

@@ -242,10 +242,13 @@ def test_a_damaged_line_is_named_by_its_number(tmp_path):
 
 def test_what_is_no_session_is_said_so_in_one_line(tmp_path):
     version_2 = header().model_dump_json().replace('"nephron_session":1', '"nephron_session":2').encode()
-    control = header().model_copy(update=dict(version="1.0\x1b[2J")).model_dump_json().encode()
+    control, other = (
+        header().model_copy(update={name: "1.0\x1b[2J"}).model_dump_json().encode()
+        for name in ("version", "arch")
+    )
     no_time = header().model_dump_json().replace("0.125", "0").encode()
     strangers = b"", b"\x89PNG\r\n\x1a\n\0\0", b'{"scene": {}}\n', b"[1, 2]\n", b"[" * 100_000
-    for content in (*strangers, version_2, control, no_time):
+    for content in (*strangers, version_2, control, other, no_time):
         (tmp_path / "file").write_bytes(content)
         with pytest.raises(SessionError, match=r"^file: [^\n]+$"):
             read_log(tmp_path / "file")
@@ -285,7 +288,7 @@ def recorded_at(folder: Path, ball: trimesh.Trimesh) -> Recorded:
     shape = (dict(kind="mesh", file="/home/doe/table.stl"),)
     probe = dict(probe="/home/doe/probe.toml")
     numbers.scene = Scene(anatomy=files, shape=shape, tissue=dict(cell_mm=7.0), transducer=probe)
-    numbers.probe = probe_of(load_scene(EMBEDDED), EMBEDDED.parent)
+    numbers.probe = probe_of(load_scene(EMBEDDED))
     kept = record(Session(numbers), LoadedAnatomy(ball, None, None, ()), "x64", folder)
     lead(Live(kept.session, Ladder(1e6), kept), 30, 0)
     kept.close({})

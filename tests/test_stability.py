@@ -13,6 +13,7 @@ from studies.rigid_fit import apart_after_fit
 from studies.stability import bodies, command, measure
 from studies.stability.cases import MODELS, Case, Subject, cases_of, quick_cases_of
 from studies.stability.motion import PROBES, STATES
+from studies.stability.picture import FATES, fate_of
 from ultrasound.hand import advanced
 
 ONE = Subject("one")
@@ -120,3 +121,23 @@ def test_a_state_along_an_axis_is_what_its_name_says(model):
     assert states["collapsed: to a line, y"] == ("scaled", 0.0, 1.0, 0.0)
     assert states["mirrored: in z"] == ("scaled", 1.0, 1.0, -1.0)
     assert states["thrown: 10 m/s, -y"] == ("thrown", 0.0, -1e4, 0.0)
+
+
+@pytest.mark.parametrize(
+    "changes, fate",
+    [
+        (dict(), "came back to where it lay"),
+        (dict(fallback="torn"), "put back by the program, to where it lay"),
+        (dict(recovered=False, shape_error_mm=0.1), "its shape whole, lies elsewhere"),
+        (
+            dict(recovered=False, shape_error_mm=0.1, fallback="torn"),
+            "put back by the program, its shape whole",
+        ),
+        (dict(recovered=False, shape_error_mm=0.2, fallback="torn"), "shape changed"),
+        (dict(recovered=False), "shape changed"),
+        (dict(finite=False), "not finite"),
+    ],
+)
+def test_the_picture_says_how_a_case_ended(changes, fate):
+    row = dict(finite=True, recovered=True, fallback=None, shape_error_mm=None)
+    assert fate_of(row | changes).startswith(fate) and fate_of(row | changes) in FATES

@@ -71,6 +71,21 @@ class Interface:
         return ti.abs(self.reflection(after)) * self.loud * ti.exp(-way_db / DB) * self.squarely / self.steps
 
 
+@ti.dataclass
+class Look:
+    """Impedance, attenuation and backscatter at a place, where its tissue was at rest [mm], and the map from the plane there."""
+
+    tissue: tm.vec3
+    rest: tm.vec3
+    linear: ti.types.matrix(3, 4, ti.f32)
+
+
+@ti.func
+def known(impedance, other):
+    """An impedance, or where there is none another."""
+    return ti.select(impedance < 1e-6, other, impedance)
+
+
 @ti.data_oriented
 class Beams:
     """Echoes (lines, samples), ``real`` and ``imaginary``, of every line; arguments as ``BMode``."""
@@ -117,8 +132,10 @@ class Beams:
             self.touching[i + 1] = self.touching[i] + near
 
     @ti.func
-    def look(self, planes: ti.template(), linear, row, column, place, elevation_sd: ti.f32):
-        """Impedance, attenuation and backscatter at a place (u, v) of the plane, and where its tissue was at rest."""
+    def look(self, planes: ti.template(), place, pixel_mm, first_mm, elevation_sd: ti.f32):
+        """What is at a place (u, v) of the plane."""
+        row, column = self.plane.pixel_near(place, pixel_mm, first_mm)
+        linear = self.plane.map_of(row, column)
         rest = linear @ tm.vec4(place, 0.0, 1.0)
         found = tm.vec3(0.0)
         for off, weight, _ in ti.static(planes):
@@ -126,7 +143,7 @@ class Beams:
         if ti.static(self.organ_alone):
             if not (self.plane.is_tissue(row, column) and self.organ.sample(rest) <= 0.0):
                 found = tm.vec3(self.around, 0.0, 0.0)
-        return found, rest
+        return Look(found, rest, linear)  # type: ignore[call-arg]
 
     @ti.kernel
     def send(
@@ -151,52 +168,59 @@ class Beams:
             start, direction = self.start[line], self.direction[line]
             for i in range(self.samples):
                 self.real[line, i] = 0.0
-            row, column = self.plane.pixel_near(start, pixel_mm, first_mm)
-            linear = self.plane.map_of(row, column)
-            near, rest = self.look(planes, linear, row, column, start, elevation_sd)
+            near = self.look(planes, start, pixel_mm, first_mm, elevation_sd)
             loss_db, passed, loud = 0.0, 1.0, 1.0
             interface = Interface()
-            interface.begin(near, 0.0, loud)
+            interface.begin(near.tissue, 0.0, loud)
             for k in range(self.samples // stride):
                 depth = k * stride_mm
                 place = start + (depth + stride_mm) * direction
-                row, column = self.plane.pixel_near(place, pixel_mm, first_mm)
-                linear_far = self.plane.map_of(row, column)
-                far, rest_far = self.look(planes, linear_far, row, column, place, elevation_sd)
+                far = self.look(planes, place, pixel_mm, first_mm, elevation_sd)
                 # Beyond the CT nothing is known: nothing scatters, nothing reflects.
-                if far.x < 1e-6:
-                    far.x = near.x
-                elif near.x < 1e-6:
-                    near.x = far.x
-                step = (far.x - near.x) / ti.max(far.x + near.x, 1e-6)
+                far.tissue.x = known(far.tissue.x, near.tissue.x)
+                near.tissue.x = known(near.tissue.x, far.tissue.x)
+                before, after = near.tissue, far.tissue
+                step = (after.x - before.x) / ti.max(after.x + before.x, 1e-6)
                 if interface.ends(step, self.interface_mm):
                     at = interface.depth_mm()
-                    echo = interface.loudness(near.x, frequency_mhz) * self.heard(line, at, aperture)
+                    echo = interface.loudness(before.x, frequency_mhz) * self.heard(line, at, aperture)
                     self.reflect(rung, line, at, echo, sample_mm, axial_sd)
-                    passed *= 1.0 - interface.reflection(near.x) ** 2
-                    interface.begin(near, depth, loud)
+                    passed *= 1.0 - interface.reflection(before.x) ** 2
+                    interface.begin(before, depth, loud)
                 if interface.steps == 0.0:
-                    interface.begin(near, depth, loud)
+                    interface.begin(before, depth, loud)
                 if ti.abs(step) >= LEAST_REFLECTION:
-                    square = self.squareness(0.5 * (rest + rest_far), linear_far, direction)
+                    square = self.squareness(0.5 * (near.rest + far.rest), far.linear, direction)
                     interface.add(step, depth + 0.5 * stride_mm, square, stride_mm)
                 # There and back, over the stride in cm.
-                loss_db += (near.y + far.y) * frequency_mhz * stride_mm / 10.0
+                loss_db += (before.y + after.y) * frequency_mhz * stride_mm / 10.0
                 loud_far = passed * ti.exp(-loss_db / DB)
                 heard = self.heard(line, depth + 0.5 * stride_mm, aperture)
-                for j in range(stride):
-                    t = (j + 0.5) / stride
-                    echo = self.scatter(
-                        rung,
-                        tm.mix(rest, rest_far, t),
-                        tm.mix(linear[:, 2], linear_far[:, 2], t),
-                        axial_sd,
-                        elevation_sd,
-                    )
-                    echo *= heard * tm.mix(loud, loud_far, t) * tm.mix(near.z, far.z, t)
-                    self.real[line, stride * k + j] = self.real[line, stride * k + j] + echo.x
-                    self.imaginary[line, stride * k + j] = echo.y
-                near, rest, linear, loud = far, rest_far, linear_far, loud_far
+                loudness = tm.vec3(loud, loud_far, heard)
+                self.scatter_between(rung, stride, line, k, near, far, loudness, axial_sd, elevation_sd)
+                near, loud = far, loud_far
+
+    @ti.func
+    def scatter_between(
+        self,
+        rung: ti.template(),
+        stride: ti.template(),
+        line,
+        k,
+        near,
+        far,
+        loudness,
+        axial_sd,
+        elevation_sd,
+    ):
+        """Write the samples of stride ``k``: what scatters there, ``loudness`` the sound at its ends and the share of it that is heard."""
+        for j in range(stride):
+            t = (j + 0.5) / stride
+            rest, across = tm.mix(near.rest, far.rest, t), tm.mix(near.linear[:, 2], far.linear[:, 2], t)
+            echo = self.scatter(rung, rest, across, axial_sd, elevation_sd)
+            echo *= loudness.z * tm.mix(loudness.x, loudness.y, t) * tm.mix(near.tissue.z, far.tissue.z, t)
+            self.real[line, stride * k + j] = self.real[line, stride * k + j] + echo.x
+            self.imaginary[line, stride * k + j] = echo.y
 
     @ti.func
     def scatter(self, rung: ti.template(), rest, across, axial_sd, elevation_sd):

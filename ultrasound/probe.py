@@ -4,14 +4,16 @@ A probe file is TOML with PLUS's names (TransducerGeometry, DepthMm, FrequencyMh
 plane are (u, v) [mm]: u to the marked side, v down into the tissue, the origin at the middle of the array's face.
 """
 
-import difflib
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic.alias_generators import to_pascal
+
+from validation import explained, meant
 
 PROBES = Path(__file__).parent / "probes"
 SOUND_MM_US = 1.54
@@ -193,33 +195,25 @@ class Probe(BaseModel):
         return own + (self.gain_percent - 50) / 100 * GAIN_RANGE_DB + (sliders - 50) / 100 * TGC_RANGE_DB
 
 
-def load_probe(name: str, folder: Path | None = None) -> Probe:
-    """The probe of a file in a folder, or one that comes with the program, by its name. Raises ProbeError."""
+def load_probe(name: str) -> Probe:
+    """The probe that comes with the program by a name, else that of a file. Raises ProbeError."""
     own = PROBES / f"{name}.toml"
-    path = own if own.is_file() else (folder or Path()) / name
+    path = own if own.is_file() else Path(name)
     try:
-        return Probe.model_validate(tomllib.loads(path.read_text("utf-8")))
+        return probe_of_values(tomllib.loads(path.read_text("utf-8")))
     except FileNotFoundError:
         known = ", ".join(sorted(each.stem for each in PROBES.glob("*.toml")))
         raise ProbeError(f"transducer.probe: {name!r} is no file, and known by name are {known}") from None
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ProbeError(f"{path}: cannot be read as a probe file ({str(error).splitlines()[0]})") from None
+    except ProbeError as error:
+        raise ProbeError(f"{path}: {error}") from None
+
+
+def probe_of_values(values: Mapping[str, Any]) -> Probe:
+    """The probe of a file's values. Raises ProbeError, which names the key."""
+    try:
+        return Probe.model_validate(values)
     except ValidationError as error:
-        raise ProbeError(f"{path}: {explained(error)}") from None
-
-
-def explained(error: ValidationError) -> str:
-    """The first of the problems, in words that name the key."""
-    first = error.errors(include_url=False)[0]
-    key = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "value_error":
-        return str(first["ctx"]["error"])
-    if first["type"] == "extra_forbidden":
         known = [to_pascal(name) for name in Probe.model_fields]
-        close = difflib.get_close_matches(key, known, n=1)
-        return f"{key}: unknown key; " + (
-            f"did you mean {close[0]}?" if close else f"known: {', '.join(known)}"
-        )
-    if first["type"] == "missing":
-        return f"{key}: missing"
-    return f"{key} = {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}"
+        raise ProbeError(explained(error, lambda where: f"unknown key; {meant(where[-1], known)}")) from None

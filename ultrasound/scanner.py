@@ -24,7 +24,7 @@ SHOWN: dict[Mode, tuple[str, ...]] = {"ct": (CT,), "b-mode": (ECHO,), "both": (E
 
 
 @dataclass(frozen=True)
-class Anatomy:
+class ScannedAnatomy:
     """What is scanned, all in one frame [mm] in which it is at rest.
 
     ``hu`` (nx, ny, nz) and ``labels``, on the same grid, with ``index_from_mm`` (4, 4); ``tissues`` says which tissue a label is.
@@ -52,7 +52,7 @@ class Scanner:
 
     def __init__(
         self,
-        anatomy: Anatomy,
+        anatomy: ScannedAnatomy,
         embedding: Embedding | Unmoved,
         probe: Probe,
         pixels: int = 512,

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from studies.beam.capture import BeamError, Capture, Oscillation, oscillation
+from studies.results import save_figure
 
 if TYPE_CHECKING:
     from studies.beam.cantilever import Cantilever, Material
@@ -217,4 +218,4 @@ def draw(groups: list[list[Capture]], traces: list[np.ndarray], rows: list[Row],
         axis.grid(alpha=0.3)
         axis.legend(loc="upper right", fontsize=8)
     axes[-1].set_xlabel("time since the release, s")
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)

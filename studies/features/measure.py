@@ -30,7 +30,7 @@ from studies.surfaces import moved_by
 from studies.timing.measure import memory_mb
 from ultrasound.hand import advanced, between, image_plane, pose_at, touching
 from ultrasound.probe import Mode, Rung
-from ultrasound.scanner import Anatomy, Scanner
+from ultrasound.scanner import ScannedAnatomy, Scanner
 
 # A press so deep, in so many steps; those before it settle.
 PRESS_MM, PRESS_STEPS, SETTLE_STEPS = 8.0, 60, 30
@@ -212,7 +212,7 @@ def of_frame(scene: Scene, anatomy: LoadedAnatomy, arch: str) -> Iterator[dict[s
     yield _whole_frame(rehearsal)
 
 
-def _pictures(rehearsal: Rehearsal, scanned: Anatomy) -> Iterator[dict[str, Any]]:
+def _pictures(rehearsal: Rehearsal, scanned: ScannedAnatomy) -> Iterator[dict[str, Any]]:
     """The rungs of the picture's ladder, each with all that it needs."""
     image, probe = rehearsal.scene.image, rehearsal.probe
     plane = image_plane(rehearsal.pose_at_depth(1.0), probe.housing_mm[2], *probe.extent_mm)
@@ -245,10 +245,13 @@ def _whole_frame(rehearsal: Rehearsal) -> dict[str, Any]:
         for depth in np.linspace(0.0, rehearsal.press.indentations_mm[0], CALLS + 1)
     ]
 
+    whole = [rehearsal.solver, rehearsal.guard, rehearsal.organ_skin, rehearsal.tumour_skin]
+    whole += [rehearsal.embedding, rehearsal.scanner]
+
     def go_on() -> None:
         page.compose(take_view(rehearsal, settings, poses.pop(0), tally), settings, patient=True)
 
-    return _alone("whole frame, with the echo", go_on, [rehearsal.scanner], rehearsal.model)
+    return _alone("whole frame, with the echo", go_on, whole, None)
 
 
 def _alone(name: str, work: Callable[[], Any], owners: list, apart: Any) -> dict[str, Any]:
@@ -257,6 +260,6 @@ def _alone(name: str, work: Callable[[], Any], owners: list, apart: Any) -> dict
     ms: list[float] = []
     for _ in range(CALLS):
         timed(work, ms)
-    mb = round(sum(memory_mb(owner, apart) for owner in owners), 4)
+    mb = round(memory_mb(owners, apart), 4)
     nothing = dict(ms_off=0.0, mb_off=0.0, kernels_on=None, kernels_off=0, launches_on=None, launches_off=0)
     return dict(feature=name, ms_on=round(float(np.median(ms)), 4), mb_on=mb, **nothing)

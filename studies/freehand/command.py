@@ -7,9 +7,9 @@ import click
 import numpy as np
 from tqdm import tqdm
 
-from scenes.anatomy import LoadedAnatomy, load_anatomy
-from scenes.scene import Scene, load_scene, scene_file
-from studies.command_line import Fault, NumberRange, arch_option, make_folder, start_taichi
+from scenes.anatomy import LoadedAnatomy
+from scenes.scene import Scene
+from studies.command_line import Fault, NumberRange, arch_option, load_patient, make_folder, start_taichi
 from studies.freehand.files import save_volumes
 from studies.freehand.picture import save_picture
 from studies.freehand.rebuild import Places, Rebuilt, Track, lit, rebuild, track_of
@@ -113,7 +113,7 @@ def reconstruct(
         pictures = with_errors(pictures, reference, errors, seed)
     track = track_of(pictures, reference)
     about = _of_track(pictures, track)
-    patient = _patient(scene)
+    patient = None if scene is None else load_patient(scene)
     make_folder(out)
     if errors != TrackingErrors():
         write_sweep(out / "tracked.igs.mha", pictures)
@@ -161,24 +161,16 @@ def usual_reach_mm(track: Track, spacing_mm: float) -> float:
     return max(2 * spacing_mm, min(usual, MOST_REACH_MM))
 
 
-def _patient(scene: Path | None) -> tuple[Scene, LoadedAnatomy, Path] | None:
-    if scene is None:
-        return None
-    path = scene_file(scene)
-    loaded = load_scene(path)
-    return loaded, load_anatomy(loaded, path.parent), path.parent
-
-
 def _unsqueezed(
-    patient: tuple[Scene, LoadedAnatomy, Path], pictures: Sweep, track: Track, reference: str, arch: str
+    patient: tuple[Scene, LoadedAnatomy], pictures: Sweep, track: Track, reference: str, arch: str
 ) -> Places:
-    scene, anatomy, folder = patient
+    scene, anatomy = patient
     start_taichi(arch)
     from studies.freehand.unsqueeze import Unsqueezed
     from studies.rehearsal import Rehearsal
 
     click.echo("Building the model.")
-    probe = probe_of(scene, folder)
+    probe = probe_of(scene)
     taken_with = pictures.fields.get(PROBE_FIELD, probe.transducer_name)
     if taken_with != probe.transducer_name:
         raise Fault(
@@ -205,7 +197,7 @@ def _of_track(pictures: Sweep, track: Track) -> dict[str, Any]:
     )
 
 
-def _agreement(rebuilt: Rebuilt, patient: tuple[Scene, LoadedAnatomy, Path] | None) -> dict[str, Any]:
+def _agreement(rebuilt: Rebuilt, patient: tuple[Scene, LoadedAnatomy] | None) -> dict[str, Any]:
     if patient is None or not rebuilt.regions:
         return {}
     from studies.freehand.compare import compared, surfaces_of

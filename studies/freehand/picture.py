@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from studies.freehand.rebuild import Rebuilt
+from studies.results import save_figure
 
 COLOUR = {"organ": "#ff8c69", "tumour": "#ffe14d"}
 AXES = "xyz"
@@ -20,7 +21,7 @@ def save_picture(rebuilt: Rebuilt, path: Path) -> None:
     figure = Figure(figsize=(12, 4.4), facecolor="#101014", layout="constrained")
     for axis, (across, down) in enumerate(((1, 2), (0, 2), (0, 1))):
         _draw_cut(figure.add_subplot(1, 3, axis + 1), rebuilt, axis, across, down, int(middle[axis]))
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 def _draw_cut(axes: Axes, rebuilt: Rebuilt, axis: int, across: int, down: int, index: int) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 import tempfile
@@ -15,6 +14,7 @@ from tqdm import tqdm
 
 from studies.command_line import make_folder
 from studies.intake.whole_body import write_whole_body
+from studies.results import write_json
 
 APP = Path(__file__).resolve().parents[2] / "app.py"
 POLL_S = 0.02
@@ -44,7 +44,7 @@ def intake(out: Path, slices: int, runs: int) -> None:
         )
         found = [_run(body, Path(temporary) / f"patient-{n}") for n in range(runs)]
     figures = dict(slices=slices, seconds=[s for s, _ in found], peak_gb=[g for _, g in found])
-    (out / "import.json").write_text(json.dumps(figures, indent=2) + "\n", "utf-8")
+    write_json(figures, out / "import.json")
     click.echo(f"512 x 512 x {slices} CT and labels to a ready scene, {runs} runs, one after another:")
     click.echo("seconds    " + ", ".join(f"{s:.1f}" for s, _ in found))
     click.echo("memory     " + ", ".join(f"{g:.2f}" for _, g in found) + " GB at most")

@@ -76,7 +76,7 @@ def plan(
     loaded = with_options(load_scene(path), {"transducer.probe": probe})
     port = trocar_of(loaded.trocar, trocar, cone_deg, wrist_deg)
     anatomy = load_anatomy(loaded, path.parent)
-    held = probe_of(loaded, path.parent)
+    held = probe_of(loaded)
     make_folder(out.parent)
     if out.is_dir():
         raise Fault(f"{out}: is a folder; name a file after --out")

@@ -13,7 +13,8 @@ from studies.rehearse.track_file import check_near
 from studies.scan.poses import TimedPoses
 from studies.session.file import Header, Log, SessionError, read_log
 from studies.session.scene import scene_of_log
-from ultrasound.probe import Probe, explained
+from ultrasound.probe import Probe, ProbeError, probe_of_values
+from validation import explained
 from version import VERSION
 
 # What a budget leaves to the user.
@@ -67,17 +68,15 @@ def as_recorded(log: Log, scene: Scene) -> Scene:
     try:
         return scene_of_log(log.header, scene)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(map(str, first["loc"]))
-        raise SessionError(f"the session's scene cannot be used: {where}: {first['msg'].lower()}") from None
+        raise SessionError(f"the session's scene cannot be used: {explained(error)}") from None
 
 
 def recorded_probe(log: Log) -> Probe:
     """The probe of a session. Raises SessionError."""
     try:
-        return Probe.model_validate(log.header.probe)
-    except ValidationError as error:
-        raise SessionError(f"the session's probe cannot be used: {explained(error)}") from None
+        return probe_of_values(log.header.probe)
+    except ProbeError as error:
+        raise SessionError(f"the session's probe cannot be used: {error}") from None
 
 
 def check_anatomy(log: Log, anatomy: LoadedAnatomy, title: str) -> None:

@@ -135,7 +135,7 @@ def rehearse(
     loaded = with_options(before, changed) if log is None else as_recorded(log, before)
     if changed["tissue.model"] is None and loaded.tissue.model != before.tissue.model:
         click.echo(f"Tissue model: {loaded.tissue.model}, as the options ask for it.")
-    probe = probe_of(loaded, path.parent) if log is None else recorded_probe(log)
+    probe = probe_of(loaded) if log is None else recorded_probe(log)
     budgeted = budget_ms is not None or error_mm is not None
     if budgeted:
         refuse_sizes(changed)

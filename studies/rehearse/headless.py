@@ -10,6 +10,7 @@ from tqdm import tqdm
 from render.pictures import PICTURES_A_SECOND, empty_folder, save_animation, side_by_side, smaller
 from render.viewer import Controls, Settings, Viewer
 from render.window import NoVulkan
+from scenes.whole_files import whole
 from studies.link.live import send_live
 from studies.link.server import Server
 from studies.rehearsal import Rehearsal
@@ -67,7 +68,8 @@ def run_headless(
     save_animation(animation, out / "press.webp")
     save_surfaces(rehearsal, out)
     report = tally.report(rehearsal, arch) | dict(reading=instruments.figures())
-    (out / "report.json").write_text(json.dumps(report, indent=2) + "\n", "utf-8")
+    with whole(out / "report.json") as partial:
+        partial.write_text(json.dumps(report, indent=2) + "\n", "utf-8")
     click.echo(summary(report))
     click.echo(f"Wrote {-(-steps // every)} pictures, press.webp and report.json to {out}")
 

@@ -15,7 +15,7 @@ from studies.rehearse.cine import Calliper, Cine, Frame
 from studies.rehearse.drivers import Driver
 from studies.rehearse.instruments import Instruments
 from studies.rehearse.planning import Plans
-from studies.rehearse.saving import save_pictures, save_screenshot, save_surfaces
+from studies.rehearse.saving import save_screenshot, save_surfaces, save_view
 from studies.rehearse.sweeping import Sweeping
 from studies.rehearse.view import probe_as_set, take_view
 from studies.report import Tally
@@ -66,7 +66,7 @@ class Loop:
         if controls.screenshot:
             save_screenshot(self.viewer.picture(), self.out)
         if controls.export:
-            begin = save_pictures(view, probe_as_set(self.rehearsal.probe, controls.settings), self.out)
+            begin = save_view(view, probe_as_set(self.rehearsal.probe, controls.settings), self.out)
             # Of a picture that is looked back at, the tissue has gone on.
             if not (self.frozen and self.cine.back):
                 save_surfaces(self.rehearsal, self.out, begin)

@@ -7,12 +7,11 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from render.pictures import in_proportion
 from render.viewer import View
 from scenes.surface_files import save_surface
 from studies.numbering import next_number
+from studies.pictures import save_picture, save_pictures
 from studies.rehearsal import Rehearsal
-from ultrasound.dicom_image import save_dicom
 from ultrasound.probe import Probe
 from ultrasound.scanner import ECHO
 
@@ -22,22 +21,16 @@ SCREENSHOT, PICTURE = r"screenshot-([0-9]{3,9})\.png", r"([0-9]{3,9})-.*\.png"
 def save_screenshot(picture: np.ndarray, out: Path) -> None:
     """Save a picture under the next free number, and say where."""
     path = out / f"screenshot-{next_number(out, SCREENSHOT):03d}.png"
-    Image.fromarray(picture).save(path)
+    save_picture(Image.fromarray(picture), path)
     click.echo(f"Saved {path}")
 
 
-def save_pictures(view: View, probe: Probe, out: Path) -> str:
+def save_view(view: View, probe: Probe, out: Path) -> str:
     """Save what the scanner shows as PNG, an echo as DICOM too, under the next free number, and say where; how their names begin."""
-    number = next_number(out, PICTURE)
-    for name, picture in view.pictures.items():
-        path = out / f"{number:03d}-{name.lower()}.png"
-        image = in_proportion(picture, view.width_mm, view.depth_mm)
-        image.save(path)
-        spacing = view.depth_mm / image.height, view.width_mm / image.width
-        if name == ECHO:
-            save_dicom(path.with_suffix(".dcm"), np.asarray(image), spacing, probe)
-        click.echo(f"Saved {path}{' and .dcm' if name == ECHO else ''}")
-    return f"{number:03d}-"
+    begin = out / f"{next_number(out, PICTURE):03d}"
+    for saved in save_pictures(view.pictures, view.width_mm, view.depth_mm, probe, begin):
+        click.echo(f"Saved {saved.path}{' and .dcm' if saved.kind == ECHO else ''}")
+    return f"{begin.name}-"
 
 
 def save_surfaces(rehearsal: Rehearsal, out: Path, begin: str = "") -> None:

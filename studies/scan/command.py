@@ -1,9 +1,8 @@
 """The command ``scan``: pictures of an anatomy at rest for a list of probe poses."""
 
-import json
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
@@ -11,12 +10,15 @@ from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy
 from scenes.scene import load_scene, scene_file, with_options
-from scenes.whole_files import whole
 from studies.command_line import Fault, arch_option, make_folder, start_taichi
+from studies.results import write_json
 from studies.scan.poses import load_poses
 from studies.setup import probe_of
 from ultrasound.probe import MODES, RUNGS, Probe
 from version import VERSION
+
+if TYPE_CHECKING:
+    from studies.pictures import SavedPicture
 
 FRAMES_A_SECOND = 30
 
@@ -70,9 +72,10 @@ def scan(
     anatomy = load_anatomy(loaded, path.parent)
     if anatomy.ct is None:
         raise Fault(f"{path}: has no CT: expected anatomy.ct, of which pictures are made")
-    held, image = probe_of(loaded, path.parent), loaded.image
+    held, image = probe_of(loaded), loaded.image
     used = start_taichi(arch)
     from sim.embedding import Unmoved
+    from studies.pictures import save_pictures
     from studies.rehearsal import scanned_anatomy
     from ultrasound.marked_sweep import MarkedSweep
     from ultrasound.plane import ImagePlane
@@ -81,21 +84,18 @@ def scan(
     make_folder(out)
     scanned = scanned_anatomy(anatomy.organ, anatomy.ct, anatomy, np.zeros(3))
     scanner = Scanner(scanned, Unmoved(), held, image.pixels, "background", contact, image.contact_gap_mm)
-    width, depth, above = held.extent_mm
     swept = MarkedSweep(out, "sweep", held) if sweep else None
     rows, ms = [], []
     for name, pose in tqdm(placed.items(), desc="scan", unit="pose"):
         began = perf_counter()
-        plane = ImagePlane(pose, width, depth, above)
+        plane = ImagePlane(pose, *held.extent_mm)
         shown = scanner.look(plane, held, image.mode, image.rung, image.window_hu, image.level_hu)
         ms.append(1000 * (perf_counter() - began))
         if swept is not None:
             grey = next(iter(shown.values()))
             swept.add(grey, scanner.marks.render(), held, pose, swept.count / FRAMES_A_SECOND)
-        rows += [
-            dict(pose=name, probe_to_patient=pose.tolist()) | row
-            for row in save_pictures(shown, held, out, name, dicom)
-        ]
+        saved = save_pictures(shown, *held.extent_mm[:2], held, out / name, dicom)
+        rows += [dict(pose=name, probe_to_patient=pose.tolist()) | _row(each, held) for each in saved]
     if swept is not None:
         swept.close()
     report = dict(
@@ -107,34 +107,18 @@ def scan(
         arch=used,
         pictures=rows,
     )
-    with whole(out / "scan.json") as partial:
-        partial.write_text(json.dumps(report, indent=2) + "\n", "utf-8")
+    write_json(report, out / "scan.json")
     click.echo(
         f"Wrote {len(rows)} pictures of {len(placed)} poses and scan.json to {out}; {np.median(ms):.1f} ms a pose (median)."
     )
 
 
-def save_pictures(
-    shown: dict[str, np.ndarray], probe: Probe, out: Path, name: str, dicom: bool
-) -> list[dict[str, Any]]:
-    """Write what is shown (rows, columns) of a pose, by kind, with square pixels; what scan.json says of each. Raises OSError."""
-    from render.pictures import in_proportion
-    from ultrasound.dicom_image import save_dicom
-    from ultrasound.scanner import ECHO
-
-    width, depth, _ = probe.extent_mm
-    rows: list[dict[str, Any]] = []
-    for kind, grey in shown.items():
-        picture = in_proportion(grey, width, depth)
-        file = out / f"{name}-{kind.lower()}.png"
-        picture.save(file)
-        spacing = depth / picture.height, width / picture.width
-        if dicom and kind == ECHO:
-            save_dicom(file.with_suffix(".dcm"), np.asarray(picture), spacing, probe)
-        to_probe = probe.image_to_probe(picture.height, picture.width).tolist()
-        rows.append(
-            dict(
-                picture=kind, file=file.name, row_mm=spacing[0], column_mm=spacing[1], image_to_probe=to_probe
-            )
-        )
-    return rows
+def _row(saved: "SavedPicture", probe: Probe) -> dict[str, Any]:
+    """What scan.json says of a picture."""
+    return dict(
+        picture=saved.kind,
+        file=saved.path.name,
+        row_mm=saved.spacing_mm[0],
+        column_mm=saved.spacing_mm[1],
+        image_to_probe=probe.image_to_probe(*saved.shape).tolist(),
+    )

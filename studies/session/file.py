@@ -41,7 +41,7 @@ class Header(_Line):
     anatomy: str
     scene: dict[str, Any]
     probe: dict[str, Any]
-    arch: str
+    arch: str = Field(pattern=r"^[0-9a-z_]{1,20}$")
     time_step_s: float = Field(gt=0)
     begins: str | None = None
     """The state that it begins with, where that is not the settled one."""

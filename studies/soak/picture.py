@@ -5,13 +5,20 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from studies.results import save_figure
+
 DPI = 130
 SHOWN = (
-    ("shape_mm", "shape from the first rest (mm)"),
-    ("moved_mm", "place on the support from the first (mm)"),
-    ("memory_mb", "memory of the process (MB)"),
+    ("shape_mm", "shape: mean distance from the first rest,\nmoved and turned to fit (mm)"),
+    (
+        "moved_mm",
+        "place: mean distance from the first rest (mm);\nfriction alone holds the kidney where it was pushed",
+    ),
+    ("memory_mb", "memory of the process since the first minute (MB)"),
     ("ms_median", "time of a step (ms)"),
 )
+# Growth that is less than so much is drawn as none.
+LEAST_MB = 10.0
 
 
 def draw(runs: list[dict[str, Any]], path: Path) -> None:
@@ -20,13 +27,19 @@ def draw(runs: list[dict[str, Any]], path: Path) -> None:
     panels = figure.subplots(2, 2, sharex=True)
     for axes, (name, label) in zip(panels.ravel(), SHOWN, strict=True):
         for run in runs:
-            at = [row["minute"] for row in run["minutes"]]
-            axes.plot(at, [row[name] for row in run["minutes"]], marker=".", label=run["model"])
+            rows = run["minutes"]
+            begins = rows[0][name] if name == "memory_mb" else 0.0
+            at = [row["minute"] for row in rows]
+            axes.plot(at, [row[name] - begins for row in rows], marker=".", label=run["model"])
         axes.set_title(label, fontsize=10)
-        axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
+        low, high = axes.get_ylim()
+        if name == "memory_mb":
+            axes.set_ylim(min(low, -LEAST_MB), max(high, LEAST_MB))
+        else:
+            axes.set_ylim(0, 1.05 * high)
     for axes in panels[1]:
-        axes.set_xlabel("simulated minutes")
-    panels[0, 0].legend()
+        axes.set_xlabel("simulated minutes, each of presses and drags by chance and a rest")
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(runs))
     figure.suptitle("An hour of rehearsal" if len(runs[0]["minutes"]) == 60 else "Rehearsal without end")
-    figure.savefig(path, dpi=DPI)
+    save_figure(figure, path, dpi=DPI)

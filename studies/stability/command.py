@@ -13,13 +13,13 @@ from studies.command_line import make_folder
 from studies.results import write_csv, write_json
 from studies.stability.cases import MODELS, Case, cases_of, quick_cases_of
 
-# Cases that a process takes at a time: those of one body, which it then need not build anew.
-BATCH = 12
+# Cases of one body that a process takes at a time, by which the bar goes on; it keeps the body for the next ones.
+BATCH = 4
 
 
 @click.command()
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for table and picture.")
-@click.option("--quick", is_flag=True, help="One case of each kind, in less than a minute.")
+@click.option("--quick", is_flag=True, help="One case of each kind, in one to two minutes.")
 @click.option("--jobs", type=click.IntRange(1, 1024), help="Processes on this machine [one a processor].")
 def stability(out: Path, quick: bool, jobs: int | None) -> None:
     """Maltreat the tissue, let go, and see whether it recovers.

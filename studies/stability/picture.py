@@ -1,79 +1,66 @@
-"""The heat map of ``study stability``: each case a field, by how far it ended from rest."""
+"""The picture of ``study stability``: how the cases of each kind ended."""
 
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from studies.results import save_figure
 
 DPI = 130
-LEAST_MM, MOST_MM = 0.01, 100.0
-MARKS = {
-    "put back": ("o", "none", "orange"),
-    "whole, elsewhere": (".", "white", "white"),
-    "not finite": ("X", "red", "red"),
+WHOLE_MM = 0.1
+# How a case may end, and its colour; good ends first.
+FATES = {
+    "came back to where it lay": "#2a7f4f",
+    "put back by the program, to where it lay": "#8fce9d",
+    "its shape whole, lies elsewhere": "#4f86c6",
+    "put back by the program, its shape whole, lies elsewhere": "#a9c8ea",
+    "shape changed": "#f0a030",
+    "not finite": "#c0202a",
 }
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Write the picture."""
+    """Write the picture: a panel a model, a bar a kind of case."""
+    kinds = list(dict.fromkeys(row["kind"] for row in rows))
     models = list(dict.fromkeys(row["model"] for row in rows))
-    kinds = list(dict.fromkeys(row["kind"] for row in rows))
-    most = max(
-        sum(row["kind"] == kind and row["model"] == model for row in rows)
-        for kind in kinds
-        for model in models
-    )
-    size = max(9.0, 0.26 * most + 4), 0.3 * len(kinds) * len(models) + 2
-    figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(len(models), squeeze=False)[:, 0]
-    shown = None
+    figure = Figure(figsize=(12, 0.25 * len(kinds) + 2), layout="constrained")
+    panels = figure.subplots(1, len(models), sharey=True, squeeze=False)[0]
     for axes, model in zip(panels, models, strict=True):
-        shown = _map(axes, [row for row in rows if row["model"] == model], model)
-    if shown is not None:
-        figure.colorbar(shown, ax=list(panels), label="distance from rest after release (mm)", shrink=0.6)
-    figure.savefig(path, dpi=DPI)
+        _bars(axes, [row for row in rows if row["model"] == model], kinds)
+        axes.set_title(model)
+    panels[0].invert_yaxis()
+    ends = [[fate_of(row) for row in rows if row["model"] == model] for model in models]
+    handles = [
+        Patch(color=colour, label=f"{fate}: {', '.join(str(each.count(fate)) for each in ends)}")
+        for fate, colour in FATES.items()
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2)
+    figure.suptitle("How tissue ended that was maltreated and let go")
+    save_figure(figure, path, dpi=DPI)
 
 
-def _map(axes: Axes, rows: list[dict[str, Any]], model: str):
-    kinds = list(dict.fromkeys(row["kind"] for row in rows))
-    wide = max(sum(row["kind"] == kind for row in rows) for kind in kinds)
-    error = np.full((len(kinds), wide), np.nan)
-    at: dict[str, list[tuple[int, int]]] = {mark: [] for mark in MARKS}
-    for y, kind in enumerate(kinds):
-        for x, row in enumerate(row for row in rows if row["kind"] == kind):
-            error[y, x] = np.clip(row["rest_error_mm"] or 0.0, LEAST_MM, MOST_MM)
-            for mark in _marks(row):
-                at[mark].append((x, y))
-    shown = axes.imshow(error, norm=LogNorm(LEAST_MM, MOST_MM), cmap="viridis", aspect="auto")
-    for mark, places in at.items():
-        symbol, face, edge = MARKS[mark]
-        if places:
-            across, down = zip(*places, strict=True)
-            axes.scatter(
-                across,
-                down,
-                marker=symbol,
-                s=34,
-                facecolors=face,
-                edgecolors=edge,
-                label=mark,
-                linewidths=1.0,
-            )
-    axes.set_yticks(range(len(kinds)), kinds)
-    axes.set_xticks([])
-    axes.set_title(f"{model}: {len(rows)} cases, each a field", fontsize=11)
-    if any(at.values()):
-        axes.legend(loc="lower right", fontsize=8, facecolor="0.8")
-    return shown
+def _bars(axes: Axes, rows: list[dict[str, Any]], kinds: list[str]) -> None:
+    fates = [(row["kind"], fate_of(row)) for row in rows]
+    begins = [0] * len(kinds)
+    for fate, colour in FATES.items():
+        counts = [fates.count((kind, fate)) for kind in kinds]
+        axes.barh(kinds, counts, left=begins, color=colour)
+        begins = [begin + count for begin, count in zip(begins, counts, strict=True)]
+    axes.set_xlabel(f"cases, of {len(rows)}")
+    axes.grid(alpha=0.3, axis="x")
+    axes.set_axisbelow(True)
 
 
-def _marks(row: dict[str, Any]) -> list[str]:
-    marks = [] if row["finite"] else ["not finite"]
-    if row["fallback"]:
-        marks.append("put back")
-    if not row["recovered"] and row["shape_error_mm"] is not None and row["shape_error_mm"] <= 0.1:
-        marks.append("whole, elsewhere")
-    return marks
+def fate_of(row: dict[str, Any]) -> str:
+    """How a case ended: one of ``FATES``."""
+    if not row["finite"]:
+        return "not finite"
+    if not row["recovered"] and (row["shape_error_mm"] is None or row["shape_error_mm"] > WHOLE_MM):
+        return "shape changed"
+    own, put_back, elsewhere, both, *_ = FATES
+    if row["recovered"]:
+        return put_back if row["fallback"] else own
+    return both if row["fallback"] else elsewhere

@@ -7,6 +7,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from studies.results import save_figure
 from studies.timing.measure import Press
 from studies.timing.phases import AFTER, BEFORE, CONTACTS, PASSES
 
@@ -32,7 +33,7 @@ def draw(presses: list[Press], sizes: list[dict], path: Path) -> None:
     _pieces(panels[0, 1], presses)
     _radii(panels[1, 0], matched)
     _sizes(panels[1, 1], sizes)
-    figure.savefig(path, dpi=DPI)
+    save_figure(figure, path, dpi=DPI)
 
 
 def _against_time(axes: Axes, press: Press) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from studies.results import save_figure
 from studies.trade.front import preset_of, setup_of_row
 from studies.trade.tried import PAPER
 
@@ -35,7 +36,7 @@ def draw(points: list[dict[str, Any]], path: Path) -> None:
     axes.set_title("What speed costs in accuracy")
     axes.grid(alpha=0.3, which="both")
     axes.legend(loc="center right")
-    figure.savefig(path, dpi=DPI)
+    save_figure(figure, path, dpi=DPI)
 
 
 def _model(axes: Axes, points: list[dict[str, Any]], model: str) -> None:

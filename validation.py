@@ -1,0 +1,42 @@
+"""What is wrong with the values of a file, in words; every layer reads files."""
+
+import difflib
+from collections.abc import Callable, Collection, Iterable
+
+from pydantic import ValidationError
+
+
+def explained(
+    error: ValidationError,
+    unknown: Callable[[list[str]], str] = lambda where: "unknown key",
+    tags: Collection[str] = (),
+) -> str:
+    """The first problem in a line: the key, what was found, what was expected, and how many more there are.
+
+    ``unknown`` says what the writer of an unknown key, given by its place, may have meant. ``tags`` are the kinds of a union, which
+    pydantic names among the keys. A validator's own message that begins with its key is left as it is.
+    """
+    problems = error.errors(include_url=False)
+    # A key that is missing under one spelling and unknown under another is one mistake: name the unknown one.
+    problems.sort(key=lambda problem: problem["type"] != "extra_forbidden")
+    first = problems[0]
+    where = [str(part) for part in first["loc"] if part not in tags]
+    name, said = ".".join(where), first["msg"][0].lower() + first["msg"][1:]
+    if first["type"] == "value_error":
+        said = str(first["ctx"]["error"])
+    if first["type"] == "extra_forbidden":
+        text = f"{name}: {unknown(where)}"
+    elif first["type"] == "missing":
+        text = f"{name}: missing"
+    elif isinstance(first["input"], dict):
+        text = said if said.startswith(name) else f"{name}: {said}"
+    else:
+        text = f"{name} = {first['input']!r}: {said}"
+    more = len(problems) - 1
+    return text + (f" (and {more} more)" if more else "")
+
+
+def meant(key: str, known: Iterable[str]) -> str:
+    """What the writer of an unknown key may have meant."""
+    close = difflib.get_close_matches(key, list(known), n=1)
+    return f"did you mean {close[0]}?" if close else f"known here: {', '.join(known)}"
