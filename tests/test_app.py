@@ -219,7 +219,7 @@ def test_a_mistake_ends_the_program_with_one_line_and_status_2(tmp_path):
 
 def test_mistakes_are_one_line(tmp_path):
     assert "no such scene file" in refused("rehearse", tmp_path / "none.toml")
-    assert "Did you mean '--headless'?" in refused("rehearse", "--hedless")
+    assert "Did you mean one of: '--headless'" in refused("rehearse", "--hedless")
     assert "No such command 'rehears'. Did you mean 'rehearse'?" in refused("rehears")
     assert "Did you mean" not in refused("xyz")
     assert "leave out --no-pictures or --link" in refused("rehearse", "--headless", "--no-pictures", "--link")

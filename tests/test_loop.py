@@ -174,9 +174,13 @@ def test_without_pictures_none_is_taken_and_the_rest_is_written(monkeypatch, tmp
     # The plane of the depth that the replay has just set.
     moments.find_plane = lambda probe: done.append(probe.depth_mm)
     moments.watch = lambda *told: done.append("watched") if told else ""
-    headless.run_headless(moments, moments, 2, Settings(), moments, "cpu", tmp_path, 0.0, draws=False)
-    steps = [["step", "carried", depth_mm, "watched"] for depth_mm in (51, 52)]
-    assert done == [*steps[0], *steps[1], "surfaces"]
+    monkeypatch.setattr(Nothing, "watch", lambda tally, rehearsal: done.append("tallied"))
+    move = moments.move
+    # The last moment is a way back: nothing is stepped, and the tool is not yet where the tissue has it.
+    moments.move = lambda controls: None if move(controls) is not None and moments.moment == 3 else np.eye(4)
+    headless.run_headless(moments, moments, 3, Settings(), moments, "cpu", tmp_path, 0.0, draws=False)
+    steps = [["step", "carried", depth_mm, "tallied", "watched"] for depth_mm in (51, 52)]
+    assert done == [*steps[0], *steps[1], 53, "watched", "surfaces"]
     assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
 
 

@@ -81,9 +81,10 @@ def run_headless(
             rehearsal.find_plane(probe)
         if pose is not None:
             _tell(driver.stepped(tally.step_ms[-1]))
+            # After a way back the tissue is where it was, but the tool only with the next step.
+            tally.watch(rehearsal)
         instruments.watch(driver.session, probe, pose)
         _tell(driver.watch())
-        tally.watch(rehearsal)
         if pictures is not None and view is not None:
             send_live(link, rehearsal, view, probe, driver.session.time_s)
             pictures.draw(step, view, settings, instruments)
