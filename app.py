@@ -26,6 +26,9 @@ except ModuleNotFoundError as missing:
         f"nephron: {missing.name} is not installed for this Python; run make run once, then use the Python of its environment: "
         ". .venv/bin/activate (Windows: .venv\\Scripts\\activate)"
     )
+except KeyboardInterrupt:
+    sys.stderr.write("Stopped.\n")
+    sys.exit(130)
 
 from version import VERSION
 
@@ -67,9 +70,10 @@ class Commands(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
 
-    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+    def get_command(self, ctx: click.Context, name: str) -> click.Command:
         if name not in COMMANDS:
-            return None
+            # click's own error suggests of the commands that it holds, and it holds none.
+            raise click.NoSuchCommand(name, possibilities=COMMANDS, ctx=ctx)
         module, command = COMMANDS[name].split(":")
         return getattr(import_module(module), command)
 
@@ -103,8 +107,7 @@ def main(arguments: list[str]) -> int:
         arguments = ["rehearse", *arguments]
     _stop_in_order()
     try:
-        cli.main(args=arguments, prog_name="app.py", standalone_mode=False)
-        return 0
+        return cli.main(args=arguments, prog_name="app.py", standalone_mode=False) or 0
     except click.ClickException as error:
         message = error.format_message()
     except MENDED_BY_USER as error:

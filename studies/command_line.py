@@ -9,7 +9,11 @@ import click
 
 from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.scene import Scene, load_scene, scene_file
+from scenes.tissue import QUALITIES
 from studies.results import write_json
+
+# The exit status of a program that Ctrl-C has ended.
+STOPPED = 130
 
 
 class Fault(click.ClickException):
@@ -90,4 +94,9 @@ arch_option = click.option(
     default="auto",
     show_default=True,
     help="Where to compute; auto is CUDA where there is one, else the CPU.",
+)
+quality_option = click.option(
+    "--quality",
+    type=click.Choice(QUALITIES),
+    help="Size and passes as a preset of the tissue model has them [the scene's].",
 )

@@ -242,6 +242,11 @@ class Rehearsal:
             return {"no CT": np.zeros((self.scene.image.pixels, self.scene.image.pixels), np.uint8)}
         return self.scanner.look(self.image_plane(probe), probe, mode, rung, window_hu, level_hu)
 
+    def find_plane(self, probe: Probe) -> None:
+        """Find the tissue that a picture would be of, and make none."""
+        if self.scanner is not None:
+            self.scanner.take(self.image_plane(probe))
+
     def image_plane(self, probe: Probe | None = None) -> ImagePlane:
         """The plane that the transducer shows now, as far as its probe, or another set like it, sees."""
         return image_plane(self.pose, self.size_mm[2], *(probe or self.probe).extent_mm)

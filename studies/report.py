@@ -45,7 +45,7 @@ class Tally:
         self.indentation_max_mm = max(self.indentation_max_mm, rehearsal.indentation_mm())
 
     def report(self, rehearsal: Rehearsal, arch: str) -> dict:
-        """Everything in one dictionary; times in ms are over all steps but the first, if there are more."""
+        """Everything in one dictionary; times in ms are over all steps but the first, if there are more, and None of what was not done."""
         settings = rehearsal.settings
         return dict(
             version=VERSION,
@@ -63,8 +63,8 @@ class Tally:
             slice_width_mm=rehearsal.probe.extent_mm[0],
             slice_depth_mm=rehearsal.probe.depth_mm,
             steps=rehearsal.steps,
-            ms_per_step=spread(self.step_ms[1:] or self.step_ms),
-            ms_per_slice=spread(self.slice_ms[1:] or self.slice_ms),
+            ms_per_step=_times(self.step_ms),
+            ms_per_slice=_times(self.slice_ms),
             build_s=round(self.build_s, 3),
             finite=self.finite,
             expected_error_mm=expected_error_of(rehearsal),
@@ -75,19 +75,22 @@ class Tally:
         )
 
 
+def _times(ms: list[float]) -> dict[str, float] | None:
+    return spread(ms[1:] or ms) if ms else None
+
+
 def summary(report: dict) -> str:
     """The figures that matter, in a few lines for the terminal."""
-    step, picture = report["ms_per_step"], report["ms_per_slice"]
-    times = (
-        f"{step['median']:.1f} ms a step, {picture['median']:.1f} ms a picture (medians of {report['steps']})"
-    )
+    measured = {"step": report["ms_per_step"], "picture": report["ms_per_slice"]}
+    times = ", ".join(f"{ms['median']:.1f} ms a {name}" for name, ms in measured.items() if ms is not None)
+    shown = f"picture {report['picture']}, echo as far as {report['rung']}"
     return "\n".join(
         [
             f"model     {TISSUES[report['model']].REPORTED.format(**report)}, {report['tetrahedra']} tetrahedra",
             f"step      1/{1 / report['time_step_s']:.0f} s in {counted(report['substeps'], 'substep')} of "
             f"{counted(report['iterations'], 'iteration')}",
-            f"speed     {times} on {report['arch']}; built in {report['build_s']:.1f} s",
-            f"probe     {report['probe']}; picture {report['picture']}, echo as far as {report['rung']}",
+            f"speed     {times} (medians of {report['steps']}) on {report['arch']}; built in {report['build_s']:.1f} s",
+            f"probe     {report['probe']}; {shown if measured['picture'] else 'no pictures'}",
             f"press     {report['indentation_max_mm']:.2f} mm deep; least volume {100 * report['volume_ratio_min']:.1f} %; "
             f"penetration at most {report['max_penetration_mm']:.3f} mm; "
             f"{'all finite' if report['finite'] else 'NOT FINITE'}",

@@ -26,8 +26,9 @@ def spread(values: list[float]) -> dict[str, float]:
 
 
 def counted(number: int, name: str) -> str:
-    """A number of things: "1 substep", "3 substeps"."""
-    return f"{number} {name}{'' if number == 1 else 's'}"
+    """A number of things: "1 substep", "3 substeps", "2 presses"."""
+    ending = "" if number == 1 else "es" if name.endswith("s") else "s"
+    return f"{number} {name}{ending}"
 
 
 def write_json(figures: dict[str, Any], path: Path) -> None:

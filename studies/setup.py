@@ -85,6 +85,11 @@ def scene_of(scene: Scene, setup: Setup) -> Scene:
     return with_options(scene, tissue | passes | {"tissue.model": setup.model})
 
 
+def with_quality(scene: Scene, quality: str | None) -> Scene:
+    """A scene with the size and passes of its model's preset, where one is asked for."""
+    return scene if quality is None else scene_of(scene, PRESETS[scene.tissue.model][quality])
+
+
 def setup_of_scene(scene: Scene, substeps: int, iterations: int, relaxation_factor: float) -> Setup:
     """The setup that a scene is computed with when its steps have these passes."""
     return Setup(scene.tissue, relaxation_factor, substeps, iterations)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import redirect_stderr
+from functools import partial
 from pathlib import Path
 
 import click
@@ -19,6 +20,8 @@ from conftest import ROOT
 from PIL import Image
 
 import app
+from studies.command_line import Fault
+from studies.rehearse.checks import refuse_no_pictures
 from version import VERSION
 
 REPORTED = {
@@ -143,6 +146,19 @@ def test_a_python_without_the_packages_is_one_line():
     assert done.returncode == 1 and "is not installed for this Python; run make run once" in line
 
 
+def test_ctrl_c_ends_it_in_words(tmp_path, monkeypatch, capsys):
+    (tmp_path / "click.py").write_text("raise KeyboardInterrupt")
+    done = run("--version", PYTHONPATH=str(tmp_path))
+    assert (done.returncode, done.stderr) == (130, "Stopped.\n")
+
+    def ends(by):
+        raise by
+
+    for by, words in ((KeyboardInterrupt(), "Stopped."), (click.exceptions.Exit(130), "")):
+        monkeypatch.setattr("studies.rehearse.command.keys_text", partial(ends, by))
+        assert app.main(["keys"]) == 130 and capsys.readouterr().err.strip() == words
+
+
 def test_options_reach_the_solver(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("studies.rehearse.headless.open_viewer", lambda *_, **__: None)
     steps = "--substeps", "2", "--iterations", "5", "--stiffness", "0.7"
@@ -190,8 +206,12 @@ def test_a_mistake_ends_the_program_with_one_line_and_status_2(tmp_path):
 
 def test_mistakes_are_one_line(tmp_path):
     assert "no such scene file" in refused("rehearse", tmp_path / "none.toml")
-    assert "--hedless" in refused("rehearse", "--hedless")
-    assert "reherse" in refused("reherse")
+    assert "Did you mean one of: '--headless'" in refused("rehearse", "--hedless")
+    assert "No such command 'rehears'. Did you mean 'rehearse'?" in refused("rehears")
+    assert "Did you mean" not in refused("xyz")
+    assert "leave out --no-pictures or --link" in refused("rehearse", "--headless", "--no-pictures", "--link")
+    with pytest.raises(Fault, match="add --headless"):
+        refuse_no_pictures(headless=False, link=False)
     assert "--arch" in refused("rehearse", "--arch", "abacus")
     assert "--seconds" in refused("rehearse", "--seconds", "-1")
     assert "--radius = 0.0" in refused("rehearse", "--radius", "0")

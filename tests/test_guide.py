@@ -18,6 +18,8 @@ from studies.readings import Reading
 from studies.rehearse import instruments
 from studies.rehearse.guide import ABOVE_MM, AHEAD, DEG_BESIDE_A_MM, NEAR_MM, Guide
 from studies.rehearse.instruments import Instruments
+from studies.session.file import Event, Log, SessionError
+from studies.session.seen import pack_seen
 from ultrasound.hand import advanced
 from ultrasound.probe import load_probe
 from ultrasound.target import TARGETS
@@ -279,6 +281,33 @@ def test_the_instruments_watch_the_guide_and_record_it(watching, rehearsal, one_
     assert watching.guide.at == 0
     watching.guide = None
     assert watching.onto(view, Settings()).guidance is None and "plan_followed" not in watching.figures()
+
+
+def test_what_a_session_holds_is_recalled_as_it_was_watched(watching, rehearsal, one_device, monkeypatch):
+    squeezed = iter([0.3, 1.5, 9.0, 0.2])
+    monkeypatch.setattr(instruments, "read", lambda *_: Reading(next(squeezed), 20.0, 5.0, 2.0, 1.0))
+    events: dict[int, list] = {}
+    session = SimpleNamespace(moment=0)
+    session.note = lambda kind, value: events.setdefault(session.moment, []).append(
+        Event(at=session.moment, kind=kind, value=value)
+    )
+    for session.moment, rehearsal.pose in enumerate(FIRST, 1):
+        watching._read_every = 1
+        watching.watch(session, rehearsal.probe, rehearsal.pose)
+    watching.course.add(None, 0.2)
+    watching.coverage.seen[watching.coverage.targets["tumour"]] = True
+    log = Log(None, np.stack([*FIRST, np.full((4, 4), np.nan)]), events)
+    again = Instruments(rehearsal, Guide(rehearsal, watching.guide.plan))
+    assert again.recall(log, 0) and not again.recall(log, 5) and again.course.duration_s == 0
+    log.seen[5] = pack_seen(watching.coverage.seen)
+    assert again.recall(log, 5)
+    assert again.figures() == watching.figures() and again.summary(2) == watching.summary(2)
+    assert (again.course.presses, again.course.went_back, again.guide.at) == (1, 1, 4)
+    view = again.onto(View(np.eye(4), {}, 40.0, 60.0), Settings(show_seen=True))
+    assert view.findings["tumour seen"] == "100 %" and view.seen["tumour"].any()
+    del log.events[1][0].value["contact_mm2"]
+    with pytest.raises(SessionError, match="without compression or contact"):
+        Instruments(rehearsal).recall(log, 5)
 
 
 def test_another_plan_brings_its_margin_and_what_was_seen_stays(watching, rehearsal, one_device):

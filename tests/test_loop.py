@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from click.exceptions import Exit
 
 import app
 from render.viewer import Controls, Settings, View
@@ -156,10 +157,45 @@ def test_without_a_window_pictures_go_to_the_link_and_the_tissue_into_the_folder
     monkeypatch.setattr(headless, "summary", lambda report: "")
     monkeypatch.setattr(headless, "save_surfaces", lambda rehearsal, out: saved.append((moments.moment, out)))
     link = SimpleNamespace(show=sent.append)
-    headless.run_headless(moments, moments, 3, Settings(), moments, "cpu", tmp_path, 0.0, link)
+    headless.run_headless(moments, moments, 3, Settings(), moments, "cpu", tmp_path, 0.0, True, link)
     assert [live.grey[0, 0] for live in sent] == [1, 2, 3] and sent[-1].time_s == 3 * STEP_S
     assert [live.image_to_probe[1, 1] for live in sent] == [51 / 4, 52 / 4, 53 / 4]
     assert saved == [(3, tmp_path)] and json.loads((tmp_path / "report.json").read_text()) == {"reading": {}}
+
+
+def test_without_pictures_none_is_taken_and_the_rest_is_written(monkeypatch, tmp_path):
+    moments, done = Moments(), []
+    monkeypatch.setattr("studies.rehearse.view.timed", lambda act, ms: ms.append(1.0) or act())
+    monkeypatch.setattr(headless, "Tally", Nothing)
+    monkeypatch.setattr(headless, "summary", lambda report: "")
+    monkeypatch.setattr(headless, "save_surfaces", lambda rehearsal, out: done.append("surfaces"))
+    moments.advance = lambda pose: done.append("step")
+    moments.update_surfaces = lambda: done.append("carried")
+    # The plane of the depth that the replay has just set.
+    moments.find_plane = lambda probe: done.append(probe.depth_mm)
+    moments.watch = lambda *told: done.append("watched") if told else ""
+    monkeypatch.setattr(Nothing, "watch", lambda tally, rehearsal: done.append("tallied"))
+    move = moments.move
+    # The last moment is a way back: nothing is stepped, and the tool is not yet where the tissue has it.
+    moments.move = lambda controls: None if move(controls) is not None and moments.moment == 3 else np.eye(4)
+    headless.run_headless(moments, moments, 3, Settings(), moments, "cpu", tmp_path, 0.0, draws=False)
+    steps = [["step", "carried", depth_mm, "tallied", "watched"] for depth_mm in (51, 52)]
+    assert done == [*steps[0], *steps[1], 53, "watched", "surfaces"]
+    assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
+
+
+def test_ctrl_c_in_a_run_says_so_before_how_it_went(monkeypatch, capsys):
+    monkeypatch.setattr(run.Run, "_end", lambda each, bookmarks: print(f"{bookmarks} bookmarks"))
+    monkeypatch.setattr(run, "Instruments", lambda rehearsal, guide: None)
+    driver = SimpleNamespace(session=SimpleNamespace(time_s=1.25), bookmarks=3)
+    each = run.Run(Moments(), None, "cpu", None)
+    with pytest.raises(Exit) as ended, each._summed_up(driver, None):
+        raise KeyboardInterrupt
+    assert ended.value.exit_code == 130
+    assert capsys.readouterr().out == "\nStopped at 1.2 s; until then:\n3 bookmarks\n"
+    with each._summed_up(driver, None):
+        pass
+    assert capsys.readouterr().out == "3 bookmarks\n"
 
 
 def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path, sent):
@@ -171,9 +207,9 @@ def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path
     looping = SimpleNamespace(run=lambda: None)
     monkeypatch.setattr(run, "Loop", lambda *_, keys, link: given.append(link) or looping)
     monkeypatch.setattr(run, "run_headless", lambda *arguments: given.append(arguments[-1]))
-    monkeypatch.setattr(run, "Session", lambda rehearsal: None)
+    monkeypatch.setattr(run, "Session", lambda rehearsal, seen: None)
     for name in ("_live", "_record", "_end"):
-        monkeypatch.setattr(run.Run, name, lambda *_: None)
+        monkeypatch.setattr(run.Run, name, lambda *_: SimpleNamespace(bookmarks=0))
     each = run.Run(Moments(), None, "cpu", tmp_path, link=link)
     each.in_window(None, 0.0)
     each.headless(None, 0.0, 1.0, 0.0)

@@ -2,7 +2,8 @@
 
 import errno
 import io
-from collections.abc import Iterator
+import json
+from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from studies.session.file import Event, Header, Log, Recording, SessionError, pa
 from studies.session.recorded import Recorded, record
 from studies.session.replay import Replay
 from studies.session.scene import scene_of_log
+from studies.session.seen import pack_seen, unpack_seen
 from studies.session.session import Session
 from studies.setup import probe_of
 from studies.trade.ladder import Ladder
@@ -35,8 +37,8 @@ def header() -> Header:
     return Header(anatomy="0", scene={}, probe={}, arch="x64", time_step_s=STEP_S)
 
 
-def live_into(path: Path) -> Live:
-    session = Session(Numbers())
+def live_into(path: Path, seen: Callable[[], np.ndarray] | None = None) -> Live:
+    session = Session(Numbers(), seen=seen)
     return Live(session, Ladder(1e6), Recorded(session, Recording(path, header())))
 
 
@@ -68,12 +70,11 @@ def written(path: Path, moments: int = 100, seed: int = 0) -> str:
 def played(log: Log, at_s: float = 0.0) -> Replay:
     """A replay opened at a time and played to its end."""
     replay = Replay(Numbers(), log)
-    replay.open_at(at_s)
-    while not replay.is_over:
-        pose, _ = replay.move()
-        if pose is not None:
-            replay.rehearsal.advance(pose)
-            replay.stepped()
+    replay.begin_at(at_s)
+    assert len(list(replay.go_to(at_s))) <= replay.session.moment == replay.moment_at(at_s)
+    for _ in replay.go_to(log.length_s):
+        pass
+    assert replay.is_over
     return replay
 
 
@@ -93,6 +94,7 @@ def test_a_session_replays_from_its_beginning_and_from_anywhere(often, tmp_path,
         replay = played(log, at_s)
         assert replay.differs_s is None and replay.rehearsal.digest() == digest, at_s
         assert replay.compared >= 10 - at_s
+        assert replay.bookmarks == sum(e.kind == "bookmark" for each in log.events.values() for e in each)
     replay = played(replace(log, states={}), 9.0)
     assert replay.differs_s is None and replay.compared == len(log.digests) == 19
     assert replay.rehearsal.digest() == digest
@@ -113,15 +115,59 @@ def test_a_state_that_a_later_way_back_goes_behind_is_not_begun_at(monkeypatch, 
     log = marked_then_gone_to(tmp_path / "session")
     assert sorted(log.states) == [5, 8, 16, 24, 32, 40, 48]
     # With the bookmark's own state all others can be begun at.
-    assert Replay(Numbers(), log).open_at(25 * STEP_S) == 24 * STEP_S
+    assert Replay(Numbers(), log).begin_at(25 * STEP_S) == 24
     assert played(log, 25 * STEP_S).differs_s is None
     del log.states[5]
     for moment, begun_at in ((5, 0), (25, 0), (32, 0), (33, 0), (39, 0), (40, 40), (47, 40)):
-        began: list[int] = []
         replay = Replay(Numbers(), log)
-        replay.open_at(moment * STEP_S, began.append)
-        assert began == [begun_at] + [1] * (moment - begun_at) and replay.session.moment == moment
+        assert replay.begin_at(moment * STEP_S) == begun_at == replay.session.moment
+        assert len(list(replay.go_to(moment * STEP_S))) == moment - begun_at
+        assert replay.session.moment == moment and replay.bookmarks == (moment > 5)
     assert played(log, 25 * STEP_S).differs_s is None
+
+
+def voxels(count: int) -> np.ndarray:
+    """The first so many of 5 x 3 x 7 were seen."""
+    return (np.arange(105) < count).reshape(5, 3, 7)
+
+
+def test_beside_each_whole_state_stands_what_was_seen_until_then(often, tmp_path):
+    live = live_into(tmp_path / "session", lambda: voxels(live.session.moment))
+    for moment in range(50):
+        step(live, bookmark=moment == 13, ray=ray(moment % 7 - 3.0))
+        live.watch()
+    live.recorded.close({})
+    log = read_log(tmp_path / "session")
+    assert sorted(log.seen) == sorted(log.states) == [13, 16, 32, 48, 50]
+    assert all(np.array_equal(unpack_seen(seen), voxels(moment)) for moment, seen in log.seen.items())
+    assert played(log).differs_s is None
+
+
+def test_what_was_seen_that_is_damaged_is_named_by_its_line(tmp_path):
+    whole = pack_seen(voxels(60))
+    damages = [
+        whole | {"shape": shape}
+        for shape in ([5, 3], [5, 3, 8], [105, 1, 0], [10**5] * 3, [5, 3, 7.0], "537", None, [True, 15, 7])
+    ]
+    damages += [whole | {"bits": bits} for bits in ("", "AAAA", whole["bits"][:-8], "\xe9", 7)]
+    damages += [whole | {"bits": pack_seen(np.zeros(300, bool))["bits"]}, {"shape": [1, 1, 1]}, "seen", [], 1]
+    damages += [whole | {"of": "doe"}]
+    live = live_into(tmp_path / "session", lambda: voxels(60))
+    for moment in range(9):
+        step(live, bookmark=moment == 3)
+        live.watch()
+    live.recorded.close({})
+    lines = (tmp_path / "session").read_text().splitlines()
+    second, end = json.loads(lines[1]), json.loads(lines[-1])
+    assert end["seen"] == whole == next(e["value"] for e in second["events"] if e["kind"] == "seen")
+    for damage in damages:
+        for event in second["events"]:
+            event["value"] = damage if event["kind"] == "seen" else event["value"]
+        end["seen"] = damage
+        for number, texts in ((2, [json.dumps(second), *lines[2:]]), (4, [*lines[1:3], json.dumps(end)])):
+            (tmp_path / "session").write_text("\n".join([lines[0], *texts, ""]))
+            with pytest.raises(SessionError, match=rf"^session: line {number} is damaged \([^\n]*$"):
+                read_log(tmp_path / "session")
 
 
 @pytest.mark.parametrize("at_back", [False, True])
@@ -314,7 +360,7 @@ def test_a_session_names_no_path_and_is_written_over_none(tmp_path, ball):
 def test_a_session_is_refused_with_another_patient_and_with_options_of_its_own(tmp_path, ball):
     path = recorded_at(tmp_path, ball).recording.path
     assert "other anatomy" in refused("--replay", path)
-    for option, value in (("--cell", 7), ("--probe", "linear"), ("--budget-ms", 5), ("--iterations", 3)):
+    for option, value in (("--cell", 7), ("--probe", "linear"), ("--budget-ms", 5), ("--quality", "fast")):
         assert refused("--replay", path, option, value).startswith(f"nephron: {option}: a replay computes")
     assert refused("--at", 3).startswith("nephron: --at: ")
     assert "no such session file" in refused("--replay", tmp_path / "none")

@@ -9,12 +9,14 @@ import pytest
 from PIL import Image
 
 import app
-from scenes.scene import EMBEDDED, PAPER, SolverSection, load_scene, with_options
+from scenes.scene import EMBEDDED, OPTIONS, PAPER, SolverSection, load_scene, with_options
 from scenes.tissue import QUALITIES
 from sim.neo_hookean import LATTICE_SETTINGS
 from studies.case import load_case
 from studies.experiment import Experiment
 from studies.models import step_settings
+from studies.rehearse.checks import refuse_sizes
+from studies.rehearse.command import as_asked
 from studies.report import expected_error_of
 from studies.setup import PRESETS, Setup, scene_of, setup_of, setup_of_scene
 from studies.trade import choice, command
@@ -150,9 +152,34 @@ def test_budgets_that_nothing_keeps_are_refused_in_words(monkeypatch):
         choice.choose(FRONT, machine.build, 10.0, 0.2)
 
 
-def test_the_command_line_refuses_a_size_beside_a_budget(capsys):
-    assert app.main(["rehearse", "--headless", "--budget-ms", "5", "--cell", "4"]) == 2
-    assert "--cell: --budget-ms and --error-mm choose this" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        (["--budget-ms", "5", "--cell", "4"], "--cell: --budget-ms chooses this too"),
+        (["--error-mm", "1", "--stiffness", "0.9"], "--stiffness: --error-mm chooses this too"),
+        (["--quality", "fast", "--cell", "5"], "--cell: --quality chooses this too"),
+        (["--quality", "fast", "--iterations", "4"], "--iterations: --quality chooses this too"),
+        (["--quality", "fast", "--error-mm", "1"], "--quality: --error-mm chooses size and passes too"),
+    ],
+)
+def test_the_command_line_refuses_a_size_beside_what_chooses_it(line, words, capsys):
+    assert app.main(["rehearse", "--headless", *line]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_a_quality_sets_size_and_passes_and_leaves_the_material():
+    scene, said = load_scene(PAPER), dict.fromkeys(OPTIONS)
+    firm = said | {"tissue.young_kpa": 33.0}
+    for quality, cell_mm, iterations in (("fast", 5.0, 4), ("accurate", 2.0, 12)):
+        asked, _ = as_asked(scene, PAPER.parent, firm, quality)
+        assert (asked.tissue.cell_mm, asked.tissue.young_kpa) == (cell_mm, 33.0)
+        assert (asked.solver.substeps, asked.solver.iterations) == (1, iterations)
+    stiff = said | {"tissue.stiffness": 0.7}
+    asked, probe = as_asked(scene, PAPER.parent, stiff, "fast")
+    assert (asked.tissue.radius_mm, asked.tissue.stiffness, asked.solver.iterations) == (3.3, 0.7, 9)
+    refuse_sizes(stiff, {"--quality": "fast", "--budget-ms": None, "--error-mm": None})
+    refuse_sizes(firm, {"--quality": None, "--budget-ms": 5.0, "--error-mm": 0.1})
+    assert as_asked(scene, PAPER.parent, said, None) == (scene, probe)
 
 
 def test_a_slow_step_loses_iterations_rung_by_rung_and_gets_them_back():

@@ -109,12 +109,16 @@ class Scanner:
     def _organ(self) -> Volume:
         return distance_volume(self.anatomy.organ)
 
+    def take(self, plane: ImagePlane) -> None:
+        """Find the tissue on a plane, of which there is no picture yet."""
+        self.embedding.update()
+        self.plane.take(plane)
+
     def look(
         self, plane: ImagePlane, probe: Probe, mode: Mode, rung: Rung, window_hu: float, level_hu: float
     ) -> dict[str, np.ndarray]:
         """Grey values (pixels, pixels) uint8 of what a mode shows of a plane, by name, the first the one that matters."""
-        self.embedding.update()
-        self.plane.take(plane)
+        self.take(plane)
         show = {
             CT: lambda: self.slice.render(window_hu, level_hu),
             ECHO: lambda: self.bmode.render(probe, rung),

@@ -9,9 +9,9 @@ from tqdm import tqdm
 from scenes.anatomy import load_anatomy
 from scenes.scene import EMBEDDED, load_scene, scene_file, with_options
 from scenes.trocar import Trocar
-from studies.command_line import Fault, NumberRange, make_folder
+from studies.command_line import Fault, NumberRange, make_folder, quality_option
 from studies.plan.file import FASTEST_MM_S, MOST_MARGIN_MM, MOST_SWEEPS, SLOWEST_MM_S, scans_of, write_plan
-from studies.setup import probe_of
+from studies.setup import probe_of, with_quality
 from ultrasound.target import TARGETS, Target
 
 
@@ -40,6 +40,7 @@ from ultrasound.target import TARGETS, Target
     "--wrist-deg", type=float, help="How far the probe may look aside from the shaft [the scene's]."
 )
 @click.option("--probe", help="Probe, by its name or as a file [the scene's].")
+@quality_option
 @click.option(
     "--speed-mm-s",
     type=NumberRange(SLOWEST_MM_S, FASTEST_MM_S),
@@ -64,6 +65,7 @@ def plan(
     cone_deg: float | None,
     wrist_deg: float | None,
     probe: str | None,
+    quality: str | None,
     speed_mm_s: float,
     trials: int,
     jobs: int | None,
@@ -73,7 +75,7 @@ def plan(
     SCENE is a scene file or a patient's folder; the plan's poses show the target on the deforming organ.
     """
     path = scene_file(scene)
-    loaded = with_options(load_scene(path), {"transducer.probe": probe})
+    loaded = with_quality(with_options(load_scene(path), {"transducer.probe": probe}), quality)
     port = trocar_of(loaded.trocar, trocar, cone_deg, wrist_deg)
     anatomy = load_anatomy(loaded, path.parent)
     held = probe_of(loaded)

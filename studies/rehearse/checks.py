@@ -17,8 +17,9 @@ from ultrasound.probe import Probe, ProbeError, probe_of_values
 from validation import explained
 from version import VERSION
 
-# What a budget leaves to the user.
+# What of tissue and solver each option that chooses size and passes leaves to the user.
 MATERIAL = ("tissue.model", "tissue.young_kpa", "tissue.poisson")
+LEFT = {"--quality": (*MATERIAL, "tissue.stiffness"), "--budget-ms": MATERIAL, "--error-mm": MATERIAL}
 
 
 def refuse_inputs(
@@ -43,38 +44,39 @@ def refuse_headless(headless: bool, gamepad: bool, link_leads: bool) -> None:
             raise Fault(f"{option}: leads in a window; leave out {option} or --headless")
 
 
+def refuse_no_pictures(headless: bool, link: bool) -> None:
+    """Raises Fault where pictures that are to be left out are needed."""
+    if not headless:
+        raise Fault("--no-pictures: a window is pictures; leave it out, or add --headless")
+    if link:
+        raise Fault("--no-pictures: pictures are what the link sends; leave out --no-pictures or --link")
+
+
 def session_of(
     replay: Path | None,
     at_s: float,
     changed: dict[str, float | str | None],
-    budget_ms: float | None,
-    error_mm: float | None,
+    choosers: dict[str, float | str | None],
 ) -> Log | None:
     """The session to be replayed, where one is. Raises Fault, where other options would make another of it, SessionError."""
     if replay is None:
         if at_s > 0:
             raise Fault("--at: says where to open a session; name its file with --replay")
         return None
-    given: dict[str, Any] = {"--budget-ms": budget_ms, "--error-mm": error_mm}
-    given |= {option: changed[key] for key, option in OPTIONS.items()}
-    for option, value in given.items():
+    for option, value in (choosers | {option: changed[key] for key, option in OPTIONS.items()}).items():
         if value is not None:
             raise Fault(f"{option}: a replay computes what was recorded; leave it out")
     return read_log(replay)
 
 
-def as_recorded(log: Log, scene: Scene) -> Scene:
-    """A scene's patient with all else as a session has it. Raises SessionError."""
+def as_recorded(log: Log, scene: Scene) -> tuple[Scene, Probe]:
+    """A scene's patient with all else as a session has it, and its probe. Raises SessionError."""
     try:
-        return scene_of_log(log.header, scene)
+        recorded = scene_of_log(log.header, scene)
     except ValidationError as error:
         raise SessionError(f"the session's scene cannot be used: {explained(error)}") from None
-
-
-def recorded_probe(log: Log) -> Probe:
-    """The probe of a session. Raises SessionError."""
     try:
-        return probe_of_values(log.header.probe)
+        return recorded, probe_of_values(log.header.probe)
     except ProbeError as error:
         raise SessionError(f"the session's probe cannot be used: {error}") from None
 
@@ -86,6 +88,24 @@ def check_anatomy(log: Log, anatomy: LoadedAnatomy, title: str) -> None:
             f"the session is of other anatomy than this scene's ({title or 'no title'}): name "
             "its scene or patient's folder before --replay; a patient imported anew is another one"
         )
+
+
+def check_files(
+    anatomy: LoadedAnatomy,
+    title: str,
+    probe: Probe,
+    log: Log | None,
+    track_file: Path | None,
+    track: TimedPoses | None,
+    plan: Plan | None,
+) -> None:
+    """Raises SessionError, PoseError or PlanError where one of the files is of another patient than an anatomy, or of another probe."""
+    if log is not None:
+        check_anatomy(log, anatomy, title)
+    if track is not None and track_file is not None:
+        check_track(track, track_file, anatomy, probe)
+    if plan is not None:
+        check_plan(plan, fingerprint(anatomy), probe)
 
 
 def check_track(track: TimedPoses, path: Path, anatomy: LoadedAnatomy, probe: Probe) -> None:
@@ -123,9 +143,17 @@ def _probe_said(name: Any, housing_mm: Any) -> str:
     return f"{name!r} of {' x '.join(f'{each:g}' for each in housing_mm or ())} mm"
 
 
-def refuse_sizes(changed: dict[str, float | str | None]) -> None:
-    """Raises Fault where the command line gives both a budget and what the budget is to choose."""
+def refuse_sizes(changed: dict[str, float | str | None], choosers: dict[str, float | str | None]) -> None:
+    """Raises Fault where a preset or a budget is to choose size and passes, and another option says them too.
+
+    ``choosers`` are --quality, --budget-ms and --error-mm.
+    """
+    given = [option for option, value in choosers.items() if value is not None]
+    if not given:
+        return
+    if given[0] == "--quality" and len(given) > 1:
+        raise Fault(f"--quality: {given[1]} chooses size and passes too; leave one of them out")
     for key, value in changed.items():
-        chosen = key.startswith(("tissue.", "solver.")) and key not in MATERIAL
+        chosen = key.startswith(("tissue.", "solver.")) and key not in LEFT[given[0]]
         if value is not None and chosen:
-            raise Fault(f"{OPTIONS[key]}: --budget-ms and --error-mm choose this; leave one of them out")
+            raise Fault(f"{OPTIONS[key]}: {given[0]} chooses this too; leave one of them out")

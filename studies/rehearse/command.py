@@ -8,26 +8,31 @@ import click
 
 from render.display import display_available
 from render.keys import Keys, keys_text, load_keys
-from scenes.anatomy import LoadedAnatomy, fingerprint, load_anatomy
+from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.reading.progress import Stages, Told
 from scenes.scene import EMBEDDED, OPTIONS, Scene, load_scene, scene_file, with_options
 from scenes.tissue import TISSUES
-from studies.command_line import Fault, NumberRange, arch_option, make_folder, start_taichi
+from studies.command_line import (
+    Fault,
+    NumberRange,
+    arch_option,
+    make_folder,
+    quality_option,
+    start_taichi,
+)
 from studies.link.options import link_options, opened_link
 from studies.plan.file import read_plan
 from studies.rehearse.checks import (
     as_recorded,
-    check_anatomy,
-    check_plan,
-    check_track,
-    recorded_probe,
+    check_files,
     refuse_headless,
     refuse_inputs,
+    refuse_no_pictures,
     refuse_sizes,
     session_of,
 )
 from studies.rehearse.track_file import PROBE_IN_PATIENT, load_track
-from studies.setup import Setup, probe_of, scene_of
+from studies.setup import Setup, probe_of, scene_of, with_quality
 from ultrasound.probe import MODES, RUNGS, Probe
 
 if TYPE_CHECKING:
@@ -38,6 +43,11 @@ if TYPE_CHECKING:
 @click.argument("scene", type=click.Path(path_type=Path), default=EMBEDDED, required=False)
 @click.option(
     "--headless", is_flag=True, help="No window: run the scripted press, write pictures and a report."
+)
+@click.option(
+    "--no-pictures",
+    is_flag=True,
+    help="With --headless: no pictures, which take most of the time; the report, the surfaces and the session all the same.",
 )
 @click.option(
     "--seconds",
@@ -85,6 +95,7 @@ if TYPE_CHECKING:
 @click.option("--stiffness", type=float, help="shape-matching: cluster stiffness, 0 to 1 [the scene's].")
 @click.option("--substeps", type=int, help="Substeps of a time step [the model's].")
 @click.option("--iterations", type=int, help="Passes over the constraints in a substep [the model's].")
+@quality_option
 @click.option("--probe", help="Probe, by its name or as a file [the scene's].")
 @click.option("--picture", type=click.Choice(MODES), help="Echo, CT or both [the scene's].")
 @click.option("--rung", type=click.Choice(RUNGS), help="How much of the echo is computed [the scene's].")
@@ -102,6 +113,7 @@ if TYPE_CHECKING:
 def rehearse(
     scene: Path,
     headless: bool,
+    no_pictures: bool,
     seconds: float | None,
     replay: Path | None,
     at: float,
@@ -112,6 +124,7 @@ def rehearse(
     plan_file: Path | None,
     out: Path,
     arch: str,
+    quality: str | None,
     budget_ms: float | None,
     error_mm: float | None,
     link: bool,
@@ -126,62 +139,58 @@ def rehearse(
     """
     path = scene_file(scene)
     changed = {key: changes[option.strip("-").replace("-", "_")] for key, option in OPTIONS.items()}
+    choosers = {"--quality": quality, "--budget-ms": budget_ms, "--error-mm": error_mm}
     before = load_scene(path)
     keys = load_keys(keys_file) if keys_file is not None else Keys()
     refuse_inputs(track_file, track_from, replay, link_leads)
+    refuse_sizes(changed, choosers)
     track = load_track(track_file, track_from) if track_file is not None else None
     plan = read_plan(plan_file) if plan_file is not None else None
-    log = session_of(replay, at, changed, budget_ms, error_mm)
-    loaded = with_options(before, changed) if log is None else as_recorded(log, before)
-    if changed["tissue.model"] is None and loaded.tissue.model != before.tissue.model:
-        click.echo(f"Tissue model: {loaded.tissue.model}, as the options ask for it.")
-    probe = probe_of(loaded) if log is None else recorded_probe(log)
-    budgeted = budget_ms is not None or error_mm is not None
-    if budgeted:
-        refuse_sizes(changed)
+    log = session_of(replay, at, changed, choosers)
+    loaded, probe = as_asked(before, changed, quality) if log is None else as_recorded(log, before)
     headless = headless or not found_display()
     refuse_headless(headless, gamepad, link_leads)
+    if no_pictures:
+        refuse_no_pictures(headless, link)
     make_folder(out)
     used = start_taichi(arch)
     server = opened_link(link, link_host, link_port, link_leads)
     with Stages() as told:
         anatomy = load_anatomy(loaded, path.parent, told)
-        if log is not None:
-            check_anatomy(log, anatomy, before.title)
-        if track is not None and track_file is not None:
-            check_track(track, track_file, anatomy, probe)
-        if plan is not None:
-            check_plan(plan, fingerprint(anatomy), probe)
+        check_files(anatomy, before.title, probe, log, track_file, track, plan)
         started, chosen = perf_counter(), ""
-        if budgeted:
+        if budget_ms is not None or error_mm is not None:
             model = changed["tissue.model"]
             rehearsal, chosen = built_within(loaded, anatomy, probe, used, told, model, budget_ms, error_mm)
         else:
-            rehearsal = built(loaded, anatomy, probe, told)
+            rehearsal = built(loaded, anatomy, probe, told, not no_pictures)
         build_s = perf_counter() - started
-        told("Building the model: the first picture")
-        compile_picture(rehearsal)
+        if not no_pictures:
+            told("Building the model: the first picture")
+            compile_picture(rehearsal)
     if chosen:
         click.echo(chosen)
     from studies.rehearse.run import Run
 
-    run = Run(
-        rehearsal,
-        anatomy,
-        used,
-        out,
-        budget_ms,
-        track=track,
-        keys=keys,
-        gamepad=gamepad,
-        link=server,
-        tracked=server.hand if server is not None and link_leads else None,
-        plan=plan,
-    )
+    tracked = server.hand if server is not None and link_leads else None
+    run = Run(rehearsal, anatomy, used, out, budget_ms, tracked, track, keys, gamepad, server, plan)
     if headless:
-        run.headless(log, at, seconds, build_s)
+        run.headless(log, at, seconds, build_s, not no_pictures)
     else:
         run.in_window(log, at)
+
+
+def as_asked(
+    scene: Scene, changed: dict[str, float | str | None], quality: str | None
+) -> tuple[Scene, Probe]:
+    """A scene as the command line changes it, and its probe; says so where that is another tissue model.
+
+    Raises SceneError, ProbeError.
+    """
+    asked = with_quality(with_options(scene, changed), quality)
+    if changed["tissue.model"] is None and asked.tissue.model != scene.tissue.model:
+        click.echo(f"Tissue model: {asked.tissue.model}, as the options ask for it.")
+    return asked, probe_of(asked)
 
 
 @click.command("keys")
@@ -198,11 +207,11 @@ def found_display() -> bool:
     return found
 
 
-def built(scene: Scene, anatomy: LoadedAnatomy, probe: Probe, told: Told) -> "Rehearsal":
-    """The rehearsal of a scene."""
+def built(scene: Scene, anatomy: LoadedAnatomy, probe: Probe, told: Told, draws: bool = True) -> "Rehearsal":
+    """The rehearsal of a scene, of which pictures are drawn or not."""
     from studies.rehearsal import Rehearsal
 
-    return Rehearsal(scene, anatomy, probe, told, shows_echo=scene.image.mode != "ct")
+    return Rehearsal(scene, anatomy, probe, told, shows_echo=draws and scene.image.mode != "ct")
 
 
 def compile_picture(rehearsal: "Rehearsal") -> None:

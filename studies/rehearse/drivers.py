@@ -29,6 +29,10 @@ class Driver(Protocol):
     def status(self) -> str:
         """What stands in the panel; empty where there is nothing to say."""
 
+    @property
+    def bookmarks(self) -> int:
+        """How many the session has."""
+
     def move(self, controls: Controls) -> np.ndarray | None:
         """The pose (4, 4) to step to; None where this moment goes back to another."""
 
@@ -60,6 +64,10 @@ class Played:
         if self.live is not None:
             return self.live.status
         return f"REPLAY   {self.replay.time_s:.1f} s   {{take_over}} leads from here"
+
+    @property
+    def bookmarks(self) -> int:
+        return self.live.bookmarks if self.live else self.replay.bookmarks
 
     def move(self, controls: Controls) -> np.ndarray | None:
         if self.live is None and (controls.take_over or self.replay.is_over):
@@ -117,7 +125,7 @@ class Scripted:
 
     def __init__(self, session: Session, recorded: Recorded | None, steps: int) -> None:
         self.session, self.recorded, self.steps = session, recorded, steps
-        self.status = ""
+        self.status, self.bookmarks = "", 0
 
     def move(self, controls: Controls) -> np.ndarray | None:
         rehearsal = self.session.rehearsal

@@ -8,7 +8,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from render.pictures import PICTURES_A_SECOND, empty_folder, save_animation, side_by_side, smaller
-from render.viewer import Controls, Settings, Viewer
+from render.viewer import Controls, Settings, View, Viewer
 from render.window import NoVulkan
 from scenes.whole_files import whole
 from studies.link.live import send_live
@@ -17,11 +17,45 @@ from studies.rehearsal import Rehearsal
 from studies.rehearse.drivers import Driver
 from studies.rehearse.instruments import Instruments
 from studies.rehearse.saving import save_surfaces
-from studies.rehearse.view import open_viewer, probe_as_set, take_view
+from studies.rehearse.view import open_viewer, probe_as_set, take_step, take_view
 from studies.report import Tally, summary
 
 # An animation is in memory before it is written: of a long session it has fewer pictures.
 MOST_SHOWN = 240
+
+
+class Pictures:
+    """What is drawn of so many steps: frames, slices, and an animation in a folder."""
+
+    def __init__(self, rehearsal: Rehearsal, steps: int, out: Path) -> None:
+        self.steps, self.out = steps, out
+        self.viewer: Viewer | None = None
+        try:
+            self.viewer = open_viewer(rehearsal, visible=False)
+        except NoVulkan as reason:
+            click.echo(f"{reason}; writing the pictures and the report without 3D frames.")
+        self._every = max(1, round(1 / (PICTURES_A_SECOND * rehearsal.settings.time_step_s)))
+        self._shown_every = self._every * (1 + steps // self._every // MOST_SHOWN)
+        self._frames, self._slices = empty_folder(out / "frames"), empty_folder(out / "slices")
+        self._animation: list[Image.Image] = []
+
+    def draw(self, step: int, view: View, settings: Settings, instruments: Instruments) -> None:
+        """A step's, where they are due."""
+        if step % self._every and step < self.steps:
+            return
+        picture = side_by_side(view)
+        picture.save(self._slices / f"{step:05d}.png")
+        if self.viewer is not None:
+            self.viewer.draw(instruments.onto(view, settings))
+            picture = Image.fromarray(self.viewer.picture())
+            picture.save(self._frames / f"{step:05d}.png")
+        if step % self._shown_every == 0 or step == self.steps:
+            self._animation.append(smaller(picture))
+
+    def save(self) -> str:
+        """Write the animation; what there is now."""
+        save_animation(self._animation, self.out / "press.webp")
+        return f"{-(-self.steps // self._every)} pictures, press.webp"
 
 
 def run_headless(
@@ -33,45 +67,35 @@ def run_headless(
     arch: str,
     out: Path,
     build_s: float,
+    draws: bool = True,
     link: Server | None = None,
 ) -> None:
-    """So many moments that a driver leads: frames, slices, an animated picture and report.json."""
-    try:
-        viewer: Viewer | None = open_viewer(rehearsal, visible=False)
-    except NoVulkan as reason:
-        click.echo(f"{reason}; writing the pictures and the report without 3D frames.")
-        viewer = None
+    """So many moments that a driver leads: surfaces and report.json; where it ``draws``, pictures too, also for the link."""
+    pictures = Pictures(rehearsal, steps, out) if draws else None
     tally = Tally(build_s)
-    every = max(1, round(1 / (PICTURES_A_SECOND * rehearsal.settings.time_step_s)))
-    frames, slices = empty_folder(out / "frames"), empty_folder(out / "slices")
-    animation: list[Image.Image] = []
-    shown_every = every * (1 + steps // every // MOST_SHOWN)
     for step in tqdm(range(1, steps + 1), desc="press", unit="step"):
         pose = driver.move(Controls(settings))
-        view = take_view(rehearsal, settings, pose, tally)
+        probe = probe_as_set(rehearsal.probe, settings)
+        view = None if pictures is None else take_view(rehearsal, settings, pose, tally)
+        if view is None:
+            take_step(rehearsal, pose, tally)
+            rehearsal.find_plane(probe)
         if pose is not None:
             _tell(driver.stepped(tally.step_ms[-1]))
-        probe = probe_as_set(rehearsal.probe, settings)
+            # After a way back the tissue is where it was, but the tool only with the next step.
+            tally.watch(rehearsal)
         instruments.watch(driver.session, probe, pose)
-        send_live(link, rehearsal, view, probe, driver.session.time_s)
         _tell(driver.watch())
-        tally.watch(rehearsal)
-        if step % every == 0 or step == steps:
-            picture = side_by_side(view)
-            picture.save(slices / f"{step:05d}.png")
-            if viewer is not None:
-                viewer.draw(instruments.onto(view, settings))
-                picture = Image.fromarray(viewer.picture())
-                picture.save(frames / f"{step:05d}.png")
-            if step % shown_every == 0 or step == steps:
-                animation.append(smaller(picture))
-    save_animation(animation, out / "press.webp")
+        if pictures is not None and view is not None:
+            send_live(link, rehearsal, view, probe, driver.session.time_s)
+            pictures.draw(step, view, settings, instruments)
     save_surfaces(rehearsal, out)
+    drawn = [pictures.save()] if pictures is not None else []
     report = tally.report(rehearsal, arch) | dict(reading=instruments.figures())
     with whole(out / "report.json") as partial:
         partial.write_text(json.dumps(report, indent=2) + "\n", "utf-8")
     click.echo(summary(report))
-    click.echo(f"Wrote {-(-steps // every)} pictures, press.webp and report.json to {out}")
+    click.echo(f"Wrote {' and '.join([*drawn, 'report.json'])} to {out}")
 
 
 def _tell(news: str) -> None:

@@ -1,6 +1,6 @@
 """What the window reads off a rehearsal while it goes on: figures four times a second, and what has been in the picture."""
 
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -10,6 +10,8 @@ from render.viewer import Settings, View
 from studies.readings import Reading, read
 from studies.rehearsal import Rehearsal
 from studies.rehearse.guide import Guide
+from studies.session.file import Log, SessionError
+from studies.session.seen import unpack_seen
 from studies.session.session import Session
 from studies.session.summary import Course
 from ultrasound.coverage import PLACES, Coverage, Gap
@@ -18,6 +20,8 @@ from ultrasound.probe import Probe
 READ_S, LOOK_S = 0.25, 1 / 30
 MARGIN_MM = 5.0
 COMPRESSION = "compression"
+# Of a reading in the record, and of what is counted by it, so that it can be counted by the record alone.
+DIGITS = 4
 
 
 class Instruments:
@@ -26,24 +30,51 @@ class Instruments:
     def __init__(self, rehearsal: Rehearsal, guide: Guide | None = None) -> None:
         self.rehearsal, self.guide = rehearsal, guide
         self.margin_mm = MARGIN_MM if guide is None else guide.plan.margin_mm
-        self.reading: Reading | None = None
         step_s = rehearsal.settings.time_step_s
         self._read_every, self._look_every = (max(1, round(s / step_s)) for s in (READ_S, LOOK_S))
-        self.course = self._new_course()
+        self._begin()
+
+    def _begin(self) -> None:
+        rehearsal = self.rehearsal
+        self.course = Course(
+            rehearsal.scene.transducer.compression_warning_mm, rehearsal.settings.time_step_s
+        )
+        self.reading: Reading | None = None
         self._seen: dict[str, np.ndarray] = {}
         self._findings: dict[str, str] = {}
         self._touches = np.ones(rehearsal.probe.number_of_scanlines, bool)
 
-    def _new_course(self) -> Course:
-        step_s = self.rehearsal.settings.time_step_s
-        return Course(self.rehearsal.scene.transducer.compression_warning_mm, step_s)
-
     def begin_anew(self) -> None:
         """Nothing was seen or done yet."""
-        self.course = self._new_course()
+        self._begin()
         self.coverage.forget()
         if self.guide is not None:
             self.guide.begin_anew()
+
+    def recall(self, log: Log, until: int) -> bool:
+        """Take over what the first moments of a session came to, where its file holds what was seen until then; whether it does.
+
+        Raises SessionError.
+        """
+        if until not in log.seen:
+            return until == 0
+        seen = unpack_seen(log.seen[until])
+        if seen.shape != self.coverage.seen.shape:
+            raise SessionError(
+                f"the session says of {seen.shape} voxels what was seen, expected {self.coverage.seen.shape}: it is damaged, or of "
+                "another body"
+            )
+        self.coverage.seen = seen
+        for moment, pose in enumerate(log.poses[:until], 1):
+            for event in log.events.get(moment, []):
+                if event.kind == "reading":
+                    self.reading = _noted(event.value)
+            is_way_back = bool(np.isnan(pose).any())
+            if self.guide is not None and not is_way_back:
+                self.guide.watch(pose)
+            self._count(None if is_way_back else pose)
+        self._show()
+        return True
 
     def follow(self, guide: Guide) -> None:
         """Follow a plan from now on; what was seen stays so."""
@@ -68,15 +99,23 @@ class Instruments:
             self.guide.watch(self.rehearsal.pose)
         if session.moment % self._read_every == 0 or self.reading is None:
             self.reading = read(self.rehearsal, probe, self._touches)
-            surfaces = {"organ": self.rehearsal.organ, "tumour": self.rehearsal.tumour}
-            self._seen = {
-                name: self.coverage.at(np.asarray(surface.vertices))
-                for name, surface in surfaces.items()
-                if surface is not None
-            }
             session.note("reading", self.figures())
-            self._findings = self.findings()
-        self.course.add(pose, self.reading.compression_mm)
+            self._show()
+        self._count(pose)
+
+    def _count(self, pose: np.ndarray | None) -> None:
+        if self.reading is not None:
+            self.course.add(pose, round(self.reading.compression_mm, DIGITS))
+
+    def _show(self) -> None:
+        """What the window shows from now on."""
+        surfaces = {"organ": self.rehearsal.organ, "tumour": self.rehearsal.tumour}
+        self._seen = {
+            name: self.coverage.at(np.asarray(surface.vertices))
+            for name, surface in surfaces.items()
+            if surface is not None
+        }
+        self._findings = self.findings()
 
     def figures(self) -> dict[str, Any]:
         """The reading and the shares seen so far, rounded, for the record."""
@@ -85,7 +124,7 @@ class Instruments:
             values |= {f"seen_{target}": self.coverage.share(target) for target in self.coverage.targets}
         if self.guide is not None:
             values |= self.guide.figures()
-        return {name: None if value is None else round(value, 4) for name, value in values.items()}
+        return {name: None if value is None else round(value, DIGITS) for name, value in values.items()}
 
     def summary(self, bookmarks: int = 0) -> dict[str, Any]:
         """How the rehearsal went so far."""
@@ -139,3 +178,11 @@ class Instruments:
 
     def _share(self, target: str) -> str:
         return f"{100 * self.coverage.share(target):.0f} %"
+
+
+def _noted(values: dict[str, float | None]) -> Reading:
+    """A reading that a session's file has. Raises SessionError."""
+    known = {each.name: values.get(each.name) for each in fields(Reading)}
+    if known["compression_mm"] is None or known["contact_mm2"] is None:
+        raise SessionError("the session holds a reading without compression or contact: it is damaged")
+    return Reading(**known)  # type: ignore[arg-type]

@@ -47,6 +47,11 @@ class Live:
             return "TRACKING LOST"
         return self.ladder.says(self._asked)
 
+    @property
+    def bookmarks(self) -> int:
+        """How many the user has set."""
+        return len(self.history.bookmarks)
+
     def move(self, controls: Controls) -> np.ndarray | None:
         """The pose to step to, None where this moment goes back to another."""
         self.session.tell("settings", asdict(controls.settings))

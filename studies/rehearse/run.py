@@ -1,30 +1,33 @@
 """A rehearsal from its first moment to its last: who leads it, what is recorded of it, and what is said at its end."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import time
 
 import click
 import numpy as np
+from click.exceptions import Exit
 from psutil import Process
-from tqdm import tqdm
 
 from render.gamepad import Gamepad, SdlPads
 from render.keys import Keys
 from render.viewer import Settings
 from render.window import NoVulkan
 from scenes.anatomy import LoadedAnatomy
-from studies.command_line import Fault
+from studies.command_line import STOPPED, Fault
 from studies.link.server import Server
 from studies.plan.file import Plan
 from studies.rehearsal import Rehearsal, RehearsalState
 from studies.rehearse.checks import origin_in_words
-from studies.rehearse.drivers import Played, Scripted, set_settings
+from studies.rehearse.drivers import Driver, Played, Scripted
 from studies.rehearse.guide import Guide
 from studies.rehearse.headless import run_headless
 from studies.rehearse.instruments import Instruments
 from studies.rehearse.live import Live
 from studies.rehearse.loop import Loop
+from studies.rehearse.opening import opened
 from studies.rehearse.planning import Plans
 from studies.rehearse.sweeping import Sweeping
 from studies.rehearse.tracked import PlayedPoses, Tracked
@@ -51,13 +54,13 @@ class Run:
     arch: str
     out: Path
     budget_ms: float | None = None
-    recorded: Recorded | None = None
     tracked: Tracked | None = None
     track: TimedPoses | None = None
     keys: Keys = field(default_factory=Keys)
     gamepad: bool = False
     link: Server | None = None
     plan: Plan | None = None
+    recorded: Recorded | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         guide = None if self.plan is None else Guide(self.rehearsal, self.plan)
@@ -71,7 +74,7 @@ class Run:
         except NoVulkan as reason:
             raise Fault(f"{reason}; install a Vulkan driver, or run with --headless") from None
         replay = None if log is None else self._replay(log, at_s, viewer.settings)
-        driver = self._live() if replay is None else Played(replay, self._take_over)
+        driver: Driver = self._live() if replay is None else Played(replay, self._take_over)
         sweeping = Sweeping(self.rehearsal)
         after_s = time() - Process().create_time()
         told = (
@@ -82,21 +85,21 @@ class Run:
         parts = driver, self.instruments, sweeping, plans
         loop = Loop(self.rehearsal, viewer, self.out, Tally(0.0), *parts, keys=self.keys, link=self.link)
         try:
-            loop.run()
+            with self._summed_up(driver, replay):
+                loop.run()
         finally:
             viewer.close()
             plans.stop()
             _say(sweeping.end())
-            live = driver.live if isinstance(driver, Played) else driver
-            self._end(len(live.history.bookmarks) if live else 0)
-            _say(_verdict(replay))
 
-    def headless(self, log: Log | None, at_s: float, seconds: float | None, build_s: float) -> None:
-        """Led by the scene's script, a log, or a tracked file, as long as that is. Raises SessionError."""
+    def headless(
+        self, log: Log | None, at_s: float, seconds: float | None, build_s: float, draws: bool = True
+    ) -> None:
+        """Led by the scene's script, a log, or a tracked file, as long as that is. Raises Fault, SessionError."""
         rehearsal, settings = self.rehearsal, settings_of(self.rehearsal)
         replay = None if log is None else self._replay(log, at_s, settings)
         step_s = rehearsal.settings.time_step_s
-        driver: Scripted | Played | Live
+        driver: Driver
         if self.track is not None:
             length_s = self.track.length_s if seconds is None else min(seconds, self.track.length_s)
             # A moment at 0 s, and one at the end; no step is too slow, so that the bits do not turn on the machine.
@@ -104,7 +107,7 @@ class Run:
             driver = self._live(budget_ms=np.inf)
         elif replay is None:
             steps = max(1, round((seconds or rehearsal.script_length_s()) / step_s))
-            session = Session(rehearsal)
+            session = self._session()
             driver = Scripted(session, self._record(session), steps)
         else:
             steps = len(replay.log.poses) - replay.session.moment
@@ -115,17 +118,16 @@ class Run:
                     f"the session has nothing after {at_s:g} s: it is {replay.log.length_s:.1f} s long"
                 )
             driver = Played(replay, self._take_over)
-        try:
-            run_headless(
-                rehearsal, driver, steps, settings, self.instruments, self.arch, self.out, build_s, self.link
-            )
-        finally:
-            self._end(0)
-            _say(_verdict(replay))
+        told = self.instruments, self.arch, self.out, build_s, draws, self.link
+        with self._summed_up(driver, replay):
+            run_headless(rehearsal, driver, steps, settings, *told)
+
+    def _session(self) -> Session:
+        return Session(self.rehearsal, seen=lambda: self.instruments.coverage.seen)
 
     def _live(self, begins: RehearsalState | None = None, budget_ms: float | None = None) -> Live:
         ladder = Ladder(budget_ms or self.budget_ms or 1000 * self.rehearsal.settings.time_step_s)
-        session = Session(self.rehearsal)
+        session = self._session()
         tracked = self.tracked if self.track is None else PlayedPoses(self.track, session)
         waits = begins is not None
         return Live(session, ladder, self._record(session, begins), waits=waits, tracked=tracked)
@@ -146,14 +148,20 @@ class Run:
         return self.recorded
 
     def _replay(self, log: Log, at_s: float, settings: Settings) -> Replay:
-        replay = Replay(self.rehearsal, log)
         _say(origin_in_words(log.header, self.arch))
-        aim = min(round(at_s / log.header.time_step_s), len(log.poses))
-        if aim > 0:
-            with tqdm(total=aim, desc=f"to {at_s:g} s", unit="step") as bar:
-                replay.open_at(at_s, bar.update)
-        set_settings(settings, replay.settings_until_now())
-        return replay
+        return opened(log, at_s, self.rehearsal, settings, self.instruments)
+
+    @contextmanager
+    def _summed_up(self, driver: Driver, replay: Replay | None) -> Iterator[None]:
+        """Say at the end how it went, also where Ctrl-C is the end."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            click.echo(f"\nStopped at {driver.session.time_s:.1f} s; until then:")
+            raise Exit(STOPPED) from None
+        finally:
+            self._end(driver.bookmarks)
+            _say(_verdict(replay))
 
     def _end(self, bookmarks: int) -> None:
         summary = self.instruments.summary(bookmarks)

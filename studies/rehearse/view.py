@@ -90,6 +90,13 @@ def open_viewer(
     )
 
 
+def take_step(rehearsal: Rehearsal, pose: np.ndarray | None, tally: Tally) -> None:
+    """Step with the transducer going to a pose, where there is one, and carry the surfaces."""
+    if pose is not None:
+        timed(partial(rehearsal.advance, pose), tally.step_ms)
+        rehearsal.update_surfaces()
+
+
 def take_view(
     rehearsal: Rehearsal,
     settings: Settings,
@@ -101,9 +108,7 @@ def take_view(
 
     Without a pose, as when frozen, the pictures alone are taken anew.
     """
-    if pose is not None:
-        timed(partial(rehearsal.advance, pose), tally.step_ms)
-        rehearsal.update_surfaces()
+    take_step(rehearsal, pose, tally)
     probe = probe_as_set(rehearsal.probe, settings)
     shown = settings.mode, settings.rung, settings.window_hu, settings.level_hu
     pictures = timed(partial(rehearsal.look, probe, *shown), tally.slice_ms)

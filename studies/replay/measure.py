@@ -98,15 +98,13 @@ def replayed(
     start(arch)
     rehearsal = Rehearsal(scene_of(scene, setup), anatomy)
     replay = Replay(rehearsal, log)
-    begins = replay.open_at(from_s, lambda moments: None)
-    while not replay.is_over:
-        pose, _ = replay.move()
-        if pose is not None:
-            rehearsal.advance(pose)
-            replay.stepped()
+    begins = replay.begin_at(from_s)
+    # The way from there to the time itself is not counted.
+    done(begins - replay.moment_at(from_s))
+    for _ in replay.go_to(log.length_s):
         done(1)
     return dict(
-        begins_s=begins,
+        begins_s=begins * log.header.time_step_s,
         digest=rehearsal.digest(),
         compared=replay.compared,
         differs_s=replay.differs_s,

@@ -1,8 +1,8 @@
 """The file of a session: one line of JSON a second, each on the disk when it is written, so that a crash costs a second at most.
 
 The first line says what is rehearsed, each other one is a second of it: what was noted, the transducer's poses, and the tissue's
-digest after it. Now and then one holds the whole state; the last, of a session that ended in order, its summary. No line names a
-patient or a path.
+digest after it. Now and then one holds the whole state and what was seen until then, as does the last, of a session that ended in
+order, with its summary. No line names a patient or a path.
 """
 
 import base64
@@ -17,6 +17,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from typing_extensions import TypedDict
+
+from studies.session.seen import Seen, SeenVoxels
 
 FORMAT = 1
 # Of a pose, all but its last row.
@@ -66,8 +68,9 @@ VALUES: dict[str, TypeAdapter] = {
     "bookmark": TypeAdapter(int),
     "reading": TypeAdapter(dict[str, float | None]),
     "state": TypeAdapter(str),
+    "seen": TypeAdapter(Seen),
 }
-Kind = Literal["settings", "solver", "back", "bookmark", "reading", "state"]
+Kind = Literal["settings", "solver", "back", "bookmark", "reading", "state", "seen"]
 
 
 class Event(_Line):
@@ -79,7 +82,10 @@ class Event(_Line):
 
     @model_validator(mode="after")
     def _of_its_kind(self) -> "Event":
-        VALUES[self.kind].validate_python(self.value, strict=True)
+        try:
+            VALUES[self.kind].validate_python(self.value, strict=True)
+        except ValidationError as error:
+            raise ValueError(f"{self.kind}: {_what(error)}") from None
         return self
 
 
@@ -93,10 +99,11 @@ class Second(_Line):
 
 
 class End(_Line):
-    """How a session that ended in order went, and the state that it can go on from."""
+    """How a session that ended in order went, and the state that it can go on from, with what was seen until then."""
 
     summary: dict[str, Any]
     state: str
+    seen: Seen | None = None
 
 
 @dataclass
@@ -108,6 +115,7 @@ class Log:
     events: dict[int, list[Event]] = field(default_factory=dict)
     digests: dict[int, str] = field(default_factory=dict)
     states: dict[int, str] = field(default_factory=dict)
+    seen: dict[int, SeenVoxels] = field(default_factory=dict)
     summary: dict[str, Any] | None = None
 
     @property
@@ -174,9 +182,9 @@ class Recording:
         self._at += len(self._poses)
         self._poses, self._events = [], []
 
-    def close(self, summary: dict[str, Any], state: str) -> None:
+    def close(self, summary: dict[str, Any], state: str, seen: SeenVoxels | None = None) -> None:
         """Write the end, and wait for the disk."""
-        self._write(End(summary=summary, state=state))
+        self._write(End(summary=summary, state=state, seen=seen))
         self._disk.shutdown()
         try:
             self._file.close()
@@ -222,11 +230,14 @@ def read_log(path: Path) -> Log:
     # Without a line's end it was being written when the session was cut off.
     for number, line in enumerate(lines[1:-1], 2):
         second = _line_of(name, number, line)
+        moments = sum(len(part) for part in parts)
         if isinstance(second, End):
             log.summary = second.summary
-            log.states[sum(len(part) for part in parts)] = second.state
+            log.states[moments] = second.state
+            if second.seen is not None:
+                log.seen[moments] = second.seen
             break
-        parts.append(_poses_of(name, number, second, sum(len(part) for part in parts)))
+        parts.append(_poses_of(name, number, second, moments))
         _file_away(second, len(parts[-1]), log)
     log.poses = np.concatenate([log.poses, *parts])
     return log
@@ -252,10 +263,16 @@ def _line_of(name: str, number: int, line: bytes) -> Second | End:
         values = json.loads(line)
         return End.model_validate(values) if "summary" in values else Second.model_validate(values)
     except (ValueError, TypeError, RecursionError) as error:
-        what = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
+        what = _what(error) if isinstance(error, ValidationError) else str(error)
         raise SessionError(
             f"{name}: line {number} is damaged ({what}); what comes before it can be had by deleting from it on"
         ) from None
+
+
+def _what(error: ValidationError) -> str:
+    """What was first found wrong."""
+    first = error.errors()[0]
+    return str(first.get("ctx", {}).get("error", first["msg"]))
 
 
 def _poses_of(name: str, number: int, second: Second, expected: int) -> np.ndarray:
@@ -274,5 +291,7 @@ def _file_away(second: Second, count: int, log: Log) -> None:
     for event in second.events:
         if event.kind == "state":
             log.states[event.at] = event.value
+        elif event.kind == "seen":
+            log.seen[event.at] = event.value
         log.events.setdefault(event.at, []).append(event)
     log.digests[second.at + count] = second.digest

@@ -43,7 +43,7 @@ class Recorded:
         """Write what is left, with the state, from which the session can go on another day."""
         rehearsal = self.session.rehearsal
         self.recording.line(rehearsal.digest())
-        self.recording.close(summary, to_text(rehearsal.snapshot()))
+        self.recording.close(summary, to_text(rehearsal.snapshot()), self.session.seen())
 
 
 def record(

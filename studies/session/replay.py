@@ -1,6 +1,6 @@
 """A recorded session once more, with the same bits."""
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from studies.session.state import StateError, from_text
 
 class Replay:
     """Drives a rehearsal through a log. ``differs_s`` is when its tissue first was not the recorded one's, None so far; ``state`` its
-    digest when it was compared last.
+    digest when it was compared last. ``bookmarks`` counts those set so far.
 
     Raises SessionError where the log's states are of another body.
     """
@@ -21,7 +21,7 @@ class Replay:
     def __init__(self, rehearsal: Rehearsal, log: Log) -> None:
         self.rehearsal, self.log = rehearsal, log
         self.session = Session(rehearsal)
-        self.compared = 0
+        self.compared = self.bookmarks = 0
         self.state = ""
         self.differs_s: float | None = None
         backs = [
@@ -45,9 +45,13 @@ class Replay:
         """Simulated time since the session began."""
         return self.session.time_s
 
-    def open_at(self, seconds: float, done: Callable[[int], Any] = lambda moments: None) -> float:
-        """Go to a time, by way of the last state before it that all which follows can be had from; of what time that is [s]."""
-        aim = min(round(seconds / self.log.header.time_step_s), len(self.log.poses))
+    def moment_at(self, seconds: float) -> int:
+        """The moment at a time, or the last."""
+        return min(round(seconds / self.log.header.time_step_s), len(self.log.poses))
+
+    def begin_at(self, seconds: float) -> int:
+        """Go to the last state before a time that all which follows can be had from; the moment that it is of."""
+        aim = self.moment_at(seconds)
         start = max(
             (moment for moment in self.log.states if moment <= aim and self._holds(moment)), default=0
         )
@@ -56,15 +60,18 @@ class Replay:
                 self._set(moment)
             self.rehearsal.restore(self._state(self.log.states[start]))
             self.session.moment = start
-        done(start)
+        self.rehearsal.update_surfaces()
+        return start
+
+    def go_to(self, seconds: float) -> Iterator[tuple[np.ndarray | None, dict[str, Any]]]:
+        """Go on to a time; after each moment what ``move`` had for it. The surfaces are left behind."""
+        aim = self.moment_at(seconds)
         while self.session.moment < aim:
-            pose, _ = self.move()
+            pose, settings = self.move()
             if pose is not None:
                 self.rehearsal.advance(pose)
                 self.stepped()
-            done(1)
-        self.rehearsal.update_surfaces()
-        return start * self.log.header.time_step_s
+            yield pose, settings
 
     def move(self) -> tuple[np.ndarray | None, dict[str, Any]]:
         """The pose to step to, None where this moment was a way back; and the pictures' settings that changed.
@@ -103,6 +110,8 @@ class Replay:
                 back = event.value
             elif event.kind == "state":
                 self.rehearsal.keep_good()
+            elif event.kind == "bookmark":
+                self.bookmarks += 1
         return back, settings
 
     def settings_until_now(self) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import numpy as np
 
 from studies.rehearsal import Rehearsal, RehearsalState
 from studies.session.file import Kind
+from studies.session.seen import SeenVoxels, pack_seen
 from studies.session.state import to_text
 
 # The moment before the first: tissue settled, transducer just touching.
@@ -24,12 +25,19 @@ class Recorder(Protocol):
 class Session:
     """``moment`` counts what has happened to a rehearsal since the session began, ways back too: no two states share one.
 
-    ``recorder``, where there is one, is told of all, so that the same session can be had again.
+    ``recorder``, where there is one, is told of all, so that the same session can be had again; ``seen``, where somebody looks, says
+    which voxels (nx, ny, nz) of the organ were seen so far.
     """
 
-    def __init__(self, rehearsal: Rehearsal, recorder: Recorder | None = None) -> None:
+    def __init__(
+        self,
+        rehearsal: Rehearsal,
+        recorder: Recorder | None = None,
+        seen: Callable[[], np.ndarray] | None = None,
+    ) -> None:
         self.rehearsal = rehearsal
         self.recorder = recorder
+        self._seen = seen
         self.moment = 0
         self.kept: dict[int, RehearsalState] = {SETTLED: rehearsal.settled}
         self._told: dict[str, Any] = {}
@@ -75,6 +83,13 @@ class Session:
         """
         self.rehearsal.keep_good()
         self.note("state", to_text(self.rehearsal.snapshot()))
+        seen = self.seen()
+        if seen is not None:
+            self.note("seen", seen)
+
+    def seen(self) -> SeenVoxels | None:
+        """What was seen so far, packed; None where nobody looks."""
+        return None if self._seen is None else pack_seen(self._seen())
 
     def forget(self, is_needed: Callable[[int], bool]) -> None:
         """Let go of what was kept and is no longer needed."""

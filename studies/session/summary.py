@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from studies.results import counted
 from ultrasound.coverage import Gap
 
 # Tissue squeezed by more than this is pressed [mm], and by less than that let go.
@@ -52,16 +53,15 @@ class Course:
             duration_s=self.duration_s,
             path_mm=self.path_mm,
             fastest_mm_s=self.fastest_mm_s,
-            presses=self.presses,
             compression_max_mm=self.compression_mm,
             compression_warning_mm=self.warning_mm,
             over_warning_s=self.too_deep_s,
-            went_back=self.went_back,
-            bookmarks=bookmarks,
         )
+        counts = dict(presses=self.presses, went_back=self.went_back, bookmarks=bookmarks)
         seen = {name: value for name, value in reading.items() if name.startswith("seen_")}
         return {
             **{name: round(float(value), 3) for name, value in figures.items()},
+            **counts,
             **seen,
             "gaps": [
                 dict(volume_ml=round(gap.volume_ml, 3), thickness_mm=round(gap.thickness_mm, 2))
@@ -81,8 +81,8 @@ def in_words(summary: dict[str, Any]) -> str:
     largest = f"; largest gap {gaps[0]['volume_ml']:.1f} ml" if gaps else ""
     return "\n".join(
         [
-            f"session   {summary['duration_s']:.1f} s, {summary['presses']:.0f} presses, the way of the transducer "
-            f"{summary['path_mm']:.0f} mm, at most {summary['fastest_mm_s']:.0f} mm/s; {summary['bookmarks']:.0f} bookmarks",
+            f"session   {summary['duration_s']:.1f} s, {counted(summary['presses'], 'press')}, the way of the transducer "
+            f"{summary['path_mm']:.0f} mm, at most {summary['fastest_mm_s']:.0f} mm/s; {counted(summary['bookmarks'], 'bookmark')}",
             f"squeezed  {summary['compression_max_mm']:.1f} mm at most; {summary['over_warning_s']:.1f} s above the limit of "
             f"{summary['compression_warning_mm']:g} mm",
             f"seen      {seen or 'nothing: there is no CT'}{largest}",
