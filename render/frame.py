@@ -11,12 +11,11 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from render.layout import Layout, Rect
-from render.panel import ALERT, LINE, MARK, QUIET, TEXT, Panel, draw_panel, font
+from render.panel import ALERT, LEAST_FONT_PX, LINE, MARK, QUIET, TEXT, Panel, draw_panel, font
 
 BACKDROP_TOP, BACKDROP_FOOT = (30, 35, 42), (13, 15, 19)
 STRIP, FINDINGS = (17, 20, 24), (20, 24, 29)
 HELP_COLUMNS, HELP_GAP_PX, FIGURES_GAP_PX = 2, 36, 20
-LEAST_FONT_PX = 8
 
 
 def backdrop(

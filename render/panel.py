@@ -17,7 +17,7 @@ PANEL, LINE = (8, 9, 11), (44, 50, 58)
 TEXT, QUIET = (222, 227, 232), (132, 142, 153)
 MARK, ALERT = (64, 196, 255), (255, 176, 46)
 OUTLINE, BEFORE, CALLIPER = (237, 194, 71), (150, 128, 196), (120, 230, 140)
-CROSS_PX, NUMBER_PX = 5, 16
+CROSS_PX, NUMBER_PX, LEAST_FONT_PX = 5, 16, 8
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,12 @@ class Panel:
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     """The font of all texts."""
     return ImageFont.load_default(size=size)
+
+
+def _fitting(text: str, width: int, most: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """The font of the largest size, up to the most, in which a text is no wider than so many pixels."""
+    sizes = range(most, LEAST_FONT_PX, -1)
+    return font(next((size for size in sizes if font(size).getlength(text) <= width), LEAST_FONT_PX))
 
 
 def ruler_ticks(panel: Panel, box: Rect) -> list[tuple[int, int | None]]:
@@ -124,7 +130,9 @@ def draw_panel(draw: ImageDraw.ImageDraw, layout: Layout, panel: Panel) -> None:
     draw.text((right, foot), ct, font=font(px(14)), fill=QUIET, anchor="rm")
     if panel.status:
         middle = (area.left + area.right) // 2, px(40)
-        draw.text(middle, panel.status, font=font(px(17)), fill=ALERT, anchor="mm")
+        draw.text(
+            middle, panel.status, font=_fitting(panel.status, right - left, px(17)), fill=ALERT, anchor="mm"
+        )
     _draw_ruler(draw, layout, panel, boxes[0])
     _draw_wedge(draw, layout, boxes[-1])
     for name, box in zip(panel.names, boxes, strict=True):

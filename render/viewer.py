@@ -59,7 +59,7 @@ KEY_MAP = (
     Key("L", "sweep", "begin to record a tracked sweep, or end it"),
     Key("Space", "plan_for", "plan for tumour and margin, tumour, or whole kidney"),
     Key("Return", "plan", "plan a sweep that shows what it is for"),
-    Key("Backspace", "next_plan", "the plan's next sweep, after the last none"),
+    Key("Backspace", "next_plan", "stop planning; or the plan's next sweep, then none"),
     Key("K", "take_over", "take the lead from a replay or a tracked probe"),
     Key("N", "show_seen", "what has been in the picture, in green"),
     Key("R", "reset", "reset tissue, transducer and view"),

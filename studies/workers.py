@@ -3,6 +3,7 @@
 A process computes on one CPU thread, so that several do not fight for the same ones, and keeps what it has built.
 """
 
+import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from sim.body import RestBody
 from studies.accuracy import bead_errors
 from studies.case import Case
 from studies.experiment import Experiment, rest_body
+from studies.orphans import end_with
 from studies.setup import Setup
 
 # Taichi frees fields only when it starts anew, and does not bear hundreds of them.
@@ -70,7 +72,8 @@ def _build(key: tuple[str, float], case: Case, setup: Setup) -> None:
 @contextmanager
 def local_workers(jobs: int | None = None) -> Iterator[Map]:
     """Processes on this machine, as many as it has processors where ``jobs`` is None."""
-    with parallel_config(backend="loky", n_jobs=jobs or cpu_count()):
+    starts = dict(initializer=end_with, initargs=(os.getpid(),))
+    with parallel_config(backend="loky", n_jobs=jobs or cpu_count(), **starts):
         yield _map
 
 

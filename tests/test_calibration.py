@@ -2,6 +2,7 @@
 
 import csv
 import json
+import threading
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bead_case import beads, write_case
+from joblib import Parallel, delayed
 from PIL import Image
 
 import studies.workers as workers
@@ -203,6 +205,11 @@ def test_calibrate_says_mistakes_in_one_line(monkeypatch, folders, tmp_path, cap
     assert "pip install dask distributed" in refused(a, *out, "--dask", "tcp://127.0.0.1:9")
 
 
+def _watches() -> bool:
+    """Whether a process looks to whether the one that started it is there."""
+    return any("_watch" in thread.name for thread in threading.enumerate())
+
+
 def test_processes_here_and_a_cluster_of_one_worker_find_the_same(cases):
     from distributed import LocalCluster
 
@@ -211,6 +218,7 @@ def test_processes_here_and_a_cluster_of_one_worker_find_the_same(cases):
     too_large = [(cases[0], setup_of(MODEL, radius_mm=20.0))]
     with local_workers(2) as work:
         here = list(work(pairs))
+        assert all(Parallel()(delayed(_watches)() for _ in range(2)))
         with pytest.raises(SamplingError, match="choose a smaller radius"):
             list(work(too_large))
     with (

@@ -1,5 +1,6 @@
 """A plan followed: the guide, its lines, the keys, and what the instruments make of it."""
 
+from collections.abc import Callable
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -19,7 +20,9 @@ from studies.rehearse import instruments
 from studies.rehearse.guide import ABOVE_MM, AHEAD, DEG_BESIDE_A_MM, NEAR_MM, Guide
 from studies.rehearse.instruments import Instruments
 from studies.session.file import Event, Log, SessionError
+from studies.session.history import MOST_UNDONE, History
 from studies.session.seen import pack_seen
+from studies.session.session import Session
 from ultrasound.hand import advanced
 from ultrasound.probe import load_probe
 from ultrasound.target import TARGETS
@@ -160,6 +163,93 @@ def test_a_way_begun_anew_is_forgotten():
     assert guide.findings()["off plan"] == ""
 
 
+# Gone back
+
+
+class Led:
+    """A session over the ball, in which each pose is an action, or the last one's sequel; its tissue is the pose."""
+
+    def __init__(self) -> None:
+        held = over_ball()
+        held.pose = held.settled = advanced(FIRST[0], -50.0)
+        held.snapshot, held.restore = lambda: held.pose, lambda pose: setattr(held, "pose", pose)
+        held.update_surfaces = lambda: None
+        self.rehearsal, self.session = held, Session(held)
+        self.session.store = lambda: None
+        self.history = History(self.session)
+        self.guide = Guide(held, plan_of(sweep_of(FIRST, SECOND), sweep_of(SECOND)))
+
+    def step(self, pose: np.ndarray, acts: bool = True) -> None:
+        self.history.watch(acts, False)
+        self.rehearsal.pose = pose
+        self.session.stepped()
+        self.guide.go_with(self.session)
+
+    def act(self, *poses: np.ndarray) -> dict[str, float]:
+        """An action after a rest; the figures after it."""
+        for _ in range(11):
+            self.step(self.rehearsal.pose, acts=False)
+        for pose in poses:
+            self.step(pose)
+        return self.guide.figures()
+
+    def back(self, way: Callable[[], object]) -> dict[str, float]:
+        way()
+        self.guide.go_with(self.session)
+        return self.guide.figures()
+
+
+@pytest.fixture
+def led() -> Led:
+    return Led()
+
+
+def test_an_undo_takes_what_was_gone_of_the_sweep_back_and_a_redo_forth(led):
+    nothing = led.guide.figures()
+    beside = turned(FIRST[1], 3.0)
+    beside[0, 3] += 0.6
+    steps = [nothing, led.act(FIRST[0]), led.act(beside, FIRST[2]), led.act(FIRST[3], SECOND[0])]
+    assert [each["plan_followed"] for each in steps] == pytest.approx([0, 1 / 7, 3 / 7, 5 / 7])
+    assert steps[2]["plan_off_mm"] == pytest.approx(0.2) and steps[2]["plan_off_deg"] == pytest.approx(1.0)
+    for before in steps[2::-1]:
+        assert led.back(led.history.undo) == before
+    assert led.guide.guidance().goal == pytest.approx(FIRST[0])
+    for after in steps[1:]:
+        assert led.back(led.history.redo) == after
+    # Another way from there on leaves what is kept of the one before as it was.
+    led.back(led.history.undo)
+    assert led.act(FIRST[3])["plan_off_mm"] == pytest.approx(0.15) and led.back(led.history.undo) == steps[2]
+
+
+def test_so_do_a_reset_and_a_bookmark(led):
+    nothing = led.guide.figures()
+    marked = led.act(FIRST[0], FIRST[1])
+    led.history.set_bookmark()
+    after = led.act(FIRST[2])
+    assert led.back(led.history.reset) == nothing
+    assert led.back(led.history.undo) == after
+    assert led.back(led.history.to_bookmark) == marked
+
+
+def test_of_another_sweep_nothing_was_gone_at_any_moment_before_it_was_shown(led):
+    led.act(FIRST[0], FIRST[1])
+    led.act(FIRST[2])
+    led.guide.next_sweep()
+    assert led.guide.figures()["plan_followed"] == 0
+    assert led.act(SECOND[0])["plan_followed"] == pytest.approx(1 / 3)
+    for _ in range(2):
+        assert led.back(led.history.undo)["plan_followed"] == 0
+    # Nor where it is shown and undone in one frame.
+    led.guide.next_sweep()
+    assert led.back(led.history.redo) == {}
+
+
+def test_no_more_is_kept_of_it_than_of_the_session(led):
+    for number in range(MOST_UNDONE + 9):
+        led.act(FIRST[number % 4])
+    assert led.guide._kept.keys() == led.session.kept.keys() and len(led.guide._kept) <= MOST_UNDONE + 1
+
+
 # Its lines
 
 
@@ -268,7 +358,7 @@ def watching(monkeypatch, rehearsal) -> Instruments:
 
 def test_the_instruments_watch_the_guide_and_record_it(watching, rehearsal, one_device):
     noted: list[dict] = []
-    session = SimpleNamespace(moment=0, note=lambda name, figures: noted.append(figures))
+    session = SimpleNamespace(moment=0, kept={}, back=None, note=lambda name, figures: noted.append(figures))
     for pose in FIRST:
         rehearsal.pose = pose
         watching.watch(session, rehearsal.probe, pose)
@@ -287,7 +377,7 @@ def test_what_a_session_holds_is_recalled_as_it_was_watched(watching, rehearsal,
     squeezed = iter([0.3, 1.5, 9.0, 0.2])
     monkeypatch.setattr(instruments, "read", lambda *_: Reading(next(squeezed), 20.0, 5.0, 2.0, 1.0))
     events: dict[int, list] = {}
-    session = SimpleNamespace(moment=0)
+    session = SimpleNamespace(moment=0, kept={}, back=None)
     session.note = lambda kind, value: events.setdefault(session.moment, []).append(
         Event(at=session.moment, kind=kind, value=value)
     )

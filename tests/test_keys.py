@@ -3,6 +3,7 @@
 import dataclasses
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 from conftest import ROOT
@@ -78,7 +79,7 @@ def test_a_held_action_goes_on_with_time(action, name, a_second):
 
 def test_what_is_said_names_the_users_keys(tmp_path, capsys):
     keys = Keys(of=USUAL_KEYS | {"sweep": "Space", "plan_for": "L"})
-    parts = [None] * 5
+    parts = [None, None, SimpleNamespace(status=""), None]
     loop = Loop(None, NullViewer(), tmp_path, None, *parts, keys=keys)
     loop._announce("sweep-001: {sweep} ends it")
     assert capsys.readouterr().out == "sweep-001: Space ends it\n"

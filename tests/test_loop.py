@@ -125,6 +125,23 @@ def test_what_the_guard_put_back_is_told_and_stands_in_the_panel_for_a_while(loo
     assert shown == ["TISSUE PUT BACK", ""] and capsys.readouterr().out == "Tissue put back\n"
 
 
+def test_a_sweep_that_is_recorded_stands_in_the_panel_beside_all_else(looping, monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr(loop, "perf_counter", lambda: clock[0])
+    looping.sweeping = SimpleNamespace(status="RECORDING 3 s", watch=lambda *_: "")
+    looping.plans = SimpleNamespace(status="PLANNING; {next_plan} stops", watch=lambda *_: "")
+    controls = Controls(Settings())
+    assert looping.frame(controls).status == "RECORDING 3 s   PLANNING; Backspace stops"
+    looping.driver.status = "TRACKING LOST"
+    assert looping.frame(controls).status == "RECORDING 3 s   TRACKING LOST   PLANNING; Backspace stops"
+    looping._say("undo: {undo}")
+    assert looping.frame(controls).status == "RECORDING 3 s   UNDO: U"
+    clock[0] += 2.1
+    assert looping.frame(Controls(Settings(), freeze=True)).status == (
+        "RECORDING 3 s   FROZEN   PLANNING; Backspace stops"
+    )
+
+
 def test_without_a_link_the_loop_goes_on(looping, sent):
     looping.link = None
     looping.frame(Controls(Settings()))

@@ -107,6 +107,22 @@ def test_a_recorded_sweep_says_where_each_pixel_is(tmp_path):
     assert read_sweep(tmp_path / "sweep-002.igs.mha").times_s == [1.0]
 
 
+def test_as_long_as_a_sweep_is_recorded_its_length_is_said(tmp_path):
+    rehearsal, view = recording()
+    sweeping = Sweeping(rehearsal)
+    said = []
+    for first in (100.0, 200.0):
+        said.append(sweeping.status)
+        sweeping.toggle(tmp_path)
+        said.append(sweeping.status)
+        for time_s in (first, first + 0.6, first + 11.8):
+            sweeping.watch(time_s, view, rehearsal.probe)
+            said.append(sweeping.status)
+        sweeping.toggle(tmp_path)
+    once = ["", *(f"RECORDING {seconds} s" for seconds in (0, 0, 1, 12))]
+    assert [*said, sweeping.status] == [*once, *once, ""]
+
+
 def test_sweeps_are_numbered_after_the_last(tmp_path):
     sweeping = Sweeping(recording()[0])
     for name in ("sweep-004.igs.mha", "sweep-009-marks.igs.mha", "sweep-x.igs.mha", "sweep-0.igs.mha"):

@@ -5,7 +5,7 @@ import pytest
 
 from render import frame, panel
 from render.layout import HEADER_HEIGHT, RULER_WIDTH, Layout
-from render.panel import Panel
+from render.panel import Panel, font
 
 LAYOUT = Layout(1280, 720)
 
@@ -102,3 +102,29 @@ def test_readouts_and_status_change_the_picture():
     frozen = frame.backdrop(LAYOUT, Panel(("CT",), 40.0, 60.0, status="FROZEN"))
     changed = np.argwhere(np.any(plain != frozen, axis=2))
     assert len(changed) > 0 and changed[:, 1].min() > LAYOUT.panel.left
+
+
+PLANNING = "PLANNING   43 %, some 18 min left; Backspace stops"
+
+
+@pytest.mark.parametrize("size", [(1280, 720), (1920, 1080)])
+@pytest.mark.parametrize(
+    "status",
+    ["FROZEN", PLANNING, f"RECORDING 12 s   TISSUE SQUEEZED BY 12 mm   {PLANNING}"],
+)
+def test_a_status_is_as_large_as_it_can_be_in_the_panel(size, status):
+    layout = Layout(*size)
+    plain, with_status = (
+        frame.backdrop(layout, Panel(("CT",), 40.0, 60.0, status=each))[:, layout.panel.left :].astype(int)
+        for each in ("", status)
+    )
+    columns = np.flatnonzero(np.any(plain != with_status, axis=(0, 2)))
+    room = layout.panel.width - 2 * layout.px(16)
+    assert layout.px(16) <= columns[0] and columns[-1] <= layout.panel.width - layout.px(16)
+    # The usual font where that fits, but for the room beside its first and last letter; else one size more would not, which
+    # makes it wider by a ninth at most.
+    usual = font(layout.px(17)).getlength(status)
+    fits = usual <= room
+    assert (
+        np.ptp(columns) == pytest.approx(usual, abs=layout.px(5)) if fits else np.ptp(columns) > 0.88 * room
+    )

@@ -19,11 +19,11 @@ from scenes.trocar import Trocar
 from studies.plan import compare, evolution
 from studies.plan.candidate import Candidate, Quantity
 from studies.plan.evolution import GENERATION, NEAR, Search, foreseen
-from studies.plan.file import PlanError, read_plan, scans_of, write_plan
+from studies.plan.file import PlanError, read_plan, write_plan
 from studies.plan.make import make_plan
 from studies.plan.parts import Parts
 from studies.plan.score import score
-from studies.plan.search import FIRST, TRIAL_MM_S, ranked, search
+from studies.plan.search import FIRST, FORESEEN, TRIAL_MM_S, length_of, ranked, search
 from studies.plan.study_command import table
 from studies.plan.workers import Outcome, Problem, SearchSpace, Workers, _trial, workers
 from ultrasound.probe import load_probe
@@ -78,6 +78,10 @@ def problem_of(**changes) -> Problem:
     anatomy = LoadedAnatomy(big_ball(), None, None, ())
     values = dict(scene=Scene(anatomy={}), anatomy=anatomy, probe=load_probe("linear"), target="organ")
     return Problem(**(values | dict(margin_mm=5.0, trocar=Trocar()) | changes))
+
+
+def with_tumour(**changes) -> Problem:
+    return problem_of(anatomy=LoadedAnatomy(big_ball(), big_ball(), None, ()), **changes)
 
 
 # Evolution
@@ -151,28 +155,28 @@ def test_a_forecasts_best_is_no_worse_than_where_it_began():
 @pytest.mark.parametrize("trials", [4, 5, 37, 64, 96, 101])
 def test_all_trials_are_made_and_counted(trials):
     crew, done = Counting(four()), []
-    searches = search(crew.candidates, crew, trials, lambda: done.append(1))
+    searches = search(crew.candidates, crew, trials, done.append)
     made = Counter(each.side for each, _, _ in crew.tasks)
-    assert sum(made.values()) == len(crew.tasks) == trials and len(done) == trials + 4
+    assert sum(made.values()) == len(crew.tasks) == trials and Counter(done) == {1: trials, FORESEEN: 4}
     assert {one.candidate.side: one.trials for one in searches} == made
     assert {speed for _, _, speed in crew.tasks} == {TRIAL_MM_S} and crew.foreseen == 4
 
 
 def test_the_better_half_has_the_rest():
     crew = Counting(four())
-    searches = search(crew.candidates, crew, 96, lambda: None)
+    searches = search(crew.candidates, crew, 96, lambda _: None)
     trials = {one.candidate.side: one.trials for one in searches}
     # Whole generations of all four until no more than the rest is left.
     first = GENERATION * -(-int(FIRST * 96) // (4 * GENERATION))
     half = (96 - 4 * first) // 2
     assert trials == {"sweep 0": first, "sweep 2": first, "sweep 1": first + half, "sweep 3": first + half}
-    of_three = search(four()[:3], Counting(four()[:3]), 96, lambda: None)
+    of_three = search(four()[:3], Counting(four()[:3]), 96, lambda _: None)
     assert sum(one.trials == max(each.trials for each in of_three) for one in of_three) == 2
 
 
 def test_every_answer_goes_to_the_candidate_that_asked():
     crew = Counting(four())
-    for one in search(crew.candidates, crew, 45, lambda: None):
+    for one in search(crew.candidates, crew, 45, lambda _: None):
         tried = [values for each, values, _ in crew.tasks if each is one.candidate]
         scores = [score(worth(values, one.candidate.count / 100)) for values in tried]
         assert one.score == max(scores) and one.values == tried[int(np.argmax(scores))]
@@ -182,7 +186,7 @@ def test_every_answer_goes_to_the_candidate_that_asked():
 def test_two_searches_try_the_same():
     one, two = Counting(four()), Counting(four())
     for crew in (one, two):
-        search(crew.candidates, crew, 70, lambda: None)
+        search(crew.candidates, crew, 70, lambda _: None)
     assert [(each.side, values) for each, values, _ in one.tasks] == [
         (each.side, values) for each, values, _ in two.tasks
     ]
@@ -190,15 +194,15 @@ def test_two_searches_try_the_same():
 
 def test_the_best_of_each_is_gone_once_more_and_ranked():
     crew, done = Counting(four()), []
-    searches = search(crew.candidates, crew, 48, lambda: None)
+    searches = search(crew.candidates, crew, 48, lambda _: None)
     crew.tasks.clear()
-    rows = ranked(searches, crew, 12.0, lambda: done.append(1))
+    rows = ranked(searches, crew, 12.0, done.append)
     assert [one.candidate.side for one, _ in rows] == ["sweep 1", "sweep 3", "sweep 2", "sweep 0"]
-    assert len(done) == 4 and {speed for _, _, speed in crew.tasks} == {12.0}
+    assert done == [3] * 4 and {speed for _, _, speed in crew.tasks} == {12.0}
     assert all(outcome.parts == worth(one.values, one.candidate.count / 100) for one, outcome in rows)
     # One that had no trial has no numbers to be gone with.
     untried = Search(candidate("untried"), np.zeros(3), NEAR)
-    assert len(ranked([*searches, untried], crew, 12.0, lambda: None)) == 4
+    assert len(ranked([*searches, untried], crew, 12.0, lambda _: None)) == 4
 
 
 # A plan made
@@ -206,8 +210,9 @@ def test_the_best_of_each_is_gone_once_more_and_ranked():
 
 def test_a_plan_is_the_ranked_sweeps_with_what_they_are_for(tmp_path):
     problem, done = problem_of(trocar=Trocar(cone_deg=33)), []
-    plans = [make_plan(problem, Counting(four()), 12.0, 96, lambda: done.append(1)) for _ in range(2)]
-    assert len(done) == 2 * scans_of(96), "what the command's progress bar expects"
+    plans = [make_plan(problem, Counting(four()), 12.0, 96, done.append) for _ in range(2)]
+    assert sum(done) == 2 * length_of(96, 12.0), "what the command's progress bar expects"
+    assert done[0] == 0 and done.count(0) == 2
     plan = plans[0]
     assert [each.name.split("passes ")[-1].removeprefix("one pass ") for each in plan.sweeps] == [
         *("sweep 1", "sweep 3", "sweep 2", "sweep 0")
@@ -234,7 +239,7 @@ def test_where_no_sweep_can_be_held_that_is_said(crew):
         crew.search_space = lambda: SearchSpace([], {})
         crew.go = lambda tasks: iter(())
     with pytest.raises(PlanError, match="no sweep was found.*move the trocar, widen its cone") as error:
-        make_plan(problem_of(), crew, 10.0, 4 if crew.candidates else 0, lambda: None)
+        make_plan(problem_of(), crew, 10.0, 4 if crew.candidates else 0, lambda _: None)
     assert "\n" not in str(error.value)
 
 
@@ -253,8 +258,8 @@ def test_a_comparison_counts_what_it_does_and_means_its_sweeps_by_chance(monkeyp
 
     monkeypatch.setattr(compare, "workers", Crew)
     done: list[int] = []
-    run = compare.compare(Scene(anatomy={}), problem_of().anatomy, 40, 3, lambda: done.append(1))
-    assert len(done) == compare.count_of(40) and jobs == [3, 3]
+    run = compare.compare(Scene(anatomy={}), with_tumour().anatomy, 40, 3, done.append)
+    assert sum(done) == compare.count_of(40) and jobs == [3, 3]
     rows = {row["sweep"]: row for row in run["rows"]}
     assert list(rows) == ["planned", "straight", "row by row", "random"]
     assert [row["count"] for row in rows.values()] == [1, 1, 1, len(compare.SEEDS)]
@@ -272,7 +277,8 @@ def test_a_process_keeps_no_ground_for_another():
     problems = [
         problem_of(),
         problem_of(margin_mm=6.0),
-        problem_of(target="tumour"),
+        with_tumour(),
+        with_tumour(target="tumour"),
         problem_of(trocar=Trocar(at_mm=(0, 0, 90))),
         problem_of(probe=load_probe("drop-in")),
         problem_of(scene=Scene(anatomy={}, tissue=dict(cell_mm=8.0))),
@@ -286,14 +292,21 @@ def _end(key: str, problem: Problem) -> None:
     os._exit(1)
 
 
-def _process(key: str, problem: Problem) -> int:
-    return os.getpid()
+def _process(key: str, problem: Problem) -> tuple[int, list[str]]:
+    return os.getpid(), [thread.name for thread in threading.enumerate()]
 
 
-def test_one_process_is_not_this_one():
+def test_one_process_is_not_this_one_and_watches_whether_this_one_is_there():
     """Taichi would be started anew under whatever this one computes."""
     with workers(problem_of(), 1) as crew:
-        assert os.getpid() not in crew._all(_process, [()])
+        ((process, threads),) = crew._all(_process, [()])
+    assert process != os.getpid() and any("_watch" in name for name in threads)
+
+
+@pytest.mark.parametrize("target", ["tumour", "margin"])
+def test_there_is_no_problem_of_a_tumour_without_one(target):
+    with pytest.raises(PlanError, match=f"--target {target}: this scene has no tumour; expected organ"):
+        problem_of(target=target)
 
 
 def test_who_waits_for_processes_that_are_stopped_is_told():
@@ -314,6 +327,7 @@ def test_a_process_that_is_ended_is_said_in_one_line():
     assert "a process of the search was ended" in str(error.value) and "\n" not in str(error.value)
 
 
+@pytest.mark.usefixtures("one_device")
 @pytest.mark.parametrize(("target", "margin"), [("tumour", 5.0), ("margin", 0.0)])
 def test_a_target_without_a_voxel_is_refused(monkeypatch, target, margin):
     speck = trimesh.creation.icosphere(subdivisions=1, radius=0.3).apply_translation([0.7, 0.7, 0.7])

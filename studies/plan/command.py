@@ -10,7 +10,7 @@ from scenes.anatomy import load_anatomy
 from scenes.scene import EMBEDDED, load_scene, scene_file, with_options
 from scenes.trocar import Trocar
 from studies.command_line import Fault, NumberRange, make_folder, quality_option
-from studies.plan.file import FASTEST_MM_S, MOST_MARGIN_MM, MOST_SWEEPS, SLOWEST_MM_S, scans_of, write_plan
+from studies.plan.file import FASTEST_MM_S, MOST_MARGIN_MM, MOST_SWEEPS, SLOWEST_MM_S, write_plan
 from studies.setup import probe_of, with_quality
 from ultrasound.target import TARGETS, Target
 
@@ -83,15 +83,16 @@ def plan(
     if out.is_dir():
         raise Fault(f"{out}: is a folder; name a file after --out")
     from studies.plan.make import make_plan
+    from studies.plan.search import length_of
     from studies.plan.workers import Problem, workers
 
-    if port.at_mm is None:
-        click.echo("No trocar is given: every way in counts as free.")
     aim: Target = target or ("organ" if anatomy.tumour is None else "margin")
     problem = Problem(loaded, anatomy, held, aim, margin_mm, port)
+    if port.at_mm is None:
+        click.echo("No trocar is given: every way in counts as free.")
     with (
         workers(problem, jobs) as crew,
-        tqdm(total=scans_of(trials), desc="plan", unit="scan") as bar,
+        tqdm(total=length_of(trials, speed_mm_s), desc="plan", unit="trial") as bar,
     ):
         made = make_plan(problem, crew, speed_mm_s, trials, bar.update)
         bar.update(bar.total - bar.n)

@@ -10,10 +10,10 @@ import numpy as np
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
 from studies.plan.baselines import UNPLANNED, planned, random_ways
-from studies.plan.file import scans_of
 from studies.plan.make import make_plan
 from studies.plan.parts import Parts
 from studies.plan.score import score
+from studies.plan.search import length_at, length_of
 from studies.plan.workers import Outcome, Problem, workers
 from studies.setup import PRESETS, probe_of, scene_of
 from ultrasound.target import Target
@@ -27,12 +27,12 @@ JUDGED_ON = PLANNED_ON.but(cell_mm=2.7, iterations=8)
 
 
 def count_of(trials: int) -> int:
-    """How often ``compare`` says that something is done."""
-    return scans_of(trials) + 1 + len(UNPLANNED) + len(SEEDS)
+    """What ``compare`` says is done adds up to this."""
+    return length_of(trials, SPEED_MM_S) + (1 + len(UNPLANNED) + len(SEEDS)) * length_at(SPEED_MM_S)
 
 
 def compare(
-    scene: Scene, anatomy: LoadedAnatomy, trials: int, jobs: int | None, done: Callable[[], Any]
+    scene: Scene, anatomy: LoadedAnatomy, trials: int, jobs: int | None, done: Callable[[int], Any]
 ) -> dict[str, Any]:
     """Plan for the tumour and its margin, and go planned, straight and random sweeps. Raises PlanError."""
     probe = probe_of(scene)
@@ -45,7 +45,7 @@ def compare(
     with workers(replace(problem, scene=scene_of(scene, JUDGED_ON)), jobs) as crew:
         for one in crew.go_ways(ways, SPEED_MM_S):
             outcomes.append(one)
-            done()
+            done(length_at(SPEED_MM_S))
     rows = [_row(name, [one]) for name, one in zip(["planned", *UNPLANNED], outcomes, strict=False)]
     rows.append(_row("random", outcomes[len(rows) :]))
     return dict(

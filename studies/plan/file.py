@@ -92,11 +92,6 @@ def write_plan(plan: Plan, path: Path) -> None:
         partial.write_text(json.dumps(plan.model_dump(mode="json"), indent=1) + "\n", "utf-8")
 
 
-def scans_of(trials: int) -> int:
-    """How much a search with so many trials has to do at most: it foresees each kind of sweep, and goes the best of it slowly."""
-    return trials + 2 * MOST_SWEEPS
-
-
 def next_free(folder: Path) -> Path:
     """The place of the next plan in a folder."""
     return folder / f"plan-{next_number(folder, NAME):03d}.json"

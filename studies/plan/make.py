@@ -18,10 +18,14 @@ DIGITS = 6
 
 
 def make_plan(
-    problem: Problem, workers: Workers, speed_mm_s: float, trials: int, done: Callable[[], Any]
+    problem: Problem, workers: Workers, speed_mm_s: float, trials: int, done: Callable[[int], Any]
 ) -> Plan:
-    """The plan that solves a problem. Raises PlanError where no way is found."""
+    """The plan that solves a problem. Raises PlanError where no way is found.
+
+    ``done`` is told of each part how long it was, in trials (``length_of``): first of 0, where the search begins.
+    """
     space = workers.search_space()
+    done(0)
     searches = search(space.candidates, workers, trials, done)
     rows = [row for row in ranked(searches, workers, speed_mm_s, done) if row[1].passes]
     if not rows or rows[0][1].parts.reachable < 1.0:

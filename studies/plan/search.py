@@ -5,6 +5,7 @@ from typing import Any
 
 from studies.plan.candidate import Candidate
 from studies.plan.evolution import NEAR, Search
+from studies.plan.file import MOST_SWEEPS
 from studies.plan.score import score
 from studies.plan.workers import Outcome, Workers
 
@@ -12,16 +13,28 @@ from studies.plan.workers import Outcome, Workers
 FIRST = 0.5
 # Trials are gone faster than the plan will be.
 TRIAL_MM_S = 60.0
+# To foresee a candidate takes as long as so many trials.
+FORESEEN = 5
+
+
+def length_of(trials: int, speed_mm_s: float) -> int:
+    """How long a plan with so many trials takes at most, in trials: what ``make_plan`` says is done adds up to it."""
+    return trials + MOST_SWEEPS * (FORESEEN + length_at(speed_mm_s))
+
+
+def length_at(speed_mm_s: float) -> int:
+    """How long it takes to go a sweep at a speed, in trials: half of a trial's time is not of the steps on its passes."""
+    return max(1, round((1 + TRIAL_MM_S / speed_mm_s) / 2))
 
 
 def search(
-    candidates: list[Candidate], workers: Workers, trials: int, done: Callable[[], Any]
+    candidates: list[Candidate], workers: Workers, trials: int, done: Callable[[int], Any]
 ) -> list[Search]:
     """Search all candidates with so many trials together: first all of them, then the better half."""
     searches = []
     for candidate, start in zip(candidates, workers.foresee(candidates), strict=True):
         searches.append(Search(candidate, start, NEAR))
-        done()
+        done(FORESEEN)
     active, left = searches, trials
     while left > 0:
         if len(active) == len(searches) and left <= (1 - FIRST) * trials:
@@ -30,7 +43,7 @@ def search(
     return searches
 
 
-def _generation(active: list[Search], workers: Workers, most: int, done: Callable[[], Any]) -> int:
+def _generation(active: list[Search], workers: Workers, most: int, done: Callable[[int], Any]) -> int:
     """One more generation of each, as far as trials are left; how many were made."""
     share = [most // len(active) + (number < most % len(active)) for number in range(len(active))]
     asked = [one.ask()[:count] for one, count in zip(active, share, strict=True)]
@@ -42,7 +55,7 @@ def _generation(active: list[Search], workers: Workers, most: int, done: Callabl
     scores = []
     for outcome in workers.go(tasks):
         scores.append(score(outcome.parts))
-        done()
+        done(1)
     for one, generation in zip(active, asked, strict=True):
         if generation:
             one.tell(generation, scores[: len(generation)])
@@ -51,7 +64,7 @@ def _generation(active: list[Search], workers: Workers, most: int, done: Callabl
 
 
 def ranked(
-    searches: list[Search], workers: Workers, speed_mm_s: float, done: Callable[[], Any]
+    searches: list[Search], workers: Workers, speed_mm_s: float, done: Callable[[int], Any]
 ) -> list[tuple[Search, Outcome]]:
     """The best of each candidate gone once more, as fast as it will be; the best of these first."""
     tried = [one for one in searches if one.trials]
@@ -60,5 +73,5 @@ def ranked(
         tried, workers.go([(each.candidate, each.values, speed_mm_s) for each in tried]), strict=True
     ):
         rows.append((one, outcome))
-        done()
+        done(length_at(speed_mm_s))
     return sorted(rows, key=lambda row: -score(row[1].parts))

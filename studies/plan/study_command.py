@@ -38,7 +38,7 @@ def plan_study(scenes: tuple[Path, ...], out: Path, trials: int, probe: str, job
 
     runs = []
     patients = scenes or (EMBEDDED,)
-    with tqdm(total=len(patients) * count_of(trials), desc="plan", unit="scan") as bar:
+    with tqdm(total=len(patients) * count_of(trials), desc="plan", unit="trial") as bar:
         for number, each in enumerate(patients, 1):
             path = scene_file(each)
             scene = with_options(load_scene(path), {"transducer.probe": probe})

@@ -3,6 +3,7 @@
 A process computes on one CPU thread, so that several do not fight for the same ones, and keeps the model that it has built.
 """
 
+import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Future
@@ -20,6 +21,7 @@ from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.scene import Scene
 from scenes.trocar import Trocar
 from studies.coordinates import probe_in_patient
+from studies.orphans import end_with
 from studies.plan.candidate import Candidate, candidates_of
 from studies.plan.evolution import foreseen
 from studies.plan.file import PlanError
@@ -36,7 +38,7 @@ from ultrasound.target import Target
 
 @dataclass(frozen=True)
 class Problem:
-    """What a plan is to solve: see a target of a patient. ``target`` is one of ``ultrasound.target.TARGETS``."""
+    """What a plan is to solve: see a target of a patient. Raises PlanError for a tumour where there is none."""
 
     scene: Scene
     anatomy: LoadedAnatomy
@@ -44,6 +46,12 @@ class Problem:
     target: Target
     margin_mm: float
     trocar: Trocar
+
+    def __post_init__(self) -> None:
+        if self.target != "organ" and self.anatomy.tumour is None:
+            raise PlanError(
+                f"--target {self.target}: this scene has no tumour; expected organ, or another scene"
+            )
 
     @property
     def bare(self) -> "Problem":
@@ -75,7 +83,8 @@ class Workers:
     """Processes that try ways for one problem. All that they do may raise PlanError."""
 
     def __init__(self, problem: Problem, jobs: int) -> None:
-        self.problem, self._jobs, self._pool = problem.bare, jobs, ProcessPoolExecutor(jobs)
+        self.problem, self._jobs = problem.bare, jobs
+        self._pool = ProcessPoolExecutor(jobs, initializer=end_with, initargs=(os.getpid(),))
         made_of = problem.scene, problem.probe, problem.target, problem.margin_mm, problem.trocar
         self._key = fingerprint(self.problem.anatomy) + repr(made_of)
 
@@ -136,10 +145,6 @@ def _trial(key: str, problem: Problem, speed_mm_s: float) -> Trial:
     """The trial of a problem, built once in a process. Raises PlanError."""
     if key not in _built:
         _built.clear()
-        if problem.target != "organ" and problem.anatomy.tumour is None:
-            raise PlanError(
-                f"--target {problem.target}: this scene has no tumour; expected organ, or another scene"
-            )
         sim.device.start("cpu", cpu_max_num_threads=1)
         rehearsal = Rehearsal(problem.scene, problem.anatomy, problem.probe)
         coverage = Coverage(rehearsal.organ, rehearsal.tumour, problem.margin_mm)

@@ -9,6 +9,7 @@ from studies.coordinates import transducer_at
 from studies.plan.file import Plan
 from studies.plan.parts import faces_of
 from studies.rehearsal import Rehearsal
+from studies.session.session import Session
 from ultrasound.hand import advanced, indentation
 
 # A probe farther than this from the sweep is elsewhere; nearer than that to a pose it is there.
@@ -19,6 +20,15 @@ DEG_BESIDE_A_MM = 3.0
 AHEAD = 6
 # So far above the organ the way is drawn.
 ABOVE_MM = 1.5
+
+
+@dataclass(frozen=True)
+class _Gone:
+    """How far a sweep was followed: the next pose, and how far from each pose the probe was (``Guide``)."""
+
+    at: int
+    off: np.ndarray
+    far: np.ndarray
 
 
 @dataclass
@@ -35,6 +45,7 @@ class Guide:
     def begin_anew(self) -> None:
         """Nothing of the sweep was gone yet."""
         self.at = 0
+        self._kept: dict[int, _Gone] = {}
         shown = self.number < len(self.plan.sweeps)
         passes = [
             np.stack([transducer_at(self.rehearsal, pose) for pose in each])
@@ -69,6 +80,16 @@ class Guide:
             return "Plan hidden"
         sweep = self.plan.sweeps[self.number]
         return f"Plan {self.number + 1}: {sweep.name}, sees {100 * sweep.parts['seen']:.0f} %"
+
+    def go_with(self, session: Session) -> None:
+        """Watch a session's last moment; one that went back takes what was gone of the sweep back too."""
+        now = _Gone(self.at, self._off.copy(), self._far.copy())
+        kept = dict.fromkeys(session.kept, now) | self._kept
+        if session.back is not None:
+            then = kept.get(session.back, now)
+            self.at, self._off, self._far = then.at, then.off.copy(), then.far.copy()
+        self._kept = {moment: kept[moment] for moment in session.kept}
+        self.watch(self.rehearsal.pose)
 
     def watch(self, pose: np.ndarray) -> None:
         """Where the transducer is now (4, 4)."""

@@ -96,7 +96,7 @@ class Instruments:
             rest = self.rehearsal.scanner.plane.rest_grid(PLACES)
             self._touches = self.coverage.look(rest, probe, image.contact_gap_mm)
         if self.guide is not None:
-            self.guide.watch(self.rehearsal.pose)
+            self.guide.go_with(session)
         if session.moment % self._read_every == 0 or self.reading is None:
             self.reading = read(self.rehearsal, probe, self._touches)
             session.note("reading", self.figures())

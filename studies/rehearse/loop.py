@@ -96,11 +96,9 @@ class Loop:
         )
 
     def _status(self, view: View) -> str:
-        if perf_counter() < self._said_until:
-            return self._said
-        return self.keys.worded(
-            "   ".join(filter(None, [view.status or self.sweeping.status, self.plans.status]))
-        )
+        is_said = perf_counter() < self._said_until
+        news = [self._said] if is_said else [view.status, self.plans.status]
+        return self.keys.worded("   ".join(filter(None, [self.sweeping.status, *news])))
 
     def _announce(self, text: str) -> None:
         """Say something in the window and in the terminal."""

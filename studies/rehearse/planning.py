@@ -2,14 +2,16 @@
 
 import threading
 from pathlib import Path
+from time import perf_counter
 
 from joblib import cpu_count
 
 from render.viewer import Controls, Settings
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene, with_options
-from studies.plan.file import Plan, PlanError, next_free, scans_of, write_plan
+from studies.plan.file import Plan, PlanError, next_free, write_plan
 from studies.plan.make import make_plan
+from studies.plan.search import length_of
 from studies.plan.workers import Problem, Workers, workers
 from studies.rehearsal import Rehearsal
 from studies.rehearse.guide import Guide
@@ -34,7 +36,9 @@ class Planning:
     def __init__(self, problem: Problem, path: Path, trials: int = TRIALS) -> None:
         self.path, self.fault = path, ""
         self.plan: Plan | None = None
-        self._problem, self._trials, self._done = problem, trials, 0
+        self._problem, self._trials = problem, trials
+        # How much is done, and when the first of it was begun.
+        self._done, self._began_s = 0, 0.0
         self._workers: Workers | None = None
         self._stops = False
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -48,7 +52,14 @@ class Planning:
     @property
     def share(self) -> float:
         """How much of it is done, 0 to 1."""
-        return min(self._done / scans_of(self._trials), 1.0)
+        return min(self._done / length_of(self._trials, SPEED_MM_S), 1.0)
+
+    @property
+    def left_s(self) -> float | None:
+        """How long it will still take at the pace so far; None before there is one."""
+        if self._done == 0:
+            return None
+        return (perf_counter() - self._began_s) * (1.0 - self.share) / self.share
 
     def stop(self) -> None:
         """Let go of the search; what was found is lost."""
@@ -61,6 +72,8 @@ class Planning:
         try:
             # One processor is left to the rehearsal.
             with workers(self._problem, max(1, cpu_count() - 1)) as self._workers:
+                # Either this is seen here, or these processes by who stops them.
+                self._count(0)
                 plan = make_plan(self._problem, self._workers, SPEED_MM_S, self._trials, self._count)
             write_plan(plan, self.path)
             self.plan = plan
@@ -71,10 +84,12 @@ class Planning:
         except Exception as error:  # whatever a process may send back: the rehearsal goes on
             self.fault = f"No plan: the search failed ({error})"
 
-    def _count(self) -> None:
+    def _count(self, trials: int) -> None:
         if self._stops:
             raise PlanError("No plan: it was stopped")
-        self._done += 1
+        if trials == 0:
+            self._began_s = perf_counter()
+        self._done += trials
 
 
 class Plans:
@@ -90,18 +105,31 @@ class Plans:
     @property
     def status(self) -> str:
         """What stands in the panel while a plan is made."""
-        return "" if self._planning is None else f"PLANNING   {100 * self._planning.share:.0f} %"
+        if self._planning is None:
+            return ""
+        left_s = self._planning.left_s
+        left = "" if left_s is None else f", {in_words(left_s)} left"
+        return f"PLANNING   {100 * self._planning.share:.0f} %{left}; {{next_plan}} stops"
 
     def watch(self, controls: Controls) -> str:
         """What the user has asked for, and a search that is over; what there is to say."""
-        guide = self.instruments.guide
-        if controls.reset and guide is not None:
-            guide.begin_anew()
         if controls.next_plan:
-            return guide.next_sweep() if guide is not None else "No plan: {plan} makes one"
+            return self._stopped() or self._next_sweep()
         if controls.plan:
             return self._begin(controls.settings)
         return self._chosen(controls.settings) or self._ended()
+
+    def _stopped(self) -> str:
+        """Let go of a search that goes on; what there is to say."""
+        planning, self._planning = self._planning, None
+        if planning is None:
+            return ""
+        planning.stop()
+        return "Planning stopped"
+
+    def _next_sweep(self) -> str:
+        guide = self.instruments.guide
+        return guide.next_sweep() if guide is not None else "No plan: {plan} makes one"
 
     def _chosen(self, settings: Settings) -> str:
         before, self._plan_for = self._plan_for, settings.plan_for
@@ -115,8 +143,7 @@ class Plans:
 
     def stop(self) -> None:
         """Let go of a search that goes on."""
-        if self._planning is not None:
-            self._planning.stop()
+        self._stopped()
 
     def _begin(self, settings: Settings) -> str:
         if self._planning is not None:
@@ -137,6 +164,12 @@ class Plans:
         guide = Guide(self.rehearsal, planning.plan)
         self.instruments.follow(guide)
         return f"{guide.said()} ({planning.path.name})"
+
+
+def in_words(seconds: float) -> str:
+    """A time that is not known well."""
+    minutes = round(seconds / 60)
+    return f"some {minutes} min" if minutes > 0 else "under a minute"
 
 
 def as_set(scene: Scene, settings: Settings) -> Scene:

@@ -20,7 +20,7 @@ class Sweeping:
     def __init__(self, rehearsal: Rehearsal) -> None:
         self.rehearsal = rehearsal
         self._sweep: MarkedSweep | None = None
-        self._due_s = 0.0
+        self._began_s = self._due_s = 0.0
         self._shows = ""
 
     def toggle(self, out: Path) -> str:
@@ -34,13 +34,13 @@ class Sweeping:
             self._sweep = MarkedSweep(out, stem, self.rehearsal.probe)
         except OSError as error:
             return f"{stem} cannot be written: {_words(error)}"
-        self._due_s, self._shows = 0.0, ""
+        self._began_s, self._due_s, self._shows = 0.0, 0.0, ""
         return f"{stem}: {{sweep}} ends it"
 
     @property
     def status(self) -> str:
         """What stands in the panel while a sweep goes on."""
-        return "" if self._sweep is None else f"SWEEP   {self._sweep.count} pictures   {{sweep}} ends it"
+        return "" if self._sweep is None else f"RECORDING {self._due_s - self._began_s:.0f} s"
 
     def end(self) -> str:
         """End the sweep, where there is one; what there is to say."""
@@ -60,6 +60,8 @@ class Sweeping:
             return self.end()
         if self._sweep is None or time_s < self._due_s - 1e-9 or self.rehearsal.scanner is None:
             return ""
+        if self._sweep.count == 0:
+            self._began_s = time_s
         self._due_s = time_s + FRAME_S
         name, picture = next(iter(view.pictures.items()))
         if name != (self._shows or name):

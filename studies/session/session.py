@@ -26,7 +26,8 @@ class Session:
     """``moment`` counts what has happened to a rehearsal since the session began, ways back too: no two states share one.
 
     ``recorder``, where there is one, is told of all, so that the same session can be had again; ``seen``, where somebody looks, says
-    which voxels (nx, ny, nz) of the organ were seen so far.
+    which voxels (nx, ny, nz) of the organ were seen so far. ``back`` is the moment that the last one went back to, None where that
+    was a step.
     """
 
     def __init__(
@@ -39,6 +40,7 @@ class Session:
         self.recorder = recorder
         self._seen = seen
         self.moment = 0
+        self.back: int | None = None
         self.kept: dict[int, RehearsalState] = {SETTLED: rehearsal.settled}
         self._told: dict[str, Any] = {}
 
@@ -61,6 +63,7 @@ class Session:
 
     def stepped(self) -> None:
         """The rehearsal has just advanced by a step."""
+        self.back = None
         self._end_moment(self.rehearsal.pose)
 
     def go_back(self, moment: int) -> None:
@@ -68,6 +71,7 @@ class Session:
         self.note("back", moment)
         self.rehearsal.restore(self.kept[moment])
         self.rehearsal.update_surfaces()
+        self.back = moment
         self._end_moment(None)
 
     def keep(self) -> int:
