@@ -1,4 +1,4 @@
-"""The front end: key map, camera, panel picture; the off-screen frame where there is Vulkan."""
+"""The front end: camera, panel picture; the off-screen frame where there is Vulkan."""
 
 import dataclasses
 import os
@@ -13,11 +13,9 @@ import trimesh
 from render import frame, panel, solids
 from render.camera import OrbitCamera
 from render.display import display_available, fitted, window_size
-from render.frame import backdrop
-from render.keys import Keys
 from render.layout import FULL_SIZE, RULER_WIDTH, Layout
 from render.panel import Panel
-from render.viewer import KEY_MAP, Controls, Geometry, NullViewer, Settings, View, key_table
+from render.viewer import Controls, Geometry, NullViewer, Settings, View
 
 BOUNDS = np.array([[-54.0, -33.0, -21.0], [54.0, 27.0, 21.0]])
 LAYOUT = Layout(1280, 720)
@@ -37,23 +35,7 @@ def _view(**changes) -> View:
     )
 
 
-# Settings and key map
-
-
-def test_key_map_names_every_key_and_action_once():
-    for column in ("key", "action", "text"):
-        values = [getattr(line, column).lower() for line in KEY_MAP]
-        assert len(set(values)) == len(values)
-
-
-def test_key_table_has_a_row_for_every_key():
-    rows = key_table().splitlines()[2:]
-    assert [row.split(" | ")[0] for row in rows] == [f"| {line.key}" for line in KEY_MAP]
-
-
-def test_the_readme_has_the_key_map():
-    readme = Path(__file__).parents[1] / "README.md"
-    assert key_table() in readme.read_text("utf-8")
+# Settings
 
 
 def test_defaults_lie_in_their_ranges_and_every_setting_can_become_a_slider():
@@ -384,14 +366,3 @@ def test_no_display_is_noticed(monkeypatch, display):
 )
 def test_a_window_fits_its_screen(screen, size):
     assert fitted(*screen) == size
-
-
-def test_all_keys_fit_into_the_help_of_any_window():
-    lines = Keys().lines()
-    for size in ((1024, 600), (1202, 676), (1280, 720), (1920, 1080), (2560, 1440)):
-        layout = Layout(*size)
-        bare, helped = (backdrop(layout, Panel(("CT",), 40.0, 60.0), shown) for shown in (None, lines))
-        written = np.argwhere((bare != helped).any(axis=2))
-        box = layout.help
-        assert (written.min(axis=0) >= [box.top, box.left]).all()
-        assert (written.max(axis=0) < [box.bottom, box.right]).all()
