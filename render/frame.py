@@ -105,7 +105,7 @@ def first_of(figures: Mapping[str, str], most: int) -> dict[str, str]:
 def _draw_figures(
     draw: ImageDraw.ImageDraw, box: Rect, figures: Mapping[str, str], alert: str, pitch: float
 ) -> None:
-    room, most = box.width - FIGURES_GAP_PX, int(0.7 * pitch)
+    room, most = box.width - FIGURES_GAP_PX, int(0.68 * pitch)
     size = min(
         (fitting_size([(f"{name}  {value}",)], room, most) for name, value in figures.items()), default=most
     )

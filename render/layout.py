@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-# Of 1280 x 720 pixels echo and CT of the drop-in probe, 16 x 40 mm each, just fill a panel of this share.
-PANEL_SHARE = 0.45
+# Of 1280 x 720 pixels echo and CT of the drop-in probe, 16 x 40 mm each, nearly fill a panel of this share.
+PANEL_SHARE = 0.43
 TITLE_HEIGHT = 42
-STRIP_HEIGHT, STRIP_GAP, READOUT_WIDTH = 184, 4, 144
+STRIP_HEIGHT, STRIP_GAP, READOUT_WIDTH = 184, 4, 134
 HEADER_HEIGHT, FOOTER_HEIGHT = 74, 52
-RULER_WIDTH, WEDGE_WIDTH, PICTURE_GAP, NAME_HEIGHT = 46, 34, 10, 26
+RULER_WIDTH, WEDGE_WIDTH, PICTURE_GAP, NAME_HEIGHT = 42, 30, 10, 26
 ASIDE_WIDTH, ASIDE_GAP = 178, 6
 FINDINGS_GAP, FINDINGS_WIDTH, FIGURE_HEIGHT, FIGURES_PAD = 10, 178, 20, 7
 COMPASS_SIZE = 92
@@ -86,11 +86,6 @@ class Layout:
         """The 3D view."""
         top = self.title.bottom
         return Rect(0, top, self.panel.left, self.strip.top - top)
-
-    def clear(self, aside: bool) -> Rect:
-        """What of the 3D view the sliders ``aside`` leave free."""
-        width = self.scene.width - (ASIDE_WIDTH if aside else 0)
-        return Rect(self.scene.left, self.scene.top, width, self.scene.height)
 
     @property
     def readouts(self) -> Rect:

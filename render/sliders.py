@@ -80,7 +80,7 @@ def _width(members: list[dataclasses.Field]) -> float:
     """Pixels that a group asks for."""
     longest = max(GLYPH_WIDTH * len(_label(member)) for member in members)
     if isinstance(members[0].metadata["low"], bool):
-        return longest + 40
+        return longest + 44
     return (longest + 16) / LABEL_SHARE
 
 

@@ -249,10 +249,9 @@ class Window:
         self._boxes_placed += 1
         self._page = Page(self.layout, self.keys)
         self.camera.aspect = size[0] / size[1]
+        self.camera.part = self.layout.window_coordinates(self.layout.scene)
 
     def _submit(self, view: View) -> None:
-        free = self.layout.clear(self.settings.show_scanner)
-        self.camera.part = self.layout.window_coordinates(free)
         if self._help_shown:
             self._page.show_help()
         else:

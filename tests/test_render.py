@@ -12,6 +12,7 @@ import trimesh
 
 from render import frame, panel, solids
 from render.camera import OrbitCamera
+from render.cut_face import FLESH
 from render.display import display_available, fitted, window_size
 from render.layout import FULL_SIZE, RULER_WIDTH, Layout
 from render.panel import Panel
@@ -312,6 +313,27 @@ def test_settings_are_seen(window, setting, value):
     setattr(opened.settings, setting, value)
     assert np.any(opened.picture() != before)
     assert opened.read_controls().settings is opened.settings
+
+
+def test_the_cut_is_filled_and_the_half_before_it_gone(window):
+    opened, _, _ = window
+    opened.settings.cut = True
+    pose = np.array(_view().transducer_pose)
+    # The image plane is square to the view, but for the height that it is seen from.
+    _, _, ahead = opened.camera.axes()
+    pose[:3, 1] = [*(ahead[:2] / np.linalg.norm(ahead[:2])), 0.0]
+    pose[:3, 0] = np.cross(pose[:3, 1], pose[:3, 2])
+    for way in (1.0, -1.0):
+        turned = pose * [way, way, 1.0, 1.0]
+        opened.draw(_view(transducer_pose=turned, width_mm=4.0))
+        places = np.array([12.0, -12.0])[:, None] * pose[:3, 0]
+        columns, rows = (opened.camera.project(places) * [640, 360]).astype(int).T
+        shown = opened.picture()[359 - rows, columns].astype(float)
+        # Flesh, evenly lit: the organ's own colour is redder, and its half before the plane would hide it.
+        assert shown / shown.max(axis=1, keepdims=True) == pytest.approx(
+            np.tile(FLESH, (2, 1)) / FLESH[0], abs=0.06
+        )
+        assert np.ptp(shown, axis=0).max() < 12
 
 
 PROBE = """
