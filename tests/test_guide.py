@@ -291,3 +291,15 @@ def test_another_plan_brings_its_margin_and_what_was_seen_stays(watching, rehear
     assert watching.margin_mm == 2.0 and watching.coverage.targets["margin"].sum() < volume / 2
     assert watching.coverage.share("tumour") == 1.0 and watching.guide.plan.margin_mm == 2.0
     assert Instruments(rehearsal).margin_mm == instruments.MARGIN_MM
+
+
+@pytest.mark.parametrize(
+    ("touching", "notes"), [(0, {"B-mode": "NO CONTACT"}), (9, {"B-mode": "NO CONTACT"}), (10, {})]
+)
+def test_an_echo_is_said_to_be_black_where_hardly_a_line_touches(
+    device, watching, rehearsal, monkeypatch, touching, notes
+):
+    touches = np.arange(rehearsal.probe.number_of_scanlines) < touching
+    monkeypatch.setattr(watching.coverage, "look", lambda *_: touches)
+    watching.watch(SimpleNamespace(moment=0, note=lambda *_: None), rehearsal.probe, FIRST[0])
+    assert watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings()).notes == notes
