@@ -11,7 +11,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from render.actions import ACTIONS, BY_MOUSE, HELD
-from render.viewer import KEY_MAP
+from render.viewer import KEY_MAP, LINES
 
 # A key as it is printed -> as GGUI names it, which hears no digits and no punctuation.
 KEYS = {each: each.lower() for each in string.ascii_uppercase}
@@ -22,7 +22,12 @@ BUTTONS = (
     *("A", "B", "X", "Y", "Back", "Guide", "Start", "Left stick", "Right stick"),
     *("Left shoulder", "Right shoulder", "Pad up", "Pad down", "Pad left", "Pad right"),
 )
-USUAL_KEYS = {line.action: line.key for line in KEY_MAP if line.action in ACTIONS}
+USUAL_KEYS = {
+    action: key
+    for line in LINES
+    for action, key in zip(line.actions, line.keys, strict=True)
+    if action in ACTIONS
+}
 USUAL_BUTTONS = {
     "freeze": "A",
     "undo": "B",
@@ -69,9 +74,15 @@ class Keys:
         """Actions that go on while their key is held, each with the key as GGUI names it."""
         return [(action, KEYS[self.of[action]]) for action in (*HELD, *VIEW_ALONE)]
 
-    def lines(self) -> list[tuple[str, str]]:
-        """Key and text of each action, the mouse's too, for the reader."""
-        return [(self.of.get(line.action, line.key), line.text) for line in KEY_MAP]
+    def lines(self) -> dict[str, list[tuple[str, str]]]:
+        """Keys and text of all actions, the mouse's too, in groups, for the reader."""
+        return {
+            group: [(" / ".join(map(self._printed, line.actions, line.keys)), line.text) for line in lines]
+            for group, lines in KEY_MAP.items()
+        }
+
+    def _printed(self, action: str, usual: str) -> str:
+        return self.of.get(action, usual)
 
     def worded(self, text: str) -> str:
         """A text with the keys of the actions that it names in braces: "{sweep} ends it"."""
@@ -104,7 +115,10 @@ def keys_text() -> str:
     """The usual keys as the TOML file that ``load_keys`` reads."""
     named = ", ".join(key for key in KEYS if len(key) > 1)
     head = HEAD.format(named=named, buttons=", ".join(BUTTONS))
-    rows = [f'{line.action} = "{line.key}"  # {line.text}' for line in KEY_MAP if line.action in ACTIONS]
+    rows = []
+    for group, lines in KEY_MAP.items():
+        keyed = [(action, line.text) for line in lines for action in line.actions if action in ACTIONS]
+        rows += [f"# {group}", *(f'{action} = "{USUAL_KEYS[action]}"  # {text}' for action, text in keyed)]
     pad = [f'{action} = "{button}"' for action, button in USUAL_BUTTONS.items()]
     return "\n".join([head, "[keys]", *rows, "", "[gamepad]", *pad, ""])
 

@@ -1,18 +1,23 @@
 """Where each part of the window lies. Pixels count from the top left; lengths below are those of a window of 1280 x 720."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-PANEL_SHARE = 0.37
+# Of 1280 x 720 pixels echo and CT of the drop-in probe, 16 x 40 mm each, nearly fill a panel of this share.
+PANEL_SHARE = 0.43
 TITLE_HEIGHT = 42
-STRIP_HEIGHT, READOUT_SHARE = 184, 0.19
-HEADER_HEIGHT, FOOTER_HEIGHT = 74, 34
-RULER_WIDTH, WEDGE_WIDTH, PICTURE_GAP, NAME_HEIGHT = 46, 34, 10, 26
-ASIDE_WIDTH = 186
-FINDINGS_GAP, FINDINGS_WIDTH, FINDINGS_HEIGHT = 10, 178, 190
-# Texts grow with the window; Dear ImGui's sliders, and so the strip that holds them, cannot.
+STRIP_HEIGHT, STRIP_GAP, READOUT_WIDTH = 184, 4, 134
+HEADER_HEIGHT, FOOTER_HEIGHT = 74, 52
+RULER_WIDTH, WEDGE_WIDTH, PICTURE_GAP, NAME_HEIGHT = 42, 30, 10, 26
+ASIDE_WIDTH, ASIDE_GAP = 178, 6
+FINDINGS_GAP, FINDINGS_WIDTH, FIGURE_HEIGHT, FIGURES_PAD = 10, 178, 20, 7
+COMPASS_SIZE = 92
+# A strip narrower than this is left to the sliders.
+STRIP_WITH_READOUTS = 480
+# Texts grow with the window; Dear ImGui's sliders, and so what holds them, cannot.
 FULL_SIZE, LEAST_SCALE, MOST_SCALE = (1280, 720), 0.8, 4.0
 # How much larger pictures one under the other must be than side by side.
 BELOW_FROM = 1.2
@@ -33,6 +38,10 @@ class Rect(NamedTuple):
     @property
     def bottom(self) -> int:
         return self.top + self.height
+
+    def holds(self, column: float, row: float) -> bool:
+        """Whether a pixel is in it."""
+        return self.left <= column < self.right and self.top <= row < self.bottom
 
     @property
     def slices(self) -> tuple[slice, slice]:
@@ -80,47 +89,69 @@ class Layout:
 
     @property
     def readouts(self) -> Rect:
-        width = round(self.strip.width * READOUT_SHARE)
+        width = self.px(READOUT_WIDTH) if self.strip.width >= STRIP_WITH_READOUTS else 0
         return Rect(self.strip.right - width, self.strip.top, width, self.strip.height)
 
     @property
-    def findings(self) -> Rect:
-        """What the surgeon looks for, over the 3D view's corner."""
-        gap, width, height = self.px(FINDINGS_GAP), self.px(FINDINGS_WIDTH), self.px(FINDINGS_HEIGHT)
-        return Rect(gap, self.title.bottom + gap, width, height)
+    def compass(self) -> Rect:
+        """Which way the patient lies, in the 3D view's lower left corner."""
+        gap, size = self.px(FINDINGS_GAP), self.px(COMPASS_SIZE)
+        return Rect(gap, self.scene.bottom - gap - size, size, size)
+
+    @property
+    def most_findings(self) -> int:
+        """How many lines of findings there is room for."""
+        room = self.compass.top - 2 * self.px(FINDINGS_GAP) - self.scene.top - 2 * FIGURES_PAD
+        return max(0, room // self.px(FIGURE_HEIGHT))
+
+    def findings(self, count: int) -> Rect:
+        """So many lines of what the surgeon looks for, over the 3D view's upper left corner."""
+        gap, height = self.px(FINDINGS_GAP), count * self.px(FIGURE_HEIGHT) + 2 * FIGURES_PAD
+        return Rect(gap, self.scene.top + gap, self.px(FINDINGS_WIDTH), height)
 
     def sliders(self, widths: list[float]) -> list[Rect]:
         """Boxes for groups of sliders, side by side in the strip; `widths` share out the room."""
-        gap = 6
-        room = self.readouts.left - gap * (len(widths) + 1)
-        edges = np.concatenate([[0.0], np.cumsum(widths)]) / sum(widths) * room
+        edges = np.concatenate([[0.0], np.cumsum(widths)]) / sum(widths) * self.slider_room(len(widths))
         return [
             Rect(
-                round(gap * (i + 1) + edges[i]),
-                self.strip.top + gap,
+                round(STRIP_GAP * (i + 1) + edges[i]),
+                self.strip.top + STRIP_GAP,
                 round(edges[i + 1] - edges[i]),
-                self.strip.height - 2 * gap,
+                self.strip.height - 2 * STRIP_GAP,
             )
             for i in range(len(widths))
         ]
 
-    @property
-    def help(self) -> Rect:
-        width, height = self.scene.width - 24, min(self.px(430), self.scene.height - 24)
-        return Rect(
-            (self.scene.width - width) // 2, self.scene.top + (self.scene.height - height) // 2, width, height
-        )
+    def slider_room(self, count: int) -> int:
+        """Pixels that so many boxes of sliders share."""
+        return self.readouts.left - STRIP_GAP * (count + 1)
 
-    def picture_boxes(self, count: int, width_mm: float, depth_mm: float, aside_px: int = 0) -> list[Rect]:
+    def aside(self, heights: list[int]) -> list[Rect]:
+        """Boxes of the scanner's sliders, one under the other in the 3D view beside the panel; lower ones where room is short."""
+        room = self.scene.height - ASIDE_GAP * (len(heights) + 1)
+        share = min(1.0, room / sum(heights))
+        edges = np.concatenate([[0], np.cumsum([int(share * height) + ASIDE_GAP for height in heights])])
+        left, top = self.scene.right - ASIDE_WIDTH, self.scene.top + ASIDE_GAP
+        return [
+            Rect(left, int(top + start), ASIDE_WIDTH - ASIDE_GAP, int(stop - start) - ASIDE_GAP)
+            for start, stop in pairwise(edges)
+        ]
+
+    @property
+    def whole(self) -> Rect:
+        """All of the window, which the help covers."""
+        return Rect(0, 0, self.width, self.height)
+
+    def picture_boxes(self, count: int, width_mm: float, depth_mm: float) -> list[Rect]:
         """The largest boxes in the panel with the shape of the image plane, side by side or one under the other.
 
-        Ruler, texts and what is aside are left free. Raises ValueError unless both lengths are positive.
+        Ruler and texts are left free. Raises ValueError unless both lengths are positive.
         """
         if not (width_mm > 0 and depth_mm > 0):
             raise ValueError(f"image plane of {width_mm} x {depth_mm} mm: both lengths must be positive")
         ruler, gap, between = self.px(RULER_WIDTH), self.px(PICTURE_GAP), self.px(NAME_HEIGHT)
         header = self.px(HEADER_HEIGHT)
-        room_x = self.panel.width - ruler - self.px(WEDGE_WIDTH) - aside_px
+        room_x = self.panel.width - ruler - self.px(WEDGE_WIDTH)
         room_y = self.panel.height - header - self.px(FOOTER_HEIGHT)
         beside = min((room_x - (count - 1) * gap) / count / width_mm, room_y / depth_mm)
         below = min(room_x / width_mm, (room_y - (count - 1) * between) / count / depth_mm)
@@ -134,12 +165,6 @@ class Layout:
             for j in range(rows)
             for i in range(columns)
         ]
-
-    def aside(self, heights: list[int]) -> list[Rect]:
-        """Boxes of the scanner's sliders, one under the other at the panel's right edge."""
-        tops = np.cumsum([self.px(HEADER_HEIGHT), *(height + 6 for height in heights[:-1])])
-        left = self.panel.right - ASIDE_WIDTH
-        return [Rect(left, int(top), ASIDE_WIDTH - 8, h) for top, h in zip(tops, heights, strict=True)]
 
     def window_coordinates(self, rect: Rect) -> tuple[float, float, float, float]:
         """Left, bottom, right, top with (0, 0) at the bottom left and (1, 1) at the top right of the window."""

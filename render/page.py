@@ -5,17 +5,29 @@ import time
 import numpy as np
 
 from render import frame
+from render.compass import compass_picture
 from render.keys import Keys
-from render.layout import ASIDE_WIDTH, Layout
-from render.panel import BEFORE, CALLIPER, OUTLINE, Panel, calliper_segments, draw_segments, paste_picture
-from render.viewer import Settings, View
+from render.layout import Layout, Rect
+from render.panel import (
+    BEFORE,
+    FIGURE_PX,
+    NOTE_PX,
+    OUTLINE,
+    QUIET,
+    Panel,
+    draw_calliper,
+    draw_segments,
+    paste_picture,
+)
+from render.text import write
+from render.viewer import View
 
 READOUT_PERIOD_S = 0.25
 
 Figures = tuple[dict[str, str], dict[str, str], str]
 
 
-def panel_of(view: View, settings: Settings) -> Panel:
+def panel_of(view: View) -> Panel:
     """What the panel says of a view."""
     return Panel(
         tuple(view.pictures),
@@ -27,7 +39,7 @@ def panel_of(view: View, settings: Settings) -> Panel:
         view.title,
         view.status,
         view.marked_side,
-        ASIDE_WIDTH if settings.show_scanner else 0,
+        view.outline_mm is not None,
     )
 
 
@@ -40,27 +52,46 @@ class Page:
         # frame.py and panel.py write rows, top down, through this view of the memory.
         self._page = self.pixels.transpose(1, 0, 2)[::-1]
         self.panel: Panel | None = None
-        self._help_shown = False
+        self._findings_shown = 0
+        self._helps = False
+        self._axes: np.ndarray | None = None
         self._figures: Figures | None = None
         self._figures_at = 0.0
 
-    def compose(
-        self, view: View, settings: Settings, help_shown: bool = False, patient: bool = False
-    ) -> None:
-        """Put a view on the page. A ``patient`` one lets read-outs stand long enough to be read."""
-        panel = panel_of(view, settings)
-        if (self.panel, self._help_shown) != (panel, help_shown):
-            lines = self.keys.lines() if help_shown else None
-            self._page[:, :, :3] = frame.backdrop(self.layout, panel, lines, self.keys.of["help"])
-            self.panel, self._help_shown, self._figures = panel, help_shown, None
-        for box, picture in zip(panel.boxes(self.layout), view.pictures.values(), strict=True):
+    def compose(self, view: View, axes: np.ndarray, patient: bool = False) -> None:
+        """Put a view on the page, and which way the patient lies for a camera's axes (3, 3): right, up and ahead, in the patient.
+
+        A ``patient`` one lets read-outs stand long enough to be read.
+        """
+        panel, findings = panel_of(view), frame.first_of(view.findings, self.layout.most_findings)
+        if self._helps or (self.panel, self._findings_shown) != (panel, len(findings)):
+            self._page[:, :, :3] = frame.backdrop(self.layout, panel, self.keys.of["help"])
+            self.panel, self._findings_shown = panel, len(findings)
+            self._figures, self._axes, self._helps = None, None, False
+        for (name, picture), box in zip(view.pictures.items(), panel.boxes(self.layout), strict=True):
             paste_picture(self._page, box, picture)
-            if view.outline_before_mm is not None:
-                draw_segments(self._page, panel, box, view.outline_before_mm, BEFORE)
-            if view.outline_mm is not None:
-                draw_segments(self._page, panel, box, view.outline_mm, OUTLINE)
-            draw_segments(self._page, panel, box, calliper_segments(panel, box, view.calliper_mm), CALLIPER)
-        self._compose_figures((dict(view.readouts), dict(view.findings), view.alert), patient)
+            self._draw_over(view, panel, name, box)
+        self._compose_figures((dict(view.readouts), findings, view.alert), patient)
+        if self._axes is None or not np.array_equal(axes, self._axes):
+            self._put(self.layout.compass, compass_picture(self.layout, axes))
+            self._axes = axes
+
+    def show_help(self) -> None:
+        """Put the list of all keys over the page, until it is composed anew."""
+        if not self._helps:
+            self._put(self.layout.whole, frame.help_picture(self.layout, self.keys.lines()))
+            self._helps = True
+
+    def _draw_over(self, view: View, panel: Panel, name: str, box: Rect) -> None:
+        """Outlines, calliper and what is written in a picture."""
+        if view.outline_before_mm is not None:
+            draw_segments(self._page, panel, box, view.outline_before_mm, BEFORE)
+        if view.outline_mm is not None:
+            draw_segments(self._page, panel, box, view.outline_mm, OUTLINE)
+        if note := view.notes.get(name):
+            middle = box.left + box.width / 2, box.top + box.height / 2
+            write(self._page, box, middle, note, self.layout.px(NOTE_PX), QUIET)
+        draw_calliper(self._page, panel, box, view.calliper_mm, view.calliper, self.layout.px(FIGURE_PX))
 
     def _compose_figures(self, figures: Figures, patient: bool) -> None:
         now = time.perf_counter()
@@ -69,16 +100,20 @@ class Page:
         if self._figures is not None and (waits or figures == self._figures):
             return
         readouts, findings, alert = figures
-        rows, columns = self.layout.readouts.slices
-        self._page[rows, columns, :3] = frame.readout_picture(self.layout, readouts)
-        if findings and not self._help_shown:
-            rows, columns = self.layout.findings.slices
-            self._page[rows, columns, :3] = frame.findings_picture(self.layout, findings, alert)
+        self._put(self.layout.readouts, frame.readout_picture(self.layout, readouts))
+        if findings:
+            box = self.layout.findings(len(findings))
+            self._put(box, frame.findings_picture(self.layout, findings, alert))
         self._figures, self._figures_at = figures, now
+
+    def _put(self, box: Rect, picture: np.ndarray) -> None:
+        rows, columns = box.slices
+        self._page[rows, columns, :3] = picture
 
     def place_at(self, column: float, row: float) -> tuple[float, float] | None:
         """The place on the image plane [mm] that a pixel of one of the pictures shows."""
-        for box in self.panel.boxes(self.layout) if self.panel else []:
-            if box.left <= column < box.right and box.top <= row < box.bottom:
-                return self.panel.to_plane(box, column, row) if self.panel else None
-        return None
+        if self.panel is None or self._helps:
+            return None
+        boxes = self.panel.boxes(self.layout)
+        hit = (box for box in boxes if box.holds(column, row))
+        return next((self.panel.to_plane(box, column, row) for box in hit), None)

@@ -6,26 +6,32 @@ Pixels count from the top left. Places on the image plane are (u, v) [mm]: u fro
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
 from render.layout import Layout, Rect
+from render.text import font, shortened, write, written_size
 
-PANEL, LINE = (8, 9, 11), (44, 50, 58)
+PANEL, FINDINGS, LINE = (8, 9, 11), (20, 24, 29), (44, 50, 58)
 TEXT, QUIET = (222, 227, 232), (132, 142, 153)
 MARK, ALERT = (64, 196, 255), (255, 176, 46)
 OUTLINE, BEFORE, CALLIPER = (237, 194, 71), (150, 128, 196), (120, 230, 140)
-CROSS_PX, NUMBER_PX, LEAST_FONT_PX = 5, 16, 8
+CROSS_PX, NUMBER_PX, NOTE_PX, FIGURE_PX = 5, 16, 17, 15
+# Under the pictures while the tumour's outline is in them.
+LEGEND = (("tumour now", OUTLINE), ("in the CT", BEFORE))
+
+Points = tuple[tuple[float, float], ...]
+# A text, its size and its colour.
+Written = tuple[str, int, tuple[int, int, int]]
 
 
 @dataclass(frozen=True)
 class Panel:
     """What the panel says around its pictures. All of it stays the same for many frames.
 
-    ``captions`` are the probe's name, above, and what the echo and the CT are shown with, below. ``aside_px`` is left free at
-    the right of the pictures.
+    ``captions`` are the probe's name, above, and what the echo and the CT are shown with, below. ``legend``: whether there are
+    outlines of the tumour to explain.
     """
 
     names: tuple[str, ...]
@@ -37,11 +43,11 @@ class Panel:
     title: str = ""
     status: str = ""
     marked_side: str = "right"
-    aside_px: int = 0
+    legend: bool = False
 
     def boxes(self, layout: Layout) -> list[Rect]:
         """Where the pictures lie, one for each name."""
-        return layout.picture_boxes(len(self.names), self.width_mm, self.depth_mm, self.aside_px)
+        return layout.picture_boxes(len(self.names), self.width_mm, self.depth_mm)
 
     def to_pixels(self, box: Rect, places_mm: np.ndarray) -> np.ndarray:
         """Columns and rows (..., 2), as fractions, of places (..., 2) on the plane."""
@@ -52,18 +58,6 @@ class Panel:
         """The place on the plane [mm] under a pixel."""
         across, down = (column - box.left) / box.width, (row - box.top) / box.height
         return (across - 0.5) * self.width_mm, down * self.depth_mm - self.above_mm
-
-
-@lru_cache(maxsize=64)
-def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """The font of all texts."""
-    return ImageFont.load_default(size=size)
-
-
-def _fitting(text: str, width: int, most: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """The font of the largest size, up to the most, in which a text is no wider than so many pixels."""
-    sizes = range(most, LEAST_FONT_PX, -1)
-    return font(next((size for size in sizes if font(size).getlength(text) <= width), LEAST_FONT_PX))
 
 
 def ruler_ticks(panel: Panel, box: Rect) -> list[tuple[int, int | None]]:
@@ -105,15 +99,26 @@ def draw_segments(page: np.ndarray, panel: Panel, box: Rect, segments_mm: np.nda
     page[row[inside], column[inside], :3] = colour
 
 
-def calliper_segments(panel: Panel, box: Rect, points_mm: tuple[tuple[float, float], ...]) -> np.ndarray:
-    """A cross at each of up to two points and the line between them, (n, 2, 2) [mm]."""
+def draw_calliper(page: np.ndarray, panel: Panel, box: Rect, points_mm: Points, figure: str, px: int) -> None:
+    """Draw a cross at each of up to two points [mm], the line between them, and beside it what it measures, ``px`` high."""
     reach = CROSS_PX * np.array([panel.width_mm / box.width, panel.depth_mm / box.height])
-    segments = []
-    for point in np.array(points_mm, float).reshape(-1, 2):
-        segments += [[point - reach * axis, point + reach * axis] for axis in np.eye(2)]
-    if len(points_mm) == 2:
-        segments.append(list(np.array(points_mm, float)))
-    return np.array(segments).reshape(-1, 2, 2)
+    points = np.array(points_mm, float).reshape(-1, 2)
+    crosses = [[point - reach * axis, point + reach * axis] for point in points for axis in np.eye(2)]
+    line = [points] if len(points) == 2 else []
+    draw_segments(page, panel, box, np.array([*crosses, *line]), CALLIPER)
+    if line and figure:
+        start, end = panel.to_pixels(box, points)
+        write(page, box, beside(start, end, written_size(figure, px), box), figure, px, CALLIPER)
+
+
+def beside(start: np.ndarray, end: np.ndarray, size: tuple[int, int], box: Rect) -> tuple[float, float]:
+    """The middle of a text of a size [pixels] that stands beside a line, at the side where more of it is in the box."""
+    along = (end - start) / max(float(np.linalg.norm(end - start)), 1.0)
+    across = np.array([along[1], -along[0]]) if along.any() else np.array([1.0, 0.0])
+    away = across * (CROSS_PX + np.abs(across) @ size / 2)
+    middle, inner = (start + end) / 2, np.array([box.left + box.width / 2, box.top + box.height / 2])
+    x, y = middle + away if away @ (inner - middle) >= 0 else middle - away
+    return float(x), float(y)
 
 
 def draw_panel(draw: ImageDraw.ImageDraw, layout: Layout, panel: Panel) -> None:
@@ -121,26 +126,41 @@ def draw_panel(draw: ImageDraw.ImageDraw, layout: Layout, panel: Panel) -> None:
     area, boxes, px = layout.panel, panel.boxes(layout), layout.px
     draw.rectangle([area.left, area.top, area.right, area.bottom], fill=PANEL)
     draw.line([(area.left, 0), (area.left, area.bottom)], fill=LINE)
+    left, width = area.left + px(16), area.width - 2 * px(16)
     probe, echo, ct = panel.captions
     depth = f"Depth {(panel.depth_mm - panel.above_mm) / 10:.1f} cm"
-    left, right, foot = area.left + px(16), area.right - px(16), area.bottom - px(17)
-    draw.text((left, px(12)), probe, font=font(px(17)), fill=TEXT)
-    draw.text((right, px(13)), depth, font=font(px(15)), fill=TEXT, anchor="ra")
-    draw.text((left, foot), echo, font=font(px(14)), fill=QUIET, anchor="lm")
-    draw.text((right, foot), ct, font=font(px(14)), fill=QUIET, anchor="rm")
-    if panel.status:
-        middle = (area.left + area.right) // 2, px(40)
-        draw.text(
-            middle, panel.status, font=_fitting(panel.status, right - left, px(17)), fill=ALERT, anchor="mm"
-        )
+    _draw_row(draw, left, width, px(22), (probe, px(17), TEXT), (depth, px(15), TEXT))
+    _draw_row(draw, left, width, area.bottom - px(17), (echo, px(14), QUIET), (ct, px(14), QUIET))
+    status = shortened(panel.status, px(17), width)
+    draw.text((left + width // 2, px(43)), status, font=font(px(17)), fill=ALERT, anchor="mm")
+    if panel.legend:
+        _draw_legend(draw, layout, boxes[0].left, boxes[-1].bottom)
     _draw_ruler(draw, layout, panel, boxes[0])
     _draw_wedge(draw, layout, boxes[-1])
     for name, box in zip(panel.names, boxes, strict=True):
         x, y = marker_centre(layout, box, panel.marked_side)
         radius = px(6)
         draw.ellipse([x - radius, y - radius, x + radius, y + radius], fill=MARK)
-        left, anchor = (box.left, "lm") if panel.marked_side == "right" else (box.right, "rm")
-        draw.text((left, y), name, font=font(px(15)), fill=TEXT, anchor=anchor)
+        edge, anchor = (box.left, "lm") if panel.marked_side == "right" else (box.right, "rm")
+        draw.text((edge, y), name, font=font(px(15)), fill=TEXT, anchor=anchor)
+
+
+def _draw_row(draw: ImageDraw.ImageDraw, x: int, width: int, y: int, left: Written, right: Written) -> None:
+    """Two texts at both ends of a row; the left one takes what the right one leaves."""
+    text, size, colour = right
+    draw.text((x + width, y), text, font=font(size), fill=colour, anchor="rm")
+    room = width - int(font(size).getlength(text)) - size
+    text, size, colour = left
+    draw.text((x, y), shortened(text, size, room), font=font(size), fill=colour, anchor="lm")
+
+
+def _draw_legend(draw: ImageDraw.ImageDraw, layout: Layout, x: int, bottom: int) -> None:
+    px, y = layout.px, bottom + layout.px(12)
+    for text, colour in LEGEND:
+        draw.line([(x, y), (x + px(16), y)], fill=colour, width=px(2))
+        x += px(22)
+        draw.text((x, y), text, font=font(px(14)), fill=colour, anchor="lm")
+        x += int(font(px(14)).getlength(text)) + px(16)
 
 
 def _draw_ruler(draw: ImageDraw.ImageDraw, layout: Layout, panel: Panel, box: Rect) -> None:

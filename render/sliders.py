@@ -1,55 +1,66 @@
-"""Sliders and switches, generated from the metadata of ``Settings``: in the strip under the 3D view, and the scanner's in the panel."""
+"""Sliders and switches, generated from the metadata of ``Settings``: in the strip under the 3D view, and the scanner's in it, beside the panel."""
 
 import dataclasses
 
 from render.layout import Layout, Rect
-from render.viewer import ASIDE, Settings
+from render.viewer import ASIDE, Geometry, Settings
 
 # Dear ImGui's glyphs are 7 pixels wide, its labels get 35 % of a box, its rows are 23 pixels high.
 GLYPH_WIDTH, LABEL_SHARE, ROW_HEIGHT = 7, 0.35, 23
+# Boxes that get less of what they ask for than this are too narrow: the first is left out.
+LEAST_SHARE = 0.7
 
 
-def groups_of(settings: Settings) -> dict[str, list[dataclasses.Field]]:
+def groups_of(settings: Settings, geometry: Geometry) -> dict[str, list[dataclasses.Field]]:
     """Name of a group -> its settings that there is something to set of."""
+    idle = without_effect(geometry)
     groups: dict[str, list[dataclasses.Field]] = {}
     for each in dataclasses.fields(settings):
-        if each.metadata and getattr(settings, each.name) is not None:
+        if each.metadata and getattr(settings, each.name) is not None and each.name not in idle:
             groups.setdefault(each.metadata["group"], []).append(each)
     return groups
 
 
-def boxes_of(settings: Settings, layout: Layout) -> dict[str, Rect]:
+def without_effect(geometry: Geometry) -> set[str]:
+    """Names of the settings of what is not there."""
+    tumour = {"show_tumour", "outline", "margin_mm"} if geometry.tumour_vertices is None else set()
+    parts = set() if geometry.parts else {"show_parts"}
+    return tumour | parts | ({"show_support"} if geometry.support_vertices is None else set())
+
+
+def boxes_of(settings: Settings, geometry: Geometry, layout: Layout) -> dict[str, Rect]:
     """Where each group is now."""
-    groups = groups_of(settings)
-    below = [name for name in groups if name not in ASIDE]
-    boxes = dict(zip(below, layout.sliders([_width(groups[name]) for name in below]), strict=True))
+    groups = groups_of(settings, geometry)
+    below = {name: _width(members) for name, members in groups.items() if name not in ASIDE}
+    while len(below) > 1 and sum(below.values()) * LEAST_SHARE > layout.slider_room(len(below)):
+        del below[next(iter(below))]
+    boxes = dict(zip(below, layout.sliders(list(below.values())), strict=True))
     if settings.show_scanner:
-        beside = [name for name in ASIDE if name in groups]
-        heights = [ROW_HEIGHT * len(groups[name]) + 32 for name in beside]
-        boxes |= dict(zip(beside, layout.aside(heights), strict=True))
+        heights = [ROW_HEIGHT * len(groups[name]) + 32 for name in ASIDE]
+        boxes |= dict(zip(ASIDE, layout.aside(heights), strict=True))
     return boxes
 
 
 def draw_sliders(
     gui,
     settings: Settings,
-    layout: Layout,
+    geometry: Geometry,
+    boxes: dict[str, Rect],
     first_size: tuple[int, int],
     placed: int,
-    mhz: tuple[float, float],
 ) -> None:
-    """Draw all, and write into the settings what the user set.
+    """Draw all that have a box, and write into the settings what the user set.
 
     GGUI measures in shares of the size that the window was opened with, and keeps a box where it first was: another ``placed`` makes
-    new ones. ``mhz`` are the least and greatest frequency of the probe.
+    new ones.
     """
-    groups = groups_of(settings)
+    groups = groups_of(settings, geometry)
     width, height = first_size
-    for name, box in boxes_of(settings, layout).items():
+    for name, box in boxes.items():
         place = (box.left / width, box.top / height, box.width / width, box.height / height)
         with gui.sub_window(f"{name}##{placed}", *place):
             for member in groups[name]:
-                _draw_slider(gui, settings, member, mhz)
+                _draw_slider(gui, settings, member, geometry.frequency_range_mhz)
 
 
 def _draw_slider(gui, settings: Settings, member: dataclasses.Field, mhz: tuple[float, float]) -> None:
@@ -69,7 +80,7 @@ def _width(members: list[dataclasses.Field]) -> float:
     """Pixels that a group asks for."""
     longest = max(GLYPH_WIDTH * len(_label(member)) for member in members)
     if isinstance(members[0].metadata["low"], bool):
-        return longest + 46
+        return longest + 44
     return (longest + 16) / LABEL_SHARE
 
 

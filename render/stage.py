@@ -7,8 +7,9 @@ import numpy as np
 
 from render import solids
 from render.camera import OrbitCamera
+from render.cut_face import CutFace, side_of_eye
 from render.guide_lines import GuideLines
-from render.surface import GLASS, SOLID, Surface
+from render.surface import CUT_EDGE_MM, GLASS, SOLID, Cut, Surface
 from render.viewer import Geometry, Settings, View
 from sim.fields import field_of, fields_of, fill
 
@@ -40,6 +41,8 @@ class Stage:
         self._probe_edges = solids.edges(geometry.transducer_size_mm, geometry.transducer_radius_mm)
         self._edge_points = field_of(self._probe_edges, within=1)
         self._guide: GuideLines | None = None
+        self._cut_face: CutFace | None = None
+        self._cut_side = 0.0
         self._plane, self._plane_indices = solids.image_plane_grid(PLANE_ROWS, PLANE_COLUMNS)
         self._plane_points, self._plane_normals, self._plane_colours = fields_of(
             *np.ones((3, len(self._plane), 3)), within=1
@@ -75,22 +78,36 @@ class Stage:
             # A reduced mesh has slivers that face the wrong way, which would show as black specks.
             _draw_surface(scene, self._support, two_sided=True)
         self._draw_transducer(scene, view.transducer_pose)
-        inner = self._parts if settings.show_parts else []
-        for surface in [*inner, self._tumour] if settings.show_tumour else inner:
-            if surface is not None:
-                if surface is self._tumour:
-                    surface.tint(view.seen.get("tumour"))
-                surface.shade(eye, key)
-                _draw_surface(scene, surface)
+        inner = self._inner(view, settings)
+        cut = self._draw_cut_face(scene, view, inner, eye, key) if settings.cut else None
+        if cut is None:
+            self._cut_side = 0.0
+            self._draw_inner(scene, inner, eye, key, ahead)
         self._draw_image_plane(scene, view, key)
+        if cut is not None:
+            self._draw_inner(scene, inner, eye, key, ahead, cut)
         if view.guidance is not None:
             self._guide = self._guide or GuideLines(self._probe_edges)
             self._guide.draw(scene, view.guidance)
-        cut = _cut(view.transducer_pose, eye) if settings.cut else None
         opacity = GLASS if settings.translucent else SOLID
         self._organ.tint(view.seen.get("organ"))
         self._organ.shade(eye, key, opacity, cut)
-        _draw_surface(scene, self._organ, ahead if opacity < SOLID or cut is not None else None)
+        _draw_surface(scene, self._organ, ahead if opacity < SOLID or cut is not None else None, cut)
+
+    def _inner(self, view: View, settings: Settings) -> list[Surface]:
+        """What is shown of what is in the organ."""
+        shown = list(self._parts) if settings.show_parts else []
+        if self._tumour is not None and settings.show_tumour:
+            self._tumour.tint(view.seen.get("tumour"))
+            shown.append(self._tumour)
+        return shown
+
+    def _draw_inner(
+        self, scene, inner: list[Surface], eye, key, ahead: np.ndarray, cut: Cut | None = None
+    ) -> None:
+        for surface in inner:
+            surface.shade(eye, key, SOLID, cut)
+            _draw_surface(scene, surface, None if cut is None else ahead, cut)
 
     def _mask(self, scene, masked) -> None:
         """Quads of alpha 0 just behind the near plane: they leave the image behind and stop whatever comes later."""
@@ -122,6 +139,16 @@ class Stage:
         )
         scene.lines(self._edge_points, LINE_WIDTH, color=EDGE)
 
+    def _draw_cut_face(self, scene, view: View, inner: list[Surface], eye, key) -> Cut:
+        """Draw the face of the half away from the eye, and say what is cut off."""
+        self._cut_side = side_of_eye(view.transducer_pose, eye, self._cut_side)
+        self._cut_face = self._cut_face or CutFace()
+        away, behind = self._cut_side * view.transducer_pose[:3, 1], np.array(view.transducer_pose)
+        # What is cut ends where the picture lies: before it nothing of a soft edge is seen.
+        behind[:3, 3] -= CUT_EDGE_MM / 2 * away
+        self._cut_face.draw(scene, self._organ, inner, behind, key)
+        return behind[:3, 3], away
+
     def _draw_image_plane(self, scene, view: View, key: np.ndarray) -> None:
         face = np.array(view.transducer_pose, dtype=np.float64)
         face[:3, 3] -= face[:3, 2] * self._half_axis_mm
@@ -142,17 +169,17 @@ class Stage:
         scene.lines(self._frame_points, LINE_WIDTH, color=FRAME)
 
 
-def _draw_surface(scene, surface: Surface, ahead: np.ndarray | None = None, two_sided=False) -> None:
+def _draw_surface(
+    scene,
+    surface: Surface,
+    ahead: np.ndarray | None = None,
+    cut: Cut | None = None,
+    two_sided=False,
+) -> None:
     scene.mesh(
         surface.vertices,
-        surface.indices(ahead),
+        surface.indices(ahead, cut),
         surface.normal,
         per_vertex_color=surface.colour,
         two_sided=two_sided,
     )
-
-
-def _cut(pose: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A point on the image plane and its normal on the side of the eye."""
-    point, normal = pose[:3, 3], pose[:3, 1]
-    return point, normal if (eye - point) @ normal > 0 else -normal

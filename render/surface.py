@@ -14,6 +14,9 @@ ORGAN, TINT = (0.66, 0.27, 0.23), (0.24, 0.60, 0.36)
 SOLID, GLASS = 1.0, 0.30
 CUT_EDGE_MM = 0.4
 
+# A point on the plane of a cut, and the unit normal on the side to take away, (3,) each.
+Cut = tuple[np.ndarray, np.ndarray]
+
 
 @ti.kernel
 def _area_normals(vertices: ti.template(), faces: ti.template(), area_normal: ti.template()):
@@ -99,9 +102,8 @@ class Surface:
         self._around = ti.field(ti.i32, shape=len(around))
         fill((self._faces, self.faces), (self._start, start), (self._around, around))
 
-    def shade(self, eye, light, opacity: float = SOLID, cut=None) -> None:
-        """Bring normals and colours up to date. `cut`: point and unit normal (3,) of the side to take away
-        (what is left is solid), or None."""
+    def shade(self, eye, light, opacity: float = SOLID, cut: Cut | None = None) -> None:
+        """Bring normals and colours up to date. What a cut leaves is solid."""
         point, side = cut if cut is not None else (np.zeros(3), np.zeros(3))
         _area_normals(self.vertices, self._faces, self._area_normal)
         _shade(
@@ -127,8 +129,13 @@ class Surface:
             else:
                 fill((self._tint, vertices))
 
-    def indices(self, ahead: np.ndarray | None = None) -> np.ndarray:
-        """Vertex indices of the faces, int32 (3 m,), farthest first along `ahead` if given."""
+    def indices(self, ahead: np.ndarray | None = None, cut: Cut | None = None) -> np.ndarray:
+        """Vertex indices of the faces, int32 (3 m,), farthest first along `ahead` if given, without those that a cut takes away."""
         if ahead is None:
             return self.faces.reshape(-1)
-        return np.ascontiguousarray(farthest_first(self.vertices.to_numpy(), self.faces, ahead)).reshape(-1)
+        vertices, faces = self.vertices.to_numpy(), self.faces
+        if cut is not None:
+            point, side = cut
+            # Unseen as they are, they would hide what is drawn behind them later.
+            faces = faces[((vertices - point) @ side < 0)[faces].any(axis=1)]
+        return np.ascontiguousarray(farthest_first(vertices, faces, ahead)).reshape(-1)

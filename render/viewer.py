@@ -18,61 +18,70 @@ ECHO, TGC = "Echo", "Gain over depth"
 ASIDE = (ECHO, TGC)
 
 
-class Key(NamedTuple):
-    """One line of the key map: `key` as it is printed, `action` (its name in the code), `text` for the reader."""
+class Line(NamedTuple):
+    """One line of the key map: ``keys`` as they are printed, ``actions`` (their names in the code), ``text`` for the reader."""
 
-    key: str
-    action: str
+    keys: tuple[str, ...]
+    actions: tuple[str, ...]
     text: str
 
 
-KEY_MAP = (
-    Key("Mouse", "point", "move the transducer over the organ"),
-    Key("Left button", "press", "press the transducer in while held"),
-    Key("W", "push", "push the transducer in"),
-    Key("S", "lift", "lift the transducer"),
-    Key("A", "roll_left", "roll about its axis, to the left"),
-    Key("D", "roll_right", "roll about its axis, to the right"),
-    Key("Q", "tilt_left", "turn the beam left in the image plane"),
-    Key("E", "tilt_right", "turn the beam right in the image plane"),
-    Key("Z", "fan_back", "tilt out of the image plane, one way"),
-    Key("C", "fan_forth", "tilt out of the image plane, the other way"),
-    Key("Right drag", "orbit", "turn the view"),
-    Key("Shift + right drag", "pan", "shift the view (or middle drag)"),
-    Key("Up", "zoom_in", "zoom in"),
-    Key("Down", "zoom_out", "zoom out"),
-    Key("B", "mode", "echo and CT, echo alone, CT alone"),
-    Key("V", "rung", "echo: how much of it is computed"),
-    Key("O", "outline", "outline of the tumour in the picture"),
-    Key("G", "show_scanner", "the scanner's sliders, gain over depth too"),
-    Key("Click on picture", "measure", "calliper from click to click, in mm"),
-    Key("Left", "cine_back", "while frozen: back through the last ten seconds"),
-    Key("Right", "cine_forth", "while frozen: forth again"),
-    Key("I", "export", "save the picture (PNG, DICOM) and the organ (PLY)"),
-    Key("T", "translucent", "organ translucent or solid"),
-    Key("X", "cut", "cut the organ along the image plane"),
-    Key("F", "freeze", "freeze and go on"),
-    Key("U", "undo", "undo the last press, turn or way"),
-    Key("Y", "redo", "take the last undo back"),
-    Key("M", "bookmark", "bookmark this moment"),
-    Key("J", "to_bookmark", "go to the last bookmark, then to earlier ones"),
-    Key("L", "sweep", "begin to record a tracked sweep, or end it"),
-    Key("Space", "plan_for", "plan for tumour and margin, tumour, or whole kidney"),
-    Key("Return", "plan", "plan a sweep that shows what it is for"),
-    Key("Backspace", "next_plan", "stop planning; or the plan's next sweep, then none"),
-    Key("K", "take_over", "take the lead from a replay or a tracked probe"),
-    Key("N", "show_seen", "what has been in the picture, in green"),
-    Key("R", "reset", "reset tissue, transducer and view"),
-    Key("P", "screenshot", "save a picture of the window"),
-    Key("H", "help", "show or hide this list"),
-    Key("Esc", "quit", "quit"),
-)
+KEY_MAP = {
+    "Transducer": (
+        Line(("Mouse",), ("point",), "move it over the organ"),
+        Line(("Left button",), ("press",), "press it in while held"),
+        Line(("W", "S"), ("push", "lift"), "push it in, lift it"),
+        Line(("A", "D"), ("roll_left", "roll_right"), "roll it about its axis, left and right"),
+        Line(("Q", "E"), ("tilt_left", "tilt_right"), "turn the beam in the image plane, left and right"),
+        Line(("Z", "C"), ("fan_back", "fan_forth"), "tilt it out of the image plane, either way"),
+    ),
+    "View": (
+        Line(("Right drag",), ("orbit",), "turn it"),
+        Line(("Middle drag",), ("pan",), "shift it (also Shift + right drag)"),
+        Line(("Up", "Down"), ("zoom_in", "zoom_out"), "zoom in and out"),
+        Line(("T",), ("translucent",), "organ translucent or solid"),
+        Line(("X",), ("cut",), "organ cut along the image plane"),
+        Line(("N",), ("show_seen",), "what has been in the picture, in green"),
+    ),
+    "Picture": (
+        Line(("B",), ("mode",), "echo and CT, echo alone, CT alone"),
+        Line(("V",), ("rung",), "echo: how much of it is computed"),
+        Line(("G",), ("show_scanner",), "the scanner's sliders, gain over depth too"),
+        Line(("O",), ("outline",), "outline of the tumour, now and in the CT"),
+        Line(("Click on picture",), ("measure",), "calliper from click to click, in mm"),
+        Line(("F",), ("freeze",), "freeze and go on"),
+        Line(
+            ("Left", "Right"),
+            ("cine_back", "cine_forth"),
+            "while frozen: back through the last ten seconds, forth",
+        ),
+        Line(("I",), ("export",), "save the picture (PNG, DICOM) and the organ (PLY)"),
+    ),
+    "Plan": (
+        Line(("Space",), ("plan_for",), "what it is for: tumour and margin, tumour, kidney"),
+        Line(("Return",), ("plan",), "make one: a sweep that shows that"),
+        Line(("Backspace",), ("next_plan",), "stop planning; or its next sweep, then none"),
+    ),
+    "Session": (
+        Line(("U", "Y"), ("undo", "redo"), "undo the last press, turn or way; take that back"),
+        Line(("M", "J"), ("bookmark", "to_bookmark"), "bookmark this moment; go back to bookmarks"),
+        Line(("L",), ("sweep",), "begin to record a tracked sweep, or end it"),
+        Line(("K",), ("take_over",), "take the lead from a replay or a tracked probe"),
+        Line(("R",), ("reset",), "reset tissue, transducer and view"),
+        Line(("P",), ("screenshot",), "save a picture of the window"),
+        Line(("H",), ("help",), "show or hide this list"),
+        Line(("Esc",), ("quit",), "quit"),
+    ),
+}
+LINES = tuple(line for group in KEY_MAP.values() for line in group)
 
 
 def key_table() -> str:
     """The key map as a Markdown table, for the README."""
-    rows = [f"| {line.key} | {line.text} |" for line in KEY_MAP]
-    return "\n".join(["| Key | What it does |", "| --- | --- |", *rows])
+    rows = ["| Key | What it does |", "| --- | --- |"]
+    for group, lines in KEY_MAP.items():
+        rows += [f"| **{group}** | |", *(f"| {' / '.join(line.keys)} | {line.text} |" for line in lines)]
+    return "\n".join(rows)
 
 
 def _slider(default, label: str, unit: str, low, high, group: str):
@@ -194,6 +203,10 @@ class View:
     guidance: Guidance | None = None
     calliper_mm: tuple[tuple[float, float], ...] = ()
     """Up to two points on the plane [mm]."""
+    calliper: str = ""
+    """What is between them."""
+    notes: dict[str, str] = field(default_factory=dict)
+    """Name of a picture -> what is written in it, such as that it is black for want of contact."""
     captions: tuple[str, str, str] = ("", "", "")
     """What is said around the pictures: the probe, above; the echo's and the CT's settings, below."""
     readouts: dict[str, str] = field(default_factory=dict)

@@ -90,14 +90,14 @@ class Window:
         self._view: View | None = None
         self._quit = False
         self._help_shown = False
-        self._frequency_range_mhz = geometry.frequency_range_mhz
+        self._geometry = geometry
         self._warm_up = 2
         self._drag: str | None = None
         self._cursor: np.ndarray | None = None
         self._pressing = False
         self._at_press: tuple[np.ndarray, tuple] | None = None
         self._boxes_placed = 0
-        self._slider_places: tuple = ()
+        self._slider_places: tuple[tuple[str, Rect], ...] = ()
         self._last_read = time.perf_counter()
         self._lens = ti.ui.Camera()
         part = self.layout.window_coordinates(self.layout.scene)
@@ -143,26 +143,20 @@ class Window:
     def _over_scene(self) -> bool:
         if self._cursor is None:
             return False
-        left, bottom, right, top = self.layout.window_coordinates(self.layout.scene)
-        x, y = self._cursor
-        inside = left <= x <= right and bottom <= y <= top
-        for over in self._over_view():
-            left, bottom, right, top = self.layout.window_coordinates(over)
-            inside = inside and not (left <= x <= right and bottom <= y <= top)
-        return inside
+        place = self._pixel(self._cursor)
+        over = self._over_view() + [box for _, box in self._slider_places]
+        return self.layout.scene.holds(*place) and not any(box.holds(*place) for box in over)
 
     def _over_view(self) -> list[Rect]:
-        """What lies over the 3D view now."""
+        """What of the page lies over the 3D view now."""
         if self._help_shown:
-            return [self.layout.help]
-        return [self.layout.findings] if self._view is not None and self._view.findings else []
+            return [self.layout.whole]
+        count = min(len(self._view.findings), self.layout.most_findings) if self._view is not None else 0
+        return [self.layout.compass, *([self.layout.findings(count)] if count else [])]
 
-    def _place_in_picture(self) -> tuple[float, float] | None:
-        """The place on the image plane [mm] under the mouse."""
-        if self._cursor is None:
-            return None
-        column, row = self._cursor[0] * self.layout.width, (1 - self._cursor[1]) * self.layout.height
-        return self._page.place_at(column, row)
+    def _pixel(self, cursor: np.ndarray) -> tuple[float, float]:
+        """Column and row under window coordinates."""
+        return cursor[0] * self.layout.width, (1 - cursor[1]) * self.layout.height
 
     def _read_events(self, controls: Controls) -> None:
         for event in self._window.get_events(ti.ui.PRESS):
@@ -178,7 +172,8 @@ class Window:
         if key == ti.ui.LMB:
             self._pressing = self._over_scene()
             self._at_press = None
-            controls.pointed_mm = self._place_in_picture()
+            if self._cursor is not None:
+                controls.pointed_mm = self._page.place_at(*self._pixel(self._cursor))
             if not self._pressing and self._cursor is not None:
                 self._at_press = self._cursor, dataclasses.astuple(self.settings)
         elif key in (ti.ui.RMB, ti.ui.MMB) and self._over_scene():
@@ -257,14 +252,18 @@ class Window:
         self.camera.part = self.layout.window_coordinates(self.layout.scene)
 
     def _submit(self, view: View) -> None:
-        self._page.compose(view, self.settings, self._help_shown, self._visible)
+        if self._help_shown:
+            self._page.show_help()
+        else:
+            self._page.compose(view, np.stack(self.camera.axes()), self._visible)
         _put_image(self._canvas, self._page.pixels)
         self._aim()
         rects = [self.layout.panel, self.layout.title, self.layout.strip, *self._over_view()]
         masked = [self.layout.window_coordinates(rect) for rect in rects]
         self._stage.draw(self._scene, view, self.settings, masked)
         self._canvas.scene(self._scene)
-        self._draw_sliders()
+        if not self._help_shown:
+            self._draw_sliders()
 
     def _aim(self) -> None:
         _, up, ahead = self.camera.axes()
@@ -279,8 +278,9 @@ class Window:
         self._scene.set_camera(self._lens)
 
     def _draw_sliders(self) -> None:
-        places = tuple(boxes_of(self.settings, self.layout).items())
+        places = tuple(boxes_of(self.settings, self._geometry, self.layout).items())
         if places != self._slider_places:
             self._slider_places, self._boxes_placed = places, self._boxes_placed + 1
-        size, mhz = self._first_size, self._frequency_range_mhz
-        draw_sliders(self._gui, self.settings, self.layout, size, self._boxes_placed, mhz)
+        draw_sliders(
+            self._gui, self.settings, self._geometry, dict(places), self._first_size, self._boxes_placed
+        )

@@ -53,17 +53,17 @@ def test_the_calliper_measures_the_tissue_as_it_lies_and_at_rest():
     u, v = np.meshgrid(np.linspace(-8.0, 8.0, 33), np.linspace(-4.0, 40.0, 33))
     frame = frame_at(0.0, np.stack([u, v], axis=-1) @ stretch.T)
     calliper = Calliper()
-    assert calliper.readouts(frame) == {}
+    assert calliper.figure(frame) == ""
     calliper.point((-3.0, 5.0))
     calliper.point(None)
     calliper.point((4.0, 29.0))
     at_rest = np.linalg.norm(stretch @ [7.0, 24.0])
     # A linear map is exact between the places that are kept.
-    assert calliper.readouts(frame) == {"calliper": "25.0 mm", "at rest": f"{at_rest:.1f} mm"}
+    assert calliper.figure(frame) == f"25.0 mm\nat rest {at_rest:.1f} mm"
     calliper.point((0.0, 0.0))
-    assert calliper.points == ((0.0, 0.0),) and calliper.readouts(frame) == {}
+    assert calliper.points == ((0.0, 0.0),) and calliper.figure(frame) == ""
 
 
 def test_without_tissue_the_calliper_still_measures_the_picture():
     calliper = Calliper(((0.0, 0.0), (3.0, 4.0)))
-    assert calliper.readouts(frame_at(0.0)) == {"calliper": "5.0 mm"}
+    assert calliper.figure(frame_at(0.0)) == "5.0 mm"

@@ -326,14 +326,14 @@ def test_the_iterations_that_were_done_are_recorded_not_those_asked_for():
     live.ladder.rung = 3
     step(live, settings=Settings(young_kpa=15.0, iterations=10))
     assert told.of("solver")[1:] == [{"iterations": 3}] and len(told.of("settings")) == 1
-    assert live.status == "FASTER, LESS EXACT: 3 of 10 iterations"
+    assert live.status == "LESS EXACT, TO KEEP PACE   3 of 10 iterations"
 
 
 def test_a_step_that_is_too_slow_is_said_once():
     live = Live(Session(Numbers()), Ladder(5.0))
     live.move(Controls(Settings(young_kpa=15.0, iterations=8)))
     said = [live.stepped(step_ms) for step_ms in [9.0] * 21]
-    assert [text for text in said if text] == ["FASTER, LESS EXACT: 6 of 8 iterations"]
+    assert [text for text in said if text] == ["LESS EXACT, TO KEEP PACE   6 of 8 iterations"]
 
 
 def test_only_what_changes_is_told():

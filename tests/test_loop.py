@@ -135,7 +135,7 @@ def test_a_sweep_that_is_recorded_stands_in_the_panel_beside_all_else(looping, m
     looping.driver.status = "TRACKING LOST"
     assert looping.frame(controls).status == "RECORDING 3 s   TRACKING LOST   PLANNING; Backspace stops"
     looping._say("undo: {undo}")
-    assert looping.frame(controls).status == "RECORDING 3 s   UNDO: U"
+    assert looping.frame(controls).status == "RECORDING 3 s   Undo: U"
     clock[0] += 2.1
     assert looping.frame(Controls(Settings(), freeze=True)).status == (
         "RECORDING 3 s   FROZEN   PLANNING; Backspace stops"

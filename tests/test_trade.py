@@ -191,7 +191,7 @@ def test_a_slow_step_loses_iterations_rung_by_rung_and_gets_them_back():
             rungs.append(ladder.iterations(8))
     # No further than the last rung, and said.
     assert rungs == [6, 4, 2] and ladder.rung == len(RUNGS) - 1
-    assert ladder.says(8) == "FASTER, LESS EXACT: 2 of 8 iterations"
+    assert ladder.says(8) == "LESS EXACT, TO KEEP PACE   2 of 8 iterations"
     # At half the budget twice the iterations would just fill it: not enough room.
     assert not any(ladder.watch(5.0) for _ in range(2 * STEPS_UP))
     assert [ladder.watch(3.0) for _ in range(STEPS_UP)].count(True) == 1 and ladder.iterations(8) == 4

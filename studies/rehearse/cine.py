@@ -62,15 +62,15 @@ class Calliper:
         if place_mm is not None:
             self.points = (place_mm,) if len(self.points) == 2 else (*self.points, place_mm)
 
-    def readouts(self, frame: Frame) -> dict[str, str]:
-        """The distance of the points as the tissue lies, and of the same tissue at rest."""
+    def figure(self, frame: Frame) -> str:
+        """The distance of the points as the tissue lies, and of the same tissue at rest; empty of fewer than two."""
         if len(self.points) < 2:
-            return {}
+            return ""
         start, end = np.array(self.points)
-        found = {"calliper": f"{np.linalg.norm(end - start):.1f} mm"}
+        found = f"{np.linalg.norm(end - start):.1f} mm"
         if frame.rest is not None:
             places = at_rest(frame.rest, np.array(self.points), frame.view)
-            found["at rest"] = f"{np.linalg.norm(places[1] - places[0]):.1f} mm"
+            found += f"\nat rest {np.linalg.norm(places[1] - places[0]):.1f} mm"
         return found
 
 

@@ -16,9 +16,12 @@ from studies.session.session import Session
 from studies.session.summary import Course
 from ultrasound.coverage import PLACES, Coverage, Gap
 from ultrasound.probe import Probe
+from ultrasound.scanner import ECHO
 
 READ_S, LOOK_S = 0.25, 1 / 30
 MARGIN_MM = 5.0
+# An echo of which no more than this share of the lines touches shows nothing.
+BLACK_BELOW = 0.05
 COMPRESSION = "compression"
 # Of a reading in the record, and of what is counted by it, so that it can be counted by the record alone.
 DIGITS = 4
@@ -151,6 +154,7 @@ class Instruments:
             seen=self._seen if settings.show_seen else {},
             guidance=self.guide.guidance() if self.guide is not None else None,
             status=status,
+            notes={ECHO: "NO CONTACT"} if self._touches.mean() < BLACK_BELOW else {},
         )
 
     def findings(self) -> dict[str, str]:

@@ -86,11 +86,11 @@ class Loop:
             self._announce(self.sweeping.toggle(self.out))
         speed = self.rate * self.rehearsal.settings.time_step_s
         figures = {"frames": f"{self.rate:.0f} /s", "time": f"{speed:.1f} x real"}
-        figures |= self.calliper.readouts(shown)
         view = shown.view
         return replace(
             view,
             calliper_mm=self.calliper.points,
+            calliper=self.calliper.figure(shown),
             readouts=view.readouts | figures,
             status=self._status(view),
         )
@@ -107,7 +107,8 @@ class Loop:
 
     def _say(self, text: str) -> None:
         if text:
-            self._said, self._said_until = self.keys.worded(text).upper(), perf_counter() + SAID_S
+            words = self.keys.worded(text)
+            self._said, self._said_until = words[0].upper() + words[1:], perf_counter() + SAID_S
 
     def _looked_back(self, controls: Controls) -> Frame | None:
         """A frame of the last seconds, where the user is looking at one."""

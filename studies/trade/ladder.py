@@ -46,4 +46,4 @@ class Ladder:
         """For the user; empty where nothing gives way."""
         if self.rung == 0:
             return ""
-        return f"FASTER, LESS EXACT: {self.iterations(asked)} of {asked} iterations"
+        return f"LESS EXACT, TO KEEP PACE   {self.iterations(asked)} of {asked} iterations"

@@ -1,0 +1,73 @@
+"""Texts in pictures: one font, the size at which they fit, and writing over what changes every frame. Pillow."""
+
+from collections.abc import Iterable
+from functools import lru_cache
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from render.layout import Rect
+
+LEAST_FONT_PX = 8
+# What is between the parts of a line; of a long one the last part goes first.
+BETWEEN = "   "
+# How much a text leaves of what it is written over, and how far around it.
+PLATE, PLATE_PX = 0.35, 4
+
+
+@lru_cache(maxsize=64)
+def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """The font of all texts."""
+    return ImageFont.load_default(size=size)
+
+
+def fitting_size(rows: Iterable[tuple[str, ...]], width: int, most: int) -> int:
+    """The largest size of font, up to the most, at which the longest text of each column fits beside the others."""
+    columns = list(zip(*rows, strict=True))
+    for size in range(most, LEAST_FONT_PX, -1):
+        if sum(max(map(font(size).getlength, column)) for column in columns) <= width:
+            return size
+    return LEAST_FONT_PX
+
+
+def shortened(text: str, size: int, width: int) -> str:
+    """A line without so many of its last parts, and of one part without so much of its end, as do not fit."""
+    parts = text.split(BETWEEN)
+    while len(parts) > 1 and font(size).getlength(BETWEEN.join(parts)) > width:
+        parts.pop()
+    line = BETWEEN.join(parts)
+    if font(size).getlength(line) <= width:
+        return line
+    while line and font(size).getlength(line + "...") > width:
+        line = line[:-1]
+    return line.rstrip() + "..."
+
+
+@lru_cache(maxsize=64)
+def _coverage(text: str, size: int) -> np.ndarray:
+    """How much of each pixel a text covers, 0 to 1, shape (rows, columns), with room around it."""
+    left, top, right, bottom = ImageDraw.Draw(Image.new("L", (1, 1))).textbbox((0, 0), text, font=font(size))
+    image = Image.new("L", (int(right - left) + 2 * PLATE_PX, int(bottom - top) + 2 * PLATE_PX))
+    ImageDraw.Draw(image).text((PLATE_PX - left, PLATE_PX - top), text, fill=255, font=font(size))
+    return np.asarray(image, np.float32)[..., None] / 255
+
+
+def written_size(text: str, size: int) -> tuple[int, int]:
+    """Width and height of a text as ``write`` writes it [pixels]."""
+    rows, columns, _ = _coverage(text, size).shape
+    return columns, rows
+
+
+def write(page: np.ndarray, box: Rect, centre: tuple[float, float], text: str, size: int, colour) -> None:
+    """Write over a picture (rows, columns, 3 or more), about a centre (x, y) or as near to it as the text lies in a box.
+
+    A text that the box has no room for is left out.
+    """
+    covered = _coverage(text, size)
+    rows, columns, _ = covered.shape
+    if rows > box.height or columns > box.width:
+        return
+    left = int(np.clip(round(centre[0] - columns / 2), box.left, box.right - columns))
+    top = int(np.clip(round(centre[1] - rows / 2), box.top, box.bottom - rows))
+    part = page[top : top + rows, left : left + columns, :3]
+    part[:] = PLATE * (1 - covered) * part + covered * np.array(colour, np.float32)
