@@ -9,13 +9,13 @@ import tempfile
 import textwrap
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import taichi as ti
 from taichi.lang import impl, kernel_impl, snode
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
+BACKENDS = {"cuda": ti.cuda, "vulkan": ti.vulkan, "cpu": ti.cpu}
 FEW_CORES = 4
 # Taichi drops compiled kernels from 100 MB on. A rehearsal leaves 4 MB for each patient and each choice of settings.
 CACHE_BYTES = 1 << 30
@@ -55,10 +55,9 @@ def start(arch: str = "cpu", **options) -> str:
     ``options`` go to ``ti.init``. Raises NoDevice.
     """
     ti.set_logging_level(ti.ERROR)
-    backends = {"cuda": ti.cuda, "vulkan": ti.vulkan, "cpu": ti.cpu}
     if arch == "auto":
         arch = "cuda" if ti.lang.misc.is_arch_supported(ti.cuda) else "cpu"
-    elif arch != "cpu" and not _is_there(backends[arch]):
+    elif arch != "cpu" and not is_there(arch):
         raise NoDevice(f"this machine has no {arch} device or driver; use --arch cpu or --arch auto")
     if arch != "vulkan":
         # LLVM does it again: kernels run as fast, and large ones compile in a tenth of the time.
@@ -69,7 +68,7 @@ def start(arch: str = "cpu", **options) -> str:
         **options,
     }
     with contextlib.redirect_stdout(io.StringIO()):
-        ti.init(arch=backends[arch], log_level=ti.ERROR, **options)
+        ti.init(arch=BACKENDS[arch], log_level=ti.ERROR, **options)
     if arch == "vulkan" and not counts_right():
         ti.reset()
         raise NoDevice(
@@ -97,12 +96,12 @@ def _count(count: ti.types.ndarray(ndim=1), least: ti.types.ndarray(ndim=1)):
         count[t] = counted
 
 
-def _is_there(backend: Any) -> bool:
-    """Whether a backend has a device and a driver; what a driver that is missing prints goes nowhere."""
+def is_there(arch: str) -> bool:
+    """Whether ``cuda`` or ``vulkan`` has a device and a driver; what a driver that is missing prints goes nowhere."""
     told, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     try:
-        return bool(ti.lang.misc.is_arch_supported(backend))
+        return bool(ti.lang.misc.is_arch_supported(BACKENDS[arch]))
     finally:
         os.dup2(told, 2)
         os.close(told)

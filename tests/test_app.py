@@ -139,6 +139,13 @@ def test_without_vulkan_it_says_so_in_one_line_and_still_writes_slices_and_repor
     assert not list((tmp_path / "frames").glob("*.png"))
 
 
+def test_a_window_without_vulkan_is_refused_before_anything_is_built(monkeypatch, tmp_path):
+    monkeypatch.setattr("studies.rehearse.command.found_display", lambda: True)
+    monkeypatch.setattr("sim.device.is_there", lambda arch: arch != "vulkan")
+    assert "install a Vulkan driver" in refused("rehearse", "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_python_without_the_packages_is_one_line():
     bare = [sys.executable, "-S", str(ROOT / "app.py"), "--version"]
     done = subprocess.run(bare, capture_output=True, text=True, cwd=ROOT, timeout=60)

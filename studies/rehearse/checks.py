@@ -44,6 +44,16 @@ def refuse_headless(headless: bool, gamepad: bool, link_leads: bool) -> None:
             raise Fault(f"{option}: leads in a window; leave out {option} or --headless")
 
 
+def refuse_no_vulkan(headless: bool) -> None:
+    """Raises Fault where a window has no driver to be drawn with: before minutes are spent on what it would show."""
+    from sim.device import is_there
+
+    if not headless and not is_there("vulkan"):
+        raise Fault(
+            "no Vulkan driver found: the window needs one; install a Vulkan driver, or run with --headless"
+        )
+
+
 def refuse_no_pictures(headless: bool, link: bool) -> None:
     """Raises Fault where pictures that are to be left out are needed."""
     if not headless:

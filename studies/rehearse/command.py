@@ -28,6 +28,7 @@ from studies.rehearse.checks import (
     refuse_headless,
     refuse_inputs,
     refuse_no_pictures,
+    refuse_no_vulkan,
     refuse_sizes,
     session_of,
 )
@@ -150,6 +151,7 @@ def rehearse(
     loaded, probe = as_asked(before, changed, quality) if log is None else as_recorded(log, before)
     headless = headless or not found_display()
     refuse_headless(headless, gamepad, link_leads)
+    refuse_no_vulkan(headless)
     if no_pictures:
         refuse_no_pictures(headless, link)
     make_folder(out)
