@@ -57,7 +57,8 @@ def test_the_instruments_watch_the_guide_and_record_it(watching, rehearsal, one_
 
 
 def test_what_a_session_holds_is_recalled_as_it_was_watched(watching, rehearsal, one_device, monkeypatch):
-    squeezed = iter([0.3, 1.5, 9.0, 0.2])
+    # The first is no press: as it is noted it is 1 mm.
+    squeezed = iter([1.00004, 0.3, 9.0, 0.2])
     monkeypatch.setattr(instruments, "read", lambda *_: Reading(next(squeezed), 20.0, 5.0, 2.0, 1.0))
     events: dict[int, list] = {}
     session = SimpleNamespace(moment=0, kept={}, back=None)

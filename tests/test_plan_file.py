@@ -15,7 +15,7 @@ from studies.plan import workers
 from studies.plan.command import trocar_of
 from studies.plan.file import PlanError, is_plan, next_free, read_plan, write_plan
 from studies.plan.track import COMES_S, LIFT_MM, LIFTED_MM_S, timed_poses
-from studies.rehearse.command import check_plan
+from studies.rehearse.checks import check_plan
 from studies.rehearse.track_file import load_track
 from ultrasound.probe import load_probe
 
@@ -233,6 +233,20 @@ def test_the_plan_command_refuses_in_one_line(ball_scene, capsys, options, words
     # Before it begins: without a bar.
     assert told.startswith("nephron: ") and words in told and told.count("\n") == 1
     assert not (ball_scene / "plan.json").exists()
+
+
+def test_a_plan_is_made_on_the_tissue_of_the_quality(ball_scene, monkeypatch, capsys):
+    cells_mm: list[float] = []
+
+    def nobody(problem: workers.Problem, jobs: int | None) -> None:
+        cells_mm.append(problem.scene.tissue.cell_mm)
+        raise PlanError("no workers")
+
+    monkeypatch.setattr(workers, "workers", nobody)
+    for quality in ((), ("--quality", "fast"), ("--quality", "accurate")):
+        assert app.main(["plan", str(ball_scene), "--out", str(ball_scene / "plan.json"), *quality]) == 2
+        assert "nephron: no workers" in capsys.readouterr().err
+    assert cells_mm == [3.5, 5.0, 2.0]
 
 
 def test_rehearse_refuses_a_plan_of_another_patient_before_it_builds_anything(ball_scene, capsys):

@@ -82,10 +82,7 @@ class Event(_Line):
 
     @model_validator(mode="after")
     def _of_its_kind(self) -> "Event":
-        try:
-            VALUES[self.kind].validate_python(self.value, strict=True)
-        except ValidationError as error:
-            raise ValueError(f"{self.kind}: {_what(error)}") from None
+        VALUES[self.kind].validate_python(self.value, strict=True)
         return self
 
 
