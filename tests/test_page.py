@@ -7,6 +7,7 @@ import pytest
 
 from render.camera import OrbitCamera
 from render.compass import compass_picture, ends_of
+from render.frame import readout_picture
 from render.layout import Layout, Rect
 from render.page import Page
 from render.panel import ALERT, BEFORE, CALLIPER, OUTLINE, QUIET
@@ -200,6 +201,15 @@ def test_findings_that_become_fewer_leave_nothing_behind():
     few = composed(page, findings=dict(list(FIGURES.items())[:4]))
     assert not np.array_equal(composed(page, findings=FIGURES), few)
     assert np.array_equal(composed(page, findings=dict(list(FIGURES.items())[:4])), few)
+
+
+@pytest.mark.parametrize("size", [(1024, 576), (1280, 720), (1920, 1080), (3840, 2160)])
+def test_all_readouts_of_a_window_are_shown(size):
+    layout = Layout(*size)
+    ends = [readout_picture(layout, dict(list(FIGURES.items())[:count])) for count in (6, 7)]
+    rows = np.flatnonzero((ends[0] != ends[1]).any(axis=(1, 2)))
+    # In a large window the lines move closer together for the seventh.
+    assert len(rows) > 5 and rows.max() < layout.readouts.height - 2
 
 
 @each_size
