@@ -17,6 +17,8 @@ from render.text import fitting_size, font, shortened
 
 BACKDROP_TOP, BACKDROP_FOOT = (30, 35, 42), (13, 15, 19)
 STRIP, HELP = (17, 20, 24), (22, 26, 31)
+# Lines of figures are no closer than this where the strip is as low as in a small window.
+LEAST_PITCH = 19
 HELP_COLUMNS, HELP_PX, HELP_GAP_PX, FIGURES_GAP_PX = 2, 17, 12, 18
 
 
@@ -82,8 +84,9 @@ def readout_picture(layout: Layout, readouts: Mapping[str, str]) -> np.ndarray:
     image = Image.new("RGB", (box.width, box.height), STRIP)
     draw = ImageDraw.Draw(image)
     draw.line([(0, 0), (box.width, 0)], fill=LINE)
-    pitch = layout.px(FIGURE_HEIGHT)
-    _draw_figures(draw, box, first_of(readouts, (box.height - 2 * FIGURES_PAD) // pitch), "", pitch)
+    room = box.height - 2 * FIGURES_PAD
+    pitch = min(layout.px(FIGURE_HEIGHT), max(LEAST_PITCH, room // max(1, len(readouts))))
+    _draw_figures(draw, box, first_of(readouts, room // pitch), "", pitch)
     return np.asarray(image)
 
 

@@ -88,6 +88,12 @@ class Layout:
         return Rect(0, top, self.panel.left, self.strip.top - top)
 
     @property
+    def clear(self) -> Rect:
+        """What of the 3D view the findings leave free: the organ is in its middle."""
+        left = self.findings(0).right
+        return Rect(left, self.scene.top, self.scene.right - left, self.scene.height)
+
+    @property
     def readouts(self) -> Rect:
         width = self.px(READOUT_WIDTH) if self.strip.width >= STRIP_WITH_READOUTS else 0
         return Rect(self.strip.right - width, self.strip.top, width, self.strip.height)

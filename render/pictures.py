@@ -9,7 +9,7 @@ from render.viewer import View
 
 PICTURES_A_SECOND = 15
 ANIMATION_WIDTH = 960
-ANIMATION_QUALITY = 85
+ANIMATION_QUALITY = 80
 
 
 def in_proportion(picture: np.ndarray, width_mm: float, depth_mm: float) -> Image.Image:

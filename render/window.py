@@ -100,7 +100,7 @@ class Window:
         self._slider_places: tuple[tuple[str, Rect], ...] = ()
         self._last_read = time.perf_counter()
         self._lens = ti.ui.Camera()
-        part = self.layout.window_coordinates(self.layout.scene)
+        part = self.layout.window_coordinates(self.layout.clear)
         self.camera = OrbitCamera(geometry.bounds, geometry.up, part, size[0] / size[1])
         self._stage = Stage(geometry, self.camera)
         self._page = Page(self.layout, self.keys)
@@ -249,7 +249,7 @@ class Window:
         self._boxes_placed += 1
         self._page = Page(self.layout, self.keys)
         self.camera.aspect = size[0] / size[1]
-        self.camera.part = self.layout.window_coordinates(self.layout.scene)
+        self.camera.part = self.layout.window_coordinates(self.layout.clear)
 
     def _submit(self, view: View) -> None:
         if self._help_shown:

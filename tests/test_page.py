@@ -7,6 +7,7 @@ import pytest
 
 from render.camera import OrbitCamera
 from render.compass import compass_picture, ends_of
+from render.frame import readout_picture
 from render.layout import Layout, Rect
 from render.page import Page
 from render.panel import ALERT, BEFORE, CALLIPER, OUTLINE, QUIET
@@ -86,7 +87,9 @@ def test_echo_and_ct_of_the_drop_in_probe_fill_the_panel():
 
 @each_size
 def test_the_first_sliders_go_where_there_is_no_room(size):
-    names = list(boxes_of(Settings(young_kpa=15.0), WHOLE, Layout(*size)))
+    layout = Layout(*size)
+    names = list(boxes_of(Settings(young_kpa=15.0), WHOLE, layout))
+    assert (layout.readouts.width == 0) == (size == (700, 420))
     assert names == (["Picture", "View"] if size == (700, 420) else ["Tissue", "Picture", "View"])
 
 
@@ -137,6 +140,10 @@ def test_what_is_written_lies_in_its_box_or_is_left_out():
     rows, columns = np.nonzero((page[..., :3] != 200).any(axis=-1))
     assert (rows.min(), columns.min()) == (box.top, box.left) and columns.max() < box.right
     assert (page[..., 3] == 200).all() and page[..., 1].max() > 240
+    page[:] = 200
+    write(page, box, (79.0, 44.0), "12.3 mm", 13, (0, 255, 0))
+    rows, columns = np.nonzero((page[..., :3] != 200).any(axis=-1))
+    assert (rows.max(), columns.max()) == (box.bottom - 1, box.right - 1)
     before = page.copy()
     write(page, Rect(10, 5, 20, 40), (12.0, 6.0), "12.3 mm", 13, (0, 255, 0))
     assert np.array_equal(page, before)
@@ -159,6 +166,7 @@ def test_no_contact_is_written_in_the_echo_alone():
     [
         ((-5.0, 8.0), (4.0, 30.0)),
         ((4.0, 10.0), (4.0, 30.0)),
+        ((-4.0, 10.0), (-4.0, 30.0)),
         ((-6.0, 36.0), (6.0, 36.0)),
         ((7.0, 20.0), (7.0, 20.0)),
     ],
@@ -174,6 +182,8 @@ def test_the_callipers_figure_stands_at_its_line(points):
         middle = (np.mean(points, axis=0) + [8.0, 0.0])[::-1] * box.height / 40.0
         # Beside the line, so no farther from its middle than half of the figure and a little more.
         assert np.abs(changed.mean(axis=0) - middle).max() < 75
+        # A line down the right half has it on its left, one down the left half on its right.
+        assert points[0][0] != points[1][0] or (changed[:, 1].mean() - middle[1]) * points[0][0] < 0
         # The line stays whole.
         assert len(coloured(told, box, CALLIPER)) > len(coloured(bare, box, CALLIPER))
     outside = np.ones(bare.shape[:2], bool)
@@ -200,6 +210,15 @@ def test_findings_that_become_fewer_leave_nothing_behind():
     few = composed(page, findings=dict(list(FIGURES.items())[:4]))
     assert not np.array_equal(composed(page, findings=FIGURES), few)
     assert np.array_equal(composed(page, findings=dict(list(FIGURES.items())[:4])), few)
+
+
+@pytest.mark.parametrize("size", [(1024, 576), (1280, 720), (1920, 1080), (3840, 2160)])
+def test_all_readouts_of_a_window_are_shown(size):
+    layout = Layout(*size)
+    ends = [readout_picture(layout, dict(list(FIGURES.items())[:count])) for count in (6, 7)]
+    rows = np.flatnonzero((ends[0] != ends[1]).any(axis=(1, 2)))
+    # In a large window the lines move closer together for the seventh.
+    assert len(rows) > 5 and rows.max() < layout.readouts.height - 2
 
 
 @each_size

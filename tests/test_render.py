@@ -285,7 +285,7 @@ def test_organ_is_drawn_where_the_camera_projects_it(window):
 def test_organ_never_covers_the_panel_the_title_or_the_readouts(window):
     opened, _, _ = window
     opened.camera.zoom(0.01)
-    left, bottom, right, top = opened.layout.window_coordinates(opened.layout.scene)
+    left, bottom, right, top = opened.camera.part
     opened.camera.pan(0.62 - (left + right) / 2, 0.5 - (bottom + top) / 2)
     opened.draw(_far_view())
     picture = opened.picture()
