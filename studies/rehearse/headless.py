@@ -13,6 +13,7 @@ from render.window import NoVulkan
 from scenes.whole_files import whole
 from studies.link.live import send_live
 from studies.link.server import Server
+from studies.pictures import save_picture
 from studies.rehearsal import Rehearsal
 from studies.rehearse.drivers import Driver
 from studies.rehearse.instruments import Instruments
@@ -58,14 +59,15 @@ def run_headless(
         tally.watch(rehearsal)
         if step % every == 0 or step == steps:
             picture = side_by_side(view)
-            picture.save(slices / f"{step:05d}.png")
+            save_picture(picture, slices / f"{step:05d}.png")
             if viewer is not None:
                 viewer.draw(instruments.onto(view, settings))
                 picture = Image.fromarray(viewer.picture())
-                picture.save(frames / f"{step:05d}.png")
+                save_picture(picture, frames / f"{step:05d}.png")
             if step % shown_every == 0 or step == steps:
                 animation.append(smaller(picture))
-    save_animation(animation, out / "press.webp")
+    with whole(out / "press.webp") as partial:
+        save_animation(animation, partial)
     save_surfaces(rehearsal, out)
     report = tally.report(rehearsal, arch) | dict(reading=instruments.figures())
     with whole(out / "report.json") as partial:
