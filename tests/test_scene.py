@@ -72,7 +72,11 @@ def refused(tmp_path: Path, text: str) -> str:
         ("[anatomy]\n[tissue]\nmodel = [3]", "tissue.model = [3]: the model should be one of"),
         ("[anatomy]\n[contact]\nparticles = true", "needs particles: set tissue.model to shape-matching, or"),
         ("[anatomy]\n[gravity]\ndirection = [0, 0, 0]", "a direction must not be zero"),
-        ("[anatomy]\n[[shape]]\nkind = 'plane'\nnormal = [0, 0, 1]\noffset_cm = 1", "write offset_mm"),
+        (
+            "[anatomy]\n[[shape]]\nkind = 'plane'\nnormal = [0, 0, 1]\noffset_cm = 1",
+            "shape.0.offset_cm: unknown key; the unit is in the key: write offset_mm",
+        ),
+        ("[anatomy]\n[attachment]\nradius_mm = 5", "a.toml: attachment.radius_mm needs a place"),
         ("[anatomy]\n[[shape]]\nkind = 'ball'", "'plane', 'mesh', 'sdf'"),
         ("[anatomy]\n[organs]\n", "organs: unknown key"),
         ("[anatomy\n", "not valid TOML"),

@@ -1,5 +1,6 @@
 """A picture as a DICOM Ultrasound Image that names nobody (PS3.3 A.6.4, with the US modules of C.8.5.5 and C.8.5.6)."""
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +75,9 @@ def save_dicom(
     data.file_meta = FileMetaDataset()
     data.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
     data.set_pixel_data(picture, "MONOCHROME2", bits_stored=8, generate_instance_uid=False)
-    data.save_as(path, enforce_file_format=True)
+    content = io.BytesIO()  # pydicom does not say what a disk has against its file
+    data.save_as(content, enforce_file_format=True)
+    path.write_bytes(content.getvalue())
 
 
 def _region(shape: tuple[int, ...], spacing_mm: tuple[float, float], probe: Probe | None) -> Dataset:

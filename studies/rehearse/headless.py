@@ -13,6 +13,7 @@ from render.window import NoVulkan
 from scenes.whole_files import whole
 from studies.link.live import send_live
 from studies.link.server import Server
+from studies.pictures import save_picture
 from studies.rehearsal import Rehearsal
 from studies.rehearse.drivers import Driver
 from studies.rehearse.instruments import Instruments
@@ -44,17 +45,18 @@ class Pictures:
         if step % self._every and step < self.steps:
             return
         picture = side_by_side(view)
-        picture.save(self._slices / f"{step:05d}.png")
+        save_picture(picture, self._slices / f"{step:05d}.png")
         if self.viewer is not None:
             self.viewer.draw(instruments.onto(view, settings))
             picture = Image.fromarray(self.viewer.picture())
-            picture.save(self._frames / f"{step:05d}.png")
+            save_picture(picture, self._frames / f"{step:05d}.png")
         if step % self._shown_every == 0 or step == self.steps:
             self._animation.append(smaller(picture))
 
     def save(self) -> str:
         """Write the animation; what there is now."""
-        save_animation(self._animation, self.out / "press.webp")
+        with whole(self.out / "press.webp") as partial:
+            save_animation(self._animation, partial)
         return f"{-(-self.steps // self._every)} pictures, press.webp"
 
 
