@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from conftest import rotation_about
 
-from ultrasound.coverage import PLACES, VOXEL_MM, Coverage
+from ultrasound.coverage import PLACES, VOXEL_MM, Coverage, _lines_of
 from ultrasound.probe import load_probe
 
 pytestmark = pytest.mark.usefixtures("one_device")
@@ -141,6 +141,13 @@ def test_the_first_and_last_places_stand_for_as_much_as_the_others(organ):
     ends = [u[organ.seen].min() + 18, v[organ.seen].min(), v[organ.seen].max() - 36]
     # A voxel is seen from any place in it; steps of 13 or 14 of the 95 are off by 3 % of half a place.
     assert ends == pytest.approx([-beyond, -beyond, beyond], abs=VOXEL_MM / 2 + 0.1)
+
+
+@pytest.mark.parametrize("lines", [127, 128])
+def test_the_columns_of_places_are_together_as_wide_as_the_picture(lines):
+    """Each stands for what is half a step to either side of it: of as many as there are, one too many."""
+    probe = PROBE.model_copy(update=dict(number_of_scanlines=lines))
+    assert _lines_of(probe, PLACES)[1].all(axis=0).sum() == PLACES - 1
 
 
 def test_off_the_organ_nothing_is_seen(organ):

@@ -214,13 +214,22 @@ def test_an_undo_takes_what_was_gone_of_the_sweep_back_and_a_redo_forth(led):
 
 
 def test_so_do_a_reset_and_a_bookmark(led):
-    nothing = led.guide.figures()
-    marked = led.act(FIRST[0], FIRST[1])
+    nothing, beside = led.guide.figures(), FIRST[0].copy()
+    beside[0, 3] += 0.6
+    marked = led.act(beside, FIRST[1])
     led.history.set_bookmark()
     after = led.act(FIRST[2])
     assert led.back(led.history.reset) == nothing
     assert led.back(led.history.undo) == after
-    assert led.back(led.history.to_bookmark) == marked
+    # Gone to twice, with a better way from there in between.
+    for _ in range(2):
+        assert led.back(led.history.to_bookmark) == marked
+        better = led.act(FIRST[0], FIRST[2])
+        assert (
+            better["plan_followed"] == after["plan_followed"]
+            and better["plan_off_mm"] == 0 < marked["plan_off_mm"]
+        )
+    assert led.back(led.history.undo) == marked
 
 
 def test_of_another_sweep_nothing_was_gone_at_any_moment_before_it_was_shown(led):

@@ -12,7 +12,7 @@ from scenes.anatomy import LoadedAnatomy
 from sim.distance import signed_distance
 from studies.coordinates import probe_in_patient
 from studies.plan import virtual_tumour
-from studies.plan.baselines import by_chance, planned, random_ways, row_by_row, straight
+from studies.plan.baselines import by_chance, planned, row_by_row, straight, ways_by_chance
 from studies.plan.candidate import (
     MOST_PASSES,
     ROUND,
@@ -216,7 +216,7 @@ def test_sweeps_by_chance_are_the_seeds_and_over_the_target(trial):
     assert all(
         abs(angle_deg(a / np.linalg.norm(a), b / np.linalg.norm(b))) > 1 for a, b in pairwise(headings)
     )
-    ways = random_ways(3, range(5, 7))
+    ways = ways_by_chance(3, range(5, 7))
     assert [
         np.array_equal(make(trial).poses, way.poses) for make, way in zip(ways, (first, other), strict=True)
     ] == [True] * 2

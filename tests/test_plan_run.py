@@ -65,7 +65,7 @@ def folder_of_ball(folder: Path) -> Path:
 class Here:
     """Instead of processes this one, where what they build stays."""
 
-    def __init__(self, jobs: int) -> None: ...
+    def __init__(self, jobs: int, **_: object) -> None: ...
 
     def submit(self, function: Callable, *arguments: object) -> Future:
         done: Future = Future()

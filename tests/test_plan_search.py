@@ -261,12 +261,12 @@ def test_a_comparison_counts_what_it_does_and_means_its_sweeps_by_chance(monkeyp
     run = compare.compare(Scene(anatomy={}), with_tumour().anatomy, 40, 3, done.append)
     assert sum(done) == compare.count_of(40) and jobs == [3, 3]
     rows = {row["sweep"]: row for row in run["rows"]}
-    assert list(rows) == ["planned", "straight", "row by row", "random"]
+    assert list(rows) == ["planned", "straight", "row by row", "by chance"]
     assert [row["count"] for row in rows.values()] == [1, 1, 1, len(compare.SEEDS)]
-    assert rows["random"]["seen"] == pytest.approx(0.1 * np.mean(3 + np.arange(len(compare.SEEDS))))
+    assert rows["by chance"]["seen"] == pytest.approx(0.1 * np.mean(3 + np.arange(len(compare.SEEDS))))
     assert rows["straight"]["score"] == pytest.approx(score(replace(GOOD, seen=0.1)))
     lines = table(dict(run, patient="patient 1"))
-    assert len(lines) == 7 and f"random ({len(compare.SEEDS)})" in lines[-2] and "40 %" in lines[-2]
+    assert len(lines) == 7 and f"by chance ({len(compare.SEEDS)})" in lines[-2] and "40 %" in lines[-2]
 
 
 # Processes

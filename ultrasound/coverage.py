@@ -131,9 +131,10 @@ def _lines_of(probe: Probe, places: int) -> tuple[np.ndarray, np.ndarray]:
     width, depth, above = probe.extent_mm
     share = np.linspace(0.0, 1.0, places)
     line, along = probe.beam_coordinates(*np.meshgrid(width * (share - 0.5), depth * share - above))
-    nearest, last = np.rint(line).astype(int), probe.number_of_scanlines - 1
-    inside = (nearest >= 0) & (nearest <= last) & (along >= 0) & (along <= probe.depth_mm)
-    return np.clip(nearest, 0, last), inside
+    last = probe.number_of_scanlines - 1
+    # Of the places on the two edges one counts, so that all that places stand for is as wide as the picture.
+    inside = (line >= -0.5) & (line < last + 0.5) & (along >= 0) & (along <= probe.depth_mm)
+    return np.clip(np.rint(line).astype(int), 0, last), inside
 
 
 def _elements_of(probe: Probe, places: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,12 +1,13 @@
 """Sweeps that nobody planned, to hold a planned one against: straight, row by row, and by chance."""
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 
-from studies.coordinates import transducer_at
 from studies.plan.candidate import half_size, passes_needed, width_mm
 from studies.plan.file import Sweep
+from studies.plan.track import passes_in
 from studies.plan.trial import Trial
 from studies.plan.way import Layout, Way, gliding, layout_towards
 
@@ -43,9 +44,7 @@ def by_chance(trial: Trial, count: int, seed: int) -> Way:
 
 def planned(trial: Trial, sweep: Sweep) -> Way:
     """The sweep of a plan."""
-    return Way(
-        tuple(np.stack([transducer_at(trial.rehearsal, pose) for pose in each]) for each in sweep.poses())
-    )
+    return Way(tuple(passes_in(trial.rehearsal, sweep)))
 
 
 def _seen_from_above(trial: Trial) -> tuple[Layout, np.ndarray]:
@@ -65,6 +64,6 @@ def _rows(trial: Trial, layout: Layout, half: np.ndarray, count: int) -> Way:
 UNPLANNED = {"straight": straight, "row by row": row_by_row}
 
 
-def random_ways(count: int, seeds: range) -> list:
-    """Ways by chance, as ``Workers.go_ways`` takes them."""
+def ways_by_chance(count: int, seeds: range) -> list[Callable[[Trial], Way]]:
+    """One for each seed, as ``Workers.go_ways`` takes them."""
     return [partial(by_chance, count=count, seed=seed) for seed in seeds]

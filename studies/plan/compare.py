@@ -9,11 +9,13 @@ import numpy as np
 
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
-from studies.plan.baselines import UNPLANNED, planned, random_ways
+from studies.plan.baselines import UNPLANNED, planned, ways_by_chance
 from studies.plan.make import make_plan
 from studies.plan.parts import Parts
 from studies.plan.score import score
 from studies.plan.search import length_at, length_of
+from studies.plan.trial import Trial
+from studies.plan.way import Way
 from studies.plan.workers import Outcome, Problem, workers
 from studies.setup import PRESETS, probe_of, scene_of
 from ultrasound.target import Target
@@ -34,20 +36,24 @@ def count_of(trials: int) -> int:
 def compare(
     scene: Scene, anatomy: LoadedAnatomy, trials: int, jobs: int | None, done: Callable[[int], Any]
 ) -> dict[str, Any]:
-    """Plan for the tumour and its margin, and go planned, straight and random sweeps. Raises PlanError."""
+    """Plan for the tumour and its margin, and go planned and straight sweeps, and such by chance. Raises PlanError."""
     probe = probe_of(scene)
     problem = Problem(scene_of(scene, PLANNED_ON), anatomy, probe, TARGET, MARGIN_MM, scene.trocar)
     with workers(problem, jobs) as crew:
         plan = make_plan(problem, crew, SPEED_MM_S, trials, done)
     sweep = plan.sweeps[0]
-    ways = [partial(planned, sweep=sweep), *UNPLANNED.values(), *random_ways(len(sweep.passes), SEEDS)]
+    ways: list[Callable[[Trial], Way]] = [
+        partial(planned, sweep=sweep),
+        *UNPLANNED.values(),
+        *ways_by_chance(len(sweep.passes), SEEDS),
+    ]
     outcomes: list[Outcome] = []
     with workers(replace(problem, scene=scene_of(scene, JUDGED_ON)), jobs) as crew:
         for one in crew.go_ways(ways, SPEED_MM_S):
             outcomes.append(one)
             done(length_at(SPEED_MM_S))
     rows = [_row(name, [one]) for name, one in zip(["planned", *UNPLANNED], outcomes, strict=False)]
-    rows.append(_row("random", outcomes[len(rows) :]))
+    rows.append(_row("by chance", outcomes[len(rows) :]))
     return dict(
         plan=sweep.name,
         why=plan.why,

@@ -27,7 +27,7 @@ from studies.results import write_json
 @click.option("--probe", default="drop-in", show_default=True, help="Probe, by its name or as a file.")
 @click.option("--jobs", type=click.IntRange(1, 256), help="Processes [as many as there are processors].")
 def plan_study(scenes: tuple[Path, ...], out: Path, trials: int, probe: str, jobs: int | None) -> None:
-    """Compare planned sweeps with straight and random ones.
+    """Compare planned sweeps with straight ones, and such by chance.
 
     Over the tumour and 5 mm around it, in SCENES [the embedded patient].
     A kidney without a tumour is given one.

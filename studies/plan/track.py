@@ -1,11 +1,13 @@
-"""A plan's sweep as the way of a tracked probe, to be followed by a machine."""
+"""A plan's sweep as poses to follow: the transducer's in a rehearsal, and a tracked probe's with their times, for a machine."""
 
 from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from studies.coordinates import transducer_at
 from studies.plan.file import Sweep
+from studies.rehearsal import Rehearsal
 from studies.scan.poses import TimedPoses
 
 # Between two passes the probe is backed out so far, and goes so fast.
@@ -14,6 +16,11 @@ LIFT_MM, LIFTED_MM_S = 6.0, 60.0
 COMES_S = 1.0
 # A turn by so many degrees takes as long as a way of one millimetre.
 DEG_A_MM = 1.5
+
+
+def passes_in(rehearsal: Rehearsal, sweep: Sweep) -> list[np.ndarray]:
+    """The transducer's poses (n, 4, 4) on each pass of a sweep."""
+    return [np.stack([transducer_at(rehearsal, pose) for pose in each]) for each in sweep.poses()]
 
 
 def timed_poses(sweep: Sweep, speed_mm_s: float) -> TimedPoses:

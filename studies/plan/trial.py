@@ -54,8 +54,7 @@ class Trial:
 
     def _come(self, pose: np.ndarray) -> None:
         """Lift the probe, bring it over its next place, and set it down there."""
-        first = self._steps_taken == 0
-        if first:
+        if self._steps_taken == 0:
             self.rehearsal.pose = advanced(pose, -LIFT_MM)
         else:
             for goal in (advanced(self.rehearsal.pose, -LIFT_MM), advanced(pose, -LIFT_MM)):

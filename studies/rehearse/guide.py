@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from render.viewer import Guidance
-from studies.coordinates import transducer_at
 from studies.plan.file import Plan
 from studies.plan.parts import faces_of
+from studies.plan.track import passes_in
 from studies.rehearsal import Rehearsal
 from studies.session.session import Session
 from ultrasound.hand import advanced, indentation
@@ -47,10 +47,7 @@ class Guide:
         self.at = 0
         self._kept: dict[int, _Gone] = {}
         shown = self.number < len(self.plan.sweeps)
-        passes = [
-            np.stack([transducer_at(self.rehearsal, pose) for pose in each])
-            for each in (self.plan.sweeps[self.number].poses() if shown else [])
-        ]
+        passes = passes_in(self.rehearsal, self.plan.sweeps[self.number]) if shown else []
         self._poses = np.concatenate(passes) if shown else np.zeros((0, 4, 4))
         # How far the probe was from each pose when it was nearest to it, in mm and degrees, and both together.
         self._off, self._far = np.zeros((len(self._poses), 2)), np.full(len(self._poses), np.inf)
@@ -83,11 +80,11 @@ class Guide:
 
     def go_with(self, session: Session) -> None:
         """Watch a session's last moment; one that went back takes what was gone of the sweep back too."""
-        now = _Gone(self.at, self._off.copy(), self._far.copy())
+        now = _Gone(self.at, self._off, self._far)
         kept = dict.fromkeys(session.kept, now) | self._kept
         if session.back is not None:
             then = kept.get(session.back, now)
-            self.at, self._off, self._far = then.at, then.off.copy(), then.far.copy()
+            self.at, self._off, self._far = then.at, then.off, then.far
         self._kept = {moment: kept[moment] for moment in session.kept}
         self.watch(self.rehearsal.pose)
 
@@ -97,6 +94,8 @@ class Guide:
         off = self._distance(pose, self._poses[first : self.at + AHEAD])
         far = off[:, 0] + off[:, 1] / DEG_BESIDE_A_MM
         places = first + np.flatnonzero(far < self._far[first : self.at + AHEAD])
+        # What was kept of them stays as it is.
+        self._off, self._far = self._off.copy(), self._far.copy()
         self._off[places], self._far[places] = off[places - first], far[places - first]
         ahead = far[self.at - first :]
         if len(ahead) and ahead.min() <= NEAR_MM:
