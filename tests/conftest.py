@@ -55,7 +55,12 @@ def kept(one_device) -> Callable:
     def keep(make: Callable, *args, **named) -> Any:
         bound = inspect.signature(make).bind(*args, **named)
         bound.apply_defaults()
-        call = make, *bound.arguments.values()
+        # A surface is another in each test, though it be the same.
+        given = [
+            v.identifier_hash if isinstance(v, trimesh.Trimesh) else v
+            for v in (*bound.args, *bound.kwargs.items())
+        ]
+        call = make, *given
         if call not in made:
             thing = make(*args, **named)
             made[call] = thing, thing.snapshot() if hasattr(thing, "snapshot") else None
@@ -75,13 +80,13 @@ def data() -> Path:
     return DATA
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture
 def ball() -> trimesh.Trimesh:
     """A ball of 12 mm radius about the origin."""
     return trimesh.creation.icosphere(subdivisions=3, radius=12.0)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture
 def block() -> trimesh.Trimesh:
     """A block of 24 x 20 x 16 mm about the origin."""
     return trimesh.creation.box([24.0, 20.0, 16.0])

@@ -18,7 +18,7 @@ AWAY = np.array([lifted(60.0), lifted(60.0)])
 ULP_MM = 2.0**-20
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def dome(ball) -> trimesh.Trimesh:
     """A ball of 12 mm radius that is flat below z = -6 mm, so that it cannot roll."""
     mesh = ball.copy()

@@ -171,7 +171,7 @@ def test_a_quality_sets_size_and_passes_and_leaves_the_material():
     scene, said = load_scene(PAPER), dict.fromkeys(OPTIONS)
     firm = said | {"tissue.young_kpa": 33.0}
     for quality, cell_mm, iterations in (("fast", 5.0, 4), ("accurate", 2.0, 12)):
-        asked, _ = as_asked(scene, PAPER.parent, firm, quality)
+        asked, _ = as_asked(scene, firm, quality)
         assert (asked.tissue.cell_mm, asked.tissue.young_kpa) == (cell_mm, 33.0)
         assert (asked.solver.substeps, asked.solver.iterations) == (1, iterations)
     stiff = said | {"tissue.stiffness": 0.7}
