@@ -175,11 +175,11 @@ def test_a_quality_sets_size_and_passes_and_leaves_the_material():
         assert (asked.tissue.cell_mm, asked.tissue.young_kpa) == (cell_mm, 33.0)
         assert (asked.solver.substeps, asked.solver.iterations) == (1, iterations)
     stiff = said | {"tissue.stiffness": 0.7}
-    asked, probe = as_asked(scene, PAPER.parent, stiff, "fast")
+    asked, probe = as_asked(scene, stiff, "fast")
     assert (asked.tissue.radius_mm, asked.tissue.stiffness, asked.solver.iterations) == (3.3, 0.7, 9)
     refuse_sizes(stiff, {"--quality": "fast", "--budget-ms": None, "--error-mm": None})
     refuse_sizes(firm, {"--quality": None, "--budget-ms": 5.0, "--error-mm": 0.1})
-    assert as_asked(scene, PAPER.parent, said, None) == (scene, probe)
+    assert as_asked(scene, said, None) == (scene, probe)
 
 
 def test_a_slow_step_loses_iterations_rung_by_rung_and_gets_them_back():
