@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+import taichi as ti
 
-from sim.fields import field_of
+from sim.fields import field_of, fields_of, fill
 
 
 @pytest.mark.parametrize("within", [0, 1, 2])
@@ -20,3 +21,18 @@ def test_a_field_holds_an_array(one_device, kind, within):
 def test_the_order_in_memory_does_not_matter(one_device):
     values = np.arange(12.0).reshape(3, 4)
     assert np.array_equal(field_of(values.T).to_numpy(), values.T)
+
+
+def test_arrays_written_together_are_each_what_they_were(one_device):
+    random = np.random.default_rng(1)
+    counts, places, turns = (
+        random.integers(-9, 9, 7),
+        random.normal(size=(4, 5, 3)),
+        random.normal(size=(6, 2, 4)),
+    )
+    fields = ti.field(ti.i32, 7), ti.Vector.field(3, ti.f32, (4, 5)), ti.Matrix.field(2, 4, ti.f32, 6)
+    fill(*zip(fields, (counts, places, turns), strict=True))
+    for field, values in zip(fields, (counts, places, turns), strict=True):
+        assert np.array_equal(field.to_numpy(), values.astype(field.to_numpy().dtype))
+    whole, broken = fields_of(counts, 0.5 * counts)
+    assert np.array_equal(whole.to_numpy(), counts) and np.array_equal(broken.to_numpy(), 0.5 * counts)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from render.camera import OrbitCamera
-from render.compass import compass_picture, ends_of
+from render.compass import ARM, compass_picture, ends_of
 from render.frame import readout_picture
 from render.layout import Layout, Rect
 from render.page import Page
-from render.panel import ALERT, BEFORE, CALLIPER, OUTLINE, QUIET
+from render.panel import ALERT, BEFORE, CALLIPER, OUTLINE, QUIET, TEXT
 from render.sliders import boxes_of, groups_of
 from render.text import fitting_size, font, shortened, write
 from render.viewer import Geometry, Settings, View
@@ -236,7 +236,9 @@ def test_the_help_covers_all_and_leaves_nothing_behind():
     page = Page(LAYOUT)
     before = composed(page, findings=FIGURES)
     box = picture_boxes(LAYOUT)[0]
-    assert page.place_at(box.left + 5, box.top + 5) is not None
+    assert page.place_at(box.left + 5, box.top + 5) == pytest.approx(
+        page.panel.to_plane(box, box.left + 5, box.top + 5)
+    )
     page.show_help()
     helped = page.pixels.transpose(1, 0, 2)[::-1, :, :3]
     assert np.ptp(helped[-1], axis=0).max() == 0 and page.place_at(box.left + 5, box.top + 5) is None
@@ -262,6 +264,16 @@ def test_the_ends_turn_with_the_camera_and_the_nearest_is_last():
     assert len(ends) == 6 and depth == sorted(depth, reverse=True)
     for letter, way in ends:
         assert way == pytest.approx([right @ ways[letter], up @ ways[letter]])
+
+
+def test_what_points_up_in_the_compass_is_drawn_up():
+    # From the front and above: the head is up and nearer than the middle, the feet are down and farther.
+    sine, cosine = 0.28, 0.96
+    picture = compass_picture(LAYOUT, np.array([[1.0, 0, 0], [0, sine, cosine], [0, cosine, -sine]]))
+    size = len(picture)
+    away = round(0.5 * ARM * size)
+    column = picture[:, size // 2].astype(int)
+    assert (column[size // 2 - away] == TEXT).all() and (column[size // 2 + away] == QUIET).all()
 
 
 def test_the_compass_is_drawn_anew_when_the_camera_turns():
