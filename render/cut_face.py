@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from render.surface import Surface
-from sim.fields import fields_of, fill
+from sim.fields import array_of, fields_of, fill
 
 CELLS = 160
 FLESH = (0.78, 0.50, 0.44)
@@ -96,7 +96,7 @@ class CutFace:
 
     def draw(self, scene, organ: Surface, inner: list[Surface], pose: np.ndarray, key: np.ndarray) -> None:
         """Hand the face on the image plane of a pose (4, 4) to a scene, evenly lit by a light at ``key`` (3,)."""
-        cuts = [section(each.vertices.to_numpy(), each.faces, pose) for each in (organ, *inner)]
+        cuts = [section(array_of(each.vertices), each.faces, pose) for each in (organ, *inner)]
         raster = Raster.around(cuts, CELLS)
         covered = [raster.covered(each).reshape(-1, 1) for each in cuts]
         colour = np.tile(FLESH, (CELLS**2, 1))

@@ -8,7 +8,7 @@ the faces are sent farthest first.
 import numpy as np
 import taichi as ti
 
-from sim.fields import fill
+from sim.fields import array_of, fill
 
 ORGAN, TINT = (0.66, 0.27, 0.23), (0.24, 0.60, 0.36)
 SOLID, GLASS = 1.0, 0.30
@@ -133,7 +133,7 @@ class Surface:
         """Vertex indices of the faces, int32 (3 m,), farthest first along `ahead` if given, without those that a cut takes away."""
         if ahead is None:
             return self.faces.reshape(-1)
-        vertices, faces = self.vertices.to_numpy(), self.faces
+        vertices, faces = array_of(self.vertices), self.faces
         if cut is not None:
             point, side = cut
             # Unseen as they are, they would hide what is drawn behind them later.

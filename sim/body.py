@@ -7,7 +7,7 @@ import taichi as ti
 import trimesh
 
 from sim.distance import signed_distance
-from sim.fields import field_of, fill
+from sim.fields import array_of, field_of, fill
 from sim.sampling import sample_particles
 
 
@@ -76,7 +76,7 @@ class Body:
 
     def snapshot(self) -> BodyState:
         """A copy of the current state."""
-        return BodyState(self.position.to_numpy(), self.velocity.to_numpy())
+        return BodyState(array_of(self.position), array_of(self.velocity))
 
     def restore(self, state: BodyState) -> None:
         """Go back to a state; the steps that follow give the same bits as they did from it before."""

@@ -5,7 +5,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import ParticleBody
-from sim.fields import fill
+from sim.fields import array_of, fill
 from sim.free_way import FreeWay
 from sim.shapes import FAR
 
@@ -54,7 +54,7 @@ class ShapeContacts:
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """What it carries from step to step: planes, and where they were found."""
-        return dict(plane=self.contact.plane.to_numpy(), found=self.found.to_numpy())
+        return dict(plane=array_of(self.contact.plane), found=array_of(self.found))
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Go back to a snapshot; the steps that follow give the same bits."""

@@ -1,9 +1,16 @@
-"""Arrays on the device. To make a kernel takes longer than what it writes: arrays that come together are written by one."""
+"""Arrays on the device. On a CPU they are written and read where they lie: to make a kernel for that takes longer."""
+
+import ctypes
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import taichi as ti
+from taichi.lang import impl
 
 from sim.device import on_cpu
+
+# The address of each tree of fields, for each start of Taichi.
+_ROOTS: WeakKeyDictionary[object, dict[int, int]] = WeakKeyDictionary()
 
 
 def field_of(values: np.ndarray, within: int = 0) -> ti.Field:
@@ -30,35 +37,48 @@ def _empty(values: np.ndarray, within: int) -> ti.Field:
 
 
 def fill(*pairs: tuple[ti.Field, np.ndarray]) -> None:
-    """Write arrays into fields of their shapes."""
-    fields = tuple(field for field, _ in pairs)
-    arrays = [
-        np.ascontiguousarray(values, np.float32 if field.dtype == ti.f32 else np.int32)
-        for field, values in pairs
-    ]
-    if on_cpu():
-        _copy(np.concatenate([values.reshape(-1).view(np.int32) for values in arrays]), fields)
-        return
-    for field, values in zip(fields, arrays, strict=True):
-        field.from_numpy(values)
+    """Write arrays into fields of their shapes. Raises ValueError for another shape."""
+    for field, values in pairs:
+        values = np.asarray(values)
+        if values.shape != _shape(field):
+            raise ValueError(f"an array of shape {values.shape} for a field of shape {_shape(field)}")
+        if on_cpu():
+            _lying(field)[...] = values
+        else:
+            field.from_numpy(np.ascontiguousarray(values, _kind(field)))
+
+
+def array_of(field: ti.Field) -> np.ndarray:
+    """The array that a field holds, (*its shape, *its element's)."""
+    return _lying(field).copy() if on_cpu() else field.to_numpy()
+
+
+def _kind(field: ti.Field) -> type[np.float32] | type[np.int32]:
+    return np.float32 if field.dtype == ti.f32 else np.int32
+
+
+def _shape(field: ti.Field) -> tuple[int, ...]:
+    element = () if isinstance(field, ti.ScalarField) else (field.n, field.m)[: field.ndim]
+    return tuple(field.shape) + element
+
+
+def _lying(field: ti.Field) -> np.ndarray:
+    """A field's own memory; Taichi lays each field down in one piece, an element beside the next."""
+    impl.get_runtime().materialize()
+    place = field.snode.ptr
+    at = _root(field, place.get_snode_tree_id()) + place.parent.offset_bytes_in_parent_cell
+    shape = _shape(field)
+    memory = (ctypes.c_int32 * int(np.prod(shape))).from_address(at)
+    return np.ctypeslib.as_array(memory).view(_kind(field)).reshape(shape)
+
+
+def _root(field: ti.Field, tree: int) -> int:
+    roots = _ROOTS.setdefault(impl.get_runtime(), {})
+    if tree not in roots:
+        roots[tree] = _address(field, len(field.shape)) - field.snode.ptr.parent.offset_bytes_in_parent_cell
+    return roots[tree]
 
 
 @ti.kernel
-def _copy(values: ti.types.ndarray(dtype=ti.i32, ndim=1), fields: ti.template()):
-    # Taichi's own copy runs on all cores, and a kernel for that takes twice as long to make and to load.
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        at = 0
-        for k in ti.static(range(len(fields))):
-            field = ti.static(fields[k])
-            for i in ti.grouped(ti.ndrange(*field.shape)):
-                if ti.static(isinstance(field, ti.ScalarField)):
-                    field[i] = ti.bit_cast(values[at], field.dtype)
-                    at += 1
-                else:
-                    for p, q in ti.static(ti.ndrange(field.n, field.m)):
-                        if ti.static(field.ndim == 1):
-                            field[i][p] = ti.bit_cast(values[at], field.dtype)
-                        else:
-                            field[i][p, q] = ti.bit_cast(values[at], field.dtype)
-                        at += 1
+def _address(field: ti.template(), axes: ti.template()) -> ti.u64:
+    return ti.get_addr(field, [0 for _ in ti.static(range(axes))])

@@ -10,7 +10,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import Body
-from sim.fields import fields_of, fill
+from sim.fields import array_of, fields_of, fill
 from sim.free_way import FreeWay
 from sim.lattice import Lattice
 from sim.shapes import FAR
@@ -76,7 +76,7 @@ class SurfaceContacts:
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """What it carries from step to step: friction, and the planes that were found."""
-        return {name: getattr(self, name).to_numpy() for name in self.remembered}
+        return {name: array_of(getattr(self, name)) for name in self.remembered}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Go back to a snapshot; the steps that follow give the same bits."""

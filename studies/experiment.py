@@ -8,6 +8,7 @@ import trimesh
 from scenes.scene import Contact, SolverSection
 from scenes.tissue import TissueSection
 from sim.body import RestBody
+from sim.fields import array_of
 from sim.shape_matching import fill
 from sim.shapes import ConvexTool
 from sim.skinning import Skin
@@ -78,7 +79,7 @@ class Experiment:
                     run.arriving[stage] = self._found()
             pose = path[-1]
             run.beads[stage] = self._found()
-            run.finite &= bool(np.isfinite(self.body.position.to_numpy()).all())
+            run.finite &= bool(np.isfinite(array_of(self.body.position)).all())
         run.finite &= bool(np.isfinite(run.beads).all())
         return run
 
@@ -92,7 +93,7 @@ class Experiment:
 
     def _found(self) -> np.ndarray:
         self.beads.update()
-        return self.beads.vertices.to_numpy() + self.origin
+        return array_of(self.beads.vertices) + self.origin
 
     def relative(self, pose: np.ndarray) -> np.ndarray:
         """A pose (4, 4) of the case's frame, in the device's."""

@@ -6,6 +6,7 @@ from typing import Any
 import igl
 import numpy as np
 
+from sim.fields import array_of
 from studies.rehearsal import Rehearsal
 from ultrasound.face import face_points, pressing
 from ultrasound.probe import Probe
@@ -34,7 +35,7 @@ class Reading:
 def read(rehearsal: Rehearsal, probe: Probe, touches: np.ndarray) -> Reading:
     """Read a rehearsal whose surfaces are up to date; ``touches`` says which lines of the probe touch."""
     organ = rehearsal.organ
-    now = rehearsal.organ_skin.vertices.to_numpy().astype(float)
+    now = array_of(rehearsal.organ_skin.vertices).astype(float)
     pressed = pressing(
         rehearsal.pose, rehearsal.size_mm, probe.radius_mm, now, np.asarray(organ.vertices), organ.faces
     )

@@ -14,6 +14,7 @@ from scenes.anatomy import Grid, LoadedAnatomy, press_on
 from scenes.reading.progress import Told, untold
 from scenes.scene import PlaneShape, Scene
 from sim.embedding import Embedding
+from sim.fields import array_of
 from sim.guard import Guard, Watch
 from sim.shapes import Plane, SignedDistanceField
 from sim.skinning import Skin
@@ -162,7 +163,7 @@ class Rehearsal:
         return pose
 
     def _hand(self) -> Hand:
-        settled = self.organ_skin.vertices.to_numpy().astype(float)
+        settled = array_of(self.organ_skin.vertices).astype(float)
         faces = np.array(self.organ.faces, np.int64)
         normals = np.array(trimesh.Trimesh(settled, faces, process=False).vertex_normals)
         radius = self.probe.radius_mm
@@ -271,7 +272,7 @@ class Rehearsal:
         if self._tumour_border is None:
             return np.zeros((0, 3))
         self._tumour_border.update()
-        return self._tumour_border.vertices.to_numpy().astype(float)
+        return array_of(self._tumour_border.vertices).astype(float)
 
     def indentation_mm(self) -> float:
         """How deep the transducer is pressed into the settled surface; negative above it."""
@@ -282,7 +283,7 @@ class Rehearsal:
 
     def volume_ratio(self) -> float:
         """Volume inside the carried surface, as a share of the resting one."""
-        carried = self.organ_skin.vertices.to_numpy()
+        carried = array_of(self.organ_skin.vertices)
         return float(volume_mm3(carried, self.organ.faces) / self.organ.volume)
 
     def reset(self) -> None:

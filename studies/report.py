@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from scenes.tissue import TISSUES
+from sim.fields import array_of
 from studies.rehearsal import Rehearsal
 from studies.results import counted, spread
 from studies.setup import setup_of_scene
@@ -39,7 +40,7 @@ class Tally:
         """Look at the state at the end of a step; the surfaces must be up to date."""
         if rehearsal.notice:
             self.fallbacks.append(rehearsal.notice)
-        self.finite &= bool(np.isfinite(rehearsal.body.position.to_numpy()).all())
+        self.finite &= bool(np.isfinite(array_of(rehearsal.body.position)).all())
         self.volume_ratio_min = min(self.volume_ratio_min, rehearsal.volume_ratio())
         self.max_penetration_mm = max(self.max_penetration_mm, rehearsal.contacts.measure_penetration())
         self.indentation_max_mm = max(self.indentation_max_mm, rehearsal.indentation_mm())

@@ -4,6 +4,7 @@ import numpy as np
 import trimesh
 
 from sim.body import Body, BodyState
+from sim.fields import array_of
 from sim.lattice import Lattice, fill_with_cells, surface_points
 from sim.neo_hookean import HOURGLASS, LATTICE_SETTINGS, LEAST_J, NeoHookean
 from sim.shapes import ConvexTool
@@ -47,7 +48,7 @@ def put(model: NeoHookean, x: np.ndarray) -> None:
 
 
 def position(solver: Solver) -> np.ndarray:
-    return solver.body.position.to_numpy().astype(np.float64)
+    return array_of(solver.body.position).astype(np.float64)
 
 
 def lifted(z: float) -> np.ndarray:

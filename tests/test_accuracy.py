@@ -13,6 +13,7 @@ from conftest import rotation_about
 from app import cli, main
 from scenes.scene import SolverSection
 from scenes.tissue import QUALITIES, TISSUES
+from sim.fields import array_of
 from studies.accuracy import (
     bead_errors,
     correlation,
@@ -129,7 +130,7 @@ def test_the_probe_waits_above_then_goes_to_each_stage_and_rests_there_wherever_
     seen = []
     experiment.solver.step = lambda settings, poses: seen.append(poses)
     run = experiment.run(COARSE)
-    assert np.abs(experiment.body.position.to_numpy()).max() < 12.0
+    assert np.abs(array_of(experiment.body.position)).max() < 12.0
     assert run.beads[0] == pytest.approx(moved.beads, abs=1e-4)
     ends = np.array([poses[-1] for poses in seen])
     assert len(ends) == 120 + 3 * 90 == 120 + len(run.step_ms)

@@ -7,6 +7,7 @@ import trimesh
 from scenes.anatomy import LoadedAnatomy, load_anatomy, phantom_folder
 from scenes.hilum import hilum
 from scenes.scene import PAPER, AnatomyFiles, Attachment, Scene, SceneError, load_scene, with_options
+from sim.fields import array_of
 from sim.sampling import SamplingError
 from studies.rehearsal import Rehearsal
 
@@ -28,7 +29,7 @@ def hanging(radius_mm: float, at=AT) -> Rehearsal:
 def moved_mm(rehearsal: Rehearsal, steps: int = 30) -> np.ndarray:
     for _ in range(steps):
         rehearsal.advance(rehearsal.pose)
-    return rehearsal.body.position.to_numpy() - rehearsal.body.rest_points
+    return array_of(rehearsal.body.position) - rehearsal.body.rest_points
 
 
 def test_held_nodes_stay_and_the_rest_hangs_from_them(device):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sim.fields import array_of
 from sim.neo_hookean import LATTICE_SETTINGS
 from sim.shapes import Plane
 from sim.solver import StepSettings
@@ -18,7 +19,7 @@ def lowest_mm(solver, settings: StepSettings) -> float:
     settings.gravity = (0.0, 0.0, -9810.0)
     for _ in range(60):
         solver.step(settings)
-    return float(solver.body.position.to_numpy()[:, 2].min())
+    return float(array_of(solver.body.position)[:, 2].min())
 
 
 def test_a_particle_of_a_block_is_half_a_radius_thick_to_either_side(one_device):

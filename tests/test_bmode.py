@@ -13,6 +13,7 @@ from skimage.registration import phase_cross_correlation
 from sim.body import BodyState
 from sim.device import start
 from sim.embedding import Embedding, Unmoved
+from sim.fields import array_of, fill
 from ultrasound.bmode import BMode
 from ultrasound.hand import image_plane, pose_at
 from ultrasound.plane import PlaneInTissue
@@ -71,14 +72,14 @@ class Tank:
         for channel, given in enumerate((impedance, attenuation, backscatter)):
             values[..., channel] = given(*self.at) if callable(given) else given
         more = [(0, n) for n in np.subtract(self.tissue.count, self.tissue.shape)]
-        self.tissue.voxels.from_numpy(np.pad(values, [*more, (0, 0)], mode="edge").reshape(-1, 3))
+        fill((self.tissue.voxels, np.pad(values, [*more, (0, 0)], mode="edge").reshape(-1, 3)))
 
     def look(self, probe, rung="reflection", at=(0, 0, 0), along=(0, 1, 0), lateral=(1, 0, 0)) -> np.ndarray:
         """Echoes (lines, samples) [dB] of a probe whose face is at a place and looks along a direction."""
         pose = pose_at(at, along, lateral, probe.housing_mm[2])
         self.plane.take(image_plane(pose, probe.housing_mm[2], *probe.extent_mm))
         self.picture = self.bmode.render(probe, rung)
-        return self.bmode.decibel.to_numpy().astype(float)
+        return array_of(self.bmode.decibel).astype(float)
 
 
 def flat_tank(voxel: float, **settings) -> Tank:
@@ -245,11 +246,11 @@ def test_a_wire_is_drawn_as_wide_as_the_focus_makes_it(endless, focus_percent, t
     axial = 2 * 1.54 / 7.5 / 2 / FWHM
     u = probe.scanlines()[0][:, 0] - probe.scanlines()[0][LINES // 2, 0]
     profile = (u == 0).astype(float) if thin else np.exp(-0.5 * (u / axial) ** 2)
-    endless.bmode.beams.real.from_numpy(np.repeat(profile[:, None], SAMPLES, axis=1).astype(np.float32))
+    fill((endless.bmode.beams.real, np.repeat(profile[:, None], SAMPLES, axis=1)))
     endless.bmode.beams.imaginary.fill(0.0)
     endless.bmode._spread()
     for depth in (8.0, 16.0, 32.0, 56.0, 72.0):
-        line = endless.bmode.decibel.to_numpy()[:, int(depth / 0.125)].astype(float)
+        line = array_of(endless.bmode.decibel)[:, int(depth / 0.125)].astype(float)
         near = line > line.max() - 6.0
         found = np.sqrt(-10 / np.log(10) / np.polyfit(u[near], line[near], 2)[0])
         formula = 1.54 / 7.5 * 3.0 / FWHM * np.sqrt(1 + ((depth - 0.8 * focus_percent) / 20.0) ** 2)

@@ -8,6 +8,7 @@ import trimesh
 from conftest import rotation_about
 from test_solver import on_floor, position, solver_of
 
+from sim.fields import array_of, fill
 from sim.shapes import FAR, ConvexTool, Plane, SignedDistanceField
 from sim.solver import Solver, StepSettings
 
@@ -16,7 +17,7 @@ def measured(shape, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Normals (n, 3) and signed distances (n,) that a shape answers with."""
     given = ti.Vector.field(3, ti.f32, len(points))
     answer = ti.Vector.field(4, ti.f32, len(points))
-    given.from_numpy(points.astype(np.float32))
+    fill((given, points))
 
     @ti.kernel
     def ask():
@@ -24,7 +25,7 @@ def measured(shape, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             answer[i] = shape.surface(given[i])
 
     ask()
-    answers = answer.to_numpy().astype(np.float64)
+    answers = array_of(answer).astype(np.float64)
     return answers[:, :3], answers[:, 3]
 
 
@@ -79,7 +80,7 @@ def test_the_way_out_of_a_rounded_cuboid_ends_a_hair_outside_its_face(one_device
             out[k] = tool.way_out(ti.Vector([1.0, 0.5, -0.5]), k)
 
     ask()
-    for point, k in zip(out.to_numpy(), range(6), strict=True):
+    for point, k in zip(array_of(out), range(6), strict=True):
         expected = np.array([1.0, 0.5, -0.5])
         expected[k % 3] = (1 if k < 3 else -1) * ([6.0, 3.0, 4.0][k % 3] + 1e-3)
         assert point == pytest.approx(expected, abs=1e-6)
@@ -104,7 +105,7 @@ def test_a_tool_knows_how_its_material_moved(one_device):
 
     material = np.array([1.0, 2.0, -2.0, 1.0])
     ask(*(now @ material)[:3])
-    assert np.abs(moved.to_numpy() - (now @ material - material)[:3]).max() < 1e-6
+    assert np.abs(array_of(moved) - (now @ material - material)[:3]).max() < 1e-6
 
 
 def test_more_poses_than_a_step_has_room_for_are_refused(one_device):
@@ -157,7 +158,7 @@ def test_a_tool_is_beyond_a_distance_only_where_it_is(one_device, edge_radius, o
     points = scattered()
     _, distance = measured(tool, points)
     given, beyond = ti.Vector.field(3, ti.f32, len(points)), ti.field(ti.i32, len(points))
-    given.from_numpy(points.astype(np.float32))
+    fill((given, points))
 
     @ti.kernel
     def ask():
@@ -165,7 +166,7 @@ def test_a_tool_is_beyond_a_distance_only_where_it_is(one_device, edge_radius, o
             beyond[i] = ti.cast(tool.is_beyond(given[i], 2.0), ti.i32)
 
     ask()
-    told = beyond.to_numpy() > 0
+    told = array_of(beyond) > 0
     assert (distance[told] > 2.0).all()
     # It sees most of what is beyond, all but what is near to an edge's or corner's corner.
     assert told.sum() > 0.9 * (distance > 2.0).sum()
@@ -264,7 +265,7 @@ def test_a_dragged_tool_drags_the_surface_by_its_friction(one_device, block):
 def oracle_of_pushes(solver: Solver, x: np.ndarray, motion: np.ndarray, passes: int, factor: float):
     """Where particles (n, 3) go in passes of pushes with Coulomb's friction in float64; how many of those slid, and had two shapes."""
     contacts, start = solver.contacts, position(solver)
-    plane, touched = contacts.contact.plane.to_numpy().astype(float), contacts.touched.to_numpy()
+    plane, touched = array_of(contacts.contact.plane).astype(float), array_of(contacts.touched)
     x, slid, several = x.copy(), 0, 0
     for i in range(len(x)):
         shapes = [s for s in range(len(contacts.shapes)) if touched[i] >> s & 1]
@@ -304,7 +305,7 @@ def test_pushes_and_friction_are_the_oracles(kept, block, factor):
     before[2, 3], now[:3, 3] = 11.6, [0.3, -0.2, 11.3]
     solver.tool.follow(np.stack([before, now]))
     body, contacts = solver.body, solver.contacts
-    body.velocity.from_numpy(np.random.default_rng(8).normal(0, 20, (body.count, 3)).astype(np.float32))
+    fill((body.velocity, np.random.default_rng(8).normal(0, 20, (body.count, 3))))
 
     @ti.kernel
     def push():
@@ -316,13 +317,13 @@ def test_pushes_and_friction_are_the_oracles(kept, block, factor):
         begin(solver, [0.0, 0.0, -1e-3], 0.01)
         motion = np.array([[0.0] * 3, [0.0] * 3, [0.3, -0.2, -0.3]])
         wanted, slid, several = oracle_of_pushes(
-            solver, body.estimate.to_numpy().astype(float), motion, 3, factor
+            solver, array_of(body.estimate).astype(float), motion, 3, factor
         )
         assert slid > 30 and several > 10
         for _ in range(3):
             push()
         # Float32 positions of 12 mm carry 1e-6 mm, and the same of each plane's offset, in each of three passes.
-        assert np.abs(body.estimate.to_numpy() - wanted).max() < 2e-5
+        assert np.abs(array_of(body.estimate) - wanted).max() < 2e-5
 
 
 def test_stabilisation_gets_out_without_adding_velocity(kept, ball):
@@ -333,7 +334,7 @@ def test_stabilisation_gets_out_without_adding_velocity(kept, ball):
             gravity=(0, 0, 0), damping=0.0, stabilisation_iterations=passes, stiffness=0.0
         )
         solver.step(settings)
-        fastest.append(np.abs(solver.body.velocity.to_numpy()).max())
+        fastest.append(np.abs(array_of(solver.body.velocity)).max())
         assert position(solver)[:, 2].min() >= -10.0 - 1e-4
     # Two millimetres in a third of a sixtieth of a second.
     assert fastest[0] > 100
@@ -345,7 +346,7 @@ def test_stabilisation_moves_position_and_estimate_alike(one_device, ball):
     ends = []
     for passes in (0, 4):
         begin(solver, [0.0, 0.0, -9810.0], 1 / 180, passes)
-        ends.append((position(solver), solver.body.estimate.to_numpy()))
+        ends.append((position(solver), array_of(solver.body.estimate)))
     moved = ends[1][0] - ends[0][0], ends[1][1] - ends[0][1]
     assert moved[0][:, 2].max() > 1.0
     assert moved[1] == pytest.approx(moved[0], abs=1e-5)

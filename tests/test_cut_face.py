@@ -9,6 +9,7 @@ from conftest import rotation_about
 
 from render import cut_face
 from render.cut_face import Raster, section, side_of_eye
+from sim.fields import array_of, field_of
 
 RADIUS = 12.0
 
@@ -100,17 +101,15 @@ class Handed:
     """A scene that keeps what it is handed."""
 
     def mesh(self, points, indices, normals, per_vertex_color):
-        self.points, self.colours = points.to_numpy(), per_vertex_color.to_numpy()
-        self.triangles, self.normals = indices.reshape(-1, 3), normals.to_numpy()
+        self.points, self.colours = array_of(points), array_of(per_vertex_color)
+        self.triangles, self.normals = indices.reshape(-1, 3), array_of(normals)
 
 
 def test_the_face_lies_on_the_plane_in_the_colours_of_what_it_cuts(device, ball, monkeypatch):
     monkeypatch.setattr(cut_face, "CELLS", 60)
     kernel = trimesh.creation.icosphere(subdivisions=2, radius=4.0).apply_translation([5.0, 0, 0])
     organ, tumour = (
-        SimpleNamespace(
-            vertices=SimpleNamespace(to_numpy=lambda at=each: at.vertices), faces=each.faces, base=colour
-        )
+        SimpleNamespace(vertices=field_of(each.vertices, 1), faces=each.faces, base=colour)
         for each, colour in ((ball, (0.5, 0.1, 0.1)), (kernel, (1.0, 0.8, 0.0)))
     )
     pose, scene = plane((0, 1, 0), (0, 0, 1), 20.0), Handed()

@@ -5,11 +5,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import taichi as ti
 
 import sim.device
 from sim.device import NoDevice, start
+from sim.fields import array_of, field_of
 
 
 def test_compiled_kernels_of_many_patients_are_kept(device):
@@ -92,3 +94,10 @@ def test_an_error_in_a_kernel_names_file_line_and_function(device):
         line = inner.func.func.__code__.co_firstlineno + 2
         assert f'"{__file__}", line {line}, in inner:' in told and "return value + not_defined" in told
         assert f"line {outer._primal.func.__code__.co_firstlineno + 4}, in outer:" in told
+
+
+def test_each_start_of_taichi_has_its_own_memory():
+    for value in (1.0, 2.0):
+        start("cpu")
+        assert np.array_equal(array_of(field_of(np.full(5, value))), np.full(5, value))
+        ti.reset()

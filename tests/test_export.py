@@ -14,7 +14,10 @@ from conftest import rotation_about
 import app
 from scenes.surface_files import FORMATS, save_surface
 from scenes.volume_files import save_image
+from sim.fields import field_of
 from studies.rehearse.saving import save_surfaces
+
+pytestmark = pytest.mark.usefixtures("one_device")
 
 # Far from the origin, as a patient's organ is.
 MIDDLE = np.array([71.5, -133.25, -1204.0])
@@ -132,7 +135,7 @@ def lying(tumour: bool) -> SimpleNamespace:
     return SimpleNamespace(
         origin=MIDDLE,
         organ=rest,
-        organ_skin=SimpleNamespace(vertices=SimpleNamespace(to_numpy=lambda: moved)),
+        organ_skin=SimpleNamespace(vertices=field_of(moved, 1)),
         tumour=body(3.0, 0.2) if tumour else None,
         tumour_vertices=lambda: body(3.0, 0.2).vertices - MIDDLE + [1.0, 0, 0],
     )

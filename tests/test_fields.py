@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from sim.fields import field_of, fields_of, fill
+from sim.fields import array_of, field_of, fields_of, fill
 
 
 @pytest.mark.parametrize("within", [0, 1, 2])
@@ -36,3 +36,31 @@ def test_arrays_written_together_are_each_what_they_were(one_device):
         assert np.array_equal(field.to_numpy(), values.astype(field.to_numpy().dtype))
     whole, broken = fields_of(counts, 0.5 * counts)
     assert np.array_equal(whole.to_numpy(), counts) and np.array_equal(broken.to_numpy(), 0.5 * counts)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (7,), (3, 5), (6, 1, 9)])
+def test_what_is_read_where_it_lies_is_what_taichi_reads(one_device, shape):
+    random = np.random.default_rng(2)
+    fields = [
+        (ti.field(ti.f32, shape), shape),
+        (ti.Vector.field(3, ti.i32, shape), (*shape, 3)),
+        (ti.Matrix.field(3, 2, ti.f32, shape), (*shape, 3, 2)),
+    ]
+    for field, whole in fields:
+        values = random.integers(-99, 99, whole)
+        field.from_numpy(values.astype(np.float32 if field.dtype == ti.f32 else np.int32))
+        assert np.array_equal(array_of(field), values) and array_of(field).shape == whole
+        fill((field, 2 * values))
+        assert np.array_equal(field.to_numpy(), 2 * values)
+
+
+def test_an_array_read_is_a_copy(one_device):
+    field = field_of(np.arange(4.0))
+    before = array_of(field)
+    fill((field, np.zeros(4)))
+    assert np.array_equal(before, np.arange(4.0))
+
+
+def test_an_array_of_another_shape_is_not_written(one_device):
+    with pytest.raises(ValueError, match=r"shape \(3,\) for a field of shape \(4,\)"):
+        fill((field_of(np.arange(4.0)), np.zeros(3)))

@@ -11,6 +11,7 @@ from lattice_tissue import tissue_of as lattice_tissue
 from particle_tissue import tissue_of as particle_tissue
 
 from sim.body import BodyState
+from sim.fields import array_of, fill
 from sim.free_way import DEEP_MM, FreeWay
 from sim.guard import CRUSHED_MM, KEEP_STEPS, PATIENCE_S, PATIENCE_STEPS, TORN, Guard, tetrahedra_among
 from sim.shapes import GRID_MM, HAIR_CELLS, ConvexTool, Plane, SignedDistanceField
@@ -87,12 +88,12 @@ def test_a_guard_lets_tissue_be_pressed_and_puts_back_what_is_none(kept, ball, m
     # Not a number: back at once, at rest.
     put(solver, np.full(good.position.shape, np.nan))
     assert "no numbers" in guard.check(DT)
-    assert (solver.body.position.to_numpy() == good.position).all()
-    assert (solver.body.velocity.to_numpy() == 0).all()
+    assert (array_of(solver.body.position) == good.position).all()
+    assert (array_of(solver.body.velocity) == 0).all()
     # Gone: the same state has failed before, so it is the first one now.
     put(solver, good.position + [0, 0, 600.0])
     assert "left the scene" in guard.check(DT)
-    assert (solver.body.position.to_numpy() == guard.home.body.position).all()
+    assert (array_of(solver.body.position) == guard.home.body.position).all()
     assert guard.fallbacks == 2
 
 
@@ -146,7 +147,7 @@ def test_what_the_tool_crushes_is_no_tangle(kept, ball):
     solver.tool.move(at, at)
     # Everything is inside out: what counts is more than 10 mm from the tool's faces, or from the ball about its corners.
     half = np.array([5.0, 3.0, 5.0])
-    at = solver.body.rest_points[guard.corner.to_numpy()[:, 0]] * [1, 1, -1]
+    at = solver.body.rest_points[array_of(guard.corner)[:, 0]] * [1, 1, -1]
     beyond = (np.abs(at) - half > CRUSHED_MM).any(axis=1)
     beyond |= np.linalg.norm(at, axis=1) > np.linalg.norm(half) + CRUSHED_MM
     assert 0 < beyond.mean() < 0.2
@@ -191,7 +192,7 @@ def look(shape: ti.template(), at: ti.template(), out: ti.template()):
 def field_of(values) -> ti.Field:
     values = np.atleast_2d(np.asarray(values, np.float32))
     field = ti.Vector.field(3, ti.f32, len(values))
-    field.from_numpy(values)
+    fill((field, values))
     return field
 
 
@@ -234,9 +235,9 @@ def test_room_is_no_more_than_the_distance(one_device, ball):
     look(shape, field_of(points), out)
     true = np.linalg.norm(points, axis=1) - 12.0
     # Linear between points of a grid: off by less than half its diagonal; beyond the grid by half a cell at most.
-    assert (out.to_numpy() <= true + np.sqrt(3) / 2 * GRID_MM).all()
+    assert (array_of(out) <= true + np.sqrt(3) / 2 * GRID_MM).all()
     near = np.abs(true) < 3.0
-    assert out.to_numpy()[near] == pytest.approx(true[near], abs=0.1)
+    assert array_of(out)[near] == pytest.approx(true[near], abs=0.1)
 
 
 def test_room_beyond_a_grid_is_the_way_to_it_whatever_its_spacing(one_device):
@@ -249,7 +250,7 @@ def test_room_beyond_a_grid_is_the_way_to_it_whatever_its_spacing(one_device):
     look(shape, field_of(points), out)
     way = np.linalg.norm(points - np.clip(points, -16.0, 16.0), axis=1)
     # And a hair into it, so that ways end in the grid.
-    assert out.to_numpy() == pytest.approx(way + HAIR_CELLS * 0.5, abs=1e-4)
+    assert array_of(out) == pytest.approx(way + HAIR_CELLS * 0.5, abs=1e-4)
 
 
 def test_a_body_on_few_points_stands_still(one_device):
@@ -261,7 +262,7 @@ def test_a_body_on_few_points_stands_still(one_device):
     for _ in range(20):
         solver.step(settings("neo-hookean"))
         # Positions of 30 mm have 2e-6 mm in float32, which a step of 1/60 s makes 1e-4 mm/s; it shook with 4 mm/s once.
-        assert np.abs(solver.body.velocity.to_numpy()).max() < 0.05
+        assert np.abs(array_of(solver.body.velocity)).max() < 0.05
     assert np.abs(position(solver) - last).max() < 0.01
 
 

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import taichi as ti
 from conftest import rotation_about
 from plan_ball import SIZE, over_ball, plan_of, straight_pass, sweep_of
 
@@ -13,6 +14,7 @@ from render.actions import begin
 from render.guide_lines import GONE, TO_GO, GuideLines
 from render.keys import Keys
 from render.viewer import Controls, Guidance, Settings
+from sim.fields import array_of
 from studies.rehearse.guide import ABOVE_MM, AHEAD, DEG_BESIDE_A_MM, NEAR_MM, Guide
 from studies.session.history import MOST_UNDONE, History
 from studies.session.session import Session
@@ -262,9 +264,9 @@ class Drawn:
 
     def lines(self, points, width, **colours) -> None:
         colours = {
-            name: getattr(each, "to_numpy", lambda each=each: each)() for name, each in colours.items()
+            name: array_of(each) if isinstance(each, ti.Field) else each for name, each in colours.items()
         }
-        self.given.append((points.to_numpy().astype(float), colours))
+        self.given.append((array_of(points).astype(float), colours))
 
 
 EDGES = solids.edges(SIZE, 0.0)

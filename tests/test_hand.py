@@ -5,6 +5,7 @@ import pytest
 import trimesh
 from conftest import rotation_about
 
+from sim.fields import array_of
 from studies.models import tool_of
 from ultrasound.hand import (
     Grip,
@@ -201,7 +202,7 @@ def test_a_curved_face_touches_where_its_arc_does():
 def test_the_tool_of_a_curved_array_is_its_arc_to_a_tenth_of_a_millimetre(one_device):
     probe = load_probe("curvilinear")
     tool = tool_of(probe)
-    planes = tool.half_space.to_numpy().astype(float)
+    planes = array_of(tool.half_space).astype(float)
     angle = np.radians(np.linspace(probe.theta_start_deg, probe.theta_stop_deg, 61))
     centre = np.array([0.0, 0.0, probe.radius_mm - probe.housing_mm[2] / 2])
     arc = centre + probe.radius_mm * np.column_stack([np.sin(angle), 0 * angle, -np.cos(angle)])

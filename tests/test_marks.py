@@ -8,6 +8,7 @@ import trimesh
 from conftest import rotation_about
 
 from sim.embedding import Unmoved
+from sim.fields import fill
 from studies.coordinates import probe_in_patient
 from ultrasound.hand import image_plane, pose_at
 from ultrasound.marks import Marks
@@ -105,7 +106,7 @@ def test_marks_are_of_where_tissue_was_at_rest(device):
     plane = taken(embedding)
     # Now it lies turned and shifted on the plane: u, v show what was at rest at v + 4, u - 9.
     moved = WORLD @ np.array([[0, 1, 0, 4], [1, 0, 0, -9], [0, 0, -1, 0], [0, 0, 0, 1.0]])
-    embedding.rest_from_plane.from_numpy(moved[None, :3].astype(np.float32))
+    fill((embedding.rest_from_plane, moved[None, :3]))
     marks = Marks(plane, distance_volume(box((14, 6, 10), 30, -12, 0), 1.0)).render()
     assert middle(marks == Mark.ORGAN) == pytest.approx((-12 + 9, 30 - 4), abs=0.25)
     assert np.ptp(V[marks == Mark.ORGAN]) == pytest.approx(14, abs=0.51)

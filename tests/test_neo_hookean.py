@@ -22,6 +22,7 @@ from scipy.linalg import polar
 from scipy.optimize import brentq
 
 from sim.body import Body, BodyState
+from sim.fields import array_of, fill
 from sim.lattice import ERSATZ, Lattice, fill_with_cells
 from sim.neo_hookean import HOURGLASS, LEAST_J, NeoHookean, ln
 from sim.shapes import ConvexTool, Plane
@@ -57,7 +58,7 @@ def forces_of(model: NeoHookean, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     begin(model, DT)
     force, hessian = ti.Vector.field(3, ti.f32, len(x)), ti.Matrix.field(3, 3, ti.f32, len(x))
     measure(model, force, hessian)
-    return force.to_numpy().astype(float), hessian.to_numpy().astype(float)
+    return array_of(force).astype(float), array_of(hessian).astype(float)
 
 
 def small_lattice() -> Lattice:
@@ -122,7 +123,7 @@ def test_the_logarithm_is_exact_to_rounding(one_device):
         np.float32
     )
     given, found = ti.field(ti.f32, len(values)), ti.field(ti.f32, len(values))
-    given.from_numpy(values)
+    fill((given, values))
 
     @ti.kernel
     def ask():
@@ -132,7 +133,7 @@ def test_the_logarithm_is_exact_to_rounding(one_device):
     ask()
     wanted = np.log(values.astype(float))
     # Of the sum of exponent and series each rounds by half a unit, the series' own terms by three more.
-    assert (np.abs(found.to_numpy() - wanted) <= 4 * EPS * np.maximum(np.abs(wanted), 0.35)).all()
+    assert (np.abs(array_of(found) - wanted) <= 4 * EPS * np.maximum(np.abs(wanted), 0.35)).all()
 
 
 def test_a_turned_state_has_turned_forces(one_device):
@@ -178,11 +179,11 @@ def test_a_pass_is_a_gauss_seidel_sweep_of_the_colours(one_device, with_held):
     x = deformed(lattice.nodes, 0.5)
     target = x + np.random.default_rng(6).normal(0, 3.0, x.shape)
     put(model, x)
-    model.body.estimate.from_numpy(target.astype(np.float32))
+    fill((model.body.estimate, target))
     begin(model, DT)
     inertia = DENSITY * lattice.tissue / DT**2
     # It starts from the body moved as a whole, which has a test of its own.
-    x = model.body.estimate.to_numpy().astype(float)
+    x = array_of(model.body.estimate).astype(float)
     y, capped = x.copy(), 0
     project(model, factor, DT)
     for colour, (first, last) in enumerate(model.colours):
@@ -199,10 +200,10 @@ def test_a_pass_is_a_gauss_seidel_sweep_of_the_colours(one_device, with_held):
     # A force's rounding over a node's stiffness, at least mu cell / 4: the share of a cell with an eighth of tissue.
     tolerance = rounding(energy, y) / (energy.mu * 4.0 / 4)
     assert tolerance < 1e-3
-    assert np.abs(model.body.estimate.to_numpy() - y).max() < tolerance
+    assert np.abs(array_of(model.body.estimate) - y).max() < tolerance
     # The cells' F is carried along with the nodes, not made anew.
     carried = np.einsum("mia,mib->mab", y[lattice.cells], lattice.gradient)
-    columns = model.deformation.to_numpy()[:-1, :, :3]
+    columns = array_of(model.deformation)[:-1, :, :3]
     assert np.abs(columns.transpose(0, 2, 1) - carried).max() < tolerance
 
 
@@ -223,7 +224,7 @@ def test_a_held_skin_makes_the_inside_affine_with_the_closed_form_stress(one_dev
     model = NeoHookean(Body(lattice.nodes), lattice, held=held)
     put(model, start)
     Solver(model).step(settings_of(150, time_step_s=10.0))
-    x = model.body.position.to_numpy().astype(float)
+    x = array_of(model.body.position).astype(float)
     energy = Energy(lattice, 0.45)
     assert np.abs(start - affine).max() > 1.0 and (x[held] == affine[held].astype(np.float32)).all()
     # A force's rounding over a whole node's stiffness, mu cell and more, spread by its neighbours, ten times.
@@ -241,13 +242,13 @@ def test_a_held_skin_makes_the_inside_affine_with_the_closed_form_stress(one_dev
 def test_a_fast_spin_is_found_whole_at_once(one_device, ball):
     """Inertia alone draws nodes from x to x + w x r, w = 1 rad a step: the nearest rigid motion is a turn by atan(1)."""
     model = tissue_of(ball, 4.0).model
-    x, mass = model.lattice.nodes, model.mass.to_numpy().astype(float)
+    x, mass = model.lattice.nodes, array_of(model.mass).astype(float)
     centre = mass @ x / mass.sum()
     velocity = np.cross([0.0, 0.0, 1.0 / DT], x - centre) + [30.0, 0.0, 0.0]
     model.body.restore(BodyState(x.astype(np.float32), velocity.astype(np.float32)))
-    model.body.estimate.from_numpy((x + DT * velocity).astype(np.float32))
+    fill((model.body.estimate, (x + DT * velocity)))
     begin(model, DT)
-    found = model.body.estimate.to_numpy()
+    found = array_of(model.body.estimate)
     wanted = centre + (x - centre) @ rotation_about([0, 0, 1], 45).T + DT * np.array([30.0, 0.0, 0.0])
     # Each Newton step leaves 1 - sqrt(2) of the angle before it, so that after one of 1e-4 mm less than that is left.
     assert np.abs(found - wanted).max() < 2e-4
@@ -265,7 +266,7 @@ def test_uniaxial_compression_between_frictionless_plates(one_device, block):
     plate = ConvexTool.cuboid(np.array([80.0, 80.0, 40.0]))
     solver = tissue_of(block, cell, [Plane(np.array([0.0, 0.0, 1.0]), -8.0), plate])
     model, contacts, lattice = solver.model, solver.contacts, solver.model.lattice
-    area = contacts.area.to_numpy()
+    area = array_of(contacts.area)
     for poisson in (0.45, 0.3):
         model.set_material(YOUNG_KPA, poisson)
         put(model, lattice.nodes)
@@ -299,7 +300,7 @@ def test_uniaxial_compression_between_frictionless_plates(one_device, block):
         assert 0 < section < 0.03
         assert np.diag(measured) == pytest.approx([q, q, stretch], abs=section * (1 - stretch))
         assert np.abs(measured - np.diag(np.diag(measured))).max() < section * (1 - stretch)
-        at = np.einsum("pk,pkd->pd", contacts.weight.to_numpy(), x[contacts.node.to_numpy()])[:, 2]
+        at = np.einsum("pk,pkd->pd", array_of(contacts.weight), x[array_of(contacts.node)])[:, 2]
         layer = 1e3 * YOUNG_KPA / LAYER_MM * area
         below, above = (layer * np.maximum(-8 - at, 0)).sum(), (layer * np.maximum(at - gap + 8, 0)).sum()
         # Heights of 8 nodes each, known to an ulp of 16 mm, of a depth of 0.017 mm.

@@ -9,6 +9,7 @@ import trimesh
 from test_contact import begin
 from test_solver import position, solver_of
 
+from sim.fields import array_of, fill
 from sim.shapes import Plane
 from sim.solver import Solver, StepSettings
 
@@ -50,10 +51,10 @@ def test_contacts_of_particles_keep_momentum_of_a_symmetric_hit(kept):
     solver = kept(two_blocks, True, floor=False)
     upper = of_upper(solver)
     velocity = np.where(upper[:, None], [0, 0, -150.0], [0, 0, 150.0])
-    solver.body.velocity.from_numpy(velocity.astype(np.float32))
+    fill((solver.body.velocity, velocity))
     for _ in range(6):
         solver.step(StepSettings(gravity=(0, 0, 0), damping=0.0))
-    v = solver.body.velocity.to_numpy().astype(float)
+    v = array_of(solver.body.velocity).astype(float)
     assert v[upper, 2].mean() > -20
     assert v[~upper, 2].mean() < 20
     # Averaging divides a particle's pushes by its own count: pairs of unlike counts leave a little over.
@@ -65,9 +66,9 @@ def test_neighbours_are_all_that_are_near_in_ascending_order(kept):
     upper = of_upper(solver)
     x = position(solver)
     x[upper, 2] -= 7.0
-    solver.body.position.from_numpy(x.astype(np.float32))
+    fill((solver.body.position, x))
     begin(solver, [0.0, 0.0, 0.0])
-    count, rows = solver.pairs.neighbour_count.to_numpy(), solver.pairs.neighbour.to_numpy()
+    count, rows = array_of(solver.pairs.neighbour_count), array_of(solver.pairs.neighbour)
     apart = np.linalg.norm(x[:, None] - x[None], axis=2)
     patches = solver.model.patches
     of_patch = [set(patches.clusters.members[a:b]) for a, b in pairwise(patches.clusters.offsets)]
@@ -85,9 +86,9 @@ def test_neighbours_are_all_that_are_near_in_ascending_order(kept):
 def pairs_pass(solver: Solver, moved: np.ndarray, factor: float) -> tuple[np.ndarray, int, int]:
     """Estimates (n, 3) after one pass over pairs in float64, and how many of these stick and slide."""
     pairs, body = solver.pairs, solver.body
-    x = moved + body.position.to_numpy()
-    mass = body.mass_scale.to_numpy().astype(float) if body.mass_scaled else np.ones(len(x))
-    row, count = pairs.neighbour.to_numpy(), pairs.neighbour_count.to_numpy()
+    x = moved + array_of(body.position)
+    mass = array_of(body.mass_scale).astype(float) if body.mass_scaled else np.ones(len(x))
+    row, count = array_of(pairs.neighbour), array_of(pairs.neighbour_count)
     change, touching, sticks, slides = np.zeros_like(x), np.zeros(len(x)), 0, 0
     for i in range(len(x)):
         for j in row[i, : count[i]]:
@@ -124,7 +125,7 @@ def test_a_pass_over_pairs_is_the_oracles(one_device, relaxation, scaling):
     top, bottom = np.flatnonzero((x == x[x[:, 2].argmin()]).all(axis=1))
     moved = random.normal(0, 0.05, x.shape) * random.uniform(0, 1, (len(x), 1)) ** 3
     moved[top] = moved[bottom]
-    body.velocity.from_numpy((moved / 0.01).astype(np.float32))
+    fill((body.velocity, (moved / 0.01)))
 
     @ti.kernel
     def project():
@@ -134,15 +135,15 @@ def test_a_pass_over_pairs_is_the_oracles(one_device, relaxation, scaling):
     most = []
     for lift, least in ((0.0, 10), (1.2, 1)):
         x[over, 2] += lift
-        body.position.from_numpy(x.astype(np.float32))
+        fill((body.position, x))
         begin(solver, [0.0, 0.0, -1e-3], 0.01)
-        moved = body.estimate.to_numpy().astype(float) - body.position.to_numpy()
+        moved = array_of(body.estimate).astype(float) - array_of(body.position)
         wanted, sticks, slides = pairs_pass(solver, moved, 1.3)
         assert sticks > least and slides > least
         project()
         most.append(pairs.most_contacts[None])
         # Float32 positions of 10 mm carry 1e-6 mm; a normal of two that are 1 mm apart, as much of its own.
-        assert np.abs(body.estimate.to_numpy() - wanted).max() < 1e-5
+        assert np.abs(array_of(body.estimate) - wanted).max() < 1e-5
     assert most[0] > most[1]
 
 
@@ -151,7 +152,7 @@ def test_a_pair_shares_its_push_by_the_scaled_masses(kept):
     upper = of_upper(solver)
     x = position(solver)
     x[upper, 2] -= 5.0
-    solver.body.position.from_numpy(x.astype(np.float32))
+    fill((solver.body.position, x))
     begin(solver, [0.0, 0.0, -1e-3])
     pairs = solver.pairs
 
@@ -160,7 +161,7 @@ def test_a_pair_shares_its_push_by_the_scaled_masses(kept):
         pairs.project(1.0)
 
     project()
-    moved = np.linalg.norm(solver.body.estimate.to_numpy() - x, axis=1)
+    moved = np.linalg.norm(array_of(solver.body.estimate) - x, axis=1)
     apart = np.linalg.norm(x[upper][:, None] - x[~upper][None], axis=2) < pairs.distance
     top, bottom = np.flatnonzero(upper), np.flatnonzero(~upper)
     alone = [(i, j) for i, j in np.argwhere(apart) if apart[i].sum() == 1 and apart[:, j].sum() == 1]
@@ -178,7 +179,7 @@ def test_scaled_masses_make_the_lower_of_a_pair_the_heavier(kept):
         upper = of_upper(solver)
         start = position(solver)
         start[upper, 2] -= 6.0
-        solver.body.position.from_numpy(start.astype(np.float32))
+        fill((solver.body.position, start))
         solver.step(StepSettings(gravity=(0, 0, -1e-3), damping=0.0))
         change = np.abs(position(solver) - start)[:, 2]
         moved[scaling] = change[~upper].mean() / change[upper].mean()

@@ -19,6 +19,7 @@ from render.panel import OUTLINE, Panel, draw_segments, paste_picture
 from render.viewer import Geometry, Settings, View
 from sim.device import start
 from sim.embedding import Embedding
+from sim.fields import array_of
 from sim.skinning import Skin
 from ultrasound.hand import held_at, image_plane, pose_at
 from ultrasound.outline import section
@@ -89,7 +90,7 @@ class Scene:
         """CT and echo as the panel shows them, with the organ's outline, uint8 (rows, columns, 3) each."""
         shown = self.scanner.look(plane, PROBE, "both", "speckle", 350.0, 40.0)
         outline = section(
-            self.surface.vertices.to_numpy(), self.anatomy.organ.faces, np.linalg.inv(plane.world_from_plane)
+            array_of(self.surface.vertices), self.anatomy.organ.faces, np.linalg.inv(plane.world_from_plane)
         )
         panel, page = Panel(tuple(shown), WIDTH, DEPTH), np.zeros((*SMALL_WINDOW[::-1], 3), np.uint8)
         pasted = {}

@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from plan_ball import SIZE, R, X, Y, Z, big_ball, hand_on
 
+from sim.fields import field_of
 from studies.plan import forecast
 from studies.plan.forecast import Forecast
 from studies.plan.parts import Parts
@@ -22,7 +23,7 @@ class Unmoved:
     """A skin of tissue that has not settled."""
 
     def __init__(self, model: None, places: np.ndarray) -> None:
-        self.vertices = SimpleNamespace(to_numpy=lambda: places.astype(np.float32))
+        self.vertices = field_of(places, 1)
 
     def update(self) -> None: ...
 

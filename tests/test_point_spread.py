@@ -6,6 +6,7 @@ import taichi as ti
 from test_bmode import LINES, flat_tank, probe_of
 
 from sim.device import start
+from sim.fields import array_of
 from ultrasound.point_spread import MOST_LINES, REACH_SD, axial_sd_mm, lateral_sd_mm, lateral_weights
 from ultrasound.probe import Probe
 
@@ -61,7 +62,7 @@ def test_lines_are_spread_by_all_weights_and_mirrored_at_the_arrays_ends():
     weights, half, loudness = lateral_weights(probe)
     assert half.max() > 8 and np.ptp(half) > 4
     real, imaginary = (
-        each.to_numpy().astype(float) for each in (tank.bmode.beams.real, tank.bmode.beams.imaginary)
+        array_of(each).astype(float) for each in (tank.bmode.beams.real, tank.bmode.beams.imaginary)
     )
     ti.reset()
     lines = np.arange(LINES)

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from sim.fields import field_of
 from studies.readings import read
 from ultrasound.probe import load_probe
+
+pytestmark = pytest.mark.usefixtures("one_device")
 
 LINEAR, CURVED = load_probe("linear"), load_probe("curvilinear")
 NOWHERE = np.zeros((0, 2, 2))
@@ -32,7 +35,7 @@ def rehearsed(
     lies = np.asarray(organ.vertices if now is None else now, np.float32)
     return SimpleNamespace(
         organ=organ,
-        organ_skin=SimpleNamespace(vertices=SimpleNamespace(to_numpy=lambda: lies)),
+        organ_skin=SimpleNamespace(vertices=field_of(lies, 1)),
         pose=posed() if pose is None else pose,
         size_mm=np.array(probe.housing_mm),
         tumour=tumour,

@@ -16,6 +16,7 @@ from scenes.reading.ct import open_ct
 from scenes.reading.labels import LabelMap
 from scenes.scene import PAPER, Press, Scene, load_scene, with_options
 from sim.distance import signed_distance
+from sim.fields import array_of
 from sim.skinning import Skin
 from studies.rehearsal import Rehearsal
 from ultrasound.hand import image_plane
@@ -81,11 +82,11 @@ def test_at_rest_the_slice_is_the_ct(one_device, tmp_path, name):
 def test_pressing_moves_the_tissue_and_the_slice_follows(kept):
     rehearsal = kept(pressed_phantom)
     before = rehearsal.look(rehearsal.probe, *LOOK)
-    top = rehearsal.organ_skin.vertices.to_numpy()
+    top = array_of(rehearsal.organ_skin.vertices)
     for step in range(31):
         rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
     rehearsal.update_surfaces()
-    moved = rehearsal.organ_skin.vertices.to_numpy() - top
+    moved = array_of(rehearsal.organ_skin.vertices) - top
     assert rehearsal.indentation_mm() == pytest.approx(12.38)
     assert (moved @ rehearsal.gravity_direction).max() > 6.0
     pressed = rehearsal.look(rehearsal.probe, *LOOK)
@@ -111,7 +112,7 @@ def test_a_pixel_shows_the_tissue_that_is_there_now(kept):
     local = (pixels[:, ::-1] + 0.5) * spacing - [plane.width_mm / 2, 0]
     shown_at = np.column_stack([local, np.zeros(len(local)), np.ones(len(local))]) @ plane.world_from_plane.T
     rest = rehearsal.scanner.plane.rest_grid(rehearsal.scene.image.pixels)[pixels[:, 0], pixels[:, 1]]
-    carried = Skin(rehearsal.model, rest).vertices.to_numpy()
+    carried = array_of(Skin(rehearsal.model, rest).vertices)
     off = np.linalg.norm(carried - shown_at[:, :3], axis=1)
     unmoved = np.linalg.norm(rest - shown_at[:, :3], axis=1)
     assert len(off) > 50 and unmoved.mean() > 2.0
@@ -184,7 +185,7 @@ def test_every_feature_at_once_stays_finite_and_out_of_everything(one_device, tm
         rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
         assert rehearsal.contacts.measure_penetration() <= 1e-3
     rehearsal.update_surfaces()
-    assert np.isfinite(rehearsal.body.position.to_numpy()).all()
+    assert np.isfinite(array_of(rehearsal.body.position)).all()
     assert 0.6 < rehearsal.volume_ratio() < 1.1
 
 
@@ -195,7 +196,7 @@ def test_the_outline_is_the_tumours_border_not_what_is_drawn_of_it(kept):
     outline = rehearsal.tumour_outline()
     plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], 1.0, 1.0)
     flat = np.column_stack([outline.reshape(-1, 2), np.zeros(2 * len(outline)), np.ones(2 * len(outline))])
-    carried = Skin(rehearsal.model, rehearsal.tumour.vertices).vertices.to_numpy()
+    carried = array_of(Skin(rehearsal.model, rehearsal.tumour.vertices).vertices)
     border = trimesh.Trimesh(carried, rehearsal.tumour.faces, process=False)
     away = signed_distance(border.vertices, border.faces, (flat @ plane.world_from_plane.T)[:, :3])[0]
     assert len(outline) > 20 and np.abs(away).max() < 1e-3

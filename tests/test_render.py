@@ -17,6 +17,7 @@ from render.display import display_available, fitted, window_size
 from render.layout import FULL_SIZE, RULER_WIDTH, Layout
 from render.panel import Panel
 from render.viewer import Controls, Geometry, NullViewer, Settings, View
+from sim.fields import fill
 
 BOUNDS = np.array([[-54.0, -33.0, -21.0], [54.0, 27.0, 21.0]])
 LAYOUT = Layout(1280, 720)
@@ -234,7 +235,7 @@ def window():
     ball = trimesh.creation.icosphere(subdivisions=3, radius=ORGAN_MM)
     vertices = ball.vertices.astype(np.float32)
     field = ti.Vector.field(3, ti.f32, shape=len(vertices))
-    field.from_numpy(vertices)
+    fill((field, vertices))
     geometry = Geometry(field, ball.faces.astype(np.int32), np.array([[-45.0] * 3, [45.0] * 3]))
     try:
         opened = Window(geometry, Settings(translucent=False), size=(640, 360), visible=False)
@@ -271,7 +272,7 @@ def test_organ_is_drawn_where_the_camera_projects_it(window):
     empty = opened.picture()
     for shift in ([0.0, 0.0, 0.0], [18.0, 0.0, 0.0], [0.0, 0.0, 15.0]):
         moved = (vertices + np.float32(shift)).astype(np.float32)
-        field.from_numpy(moved)
+        fill((field, moved))
         opened.draw(_far_view())
         picture = opened.picture()
         rows, columns = np.nonzero(np.any(picture != empty, axis=2))

@@ -5,6 +5,7 @@ import pytest
 import taichi as ti
 from scipy.spatial.transform import Rotation
 
+from sim.fields import array_of, fill
 from sim.rotation import nearest_rotation, rotation_near
 
 COUNT = 336_000
@@ -33,9 +34,9 @@ def rotations(values: np.ndarray, guesses: np.ndarray | None = None) -> np.ndarr
     given = ti.Matrix.field(3, 3, ti.f32, len(values))
     guess = ti.Matrix.field(3, 3, ti.f32, len(values))
     found = ti.Matrix.field(3, 3, ti.f32, len(values))
-    given.from_numpy(values)
+    fill((given, values))
     if guesses is not None:
-        guess.from_numpy(guesses.astype(np.float32))
+        fill((guess, guesses))
 
     @ti.kernel
     def extract():
@@ -48,7 +49,7 @@ def rotations(values: np.ndarray, guesses: np.ndarray | None = None) -> np.ndarr
             found[i] = rotation_near(guess[i], given[i])
 
     extract() if guesses is None else extract_near()
-    return found.to_numpy().astype(np.float64)
+    return array_of(found).astype(np.float64)
 
 
 @pytest.mark.parametrize("guess", [None, "any", "near"])

@@ -6,6 +6,7 @@ import trimesh
 from conftest import rotation_about
 
 from sim.embedding import Unmoved
+from sim.fields import array_of
 from ultrasound.acoustics import CORTEX_DB
 from ultrasound.hand import image_plane, pose_at
 from ultrasound.plane import ImagePlane
@@ -50,7 +51,7 @@ def plane_at(above: float = 0.0) -> ImagePlane:
 def echo(scanner: Scanner, plane: ImagePlane) -> np.ndarray:
     """What the middle line holds [dB], but for the gain."""
     scanner.look(plane, PROBE, "b-mode", "reflection", 350.0, 40.0)
-    return scanner.bmode.decibel.to_numpy()[16].astype(float) - PROBE.gain_db()
+    return array_of(scanner.bmode.decibel)[16].astype(float) - PROBE.gain_db()
 
 
 @pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.8, 1.25, 2.0), (2.0, 0.8, 1.25)])

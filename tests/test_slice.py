@@ -14,6 +14,7 @@ from slicing import organ_mask
 
 from sim.body import BodyState
 from sim.embedding import Embedding, Unmoved, tetrahedra_around
+from sim.fields import array_of, fill
 from sim.shape_matching import ShapeMatching
 from sim.skinning import Skin
 from ultrasound.hand import image_plane, pose_at
@@ -152,10 +153,10 @@ def test_under_an_affine_deformation_it_is_the_pull_back_within_the_skins_error(
     # is off by (F - R)(X - c). Pulled back, that is an error of F^-1 (F - R)(X - c) at most, in any tetrahedron.
     u, _, vt = np.linalg.svd(shear)
     skin = embedding.skin
-    centre = np.einsum("vk,vkj->vj", skin.weight.to_numpy(), model.rest_centres[skin.frame.to_numpy()])
-    used = np.unique(cut.plane.owner.to_numpy()[inside])
-    vertices = np.unique(embedding.tetrahedron.to_numpy()[used])
-    off = (skin.rest.to_numpy() - centre)[vertices] @ (np.linalg.inv(shear) @ (shear - u @ vt)).T
+    centre = np.einsum("vk,vkj->vj", array_of(skin.weight), model.rest_centres[array_of(skin.frame)])
+    used = np.unique(array_of(cut.plane.owner)[inside])
+    vertices = np.unique(array_of(embedding.tetrahedron)[used])
+    off = (array_of(skin.rest) - centre)[vertices] @ (np.linalg.inv(shear) @ (shear - u @ vt)).T
     bound = np.linalg.norm(off, axis=1).max() * np.linalg.norm(GRADIENT)
     error = np.abs(cut.hounsfield() - wanted)[inside]
     assert error.max() < bound
@@ -223,11 +224,11 @@ def test_an_unknown_outside_is_refused(kept, ball):
 
 def test_every_pixel_finds_the_tetrahedron_that_holds_it(kept, ball):
     cut, plane, _, embedding = sliced(kept, ball, ramp_image, bent)
-    vertices = embedding.skin.vertices.to_numpy().astype(float)
-    corners = vertices[embedding.tetrahedron.to_numpy()]
+    vertices = array_of(embedding.skin.vertices).astype(float)
+    corners = vertices[array_of(embedding.tetrahedron)]
     edges = np.moveaxis(corners[:, :3] - corners[:, 3:], 1, 2)
     inverse = np.linalg.inv(edges)
-    owner = cut.plane.owner.to_numpy()
+    owner = array_of(cut.plane.owner)
     points = pixel_points(plane, 96)
     for row, column in np.random.default_rng(5).integers(0, 96, (300, 2)):
         weights = np.einsum("tij,tj->ti", inverse, points[row, column] - corners[:, 3])
@@ -245,7 +246,7 @@ def test_no_pixel_falls_between_tetrahedra_where_the_plane_goes_along_their_side
     kept, ball, direction, lateral
 ):
     embedding = kept(embedded, ball).embedding
-    vertices = embedding.skin.rest.to_numpy().astype(float)
+    vertices = array_of(embedding.skin.rest).astype(float)
     centre = vertices[np.linalg.norm(vertices, axis=1).argmin()]
     # Through a vertex amid the ball, with pixels on the edges: 4 mm are 8 of them.
     pose = pose_at(np.zeros(3), np.array(direction, float), np.array(lateral, float), 20.0)
@@ -257,7 +258,7 @@ def test_no_pixel_falls_between_tetrahedra_where_the_plane_goes_along_their_side
         world[:3, :3] = np.roll(axes[:3, :3], int(out.argmax()), axis=1)
         world[:3, 3] = centre - world[:3, :3] @ [0.0, 8.25, 0.0]
         plane.take(ImagePlane(world, 16.5, 16.5))
-        assert (plane.owner.to_numpy() < embedding.count).all()
+        assert (array_of(plane.owner) < embedding.count).all()
 
 
 def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(kept, ball):
@@ -265,13 +266,13 @@ def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(kept
         return x - np.column_stack([0 * x[:, 0], 0 * x[:, 0], 10.0 * (x[:, 2] > 1.0)])
 
     cut, plane, _, embedding = sliced(kept, ball, ramp_image, folded)
-    corners = embedding.skin.vertices.to_numpy().astype(float)[embedding.tetrahedron.to_numpy()]
+    corners = array_of(embedding.skin.vertices).astype(float)[array_of(embedding.tetrahedron)]
     edges = np.moveaxis(corners[:, :3] - corners[:, 3:], 1, 2)
     # What is turned inside out is not taken: the tissue that it was squeezed into is there too.
     solid = np.linalg.det(edges) < -0.1
     inverse = np.zeros_like(edges)
     inverse[solid] = np.linalg.inv(edges[solid])
-    points, owner = pixel_points(plane, 96), cut.plane.owner.to_numpy()
+    points, owner = pixel_points(plane, 96), array_of(cut.plane.owner)
     overlaps = 0
     for row, column in np.argwhere(owner != embedding.count)[::3]:
         weights = np.einsum("tij,tj->ti", inverse, points[row, column] - corners[:, 3])
@@ -288,13 +289,13 @@ def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(kept
     for serial in (False, True):
         cut.plane.owner.fill(-1)
         embedding._locate(serial, *matrices, cut.plane.pixel_mm, cut.plane.first_mm, cut.plane.owner)
-        assert np.array_equal(cut.plane.owner.to_numpy(), owner)
+        assert np.array_equal(array_of(cut.plane.owner), owner)
 
 
 @pytest.mark.parametrize("squash", [(1, 1, 0), (1, 0, 0), (0, 0, 0), (1, 1, -1), (1, 1, 1e-6)])
 def test_flat_collapsed_and_inverted_tissue_still_gives_a_picture(kept, ball, squash):
     cut, _, _, embedding = sliced(kept, ball, ramp_image, lambda x: x * np.array(squash) + [0, 0, 3.0])
-    owner = cut.plane.owner.to_numpy()
+    owner = array_of(cut.plane.owner)
     assert ((owner >= 0) & (owner <= embedding.count)).all()
     assert np.isfinite(cut.hounsfield()).all()
 
@@ -304,8 +305,8 @@ def test_what_lies_around_the_organ_gives_way_to_it_and_far_away_stays(kept, bal
     body = kept(embedded, ball, margin_mm=25.0)
     body.move(body.model.body.rest_points + shift)
     embedding = body.embedding
-    moved = embedding.skin.vertices.to_numpy() - embedding.skin.rest.to_numpy()
-    away = np.linalg.norm(embedding.skin.rest.to_numpy(), axis=1) - 12.0
+    moved = array_of(embedding.skin.vertices) - array_of(embedding.skin.rest)
+    away = np.linalg.norm(array_of(embedding.skin.rest), axis=1) - 12.0
     assert np.abs(moved[away < 2 * RADIUS] - shift).max() < 1e-4
     assert np.abs(moved[away > 26.0]).max() < 1e-4
     between = (away > 10.0) & (away < 20.0)
@@ -316,14 +317,14 @@ def test_surroundings_that_fold_over_the_organ_do_not_cover_it(kept, ball):
     embedding = kept(embedded, ball, margin_mm=25.0).embedding
     cut = cut_of(embedding, ball, ramp_image, 96, "background")
     cut.plane.take(oblique_plane())
-    organ, owner = organ_mask(cut), cut.plane.owner.to_numpy()
-    vertices = embedding.skin.vertices.to_numpy()
-    outside = np.linalg.norm(embedding.skin.rest.to_numpy(), axis=1) > 12.0 + 2 * RADIUS * np.sqrt(3)
+    organ, owner = organ_mask(cut), array_of(cut.plane.owner)
+    vertices = array_of(embedding.skin.vertices)
+    outside = np.linalg.norm(array_of(embedding.skin.rest), axis=1) > 12.0 + 2 * RADIUS * np.sqrt(3)
     vertices[outside & (vertices[:, 2] > 0)] -= [0.0, 0.0, 26.0]
-    embedding.skin.vertices.from_numpy(vertices)
+    fill((embedding.skin.vertices, vertices))
     cut.plane.take(oblique_plane())
-    assert organ.sum() > 1000 and (cut.plane.owner.to_numpy() != owner)[~organ].sum() > 100
-    assert (cut.plane.owner.to_numpy() == owner)[organ].all()
+    assert organ.sum() > 1000 and (array_of(cut.plane.owner) != owner)[~organ].sum() > 100
+    assert (array_of(cut.plane.owner) == owner)[organ].all()
 
 
 def test_what_does_not_move_is_shown_where_it_lies(kept, ball):
@@ -354,7 +355,7 @@ def test_tetrahedra_fill_the_organ_without_gaps(ball):
 def test_skin_weights_fall_off_with_the_inverse_square(kept, ball):
     model = kept(embedded, ball).model
     skin = Skin(model, ball.vertices)
-    frame, weight = skin.frame.to_numpy(), skin.weight.to_numpy()
+    frame, weight = array_of(skin.frame), array_of(skin.weight)
     assert frame.shape[1] == 4
     assert weight.sum(axis=1) == pytest.approx(np.ones(len(weight)), abs=1e-6)
     squared = ((ball.vertices[:, None] - model.rest_centres[frame]) ** 2).sum(axis=2)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from particle_tissue import tissue_of
 
+from sim.fields import array_of, fill
 from sim.neighbours import ParticleContacts
 from sim.shapes import ConvexTool, Plane, SignedDistanceField
 from sim.solver import Solver, StepSettings
@@ -38,7 +39,7 @@ def in_bowl(mesh) -> Solver:
 
 
 def position(solver: Solver) -> np.ndarray:
-    return solver.body.position.to_numpy().astype(np.float64)
+    return array_of(solver.body.position).astype(np.float64)
 
 
 @pytest.mark.parametrize("damping", [0.0, 12.0])
@@ -79,10 +80,10 @@ def test_linear_momentum_is_kept_without_contact_and_gravity(kept, block, relaxa
     solver = kept(solver_of, block, relaxation=relaxation)
     x = position(solver)
     velocity = np.cross([0.0, 2.0, 9.0], x) + 40 * np.sin(x[:, [1, 2, 0]]) + [100.0, 50.0, 20.0]
-    solver.body.velocity.from_numpy(velocity.astype(np.float32))
+    fill((solver.body.velocity, velocity))
     for _ in range(10):
         solver.step(StepSettings(gravity=(0, 0, 0), damping=0.0, stiffness=0.7))
-    later = solver.body.velocity.to_numpy().astype(np.float64)
+    later = array_of(solver.body.velocity).astype(np.float64)
     # A cluster's frame rounds by three operations at 40 mm (4e-6 mm), for all its members and the nine passes of a
     # substep alike; over clusters and the thirty substeps it adds at random.
     spread = solver.body.count / solver.model.count**0.5
@@ -98,10 +99,10 @@ def test_angular_momentum_is_kept_to_the_order_of_the_scheme(kept, block):
         solver = kept(solver_of, block)
         x = position(solver)
         velocity = np.cross([0.0, 0.0, turning], x - x.mean(axis=0))
-        solver.body.velocity.from_numpy(velocity.astype(np.float32))
+        fill((solver.body.velocity, velocity))
         for _ in range(steps):
             solver.step(StepSettings(gravity=(0, 0, 0), damping=0.0, stiffness=1.0, substeps=substeps))
-        y, v = position(solver), solver.body.velocity.to_numpy().astype(np.float64)
+        y, v = position(solver), array_of(solver.body.velocity).astype(np.float64)
         before = np.cross(x - x.mean(axis=0), velocity)[:, 2].sum()
         lost.append(1 - np.cross(y - y.mean(axis=0), v)[:, 2].sum() / before)
     # From 2 x - x_before the projection turns by w h (1 - (w h)^2): that much is lost a substep, h w^2 t in all.
@@ -116,7 +117,7 @@ def test_stiffness_one_moves_a_small_body_rigidly(one_device):
     solver = solver_of(trimesh.creation.icosphere(subdivisions=2, radius=4.0), radius=2.0)
     assert solver.model.count <= 3
     before = position(solver)
-    solver.body.velocity.from_numpy(np.random.default_rng(0).normal(0, 200, before.shape).astype(np.float32))
+    fill((solver.body.velocity, np.random.default_rng(0).normal(0, 200, before.shape)))
     for _ in range(5):
         solver.step(StepSettings(stiffness=1.0, gravity=(0, 0, 0)))
     after = position(solver)
@@ -136,7 +137,7 @@ def slide(kept, block, slope_deg: float, friction: float = 0.35) -> tuple[float,
     for steps in (8, 12):
         for _ in range(steps):
             solver.step(settings)
-        speeds.append(solver.body.velocity.to_numpy().astype(float)[:, 0].mean())
+        speeds.append(array_of(solver.body.velocity).astype(float)[:, 0].mean())
     return (speeds[1] - speeds[0]) / 0.2 / G, speeds[1]
 
 
@@ -167,14 +168,14 @@ def test_the_tool_goes_along_its_poses_and_stays_where_it_came_to(kept, block, s
     poses[:, :3, 3] = 30.0 + np.array([[0.0], [0.5], [1.5], [3.5]]) * [1.0, -2.0, 3.0]
     for given, motion in ((poses, [2.0, -4.0, 6.0]), (None, [0.0] * 3)):
         solver.step(StepSettings(substeps=3, iterations=1), given)
-        assert np.array_equal(tool.pose.to_numpy(), poses[-1].astype(np.float32))
+        assert np.array_equal(array_of(tool.pose), poses[-1].astype(np.float32))
         # Back to where it was a substep before.
-        assert tool.step_back.to_numpy()[:3, 3] == pytest.approx(-np.array(motion), abs=1e-5)
+        assert array_of(tool.step_back)[:3, 3] == pytest.approx(-np.array(motion), abs=1e-5)
 
 
 def test_sliding_over_a_curved_surface_does_not_sink_in(kept, ball):
     solver = kept(in_bowl, ball)
-    radius = solver.body.contact_radius.to_numpy().astype(float)
+    radius = array_of(solver.body.contact_radius).astype(float)
     deepest, first = 0.0, position(solver)
     for step in range(30):
         angle = 0.1 * step
@@ -200,7 +201,7 @@ def test_over_relaxation_is_stable(kept, ball, iterations, factor):
     for _ in range(40):
         solver.step(settings)
     assert np.abs(position(solver)).max() < 40
-    assert np.abs(solver.body.velocity.to_numpy()).max() < 2000
+    assert np.abs(array_of(solver.body.velocity)).max() < 2000
 
 
 def test_over_relaxation_converges_faster(kept, ball):

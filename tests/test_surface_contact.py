@@ -7,6 +7,7 @@ import trimesh
 from lattice_tissue import DENSITY, YOUNG_KPA, G, jacobians, lifted, position, put, settings_of, tissue_of
 
 from sim.body import BodyState
+from sim.fields import array_of, fill
 from sim.shapes import ConvexTool, Plane, SignedDistanceField
 from sim.surface_contact import LAYER_MM, NEAR_MM, REACH_MM, STICK
 
@@ -58,7 +59,7 @@ def contact_force(solver, settings) -> np.ndarray:
     solver.launch_start(0, settings.time_step_s, *settings.gravity, settings.damping, 0)
     out = ti.Vector.field(3, ti.f32, solver.body.count)
     push(solver.contacts, out)
-    return out.to_numpy().astype(float).sum(axis=0)
+    return array_of(out).astype(float).sum(axis=0)
 
 
 def weight(solver) -> float:
@@ -85,7 +86,7 @@ def test_friction_holds_below_its_angle_and_slides_above(one_device, block):
         speed = []
         for _ in range(2):
             rest(solver, 40, settings)
-            speed.append(solver.body.velocity.to_numpy()[:, 0].mean())
+            speed.append(array_of(solver.body.velocity)[:, 0].mean())
         force = contact_force(solver, settings) / weight(solver)
         # Gravity draws with sin(angle); Coulomb's friction is at most 0.35 cos(angle), 5 % less one degree beyond.
         held = min(np.sin(angle), FRICTION * np.cos(angle))
@@ -137,22 +138,22 @@ def test_a_shape_whose_distances_end_is_met_by_what_came_from_beyond_them(one_de
     for above, is_near in ((15.0, False), (1.0, True), (15.0, False)):
         put(solver.model, solver.body.rest_points + [0.0, 0.0, above])
         solver.launch_start(0, 1e-3, 0.0, 0.0, 0.0, 0.0, 0)
-        assert (solver.contacts.near.to_numpy() > 0).any() == is_near
+        assert (array_of(solver.contacts.near) > 0).any() == is_near
 
 
 def test_what_a_tool_holds_moves_with_it(kept, dome):
     solver = kept(pressed_dome, dome)
     press(solver, 2.0, settings_of(20, DOWN), 30)
     contacts, aside = solver.contacts, 0.1
-    before = contacts.point.to_numpy().astype(float)
+    before = array_of(contacts.point).astype(float)
     for step in range(10):
         poses = np.array([lifted(20.0), lifted(20.0)])
         poses[:, 0, 3] = aside * np.array([step, step + 1]) / 10
         solver.step(settings_of(40, DOWN), poses)
-    moved = contacts.point.to_numpy()[:, 0] - before[:, 0]
-    depth = contacts.point.to_numpy()[:, 2].astype(float) - 10.0
+    moved = array_of(contacts.point)[:, 0] - before[:, 0]
+    depth = array_of(contacts.point)[:, 2].astype(float) - 10.0
     most = FRICTION * depth / STICK
-    held = (depth > 0) & (np.linalg.norm(contacts.stick.to_numpy()[1], axis=1) < 0.8 * most)
+    held = (depth > 0) & (np.linalg.norm(array_of(contacts.stick)[1], axis=1) < 0.8 * most)
     assert held.sum() > 3 and most[held].max() < aside / 2
     # They go the tool's way but for the bending of their sticks, at most friction times depth over STICK each way.
     assert (np.abs(moved - aside) < 2 * most)[held].all()
@@ -179,12 +180,12 @@ def layer_of(contacts, s: int, x: np.ndarray, shifted: np.ndarray, slid: np.ndar
     """Force (p, 3) [uN] and stiffness (p, 3, 3) of shape s on points at x (p, 3) in float64, where its planes were shifted by so
     much since they were found and points slid on it by ``slid`` (p, 3); which touch, and which of these slide.
     """
-    plane, near = contacts.plane.to_numpy()[s].astype(float), (contacts.near.to_numpy() >> s & 1) == 1
-    normal, stick = plane[:, :3], contacts.stick.to_numpy()[s].astype(float) + slid
+    plane, near = array_of(contacts.plane)[s].astype(float), (array_of(contacts.near) >> s & 1) == 1
+    normal, stick = plane[:, :3], array_of(contacts.stick)[s].astype(float) + slid
     depth = np.where(near, np.maximum(plane[:, 3] - ((x - shifted) * normal).sum(axis=1), 0.0), 0.0)
     stick -= (stick * normal).sum(axis=1, keepdims=True) * normal
     share = np.minimum(FRICTION * depth / STICK / np.maximum(np.linalg.norm(stick, axis=1), 1e-12), 1.0)
-    layer = np.where(depth > 0, 1e3 * YOUNG_KPA / LAYER_MM * contacts.area.to_numpy(), 0.0)
+    layer = np.where(depth > 0, 1e3 * YOUNG_KPA / LAYER_MM * array_of(contacts.area), 0.0)
     force = layer[:, None] * (depth[:, None] * normal - STICK * share[:, None] * stick)
     out = np.einsum("pi,pj->pij", normal, normal)
     stiffness = layer[:, None, None] * (out + (STICK * share)[:, None, None] * (np.eye(3) - out))
@@ -199,23 +200,23 @@ def test_forces_and_stiffnesses_are_the_laws_of_the_layer(kept, dome):
     poses = np.array([lifted(20.0), lifted(20.0)])
     poses[1, :3, 3] += motion
     tool.move(*poses)
-    known = contacts.point.to_numpy().astype(float)
+    known = array_of(contacts.point).astype(float)
     places = known + np.random.default_rng(9).normal(0, 0.02, known.shape)
     at = ti.Vector.field(3, ti.f32, contacts.count)
-    at.from_numpy(places.astype(np.float32))
+    fill((at, places))
     pushed, held = (ti.Matrix.field(4, 3, ti.f32, n) for n in (solver.body.count, contacts.count))
     ask(contacts, pushed, held, at)
     # Rounding of 1e-6 mm is a few thousandths of a percent of the deepest, and of the longest stick.
-    pushed, held = (each.to_numpy().astype(float) for each in (pushed, held))
+    pushed, held = (array_of(each).astype(float) for each in (pushed, held))
     ways = np.zeros(3), motion
     laws = [layer_of(contacts, s, places, way, places - known - way) for s, way in enumerate(ways)]
     assert all(law[2].sum() > 5 for law in laws) and 3 < sum(law[3].sum() for law in laws) < 100
     wanted = np.concatenate([sum(law[0] for law in laws)[:, None], sum(law[1] for law in laws)], axis=1)
     assert (np.abs(held - wanted).max(axis=(0, 2)) < 1e-3 * np.abs(wanted).max(axis=(0, 2))).all()
     # At the nodes: of points where they are, on planes that were found where the shapes are.
-    start = contacts.start.to_numpy().astype(float)
+    start = array_of(contacts.start).astype(float)
     laws = [layer_of(contacts, s, known, np.zeros(3), known - start - way) for s, way in enumerate(ways)]
-    weight, node = contacts.weight.to_numpy().astype(float), contacts.node.to_numpy()
+    weight, node = array_of(contacts.weight).astype(float), array_of(contacts.node)
     wanted = np.zeros_like(pushed)
     for law in laws:
         np.add.at(wanted[:, 0], node, weight[..., None] * law[0][:, None])
@@ -227,9 +228,9 @@ def test_points_are_where_their_nodes_carry_them_whatever_was_over_relaxed(kept,
     solver = kept(pressed_dome, dome)
     press(solver, 2.0, settings_of(4, DOWN), 5)
     contacts = solver.contacts
-    carried = np.einsum("pk,pkd->pd", contacts.weight.to_numpy(), position(solver)[contacts.node.to_numpy()])
+    carried = np.einsum("pk,pkd->pd", array_of(contacts.weight), position(solver)[array_of(contacts.node)])
     # A pass adds eight changes to a point, each with its rounding.
-    assert np.abs(contacts.point.to_numpy() - carried).max() < 4 * 8 * ULP_MM
+    assert np.abs(array_of(contacts.point) - carried).max() < 4 * 8 * ULP_MM
 
 
 def test_what_lets_go_forgets_how_it_was_bent(kept, dome):
@@ -238,9 +239,9 @@ def test_what_lets_go_forgets_how_it_was_bent(kept, dome):
     poses = np.array([lifted(20.0), lifted(20.0)])
     poses[1, 0, 3] = 0.1
     solver.step(settings_of(20, DOWN), poses)
-    assert (np.linalg.norm(solver.contacts.stick.to_numpy()[1], axis=1) > 1e-3).sum() > 3
+    assert (np.linalg.norm(array_of(solver.contacts.stick)[1], axis=1) > 1e-3).sum() > 3
     rest(solver, 2, settings_of(20, DOWN), AWAY)
-    assert (solver.contacts.stick.to_numpy()[1] == 0).all()
+    assert (array_of(solver.contacts.stick)[1] == 0).all()
 
 
 def beads(solver, x: np.ndarray) -> np.ndarray:
@@ -256,7 +257,7 @@ def at_rest(solver, seconds=1.0, **changed) -> np.ndarray:
     press(solver, 3.0, settings, round(0.5 / settings.time_step_s))
     hold = np.array([lifted(19.0)] * (settings.substeps + 1))
     rest(solver, round((seconds - 0.5) / settings.time_step_s), settings, hold)
-    assert np.abs(solver.body.velocity.to_numpy()).max() < 0.05
+    assert np.abs(array_of(solver.body.velocity)).max() < 0.05
     return beads(solver, position(solver))
 
 
@@ -282,7 +283,7 @@ def test_rest_moves_little_with_the_cells(kept, dome):
 
 
 def bits(solver) -> bytes:
-    return solver.body.position.to_numpy().tobytes() + solver.body.velocity.to_numpy().tobytes()
+    return array_of(solver.body.position).tobytes() + array_of(solver.body.velocity).tobytes()
 
 
 def test_a_restored_state_goes_on_with_the_same_bits(kept, dome):
@@ -366,7 +367,7 @@ def test_inverted_cells_find_back(kept, dome, poisson):
         rest(solver, 10, settings_of(8, DOWN), np.array([lifted(22.0 - depth)] * 2))
         # The skin stays about as wide as twice the dome; it has nowhere else to go.
         assert np.isfinite(position(solver)).all()
-        assert np.abs(solver.contacts.point.to_numpy()).max() < 24
+        assert np.abs(array_of(solver.contacts.point)).max() < 24
         recovers(solver, wanted)
 
 

@@ -10,6 +10,7 @@ from test_solver import position, solver_of
 
 from scenes.anatomy import load_anatomy
 from sim.device import start
+from sim.fields import array_of
 from sim.shapes import ConvexTool, Plane
 from sim.solver import StepSettings
 from studies.rehearsal import Rehearsal
@@ -24,7 +25,7 @@ def pressed(mesh, threads: int, serial: bool) -> bytes:
     for step in range(20):
         poses[:, 2, 3] = 17.0 - 0.3 * (step + np.arange(4) / 3)
         solver.step(StepSettings(), poses)
-    return position(solver).tobytes() + solver.body.velocity.to_numpy().tobytes()
+    return position(solver).tobytes() + array_of(solver.body.velocity).tobytes()
 
 
 @pytest.mark.parametrize("serial", [True, False])

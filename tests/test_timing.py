@@ -13,6 +13,7 @@ from PIL import Image
 
 import app
 from sim.body import BodyState
+from sim.fields import array_of
 from sim.neighbours import ParticleContacts
 from sim.neo_hookean import LATTICE_SETTINGS
 from sim.shapes import ConvexTool, Plane
@@ -44,7 +45,7 @@ def test_a_step_in_pieces_is_the_step(device, ball, model):
         for n in range(10):
             poses[:, 2, 3] = 17.5 - 0.3 * (n + np.linspace(0, 1, settings.substeps + 1))
             step(settings, poses)
-        ends.append(solver.body.position.to_numpy().astype(float))
+        ends.append(array_of(solver.body.position).astype(float))
     assert np.abs(ends[0] - solver.body.rest_points).max() > 1.0
     # Compiled otherwise, sums round otherwise: 1e-6 mm a pass at 12 mm, in a hundred passes that do not forget it.
     assert np.abs(ends[1] - ends[0]).max() < 1e-3
@@ -82,7 +83,7 @@ def test_the_bound_in_c_computes_what_shape_matching_does(device, block):
     assert plain.run(3, 2) > 0
     assert np.abs(plain.x - x).max() > 1e-3
     # Both round at 15 mm, 1e-6 mm, in each of the operations of three passes.
-    assert np.abs(model.body.estimate.to_numpy() - plain.x).max() < 3e-5
+    assert np.abs(array_of(model.body.estimate) - plain.x).max() < 3e-5
 
 
 def test_memory_is_that_of_the_fields(device, block):

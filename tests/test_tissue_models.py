@@ -15,6 +15,7 @@ from scenes.tissue import QUALITIES, TISSUES, TissueSection
 from sim.body import BodyState
 from sim.device import start
 from sim.embedding import Embedding
+from sim.fields import array_of
 from sim.guard import Guard
 from sim.shapes import ConvexTool, Plane
 from sim.skinning import Skin
@@ -64,12 +65,12 @@ class Subject:
             self.solver.step(settings, np.stack([lifted(z) for z in way[n : n + settings.substeps + 1]]))
 
     def position(self) -> np.ndarray:
-        return self.solver.body.position.to_numpy().astype(float)
+        return array_of(self.solver.body.position).astype(float)
 
     def surface(self) -> np.ndarray:
         """Where the points of the surface are now (n, 3)."""
         self.skin.update()
-        return self.skin.vertices.to_numpy().astype(float)
+        return array_of(self.skin.vertices).astype(float)
 
     def bits(self) -> bytes:
         state = self.solver.body.snapshot()
@@ -190,7 +191,7 @@ def test_the_same_bits_whatever_the_threads(model):
         start("cpu", cpu_max_num_threads=threads)
         ball = ball_of(model, True, serial=False)
         # Nothing has moved yet, and nothing that is carried.
-        assert np.abs(ball.skin.vertices.to_numpy() - ball.mesh.vertices).max() < 10 * ROUNDING_MM
+        assert np.abs(array_of(ball.skin.vertices) - ball.mesh.vertices).max() < 10 * ROUNDING_MM
         ball.press(ball.settings(G), 18.0, 13.0, 12)
         found.append(ball.bits())
         ti.reset()
@@ -219,8 +220,8 @@ def test_points_are_carried_as_the_body_is(free):
     # So is what carries the image plane.
     embedding = Embedding(free.solver.model, free.mesh, embedding_cell_mm(free.tissue))
     embedding.update()
-    vertices = embedding.skin.rest.to_numpy() @ turn.T + way
-    assert np.abs(embedding.skin.vertices.to_numpy() - vertices).max() < 1e-4
+    vertices = array_of(embedding.skin.rest) @ turn.T + way
+    assert np.abs(array_of(embedding.skin.vertices) - vertices).max() < 1e-4
 
 
 def test_pressed_it_gives_way_and_comes_back(laid):

@@ -7,6 +7,7 @@ import taichi.math as tm
 import trimesh
 from conftest import rotation_about
 
+from sim.fields import array_of, fill
 from ultrasound.plane import LANES, Lanes
 from ultrasound.volume import Volume, distance_volume
 
@@ -19,7 +20,7 @@ def test_a_volume_of_vectors_is_sampled_as_each_of_its_parts(device):
     points = np.random.default_rng(3).uniform(-1.0, 4.0, (200, 3)).astype(np.float32)
     given, found = ti.Vector.field(3, ti.f32, len(points)), ti.Vector.field(2, ti.f32, len(points))
     apart = ti.Vector.field(2, ti.f32, len(points))
-    given.from_numpy(points)
+    fill((given, points))
 
     @ti.kernel
     def ask():
@@ -30,8 +31,8 @@ def test_a_volume_of_vectors_is_sampled_as_each_of_its_parts(device):
 
     ask()
     # The compiler may fuse the same sums differently: rounding of values of 4, at a place rounded to 1e-6 of a voxel.
-    assert found.to_numpy() == pytest.approx(apart.to_numpy(), abs=1e-5)
-    assert (found.to_numpy() != -1000.0).any() and (found.to_numpy() == -1000.0).any()
+    assert array_of(found) == pytest.approx(array_of(apart), abs=1e-5)
+    assert (array_of(found) != -1000.0).any() and (array_of(found) == -1000.0).any()
 
 
 @pytest.mark.parametrize("shape", [(6, 5, 4), (6, 1, 4)])
@@ -76,7 +77,7 @@ def test_the_slope_of_a_volume_is_that_of_its_trilinear_value(device):
     inside = inside[(np.abs(inside - np.rint(inside)) > 0.02).all(axis=1)]
     points = inside @ np.linalg.inv(index_from_mm[:3, :3]).T
     given, slope = ti.Vector.field(3, ti.f32, len(points)), ti.Vector.field(3, ti.f32, len(points))
-    given.from_numpy(points.astype(np.float32))
+    fill((given, points))
 
     @ti.kernel
     def ask():
@@ -97,7 +98,7 @@ def test_the_slope_of_a_volume_is_that_of_its_trilinear_value(device):
     step = 1e-4 * np.eye(3)
     wanted = np.column_stack([(value(points + h) - value(points - h)) / 2e-4 for h in step])
     # Along one axis a trilinear value is a cubic at most; float32 of values of 4 over a voxel.
-    assert slope.to_numpy() == pytest.approx(wanted, abs=1e-4)
+    assert array_of(slope) == pytest.approx(wanted, abs=1e-4)
 
 
 def test_a_volume_is_trilinear_between_voxels_and_ends_half_a_voxel_beyond(device):
@@ -108,7 +109,7 @@ def test_a_volume_is_trilinear_between_voxels_and_ends_half_a_voxel_beyond(devic
     )
     given = ti.Vector.field(3, ti.f32, len(points))
     found = ti.field(ti.f32, len(points))
-    given.from_numpy(points)
+    fill((given, points))
 
     @ti.kernel
     def ask():
@@ -119,7 +120,7 @@ def test_a_volume_is_trilinear_between_voxels_and_ends_half_a_voxel_beyond(devic
     cell = voxels[1:3, 2:4, 0:2].astype(float)
     mixed = np.einsum("ijk,i,j,k->", cell, [0.75, 0.25], [0.5, 0.5], [0.25, 0.75])
     wanted = [voxels[0, 0, 0], voxels[4, 3, 2], mixed, voxels[0, 1, 1], -7.0, -7.0]
-    assert found.to_numpy() == pytest.approx(np.array(wanted), abs=1e-5)
+    assert array_of(found) == pytest.approx(np.array(wanted), abs=1e-5)
 
 
 def test_a_volume_of_one_slice_is_sampled_within_its_thickness(device):
@@ -132,12 +133,12 @@ def test_a_volume_of_one_slice_is_sampled_within_its_thickness(device):
         found[1] = volume.sample(ti.Vector([1.2, 0.7, 0.7]))
 
     ask()
-    assert found.to_numpy() == pytest.approx([5.0, -1000.0])
+    assert array_of(found) == pytest.approx([5.0, -1000.0])
 
 
 def test_distance_volume_is_signed(device, ball):
     volume = distance_volume(trimesh.creation.icosphere(subdivisions=4, radius=10.0), 1.0)
-    found, axis = volume.voxels.to_numpy().reshape(volume.count), np.arange(volume.count[0]) - 16.0
+    found, axis = array_of(volume.voxels).reshape(volume.count), np.arange(volume.count[0]) - 16.0
     expected = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij")), axis=0) - 10.0
     near = np.abs(expected) < 4.5
     # The facets lie up to 0.03 mm within the ball.

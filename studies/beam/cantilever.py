@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sim.body import Body
+from sim.fields import array_of
 from sim.lattice import fill_block
 from sim.neo_hookean import NeoHookean
 from sim.solver import Solver, StepSettings
@@ -97,7 +98,7 @@ class Cantilever:
 
     def displacement(self) -> np.ndarray:
         """Of the markers (n, 3) [mm], now. Raises BeamError where the computation failed."""
-        moved = self.body.position.to_numpy().astype(float) - self.body.rest_points
+        moved = array_of(self.body.position).astype(float) - self.body.rest_points
         if not np.isfinite(moved).all():
             raise BeamError("the computed beam flies apart; choose a lower --poisson or a higher --young-kpa")
         feet = np.einsum("nk,nkd->nd", self.weight, moved[self.frame])

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from sim.distance_grid import distance_grid
+from sim.fields import array_of
 from sim.skinning import Skin
 from studies.plan.parts import Parts, incidence_deg, path_mm
 from studies.plan.reach import Reach
@@ -28,7 +29,7 @@ class Forecast:
         places = coverage.places(target)
         settled = Skin(rehearsal.model, places[:: -(-len(places) // PLACES)])
         settled.update()
-        self._places = settled.vertices.to_numpy().astype(float)
+        self._places = array_of(settled.vertices).astype(float)
         self._distance, self._low_mm = distance_grid(self.hand.vertices, self.hand.faces, VOXEL_MM, REACH_MM)
         probe = rehearsal.probe
         elements = probe.elements()

@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from sim.fields import array_of
 from studies.plan.parts import Parts, faces_of, incidence_deg
 from studies.plan.reach import Reach
 from studies.plan.track import DEG_A_MM, LIFT_MM
@@ -91,7 +92,7 @@ class Trial:
         gap = rehearsal.scene.image.contact_gap_mm
         touches = self.coverage.look(self.plane.rest_grid(PLACES), rehearsal.probe, gap)
         rehearsal.organ_skin.update()
-        now = rehearsal.organ_skin.vertices.to_numpy().astype(float)
+        now = array_of(rehearsal.organ_skin.vertices).astype(float)
         organ, probe = rehearsal.organ, rehearsal.probe
         pressed = pressing(
             rehearsal.pose, rehearsal.size_mm, probe.radius_mm, now, np.asarray(organ.vertices), organ.faces

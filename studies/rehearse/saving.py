@@ -9,6 +9,7 @@ from PIL import Image
 
 from render.viewer import View
 from scenes.surface_files import save_surface
+from sim.fields import array_of
 from studies.numbering import next_number
 from studies.pictures import save_picture, save_pictures
 from studies.rehearsal import Rehearsal
@@ -35,7 +36,7 @@ def save_view(view: View, probe: Probe, out: Path) -> str:
 
 def save_surfaces(rehearsal: Rehearsal, out: Path, begin: str = "") -> None:
     """Save organ and tumour as they lie (PLY, mm, LPS), and say where; their vertices are those of the surfaces at rest, in order."""
-    lying = {"organ": (rehearsal.organ, rehearsal.organ_skin.vertices.to_numpy())}
+    lying = {"organ": (rehearsal.organ, array_of(rehearsal.organ_skin.vertices))}
     if rehearsal.tumour is not None:
         lying["tumour"] = rehearsal.tumour, rehearsal.tumour_vertices()
     for name, (rest, vertices) in lying.items():

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
 from sim.device import start
+from sim.fields import array_of
 from studies.rehearsal import Rehearsal, RehearsalState
 from studies.rigid_fit import apart_after_fit
 from studies.setup import Setup, scene_of
@@ -82,7 +83,7 @@ def _minute(rehearsal: Rehearsal, minute: int, minute_s: float, first: Rehearsal
             goal = next(goals)
         timed(lambda: rehearsal.advance(rehearsal.pose_towards(goal)), ms)
         fallbacks += bool(rehearsal.notice)
-    position = rehearsal.body.position.to_numpy().astype(float)
+    position = array_of(rehearsal.body.position).astype(float)
     rest = first.solver.body.position.astype(float)
     rehearsal.update_surfaces()
     return dict(

@@ -9,6 +9,7 @@ from scenes.anatomy import load_anatomy
 from scenes.scene import PAPER, Contact, SolverSection, load_scene, with_options
 from scenes.tissue import TISSUES
 from sim.device import start
+from sim.fields import array_of
 from sim.guard import Guard
 from sim.neo_hookean import LATTICE_SETTINGS, NeoHookean
 from sim.shapes import ConvexTool, Plane
@@ -52,23 +53,23 @@ class Specimen:
         self.settled = self.guard.home
         self.rest = self.settled.body.position.astype(float)
         skin.update()
-        surface = skin.vertices.to_numpy().astype(float)
+        surface = array_of(skin.vertices).astype(float)
         along = (surface - home[:3, 3]) @ home[:3, 2]
         self.thickness_mm = float(np.ptp(along))
 
     def _masses(self) -> np.ndarray:
         if isinstance(self.model, NeoHookean):
-            return self.model.mass.to_numpy().astype(float)
+            return array_of(self.model.mass).astype(float)
         return np.full(self.body.count, DENSITY * self.volume / self.body.count)
 
     def volume_ratio(self) -> float:
         """Volume inside the carried surface, as a share of the resting one."""
         self.skin.update()
-        return volume_mm3(self.skin.vertices.to_numpy(), self.faces) / self.volume
+        return volume_mm3(array_of(self.skin.vertices), self.faces) / self.volume
 
     def kinetic_mj(self) -> float:
         """Kinetic energy now [mJ]."""
-        velocity = self.body.velocity.to_numpy().astype(float)
+        velocity = array_of(self.body.velocity).astype(float)
         return float(0.5e-6 * self.mass @ (velocity**2).sum(axis=1))
 
 
@@ -88,7 +89,7 @@ def prepared(model: str, subject: Subject) -> Specimen:
     settings.gravity = DOWN
     _settle(solver, settings, tool)
     skin.update()
-    surface = skin.vertices.to_numpy().astype(float)
+    surface = array_of(skin.vertices).astype(float)
     top = surface[:, :2].mean(axis=0)
     pose = pose_at(np.array([*top, 100.0]), np.array([0.0, 0, -1]), np.array([1.0, 0, 0]), TRANSDUCER_MM[2])
     specimen = Specimen(solver, skin, mesh, settings, touching(pose, TRANSDUCER_MM, surface))
@@ -155,5 +156,5 @@ def _settle(solver: Solver, settings: StepSettings, tool: ConvexTool) -> None:
         for _ in range(SETTLE_STEPS):
             solver.step(settings)
         # A cell that falls alone tumbles on for seconds, on some processors longer than on others.
-        if np.abs(solver.body.velocity.to_numpy()).max() < STILL_MM_S:
+        if np.abs(array_of(solver.body.velocity)).max() < STILL_MM_S:
             return

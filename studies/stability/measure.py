@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sim.body import BodyState
-from sim.fields import fill
+from sim.fields import array_of, fill
 from sim.neo_hookean import NeoHookean
 from sim.solver import SolverState, StepSettings
 from studies.results import rounded
@@ -40,7 +40,7 @@ class Extremes:
         """After a step, which the guard has seen."""
         if notice:
             self.fallbacks.append(notice)
-        finite = bool(np.isfinite(specimen.body.position.to_numpy()).all())
+        finite = bool(np.isfinite(array_of(specimen.body.position)).all())
         self.finite &= finite
         if finite:
             volume = specimen.volume_ratio()
@@ -72,7 +72,7 @@ def run(model: str, case: Case) -> dict[str, Any]:
         extreme=case.extreme,
         body=case.subject.kind,
         points=specimen.body.count,
-        finite=extremes.finite and bool(np.isfinite(specimen.body.position.to_numpy()).all()),
+        finite=extremes.finite and bool(np.isfinite(array_of(specimen.body.position)).all()),
         recovered=recovered,
         rest_error_mm=rounded(rest_error),
         shape_error_mm=rounded(shape_error),
@@ -141,7 +141,7 @@ def _let_go(specimen: Specimen, extremes: Extremes) -> None:
 
 def _distance(specimen: Specimen) -> float:
     """Mean distance [mm] of the body's points from where they were at rest."""
-    position = specimen.body.position.to_numpy().astype(float)
+    position = array_of(specimen.body.position).astype(float)
     return float(np.linalg.norm(position - specimen.rest, axis=1).mean())
 
 
@@ -166,7 +166,7 @@ def _lifted(specimen: Specimen) -> float:
 
 
 def _shape_error(specimen: Specimen) -> float:
-    position = specimen.body.position.to_numpy().astype(float)
+    position = array_of(specimen.body.position).astype(float)
     wanted = specimen.body.rest_points
     if not np.isfinite(position).all():
         return np.inf
