@@ -4,6 +4,7 @@ The window, the headless run and every measurement go through this class, so tha
 """
 
 import hashlib
+from concurrent.futures import Future
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,7 +38,7 @@ from ultrasound.hand import (
 from ultrasound.outline import section
 from ultrasound.plane import ImagePlane
 from ultrasound.probe import Mode, Probe, Rung
-from ultrasound.scanner import ScannedAnatomy, Scanner
+from ultrasound.scanner import ScannedAnatomy, Scanner, begin_echo
 
 TURN_DEG_S = 180.0
 AWAY_MM = 200.0
@@ -86,15 +87,17 @@ class Rehearsal:
         self.gravity_direction = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
         meshes = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
         self.supports = [_shrunk(moved_by(mesh, -self.origin), SUPPORT_SUNK_MM) for mesh in meshes]
+        scanned, echo = None, None
+        if anatomy.ct is not None:
+            scanned = scanned_anatomy(self.organ, anatomy.ct, anatomy, self.origin)
+            echo = begin_echo(scanned) if shows_echo else None
         told("Building the model: tissue and contacts")
         self._build_solver(anatomy)
         self.guard = Guard(self.solver)
         self.notice = ""
         told("Building the model: surfaces")
         self._build_surfaces()
-        self._build_scanner(anatomy)
-        if shows_echo and self.scanner is not None:
-            self.scanner.foresee_echo()
+        self._build_scanner(scanned, echo)
         self.press = press_on(scene.press, anatomy, self.gravity_direction)
         self.steps = 0
         told("Building the model: the tissue comes to rest")
@@ -141,15 +144,14 @@ class Rehearsal:
             self.tumour_skin = Skin(self.model, drawn)
         self.part_skins = {tissue: Skin(self.model, part.vertices) for tissue, part in self.parts.items()}
 
-    def _build_scanner(self, anatomy: LoadedAnatomy) -> None:
+    def _build_scanner(self, scanned: ScannedAnatomy | None, echo: Future[np.ndarray] | None) -> None:
         image = self.scene.image
         margin = SURROUNDINGS_MM if image.outside == "background" else 0.0
         self.embedding = Embedding(self.model, self.organ, embedding_cell_mm(self.scene.tissue), margin)
         self.scanner = None
-        if anatomy.ct is not None:
-            scanned = scanned_anatomy(self.organ, anatomy.ct, anatomy, self.origin)
+        if scanned is not None:
             around = image.outside, image.contact, image.contact_gap_mm
-            self.scanner = Scanner(scanned, self.embedding, self.probe, image.pixels, *around)
+            self.scanner = Scanner(scanned, self.embedding, self.probe, image.pixels, *around, echo)
 
     def _settle(self) -> np.ndarray:
         """Let the organ come to rest on its support, the transducer far away: the paper's warm-up."""

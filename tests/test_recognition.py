@@ -82,6 +82,20 @@ def test_a_bone_in_the_cts_corner_of_which_no_cut_shows_a_whole_ring_is_filled_t
     assert not (found & ~ball((0.0, 0.0, 0.0), 25.0 + 2 * 1.8 * np.sqrt(3))).any()
 
 
+@pytest.mark.parametrize("axis", range(3))
+def test_a_pipe_of_bone_is_filled_though_both_its_ends_are_open(axis):
+    places = np.moveaxis(np.indices((70, 70, 70)), 0, -1) * SPACING - 35 * SPACING
+    across = np.linalg.norm(np.delete(places, axis, -1), axis=-1)
+    within = np.abs(places[..., axis]) < 12.0
+    hu = np.select([within & (across < 8.0), within & (across < 10.0)], [MARROW, SHELL], FAT)
+    found = bones(hu, SPACING)
+    assert found[within & (across < 8.0)].mean() > 0.99
+    # Not what lies beside it: a rim of a block of 1.8 mm may be too much.
+    assert not found[
+        (across > 10.0 + 2 * 1.8 * np.sqrt(3)) | (np.abs(places[..., axis]) > 12.0 + 2 * 1.8 * np.sqrt(3))
+    ].any()
+
+
 def test_what_is_bright_by_contrast_agent_is_no_bone_and_outside_the_labels_blood():
     hu, bone, kidney, vessel = abdomen()
     found = recognised(hu, {"kidney": kidney}, SPACING)

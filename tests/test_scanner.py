@@ -1,5 +1,7 @@
 """The scanner: that each side of it is given what it asks for. What a side makes of it has tests of its own."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -11,7 +13,7 @@ from ultrasound.acoustics import CORTEX_DB
 from ultrasound.hand import image_plane, pose_at
 from ultrasound.plane import ImagePlane
 from ultrasound.probe import Probe
-from ultrasound.scanner import CT, ScannedAnatomy, Scanner
+from ultrasound.scanner import CT, ScannedAnatomy, Scanner, begin_echo
 
 PIXELS, RADIUS, REACH = 64, 12.0, 20.0
 PROBE = Probe(
@@ -78,6 +80,13 @@ def test_each_look_is_at_where_the_body_is_now(device):
     for looks in (1, 2):
         scanner.look(plane_at(), PROBE, "ct", "speckle", 400.0, 20.0)
         assert embedding.looks == looks
+
+
+def test_an_echo_begun_before_is_the_one_that_is_shown(device):
+    bones, plane = replace(anatomy(), tissues={1: "bone"}), plane_at()
+    begun = echo(Scanner(anatomy(), Unmoved(), PROBE, PIXELS, echo=begin_echo(bones)), plane)
+    assert np.array_equal(begun, echo(Scanner(bones, Unmoved(), PROBE, PIXELS), plane))
+    assert np.abs(begun - echo(Scanner(anatomy(), Unmoved(), PROBE, PIXELS), plane)).max() > 10.0
 
 
 @pytest.mark.parametrize("gap", [1.0, 4.0])

@@ -71,14 +71,23 @@ def bones(hu: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
     beyond = [min(n, int(BEYOND_MM / (s * k))) for n, s, k in zip(shell.shape, spacing_mm, step, strict=True)]
     whole = np.pad(shell, [(n, n) for n in beyond], mode="symmetric")
     whole = ndimage.binary_closing(whole, iterations=2)
-    filled = whole.copy()
-    for axis in range(3):
-        for one, into in zip(np.moveaxis(whole, axis, 0), np.moveaxis(filled, axis, 0), strict=True):
-            if one.any():
-                into |= ndimage.binary_fill_holes(one)
+    filled = np.logical_or.reduce([_filled(whole, axis) for axis in range(3)])
     inner = filled[tuple(slice(n, n + size) for n, size in zip(beyond, shell.shape, strict=True))]
     fine = inner.repeat(step[0], 0).repeat(step[1], 1).repeat(step[2], 2)
     return fine[: hu.shape[0], : hu.shape[1], : hu.shape[2]]
+
+
+def _filled(solid: np.ndarray, axis: int) -> np.ndarray:
+    """Each section across an axis with its holes filled: what reaches no edge of the section."""
+    beside = ndimage.generate_binary_structure(3, 1)
+    beside[tuple(slice(None) if k != axis else [0, 2] for k in range(3))] = False
+    parts, count = ndimage.label(~solid, beside)
+    is_open = np.zeros(count + 1, bool)
+    for other in {0, 1, 2} - {axis}:
+        for edge in (0, -1):
+            is_open[parts.take(edge, other)] = True
+    is_open[0] = False
+    return ~is_open[parts]
 
 
 def _large_parts(hu: np.ndarray, voxel_mm3: float) -> np.ndarray:

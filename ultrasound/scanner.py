@@ -43,11 +43,19 @@ class ScannedAnatomy:
         return np.linalg.norm(np.linalg.inv(self.index_from_mm[:3, :3]), axis=0)
 
 
+def begin_echo(anatomy: ScannedAnatomy) -> Future[np.ndarray]:
+    """Begin with what an echo of an anatomy needs, on a thread of its own, while other things are made."""
+    worker = ThreadPoolExecutor(1)
+    values = worker.submit(properties, anatomy.hu, anatomy.labels, anatomy.tissues, anatomy.voxel_mm)
+    worker.shutdown(wait=False)
+    return values
+
+
 class Scanner:
     """Pictures of ``pixels`` x ``pixels`` of an anatomy that an embedding carries along.
 
     ``outside`` (see ``Slice``), ``contact`` and ``contact_gap_mm`` (see ``BMode``) say what lies around the organ and what lets
-    sound in. What a mode needs is made when it is first asked for. Raises TissueError.
+    sound in. What a mode needs is made when it is first asked for, but for an ``echo`` begun before. Raises TissueError.
     """
 
     def __init__(
@@ -59,6 +67,7 @@ class Scanner:
         outside: str = "background",
         contact: str = "organ",
         contact_gap_mm: float = 1.5,
+        echo: Future[np.ndarray] | None = None,
     ) -> None:
         check_tissues(anatomy.tissues)
         self.anatomy = anatomy
@@ -66,16 +75,7 @@ class Scanner:
         self.probe = probe
         self.plane = PlaneInTissue(embedding, pixels)
         self.outside, self.contact, self.contact_gap_mm = outside, contact, contact_gap_mm
-        self._values: Future[np.ndarray] | None = None
-
-    def foresee_echo(self) -> Future[np.ndarray]:
-        """Begin with what an echo needs, on a thread of its own, while other things are made."""
-        if self._values is None:
-            anatomy, worker = self.anatomy, ThreadPoolExecutor(1)
-            voxels = anatomy.hu, anatomy.labels, anatomy.tissues, anatomy.voxel_mm
-            self._values = worker.submit(properties, *voxels)
-            worker.shutdown(wait=False)
-        return self._values
+        self._echo = echo
 
     @cached_property
     def slice(self) -> Slice:
@@ -86,7 +86,7 @@ class Scanner:
     @cached_property
     def bmode(self) -> BMode:
         """The echo's side of the scanner."""
-        values, self._values = self.foresee_echo().result(), None
+        values, self._echo = (self._echo or begin_echo(self.anatomy)).result(), None
         tissue = Volume(values, self.anatomy.index_from_mm, outside=0.0)
         return BMode(
             tissue,
