@@ -1,5 +1,6 @@
 """Shared by all tests: a fresh Taichi for each, small bodies, and the place of the optional real data."""
 
+import gc
 import inspect
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -26,6 +27,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest first: no worker is left with it when the others have ended."""
     items.sort(key=lambda item: item.path.stem != "test_window")
+
+
+def pytest_collection_finish() -> None:
+    """What is imported by now stays: each search for what is no longer used need not look at it."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture
