@@ -58,24 +58,34 @@ def _kind(field: ti.Field) -> type[np.float32] | type[np.int32]:
 
 
 def _shape(field: ti.Field) -> tuple[int, ...]:
-    element = () if isinstance(field, ti.ScalarField) else (field.n, field.m)[: field.ndim]
-    return tuple(field.shape) + element
+    return tuple(field.shape) + _element(field)
+
+
+def _element(field: ti.Field) -> tuple[int, ...]:
+    return () if isinstance(field, ti.ScalarField) else (field.n, field.m)[: field.ndim]
 
 
 def _lying(field: ti.Field) -> np.ndarray:
-    """A field's own memory; Taichi lays each field down in one piece, an element beside the next."""
+    """A field's own memory: an element in one piece, in each cell beside those of the other fields of a struct."""
     impl.get_runtime().materialize()
     place = field.snode.ptr
-    at = _root(field, place.get_snode_tree_id()) + place.parent.offset_bytes_in_parent_cell
-    shape = _shape(field)
-    memory = (ctypes.c_int32 * int(np.prod(shape))).from_address(at)
-    return np.ctypeslib.as_array(memory).view(_kind(field)).reshape(shape)
+    size = place.parent.cell_size_bytes
+    at = _root(field) + place.parent.offset_bytes_in_parent_cell
+    memory = (ctypes.c_byte * (size * int(np.prod(field.shape)))).from_address(at)
+    strides = _strides(field.shape, size) + _strides(_element(field), np.dtype(_kind(field)).itemsize)
+    return np.ndarray(_shape(field), _kind(field), memory, place.offset_bytes_in_parent_cell, strides)
 
 
-def _root(field: ti.Field, tree: int) -> int:
-    roots = _ROOTS.setdefault(impl.get_runtime(), {})
+def _strides(shape: tuple[int, ...], size: int) -> tuple[int, ...]:
+    return tuple(size * int(np.prod(shape[axis + 1 :])) for axis in range(len(shape)))
+
+
+def _root(field: ti.Field) -> int:
+    roots, place = _ROOTS.setdefault(impl.get_runtime(), {}), field.snode.ptr
+    tree = place.get_snode_tree_id()
     if tree not in roots:
-        roots[tree] = _address(field, len(field.shape)) - field.snode.ptr.parent.offset_bytes_in_parent_cell
+        before = place.parent.offset_bytes_in_parent_cell + place.offset_bytes_in_parent_cell
+        roots[tree] = _address(field, len(field.shape)) - before
     return roots[tree]
 
 

@@ -64,3 +64,23 @@ def test_an_array_read_is_a_copy(one_device):
 def test_an_array_of_another_shape_is_not_written(one_device):
     with pytest.raises(ValueError, match=r"shape \(3,\) for a field of shape \(4,\)"):
         fill((field_of(np.arange(4.0)), np.zeros(3)))
+
+
+@pytest.mark.parametrize("first", ["plane", "push", "turn", "count"])
+def test_fields_of_a_struct_lie_side_by_side(one_device, first):
+    """Whichever of them is asked for first in a tree of its own."""
+    shapes = {"plane": (4,), "count": (), "turn": (2, 3), "push": (3,)}
+    kinds = {
+        "plane": ti.math.vec4,
+        "count": ti.i32,
+        "turn": ti.types.matrix(2, 3, ti.f32),
+        "push": ti.math.vec3,
+    }
+    contact = ti.Struct.field(kinds, shape=(5, 2))
+    random = np.random.default_rng(3)
+    values = {name: random.integers(-99, 99, (5, 2, *shape)) for name, shape in shapes.items()}
+    for name in (first, *values):
+        fill((getattr(contact, name), values[name]))
+    for name, wanted in values.items():
+        assert np.array_equal(getattr(contact, name).to_numpy(), wanted)
+        assert np.array_equal(array_of(getattr(contact, name)), wanted)
