@@ -154,6 +154,15 @@ def test_each_begins_over_its_target_and_its_numbers_go_from_end_to_end(rehearsa
         assert over.min() < WIDTH and over.max() < 3 * radius
 
 
+def test_a_glide_begins_as_the_straight_rows_that_it_is_held_against(rehearsal):
+    coverage = coverage_of(16.0 * Z, 12.0)
+    glide = next(each for each in candidates_of(rehearsal, coverage, "tumour", everywhere) if each.count > 1)
+    rows = row_by_row(SimpleNamespace(rehearsal=rehearsal, coverage=coverage, target="tumour"))
+    begun = glide.way(rehearsal.hand, glide.values(glide.start()))
+    assert glide.motion == "glide" and len(rows.passes) == glide.count
+    assert begun.poses == pytest.approx(rows.poses, abs=1e-9)
+
+
 def glide_of(rehearsal, count: int) -> Candidate:
     found = found_for(rehearsal, 18.0 * Z, radius=9.0)
     return next(each for each in found if each.motion == "glide" and each.count == count)

@@ -23,7 +23,7 @@ from studies.plan.file import PlanError, read_plan, write_plan
 from studies.plan.make import make_plan
 from studies.plan.parts import Parts
 from studies.plan.score import score
-from studies.plan.search import FIRST, FORESEEN, TRIAL_MM_S, length_of, ranked, search
+from studies.plan.search import FORESEEN, TRIAL_MM_S, length_of, ranked, search
 from studies.plan.study_command import table
 from studies.plan.workers import Outcome, Problem, SearchSpace, Workers, _trial, workers
 from ultrasound.probe import load_probe
@@ -126,6 +126,21 @@ def test_the_first_generation_has_the_start_and_all_stay_in_range():
     assert found.best[0] > 0.9 and found.score == found.best[0]
 
 
+@pytest.mark.parametrize("better", [True, False])
+def test_a_search_goes_on_where_its_candidate_begins_if_that_is_better(better):
+    """Than where a forecast has led it."""
+    one, start = candidate("one"), np.array([0.9, 0.9, 0.9])
+    found = Search(one, start, NEAR)
+    asked = found.ask()
+    assert np.array_equal(asked[:2], [start, one.start()])
+    found.tell(asked, [1.0, 2.0 if better else 0.0, *[0.5] * (GENERATION - 2)])
+    wanted = one.start() if better else start
+    away = np.linalg.norm(found.ask() - wanted, axis=1)
+    # Steps of NEAR along each of three axes; what lies there is farther off.
+    assert away.max() < 5 * NEAR < np.linalg.norm(start - one.start())
+    assert np.array_equal(found.best, wanted)
+
+
 def test_part_of_a_generation_counts_and_the_best_so_far_stays():
     found = Search(candidate("one"), candidate("one").start(), NEAR)
     asked = found.ask()
@@ -166,10 +181,8 @@ def test_the_better_half_has_the_rest():
     crew = Counting(four())
     searches = search(crew.candidates, crew, 96, lambda _: None)
     trials = {one.candidate.side: one.trials for one in searches}
-    # Whole generations of all four until no more than the rest is left.
-    first = GENERATION * -(-int(FIRST * 96) // (4 * GENERATION))
-    half = (96 - 4 * first) // 2
-    assert trials == {"sweep 0": first, "sweep 2": first, "sweep 1": first + half, "sweep 3": first + half}
+    half = (96 - 2 * GENERATION) // 2
+    assert trials == {"sweep 0": GENERATION, "sweep 2": GENERATION, "sweep 1": half, "sweep 3": half}
     of_three = search(four()[:3], Counting(four()[:3]), 96, lambda _: None)
     assert sum(one.trials == max(each.trials for each in of_three) for one in of_three) == 2
 

@@ -5,14 +5,11 @@ from functools import partial
 
 import numpy as np
 
-from studies.plan.candidate import half_size, passes_needed, width_mm
+from studies.plan.candidate import UNPLANNED_MM, half_size, passes_needed, width_mm
 from studies.plan.file import Sweep
 from studies.plan.track import passes_in
 from studies.plan.trial import Trial
 from studies.plan.way import Layout, Way, gliding, layout_towards
-
-# How deep an unplanned sweep presses: in the middle of what a scene's press begins with; by chance up to twice as deep.
-DEPTH_MM = 3.0
 
 
 def straight(trial: Trial) -> Way:
@@ -37,7 +34,7 @@ def by_chance(trial: Trial, count: int, seed: int) -> Way:
         turned = layout.turned((0.0, 0.0), chance.uniform(-180.0, 180.0))
         centre = layout.centre + aside * layout.lateral + ahead * layout.ahead
         one = Layout(centre, turned.outward, turned.ahead, turned.lateral)
-        depth = chance.uniform(0.0, 2 * DEPTH_MM)
+        depth = chance.uniform(0.0, 2 * UNPLANNED_MM)
         passes += gliding(trial.rehearsal.hand, one, np.zeros(1), -half[1], half[1], depth, 1.0).passes
     return Way(tuple(passes))
 
@@ -58,7 +55,7 @@ def _seen_from_above(trial: Trial) -> tuple[Layout, np.ndarray]:
 def _rows(trial: Trial, layout: Layout, half: np.ndarray, count: int) -> Way:
     width = width_mm(trial.rehearsal, layout)
     aside = width * (np.arange(count) - (count - 1) / 2)
-    return gliding(trial.rehearsal.hand, layout, aside, -half[1], half[1], DEPTH_MM, 0.0)
+    return gliding(trial.rehearsal.hand, layout, aside, -half[1], half[1], UNPLANNED_MM, 0.0)
 
 
 UNPLANNED = {"straight": straight, "row by row": row_by_row}

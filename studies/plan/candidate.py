@@ -14,6 +14,8 @@ from ultrasound.hand import Hand
 # Sides of the organ that are looked at, no farther round than this from above (its cosine), and how much two differ.
 SIDES, ROUND, APART_DEG = 300, 0.1, 20.0
 MOST_PASSES = 6
+# How deep a sweep presses that nobody planned: in the middle of what a scene's press begins with.
+UNPLANNED_MM = 3.0
 
 
 class Quantity(NamedTuple):
@@ -134,20 +136,21 @@ def _about(half: np.ndarray) -> dict[str, Quantity]:
         "lean_aside_deg": Quantity(-40.0, 40.0, 0.0),
         "heading_deg": Quantity(-90.0, 90.0, 0.0),
         "aside_mm": Quantity(-half[0], half[0], 0.0),
-        "depth_mm": Quantity(0.0, 6.0, 1.5),
     }
 
 
 def _apart(count: int, width: float) -> dict[str, Quantity]:
-    return {} if count == 1 else {"apart_mm": Quantity(0.4 * width, 1.1 * width, 0.8 * width)}
+    return {} if count == 1 else {"apart_mm": Quantity(0.4 * width, 1.1 * width, width)}
 
 
 def _glide(side: str, count: int, layout: Layout, half: np.ndarray, width: float) -> Candidate:
+    """Passes side by side; it begins with the straight rows that anyone would go."""
     far = half[1]
     own = {
-        "start_mm": Quantity(-1.4 * far, 0.0, -0.8 * far),
-        "end_mm": Quantity(0.0, 1.4 * far, 0.8 * far),
-        "follow": Quantity(0.0, 1.0, 0.5),
+        "start_mm": Quantity(-1.4 * far, 0.0, -far),
+        "end_mm": Quantity(0.0, 1.4 * far, far),
+        "follow": Quantity(0.0, 1.0, 0.0),
+        "depth_mm": Quantity(0.0, 6.0, UNPLANNED_MM),
     }
     return Candidate(side, "glide", count, layout, _about(half) | own | _apart(count, width))
 
@@ -157,5 +160,6 @@ def _rock(side: str, count: int, layout: Layout, half: np.ndarray, width: float)
         "ahead_mm": Quantity(-half[1], half[1], 0.0),
         "first_deg": Quantity(-45.0, 0.0, -30.0),
         "last_deg": Quantity(0.0, 45.0, 30.0),
+        "depth_mm": Quantity(0.0, 6.0, 1.5),
     }
     return Candidate(side, "rock", count, layout, _about(half) | own | _apart(count, width))

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -43,7 +44,8 @@ class Search:
             popsize=GENERATION,
             verbose=-9,
         )
-        self._strategy = cma.CMAEvolutionStrategy(self.start, self.sigma, options)
+        self._about = partial(cma.CMAEvolutionStrategy, sigma0=self.sigma, inopts=options)
+        self._strategy = self._about(self.start)
 
     @property
     def values(self) -> dict[str, float]:
@@ -51,17 +53,22 @@ class Search:
         return self.candidate.values(self.best)
 
     def ask(self) -> list[np.ndarray]:
-        """The next generation; the first has the start in it."""
+        """The next generation; the first has the start in it, and where the candidate itself begins."""
         asked = self._strategy.ask()
-        return [self.start, *asked[1:]] if self.trials == 0 else asked
+        return [self.start, self.candidate.start(), *asked[2:]] if self.trials == 0 else asked
 
     def tell(self, asked: list[np.ndarray], scores: list[float]) -> None:
-        """What a generation was worth; the last of a search may not be whole."""
+        """What a generation was worth; the last of a search may not be whole.
+
+        The search goes on about the candidate's own beginning where nothing in the first was better.
+        """
+        best, is_first = int(np.argmax(scores)), self.trials == 0
         self.trials += len(asked)
-        best = int(np.argmax(scores))
         if scores[best] > self.score:
             self.score, self.best = scores[best], asked[best]
-        if len(asked) == GENERATION:
+        if is_first and best == 1:
+            self._strategy = self._about(asked[1])
+        elif len(asked) == GENERATION:
             self._strategy.tell(asked, [-each for each in scores])
 
 

@@ -9,8 +9,6 @@ from studies.plan.file import MOST_SWEEPS
 from studies.plan.score import score
 from studies.plan.workers import Outcome, Workers
 
-# The share of all trials in which the candidates are compared; the better half of them has the rest.
-FIRST = 0.5
 # Trials are gone faster than the plan will be.
 TRIAL_MM_S = 60.0
 # To foresee a candidate takes as long as so many trials.
@@ -30,16 +28,15 @@ def length_at(speed_mm_s: float) -> int:
 def search(
     candidates: list[Candidate], workers: Workers, trials: int, done: Callable[[int], Any]
 ) -> list[Search]:
-    """Search all candidates with so many trials together: first all of them, then the better half."""
+    """Search all candidates with so many trials together: a generation of each, then the better half with all the rest."""
     searches = []
     for candidate, start in zip(candidates, workers.foresee(candidates), strict=True):
         searches.append(Search(candidate, start, NEAR))
         done(FORESEEN)
-    active, left = searches, trials
+    left = trials - _generation(searches, workers, trials, done)
+    better = sorted(searches, key=lambda one: -one.score)[: -(-len(searches) // 2)]
     while left > 0:
-        if len(active) == len(searches) and left <= (1 - FIRST) * trials:
-            active = sorted(searches, key=lambda one: -one.score)[: -(-len(searches) // 2)]
-        left -= _generation(active, workers, left, done)
+        left -= _generation(better, workers, left, done)
     return searches
 
 

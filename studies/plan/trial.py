@@ -17,6 +17,8 @@ from ultrasound.plane import PlaneInTissue
 
 # Between two passes the probe is over its next place after so many steps at the latest.
 MOST_STEPS = 240
+# A whole number of steps is not one more where the poses come from a file, which rounds them.
+ROUNDED_STEPS = 1e-3
 
 
 class Trial:
@@ -83,7 +85,8 @@ class Trial:
         cosine = (np.einsum("ij,ij->", start[:3, :3], end[:3, :3]) - 1) / 2
         turn = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
         way = max(float(np.linalg.norm(self._face(end) - self._face(start))), turn / DEG_A_MM)
-        return max(1, int(np.ceil(way / (self.speed_mm_s * self.rehearsal.settings.time_step_s))))
+        steps = way / (self.speed_mm_s * self.rehearsal.settings.time_step_s)
+        return max(1, int(np.ceil(steps - ROUNDED_STEPS)))
 
     def _look(self) -> None:
         rehearsal = self.rehearsal
