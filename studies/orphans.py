@@ -5,6 +5,7 @@ import threading
 import time
 
 import psutil
+from joblib import cpu_count, parallel_config
 
 WATCH_S = 0.5
 
@@ -15,6 +16,13 @@ def end_with(parent: int) -> None:
     A pool whose process is killed tells its workers nothing: they would finish what they do, and wait for more.
     """
     threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+
+
+def processes(jobs: int | None = None) -> parallel_config:
+    """While it lasts joblib works in so many processes, or as many as there are processors, that end with this one."""
+    return parallel_config(
+        backend="loky", n_jobs=jobs or cpu_count(), initializer=end_with, initargs=(os.getpid(),)
+    )
 
 
 def _watch(parent: int) -> None:

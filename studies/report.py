@@ -41,12 +41,16 @@ class Tally:
         if rehearsal.notice:
             self.fallbacks.append(rehearsal.notice)
         self.finite &= bool(np.isfinite(array_of(rehearsal.body.position)).all())
+        if not self.finite:
+            return
         self.volume_ratio_min = min(self.volume_ratio_min, rehearsal.volume_ratio())
         self.max_penetration_mm = max(self.max_penetration_mm, rehearsal.contacts.measure_penetration())
         self.indentation_max_mm = max(self.indentation_max_mm, rehearsal.indentation_mm())
 
     def report(self, rehearsal: Rehearsal, arch: str) -> dict:
-        """Everything in one dictionary; times in ms are over all steps but the first, if there are more, and None of what was not done."""
+        """Everything in one dictionary; times in ms are over all steps but the first, if there are more, and None of what was not done;
+        of tissue that was not finite there are no figures.
+        """
         settings = rehearsal.settings
         return dict(
             version=VERSION,
@@ -70,9 +74,9 @@ class Tally:
             finite=self.finite,
             expected_error_mm=expected_error_of(rehearsal),
             fallbacks=self.fallbacks,
-            volume_ratio_min=round(self.volume_ratio_min, 6),
-            max_penetration_mm=round(self.max_penetration_mm, 6),
-            indentation_max_mm=round(self.indentation_max_mm, 4),
+            volume_ratio_min=round(self.volume_ratio_min, 6) if self.finite else None,
+            max_penetration_mm=round(self.max_penetration_mm, 6) if self.finite else None,
+            indentation_max_mm=round(self.indentation_max_mm, 4) if self.finite else None,
         )
 
 
@@ -92,12 +96,19 @@ def summary(report: dict) -> str:
             f"{counted(report['iterations'], 'iteration')}",
             f"speed     {times} (medians of {report['steps']}) on {report['arch']}; built in {report['build_s']:.1f} s",
             f"probe     {report['probe']}; {shown if measured['picture'] else 'no pictures'}",
-            f"press     {report['indentation_max_mm']:.2f} mm deep; least volume {100 * report['volume_ratio_min']:.1f} %; "
-            f"penetration at most {report['max_penetration_mm']:.3f} mm; "
-            f"{'all finite' if report['finite'] else 'NOT FINITE'}",
+            f"press     {_press(report)}",
             f"error     {_error(report['expected_error_mm'])}",
             *(f"MIND      {text}" for text in report["fallbacks"]),
         ]
+    )
+
+
+def _press(report: dict) -> str:
+    if not report["finite"]:
+        return "NOT FINITE: the tissue was lost, and there are no figures of it"
+    return (
+        f"{report['indentation_max_mm']:.2f} mm deep; least volume {100 * report['volume_ratio_min']:.1f} %; "
+        f"penetration at most {report['max_penetration_mm']:.3f} mm; all finite"
     )
 
 

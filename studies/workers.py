@@ -3,21 +3,20 @@
 A process computes on one CPU thread, so that several do not fight for the same ones, and keeps what it has built.
 """
 
-import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-from joblib import Parallel, cpu_count, delayed, parallel_config
+from joblib import Parallel, delayed, parallel_config
 
 import sim.device
 from sim.body import RestBody
 from studies.accuracy import bead_errors
 from studies.case import Case
 from studies.experiment import Experiment, rest_body
-from studies.orphans import end_with
+from studies.orphans import processes
 from studies.setup import Setup
 
 # Taichi frees fields only when it starts anew, and does not bear hundreds of them.
@@ -72,8 +71,7 @@ def _build(key: tuple[str, float], case: Case, setup: Setup) -> None:
 @contextmanager
 def local_workers(jobs: int | None = None) -> Iterator[Map]:
     """Processes on this machine, as many as it has processors where ``jobs`` is None."""
-    starts = dict(initializer=end_with, initargs=(os.getpid(),))
-    with parallel_config(backend="loky", n_jobs=jobs or cpu_count(), **starts):
+    with processes(jobs):
         yield _map
 
 

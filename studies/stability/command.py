@@ -10,6 +10,7 @@ from joblib import Parallel, delayed
 from tqdm import tqdm
 
 from studies.command_line import make_folder
+from studies.orphans import processes
 from studies.results import write_csv, write_json
 from studies.stability.cases import MODELS, Case, cases_of, quick_cases_of
 
@@ -32,7 +33,7 @@ def stability(out: Path, quick: bool, jobs: int | None) -> None:
     given = {model: quick_cases_of(model) if quick else cases_of(model) for model in MODELS}
     rows: list[dict[str, Any]] = []
     with tqdm(total=sum(map(len, given.values())), desc="stability", unit="case") as bar:
-        for found in _figures(given, jobs or -1):
+        for found in _figures(given, jobs):
             rows += found
             bar.update(len(found))
     write_json(dict(cases=rows), out / "stability.json")
@@ -42,16 +43,15 @@ def stability(out: Path, quick: bool, jobs: int | None) -> None:
     click.echo(f"\nWrote stability.json, stability.csv and stability.png to {out}")
 
 
-def _figures(given: dict[str, list[Case]], jobs: int) -> Iterator[list[dict[str, Any]]]:
+def _figures(given: dict[str, list[Case]], jobs: int | None) -> Iterator[list[dict[str, Any]]]:
     """Batches of figures in the order of the cases, as they are done."""
     tasks = []
     for model, cases in given.items():
         for _, alike in groupby(cases, key=lambda case: case.subject):
             same = list(alike)
             tasks += [(model, same[first : first + BATCH]) for first in range(0, len(same), BATCH)]
-    yield from Parallel(n_jobs=jobs, return_as="generator", batch_size=1)(
-        delayed(_run)(*task) for task in tasks
-    )
+    with processes(jobs):
+        yield from Parallel(return_as="generator", batch_size=1)(delayed(_run)(*task) for task in tasks)
 
 
 def _run(model: str, cases: list[Case]) -> list[dict[str, Any]]:
