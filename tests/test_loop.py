@@ -148,7 +148,9 @@ def test_without_a_link_the_loop_goes_on(looping, sent):
     assert sent == []
 
 
-def test_the_export_key_saves_the_tissue_beside_its_picture(looping, monkeypatch, tmp_path):
+def test_the_export_key_saves_the_tissue_beside_its_picture_and_says_what_it_cannot_give(
+    looping, monkeypatch, tmp_path, capsys
+):
     begins: list[str] = []
     monkeypatch.setattr(loop, "save_surfaces", lambda rehearsal, out, begin: begins.append(begin))
     settings = Settings()
@@ -158,9 +160,17 @@ def test_the_export_key_saves_the_tissue_beside_its_picture(looping, monkeypatch
     looping.cine.frames.append(looping.cine.frames[-1])
     looping._save(Controls(settings, export=True), looping.frame(Controls(settings, freeze=True)))
     assert begins == ["001-", "002-", "003-"] and (tmp_path / "003-b-mode.dcm").is_file()
+    assert looping.frame(Controls(settings)).status == "Saved 003"
     # What is looked back at lay otherwise than the tissue does now.
-    looping._save(Controls(settings, export=True), looping.frame(Controls(settings, cine=-1)))
+    before = replace(looping.frame(Controls(settings, cine=-1)), notes={"B-mode": "NO CONTACT"})
+    looping._save(Controls(settings, export=True), before)
     assert len(begins) == 3 and (tmp_path / "004-b-mode.png").is_file()
+    missing = (
+        "echo black: the probe does not touch the organ",
+        "no organ (PLY), which has moved since: F goes on",
+    )
+    assert looping.frame(Controls(settings)).status == "   ".join(["Saved 004", *missing])
+    assert capsys.readouterr().out.endswith(f"\n{'; '.join(missing)}\n")
 
 
 def test_without_a_window_pictures_go_to_the_link_and_the_tissue_into_the_folder(monkeypatch, tmp_path, sent):
