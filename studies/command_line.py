@@ -20,8 +20,22 @@ class Fault(click.ClickException):
     """What the user must know, in one line."""
 
 
+class Number(click.types.FloatParamType):
+    """A number, by that name in the help."""
+
+    name = "number"
+
+
+class WholeRange(click.IntRange):
+    """Whole numbers between two."""
+
+    name = "integer"
+
+
 class NumberRange(click.FloatRange):
     """Numbers between two; click's own range lets nan through."""
+
+    name = "number"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         number = super().convert(value, param, ctx)
