@@ -3,6 +3,7 @@
 import json
 import socket
 from dataclasses import replace
+from pathlib import PurePosixPath
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +13,7 @@ from click.exceptions import Exit
 import app
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
+from scenes.scene import EMBEDDED
 from studies.rehearse import command, headless, loop, run
 from studies.rehearse.loop import Loop
 from studies.rehearse.view import probe_as_set
@@ -225,6 +227,25 @@ def test_ctrl_c_in_a_run_says_so_before_how_it_went(monkeypatch, capsys):
     assert capsys.readouterr().out == "3 bookmarks\n"
 
 
+@pytest.mark.parametrize(
+    ("scene", "line"),
+    [
+        (None, "--replay a/session-001.jsonl"),
+        (PurePosixPath("my patients/a"), '"my patients/a" --replay a/session-001.jsonl'),
+    ],
+)
+def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scene, line):
+    monkeypatch.setattr(
+        run, "Instruments", lambda rehearsal, guide: SimpleNamespace(guide=None, summary=lambda bookmarks: {})
+    )
+    monkeypatch.setattr(run, "in_words", lambda summary: "")
+    each = run.Run(Moments(), None, "cpu", None, scene=scene)
+    recording = SimpleNamespace(path=PurePosixPath("a/session-001.jsonl"), fault="")
+    each.recorded = SimpleNamespace(recording=recording, close=lambda summary: None)
+    each._end(0)
+    assert capsys.readouterr().out.endswith(f"replay it with: python app.py rehearse {line}\n")
+
+
 def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path, sent):
     link, given = SimpleNamespace(show=sent.append), []
     viewer = SimpleNamespace(close=lambda: None, settings=Settings())
@@ -243,15 +264,17 @@ def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path
     assert given == [link, link]
 
 
-def test_the_command_opens_the_link_for_as_long_as_it_runs(monkeypatch, tmp_path, capsys):
+def test_the_command_opens_the_link_for_as_long_as_it_runs_and_names_its_scene(monkeypatch, tmp_path, capsys):
     with socket.socket() as listening:
         listening.bind(("127.0.0.1", 0))
         port = listening.getsockname()[1]
     reached: list[bool] = []
+    scene = tmp_path / "scene.toml"
+    scene.write_bytes(EMBEDDED.read_bytes())
 
     def headless_run(each: run.Run, *_) -> None:
         socket.create_connection(("127.0.0.1", port), 5).close()
-        reached.append(each.link is not None and each.link.port == port)
+        reached.append(each.link is not None and each.link.port == port and each.scene == scene)
 
     monkeypatch.setattr(command, "start_taichi", lambda arch: "cpu")
     monkeypatch.setattr(command, "built", lambda *_: None)
@@ -260,6 +283,7 @@ def test_the_command_opens_the_link_for_as_long_as_it_runs(monkeypatch, tmp_path
     monkeypatch.setattr(run.Run, "headless", headless_run)
     line = [
         "rehearse",
+        str(scene),
         "--headless",
         "--out",
         str(tmp_path),

@@ -176,7 +176,8 @@ def rehearse(
     from studies.rehearse.run import Run
 
     tracked = server.hand if server is not None and link_leads else None
-    run = Run(rehearsal, anatomy, used, out, budget_ms, tracked, track, keys, gamepad, server, plan)
+    named = None if scene == EMBEDDED else scene
+    run = Run(rehearsal, anatomy, used, out, budget_ms, tracked, track, keys, gamepad, server, plan, named)
     if headless:
         run.headless(log, at, seconds, build_s, not no_pictures)
     else:
