@@ -173,6 +173,8 @@ def test_the_export_key_saves_the_tissue_beside_its_picture_and_says_what_it_can
     )
     assert looping.frame(Controls(settings)).status == "   ".join(["Saved 004", *missing])
     assert capsys.readouterr().out.endswith(f"\n{'; '.join(missing)}\n")
+    looping._save(Controls(settings, export=True), replace(before, pictures={"CT": before.pictures["CT"]}))
+    assert looping.frame(Controls(settings)).status == f"Saved 005   {missing[1]}"
 
 
 def test_without_a_window_pictures_go_to_the_link_and_the_tissue_into_the_folder(monkeypatch, tmp_path, sent):

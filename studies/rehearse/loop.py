@@ -71,7 +71,7 @@ class Loop:
     def _export(self, settings: Settings, view: View) -> None:
         """Save the picture and the tissue, and say what is not in them, and why. Raises OSError."""
         begin, missing = save_view(view, probe_as_set(self.rehearsal.probe, settings), self.out), []
-        if view.notes:
+        if view.notes.keys() & view.pictures.keys():
             missing.append("echo black: the probe does not touch the organ")
         if self.frozen and self.cine.back:
             missing.append("no organ (PLY), which has moved since: {freeze} goes on")
