@@ -55,7 +55,7 @@ def table(run: dict[str, Any]) -> list[str]:
     """The figures of one patient."""
     lines = [
         f"{run['patient']}, {run['probe']}: {run['plan']}",
-        f"{'sweep':<14}seen  squeezed, mean and most, mm  lines touching  aside of square  path, mm  reachable  points",
+        f"{'sweep':<14}seen  squeezed, mean and most, mm  lines touching       off square  path, mm  reachable  points",
     ]
     for row in run["rows"]:
         name = row["sweep"] if row["count"] == 1 else f"{row['sweep']} ({row['count']})"
