@@ -7,8 +7,8 @@ from render.viewer import ASIDE, Geometry, Settings
 
 # Dear ImGui's glyphs are 7 pixels wide, its labels get 35 % of a box, its rows are 23 pixels high.
 GLYPH_WIDTH, LABEL_SHARE, ROW_HEIGHT = 7, 0.35, 23
-# Boxes that get less of what they ask for than this are too narrow: the first is left out.
-LEAST_SHARE = 0.7
+# Boxes that get less of what they ask for than this are too narrow for their labels: the first is left out.
+LEAST_SHARE = 0.9
 
 
 def groups_of(settings: Settings, geometry: Geometry) -> dict[str, list[dataclasses.Field]]:

@@ -48,7 +48,7 @@ KEY_MAP = {
         Line(("V",), ("rung",), "echo: how much of it is computed"),
         Line(("G",), ("show_scanner",), "the scanner's sliders, gain over depth too"),
         Line(("O",), ("outline",), "outline of the tumour, now and in the CT"),
-        Line(("Click on picture",), ("measure",), "calliper from click to click, in mm"),
+        Line(("Click on picture",), ("measure",), "calliper from click to click, in mm; a third ends it"),
         Line(("F",), ("freeze",), "freeze and go on"),
         Line(
             ("Left", "Right"),

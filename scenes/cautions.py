@@ -20,6 +20,8 @@ LIVER_LEFT_MM = 15.0
 # So near its surface an organ's label holds little fat where it was drawn on this CT; its sinus lies deeper.
 SHELL_MM, FAT_BELOW_HU, MOST_FAT = 4.0, -60, 0.05
 LEAST_LEFT_OUT_ML = 0.5
+# What of the parenchyma the echo takes for stone (``ultrasound.recognition``), and the least of it that is worth a line.
+STONE_ABOVE_MEDIAN_HU, LEAST_STONE_ML = 130.0, 0.1
 
 
 def turned(
@@ -71,6 +73,25 @@ def in_fat(
     return (
         f"{share:.0%} of the organ's rim is fat or gas in the CT; the labels may be shifted, mirrored or of another CT; "
         "compare the outlines in check.png",
+    )
+
+
+def as_stone(
+    grid: VoxelGrid, hounsfield: np.ndarray, parenchyma: np.ndarray, urine: np.ndarray
+) -> tuple[str, ...]:
+    """A line where the echo will show stones in parenchyma (z, y, x): a kidney that excretes contrast agent is as bright there.
+
+    What is labelled as urine, with its rim, the echo takes for none.
+    """
+    if not parenchyma.any():
+        return ()
+    bright = hounsfield > np.median(hounsfield[parenchyma]) + STONE_ABOVE_MEDIAN_HU
+    found_ml = float((bright & parenchyma & ~ndimage.binary_dilation(urine)).sum() * grid.voxel_ml)
+    if found_ml < LEAST_STONE_ML:
+        return ()
+    return (
+        f"{found_ml:.1f} ml inside the organ are as bright as stone or contrast agent; in the echo they shine and throw shadows; if they "
+        "are contrast agent in the collecting system, label it (--collecting), or take a CT of the portal-venous or nephrographic phase",
     )
 
 

@@ -16,7 +16,7 @@ import SimpleITK as sitk
 import trimesh
 
 from scenes.bed import bed_of_file, bed_of_labels
-from scenes.cautions import in_fat, taken, turned
+from scenes.cautions import as_stone, in_fat, taken, turned
 from scenes.organ import GROWN, INNER, PARENCHYMA, Organ, check_volume, midline_x, organs, single_out
 from scenes.parts import colours_of_labels, organ_surface, parts_of, surfaces_aside, volume_ml
 from scenes.reading.error import PatientError
@@ -99,9 +99,14 @@ def import_patient(
     at = _located(ct, labels, organ, side, margin_mm)
     piece = at.piece
     marks, tissues = _marks(labels, piece, at.grid, at.on_ct)
+
+    def of(*wanted: str) -> np.ndarray:
+        return np.isin(marks, [code for code, tissue in tissues.items() if tissue in wanted])
+
     warned = (
         *turned(at.level, at.level_hu, labels, at.midline),
-        *in_fat(at.grid, at.hounsfield, at.on_ct, marks == tissue_codes([])["kidney"]),
+        *in_fat(at.grid, at.hounsfield, at.on_ct, of("kidney")),
+        *as_stone(at.grid, at.hounsfield, of("kidney", "cortex", "medulla", "sinus"), of("urine")),
         *taken(labels, piece, organ is not None),
     )
     found = parts_of(labels, piece, needed)

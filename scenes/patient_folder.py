@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import os
 import re
 import shutil
 import zlib
@@ -20,7 +19,7 @@ from scenes.reading.error import PatientError
 from scenes.scene import AnatomyFiles, Scene, scene_text
 from scenes.surface_files import STL_HEADER_BYTES, save_surface
 from scenes.volume_files import save_image
-from scenes.whole_files import whole
+from scenes.whole_files import check_writable, whole
 
 # Shorter texts, such as the id 7, say nothing, and numbers under six digits are in every file.
 LEAST_TEXT, LEAST_DIGITS = 3, 6
@@ -79,9 +78,14 @@ def check_folder(folder: Path) -> None:
     """Refuse a folder that cannot become a patient's, before the work. Raises PatientError."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise PatientError(f"{folder}: exists and is not an empty folder; choose another folder or remove it")
-    above = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    if not above.is_dir() or not os.access(above, os.W_OK):
-        raise PatientError(f"{folder}: cannot be made in {above}; choose a folder that can be written")
+    # Its files are written beside it, and then take its place.
+    above = next(path for path in folder.absolute().parents if path.exists())
+    try:
+        check_writable(above)
+    except OSError as error:
+        raise PatientError(
+            f"{folder}: cannot be made in {above} ({error.strerror}); choose a folder that can be written"
+        ) from None
 
 
 def _write(patient: Patient, folder: Path, texts: dict[str, str]) -> None:

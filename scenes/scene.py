@@ -207,12 +207,36 @@ class Scene(Section):
         return self
 
 
+# What a file is that is given in a scene's place, by how its name ends, and what takes it.
+NO_SCENES: dict[str | tuple[str, ...], str] = {
+    ".igs.mha": "a tracked sweep: app.py reconstruct and rehearse --track take it",
+    (
+        ".dcm",
+        ".nii",
+        ".nii.gz",
+        ".nrrd",
+        ".mha",
+        ".zip",
+    ): "a CT or labels: app.py import makes a patient's folder of them",
+    ".jsonl": "a session: rehearse --replay takes it",
+    (".json", ".csv"): "a plan or poses: rehearse --plan, rehearse --track and scan --pose take them",
+    (".stl", ".ply"): "a surface: a scene's [anatomy] names it",
+    ".xml": "a PLUS configuration: reconstruct --config takes it",
+    (".png", ".webp", ".jpg", ".jpeg"): "a picture",
+}
+EXPECTED = "expected a scene file (TOML) or a patient's folder"
+
+
 def scene_file(named: Path) -> Path:
     """The scene file that a path names: itself, or that of a patient's folder. Raises SceneError."""
     if not named.is_dir():
         return named
     path = named / "scene.toml"
     if not path.is_file():
+        if session := next(named.glob("session-*.jsonl"), None):
+            raise SceneError(
+                f"{named}: holds {session.name}, a session: rehearse --replay takes that file; {EXPECTED}"
+            )
         raise SceneError(f"{named}: holds no scene.toml; make a patient's folder of a CT with: app.py import")
     return path
 
@@ -221,12 +245,15 @@ def load_scene(path: Path) -> Scene:
     """Read a scene file; a probe's file is named by its whole path. Raises SceneError with one line that names the file, the key and
     the mend.
     """
+    for ends, what in NO_SCENES.items():
+        if path.name.lower().endswith(ends) and path.is_file():
+            raise SceneError(f"{path}: is {what}; {EXPECTED}")
     try:
         values = tomllib.loads(path.read_text("utf-8"))
     except FileNotFoundError:
         raise SceneError(f"{path}: no such scene file or patient's folder") from None
     except UnicodeDecodeError:
-        raise SceneError(f"{path}: is no text; give a scene file (TOML) or a patient's folder") from None
+        raise SceneError(f"{path}: is no text; {EXPECTED}") from None
     except OSError as error:
         raise SceneError(f"{path}: cannot be read as a scene ({_first_line(error)})") from None
     except tomllib.TOMLDecodeError as error:

@@ -8,6 +8,15 @@ from contextlib import contextmanager
 from pathlib import Path
 
 
+def check_writable(folder: Path) -> None:
+    """Write a file into a folder, and remove it: rights alone do not say what a disk lets in. Raises OSError."""
+    tried = folder / f".{secrets.token_hex(4)}.tried"
+    try:
+        tried.write_bytes(b"0")
+    finally:
+        tried.unlink(missing_ok=True)
+
+
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
     """A place beside a path to write its file or folder to; what ends in order takes the path's name, what does not is removed.

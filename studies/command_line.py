@@ -1,7 +1,6 @@
 """What commands share: their faults, the numbers, scenes and folders that they take, and the start of Taichi."""
 
 import math
-import os
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import click
 from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.scene import Scene, load_scene, scene_file
 from scenes.tissue import QUALITIES
+from scenes.whole_files import check_writable
 from studies.results import write_json
 
 # The exit status of a program that Ctrl-C has ended.
@@ -20,8 +20,22 @@ class Fault(click.ClickException):
     """What the user must know, in one line."""
 
 
+class Number(click.types.FloatParamType):
+    """A number, by that name in the help."""
+
+    name = "number"
+
+
+class WholeRange(click.IntRange):
+    """Whole numbers between two."""
+
+    name = "integer"
+
+
 class NumberRange(click.FloatRange):
     """Numbers between two; click's own range lets nan through."""
+
+    name = "number"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         number = super().convert(value, param, ctx)
@@ -48,8 +62,10 @@ def make_folder(folder: Path, option: str = "--out") -> None:
         raise Fault(
             f"{folder}: cannot be made a folder for results ({error.strerror}); choose another {option}"
         ) from None
-    if not os.access(folder, os.W_OK):
-        raise Fault(f"{folder}: cannot be written to; choose another {option}")
+    try:
+        check_writable(folder)
+    except OSError as error:
+        raise Fault(f"{folder}: cannot be written to ({error.strerror}); choose another {option}") from None
 
 
 def make_place(json_file: Path | None) -> None:

@@ -13,6 +13,7 @@ from studies.case import load_case
 from studies.command_line import (
     Fault,
     NumberRange,
+    WholeRange,
     arch_option,
     make_folder,
     make_place,
@@ -57,10 +58,10 @@ if TYPE_CHECKING:
     help="shape-matching: particle radius in mm [the preset's].",
 )
 @click.option("--stiffness", type=NumberRange(0, 1), help="shape-matching: cluster stiffness [the preset's].")
-@click.option("--substeps", type=click.IntRange(1, 100), help="Substeps of a time step [the preset's].")
+@click.option("--substeps", type=WholeRange(1, 100), help="Substeps of a time step [the preset's].")
 @click.option(
     "--iterations",
-    type=click.IntRange(1, 1000),
+    type=WholeRange(1, 1000),
     help="Passes over the constraints in a substep [the preset's].",
 )
 @click.option("--time-step", "time_step_s", type=NumberRange(1e-4, 0.1), help="Time step in s [1/60].")
@@ -137,10 +138,10 @@ def validate(
 @click.option(
     "--search",
     "generations",
-    type=click.IntRange(1, 1000),
+    type=WholeRange(1, 1000),
     help="Instead of the stiffness alone, search stiffness, over-relaxation and iterations for so many generations.",
 )
-@click.option("--jobs", type=click.IntRange(1, 1024), help="Processes on this machine [one a processor].")
+@click.option("--jobs", type=WholeRange(1, 1024), help="Processes on this machine [one a processor].")
 @click.option("--dask", "address", help="Run on the Dask cluster of this scheduler, such as tcp://host:8786.")
 def calibrate(
     cases: tuple[Path, ...],

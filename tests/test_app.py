@@ -249,22 +249,30 @@ def test_what_a_machine_lacks_is_one_line(fault, words, monkeypatch):
     assert words in refused("keys")
 
 
-def ranges(group: click.Group) -> Iterator[click.FloatRange]:
+def types(group: click.Group) -> Iterator[click.ParamType]:
+    """Of what kind the options of all commands are."""
     context = click.Context(group)
     for name in group.list_commands(context):
         command = group.get_command(context, name)
         if isinstance(command, click.Group):
-            yield from ranges(command)
-        yield from (each.type for each in command.params if isinstance(each.type, click.FloatRange))
+            yield from types(command)
+        yield from (each.type for each in command.params)
 
 
 def test_no_range_of_numbers_lets_one_through_that_is_none():
-    found = list(ranges(app.cli))
+    found = [each for each in types(app.cli) if isinstance(each, click.FloatRange)]
     assert len(found) > 20
     for each in found:
         for word in ("nan", "inf", "-inf"):
             with pytest.raises(click.BadParameter):
                 each.convert(word, None, None)
+
+
+def test_numbers_have_everyday_names_in_the_help():
+    named = {each.name for each in types(app.cli)}
+    assert {"number", "integer"} <= named and not [
+        name for name in named if "float" in name or "range" in name
+    ]
 
 
 def test_an_organ_too_small_for_its_particles_is_refused_in_one_line(tmp_path):

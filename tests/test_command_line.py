@@ -4,14 +4,28 @@ from pathlib import Path
 
 import pytest
 
+from scenes.patient_folder import check_folder
+from scenes.reading.error import PatientError
 from scenes.scene import EMBEDDED
-from studies.command_line import Fault, load_patient, save_figures
+from studies.command_line import Fault, load_patient, make_folder, save_figures
 
 
 def test_a_folder_stands_for_its_scene(tmp_path):
     (tmp_path / "scene.toml").write_text(Path(EMBEDDED).read_text("utf-8"), "utf-8")
     scene, anatomy = load_patient(tmp_path)
     assert scene.anatomy.phantom and anatomy.organ.is_watertight and anatomy.tumour.is_watertight
+
+
+def test_a_folder_is_tried_before_the_work(tmp_path, bytes_to_a_file):
+    make_folder(tmp_path / "out")
+    # It may be entered and listed, and what is written to it does not stay.
+    with bytes_to_a_file(0):
+        with pytest.raises(Fault, match=r"out: cannot be written to \(.+\); choose another --out"):
+            make_folder(tmp_path / "out")
+        with pytest.raises(PatientError, match=r"a: cannot be made in .* \(.+\); choose a folder"):
+            check_folder(tmp_path / "out" / "a")
+    check_folder(tmp_path / "out" / "a")
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_figures_that_cannot_be_written_say_so(tmp_path, capsys):

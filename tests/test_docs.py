@@ -15,12 +15,13 @@ import taichi as ti
 from conftest import ROOT
 
 import app
-from scenes.scene import Scene
+from scenes.scene import Image, Scene
 from scenes.tissue import NeoHookeanTissue, ShapeMatchingTissue
 from scenes.trocar import Trocar
 from studies.plan.file import Plan, Sweep
 from studies.scan.poses import load_poses, load_timed_poses
 from studies.session.file import End, Event, Header, Second
+from studies.trade.ladder import Ladder
 from ultrasound.probe import Probe
 
 DOCS = ROOT / "docs"
@@ -243,6 +244,15 @@ def test_the_tool_of_the_example_presses_tissue():
     depth_mm = float(re.findall(r"at most ([\d.]+) mm", told.getvalue())[0])
     # Pressed, so the layer gives way, but by no more than a few times its thickness at Young's modulus.
     assert 0.01 < depth_mm < 0.5
+
+
+def test_what_the_window_says_in_capitals_is_explained():
+    ladder = Ladder(1.0)
+    ladder.rung = 1
+    assert f"*{ladder.says(8).partition('   ')[0]}*" in text(DOCS / "rehearsal.md")
+    assert f"`image.contact_gap_mm` of the scene ({Image().contact_gap_mm} mm)" in text(
+        DOCS / "ultrasound.md"
+    )
 
 
 def test_the_poses_that_come_along_can_be_read():

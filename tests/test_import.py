@@ -23,6 +23,7 @@ from synthetic_body import (
 
 import scenes.patient
 from scenes import anatomy
+from scenes.cautions import STONE_ABOVE_MEDIAN_HU, as_stone
 from scenes.facts import facts, told
 from scenes.organ import midline_x, organs, single_out
 from scenes.patient import import_patient
@@ -341,6 +342,27 @@ class TestCautions:
         shifted.SetOrigin(np.add(labels.GetOrigin(), (0, 8.0, 0)).tolist())
         (said,) = imported(with_voxels(ct, voxels), shifted, [2], margin_mm=20.0, tumour=[3]).cautions
         assert "of the organ's rim is fat or gas" in said
+
+    def test_what_is_as_bright_as_stone_unless_its_label_says_that_it_is_urine(self, ct_and_labels):
+        ct, labels = ct_and_labels
+        points = points_of(ct)
+        stone, pelvis = level(points, (LEFT[0] + [0, 0, 25], np.full(3, 6.0))) < 0, level(points, PELVIS) < 0
+        voxels, marks = sitk.GetArrayFromImage(ct), sitk.GetArrayFromImage(labels)
+        voxels[stone | pelvis], marks[pelvis] = 120 + STONE_ABOVE_MEDIAN_HU + 1, 4
+        bright, told = with_voxels(ct, voxels), with_voxels(labels, marks)
+        (said,) = imported(bright, told, [2], margin_mm=20.0, tumour=[3], urine=[4]).cautions
+        ml = stone.sum() * np.prod(ct.GetSpacing()) / 1000
+        assert f"{ml:.1f} ml inside the organ are as bright as stone" in said and "--collecting" in said
+
+    def test_as_bright_as_stone_is_what_the_echo_takes_for_one(self, ct_and_labels):
+        hounsfield, organ, nothing = (
+            np.full((10, 10, 10), 100.0),
+            np.ones((10, 10, 10), bool),
+            np.zeros(1, bool),
+        )
+        for hu, lines in ((100 + STONE_ABOVE_MEDIAN_HU, 0), (101 + STONE_ABOVE_MEDIAN_HU, 1)):
+            hounsfield[2:5, 2:5, 2:5] = hu
+            assert len(as_stone(VoxelGrid.of(ct_and_labels[0]), hounsfield, organ, organ & nothing)) == lines
 
     def test_labels_without_a_meaning(self, ct_and_labels):
         (said,) = imported(*ct_and_labels, side="left", margin_mm=20.0).cautions

@@ -84,6 +84,23 @@ def test_what_a_session_holds_is_recalled_as_it_was_watched(watching, rehearsal,
         Instruments(rehearsal).recall(log, 5)
 
 
+def test_a_way_back_is_looked_at_and_read_anew_at_once(watching, rehearsal, one_device, monkeypatch):
+    depths = iter([9.0, 0.2])
+    monkeypatch.setattr(instruments, "read", lambda *_: Reading(next(depths), 20.0))
+    lines = np.ones(rehearsal.probe.number_of_scanlines, bool)
+    looks = iter([lines, ~lines])
+    monkeypatch.setattr(watching.coverage, "look", lambda *_: next(looks))
+    noted: list[float] = []
+    watching._look_every = 2
+    session = SimpleNamespace(moment=0, kept={}, back=None)
+    session.note = lambda kind, figures: noted.append(figures["compression_mm"])
+    for session.moment, pose in ((0, FIRST[0]), (1, FIRST[0]), (3, None)):
+        watching.watch(session, rehearsal.probe, pose)
+    view = watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings())
+    assert view.findings["compression"] == "0.2 mm" and noted == [9.0, 0.2] and view.notes
+    assert view.alert == ""
+
+
 def test_another_plan_brings_its_margin_and_what_was_seen_stays(watching, rehearsal, one_device):
     volume = watching.coverage.targets["margin"].sum()
     watching.coverage.seen[watching.coverage.targets["tumour"]] = True

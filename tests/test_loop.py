@@ -3,6 +3,7 @@
 import json
 import socket
 from dataclasses import replace
+from pathlib import PurePosixPath
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +13,7 @@ from click.exceptions import Exit
 import app
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
+from scenes.scene import EMBEDDED
 from studies.rehearse import command, headless, loop, run
 from studies.rehearse.loop import Loop
 from studies.rehearse.view import probe_as_set
@@ -148,7 +150,9 @@ def test_without_a_link_the_loop_goes_on(looping, sent):
     assert sent == []
 
 
-def test_the_export_key_saves_the_tissue_beside_its_picture(looping, monkeypatch, tmp_path):
+def test_the_export_key_saves_the_tissue_beside_its_picture_and_says_what_it_cannot_give(
+    looping, monkeypatch, tmp_path, capsys
+):
     begins: list[str] = []
     monkeypatch.setattr(loop, "save_surfaces", lambda rehearsal, out, begin: begins.append(begin))
     settings = Settings()
@@ -158,9 +162,19 @@ def test_the_export_key_saves_the_tissue_beside_its_picture(looping, monkeypatch
     looping.cine.frames.append(looping.cine.frames[-1])
     looping._save(Controls(settings, export=True), looping.frame(Controls(settings, freeze=True)))
     assert begins == ["001-", "002-", "003-"] and (tmp_path / "003-b-mode.dcm").is_file()
+    assert looping.frame(Controls(settings)).status == "Saved 003"
     # What is looked back at lay otherwise than the tissue does now.
-    looping._save(Controls(settings, export=True), looping.frame(Controls(settings, cine=-1)))
+    before = replace(looping.frame(Controls(settings, cine=-1)), notes={"B-mode": "NO CONTACT"})
+    looping._save(Controls(settings, export=True), before)
     assert len(begins) == 3 and (tmp_path / "004-b-mode.png").is_file()
+    missing = (
+        "echo black: the probe does not touch the organ",
+        "no organ (PLY), which has moved since: F goes on",
+    )
+    assert looping.frame(Controls(settings)).status == "   ".join(["Saved 004", *missing])
+    assert capsys.readouterr().out.endswith(f"\n{'; '.join(missing)}\n")
+    looping._save(Controls(settings, export=True), replace(before, pictures={"CT": before.pictures["CT"]}))
+    assert looping.frame(Controls(settings)).status == f"Saved 005   {missing[1]}"
 
 
 def test_without_a_window_pictures_go_to_the_link_and_the_tissue_into_the_folder(monkeypatch, tmp_path, sent):
@@ -215,6 +229,25 @@ def test_ctrl_c_in_a_run_says_so_before_how_it_went(monkeypatch, capsys):
     assert capsys.readouterr().out == "3 bookmarks\n"
 
 
+@pytest.mark.parametrize(
+    ("scene", "line"),
+    [
+        (None, "--replay a/session-001.jsonl"),
+        (PurePosixPath("my patients/a"), '"my patients/a" --replay a/session-001.jsonl'),
+    ],
+)
+def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scene, line):
+    monkeypatch.setattr(
+        run, "Instruments", lambda rehearsal, guide: SimpleNamespace(guide=None, summary=lambda bookmarks: {})
+    )
+    monkeypatch.setattr(run, "in_words", lambda summary: "")
+    each = run.Run(Moments(), None, "cpu", None, scene=scene)
+    recording = SimpleNamespace(path=PurePosixPath("a/session-001.jsonl"), fault="")
+    each.recorded = SimpleNamespace(recording=recording, close=lambda summary: None)
+    each._end(0)
+    assert capsys.readouterr().out.endswith(f"replay it with: python app.py rehearse {line}\n")
+
+
 def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path, sent):
     link, given = SimpleNamespace(show=sent.append), []
     viewer = SimpleNamespace(close=lambda: None, settings=Settings())
@@ -233,15 +266,17 @@ def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path
     assert given == [link, link]
 
 
-def test_the_command_opens_the_link_for_as_long_as_it_runs(monkeypatch, tmp_path, capsys):
+def test_the_command_opens_the_link_for_as_long_as_it_runs_and_names_its_scene(monkeypatch, tmp_path, capsys):
     with socket.socket() as listening:
         listening.bind(("127.0.0.1", 0))
         port = listening.getsockname()[1]
     reached: list[bool] = []
+    scene = tmp_path / "scene.toml"
+    scene.write_bytes(EMBEDDED.read_bytes())
 
     def headless_run(each: run.Run, *_) -> None:
         socket.create_connection(("127.0.0.1", port), 5).close()
-        reached.append(each.link is not None and each.link.port == port)
+        reached.append(each.link is not None and each.link.port == port and each.scene == scene)
 
     monkeypatch.setattr(command, "start_taichi", lambda arch: "cpu")
     monkeypatch.setattr(command, "built", lambda *_: None)
@@ -250,6 +285,7 @@ def test_the_command_opens_the_link_for_as_long_as_it_runs(monkeypatch, tmp_path
     monkeypatch.setattr(run.Run, "headless", headless_run)
     line = [
         "rehearse",
+        str(scene),
         "--headless",
         "--out",
         str(tmp_path),

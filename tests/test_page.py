@@ -89,8 +89,19 @@ def test_echo_and_ct_of_the_drop_in_probe_fill_the_panel():
 def test_the_first_sliders_go_where_there_is_no_room(size):
     layout = Layout(*size)
     names = list(boxes_of(Settings(young_kpa=15.0), WHOLE, layout))
-    assert (layout.readouts.width == 0) == (size == (700, 420))
+    assert (layout.readouts.width == 0) == (size in ((700, 420), (1024, 576)))
     assert names == (["Picture", "View"] if size == (700, 420) else ["Tissue", "Picture", "View"])
+
+
+@pytest.mark.parametrize("width", range(704, 1600, 64))
+def test_labels_of_sliders_are_whole(width):
+    settings, layout = Settings(young_kpa=15.0), Layout(width, width * 9 // 16)
+    groups = groups_of(settings, WHOLE)
+    for name, box in boxes_of(settings, WHOLE, layout).items():
+        for about in (member.metadata for member in groups[name]):
+            label = 7 * len(f"{about['label']} {about['unit']}".strip())
+            # A switch is 31 pixels wide with what is around it.
+            assert label <= (box.width - 31 if name == "View" else 0.35 * box.width)
 
 
 def test_what_is_not_there_has_no_slider():
@@ -212,7 +223,7 @@ def test_findings_that_become_fewer_leave_nothing_behind():
     assert np.array_equal(composed(page, findings=dict(list(FIGURES.items())[:4])), few)
 
 
-@pytest.mark.parametrize("size", [(1024, 576), (1280, 720), (1920, 1080), (3840, 2160)])
+@pytest.mark.parametrize("size", [(1232, 693), (1280, 720), (1920, 1080), (3840, 2160)])
 def test_all_readouts_of_a_window_are_shown(size):
     layout = Layout(*size)
     ends = [readout_picture(layout, dict(list(FIGURES.items())[:count])) for count in (6, 7)]

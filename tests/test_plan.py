@@ -269,26 +269,33 @@ def test_what_is_worse_is_worth_less_and_said(part, worse):
     assert lost == pytest.approx(score(GOOD) - score(other)) and lost > 0
     told = why(GOOD, other)
     if part == "reachable":
-        assert told == "the other cannot be reached at 10 % of its poses"
+        assert told == "it can be reached everywhere, the other not at 10 % of its poses"
     else:
-        assert f"({lost:+.1f} points)" in told and ";" not in told
-        figure = 100 if part in ("seen", "over_limit", "contact") else 1
-        said = [SAID[part].format(figure * getattr(each, part)) for each in (GOOD, other)]
-        assert told.startswith(f"it {said[0]}, the other {said[1]}")
-        assert said[0] in in_words(GOOD) and said[1] in in_words(other)
+        share = 100 if part in ("seen", "over_limit", "contact") else 1
+        words, unit = SAID[part]
+        figures = [unit.format(share * getattr(each, part)) for each in (GOOD, other)]
+        assert told == f"it {words.format(figures[0])} rather than {figures[1]} ({lost:+.1f} points)"
+        assert words.format(figures[1]) in in_words(other)
 
 
 def test_what_speaks_for_the_other_is_said_too():
     told = why(GOOD, replace(GOOD, seen=0.4, path_mm=20.0))
-    assert "; the other is 20 mm long, it is 60 mm long (" in told
+    assert ", though it goes a way of 60 mm rather than 20 mm (" in told
     assert set(POINTS) <= set(SAID)
+
+
+def test_what_a_sweep_is_worth_is_a_sentence():
+    assert in_words(Parts(0.94, 2.2, 3.4, 0.0, 0.97, 4.6, 211.0, 21.0, 1.0)) == (
+        "it sees 94 % of the target, squeezes the tissue by 2.2 mm on average, is over the limit of squeezing at 0 % of its poses, "
+        "has contact on 97 % of the probe's face, stands 5 degrees off square to the surface, and goes a way of 211 mm"
+    )
 
 
 def test_any_way_that_can_be_held_is_worth_more_than_one_that_cannot():
     poor = Parts(0.0, 15.0, 20.0, 1.0, 0.0, 90.0, 2000.0, 100.0, 1.0)
     perfect = Parts(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.99)
     assert score(poor) > score(perfect) > score(replace(perfect, reachable=0.5)) > score(Parts.nothing())
-    assert why(poor, perfect) == "the other cannot be reached at 1 % of its poses"
+    assert why(poor, perfect) == "it can be reached everywhere, the other not at 1 % of its poses"
 
 
 def test_a_way_of_no_pass_has_no_poses():

@@ -5,8 +5,9 @@ from itertools import permutations
 import numpy as np
 import pytest
 
+from scenes import cautions
 from ultrasound.acoustics import ATTENUATION, IMPEDANCE, properties, tissue_table
-from ultrasound.recognition import bones, hollow, recognised
+from ultrasound.recognition import STONE_ABOVE_MEDIAN_HU, bones, hollow, recognised
 
 SPACING = np.array([0.9, 0.9, 0.9])
 FAT, MARROW, SHELL, CORTEX, BLOOD = -100.0, 150.0, 600.0, 180.0, 200.0
@@ -108,6 +109,20 @@ def test_without_contrast_agent_nothing_is_taken_for_blood():
     hu, _, kidney, _ = abdomen()
     hu[kidney] -= CORTEX - 30.0
     assert "vessel" not in recognised(hu, {"kidney": kidney}, SPACING)
+
+
+def test_contrast_agent_in_labelled_urine_and_about_it_is_no_stone_but_without_agent_what_is_bright_there_is():
+    hu, _, kidney, _ = abdomen()
+    urine, agent = ball((50.0, 30.0, 27.0), 4.0), ball((50.0, 30.0, 27.0), 4.5)
+    hu[agent] = CORTEX + STONE_ABOVE_MEDIAN_HU + 100.0
+    named = {"kidney": kidney & ~urine, "urine": urine}
+    assert not recognised(hu, named, SPACING)["stone"].any()
+    assert (recognised(hu, {"kidney": kidney}, SPACING)["stone"] == agent).all()
+    assert (recognised(hu - CORTEX + 30.0, named, SPACING)["stone"] == agent).all()
+
+
+def test_an_import_warns_of_what_the_echo_takes_for_stone():
+    assert cautions.STONE_ABOVE_MEDIAN_HU == STONE_ABOVE_MEDIAN_HU
 
 
 def test_a_bright_speck_is_no_bone():

@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+import trimesh
 from conftest import rotation_about
 from PIL import Image
 
@@ -12,6 +13,7 @@ import app
 from scenes.anatomy import phantom_folder
 from scenes.scene import EMBEDDED
 from scenes.surface_files import load_surface
+from studies.scan.command import warn_of_deep
 from studies.scan.poses import PoseError, TimedPoses, load_poses, load_timed_poses
 from ultrasound.probe import load_probe
 from version import VERSION
@@ -168,8 +170,23 @@ def test_scan_leaves_a_picture_of_each_pose_and_mode(tmp_path, capsys):
     assert (out / "on-b-mode.dcm").is_file() and not (out / "on-ct.dcm").exists()
 
 
-def test_an_unknown_probe_is_named_with_those_that_are_known(tmp_path, capsys):
-    (tmp_path / "poses.json").write_text(json.dumps([dict(probe_to_patient=np.eye(4).tolist())]))
+def test_poses_deep_inside_the_organ_are_counted(capsys):
+    poses = np.stack([np.eye(4)] * 4)
+    # Of a ball of 30 mm, whose facets lie up to 0.2 mm inside it; outside is not deep.
+    poses[:, 0, 3] = [0.0, 9.5, 10.1, 55.0]
+    organ = trimesh.creation.icosphere(subdivisions=4, radius=30.0)
+    warn_of_deep(poses, organ)
+    assert (
+        "2 of 4 poses lie more than 20 mm inside the organ; they may be of another" in capsys.readouterr().out
+    )
+    warn_of_deep(poses[2:], organ)
+    assert capsys.readouterr().out == ""
+
+
+def test_an_unknown_probe_is_named_with_those_that_are_known_and_poses_that_are_too_deep(tmp_path, capsys):
+    deep = np.eye(4)
+    deep[:3, 3] = [69.7, 26.8, -341.1]
+    (tmp_path / "poses.json").write_text(json.dumps([dict(probe_to_patient=deep.tolist())]))
     command = [
         "scan",
         str(EMBEDDED),
@@ -181,7 +198,8 @@ def test_an_unknown_probe_is_named_with_those_that_are_known(tmp_path, capsys):
         "x.toml",
     ]
     assert app.main(command) == 2
-    assert "known by name are curvilinear, drop-in, linear, phased" in capsys.readouterr().err
+    told = capsys.readouterr()
+    assert "known by name are curvilinear, drop-in, linear, phased" in told.err and "1 of 1 poses" in told.out
 
 
 def test_a_label_of_no_known_tissue_is_refused_in_one_line(tmp_path, capsys):

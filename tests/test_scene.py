@@ -92,7 +92,7 @@ def test_missing_and_unreadable_files_are_named(tmp_path):
     with pytest.raises(SceneError, match="no such scene file"):
         load_scene(tmp_path / "none.toml")
     (tmp_path / "b.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(SceneError, match="is no text; give a scene file"):
+    with pytest.raises(SceneError, match="is no text; expected a scene file"):
         load_scene(tmp_path / "b.toml")
     with pytest.raises(SceneError, match="cannot be read"):
         load_scene(tmp_path)
@@ -208,6 +208,25 @@ def test_the_embedded_patient_is_made_once():
     anatomy = load_anatomy(load_scene(EMBEDDED), EMBEDDED.parent)
     assert 150e3 < anatomy.organ.volume < 200e3
     assert anatomy.tumour is not None and len(anatomy.shapes) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("a.PNG", "is a picture; expected a scene file"),
+        ("ct.nii.gz", "app.py import"),
+        ("sweep-001.igs.mha", "a tracked sweep: app.py reconstruct"),
+        ("session-001.jsonl", "a session: rehearse --replay takes it"),
+        ("plan.json", "rehearse --plan"),
+    ],
+)
+def test_what_is_no_scene_is_named_with_what_takes_it(tmp_path, name, words):
+    (tmp_path / name).write_bytes(b"\x89 anything")
+    with pytest.raises(SceneError, match=words):
+        load_scene(tmp_path / name)
+    (tmp_path / "session-001.jsonl").touch()
+    with pytest.raises(SceneError, match="holds session-001.jsonl, a session: rehearse --replay"):
+        scene_file(tmp_path)
 
 
 def test_a_folder_is_its_scene_and_without_one_is_refused(tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,9 @@ from test_history import STEP_S, Numbers, ray, step
 from test_session import header
 
 import app
+from render.viewer import Controls, Settings
 from studies.coordinates import probe_in_patient
+from studies.rehearse.drivers import Played
 from studies.rehearse.live import Live
 from studies.rehearse.track_file import check_near, load_track
 from studies.rehearse.tracked import PlayedPoses, TrackOver, has_moved, pose_at_time
@@ -103,6 +106,19 @@ def test_mouse_and_keys_do_not_lead_beside_a_tracker_but_go_back():
     steps(live, 10)
     step(live, undo=True)
     assert live.take_said() == "undo" and at(live) != pytest.approx(placed(2.0))
+
+
+def test_who_takes_the_lead_twice_is_told_that_it_is_theirs():
+    live, said = live_of(Tracker(placed(2.0))), []
+    for _ in range(2):
+        step(live, take_over=True)
+        said.append(live.take_said())
+    assert said == ["Yours now", "Yours already"]
+    replay, said = Played(SimpleNamespace(is_over=False), lambda: Live(Session(Patient()), Ladder(1e6))), []
+    for controls in (Controls(Settings(), take_over=True), Controls(Settings())):
+        replay.move(controls)
+        said.append(replay.take_said())
+    assert said == ["Yours now", ""]
 
 
 def test_after_a_way_back_it_stays_until_the_tracked_probe_moves():

@@ -1,7 +1,8 @@
 """What sound meets in a CT: impedance, attenuation and backscatter of every voxel, from labels and HU. NumPy.
 
 Where a voxel has a label, its tissue's values hold (``tissues.toml``), for contrast agent raises HU by iodine, not by density; but fat
-and stones within a kidney are told by HU, which no agent lowers to fat's nor, in parenchyma, raises to a stone's.
+and stones within a kidney are told by HU, which no agent lowers to fat's nor, in parenchyma, raises to a stone's. Urine with agent
+is as bright as stone: only a label tells it.
 """
 
 import tomllib

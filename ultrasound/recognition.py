@@ -34,6 +34,9 @@ def recognised(
         fat = kidney & (hu < FAT_BELOW_HU)
         found["sinus"] = found["sinus"] | fat if "sinus" in found else fat
         found["stone"] = kidney & (hu > median + STONE_ABOVE_MEDIAN_HU)
+        if median > ENHANCED_FROM_HU and "urine" in labelled:
+            # A rim of it is as bright, where voxels are cut.
+            found["stone"] &= ~ndimage.binary_dilation(labelled["urine"])
     tumour = labelled.get("tumour")
     if tumour is not None and tumour.any():
         found["necrosis"] = tumour & (hu < np.median(hu[tumour]) - NECROSIS_BELOW_MEDIAN_HU)

@@ -148,7 +148,9 @@ def load_constants(path: Path) -> dict[str, np.ndarray]:
     try:
         return _constants_of(_configuration(path))
     except SweepError as error:
-        raise SweepError(f"{path.name}: {error}") from error
+        raise SweepError(
+            f"{path.name}: {error}; expected a PLUS configuration (XML); a scene or a patient's folder goes after --scene"
+        ) from error
 
 
 def transform_text(matrix: np.ndarray) -> str:
@@ -193,7 +195,7 @@ def _configuration(path: Path) -> ElementTree.Element:
     except OSError as error:
         raise SweepError(f"{error.strerror}") from error
     if len(content) > CONFIGURATION_LIMIT:
-        raise SweepError(f"more than {CONFIGURATION_LIMIT >> 20} MB: expected a PLUS configuration")
+        raise SweepError(f"more than {CONFIGURATION_LIMIT >> 20} MB")
     try:
         return ElementTree.fromstring(content)
     except (ElementTree.ParseError, LookupError, ValueError) as error:

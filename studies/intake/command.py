@@ -12,7 +12,7 @@ import click
 import psutil
 from tqdm import tqdm
 
-from studies.command_line import make_folder
+from studies.command_line import WholeRange, make_folder
 from studies.intake.whole_body import write_whole_body
 from studies.results import write_json
 
@@ -26,12 +26,12 @@ TUMOUR_OF_PHANTOM = "6"
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the figures.")
 @click.option(
     "--slices",
-    type=click.IntRange(200, 2000),
+    type=WholeRange(200, 2000),
     default=800,
     show_default=True,
     help="Slices of 512 x 512 pixels.",
 )
-@click.option("--runs", type=click.IntRange(1, 20), default=3, show_default=True)
+@click.option("--runs", type=WholeRange(1, 20), default=3, show_default=True)
 def intake(out: Path, slices: int, runs: int) -> None:
     """Measure an import: seconds and memory.
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from studies.command_line import Fault
+from studies.command_line import Fault, WholeRange
 
 if TYPE_CHECKING:
     from studies.link.server import Server
@@ -19,7 +19,7 @@ OPTIONS = (
         is_flag=True,
         help="With --link: the probe goes where a client says that it is, by the transform HandToReference.",
     ),
-    click.option("--link-port", type=click.IntRange(1, 65535), help=f"With --link: its port [{PORT}]."),
+    click.option("--link-port", type=WholeRange(1, 65535), help=f"With --link: its port [{PORT}]."),
 )
 
 

@@ -9,7 +9,7 @@ from tqdm import tqdm
 from scenes.anatomy import load_anatomy
 from scenes.scene import EMBEDDED, load_scene, scene_file, with_options
 from scenes.trocar import Trocar
-from studies.command_line import Fault, NumberRange, make_folder, quality_option
+from studies.command_line import Fault, Number, NumberRange, WholeRange, make_folder, quality_option
 from studies.plan.file import FASTEST_MM_S, MOST_MARGIN_MM, MOST_SWEEPS, SLOWEST_MM_S, write_plan
 from studies.setup import probe_of, with_quality
 from ultrasound.target import TARGETS, Target
@@ -31,13 +31,13 @@ from ultrasound.target import TARGETS, Target
     help="How much around the tumour is to be seen.",
 )
 @click.option(
-    "--trocar", nargs=3, type=float, help="Where the instrument comes in: x y z, LPS, mm [the scene's]."
+    "--trocar", nargs=3, type=Number(), help="Where the instrument comes in: x y z, LPS, mm [the scene's]."
 )
 @click.option(
-    "--cone-deg", type=float, help="How far the shaft may lean from its middle direction [the scene's]."
+    "--cone-deg", type=Number(), help="How far the shaft may lean from its middle direction [the scene's]."
 )
 @click.option(
-    "--wrist-deg", type=float, help="How far the probe may look aside from the shaft [the scene's]."
+    "--wrist-deg", type=Number(), help="How far the probe may look aside from the shaft [the scene's]."
 )
 @click.option("--probe", help="Probe, by its name or as a file [the scene's].")
 @quality_option
@@ -50,12 +50,12 @@ from ultrasound.target import TARGETS, Target
 )
 @click.option(
     "--trials",
-    type=click.IntRange(MOST_SWEEPS, 100_000),
+    type=WholeRange(MOST_SWEEPS, 100_000),
     default=96,
     show_default=True,
     help="Scans that the search may make.",
 )
-@click.option("--jobs", type=click.IntRange(1, 256), help="Processes [as many as there are processors].")
+@click.option("--jobs", type=WholeRange(1, 256), help="Processes [as many as there are processors].")
 def plan(
     scene: Path,
     out: Path,

@@ -49,11 +49,12 @@ def make_plan(
 
 
 def _reasons(rows: list[tuple[Search, Outcome]]) -> list[str]:
-    winner = rows[0][1].parts
-    said = [f"{_name(*rows[0])}: {in_words(winner)}; {score(winner):.1f} points"]
+    first = rows[0][1].parts
+    said = [f"The first sweep is {_name(*rows[0])}, with {score(first):.1f} points: {in_words(first)}."]
     for one, outcome in rows[1:]:
+        parts = outcome.parts
         said.append(
-            f"before {_name(one, outcome)} ({score(outcome.parts):.1f} points): {why(winner, outcome.parts)}"
+            f"It comes before {_name(one, outcome)}, with {score(parts):.1f} points: {why(first, parts)}."
         )
     return said
 

@@ -13,13 +13,14 @@ POINTS = {
 }
 # A way that cannot be gone is worth less than any that can.
 UNREACHABLE = -300.0
+# What a part says of a sweep, and its figure.
 SAID = {
-    "seen": "sees {:.0f} % of the target",
-    "compression_mean_mm": "squeezes {:.1f} mm",
-    "over_limit": "is over the limit at {:.0f} % of its poses",
-    "contact": "touches with {:.0f} % of its lines",
-    "incidence_deg": "looks {:.0f} degrees aside of square",
-    "path_mm": "is {:.0f} mm long",
+    "seen": ("sees {} of the target", "{:.0f} %"),
+    "compression_mean_mm": ("squeezes the tissue by {} on average", "{:.1f} mm"),
+    "over_limit": ("is over the limit of squeezing at {} of its poses", "{:.0f} %"),
+    "contact": ("has contact on {} of the probe's face", "{:.0f} %"),
+    "incidence_deg": ("stands {} off square to the surface", "{:.0f} degrees"),
+    "path_mm": ("goes a way of {}", "{:.0f} mm"),
 }
 SHARES = ("seen", "over_limit", "contact")
 
@@ -38,23 +39,34 @@ def score(parts: Parts) -> float:
 
 
 def in_words(parts: Parts) -> str:
-    """All parts in one line."""
-    return ", ".join(_said(parts, name) for name in POINTS)
+    """All parts of a sweep in one sentence, of which it is the subject."""
+    *said, last = (_said(parts, name) for name in POINTS)
+    return f"it {', '.join(said)}, and {last}"
 
 
 def why(winner: Parts, other: Parts) -> str:
-    """What decided between two, and what the other had for it."""
+    """What decided between two in one sentence, of which the winner is the subject, and what the other had for it."""
     if other.reachable < 1.0 <= winner.reachable:
-        return f"the other cannot be reached at {100 * (1 - other.reachable):.0f} % of its poses"
+        return (
+            f"it can be reached everywhere, the other not at {100 * (1 - other.reachable):.0f} % of its poses"
+        )
     a, b = points(winner), points(other)
     gains = sorted(((a[name] - b[name], name) for name in POINTS), reverse=True)
     most, name = gains[0]
-    text = f"it {_said(winner, name)}, the other {_said(other, name)} ({most:+.1f} points)"
+    text = f"it {_compared(winner, other, name)} ({most:+.1f} points)"
     least, name = gains[-1]
     if least < -0.05:
-        text += f"; the other {_said(other, name)}, it {_said(winner, name)} ({least:+.1f})"
+        text += f", though it {_compared(winner, other, name)} ({least:+.1f})"
     return text
 
 
+def _compared(winner: Parts, other: Parts, name: str) -> str:
+    return f"{_said(winner, name)} rather than {_figure(other, name)}"
+
+
 def _said(parts: Parts, name: str) -> str:
-    return SAID[name].format(getattr(parts, name) * (100 if name in SHARES else 1))
+    return SAID[name][0].format(_figure(parts, name))
+
+
+def _figure(parts: Parts, name: str) -> str:
+    return SAID[name][1].format(getattr(parts, name) * (100 if name in SHARES else 1))

@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy
 from scenes.scene import EMBEDDED, load_scene, scene_file, with_options
-from studies.command_line import make_folder
+from studies.command_line import WholeRange, make_folder
 from studies.plan.file import MOST_SWEEPS
 from studies.results import write_json
 
@@ -19,13 +19,13 @@ from studies.results import write_json
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the figures.")
 @click.option(
     "--trials",
-    type=click.IntRange(MOST_SWEEPS, 100_000),
+    type=WholeRange(MOST_SWEEPS, 100_000),
     default=96,
     show_default=True,
     help="Scans a search.",
 )
 @click.option("--probe", default="drop-in", show_default=True, help="Probe, by its name or as a file.")
-@click.option("--jobs", type=click.IntRange(1, 256), help="Processes [as many as there are processors].")
+@click.option("--jobs", type=WholeRange(1, 256), help="Processes [as many as there are processors].")
 def plan_study(scenes: tuple[Path, ...], out: Path, trials: int, probe: str, jobs: int | None) -> None:
     """Compare planned sweeps with straight ones, and such by chance.
 
@@ -55,7 +55,7 @@ def table(run: dict[str, Any]) -> list[str]:
     """The figures of one patient."""
     lines = [
         f"{run['patient']}, {run['probe']}: {run['plan']}",
-        f"{'sweep':<14}seen  squeezed, mean and most, mm  lines touching  aside of square  path, mm  reachable  points",
+        f"{'sweep':<14}seen  squeezed, mean and most, mm  lines touching       off square  path, mm  reachable  points",
     ]
     for row in run["rows"]:
         name = row["sweep"] if row["count"] == 1 else f"{row['sweep']} ({row['count']})"

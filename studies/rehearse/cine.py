@@ -53,14 +53,14 @@ class Cine:
 
 @dataclass
 class Calliper:
-    """Two points on the image plane [mm], set by clicks; a third click begins anew."""
+    """Two points on the image plane [mm], set by clicks; a third click removes them."""
 
     points: tuple[tuple[float, float], ...] = ()
 
     def point(self, place_mm: tuple[float, float] | None) -> None:
-        """Set the next point, if there was a click."""
+        """Set the next point, or remove both, if there was a click."""
         if place_mm is not None:
-            self.points = (place_mm,) if len(self.points) == 2 else (*self.points, place_mm)
+            self.points = () if len(self.points) == 2 else (*self.points, place_mm)
 
     def figure(self, frame: Frame) -> str:
         """The distance of the points as the tissue lies, and of the same tissue at rest; empty of fewer than two."""

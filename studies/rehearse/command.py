@@ -14,6 +14,7 @@ from scenes.scene import EMBEDDED, OPTIONS, Scene, load_scene, scene_file, with_
 from scenes.tissue import TISSUES
 from studies.command_line import (
     Fault,
+    Number,
     NumberRange,
     arch_option,
     make_folder,
@@ -89,11 +90,11 @@ if TYPE_CHECKING:
 )
 @arch_option
 @click.option("--model", type=click.Choice(list(TISSUES)), help="Tissue model [the scene's].")
-@click.option("--cell", type=float, help="neo-hookean: width of a cell in mm [the scene's].")
-@click.option("--young-kpa", type=float, help="neo-hookean: Young's modulus in kPa [the scene's].")
-@click.option("--poisson", type=float, help="neo-hookean: Poisson's ratio [the scene's].")
-@click.option("--radius", type=float, help="shape-matching: particle radius in mm [the scene's].")
-@click.option("--stiffness", type=float, help="shape-matching: cluster stiffness, 0 to 1 [the scene's].")
+@click.option("--cell", type=Number(), help="neo-hookean: width of a cell in mm [the scene's].")
+@click.option("--young-kpa", type=Number(), help="neo-hookean: Young's modulus in kPa [the scene's].")
+@click.option("--poisson", type=Number(), help="neo-hookean: Poisson's ratio [the scene's].")
+@click.option("--radius", type=Number(), help="shape-matching: particle radius in mm [the scene's].")
+@click.option("--stiffness", type=Number(), help="shape-matching: cluster stiffness, 0 to 1 [the scene's].")
 @click.option("--substeps", type=int, help="Substeps of a time step [the model's].")
 @click.option("--iterations", type=int, help="Passes over the constraints in a substep [the model's].")
 @quality_option
@@ -175,7 +176,8 @@ def rehearse(
     from studies.rehearse.run import Run
 
     tracked = server.hand if server is not None and link_leads else None
-    run = Run(rehearsal, anatomy, used, out, budget_ms, tracked, track, keys, gamepad, server, plan)
+    named = None if scene == EMBEDDED else scene
+    run = Run(rehearsal, anatomy, used, out, budget_ms, tracked, track, keys, gamepad, server, plan, named)
     if headless:
         run.headless(log, at, seconds, build_s, not no_pictures)
     else:

@@ -1,7 +1,7 @@
 """Who leads the transducer in a rehearsal: the user (``live.py``), a recorded session, or the scene's script."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -72,7 +72,7 @@ class Played:
     def move(self, controls: Controls) -> np.ndarray | None:
         if self.live is None and (controls.take_over or self.replay.is_over):
             self._said = "Yours now" if controls.take_over else "The replay is over: yours now"
-            self.live = self._lead()
+            self.live, controls = self._lead(), replace(controls, take_over=False)
         if self.live is not None:
             return self.live.move(controls)
         pose, settings = self.replay.move()

@@ -58,9 +58,8 @@ class Live:
         if self._go_back(controls):
             self._wait(controls.ray)
             return None
-        if controls.take_over and self._follower is not None:
-            self._follower, self._said = None, "Yours now"
-            self.session.rehearsal.hand.take(self.session.rehearsal.pose)
+        if controls.take_over:
+            self._take_over()
         self._set_solver(controls)
         rehearsal = self.session.rehearsal
         held, follower = rehearsal.hand.grip, self._follower
@@ -72,6 +71,14 @@ class Live:
         self.history.watch(moves or presses, presses)
         rehearsal.hand.grip = grip
         return pose
+
+    def _take_over(self) -> None:
+        """The user leads, and no longer a tracked probe."""
+        if self._follower is None:
+            self._said = "Yours already"
+            return
+        self._follower, self._said = None, "Yours now"
+        self.session.rehearsal.hand.take(self.session.rehearsal.pose)
 
     def _wait(self, ray: Ray | None) -> None:
         """The transducer stays until the user moves it."""

@@ -66,10 +66,19 @@ class Loop:
         if controls.screenshot:
             save_screenshot(self.viewer.picture(), self.out)
         if controls.export:
-            begin = save_view(view, probe_as_set(self.rehearsal.probe, controls.settings), self.out)
-            # Of a picture that is looked back at, the tissue has gone on.
-            if not (self.frozen and self.cine.back):
-                save_surfaces(self.rehearsal, self.out, begin)
+            self._export(controls.settings, view)
+
+    def _export(self, settings: Settings, view: View) -> None:
+        """Save the picture and the tissue, and say what is not in them, and why. Raises OSError."""
+        begin, missing = save_view(view, probe_as_set(self.rehearsal.probe, settings), self.out), []
+        if view.notes.keys() & view.pictures.keys():
+            missing.append("echo black: the probe does not touch the organ")
+        if self.frozen and self.cine.back:
+            missing.append("no organ (PLY), which has moved since: {freeze} goes on")
+        else:
+            save_surfaces(self.rehearsal, self.out, begin)
+        self._say("   ".join([f"saved {begin.rstrip('-')}", *missing]))
+        self._tell("; ".join(missing))
 
     def frame(self, controls: Controls) -> View:
         """One frame: what the user did, a moment unless frozen, and what is to be seen."""

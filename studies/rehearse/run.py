@@ -46,7 +46,7 @@ from studies.trade.ladder import Ladder
 class Run:
     """One rehearsal, its anatomy, the folder for what comes of it, and what leads beside the mouse.
 
-    ``tracked`` is a probe that is tracked now, ``track`` the way of one that was.
+    ``tracked`` is a probe that is tracked now, ``track`` the way of one that was; ``scene`` is the path that the user named, if any.
     """
 
     rehearsal: Rehearsal
@@ -60,6 +60,7 @@ class Run:
     gamepad: bool = False
     link: Server | None = None
     plan: Plan | None = None
+    scene: Path | None = None
     recorded: Recorded | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
@@ -171,8 +172,14 @@ class Run:
             _say(guide.in_words(summary.get(f"seen_{guide.plan.target}")))
         if self.recorded is not None:
             self.recorded.close(summary)
-            path = self.recorded.recording.path
-            click.echo(self.recorded.recording.fault or f"Recorded: replay it with rehearse --replay {path}")
+            told = f"Recorded; replay it with: {self._replaying(self.recorded.recording.path)}"
+            click.echo(self.recorded.recording.fault or told)
+
+    def _replaying(self, session: Path) -> str:
+        """The command line that replays a session, to be pasted."""
+        scene = [] if self.scene is None else [self.scene]
+        quoted = [f'"{path}"' if " " in str(path) else str(path) for path in (*scene, "--replay", session)]
+        return f"python app.py rehearse {' '.join(quoted)}"
 
 
 def _verdict(replay: Replay | None) -> str:

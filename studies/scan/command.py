@@ -1,15 +1,18 @@
 """The command ``scan``: pictures of an anatomy at rest for a list of probe poses."""
 
+from collections.abc import Collection
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
+import trimesh
 from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy
 from scenes.scene import load_scene, scene_file, with_options
+from sim.distance import signed_distance
 from studies.command_line import Fault, arch_option, make_folder, start_taichi
 from studies.results import write_json
 from studies.scan.poses import load_poses
@@ -21,6 +24,8 @@ if TYPE_CHECKING:
     from studies.pictures import SavedPicture
 
 FRAMES_A_SECOND = 30
+# No hand presses a probe as deep as this into where an organ lies at rest.
+DEEP_MM = 20.0
 
 
 @click.command()
@@ -72,6 +77,7 @@ def scan(
     anatomy = load_anatomy(loaded, path.parent)
     if anatomy.ct is None:
         raise Fault(f"{path}: has no CT: expected anatomy.ct, of which pictures are made")
+    warn_of_deep(placed.values(), anatomy.organ)
     held, image = probe_of(loaded), loaded.image
     used = start_taichi(arch)
     from sim.embedding import Unmoved
@@ -111,6 +117,16 @@ def scan(
     click.echo(
         f"Wrote {len(rows)} pictures of {len(placed)} poses and scan.json to {out}; {np.median(ms):.1f} ms a pose (median)."
     )
+
+
+def warn_of_deep(poses: Collection[np.ndarray], organ: trimesh.Trimesh) -> None:
+    """Say how many poses (4, 4) no probe can take on this organ."""
+    faces = np.array([pose[:3, 3] for pose in poses])
+    deep = int((signed_distance(organ.vertices, organ.faces, faces)[0] < -DEEP_MM).sum())
+    if deep:
+        click.echo(
+            f"Mind: {deep} of {len(poses)} poses lie more than {DEEP_MM:g} mm inside the organ; they may be of another patient."
+        )
 
 
 def _row(saved: "SavedPicture", probe: Probe) -> dict[str, Any]:

@@ -78,7 +78,10 @@ def in_words(summary: dict[str, Any]) -> str:
         if name.startswith("seen_")
     )
     gaps = summary["gaps"]
-    largest = f"; largest gap {gaps[0]['volume_ml']:.1f} ml" if gaps else ""
+    largest = ""
+    if gaps:
+        volume_ml, thickness_mm = gaps[0]["volume_ml"], gaps[0]["thickness_mm"]
+        largest = f"; the largest part unseen is {volume_ml:.1f} ml, up to {thickness_mm:.1f} mm thick"
     return "\n".join(
         [
             f"session   {summary['duration_s']:.1f} s, {counted(summary['presses'], 'press')}, the way of the transducer "

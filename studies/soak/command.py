@@ -7,7 +7,7 @@ import click
 from tqdm import tqdm
 
 from scenes.scene import PAPER
-from studies.command_line import arch_option, load_patient, make_folder, start_taichi
+from studies.command_line import WholeRange, arch_option, load_patient, make_folder, start_taichi
 from studies.results import write_csv, write_json
 from studies.setup import PRESETS
 
@@ -18,7 +18,7 @@ HOUR = 60
 @click.argument("scene", type=click.Path(path_type=Path), default=PAPER, required=False)
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for table and picture.")
 @click.option(
-    "--minutes", type=click.IntRange(1, 6000), default=HOUR, show_default=True, help="Simulated minutes."
+    "--minutes", type=WholeRange(1, 6000), default=HOUR, show_default=True, help="Simulated minutes."
 )
 @click.option("--quick", is_flag=True, help="A quarter of a simulated minute of each model.")
 @click.option("--model", type=click.Choice(list(PRESETS)), help="One tissue model [all].")

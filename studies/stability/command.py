@@ -9,7 +9,7 @@ import click
 from joblib import Parallel, delayed
 from tqdm import tqdm
 
-from studies.command_line import make_folder
+from studies.command_line import WholeRange, make_folder
 from studies.orphans import processes
 from studies.results import write_csv, write_json
 from studies.stability.cases import MODELS, Case, cases_of, quick_cases_of
@@ -21,7 +21,7 @@ BATCH = 4
 @click.command()
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for table and picture.")
 @click.option("--quick", is_flag=True, help="One case of each kind, in one to two minutes.")
-@click.option("--jobs", type=click.IntRange(1, 1024), help="Processes on this machine [one a processor].")
+@click.option("--jobs", type=WholeRange(1, 1024), help="Processes on this machine [one a processor].")
 def stability(out: Path, quick: bool, jobs: int | None) -> None:
     """Maltreat the tissue, let go, and see whether it recovers.
 
