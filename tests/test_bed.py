@@ -4,7 +4,7 @@ import igl
 import numpy as np
 import pytest
 import trimesh
-from synthetic_body import LEFT, TUMOUR, assert_sound, body, drawn, least_gap, level
+from synthetic_body import LEFT, TUMOUR, assert_sound, body, drawn, grid_around, least_gap, level
 
 from scenes.bed import bed_of_file, bed_of_labels
 from scenes.patient import SUPINE_GRAVITY, import_patient
@@ -15,6 +15,16 @@ from scenes.reading.volume import Volume
 # A muscle behind the left kidney, with 4 mm of fat between.
 MUSCLE = np.array([70.0, 79.0, 12.0]), np.array([45.0, 20.0, 70.0])
 NAMES = {2: "kidney_left", 3: "tumour", 4: "psoas"}
+SMALL = np.array([10.0, -20.0, 30.0]), np.array([13.0, 11.0, 18.0])
+
+
+def small_organs_bed(muscle: tuple[np.ndarray, np.ndarray]) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
+    """An organ that is soon made, and the bed of a muscle."""
+    organ = trimesh.creation.icosphere(subdivisions=3)
+    organ.vertices = organ.vertices * SMALL[1] + SMALL[0]
+    empty = grid_around(SMALL[0] - 50, SMALL[0] + 50, (2.5, 2.5, 2.5))
+    labels = LabelMap.of(drawn(empty, (4, muscle), (2, SMALL)), NAMES)
+    return organ, bed_of_labels(organ, labels, [2, 3], SUPINE_GRAVITY)
 
 
 @pytest.fixture(scope="module")
@@ -49,17 +59,15 @@ class TestBedOfLabels:
         off = np.abs(level(beside, MUSCLE)) * MUSCLE[1].min()
         assert np.percentile(off, 90) < 2.5  # a voxel
 
-    def test_nothing_under_the_organ(self, ct_and_labels, patient):
-        _, labels = ct_and_labels
-        aside = drawn(labels, (4, (MUSCLE[0] - [60, 0, 0], MUSCLE[1])), (2, LEFT), (3, TUMOUR))
+    def test_nothing_under_the_organ(self):
+        aside = SMALL[0] + [-36, 30, 0], np.array([20.0, 14.0, 40.0])
         with pytest.raises(PatientError, match=r"lies under \d+% of the organ: expected 50% or more"):
-            bed_of_labels(patient.organ, LabelMap.of(aside, NAMES), [2, 3], SUPINE_GRAVITY)
+            small_organs_bed(aside)
 
-    def test_ends_at_half_of_the_organs_height(self, ct_and_labels, patient):
+    def test_ends_at_half_of_the_organs_height(self):
         """Though tissue goes on around it; less what the rounded rim takes."""
-        around = drawn(ct_and_labels[1], (4, (LEFT[0], LEFT[1] + 30)), (2, LEFT), (3, TUMOUR))
-        bed = bed_of_labels(patient.organ, LabelMap.of(around, NAMES), [2, 3], SUPINE_GRAVITY)
-        assert 0 <= bed.bounds[0, 1] - patient.organ.bounds[:, 1].mean() < 4
+        organ, bed = small_organs_bed((SMALL[0], SMALL[1] + 30))
+        assert 0 <= bed.bounds[0, 1] - organ.bounds[:, 1].mean() < 4
 
 
 class TestBedOfFile:

@@ -281,31 +281,32 @@ def written(path, image=None):
 
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+KINDS = "dicom", "files", "labels"
 CASES = 120
 
 
-@pytest.mark.parametrize("count", ["-3", "0", "11", "1000000000"])
-def test_count_of_dimensions(tmp_path, count):
-    """ITK takes it for a length of its own; read by another process, lest this one ends."""
-    path = written(tmp_path / "a.mha")
-    path.write_bytes(path.read_bytes().replace(b"NDims = 3", f"NDims = {count}".encode()))
-    done = subprocess.run(
-        [sys.executable, __file__, str(path)], capture_output=True, text=True, env=ENVIRONMENT
-    )
-    assert done.returncode == 0 and "a.mha" in done.stdout
+def in_another_process(*arguments):
+    """What this file prints when it is run: a reader that is killed does not end the tests."""
+    command = [sys.executable, __file__, *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT)
+    assert done.returncode == 0, done.stdout[-300:] + done.stderr[-600:]
+    return done.stdout.splitlines()
 
 
-@pytest.mark.parametrize("kind", ["dicom", "files", "labels"])
-def test_chance_damage(tmp_path, kind):
-    """Flipped, inserted and lost bytes: a volume or labels that read, or one line; in a process of its own."""
-    done = subprocess.run(
-        [sys.executable, __file__, "damage", kind, str(tmp_path)],
-        capture_output=True,
-        text=True,
-        env=ENVIRONMENT,
-    )
-    assert done.returncode == 0, done.stderr[-600:]
-    assert done.stdout.splitlines()[-1] == "sound", done.stdout
+def test_count_of_dimensions(tmp_path):
+    """ITK takes it for a length of its own."""
+    sound = written(tmp_path / "a.mha").read_bytes()
+    paths = [tmp_path / f"{count}.mha" for count in (-3, 0, 11, 1000000000)]
+    for path in paths:
+        path.write_bytes(sound.replace(b"NDims = 3", f"NDims = {path.stem}".encode()))
+    said = in_another_process("read", *paths)
+    assert [line.split(".mha")[0] for line in said] == [path.stem for path in paths]
+
+
+def test_chance_damage(tmp_path):
+    """Flipped, inserted and lost bytes: a volume or labels that read, or one line."""
+    said = in_another_process("damage", tmp_path)
+    assert said[-1] == "sound", said
 
 
 def samples(folder, kind):
@@ -360,8 +361,8 @@ def damaged(content, chance):
 
 
 def damage(kind, folder):
-    """What happens to damaged files; the last line is 'sound' where nothing did."""
-    resource.setrlimit(resource.RLIMIT_AS, (6 * 2**30,) * 2)
+    """What damaged files do that they should not."""
+    folder.mkdir()
     grid, faults = None, set()
     for target, path, read in samples(folder, kind):
         good, chance = target.read_bytes(), random.Random(target.name)
@@ -377,14 +378,17 @@ def damage(kind, folder):
             except Exception as error:
                 faults.add(f"{target.name}: {type(error).__name__} {str(error)[:80]}")
         target.write_bytes(good)
-    print("\n".join(sorted(faults)) or "sound")
+    return faults
 
 
 if __name__ == "__main__":
     if sys.argv[1] == "damage":
-        damage(sys.argv[2], Path(sys.argv[3]))
+        resource.setrlimit(resource.RLIMIT_AS, (6 * 2**30,) * 2)
+        faults = set().union(*(damage(kind, Path(sys.argv[2]) / kind) for kind in KINDS))
+        print("\n".join(sorted(faults)) or "sound")
     else:
-        try:
-            open_ct(Path(sys.argv[1])).hounsfield()
-        except PatientError as error:
-            print(error)
+        for path in map(Path, sys.argv[2:]):
+            try:
+                open_ct(path).hounsfield()
+            except PatientError as error:
+                print(str(error).removeprefix(f"{path.parent}{os.sep}"))

@@ -200,7 +200,7 @@ def pressed_ball(indentations_mm: tuple[float, ...]) -> tuple[Experiment, list[t
     block = trimesh.creation.box([40.0, 40.0, 8.0])
     block.apply_translation([0.0, 0.0, -12.7])
     press = Press(size_mm=(12.0, 6.0, 8.0), indentations_mm=indentations_mm)
-    mesh = tetrahedra(ball, lambda points: np.full(len(points), 6.0))
+    mesh = tetrahedra(ball, lambda points: np.full(len(points), 9.0))
     return Experiment(mesh, block, TISSUE, press), [ball, block]
 
 
@@ -209,8 +209,9 @@ def solved_case() -> Case:
     """The ball pressed by 1 mm."""
     experiment, (ball, block) = pressed_ball((0.0, 1.0))
     stages = list(experiment.stages())
-    made = dict(time_s=1.0, edge_near_probe_mm=6.0)
-    beads = blue_noise(ball, count=12)
+    made = dict(time_s=1.0, edge_near_probe_mm=9.0)
+    # Deep, where tetrahedra are straight.
+    beads = blue_noise(ball, count=12, depth_mm=6.0)
     return Case(
         "ball",
         "a test",

@@ -5,7 +5,7 @@ import hashlib
 import numpy as np
 import pytest
 import taichi as ti
-from test_rehearsal import LOOK, patient_in
+from test_rehearsal import LOOK, phantom
 from test_solver import position, solver_of
 
 from scenes.anatomy import load_anatomy
@@ -34,11 +34,11 @@ def test_pairs_give_the_same_bits_whatever_the_threads(ball, serial):
     ti.reset()
 
 
-def test_two_runs_of_a_scene_give_the_same_bits(tmp_path):
+def test_two_runs_of_a_scene_give_the_same_bits():
     digests = []
     for _ in range(2):
         start("cpu")
-        scene, folder = patient_in("phantom", tmp_path)
+        scene, folder = phantom()
         scene = scene.model_copy(update={"press": scene.press.model_copy(update={"warm_up_steps": 20})})
         rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
         for step in range(20):

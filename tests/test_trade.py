@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from bead_case import write_case
 from PIL import Image
 
 import app
@@ -202,21 +203,22 @@ def test_a_slow_step_loses_iterations_rung_by_rung_and_gets_them_back():
 
 def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, capsys):
     tried = (
-        setup_of("neo-hookean", cell_mm=10.0, iterations=2, warm_up_steps=20, stage_steps=12),
-        setup_of("shape-matching", radius_mm=7.0, warm_up_steps=20, stage_steps=12),
+        setup_of("neo-hookean", cell_mm=6.0, iterations=2, warm_up_steps=20, stage_steps=12),
+        setup_of("shape-matching", radius_mm=3.0, warm_up_steps=20, stage_steps=12),
     )
     monkeypatch.setattr("studies.trade.tried.QUICK", tried)
+    monkeypatch.setattr(command, "EMBEDDED_CASE", write_case(tmp_path / "case"))
     assert app.main(["study", "trade", "--quick", "--out", str(tmp_path)]) == 0
     report = json.loads((tmp_path / "trade.json").read_text())
     assert [p["model"] for p in report["points"]] == ["neo-hookean", "shape-matching"]
     for p in report["points"]:
-        assert p["ms_median"] > 0 and p["error_resting_mm"] == p["errors_mm"]["phantom"]
+        assert p["ms_median"] > 0 and p["error_resting_mm"] == p["errors_mm"]["ball"]
         both = p["error_resting_mm"] + p["error_arriving_mm"]
         assert p["error_mean_mm"] == pytest.approx(both / 2, abs=1e-6)
-    assert report["points"][0]["cell_mm"] == 10.0 and report["points"][0]["radius_mm"] is None
+    assert report["points"][0]["cell_mm"] == 6.0 and report["points"][0]["radius_mm"] is None
     assert any(p["pareto"] for p in report["points"])
     with (tmp_path / "trade.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert float(rows[1]["error_phantom_mm"]) == report["points"][1]["error_resting_mm"]
+    assert float(rows[1]["error_ball_mm"]) == report["points"][1]["error_resting_mm"]
     assert Image.open(tmp_path / "trade.png").size[0] > 1000
     assert "front" in capsys.readouterr().out
