@@ -5,13 +5,11 @@ import json
 
 import pytest
 import taichi as ti
-import trimesh
-from bead_case import RADIUS, bowl
+from bead_case import briefly, small_anatomy
 from PIL import Image
 
 import app
-from scenes.anatomy import LoadedAnatomy
-from scenes.scene import PAPER, Press, Scene, load_scene
+from scenes.scene import PAPER, load_scene
 from sim.contact import ShapeContacts
 from sim.neighbours import ParticleContacts
 from sim.shape_matching import ShapeMatching
@@ -42,20 +40,6 @@ WITHOUT = (
         ("friction on shapes", "contacts of particles", "scaled masses"),
     ),
 )
-
-
-def small_anatomy() -> LoadedAnatomy:
-    """A ball in a bowl, on the back as patients are."""
-    mould = bowl()
-    mould.vertices = mould.vertices[:, [0, 2, 1]] * [1, -1, 1]
-    mould.fix_normals()
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
-    return LoadedAnatomy(ball, None, None, (mould,))
-
-
-def briefly(warm_up_steps: int) -> Scene:
-    """The paper's scene, whose tissue is given so many steps to settle."""
-    return load_scene(PAPER).model_copy(update={"press": Press(warm_up_steps=warm_up_steps)})
 
 
 def body_of(model: str) -> measure.Body:
