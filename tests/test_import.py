@@ -11,6 +11,7 @@ from synthetic_body import (
     TUMOUR,
     assert_sound,
     body,
+    coarsely,
     drawn,
     grid_around,
     least_gap,
@@ -77,8 +78,7 @@ def without_support(monkeypatch):
 
 @pytest.fixture
 def coarse(monkeypatch):
-    """Surfaces are tested by themselves, and coarse ones take a quarter of the time."""
-    monkeypatch.setattr("scenes.surfaces.CELL_MM", (2.0, 2.0))
+    coarsely(monkeypatch)
 
 
 @pytest.mark.usefixtures("patient", "without_support")

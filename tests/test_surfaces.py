@@ -12,6 +12,7 @@ from synthetic_body import (
     SPACINGS,
     TUMOUR,
     assert_sound,
+    coarsely,
     drawn,
     grid_around,
     least_gap,
@@ -25,8 +26,7 @@ from scenes.surfaces import decimate, self_intersections, surface_from_mask
 
 @pytest.fixture
 def coarse(monkeypatch):
-    """A coarser grid, for what does not depend on it."""
-    monkeypatch.setattr("scenes.surfaces.CELL_MM", (1.5, 1.5))
+    coarsely(monkeypatch)
 
 
 class TestSurface:
