@@ -93,9 +93,10 @@ def _most_like_a_kidney(tissue: sitk.Image, seed: np.ndarray) -> np.ndarray:
     hounsfield = sitk.GetArrayFromImage(tissue)
     index = np.rint(VoxelGrid.of(tissue).index(seed[None])[0]).astype(int)
     start = np.clip(index, 0, np.array(tissue.GetSize()) - 1)
-    level = float(np.median(hounsfield[_distance(hounsfield, start) <= SEED_BALL_MM]))
+    away = _distance(hounsfield, start)
+    level = float(np.median(hounsfield[away <= SEED_BALL_MM]))
     _check_parenchyma(level, seed)
-    found = [one for low, high in _bands(level) for one in _openings(tissue, start, low, high)]
+    found = [one for low, high in _bands(level) for one in _openings(tissue, away, low, high)]
     shapes = [(*_shape(inside, hounsfield), inside) for inside in found if _whole(inside)]
     if not shapes:
         raise _refusal(seed, _why_none(found))
@@ -131,24 +132,24 @@ def _bands(level: float) -> list[tuple[float, float]]:
     return [(FAT_HU + share * (level - FAT_HU), level + above) for share, above in shares]
 
 
-def _openings(tissue: sitk.Image, start: np.ndarray, low: float, high: float) -> Iterator[np.ndarray]:
-    """Regions (z, y, x) that a band of HU connects to the start, cut where they are thin.
+def _openings(tissue: sitk.Image, away: np.ndarray, low: float, high: float) -> Iterator[np.ndarray]:
+    """Regions (z, y, x) that a band of HU connects to the start, cut where they are thin; ``away`` from it [mm].
 
     sitk.ConnectedThreshold, then what is deep in it by sitk.SignedMaurerDistanceMap; the core at the start grows back by
     sitk.BinaryDilate. In an opening the cores of the neighbours would, too.
     """
-    body = _connected(tissue, start, low, high, OFF_SEED_MM)
+    body = _connected(tissue, away, low, high, OFF_SEED_MM)
     depth = sitk.SignedMaurerDistanceMap(body, insideIsPositive=True, squaredDistance=False)
     for radius in OPENINGS:
-        core = _connected(depth, start, radius - 0.9, 1e4, (radius + 1) * WORKING_MM)
+        core = _connected(depth, away, radius - 0.9, 1e4, (radius + 1) * WORKING_MM)
         if sitk.GetArrayViewFromImage(core).any():
             yield _grown_back(sitk.GetArrayViewFromImage(core), sitk.GetArrayViewFromImage(body), radius)
 
 
-def _connected(image: sitk.Image, start: np.ndarray, low: float, high: float, off_mm: float) -> sitk.Image:
+def _connected(image: sitk.Image, away: np.ndarray, low: float, high: float, off_mm: float) -> sitk.Image:
     """What is of a range and connected to its voxel that is nearest to the start; nothing where that is too far."""
     voxels = sitk.GetArrayViewFromImage(image)
-    distance = np.where((voxels >= low) & (voxels <= high), _distance(voxels, start), np.inf)
+    distance = np.where((voxels >= low) & (voxels <= high), away, np.inf)
     z, y, x = (int(n) for n in np.unravel_index(np.argmin(distance), distance.shape))
     return sitk.ConnectedThreshold(image, [[x, y, z]] if distance[z, y, x] <= off_mm else [], low, high)
 

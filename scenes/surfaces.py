@@ -18,6 +18,8 @@ from skimage.measure import marching_cubes
 
 FACES = 5000
 SMOOTHING_ITERATIONS = 20
+# The grid on which it is contoured: so many cells along a cube of the body's volume, of sizes between these [mm].
+CELLS, CELL_MM = 40, (0.3, 1.0)
 # Standard deviation, in voxels, of the low-pass on the signed distance. A label knows its boundary to half a
 # voxel, so terraces of that size are not anatomy; the HC filter alone keeps them, as it pulls back by design.
 TERRACE_SD = 0.7
@@ -42,7 +44,7 @@ def surface_from_mask(mask: sitk.Image, faces: int = FACES) -> trimesh.Trimesh:
     spacing = np.array(mask.GetSpacing())
     volume = float(solid.sum() * spacing.prod())
 
-    fine = _iso_surface(solid, spacing, step=float(np.clip(np.cbrt(volume) / 40, 0.3, 1.0)))
+    fine = _iso_surface(solid, spacing, step=float(np.clip(np.cbrt(volume) / CELLS, *CELL_MM)))
     trimesh.smoothing.filter_humphrey(fine, alpha=0.1, beta=0.5, iterations=SMOOTHING_ITERATIONS)
 
     coarse = decimate(fine, faces)

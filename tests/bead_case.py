@@ -1,4 +1,4 @@
-"""A tiny bead experiment as files: a ball in a bowl under a probe, with made-up measurements."""
+"""A tiny bead experiment as files: a ball in a bowl under a probe, with made-up measurements; and the two as a patient."""
 
 import json
 from pathlib import Path
@@ -6,6 +6,9 @@ from pathlib import Path
 import numpy as np
 import tomli_w
 import trimesh
+
+from scenes.anatomy import LoadedAnatomy
+from scenes.scene import PAPER, Press, Scene, load_scene
 
 RADIUS = 12.0
 DEPTHS = (0.0, 2.0, 4.0)
@@ -69,3 +72,17 @@ def write_case(folder: Path, case: dict | None = None, places: np.ndarray | None
     lines += [",".join([str(i), *(json.dumps(float(v)) for v in row)]) for i, row in enumerate(rows)]
     (folder / "beads.csv").write_text("\n".join(lines) + "\n", "utf-8")
     return folder
+
+
+def small_anatomy() -> LoadedAnatomy:
+    """The ball in its bowl, on the back as patients are."""
+    mould = bowl()
+    mould.vertices = mould.vertices[:, [0, 2, 1]] * [1, -1, 1]
+    mould.fix_normals()
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
+    return LoadedAnatomy(ball, None, None, (mould,))
+
+
+def briefly(warm_up_steps: int) -> Scene:
+    """The paper's scene, whose tissue is given so many steps to settle."""
+    return load_scene(PAPER).model_copy(update={"press": Press(warm_up_steps=warm_up_steps)})

@@ -26,6 +26,12 @@ DIRECTIONS = {
 SPACINGS = {"thick": (1.3, 1.1, 4.5), "even": (1.5, 1.5, 1.5)}
 
 
+def coarsely(patch):
+    """While a patch lasts, surfaces and supports are made on coarse grids: they are tested by themselves, and take seconds."""
+    patch.setattr("scenes.surfaces.CELL_MM", (2.0, 2.0))
+    patch.setattr("scenes.support.GRID_MM", 2.0)
+
+
 def level(points, solid):
     """(|p - c| / a) - 1 of an ellipsoid; negative inside."""
     centre, axes = solid

@@ -295,14 +295,15 @@ def test_import_refuses_in_one_line_too(tmp_path):
     assert not (tmp_path / "o").exists()
 
 
-def test_a_real_kidney_comes_in_and_gives_way(data, tmp_path):
+def test_a_real_kidney_comes_in_and_gives_way(data, tmp_path, monkeypatch, capsys):
     ct, labels, side = "crlm_1004", "crlm_1004_labels/kidneys_provisional.nii.gz", "left"
     patient = tmp_path / "patient"
-    done = run("import", data / "ct" / ct, data / "ct" / labels, "--side", side, "--out", patient)
-    assert done.returncode == 0, done.stderr
-    assert f"{side} kidney" in done.stdout and "crlm" not in (patient / "scene.toml").read_text()
-    done = run("rehearse", patient, "--headless", *SHORT, "--out", tmp_path / "out")
-    assert done.returncode == 0, done.stderr
+    files = str(data / "ct" / ct), str(data / "ct" / labels)
+    assert app.main(["import", *files, "--side", side, "--out", str(patient)]) == 0
+    said = capsys.readouterr().out
+    assert f"{side} kidney" in said and "crlm" not in (patient / "scene.toml").read_text()
+    monkeypatch.setattr("studies.rehearse.headless.open_viewer", lambda *_, **__: None)
+    assert app.main(["rehearse", str(patient), "--headless", *SHORT, "--out", str(tmp_path / "out")]) == 0
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["finite"] and report["max_penetration_mm"] <= 0.8 and report["volume_ratio_min"] > 0.95
     slices = [

@@ -5,14 +5,11 @@ import json
 
 import pytest
 import taichi as ti
-import trimesh
-from bead_case import RADIUS, bowl
+from bead_case import briefly, small_anatomy
 from PIL import Image
 
 import app
-from scenes.anatomy import LoadedAnatomy
-from scenes.scene import PAPER, Press, load_scene
-from sim.body import ParticleBody
+from scenes.scene import PAPER, load_scene
 from sim.contact import ShapeContacts
 from sim.neighbours import ParticleContacts
 from sim.shape_matching import ShapeMatching
@@ -45,15 +42,6 @@ WITHOUT = (
 )
 
 
-def small_anatomy() -> LoadedAnatomy:
-    """A ball in a bowl, on the back as patients are."""
-    mould = bowl()
-    mould.vertices = mould.vertices[:, [0, 2, 1]] * [1, -1, 1]
-    mould.fix_normals()
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
-    return LoadedAnatomy(ball, None, None, (mould,))
-
-
 def body_of(model: str) -> measure.Body:
     return measure.body_of(load_scene(PAPER), small_anatomy(), model, SIZES[model])
 
@@ -78,18 +66,11 @@ def test_what_is_off_is_not_compiled_and_not_allocated(device, monkeypatch, mode
                 with pytest.raises(ti.TaichiCompilationError, match="compiled"):
                     on.step(body.settings, body.poses(on, 0))
     for options, names in WITHOUT:
-        off = body.solver(options)
+        off = solver_of(options)
         with monkeypatch.context() as forbidden:
             for owner, method in [part for name in names for part in OWN[name]]:
                 forbidden.setattr(owner, method, compiled)
             off.step(body.settings, body.poses(off, 0))
-
-
-def test_scaled_masses_that_are_off_take_no_field(device):
-    body = body_of("shape-matching")
-    assert not hasattr(body.solver(measure.BASE).body, "mass_scale")
-    on = body.solver(measure.Options(mass_scaling_per_mm=0.02)).body
-    assert isinstance(on, ParticleBody) and hasattr(on, "mass_scale")
 
 
 def test_kernels_are_counted_where_a_step_is_parallel(device):
@@ -101,7 +82,8 @@ def test_kernels_are_counted_where_a_step_is_parallel(device):
 
 
 def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(command, "load_patient", lambda scene: (load_scene(scene), small_anatomy()))
+    monkeypatch.setattr(command, "load_patient", lambda _: (briefly(20), small_anatomy()))
+    monkeypatch.setattr(measure, "SETTLE_STEPS", 3)
     monkeypatch.setattr(measure, "PRESS_STEPS", 3)
     monkeypatch.setitem(measure.FEATURES, "neo-hookean", measure.EVERYWHERE[2:])
     assert app.main(["study", "features", "--quick", "--out", str(tmp_path)]) == 0
@@ -120,15 +102,14 @@ def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, cap
 
 @pytest.mark.parametrize(
     "setup",
-    [PRESETS["neo-hookean"]["balanced"], setup_of("shape-matching", radius_mm=4.0)],
+    [PRESETS["neo-hookean"]["fast"], setup_of("shape-matching", radius_mm=4.0)],
     ids=lambda setup: setup.model,
 )
 def test_a_soak_ends_where_it_began_and_replays(setup, monkeypatch):
     monkeypatch.setattr(soak, "REST_S", 3.0)
     monkeypatch.setattr(soak, "REPLAYED_MINUTES", 1)
-    scene = load_scene(PAPER).model_copy(update={"press": Press(warm_up_steps=60)})
     told = []
-    found = soak.soak(scene, small_anatomy(), setup, 2, 5.0, "cpu", lambda: told.append(1))
+    found = soak.soak(briefly(60), small_anatomy(), setup, 2, 5.0, "cpu", lambda: told.append(1))
     assert len(found["minutes"]) == 2 and len(told) == 3
     assert found["replay_equal"] and found["reset_equal"] and found["fallbacks"] == 0
     for row in found["minutes"]:

@@ -11,6 +11,7 @@ from synthetic_body import (
     TUMOUR,
     assert_sound,
     body,
+    coarsely,
     drawn,
     grid_around,
     least_gap,
@@ -75,6 +76,11 @@ def without_support(monkeypatch):
     monkeypatch.setattr(scenes.patient, "_support", lambda kind, organ, labels, piece: organ)
 
 
+@pytest.fixture
+def coarse(monkeypatch):
+    coarsely(monkeypatch)
+
+
 @pytest.mark.usefixtures("patient", "without_support")
 class TestImport:
     def test_finds_the_organ(self, patient, ct_and_labels):
@@ -119,7 +125,7 @@ class TestImport:
         with pytest.raises(PatientError, match="no (left|right) kidney"):
             found(ct, only_one, side="left" if side == "right" else "right")
 
-    def test_parts_of_the_organ_keep_their_tissue(self, ct_and_labels):
+    def test_parts_of_the_organ_keep_their_tissue(self, coarse, ct_and_labels):
         ct, labels = ct_and_labels
         voxels = drawn(labels, (2, LEFT), (3, TUMOUR), (7, PELVIS), (8, CYST), (9, LIVER))
         patient = imported(ct, voxels, [2], margin_mm=60.0, tumour=[3], urine=[7], cyst=[8], liver=[9])
@@ -151,7 +157,7 @@ class TestImport:
         truth = level(points_of(patient.labels), LEFT) < 0
         assert (marked & truth).sum() * 2 / (marked.sum() + truth.sum()) > 0.9
 
-    def test_slices_first_labels_on_an_upright_ct(self, ct_and_labels):
+    def test_slices_first_labels_on_an_upright_ct(self, coarse, ct_and_labels):
         """KiTS keeps label maps slices first, with direction (0,0,1, 0,1,0, -1,0,0)."""
         ct, _ = ct_and_labels
         _, labels = body(DIRECTIONS["slices first"], spacing=(4.0, 2.5, 3.0))
@@ -159,7 +165,7 @@ class TestImport:
         assert patient.side == "left"
         np.testing.assert_allclose(patient.tumour.center_mass, TUMOUR[0], atol=1.5)
 
-    def test_padding_becomes_air(self, ct_and_labels):
+    def test_padding_becomes_air(self, coarse, ct_and_labels):
         ct, labels = ct_and_labels
         voxels = sitk.GetArrayFromImage(ct)
         voxels[voxels == -1000] = -3024
@@ -173,7 +179,7 @@ class TestImport:
             found(ct[near], labels[near], [2])
         assert found(ct[near], labels[near], [2], "left")[1] == "left"
 
-    def test_names_tell_the_side_and_are_checked(self, ct_and_labels):
+    def test_names_tell_the_side_and_are_checked(self, coarse, ct_and_labels):
         ct, labels = ct_and_labels
         near = [slice(ct.TransformPhysicalPointToIndex((30.0, 0, 0))[0], None), slice(None), slice(None)]
         named = LabelMap.of(labels[near], {2: "kidney_left", 3: "kidney tumour"})
@@ -314,7 +320,7 @@ class TestSave:
             anatomy.phantom_folder()
 
 
-@pytest.mark.usefixtures("patient", "without_support")
+@pytest.mark.usefixtures("patient", "without_support", "coarse")
 class TestCautions:
     """What looks wrong is said, though the import goes on."""
 
@@ -371,7 +377,7 @@ class TestCautions:
         assert "were left out: 3 (5." in said and "--tumour" in said
 
 
-def test_what_touches_by_a_corner_is_held_and_what_only_touches_is_no_part(ct_and_labels):
+def test_what_touches_by_a_corner_is_held_and_what_only_touches_is_no_part(ct_and_labels, without_support):
     """Of two organs that touch by a corner neither is the other's, but a tumour that does is the kidney's."""
     ct, _ = ct_and_labels
     grid = VoxelGrid.of(ct)

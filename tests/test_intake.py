@@ -6,7 +6,7 @@ import pytest
 import SimpleITK as sitk
 from dicom_series import PERSON, Series, write_segmentation, write_structures, zipped
 from pydicom.dataset import Dataset
-from synthetic_body import BODY, DIRECTIONS, LEFT, RIGHT, TUMOUR, level
+from synthetic_body import BODY, DIRECTIONS, LEFT, RIGHT, TUMOUR, coarsely, level
 
 from app import main
 from scenes.anatomy import load_anatomy
@@ -33,6 +33,13 @@ def hounsfield(places):
     return found
 
 
+@pytest.fixture(scope="module", autouse=True)
+def coarse():
+    with pytest.MonkeyPatch.context() as patch:
+        coarsely(patch)
+        yield
+
+
 @pytest.fixture(scope="module")
 def hospital(tmp_path_factory):
     """A DICOM folder as a hospital sends it: a CT and a segmentation of it."""
@@ -53,17 +60,28 @@ def hospital(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def written(hospital, tmp_path_factory):
-    """What the command leaves of it."""
-    out = tmp_path_factory.mktemp("patients") / "a"
-    assert main(["import", str(hospital[0]), "--side", "left", "--out", str(out)]) == 0
-    return out
+def imported(hospital, tmp_path_factory):
+    """The folder that the command leaves of it; the patient, and what is private of it."""
+    out, found = tmp_path_factory.mktemp("patients") / "a", []
+
+    def watched(*request):
+        found.append(take_in(*request))
+        return found[0]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("scenes.intake.take_in", watched)
+        assert main(["import", str(hospital[0]), "--side", "left", "--out", str(out)]) == 0
+    return out, *found
 
 
 @pytest.fixture(scope="module")
-def taken_in(hospital):
-    """The patient, and what is private of it."""
-    return take_in(Request(hospital[0], side="left"))
+def written(imported):
+    return imported[0]
+
+
+@pytest.fixture(scope="module")
+def taken_in(imported):
+    return imported[1]
 
 
 def test_the_folder_is_a_scene(written):

@@ -13,9 +13,9 @@ from scenes.reading.ct import open_ct
 from scenes.reading.error import PatientError
 from scenes.reading.files import file_volume
 from scenes.reading.grid import VoxelGrid
-from scenes.reading.labels import LabelMap, nearest
+from scenes.reading.labels import LabelMap, box_of, nearest
 from scenes.reading.volume import Volume
-from scenes.seed import DRAFT, REACH_MM, WORKING_MM, grown
+from scenes.seed import DRAFT, WORKING_MM, grown
 
 CENTRE = np.array([62.0, 31.0, -118.0])
 KIDNEY = CENTRE, np.array([30.0, 24.0, 52.0])
@@ -54,7 +54,11 @@ def dice(a, b):
 
 def seeds_in(grid: VoxelGrid, inside: np.ndarray, count: int, deep_mm: float = 5.0):
     """Places at random, deeper in what is labelled than stated."""
-    deep = np.argwhere(ndimage.distance_transform_edt(inside, sampling=grid.spacing[::-1]) > deep_mm)
+    box = box_of(inside)[::-1]
+    # A rim of nothing, and what is labelled is as deep as in the whole.
+    piece = np.pad(inside[box], 1)
+    found = np.argwhere(ndimage.distance_transform_edt(piece, sampling=grid.spacing[::-1]) > deep_mm)
+    deep = found + [axis.start - 1 for axis in box]
     return grid.place(np.random.default_rng(11).permutation(deep)[:count, ::-1])
 
 
@@ -111,13 +115,14 @@ class TestSynthetic:
         assert first.grid.same_as(second.grid)
         np.testing.assert_array_equal(first.values, second.values)
 
-    def test_reads_only_around_the_seed(self):
-        image = scanned([(150.0, KIDNEY)], spacing=(3.0, 3.0, 3.0), half_mm=130.0)
+    def test_reads_only_around_the_seed(self, monkeypatch):
+        monkeypatch.setattr("scenes.seed.REACH_MM", 65.0)
+        image = scanned([(150.0, KIDNEY)], spacing=(3.0, 3.0, 3.0), half_mm=80.0)
         whole, read = Volume.of(image), []  # a view: the image has to stay
         ct = Volume(whole.name, whole.grid, lambda box: (read.append(box), whole.read_box(box))[1])
         grown(ct, CENTRE)
         assert len(read) == 1
-        assert all((a.stop - a.start - 2) * 3.0 <= 2 * REACH_MM for a in read[0])
+        assert all((a.stop - a.start - 2) * 3.0 <= 2 * 65.0 for a in read[0])
 
 
 class TestRefused:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import taichi as ti
 import trimesh
+from bead_case import briefly, small_anatomy
 from lattice_tissue import tissue_of as lattice_tissue
 from particle_tissue import tissue_of as particle_tissue
 from PIL import Image
@@ -100,8 +101,9 @@ def test_memory_is_that_of_the_fields(device, block):
 
 
 def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, capsys):
-    small = setup_of("shape-matching", radius_mm=6.0)
-    coarse = setup_of("neo-hookean", cell_mm=8.0, substeps=1, iterations=8)
+    small = setup_of("shape-matching", radius_mm=4.0)
+    coarse = setup_of("neo-hookean", cell_mm=6.0, substeps=1, iterations=8)
+    monkeypatch.setattr(command, "load_patient", lambda _: (briefly(20), small_anatomy()))
     monkeypatch.setattr(command, "PAPERS", small)
     monkeypatch.setattr(command, "_setups", lambda quick: [coarse, small])
     monkeypatch.setattr(command, "QUICK_COUNTS", [64])
@@ -115,7 +117,7 @@ def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, cap
         assert 0 < ms["min"] <= ms["median"] <= ms["max"] and ms["sd"] >= 0
         assert case["memory_mb"] > 0 and case["arch"] == report["arch"]
     matched = report["cases"][1]
-    assert matched["radius_mm"] == 6.0 and matched["memberships"] > matched["particles"] > 100
+    assert matched["radius_mm"] == 4.0 and matched["memberships"] > matched["particles"] > 100
     assert matched["bound_ms"] == report["bound_ms"] and report["cases"][0]["bound_ms"] is None
     assert set(matched["phases_ms"]) >= {"find contacts", "fit clusters", "average goals", "keep out"}
     assert [size["particles"] for size in report["sizes"]] == [64, 64]
