@@ -1,6 +1,8 @@
 """What commands share: their faults, the numbers, scenes and folders that they take, and the start of Taichi."""
 
 import math
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +57,13 @@ def start_taichi(arch: str) -> str:
 
 
 def make_folder(folder: Path, option: str = "--out") -> None:
-    """Make sure that a folder can be written to before time is spent on what goes there. Raises Fault."""
+    """Make sure that a folder can be written to before time is spent on what goes there. Raises Fault.
+
+    Of a command that ends without anything in it the folder goes again.
+    """
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    if context := click.get_current_context(silent=True):
+        context.call_on_close(partial(_remove_empty, made))
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -66,6 +74,13 @@ def make_folder(folder: Path, option: str = "--out") -> None:
         check_writable(folder)
     except OSError as error:
         raise Fault(f"{folder}: cannot be written to ({error.strerror}); choose another {option}") from None
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    """Remove folders, each within the next, as far as nothing is in them."""
+    with suppress(OSError):
+        for each in folders:
+            each.rmdir()
 
 
 def make_place(json_file: Path | None) -> None:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import click.testing
 import pytest
 
 from scenes.patient_folder import check_folder
@@ -33,3 +34,22 @@ def test_figures_that_cannot_be_written_say_so(tmp_path, capsys):
     assert (tmp_path / "a.json").is_file() and "Wrote" in capsys.readouterr().out
     with pytest.raises(Fault, match=r"cannot be written \(.*\); choose another --json"):
         save_figures({"mm": 1.0}, tmp_path / "none" / "a.json")
+
+
+@pytest.mark.parametrize("leaves", [[], ["a.txt"]])
+def test_a_command_that_leaves_nothing_leaves_no_folder(tmp_path, leaves):
+    out = tmp_path / "made" / "here"
+
+    @click.command()
+    def command() -> None:
+        make_folder(out)
+        for name in leaves:
+            (out / name).write_text("")
+        raise Fault("no display")
+
+    assert click.testing.CliRunner().invoke(command).exit_code == 1
+    assert list(tmp_path.rglob("*.txt")) == [out / name for name in leaves]
+    assert out.exists() == (tmp_path / "made").exists() == bool(leaves)
+    # One that was there stays.
+    out.mkdir(parents=True, exist_ok=True)
+    assert click.testing.CliRunner().invoke(command).exit_code == 1 and out.is_dir()

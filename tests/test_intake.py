@@ -154,7 +154,7 @@ def test_labels_of_another_examination(hospital, tmp_path):
 
 
 class TestPrivate:
-    @pytest.fixture(scope="class")
+    @pytest.fixture
     def patient(self, taken_in):
         return taken_in[0]
 
