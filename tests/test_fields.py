@@ -76,11 +76,13 @@ def test_fields_of_a_struct_lie_side_by_side(one_device, first):
         "turn": ti.types.matrix(2, 3, ti.f32),
         "push": ti.math.vec3,
     }
-    contact = ti.Struct.field(kinds, shape=(5, 2))
+    beside, contact = ti.field(ti.i32, 3), ti.Struct.field(kinds, shape=(5, 2))
     random = np.random.default_rng(3)
     values = {name: random.integers(-99, 99, (5, 2, *shape)) for name, shape in shapes.items()}
     for name in (first, *values):
         fill((getattr(contact, name), values[name]))
+    fill((beside, np.arange(3)))
+    assert beside.to_numpy().tolist() == [0, 1, 2]
     for name, wanted in values.items():
         assert np.array_equal(getattr(contact, name).to_numpy(), wanted)
         assert np.array_equal(array_of(getattr(contact, name)), wanted)

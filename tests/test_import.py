@@ -24,7 +24,7 @@ from synthetic_body import (
 
 import scenes.patient
 from scenes import anatomy
-from scenes.cautions import STONE_ABOVE_MEDIAN_HU, as_stone
+from scenes.cautions import STONE_ABOVE_MEDIAN_HU
 from scenes.facts import facts, told
 from scenes.organ import midline_x, organs, single_out
 from scenes.patient import import_patient
@@ -359,16 +359,6 @@ class TestCautions:
         (said,) = imported(bright, told, [2], margin_mm=20.0, tumour=[3], urine=[4]).cautions
         ml = stone.sum() * np.prod(ct.GetSpacing()) / 1000
         assert f"{ml:.1f} ml inside the organ are as bright as stone" in said and "--collecting" in said
-
-    def test_as_bright_as_stone_is_what_the_echo_takes_for_one(self, ct_and_labels):
-        hounsfield, organ, nothing = (
-            np.full((10, 10, 10), 100.0),
-            np.ones((10, 10, 10), bool),
-            np.zeros(1, bool),
-        )
-        for hu, lines in ((100 + STONE_ABOVE_MEDIAN_HU, 0), (101 + STONE_ABOVE_MEDIAN_HU, 1)):
-            hounsfield[2:5, 2:5, 2:5] = hu
-            assert len(as_stone(VoxelGrid.of(ct_and_labels[0]), hounsfield, organ, organ & nothing)) == lines
 
     def test_labels_without_a_meaning(self, ct_and_labels):
         (said,) = imported(*ct_and_labels, side="left", margin_mm=20.0).cautions

@@ -161,6 +161,15 @@ def trial(made) -> Trial:
     return made.trial
 
 
+@pytest.mark.parametrize("count", [1, 3, 40])
+def test_a_whole_number_of_steps_stays_one_where_poses_were_rounded(trial, count):
+    start, end = trial.rehearsal.hand.home, trial.rehearsal.hand.home.copy()
+    step_mm = trial.speed_mm_s * trial.rehearsal.settings.time_step_s
+    for off_mm, steps in ((-1e-6, count), (0.0, count), (1e-6, count), (0.01 * step_mm, count + 1)):
+        end[:3, 3] = start[:3, 3] + [0.0, 0.0, count * step_mm + off_mm]
+        assert trial._steps(start, end) == steps
+
+
 def test_a_trial_gives_the_same_figures_twice_whatever_was_tried_between(trial):
     way = way_at(trial, 2.0, 2)
     first = trial.run(way)

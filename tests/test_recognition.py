@@ -4,10 +4,11 @@ from itertools import permutations
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from scenes import cautions
 from ultrasound.acoustics import ATTENUATION, IMPEDANCE, properties, tissue_table
-from ultrasound.recognition import STONE_ABOVE_MEDIAN_HU, bones, hollow, recognised
+from ultrasound.recognition import STONE_ABOVE_MEDIAN_HU, _filled, bones, hollow, recognised
 
 SPACING = np.array([0.9, 0.9, 0.9])
 FAT, MARROW, SHELL, CORTEX, BLOOD = -100.0, 150.0, 600.0, 180.0, 200.0
@@ -95,6 +96,14 @@ def test_a_pipe_of_bone_is_filled_though_both_its_ends_are_open(axis):
     assert not found[
         (across > 10.0 + 2 * 1.8 * np.sqrt(3)) | (np.abs(places[..., axis]) > 12.0 + 2 * 1.8 * np.sqrt(3))
     ].any()
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.7])
+@pytest.mark.parametrize("axis", range(3))
+def test_all_sections_are_filled_as_each_alone(axis, share):
+    solid = np.random.default_rng(0).random((12, 15, 18)) < share
+    each = [ndimage.binary_fill_holes(section) for section in np.moveaxis(solid, axis, 0)]
+    assert np.array_equal(_filled(solid, axis), np.moveaxis(np.stack(each), 0, axis))
 
 
 def test_what_is_bright_by_contrast_agent_is_no_bone_and_outside_the_labels_blood():
