@@ -101,6 +101,20 @@ def test_a_way_back_is_looked_at_and_read_anew_at_once(watching, rehearsal, one_
     assert view.alert == ""
 
 
+def test_a_session_that_begins_is_read_with_what_touches_then(watching, rehearsal, one_device, monkeypatch):
+    """Though its first moment is none at which it would be looked."""
+    given = []
+    monkeypatch.setattr(instruments, "read", lambda *asked: given.append(asked[-1]) or Reading(1.0, 20.0))
+    touches = np.arange(rehearsal.probe.number_of_scanlines) < 30
+    monkeypatch.setattr(watching.coverage, "look", lambda *_: touches)
+    watching._look_every = 2
+    for _ in range(2):
+        session = SimpleNamespace(moment=1, kept={}, back=None, note=lambda *_: None)
+        watching.watch(session, rehearsal.probe, FIRST[0])
+        watching.begin_anew()
+    assert len(given) == 2 and all(np.array_equal(each, touches) for each in given)
+
+
 def test_another_plan_brings_its_margin_and_what_was_seen_stays(watching, rehearsal, one_device):
     volume = watching.coverage.targets["margin"].sum()
     watching.coverage.seen[watching.coverage.targets["tumour"]] = True

@@ -95,14 +95,14 @@ class Instruments:
     def watch(self, session: Session, probe: Probe, pose: np.ndarray | None) -> None:
         """Look at a moment (its step's pose, None of a way back) whose pictures were taken, and note a new reading in the session."""
         # What was read before a way back is not so any more.
-        is_way_back = pose is None
-        if (is_way_back or session.moment % self._look_every == 0) and self.rehearsal.scanner is not None:
+        is_anew = pose is None or self.reading is None
+        if (is_anew or session.moment % self._look_every == 0) and self.rehearsal.scanner is not None:
             image = self.rehearsal.scene.image
             rest = self.rehearsal.scanner.plane.rest_grid(PLACES)
             self._touches = self.coverage.look(rest, probe, image.contact_gap_mm)
         if self.guide is not None:
             self.guide.go_with(session)
-        if is_way_back or session.moment % self._read_every == 0 or self.reading is None:
+        if is_anew or session.moment % self._read_every == 0:
             self.reading = read(self.rehearsal, probe, self._touches)
             session.note("reading", self.figures())
             self._show()
