@@ -29,7 +29,7 @@ class Line(NamedTuple):
 KEY_MAP = {
     "Transducer": (
         Line(("Mouse",), ("point",), "move it over the organ"),
-        Line(("Left button",), ("press",), "press it in while held"),
+        Line(("Left button",), ("press",), "press it in, the deeper the longer it is held"),
         Line(("W", "S"), ("push", "lift"), "push it in, lift it"),
         Line(("A", "D"), ("roll_left", "roll_right"), "roll it about its axis, left and right"),
         Line(("Q", "E"), ("tilt_left", "tilt_right"), "turn the beam in the image plane, left and right"),
