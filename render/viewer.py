@@ -216,7 +216,7 @@ class View:
     alert: str = ""
     """Which of them is more than it should be."""
     status: str = ""
-    """A short word over the picture, such as FROZEN."""
+    """Short words over the picture, such as FROZEN, three spaces apart; the weightiest first: the last go where room ends."""
     title: str = ""
     """What is shown (scene or case); no patient's name, id or date."""
     marked_side: str = "right"

@@ -43,12 +43,12 @@ class Moments:
         place[0, 3] = self.moment
         return SimpleNamespace(world_from_plane=place)
 
-    def take_view(self, rehearsal, settings, pose, tally, status="") -> View:
+    def take_view(self, rehearsal, settings, pose, tally) -> View:
         tally.step_ms.append(1.0)
-        grey = np.full((4, 4), self.moment + 100 * (status == "FROZEN"), np.uint8)
+        grey = np.full((4, 4), self.moment + 100 * (pose is None), np.uint8)
         probe = probe_as_set(self.probe, settings)
         width, depth, _ = probe.extent_mm
-        return View(np.eye(4), {"B-mode": grey, "CT": 255 - grey}, width, depth, status=status)
+        return View(np.eye(4), {"B-mode": grey, "CT": 255 - grey}, width, depth)
 
     def rest_grid(self) -> None: ...
     def stepped(self, step_ms: float) -> str:
@@ -119,12 +119,13 @@ def test_what_the_guard_put_back_is_told_and_stands_in_the_panel_for_a_while(loo
     clock = [100.0]
     monkeypatch.setattr(loop, "perf_counter", lambda: clock[0])
     looping.rehearsal.notice = "Tissue put back"
-    assert looping.frame(Controls(Settings())).status == ""
+    shown = [looping.frame(Controls(Settings())).status]
     looping.rehearsal.notice = ""
-    shown = []
     for clock[0] in (103.9, 104.1):
         shown.append(looping.frame(Controls(Settings())).status)
-    assert shown == ["TISSUE PUT BACK", ""] and capsys.readouterr().out == "Tissue put back\n"
+    assert (
+        shown == ["TISSUE PUT BACK", "TISSUE PUT BACK", ""] and capsys.readouterr().out == "Tissue put back\n"
+    )
 
 
 def test_a_sweep_that_is_recorded_stands_in_the_panel_beside_all_else(looping, monkeypatch):
@@ -142,6 +143,21 @@ def test_a_sweep_that_is_recorded_stands_in_the_panel_beside_all_else(looping, m
     assert looping.frame(Controls(Settings(), freeze=True)).status == (
         "RECORDING 3 s   FROZEN   PLANNING; Backspace stops"
     )
+
+
+def test_what_is_wrong_with_the_tissue_stands_before_all_that_is_technical(looping, monkeypatch):
+    monkeypatch.setattr(loop, "perf_counter", lambda: 100.0)
+    monkeypatch.setattr(Moments, "onto", lambda each, view, settings: replace(view, status="SQUEEZED"))
+    looping.sweeping = SimpleNamespace(status="RECORDING 3 s", watch=lambda *_: "")
+    looping.plans = SimpleNamespace(status="PLANNING", watch=lambda *_: "")
+    looping.driver.status = "LESS EXACT"
+    controls = Controls(Settings())
+    assert looping.frame(controls).status == "SQUEEZED   RECORDING 3 s   LESS EXACT   PLANNING"
+    looping._say("undo")
+    assert looping.frame(controls).status == "SQUEEZED   RECORDING 3 s   Undo"
+    looping._said_until, looping._put_back_until = 0.0, 104.0
+    status = looping.frame(Controls(Settings(), freeze=True)).status
+    assert status == "TISSUE PUT BACK   SQUEEZED   RECORDING 3 s   FROZEN   PLANNING"
 
 
 def test_without_a_link_the_loop_goes_on(looping, sent):

@@ -105,9 +105,18 @@ class Loop:
         )
 
     def _status(self, view: View) -> str:
-        is_said = perf_counter() < self._said_until
-        news = [self._said] if is_said else [view.status, self.plans.status]
-        return self.keys.worded("   ".join(filter(None, [self.sweeping.status, *news])))
+        """What stands over the pictures, by weight: the tissue before all else, for the last words go where there is no room."""
+        now = perf_counter()
+        put_back = "TISSUE PUT BACK" if now < self._put_back_until else ""
+        news = [self._said] if now < self._said_until else [self._state(), self.plans.status]
+        return self.keys.worded(
+            "   ".join(filter(None, [put_back, view.status, self.sweeping.status, *news]))
+        )
+
+    def _state(self) -> str:
+        if not self.frozen:
+            return self.driver.status
+        return f"FROZEN   {self.cine.age_s:.1f} s" if self.cine.back else "FROZEN"
 
     def _announce(self, text: str) -> None:
         """Say something in the window and in the terminal."""
@@ -125,18 +134,16 @@ class Loop:
             self.cine.go(controls.cine)
         if not self.frozen or self.cine.back == 0:
             return None
-        frame = self.cine.shown
-        return replace(frame, view=replace(frame.view, status=f"FROZEN   {self.cine.age_s:.1f} s"))
+        return self.cine.shown
 
     def _taken(self, controls: Controls) -> Frame:
         """A new frame. A frozen one shows the same tissue with the scanner set anew, and is not kept."""
         if self.frozen:
-            view = take_view(self.rehearsal, controls.settings, None, self.tally, "FROZEN")
+            view = take_view(self.rehearsal, controls.settings, None, self.tally)
             return self._sent(view, controls.settings)
         pose = self.driver.move(controls)
         self._say(self.driver.take_said())
-        status = "TISSUE PUT BACK" if perf_counter() < self._put_back_until else self.driver.status
-        view = take_view(self.rehearsal, controls.settings, pose, self.tally, status)
+        view = take_view(self.rehearsal, controls.settings, pose, self.tally)
         if pose is not None:
             if self.rehearsal.notice:
                 self._tell(self.rehearsal.notice)
