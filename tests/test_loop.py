@@ -160,6 +160,17 @@ def test_what_is_wrong_with_the_tissue_stands_before_all_that_is_technical(loopi
     assert status == "TISSUE PUT BACK   SQUEEZED   RECORDING 3 s   FROZEN   PLANNING"
 
 
+def test_a_frozen_picture_keeps_its_calliper_and_a_live_one_until_the_probe_moves(looping, monkeypatch):
+    take_view, at = looping.rehearsal.take_view, np.eye(4)
+    monkeypatch.setattr(loop, "take_view", lambda *told: replace(take_view(*told), transducer_pose=at.copy()))
+    place = (1.0, 2.0)
+    assert looping.frame(Controls(Settings(), pointed_mm=place)).calliper_mm == (place,)
+    assert looping.frame(Controls(Settings(), pointed_mm=place)).calliper == "0.0 mm"
+    at[0, 3] = 5.0
+    assert looping.frame(Controls(Settings(), freeze=True)).calliper == "0.0 mm"
+    assert looping.frame(Controls(Settings(), freeze=True)).calliper_mm == ()
+
+
 def test_without_a_link_the_loop_goes_on(looping, sent):
     looping.link = None
     looping.frame(Controls(Settings()))

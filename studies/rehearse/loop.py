@@ -87,7 +87,6 @@ class Loop:
             self.frozen = not self.frozen
         if controls.reset:
             self.calliper.points = ()
-        self.calliper.point(controls.pointed_mm)
         self._announce(controls.news)
         self._announce(self.plans.watch(controls))
         shown = self._looked_back(controls) or self._taken(controls)
@@ -96,6 +95,9 @@ class Loop:
         speed = self.rate * self.rehearsal.settings.time_step_s
         figures = {"frames": f"{self.rate:.0f} /s", "time": f"{speed:.1f} x real"}
         view = shown.view
+        self.calliper.point(controls.pointed_mm, view.transducer_pose)
+        if not self.frozen:
+            self.calliper.go_with(view.transducer_pose)
         return replace(
             view,
             calliper_mm=self.calliper.points,
