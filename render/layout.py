@@ -8,7 +8,7 @@ import numpy as np
 
 # Of 1280 x 720 pixels echo and CT of the drop-in probe, 16 x 40 mm each, nearly fill a panel of this share.
 PANEL_SHARE = 0.43
-TITLE_HEIGHT = 42
+TITLE_HEIGHT, CLOCK_WIDTH = 42, 150
 STRIP_HEIGHT, STRIP_GAP, READOUT_WIDTH = 184, 4, 134
 HEADER_HEIGHT, FOOTER_HEIGHT = 74, 52
 RULER_WIDTH, WEDGE_WIDTH, PICTURE_GAP, NAME_HEIGHT = 42, 30, 10, 26

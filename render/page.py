@@ -24,7 +24,8 @@ from render.viewer import View
 
 READOUT_PERIOD_S = 0.25
 
-Figures = tuple[dict[str, str], dict[str, str], str]
+# Read-outs, findings, which of them is too much, clock and pace.
+Figures = tuple[dict[str, str], dict[str, str], str, str, str]
 
 
 def panel_of(view: View) -> Panel:
@@ -71,7 +72,8 @@ class Page:
         for (name, picture), box in zip(view.pictures.items(), panel.boxes(self.layout), strict=True):
             paste_picture(self._page, box, picture)
             self._draw_over(view, panel, name, box)
-        self._compose_figures((dict(view.readouts), findings, view.alert), patient)
+        figures = dict(view.readouts), findings, view.alert, view.clock, view.pace
+        self._compose_figures(figures, patient)
         if self._axes is None or not np.array_equal(axes, self._axes):
             self._put(self.layout.compass, compass_picture(self.layout, axes))
             self._axes = axes
@@ -99,7 +101,9 @@ class Page:
         waits = patient and now - self._figures_at < READOUT_PERIOD_S
         if self._figures is not None and (waits or figures == self._figures):
             return
-        readouts, findings, alert = figures
+        readouts, findings, alert, clock, pace = figures
+        box = frame.clock_box(self.layout, self.keys.of["help"])
+        self._put(box, frame.clock_picture(self.layout, box, clock, pace))
         self._put(self.layout.readouts, frame.readout_picture(self.layout, readouts))
         if findings:
             box = self.layout.findings(len(findings))

@@ -171,6 +171,17 @@ def test_a_frozen_picture_keeps_its_calliper_and_a_live_one_until_the_probe_move
     assert looping.frame(Controls(Settings(), freeze=True)).calliper_mm == ()
 
 
+def test_the_clock_is_the_sessions_and_says_where_it_is_slow(looping):
+    told = []
+    for looping.rate in (1.0, 0.15, 0.89 / STEP_S, 0.91 / STEP_S):
+        view = looping.frame(Controls(Settings()))
+        told.append((view.clock, view.pace))
+    assert told == [("0.2 s", "0.2 x real"), ("0.5 s", "0.04 x real"), ("0.8 s", "0.9 x real"), ("1.0 s", "")]
+    looping.rate = 1.0
+    frozen = looping.frame(Controls(Settings(), freeze=True))
+    assert (frozen.clock, frozen.pace) == ("1.0 s", "") and "time" not in frozen.readouts
+
+
 def test_without_a_link_the_loop_goes_on(looping, sent):
     looping.link = None
     looping.frame(Controls(Settings()))

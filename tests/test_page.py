@@ -7,7 +7,8 @@ import pytest
 
 from render.camera import OrbitCamera
 from render.compass import ARM, compass_picture, ends_of
-from render.frame import readout_picture
+from render.frame import clock_box, readout_picture
+from render.keys import USUAL_KEYS, Keys
 from render.layout import Layout, Rect
 from render.page import Page
 from render.panel import ALERT, BEFORE, CALLIPER, OUTLINE, QUIET, TEXT
@@ -230,6 +231,22 @@ def test_all_readouts_of_a_window_are_shown(size):
     rows = np.flatnonzero((ends[0] != ends[1]).any(axis=(1, 2)))
     # In a large window the lines move closer together for the seventh.
     assert len(rows) > 5 and rows.max() < layout.readouts.height - 2
+
+
+@each_size
+@pytest.mark.parametrize("help_key", ["H", "Backspace"])
+def test_clock_and_pace_stand_between_title_and_help_in_every_window(size, help_key):
+    layout, told = Layout(*size), {"clock": "1234.5 s", "title": "A long title of a patient " * 5}
+    page = Page(layout, Keys({**USUAL_KEYS, "help": help_key}))
+    box = clock_box(layout, help_key)
+    bare, real, slow = (composed(page, **told | more) for more in ({"clock": ""}, {}, {"pace": "0.2 x real"}))
+    assert set(np.unique(bare[box.slices])) == {17, 20, 24}
+    for before, after, is_caution in ((bare, real, False), (real, slow, True)):
+        changed = after[(before != after).any(axis=2)].astype(int)
+        assert len(changed) > 50 and len(changed) == (before != after)[box.slices].any(axis=2).sum()
+        assert (np.ptp(changed, axis=1).max() > 100) == is_caution
+    # Neither is cut at its left end.
+    assert (slow[: box.height, box.left] == bare[: box.height, box.left]).all()
 
 
 @each_size

@@ -22,6 +22,8 @@ from studies.report import Tally
 
 # How long what was done is said, and that the guard put the tissue back.
 SAID_S, PUT_BACK_S = 2.0, 4.0
+# A share of real time that is as good as that.
+REAL = 0.9
 
 
 @dataclass
@@ -92,8 +94,6 @@ class Loop:
         shown = self._looked_back(controls) or self._taken(controls)
         if controls.sweep:
             self._announce(self.sweeping.toggle(self.out))
-        speed = self.rate * self.rehearsal.settings.time_step_s
-        figures = {"frames": f"{self.rate:.0f} /s", "time": f"{speed:.1f} x real"}
         view = shown.view
         self.calliper.point(controls.pointed_mm, view.transducer_pose)
         if not self.frozen:
@@ -102,9 +102,16 @@ class Loop:
             view,
             calliper_mm=self.calliper.points,
             calliper=self.calliper.figure(shown),
-            readouts=view.readouts | figures,
+            readouts=view.readouts | {"frames": f"{self.rate:.0f} /s"},
+            clock=f"{self.driver.session.time_s:.1f} s",
+            pace=self._pace(),
             status=self._status(view),
         )
+
+    def _pace(self) -> str:
+        """How slowly simulated time goes, where it is slower than real; a frozen one stands."""
+        speed = self.rate * self.rehearsal.settings.time_step_s
+        return "" if self.frozen or speed >= REAL else f"{speed:.1g} x real"
 
     def _status(self, view: View) -> str:
         """What stands over the pictures, by weight: the tissue before all else, for the last words go where there is no room."""
