@@ -19,6 +19,8 @@ BACKDROP_TOP, BACKDROP_FOOT = (30, 35, 42), (13, 15, 19)
 STRIP, HELP = (17, 20, 24), (22, 26, 31)
 # Lines of figures are no closer than this where the strip is as low as in a small window.
 LEAST_PITCH = 19
+# Stands where a figure has nothing to say.
+NOTHING = "-"
 HELP_COLUMNS, HELP_PX, HELP_GAP_PX, FIGURES_GAP_PX = 2, 17, 12, 18
 
 
@@ -137,4 +139,4 @@ def _draw_figures(
         y = FIGURES_PAD + (i + 0.5) * pitch
         colours = (ALERT, ALERT) if name == alert else (QUIET, TEXT)
         draw.text((8, y), name, font=font(size), fill=colours[0], anchor="lm")
-        draw.text((box.width - 10, y), value, font=font(size), fill=colours[1], anchor="rm")
+        draw.text((box.width - 10, y), value or NOTHING, font=font(size), fill=colours[1], anchor="rm")

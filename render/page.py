@@ -11,15 +11,13 @@ from render.layout import Layout, Rect
 from render.panel import (
     BEFORE,
     FIGURE_PX,
-    NOTE_PX,
     OUTLINE,
-    QUIET,
     Panel,
     draw_calliper,
+    draw_note,
     draw_segments,
     paste_picture,
 )
-from render.text import write
 from render.viewer import View
 
 READOUT_PERIOD_S = 0.25
@@ -91,8 +89,7 @@ class Page:
         if view.outline_mm is not None:
             draw_segments(self._page, panel, box, view.outline_mm, OUTLINE)
         if note := view.notes.get(name):
-            middle = box.left + box.width / 2, box.top + box.height / 2
-            write(self._page, box, middle, note, self.layout.px(NOTE_PX), QUIET)
+            draw_note(self._page, self.layout, box, note)
         draw_calliper(self._page, panel, box, view.calliper_mm, view.calliper, self.layout.px(FIGURE_PX))
 
     def _compose_figures(self, figures: Figures, patient: bool) -> None:

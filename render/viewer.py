@@ -206,7 +206,7 @@ class View:
     calliper: str = ""
     """What is between them."""
     notes: dict[str, str] = field(default_factory=dict)
-    """Name of a picture -> what is written in it, such as that it is black for want of contact."""
+    """Name of a picture -> what is written in it, such as that it is black for want of contact; in a second line what to do."""
     captions: tuple[str, str, str] = ("", "", "")
     """What is said around the pictures: the probe, above; the echo's and the CT's settings, below."""
     readouts: dict[str, str] = field(default_factory=dict)

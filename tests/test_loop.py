@@ -11,6 +11,7 @@ import pytest
 from click.exceptions import Exit
 
 import app
+from render.keys import USUAL_KEYS, Keys
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
 from scenes.scene import EMBEDDED
@@ -180,6 +181,21 @@ def test_the_clock_is_the_sessions_and_says_where_it_is_slow(looping):
     looping.rate = 1.0
     frozen = looping.frame(Controls(Settings(), freeze=True))
     assert (frozen.clock, frozen.pace) == ("1.0 s", "") and "time" not in frozen.readouts
+
+
+def test_without_contact_whoever_leads_by_hand_is_told_how_to_press(looping, monkeypatch):
+    monkeypatch.setattr(Moments, "onto", lambda each, view, _: replace(view, notes={"B-mode": "NO CONTACT"}))
+    monkeypatch.setattr(loop, "Live", SimpleNamespace)
+    looping.keys = Keys({**USUAL_KEYS, "push": "Return"})
+    monkeypatch.setattr(loop, "Played", Moments)
+    by_hand, tracked = (SimpleNamespace(is_by_hand=each) for each in (True, False))
+    told = []
+    for looping.driver.live in (None, by_hand, tracked):
+        told.append(looping.frame(Controls(Settings())).notes["B-mode"])
+    assert told == ["NO CONTACT", "NO CONTACT\nLeft button or Return presses", "NO CONTACT"]
+    looping.driver.live = by_hand
+    frozen = looping.frame(Controls(Settings(), freeze=True))
+    assert frozen.notes["B-mode"] == "NO CONTACT"
 
 
 def test_without_a_link_the_loop_goes_on(looping, sent):

@@ -7,7 +7,7 @@ import pytest
 
 from render.camera import OrbitCamera
 from render.compass import ARM, compass_picture, ends_of
-from render.frame import clock_box, readout_picture
+from render.frame import clock_box, findings_picture, readout_picture
 from render.keys import USUAL_KEYS, Keys
 from render.layout import Layout, Rect
 from render.page import Page
@@ -173,6 +173,21 @@ def test_no_contact_is_written_in_the_echo_alone():
     assert np.array_equal(plain[ct.slices], noted[ct.slices])
 
 
+@pytest.mark.parametrize("size", [(1024, 576), (1088, 612), (1280, 720), (1920, 1080)])
+@pytest.mark.parametrize("hint", ["Left button or W presses", "Left button or Backspace presses"])
+def test_what_to_do_stands_whole_under_a_note(size, hint):
+    layout = Layout(*size)
+    plain, hinted = (
+        composed(Page(layout), notes={"B-mode": note}) for note in ("NO CONTACT", f"NO CONTACT\n{hint}")
+    )
+    echo = layout.picture_boxes(2, 16.0, 40.0)[0]
+    rows, columns = np.nonzero((plain != hinted).any(axis=2))
+    assert echo.left <= columns.min() and columns.max() < echo.right
+    assert np.ptp(columns) > 0.4 * echo.width
+    noted = coloured(plain, echo, QUIET)[:, 0].max() + echo.top
+    assert noted < rows.min() and rows.max() < noted + 50
+
+
 @pytest.mark.parametrize(
     "points",
     [
@@ -222,6 +237,11 @@ def test_findings_that_become_fewer_leave_nothing_behind():
     few = composed(page, findings=dict(list(FIGURES.items())[:4]))
     assert not np.array_equal(composed(page, findings=FIGURES), few)
     assert np.array_equal(composed(page, findings=dict(list(FIGURES.items())[:4])), few)
+
+
+def test_a_figure_that_has_nothing_to_say_is_a_dash():
+    pictures = [findings_picture(LAYOUT, {"margin": figure}) for figure in ("", "-", "4.2 mm")]
+    assert np.array_equal(pictures[0], pictures[1]) and not np.array_equal(pictures[0], pictures[2])
 
 
 @pytest.mark.parametrize("size", [(1232, 693), (1280, 720), (1920, 1080), (3840, 2160)])

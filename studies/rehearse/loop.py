@@ -12,8 +12,9 @@ from studies.link.live import send_live
 from studies.link.server import Server
 from studies.rehearsal import Rehearsal
 from studies.rehearse.cine import Calliper, Cine, Frame
-from studies.rehearse.drivers import Driver
+from studies.rehearse.drivers import Driver, Played
 from studies.rehearse.instruments import Instruments
+from studies.rehearse.live import Live
 from studies.rehearse.planning import Plans
 from studies.rehearse.saving import save_screenshot, save_surfaces, save_view
 from studies.rehearse.sweeping import Sweeping
@@ -24,6 +25,7 @@ from studies.report import Tally
 SAID_S, PUT_BACK_S = 2.0, 4.0
 # A share of real time that is as good as that.
 REAL = 0.9
+HOW_TO_PRESS = "{press} or {push} presses"
 
 
 @dataclass
@@ -106,12 +108,20 @@ class Loop:
             clock=f"{self.driver.session.time_s:.1f} s",
             pace=self._pace(),
             status=self._status(view),
+            notes={name: self._hinted(note) for name, note in view.notes.items()},
         )
 
     def _pace(self) -> str:
         """How slowly simulated time goes, where it is slower than real; a frozen one stands."""
         speed = self.rate * self.rehearsal.settings.time_step_s
         return "" if self.frozen or speed >= REAL else f"{speed:.1g} x real"
+
+    def _hinted(self, note: str) -> str:
+        """A note that there is no contact, with what the user can do about it, if anything."""
+        live = self.driver.live if isinstance(self.driver, Played) else self.driver
+        if self.frozen or not isinstance(live, Live) or not live.is_by_hand:
+            return note
+        return self.keys.worded(f"{note}\n{HOW_TO_PRESS}")
 
     def _status(self, view: View) -> str:
         """What stands over the pictures, by weight: the tissue before all else, for the last words go where there is no room."""
