@@ -104,9 +104,9 @@ class Settings:
     A field that is None or has no metadata has no slider: of the first two, each tissue model has one.
     """
 
-    young_kpa: float | None = _slider(None, "Stiff.", "kPa", 1.0, 100.0, "Tissue")
+    young_kpa: float | None = _slider(None, "Young", "kPa", 1.0, 100.0, "Tissue")
     stiffness: float | None = _slider(None, "Stiffness", "", 0.1, 1.0, "Tissue")
-    iterations: int = _slider(9, "Iterations", "", 1, 40, "Tissue")
+    iterations: int = _slider(9, "Iter.", "", 1, 40, "Tissue")
     substeps: int = _slider(3, "Substeps", "", 1, 10, "Tissue")
     gravity_m_s2: float = _slider(9.81, "g", "m/s2", 0.0, 20.0, "Tissue")
     depth_mm: int = _slider(60, "Depth", "mm", 5, 300, "Picture")

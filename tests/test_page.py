@@ -94,15 +94,17 @@ def test_the_first_sliders_go_where_there_is_no_room(size):
     assert names == (["Picture", "View"] if size == (700, 420) else ["Tissue", "Picture", "View"])
 
 
-@pytest.mark.parametrize("width", range(704, 1600, 64))
-def test_labels_of_sliders_are_whole(width):
-    settings, layout = Settings(young_kpa=15.0), Layout(width, width * 9 // 16)
+@pytest.mark.parametrize("width", [*range(704, 1600, 64), 1250])
+@pytest.mark.parametrize("tissue", ["young_kpa", "stiffness"])
+def test_labels_of_sliders_are_whole(width, tissue):
+    settings = Settings(**{tissue: 0.9}, show_scanner=True)
+    layout = Layout(width, width * 9 // 16)
     groups = groups_of(settings, WHOLE)
     for name, box in boxes_of(settings, WHOLE, layout).items():
         for about in (member.metadata for member in groups[name]):
             label = 7 * len(f"{about['label']} {about['unit']}".strip())
-            # A switch is 31 pixels wide with what is around it.
-            assert label <= (box.width - 31 if name == "View" else 0.35 * box.width)
+            # Pixels around a label, and of a switch, as Dear ImGui draws them.
+            assert label <= (box.width - 35 if name == "View" else 0.35 * box.width - 16)
 
 
 def test_what_is_not_there_has_no_slider():
@@ -244,7 +246,7 @@ def test_a_figure_that_has_nothing_to_say_is_a_dash():
     assert np.array_equal(pictures[0], pictures[1]) and not np.array_equal(pictures[0], pictures[2])
 
 
-@pytest.mark.parametrize("size", [(1232, 693), (1280, 720), (1920, 1080), (3840, 2160)])
+@pytest.mark.parametrize("size", [(1250, 703), (1280, 720), (1920, 1080), (3840, 2160)])
 def test_all_readouts_of_a_window_are_shown(size):
     layout = Layout(*size)
     ends = [readout_picture(layout, dict(list(FIGURES.items())[:count])) for count in (6, 7)]
