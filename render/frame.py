@@ -11,7 +11,7 @@ from itertools import islice
 import numpy as np
 from PIL import Image, ImageDraw
 
-from render.layout import FIGURE_HEIGHT, FIGURES_PAD, Layout, Rect
+from render.layout import CLOCK_WIDTH, FIGURE_HEIGHT, FIGURES_PAD, Layout, Rect
 from render.panel import ALERT, FINDINGS, LINE, MARK, QUIET, TEXT, Panel, draw_panel
 from render.text import fitting_size, font, shortened
 
@@ -19,6 +19,8 @@ BACKDROP_TOP, BACKDROP_FOOT = (30, 35, 42), (13, 15, 19)
 STRIP, HELP = (17, 20, 24), (22, 26, 31)
 # Lines of figures are no closer than this where the strip is as low as in a small window.
 LEAST_PITCH = 19
+# Stands where a figure has nothing to say.
+NOTHING = "-"
 HELP_COLUMNS, HELP_PX, HELP_GAP_PX, FIGURES_GAP_PX = 2, 17, 12, 18
 
 
@@ -40,11 +42,32 @@ def backdrop(layout: Layout, panel: Panel, help_key: str = "H") -> np.ndarray:
 
 def _draw_title(draw: ImageDraw.ImageDraw, layout: Layout, panel: Panel, help_key: str) -> None:
     px, middle = layout.px, layout.title.height // 2
-    right, told = layout.scene.right - px(16), f"{help_key}  all keys"
-    draw.text((right, middle), told, font=font(px(14)), fill=TEXT, anchor="rm")
-    room = right - 2 * px(16) - int(font(px(14)).getlength(told))
+    right = layout.title.right - px(16)
+    draw.text((right, middle), _of_help(help_key), font=font(px(14)), fill=TEXT, anchor="rm")
+    room = clock_box(layout, help_key).left - 2 * px(16)
     title = shortened(panel.title or "Nephron", px(17), room)
     draw.text((px(16), middle), title, font=font(px(17)), fill=TEXT, anchor="lm")
+
+
+def _of_help(key: str) -> str:
+    return f"{key}  all keys"
+
+
+def clock_box(layout: Layout, help_key: str = "H") -> Rect:
+    """Where the clock is, in the title's row, left of what is said of the help."""
+    px = layout.px
+    right = layout.title.right - 2 * px(16) - int(font(px(14)).getlength(_of_help(help_key)))
+    return Rect(right - px(CLOCK_WIDTH), 0, px(CLOCK_WIDTH), layout.title.height - 1)
+
+
+def clock_picture(layout: Layout, box: Rect, clock: str, pace: str) -> np.ndarray:
+    """The session's time, and before it how slowly that goes, uint8, shape of the box."""
+    image = Image.new("RGB", (box.width, box.height), STRIP)
+    draw, letters, middle = ImageDraw.Draw(image), font(layout.px(14)), layout.title.height // 2
+    draw.text((box.width, middle), clock, font=letters, fill=TEXT, anchor="rm")
+    right = box.width - int(letters.getlength(clock)) - layout.px(12)
+    draw.text((right, middle), pace, font=letters, fill=ALERT, anchor="rm")
+    return np.asarray(image)
 
 
 def help_picture(layout: Layout, groups: Mapping[str, list[tuple[str, str]]]) -> np.ndarray:
@@ -116,4 +139,4 @@ def _draw_figures(
         y = FIGURES_PAD + (i + 0.5) * pitch
         colours = (ALERT, ALERT) if name == alert else (QUIET, TEXT)
         draw.text((8, y), name, font=font(size), fill=colours[0], anchor="lm")
-        draw.text((box.width - 10, y), value, font=font(size), fill=colours[1], anchor="rm")
+        draw.text((box.width - 10, y), value or NOTHING, font=font(size), fill=colours[1], anchor="rm")

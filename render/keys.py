@@ -28,6 +28,12 @@ USUAL_KEYS = {
     for action, key in zip(line.actions, line.keys, strict=True)
     if action in ACTIONS
 }
+MOUSE = {
+    action: key
+    for line in LINES
+    for action, key in zip(line.actions, line.keys, strict=True)
+    if action in BY_MOUSE
+}
 USUAL_BUTTONS = {
     "freeze": "A",
     "undo": "B",
@@ -85,8 +91,9 @@ class Keys:
         return self.of.get(action, usual)
 
     def worded(self, text: str) -> str:
-        """A text with the keys of the actions that it names in braces: "{sweep} ends it"."""
-        return re.sub(r"\{(\w+)\}", lambda found: self.of.get(found[1], found[0]), text)
+        """A text with the keys of the actions, the mouse's too, that it names in braces: "{sweep} ends it"."""
+        words = {**MOUSE, **self.of}
+        return re.sub(r"\{(\w+)\}", lambda found: words.get(found[1], found[0]), text)
 
 
 def load_keys(path: Path) -> Keys:

@@ -8,15 +8,15 @@ import numpy as np
 
 # Of 1280 x 720 pixels echo and CT of the drop-in probe, 16 x 40 mm each, nearly fill a panel of this share.
 PANEL_SHARE = 0.43
-TITLE_HEIGHT = 42
+TITLE_HEIGHT, CLOCK_WIDTH = 42, 150
 STRIP_HEIGHT, STRIP_GAP, READOUT_WIDTH = 184, 4, 134
 HEADER_HEIGHT, FOOTER_HEIGHT = 74, 52
 RULER_WIDTH, WEDGE_WIDTH, PICTURE_GAP, NAME_HEIGHT = 42, 30, 10, 26
-ASIDE_WIDTH, ASIDE_GAP = 178, 6
+ASIDE_WIDTH, ASIDE_GAP = 196, 6
 FINDINGS_GAP, FINDINGS_WIDTH, FIGURE_HEIGHT, FIGURES_PAD = 10, 178, 20, 7
 COMPASS_SIZE = 92
 # A strip narrower than this is left to the sliders, whose labels would be cut.
-STRIP_WITH_READOUTS = 700
+STRIP_WITH_READOUTS = 712
 # Texts grow with the window; Dear ImGui's sliders, and so what holds them, cannot.
 FULL_SIZE, LEAST_SCALE, MOST_SCALE = (1280, 720), 0.8, 4.0
 # How much larger pictures one under the other must be than side by side.

@@ -11,20 +11,19 @@ from render.layout import Layout, Rect
 from render.panel import (
     BEFORE,
     FIGURE_PX,
-    NOTE_PX,
     OUTLINE,
-    QUIET,
     Panel,
     draw_calliper,
+    draw_note,
     draw_segments,
     paste_picture,
 )
-from render.text import write
 from render.viewer import View
 
 READOUT_PERIOD_S = 0.25
 
-Figures = tuple[dict[str, str], dict[str, str], str]
+# Read-outs, findings, which of them is too much, clock and pace.
+Figures = tuple[dict[str, str], dict[str, str], str, str, str]
 
 
 def panel_of(view: View) -> Panel:
@@ -71,7 +70,8 @@ class Page:
         for (name, picture), box in zip(view.pictures.items(), panel.boxes(self.layout), strict=True):
             paste_picture(self._page, box, picture)
             self._draw_over(view, panel, name, box)
-        self._compose_figures((dict(view.readouts), findings, view.alert), patient)
+        figures = dict(view.readouts), findings, view.alert, view.clock, view.pace
+        self._compose_figures(figures, patient)
         if self._axes is None or not np.array_equal(axes, self._axes):
             self._put(self.layout.compass, compass_picture(self.layout, axes))
             self._axes = axes
@@ -89,8 +89,7 @@ class Page:
         if view.outline_mm is not None:
             draw_segments(self._page, panel, box, view.outline_mm, OUTLINE)
         if note := view.notes.get(name):
-            middle = box.left + box.width / 2, box.top + box.height / 2
-            write(self._page, box, middle, note, self.layout.px(NOTE_PX), QUIET)
+            draw_note(self._page, self.layout, box, note)
         draw_calliper(self._page, panel, box, view.calliper_mm, view.calliper, self.layout.px(FIGURE_PX))
 
     def _compose_figures(self, figures: Figures, patient: bool) -> None:
@@ -99,7 +98,9 @@ class Page:
         waits = patient and now - self._figures_at < READOUT_PERIOD_S
         if self._figures is not None and (waits or figures == self._figures):
             return
-        readouts, findings, alert = figures
+        readouts, findings, alert, clock, pace = figures
+        box = frame.clock_box(self.layout, self.keys.of["help"])
+        self._put(box, frame.clock_picture(self.layout, box, clock, pace))
         self._put(self.layout.readouts, frame.readout_picture(self.layout, readouts))
         if findings:
             box = self.layout.findings(len(findings))

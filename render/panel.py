@@ -11,13 +11,13 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from render.layout import Layout, Rect
-from render.text import font, shortened, write, written_size
+from render.text import PLATE_PX, fitting_size, font, shortened, write, written_size
 
 PANEL, FINDINGS, LINE = (8, 9, 11), (20, 24, 29), (44, 50, 58)
 TEXT, QUIET = (222, 227, 232), (132, 142, 153)
 MARK, ALERT = (64, 196, 255), (255, 176, 46)
 OUTLINE, BEFORE, CALLIPER = (237, 194, 71), (150, 128, 196), (120, 230, 140)
-CROSS_PX, NUMBER_PX, NOTE_PX, FIGURE_PX = 5, 16, 17, 15
+CROSS_PX, NUMBER_PX, NOTE_PX, HINT_PX, FIGURE_PX = 5, 16, 17, 14, 15
 # Under the pictures while the tumour's outline is in them.
 LEGEND = (("tumour now", OUTLINE), ("in the CT", BEFORE))
 
@@ -85,6 +85,16 @@ def paste_picture(page: np.ndarray, box: Rect, picture: np.ndarray) -> None:
     rows, columns = box.slices
     for channel in range(3):
         page[rows, columns, channel] = picture
+
+
+def draw_note(page: np.ndarray, layout: Layout, box: Rect, note: str) -> None:
+    """Write over the middle of the picture in a box; a second line is smaller, and as small as it must be to fit."""
+    px, (x, y) = layout.px, (box.left + box.width / 2, box.top + box.height / 2)
+    said, _, hint = note.partition("\n")
+    write(page, box, (x, y), said, px(NOTE_PX), QUIET)
+    if hint:
+        size = fitting_size([(hint,)], box.width - 3 * PLATE_PX, px(HINT_PX))
+        write(page, box, (x, y + 1.5 * px(NOTE_PX)), hint, size, QUIET)
 
 
 def draw_segments(page: np.ndarray, panel: Panel, box: Rect, segments_mm: np.ndarray, colour) -> None:

@@ -5,10 +5,10 @@ import dataclasses
 from render.layout import Layout, Rect
 from render.viewer import ASIDE, Geometry, Settings
 
-# Dear ImGui's glyphs are 7 pixels wide, its labels get 35 % of a box, its rows are 23 pixels high.
+# Dear ImGui's glyphs are 7 pixels wide, its rows are 23 pixels high. Its labels get 35 % of a box, a switch's all of it, but for so many
+# pixels around them.
 GLYPH_WIDTH, LABEL_SHARE, ROW_HEIGHT = 7, 0.35, 23
-# Boxes that get less of what they ask for than this are too narrow for their labels: the first is left out.
-LEAST_SHARE = 0.9
+AROUND_LABEL, AROUND_SWITCH = 16, 35
 
 
 def groups_of(settings: Settings, geometry: Geometry) -> dict[str, list[dataclasses.Field]]:
@@ -32,7 +32,8 @@ def boxes_of(settings: Settings, geometry: Geometry, layout: Layout) -> dict[str
     """Where each group is now."""
     groups = groups_of(settings, geometry)
     below = {name: _width(members) for name, members in groups.items() if name not in ASIDE}
-    while len(below) > 1 and sum(below.values()) * LEAST_SHARE > layout.slider_room(len(below)):
+    # Where boxes would be too narrow for their labels, the first is left out.
+    while len(below) > 1 and sum(below.values()) > layout.slider_room(len(below)):
         del below[next(iter(below))]
     boxes = dict(zip(below, layout.sliders(list(below.values())), strict=True))
     if settings.show_scanner:
@@ -77,11 +78,11 @@ def _draw_slider(gui, settings: Settings, member: dataclasses.Field, mhz: tuple[
 
 
 def _width(members: list[dataclasses.Field]) -> float:
-    """Pixels that a group asks for."""
+    """Pixels that the labels of a group need."""
     longest = max(GLYPH_WIDTH * len(_label(member)) for member in members)
     if isinstance(members[0].metadata["low"], bool):
-        return longest + 44
-    return (longest + 16) / LABEL_SHARE
+        return longest + AROUND_SWITCH
+    return (longest + AROUND_LABEL) / LABEL_SHARE
 
 
 def _label(member: dataclasses.Field) -> str:

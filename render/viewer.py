@@ -104,9 +104,9 @@ class Settings:
     A field that is None or has no metadata has no slider: of the first two, each tissue model has one.
     """
 
-    young_kpa: float | None = _slider(None, "Stiff.", "kPa", 1.0, 100.0, "Tissue")
+    young_kpa: float | None = _slider(None, "Young", "kPa", 1.0, 100.0, "Tissue")
     stiffness: float | None = _slider(None, "Stiffness", "", 0.1, 1.0, "Tissue")
-    iterations: int = _slider(9, "Iterations", "", 1, 40, "Tissue")
+    iterations: int = _slider(9, "Iter.", "", 1, 40, "Tissue")
     substeps: int = _slider(3, "Substeps", "", 1, 10, "Tissue")
     gravity_m_s2: float = _slider(9.81, "g", "m/s2", 0.0, 20.0, "Tissue")
     depth_mm: int = _slider(60, "Depth", "mm", 5, 300, "Picture")
@@ -206,7 +206,7 @@ class View:
     calliper: str = ""
     """What is between them."""
     notes: dict[str, str] = field(default_factory=dict)
-    """Name of a picture -> what is written in it, such as that it is black for want of contact."""
+    """Name of a picture -> what is written in it, such as that it is black for want of contact; in a second line what to do."""
     captions: tuple[str, str, str] = ("", "", "")
     """What is said around the pictures: the probe, above; the echo's and the CT's settings, below."""
     readouts: dict[str, str] = field(default_factory=dict)
@@ -216,7 +216,11 @@ class View:
     alert: str = ""
     """Which of them is more than it should be."""
     status: str = ""
-    """A short word over the picture, such as FROZEN."""
+    """Short words over the picture, such as FROZEN, three spaces apart; the weightiest first: the last go where room ends."""
+    clock: str = ""
+    """The session's time, in simulated seconds: "42.6 s"."""
+    pace: str = ""
+    """How slowly that goes, where it is slower than real: "0.2 x real"."""
     title: str = ""
     """What is shown (scene or case); no patient's name, id or date."""
     marked_side: str = "right"

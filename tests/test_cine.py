@@ -6,6 +6,8 @@ import pytest
 from render.viewer import View
 from studies.rehearse.cine import KEPT_S, Calliper, Cine, Frame
 
+HERE = np.eye(4)
+
 
 def frame_at(time_s: float, rest: np.ndarray | None = None) -> Frame:
     grey = np.full((8, 8), round(time_s) % 256, np.uint8)
@@ -54,16 +56,30 @@ def test_the_calliper_measures_the_tissue_as_it_lies_and_at_rest():
     frame = frame_at(0.0, np.stack([u, v], axis=-1) @ stretch.T)
     calliper = Calliper()
     assert calliper.figure(frame) == ""
-    calliper.point((-3.0, 5.0))
-    calliper.point(None)
-    calliper.point((4.0, 29.0))
+    calliper.point((-3.0, 5.0), HERE)
+    calliper.point(None, HERE)
+    calliper.point((4.0, 29.0), HERE)
     at_rest = np.linalg.norm(stretch @ [7.0, 24.0])
     # A linear map is exact between the places that are kept.
     assert calliper.figure(frame) == f"25.0 mm\nat rest {at_rest:.1f} mm"
-    calliper.point((0.0, 0.0))
+    calliper.point((0.0, 0.0), HERE)
     assert calliper.points == () and calliper.figure(frame) == ""
 
 
 def test_without_tissue_the_calliper_still_measures_the_picture():
     calliper = Calliper(((0.0, 0.0), (3.0, 4.0)))
     assert calliper.figure(frame_at(0.0)) == "5.0 mm"
+
+
+def test_the_calliper_goes_when_the_probe_moves():
+    calliper, moved = Calliper(), HERE.copy()
+    moved[0, 3] = 0.5
+    for count in (1, 2):
+        calliper.point((float(count), 0.0), HERE)
+        calliper.go_with(HERE + 1e-6)
+        assert len(calliper.points) == count
+    calliper.go_with(moved)
+    assert calliper.points == ()
+    calliper.point((1.0, 0.0), moved)
+    calliper.go_with(moved)
+    assert calliper.points == ((1.0, 0.0),)

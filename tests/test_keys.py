@@ -83,7 +83,7 @@ def test_what_is_said_names_the_users_keys(tmp_path, capsys):
     loop = Loop(None, NullViewer(), tmp_path, None, *parts, keys=keys)
     loop._announce("sweep-001: {sweep} ends it")
     assert capsys.readouterr().out == "sweep-001: Space ends it\n"
-    assert loop._status(None) == "Sweep-001: Space ends it"
+    assert loop._status(SimpleNamespace(status="")) == "Sweep-001: Space ends it"
 
 
 def test_the_printed_file_is_the_usual_map(tmp_path, capsys):

@@ -11,6 +11,7 @@ import pytest
 from click.exceptions import Exit
 
 import app
+from render.keys import USUAL_KEYS, Keys
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
 from scenes.scene import EMBEDDED
@@ -43,12 +44,12 @@ class Moments:
         place[0, 3] = self.moment
         return SimpleNamespace(world_from_plane=place)
 
-    def take_view(self, rehearsal, settings, pose, tally, status="") -> View:
+    def take_view(self, rehearsal, settings, pose, tally) -> View:
         tally.step_ms.append(1.0)
-        grey = np.full((4, 4), self.moment + 100 * (status == "FROZEN"), np.uint8)
+        grey = np.full((4, 4), self.moment + 100 * (pose is None), np.uint8)
         probe = probe_as_set(self.probe, settings)
         width, depth, _ = probe.extent_mm
-        return View(np.eye(4), {"B-mode": grey, "CT": 255 - grey}, width, depth, status=status)
+        return View(np.eye(4), {"B-mode": grey, "CT": 255 - grey}, width, depth)
 
     def rest_grid(self) -> None: ...
     def stepped(self, step_ms: float) -> str:
@@ -119,12 +120,13 @@ def test_what_the_guard_put_back_is_told_and_stands_in_the_panel_for_a_while(loo
     clock = [100.0]
     monkeypatch.setattr(loop, "perf_counter", lambda: clock[0])
     looping.rehearsal.notice = "Tissue put back"
-    assert looping.frame(Controls(Settings())).status == ""
+    shown = [looping.frame(Controls(Settings())).status]
     looping.rehearsal.notice = ""
-    shown = []
     for clock[0] in (103.9, 104.1):
         shown.append(looping.frame(Controls(Settings())).status)
-    assert shown == ["TISSUE PUT BACK", ""] and capsys.readouterr().out == "Tissue put back\n"
+    assert (
+        shown == ["TISSUE PUT BACK", "TISSUE PUT BACK", ""] and capsys.readouterr().out == "Tissue put back\n"
+    )
 
 
 def test_a_sweep_that_is_recorded_stands_in_the_panel_beside_all_else(looping, monkeypatch):
@@ -142,6 +144,58 @@ def test_a_sweep_that_is_recorded_stands_in_the_panel_beside_all_else(looping, m
     assert looping.frame(Controls(Settings(), freeze=True)).status == (
         "RECORDING 3 s   FROZEN   PLANNING; Backspace stops"
     )
+
+
+def test_what_is_wrong_with_the_tissue_stands_before_all_that_is_technical(looping, monkeypatch):
+    monkeypatch.setattr(loop, "perf_counter", lambda: 100.0)
+    monkeypatch.setattr(Moments, "onto", lambda each, view, settings: replace(view, status="SQUEEZED"))
+    looping.sweeping = SimpleNamespace(status="RECORDING 3 s", watch=lambda *_: "")
+    looping.plans = SimpleNamespace(status="PLANNING", watch=lambda *_: "")
+    looping.driver.status = "LESS EXACT"
+    controls = Controls(Settings())
+    assert looping.frame(controls).status == "SQUEEZED   RECORDING 3 s   LESS EXACT   PLANNING"
+    looping._say("undo")
+    assert looping.frame(controls).status == "SQUEEZED   RECORDING 3 s   Undo"
+    looping._said_until, looping._put_back_until = 0.0, 104.0
+    status = looping.frame(Controls(Settings(), freeze=True)).status
+    assert status == "TISSUE PUT BACK   SQUEEZED   RECORDING 3 s   FROZEN   PLANNING"
+
+
+def test_a_frozen_picture_keeps_its_calliper_and_a_live_one_until_the_probe_moves(looping, monkeypatch):
+    take_view, at = looping.rehearsal.take_view, np.eye(4)
+    monkeypatch.setattr(loop, "take_view", lambda *told: replace(take_view(*told), transducer_pose=at.copy()))
+    place = (1.0, 2.0)
+    assert looping.frame(Controls(Settings(), pointed_mm=place)).calliper_mm == (place,)
+    assert looping.frame(Controls(Settings(), pointed_mm=place)).calliper == "0.0 mm"
+    at[0, 3] = 5.0
+    assert looping.frame(Controls(Settings(), freeze=True)).calliper == "0.0 mm"
+    assert looping.frame(Controls(Settings(), freeze=True)).calliper_mm == ()
+
+
+def test_the_clock_is_the_sessions_and_says_where_it_is_slow(looping):
+    told = []
+    for looping.rate in (1.0, 0.15, 0.89 / STEP_S, 0.91 / STEP_S):
+        view = looping.frame(Controls(Settings()))
+        told.append((view.clock, view.pace))
+    assert told == [("0.2 s", "0.2 x real"), ("0.5 s", "0.04 x real"), ("0.8 s", "0.9 x real"), ("1.0 s", "")]
+    looping.rate = 1.0
+    frozen = looping.frame(Controls(Settings(), freeze=True))
+    assert (frozen.clock, frozen.pace) == ("1.0 s", "") and "time" not in frozen.readouts
+
+
+def test_without_contact_whoever_leads_by_hand_is_told_how_to_press(looping, monkeypatch):
+    monkeypatch.setattr(Moments, "onto", lambda each, view, _: replace(view, notes={"B-mode": "NO CONTACT"}))
+    monkeypatch.setattr(loop, "Live", SimpleNamespace)
+    looping.keys = Keys({**USUAL_KEYS, "push": "Return"})
+    monkeypatch.setattr(loop, "Played", Moments)
+    by_hand, tracked = (SimpleNamespace(is_by_hand=each) for each in (True, False))
+    told = []
+    for looping.driver.live in (None, by_hand, tracked):
+        told.append(looping.frame(Controls(Settings())).notes["B-mode"])
+    assert told == ["NO CONTACT", "NO CONTACT\nLeft button or Return presses", "NO CONTACT"]
+    looping.driver.live = by_hand
+    frozen = looping.frame(Controls(Settings(), freeze=True))
+    assert frozen.notes["B-mode"] == "NO CONTACT"
 
 
 def test_without_a_link_the_loop_goes_on(looping, sent):

@@ -7,7 +7,8 @@ import pytest
 
 from render.camera import OrbitCamera
 from render.compass import ARM, compass_picture, ends_of
-from render.frame import readout_picture
+from render.frame import clock_box, findings_picture, readout_picture
+from render.keys import USUAL_KEYS, Keys
 from render.layout import Layout, Rect
 from render.page import Page
 from render.panel import ALERT, BEFORE, CALLIPER, OUTLINE, QUIET, TEXT
@@ -93,15 +94,17 @@ def test_the_first_sliders_go_where_there_is_no_room(size):
     assert names == (["Picture", "View"] if size == (700, 420) else ["Tissue", "Picture", "View"])
 
 
-@pytest.mark.parametrize("width", range(704, 1600, 64))
-def test_labels_of_sliders_are_whole(width):
-    settings, layout = Settings(young_kpa=15.0), Layout(width, width * 9 // 16)
+@pytest.mark.parametrize("width", [*range(704, 1600, 64), 1250])
+@pytest.mark.parametrize("tissue", ["young_kpa", "stiffness"])
+def test_labels_of_sliders_are_whole(width, tissue):
+    settings = Settings(**{tissue: 0.9}, show_scanner=True)
+    layout = Layout(width, width * 9 // 16)
     groups = groups_of(settings, WHOLE)
     for name, box in boxes_of(settings, WHOLE, layout).items():
         for about in (member.metadata for member in groups[name]):
             label = 7 * len(f"{about['label']} {about['unit']}".strip())
-            # A switch is 31 pixels wide with what is around it.
-            assert label <= (box.width - 31 if name == "View" else 0.35 * box.width)
+            # Pixels around a label, and of a switch, as Dear ImGui draws them.
+            assert label <= (box.width - 35 if name == "View" else 0.35 * box.width - 16)
 
 
 def test_what_is_not_there_has_no_slider():
@@ -172,6 +175,21 @@ def test_no_contact_is_written_in_the_echo_alone():
     assert np.array_equal(plain[ct.slices], noted[ct.slices])
 
 
+@pytest.mark.parametrize("size", [(1024, 576), (1088, 612), (1280, 720), (1920, 1080)])
+@pytest.mark.parametrize("hint", ["Left button or W presses", "Left button or Backspace presses"])
+def test_what_to_do_stands_whole_under_a_note(size, hint):
+    layout = Layout(*size)
+    plain, hinted = (
+        composed(Page(layout), notes={"B-mode": note}) for note in ("NO CONTACT", f"NO CONTACT\n{hint}")
+    )
+    echo = layout.picture_boxes(2, 16.0, 40.0)[0]
+    rows, columns = np.nonzero((plain != hinted).any(axis=2))
+    assert echo.left <= columns.min() and columns.max() < echo.right
+    assert np.ptp(columns) > 0.4 * echo.width
+    noted = coloured(plain, echo, QUIET)[:, 0].max() + echo.top
+    assert noted < rows.min() and rows.max() < noted + 50
+
+
 @pytest.mark.parametrize(
     "points",
     [
@@ -223,13 +241,34 @@ def test_findings_that_become_fewer_leave_nothing_behind():
     assert np.array_equal(composed(page, findings=dict(list(FIGURES.items())[:4])), few)
 
 
-@pytest.mark.parametrize("size", [(1232, 693), (1280, 720), (1920, 1080), (3840, 2160)])
+def test_a_figure_that_has_nothing_to_say_is_a_dash():
+    pictures = [findings_picture(LAYOUT, {"margin": figure}) for figure in ("", "-", "4.2 mm")]
+    assert np.array_equal(pictures[0], pictures[1]) and not np.array_equal(pictures[0], pictures[2])
+
+
+@pytest.mark.parametrize("size", [(1250, 703), (1280, 720), (1920, 1080), (3840, 2160)])
 def test_all_readouts_of_a_window_are_shown(size):
     layout = Layout(*size)
     ends = [readout_picture(layout, dict(list(FIGURES.items())[:count])) for count in (6, 7)]
     rows = np.flatnonzero((ends[0] != ends[1]).any(axis=(1, 2)))
     # In a large window the lines move closer together for the seventh.
     assert len(rows) > 5 and rows.max() < layout.readouts.height - 2
+
+
+@each_size
+@pytest.mark.parametrize("help_key", ["H", "Backspace"])
+def test_clock_and_pace_stand_between_title_and_help_in_every_window(size, help_key):
+    layout, told = Layout(*size), {"clock": "1234.5 s", "title": "A long title of a patient " * 5}
+    page = Page(layout, Keys({**USUAL_KEYS, "help": help_key}))
+    box = clock_box(layout, help_key)
+    bare, real, slow = (composed(page, **told | more) for more in ({"clock": ""}, {}, {"pace": "0.2 x real"}))
+    assert set(np.unique(bare[box.slices])) == {17, 20, 24}
+    for before, after, is_caution in ((bare, real, False), (real, slow, True)):
+        changed = after[(before != after).any(axis=2)].astype(int)
+        assert len(changed) > 50 and len(changed) == (before != after)[box.slices].any(axis=2).sum()
+        assert (np.ptp(changed, axis=1).max() > 100) == is_caution
+    # Neither is cut at its left end.
+    assert (slow[: box.height, box.left] == bare[: box.height, box.left]).all()
 
 
 @each_size

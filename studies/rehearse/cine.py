@@ -7,6 +7,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from render.viewer import View
+from studies.rehearse.live import STILL_MM
 
 KEPT_S, KEPT_A_SECOND = 10.0, 30
 
@@ -53,14 +54,23 @@ class Cine:
 
 @dataclass
 class Calliper:
-    """Two points on the image plane [mm], set by clicks; a third click removes them."""
+    """Two points on the image plane [mm], set by clicks; a third click removes them, or a probe that moves."""
 
     points: tuple[tuple[float, float], ...] = ()
+    _pose: np.ndarray | None = None
 
-    def point(self, place_mm: tuple[float, float] | None) -> None:
-        """Set the next point, or remove both, if there was a click."""
-        if place_mm is not None:
-            self.points = () if len(self.points) == 2 else (*self.points, place_mm)
+    def point(self, place_mm: tuple[float, float] | None, pose: np.ndarray) -> None:
+        """Set the next point, or remove both, if there was a click in a picture whose probe has a pose (4, 4)."""
+        if place_mm is None:
+            return
+        if not self.points:
+            self._pose = pose
+        self.points = () if len(self.points) == 2 else (*self.points, place_mm)
+
+    def go_with(self, pose: np.ndarray) -> None:
+        """Remove the points where the probe of a live picture is elsewhere (4, 4) than when the first was set."""
+        if self.points and self._pose is not None and np.abs(pose - self._pose).max() > STILL_MM:
+            self.points = ()
 
     def figure(self, frame: Frame) -> str:
         """The distance of the points as the tissue lies, and of the same tissue at rest; empty of fewer than two."""

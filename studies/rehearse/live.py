@@ -48,6 +48,11 @@ class Live:
         return self.ladder.says(self._asked)
 
     @property
+    def is_by_hand(self) -> bool:
+        """Whether mouse, keys and gamepad lead, and no tracked probe."""
+        return self._follower is None
+
+    @property
     def bookmarks(self) -> int:
         """How many the user has set."""
         return len(self.history.bookmarks)

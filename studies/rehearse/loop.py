@@ -12,8 +12,9 @@ from studies.link.live import send_live
 from studies.link.server import Server
 from studies.rehearsal import Rehearsal
 from studies.rehearse.cine import Calliper, Cine, Frame
-from studies.rehearse.drivers import Driver
+from studies.rehearse.drivers import Driver, Played
 from studies.rehearse.instruments import Instruments
+from studies.rehearse.live import Live
 from studies.rehearse.planning import Plans
 from studies.rehearse.saving import save_screenshot, save_surfaces, save_view
 from studies.rehearse.sweeping import Sweeping
@@ -22,6 +23,9 @@ from studies.report import Tally
 
 # How long what was done is said, and that the guard put the tissue back.
 SAID_S, PUT_BACK_S = 2.0, 4.0
+# A share of real time that is as good as that.
+REAL = 0.9
+HOW_TO_PRESS = "{press} or {push} presses"
 
 
 @dataclass
@@ -87,27 +91,51 @@ class Loop:
             self.frozen = not self.frozen
         if controls.reset:
             self.calliper.points = ()
-        self.calliper.point(controls.pointed_mm)
         self._announce(controls.news)
         self._announce(self.plans.watch(controls))
         shown = self._looked_back(controls) or self._taken(controls)
         if controls.sweep:
             self._announce(self.sweeping.toggle(self.out))
-        speed = self.rate * self.rehearsal.settings.time_step_s
-        figures = {"frames": f"{self.rate:.0f} /s", "time": f"{speed:.1f} x real"}
         view = shown.view
+        self.calliper.point(controls.pointed_mm, view.transducer_pose)
+        if not self.frozen:
+            self.calliper.go_with(view.transducer_pose)
         return replace(
             view,
             calliper_mm=self.calliper.points,
             calliper=self.calliper.figure(shown),
-            readouts=view.readouts | figures,
+            readouts=view.readouts | {"frames": f"{self.rate:.0f} /s"},
+            clock=f"{self.driver.session.time_s:.1f} s",
+            pace=self._pace(),
             status=self._status(view),
+            notes={name: self._hinted(note) for name, note in view.notes.items()},
         )
 
+    def _pace(self) -> str:
+        """How slowly simulated time goes, where it is slower than real; a frozen one stands."""
+        speed = self.rate * self.rehearsal.settings.time_step_s
+        return "" if self.frozen or speed >= REAL else f"{speed:.1g} x real"
+
+    def _hinted(self, note: str) -> str:
+        """A note that there is no contact, with what the user can do about it, if anything."""
+        live = self.driver.live if isinstance(self.driver, Played) else self.driver
+        if self.frozen or not isinstance(live, Live) or not live.is_by_hand:
+            return note
+        return self.keys.worded(f"{note}\n{HOW_TO_PRESS}")
+
     def _status(self, view: View) -> str:
-        is_said = perf_counter() < self._said_until
-        news = [self._said] if is_said else [view.status, self.plans.status]
-        return self.keys.worded("   ".join(filter(None, [self.sweeping.status, *news])))
+        """What stands over the pictures, by weight: the tissue before all else, for the last words go where there is no room."""
+        now = perf_counter()
+        put_back = "TISSUE PUT BACK" if now < self._put_back_until else ""
+        news = [self._said] if now < self._said_until else [self._state(), self.plans.status]
+        return self.keys.worded(
+            "   ".join(filter(None, [put_back, view.status, self.sweeping.status, *news]))
+        )
+
+    def _state(self) -> str:
+        if not self.frozen:
+            return self.driver.status
+        return f"FROZEN   {self.cine.age_s:.1f} s" if self.cine.back else "FROZEN"
 
     def _announce(self, text: str) -> None:
         """Say something in the window and in the terminal."""
@@ -125,18 +153,16 @@ class Loop:
             self.cine.go(controls.cine)
         if not self.frozen or self.cine.back == 0:
             return None
-        frame = self.cine.shown
-        return replace(frame, view=replace(frame.view, status=f"FROZEN   {self.cine.age_s:.1f} s"))
+        return self.cine.shown
 
     def _taken(self, controls: Controls) -> Frame:
         """A new frame. A frozen one shows the same tissue with the scanner set anew, and is not kept."""
         if self.frozen:
-            view = take_view(self.rehearsal, controls.settings, None, self.tally, "FROZEN")
+            view = take_view(self.rehearsal, controls.settings, None, self.tally)
             return self._sent(view, controls.settings)
         pose = self.driver.move(controls)
         self._say(self.driver.take_said())
-        status = "TISSUE PUT BACK" if perf_counter() < self._put_back_until else self.driver.status
-        view = take_view(self.rehearsal, controls.settings, pose, self.tally, status)
+        view = take_view(self.rehearsal, controls.settings, pose, self.tally)
         if pose is not None:
             if self.rehearsal.notice:
                 self._tell(self.rehearsal.notice)

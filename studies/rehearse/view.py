@@ -102,7 +102,6 @@ def take_view(
     settings: Settings,
     pose: np.ndarray | None,
     tally: Tally,
-    status: str = "",
 ) -> View:
     """One frame, on screen and off: step with the transducer going to a pose, carry the surfaces, take the pictures.
 
@@ -125,7 +124,6 @@ def take_view(
         outline_before_mm=rehearsal.tumour_outline(at_rest=True) if settings.outline else None,
         captions=captions(probe, settings),
         readouts=readouts(rehearsal, tally),
-        status=status,
         title=rehearsal.scene.title,
     )
 
