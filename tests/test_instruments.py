@@ -139,3 +139,12 @@ def test_an_echo_is_said_to_be_black_where_hardly_a_line_touches(
         SimpleNamespace(moment=0, kept={}, back=None, note=lambda *_: None), rehearsal.probe, FIRST[0]
     )
     assert watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings()).notes == notes
+
+
+@pytest.mark.parametrize(
+    ("in_view", "margin", "shown"),
+    [(0.5, -0.04, "0.0 mm"), (0.5, 0.0, "0.0 mm"), (0.5, -0.06, "-0.1 mm"), (0.0, 1.0, ""), (None, None, "")],
+)
+def test_a_margin_of_nothing_has_no_minus(one_device, watching, in_view, margin, shown):
+    watching.reading = Reading(1.0, 20.0, 5.0, 2.0, 1.0, in_view, margin)
+    assert watching.findings()["margin"] == shown

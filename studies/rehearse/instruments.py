@@ -167,15 +167,15 @@ class Instruments:
         reading = self.reading
         if reading is None:
             return {}
-        found = {COMPRESSION: f"{reading.compression_mm:.1f} mm", "contact": f"{reading.contact_mm2:.0f} mm2"}
+        found = {COMPRESSION: _mm(reading.compression_mm), "contact": f"{reading.contact_mm2:.0f} mm2"}
         if reading.to_tumour_mm is None:
             return found if self.rehearsal.scanner is None else found | {"organ seen": self._share("organ")}
         found |= {
-            "to tumour": f"{reading.to_tumour_mm:.1f} mm",
-            "tumour depth": f"{reading.tumour_depth_mm:.1f} mm",
-            "tumour shift": f"{reading.tumour_shift_mm:.1f} mm",
+            "to tumour": _mm(reading.to_tumour_mm),
+            "tumour depth": _mm(reading.tumour_depth_mm),
+            "tumour shift": _mm(reading.tumour_shift_mm),
             "in view": "not cut" if reading.in_view is None else f"{100 * reading.in_view:.0f} %",
-            "margin": f"{reading.margin_mm:.1f} mm" if reading.in_view and reading.margin_mm else "",
+            "margin": _mm(reading.margin_mm) if reading.in_view else "",
         }
         return found | {
             "tumour seen": self._share("tumour"),
@@ -184,6 +184,11 @@ class Instruments:
 
     def _share(self, target: str) -> str:
         return f"{100 * self.coverage.share(target):.0f} %"
+
+
+def _mm(length: float | None) -> str:
+    """As the window shows it, without a minus before nothing; empty of none."""
+    return "" if length is None else f"{round(length, 1) + 0.0:.1f} mm"
 
 
 def _noted(values: dict[str, float | None]) -> Reading:
