@@ -13,6 +13,7 @@ from click.exceptions import Exit
 import app
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
+from scenes.pasted import pasted
 from scenes.scene import EMBEDDED
 from studies.rehearse import command, headless, loop, run
 from studies.rehearse.loop import Loop
@@ -230,13 +231,13 @@ def test_ctrl_c_in_a_run_says_so_before_how_it_went(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    ("scene", "line"),
+    ("scene", "words"),
     [
-        (None, "--replay a/session-001.jsonl"),
-        (PurePosixPath("my patients/a"), '"my patients/a" --replay a/session-001.jsonl'),
+        (None, ["--replay", "a/session-001.jsonl"]),
+        (PurePosixPath("my patients/a"), ["my patients/a", "--replay", "a/session-001.jsonl"]),
     ],
 )
-def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scene, line):
+def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scene, words):
     monkeypatch.setattr(
         run, "Instruments", lambda rehearsal, guide: SimpleNamespace(guide=None, summary=lambda bookmarks: {})
     )
@@ -245,7 +246,7 @@ def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scen
     recording = SimpleNamespace(path=PurePosixPath("a/session-001.jsonl"), fault="")
     each.recorded = SimpleNamespace(recording=recording, close=lambda summary: None)
     each._end(0)
-    assert capsys.readouterr().out.endswith(f"replay it with: python app.py rehearse {line}\n")
+    assert capsys.readouterr().out.endswith(f"replay it with: {pasted('rehearse', *words)}\n")
 
 
 def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path, sent):
