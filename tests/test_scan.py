@@ -58,7 +58,7 @@ def test_poses_of_both_formats_are_the_same(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("{", "not valid JSON"),
+        ("{", "; expected poses as JSON or CSV"),
         (" ", "is empty"),
         ("[]", "holds no poses"),
         ('[{"probe_to_patient": [[1, 0, 0, 0]]}]', "pose 1, probe_to_patient"),
@@ -75,7 +75,12 @@ def test_poses_that_cannot_be_used_are_refused_in_one_line(tmp_path, text, words
 
 def test_a_table_with_another_number_of_columns_is_refused(tmp_path):
     assert "pose 1: 3 numbers" in refused(tmp_path, "1,2,3", "poses.csv")
-    assert "expected sixteen" in refused(tmp_path, "a,b", "poses.csv")
+    assert "'a' is no number; expected sixteen" in refused(tmp_path, "a,b", "poses.csv")
+    (tmp_path / "a.png").write_bytes(b"\x89PNG")
+    with pytest.raises(PoseError, match="is no text; expected poses as JSON or CSV"):
+        load_poses(tmp_path / "a.png")
+    with pytest.raises(PoseError, match="cannot be read as poses"):
+        load_poses(tmp_path)
     with pytest.raises(PoseError, match="no such file"):
         load_poses(tmp_path / "none.json")
 
