@@ -178,6 +178,18 @@ def test_the_export_key_saves_the_tissue_beside_its_picture_and_says_what_it_can
     assert looping.frame(Controls(settings)).status == f"Saved 005   {missing[1]}"
 
 
+@pytest.mark.parametrize("earlier", [True, False])
+def test_pictures_of_an_earlier_run_are_not_replaced_without_a_word(monkeypatch, tmp_path, capsys, earlier):
+    monkeypatch.setattr(headless, "open_viewer", lambda *_, **__: None)
+    picture = tmp_path / "slices" / "00004.png"
+    picture.parent.mkdir()
+    if earlier:
+        picture.touch()
+    headless.Pictures(Moments(), 3, tmp_path)
+    said = f"Replacing the pictures of an earlier run in {tmp_path}.\n" if earlier else ""
+    assert capsys.readouterr().out == said and not picture.exists()
+
+
 def test_without_a_window_pictures_go_to_the_link_and_the_tissue_into_the_folder(monkeypatch, tmp_path, sent):
     def no_viewer(rehearsal, visible):
         raise NoVulkan("no Vulkan")
