@@ -135,11 +135,13 @@ def test_a_pixel_is_where_its_matrix_says():
 
 
 def test_scan_leaves_a_picture_of_each_pose_and_mode(tmp_path, capsys):
-    away = pose_on_tumour()
+    away, beyond = pose_on_tumour(), pose_on_tumour()
     away[:3, 3] -= 30 * away[:3, 1]
+    beyond[:3, 3] -= 50 * beyond[:3, 1]
     poses = [
         dict(name="on", probe_to_patient=pose_on_tumour().tolist()),
         dict(name="off", probe_to_patient=away.tolist()),
+        dict(name="past", probe_to_patient=beyond.tolist()),
     ]
     (tmp_path / "poses.json").write_text(json.dumps(poses))
     out = tmp_path / "out"
@@ -161,7 +163,10 @@ def test_scan_leaves_a_picture_of_each_pose_and_mode(tmp_path, capsys):
         "on-ct.png",
         "off-b-mode.png",
         "off-ct.png",
+        "past-b-mode.png",
+        "past-ct.png",
     ]
+    assert "1 of 3 poses show nothing of the organ; they may be of another" in capsys.readouterr().out
     assert report["probe"]["FrequencyMhz"] == 9.0 and report["version"] == VERSION
     shown = {path.stem: np.asarray(Image.open(path)).astype(int) for path in out.glob("*.png")}
     row = report["pictures"][0]

@@ -242,7 +242,9 @@ def _read_header(file: BinaryIO) -> tuple[dict[str, str], dict[int, dict[str, st
     fields: dict[str, str] = {}
     frames: dict[int, dict[str, str]] = {}
     if b"".join(file.readline(HEADER_LIMIT).split()) != b"ObjectType=Image":
-        raise SweepError("is no tracked sweep (.igs.mha), which begins with ObjectType = Image")
+        raise SweepError(
+            "is no sweep; expected a tracked one (.igs.mha), which begins with ObjectType = Image"
+        )
     file.seek(0)
     while True:
         name, text = _read_line(file)
