@@ -5,6 +5,7 @@ from pathlib import Path
 import click
 import numpy as np
 
+from scenes.pasted import pasted
 from scenes.patient_folder import check_folder, save_patient
 from scenes.reading.error import PatientError
 from scenes.reading.names import Side
@@ -73,7 +74,7 @@ def import_patient_command(
     searched = save_patient(patient, out, texts, lambda folder: draw_check(patient, rows, folder), private)
     rows.append(("private", f"{searched} names, ids, dates, uids, paths of the source: none is in the files"))
     click.echo(told(rows))
-    click.echo(f"Written to {out}. Look at {out / 'check.png'}, then: python app.py rehearse {out}")
+    click.echo(f"Written to {out}. Look at {out / 'check.png'}, then: {pasted('rehearse', out)}")
 
 
 def label_words(text: str, option: str) -> list[str]:

@@ -257,7 +257,7 @@ def load_scene(path: Path) -> Scene:
     except OSError as error:
         raise SceneError(f"{path}: cannot be read as a scene ({_first_line(error)})") from None
     except tomllib.TOMLDecodeError as error:
-        raise SceneError(f"{path}: not valid TOML: {_first_line(error)}") from None
+        raise SceneError(f"{path}: not valid TOML: {_first_line(error)}; {EXPECTED}") from None
     try:
         return _with_probe_beside(path, Scene.model_validate(values))
     except ValidationError as error:

@@ -22,6 +22,7 @@ from PIL import Image
 import app
 from studies.command_line import Fault
 from studies.rehearse.checks import refuse_no_pictures
+from studies.rehearse.command import found_display
 from version import VERSION
 
 REPORTED = {
@@ -115,8 +116,15 @@ def test_it_leaves_pictures_in_which_the_press_is_seen(pressed):
 
 
 def test_without_a_display_it_runs_headless_by_itself_and_says_so(pressed):
-    assert "No display" in (pressed / "said.txt").read_text()
+    assert "No display (DISPLAY is not set): running" in (pressed / "said.txt").read_text()
     assert len(list((pressed / "frames").glob("*.png"))) == len(list((pressed / "slices").glob("*.png")))
+
+
+def test_a_display_that_does_not_answer_is_named(monkeypatch, capsys):
+    monkeypatch.setattr("studies.rehearse.command.display_available", lambda: False)
+    monkeypatch.setenv("DISPLAY", ":4242")
+    assert not found_display()
+    assert "No display (DISPLAY is :4242, which does not answer): running" in capsys.readouterr().out
 
 
 def test_without_vulkan_it_says_so_in_one_line_and_still_writes_slices_and_report(tmp_path):

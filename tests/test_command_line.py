@@ -1,14 +1,16 @@
 """What commands share."""
 
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import click.testing
 import pytest
 
+from scenes.pasted import pasted
 from scenes.patient_folder import check_folder
 from scenes.reading.error import PatientError
 from scenes.scene import EMBEDDED
 from studies.command_line import Fault, load_patient, make_folder, save_figures
+from studies.plan.command import following
 
 
 def test_a_folder_stands_for_its_scene(tmp_path):
@@ -27,6 +29,23 @@ def test_a_folder_is_tried_before_the_work(tmp_path, bytes_to_a_file):
             check_folder(tmp_path / "out" / "a")
     check_folder(tmp_path / "out" / "a")
     assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("system", "quoted"), [("linux", """'Fritz "$HOME"/a b'"""), ("win32", r'"Fritz \"$HOME\"/a b"')]
+)
+def test_a_command_to_be_pasted_is_quoted_as_its_shell_needs_it(monkeypatch, system, quoted):
+    monkeypatch.setattr("scenes.pasted.sys.platform", system)
+    path = PurePosixPath('Fritz "$HOME"/a b')
+    assert pasted("rehearse", path, "--at", "3") == f"python app.py rehearse {quoted} --at 3"
+
+
+@pytest.mark.parametrize(
+    ("scene", "probe", "words"),
+    [(EMBEDDED, None, []), (Path("a b"), "linear", ["a b", "--probe", "linear"])],
+)
+def test_what_follows_a_plan_names_its_scene_and_probe(scene, probe, words):
+    assert following(scene, Path("plan.json"), probe) == pasted("rehearse", *words, "--plan", "plan.json")
 
 
 def test_figures_that_cannot_be_written_say_so(tmp_path, capsys):

@@ -12,6 +12,7 @@ from app import main
 from scenes.anatomy import load_anatomy
 from scenes.command import place_mm
 from scenes.intake import Request, take_in, with_labels
+from scenes.pasted import pasted
 from scenes.patient_folder import save_patient, telling
 from scenes.reading.ct import open_ct
 from scenes.reading.error import PatientError
@@ -109,8 +110,10 @@ def test_nothing_names_the_patient(written, hospital):
 
 
 def test_the_terminal_names_nobody_and_tells_the_facts(hospital, tmp_path, capfd):
-    assert main(["import", str(hospital[0]), "--side", "right", "--out", str(tmp_path / "b")]) == 0
+    out = tmp_path / "a b"
+    assert main(["import", str(hospital[0]), "--side", "right", "--out", str(out)]) == 0
     said = capfd.readouterr()
+    assert said.out.endswith(f"then: {pasted('rehearse', out)}\n")
     assert "right kidney" in said.out and "none is in the files" in said.out
     for text in ("Doe", "Jane", "4711", "19600229", hospital[1].uid):
         assert text not in said.out + said.err

@@ -14,6 +14,7 @@ import app
 from render.keys import USUAL_KEYS, Keys
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
+from scenes.pasted import pasted
 from scenes.scene import EMBEDDED
 from studies.rehearse import command, headless, loop, run
 from studies.rehearse.loop import Loop
@@ -231,6 +232,18 @@ def test_the_export_key_saves_the_tissue_beside_its_picture_and_says_what_it_can
     assert looping.frame(Controls(settings)).status == f"Saved 005   {missing[1]}"
 
 
+@pytest.mark.parametrize("earlier", [True, False])
+def test_pictures_of_an_earlier_run_are_not_replaced_without_a_word(monkeypatch, tmp_path, capsys, earlier):
+    monkeypatch.setattr(headless, "open_viewer", lambda *_, **__: None)
+    picture = tmp_path / "slices" / "00004.png"
+    picture.parent.mkdir()
+    if earlier:
+        picture.touch()
+    headless.Pictures(Moments(), 3, tmp_path)
+    said = f"Replacing the pictures of an earlier run in {tmp_path}.\n" if earlier else ""
+    assert capsys.readouterr().out == said and not picture.exists()
+
+
 def test_without_a_window_pictures_go_to_the_link_and_the_tissue_into_the_folder(monkeypatch, tmp_path, sent):
     def no_viewer(rehearsal, visible):
         raise NoVulkan("no Vulkan")
@@ -284,13 +297,13 @@ def test_ctrl_c_in_a_run_says_so_before_how_it_went(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    ("scene", "line"),
+    ("scene", "words"),
     [
-        (None, "--replay a/session-001.jsonl"),
-        (PurePosixPath("my patients/a"), '"my patients/a" --replay a/session-001.jsonl'),
+        (None, ["--replay", "a/session-001.jsonl"]),
+        (PurePosixPath("my patients/a"), ["my patients/a", "--replay", "a/session-001.jsonl"]),
     ],
 )
-def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scene, line):
+def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scene, words):
     monkeypatch.setattr(
         run, "Instruments", lambda rehearsal, guide: SimpleNamespace(guide=None, summary=lambda bookmarks: {})
     )
@@ -299,7 +312,7 @@ def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scen
     recording = SimpleNamespace(path=PurePosixPath("a/session-001.jsonl"), fault="")
     each.recorded = SimpleNamespace(recording=recording, close=lambda summary: None)
     each._end(0)
-    assert capsys.readouterr().out.endswith(f"replay it with: python app.py rehearse {line}\n")
+    assert capsys.readouterr().out.endswith(f"replay it with: {pasted('rehearse', *words)}\n")
 
 
 def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path, sent):

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import shutil
 from contextlib import redirect_stderr
 from pathlib import Path
@@ -291,6 +292,8 @@ def test_reconstruct_makes_a_volume_and_compares_it(swept, tmp_path, capsys):
     assert (
         "14 of 14 with a pose, 1.50 mm apart" in told and f"Dice {tumour['scanned_part']['dice']:.3f}" in told
     )
+    assert f"organ     {100 * organ['scanned']:.0f} % scanned; of that small part alone Dice" in told
+    assert f"tumour    {100 * tumour['scanned']:.0f} % scanned; of that Dice" in told
     volume, labels = (sitk.ReadImage(str(tmp_path / "out" / f"{name}.nrrd")) for name in ("volume", "labels"))
     assert list(volume.GetSize()) == report["shape"] == list(labels.GetSize())
     middle = load_surface(phantom_folder() / "tumour.stl").center_mass
@@ -299,10 +302,24 @@ def test_reconstruct_makes_a_volume_and_compares_it(swept, tmp_path, capsys):
     assert (tmp_path / "out" / "volume.png").stat().st_size > 10_000
 
 
+@pytest.mark.parametrize("away_mm", [-50, 4000])
+def test_reconstruct_compares_no_sweep_with_an_organ_that_it_does_not_show(swept, tmp_path, capsys, away_mm):
+    organ = load_surface(phantom_folder() / "organ.stl").apply_translation([0, 0, away_mm])
+    organ.export(tmp_path / "organ.stl")
+    (tmp_path / "scene.toml").write_text('[anatomy]\norgan = "organ.stl"\n')
+    command = ["reconstruct", swept, "--scene", tmp_path, "--spacing-mm", "2", "--out", tmp_path]
+    assert app.main([str(part) for part in command]) == 0
+    report, told = json.loads((tmp_path / "report.json").read_text()), capsys.readouterr().out
+    assert report["agreement"] == {} and "Dice" not in told
+    assert re.search(
+        r"the sweep is not of this organ, or of another patient; it shows 0\.[0-9] % of it", told
+    )
+
+
 def test_reconstruct_refuses_in_one_line(swept, tmp_path, monkeypatch):
     out = ("--out", tmp_path / "out")
     assert "none.igs.mha: No such file" in refused("reconstruct", tmp_path / "none.igs.mha", *out)
-    assert "expected" in refused("reconstruct", Path(__file__), *out)
+    assert "expected a tracked one" in refused("reconstruct", Path(__file__), *out)
     assert "name it with --scene" in refused("reconstruct", swept, *out, "--undo-compression")
     there = refused("reconstruct", swept, *out, "--reference", "Tracker")
     assert "no chain of transforms from Image to Tracker" in there and "ProbeToReference" in there

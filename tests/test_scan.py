@@ -58,7 +58,7 @@ def test_poses_of_both_formats_are_the_same(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("{", "not valid JSON"),
+        ("{", "; expected poses as JSON or CSV"),
         (" ", "is empty"),
         ("[]", "holds no poses"),
         ('[{"probe_to_patient": [[1, 0, 0, 0]]}]', "pose 1, probe_to_patient"),
@@ -75,7 +75,12 @@ def test_poses_that_cannot_be_used_are_refused_in_one_line(tmp_path, text, words
 
 def test_a_table_with_another_number_of_columns_is_refused(tmp_path):
     assert "pose 1: 3 numbers" in refused(tmp_path, "1,2,3", "poses.csv")
-    assert "expected sixteen" in refused(tmp_path, "a,b", "poses.csv")
+    assert "'a' is no number; expected sixteen" in refused(tmp_path, "a,b", "poses.csv")
+    (tmp_path / "a.png").write_bytes(b"\x89PNG")
+    with pytest.raises(PoseError, match="is no text; expected poses as JSON or CSV"):
+        load_poses(tmp_path / "a.png")
+    with pytest.raises(PoseError, match="cannot be read as poses"):
+        load_poses(tmp_path)
     with pytest.raises(PoseError, match="no such file"):
         load_poses(tmp_path / "none.json")
 
@@ -130,11 +135,13 @@ def test_a_pixel_is_where_its_matrix_says():
 
 
 def test_scan_leaves_a_picture_of_each_pose_and_mode(tmp_path, capsys):
-    away = pose_on_tumour()
+    away, beyond = pose_on_tumour(), pose_on_tumour()
     away[:3, 3] -= 30 * away[:3, 1]
+    beyond[:3, 3] -= 50 * beyond[:3, 1]
     poses = [
         dict(name="on", probe_to_patient=pose_on_tumour().tolist()),
         dict(name="off", probe_to_patient=away.tolist()),
+        dict(name="past", probe_to_patient=beyond.tolist()),
     ]
     (tmp_path / "poses.json").write_text(json.dumps(poses))
     out = tmp_path / "out"
@@ -156,7 +163,10 @@ def test_scan_leaves_a_picture_of_each_pose_and_mode(tmp_path, capsys):
         "on-ct.png",
         "off-b-mode.png",
         "off-ct.png",
+        "past-b-mode.png",
+        "past-ct.png",
     ]
+    assert "1 of 3 poses show nothing of the organ; they may be of another" in capsys.readouterr().out
     assert report["probe"]["FrequencyMhz"] == 9.0 and report["version"] == VERSION
     shown = {path.stem: np.asarray(Image.open(path)).astype(int) for path in out.glob("*.png")}
     row = report["pictures"][0]

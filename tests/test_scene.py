@@ -79,7 +79,7 @@ def refused(tmp_path: Path, text: str) -> str:
         ("[anatomy]\n[attachment]\nradius_mm = 5", "a.toml: attachment.radius_mm needs a place"),
         ("[anatomy]\n[[shape]]\nkind = 'ball'", "'plane', 'mesh', 'sdf'"),
         ("[anatomy]\n[organs]\n", "organs: unknown key"),
-        ("[anatomy\n", "not valid TOML"),
+        ("[anatomy\n", "; expected a scene file (TOML) or a patient's folder"),
         ("[anatomy]\nphantom = true\nct = 'ct.nrrd'", "which has files of its own"),
         ("[anatomy]\n[press]\nindentations_mm = [300.0]", "less than or equal to 40"),
     ],

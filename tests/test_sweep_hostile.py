@@ -26,7 +26,7 @@ HOSTILE = {
     "compressed somehow": (dict(CompressedData="Perhaps"), "CompressedData = 'Perhaps'"),
     "another file": (dict(ElementDataFile="other.raw"), "ElementDataFile = 'other.raw': expected LOCAL"),
     "no end": (dict(ElementDataFile=None, pixels=b""), "no ElementDataFile = LOCAL"),
-    "no sweep": (dict(ObjectType="Mesh"), "expected ObjectType = Image"),
+    "no sweep": (dict(ObjectType="Mesh"), "expected a tracked one .*begins with ObjectType = Image"),
     "no size": (dict(DimSize=None), "DimSize = ''"),
     "size of two": (dict(DimSize="4 3"), "DimSize = '4 3'"),
     "size of words": (dict(DimSize="4 3 one"), "DimSize = '4 3 one'"),

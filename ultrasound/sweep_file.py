@@ -241,10 +241,13 @@ def _read_header(file: BinaryIO) -> tuple[dict[str, str], dict[int, dict[str, st
     """The header's own fields, and each frame's by its number; the file then stands at the pixels."""
     fields: dict[str, str] = {}
     frames: dict[int, dict[str, str]] = {}
+    if b"".join(file.readline(HEADER_LIMIT).split()) != b"ObjectType=Image":
+        raise SweepError(
+            "is no sweep; expected a tracked one (.igs.mha), which begins with ObjectType = Image"
+        )
+    file.seek(0)
     while True:
         name, text = _read_line(file)
-        if not fields and (name, text.strip()) != ("ObjectType", "Image"):
-            raise SweepError(f"starts with {reprlib.repr(name)}: expected ObjectType = Image")
         if name == "ElementDataFile":
             if text.strip() != "LOCAL":
                 raise SweepError(f"ElementDataFile = {reprlib.repr(text)}: expected LOCAL")

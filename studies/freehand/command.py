@@ -24,6 +24,8 @@ from ultrasound.tracking import TrackingErrors
 from version import VERSION
 
 MOST_REACH_MM = 5.0
+# Of less of the organ its figures say nothing, and of less than the second they are easily taken for the whole organ's.
+LEAST_SCANNED, LITTLE_SCANNED = 0.01, 0.3
 
 
 @click.command()
@@ -200,13 +202,27 @@ def _of_track(pictures: Sweep, track: Track) -> dict[str, Any]:
 def _agreement(rebuilt: Rebuilt, patient: tuple[Scene, LoadedAnatomy] | None) -> dict[str, Any]:
     if patient is None or not rebuilt.regions:
         return {}
-    from studies.freehand.compare import compared, surfaces_of
+    from studies.freehand.compare import are_apart, compared, surfaces_of
 
+    surfaces = surfaces_of(patient[1])
     try:
-        return compared(rebuilt, surfaces_of(patient[1]))
+        # A box around both could be larger than the memory.
+        found = {} if are_apart(rebuilt.box, surfaces["organ"]) else compared(rebuilt, surfaces)
     except ValueError as error:
         click.echo(f"Not compared with the whole organ: {error}")
         return {}
+    scanned = found["organ"]["scanned"] if "organ" in found else 0.0
+    if scanned < LEAST_SCANNED:
+        click.echo(
+            f"Not compared: the sweep is not of this organ, or of another patient; it shows {100 * scanned:.1f} % of it. Name its own "
+            "scene with --scene."
+        )
+        return {}
+    return found
+
+
+def _of_that(scanned: float) -> str:
+    return "of that" if scanned >= LITTLE_SCANNED else "of that small part alone"
 
 
 def in_words(report: dict[str, Any]) -> str:
@@ -224,9 +240,9 @@ def in_words(report: dict[str, Any]) -> str:
             + (
                 ""
                 if not part
-                else "; of that nothing found"
+                else f"; {_of_that(figures['scanned'])} nothing found"
                 if part["centroid_mm"] is None
-                else f"; of that Dice {part['dice']:.3f}, HD95 {part['hd95_mm']:.2f} mm, volume {part['volume_percent']:+.1f} %, "
+                else f"; {_of_that(figures['scanned'])} Dice {part['dice']:.3f}, HD95 {part['hd95_mm']:.2f} mm, volume {part['volume_percent']:+.1f} %, "
                 f"centroid {part['centroid_mm']:.2f} mm off"
             )
         )

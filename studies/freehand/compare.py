@@ -34,6 +34,13 @@ def inside(surface: trimesh.Trimesh, box: VoxelBox) -> np.ndarray:
     return mask
 
 
+def are_apart(box: VoxelBox, surface: trimesh.Trimesh) -> bool:
+    """Whether none of a surface [mm] can lie in a box."""
+    last = box.origin_mm + box.spacing_mm * (np.array(box.shape) - 1)
+    low, high = surface.bounds
+    return bool((low > last).any() or (high < box.origin_mm).any())
+
+
 def wider(rebuilt: Rebuilt, surface: trimesh.Trimesh) -> Rebuilt:
     """The same on a box that holds a surface too, so that what was not scanned counts."""
     box, spacing = rebuilt.box, rebuilt.box.spacing_mm

@@ -7,6 +7,7 @@ from pydantic import ValidationError
 from tqdm import tqdm
 
 from scenes.anatomy import load_anatomy
+from scenes.pasted import pasted
 from scenes.scene import EMBEDDED, load_scene, scene_file, with_options
 from scenes.trocar import Trocar
 from studies.command_line import Fault, Number, NumberRange, WholeRange, make_folder, quality_option
@@ -99,8 +100,15 @@ def plan(
     write_plan(made, out)
     click.echo("\n".join(made.why))
     click.echo(
-        f"Wrote {len(made.sweeps)} sweeps to {out}; follow the first with: app.py rehearse SCENE --plan {out}"
+        f"Wrote {len(made.sweeps)} sweeps to {out}; follow the first with: {following(scene, out, probe)}"
     )
+
+
+def following(scene: Path, plan_file: Path, probe: str | None) -> str:
+    """The command line that follows a plan; it needs the probe that was planned for."""
+    named = [] if scene == EMBEDDED else [scene]
+    held = [] if probe is None else ["--probe", probe]
+    return pasted("rehearse", *named, *held, "--plan", plan_file)
 
 
 def trocar_of(

@@ -115,6 +115,8 @@ def read_plan(path: Path) -> Plan:
         raise PlanError(f"{path}: cannot be read as a plan ({error.strerror})") from None
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
+        if first["type"] == "json_invalid":
+            raise PlanError(f"{path}: not a plan; expected a file that app.py plan wrote") from None
         where = ".".join(map(str, first["loc"]))
         raise PlanError(
             f"{path}: not a plan{f', {where}' if where else ''}: {first['msg'].lower()}; expected a file that app.py plan wrote"

@@ -76,7 +76,10 @@ def session_of(
     for option, value in (choosers | {option: changed[key] for key, option in OPTIONS.items()}).items():
         if value is not None:
             raise Fault(f"{option}: a replay computes what was recorded; leave it out")
-    return read_log(replay)
+    log = read_log(replay)
+    if at_s > log.length_s:
+        raise Fault(f"--at {at_s:g}: the session is {log.length_s:.1f} s long; open it at an earlier second")
+    return log
 
 
 def as_recorded(log: Log, scene: Scene) -> tuple[Scene, Probe]:

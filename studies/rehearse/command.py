@@ -1,5 +1,6 @@
 """The command ``rehearse``: press a kidney, in a window or without one."""
 
+import os
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -54,7 +55,8 @@ if TYPE_CHECKING:
 @click.option(
     "--seconds",
     type=NumberRange(0.02, 3600),
-    help="Simulated seconds without a window [the scene's press].",
+    help="Simulated seconds without a window [the scene's press]; the scripted press is as fast or slow as fills them, a replay or a "
+    "track is cut off.",
 )
 @click.option(
     "--replay",
@@ -86,7 +88,7 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path),
     default=Path("out"),
     show_default=True,
-    help="Folder for pictures and the report.",
+    help="Folder for pictures and the report; a run without a window replaces those of the run before.",
 )
 @arch_option
 @click.option("--model", type=click.Choice(list(TISSUES)), help="Tissue model [the scene's].")
@@ -207,7 +209,9 @@ def found_display() -> bool:
     """Whether there is a screen for a window; says so where there is none."""
     found = display_available()
     if not found:
-        click.echo("No display: running the scripted press without a window.")
+        display = os.environ.get("DISPLAY")
+        why = f"DISPLAY is {display}, which does not answer" if display else "DISPLAY is not set"
+        click.echo(f"No display ({why}): running the scripted press without a window.")
     return found
 
 

@@ -37,7 +37,10 @@ class Pictures:
             click.echo(f"{reason}; writing the pictures and the report without 3D frames.")
         self._every = max(1, round(1 / (PICTURES_A_SECOND * rehearsal.settings.time_step_s)))
         self._shown_every = self._every * (1 + steps // self._every // MOST_SHOWN)
-        self._frames, self._slices = empty_folder(out / "frames"), empty_folder(out / "slices")
+        folders = out / "frames", out / "slices"
+        if any(next(folder.glob("*.png"), None) for folder in folders):
+            click.echo(f"Replacing the pictures of an earlier run in {out}.")
+        self._frames, self._slices = map(empty_folder, folders)
         self._animation: list[Image.Image] = []
 
     def draw(self, step: int, view: View, settings: Settings, instruments: Instruments) -> None:

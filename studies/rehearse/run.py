@@ -16,6 +16,7 @@ from render.keys import Keys
 from render.viewer import Settings
 from render.window import NoVulkan
 from scenes.anatomy import LoadedAnatomy
+from scenes.pasted import pasted
 from studies.command_line import STOPPED, Fault
 from studies.link.server import Server
 from studies.plan.file import Plan
@@ -178,8 +179,7 @@ class Run:
     def _replaying(self, session: Path) -> str:
         """The command line that replays a session, to be pasted."""
         scene = [] if self.scene is None else [self.scene]
-        quoted = [f'"{path}"' if " " in str(path) else str(path) for path in (*scene, "--replay", session)]
-        return f"python app.py rehearse {' '.join(quoted)}"
+        return pasted("rehearse", *scene, "--replay", session)
 
 
 def _verdict(replay: Replay | None) -> str:

@@ -91,15 +91,17 @@ def scan(
     scanned = scanned_anatomy(anatomy.organ, anatomy.ct, anatomy, np.zeros(3))
     scanner = Scanner(scanned, Unmoved(), held, image.pixels, "background", contact, image.contact_gap_mm)
     swept = MarkedSweep(out, "sweep", held) if sweep else None
-    rows, ms = [], []
+    rows, ms, empty = [], [], 0
     for name, pose in tqdm(placed.items(), desc="scan", unit="pose"):
         began = perf_counter()
         plane = ImagePlane(pose, *held.extent_mm)
         shown = scanner.look(plane, held, image.mode, image.rung, image.window_hu, image.level_hu)
         ms.append(1000 * (perf_counter() - began))
+        marks = scanner.marks.render()
+        empty += not marks.any()
         if swept is not None:
             grey = next(iter(shown.values()))
-            swept.add(grey, scanner.marks.render(), held, pose, swept.count / FRAMES_A_SECOND)
+            swept.add(grey, marks, held, pose, swept.count / FRAMES_A_SECOND)
         saved = save_pictures(shown, *held.extent_mm[:2], held, out / name, dicom)
         rows += [dict(pose=name, probe_to_patient=pose.tolist()) | _row(each, held) for each in saved]
     if swept is not None:
@@ -114,6 +116,10 @@ def scan(
         pictures=rows,
     )
     write_json(report, out / "scan.json")
+    if empty:
+        click.echo(
+            f"Mind: {empty} of {len(placed)} poses show nothing of the organ; they may be of another patient."
+        )
     click.echo(
         f"Wrote {len(rows)} pictures of {len(placed)} poses and scan.json to {out}; {np.median(ms):.1f} ms a pose (median)."
     )

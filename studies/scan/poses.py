@@ -11,6 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 # How far the axes of a pose may be from orthonormal: what six digits in a file leave.
 RIGID = 1e-3
 
+EXPECTED = "expected poses as JSON or CSV"
+
 
 class PoseError(ValueError):
     """Poses that cannot be used; the message is one line."""
@@ -89,8 +91,10 @@ def _read(path: Path) -> list[_Placed]:
         text = path.read_text("utf-8")
     except FileNotFoundError:
         raise PoseError(f"{path}: no such file of poses") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise PoseError(f"{path}: cannot be read as poses ({str(error).splitlines()[0]})") from None
+    except UnicodeDecodeError:
+        raise PoseError(f"{path}: is no text; {EXPECTED}") from None
+    except OSError as error:
+        raise PoseError(f"{path}: cannot be read as poses ({error.strerror})") from None
     found = _of_csv(path, text) if path.suffix.lower() == ".csv" else _of_json(path, text)
     for number, placed in enumerate(found, 1):
         check_rigid(f"{path}: pose {number}", placed.pose)
@@ -105,7 +109,7 @@ def _of_json(path: Path, text: str) -> list[_Placed]:
             raise PoseError(f"{path}: is empty; expected a list of poses")
         poses = TypeAdapter(list[_Pose]).validate_python(json.loads(text))
     except json.JSONDecodeError as error:
-        raise PoseError(f"{path}: not valid JSON: {error}") from None
+        raise PoseError(f"{path}: not valid JSON: {error}; {EXPECTED}") from None
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = (
@@ -121,14 +125,15 @@ def _of_json(path: Path, text: str) -> list[_Placed]:
 
 def _of_csv(path: Path, text: str) -> list[_Placed]:
     rows = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    expected = "expected sixteen, row by row, or before them the time in s"
+    sixteen = "sixteen, row by row, or before them the time in s"
     try:
         numbers = [[float(value) for value in line.replace(";", ",").split(",")] for line in rows]
     except ValueError as error:
-        raise PoseError(f"{path}: {error}; {expected}") from None
+        found = str(error).partition(": ")[2]
+        raise PoseError(f"{path}: {found} is no number; expected {sixteen}") from None
     for number, row in enumerate(numbers, 1):
         if len(row) not in (16, 17) or len(row) != len(numbers[0]):
-            raise PoseError(f"{path}: pose {number}: {len(row)} numbers; {expected}, as in each line")
+            raise PoseError(f"{path}: pose {number}: {len(row)} numbers; expected {sixteen}, as in each line")
         if not np.isfinite(row[0]):
             raise PoseError(f"{path}: pose {number}: begins with {row[0]}; expected a finite number")
     return [

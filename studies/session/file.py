@@ -251,7 +251,7 @@ def _header(name: str, line: bytes) -> Header:
         if isinstance(error, SessionError):
             raise
         raise SessionError(
-            f"{name}: its first line is no session's; expected a file that rehearse has written"
+            f"{name}: its first line is no session's; expected a file that rehearse has written, such as session-001.jsonl"
         ) from None
 
 
