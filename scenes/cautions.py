@@ -81,7 +81,7 @@ def as_stone(
 ) -> tuple[str, ...]:
     """A line where the echo will show stones in parenchyma (z, y, x): a kidney that excretes contrast agent is as bright there.
 
-    What is labelled as urine, with its rim, the echo takes for none.
+    What is labelled as urine, with its rim, is left out: of an enhanced kidney the echo takes it for none.
     """
     if not parenchyma.any():
         return ()
