@@ -9,15 +9,15 @@ from importlib import import_module
 try:
     import click
 
+    from rehearsal.configuration import SetupError
+    from rehearsal.planning.plan_file import PlanError
+    from rehearsal.sessions.session_file import SessionError
+    from rehearsal.tracking.pose_file import PoseError
     from render.keys import KeysError
-    from scenes.reading.error import PatientError
+    from scenes.patients.import_error import PatientError
     from scenes.scene import SceneError
     from sim.sampling import SamplingError
-    from studies.case import CaseError
-    from studies.plan.file import PlanError
-    from studies.scan.poses import PoseError
-    from studies.session.file import SessionError
-    from studies.setup import SetupError
+    from studies.accuracy.bead_case import CaseError
     from ultrasound.acoustics import TissueError
     from ultrasound.probe import ProbeError
     from ultrasound.sweep import SweepError
@@ -34,18 +34,18 @@ from version import VERSION
 
 # Where each command is; only the one that is called is imported, for the others' libraries take seconds to load.
 COMMANDS = {
-    "rehearse": "studies.rehearse.command:rehearse",
-    "keys": "studies.rehearse.command:keys_command",
-    "import": "scenes.command:import_patient_command",
-    "plan": "studies.plan.command:plan",
-    "export": "studies.export.command:export",
-    "scan": "studies.scan.command:scan",
-    "reconstruct": "studies.freehand.command:reconstruct",
-    "validate": "studies.commands:validate",
-    "calibrate": "studies.commands:calibrate",
-    "beam": "studies.beam.command:beam",
-    "reference": "studies.reference.command:reference",
-    "study": "studies.study:study",
+    "rehearse": "rehearsal.commands.rehearse_command:rehearse",
+    "keys": "rehearsal.commands.rehearse_command:keys_command",
+    "import": "scenes.patients.import_command:import_patient_command",
+    "plan": "rehearsal.commands.plan_command:plan",
+    "export": "rehearsal.commands.export_command:export",
+    "scan": "rehearsal.commands.scan_command:scan",
+    "reconstruct": "rehearsal.commands.reconstruct_command:reconstruct",
+    "validate": "studies.accuracy.accuracy_commands:validate",
+    "calibrate": "studies.accuracy.accuracy_commands:calibrate",
+    "beam": "studies.beam.beam_command:beam",
+    "reference": "studies.reference.reference_command:reference",
+    "study": "studies.study_command:study",
 }
 # What is wrong with a file or a value, said in one line.
 MENDED_BY_USER = (

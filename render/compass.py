@@ -3,9 +3,9 @@
 import numpy as np
 from PIL import Image, ImageDraw
 
-from render.layout import Layout
-from render.panel import FINDINGS, LINE, QUIET, TEXT
 from render.text import font
+from render.ultrasound_panel import FINDINGS, LINE, QUIET, TEXT
+from render.window_layout import Layout
 
 # Patient coordinates are LPS: towards the patient's left, back and head; and the other way.
 LETTERS = (("R", "L"), ("A", "P"), ("I", "S"))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from render.surface import Surface
+from render.surface_shading import Surface
 from sim.fields import array_of, fields_of, fill
 
 CELLS = 160

@@ -5,7 +5,7 @@ import os
 import sys
 from functools import cache
 
-from render.layout import FULL_SIZE
+from render.window_layout import FULL_SIZE
 
 # So much of a small screen's height a window takes, as its title and a task bar leave; its width is a multiple of STEP.
 SHARE, STEP = 0.88, 64

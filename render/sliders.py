@@ -2,8 +2,8 @@
 
 import dataclasses
 
-from render.layout import Layout, Rect
 from render.viewer import ASIDE, Geometry, Settings
+from render.window_layout import Layout, Rect
 
 # Dear ImGui's glyphs are 7 pixels wide, its rows are 23 pixels high. Its labels get 35 % of a box, a switch's all of it, but for so many
 # pixels around them.

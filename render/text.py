@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from render.layout import Rect
+from render.window_layout import Rect
 
 LEAST_FONT_PX = 8
 # What is between the parts of a line; of a long one the last part goes first.

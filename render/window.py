@@ -18,15 +18,15 @@ import taichi as ti
 from taichi.ui.utils import get_field_info
 
 from render.actions import begin, hold
+from render.background_image import Page
 from render.camera import FIELD_OF_VIEW_DEG, OrbitCamera
 from render.display import display_available
 from render.gamepad import Gamepad
 from render.keys import Keys
-from render.layout import FULL_SIZE, Layout, Rect
-from render.page import Page
+from render.scene_view import Stage
 from render.sliders import boxes_of, draw_sliders
-from render.stage import Stage
 from render.viewer import Controls, Geometry, Settings, View
+from render.window_layout import FULL_SIZE, Layout, Rect
 
 ZOOM_S = 0.5
 FRAMES_A_SECOND = 60

@@ -11,17 +11,17 @@ import numpy as np
 import SimpleITK as sitk
 import trimesh
 
-from scenes.hilum import hilum
-from scenes.organ import GROWN, PARENCHYMA
-from scenes.parts import PARTS
-from scenes.patient import Patient, import_patient, tissue_codes
-from scenes.patient_folder import save_patient
-from scenes.phantom import Label, make_phantom
-from scenes.reading.error import PatientError
-from scenes.reading.files import file_volume
-from scenes.reading.labels import LabelMap
-from scenes.reading.progress import Told, untold
-from scenes.reading.volume import Volume
+from scenes.patients.hilum import hilum
+from scenes.patients.import_error import PatientError
+from scenes.patients.organ_selection import GROWN, PARENCHYMA
+from scenes.patients.part_surfaces import PARTS
+from scenes.patients.patient_folder import save_patient
+from scenes.patients.patient_import import Patient, import_patient, tissue_codes
+from scenes.patients.readers.label_maps import LabelMap
+from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.volume_readers import file_volume
+from scenes.phantom.kidney import Label, make_phantom
+from scenes.progress import Told, untold
 from scenes.scene import (
     AnatomyFiles,
     Attachment,

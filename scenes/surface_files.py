@@ -7,8 +7,8 @@ import trimesh
 from trimesh.exchange.ply import export_ply
 from trimesh.exchange.stl import export_stl
 
-from scenes.reading.error import PatientError
-from scenes.whole_files import whole
+from scenes.atomic_files import whole
+from scenes.patients.import_error import PatientError
 
 # What 3D Slicer looks for in an STL's header and in a PLY's comments.
 SPACE = b"SPACE=LPS"

@@ -16,7 +16,7 @@ USUAL = "neo-hookean"
 class TissueSection(Section):
     """What a model is told: a section of a scene file. Each subclass is a model that a scene can name.
 
-    ``BUILT_BY`` is its ``sim.tissue.TissueModel``, imported when it is built. ``SIZE`` is the key that says how fine it is,
+    ``BUILT_BY`` is its ``sim.tissue_model.TissueModel``, imported when it is built. ``SIZE`` is the key that says how fine it is,
     ``PIECES`` what that is the size of, among its counts. ``REPORTED`` is its line of a report, with names of keys and counts.
     ``STEP`` is its own choice of a step, by names of the solver's section, where it is not the paper's; ``PRESETS`` are what each
     quality changes of keys and step, from coarse to fine. ``CAN_TOUCH_ITSELF``: it takes contacts of particles;

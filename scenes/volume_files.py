@@ -5,7 +5,7 @@ from pathlib import Path
 
 import SimpleITK as sitk
 
-from scenes.whole_files import whole
+from scenes.atomic_files import whole
 
 
 def save_image(image: sitk.Image, path: Path) -> None:

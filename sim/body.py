@@ -6,8 +6,8 @@ import numpy as np
 import taichi as ti
 import trimesh
 
-from sim.distance import signed_distance
 from sim.fields import array_of, field_of, fill
+from sim.mesh_distance import signed_distance
 from sim.sampling import sample_particles
 
 

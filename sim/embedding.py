@@ -12,10 +12,10 @@ import taichi.math as tm
 import trimesh
 
 from sim.device import is_too_small
-from sim.distance import signed_distance
 from sim.fields import field_of
+from sim.mesh_distance import signed_distance
 from sim.skinning import Skin
-from sim.tissue import TissueModel
+from sim.tissue_model import TissueModel
 
 # Barycentric slack that closes the seams between tetrahedra against rounding.
 SEAM = 1e-5

@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from sim.distance import signed_distance
+from sim.mesh_distance import signed_distance
 from sim.sampling import SamplingError, check_memory
 
 # Corners of a cell, x slowest.

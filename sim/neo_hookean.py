@@ -18,10 +18,10 @@ from sim.device import is_too_small
 from sim.fields import field_of, fields_of
 from sim.four_wide import cross, four, row
 from sim.lattice import Lattice, fill_with_cells, surface_points
-from sim.rigid_motion import RigidMotion
+from sim.rigid_correction import RigidMotion
 from sim.solver import StepSettings
 from sim.surface_contact import LAYER_MM, REACH_MM, SurfaceContacts
-from sim.tissue import Parts
+from sim.tissue_model import Parts
 
 # Stiffness, in units of the shear modulus, of deformation that varies inside a cell: between 1, exact for torsion,
 # and (1 + nu), exact for bending.

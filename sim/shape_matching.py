@@ -13,14 +13,14 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from sim.body import ParticleBody, RestBody, fill_body
-from sim.contact import REACH_RADII, ShapeContacts
 from sim.device import is_too_small
 from sim.fields import field_of, fields_of
 from sim.four_wide import four, row
-from sim.patches import Patches, arrange
+from sim.particle_contact import REACH_RADII, ShapeContacts
+from sim.particle_patches import Patches, arrange
 from sim.rotation import rotation_near
 from sim.sampling import Clusters
-from sim.tissue import Parts
+from sim.tissue_model import Parts
 
 RELAXATIONS = ("local", "global")
 # Points are carried by this many clusters at most.

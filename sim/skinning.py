@@ -4,7 +4,7 @@ import numpy as np
 import taichi as ti
 
 from sim.fields import fields_of
-from sim.tissue import TissueModel
+from sim.tissue_model import TissueModel
 
 
 @ti.data_oriented

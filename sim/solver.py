@@ -9,9 +9,9 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import BodyState
-from sim.neighbours import ParticleContacts
+from sim.self_contact import ParticleContacts
 from sim.shapes import MOST_SUBSTEPS, ConvexTool
-from sim.tissue import TissueModel
+from sim.tissue_model import TissueModel
 
 # What a step can be told, least and most; more substeps than that have no room on the device.
 RANGES = {

@@ -26,9 +26,9 @@ from pydicom.uid import (
 )
 from synthetic_body import DIRECTIONS
 
-from scenes.reading.ct import open_ct
-from scenes.reading.error import PatientError
-from scenes.reading.volume import Volume
+from scenes.patients.import_error import PatientError
+from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.lazy_volume import Volume
 
 PERSON = {
     "PatientName": "Doe^Jane",

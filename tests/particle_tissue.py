@@ -1,8 +1,8 @@
 """Shape-matched tissue as tests build it."""
 
 from sim.body import ParticleBody, fill_body
-from sim.contact import ShapeContacts
-from sim.patches import arrange
+from sim.particle_contact import ShapeContacts
+from sim.particle_patches import arrange
 from sim.shape_matching import ShapeMatching
 
 

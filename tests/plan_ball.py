@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import trimesh
 
+from rehearsal.planning.plan_file import Plan, Sweep
+from rehearsal.planning.score_terms import Parts
+from rehearsal.planning.sweep_path import Layout, layout_towards
 from scenes.trocar import Trocar
-from studies.plan.file import Plan, Sweep
-from studies.plan.parts import Parts
-from studies.plan.way import Layout, layout_towards
-from ultrasound.hand import Hand, image_plane, pose_at
 from ultrasound.probe import load_probe
+from ultrasound.probe_manipulator import Hand, image_plane, pose_at
 
 R = 30.0
 SIZE = np.array([16.0, 9.0, 20.0])

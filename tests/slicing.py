@@ -4,7 +4,7 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from ultrasound.slice import Slice
+from ultrasound.ct_slice import Slice
 
 
 def organ_mask(cut: Slice) -> np.ndarray:

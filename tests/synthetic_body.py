@@ -6,7 +6,7 @@ import SimpleITK as sitk
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from scenes.surfaces import self_intersections
+from scenes.patients.label_surfaces import self_intersections
 
 # Organs of the synthetic body: centre and half-axes in LPS [mm]. Left and right differ in size and place, so
 # that a mirrored, swapped or shifted import cannot pass.
@@ -28,8 +28,8 @@ SPACINGS = {"thick": (1.3, 1.1, 4.5), "even": (1.5, 1.5, 1.5)}
 
 def coarsely(patch):
     """While a patch lasts, surfaces and supports are made on coarse grids: they are tested by themselves, and take seconds."""
-    patch.setattr("scenes.surfaces.CELL_MM", (2.0, 2.0))
-    patch.setattr("scenes.support.GRID_MM", 2.0)
+    patch.setattr("scenes.patients.label_surfaces.CELL_MM", (2.0, 2.0))
+    patch.setattr("scenes.patients.moulded_support.GRID_MM", 2.0)
 
 
 def level(points, solid):

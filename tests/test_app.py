@@ -20,9 +20,9 @@ from conftest import ROOT
 from PIL import Image
 
 import app
-from studies.command_line import Fault
-from studies.rehearse.checks import refuse_no_pictures
-from studies.rehearse.command import found_display
+from rehearsal.commands.command_line import Fault
+from rehearsal.commands.option_checks import refuse_no_pictures
+from rehearsal.commands.rehearse_command import found_display
 from version import VERSION
 
 REPORTED = {
@@ -121,7 +121,7 @@ def test_without_a_display_it_runs_headless_by_itself_and_says_so(pressed):
 
 
 def test_a_display_that_does_not_answer_is_named(monkeypatch, capsys):
-    monkeypatch.setattr("studies.rehearse.command.display_available", lambda: False)
+    monkeypatch.setattr("rehearsal.commands.rehearse_command.display_available", lambda: False)
     monkeypatch.setenv("DISPLAY", ":4242")
     assert not found_display()
     assert "No display (DISPLAY is :4242, which does not answer): running" in capsys.readouterr().out
@@ -148,7 +148,7 @@ def test_without_vulkan_it_says_so_in_one_line_and_still_writes_slices_and_repor
 
 
 def test_a_window_without_vulkan_is_refused_before_anything_is_built(monkeypatch, tmp_path):
-    monkeypatch.setattr("studies.rehearse.command.found_display", lambda: True)
+    monkeypatch.setattr("rehearsal.commands.rehearse_command.found_display", lambda: True)
     monkeypatch.setattr("sim.device.is_there", lambda arch: arch != "vulkan")
     assert "install a Vulkan driver" in refused("rehearse", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -170,12 +170,12 @@ def test_ctrl_c_ends_it_in_words(tmp_path, monkeypatch, capsys):
         raise by
 
     for by, words in ((KeyboardInterrupt(), "Stopped."), (click.exceptions.Exit(130), "")):
-        monkeypatch.setattr("studies.rehearse.command.keys_text", partial(ends, by))
+        monkeypatch.setattr("rehearsal.commands.rehearse_command.keys_text", partial(ends, by))
         assert app.main(["keys"]) == 130 and capsys.readouterr().err.strip() == words
 
 
 def test_options_reach_the_solver(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("studies.rehearse.headless.open_viewer", lambda *_, **__: None)
+    monkeypatch.setattr("rehearsal.headless.open_viewer", lambda *_, **__: None)
     steps = "--substeps", "2", "--iterations", "5", "--stiffness", "0.7"
     assert app.main(["rehearse", "--headless", *PAPER, *steps, "--out", str(tmp_path)]) == 0
     report = json.loads((tmp_path / "report.json").read_text())
@@ -253,7 +253,7 @@ def test_what_a_machine_lacks_is_one_line(fault, words, monkeypatch):
     def fails():
         raise fault
 
-    monkeypatch.setattr("studies.rehearse.command.keys_text", fails)
+    monkeypatch.setattr("rehearsal.commands.rehearse_command.keys_text", fails)
     assert words in refused("keys")
 
 
@@ -310,7 +310,7 @@ def test_a_real_kidney_comes_in_and_gives_way(data, tmp_path, monkeypatch, capsy
     assert app.main(["import", *files, "--side", side, "--out", str(patient)]) == 0
     said = capsys.readouterr().out
     assert f"{side} kidney" in said and "crlm" not in (patient / "scene.toml").read_text()
-    monkeypatch.setattr("studies.rehearse.headless.open_viewer", lambda *_, **__: None)
+    monkeypatch.setattr("rehearsal.headless.open_viewer", lambda *_, **__: None)
     assert app.main(["rehearse", str(patient), "--headless", *SHORT, "--out", str(tmp_path / "out")]) == 0
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["finite"] and report["max_penetration_mm"] <= 0.8 and report["volume_ratio_min"] > 0.95

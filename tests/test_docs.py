@@ -15,13 +15,13 @@ import taichi as ti
 from conftest import ROOT
 
 import app
+from rehearsal.adaptive_iterations import Ladder
+from rehearsal.planning.plan_file import Plan, Sweep
+from rehearsal.sessions.session_file import End, Event, Header, Second
+from rehearsal.tracking.pose_file import load_poses, load_timed_poses
 from scenes.scene import Image, Scene
 from scenes.tissue import NeoHookeanTissue, ShapeMatchingTissue
 from scenes.trocar import Trocar
-from studies.plan.file import Plan, Sweep
-from studies.scan.poses import load_poses, load_timed_poses
-from studies.session.file import End, Event, Header, Second
-from studies.trade.ladder import Ladder
 from ultrasound.probe import Probe
 
 DOCS = ROOT / "docs"

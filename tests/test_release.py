@@ -13,7 +13,7 @@ from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 from test_session import header
 
-from studies.rehearse.checks import origin_in_words
+from rehearsal.commands.option_checks import origin_in_words
 from version import PROJECT, VERSION
 
 # What a package says of its licence, of those that a program under Apache-2.0 can use.

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from ultrasound.recognition import recognised
+from ultrasound.tissue_classification import recognised
 
 TISSUES = Path(__file__).parent / "tissues.toml"
 # Amplitude of renal cortex against a perfect reflector: its speckle lies some 16 dB under the echo of fat on kidney.

@@ -11,11 +11,11 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.fields import fill
-from ultrasound.beam import DB, Beams
-from ultrasound.plane import Picture, PlaneInTissue
+from ultrasound.image_plane import Picture, PlaneInTissue
 from ultrasound.point_spread import MOST_LINES, axial_sd_mm, elevation_sd_mm, lateral_weights
 from ultrasound.probe import RUNGS, Probe, Rung
-from ultrasound.volume import Volume
+from ultrasound.sampled_volume import Volume
+from ultrasound.scanline_echo import DB, Beams
 
 # A probe's samples are a multiple of this.
 LANES = 16

@@ -11,11 +11,11 @@ import trimesh
 from sim.embedding import Embedding, Unmoved
 from ultrasound.acoustics import check_tissues, properties
 from ultrasound.bmode import BMode
-from ultrasound.marks import Marks
-from ultrasound.plane import ImagePlane, PlaneInTissue
+from ultrasound.ct_slice import Slice
+from ultrasound.ground_truth_labels import Marks
+from ultrasound.image_plane import ImagePlane, PlaneInTissue
 from ultrasound.probe import Mode, Probe, Rung
-from ultrasound.slice import Slice
-from ultrasound.volume import Volume, distance_volume
+from ultrasound.sampled_volume import Volume, distance_volume
 
 # What is around the organ where the picture shows no CT there [MRayl].
 AROUND = {"background": None, "gel": 1.5, "air": 4e-4}

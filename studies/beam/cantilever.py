@@ -11,7 +11,7 @@ from sim.fields import array_of
 from sim.lattice import fill_block
 from sim.neo_hookean import NeoHookean
 from sim.solver import Solver, StepSettings
-from studies.beam.capture import BeamError
+from studies.beam.motion_capture import BeamError
 
 GRAVITY_MM_S2 = 9810.0
 # A pressure wave goes through so many cells in a time step; with more, passes in the tens leave it unbalanced and

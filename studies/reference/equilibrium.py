@@ -6,8 +6,8 @@ import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
-from studies.reference.contact import Contact
-from studies.reference.solid import Solid
+from studies.reference.fem_solid import Solid
+from studies.reference.penalty_contact import Contact
 
 LEAST_VOLUME_RATIO = 0.05
 SEARCHES, LEAST_REACH = 6, 1e-6

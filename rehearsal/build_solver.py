@@ -1,0 +1,80 @@
+"""A scene's tissue put on the device with its contacts, ready to step, and what touches it there."""
+
+from dataclasses import fields, replace
+from pkgutil import resolve_name
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from scenes.scene import Contact, SolverSection
+from scenes.tissue import TissueSection
+from sim.body import RestBody
+from sim.self_contact import ParticleContacts
+from sim.shapes import ConvexTool, SignedDistanceField
+from sim.solver import Solver, StepSettings
+from sim.tissue_model import Held, Parts, TissueModel
+from ultrasound.probe import Probe
+
+# Flats that stand for the arc of a curved array: of 60 mm and 60 degrees, they are nowhere 0.1 mm off it.
+ARC_FLATS = 11
+
+
+def model_of(tissue: TissueSection) -> type[TissueModel]:
+    """What a tissue is built by."""
+    return resolve_name(tissue.BUILT_BY)
+
+
+def static_shape(mesh: trimesh.Trimesh, tissue: TissueSection) -> SignedDistanceField:
+    """What a closed surface [mm] that does not move is to a tissue: distances as far around as it asks for them."""
+    return SignedDistanceField.of_surface(mesh.vertices, mesh.faces, model_of(tissue).reach_mm(tissue))
+
+
+def tool_of(probe: Probe) -> ConvexTool:
+    """What touches the tissue: the probe's housing, its face an arc of flats where the array is curved."""
+    size = np.array(probe.housing_mm)
+    if probe.radius_mm == 0:
+        return ConvexTool.cuboid(size, probe.edge_radius_mm)
+    angle = np.radians(np.linspace(probe.theta_start_deg, probe.theta_stop_deg, ARC_FLATS))
+    arc = np.column_stack([np.sin(angle), np.zeros(ARC_FLATS), -np.cos(angle)])
+    centre = np.array([0.0, 0.0, probe.radius_mm - size[2] / 2])
+    # All sides of the cuboid but the one that the arc takes the place of.
+    sides = np.concatenate([np.eye(3), -np.eye(3)[:2]])
+    offsets = np.concatenate([size / 2, size[:2] / 2, arc @ centre + probe.radius_mm])
+    return ConvexTool(np.concatenate([sides, arc]), offsets, probe.edge_radius_mm)
+
+
+def embedding_cell_mm(tissue: TissueSection) -> float:
+    """Width of the coarse tetrahedra that carry the image plane."""
+    return model_of(tissue).EMBEDDING_SIZES * tissue.size_mm
+
+
+def step_settings(tissue: TissueSection, section: SolverSection) -> StepSettings:
+    """The scene's settings of a step; what it leaves out is the tissue's own choice, then the paper's."""
+    names = {field.name for field in fields(StepSettings)}
+    own = {name: value for name, value in tissue.model_dump().items() if name in names}
+    given = {name: value for name, value in section.model_dump(exclude_none=True).items() if name in names}
+    return replace(StepSettings(damping=section.damping_per_s), **(own | dict(tissue.STEP) | given))
+
+
+def build_solver(
+    organ: trimesh.Trimesh | RestBody,
+    tissue: TissueSection,
+    shapes: list,
+    tool: ConvexTool | None,
+    contact: Contact | None = None,
+    section: SolverSection | None = None,
+    serial: bool | None = None,
+    held: Held | None = None,
+) -> Solver:
+    """A solver of the organ [mm] among shapes, the tool among them. Raises SamplingError.
+
+    Shape matching also takes an organ that was filled before (``sim.shape_matching.fill``). ``serial`` says whether a step is one
+    kernel on one core; left open, the body's size and the machine decide.
+    """
+    contact, section = contact or Contact(), section or SolverSection()
+    scaling = section.mass_scaling_per_mm
+    parts = Parts(organ, tissue, shapes, contact.shape_friction, held, serial, section.relaxation, scaling)
+    model: Any = model_of(tissue).make(parts)
+    pairs = ParticleContacts(model, contact.particle_friction) if contact.particles else None
+    return Solver(model, pairs, tool)

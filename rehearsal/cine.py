@@ -1,0 +1,93 @@
+"""What a frozen scanner offers: the pictures of the last seconds, and a calliper."""
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from rehearsal.inputs.user_input import STILL_MM
+from render.viewer import View
+
+KEPT_S, KEPT_A_SECOND = 10.0, 30
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A view, when it was there [s], and where its tissue was at rest (rows, columns, 3) [mm]; None without a CT."""
+
+    time_s: float
+    view: View
+    rest: np.ndarray | None
+
+
+@dataclass
+class Cine:
+    """The frames of the last KEPT_S seconds. ``back`` says how many before the newest is looked at."""
+
+    frames: deque[Frame] = field(default_factory=deque)
+    back: int = 0
+
+    def keep(self, frame: Frame) -> None:
+        """Add a frame, now the newest, and let go of those that are too old; of a fast machine's not each is kept."""
+        self.back = 0
+        if self.frames and frame.time_s - self.frames[-1].time_s < 0.99 / KEPT_A_SECOND:
+            return
+        self.frames.append(frame)
+        while frame.time_s - self.frames[0].time_s > KEPT_S:
+            self.frames.popleft()
+
+    def go(self, frames: int) -> None:
+        """Look so many frames on (back, negative), as far as there are any."""
+        self.back = int(np.clip(self.back - frames, 0, max(len(self.frames) - 1, 0)))
+
+    @property
+    def shown(self) -> Frame:
+        """The frame that is looked at."""
+        return self.frames[-1 - self.back]
+
+    @property
+    def age_s(self) -> float:
+        """How much older than the newest frame the one looked at is, negative [s]."""
+        return self.shown.time_s - self.frames[-1].time_s
+
+
+@dataclass
+class Calliper:
+    """Two points on the image plane [mm], set by clicks; a third click removes them, or a probe that moves."""
+
+    points: tuple[tuple[float, float], ...] = ()
+    _pose: np.ndarray | None = None
+
+    def point(self, place_mm: tuple[float, float] | None, pose: np.ndarray) -> None:
+        """Set the next point, or remove both, if there was a click in a picture whose probe has a pose (4, 4)."""
+        if place_mm is None:
+            return
+        if not self.points:
+            self._pose = pose
+        self.points = () if len(self.points) == 2 else (*self.points, place_mm)
+
+    def go_with(self, pose: np.ndarray) -> None:
+        """Remove the points where the probe of a live picture is elsewhere (4, 4) than when the first was set."""
+        if self.points and self._pose is not None and np.abs(pose - self._pose).max() > STILL_MM:
+            self.points = ()
+
+    def figure(self, frame: Frame) -> str:
+        """The distance of the points as the tissue lies, and of the same tissue at rest; empty of fewer than two."""
+        if len(self.points) < 2:
+            return ""
+        start, end = np.array(self.points)
+        found = f"{np.linalg.norm(end - start):.1f} mm"
+        if frame.rest is not None:
+            places = at_rest(frame.rest, np.array(self.points), frame.view)
+            found += f"\nat rest {np.linalg.norm(places[1] - places[0]):.1f} mm"
+        return found
+
+
+def at_rest(rest: np.ndarray, points_mm: np.ndarray, view: View) -> np.ndarray:
+    """Where the tissue at points (n, 2) of a view's plane was at rest (n, 3) [mm]; ``rest`` (rows, columns, 3) is over its picture."""
+    share = (points_mm + [view.width_mm / 2, view.above_mm]) / [view.width_mm, view.depth_mm]
+    at = share[:, ::-1].T * (np.array(rest.shape[:2])[:, None] - 1)
+    return np.column_stack(
+        [map_coordinates(rest[..., axis], at, order=1, mode="nearest") for axis in range(3)]
+    )

@@ -1,0 +1,70 @@
+"""The command ``export``: a scene's surfaces and volumes, for other programs."""
+
+from pathlib import Path
+
+import click
+import trimesh
+
+from scenes.anatomy import LoadedAnatomy, files_of, load_anatomy
+from scenes.patients.part_surfaces import PARTS
+from scenes.patients.patient_folder import check_folder, new_folder
+from scenes.patients.readers.volume_readers import file_volume
+from scenes.scene import Scene, load_scene, scene_file
+from scenes.surface_files import FORMATS, save_surface
+from scenes.volume_files import save_image
+
+
+@click.command()
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, help="Folder to write to; new or empty."
+)
+@click.option(
+    "--format",
+    "suffix",
+    type=click.Choice(FORMATS),
+    default="stl",
+    show_default=True,
+    help="Of the surfaces; PLY keeps the order of their vertices.",
+)
+def export(scene: Path, out: Path, suffix: str) -> None:
+    """Write surfaces, CT and labels of SCENE as files.
+
+    SCENE is a scene file or a patient's folder; surfaces become STL or PLY, CT and label map NRRD.
+    All is in mm, in the patient's LPS, at rest. As they lie when they are pressed, rehearse writes them.
+    """
+    path = scene_file(scene)
+    check_folder(out)
+    loaded = load_scene(path)
+    anatomy = load_anatomy(loaded, path.parent)
+    named = surfaces(anatomy)
+    with new_folder(out) as partial:
+        for name, surface in named.items():
+            save_surface(surface, partial / f"{name}.{suffix}")
+        volumes = save_volumes(loaded, path.parent, partial)
+    click.echo(
+        f"Wrote to {out}, in mm, LPS: {', '.join([*(f'{name}.{suffix}' for name in named), *volumes])}"
+    )
+    without = sum(not isinstance(shape, trimesh.Trimesh) for shape in anatomy.shapes)
+    if without:
+        click.echo(f"Left out: {without} of what the organ lies on, as planes and distances are no surfaces.")
+
+
+def surfaces(anatomy: LoadedAnatomy) -> dict[str, trimesh.Trimesh]:
+    """The surfaces of an anatomy, by the names of their files: organ, tumour, parts, support, support-2, ..."""
+    found = {"organ": anatomy.organ}
+    if anatomy.tumour is not None:
+        found["tumour"] = anatomy.tumour
+    found |= {PARTS[tissue]: part for tissue, part in anatomy.parts.items()}
+    supports = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
+    return found | {"support" if n == 1 else f"support-{n}": each for n, each in enumerate(supports, 1)}
+
+
+def save_volumes(scene: Scene, folder: Path, out: Path) -> list[str]:
+    """Write the voxels of CT and label map as their files have them, without metadata; the names of the files. Raises OSError."""
+    folder, files = files_of(scene, folder)
+    wanted = {"ct.nrrd": files.ct, "labels.nrrd": files.labels}
+    written = {name: file for name, file in wanted.items() if file}
+    for name, file in written.items():
+        save_image(file_volume(folder / file).image(), out / name)
+    return list(written)

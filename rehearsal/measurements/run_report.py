@@ -1,0 +1,118 @@
+"""What a headless run measured, as ``report.json`` has it."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rehearsal.configuration import setup_of_scene
+from rehearsal.rehearsal import Rehearsal
+from rehearsal.result_files import counted, spread
+from rehearsal.speed_accuracy.pareto_front import expected_error_mm, load_points
+from scenes.tissue import TISSUES
+from sim.fields import array_of
+from version import VERSION
+
+# Keys that not every tissue model fills.
+NOT_EVERYWHERE = dict(radius_mm=None, stiffness=None, clusters=0, memberships=0)
+
+
+def expected_error_of(rehearsal: Rehearsal) -> float | None:
+    """Mean error of beads [mm] that ``study trade`` measured with settings like a rehearsal's; None where it measured none."""
+    step = rehearsal.settings
+    setup = setup_of_scene(rehearsal.scene, step.substeps, step.iterations, step.relaxation_factor)
+    return expected_error_mm(load_points(), setup)
+
+
+@dataclass
+class Tally:
+    """Figures gathered while a rehearsal runs; the first step and slice, which compile, count as building."""
+
+    build_s: float
+    step_ms: list[float] = field(default_factory=list)
+    slice_ms: list[float] = field(default_factory=list)
+    finite: bool = True
+    fallbacks: list[str] = field(default_factory=list)
+    volume_ratio_min: float = 1.0
+    max_penetration_mm: float = 0.0
+    indentation_max_mm: float = 0.0
+
+    def watch(self, rehearsal: Rehearsal) -> None:
+        """Look at the state at the end of a step; the surfaces must be up to date."""
+        if rehearsal.notice:
+            self.fallbacks.append(rehearsal.notice)
+        self.finite &= bool(np.isfinite(array_of(rehearsal.body.position)).all())
+        if not self.finite:
+            return
+        self.volume_ratio_min = min(self.volume_ratio_min, rehearsal.volume_ratio())
+        self.max_penetration_mm = max(self.max_penetration_mm, rehearsal.contacts.measure_penetration())
+        self.indentation_max_mm = max(self.indentation_max_mm, rehearsal.indentation_mm())
+
+    def report(self, rehearsal: Rehearsal, arch: str) -> dict:
+        """Everything in one dictionary; times in ms are over all steps but the first, if there are more, and None of what was not done;
+        of tissue that was not finite there are no figures.
+        """
+        settings = rehearsal.settings
+        return dict(
+            version=VERSION,
+            title=rehearsal.scene.title,
+            arch=arch,
+            **(NOT_EVERYWHERE | rehearsal.scene.tissue.model_dump() | rehearsal.model.counts()),
+            tetrahedra=rehearsal.embedding.count,
+            time_step_s=settings.time_step_s,
+            substeps=settings.substeps,
+            iterations=settings.iterations,
+            probe=rehearsal.probe.transducer_name,
+            probe_settings=rehearsal.probe.model_dump(by_alias=True),
+            picture=rehearsal.scene.image.mode,
+            rung=rehearsal.scene.image.rung,
+            slice_width_mm=rehearsal.probe.extent_mm[0],
+            slice_depth_mm=rehearsal.probe.depth_mm,
+            steps=rehearsal.steps,
+            ms_per_step=_times(self.step_ms),
+            ms_per_slice=_times(self.slice_ms),
+            build_s=round(self.build_s, 3),
+            finite=self.finite,
+            expected_error_mm=expected_error_of(rehearsal),
+            fallbacks=self.fallbacks,
+            volume_ratio_min=round(self.volume_ratio_min, 6) if self.finite else None,
+            max_penetration_mm=round(self.max_penetration_mm, 6) if self.finite else None,
+            indentation_max_mm=round(self.indentation_max_mm, 4) if self.finite else None,
+        )
+
+
+def _times(ms: list[float]) -> dict[str, float] | None:
+    return spread(ms[1:] or ms) if ms else None
+
+
+def summary(report: dict) -> str:
+    """The figures that matter, in a few lines for the terminal."""
+    measured = {"step": report["ms_per_step"], "picture": report["ms_per_slice"]}
+    times = ", ".join(f"{ms['median']:.1f} ms a {name}" for name, ms in measured.items() if ms is not None)
+    shown = f"picture {report['picture']}, echo as far as {report['rung']}"
+    return "\n".join(
+        [
+            f"model     {TISSUES[report['model']].REPORTED.format(**report)}, {report['tetrahedra']} tetrahedra",
+            f"step      1/{1 / report['time_step_s']:.0f} s in {counted(report['substeps'], 'substep')} of "
+            f"{counted(report['iterations'], 'iteration')}",
+            f"speed     {times} (medians of {report['steps']}) on {report['arch']}; built in {report['build_s']:.1f} s",
+            f"probe     {report['probe']}; {shown if measured['picture'] else 'no pictures'}",
+            f"press     {_press(report)}",
+            f"error     {_error(report['expected_error_mm'])}",
+            *(f"MIND      {text}" for text in report["fallbacks"]),
+        ]
+    )
+
+
+def _press(report: dict) -> str:
+    if not report["finite"]:
+        return "NOT FINITE: the tissue was lost, and there are no figures of it"
+    return (
+        f"{report['indentation_max_mm']:.2f} mm deep; least volume {100 * report['volume_ratio_min']:.1f} %; "
+        f"penetration at most {report['max_penetration_mm']:.3f} mm; all finite"
+    )
+
+
+def _error(expected_mm: float | None) -> str:
+    if expected_mm is None:
+        return "not known: study trade measured no settings like these"
+    return f"{expected_mm:.2f} mm expected, the mean of beads with settings like these (study trade)"

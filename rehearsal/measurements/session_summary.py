@@ -1,0 +1,93 @@
+"""How a rehearsal went, in the figures that its readings gave."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from rehearsal.result_files import counted
+from ultrasound.coverage import Gap
+
+# Tissue squeezed by more than this is pressed [mm], and by less than that let go.
+PRESSED_MM, RELEASED_MM = 1.0, 0.5
+
+
+@dataclass
+class Course:
+    """Gathers what a summary is made of, moment by moment."""
+
+    warning_mm: float
+    step_s: float
+    duration_s: float = 0.0
+    path_mm: float = 0.0
+    presses: int = 0
+    compression_mm: float = 0.0
+    too_deep_s: float = 0.0
+    fastest_mm_s: float = 0.0
+    went_back: int = 0
+    _squeezed: bool = field(default=False, init=False)
+    _at: np.ndarray | None = field(default=None, init=False)
+
+    def add(self, pose: np.ndarray | None, compression_mm: float) -> None:
+        """A moment: the pose (4, 4) of its step or None for a way back, and how far the tissue is squeezed."""
+        self.duration_s += self.step_s
+        if pose is None:
+            self.went_back += 1
+            self._at = None
+            return
+        if self._at is not None:
+            way = float(np.linalg.norm(pose[:3, 3] - self._at))
+            self.path_mm += way
+            self.fastest_mm_s = max(self.fastest_mm_s, way / self.step_s)
+        self._at = pose[:3, 3].copy()
+        self.compression_mm = max(self.compression_mm, compression_mm)
+        self.too_deep_s += self.step_s * (compression_mm > self.warning_mm)
+        if not self._squeezed and compression_mm > PRESSED_MM:
+            self.presses += 1
+        self._squeezed = compression_mm > (RELEASED_MM if self._squeezed else PRESSED_MM)
+
+    def summary(self, reading: dict[str, Any], gaps: Iterable[Gap], bookmarks: int) -> dict[str, Any]:
+        """Everything in one dictionary; ``reading`` is the last one, ``gaps`` are those of what was to be seen."""
+        figures = dict(
+            duration_s=self.duration_s,
+            path_mm=self.path_mm,
+            fastest_mm_s=self.fastest_mm_s,
+            compression_max_mm=self.compression_mm,
+            compression_warning_mm=self.warning_mm,
+            over_warning_s=self.too_deep_s,
+        )
+        counts = dict(presses=self.presses, went_back=self.went_back, bookmarks=bookmarks)
+        seen = {name: value for name, value in reading.items() if name.startswith("seen_")}
+        return {
+            **{name: round(float(value), 3) for name, value in figures.items()},
+            **counts,
+            **seen,
+            "gaps": [
+                dict(volume_ml=round(gap.volume_ml, 3), thickness_mm=round(gap.thickness_mm, 2))
+                for gap in gaps
+            ],
+        }
+
+
+def in_words(summary: dict[str, Any]) -> str:
+    """A summary for the terminal."""
+    seen = ", ".join(
+        f"{name.removeprefix('seen_')} {100 * value:.0f} %"
+        for name, value in summary.items()
+        if name.startswith("seen_")
+    )
+    gaps = summary["gaps"]
+    largest = ""
+    if gaps:
+        volume_ml, thickness_mm = gaps[0]["volume_ml"], gaps[0]["thickness_mm"]
+        largest = f"; the largest part unseen is {volume_ml:.1f} ml, up to {thickness_mm:.1f} mm thick"
+    return "\n".join(
+        [
+            f"session   {summary['duration_s']:.1f} s, {counted(summary['presses'], 'press')}, the way of the transducer "
+            f"{summary['path_mm']:.0f} mm, at most {summary['fastest_mm_s']:.0f} mm/s; {counted(summary['bookmarks'], 'bookmark')}",
+            f"squeezed  {summary['compression_max_mm']:.1f} mm at most; {summary['over_warning_s']:.1f} s above the limit of "
+            f"{summary['compression_warning_mm']:g} mm",
+            f"seen      {seen or 'nothing: there is no CT'}{largest}",
+        ]
+    )

@@ -1,0 +1,88 @@
+"""The figures that matter in a partial nephrectomy, read off a rehearsal: in the window, in its record, and for a plan."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import igl
+import numpy as np
+
+from rehearsal.rehearsal import Rehearsal
+from sim.fields import array_of
+from ultrasound.array_contact import face_points, pressing
+from ultrasound.probe import Probe
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Lengths in mm; None where there is no tumour, or none on the image plane."""
+
+    compression_mm: float
+    """The most by which tissue before the face is shorter than at rest (``ultrasound.array_contact.Pressing``)."""
+    contact_mm2: float
+    """Area of the face that touches."""
+    to_tumour_mm: float | None = None
+    """From the face to the nearest point of the tumour."""
+    tumour_depth_mm: float | None = None
+    """From the organ's surface to the nearest point of the tumour, as the tissue lies; 0 where it sticks out."""
+    tumour_shift_mm: float | None = None
+    """How far the tumour's middle is from where it was in the CT."""
+    in_view: float | None = None
+    """Share of the tumour's outline on the image plane that is in the picture, 0 to 1."""
+    margin_mm: float | None = None
+    """Least width of what the picture shows beside and under that outline; negative where it is cut off."""
+
+
+def read(rehearsal: Rehearsal, probe: Probe, touches: np.ndarray) -> Reading:
+    """Read a rehearsal whose surfaces are up to date; ``touches`` says which lines of the probe touch."""
+    organ = rehearsal.organ
+    now = array_of(rehearsal.organ_skin.vertices).astype(float)
+    pressed = pressing(
+        rehearsal.pose, rehearsal.size_mm, probe.radius_mm, now, np.asarray(organ.vertices), organ.faces
+    )
+    reading: dict[str, Any] = dict(compression_mm=pressed.compression_mm, contact_mm2=pressed.area_mm2)
+    outline = rehearsal.tumour_outline()
+    if outline is None or rehearsal.tumour is None:
+        return Reading(**reading)
+    tumour = rehearsal.tumour_vertices()
+    middle, before = tumour.mean(axis=0), np.asarray(rehearsal.tumour.vertices).mean(axis=0)
+    return Reading(
+        **reading,
+        to_tumour_mm=_to_tumour_mm(rehearsal, probe, tumour),
+        tumour_depth_mm=_depth_mm(tumour, now, organ.faces),
+        tumour_shift_mm=float(np.linalg.norm(middle - before)),
+        **_in_picture(outline, probe, touches),
+    )
+
+
+def _to_tumour_mm(rehearsal: Rehearsal, probe: Probe, tumour: np.ndarray) -> float:
+    points = face_points(rehearsal.size_mm, probe.radius_mm)[0]
+    places = points @ rehearsal.pose[:3, :3].T + rehearsal.pose[:3, 3]
+    return float(np.sqrt(_nearest(places, tumour, rehearsal.tumour.faces)[0].min()))  # type: ignore[union-attr]
+
+
+def _depth_mm(tumour: np.ndarray, organ: np.ndarray, faces: np.ndarray) -> float:
+    """How far the nearest vertex of a tumour is under the organ's surface."""
+    squared, face, near = _nearest(tumour, organ, faces)
+    a, b, c = np.moveaxis(organ[faces[face]], 1, 0)
+    outside = np.einsum("ij,ij->i", tumour - near, np.cross(b - a, c - a)) > 0
+    return float(np.sqrt(np.where(outside, 0.0, squared).min()))
+
+
+def _nearest(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Of points (n, 3): squared distances to a surface, the nearest faces and the points on them."""
+    return igl.point_mesh_squared_distance(
+        np.ascontiguousarray(points), np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64)
+    )
+
+
+def _in_picture(outline_mm: np.ndarray, probe: Probe, touches: np.ndarray) -> dict[str, Any]:
+    """Share of an outline (n, 2, 2) on the plane that the picture shows, and what it shows around it."""
+    if len(outline_mm) == 0:
+        return dict(in_view=None, margin_mm=None)
+    middle, length = outline_mm.mean(axis=1), np.linalg.norm(outline_mm[:, 1] - outline_mm[:, 0], axis=1)
+    line, depth = probe.beam_coordinates(*middle.T)
+    last = probe.number_of_scanlines - 1
+    aside = np.minimum(line + 0.5, last + 0.5 - line) * probe.line_spacing_mm(np.maximum(depth, 0.0))
+    margin = np.minimum(aside, probe.depth_mm - depth)
+    shown = (margin >= 0) & (depth >= 0) & touches[np.clip(np.rint(line).astype(int), 0, last)]
+    return dict(in_view=float(length[shown].sum() / length.sum()), margin_mm=float(margin.min()))

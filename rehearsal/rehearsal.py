@@ -1,0 +1,315 @@
+"""One scene put together: the body under its probe, advanced and imaged one frame at a time.
+
+The window, the headless run and every measurement go through this class, so that they compute the same.
+"""
+
+import hashlib
+from concurrent.futures import Future
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+import trimesh
+
+from rehearsal.build_solver import build_solver, embedding_cell_mm, static_shape, step_settings, tool_of
+from rehearsal.configuration import probe_of
+from scenes.anatomy import Grid, LoadedAnatomy, press_on
+from scenes.closed_surfaces import moved_by, volume_mm3
+from scenes.progress import Told, untold
+from scenes.scene import PlaneShape, Scene
+from sim.divergence_check import Guard, Watch
+from sim.embedding import Embedding
+from sim.fields import array_of
+from sim.shapes import Plane, SignedDistanceField
+from sim.skinning import Skin
+from sim.solver import SolverState
+from sim.tissue_model import Held, MaterialModel
+from ultrasound.image_plane import ImagePlane
+from ultrasound.outline import section
+from ultrasound.probe import Mode, Probe, Rung
+from ultrasound.probe_manipulator import (
+    Grip,
+    Hand,
+    advanced,
+    approached,
+    between,
+    image_plane,
+    indentation,
+    pose_at,
+    touching,
+)
+from ultrasound.scanner import ScannedAnatomy, Scanner, begin_echo
+
+TURN_DEG_S = 180.0
+AWAY_MM = 200.0
+# Where the tumour sticks out, the organ has the same surface: the tumour's is drawn this far outside it.
+TUMOUR_LIFT_MM = 0.8
+# Where the organ lies on a support both have the same surface: the support is drawn this far inside its own.
+SUPPORT_SUNK_MM = 0.4
+# How far around the organ the tissue in the picture gives way to it.
+SURROUNDINGS_MM = 25.0
+# Places along each side of a picture whose rest is asked for.
+REST_PLACES = 48
+
+
+@dataclass(frozen=True)
+class RehearsalState:
+    """All that frames change: the tissue, what its guard remembers, the transducer's pose (4, 4), the hand that holds it."""
+
+    solver: SolverState
+    watch: Watch
+    pose: np.ndarray
+    steps: int
+    grip: Grip
+
+
+class Rehearsal:
+    """A scene on the device. All positions are mm relative to ``origin``, the middle of the resting organ (LPS).
+
+    Needs Taichi to be initialised; a new one for another scene needs it initialised anew, which frees the old. ``told`` hears
+    what is being made; one that ``shows_echo`` from its first frame on gets ready for it meanwhile.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        anatomy: LoadedAnatomy,
+        probe: Probe | None = None,
+        told: Told = untold,
+        shows_echo: bool = False,
+    ) -> None:
+        self.scene = scene
+        self.probe = probe or probe_of(scene)
+        self.origin = anatomy.organ.bounds.mean(axis=0)
+        self.organ = moved_by(anatomy.organ, -self.origin)
+        self.tumour = anatomy.tumour and moved_by(anatomy.tumour, -self.origin)
+        self.parts = {tissue: moved_by(part, -self.origin) for tissue, part in anatomy.parts.items()}
+        self.gravity_direction = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
+        meshes = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
+        self.supports = [_shrunk(moved_by(mesh, -self.origin), SUPPORT_SUNK_MM) for mesh in meshes]
+        scanned, echo = None, None
+        if anatomy.ct is not None:
+            scanned = scanned_anatomy(self.organ, anatomy.ct, anatomy, self.origin)
+            echo = begin_echo(scanned) if shows_echo else None
+        told("Building the model: tissue and contacts")
+        self._build_solver(anatomy)
+        self.guard = Guard(self.solver)
+        self.notice = ""
+        told("Building the model: surfaces")
+        self._build_surfaces()
+        self._build_scanner(scanned, echo)
+        self.press = press_on(scene.press, anatomy, self.gravity_direction)
+        self.steps = 0
+        told("Building the model: the tissue comes to rest")
+        self.pose = self._settle()
+        self.hand = self._hand()
+        self.pose = self.hand.pose()
+        self.guard.settle()
+        self.settled = self.snapshot()
+
+    def _build_solver(self, anatomy: LoadedAnatomy) -> None:
+        self.size_mm = np.array(self.probe.housing_mm)
+        self.tool = tool_of(self.probe)
+        shapes = [*(self._shape(shape) for shape in anatomy.shapes), self.tool]
+        tissue, section = self.scene.tissue, self.scene.solver
+        held = self._held()
+        self.solver = build_solver(
+            self.organ, tissue, shapes, self.tool, self.scene.contact, section, held=held
+        )
+        self.body, self.model, self.contacts = self.solver.body, self.solver.model, self.solver.contacts
+        self.settings = step_settings(tissue, section)
+        self.set_gravity(self.scene.gravity.acceleration_m_s2)
+
+    def _held(self) -> Held | None:
+        attachment = self.scene.attachment
+        if attachment.radius_mm == 0 or attachment.at_mm is None:
+            return None
+        return Held(np.array(attachment.at_mm) - self.origin, attachment.radius_mm)
+
+    def _shape(self, shape: PlaneShape | trimesh.Trimesh | Grid) -> Plane | SignedDistanceField:
+        if isinstance(shape, PlaneShape):
+            normal = np.array(shape.normal) / np.linalg.norm(shape.normal)
+            return Plane(normal, shape.offset_mm / np.linalg.norm(shape.normal) - normal @ self.origin)
+        if isinstance(shape, trimesh.Trimesh):
+            return static_shape(moved_by(shape, -self.origin), self.scene.tissue)
+        spacing = 1 / np.diag(shape.index_from_mm)[:3]
+        return SignedDistanceField(shape.voxels, -spacing * shape.index_from_mm[:3, 3] - self.origin, spacing)
+
+    def _build_surfaces(self) -> None:
+        self.organ_skin = Skin(self.model, self.organ.vertices)
+        self.tumour_skin = self._tumour_border = None
+        if self.tumour is not None:
+            self._tumour_border = Skin(self.model, self.tumour.vertices)
+            drawn = self.tumour.vertices + TUMOUR_LIFT_MM * self.tumour.vertex_normals
+            self.tumour_skin = Skin(self.model, drawn)
+        self.part_skins = {tissue: Skin(self.model, part.vertices) for tissue, part in self.parts.items()}
+
+    def _build_scanner(self, scanned: ScannedAnatomy | None, echo: Future[np.ndarray] | None) -> None:
+        image = self.scene.image
+        margin = SURROUNDINGS_MM if image.outside == "background" else 0.0
+        self.embedding = Embedding(self.model, self.organ, embedding_cell_mm(self.scene.tissue), margin)
+        self.scanner = None
+        if scanned is not None:
+            around = image.outside, image.contact, image.contact_gap_mm
+            self.scanner = Scanner(scanned, self.embedding, self.probe, image.pixels, *around, echo)
+
+    def _settle(self) -> np.ndarray:
+        """Let the organ come to rest on its support, the transducer far away: the paper's warm-up."""
+        target = np.array(self.press.target_mm) - self.origin
+        pose = pose_at(target, np.array(self.press.direction), np.array(self.press.lateral), self.size_mm[2])
+        self.pose = advanced(pose, -AWAY_MM)
+        for _ in range(self.press.warm_up_steps):
+            self.advance(self.pose)
+        self.steps = 0
+        self.update_surfaces()
+        return pose
+
+    def _hand(self) -> Hand:
+        settled = array_of(self.organ_skin.vertices).astype(float)
+        faces = np.array(self.organ.faces, np.int64)
+        normals = np.array(trimesh.Trimesh(settled, faces, process=False).vertex_normals)
+        radius = self.probe.radius_mm
+        hand = Hand(settled, faces, normals, self.size_mm, self.pose, np.array(self.press.lateral), radius)
+        hand.home = touching(self.pose, self.size_mm, hand.samples, radius)
+        return hand
+
+    def set_gravity(self, acceleration_m_s2: float) -> None:
+        """Change the acceleration due to gravity; its direction is the scene's."""
+        self.settings.gravity = tuple(1000.0 * acceleration_m_s2 * self.gravity_direction)
+
+    def set_young(self, young_kpa: float) -> None:
+        """Change Young's modulus of a tissue that has one; of others nothing."""
+        if isinstance(self.model, MaterialModel):
+            self.model.set_young(young_kpa)
+
+    def scripted_pose(self, time_s: float) -> np.ndarray:
+        """The transducer's pose at a time of the scripted press: just touching at first, then down stage by stage."""
+        depths = [0.0, *self.press.indentations_mm]
+        stage = time_s / self.scene.solver.time_step_s / self.press.stage_steps
+        return self.pose_at_depth(float(np.interp(stage, np.arange(len(depths)), depths)))
+
+    def pose_at_depth(self, depth_mm: float) -> np.ndarray:
+        """The transducer's pose so deep in the organ, along the scripted press."""
+        return advanced(self.hand.home, depth_mm)
+
+    def script_length_s(self) -> float:
+        """How long the scripted press takes [s]."""
+        return len(self.press.indentations_mm) * self.press.stage_steps * self.scene.solver.time_step_s
+
+    def pose_towards(self, goal: np.ndarray) -> np.ndarray:
+        """The transducer's next pose on its way to a goal (4, 4): no faster than a hand, and over the organ."""
+        most_mm = self.scene.transducer.speed_mm_s * self.settings.time_step_s
+        pose = approached(self.pose, goal, most_mm, TURN_DEG_S * self.settings.time_step_s)
+        # Between two places of the surface the straight way leads through the organ.
+        wanted = max(self._indentation(goal), 0.0)
+        through = self._indentation(pose) - max(wanted, self.indentation_mm())
+        return advanced(pose, -through) if through > 0 else pose
+
+    def advance(self, pose: np.ndarray) -> None:
+        """Advance one time step, at whose end the transducer has a pose (4, 4).
+
+        ``notice`` says what had to be put right; it is empty after most steps.
+        """
+        self.solver.step(self.settings, between(self.pose, pose, self.settings.substeps))
+        self.notice = self.guard.check(self.settings.time_step_s)
+        self.pose = pose
+        self.steps += 1
+
+    def snapshot(self) -> RehearsalState:
+        """A copy of the current state."""
+        return RehearsalState(self.solver.snapshot(), self.guard.watch, self.pose, self.steps, self.hand.grip)
+
+    def restore(self, state: RehearsalState) -> None:
+        """Go back to a state; the steps that follow give the same bits as they did from it before."""
+        self.solver.restore(state.solver)
+        self.guard.watch = state.watch
+        self.pose, self.steps, self.hand.grip = state.pose, state.steps, state.grip
+
+    def keep_good(self) -> None:
+        """Take the tissue, where it is well, for what its guard would put back."""
+        self.guard.keep()
+
+    def update_surfaces(self) -> None:
+        """Carry the surfaces that are drawn to where the body is."""
+        self.organ_skin.update()
+        if self.tumour_skin is not None:
+            self.tumour_skin.update()
+        for skin in self.part_skins.values():
+            skin.update()
+
+    def look(
+        self, probe: Probe, mode: Mode, rung: Rung, window_hu: float, level_hu: float
+    ) -> dict[str, np.ndarray]:
+        """What the scanner shows now, by name (``Scanner.look``); black in a scene without a CT."""
+        if self.scanner is None:
+            return {"no CT": np.zeros((self.scene.image.pixels, self.scene.image.pixels), np.uint8)}
+        return self.scanner.look(self.image_plane(probe), probe, mode, rung, window_hu, level_hu)
+
+    def find_plane(self, probe: Probe) -> None:
+        """Find the tissue that a picture would be of, and make none."""
+        if self.scanner is not None:
+            self.scanner.take(self.image_plane(probe))
+
+    def image_plane(self, probe: Probe | None = None) -> ImagePlane:
+        """The plane that the transducer shows now, as far as its probe, or another set like it, sees."""
+        return image_plane(self.pose, self.size_mm[2], *(probe or self.probe).extent_mm)
+
+    def rest_grid(self) -> np.ndarray | None:
+        """Where the tissue of the picture taken last was at rest, evenly over it, (n, n, 3) [mm]; None without a CT."""
+        return None if self.scanner is None else self.scanner.plane.rest_grid(REST_PLACES)
+
+    def tumour_outline(self, at_rest: bool = False) -> np.ndarray | None:
+        """Where the image plane cuts the tumour as it lies, or as it lay in the CT: segments (n, 2, 2) on the plane [mm].
+
+        None without a tumour.
+        """
+        if self.tumour is None:
+            return None
+        plane = self.image_plane()
+        vertices = np.asarray(self.tumour.vertices) if at_rest else self.tumour_vertices()
+        return section(vertices, self.tumour.faces, np.linalg.inv(plane.world_from_plane))
+
+    def tumour_vertices(self) -> np.ndarray:
+        """Where the tumour's surface is now (n, 3) [mm]; none of an organ without one."""
+        if self._tumour_border is None:
+            return np.zeros((0, 3))
+        self._tumour_border.update()
+        return array_of(self._tumour_border.vertices).astype(float)
+
+    def indentation_mm(self) -> float:
+        """How deep the transducer is pressed into the settled surface; negative above it."""
+        return self._indentation(self.pose)
+
+    def _indentation(self, pose: np.ndarray) -> float:
+        return indentation(pose, self.size_mm, self.hand.samples, self.probe.radius_mm)
+
+    def volume_ratio(self) -> float:
+        """Volume inside the carried surface, as a share of the resting one."""
+        carried = array_of(self.organ_skin.vertices)
+        return float(volume_mm3(carried, self.organ.faces) / self.organ.volume)
+
+    def reset(self) -> None:
+        """Tissue and transducer as they were at the start: settled, and just touching."""
+        self.restore(self.settled)
+        ti.sync()
+
+    def digest(self) -> str:
+        """A short name of the tissue's state: other bits, another name."""
+        state = self.body.snapshot()
+        return hashlib.sha256(state.position.tobytes() + state.velocity.tobytes()).hexdigest()[:16]
+
+
+def _shrunk(mesh: trimesh.Trimesh, by_mm: float) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices - by_mm * mesh.vertex_normals, mesh.faces, process=False)
+
+
+def scanned_anatomy(
+    organ: trimesh.Trimesh, ct: Grid, anatomy: LoadedAnatomy, origin: np.ndarray
+) -> ScannedAnatomy:
+    """What there is to scan, with an origin that the organ has already been moved to."""
+    labels = anatomy.labels
+    shift = np.eye(4)
+    shift[:3, 3] = origin
+    marks = None if labels is None else labels.voxels.astype(np.int32)
+    tumour = anatomy.tumour and moved_by(anatomy.tumour, -origin)
+    return ScannedAnatomy(organ, ct.voxels, ct.index_from_mm @ shift, marks, anatomy.tissues, tumour)

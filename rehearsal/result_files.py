@@ -1,0 +1,53 @@
+"""Figures as reports have them, and their files: JSON and CSV."""
+
+import csv
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from scenes.atomic_files import whole
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def rounded(value: float | None) -> float | None:
+    """As files have it, in which rounding of the last bits is not seen; None for what JSON has no number for."""
+    return None if value is None or not np.isfinite(value) else round(float(value), 6)
+
+
+def spread(values: list[float]) -> dict[str, float]:
+    """Mean, standard deviation, minimum, maximum and median."""
+    v = np.array(values)
+    figures = dict(mean=v.mean(), sd=v.std(), min=v.min(), max=v.max(), median=np.median(v))
+    return {name: round(float(value), 4) for name, value in figures.items()}
+
+
+def counted(number: int, name: str) -> str:
+    """A number of things: "1 substep", "3 substeps", "2 presses"."""
+    ending = "" if number == 1 else "es" if name.endswith("s") else "s"
+    return f"{number} {name}{ending}"
+
+
+def write_json(figures: dict[str, Any], path: Path) -> None:
+    """Write figures as JSON. Raises ValueError for a number that JSON has none for, OSError."""
+    text = json.dumps(figures, indent=2, allow_nan=False) + "\n"
+    with whole(path) as partial:
+        partial.write_text(text, "utf-8")
+
+
+def write_csv(rows: list[dict[str, Any]], path: Path) -> None:
+    """Write a line a row under all names that rows have, in their order; a row without one leaves it empty. Raises OSError."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    with whole(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+        lines = csv.DictWriter(file, list(names))
+        lines.writeheader()
+        lines.writerows(rows)
+
+
+def save_figure(figure: "Figure", path: Path, **options: Any) -> None:
+    """Write a figure with Matplotlib's options. Raises OSError."""
+    with whole(path) as partial:
+        figure.savefig(partial, **options)

@@ -1,0 +1,294 @@
+"""The file of a session: one line of JSON a second, each on the disk when it is written, so that a crash costs a second at most.
+
+The first line says what is rehearsed, each other one is a second of it: what was noted, the transducer's poses, and the tissue's
+digest after it. Now and then one holds the whole state and what was seen until then, as does the last, of a session that ended in
+order, with its summary. No line names a patient or a path.
+"""
+
+import base64
+import json
+import os
+import zlib
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from typing_extensions import TypedDict
+
+from rehearsal.sessions.packed_coverage import Seen, SeenVoxels
+
+FORMAT = 1
+# Of a pose, all but its last row.
+NUMBERS = 12
+MOST_SECOND = 1_000_000
+MOST_BYTES = 2_000_000_000
+
+
+class SessionError(ValueError):
+    """A session's file that cannot be used; the message is one line."""
+
+
+class _Line(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class Header(_Line):
+    """What is rehearsed, by which version of Nephron. ``anatomy`` is the fingerprint of the files that a scene names, not in here."""
+
+    nephron_session: Literal[1] = 1
+    version: str | None = Field(None, pattern=r"^[0-9A-Za-z.+-]{1,40}$")
+    anatomy: str
+    scene: dict[str, Any]
+    probe: dict[str, Any]
+    arch: str = Field(pattern=r"^[0-9a-z_]{1,20}$")
+    time_step_s: float = Field(gt=0)
+    begins: str | None = None
+    """The state that it begins with, where that is not the settled one."""
+
+
+class SolverValues(TypedDict, total=False):
+    """What a step is told; what is left out stays as it was."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)  # type: ignore[misc]
+    iterations: Annotated[int, Field(ge=1, le=1000)]
+    substeps: Annotated[int, Field(ge=1, le=100)]
+    stiffness: Annotated[float, Field(ge=0, le=1)]
+    young_kpa: Annotated[float, Field(gt=0, le=1e6)]
+    gravity_m_s2: Annotated[float, Field(ge=0, le=100)]
+
+
+# What the value of each kind of event is.
+VALUES: dict[str, TypeAdapter] = {
+    "settings": TypeAdapter(dict[str, bool | int | float | str | None]),
+    "solver": TypeAdapter(SolverValues),
+    "back": TypeAdapter(int),
+    "bookmark": TypeAdapter(int),
+    "reading": TypeAdapter(dict[str, float | None]),
+    "state": TypeAdapter(str),
+    "seen": TypeAdapter(Seen),
+}
+Kind = Literal["settings", "solver", "back", "bookmark", "reading", "state", "seen"]
+
+
+class Event(_Line):
+    """Something of the moment ``at``, before its step."""
+
+    at: int = Field(ge=0)
+    kind: Kind
+    value: Any
+
+    @model_validator(mode="after")
+    def _of_its_kind(self) -> "Event":
+        VALUES[self.kind].validate_python(self.value, strict=True)
+        return self
+
+
+class Second(_Line):
+    """Moments from ``at`` on: their poses, packed; the tissue's digest after the last of them."""
+
+    at: int = Field(ge=0)
+    poses: str
+    events: list[Event] = Field(default_factory=list)
+    digest: str
+
+
+class End(_Line):
+    """How a session that ended in order went, and the state that it can go on from, with what was seen until then."""
+
+    summary: dict[str, Any]
+    state: str
+    seen: Seen | None = None
+
+
+@dataclass
+class Log:
+    """A session as read: ``poses`` (moments, 4, 4), not a number where a moment is a way back; the rest by moment."""
+
+    header: Header
+    poses: np.ndarray
+    events: dict[int, list[Event]] = field(default_factory=dict)
+    digests: dict[int, str] = field(default_factory=dict)
+    states: dict[int, str] = field(default_factory=dict)
+    seen: dict[int, SeenVoxels] = field(default_factory=dict)
+    summary: dict[str, Any] | None = None
+
+    @property
+    def length_s(self) -> float:
+        """Simulated time."""
+        return len(self.poses) * self.header.time_step_s
+
+
+def pack(poses: list[np.ndarray | None]) -> str:
+    """Poses (4, 4), or None for a way back, with all of their bits."""
+    rows = np.full((len(poses), NUMBERS), np.nan)
+    for row, pose in zip(rows, poses, strict=True):
+        if pose is not None:
+            row[:] = np.asarray(pose, float)[:3].ravel()
+    return base64.b64encode(zlib.compress(rows.astype("<f8").tobytes())).decode("ascii")
+
+
+def unpack(text: str) -> np.ndarray:
+    """Poses (n, 4, 4). Raises ValueError or zlib.error."""
+    unzip = zlib.decompressobj()
+    raw = unzip.decompress(base64.b64decode(text, validate=True), MOST_SECOND * NUMBERS * 8)
+    rows = np.frombuffer(raw, "<f8").reshape(-1, NUMBERS)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = rows.reshape(-1, 3, 4)
+    if np.isinf(poses).any():
+        raise ValueError("a pose that is not finite")
+    return poses
+
+
+class Recording:
+    """A session's file as it grows; lines are written beside the rehearsal, which does not wait for the disk.
+
+    Raises OSError where the file cannot be made; what goes wrong later is said by ``fault``, and the rehearsal goes on.
+    """
+
+    def __init__(self, path: Path, header: Header) -> None:
+        self.path = path
+        self.fault = ""
+        self._at = 0
+        self._poses: list[np.ndarray | None] = []
+        self._events: list[Event] = []
+        self._file = path.open("x", encoding="utf-8")
+        self._disk = ThreadPoolExecutor(1, "session")
+        self._write(header)
+
+    @property
+    def moments(self) -> int:
+        """How many there are since the last line."""
+        return len(self._poses)
+
+    def note(self, kind: Kind, value: Any) -> None:
+        """Something of the moment to come."""
+        self._events.append(Event(at=self._at + len(self._poses), kind=kind, value=value))
+
+    def moment(self, pose: np.ndarray | None) -> None:
+        """A moment: the pose of its step, None for a way back."""
+        self._poses.append(pose)
+
+    def line(self, digest: str) -> None:
+        """Write what there is since the last line, with the tissue's digest now."""
+        if not self._poses:
+            return
+        self._write(Second(at=self._at, poses=pack(self._poses), events=self._events, digest=digest))
+        self._at += len(self._poses)
+        self._poses, self._events = [], []
+
+    def close(self, summary: dict[str, Any], state: str, seen: SeenVoxels | None = None) -> None:
+        """Write the end, and wait for the disk."""
+        self._write(End(summary=summary, state=state, seen=seen))
+        self._disk.shutdown()
+        try:
+            self._file.close()
+        except OSError as error:
+            # What a full disk did not take is tried once more.
+            self._fail(error)
+
+    def _write(self, line: BaseModel) -> None:
+        self._disk.submit(self._put, line)
+
+    def _put(self, line: BaseModel) -> None:
+        """On the disk's own thread; after a fault nothing more, or a line would be missing in between."""
+        if self.fault:
+            return
+        try:
+            self._file.write(line.model_dump_json(exclude_none=True) + "\n")
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        except (OSError, ValueError) as error:
+            self._fail(error)
+
+    def _fail(self, error: OSError | ValueError) -> None:
+        if not self.fault:
+            self.fault = f"{self.path.name}: no longer written ({getattr(error, 'strerror', None) or error})"
+
+
+def read_log(path: Path) -> Log:
+    """A session's file; what a crash left of its last line is left out. Raises SessionError."""
+    name = path.name
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise SessionError(
+                f"{name}: is larger than any session; expected a file that rehearse has written"
+            )
+        lines = path.read_bytes().split(b"\n")
+    except FileNotFoundError:
+        raise SessionError(f"{path}: no such session file") from None
+    except OSError as error:
+        raise SessionError(f"{name}: cannot be read as a session ({str(error).splitlines()[0]})") from None
+    header = _header(name, lines[0])
+    log = Log(header, np.zeros((0, 4, 4)))
+    parts: list[np.ndarray] = []
+    # Without a line's end it was being written when the session was cut off.
+    for number, line in enumerate(lines[1:-1], 2):
+        second = _line_of(name, number, line)
+        moments = sum(len(part) for part in parts)
+        if isinstance(second, End):
+            log.summary = second.summary
+            log.states[moments] = second.state
+            if second.seen is not None:
+                log.seen[moments] = second.seen
+            break
+        parts.append(_poses_of(name, number, second, moments))
+        _file_away(second, len(parts[-1]), log)
+    log.poses = np.concatenate([log.poses, *parts])
+    return log
+
+
+def _header(name: str, line: bytes) -> Header:
+    try:
+        values = json.loads(line)
+        found = values.get("nephron_session", FORMAT) if isinstance(values, dict) else None
+        if found != FORMAT:
+            raise SessionError(f"{name}: not a session, or of another format; expected nephron_session = 1")
+        return Header.model_validate(values)
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, SessionError):
+            raise
+        raise SessionError(
+            f"{name}: its first line is no session's; expected a file that rehearse has written, such as session-001.jsonl"
+        ) from None
+
+
+def _line_of(name: str, number: int, line: bytes) -> Second | End:
+    try:
+        values = json.loads(line)
+        return End.model_validate(values) if "summary" in values else Second.model_validate(values)
+    except (ValueError, TypeError, RecursionError) as error:
+        what = _what(error) if isinstance(error, ValidationError) else str(error)
+        raise SessionError(
+            f"{name}: line {number} is damaged ({what}); what comes before it can be had by deleting from it on"
+        ) from None
+
+
+def _what(error: ValidationError) -> str:
+    """What was first found wrong."""
+    first = error.errors()[0]
+    return str(first.get("ctx", {}).get("error", first["msg"]))
+
+
+def _poses_of(name: str, number: int, second: Second, expected: int) -> np.ndarray:
+    try:
+        poses = unpack(second.poses)
+    except (ValueError, zlib.error):
+        poses = np.zeros((0, 4, 4))
+    if second.at != expected or len(poses) == 0:
+        raise SessionError(
+            f"{name}: line {number} does not follow the line before it: one is missing or damaged"
+        )
+    return poses
+
+
+def _file_away(second: Second, count: int, log: Log) -> None:
+    for event in second.events:
+        if event.kind == "state":
+            log.states[event.at] = event.value
+        elif event.kind == "seen":
+            log.seen[event.at] = event.value
+        log.events.setdefault(event.at, []).append(event)
+    log.digests[second.at + count] = second.digest

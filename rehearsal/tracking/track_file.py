@@ -1,0 +1,61 @@
+"""The way of a tracked probe that a rehearsal is to follow, from a file."""
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from rehearsal.planning.plan_file import is_plan, read_plan
+from rehearsal.planning.plan_poses import timed_poses
+from rehearsal.tracking.pose_file import PoseError, TimedPoses, check_rigid, load_timed_poses
+from ultrasound.sweep import TRANSFORM_NAME, SweepError
+from ultrasound.sweep_file import read_sweep
+
+PROBE_IN_PATIENT = "ProbeToReference"
+# Poses that are all farther from the organ than this are of something else.
+FAR_MM = 50.0
+
+
+def load_track(path: Path, name: str | None = None) -> TimedPoses:
+    """The way of a probe in the patient, of a tracked sweep (.igs.mha), the first sweep of a plan, or a file of poses with times.
+
+    ``name`` is the sweep's transform that takes the probe to the patient, ProbeToReference where it is None. Raises PoseError,
+    SweepError, PlanError.
+    """
+    if path.suffix.lower() == ".mha":
+        return _of_sweep(path, name or PROBE_IN_PATIENT)
+    if name is not None:
+        raise PoseError(f"--track-from {name}: {path.name} is no sweep (.igs.mha), whose transforms it names")
+    if is_plan(path):
+        plan = read_plan(path)
+        return timed_poses(plan.sweeps[0], plan.speed_mm_s)
+    return load_timed_poses(path)
+
+
+def check_near(track: TimedPoses, organ: np.ndarray, path: Path) -> None:
+    """Raises PoseError where a track never comes near an organ's vertices (n, 3) in the patient (LPS, mm)."""
+    places = np.array([pose[:3, 3] for pose in track.poses if pose is not None])
+    nearest = float(cKDTree(organ).query(places)[0].min())
+    if nearest > FAR_MM:
+        raise PoseError(
+            f"{path.name}: the nearest pose is {nearest:.0f} mm from the organ; expected the probe's poses in this patient "
+            "(LPS, mm): register the tracker to the patient first"
+        )
+
+
+def _of_sweep(path: Path, name: str) -> TimedPoses:
+    found = TRANSFORM_NAME.fullmatch(name)
+    if found is None:
+        raise SweepError(f"--track-from {name!r}: expected a transform's name such as {PROBE_IN_PATIENT}")
+    probe, patient = found.groups()
+    sweep = read_sweep(path)
+    try:
+        poses = [sweep.transform(probe, patient, frame) for frame in range(len(sweep))]
+        for frame, pose in enumerate(poses):
+            if pose is not None:
+                check_rigid(f"frame {frame}: {name}", pose)
+        if all(pose is None for pose in poses):
+            raise SweepError(f"{name} has the status OK in none of {len(poses)} frames; expected some")
+        return TimedPoses(sweep.times_s, poses)
+    except (SweepError, PoseError) as error:
+        raise type(error)(f"{path.name}: {error}") from None

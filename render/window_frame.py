@@ -1,0 +1,142 @@
+"""The picture around the 3D view: backdrop, title, help and read-outs; the panel is panel.py's, the compass compass.py's.
+
+A picture is uint8 with shape (height, width, 3 or more); only its first three channels are written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import islice
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from render.text import fitting_size, font, shortened
+from render.ultrasound_panel import ALERT, FINDINGS, LINE, MARK, QUIET, TEXT, Panel, draw_panel
+from render.window_layout import CLOCK_WIDTH, FIGURE_HEIGHT, FIGURES_PAD, Layout, Rect
+
+BACKDROP_TOP, BACKDROP_FOOT = (30, 35, 42), (13, 15, 19)
+STRIP, HELP = (17, 20, 24), (22, 26, 31)
+# Lines of figures are no closer than this where the strip is as low as in a small window.
+LEAST_PITCH = 19
+# Stands where a figure has nothing to say.
+NOTHING = "-"
+HELP_COLUMNS, HELP_PX, HELP_GAP_PX, FIGURES_GAP_PX = 2, 17, 12, 18
+
+
+def backdrop(layout: Layout, panel: Panel, help_key: str = "H") -> np.ndarray:
+    """All that stays the same from frame to frame, uint8, shape (height, width, 3)."""
+    fade = np.linspace(0, 1, layout.scene.height)[:, None]
+    rows = (1 - fade) * np.array(BACKDROP_TOP) + fade * np.array(BACKDROP_FOOT)
+    picture = np.empty((layout.height, layout.width, 3), dtype=np.uint8)
+    picture[:] = STRIP
+    picture[layout.scene.slices] = np.round(rows).astype(np.uint8)[:, None]
+    image = Image.fromarray(picture)
+    draw = ImageDraw.Draw(image)
+    _draw_title(draw, layout, panel, help_key)
+    draw_panel(draw, layout, panel)
+    for y in (layout.title.bottom - 1, layout.strip.top):
+        draw.line([(0, y), (layout.strip.right, y)], fill=LINE)
+    return np.array(image)
+
+
+def _draw_title(draw: ImageDraw.ImageDraw, layout: Layout, panel: Panel, help_key: str) -> None:
+    px, middle = layout.px, layout.title.height // 2
+    right = layout.title.right - px(16)
+    draw.text((right, middle), _of_help(help_key), font=font(px(14)), fill=TEXT, anchor="rm")
+    room = clock_box(layout, help_key).left - 2 * px(16)
+    title = shortened(panel.title or "Nephron", px(17), room)
+    draw.text((px(16), middle), title, font=font(px(17)), fill=TEXT, anchor="lm")
+
+
+def _of_help(key: str) -> str:
+    return f"{key}  all keys"
+
+
+def clock_box(layout: Layout, help_key: str = "H") -> Rect:
+    """Where the clock is, in the title's row, left of what is said of the help."""
+    px = layout.px
+    right = layout.title.right - 2 * px(16) - int(font(px(14)).getlength(_of_help(help_key)))
+    return Rect(right - px(CLOCK_WIDTH), 0, px(CLOCK_WIDTH), layout.title.height - 1)
+
+
+def clock_picture(layout: Layout, box: Rect, clock: str, pace: str) -> np.ndarray:
+    """The session's time, and before it how slowly that goes, uint8, shape of the box."""
+    image = Image.new("RGB", (box.width, box.height), STRIP)
+    draw, letters, middle = ImageDraw.Draw(image), font(layout.px(14)), layout.title.height // 2
+    draw.text((box.width, middle), clock, font=letters, fill=TEXT, anchor="rm")
+    right = box.width - int(letters.getlength(clock)) - layout.px(12)
+    draw.text((right, middle), pace, font=letters, fill=ALERT, anchor="rm")
+    return np.asarray(image)
+
+
+def help_picture(layout: Layout, groups: Mapping[str, list[tuple[str, str]]]) -> np.ndarray:
+    """All keys and what they do, group by group, uint8, shape (height, width, 3)."""
+    box, px = layout.whole, layout.px
+    image = Image.new("RGB", (box.width, box.height), HELP)
+    draw = ImageDraw.Draw(image)
+    columns = in_columns(groups)
+    pitch = (box.height - px(28)) / max(map(len, columns))
+    width, gap = box.width // HELP_COLUMNS - 2 * px(16), px(HELP_GAP_PX)
+    rows = [row for lines in groups.values() for row in lines]
+    size = fitting_size(rows, width - gap, min(int(0.75 * pitch), px(HELP_PX)))
+    key_width = max(font(size).getlength(key) for key, _ in rows)
+    for number, column in enumerate(columns):
+        x = px(16) + number * box.width // HELP_COLUMNS + key_width
+        for place, (key, text) in enumerate(column):
+            y = px(14) + (place + 0.5) * pitch
+            draw.text((x, y), key, font=font(size), fill=MARK, anchor="rm")
+            draw.text((x + gap, y), text, font=font(size), fill=TEXT if key else QUIET, anchor="lm")
+    return np.asarray(image)
+
+
+def in_columns(groups: Mapping[str, list[tuple[str, str]]]) -> list[list[tuple[str, str]]]:
+    """Groups of rows in HELP_COLUMNS columns, none of them torn, each under its name, an empty row between them."""
+    blocks = [[("", name), *rows, ("", "")] for name, rows in groups.items()]
+    columns: list[list[tuple[str, str]]] = [[] for _ in range(HELP_COLUMNS)]
+    share = sum(map(len, blocks)) / HELP_COLUMNS
+    for block in blocks:
+        column = next((each for each in columns if len(each) + len(block) / 2 <= share), columns[-1])
+        column += block
+    return columns
+
+
+def readout_picture(layout: Layout, readouts: Mapping[str, str]) -> np.ndarray:
+    """Names and values, one line each, as many as there is room for, uint8, shape of layout.readouts."""
+    box = layout.readouts
+    image = Image.new("RGB", (box.width, box.height), STRIP)
+    draw = ImageDraw.Draw(image)
+    draw.line([(0, 0), (box.width, 0)], fill=LINE)
+    room = box.height - 2 * FIGURES_PAD
+    pitch = min(layout.px(FIGURE_HEIGHT), max(LEAST_PITCH, room // max(1, len(readouts))))
+    _draw_figures(draw, box, first_of(readouts, room // pitch), "", pitch)
+    return np.asarray(image)
+
+
+def findings_picture(layout: Layout, findings: Mapping[str, str], alert: str = "") -> np.ndarray:
+    """Names and values, uint8, shape of layout.findings(their count); the one that ``alert`` names stands out."""
+    box = layout.findings(len(findings))
+    image = Image.new("RGB", (box.width, box.height), FINDINGS)
+    draw = ImageDraw.Draw(image)
+    draw.rectangle([0, 0, box.width - 1, box.height - 1], outline=ALERT if alert else LINE)
+    _draw_figures(draw, box, findings, alert, layout.px(FIGURE_HEIGHT))
+    return np.asarray(image)
+
+
+def first_of(figures: Mapping[str, str], most: int) -> dict[str, str]:
+    """The first figures, so many at most."""
+    return dict(islice(figures.items(), most))
+
+
+def _draw_figures(
+    draw: ImageDraw.ImageDraw, box: Rect, figures: Mapping[str, str], alert: str, pitch: float
+) -> None:
+    room, most = box.width - FIGURES_GAP_PX, int(0.68 * pitch)
+    size = min(
+        (fitting_size([(f"{name}  {value}",)], room, most) for name, value in figures.items()), default=most
+    )
+    for i, (name, value) in enumerate(figures.items()):
+        y = FIGURES_PAD + (i + 0.5) * pitch
+        colours = (ALERT, ALERT) if name == alert else (QUIET, TEXT)
+        draw.text((8, y), name, font=font(size), fill=colours[0], anchor="lm")
+        draw.text((box.width - 10, y), value or NOTHING, font=font(size), fill=colours[1], anchor="rm")

@@ -1,0 +1,207 @@
+"""The checking picture of an import: three slices with outlines, the surfaces, orientation letters, what was found."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import SimpleITK as sitk
+import trimesh
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+from scenes.patients.import_summary import told
+from scenes.patients.patient_import import Patient
+from scenes.patients.readers.label_maps import Colour
+from scenes.patients.readers.lazy_volume import AIR_HU
+from scenes.patients.readers.voxel_grid import VoxelGrid
+
+BACKGROUND, WARNING = "#101014", "#ffb000"
+PIXEL_MM = 0.5
+WINDOW_HU, LEVEL_HU = 400.0, 50.0
+COLOUR = {
+    "organ": "#ff8c69",
+    "tumour": "#ffe14d",
+    "cyst": "#4dd2ff",
+    "urine": "#b6ff6b",
+    "vessel": "#ff3b5c",
+    "support": "#b99cff",
+}
+WORD = {"organ": "kidney", "urine": "collecting system", "vessel": "vessels"}
+LEAST_BRIGHT = 0.85
+TEXT_WIDTH = 56
+# White with a black rim, to be read on bone and on air.
+LETTER: dict[str, Any] = dict(
+    color="white",
+    weight="bold",
+    ha="center",
+    va="center",
+    path_effects=[withStroke(linewidth=3, foreground="black")],
+)
+LIGHT = np.array([-0.4, -0.8, 0.45])  # from the front, the patient's right and above
+# From where surfaces are looked at, and to which side of the patient their light is turned.
+AZIMUTH = {"from the front": (-105, np.ones(3)), "from behind": (75, np.array([-1.0, -1.0, 1.0]))}
+# An overview is worth a panel that shows so many times the width.
+WIDER = 1.2
+
+
+@dataclass(frozen=True)
+class View:
+    """A cut as a radiologist sees it: where right and down of the picture point in the patient, and the letters there."""
+
+    name: str
+    right: tuple[int, int, int]
+    down: tuple[int, int, int]
+    letters: tuple[str, str, str, str]  # left, right, top, bottom
+
+
+VIEWS = (
+    View("axial, from the feet", (1, 0, 0), (0, 1, 0), ("R", "L", "A", "P")),
+    View("coronal, from the front", (1, 0, 0), (0, 0, -1), ("R", "L", "S", "I")),
+    View("sagittal, from the left", (0, 1, 0), (0, 0, -1), ("A", "P", "S", "I")),
+)
+WHOLE = View("coronal, the whole width", (1, 0, 0), (0, 0, -1), ("R", "L", "S", "I"))
+
+
+def draw_check(patient: Patient, rows: list[tuple[str, str]], folder: Path) -> None:
+    """Draw check.png into a folder: cuts through the tumour, or the organ where there is none, and all that was found."""
+    figure = Figure(figsize=(13, 9.6), facecolor=BACKGROUND)
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(2, 3, hspace=0.08, wspace=0.06)
+    grid.update(left=0.03, right=0.97, top=0.92, bottom=0.02)
+    draft = " (DRAFT, grown from a seed)" if patient.draft else ""
+    question = "is this the side, the organ and the way up that you expect?"
+    colour = "white"
+    if patient.cautions:
+        question, colour = "read the CAUTION, and compare with the patient", WARNING
+    figure.suptitle(f"{patient.side.upper()} KIDNEY{draft}: {question}", color=colour, fontsize=15)
+    colours = colours_of(patient)
+    surfaces = {"organ": patient.organ, **patient.parts}
+    middle = (patient.tumour or patient.organ).bounds.mean(axis=0)
+    around = {"support": patient.support, **surfaces}
+    for n, view in enumerate(VIEWS):
+        _draw_cut(figure.add_subplot(grid[0, n]), view, patient.ct, around, middle, colours)
+    _draw_surfaces(_solid(figure, grid[1, 0]), "from the front", surfaces, colours)
+    if is_wider(patient.overview, patient.ct):
+        _draw_cut(figure.add_subplot(grid[1, 1]), WHOLE, patient.overview, surfaces, middle, colours)
+    else:
+        _draw_surfaces(_solid(figure, grid[1, 1]), "from behind", surfaces, colours)
+    words = figure.add_subplot(grid[1, 2])
+    words.axis("off")
+    _draw_words(words, rows, {name: colours[name] for name in [*surfaces, "support"]})
+    figure.savefig(
+        folder / "check.png", dpi=100, facecolor=figure.get_facecolor(), metadata={"Software": None}
+    )
+
+
+def colours_of(patient: Patient) -> dict[str, Colour]:
+    """What organ, parts and support are drawn in: their files' own colours, made bright enough for a dark ground."""
+    own = {name: _bright(colour) for name, colour in patient.colours.items()}
+    return {name: to_rgb(colour) for name, colour in COLOUR.items()} | own
+
+
+def _bright(colour: Colour) -> Colour:
+    scale = max(1.0, LEAST_BRIGHT / max(*colour, 1e-3))
+    return colour[0] * scale, colour[1] * scale, colour[2] * scale
+
+
+def _draw_cut(
+    axes: Axes,
+    view: View,
+    ct: sitk.Image,
+    surfaces: dict[str, trimesh.Trimesh],
+    middle: np.ndarray,
+    colours: dict[str, Colour],
+) -> None:
+    right, down = np.array(view.right, float), np.array(view.down, float)
+    low, high = VoxelGrid.of(ct).bounds()
+    spans = [sorted((low @ axis, high @ axis)) for axis in (right, down)]
+    picture = cut(ct, right, down, spans, middle)
+    black = LEVEL_HU - WINDOW_HU / 2
+    extent = (*spans[0], spans[1][1], spans[1][0])
+    axes.imshow(
+        picture, cmap="gray", vmin=black, vmax=black + WINDOW_HU, extent=extent, interpolation="bilinear"
+    )
+    for name, surface in surfaces.items():
+        section = surface.section(np.cross(right, down), middle)
+        for line in [] if section is None else section.discrete:
+            axes.plot(line @ right, line @ down, color=colours[name], linewidth=1.4)
+    axes.set(xlim=extent[:2], ylim=extent[2:], xticks=[], yticks=[])
+    axes.set_title(view.name, color="white", fontsize=11)
+    for letter, place in zip(view.letters, ((0.03, 0.5), (0.97, 0.5), (0.5, 0.97), (0.5, 0.03)), strict=True):
+        axes.text(*place, letter, transform=axes.transAxes, fontsize=17, **LETTER)
+
+
+def cut(
+    image: sitk.Image, right: np.ndarray, down: np.ndarray, spans: list[list[float]], middle: np.ndarray
+) -> np.ndarray:
+    """HU on a plane through the middle, across two spans [mm]."""
+    across = np.cross(right, down)
+    origin = right * spans[0][0] + down * spans[1][0] + across * (middle @ across)
+    width, height = (int((high - low) / PIXEL_MM) + 1 for low, high in spans)
+    axes = np.column_stack([right, down, across])
+    plane = VoxelGrid((width, height, 1), np.full(3, PIXEL_MM), origin, axes)
+    return plane.sampled(image, sitk.sitkLinear, AIR_HU)[0]
+
+
+def is_wider(overview: sitk.Image, ct: sitk.Image) -> bool:
+    """Whether an overview shows more of the body's width than a CT that was cut out of it."""
+    width_mm, shown_mm = (
+        np.ptp([corner[0] for corner in VoxelGrid.of(each).bounds()]) for each in (overview, ct)
+    )
+    return bool(width_mm > WIDER * shown_mm)
+
+
+def _solid(figure: Figure, place: Any) -> Any:
+    return figure.add_subplot(place, projection="3d", facecolor=BACKGROUND)
+
+
+def _draw_surfaces(
+    axes: Any, view: str, surfaces: dict[str, trimesh.Trimesh], colours: dict[str, Colour]
+) -> None:
+    """The surfaces from the front or from behind, a little from aside and above."""
+    azimuth_deg, towards = AZIMUTH[view]
+    corners = np.concatenate([surface.bounds for surface in surfaces.values()])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    light = towards * LIGHT / np.linalg.norm(LIGHT)
+    for name, surface in reversed(surfaces.items()):
+        shade = 0.35 + 0.65 * np.clip(surface.face_normals @ light, 0, 1)
+        opacity = 0.45 if name == "organ" and len(surfaces) > 1 else 1.0
+        faces = np.column_stack([shade[:, None] * np.array(colours[name]), np.full(len(shade), opacity)])
+        axes.add_collection3d(
+            Poly3DCollection(surface.triangles, facecolors=faces, edgecolors=faces, linewidths=0.2)
+        )
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    axes.set_box_aspect(high - low, zoom=1.1)
+    axes.set_proj_type("ortho")
+    axes.view_init(elev=12, azim=azimuth_deg)
+    axes.set_axis_off()
+    axes.set_title(f"surface, {view}", color="white", fontsize=11, y=1.12)
+    x, y, z = (low + high) / 2
+    gap = 0.09 * (high - low).max()
+    for letter, place in {
+        "R": (low[0] - gap, y, z),
+        "L": (high[0] + gap, y, z),
+        "S": (x, y, high[2] + gap),
+        "I": (x, y, low[2] - gap),
+    }.items():
+        axes.text(*place, letter, fontsize=15, **LETTER)
+
+
+def _draw_words(axes: Axes, rows: list[tuple[str, str]], shown: dict[str, Colour]) -> None:
+    lines = []
+    for word, line in rows:
+        wrapped = textwrap.wrap(line, TEXT_WIDTH - 11) or [""]
+        lines += [(word, wrapped[0]), *(("", more) for more in wrapped[1:])]
+    place: dict[str, Any] = dict(transform=axes.transAxes)
+    axes.text(0.0, 0.95, told(lines), color="white", family="monospace", fontsize=8.5, va="top", **place)
+    for n, (name, colour) in enumerate(shown.items()):
+        left, low = 0.5 * (n % 2), 0.12 - 0.055 * (n // 2)
+        axes.text(left, low, WORD.get(name, name), color=colour, fontsize=11, weight="bold", **place)

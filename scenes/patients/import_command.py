@@ -1,0 +1,98 @@
+"""The command ``import``: a patient's folder, with a scene, out of a CT and its labels."""
+
+from pathlib import Path
+
+import click
+import numpy as np
+
+from scenes.patients.import_error import PatientError
+from scenes.patients.patient_folder import check_folder, save_patient
+from scenes.patients.readers.segment_names import Side
+from scenes.progress import bar
+from scenes.scene import scene_text
+from scenes.shell_quoting import pasted
+
+# Options that say which labels are of a tissue.
+TISSUE_OPTIONS = {"tumour": "tumour", "cyst": "cyst", "vessels": "vessel", "collecting": "urine"}
+LABEL = "Names or values of the labels"
+
+
+@click.command("import")
+@click.argument("ct", type=click.Path(path_type=Path))
+@click.argument("labels", type=click.Path(path_type=Path), nargs=-1)
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, help="Folder to write to; new or empty."
+)
+@click.option(
+    "--organ", help=f"{LABEL} that are the organ, such as 1,2 [named as a kidney; without names, all]."
+)
+@click.option("--tumour", help=f"{LABEL} of the tumour [by name].")
+@click.option("--cyst", help=f"{LABEL} of cysts [by name].")
+@click.option("--vessels", help=f"{LABEL} of blood vessels [by name].")
+@click.option("--collecting", help=f"{LABEL} of the collecting system [by name].")
+@click.option("--side", type=click.Choice(["left", "right"]), help="Which kidney, where there are both.")
+@click.option("--series", help="Number of the CT series, or the end of its uid [the best guess].")
+@click.option("--seed", help="X,Y,Z in mm, LPS: without labels, grow a draft of the kidney from there.")
+@click.option(
+    "--support",
+    default="mould",
+    show_default=True,
+    help="What the organ lies on: a mould of its underside, the bed that the labels around it make (labels), or a surface in a "
+    "file (LPS, mm).",
+)
+def import_patient_command(
+    ct: Path,
+    labels: tuple[Path, ...],
+    out: Path,
+    organ: str | None,
+    side: Side | None,
+    series: str | None,
+    seed: str | None,
+    support: str,
+    **words: str | None,
+) -> None:
+    """Make a patient's folder out of a CT and its LABELS.
+
+    The folder holds the scene to rehearse in.
+
+    CT: a folder with DICOM, a DICOMDIR or zip archive, a NIfTI, NRRD or MHA file. LABELS: label maps, a folder with a file
+    an organ, DICOM-SEG, RTSTRUCT; without them those that lie with the CT.
+    """
+    check_folder(out)
+    # What draws and what reads segmentations takes half a second that no other command should wait for.
+    from scenes.anatomy import patient_scene
+    from scenes.patients.check_picture import draw_check
+    from scenes.patients.import_request import Request, take_in
+    from scenes.patients.import_summary import facts, told
+
+    tissues = {TISSUE_OPTIONS[o]: label_words(text, o) for o, text in words.items() if text is not None}
+    own = [] if organ is None else label_words(organ, "organ")
+    place = None if seed is None else place_mm(seed)
+    patient, private = take_in(Request(ct, labels, own, tissues, side, series, place, support), bar)
+    rows = facts(patient)
+    texts = {"scene.toml": scene_text(patient_scene(patient))}
+    searched = save_patient(patient, out, texts, lambda folder: draw_check(patient, rows, folder), private)
+    rows.append(("private", f"{searched} names, ids, dates, uids, paths of the source: none is in the files"))
+    click.echo(told(rows))
+    click.echo(f"Written to {out}. Look at {out / 'check.png'}, then: {pasted('rehearse', out)}")
+
+
+def label_words(text: str, option: str) -> list[str]:
+    """Names or values of an option's text, such as "1,2"."""
+    words = [word.strip() for word in text.split(",")]
+    if not all(words):
+        raise PatientError(f"--{option} is {text!r}: expected names or values of labels, such as 1 or 1,2")
+    return words
+
+
+def place_mm(text: str) -> np.ndarray:
+    """A place in LPS [mm] of an option's text."""
+    try:
+        place = np.array([float(number) for number in text.split(",")])
+    except ValueError:
+        place = np.array([])
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise PatientError(
+            f"--seed is {text!r}: expected three numbers X,Y,Z in mm, LPS, such as -60,25,-310"
+        )
+    return place

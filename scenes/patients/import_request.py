@@ -1,0 +1,99 @@
+"""From paths and the user's words to a patient: finds CT and labels, puts them together, remembers what is private."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from scenes.patients.import_error import PatientError
+from scenes.patients.patient_import import Patient, import_patient
+from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.dicom_series import dicom_found
+from scenes.patients.readers.label_files import Drawing, drawing_of, open_labels
+from scenes.patients.readers.label_maps import LabelMap, merged, with_tissues
+from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.segment_names import Side
+from scenes.patients.region_growing import grown
+from scenes.progress import Progress, silent
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the user asked for: paths, and words on labels, by names or values."""
+
+    ct: Path
+    labels: Sequence[Path] = ()
+    organ: Sequence[str] = ()
+    tissues: Mapping[str, Sequence[str]] = field(default_factory=dict)  # tissue -> labels
+    side: Side | None = None
+    series: str | None = None
+    seed_mm: np.ndarray | None = None  # (3,) LPS; instead of labels
+    support: str = "mould"
+
+
+def take_in(request: Request, progress: Progress = silent) -> tuple[Patient, set[str]]:
+    """Import a patient, and what of its source none of its files may hold. Raises PatientError."""
+    if not request.ct.exists():
+        raise PatientError(f"{request.ct}: no such file or folder; check the path")
+    if request.seed_mm is not None:
+        if request.labels or request.organ or request.tissues:
+            raise PatientError(
+                "--seed grows the organ where there are no labels: give it, or labels, not both"
+            )
+        drawings: list[Drawing] = []
+        volume = open_ct(request.ct, request.series, progress=progress)
+        labels = grown(volume, request.seed_mm)
+        notes: tuple[str, ...] = ()
+    else:
+        volume, drawings, labels = with_labels(request, progress)
+        notes = tuple(note for drawing in drawings for note in drawing.notes)
+    organ = labels.called(request.organ) if request.organ else None
+    patient = import_patient(
+        volume,
+        labels,
+        organ,
+        request.side,
+        support=request.support,
+        needed=set(request.tissues),
+        progress=progress,
+    )
+    private = set(volume.secrets).union(*(drawing.secrets for drawing in drawings))
+    is_draft = request.seed_mm is not None
+    return replace(patient, notes=(*patient.notes, *notes), draft=is_draft), private | _paths(request)
+
+
+def with_labels(request: Request, progress: Progress) -> tuple[Volume, list[Drawing], LabelMap]:
+    """A CT, the labels found for it, and one map of them all with the user's words on it. Raises PatientError."""
+    words = [*request.organ, *(word for several in request.tissues.values() for word in several)]
+    drawings = [open_labels(path, words, progress) for path in request.labels]
+    drawings = drawings or [_beside(request.ct, progress)]
+    referenced = next((drawing.referenced for drawing in drawings if drawing.referenced), "")
+    volume = open_ct(request.ct, request.series, referenced, progress)
+    for drawing in drawings:
+        frames = {drawing.frame_of_reference, volume.frame_of_reference} - {""}
+        if len(frames) > 1:
+            raise PatientError(
+                f"{request.ct}: the labels were drawn in another frame of reference than this series; expected the CT that they "
+                "were drawn on; choose it with --series, or give its folder"
+            )
+    maps = [one for drawing in drawings for one in drawing.maps(volume.grid)]
+    return volume, drawings, merged(with_tissues(maps, request.organ, request.tissues))
+
+
+def _beside(ct: Path, progress: Progress) -> Drawing:
+    """The labels that lie with a CT."""
+    found = drawing_of(dicom_found(ct, progress)) if ct.is_dir() else None
+    if found is None:
+        raise PatientError(
+            f"{ct}: no labels lie with this CT; give a file or folder with LABELS, or --seed X,Y,Z for a draft"
+        )
+    return found
+
+
+def _paths(request: Request) -> set[str]:
+    """The paths of the source, as they are and as they were given."""
+    given = [request.ct, *request.labels]
+    return {str(path.resolve()) for path in given} | {str(path) for path in given if len(path.parts) > 1}

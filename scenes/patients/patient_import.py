@@ -1,0 +1,299 @@
+"""Patient import: a CT and its labels become an organ's surface, what is in it, its support, its CT.
+
+Everything stays in patient coordinates: LPS [mm], +x to the patient's left, +y posterior, +z to the head, as
+DICOM has them. Voxels are cropped, and resampled only where a series is tilted or unevenly spaced.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import SimpleITK as sitk
+import trimesh
+
+from scenes.patients.bed_support import bed_of_file, bed_of_labels
+from scenes.patients.import_error import PatientError
+from scenes.patients.import_warnings import as_stone, in_fat, taken, turned
+from scenes.patients.moulded_support import mould
+from scenes.patients.organ_selection import (
+    GROWN,
+    INNER,
+    PARENCHYMA,
+    Organ,
+    check_volume,
+    midline_x,
+    organs,
+    single_out,
+)
+from scenes.patients.part_surfaces import (
+    colours_of_labels,
+    organ_surface,
+    parts_of,
+    surfaces_aside,
+    volume_ml,
+)
+from scenes.patients.readers.label_maps import Colour, LabelMap, nearest, present
+from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.segment_names import Side
+from scenes.patients.readers.voxel_grid import Box, VoxelGrid
+from scenes.progress import Progress, silent
+
+SUPINE_GRAVITY = np.array([0.0, 1.0, 0.0])  # as the CT was taken: on the back, posterior is down
+PLAUSIBLE_ORGAN_HU = (-150.0, 600.0)
+CUT_AREA_MM2 = 100.0  # a pole that just grazes the border is whole to within the thickness of a slice
+LEAST_OVERLAP = 0.99
+MOST_VOLUME_OFF = 0.05
+OVERVIEW_MM = 1.5
+# A CT of a body holds fat, if not air, and much that is brighter.
+FAT_HU, LEAST_SPAN_HU = -60, 200
+
+
+@dataclass(frozen=True)
+class Patient:
+    """One organ with what is in it and around it; meshes in LPS [mm], watertight, normals outward."""
+
+    ct: sitk.Image  # int16 [HU], cropped around the organ, original voxels and direction
+    labels: sitk.Image  # uint8 on the grid of `ct`: a tissue each
+    tissues: dict[int, str]  # what the labels are: 1 = kidney, 2 = tumour, and more where the import was told
+    organ: trimesh.Trimesh  # tumours and cysts included
+    parts: dict[str, trimesh.Trimesh]  # PARTS that are there, by tissue
+    support: trimesh.Trimesh
+    side: Side
+    volumes_ml: dict[str, float]  # of the labels: "organ" with all that is in it, and each part
+    overview: (
+        sitk.Image
+    )  # int16 [HU], the CT's whole width at the organ's level, coarse; not kept in a folder
+    spacing_mm: tuple[float, float, float]  # of the CT's voxels along the image's own axes
+    notes: tuple[str, ...] = ()  # what was chosen, left out, resampled
+    cautions: tuple[str, ...] = ()  # what looks wrong
+    colours: dict[str, Colour] = field(default_factory=dict)  # of organ and parts, where labels have one
+    draft: bool = False  # grown from a seed, and drawn by nobody
+
+    @property
+    def tumour(self) -> trimesh.Trimesh | None:
+        return self.parts.get("tumour")
+
+
+def tissue_codes(tissues: Sequence[str]) -> dict[str, int]:
+    """The value that each tissue has in a patient's label map: 1 = kidney, 2 = tumour, the rest by name from 3."""
+    others = sorted(set(tissues) - {"kidney", "tumour"})
+    return {"kidney": 1, "tumour": 2} | {tissue: code for code, tissue in enumerate(others, start=3)}
+
+
+def import_patient(
+    ct: Volume,
+    labels: LabelMap,
+    organ: Sequence[int] | None = None,
+    side: Side | None = None,
+    margin_mm: float = 60.0,
+    support: str = "mould",
+    needed: Collection[str] = (),
+    progress: Progress = silent,
+) -> Patient:
+    """Cut one organ out of a CT and its label map and build its surfaces and its support.
+
+    Args:
+        ct: scalar volume [HU]; read where the organ is.
+        labels: what is labelled, on any grid; surfaces are made on it, and the CT's labels by nearest neighbour.
+        organ: label values that together are the organ; None: those of a kidney by their names, or all that are nothing else.
+        side: which kidney, where the label map holds both, and a check where it holds one; needed where neither the CT
+            shows the body's whole width nor the labels say the side.
+        margin_mm: CT kept around the organ [mm].
+        support: what the organ lies on: a "mould" of its underside, the bed that surrounding "labels" make, or a file with a
+            surface.
+        needed: tissues that must be in the organ, because the user said where they are.
+        progress: shows how far it is.
+
+    Raises:
+        PatientError: one line that says what was found, what was expected and what to do.
+    """
+    at = _located(ct, labels, organ, side, margin_mm)
+    piece = at.piece
+    marks, tissues = _marks(labels, piece, at.grid, at.on_ct)
+
+    def of(*wanted: str) -> np.ndarray:
+        return np.isin(marks, [code for code, tissue in tissues.items() if tissue in wanted])
+
+    warned = (
+        *turned(at.level, at.level_hu, labels, at.midline),
+        *in_fat(at.grid, at.hounsfield, at.on_ct, of("kidney")),
+        *as_stone(at.grid, at.hounsfield, of("kidney", "cortex", "medulla", "sinus"), of("urine")),
+        *taken(labels, piece, organ is not None),
+    )
+    found = parts_of(labels, piece, needed)
+    with surfaces_aside(found) as parts_made:
+        surface = organ_surface(piece)
+        _check_surface(surface, piece)
+        bed = _support(support, surface, labels, piece)
+        parts = parts_made(progress)
+    return Patient(
+        ct=at.grid.image(at.hounsfield),
+        labels=at.grid.image(marks),
+        tissues=tissues,
+        organ=surface,
+        parts=parts,
+        support=bed,
+        side=at.side,
+        volumes_ml={"organ": piece.volume_ml, **{part: volume_ml(*found[part]) for part in parts}},
+        overview=_overview(at.level, at.level_hu),
+        spacing_mm=tuple(at.grid.spacing.tolist()),
+        notes=ct.notes,
+        cautions=warned,
+        colours=colours_of_labels(labels, [*parts]),
+    )
+
+
+@dataclass(frozen=True)
+class _Located:
+    """An organ in its CT: ``level`` is the CT at the height of all organs, ``grid`` the part around this one, each with its HU."""
+
+    piece: Organ
+    side: Side
+    midline: float | None
+    level: VoxelGrid
+    level_hu: np.ndarray
+    grid: VoxelGrid
+    hounsfield: np.ndarray
+    on_ct: np.ndarray  # which voxels of that part are the organ
+
+
+def _located(
+    ct: Volume, labels: LabelMap, organ: Sequence[int] | None, side: Side | None, margin_mm: float
+) -> _Located:
+    """The one organ that is asked for, whole and in soft tissue. Raises PatientError."""
+    if not margin_mm >= 0:
+        raise PatientError(f"the margin is {margin_mm} mm: expected 0 or more")
+    pieces = organs(labels, organ)
+    slab, level_hu = _level(ct, pieces, margin_mm)
+    level = ct.grid.part(slab)
+    heights = np.concatenate([piece.grid.corners()[:, 2] for piece in pieces])
+    midline = midline_x(level, level_hu, heights.min(), heights.max())
+    piece, told_side = single_out(pieces, midline, side)
+    check_volume(piece)
+    _check_overlap(ct.grid, piece)
+    grid, hounsfield = _cropped(ct.grid, slab, level_hu, piece, margin_mm)
+    on_ct = nearest(piece.grid, piece.mask, grid)
+    _check_place(ct.grid, grid, on_ct, hounsfield, piece)
+    return _Located(piece, told_side, midline, level, level_hu, grid, hounsfield, on_ct)
+
+
+def _support(kind: str, organ: trimesh.Trimesh, labels: LabelMap, piece: Organ) -> trimesh.Trimesh:
+    if kind == "labels":
+        own = [int(value) for value in np.unique(piece.values[piece.mask])]
+        return bed_of_labels(organ, labels, [*own, *labels.of_tissues(*INNER)], SUPINE_GRAVITY)
+    if kind != "mould":
+        return bed_of_file(Path(kind), organ)
+    try:
+        return mould(organ, SUPINE_GRAVITY)
+    except ValueError as error:
+        raise PatientError(f"no support fits under the organ: {error}; check the organ's label") from error
+
+
+def _level(ct: Volume, pieces: list[Organ], margin_mm: float) -> tuple[Box, np.ndarray]:
+    """The box of a CT at the height of all organs, and its HU: enough to tell sides and to crop from."""
+    if max(_overlap(ct.grid, piece) for piece in pieces) == 0:
+        raise PatientError(
+            "the labels lie outside the CT, with 0 % of the organ in it: expected both to overlap in patient coordinates; "
+            "choose labels that were drawn on this CT"
+        )
+    places = np.concatenate([piece.grid.corners() for piece in pieces])
+    low, high = ct.grid.bounds()
+    low[2], high[2] = places[:, 2].min() - margin_mm, places[:, 2].max() + margin_mm
+    box = ct.grid.box_around(low, high)
+    hounsfield = ct.hounsfield(box)
+    darkest, brightest = int(hounsfield.min()), int(hounsfield.max())
+    if darkest > FAT_HU or brightest - darkest < LEAST_SPAN_HU:
+        raise PatientError(
+            f"the CT holds values from {darkest} to {brightest}: expected HU, fat about -100 and air -1000; give the CT first, then the "
+            "labels, and export it with its rescale and without normalising"
+        )
+    return box, hounsfield
+
+
+def _overview(grid: VoxelGrid, hounsfield: np.ndarray) -> sitk.Image:
+    step = np.maximum(1, np.rint(OVERVIEW_MM / grid.spacing)).astype(int)
+    coarse = np.ascontiguousarray(hounsfield[:: step[2], :: step[1], :: step[0]])
+    return replace(grid, size=coarse.shape[::-1], spacing=grid.spacing * step).image(coarse)
+
+
+def _overlap(grid: VoxelGrid, piece: Organ) -> float:
+    """Share of an organ's voxels that lie within a grid."""
+    indices = np.argwhere(piece.mask)[:, ::-1]
+    found = grid.index(piece.grid.place(indices[:: max(1, len(indices) // 200_000)]))
+    return float(((found >= -0.5) & (found <= np.array(grid.size) - 0.5)).all(axis=1).mean())
+
+
+def _check_overlap(grid: VoxelGrid, piece: Organ) -> None:
+    share = _overlap(grid, piece)
+    if share < LEAST_OVERLAP:
+        raise PatientError(
+            f"{piece.title} lies in the CT with {share:.0%} of its voxels: expected a whole organ; choose a CT that shows all of "
+            "it, or the labels that were drawn on this one"
+        )
+
+
+def _cropped(
+    grid: VoxelGrid, slab: Box, hounsfield: np.ndarray, piece: Organ, margin_mm: float
+) -> tuple[VoxelGrid, np.ndarray]:
+    """The CT around the organ: its grid and its HU (z, y, x)."""
+    found = grid.index(piece.grid.corners())
+    rim = margin_mm / grid.spacing
+    low = np.floor(found.min(axis=0) - rim).astype(int)
+    high = np.ceil(found.max(axis=0) + rim).astype(int) + 1
+    box = tuple(
+        slice(max(int(a), s.start), min(int(b), s.stop)) for a, b, s in zip(low, high, slab, strict=True)
+    )
+    inner = tuple(slice(b.start - s.start, b.stop - s.start) for b, s in zip(box, slab, strict=True))
+    return grid.part(cast(Box, box)), np.ascontiguousarray(hounsfield[inner[::-1]])
+
+
+def _check_place(
+    whole: VoxelGrid, grid: VoxelGrid, on_ct: np.ndarray, hounsfield: np.ndarray, piece: Organ
+) -> None:
+    """Refuse what is no whole organ in soft tissue."""
+    first = np.rint(whole.index(grid.origin)).astype(int)
+    for axis in range(3):
+        at_border = {0: first[axis] == 0, -1: first[axis] + grid.size[axis] == whole.size[axis]}
+        ends = [on_ct.take(end, axis=2 - axis).sum() for end, there in at_border.items() if there]
+        cut = max(ends, default=0) * np.prod(grid.spacing) / grid.spacing[axis]
+        if cut > CUT_AREA_MM2:
+            raise PatientError(
+                f"{piece.title} is cut off at the border of the CT over {cut / 100:.1f} cm2: expected a whole "
+                "organ; choose a CT that shows all of it"
+            )
+    median = float(np.median(hounsfield[on_ct])) if on_ct.any() else 0.0
+    if not PLAUSIBLE_ORGAN_HU[0] <= median <= PLAUSIBLE_ORGAN_HU[1]:
+        raise PatientError(
+            f"{piece.title} has a median of {median:.0f} HU: expected soft tissue; check that the labels belong to "
+            "this CT and that the CT is in HU"
+        )
+
+
+def _check_surface(surface: trimesh.Trimesh, piece: Organ) -> None:
+    """Refuse a surface that leaves out some of its label."""
+    found_ml = surface.volume / 1000
+    if found_ml < (1 - MOST_VOLUME_OFF) * piece.volume_ml:
+        raise PatientError(
+            f"{piece.title} has {piece.volume_ml:.1f} ml, and its surface encloses {found_ml:.1f}: expected all of it; parts of it "
+            "hang together by a thread; mend the label, or name the organ's own with --organ"
+        )
+
+
+def _marks(
+    labels: LabelMap, piece: Organ, grid: VoxelGrid, on_ct: np.ndarray
+) -> tuple[np.ndarray, dict[int, str]]:
+    """Tissue codes (z, y, x) of the cropped CT, and what they are: the organ's own, and of other organs all that is there."""
+    values = nearest(labels.grid, labels.values, grid)
+    there = set(present(values))
+    tissue_of = {v: s.tissue for v, s in labels.segments.items() if v in there and s.tissue}
+    codes = tissue_codes(list(tissue_of.values()))
+    marks = on_ct.astype(np.uint8)
+    for value, tissue in tissue_of.items():
+        if tissue != "kidney":
+            here = values == value
+            marks[here & on_ct if tissue in (*GROWN, *PARENCHYMA) else here] = codes[tissue]
+    return marks, {code: tissue for tissue, code in codes.items()}

@@ -1,0 +1,34 @@
+"""A CT from whatever a hospital sends: DICOM folders, DICOMDIR, zip archives, NIfTI, NRRD, MetaImage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from scenes.patients.import_error import PatientError
+from scenes.patients.readers.dicom_series import dicom_found, series_volume
+from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.volume_readers import file_volume, is_volume_file
+from scenes.progress import Progress, silent
+
+
+def open_ct(
+    path: Path, series: str | None = None, referenced: str = "", progress: Progress = silent
+) -> Volume:
+    """Find a CT and say where its voxels are; they are read when they are asked for.
+
+    Args:
+        path: a folder with DICOM files, in subfolders too; a DICOMDIR; a zip archive of DICOM files; an enhanced CT;
+            a .nii, .nii.gz, .nrrd, .nhdr, .mha or .mhd file.
+        series: number or uid (or its end) of the series, where there are several.
+        referenced: uid of the series that labels were drawn on, which is the best guess.
+
+    Raises:
+        PatientError: nothing readable, or nothing that is one whole, upright CT; a line for the user.
+    """
+    if not path.exists():
+        raise PatientError(f"{path}: no such file or folder; check the path")
+    if path.is_file() and is_volume_file(path):
+        if series is not None:
+            raise PatientError(f"{path}: holds no series; leave --series out")
+        return file_volume(path)
+    return series_volume(path, dicom_found(path, progress), series, referenced, progress)

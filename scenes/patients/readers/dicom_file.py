@@ -1,0 +1,102 @@
+"""One DICOM data set from an open file: damage is said in words, and memory is bounded."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+import zlib
+from typing import Any, BinaryIO
+
+import pydicom
+from pydicom import config
+from pydicom.dataset import Dataset, FileDataset
+from pydicom.uid import ExplicitVRLittleEndian, ImplicitVRLittleEndian
+
+from scenes.patients.import_error import PatientError
+
+# A value that breaks the standard is found where it matters; warnings and logs would print it, whatever it says of whom.
+config.settings.reading_validation_mode = config.IGNORE
+logging.getLogger("pydicom").setLevel(logging.CRITICAL)
+
+MAGIC_AT, MAGIC = 128, b"DICM"
+MEDIA_DIRECTORY = "1.2.840.10008.1.3.10"
+# A deflated data set names its syntax in its meta header; after it there may be a bomb.
+DEFLATED, MOST_INFLATED = b"1.2.840.10008.1.2.1.99", 2 * 2**30
+
+
+def looks_like_dicom(start: bytes) -> bool:
+    """Whether a file's first 132 bytes are DICOM's: a preamble, or a data set without one (group 8, little endian)."""
+    return start[MAGIC_AT:] == MAGIC or (start[:2] in (b"\x08\x00", b"\x02\x00") and start[3:4] == b"\x00")
+
+
+def parsed(file: BinaryIO, name: str, **options: Any) -> FileDataset:
+    """A DICOM data set, read with pydicom's options; memory is bounded and faults are in words. Raises PatientError."""
+    try:
+        start = file.read(4096)
+        file.seek(0)
+        if start[MAGIC_AT : MAGIC_AT + 4] == MAGIC:
+            _check_inflated(file, name)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            data = pydicom.dcmread(file, force=start[MAGIC_AT : MAGIC_AT + 4] != MAGIC, **options)
+            if "TransferSyntaxUID" not in data.file_meta:
+                implicit = data.original_encoding[0]
+                data.file_meta.TransferSyntaxUID = (
+                    ImplicitVRLittleEndian if implicit else ExplicitVRLittleEndian
+                )
+            return data
+    except PatientError:
+        raise
+    except Exception as error:  # a parser's faults are many; all of them are the file's
+        raise PatientError(
+            f"{name}: a damaged DICOM file ({type(error).__name__}); copy or export it again"
+        ) from error
+
+
+def _check_inflated(file: BinaryIO, name: str) -> None:
+    """Refuse a deflated data set that would fill the memory. Its meta header's own length may lie."""
+    at, deflated = MAGIC_AT + 4, False
+    while True:
+        file.seek(at)
+        head = file.read(12)
+        if len(head) < 8 or head[:2] != b"\x02\x00":
+            break
+        long = head[4:6] in (b"OB", b"OW", b"UN", b"UT", b"SQ", b"OD", b"OF", b"OL", b"OV", b"UC", b"UR")
+        length = int.from_bytes(head[8:12] if long else head[6:8], "little")
+        at += (12 if long else 8) + length
+        if head[2:4] == b"\x10\x00":
+            file.seek(at - length)
+            deflated = file.read(min(length, 64)).strip(b"\0 ") == DEFLATED
+    if not deflated:
+        file.seek(0)
+        return
+    file.seek(at)
+    inflater, size = zlib.decompressobj(-zlib.MAX_WBITS), 0
+    while (chunk := file.read(1 << 16)) and not inflater.eof:
+        while chunk:
+            size += len(inflater.decompress(chunk, 1 << 22))
+            chunk = inflater.unconsumed_tail
+            if size > MOST_INFLATED:
+                raise PatientError(
+                    f"{name}: inflates to more than 2 GiB; expected one CT; export it uncompressed"
+                )
+    file.seek(0)
+
+
+def text_of(name: str, header: Dataset, keyword: str) -> str:
+    """A value as text; empty where there is none. Raises PatientError where it is damaged."""
+    try:
+        found = header.get(keyword)
+    except Exception as error:  # a parser's faults are many; all of them are the file's
+        raise PatientError(
+            f"{name}: a damaged DICOM file ({keyword}: {type(error).__name__}); copy or export it again"
+        ) from error
+    return "" if found is None else str(found)
+
+
+def is_directory(header: FileDataset) -> bool:
+    """Whether a data set is a medium's DICOMDIR."""
+    try:
+        return str(header.file_meta.get("MediaStorageSOPClassUID", "")) == MEDIA_DIRECTORY
+    except Exception:  # a damaged meta header is no directory's
+        return False

@@ -1,0 +1,254 @@
+"""The headers of DICOM files: which slice of which series lies where. Pixels stay where they are."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from pydicom.dataset import Dataset, FileDataset
+
+from scenes.patients.import_error import PatientError
+from scenes.patients.readers.dicom_file import is_directory, parsed, text_of
+from scenes.patients.readers.dicom_source import Item
+
+CT_CLASSES = {
+    "1.2.840.10008.5.1.4.1.1.2",
+    "1.2.840.10008.5.1.4.1.1.2.1",  # enhanced
+    "1.2.840.10008.5.1.4.1.1.2.2",  # legacy converted enhanced
+}
+SEGMENTATIONS = {"1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7"}
+STRUCTURE_SET = "1.2.840.10008.5.1.4.1.1.481.3"
+MOST_PIXELS = 8192 * 8192
+TAGS = [
+    "SOPClassUID",
+    "SOPInstanceUID",
+    "Modality",
+    "SeriesInstanceUID",
+    "SeriesNumber",
+    "InstanceNumber",
+    "ImageType",
+    "FrameOfReferenceUID",
+    "ImagePositionPatient",
+    "ImageOrientationPatient",
+    "PixelSpacing",
+    "Rows",
+    "Columns",
+    "NumberOfFrames",
+    "RescaleSlope",
+    "RescaleIntercept",
+    "RescaleType",
+    "PixelPaddingValue",
+    "PixelPaddingRangeLimit",
+    "BurnedInAnnotation",
+    "SamplesPerPixel",
+    "SharedFunctionalGroupsSequence",
+    "PerFrameFunctionalGroupsSequence",
+]
+MODALITY = re.compile("[A-Z]{2,8}")
+LOCALIZERS = {"LOCALIZER", "SCOUT", "TOPOGRAM"}
+# Third and fourth values of ImageType whose pixels are no HU.
+NOT_HU = {
+    "PERFUSION",
+    "RCBF",
+    "RCBV",
+    "MTT",
+    "TTP",
+    "ANGIO",
+    "DENSITY_MAP",
+    "MAT_FRACTION",
+    "MAT_SPECIFIC",
+    "EFF_ATOMIC_NUM",
+}
+
+
+@dataclass(frozen=True)
+class Slice:
+    """One slice of a CT: a file, or a frame of one."""
+
+    item: Item
+    frame: int | None  # None in a file with one slice
+    number: int | None  # InstanceNumber, or the frame's number from 1
+    sop: str
+    position: np.ndarray  # (3,) middle of the first pixel, LPS [mm]
+    row: np.ndarray  # (3,) along which the column index grows
+    column: np.ndarray  # (3,) along which the row index grows
+    spacing: tuple[float, float]  # along row and column [mm]
+    columns: int
+    rows: int
+    slope: float
+    intercept: float
+    is_rescaled: bool  # whether its header says how stored values become HU
+    padding: tuple[int, int] | None  # raw values between which pixels mean nothing
+
+    @property
+    def label(self) -> str:
+        """How errors name it."""
+        return f"slice {'without a number' if self.number is None else self.number} ({self.item.name})"
+
+
+@dataclass
+class Series:
+    """The slices of one SeriesInstanceUID, in the order of their files."""
+
+    uid: str
+    number: str
+    frame_of_reference: str = ""
+    slices: list[Slice] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)  # slices that cannot be used, a line each
+    localizers: int = 0
+
+
+@dataclass
+class Found:
+    """What DICOM files hold."""
+
+    series: dict[str, Series] = field(default_factory=dict)
+    segmentations: list[Item] = field(default_factory=list)  # DICOM-SEG
+    structure_sets: list[Item] = field(default_factory=list)  # RTSTRUCT
+    others: dict[str, int] = field(default_factory=dict)  # what else there is, by modality
+
+
+def read_headers(items: list[Item], progress: Callable[[Iterable[Item]], Iterable[Item]] = iter) -> Found:
+    """Sort DICOM files by what they are. Raises PatientError where one is cut off."""
+    found = Found()
+    for item in progress(items):
+        header = read_header(item)
+        sop_class = text_of(item.name, header, "SOPClassUID")
+        if not sop_class and is_directory(header):
+            continue
+        if sop_class in SEGMENTATIONS:
+            found.segmentations.append(item)
+        elif sop_class == STRUCTURE_SET:
+            found.structure_sets.append(item)
+        elif sop_class in CT_CLASSES:
+            _add_slices(found, item, header)
+        elif not sop_class and header.preamble is not None:
+            raise PatientError(
+                f"{item.name}: a damaged DICOM file (it says not what it is); copy or export it again"
+            )
+        else:
+            what = text_of(item.name, header, "Modality")
+            # Anything else may be free text, which may name the patient.
+            what = what if MODALITY.fullmatch(what) else "files of no known kind"
+            found.others[what] = found.others.get(what, 0) + 1
+    return found
+
+
+def read_header(item: Item, tags: list[str] | None = TAGS) -> FileDataset:
+    """A file's elements but its pixels, all of them with tags None. Raises PatientError."""
+    with item.open() as file:
+        return parsed(file, item.name, stop_before_pixels=True, specific_tags=tags)
+
+
+def _add_slices(found: Found, item: Item, header: Dataset) -> None:
+    uid, number = text_of(item.name, header, "SeriesInstanceUID"), text_of(item.name, header, "SeriesNumber")
+    series = found.series.setdefault(uid, Series(uid, number if number.isdecimal() else "without a number"))
+    series.frame_of_reference = text_of(item.name, header, "FrameOfReferenceUID")
+    try:
+        for slice_ in slices_of(item, header):
+            if slice_ is None:
+                series.localizers += 1
+            else:
+                series.slices.append(slice_)
+    except PatientError as error:
+        series.faults.append(str(error))
+    except Exception as error:  # values that are no numbers, and groups that are not there
+        series.faults.append(f"{item.name}: its header cannot be understood ({type(error).__name__})")
+
+
+def slices_of(item: Item, header: Dataset) -> Iterator[Slice | None]:
+    """The slices of one file; None for what shows a view and no slice."""
+    if str(header.get("BurnedInAnnotation", "NO")).upper() == "YES":
+        raise PatientError(f"{item.name}: has text burned into its pixels, which may name the patient")
+    if int(header.get("SamplesPerPixel", 1)) != 1:
+        raise PatientError(f"{item.name}: has colours; expected HU")
+    frames = header.get("PerFrameFunctionalGroupsSequence")
+    if frames is None:
+        if int(header.get("NumberOfFrames") or 1) > 1:
+            raise PatientError(f"{item.name}: holds {header.NumberOfFrames} frames, and not where they lie")
+        yield _slice(item, None, header.get("InstanceNumber"), [header], header)
+        return
+    shared = (header.get("SharedFunctionalGroupsSequence") or [Dataset()])[0]
+    if len(frames) != int(header.get("NumberOfFrames") or 1):
+        raise PatientError(
+            f"{item.name}: says {header.get('NumberOfFrames')} frames, and where {len(frames)} of them lie"
+        )
+    for n, frame in enumerate(frames):
+        yield _slice(item, n, n + 1, [*_groups(frame), *_groups(shared), header], header)
+
+
+def _groups(functional: Dataset) -> list[Dataset]:
+    """The single items of functional groups: each a macro's values."""
+    return [element.value[0] for element in functional if element.VR == "SQ" and element.value]
+
+
+def _slice(
+    item: Item, frame: int | None, number: Any, groups: list[Dataset], header: Dataset
+) -> Slice | None:
+    def value(name: str, usual: Any = None) -> Any:
+        found = (group.get(name) for group in groups if group.get(name) not in (None, ""))
+        return next(found, usual)
+
+    kind = {str(word).upper() for word in [*(value("ImageType") or []), *(value("FrameType") or [])]}
+    if kind & LOCALIZERS:
+        return None
+    if kind & NOT_HU:
+        raise PatientError(
+            f"{item.name}: its pixels are {', '.join(sorted(kind & NOT_HU))}; expected HU; give the CT that it was made from"
+        )
+    row, column = _orientation(item, value("ImageOrientationPatient"))
+    vertical, horizontal = _numbers(item, "PixelSpacing", value("PixelSpacing"), 2)
+    rows, columns = int(header.get("Rows", 0)), int(header.get("Columns", 0))
+    if min(vertical, horizontal) <= 0 or not 2 <= rows * columns <= MOST_PIXELS:
+        raise PatientError(f"{item.name}: {columns} x {rows} pixels of {horizontal:g} x {vertical:g} mm")
+    slope, intercept = float(value("RescaleSlope", 1)), float(value("RescaleIntercept", 0))
+    if not np.isfinite([slope, intercept]).all() or slope == 0:
+        raise PatientError(f"{item.name}: RescaleSlope is {slope:g} and RescaleIntercept {intercept:g}")
+    return Slice(
+        item=item,
+        frame=frame,
+        number=None if number in (None, "") else int(number),
+        sop=str(header.get("SOPInstanceUID", "")),
+        position=_numbers(item, "ImagePositionPatient", value("ImagePositionPatient"), 3),
+        row=row,
+        column=column,
+        spacing=(horizontal, vertical),
+        columns=columns,
+        rows=rows,
+        slope=slope,
+        intercept=intercept,
+        is_rescaled=value("RescaleIntercept") is not None,
+        padding=_padding(header),
+    )
+
+
+def _numbers(item: Item, name: str, found: Any, count: int) -> np.ndarray:
+    if found is None:
+        raise PatientError(f"{item.name}: says no {name}")
+    numbers = np.array([float(n) for n in found] if isinstance(found, Iterable) else [])
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        raise PatientError(f"{item.name}: {name} is not {count} numbers")
+    return numbers
+
+
+def _orientation(item: Item, found: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors along a slice's rows and columns, at right angles."""
+    both = _numbers(item, "ImageOrientationPatient", found, 6).reshape(2, 3)
+    lengths = np.linalg.norm(both, axis=1)
+    if np.abs(lengths - 1).max() > 0.01 or abs(both[0] @ both[1]) > 0.01:
+        raise PatientError(f"{item.name}: ImageOrientationPatient is not two directions at right angles")
+    row = both[0] / lengths[0]
+    column = both[1] - (both[1] @ row) * row
+    return row, column / np.linalg.norm(column)
+
+
+def _padding(header: Dataset) -> tuple[int, int] | None:
+    if header.get("PixelPaddingValue") in (None, ""):
+        return None
+    one = int(header.PixelPaddingValue)
+    limit = header.get("PixelPaddingRangeLimit")
+    other = one if limit in (None, "") else int(limit)
+    return min(one, other), max(one, other)

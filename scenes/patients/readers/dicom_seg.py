@@ -1,0 +1,98 @@
+"""Labels from DICOM: segmentation objects (binary, fractional, label map), by highdicom."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from dataclasses import replace
+
+import highdicom as hd
+import numpy as np
+
+from scenes.patients.import_error import PatientError
+from scenes.patients.readers.dicom_file import parsed
+from scenes.patients.readers.dicom_headers import read_header, slices_of
+from scenes.patients.readers.dicom_source import Item
+from scenes.patients.readers.label_maps import LabelMap, Segment
+from scenes.patients.readers.segment_names import tissue_of
+from scenes.patients.readers.slice_stack import stacked
+from scenes.patients.readers.voxel_grid import VoxelGrid
+
+# A voxel of a fractional segment is in it from this share on.
+HALF = 0.5
+# What stands for wholly inside where a segment is straightened; beyond its frames there is air.
+FULL_HU = 1000.0
+
+
+def read_segmentation(item: Item) -> tuple[list[LabelMap], list[str], str]:
+    """The segments of a DICOM-SEG, a map each; notes; and the uid of the series that it was drawn on.
+
+    Raises PatientError: damaged, or not in the patient's coordinates.
+    """
+    logging.getLogger("highdicom").setLevel(logging.ERROR)
+    with item.open() as file:
+        data = parsed(file, item.name)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            segmentation = hd.seg.Segmentation.from_dataset(data, copy=False)
+            found = _maps(item, segmentation)
+    except PatientError:
+        raise
+    except Exception as error:  # a parser's faults are many; all of them are the file's
+        raise PatientError(
+            f"{item.name}: cannot be read as a DICOM segmentation ({type(error).__name__}); expected evenly spaced frames in the "
+            "patient's coordinates; export it as a label map, for example NRRD"
+        ) from error
+    if not found:
+        raise PatientError(
+            f"{item.name}: is empty, no voxel is marked; expected an organ; choose another file"
+        )
+    fractional = segmentation.segmentation_type == hd.seg.SegmentationTypeValues.FRACTIONAL
+    notes = [f"fractional segments were cut at {HALF:.0%}"] if fractional else []
+    referenced = data.get("ReferencedSeriesSequence") or []
+    return found, notes, str(referenced[0].get("SeriesInstanceUID", "")) if referenced else ""
+
+
+def _maps(item: Item, segmentation: hd.seg.Segmentation) -> list[LabelMap]:
+    if segmentation.get("FrameOfReferenceUID") is None:
+        raise PatientError(
+            f"{item.name}: has no frame of reference, so it was drawn on no volume; expected labels of a CT; choose another file"
+        )
+    is_upright = segmentation.get_volume_geometry(allow_missing_positions=True) is not None
+    read = _upright if is_upright else _tilted
+    maps = []
+    for number in segmentation.segment_numbers:
+        if number == 0:  # background of a label map
+            continue
+        described = segmentation.get_segment_description(number)
+        segment = Segment.named(described.segment_label, int(number))
+        if segment.tissue is None:
+            segment = replace(segment, tissue=tissue_of(described.segmented_property_type.meaning))
+        one = LabelMap.single(*read(item, segmentation, int(number)), segment)
+        if one is not None:
+            maps.append(one)
+    return maps
+
+
+def _upright(item: Item, segmentation: hd.seg.Segmentation, number: int) -> tuple[VoxelGrid, np.ndarray]:
+    """A segment's grid, and which of its voxels (z, y, x) it holds."""
+    volume = segmentation.get_volume(segment_numbers=[number], allow_missing_positions=True)
+    place = np.array(volume.spacing), np.array(volume.position), np.array(volume.direction)
+    grid = VoxelGrid(volume.spatial_shape, *place).checked(item.name)
+    return grid, np.asarray(volume.array[..., 0] >= HALF).T
+
+
+def _tilted(item: Item, segmentation: hd.seg.Segmentation, number: int) -> tuple[VoxelGrid, np.ndarray]:
+    """The same of frames that lean, as a tilted gantry's slices do: straightened as those are, as if they were HU."""
+    most = float(segmentation.get("MaximumFractionalValue") or 1)
+    shared = segmentation.SharedFunctionalGroupsSequence[0].get("SegmentIdentificationSequence")
+    groups = segmentation.PerFrameFunctionalGroupsSequence
+    told = [frame.get("SegmentIdentificationSequence", shared)[0] for frame in groups]
+    own = [
+        replace(one, slope=FULL_HU / most, intercept=0.0)
+        for one, frame in zip(slices_of(item, read_header(item)), told, strict=True)
+        if one is not None and frame.ReferencedSegmentNumber == number
+    ]
+    stack = stacked(item.name, own)
+    return stack.grid, stack.read(stack.grid.whole()) >= HALF * FULL_HU

@@ -1,0 +1,153 @@
+"""Which CT series of many, and the volume that it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from scenes.patients.import_error import PatientError
+from scenes.patients.readers.dicom_headers import Found, Series, Slice, read_headers
+from scenes.patients.readers.dicom_source import items_of
+from scenes.patients.readers.identifiers import secrets_of
+from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.slice_stack import stacked
+from scenes.patients.readers.volume_readers import ENDINGS
+from scenes.progress import Progress
+
+# Slices in another view than this share of their series are scouts that do not say so.
+STRAY = 0.1
+# As much of a uid as tells series apart and is no number of one.
+UID_END = 6
+
+
+def dicom_found(path: Path, progress: Progress) -> Found:
+    """What the DICOM files of a folder, DICOMDIR or archive hold. Raises PatientError where there are none."""
+    items = items_of(path)
+    if not items and path.is_file():
+        raise PatientError(
+            f"{path}: unknown kind of file; expected DICOM (a folder, a DICOMDIR or a zip archive), or a file that ends in "
+            f"{', '.join(ENDINGS)}; convert it"
+        )
+    if not items:
+        raise PatientError(
+            f"{path}: no DICOM file in there; give the folder that holds the slices, or a NIfTI, NRRD or MHA file"
+        )
+    return read_headers(items, lambda files: progress(files, "headers"))
+
+
+def series_volume(
+    path: Path, found: Found, wanted: str | None, referenced: str, progress: Progress
+) -> Volume:
+    """The CT of a series: the wanted one, by number or uid, the one that labels refer to, or the best guess.
+
+    Raises PatientError: none, not that one, or one that is no whole volume.
+    """
+    candidates = [s for s in found.series.values() if s.slices or s.faults]
+    if not candidates:
+        raise PatientError(f"{path}: {_instead(found)}; expected a CT; give the folder of a CT series")
+    series, notes = _chosen(path, candidates, wanted, referenced)
+    if series.faults:
+        more = len(series.faults) - 1
+        fault = series.faults[0].removeprefix(f"{path.name}: ")
+        raise PatientError(
+            f"{path}: {fault}{f' (and {more} more files of this series)' if more else ''}; "
+            "export the series again"
+        )
+    slices, left_out = _one_view(series)
+    if series.localizers + left_out:
+        notes.append(f"left out, localisers: {series.localizers + left_out}")
+    if found.others:
+        others = ", ".join(f"{count} {what}" for what, count in sorted(found.others.items()))
+        notes.append(f"left out, no CT slices: {others}")
+    if not all(one.is_rescaled for one in slices):
+        notes.append("the files do not say how their values become HU: they were taken as HU")
+    stack = stacked(str(path), slices)
+    return Volume(
+        name=str(path),
+        grid=stack.grid,
+        read_box=lambda box: stack.read(box, lambda files: progress(files, "slices")),
+        notes=(*notes, *stack.notes),
+        frame_of_reference=series.frame_of_reference,
+        secrets=secrets_of(slices[0].item),
+    )
+
+
+def _instead(found: Found) -> str:
+    kinds = [f"{count} {what}" for what, count in sorted(found.others.items())]
+    kinds += [f"{len(found.segmentations)} SEG"] * bool(found.segmentations)
+    kinds += [f"{len(found.structure_sets)} RTSTRUCT"] * bool(found.structure_sets)
+    views = sum(series.localizers for series in found.series.values())
+    kinds += [f"{views} localisers"] * bool(views)
+    return f"no CT slices, but {', '.join(kinds)}" if kinds else "no CT slices"
+
+
+def _chosen(
+    path: Path, candidates: list[Series], wanted: str | None, referenced: str
+) -> tuple[Series, list[str]]:
+    """The series, and why, where there are several."""
+    ranked = sorted(candidates, key=lambda s: _rank(s, referenced), reverse=True)
+    numbers = [s.number for s in candidates]
+    listed = "; ".join(
+        _described(s, numbers.count(s.number) > 1)
+        for s in sorted(candidates, key=lambda s: (len(s.number), s.number))
+    )
+    if wanted is not None:
+        matching = [
+            s for s in candidates if s.number == wanted or (len(wanted) >= UID_END and s.uid.endswith(wanted))
+        ]
+        if len(matching) != 1:
+            what = "no series" if not matching else f"{len(matching)} series"
+            raise PatientError(
+                f"{path}: --series {wanted} is {what}; expected the number of one of these, or the end of its uid: {listed}"
+            )
+        return matching[0], []
+    best = ranked[0]
+    if len(candidates) == 1:
+        return best, []
+    why = "it shows most of the body in the thinnest slices"
+    if best.uid == referenced:
+        why = "the labels were drawn on it"
+    elif _rank(best, "")[:-1] == _rank(ranked[1], "")[:-1]:
+        why = "of several that are alike the lowest number"
+    return best, [
+        f"of {len(candidates)} series, number {best.number} was taken: {why}; there are: {listed}; --series N takes another"
+    ]
+
+
+def _rank(series: Series, referenced: str) -> tuple:
+    """Larger is better: drawn on, usable, axial, tall in steps of 5 cm, many slices."""
+    along = [float(s.position @ np.cross(s.row, s.column)) for s in series.slices] or [0.0]
+    axial = bool(series.slices) and abs(np.cross(series.slices[0].row, series.slices[0].column)[2]) > 0.9
+    number = float(series.number) if series.number.isdecimal() else 1e9
+    return (
+        series.uid == referenced,
+        not series.faults and len(series.slices) > 1,
+        axial,
+        round((max(along) - min(along)) / 50),
+        len(series.slices),
+        -number,
+    )
+
+
+def _described(series: Series, with_uid: bool) -> str:
+    """Number, slices and distance, and where that is not enough the end of the uid; free text may name the patient."""
+    places = np.unique([round(float(s.position @ np.cross(s.row, s.column)), 2) for s in series.slices])
+    gap = f", {np.median(np.diff(places)):.2f} mm apart" if len(places) > 1 else ""
+    uid = f", uid ends in {series.uid[-UID_END:]}" if with_uid else ""
+    return f"series {series.number} (CT, {len(series.slices)} slices{gap}{uid})"
+
+
+def _one_view(series: Series) -> tuple[list[Slice], int]:
+    """The slices without the few that show another view."""
+
+    def view(one: Slice) -> tuple:
+        return (*np.round(np.concatenate([one.row, one.column]), 2).tolist(), one.rows, one.columns)
+
+    views = [view(one) for one in series.slices]
+    main = max(views, key=views.count)
+    kept = [one for one, seen in zip(series.slices, views, strict=True) if seen == main]
+    stray = len(views) - len(kept)
+    if stray and stray <= STRAY * len(views):
+        return kept, stray
+    return series.slices, 0

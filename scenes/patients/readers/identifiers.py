@@ -1,0 +1,59 @@
+"""What a source says about a person, so that what an import wrote can be searched for it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from pydicom.dataelem import DataElement
+from pydicom.dataset import Dataset
+
+from scenes.patients.readers.dicom_headers import read_header
+from scenes.patients.readers.dicom_source import Item
+
+# Of DICOM's kinds of text those that name persons, dates and things; UI also holds standard uids, which name nobody.
+NAMING = ("PN", "DA", "DT", "UI")
+FREE_TEXT = ("LO", "SH", "ST", "LT", "UT", "UC", "UN", "AE")
+STANDARD_UID = "1.2.840.10008."
+# Free text that is the scanner's, of public groups.
+PERSONAL_KEYWORDS = (
+    "Patient", "Physician", "Operator", "Institution", "Accession", "StudyID", "StudyDescription", "SeriesDescription",
+    "Station", "SerialNumber", "Address", "Telephone", "Comments", "History", "Occupation", "Department", "Protocol",
+    "Requested", "Performed", "AdmissionID", "Issuer", "Reason", "Name",
+)  # fmt: skip
+
+
+def secrets_of(item: Item) -> frozenset[str]:
+    """Every name, id, date, institution, uid and private text of one DICOM file; of what cannot be parsed, its bytes."""
+    return frozenset(text for text in _texts(read_header(item, tags=None)) if text)
+
+
+def _texts(data: Dataset) -> Iterator[str]:
+    for tag in sorted(data.keys()):
+        try:
+            element = data[tag]
+            nested = list(element.value) if element.VR == "SQ" else []
+        except Exception:  # a parser's faults are many
+            yield from _plain(getattr(data.get_item(tag), "value", None))
+            continue
+        if element.VR == "SQ":
+            for one in nested:
+                yield from _texts(one)
+            continue
+        personal = element.tag.is_private or any(word in element.keyword for word in PERSONAL_KEYWORDS)
+        if element.VR in NAMING or (element.VR in FREE_TEXT and personal):
+            yield from _words(element)
+
+
+def _words(element: DataElement) -> Iterator[str]:
+    for value in element.value if element.VM > 1 else [element.value]:
+        for text in _plain(value):
+            yield text
+            if element.VR == "PN":
+                yield from (part for part in text.replace("=", "^").split("^") if part)
+
+
+def _plain(value: object) -> Iterator[str]:
+    """A value as text, where it is text that names somebody."""
+    text = (value.decode("latin-1") if isinstance(value, bytes) else str(value)).strip("\0 ")
+    if text.isprintable() and not text.startswith(STANDARD_UID):
+        yield text

@@ -1,0 +1,75 @@
+"""A volume that is known by its header, and read where it is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import psutil
+import SimpleITK as sitk
+
+from scenes.patients.import_error import PatientError
+from scenes.patients.readers.voxel_grid import Box, VoxelGrid
+
+AIR_HU = -1000
+PADDING_BELOW_HU = -1024
+LEAST_HU, MOST_HU = -32768, 32767
+# What a voxel takes until its organ is cropped: 4.8 bytes, measured on a label map and its CT.
+VOXEL_BYTES = 5
+
+
+@dataclass(frozen=True)
+class Volume:
+    """A scalar volume in the patient, on a disk or in memory."""
+
+    name: str  # for errors: the file or folder
+    grid: VoxelGrid
+    read_box: Callable[[Box], np.ndarray]  # voxels (z, y, x) of a box
+    notes: tuple[str, ...] = ()  # what was chosen, left out or resampled, for the user
+    frame_of_reference: str = ""  # DICOM's uid, where there is one
+    secrets: frozenset[str] = frozenset()  # what of the source no file of ours may hold
+
+    @classmethod
+    def of(cls, image: sitk.Image, name: str = "the image") -> Volume:
+        """A volume that is in memory already."""
+        # A view does not keep its image alive.
+        return cls(
+            name,
+            VoxelGrid.of(image),
+            lambda box: np.array(sitk.GetArrayViewFromImage(image)[box[::-1]]),
+        )
+
+    def read(self, box: Box | None = None) -> np.ndarray:
+        """Voxels (z, y, x) of a box, all of them without one. Raises PatientError: they are too many, or one is no number."""
+        box = box or self.grid.whole()
+        self._check_memory(box)
+        voxels = self.read_box(box)
+        if voxels.dtype.kind == "f":
+            count = int((~np.isfinite(voxels)).sum())
+            if count:
+                raise PatientError(
+                    f"{self.name}: {count} voxels are not finite numbers; export the volume again"
+                )
+        return voxels
+
+    def _check_memory(self, box: Box) -> None:
+        needed = VOXEL_BYTES * float(np.prod([float(a.stop - a.start) for a in box]))
+        free = psutil.virtual_memory().available
+        if needed > free:
+            raise PatientError(
+                f"{self.name}: takes {needed / 1e9:.1f} GB to read, and {free / 1e9:.1f} GB are free; close other programs, or "
+                "crop the volume around the kidney"
+            )
+
+    def hounsfield(self, box: Box | None = None) -> np.ndarray:
+        """HU (z, y, x) of a box as int16; what lies around the field of view is air."""
+        voxels = self.read(box)
+        if voxels.dtype != np.int16:
+            voxels = np.clip(np.rint(voxels), LEAST_HU, MOST_HU).astype(np.int16)
+        voxels[voxels < PADDING_BELOW_HU] = AIR_HU
+        return voxels
+
+    def image(self, box: Box | None = None) -> sitk.Image:
+        """The voxels of a box as an image, without metadata."""
+        return self.grid.part(box or self.grid.whole()).image(self.read(box))

@@ -1,0 +1,135 @@
+"""NIfTI, by nibabel: its RAS becomes LPS, and a file that does not say its orientation is refused."""
+
+from __future__ import annotations
+
+import logging
+import re
+import warnings
+from pathlib import Path
+from typing import Any, cast
+
+import nibabel
+import numpy as np
+
+from scenes.patients.import_error import PatientError
+from scenes.patients.readers.file_checks import check_size, cut_off, no_scalar, not_3d
+from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.voxel_grid import Box, VoxelGrid
+
+# What is wrong is said in an error.
+logging.getLogger("nibabel").setLevel(logging.CRITICAL)
+
+SLAB_VOXELS = 8_000_000
+# Not parsed as XML: all that is wanted is the names, and an extension may be anything.
+LABEL_ENTRY = re.compile(r'<Label\s[^<>]*?Key="(\d{1,5})"[^<>]*>(?:<!\[CDATA\[)?([^<>\]]{1,200})')
+MOST_NAMES_BYTES = 1 << 20
+MM_OF_UNIT = {"meter": 1000.0, "micron": 0.001}
+SCANNER_CODE = 1
+RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0])
+
+
+def nifti_volume(path: Path) -> Volume:
+    """The volume of a file. Raises PatientError: damaged, not 3D, sheared, or without its place in the patient."""
+    try:
+        image: Any = nibabel.load(path, keep_file_open=True)
+        header, shape = image.header, image.shape
+        kind = image.get_data_dtype()
+    except Exception as error:  # a parser's faults are many; all of them are the file's
+        raise PatientError(
+            f"{path}: cannot be read as NIfTI ({type(error).__name__}); expected a whole file; copy or export it again"
+        ) from error
+    while len(shape) > 3 and shape[-1] == 1:
+        shape = shape[:-1]
+    if len(shape) != 3:
+        raise not_3d(path, shape)
+    if kind.fields or kind.kind not in "iuf":
+        raise no_scalar(path, kind)
+    grid = _grid(path, header, shape).checked(str(path))
+    check_size(path, grid, kind.itemsize, path.stat().st_size, packed=path.name.lower().endswith(".gz"))
+    last = (0,) * (len(image.shape) - 3)
+
+    def read_box(box: Box) -> np.ndarray:
+        x, y, z = box
+        slabs = max(1, SLAB_VOXELS // (grid.size[0] * grid.size[1]))
+        planes = []
+        try:
+            for k in range(z.start, z.stop, slabs):
+                part = image.dataobj[(x, y, slice(k, min(k + slabs, z.stop)), *last)]
+                planes.append(_narrow(np.asarray(part)).T)
+        except Exception as error:  # a parser's faults are many; all of them are the file's
+            raise cut_off(path) from error
+        return np.concatenate(planes)
+
+    texts = [
+        str(header[key].item(), "latin-1").strip("\0 ")
+        for key in ("descrip", "aux_file", "intent_name", "db_name")
+        if key in header
+    ]
+    return Volume(str(path), grid, read_box, secrets=frozenset(text for text in texts if text))
+
+
+def label_names(path: Path) -> dict[int, str]:
+    """Names of label values, where a header's extension has Connectome Workbench's table of them, as TotalSegmentator writes."""
+    try:
+        image: Any = nibabel.load(path)
+        texts = [extension.get_content() for extension in image.header.extensions]
+    except Exception:  # a damaged extension names nothing
+        return {}
+    found: dict[int, str] = {}
+    for text in texts:
+        plain = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
+        for key, name in LABEL_ENTRY.findall(plain[:MOST_NAMES_BYTES]):
+            found[int(key)] = name.strip()
+    return found
+
+
+def _narrow(voxels: np.ndarray) -> np.ndarray:
+    """Whole numbers as integers: scaled or stored as float64 they take four times the memory."""
+    if voxels.dtype.kind != "f" or not np.isfinite(voxels).all():
+        return voxels
+    whole = np.rint(voxels)
+    if np.array_equal(whole, voxels) and np.abs(whole).max(initial=0) < 2**15:
+        return whole.astype(np.int16)
+    return voxels.astype(np.float32)
+
+
+def _grid(path: Path, header: Any, shape: tuple[int, ...]) -> VoxelGrid:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            unit = header.get_xyzt_units()[0]
+            forms = (
+                (int(header["sform_code"]), header.get_sform()),
+                (int(header["qform_code"]), header.get_qform()),
+            )
+        except Exception as error:  # a parser's faults are many; all of them are the file's
+            raise PatientError(
+                f"{path}: its place in the patient cannot be understood ({type(error).__name__}); export it again"
+            ) from error
+    affine = _affine(path, [form for form in forms if form[0] > 0], shape)
+    scale = MM_OF_UNIT.get(unit, 1.0)
+    columns = RAS_TO_LPS @ affine[:3, :3] * scale
+    spacing = np.linalg.norm(columns, axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        direction = columns / spacing
+    size = cast(tuple[int, int, int], tuple(shape))
+    return VoxelGrid(size, spacing, RAS_TO_LPS @ affine[:3, 3] * scale, direction)
+
+
+def _affine(path: Path, forms: list[tuple[int, np.ndarray]], shape: tuple[int, ...]) -> np.ndarray:
+    """RAS from indices (4, 4), of the one or two places that a header says; the scanner's where they disagree."""
+    if not forms:
+        raise PatientError(
+            f"{path}: says no orientation (sform and qform codes are 0), so left may be right; export it again with its orientation"
+        )
+    affine = forms[0][1]
+    corners = np.array(np.meshgrid(*[(0, n - 1) for n in shape], [1])).reshape(4, -1)
+    apart = max(np.abs((affine - other) @ corners).max() for _, other in forms)
+    if apart <= 0.5 * np.linalg.norm(affine[:3, :3], axis=0).min():
+        return affine
+    scanner = [other for code, other in forms if code == SCANNER_CODE]
+    if len(scanner) != 1:
+        raise PatientError(
+            f"{path}: sform and qform place it up to {apart:.1f} mm apart; expected one place; export it again"
+        )
+    return scanner[0]

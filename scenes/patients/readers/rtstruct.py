@@ -1,0 +1,113 @@
+"""Labels from DICOM: the contours of an RTSTRUCT, filled on the planes that they were drawn on."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydicom.dataset import Dataset
+from skimage.draw import polygon
+
+from scenes.patients.import_error import PatientError
+from scenes.patients.readers.dicom_file import parsed
+from scenes.patients.readers.dicom_source import Item
+from scenes.patients.readers.label_maps import LabelMap, Segment
+from scenes.patients.readers.voxel_grid import VoxelGrid
+
+# Part of a plane's distance by which a contour's points may lie off their plane.
+OFF_PLANE = 0.3
+MOST_POINTS = 20_000_000
+
+
+def read_contours(item: Item, ct: VoxelGrid) -> list[LabelMap]:
+    """The regions of an RTSTRUCT, a map each, with the pixels of a CT, on the planes of the contours.
+
+    Contours of one region on one plane take turns to be inside and outside, as a ring's do.
+    Raises PatientError: damaged, or drawn across the CT's slices.
+    """
+    with item.open() as file:
+        data = parsed(file, item.name)
+    try:
+        names = {int(roi.ROINumber): str(roi.get("ROIName", "")) for roi in data.StructureSetROISequence}
+        regions = [
+            (Segment.named(names.get(number, ""), number, _colour(roi)), _contours(roi))
+            for roi in data.ROIContourSequence
+            for number in [int(roi.ReferencedROINumber)]
+        ]
+    except Exception as error:  # a parser's faults are many; all of them are the file's
+        raise PatientError(
+            f"{item.name}: cannot be read as an RTSTRUCT ({type(error).__name__}); export it again"
+        ) from error
+    maps = []
+    for segment, contours in regions:
+        if contours:
+            maps.append(LabelMap.single(*_filled(item.name, contours, ct), segment))
+    found = [one for one in maps if one is not None]
+    if not found:
+        raise PatientError(f"{item.name}: holds no closed contour; expected an organ's; choose another file")
+    return found
+
+
+def referenced_series(data: Dataset) -> str:
+    """The uid of the series that a structure set was drawn on; empty where it does not say."""
+    try:
+        for frame in data.get("ReferencedFrameOfReferenceSequence") or []:
+            for study in frame.get("RTReferencedStudySequence") or []:
+                for series in study.get("RTReferencedSeriesSequence") or []:
+                    return str(series.get("SeriesInstanceUID", ""))
+    except Exception:  # a parser's faults are many; without it the best series is taken
+        return ""
+    return ""
+
+
+def _colour(roi: Dataset) -> tuple[float, float, float] | None:
+    given = roi.get("ROIDisplayColor")
+    if given is None or len(given) != 3:
+        return None
+    red, green, blue = (min(255, max(0, int(c))) / 255 for c in given)
+    return red, green, blue
+
+
+def _contours(roi: Dataset) -> list[np.ndarray]:
+    """Points (n, 3) of each closed contour, LPS [mm]."""
+    closed = [
+        c
+        for c in roi.get("ContourSequence") or []
+        if c.get("ContourGeometricType") in ("CLOSED_PLANAR", "CLOSEDPLANAR_XOR")
+    ]
+    points = [np.array(c.ContourData, float).reshape(-1, 3) for c in closed]
+    if sum(map(len, points)) > MOST_POINTS or not all(np.isfinite(p).all() for p in points):
+        raise ValueError
+    return [p for p in points if len(p) >= 3]
+
+
+def _filled(name: str, contours: list[np.ndarray], ct: VoxelGrid) -> tuple[VoxelGrid, np.ndarray]:
+    """A region's voxels, and their grid: a CT's pixels, on the planes of its contours."""
+    places = [ct.index(points) for points in contours]
+    ends = np.array(ct.size)
+    if any((place < -ends).any() or (place > 2 * ends).any() for place in places):
+        raise PatientError(
+            f"{name}: contours lie far outside this CT; expected contours on it; give the CT that they were drawn on"
+        )
+    heights = np.array([place[:, 2].mean() for place in places])
+    if max(np.ptp(place[:, 2]) for place in places) > 1:
+        raise PatientError(
+            f"{name}: contours run across the slices of this CT; expected contours on them; give the CT that they were drawn on"
+        )
+    planes = np.unique(np.round(heights, 2))
+    gaps = np.diff(planes)
+    step = float(gaps[gaps > OFF_PLANE].min()) if (gaps > OFF_PLANE).any() else 1.0
+    numbers = (heights - heights.min()) / step
+    if np.abs(numbers - np.rint(numbers)).max() > OFF_PLANE:
+        raise PatientError(
+            f"{name}: contours are unevenly spaced; expected one distance between planes; export it as a label map"
+        )
+    low = np.floor(np.min([p[:, :2].min(axis=0) for p in places], axis=0)).astype(int) - 1
+    high = np.ceil(np.max([p[:, :2].max(axis=0) for p in places], axis=0)).astype(int) + 1
+    size = (*(high - low + 1).tolist(), max(2, int(np.rint(numbers).max()) + 1))
+    spacing = ct.spacing * (1, 1, step)
+    origin = ct.place(np.array([low[0], low[1], heights.min()]))
+    grid = VoxelGrid(size, spacing, origin, ct.direction).checked(name)
+    inside = np.zeros(size[::-1], bool)
+    for place, number in zip(places, np.rint(numbers).astype(int), strict=True):
+        rows, columns = polygon(place[:, 1] - low[1], place[:, 0] - low[0], inside.shape[1:])
+        inside[number, rows, columns] ^= True
+    return grid, inside

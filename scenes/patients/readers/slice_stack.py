@@ -1,0 +1,259 @@
+"""CT slices in any order -> one upright, evenly spaced volume; what is missing, double or tilted is said or refused.
+
+A tilted gantry shears the stack: its slices stay as they are and are shifted in their own plane, so that nothing is
+interpolated between them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from scenes.patients.import_error import PatientError
+from scenes.patients.readers.dicom_headers import Slice
+from scenes.patients.readers.dicom_pixels import hounsfield
+from scenes.patients.readers.lazy_volume import AIR_HU
+from scenes.patients.readers.voxel_grid import Box, VoxelGrid
+
+# Part of a slice distance by which a slice may lie off the even grid: scanners round positions, to 0.1 mm at
+# worst, and a missing slice is off by a whole distance.
+UNEVEN = 0.1
+# Part of a pixel by which slices may be shifted sideways before they are shifted back.
+SIDEWAYS = 0.25
+# Pixels by which a slice may lie off the line of a tilted stack.
+OUT_OF_LINE = 1.0
+# Gantries tilt by 30 degrees at most.
+MOST_TILT = 45.0
+# Gaps between slices, as parts of the usual one, that are resampled; beyond them something is missing or double.
+GAPS = (0.5, 1.5)
+PARALLEL = 1e-3
+SAME_PLACE_MM = 1e-3
+MOST_GAP_MM = 10.0
+
+
+@dataclass(frozen=True)
+class Stack:
+    """Slices in order, and the upright, even grid that they are read onto."""
+
+    slices: list[Slice]
+    grid: VoxelGrid
+    planes: np.ndarray  # (n,) place of each slice along the grid's third axis, in voxels from its first
+    sideways: (
+        np.ndarray
+    )  # (n, 2) how far each slice's first pixel is from the grid's, in pixels along row and column
+    notes: tuple[str, ...]
+
+    def read(self, box: Box, progress: Callable[[Iterable[Slice]], Iterable[Slice]] = iter) -> np.ndarray:
+        """HU (z, y, x) int16 of a box of the grid."""
+        x, y, z = box
+        first = int(np.searchsorted(self.planes, z.start + UNEVEN, side="right")) - 1
+        last = int(np.searchsorted(self.planes, z.stop - 1 - UNEVEN, side="left"))
+        first, last = max(first, 0), min(last, len(self.slices) - 1)
+        used = range(first, last + 1)
+        voxels = np.empty((z.stop - z.start, y.stop - y.start, x.stop - x.start), np.int16)
+        before: tuple[float, np.ndarray] | None = None
+        k = z.start
+        pixels = hounsfield(list(progress([self.slices[n] for n in used])))
+        for n, plane in zip(used, pixels, strict=True):
+            here = float(self.planes[n]), self._shifted(plane, n)[y, x]
+            while k < z.stop and k <= here[0] + UNEVEN:
+                voxels[k - z.start] = _between(before, here, k)
+                k += 1
+            before = here
+        return voxels
+
+    def _shifted(self, plane: np.ndarray, n: int) -> np.ndarray:
+        """A slice on the grid's pixels; air beyond it."""
+        columns, rows, _ = self.grid.size
+        if plane.shape == (rows, columns) and not self.sideways[n].any():
+            return plane
+        right, down = self.sideways[n]
+        wide = np.full((rows, columns), AIR_HU, np.float32)
+        wide[: plane.shape[0], : plane.shape[1]] = plane
+        moved = ndimage.shift(wide, (down, right), order=1, mode="constant", cval=AIR_HU)
+        return np.rint(moved).astype(np.int16)
+
+
+def _between(before: tuple[float, np.ndarray] | None, after: tuple[float, np.ndarray], k: int) -> np.ndarray:
+    """The plane at k between two slices, or the nearer one where it is as good as there."""
+    if before is None or abs(after[0] - k) <= UNEVEN:
+        return after[1]
+    if abs(before[0] - k) <= UNEVEN:
+        return before[1]
+    share = np.float32((k - before[0]) / (after[0] - before[0]))
+    return np.rint(before[1] * (1 - share) + after[1] * share).astype(np.int16)
+
+
+def stacked(name: str, slices: list[Slice]) -> Stack:
+    """Put slices in order on one grid. Raises PatientError: too few, not parallel, one missing, double or in conflict."""
+    if len(slices) < 2:
+        raise PatientError(
+            f"{name}: one slice only; expected a series of slices; give the folder of the whole series"
+        )
+    _check_alike(name, slices)
+    normal = np.cross(slices[0].row, slices[0].column)
+    _check_phases(name, slices, normal)
+    notes: list[str] = []
+    slices = sorted(slices, key=lambda s: (float(s.position @ normal), s.number or 0))
+    slices = _once(name, slices, normal, notes)
+    if len(slices) < 2:
+        raise PatientError(f"{name}: all slices lie at one position; expected a stack; choose another series")
+    along = np.array([s.position @ normal for s in slices])
+    _check_gaps(name, slices, along)
+    planes, gap = _even(along, notes)
+    origin, sideways, size = _upright(name, slices, normal, notes)
+    direction = np.column_stack([slices[0].row, slices[0].column, normal])
+    planes_count = int(np.floor(planes[-1] + UNEVEN)) + 1
+    grid = VoxelGrid((*size, planes_count), np.array([*slices[0].spacing, gap]), origin, direction)
+    return Stack(slices, grid.checked(name), planes, sideways, tuple(notes))
+
+
+def _check_alike(name: str, slices: list[Slice]) -> None:
+    first = slices[0]
+    for other in slices[1:]:
+        turned = max(np.abs(other.row - first.row).max(), np.abs(other.column - first.column).max())
+        scaled = np.abs(np.subtract(other.spacing, first.spacing)).max() > 1e-3 * first.spacing[0]
+        if turned > PARALLEL or scaled or (other.rows, other.columns) != (first.rows, first.columns):
+            what = "orientation" if turned > PARALLEL else "pixel spacing" if scaled else "size"
+            raise PatientError(
+                f"{name}: {first.label} and {other.label} are of different {what}; expected one stack of parallel "
+                "slices; put the slices of one view in a folder of their own"
+            )
+
+
+def _check_phases(name: str, slices: list[Slice], normal: np.ndarray) -> None:
+    """Refuse several phases in one series: every place is there as often."""
+    places, counts = np.unique([round(float(s.position @ normal), 2) for s in slices], return_counts=True)
+    often = int(counts.min())
+    if (
+        len(places) > 2
+        and often > 1
+        and len({s.sop for s in slices}) == len(slices)
+        and not _alike(slices, normal)
+    ):
+        raise PatientError(
+            f"{name}: all {len(places)} positions are there {often} times: several phases in one series; expected one; put the slices "
+            "of one phase, which their acquisition numbers or times tell apart, in a folder of their own"
+        )
+
+
+def _alike(slices: list[Slice], normal: np.ndarray) -> bool:
+    """Whether the first two slices at one place are the same."""
+    first = min(slices, key=lambda s: float(s.position @ normal))
+    twin = [s for s in slices if abs((s.position - first.position) @ normal) < SAME_PLACE_MM][:2]
+    return len(twin) == 2 and _same(*twin)
+
+
+def _once(name: str, slices: list[Slice], normal: np.ndarray, notes: list[str]) -> list[Slice]:
+    """Slices that lie at one place: copies are left out, others in conflict."""
+    kept, copies = [slices[0]], []
+    for one in slices[1:]:
+        if (one.position - kept[-1].position) @ normal > SAME_PLACE_MM:
+            kept.append(one)
+        elif _same(one, kept[-1]):
+            copies.append(one)
+        else:
+            raise PatientError(
+                f"{name}: {kept[-1].label} and {one.label} lie at one position, {_at(one, normal)}, and differ; expected each "
+                "slice once; take out other phases, or the wrong copy"
+            )
+    if copies:
+        named = ", ".join(one.label for one in copies[:3]) + (" and others" if len(copies) > 3 else "")
+        notes.append(f"there twice, alike, and taken once: {named}")
+    return kept
+
+
+def _same(one: Slice, other: Slice) -> bool:
+    sideways = np.abs(one.position - other.position).max() <= SAME_PLACE_MM
+    mine, its = hounsfield([one, other])
+    return bool(sideways) and np.array_equal(mine, its)
+
+
+def _at(one: Slice, normal: np.ndarray) -> str:
+    return f"at {one.position @ normal:.2f} mm"
+
+
+def _check_gaps(name: str, slices: list[Slice], along: np.ndarray) -> None:
+    gaps = np.diff(along)
+    usual = float(np.percentile(gaps, 50, method="lower"))
+    least, most = GAPS
+
+    def pair(n: int) -> str:
+        (a, b), (at_a, at_b) = slices[n : n + 2], along[n : n + 2]
+        return f"{a.label} at {at_a:.2f} mm and {b.label} at {at_b:.2f} mm are {gaps[n]:.2f} mm apart, the others {usual:.2f} mm"
+
+    if gaps.max() > most * usual:
+        wide = int((gaps > most * usual).sum())
+        more = f" (and {wide - 1} more such gaps)" if wide > 1 else ""
+        raise PatientError(
+            f"{name}: {pair(int(np.argmax(gaps)))}{more}; expected no slice to be missing, and no gap over {most:g} times the usual; "
+            "copy the whole series"
+        )
+    if gaps.min() < least * usual:
+        raise PatientError(
+            f"{name}: {pair(int(np.argmin(gaps)))}; expected one stack, no gap under {least:g} times the usual; "
+            "two acquisitions may overlap here: take one out"
+        )
+    if usual > MOST_GAP_MM + SAME_PLACE_MM:
+        raise PatientError(
+            f"{name}: slices are {usual:.1f} mm apart; expected at most {MOST_GAP_MM:g} mm; choose a thinner series"
+        )
+
+
+def _even(along: np.ndarray, notes: list[str]) -> tuple[np.ndarray, float]:
+    """Where slices lie on an even grid, in its spacings from the first, and that spacing [mm]."""
+    gap = (along[-1] - along[0]) / (len(along) - 1)
+    planes = (along - along[0]) / gap
+    if np.abs(planes - np.arange(len(along))).max() <= UNEVEN:
+        return np.arange(len(along), dtype=float), float(gap)
+    gaps = np.diff(along)
+    usual = float(np.percentile(gaps, 50, method="lower"))
+    gap = (along[-1] - along[0]) / max(1, round((along[-1] - along[0]) / usual))
+    notes.append(
+        f"slices are {gaps.min():.2f} to {gaps.max():.2f} mm apart: resampled to {gap:.2f} mm, linearly between neighbours"
+    )
+    return (along - along[0]) / gap, float(gap)
+
+
+def _upright(
+    name: str, slices: list[Slice], normal: np.ndarray, notes: list[str]
+) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
+    """Origin of an upright grid that holds all slices, their places on it in pixels, and its columns and rows."""
+    first = slices[0]
+    axes = np.column_stack([first.row, first.column])
+    positions = np.array([s.position for s in slices])
+    offsets = (positions - first.position) @ axes  # (n, 2) [mm]
+    spacing = np.array(first.spacing)
+    size = first.columns, first.rows
+    if np.abs(offsets).max() <= SIDEWAYS * spacing.min():
+        return first.position, np.zeros((len(slices), 2)), size
+    along = (positions - first.position) @ normal
+    lean = np.median(
+        np.diff(offsets, axis=0) / np.diff(along)[:, None], axis=0
+    )  # a tilt's, the same everywhere
+    off = offsets - along[:, None] * lean
+    off = np.abs(off - np.median(off, axis=0)).max(axis=1)
+    worst = int(np.argmax(off))
+    if off[worst] > OUT_OF_LINE * spacing.min():
+        raise PatientError(
+            f"{name}: {slices[worst].label} lies {off[worst]:.1f} mm to the side of its neighbours; expected slices in one "
+            "line; take out the wrong slice, or export the series again"
+        )
+    angle = float(np.degrees(np.arctan(np.linalg.norm(lean))))
+    if angle > MOST_TILT:
+        raise PatientError(
+            f"{name}: its slices lean by {angle:.1f} degrees; expected at most {MOST_TILT:g}; export the series again"
+        )
+    low, high = offsets.min(axis=0), offsets.max(axis=0)
+    extra = np.ceil((high - low) / spacing - 1e-6).astype(int)
+    notes.append(
+        f"the gantry was tilted by {angle:.1f} degrees: slices shifted back in their planes by up to {np.abs(offsets).max():.1f} mm"
+    )
+    return (
+        first.position + axes @ low,
+        (offsets - low) / spacing,
+        (size[0] + int(extra[0]), size[1] + int(extra[1])),
+    )

@@ -1,0 +1,286 @@
+"""A bead experiment as files: an organ on its support, pressed stage by stage, with beads measured at each stage.
+
+A case is a folder with ``case.toml`` (``CaseFile`` below), two closed surfaces and a table of beads. Lengths are mm in
+the frame of the organ's surface. Keys that are not listed here are a laboratory's own and left alone.
+"""
+
+import csv
+import hashlib
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import trimesh
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from scenes.patients.import_error import PatientError
+from scenes.section import Direction, Vector3
+from scenes.surface_files import load_surface
+from sim.mesh_distance import signed_distance
+from validation import explained
+
+UNITS = ("_mm", "_kPa")
+# Between the nominal indentation and where the probe was found.
+MOST_APART_MM = 0.5
+
+
+class CaseError(ValueError):
+    """A case that cannot be used; the message is one line that says where, what was found and what to do."""
+
+
+def _proper(rows: tuple[Vector3, Vector3, Vector3]) -> tuple[Vector3, Vector3, Vector3]:
+    matrix = np.array(rows)
+    if np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-4 or np.linalg.det(matrix) < 0:
+        raise ValueError("expected a rotation matrix: orthonormal rows, determinant 1")
+    return rows
+
+
+Rotation = Annotated[tuple[Vector3, Vector3, Vector3], AfterValidator(_proper)]
+
+
+class Section(BaseModel):
+    """A table of case.toml. Keys that are not listed are a laboratory's own, but none of ours in another unit."""
+
+    model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="after")
+    def _own_units(self) -> "Section":
+        for known in type(self).model_fields:
+            quantity = known.removesuffix(next((unit for unit in UNITS if known.endswith(unit)), ""))
+            for key in self.model_extra or {}:
+                if quantity != known and key.rpartition("_")[0] == quantity:
+                    raise ValueError(f"{key}: the unit is in the key; write {known}")
+        return self
+
+
+class Units(Section):
+    length: Literal["mm"]
+    acceleration: Literal["m/s^2"]
+    pressure: Literal["kPa"] = "kPa"
+    density: Literal["kg/m^3"] = "kg/m^3"
+
+
+class Gravity(Section):
+    g: float = Field(ge=0, le=100)
+    direction: Direction
+
+
+class Material(Section):
+    """What is known of the tissue; not every model needs all of it."""
+
+    young_kPa: float | None = Field(None, gt=0, le=1e6)
+    poisson: float | None = Field(None, ge=0, lt=0.5)
+    density: float | None = Field(None, ge=100, le=20000)
+
+
+class Contact(Section):
+    """Coulomb friction, the same on support and probe."""
+
+    friction_coefficient: float = Field(0.35, ge=0, le=10)
+    friction_on_support: Literal[True] = True
+    friction_on_probe: Literal[True] = True
+
+
+class Files(Section):
+    kidney: str = "kidney.stl"
+    support: str = "support.stl"
+    beads: str = "beads.csv"
+
+
+class Probe(Section):
+    """A cuboid, full lengths along its own axes, edges rounded inside them; columns of ``rotation`` are these axes."""
+
+    shape: Literal["cuboid"]
+    size_mm: tuple[Annotated[float, Field(gt=0, le=500)], ...] = Field(min_length=3, max_length=3)
+    edge_radius_mm: float = Field(0.0, ge=0)
+    press_direction: Direction
+    rotation: Rotation
+
+    @model_validator(mode="after")
+    def _room_for_edges(self) -> "Probe":
+        if self.edge_radius_mm > min(self.size_mm) / 2:
+            raise ValueError(
+                f"edge_radius_mm is {self.edge_radius_mm:g}: expected at most half of the least of size_mm"
+            )
+        return self
+
+
+class Stage(Section):
+    """The probe's centre and how far it has come since stage 0; with a rotation of its own if it turned."""
+
+    index: int
+    indentation_mm: float = Field(ge=0, le=500)
+    position: Vector3
+    rotation: Rotation | None = None
+
+
+class CaseFile(Section):
+    """``case.toml``."""
+
+    format_version: Literal[1]
+    name: str = ""
+    units: Units
+    gravity: Gravity
+    material: Material = Material()
+    contact: Contact = Contact()
+    files: Files = Files()
+    probe: Probe
+    stage: tuple[Stage, ...] = Field(min_length=2)
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "CaseFile":
+        first, direction = self.stage[0], _unit(self.probe.press_direction)
+        for place, stage in enumerate(self.stage):
+            if stage.index != place:
+                raise ValueError(f"stage {place} has index {stage.index}: list the stages in order, from 0")
+            if place == 0 and stage.indentation_mm != 0:
+                raise ValueError(
+                    f"stage 0 has indentation_mm {stage.indentation_mm:g}: expected 0, just touching"
+                )
+            if place > 0 and stage.indentation_mm <= self.stage[place - 1].indentation_mm:
+                raise ValueError(
+                    f"stage {place} has indentation_mm {stage.indentation_mm:g}: expected more than "
+                    f"{self.stage[place - 1].indentation_mm:g} of the stage before"
+                )
+            along = float((np.array(stage.position) - first.position) @ direction)
+            if abs(along - stage.indentation_mm) > MOST_APART_MM:
+                raise ValueError(
+                    f"stage {place} has indentation_mm {stage.indentation_mm:g}, but its position is {along:.2f} mm "
+                    f"from stage 0's along press_direction: correct one of them"
+                )
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One experiment: float64, mm, in the frame of the organ's stress-free surface.
+
+    ``beads`` (n, 3) stress-free, ``measured`` (stages, n, 3), ``poses`` (stages, 4, 4) world from probe,
+    ``indentation_mm`` (stages,), ``press_direction`` (3,) unit, ``size_mm`` (3,), ``gravity`` (3,) in mm/s^2. What is
+    not known of the material is None. ``digest`` names the content of all files.
+    """
+
+    name: str
+    digest: str
+    organ: trimesh.Trimesh
+    support: trimesh.Trimesh
+    beads: np.ndarray
+    measured: np.ndarray
+    poses: np.ndarray
+    indentation_mm: np.ndarray
+    press_direction: np.ndarray
+    size_mm: np.ndarray
+    edge_radius_mm: float
+    gravity: np.ndarray
+    friction: float
+    young_kpa: float | None
+    poisson: float | None
+    density_kg_m3: float | None
+
+
+def load_case(folder: Path) -> Case:
+    """Read a case folder. Raises CaseError with one line."""
+    file = _read_file(folder)
+    probe, material, files = file.probe, file.material, file.files
+    organ, support = _surface(folder, files.kidney), _surface(folder, files.support)
+    beads, measured = _read_beads(folder / files.beads, len(file.stage))
+    _check_beads(folder / files.beads, beads, measured, organ)
+    poses = np.tile(np.eye(4), (len(file.stage), 1, 1))
+    poses[:, :3, :3] = [stage.rotation or probe.rotation for stage in file.stage]
+    poses[:, :3, 3] = [stage.position for stage in file.stage]
+    contents = [folder / name for name in ("case.toml", files.kidney, files.support, files.beads)]
+    return Case(
+        name=file.name or folder.resolve().name,
+        digest=hashlib.sha256(b"".join(path.read_bytes() for path in contents)).hexdigest(),
+        organ=organ,
+        support=support,
+        beads=beads,
+        measured=measured,
+        poses=poses,
+        indentation_mm=np.array([stage.indentation_mm for stage in file.stage]),
+        press_direction=_unit(probe.press_direction),
+        size_mm=np.array(probe.size_mm),
+        edge_radius_mm=probe.edge_radius_mm,
+        gravity=1000.0 * file.gravity.g * _unit(file.gravity.direction),
+        friction=file.contact.friction_coefficient,
+        young_kpa=material.young_kPa,
+        poisson=material.poisson,
+        density_kg_m3=material.density,
+    )
+
+
+def _read_file(folder: Path) -> CaseFile:
+    path = folder / "case.toml"
+    try:
+        return CaseFile.model_validate(tomllib.loads(path.read_text("utf-8")))
+    except (FileNotFoundError, NotADirectoryError):
+        raise CaseError(
+            f"{folder}: holds no case.toml; name a folder with case.toml, two STL surfaces and beads.csv"
+        ) from None
+    except tomllib.TOMLDecodeError as error:
+        raise CaseError(f"{path}: not valid TOML: {error}; correct it there") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise CaseError(f"{path}: cannot be read ({error}); expected TOML in UTF-8") from None
+    except ValidationError as error:
+        raise CaseError(f"{path}: {explained(error)}; correct it there") from None
+
+
+def _surface(folder: Path, name: str) -> trimesh.Trimesh:
+    try:
+        return load_surface(folder / name)
+    except PatientError as error:
+        raise CaseError(str(error)) from None
+
+
+def _read_beads(path: Path, stages: int) -> tuple[np.ndarray, np.ndarray]:
+    """Positions of the beads (n, 3) stress-free and (stages, n, 3) measured [mm]."""
+    columns = [f"{axis}{stage}" for stage in ("", *range(stages)) for axis in "xyz"]
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file, skipinitialspace=True))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise CaseError(f"{path}: cannot be read ({error}); expected a table of beads in CSV") from None
+    if not rows:
+        raise CaseError(f"{path}: holds no beads; expected a header and one line a bead")
+    missing = [name for name in columns if name not in rows[0]]
+    if missing:
+        raise CaseError(
+            f"{path}: column {missing[0]} is missing; expected {columns[0]} to {columns[-1]} for {stages} stages"
+        )
+    values = np.array(
+        [[_number(path, line, row, name) for name in columns] for line, row in enumerate(rows, 2)]
+    )
+    places = values.reshape(len(rows), stages + 1, 3).transpose(1, 0, 2)
+    return places[0].copy(), places[1:].copy()
+
+
+def _number(path: Path, line: int, row: dict[str, str | None], column: str) -> float:
+    try:
+        value = float(row[column] or "")
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise CaseError(f"{path}: line {line}, {column} is {row[column]!r}: expected a finite number in mm")
+    return value
+
+
+def _check_beads(path: Path, beads: np.ndarray, measured: np.ndarray, organ: trimesh.Trimesh) -> None:
+    outside = signed_distance(organ.vertices, organ.faces, beads)[0]
+    if outside.max() > 0:
+        raise CaseError(
+            f"{path}: the bead on line {2 + outside.argmax()} is {outside.max():.2f} mm outside the organ at x, y, z: "
+            f"expected a place inside, in mm in the organ's frame"
+        )
+    moved = np.linalg.norm(measured - beads, axis=2)
+    stage, bead = np.unravel_index(moved.argmax(), moved.shape)
+    if moved.max() > organ.extents.max():
+        raise CaseError(
+            f"{path}: the bead on line {2 + bead} is {moved.max():.0f} mm from its stress-free place at stage {stage}: "
+            f"expected less than the organ's length, in mm in the organ's frame"
+        )
+
+
+def _unit(direction: Vector3) -> np.ndarray:
+    return np.array(direction) / np.linalg.norm(direction)

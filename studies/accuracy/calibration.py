@@ -1,0 +1,250 @@
+"""The paper's calibration: settings searched for the least mean bead error, and their worth on data held out."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import Polynomial
+from scipy.optimize import differential_evolution
+
+from rehearsal.configuration import Setup, setup_of
+from studies.accuracy.bead_case import Case
+from studies.accuracy.bead_errors import null_errors
+from studies.accuracy.case_workers import Map, Measured
+
+# The model that the paper calibrates.
+MODEL = "shape-matching"
+# Of the beads held out, each third: neighbours on a thread are then on either side.
+BEADS_EVERY = 3
+# The grid's spacing over that of the finer look around its best.
+FINER = 5
+QUARTIC = 4
+# stiffness, over-relaxation and iterations, with Eq. 7's range for the second.
+BOUNDS = ((0.05, 1.0), (1.0, 2.0), (3, 30))
+POPULATION = 5
+# An error this many times the least is that of a body that falls apart, which would spoil the fit for the others.
+TALLEST = 4.0
+
+
+class CalibrationError(ValueError):
+    """A calibration that cannot be made; the message is one line."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """What is fitted on: for each case a mask (stages, n), True where an error counts; the rest is held out."""
+
+    fitted: tuple[np.ndarray, ...]
+    fitted_name: str
+    held_out_name: str
+
+    def fit_mm(self, errors: Sequence[np.ndarray]) -> float:
+        """Mean of the cases' mean errors [mm], of those that are fitted on; ``errors`` (stages, n) of each case."""
+        return _mean(errors, self.fitted)
+
+    def held_out_mm(self, errors: Sequence[np.ndarray]) -> float:
+        """Mean of the cases' mean errors [mm], of those that are held out."""
+        return _mean(errors, [~mask for mask in self.fitted])
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One setup evaluated on every case."""
+
+    setup: Setup
+    measured: tuple[Measured, ...]
+    fit_mm: float
+    held_out_mm: float
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A quartic through mean errors over a range of the stiffness, and where it is least in that."""
+
+    polynomial: Polynomial
+    range: tuple[float, float]
+    stiffness: float
+    error_mm: float
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """All trials of each radius, in the order in which they were made."""
+
+    cases: tuple[Case, ...]
+    split: Split
+    trials: dict[float, list[Trial]]
+
+    def best(self, radius_mm: float) -> Trial:
+        """The trial that fits best, the first of equals."""
+        return min(self.trials[radius_mm], key=lambda trial: trial.fit_mm)
+
+    def null_mm(self) -> float:
+        """Error [mm] of predicting no motion, on what is held out."""
+        return self.split.held_out_mm([null_errors(case) for case in self.cases])
+
+
+def split_of(cases: Sequence[Case], hold_out: str) -> Split:
+    """Hold out each case's deepest stage, every third of its beads, or the last case. Raises CalibrationError."""
+    if len({case.digest for case in cases}) < len(cases):
+        raise CalibrationError(
+            "a case is named twice: what is fitted on would be held out as well; name each once"
+        )
+    masks: list[np.ndarray] = [np.ones(case.measured.shape[:2], bool) for case in cases]
+    if hold_out == "stages":
+        for mask in masks:
+            mask[-1] = False
+        return Split(tuple(masks), "all stages but the deepest", "the deepest stage")
+    if hold_out == "beads":
+        for case, mask in zip(cases, masks, strict=True):
+            if mask.shape[1] < BEADS_EVERY:
+                raise CalibrationError(
+                    f"--hold-out beads: {case.name} has less than {BEADS_EVERY} beads; hold out stages"
+                )
+            mask[:, BEADS_EVERY - 1 :: BEADS_EVERY] = False
+        return Split(tuple(masks), "two beads of three", "every third bead")
+    if len(cases) < 2:
+        raise CalibrationError(
+            "--hold-out cases: there is one case; name two or more, or hold out stages or beads"
+        )
+    masks[-1][:] = False
+    return Split(tuple(masks), ", ".join(case.name for case in cases[:-1]), cases[-1].name)
+
+
+def exhaustive(
+    cases: Sequence[Case],
+    split: Split,
+    radii_mm: Sequence[float],
+    spacing: float,
+    workers: Map,
+    done: Callable[[int], object],
+) -> Calibration:
+    """The paper's search: every stiffness on a grid for each radius, then a finer look around the best of each.
+
+    ``done`` is told of evaluations as they are finished, ``exhaustive_count`` of them at most.
+    """
+    grid = stiffness_grid(spacing)
+    trials = try_all(
+        cases,
+        split,
+        [setup_of(MODEL, radius_mm=r, stiffness=a) for r in radii_mm for a in grid],
+        workers,
+        done,
+    )
+    by_radius = {r: [trial for trial in trials if trial.setup.tissue.radius_mm == r] for r in radii_mm}
+    coarse = Calibration(tuple(cases), split, by_radius)
+    finer = [
+        setup_of(MODEL, radius_mm=r, stiffness=a)
+        for r in radii_mm
+        for a in finer_grid(coarse.best(r).setup.tissue.stiffness, spacing)
+    ]
+    for trial in try_all(cases, split, finer, workers, done):
+        by_radius[trial.setup.tissue.radius_mm].append(trial)
+    return coarse
+
+
+def stiffness_grid(spacing: float) -> list[float]:
+    """Evenly to 1; at 0 nothing holds the tissue together and there is nothing to compare."""
+    return np.round(np.arange(1.0, spacing / 2, -spacing)[::-1], 6).tolist()
+
+
+def finer_grid(best: float, spacing: float) -> list[float]:
+    """The stiffnesses between the best of a grid and its neighbours there."""
+    offsets = np.arange(-FINER + 1, FINER) * spacing / FINER
+    around = np.round(best + offsets[offsets != 0], 6)
+    return around[(around > 0) & (around <= 1)].tolist()
+
+
+def exhaustive_count(cases: int, radii: int, spacing: float) -> int:
+    """Evaluations of an exhaustive search, at most."""
+    return cases * radii * (len(stiffness_grid(spacing)) + 2 * (FINER - 1))
+
+
+def search(
+    cases: Sequence[Case],
+    split: Split,
+    radii_mm: Sequence[float],
+    generations: int,
+    workers: Map,
+    done: Callable[[int], object],
+) -> Calibration:
+    """Stiffness, over-relaxation and iterations together for each radius, by differential evolution from a fixed seed.
+
+    A generation is evaluated at once, so the outcome does not depend on the number of workers.
+    """
+    trials: dict[float, list[Trial]] = {radius: [] for radius in radii_mm}
+
+    def errors_of(radius: float, x: np.ndarray) -> np.ndarray:
+        setups = [_setup_at(radius, *column) for column in x.reshape(len(BOUNDS), -1).T]
+        made = try_all(cases, split, setups, workers, done)
+        trials[radius].extend(made)
+        return np.array([trial.fit_mm for trial in made])
+
+    for radius in radii_mm:
+        differential_evolution(
+            lambda x, radius=radius: errors_of(radius, x),
+            BOUNDS,
+            integrality=[False, False, True],
+            popsize=POPULATION,
+            maxiter=generations,
+            tol=0,
+            rng=0,
+            polish=False,
+            updating="deferred",
+            vectorized=True,
+        )
+    return Calibration(tuple(cases), split, trials)
+
+
+def search_count(cases: int, radii: int, generations: int) -> int:
+    """Evaluations of a search."""
+    return cases * radii * (generations + 1) * POPULATION * len(BOUNDS)
+
+
+def try_all(
+    cases: Sequence[Case], split: Split, setups: Sequence[Setup], workers: Map, done: Callable[[int], object]
+) -> list[Trial]:
+    """Evaluate setups on every case; case by case, as what a worker has built for one serves all setups of a radius."""
+    pairs = [(case, setup) for case in cases for setup in setups]
+    results = list(_told(workers(pairs), done))
+    trials = []
+    for place, setup in enumerate(setups):
+        measured = tuple(results[place :: len(setups)])
+        errors = [each.errors for each in measured]
+        trials.append(Trial(setup, measured, split.fit_mm(errors), split.held_out_mm(errors)))
+    return trials
+
+
+def quartic(trials: Sequence[Trial]) -> Fit | None:
+    """The paper's smooth curve through the errors up to TALLEST times the least; None where these are too few."""
+    at = np.array([(trial.setup.tissue.stiffness, trial.fit_mm) for trial in trials])
+    at = at[np.isfinite(at[:, 1]) & (at[:, 1] <= TALLEST * at[:, 1].min())]
+    if len(np.unique(at[:, 0])) <= QUARTIC:
+        return None
+    polynomial = Polynomial.fit(at[:, 0], at[:, 1], QUARTIC)
+    first, last = float(at[:, 0].min()), float(at[:, 0].max())
+    stiffness = np.linspace(first, last, 1001)
+    least = np.argmin(polynomial(stiffness))
+    return Fit(polynomial, (first, last), float(stiffness[least]), float(polynomial(stiffness[least])))
+
+
+def _setup_at(radius_mm: float, stiffness: float, relaxation_factor: float, iterations: float) -> Setup:
+    return setup_of(
+        MODEL,
+        radius_mm=radius_mm,
+        stiffness=float(stiffness),
+        relaxation_factor=float(relaxation_factor),
+        iterations=round(iterations),
+    )
+
+
+def _told(results: Iterable[Measured], done: Callable[[int], object]) -> Iterable[Measured]:
+    for result in results:
+        done(1)
+        yield result
+
+
+def _mean(errors: Sequence[np.ndarray], masks: Sequence[np.ndarray]) -> float:
+    return float(
+        np.mean([error[mask].mean() for error, mask in zip(errors, masks, strict=True) if mask.any()])
+    )

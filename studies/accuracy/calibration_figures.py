@@ -1,0 +1,113 @@
+"""Pictures of a calibration: the paper's Figures 4 and 5, its tables, and how a search went."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
+
+from rehearsal.result_files import save_figure
+from studies.accuracy.calibration import TALLEST, Calibration, Trial, quartic
+from studies.accuracy.calibration_tables import Table
+
+DPI = 130
+
+
+def write_figure4(calibration: Calibration, path: Path) -> None:
+    """Mean error over the stiffness for each radius, fitted and held out; quartics with a ring where they are least."""
+    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    for colour, radius in zip(_colours(calibration), calibration.trials, strict=True):
+        trials = sorted(calibration.trials[radius], key=lambda trial: trial.setup.tissue.stiffness)
+        at = [trial.setup.tissue.stiffness for trial in trials]
+        left.plot(at, [trial.fit_mm for trial in trials], ".", color=colour, label=f"{radius:g} mm")
+        right.plot(at, [trial.held_out_mm for trial in trials], ".-", color=colour, linewidth=0.8)
+        fit = quartic(trials)
+        if fit is not None:
+            smooth = np.linspace(*fit.range, 200)
+            left.plot(smooth, fit.polynomial(smooth), "-", color=colour, linewidth=1)
+            left.plot(fit.stiffness, fit.error_mm, "o", color=colour, markersize=9, fillstyle="none")
+    right.axhline(calibration.null_mm(), color="0.4", linestyle="--", label="no motion at all")
+    _both(calibration, left, right, "stiffness α")
+    save_figure(figure, path, dpi=DPI, bbox_inches="tight")
+
+
+def write_search(calibration: Calibration, path: Path) -> None:
+    """Error of the best setup so far over the evaluations, fitted and held out."""
+    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    for colour, (radius, trials) in zip(_colours(calibration), calibration.trials.items(), strict=True):
+        best = best_so_far(trials)
+        left.plot([trial.fit_mm for trial in trials], ".", color=colour, alpha=0.35, markersize=4)
+        left.plot(
+            [trial.fit_mm for trial in best], color=colour, drawstyle="steps-post", label=f"{radius:g} mm"
+        )
+        right.plot([trial.held_out_mm for trial in best], color=colour, drawstyle="steps-post")
+    right.axhline(calibration.null_mm(), color="0.4", linestyle="--", label="no motion at all")
+    _both(calibration, left, right, "setups tried")
+    save_figure(figure, path, dpi=DPI, bbox_inches="tight")
+
+
+def best_so_far(trials: list[Trial]) -> list[Trial]:
+    """After each trial, the one that fits best until then."""
+    best: list[Trial] = []
+    for trial in trials:
+        best.append(trial if not best or trial.fit_mm < best[-1].fit_mm else best[-1])
+    return best
+
+
+def write_figure5(calibration: Calibration, path: Path) -> None:
+    """Particles and clusters over the radius, for each case."""
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    radii = list(calibration.trials)
+    for place, case in enumerate(calibration.cases):
+        measured = [calibration.trials[radius][0].measured[place] for radius in radii]
+        left.plot(radii, [each.particles for each in measured], "o-", label=case.name)
+        right.plot(radii, [each.clusters for each in measured], "o-", label=case.name)
+    for axes, what in ((left, "particles"), (right, "clusters")):
+        axes.set(xlabel="particle radius (mm)", ylabel=what, ylim=(0, None))
+        axes.grid(alpha=0.3)
+        axes.legend()
+    save_figure(figure, path, dpi=DPI, bbox_inches="tight")
+
+
+def write_table(table: Table, path: Path) -> None:
+    """A table as a picture."""
+    cells = table.cells()
+    wide = [max(len(line[column]) for line in cells) + 3 for column in range(len(cells[0]))]
+    figure = Figure(figsize=(0.085 * sum(wide) + 0.4, 0.26 * (len(cells) + 1.5)))
+    axes = figure.subplots()
+    axes.axis("off")
+    drawn = axes.table(
+        cells[1:], colLabels=cells[0], colWidths=[w / sum(wide) for w in wide], bbox=Bbox.unit()
+    )
+    drawn.auto_set_font_size(False)
+    drawn.set_fontsize(9)
+    for (row, _), cell in drawn.get_celld().items():
+        cell.set_linewidth(0.3)
+        cell.set_text_props(ha="left", weight="bold" if row == 0 else "normal")
+    axes.set_title(table.title, fontsize=10)
+    save_figure(figure, path, dpi=DPI, bbox_inches="tight")
+
+
+def _both(calibration: Calibration, left: Axes, right: Axes, across: str) -> None:
+    split = calibration.split
+    left.set(title=f"Fit: {split.fitted_name}", xlabel=across, ylabel="mean bead error (mm)")
+    right.set(title=f"Held out: {split.held_out_name}", xlabel=across)
+    least = min(calibration.best(radius).fit_mm for radius in calibration.trials)
+    errors = [
+        error for trials in calibration.trials.values() for t in trials for error in (t.fit_mm, t.held_out_mm)
+    ]
+    most = max(filter(np.isfinite, errors), default=1.0)
+    left.set_ylim(0, min(1.05 * most, TALLEST * max(least, calibration.null_mm())))
+    left.legend(title="particle radius")
+    right.legend()
+    for axes in (left, right):
+        axes.grid(alpha=0.3)
+
+
+def _colours(calibration: Calibration) -> list:
+    return [colormaps["viridis"](at) for at in np.linspace(0, 0.85, len(calibration.trials))]

@@ -1,0 +1,221 @@
+"""A clamped beam as measured, as beam theory has it and as the tissue model computes it: rows, table, figure."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.optimize import brentq
+
+from rehearsal.result_files import save_figure
+from studies.beam.motion_capture import BeamError, Capture, Oscillation, oscillation
+
+if TYPE_CHECKING:
+    from studies.beam.cantilever import Cantilever, Material
+
+FRAME_S = 0.01
+# Swings that are computed, in periods that beam theory expects.
+PERIODS = 5.0
+# The computed beam is looked at as often as the recorded one, or more often where it swings so fast.
+FRAMES_A_PERIOD = 10
+GRAVITY_M_S2 = 9.81
+
+
+@dataclass(frozen=True)
+class Row:
+    """Measured and computed for one load: length of the tip's final displacement [mm], first frequency [Hz].
+
+    Errors of what is measured cover its repeats; ``rest_left_mm`` is what the computed rest still moved when its
+    passes were doubled.
+    """
+
+    load_g: float
+    recordings: int
+    measured_mm: float
+    measured_error_mm: float
+    computed_mm: float
+    theory_mm: float
+    measured_hz: float
+    measured_error_hz: float
+    computed_hz: float
+    theory_hz: float
+    measured_damping_ratio: float
+    computed_damping_ratio: float
+    rest_left_mm: float
+
+
+def theory(size_mm: np.ndarray, material: "Material", load_g: float) -> tuple[float, float]:
+    """Sag [mm] of a Timoshenko cantilever, frequency [Hz] of an Euler-Bernoulli one with a mass at its tip.
+
+    Small deflections, a clamped end that is free to change its width, and for the frequency no shear and no turning
+    mass.
+    """
+    height, width, length = 1e-3 * np.asarray(size_mm, float)
+    young = 1e3 * material.young_kpa
+    area, bending = height * width, young * width * height**3 / 12
+    shear = 5 / 6 * area * young / (2 * (1 + material.poisson))
+    mass = 1e3 * material.density_g_cm3 * area
+    load = 1e-3 * load_g
+    sag = mass * (length**4 / (8 * bending) + length**2 / (2 * shear))
+    sag += load * (length**3 / (3 * bending) + length / shear)
+    ratio = load / (mass * length)
+
+    def condition(b: float) -> float:
+        swing = np.cos(b) * np.sinh(b) - np.sin(b) * np.cosh(b)
+        return float(1 + np.cos(b) * np.cosh(b) + ratio * b * swing)
+
+    root = brentq(condition, 1e-3, 1.9)
+    return 1e3 * GRAVITY_M_S2 * sag, root**2 / (2 * np.pi) * np.sqrt(bending / (mass * length**4))
+
+
+def compare(
+    captures: list[Capture], build: Callable[..., "Cantilever"], cell_mm: float
+) -> tuple[Row, np.ndarray]:
+    """One load's row, and time [s] and computed height [mm] of the markers after the release, shape (2, frames).
+
+    ``build`` makes a beam of a cell width and a load; the rest is found on cells of half the width.
+    """
+    load_g = captures[0].load_g
+    beam = build(cell_mm=cell_mm, load_g=load_g)
+    sag, theory_hz = theory(beam.size_mm, beam.material, load_g)
+    rest = build(cell_mm=cell_mm / 2, load_g=load_g).rest()
+    frame_s = min(FRAME_S, 1 / (FRAMES_A_PERIOD * theory_hz))
+    trace = released(beam, int(np.ceil(PERIODS / theory_hz / frame_s)), frame_s)
+    computed = computed_oscillation(beam, trace)
+    finals = [mean_length(capture.final_mm()) for capture in captures]
+    swings = [measured_oscillation(capture) for capture in captures]
+    hz = [swing.hz for swing in swings]
+    row = Row(
+        load_g=load_g,
+        recordings=len(captures),
+        measured_mm=float(np.mean(finals)),
+        measured_error_mm=float(np.ptp(finals) / 2),
+        computed_mm=mean_length(rest.displacement_mm),
+        theory_mm=float(sag),
+        measured_hz=float(np.mean(hz)),
+        measured_error_hz=float(max(np.ptp(hz) / 2, *(swing.error_hz for swing in swings))),
+        computed_hz=computed.hz,
+        theory_hz=float(theory_hz),
+        measured_damping_ratio=float(np.mean([swing.damping_ratio for swing in swings])),
+        computed_damping_ratio=computed.damping_ratio,
+        rest_left_mm=rest.left_mm,
+    )
+    return row, trace
+
+
+def released(
+    beam: "Cantilever", frames: int, frame_s: float, finer: int = 1, passes: int | None = None
+) -> np.ndarray:
+    """Time [s] and mean height [mm] of the markers after a release, shape (2, frames + 1)."""
+    height = beam.swing(frames, frame_s, finer * beam.substeps(frame_s), passes)[:, :, 0].mean(axis=1)
+    return np.array([frame_s * np.arange(frames + 1), height])
+
+
+def computed_oscillation(beam: "Cantilever", trace: np.ndarray) -> Oscillation:
+    """Of a computed trace (2, frames). Raises BeamError, naming the beam."""
+    try:
+        return oscillation(*trace)
+    except BeamError as error:
+        raise BeamError(f"the computed beam, E {beam.material.young_kpa:g} kPa: {error}") from None
+
+
+def mean_length(displacement_mm: np.ndarray) -> float:
+    """Mean length [mm] of the markers' displacements (n, 3): it asks for no frame common to capture and beam."""
+    return float(np.linalg.norm(displacement_mm, axis=1).mean())
+
+
+def measured_oscillation(capture: Capture) -> Oscillation:
+    """Of one recording, from its release on. Raises BeamError, naming it."""
+    first = capture.release()
+    try:
+        return oscillation(capture.time_s[first:], capture.height_mm()[first:])
+    except BeamError as error:
+        raise BeamError(f"{capture.name}: {error}") from None
+
+
+def table(rows: list[Row]) -> str:
+    """The rows as text."""
+    lines = [
+        "            tip's final displacement, mm                  first frequency, Hz                     damping ratio",
+        "load, g   measured      computed   off    theory    measured       computed   off    theory   measured",
+    ]
+    for row in rows:
+        lines.append(
+            f"{row.load_g:7.0f}   {row.measured_mm:5.2f} ± {row.measured_error_mm:4.2f}"
+            f"   {row.computed_mm:8.2f} {percent(row.computed_mm, row.measured_mm)}  {row.theory_mm:8.2f}"
+            f"    {row.measured_hz:5.3f} ± {row.measured_error_hz:5.3f}"
+            f"  {row.computed_hz:8.3f} {percent(row.computed_hz, row.measured_hz)} {row.theory_hz:8.3f}"
+            f"   {row.measured_damping_ratio:8.3f}"
+        )
+    return "\n".join(lines)
+
+
+def percent(value: float, reference: float) -> str:
+    """How far a value is off a reference."""
+    return f"{100 * (value / reference - 1):+6.1f}%"
+
+
+def check(build: Callable[..., "Cantilever"], cell_mm: float, load_g: float, trace: np.ndarray) -> str:
+    """How much the frequency changes with time step and passes; it and the rest with cells, material and load's place.
+
+    Args:
+        build: makes a beam of a cell width, a load, a material and a height at which the load hangs.
+        cell_mm: of the motion; the rests are on cells as wide, so that lines compare.
+        load_g: at the tip.
+        trace: of ``compare``, shape (2, frames).
+    """
+    from studies.beam.cantilever import PASSES
+
+    frames, frame_s = trace.shape[1] - 1, float(trace[0, 1])
+
+    def line(name: str, beam: "Cantilever", trace: np.ndarray, rest: bool = True) -> str:
+        sag = f"{mean_length(beam.rest().displacement_mm):8.3f} mm" if rest else " " * 11
+        return f"  {name:32s} {sag}  {computed_oscillation(beam, trace).hz:7.4f} Hz"
+
+    def changed_line(name: str, beam: "Cantilever") -> str:
+        return line(name, beam, released(beam, frames, frame_s))
+
+    beam = build(cell_mm=cell_mm, load_g=load_g)
+    lines = [
+        f"What the settings change, {load_g:.0f} g, cells of {cell_mm:g} mm:",
+        line("as above", beam, trace),
+        line("half the time step", beam, released(beam, frames, frame_s, finer=2), rest=False),
+        line("twice the passes", beam, released(beam, frames, frame_s, passes=2 * PASSES), rest=False),
+    ]
+    for poisson in (0.45, 0.49):
+        material = replace(beam.material, poisson=poisson)
+        lines.append(changed_line(f"Poisson's ratio {poisson:g}", build(cell_mm, load_g, material)))
+    material = replace(beam.material, poisson=0.45)
+    lines.append(changed_line(f"0.45 on cells of {cell_mm / 2:g} mm", build(cell_mm / 2, load_g, material)))
+    if load_g > 0:
+        middle = beam.size_mm[0] / 2
+        lines.append(changed_line("load across the end's middle", build(cell_mm, load_g, hung_mm=middle)))
+    return "\n".join(lines)
+
+
+def draw(groups: list[list[Capture]], traces: list[np.ndarray], rows: list[Row], path: Path) -> None:
+    """Tip height against time, measured and computed, a panel a load. Raises OSError."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 3.2 * len(rows)), layout="constrained")
+    axes = figure.subplots(len(rows), squeeze=False)[:, 0]
+    for axis, captures, trace, row in zip(axes, groups, traces, rows, strict=True):
+        for capture in captures:
+            first = capture.release()
+            axis.plot(
+                capture.time_s[first:] - capture.time_s[first],
+                capture.height_mm()[first:],
+                label=capture.name,
+            )
+        axis.plot(*trace, "k--", lw=1, label="computed, undamped")
+        axis.set_xlim(0, 1.2 * trace[0, -1])
+        axis.set_ylabel("tip height, mm")
+        axis.set_title(
+            f"{row.load_g:.0f} g at the tip: measured {row.measured_hz:.2f} Hz, computed {row.computed_hz:.2f} Hz",
+            loc="left",
+        )
+        axis.grid(alpha=0.3)
+        axis.legend(loc="upper right", fontsize=8)
+    axes[-1].set_xlabel("time since the release, s")
+    save_figure(figure, path, dpi=110)

@@ -1,0 +1,167 @@
+"""Freehand sweeps of which the truth is known: a slow one of the resting kidney, and ones pressed in, over the tumour."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+
+from rehearsal.coordinates import probe_in_patient
+from rehearsal.measurements.tumour_measurements import read
+from rehearsal.reconstruction.compression_correction import come
+from rehearsal.rehearsal import Rehearsal, scanned_anatomy
+from scenes.anatomy import LoadedAnatomy
+from sim.embedding import Unmoved
+from sim.mesh_distance import signed_distance
+from ultrasound.bmode import source_of_pixels
+from ultrasound.ground_truth_labels import MOST_BEADS, Marks
+from ultrasound.image_plane import ImagePlane, PlaneInTissue
+from ultrasound.probe import Probe
+from ultrasound.probe_manipulator import advanced, touching
+from ultrasound.sampled_volume import distance_volume
+from ultrasound.scanner import Scanner
+from ultrasound.sweep import Sweep, transform_text
+
+FRAMES_A_SECOND = 30
+# The slow sweep: so fast, its probe so far above the organ, which it passes by so much at either end.
+SPEED_MM_S, ABOVE_MM, BEYOND_MM = 10.0, 12.0, 4.0
+# The pressed one begins and ends that far beside the tumour.
+BESIDE_MM = 4.0
+# Virtual beads, as the paper's: around the tumour, apart from each other and under the surface.
+BEAD_RADIUS_MM, BEADS_APART_MM, BEADS_WITHIN_MM = 1.5, 9.0, 24.0
+
+
+@dataclass
+class Truth:
+    """A sweep of ``Mark`` pictures with the true poses (n, 4, 4) of the probe in the patient, and its beads (k, 3) at rest (LPS, mm).
+
+    ``on_probe`` (4, 4) is ImageToProbe, ``mask`` says which pixels (rows, columns) the probe shows.
+    """
+
+    sweep: Sweep
+    poses: np.ndarray
+    beads_mm: np.ndarray
+    on_probe: np.ndarray
+    mask: np.ndarray
+    compression_mm: float = 0.0
+
+
+def beads_of(organ: trimesh.Trimesh, tumour: trimesh.Trimesh | None) -> np.ndarray:
+    """Places (k, 3) of beads [mm], on a grid around the middle of the tumour or the organ."""
+    middle = (tumour or organ).center_mass
+    most = np.ceil(BEADS_WITHIN_MM / BEADS_APART_MM)
+    steps = np.arange(-most, most + 1)
+    cells = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
+    grid = middle + BEADS_APART_MM * cells
+    near = grid[np.linalg.norm(grid - middle, axis=1) < BEADS_WITHIN_MM]
+    depth = -signed_distance(organ.vertices, organ.faces, near)[0]
+    inside = near[depth > 2 * BEAD_RADIUS_MM]
+    # Of more than there is room for, those nearest to the middle.
+    nearest = np.argsort(np.linalg.norm(inside - middle, axis=1), kind="stable")[:MOST_BEADS]
+    return inside[np.sort(nearest)]
+
+
+def resting(anatomy: LoadedAnatomy, probe: Probe, direction: np.ndarray, pixels: int) -> Truth:
+    """The slow sweep along the organ's long axis, of the CT as it is; Taichi must have been started."""
+    if anatomy.ct is None:
+        raise ValueError("a sweep needs a CT")
+    organ, tumour = anatomy.organ, anatomy.tumour
+    scanned = scanned_anatomy(organ, anatomy.ct, anatomy, np.zeros(3))
+    scanner = Scanner(scanned, Unmoved(), probe, pixels, "background", "tissue")
+    poses = _along(organ, probe, direction)
+    beads = beads_of(organ, tumour)
+    marks = _marks(scanner.plane, organ, tumour, beads)
+    images = []
+    for pose in poses:
+        scanner.embedding.update()
+        scanner.plane.take(ImagePlane(pose, *probe.extent_mm))
+        images.append(marks.render())
+    return _truth(np.stack(images), poses, np.arange(len(poses)) / FRAMES_A_SECOND, probe, beads)
+
+
+def _along(organ: trimesh.Trimesh, probe: Probe, direction: np.ndarray) -> np.ndarray:
+    """Poses (n, 4, 4) of a probe that goes along the organ's long axis, square to it, and looks along a direction."""
+    down = direction / np.linalg.norm(direction)
+    centred = organ.vertices - organ.center_mass
+    axis = np.linalg.svd(centred - np.outer(centred @ down, down), full_matrices=False)[2][0]
+    way, depth = centred @ axis, centred @ down
+    steps = np.arange(way.min() - BEYOND_MM, way.max() + BEYOND_MM, SPEED_MM_S / FRAMES_A_SECOND)
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([np.cross(down, axis), down, axis])
+    poses = np.tile(pose, (len(steps), 1, 1))
+    poses[:, :3, 3] = organ.center_mass + (depth.min() - ABOVE_MM) * down + steps[:, None] * axis
+    return poses
+
+
+def pressed(rehearsal: Rehearsal, depth_mm: float) -> Truth:
+    """A sweep over the tumour, pressed in by a depth, along the probe's elevation, with the body moving."""
+    if rehearsal.tumour is None or rehearsal.scanner is None:
+        raise ValueError("a pressed sweep needs a tumour and a CT")
+    rehearsal.reset()
+    probe, way = rehearsal.probe, _way(rehearsal, depth_mm)
+    beads = beads_of(rehearsal.organ, rehearsal.tumour)
+    marks = _marks(rehearsal.scanner.plane, rehearsal.organ, rehearsal.tumour, beads)
+    touches = np.ones(probe.number_of_scanlines, bool)
+    come(rehearsal, way[0])
+    images, poses, squeezed = [], [], []
+    every = round(1 / (FRAMES_A_SECOND * rehearsal.settings.time_step_s))
+    for step, pose in enumerate(way):
+        rehearsal.advance(pose)
+        if step % every == 0:
+            rehearsal.update_surfaces()
+            rehearsal.embedding.update()
+            rehearsal.scanner.plane.take(rehearsal.image_plane())
+            images.append(marks.render())
+            poses.append(probe_in_patient(rehearsal))
+            squeezed.append(read(rehearsal, probe, touches).compression_mm)
+    times = np.arange(len(poses)) * every * rehearsal.settings.time_step_s
+    truth = _truth(np.stack(images), np.stack(poses), times, probe, beads + rehearsal.origin)
+    truth.compression_mm = float(np.mean(squeezed))
+    return truth
+
+
+def _way(rehearsal: Rehearsal, depth_mm: float) -> np.ndarray:
+    """Poses (n, 4, 4), step by step, over the middle of the tumour at one depth under the settled surface."""
+    home = rehearsal.hand.home
+    local = (np.asarray(rehearsal.tumour.vertices) - home[:3, 3]) @ home[:3, :3]  # type: ignore[union-attr]
+    low, high = local.min(axis=0)[:2], local.max(axis=0)[:2]
+    step_mm = SPEED_MM_S * rehearsal.settings.time_step_s
+    ways = np.arange(low[1] - BESIDE_MM, high[1] + BESIDE_MM, step_mm)
+    return np.stack([_over(rehearsal, (low[0] + high[0]) / 2, y, depth_mm) for y in ways])
+
+
+def _over(rehearsal: Rehearsal, x: float, y: float, depth_mm: float) -> np.ndarray:
+    """The pose at a place beside home, turned as that, so deep under the settled surface."""
+    hand = rehearsal.hand
+    pose = hand.home.copy()
+    pose[:3, 3] += pose[:3, :2] @ [x, y]
+    return advanced(touching(pose, rehearsal.size_mm, hand.samples, hand.radius_mm), depth_mm)
+
+
+def _marks(
+    plane: PlaneInTissue, organ: trimesh.Trimesh, tumour: trimesh.Trimesh | None, beads: np.ndarray
+) -> Marks:
+    around = None if tumour is None else distance_volume(tumour, 1.0)
+    return Marks(plane, distance_volume(organ, 1.0), around, beads, BEAD_RADIUS_MM)
+
+
+def _truth(
+    images: np.ndarray, poses: np.ndarray, times_s: np.ndarray, probe: Probe, beads_mm: np.ndarray
+) -> Truth:
+    on_probe = probe.image_to_probe(*images.shape[1:])
+    mask = source_of_pixels(probe, images.shape[1])[..., 0] > -1.0
+    return Truth(sweep_of(images, poses, times_s, on_probe), poses, beads_mm, on_probe, mask)
+
+
+def sweep_of(
+    images: np.ndarray, poses: list[np.ndarray | None] | np.ndarray, times_s: np.ndarray, on_probe: np.ndarray
+) -> Sweep:
+    """Pictures (n, rows, columns) with poses of the probe in the patient, None where they were lost, as a sweep."""
+    frames = [
+        {
+            "ProbeToReferenceTransform": transform_text(np.eye(4) if pose is None else pose),
+            "ProbeToReferenceTransformStatus": "INVALID" if pose is None else "OK",
+            "Timestamp": repr(float(time_s)),
+        }
+        for pose, time_s in zip(poses, times_s, strict=True)
+    ]
+    return Sweep(images, frames, {}, {"ImageToProbe": on_probe})

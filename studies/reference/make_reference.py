@@ -1,0 +1,140 @@
+"""Make the reference: the embedded patient's kidney on its support, solved on two meshes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+import numpy as np
+import trimesh
+from skfem import MeshTet2
+
+from studies.reference.fem_press import FRICTION, Experiment, Press
+from studies.reference.fem_solid import Material
+from studies.reference.reference_case import Case
+from studies.reference.smooth_obstacles import RoundedBox, signed_distance
+from studies.reference.tetrahedral_mesh import tetrahedra
+
+BEADS, BEAD_DEPTH_MM, BEAD_SEED, CANDIDATES_A_BEAD = 45, 3.0, 20160705, 10
+GROWTH, BULK_OF_NEAR = 1.0, 5.0
+COARSER = 1.4
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Lengths of the tetrahedra's edges [mm]: by the transducer, and far from it."""
+
+    near_mm: float
+
+    @property
+    def bulk_mm(self) -> float:
+        """Far from the transducer, where Mmg makes them shorter still if the surface is round."""
+        return BULK_OF_NEAR * self.near_mm
+
+    def coarser(self) -> "Sizes":
+        """Sizes for the mesh that shows how much the mesh matters."""
+        return Sizes(COARSER * self.near_mm)
+
+    def mesh(self, kidney: trimesh.Trimesh, press: Press) -> MeshTet2:
+        """Tetrahedra that fill the kidney, fine where the transducer touches it. Raises MeshError."""
+        box = RoundedBox(np.array(press.size_mm), press.edge_mm)
+        beside = np.abs(kidney.vertices[:, :2] - press.over_mm) - np.array(press.size_mm[:2]) / 2
+        top = kidney.vertices[(beside <= 0).all(axis=1), 2].max()
+        touching = np.array([*press.over_mm, top + press.size_mm[2] / 2])
+
+        def wanted(points: np.ndarray) -> np.ndarray:
+            away = np.maximum(box.gap(points - touching) - self.near_mm, 0.0)
+            return np.minimum(self.near_mm + GROWTH * away, self.bulk_mm)
+
+        return tetrahedra(kidney, wanted)
+
+
+def make_reference(
+    organ: trimesh.Trimesh,
+    mould: trimesh.Trimesh,
+    gravity: np.ndarray,
+    sizes: Sizes,
+    report: Callable[[str], None],
+) -> Case:
+    """The case of the embedded patient, solved on a mesh and, for its error, on a coarser one.
+
+    Args:
+        organ: its surface in LPS [mm].
+        mould: the support's surface in LPS [mm].
+        gravity: its direction in LPS, shape (3,).
+        sizes: of the mesh that the case is made of.
+        report: told what happens, a line at a time.
+
+    Raises:
+        MeshError: no mesh fills the organ.
+        NotConvergedError: no equilibrium was found.
+    """
+    kidney, support = laid(organ, gravity, organ), laid(mould, gravity, organ)
+    beads = blue_noise(kidney)
+    coarse = solved(kidney, support, beads, sizes.coarser(), report)
+    case = solved(kidney, support, beads, sizes, report)
+    return replace(case, to_coarser_mm=np.linalg.norm(case.moved_beads - coarse.moved_beads, axis=2))
+
+
+def solved(
+    kidney: trimesh.Trimesh,
+    support: trimesh.Trimesh,
+    beads: np.ndarray,
+    sizes: Sizes,
+    report: Callable[[str], None],
+) -> Case:
+    """The experiment on one mesh; surfaces and beads (n, 3) in the frame of the files [mm]."""
+    start = perf_counter()
+    press = Press()
+    experiment = Experiment(sizes.mesh(kidney, press), support, Material(), press, report=report)
+    report(f"{len(experiment.solid.nodes_of)} tetrahedra, {len(experiment.solid.rest)} nodes")
+    stages = list(experiment.stages())
+    return Case(
+        name="phantom",
+        note="embedded patient of this project, straight central press",
+        kidney=kidney,
+        support=support,
+        beads=beads,
+        solid=experiment.solid,
+        press=press,
+        friction=FRICTION,
+        stages=stages,
+        mesh={
+            "edge_bulk_mm": sizes.bulk_mm,
+            "edge_near_probe_mm": sizes.near_mm,
+            "newton_residual_max": experiment.worst_residual,
+            "time_s": round(perf_counter() - start, 1),
+        },
+        provenance={
+            "kind": "analytic",
+            "formula": "scenes/phantom/kidney.py of Nephron, surface and support as its import makes them",
+            "licence": "no third-party data",
+        },
+    )
+
+
+def laid(surface: trimesh.Trimesh, gravity: np.ndarray, organ: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A surface in the frame of the files: z against gravity, x along the organ's length, its centre of mass 0."""
+    up = -np.asarray(gravity, float) / np.linalg.norm(gravity)
+    length = np.linalg.svd(organ.vertices - organ.vertices.mean(axis=0), full_matrices=False)[2][0]
+    x = length - (length @ up) * up
+    x *= np.sign(x[np.argmax(np.abs(x))]) / np.linalg.norm(x)
+    axes = np.array([x, np.cross(up, x), up])
+    return trimesh.Trimesh((surface.vertices - organ.center_mass) @ axes.T, surface.faces, process=False)
+
+
+def blue_noise(surface: trimesh.Trimesh, count: int = BEADS, depth_mm: float = BEAD_DEPTH_MM) -> np.ndarray:
+    """Points inside a surface, far from each other, shape (count, 3) [mm].
+
+    Mitchell's best candidate (*Spectrally optimal sampling for distribution ray tracing*, SIGGRAPH 1991): of
+    ever more random points, the one that is farthest from those chosen. The seed is fixed.
+    """
+    rng = np.random.default_rng(BEAD_SEED)
+    chosen = np.empty((0, 3))
+    while len(chosen) < count:
+        low, high = surface.bounds
+        points = rng.uniform(low, high, size=(CANDIDATES_A_BEAD * (len(chosen) + 1), 3))
+        points = points[signed_distance(surface, points) <= -depth_mm]
+        if len(points):
+            apart = np.linalg.norm(points[:, None] - chosen[None], axis=2).min(axis=1, initial=np.inf)
+            chosen = np.vstack([chosen, points[apart.argmax()]])
+    return chosen

@@ -1,0 +1,160 @@
+"""The bodies that ``study stability`` maltreats: each settled, with its guard, its transducer and its skin."""
+
+from dataclasses import replace
+
+import numpy as np
+import trimesh
+
+from rehearsal.build_solver import build_solver, step_settings
+from rehearsal.configuration import PRESETS
+from rehearsal.rehearsal import Rehearsal
+from scenes.anatomy import load_anatomy
+from scenes.closed_surfaces import volume_mm3
+from scenes.scene import PAPER, Contact, SolverSection, load_scene, with_options
+from scenes.tissue import TISSUES
+from sim.device import start
+from sim.divergence_check import Guard
+from sim.fields import array_of
+from sim.neo_hookean import LATTICE_SETTINGS, NeoHookean
+from sim.shapes import ConvexTool, Plane
+from sim.skinning import Skin
+from sim.solver import Solver, StepSettings
+from studies.robustness.stress_cases import Subject
+from studies.robustness.stress_motion import AWAY_MM
+from studies.uniform_blocks import block_of_cells, block_of_particles
+from ultrasound.probe_manipulator import advanced, pose_at, touching
+
+# Bodies other than the kidney lie on a plane [mm].
+ELLIPSOID_MM, BALL_MM, APART_MM = (30.0, 18.0, 15.0), 12.0, 40.0
+SIZE_MM = {"neo-hookean": 6.0, "shape-matching": 3.3}
+TRANSDUCER_MM = np.array([20.0, 6.0, 20.0])
+DENSITY = 1.05e-3
+DOWN = (0.0, 0.0, -9810.0)
+# So many steps at a time, until nothing moves any more.
+SETTLE_STEPS, MOST_SETTLES, STILL_MM_S = 180, 20, 0.05
+
+
+class Specimen:
+    """A body at rest in its scene. ``home`` is the transducer's pose (4, 4) where it just touches, ``parts`` the indices of
+    the points of each separate piece, ``mass`` (n,) [g], ``rest`` (n, 3) [mm] where the points came to rest.
+    """
+
+    def __init__(
+        self, solver: Solver, skin: Skin, mesh: trimesh.Trimesh, settings: StepSettings, home: np.ndarray
+    ) -> None:
+        self.solver, self.skin, self.settings, self.home = solver, skin, settings, home
+        self.body, self.model = solver.body, solver.model
+        self.faces, self.volume = np.asarray(mesh.faces), float(mesh.volume)
+        self.parts = [np.arange(self.body.count)]
+        gravity = np.array(settings.gravity)
+        self.up = -gravity / np.linalg.norm(gravity)
+        self.mass = self._masses()
+        self.guard = Guard(solver)
+        self.settled = self.guard.home
+        self.rest = self.settled.body.position.astype(float)
+        skin.update()
+        surface = array_of(skin.vertices).astype(float)
+        along = (surface - home[:3, 3]) @ home[:3, 2]
+        self.thickness_mm = float(np.ptp(along))
+
+    def _masses(self) -> np.ndarray:
+        if isinstance(self.model, NeoHookean):
+            return array_of(self.model.mass).astype(float)
+        return np.full(self.body.count, DENSITY * self.volume / self.body.count)
+
+    def volume_ratio(self) -> float:
+        """Volume inside the carried surface, as a share of the resting one."""
+        self.skin.update()
+        return volume_mm3(array_of(self.skin.vertices), self.faces) / self.volume
+
+    def kinetic_mj(self) -> float:
+        """Kinetic energy now [mJ]."""
+        velocity = array_of(self.body.velocity).astype(float)
+        return float(0.5e-6 * self.mass @ (velocity**2).sum(axis=1))
+
+
+def prepared(model: str, subject: Subject) -> Specimen:
+    """Put a body on a fresh device and let it come to rest."""
+    start("cpu")
+    if subject.kind == "kidney":
+        return _kidney(model)
+    mesh = _mesh(model, subject)
+    tool = ConvexTool.cuboid(TRANSDUCER_MM)
+    shapes = [Plane(np.array([0.0, 0.0, 1.0]), mesh.bounds[0, 2]), tool]
+    if subject.kind in ("one", "cluster"):
+        solver, settings = _block(model, 1 if subject.kind == "one" else 2, shapes, tool)
+    else:
+        solver, settings = _filled(model, subject, mesh, shapes, tool)
+    skin = Skin(solver.model, mesh.vertices)
+    settings.gravity = DOWN
+    _settle(solver, settings, tool)
+    skin.update()
+    surface = array_of(skin.vertices).astype(float)
+    top = surface[:, :2].mean(axis=0)
+    pose = pose_at(np.array([*top, 100.0]), np.array([0.0, 0, -1]), np.array([1.0, 0, 0]), TRANSDUCER_MM[2])
+    specimen = Specimen(solver, skin, mesh, settings, touching(pose, TRANSDUCER_MM, surface))
+    if subject.kind == "two":
+        specimen.parts = [np.flatnonzero(solver.body.rest_points[:, 0] * side > 0) for side in (-1, 1)]
+    return specimen
+
+
+def _kidney(model: str) -> Specimen:
+    fast = PRESETS[model]["fast"]
+    size = {f"tissue.{fast.tissue.SIZE}": fast.size_mm}
+    scene = load_scene(PAPER)
+    anatomy = replace(load_anatomy(scene, PAPER.parent), ct=None)
+    rehearsal = Rehearsal(with_options(scene, {"tissue.model": model, **size}), anatomy)
+    # What is measured from is where the tissue does not move any more.
+    away = advanced(rehearsal.hand.home, -AWAY_MM)
+    for _ in range(SETTLE_STEPS):
+        rehearsal.advance(away)
+    return Specimen(
+        rehearsal.solver, rehearsal.organ_skin, rehearsal.organ, rehearsal.settings, rehearsal.hand.home
+    )
+
+
+def _mesh(model: str, subject: Subject) -> trimesh.Trimesh:
+    size = subject.size_mm or SIZE_MM[model]
+    if subject.kind == "one" and model == "shape-matching":
+        return trimesh.creation.icosphere(subdivisions=2, radius=size / 2)
+    if subject.kind in ("one", "cluster"):
+        side = size * (1 if subject.kind == "one" else 2)
+        return trimesh.creation.box(bounds=[[0.0] * 3, [side] * 3])
+    if subject.kind == "two":
+        ball = trimesh.creation.icosphere(subdivisions=3, radius=BALL_MM)
+        left, right = (ball.vertices + [x, 0.0, 0.0] for x in (-APART_MM / 2, APART_MM / 2))
+        faces = np.concatenate([ball.faces, ball.faces + len(left)])
+        return trimesh.Trimesh(np.concatenate([left, right]), faces, process=False)
+    return trimesh.creation.icosphere(subdivisions=4).apply_scale(ELLIPSOID_MM)
+
+
+def _filled(
+    model: str, subject: Subject, mesh: trimesh.Trimesh, shapes: list, tool: ConvexTool
+) -> tuple[Solver, StepSettings]:
+    size = subject.size_mm or SIZE_MM[model]
+    options: dict[str, str | float | None] = {"tissue.model": model, f"tissue.{TISSUES[model].SIZE}": size}
+    tissue = with_options(load_scene(PAPER), options).tissue
+    scaling = np.log(subject.mass_ratio) / np.ptp(mesh.bounds[:, 2])
+    section = SolverSection(mass_scaling_per_mm=min(float(scaling), 1.0))
+    contact = Contact(particles=subject.kind == "two" and tissue.CAN_TOUCH_ITSELF)
+    return build_solver(mesh, tissue, shapes, tool, contact, section), step_settings(tissue, section)
+
+
+def _block(model: str, side: int, shapes: list, tool: ConvexTool) -> tuple[Solver, StepSettings]:
+    """A cell or a particle alone, or two of them along each edge, which are one cluster."""
+    size = SIZE_MM[model]
+    if model == "neo-hookean":
+        return block_of_cells(side, size, shapes, tool), replace(LATTICE_SETTINGS)
+    points = size * (np.indices((side, side, side)).reshape(3, -1).T + (0.5 if side > 1 else 0.0))
+    return block_of_particles(points, size, shapes, tool), StepSettings()
+
+
+def _settle(solver: Solver, settings: StepSettings, tool: ConvexTool) -> None:
+    away = advanced(np.eye(4), -AWAY_MM)
+    tool.move(away, away)
+    for _ in range(MOST_SETTLES):
+        for _ in range(SETTLE_STEPS):
+            solver.step(settings)
+        # A cell that falls alone tumbles on for seconds, on some processors longer than on others.
+        if np.abs(array_of(solver.body.velocity)).max() < STILL_MM_S:
+            return

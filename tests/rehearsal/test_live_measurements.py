@@ -1,0 +1,152 @@
+"""What the instruments read off a rehearsal, and make of a plan and of a session that is opened in its midst."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+from plan_ball import Z, over_ball, plan_of, straight_pass, sweep_of
+
+from rehearsal.measurements import live_measurements
+from rehearsal.measurements.live_measurements import Instruments
+from rehearsal.measurements.tumour_measurements import Reading
+from rehearsal.planning.plan_guidance import Guide
+from rehearsal.sessions.packed_coverage import pack_seen
+from rehearsal.sessions.session_file import Event, Log, SessionError
+from render.viewer import Settings, View
+from ultrasound.probe import load_probe
+
+FIRST, SECOND = straight_pass(4, step_mm=2.0), straight_pass(3, 20.0, 2.0)
+
+
+@pytest.fixture
+def rehearsal() -> SimpleNamespace:
+    organ = trimesh.creation.icosphere(subdivisions=3, radius=25.0)
+    tumour = trimesh.creation.icosphere(subdivisions=3, radius=6.0).apply_translation(12 * Z)
+    image = SimpleNamespace(contact_gap_mm=None)
+    scene = SimpleNamespace(image=image, transducer=SimpleNamespace(compression_warning_mm=8.0))
+    plane = SimpleNamespace(rest_grid=lambda count: np.full((count, count, 3), 500.0, np.float32))
+    return SimpleNamespace(
+        **vars(over_ball()) | dict(organ=organ, tumour=tumour, scene=scene, probe=load_probe("linear")),
+        scanner=SimpleNamespace(plane=plane),
+        pose=FIRST[0],
+    )
+
+
+@pytest.fixture
+def watching(monkeypatch, rehearsal) -> Instruments:
+    monkeypatch.setattr(live_measurements, "read", lambda *_: Reading(1.0, 20.0))
+    return Instruments(rehearsal, Guide(rehearsal, plan_of(sweep_of(FIRST, SECOND), margin_mm=8.0)))
+
+
+def test_the_instruments_watch_the_guide_and_record_it(watching, rehearsal, one_device):
+    noted: list[dict] = []
+    session = SimpleNamespace(moment=0, kept={}, back=None, note=lambda name, figures: noted.append(figures))
+    for pose in FIRST:
+        rehearsal.pose = pose
+        watching.watch(session, rehearsal.probe, pose)
+        session.moment += 5
+    assert [round(each["plan_followed"], 3) for each in noted] == [round(n / 7, 3) for n in (1, 2, 3, 4)]
+    assert all(each["plan_off_mm"] == 0 and "seen_margin" in each for each in noted)
+    view = watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings())
+    assert view.guidance.goal == pytest.approx(SECOND[0]) and view.findings["plan"] == "57 %"
+    watching.begin_anew()
+    assert watching.guide.at == 0
+    watching.guide = None
+    assert watching.onto(view, Settings()).guidance is None and "plan_followed" not in watching.figures()
+
+
+def test_what_a_session_holds_is_recalled_as_it_was_watched(watching, rehearsal, one_device, monkeypatch):
+    # The first is no press: as it is noted it is 1 mm.
+    squeezed = iter([1.00004, 0.3, 9.0, 0.2])
+    monkeypatch.setattr(live_measurements, "read", lambda *_: Reading(next(squeezed), 20.0, 5.0, 2.0, 1.0))
+    events: dict[int, list] = {}
+    session = SimpleNamespace(moment=0, kept={}, back=None)
+    session.note = lambda kind, value: events.setdefault(session.moment, []).append(
+        Event(at=session.moment, kind=kind, value=value)
+    )
+    for session.moment, rehearsal.pose in enumerate(FIRST, 1):
+        watching._read_every = 1
+        watching.watch(session, rehearsal.probe, rehearsal.pose)
+    watching.course.add(None, 0.2)
+    watching.coverage.seen[watching.coverage.targets["tumour"]] = True
+    log = Log(None, np.stack([*FIRST, np.full((4, 4), np.nan)]), events)
+    again = Instruments(rehearsal, Guide(rehearsal, watching.guide.plan))
+    assert again.recall(log, 0) and not again.recall(log, 5) and again.course.duration_s == 0
+    log.seen[5] = pack_seen(watching.coverage.seen)
+    assert again.recall(log, 5)
+    assert again.figures() == watching.figures() and again.summary(2) == watching.summary(2)
+    assert (again.course.presses, again.course.went_back, again.guide.at) == (1, 1, 4)
+    view = again.onto(View(np.eye(4), {}, 40.0, 60.0), Settings(show_seen=True))
+    assert view.findings["tumour seen"] == "100 %" and view.seen["tumour"].any()
+    del log.events[1][0].value["contact_mm2"]
+    with pytest.raises(SessionError, match="without compression or contact"):
+        Instruments(rehearsal).recall(log, 5)
+
+
+def test_a_way_back_is_looked_at_and_read_anew_at_once(watching, rehearsal, one_device, monkeypatch):
+    depths = iter([9.0, 0.2])
+    monkeypatch.setattr(live_measurements, "read", lambda *_: Reading(next(depths), 20.0))
+    lines = np.ones(rehearsal.probe.number_of_scanlines, bool)
+    looks = iter([lines, ~lines])
+    monkeypatch.setattr(watching.coverage, "look", lambda *_: next(looks))
+    noted: list[float] = []
+    watching._look_every = 2
+    session = SimpleNamespace(moment=0, kept={}, back=None)
+    session.note = lambda kind, figures: noted.append(figures["compression_mm"])
+    for session.moment, pose in ((0, FIRST[0]), (1, FIRST[0]), (3, None)):
+        watching.watch(session, rehearsal.probe, pose)
+    view = watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings())
+    assert view.findings["compression"] == "0.2 mm" and noted == [9.0, 0.2] and view.notes
+    assert view.alert == ""
+
+
+def test_a_session_that_begins_is_read_with_what_touches_then(watching, rehearsal, one_device, monkeypatch):
+    """Though its first moment is none at which it would be looked."""
+    given = []
+    monkeypatch.setattr(
+        live_measurements, "read", lambda *asked: given.append(asked[-1]) or Reading(1.0, 20.0)
+    )
+    touches = np.arange(rehearsal.probe.number_of_scanlines) < 30
+    monkeypatch.setattr(watching.coverage, "look", lambda *_: touches)
+    watching._look_every = 2
+    for _ in range(2):
+        session = SimpleNamespace(moment=1, kept={}, back=None, note=lambda *_: None)
+        watching.watch(session, rehearsal.probe, FIRST[0])
+        watching.begin_anew()
+    assert len(given) == 2 and all(np.array_equal(each, touches) for each in given)
+
+
+def test_another_plan_brings_its_margin_and_what_was_seen_stays(watching, rehearsal, one_device):
+    volume = watching.coverage.targets["margin"].sum()
+    watching.coverage.seen[watching.coverage.targets["tumour"]] = True
+    before = watching.coverage
+    watching.follow(Guide(rehearsal, plan_of(margin_mm=8.0)))
+    assert watching.coverage is before
+    watching.follow(Guide(rehearsal, plan_of(margin_mm=2.0)))
+    assert watching.margin_mm == 2.0 and watching.coverage.targets["margin"].sum() < volume / 2
+    assert watching.coverage.share("tumour") == 1.0 and watching.guide.plan.margin_mm == 2.0
+    assert Instruments(rehearsal).margin_mm == live_measurements.MARGIN_MM
+
+
+@pytest.mark.parametrize(
+    ("touching", "notes"), [(0, {"B-mode": "NO CONTACT"}), (9, {"B-mode": "NO CONTACT"}), (10, {})]
+)
+def test_an_echo_is_said_to_be_black_where_hardly_a_line_touches(
+    one_device, watching, rehearsal, monkeypatch, touching, notes
+):
+    touches = np.arange(rehearsal.probe.number_of_scanlines) < touching
+    monkeypatch.setattr(watching.coverage, "look", lambda *_: touches)
+    watching.watch(
+        SimpleNamespace(moment=0, kept={}, back=None, note=lambda *_: None), rehearsal.probe, FIRST[0]
+    )
+    assert watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings()).notes == notes
+
+
+@pytest.mark.parametrize(
+    ("in_view", "margin", "shown"),
+    [(0.5, -0.04, "0.0 mm"), (0.5, 0.0, "0.0 mm"), (0.5, -0.06, "-0.1 mm"), (0.0, 1.0, ""), (None, None, "")],
+)
+def test_a_margin_of_nothing_has_no_minus(one_device, watching, in_view, margin, shown):
+    watching.reading = Reading(1.0, 20.0, 5.0, 2.0, 1.0, in_view, margin)
+    assert watching.findings()["margin"] == shown

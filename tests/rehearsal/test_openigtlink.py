@@ -1,0 +1,367 @@
+"""The link: what a client gets over a real socket, where it is in the patient, and clients that misbehave."""
+
+import io
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+
+import numpy as np
+import pyigtl
+import pytest
+from conftest import rotation_about
+from pyigtl.messages import CRC64
+
+from rehearsal.tracking import openigtlink_server as server_module
+from rehearsal.tracking.openigtlink_image import send_live
+from rehearsal.tracking.openigtlink_messages import IMAGE, IMAGE_TO_PROBE, PROBE, LivePicture, packed
+from rehearsal.tracking.openigtlink_pose import HAND, STALE_S
+from rehearsal.tracking.openigtlink_server import Server
+from ultrasound.probe import Probe, load_probe
+
+# One of 3 x 5 pixels is 277 bytes.
+ROWS, COLUMNS = 3, 5
+HEADER = ">H 12s 20s II Q Q"
+# Long for a loopback, short for a test.
+SOON_S = 5.0
+
+
+def pose() -> np.ndarray:
+    """A probe held aslant, off the origin, with no two axes alike."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_about([1.0, 2.0, -0.5], 40.0)
+    pose[:3, 3] = 12.0, -80.5, -333.25
+    return pose
+
+
+def live(
+    number: int = 0, rows: int = ROWS, columns: int = COLUMNS, probe: Probe | None = None
+) -> LivePicture:
+    """Pictures that tell their number by pixels, place and time."""
+    grey = ((np.arange(rows * columns) + number) % 251).astype(np.uint8).reshape(rows, columns)
+    place = pose()
+    place[0, 3] += number
+    pixels = (probe or load_probe("linear")).image_to_probe(rows, columns)
+    return LivePicture(grey, pixels, place, number / 30)
+
+
+@pytest.fixture
+def said() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def server(said) -> Iterator[Server]:
+    """A server on a free port of the loopback."""
+    with Server("127.0.0.1", 0, said.append) as server:
+        yield server
+
+
+@pytest.fixture
+def client(server) -> Iterator[pyigtl.OpenIGTLinkClient]:
+    client = pyigtl.OpenIGTLinkClient("127.0.0.1", server.port)
+    yield client
+    client.stop()
+
+
+def joined(server: Server) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", server.port), SOON_S)
+
+
+def read(connection: socket.socket, size: int) -> bytes:
+    content = b""
+    while len(content) < size:
+        piece = connection.recv(size - len(content))
+        assert piece, "the server has gone"
+        content += piece
+    return content
+
+
+def next_message(connection: socket.socket) -> tuple[str, str, bytes]:
+    """Type, device name and body of the next message, by the protocol's text; its sum must be right."""
+    version, kind, name, _, _, size, check = struct.unpack(HEADER, read(connection, struct.calcsize(HEADER)))
+    body = read(connection, size)
+    assert version == 1 and check == CRC64(body)
+    return kind.rstrip(b"\0").decode(), name.rstrip(b"\0").decode(), body
+
+
+def next_picture(connection: socket.socket) -> bytes:
+    while (message := next_message(connection))[:2] != ("IMAGE", IMAGE):
+        pass
+    return message[2]
+
+
+def soon(holds: Callable[[], bool]) -> bool:
+    """Whether something comes true before long."""
+    until = time.monotonic() + SOON_S
+    while not holds() and time.monotonic() < until:
+        time.sleep(0.005)
+    return holds()
+
+
+def test_a_client_gets_pictures_and_poses_at_thirty_a_second(server, client):
+    server.show(live(0))
+    assert client.wait_for_message(IMAGE, SOON_S).image[0, 0, 0] == 0
+    fed = 60
+
+    def feed() -> None:
+        for number in range(1, fed + 1):
+            time.sleep(1 / 30)
+            server.show(live(number))
+
+    feeder = threading.Thread(target=feed)
+    feeder.start()
+    got: dict[str, list] = {IMAGE: [], PROBE: [], IMAGE_TO_PROBE: []}
+    until = time.monotonic() + fed / 30 + SOON_S
+    while time.monotonic() < until and not (got[IMAGE] and got[IMAGE][-1].timestamp > fed / 30 - 1e-6):
+        for message in client.get_latest_messages():
+            got[message.device_name].append(message)
+        time.sleep(0.002)
+    feeder.join()
+    for messages in got.values():
+        numbers = [round(30 * message.timestamp) for message in messages]
+        # pyigtl's client keeps one message a device: where it is held up, a later one takes an earlier one's place.
+        assert len(set(numbers) - {0}) >= 0.9 * fed and numbers == sorted(numbers) and numbers[-1] == fed
+    for number, message in ((round(30 * each.timestamp), each) for each in got[IMAGE]):
+        assert np.array_equal(message.image[0], live(number).grey)
+        assert message.timestamp == pytest.approx(number / 30, abs=2e-9)
+    for number, message in ((round(30 * each.timestamp), each) for each in got[PROBE]):
+        # x and y change sign from LPS to RAS, z does not; a float32 of 333 mm is good to 2e-5.
+        assert np.allclose(message.matrix, live(number).probe_in_patient * [[-1], [-1], [1], [1]], atol=2e-5)
+    assert np.allclose(got[IMAGE_TO_PROBE][-1].matrix, live().image_to_probe, atol=2e-6)
+
+
+def test_the_corner_pixels_are_where_they_are_in_the_patient(server):
+    """The oracle: a curved array's picture of 40 rows and 24 columns laid out by hand, the message read by the protocol's text."""
+    rows, columns = 40, 24
+    probe = load_probe("curvilinear")
+    width, depth, above = probe.extent_mm
+    assert above > 1
+    sent = live(7, rows, columns, probe)
+    with joined(server) as connection:
+        server.show(sent)
+        body = next_picture(connection)
+    version, components, scalar, _, space, *size = struct.unpack(">HBBBBHHH", body[:12])
+    assert (version, components, scalar, space, size) == (1, 1, 3, 1, [columns, rows, 1])
+    vectors = np.array(struct.unpack(">12f", body[12:60])).reshape(4, 3)
+    assert struct.unpack(">6H", body[60:72]) == (0, 0, 0, columns, rows, 1)
+    along_column, along_row, normal, centre = vectors
+    x, y, z, origin = sent.probe_in_patient[:3].T
+    for column in (0, columns - 1):
+        for row in (0, rows - 1):
+            place = centre + (column - (columns - 1) / 2) * along_column + (row - (rows - 1) / 2) * along_row
+            u = (column + 0.5) * width / columns - width / 2
+            v = (row + 0.5) * depth / rows - above
+            wanted = (origin + u * x + v * y) * [-1, -1, 1]
+            # Two dozen float32 of up to 400 mm.
+            assert np.allclose(place, wanted, atol=2e-4)
+            pixel = body[72 + row * columns + column]
+            assert pixel == sent.grey[row, column]
+    # Slices are one mm thick, towards z = x cross y, so that no picture is mirrored.
+    assert np.allclose(normal, z * [-1, -1, 1], atol=1e-6)
+
+
+def test_pyigtl_reads_the_same_corner(server, client):
+    sent = live(3)
+    server.show(sent)
+    message = client.wait_for_message(IMAGE, SOON_S)
+    wanted = np.diag([-1, -1, 1, 1]) @ sent.probe_in_patient @ sent.image_to_probe
+    assert message.world_coordinate_system == "ras" and message.image.shape == (1, ROWS, COLUMNS)
+    assert np.allclose(message.ijk_to_world_matrix, wanted, atol=1e-4)
+
+
+def test_nothing_of_anybody_is_sent():
+    names = {b"IMAGE", b"TRANSFORM", IMAGE.encode(), PROBE.encode(), IMAGE_TO_PROBE.encode()}
+    stream, found = packed(live()), set()
+    while stream:
+        header, stream = stream[:58], stream[58:]
+        _, kind, name, seconds, _, size, _ = struct.unpack(HEADER, header)
+        found |= {kind.rstrip(b"\0"), name.rstrip(b"\0")}
+        # The rehearsal's time, which says nothing of the day.
+        assert seconds == 0
+        stream = stream[size:]
+    assert found == names and max(map(len, names)) <= 20
+
+
+def test_showing_packs_nothing_and_without_a_client_nobody_does(server, monkeypatch):
+    packers: list[int] = []
+
+    def watched(picture: LivePicture) -> bytes:
+        packers.append(threading.get_ident())
+        return packed(picture)
+
+    monkeypatch.setattr(server_module, "packed", watched)
+    for number in range(20):
+        server.show(live(number))
+    time.sleep(0.1)
+    assert packers == []
+    with joined(server) as connection:
+        # One that comes late has the newest picture at once, and that once.
+        assert next_picture(connection)[72] == 19
+        server.show(live(20))
+        assert next_picture(connection)[72] == 20
+        assert len(packers) == 2 and threading.get_ident() not in packers
+
+
+def test_a_slow_client_skips_pictures_and_the_newest_reaches_it(server):
+    with joined(server) as slow, joined(server) as quick:
+        for number in range(200):
+            # More than the sockets between them hold.
+            server.show(live(number, 512, 512))
+        while next_picture(quick)[72] != 199:
+            pass
+        seen = 0
+        while next_picture(slow)[72] != 199:
+            seen += 1
+        assert seen < 150
+
+
+def test_clients_that_come_and_go_and_send_rubbish_harm_nobody(server, said):
+    half = struct.pack(HEADER, 1, b"TRANSFORM", HAND.encode(), 0, 0, 48, 0)
+    rubbish = (
+        b"GET / HTTP/1.1\r\nHost: here\r\nAccept: everything, twice over\r\n\r\n",
+        bytes(range(255, 195, -1)),
+        struct.pack(HEADER, 1, b"\xff\xfe", b"", 0, 0, 0, 0),
+        struct.pack(HEADER, 1, b"TRANSFORM", b"", 0, 0, 1 << 60, 0),
+        struct.pack(HEADER, 1, b"TRANSFORM", b"", 0, 0, 5, 0) + b"short",
+    )
+    for each in rubbish:
+        with joined(server) as connection:
+            connection.sendall(each)
+            assert connection.recv(1) == b"", each
+    for each in (b"", half[:20], half + b"\0" * 20):
+        joined(server).sendall(each)
+    with joined(server) as connection:
+        server.show(live(5))
+        assert next_picture(connection)[72] == 5
+    server.show(live(6))
+    assert len(said) == 1 and "was let go" in said[0]
+    assert soon(lambda: not server._clients) and server.hand.pose() is None
+
+
+def test_what_is_no_transform_is_passed_over(server, client):
+    with joined(server) as connection:
+        picture = pyigtl.ImageMessage(np.zeros((1, 300, 300), np.uint8), device_name=HAND).pack()
+        status = struct.pack(HEADER, 2, b"GET_STATUS", b"", 0, 0, 0, 0)
+        connection.sendall(picture + status + hand_message(pose(), "Stylus") + hand_message(np.eye(4)))
+        assert soon(lambda: server.hand.pose() is not None)
+    assert np.allclose(server.hand.pose(), np.diag([-1, -1, 1, 1]))
+
+
+class Late:
+    """A client that was let in while the server closed."""
+
+    is_here = False
+
+
+@pytest.mark.parametrize("sent", [b"", b"\0" * 30], ids=["silent", "half a header"])
+def test_closing_ends_at_once_and_frees_the_port(said, sent):
+    server = Server("127.0.0.1", 0, said.append)
+    port, before = server.port, threading.active_count()
+    with joined(server) as connection:
+        connection.sendall(sent)
+        assert soon(lambda: threading.active_count() == before + 2)
+        began = time.monotonic()
+        server.close()
+        assert time.monotonic() - began < 1
+        assert connection.recv(1) == b""
+        # Nobody waits for a client that stays.
+        assert soon(lambda: threading.active_count() < before)
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", port), SOON_S)
+    late = Late()
+    server.enter(late)
+    assert server.newer(late, None) is None and said == []
+    Server("127.0.0.1", port, said.append).close()
+
+
+def hand_message(matrix: np.ndarray, name: str = HAND, version: int = 1) -> bytes:
+    message = pyigtl.TransformMessage(matrix, device_name=name)
+    message.header_version = version
+    return message.pack()
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_clients_pose_comes_in(server, version):
+    assert server.hand.pose() is None
+    # Aslant, in RAS: a probe whose x is the patient's right is -x in LPS.
+    sent = pose()
+    with joined(server) as connection:
+        connection.sendall(hand_message(sent, version=version))
+        assert soon(lambda: server.hand.pose() is not None)
+    got = server.hand.pose()
+    assert np.allclose(got[:3, 3], [-12.0, 80.5, -333.25]) and np.allclose(got[3], [0, 0, 0, 1])
+    for axis in range(3):
+        assert np.allclose(got[:3, axis], sent[:3, axis] * [-1, -1, 1], atol=1e-6)
+    # What a float32 leaves of right angles is put right.
+    assert np.abs(got[:3, :3].T @ got[:3, :3] - np.eye(3)).max() < 1e-14
+
+
+def test_a_pose_goes_stale(said):
+    now = [100.0]
+    hand = server_module.HandPose(said.append, lambda: now[0])
+    hand.take(HAND, pose())
+    now[0] += STALE_S
+    hand.take("ProbeToReference", np.eye(4))
+    assert np.allclose(hand.pose()[:3, 3], [-12.0, 80.5, -333.25])
+    now[0] += 1e-3
+    assert hand.pose() is None
+    hand.take(HAND, np.eye(4))
+    assert np.allclose(hand.pose(), np.diag([-1, -1, 1, 1])) and said == []
+
+
+def changed(at: tuple, value: float) -> np.ndarray:
+    matrix = pose()
+    matrix[at] = value
+    return matrix
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        changed((0, 3), np.nan),
+        changed((1, 1), np.inf),
+        changed((2, 3), 1e5),
+        pose() @ np.diag([1.01, 1, 1, 1]),
+        pose() @ np.diag([1, 1, -1, 1]),
+        np.diag([0, 0, 0, 1.0]),
+        np.array([[1, 0.01, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
+    ],
+)
+def test_what_is_no_rigid_pose_is_refused_and_said_once(said, matrix):
+    hand = server_module.HandPose(said.append)
+    hand.take(HAND, pose())
+    for _ in range(2):
+        hand.take(HAND, matrix)
+        assert hand.pose() is None
+    assert len(said) == 1 and "no rigid transform" in said[0]
+    hand.take(HAND, pose())
+    assert isinstance(hand.pose(), np.ndarray)
+
+
+def test_a_rehearsals_first_picture_goes_out_with_the_probe_as_it_is_set():
+    shown: list[LivePicture] = []
+    plane, origin = pose(), np.array([10.0, 20.0, 30.0])
+    rehearsal = SimpleNamespace(image_plane=lambda: SimpleNamespace(world_from_plane=plane), origin=origin)
+    echo, ct = np.full((8, 6), 9, np.uint8), np.zeros((8, 6), np.uint8)
+    probe = load_probe("linear").model_copy(update=dict(depth_mm=80.0, transducer_width_mm=30.0))
+    send_live(None, rehearsal, SimpleNamespace(pictures={"B-mode": echo}), probe, 1.5)
+    link = SimpleNamespace(show=shown.append)
+    send_live(link, rehearsal, SimpleNamespace(pictures={"B-mode": echo, "CT": ct}), probe, 1.5)
+    (sent,) = shown
+    assert sent.grey is echo and sent.time_s == 1.5
+    assert np.allclose(sent.probe_in_patient[:3, 3], plane[:3, 3] + origin)
+    assert np.allclose(np.diag(sent.image_to_probe), [30 / 6, 80 / 8, 1, 1])
+
+
+def test_packing_is_a_stream_of_whole_messages():
+    stream = io.BytesIO(packed(live()))
+    kinds = []
+    while header := stream.read(58):
+        _, kind, *_, size, _ = struct.unpack(HEADER, header)
+        kinds.append(kind.rstrip(b"\0").decode())
+        assert len(stream.read(size)) == size
+    # Where it is comes before what it shows.
+    assert kinds == ["TRANSFORM", "TRANSFORM", "IMAGE"]

@@ -1,0 +1,98 @@
+"""A rehearsal's state as text, bit for bit, and what a session comes to in figures."""
+
+import base64
+import io
+import zipfile
+from contextlib import suppress
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from test_undo_history import STEP_S, Numbers
+
+from rehearsal.measurements.session_summary import Course, in_words
+from rehearsal.sessions import packed_state
+from rehearsal.sessions.packed_state import StateError, from_text, to_text
+from ultrasound.coverage import Gap
+from ultrasound.probe_manipulator import Grip
+
+
+def arrays_of(state: Any) -> list[np.ndarray]:
+    """All that a state holds, depth first."""
+    if isinstance(state, dict):
+        return [array for _, each in sorted(packed_state.items()) for array in arrays_of(each)]
+    if is_dataclass(state):
+        return [array for each in fields(state) for array in arrays_of(getattr(state, each.name))]
+    return [np.asarray(state)]
+
+
+@pytest.mark.parametrize("aim", [None, np.diag([-0.0, 1 / 3, 5e-324, 1.0])])
+def test_a_state_as_text_keeps_every_bit(aim):
+    numbers = Numbers()
+    for _ in range(15):
+        numbers.advance(numbers.pose_towards(np.eye(4)))
+    numbers.watch = replace(numbers.watch, steps_tangled=3, is_restored=True)
+    numbers.velocity = np.array([[-0.0, 1e-45, np.inf], [np.nan, 1 / 3, -7]], np.float32)
+    numbers.hand.grip = Grip(0.1, 2.3, (1 / 3, -4.0, 5.0), aim)
+    before = numbers.snapshot()
+    pairs = list(zip(arrays_of(before), arrays_of(from_text(to_text(before), numbers.settled)), strict=True))
+    # Now and when last good: position, velocity and contacts; the watch's three; pose, steps; the hand's four.
+    assert len(pairs) == 2 * 3 + 3 + 2 + 4
+    assert all(old.dtype == new.dtype and old.tobytes() == new.tobytes() for old, new in pairs)
+
+
+def packed(**arrays: np.ndarray) -> str:
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return base64.b64encode(file.getvalue()).decode()
+
+
+def test_what_is_no_state_of_this_body_is_refused(monkeypatch):
+    numbers, random = Numbers(), np.random.default_rng(0)
+    text = to_text(numbers.snapshot())
+    whole = base64.b64decode(text)
+    arrays = dict(np.load(io.BytesIO(whole)))
+    hostile = ["", "no state", text[:-40], packed(), packed(**arrays | {"pose": np.full((4, 4), np.nan)})]
+    for name, array in arrays.items():
+        others = np.array(["a"]), np.array([{}]), np.stack([array, array])
+        hostile += [packed(**arrays | {name: other}) for other in others]
+        hostile.append(packed(**{key: values for key, values in arrays.items() if key != name}))
+    huge, npy = io.BytesIO(), io.BytesIO()
+    np.lib.format.write_array_header_1_0(npy, dict(descr="<f8", fortran_order=False, shape=(10**15,)))
+    with zipfile.ZipFile(huge, "w") as members:
+        members.writestr("pose.npy", npy.getvalue())
+    for each in [*hostile, base64.b64encode(huge.getvalue()).decode()]:
+        with pytest.raises(StateError, match=r"^[^\n]+$"):
+            from_text(each, numbers.settled)
+    for _ in range(300):
+        flipped = bytearray(whole)
+        flipped[random.integers(len(whole))] ^= 1 << random.integers(8)
+        with suppress(StateError):
+            assert to_text(from_text(base64.b64encode(flipped).decode(), numbers.settled)) == text
+    monkeypatch.setattr(packed_state, "MOST_BYTES", 500)
+    with pytest.raises(StateError, match="too large"):
+        from_text(text, numbers.settled)
+
+
+def test_a_course_counts_presses_ways_and_time_over_the_limit():
+    course = Course(warning_mm=8.0, step_s=STEP_S)
+    pose = np.eye(4)
+    # Squeezed over 1 mm is a press, until it is less than 0.5 mm.
+    for compression_mm in (0.0, 1.0, 1.1, 0.6, 1.2, 0.5, 0.9, 1.5, 9.0, 8.0, 8.5):
+        course.add(pose, compression_mm)
+    assert (course.presses, course.compression_mm, course.too_deep_s) == (2, 9.0, 2 * STEP_S)
+    assert course.path_mm == course.fastest_mm_s == 0.0
+    for at_mm in ([3.0, 4.0, 0.0], [3.0, 4.0, 1.0], None, [90.0, 0.0, 0.0], [90.0, 0.0, 2.0]):
+        pose[:3, 3] = at_mm or 0.0
+        course.add(None if at_mm is None else pose, 0.0)
+    # 5 mm, 1 mm, a way back, whose leap is no way of the transducer, 2 mm.
+    assert (course.path_mm, course.fastest_mm_s, course.went_back) == (8.0, 5.0 / STEP_S, 1)
+    figures = course.summary({"seen_organ": 0.25, "contact_mm2": 3.0}, [Gap(1.5, 2.0)], 4)
+    assert (figures["duration_s"], figures["bookmarks"], figures["seen_organ"]) == (2.0, 4, 0.25)
+    assert "contact_mm2" not in figures and "2 presses" in in_words(figures)
+    assert "4 bookmarks" in in_words(
+        figures
+    ) and "largest part unseen is 1.5 ml, up to 2.0 mm thick" in in_words(figures)
+    said = in_words(figures | dict(presses=1, bookmarks=1))
+    assert "1 press," in said and "1 bookmark\n" in said

@@ -1,0 +1,259 @@
+"""What a plan chooses among, and sweeps that nobody planned, over a ball with a tumour in it."""
+
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+from plan_ball import FACET_MM, ORIGIN, SIZE, X, Y, Z, big_ball, faces_in, hand_on, in_patient, sweep_of
+
+from rehearsal.coordinates import probe_in_patient
+from rehearsal.planning.plan_file import MOST_SWEEPS
+from rehearsal.planning.sweep_candidates import (
+    MOST_PASSES,
+    ROUND,
+    Candidate,
+    candidates_of,
+    directions,
+    half_size,
+    passes_needed,
+    shallowest,
+)
+from rehearsal.planning.sweep_path import layout_towards
+from scenes.anatomy import LoadedAnatomy
+from sim.mesh_distance import signed_distance
+from studies.planning import virtual_tumour
+from studies.planning.baseline_sweeps import by_chance, planned, row_by_row, straight, ways_by_chance
+from ultrasound.coverage import VOXEL_MM, Coverage
+from ultrasound.probe import load_probe
+
+pytestmark = pytest.mark.usefixtures("one_device")
+
+R, WIDTH = 30.0, 16.0
+PROBE = load_probe("linear").model_copy(update=dict(transducer_width_mm=WIDTH))
+# Directions of a Fibonacci spiral are no farther from any than this.
+GRAIN_DEG = 9.0
+
+
+def everywhere(poses: np.ndarray) -> np.ndarray:
+    return np.ones(len(poses), bool)
+
+
+@pytest.fixture(scope="module")
+def rehearsal(one_device) -> SimpleNamespace:
+    press = SimpleNamespace(direction=(0.0, 0.0, -1.0), lateral=(1.0, 0.0, 0.0))
+    return SimpleNamespace(hand=hand_on(big_ball()), press=press, probe=PROBE, size_mm=SIZE, origin=ORIGIN)
+
+
+def coverage_of(at: np.ndarray, radius: float = 7.0) -> Coverage:
+    tumour = trimesh.creation.icosphere(subdivisions=3, radius=radius).apply_translation(at)
+    return Coverage(big_ball(), tumour)
+
+
+def aside_by(degrees: float) -> np.ndarray:
+    return np.array([0.0, np.sin(np.radians(degrees)), np.cos(np.radians(degrees))])
+
+
+def found_for(rehearsal, at: np.ndarray, reach=everywhere, radius: float = 7.0) -> list[Candidate]:
+    return candidates_of(rehearsal, coverage_of(at, radius), "tumour", reach)
+
+
+def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
+
+
+def test_directions_are_units_evenly_around():
+    found = directions(300)
+    assert np.linalg.norm(found, axis=1) == pytest.approx(1)
+    cosines = np.clip(np.random.default_rng(1).normal(size=(2000, 3)), -3, 3)
+    cosines /= np.linalg.norm(cosines, axis=1, keepdims=True)
+    assert np.degrees(np.arccos((cosines @ found.T).max(axis=1))).max() < GRAIN_DEG
+    # Second moments of a sphere are those of a third along each axis.
+    assert found.T @ found / 300 == pytest.approx(np.eye(3) / 3, abs=0.01)
+
+
+def test_a_tumour_on_top_is_looked_at_from_above_only(rehearsal):
+    found = found_for(rehearsal, 18.0 * Z)
+    assert [each.motion for each in found] == ["glide", "glide", "rock"]
+    assert all(each.side == "from above" for each in found)
+    assert [each.count for each in found] == [1, 2, 1]
+    for each in found:
+        assert each.layout.outward == pytest.approx(Z) and each.layout.lateral == pytest.approx(X)
+        assert each.layout.centre == pytest.approx(18.0 * Z, abs=VOXEL_MM / 2)
+
+
+@pytest.mark.parametrize("aside", [40.0, -60.0])
+def test_a_tumour_at_the_side_is_looked_at_from_there_too(rehearsal, aside):
+    found = found_for(rehearsal, 18.0 * aside_by(aside))
+    assert [each.motion for each in found] == ["glide", "glide", "glide", "rock"]
+    assert len(found) <= MOST_SWEEPS
+    assert found[0].layout.outward == pytest.approx(Z)
+    for each in found[1:]:
+        assert angle_deg(each.layout.outward, aside_by(aside)) < GRAIN_DEG
+        assert each.side == "from the nearest side"
+
+
+def test_no_side_is_looked_at_from_under_the_organ(rehearsal):
+    outward = shallowest(rehearsal.hand, -20.0 * Z, Z, everywhere, X)
+    assert outward @ Z >= ROUND
+    assert angle_deg(outward, np.array([*outward[:2], 0.0]) / np.linalg.norm(outward[:2])) < 2 * GRAIN_DEG
+
+
+def test_the_nearest_side_is_one_that_can_be_reached(rehearsal):
+    centre = 18.0 * aside_by(60)
+
+    def from_left(poses: np.ndarray) -> np.ndarray:
+        return poses[:, 1, 2] < -0.2
+
+    outward = shallowest(rehearsal.hand, centre, Z, from_left, X)
+    assert outward[1] < -0.1
+    assert shallowest(rehearsal.hand, centre, Z, lambda poses: ~everywhere(poses), X) is None
+    nowhere = found_for(rehearsal, centre, lambda poses: ~everywhere(poses))
+    assert len(nowhere) == 3 and all(each.side == "from above" for each in nowhere)
+
+
+def test_half_of_a_target_is_measured_across_and_along():
+    layout = layout_towards(np.array([1.0, 1, 1]), Z, Y)
+    places = np.array([[1.0, 1, 1], [4, 1, 9], [1, -6, 1]])
+    assert half_size(layout, places) == pytest.approx([7, 3])
+
+
+def test_passes_are_as_many_as_the_target_is_wide_in_pictures():
+    assert passes_needed(0.4 * WIDTH, WIDTH) == 1
+    counts = [passes_needed(half, WIDTH) for half in np.arange(1.0, 200.0)]
+    assert sorted(counts) == counts and counts[-1] == MOST_PASSES and set(np.diff(counts)) == {0, 1}
+
+
+def test_no_two_candidates_are_the_same_where_passes_are_at_their_most(rehearsal):
+    narrow = SimpleNamespace(
+        **vars(rehearsal) | dict(probe=load_probe("linear").model_copy(update=dict(transducer_width_mm=3.0)))
+    )
+    found = candidates_of(narrow, coverage_of(18.0 * Z), "organ", everywhere)
+    assert {each.count for each in found} == {MOST_PASSES}
+    assert len({each.named(each.count) for each in found}) == len(found) == 3
+
+
+@pytest.mark.parametrize("radius", [7.0, 12.0])
+def test_each_begins_over_its_target_and_its_numbers_go_from_end_to_end(rehearsal, radius):
+    coverage = coverage_of(15.0 * aside_by(35), radius)
+    for each in candidates_of(rehearsal, coverage, "tumour", everywhere):
+        start = each.start()
+        assert ((start >= 0) & (start <= 1)).all()
+        values = each.values(start)
+        assert list(values) == list(each.quantities)
+        for (name, value), (low, high, begins) in zip(values.items(), each.quantities.values(), strict=True):
+            assert low < high and low <= begins <= high and value == pytest.approx(begins), name
+        beyond = each.values(np.where(np.arange(len(start)) % 2, -3.0, 7.0))
+        ends = [q.low if n % 2 else q.high for n, q in enumerate(each.quantities.values())]
+        assert list(beyond.values()) == ends
+        passes = each.way(rehearsal.hand, values).passes
+        assert len(passes) == each.count
+        faces = np.concatenate([faces_in(each) for each in passes])
+        over = np.linalg.norm(np.cross(faces - each.layout.centre, each.layout.outward), axis=1)
+        assert over.min() < WIDTH and over.max() < 3 * radius
+
+
+def test_a_glide_begins_as_the_straight_rows_that_it_is_held_against(rehearsal):
+    coverage = coverage_of(16.0 * Z, 12.0)
+    glide = next(each for each in candidates_of(rehearsal, coverage, "tumour", everywhere) if each.count > 1)
+    rows = row_by_row(SimpleNamespace(rehearsal=rehearsal, coverage=coverage, target="tumour"))
+    begun = glide.way(rehearsal.hand, glide.values(glide.start()))
+    assert glide.motion == "glide" and len(rows.passes) == glide.count
+    assert begun.poses == pytest.approx(rows.poses, abs=1e-9)
+
+
+def glide_of(rehearsal, count: int) -> Candidate:
+    found = found_for(rehearsal, 18.0 * Z, radius=9.0)
+    return next(each for each in found if each.motion == "glide" and each.count == count)
+
+
+def values_of(candidate: Candidate, **changes: float) -> dict[str, float]:
+    values = candidate.values(candidate.start())
+    assert changes.keys() <= values.keys()
+    return values | dict(follow=0.0) | changes
+
+
+def test_a_glides_numbers_are_what_they_are_called(rehearsal):
+    glide, hand = glide_of(rehearsal, 2), rehearsal.hand
+    numbers = values_of(glide, aside_mm=2.0, apart_mm=9.0, start_mm=-7.0, end_mm=5.0, depth_mm=0.0)
+    one, two = (faces_in(each) - glide.layout.centre for each in glide.way(hand, numbers).passes)
+    assert one[:, 0] == pytest.approx(2.0 - 4.5) and two[:, 0] == pytest.approx(2.0 + 4.5)
+    assert one[[0, -1], 1] == pytest.approx([-7, 5]) and two[[0, -1], 1] == pytest.approx([5, -7])
+    deeper = glide.way(hand, numbers | dict(depth_mm=3.0)).passes[0]
+    assert faces_in(deeper) - glide.layout.centre == pytest.approx(one - 3.0 * Z)
+    turned = faces_in(glide.way(hand, numbers | dict(heading_deg=90.0)).passes[0]) - glide.layout.centre
+    assert turned[[0, -1], 0] == pytest.approx([7, -5]) and turned[:, 1] == pytest.approx(-2.5)
+    for name, axis in (("lean_deg", [0, -0.5, np.sqrt(0.75)]), ("lean_aside_deg", [0.5, 0, np.sqrt(0.75)])):
+        leant = glide.way(hand, numbers | {name: 30.0}).poses
+        assert leant[:, :3, 2] == pytest.approx(np.tile(axis, (len(leant), 1)))
+
+
+def test_rocking_turns_where_its_numbers_say(rehearsal):
+    rock = next(each for each in found_for(rehearsal, 18.0 * Z) if each.motion == "rock")
+    numbers = values_of(rock, ahead_mm=0.0, first_deg=-10.0, last_deg=24.0, depth_mm=1.0)
+    (poses,) = rock.way(rehearsal.hand, numbers).passes
+    angles = np.degrees(np.arctan2(-poses[:, 1, 2], poses[:, 2, 2]))
+    assert angles[[0, -1]] == pytest.approx([-10, 24], abs=1.5)
+    assert faces_in(poses)[:, 2] == pytest.approx(R - 1.0, abs=FACET_MM)
+
+
+# Sweeps that nobody planned
+
+
+@pytest.fixture(scope="module")
+def trial(rehearsal) -> SimpleNamespace:
+    return SimpleNamespace(rehearsal=rehearsal, coverage=coverage_of(16.0 * Z, 12.0), target="tumour")
+
+
+def test_straight_sweeps_look_down_and_cover_the_target_side_by_side(trial):
+    (one,), rows = straight(trial).passes, row_by_row(trial).passes
+    assert np.array([one[0], one[-1]])[:, :3, 2] == pytest.approx(np.stack([Z, Z]))
+    assert faces_in(one)[:, 0] == pytest.approx(0, abs=VOXEL_MM / 2)
+    assert faces_in(one)[[0, -1], 1] == pytest.approx([-12, 12], abs=VOXEL_MM)
+    assert len(rows) == passes_needed(12.0, WIDTH) == 2
+    aside = [faces_in(each)[0, 0] for each in rows]
+    assert np.diff(aside) == pytest.approx([WIDTH]) and np.mean(aside) == pytest.approx(0, abs=VOXEL_MM / 2)
+
+
+def test_sweeps_by_chance_are_the_seeds_and_over_the_target(trial):
+    first, again, other = (by_chance(trial, 3, seed) for seed in (5, 5, 6))
+    assert len(first.passes) == 3
+    assert np.array_equal(first.poses, again.poses) and not np.array_equal(first.poses[0], other.poses[0])
+    assert (np.linalg.norm(faces_in(first.poses)[:, :2], axis=1) < 12 * (np.sqrt(2) + 1)).all()
+    headings = [each[-1, :3, 3] - each[0, :3, 3] for each in first.passes]
+    assert all(
+        abs(angle_deg(a / np.linalg.norm(a), b / np.linalg.norm(b))) > 1 for a, b in pairwise(headings)
+    )
+    ways = ways_by_chance(3, range(5, 7))
+    assert [
+        np.array_equal(make(trial).poses, way.poses) for make, way in zip(ways, (first, other), strict=True)
+    ] == [True] * 2
+
+
+def test_a_plans_poses_are_the_ways_in_the_patient(rehearsal):
+    way = glide_of(rehearsal, 2).way(rehearsal.hand, values_of(glide_of(rehearsal, 2)))
+    placed = np.stack([probe_in_patient(rehearsal, pose) for pose in way.poses])
+    # PLUS's axes of a probe: x to the marked side, y into the tissue, from the middle of the face.
+    assert placed[:, :3, 3] == pytest.approx(faces_in(way.poses) + ORIGIN)
+    assert placed[:, :3, 0] == pytest.approx(way.poses[:, :3, 0])
+    assert placed[:, :3, 1] == pytest.approx(-way.poses[:, :3, 2])
+    assert np.linalg.det(placed[:, :3, :3]) == pytest.approx(1)
+    assert placed.tolist() == pytest.approx(np.array(in_patient(way.poses)))
+    again = planned(SimpleNamespace(rehearsal=rehearsal), sweep_of(*way.passes))
+    assert [len(each) for each in again.passes] == [len(each) for each in way.passes]
+    assert again.poses == pytest.approx(way.poses, abs=1e-9)
+
+
+def test_a_kidney_without_a_tumour_is_given_one_under_its_highest_place():
+    organ = trimesh.creation.icosphere(subdivisions=4, radius=1.0)
+    organ.vertices *= [25.0, 25.0, 50.0]
+    given = virtual_tumour.with_tumour(LoadedAnatomy(organ, None, None, ()), np.array([0, 9.81, 0]))
+    tumour = given.tumour
+    assert tumour.volume == pytest.approx(4 / 3 * np.pi * virtual_tumour.RADIUS_MM**3, rel=0.02)
+    middle = tumour.vertices.mean(axis=0)
+    share = (middle[2] + 50) / 100
+    assert share == pytest.approx(virtual_tumour.ALONG, abs=0.12) and middle[1] < 0 and abs(middle[0]) < 2
+    depths = -signed_distance(organ.vertices, organ.faces, tumour.vertices)[0]
+    assert depths.min() == pytest.approx(virtual_tumour.UNDER_MM, abs=0.3)
+    assert virtual_tumour.with_tumour(given, Z) is given

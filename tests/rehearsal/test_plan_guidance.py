@@ -1,0 +1,336 @@
+"""A plan followed: the guide, its lines and the keys."""
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import taichi as ti
+from conftest import rotation_about
+from plan_ball import SIZE, over_ball, plan_of, straight_pass, sweep_of
+
+from rehearsal.planning.plan_guidance import ABOVE_MM, AHEAD, DEG_BESIDE_A_MM, NEAR_MM, Guide
+from rehearsal.sessions.session import Session
+from rehearsal.sessions.undo_history import MOST_UNDONE, History
+from render import plan_lines, transducer_shape
+from render.actions import begin
+from render.keys import Keys
+from render.plan_lines import GONE, TO_GO, GuideLines
+from render.viewer import Controls, Guidance, Settings
+from sim.fields import array_of
+from ultrasound.probe_manipulator import advanced
+from ultrasound.target import TARGETS
+
+FIRST, SECOND = straight_pass(4, step_mm=2.0), straight_pass(3, 20.0, 2.0)
+
+
+def guide_of(*sweeps) -> Guide:
+    return Guide(over_ball(), plan_of(*(sweeps or [sweep_of(FIRST, SECOND)])))
+
+
+def turned(pose: np.ndarray, degrees: float) -> np.ndarray:
+    """About the face's middle."""
+    turn, face = np.eye(4), np.eye(4)
+    turn[:3, :3], face[2, 3] = rotation_about([1, 1, 0], degrees), -SIZE[2] / 2
+    return pose @ face @ turn @ np.linalg.inv(face)
+
+
+# Followed
+
+
+def test_a_plan_followed_exactly_is_followed_wholly_with_nothing_off():
+    guide = guide_of()
+    for number, pose in enumerate([*FIRST, *SECOND]):
+        assert guide.guidance().goal == pytest.approx(pose)
+        assert guide.followed == pytest.approx(number / 7)
+        guide.watch(pose)
+    assert guide.figures() == pytest.approx(dict(plan_followed=1.0, plan_off_mm=0.0, plan_off_deg=0.0))
+    assert guide.guidance().goal is None and guide.guidance().gone.all()
+    assert guide.findings() == {"plan": "100 %", "off plan": "0.0 mm 0 deg"}
+    assert guide.in_words(0.5) == (
+        "plan      two passes: 100 % of it followed, 0.0 mm and 0 degrees beside it; margin seen 50 % (planned 75 %)"
+    )
+    guide.watch(SECOND[-1])
+    assert guide.followed == 1.0
+
+
+def test_how_far_beside_it_went_is_the_faces_middles_way_and_the_turn():
+    sparse = straight_pass(7, step_mm=9.0)
+    guide = guide_of(sweep_of(sparse))
+    for number, pose in enumerate(sparse):
+        beside = turned(pose, 9.0 if number % 2 else 3.0)
+        beside[:3, 3] += [0.6, 0.0, -0.8]
+        guide.watch(beside)
+    figures = guide.figures()
+    assert figures["plan_followed"] == 1.0 and figures["plan_off_mm"] == pytest.approx(1.0)
+    assert figures["plan_off_deg"] == pytest.approx((4 * 3 + 3 * 9) / 7)
+
+
+@pytest.mark.parametrize("offset", [0.0, 2.0])
+def test_each_pose_is_judged_where_it_was_nearest_and_none_is_behind_before(offset):
+    """In tenths of a step, from above the first: one that is gone to exactly is behind from a millimetre before it on, any other
+    where the next is nearer, and the last where the one before it is not."""
+    guide = guide_of(sweep_of(straight_pass(11, step_mm=1.5)))
+    (begin,) = straight_pass(1, offset)
+    for height in np.arange(8.0, 1.0, -0.25):
+        guide.watch(advanced(begin, -height))
+        assert guide.at == 0
+    for number, pose in enumerate(straight_pass(101, offset, 0.15)):
+        guide.watch(pose)
+        if offset == 0:
+            assert guide.at == min((number + 6) // 10 + 1, 11)
+        elif number % 10 != 5:
+            assert guide.at == (number + 5) // 10 + (number > 95)
+    off = dict(plan_followed=1.0, plan_off_mm=offset, plan_off_deg=0.0)
+    assert guide.figures() == pytest.approx(off, abs=1e-6)
+
+
+def test_rocking_is_judged_where_each_pose_was_nearest_too():
+    rocked = np.stack([turned(straight_pass(1)[0], angle) for angle in np.arange(-30.0, 31.0, 2.0)])
+    guide = guide_of(sweep_of(rocked))
+    for angle in np.arange(-30.0, 30.1, 0.5):
+        guide.watch(turned(straight_pass(1)[0], angle))
+        assert (angle + 30) / 2 < guide.at <= (angle + 30) / 2 + 3
+    assert guide.figures() == pytest.approx(
+        dict(plan_followed=1.0, plan_off_mm=0.0, plan_off_deg=0.0), abs=1e-4
+    )
+
+
+def test_the_way_that_is_drawn_is_each_pass_and_not_between_them():
+    guide = guide_of()
+    places = [[0.0, 2 * n, 0.0] for n in range(4)], [[20.0, 2 * n, 0.0] for n in range(3)]
+    segments = [[a, b] for each in places for a, b in pairwise(each)]
+    assert guide.guidance().way_mm == pytest.approx(np.array(segments) + [0, 0, ABOVE_MM])
+    gone = []
+    for pose in [*FIRST, *SECOND]:
+        guide.watch(pose)
+        gone.append(guide.guidance().gone.sum())
+    assert gone == [0, 1, 2, 3, 3, 4, 5]
+
+
+def test_poses_may_be_skipped_but_not_too_many_and_none_is_gone_back_to():
+    long = straight_pass(30, step_mm=5.0)
+    guide = guide_of(sweep_of(long))
+    guide.watch(long[3])
+    assert guide.at == 4 and guide.guidance().goal == pytest.approx(long[4])
+    guide.watch(long[0])
+    guide.watch(long[4 + AHEAD + 1])
+    assert guide.at == 4
+    guide.watch(long[4 + AHEAD - 1])
+    assert guide.at == 4 + AHEAD
+
+
+@pytest.mark.parametrize(
+    ("mm", "degrees", "near"),
+    [(5.9, 0, True), (6.1, 0, False), (0, 17.9, True), (0, 18.1, False), (3.1, 9, False)],
+)
+def test_what_is_near_is_a_way_and_a_turn_together(mm, degrees, near):
+    assert (NEAR_MM, DEG_BESIDE_A_MM) == (6.0, 3.0)
+    sparse = straight_pass(4, step_mm=50.0)
+    guide = guide_of(sweep_of(sparse))
+    beside = turned(sparse[2], degrees)
+    beside[0, 3] += mm
+    guide.watch(beside)
+    assert guide.at == (2 if near else 0)
+
+
+def test_the_sweeps_are_shown_in_turn_and_then_none():
+    guide = guide_of(sweep_of(FIRST), sweep_of(SECOND, name="rocking in one place", seen=0.6))
+    assert guide.said() == "Plan 1: two passes, sees 75 %"
+    guide.watch(FIRST[0])
+    assert guide.next_sweep() == "Plan 2: rocking in one place, sees 60 %"
+    assert guide.at == 0 and guide.guidance().goal == pytest.approx(SECOND[0])
+    assert guide.next_sweep() == "Plan hidden"
+    guide.watch(FIRST[0])
+    assert guide.guidance() is None and guide.figures() == {} == guide.findings()
+    assert guide.in_words(0.5) == "" and guide.followed == 0.0
+    assert guide.next_sweep() == "Plan 1: two passes, sees 75 %" and len(guide.guidance().way_mm) == 3
+
+
+def test_a_way_begun_anew_is_forgotten():
+    guide = guide_of()
+    assert guide.findings() == {"plan": "0 %", "off plan": ""}
+    assert guide.in_words(None) == "plan      two passes: 0 % of it followed"
+    guide.watch(FIRST[0])
+    guide.begin_anew()
+    assert guide.at == 0 and guide.figures()["plan_followed"] == 0 and not guide.guidance().gone.any()
+    assert guide.findings()["off plan"] == ""
+
+
+# Gone back
+
+
+class Led:
+    """A session over the ball, in which each pose is an action, or the last one's sequel; its tissue is the pose."""
+
+    def __init__(self) -> None:
+        held = over_ball()
+        held.pose = held.settled = advanced(FIRST[0], -50.0)
+        held.snapshot, held.restore = lambda: held.pose, lambda pose: setattr(held, "pose", pose)
+        held.update_surfaces = lambda: None
+        self.rehearsal, self.session = held, Session(held)
+        self.session.store = lambda: None
+        self.history = History(self.session)
+        self.guide = Guide(held, plan_of(sweep_of(FIRST, SECOND), sweep_of(SECOND)))
+
+    def step(self, pose: np.ndarray, acts: bool = True) -> None:
+        self.history.watch(acts, False)
+        self.rehearsal.pose = pose
+        self.session.stepped()
+        self.guide.go_with(self.session)
+
+    def act(self, *poses: np.ndarray) -> dict[str, float]:
+        """An action after a rest; the figures after it."""
+        for _ in range(11):
+            self.step(self.rehearsal.pose, acts=False)
+        for pose in poses:
+            self.step(pose)
+        return self.guide.figures()
+
+    def back(self, way: Callable[[], object]) -> dict[str, float]:
+        way()
+        self.guide.go_with(self.session)
+        return self.guide.figures()
+
+
+@pytest.fixture
+def led() -> Led:
+    return Led()
+
+
+def test_an_undo_takes_what_was_gone_of_the_sweep_back_and_a_redo_forth(led):
+    nothing = led.guide.figures()
+    beside = turned(FIRST[1], 3.0)
+    beside[0, 3] += 0.6
+    steps = [nothing, led.act(FIRST[0]), led.act(beside, FIRST[2]), led.act(FIRST[3], SECOND[0])]
+    assert [each["plan_followed"] for each in steps] == pytest.approx([0, 1 / 7, 3 / 7, 5 / 7])
+    assert steps[2]["plan_off_mm"] == pytest.approx(0.2) and steps[2]["plan_off_deg"] == pytest.approx(1.0)
+    for before in steps[2::-1]:
+        assert led.back(led.history.undo) == before
+    assert led.guide.guidance().goal == pytest.approx(FIRST[0])
+    for after in steps[1:]:
+        assert led.back(led.history.redo) == after
+    # Another way from there on leaves what is kept of the one before as it was.
+    led.back(led.history.undo)
+    assert led.act(FIRST[3])["plan_off_mm"] == pytest.approx(0.15) and led.back(led.history.undo) == steps[2]
+
+
+def test_so_do_a_reset_and_a_bookmark(led):
+    nothing, beside = led.guide.figures(), FIRST[0].copy()
+    beside[0, 3] += 0.6
+    marked = led.act(beside, FIRST[1])
+    led.history.set_bookmark()
+    after = led.act(FIRST[2])
+    assert led.back(led.history.reset) == nothing
+    assert led.back(led.history.undo) == after
+    # Gone to twice, with a better way from there in between.
+    for _ in range(2):
+        assert led.back(led.history.to_bookmark) == marked
+        better = led.act(FIRST[0], FIRST[2])
+        assert (
+            better["plan_followed"] == after["plan_followed"]
+            and better["plan_off_mm"] == 0 < marked["plan_off_mm"]
+        )
+    assert led.back(led.history.undo) == marked
+
+
+def test_of_another_sweep_nothing_was_gone_at_any_moment_before_it_was_shown(led):
+    led.act(FIRST[0], FIRST[1])
+    led.act(FIRST[2])
+    led.guide.next_sweep()
+    assert led.guide.figures()["plan_followed"] == 0
+    assert led.act(SECOND[0])["plan_followed"] == pytest.approx(1 / 3)
+    for _ in range(2):
+        assert led.back(led.history.undo)["plan_followed"] == 0
+    # Nor where it is shown and undone in one frame.
+    led.guide.next_sweep()
+    assert led.back(led.history.redo) == {}
+
+
+def test_no_more_is_kept_of_it_than_of_the_session(led):
+    for number in range(MOST_UNDONE + 9):
+        led.act(FIRST[number % 4])
+    assert led.guide._kept.keys() == led.session.kept.keys() and len(led.guide._kept) <= MOST_UNDONE + 1
+
+
+# Its lines
+
+
+class Drawn:
+    """A scene that keeps what it is given."""
+
+    def __init__(self) -> None:
+        self.given: list[tuple[np.ndarray, dict]] = []
+
+    def lines(self, points, width, **colours) -> None:
+        colours = {
+            name: array_of(each) if isinstance(each, ti.Field) else each for name, each in colours.items()
+        }
+        self.given.append((array_of(points).astype(float), colours))
+
+
+EDGES = transducer_shape.edges(SIZE, 0.0)
+
+
+def drawn(lines: GuideLines, guidance: Guidance) -> tuple[np.ndarray, np.ndarray, list]:
+    """Segments (n, 2, 3) that have a length, their colours (n, 3), and what else was drawn."""
+    scene = Drawn()
+    lines.draw(scene, guidance)
+    (points, colours), *more = scene.given
+    segments, each = points.reshape(-1, 2, 3), colours["per_vertex_color"].reshape(-1, 2, 3)
+    long = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1) > 0
+    assert np.array_equal(each[:, 0], each[:, 1])
+    return segments[long], each[long, 0], more
+
+
+def test_the_lines_are_the_way_and_what_is_behind_has_another_colour(one_device):
+    guide, lines = guide_of(), GuideLines(EDGES)
+    for pose in [None, *FIRST[:3]]:
+        if pose is not None:
+            guide.watch(pose)
+        guidance = guide.guidance()
+        segments, colours, (goal,) = drawn(lines, guidance)
+        assert segments == pytest.approx(guidance.way_mm)
+        assert np.array_equal(colours, np.where(guidance.gone[:, None], GONE, TO_GO))
+        assert goal[0] == pytest.approx(transducer_shape.placed(EDGES, guidance.goal), abs=1e-5)
+    for pose in [FIRST[3], *SECOND]:
+        guide.watch(pose)
+    _, colours, more = drawn(lines, guide.guidance())
+    assert (colours == GONE).all() and more == []
+
+
+def test_of_two_sweeps_shown_one_after_the_other_each_has_its_own_lines(one_device):
+    """Arrays that are freed leave their identity to others."""
+    lines, goal = GuideLines(EDGES), np.eye(4)
+    for number in range(20):
+        way = np.array([[[number, 0.0, 0.0], [number, 1.0, 0.0]]])
+        segments, _, _ = drawn(lines, Guidance(goal, way, np.zeros(1, bool)))
+        assert segments == pytest.approx(way)
+        del way
+
+
+def test_of_a_longer_way_than_there_are_lines_every_second_segment_is_drawn(one_device, monkeypatch):
+    monkeypatch.setattr(plan_lines, "MOST_SEGMENTS", 10)
+    way = np.arange(15 * 6, dtype=float).reshape(15, 2, 3)
+    gone = np.arange(15) < 7
+    segments, colours, _ = drawn(GuideLines(EDGES), Guidance(None, way, gone))
+    assert segments == pytest.approx(way[::2])
+    assert np.array_equal(colours, np.where(gone[::2, None], GONE, TO_GO))
+
+
+# Keys
+
+
+def test_the_keys_are_those_that_the_window_hears():
+    keys = Keys()
+    heard = {" ": "plan_for", "Return": "plan", "BackSpace": "next_plan"}
+    assert {key: keys.action_of(key) for key in heard} == heard
+    controls, targets = Controls(Settings()), []
+    begin("plan", controls)
+    assert controls.plan and not controls.next_plan
+    begin("next_plan", controls)
+    assert controls.next_plan
+    for _ in TARGETS:
+        begin("plan_for", controls)
+        targets.append(controls.settings.plan_for)
+    assert targets == [*TARGETS[1:], TARGETS[0]] and Settings().plan_for == TARGETS[0]

@@ -1,0 +1,255 @@
+"""A plan made by the command on a coarse ball, tried, and followed: twice the same, and true to how tissue is pressed."""
+
+import io
+import re
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import redirect_stdout
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+import app
+from rehearsal import headless
+from rehearsal.planning import evolution, trial_workers
+from rehearsal.planning.plan_file import Plan, read_plan
+from rehearsal.planning.sweep_path import Way, gliding, layout_towards
+from rehearsal.planning.trial import Trial
+from studies.planning.baseline_sweeps import planned
+from ultrasound.probe_manipulator import advanced, indentation
+from version import VERSION
+
+R = 25.0
+TRIALS, SPEED_MM_S = 4, 60.0
+SCENE = """
+title = "ball"
+[anatomy]
+organ = "organ.stl"
+tumour = "tumour.stl"
+[tissue]
+cell_mm = 8.0
+[gravity]
+direction = [0.0, 0.0, -1.0]
+[attachment]
+at_mm = [30.0, -40.0, -5.0]  # or the ball rolls away
+radius_mm = 18.0
+[transducer]
+probe = "drop-in"
+[trocar]
+at_mm = [0.0, -150.0, 200.0]
+[press]
+direction = [0.0, 0.0, -1.0]
+lateral = [1.0, 0.0, 0.0]
+warm_up_steps = 90
+[[shape]]
+kind = "plane"
+normal = [0.0, 0.0, 1.0]
+offset_mm = -5.0
+"""
+# The organ's middle in the patient.
+MIDDLE = np.array([30.0, -40.0, 20.0])
+
+
+def folder_of_ball(folder: Path) -> Path:
+    organ = trimesh.creation.icosphere(subdivisions=3, radius=R)
+    tumour = trimesh.creation.icosphere(subdivisions=3, radius=7.0).apply_translation([0, 4.0, 15.0])
+    for name, mesh in (("organ", organ), ("tumour", tumour)):
+        mesh.apply_translation(MIDDLE).export(folder / f"{name}.stl")
+    (folder / "scene.toml").write_text(SCENE)
+    return folder
+
+
+class Here:
+    """Instead of processes this one, where what they build stays."""
+
+    def __init__(self, jobs: int, **_: object) -> None: ...
+
+    def submit(self, function: Callable, *arguments: object) -> Future:
+        done: Future = Future()
+        done.set_result(function(*arguments))
+        return done
+
+    def shutdown(self, **_: bool) -> None: ...
+
+
+@dataclass
+class Made:
+    """A patient's folder with ``plan.json`` in it, what the commands said that made and followed it, and a trial of its problem."""
+
+    folder: Path
+    plan: Plan
+    said: list[str]
+    followed: list[str]
+    trial: Trial
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Iterator[Made]:
+    folder = folder_of_ball(tmp_path_factory.mktemp("ball"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evolution, "FORECASTS", 8)
+        patch.setattr(trial_workers, "ProcessPoolExecutor", Here)
+        patch.setattr(headless, "open_viewer", lambda *_, **__: None)
+        said = planned_into(folder / "plan.json")
+        follow = ["--track", folder / "plan.json", "--plan", folder / "plan.json"]
+        followed = told("rehearse", folder, "--headless", "--arch", "cpu", *follow, "--out", folder / "out")
+        # The last starts Taichi for the trial, which stays.
+        planned_into(folder / "again.json")
+    (trial,) = trial_workers._built.values()
+    yield Made(folder, read_plan(folder / "plan.json"), said, followed, trial)
+    trial_workers._built.clear()
+
+
+def planned_into(path: Path) -> list[str]:
+    """What the command says. Each begins with nothing built, as in a process of its own."""
+    trial_workers._built.clear()
+    few = ["--trials", TRIALS, "--speed-mm-s", SPEED_MM_S, "--jobs", 1]
+    return told("plan", path.parent, "--out", path, *few)
+
+
+def told(*line: object) -> list[str]:
+    """The lines that a command prints."""
+    with redirect_stdout(io.StringIO()) as printed:
+        assert app.main([str(each) for each in line]) == 0
+    return printed.getvalue().splitlines()
+
+
+def test_two_runs_write_the_same_bytes(made):
+    assert (made.folder / "plan.json").read_bytes() == (made.folder / "again.json").read_bytes()
+    assert sum(sweep.trials for sweep in made.plan.sweeps) == TRIALS
+    *why, wrote = made.said
+    assert why == made.plan.why and wrote.startswith(f"Wrote {len(made.plan.sweeps)} sweeps to ")
+    assert made.plan.trocar.at_mm == (0.0, -150.0, 200.0)
+    assert made.plan.model["cell_mm"] == 8.0 and (made.plan.target, made.plan.margin_mm) == ("margin", 5.0)
+
+
+def test_the_plans_figures_are_those_of_its_sweep_tried_again(made):
+    """Of the poses in the file, which are rounded to six digits."""
+    sweep = made.plan.sweeps[0]
+    made.trial.speed_mm_s = made.plan.speed_mm_s
+    parts = vars(made.trial.run(planned(made.trial, sweep)))
+    # Not one step more or less; the file's figures have six digits.
+    assert parts.pop("time_s") == pytest.approx(sweep.parts["time_s"], rel=1e-5)
+    assert parts == pytest.approx({name: sweep.parts[name] for name in parts}, abs=1e-2)
+    assert sweep.parts["reachable"] == 1.0 and sweep.parts["seen"] > 0
+    assert made.plan.version == VERSION
+
+
+def test_the_poses_of_a_plan_lie_about_the_organ_in_the_patient(made):
+    for pose in np.concatenate(made.plan.sweeps[0].poses()):
+        # Their y looks into the organ from its surface.
+        assert R - 8 < np.linalg.norm(pose[:3, 3] - MIDDLE) < R + 4
+        assert pose[:3, 1] @ (MIDDLE - pose[:3, 3]) > 0
+
+
+# Trials
+
+
+def way_at(trial: Trial, depth_mm: float, passes: int = 1) -> Way:
+    """Over the tumour, along y."""
+    layout = layout_towards(np.array([0.0, 4.0, 0.0]), np.array([0.0, 0, 1]), np.array([1.0, 0, 0]))
+    aside = np.linspace(-3.0, 3.0, passes) if passes > 1 else np.zeros(1)
+    return gliding(trial.rehearsal.hand, layout, aside, -5.0, 5.0, depth_mm, 0.5)
+
+
+@pytest.fixture
+def trial(made) -> Trial:
+    made.trial.speed_mm_s = 60.0
+    return made.trial
+
+
+@pytest.mark.parametrize("count", [1, 3, 40])
+def test_a_whole_number_of_steps_stays_one_where_poses_were_rounded(trial, count):
+    start, end = trial.rehearsal.hand.home, trial.rehearsal.hand.home.copy()
+    step_mm = trial.speed_mm_s * trial.rehearsal.settings.time_step_s
+    for off_mm, steps in ((-1e-6, count), (0.0, count), (1e-6, count), (0.01 * step_mm, count + 1)):
+        end[:3, 3] = start[:3, 3] + [0.0, 0.0, count * step_mm + off_mm]
+        assert trial._steps(start, end) == steps
+
+
+def test_a_trial_gives_the_same_figures_twice_whatever_was_tried_between(trial):
+    way = way_at(trial, 2.0, 2)
+    first = trial.run(way)
+    trial.run(way_at(trial, 6.0))
+    assert trial.run(way) == first
+
+
+def test_a_way_that_presses_deeper_squeezes_more_and_touches_more(trial):
+    shallow, middle, deep = (trial.run(way_at(trial, depth)) for depth in (0.5, 3.0, 6.0))
+    for name in ("compression_mean_mm", "compression_max_mm"):
+        assert getattr(shallow, name) < getattr(middle, name) < getattr(deep, name)
+    # Under the face the tissue gives way by what it is pressed deeper, but for what goes aside and down.
+    assert deep.compression_mean_mm - shallow.compression_mean_mm == pytest.approx(5.5, rel=0.3)
+    assert shallow.contact <= deep.contact
+    scene = trial.rehearsal.scene
+    limit = scene.transducer.model_copy(update=dict(compression_warning_mm=middle.compression_mean_mm))
+    trial.rehearsal.scene = scene.model_copy(update=dict(transducer=limit))
+    assert [trial.run(way_at(trial, depth)).over_limit for depth in (0.5, 6.0)] == [0.0, 1.0]
+    trial.rehearsal.scene = scene
+
+
+def test_a_lifted_way_sees_nothing_and_squeezes_nothing(trial):
+    way = way_at(trial, 1.0)
+    lifted = trial.run(Way(tuple(np.stack([advanced(pose, -6.0) for pose in each]) for each in way.passes)))
+    assert (lifted.seen, lifted.contact, lifted.compression_max_mm) == (0.0, 0.0, 0.0)
+    assert trial.run(way).seen > 0.05
+    assert trial.run(Way(())) == replace(lifted, incidence_deg=0.0, path_mm=0.0, time_s=0.0, reachable=0.0)
+
+
+def test_two_passes_see_more_than_either_and_the_probe_is_lifted_between(trial):
+    both = way_at(trial, 2.0, 2)
+    depths: list[float] = []
+    rehearsal, advance = trial.rehearsal, trial.rehearsal.advance
+
+    def watched(pose: np.ndarray) -> None:
+        depths.append(indentation(pose, rehearsal.size_mm, rehearsal.hand.samples, 0.0))
+        advance(pose)
+
+    one, other = (trial.run(Way((each,))) for each in both.passes)
+    rehearsal.advance = watched
+    together = trial.run(both)
+    del rehearsal.advance
+    assert max(one.seen, other.seen) < together.seen
+    # From above, along a pass, up, over, down, along the other: never deeper than the passes, and up in between.
+    assert max(depths) < 2.0 + 0.5 and depths[0] < -3.0
+    middle = depths[len(depths) // 3 : 2 * len(depths) // 3]
+    assert min(middle) < -3.0
+    assert together.path_mm > one.path_mm + other.path_mm
+    assert together.time_s == pytest.approx(len(depths) * rehearsal.settings.time_step_s)
+
+
+def test_a_slower_sweep_takes_longer_over_the_same_way(trial):
+    way = way_at(trial, 2.0)
+    fast = trial.run(way)
+    trial.speed_mm_s = 20.0
+    slow = trial.run(way)
+    assert slow.time_s == pytest.approx(3 * fast.time_s, rel=0.15)
+    assert slow.path_mm == pytest.approx(fast.path_mm, rel=1e-6) and slow.incidence_deg == fast.incidence_deg
+    assert trial.speed_mm_s * slow.time_s == pytest.approx(slow.path_mm, rel=0.15)
+
+
+def test_what_the_guard_puts_right_counts_against_the_pose_where_it_does(trial):
+    way, rehearsal = way_at(trial, 2.0), trial.rehearsal
+    advance = rehearsal.advance
+
+    def troubled(pose: np.ndarray) -> None:
+        advance(pose)
+        rehearsal.notice = "put right" if np.allclose(pose, way.passes[0][3]) else ""
+
+    rehearsal.advance = troubled
+    parts = trial.run(way)
+    del rehearsal.advance
+    assert parts.over_limit == pytest.approx(1 / len(way.poses))
+
+
+def test_a_plan_is_followed_exactly_without_a_window_and_says_so(made):
+    begin = f"plan      {made.plan.sweeps[0].name}: 100 % of it followed, "
+    (line,) = [each for each in made.followed if each.startswith(begin)]
+    mm, degrees = re.fullmatch(
+        r"([0-9.]+) mm and ([0-9]+) degrees beside it", line.removeprefix(begin)
+    ).groups()
+    # No pose is farther than half a step of the rehearsal from where the probe was: 1 mm or 1.5 degrees at this speed.
+    assert float(mm) <= 0.5 and float(degrees) <= 1

@@ -1,0 +1,370 @@
+"""The search for a plan: evolution, who has how many trials, and what a plan is made of; with processes that only count."""
+
+import os
+import re
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+from plan_ball import GOOD, big_ball, from_above, hand_on, straight_pass
+
+from rehearsal.planning import evolution
+from rehearsal.planning.evolution import GENERATION, NEAR, Search, foreseen
+from rehearsal.planning.make_plan import make_plan
+from rehearsal.planning.plan_file import PlanError, read_plan, write_plan
+from rehearsal.planning.score import score
+from rehearsal.planning.score_terms import Parts
+from rehearsal.planning.search import FORESEEN, TRIAL_MM_S, length_of, ranked, search
+from rehearsal.planning.sweep_candidates import Candidate, Quantity
+from rehearsal.planning.trial_workers import Outcome, Problem, SearchSpace, Workers, _trial, workers
+from scenes.anatomy import LoadedAnatomy, fingerprint
+from scenes.scene import Scene
+from scenes.trocar import Trocar
+from studies.planning import plan_comparison
+from studies.planning.plan_study_command import table
+from ultrasound.probe import load_probe
+
+BEST = dict(a_mm=-3.0, b_mm=7.0, c_deg=20.0)
+RANGES = dict(a_mm=Quantity(-10, 10, 0), b_mm=Quantity(0, 8, 2), c_deg=Quantity(-45, 45, -30))
+
+
+def candidate(name: str, handicap: float = 0.0) -> Candidate:
+    """One that is worth less by a handicap, which its count carries."""
+    return Candidate(name, "glide", int(100 * handicap), from_above(), RANGES)
+
+
+def worth(values: dict[str, float], handicap: float = 0.0) -> Parts:
+    """Best in one place, and known how good there: how much is seen falls with the square of the distance."""
+    off = sum(((values[name] - BEST[name]) / (RANGES[name].high - RANGES[name].low)) ** 2 for name in BEST)
+    return replace(GOOD, seen=1.0 - handicap - off)
+
+
+class Counting(Workers):
+    """No processes: a way is worth what its numbers say, and every task is written down."""
+
+    def __init__(self, candidates: list[Candidate], reachable: float = 1.0, ways: int = 1) -> None:
+        self.candidates, self.reachable, self.ways = candidates, reachable, ways
+        self.tasks: list[tuple[Candidate, dict[str, float], float]] = []
+        self.foreseen = 0
+
+    def search_space(self) -> SearchSpace:
+        return SearchSpace(self.candidates, dict(model="neo-hookean", cell_mm=8.0))
+
+    def foresee(self, candidates) -> Iterator[np.ndarray]:
+        for each in candidates:
+            self.foreseen += 1
+            yield each.start()
+
+    def go(self, tasks) -> Iterator[Outcome]:
+        for each, values, speed in tasks:
+            self.tasks.append((each, values, speed))
+            parts = replace(worth(values, each.count / 100), reachable=self.reachable)
+            yield Outcome(parts, [straight_pass(4)] * self.ways)
+
+    def go_ways(self, ways, speed_mm_s) -> Iterator[Outcome]:
+        for number, _ in enumerate(ways):
+            yield Outcome(replace(GOOD, seen=0.1 * number), [straight_pass(4)])
+
+
+def four() -> list[Candidate]:
+    return [candidate(f"sweep {n}", handicap) for n, handicap in enumerate((0.3, 0.0, 0.2, 0.1))]
+
+
+def problem_of(**changes) -> Problem:
+    anatomy = LoadedAnatomy(big_ball(), None, None, ())
+    values = dict(scene=Scene(anatomy={}), anatomy=anatomy, probe=load_probe("linear"), target="organ")
+    return Problem(**(values | dict(margin_mm=5.0, trocar=Trocar()) | changes))
+
+
+def with_tumour(**changes) -> Problem:
+    return problem_of(anatomy=LoadedAnatomy(big_ball(), big_ball(), None, ()), **changes)
+
+
+# Evolution
+
+
+def evolved(generations: int, beside: bool = False) -> Search:
+    found, other = (Search(candidate("one"), candidate("one").start(), NEAR) for _ in range(2))
+    for _ in range(generations):
+        asked = found.ask()
+        if beside:
+            other.tell(other.ask(), [0.0] * GENERATION)
+            np.random.default_rng(0).normal(size=7)
+        found.tell(asked, [score(worth(found.candidate.values(each))) for each in asked])
+    return found
+
+
+def test_evolution_finds_the_best_numbers_and_says_what_they_are():
+    found = evolved(40)
+    for name, best in BEST.items():
+        assert found.values[name] == pytest.approx(best, abs=0.01 * (RANGES[name].high - RANGES[name].low))
+    assert found.score == pytest.approx(score(replace(GOOD, seen=1.0)), abs=0.05)
+    assert found.candidate.values(found.best) == found.values and found.trials == 40 * GENERATION
+
+
+def test_the_same_trials_give_the_same_and_no_other_search_or_chance_is_heard():
+    np.random.seed(5)  # noqa: NPY002 the one that all share
+    before = np.random.get_state()[1].copy()  # noqa: NPY002
+    alone = evolved(5)
+    assert np.array_equal(np.random.get_state()[1], before)  # noqa: NPY002
+    np.random.seed(6)  # noqa: NPY002
+    assert np.array_equal(evolved(5, beside=True).best, alone.best)
+
+
+def test_the_first_generation_has_the_start_and_all_stay_in_range():
+    start = np.array([0.0, 1.0, 0.5])
+    found = Search(candidate("one"), start, 0.5)
+    for generation in range(6):
+        asked = found.ask()
+        assert len(asked) == GENERATION and np.array_equal(asked[0], start) == (generation == 0)
+        assert all(((each >= 0) & (each <= 1)).all() for each in asked)
+        found.tell(asked, [each[0] for each in asked])
+    assert found.best[0] > 0.9 and found.score == found.best[0]
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_a_search_goes_on_where_its_candidate_begins_if_that_is_better(better):
+    """Than where a forecast has led it."""
+    one, start = candidate("one"), np.array([0.9, 0.9, 0.9])
+    found = Search(one, start, NEAR)
+    asked = found.ask()
+    assert np.array_equal(asked[:2], [start, one.start()])
+    found.tell(asked, [1.0, 2.0 if better else 0.0, *[0.5] * (GENERATION - 2)])
+    wanted = one.start() if better else start
+    away = np.linalg.norm(found.ask() - wanted, axis=1)
+    # Steps of NEAR along each of three axes; what lies there is farther off.
+    assert away.max() < 5 * NEAR < np.linalg.norm(start - one.start())
+    assert np.array_equal(found.best, wanted)
+
+
+def test_part_of_a_generation_counts_and_the_best_so_far_stays():
+    found = Search(candidate("one"), candidate("one").start(), NEAR)
+    asked = found.ask()
+    found.tell(asked[:3], [1.0, 5.0, 2.0])
+    assert (found.trials, found.score) == (3, 5.0) and np.array_equal(found.best, asked[1])
+    found.tell(found.ask(), [4.0] * GENERATION)
+    assert (found.trials, found.score) == (3 + GENERATION, 5.0) and np.array_equal(found.best, asked[1])
+
+
+def test_a_forecasts_best_is_no_worse_than_where_it_began():
+    asked: list[dict[str, float]] = []
+
+    def seen(values: dict[str, float]) -> Parts:
+        asked.append(values)
+        return worth(values)
+
+    one = candidate("one")
+    best = foreseen(one, seen)
+    assert len(asked) == -(-evolution.FORECASTS // GENERATION) * GENERATION
+    assert asked[0] == pytest.approx(one.values(one.start()))
+    assert worth(one.values(best)).seen == max(worth(values).seen for values in asked) > 0.99
+
+
+# Who has how many trials
+
+
+@pytest.mark.parametrize("trials", [4, 5, 37, 64, 96, 101])
+def test_all_trials_are_made_and_counted(trials):
+    crew, done = Counting(four()), []
+    searches = search(crew.candidates, crew, trials, done.append)
+    made = Counter(each.side for each, _, _ in crew.tasks)
+    assert sum(made.values()) == len(crew.tasks) == trials and Counter(done) == {1: trials, FORESEEN: 4}
+    assert {one.candidate.side: one.trials for one in searches} == made
+    assert {speed for _, _, speed in crew.tasks} == {TRIAL_MM_S} and crew.foreseen == 4
+
+
+def test_the_better_half_has_the_rest():
+    crew = Counting(four())
+    searches = search(crew.candidates, crew, 96, lambda _: None)
+    trials = {one.candidate.side: one.trials for one in searches}
+    half = (96 - 2 * GENERATION) // 2
+    assert trials == {"sweep 0": GENERATION, "sweep 2": GENERATION, "sweep 1": half, "sweep 3": half}
+    of_three = search(four()[:3], Counting(four()[:3]), 96, lambda _: None)
+    assert sum(one.trials == max(each.trials for each in of_three) for one in of_three) == 2
+
+
+def test_every_answer_goes_to_the_candidate_that_asked():
+    crew = Counting(four())
+    for one in search(crew.candidates, crew, 45, lambda _: None):
+        tried = [values for each, values, _ in crew.tasks if each is one.candidate]
+        scores = [score(worth(values, one.candidate.count / 100)) for values in tried]
+        assert one.score == max(scores) and one.values == tried[int(np.argmax(scores))]
+        assert tried[0] == pytest.approx(one.candidate.values(one.candidate.start()))
+
+
+def test_two_searches_try_the_same():
+    one, two = Counting(four()), Counting(four())
+    for crew in (one, two):
+        search(crew.candidates, crew, 70, lambda _: None)
+    assert [(each.side, values) for each, values, _ in one.tasks] == [
+        (each.side, values) for each, values, _ in two.tasks
+    ]
+
+
+def test_the_best_of_each_is_gone_once_more_and_ranked():
+    crew, done = Counting(four()), []
+    searches = search(crew.candidates, crew, 48, lambda _: None)
+    crew.tasks.clear()
+    rows = ranked(searches, crew, 12.0, done.append)
+    assert [one.candidate.side for one, _ in rows] == ["sweep 1", "sweep 3", "sweep 2", "sweep 0"]
+    assert done == [3] * 4 and {speed for _, _, speed in crew.tasks} == {12.0}
+    assert all(outcome.parts == worth(one.values, one.candidate.count / 100) for one, outcome in rows)
+    # One that had no trial has no numbers to be gone with.
+    untried = Search(candidate("untried"), np.zeros(3), NEAR)
+    assert len(ranked([*searches, untried], crew, 12.0, lambda _: None)) == 4
+
+
+# A plan made
+
+
+def test_a_plan_is_the_ranked_sweeps_with_what_they_are_for(tmp_path):
+    problem, done = problem_of(trocar=Trocar(cone_deg=33)), []
+    plans = [make_plan(problem, Counting(four()), 12.0, 96, done.append) for _ in range(2)]
+    assert sum(done) == 2 * length_of(96, 12.0), "what the command's progress bar expects"
+    assert done[0] == 0 and done.count(0) == 2
+    plan = plans[0]
+    assert [each.name.split("passes ")[-1].removeprefix("one pass ") for each in plan.sweeps] == [
+        *("sweep 1", "sweep 3", "sweep 2", "sweep 0")
+    ]
+    scores = [each.score for each in plan.sweeps]
+    assert scores == sorted(scores, reverse=True) and sum(each.trials for each in plan.sweeps) == 96
+    for each in plan.sweeps:
+        assert each.score == pytest.approx(sum(each.points.values()), abs=1e-5)
+        assert each.score == pytest.approx(score(Parts(**each.parts)), abs=1e-3)
+        assert np.array(each.passes[0]) == pytest.approx(straight_pass(4), abs=1e-6)
+    assert plan.anatomy == fingerprint(problem.anatomy) and plan.trocar.cone_deg == 33
+    assert (plan.target, plan.margin_mm, plan.speed_mm_s) == ("organ", 5.0, 12.0)
+    named = [
+        re.match(r"(The first sweep is|It comes before) .*sweep (\d), with -?[\d.]+ points: it .*\.$", line)
+        for line in plan.why
+    ]
+    assert [one[2] for one in named] == ["1", "3", "2", "0"]
+    for name, each in zip("ab", plans, strict=True):
+        write_plan(each, tmp_path / name)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    assert read_plan(tmp_path / "a") == plan
+
+
+@pytest.mark.parametrize("crew", [Counting(four(), reachable=0.95), Counting(four(), ways=0), Counting([])])
+def test_where_no_sweep_can_be_held_that_is_said(crew):
+    if not crew.candidates:
+        crew.search_space = lambda: SearchSpace([], {})
+        crew.go = lambda tasks: iter(())
+    with pytest.raises(PlanError, match="no sweep was found.*move the trocar, widen its cone") as error:
+        make_plan(problem_of(), crew, 10.0, 4 if crew.candidates else 0, lambda _: None)
+    assert "\n" not in str(error.value)
+
+
+def test_a_comparison_counts_what_it_does_and_means_its_sweeps_by_chance(monkeypatch):
+    jobs: list[int | None] = []
+
+    class Crew(Counting):
+        def __init__(self, problem: Problem, count: int | None) -> None:
+            super().__init__(four())
+            jobs.append(count)
+
+        def __enter__(self) -> "Crew":
+            return self
+
+        def __exit__(self, *_) -> None: ...
+
+    monkeypatch.setattr(plan_comparison, "workers", Crew)
+    done: list[int] = []
+    run = plan_comparison.compare(Scene(anatomy={}), with_tumour().anatomy, 40, 3, done.append)
+    assert sum(done) == plan_comparison.count_of(40) and jobs == [3, 3]
+    rows = {row["sweep"]: row for row in run["rows"]}
+    assert list(rows) == ["planned", "straight", "row by row", "by chance"]
+    assert [row["count"] for row in rows.values()] == [1, 1, 1, len(plan_comparison.SEEDS)]
+    assert rows["by chance"]["seen"] == pytest.approx(
+        0.1 * np.mean(3 + np.arange(len(plan_comparison.SEEDS)))
+    )
+    assert rows["straight"]["score"] == pytest.approx(score(replace(GOOD, seen=0.1)))
+    lines = table(dict(run, patient="patient 1"))
+    assert (
+        len(lines) == 7 and f"by chance ({len(plan_comparison.SEEDS)})" in lines[-2] and "40 %" in lines[-2]
+    )
+
+
+# Processes
+
+
+def test_a_process_keeps_no_ground_for_another():
+    """What it has built is found by all that a trial turns on."""
+    problems = [
+        problem_of(),
+        problem_of(margin_mm=6.0),
+        with_tumour(),
+        with_tumour(target="tumour"),
+        problem_of(trocar=Trocar(at_mm=(0, 0, 90))),
+        problem_of(probe=load_probe("drop-in")),
+        problem_of(scene=Scene(anatomy={}, tissue=dict(cell_mm=8.0))),
+        problem_of(anatomy=LoadedAnatomy(trimesh.creation.box([9.0] * 3), None, None, ())),
+    ]
+    assert len({Workers(each, 1)._key for each in problems}) == len(problems)
+    assert Workers(problem_of(), 1)._key == Workers(problems[0], 1)._key
+
+
+def _end(key: str, problem: Problem) -> None:
+    os._exit(1)
+
+
+def _process(key: str, problem: Problem) -> tuple[int, list[str]]:
+    return os.getpid(), [thread.name for thread in threading.enumerate()]
+
+
+def test_one_process_is_not_this_one_and_watches_whether_this_one_is_there():
+    """Taichi would be started anew under whatever this one computes."""
+    with workers(problem_of(), 1) as crew:
+        ((process, threads),) = crew._all(_process, [()])
+    assert process != os.getpid() and any("_watch" in name for name in threads)
+
+
+@pytest.mark.parametrize("target", ["tumour", "margin"])
+def test_there_is_no_problem_of_a_tumour_without_one(target):
+    with pytest.raises(PlanError, match=f"--target {target}: this scene has no tumour; expected organ"):
+        problem_of(target=target)
+
+
+def test_who_waits_for_processes_that_are_stopped_is_told():
+    with workers(problem_of(), 1) as crew:
+        waiting = crew._all(_sleep, [()] * 9)
+        threading.Timer(0.5, crew.stop).start()
+        with pytest.raises(PlanError, match="was ended"):
+            list(waiting)
+
+
+def _sleep(key: str, problem: Problem) -> None:
+    time.sleep(60)
+
+
+def test_a_process_that_is_ended_is_said_in_one_line():
+    with workers(problem_of(), 2) as crew, pytest.raises(PlanError) as error:
+        list(crew._all(_end, [()]))
+    assert "a process of the search was ended" in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.usefixtures("one_device")
+@pytest.mark.parametrize(("target", "margin"), [("tumour", 5.0), ("margin", 0.0)])
+def test_a_target_without_a_voxel_is_refused(monkeypatch, target, margin):
+    speck = trimesh.creation.icosphere(subdivisions=1, radius=0.3).apply_translation([0.7, 0.7, 0.7])
+    built = SimpleNamespace(organ=big_ball(), tumour=speck, hand=hand_on(big_ball()), origin=np.zeros(3))
+    monkeypatch.setattr("rehearsal.planning.trial_workers.Rehearsal", lambda *_: built)
+    monkeypatch.setattr("sim.device.start", lambda *_, **__: "cpu")
+    anatomy = replace(problem_of().anatomy, tumour=speck)
+    # Not in a process of its own, which would build a rehearsal.
+    with pytest.raises(PlanError, match=f"--target {target}: it is smaller than a voxel of 1.5 mm"):
+        _trial("speck", problem_of(anatomy=anatomy, target=target, margin_mm=margin), 10.0)
+
+
+def test_no_pictures_go_to_the_processes():
+    grid = SimpleNamespace(voxels=np.zeros((2, 2, 2)))
+    anatomy = replace(problem_of().anatomy, ct=grid, labels=grid, parts=dict(vessel=big_ball()))
+    bare = problem_of(anatomy=anatomy).bare
+    assert bare.anatomy.ct is None and bare.anatomy.labels is None and bare.anatomy.parts == {}
+    assert bare.anatomy.organ is anatomy.organ

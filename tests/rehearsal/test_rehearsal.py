@@ -1,0 +1,201 @@
+"""A whole scene: at rest its slice is the CT, pressed it gives way, and twice it gives the same bits."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+import trimesh
+from slicing import organ_mask
+
+from rehearsal.rehearsal import Rehearsal
+from scenes.anatomy import load_anatomy, patient_scene, phantom_folder
+from scenes.patients.patient_folder import save_patient
+from scenes.patients.patient_import import import_patient
+from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.label_maps import LabelMap
+from scenes.patients.readers.lazy_volume import Volume
+from scenes.scene import PAPER, Press, Scene, load_scene, with_options
+from sim.fields import array_of
+from sim.mesh_distance import signed_distance
+from sim.skinning import Skin
+from ultrasound.probe_manipulator import image_plane
+
+LOOK = ("both", "speckle", 350, 40)
+LOOK_AT_CT = ("ct", "speckle", 350, 40)
+CRLM = "crlm_1004", "crlm_1004_labels/kidneys_provisional.nii.gz"
+# No axis is where it was and two run backwards: whatever mixes up axes, directions or spacings is seen.
+AXES = "SRA"
+
+
+def phantom() -> tuple[Scene, Path]:
+    """A coarse scene of the embedded patient, and the folder of its files."""
+    return with_options(load_scene(PAPER), {"tissue.cell_mm": 6.0}), phantom_folder()
+
+
+def real_patient(data: Path, tmp_path: Path) -> tuple[Scene, Path]:
+    """A coarse scene of a patient on a slab, and the folder of its files."""
+    ct, labels = (sitk.DICOMOrient(open_ct(data / "ct" / name).image(), AXES) for name in CRLM)
+    slab = trimesh.creation.box([60.0, 10.0, 80.0])
+    slab.apply_translation([-57.0, 60.0, -322.0])
+    slab.export(tmp_path / "slab.stl")
+    patient = import_patient(
+        Volume.of(ct), LabelMap.of(labels), side="right", support=str(tmp_path / "slab.stl")
+    )
+    save_patient(patient, tmp_path / "patient")
+    return with_options(patient_scene(patient), {"tissue.cell_mm": 6.0}), tmp_path / "patient"
+
+
+def pressed_phantom() -> Rehearsal:
+    scene, folder = phantom()
+    return Rehearsal(scene, load_anatomy(scene, folder))
+
+
+def resampled(folder: Path, plane, origin: np.ndarray, pixels: int) -> np.ndarray:
+    """SimpleITK's oblique resample of the patient's CT on a plane given relative to an origin (LPS)."""
+    grid = sitk.Image(pixels, pixels, 1, sitk.sitkFloat32)
+    spacing = np.array([plane.width_mm, plane.depth_mm]) / pixels
+    grid.SetSpacing((*spacing.tolist(), 1.0))
+    grid.SetDirection(plane.world_from_plane[:3, :3].flatten().tolist())
+    first = plane.world_from_plane @ [-plane.width_mm / 2 + spacing[0] / 2, spacing[1] / 2, 0, 1]
+    grid.SetOrigin((first[:3] + origin).tolist())
+    ct = sitk.Cast(sitk.ReadImage(str(folder / "ct.nrrd")), sitk.sitkFloat32)
+    return sitk.GetArrayFromImage(sitk.Resample(ct, grid, sitk.Transform(), sitk.sitkLinear, -1000.0))[0]
+
+
+def assert_at_rest_the_slice_is_the_ct(scene: Scene, folder: Path) -> None:
+    scene = scene.model_copy(update={"press": Press(warm_up_steps=0)})
+    rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
+    rehearsal.hand.turn(20, 10, 35)
+    rehearsal.pose = rehearsal.hand.pose()
+    rehearsal.look(rehearsal.probe, *LOOK_AT_CT)
+    plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], *rehearsal.probe.extent_mm)
+    cut = rehearsal.scanner.slice
+    inside = organ_mask(cut)
+    difference = np.abs(cut.hounsfield() - resampled(folder, plane, rehearsal.origin, scene.image.pixels))
+    print(f"mean {difference[inside].mean():.4f} HU, maximum {difference[inside].max():.3f} HU")
+    assert inside.mean() > 0.1
+    # The bar is 5 HU; float32 positions (1e-5 mm) in gradients of 500 HU/mm leave far less.
+    assert difference[inside].mean() < 0.05
+
+
+def test_at_rest_the_slice_is_the_embedded_patients_ct(one_device):
+    assert_at_rest_the_slice_is_the_ct(*phantom())
+
+
+def test_at_rest_the_slice_is_a_real_ct_however_its_voxels_lie(one_device, data, tmp_path):
+    assert_at_rest_the_slice_is_the_ct(*real_patient(data, tmp_path))
+
+
+def test_pressing_moves_the_tissue_and_the_slice_follows(kept):
+    rehearsal = kept(pressed_phantom)
+    before = rehearsal.look(rehearsal.probe, *LOOK)
+    top = array_of(rehearsal.organ_skin.vertices)
+    for step in range(31):
+        rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
+    rehearsal.update_surfaces()
+    moved = array_of(rehearsal.organ_skin.vertices) - top
+    assert rehearsal.indentation_mm() == pytest.approx(12.38)
+    assert (moved @ rehearsal.gravity_direction).max() > 6.0
+    pressed = rehearsal.look(rehearsal.probe, *LOOK)
+    assert list(pressed) == ["B-mode", "CT"]
+    assert all(np.abs(pressed[name].astype(int) - before[name]).mean() > 10 for name in before)
+    assert 0.97 < rehearsal.volume_ratio() < 1.0
+    assert rehearsal.contacts.measure_penetration() <= 0.5
+    rehearsal.reset()
+    rehearsal.update_surfaces()
+    after = rehearsal.look(rehearsal.probe, *LOOK)
+    assert all(np.array_equal(after[name], before[name]) for name in before)
+    assert rehearsal.indentation_mm() == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_pixel_shows_the_tissue_that_is_there_now(kept):
+    rehearsal = kept(pressed_phantom)
+    for step in range(31):
+        rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
+    rehearsal.look(rehearsal.probe, *LOOK_AT_CT)
+    plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], *rehearsal.probe.extent_mm)
+    pixels = np.argwhere(organ_mask(rehearsal.scanner.slice))[::1009]
+    spacing = np.array([plane.width_mm, plane.depth_mm]) / rehearsal.scene.image.pixels
+    local = (pixels[:, ::-1] + 0.5) * spacing - [plane.width_mm / 2, 0]
+    shown_at = np.column_stack([local, np.zeros(len(local)), np.ones(len(local))]) @ plane.world_from_plane.T
+    rest = rehearsal.scanner.plane.rest_grid(rehearsal.scene.image.pixels)[pixels[:, 0], pixels[:, 1]]
+    carried = array_of(Skin(rehearsal.model, rest).vertices)
+    off = np.linalg.norm(carried - shown_at[:, :3], axis=1)
+    unmoved = np.linalg.norm(rest - shown_at[:, :3], axis=1)
+    assert len(off) > 50 and unmoved.mean() > 2.0
+    # Cells of 8 mm are straight where the clusters bend: under a tenth of the motion on average.
+    assert off.mean() < 0.1 * unmoved.mean()
+
+
+def test_a_hand_cannot_outrun_its_speed(kept):
+    rehearsal = kept(pressed_phantom)
+    away = rehearsal.pose.copy()
+    away[:3, 3] += [0, -100.0, 0]
+    moved = rehearsal.pose_towards(away)
+    assert np.linalg.norm(moved[:3, 3] - away[:3, 3]) == pytest.approx(100.0 - 150.0 / 60)
+
+
+def test_the_transducer_goes_over_the_organ_not_through_it(kept):
+    rehearsal = kept(pressed_phantom)
+    hand, middle = rehearsal.hand, rehearsal.hand.vertices.mean(axis=0)
+    ends = [
+        middle + side * 30 * np.array(rehearsal.press.lateral) - 60 * rehearsal.gravity_direction
+        for side in (-1, 1)
+    ]
+    hand.point(ends[0], rehearsal.gravity_direction)
+    for _ in range(90):
+        rehearsal.advance(rehearsal.pose_towards(hand.pose()))
+    there = rehearsal.pose.copy()
+    hand.point(ends[1], rehearsal.gravity_direction)
+    deepest = -np.inf
+    for _ in range(90):
+        rehearsal.advance(rehearsal.pose_towards(hand.pose()))
+        deepest = max(deepest, rehearsal.indentation_mm())
+    assert np.linalg.norm(rehearsal.pose[:3, 3] - there[:3, 3]) > 30
+    assert rehearsal.pose == pytest.approx(hand.pose(), abs=1e-6)
+    # A straight way would cut several millimetres deep into the organ's curve.
+    assert deepest < 0.5
+
+
+def test_every_feature_at_once_without_a_ct_stays_finite_and_out_of_everything(one_device, tmp_path):
+    trimesh.creation.icosphere(subdivisions=3, radius=20.0).export(tmp_path / "organ.stl")
+    grid = np.indices((31, 31, 11)).transpose(1, 2, 3, 0) * 2.0 - [30, 30, 34]
+    bed = sitk.GetImageFromArray(
+        (grid[..., 2] + 19.0 - 0.1 * np.abs(grid[..., 0])).transpose(2, 1, 0).astype(np.float32)
+    )
+    bed.SetSpacing((2.0, 2.0, 2.0))
+    bed.SetOrigin((-30.0, -30.0, -34.0))
+    sitk.WriteImage(bed, str(tmp_path / "bed.nrrd"))
+    scene = Scene(
+        anatomy={},
+        tissue=dict(model="shape-matching", radius_mm=3.0, surface_samples_per_mm2=0.5),
+        solver=dict(relaxation="global", relaxation_factor=1.5, mass_scaling_per_mm=0.02),
+        gravity=dict(direction=(0, 0, -1)),
+        contact=dict(particles=True),
+        shape=(dict(kind="sdf", file="bed.nrrd"), dict(kind="plane", normal=(0, 0.2, 1), offset_mm=-21.0)),
+        press=dict(direction=(0.2, 0, -1), warm_up_steps=20),
+    )
+    rehearsal = Rehearsal(scene, load_anatomy(scene, tmp_path))
+    assert rehearsal.model.relaxation == "global"
+    for step in range(31):
+        rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
+        assert rehearsal.contacts.measure_penetration() <= 1e-3
+    rehearsal.update_surfaces()
+    assert np.isfinite(array_of(rehearsal.body.position)).all()
+    assert 0.6 < rehearsal.volume_ratio() < 1.1
+    assert rehearsal.scanner is None and rehearsal.rest_grid() is None
+    assert not any(picture.any() for picture in rehearsal.look(rehearsal.probe, *LOOK).values())
+
+
+def test_the_outline_is_the_tumours_border_not_what_is_drawn_of_it(kept):
+    rehearsal = kept(pressed_phantom)
+    for _ in range(20):
+        rehearsal.advance(rehearsal.pose_at_depth(6.0))
+    outline = rehearsal.tumour_outline()
+    plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], 1.0, 1.0)
+    flat = np.column_stack([outline.reshape(-1, 2), np.zeros(2 * len(outline)), np.ones(2 * len(outline))])
+    carried = array_of(Skin(rehearsal.model, rehearsal.tumour.vertices).vertices)
+    border = trimesh.Trimesh(carried, rehearsal.tumour.faces, process=False)
+    away = signed_distance(border.vertices, border.faces, (flat @ plane.world_from_plane.T)[:, :3])[0]
+    assert len(outline) > 20 and np.abs(away).max() < 1e-3

@@ -1,0 +1,120 @@
+"""A rigid forecast of a way, against counting voxels one by one."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+from plan_ball import SIZE, R, X, Y, Z, big_ball, hand_on
+
+from rehearsal.planning import rigid_surrogate
+from rehearsal.planning.rigid_surrogate import Forecast
+from rehearsal.planning.score_terms import Parts
+from rehearsal.planning.sweep_path import Way, fanned
+from sim.fields import field_of
+from ultrasound.coverage import VOXEL_MM, Coverage
+from ultrasound.probe import load_probe
+from ultrasound.probe_manipulator import pose_at
+
+pytestmark = pytest.mark.usefixtures("one_device")
+
+
+class Unmoved:
+    """A skin of tissue that has not settled."""
+
+    def __init__(self, model: None, places: np.ndarray) -> None:
+        self.vertices = field_of(places, 1)
+
+    def update(self) -> None: ...
+
+
+GAP_MM, WARNING_MM = 1.5, 2.0
+TUMOUR_MM, AT = 8.0, np.array([2.0, -3.0, 14.0])
+
+
+def forecast_of(monkeypatch, probe) -> tuple[Forecast, Coverage]:
+    monkeypatch.setattr(rigid_surrogate, "Skin", Unmoved)
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=TUMOUR_MM).apply_translation(AT)
+    coverage = Coverage(big_ball(), ball)
+    scene = SimpleNamespace(
+        image=SimpleNamespace(contact_gap_mm=GAP_MM),
+        transducer=SimpleNamespace(compression_warning_mm=WARNING_MM),
+    )
+    size = np.array(probe.housing_mm)
+    held = SimpleNamespace(hand=hand_on(big_ball(), size), model=None, probe=probe, scene=scene, size_mm=size)
+    return Forecast(held, coverage, "tumour", lambda poses: poses[:, 0, 3] < 5.0), coverage
+
+
+def way_over_the_tumour(length: float) -> Way:
+    """Poses whose faces are 1, 3 and 0.5 mm in the ball, the second tilted and the third turned; one above it, and one beside it."""
+    faces = np.array([[0, 0, R - 1], [0, -4, R - 3], [3, 0, R - 0.5], [0, 5, R + 3]])
+    down = np.stack([pose_at(face, -Z, X, length) for face in faces])
+    down[1] = fanned(down[1], length, 12.0)
+    down[2] = pose_at(faces[2], -Z, X + Y, length)
+    return Way((down, pose_at(R * Z + 60 * X, -Z, X, length)[None]))
+
+
+@pytest.mark.parametrize("name", ["linear", "drop-in", "curvilinear"])
+def test_a_forecast_is_what_counting_voxels_one_by_one_gives(monkeypatch, name):
+    probe = load_probe(name)
+    found, coverage = forecast_of(monkeypatch, probe)
+    length = float(probe.housing_mm[2])
+    way = way_over_the_tumour(length)
+    parts = found.parts(way)
+    places = coverage.low_mm + VOXEL_MM * np.argwhere(coverage.targets["tumour"])
+    surely, perhaps = np.zeros(len(places), bool), np.zeros(len(places), bool)
+    for pose in way.poses:
+        slack = [shown_by(probe, pose, length, places, off) for off in (-0.3, 0.3)]
+        surely |= slack[0]
+        perhaps |= slack[1]
+    assert surely.mean() <= parts.seen <= perhaps.mean() and 0.2 < parts.seen < 0.99
+    assert perhaps.mean() - surely.mean() < 0.12
+    deep = [max(depth_of_array(probe, pose, length).max(), 0.0) for pose in way.poses]
+    # Distances between voxels are off by VOXEL^2 / 8 of the curvatures 2 / R, and the facets.
+    off = VOXEL_MM**2 / 4 / R + 0.05
+    assert parts.compression_max_mm == pytest.approx(max(deep), abs=off)
+    assert parts.compression_mean_mm == pytest.approx(np.mean(deep), abs=off)
+    assert parts.over_limit == np.mean(np.array(deep) > WARNING_MM) == 0.2
+    touching = [(depth_of_array(probe, pose, length) >= -GAP_MM).mean() for pose in way.poses]
+    assert parts.contact == pytest.approx(np.mean(touching), abs=1.5 / rigid_surrogate.ELEMENTS)
+    assert parts.reachable == 0.8 and parts.time_s == 0.0
+
+
+def shown_by(probe, pose: np.ndarray, length: float, places: np.ndarray, slack: float) -> np.ndarray:
+    """Which places a picture shows, one after the other; slack [mm] widens all that decides."""
+    shown = []
+    for u, minus_w, z in (places - pose[:3, 3]) @ pose[:3, :3]:
+        v, w = -z - length / 2, -minus_w
+        if probe.radius_mm > 0:
+            angle, along = (
+                np.arctan2(u, v + probe.radius_mm),
+                np.hypot(u, v + probe.radius_mm) - probe.radius_mm,
+            )
+            edges = np.radians([probe.theta_start_deg, probe.theta_stop_deg])
+            aside = max(edges[0] - angle, angle - edges[1]) * probe.radius_mm
+            element = probe.radius_mm * np.array([np.sin(angle), np.cos(angle) - 1])
+        else:
+            along, aside, element = v, abs(u) - probe.transducer_width_mm / 2, np.array([u, 0.0])
+        at = pose @ [element[0], 0.0, -element[1] - length / 2, 1.0]
+        shown.append(
+            aside <= slack
+            and -slack <= along <= probe.depth_mm + slack
+            and abs(w) <= (probe.elevation_width_mm + VOXEL_MM) / 2 + slack / 10
+            and np.linalg.norm(at[:3]) - R <= GAP_MM + slack
+        )
+    return np.array(shown)
+
+
+def depth_of_array(probe, pose: np.ndarray, length: float) -> np.ndarray:
+    """How deep elements all along the array are in the ball [mm]."""
+    at = [pose @ [u, 0.0, -v - length / 2, 1.0] for u, v in probe.elements()]
+    return R - np.linalg.norm(np.array(at)[:, :3], axis=1)
+
+
+def test_the_forecast_of_no_pass_is_nothing_and_of_the_same_way_the_same(monkeypatch):
+    found, _ = forecast_of(monkeypatch, load_probe("linear"))
+    assert found.parts(Way(())) == Parts.nothing()
+    way = way_over_the_tumour(SIZE[2])
+    assert found.parts(way) == found.parts(way)
+    # It lays ways with fewer samples, and leaves the hand of the trials as it is.
+    assert len(found.hand.samples) < len(found.rehearsal.hand.samples)

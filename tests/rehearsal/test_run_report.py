@@ -1,0 +1,50 @@
+"""The report of a run: of tissue that was lost it has no figures, and says so."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from rehearsal.build_solver import step_settings
+from rehearsal.configuration import probe_of
+from rehearsal.measurements.run_report import Tally, summary
+from scenes.scene import EMBEDDED, load_scene
+from sim.fields import field_of, fill
+
+SCENE = load_scene(EMBEDDED)
+
+
+def rehearsed() -> SimpleNamespace:
+    """What a tally asks of a rehearsal."""
+    return SimpleNamespace(
+        scene=SCENE,
+        settings=step_settings(SCENE.tissue, SCENE.solver),
+        probe=probe_of(SCENE),
+        model=SimpleNamespace(counts=lambda: dict(particles=4, nodes=4, cells=1)),
+        embedding=SimpleNamespace(count=6),
+        body=SimpleNamespace(position=field_of(np.zeros((4, 3)), 1)),
+        contacts=SimpleNamespace(measure_penetration=lambda: 0.25),
+        volume_ratio=lambda: 0.97,
+        indentation_mm=lambda: 3.5,
+        notice="",
+        steps=2,
+    )
+
+
+@pytest.mark.parametrize("lost", [None, np.nan, np.inf])
+def test_figures_are_those_of_tissue_that_is_there(one_device, lost):
+    rehearsal, tally = rehearsed(), Tally(1.0)
+    tally.watch(rehearsal)
+    if lost is not None:
+        places = np.zeros((4, 3))
+        places[3, 1] = lost
+        fill((rehearsal.body.position, places))
+        rehearsal.volume_ratio = rehearsal.indentation_mm = lambda: lost
+        tally.watch(rehearsal)
+    report = tally.report(rehearsal, "cpu")
+    json.dumps(report, allow_nan=False)
+    names = "volume_ratio_min", "max_penetration_mm", "indentation_max_mm"
+    assert [report[name] for name in names] == ([0.97, 0.25, 3.5] if lost is None else [None] * 3)
+    (press,) = (line for line in summary(report).splitlines() if line.startswith("press"))
+    assert ("3.50 mm deep" in press) == (lost is None) != ("NOT FINITE" in press)

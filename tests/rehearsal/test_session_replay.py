@@ -1,0 +1,218 @@
+"""A real rehearsal recorded in a window that draws nothing, and replayed: the same bits and pixels."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import taichi as ti
+
+from rehearsal import headless, run
+from rehearsal.build_solver import step_settings
+from rehearsal.coordinates import probe_in_patient
+from rehearsal.frame_view import settings_of
+from rehearsal.measurements.live_measurements import Instruments
+from rehearsal.rehearsal import Rehearsal
+from rehearsal.sessions import recorder
+from rehearsal.sessions.open_session import opened
+from rehearsal.sessions.packed_coverage import pack_seen
+from rehearsal.sessions.replay import Replay
+from rehearsal.sessions.session_file import Log, SessionError, read_log
+from rehearsal.tracking.pose_file import TimedPoses
+from render.viewer import Controls, NullViewer, Settings, View
+from render.window import NoVulkan
+from scenes.anatomy import LoadedAnatomy, load_anatomy, phantom_folder
+from scenes.scene import EMBEDDED, load_scene, with_options
+from sim.device import start
+from ultrasound import coverage
+from version import VERSION
+
+
+class Watched(NullViewer):
+    """A window that draws nothing, and keeps what each frame showed, but for frozen ones."""
+
+    def __init__(self, settings: Settings, script: Any) -> None:
+        super().__init__(settings, script)
+        self.seen: list[tuple] = []
+        self.is_frozen = False
+
+    def read_controls(self) -> Controls:
+        controls = super().read_controls()
+        self.is_frozen ^= controls.freeze
+        return controls
+
+    def draw(self, view: View) -> None:
+        if not self.is_frozen:
+            self.seen.append((view.transducer_pose.tobytes(), *(p.tobytes() for p in view.pictures.values())))
+
+
+def once(make: Any) -> Any:
+    """Gives again what was made of the same arrays and numbers."""
+    made: dict[tuple, Any] = {}
+
+    def again(*given: Any) -> Any:
+        call = tuple(np.asarray(each).tobytes() for each in given)
+        return made[call] if call in made else made.setdefault(call, make(*given))
+
+    return again
+
+
+@pytest.fixture(scope="module")
+def built() -> Iterator[tuple[Rehearsal, LoadedAnatomy]]:
+    """The embedded patient, coarse and with small pictures."""
+    start("cpu")
+    scene = with_options(load_scene(EMBEDDED), {"tissue.cell_mm": 8.0, "image.mode": "b-mode"})
+    short = dict(press=scene.press.model_copy(update={"warm_up_steps": 20}))
+    small = dict(image=scene.image.model_copy(update={"pixels": 32}))
+    anatomy = load_anatomy(scene, phantom_folder())
+    with pytest.MonkeyPatch.context() as patch:
+        # Every run begins with a new coverage of the one organ.
+        patch.setattr(coverage, "distance_grid", once(coverage.distance_grid))
+        yield Rehearsal(scene.model_copy(update=short | small), anatomy), anatomy
+    ti.reset()
+
+
+def rewound(rehearsal: Rehearsal) -> Rehearsal:
+    """As it was built."""
+    scene = rehearsal.scene
+    rehearsal.reset()
+    rehearsal.settings = step_settings(scene.tissue, scene.solver)
+    rehearsal.set_gravity(scene.gravity.acceleration_m_s2)
+    rehearsal.set_young(scene.tissue.young_kpa)
+    return rehearsal
+
+
+def rehearsed(built, monkeypatch, out: Path, script: Any, log: Log | None = None, at_s: float = 0.0):
+    """What a rehearsal showed, frame by frame, the tissue's digest at its end, and what it recorded."""
+    rehearsal, anatomy = rewound(built[0]), built[1]
+    settings = settings_of(rehearsal)
+    viewer = Watched(settings, script(settings))
+    monkeypatch.setattr(run, "open_viewer", lambda *_, **__: viewer)
+    # A budget that no step keeps: the ladder goes down.
+    each = run.Run(rehearsal, anatomy, "cpu", out, budget_ms=0.01)
+    each.in_window(log, at_s)
+    return viewer.seen, rehearsal.digest(), each.recorded and read_log(each.recorded.recording.path)
+
+
+def user(settings: Settings, frames: int = 150) -> Iterator[Controls]:
+    """All there is to do, in 140 moments and ten frozen frames."""
+    for frame in range(frames):
+        settings.young_kpa = 40.0 if 30 <= frame < 50 else 15.0
+        settings.iterations = 3 if 40 <= frame < 60 else 8
+        settings.gain_percent = 40 if frame < 85 else 75
+        settings.depth_mm = 20 if 60 <= frame < 108 else 40
+        over = np.array([0.1 * (frame % 100) - 5.0, -80.0, 3.0]), np.array([0.0, 1.0, 0.0])
+        keys = dict(undo=frame in (70, 71, 140), redo=frame == 72, bookmark=frame in (20, 98))
+        keys |= dict(to_bookmark=frame in (110, 112), reset=frame == 130, freeze=frame in (80, 90))
+        at = over if frame % 40 < 30 else None
+        fan_deg = 0.5 * (frame % 7 == 0)
+        yield Controls(settings, at, press=frame % 40 > 15, fan_deg=fan_deg, quit=frame == frames - 1, **keys)
+
+
+def watching(frames: int, take_over_at: int = -1) -> Any:
+    def script(settings: Settings) -> Iterator[Controls]:
+        for frame in range(frames):
+            press = 0 <= take_over_at < frame
+            news = "Gamepad ready" if frame == 0 else ""
+            last = frame == frames - 1
+            yield Controls(settings, take_over=frame == take_over_at, press=press, quit=last, news=news)
+
+    return script
+
+
+def test_a_rehearsal_is_replayed_to_the_bit_and_the_pixel(built, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(recorder, "STATE_S", 1.0)
+    summaries: list[dict] = []
+    monkeypatch.setattr(run, "in_words", lambda summary: summaries.append(summary) or "")
+    seen, end, log = rehearsed(built, monkeypatch, tmp_path, user)
+    assert len(seen) == len(log.poses) == 140 and len(set(seen)) > 120 and log.summary["went_back"] == 7
+    told = [event.value for events in log.events.values() for event in events if event.kind == "solver"]
+    assert len({values["iterations"] for values in told if "iterations" in values}) > 2
+    for at in (0, 125):
+        shown, again, _ = rehearsed(built, monkeypatch, tmp_path, watching(140 - at), log, at / 60)
+        assert shown == seen[at:] and again == end and "identical in all" in capsys.readouterr().out
+    assert summaries == [log.summary] * 3 and log.summary["bookmarks"] == 2
+    opened_at_each(built, log, capsys)
+
+
+def opened_at_each(built, log: Log, capsys) -> None:
+    """Wherever a session is opened, the read-outs are those that it noted there."""
+    noted = {
+        moment: event.value
+        for moment, events in sorted(log.events.items())
+        for event in events
+        if event.kind == "reading"
+    }
+    # From the beginning; from a bookmark, over a change of depth and two ways back; on a state, and from there over a way back.
+    for begins, moment in ((0, 30), (88, 105), (120, 120), (120, 135)):
+        rehearsal, settings = rewound(built[0]), settings_of(built[0])
+        instruments = Instruments(rehearsal)
+        assert Replay(rehearsal, log).begin_at(moment / 60) == begins
+        replay = opened(log, moment / 60, rewound(rehearsal), settings, instruments)
+        assert replay.session.moment == moment and instruments.figures() == noted[moment], moment
+        assert instruments.course.duration_s == pytest.approx(moment / 60)
+        assert settings.depth_mm == 40 and replay.bookmarks == 1 + (moment > 88)
+    assert "Mind" not in capsys.readouterr().out
+    instruments = Instruments(rehearsal)
+    opened(replace(log, seen={}), 127 / 60, rehearsal, settings_of(rehearsal), instruments)
+    assert "what was seen until 2 s; what was seen and done counts from there" in capsys.readouterr().out
+    assert instruments.figures()["seen_organ"] < noted[120]["seen_organ"]
+    assert instruments.course.duration_s == pytest.approx(7 / 60)
+    other = replace(log, seen=dict.fromkeys(log.seen, pack_seen(np.zeros((2, 3, 4), bool))))
+    with pytest.raises(SessionError, match=r"of \(2, 3, 4\) voxels what was seen, expected \([^\n]*$"):
+        opened(other, 127 / 60, rehearsal, settings_of(rehearsal), Instruments(rehearsal))
+
+
+def test_a_session_that_goes_on_from_a_replay_is_one_too(built, monkeypatch, tmp_path, capsys):
+    summaries: list[dict] = []
+    monkeypatch.setattr(run, "in_words", lambda summary: summaries.append(summary) or "")
+    _, _, first = rehearsed(built, monkeypatch, tmp_path, partial(user, frames=60))
+    led, end, second = rehearsed(built, monkeypatch, tmp_path, watching(60, 20), first, 0.5)
+    assert len(second.poses) == 40 and second.header.begins and second.header.version == VERSION
+    assert "recorded by version" not in capsys.readouterr().out
+    second.header.version = "0.9"
+    shown, again, _ = rehearsed(built, monkeypatch, tmp_path, watching(40), second)
+    told = capsys.readouterr().out
+    assert shown == led[20:] and again == end and summaries[2] == summaries[1] == second.summary
+    assert second.summary["duration_s"] == round(40 / 60, 3) and summaries[0] == first.summary
+    assert "identical in all 1 states" in told
+    assert told.count("Gamepad ready") == 1 and f"recorded by version 0.9, replayed by {VERSION}" in told
+
+
+def test_a_tracked_file_is_followed_headless_and_replayed(built, monkeypatch, tmp_path, capsys):
+    rehearsal, anatomy = built
+    rehearsal.reset()
+    monkeypatch.setattr(headless, "open_viewer", no_vulkan)
+    poses = [probe_in_patient(rehearsal)]
+    for _ in range(30):
+        rehearsal.hand.slide(0.3, -0.1)
+        rehearsal.pose = rehearsal.hand.pose()
+        poses.append(probe_in_patient(rehearsal))
+    rehearsal.reset()
+    # The slides, 9.5 mm, in half a second.
+    track = TimedPoses(
+        np.linspace(2.0, 2.5, 31), [None if 8 <= k < 12 else pose for k, pose in enumerate(poses)]
+    )
+    tracked = run.Run(rehearsal, anatomy, "cpu", tmp_path, budget_ms=0.01, track=track)
+    tracked.headless(None, 0.0, None, 0.0)
+    log = read_log(tracked.recorded.recording.path)
+    assert len(log.poses) == 31 and probe_in_patient(rehearsal) == pytest.approx(poses[-1])
+    told = [event.value for events in log.events.values() for event in events if event.kind == "solver"]
+    assert len({values["iterations"] for values in told if "iterations" in values}) == 1
+    assert "echo as far as" in capsys.readouterr().out and (tmp_path / "slices").is_dir()
+    rehearsal.reset()
+    (tmp_path / "bare").mkdir()
+    run.Run(rehearsal, anatomy, "cpu", tmp_path / "bare").headless(log, 0.0, None, 0.0, draws=False)
+    told = capsys.readouterr().out
+    assert "identical in all 1 states" in told and "no pictures" in told and "a picture" not in told
+    assert sorted(path.name for path in (tmp_path / "bare").iterdir()) == FILES
+
+
+FILES = ["organ.ply", "report.json", "tumour.ply"]
+
+
+def no_vulkan(rehearsal: Rehearsal, visible: bool) -> None:
+    raise NoVulkan("none")

@@ -1,0 +1,224 @@
+"""The figures read off a rehearsal: a ball in a ball, and outlines whose place in the picture is known by hand."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+
+from rehearsal.measurements.tumour_measurements import read
+from sim.fields import field_of
+from ultrasound.probe import load_probe
+
+pytestmark = pytest.mark.usefixtures("one_device")
+
+LINEAR, CURVED = load_probe("linear"), load_probe("curvilinear")
+NOWHERE = np.zeros((0, 2, 2))
+
+
+def ball(radius: float, at=(0, 0, 0), subdivisions: int = 3) -> trimesh.Trimesh:
+    return trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius).apply_translation(at)
+
+
+def posed(face=(0.0, 0.0, 40.0), probe=LINEAR) -> np.ndarray:
+    """Looks down -z, the middle of the face there."""
+    pose = np.eye(4)
+    pose[:3, 3] = np.asarray(face) + [0, 0, probe.housing_mm[2] / 2]
+    return pose
+
+
+def rehearsed(
+    organ=None, tumour=None, shift=(0, 0, 0), now=None, pose=None, probe=LINEAR, outline=NOWHERE
+) -> SimpleNamespace:
+    """What is read of a rehearsal: an organ that lies as it was, or as ``now``, and a tumour that has shifted."""
+    organ = organ or ball(30.0)
+    lies = np.asarray(organ.vertices if now is None else now, np.float32)
+    return SimpleNamespace(
+        organ=organ,
+        organ_skin=SimpleNamespace(vertices=field_of(lies, 1)),
+        pose=posed() if pose is None else pose,
+        size_mm=np.array(probe.housing_mm),
+        tumour=tumour,
+        tumour_vertices=lambda: np.asarray(tumour.vertices) + shift,
+        tumour_outline=lambda: None if tumour is None else outline,
+    )
+
+
+def reading(probe=LINEAR, touches=None, **parts):
+    every = np.ones(probe.number_of_scanlines, bool)
+    return read(rehearsed(probe=probe, **parts), probe, every if touches is None else touches)
+
+
+def test_without_a_tumour_there_is_nothing_to_say_of_it():
+    found = reading()
+    assert (found.contact_mm2, found.compression_mm) == (0, 0)
+    assert {
+        found.to_tumour_mm,
+        found.tumour_depth_mm,
+        found.tumour_shift_mm,
+        found.in_view,
+        found.margin_mm,
+    } == {None}
+
+
+def test_what_is_pressed_is_read_of_the_organ_as_it_lies():
+    organ = trimesh.creation.box([60.0, 60.0, 40.0])
+    found = reading(organ=organ, now=organ.vertices * [1, 1, 0.9], pose=posed((0, 0, 18)))
+    assert found.contact_mm2 == pytest.approx(400)
+    assert found.compression_mm == pytest.approx(4, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", ["drop-in", "linear", "curvilinear"])
+@pytest.mark.parametrize(
+    "at", [(0, 0, 0), (3.5, 1, 5), (-5.5, -2, 3), (60, 5, 0), (-60, 0, 9), (5, 30, 0), (0, -30, 0)]
+)
+def test_from_the_face_to_the_tumour(name, at):
+    probe = load_probe(name)
+    turned = trimesh.transformations.random_rotation_matrix(np.array([0.2, 0.7, 0.4]))
+    found = reading(
+        probe,
+        tumour=ball(4.0, at).apply_transform(turned),
+        pose=turned @ posed((0, 0, 12), probe),
+        organ=ball(100.0),
+    )
+    # The nearest point of the face, on the arc that it has along x; of so many that the nearest is told by looking.
+    half = np.array(probe.housing_mm[:2]) / 2
+    x, y = np.linspace(-half[0], half[0], 20_001), np.clip(at[1], -half[1], half[1])
+    z = 12 + (probe.radius_mm and probe.radius_mm - np.sqrt(probe.radius_mm**2 - x**2))
+    true = np.sqrt((x - at[0]) ** 2 + (y - at[1]) ** 2 + (z - at[2]) ** 2).min() - 4
+    # The face's places are 0.77 mm apart at most, so it ends 0.4 mm beyond the last of them; facets lie 0.5 % in.
+    assert true - 1e-3 < found.to_tumour_mm < true + 0.02 + np.hypot(0.4, 0.4)
+    if abs(at[0]) < half[0] - 1 and abs(at[1]) < half[1] - 1 and probe.radius_mm == 0:
+        # Over it, half a place aside costs its square.
+        assert found.to_tumour_mm < true + 0.02 + 2 * 0.385**2 / (2 * (true + 4))
+
+
+@pytest.mark.parametrize("at", [(0, 0, 10), (12, -9, 8), (-16, 12, 0)])
+def test_how_deep_a_tumour_lies(at):
+    organ = ball(30.0, subdivisions=4)
+    found = reading(organ=organ, tumour=ball(5.0, at), now=organ.vertices * 1.1 + [1, 2, 3], shift=(1, 2, 3))
+    # Facets of the organ lie 0.15 % in. The tumour's nearest vertex is 9 degrees from the way out at most.
+    true = 33 - np.linalg.norm(at) - 5
+    assert true - 0.05 < found.tumour_depth_mm < true + 5 * (1 - np.cos(np.radians(9)))
+
+
+def test_how_deep_a_tumour_lies_under_large_triangles():
+    # Under the middle of a face no vertex of the organ is near.
+    organ = trimesh.creation.box([60.0, 60.0, 40.0])
+    assert reading(organ=organ, tumour=ball(5.0, (15, 2, 13))).tumour_depth_mm == pytest.approx(2.0, abs=0.05)
+
+
+@pytest.mark.parametrize("at", [(0, 0, 16), (0, 0, 22), (29, 0, 17)])
+def test_a_tumour_that_sticks_out_has_no_depth(at):
+    organ = trimesh.creation.box([60.0, 60.0, 40.0])
+    assert reading(organ=organ, tumour=ball(5.0, at)).tumour_depth_mm == 0
+
+
+def test_how_far_a_tumour_has_moved():
+    found = reading(tumour=ball(5.0, (1, 2, 3)), shift=(2, -3, 6))
+    assert found.tumour_shift_mm == pytest.approx(7)
+
+
+def along(*corners, parts: int = 10) -> np.ndarray:
+    """An outline through corners (u, v), every side in so many segments."""
+    ends = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    points = np.concatenate([np.linspace(a, b, parts, endpoint=False) for a, b in ends])
+    return np.stack([points, np.roll(points, -1, axis=0)], axis=1)
+
+
+def square(u: float, v: float, half: float = 5.0) -> np.ndarray:
+    """40 segments of 1 mm about a place, for a half of 5 mm."""
+    return along((u - half, v - half), (u + half, v - half), (u + half, v + half), (u - half, v + half))
+
+
+def seen(probe, outline, touches=None) -> tuple:
+    found = reading(probe, touches, tumour=ball(5.0), outline=outline)
+    return found.in_view, found.margin_mm
+
+
+# 40 mm wide, 60 deep.
+@pytest.mark.parametrize(
+    "u, v, in_view, margin",
+    [
+        (8, 20, 1.0, 7.0),
+        (-10, 20, 1.0, 5.0),
+        (0, 53, 1.0, 2.0),
+        (18, 20, 0.6, -3.0),  # of 40 segments the far 10, and 3 of both between, are out
+        (-18, 20, 0.6, -3.0),
+        (0, 58, 0.6, -3.0),
+        (0, 2, 0.6, 15.0),  # behind the face nothing is shown; what is beside and under it stays
+        (40, 20, 0.0, -25.0),
+        (0, 80, 0.0, -25.0),
+        (15, 20, 1.0, 0.0),
+        (0, 55, 1.0, 0.0),
+    ],
+)
+def test_a_square_in_a_linear_picture(u, v, in_view, margin):
+    # 1e-9 aside, so that segments on the edge are in it.
+    outline = square(u * (1 - 1e-10), v * (1 - 1e-10))
+    assert seen(LINEAR, outline) == pytest.approx((in_view, margin), abs=1e-6)
+
+
+def test_an_outline_is_weighed_by_its_length():
+    outline = square(18, 20)
+    out = outline.mean(axis=1)[:, 0] > 20
+    halves = np.concatenate([outline[~out], *(np.stack([outline[out, 0] + a * d, outline[out, 0] + b * d], axis=1)
+                             for d in [outline[out, 1] - outline[out, 0]] for a, b in ((0, 0.5), (0.5, 1)))])  # fmt: skip
+    assert len(halves) > len(outline)
+    assert seen(LINEAR, halves)[0] == pytest.approx(0.6)
+
+
+def test_what_lies_before_lines_that_do_not_touch_is_not_in_view():
+    # Lines of u < 8 do not touch: the left side, and 3 of both between.
+    touches = LINEAR.elements()[:, 0] > 8
+    assert seen(LINEAR, square(10, 20), touches) == pytest.approx((0.6, 5.0))
+    assert seen(LINEAR, square(10, 20), ~touches) == pytest.approx((0.4, 5.0))
+
+
+def test_a_plane_that_misses_the_tumour_shows_none_of_it():
+    assert seen(LINEAR, NOWHERE) == (None, None)
+
+
+def sector(first: float, last: float, near: float, far: float) -> np.ndarray:
+    """Between two angles [degrees] and two depths [mm] of the curvilinear probe: arcs of 1 degree, radii of 1 mm."""
+    angles, depths = np.radians(np.arange(first, last + 0.5)), np.arange(near, far + 0.5)
+
+    def polar(angle, depth):
+        radius = depth + 60
+        return np.column_stack([radius * np.sin(angle), radius * np.cos(angle) - 60])
+
+    sides = [
+        polar(angles, near),
+        polar(angles[-1], depths),
+        polar(angles, far)[::-1],
+        polar(angles[0], depths)[::-1],
+    ]
+    return np.concatenate([np.stack([side[:-1], side[1:]], axis=1) for side in sides])
+
+
+# 60 mm of radius, from -30 to 30 degrees, 120 mm deep.
+@pytest.mark.parametrize(
+    "first, last, near, far, in_view, margin",
+    [
+        # The first radial segment's middle is 20.5 deep: 80.5 mm from where the lines leave, 5 degrees from the last.
+        (-5, 25, 20, 40, 1.0, 80.5 * np.radians(5)),
+        (-25, 5, 20, 40, 1.0, 80.5 * np.radians(5)),
+        # An arc's chord is nearer by 1 - cos(0.5 degrees) of 175 mm.
+        (-5, 5, 100, 115, 1.0, 120 - (175 * np.cos(np.radians(0.5)) - 60)),
+        # Arcs of radius 80 and 100: 10 degrees of 15 in, and one radius of 20 mm of two. Out by 5 degrees of the farthest, at 39.5.
+        (20, 35, 20, 40, None, -99.5 * np.radians(5)),
+        (-35, -20, 20, 40, None, -99.5 * np.radians(5)),
+    ],
+)
+def test_a_piece_of_a_sector_in_a_curvilinear_picture(first, last, near, far, in_view, margin):
+    chord = 2 * np.sin(np.radians(0.5))
+    if in_view is None:
+        in_view = (10 * 180 * chord + 20) / (15 * 180 * chord + 40)
+    assert seen(CURVED, sector(first, last, near, far)) == pytest.approx((in_view, margin), rel=1e-6)
+
+
+def test_a_curvilinear_picture_ends_behind_its_face():
+    # Of 12 degrees each side: arcs of radius 54 and 66 mm, two radii of 12 mm, the half of them behind the face.
+    in_view = (66 * 24 * 2 * np.sin(np.radians(0.5)) + 12) / (120 * 24 * 2 * np.sin(np.radians(0.5)) + 24)
+    # Behind the face lines are taken to be as far apart as on it.
+    assert seen(CURVED, sector(-12, 12, -6, 6)) == pytest.approx((in_view, 60 * np.radians(18)))

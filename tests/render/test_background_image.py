@@ -1,0 +1,338 @@
+"""The page behind the 3D view: parts that do not overlap, texts that fit, and what is written over pictures."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from render.background_image import Page
+from render.camera import OrbitCamera
+from render.compass import ARM, compass_picture, ends_of
+from render.keys import USUAL_KEYS, Keys
+from render.sliders import boxes_of, groups_of
+from render.text import fitting_size, font, shortened, write
+from render.ultrasound_panel import ALERT, BEFORE, CALLIPER, OUTLINE, QUIET, TEXT
+from render.viewer import Geometry, Settings, View
+from render.window_frame import clock_box, findings_picture, readout_picture
+from render.window_layout import Layout, Rect
+
+LAYOUT = Layout(1280, 720)
+AXES = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, 1.0, 0]])
+FIGURES = {f"figure {k}": f"{k} mm" for k in range(14)}
+SQUARE = np.array([[[-4.0, 10.0], [4.0, 10.0]], [[4.0, 10.0], [4.0, 20.0]]])
+each_size = pytest.mark.parametrize("size", [(700, 420), (1024, 576), (1280, 720), (1366, 768), (1920, 1080)])
+
+
+def view(**changes) -> View:
+    pictures = {"B-mode": np.zeros((64, 32), np.uint8), "CT": np.zeros((64, 32), np.uint8)}
+    return View(
+        **{"transducer_pose": np.eye(4), "pictures": pictures, "width_mm": 16.0, "depth_mm": 40.0} | changes
+    )
+
+
+def composed(page: Page, **changes) -> np.ndarray:
+    """The page (rows, columns, 3) with a view on it."""
+    page.compose(view(**changes), AXES)
+    return page.pixels.transpose(1, 0, 2)[::-1, :, :3].copy()
+
+
+def picture_boxes(layout: Layout) -> list[Rect]:
+    return layout.picture_boxes(2, 16.0, 40.0)
+
+
+def coloured(picture: np.ndarray, box: Rect, colour) -> np.ndarray:
+    """Rows and columns (n, 2) in a box of the pixels that are near a colour."""
+    return np.argwhere(np.abs(picture[box.slices].astype(int) - colour).max(axis=-1) < 12)
+
+
+def apart(one: Rect, other: Rect) -> bool:
+    return (
+        one.right <= other.left
+        or other.right <= one.left
+        or one.bottom <= other.top
+        or other.bottom <= one.top
+    )
+
+
+def geometry(**parts) -> Geometry:
+    return Geometry(None, np.zeros((0, 3)), np.zeros((2, 3)), **parts)
+
+
+WHOLE = geometry(tumour_vertices=1, parts={"vessel": (1, 1)}, support_vertices=np.zeros((1, 3)))
+
+
+@each_size
+def test_no_part_of_the_window_overlaps_another(size):
+    layout = Layout(*size)
+    settings = Settings(young_kpa=15.0, show_scanner=True)
+    placed = boxes_of(settings, WHOLE, layout)
+    over = [layout.findings(layout.most_findings), layout.compass, placed["Echo"], placed["Gain over depth"]]
+    below = [box for name, box in placed.items() if name not in ("Echo", "Gain over depth")]
+    parts = [*over, *below, layout.readouts, *picture_boxes(layout)]
+    for one, other in combinations(parts, 2):
+        assert apart(one, other) or 0 in (*one[2:], *other[2:])
+    for within, area in (
+        (over, layout.scene),
+        ([*below, layout.readouts], layout.strip),
+        (picture_boxes(layout), layout.panel),
+    ):
+        for box in within:
+            assert area.left <= box.left and box.right <= area.right
+            assert area.top <= box.top and box.bottom <= area.bottom
+
+
+def test_echo_and_ct_of_the_drop_in_probe_fill_the_panel():
+    box = picture_boxes(LAYOUT)[0]
+    assert box.height > 0.95 * (720 - 74 - 52) and LAYOUT.scene.width > 720
+
+
+@each_size
+def test_the_first_sliders_go_where_there_is_no_room(size):
+    layout = Layout(*size)
+    names = list(boxes_of(Settings(young_kpa=15.0), WHOLE, layout))
+    assert (layout.readouts.width == 0) == (size in ((700, 420), (1024, 576)))
+    assert names == (["Picture", "View"] if size == (700, 420) else ["Tissue", "Picture", "View"])
+
+
+@pytest.mark.parametrize("width", [*range(704, 1600, 64), 1250])
+@pytest.mark.parametrize("tissue", ["young_kpa", "stiffness"])
+def test_labels_of_sliders_are_whole(width, tissue):
+    settings = Settings(**{tissue: 0.9}, show_scanner=True)
+    layout = Layout(width, width * 9 // 16)
+    groups = groups_of(settings, WHOLE)
+    for name, box in boxes_of(settings, WHOLE, layout).items():
+        for about in (member.metadata for member in groups[name]):
+            label = 7 * len(f"{about['label']} {about['unit']}".strip())
+            # Pixels around a label, and of a switch, as Dear ImGui draws them.
+            assert label <= (box.width - 35 if name == "View" else 0.35 * box.width - 16)
+
+
+def test_what_is_not_there_has_no_slider():
+    def named(shown: Geometry) -> set[str]:
+        groups = groups_of(Settings(young_kpa=15.0), shown)
+        return {each.name for members in groups.values() for each in members}
+
+    whole = named(WHOLE)
+    assert {
+        "show_tumour",
+        "outline",
+        "margin_mm",
+        "show_parts",
+        "show_support",
+    } <= whole and "stiffness" not in whole
+    assert whole - named(geometry()) == {"show_tumour", "outline", "margin_mm", "show_parts", "show_support"}
+    assert whole - named(geometry(tumour_vertices=1, parts={"cyst": (1, 1)})) == {"show_support"}
+
+
+# Texts
+
+
+def test_a_long_line_loses_its_last_parts_and_a_long_part_its_end():
+    line = "TISSUE SQUEEZED BY 9 mm   SWEEP   122 pictures"
+    length = font(17).getlength
+    assert shortened(line, 17, 1000) == line and shortened("", 17, 10) == ""
+    cut = shortened(line, 17, int(length("TISSUE SQUEEZED BY 9 mm   SWEEP")) + 1)
+    assert cut == "TISSUE SQUEEZED BY 9 mm   SWEEP"
+    cut = shortened(line, 17, 100)
+    assert cut.endswith("...") and line.startswith(cut[:-3]) and 70 < length(cut) <= 100
+
+
+def test_the_font_is_as_large_as_fits():
+    rows = [("Space", "what it is for"), ("W / S", "push it in, lift it")]
+    size = fitting_size(rows, 150, 30)
+    lengths = [
+        font(each).getlength("Space") + font(each).getlength("push it in, lift it")
+        for each in (size, size + 1)
+    ]
+    assert lengths[0] <= 150 < lengths[1]
+    assert fitting_size(rows, 900, 15) == 15
+
+
+def test_what_is_written_lies_in_its_box_or_is_left_out():
+    page, box = np.full((60, 90, 4), 200, np.uint8), Rect(10, 5, 70, 40)
+    write(page, box, (12.0, 6.0), "12.3 mm", 13, (0, 255, 0))
+    rows, columns = np.nonzero((page[..., :3] != 200).any(axis=-1))
+    assert (rows.min(), columns.min()) == (box.top, box.left) and columns.max() < box.right
+    assert (page[..., 3] == 200).all() and page[..., 1].max() > 240
+    page[:] = 200
+    write(page, box, (79.0, 44.0), "12.3 mm", 13, (0, 255, 0))
+    rows, columns = np.nonzero((page[..., :3] != 200).any(axis=-1))
+    assert (rows.max(), columns.max()) == (box.bottom - 1, box.right - 1)
+    before = page.copy()
+    write(page, Rect(10, 5, 20, 40), (12.0, 6.0), "12.3 mm", 13, (0, 255, 0))
+    assert np.array_equal(page, before)
+
+
+# Over the pictures
+
+
+def test_no_contact_is_written_in_the_echo_alone():
+    plain, noted = (composed(Page(LAYOUT), notes=notes) for notes in ({}, {"B-mode": "NO CONTACT"}))
+    echo, ct = picture_boxes(LAYOUT)
+    at = coloured(noted, echo, QUIET)
+    assert len(at) > 100 and len(coloured(plain, echo, QUIET)) == 0
+    assert at.mean(axis=0) == pytest.approx([echo.height / 2, echo.width / 2], abs=6)
+    assert np.array_equal(plain[ct.slices], noted[ct.slices])
+
+
+@pytest.mark.parametrize("size", [(1024, 576), (1088, 612), (1280, 720), (1920, 1080)])
+@pytest.mark.parametrize("hint", ["Left button or W presses", "Left button or Backspace presses"])
+def test_what_to_do_stands_whole_under_a_note(size, hint):
+    layout = Layout(*size)
+    plain, hinted = (
+        composed(Page(layout), notes={"B-mode": note}) for note in ("NO CONTACT", f"NO CONTACT\n{hint}")
+    )
+    echo = layout.picture_boxes(2, 16.0, 40.0)[0]
+    rows, columns = np.nonzero((plain != hinted).any(axis=2))
+    assert echo.left <= columns.min() and columns.max() < echo.right
+    assert np.ptp(columns) > 0.4 * echo.width
+    noted = coloured(plain, echo, QUIET)[:, 0].max() + echo.top
+    assert noted < rows.min() and rows.max() < noted + 50
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        ((-5.0, 8.0), (4.0, 30.0)),
+        ((4.0, 10.0), (4.0, 30.0)),
+        ((-4.0, 10.0), (-4.0, 30.0)),
+        ((-6.0, 36.0), (6.0, 36.0)),
+        ((7.0, 20.0), (7.0, 20.0)),
+    ],
+)
+def test_the_callipers_figure_stands_at_its_line(points):
+    bare, told = (
+        composed(Page(LAYOUT), calliper_mm=points, calliper=figure)
+        for figure in ("", "24.0 mm\nat rest 25.1 mm")
+    )
+    for box in picture_boxes(LAYOUT):
+        changed = np.argwhere((bare != told)[box.slices].any(axis=-1))
+        assert len(changed) > 100
+        middle = (np.mean(points, axis=0) + [8.0, 0.0])[::-1] * box.height / 40.0
+        # Beside the line, so no farther from its middle than half of the figure and a little more.
+        assert np.abs(changed.mean(axis=0) - middle).max() < 75
+        # A line down the right half has it on its left, one down the left half on its right.
+        assert points[0][0] != points[1][0] or (changed[:, 1].mean() - middle[1]) * points[0][0] < 0
+        # The line stays whole.
+        assert len(coloured(told, box, CALLIPER)) > len(coloured(bare, box, CALLIPER))
+    outside = np.ones(bare.shape[:2], bool)
+    for box in picture_boxes(LAYOUT):
+        outside[box.slices] = False
+    assert np.array_equal(bare[outside], told[outside])
+
+
+def test_outlines_have_a_legend_under_the_picture():
+    plain, outlined = (
+        composed(Page(LAYOUT), outline_mm=now, outline_before_mm=now) for now in (None, SQUARE)
+    )
+    foot = picture_boxes(LAYOUT)[0].bottom
+    under = Rect(LAYOUT.panel.left, foot, LAYOUT.panel.width, 24)
+    for colour in (OUTLINE, BEFORE):
+        assert len(coloured(outlined, under, colour)) > 30 and len(coloured(plain, under, colour)) == 0
+
+
+# Read-outs
+
+
+def test_findings_that_become_fewer_leave_nothing_behind():
+    page = Page(LAYOUT)
+    few = composed(page, findings=dict(list(FIGURES.items())[:4]))
+    assert not np.array_equal(composed(page, findings=FIGURES), few)
+    assert np.array_equal(composed(page, findings=dict(list(FIGURES.items())[:4])), few)
+
+
+def test_a_figure_that_has_nothing_to_say_is_a_dash():
+    pictures = [findings_picture(LAYOUT, {"margin": figure}) for figure in ("", "-", "4.2 mm")]
+    assert np.array_equal(pictures[0], pictures[1]) and not np.array_equal(pictures[0], pictures[2])
+
+
+@pytest.mark.parametrize("size", [(1250, 703), (1280, 720), (1920, 1080), (3840, 2160)])
+def test_all_readouts_of_a_window_are_shown(size):
+    layout = Layout(*size)
+    ends = [readout_picture(layout, dict(list(FIGURES.items())[:count])) for count in (6, 7)]
+    rows = np.flatnonzero((ends[0] != ends[1]).any(axis=(1, 2)))
+    # In a large window the lines move closer together for the seventh.
+    assert len(rows) > 5 and rows.max() < layout.readouts.height - 2
+
+
+@each_size
+@pytest.mark.parametrize("help_key", ["H", "Backspace"])
+def test_clock_and_pace_stand_between_title_and_help_in_every_window(size, help_key):
+    layout, told = Layout(*size), {"clock": "1234.5 s", "title": "A long title of a patient " * 5}
+    page = Page(layout, Keys({**USUAL_KEYS, "help": help_key}))
+    box = clock_box(layout, help_key)
+    bare, real, slow = (composed(page, **told | more) for more in ({"clock": ""}, {}, {"pace": "0.2 x real"}))
+    assert set(np.unique(bare[box.slices])) == {17, 20, 24}
+    for before, after, is_caution in ((bare, real, False), (real, slow, True)):
+        changed = after[(before != after).any(axis=2)].astype(int)
+        assert len(changed) > 50 and len(changed) == (before != after)[box.slices].any(axis=2).sum()
+        assert (np.ptp(changed, axis=1).max() > 100) == is_caution
+    # Neither is cut at its left end.
+    assert (slow[: box.height, box.left] == bare[: box.height, box.left]).all()
+
+
+@each_size
+def test_findings_grow_with_their_lines_and_the_last_go_where_room_ends(size):
+    layout = Layout(*size)
+    assert layout.findings(11).height > layout.findings(9).height
+    assert layout.most_findings >= (11 if size != (700, 420) else 7)
+    empty, full = (composed(Page(layout), findings=figures, alert="figure 0") for figures in ({}, FIGURES))
+    rows = np.flatnonzero((empty != full).any(axis=(1, 2)))
+    assert rows.max() < layout.compass.top
+    assert len(coloured(full, layout.findings(1), ALERT)) > 20
+
+
+def test_the_help_covers_all_and_leaves_nothing_behind():
+    page = Page(LAYOUT)
+    before = composed(page, findings=FIGURES)
+    box = picture_boxes(LAYOUT)[0]
+    assert page.place_at(box.left + 5, box.top + 5) == pytest.approx(
+        page.panel.to_plane(box, box.left + 5, box.top + 5)
+    )
+    page.show_help()
+    helped = page.pixels.transpose(1, 0, 2)[::-1, :, :3]
+    assert np.ptp(helped[-1], axis=0).max() == 0 and page.place_at(box.left + 5, box.top + 5) is None
+    assert np.array_equal(composed(page, findings=FIGURES), before)
+
+
+# Which way the patient lies
+
+
+def test_seen_from_the_front_the_patients_left_is_to_the_right_and_the_head_up():
+    ends = dict(ends_of(AXES))
+    assert set(ends) == {"L", "R", "S", "I"}
+    for letter, way in (("L", (1, 0)), ("R", (-1, 0)), ("S", (0, 1)), ("I", (0, -1))):
+        assert tuple(ends[letter]) == way
+
+
+def test_the_ends_turn_with_the_camera_and_the_nearest_is_last():
+    camera = OrbitCamera(np.array([[-50.0] * 3, [50.0] * 3]), (0.0, -1.0, 0.0), (0, 0, 1, 1), 1.5)
+    right, up, ahead = axes = np.stack(camera.axes())
+    ways = {"L": [1, 0, 0], "R": [-1, 0, 0], "P": [0, 1, 0], "A": [0, -1, 0], "S": [0, 0, 1], "I": [0, 0, -1]}
+    ends = ends_of(axes)
+    depth = [ahead @ ways[letter] for letter, _ in ends]
+    assert len(ends) == 6 and depth == sorted(depth, reverse=True)
+    for letter, way in ends:
+        assert way == pytest.approx([right @ ways[letter], up @ ways[letter]])
+
+
+def test_what_points_up_in_the_compass_is_drawn_up():
+    # From the front and above: the head is up and nearer than the middle, the feet are down and farther.
+    sine, cosine = 0.28, 0.96
+    picture = compass_picture(LAYOUT, np.array([[1.0, 0, 0], [0, sine, cosine], [0, cosine, -sine]]))
+    size = len(picture)
+    away = round(0.5 * ARM * size)
+    column = picture[:, size // 2].astype(int)
+    assert (column[size // 2 - away] == TEXT).all() and (column[size // 2 + away] == QUIET).all()
+
+
+def test_the_compass_is_drawn_anew_when_the_camera_turns():
+    page, turned = Page(LAYOUT), np.array([[0, 0, -1.0], [1.0, 0, 0], [0, 1.0, 0]])
+    box = LAYOUT.compass
+    first = composed(page)[box.slices]
+    assert np.array_equal(first, compass_picture(LAYOUT, AXES))
+    page.compose(view(), turned)
+    assert np.array_equal(
+        page.pixels.transpose(1, 0, 2)[::-1, :, :3][box.slices], compass_picture(LAYOUT, turned)
+    )
+    assert not np.array_equal(first, compass_picture(LAYOUT, turned))

@@ -1,0 +1,66 @@
+"""The key map, in the README and in the window's help."""
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from PIL import ImageDraw
+
+from render.keys import Keys
+from render.viewer import KEY_MAP, LINES, key_table
+from render.window_frame import help_picture, in_columns
+from render.window_layout import FULL_SIZE, Layout
+
+
+def test_key_map_names_every_key_and_action_once():
+    for column in ("keys", "actions"):
+        values = [each.lower() for line in LINES for each in getattr(line, column)]
+        assert len(set(values)) == len(values)
+    assert all(len(line.keys) == len(line.actions) for line in LINES)
+    assert len({line.text for line in LINES}) == len(LINES)
+
+
+def test_key_table_has_a_row_for_every_line_and_group():
+    rows = [row.split(" | ")[0] for row in key_table().splitlines()[2:]]
+    assert [row for row in rows if "**" not in row] == [f"| {' / '.join(line.keys)}" for line in LINES]
+    assert [row for row in rows if "**" in row] == [f"| **{group}**" for group in KEY_MAP]
+
+
+def test_the_readme_has_the_key_map():
+    readme = ROOT / "README.md"
+    assert key_table() in readme.read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    "size", [(700, 420), (1024, 600), (1202, 676), (1280, 720), (1920, 1080), (2560, 1440)]
+)
+def test_all_keys_fit_into_the_help_of_any_window(monkeypatch, size):
+    layout, written = Layout(*size), []
+    text = ImageDraw.ImageDraw.text
+
+    def noted(draw, place, words, **how):
+        written.append(
+            (draw.textbbox(place, words, font=how["font"], anchor=how["anchor"]), how["font"].size)
+        )
+        text(draw, place, words, **how)
+
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", noted)
+    picture = help_picture(layout, Keys().lines())
+    assert picture.shape == (size[1], size[0], 3)
+    boxes = np.array([box for box, _ in written if box[2] > box[0]])
+    assert (boxes[:, :2] >= 0).all() and (boxes[:, 2:] <= size).all()
+    for number, box in enumerate(boxes):
+        others = np.delete(boxes, number, axis=0)
+        apart = (others[:, :2] >= box[2:]).any(axis=1) | (others[:, 2:] <= box[:2]).any(axis=1)
+        assert apart.all()
+    if size == FULL_SIZE:
+        assert min(size for _, size in written) >= 13
+
+
+def test_the_help_has_every_group_whole_under_its_name():
+    groups = Keys().lines()
+    columns = in_columns(groups)
+    assert max(map(len, columns)) <= 0.6 * sum(map(len, columns))
+    rows = [row for column in columns for row in column]
+    for name, lines in groups.items():
+        at = rows.index(("", name))
+        assert rows[at + 1 : at + 1 + len(lines)] == lines

@@ -1,0 +1,165 @@
+"""Keys and gamepad buttons: one map for what they do, what the help says, and the user's own file."""
+
+import dataclasses
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+from conftest import ROOT
+
+import app
+from rehearsal.frame import Loop
+from render.actions import ACTIONS, BY_MOUSE, CYCLES, HELD, STEPS, begin, hold
+from render.keys import KEYS, USUAL_BUTTONS, USUAL_KEYS, VIEW_ALONE, Keys, KeysError, keys_text, load_keys
+from render.viewer import KEY_MAP, LINES, Controls, NullViewer, Settings
+
+
+def file_of(tmp_path, text: str):
+    path = tmp_path / "keys.toml"
+    path.write_text(text)
+    return path
+
+
+def refused(tmp_path, text: str) -> str:
+    with pytest.raises(KeysError) as error:
+        load_keys(file_of(tmp_path, text))
+    assert "\n" not in str(error.value) and "keys.toml: " in str(error.value)
+    return str(error.value)
+
+
+def test_every_action_does_one_thing():
+    flags = {
+        each.name for each in dataclasses.fields(Controls) if each.default is False and each.name != "press"
+    }
+    switches = {each.name for each in dataclasses.fields(Settings) if isinstance(each.default, bool)}
+    does = [*BY_MOUSE, *HELD, *STEPS, *CYCLES, *VIEW_ALONE, "help"]
+    for action in (each for line in LINES for each in line.actions):
+        kinds = does.count(action) + (action in flags) + (action in switches)
+        assert kinds == 1, action
+    assert flags <= set(ACTIONS), "controls that no key reaches"
+
+
+def test_an_action_changes_what_it_is_named_for():
+    controls = Controls(Settings())
+    for action in ("undo", "sweep", "cut", "translucent", "mode", "cine_back", "cine_back", "cine_forth"):
+        begin(action, controls)
+    settings = controls.settings
+    assert controls.undo and controls.sweep and not controls.redo and controls.cine == -1
+    assert settings.cut and not settings.translucent and settings.mode == "b-mode"
+    begin("mode", controls)
+    begin("mode", controls)
+    assert settings.mode == "both"
+    before = dataclasses.replace(controls)
+    for action in ("push", "help", "zoom_in", ""):
+        begin(action, controls)
+    assert controls == before
+
+
+@pytest.mark.parametrize(
+    ("action", "name", "a_second"),
+    [
+        ("push", "push_mm", 15.0),
+        ("lift", "push_mm", -15.0),
+        ("roll_left", "roll_deg", 45.0),
+        ("roll_right", "roll_deg", -45.0),
+        ("tilt_left", "tilt_deg", 30.0),
+        ("tilt_right", "tilt_deg", -30.0),
+        ("fan_back", "fan_deg", -30.0),
+        ("fan_forth", "fan_deg", 30.0),
+    ],
+)
+def test_a_held_action_goes_on_with_time(action, name, a_second):
+    controls = Controls(Settings(), **{name: 1.0})
+    hold(action, controls, 0.1)
+    assert controls == Controls(controls.settings, **{name: pytest.approx(1.0 + 0.1 * a_second)})
+    hold("undo", controls, 0.1)
+    assert not controls.undo
+
+
+def test_what_is_said_names_the_users_keys(tmp_path, capsys):
+    keys = Keys(of=USUAL_KEYS | {"sweep": "Space", "plan_for": "L"})
+    parts = [None, None, SimpleNamespace(status=""), None]
+    loop = Loop(None, NullViewer(), tmp_path, None, *parts, keys=keys)
+    loop._announce("sweep-001: {sweep} ends it")
+    assert capsys.readouterr().out == "sweep-001: Space ends it\n"
+    assert loop._status(SimpleNamespace(status="")) == "Sweep-001: Space ends it"
+
+
+def test_the_printed_file_is_the_usual_map(tmp_path, capsys):
+    assert app.main(["keys"]) == 0
+    printed = capsys.readouterr().out
+    assert printed == keys_text()
+    keys = load_keys(file_of(tmp_path, printed))
+    assert keys.of == USUAL_KEYS and keys.buttons == USUAL_BUTTONS
+    assert load_keys(file_of(tmp_path, "")).of == USUAL_KEYS
+
+
+def test_a_file_changes_behaviour_help_and_words(tmp_path):
+    keys = load_keys(
+        file_of(
+            tmp_path,
+            '[keys]\npush = "i"\nexport = "w"\nfreeze = "space"\nhelp = "Return"\nplan_for = "f"\nplan = "h"\n[gamepad]\nundo = "guide"\nredo = "b"\n',
+        )
+    )
+    assert [keys.action_of(key) for key in ("i", "w", " ", "f", "h", "F1", "Return", "Escape")] == [
+        "push",
+        "export",
+        "freeze",
+        "plan_for",
+        "plan",
+        "",
+        "help",
+        "quit",
+    ]
+    assert dict(keys.held())["push"] == "i" and dict(keys.held())["zoom_in"] == "Up"
+    groups = keys.lines()
+    assert list(groups) == list(KEY_MAP) and sum(map(len, groups.values())) == len(LINES)
+    lines = {text: key for rows in groups.values() for key, text in rows}
+    assert lines["push it in, lift it"] == "I / S" and lines["freeze and go on"] == "Space"
+    assert [key for key, _ in groups["Transducer"]][:2] == ["Mouse", "Left button"]
+    assert keys.worded("{help} shows, {quit} quits {so} {}") == "Return shows, Esc quits {so} {}"
+    assert keys.buttons["undo"] == "Guide" and keys.buttons["redo"] == "B"
+
+
+def test_every_usual_key_is_a_key_and_there_once():
+    assert set(USUAL_KEYS.values()) <= set(KEYS) and len(set(USUAL_KEYS.values())) == len(USUAL_KEYS)
+    assert [Keys().action_of(KEYS[key]) for key in USUAL_KEYS.values()] == list(USUAL_KEYS)
+    assert len(set(KEYS.values())) == len(KEYS)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('[keys]\npusch = "i"', "keys.pusch: no such action; did you mean push?"),
+        ('[keys]\npush = "F13"', "keys.push = 'F13': no such key; known: A B"),
+        ('[keys]\npush = "1"', "keys.push = '1': no such key; known: A B"),
+        ('[keys]\npush = "Spce"', "did you mean Space?"),
+        ('[keys]\npush = "u"', "keys: push and undo are both on U; give one another"),
+        ('[keys]\npush = "Space"\nlift = "space"', "keys: push and lift are both on Space"),
+        ('[keys]\npoint = "m"', "keys.point: is done with the mouse; leave it out"),
+        ('[gamepad]\nundo = "A"', "gamepad: freeze and undo are both on A"),
+        ('[gamepad]\nundo = "Q"', "gamepad.undo = 'Q': no such button"),
+        ('[gamepad]\nzoom_in = "Guide"', "gamepad.zoom_in: no such action"),
+        ('[gamepad]\npress = "Guide"', "gamepad.press: is done with the mouse"),
+        ("[keys]\npush = 1", "keys.push = 1: expected a text"),
+        ('[kesy]\npush = "i"', "kesy: unknown; expected the sections"),
+        ('push = "i"', "push: unknown; expected the sections"),
+        ("[keys", "cannot be read as a TOML file"),
+    ],
+)
+def test_a_file_that_cannot_be_used_is_refused_in_words(tmp_path, text, words):
+    assert words in refused(tmp_path, text)
+
+
+def test_the_command_line_refuses_in_one_line(tmp_path, capsys):
+    assert app.main(["rehearse", "--keys", str(tmp_path / "none.toml")]) == 2
+    assert "no such file of keys; app.py keys prints one" in capsys.readouterr().err
+    assert app.main(["rehearse", "--gamepad", "--headless"]) == 2
+    assert "--gamepad: leads in a window" in capsys.readouterr().err
+
+
+def test_the_program_starts_without_pygame_and_taichi():
+    asked = "import sys, app, render.gamepad; print({'pygame', 'taichi'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, cwd=ROOT)
+    assert done.stdout.strip() == "set()", done.stderr

@@ -1,0 +1,390 @@
+"""The front end: camera, panel picture; the off-screen frame where there is Vulkan."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import ROOT
+
+from render import transducer_shape, ultrasound_panel, window_frame
+from render.camera import OrbitCamera
+from render.cut_face import FLESH
+from render.display import display_available, fitted, window_size
+from render.ultrasound_panel import Panel
+from render.viewer import Controls, Geometry, NullViewer, Settings, View
+from render.window_layout import FULL_SIZE, RULER_WIDTH, Layout
+from sim.fields import fill
+
+BOUNDS = np.array([[-54.0, -33.0, -21.0], [54.0, 27.0, 21.0]])
+LAYOUT = Layout(1280, 720)
+
+
+def _camera(up=(0.0, 0.0, 1.0)) -> OrbitCamera:
+    return OrbitCamera(BOUNDS, up, LAYOUT.window_coordinates(LAYOUT.scene), 1280 / 720)
+
+
+def _view(**changes) -> View:
+    pose = np.eye(4)
+    pose[:3, 3] = [0.0, 0.0, 31.0]
+    rows, columns = np.indices((96, 64))
+    grey = ((rows * 2 + columns) % 256).astype(np.uint8)
+    return View(
+        **{"transducer_pose": pose, "pictures": {"CT": grey}, "width_mm": 40.0, "depth_mm": 60.0} | changes
+    )
+
+
+# Settings
+
+
+def test_defaults_lie_in_their_ranges_and_every_setting_can_become_a_slider():
+    for each in (setting for setting in dataclasses.fields(Settings) if setting.metadata):
+        default = each.metadata["high"] if each.default is None else each.default
+        assert each.metadata["low"] <= default <= each.metadata["high"]
+        assert {"label", "unit", "low", "high", "group"} <= set(each.metadata)
+        # The type of the range chooses the widget, so it must be the type of the value.
+        assert type(each.metadata["low"]) is type(each.metadata["high"]) is type(default)
+
+
+# Camera
+
+
+def test_the_camera_goes_home():
+    camera = _camera()
+    eye = camera.eye()
+    camera.orbit(0.2, 0.1)
+    camera.zoom(0.5)
+    camera.pan(0.1, 0.1)
+    assert np.abs(camera.eye() - eye).max() > 10.0
+    camera.go_home()
+    assert np.abs(camera.eye() - eye).max() < 1e-9
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.3, -0.8, 0.2)])
+def test_ray_under_the_mouse_passes_through_the_projected_point(up):
+    camera = _camera(up)
+    camera.orbit(0.13, -0.07)
+    camera.pan(0.05, 0.02)
+    camera.zoom(0.8)
+    points = np.random.default_rng(1).uniform(BOUNDS[0], BOUNDS[1], (50, 3))
+    for point, cursor in zip(points, camera.project(points), strict=True):
+        origin, direction = camera.ray(cursor)
+        assert np.linalg.norm(np.cross(point - origin, direction)) < 1e-6
+        assert (point - origin) @ direction > 0
+
+
+def test_bounds_just_fit_the_3d_view():
+    camera = _camera()
+    corners = np.array([[x, y, z] for x in BOUNDS[:, 0] for y in BOUNDS[:, 1] for z in BOUNDS[:, 2]])
+    left, bottom, right, top = LAYOUT.window_coordinates(LAYOUT.scene)
+    share = (camera.project(corners) - [left, bottom]) / [right - left, top - bottom]
+    assert share.min() > 0.0 and share.max() < 1.0
+    # The margin is 4 % of the distance, so one corner comes closer to an edge than that.
+    assert min(share.min(), 1.0 - share.max()) < 0.04
+
+
+def test_target_stays_in_the_middle_of_the_3d_view_when_the_camera_turns_and_zooms():
+    camera = _camera()
+    left, bottom, right, top = LAYOUT.window_coordinates(LAYOUT.scene)
+    camera.orbit(0.4, 0.2)
+    camera.zoom(0.5)
+    assert np.allclose(camera.project(camera.target), [(left + right) / 2, (bottom + top) / 2], atol=1e-9)
+
+
+def test_up_is_up_and_the_tissue_follows_a_pan():
+    camera = _camera()
+    low, high = camera.project(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 10.0]]))
+    assert high[1] > low[1]
+    target = camera.target
+    before = camera.project(target)
+    camera.pan(0.1, -0.05)
+    assert np.allclose(camera.project(target) - before, [0.1, -0.05], atol=1e-9)
+
+
+# Solids
+
+
+@pytest.mark.parametrize("kind", ["cuboid", "curved"])
+def test_solids_face_outward(kind):
+    size = (40.0, 10.0, 20.0)
+    solid = transducer_shape.cuboid(size)
+    if kind == "curved":
+        parts = transducer_shape.transducer(size, radius=25.0)
+        lens = np.flatnonzero((parts.colours == transducer_shape.LENS).all(axis=1))
+        inside = np.isin(parts.indices.reshape(-1, 3), lens).all(axis=1)
+        middle = parts.vertices[lens].mean(axis=0)
+        faces = parts.indices.reshape(-1, 3)[inside] - lens[0]
+        solid = transducer_shape.Solid(
+            parts.vertices[lens] - middle, parts.normals[lens], parts.colours[lens], faces.reshape(-1)
+        )
+        # The arc's middle is the lowest, where the image starts.
+        assert parts.vertices[:, 2].min() == pytest.approx(-10.0)
+    a, b, c = (solid.vertices[solid.indices.reshape(-1, 3)[:, i]] for i in range(3))
+    centre = (a + b + c) / 3
+    assert np.all(np.einsum("ij,ij->i", np.cross(b - a, c - a), centre) > 0)
+    assert np.all(np.einsum("ij,ij->i", solid.normals, solid.vertices) > 0)
+
+
+def test_image_plane_carries_the_picture_the_right_way_round():
+    shares, indices = transducer_shape.image_plane_grid(6, 4)
+    grey = np.zeros((60, 40), dtype=np.uint8)
+    grey[0, -1] = 255
+    view = _view(pictures={"CT": grey})
+    places = transducer_shape.on_plane(shares, view)
+    bright = transducer_shape.standing(places)[transducer_shape.sampled(grey, places, view) == 1.0]
+    assert np.allclose(bright, [[20.0, 0.0, 0.0]])
+    assert indices.max() == len(shares) - 1 and len(indices) == 6 * 5 * 3
+
+
+def test_a_sector_fans_out_from_its_arc():
+    radius, half, depth = 60.0, np.radians(30), 120.0
+    above, width = radius * (1 - np.cos(half)), 2 * (radius + depth) * np.sin(half)
+    grey = np.zeros((180, 180), dtype=np.uint8)
+    view = _view(
+        pictures={"B-mode": grey},
+        width_mm=width,
+        depth_mm=depth + above,
+        above_mm=above,
+        sector=(radius, -half, half),
+    )
+    places = transducer_shape.on_plane(np.array([[0.5, 0.0], [0.5, 1.0], [1.0, 0.0], [1.0, 1.0]]), view)
+    wanted = [[0, 0], [0, depth], [30, -above], [width / 2, (radius + depth) * np.cos(half) - radius]]
+    assert places == pytest.approx(np.array(wanted), abs=1e-9)
+    # The deepest place of the middle line is the middle of the last row.
+    grey[-1, 88:92] = 255
+    assert list(transducer_shape.sampled(grey, places, view)) == [0.0, 1.0, 0.0, 0.0]
+    frame_points = transducer_shape.image_plane_frame(view)
+    assert frame_points.shape == (2 * transducer_shape.FRAME_SIDES, 3) and frame_points[:, 2].min() < -depth
+
+
+@pytest.mark.parametrize(("width_mm", "depth_mm"), [(16.0, 40.0), (40.0, 60.0), (180.0, 128.0)])
+def test_two_pictures_share_the_panel_without_overlap_as_large_as_they_can_be(width_mm, depth_mm):
+    boxes = LAYOUT.picture_boxes(2, width_mm, depth_mm)
+    taken = np.zeros((720, 1280), int)
+    for box in boxes:
+        taken[box.slices] += 1
+        assert box.left >= LAYOUT.panel.left + RULER_WIDTH and box.bottom <= LAYOUT.panel.bottom
+        assert abs(box.width * depth_mm - box.height * width_mm) <= width_mm + depth_mm
+    assert taken.max() == 1 and boxes[0][2:] == boxes[1][2:]
+    stacked = boxes[0].left == boxes[1].left
+    assert stacked == (width_mm > depth_mm)
+
+
+def test_a_place_in_a_picture_is_found_again_under_its_pixel():
+    shown = Panel(("B-mode", "CT"), 40.0, 68.0, above_mm=8.0)
+    for box in shown.boxes(LAYOUT):
+        column, row = shown.to_pixels(box, np.array([-7.0, 31.0]))
+        assert shown.to_plane(box, column, row) == pytest.approx((-7.0, 31.0))
+        # Zero depth is the face's middle, an eighth of 68 mm below the top.
+        assert shown.to_pixels(box, np.zeros(2))[1] == pytest.approx(box.top + 8 / 68 * box.height)
+
+
+def test_segments_are_drawn_where_they_are_and_nowhere_else():
+    shown = Panel(("CT",), 40.0, 60.0)
+    box = shown.boxes(LAYOUT)[0]
+    page = np.zeros((720, 1280, 4), np.uint8)
+    ultrasound_panel.draw_segments(
+        page, shown, box, np.array([[[-10.0, 20.0], [10.0, 20.0]], [[0.0, 50.0], [0.0, 90.0]]]), (1, 2, 3)
+    )
+    rows, columns = np.nonzero((page[..., :3] == (1, 2, 3)).all(axis=2))
+    level = shown.to_pixels(box, np.array([0.0, 20.0]))[1]
+    assert set(rows[rows < level + 5]) == {int(level)}
+    across = columns[rows == int(level)]
+    left, right = (shown.to_pixels(box, np.array([u, 20.0]))[0] for u in (-10.0, 10.0))
+    assert (
+        across.min() == int(left)
+        and across.max() == int(right)
+        and len(set(across)) == int(right) - int(left) + 1
+    )
+    # What leaves the picture ends at its edge.
+    assert rows.max() == box.bottom - 1 and page[..., 3].max() == 0
+    ultrasound_panel.draw_segments(page, shown, box, np.empty((0, 2, 2)), (9, 9, 9))
+    assert not (page == 9).any()
+
+
+# Front ends
+
+
+def test_null_viewer_drives_a_loop():
+    settings = Settings(stiffness=0.4)
+    script = [Controls(settings, push_mm=1.0), None, Controls(settings, quit=True)]
+    viewer = NullViewer(settings, script)
+    pushed = 0.0
+    while viewer.running:
+        controls = viewer.read_controls()
+        pushed += controls.push_mm
+        assert controls.settings.stiffness == 0.4
+        viewer.draw(_view())
+    assert (viewer.frames, pushed) == (3, 1.0)
+    assert viewer.picture().shape == (720, 1280, 3)
+
+
+ORGAN_MM = 22.0
+
+
+@pytest.fixture
+def window():
+    """An off-screen window on a ball, its vertices as a field and as an array; skips where Vulkan is missing."""
+    ti = pytest.importorskip("taichi")
+    from render.window import NoVulkan, Window
+
+    ti.init(arch=ti.cpu, log_level=ti.ERROR)
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=ORGAN_MM)
+    vertices = ball.vertices.astype(np.float32)
+    field = ti.Vector.field(3, ti.f32, shape=len(vertices))
+    fill((field, vertices))
+    geometry = Geometry(field, ball.faces.astype(np.int32), np.array([[-45.0] * 3, [45.0] * 3]))
+    try:
+        opened = Window(geometry, Settings(translucent=False), size=(640, 360), visible=False)
+    except NoVulkan as reason:
+        ti.reset()
+        pytest.skip(str(reason))
+    yield opened, field, vertices
+    opened.close()
+    ti.reset()
+
+
+def _organ_pixels(picture: np.ndarray) -> np.ndarray:
+    """Where the picture is as red as the organ, bool (height, width). Nothing else in the window is."""
+    red, green, blue = (picture[..., i].astype(int) for i in range(3))
+    return (red > 60) & (red > 3 * green // 2) & (red > 3 * blue // 2)
+
+
+def _far_view() -> View:
+    # The transducer stands aside, so that it hides nothing.
+    pose = np.eye(4)
+    pose[:3, 3] = [0.0, 200.0, 200.0]
+    return _view(transducer_pose=pose)
+
+
+def test_picture_before_any_view_is_refused(window):
+    with pytest.raises(RuntimeError, match="nothing was drawn"):
+        window[0].picture()
+
+
+def test_organ_is_drawn_where_the_camera_projects_it(window):
+    opened, field, vertices = window
+    field.fill(0.0)
+    opened.draw(_far_view())
+    empty = opened.picture()
+    for shift in ([0.0, 0.0, 0.0], [18.0, 0.0, 0.0], [0.0, 0.0, 15.0]):
+        moved = (vertices + np.float32(shift)).astype(np.float32)
+        fill((field, moved))
+        opened.draw(_far_view())
+        picture = opened.picture()
+        rows, columns = np.nonzero(np.any(picture != empty, axis=2))
+        assert _organ_pixels(picture).sum() > len(rows) / 2
+        # The outline of the vertices, in pixels from the bottom left. A pixel is drawn if its middle is inside.
+        outline = opened.camera.project(moved) * [640, 360]
+        drawn = [[columns.min(), 360 - rows.max() - 1], [columns.max() + 1, 360 - rows.min()]]
+        assert np.allclose(drawn, [outline.min(axis=0), outline.max(axis=0)], atol=1.0)
+
+
+def test_organ_never_covers_the_panel_the_title_or_the_readouts(window):
+    opened, _, _ = window
+    opened.camera.zoom(0.01)
+    left, bottom, right, top = opened.camera.part
+    opened.camera.pan(0.62 - (left + right) / 2, 0.5 - (bottom + top) / 2)
+    opened.draw(_far_view())
+    picture = opened.picture()
+    red = _organ_pixels(picture)
+    layout = opened.layout
+    assert red[layout.scene.slices][:, -1].any(), "the organ does not reach the panel: this proves nothing"
+    expected = window_frame.backdrop(layout, Panel(("CT",), 40.0, 60.0))
+    ultrasound_panel.paste_picture(expected, layout.picture_boxes(1, 40.0, 60.0)[0], _view().pictures["CT"])
+    for rect in (layout.panel, layout.title):
+        assert np.array_equal(picture[rect.slices], expected[rect.slices])
+    assert np.array_equal(picture[layout.readouts.slices], window_frame.readout_picture(layout, {}))
+
+
+def test_two_pictures_of_one_view_are_the_same(window):
+    opened, _, _ = window
+    opened.draw(_view(status="FROZEN"))
+    assert np.array_equal(opened.picture(), opened.picture())
+
+
+@pytest.mark.parametrize(("setting", "value"), [("translucent", True), ("cut", True), ("level_hu", 90)])
+def test_settings_are_seen(window, setting, value):
+    opened, _, _ = window
+    opened.draw(_view())
+    before = opened.picture()
+    setattr(opened.settings, setting, value)
+    assert np.any(opened.picture() != before)
+    assert opened.read_controls().settings is opened.settings
+
+
+def test_the_cut_is_filled_and_the_half_before_it_gone(window):
+    opened, _, _ = window
+    opened.settings.cut = True
+    pose = np.array(_view().transducer_pose)
+    # The image plane is square to the view, but for the height that it is seen from.
+    _, _, ahead = opened.camera.axes()
+    pose[:3, 1] = [*(ahead[:2] / np.linalg.norm(ahead[:2])), 0.0]
+    pose[:3, 0] = np.cross(pose[:3, 1], pose[:3, 2])
+    for way in (1.0, -1.0):
+        turned = pose * [way, way, 1.0, 1.0]
+        opened.draw(_view(transducer_pose=turned, width_mm=4.0))
+        places = np.array([12.0, -12.0])[:, None] * pose[:3, 0]
+        columns, rows = (opened.camera.project(places) * [640, 360]).astype(int).T
+        shown = opened.picture()[359 - rows, columns].astype(float)
+        # Flesh, evenly lit: the organ's own colour is redder, and its half before the plane would hide it.
+        assert shown / shown.max(axis=1, keepdims=True) == pytest.approx(
+            np.tile(FLESH, (2, 1)) / FLESH[0], abs=0.06
+        )
+        assert np.ptp(shown, axis=0).max() < 12
+
+
+PROBE = """
+import numpy as np, taichi as ti
+ti.init(arch=ti.cpu, log_level=ti.ERROR)
+from render.viewer import Geometry
+from render.window import NoVulkan, Window
+field = ti.Vector.field(3, ti.f32, shape=3)
+try:
+    Window(Geometry(field, np.array([[0, 1, 2]]), np.array([[-1.0] * 3, [1.0] * 3])), visible=False)
+except NoVulkan as reason:
+    assert "\\n" not in str(reason)
+    print("said", reason)
+"""
+
+
+def test_missing_vulkan_is_said_and_not_died_of():
+    pytest.importorskip("taichi")
+    nowhere = {"VK_ICD_FILENAMES": "/nonexistent", "VK_DRIVER_FILES": "/nonexistent"}
+    done = subprocess.run(
+        [sys.executable, "-c", PROBE],
+        cwd=ROOT,
+        check=False,
+        env=os.environ | nowhere,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "said no Vulkan driver" in done.stdout
+
+
+@pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="these always have a display")
+@pytest.mark.parametrize("display", [None, ":4242"])
+def test_no_display_is_noticed(monkeypatch, display):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    if display:
+        monkeypatch.setenv("DISPLAY", display)
+    assert not display_available() and window_size() == FULL_SIZE
+
+
+@pytest.mark.parametrize(
+    ("screen", "size"),
+    [
+        ((1920, 1080), (1280, 720)),
+        ((3840, 2160), (1280, 720)),
+        ((1366, 768), (1152, 648)),
+        ((1080, 1920), (1024, 576)),
+    ],
+)
+def test_a_window_fits_its_screen(screen, size):
+    assert fitted(*screen) == size

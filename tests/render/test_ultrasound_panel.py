@@ -1,0 +1,133 @@
+"""The ultrasound panel: where its pictures lie and what is drawn around and over them."""
+
+import numpy as np
+import pytest
+
+from render import ultrasound_panel, window_frame
+from render.ultrasound_panel import Panel, font
+from render.window_layout import HEADER_HEIGHT, RULER_WIDTH, Layout
+
+LAYOUT = Layout(1280, 720)
+
+
+def test_slice_of_the_size_of_its_box_appears_unchanged_and_nothing_else_is_written():
+    box = LAYOUT.picture_boxes(1, 40.0, 60.0)[0]
+    grey = np.random.default_rng(2).integers(0, 256, (box.height, box.width), dtype=np.uint8)
+    picture = np.full((720, 1280, 4), 7, dtype=np.uint8)
+    ultrasound_panel.paste_picture(picture, box, grey)
+    assert np.array_equal(picture[box.slices][..., :3], np.repeat(grey[..., None], 3, axis=2))
+    assert np.all(picture[..., 3] == 7)
+    picture[box.slices] = 7
+    assert np.all(picture == 7)
+
+
+def test_resampled_slice_keeps_its_sides():
+    box = LAYOUT.picture_boxes(1, 40.0, 60.0)[0]
+    grey = np.zeros((512, 512), dtype=np.uint8)
+    grey[:256, :256] = 200
+    picture = np.zeros((720, 1280, 3), dtype=np.uint8)
+    ultrasound_panel.paste_picture(picture, box, grey)
+    inside = picture[box.slices][..., 0]
+    rows, columns = box.height // 2, box.width // 2
+    assert np.all(inside[: rows - 2, : columns - 2] == 200)
+    assert np.all(inside[rows + 2 :] == 0) and np.all(inside[:, columns + 2 :] == 0)
+
+
+@pytest.mark.parametrize(("width_mm", "depth_mm"), [(40.0, 60.0), (40.0, 20.0), (40.0, 120.0), (60.0, 45.0)])
+def test_picture_box_has_the_shape_of_the_image_plane_and_stays_in_the_panel(width_mm, depth_mm):
+    box = LAYOUT.picture_boxes(1, width_mm, depth_mm)[0]
+    assert box.left >= LAYOUT.panel.left + RULER_WIDTH and box.right <= LAYOUT.panel.right
+    assert box.top >= HEADER_HEIGHT and box.bottom <= LAYOUT.panel.bottom
+    # Each side is rounded to whole pixels: half a pixel on either.
+    assert abs(box.width * depth_mm - box.height * width_mm) <= 0.5 * (width_mm + depth_mm)
+
+
+def test_image_plane_without_extent_is_refused():
+    with pytest.raises(ValueError, match="positive"):
+        LAYOUT.picture_boxes(1, 40.0, 0.0)[0]
+
+
+@pytest.mark.parametrize("depth_mm", [20.0, 60.0, 87.0, 120.0])
+def test_ruler_ticks_stand_at_their_depth(depth_mm):
+    box = LAYOUT.picture_boxes(1, 40.0, depth_mm)[0]
+    ticks = ultrasound_panel.ruler_ticks(Panel(("CT",), 40.0, depth_mm), box)
+    assert len(ticks) == int(depth_mm // 5) + 1
+    for i, (row, centimetres) in enumerate(ticks):
+        depth = (row - box.top) / (box.height - 1) * depth_mm
+        assert abs(depth - 5.0 * i) <= 0.5 * depth_mm / (box.height - 1) + 1e-9
+        assert centimetres == (i // 2 if i % 2 == 0 else None)
+
+
+def test_ruler_is_drawn_where_its_ticks_say():
+    drawn_with = Panel(("CT",), 40.0, 60.0)
+    box = LAYOUT.picture_boxes(1, 40.0, 60.0)[0]
+    picture = window_frame.backdrop(LAYOUT, drawn_with)
+    column = picture[box.top : box.bottom, box.left - 8]
+    drawn = {box.top + int(row) for row in np.flatnonzero(np.any(column != ultrasound_panel.PANEL, axis=1))}
+    assert drawn == {row for row, _ in ultrasound_panel.ruler_ticks(drawn_with, box)}
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_marker_dot_is_on_the_marked_side(side):
+    picture = window_frame.backdrop(LAYOUT, Panel(("CT",), 40.0, 60.0, marked_side=side))
+    box = LAYOUT.picture_boxes(1, 40.0, 60.0)[0]
+    columns = np.flatnonzero(np.any(np.all(picture == ultrasound_panel.MARK, axis=2), axis=0))
+    middle = (box.left + box.right) / 2
+    assert len(columns) > 0
+    assert np.all(columns < middle) if side == "left" else np.all(columns > middle)
+
+
+def test_unknown_marked_side_is_refused():
+    with pytest.raises(ValueError, match="marked_side"):
+        window_frame.backdrop(LAYOUT, Panel(("CT",), 40.0, 60.0, marked_side="top"))
+
+
+def test_parts_of_the_window_do_not_overlap():
+    taken = np.zeros((720, 1280), dtype=int)
+    for rect in [LAYOUT.panel, LAYOUT.title, LAYOUT.scene, LAYOUT.strip]:
+        taken[rect.slices] += 1
+    assert np.all(taken == 1)
+    taken[:] = 0
+    for rect in [*LAYOUT.sliders([280.0, 220.0, 130.0]), LAYOUT.readouts]:
+        taken[rect.slices] += 1
+        assert rect.left >= 0 and rect.bottom <= 720 and rect.right <= LAYOUT.panel.left
+    assert taken.max() == 1
+
+
+def test_readouts_and_status_change_the_picture():
+    assert np.any(
+        window_frame.readout_picture(LAYOUT, {"Step": "9 ms"})
+        != window_frame.readout_picture(LAYOUT, {"Step": "8 ms"})
+    )
+    plain = window_frame.backdrop(LAYOUT, Panel(("CT",), 40.0, 60.0))
+    frozen = window_frame.backdrop(LAYOUT, Panel(("CT",), 40.0, 60.0, status="FROZEN"))
+    changed = np.argwhere(np.any(plain != frozen, axis=2))
+    assert len(changed) > 0 and changed[:, 1].min() > LAYOUT.panel.left
+
+
+PLANNING = "PLANNING   43 %, some 18 min left; Backspace stops"
+
+
+@pytest.mark.parametrize("size", [(1280, 720), (1920, 1080)])
+@pytest.mark.parametrize(
+    "status",
+    ["FROZEN", PLANNING, f"RECORDING 12 s   TISSUE SQUEEZED BY 12 mm   {PLANNING}"],
+)
+def test_a_status_is_as_large_as_it_can_be_in_the_panel(size, status):
+    layout = Layout(*size)
+    plain, with_status = (
+        window_frame.backdrop(layout, Panel(("CT",), 40.0, 60.0, status=each))[:, layout.panel.left :].astype(
+            int
+        )
+        for each in ("", status)
+    )
+    columns = np.flatnonzero(np.any(plain != with_status, axis=(0, 2)))
+    room = layout.panel.width - 2 * layout.px(16)
+    assert layout.px(16) <= columns[0] and columns[-1] <= layout.panel.width - layout.px(16)
+    # The usual font where that fits, but for the room beside its first and last letter; else one size more would not, which
+    # makes it wider by a ninth at most.
+    usual = font(layout.px(17)).getlength(status)
+    fits = usual <= room
+    assert (
+        np.ptp(columns) == pytest.approx(usual, abs=layout.px(5)) if fits else np.ptp(columns) > 0.88 * room
+    )

@@ -1,0 +1,172 @@
+"""A real window under Xvfb, its mouse moved by xdotool: what the surgeon does is what happens."""
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from PIL import Image
+
+from render.ultrasound_panel import CALLIPER
+
+pytestmark = pytest.mark.skipif(
+    not (shutil.which("Xvfb") and shutil.which("xdotool")), reason="needs Xvfb and xdotool"
+)
+START_S, REST_S = 120, 90
+# How long a picture is waited for before its key is pressed again, and how far apart two pictures are at least.
+ASK_S, APART_S = 2.0, 1.0
+# The slice and what is drawn of organ and transducer, and how much two pictures of a still one differ at most.
+PANEL, SCENE = np.s_[80:640, 860:1240], np.s_[60:570, 20:780]
+STILL = 0.5
+# Two places on the echo where it stands beside the CT.
+ECHO_TOP, ECHO_FOOT = (950, 150), (950, 400)
+
+
+class Screen:
+    """The program in a window on a display of its own."""
+
+    def __init__(self, display: str, out: Path) -> None:
+        self.out = out
+        self.environment = os.environ | {"DISPLAY": display}
+        self.environment.pop("WAYLAND_DISPLAY", None)
+        keys = out / "keys.toml"
+        keys.write_text('[keys]\nfreeze = "Space"\nplan_for = "F"\nexport = "E"\ntilt_right = "I"\n')
+        self.program = subprocess.Popen(
+            [
+                sys.executable,
+                str(ROOT / "app.py"),
+                "rehearse",
+                "--cell",
+                "7",
+                "--picture",
+                "ct",
+                "--arch",
+                "cpu",
+                "--keys",
+                str(keys),
+                "--out",
+                str(out),
+            ],
+            env=self.environment,
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self.window = self._wait_for_window()
+
+    def _wait_for_window(self) -> str:
+        end = time.monotonic() + START_S
+        while time.monotonic() < end and self.program.poll() is None:
+            found = self.do("search", "--name", "Nephron").stdout.split()
+            if found:
+                return found[0]
+            time.sleep(0.5)
+        self.program.kill()
+        output = self.program.communicate()[0]
+        if "Vulkan" in output:
+            pytest.skip("no Vulkan driver to open a window with")
+        pytest.fail(f"no window came: {output}")
+
+    def do(self, *command) -> subprocess.CompletedProcess:
+        return subprocess.run(
+            ["xdotool", *map(str, command)], env=self.environment, capture_output=True, text=True
+        )
+
+    def point(self, x: int, y: int) -> None:
+        self.do("mousemove", "--window", self.window, x, y)
+
+    def at_rest(self) -> np.ndarray:
+        """What the window shows when nothing moves any more, however slow the machine."""
+        end = time.monotonic() + REST_S
+        before = self.picture()
+        while time.monotonic() < end:
+            after = self.picture()
+            if all(np.abs(after - before)[part].mean() < STILL for part in (SCENE, PANEL)):
+                return after
+            before = after
+        pytest.fail("the picture does not come to rest")
+
+    def picture(self) -> np.ndarray:
+        """What the window shows, saved by its own screenshot key."""
+        before = len(self._screenshots())
+        end = time.monotonic() + 20
+        while time.monotonic() < end:
+            self.do("key", "--window", self.window, "p")
+            asked = time.monotonic()
+            while time.monotonic() < asked + ASK_S:
+                time.sleep(0.1)
+                if len(self._screenshots()) > before:
+                    # Not sooner: what moves slowly is not to be taken for still.
+                    time.sleep(max(0.0, asked + APART_S - time.monotonic()))
+                    return np.asarray(Image.open(self._screenshots()[-1]).convert("RGB")).astype(int)
+        pytest.fail("the screenshot key leaves no picture")
+
+    def _screenshots(self) -> list[Path]:
+        """Those that are written to their end."""
+        paths = sorted(self.out.glob("screenshot-*.png"))
+        return [path for path in paths if path.read_bytes()[-8:-4] == b"IEND"]
+
+
+@pytest.fixture
+def screen(tmp_path):
+    read, write = os.pipe()
+    server = subprocess.Popen(
+        ["Xvfb", "-displayfd", str(write), "-screen", "0", "1400x900x24"],
+        pass_fds=[write],
+        stderr=subprocess.DEVNULL,
+    )
+    os.close(write)
+    with os.fdopen(read) as numbers:
+        display = f":{numbers.readline().strip()}"
+    shown = None
+    try:
+        shown = Screen(display, tmp_path)
+        yield shown
+    finally:
+        if shown is not None:
+            shown.program.kill()
+        server.terminate()
+        server.wait()
+
+
+def test_the_mouse_moves_and_presses_the_transducer(screen):
+    screen.point(330, 330)
+    first = screen.at_rest()
+    screen.point(450, 330)
+    second = screen.at_rest()
+    assert np.abs(second - first)[SCENE].mean() > 1.0, "the transducer does not follow the mouse"
+    assert np.abs(second - first)[PANEL].mean() > 5.0, "the panel does not change with the transducer"
+    screen.do("mousedown", 1)
+    pressed = screen.at_rest()
+    screen.do("mouseup", 1)
+    assert np.abs(pressed - second)[PANEL].mean() > 5.0, "pressing does not change the panel"
+    assert np.abs(pressed - second)[SCENE].mean() > 0.5, "pressing does not move the transducer in"
+    let_go = screen.at_rest()
+    assert np.abs(let_go - second)[PANEL].mean() < 0.5 * np.abs(pressed - second)[PANEL].mean()
+    screen.do("key", "--window", screen.window, "b")
+    both = screen.at_rest()
+    assert np.abs(both - let_go)[PANEL].mean() > 5.0, "the key for the echo changes nothing"
+    screen.do("key", "--window", screen.window, "space")
+    for place in (ECHO_TOP, ECHO_FOOT):
+        screen.point(*place)
+        time.sleep(1.0)
+        screen.do("mousedown", 1)
+        time.sleep(0.5)
+        screen.do("mouseup", 1)
+    measured = screen.picture()
+    green = (measured == CALLIPER).all(axis=2)[PANEL]
+    assert green.sum() > 100, "two clicks on the echo draw no calliper"
+    screen.do("key", "--window", screen.window, "e")
+    exported = screen.out / "001-b-mode.dcm"
+    end = time.monotonic() + 20
+    while not exported.exists() and time.monotonic() < end:
+        time.sleep(0.5)
+    assert exported.exists() and (screen.out / "001-ct.png").exists()
+    screen.do("key", "--window", screen.window, "Escape")
+    assert screen.program.wait(timeout=20) == 0

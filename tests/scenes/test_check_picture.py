@@ -1,0 +1,137 @@
+"""The checking picture shows what was imported where it is, the way up that its letters say."""
+
+from dataclasses import replace
+
+import matplotlib.image
+import numpy as np
+import pytest
+from synthetic_body import LEFT, TUMOUR, body, points_of, with_voxels
+
+from scenes.patients.check_picture import (
+    COLOUR,
+    PIXEL_MM,
+    VIEWS,
+    WHOLE,
+    colours_of,
+    cut,
+    draw_check,
+    is_wider,
+)
+from scenes.patients.import_summary import facts
+from scenes.patients.patient_import import import_patient
+from scenes.patients.readers.label_maps import LabelMap
+from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.voxel_grid import VoxelGrid
+
+LETTER = {(1, 0, 0): "L", (-1, 0, 0): "R", (0, 1, 0): "P", (0, -1, 0): "A", (0, 0, 1): "S", (0, 0, -1): "I"}
+NAMES = {2: "kidney_left", 3: "tumour"}
+
+
+@pytest.fixture(scope="module")
+def patient():
+    ct, labels = body(spacing=(3.0, 3.0, 3.0))
+    return import_patient(Volume.of(ct), LabelMap.of(labels, NAMES), side="left", margin_mm=30.0)
+
+
+@pytest.mark.parametrize("view", [*VIEWS, WHOLE], ids=lambda view: view.name)
+def test_letters_are_those_of_the_axes(view):
+    right, down = np.array(view.right), np.array(view.down)
+    assert view.letters == tuple(LETTER[tuple(axis)] for axis in (-right, right, -down, down))
+    # Seen from the feet, the front and the left: what is ahead comes towards the viewer.
+    towards = {"axial": (0, 0, -1), "coronal": (0, -1, 0), "sagittal": (1, 0, 0)}[view.name.split(",")[0]]
+    assert np.array_equal(-np.cross(right, down), towards)
+
+
+@pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
+def test_a_spot_is_drawn_on_its_side(patient, view):
+    """A bright spot to the left, front and head of the middle appears where the letters say."""
+    low, high = VoxelGrid.of(patient.ct).bounds()
+    spot = (low + high) / 2 + [18.0, -15.0, 21.0]
+    voxels = np.zeros(patient.ct.GetSize()[::-1], np.int16)
+    voxels[patient.ct.TransformPhysicalPointToIndex(spot.tolist())[::-1]] = 1000
+    right, down = np.array(view.right, float), np.array(view.down, float)
+    spans = [sorted((low @ axis, high @ axis)) for axis in (right, down)]
+    picture = cut(with_voxels(patient.ct, voxels), right, down, spans, spot)
+    row, column = np.unravel_index(picture.argmax(), picture.shape)
+    assert column * PIXEL_MM + spans[0][0] == pytest.approx(spot @ right, abs=2.0)  # a voxel is 3 mm
+    assert row * PIXEL_MM + spans[1][0] == pytest.approx(spot @ down, abs=2.0)
+
+
+def test_outlines_and_surfaces_are_in_the_picture(patient, tmp_path):
+    draw_check(patient, facts(patient), tmp_path)
+    picture = matplotlib.image.imread(tmp_path / "check.png")[..., :3]
+    assert picture.shape[:2] == (960, 1300)
+    half = picture.shape[0] // 2
+    for name in ("organ", "tumour"):
+        wanted = np.array([int(COLOUR[name][n : n + 2], 16) for n in (1, 3, 5)]) / 255
+        shown = np.abs(picture - wanted).max(axis=2) < 0.1
+        assert shown[:half].sum() > 300, name
+    # In the axial cut the tumour lies to the picture's right of the kidney: on the patient's left.
+    axial = picture[:half, : picture.shape[1] // 3]
+    middle = {}
+    for name in ("organ", "tumour"):
+        wanted = np.array([int(COLOUR[name][n : n + 2], 16) for n in (1, 3, 5)]) / 255
+        middle[name] = np.argwhere(np.abs(axial - wanted).max(axis=2) < 0.1).mean(axis=0)
+    assert middle["tumour"][1] > middle["organ"][1] + 20 and TUMOUR[0][0] > LEFT[0][0]
+
+
+def test_files_own_colours_are_shown_brightly(patient):
+    own = replace(patient, colours={"organ": (0.2, 0.1, 0.1), "tumour": (0.0, 1.0, 0.5)})
+    assert colours_of(own)["organ"] == pytest.approx((0.85, 0.425, 0.425))
+    assert colours_of(own)["tumour"] == (0.0, 1.0, 0.5)
+    assert colours_of(own)["support"] == colours_of(patient)["support"]
+
+
+def test_the_file_says_nothing_of_its_maker(patient, tmp_path):
+    draw_check(patient, facts(patient), tmp_path)
+    content = (tmp_path / "check.png").read_bytes()
+    assert not any(word in content for word in (b"tEXt", b"iTXt", b"eXIf", str(tmp_path).encode()))
+
+
+def panel_of(picture, n):
+    """One of the three cuts, and its middle's column and row."""
+    height, width = picture.shape[:2]
+    return (
+        picture[: height // 2, n * width // 3 : (n + 1) * width // 3],
+        (0.03 + 0.94 * (n + 0.5) / 3 - n / 3) * width,
+        0.297 * height,
+    )
+
+
+def test_ct_lies_under_its_letters(patient, tmp_path):
+    """A block on the patient's left, in front and above: right and up, right and up, left and up."""
+    places = points_of(patient.ct)
+    block = ((places > (85, 5, 14)) & (places < (105, 32, 40))).all(axis=-1)
+    bright = with_voxels(patient.ct, np.where(block, 1000, -1000).astype(np.int16))
+    draw_check(replace(patient, ct=bright), facts(patient), tmp_path)
+    picture = matplotlib.image.imread(tmp_path / "check.png")[..., :3]
+    for n, sense in enumerate((1, 1, -1)):
+        panel, column, row = panel_of(picture, n)
+        at = np.median(np.argwhere(panel.min(axis=2) > 0.97), axis=0)
+        assert sense * (at[1] - column) > 15 and row - at[0] > 15, n
+
+
+def test_outlines_lie_under_their_letters(patient, tmp_path):
+    """The tumour is in all cuts, to the left, in front and above the kidney's middle."""
+    draw_check(patient, facts(patient), tmp_path)
+    picture = matplotlib.image.imread(tmp_path / "check.png")[..., :3]
+    for n, sense in enumerate((1, 1, -1)):
+        panel, middle = panel_of(picture, n)[0], {}
+        for name in ("organ", "tumour"):
+            wanted = np.array([int(COLOUR[name][k : k + 2], 16) for k in (1, 3, 5)]) / 255
+            shown = np.argwhere(np.abs(panel - wanted).max(axis=2) < 0.1)
+            assert len(shown) > 60, (n, name)
+            middle[name] = shown.mean(axis=0)
+        down, right = middle["tumour"] - middle["organ"]
+        assert sense * right > 3 and down < -3, n
+
+
+def test_the_whole_width_is_shown_where_it_is_wider_than_the_cuts(patient, tmp_path):
+    """Else the surface is shown once more: below the middle it is shaded, and has no grey in it."""
+    assert is_wider(patient.overview, patient.ct) and not is_wider(patient.ct, patient.ct)
+    grey = []
+    for each in (patient, replace(patient, overview=patient.ct)):
+        draw_check(each, facts(each), tmp_path)
+        panel = matplotlib.image.imread(tmp_path / "check.png")[560:, 460:840, :3]
+        grey.append(((np.ptp(panel, axis=2) < 0.01) & (panel[..., 0] > 0.3)).sum())
+    assert grey[0] > 20 * grey[1]

@@ -1,0 +1,286 @@
+"""The command import from end to end: what a hospital sends becomes a patient's folder that names nobody."""
+
+import nibabel
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from dicom_series import PERSON, Series, write_segmentation, write_structures, zipped
+from pydicom.dataset import Dataset
+from synthetic_body import BODY, DIRECTIONS, LEFT, RIGHT, TUMOUR, coarsely, level
+
+from app import main
+from scenes.anatomy import load_anatomy
+from scenes.patients.import_command import place_mm
+from scenes.patients.import_error import PatientError
+from scenes.patients.import_request import Request, take_in, with_labels
+from scenes.patients.patient_folder import save_patient, telling
+from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.label_files import open_labels
+from scenes.patients.readers.label_maps import LabelMap
+from scenes.progress import silent
+from scenes.scene import load_scene
+from scenes.shell_quoting import pasted
+
+SPINE = np.array([0.0, 70.0, 0.0]), np.array([22.0, 20.0, 400.0])
+ORIGIN = (-175.0, -120.0, -56.0)
+SIZE = (438, 343, 36)
+
+
+def hounsfield(places):
+    """HU of the synthetic body, with a spine."""
+    found = np.full(places.shape[:-1], -1000.0)
+    for value, solid in ((40, BODY), (500, SPINE), (120, LEFT), (120, RIGHT), (70, TUMOUR)):
+        found[level(places, solid) < 0] = value
+    return found
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coarse():
+    with pytest.MonkeyPatch.context() as patch:
+        coarsely(patch)
+        yield
+
+
+@pytest.fixture(scope="module")
+def hospital(tmp_path_factory):
+    """A DICOM folder as a hospital sends it: a CT and a segmentation of it."""
+    folder = tmp_path_factory.mktemp("hospital") / "Doe_Jane"
+    series = Series(
+        folder / "ct", DIRECTIONS["identity"], size=SIZE, gap=3.5, field=hounsfield, origin=ORIGIN
+    )
+    series.write()
+    places = np.stack([series.places(k) for k in range(SIZE[2])])
+    masks = {
+        "Left kidney": level(places, LEFT) < 0,
+        "Right kidney": level(places, RIGHT) < 0,
+        "Renal mass": level(places, TUMOUR) < 0,
+    }
+    masks["Left kidney"] &= ~masks["Renal mass"]
+    write_segmentation(folder / "seg" / "labels.dcm", series, masks)
+    return folder, series
+
+
+@pytest.fixture(scope="module")
+def imported(hospital, tmp_path_factory):
+    """The folder that the command leaves of it; the patient, and what is private of it."""
+    out, found = tmp_path_factory.mktemp("patients") / "a", []
+
+    def watched(*request):
+        found.append(take_in(*request))
+        return found[0]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("scenes.patients.import_request.take_in", watched)
+        assert main(["import", str(hospital[0]), "--side", "left", "--out", str(out)]) == 0
+    return out, *found
+
+
+@pytest.fixture(scope="module")
+def written(imported):
+    return imported[0]
+
+
+@pytest.fixture(scope="module")
+def taken_in(imported):
+    return imported[1]
+
+
+def test_the_folder_is_a_scene(written):
+    scene = load_scene(written / "scene.toml")
+    anatomy = load_anatomy(scene, written)
+    assert scene.title == "Left kidney"
+    np.testing.assert_allclose(anatomy.tumour.center_mass, TUMOUR[0], atol=1.0)
+    assert anatomy.organ.center_mass[0] > 0 and anatomy.ct.voxels.ndim == 3
+    assert scene.attachment.at_mm is not None and scene.attachment.radius_mm == 0
+    assert {file.name for file in written.iterdir()} == {
+        "check.png", "ct.nrrd", "labels.nrrd", "organ.stl", "scene.toml", "support.stl", "tumour.stl",
+    }  # fmt: skip
+    assert [entry.name for entry in written.parent.iterdir()] == ["a"]
+
+
+def test_nothing_names_the_patient(written, hospital):
+    folder, series = hospital
+    secrets = [*PERSON.values(), "Doe", "Jane", series.uid, series.frame_of_reference, series.study]
+    secrets += [str(folder), "Doe_Jane", *series.sops]
+    words = [value for value in secrets if len(value) > 3]
+    assert len(words) > 40
+    for file in written.iterdir():
+        content = file.read_bytes()
+        assert not [word for word in words if word.encode() in content], file.name
+
+
+def test_the_terminal_names_nobody_and_tells_the_facts(hospital, tmp_path, capfd):
+    out = tmp_path / "a b"
+    assert main(["import", str(hospital[0]), "--side", "right", "--out", str(out)]) == 0
+    said = capfd.readouterr()
+    assert said.out.endswith(f"then: {pasted('rehearse', out)}\n")
+    assert "right kidney" in said.out and "none is in the files" in said.out
+    for text in ("Doe", "Jane", "4711", "19600229", hospital[1].uid):
+        assert text not in said.out + said.err
+
+
+def test_what_was_read_is_known_to_be_private(hospital, taken_in):
+    folder, series = hospital
+    private = taken_in[1]
+    assert {"Doe^Jane", "Doe", "Jane", "19600229", "A1234567", series.uid, series.sops[0]} <= private
+    assert str(folder.resolve()) in private
+
+
+def test_contours_on_an_archive(hospital, tmp_path):
+    folder, series = hospital
+    angle = np.linspace(0, 2 * np.pi, 90, endpoint=False)
+    contours = []
+    for k in range(SIZE[2]):
+        z = series.positions(k)[2]
+        share = 1 - ((z - LEFT[0][2]) / LEFT[1][2]) ** 2
+        if share > 0.01:
+            x, y = (
+                LEFT[0][i] + LEFT[1][i] * np.sqrt(share) * f(angle) for i, f in ((0, np.cos), (1, np.sin))
+            )
+            contours.append(np.column_stack([x, y, np.full(90, z)]))
+    structures = write_structures(tmp_path / "rt.dcm", {"Kidney_L": contours, "External": []}, series.uid)
+    archive = zipped(folder / "ct", tmp_path / "ct.zip")
+    patient, _ = take_in(Request(archive, [structures]))
+    assert patient.side == "left"
+    assert patient.volumes_ml["organ"] == pytest.approx(4 / 3 * np.pi * LEFT[1].prod() / 1000, rel=0.02)
+    np.testing.assert_allclose(patient.organ.center_mass, LEFT[0], atol=0.5)
+
+
+def test_labels_of_another_examination(hospital, tmp_path):
+    folder, _series = hospital
+    other = Series(tmp_path / "ct", DIRECTIONS["identity"], size=(20, 20, 6), origin=ORIGIN, field=hounsfield)
+    other.write()
+    with pytest.raises(PatientError, match="another frame of reference"):
+        take_in(Request(tmp_path / "ct", [folder / "seg"]))
+    with pytest.raises(PatientError, match="no labels lie with this CT.*--seed"):
+        take_in(Request(tmp_path / "ct"))
+
+
+class TestPrivate:
+    @pytest.fixture
+    def patient(self, taken_in):
+        return taken_in[0]
+
+    @pytest.mark.parametrize("secret", ["Doe", "Doe^Jane", "19600229", "1.2.826.0.1.3680043.8.498.1", "Ünal"])
+    def test_a_file_that_would_name_somebody_is_not_written(self, patient, tmp_path, secret):
+        texts = {"scene.toml": f'title = "kidney of {secret}"\n'}
+        with pytest.raises(PatientError, match=r"scene\.toml would have held something") as caught:
+            save_patient(patient, tmp_path / "p", texts, private={secret, "Nobody"})
+        assert secret not in str(caught.value) and list(tmp_path.iterdir()) == []
+        assert save_patient(patient, tmp_path / "p", {"scene.toml": ""}, private={secret, "Nobody"}) == 2
+
+    def test_headers_of_images_and_surfaces_are_searched(self, patient, tmp_path):
+        def draw(folder):
+            organ = folder / "organ.stl"
+            organ.write_bytes(b"solid of Doe".ljust(80) + organ.read_bytes()[80:])
+
+        with pytest.raises(PatientError, match=r"organ\.stl would have held"):
+            save_patient(patient, tmp_path / "p", draw=draw, private={"Doe"})
+        assert list(tmp_path.iterdir()) == []
+
+    def test_words_of_every_file_name_nobody(self):
+        assert telling("Doe") and telling("Left^Doe") and telling("123456") and telling("1.2.3")
+        assert not any(map(telling, ["", "7", "AB", "12345", "kidney", "Left Kidney", "STL"]))
+
+    def test_an_interrupted_import_leaves_nothing(self, patient, tmp_path):
+        def draw(_):
+            raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            save_patient(patient, tmp_path / "p", draw=draw)
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_the_folder_is_checked_before_the_work(tmp_path, capfd):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "precious.txt").write_text("mine")
+    assert main(["import", "nowhere", "--out", str(tmp_path / "mine")]) == 2
+    assert "exists and is not an empty folder" in capfd.readouterr().err
+    assert main(["import", "nowhere", "--out", str(tmp_path / "mine" / "precious.txt" / "p")]) == 2
+    assert "cannot be made in" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["", "1,2", "1,2,3,4", "a,b,c", "1,2,nan"])
+def test_a_seed_is_three_numbers(text):
+    with pytest.raises(PatientError, match="three numbers X,Y,Z"):
+        place_mm(text)
+
+
+def test_a_seed_or_labels(tmp_path):
+    with pytest.raises(PatientError, match="not both"):
+        take_in(Request(tmp_path, [tmp_path], seed_mm=np.zeros(3)))
+
+
+def test_the_series_that_labels_were_drawn_on(tmp_path):
+    """Though another shows more."""
+    thin = Series(tmp_path / "ct", number=3, gap=1.25, size=(12, 10, 12))
+    thick = Series(
+        tmp_path / "ct", number=8, gap=5.0, size=(12, 10, 3), frame_of_reference=thin.frame_of_reference
+    )
+    thin.write()
+    thick.write()
+    seg = write_segmentation(tmp_path / "seg.dcm", thick, {"Kidney": np.ones((3, 10, 12))})
+    assert with_labels(Request(tmp_path / "ct", [seg]), silent)[0].grid.spacing[2] == pytest.approx(5.0)
+
+
+def test_each_source_is_private(hospital, taken_in):
+    """The CT's header by itself, and the labels'."""
+    folder, series = hospital
+    for said in (open_ct(folder / "ct").secrets, open_labels(folder / "seg").secrets):
+        assert {"Doe^Jane", "Doe", "Jane", "19600229", "A1234567", series.study} <= said
+
+
+def test_what_labels_say_and_paths_are_private(hospital, taken_in, tmp_path, monkeypatch):
+    monkeypatch.setattr("scenes.patients.import_request.import_patient", lambda *_, **__: taken_in[0])
+    monkeypatch.chdir(tmp_path)
+    made = nibabel.Nifti1Image(np.ones((5, 5, 5), np.uint8), np.eye(4))
+    made.header["descrip"] = b"drawn by Roe"
+    nibabel.save(made, tmp_path / "kidney.nii.gz")
+    given = type(tmp_path)("../") / tmp_path.name / "kidney.nii.gz"
+    private = take_in(Request(hospital[0] / "ct", [given]))[1]
+    assert {"drawn by Roe", "Doe^Jane", str(given), str(tmp_path.resolve() / "kidney.nii.gz")} <= private
+
+
+def test_a_seed_makes_a_draft(hospital, taken_in, monkeypatch):
+    labels = LabelMap.of(sitk.Image([4, 4, 4], sitk.sitkUInt8) + 1)
+    monkeypatch.setattr("scenes.patients.import_request.grown", lambda ct, seed: labels)
+    monkeypatch.setattr(
+        "scenes.patients.import_request.import_patient", lambda ct, labels, *_, **__: taken_in[0]
+    )
+    assert take_in(Request(hospital[0] / "ct", seed_mm=LEFT[0]))[0].draft and not taken_in[0].draft
+
+
+def test_what_one_header_says(tmp_path):
+    """Also in sequences, in private groups, in lists and in free text."""
+
+    def edit(data, _):
+        inner = Dataset()
+        inner.PatientName = "Roe^Ann"
+        data.RequestAttributesSequence, data.ImageComments = [inner], "calls himself Jim"
+        data.OtherPatientIDs, data.InstitutionName = ["X-1", "X-22"], "St Elsewhere"
+        data.private_block(0x0099, "MAKER", create=True).add_new(1, "LO", "Ward 12")
+
+    secrets = open_ct(Series(tmp_path).write(edit=edit)).secrets
+    assert {"Roe^Ann", "Roe", "Ann", "calls himself Jim", "X-22", "St Elsewhere", "Ward 12"} <= secrets
+
+
+class TestSearch:
+    @pytest.mark.parametrize("encoding", ["utf-8", "utf-16-le", "latin-1"])
+    def test_any_file_in_any_encoding(self, taken_in, tmp_path, encoding):
+        def draw(folder):
+            (folder / "check.png").write_bytes(b"\0\1" + "Özgür Ünal".encode(encoding) + b"\2")
+
+        with pytest.raises(PatientError, match=r"check\.png would have held"):
+            save_patient(taken_in[0], tmp_path / "p", draw=draw, private={"Özgür Ünal"})
+
+    def test_packed_voxels_are_searched(self, taken_in, tmp_path):
+        def draw(folder):
+            words = sitk.GetImageFromArray(np.frombuffer(b"\0\0of Doe^Jane\0", np.uint8).reshape(1, 1, -1))
+            sitk.WriteImage(words, str(folder / "labels.nrrd"), useCompression=True)
+
+        with pytest.raises(PatientError, match=r"labels\.nrrd would have held"):
+            save_patient(taken_in[0], tmp_path / "p", draw=draw, private={"Doe^Jane"})
+
+    def test_a_word_within_another_names_nobody(self, taken_in, tmp_path):
+        texts = {"scene.toml": 'title = "monroe\'s doer"\n'}
+        assert save_patient(taken_in[0], tmp_path / "p", texts, private={"roe", "doe"}) == 2

@@ -1,0 +1,59 @@
+"""Patient import: real CTs, and supports like those of the bead experiments."""
+
+import igl
+import numpy as np
+import pytest
+import SimpleITK as sitk
+import trimesh
+from conftest import DATA
+from synthetic_body import assert_sound, least_gap, voxels_to_boundary
+from test_patient_import import label_map
+
+from scenes.patients.moulded_support import mould
+from scenes.patients.patient_import import import_patient
+from scenes.patients.readers.ct_files import open_ct
+
+REAL = [
+    ("crlm_1004", "crlm_1004_labels/kidneys_provisional.nii.gz", 1, "right", 108.8),
+    ("crlm_1004", "crlm_1004_labels/kidneys_provisional.nii.gz", 2, "left", 125.6),
+    ("totalseg/ct.nii.gz", "totalseg/kidneys.nii.gz", 1, "left", 138.9),
+    ("totalseg/ct.nii.gz", "totalseg/kidneys.nii.gz", 2, "right", 188.8),
+]
+
+
+@pytest.mark.skipif(not (DATA / "ct").is_dir(), reason="real data (../shared/data/ct) is not here")
+class TestRealData:
+    @pytest.mark.parametrize(("ct", "labels", "value", "side", "volume_ml"), REAL)
+    def test_kidney(self, ct, labels, value, side, volume_ml):
+        labels = open_ct(DATA / "ct" / labels).image()
+        patient = import_patient(open_ct(DATA / "ct" / ct), *label_map(labels, [value]))
+        assert patient.side == side
+        assert patient.organ.volume / 1000 == pytest.approx(volume_ml, rel=0.01)
+        assert len(patient.organ.faces) == pytest.approx(5000, abs=20)
+        assert_sound(patient.organ)
+        assert_sound(patient.support)
+        assert voxels_to_boundary(patient.organ, labels == value).max() < 1
+        assert least_gap(patient.support, patient.organ) > 0
+        assert sitk.GetArrayViewFromImage(patient.ct).min() >= -1024
+
+
+@pytest.mark.skipif(
+    not (DATA / "truth").is_dir(), reason="bead experiments (../shared/data/truth) are not here"
+)
+@pytest.mark.parametrize("case", ["bean", "kits040"])
+def test_support_like_that_of_the_bead_experiments(case):
+    organ = trimesh.load(DATA / "truth" / case / "kidney.stl")
+    expected = trimesh.load(DATA / "truth" / case / "support.stl")
+    support = mould(organ, np.array([0.0, 0.0, -1.0]))
+    assert_sound(support)
+    np.testing.assert_allclose(support.bounds[:, 2], expected.bounds[:, 2], atol=0.1)
+    # The mould itself: organ's underside, away from the rim, as far from our support as from theirs.
+    low, high = organ.bounds[:, 2]
+    under = organ.vertices[organ.vertices[:, 2] < low + 0.2 * (high - low)]
+    gaps = [
+        igl.signed_distance(
+            np.ascontiguousarray(under), np.asarray(m.vertices), np.asarray(m.faces, np.int64)
+        )[0]
+        for m in (support, expected)
+    ]
+    assert np.abs(gaps[0] - gaps[1]).mean() < 0.1

@@ -1,0 +1,138 @@
+"""Labels in detail: names, notes and near misses."""
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from dicom_series import Series, refusal, write_segmentation, write_structures
+from synthetic_body import DIRECTIONS, drawn, grid_around
+from test_readers_labels import KIDNEY, by_name, ct_grid, ring
+
+from scenes.patients.readers.label_files import open_labels
+from scenes.patients.readers.label_maps import LabelMap, merged, with_tissues
+from scenes.patients.readers.segment_names import side_of
+from scenes.patients.readers.voxel_grid import VoxelGrid
+
+GRID = VoxelGrid.of(grid_around((-33, 18, -401), (-22, 30, -385), (0.7, 0.9, 1.6)))
+
+
+def strips(*names):
+    """A label map of a row of segments."""
+    values = np.zeros(GRID.size[::-1], np.uint8)
+    for n in range(1, len(names) + 1):
+        values[2:5, 2:5, n] = n
+    return LabelMap.valued(GRID, values, dict(enumerate(names, start=1)))
+
+
+class TestTogether:
+    def test_the_users_word_is_all_that_is(self):
+        (told,) = with_tissues(
+            [strips("kidney_left", "old tumour", "new mass")], [], {"tumour": ["new mass"]}
+        )
+        assert [s.tissue for s in told.segments.values()] == ["kidney", None, "tumour"]
+
+    def test_what_of_the_organ_has_a_tissue_keeps_it(self):
+        (told,) = with_tissues([strips("kidney_left", "mass", "x")], ["kidney_left", "mass", "x"], {})
+        assert [s.tissue for s in told.segments.values()] == ["kidney", "tumour", "kidney"]
+
+    @pytest.mark.parametrize(
+        ("over", "under"), [("tumour", "cyst"), ("cyst", "kidney"), ("stone", "tumour"), ("vein", "kidney")]
+    )
+    def test_what_lies_over_what(self, over, under):
+        inside = np.zeros(GRID.size[::-1], np.uint8)
+        inside[2:6, 2:6, 2:6] = 1
+        maps = [LabelMap.valued(GRID, inside, {1: name}) for name in (over, under)]
+        for one in (merged(maps), merged(maps[::-1])):
+            assert [s.name for s in one.segments.values()] == [over] and len(one.segments) == 1
+
+    def test_many_values(self):
+        values = np.zeros(GRID.size[::-1], np.int32)
+        values[2:5, 2:5, 2], values[2:5, 2:5, 4] = 300, 44
+        labels = LabelMap.of(GRID.image(values), {300: "kidney_left"})
+        assert labels.of_tissues("kidney") == [300] and set(labels.segments) == {44, 300}
+        assert (labels.values == values).all()
+
+    @pytest.mark.parametrize("direction", DIRECTIONS)
+    def test_coarse_voxels_keep_their_volume(self, direction):
+        """On a finer grid, to their outer faces."""
+        fine = VoxelGrid.of(grid_around((-25,) * 3, (25,) * 3, (1.0, 1.0, 1.0)))
+        coarse = VoxelGrid((3, 2, 4), np.array([4.0, 6.0, 5.0]), np.full(3, 0.2), DIRECTIONS[direction])
+        maps = [
+            LabelMap.valued(grid, np.ones(grid.size[::-1], np.uint8), {1: name})
+            for grid, name in ((fine, "kidney"), (coarse, "mass"))
+        ]
+        one = merged(maps)
+        assert np.isin(one.values, one.of_tissues("tumour")).sum() == pytest.approx(24 * 120, rel=0.03)
+
+
+class TestLabelMaps:
+    @pytest.mark.parametrize("ending", [".nii.gz", ".nrrd"])
+    def test_shares_of_an_organ(self, tmp_path, ending):
+        voxels = np.random.default_rng(2).random((6, 6, 6)).astype(np.float32)
+        sitk.WriteImage(sitk.GetImageFromArray(voxels), str(tmp_path / f"kidney_left{ending}"))
+        assert "probability" in refusal(tmp_path, read=open_labels, name=f"kidney_left{ending}")
+
+    def test_a_file_is_called_as_its_one_value(self, tmp_path):
+        empty = grid_around((-33, 18, -401), (-22, 30, -385), (0.7, 0.9, 1.6))
+        sitk.WriteImage(drawn(empty, (4, KIDNEY)), str(tmp_path / "kidney_right.nii.gz"))
+        (one,) = open_labels(tmp_path / "kidney_right.nii.gz").maps(None)
+        assert [(s.tissue, s.side) for s in one.segments.values()] == [("kidney", "right")]
+
+    def test_organs_are_read_near_the_kidneys(self, tmp_path):
+        """And all that a picture shows of them: 80 mm around."""
+        empty = grid_around((-20, -20, -150), (20, 20, 150), (4.0, 4.0, 5.0), DIRECTIONS["slices first"])
+        middle, wide = np.zeros(3), np.array([9.0, 8.0, 11.0])
+        for name, shape in {
+            "kidney_left": (middle, wide),
+            "aorta": (middle, np.array([9.0, 9.0, 1e4])),
+        }.items():
+            sitk.WriteImage(drawn(empty, (1, shape)), str(tmp_path / f"{name}.nii.gz"))
+        kidney, aorta = (np.abs(one.grid.corners()[:, 2]).max() for one in open_labels(tmp_path).maps(None))
+        assert kidney + 80 <= aorta <= kidney + 85
+
+
+class TestNames:
+    def test_both_sides_are_none(self):
+        assert side_of("left and right kidney") is None and side_of("kidney") is None
+
+
+class TestSegmentations:
+    def test_what_is_meant(self, series, tmp_path):
+        """A name that says nothing: the coded property does."""
+        mask = np.ones(series.size[::-1])
+        (one,) = open_labels(write_segmentation(tmp_path / "seg.dcm", series, {"Xidney 1": mask})).maps(None)
+        assert [(s.name, s.tissue) for s in one.segments.values()] == [("Xidney 1", "kidney")]
+
+    @pytest.fixture
+    def series(self, tmp_path):
+        return Series(tmp_path / "ct")
+
+    def test_what_labels_say_is_private(self, series, tmp_path):
+        seg = write_segmentation(tmp_path / "seg.dcm", series, {"Kidney": np.ones(series.size[::-1])})
+        rt = write_structures(
+            tmp_path / "rt.dcm", {"Kidney": [ring(series.positions(2), 5, series.direction)]}
+        )
+        image = sitk.Compose(*[sitk.GetImageFromArray(np.ones((4, 4, 4), np.uint8))] * 2)
+        image.SetMetaData("Comment", "Doe^Jane")
+        sitk.WriteImage(image, str(tmp_path / "a.seg.nrrd"))
+        for path in (seg, rt, tmp_path / "a.seg.nrrd"):
+            assert "Doe^Jane" in open_labels(path).secrets, path.name
+
+
+class TestContours:
+    def test_a_plane_left_out(self, tmp_path):
+        """Planes stay where they were drawn; between them one is empty."""
+        series = Series(tmp_path / "ct")
+        rings = [ring(series.places(k)[5, 6], 2.6, series.direction) for k in (1, 2, 4)]
+        path = write_structures(tmp_path / "rt.dcm", {"Kidney": rings})
+        found = by_name(open_labels(path).maps(ct_grid(series)), ct_grid(series))["Kidney"]
+        assert found.any(axis=(1, 2)).tolist() == [False, True, True, False, True, False]
+
+    def test_uneven_planes(self, tmp_path):
+        series = Series(tmp_path / "ct")
+        middle = series.places(1)[5, 6]
+        rings = [
+            ring(middle + at * series.gap * series.direction[:, 2], 2.6, series.direction)
+            for at in (0, 1, 2.5)
+        ]
+        path = write_structures(tmp_path / "rt.dcm", {"Kidney": rings})
+        assert "unevenly spaced" in refusal(path, read=lambda path: open_labels(path).maps(ct_grid(series)))

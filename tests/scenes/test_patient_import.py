@@ -1,0 +1,385 @@
+"""Patient import: a synthetic body whose organs are known in LPS mm."""
+
+import igl
+import numpy as np
+import pytest
+import SimpleITK as sitk
+import trimesh
+from synthetic_body import (
+    DIRECTIONS,
+    LEFT,
+    TUMOUR,
+    assert_sound,
+    body,
+    coarsely,
+    drawn,
+    grid_around,
+    least_gap,
+    level,
+    mapped,
+    points_of,
+    voxels_to_boundary,
+    with_voxels,
+)
+
+import scenes.patients.patient_import
+from scenes import anatomy
+from scenes.patients.import_error import PatientError
+from scenes.patients.import_summary import facts, told
+from scenes.patients.import_warnings import STONE_ABOVE_MEDIAN_HU
+from scenes.patients.organ_selection import midline_x, organs, single_out
+from scenes.patients.patient_folder import save_patient
+from scenes.patients.patient_import import import_patient
+from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.label_maps import LabelMap, with_tissues
+from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.scene import SceneError
+
+PELVIS = np.array([62.0, 35.0, 12.0]), np.array([8.0, 7.0, 12.0])
+CYST = np.array([70.0, 20.0, -30.0]), np.array([12.0, 12.0, 12.0])  # sticks out, too
+LIVER = np.array([20.0, 0.0, 40.0]), np.array([20.0, 20.0, 20.0])
+
+
+def label_map(labels, organ=(), **tissues):
+    """A label map with values said to be of tissues, and the values of its organ, None where they are not said."""
+    words = {tissue: [str(v) for v in values] for tissue, values in tissues.items()}
+    (told_map,) = with_tissues([LabelMap.of(labels)], [str(v) for v in organ], words)
+    return told_map, list(organ) or None
+
+
+def imported(ct, labels, organ=(), side=None, margin_mm=60.0, **tissues):
+    labelled = label_map(labels, organ, **tissues)
+    return import_patient(Volume.of(ct), *labelled, side, margin_mm, needed=set(tissues))
+
+
+def found(ct, labels, organ=(), side=None, **tissues):
+    """The organ that an import would take, and its side."""
+    pieces = organs(*label_map(labels, organ, **tissues))
+    midline = midline_x(VoxelGrid.of(ct), sitk.GetArrayFromImage(ct), -1000, 1000)
+    return single_out(pieces, midline, side)
+
+
+@pytest.fixture(scope="module")
+def ct_and_labels():
+    return body()
+
+
+@pytest.fixture(scope="module")
+def patient(ct_and_labels):
+    return imported(*ct_and_labels, organ=[2], tumour=[3], margin_mm=20.0)
+
+
+@pytest.fixture
+def without_support(monkeypatch):
+    """A mould takes a second, and is tested by itself."""
+    monkeypatch.setattr(scenes.patients.patient_import, "_support", lambda kind, organ, labels, piece: organ)
+
+
+@pytest.fixture
+def coarse(monkeypatch):
+    coarsely(monkeypatch)
+
+
+@pytest.mark.usefixtures("patient", "without_support")
+class TestImport:
+    def test_finds_the_organ(self, patient, ct_and_labels):
+        ct, labels = ct_and_labels
+        values = sitk.GetArrayViewFromImage(labels)
+        voxel_ml = np.prod(ct.GetSpacing()) / 1000
+        assert patient.side == "left"
+        assert patient.volumes_ml["organ"] == pytest.approx((values >= 2).sum() * voxel_ml)
+        assert patient.volumes_ml["tumour"] == pytest.approx((values == 3).sum() * voxel_ml)
+        assert patient.organ.volume / 1000 == pytest.approx(patient.volumes_ml["organ"], rel=0.005)
+        assert patient.tumour.volume / 1000 == pytest.approx(patient.volumes_ml["tumour"], rel=0.005)
+        for mesh in (patient.organ, patient.tumour, patient.support):
+            assert_sound(mesh)
+        np.testing.assert_allclose(patient.tumour.center_mass, TUMOUR[0], atol=1.0)
+        assert least_gap(patient.support, patient.organ) > 0
+        assert patient.support.bounds[1, 1] > patient.organ.bounds[1, 1]  # posterior of it: supine
+        text = told(facts(patient))
+        assert "left" in text and f"{patient.volumes_ml['organ']:.1f} ml" in text and "2.50" in text
+
+    def test_crop_keeps_voxels_where_they_were(self, patient, ct_and_labels):
+        assert patient.ct.GetPixelID() == sitk.sitkInt16 and patient.labels.GetPixelID() == sitk.sitkUInt8
+        again = sitk.Resample(ct_and_labels[0], patient.ct, sitk.Transform(), sitk.sitkNearestNeighbor)
+        assert np.array_equal(sitk.GetArrayViewFromImage(again), sitk.GetArrayViewFromImage(patient.ct))
+        points, marked = points_of(patient.labels), sitk.GetArrayViewFromImage(patient.labels) > 0
+        assert (points.reshape(-1, 3).min(axis=0) <= points[marked].min(axis=0) - 20).all()
+        assert (points.reshape(-1, 3).max(axis=0) >= points[marked].max(axis=0) + 20).all()
+        assert set(np.unique(sitk.GetArrayViewFromImage(patient.labels)).tolist()) == {0, 1, 2}
+        assert not marked[points[..., 0] < 0].any()  # not the other kidney
+
+    @pytest.mark.parametrize("direction", DIRECTIONS.values(), ids=DIRECTIONS)
+    @pytest.mark.parametrize(("value", "side"), [(1, "right"), (2, "left")])
+    def test_tells_left_from_right(self, direction, value, side):
+        ct, labels = body(direction, spacing=(4.0, 3.5, 5.0))
+        assert found(ct, labels, [value])[1] == side
+        both = found(ct, labels, side=side, tumour=[3] if value == 2 else [])[0]
+        assert both.names[0] == str(value)
+        only_one = mapped(labels, [0, value == 1, value == 2, value == 2])
+        assert found(ct, only_one)[1] == side
+        both_one_value = mapped(labels, [0, 1, 1, 1])
+        organ, told_side = found(ct, both_one_value, side=side)
+        assert told_side == side and np.sign(organ.centre_x_mm) == (1 if side == "left" else -1)
+        with pytest.raises(PatientError, match="no (left|right) kidney"):
+            found(ct, only_one, side="left" if side == "right" else "right")
+
+    def test_parts_of_the_organ_keep_their_tissue(self, coarse, ct_and_labels):
+        ct, labels = ct_and_labels
+        voxels = drawn(labels, (2, LEFT), (3, TUMOUR), (7, PELVIS), (8, CYST), (9, LIVER))
+        patient = imported(ct, voxels, [2], margin_mm=60.0, tumour=[3], urine=[7], cyst=[8], liver=[9])
+        assert patient.tissues == {1: "kidney", 2: "tumour", 3: "cyst", 4: "liver", 5: "urine"}
+        marks = sitk.GetArrayViewFromImage(patient.labels)
+        places = points_of(patient.labels)
+        for code, solid in ((2, TUMOUR), (3, CYST), (4, LIVER), (5, PELVIS)):
+            inside = level(places, solid) < 0
+            assert (marks[inside] == code).mean() > 0.95, code
+        assert set(patient.parts) == {"tumour", "cyst", "urine"}
+        for tissue, solid in (("tumour", TUMOUR), ("cyst", CYST), ("urine", PELVIS)):
+            np.testing.assert_allclose(patient.parts[tissue].center_mass, solid[0], atol=1.5)
+        # The cyst sticks out and is of the organ; the pelvis lies in it; the liver is another organ.
+        centres = np.array([CYST[0], PELVIS[0], TUMOUR[0], LIVER[0]])
+        faces = np.asarray(patient.organ.faces, np.int64)
+        distance = igl.signed_distance(centres, np.asarray(patient.organ.vertices), faces)[0]
+        assert (distance < 0).tolist() == [True, True, True, False]
+
+    @pytest.mark.parametrize("spacing", [(1.5, 1.5, 1.5), (5.0, 5.0, 6.0)], ids=["finer", "coarser"])
+    def test_labels_on_another_grid(self, ct_and_labels, spacing):
+        """The surface is as true as the label, whatever the CT's voxels are."""
+        ct, _ = ct_and_labels
+        tight = grid_around((40, 10, -40), (105, 60, 65), spacing, DIRECTIONS["oblique"])
+        own = drawn(tight, (2, LEFT))
+        patient = imported(ct, own, [2], margin_mm=20.0)
+        assert patient.side == "left" and patient.labels.GetSize() == patient.ct.GetSize()
+        assert voxels_to_boundary(patient.organ, own).mean() < 0.5
+        marked = sitk.GetArrayViewFromImage(patient.labels) > 0
+        truth = level(points_of(patient.labels), LEFT) < 0
+        assert (marked & truth).sum() * 2 / (marked.sum() + truth.sum()) > 0.9
+
+    def test_slices_first_labels_on_an_upright_ct(self, coarse, ct_and_labels):
+        """KiTS keeps label maps slices first, with direction (0,0,1, 0,1,0, -1,0,0)."""
+        ct, _ = ct_and_labels
+        _, labels = body(DIRECTIONS["slices first"], spacing=(4.0, 2.5, 3.0))
+        patient = imported(ct, labels, [2], tumour=[3])
+        assert patient.side == "left"
+        np.testing.assert_allclose(patient.tumour.center_mass, TUMOUR[0], atol=1.5)
+
+    def test_padding_becomes_air(self, coarse, ct_and_labels):
+        ct, labels = ct_and_labels
+        voxels = sitk.GetArrayFromImage(ct)
+        voxels[voxels == -1000] = -3024
+        patient = imported(with_voxels(ct, voxels), labels, [2], margin_mm=300.0)
+        assert sitk.GetArrayViewFromImage(patient.ct).min() == -1000
+
+    def test_cropped_ct_needs_the_side(self, ct_and_labels):
+        ct, labels = ct_and_labels
+        near = [slice(ct.TransformPhysicalPointToIndex((30.0, 0, 0))[0], None), slice(None), slice(None)]
+        with pytest.raises(PatientError, match="--side left or --side right"):
+            found(ct[near], labels[near], [2])
+        assert found(ct[near], labels[near], [2], "left")[1] == "left"
+
+    def test_names_tell_the_side_and_are_checked(self, coarse, ct_and_labels):
+        ct, labels = ct_and_labels
+        near = [slice(ct.TransformPhysicalPointToIndex((30.0, 0, 0))[0], None), slice(None), slice(None)]
+        named = LabelMap.of(labels[near], {2: "kidney_left", 3: "kidney tumour"})
+        assert import_patient(Volume.of(ct[near]), named, margin_mm=10.0).side == "left"
+        with pytest.raises(PatientError, match="called by the other side's name"):
+            import_patient(Volume.of(ct[near]), named, side="right", margin_mm=10.0)
+        mirrored = LabelMap.of(labels, {1: "kidney_left", 2: "kidney_right", 3: "tumour"})
+        with pytest.raises(PatientError, match="lies on the patient's left, which its name denies"):
+            import_patient(Volume.of(ct), mirrored, side="left", margin_mm=10.0)
+        other = LabelMap.of(labels, {1: "liver", 2: "spleen", 3: "stomach"})
+        with pytest.raises(PatientError, match="no label says that it is a kidney: 1 liver, 2 spleen"):
+            import_patient(Volume.of(ct), other)
+
+
+class TestImportRefuses:
+    @pytest.mark.parametrize(
+        ("options", "words"),
+        [
+            ({}, r"2 organs .*label 1, right, \d+\.\d ml; label 2\+3, left, \d+\.\d ml.*--side"),
+            ({"organ": [5]}, "label 5 is not in the label map: it holds 1, 2, 3; give one of these"),
+            ({"tumour": [8], "organ": [1]}, "tumour's label 8 is not"),
+            ({"organ": [1, 3], "tumour": [3]}, "label 3 is given as organ and as tumour"),
+            ({"organ": [1], "tumour": [3]}, "the tumour does not touch the organ"),
+            ({"organ": [1], "side": "left"}, "no left kidney is labelled, found: label 1, right"),
+            ({"organ": [3]}, r"has 5\.\d ml: expected 20 to 2000 ml"),
+            ({"organ": [2], "margin_mm": -1.0}, "margin"),
+        ],
+    )
+    def test_options(self, ct_and_labels, options, words):
+        with pytest.raises(PatientError, match=words) as caught:
+            imported(*ct_and_labels, **options)
+        assert "\n" not in str(caught.value)
+
+    def test_labels_that_are_none(self, ct_and_labels):
+        ct, labels = ct_and_labels
+        with pytest.raises(PatientError, match="empty"):
+            imported(ct, labels * 0)
+        with pytest.raises(PatientError, match="swapped"):
+            imported(labels, ct)
+        with pytest.raises(PatientError, match="whole numbers"):
+            imported(ct, sitk.Cast(labels, sitk.sitkFloat32) * 0.3)
+        with pytest.raises(PatientError, match="no organ, but 3; expected a kidney's too"):
+            imported(ct, mapped(labels, [0, 0, 0, 3]), tumour=[3])
+
+    def test_labels_of_another_place(self, ct_and_labels):
+        ct, labels = ct_and_labels
+        far = sitk.Image(labels)
+        far.SetOrigin((1000.0, 0.0, 0.0))
+        with pytest.raises(PatientError, match="outside the CT, with 0 %"):
+            imported(ct, far)
+        half = sitk.Image(labels)
+        half.SetOrigin(np.add(labels.GetOrigin(), (0, 0, 80.0)).tolist())
+        with pytest.raises(PatientError, match=r"lies in the CT with \d\d% of its voxels"):
+            imported(ct, half, [2], "left")
+
+    def test_organ_cut_off(self):
+        ct, labels = body(z=(-90.0, 20.0))
+        with pytest.raises(PatientError, match="cut off at the border"):
+            imported(ct, labels, organ=[2])
+
+    def test_implausible_organ(self, ct_and_labels):
+        ct, labels = ct_and_labels
+        everything = with_voxels(labels, (sitk.GetArrayViewFromImage(ct) > -500).astype(np.int16))
+        with pytest.raises(PatientError, match="expected 20 to 2000 ml"):
+            imported(ct, everything, side="left")
+
+    def test_organ_that_is_no_soft_tissue(self, ct_and_labels):
+        ct, labels = ct_and_labels
+        with pytest.raises(PatientError, match="soft tissue"):
+            imported(ct + 800, labels, organ=[2])
+
+
+class TestSave:
+    def test_writes_what_was_imported_and_nothing_of_the_source(self, patient, tmp_path):
+        named = sitk.Image(patient.ct)
+        named.SetMetaData("0010|0010", "Doe^Jane")
+        object.__setattr__(patient, "ct", named)
+        folder = tmp_path / "new" / "patient"
+        save_patient(patient, folder, texts={"scene.toml": "a = 1\n"})
+
+        names = {file.name for file in folder.iterdir()}
+        assert names == {"ct.nrrd", "labels.nrrd", "organ.stl", "tumour.stl", "support.stl", "scene.toml"}
+        assert [entry.name for entry in folder.parent.iterdir()] == ["patient"]
+        for name in ("ct", "labels"):
+            again, image = open_ct(folder / f"{name}.nrrd").image(), getattr(patient, name)
+            assert np.array_equal(sitk.GetArrayViewFromImage(again), sitk.GetArrayViewFromImage(image))
+            np.testing.assert_allclose(again.GetOrigin(), image.GetOrigin(), atol=1e-6)
+            np.testing.assert_allclose(again.GetDirection(), image.GetDirection(), atol=1e-9)
+        organ = trimesh.load(folder / "organ.stl")
+        assert organ.is_watertight and organ.volume == pytest.approx(patient.organ.volume, rel=1e-5)
+        # Without it 3D Slicer takes a surface's coordinates for RAS.
+        assert all(file.read_bytes().startswith(b"SPACE=LPS") for file in folder.glob("*.stl"))
+        for file in folder.iterdir():
+            content = file.read_bytes()
+            assert b"Doe" not in content and str(tmp_path).encode() not in content
+
+    def test_leaves_what_is_there(self, patient, tmp_path):
+        (tmp_path / "precious.txt").write_text("mine")
+        with pytest.raises(PatientError, match="not an empty folder"):
+            save_patient(patient, tmp_path)
+        with pytest.raises(PatientError, match="not an empty folder"):
+            save_patient(patient, tmp_path / "precious.txt")
+        assert [entry.name for entry in tmp_path.iterdir()] == ["precious.txt"]
+
+    @pytest.mark.parametrize("fault", [(28, "No space"), ("broken picture",)])
+    def test_interrupted_leaves_nothing(self, patient, tmp_path, fault):
+        def full(_folder):
+            raise OSError(*fault)
+
+        with pytest.raises(PatientError, match="(No space|cannot be written); choose a folder"):
+            save_patient(patient, tmp_path / "patient", draw=full)
+        assert list(tmp_path.iterdir()) == []
+
+    def test_a_disk_that_is_full_is_told_and_leaves_nothing(self, patient, tmp_path, bytes_to_a_file):
+        with bytes_to_a_file(100), pytest.raises(PatientError, match="is the disk full.*; choose a folder"):
+            save_patient(patient, tmp_path / "patient")
+        assert list(tmp_path.iterdir()) == []
+
+    def test_what_a_killed_run_left_is_removed(self, patient, tmp_path):
+        (tmp_path / ".0a1b2c3d.partial-patient").mkdir()
+        (tmp_path / ".0a1b2c3d.partial-another").mkdir()
+        save_patient(patient, tmp_path / "patient")
+        assert {each.name for each in tmp_path.iterdir()} == {"patient", ".0a1b2c3d.partial-another"}
+
+    def test_the_embedded_patient_is_saved_where_it_can_be(self, patient, tmp_path, monkeypatch):
+        monkeypatch.setattr(anatomy, "_phantom_patient", lambda told: patient)
+        monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path / "temporary"))
+        cache = tmp_path / "cache"
+        cache.write_text("a file in the way")
+        monkeypatch.setattr(anatomy, "CACHE", cache)
+        folder = anatomy.phantom_folder()
+        assert folder.parent == tmp_path / "temporary" / "nephron" and (folder / "organ.stl").is_file()
+        monkeypatch.setattr(anatomy, "_phantom_patient", lambda told: pytest.fail("made twice"))
+        assert anatomy.phantom_folder() == folder
+        monkeypatch.setattr(anatomy, "_phantom_patient", lambda told: patient)
+        monkeypatch.setattr("tempfile.gettempdir", lambda: str(cache))
+        with pytest.raises(SceneError, match="can be written to neither; free"):
+            anatomy.phantom_folder()
+
+
+@pytest.mark.usefixtures("patient", "without_support", "coarse")
+class TestCautions:
+    """What looks wrong is said, though the import goes on."""
+
+    def test_a_body_as_it_should_be(self, patient):
+        assert patient.cautions == () and patient.notes == ()
+
+    def test_turned_over_or_mirrored(self, ct_and_labels):
+        ct, labels = ct_and_labels
+        spine = np.array([0.0, 75.0, 0.0]), np.array([22.0, 18.0, 400.0])
+        liver = np.array([-60.0, -40.0, 20.0]), np.array([40.0, 30.0, 50.0])
+        for sign, words in ((1, []), (-1, ["bones lie in front", "liver lies on the patient's left"])):
+            voxels = sitk.GetArrayFromImage(ct)
+            voxels[level(points_of(ct), (sign * spine[0], spine[1])) < 0] = 500
+            marked = drawn(labels, (4, (liver[0] * [sign, 1, 1], liver[1])), (2, LEFT))
+            patient = imported(with_voxels(ct, voxels), marked, [2], margin_mm=20.0, liver=[4])
+            assert len(patient.cautions) == len(words)
+            assert all(word in line for word, line in zip(words, patient.cautions, strict=True))
+
+    def test_labels_shifted_into_fat(self, ct_and_labels):
+        ct, labels = ct_and_labels
+        voxels = sitk.GetArrayFromImage(ct)
+        voxels[voxels == 40] = -100
+        assert not imported(with_voxels(ct, voxels), labels, [2], margin_mm=20.0, tumour=[3]).cautions
+        shifted = sitk.Image(labels)
+        shifted.SetOrigin(np.add(labels.GetOrigin(), (0, 8.0, 0)).tolist())
+        (said,) = imported(with_voxels(ct, voxels), shifted, [2], margin_mm=20.0, tumour=[3]).cautions
+        assert "of the organ's rim is fat or gas" in said
+
+    def test_what_is_as_bright_as_stone_unless_its_label_says_that_it_is_urine(self, ct_and_labels):
+        ct, labels = ct_and_labels
+        points = points_of(ct)
+        stone, pelvis = level(points, (LEFT[0] + [0, 0, 25], np.full(3, 6.0))) < 0, level(points, PELVIS) < 0
+        voxels, marks = sitk.GetArrayFromImage(ct), sitk.GetArrayFromImage(labels)
+        voxels[stone | pelvis], marks[pelvis] = 120 + STONE_ABOVE_MEDIAN_HU + 1, 4
+        bright, told = with_voxels(ct, voxels), with_voxels(labels, marks)
+        (said,) = imported(bright, told, [2], margin_mm=20.0, tumour=[3], urine=[4]).cautions
+        ml = stone.sum() * np.prod(ct.GetSpacing()) / 1000
+        assert f"{ml:.1f} ml inside the organ are as bright as stone" in said and "--collecting" in said
+
+    def test_labels_without_a_meaning(self, ct_and_labels):
+        (said,) = imported(*ct_and_labels, side="left", margin_mm=20.0).cautions
+        assert "labels 2, 3 say nothing, and were all taken as the kidney" in said
+        (said,) = imported(*ct_and_labels, organ=[2], margin_mm=20.0).cautions
+        assert "were left out: 3 (5." in said and "--tumour" in said
+
+
+def test_what_touches_by_a_corner_is_held_and_what_only_touches_is_no_part(ct_and_labels, without_support):
+    """Of two organs that touch by a corner neither is the other's, but a tumour that does is the kidney's."""
+    ct, _ = ct_and_labels
+    grid = VoxelGrid.of(ct)
+    values = np.zeros(grid.size[::-1], np.uint8)
+    x, y, z = (int(n) for n in grid.index(LEFT[0][None])[0])
+    values[z - 8 : z + 8, y - 8 : y + 8, x - 8 : x + 8] = 1
+    values[z + 8 : z + 13, y + 8 : y + 13, x + 8 : x + 13] = 2
+    apart = organs(LabelMap.valued(grid, values), [1, 2])
+    assert [piece.mask.sum() for piece in apart] == [16**3]
+    label = LabelMap.valued(grid, values, {1: "kidney", 2: "tumour"})
+    (piece,) = organs(label)
+    assert 16**3 + 5**3 < piece.mask.sum() <= 16**3 + 5**3 + 8
+    patient = import_patient(Volume.of(ct), label, side="left", margin_mm=10.0)
+    assert patient.organ.body_count == 1
+    assert patient.organ.volume / 1000 == pytest.approx(patient.volumes_ml["organ"], rel=0.02)

@@ -1,0 +1,187 @@
+"""The embedded patient is what it says: a left kidney with a tumour, in LPS, as a contrast CT shows it."""
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from scipy import ndimage
+from skimage.morphology import ball, convex_hull_image
+
+from scenes.phantom.kidney import NOISE_SD, Label, make_phantom
+
+
+@pytest.fixture(scope="module")
+def phantom() -> tuple[sitk.Image, sitk.Image]:
+    return make_phantom()
+
+
+@pytest.fixture(scope="module")
+def hu(phantom) -> np.ndarray:
+    return sitk.GetArrayFromImage(phantom[0]).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def labels(phantom) -> np.ndarray:
+    return sitk.GetArrayFromImage(phantom[1])
+
+
+@pytest.fixture(scope="module")
+def spacing(phantom) -> float:
+    return phantom[0].GetSpacing()[0]
+
+
+def _positions(mask: np.ndarray, image: sitk.Image) -> np.ndarray:
+    """LPS [mm] of the voxels of a mask, shape (n, 3)."""
+    return np.argwhere(mask)[:, ::-1] * np.array(image.GetSpacing()) + np.array(image.GetOrigin())
+
+
+def test_two_calls_give_the_same_voxels(phantom, hu, labels):
+    again = make_phantom()
+    assert np.array_equal(sitk.GetArrayViewFromImage(again[0]), hu)
+    assert np.array_equal(sitk.GetArrayViewFromImage(again[1]), labels)
+
+
+def test_grid_is_isotropic_lps_and_shared(phantom):
+    ct, label_map = phantom
+    assert ct.GetPixelID() == sitk.sitkInt16
+    assert label_map.GetPixelID() == sitk.sitkUInt8
+    assert ct.GetDirection() == (1, 0, 0, 0, 1, 0, 0, 0, 1)
+    assert len(set(ct.GetSpacing())) == 1
+    assert 0.8 <= ct.GetSpacing()[0] <= 1.0
+    for of in ("GetSize", "GetSpacing", "GetOrigin", "GetDirection"):
+        assert getattr(ct, of)() == getattr(label_map, of)()
+
+
+def test_every_label_occurs_and_no_other(labels):
+    assert set(np.unique(labels)) == set(Label)
+
+
+def test_kidney_has_the_size_of_a_kidney(phantom, labels, spacing):
+    assert 150 < (labels > 0).sum() * spacing**3 / 1000 < 190
+    points = _positions(labels > 0, phantom[1])
+    axes = np.linalg.svd(np.cov(points.T))[0]
+    thickness, width, length = sorted(np.ptp(points @ axes, axis=0))
+    assert 100 < length < 118
+    assert 55 < width < 70
+    assert 42 < thickness < 60  # with the bulge of the tumour
+
+
+def test_tumour_is_25_mm_and_partly_exophytic(labels, spacing):
+    tumour = labels == Label.TUMOUR
+    diameter = (6 * tumour.sum() * spacing**3 / np.pi) ** (1 / 3)
+    assert 22 < diameter < 28
+    # What stands out is beyond the convex hull of the rest; every third voxel is enough for a share.
+    coarse = np.s_[::3, ::3, ::3]
+    rest = convex_hull_image(((labels > 0) & ~tumour)[coarse])
+    assert 0.15 < (tumour[coarse] & ~rest).sum() / tumour[coarse].sum() < 0.6
+
+
+def test_tumour_faces_the_front_below_the_middle_on_the_lateral_side(phantom, labels):
+    tumour = _positions(labels == Label.TUMOUR, phantom[1]).mean(axis=0)
+    kidney = _positions(labels > 0, phantom[1]).mean(axis=0)
+    assert tumour[0] > kidney[0] + 5
+    assert tumour[1] < kidney[1] - 5
+    assert -40 < tumour[2] - kidney[2] < -5
+    i, _, k = phantom[1].TransformPhysicalPointToIndex(tumour)
+    column = labels[k, :, i]
+    assert column[np.argmax(column > 0)] == Label.TUMOUR
+
+
+def test_union_is_one_solid_without_cavities(labels):
+    organ = labels > 0
+    assert ndimage.label(organ)[1] == 1
+    assert np.array_equal(ndimage.binary_fill_holes(organ), organ)
+
+
+def test_union_is_nowhere_thin(labels, spacing):
+    """A ball of 3 mm radius reaches all but 0.6 % of the organ, and the rest is within 3 mm of that."""
+    organ = labels > 0
+    thick = ndimage.binary_opening(organ, ball(round(3 / spacing)))
+    assert (organ & ~thick).sum() < 0.006 * organ.sum()
+    assert ndimage.distance_transform_edt(~thick, sampling=spacing)[organ].max() < 3
+
+
+def test_organ_keeps_clear_of_the_border(labels):
+    for axis in range(3):
+        inside = np.flatnonzero((labels > 0).any(axis=tuple({0, 1, 2} - {axis})))
+        assert inside[0] >= 8
+        assert inside[-1] < labels.shape[axis] - 8
+
+
+@pytest.mark.parametrize(
+    ("label", "margin", "low", "high"),
+    [
+        (Label.CORTEX, 2, 170, 195),
+        (Label.MEDULLA, 2, 100, 120),
+        (Label.SINUS_FAT, 2, -115, -80),
+        (Label.COLLECTING_SYSTEM, 2, 0, 20),
+        (Label.VESSEL, 2, 175, 215),
+        (Label.TUMOUR, 1, 70, 90),
+    ],
+)
+def test_mean_attenuation_of_each_tissue(hu, labels, label, margin, low, high):
+    """Away from its borders by more than the point spread, so that no neighbour is mixed in."""
+    core = ndimage.binary_erosion(labels == label, iterations=margin)
+    assert core.sum() > 20
+    assert low < hu[core].mean() < high
+
+
+def test_tumour_has_a_core_of_lower_attenuation(hu, labels):
+    depth = ndimage.distance_transform_edt(labels == Label.TUMOUR)
+    rim, core = hu[(depth > 2) & (depth < 6)], hu[depth > 0.75 * depth.max()]
+    assert core.mean() < rim.mean() - 25
+
+
+def test_noise_has_its_sd_and_is_correlated(hu, labels):
+    """Differences over 4 voxels hold two independent draws of the noise, those of neighbours hold less."""
+    cortex = ndimage.binary_erosion(labels == Label.CORTEX, iterations=2)
+
+    def sd(lag: int) -> float:
+        both = cortex[..., lag:] & cortex[..., :-lag]
+        return (hu[..., lag:] - hu[..., :-lag])[both].std() / np.sqrt(2)
+
+    assert 0.9 * NOISE_SD < sd(4) < 1.25 * NOISE_SD
+    assert sd(1) < 0.8 * sd(4)
+
+
+def test_hilum_opens_medially_and_to_the_front(phantom, labels, spacing):
+    """The deepest dent of a left kidney lies toward -x, and not behind its centre."""
+    organ = (labels > 0)[::3, ::3, ::3]
+    dent = convex_hull_image(organ) & ~organ
+    depth = ndimage.distance_transform_edt(dent)
+    deepest = np.array(np.unravel_index(depth.argmax(), depth.shape))[::-1] * 3 * spacing
+    hilum = deepest + np.array(phantom[1].GetOrigin())
+    kidney = _positions(labels > 0, phantom[1]).mean(axis=0)
+    assert hilum[0] < kidney[0] - 12
+    assert hilum[1] < kidney[1]
+    assert abs(hilum[2] - kidney[2]) < 20
+
+
+def test_upper_pole_leans_medially_and_backward(phantom, labels):
+    points = _positions(labels > 0, phantom[1])
+    low, high = np.quantile(points[:, 2], (0.15, 0.85))
+    lower, upper = points[points[:, 2] < low].mean(axis=0), points[points[:, 2] > high].mean(axis=0)
+    assert upper[0] < lower[0] - 10
+    assert upper[1] > lower[1] + 5
+
+
+def test_calyces_and_vessels_lie_within_the_kidney_or_a_few_mm_out_of_the_hilum(phantom, labels):
+    """All that is labelled beyond cortex and tumour is central; only the medial side may show it."""
+    surface = (labels > 0) & ~ndimage.binary_erosion(labels > 0)
+    shown = surface & np.isin(labels, (Label.SINUS_FAT, Label.COLLECTING_SYSTEM, Label.VESSEL))
+    assert 20 < shown.sum() < 0.1 * surface.sum()
+    assert _positions(shown, phantom[1])[:, 0].max() < _positions(labels > 0, phantom[1])[:, 0].mean()
+
+
+def test_renal_vessels_run_on_to_the_aorta_without_a_label(phantom, hu, labels):
+    beyond = (ndimage.gaussian_filter(hu, 0.7) > 130) & (labels == Label.OUTSIDE)
+    parts, _ = ndimage.label(beyond)
+    touching = np.unique(parts[ndimage.binary_dilation(labels == Label.VESSEL, iterations=2) & beyond])
+    runs = [_positions(parts == part, phantom[0]) for part in touching if part]
+    assert any(np.ptp(run[:, 0]) > 40 for run in runs)
+
+
+def test_volume_is_filled_with_tissue(hu):
+    """Bowel gas is the only air; fat and soft tissue both take a large share."""
+    assert (hu < -300).mean() < 0.02
+    assert 0.3 < ((hu > -150) & (hu < -60)).mean() < 0.7
+    assert ((hu > 20) & (hu < 140)).mean() > 0.2

@@ -1,0 +1,76 @@
+"""Volumes in files, in detail: values, what is private, where a box is."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from synthetic_body import DIRECTIONS, grid_around, with_voxels
+from test_readers import AIR, ENDINGS, RAS, affine_of, nifti, noise, written
+
+from scenes.patients.import_error import PatientError
+from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.label_files import open_labels
+from scenes.patients.readers.voxel_grid import VoxelGrid
+
+
+class TestFiles:
+    @pytest.mark.parametrize("ending", [".nii.gz", ".mha"])
+    def test_values_beyond_16_bits_are_cut(self, tmp_path, ending):
+        voxels = sitk.GetArrayFromImage(noise()).astype(np.float64)
+        voxels[0, 0, :2] = 40_000, -40_000
+        path = written(tmp_path / f"ct{ending}", with_voxels(noise(), voxels))
+        assert open_ct(path).hounsfield()[0, 0, :2].tolist() == [32767, AIR]
+
+    @pytest.mark.parametrize("ending", ENDINGS)
+    def test_what_a_header_says_is_private(self, tmp_path, ending):
+        path = tmp_path / f"a{ending}"
+        if ending.startswith(".nii"):
+            nifti(path, noise(), descrip=b"Doe^Jane")
+        else:
+            marked = noise()
+            marked.SetMetaData("descrip", "Doe^Jane")
+            written(path, marked)
+        assert "Doe^Jane" in open_ct(path).secrets and "Doe^Jane" in open_labels(path).secrets
+
+    def test_what_no_memory_holds_is_refused_with_what_it_takes(self, tmp_path, monkeypatch):
+        ct = open_ct(written(tmp_path / "ct.mha", noise()))
+        needed = 5 * np.prod(ct.grid.size)
+        monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=needed - 1))
+        with pytest.raises(
+            PatientError, match=r"ct\.mha: takes 0\.0 GB to read, and 0\.0 GB are free; close"
+        ):
+            ct.read()
+        assert ct.read((slice(0, 2),) * 3).shape == (2, 2, 2)
+        monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=needed))
+        assert ct.read().size == needed / 5
+
+
+class TestNifti:
+    def test_conflict_by_a_few_voxels(self, tmp_path):
+        shifted = affine_of(noise())
+        shifted[0, 3] += 2
+        path = nifti(tmp_path / "a.nii", noise(), [("s", 2), ("q", 1)], affines=[affine_of(noise()), shifted])
+        np.testing.assert_allclose(open_ct(path).grid.origin, (RAS @ shifted)[:3, 3], atol=1e-3)
+
+
+class TestGrid:
+    def test_part_of_a_voxel_is_another_grid(self):
+        """And so are finer voxels with the same corners."""
+        one = VoxelGrid.of(grid_around((0, 0, 0), (9, 8, 6), (1.0, 1.0, 2.0)))
+        finer = replace(one, size=tuple(2 * n - 1 for n in one.size), spacing=one.spacing / 2)
+        assert one.same_as(replace(one, origin=one.origin + [0.005, 0, 0]))
+        assert not one.same_as(replace(one, origin=one.origin + [0.5, 0, 0])) and not one.same_as(finer)
+
+    @pytest.mark.parametrize("direction", DIRECTIONS)
+    def test_box_covers_its_places(self, direction):
+        grid = VoxelGrid.of(
+            grid_around((-60, -60, -60), (60, 60, 60), (0.9, 1.3, 2.0), DIRECTIONS[direction])
+        )
+        low, high = np.array([-20.3, -11.1, -7.7]), np.array([10.4, 15.2, 9.9])
+        box = grid.box_around(low, high)
+        places = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
+        found, first, last = grid.index(places), [a.start for a in box], [a.stop - 1 for a in box]
+        assert ((found >= first) & (found <= last)).all()
+        assert (found.min(axis=0) - first < 1).all() and (last - found.max(axis=0) < 1).all()

@@ -1,0 +1,122 @@
+"""Which series and slices, in detail, and how they are put together."""
+
+import numpy as np
+import pydicom
+import pytest
+from dicom_series import Series, read_ct, refusal, save
+from pydicom.dataset import Dataset
+from pydicom.uid import generate_uid
+from synthetic_body import DIRECTIONS
+from test_readers_dicom import SLOPE, assert_whole, voxel_places
+
+
+class TestGeometry:
+    @pytest.mark.parametrize("lean", [0.1, -0.1, 0.4, -0.4])
+    def test_leans_either_way(self, tmp_path, lean):
+        """A plane stays one: slices are shifted back up or down, by part of a pixel or by several."""
+        start, slope = np.array([-31.5, 20.25, -400.0]), 10 * SLOPE
+        series = Series(
+            tmp_path, DIRECTIONS["identity"], field=lambda places: (places - start) @ slope + 2000,
+            positions=lambda k: start + k * np.array([0, lean, 2.5]),
+        )  # fmt: skip
+        volume, voxels = read_ct(series.write())
+        assert volume.grid.size == (12, 10 + np.ceil(5 * abs(lean) / 0.7), 6)
+        places = voxel_places(volume.grid)
+        low, high = 20.25 + max(0, 5 * lean), 20.25 + 9 * 0.7 + min(0, 5 * lean)
+        held = (places[..., 1] > low - 0.01) & (places[..., 1] < high + 0.01)
+        assert held.sum() > 200 and np.abs(voxels - (places - start) @ slope - 2000)[held].max() <= 1
+
+    @pytest.mark.parametrize(("k", "aside"), [(2, 1.5), (5, 20.0), (0, 20.0)])
+    def test_the_slice_out_of_line_is_named(self, tmp_path, k, aside):
+        series = Series(tmp_path)
+        at = series.positions
+        series.positions = lambda n: at(n) + (n == k) * aside * series.direction[:, 0]
+        assert f"slice {k + 1} (s1-{k}.dcm)" in refusal(series.write())
+
+    def test_slices_of_other_pixels(self, tmp_path):
+        series = Series(tmp_path)
+        save(series.slice(5, PixelSpacing=[0.7, 0.82]), series.write(range(5)) / "z.dcm")
+        assert "of different pixel spacing" in refusal(tmp_path)
+
+    def test_copy_beside_its_slice(self, tmp_path):
+        """The same pixels at another place of one plane are no copy."""
+        series = Series(tmp_path)
+        aside = (series.positions(3) + 0.5 * series.direction[:, 0]).round(6).tolist()
+        save(series.slice(3, ImagePositionPatient=aside, InstanceNumber=40), series.write() / "z.dcm")
+        said = refusal(tmp_path)
+        assert "slice 4 (s1-3.dcm)" in said and "slice 40 (z.dcm)" in said and "one position" in said
+
+    def test_the_last_of_uneven_slices(self, tmp_path):
+        """Of 7 gaps of 1.1 mm, which divided by their length are a hair less than 7."""
+        at = 1.1 * np.array([0, 1, 2.4, 3.4, 4.4, 5.8, 6.8])
+        series = Series(
+            tmp_path, DIRECTIONS["identity"], size=(12, 10, 7), positions=lambda k: np.array([0, 0, at[k]])
+        )
+        voxels = read_ct(series.write())[1]
+        assert voxels.shape[0] == 8 and np.array_equal(voxels[-1], series.hounsfield[-1])
+
+
+class TestSeries:
+    def test_values_beyond_16_bits_are_cut(self, tmp_path):
+        series = Series(tmp_path, slope=20.0)
+        assert np.array_equal(read_ct(series.write())[1], np.clip(series.hounsfield, -1024, 32767))
+
+    @pytest.mark.parametrize("slope", [0.4, 0.3])
+    def test_rescaled_values_are_rounded(self, tmp_path, slope):
+        series = Series(tmp_path, slope=slope, intercept=-1000)
+        exact = series.stored * slope - 1000
+        assert np.abs(read_ct(series.write())[1] - exact).max() <= 0.5 + 1e-3
+
+    def test_no_word_on_hounsfield(self, tmp_path):
+        volume = Series(tmp_path).write(RescaleIntercept=None, RescaleSlope=None)
+        assert any("the files do not say how" in note for note in read_ct(volume)[0].notes)
+
+    def test_a_frames_own_values_count(self, tmp_path):
+        """Not those that stand at the file's top, too."""
+        series = Series(tmp_path)
+        data = pydicom.dcmread(file := series.write_enhanced())
+        data.RescaleIntercept, data.RescaleSlope, data.PixelSpacing = 0, 2, [1, 1]
+        data.save_as(file)
+        assert_whole(series, file)
+
+    def test_frames_that_are_no_hounsfield(self, tmp_path):
+        data = pydicom.dcmread(file := Series(tmp_path).write_enhanced())
+        kind = Dataset()
+        kind.FrameType = ["DERIVED", "PRIMARY", "PERFUSION", "MTT"]
+        data.SharedFunctionalGroupsSequence[0].CTImageFrameTypeSequence = [kind]
+        data.save_as(file)
+        assert "MTT, PERFUSION; expected HU" in refusal(file)
+
+    def test_legacy_converted(self, tmp_path):
+        series = Series(tmp_path)
+        data = pydicom.dcmread(file := series.write_enhanced())
+        data.SOPClassUID = data.file_meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.2.2"
+        data.save_as(file)
+        assert_whole(series, file)
+
+
+class TestChoice:
+    def test_scout_that_does_not_say_so(self, tmp_path):
+        series = Series(tmp_path, size=(12, 10, 10))
+        view = {"ImageOrientationPatient": [1, 0, 0, 0, 0, -1], "SOPInstanceUID": generate_uid()}
+        save(series.slice(0, **view), series.write() / "scout.dcm")
+        assert "left out, localisers: 1" in assert_whole(series, tmp_path).notes
+
+    def test_axial_before_more_slices(self, tmp_path):
+        axial = Series(tmp_path, DIRECTIONS["identity"], number=2)
+        axial.write()
+        Series(tmp_path, DIRECTIONS["slices first"], number=1, size=(12, 10, 9)).write()
+        assert_whole(axial, tmp_path)
+
+    def test_tall_before_more_slices(self, tmp_path):
+        tall = Series(tmp_path, number=2, size=(12, 10, 7), gap=9.0)
+        tall.write()
+        Series(tmp_path, number=1, size=(12, 10, 20), gap=0.625).write()
+        assert_whole(tall, tmp_path)
+
+    def test_a_number_is_no_end_of_a_uid(self, tmp_path):
+        one, other = Series(tmp_path, number=8), Series(tmp_path, number=3)
+        other.uid = "1.2.826.0.1.3680043.8"
+        one.write()
+        other.write()
+        assert_whole(one, tmp_path, series="8")

@@ -1,0 +1,143 @@
+"""Surfaces of labels, and the support moulded under an organ."""
+
+import igl
+import numpy as np
+import pytest
+import SimpleITK as sitk
+import trimesh
+from synthetic_body import (
+    DIRECTIONS,
+    LEFT,
+    LEFT_ML,
+    SPACINGS,
+    TUMOUR,
+    assert_sound,
+    coarsely,
+    drawn,
+    grid_around,
+    least_gap,
+    level,
+    voxels_to_boundary,
+)
+
+from scenes.patients.label_surfaces import decimate, self_intersections, surface_from_mask
+from scenes.patients.moulded_support import mould
+
+
+@pytest.fixture
+def coarse(monkeypatch):
+    coarsely(monkeypatch)
+
+
+class TestSurface:
+    @pytest.mark.parametrize(
+        ("direction", "spacing"),
+        [*((direction, "thick") for direction in DIRECTIONS), ("oblique", "even")],
+    )
+    def test_lies_where_the_label_is(self, direction, spacing):
+        (centre, axes), direction, spacing = LEFT, DIRECTIONS[direction], SPACINGS[spacing]
+        mask = drawn(grid_around(centre - axes - 12, centre + axes + 7, spacing, direction), (1, LEFT))
+        surface = surface_from_mask(mask, faces=2000)
+
+        assert_sound(surface)
+        assert len(surface.faces) == pytest.approx(2000, abs=20)
+        label_ml = sitk.GetArrayViewFromImage(mask).sum() * np.prod(spacing) / 1000
+        assert surface.volume / 1000 == pytest.approx(label_ml, rel=1e-3)
+        assert surface.volume / 1000 == pytest.approx(LEFT_ML, rel=0.03)
+        assert voxels_to_boundary(surface, mask).max() < 1
+        # The label knows each boundary point to half a voxel; the smoothed surface must not be worse than
+        # that against the true ellipsoid, along the normal, where a voxel measures |n| . spacing.
+        gradient = (surface.vertices - centre) / axes**2
+        normal = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
+        off = np.abs(level(surface.vertices, LEFT) / np.linalg.norm(gradient, axis=1))
+        assert (off <= 0.5 * np.abs(normal @ direction) @ np.array(spacing)).all()
+        assert np.abs(surface.center_mass - centre).max() < 0.1 * max(spacing)
+
+    def test_has_no_stairs_between_thick_slices(self):
+        centre, axes = LEFT
+        mask = drawn(grid_around(centre - axes - 9, centre + axes + 9, (0.8, 0.8, 5.0)), (1, LEFT))
+        surface = surface_from_mask(mask)
+        # Stairs would turn the normal by 90 degrees at each of 18 slices; 5000 even triangles of an
+        # ellipsoid with 9 mm as its least radius of curvature turn by about 1.5 mm / 9 mm, 10 degrees.
+        turn = np.degrees(surface.face_adjacency_angles)
+        assert np.percentile(turn, 99) < 15
+        assert np.degrees(surface.face_angles.min(axis=1)).min() > 5
+
+    def test_drops_islands_and_fills_holes(self, coarse):
+        centre, axes = LEFT
+        empty = grid_around(centre - axes - 30, centre + axes + 10, (1.5, 1.5, 1.5))
+        island = centre - axes - 15, np.full(3, 5.0)
+        hole = centre, np.full(3, 6.0)
+        surface = surface_from_mask(drawn(empty, (1, LEFT), (1, island), (0, hole)), faces=2000)
+        assert_sound(surface)
+        assert surface.volume / 1000 == pytest.approx(LEFT_ML, rel=0.01)
+
+    def test_empty_mask_is_refused(self):
+        with pytest.raises(ValueError, match="empty"):
+            surface_from_mask(sitk.Image([9, 9, 9], sitk.sitkUInt8))
+
+    def test_same_bits_twice(self, coarse):
+        centre, axes = TUMOUR
+        mask = drawn(grid_around(centre - axes - 9, centre + axes + 9, (1.5, 1.5, 1.5)), (1, TUMOUR))
+        first, second = surface_from_mask(mask, 500), surface_from_mask(mask, 500)
+        assert np.array_equal(first.vertices, second.vertices)
+        assert np.array_equal(first.faces, second.faces)
+
+    def test_self_intersections_are_found(self):
+        ball = trimesh.creation.icosphere(subdivisions=2)
+        assert self_intersections(ball) == 0
+        ball.vertices[0] = -1.5 * ball.vertices[0]
+        assert self_intersections(ball) > 0
+
+    def test_walls_close_to_each_other_stay_apart(self):
+        """A ball folded into a bowl: thinned without regard to the other wall, each wall goes through it."""
+        ball = trimesh.creation.icosphere(subdivisions=3, radius=10.0)
+        x, y, z = ball.vertices.T
+        bowl = trimesh.Trimesh(
+            np.column_stack([x, y, np.where(z < 0, -0.95 * z, z)]), ball.faces, process=False
+        )
+        thin = decimate(bowl, 120)
+        assert len(thin.faces) == 120 and thin.is_watertight
+        assert self_intersections(bowl) == self_intersections(thin) == 0
+
+
+class TestSupport:
+    @pytest.mark.parametrize("gravity", [(0, 0, -1), (0, 1, 0), (0.6, 0, -0.8)])
+    def test_lies_under_the_organ_and_clear_of_it(self, gravity):
+        organ = trimesh.creation.icosphere(subdivisions=4)
+        organ.vertices = organ.vertices * (28, 14, 18) + (10, -300, 40)
+        support = mould(organ, np.array(gravity))
+
+        assert_sound(support)
+        assert len(support.faces) == pytest.approx(5000, abs=50)
+        assert 0.0 < least_gap(support, organ) < 0.35
+        down = np.array(gravity)
+        height = np.ptp(organ.vertices @ down)
+        bottom, top = (organ.vertices @ down).max(), (support.vertices @ down).min()
+        assert bottom - top == pytest.approx(0.35 * height, abs=0.1)
+        assert (support.vertices @ down).max() == pytest.approx(bottom + 8, abs=0.1)
+
+    def test_moulds_the_underside(self):
+        organ = trimesh.creation.icosphere(subdivisions=4, radius=20)
+        support = mould(organ, np.array([0, 0, -1]), clearance_mm=0.5)
+        # Polar angles up to 40 degrees lie in the mould, well inside of its filleted rim (at 73 degrees).
+        under = organ.vertices[organ.vertices[:, 2] < -20 * np.cos(np.radians(40))]
+        faces = np.asarray(support.faces, np.int64)
+        gap = igl.signed_distance(np.ascontiguousarray(under), np.asarray(support.vertices), faces)[0]
+        assert np.abs(gap - 0.5).max() < 0.15
+
+    def test_organ_can_be_lifted_out(self):
+        leaning = trimesh.creation.icosphere(subdivisions=4, radius=20)
+        leaning.vertices[:, 0] -= leaning.vertices[
+            :, 2
+        ]  # its lower end reaches far under the rim: an undercut
+        up = np.array([0.0, 0.0, 1.0])
+        support = mould(leaning, -up)
+        for lift in (1.0, 5.0, 20.0):
+            lifted = leaning.copy().apply_translation(lift * up)
+            assert least_gap(support, lifted) > 0
+
+    @pytest.mark.parametrize("gravity", [(0, 0, 0), (np.nan, 0, 1)])
+    def test_gravity_without_direction_is_refused(self, gravity):
+        with pytest.raises(ValueError, match="gravity"):
+            mould(trimesh.creation.icosphere(radius=30), np.array(gravity))

@@ -1,0 +1,75 @@
+"""The example of docs/adding-a-tissue-model.md is a tissue model: its code, taken from the page, does what every model must."""
+
+import re
+import sys
+from collections.abc import Iterator
+from importlib.util import module_from_spec, spec_from_file_location
+
+import numpy as np
+import pytest
+import taichi as ti
+import test_tissue_models as every
+from conftest import ROOT
+
+import scenes.tissue
+from rehearsal.configuration import setup_of
+from scenes.scene import Scene, SceneError, load_scene
+from sim.body import BodyState, ParticleBody, RestBody
+from sim.device import start
+from sim.solver import Solver, StepSettings
+
+PAGE = (ROOT / "docs" / "adding-a-tissue-model.md").read_text("utf-8")
+FILE, SECTION, TEST = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+MODEL = "mass-spring"
+
+
+@pytest.fixture(scope="module")
+def added(tmp_path_factory) -> Iterator[type]:
+    """Both pieces where the page has them go; the model's class."""
+    with pytest.MonkeyPatch.context() as patch:
+        path = tmp_path_factory.mktemp("sim") / "mass_spring.py"
+        path.write_text(FILE, "utf-8")
+        spec = spec_from_file_location("sim.mass_spring", path)
+        module = module_from_spec(spec)
+        patch.setitem(sys.modules, spec.name, module)
+        spec.loader.exec_module(module)
+        # Entered by its definition alone, and taken out again.
+        patch.setitem(scenes.tissue.TISSUES, MODEL, scenes.tissue.TissueSection)
+        exec(SECTION, dict(vars(scenes.tissue)))
+        start("cpu")
+        yield module.MassSpring
+        ti.reset()
+
+
+@pytest.fixture(scope="module")
+def laid(added) -> every.Subject:
+    return every.ball_of(MODEL, True)
+
+
+def test_a_scene_names_it_and_is_told_what_is_wrong(added, tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(f"[anatomy]\n[tissue]\nmodel = '{MODEL}'\nstiffness = 0.5", "utf-8")
+    scene = load_scene(path)
+    assert scene.tissue.stiffness == 0.5 and Scene.model_validate(scene.model_dump()) == scene
+    path.write_text(f"[anatomy]\n[tissue]\nmodel = '{MODEL}'\nradius_mm = 99", "utf-8")
+    with pytest.raises(SceneError, match=r"tissue.radius_mm = 99: input should be less than or equal to 20"):
+        load_scene(path)
+    assert setup_of(MODEL, iterations=7).substeps == 12
+
+
+def test_it_does_what_every_model_must(laid):
+    free = every.ball_of(MODEL, False)
+    for test in (every.test_it_tells_its_size, every.test_it_falls_as_all_things_do):
+        test(free)
+        free.solver.restore(free.built)
+    every.test_points_are_carried_as_the_body_is(free)
+    every.test_pressed_it_gives_way_and_comes_back(laid)
+    laid.solver.restore(laid.built)
+    every.test_a_restored_state_goes_on_with_the_same_bits(laid)
+
+
+def test_its_own_test_passes(added):
+    given = dict(BodyState=BodyState, MassSpring=added, ParticleBody=ParticleBody, RestBody=RestBody)
+    given |= dict(Solver=Solver, StepSettings=StepSettings, np=np, pytest=pytest)
+    exec(TEST, given)
+    given["test_a_pass_takes_a_spring_to_its_length_by_its_stiffness"]()

@@ -1,0 +1,187 @@
+"""Contacts of particles with each other: who is near, how a push is shared, and friction, against float64 oracles."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import taichi as ti
+import trimesh
+from test_particle_contact import begin
+from test_solver import position, solver_of
+
+from sim.fields import array_of, fill
+from sim.shapes import Plane
+from sim.solver import Solver, StepSettings
+
+
+def two_blocks(pairs: bool, scaling: float = 0.0, floor: bool = True) -> Solver:
+    """One block over another, on a floor."""
+    lower = trimesh.creation.box([12.0, 12.0, 8.0])
+    upper = lower.copy()
+    # Clusters reach 5 mm: nearer bodies would be held together by them.
+    upper.apply_translation([0, 0, 14.0])
+    shapes = [Plane(np.array([0.0, 0.0, 1.0]), -4.0)] * floor
+    both = trimesh.util.concatenate([lower, upper])
+    return solver_of(both, shapes, radius=1.5, scaling=scaling, pairs=pairs)
+
+
+def of_upper(solver: Solver) -> np.ndarray:
+    """Which particles (n,) are the upper block's."""
+    return solver.body.rest_points[:, 2] > 7
+
+
+def test_particles_that_share_no_cluster_keep_their_distance(kept):
+    height = {}
+    for pairs in (False, True):
+        solver = kept(two_blocks, pairs)
+        upper = of_upper(solver)
+        for _ in range(40):
+            solver.step(StepSettings(iterations=30))
+        x = position(solver)
+        height[pairs] = x[upper][:, 2].mean() - x[~upper][:, 2].mean()
+        if pairs:
+            # The lowest layer, a twelfth of the block, holds its weight, g h^2 = 0.3 mm a substep, in 30 passes that
+            # share each push between two: 0.3 * 12 / 30 * 2 mm short of the distance, at the averaged pushes.
+            assert np.linalg.norm(x[upper][:, None] - x[~upper][None], axis=2).min() > 0.75 * 1.5
+    assert height[True] == pytest.approx(8.0, abs=1.5)
+    assert height[False] < 4.0
+
+
+def test_contacts_of_particles_keep_momentum_of_a_symmetric_hit(kept):
+    solver = kept(two_blocks, True, floor=False)
+    upper = of_upper(solver)
+    velocity = np.where(upper[:, None], [0, 0, -150.0], [0, 0, 150.0])
+    fill((solver.body.velocity, velocity))
+    for _ in range(6):
+        solver.step(StepSettings(gravity=(0, 0, 0), damping=0.0))
+    v = array_of(solver.body.velocity).astype(float)
+    assert v[upper, 2].mean() > -20
+    assert v[~upper, 2].mean() < 20
+    # Averaging divides a particle's pushes by its own count: pairs of unlike counts leave a little over.
+    assert np.abs(v.sum(axis=0) - velocity.sum(axis=0)).max() < 0.1 * np.abs(velocity).sum()
+
+
+def test_neighbours_are_all_that_are_near_in_ascending_order(kept):
+    solver = kept(two_blocks, True)
+    upper = of_upper(solver)
+    x = position(solver)
+    x[upper, 2] -= 7.0
+    fill((solver.body.position, x))
+    begin(solver, [0.0, 0.0, 0.0])
+    count, rows = array_of(solver.pairs.neighbour_count), array_of(solver.pairs.neighbour)
+    apart = np.linalg.norm(x[:, None] - x[None], axis=2)
+    patches = solver.model.patches
+    of_patch = [set(patches.clusters.members[a:b]) for a, b in pairwise(patches.clusters.offsets)]
+    clusters = [of_patch[p] for p in patches.of_particles()]
+    for i in range(len(x)):
+        near = [
+            j
+            for j in np.flatnonzero(apart[i] < solver.pairs.reach)
+            if j != i and not clusters[i] & clusters[j]
+        ]
+        assert rows[i, : count[i]].tolist() == near[:24]
+    assert count.max() > 5
+
+
+def pairs_pass(solver: Solver, moved: np.ndarray, factor: float) -> tuple[np.ndarray, int, int]:
+    """Estimates (n, 3) after one pass over pairs in float64, and how many of these stick and slide."""
+    pairs, body = solver.pairs, solver.body
+    x = moved + array_of(body.position)
+    mass = array_of(body.mass_scale).astype(float) if body.mass_scaled else np.ones(len(x))
+    row, count = array_of(pairs.neighbour), array_of(pairs.neighbour_count)
+    change, touching, sticks, slides = np.zeros_like(x), np.zeros(len(x)), 0, 0
+    for i in range(len(x)):
+        for j in row[i, : count[i]]:
+            away = x[i] - x[j]
+            gap = np.linalg.norm(away)
+            depth = pairs.distance - gap
+            if depth > 0:
+                normal = away / gap if gap > 0 else np.array([0.0, 0.0, np.sign(i - j)])
+                slip = (np.eye(3) - np.outer(normal, normal)) @ (moved[i] - moved[j])
+                most = pairs.friction * depth
+                sticks, slides = (
+                    sticks + (np.linalg.norm(slip) < most),
+                    slides + (np.linalg.norm(slip) > most),
+                )
+                rubbed = slip * min(1.0, most / max(np.linalg.norm(slip), 1e-12))
+                change[i] += mass[j] / (mass[i] + mass[j]) * (depth * normal - rubbed)
+                touching[i] += 1
+    share = touching.max() if pairs.relax_globally else np.maximum(touching, 1)[:, None]
+    return x + factor * change / share, sticks, slides
+
+
+@pytest.mark.parametrize("relaxation, scaling", [("local", 0.0), ("global", 0.0), ("local", 0.5)])
+def test_a_pass_over_pairs_is_the_oracles(one_device, relaxation, scaling):
+    lower = trimesh.creation.box([9.0, 9.0, 6.0])
+    upper = lower.copy().apply_translation([0, 0, 12.0])
+    both = trimesh.util.concatenate([lower, upper])
+    solver = solver_of(both, radius=1.5, relaxation=relaxation, scaling=scaling, pairs=True)
+    body, pairs = solver.body, solver.pairs
+    x, random = position(solver), np.random.default_rng(5)
+    over = x[:, 2] > 6
+    x[over] -= [0.4, 0.3, 6.2]
+    # Two are at one place, and stay so.
+    x[x[:, 2].argmax()] = x[x[:, 2].argmin()]
+    top, bottom = np.flatnonzero((x == x[x[:, 2].argmin()]).all(axis=1))
+    moved = random.normal(0, 0.05, x.shape) * random.uniform(0, 1, (len(x), 1)) ** 3
+    moved[top] = moved[bottom]
+    fill((body.velocity, (moved / 0.01)))
+
+    @ti.kernel
+    def project():
+        pairs.project(1.3)
+
+    # The second time a particle has fewer contacts at most, and nothing is left of the first.
+    most = []
+    for lift, least in ((0.0, 10), (1.2, 1)):
+        x[over, 2] += lift
+        fill((body.position, x))
+        begin(solver, [0.0, 0.0, -1e-3], 0.01)
+        moved = array_of(body.estimate).astype(float) - array_of(body.position)
+        wanted, sticks, slides = pairs_pass(solver, moved, 1.3)
+        assert sticks > least and slides > least
+        project()
+        most.append(pairs.most_contacts[None])
+        # Float32 positions of 10 mm carry 1e-6 mm; a normal of two that are 1 mm apart, as much of its own.
+        assert np.abs(array_of(body.estimate) - wanted).max() < 1e-5
+    assert most[0] > most[1]
+
+
+def test_a_pair_shares_its_push_by_the_scaled_masses(kept):
+    solver = kept(two_blocks, True, scaling=0.5, floor=False)
+    upper = of_upper(solver)
+    x = position(solver)
+    x[upper, 2] -= 5.0
+    fill((solver.body.position, x))
+    begin(solver, [0.0, 0.0, -1e-3])
+    pairs = solver.pairs
+
+    @ti.kernel
+    def project():
+        pairs.project(1.0)
+
+    project()
+    moved = np.linalg.norm(array_of(solver.body.estimate) - x, axis=1)
+    apart = np.linalg.norm(x[upper][:, None] - x[~upper][None], axis=2) < pairs.distance
+    top, bottom = np.flatnonzero(upper), np.flatnonzero(~upper)
+    alone = [(i, j) for i, j in np.argwhere(apart) if apart[i].sum() == 1 and apart[:, j].sum() == 1]
+    assert len(alone) > 3
+    for i, j in alone:
+        # m ~ exp(-k h), each moves by the other's share of both.
+        height = x[top[i], 2] - x[bottom[j], 2]
+        assert moved[bottom[j]] / moved[top[i]] == pytest.approx(np.exp(-0.5 * height), rel=1e-3)
+
+
+def test_scaled_masses_make_the_lower_of_a_pair_the_heavier(kept):
+    moved = {}
+    for scaling in (0.0, 0.5):
+        solver = kept(two_blocks, True, scaling, floor=False)
+        upper = of_upper(solver)
+        start = position(solver)
+        start[upper, 2] -= 6.0
+        fill((solver.body.position, start))
+        solver.step(StepSettings(gravity=(0, 0, -1e-3), damping=0.0))
+        change = np.abs(position(solver) - start)[:, 2]
+        moved[scaling] = change[~upper].mean() / change[upper].mean()
+    assert moved[0.0] == pytest.approx(1.0, abs=0.3)
+    assert moved[0.5] < 0.6 * moved[0.0]

@@ -1,0 +1,221 @@
+"""A time step as Algorithm 1 has it: against closed forms, and the same bits every time."""
+
+import numpy as np
+import pytest
+from particle_tissue import tissue_of
+
+from sim.fields import array_of, fill
+from sim.self_contact import ParticleContacts
+from sim.shapes import ConvexTool, Plane, SignedDistanceField
+from sim.solver import Solver, StepSettings
+
+G = 9810.0
+
+
+def solver_of(
+    mesh,
+    shapes=(),
+    friction=0.35,
+    radius=2.0,
+    relaxation="local",
+    pairs=False,
+    scaling=0.0,
+    tool=None,
+    serial=None,
+):
+    model = tissue_of(mesh, radius, shapes, friction, relaxation, scaling, serial=serial)
+    particle_contacts = ParticleContacts(model, 0.25) if pairs else None
+    return Solver(model, particle_contacts, tool)
+
+
+def on_floor(mesh, height_mm: float, friction: float = 0.35) -> Solver:
+    """A body over a plane."""
+    return solver_of(mesh, [Plane(np.array([0.0, 0.0, 1.0]), height_mm)], friction)
+
+
+def in_bowl(mesh) -> Solver:
+    """A body in ``bowl``, which it slides in without friction."""
+    return solver_of(mesh, [bowl()], friction=0.0)
+
+
+def position(solver: Solver) -> np.ndarray:
+    return array_of(solver.body.position).astype(np.float64)
+
+
+@pytest.mark.parametrize("damping", [0.0, 12.0])
+def test_a_falling_body_falls_as_the_scheme_says(kept, block, damping):
+    solver = kept(solver_of, block)
+    settings = StepSettings(damping=damping, stiffness=0.9)
+    start_at = position(solver)
+    steps = 30
+    for _ in range(steps):
+        solver.step(settings)
+    h = settings.time_step_s / settings.substeps
+    velocity = fallen = 0.0
+    for _ in range(steps * settings.substeps):
+        velocity = velocity * np.exp(-damping * h) - G * h
+        fallen += h * velocity
+    moved = position(solver) - start_at
+    assert fallen < -200
+    # Each of n substeps rounds positions of up to 1300 mm (6e-5 mm) 9 times, at random; what is left over is a
+    # velocity that goes on, so the errors add up twice: to sqrt(n^3 / 3) of one.
+    n = steps * settings.substeps
+    assert np.abs(moved - [0, 0, fallen]).max() < 6e-5 * 9**0.5 * (n**3 / 3) ** 0.5
+
+
+def test_without_damping_the_scheme_is_first_order_in_the_exact_parabola(kept, block):
+    errors = []
+    for substeps in (2, 4):
+        solver = kept(solver_of, block)
+        z = position(solver)[:, 2].mean()
+        for _ in range(12):
+            solver.step(StepSettings(damping=0.0, substeps=substeps))
+        errors.append(position(solver)[:, 2].mean() - z + G * 0.2**2 / 2)
+    # Symplectic Euler is behind by g t h / 2.
+    assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.01)
+
+
+@pytest.mark.parametrize("relaxation", ["local", "global"])
+def test_linear_momentum_is_kept_without_contact_and_gravity(kept, block, relaxation):
+    solver = kept(solver_of, block, relaxation=relaxation)
+    x = position(solver)
+    velocity = np.cross([0.0, 2.0, 9.0], x) + 40 * np.sin(x[:, [1, 2, 0]]) + [100.0, 50.0, 20.0]
+    fill((solver.body.velocity, velocity))
+    for _ in range(10):
+        solver.step(StepSettings(gravity=(0, 0, 0), damping=0.0, stiffness=0.7))
+    later = array_of(solver.body.velocity).astype(np.float64)
+    # A cluster's frame rounds by three operations at 40 mm (4e-6 mm), for all its members and the nine passes of a
+    # substep alike; over clusters and the thirty substeps it adds at random.
+    spread = solver.body.count / solver.model.count**0.5
+    rounding = 4e-6 * 180 * spread * 9 * 30**0.5
+    assert np.abs(velocity.sum(axis=0)).max() > 1000 * rounding
+    assert np.abs(later.sum(axis=0) - velocity.sum(axis=0)).max() < 3 * rounding
+
+
+def test_angular_momentum_is_kept_to_the_order_of_the_scheme(kept, block):
+    turning, steps, time_step = 10.0, 8, 1 / 60
+    lost = []
+    for substeps in (4, 8):
+        solver = kept(solver_of, block)
+        x = position(solver)
+        velocity = np.cross([0.0, 0.0, turning], x - x.mean(axis=0))
+        fill((solver.body.velocity, velocity))
+        for _ in range(steps):
+            solver.step(StepSettings(gravity=(0, 0, 0), damping=0.0, stiffness=1.0, substeps=substeps))
+        y, v = position(solver), array_of(solver.body.velocity).astype(np.float64)
+        before = np.cross(x - x.mean(axis=0), velocity)[:, 2].sum()
+        lost.append(1 - np.cross(y - y.mean(axis=0), v)[:, 2].sum() / before)
+    # From 2 x - x_before the projection turns by w h (1 - (w h)^2): that much is lost a substep, h w^2 t in all.
+    wanted = [time_step / substeps * turning**2 * steps * time_step for substeps in (4, 8)]
+    assert lost == pytest.approx(wanted, rel=0.25)
+
+
+def test_stiffness_one_moves_a_small_body_rigidly(one_device):
+    import trimesh
+
+    # A ball of one cluster: nothing in it can deform.
+    solver = solver_of(trimesh.creation.icosphere(subdivisions=2, radius=4.0), radius=2.0)
+    assert solver.model.count <= 3
+    before = position(solver)
+    fill((solver.body.velocity, np.random.default_rng(0).normal(0, 200, before.shape)))
+    for _ in range(5):
+        solver.step(StepSettings(stiffness=1.0, gravity=(0, 0, 0)))
+    after = position(solver)
+    pairs = np.triu_indices(len(before), 1)
+    lengths = [np.linalg.norm(x[pairs[0]] - x[pairs[1]], axis=1) for x in (before, after)]
+    assert np.abs(lengths[0] - lengths[1]).max() < 1e-4
+
+
+def slide(kept, block, slope_deg: float, friction: float = 0.35) -> tuple[float, float]:
+    """Acceleration down a slope over 0.2 s, as a share of g, and the speed then [mm/s]; it starts from rest."""
+    angle = np.radians(slope_deg)
+    solver = kept(on_floor, block, -8.0, friction)
+    settings = StepSettings(
+        gravity=(G * np.sin(angle), 0.0, -G * np.cos(angle)), damping=0.0, stiffness=1.0, iterations=30
+    )
+    speeds = []
+    for steps in (8, 12):
+        for _ in range(steps):
+            solver.step(settings)
+        speeds.append(array_of(solver.body.velocity).astype(float)[:, 0].mean())
+    return (speeds[1] - speeds[0]) / 0.2 / G, speeds[1]
+
+
+def test_sliding_starts_at_the_friction_angle(kept, block):
+    critical = np.degrees(np.arctan(0.35))
+    # Without friction either slope would give it more than 1000 mm/s by then.
+    assert abs(slide(kept, block, critical - 0.5)[1]) < 5.0
+    assert slide(kept, block, critical + 0.5)[1] > 10.0
+
+
+@pytest.mark.parametrize("slope_deg", [25.0, 35.0])
+def test_beyond_it_the_block_accelerates_by_coulombs_law(kept, block, slope_deg):
+    angle = np.radians(slope_deg)
+    wanted = np.sin(angle) - 0.35 * np.cos(angle)
+    # The block rocks and settles while it slides: 5 %.
+    assert slide(kept, block, slope_deg)[0] == pytest.approx(wanted, rel=0.05)
+
+
+def test_without_friction_a_slope_holds_nothing(kept, block):
+    assert slide(kept, block, 10.0, friction=0.0)[0] == pytest.approx(np.sin(np.radians(10)), rel=0.02)
+
+
+@pytest.mark.parametrize("serial", [True, False])
+def test_the_tool_goes_along_its_poses_and_stays_where_it_came_to(kept, block, serial):
+    tool = ConvexTool.cuboid(np.array([4.0, 4.0, 4.0]))
+    solver = solver_of(block, [tool], tool=tool, serial=serial)
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, :3, 3] = 30.0 + np.array([[0.0], [0.5], [1.5], [3.5]]) * [1.0, -2.0, 3.0]
+    for given, motion in ((poses, [2.0, -4.0, 6.0]), (None, [0.0] * 3)):
+        solver.step(StepSettings(substeps=3, iterations=1), given)
+        assert np.array_equal(array_of(tool.pose), poses[-1].astype(np.float32))
+        # Back to where it was a substep before.
+        assert array_of(tool.step_back)[:3, 3] == pytest.approx(-np.array(motion), abs=1e-5)
+
+
+def test_sliding_over_a_curved_surface_does_not_sink_in(kept, ball):
+    solver = kept(in_bowl, ball)
+    radius = array_of(solver.body.contact_radius).astype(float)
+    deepest, first = 0.0, position(solver)
+    for step in range(30):
+        angle = 0.1 * step
+        solver.step(StepSettings(gravity=(G * np.sin(angle), 0.0, -G * np.cos(angle)), damping=0.0))
+        deepest = max(deepest, (np.linalg.norm(position(solver), axis=1) + radius - 13.0).max())
+    assert np.linalg.norm(position(solver) - first, axis=1).max() > 1.5
+    # The grid's own distances are off by spacing^2 / 8 times the two curvatures 1 / r, r > 10 mm, towards the inside.
+    assert deepest < 1 / 8 * 2 / 10 + 1e-3
+
+
+def bowl() -> SignedDistanceField:
+    """Distances to the inside of a ball of 13 mm, in which one of 12 mm rolls."""
+    x, y, z = np.meshgrid(*[np.arange(-20.0, 21.0)] * 3, indexing="ij")
+    distance = 13.0 - np.sqrt(x**2 + y**2 + z**2)
+    return SignedDistanceField(distance, np.full(3, -20.0), np.ones(3))
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 9, 10])
+@pytest.mark.parametrize("factor", [1.0, 1.5, 2.0])
+def test_over_relaxation_is_stable(kept, ball, iterations, factor):
+    solver = kept(on_floor, ball, -12.0)
+    settings = StepSettings(stiffness=1.0, iterations=iterations, relaxation_factor=factor, damping=0.0)
+    for _ in range(40):
+        solver.step(settings)
+    assert np.abs(position(solver)).max() < 40
+    assert np.abs(array_of(solver.body.velocity)).max() < 2000
+
+
+def test_over_relaxation_converges_faster(kept, ball):
+    sag = []
+    for factor in (1.0, 1.8):
+        solver = kept(on_floor, ball, -12.0)
+        for _ in range(60):
+            solver.step(StepSettings(stiffness=1.0, relaxation_factor=factor, iterations=5))
+        sag.append(24.0 - np.ptp(position(solver)[:, 2]))
+    assert sag[1] < 0.8 * sag[0]
+
+
+def test_what_a_scene_switches_off_is_not_there(kept, block):
+    solver = kept(solver_of, block)
+    assert not hasattr(solver.body, "mass_scale") and solver.contacts is None and solver.pairs is None
+    assert hasattr(solver_of(block, scaling=0.1).body, "mass_scale")
+    assert not hasattr(kept(on_floor, block, -8.0, 0.0).contacts, "push")

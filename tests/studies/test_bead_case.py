@@ -1,0 +1,140 @@
+"""Case folders: what is read, and what is refused, in which words."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import rotation_about
+from small_bead_case import DEPTHS, beads, values, write_case
+
+from studies.accuracy.bead_case import CaseError, load_case
+
+
+def refused(folder: Path) -> str:
+    with pytest.raises(CaseError) as error:
+        load_case(folder)
+    assert "\n" not in str(error.value) and str(folder) in str(error.value)
+    return str(error.value)
+
+
+def changed(path: str, value) -> dict:
+    """The values of a case with one of them changed, or left out where the value is ``None``."""
+    case = values()
+    at = case
+    *way, last = [int(part) if part.isdigit() else part for part in path.split(".")]
+    for part in way:
+        at = at[part]
+    if value is None:
+        del at[last]
+    else:
+        at[last] = value
+    return case
+
+
+def test_a_case_is_read_as_it_was_written(tmp_path):
+    turned = rotation_about([0, 0, 1], 30)
+    case = load_case(write_case(tmp_path / "a", changed("probe.rotation", turned.tolist())))
+    assert case.name == "ball" and case.organ.is_watertight and case.support.is_watertight
+    assert np.array_equal(case.beads, beads()[0]) and np.array_equal(case.measured, beads()[1:])
+    assert case.indentation_mm.tolist() == list(DEPTHS)
+    assert np.array_equal(case.poses[2, :3, :3], turned) and case.poses[2, :3, 3].tolist() == [0, 0, 13.0]
+    assert case.gravity.tolist() == [0, 0, -9810.0] and case.friction == 0.35
+    assert (case.young_kpa, case.poisson, case.density_kg_m3) == (15.0, 0.45, 1050.0)
+    assert case.size_mm.tolist() == [16, 8, 10] and case.edge_radius_mm == 1.0
+
+
+def test_a_laboratory_without_material_values_brings_its_own_case(tmp_path):
+    case = load_case(write_case(tmp_path, changed("material", None)))
+    assert (case.young_kpa, case.poisson, case.density_kg_m3) == (None, None, None)
+
+
+def test_a_stage_may_have_the_probe_turned(tmp_path):
+    turned = rotation_about([1, 0, 0], 5)
+    case = load_case(write_case(tmp_path, changed("stage.1.rotation", turned.tolist())))
+    assert np.array_equal(case.poses[1, :3, :3], turned) and np.array_equal(case.poses[2, :3, :3], np.eye(3))
+
+
+def test_the_digest_tells_contents_apart(tmp_path):
+    one, same = load_case(write_case(tmp_path / "a")), load_case(write_case(tmp_path / "b"))
+    other = load_case(write_case(tmp_path / "c", places=beads() * [1, 1, 0.999]))
+    assert one.digest == same.digest != other.digest
+
+
+@pytest.mark.parametrize(
+    "path, value, words",
+    [
+        ("probe", None, "probe: missing; correct it there"),
+        ("stage.1.position", None, "stage.1.position: missing"),
+        ("units.length", "cm", "units.length = 'cm': input should be 'mm'"),
+        ("units.acceleration", "mm/s^2", "units.acceleration = 'mm/s^2': input should be 'm/s^2'"),
+        ("material.young_MPa", 0.015, "young_MPa: the unit is in the key; write young_kPa"),
+        ("stage.1.indentation_cm", 0.2, "indentation_cm: the unit is in the key; write indentation_mm"),
+        ("material.young_kPa", "15 kPa", "material.young_kPa = '15 kPa': input should be a valid number"),
+        ("material.young_kPa", float("nan"), "material.young_kPa = nan: input should be a finite number"),
+        ("material.poisson", 0.5, "material.poisson = 0.5: input should be less than 0.5"),
+        ("material.density", 1.05, "material.density = 1.05: input should be greater than or equal to 100"),
+        ("gravity.direction", [0, 0, 0], "a direction must not be zero"),
+        ("contact.friction_on_probe", False, "contact.friction_on_probe = False: input should be True"),
+        ("probe.shape", "sphere", "probe.shape = 'sphere': input should be 'cuboid'"),
+        ("probe.size_mm", [40.0, 10.0], "probe.size_mm = [40.0, 10.0]: tuple should have at least 3 items"),
+        ("probe.edge_radius_mm", 4.5, "edge_radius_mm is 4.5: expected at most half"),
+        ("probe.rotation", [[2, 0, 0], [0, 1, 0], [0, 0, 1]], "expected a rotation matrix"),
+        ("probe.rotation", [[-1, 0, 0], [0, 1, 0], [0, 0, 1]], "expected a rotation matrix"),
+        ("stage.1.index", 2, "stage 1 has index 2: list the stages in order, from 0"),
+        ("stage.0.indentation_mm", 1.0, "stage 0 has indentation_mm 1: expected 0"),
+        ("stage.2.indentation_mm", 2.0, "stage 2 has indentation_mm 2: expected more than 2"),
+        ("stage.1.position", [0, 0, 17], "its position is 0.00 mm from stage 0's along press_direction"),
+        ("stage", [], "tuple should have at least 2 items"),
+        ("format_version", 2, "format_version = 2: input should be 1"),
+        ("files", {"kidney": "none.stl"}, "no such surface file"),
+    ],
+)
+def test_a_wrong_case_is_refused_by_name(tmp_path, path, value, words):
+    assert words in refused(write_case(tmp_path, changed(path, value)))
+
+
+def test_a_folder_that_is_no_case_is_refused(tmp_path):
+    assert "holds no case.toml" in refused(tmp_path)
+    (tmp_path / "case.toml").write_text("[units\n")
+    assert "not valid TOML" in refused(tmp_path)
+    (tmp_path / "case.toml").write_bytes(b"\xff\xfe")
+    assert "cannot be read" in refused(tmp_path)
+
+
+def test_an_open_surface_is_refused(tmp_path):
+    folder = write_case(tmp_path)
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=12.0)
+    trimesh.Trimesh(mesh.vertices, mesh.faces[:-3]).export(folder / "kidney.stl")
+    assert "kidney.stl: is not a closed surface" in refused(folder)
+
+
+@pytest.mark.parametrize(
+    "old, new, words",
+    [
+        ("x2,", "q2,", "column x2 is missing; expected x to z2 for 3 stages"),
+        (None, "", "holds no beads"),
+        ("\n1,", "\n1,nan,", "line 3, x is 'nan': expected a finite number"),
+        ("\n1,", "\n1,here,", "line 3, x is 'here': expected a finite number"),
+    ],
+)
+def test_a_wrong_table_of_beads_is_refused(tmp_path, old, new, words):
+    table = write_case(tmp_path) / "beads.csv"
+    text = table.read_text()
+    table.write_text(text.replace(old, new) if old else new)
+    assert words in refused(tmp_path)
+
+
+def test_a_short_line_is_refused(tmp_path):
+    table = write_case(tmp_path) / "beads.csv"
+    table.write_text(table.read_text().rstrip().rsplit(",", 1)[0])
+    assert "line 13, z2 is None" in refused(tmp_path)
+
+
+def test_beads_elsewhere_are_refused(tmp_path):
+    places = beads()
+    places[0, 4] = [0, 0, 14.0]
+    assert "the bead on line 6 is 2.0" in refused(write_case(tmp_path / "outside", places=places))
+    places = beads()
+    places[2, 5] *= 1000
+    assert "the bead on line 7 is" in refused(write_case(tmp_path / "metres", places=places))

@@ -1,0 +1,222 @@
+"""The tables of a run against arithmetic done by hand, and the run that they are of."""
+
+import json
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from conftest import rotation_about
+from small_bead_case import DEPTHS, beads, values, write_case
+
+from app import cli, main
+from rehearsal.build_solver import step_settings
+from rehearsal.configuration import PRESETS, SetupError, choose_setup, setup_of
+from scenes.scene import SolverSection
+from scenes.tissue import QUALITIES, TISSUES
+from sim.fields import array_of
+from studies.accuracy.bead_case import Case, load_case
+from studies.accuracy.bead_errors import (
+    bead_errors,
+    correlation,
+    null_errors,
+    probe_distances,
+    report,
+    stage_figures,
+    summary,
+    table,
+)
+from studies.accuracy.bead_experiment import Experiment, Run
+
+KEYS = {
+    "case",
+    "model",
+    "radius_mm",
+    "particles",
+    "substeps",
+    "iterations",
+    "time_step_s",
+    "stages",
+    "overall_mean_mm",
+    "ms_per_step",
+    "distance_correlation",
+    "finite",
+}
+COARSE = setup_of("shape-matching", radius_mm=3.0)
+BRIEF = setup_of("shape-matching", radius_mm=3.0, warm_up_steps=12, stage_steps=9)
+
+
+@pytest.fixture
+def case(tmp_path) -> Case:
+    return load_case(write_case(tmp_path / "ball"))
+
+
+def test_figures_of_a_stage_by_hand():
+    errors = np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 2.0, 3.0, 6.0]])
+    null = np.array([[0.0, 0.0, 0.0, 0.0], [2.0, 2.0, 4.0, 4.0]])
+    first, second = stage_figures(np.array([0.0, 10.0]), errors, null)
+    assert first == dict(
+        indentation_mm=0, mean_mm=1, sd_mm=0, max_mm=1, percent_of_travel=None, null_mean_mm=0
+    )
+    # Mean 3, deviations -2, -1, 0 and 3.
+    assert second.pop("sd_mm") == pytest.approx((14 / 4) ** 0.5, abs=1e-6)
+    assert second == dict(indentation_mm=10, mean_mm=3, max_mm=6, percent_of_travel=30, null_mean_mm=3)
+
+
+def test_errors_are_distances_and_the_null_model_stays_at_stage_0(case):
+    shifted = case.measured + [3.0, 0.0, -4.0]
+    assert bead_errors(case, shifted) == pytest.approx(np.full((3, 12), 5.0))
+    rest = beads()[0]
+    way = np.sqrt((rest[:, 0] / 6) ** 2 + (rest[:, 1] / 6) ** 2 + (1 + rest[:, 2] / 6) ** 2)
+    assert null_errors(case) == pytest.approx(np.outer(DEPTHS, way) / 12)
+    assert bead_errors(case, np.broadcast_to(case.measured[0], case.measured.shape)) == pytest.approx(
+        null_errors(case)
+    )
+
+
+def test_correlation_is_pearsons_and_none_of_what_does_not_vary():
+    random = np.random.default_rng(5)
+    a = random.normal(size=(3, 20))
+    b = a + random.normal(size=(3, 20))
+    assert correlation(a, b) == pytest.approx(np.corrcoef(a.ravel(), b.ravel())[0, 1], abs=1e-6)
+    assert correlation(a, 1 - 2 * a) == -1
+    assert correlation(a, np.ones_like(a)) is None
+
+
+def test_distance_from_the_probe_is_that_of_the_rounded_cuboid_at_its_pose(case):
+    turn = rotation_about([0, 0, 1], 90)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, [1.0, 2.0, 3.0]
+    local = np.array([[10.0, 0, 0], [0, -7.0, 0], [0, 0, 0], [8.0, 4.0, 5.0]])
+    placed = replace(case, poses=pose[None], measured=(local @ turn.T + pose[:3, 3])[None])
+    # Half sizes 8, 4 and 5, edges of 1: beyond a face, beyond a face, inside, at a corner that is rounded off.
+    assert probe_distances(placed)[0] == pytest.approx([2, 3, -4, 3**0.5 - 1])
+
+
+def test_report_and_table_show_these_figures(device, case):
+    experiment = Experiment(case, COARSE)
+    off = np.linspace(0, 1, 12)[:, None] * np.array([0.0, 0.0, 1.0])
+    run = Run(case.measured + off, step_ms=[1.0, 2.0, 6.0])
+    figures = report(experiment, COARSE, run)
+    assert set(figures) == KEYS | {"clusters", "memberships"} and figures["case"] == "ball"
+    assert figures["overall_mean_mm"] == pytest.approx(0.5)
+    assert figures["ms_per_step"]["median"] == 2 and figures["ms_per_step"]["mean"] == 3
+    distances = probe_distances(case)[1:].ravel()
+    expected = np.corrcoef(distances, np.tile(np.linspace(0, 1, 12), 2))[0, 1]
+    assert figures["distance_correlation"] == pytest.approx(expected, abs=1e-6)
+    rows = table(case, run.beads).splitlines()
+    null = null_errors(case).mean(axis=1)
+    assert rows[2].split() == [
+        *["1", "2.00", "mm", "0.50", "25", "%", "0.31", "1.00", f"{null[1]:.2f}", f"{0.5 / null[1]:.2f}"],
+        f"{np.corrcoef(probe_distances(case)[1], off[:, 2])[0, 1]:.2f}",
+    ]
+    assert rows[4].split() == ["all", "0.50", "1.00", f"{null.mean():.2f}", f"{0.5 / null.mean():.2f}"]
+    assert sum(int(row.split("(")[1].split()[0]) for row in rows if "bead positions" in row) == 24
+    # What is not finite is said, and is valid JSON.
+    lost = Run(np.full_like(case.measured, np.nan), [1.0], finite=False)
+    figures = report(experiment, COARSE, lost)
+    assert figures["finite"] is False and figures["overall_mean_mm"] is None
+    json.dumps(figures, allow_nan=False)
+    assert "NOT FINITE" in summary(figures, experiment.describe(COARSE)) and "-" in table(case, lost.beads)
+
+
+def test_the_probe_waits_above_then_goes_to_each_stage_and_rests_there_wherever_the_case_is(device, case):
+    far = np.array([100.0, -200.0, 1000.0])
+    organ, support = (mesh.copy().apply_translation(far) for mesh in (case.organ, case.support))
+    poses = case.poses + np.pad(far[:, None], ((0, 1), (3, 0)))
+    moved = replace(case, organ=organ, support=support, beads=case.beads + far, poses=poses)
+    experiment = Experiment(moved, COARSE)
+    seen = []
+    experiment.solver.step = lambda settings, poses: seen.append(poses)
+    run = experiment.run(COARSE)
+    assert np.abs(array_of(experiment.body.position)).max() < 12.0
+    assert run.beads[0] == pytest.approx(moved.beads, abs=1e-4)
+    ends = np.array([poses[-1] for poses in seen])
+    assert len(ends) == 120 + 3 * 90 == 120 + len(run.step_ms)
+    assert np.array_equal(np.concatenate([seen[0][:1], ends[:-1]]), [poses[0] for poses in seen])
+    lowest = ends[:, 2, 3] - case.size_mm[2] / 2
+    assert (lowest[:120] > 40).all()
+    way = np.diff(lowest[119:])
+    assert way[:60] == pytest.approx(way[0]) and way[90:150] == pytest.approx(-2.0 / 60)
+    for stage, depth in enumerate(DEPTHS):
+        assert lowest[120 + stage * 90 + 59 : 120 + (stage + 1) * 90] == pytest.approx(12.0 - depth)
+
+
+def test_a_pressed_ball_sinks_the_same_every_time_whatever_ran_between(device, case):
+    experiment = Experiment(case, COARSE)
+    first = experiment.run(BRIEF)
+    other = experiment.run(BRIEF.but(stiffness=0.4, iterations=5))
+    again = experiment.run(BRIEF)
+    assert np.array_equal(first.beads, again.beads) and not np.array_equal(first.beads, other.beads)
+    sunk = (first.beads - case.beads)[:, :, 2].mean(axis=1)
+    # It falls by the 0.2 mm of play at least, and by less than 1 mm; pressed 4 mm, beads sink by some of that.
+    assert first.finite and -1.0 < sunk[0] < -0.15 and -3.0 < sunk[2] - sunk[0] < -0.3
+
+
+def test_presets_differ_in_radius_alone_and_options_change_them():
+    radii = [PRESETS["shape-matching"][quality].size_mm for quality in QUALITIES]
+    assert radii == [3.3, 2.7, 2.2]
+    assert choose_setup("shape-matching", "fast") == setup_of("shape-matching", radius_mm=3.3)
+    assert choose_setup("shape-matching", "fast", stiffness=0.5, radius_mm=None) == setup_of(
+        "shape-matching", radius_mm=3.3, stiffness=0.5
+    )
+    with pytest.raises(SetupError, match="--young-kpa: shape-matching has no such setting"):
+        choose_setup("shape-matching", "fast", young_kpa=15.0)
+
+
+@pytest.mark.parametrize("model", PRESETS)
+def test_a_scene_is_rehearsed_as_balanced_is_validated(model):
+    balanced = choose_setup(model, "balanced")
+    tissue = TISSUES[model].model_validate({"model": model})
+    stepped = step_settings(tissue, SolverSection())
+    for name in ("time_step_s", "substeps", "iterations", "relaxation_factor"):
+        assert getattr(balanced, name) == getattr(stepped, name)
+    assert balanced.tissue == tissue
+
+
+def test_validate_twice_prints_and_writes_the_same_but_for_times(monkeypatch, tmp_path):
+    brief = partial(choose_setup, warm_up_steps=12, stage_steps=9)
+    monkeypatch.setattr("studies.accuracy.accuracy_commands.choose_setup", brief)
+    folder = write_case(tmp_path / "ball")
+    reports = []
+    for name in ("a.json", "new/b.json"):
+        arguments = ["validate", folder, "--cell", 5, "--arch", "cpu", "--json", tmp_path / name]
+        done = CliRunner().invoke(cli, [str(argument) for argument in arguments])
+        assert done.exit_code == 0 and "1/60 s in 1 substep of 4 iterations" in done.output
+        reports.append(json.loads((tmp_path / name).read_text()))
+    times = [figures.pop("ms_per_step") for figures in reports]
+    assert times[0].keys() == {"mean", "sd", "min", "max", "median"}
+    assert reports[0] == reports[1] and reports[0]["finite"] and reports[0]["cell_mm"] == 5
+
+
+def test_validate_says_mistakes_in_one_line(tmp_path, capsys):
+    def refused(*arguments) -> str:
+        assert main(["validate", *map(str, arguments)]) == 2
+        line = capsys.readouterr().err.strip()
+        assert line.startswith("nephron: ") and "\n" not in line
+        return line
+
+    folder = write_case(tmp_path / "ball")
+    assert "holds no case.toml" in refused(tmp_path)
+    assert "--model" in refused(folder, "--model", "clay")
+    assert "--quality" in refused(folder, "--quality", "best")
+    assert "--poisson" in refused(folder, "--poisson", 0.5)
+    assert "has no such setting" in refused(folder, "--radius", 3, "--cell", 4)
+    shape_matching = [folder, "--model", "shape-matching"]
+    assert "has no such setting" in refused(*shape_matching, "--young-kpa", 15)
+    assert "choose a smaller radius" in refused(*shape_matching, "--radius", 20, "--arch", "cpu")
+    assert "is a folder" in refused(folder, "--json", tmp_path)
+    assert "choose another --json" in refused(folder, "--json", folder / "case.toml" / "a.json")
+    write_case(tmp_path / "ball", values() | {"stage": []})
+    assert "stage" in refused(folder)
+
+
+def test_a_real_case_is_pressed(device, data):
+    case = load_case(data / "truth" / "bean")
+    assert case.measured.shape == (4, 45, 3) and case.young_kpa == 15.0
+    # The README of the truth names these displacements.
+    assert null_errors(case).mean(axis=1) == pytest.approx([0, 0.86, 1.45, 1.96], abs=0.006)
+    setup = BRIEF.but(radius_mm=6.0)
+    run = Experiment(case, setup).run(setup)
+    assert run.finite and 0.3 < bead_errors(case, run.beads).mean() < 2.0

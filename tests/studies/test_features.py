@@ -1,0 +1,118 @@
+"""A scene pays only for what it declares: what is off is neither compiled nor allocated; and a soak ends as it began."""
+
+import functools
+import json
+
+import pytest
+import taichi as ti
+from PIL import Image
+from small_bead_case import briefly, small_anatomy
+
+import app
+from rehearsal.configuration import PRESETS, setup_of
+from scenes.scene import PAPER, load_scene
+from sim.particle_contact import ShapeContacts
+from sim.self_contact import ParticleContacts
+from sim.shape_matching import ShapeMatching
+from sim.shapes import ConvexTool, SignedDistanceField
+from sim.surface_contact import SurfaceContacts
+from studies.performance import feature_costs, features_command
+from studies.performance.step_timing import memory_mb
+from studies.robustness import soak as soak
+
+SIZES = {"neo-hookean": 6.0, "shape-matching": 4.0}
+# What only the feature has kernels use.
+OWN = {
+    "contact with the support": [(SignedDistanceField, "surface"), (SignedDistanceField, "room")],
+    "the transducer": [(ConvexTool, "surface"), (ConvexTool, "motion")],
+    "friction on shapes": [(SurfaceContacts, "bent"), (ShapeContacts, "rub")],
+    "contacts of particles": [(ParticleContacts, "find"), (ParticleContacts, "project")],
+    "scaled masses": [(ShapeMatching, "weigh_patches"), (ShapeMatching, "weigh_clusters")],
+}
+# Options, and the features that none of them has.
+WITHOUT = (
+    (
+        feature_costs.Options(support=False, transducer=False),
+        ("contact with the support", "the transducer", "friction on shapes"),
+    ),
+    (
+        feature_costs.Options(shape_friction=0.0),
+        ("friction on shapes", "contacts of particles", "scaled masses"),
+    ),
+)
+
+
+def body_of(model: str) -> feature_costs.Body:
+    return feature_costs.body_of(load_scene(PAPER), small_anatomy(), model, SIZES[model])
+
+
+@pytest.mark.parametrize("model", list(feature_costs.FEATURES))
+@pytest.mark.filterwarnings("ignore:.*Calling non-taichi function:SyntaxWarning")
+def test_what_is_off_is_not_compiled_and_not_allocated(device, monkeypatch, model):
+    body = body_of(model)
+    # Where one solver serves two features, what the first needs is what it has not compiled yet.
+    solver_of = functools.cache(body.solver)
+
+    def compiled(*_):
+        raise AssertionError("compiled")
+
+    for feature in feature_costs.FEATURES[model]:
+        if feature.name in OWN:
+            on, off = solver_of(feature.having), solver_of(feature.without)
+            assert memory_mb(off) < memory_mb(on), feature.name
+            with monkeypatch.context() as forbidden:
+                for owner, name in OWN[feature.name]:
+                    forbidden.setattr(owner, name, compiled)
+                with pytest.raises(ti.TaichiCompilationError, match="compiled"):
+                    on.step(body.settings, body.poses(on, 0))
+    for options, names in WITHOUT:
+        off = solver_of(options)
+        with monkeypatch.context() as forbidden:
+            for owner, method in [part for name in names for part in OWN[name]]:
+                forbidden.setattr(owner, method, compiled)
+            off.step(body.settings, body.poses(off, 0))
+
+
+def test_kernels_are_counted_where_a_step_is_parallel(device):
+    body = body_of("shape-matching")
+    base = feature_costs.kernels_of(body, feature_costs.BASE, "cpu")
+    # Every iteration launches its own kernels.
+    assert base["launches"] > body.settings.substeps * body.settings.iterations
+    assert base["launches"] > base["kernels"] > 10
+
+
+def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(features_command, "load_patient", lambda _: (briefly(20), small_anatomy()))
+    monkeypatch.setattr(feature_costs, "SETTLE_STEPS", 3)
+    monkeypatch.setattr(feature_costs, "PRESS_STEPS", 3)
+    monkeypatch.setitem(feature_costs.FEATURES, "neo-hookean", feature_costs.EVERYWHERE[2:])
+    assert app.main(["study", "features", "--quick", "--out", str(tmp_path)]) == 0
+    rows = json.loads((tmp_path / "features.json").read_text())["features"]
+    assert [row["feature"] for row in rows] == [
+        "friction on shapes",
+        "guard",
+        "organ's surface",
+    ]
+    for row in rows:
+        assert row["mb_on"] > row["mb_off"] and row["ms_on"] > 0
+    assert (tmp_path / "features.csv").is_file()
+    assert Image.open(tmp_path / "features.png").size[0] > 1000
+    assert "what is off" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "setup",
+    [PRESETS["neo-hookean"]["fast"], setup_of("shape-matching", radius_mm=4.0)],
+    ids=lambda setup: setup.model,
+)
+def test_a_soak_ends_where_it_began_and_replays(setup, monkeypatch):
+    monkeypatch.setattr(soak, "REST_S", 3.0)
+    monkeypatch.setattr(soak, "REPLAYED_MINUTES", 1)
+    told = []
+    found = soak.soak(briefly(60), small_anatomy(), setup, 2, 5.0, "cpu", lambda: told.append(1))
+    assert len(found["minutes"]) == 2 and len(told) == 3
+    assert found["replay_equal"] and found["reset_equal"] and found["fallbacks"] == 0
+    for row in found["minutes"]:
+        assert row["finite"] and row["shape_mm"] < 1.0 and abs(row["volume_ratio"] - 1) < 0.1
+    assert found["minutes"][0]["moved_mm"] != found["minutes"][1]["moved_mm"]
+    ti.reset()

@@ -1,0 +1,143 @@
+"""``study stability`` maltreats what it says, measures it from where it lay, and says why a body is not back."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from conftest import rotation_about
+from PIL import Image
+
+import app
+from studies.robustness import stability_command, stress_bodies, stress_test
+from studies.robustness.rigid_fit import apart_after_fit
+from studies.robustness.stability_figure import FATES, fate_of
+from studies.robustness.stress_cases import MODELS, Case, Subject, cases_of, quick_cases_of
+from studies.robustness.stress_motion import PROBES, STATES
+from ultrasound.probe_manipulator import advanced
+
+ONE = Subject("one")
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_the_cases_are_many_and_each_is_another(model):
+    cases = cases_of(model)
+    assert len(cases) > 300
+    assert len({case.name for case in cases}) == len(cases)
+    assert {case.probe[0] for case in cases} == set(PROBES)
+    assert {case.state[0] for case in cases} == set(STATES)
+    steps = [case.settings.get("time_step_s", 1 / 60) for case in cases]
+    assert (min(steps), max(steps)) == (1e-4, 1.0)
+    assert {case.settings.get("iterations") for case in cases} >= {1, 100}
+    assert {case.gravity for case in cases} >= {0.0, 1000.0}
+    assert {case.subject.size_mm for case in cases} >= {1.0, 10.0}
+    assert max(max(case.heaviest, case.subject.mass_ratio) for case in cases) == 1e6
+    kinds = {case.kind for case in cases if case.subject == stress_bodies.Subject("kidney")}
+    assert {case.kind for case in quick_cases_of(model)} == kinds | {"one alone"}
+
+
+def test_bodies_start_and_transducers_move_as_their_names_say():
+    x = np.random.default_rng(0).normal(size=(50, 3))
+    up, home = np.array([0.0, 0.0, 1.0]), np.eye(4)
+    assert np.ptp(STATES["scaled"](x, up, 1.0, 1.0, 0.0)[0][:, 2]) == 0
+    mirrored = STATES["scaled"](x, up, -1.0, 1.0, 1.0)[0]
+    assert mirrored - x.mean(axis=0) == pytest.approx((x - x.mean(axis=0)) * [-1, 1, 1])
+    turning = STATES["turning"](x, up, 2, 10.0)[1]
+    assert turning == pytest.approx(np.cross([0, 0, 10.0], x - x.mean(axis=0)))
+    two = np.concatenate([x - [9, 0, 0], x + [9, 0, 0]])
+    wholly = STATES["overlapped"](two, up, 1.0)[0]
+    assert wholly[50:].mean(axis=0) == pytest.approx(wholly[:50].mean(axis=0))
+    press = PROBES["press"](home, 30.0, 1 / 60, 12.0)
+    assert press(0.0) == pytest.approx(home)
+    assert press(10.0) == pytest.approx(advanced(home, 12.0))
+    flat = PROBES["flat"](home, 30.0, 1 / 60, -2.0)
+    assert flat(10.0) == pytest.approx(advanced(home, 32.0))
+    sweep = PROBES["sweep"](home, 30.0, 1 / 60, 1000.0, 5.0)
+    assert np.linalg.norm(sweep(0.11)[:3, 3] - sweep(0.10)[:3, 3]) == pytest.approx(10.0)
+    spin = PROBES["spin"](home, 30.0, 1 / 60, 10.0, 2)
+    assert spin(0.1)[:3, :3] == pytest.approx(rotation_about([0, 0, 1], np.degrees(1.0)))
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_small_body_is_maltreated_let_go_and_measured(model):
+    cases = [
+        Case("rest", "", ONE),
+        Case("lost", "", ONE, state=("nothing",)),
+        Case("gone", "", ONE, state=("lifted", 1e6)),
+        Case("beside", "", ONE, state=("lifted", 100.0)),
+    ]
+    rest, lost, gone, beside = (stress_test.run(model, case) for case in cases)
+    assert rest["finite"] and rest["recovered"] and rest["fallback"] is None and rest["reason"] is None
+    assert rest["rest_error_mm"] < 0.01
+    assert rest["volume_ratio"] == pytest.approx(1.0, abs=0.01)
+    for put_back, why in ((lost, "no numbers"), (gone, "left the scene")):
+        assert why in put_back["fallback"]
+        assert put_back["finite"] and put_back["recovered"]
+    # It falls 100 mm and comes to rest somewhere: where it was, or there is a reason.
+    assert beside["fallback"] is None and beside["kinetic_peak_mj"] > rest["kinetic_peak_mj"]
+    assert beside["recovered"] == (beside["rest_error_mm"] <= 0.1) == (beside["reason"] is None)
+
+
+def test_two_bodies_are_fitted_apart(device):
+    specimen = stress_bodies.prepared("shape-matching", Subject("two"))
+    assert sorted(np.concatenate(specimen.parts)) == list(range(specimen.body.count))
+    assert min(len(part) for part in specimen.parts) > 0.4 * specimen.body.count
+    turned = specimen.body.rest_points.copy()
+    turned[specimen.parts[1]] = turned[specimen.parts[1]] @ np.diag([-1.0, -1.0, 1.0]) + [5.0, 3.0, 1.0]
+    assert apart_after_fit(turned, specimen.body.rest_points).mean() > 1.0
+    state = specimen.solver.snapshot().body
+    specimen.body.restore(type(state)(turned.astype(np.float32), state.velocity))
+    assert stress_test._shape_error(specimen) < 1e-4
+
+
+def test_reasons_tell_place_from_shape():
+    assert stress_test._reason(0.05, None) is None
+    assert "its shape is whole" in stress_test._reason(12.0, 0.01)
+    assert "shape 3 mm off" in stress_test._reason(12.0, 3.0)
+
+
+def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, capsys):
+    few = [Case("rest", "long", ONE), Case("lost", "wholly", ONE, state=("nothing",))]
+    monkeypatch.setattr(stability_command, "quick_cases_of", lambda model: few)
+    assert app.main(["study", "stability", "--quick", "--jobs", "1", "--out", str(tmp_path)]) == 0
+    cases = json.loads((tmp_path / "stability.json").read_text())["cases"]
+    assert [(case["model"], case["name"]) for case in cases] == [
+        (model, name) for model in MODELS for name in ("rest: long", "lost: wholly")
+    ]
+    for case in cases:
+        assert {"finite", "recovered", "rest_error_mm", "volume_ratio", "fallback", "reason"} <= set(case)
+        assert case["finite"]
+    with (tmp_path / "stability.csv").open(newline="") as file:
+        assert [row["fallback"] != "" for row in csv.DictReader(file)] == [False, True, False, True]
+    assert Image.open(tmp_path / "stability.png").size[0] > 900
+    printed = capsys.readouterr().out
+    assert "2 cases, 2 finite; 2 came back to within 0.1 mm, 1 after the tissue was put back" in printed
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_state_along_an_axis_is_what_its_name_says(model):
+    states = {case.name: case.state for case in cases_of(model)}
+    assert states["collapsed: to a plane, x"] == ("scaled", 0.0, 1.0, 1.0)
+    assert states["collapsed: to a line, y"] == ("scaled", 0.0, 1.0, 0.0)
+    assert states["mirrored: in z"] == ("scaled", 1.0, 1.0, -1.0)
+    assert states["thrown: 10 m/s, -y"] == ("thrown", 0.0, -1e4, 0.0)
+
+
+@pytest.mark.parametrize(
+    "changes, fate",
+    [
+        (dict(), "came back to where it lay"),
+        (dict(fallback="torn"), "put back by the program, to where it lay"),
+        (dict(recovered=False, shape_error_mm=0.1), "its shape whole, lies elsewhere"),
+        (
+            dict(recovered=False, shape_error_mm=0.1, fallback="torn"),
+            "put back by the program, its shape whole",
+        ),
+        (dict(recovered=False, shape_error_mm=0.2, fallback="torn"), "shape changed"),
+        (dict(recovered=False), "shape changed"),
+        (dict(finite=False), "not finite"),
+    ],
+)
+def test_the_picture_says_how_a_case_ended(changes, fate):
+    row = dict(finite=True, recovered=True, fallback=None, shape_error_mm=None)
+    assert fate_of(row | changes).startswith(fate) and fate_of(row | changes) in FATES

@@ -1,0 +1,210 @@
+"""What sound meets in voxels: HU by the published fits, labels before HU, the table's values, and texture as it says."""
+
+import numpy as np
+import pytest
+
+from ultrasound.acoustics import (
+    ATTENUATION,
+    BACKSCATTER,
+    CORTEX_DB,
+    IMPEDANCE,
+    TissueError,
+    impedance_of_hu,
+    properties,
+    tissue_table,
+)
+from ultrasound.tissue_classification import FAT_BELOW_HU, STONE_ABOVE_MEDIAN_HU
+
+TISSUES = [name for name in tissue_table() if name != "hounsfield"]
+# Of contrast agent in the corticomedullary phase, far above what density makes of it.
+ENHANCED_HU = 185.0
+SHAPE = (24, 24, 24)
+
+
+def block(width: int) -> tuple[slice, ...]:
+    """A cube of voxels in the middle of SHAPE."""
+    return (slice(12 - width // 2, 12 - width // 2 + width),) * 3
+
+
+def labelled(width: int = 16) -> tuple[np.ndarray, np.ndarray]:
+    """HU and labels: an enhanced cube, label 1, in muscle."""
+    hu, labels = np.full(SHAPE, 55.0, np.float32), np.zeros(SHAPE, np.uint8)
+    hu[block(width)], labels[block(width)] = ENHANCED_HU, 1
+    return hu, labels
+
+
+def expected(tissue: str) -> list[float]:
+    return [tissue_table()[tissue][key] for key in ("impedance_mrayl", "attenuation_db_cm_mhz")]
+
+
+@pytest.mark.parametrize(
+    "hu, density",
+    [
+        (-1000.0, 1.2),
+        (-100.0, 917.53),
+        (0.0, 1011.886),
+        (30.0, 1039.134),
+        (150.0, 1127.46),
+        (700.0, 1475.169),
+    ],
+)
+def test_impedance_is_that_of_the_density_by_schneider_and_the_speed_by_mast(hu, density):
+    # By hand, a piece each: 1.02579 * 900 - 5.680; 0.90827 * 1000 + 103.615; the same at 1030; 0.51084 * 1150 + 539.998;
+    # 0.66254 * 1700 + 348.856; nothing is lighter than air. The coefficients have six figures here.
+    speed = (density + 349) / 0.893
+    assert float(impedance_of_hu(hu)) == pytest.approx(density * speed * 1e-6, rel=2e-5)
+
+
+def test_impedance_of_kidney_is_that_of_tables_and_rises_with_hu():
+    assert float(impedance_of_hu(30.0)) == pytest.approx(1.615, abs=5e-4)
+    assert float(impedance_of_hu(30.0)) == pytest.approx(expected("kidney")[0], rel=0.01)
+    # Where pieces meet they differ by less than a step of one HU.
+    assert (np.diff(impedance_of_hu(np.arange(-990.0, 2000.0))) > 0).all()
+
+
+def test_without_labels_everything_goes_by_hu():
+    for hu in (-100.0, 40.0, 300.0):
+        values = properties(np.full(SHAPE, hu, np.float32))
+        assert values.dtype == np.float32 and values.shape == (*SHAPE, 3)
+        table = tissue_table()["hounsfield"]
+        assert values[..., IMPEDANCE] == pytest.approx(float(impedance_of_hu(hu)), rel=1e-6)
+        wanted = np.interp(hu, table["hu"], table["attenuation_db_cm_mhz"])
+        assert values[..., ATTENUATION] == pytest.approx(wanted, rel=1e-5)
+
+
+@pytest.mark.parametrize("tissue", TISSUES)
+def test_a_label_wins_over_hu_away_from_borders(tissue):
+    hu, labels = labelled()
+    by_hu = properties(hu)
+    values = properties(hu, labels, {1: tissue, 2: "bone"})
+    # Smoothing reaches two voxels; what a tumour's or a kidney's HU tell of its parts is not told by even ones.
+    core = values[block(12)][..., :2]
+    assert core == pytest.approx(np.broadcast_to(expected(tissue), core.shape), rel=1e-6)
+    away = np.ones(SHAPE, bool)
+    away[block(20)] = False
+    assert (values[away] == by_hu[away]).all()
+    # Enhanced as it is, HU alone take the cube for denser than any parenchyma.
+    assert by_hu[12, 12, 12, IMPEDANCE] > 1.75
+
+
+def test_labels_without_a_tissue_and_the_background_go_by_hu():
+    hu, labels = labelled()
+    assert (properties(hu, labels, {2: "kidney"}) == properties(hu)).all()
+    assert (properties(hu, labels, {}) == properties(hu)).all()
+    both = labels.copy()
+    both[:12] *= 2
+    assert (properties(hu, both, {1: "liver", 2: "liver"}) == properties(hu, labels, {1: "liver"})).all()
+
+
+@pytest.mark.parametrize("kidney", ["kidney", "cortex", "medulla"])
+@pytest.mark.parametrize(
+    "hu, width, tissue",
+    [
+        (FAT_BELOW_HU - 1, 6, "sinus"),
+        (FAT_BELOW_HU + 1, 6, None),
+        (ENHANCED_HU + STONE_ABOVE_MEDIAN_HU + 1, 3, "stone"),
+        (ENHANCED_HU + STONE_ABOVE_MEDIAN_HU - 1, 3, None),
+    ],
+)
+def test_fat_and_stones_within_a_kidney_are_known_by_their_hu(kidney, hu, width, tissue):
+    given, labels = labelled()
+    given[block(width)] = hu
+    values = properties(given, labels, {1: kidney})[12, 12, 12]
+    # Smoothing reaches two voxels, so that of six the middle two are fat's alone; stones are as hard as they are.
+    assert values[:2] == pytest.approx(expected(tissue or kidney), rel=1e-6)
+    # In a liver they are no parts.
+    assert properties(given, labels, {1: "liver"})[12, 12, 12, :2] == pytest.approx(
+        expected("liver"), rel=1e-6
+    )
+
+
+def test_a_stone_scatters_as_the_table_says():
+    hu, labels = labelled()
+    hu[block(6)] = ENHANCED_HU + STONE_ABOVE_MEDIAN_HU + 50
+    level = tissue_table()["stone"]["backscatter_db"] + CORTEX_DB
+    assert properties(hu, labels, {1: "kidney"})[12, 12, 12, BACKSCATTER] == pytest.approx(10 ** (level / 20))
+
+
+def test_what_of_a_tumour_takes_up_no_agent_is_necrosis():
+    hu, labels = labelled()
+    hu[block(6)] = 30.0
+    values = properties(hu, labels, {1: "tumour"})
+    assert values[12, 12, 12, :2] == pytest.approx(expected("necrosis"), rel=1e-6)
+    assert values[6, 6, 6, :2] == pytest.approx(expected("tumour"), rel=1e-6)
+
+
+def test_fat_in_a_kidneys_hollow_is_sinus_and_fat_around_it_is_not():
+    hu, labels = np.full(SHAPE, -90.0, np.float32), np.zeros(SHAPE, np.uint8)
+    hu[block(14)], labels[block(14)] = ENHANCED_HU, 1
+    # A shaft 6 voxels wide through the cube; what smoothing of HU and then of values leaves alone is 4 voxels off.
+    hu[9:15, 9:15, :], labels[9:15, 9:15, :] = -90.0, 0
+    values = properties(hu, labels, {1: "kidney"}, np.ones(3))
+    assert values[12, 12, 12, :2] == pytest.approx(expected("sinus"), rel=1e-6)
+    assert values[0, 0, 0, IMPEDANCE] == pytest.approx(float(impedance_of_hu(-90.0)), rel=1e-6)
+
+
+def test_an_unknown_tissue_is_refused_with_those_known():
+    hu, labels = labelled()
+    for name in ("spleen", "hounsfield"):
+        with pytest.raises(
+            TissueError, match=f"label 1 is '{name}': no tissue of that name; known: "
+        ) as refused:
+            properties(hu, labels, {1: name})
+        assert all(tissue in str(refused.value) for tissue in TISSUES)
+
+
+def test_the_same_voxels_have_the_same_properties():
+    hu, labels = labelled()
+    hu += np.random.default_rng(1).normal(0, 12, SHAPE).astype(np.float32)
+    given = hu.copy(), labels.copy()
+    first = properties(hu, labels, {1: "kidney"}, np.array([0.8, 0.9, 1.0]))
+    assert (properties(hu, labels, {1: "kidney"}, np.array([0.8, 0.9, 1.0])) == first).all()
+    assert (hu == given[0]).all() and (labels == given[1]).all()
+    assert np.isfinite(first).all() and (first > 0).all()
+
+
+@pytest.mark.parametrize("tissue", TISSUES)
+def test_every_tissue_has_sane_values(tissue):
+    table = tissue_table()[tissue]
+    keys = {"impedance_mrayl", "attenuation_db_cm_mhz", "backscatter_db", "texture_db", "texture_mm"}
+    assert set(table) == keys
+    # From fat to cortical bone, from water to what nothing passes; and no echo above all of the sound.
+    assert 1.3 < table["impedance_mrayl"] < 8.0 and 0 < table["attenuation_db_cm_mhz"] <= 12.0
+    assert -50.0 < table["backscatter_db"] < -10.0 - CORTEX_DB
+    assert 0 <= table["texture_db"] < 6.0 and 0.5 <= table["texture_mm"] <= 5.0
+
+
+def test_the_table_has_the_values_of_the_literature():
+    wanted = {
+        "kidney": (1.62, 1.0),
+        "fat": (1.38, 0.63),
+        "vessel": (1.61, 0.18),
+        "liver": (1.65, 0.7),
+        "bone": (7.8, 9.0),
+    }
+    for tissue, values in wanted.items():
+        assert expected(tissue) == pytest.approx(values)
+    by_hu = tissue_table()["hounsfield"]
+    assert (np.diff(by_hu["hu"]) > 0).all()
+    assert len(by_hu["hu"]) == len(by_hu["attenuation_db_cm_mhz"]) == len(by_hu["backscatter_db"])
+
+
+@pytest.mark.parametrize("tissue", ["kidney", "tumour", "vessel"])
+def test_backscatter_has_the_tables_level_and_texture(tissue):
+    table, spacing, shape = tissue_table()[tissue], 0.3, (64, 64, 64)
+    values = properties(
+        np.full(shape, 120.0, np.float32), np.ones(shape, np.uint8), {1: tissue}, np.full(3, spacing)
+    )
+    decibel = 20 * np.log10(values[..., BACKSCATTER].astype(float))
+    # Some 200 patches, of which the mean is an SD of 0.07 off that of texture.
+    level = table["backscatter_db"] + CORTEX_DB
+    assert decibel.mean() == pytest.approx(level, abs=0.01 + 0.2 * table["texture_db"])
+    # Of patches of SD s voxels, cut at 2 SD (0.88 s), the smoothing by 0.8 voxels takes 1 - (1 + (0.8 / 0.88 s)^2)^-0.75.
+    patch = table["texture_mm"] / 2 / spacing
+    kept = (1 + (0.8 / (0.88 * patch)) ** 2) ** -0.75
+    assert decibel.std() == pytest.approx(kept * table["texture_db"], rel=0.03, abs=1e-4)
+    if table["texture_db"]:
+        # Noise through a Gaussian of half the distance correlates by exp(-1) over it, here with 0.07 of sampling.
+        lag, off = round(table["texture_mm"] / spacing), decibel - decibel.mean()
+        along = np.mean([(np.roll(off, lag, axis) * off).mean() for axis in range(3)]) / off.var()
+        assert along == pytest.approx(np.exp(-1), abs=0.15)

@@ -1,0 +1,397 @@
+"""Sweeps with the truth beside them: as they are recorded, and what ``reconstruct`` makes of them and of PLUS's."""
+
+import io
+import json
+import re
+import shutil
+from contextlib import redirect_stderr
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from conftest import rotation_about
+
+import app
+from rehearsal.coordinates import probe_in_patient
+from rehearsal.reconstruction import compression_correction
+from rehearsal.reconstruction.compression_correction import Unsqueezed
+from rehearsal.reconstruction.sweep_volumes import track_of
+from rehearsal.tracking.sweep_recording import Sweeping
+from scenes.anatomy import phantom_folder
+from scenes.scene import EMBEDDED
+from scenes.surface_files import load_surface
+from sim.embedding import Unmoved
+from sim.mesh_distance import signed_distance
+from studies.freehand.freehand_sweeps import sweep_of
+from ultrasound import reconstruction
+from ultrasound.labelled_sweep import MARKS, SUFFIX, MarkedSweep, marks_beside
+from ultrasound.probe import load_probe
+from ultrasound.probe_manipulator import held_at, image_plane, pose_at
+from ultrasound.sweep import Mark, SweepError
+from ultrasound.sweep_file import read_sweep, write_sweep
+from version import VERSION
+
+SPINE, NWIRE = "SpinePhantomFreehand", "NwirePhantomFreehand"
+SPINE_XML = "us/PlusDeviceSet_SpinePhantomFreehandReconstructionOnly.xml"
+NWIRE_XML = "us/PlusDeviceSet_NwirePhantomFreehand_vtkVolumeReconstructorTest2.xml"
+FULL = "File too large"
+
+
+def refused(*arguments) -> str:
+    """The one line with which a command is refused."""
+    told = io.StringIO()
+    with redirect_stderr(told):
+        status = app.main([str(argument) for argument in arguments])
+    lines = [line for line in told.getvalue().strip().splitlines() if "picture/s" not in line]
+    assert status == 2 and len(lines) == 1 and lines[0].startswith("nephron: "), told.getvalue()
+    return lines[0]
+
+
+def recording(pixels: int = 24) -> tuple[SimpleNamespace, SimpleNamespace]:
+    """What recording asks of a rehearsal and a view; their pictures change with the pose."""
+    probe = load_probe("curvilinear")
+    pose = pose_at(np.array([9.0, -4, 17]), np.array([0.3, -0.2, -1]), np.array([1, 0.5, 0.2]), 30.0)
+    rehearsal = SimpleNamespace(
+        pose=pose, size_mm=np.array(probe.housing_mm), origin=np.array([-61.0, 112.0, 1240.0]), probe=probe
+    )
+    rehearsal.image_plane = lambda: image_plane(rehearsal.pose, rehearsal.size_mm[2], *probe.extent_mm)
+    draw = np.random.default_rng(5)
+    view = SimpleNamespace(pictures={"B-mode": draw.integers(0, 256, (pixels, pixels), np.uint8), "CT": None})
+    marks = SimpleNamespace(render=lambda: view.pictures["B-mode"] % 3)
+    rehearsal.scanner = SimpleNamespace(marks=marks)
+    return rehearsal, view
+
+
+def moved_on(rehearsal: SimpleNamespace, by_mm: float) -> None:
+    rehearsal.pose = rehearsal.pose.copy()
+    rehearsal.pose[:3, 3] += by_mm * rehearsal.pose[:3, 1]
+
+
+def test_a_recorded_sweep_says_where_each_pixel_is(tmp_path):
+    rehearsal, view = recording()
+    sweeping, places, pictures = Sweeping(rehearsal), [], []
+    assert sweeping.watch(0.0, view, rehearsal.probe) == "" and sweeping.end() == ""
+    assert sweeping.toggle(tmp_path) == "sweep-001: {sweep} ends it"
+    for step in range(8):
+        # A step of 1/60 s: every other is a frame, the first among them.
+        assert sweeping.watch(5.0 + step / 60, view, rehearsal.probe) == ""
+        if step % 2 == 0:
+            plane = rehearsal.image_plane()
+            # The middle of the last row but one pixel: on the middle line, a pixel and a half from its end.
+            deep = plane.depth_mm * (1 - 1.5 / 24) - plane.above_mm
+            aside = plane.width_mm * 0.5 / 24
+            places.append((plane.world_from_plane @ [aside, deep, 0, 1])[:3] + rehearsal.origin)
+            pictures.append(view.pictures["B-mode"])
+        moved_on(rehearsal, 0.7)
+        view.pictures["B-mode"] = np.roll(view.pictures["B-mode"], 1, axis=step % 2)
+    assert sweeping.toggle(tmp_path) == "sweep-001.igs.mha: 4 pictures"
+    sweep = read_sweep(tmp_path / "sweep-001.igs.mha")
+    assert np.array_equal(sweep.images, pictures)
+    assert sweep.times_s == pytest.approx(5 + np.arange(4) / 30)
+    assert sweep.transform("Probe", "Reference", 0)[:3, 1] == pytest.approx(-rehearsal.pose[:3, 2])
+    for frame, place in enumerate(places):
+        at = sweep.transform("Image", "Reference", frame) @ [12, 22, 0, 1]
+        assert at[:3] == pytest.approx(place, abs=1e-6)
+    marks = marks_beside(tmp_path / "sweep-001.igs.mha")
+    assert np.array_equal(marks.images, sweep.images % 3)
+    assert sweep.fields["NephronVersion"] == marks.fields["NephronVersion"] == VERSION
+    assert [frame["ProbeToReferenceTransform"] for frame in marks.frames] == [
+        frame["ProbeToReferenceTransform"] for frame in sweep.frames
+    ]
+    assert marks_beside(tmp_path / "sweep-001-marks.igs.mha") is None
+    # Times of a sweep are those of the rehearsal, and a new one begins at once, whenever the last ended.
+    assert sweeping.toggle(tmp_path) == "sweep-002: {sweep} ends it"
+    sweeping.watch(1.0, view, rehearsal.probe)
+    assert sweeping.end() == "sweep-002.igs.mha: 1 pictures"
+    assert read_sweep(tmp_path / "sweep-002.igs.mha").times_s == [1.0]
+
+
+def test_as_long_as_a_sweep_is_recorded_its_length_is_said(tmp_path):
+    rehearsal, view = recording()
+    sweeping = Sweeping(rehearsal)
+    said = []
+    for first in (100.0, 200.0):
+        said.append(sweeping.status)
+        sweeping.toggle(tmp_path)
+        said.append(sweeping.status)
+        for time_s in (first, first + 0.6, first + 11.8):
+            sweeping.watch(time_s, view, rehearsal.probe)
+            said.append(sweeping.status)
+        sweeping.toggle(tmp_path)
+    once = ["", *(f"RECORDING {seconds} s" for seconds in (0, 0, 1, 12))]
+    assert [*said, sweeping.status] == [*once, *once, ""]
+
+
+def test_sweeps_are_numbered_after_the_last(tmp_path):
+    sweeping = Sweeping(recording()[0])
+    for name in ("sweep-004.igs.mha", "sweep-009-marks.igs.mha", "sweep-x.igs.mha", "sweep-0.igs.mha"):
+        (tmp_path / name).touch()
+    assert sweeping.toggle(tmp_path).startswith("sweep-005:")
+    sweeping.end()
+    for name in ("sweep-999", "sweep-1000"):
+        (tmp_path / f"{name}.igs.mha").touch()
+    assert sweeping.toggle(tmp_path).startswith("sweep-1001:")
+
+
+def test_a_sweep_without_frames_or_ct_leaves_words_and_no_file(tmp_path):
+    rehearsal, _ = recording()
+    sweeping = Sweeping(rehearsal)
+    sweeping.toggle(tmp_path)
+    assert sweeping.end() == "No sweep: a sweep without frames"
+    assert "cannot be written: No such file" in sweeping.toggle(tmp_path / "none")
+    rehearsal.scanner = None
+    assert sweeping.toggle(tmp_path) == "No CT, no sweep"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("marks_too", [False, True])
+def test_a_full_disk_ends_a_sweep_in_words_and_leaves_nothing(tmp_path, marks_too, bytes_to_a_file):
+    rehearsal, view = recording(pixels=256)
+    if marks_too:
+        rehearsal.scanner.marks.render = lambda: view.pictures["B-mode"]
+    sweeping = Sweeping(rehearsal)
+    sweeping.toggle(tmp_path)
+    with bytes_to_a_file(150_000):
+        # Noise: 65 kB each, of which two have room.
+        said = [sweeping.watch(k / 30, view, rehearsal.probe) for k in range(5)]
+    assert said == ["", "", f"No sweep: {FULL}", "", ""]
+    assert list(tmp_path.iterdir()) == []
+    sweeping.toggle(tmp_path)
+    sweeping.watch(0.0, view, rehearsal.probe)
+    assert sweeping.end() == "sweep-001.igs.mha: 1 pictures"
+
+
+def test_a_picture_of_another_size_ends_a_sweep_with_what_there_is(tmp_path):
+    rehearsal, view = recording()
+    sweeping = Sweeping(rehearsal)
+    sweeping.toggle(tmp_path)
+    sweeping.watch(0.0, view, rehearsal.probe)
+    view.pictures["B-mode"] = np.zeros((8, 8), np.uint8)
+    said = sweeping.watch(1.0, view, rehearsal.probe)
+    assert said.startswith("sweep-001.igs.mha: 1 pictures: frame 1: image of uint8 (8, 8)")
+    assert len(read_sweep(tmp_path / "sweep-001.igs.mha")) == len(
+        read_sweep(tmp_path / "sweep-001-marks.igs.mha")
+    )
+
+
+def test_both_files_or_none(tmp_path):
+    rehearsal, view = recording()
+    sweep = MarkedSweep(tmp_path, "s", rehearsal.probe)
+    picture = view.pictures["B-mode"]
+    sweep.add(picture, picture % 3, rehearsal.probe, probe_in_patient(rehearsal), 0.0)
+    # The pictures find a folder where their file should be.
+    (tmp_path / "s.igs.mha").mkdir()
+    with pytest.raises(IsADirectoryError):
+        sweep.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["s.igs.mha"]
+
+
+def over_tumour() -> np.ndarray:
+    """Poses over the embedded patient's tumour, 1.5 mm apart, seen from in front; x is not along an axis."""
+    middle = load_surface(phantom_folder() / "tumour.stl").center_mass
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_about([0, 1, 0], 20)
+    way = np.tile(pose, (14, 1, 1))
+    way[:, :3, 3] = middle + [0, -20, 0] + (np.arange(14) - 6.5)[:, None] * 1.5 * pose[:3, 2]
+    return way
+
+
+def test_the_matrices_of_a_frame_are_of_its_rows_and_columns(tmp_path):
+    probe, pose = load_probe("curvilinear"), np.eye(4)
+    pose[:3, 3] = 3.0, -2.0, 7.0
+    sweep = MarkedSweep(tmp_path, "sweep", probe)
+    sweep.add(*np.zeros((2, 50, 80), np.uint8), probe, pose, 0.0)
+    sweep.close()
+    for end in (SUFFIX, MARKS):
+        read = read_sweep(tmp_path / f"sweep{end}")
+        assert read.images.shape == (1, 50, 80)
+        assert np.array_equal(read.transform("Image", "Probe", 0), probe.image_to_probe(50, 80))
+        assert np.array_equal(read.transform("Probe", "Reference", 0), pose)
+
+
+def test_a_probe_is_held_where_its_image_plane_is():
+    pose = pose_at(np.array([9.0, -4, 17]), np.array([0.3, -0.2, -1]), np.array([1, 0.5, 0.2]), 30.0)
+    assert held_at(image_plane(pose, 22.0, 40, 50, 6).world_from_plane, 22.0) == pytest.approx(pose)
+
+
+class Still:
+    """What undoing asks of a rehearsal, whose tissue never moves; it remembers how the probe did."""
+
+    def __init__(self, origin: np.ndarray, length_mm: float) -> None:
+        self.embedding, self.origin, self.size_mm = Unmoved(), origin, np.array([40.0, 10.0, length_mm])
+        self.settings, self.way = SimpleNamespace(time_step_s=1 / 60), []
+
+    def advance(self, pose: np.ndarray) -> None:
+        self.pose = pose
+        self.way.append(pose)
+
+
+def test_undoing_takes_the_tracked_way_and_finds_still_tissue_where_the_tracker_says(device):
+    probe = load_probe("curvilinear")
+    on_probe, way = probe.image_to_probe(32, 32), over_tumour()[::5]
+    sweep = sweep_of(np.zeros((len(way), 32, 32), np.uint8), way, np.array([0.0, 0.1, 9.0]), on_probe)
+    still = Still(np.array([-61.0, 112.0, 1240.0]), 20.0)
+    places = Unsqueezed(still, sweep, track_of(sweep, "Reference"), "Reference")
+    begun = len(still.way)
+    assert begun == (compression_correction.COMES_S + compression_correction.WAITS_S) * 60
+    row, column = np.indices((32, 32))
+    pixels = np.stack([column, row, 0 * row, 1 + 0 * row], axis=-1)
+    for frame, pose in enumerate(way):
+        # Float32 of 1300 mm, less its origin.
+        expected = (pixels @ (pose @ on_probe).T)[..., :3]
+        assert places(frame) == pytest.approx(expected, abs=1e-3)
+        face = still.pose @ [0, 0, -10.0, 1]
+        assert face[:3] + still.origin == pytest.approx(pose[:3, 3])
+    # 0.1 s, and a pause of 8.9 s cut to 2.
+    assert len(still.way) - begun == 6 + 120
+    assert np.linalg.norm(still.way[0][:3, 3] - still.way[begun - 1][:3, 3]) == pytest.approx(29.0)
+
+
+def test_what_no_probe_can_press_again_is_refused(device):
+    sweep = sweep_of(np.zeros((1, 32, 30), np.uint8), np.eye(4)[None], np.zeros(1), np.eye(4))
+    with pytest.raises(SweepError, match="32 x 30 pixels: expected a sweep that Nephron recorded"):
+        Unsqueezed(Still(np.zeros(3), 20.0), sweep, track_of(sweep, "Reference"), "Reference")
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory) -> Path:
+    """A sweep over the embedded patient's tumour, with marks by its surfaces."""
+    folder = tmp_path_factory.mktemp("swept")
+    organ, tumour = (load_surface(phantom_folder() / f"{name}.stl") for name in ("organ", "tumour"))
+    probe = load_probe("drop-in")
+    sweep = MarkedSweep(folder, "over", probe)
+    row, column = np.indices((64, 64))
+    pixels = np.stack([column, row, 0 * row, 1 + 0 * row], axis=-1).reshape(-1, 4)
+    way = over_tumour()
+    places = np.concatenate([(pixels @ (pose @ probe.image_to_probe(64, 64)).T)[:, :3] for pose in way])
+    inside = [signed_distance(each.vertices, each.faces, places)[0] < 0 for each in (organ, tumour)]
+    marks = np.where(inside[1], Mark.TUMOUR, inside[0]).astype(np.uint8).reshape(-1, 64, 64)
+    for k, (pose, each) in enumerate(zip(way, marks, strict=True)):
+        sweep.add(40 + 80 * each, each, probe, pose, k / 10)
+    sweep.close()
+    return folder / "over.igs.mha"
+
+
+def test_reconstruct_makes_a_volume_and_compares_it(swept, tmp_path, capsys):
+    command = ["reconstruct", swept, "--scene", EMBEDDED, "--spacing-mm", "1", "--out", tmp_path / "out"]
+    assert app.main([str(part) for part in command]) == 0
+    report = json.loads((tmp_path / "out" / "report.json").read_text(), parse_constant=pytest.fail)
+    assert (report["frames"], report["used"], report["method"]) == (14, 14, "smooth")
+    assert report["version"] == VERSION
+    assert report["way_mm"] == pytest.approx(13 * 1.5) and report["between_max_mm"] == pytest.approx(1.5)
+    assert report["speed_median_mm_s"] == report["speed_max_mm_s"] == pytest.approx(15.0)
+    # Two voxels, which is more than pictures are apart.
+    assert report["reach_mm"] == 2.0 and report["undo_compression"] is False
+    organ, tumour = report["agreement"]["organ"], report["agreement"]["tumour"]
+    assert organ["scanned"] < 0.3 < 0.5 < tumour["scanned"] < 1
+    # As balls of the same volume: an outline that is off by a quarter of a voxel on average.
+    assert tumour["scanned_part"]["dice"] > 0.95 and tumour["scanned_part"]["centroid_mm"] < 0.2
+    told = capsys.readouterr().out
+    assert (
+        "14 of 14 with a pose, 1.50 mm apart" in told and f"Dice {tumour['scanned_part']['dice']:.3f}" in told
+    )
+    assert f"organ     {100 * organ['scanned']:.0f} % scanned; of that small part alone Dice" in told
+    assert f"tumour    {100 * tumour['scanned']:.0f} % scanned; of that Dice" in told
+    volume, labels = (sitk.ReadImage(str(tmp_path / "out" / f"{name}.nrrd")) for name in ("volume", "labels"))
+    assert list(volume.GetSize()) == report["shape"] == list(labels.GetSize())
+    middle = load_surface(phantom_folder() / "tumour.stl").center_mass
+    at = volume.TransformPhysicalPointToIndex(middle.tolist())
+    assert (volume[at], labels[at]) == (40 + 80 * Mark.TUMOUR, Mark.TUMOUR)
+    assert (tmp_path / "out" / "volume.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("away_mm", [-50, 4000])
+def test_reconstruct_compares_no_sweep_with_an_organ_that_it_does_not_show(swept, tmp_path, capsys, away_mm):
+    organ = load_surface(phantom_folder() / "organ.stl").apply_translation([0, 0, away_mm])
+    organ.export(tmp_path / "organ.stl")
+    (tmp_path / "scene.toml").write_text('[anatomy]\norgan = "organ.stl"\n')
+    command = ["reconstruct", swept, "--scene", tmp_path, "--spacing-mm", "2", "--out", tmp_path]
+    assert app.main([str(part) for part in command]) == 0
+    report, told = json.loads((tmp_path / "report.json").read_text()), capsys.readouterr().out
+    assert report["agreement"] == {} and "Dice" not in told
+    assert re.search(
+        r"the sweep is not of this organ, or of another patient; it shows 0\.[0-9] % of it", told
+    )
+
+
+def test_reconstruct_refuses_in_one_line(swept, tmp_path, monkeypatch):
+    out = ("--out", tmp_path / "out")
+    assert "none.igs.mha: No such file" in refused("reconstruct", tmp_path / "none.igs.mha", *out)
+    assert "expected a tracked one" in refused("reconstruct", Path(__file__), *out)
+    assert "name it with --scene" in refused("reconstruct", swept, *out, "--undo-compression")
+    there = refused("reconstruct", swept, *out, "--reference", "Tracker")
+    assert "no chain of transforms from Image to Tracker" in there and "ProbeToReference" in there
+    (tmp_path / "none.xml").write_text("<PlusConfiguration/>")
+    assert "none.xml: no CoordinateDefinitions" in refused(
+        "reconstruct", swept, *out, "--config", tmp_path / "none.xml"
+    )
+    sweep = read_sweep(swept)
+    del sweep.frames[5]["Timestamp"]
+    write_sweep(tmp_path / "timeless.igs.mha", sweep)
+    assert "frame 5: Timestamp" in refused("reconstruct", tmp_path / "timeless.igs.mha", *out)
+    # Nothing of this is found out after a folder was made.
+    assert not (tmp_path / "out").exists()
+    monkeypatch.setattr(reconstruction, "MOST_VOXELS", 5000)
+    large = refused("reconstruct", swept, *out)
+    assert "over.igs.mha: " in large and "take larger voxels" in large
+    monkeypatch.undo()
+    shutil.copy(swept, tmp_path / "a.igs.mha")
+    write_sweep(tmp_path / "a-marks.igs.mha", type(sweep)(sweep.images[:3], sweep.frames[:3], sweep.fields))
+    assert "marks of (3, 64, 64)" in refused("reconstruct", tmp_path / "a.igs.mha", *out)
+    sweep.images = sweep.images * np.uint8(0)
+    sweep.frames[5]["Timestamp"] = "0.5"
+    write_sweep(tmp_path / "black.igs.mha", sweep)
+    assert "all pictures are black" in refused("reconstruct", tmp_path / "black.igs.mha", *out)
+
+
+@pytest.mark.parametrize(("sample", "config", "used"), [(SPINE, SPINE_XML, 21), (NWIRE, NWIRE_XML, None)])
+def test_reconstruct_takes_what_plus_wrote(data, tmp_path, capsys, sample, config, used):
+    sweep = data / f"us/{sample}.igs.mha"
+    assert "no chain of transforms from Image" in refused("reconstruct", sweep, "--out", tmp_path / "none")
+    command = ["reconstruct", sweep, "--config", data / config, "--spacing-mm", "2", "--out", tmp_path]
+    assert app.main([str(part) for part in command]) == 0
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (
+        report["used"] == report["frames"] == (used or len(read_sweep(sweep))) and report["agreement"] == {}
+    )
+    voxels = sitk.GetArrayFromImage(sitk.ReadImage(str(tmp_path / "volume.nrrd")))
+    assert list(voxels.shape[::-1]) == report["shape"] and (voxels > 0).mean() > 0.02
+    # Voxels are means of pixels.
+    assert voxels.max() <= read_sweep(sweep).images.max()
+    assert not (tmp_path / "labels.nrrd").exists()
+    assert f"{report['used']}/{report['used']}" in capsys.readouterr().err
+
+
+def test_poses_alone_make_no_volume(data, tmp_path):
+    sweep = data / "us/SlidingProbeTrackingData.igs.mha"
+    assert "no picture with a valid pose" in refused("reconstruct", sweep, "--out", tmp_path)
+
+
+def test_scan_leaves_a_sweep_at_the_poses_of_its_file(tmp_path):
+    way = over_tumour()[5:8]
+    (tmp_path / "poses.json").write_text(json.dumps([dict(probe_to_patient=pose.tolist()) for pose in way]))
+    command = ["scan", EMBEDDED, "--pose", tmp_path / "poses.json", "--out", tmp_path / "out", "--sweep"]
+    assert app.main([str(part) for part in [*command, "--picture", "ct", "--arch", "cpu"]]) == 0
+    sweep = read_sweep(tmp_path / "out/sweep.igs.mha")
+    marks = marks_beside(tmp_path / "out/sweep.igs.mha")
+    probe, rows = load_probe("drop-in"), sweep.images.shape[1]
+    for frame, pose in enumerate(way):
+        for each in (sweep, marks):
+            assert each.transform("Probe", "Reference", frame) == pytest.approx(pose, abs=1e-9)
+        at = sweep.transform("Image", "Reference", frame)
+        assert at == pytest.approx(pose @ probe.image_to_probe(rows, rows), abs=1e-9)
+    assert np.diff(sweep.times_s) == pytest.approx(1 / 30) and sweep.images.std() > 10
+    # The tumour's middle, 20 mm before the face, lies half a step beside the two last pictures.
+    middle = load_surface(phantom_folder() / "tumour.stl").center_mass
+    column, row, aside, _ = np.linalg.inv(sweep.transform("Image", "Reference", 1)) @ [*middle, 1]
+    assert abs(aside) == pytest.approx(0.75) and marks.images[1, round(row), round(column)] == Mark.TUMOUR
+    assert np.argwhere(marks.images == Mark.TUMOUR).size and (marks.images[1][0] == Mark.OUTSIDE).any()
+
+
+def test_marks_of_another_file_are_not_taken(tmp_path):
+    (tmp_path / "a-marks.igs.mha").write_text("no sweep")
+    assert marks_beside(tmp_path / "a.mha") is None and marks_beside(tmp_path / "b.igs.mha") is None
+    with pytest.raises(SweepError, match="a-marks"):
+        marks_beside(tmp_path / "a.igs.mha")

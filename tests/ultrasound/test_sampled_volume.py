@@ -1,0 +1,146 @@
+"""A volume on the device: between voxels, at its border, one place or many, and its slope."""
+
+import numpy as np
+import pytest
+import taichi as ti
+import taichi.math as tm
+import trimesh
+from conftest import rotation_about
+
+from sim.fields import array_of, fill
+from ultrasound.image_plane import LANES, Lanes
+from ultrasound.sampled_volume import Volume, distance_volume
+
+
+def test_a_volume_of_vectors_is_sampled_as_each_of_its_parts(device):
+    voxels = np.random.default_rng(2).normal(size=(5, 4, 3, 2)).astype(np.float32)
+    index_from_mm = np.eye(4)
+    index_from_mm[:3, :3] = rotation_about([1, 2, 3], 30) * 0.8
+    whole, parts = Volume(voxels, index_from_mm), [Volume(voxels[..., k], index_from_mm) for k in range(2)]
+    points = np.random.default_rng(3).uniform(-1.0, 4.0, (200, 3)).astype(np.float32)
+    given, found = ti.Vector.field(3, ti.f32, len(points)), ti.Vector.field(2, ti.f32, len(points))
+    apart = ti.Vector.field(2, ti.f32, len(points))
+    fill((given, points))
+
+    @ti.kernel
+    def ask():
+        for i in given:
+            found[i] = whole.sample(given[i])
+            for k in ti.static(range(2)):
+                apart[i][k] = parts[k].sample(given[i])
+
+    ask()
+    # The compiler may fuse the same sums differently: rounding of values of 4, at a place rounded to 1e-6 of a voxel.
+    assert array_of(found) == pytest.approx(array_of(apart), abs=1e-5)
+    assert (array_of(found) != -1000.0).any() and (array_of(found) == -1000.0).any()
+
+
+@pytest.mark.parametrize("shape", [(6, 5, 4), (6, 1, 4)])
+def test_places_sampled_together_have_the_values_that_they_have_alone(device, shape):
+    index_from_mm = np.eye(4)
+    index_from_mm[:3, :3] = rotation_about([1, 2, 3], 30) * 0.9
+    volume = Volume(
+        np.random.default_rng(6).normal(size=shape).astype(np.float32), index_from_mm, outside=-7.0
+    )
+    starts = (
+        np.random.default_rng(7).uniform(-0.8, np.array(shape) - 0.2, (400, 3))
+        @ np.linalg.inv(index_from_mm[:3, :3]).T
+    )
+    # Half of the lines stay within a voxel, half cross several and the border, where the last half voxel still counts.
+    ways = np.random.default_rng(8).normal(size=(400, 3)) * np.where(np.arange(400) % 2, 0.01, 0.4)[:, None]
+    places = (starts[:, None] + np.arange(LANES)[:, None] * ways[:, None]).astype(np.float32)
+    together, alone = np.zeros((2, 400, LANES), np.float32)
+    values = ti.types.ndarray(ti.f32, ndim=2)
+
+    @ti.kernel
+    def ask(places: ti.types.ndarray(ti.f32, ndim=3), together: values, alone: values):
+        for i in range(places.shape[0]):
+            x, y, z = Lanes(0.0), Lanes(0.0), Lanes(0.0)
+            for lane in ti.static(range(LANES)):
+                x[lane], y[lane], z[lane] = places[i, lane, 0], places[i, lane, 1], places[i, lane, 2]
+                alone[i, lane] = volume.sample(tm.vec3(x[lane], y[lane], z[lane]))
+            found = volume.sample_lanes(x, y, z, True)
+            for lane in ti.static(range(LANES)):
+                together[i, lane] = found[lane]
+
+    ask(places, together, alone)
+    assert 0.1 < (alone == -7.0).mean() < 0.9 and np.abs(together - alone).max() < 1e-5
+
+
+def test_the_slope_of_a_volume_is_that_of_its_trilinear_value(device):
+    voxels = np.random.default_rng(4).normal(size=(6, 5, 4, 3)).astype(np.float32)
+    index_from_mm = np.eye(4)
+    index_from_mm[:3, :3] = rotation_about([3, 1, 2], 40) * [1.3, 0.7, 0.9]
+    volume = Volume(voxels, index_from_mm)
+    inside = np.random.default_rng(5).uniform([0.1] * 3, [4.9, 3.9, 2.9], (300, 3))
+    # Away from voxel centres, where the slope jumps, by more than the step of the differences.
+    inside = inside[(np.abs(inside - np.rint(inside)) > 0.02).all(axis=1)]
+    points = inside @ np.linalg.inv(index_from_mm[:3, :3]).T
+    given, slope = ti.Vector.field(3, ti.f32, len(points)), ti.Vector.field(3, ti.f32, len(points))
+    fill((given, points))
+
+    @ti.kernel
+    def ask():
+        for i in given:
+            slope[i] = volume.slope(given[i])
+
+    ask()
+
+    def value(p):
+        at = p @ index_from_mm[:3, :3].T
+        base = np.floor(at).astype(int)
+        t, total = at - base, np.zeros(len(p))
+        for corner in np.ndindex(2, 2, 2):
+            weight = np.prod(np.where(corner, t, 1 - t), axis=1)
+            total += weight * voxels[(*(base + corner).T, 0)]
+        return total
+
+    step = 1e-4 * np.eye(3)
+    wanted = np.column_stack([(value(points + h) - value(points - h)) / 2e-4 for h in step])
+    # Along one axis a trilinear value is a cubic at most; float32 of values of 4 over a voxel.
+    assert array_of(slope) == pytest.approx(wanted, abs=1e-4)
+
+
+def test_a_volume_is_trilinear_between_voxels_and_ends_half_a_voxel_beyond(device):
+    voxels = np.random.default_rng(1).normal(size=(5, 4, 3)).astype(np.float32)
+    volume = Volume(voxels, np.eye(4), outside=-7.0)
+    points = np.array(
+        [[0, 0, 0], [4, 3, 2], [1.25, 2.5, 0.75], [-0.4, 1, 1], [-0.6, 1, 1], [4.6, 3, 2]], np.float32
+    )
+    given = ti.Vector.field(3, ti.f32, len(points))
+    found = ti.field(ti.f32, len(points))
+    fill((given, points))
+
+    @ti.kernel
+    def ask():
+        for i in given:
+            found[i] = volume.sample(given[i])
+
+    ask()
+    cell = voxels[1:3, 2:4, 0:2].astype(float)
+    mixed = np.einsum("ijk,i,j,k->", cell, [0.75, 0.25], [0.5, 0.5], [0.25, 0.75])
+    wanted = [voxels[0, 0, 0], voxels[4, 3, 2], mixed, voxels[0, 1, 1], -7.0, -7.0]
+    assert array_of(found) == pytest.approx(np.array(wanted), abs=1e-5)
+
+
+def test_a_volume_of_one_slice_is_sampled_within_its_thickness(device):
+    volume = Volume(np.full((3, 3, 1), 5.0, np.float32), np.eye(4))
+    found = ti.field(ti.f32, 2)
+
+    @ti.kernel
+    def ask():
+        found[0] = volume.sample(ti.Vector([1.2, 0.7, 0.3]))
+        found[1] = volume.sample(ti.Vector([1.2, 0.7, 0.7]))
+
+    ask()
+    assert array_of(found) == pytest.approx([5.0, -1000.0])
+
+
+def test_distance_volume_is_signed(device, ball):
+    volume = distance_volume(trimesh.creation.icosphere(subdivisions=4, radius=10.0), 1.0)
+    found, axis = array_of(volume.voxels).reshape(volume.count), np.arange(volume.count[0]) - 16.0
+    expected = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij")), axis=0) - 10.0
+    near = np.abs(expected) < 4.5
+    # The facets lie up to 0.03 mm within the ball.
+    assert np.abs(found - expected)[near].max() < 0.04
+    assert (found[expected < -4.5] < -4.5).all() and (found[expected > 4.5] > 4.4).all()

@@ -1,0 +1,119 @@
+"""The scanner: that each side of it is given what it asks for. What a side makes of it has tests of its own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import rotation_about
+
+from sim.embedding import Unmoved
+from sim.fields import array_of
+from ultrasound.acoustics import CORTEX_DB
+from ultrasound.image_plane import ImagePlane
+from ultrasound.probe import Probe
+from ultrasound.probe_manipulator import image_plane, pose_at
+from ultrasound.scanner import CT, ScannedAnatomy, Scanner, begin_echo
+
+PIXELS, RADIUS, REACH = 64, 12.0, 20.0
+PROBE = Probe(
+    transducer_name="test",
+    housing_mm=(20.0, 10.0, 20.0),
+    transducer_width_mm=20.0,
+    number_of_scanlines=32,
+    number_of_samples_per_scanline=320,
+    depth_mm=60.0,
+)
+
+
+UPRIGHT = np.eye(3)
+# HU 32 has the impedance that kidney has.
+FAT_HU, KIDNEY_HU = -90, 32
+
+
+def anatomy(spacing=(1.0, 1.0, 1.0), turn: np.ndarray = UPRIGHT, around_hu: int = FAT_HU) -> ScannedAnatomy:
+    """A ball of kidney, in a grid of voxels 40 mm along each edge."""
+    mm_from_index = np.eye(4)
+    mm_from_index[:3, :3] = turn * spacing
+    counts = np.rint(2 * REACH / np.array(spacing)).astype(int) + 1
+    mm_from_index[:3, 3] = -mm_from_index[:3, :3] @ (counts - 1) / 2
+    at = np.moveaxis(np.indices(counts), 0, -1) @ mm_from_index[:3, :3].T + mm_from_index[:3, 3]
+    labels = (np.linalg.norm(at, axis=-1) < RADIUS).astype(np.int16)
+    organ = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
+    hu = np.where(labels, KIDNEY_HU, around_hu).astype(np.int16)
+    return ScannedAnatomy(organ, hu, np.linalg.inv(mm_from_index), labels, {1: "kidney"})
+
+
+def plane_at(above: float = 0.0) -> ImagePlane:
+    """Of a probe so far above the ball that looks down."""
+    face = np.array([0.0, 0.0, RADIUS + above])
+    return image_plane(pose_at(face, [0, 0, -1.0], [1.0, 0, 0], 20.0), 20.0, *PROBE.extent_mm)
+
+
+def echo(scanner: Scanner, plane: ImagePlane) -> np.ndarray:
+    """What the middle line holds [dB], but for the gain."""
+    scanner.look(plane, PROBE, "b-mode", "reflection", 350.0, 40.0)
+    return array_of(scanner.bmode.decibel)[16].astype(float) - PROBE.gain_db()
+
+
+@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.8, 1.25, 2.0), (2.0, 0.8, 1.25)])
+def test_voxels_are_measured_along_their_own_axes(spacing):
+    assert anatomy(spacing, rotation_about([1, 2, 3], 40)).voxel_mm == pytest.approx(spacing)
+
+
+def test_the_slice_is_windowed_as_asked_for(device):
+    scanner = Scanner(anatomy(), Unmoved(), PROBE, PIXELS)
+    picture = scanner.look(plane_at(), PROBE, "ct", "speckle", 400.0, 20.0)[CT]
+    wanted = np.clip((scanner.slice.hounsfield().astype(float) - 20.0) / 400.0 + 0.5, 0, 1) * 255
+    assert np.ptp(wanted) > 50 and np.abs(picture - wanted).max() <= 0.51
+
+
+def test_each_look_is_at_where_the_body_is_now(device):
+    class Followed(Unmoved):
+        looks = 0
+
+        def update(self) -> None:
+            self.looks += 1
+
+    embedding = Followed()
+    scanner = Scanner(anatomy(), embedding, PROBE, PIXELS)
+    for looks in (1, 2):
+        scanner.look(plane_at(), PROBE, "ct", "speckle", 400.0, 20.0)
+        assert embedding.looks == looks
+
+
+def test_an_echo_begun_before_is_the_one_that_is_shown(device):
+    bones, plane = replace(anatomy(), tissues={1: "bone"}), plane_at()
+    begun = echo(Scanner(anatomy(), Unmoved(), PROBE, PIXELS, echo=begin_echo(bones)), plane)
+    assert np.array_equal(begun, echo(Scanner(bones, Unmoved(), PROBE, PIXELS), plane))
+    assert np.abs(begun - echo(Scanner(anatomy(), Unmoved(), PROBE, PIXELS), plane)).max() > 10.0
+
+
+@pytest.mark.parametrize("gap", [1.0, 4.0])
+def test_sound_enters_as_near_to_the_organ_as_asked_for(device, gap):
+    scanner = Scanner(anatomy(), Unmoved(), PROBE, PIXELS, contact_gap_mm=gap)
+    # A line at the middle has the 1 mm of its element's own contact; facets and distances 2 mm apart are 0.2 mm off.
+    assert echo(scanner, plane_at(gap - 0.4))[:40].max() > -100.0
+    assert echo(scanner, plane_at(gap + 0.4))[:40].max() < -170.0
+
+
+def test_beyond_the_ct_is_silence(device):
+    decibel = echo(Scanner(anatomy(), Unmoved(), PROBE, PIXELS), plane_at())
+    depth = (np.arange(320) + 0.5) * PROBE.sample_mm
+    within = depth < RADIUS + REACH - 1.0
+    # The array is in touch with the ball for 5 mm to either side; the least that a line holds is 20 log10(1e-9).
+    assert decibel[within].min() > -120.0 and decibel[depth > RADIUS + REACH + 1.0].max() < -179.9
+
+
+def test_what_lies_around_the_organ_reflects_as_gel_or_as_air(device):
+    depth = (np.arange(320) + 0.5) * PROBE.sample_mm
+    border = np.abs(depth - 2 * RADIUS + 1.0) < 2.0
+    peak = {}
+    for outside in ("gel", "air"):
+        scanner = Scanner(anatomy(around_hu=KIDNEY_HU), Unmoved(), PROBE, PIXELS, outside)
+        # A millimetre in, so that facets leave no place of the face outside.
+        peak[outside] = echo(scanner, plane_at(-1.0))[border].max()
+    # Kidney has 1.62 MRayl: gel reflects (1.62 - 1.5) / (1.62 + 1.5) of the sound, air all; what scatters is added. Texture has 1 dB.
+    scattered = 10 ** (CORTEX_DB / 20)
+    wanted = 20 * np.log10((1 + scattered) / (0.12 / 3.12 + scattered))
+    assert peak["air"] - peak["gel"] == pytest.approx(wanted, abs=1.0)

@@ -1,0 +1,91 @@
+"""What lies under the transducer's face: how much of it touches, and how far it has squeezed the tissue before it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ultrasound.probe_manipulator import sagitta
+
+SPACING_MM = 0.75
+# Nearer to the face than this the surface touches; so far through it contacts let none.
+TOUCH_MM = 0.5
+# Barycentric slack that closes the seams between triangles against rounding.
+SEAM = 1e-9
+
+
+@dataclass(frozen=True)
+class Pressing:
+    """``area_mm2`` of the face touches. ``compression_mm`` is the most by which tissue before it is shorter than at rest, on a way
+    along the transducer's axis from where that enters the organ to where it leaves it; 0 where nothing touches.
+    """
+
+    area_mm2: float = 0.0
+    compression_mm: float = 0.0
+
+
+def face_points(size_mm: np.ndarray, radius_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) evenly over the face, in the transducer's axes [mm], and the area (n,) that each stands for [mm^2]."""
+    counts = np.maximum(np.rint(np.asarray(size_mm[:2]) / SPACING_MM).astype(int), 1)
+    x, y = ((np.arange(n) + 0.5) / n * s - s / 2 for n, s in zip(counts, size_mm[:2], strict=True))
+    x, y = (each.ravel() for each in np.meshgrid(x, y))
+    points = np.column_stack([x, y, sagitta(x, radius_mm) - size_mm[2] / 2])
+    slope = np.ones_like(x) if radius_mm == 0 else radius_mm / np.sqrt(np.maximum(radius_mm**2 - x**2, 1e-6))
+    return points, slope * np.prod(np.asarray(size_mm[:2]) / counts)
+
+
+def pressing(
+    pose: np.ndarray,
+    size_mm: np.ndarray,
+    radius_mm: float,
+    now_mm: np.ndarray,
+    rest_mm: np.ndarray,
+    faces: np.ndarray,
+) -> Pressing:
+    """How a transducer at a pose (4, 4) touches a closed surface whose vertices (v, 3) are now and were at rest [mm]."""
+    points, area = face_points(size_mm, radius_mm)
+    local = (now_mm - pose[:3, 3]) @ pose[:3, :3]
+    corners = local[faces]
+    half = np.asarray(size_mm[:2]) / 2
+    beside = (corners[..., :2].min(axis=1) > half) | (corners[..., :2].max(axis=1) < -half)
+    under = np.flatnonzero(~beside.any(axis=1))
+    weights, covered = _weights(corners[under], points[:, :2])
+    if not covered.any():
+        return Pressing()
+    z = np.einsum("tkc,tc->tk", weights, corners[under, :, 2])
+    upward = _upward(corners[under])[:, None]
+    enters = np.where(covered & upward & (z <= points[:, 2] + TOUCH_MM), z, -np.inf)
+    first, top = enters.argmax(axis=0), enters.max(axis=0)
+    touches = points[:, 2] - top <= TOUCH_MM
+    leaves = np.where(covered & ~upward & (z < top), z, -np.inf)
+    last, bottom = leaves.argmax(axis=0), leaves.max(axis=0)
+    through = np.flatnonzero(touches & np.isfinite(bottom))
+    compression = 0.0
+    if len(through):
+        at_rest = [
+            np.einsum("kc,kcx->kx", weights[t[through], through], rest_mm[faces[under[t[through]]]])
+            for t in (first, last)
+        ]
+        shorter = np.linalg.norm(at_rest[0] - at_rest[1], axis=1) - (top[through] - bottom[through])
+        compression = max(float(shorter.max()), 0.0)
+    return Pressing(float(area[touches].sum()), compression)
+
+
+def _weights(corners: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Barycentric weights (t, k, 3) of places (k, 2) in triangles (t, 3, 3) seen along z, and whether they are in them."""
+    a, b, c = (corners[:, i, :2] for i in range(3))
+    twice = _cross(b - a, c - a)
+    safe = np.where(np.abs(twice) < 1e-12, np.inf, twice)
+    to = places[None] - a[:, None]
+    second = _cross(to, (c - a)[:, None]) / safe[:, None]
+    third = _cross((b - a)[:, None], to) / safe[:, None]
+    weights = np.stack([1 - second - third, second, third], axis=-1)
+    return weights, (weights >= -SEAM).all(axis=-1) & (np.abs(twice) >= 1e-12)[:, None]
+
+
+def _upward(corners: np.ndarray) -> np.ndarray:
+    """Which triangles (t, 3, 3) face the transducer."""
+    return _cross(corners[:, 1, :2] - corners[:, 0, :2], corners[:, 2, :2] - corners[:, 0, :2]) > 0
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -1,0 +1,138 @@
+"""A scalar volume on the device, sampled in mm."""
+
+import numpy as np
+import taichi as ti
+import taichi.math as tm
+import trimesh
+
+from sim.distance_grid import distance_grid
+from sim.fields import field_of
+from ultrasound.image_plane import LANES, Lanes
+
+AIR_HU = -1000.0
+FAR_MM = 1e6
+
+
+@ti.data_oriented
+class Volume:
+    """Voxels (nx, ny, nz) float32 with the affine map (4, 4) that takes mm to voxel indices.
+
+    Index (0, 0, 0) is the centre of the first voxel. ``outside`` is the value beyond the outer half voxel. With a last
+    axis (nx, ny, nz, c) every voxel holds a vector of c values, which are sampled together.
+    """
+
+    def __init__(self, voxels: np.ndarray, index_from_mm: np.ndarray, outside: float = AIR_HU) -> None:
+        # Between the last voxel and the next there is no weight, but the next must be there.
+        thin = [(0, 1 if n == 1 else 0) for n in voxels.shape[:3]]
+        filled = np.pad(np.asarray(voxels, np.float32), thin + [(0, 0)] * (voxels.ndim - 3), mode="edge")
+        self.shape, self.count = voxels.shape[:3], filled.shape[:3]
+        self.outside = float(outside)
+        self.strides = self.count[1] * self.count[2], self.count[2]
+        flat = filled.reshape(-1, *voxels.shape[3:])
+        self.voxels = field_of(flat, voxels.ndim - 3)
+        self.linear = ti.Matrix(index_from_mm[:3, :3].tolist())
+        self.offset = ti.Vector(index_from_mm[:3, 3].tolist())
+
+    @ti.func
+    def place(self, p):
+        """Where p [mm] lies: the first of the eight voxels around it, the way on to the next ones (0 to 1), whether inside."""
+        at = self.linear @ p + self.offset
+        last = tm.vec3(self.shape[0] - 1, self.shape[1] - 1, self.shape[2] - 1)
+        inside = (at >= -0.5).all() and (at <= last + 0.5).all()
+        clamped = tm.clamp(at, 0.0, last)
+        most = ti.Vector([self.count[0] - 2, self.count[1] - 2, self.count[2] - 2])
+        base = ti.min(ti.cast(clamped, ti.i32), most)
+        return base.x * self.strides[0] + base.y * self.strides[1] + base.z, clamped - base, inside
+
+    @ti.func
+    def sample(self, p):
+        """Trilinear value at p [mm]."""
+        first, t, inside = self.place(p)
+        value = self.voxels[0] * 0.0 + self.outside
+        if inside:
+            x, y = ti.static(self.strides)
+            low = tm.mix(self.along_z(first, t.z), self.along_z(first + y, t.z), t.y)
+            high = tm.mix(self.along_z(first + x, t.z), self.along_z(first + x + y, t.z), t.y)
+            value = tm.mix(low, high, t.x)
+        return value
+
+    @ti.func
+    def sample_lanes(self, x, y, z, in_line):
+        """Trilinear values at LANES places [mm], one a lane; ``in_line`` says that they are evenly spaced on a line."""
+        a, o = self.linear, self.offset
+        first_i, along_i, off_i = self.lanes_along(0, a[0, 0] * x + a[0, 1] * y + a[0, 2] * z + o[0])
+        first_j, along_j, off_j = self.lanes_along(1, a[1, 0] * x + a[1, 1] * y + a[1, 2] * z + o[1])
+        first_k, along_k, off_k = self.lanes_along(2, a[2, 0] * x + a[2, 1] * y + a[2, 2] * z + o[2])
+        first = first_i * self.strides[0] + first_j * self.strides[1] + first_k
+        low, high = Lanes(0.0), Lanes(0.0)
+        if in_line and first[0] == first[LANES - 1]:
+            # A picture has many pixels a voxel: both ends of a line between the same eight, all of it is.
+            low = self.between(first[0], 0, along_j, along_k)
+            high = self.between(first[0], self.strides[0], along_j, along_k)
+        else:
+            low = self.lanes_between(first, 0, along_j, along_k)
+            high = self.lanes_between(first, self.strides[0], along_j, along_k)
+        value = low + along_i * (high - low)
+        off = ti.max(ti.max(off_i, off_j), off_k)
+        return ti.select(off <= 0.5, value, self.outside)
+
+    @ti.func
+    def lanes_along(self, axis: ti.template(), at):
+        """Along one axis: the voxels before places (in voxels), the way on to the next, how far outside the voxels' centres."""
+        clamped = ti.min(ti.max(at, 0.0), float(self.shape[axis] - 1))
+        base = ti.min(ti.cast(clamped, ti.i32), self.count[axis] - 2)
+        return base, clamped - base, ti.abs(at - clamped)
+
+    @ti.func
+    def between(self, voxel, shift: ti.template(), tj, tk):
+        """Values at lanes between the four voxels of a plane, the first of which is ``shift`` on."""
+        v, y = ti.static(self.voxels, shift + self.strides[1])
+        low = v[voxel + shift] + tk * (v[voxel + shift + 1] - v[voxel + shift])
+        high = v[voxel + y] + tk * (v[voxel + y + 1] - v[voxel + y])
+        return low + tj * (high - low)
+
+    @ti.func
+    def lanes_between(self, first, shift: ti.template(), tj, tk):
+        """As ``between``, each lane with voxels of its own."""
+        y = ti.static(shift + self.strides[1])
+        a, b = self.lanes_of(first, shift), self.lanes_of(first, shift + 1)
+        c, d = self.lanes_of(first, y), self.lanes_of(first, y + 1)
+        low, high = a + tk * (b - a), c + tk * (d - c)
+        return low + tj * (high - low)
+
+    @ti.func
+    def lanes_of(self, first, shift: ti.template()):
+        """The voxels ``shift`` after those of the lanes."""
+        return Lanes([self.voxels[first[lane] + shift] for lane in ti.static(range(LANES))])
+
+    @ti.func
+    def along_z(self, voxel, t):
+        """Linear between a voxel and the next."""
+        return tm.mix(self.voxels[voxel], self.voxels[voxel + 1], t)
+
+    @ti.func
+    def slope(self, p):
+        """Gradient [1/mm] of the trilinear first value at p [mm]; zero outside."""
+        first, t, inside = self.place(p)
+        along = tm.vec3(0.0)
+        if inside:
+            x, y = ti.static(self.strides)
+            low = tm.vec4([self.voxels[first + i][0] for i in ti.static((0, y, x, x + y))])
+            high = tm.vec4([self.voxels[first + i + 1][0] for i in ti.static((0, y, x, x + y))])
+            at_y = tm.mix(
+                tm.vec2(high.x - low.x, high.z - low.z), tm.vec2(high.y - low.y, high.w - low.w), t.y
+            )
+            ends = tm.mix(low, high, t.z)
+            along.z = tm.mix(at_y.x, at_y.y, t.x)
+            along.y = tm.mix(ends.y - ends.x, ends.w - ends.z, t.x)
+            along.x = tm.mix(ends.z, ends.w, t.y) - tm.mix(ends.x, ends.y, t.y)
+        return self.linear.transpose() @ along
+
+
+def distance_volume(surface: trimesh.Trimesh, spacing_mm: float = 2.0, reach_mm: float = 6.0) -> Volume:
+    """Signed distances [mm] to a closed surface, negative inside, as far as ``reach_mm`` around it (``distance_grid``); FAR_MM beyond."""
+    distance, low = distance_grid(surface.vertices, surface.faces, spacing_mm, reach_mm)
+    index_from_mm = np.eye(4)
+    index_from_mm[:3] /= spacing_mm
+    index_from_mm[:3, 3] = -low / spacing_mm
+    return Volume(distance, index_from_mm, outside=FAR_MM)

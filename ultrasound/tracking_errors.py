@@ -1,0 +1,79 @@
+"""What a tracker gets wrong of a probe's poses: noise, calibration, latency, frames that are lost."""
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from ultrasound.probe_manipulator import rigid
+
+
+@dataclass(frozen=True)
+class TrackingErrors:
+    """All 0 is a perfect tracker. Raises ValueError for what is negative or not finite, or a share over 1."""
+
+    # Standard deviation of each coordinate of the position, and of the turn about each axis; frame by frame.
+    noise_mm: float = 0.0
+    noise_deg: float = 0.0
+    # The same in every frame: how far the image is off the probe, and turned; the seed says which way.
+    calibration_mm: float = 0.0
+    calibration_deg: float = 0.0
+    # A picture comes with the pose of so much earlier.
+    latency_s: float = 0.0
+    # Share of the frames that have no pose (PLUS's status INVALID).
+    lost: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (math.isfinite(value) and value >= 0):
+                raise ValueError(f"{field.name} must be 0 or more, not {value:g}")
+        if self.lost > 1:
+            raise ValueError(f"lost is a share of the frames, at most 1, not {self.lost:g}")
+
+
+def tracked(
+    poses: np.ndarray, times_s: np.ndarray, errors: TrackingErrors, seed: int = 0
+) -> list[np.ndarray | None]:
+    """What a tracker reports of rigid ``poses`` (n, 4, 4) [mm], reference from probe: None where it is lost.
+
+    In this order: latency; noise, turning about the probe's own origin; calibration, on the image's side
+    (``pose @ calibration``). One ``seed`` draws the same pattern at whatever size of the errors, so that
+    sizes can be compared. Raises ValueError where shapes do not fit, or ``times_s`` (n,) do not grow.
+    """
+    poses, times = np.asarray(poses, float), np.asarray(times_s, float)
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or times.shape != poses.shape[:1]:
+        raise ValueError(f"poses (n, 4, 4) need times (n,), not {poses.shape} and {times.shape}")
+    if not (np.diff(times) > 0).all():
+        raise ValueError("the times of poses must grow from each to the next")
+    noise, calibration, losses = np.random.default_rng(seed).spawn(3)
+    reported = _noisy(_delayed(poses, times, errors.latency_s), errors, noise) @ _calibration(
+        errors, calibration
+    )
+    lost = losses.random(len(poses)) < errors.lost
+    return [None if gone else pose for pose, gone in zip(reported, lost, strict=True)]
+
+
+def _delayed(poses: np.ndarray, times: np.ndarray, latency_s: float) -> np.ndarray:
+    """Poses of ``latency_s`` earlier; before the first it is the first."""
+    if latency_s == 0 or len(poses) < 2:
+        return poses
+    earlier = np.maximum(times - latency_s, times[0])
+    turns = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(earlier)
+    places = [np.interp(earlier, times, poses[:, axis, 3]) for axis in range(3)]
+    return rigid(turns.as_matrix(), np.stack(places, axis=1))
+
+
+def _noisy(poses: np.ndarray, errors: TrackingErrors, draw: np.random.Generator) -> np.ndarray:
+    shifts = errors.noise_mm * draw.standard_normal((len(poses), 3))
+    turns = np.radians(errors.noise_deg) * draw.standard_normal((len(poses), 3))
+    turned = poses[:, :3, :3] @ Rotation.from_rotvec(turns).as_matrix()
+    return rigid(turned, poses[:, :3, 3] + shifts)
+
+
+def _calibration(errors: TrackingErrors, draw: np.random.Generator) -> np.ndarray:
+    """The map (4, 4) from where the image is taken to be to where it is."""
+    direction, axis = (v / np.linalg.norm(v) for v in draw.standard_normal((2, 3)))
+    turn = Rotation.from_rotvec(np.radians(errors.calibration_deg) * axis)
+    return rigid(turn.as_matrix(), errors.calibration_mm * direction)
