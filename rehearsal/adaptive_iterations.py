@@ -14,7 +14,7 @@ STEPS_DOWN, STEPS_UP = 20, 120
 ROOM = 0.8
 
 
-class Ladder:
+class AdaptiveIterations:
     """Keeps a step within a budget [ms] by asking for fewer iterations; ``rung`` is 0 where nothing gives way."""
 
     def __init__(self, budget_ms: float) -> None:

@@ -13,7 +13,7 @@ from sim.body import RestBody
 from sim.self_contact import ParticleContacts
 from sim.shapes import ConvexTool, SignedDistanceField
 from sim.solver import Solver, StepSettings
-from sim.tissue_model import Held, Parts, TissueModel
+from sim.tissue_model import FixedRegion, ModelInputs, TissueModel
 from ultrasound.probe import Probe
 
 # Flats that stand for the arc of a curved array: of 60 mm and 60 degrees, they are nowhere 0.1 mm off it.
@@ -65,7 +65,7 @@ def build_solver(
     contact: Contact | None = None,
     section: SolverSection | None = None,
     serial: bool | None = None,
-    held: Held | None = None,
+    held: FixedRegion | None = None,
 ) -> Solver:
     """A solver of the organ [mm] among shapes, the tool among them. Raises SamplingError.
 
@@ -74,7 +74,9 @@ def build_solver(
     """
     contact, section = contact or Contact(), section or SolverSection()
     scaling = section.mass_scaling_per_mm
-    parts = Parts(organ, tissue, shapes, contact.shape_friction, held, serial, section.relaxation, scaling)
+    parts = ModelInputs(
+        organ, tissue, shapes, contact.shape_friction, held, serial, section.relaxation, scaling
+    )
     model: Any = model_of(tissue).make(parts)
     pairs = ParticleContacts(model, contact.particle_friction) if contact.particles else None
     return Solver(model, pairs, tool)

@@ -1,4 +1,4 @@
-"""What a frozen scanner offers: the pictures of the last seconds, and a calliper."""
+"""What a frozen scanner offers: the pictures of the last seconds, and a caliper."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ KEPT_S, KEPT_A_SECOND = 10.0, 30
 
 
 @dataclass(frozen=True)
-class Frame:
+class CineFrame:
     """A view, when it was there [s], and where its tissue was at rest (rows, columns, 3) [mm]; None without a CT."""
 
     time_s: float
@@ -25,10 +25,10 @@ class Frame:
 class Cine:
     """The frames of the last KEPT_S seconds. ``back`` says how many before the newest is looked at."""
 
-    frames: deque[Frame] = field(default_factory=deque)
+    frames: deque[CineFrame] = field(default_factory=deque)
     back: int = 0
 
-    def keep(self, frame: Frame) -> None:
+    def keep(self, frame: CineFrame) -> None:
         """Add a frame, now the newest, and let go of those that are too old; of a fast machine's not each is kept."""
         self.back = 0
         if self.frames and frame.time_s - self.frames[-1].time_s < 0.99 / KEPT_A_SECOND:
@@ -42,7 +42,7 @@ class Cine:
         self.back = int(np.clip(self.back - frames, 0, max(len(self.frames) - 1, 0)))
 
     @property
-    def shown(self) -> Frame:
+    def shown(self) -> CineFrame:
         """The frame that is looked at."""
         return self.frames[-1 - self.back]
 
@@ -53,7 +53,7 @@ class Cine:
 
 
 @dataclass
-class Calliper:
+class Caliper:
     """Two points on the image plane [mm], set by clicks; a third click removes them, or a probe that moves."""
 
     points: tuple[tuple[float, float], ...] = ()
@@ -72,7 +72,7 @@ class Calliper:
         if self.points and self._pose is not None and np.abs(pose - self._pose).max() > STILL_MM:
             self.points = ()
 
-    def figure(self, frame: Frame) -> str:
+    def figure(self, frame: CineFrame) -> str:
         """The distance of the points as the tissue lies, and of the same tissue at rest; empty of fewer than two."""
         if len(self.points) < 2:
             return ""

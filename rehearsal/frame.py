@@ -6,11 +6,11 @@ from time import perf_counter
 
 import click
 
-from rehearsal.cine import Calliper, Cine, Frame
+from rehearsal.cine import Caliper, Cine, CineFrame
 from rehearsal.frame_view import probe_as_set, take_view
-from rehearsal.inputs.input_source import Driver, Played
-from rehearsal.inputs.user_input import Live
-from rehearsal.measurements.live_measurements import Instruments
+from rehearsal.inputs.input_source import InputSource, ReplayInput
+from rehearsal.inputs.user_input import UserInput
+from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import Tally
 from rehearsal.planning.plans_in_window import Plans
 from rehearsal.rehearsal import Rehearsal
@@ -29,19 +29,19 @@ HOW_TO_PRESS = "{press} or {push} presses"
 
 
 @dataclass
-class Loop:
+class FrameLoop:
     """The frames of one rehearsal in a window, led by a driver."""
 
     rehearsal: Rehearsal
     viewer: Viewer
     out: Path
     tally: Tally
-    driver: Driver
-    instruments: Instruments
+    driver: InputSource
+    instruments: LiveMeasurements
     sweeping: Sweeping
     plans: Plans
     cine: Cine = field(default_factory=Cine)
-    calliper: Calliper = field(default_factory=Calliper)
+    caliper: Caliper = field(default_factory=Caliper)
     keys: Keys = field(default_factory=Keys)
     link: Server | None = None
     frozen: bool = False
@@ -90,20 +90,20 @@ class Loop:
         if controls.freeze or (self.frozen and (any(ends_freeze) or controls.take_over)):
             self.frozen = not self.frozen
         if controls.reset:
-            self.calliper.points = ()
+            self.caliper.points = ()
         self._announce(controls.news)
         self._announce(self.plans.watch(controls))
         shown = self._looked_back(controls) or self._taken(controls)
         if controls.sweep:
             self._announce(self.sweeping.toggle(self.out))
         view = shown.view
-        self.calliper.point(controls.pointed_mm, view.transducer_pose)
+        self.caliper.point(controls.pointed_mm, view.transducer_pose)
         if not self.frozen:
-            self.calliper.go_with(view.transducer_pose)
+            self.caliper.go_with(view.transducer_pose)
         return replace(
             view,
-            calliper_mm=self.calliper.points,
-            calliper=self.calliper.figure(shown),
+            caliper_mm=self.caliper.points,
+            caliper=self.caliper.figure(shown),
             readouts=view.readouts | {"frames": f"{self.rate:.0f} /s"},
             clock=f"{self.driver.session.time_s:.1f} s",
             pace=self._pace(),
@@ -118,8 +118,8 @@ class Loop:
 
     def _hinted(self, note: str) -> str:
         """A note that there is no contact, with what the user can do about it, if anything."""
-        live = self.driver.live if isinstance(self.driver, Played) else self.driver
-        if self.frozen or not isinstance(live, Live) or not live.is_by_hand:
+        live = self.driver.live if isinstance(self.driver, ReplayInput) else self.driver
+        if self.frozen or not isinstance(live, UserInput) or not live.is_by_hand:
             return note
         return self.keys.worded(f"{note}\n{HOW_TO_PRESS}")
 
@@ -147,7 +147,7 @@ class Loop:
             words = self.keys.worded(text)
             self._said, self._said_until = words[0].upper() + words[1:], perf_counter() + SAID_S
 
-    def _looked_back(self, controls: Controls) -> Frame | None:
+    def _looked_back(self, controls: Controls) -> CineFrame | None:
         """A frame of the last seconds, where the user is looking at one."""
         if self.frozen:
             self.cine.go(controls.cine)
@@ -155,7 +155,7 @@ class Loop:
             return None
         return self.cine.shown
 
-    def _taken(self, controls: Controls) -> Frame:
+    def _taken(self, controls: Controls) -> CineFrame:
         """A new frame. A frozen one shows the same tissue with the scanner set anew, and is not kept."""
         if self.frozen:
             view = take_view(self.rehearsal, controls.settings, None, self.tally)
@@ -176,11 +176,11 @@ class Loop:
         self.cine.keep(frame)
         return frame
 
-    def _sent(self, view: View, settings: Settings) -> Frame:
+    def _sent(self, view: View, settings: Settings) -> CineFrame:
         """A view sent over the link, and with what the instruments read."""
         probe = probe_as_set(self.rehearsal.probe, settings)
         send_live(self.link, self.rehearsal, view, probe, self.driver.session.time_s)
-        return Frame(perf_counter(), self.instruments.onto(view, settings), self.rehearsal.rest_grid())
+        return CineFrame(perf_counter(), self.instruments.onto(view, settings), self.rehearsal.rest_grid())
 
     def _tell(self, news: str) -> None:
         if news:

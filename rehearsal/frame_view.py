@@ -35,7 +35,7 @@ def settings_of(rehearsal: Rehearsal) -> Settings:
         frequency_mhz=probe.frequency_mhz,
         focus_percent=round(probe.focus_depth_percent),
         mode=scene.image.mode,
-        rung=scene.image.rung,
+        detail_level=scene.image.detail_level,
     )
     for name, value in zip(TGC, probe.time_gain_compensation, strict=True):
         setattr(settings, name, round(value))
@@ -109,7 +109,7 @@ def take_view(
     """
     take_step(rehearsal, pose, tally)
     probe = probe_as_set(rehearsal.probe, settings)
-    shown = settings.mode, settings.rung, settings.window_hu, settings.level_hu
+    shown = settings.mode, settings.detail_level, settings.window_hu, settings.level_hu
     pictures = timed(partial(rehearsal.look, probe, *shown), tally.slice_ms)
     width, depth, above = probe.extent_mm
     return View(
@@ -130,7 +130,7 @@ def take_view(
 
 def captions(probe: Probe, settings: Settings) -> tuple[str, str, str]:
     """The probe, and what echo and CT are shown with."""
-    echo = f"{probe.frequency_mhz:.1f} MHz   G {probe.gain_percent:.0f} %   DR {probe.dyn_range_db:.0f} dB   {settings.rung}"
+    echo = f"{probe.frequency_mhz:.1f} MHz   G {probe.gain_percent:.0f} %   DR {probe.dyn_range_db:.0f} dB   {settings.detail_level}"
     ct = f"W {settings.window_hu}   L {settings.level_hu} HU"
     return (
         probe.transducer_name,

@@ -9,8 +9,8 @@ from tqdm import tqdm
 
 from rehearsal.frame_view import open_viewer, probe_as_set, take_step, take_view
 from rehearsal.image_files import save_picture
-from rehearsal.inputs.input_source import Driver
-from rehearsal.measurements.live_measurements import Instruments
+from rehearsal.inputs.input_source import InputSource
+from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import Tally, summary
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.saving import save_surfaces
@@ -43,7 +43,7 @@ class Pictures:
         self._frames, self._slices = map(empty_folder, folders)
         self._animation: list[Image.Image] = []
 
-    def draw(self, step: int, view: View, settings: Settings, instruments: Instruments) -> None:
+    def draw(self, step: int, view: View, settings: Settings, instruments: LiveMeasurements) -> None:
         """A step's, where they are due."""
         if step % self._every and step < self.steps:
             return
@@ -65,10 +65,10 @@ class Pictures:
 
 def run_headless(
     rehearsal: Rehearsal,
-    driver: Driver,
+    driver: InputSource,
     steps: int,
     settings: Settings,
-    instruments: Instruments,
+    instruments: LiveMeasurements,
     arch: str,
     out: Path,
     build_s: float,

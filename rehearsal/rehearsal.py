@@ -15,21 +15,21 @@ from rehearsal.build_solver import build_solver, embedding_cell_mm, static_shape
 from rehearsal.configuration import probe_of
 from scenes.anatomy import Grid, LoadedAnatomy, press_on
 from scenes.closed_surfaces import moved_by, volume_mm3
-from scenes.progress import Told, untold
+from scenes.progress import ReportProgress, no_progress
 from scenes.scene import PlaneShape, Scene
-from sim.divergence_check import Guard, Watch
+from sim.divergence_check import DivergenceCheck, DivergenceState
 from sim.embedding import Embedding
 from sim.fields import array_of
 from sim.shapes import Plane, SignedDistanceField
 from sim.skinning import Skin
 from sim.solver import SolverState
-from sim.tissue_model import Held, MaterialModel
+from sim.tissue_model import FixedRegion, MaterialModel
 from ultrasound.image_plane import ImagePlane
 from ultrasound.outline import section
-from ultrasound.probe import Mode, Probe, Rung
+from ultrasound.probe import DetailLevel, Mode, Probe
 from ultrasound.probe_manipulator import (
-    Grip,
-    Hand,
+    ManipulatorState,
+    ProbeManipulator,
     advanced,
     approached,
     between,
@@ -57,10 +57,10 @@ class RehearsalState:
     """All that frames change: the tissue, what its guard remembers, the transducer's pose (4, 4), the hand that holds it."""
 
     solver: SolverState
-    watch: Watch
+    watch: DivergenceState
     pose: np.ndarray
     steps: int
-    grip: Grip
+    manipulator: ManipulatorState
 
 
 class Rehearsal:
@@ -75,7 +75,7 @@ class Rehearsal:
         scene: Scene,
         anatomy: LoadedAnatomy,
         probe: Probe | None = None,
-        told: Told = untold,
+        progress: ReportProgress = no_progress,
         shows_echo: bool = False,
     ) -> None:
         self.scene = scene
@@ -91,19 +91,19 @@ class Rehearsal:
         if anatomy.ct is not None:
             scanned = scanned_anatomy(self.organ, anatomy.ct, anatomy, self.origin)
             echo = begin_echo(scanned) if shows_echo else None
-        told("Building the model: tissue and contacts")
+        progress("Building the model: tissue and contacts")
         self._build_solver(anatomy)
-        self.guard = Guard(self.solver)
+        self.guard = DivergenceCheck(self.solver)
         self.notice = ""
-        told("Building the model: surfaces")
+        progress("Building the model: surfaces")
         self._build_surfaces()
         self._build_scanner(scanned, echo)
         self.press = press_on(scene.press, anatomy, self.gravity_direction)
         self.steps = 0
-        told("Building the model: the tissue comes to rest")
+        progress("Building the model: the tissue comes to rest")
         self.pose = self._settle()
-        self.hand = self._hand()
-        self.pose = self.hand.pose()
+        self.manipulator = self._manipulator()
+        self.pose = self.manipulator.pose()
         self.guard.settle()
         self.settled = self.snapshot()
 
@@ -120,11 +120,11 @@ class Rehearsal:
         self.settings = step_settings(tissue, section)
         self.set_gravity(self.scene.gravity.acceleration_m_s2)
 
-    def _held(self) -> Held | None:
+    def _held(self) -> FixedRegion | None:
         attachment = self.scene.attachment
         if attachment.radius_mm == 0 or attachment.at_mm is None:
             return None
-        return Held(np.array(attachment.at_mm) - self.origin, attachment.radius_mm)
+        return FixedRegion(np.array(attachment.at_mm) - self.origin, attachment.radius_mm)
 
     def _shape(self, shape: PlaneShape | trimesh.Trimesh | Grid) -> Plane | SignedDistanceField:
         if isinstance(shape, PlaneShape):
@@ -164,14 +164,16 @@ class Rehearsal:
         self.update_surfaces()
         return pose
 
-    def _hand(self) -> Hand:
+    def _manipulator(self) -> ProbeManipulator:
         settled = array_of(self.organ_skin.vertices).astype(float)
         faces = np.array(self.organ.faces, np.int64)
         normals = np.array(trimesh.Trimesh(settled, faces, process=False).vertex_normals)
         radius = self.probe.radius_mm
-        hand = Hand(settled, faces, normals, self.size_mm, self.pose, np.array(self.press.lateral), radius)
-        hand.home = touching(self.pose, self.size_mm, hand.samples, radius)
-        return hand
+        manipulator = ProbeManipulator(
+            settled, faces, normals, self.size_mm, self.pose, np.array(self.press.lateral), radius
+        )
+        manipulator.home = touching(self.pose, self.size_mm, manipulator.samples, radius)
+        return manipulator
 
     def set_gravity(self, acceleration_m_s2: float) -> None:
         """Change the acceleration due to gravity; its direction is the scene's."""
@@ -190,7 +192,7 @@ class Rehearsal:
 
     def pose_at_depth(self, depth_mm: float) -> np.ndarray:
         """The transducer's pose so deep in the organ, along the scripted press."""
-        return advanced(self.hand.home, depth_mm)
+        return advanced(self.manipulator.home, depth_mm)
 
     def script_length_s(self) -> float:
         """How long the scripted press takes [s]."""
@@ -217,13 +219,15 @@ class Rehearsal:
 
     def snapshot(self) -> RehearsalState:
         """A copy of the current state."""
-        return RehearsalState(self.solver.snapshot(), self.guard.watch, self.pose, self.steps, self.hand.grip)
+        return RehearsalState(
+            self.solver.snapshot(), self.guard.watch, self.pose, self.steps, self.manipulator.state
+        )
 
     def restore(self, state: RehearsalState) -> None:
         """Go back to a state; the steps that follow give the same bits as they did from it before."""
         self.solver.restore(state.solver)
         self.guard.watch = state.watch
-        self.pose, self.steps, self.hand.grip = state.pose, state.steps, state.grip
+        self.pose, self.steps, self.manipulator.state = state.pose, state.steps, state.manipulator
 
     def keep_good(self) -> None:
         """Take the tissue, where it is well, for what its guard would put back."""
@@ -238,12 +242,12 @@ class Rehearsal:
             skin.update()
 
     def look(
-        self, probe: Probe, mode: Mode, rung: Rung, window_hu: float, level_hu: float
+        self, probe: Probe, mode: Mode, detail_level: DetailLevel, window_hu: float, level_hu: float
     ) -> dict[str, np.ndarray]:
         """What the scanner shows now, by name (``Scanner.look``); black in a scene without a CT."""
         if self.scanner is None:
             return {"no CT": np.zeros((self.scene.image.pixels, self.scene.image.pixels), np.uint8)}
-        return self.scanner.look(self.image_plane(probe), probe, mode, rung, window_hu, level_hu)
+        return self.scanner.look(self.image_plane(probe), probe, mode, detail_level, window_hu, level_hu)
 
     def find_plane(self, probe: Probe) -> None:
         """Find the tissue that a picture would be of, and make none."""
@@ -281,7 +285,7 @@ class Rehearsal:
         return self._indentation(self.pose)
 
     def _indentation(self, pose: np.ndarray) -> float:
-        return indentation(pose, self.size_mm, self.hand.samples, self.probe.radius_mm)
+        return indentation(pose, self.size_mm, self.manipulator.samples, self.probe.radius_mm)
 
     def volume_ratio(self) -> float:
         """Volume inside the carried surface, as a share of the resting one."""

@@ -1,25 +1,25 @@
 """What the actions of the key map do to the controls and settings, by whichever key or button they come."""
 
 from render.viewer import LINES, Controls
-from ultrasound.probe import MODES, RUNGS
+from ultrasound.probe import DETAIL_LEVELS, MODES
 from ultrasound.target import TARGETS
 
-PUSH_MM_S, ROLL_DEG_S, TILT_DEG_S = 15.0, 45.0, 30.0
+PUSH_MM_S, ROTATE_DEG_S, TILT_DEG_S = 15.0, 45.0, 30.0
 # While held: what of the controls changes, and how much in a second.
 HELD = {
     "push": ("push_mm", PUSH_MM_S),
     "lift": ("push_mm", -PUSH_MM_S),
-    "roll_left": ("roll_deg", ROLL_DEG_S),
-    "roll_right": ("roll_deg", -ROLL_DEG_S),
-    "tilt_left": ("tilt_deg", TILT_DEG_S),
-    "tilt_right": ("tilt_deg", -TILT_DEG_S),
-    "fan_back": ("fan_deg", -TILT_DEG_S),
-    "fan_forth": ("fan_deg", TILT_DEG_S),
+    "rotate_left": ("rotate_deg", ROTATE_DEG_S),
+    "rotate_right": ("rotate_deg", -ROTATE_DEG_S),
+    "rock_left": ("rock_deg", TILT_DEG_S),
+    "rock_right": ("rock_deg", -TILT_DEG_S),
+    "tilt_back": ("tilt_deg", -TILT_DEG_S),
+    "tilt_forward": ("tilt_deg", TILT_DEG_S),
 }
 # The rest begins as the key goes down: steps through pictures, settings of several values, settings that are on or off,
 # and what the controls name as the action is named.
 STEPS = {"cine_back": -1, "cine_forth": 1}
-CYCLES = {"mode": MODES, "rung": RUNGS, "plan_for": TARGETS}
+CYCLES = {"mode": MODES, "detail_level": DETAIL_LEVELS, "plan_for": TARGETS}
 # What is the mouse's alone.
 BY_MOUSE = ("point", "press", "orbit", "pan", "measure")
 ACTIONS = tuple(action for line in LINES for action in line.actions if action not in BY_MOUSE)

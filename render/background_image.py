@@ -12,13 +12,13 @@ from render.ultrasound_panel import (
     FIGURE_PX,
     OUTLINE,
     Panel,
-    draw_calliper,
+    draw_caliper,
     draw_note,
     draw_segments,
     paste_picture,
 )
 from render.viewer import View
-from render.window_layout import Layout, Rect
+from render.window_layout import Rect, WindowLayout
 
 READOUT_PERIOD_S = 0.25
 
@@ -45,7 +45,7 @@ def panel_of(view: View) -> Panel:
 class Page:
     """``pixels`` uint8 (width, height, 4) as GGUI wants them: columns first, bottom up."""
 
-    def __init__(self, layout: Layout, keys: Keys | None = None) -> None:
+    def __init__(self, layout: WindowLayout, keys: Keys | None = None) -> None:
         self.layout, self.keys = layout, keys or Keys()
         self.pixels = np.full((layout.width, layout.height, 4), 255, dtype=np.uint8)
         # window_frame.py and panel.py write rows, top down, through this view of the memory.
@@ -83,14 +83,14 @@ class Page:
             self._helps = True
 
     def _draw_over(self, view: View, panel: Panel, name: str, box: Rect) -> None:
-        """Outlines, calliper and what is written in a picture."""
+        """Outlines, caliper and what is written in a picture."""
         if view.outline_before_mm is not None:
             draw_segments(self._page, panel, box, view.outline_before_mm, BEFORE)
         if view.outline_mm is not None:
             draw_segments(self._page, panel, box, view.outline_mm, OUTLINE)
         if note := view.notes.get(name):
             draw_note(self._page, self.layout, box, note)
-        draw_calliper(self._page, panel, box, view.calliper_mm, view.calliper, self.layout.px(FIGURE_PX))
+        draw_caliper(self._page, panel, box, view.caliper_mm, view.caliper, self.layout.px(FIGURE_PX))
 
     def _compose_figures(self, figures: Figures, patient: bool) -> None:
         now = time.perf_counter()

@@ -5,7 +5,7 @@ from PIL import Image, ImageDraw
 
 from render.text import font
 from render.ultrasound_panel import FINDINGS, LINE, QUIET, TEXT
-from render.window_layout import Layout
+from render.window_layout import WindowLayout
 
 # Patient coordinates are LPS: towards the patient's left, back and head; and the other way.
 LETTERS = (("R", "L"), ("A", "P"), ("I", "S"))
@@ -29,7 +29,7 @@ def ends_of(axes: np.ndarray) -> list[tuple[str, np.ndarray]]:
     return [(letter, way[:2]) for letter, way in sorted(ends, key=lambda end: -end[1][2])]
 
 
-def compass_picture(layout: Layout, axes: np.ndarray) -> np.ndarray:
+def compass_picture(layout: WindowLayout, axes: np.ndarray) -> np.ndarray:
     """The cross for a camera's axes (3, 3), uint8, shape of layout.compass."""
     size = layout.compass.width
     image = Image.new("RGB", (size, size), FINDINGS)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from render.surface_shading import Surface
+from render.surface_shading import ShadedSurface
 from sim.fields import array_of, fields_of, fill
 
 CELLS = 160
@@ -94,7 +94,9 @@ class CutFace:
         first = (np.arange(CELLS - 1)[:, None] * CELLS + np.arange(CELLS - 1)).reshape(-1, 1)
         self._quads = (first + [0, CELLS, 1, 1, CELLS, CELLS + 1]).astype(np.int32)
 
-    def draw(self, scene, organ: Surface, inner: list[Surface], pose: np.ndarray, key: np.ndarray) -> None:
+    def draw(
+        self, scene, organ: ShadedSurface, inner: list[ShadedSurface], pose: np.ndarray, key: np.ndarray
+    ) -> None:
         """Hand the face on the image plane of a pose (4, 4) to a scene, evenly lit by a light at ``key`` (3,)."""
         cuts = [section(array_of(each.vertices), each.faces, pose) for each in (organ, *inner)]
         raster = Raster.around(cuts, CELLS)

@@ -58,8 +58,8 @@ class Gamepad:
         x, y = shaped(*state.left)
         controls.slide_mm = (SLIDE_MM_S * seconds * x, SLIDE_MM_S * seconds * y)
         x, y = shaped(*state.right)
-        controls.tilt_deg -= TILT_DEG_S * seconds * x
-        controls.fan_deg += TILT_DEG_S * seconds * y
+        controls.rock_deg -= TILT_DEG_S * seconds * x
+        controls.tilt_deg += TILT_DEG_S * seconds * y
         if state.trigger > DEAD_TRIGGER and not controls.press:
             controls.press, controls.press_share = True, _beyond(state.trigger, DEAD_TRIGGER)
         for action, button in self._buttons.items():

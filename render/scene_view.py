@@ -9,7 +9,7 @@ from render import transducer_shape
 from render.camera import OrbitCamera
 from render.cut_face import CutFace, side_of_eye
 from render.plan_lines import GuideLines
-from render.surface_shading import CUT_EDGE_MM, GLASS, SOLID, Cut, Surface
+from render.surface_shading import CUT_EDGE_MM, GLASS, SOLID, Cut, ShadedSurface
 from render.viewer import Geometry, Settings, View
 from sim.fields import field_of, fields_of, fill
 
@@ -21,18 +21,19 @@ LINE_WIDTH = 1.2
 MASKS = 5
 
 
-class Stage:
+class SceneView:
     """The fields of what is drawn, and one method that draws them all."""
 
     def __init__(self, geometry: Geometry, camera: OrbitCamera):
         self.camera = camera
-        self._organ = Surface(geometry.organ_vertices, geometry.organ_faces)
+        self._organ = ShadedSurface(geometry.organ_vertices, geometry.organ_faces)
         self._tumour = self._support = None
         self._parts = [
-            Surface(vertices, faces, PARTS[tissue]) for tissue, (vertices, faces) in geometry.parts.items()
+            ShadedSurface(vertices, faces, PARTS[tissue])
+            for tissue, (vertices, faces) in geometry.parts.items()
         ]
         if geometry.tumour_vertices is not None and geometry.tumour_faces is not None:
-            self._tumour = Surface(geometry.tumour_vertices, geometry.tumour_faces, TUMOUR)
+            self._tumour = ShadedSurface(geometry.tumour_vertices, geometry.tumour_faces, TUMOUR)
         if geometry.support_vertices is not None and geometry.support_faces is not None:
             self._support = self._matt_support(geometry.support_vertices, geometry.support_faces)
         self._half_axis_mm = geometry.transducer_size_mm[2] / 2
@@ -53,8 +54,8 @@ class Stage:
         )
         self._mask_indices = np.arange(6 * MASKS, dtype=np.int32)
 
-    def _matt_support(self, vertices: np.ndarray, faces: np.ndarray) -> Surface:
-        support = Surface(field_of(vertices, within=1), faces, SUPPORT, gloss=0.0)
+    def _matt_support(self, vertices: np.ndarray, faces: np.ndarray) -> ShadedSurface:
+        support = ShadedSurface(field_of(vertices, within=1), faces, SUPPORT, gloss=0.0)
         # It neither moves nor shines, so its colours are worked out once, as seen from far above.
         above = self.camera.target + 10.0 * self.camera.distance_home * self.camera.up
         support.shade(above, above)
@@ -94,7 +95,7 @@ class Stage:
         self._organ.shade(eye, key, opacity, cut)
         _draw_surface(scene, self._organ, ahead if opacity < SOLID or cut is not None else None, cut)
 
-    def _inner(self, view: View, settings: Settings) -> list[Surface]:
+    def _inner(self, view: View, settings: Settings) -> list[ShadedSurface]:
         """What is shown of what is in the organ."""
         shown = list(self._parts) if settings.show_parts else []
         if self._tumour is not None and settings.show_tumour:
@@ -103,7 +104,7 @@ class Stage:
         return shown
 
     def _draw_inner(
-        self, scene, inner: list[Surface], eye, key, ahead: np.ndarray, cut: Cut | None = None
+        self, scene, inner: list[ShadedSurface], eye, key, ahead: np.ndarray, cut: Cut | None = None
     ) -> None:
         for surface in inner:
             surface.shade(eye, key, SOLID, cut)
@@ -139,7 +140,7 @@ class Stage:
         )
         scene.lines(self._edge_points, LINE_WIDTH, color=EDGE)
 
-    def _draw_cut_face(self, scene, view: View, inner: list[Surface], eye, key) -> Cut:
+    def _draw_cut_face(self, scene, view: View, inner: list[ShadedSurface], eye, key) -> Cut:
         """Draw the face of the half away from the eye, and say what is cut off."""
         self._cut_side = side_of_eye(view.transducer_pose, eye, self._cut_side)
         self._cut_face = self._cut_face or CutFace()
@@ -171,7 +172,7 @@ class Stage:
 
 def _draw_surface(
     scene,
-    surface: Surface,
+    surface: ShadedSurface,
     ahead: np.ndarray | None = None,
     cut: Cut | None = None,
     two_sided=False,

@@ -3,7 +3,7 @@
 import dataclasses
 
 from render.viewer import ASIDE, Geometry, Settings
-from render.window_layout import Layout, Rect
+from render.window_layout import Rect, WindowLayout
 
 # Dear ImGui's glyphs are 7 pixels wide, its rows are 23 pixels high. Its labels get 35 % of a box, a switch's all of it, but for so many
 # pixels around them.
@@ -28,7 +28,7 @@ def without_effect(geometry: Geometry) -> set[str]:
     return tumour | parts | ({"show_support"} if geometry.support_vertices is None else set())
 
 
-def boxes_of(settings: Settings, geometry: Geometry, layout: Layout) -> dict[str, Rect]:
+def boxes_of(settings: Settings, geometry: Geometry, layout: WindowLayout) -> dict[str, Rect]:
     """Where each group is now."""
     groups = groups_of(settings, geometry)
     below = {name: _width(members) for name, members in groups.items() if name not in ASIDE}

@@ -76,7 +76,7 @@ def farthest_first(vertices: np.ndarray, faces: np.ndarray, ahead: np.ndarray) -
     return faces[np.argsort(-depth[faces].sum(axis=1), kind="stable")]
 
 
-class Surface:
+class ShadedSurface:
     """Normals and colours of one triangle mesh whose vertices move.
 
     Args:

@@ -24,7 +24,7 @@ _EDGES = np.array(
 )
 
 
-class Solid(NamedTuple):
+class TransducerShape(NamedTuple):
     """Vertices (n, 3), unit normals (n, 3), colours (n, 3) in [0, 1], vertex indices of the triangles (3 m,)."""
 
     vertices: np.ndarray
@@ -33,17 +33,19 @@ class Solid(NamedTuple):
     indices: np.ndarray
 
 
-def cuboid(size, centre=(0.0, 0.0, 0.0), colour=BODY) -> Solid:
+def cuboid(size, centre=(0.0, 0.0, 0.0), colour=BODY) -> TransducerShape:
     """A box with sharp edges: every side has its own four vertices, normals outward."""
     vertices = (_CORNERS * size + centre)[_SIDES]
     normals = np.cross(vertices[:, 1] - vertices[:, 0], vertices[:, 2] - vertices[:, 0])
     normals = np.repeat(normals / np.linalg.norm(normals, axis=1, keepdims=True), 4, axis=0)
     quad = np.array([0, 1, 2, 0, 2, 3])
     indices = (4 * np.arange(6)[:, None] + quad).reshape(-1)
-    return Solid(vertices.reshape(-1, 3), normals, np.tile(colour, (24, 1)), indices.astype(np.int32))
+    return TransducerShape(
+        vertices.reshape(-1, 3), normals, np.tile(colour, (24, 1)), indices.astype(np.int32)
+    )
 
 
-def prism(profile: np.ndarray, length: float, colour=BODY) -> Solid:
+def prism(profile: np.ndarray, length: float, colour=BODY) -> TransducerShape:
     """A convex profile (n, 2) of x and z, clockwise where x is to the right and z up, drawn out along y, about y = 0."""
     count = len(profile)
     ends = [np.insert(profile, 1, y, axis=1) for y in (-length / 2, length / 2)]
@@ -61,10 +63,10 @@ def prism(profile: np.ndarray, length: float, colour=BODY) -> Solid:
     indices = np.concatenate(
         [quads.reshape(-1), (4 * count + fan[:, ::-1]).reshape(-1), (5 * count + fan).reshape(-1)]
     )
-    return Solid(vertices, normals, np.tile(colour, (len(vertices), 1)), indices.astype(np.int32))
+    return TransducerShape(vertices, normals, np.tile(colour, (len(vertices), 1)), indices.astype(np.int32))
 
 
-def transducer(size, radius: float = 0.0) -> Solid:
+def transducer(size, radius: float = 0.0) -> TransducerShape:
     """The housing, its dark acoustic lens, flat or an arc of a radius, and a mark on the +x side."""
     x, y, z = (float(each) for each in size)
     lens = min(LENS_MM, z / 4)
@@ -79,7 +81,7 @@ def transducer(size, radius: float = 0.0) -> Solid:
     offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
     vertices, normals, colours = (np.concatenate([part[i] for part in parts]) for i in range(3))
     indices = np.concatenate([part.indices + offset for part, offset in zip(parts, offsets, strict=True)])
-    return Solid(vertices, normals, colours, indices.astype(np.int32))
+    return TransducerShape(vertices, normals, colours, indices.astype(np.int32))
 
 
 def _face(x: float, z: float, radius: float) -> np.ndarray:

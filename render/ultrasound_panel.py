@@ -1,4 +1,4 @@
-"""The ultrasound panel as on a scanner: pictures, ruler, focus, marker dot, settings, outline and calliper. NumPy and Pillow.
+"""The ultrasound panel as on a scanner: pictures, ruler, focus, marker dot, settings, outline and caliper. NumPy and Pillow.
 
 Pixels count from the top left. Places on the image plane are (u, v) [mm]: u from the middle to the right, v down from the face.
 """
@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from render.text import PLATE_PX, fitting_size, font, shortened, write, written_size
-from render.window_layout import Layout, Rect
+from render.window_layout import Rect, WindowLayout
 
 PANEL, FINDINGS, LINE = (8, 9, 11), (20, 24, 29), (44, 50, 58)
 TEXT, QUIET = (222, 227, 232), (132, 142, 153)
@@ -45,7 +45,7 @@ class Panel:
     marked_side: str = "right"
     legend: bool = False
 
-    def boxes(self, layout: Layout) -> list[Rect]:
+    def boxes(self, layout: WindowLayout) -> list[Rect]:
         """Where the pictures lie, one for each name."""
         return layout.picture_boxes(len(self.names), self.width_mm, self.depth_mm)
 
@@ -69,7 +69,7 @@ def ruler_ticks(panel: Panel, box: Rect) -> list[tuple[int, int | None]]:
     return ticks
 
 
-def marker_centre(layout: Layout, box: Rect, marked_side: str) -> tuple[int, int]:
+def marker_centre(layout: WindowLayout, box: Rect, marked_side: str) -> tuple[int, int]:
     """Centre (x, y) of the marker dot, above the picture at its marked side. Raises ValueError for another side."""
     if marked_side not in ("left", "right"):
         raise ValueError(f"marked_side is {marked_side!r}: it must be 'left' or 'right'")
@@ -87,7 +87,7 @@ def paste_picture(page: np.ndarray, box: Rect, picture: np.ndarray) -> None:
         page[rows, columns, channel] = picture
 
 
-def draw_note(page: np.ndarray, layout: Layout, box: Rect, note: str) -> None:
+def draw_note(page: np.ndarray, layout: WindowLayout, box: Rect, note: str) -> None:
     """Write over the middle of the picture in a box; a second line is smaller, and as small as it must be to fit."""
     px, (x, y) = layout.px, (box.left + box.width / 2, box.top + box.height / 2)
     said, _, hint = note.partition("\n")
@@ -109,7 +109,7 @@ def draw_segments(page: np.ndarray, panel: Panel, box: Rect, segments_mm: np.nda
     page[row[inside], column[inside], :3] = colour
 
 
-def draw_calliper(page: np.ndarray, panel: Panel, box: Rect, points_mm: Points, figure: str, px: int) -> None:
+def draw_caliper(page: np.ndarray, panel: Panel, box: Rect, points_mm: Points, figure: str, px: int) -> None:
     """Draw a cross at each of up to two points [mm], the line between them, and beside it what it measures, ``px`` high."""
     reach = CROSS_PX * np.array([panel.width_mm / box.width, panel.depth_mm / box.height])
     points = np.array(points_mm, float).reshape(-1, 2)
@@ -131,7 +131,7 @@ def beside(start: np.ndarray, end: np.ndarray, size: tuple[int, int], box: Rect)
     return float(x), float(y)
 
 
-def draw_panel(draw: ImageDraw.ImageDraw, layout: Layout, panel: Panel) -> None:
+def draw_panel(draw: ImageDraw.ImageDraw, layout: WindowLayout, panel: Panel) -> None:
     """All of the panel but its pictures."""
     area, boxes, px = layout.panel, panel.boxes(layout), layout.px
     draw.rectangle([area.left, area.top, area.right, area.bottom], fill=PANEL)
@@ -164,7 +164,7 @@ def _draw_row(draw: ImageDraw.ImageDraw, x: int, width: int, y: int, left: Writt
     draw.text((x, y), shortened(text, size, room), font=font(size), fill=colour, anchor="lm")
 
 
-def _draw_legend(draw: ImageDraw.ImageDraw, layout: Layout, x: int, bottom: int) -> None:
+def _draw_legend(draw: ImageDraw.ImageDraw, layout: WindowLayout, x: int, bottom: int) -> None:
     px, y = layout.px, bottom + layout.px(12)
     for text, colour in LEGEND:
         draw.line([(x, y), (x + px(16), y)], fill=colour, width=px(2))
@@ -173,7 +173,7 @@ def _draw_legend(draw: ImageDraw.ImageDraw, layout: Layout, x: int, bottom: int)
         x += int(font(px(14)).getlength(text)) + px(16)
 
 
-def _draw_ruler(draw: ImageDraw.ImageDraw, layout: Layout, panel: Panel, box: Rect) -> None:
+def _draw_ruler(draw: ImageDraw.ImageDraw, layout: WindowLayout, panel: Panel, box: Rect) -> None:
     px, x = layout.px, box.left - layout.px(6)
     # Where centimetres are small, not each of them has room for its number.
     every = int(np.ceil(px(NUMBER_PX) / (10.0 * box.height / panel.depth_mm)))
@@ -189,7 +189,7 @@ def _draw_ruler(draw: ImageDraw.ImageDraw, layout: Layout, panel: Panel, box: Re
         draw.polygon([(x + px(4), row), (x - px(4), row - px(5)), (x - px(4), row + px(5))], fill=ALERT)
 
 
-def _draw_wedge(draw: ImageDraw.ImageDraw, layout: Layout, box: Rect) -> None:
+def _draw_wedge(draw: ImageDraw.ImageDraw, layout: WindowLayout, box: Rect) -> None:
     """The grey scale, white at the top, as a scanner shows it beside its picture."""
     height = min(layout.px(128), box.height)
     left, right = box.right + layout.px(12), box.right + layout.px(19)

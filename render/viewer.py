@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ultrasound.probe import Mode, Rung
+from ultrasound.probe import DetailLevel, Mode
 from ultrasound.target import Target
 
 ECHO, TGC = "Echo", "Gain over depth"
@@ -31,9 +31,9 @@ KEY_MAP = {
         Line(("Mouse",), ("point",), "move it over the organ"),
         Line(("Left button",), ("press",), "press it in, the deeper the longer it is held"),
         Line(("W", "S"), ("push", "lift"), "push it in, lift it"),
-        Line(("A", "D"), ("roll_left", "roll_right"), "roll it about its axis, left and right"),
-        Line(("Q", "E"), ("tilt_left", "tilt_right"), "turn the beam in the image plane, left and right"),
-        Line(("Z", "C"), ("fan_back", "fan_forth"), "tilt it out of the image plane, either way"),
+        Line(("A", "D"), ("rotate_left", "rotate_right"), "roll it about its axis, left and right"),
+        Line(("Q", "E"), ("rock_left", "rock_right"), "turn the beam in the image plane, left and right"),
+        Line(("Z", "C"), ("tilt_back", "tilt_forward"), "tilt it out of the image plane, either way"),
     ),
     "View": (
         Line(("Right drag",), ("orbit",), "turn it"),
@@ -45,10 +45,10 @@ KEY_MAP = {
     ),
     "Picture": (
         Line(("B",), ("mode",), "echo and CT, echo alone, CT alone"),
-        Line(("V",), ("rung",), "echo: how much of it is computed"),
+        Line(("V",), ("detail_level",), "echo: how much of it is computed"),
         Line(("G",), ("show_scanner",), "the scanner's sliders, gain over depth too"),
         Line(("O",), ("outline",), "outline of the tumour, now and in the CT"),
-        Line(("Click on picture",), ("measure",), "calliper from click to click, in mm; a third ends it"),
+        Line(("Click on picture",), ("measure",), "caliper from click to click, in mm; a third ends it"),
         Line(("F",), ("freeze",), "freeze and go on"),
         Line(
             ("Left", "Right"),
@@ -134,7 +134,7 @@ class Settings:
     show_scanner: bool = False
     show_seen: bool = False
     mode: Mode = "both"
-    rung: Rung = "speckle"
+    detail_level: DetailLevel = "speckle"
     plan_for: Target = "margin"
 
 
@@ -201,9 +201,9 @@ class View:
     seen: dict[str, np.ndarray] = field(default_factory=dict)
     """Which vertices of "organ" and "tumour" lie in tissue that has been in the picture, bool, shape (n,)."""
     guidance: Guidance | None = None
-    calliper_mm: tuple[tuple[float, float], ...] = ()
+    caliper_mm: tuple[tuple[float, float], ...] = ()
     """Up to two points on the plane [mm]."""
-    calliper: str = ""
+    caliper: str = ""
     """What is between them."""
     notes: dict[str, str] = field(default_factory=dict)
     """Name of a picture -> what is written in it, such as that it is black for want of contact; in a second line what to do."""
@@ -245,11 +245,11 @@ class Controls:
     """Over the organ's surface, along the transducer's own x (lateral) and y (elevation)."""
     push_mm: float = 0.0
     """Along the transducer's axis, positive into the tissue, negative lifts."""
-    roll_deg: float = 0.0
+    rotate_deg: float = 0.0
     """About the transducer's axis (local z)."""
-    tilt_deg: float = 0.0
+    rock_deg: float = 0.0
     """In the image plane (about local y); positive swings the beam towards -x."""
-    fan_deg: float = 0.0
+    tilt_deg: float = 0.0
     """Out of the image plane (about local x); positive swings the beam towards +y."""
     reset: bool = False
     undo: bool = False

@@ -23,10 +23,10 @@ from render.camera import FIELD_OF_VIEW_DEG, OrbitCamera
 from render.display import display_available
 from render.gamepad import Gamepad
 from render.keys import Keys
-from render.scene_view import Stage
+from render.scene_view import SceneView
 from render.sliders import boxes_of, draw_sliders
 from render.viewer import Controls, Geometry, Settings, View
-from render.window_layout import FULL_SIZE, Layout, Rect
+from render.window_layout import FULL_SIZE, Rect, WindowLayout
 
 ZOOM_S = 0.5
 FRAMES_A_SECOND = 60
@@ -75,7 +75,7 @@ class Window:
             raise RuntimeError("no display to open a window on")
         self.settings = settings or Settings()
         self.keys, self._gamepad = keys or Keys(), gamepad
-        self.layout = Layout(*size)
+        self.layout = WindowLayout(*size)
         # GGUI goes on to measure sliders in shares of the size that the window was opened with.
         self._first_size = size
         self._visible = visible
@@ -102,7 +102,7 @@ class Window:
         self._lens = ti.ui.Camera()
         part = self.layout.window_coordinates(self.layout.clear)
         self.camera = OrbitCamera(geometry.bounds, geometry.up, part, size[0] / size[1])
-        self._stage = Stage(geometry, self.camera)
+        self._stage = SceneView(geometry, self.camera)
         self._page = Page(self.layout, self.keys)
 
     # What the user does
@@ -245,7 +245,7 @@ class Window:
         size = self._window.get_window_shape()
         if tuple(size) == (self.layout.width, self.layout.height) or min(size) < 200:
             return
-        self.layout = Layout(*size)
+        self.layout = WindowLayout(*size)
         self._boxes_placed += 1
         self._page = Page(self.layout, self.keys)
         self.camera.aspect = size[0] / size[1]

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw
 
 from render.text import fitting_size, font, shortened
 from render.ultrasound_panel import ALERT, FINDINGS, LINE, MARK, QUIET, TEXT, Panel, draw_panel
-from render.window_layout import CLOCK_WIDTH, FIGURE_HEIGHT, FIGURES_PAD, Layout, Rect
+from render.window_layout import CLOCK_WIDTH, FIGURE_HEIGHT, FIGURES_PAD, Rect, WindowLayout
 
 BACKDROP_TOP, BACKDROP_FOOT = (30, 35, 42), (13, 15, 19)
 STRIP, HELP = (17, 20, 24), (22, 26, 31)
@@ -24,7 +24,7 @@ NOTHING = "-"
 HELP_COLUMNS, HELP_PX, HELP_GAP_PX, FIGURES_GAP_PX = 2, 17, 12, 18
 
 
-def backdrop(layout: Layout, panel: Panel, help_key: str = "H") -> np.ndarray:
+def backdrop(layout: WindowLayout, panel: Panel, help_key: str = "H") -> np.ndarray:
     """All that stays the same from frame to frame, uint8, shape (height, width, 3)."""
     fade = np.linspace(0, 1, layout.scene.height)[:, None]
     rows = (1 - fade) * np.array(BACKDROP_TOP) + fade * np.array(BACKDROP_FOOT)
@@ -40,7 +40,7 @@ def backdrop(layout: Layout, panel: Panel, help_key: str = "H") -> np.ndarray:
     return np.array(image)
 
 
-def _draw_title(draw: ImageDraw.ImageDraw, layout: Layout, panel: Panel, help_key: str) -> None:
+def _draw_title(draw: ImageDraw.ImageDraw, layout: WindowLayout, panel: Panel, help_key: str) -> None:
     px, middle = layout.px, layout.title.height // 2
     right = layout.title.right - px(16)
     draw.text((right, middle), _of_help(help_key), font=font(px(14)), fill=TEXT, anchor="rm")
@@ -53,14 +53,14 @@ def _of_help(key: str) -> str:
     return f"{key}  all keys"
 
 
-def clock_box(layout: Layout, help_key: str = "H") -> Rect:
+def clock_box(layout: WindowLayout, help_key: str = "H") -> Rect:
     """Where the clock is, in the title's row, left of what is said of the help."""
     px = layout.px
     right = layout.title.right - 2 * px(16) - int(font(px(14)).getlength(_of_help(help_key)))
     return Rect(right - px(CLOCK_WIDTH), 0, px(CLOCK_WIDTH), layout.title.height - 1)
 
 
-def clock_picture(layout: Layout, box: Rect, clock: str, pace: str) -> np.ndarray:
+def clock_picture(layout: WindowLayout, box: Rect, clock: str, pace: str) -> np.ndarray:
     """The session's time, and before it how slowly that goes, uint8, shape of the box."""
     image = Image.new("RGB", (box.width, box.height), STRIP)
     draw, letters, middle = ImageDraw.Draw(image), font(layout.px(14)), layout.title.height // 2
@@ -70,7 +70,7 @@ def clock_picture(layout: Layout, box: Rect, clock: str, pace: str) -> np.ndarra
     return np.asarray(image)
 
 
-def help_picture(layout: Layout, groups: Mapping[str, list[tuple[str, str]]]) -> np.ndarray:
+def help_picture(layout: WindowLayout, groups: Mapping[str, list[tuple[str, str]]]) -> np.ndarray:
     """All keys and what they do, group by group, uint8, shape (height, width, 3)."""
     box, px = layout.whole, layout.px
     image = Image.new("RGB", (box.width, box.height), HELP)
@@ -101,7 +101,7 @@ def in_columns(groups: Mapping[str, list[tuple[str, str]]]) -> list[list[tuple[s
     return columns
 
 
-def readout_picture(layout: Layout, readouts: Mapping[str, str]) -> np.ndarray:
+def readout_picture(layout: WindowLayout, readouts: Mapping[str, str]) -> np.ndarray:
     """Names and values, one line each, as many as there is room for, uint8, shape of layout.readouts."""
     box = layout.readouts
     image = Image.new("RGB", (box.width, box.height), STRIP)
@@ -113,7 +113,7 @@ def readout_picture(layout: Layout, readouts: Mapping[str, str]) -> np.ndarray:
     return np.asarray(image)
 
 
-def findings_picture(layout: Layout, findings: Mapping[str, str], alert: str = "") -> np.ndarray:
+def findings_picture(layout: WindowLayout, findings: Mapping[str, str], alert: str = "") -> np.ndarray:
     """Names and values, uint8, shape of layout.findings(their count); the one that ``alert`` names stands out."""
     box = layout.findings(len(findings))
     image = Image.new("RGB", (box.width, box.height), FINDINGS)

@@ -50,7 +50,7 @@ class Rect(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Layout:
+class WindowLayout:
     """Where each part of the window lies, for a window of width x height pixels."""
 
     width: int

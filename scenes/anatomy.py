@@ -18,10 +18,10 @@ from scenes.patients.part_surfaces import PARTS
 from scenes.patients.patient_folder import save_patient
 from scenes.patients.patient_import import Patient, import_patient, tissue_codes
 from scenes.patients.readers.label_maps import LabelMap
-from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.lazy_volume import LazyVolume
 from scenes.patients.readers.volume_readers import file_volume
 from scenes.phantom.kidney import Label, make_phantom
-from scenes.progress import Told, untold
+from scenes.progress import ReportProgress, no_progress
 from scenes.scene import (
     AnatomyFiles,
     Attachment,
@@ -37,6 +37,16 @@ from scenes.surface_files import load_surface
 
 HERE = Path(__file__).parent
 CACHE = HERE.parent / ".cache"
+# What the embedded patient is made by: when one of these changes, it is made anew.
+PHANTOM_SOURCES = (
+    *("anatomy", "phantom/kidney", "phantom/abdomen", "patients/organ_selection", "patients/patient_import"),
+    *(
+        "patients/part_surfaces",
+        "patients/label_surfaces",
+        "patients/moulded_support",
+        "patients/readers/label_maps",
+    ),
+)
 FAT_HU = -110.0
 LEAST_WINDOW_HU = 310.0  # to 200 HU, or an unenhanced kidney is white
 # What the parts of the embedded kidney are for sound.
@@ -75,9 +85,9 @@ class LoadedAnatomy:
     """Surfaces of cysts, vessels and collecting system, by tissue."""
 
 
-def load_anatomy(scene: Scene, folder: Path, told: Told = untold) -> LoadedAnatomy:
+def load_anatomy(scene: Scene, folder: Path, progress: ReportProgress = no_progress) -> LoadedAnatomy:
     """Read the files that a scene names, relative to ``folder``. Raises SceneError, PatientError."""
-    folder, anatomy = files_of(scene, folder, told)
+    folder, anatomy = files_of(scene, folder, progress)
     return LoadedAnatomy(
         organ=load_surface(folder / anatomy.organ),
         tumour=load_surface(folder / anatomy.tumour) if anatomy.tumour else None,
@@ -89,12 +99,12 @@ def load_anatomy(scene: Scene, folder: Path, told: Told = untold) -> LoadedAnato
     )
 
 
-def files_of(scene: Scene, folder: Path, told: Told = untold) -> tuple[Path, AnatomyFiles]:
+def files_of(scene: Scene, folder: Path, progress: ReportProgress = no_progress) -> tuple[Path, AnatomyFiles]:
     """A scene's files and the folder that they are in: its own, or the embedded patient's. Raises SceneError."""
     if not scene.anatomy.phantom:
         return folder, scene.anatomy
     parts = {tissue: f"{PARTS[tissue]}.stl" for tissue in PHANTOM_PARTS}
-    return phantom_folder(told), AnatomyFiles(
+    return phantom_folder(progress), AnatomyFiles(
         tumour="tumour.stl", parts=parts, ct="ct.nrrd", labels="labels.nrrd", tissues=PHANTOM_TISSUES
     )
 
@@ -160,24 +170,13 @@ def patient_scene(patient: Patient) -> Scene:
     )
 
 
-def phantom_folder(told: Told = untold) -> Path:
+def phantom_folder(progress: ReportProgress = no_progress) -> Path:
     """Folder of the embedded patient, imported like any other on first use and whenever its sources changed."""
-    names = (
-        "phantom",
-        "abdomen",
-        "anatomy",
-        "organ",
-        "patient",
-        "parts",
-        "surfaces",
-        "support",
-        "reading/labels",
-    )
-    sources = [HERE / f"{name}.py" for name in names]
+    sources = [HERE / f"{name}.py" for name in PHANTOM_SOURCES]
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]
     places = [root / f"phantom-{digest}" for root in (CACHE, Path(tempfile.gettempdir()) / "nephron")]
     there = next((folder for folder in places if folder.is_dir()), None)
-    return there or _saved_in_one_of(places, _phantom_patient(told))
+    return there or _saved_in_one_of(places, _phantom_patient(progress))
 
 
 def _saved_in_one_of(places: list[Path], patient: Patient) -> Path:
@@ -193,17 +192,17 @@ def _saved_in_one_of(places: list[Path], patient: Patient) -> Path:
     )
 
 
-def _phantom_patient(told: Told) -> Patient:
+def _phantom_patient(progress: ReportProgress) -> Patient:
     """The embedded patient: its organ is all that it has labelled."""
-    told("Making the embedded patient, this once: its CT")
+    progress("Making the embedded patient, this once: its CT")
     ct, image = make_phantom()
-    told("Making the embedded patient, this once: its surfaces")
+    progress("Making the embedded patient, this once: its surfaces")
     labels = LabelMap.of(image)
     named = {
         value: replace(segment, tissue=TISSUE_OF_PART[value]) for value, segment in labels.segments.items()
     }
     own = [value for value in named if value != Label.TUMOUR]
-    return import_patient(Volume.of(ct), replace(labels, segments=named), own, side="left")
+    return import_patient(LazyVolume.of(ct), replace(labels, segments=named), own, side="left")
 
 
 def _grid(folder: Path, name: str) -> Grid:

@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 Thing = TypeVar("Thing")
 # Is told what is being made.
-Told = Callable[[str], None]
+ReportProgress = Callable[[str], None]
 REFRESH_S = 0.5
 
 
@@ -30,7 +30,7 @@ def bar(things: Iterable[Thing], what: str) -> Iterable[Thing]:
     return tqdm(things, desc=f"{what:10}", leave=False, disable=None)
 
 
-def untold(what: str) -> None:
+def no_progress(what: str) -> None:
     """No line."""
 
 
@@ -42,7 +42,7 @@ class Stages:
         self._ended = threading.Event()
         self._clock = threading.Thread(target=self._tick, daemon=True)
 
-    def __enter__(self) -> Told:
+    def __enter__(self) -> ReportProgress:
         self._clock.start()
         return self._bar.set_description_str
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tomli_w
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import AliasChoices, BaseModel, Field, ValidationError, model_validator
 
 from scenes.section import Direction, Length, Section, Vector3
 from scenes.tissue import TISSUES, NeoHookeanTissue, Tissue
@@ -33,7 +33,7 @@ OPTIONS = {
     "solver.iterations": "--iterations",
     "transducer.probe": "--probe",
     "image.mode": "--picture",
-    "image.rung": "--rung",
+    "image.detail_level": "--detail-level",
 }
 
 
@@ -143,14 +143,16 @@ class Transducer(Section):
 
 
 class Image(Section):
-    """The ultrasound panel: which picture, how much of the ladder of realism, and the CT window.
+    """The ultrasound panel: which picture, its level of detail (``rung`` in scenes of version 1.0), and the CT window.
 
     The depth is the probe's, unless it is given. Sound leaves where the organ is nearer to the array than ``contact_gap_mm``; with
     ``contact`` "tissue", where anything but gas is.
     """
 
     mode: Literal["ct", "b-mode", "both"] = "both"
-    rung: Literal["reflection", "speckle", "elevation"] = "speckle"
+    detail_level: Literal["reflection", "speckle", "elevation"] = Field(
+        "speckle", validation_alias=AliasChoices("detail_level", "rung")
+    )
     depth_mm: float | None = Field(None, ge=5, le=300)
     pixels: int = Field(512, ge=16, le=4096)
     window_hu: float = Field(350.0, gt=0, le=10000)

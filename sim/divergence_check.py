@@ -57,7 +57,7 @@ class Health:
 
 
 @dataclass(frozen=True)
-class Watch:
+class DivergenceState:
     """What a guard remembers between steps: the last good state, how long ago it was, how long the tissue has been tangled,
     and whether that state has been put back since.
     """
@@ -69,7 +69,7 @@ class Watch:
 
 
 @ti.data_oriented
-class Guard:
+class DivergenceCheck:
     """Looks at a solver's body after each step; ``fallbacks`` counts how often it had to put it back.
 
     ``home`` is the state to go back to where the last good one leads to the same fault again.
@@ -98,13 +98,13 @@ class Guard:
     def settle(self) -> None:
         """Take the body's state for the one to come home to."""
         self.home = self.solver.snapshot()
-        self.watch = Watch(self.home)
+        self.watch = DivergenceState(self.home)
 
     def keep(self) -> None:
         """Take the body's state now for the last good one, where it is well."""
         health = self.health()
         if health.tangled == 0.0 and not health.is_lost:
-            self.watch = Watch(self.solver.snapshot())
+            self.watch = DivergenceState(self.solver.snapshot())
 
     def check(self, time_step_s: float) -> str:
         """Look at the body after a step; where it is no tissue any more put it back and say so, else an empty text."""
@@ -119,7 +119,7 @@ class Guard:
         if health.is_lost or watch.steps_tangled > patience:
             return self._put_back(health.fault, time_step_s)
         if health.tangled == 0.0 and watch.steps_since_good >= max(KEEP_STEPS, round(KEEP_S / time_step_s)):
-            watch = Watch(self.solver.snapshot())
+            watch = DivergenceState(self.solver.snapshot())
         self.watch = watch
         return ""
 
@@ -130,7 +130,7 @@ class Guard:
             state, where = self.home, "as it was at the start"
         still = replace(state.body, velocity=np.zeros_like(state.body.velocity))
         self.solver.restore(SolverState(still, state.contacts))
-        self.watch = Watch(state, is_restored=True)
+        self.watch = DivergenceState(state, is_restored=True)
         self.fallbacks += 1
         return f"Tissue put back, {where}: {fault}"
 

@@ -21,7 +21,7 @@ from sim.lattice import Lattice, fill_with_cells, surface_points
 from sim.rigid_correction import RigidMotion
 from sim.solver import StepSettings
 from sim.surface_contact import LAYER_MM, REACH_MM, SurfaceContacts
-from sim.tissue_model import Parts
+from sim.tissue_model import ModelInputs
 
 # Stiffness, in units of the shear modulus, of deformation that varies inside a cell: between 1, exact for torsion,
 # and (1 + nu), exact for bending.
@@ -51,7 +51,7 @@ class NeoHookean:
     EMBEDDING_SIZES: ClassVar[float] = 1.35
 
     @classmethod
-    def make(cls, parts: Parts) -> "NeoHookean":
+    def make(cls, parts: ModelInputs) -> "NeoHookean":
         """Cells that fill the organ, and points of its surface where there is something to touch. Raises SamplingError."""
         tissue = parts.tissue
         lattice = fill_with_cells(parts.organ, tissue.cell_mm)

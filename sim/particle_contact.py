@@ -7,7 +7,7 @@ import taichi.math as tm
 from sim.body import ParticleBody
 from sim.fields import array_of, fill
 from sim.shapes import FAR
-from sim.time_of_impact import FreeWay
+from sim.time_of_impact import TimeOfImpact
 
 KEEP_OUT_SWEEPS = 8
 # How far around a static shape its distances must be known, in particle radii.
@@ -34,7 +34,7 @@ class ShapeContacts:
     def __init__(self, body: ParticleBody, shapes: list, friction: float) -> None:
         self.body = body
         self.shapes = list(shapes)
-        self.free_way = FreeWay(shapes)
+        self.free_way = TimeOfImpact(shapes)
         self.friction = friction
         self.rough = friction > 0
         self.margin = body.radius_mm / 2

@@ -20,7 +20,7 @@ from sim.particle_contact import REACH_RADII, ShapeContacts
 from sim.particle_patches import Patches, arrange
 from sim.rotation import rotation_near
 from sim.sampling import Clusters
-from sim.tissue_model import Parts
+from sim.tissue_model import ModelInputs
 
 RELAXATIONS = ("local", "global")
 # Points are carried by this many clusters at most.
@@ -50,7 +50,7 @@ class ShapeMatching:
     EMBEDDING_SIZES: ClassVar[float] = 2.0
 
     @classmethod
-    def make(cls, parts: Parts) -> "ShapeMatching":
+    def make(cls, parts: ModelInputs) -> "ShapeMatching":
         """Particles that fill the organ, or of an organ that was filled before, in clusters. Raises SamplingError."""
         rest = parts.organ if isinstance(parts.organ, RestBody) else fill(parts.organ, parts.tissue)
         arranged, patches = arrange(rest, parts.tissue.cluster_spacing)

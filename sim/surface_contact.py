@@ -13,7 +13,7 @@ from sim.body import Body
 from sim.fields import array_of, fields_of, fill
 from sim.lattice import Lattice
 from sim.shapes import FAR
-from sim.time_of_impact import FreeWay
+from sim.time_of_impact import TimeOfImpact
 
 # A pressure as high as Young's modulus presses the surface this far into a shape.
 LAYER_MM = 0.05
@@ -46,7 +46,7 @@ class SurfaceContacts:
     ) -> None:
         self.body = body
         self.shapes = list(shapes)
-        self.free_way = FreeWay(shapes)
+        self.free_way = TimeOfImpact(shapes)
         self.friction = friction
         self.rough = friction > 0
         self.count = len(points)

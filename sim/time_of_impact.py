@@ -12,7 +12,7 @@ LEAST_STRIDE_MM = 0.01
 
 
 @ti.data_oriented
-class FreeWay:
+class TimeOfImpact:
     """Ways among the shapes that do not move, by sphere tracing (Hart 1996); where there are none all ways are free."""
 
     def __init__(self, shapes: list) -> None:

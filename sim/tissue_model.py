@@ -16,7 +16,7 @@ from sim.surface_contact import SurfaceContacts
 
 
 @dataclass(frozen=True)
-class Held:
+class FixedRegion:
     """Tissue that stays where it is: all within a distance [mm] of a place (3,) [mm]."""
 
     at_mm: np.ndarray
@@ -35,7 +35,7 @@ class Held:
 
 
 @dataclass(frozen=True)
-class Parts:
+class ModelInputs:
     """What a tissue model is made of: an organ [mm] among shapes, and all that a scene says of the tissue.
 
     ``organ`` is a closed surface, or what the model itself takes in its stead; ``tissue`` has the model's parameters by the names
@@ -47,7 +47,7 @@ class Parts:
     tissue: Any
     shapes: list
     friction: float
-    held: Held | None
+    held: FixedRegion | None
     serial: bool | None
     relaxation: str
     mass_scaling_per_mm: float
@@ -63,7 +63,7 @@ class TissueModel(Protocol):
     EMBEDDING_SIZES: ClassVar[float]
 
     @classmethod
-    def make(cls, parts: Parts) -> "TissueModel":
+    def make(cls, parts: ModelInputs) -> "TissueModel":
         """The organ at rest, with its contacts. Raises SamplingError."""
         ...
 

@@ -28,7 +28,7 @@ from synthetic_body import DIRECTIONS
 
 from scenes.patients.import_error import PatientError
 from scenes.patients.readers.ct_files import open_ct
-from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.lazy_volume import LazyVolume
 
 PERSON = {
     "PatientName": "Doe^Jane",
@@ -42,7 +42,7 @@ PERSON = {
 }
 
 
-def read_ct(path: Path, **options: str) -> tuple[Volume, np.ndarray]:
+def read_ct(path: Path, **options: str) -> tuple[LazyVolume, np.ndarray]:
     """A CT, and its HU."""
     volume = open_ct(path, **options)
     return volume, volume.hounsfield()

@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import trimesh
 
-from rehearsal.planning.plan_file import Plan, Sweep
-from rehearsal.planning.score_terms import Parts
-from rehearsal.planning.sweep_path import Layout, layout_towards
+from rehearsal.planning.plan_file import Plan, PlannedSweep
+from rehearsal.planning.score_terms import ScoreTerms
+from rehearsal.planning.sweep_path import SweepLayout, layout_towards
 from scenes.trocar import Trocar
 from ultrasound.probe import load_probe
-from ultrasound.probe_manipulator import Hand, image_plane, pose_at
+from ultrasound.probe_manipulator import ProbeManipulator, image_plane, pose_at
 
 R = 30.0
 SIZE = np.array([16.0, 9.0, 20.0])
@@ -18,7 +18,7 @@ ORIGIN = np.array([100.0, -200.0, 300.0])
 X, Y, Z = np.eye(3)
 # The ball's facets lie up to 2.2^2 / (8 R) = 0.02 mm inside it, and its patches' normals half a degree beside its radii.
 FACET_MM, NORMAL_DEG = 0.03, 0.5
-GOOD = Parts(
+GOOD = ScoreTerms(
     seen=0.9,
     compression_mean_mm=1.0,
     compression_max_mm=2.0,
@@ -31,17 +31,19 @@ GOOD = Parts(
 )
 
 
-def hand_on(mesh: trimesh.Trimesh, size_mm: np.ndarray = SIZE) -> Hand:
+def hand_on(mesh: trimesh.Trimesh, size_mm: np.ndarray = SIZE) -> ProbeManipulator:
     """A hand over a settled surface, straight above its origin."""
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces, np.int64)
-    return Hand(vertices, faces, np.array(mesh.vertex_normals), size_mm, pose_at(R * Z, -Z, X, size_mm[2]), X)
+    return ProbeManipulator(
+        vertices, faces, np.array(mesh.vertex_normals), size_mm, pose_at(R * Z, -Z, X, size_mm[2]), X
+    )
 
 
 def big_ball() -> trimesh.Trimesh:
     return trimesh.creation.icosphere(subdivisions=4, radius=R)
 
 
-def from_above() -> Layout:
+def from_above() -> SweepLayout:
     return layout_towards(np.zeros(3), Z, X)
 
 
@@ -63,9 +65,9 @@ def in_patient(poses: np.ndarray) -> list:
     return placed.tolist()
 
 
-def sweep_of(*passes: np.ndarray, name: str = "two passes", seen: float = 0.75) -> Sweep:
+def sweep_of(*passes: np.ndarray, name: str = "two passes", seen: float = 0.75) -> PlannedSweep:
     parts = dict(vars(GOOD), seen=seen)
-    return Sweep(
+    return PlannedSweep(
         name=name,
         score=50.0,
         parts=parts,
@@ -76,7 +78,7 @@ def sweep_of(*passes: np.ndarray, name: str = "two passes", seen: float = 0.75) 
     )
 
 
-def plan_of(*sweeps: Sweep, **changes) -> Plan:
+def plan_of(*sweeps: PlannedSweep, **changes) -> Plan:
     values = dict(
         anatomy="a" * 16,
         target="margin",

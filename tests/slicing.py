@@ -4,10 +4,10 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from ultrasound.ct_slice import Slice
+from ultrasound.ct_slice import CtSlice
 
 
-def organ_mask(cut: Slice) -> np.ndarray:
+def organ_mask(cut: CtSlice) -> np.ndarray:
     """Which pixels (rows, columns) of the plane taken last show the organ, bool."""
     inside = np.zeros((cut.plane.pixels, cut.plane.pixels), np.int32)
 

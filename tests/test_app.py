@@ -20,7 +20,7 @@ from conftest import ROOT
 from PIL import Image
 
 import app
-from rehearsal.commands.command_line import Fault
+from rehearsal.commands.command_line import CommandError
 from rehearsal.commands.option_checks import refuse_no_pictures
 from rehearsal.commands.rehearse_command import found_display
 from version import VERSION
@@ -100,7 +100,7 @@ def test_a_headless_press_reports_what_it_promises(pressed):
     assert 0.95 < report["volume_ratio_min"] <= 1.01
     assert report["max_penetration_mm"] <= 0.8
     assert report["indentation_max_mm"] == pytest.approx(6.0, abs=1e-3)
-    assert (report["picture"], report["rung"]) == ("both", "speckle") and report["probe"].startswith(
+    assert (report["picture"], report["detail_level"]) == ("both", "speckle") and report["probe"].startswith(
         "Drop-in"
     )
 
@@ -225,7 +225,7 @@ def test_mistakes_are_one_line(tmp_path):
     assert "No such command 'rehears'. Did you mean 'rehearse'?" in refused("rehears")
     assert "Did you mean" not in refused("xyz")
     assert "leave out --no-pictures or --link" in refused("rehearse", "--headless", "--no-pictures", "--link")
-    with pytest.raises(Fault, match="add --headless"):
+    with pytest.raises(CommandError, match="add --headless"):
         refuse_no_pictures(headless=False, link=False)
     assert "--arch" in refused("rehearse", "--arch", "abacus")
     assert "--seconds" in refused("rehearse", "--seconds", "-1")

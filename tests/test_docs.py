@@ -15,8 +15,8 @@ import taichi as ti
 from conftest import ROOT
 
 import app
-from rehearsal.adaptive_iterations import Ladder
-from rehearsal.planning.plan_file import Plan, Sweep
+from rehearsal.adaptive_iterations import AdaptiveIterations
+from rehearsal.planning.plan_file import Plan, PlannedSweep
 from rehearsal.sessions.session_file import End, Event, Header, Second
 from rehearsal.tracking.pose_file import load_poses, load_timed_poses
 from scenes.scene import Image, Scene
@@ -247,7 +247,7 @@ def test_the_tool_of_the_example_presses_tissue():
 
 
 def test_what_the_window_says_in_capitals_is_explained():
-    ladder = Ladder(1.0)
+    ladder = AdaptiveIterations(1.0)
     ladder.rung = 1
     assert f"*{ladder.says(8).partition('   ')[0]}*" in text(DOCS / "rehearsal.md")
     assert f"`image.contact_gap_mm` of the scene ({Image().contact_gap_mm} mm)" in text(
@@ -274,7 +274,7 @@ def section(heading: str) -> set[str]:
     [
         ("Scene", [NeoHookeanTissue, ShapeMatchingTissue, Trocar]),
         ("Session", [Header, Event, Second, End]),
-        ("Plan", [Plan, Sweep]),
+        ("Plan", [Plan, PlannedSweep]),
     ],
 )
 def test_the_formats_have_every_key(heading, models):

@@ -13,8 +13,8 @@ import taichi.math as tm
 from sim.fields import fill
 from ultrasound.image_plane import Picture, PlaneInTissue
 from ultrasound.point_spread import MOST_LINES, axial_sd_mm, elevation_sd_mm, lateral_weights
-from ultrasound.probe import RUNGS, Probe, Rung
-from ultrasound.sampled_volume import Volume
+from ultrasound.probe import DETAIL_LEVELS, DetailLevel, Probe
+from ultrasound.sampled_volume import SampledVolume
 from ultrasound.scanline_echo import DB, Beams
 
 # A probe's samples are a multiple of this.
@@ -37,8 +37,8 @@ class BMode:
 
     def __init__(
         self,
-        tissue: Volume,
-        organ: Volume,
+        tissue: SampledVolume,
+        organ: SampledVolume,
         plane: PlaneInTissue,
         probe: Probe,
         voxel_mm: float,
@@ -57,7 +57,7 @@ class BMode:
         self.source = ti.Vector.field(2, ti.f32, (plane.pixels, plane.pixels))
         self._tables_of: tuple | None = None
 
-    def render(self, probe: Probe, rung: Rung = "speckle") -> np.ndarray:
+    def render(self, probe: Probe, detail_level: DetailLevel = "speckle") -> np.ndarray:
         """Grey values (pixels, pixels) uint8 of the plane that was taken last; ``decibel`` holds its lines.
 
         Raises ValueError for a probe of other lines or samples than this was made for.
@@ -76,9 +76,15 @@ class BMode:
         sd = axial_sd_mm(probe), elevation_sd_mm(probe)
         stride = STRIDES[0] if STRIDES[0] * probe.sample_mm <= self.voxel_mm else STRIDES[1]
         self.beams.send(
-            RUNGS.index(rung), stride, *places, probe.sample_mm, probe.frequency_mhz, aperture, *sd
+            DETAIL_LEVELS.index(detail_level),
+            stride,
+            *places,
+            probe.sample_mm,
+            probe.frequency_mhz,
+            aperture,
+            *sd,
         )
-        if rung == "reflection":
+        if detail_level == "reflection":
             self._add()
         else:
             self._spread()

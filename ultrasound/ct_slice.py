@@ -5,14 +5,14 @@ import taichi as ti
 import taichi.math as tm
 
 from ultrasound.image_plane import LANES, Picture, PlaneInTissue
-from ultrasound.sampled_volume import AIR_HU, Volume
+from ultrasound.sampled_volume import AIR_HU, SampledVolume
 
 # What the picture shows of all that is not the organ; the background is the CT itself.
 OUTSIDE_HU = {"background": 0.0, "gel": 0.0, "air": AIR_HU}
 
 
 @ti.data_oriented
-class Slice:
+class CtSlice:
     """The CT on an image plane through the deformed body.
 
     ``ct`` [HU] and ``organ``, the signed distance from its surface [mm], negative inside, are volumes in the body's
@@ -20,7 +20,9 @@ class Slice:
     which gives way to the organ as far as the embedding reaches; ``gel`` (0 HU); ``air`` (-1000 HU).
     """
 
-    def __init__(self, ct: Volume, organ: Volume, plane: PlaneInTissue, outside: str = "background") -> None:
+    def __init__(
+        self, ct: SampledVolume, organ: SampledVolume, plane: PlaneInTissue, outside: str = "background"
+    ) -> None:
         if outside not in OUTSIDE_HU:
             raise ValueError(f"outside is {outside!r}: expected one of {', '.join(OUTSIDE_HU)}")
         self.ct = ct

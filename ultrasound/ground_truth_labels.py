@@ -8,15 +8,15 @@ import taichi.math as tm
 
 from sim.fields import field_of
 from ultrasound.image_plane import Picture, PlaneInTissue
-from ultrasound.sampled_volume import Volume
+from ultrasound.sampled_volume import SampledVolume
 from ultrasound.sweep import Mark
 
 MOST_BEADS = 255 // Mark.BEAD
 
 
 @ti.data_oriented
-class Marks:
-    """Marks of the plane that was taken last, by where its tissue was at rest.
+class GroundTruthLabels:
+    """GroundTruthLabels of the plane that was taken last, by where its tissue was at rest.
 
     ``organ`` and ``tumour`` are signed distances [mm], negative inside; ``beads`` (n, 3) are middles of balls of a radius [mm].
     """
@@ -24,8 +24,8 @@ class Marks:
     def __init__(
         self,
         plane: PlaneInTissue,
-        organ: Volume,
-        tumour: Volume | None = None,
+        organ: SampledVolume,
+        tumour: SampledVolume | None = None,
         beads: np.ndarray | None = None,
         radius_mm: float = 2.0,
     ) -> None:
@@ -39,7 +39,7 @@ class Marks:
             self.bead = field_of(np.asarray(beads, float), 1)
 
     def render(self) -> np.ndarray:
-        """Marks (pixels, pixels) uint8."""
+        """GroundTruthLabels (pixels, pixels) uint8."""
         picture = np.empty((self.plane.pixels, self.plane.pixels), np.uint8)
         self._render(self.plane.pixel_mm, self.plane.first_mm, picture)
         return picture

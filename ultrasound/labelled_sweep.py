@@ -14,7 +14,7 @@ SUFFIX, MARKS = ".igs.mha", "-marks.igs.mha"
 PROBE_FIELD, VERSION_FIELD = "TransducerName", "NephronVersion"
 
 
-class MarkedSweep:
+class LabelledSweep:
     """Writes STEM.igs.mha and STEM-marks.igs.mha into a folder, both or none; the header names the probe and the version.
 
     Reference is the patient (LPS, mm). Raises OSError.

@@ -23,8 +23,8 @@ GAIN_RANGE_DB, TGC_RANGE_DB, TGC_SLIDERS = 60.0, 24.0, 8
 Mode = Literal["both", "b-mode", "ct"]
 MODES: tuple[Mode, ...] = get_args(Mode)
 # The echo's ladder of realism: reflection and attenuation; and speckle and point spread; and the thickness of the plane.
-Rung = Literal["reflection", "speckle", "elevation"]
-RUNGS: tuple[Rung, ...] = get_args(Rung)
+DetailLevel = Literal["reflection", "speckle", "elevation"]
+DETAIL_LEVELS: tuple[DetailLevel, ...] = get_args(DetailLevel)
 
 Percent = Annotated[float, Field(ge=0, le=100)]
 

@@ -117,7 +117,7 @@ def interpolated(start: np.ndarray, end: np.ndarray, share: float | np.ndarray) 
 
 
 @dataclass(frozen=True)
-class Grip:
+class ManipulatorState:
     """What of a hand changes: how deep it presses [mm], how it is turned (3,) [degrees], where it aims (4, 4), home where None."""
 
     depth_mm: float = 0.0
@@ -127,7 +127,7 @@ class Grip:
 
 
 @dataclass
-class Hand:
+class ProbeManipulator:
     """What holds the transducer: where on the settled organ it aims, how it is turned, how deep it presses.
 
     ``vertices`` (n, 3), ``faces`` (m, 3) and ``normals`` (n, 3) are the settled surface [mm]; ``home`` is the pose it
@@ -155,21 +155,23 @@ class Hand:
         self.most_mm = min(MOST_DEPTH_MM, MOST_LENGTHS * float(self.size_mm[2]))
 
     @property
-    def grip(self) -> Grip:
+    def state(self) -> ManipulatorState:
         """How it holds the transducer now; set, it holds it so."""
-        fan, tilt, roll = map(float, self.turn_deg)
-        return Grip(self.depth_mm, self.pressed_mm, (fan, tilt, roll), self.aim)
+        tilt, rock, rotate = map(float, self.turn_deg)
+        return ManipulatorState(self.depth_mm, self.pressed_mm, (tilt, rock, rotate), self.aim)
 
-    @grip.setter
-    def grip(self, grip: Grip) -> None:
-        self.depth_mm, self.pressed_mm = grip.depth_mm, grip.pressed_mm
-        self.turn_deg, self.aim = np.array(grip.turn_deg), grip.aim
+    @state.setter
+    def state(self, state: ManipulatorState) -> None:
+        self.depth_mm, self.pressed_mm = state.depth_mm, state.pressed_mm
+        self.turn_deg, self.aim = np.array(state.turn_deg), state.aim
 
     def take(self, pose: np.ndarray) -> None:
         """Hold a transducer as it is at a pose (4, 4), as if pressed in by a button that is then let go."""
         depth = indentation(pose, self.size_mm, self.samples, self.radius_mm)
         pressed = float(np.clip(depth, 0.0, self.most_mm)) if np.isfinite(depth) else 0.0
-        self.grip = Grip(depth - pressed if np.isfinite(depth) else 0.0, pressed, aim=pose.copy())
+        self.state = ManipulatorState(
+            depth - pressed if np.isfinite(depth) else 0.0, pressed, aim=pose.copy()
+        )
 
     def point(self, origin: np.ndarray, direction: np.ndarray) -> None:
         """Aim where a ray [mm] first meets the settled organ, perpendicular to its surface; a miss changes nothing."""
@@ -216,9 +218,9 @@ class Hand:
         least, most = self.pressed_mm - RELEASE_MM_S * time_s, self.pressed_mm + PRESS_MM_S * time_s
         self.pressed_mm = float(np.clip(goal, least, most))
 
-    def turn(self, fan_deg: float, tilt_deg: float, roll_deg: float) -> None:
-        """Turn about the transducer's x, y and z axes [degrees]; fan and tilt end where a hand's do."""
-        self.turn_deg = self.turn_deg + [fan_deg, tilt_deg, roll_deg]
+    def turn(self, tilt_deg: float, rock_deg: float, rotate_deg: float) -> None:
+        """Turn about the transducer's x, y and z axes [degrees]; tilt and rock end where a hand's do."""
+        self.turn_deg = self.turn_deg + [tilt_deg, rock_deg, rotate_deg]
         self.turn_deg[:2] = np.clip(self.turn_deg[:2], -60.0, 60.0)
 
     def pose(self) -> np.ndarray:

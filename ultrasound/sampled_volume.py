@@ -14,7 +14,7 @@ FAR_MM = 1e6
 
 
 @ti.data_oriented
-class Volume:
+class SampledVolume:
     """Voxels (nx, ny, nz) float32 with the affine map (4, 4) that takes mm to voxel indices.
 
     Index (0, 0, 0) is the centre of the first voxel. ``outside`` is the value beyond the outer half voxel. With a last
@@ -129,10 +129,12 @@ class Volume:
         return self.linear.transpose() @ along
 
 
-def distance_volume(surface: trimesh.Trimesh, spacing_mm: float = 2.0, reach_mm: float = 6.0) -> Volume:
+def distance_volume(
+    surface: trimesh.Trimesh, spacing_mm: float = 2.0, reach_mm: float = 6.0
+) -> SampledVolume:
     """Signed distances [mm] to a closed surface, negative inside, as far as ``reach_mm`` around it (``distance_grid``); FAR_MM beyond."""
     distance, low = distance_grid(surface.vertices, surface.faces, spacing_mm, reach_mm)
     index_from_mm = np.eye(4)
     index_from_mm[:3] /= spacing_mm
     index_from_mm[:3, 3] = -low / spacing_mm
-    return Volume(distance, index_from_mm, outside=FAR_MM)
+    return SampledVolume(distance, index_from_mm, outside=FAR_MM)

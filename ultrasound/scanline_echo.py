@@ -4,7 +4,7 @@ import taichi as ti
 import taichi.math as tm
 
 from ultrasound.image_plane import PlaneInTissue
-from ultrasound.sampled_volume import Volume
+from ultrasound.sampled_volume import SampledVolume
 from ultrasound.speckle import Speckle
 
 # The planes that a thick one is made of: how far off in standard deviations, the weight in a mean, and in a sum of noise that
@@ -92,8 +92,8 @@ class Beams:
 
     def __init__(
         self,
-        tissue: Volume,
-        organ: Volume,
+        tissue: SampledVolume,
+        organ: SampledVolume,
         plane: PlaneInTissue,
         shape: tuple[int, int],
         voxel_mm: float,
@@ -148,7 +148,7 @@ class Beams:
     @ti.kernel
     def send(
         self,
-        rung: ti.template(),
+        detail_level: ti.template(),
         stride: ti.template(),
         pixel_mm: tm.vec2,
         first_mm: tm.vec2,
@@ -158,11 +158,11 @@ class Beams:
         axial_sd: float,
         elevation_sd: float,
     ):
-        """Send sound along every line and write what comes back, a rung (its index) up the ladder; ``touch`` comes before.
+        """Send sound along every line and write what comes back, a detail_level (its index) up the ladder; ``touch`` comes before.
 
         The tissue is looked at every ``stride`` samples. A line uses ``aperture`` elements a mm of depth to each side.
         """
-        planes = ti.static(THICK if rung == 2 else MIDDLE)
+        planes = ti.static(THICK if detail_level == 2 else MIDDLE)
         stride_mm = stride * sample_mm
         for line in range(self.lines):
             start, direction = self.start[line], self.direction[line]
@@ -184,7 +184,7 @@ class Beams:
                 if interface.ends(step, self.interface_mm):
                     at = interface.depth_mm()
                     echo = interface.loudness(before.x, frequency_mhz) * self.heard(line, at, aperture)
-                    self.reflect(rung, line, at, echo, sample_mm, axial_sd)
+                    self.reflect(detail_level, line, at, echo, sample_mm, axial_sd)
                     passed *= 1.0 - interface.reflection(before.x) ** 2
                     interface.begin(before, depth, loud)
                 if interface.steps == 0.0:
@@ -197,13 +197,15 @@ class Beams:
                 loud_far = passed * ti.exp(-loss_db / DB)
                 heard = self.heard(line, depth + 0.5 * stride_mm, aperture)
                 loudness = tm.vec3(loud, loud_far, heard)
-                self.scatter_between(rung, stride, line, k, near, far, loudness, axial_sd, elevation_sd)
+                self.scatter_between(
+                    detail_level, stride, line, k, near, far, loudness, axial_sd, elevation_sd
+                )
                 near, loud = far, loud_far
 
     @ti.func
     def scatter_between(
         self,
-        rung: ti.template(),
+        detail_level: ti.template(),
         stride: ti.template(),
         line,
         k,
@@ -217,16 +219,16 @@ class Beams:
         for j in range(stride):
             t = (j + 0.5) / stride
             rest, across = tm.mix(near.rest, far.rest, t), tm.mix(near.linear[:, 2], far.linear[:, 2], t)
-            echo = self.scatter(rung, rest, across, axial_sd, elevation_sd)
+            echo = self.scatter(detail_level, rest, across, axial_sd, elevation_sd)
             echo *= loudness.z * tm.mix(loudness.x, loudness.y, t) * tm.mix(near.tissue.z, far.tissue.z, t)
             self.real[line, stride * k + j] = self.real[line, stride * k + j] + echo.x
             self.imaginary[line, stride * k + j] = echo.y
 
     @ti.func
-    def scatter(self, rung: ti.template(), rest, across, axial_sd, elevation_sd):
+    def scatter(self, detail_level: ti.template(), rest, across, axial_sd, elevation_sd):
         """Echo (2,) of scatterers at a place at rest [mm], of unit mean square; without speckle the root of that."""
-        echo = tm.vec2(ti.static(1.0 if rung == 0 else 0.0), 0.0)
-        for off, _, weight in ti.static(((), MIDDLE, THICK)[rung]):
+        echo = tm.vec2(ti.static(1.0 if detail_level == 0 else 0.0), 0.0)
+        for off, _, weight in ti.static(((), MIDDLE, THICK)[detail_level]):
             echo += weight * self.speckle.at(rest + (off * elevation_sd) * across, axial_sd)
         return echo
 
@@ -249,7 +251,7 @@ class Beams:
         return square
 
     @ti.func
-    def reflect(self, rung: ti.template(), line, depth_mm, loud, sample_mm, axial_sd):
+    def reflect(self, detail_level: ti.template(), line, depth_mm, loud, sample_mm, axial_sd):
         """Add the echo of an interface to a line, as wide as the pulse; what makes speckle louder leaves it as it is."""
         at, reach = depth_mm / sample_mm - 0.5, ti.ceil(3.5 * axial_sd / sample_mm, ti.i32)
         first = ti.max(ti.floor(at, ti.i32) - reach, 0)
@@ -257,6 +259,6 @@ class Beams:
         for i in range(first, last + 1):
             off = (i - at) * sample_mm / axial_sd
             echo = loud * ti.exp(-0.5 * off * off)
-            if ti.static(rung > 0):
+            if ti.static(detail_level > 0):
                 echo /= self.loudness[i]
             self.real[line, i] = self.real[line, i] + echo

@@ -11,11 +11,11 @@ import trimesh
 from sim.embedding import Embedding, Unmoved
 from ultrasound.acoustics import check_tissues, properties
 from ultrasound.bmode import BMode
-from ultrasound.ct_slice import Slice
-from ultrasound.ground_truth_labels import Marks
+from ultrasound.ct_slice import CtSlice
+from ultrasound.ground_truth_labels import GroundTruthLabels
 from ultrasound.image_plane import ImagePlane, PlaneInTissue
-from ultrasound.probe import Mode, Probe, Rung
-from ultrasound.sampled_volume import Volume, distance_volume
+from ultrasound.probe import DetailLevel, Mode, Probe
+from ultrasound.sampled_volume import SampledVolume, distance_volume
 
 # What is around the organ where the picture shows no CT there [MRayl].
 AROUND = {"background": None, "gel": 1.5, "air": 4e-4}
@@ -54,7 +54,7 @@ def begin_echo(anatomy: ScannedAnatomy) -> Future[np.ndarray]:
 class Scanner:
     """Pictures of ``pixels`` x ``pixels`` of an anatomy that an embedding carries along.
 
-    ``outside`` (see ``Slice``), ``contact`` and ``contact_gap_mm`` (see ``BMode``) say what lies around the organ and what lets
+    ``outside`` (see ``CtSlice``), ``contact`` and ``contact_gap_mm`` (see ``BMode``) say what lies around the organ and what lets
     sound in. What a mode needs is made when it is first asked for, but for an ``echo`` begun before. Raises TissueError.
     """
 
@@ -78,16 +78,16 @@ class Scanner:
         self._echo = echo
 
     @cached_property
-    def slice(self) -> Slice:
+    def slice(self) -> CtSlice:
         """The CT's side of the scanner."""
-        ct = Volume(self.anatomy.hu, self.anatomy.index_from_mm)
-        return Slice(ct, self._organ, self.plane, self.outside)
+        ct = SampledVolume(self.anatomy.hu, self.anatomy.index_from_mm)
+        return CtSlice(ct, self._organ, self.plane, self.outside)
 
     @cached_property
     def bmode(self) -> BMode:
         """The echo's side of the scanner."""
         values, self._echo = (self._echo or begin_echo(self.anatomy)).result(), None
-        tissue = Volume(values, self.anatomy.index_from_mm, outside=0.0)
+        tissue = SampledVolume(values, self.anatomy.index_from_mm, outside=0.0)
         return BMode(
             tissue,
             self._organ,
@@ -100,13 +100,15 @@ class Scanner:
         )
 
     @cached_property
-    def marks(self) -> Marks:
+    def marks(self) -> GroundTruthLabels:
         """What the pictures show, in truth."""
         tumour = self.anatomy.tumour
-        return Marks(self.plane, self._organ, None if tumour is None else distance_volume(tumour, 1.0))
+        return GroundTruthLabels(
+            self.plane, self._organ, None if tumour is None else distance_volume(tumour, 1.0)
+        )
 
     @cached_property
-    def _organ(self) -> Volume:
+    def _organ(self) -> SampledVolume:
         return distance_volume(self.anatomy.organ)
 
     def take(self, plane: ImagePlane) -> None:
@@ -115,12 +117,18 @@ class Scanner:
         self.plane.take(plane)
 
     def look(
-        self, plane: ImagePlane, probe: Probe, mode: Mode, rung: Rung, window_hu: float, level_hu: float
+        self,
+        plane: ImagePlane,
+        probe: Probe,
+        mode: Mode,
+        detail_level: DetailLevel,
+        window_hu: float,
+        level_hu: float,
     ) -> dict[str, np.ndarray]:
         """Grey values (pixels, pixels) uint8 of what a mode shows of a plane, by name, the first the one that matters."""
         self.take(plane)
         show = {
             CT: lambda: self.slice.render(window_hu, level_hu),
-            ECHO: lambda: self.bmode.render(probe, rung),
+            ECHO: lambda: self.bmode.render(probe, detail_level),
         }
         return {name: show[name]() for name in SHOWN[mode]}

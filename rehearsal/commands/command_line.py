@@ -18,7 +18,7 @@ from scenes.tissue import QUALITIES
 STOPPED = 130
 
 
-class Fault(click.ClickException):
+class CommandError(click.ClickException):
     """What the user must know, in one line."""
 
 
@@ -47,17 +47,17 @@ class NumberRange(click.FloatRange):
 
 
 def start_taichi(arch: str) -> str:
-    """Initialise Taichi where the user wants it; the backend it is. Raises Fault."""
+    """Initialise Taichi where the user wants it; the backend it is. Raises CommandError."""
     from sim.device import NoDevice, start
 
     try:
         return start(arch)
     except NoDevice as error:
-        raise Fault(f"--arch {arch}: {error}") from None
+        raise CommandError(f"--arch {arch}: {error}") from None
 
 
 def make_folder(folder: Path, option: str = "--out") -> None:
-    """Make sure that a folder can be written to before time is spent on what goes there. Raises Fault.
+    """Make sure that a folder can be written to before time is spent on what goes there. Raises CommandError.
 
     Of a command that ends without anything in it the folder goes again.
     """
@@ -67,13 +67,15 @@ def make_folder(folder: Path, option: str = "--out") -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise Fault(
+        raise CommandError(
             f"{folder}: cannot be made a folder for results ({error.strerror}); choose another {option}"
         ) from None
     try:
         check_writable(folder)
     except OSError as error:
-        raise Fault(f"{folder}: cannot be written to ({error.strerror}); choose another {option}") from None
+        raise CommandError(
+            f"{folder}: cannot be written to ({error.strerror}); choose another {option}"
+        ) from None
 
 
 def _remove_empty(folders: list[Path]) -> None:
@@ -84,20 +86,22 @@ def _remove_empty(folders: list[Path]) -> None:
 
 
 def make_place(json_file: Path | None) -> None:
-    """Make sure that the file of --json, where it is asked for, can be written before time is spent. Raises Fault."""
+    """Make sure that the file of --json, where it is asked for, can be written before time is spent. Raises CommandError."""
     if json_file is None:
         return
     make_folder(json_file.parent, "--json")
     if json_file.is_dir():
-        raise Fault(f"{json_file}: is a folder; name a file after --json")
+        raise CommandError(f"{json_file}: is a folder; name a file after --json")
 
 
 def save_figures(figures: dict[str, Any], json_file: Path) -> None:
-    """Write figures to the file of --json and say so. Raises Fault."""
+    """Write figures to the file of --json and say so. Raises CommandError."""
     try:
         write_json(figures, json_file)
     except OSError as error:
-        raise Fault(f"{json_file}: cannot be written ({error.strerror}); choose another --json") from None
+        raise CommandError(
+            f"{json_file}: cannot be written ({error.strerror}); choose another --json"
+        ) from None
     click.echo(f"\nWrote {json_file}")
 
 
@@ -109,13 +113,15 @@ def load_patient(scene: Path) -> tuple[Scene, LoadedAnatomy]:
 
 
 def numbers(text: str, option: str, least: float, most: float) -> list[float]:
-    """Different numbers of an option's text, such as "2.2,2.7", in ascending order. Raises Fault."""
+    """Different numbers of an option's text, such as "2.2,2.7", in ascending order. Raises CommandError."""
     try:
         values = sorted({float(value) for value in text.split(",")})
     except ValueError:
         values = []
     if not values or not all(least <= value <= most for value in values):
-        raise Fault(f"{option} is {text!r}: expected numbers from {least:g} to {most:g} such as 2.2,2.7")
+        raise CommandError(
+            f"{option} is {text!r}: expected numbers from {least:g} to {most:g} such as 2.2,2.7"
+        )
     return values
 
 

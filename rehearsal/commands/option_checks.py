@@ -5,7 +5,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from rehearsal.commands.command_line import Fault
+from rehearsal.commands.command_line import CommandError
 from rehearsal.planning.plan_file import Plan, PlanError, is_plan, read_plan
 from rehearsal.sessions.recorded_scene import scene_of_log
 from rehearsal.sessions.session_file import Header, Log, SessionError, read_log
@@ -28,38 +28,42 @@ def refuse_inputs(
     replay: Path | None,
     link_leads: bool,
 ) -> None:
-    """Raises Fault where what is to lead the transducer does not go together."""
+    """Raises CommandError where what is to lead the transducer does not go together."""
     if track is None and track_from is not None:
-        raise Fault("--track-from: says what of a tracked sweep is the probe; name its file with --track")
+        raise CommandError(
+            "--track-from: says what of a tracked sweep is the probe; name its file with --track"
+        )
     if track is not None and replay is not None:
-        raise Fault("--track: a replay goes the recorded way; leave out --track or --replay")
+        raise CommandError("--track: a replay goes the recorded way; leave out --track or --replay")
     if link_leads and (track is not None or replay is not None):
-        raise Fault("--link-leads: a file leads already; leave it out, or --track and --replay")
+        raise CommandError("--link-leads: a file leads already; leave it out, or --track and --replay")
 
 
 def refuse_headless(headless: bool, gamepad: bool, link_leads: bool) -> None:
-    """Raises Fault where what leads in a window alone is asked for without one."""
+    """Raises CommandError where what leads in a window alone is asked for without one."""
     for option, given in {"--gamepad": gamepad, "--link-leads": link_leads}.items():
         if headless and given:
-            raise Fault(f"{option}: leads in a window; leave out {option} or --headless")
+            raise CommandError(f"{option}: leads in a window; leave out {option} or --headless")
 
 
 def refuse_no_vulkan(headless: bool) -> None:
-    """Raises Fault where a window has no driver to be drawn with: before minutes are spent on what it would show."""
+    """Raises CommandError where a window has no driver to be drawn with: before minutes are spent on what it would show."""
     from sim.device import is_there
 
     if not headless and not is_there("vulkan"):
-        raise Fault(
+        raise CommandError(
             "no Vulkan driver found: the window needs one; install a Vulkan driver, or run with --headless"
         )
 
 
 def refuse_no_pictures(headless: bool, link: bool) -> None:
-    """Raises Fault where pictures that are to be left out are needed."""
+    """Raises CommandError where pictures that are to be left out are needed."""
     if not headless:
-        raise Fault("--no-pictures: a window is pictures; leave it out, or add --headless")
+        raise CommandError("--no-pictures: a window is pictures; leave it out, or add --headless")
     if link:
-        raise Fault("--no-pictures: pictures are what the link sends; leave out --no-pictures or --link")
+        raise CommandError(
+            "--no-pictures: pictures are what the link sends; leave out --no-pictures or --link"
+        )
 
 
 def session_of(
@@ -68,17 +72,19 @@ def session_of(
     changed: dict[str, float | str | None],
     choosers: dict[str, float | str | None],
 ) -> Log | None:
-    """The session to be replayed, where one is. Raises Fault, where other options would make another of it, SessionError."""
+    """The session to be replayed, where one is. Raises CommandError, where other options would make another of it, SessionError."""
     if replay is None:
         if at_s > 0:
-            raise Fault("--at: says where to open a session; name its file with --replay")
+            raise CommandError("--at: says where to open a session; name its file with --replay")
         return None
     for option, value in (choosers | {option: changed[key] for key, option in OPTIONS.items()}).items():
         if value is not None:
-            raise Fault(f"{option}: a replay computes what was recorded; leave it out")
+            raise CommandError(f"{option}: a replay computes what was recorded; leave it out")
     log = read_log(replay)
     if at_s > log.length_s:
-        raise Fault(f"--at {at_s:g}: the session is {log.length_s:.1f} s long; open it at an earlier second")
+        raise CommandError(
+            f"--at {at_s:g}: the session is {log.length_s:.1f} s long; open it at an earlier second"
+        )
     return log
 
 
@@ -157,7 +163,7 @@ def _probe_said(name: Any, housing_mm: Any) -> str:
 
 
 def refuse_sizes(changed: dict[str, float | str | None], choosers: dict[str, float | str | None]) -> None:
-    """Raises Fault where a preset or a budget is to choose size and passes, and another option says them too.
+    """Raises CommandError where a preset or a budget is to choose size and passes, and another option says them too.
 
     ``choosers`` are --quality, --budget-ms and --error-mm.
     """
@@ -165,8 +171,8 @@ def refuse_sizes(changed: dict[str, float | str | None], choosers: dict[str, flo
     if not given:
         return
     if given[0] == "--quality" and len(given) > 1:
-        raise Fault(f"--quality: {given[1]} chooses size and passes too; leave one of them out")
+        raise CommandError(f"--quality: {given[1]} chooses size and passes too; leave one of them out")
     for key, value in changed.items():
         chosen = key.startswith(("tissue.", "solver.")) and key not in LEFT[given[0]]
         if value is not None and chosen:
-            raise Fault(f"{OPTIONS[key]}: {given[0]} chooses this too; leave one of them out")
+            raise CommandError(f"{OPTIONS[key]}: {given[0]} chooses this too; leave one of them out")

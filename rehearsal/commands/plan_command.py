@@ -7,7 +7,7 @@ from pydantic import ValidationError
 from tqdm import tqdm
 
 from rehearsal.commands.command_line import (
-    Fault,
+    CommandError,
     Number,
     NumberRange,
     WholeRange,
@@ -89,7 +89,7 @@ def plan(
     held = probe_of(loaded)
     make_folder(out.parent)
     if out.is_dir():
-        raise Fault(f"{out}: is a folder; name a file after --out")
+        raise CommandError(f"{out}: is a folder; name a file after --out")
     from rehearsal.planning.make_plan import make_plan
     from rehearsal.planning.search import length_of
     from rehearsal.planning.trial_workers import Problem, workers
@@ -121,7 +121,7 @@ def following(scene: Path, plan_file: Path, probe: str | None) -> str:
 def trocar_of(
     scenes: Trocar, at_mm: tuple[float, float, float] | None, cone_deg: float | None, wrist_deg: float | None
 ) -> Trocar:
-    """The scene's trocar with what the command line changes. Raises Fault."""
+    """The scene's trocar with what the command line changes. Raises CommandError."""
     given = {"at_mm": at_mm, "cone_deg": cone_deg, "wrist_deg": wrist_deg}
     values = scenes.model_dump() | {name: value for name, value in given.items() if value is not None}
     try:
@@ -129,4 +129,4 @@ def trocar_of(
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         option = str(first["loc"][0]).replace("at_mm", "trocar").replace("_", "-")
-        raise Fault(f"--{option} = {first['input']!r}: {first['msg'].lower()}") from None
+        raise CommandError(f"--{option} = {first['input']!r}: {first['msg'].lower()}") from None

@@ -8,7 +8,7 @@ import numpy as np
 from tqdm import tqdm
 
 from rehearsal.commands.command_line import (
-    Fault,
+    CommandError,
     NumberRange,
     arch_option,
     load_patient,
@@ -113,7 +113,7 @@ def reconstruct(
     organ and tumour as they were seen, in labels.nrrd. With a tracker's errors, the sweep that has them is left as tracked.igs.mha.
     """
     if undo_compression and scene is None:
-        raise Fault("--undo-compression: presses the organ of a scene; name it with --scene")
+        raise CommandError("--undo-compression: presses the organ of a scene; name it with --scene")
     pictures = read_sweep(sweep)
     pictures.constant |= load_constants(config) if config else {}
     marks = marks_beside(sweep)
@@ -139,7 +139,7 @@ def reconstruct(
             seen = lit(pictures.images)
             rebuilt = rebuild(pictures, track, seen, **settings, marks=marks, places=places, done=bar.update)
         except ValueError as error:
-            raise Fault(f"{sweep.name}: {error}") from None
+            raise CommandError(f"{sweep.name}: {error}") from None
     save_volumes(rebuilt, out)
     report = dict(
         version=VERSION,
@@ -161,7 +161,7 @@ def _errors_of(tracker: dict[str, float]) -> TrackingErrors:
     try:
         return TrackingErrors(**tracker)
     except ValueError as error:
-        raise Fault(f"errors of a tracker: {error}") from None
+        raise CommandError(f"errors of a tracker: {error}") from None
 
 
 def usual_reach_mm(track: Track, spacing_mm: float) -> float:
@@ -175,19 +175,19 @@ def _unsqueezed(
 ) -> Places:
     scene, anatomy = patient
     start_taichi(arch)
-    from rehearsal.reconstruction.compression_correction import Unsqueezed
+    from rehearsal.reconstruction.compression_correction import CompressionCorrection
     from rehearsal.rehearsal import Rehearsal
 
     click.echo("Building the model.")
     probe = probe_of(scene)
     taken_with = pictures.fields.get(PROBE_FIELD, probe.transducer_name)
     if taken_with != probe.transducer_name:
-        raise Fault(
+        raise CommandError(
             f"--undo-compression: the sweep was taken with the probe {taken_with}, the scene has {probe.transducer_name}: "
             "set transducer.probe in the scene"
         )
     rehearsal = Rehearsal(scene, anatomy, probe)
-    return Unsqueezed(rehearsal, pictures, track, reference)
+    return CompressionCorrection(rehearsal, pictures, track, reference)
 
 
 def _of_track(pictures: Sweep, track: Track) -> dict[str, Any]:

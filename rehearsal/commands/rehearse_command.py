@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rehearsal.commands.command_line import (
-    Fault,
+    CommandError,
     Number,
     NumberRange,
     arch_option,
@@ -33,10 +33,10 @@ from rehearsal.tracking.track_file import PROBE_IN_PATIENT, load_track
 from render.display import display_available
 from render.keys import Keys, keys_text, load_keys
 from scenes.anatomy import LoadedAnatomy, load_anatomy
-from scenes.progress import Stages, Told
+from scenes.progress import ReportProgress, Stages
 from scenes.scene import EMBEDDED, OPTIONS, Scene, load_scene, scene_file, with_options
 from scenes.tissue import TISSUES
-from ultrasound.probe import MODES, RUNGS, Probe
+from ultrasound.probe import DETAIL_LEVELS, MODES, Probe
 
 if TYPE_CHECKING:
     from rehearsal.rehearsal import Rehearsal
@@ -102,7 +102,13 @@ if TYPE_CHECKING:
 @quality_option
 @click.option("--probe", help="Probe, by its name or as a file [the scene's].")
 @click.option("--picture", type=click.Choice(MODES), help="Echo, CT or both [the scene's].")
-@click.option("--rung", type=click.Choice(RUNGS), help="How much of the echo is computed [the scene's].")
+@click.option(
+    "--detail-level",
+    "--rung",
+    "detail_level",
+    type=click.Choice(DETAIL_LEVELS),
+    help="How much of the echo is computed [the scene's].",
+)
 @click.option(
     "--budget-ms",
     type=NumberRange(0.01, 10_000),
@@ -160,26 +166,30 @@ def rehearse(
     make_folder(out)
     used = start_taichi(arch)
     server = opened_link(link, link_host, link_port, link_leads)
-    with Stages() as told:
-        anatomy = load_anatomy(loaded, path.parent, told)
+    with Stages() as progress:
+        anatomy = load_anatomy(loaded, path.parent, progress)
         check_files(anatomy, before.title, probe, log, track_file, track, plan)
         started, chosen = perf_counter(), ""
         if budget_ms is not None or error_mm is not None:
             model = changed["tissue.model"]
-            rehearsal, chosen = built_within(loaded, anatomy, probe, used, told, model, budget_ms, error_mm)
+            rehearsal, chosen = built_within(
+                loaded, anatomy, probe, used, progress, model, budget_ms, error_mm
+            )
         else:
-            rehearsal = built(loaded, anatomy, probe, told, not no_pictures)
+            rehearsal = built(loaded, anatomy, probe, progress, not no_pictures)
         build_s = perf_counter() - started
         if not no_pictures:
-            told("Building the model: the first picture")
+            progress("Building the model: the first picture")
             compile_picture(rehearsal)
     if chosen:
         click.echo(chosen)
-    from rehearsal.run import Run
+    from rehearsal.run import RehearsalRun
 
     tracked = server.hand if server is not None and link_leads else None
     named = None if scene == EMBEDDED else scene
-    run = Run(rehearsal, anatomy, used, out, budget_ms, tracked, track, keys, gamepad, server, plan, named)
+    run = RehearsalRun(
+        rehearsal, anatomy, used, out, budget_ms, tracked, track, keys, gamepad, server, plan, named
+    )
     if headless:
         run.headless(log, at, seconds, build_s, not no_pictures)
     else:
@@ -215,11 +225,13 @@ def found_display() -> bool:
     return found
 
 
-def built(scene: Scene, anatomy: LoadedAnatomy, probe: Probe, told: Told, draws: bool = True) -> "Rehearsal":
+def built(
+    scene: Scene, anatomy: LoadedAnatomy, probe: Probe, progress: ReportProgress, draws: bool = True
+) -> "Rehearsal":
     """The rehearsal of a scene, of which pictures are drawn or not."""
     from rehearsal.rehearsal import Rehearsal
 
-    return Rehearsal(scene, anatomy, probe, told, shows_echo=draws and scene.image.mode != "ct")
+    return Rehearsal(scene, anatomy, probe, progress, shows_echo=draws and scene.image.mode != "ct")
 
 
 def compile_picture(rehearsal: "Rehearsal") -> None:
@@ -235,23 +247,23 @@ def built_within(
     anatomy: LoadedAnatomy,
     probe: Probe,
     arch: str,
-    told: Told,
+    progress: ReportProgress,
     model: Any,
     budget_ms: float | None,
     error_mm: float | None,
 ) -> tuple["Rehearsal", str]:
-    """The rehearsal with the settings that fit the budgets on this machine, and which they are. Raises Fault."""
+    """The rehearsal with the settings that fit the budgets on this machine, and which they are. Raises CommandError."""
     from rehearsal.speed_accuracy.budget_choice import NoPoint, choose, described
     from rehearsal.speed_accuracy.pareto_front import front_of, load_points
 
     def build(setup: Setup) -> "Rehearsal":
         start_taichi(arch)
-        return built(scene_of(scene, setup), anatomy, probe, told)
+        return built(scene_of(scene, setup), anatomy, probe, progress)
 
     try:
         rehearsal, point, step_ms = choose(front_of(load_points(), model), build, budget_ms, error_mm)
     except NoPoint as reason:
-        raise Fault(str(reason)) from None
+        raise CommandError(str(reason)) from None
     return rehearsal, (
         f"Chosen: {described(point.setup)}; a step takes {step_ms:.1f} ms here, expected error {point.error_mean_mm:.2f} mm."
     )

@@ -10,14 +10,14 @@ import numpy as np
 import trimesh
 from tqdm import tqdm
 
-from rehearsal.commands.command_line import Fault, arch_option, make_folder, start_taichi
+from rehearsal.commands.command_line import CommandError, arch_option, make_folder, start_taichi
 from rehearsal.configuration import probe_of
 from rehearsal.result_files import write_json
 from rehearsal.tracking.pose_file import load_poses
 from scenes.anatomy import load_anatomy
 from scenes.scene import load_scene, scene_file, with_options
 from sim.mesh_distance import signed_distance
-from ultrasound.probe import MODES, RUNGS, Probe
+from ultrasound.probe import DETAIL_LEVELS, MODES, Probe
 from version import VERSION
 
 if TYPE_CHECKING:
@@ -38,7 +38,13 @@ DEEP_MM = 20.0
 )
 @click.option("--probe", help="Probe, by its name or as a file [the scene's].")
 @click.option("--picture", type=click.Choice(MODES), help="Echo, CT or both [the scene's].")
-@click.option("--rung", type=click.Choice(RUNGS), help="How much of the echo is computed [the scene's].")
+@click.option(
+    "--detail-level",
+    "--rung",
+    "detail_level",
+    type=click.Choice(DETAIL_LEVELS),
+    help="How much of the echo is computed [the scene's].",
+)
 @click.option(
     "--contact",
     type=click.Choice(["tissue", "organ"]),
@@ -59,7 +65,7 @@ def scan(
     out: Path,
     probe: str | None,
     picture: str | None,
-    rung: str | None,
+    detail_level: str | None,
     contact: str,
     dicom: bool,
     sweep: bool,
@@ -71,12 +77,12 @@ def scan(
     For each pose of a file, what the probe shows there. Writes PNG pictures and scan.json, which says how large their pixels are.
     """
     path = scene_file(scene)
-    options = {"transducer.probe": probe, "image.mode": picture, "image.rung": rung}
+    options = {"transducer.probe": probe, "image.mode": picture, "image.detail_level": detail_level}
     loaded = with_options(load_scene(path), options)
     placed = load_poses(poses)
     anatomy = load_anatomy(loaded, path.parent)
     if anatomy.ct is None:
-        raise Fault(f"{path}: has no CT: expected anatomy.ct, of which pictures are made")
+        raise CommandError(f"{path}: has no CT: expected anatomy.ct, of which pictures are made")
     warn_of_deep(placed.values(), anatomy.organ)
     held, image = probe_of(loaded), loaded.image
     used = start_taichi(arch)
@@ -84,18 +90,18 @@ def scan(
     from rehearsal.rehearsal import scanned_anatomy
     from sim.embedding import Unmoved
     from ultrasound.image_plane import ImagePlane
-    from ultrasound.labelled_sweep import MarkedSweep
+    from ultrasound.labelled_sweep import LabelledSweep
     from ultrasound.scanner import Scanner
 
     make_folder(out)
     scanned = scanned_anatomy(anatomy.organ, anatomy.ct, anatomy, np.zeros(3))
     scanner = Scanner(scanned, Unmoved(), held, image.pixels, "background", contact, image.contact_gap_mm)
-    swept = MarkedSweep(out, "sweep", held) if sweep else None
+    swept = LabelledSweep(out, "sweep", held) if sweep else None
     rows, ms, empty = [], [], 0
     for name, pose in tqdm(placed.items(), desc="scan", unit="pose"):
         began = perf_counter()
         plane = ImagePlane(pose, *held.extent_mm)
-        shown = scanner.look(plane, held, image.mode, image.rung, image.window_hu, image.level_hu)
+        shown = scanner.look(plane, held, image.mode, image.detail_level, image.window_hu, image.level_hu)
         ms.append(1000 * (perf_counter() - began))
         marks = scanner.marks.render()
         empty += not marks.any()
@@ -109,7 +115,7 @@ def scan(
     report = dict(
         version=VERSION,
         probe=held.model_dump(by_alias=True),
-        rung=image.rung,
+        detail_level=image.detail_level,
         contact=contact,
         contact_gap_mm=image.contact_gap_mm,
         arch=used,

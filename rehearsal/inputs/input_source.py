@@ -6,19 +6,22 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from rehearsal.inputs.user_input import Live
-from rehearsal.sessions.recorder import Recorded
+from rehearsal.inputs.user_input import UserInput
+from rehearsal.sessions.recorder import SessionRecorder
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import SessionError
 from render.viewer import Controls, Settings
-from ultrasound.probe import MODES, RUNGS
+from ultrasound.probe import DETAIL_LEVELS, MODES
 from ultrasound.target import TARGETS
 
-CHOICES: dict[str, tuple[str, ...]] = {"mode": MODES, "rung": RUNGS, "plan_for": TARGETS}
+CHOICES: dict[str, tuple[str, ...]] = {"mode": MODES, "detail_level": DETAIL_LEVELS, "plan_for": TARGETS}
+
+# What sessions of version 1.0 call a setting -> its name now.
+RENAMED = {"rung": "detail_level"}
 
 
-class Driver(Protocol):
+class InputSource(Protocol):
     """For each moment: ``move``, then, where that gave a pose, the step and ``stepped``; then ``watch``."""
 
     @property
@@ -46,12 +49,12 @@ class Driver(Protocol):
         """What there was to say to the user since this was last asked."""
 
 
-class Played:
-    """A recorded session, a ``Driver``, until it is over or the user takes over: from then on ``lead()``."""
+class ReplayInput:
+    """A recorded session, a ``InputSource``, until it is over or the user takes over: from then on ``lead()``."""
 
-    def __init__(self, replay: Replay, lead: Callable[[], Live]) -> None:
+    def __init__(self, replay: Replay, lead: Callable[[], UserInput]) -> None:
         self.replay, self._lead = replay, lead
-        self.live: Live | None = None
+        self.live: UserInput | None = None
         self._said = ""
         self._has_warned = False
 
@@ -99,7 +102,8 @@ class Played:
 def set_settings(settings: Settings, values: dict[str, Any]) -> None:
     """Set what a session says. Raises SessionError for what is no setting, or none that there can be."""
     known = {each.name: each.metadata for each in fields(settings)}
-    for name, value in values.items():
+    for recorded, value in values.items():
+        name = RENAMED.get(recorded, recorded)
         if name not in known or not _fits(getattr(settings, name), value, name, known[name]):
             raise SessionError(
                 f"the session sets {name} to {value!r}, which it cannot be: its file is damaged"
@@ -120,10 +124,10 @@ def _fits(usual: Any, value: Any, name: str, about: Mapping[str, Any]) -> bool:
     return not about or bool(about["low"] <= value <= about["high"])
 
 
-class Scripted:
-    """The scene's scripted press in so many steps, a ``Driver``."""
+class ScriptedInput:
+    """The scene's scripted press in so many steps, a ``InputSource``."""
 
-    def __init__(self, session: Session, recorded: Recorded | None, steps: int) -> None:
+    def __init__(self, session: Session, recorded: SessionRecorder | None, steps: int) -> None:
         self.session, self.recorded, self.steps = session, recorded, steps
         self.status, self.bookmarks = "", 0
 

@@ -4,8 +4,8 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from rehearsal.adaptive_iterations import Ladder
-from rehearsal.sessions.recorder import Recorded
+from rehearsal.adaptive_iterations import AdaptiveIterations
+from rehearsal.sessions.recorder import SessionRecorder
 from rehearsal.sessions.replay import set_solver
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.undo_history import History
@@ -18,15 +18,15 @@ Ray = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass
-class Live:
+class UserInput:
     """The rehearsal led by the user, a ``Driver``: by a probe that is tracked, else by mouse, keys and gamepad.
 
     After a way back the transducer stays until the user moves it.
     """
 
     session: Session
-    ladder: Ladder
-    recorded: Recorded | None = None
+    ladder: AdaptiveIterations
+    recorded: SessionRecorder | None = None
     waits: bool = False
     tracked: Tracked | None = None
     _ray: Ray | None = field(default=None, init=False)
@@ -67,14 +67,14 @@ class Live:
             self._take_over()
         self._set_solver(controls)
         rehearsal = self.session.rehearsal
-        held, follower = rehearsal.hand.grip, self._follower
+        held, follower = rehearsal.manipulator.state, self._follower
         pose = self._led(controls) if follower is None else self._followed(follower, controls)
         moves = bool(np.abs(pose - rehearsal.pose).max() > STILL_MM)
         presses = controls.press and follower is None
         # What is kept here is gone back to: with the hand as it was before this input.
-        rehearsal.hand.grip, grip = held, rehearsal.hand.grip
+        rehearsal.manipulator.state, grip = held, rehearsal.manipulator.state
         self.history.watch(moves or presses, presses)
-        rehearsal.hand.grip = grip
+        rehearsal.manipulator.state = grip
         return pose
 
     def _take_over(self) -> None:
@@ -83,7 +83,7 @@ class Live:
             self._said = "Yours already"
             return
         self._follower, self._said = None, "Yours now"
-        self.session.rehearsal.hand.take(self.session.rehearsal.pose)
+        self.session.rehearsal.manipulator.take(self.session.rehearsal.pose)
 
     def _wait(self, ray: Ray | None) -> None:
         """The transducer stays until the user moves it."""
@@ -101,7 +101,7 @@ class Live:
             self._wait(controls.ray)
             return rehearsal.pose
         pose = rehearsal.pose if goal is None else rehearsal.pose_towards(goal)
-        rehearsal.hand.take(pose)
+        rehearsal.manipulator.take(pose)
         return pose
 
     def _led(self, controls: Controls) -> np.ndarray:
@@ -154,17 +154,17 @@ class Live:
     def _steered(self, controls: Controls) -> np.ndarray:
         """Hand the user's input to the hand that holds the transducer; the pose to go to then."""
         rehearsal = self.session.rehearsal
-        hand = rehearsal.hand
+        manipulator = rehearsal.manipulator
         if any(controls.slide_mm):
-            hand.slide(*controls.slide_mm)
+            manipulator.slide(*controls.slide_mm)
             self._left = controls.ray
         elif controls.ray is not None and mouse_moved(controls.ray, self._left):
-            hand.point(*controls.ray)
+            manipulator.point(*controls.ray)
             self._left = None
-        hand.hold(controls.press, rehearsal.settings.time_step_s, controls.press_share)
-        hand.push(controls.push_mm)
-        hand.turn(controls.fan_deg, controls.tilt_deg, controls.roll_deg)
-        return rehearsal.pose_towards(hand.pose())
+        manipulator.hold(controls.press, rehearsal.settings.time_step_s, controls.press_share)
+        manipulator.push(controls.push_mm)
+        manipulator.turn(controls.tilt_deg, controls.rock_deg, controls.rotate_deg)
+        return rehearsal.pose_towards(manipulator.pose())
 
     def stepped(self, step_ms: float) -> str:
         """The rehearsal has just advanced to the pose of a move, in so many ms; what the terminal has to say of it."""
@@ -181,7 +181,7 @@ class Live:
 
 def acts(controls: Controls, ray: Ray | None) -> bool:
     """Whether the user does anything but keep the mouse on a ray."""
-    turns = controls.push_mm, controls.fan_deg, controls.tilt_deg, controls.roll_deg
+    turns = controls.push_mm, controls.tilt_deg, controls.rock_deg, controls.rotate_deg
     return mouse_moved(controls.ray, ray) or controls.press or any(turns) or any(controls.slide_mm)
 
 

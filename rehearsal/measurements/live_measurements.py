@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from rehearsal.measurements.session_summary import Course
-from rehearsal.measurements.tumour_measurements import Reading, read
-from rehearsal.planning.plan_guidance import Guide
+from rehearsal.measurements.session_summary import SessionCourse
+from rehearsal.measurements.tumour_measurements import Measurement, measure
+from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions.packed_coverage import unpack_seen
 from rehearsal.sessions.session import Session
@@ -27,10 +27,10 @@ COMPRESSION = "compression"
 DIGITS = 4
 
 
-class Instruments:
+class LiveMeasurements:
     """``reading`` is the latest; ``coverage`` is of the whole session; ``guide`` is the plan that is followed, if any."""
 
-    def __init__(self, rehearsal: Rehearsal, guide: Guide | None = None) -> None:
+    def __init__(self, rehearsal: Rehearsal, guide: PlanGuidance | None = None) -> None:
         self.rehearsal, self.guide = rehearsal, guide
         self.margin_mm = MARGIN_MM if guide is None else guide.plan.margin_mm
         step_s = rehearsal.settings.time_step_s
@@ -39,10 +39,10 @@ class Instruments:
 
     def _begin(self) -> None:
         rehearsal = self.rehearsal
-        self.course = Course(
+        self.course = SessionCourse(
             rehearsal.scene.transducer.compression_warning_mm, rehearsal.settings.time_step_s
         )
-        self.reading: Reading | None = None
+        self.reading: Measurement | None = None
         self._seen: dict[str, np.ndarray] = {}
         self._findings: dict[str, str] = {}
         self._touches = np.ones(rehearsal.probe.number_of_scanlines, bool)
@@ -79,7 +79,7 @@ class Instruments:
         self._show()
         return True
 
-    def follow(self, guide: Guide) -> None:
+    def follow(self, guide: PlanGuidance) -> None:
         """Follow a plan from now on; what was seen stays so."""
         self.guide = guide
         if guide.plan.margin_mm != self.margin_mm:
@@ -94,7 +94,7 @@ class Instruments:
 
     def watch(self, session: Session, probe: Probe, pose: np.ndarray | None) -> None:
         """Look at a moment (its step's pose, None of a way back) whose pictures were taken, and note a new reading in the session."""
-        # What was read before a way back is not so any more.
+        # What was measure before a way back is not so any more.
         is_anew = pose is None or self.reading is None
         if (is_anew or session.moment % self._look_every == 0) and self.rehearsal.scanner is not None:
             image = self.rehearsal.scene.image
@@ -103,7 +103,7 @@ class Instruments:
         if self.guide is not None:
             self.guide.go_with(session)
         if is_anew or session.moment % self._read_every == 0:
-            self.reading = read(self.rehearsal, probe, self._touches)
+            self.reading = measure(self.rehearsal, probe, self._touches)
             session.note("reading", self.figures())
             self._show()
         self._count(pose)
@@ -145,7 +145,7 @@ class Instruments:
         return self.reading is not None and self.reading.compression_mm > limit
 
     def onto(self, view: View, settings: Settings) -> View:
-        """A view with what was read."""
+        """A view with what was measure."""
         status = view.status
         if self.is_too_deep and self.reading is not None and not status:
             status = f"TISSUE SQUEEZED BY {self.reading.compression_mm:.0f} mm"
@@ -191,9 +191,9 @@ def _mm(length: float | None) -> str:
     return "" if length is None else f"{round(length, 1) + 0.0:.1f} mm"
 
 
-def _noted(values: dict[str, float | None]) -> Reading:
+def _noted(values: dict[str, float | None]) -> Measurement:
     """A reading that a session's file has. Raises SessionError."""
-    known = {each.name: values.get(each.name) for each in fields(Reading)}
+    known = {each.name: values.get(each.name) for each in fields(Measurement)}
     if known["compression_mm"] is None or known["contact_mm2"] is None:
         raise SessionError("the session holds a reading without compression or contact: it is damaged")
-    return Reading(**known)  # type: ignore[arg-type]
+    return Measurement(**known)  # type: ignore[arg-type]

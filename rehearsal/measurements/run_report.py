@@ -64,7 +64,7 @@ class Tally:
             probe=rehearsal.probe.transducer_name,
             probe_settings=rehearsal.probe.model_dump(by_alias=True),
             picture=rehearsal.scene.image.mode,
-            rung=rehearsal.scene.image.rung,
+            detail_level=rehearsal.scene.image.detail_level,
             slice_width_mm=rehearsal.probe.extent_mm[0],
             slice_depth_mm=rehearsal.probe.depth_mm,
             steps=rehearsal.steps,
@@ -88,7 +88,7 @@ def summary(report: dict) -> str:
     """The figures that matter, in a few lines for the terminal."""
     measured = {"step": report["ms_per_step"], "picture": report["ms_per_slice"]}
     times = ", ".join(f"{ms['median']:.1f} ms a {name}" for name, ms in measured.items() if ms is not None)
-    shown = f"picture {report['picture']}, echo as far as {report['rung']}"
+    shown = f"picture {report['picture']}, echo as far as {report['detail_level']}"
     return "\n".join(
         [
             f"model     {TISSUES[report['model']].REPORTED.format(**report)}, {report['tetrahedra']} tetrahedra",

@@ -14,7 +14,7 @@ PRESSED_MM, RELEASED_MM = 1.0, 0.5
 
 
 @dataclass
-class Course:
+class SessionCourse:
     """Gathers what a summary is made of, moment by moment."""
 
     warning_mm: float
@@ -70,7 +70,7 @@ class Course:
         }
 
 
-def in_words(summary: dict[str, Any]) -> str:
+def summary_text(summary: dict[str, Any]) -> str:
     """A summary for the terminal."""
     seen = ", ".join(
         f"{name.removeprefix('seen_')} {100 * value:.0f} %"

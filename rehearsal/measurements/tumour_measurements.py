@@ -1,4 +1,4 @@
-"""The figures that matter in a partial nephrectomy, read off a rehearsal: in the window, in its record, and for a plan."""
+"""The figures that matter in a partial nephrectomy, measure off a rehearsal: in the window, in its record, and for a plan."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +13,7 @@ from ultrasound.probe import Probe
 
 
 @dataclass(frozen=True)
-class Reading:
+class Measurement:
     """Lengths in mm; None where there is no tumour, or none on the image plane."""
 
     compression_mm: float
@@ -32,7 +32,7 @@ class Reading:
     """Least width of what the picture shows beside and under that outline; negative where it is cut off."""
 
 
-def read(rehearsal: Rehearsal, probe: Probe, touches: np.ndarray) -> Reading:
+def measure(rehearsal: Rehearsal, probe: Probe, touches: np.ndarray) -> Measurement:
     """Read a rehearsal whose surfaces are up to date; ``touches`` says which lines of the probe touch."""
     organ = rehearsal.organ
     now = array_of(rehearsal.organ_skin.vertices).astype(float)
@@ -42,10 +42,10 @@ def read(rehearsal: Rehearsal, probe: Probe, touches: np.ndarray) -> Reading:
     reading: dict[str, Any] = dict(compression_mm=pressed.compression_mm, contact_mm2=pressed.area_mm2)
     outline = rehearsal.tumour_outline()
     if outline is None or rehearsal.tumour is None:
-        return Reading(**reading)
+        return Measurement(**reading)
     tumour = rehearsal.tumour_vertices()
     middle, before = tumour.mean(axis=0), np.asarray(rehearsal.tumour.vertices).mean(axis=0)
-    return Reading(
+    return Measurement(
         **reading,
         to_tumour_mm=_to_tumour_mm(rehearsal, probe, tumour),
         tumour_depth_mm=_depth_mm(tumour, now, organ.faces),

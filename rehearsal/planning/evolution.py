@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from rehearsal.planning.score import score
-from rehearsal.planning.score_terms import Parts
+from rehearsal.planning.score_terms import ScoreTerms
 from rehearsal.planning.sweep_candidates import Candidate
 
 SEED = 20161130
@@ -72,7 +72,7 @@ class Search:
             self._strategy.tell(asked, [-each for each in scores])
 
 
-def foreseen(candidate: Candidate, worth: Callable[[dict[str, float]], Parts]) -> np.ndarray:
+def foreseen(candidate: Candidate, worth: Callable[[dict[str, float]], ScoreTerms]) -> np.ndarray:
     """Shares (n,) of a candidate's ranges that do best by a forecast."""
     found = Search(candidate, candidate.start(), FAR)
     while found.trials < FORECASTS:

@@ -4,7 +4,7 @@ import igl
 import numpy as np
 
 from scenes.trocar import Trocar
-from ultrasound.probe_manipulator import Hand
+from ultrasound.probe_manipulator import ProbeManipulator
 
 # The shaft may touch the organ so far from where it holds the probe [mm].
 NEAR_MM = 2.0
@@ -16,8 +16,10 @@ class Reach:
     The shaft goes straight from the trocar to the middle of the probe's back.
     """
 
-    def __init__(self, trocar: Trocar, hand: Hand, origin: np.ndarray, target: np.ndarray) -> None:
-        self.trocar, self.hand = trocar, hand
+    def __init__(
+        self, trocar: Trocar, manipulator: ProbeManipulator, origin: np.ndarray, target: np.ndarray
+    ) -> None:
+        self.trocar, self.manipulator = trocar, manipulator
         self.at = None if trocar.at_mm is None else np.array(trocar.at_mm) - origin
         axis = (
             np.array(trocar.axis)
@@ -30,7 +32,7 @@ class Reach:
         """Which poses (n, 4, 4) can be reached, bool (n,)."""
         if self.at is None:
             return np.ones(len(poses), bool)
-        backs = poses[:, :3, 3] + self.hand.size_mm[2] / 2 * poses[:, :3, 2]
+        backs = poses[:, :3, 3] + self.manipulator.size_mm[2] / 2 * poses[:, :3, 2]
         shafts = backs - self.at
         length = np.linalg.norm(shafts, axis=1)
         along = shafts / np.maximum(length, 1e-9)[:, None]
@@ -42,7 +44,7 @@ class Reach:
 
     def _is_free(self, along: np.ndarray, length_mm: float) -> bool:
         """Whether the shaft passes the organ by."""
-        hits = igl.ray_mesh_intersect(self.at, along, self.hand.vertices, self.hand.faces)
+        hits = igl.ray_mesh_intersect(self.at, along, self.manipulator.vertices, self.manipulator.faces)
         return not hits or hits[0][1] > length_mm - NEAR_MM
 
 

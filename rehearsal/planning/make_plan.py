@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rehearsal.planning.evolution import SEED, Search
-from rehearsal.planning.plan_file import Plan, PlanError, Sweep
+from rehearsal.planning.plan_file import Plan, PlanError, PlannedSweep
 from rehearsal.planning.score import in_words, points, score, why
 from rehearsal.planning.search import ranked, search
 from rehearsal.planning.trial_workers import Outcome, Problem, Workers
@@ -63,8 +63,8 @@ def _name(one: Search, outcome: Outcome) -> str:
     return one.candidate.named(len(outcome.passes))
 
 
-def _sweep(one: Search, outcome: Outcome) -> Sweep:
-    return Sweep(
+def _sweep(one: Search, outcome: Outcome) -> PlannedSweep:
+    return PlannedSweep(
         name=_name(one, outcome),
         score=round(score(outcome.parts), DIGITS),
         parts=_rounded(asdict(outcome.parts)),

@@ -34,7 +34,7 @@ class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
-class Sweep(_Part):
+class PlannedSweep(_Part):
     """One candidate. ``passes`` are its poses, probe to patient: the probe's axes are PLUS's (``ultrasound.image_plane``)."""
 
     name: str
@@ -83,7 +83,7 @@ class Plan(_Part):
     model: dict[str, float | int | str]
     seed: int
     why: list[str]
-    sweeps: list[Sweep] = Field(min_length=1)
+    sweeps: list[PlannedSweep] = Field(min_length=1)
 
 
 def write_plan(plan: Plan, path: Path) -> None:

@@ -24,7 +24,7 @@ ABOVE_MM = 1.5
 
 @dataclass(frozen=True)
 class _Gone:
-    """How far a sweep was followed: the next pose, and how far from each pose the probe was (``Guide``)."""
+    """How far a sweep was followed: the next pose, and how far from each pose the probe was (``PlanGuidance``)."""
 
     at: int
     off: np.ndarray
@@ -32,7 +32,7 @@ class _Gone:
 
 
 @dataclass
-class Guide:
+class PlanGuidance:
     """The sweep of a plan that is shown, and the way along it so far. ``number`` says which sweep; one past the last is none."""
 
     rehearsal: Rehearsal
@@ -61,9 +61,9 @@ class Guide:
 
     def _above(self, pose: np.ndarray) -> np.ndarray:
         """The face's middle (3,) as far outside as the settled organ reaches there."""
-        hand = self.rehearsal.hand
-        depth = indentation(pose, hand.size_mm, hand.samples, hand.radius_mm)
-        return faces_of(hand, advanced(pose, -max(depth, 0.0) - ABOVE_MM)[None])[0]
+        manipulator = self.rehearsal.manipulator
+        depth = indentation(pose, manipulator.size_mm, manipulator.samples, manipulator.radius_mm)
+        return faces_of(manipulator, advanced(pose, -max(depth, 0.0) - ABOVE_MM)[None])[0]
 
     def next_sweep(self) -> str:
         """Show the plan's next sweep, after the last none; what there is to say."""
@@ -105,8 +105,8 @@ class Guide:
 
     def _distance(self, pose: np.ndarray, others: np.ndarray) -> np.ndarray:
         """How far a pose is from others (n, 4, 4): of the face's middle [mm], and of the turn [degrees]; (n, 2)."""
-        hand = self.rehearsal.hand
-        away = np.linalg.norm(faces_of(hand, others) - faces_of(hand, pose[None]), axis=1)
+        manipulator = self.rehearsal.manipulator
+        away = np.linalg.norm(faces_of(manipulator, others) - faces_of(manipulator, pose[None]), axis=1)
         cosine = (np.einsum("nij,ij->n", others[:, :3, :3], pose[:3, :3]) - 1) / 2
         return np.column_stack([away, np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))])
 

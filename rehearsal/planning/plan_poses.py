@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rehearsal.coordinates import transducer_at
-from rehearsal.planning.plan_file import Sweep
+from rehearsal.planning.plan_file import PlannedSweep
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.tracking.pose_file import TimedPoses
 
@@ -18,12 +18,12 @@ COMES_S = 1.0
 DEG_A_MM = 1.5
 
 
-def passes_in(rehearsal: Rehearsal, sweep: Sweep) -> list[np.ndarray]:
+def passes_in(rehearsal: Rehearsal, sweep: PlannedSweep) -> list[np.ndarray]:
     """The transducer's poses (n, 4, 4) on each pass of a sweep."""
     return [np.stack([transducer_at(rehearsal, pose) for pose in each]) for each in sweep.poses()]
 
 
-def timed_poses(sweep: Sweep, speed_mm_s: float) -> TimedPoses:
+def timed_poses(sweep: PlannedSweep, speed_mm_s: float) -> TimedPoses:
     """The sweep from a wait above its first pose, at a speed on its passes, lifted between them."""
     poses: list[np.ndarray] = []
     speeds: list[float] = []

@@ -7,10 +7,10 @@ from time import perf_counter
 from joblib import cpu_count
 
 from rehearsal.frame_view import probe_as_set
-from rehearsal.measurements.live_measurements import Instruments
+from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.planning.make_plan import make_plan
 from rehearsal.planning.plan_file import Plan, PlanError, next_free, write_plan
-from rehearsal.planning.plan_guidance import Guide
+from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.search import length_of
 from rehearsal.planning.trial_workers import Problem, Workers, workers
 from rehearsal.rehearsal import Rehearsal
@@ -96,7 +96,7 @@ class Plans:
     """What the user asks of plans; the instruments' guide is the one that is followed."""
 
     def __init__(
-        self, rehearsal: Rehearsal, anatomy: LoadedAnatomy, instruments: Instruments, out: Path
+        self, rehearsal: Rehearsal, anatomy: LoadedAnatomy, instruments: LiveMeasurements, out: Path
     ) -> None:
         self.rehearsal, self.anatomy, self.instruments, self.out = rehearsal, anatomy, instruments, out
         self._planning: Planning | None = None
@@ -161,7 +161,7 @@ class Plans:
         self._planning = None
         if planning.plan is None:
             return planning.fault
-        guide = Guide(self.rehearsal, planning.plan)
+        guide = PlanGuidance(self.rehearsal, planning.plan)
         self.instruments.follow(guide)
         return f"{guide.said()} ({planning.path.name})"
 

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from rehearsal.planning.instrument_reach import Reach
-from rehearsal.planning.score_terms import Parts, incidence_deg, path_mm
-from rehearsal.planning.sweep_path import Way
+from rehearsal.planning.score_terms import ScoreTerms, incidence_deg, path_mm
+from rehearsal.planning.sweep_path import SweepPath
 from rehearsal.rehearsal import Rehearsal
 from sim.distance_grid import distance_grid
 from sim.fields import array_of
@@ -19,26 +19,28 @@ from ultrasound.probe_manipulator import image_plane
 PLACES, ELEMENTS = 1500, 32
 
 
-class Forecast:
+class RigidSurrogate:
     """Ways on one settled organ; ``hand`` lays them with fewer samples of its surface than a trial's."""
 
     def __init__(self, rehearsal: Rehearsal, coverage: Coverage, target: str, reach: Reach) -> None:
         self.rehearsal, self.reach = rehearsal, reach
-        self.hand = copy.copy(rehearsal.hand)
-        self.hand.samples = self.hand.vertices
+        self.manipulator = copy.copy(rehearsal.manipulator)
+        self.manipulator.samples = self.manipulator.vertices
         places = coverage.places(target)
         settled = Skin(rehearsal.model, places[:: -(-len(places) // PLACES)])
         settled.update()
         self._places = array_of(settled.vertices).astype(float)
-        self._distance, self._low_mm = distance_grid(self.hand.vertices, self.hand.faces, VOXEL_MM, REACH_MM)
+        self._distance, self._low_mm = distance_grid(
+            self.manipulator.vertices, self.manipulator.faces, VOXEL_MM, REACH_MM
+        )
         probe = rehearsal.probe
         elements = probe.elements()
         self._elements = elements[np.linspace(0, len(elements) - 1, ELEMENTS).astype(int)]
 
-    def parts(self, way: Way) -> Parts:
+    def parts(self, way: SweepPath) -> ScoreTerms:
         """The same figures as a trial's, of the rigid organ; ``compression`` is how deep the array is in it."""
         if not way.passes:
-            return Parts.nothing()
+            return ScoreTerms.nothing()
         seen = np.zeros(len(self._places), bool)
         deepest, touching = [], []
         for pose in way.poses:
@@ -49,14 +51,14 @@ class Forecast:
             deepest.append(max(float(-outside.min()), 0.0))
             touching.append(float(touches.mean()))
         squeezed = np.array(deepest)
-        return Parts(
+        return ScoreTerms(
             seen=float(seen.mean()),
             compression_mean_mm=float(squeezed.mean()),
             compression_max_mm=float(squeezed.max()),
             over_limit=float((squeezed > self.rehearsal.scene.transducer.compression_warning_mm).mean()),
             contact=float(np.mean(touching)),
-            incidence_deg=incidence_deg(self.hand, way.poses),
-            path_mm=path_mm(self.hand, way.poses),
+            incidence_deg=incidence_deg(self.manipulator, way.poses),
+            path_mm=path_mm(self.manipulator, way.poses),
             time_s=0.0,
             reachable=float(self.reach(way.poses).mean()),
         )

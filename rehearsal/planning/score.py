@@ -1,6 +1,6 @@
 """One figure out of what a way was worth, and in words why one is better than another."""
 
-from rehearsal.planning.score_terms import Parts
+from rehearsal.planning.score_terms import ScoreTerms
 
 # Points for each part: the whole target seen is 100, and what it costs is taken off.
 POINTS = {
@@ -25,7 +25,7 @@ SAID = {
 SHARES = ("seen", "over_limit", "contact")
 
 
-def points(parts: Parts) -> dict[str, float]:
+def points(parts: ScoreTerms) -> dict[str, float]:
     """What each part adds, by name."""
     found = {name: weight * getattr(parts, name) for name, weight in POINTS.items()}
     if parts.reachable < 1.0:
@@ -33,18 +33,18 @@ def points(parts: Parts) -> dict[str, float]:
     return found
 
 
-def score(parts: Parts) -> float:
+def score(parts: ScoreTerms) -> float:
     """The sum of the points; more is better."""
     return sum(points(parts).values())
 
 
-def in_words(parts: Parts) -> str:
+def in_words(parts: ScoreTerms) -> str:
     """All parts of a sweep in one sentence, of which it is the subject."""
     *said, last = (_said(parts, name) for name in POINTS)
     return f"it {', '.join(said)}, and {last}"
 
 
-def why(winner: Parts, other: Parts) -> str:
+def why(winner: ScoreTerms, other: ScoreTerms) -> str:
     """What decided between two in one sentence, of which the winner is the subject, and what the other had for it."""
     if other.reachable < 1.0 <= winner.reachable:
         return (
@@ -60,13 +60,13 @@ def why(winner: Parts, other: Parts) -> str:
     return text
 
 
-def _compared(winner: Parts, other: Parts, name: str) -> str:
+def _compared(winner: ScoreTerms, other: ScoreTerms, name: str) -> str:
     return f"{_said(winner, name)} rather than {_figure(other, name)}"
 
 
-def _said(parts: Parts, name: str) -> str:
+def _said(parts: ScoreTerms, name: str) -> str:
     return SAID[name][0].format(_figure(parts, name))
 
 
-def _figure(parts: Parts, name: str) -> str:
+def _figure(parts: ScoreTerms, name: str) -> str:
     return SAID[name][1].format(getattr(parts, name) * (100 if name in SHARES else 1))

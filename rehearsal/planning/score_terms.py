@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ultrasound.probe_manipulator import Hand
+from ultrasound.probe_manipulator import ProbeManipulator
 
 
 @dataclass(frozen=True)
-class Parts:
+class ScoreTerms:
     """What a way was worth. Means are over its poses; a way that touches nothing has none."""
 
     seen: float
@@ -28,23 +28,23 @@ class Parts:
     """Share of poses that the trocar lets an instrument hold."""
 
     @classmethod
-    def nothing(cls) -> "Parts":
+    def nothing(cls) -> "ScoreTerms":
         """Of a way that has no pass."""
         return cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def faces_of(hand: Hand, poses: np.ndarray) -> np.ndarray:
+def faces_of(manipulator: ProbeManipulator, poses: np.ndarray) -> np.ndarray:
     """The middles (n, 3) of the face at poses (n, 4, 4) [mm]."""
-    return poses[:, :3, 3] - hand.size_mm[2] / 2 * poses[:, :3, 2]
+    return poses[:, :3, 3] - manipulator.size_mm[2] / 2 * poses[:, :3, 2]
 
 
-def path_mm(hand: Hand, poses: np.ndarray) -> float:
+def path_mm(manipulator: ProbeManipulator, poses: np.ndarray) -> float:
     """How far the face's middle goes from pose to pose."""
-    return float(np.linalg.norm(np.diff(faces_of(hand, poses), axis=0), axis=1).sum())
+    return float(np.linalg.norm(np.diff(faces_of(manipulator, poses), axis=0), axis=1).sum())
 
 
-def incidence_deg(hand: Hand, poses: np.ndarray) -> float:
+def incidence_deg(manipulator: ProbeManipulator, poses: np.ndarray) -> float:
     """The mean angle between the probe's axis and the settled surface's normal."""
-    normals = np.stack([hand.outward(face) for face in faces_of(hand, poses)])
+    normals = np.stack([manipulator.outward(face) for face in faces_of(manipulator, poses)])
     cosine = np.einsum("ij,ij->i", normals, poses[:, :3, 2])
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).mean())

@@ -6,8 +6,8 @@ import numpy as np
 
 from rehearsal.planning.instrument_reach import Reach
 from rehearsal.planning.plan_poses import DEG_A_MM, LIFT_MM
-from rehearsal.planning.score_terms import Parts, faces_of, incidence_deg
-from rehearsal.planning.sweep_path import Way
+from rehearsal.planning.score_terms import ScoreTerms, faces_of, incidence_deg
+from rehearsal.planning.sweep_path import SweepPath
 from rehearsal.rehearsal import Rehearsal
 from sim.fields import array_of
 from ultrasound.array_contact import pressing
@@ -34,7 +34,7 @@ class Trial:
         self.speed_mm_s = speed_mm_s
         self.plane = PlaneInTissue(rehearsal.embedding, PLACES)
 
-    def run(self, way: Way) -> Parts:
+    def run(self, way: SweepPath) -> ScoreTerms:
         """Go the way; the same way gives the same figures."""
         self._begin()
         for each in way.passes:
@@ -79,7 +79,7 @@ class Trial:
         self._steps_taken += 1
 
     def _face(self, pose: np.ndarray) -> np.ndarray:
-        return faces_of(self.rehearsal.hand, pose[None])[0]
+        return faces_of(self.rehearsal.manipulator, pose[None])[0]
 
     def _steps(self, start: np.ndarray, end: np.ndarray) -> int:
         cosine = (np.einsum("ij,ij->", start[:3, :3], end[:3, :3]) - 1) / 2
@@ -105,17 +105,17 @@ class Trial:
         self._troubled.append(self._trouble)
         self._trouble = False
 
-    def _parts(self, way: Way) -> Parts:
+    def _parts(self, way: SweepPath) -> ScoreTerms:
         if not self._squeezed:
-            return Parts.nothing()
+            return ScoreTerms.nothing()
         squeezed, limit = np.array(self._squeezed), self.rehearsal.scene.transducer.compression_warning_mm
-        return Parts(
+        return ScoreTerms(
             seen=self.coverage.share(self.target),
             compression_mean_mm=float(squeezed.mean()),
             compression_max_mm=float(squeezed.max()),
             over_limit=float(((squeezed > limit) | self._troubled).mean()),
             contact=float(np.mean(self._touching)),
-            incidence_deg=incidence_deg(self.rehearsal.hand, way.poses),
+            incidence_deg=incidence_deg(self.rehearsal.manipulator, way.poses),
             path_mm=self._way_mm,
             time_s=self._steps_taken * self.rehearsal.settings.time_step_s,
             reachable=float(self.reach(way.poses).mean()),

@@ -21,10 +21,10 @@ from rehearsal.coordinates import probe_in_patient
 from rehearsal.planning.evolution import foreseen
 from rehearsal.planning.instrument_reach import Reach
 from rehearsal.planning.plan_file import PlanError
-from rehearsal.planning.rigid_surrogate import Forecast
-from rehearsal.planning.score_terms import Parts
+from rehearsal.planning.rigid_surrogate import RigidSurrogate
+from rehearsal.planning.score_terms import ScoreTerms
 from rehearsal.planning.sweep_candidates import Candidate, candidates_of
-from rehearsal.planning.sweep_path import Way
+from rehearsal.planning.sweep_path import SweepPath
 from rehearsal.planning.trial import Trial
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.worker_processes import end_with
@@ -63,7 +63,7 @@ class Problem:
 class Outcome:
     """What a way was worth, and its passes (n, 4, 4): probe in the patient, in PLUS's axes (LPS, mm)."""
 
-    parts: Parts
+    parts: ScoreTerms
     passes: list[np.ndarray]
 
 
@@ -100,7 +100,7 @@ class Workers:
         """In the order of the tasks, as they are done."""
         return self._all(_go, tasks)
 
-    def go_ways(self, ways: Sequence[Callable[[Trial], Way]], speed_mm_s: float) -> Iterator[Outcome]:
+    def go_ways(self, ways: Sequence[Callable[[Trial], SweepPath]], speed_mm_s: float) -> Iterator[Outcome]:
         """The same of ways that are not candidates': each is made in its process."""
         return self._all(_go_way, [(way, speed_mm_s) for way in ways])
 
@@ -153,7 +153,7 @@ def _trial(key: str, problem: Problem, speed_mm_s: float) -> Trial:
                 f"--target {problem.target}: it is smaller than a voxel of {VOXEL_MM:g} mm; expected a larger one"
             )
         middle = coverage.low_mm + VOXEL_MM * np.argwhere(coverage.targets[problem.target]).mean(axis=0)
-        reach = Reach(problem.trocar, rehearsal.hand, rehearsal.origin, middle)
+        reach = Reach(problem.trocar, rehearsal.manipulator, rehearsal.origin, middle)
         _built[key] = Trial(rehearsal, coverage, problem.target, reach, speed_mm_s)
     _built[key].speed_mm_s = speed_mm_s
     return _built[key]
@@ -170,17 +170,17 @@ def _search_space(key: str, problem: Problem) -> SearchSpace:
 def _foreseen(key: str, problem: Problem, candidate: Candidate) -> np.ndarray:
     trial = _trial(key, problem, 1.0)
     trial.rehearsal.reset()
-    forecast = Forecast(trial.rehearsal, trial.coverage, trial.target, trial.reach)
-    return foreseen(candidate, lambda values: forecast.parts(candidate.way(forecast.hand, values)))
+    forecast = RigidSurrogate(trial.rehearsal, trial.coverage, trial.target, trial.reach)
+    return foreseen(candidate, lambda values: forecast.parts(candidate.way(forecast.manipulator, values)))
 
 
 def _go(
     key: str, problem: Problem, candidate: Candidate, values: dict[str, float], speed_mm_s: float
 ) -> Outcome:
-    return _go_way(key, problem, lambda trial: candidate.way(trial.rehearsal.hand, values), speed_mm_s)
+    return _go_way(key, problem, lambda trial: candidate.way(trial.rehearsal.manipulator, values), speed_mm_s)
 
 
-def _go_way(key: str, problem: Problem, make: Callable[[Trial], Way], speed_mm_s: float) -> Outcome:
+def _go_way(key: str, problem: Problem, make: Callable[[Trial], SweepPath], speed_mm_s: float) -> Outcome:
     trial = _trial(key, problem, speed_mm_s)
     way = make(trial)
     parts = trial.run(way)

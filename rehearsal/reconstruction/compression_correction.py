@@ -15,7 +15,7 @@ FROM_MM, COMES_S, WAITS_S = 30.0, 0.5, 1.0
 LONGEST_S = 2.0
 
 
-class Unsqueezed:
+class CompressionCorrection:
     """Called with the frames of a track in their order, it gives where the tissue at each pixel (rows, columns, 3) was at rest (LPS, mm).
 
     Raises SweepError for a sweep that has no probe, or pictures with other than as many rows as columns.

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from rehearsal.reconstruction.segmentation_metrics import Agreement, agreement
+from rehearsal.reconstruction.segmentation_metrics import SegmentationMetrics, segmentation_metrics
 from rehearsal.reconstruction.sweep_volumes import Rebuilt
 from scenes.anatomy import LoadedAnatomy
 from sim.mesh_distance import signed_distance
@@ -70,8 +70,8 @@ def compared(
         spacing = rebuilt.box.spacing_mm
         region = all_of.regions[name]
         seen = truth & all_of.known
-        whole = agreement(region, truth, spacing)
-        part = agreement(region & all_of.known, seen, spacing) if seen.any() else None
+        whole = segmentation_metrics(region, truth, spacing)
+        part = segmentation_metrics(region & all_of.known, seen, spacing) if seen.any() else None
         found[name] = dict(
             scanned=float(seen.sum() / truth.sum()),
             whole=_rounded(whole),
@@ -93,7 +93,7 @@ def landmark_errors(rebuilt: Rebuilt, beads_mm: np.ndarray) -> list[float]:
     return [float(np.linalg.norm(place - beads_mm[bead])) for bead, place in rebuilt.beads.items()]
 
 
-def _rounded(figures: Agreement) -> dict[str, float | None]:
+def _rounded(figures: SegmentationMetrics) -> dict[str, float | None]:
     """None for what cannot be measured, where nothing was found."""
     return {
         name: round(value, 4) if math.isfinite(value) else None for name, value in asdict(figures).items()

@@ -8,7 +8,7 @@ from scipy import ndimage
 
 
 @dataclass(frozen=True)
-class Agreement:
+class SegmentationMetrics:
     """Of a region that was found with the true one.
 
     - ``dice``: twice what they share over what both have, 0 to 1.
@@ -28,7 +28,7 @@ class Agreement:
     centroid_mm: float
 
 
-def agreement(found: np.ndarray, truth: np.ndarray, spacing_mm: float) -> Agreement:
+def segmentation_metrics(found: np.ndarray, truth: np.ndarray, spacing_mm: float) -> SegmentationMetrics:
     """Compare two regions (x, y, z) bool on one grid of cubic voxels.
 
     Raises ValueError where the grids differ, or where the truth is empty.
@@ -39,12 +39,12 @@ def agreement(found: np.ndarray, truth: np.ndarray, spacing_mm: float) -> Agreem
     if not truth.any():
         raise ValueError("the true region is empty")
     if not found.any():
-        return Agreement(0.0, math.nan, -100.0, math.nan)
+        return SegmentationMetrics(0.0, math.nan, -100.0, math.nan)
     # Neither has anything beyond this, so that distances are the same.
     both = ndimage.find_objects((found | truth).astype(np.uint8))[0]
     found, truth = found[both], truth[both]
     shared, count, true_count = (int(np.count_nonzero(a)) for a in (found & truth, found, truth))
-    return Agreement(
+    return SegmentationMetrics(
         dice=2 * shared / (count + true_count),
         hd95_mm=spacing_mm * max(_distance95(found, truth), _distance95(truth, found)),
         volume_percent=100 * (count / true_count - 1),

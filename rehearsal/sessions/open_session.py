@@ -5,7 +5,7 @@ from tqdm import tqdm
 
 from rehearsal.frame_view import probe_as_set
 from rehearsal.inputs.input_source import set_settings
-from rehearsal.measurements.live_measurements import Instruments
+from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session_file import Log
@@ -13,7 +13,7 @@ from render.viewer import Settings
 
 
 def opened(
-    log: Log, at_s: float, rehearsal: Rehearsal, settings: Settings, instruments: Instruments
+    log: Log, at_s: float, rehearsal: Rehearsal, settings: Settings, instruments: LiveMeasurements
 ) -> Replay:
     """A replay that has come to a time, by way of the last state before it. Raises SessionError."""
     replay = Replay(rehearsal, log)

@@ -12,9 +12,9 @@ import numpy as np
 
 from rehearsal.rehearsal import RehearsalState
 from sim.body import BodyState
-from sim.divergence_check import Watch
+from sim.divergence_check import DivergenceState
 from sim.solver import SolverState
-from ultrasound.probe_manipulator import Grip
+from ultrasound.probe_manipulator import ManipulatorState
 
 # Of all arrays: a body of a million particles has less.
 MOST_BYTES = 1 << 30
@@ -37,7 +37,7 @@ def to_text(state: RehearsalState) -> str:
         **_of_solver("now", state.solver),
         **({} if _is_same(watch.good, state.solver) else _of_solver("good", watch.good)),
         "pose": state.pose,
-        **{f"grip.{name}": value for name, value in asdict(state.grip).items() if value is not None},
+        **{f"grip.{name}": value for name, value in asdict(state.manipulator).items() if value is not None},
         "numbers": [state.steps, watch.steps_since_good, watch.steps_tangled, watch.is_restored],
     }
     packed = io.BytesIO()
@@ -55,11 +55,11 @@ def from_text(text: str, like: RehearsalState) -> RehearsalState:
         now = _solver(arrays, "now", like.solver)
         steps, since_good, tangled, restored = map(int, arrays["numbers"])
         good = _solver(arrays, "good", like.solver) if "good.position" in arrays else now
-        watch = Watch(good, since_good, tangled, bool(restored))
+        watch = DivergenceState(good, since_good, tangled, bool(restored))
         turn = tuple(map(float, arrays["grip.turn_deg"].reshape(3)))
         depth, pressed = float(arrays["grip.depth_mm"]), float(arrays["grip.pressed_mm"])
         aim = _pose(arrays, "grip.aim") if "grip.aim" in arrays else None
-        grip = Grip(depth, pressed, turn, aim)  # type: ignore[arg-type]
+        grip = ManipulatorState(depth, pressed, turn, aim)  # type: ignore[arg-type]
         pose = _pose(arrays, "pose")
     except UNREADABLE as error:
         what = str(error) or type(error).__name__

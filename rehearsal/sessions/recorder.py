@@ -17,7 +17,7 @@ STATE_S = 60.0
 NAME = r"session-([0-9]{3,9})\.jsonl"
 
 
-class Recorded:
+class SessionRecorder:
     """A session with its file; ``watch`` after each moment."""
 
     def __init__(self, session: Session, recording: Recording) -> None:
@@ -52,7 +52,7 @@ def record(
     arch: str,
     folder: Path,
     begins: RehearsalState | None = None,
-) -> Recorded:
+) -> SessionRecorder:
     """Record a session from here on under the next free number of a folder. Raises OSError."""
     rehearsal = session.rehearsal
     header = Header(
@@ -65,4 +65,4 @@ def record(
         begins=None if begins is None else to_text(begins),
     )
     path = folder / f"session-{next_number(folder, NAME):03d}.jsonl"
-    return Recorded(session, Recording(path, header))
+    return SessionRecorder(session, Recording(path, header))

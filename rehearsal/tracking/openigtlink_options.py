@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rehearsal.commands.command_line import Fault, WholeRange
+from rehearsal.commands.command_line import CommandError, WholeRange
 
 if TYPE_CHECKING:
     from rehearsal.tracking.openigtlink_server import Server
@@ -31,7 +31,7 @@ def link_options(command: Callable) -> Callable:
 
 
 def opened_link(link: bool, host: str | None, port: int | None, leads: bool = False) -> "Server | None":
-    """The server that the options ask for, which closes when the command ends. Raises Fault."""
+    """The server that the options ask for, which closes when the command ends. Raises CommandError."""
     if not link:
         for option, value in {
             "--link-host": host,
@@ -39,7 +39,7 @@ def opened_link(link: bool, host: str | None, port: int | None, leads: bool = Fa
             "--link-leads": leads or None,
         }.items():
             if value is not None:
-                raise Fault(f"{option}: is about the link, which is off; add --link, or leave it out")
+                raise CommandError(f"{option}: is about the link, which is off; add --link, or leave it out")
         return None
     from rehearsal.tracking.openigtlink_server import Server
 
@@ -48,7 +48,7 @@ def opened_link(link: bool, host: str | None, port: int | None, leads: bool = Fa
         server = Server(host, port, click.echo)
     except (OSError, TypeError) as error:  # TypeError: a text that no name of a machine can be
         reason = getattr(error, "strerror", None) or "no name of a machine"
-        raise Fault(
+        raise CommandError(
             f"--link: {host} port {port} cannot be opened ({reason}); end the program that has it, or choose another --link-host or "
             "--link-port"
         ) from None

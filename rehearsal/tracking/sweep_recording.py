@@ -6,7 +6,7 @@ from rehearsal.coordinates import probe_in_patient
 from rehearsal.numbered_files import next_number
 from rehearsal.rehearsal import Rehearsal
 from render.viewer import View
-from ultrasound.labelled_sweep import MarkedSweep
+from ultrasound.labelled_sweep import LabelledSweep
 from ultrasound.probe import Probe
 from ultrasound.sweep import SweepError
 
@@ -19,7 +19,7 @@ class Sweeping:
 
     def __init__(self, rehearsal: Rehearsal) -> None:
         self.rehearsal = rehearsal
-        self._sweep: MarkedSweep | None = None
+        self._sweep: LabelledSweep | None = None
         self._began_s = self._due_s = 0.0
         self._shows = ""
 
@@ -31,7 +31,7 @@ class Sweeping:
             return "No CT, no sweep"
         stem = f"sweep-{next_number(out, NAME):03d}"
         try:
-            self._sweep = MarkedSweep(out, stem, self.rehearsal.probe)
+            self._sweep = LabelledSweep(out, stem, self.rehearsal.probe)
         except OSError as error:
             return f"{stem} cannot be written: {_words(error)}"
         self._began_s, self._due_s, self._shows = 0.0, 0.0, ""

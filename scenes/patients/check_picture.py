@@ -53,7 +53,7 @@ WIDER = 1.2
 
 
 @dataclass(frozen=True)
-class View:
+class CheckView:
     """A cut as a radiologist sees it: where right and down of the picture point in the patient, and the letters there."""
 
     name: str
@@ -63,11 +63,11 @@ class View:
 
 
 VIEWS = (
-    View("axial, from the feet", (1, 0, 0), (0, 1, 0), ("R", "L", "A", "P")),
-    View("coronal, from the front", (1, 0, 0), (0, 0, -1), ("R", "L", "S", "I")),
-    View("sagittal, from the left", (0, 1, 0), (0, 0, -1), ("A", "P", "S", "I")),
+    CheckView("axial, from the feet", (1, 0, 0), (0, 1, 0), ("R", "L", "A", "P")),
+    CheckView("coronal, from the front", (1, 0, 0), (0, 0, -1), ("R", "L", "S", "I")),
+    CheckView("sagittal, from the left", (0, 1, 0), (0, 0, -1), ("A", "P", "S", "I")),
 )
-WHOLE = View("coronal, the whole width", (1, 0, 0), (0, 0, -1), ("R", "L", "S", "I"))
+WHOLE = CheckView("coronal, the whole width", (1, 0, 0), (0, 0, -1), ("R", "L", "S", "I"))
 
 
 def draw_check(patient: Patient, rows: list[tuple[str, str]], folder: Path) -> None:
@@ -114,7 +114,7 @@ def _bright(colour: Colour) -> Colour:
 
 def _draw_cut(
     axes: Axes,
-    view: View,
+    view: CheckView,
     ct: sitk.Image,
     surfaces: dict[str, trimesh.Trimesh],
     middle: np.ndarray,

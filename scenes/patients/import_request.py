@@ -14,7 +14,7 @@ from scenes.patients.readers.ct_files import open_ct
 from scenes.patients.readers.dicom_series import dicom_found
 from scenes.patients.readers.label_files import Drawing, drawing_of, open_labels
 from scenes.patients.readers.label_maps import LabelMap, merged, with_tissues
-from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.lazy_volume import LazyVolume
 from scenes.patients.readers.segment_names import Side
 from scenes.patients.region_growing import grown
 from scenes.progress import Progress, silent
@@ -65,7 +65,7 @@ def take_in(request: Request, progress: Progress = silent) -> tuple[Patient, set
     return replace(patient, notes=(*patient.notes, *notes), draft=is_draft), private | _paths(request)
 
 
-def with_labels(request: Request, progress: Progress) -> tuple[Volume, list[Drawing], LabelMap]:
+def with_labels(request: Request, progress: Progress) -> tuple[LazyVolume, list[Drawing], LabelMap]:
     """A CT, the labels found for it, and one map of them all with the user's words on it. Raises PatientError."""
     words = [*request.organ, *(word for several in request.tissues.values() for word in several)]
     drawings = [open_labels(path, words, progress) for path in request.labels]

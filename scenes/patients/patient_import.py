@@ -37,7 +37,7 @@ from scenes.patients.part_surfaces import (
     volume_ml,
 )
 from scenes.patients.readers.label_maps import Colour, LabelMap, nearest, present
-from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.lazy_volume import LazyVolume
 from scenes.patients.readers.segment_names import Side
 from scenes.patients.readers.voxel_grid import Box, VoxelGrid
 from scenes.progress import Progress, silent
@@ -85,7 +85,7 @@ def tissue_codes(tissues: Sequence[str]) -> dict[str, int]:
 
 
 def import_patient(
-    ct: Volume,
+    ct: LazyVolume,
     labels: LabelMap,
     organ: Sequence[int] | None = None,
     side: Side | None = None,
@@ -162,7 +162,7 @@ class _Located:
 
 
 def _located(
-    ct: Volume, labels: LabelMap, organ: Sequence[int] | None, side: Side | None, margin_mm: float
+    ct: LazyVolume, labels: LabelMap, organ: Sequence[int] | None, side: Side | None, margin_mm: float
 ) -> _Located:
     """The one organ that is asked for, whole and in soft tissue. Raises PatientError."""
     if not margin_mm >= 0:
@@ -193,7 +193,7 @@ def _support(kind: str, organ: trimesh.Trimesh, labels: LabelMap, piece: Organ) 
         raise PatientError(f"no support fits under the organ: {error}; check the organ's label") from error
 
 
-def _level(ct: Volume, pieces: list[Organ], margin_mm: float) -> tuple[Box, np.ndarray]:
+def _level(ct: LazyVolume, pieces: list[Organ], margin_mm: float) -> tuple[Box, np.ndarray]:
     """The box of a CT at the height of all organs, and its HU: enough to tell sides and to crop from."""
     if max(_overlap(ct.grid, piece) for piece in pieces) == 0:
         raise PatientError(

@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull
 
 from scenes.patients.import_error import PatientError
 from scenes.patients.readers.label_maps import LabelMap, Segment, box_of
-from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.lazy_volume import LazyVolume
 from scenes.patients.readers.voxel_grid import Box, VoxelGrid
 
 DRAFT = Segment("kidney (draft, grown from a seed)", None, "kidney", None)
@@ -41,7 +41,7 @@ LEAST_EDGE, LEAST_SOLIDITY = 0.75, 0.65
 ELSEWHERE = "give a point deeper in the parenchyma, or draw labels"
 
 
-def grown(ct: Volume, seed_mm: np.ndarray) -> LabelMap:
+def grown(ct: LazyVolume, seed_mm: np.ndarray) -> LabelMap:
     """The kidney around a seed, on the CT's grid; the same call gives the same voxels.
 
     It knows tissue and shape, not anatomy: from a seed in another compact organ with fat around it, that is what grows.

@@ -8,7 +8,7 @@ import click
 from tqdm import tqdm
 
 from rehearsal.commands.command_line import (
-    Fault,
+    CommandError,
     NumberRange,
     WholeRange,
     arch_option,
@@ -93,12 +93,12 @@ def validate(
     used = start_taichi(arch)
     from studies.accuracy import convergence_study
     from studies.accuracy.bead_errors import report, summary, table
-    from studies.accuracy.bead_experiment import Experiment
+    from studies.accuracy.bead_experiment import BeadExperiment
 
     if checked:
         convergence_study.changes_of(setup)
     started = perf_counter()
-    experiment = Experiment(loaded, setup)
+    experiment = BeadExperiment(loaded, setup)
     built_s = perf_counter() - started
     run = experiment.run(setup)
     figures = report(experiment, setup, run)
@@ -176,7 +176,7 @@ def calibrate(
                     found = calibration.exhaustive(loaded, split, radii_mm, spacing, work, bar.update)
                 bar.total = bar.n
     except (calibration.CalibrationError, case_workers.WorkerError) as error:
-        raise Fault(str(error)) from None
+        raise CommandError(str(error)) from None
     write_calibration(found, out, searched=generations is not None)
 
 

@@ -40,13 +40,13 @@ def _proper(rows: tuple[Vector3, Vector3, Vector3]) -> tuple[Vector3, Vector3, V
 Rotation = Annotated[tuple[Vector3, Vector3, Vector3], AfterValidator(_proper)]
 
 
-class Section(BaseModel):
+class CaseSection(BaseModel):
     """A table of case.toml. Keys that are not listed are a laboratory's own, but none of ours in another unit."""
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
 
     @model_validator(mode="after")
-    def _own_units(self) -> "Section":
+    def _own_units(self) -> "CaseSection":
         for known in type(self).model_fields:
             quantity = known.removesuffix(next((unit for unit in UNITS if known.endswith(unit)), ""))
             for key in self.model_extra or {}:
@@ -55,19 +55,19 @@ class Section(BaseModel):
         return self
 
 
-class Units(Section):
+class Units(CaseSection):
     length: Literal["mm"]
     acceleration: Literal["m/s^2"]
     pressure: Literal["kPa"] = "kPa"
     density: Literal["kg/m^3"] = "kg/m^3"
 
 
-class Gravity(Section):
+class CaseGravity(CaseSection):
     g: float = Field(ge=0, le=100)
     direction: Direction
 
 
-class Material(Section):
+class CaseMaterial(CaseSection):
     """What is known of the tissue; not every model needs all of it."""
 
     young_kPa: float | None = Field(None, gt=0, le=1e6)
@@ -75,7 +75,7 @@ class Material(Section):
     density: float | None = Field(None, ge=100, le=20000)
 
 
-class Contact(Section):
+class CaseContact(CaseSection):
     """Coulomb friction, the same on support and probe."""
 
     friction_coefficient: float = Field(0.35, ge=0, le=10)
@@ -83,13 +83,13 @@ class Contact(Section):
     friction_on_probe: Literal[True] = True
 
 
-class Files(Section):
+class Files(CaseSection):
     kidney: str = "kidney.stl"
     support: str = "support.stl"
     beads: str = "beads.csv"
 
 
-class Probe(Section):
+class CaseProbe(CaseSection):
     """A cuboid, full lengths along its own axes, edges rounded inside them; columns of ``rotation`` are these axes."""
 
     shape: Literal["cuboid"]
@@ -99,7 +99,7 @@ class Probe(Section):
     rotation: Rotation
 
     @model_validator(mode="after")
-    def _room_for_edges(self) -> "Probe":
+    def _room_for_edges(self) -> "CaseProbe":
         if self.edge_radius_mm > min(self.size_mm) / 2:
             raise ValueError(
                 f"edge_radius_mm is {self.edge_radius_mm:g}: expected at most half of the least of size_mm"
@@ -107,7 +107,7 @@ class Probe(Section):
         return self
 
 
-class Stage(Section):
+class CaseStage(CaseSection):
     """The probe's centre and how far it has come since stage 0; with a rotation of its own if it turned."""
 
     index: int
@@ -116,18 +116,18 @@ class Stage(Section):
     rotation: Rotation | None = None
 
 
-class CaseFile(Section):
+class CaseFile(CaseSection):
     """``case.toml``."""
 
     format_version: Literal[1]
     name: str = ""
     units: Units
-    gravity: Gravity
-    material: Material = Material()
-    contact: Contact = Contact()
+    gravity: CaseGravity
+    material: CaseMaterial = CaseMaterial()
+    contact: CaseContact = CaseContact()
     files: Files = Files()
-    probe: Probe
-    stage: tuple[Stage, ...] = Field(min_length=2)
+    probe: CaseProbe
+    stage: tuple[CaseStage, ...] = Field(min_length=2)
 
     @model_validator(mode="after")
     def _in_order(self) -> "CaseFile":
@@ -154,7 +154,7 @@ class CaseFile(Section):
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class BeadCase:
     """One experiment: float64, mm, in the frame of the organ's stress-free surface.
 
     ``beads`` (n, 3) stress-free, ``measured`` (stages, n, 3), ``poses`` (stages, 4, 4) world from probe,
@@ -180,7 +180,7 @@ class Case:
     density_kg_m3: float | None
 
 
-def load_case(folder: Path) -> Case:
+def load_case(folder: Path) -> BeadCase:
     """Read a case folder. Raises CaseError with one line."""
     file = _read_file(folder)
     probe, material, files = file.probe, file.material, file.files
@@ -191,7 +191,7 @@ def load_case(folder: Path) -> Case:
     poses[:, :3, :3] = [stage.rotation or probe.rotation for stage in file.stage]
     poses[:, :3, 3] = [stage.position for stage in file.stage]
     contents = [folder / name for name in ("case.toml", files.kidney, files.support, files.beads)]
-    return Case(
+    return BeadCase(
         name=file.name or folder.resolve().name,
         digest=hashlib.sha256(b"".join(path.read_bytes() for path in contents)).hexdigest(),
         organ=organ,

@@ -4,23 +4,23 @@ import numpy as np
 
 from rehearsal.configuration import Setup
 from rehearsal.result_files import counted, rounded, spread
-from studies.accuracy.bead_case import Case
-from studies.accuracy.bead_experiment import Experiment, Run
+from studies.accuracy.bead_case import BeadCase
+from studies.accuracy.bead_experiment import BeadExperiment, BeadRun
 
 DISTANCE_BANDS = 4
 
 
-def bead_errors(case: Case, beads: np.ndarray) -> np.ndarray:
+def bead_errors(case: BeadCase, beads: np.ndarray) -> np.ndarray:
     """Distances (stages, n) [mm] between beads (stages, n, 3) [mm] and where they were measured."""
     return np.linalg.norm(beads - case.measured, axis=2)
 
 
-def null_errors(case: Case) -> np.ndarray:
+def null_errors(case: BeadCase) -> np.ndarray:
     """The errors (stages, n) [mm] of predicting no motion: beads that stay where they were measured at stage 0."""
     return np.linalg.norm(case.measured - case.measured[0], axis=2)
 
 
-def probe_distances(case: Case) -> np.ndarray:
+def probe_distances(case: BeadCase) -> np.ndarray:
     """Distances (stages, n) [mm] of the measured beads from the probe's surface at their stage; negative inside it."""
     core = case.size_mm / 2 - case.edge_radius_mm
     rotation, centre = case.poses[:, None, :3, :3], case.poses[:, None, :3, 3]
@@ -60,7 +60,7 @@ def correlation(first: np.ndarray, second: np.ndarray) -> float | None:
     return rounded(a @ b / scale) if scale > 1e-12 else None
 
 
-def report(experiment: Experiment, setup: Setup, run: Run) -> dict:
+def report(experiment: BeadExperiment, setup: Setup, run: BeadRun) -> dict:
     """What ``validate --json`` writes; the correlation is over all beads at all stages at which the probe presses."""
     case = experiment.case
     errors = bead_errors(case, run.beads)
@@ -80,7 +80,7 @@ def report(experiment: Experiment, setup: Setup, run: Run) -> dict:
 
 
 def summary(report: dict, model: str) -> str:
-    """What was computed and how fast, in a few lines for the terminal; ``model`` is ``Experiment.describe``'s."""
+    """What was computed and how fast, in a few lines for the terminal; ``model`` is ``BeadExperiment.describe``'s."""
     time = report["ms_per_step"]
     lines = [
         f"case   {report['case']}",
@@ -92,7 +92,7 @@ def summary(report: dict, model: str) -> str:
     return "\n".join(lines if report["finite"] else [*lines, "NOT FINITE: the figures below mean nothing"])
 
 
-def table(case: Case, beads: np.ndarray) -> str:
+def table(case: BeadCase, beads: np.ndarray) -> str:
     """The paper's Tables 2 to 4 for one run's beads (stages, n, 3) [mm], beside what predicting no motion gives.
 
     The last column is the correlation of error and distance from the probe at that stage; below are the errors by

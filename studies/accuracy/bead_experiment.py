@@ -17,7 +17,7 @@ from sim.shape_matching import fill
 from sim.shapes import ConvexTool
 from sim.skinning import Skin
 from sim.solver import StepSettings
-from studies.accuracy.bead_case import Case
+from studies.accuracy.bead_case import BeadCase
 from ultrasound.probe_manipulator import between
 
 # The share of a stage's steps in which the probe moves; in the others the tissue comes to rest, as it did for the scan.
@@ -29,7 +29,7 @@ DENSITY_KG_M3 = 1050.0
 
 
 @dataclass
-class Run:
+class BeadRun:
     """One run: beads (stages, n, 3) [mm] at each stage's end, and at the moment when the probe arrives; each stage step's
     time, whether all stayed finite.
     """
@@ -40,14 +40,14 @@ class Run:
     arriving: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
 
 
-class Experiment:
+class BeadExperiment:
     """A case on the device, which can be run with several setups that share model, size and material.
 
     Needs Taichi to be initialised. All positions on the device are relative to ``origin``, the middle of the organ.
     Raises SamplingError and SetupError.
     """
 
-    def __init__(self, case: Case, setup: Setup, rest: RestBody | None = None) -> None:
+    def __init__(self, case: BeadCase, setup: Setup, rest: RestBody | None = None) -> None:
         self.case = case
         self.origin = case.organ.bounds.mean(axis=0)
         tissue = tissue_of(case, setup)
@@ -58,7 +58,7 @@ class Experiment:
         self.body, self.model, self.contacts = self.solver.body, self.solver.model, self.solver.contacts
         self.beads = Skin(self.model, case.beads - self.origin)
 
-    def run(self, setup: Setup) -> Run:
+    def run(self, setup: Setup) -> BeadRun:
         """Press the organ from its stress-free shape.
 
         It settles for the warm-up's 120 steps with the probe away, as at its stage-0 place the probe would be in the way
@@ -68,7 +68,7 @@ class Experiment:
         """
         step = self.prepare(setup)
         pose = self._away()
-        run = Run(np.zeros_like(self.case.measured), arriving=np.zeros_like(self.case.measured))
+        run = BeadRun(np.zeros_like(self.case.measured), arriving=np.zeros_like(self.case.measured))
         moving = max(1, round(MOVING * setup.stage_steps))
         for stage, goal in enumerate(self.case.poses):
             path = between(pose, self.relative(goal), moving)
@@ -127,7 +127,7 @@ class Experiment:
         return pose
 
 
-def tissue_of(case: Case, setup: Setup) -> TissueSection:
+def tissue_of(case: BeadCase, setup: Setup) -> TissueSection:
     """The setup's tissue with what is the case's own. Raises SetupError where neither gives the material."""
     tissue, density = setup.tissue, (case.density_kg_m3 or DENSITY_KG_M3) / 1000
     material = dict(young_kpa=case.young_kpa, poisson=case.poisson, density_g_cm3=density)
@@ -140,10 +140,10 @@ def tissue_of(case: Case, setup: Setup) -> TissueSection:
     return type(tissue).model_validate(told)
 
 
-def rest_body(case: Case, setup: Setup) -> RestBody:
+def rest_body(case: BeadCase, setup: Setup) -> RestBody:
     """Shape matching's particles of a case; Experiments of one radius can share them."""
     return fill(_organ(case), setup.tissue)
 
 
-def _organ(case: Case) -> trimesh.Trimesh:
+def _organ(case: BeadCase) -> trimesh.Trimesh:
     return moved_by(case.organ, -case.organ.bounds.mean(axis=0))

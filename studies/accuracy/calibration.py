@@ -8,7 +8,7 @@ from numpy.polynomial import Polynomial
 from scipy.optimize import differential_evolution
 
 from rehearsal.configuration import Setup, setup_of
-from studies.accuracy.bead_case import Case
+from studies.accuracy.bead_case import BeadCase
 from studies.accuracy.bead_errors import null_errors
 from studies.accuracy.case_workers import Map, Measured
 
@@ -48,7 +48,7 @@ class Split:
 
 
 @dataclass(frozen=True)
-class Trial:
+class CalibrationTrial:
     """One setup evaluated on every case."""
 
     setup: Setup
@@ -71,11 +71,11 @@ class Fit:
 class Calibration:
     """All trials of each radius, in the order in which they were made."""
 
-    cases: tuple[Case, ...]
+    cases: tuple[BeadCase, ...]
     split: Split
-    trials: dict[float, list[Trial]]
+    trials: dict[float, list[CalibrationTrial]]
 
-    def best(self, radius_mm: float) -> Trial:
+    def best(self, radius_mm: float) -> CalibrationTrial:
         """The trial that fits best, the first of equals."""
         return min(self.trials[radius_mm], key=lambda trial: trial.fit_mm)
 
@@ -84,7 +84,7 @@ class Calibration:
         return self.split.held_out_mm([null_errors(case) for case in self.cases])
 
 
-def split_of(cases: Sequence[Case], hold_out: str) -> Split:
+def split_of(cases: Sequence[BeadCase], hold_out: str) -> Split:
     """Hold out each case's deepest stage, every third of its beads, or the last case. Raises CalibrationError."""
     if len({case.digest for case in cases}) < len(cases):
         raise CalibrationError(
@@ -112,7 +112,7 @@ def split_of(cases: Sequence[Case], hold_out: str) -> Split:
 
 
 def exhaustive(
-    cases: Sequence[Case],
+    cases: Sequence[BeadCase],
     split: Split,
     radii_mm: Sequence[float],
     spacing: float,
@@ -161,7 +161,7 @@ def exhaustive_count(cases: int, radii: int, spacing: float) -> int:
 
 
 def search(
-    cases: Sequence[Case],
+    cases: Sequence[BeadCase],
     split: Split,
     radii_mm: Sequence[float],
     generations: int,
@@ -172,7 +172,7 @@ def search(
 
     A generation is evaluated at once, so the outcome does not depend on the number of workers.
     """
-    trials: dict[float, list[Trial]] = {radius: [] for radius in radii_mm}
+    trials: dict[float, list[CalibrationTrial]] = {radius: [] for radius in radii_mm}
 
     def errors_of(radius: float, x: np.ndarray) -> np.ndarray:
         setups = [_setup_at(radius, *column) for column in x.reshape(len(BOUNDS), -1).T]
@@ -202,8 +202,12 @@ def search_count(cases: int, radii: int, generations: int) -> int:
 
 
 def try_all(
-    cases: Sequence[Case], split: Split, setups: Sequence[Setup], workers: Map, done: Callable[[int], object]
-) -> list[Trial]:
+    cases: Sequence[BeadCase],
+    split: Split,
+    setups: Sequence[Setup],
+    workers: Map,
+    done: Callable[[int], object],
+) -> list[CalibrationTrial]:
     """Evaluate setups on every case; case by case, as what a worker has built for one serves all setups of a radius."""
     pairs = [(case, setup) for case in cases for setup in setups]
     results = list(_told(workers(pairs), done))
@@ -211,11 +215,11 @@ def try_all(
     for place, setup in enumerate(setups):
         measured = tuple(results[place :: len(setups)])
         errors = [each.errors for each in measured]
-        trials.append(Trial(setup, measured, split.fit_mm(errors), split.held_out_mm(errors)))
+        trials.append(CalibrationTrial(setup, measured, split.fit_mm(errors), split.held_out_mm(errors)))
     return trials
 
 
-def quartic(trials: Sequence[Trial]) -> Fit | None:
+def quartic(trials: Sequence[CalibrationTrial]) -> Fit | None:
     """The paper's smooth curve through the errors up to TALLEST times the least; None where these are too few."""
     at = np.array([(trial.setup.tissue.stiffness, trial.fit_mm) for trial in trials])
     at = at[np.isfinite(at[:, 1]) & (at[:, 1] <= TALLEST * at[:, 1].min())]

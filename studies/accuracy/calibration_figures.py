@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
 from rehearsal.result_files import save_figure
-from studies.accuracy.calibration import TALLEST, Calibration, Trial, quartic
+from studies.accuracy.calibration import TALLEST, Calibration, CalibrationTrial, quartic
 from studies.accuracy.calibration_tables import Table
 
 DPI = 130
@@ -50,9 +50,9 @@ def write_search(calibration: Calibration, path: Path) -> None:
     save_figure(figure, path, dpi=DPI, bbox_inches="tight")
 
 
-def best_so_far(trials: list[Trial]) -> list[Trial]:
+def best_so_far(trials: list[CalibrationTrial]) -> list[CalibrationTrial]:
     """After each trial, the one that fits best until then."""
-    best: list[Trial] = []
+    best: list[CalibrationTrial] = []
     for trial in trials:
         best.append(trial if not best or trial.fit_mm < best[-1].fit_mm else best[-1])
     return best

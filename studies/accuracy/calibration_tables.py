@@ -9,7 +9,7 @@ import numpy as np
 
 from rehearsal.result_files import rounded, spread, write_json
 from scenes.atomic_files import whole
-from studies.accuracy.calibration import Calibration, Trial, quartic
+from studies.accuracy.calibration import Calibration, CalibrationTrial, quartic
 
 FIT, HELD_OUT = "fit", "held out"
 Row = list[float | None]
@@ -73,7 +73,11 @@ def tables_of(calibration: Calibration) -> list[Table]:
 
 
 def _bead_table(
-    calibration: Calibration, best: list[Trial], name: str, title: str, figure: Callable[[np.ndarray], float]
+    calibration: Calibration,
+    best: list[CalibrationTrial],
+    name: str,
+    title: str,
+    figure: Callable[[np.ndarray], float],
 ) -> Table:
     """One figure of the errors of each stage's beads; the stiffness is the first row."""
     names = [["", "", "stiffness"]]
@@ -136,7 +140,7 @@ def _radius(calibration: Calibration, radius: float) -> dict:
     )
 
 
-def _trial(trial: Trial) -> dict:
+def _trial(trial: CalibrationTrial) -> dict:
     setup = trial.setup
     return dict(
         stiffness=setup.tissue.stiffness,
@@ -156,7 +160,7 @@ def _rows(calibration: Calibration) -> Iterator[tuple[int, int, str, np.ndarray]
                     yield place, stage, part, used
 
 
-def _times(calibration: Calibration, best: list[Trial]) -> Table:
+def _times(calibration: Calibration, best: list[CalibrationTrial]) -> Table:
     """Table 5; where several evaluations run at once, a time is that of one CPU thread among others."""
     spreads = [spread([ms for measured in trial.measured for ms in measured.step_ms]) for trial in best]
     rows = {"mean": "mean", "standard deviation": "sd", "minimum": "min", "maximum": "max"}

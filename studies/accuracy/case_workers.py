@@ -15,15 +15,15 @@ import sim.device
 from rehearsal.configuration import Setup
 from rehearsal.worker_processes import processes
 from sim.body import RestBody
-from studies.accuracy.bead_case import Case
+from studies.accuracy.bead_case import BeadCase
 from studies.accuracy.bead_errors import bead_errors
-from studies.accuracy.bead_experiment import Experiment, rest_body
+from studies.accuracy.bead_experiment import BeadExperiment, rest_body
 
 # Taichi frees fields only when it starts anew, and does not bear hundreds of them.
 MOST_BUILT = 4
 CONNECT_S = 10
 
-_built: dict[tuple[str, float], Experiment] = {}
+_built: dict[tuple[str, float], BeadExperiment] = {}
 _filled: dict[tuple[str, float], RestBody] = {}
 # A Dask worker may run several threads; Taichi serves one.
 _turn = threading.Lock()
@@ -43,10 +43,10 @@ class Measured:
     clusters: int
 
 
-Map = Callable[[Sequence[tuple[Case, Setup]]], Iterator[Measured]]
+Map = Callable[[Sequence[tuple[BeadCase, Setup]]], Iterator[Measured]]
 
 
-def evaluate(case: Case, setup: Setup) -> Measured:
+def evaluate(case: BeadCase, setup: Setup) -> Measured:
     """Run a case in this process; errors are infinite where the result is not finite."""
     key = (case.digest, setup.tissue.radius_mm)
     with _turn:
@@ -59,13 +59,13 @@ def evaluate(case: Case, setup: Setup) -> Measured:
     return Measured(errors, run.step_ms, size["particles"], size["clusters"])
 
 
-def _build(key: tuple[str, float], case: Case, setup: Setup) -> None:
+def _build(key: tuple[str, float], case: BeadCase, setup: Setup) -> None:
     if len(_built) in (0, MOST_BUILT):
         _built.clear()
         sim.device.start("cpu", cpu_max_num_threads=1)
     if key not in _filled:
         _filled[key] = rest_body(case, setup)
-    _built[key] = Experiment(case, setup, _filled[key])
+    _built[key] = BeadExperiment(case, setup, _filled[key])
 
 
 @contextmanager
@@ -111,7 +111,7 @@ def _ready() -> bool:
     return True
 
 
-def _map(pairs: Sequence[tuple[Case, Setup]]) -> Iterator[Measured]:
+def _map(pairs: Sequence[tuple[BeadCase, Setup]]) -> Iterator[Measured]:
     """Evaluations in the order of the pairs, as they are done."""
     for result in Parallel(batch_size=1, return_as="generator")(delayed(_attempt)(*pair) for pair in pairs):
         if isinstance(result, Exception):
@@ -119,7 +119,7 @@ def _map(pairs: Sequence[tuple[Case, Setup]]) -> Iterator[Measured]:
         yield result
 
 
-def _attempt(case: Case, setup: Setup) -> Measured | Exception:
+def _attempt(case: BeadCase, setup: Setup) -> Measured | Exception:
     # joblib waits for ever for a task that raises on Dask.
     try:
         return evaluate(case, setup)

@@ -7,7 +7,7 @@ import numpy as np
 
 from rehearsal.configuration import Setup, SetupError, option_of
 from rehearsal.result_files import rounded
-from studies.accuracy.bead_experiment import Experiment
+from studies.accuracy.bead_experiment import BeadExperiment
 
 # Sizes of which a third more and less can be built.
 LEAST_MM, MOST_MM = 0.75, 15.0
@@ -44,7 +44,7 @@ def changes_of(setup: Setup) -> dict[str, Setup]:
     }
 
 
-def moved(experiment: Experiment, setup: Setup, beads: np.ndarray) -> Iterator[dict]:
+def moved(experiment: BeadExperiment, setup: Setup, beads: np.ndarray) -> Iterator[dict]:
     """What each change moves, as ``validate --json`` has it.
 
     Args:
@@ -57,7 +57,7 @@ def moved(experiment: Experiment, setup: Setup, beads: np.ndarray) -> Iterator[d
     """
     for name, changed in changes_of(setup).items():
         same = changed.size_mm == setup.size_mm
-        other = experiment if same else Experiment(experiment.case, changed)
+        other = experiment if same else BeadExperiment(experiment.case, changed)
         apart = np.linalg.norm(other.run(changed).beads - beads, axis=2)
         yield dict(
             change=name,

@@ -10,7 +10,7 @@ import trimesh
 from tqdm import tqdm
 
 from rehearsal.commands.command_line import (
-    Fault,
+    CommandError,
     NumberRange,
     make_folder,
     make_place,
@@ -84,7 +84,7 @@ def beam(
     try:
         run(folder, (cell_mm, young_kpa, poisson, density), checked, json_path, out)
     except BeamError as error:
-        raise Fault(str(error)) from None
+        raise CommandError(str(error)) from None
 
 
 def run(
@@ -94,7 +94,7 @@ def run(
     json_path: Path | None,
     out: Path | None,
 ) -> None:
-    """Read, compute, print, write. Raises BeamError and Fault."""
+    """Read, compute, print, write. Raises BeamError and CommandError."""
     cell_mm, *values = options
     captures = load_captures(folder)
     size = beam_size(folder)
@@ -102,13 +102,13 @@ def run(
         make_folder(out)
     make_place(json_path)
     start_taichi("cpu")
-    from studies.beam.cantilever import PASSES, REST_RELAXATION, REST_TOLERANCE_MM, Cantilever, Material
+    from studies.beam.cantilever import PASSES, REST_RELAXATION, REST_TOLERANCE_MM, BeamMaterial, Cantilever
 
-    material = Material(*values)
+    material = BeamMaterial(*values)
     groups = [list(group) for _, group in groupby(captures, key=lambda capture: capture.load_g)]
 
     def build(
-        cell_mm: float, load_g: float, changed: Material = material, hung_mm: float | None = None
+        cell_mm: float, load_g: float, changed: BeamMaterial = material, hung_mm: float | None = None
     ) -> Cantilever:
         return Cantilever(size, changed, cell_mm, load_g, markers_on(size), hung_mm)
 
@@ -142,11 +142,11 @@ def run(
 
 
 def save_picture(groups: list[list[Capture]], traces: list[np.ndarray], rows: list[Row], out: Path) -> None:
-    """Draw beam.png into a folder and say so. Raises Fault."""
+    """Draw beam.png into a folder and say so. Raises CommandError."""
     try:
         draw(groups, traces, rows, out / "beam.png")
     except OSError as error:
-        raise Fault(f"{out}: cannot be written to ({error.strerror}); choose another --out") from None
+        raise CommandError(f"{out}: cannot be written to ({error.strerror}); choose another --out") from None
     click.echo(f"Wrote {out / 'beam.png'}")
 
 

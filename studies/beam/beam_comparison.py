@@ -12,7 +12,7 @@ from rehearsal.result_files import save_figure
 from studies.beam.motion_capture import BeamError, Capture, Oscillation, oscillation
 
 if TYPE_CHECKING:
-    from studies.beam.cantilever import Cantilever, Material
+    from studies.beam.cantilever import BeamMaterial, Cantilever
 
 FRAME_S = 0.01
 # Swings that are computed, in periods that beam theory expects.
@@ -45,7 +45,7 @@ class Row:
     rest_left_mm: float
 
 
-def theory(size_mm: np.ndarray, material: "Material", load_g: float) -> tuple[float, float]:
+def theory(size_mm: np.ndarray, material: "BeamMaterial", load_g: float) -> tuple[float, float]:
     """Sag [mm] of a Timoshenko cantilever, frequency [Hz] of an Euler-Bernoulli one with a mass at its tip.
 
     Small deflections, a clamped end that is free to change its width, and for the frequency no shear and no turning

@@ -33,7 +33,7 @@ HARD_PASSES = 16_000
 
 
 @dataclass(frozen=True)
-class Material:
+class BeamMaterial:
     """Young's modulus [kPa], Poisson's ratio, density [g/cm^3]."""
 
     young_kpa: float
@@ -65,7 +65,7 @@ class Cantilever:
     def __init__(
         self,
         size_mm: np.ndarray,
-        material: Material,
+        material: BeamMaterial,
         cell_mm: float,
         load_g: float = 0.0,
         markers: np.ndarray | None = None,

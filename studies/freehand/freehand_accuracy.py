@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from rehearsal.configuration import Setup, scene_of
-from rehearsal.reconstruction.compression_correction import Unsqueezed
+from rehearsal.reconstruction.compression_correction import CompressionCorrection
 from rehearsal.reconstruction.patient_comparison import compared, surfaces_of
 from rehearsal.reconstruction.sweep_volumes import Places, rebuild, track_of
 from rehearsal.rehearsal import Rehearsal
@@ -119,7 +119,7 @@ def compression(
         truth = pressed(rehearsal, depth)
         rehearsal.reset()
         track = track_of(truth.sweep, REFERENCE)
-        unsqueezed = Unsqueezed(rehearsal, truth.sweep, track, REFERENCE)
+        unsqueezed = CompressionCorrection(rehearsal, truth.sweep, track, REFERENCE)
         for undone, places in ((False, None), (True, unsqueezed)):
             row = dict(depth_mm=depth, compression_mm=round(truth.compression_mm, 4), undone=undone)
             rows.append(row | _row(truth, truth.poses, surfaces, places))

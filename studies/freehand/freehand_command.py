@@ -7,7 +7,7 @@ from typing import Any
 import click
 from tqdm import tqdm
 
-from rehearsal.commands.command_line import Fault, arch_option, load_patient, make_folder, start_taichi
+from rehearsal.commands.command_line import CommandError, arch_option, load_patient, make_folder, start_taichi
 from rehearsal.configuration import PRESETS
 from rehearsal.result_files import write_csv, write_json
 from scenes.scene import EMBEDDED
@@ -31,7 +31,7 @@ def freehand(scenes: tuple[Path, ...], out: Path, quick: bool, arch: str) -> Non
     for scene in scenes or (EMBEDDED,):
         one, anatomy = load_patient(scene)
         if anatomy.ct is None:
-            raise Fault(f"{scene}: has no CT: expected anatomy.ct, which a sweep shows")
+            raise CommandError(f"{scene}: has no CT: expected anatomy.ct, which a sweep shows")
         loaded.append((one, anatomy))
     used = start_taichi(arch)
     from studies.freehand.freehand_accuracy import count_of, measure

@@ -6,14 +6,14 @@ import numpy as np
 import trimesh
 
 from rehearsal.coordinates import probe_in_patient
-from rehearsal.measurements.tumour_measurements import read
+from rehearsal.measurements.tumour_measurements import measure
 from rehearsal.reconstruction.compression_correction import come
 from rehearsal.rehearsal import Rehearsal, scanned_anatomy
 from scenes.anatomy import LoadedAnatomy
 from sim.embedding import Unmoved
 from sim.mesh_distance import signed_distance
 from ultrasound.bmode import source_of_pixels
-from ultrasound.ground_truth_labels import MOST_BEADS, Marks
+from ultrasound.ground_truth_labels import MOST_BEADS, GroundTruthLabels
 from ultrasound.image_plane import ImagePlane, PlaneInTissue
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import advanced, touching
@@ -112,7 +112,7 @@ def pressed(rehearsal: Rehearsal, depth_mm: float) -> Truth:
             rehearsal.scanner.plane.take(rehearsal.image_plane())
             images.append(marks.render())
             poses.append(probe_in_patient(rehearsal))
-            squeezed.append(read(rehearsal, probe, touches).compression_mm)
+            squeezed.append(measure(rehearsal, probe, touches).compression_mm)
     times = np.arange(len(poses)) * every * rehearsal.settings.time_step_s
     truth = _truth(np.stack(images), np.stack(poses), times, probe, beads + rehearsal.origin)
     truth.compression_mm = float(np.mean(squeezed))
@@ -121,7 +121,7 @@ def pressed(rehearsal: Rehearsal, depth_mm: float) -> Truth:
 
 def _way(rehearsal: Rehearsal, depth_mm: float) -> np.ndarray:
     """Poses (n, 4, 4), step by step, over the middle of the tumour at one depth under the settled surface."""
-    home = rehearsal.hand.home
+    home = rehearsal.manipulator.home
     local = (np.asarray(rehearsal.tumour.vertices) - home[:3, 3]) @ home[:3, :3]  # type: ignore[union-attr]
     low, high = local.min(axis=0)[:2], local.max(axis=0)[:2]
     step_mm = SPEED_MM_S * rehearsal.settings.time_step_s
@@ -131,17 +131,17 @@ def _way(rehearsal: Rehearsal, depth_mm: float) -> np.ndarray:
 
 def _over(rehearsal: Rehearsal, x: float, y: float, depth_mm: float) -> np.ndarray:
     """The pose at a place beside home, turned as that, so deep under the settled surface."""
-    hand = rehearsal.hand
-    pose = hand.home.copy()
+    manipulator = rehearsal.manipulator
+    pose = manipulator.home.copy()
     pose[:3, 3] += pose[:3, :2] @ [x, y]
-    return advanced(touching(pose, rehearsal.size_mm, hand.samples, hand.radius_mm), depth_mm)
+    return advanced(touching(pose, rehearsal.size_mm, manipulator.samples, manipulator.radius_mm), depth_mm)
 
 
 def _marks(
     plane: PlaneInTissue, organ: trimesh.Trimesh, tumour: trimesh.Trimesh | None, beads: np.ndarray
-) -> Marks:
+) -> GroundTruthLabels:
     around = None if tumour is None else distance_volume(tumour, 1.0)
-    return Marks(plane, distance_volume(organ, 1.0), around, beads, BEAD_RADIUS_MM)
+    return GroundTruthLabels(plane, distance_volume(organ, 1.0), around, beads, BEAD_RADIUS_MM)
 
 
 def _truth(

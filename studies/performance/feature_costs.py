@@ -16,7 +16,7 @@ from rehearsal.measurements.run_report import Tally
 from rehearsal.rehearsal import SURROUNDINGS_MM, Rehearsal, scanned_anatomy
 from rehearsal.stopwatch import timed
 from render.background_image import Page
-from render.window_layout import Layout
+from render.window_layout import WindowLayout
 from scenes.anatomy import LoadedAnatomy
 from scenes.closed_surfaces import moved_by
 from scenes.scene import Contact, Scene, SolverSection, with_options
@@ -28,7 +28,7 @@ from sim.shape_matching import fill
 from sim.shapes import GRID_MM, ConvexTool, SignedDistanceField
 from sim.solver import Solver
 from studies.performance.step_timing import memory_mb
-from ultrasound.probe import Mode, Rung
+from ultrasound.probe import DetailLevel, Mode
 from ultrasound.probe_manipulator import advanced, between, image_plane, pose_at, touching
 from ultrasound.scanner import ScannedAnatomy, Scanner
 
@@ -78,7 +78,7 @@ FEATURES = {
 }
 
 
-class Body:
+class FeatureBody:
     """A scene's organ and support, of which solvers are made with some features or others. Positions are relative to the
     middle of the organ [mm].
     """
@@ -133,15 +133,15 @@ class Body:
         return between(advanced(self.home, depth[0]), advanced(self.home, depth[1]), self.settings.substeps)
 
 
-def body_of(scene: Scene, anatomy: LoadedAnatomy, model: str, size_mm: float) -> Body:
+def body_of(scene: Scene, anatomy: LoadedAnatomy, model: str, size_mm: float) -> FeatureBody:
     """The scene's organ in a tissue model, of cells or particles of a size."""
     options: dict[str, str | float | None] = {"tissue.model": model, f"tissue.{TISSUES[model].SIZE}": size_mm}
     tissue = with_options(scene, options).tissue
-    return Body(scene, anatomy, tissue)
+    return FeatureBody(scene, anatomy, tissue)
 
 
 def of_steps(
-    body: Body, features: tuple[Feature, ...], arch: str, quick: bool, done: Callable[[], Any]
+    body: FeatureBody, features: tuple[Feature, ...], arch: str, quick: bool, done: Callable[[], Any]
 ) -> list[dict[str, Any]]:
     """What each feature adds to a step: medians with it and without, memory, and kernels where they run in parallel.
 
@@ -166,7 +166,7 @@ def of_steps(
     return rows
 
 
-def _stepped(body: Body, ways: list[Options], arch: str) -> list[dict[str, Any]]:
+def _stepped(body: FeatureBody, ways: list[Options], arch: str) -> list[dict[str, Any]]:
     """Median time of a step [ms] through a press and memory [MB] of some solvers, stepped in turn."""
     start(arch)
     solvers = [body.solver(options) for options in ways]
@@ -180,7 +180,7 @@ def _stepped(body: Body, ways: list[Options], arch: str) -> list[dict[str, Any]]
     ]
 
 
-def kernels_of(body: Body, options: Options, arch: str) -> dict[str, int]:
+def kernels_of(body: FeatureBody, options: Options, arch: str) -> dict[str, int]:
     """Kernels that a step has where it runs in parallel, as on a GPU, and how often they are launched."""
     start(arch, kernel_profiler=True)
     solver = body.solver(options, serial=False)
@@ -216,7 +216,7 @@ def _pictures(rehearsal: Rehearsal, scanned: ScannedAnatomy) -> Iterator[dict[st
     """The rungs of the picture's ladder, each with all that it needs."""
     image, probe = rehearsal.scene.image, rehearsal.probe
     plane = image_plane(rehearsal.pose_at_depth(1.0), probe.housing_mm[2], *probe.extent_mm)
-    ladder: tuple[tuple[str, float, str, Mode, Rung], ...] = (
+    ladder: tuple[tuple[str, float, str, Mode, DetailLevel], ...] = (
         ("CT, organ alone", 0.0, "gel", "ct", "speckle"),
         ("CT", SURROUNDINGS_MM, "background", "ct", "speckle"),
         ("echo: reflection, attenuation", SURROUNDINGS_MM, "background", "b-mode", "reflection"),
@@ -224,13 +224,13 @@ def _pictures(rehearsal: Rehearsal, scanned: ScannedAnatomy) -> Iterator[dict[st
         ("echo: and elevation", SURROUNDINGS_MM, "background", "b-mode", "elevation"),
         ("echo and CT", SURROUNDINGS_MM, "background", "both", "speckle"),
     )
-    for name, margin, outside, mode, rung in ladder:
+    for name, margin, outside, mode, detail_level in ladder:
         cell = embedding_cell_mm(rehearsal.scene.tissue)
         embedding = Embedding(rehearsal.model, rehearsal.organ, cell, margin)
         scanner = Scanner(scanned, embedding, probe, image.pixels, outside)
 
         def draw() -> None:
-            scanner.look(plane, probe, mode, rung, image.window_hu, image.level_hu)
+            scanner.look(plane, probe, mode, detail_level, image.window_hu, image.level_hu)
 
         yield _alone(f"picture, {name}", draw, [embedding, scanner], rehearsal.model)
 
@@ -238,7 +238,7 @@ def _pictures(rehearsal: Rehearsal, scanned: ScannedAnatomy) -> Iterator[dict[st
 def _whole_frame(rehearsal: Rehearsal) -> dict[str, Any]:
     """All that a frame does but drawing the 3D view: a step under the pressing transducer, skin, echo, window's picture."""
     rehearsal.reset()
-    settings, tally, page = settings_of(rehearsal), Tally(0.0), Page(Layout(1280, 720))
+    settings, tally, page = settings_of(rehearsal), Tally(0.0), Page(WindowLayout(1280, 720))
     settings.mode = "b-mode"
     poses = [
         rehearsal.pose_at_depth(depth)

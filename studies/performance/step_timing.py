@@ -34,7 +34,7 @@ ROUNDS, STEPS_A_ROUND = 9, 5
 
 
 @dataclass(frozen=True)
-class Press:
+class TimedPress:
     """One press: when each step was, in simulated seconds, and how long it took; and the times of a step's pieces."""
 
     setup: Setup
@@ -62,7 +62,7 @@ def press(
     dt = settings.time_step_s
     warm_up = max(1, round(share * rehearsal.press.warm_up_steps))
     pressed = max(1, round(share * script / dt))
-    away = advanced(rehearsal.hand.home, -AWAY_MM)
+    away = advanced(rehearsal.manipulator.home, -AWAY_MM)
     for n in range(warm_up):
         step(settings, between(away, away, settings.substeps))
         yield (n + 1) * dt
@@ -74,11 +74,11 @@ def press(
         yield (warm_up + n + 1) * dt
 
 
-def measure(rehearsal: Rehearsal, setup: Setup, share: float, arch: str) -> Press:
-    """Press twice: once timed as a whole, once piece by piece; the first step, which compiles, is taken before."""
+def measure(rehearsal: Rehearsal, setup: Setup, share: float, arch: str) -> TimedPress:
+    """TimedPress twice: once timed as a whole, once piece by piece; the first step, which compiles, is taken before."""
     solver = rehearsal.solver
     phases = Phases(solver)
-    home = between(rehearsal.hand.home, rehearsal.hand.home, rehearsal.settings.substeps)
+    home = between(rehearsal.manipulator.home, rehearsal.manipulator.home, rehearsal.settings.substeps)
     phases.step(rehearsal.settings, home)
     step_ms: list[float] = []
     pieces: list[dict[str, float]] = []
@@ -89,7 +89,7 @@ def measure(rehearsal: Rehearsal, setup: Setup, share: float, arch: str) -> Pres
         pieces.append(without_calls(phases.ms, phases.calls, step_ms[n]))
     case = describe(setup, solver, arch) | dict(ms=spread(step_ms), phases_ms=mean_of(pieces))
     warm_up_s = max(1, round(share * rehearsal.press.warm_up_steps)) * rehearsal.settings.time_step_s
-    return Press(setup, case, elapsed, step_ms, pieces, warm_up_s)
+    return TimedPress(setup, case, elapsed, step_ms, pieces, warm_up_s)
 
 
 def describe(setup: Setup, solver: Solver, arch: str) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from rehearsal.result_files import save_figure
 from studies.performance.step_phases import AFTER, BEFORE, CONTACTS, PASSES
-from studies.performance.step_timing import Press
+from studies.performance.step_timing import TimedPress
 
 DPI = 130
 # The paper's Table 5: radius [mm], mean, minimum and maximum [ms].
@@ -24,7 +24,7 @@ FRAME_MS = 1000 / 60
 LEAST_SHARE = 2.0
 
 
-def draw(presses: list[Press], sizes: list[dict], path: Path) -> None:
+def draw(presses: list[TimedPress], sizes: list[dict], path: Path) -> None:
     """Write the picture."""
     figure = Figure(figsize=(13, 9), layout="constrained")
     panels = figure.subplots(2, 2)
@@ -36,7 +36,7 @@ def draw(presses: list[Press], sizes: list[dict], path: Path) -> None:
     save_figure(figure, path, dpi=DPI)
 
 
-def _against_time(axes: Axes, press: Press) -> None:
+def _against_time(axes: Axes, press: TimedPress) -> None:
     """The paper's Figure 7."""
     case = press.case
     contacts = [sum(ms.get(name, 0.0) for name in CONTACTS) for ms in press.pieces_ms]
@@ -54,7 +54,7 @@ def _against_time(axes: Axes, press: Press) -> None:
     axes.legend()
 
 
-def _pieces(axes: Axes, presses: list[Press]) -> None:
+def _pieces(axes: Axes, presses: list[TimedPress]) -> None:
     """The paper's Figure 8, for every model and size: what takes less than a fiftieth everywhere is the rest."""
     shares = []
     for press in presses:
@@ -80,7 +80,7 @@ def _name(case: dict) -> str:
     return f"{'shape matching' if case['radius_mm'] else 'neo-Hookean'} {size:g} mm"
 
 
-def _radii(axes: Axes, matched: list[Press]) -> None:
+def _radii(axes: Axes, matched: list[TimedPress]) -> None:
     """The paper's Table 5."""
     rows = [
         (press.case["radius_mm"], *(press.case["ms"][key] for key in ("mean", "min", "max")))

@@ -12,19 +12,19 @@ from rehearsal.result_files import rounded
 from rehearsal.speed_accuracy.pareto_front import SETTINGS, pareto
 from rehearsal.stopwatch import timed
 from sim.device import start
-from studies.accuracy.bead_case import Case
+from studies.accuracy.bead_case import BeadCase
 from studies.accuracy.bead_errors import bead_errors
-from studies.accuracy.bead_experiment import Experiment
+from studies.accuracy.bead_experiment import BeadExperiment
 from ultrasound.probe_manipulator import between
 
 # The machine's speed changes in minutes: every setting is timed in each round, and the median counts.
 ROUNDS, TIMED_STEPS = 3, 45
 
-Built = Iterator[tuple[Experiment, list[Setup]]]
+Built = Iterator[tuple[BeadExperiment, list[Setup]]]
 
 
 def points(
-    cases: list[Case], tried: list[Setup], arch: str, rounds: int, done: Callable[[], Any]
+    cases: list[BeadCase], tried: list[Setup], arch: str, rounds: int, done: Callable[[], Any]
 ) -> list[dict[str, Any]]:
     """Rows of trade.json: error over all cases, cost on the first. ``done`` is told of each setting's runs.
 
@@ -55,24 +55,24 @@ def points(
     return [_row(setup, cost[k], best[k], resting[setup], arriving[setup]) for k, setup in enumerate(tried)]
 
 
-def count(cases: list[Case], tried: list[Setup], rounds: int) -> int:
+def count(cases: list[BeadCase], tried: list[Setup], rounds: int) -> int:
     """How often ``points`` reports."""
     return (len(cases) + rounds) * len(tried)
 
 
-def _built(case: Case, tried: list[Setup], arch: str) -> Built:
+def _built(case: BeadCase, tried: list[Setup], arch: str) -> Built:
     """Each model and size on a device of its own, with the settings that share it."""
     for _, alike in groupby(tried, key=lambda setup: (setup.model, setup.size_mm)):
         group = list(alike)
         start(arch)
-        yield Experiment(case, group[0]), group
+        yield BeadExperiment(case, group[0]), group
 
 
-def _mean_error(case: Case, beads: np.ndarray, finite: bool) -> float:
+def _mean_error(case: BeadCase, beads: np.ndarray, finite: bool) -> float:
     return float(bead_errors(case, beads).mean()) if finite else float("inf")
 
 
-def _time(experiment: Experiment, setup: Setup) -> float:
+def _time(experiment: BeadExperiment, setup: Setup) -> float:
     """Median of a step [ms] on the way to the deepest stage."""
     short = replace(setup, warm_up_steps=10)
     step = experiment.prepare(short)

@@ -10,9 +10,9 @@ import numpy as np
 from rehearsal.configuration import PRESETS, probe_of, scene_of
 from rehearsal.planning.make_plan import make_plan
 from rehearsal.planning.score import score
-from rehearsal.planning.score_terms import Parts
+from rehearsal.planning.score_terms import ScoreTerms
 from rehearsal.planning.search import length_at, length_of
-from rehearsal.planning.sweep_path import Way
+from rehearsal.planning.sweep_path import SweepPath
 from rehearsal.planning.trial import Trial
 from rehearsal.planning.trial_workers import Outcome, Problem, workers
 from scenes.anatomy import LoadedAnatomy
@@ -42,7 +42,7 @@ def compare(
     with workers(problem, jobs) as crew:
         plan = make_plan(problem, crew, SPEED_MM_S, trials, done)
     sweep = plan.sweeps[0]
-    ways: list[Callable[[Trial], Way]] = [
+    ways: list[Callable[[Trial], SweepPath]] = [
         partial(planned, sweep=sweep),
         *UNPLANNED.values(),
         *ways_by_chance(len(sweep.passes), SEEDS),
@@ -68,7 +68,7 @@ def compare(
 def _row(name: str, outcomes: list[Outcome]) -> dict[str, Any]:
     """Means over several sweeps, and of how many."""
     parts = [asdict(one.parts) for one in outcomes]
-    means = Parts(**{key: float(np.mean([each[key] for each in parts])) for key in parts[0]})
+    means = ScoreTerms(**{key: float(np.mean([each[key] for each in parts])) for key in parts[0]})
     return dict(
         sweep=name,
         count=len(outcomes),

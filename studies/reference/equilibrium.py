@@ -6,8 +6,8 @@ import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
-from studies.reference.fem_solid import Solid
-from studies.reference.penalty_contact import Contact
+from studies.reference.fem_solid import FemSolid
+from studies.reference.penalty_contact import PenaltyContact
 
 LEAST_VOLUME_RATIO = 0.05
 SEARCHES, LEAST_REACH = 6, 1e-6
@@ -51,7 +51,11 @@ class Equilibrium:
     """
 
     def __init__(
-        self, solid: Solid, contacts: list[Contact], load: np.ndarray, fixed: np.ndarray | None = None
+        self,
+        solid: FemSolid,
+        contacts: list[PenaltyContact],
+        load: np.ndarray,
+        fixed: np.ndarray | None = None,
     ):
         self.solid, self.contacts, self.load = solid, contacts, load
         self.fixed = np.zeros(load.shape, bool) if fixed is None else fixed

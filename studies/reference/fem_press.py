@@ -12,8 +12,8 @@ import trimesh
 from skfem import MeshTet2
 
 from studies.reference.equilibrium import LEAST_VOLUME_RATIO, Equilibrium, NotConvergedError
-from studies.reference.fem_solid import Material, Solid
-from studies.reference.penalty_contact import Contact, Law, Surface
+from studies.reference.fem_solid import FemMaterial, FemSolid
+from studies.reference.penalty_contact import ContactSurface, Law, PenaltyContact
 from studies.reference.smooth_obstacles import FAR_MM, DistanceField, RoundedBox
 
 GRAVITY_M_S2, FRICTION = 9.81, 0.35
@@ -30,7 +30,7 @@ SOFT_KPA_MM, SOFT_TOLERANCE = 100.0, 2e-2
 
 
 @dataclass(frozen=True)
-class Press:
+class FemPress:
     """A transducer cuboid that goes straight down, its long side along x.
 
     Attributes:
@@ -47,7 +47,7 @@ class Press:
 
 
 @dataclass(frozen=True)
-class Stage:
+class FemStage:
     """The equilibrium at one indentation."""
 
     indentation_mm: float
@@ -86,7 +86,7 @@ class _Path:
         self.state, self.depth_mm = state, depth_mm
 
 
-class Experiment:
+class FemExperiment:
     """One kidney on its support under one press.
 
     Attributes:
@@ -97,24 +97,24 @@ class Experiment:
         self,
         mesh: MeshTet2,
         support: trimesh.Trimesh,
-        material: Material,
-        press: Press,
+        material: FemMaterial,
+        press: FemPress,
         friction: float = FRICTION,
         report: Callable[[str], None] = lambda text: None,
     ) -> None:
         """Set up; meshes in one frame [mm], the kidney not yet touching its support."""
-        self.solid, self.press, self._report = Solid(mesh, material), press, report
+        self.solid, self.press, self._report = FemSolid(mesh, material), press, report
         self.worst_residual = 0.0
-        surface = Surface(self.solid)
+        surface = ContactSurface(self.solid)
         box = RoundedBox(np.array(press.size_mm), press.edge_mm)
-        self.support = Contact(surface, DistanceField(support), Law(300.0, friction))
+        self.support = PenaltyContact(surface, DistanceField(support), Law(300.0, friction))
         # Stiff enough for 0.05 mm of overlap at 20 kPa; stiffer ones cost many iterations at the probe's edges.
         law = Law(800.0, friction, soft_mm=0.05)
-        self.probe = Contact(surface, box, law, np.array([*press.over_mm, FAR_MM]))
+        self.probe = PenaltyContact(surface, box, law, np.array([*press.over_mm, FAR_MM]))
         weight = self.solid.weight(np.array([0.0, 0.0, -GRAVITY_M_S2]))
         self.equilibrium = Equilibrium(self.solid, [self.support, self.probe], weight)
 
-    def stages(self) -> Iterator[Stage]:
+    def stages(self) -> Iterator[FemStage]:
         """Solve stage by stage. Raises NotConvergedError."""
         state, residual = self._settled()
         path = _Path(home_mm=self._touching_height(state), state=state, before=state)
@@ -195,6 +195,6 @@ class Experiment:
         for contact in self.equilibrium.contacts:
             contact.carry(state)
 
-    def _stage(self, indentation: float, state: np.ndarray, residual: float) -> Stage:
+    def _stage(self, indentation: float, state: np.ndarray, residual: float) -> FemStage:
         probe, support = (contact.force(state)[1] / 1000 for contact in (self.probe, self.support))
-        return Stage(indentation, self.probe.offset.copy(), state, probe, support, residual)
+        return FemStage(indentation, self.probe.offset.copy(), state, probe, support, residual)

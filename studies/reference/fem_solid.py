@@ -14,7 +14,7 @@ INVERSION_STEPS = 12
 
 
 @dataclass(frozen=True)
-class Material:
+class FemMaterial:
     """Isotropic hyperelastic tissue."""
 
     young_kpa: float = 15.0
@@ -36,7 +36,7 @@ class MeshError(ValueError):
     """Why a mesh does not make a body, in one line."""
 
 
-class Solid:
+class FemSolid:
     """A body at rest, free of stress, and the forces of its deformation.
 
     Attributes:
@@ -45,7 +45,7 @@ class Solid:
         volume_share: volume that each node stands for [mm^3], shape (nodes,); all positive.
     """
 
-    def __init__(self, mesh: MeshTet2, material: Material) -> None:
+    def __init__(self, mesh: MeshTet2, material: FemMaterial) -> None:
         """10-node tetrahedra [mm], straight or curved, with 4 Gauss points each."""
         self.mesh, self.material = mesh, material
         self.basis = Basis(mesh, ElementTetP2(), intorder=2)

@@ -8,9 +8,9 @@ import numpy as np
 import trimesh
 from skfem import MeshTet2
 
-from studies.reference.fem_press import FRICTION, Experiment, Press
-from studies.reference.fem_solid import Material
-from studies.reference.reference_case import Case
+from studies.reference.fem_press import FRICTION, FemExperiment, FemPress
+from studies.reference.fem_solid import FemMaterial
+from studies.reference.reference_case import ReferenceCase
 from studies.reference.smooth_obstacles import RoundedBox, signed_distance
 from studies.reference.tetrahedral_mesh import tetrahedra
 
@@ -34,7 +34,7 @@ class Sizes:
         """Sizes for the mesh that shows how much the mesh matters."""
         return Sizes(COARSER * self.near_mm)
 
-    def mesh(self, kidney: trimesh.Trimesh, press: Press) -> MeshTet2:
+    def mesh(self, kidney: trimesh.Trimesh, press: FemPress) -> MeshTet2:
         """Tetrahedra that fill the kidney, fine where the transducer touches it. Raises MeshError."""
         box = RoundedBox(np.array(press.size_mm), press.edge_mm)
         beside = np.abs(kidney.vertices[:, :2] - press.over_mm) - np.array(press.size_mm[:2]) / 2
@@ -54,7 +54,7 @@ def make_reference(
     gravity: np.ndarray,
     sizes: Sizes,
     report: Callable[[str], None],
-) -> Case:
+) -> ReferenceCase:
     """The case of the embedded patient, solved on a mesh and, for its error, on a coarser one.
 
     Args:
@@ -81,14 +81,14 @@ def solved(
     beads: np.ndarray,
     sizes: Sizes,
     report: Callable[[str], None],
-) -> Case:
+) -> ReferenceCase:
     """The experiment on one mesh; surfaces and beads (n, 3) in the frame of the files [mm]."""
     start = perf_counter()
-    press = Press()
-    experiment = Experiment(sizes.mesh(kidney, press), support, Material(), press, report=report)
+    press = FemPress()
+    experiment = FemExperiment(sizes.mesh(kidney, press), support, FemMaterial(), press, report=report)
     report(f"{len(experiment.solid.nodes_of)} tetrahedra, {len(experiment.solid.rest)} nodes")
     stages = list(experiment.stages())
-    return Case(
+    return ReferenceCase(
         name="phantom",
         note="embedded patient of this project, straight central press",
         kidney=kidney,

@@ -1,8 +1,8 @@
-"""Contact of the tissue's surface with rigid obstacles: a penalty on the gap, and Coulomb friction.
+"""PenaltyContact of the tissue's surface with rigid obstacles: a penalty on the gap, and Coulomb friction.
 
 At each of 12 points of a face, with d = -gap > 0, the pressure is eps d^2 / (2 delta) for d < delta and
 eps (d - delta/2) beyond. Friction is an elastic stick that gives way at Coulomb's limit, a return mapping with
-anchors that are carried from increment to increment (Wriggers, *Computational Contact Mechanics*, 2nd ed. 2006,
+anchors that are carried from increment to increment (Wriggers, *Computational PenaltyContact Mechanics*, 2nd ed. 2006,
 chapters 5.2 and 10.5). Areas are those at rest.
 """
 
@@ -14,7 +14,7 @@ from skfem import ElementTetP2
 from skfem.quadrature import get_quadrature
 from skfem.refdom import RefTri
 
-from studies.reference.fem_solid import Solid
+from studies.reference.fem_solid import FemSolid
 
 TINY = 1e-12
 
@@ -67,7 +67,7 @@ class Law:
         return secant, 1 - beyond / (2 * self.blend)
 
 
-class Surface:
+class ContactSurface:
     """The points of a solid's boundary at which contact is looked at: 12 on each face of 6 nodes.
 
     Attributes:
@@ -76,7 +76,7 @@ class Surface:
         areas: area at rest that each point stands for [mm^2], shape (points,).
     """
 
-    def __init__(self, solid: Solid) -> None:
+    def __init__(self, solid: FemSolid) -> None:
         self.solid, mesh = solid, solid.mesh
         faces = mesh.boundary_facets()
         tets = mesh.f2t[0, faces]
@@ -102,7 +102,7 @@ class Surface:
         return np.einsum("pa,pai->pi", self.shares, nodes)
 
 
-class Contact:
+class PenaltyContact:
     """One obstacle against one surface.
 
     Attributes:
@@ -110,7 +110,7 @@ class Contact:
     """
 
     def __init__(
-        self, surface: Surface, obstacle: Obstacle, law: Law, offset: np.ndarray | None = None
+        self, surface: ContactSurface, obstacle: Obstacle, law: Law, offset: np.ndarray | None = None
     ) -> None:
         self.surface, self.obstacle, self.law = surface, obstacle, law
         self.offset = np.zeros(3) if offset is None else np.array(offset, float)

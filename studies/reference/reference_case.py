@@ -13,8 +13,8 @@ import tomli_w
 import trimesh
 
 from scenes.patients.moulded_support import least_gap
-from studies.reference.fem_press import GRAVITY_M_S2, Press, Stage
-from studies.reference.fem_solid import Solid
+from studies.reference.fem_press import GRAVITY_M_S2, FemPress, FemStage
+from studies.reference.fem_solid import FemSolid
 
 # scikit-fem has the middles of edges 01 12 02 03 13 23, the case folder 01 02 03 12 13 23.
 FILE_ORDER = [0, 1, 2, 3, 4, 6, 7, 5, 8, 9]
@@ -22,7 +22,7 @@ DIGITS = 6
 
 
 @dataclass(frozen=True)
-class Case:
+class ReferenceCase:
     """A solved experiment and all that went into it; lengths mm, in the frame of the files."""
 
     name: str
@@ -30,10 +30,10 @@ class Case:
     kidney: trimesh.Trimesh
     support: trimesh.Trimesh
     beads: np.ndarray  # stress-free, shape (beads, 3)
-    solid: Solid
-    press: Press
+    solid: FemSolid
+    press: FemPress
     friction: float
-    stages: list[Stage]
+    stages: list[FemStage]
     mesh: dict  # how it was made, for case.toml's [fem]
     provenance: dict
     to_coarser_mm: np.ndarray | None = (

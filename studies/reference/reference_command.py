@@ -6,7 +6,7 @@ import click
 import numpy as np
 import trimesh
 
-from rehearsal.commands.command_line import Fault, NumberRange, make_folder
+from rehearsal.commands.command_line import CommandError, NumberRange, make_folder
 from scenes.anatomy import load_anatomy
 from scenes.scene import PAPER, load_scene
 
@@ -32,7 +32,7 @@ def reference(out: Path, edge_mm: float) -> None:
         from studies.reference.fem_solid import MeshError
         from studies.reference.make_reference import Sizes, make_reference
     except ImportError as error:
-        raise Fault(
+        raise CommandError(
             f"the reference needs {error.name}, which is not installed: pip install -r requirements-dev.txt"
         ) from None
     scene = load_scene(PAPER)
@@ -43,9 +43,11 @@ def reference(out: Path, edge_mm: float) -> None:
         gravity = np.array(scene.gravity.direction)
         case = make_reference(anatomy.organ, support, gravity, Sizes(edge_mm), click.echo)
     except (MeshError, NotConvergedError) as error:
-        raise Fault(f"no reference with edges of {edge_mm:g} mm: {error}; try another --edge") from None
+        raise CommandError(
+            f"no reference with edges of {edge_mm:g} mm: {error}; try another --edge"
+        ) from None
     try:
         case.write(out)
     except OSError as error:
-        raise Fault(f"{out}: cannot be written to ({error.strerror}); choose another --out") from None
+        raise CommandError(f"{out}: cannot be written to ({error.strerror}); choose another --out") from None
     click.echo(case.summary())

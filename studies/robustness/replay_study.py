@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from rehearsal.adaptive_iterations import Ladder
+from rehearsal.adaptive_iterations import AdaptiveIterations
 from rehearsal.configuration import Setup, scene_of
 from rehearsal.frame_view import settings_of
-from rehearsal.inputs.user_input import Live
+from rehearsal.inputs.user_input import UserInput
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions.recorder import record
 from rehearsal.sessions.replay import Replay
@@ -30,8 +30,8 @@ SELDOM = {"undo": 0.06, "redo": 0.03, "bookmark": 0.03, "to_bookmark": 0.02, "re
 def chance(rehearsal: Rehearsal, settings: Settings, moments: int) -> Iterator[Controls]:
     """What a restless user would do: the same each time."""
     random = np.random.default_rng(SEED)
-    hand = rehearsal.hand
-    above = np.flatnonzero(hand.normals @ rehearsal.gravity_direction < -0.5)
+    manipulator = rehearsal.manipulator
+    above = np.flatnonzero(manipulator.normals @ rehearsal.gravity_direction < -0.5)
     every = round(CHANGE_S / rehearsal.settings.time_step_s)
     lasting: dict[str, Any] = {}
     for moment in range(moments):
@@ -39,12 +39,12 @@ def chance(rehearsal: Rehearsal, settings: Settings, moments: int) -> Iterator[C
         if moment % every == 0:
             at = int(random.choice(above))
             lasting = dict(
-                ray=(hand.vertices[at] + FROM_MM * hand.normals[at], -hand.normals[at]),
+                ray=(manipulator.vertices[at] + FROM_MM * manipulator.normals[at], -manipulator.normals[at]),
                 press=bool(random.random() < 0.5),
                 push_mm=float(random.normal(0, 0.05)),
-                roll_deg=float(random.normal(0, 0.3)),
+                rotate_deg=float(random.normal(0, 0.3)),
+                rock_deg=float(random.normal(0, 0.2)),
                 tilt_deg=float(random.normal(0, 0.2)),
-                fan_deg=float(random.normal(0, 0.2)),
             )
             for name, share in SELDOM.items():
                 setattr(controls, name, bool(random.random() < share))
@@ -72,7 +72,7 @@ def recorded_session(
     session = Session(rehearsal)
     # What a step costs would otherwise have its say, and another session would be recorded each time.
     recorded = record(session, anatomy, arch, out)
-    live = Live(session, Ladder(np.inf), recorded)
+    live = UserInput(session, AdaptiveIterations(np.inf), recorded)
     moments = round(60 * minutes / rehearsal.settings.time_step_s)
     for controls in chance(rehearsal, settings_of(rehearsal), moments):
         pose = live.move(controls)

@@ -78,7 +78,7 @@ def _minute(rehearsal: Rehearsal, minute: int, minute_s: float, first: Rehearsal
     goals = _goals(rehearsal, minute)
     for step in range(round(minute_s / dt)):
         if step * dt >= minute_s - REST_S:
-            goal = advanced(rehearsal.hand.home, -AWAY_MM)
+            goal = advanced(rehearsal.manipulator.home, -AWAY_MM)
         elif step % round(CHANGE_S / dt) == 0:
             goal = next(goals)
         timed(lambda: rehearsal.advance(rehearsal.pose_towards(goal)), ms)
@@ -102,7 +102,7 @@ def _minute(rehearsal: Rehearsal, minute: int, minute_s: float, first: Rehearsal
 def _goals(rehearsal: Rehearsal, minute: int) -> Iterator[np.ndarray]:
     """Poses over the organ and in it, the same for every minute of one number."""
     random = np.random.default_rng([SEED, minute])
-    home = rehearsal.hand.home
+    home = rehearsal.manipulator.home
     while True:
         goal = advanced(home, random.uniform(-5.0, DEEPEST_MM))
         goal[:3, 3] += home[:3, :2] @ (random.uniform(-1, 1, 2) * ASIDE_MM)

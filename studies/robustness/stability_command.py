@@ -12,7 +12,7 @@ from tqdm import tqdm
 from rehearsal.commands.command_line import WholeRange, make_folder
 from rehearsal.result_files import write_csv, write_json
 from rehearsal.worker_processes import processes
-from studies.robustness.stress_cases import MODELS, Case, cases_of, quick_cases_of
+from studies.robustness.stress_cases import MODELS, StressCase, cases_of, quick_cases_of
 
 # Cases of one body that a process takes at a time, by which the bar goes on; it keeps the body for the next ones.
 BATCH = 4
@@ -43,7 +43,7 @@ def stability(out: Path, quick: bool, jobs: int | None) -> None:
     click.echo(f"\nWrote stability.json, stability.csv and stability.png to {out}")
 
 
-def _figures(given: dict[str, list[Case]], jobs: int | None) -> Iterator[list[dict[str, Any]]]:
+def _figures(given: dict[str, list[StressCase]], jobs: int | None) -> Iterator[list[dict[str, Any]]]:
     """Batches of figures in the order of the cases, as they are done."""
     tasks = []
     for model, cases in given.items():
@@ -54,7 +54,7 @@ def _figures(given: dict[str, list[Case]], jobs: int | None) -> Iterator[list[di
         yield from Parallel(return_as="generator", batch_size=1)(delayed(_run)(*task) for task in tasks)
 
 
-def _run(model: str, cases: list[Case]) -> list[dict[str, Any]]:
+def _run(model: str, cases: list[StressCase]) -> list[dict[str, Any]]:
     from studies.robustness.stress_test import run
 
     return [run(model, case) for case in cases]

@@ -13,7 +13,7 @@ from scenes.closed_surfaces import volume_mm3
 from scenes.scene import PAPER, Contact, SolverSection, load_scene, with_options
 from scenes.tissue import TISSUES
 from sim.device import start
-from sim.divergence_check import Guard
+from sim.divergence_check import DivergenceCheck
 from sim.fields import array_of
 from sim.neo_hookean import LATTICE_SETTINGS, NeoHookean
 from sim.shapes import ConvexTool, Plane
@@ -49,7 +49,7 @@ class Specimen:
         gravity = np.array(settings.gravity)
         self.up = -gravity / np.linalg.norm(gravity)
         self.mass = self._masses()
-        self.guard = Guard(solver)
+        self.guard = DivergenceCheck(solver)
         self.settled = self.guard.home
         self.rest = self.settled.body.position.astype(float)
         skin.update()
@@ -105,11 +105,15 @@ def _kidney(model: str) -> Specimen:
     anatomy = replace(load_anatomy(scene, PAPER.parent), ct=None)
     rehearsal = Rehearsal(with_options(scene, {"tissue.model": model, **size}), anatomy)
     # What is measured from is where the tissue does not move any more.
-    away = advanced(rehearsal.hand.home, -AWAY_MM)
+    away = advanced(rehearsal.manipulator.home, -AWAY_MM)
     for _ in range(SETTLE_STEPS):
         rehearsal.advance(away)
     return Specimen(
-        rehearsal.solver, rehearsal.organ_skin, rehearsal.organ, rehearsal.settings, rehearsal.hand.home
+        rehearsal.solver,
+        rehearsal.organ_skin,
+        rehearsal.organ,
+        rehearsal.settings,
+        rehearsal.manipulator.home,
     )
 
 

@@ -24,7 +24,7 @@ KIDNEY = Subject("kidney")
 
 
 @dataclass(frozen=True)
-class Case:
+class StressCase:
     """One maltreatment: of whom, with which settings of the step, moved how by the transducer, from which state.
 
     ``settings`` are StepSettings' names, ``material`` young_kpa and poisson; ``probe`` and ``state`` a name in
@@ -51,7 +51,7 @@ class Case:
 PRESS = ("press", 12.38)
 
 
-def cases_of(model: str) -> list[Case]:
+def cases_of(model: str) -> list[StressCase]:
     """All cases of a model, those of one body together."""
     return [
         *_step_settings(),
@@ -66,9 +66,9 @@ def cases_of(model: str) -> list[Case]:
     ]
 
 
-def quick_cases_of(model: str) -> list[Case]:
+def quick_cases_of(model: str) -> list[StressCase]:
     """The last case of each kind on the kidney, which is the hardest, and the small bodies."""
-    chosen: list[Case] = []
+    chosen: list[StressCase] = []
     for kind in dict.fromkeys(case.kind for case in cases_of(model)):
         alike = [case for case in cases_of(model) if case.kind == kind]
         if alike[0].subject == KIDNEY:
@@ -78,77 +78,85 @@ def quick_cases_of(model: str) -> list[Case]:
     return chosen
 
 
-def _step_settings() -> Iterator[Case]:
+def _step_settings() -> Iterator[StressCase]:
     for dt in (1e-4, 1e-3, 1 / 240, 1 / 60, 1 / 30, 0.1, 0.3, 1.0):
         for iterations in (1, 3, 10, 30, 100):
             settings: dict[str, Any] = dict(time_step_s=dt, iterations=iterations)
-            yield Case("time step", f"{dt:.4g} s, {iterations} iterations", settings=settings, probe=PRESS)
+            yield StressCase(
+                "time step", f"{dt:.4g} s, {iterations} iterations", settings=settings, probe=PRESS
+            )
     for factor in (1.0, 1.25, 1.5, 1.75, 1.9, 2.0):
         for iterations in (2, 10, 100):
             settings = dict(relaxation_factor=factor, iterations=iterations)
-            yield Case(
+            yield StressCase(
                 "over-relaxation", f"{factor:g}, {iterations} iterations", settings=settings, probe=PRESS
             )
     for substeps in (1, 2, 5, 20, 100):
         for iterations in (1, 10):
             settings = dict(substeps=substeps, iterations=iterations)
-            yield Case("substeps", f"{substeps}, {iterations} iterations", settings=settings, probe=PRESS)
+            yield StressCase(
+                "substeps", f"{substeps}, {iterations} iterations", settings=settings, probe=PRESS
+            )
 
 
-def _material() -> Iterator[Case]:
+def _material() -> Iterator[StressCase]:
     for poisson in (0.0, 0.3, 0.45, 0.49, 0.499):
         for iterations in (1, 8, 100):
             material, settings = dict(poisson=poisson), dict(iterations=iterations)
             extreme = f"{poisson:g}, {iterations} iterations"
-            yield Case("Poisson's ratio", extreme, material=material, settings=settings, probe=PRESS)
+            yield StressCase("Poisson's ratio", extreme, material=material, settings=settings, probe=PRESS)
     for young in (0.01, 0.1, 1.0, 100.0, 1e4, 1e6):
         for dt in (1 / 240, 1 / 60, 0.1):
             material, step = dict(young_kpa=young), dict(time_step_s=dt)
             extreme = f"{young:g} kPa, {dt:.4g} s"
-            yield Case("Young's modulus", extreme, material=material, settings=step, probe=PRESS)
+            yield StressCase("Young's modulus", extreme, material=material, settings=step, probe=PRESS)
 
 
-def _cluster_stiffness() -> Iterator[Case]:
+def _cluster_stiffness() -> Iterator[StressCase]:
     for stiffness in (0.0, 0.01, 0.25, 0.5, 0.75, 1.0):
         for dt in (1e-3, 1 / 240, 1 / 60, 0.1):
             settings = dict(stiffness=stiffness, time_step_s=dt)
-            yield Case("stiffness", f"{stiffness:g}, {dt:.4g} s", settings=settings, probe=PRESS)
+            yield StressCase("stiffness", f"{stiffness:g}, {dt:.4g} s", settings=settings, probe=PRESS)
 
 
-def _gravity() -> Iterator[Case]:
+def _gravity() -> Iterator[StressCase]:
     for times in (0.0, 0.1, 10.0, 100.0, 1000.0):
         for dt in (1e-3, 1 / 240, 1 / 60, 0.1, 1.0):
-            yield Case("gravity", f"x {times:g}, {dt:.4g} s", settings=dict(time_step_s=dt), gravity=times)
+            yield StressCase(
+                "gravity", f"x {times:g}, {dt:.4g} s", settings=dict(time_step_s=dt), gravity=times
+            )
 
 
-def _probes() -> Iterator[Case]:
+def _probes() -> Iterator[StressCase]:
     for depth in (2.0, 10.0, 20.0, 30.0, 40.0):
         for dt in (1e-3, 1 / 60, 0.1):
             settings = dict(time_step_s=dt)
-            yield Case(
+            yield StressCase(
                 "teleported", f"{depth:g} mm deep, {dt:.4g} s", settings=settings, probe=("teleport", depth)
             )
     for gap in (5.0, 1.0, 0.0, -2.0):
         for iterations in (3, 30):
             settings = dict(iterations=iterations)
             extreme = f"to {gap:g} mm, {iterations} iterations"
-            yield Case("pressed flat", extreme, settings=settings, probe=("flat", gap))
+            yield StressCase("pressed flat", extreme, settings=settings, probe=("flat", gap))
     for speed in (0.1, 1.0, 10.0):
         for depth in (5.0, 15.0, 25.0):
-            yield Case("swept", f"{speed:g} m/s, {depth:g} mm deep", probe=("sweep", 1000 * speed, depth))
+            yield StressCase(
+                "swept", f"{speed:g} m/s, {depth:g} mm deep", probe=("sweep", 1000 * speed, depth)
+            )
     for speed in (10.0, 100.0, 1000.0):
         for axis, name in enumerate(("lateral", "elevation", "long")):
-            yield Case("spun", f"{speed:g} rad/s, {name} axis", probe=("spin", speed, axis))
+            yield StressCase("spun", f"{speed:g} rad/s, {name} axis", probe=("spin", speed, axis))
     for name in ("in and out", "jitter", "tumble"):
         for dt in (1e-3, 1 / 60, 0.1):
-            yield Case(name, f"{dt:.4g} s", settings=dict(time_step_s=dt), probe=(name,))
+            yield StressCase(name, f"{dt:.4g} s", settings=dict(time_step_s=dt), probe=(name,))
 
 
-def _states() -> Iterator[Case]:
+def _states() -> Iterator[StressCase]:
     for usual, settings in (("", {}), (", 1 iteration", dict(iterations=1))):
         for kind, states in STATES.items():
             for extreme, state in states:
-                yield Case(kind, extreme + usual, settings=settings, state=state)
+                yield StressCase(kind, extreme + usual, settings=settings, state=state)
 
 
 def _each_axis(extreme: str, name: str, along: float, across: float) -> list[tuple[str, tuple]]:
@@ -199,50 +207,54 @@ STATES: dict[str, list[tuple[str, tuple]]] = {
 }
 
 
-def _small() -> Iterator[Case]:
+def _small() -> Iterator[StressCase]:
     for kind, subject in (("one alone", Subject("one")), ("one cluster", Subject("cluster"))):
-        yield Case(kind, "at rest", subject)
-        yield Case(kind, "pressed", subject, probe=("press", 3.0))
-        yield Case(kind, "teleported into", subject, probe=("teleport", 3.0))
+        yield StressCase(kind, "at rest", subject)
+        yield StressCase(kind, "pressed", subject, probe=("press", 3.0))
+        yield StressCase(kind, "teleported into", subject, probe=("teleport", 3.0))
         for dt in (1e-4, 1.0):
-            yield Case(kind, f"{dt:g} s, 1 iteration", subject, dict(time_step_s=dt, iterations=1))
-        yield Case(kind, "gravity x 1000", subject, gravity=1000.0)
-        yield Case(kind, "collapsed to a point", subject, state=("scaled", 0.0, 0.0, 0.0))
-        yield Case(kind, "mirrored", subject, state=("scaled", 1.0, 1.0, -1.0))
-        yield Case(kind, "scattered by 100 mm", subject, state=("scattered", 100.0))
-        yield Case(kind, "thrown 10 m/s", subject, state=("thrown", 0.0, 0.0, -1e4))
+            yield StressCase(kind, f"{dt:g} s, 1 iteration", subject, dict(time_step_s=dt, iterations=1))
+        yield StressCase(kind, "gravity x 1000", subject, gravity=1000.0)
+        yield StressCase(kind, "collapsed to a point", subject, state=("scaled", 0.0, 0.0, 0.0))
+        yield StressCase(kind, "mirrored", subject, state=("scaled", 1.0, 1.0, -1.0))
+        yield StressCase(kind, "scattered by 100 mm", subject, state=("scattered", 100.0))
+        yield StressCase(kind, "thrown 10 m/s", subject, state=("thrown", 0.0, 0.0, -1e4))
 
 
-def _two() -> Iterator[Case]:
+def _two() -> Iterator[StressCase]:
     two = Subject("two")
     for extreme, share in (("a quarter", 0.25), ("half", 0.5), ("wholly", 1.0)):
         for iterations in (1, 9):
             settings = dict(iterations=iterations)
-            yield Case(
+            yield StressCase(
                 "two overlapping",
                 f"{extreme}, {iterations} iterations",
                 two,
                 settings,
                 state=("overlapped", share),
             )
-    yield Case("two overlapping", "pressed together", two, probe=("press", 6.0))
+    yield StressCase("two overlapping", "pressed together", two, probe=("press", 6.0))
 
 
-def _masses(model: str) -> Iterator[Case]:
+def _masses(model: str) -> Iterator[StressCase]:
     for power in range(1, 7):
         for name, probe in (("at rest", ("away",)), ("pressed", ("press", 6.0))):
             ratio = 10.0**power
             extreme = f"1e{power}, {name}"
             if model == "neo-hookean":
-                yield Case("mass ratio", extreme, Subject("ellipsoid", 5.0), probe=probe, heaviest=ratio)
+                yield StressCase(
+                    "mass ratio", extreme, Subject("ellipsoid", 5.0), probe=probe, heaviest=ratio
+                )
             else:
-                yield Case("mass ratio", extreme, Subject("ellipsoid", 3.3, ratio), probe=probe)
+                yield StressCase("mass ratio", extreme, Subject("ellipsoid", 3.3, ratio), probe=probe)
 
 
-def _sizes() -> Iterator[Case]:
+def _sizes() -> Iterator[StressCase]:
     for size in SIZES_MM:
         subject = Subject("ellipsoid", size)
-        yield Case("size", f"{size:g} mm, pressed", subject, probe=("press", 8.0))
-        yield Case("size", f"{size:g} mm, 1 iteration", subject, dict(iterations=1), probe=("press", 8.0))
-        yield Case("size", f"{size:g} mm, swept 10 m/s", subject, probe=("sweep", 1e4, 8.0))
-        yield Case("size", f"{size:g} mm, scattered by 3 mm", subject, state=("scattered", 3.0))
+        yield StressCase("size", f"{size:g} mm, pressed", subject, probe=("press", 8.0))
+        yield StressCase(
+            "size", f"{size:g} mm, 1 iteration", subject, dict(iterations=1), probe=("press", 8.0)
+        )
+        yield StressCase("size", f"{size:g} mm, swept 10 m/s", subject, probe=("sweep", 1e4, 8.0))
+        yield StressCase("size", f"{size:g} mm, scattered by 3 mm", subject, state=("scattered", 3.0))

@@ -13,7 +13,7 @@ from sim.neo_hookean import NeoHookean
 from sim.solver import SolverState, StepSettings
 from studies.robustness.rigid_fit import apart_after_fit
 from studies.robustness.stress_bodies import Specimen, prepared
-from studies.robustness.stress_cases import Case, Subject
+from studies.robustness.stress_cases import StressCase, Subject
 from studies.robustness.stress_motion import AWAY_MM, PROBES, STATES
 from ultrasound.probe_manipulator import advanced
 
@@ -51,7 +51,7 @@ class Extremes:
             self.kinetic_peak_mj = max(self.kinetic_peak_mj, specimen.kinetic_mj())
 
 
-def run(model: str, case: Case) -> dict[str, Any]:
+def run(model: str, case: StressCase) -> dict[str, Any]:
     """One case's figures, under the names of stability.json."""
     key = (model, case.subject)
     if key not in _prepared:
@@ -85,7 +85,7 @@ def run(model: str, case: Case) -> dict[str, Any]:
     )
 
 
-def _maltreat(specimen: Specimen, case: Case, extremes: Extremes) -> None:
+def _maltreat(specimen: Specimen, case: StressCase, extremes: Extremes) -> None:
     """From the settled state, under the case's own settings."""
     settings = replace(specimen.settings, **case.settings)
     x, y, z = specimen.settings.gravity
@@ -109,7 +109,7 @@ def _maltreat(specimen: Specimen, case: Case, extremes: Extremes) -> None:
     _harden(specimen, {})
 
 
-def _state(specimen: Specimen, case: Case) -> tuple[np.ndarray, np.ndarray]:
+def _state(specimen: Specimen, case: StressCase) -> tuple[np.ndarray, np.ndarray]:
     kind, *numbers = case.state
     return STATES[kind](specimen.rest, specimen.up, *numbers)
 

@@ -1,17 +1,17 @@
-"""The last seconds of a frozen scanner, and its calliper."""
+"""The last seconds of a frozen scanner, and its caliper."""
 
 import numpy as np
 import pytest
 
-from rehearsal.cine import KEPT_S, Calliper, Cine, Frame
+from rehearsal.cine import KEPT_S, Caliper, Cine, CineFrame
 from render.viewer import View
 
 HERE = np.eye(4)
 
 
-def frame_at(time_s: float, rest: np.ndarray | None = None) -> Frame:
+def frame_at(time_s: float, rest: np.ndarray | None = None) -> CineFrame:
     grey = np.full((8, 8), round(time_s) % 256, np.uint8)
-    return Frame(time_s, View(np.eye(4), {"B-mode": grey}, 16.0, 44.0, above_mm=4.0), rest)
+    return CineFrame(time_s, View(np.eye(4), {"B-mode": grey}, 16.0, 44.0, above_mm=4.0), rest)
 
 
 def test_the_last_ten_seconds_are_kept_and_no_more():
@@ -50,36 +50,36 @@ def test_an_empty_cine_goes_nowhere():
     assert cine.back == 0
 
 
-def test_the_calliper_measures_the_tissue_as_it_lies_and_at_rest():
+def test_the_caliper_measures_the_tissue_as_it_lies_and_at_rest():
     stretch = np.array([[1.25, 0.1], [0.0, 0.8], [0.2, -0.3]])
     u, v = np.meshgrid(np.linspace(-8.0, 8.0, 33), np.linspace(-4.0, 40.0, 33))
     frame = frame_at(0.0, np.stack([u, v], axis=-1) @ stretch.T)
-    calliper = Calliper()
-    assert calliper.figure(frame) == ""
-    calliper.point((-3.0, 5.0), HERE)
-    calliper.point(None, HERE)
-    calliper.point((4.0, 29.0), HERE)
+    caliper = Caliper()
+    assert caliper.figure(frame) == ""
+    caliper.point((-3.0, 5.0), HERE)
+    caliper.point(None, HERE)
+    caliper.point((4.0, 29.0), HERE)
     at_rest = np.linalg.norm(stretch @ [7.0, 24.0])
     # A linear map is exact between the places that are kept.
-    assert calliper.figure(frame) == f"25.0 mm\nat rest {at_rest:.1f} mm"
-    calliper.point((0.0, 0.0), HERE)
-    assert calliper.points == () and calliper.figure(frame) == ""
+    assert caliper.figure(frame) == f"25.0 mm\nat rest {at_rest:.1f} mm"
+    caliper.point((0.0, 0.0), HERE)
+    assert caliper.points == () and caliper.figure(frame) == ""
 
 
-def test_without_tissue_the_calliper_still_measures_the_picture():
-    calliper = Calliper(((0.0, 0.0), (3.0, 4.0)))
-    assert calliper.figure(frame_at(0.0)) == "5.0 mm"
+def test_without_tissue_the_caliper_still_measures_the_picture():
+    caliper = Caliper(((0.0, 0.0), (3.0, 4.0)))
+    assert caliper.figure(frame_at(0.0)) == "5.0 mm"
 
 
-def test_the_calliper_goes_when_the_probe_moves():
-    calliper, moved = Calliper(), HERE.copy()
+def test_the_caliper_goes_when_the_probe_moves():
+    caliper, moved = Caliper(), HERE.copy()
     moved[0, 3] = 0.5
     for count in (1, 2):
-        calliper.point((float(count), 0.0), HERE)
-        calliper.go_with(HERE + 1e-6)
-        assert len(calliper.points) == count
-    calliper.go_with(moved)
-    assert calliper.points == ()
-    calliper.point((1.0, 0.0), moved)
-    calliper.go_with(moved)
-    assert calliper.points == ((1.0, 0.0),)
+        caliper.point((float(count), 0.0), HERE)
+        caliper.go_with(HERE + 1e-6)
+        assert len(caliper.points) == count
+    caliper.go_with(moved)
+    assert caliper.points == ()
+    caliper.point((1.0, 0.0), moved)
+    caliper.go_with(moved)
+    assert caliper.points == ((1.0, 0.0),)

@@ -5,7 +5,7 @@ from pathlib import Path, PurePosixPath
 import click.testing
 import pytest
 
-from rehearsal.commands.command_line import Fault, load_patient, make_folder, save_figures
+from rehearsal.commands.command_line import CommandError, load_patient, make_folder, save_figures
 from rehearsal.commands.plan_command import following
 from scenes.patients.import_error import PatientError
 from scenes.patients.patient_folder import check_folder
@@ -23,7 +23,7 @@ def test_a_folder_is_tried_before_the_work(tmp_path, bytes_to_a_file):
     make_folder(tmp_path / "out")
     # It may be entered and listed, and what is written to it does not stay.
     with bytes_to_a_file(0):
-        with pytest.raises(Fault, match=r"out: cannot be written to \(.+\); choose another --out"):
+        with pytest.raises(CommandError, match=r"out: cannot be written to \(.+\); choose another --out"):
             make_folder(tmp_path / "out")
         with pytest.raises(PatientError, match=r"a: cannot be made in .* \(.+\); choose a folder"):
             check_folder(tmp_path / "out" / "a")
@@ -51,7 +51,7 @@ def test_what_follows_a_plan_names_its_scene_and_probe(scene, probe, words):
 def test_figures_that_cannot_be_written_say_so(tmp_path, capsys):
     save_figures({"mm": 1.0}, tmp_path / "a.json")
     assert (tmp_path / "a.json").is_file() and "Wrote" in capsys.readouterr().out
-    with pytest.raises(Fault, match=r"cannot be written \(.*\); choose another --json"):
+    with pytest.raises(CommandError, match=r"cannot be written \(.*\); choose another --json"):
         save_figures({"mm": 1.0}, tmp_path / "none" / "a.json")
 
 
@@ -64,7 +64,7 @@ def test_a_command_that_leaves_nothing_leaves_no_folder(tmp_path, leaves):
         make_folder(out)
         for name in leaves:
             (out / name).write_text("")
-        raise Fault("no display")
+        raise CommandError("no display")
 
     assert click.testing.CliRunner().invoke(command).exit_code == 1
     assert list(tmp_path.rglob("*.txt")) == [out / name for name in leaves]

@@ -13,7 +13,7 @@ from click.exceptions import Exit
 import app
 from rehearsal import frame, headless, run
 from rehearsal.commands import rehearse_command
-from rehearsal.frame import Loop
+from rehearsal.frame import FrameLoop
 from rehearsal.frame_view import probe_as_set
 from render.keys import USUAL_KEYS, Keys
 from render.viewer import Controls, Settings, View
@@ -87,11 +87,11 @@ def sent() -> list:
 
 
 @pytest.fixture
-def looping(monkeypatch, tmp_path, sent) -> Loop:
+def looping(monkeypatch, tmp_path, sent) -> FrameLoop:
     moments = Moments()
     monkeypatch.setattr(frame, "take_view", moments.take_view)
     link = SimpleNamespace(show=sent.append)
-    return Loop(moments, None, tmp_path, Nothing(0.0), *[moments] * 4, frozen=False, link=link)
+    return FrameLoop(moments, None, tmp_path, Nothing(0.0), *[moments] * 4, frozen=False, link=link)
 
 
 def test_each_frame_goes_to_the_link_as_it_is_shown(looping, sent):
@@ -163,17 +163,17 @@ def test_what_is_wrong_with_the_tissue_stands_before_all_that_is_technical(loopi
     assert status == "TISSUE PUT BACK   SQUEEZED   RECORDING 3 s   FROZEN   PLANNING"
 
 
-def test_a_frozen_picture_keeps_its_calliper_and_a_live_one_until_the_probe_moves(looping, monkeypatch):
+def test_a_frozen_picture_keeps_its_caliper_and_a_live_one_until_the_probe_moves(looping, monkeypatch):
     take_view, at = looping.rehearsal.take_view, np.eye(4)
     monkeypatch.setattr(
         frame, "take_view", lambda *told: replace(take_view(*told), transducer_pose=at.copy())
     )
     place = (1.0, 2.0)
-    assert looping.frame(Controls(Settings(), pointed_mm=place)).calliper_mm == (place,)
-    assert looping.frame(Controls(Settings(), pointed_mm=place)).calliper == "0.0 mm"
+    assert looping.frame(Controls(Settings(), pointed_mm=place)).caliper_mm == (place,)
+    assert looping.frame(Controls(Settings(), pointed_mm=place)).caliper == "0.0 mm"
     at[0, 3] = 5.0
-    assert looping.frame(Controls(Settings(), freeze=True)).calliper == "0.0 mm"
-    assert looping.frame(Controls(Settings(), freeze=True)).calliper_mm == ()
+    assert looping.frame(Controls(Settings(), freeze=True)).caliper == "0.0 mm"
+    assert looping.frame(Controls(Settings(), freeze=True)).caliper_mm == ()
 
 
 def test_the_clock_is_the_sessions_and_says_where_it_is_slow(looping):
@@ -286,10 +286,10 @@ def test_without_pictures_none_is_taken_and_the_rest_is_written(monkeypatch, tmp
 
 
 def test_ctrl_c_in_a_run_says_so_before_how_it_went(monkeypatch, capsys):
-    monkeypatch.setattr(run.Run, "_end", lambda each, bookmarks: print(f"{bookmarks} bookmarks"))
+    monkeypatch.setattr(run.RehearsalRun, "_end", lambda each, bookmarks: print(f"{bookmarks} bookmarks"))
     monkeypatch.setattr(run, "Instruments", lambda rehearsal, guide: None)
     driver = SimpleNamespace(session=SimpleNamespace(time_s=1.25), bookmarks=3)
-    each = run.Run(Moments(), None, "cpu", None)
+    each = run.RehearsalRun(Moments(), None, "cpu", None)
     with pytest.raises(Exit) as ended, each._summed_up(driver, None):
         raise KeyboardInterrupt
     assert ended.value.exit_code == 130
@@ -311,7 +311,7 @@ def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scen
         run, "Instruments", lambda rehearsal, guide: SimpleNamespace(guide=None, summary=lambda bookmarks: {})
     )
     monkeypatch.setattr(run, "in_words", lambda summary: "")
-    each = run.Run(Moments(), None, "cpu", None, scene=scene)
+    each = run.RehearsalRun(Moments(), None, "cpu", None, scene=scene)
     recording = SimpleNamespace(path=PurePosixPath("a/session-001.jsonl"), fault="")
     each.recorded = SimpleNamespace(recording=recording, close=lambda summary: None)
     each._end(0)
@@ -325,12 +325,12 @@ def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path
     monkeypatch.setattr(run, "open_viewer", lambda rehearsal, **_: viewer)
     monkeypatch.setattr(run, "settings_of", lambda rehearsal: Settings())
     looping = SimpleNamespace(run=lambda: None)
-    monkeypatch.setattr(run, "Loop", lambda *_, keys, link: given.append(link) or looping)
+    monkeypatch.setattr(run, "FrameLoop", lambda *_, keys, link: given.append(link) or looping)
     monkeypatch.setattr(run, "run_headless", lambda *arguments: given.append(arguments[-1]))
     monkeypatch.setattr(run, "Session", lambda rehearsal, seen: None)
     for name in ("_live", "_record", "_end"):
-        monkeypatch.setattr(run.Run, name, lambda *_: SimpleNamespace(bookmarks=0))
-    each = run.Run(Moments(), None, "cpu", tmp_path, link=link)
+        monkeypatch.setattr(run.RehearsalRun, name, lambda *_: SimpleNamespace(bookmarks=0))
+    each = run.RehearsalRun(Moments(), None, "cpu", tmp_path, link=link)
     each.in_window(None, 0.0)
     each.headless(None, 0.0, 1.0, 0.0)
     assert given == [link, link]
@@ -344,7 +344,7 @@ def test_the_command_opens_the_link_for_as_long_as_it_runs_and_names_its_scene(m
     scene = tmp_path / "scene.toml"
     scene.write_bytes(EMBEDDED.read_bytes())
 
-    def headless_run(each: run.Run, *_) -> None:
+    def headless_run(each: run.RehearsalRun, *_) -> None:
         socket.create_connection(("127.0.0.1", port), 5).close()
         reached.append(each.link is not None and each.link.port == port and each.scene == scene)
 
@@ -352,7 +352,7 @@ def test_the_command_opens_the_link_for_as_long_as_it_runs_and_names_its_scene(m
     monkeypatch.setattr(rehearse_command, "built", lambda *_: None)
     monkeypatch.setattr(rehearse_command, "compile_picture", lambda rehearsal: None)
     monkeypatch.setattr(run, "Instruments", lambda rehearsal, guide: None)
-    monkeypatch.setattr(run.Run, "headless", headless_run)
+    monkeypatch.setattr(run.RehearsalRun, "headless", headless_run)
     line = [
         "rehearse",
         str(scene),

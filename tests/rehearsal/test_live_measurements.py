@@ -8,9 +8,9 @@ import trimesh
 from plan_ball import Z, over_ball, plan_of, straight_pass, sweep_of
 
 from rehearsal.measurements import live_measurements
-from rehearsal.measurements.live_measurements import Instruments
-from rehearsal.measurements.tumour_measurements import Reading
-from rehearsal.planning.plan_guidance import Guide
+from rehearsal.measurements.live_measurements import LiveMeasurements
+from rehearsal.measurements.tumour_measurements import Measurement
+from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.sessions.packed_coverage import pack_seen
 from rehearsal.sessions.session_file import Event, Log, SessionError
 from render.viewer import Settings, View
@@ -34,9 +34,11 @@ def rehearsal() -> SimpleNamespace:
 
 
 @pytest.fixture
-def watching(monkeypatch, rehearsal) -> Instruments:
-    monkeypatch.setattr(live_measurements, "read", lambda *_: Reading(1.0, 20.0))
-    return Instruments(rehearsal, Guide(rehearsal, plan_of(sweep_of(FIRST, SECOND), margin_mm=8.0)))
+def watching(monkeypatch, rehearsal) -> LiveMeasurements:
+    monkeypatch.setattr(live_measurements, "read", lambda *_: Measurement(1.0, 20.0))
+    return LiveMeasurements(
+        rehearsal, PlanGuidance(rehearsal, plan_of(sweep_of(FIRST, SECOND), margin_mm=8.0))
+    )
 
 
 def test_the_instruments_watch_the_guide_and_record_it(watching, rehearsal, one_device):
@@ -59,7 +61,9 @@ def test_the_instruments_watch_the_guide_and_record_it(watching, rehearsal, one_
 def test_what_a_session_holds_is_recalled_as_it_was_watched(watching, rehearsal, one_device, monkeypatch):
     # The first is no press: as it is noted it is 1 mm.
     squeezed = iter([1.00004, 0.3, 9.0, 0.2])
-    monkeypatch.setattr(live_measurements, "read", lambda *_: Reading(next(squeezed), 20.0, 5.0, 2.0, 1.0))
+    monkeypatch.setattr(
+        live_measurements, "read", lambda *_: Measurement(next(squeezed), 20.0, 5.0, 2.0, 1.0)
+    )
     events: dict[int, list] = {}
     session = SimpleNamespace(moment=0, kept={}, back=None)
     session.note = lambda kind, value: events.setdefault(session.moment, []).append(
@@ -71,7 +75,7 @@ def test_what_a_session_holds_is_recalled_as_it_was_watched(watching, rehearsal,
     watching.course.add(None, 0.2)
     watching.coverage.seen[watching.coverage.targets["tumour"]] = True
     log = Log(None, np.stack([*FIRST, np.full((4, 4), np.nan)]), events)
-    again = Instruments(rehearsal, Guide(rehearsal, watching.guide.plan))
+    again = LiveMeasurements(rehearsal, PlanGuidance(rehearsal, watching.guide.plan))
     assert again.recall(log, 0) and not again.recall(log, 5) and again.course.duration_s == 0
     log.seen[5] = pack_seen(watching.coverage.seen)
     assert again.recall(log, 5)
@@ -81,12 +85,12 @@ def test_what_a_session_holds_is_recalled_as_it_was_watched(watching, rehearsal,
     assert view.findings["tumour seen"] == "100 %" and view.seen["tumour"].any()
     del log.events[1][0].value["contact_mm2"]
     with pytest.raises(SessionError, match="without compression or contact"):
-        Instruments(rehearsal).recall(log, 5)
+        LiveMeasurements(rehearsal).recall(log, 5)
 
 
 def test_a_way_back_is_looked_at_and_read_anew_at_once(watching, rehearsal, one_device, monkeypatch):
     depths = iter([9.0, 0.2])
-    monkeypatch.setattr(live_measurements, "read", lambda *_: Reading(next(depths), 20.0))
+    monkeypatch.setattr(live_measurements, "read", lambda *_: Measurement(next(depths), 20.0))
     lines = np.ones(rehearsal.probe.number_of_scanlines, bool)
     looks = iter([lines, ~lines])
     monkeypatch.setattr(watching.coverage, "look", lambda *_: next(looks))
@@ -105,7 +109,7 @@ def test_a_session_that_begins_is_read_with_what_touches_then(watching, rehearsa
     """Though its first moment is none at which it would be looked."""
     given = []
     monkeypatch.setattr(
-        live_measurements, "read", lambda *asked: given.append(asked[-1]) or Reading(1.0, 20.0)
+        live_measurements, "read", lambda *asked: given.append(asked[-1]) or Measurement(1.0, 20.0)
     )
     touches = np.arange(rehearsal.probe.number_of_scanlines) < 30
     monkeypatch.setattr(watching.coverage, "look", lambda *_: touches)
@@ -121,12 +125,12 @@ def test_another_plan_brings_its_margin_and_what_was_seen_stays(watching, rehear
     volume = watching.coverage.targets["margin"].sum()
     watching.coverage.seen[watching.coverage.targets["tumour"]] = True
     before = watching.coverage
-    watching.follow(Guide(rehearsal, plan_of(margin_mm=8.0)))
+    watching.follow(PlanGuidance(rehearsal, plan_of(margin_mm=8.0)))
     assert watching.coverage is before
-    watching.follow(Guide(rehearsal, plan_of(margin_mm=2.0)))
+    watching.follow(PlanGuidance(rehearsal, plan_of(margin_mm=2.0)))
     assert watching.margin_mm == 2.0 and watching.coverage.targets["margin"].sum() < volume / 2
     assert watching.coverage.share("tumour") == 1.0 and watching.guide.plan.margin_mm == 2.0
-    assert Instruments(rehearsal).margin_mm == live_measurements.MARGIN_MM
+    assert LiveMeasurements(rehearsal).margin_mm == live_measurements.MARGIN_MM
 
 
 @pytest.mark.parametrize(
@@ -148,5 +152,5 @@ def test_an_echo_is_said_to_be_black_where_hardly_a_line_touches(
     [(0.5, -0.04, "0.0 mm"), (0.5, 0.0, "0.0 mm"), (0.5, -0.06, "-0.1 mm"), (0.0, 1.0, ""), (None, None, "")],
 )
 def test_a_margin_of_nothing_has_no_minus(one_device, watching, in_view, margin, shown):
-    watching.reading = Reading(1.0, 20.0, 5.0, 2.0, 1.0, in_view, margin)
+    watching.reading = Measurement(1.0, 20.0, 5.0, 2.0, 1.0, in_view, margin)
     assert watching.findings()["margin"] == shown

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from test_undo_history import STEP_S, Numbers
 
-from rehearsal.measurements.session_summary import Course, in_words
+from rehearsal.measurements.session_summary import SessionCourse, summary_text
 from rehearsal.sessions import packed_state
 from rehearsal.sessions.packed_state import StateError, from_text, to_text
 from ultrasound.coverage import Gap
-from ultrasound.probe_manipulator import Grip
+from ultrasound.probe_manipulator import ManipulatorState
 
 
 def arrays_of(state: Any) -> list[np.ndarray]:
@@ -34,7 +34,7 @@ def test_a_state_as_text_keeps_every_bit(aim):
         numbers.advance(numbers.pose_towards(np.eye(4)))
     numbers.watch = replace(numbers.watch, steps_tangled=3, is_restored=True)
     numbers.velocity = np.array([[-0.0, 1e-45, np.inf], [np.nan, 1 / 3, -7]], np.float32)
-    numbers.hand.grip = Grip(0.1, 2.3, (1 / 3, -4.0, 5.0), aim)
+    numbers.manipulator.state = ManipulatorState(0.1, 2.3, (1 / 3, -4.0, 5.0), aim)
     before = numbers.snapshot()
     pairs = list(zip(arrays_of(before), arrays_of(from_text(to_text(before), numbers.settled)), strict=True))
     # Now and when last good: position, velocity and contacts; the watch's three; pose, steps; the hand's four.
@@ -76,7 +76,7 @@ def test_what_is_no_state_of_this_body_is_refused(monkeypatch):
 
 
 def test_a_course_counts_presses_ways_and_time_over_the_limit():
-    course = Course(warning_mm=8.0, step_s=STEP_S)
+    course = SessionCourse(warning_mm=8.0, step_s=STEP_S)
     pose = np.eye(4)
     # Squeezed over 1 mm is a press, until it is less than 0.5 mm.
     for compression_mm in (0.0, 1.0, 1.1, 0.6, 1.2, 0.5, 0.9, 1.5, 9.0, 8.0, 8.5):
@@ -90,9 +90,9 @@ def test_a_course_counts_presses_ways_and_time_over_the_limit():
     assert (course.path_mm, course.fastest_mm_s, course.went_back) == (8.0, 5.0 / STEP_S, 1)
     figures = course.summary({"seen_organ": 0.25, "contact_mm2": 3.0}, [Gap(1.5, 2.0)], 4)
     assert (figures["duration_s"], figures["bookmarks"], figures["seen_organ"]) == (2.0, 4, 0.25)
-    assert "contact_mm2" not in figures and "2 presses" in in_words(figures)
-    assert "4 bookmarks" in in_words(
+    assert "contact_mm2" not in figures and "2 presses" in summary_text(figures)
+    assert "4 bookmarks" in summary_text(
         figures
-    ) and "largest part unseen is 1.5 ml, up to 2.0 mm thick" in in_words(figures)
-    said = in_words(figures | dict(presses=1, bookmarks=1))
+    ) and "largest part unseen is 1.5 ml, up to 2.0 mm thick" in summary_text(figures)
+    said = summary_text(figures | dict(presses=1, bookmarks=1))
     assert "1 press," in said and "1 bookmark\n" in said

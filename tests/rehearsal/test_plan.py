@@ -10,23 +10,23 @@ from plan_ball import FACET_MM, GOOD, NORMAL_DEG, SIZE, R, X, Y, Z, big_ball, fa
 
 from rehearsal.planning.instrument_reach import NEAR_MM, Reach
 from rehearsal.planning.score import POINTS, SAID, in_words, points, score, why
-from rehearsal.planning.score_terms import Parts, faces_of, incidence_deg, path_mm
+from rehearsal.planning.score_terms import ScoreTerms, faces_of, incidence_deg, path_mm
 from rehearsal.planning.sweep_path import (
     STEP_DEG,
     STEP_MM,
-    Layout,
-    Way,
-    fanned,
+    SweepLayout,
+    SweepPath,
     gliding,
     layout_towards,
-    rocking,
+    tilted,
+    tilting,
 )
 from scenes.trocar import Trocar
-from ultrasound.probe_manipulator import Hand, advanced, pose_at
+from ultrasound.probe_manipulator import ProbeManipulator, advanced, pose_at
 
 
 @pytest.fixture(scope="module")
-def hand() -> Hand:
+def hand() -> ProbeManipulator:
     return hand_on(big_ball())
 
 
@@ -61,7 +61,7 @@ def test_a_layout_has_right_handed_unit_axes_with_lateral_nearest_to_what_was_as
 )
 def test_a_layout_leans_and_turns_about_its_own_axes(lean, heading, lateral, ahead, outward):
     base = rotation_about([1, 2, 3], 50)
-    before = Layout(np.array([1.0, 2, 3]), base @ Z, base @ Y, base @ X)
+    before = SweepLayout(np.array([1.0, 2, 3]), base @ Z, base @ Y, base @ X)
     turned = before.turned(lean, heading)
     found = np.stack([turned.lateral, turned.ahead, turned.outward])
     assert found @ base == pytest.approx(np.stack([lateral, ahead, outward]), abs=1e-12)
@@ -72,8 +72,8 @@ def test_a_layout_leans_and_turns_about_its_own_axes(lean, heading, lateral, ahe
 
 
 @pytest.mark.parametrize("depth", [0.0, 2.5])
-def test_a_glide_square_to_the_surface_is_evenly_spaced_at_its_depth(hand, depth):
-    way = gliding(hand, from_above(), np.array([-6.0, 6.0]), -12.0, 13.0, depth, 1.0)
+def test_a_glide_square_to_the_surface_is_evenly_spaced_at_its_depth(manipulator, depth):
+    way = gliding(manipulator, from_above(), np.array([-6.0, 6.0]), -12.0, 13.0, depth, 1.0)
     assert [len(each) for each in way.passes] == [int(np.ceil(25 / STEP_MM)) + 1] * 2
     for each, aside, sign in zip(way.passes, (-6.0, 6.0), (1, -1), strict=True):
         faces = faces_in(each)
@@ -88,9 +88,9 @@ def test_a_glide_square_to_the_surface_is_evenly_spaced_at_its_depth(hand, depth
         assert (each[:, :3, 0] @ X > 0.9).all()
 
 
-def test_a_glide_along_its_layout_only_looks_as_that_does(hand):
+def test_a_glide_along_its_layout_only_looks_as_that_does(manipulator):
     layout = from_above().turned((0.0, 0.0), 90.0)
-    way = gliding(hand, layout, np.array([3.0]), -15.0, 15.0, 1.0, 0.0)
+    way = gliding(manipulator, layout, np.array([3.0]), -15.0, 15.0, 1.0, 0.0)
     poses = way.poses
     assert poses[:, :3, 2] == pytest.approx(np.tile(Z, (len(poses), 1)))
     assert poses[:, :3, 0] == pytest.approx(np.tile(Y, (len(poses), 1)))
@@ -104,8 +104,8 @@ def test_a_glide_along_its_layout_only_looks_as_that_does(hand):
     assert faces[beside == 0, 2] == pytest.approx(R - 1.0, abs=FACET_MM)
 
 
-def test_half_following_looks_halfway_between(hand):
-    poses = gliding(hand, from_above(), np.zeros(1), -14.0, 14.0, 0.0, 0.5).poses
+def test_half_following_looks_halfway_between(manipulator):
+    poses = gliding(manipulator, from_above(), np.zeros(1), -14.0, 14.0, 0.0, 0.5).poses
     ahead = np.linspace(-14, 14, len(poses))
     # The place under the layout's line, not the face's middle, says where the surface looks.
     half = np.degrees(np.arcsin(ahead / R)) / 2
@@ -113,13 +113,13 @@ def test_half_following_looks_halfway_between(hand):
     assert found == pytest.approx(half, abs=NORMAL_DEG)
 
 
-def test_a_pass_ends_where_the_organ_does_and_one_beside_it_is_left_out(hand):
-    way = gliding(hand, from_above(), np.array([0.0, 45.0]), -40.0, 40.0, 0.0, 1.0)
+def test_a_pass_ends_where_the_organ_does_and_one_beside_it_is_left_out(manipulator):
+    way = gliding(manipulator, from_above(), np.array([0.0, 45.0]), -40.0, 40.0, 0.0, 1.0)
     ahead = np.linspace(-40, 40, int(np.ceil(80 / STEP_MM)) + 1)
     (only,) = way.passes
     # Where the surface is as steep as its facets are long, a ray may pass by.
     assert abs(len(only) - (np.abs(ahead) < R).sum()) <= 2
-    assert gliding(hand, from_above(), np.array([45.0]), -4.0, 4.0, 0.0, 1.0).poses.shape == (0, 4, 4)
+    assert gliding(manipulator, from_above(), np.array([45.0]), -4.0, 4.0, 0.0, 1.0).poses.shape == (0, 4, 4)
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -135,8 +135,8 @@ def test_of_two_lobes_the_longer_is_gone_over(sign):
 # Rocking
 
 
-def test_rocking_turns_about_the_faces_middle_in_equal_steps(hand):
-    way = rocking(hand, from_above(), np.array([-5.0, 5.0]), 4.0, (-20.0, 31.0), 1.5)
+def test_rocking_turns_about_the_faces_middle_in_equal_steps(manipulator):
+    way = tilting(manipulator, from_above(), np.array([-5.0, 5.0]), 4.0, (-20.0, 31.0), 1.5)
     count = int(np.ceil(51 / STEP_DEG)) + 1
     assert [len(each) for each in way.passes] == [count, count]
     for each, sign in zip(way.passes, (1, -1), strict=True):
@@ -151,53 +151,55 @@ def test_rocking_turns_about_the_faces_middle_in_equal_steps(hand):
             np.arctan2(np.cross(radius, each[:, :3, 2]) @ lateral, each[:, :3, 2] @ radius),
         )
         assert angles == pytest.approx(np.linspace(-20, 31, count)[::sign], abs=NORMAL_DEG)
-    beside = rocking(hand, from_above(), np.array([50.0]), 0.0, (-10.0, 10.0), 0.0)
+    beside = tilting(manipulator, from_above(), np.array([50.0]), 0.0, (-10.0, 10.0), 0.0)
     assert beside.passes == ()
 
 
 def test_a_fan_swings_the_beam_towards_y():
     pose = pose_at(np.array([1.0, 2, 3]), -Z, X, 20.0)
-    turned = fanned(pose, 20.0, 30.0)
+    turned = tilted(pose, 20.0, 30.0)
     assert -turned[:3, 2] == pytest.approx([0, 0.5, -np.sqrt(0.75)])
     assert turned @ [0, 0, -10, 1] == pytest.approx([1, 2, 3, 1])
     assert np.array_equal(pose, pose_at(np.array([1.0, 2, 3]), -Z, X, 20.0))
 
 
-# Parts
+# ScoreTerms
 
 
-def test_the_path_is_of_the_faces_middle(hand):
+def test_the_path_is_of_the_faces_middle(manipulator):
     at = np.array([[0.0, 0, 0], [3, 4, 0], [3, 4, 12]])
     poses = np.stack([pose_at(place, -Z, X, SIZE[2]) for place in at])
-    assert faces_of(hand, poses) == pytest.approx(at)
-    assert path_mm(hand, poses) == pytest.approx(5 + 12)
-    rocked = np.stack([fanned(poses[0], SIZE[2], angle) for angle in (0, 20, -30)])
-    assert path_mm(hand, rocked) == pytest.approx(0, abs=1e-9)
+    assert faces_of(manipulator, poses) == pytest.approx(at)
+    assert path_mm(manipulator, poses) == pytest.approx(5 + 12)
+    rocked = np.stack([tilted(poses[0], SIZE[2], angle) for angle in (0, 20, -30)])
+    assert path_mm(manipulator, rocked) == pytest.approx(0, abs=1e-9)
 
 
-def test_incidence_is_the_mean_angle_to_the_surface(hand):
+def test_incidence_is_the_mean_angle_to_the_surface(manipulator):
     top = pose_at(R * Z, -Z, X, SIZE[2])
-    poses = np.stack([fanned(top, SIZE[2], angle) for angle in (-10.0, 20.0, 30.0)])
-    assert incidence_deg(hand, poses) == pytest.approx(20.0, abs=NORMAL_DEG)
+    poses = np.stack([tilted(top, SIZE[2], angle) for angle in (-10.0, 20.0, 30.0)])
+    assert incidence_deg(manipulator, poses) == pytest.approx(20.0, abs=NORMAL_DEG)
 
 
 # Reach
 
 
-def reached(trocar: Trocar, poses: np.ndarray, hand: Hand, target: np.ndarray | None = None) -> list[bool]:
+def reached(
+    trocar: Trocar, poses: np.ndarray, manipulator: ProbeManipulator, target: np.ndarray | None = None
+) -> list[bool]:
     """With the organ's middle at a place in the patient, to which the trocar is given."""
     origin = np.array([10.0, -20.0, 30.0])
     if trocar.at_mm is not None:
         trocar = trocar.model_copy(update=dict(at_mm=tuple(np.array(trocar.at_mm) + origin)))
-    return Reach(trocar, hand, origin, np.zeros(3) if target is None else target)(poses).tolist()
+    return Reach(trocar, manipulator, origin, np.zeros(3) if target is None else target)(poses).tolist()
 
 
 def with_back_at(back: np.ndarray, outward: np.ndarray = Z) -> np.ndarray:
     return pose_at(back - SIZE[2] * outward, -outward, X, SIZE[2])
 
 
-def test_without_a_trocar_every_pose_can_be_reached(hand):
-    assert reached(Trocar(), np.stack([with_back_at(np.array([900.0, 0, 0]))] * 3), hand) == [True] * 3
+def test_without_a_trocar_every_pose_can_be_reached(manipulator):
+    assert reached(Trocar(), np.stack([with_back_at(np.array([900.0, 0, 0]))] * 3), manipulator) == [True] * 3
 
 
 @pytest.mark.parametrize("cone", [20.0, 45.0, 90.0])
@@ -210,11 +212,11 @@ def test_the_shaft_leans_no_farther_than_the_cone(cone, axis):
     assert reached(trocar, np.stack([with_back_at(each) for each in backs]), tiny) == [True, False]
 
 
-def test_without_an_axis_the_cone_is_about_the_way_to_the_target(hand):
+def test_without_an_axis_the_cone_is_about_the_way_to_the_target(manipulator):
     trocar = Trocar(at_mm=(0, 0, 100), cone_deg=10, wrist_deg=180)
     poses = np.stack([with_back_at(np.array([x, 0.0, 60])) for x in (0.0, 40.0)])
-    assert reached(trocar, poses, hand) == [True, False]
-    assert reached(trocar, poses, hand, np.array([100.0, 0, 0])) == [False, True]
+    assert reached(trocar, poses, manipulator) == [True, False]
+    assert reached(trocar, poses, manipulator, np.array([100.0, 0, 0])) == [False, True]
 
 
 @pytest.mark.parametrize("wrist", [0.0, 30.0, 90.0, 120.0])
@@ -229,20 +231,20 @@ def test_the_probe_looks_no_farther_aside_than_the_wrist(wrist):
     assert reached(trocar, poses, tiny)[wrist == 0 :] == expected[wrist == 0 :]
 
 
-def test_the_shaft_is_no_longer_than_the_instrument(hand):
+def test_the_shaft_is_no_longer_than_the_instrument(manipulator):
     trocar = Trocar(at_mm=(0, 0, 150), longest_mm=80)
     poses = np.stack([with_back_at(np.array([0, 0, z])) for z in (70.1, 69.9)])
-    assert reached(trocar, poses, hand) == [True, False]
+    assert reached(trocar, poses, manipulator) == [True, False]
 
 
-def test_the_organ_is_not_gone_through(hand):
+def test_the_organ_is_not_gone_through(manipulator):
     """Against the chord of a ball, for poses all around it."""
     chance = np.random.default_rng(3)
     at = np.array([0.0, -70.0, 90.0])
     trocar = Trocar(at_mm=tuple(at), cone_deg=90, wrist_deg=180, longest_mm=500)
     backs = chance.normal(size=(400, 3))
     backs *= chance.uniform(R - 5, R + 25, (400, 1)) / np.linalg.norm(backs, axis=1, keepdims=True)
-    found = reached(trocar, np.stack([with_back_at(each) for each in backs]), hand)
+    found = reached(trocar, np.stack([with_back_at(each) for each in backs]), manipulator)
     shafts = backs - at
     length = np.linalg.norm(shafts, axis=1)
     along = shafts / length[:, None]
@@ -294,20 +296,20 @@ def test_what_speaks_for_the_other_is_said_too():
 
 
 def test_what_a_sweep_is_worth_is_a_sentence():
-    assert in_words(Parts(0.94, 2.2, 3.4, 0.0, 0.97, 4.6, 211.0, 21.0, 1.0)) == (
+    assert in_words(ScoreTerms(0.94, 2.2, 3.4, 0.0, 0.97, 4.6, 211.0, 21.0, 1.0)) == (
         "it sees 94 % of the target, squeezes the tissue by 2.2 mm on average, is over the limit of squeezing at 0 % of its poses, "
         "has contact on 97 % of the probe's face, stands 5 degrees off square to the surface, and goes a way of 211 mm"
     )
 
 
 def test_any_way_that_can_be_held_is_worth_more_than_one_that_cannot():
-    poor = Parts(0.0, 15.0, 20.0, 1.0, 0.0, 90.0, 2000.0, 100.0, 1.0)
-    perfect = Parts(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.99)
-    assert score(poor) > score(perfect) > score(replace(perfect, reachable=0.5)) > score(Parts.nothing())
+    poor = ScoreTerms(0.0, 15.0, 20.0, 1.0, 0.0, 90.0, 2000.0, 100.0, 1.0)
+    perfect = ScoreTerms(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.99)
+    assert score(poor) > score(perfect) > score(replace(perfect, reachable=0.5)) > score(ScoreTerms.nothing())
     assert why(poor, perfect) == "it can be reached everywhere, the other not at 1 % of its poses"
 
 
 def test_a_way_of_no_pass_has_no_poses():
-    assert Way(()).poses.shape == (0, 4, 4)
+    assert SweepPath(()).poses.shape == (0, 4, 4)
     one = advanced(np.eye(4), 1.0)[None]
-    assert Way((one, np.stack([np.eye(4)] * 2))).poses.shape == (3, 4, 4)
+    assert SweepPath((one, np.stack([np.eye(4)] * 2))).poses.shape == (3, 4, 4)

@@ -75,7 +75,7 @@ def test_directions_are_units_evenly_around():
 
 def test_a_tumour_on_top_is_looked_at_from_above_only(rehearsal):
     found = found_for(rehearsal, 18.0 * Z)
-    assert [each.motion for each in found] == ["glide", "glide", "rock"]
+    assert [each.motion for each in found] == ["glide", "glide", "tilt"]
     assert all(each.side == "from above" for each in found)
     assert [each.count for each in found] == [1, 2, 1]
     for each in found:
@@ -86,7 +86,7 @@ def test_a_tumour_on_top_is_looked_at_from_above_only(rehearsal):
 @pytest.mark.parametrize("aside", [40.0, -60.0])
 def test_a_tumour_at_the_side_is_looked_at_from_there_too(rehearsal, aside):
     found = found_for(rehearsal, 18.0 * aside_by(aside))
-    assert [each.motion for each in found] == ["glide", "glide", "glide", "rock"]
+    assert [each.motion for each in found] == ["glide", "glide", "glide", "tilt"]
     assert len(found) <= MOST_SWEEPS
     assert found[0].layout.outward == pytest.approx(Z)
     for each in found[1:]:
@@ -95,7 +95,7 @@ def test_a_tumour_at_the_side_is_looked_at_from_there_too(rehearsal, aside):
 
 
 def test_no_side_is_looked_at_from_under_the_organ(rehearsal):
-    outward = shallowest(rehearsal.hand, -20.0 * Z, Z, everywhere, X)
+    outward = shallowest(rehearsal.manipulator, -20.0 * Z, Z, everywhere, X)
     assert outward @ Z >= ROUND
     assert angle_deg(outward, np.array([*outward[:2], 0.0]) / np.linalg.norm(outward[:2])) < 2 * GRAIN_DEG
 
@@ -106,9 +106,9 @@ def test_the_nearest_side_is_one_that_can_be_reached(rehearsal):
     def from_left(poses: np.ndarray) -> np.ndarray:
         return poses[:, 1, 2] < -0.2
 
-    outward = shallowest(rehearsal.hand, centre, Z, from_left, X)
+    outward = shallowest(rehearsal.manipulator, centre, Z, from_left, X)
     assert outward[1] < -0.1
-    assert shallowest(rehearsal.hand, centre, Z, lambda poses: ~everywhere(poses), X) is None
+    assert shallowest(rehearsal.manipulator, centre, Z, lambda poses: ~everywhere(poses), X) is None
     nowhere = found_for(rehearsal, centre, lambda poses: ~everywhere(poses))
     assert len(nowhere) == 3 and all(each.side == "from above" for each in nowhere)
 
@@ -147,7 +147,7 @@ def test_each_begins_over_its_target_and_its_numbers_go_from_end_to_end(rehearsa
         beyond = each.values(np.where(np.arange(len(start)) % 2, -3.0, 7.0))
         ends = [q.low if n % 2 else q.high for n, q in enumerate(each.quantities.values())]
         assert list(beyond.values()) == ends
-        passes = each.way(rehearsal.hand, values).passes
+        passes = each.way(rehearsal.manipulator, values).passes
         assert len(passes) == each.count
         faces = np.concatenate([faces_in(each) for each in passes])
         over = np.linalg.norm(np.cross(faces - each.layout.centre, each.layout.outward), axis=1)
@@ -158,7 +158,7 @@ def test_a_glide_begins_as_the_straight_rows_that_it_is_held_against(rehearsal):
     coverage = coverage_of(16.0 * Z, 12.0)
     glide = next(each for each in candidates_of(rehearsal, coverage, "tumour", everywhere) if each.count > 1)
     rows = row_by_row(SimpleNamespace(rehearsal=rehearsal, coverage=coverage, target="tumour"))
-    begun = glide.way(rehearsal.hand, glide.values(glide.start()))
+    begun = glide.way(rehearsal.manipulator, glide.values(glide.start()))
     assert glide.motion == "glide" and len(rows.passes) == glide.count
     assert begun.poses == pytest.approx(rows.poses, abs=1e-9)
 
@@ -175,24 +175,26 @@ def values_of(candidate: Candidate, **changes: float) -> dict[str, float]:
 
 
 def test_a_glides_numbers_are_what_they_are_called(rehearsal):
-    glide, hand = glide_of(rehearsal, 2), rehearsal.hand
+    glide, manipulator = glide_of(rehearsal, 2), rehearsal.manipulator
     numbers = values_of(glide, aside_mm=2.0, apart_mm=9.0, start_mm=-7.0, end_mm=5.0, depth_mm=0.0)
-    one, two = (faces_in(each) - glide.layout.centre for each in glide.way(hand, numbers).passes)
+    one, two = (faces_in(each) - glide.layout.centre for each in glide.way(manipulator, numbers).passes)
     assert one[:, 0] == pytest.approx(2.0 - 4.5) and two[:, 0] == pytest.approx(2.0 + 4.5)
     assert one[[0, -1], 1] == pytest.approx([-7, 5]) and two[[0, -1], 1] == pytest.approx([5, -7])
-    deeper = glide.way(hand, numbers | dict(depth_mm=3.0)).passes[0]
+    deeper = glide.way(manipulator, numbers | dict(depth_mm=3.0)).passes[0]
     assert faces_in(deeper) - glide.layout.centre == pytest.approx(one - 3.0 * Z)
-    turned = faces_in(glide.way(hand, numbers | dict(heading_deg=90.0)).passes[0]) - glide.layout.centre
+    turned = (
+        faces_in(glide.way(manipulator, numbers | dict(heading_deg=90.0)).passes[0]) - glide.layout.centre
+    )
     assert turned[[0, -1], 0] == pytest.approx([7, -5]) and turned[:, 1] == pytest.approx(-2.5)
     for name, axis in (("lean_deg", [0, -0.5, np.sqrt(0.75)]), ("lean_aside_deg", [0.5, 0, np.sqrt(0.75)])):
-        leant = glide.way(hand, numbers | {name: 30.0}).poses
+        leant = glide.way(manipulator, numbers | {name: 30.0}).poses
         assert leant[:, :3, 2] == pytest.approx(np.tile(axis, (len(leant), 1)))
 
 
 def test_rocking_turns_where_its_numbers_say(rehearsal):
-    rock = next(each for each in found_for(rehearsal, 18.0 * Z) if each.motion == "rock")
-    numbers = values_of(rock, ahead_mm=0.0, first_deg=-10.0, last_deg=24.0, depth_mm=1.0)
-    (poses,) = rock.way(rehearsal.hand, numbers).passes
+    tilt = next(each for each in found_for(rehearsal, 18.0 * Z) if each.motion == "tilt")
+    numbers = values_of(tilt, ahead_mm=0.0, first_deg=-10.0, last_deg=24.0, depth_mm=1.0)
+    (poses,) = tilt.way(rehearsal.manipulator, numbers).passes
     angles = np.degrees(np.arctan2(-poses[:, 1, 2], poses[:, 2, 2]))
     assert angles[[0, -1]] == pytest.approx([-10, 24], abs=1.5)
     assert faces_in(poses)[:, 2] == pytest.approx(R - 1.0, abs=FACET_MM)
@@ -232,7 +234,7 @@ def test_sweeps_by_chance_are_the_seeds_and_over_the_target(trial):
 
 
 def test_a_plans_poses_are_the_ways_in_the_patient(rehearsal):
-    way = glide_of(rehearsal, 2).way(rehearsal.hand, values_of(glide_of(rehearsal, 2)))
+    way = glide_of(rehearsal, 2).way(rehearsal.manipulator, values_of(glide_of(rehearsal, 2)))
     placed = np.stack([probe_in_patient(rehearsal, pose) for pose in way.poses])
     # PLUS's axes of a probe: x to the marked side, y into the tissue, from the middle of the face.
     assert placed[:, :3, 3] == pytest.approx(faces_in(way.poses) + ORIGIN)

@@ -9,7 +9,7 @@ import taichi as ti
 from conftest import rotation_about
 from plan_ball import SIZE, over_ball, plan_of, straight_pass, sweep_of
 
-from rehearsal.planning.plan_guidance import ABOVE_MM, AHEAD, DEG_BESIDE_A_MM, NEAR_MM, Guide
+from rehearsal.planning.plan_guidance import ABOVE_MM, AHEAD, DEG_BESIDE_A_MM, NEAR_MM, PlanGuidance
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.undo_history import MOST_UNDONE, History
 from render import plan_lines, transducer_shape
@@ -24,8 +24,8 @@ from ultrasound.target import TARGETS
 FIRST, SECOND = straight_pass(4, step_mm=2.0), straight_pass(3, 20.0, 2.0)
 
 
-def guide_of(*sweeps) -> Guide:
-    return Guide(over_ball(), plan_of(*(sweeps or [sweep_of(FIRST, SECOND)])))
+def guide_of(*sweeps) -> PlanGuidance:
+    return PlanGuidance(over_ball(), plan_of(*(sweeps or [sweep_of(FIRST, SECOND)])))
 
 
 def turned(pose: np.ndarray, degrees: float) -> np.ndarray:
@@ -135,10 +135,10 @@ def test_what_is_near_is_a_way_and_a_turn_together(mm, degrees, near):
 
 
 def test_the_sweeps_are_shown_in_turn_and_then_none():
-    guide = guide_of(sweep_of(FIRST), sweep_of(SECOND, name="rocking in one place", seen=0.6))
+    guide = guide_of(sweep_of(FIRST), sweep_of(SECOND, name="tilting in one place", seen=0.6))
     assert guide.said() == "Plan 1: two passes, sees 75 %"
     guide.watch(FIRST[0])
-    assert guide.next_sweep() == "Plan 2: rocking in one place, sees 60 %"
+    assert guide.next_sweep() == "Plan 2: tilting in one place, sees 60 %"
     assert guide.at == 0 and guide.guidance().goal == pytest.approx(SECOND[0])
     assert guide.next_sweep() == "Plan hidden"
     guide.watch(FIRST[0])
@@ -171,7 +171,7 @@ class Led:
         self.rehearsal, self.session = held, Session(held)
         self.session.store = lambda: None
         self.history = History(self.session)
-        self.guide = Guide(held, plan_of(sweep_of(FIRST, SECOND), sweep_of(SECOND)))
+        self.guide = PlanGuidance(held, plan_of(sweep_of(FIRST, SECOND), sweep_of(SECOND)))
 
     def step(self, pose: np.ndarray, acts: bool = True) -> None:
         self.history.watch(acts, False)

@@ -16,7 +16,7 @@ import app
 from rehearsal import headless
 from rehearsal.planning import evolution, trial_workers
 from rehearsal.planning.plan_file import Plan, read_plan
-from rehearsal.planning.sweep_path import Way, gliding, layout_towards
+from rehearsal.planning.sweep_path import SweepPath, gliding, layout_towards
 from rehearsal.planning.trial import Trial
 from studies.planning.baseline_sweeps import planned
 from ultrasound.probe_manipulator import advanced, indentation
@@ -148,11 +148,11 @@ def test_the_poses_of_a_plan_lie_about_the_organ_in_the_patient(made):
 # Trials
 
 
-def way_at(trial: Trial, depth_mm: float, passes: int = 1) -> Way:
+def way_at(trial: Trial, depth_mm: float, passes: int = 1) -> SweepPath:
     """Over the tumour, along y."""
     layout = layout_towards(np.array([0.0, 4.0, 0.0]), np.array([0.0, 0, 1]), np.array([1.0, 0, 0]))
     aside = np.linspace(-3.0, 3.0, passes) if passes > 1 else np.zeros(1)
-    return gliding(trial.rehearsal.hand, layout, aside, -5.0, 5.0, depth_mm, 0.5)
+    return gliding(trial.rehearsal.manipulator, layout, aside, -5.0, 5.0, depth_mm, 0.5)
 
 
 @pytest.fixture
@@ -163,7 +163,7 @@ def trial(made) -> Trial:
 
 @pytest.mark.parametrize("count", [1, 3, 40])
 def test_a_whole_number_of_steps_stays_one_where_poses_were_rounded(trial, count):
-    start, end = trial.rehearsal.hand.home, trial.rehearsal.hand.home.copy()
+    start, end = trial.rehearsal.manipulator.home, trial.rehearsal.manipulator.home.copy()
     step_mm = trial.speed_mm_s * trial.rehearsal.settings.time_step_s
     for off_mm, steps in ((-1e-6, count), (0.0, count), (1e-6, count), (0.01 * step_mm, count + 1)):
         end[:3, 3] = start[:3, 3] + [0.0, 0.0, count * step_mm + off_mm]
@@ -193,10 +193,14 @@ def test_a_way_that_presses_deeper_squeezes_more_and_touches_more(trial):
 
 def test_a_lifted_way_sees_nothing_and_squeezes_nothing(trial):
     way = way_at(trial, 1.0)
-    lifted = trial.run(Way(tuple(np.stack([advanced(pose, -6.0) for pose in each]) for each in way.passes)))
+    lifted = trial.run(
+        SweepPath(tuple(np.stack([advanced(pose, -6.0) for pose in each]) for each in way.passes))
+    )
     assert (lifted.seen, lifted.contact, lifted.compression_max_mm) == (0.0, 0.0, 0.0)
     assert trial.run(way).seen > 0.05
-    assert trial.run(Way(())) == replace(lifted, incidence_deg=0.0, path_mm=0.0, time_s=0.0, reachable=0.0)
+    assert trial.run(SweepPath(())) == replace(
+        lifted, incidence_deg=0.0, path_mm=0.0, time_s=0.0, reachable=0.0
+    )
 
 
 def test_two_passes_see_more_than_either_and_the_probe_is_lifted_between(trial):
@@ -205,10 +209,10 @@ def test_two_passes_see_more_than_either_and_the_probe_is_lifted_between(trial):
     rehearsal, advance = trial.rehearsal, trial.rehearsal.advance
 
     def watched(pose: np.ndarray) -> None:
-        depths.append(indentation(pose, rehearsal.size_mm, rehearsal.hand.samples, 0.0))
+        depths.append(indentation(pose, rehearsal.size_mm, rehearsal.manipulator.samples, 0.0))
         advance(pose)
 
-    one, other = (trial.run(Way((each,))) for each in both.passes)
+    one, other = (trial.run(SweepPath((each,))) for each in both.passes)
     rehearsal.advance = watched
     together = trial.run(both)
     del rehearsal.advance

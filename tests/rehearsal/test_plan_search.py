@@ -19,7 +19,7 @@ from rehearsal.planning.evolution import GENERATION, NEAR, Search, foreseen
 from rehearsal.planning.make_plan import make_plan
 from rehearsal.planning.plan_file import PlanError, read_plan, write_plan
 from rehearsal.planning.score import score
-from rehearsal.planning.score_terms import Parts
+from rehearsal.planning.score_terms import ScoreTerms
 from rehearsal.planning.search import FORESEEN, TRIAL_MM_S, length_of, ranked, search
 from rehearsal.planning.sweep_candidates import Candidate, Quantity
 from rehearsal.planning.trial_workers import Outcome, Problem, SearchSpace, Workers, _trial, workers
@@ -39,7 +39,7 @@ def candidate(name: str, handicap: float = 0.0) -> Candidate:
     return Candidate(name, "glide", int(100 * handicap), from_above(), RANGES)
 
 
-def worth(values: dict[str, float], handicap: float = 0.0) -> Parts:
+def worth(values: dict[str, float], handicap: float = 0.0) -> ScoreTerms:
     """Best in one place, and known how good there: how much is seen falls with the square of the distance."""
     off = sum(((values[name] - BEST[name]) / (RANGES[name].high - RANGES[name].low)) ** 2 for name in BEST)
     return replace(GOOD, seen=1.0 - handicap - off)
@@ -155,7 +155,7 @@ def test_part_of_a_generation_counts_and_the_best_so_far_stays():
 def test_a_forecasts_best_is_no_worse_than_where_it_began():
     asked: list[dict[str, float]] = []
 
-    def seen(values: dict[str, float]) -> Parts:
+    def seen(values: dict[str, float]) -> ScoreTerms:
         asked.append(values)
         return worth(values)
 
@@ -236,7 +236,7 @@ def test_a_plan_is_the_ranked_sweeps_with_what_they_are_for(tmp_path):
     assert scores == sorted(scores, reverse=True) and sum(each.trials for each in plan.sweeps) == 96
     for each in plan.sweeps:
         assert each.score == pytest.approx(sum(each.points.values()), abs=1e-5)
-        assert each.score == pytest.approx(score(Parts(**each.parts)), abs=1e-3)
+        assert each.score == pytest.approx(score(ScoreTerms(**each.parts)), abs=1e-3)
         assert np.array(each.passes[0]) == pytest.approx(straight_pass(4), abs=1e-6)
     assert plan.anatomy == fingerprint(problem.anatomy) and plan.trocar.cone_deg == 33
     assert (plan.target, plan.margin_mm, plan.speed_mm_s) == ("organ", 5.0, 12.0)

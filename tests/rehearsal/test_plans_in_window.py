@@ -11,7 +11,7 @@ from plan_ball import over_ball, plan_of, straight_pass, sweep_of
 from rehearsal.frame_view import probe_as_set
 from rehearsal.planning import plans_in_window
 from rehearsal.planning.plan_file import PlanError, read_plan
-from rehearsal.planning.plan_guidance import Guide
+from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.plans_in_window import SPEED_MM_S, TRIALS, Plans, in_words
 from rehearsal.planning.search import length_of
 from render.viewer import Controls, Settings
@@ -97,7 +97,7 @@ def test_a_plan_is_made_while_the_rehearsal_goes_on_and_then_followed(searching,
     assert ended(plans) == "Plan 1: two passes, sees 75 % (plan-001.json)"
     assert plans.status == "" and said(plans) == "" and len(searching.problems) == 1
     guide = plans.instruments.guide
-    assert isinstance(guide, Guide) and read_plan(tmp_path / "plan-001.json") == guide.plan
+    assert isinstance(guide, PlanGuidance) and read_plan(tmp_path / "plan-001.json") == guide.plan
     (problem,) = searching.problems
     assert (problem.target, problem.margin_mm, problem.anatomy, problem.probe) == (
         "margin",
@@ -157,7 +157,7 @@ def test_a_key_stops_it_and_shows_the_next_sweep_otherwise(monkeypatch, searchin
                 yield each
 
         monkeypatch.setattr(plans_in_window, "workers", late)
-    plans.instruments.guide = guide = Guide(plans.rehearsal, plan_of(sweep_of(straight_pass(3))))
+    plans.instruments.guide = guide = PlanGuidance(plans.rehearsal, plan_of(sweep_of(straight_pass(3))))
     said(plans, plan=True)
     search = plans._planning
     if began:
@@ -227,7 +227,7 @@ def test_what_a_plan_is_for_is_said_and_an_organ_without_a_tumour_is_planned_for
 def test_sweeps_are_shown_in_turn(plans):
     assert said(plans, next_plan=True) == "No plan: {plan} makes one"
     first, second = straight_pass(3), straight_pass(2)
-    plans.instruments.guide = guide = Guide(
+    plans.instruments.guide = guide = PlanGuidance(
         plans.rehearsal, plan_of(sweep_of(first), sweep_of(second, name="b", seen=0.5))
     )
     guide.watch(first[0])

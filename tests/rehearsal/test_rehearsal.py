@@ -14,7 +14,7 @@ from scenes.patients.patient_folder import save_patient
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.ct_files import open_ct
 from scenes.patients.readers.label_maps import LabelMap
-from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.lazy_volume import LazyVolume
 from scenes.scene import PAPER, Press, Scene, load_scene, with_options
 from sim.fields import array_of
 from sim.mesh_distance import signed_distance
@@ -40,7 +40,7 @@ def real_patient(data: Path, tmp_path: Path) -> tuple[Scene, Path]:
     slab.apply_translation([-57.0, 60.0, -322.0])
     slab.export(tmp_path / "slab.stl")
     patient = import_patient(
-        Volume.of(ct), LabelMap.of(labels), side="right", support=str(tmp_path / "slab.stl")
+        LazyVolume.of(ct), LabelMap.of(labels), side="right", support=str(tmp_path / "slab.stl")
     )
     save_patient(patient, tmp_path / "patient")
     return with_options(patient_scene(patient), {"tissue.cell_mm": 6.0}), tmp_path / "patient"
@@ -66,8 +66,8 @@ def resampled(folder: Path, plane, origin: np.ndarray, pixels: int) -> np.ndarra
 def assert_at_rest_the_slice_is_the_ct(scene: Scene, folder: Path) -> None:
     scene = scene.model_copy(update={"press": Press(warm_up_steps=0)})
     rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
-    rehearsal.hand.turn(20, 10, 35)
-    rehearsal.pose = rehearsal.hand.pose()
+    rehearsal.manipulator.turn(20, 10, 35)
+    rehearsal.pose = rehearsal.manipulator.pose()
     rehearsal.look(rehearsal.probe, *LOOK_AT_CT)
     plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], *rehearsal.probe.extent_mm)
     cut = rehearsal.scanner.slice
@@ -138,22 +138,22 @@ def test_a_hand_cannot_outrun_its_speed(kept):
 
 def test_the_transducer_goes_over_the_organ_not_through_it(kept):
     rehearsal = kept(pressed_phantom)
-    hand, middle = rehearsal.hand, rehearsal.hand.vertices.mean(axis=0)
+    manipulator, middle = rehearsal.manipulator, rehearsal.manipulator.vertices.mean(axis=0)
     ends = [
         middle + side * 30 * np.array(rehearsal.press.lateral) - 60 * rehearsal.gravity_direction
         for side in (-1, 1)
     ]
-    hand.point(ends[0], rehearsal.gravity_direction)
+    manipulator.point(ends[0], rehearsal.gravity_direction)
     for _ in range(90):
-        rehearsal.advance(rehearsal.pose_towards(hand.pose()))
+        rehearsal.advance(rehearsal.pose_towards(manipulator.pose()))
     there = rehearsal.pose.copy()
-    hand.point(ends[1], rehearsal.gravity_direction)
+    manipulator.point(ends[1], rehearsal.gravity_direction)
     deepest = -np.inf
     for _ in range(90):
-        rehearsal.advance(rehearsal.pose_towards(hand.pose()))
+        rehearsal.advance(rehearsal.pose_towards(manipulator.pose()))
         deepest = max(deepest, rehearsal.indentation_mm())
     assert np.linalg.norm(rehearsal.pose[:3, 3] - there[:3, 3]) > 30
-    assert rehearsal.pose == pytest.approx(hand.pose(), abs=1e-6)
+    assert rehearsal.pose == pytest.approx(manipulator.pose(), abs=1e-6)
     # A straight way would cut several millimetres deep into the organ's curve.
     assert deepest < 0.5
 

@@ -8,9 +8,9 @@ import trimesh
 from plan_ball import SIZE, R, X, Y, Z, big_ball, hand_on
 
 from rehearsal.planning import rigid_surrogate
-from rehearsal.planning.rigid_surrogate import Forecast
-from rehearsal.planning.score_terms import Parts
-from rehearsal.planning.sweep_path import Way, fanned
+from rehearsal.planning.rigid_surrogate import RigidSurrogate
+from rehearsal.planning.score_terms import ScoreTerms
+from rehearsal.planning.sweep_path import SweepPath, fanned
 from sim.fields import field_of
 from ultrasound.coverage import VOXEL_MM, Coverage
 from ultrasound.probe import load_probe
@@ -32,7 +32,7 @@ GAP_MM, WARNING_MM = 1.5, 2.0
 TUMOUR_MM, AT = 8.0, np.array([2.0, -3.0, 14.0])
 
 
-def forecast_of(monkeypatch, probe) -> tuple[Forecast, Coverage]:
+def forecast_of(monkeypatch, probe) -> tuple[RigidSurrogate, Coverage]:
     monkeypatch.setattr(rigid_surrogate, "Skin", Unmoved)
     ball = trimesh.creation.icosphere(subdivisions=3, radius=TUMOUR_MM).apply_translation(AT)
     coverage = Coverage(big_ball(), ball)
@@ -42,16 +42,16 @@ def forecast_of(monkeypatch, probe) -> tuple[Forecast, Coverage]:
     )
     size = np.array(probe.housing_mm)
     held = SimpleNamespace(hand=hand_on(big_ball(), size), model=None, probe=probe, scene=scene, size_mm=size)
-    return Forecast(held, coverage, "tumour", lambda poses: poses[:, 0, 3] < 5.0), coverage
+    return RigidSurrogate(held, coverage, "tumour", lambda poses: poses[:, 0, 3] < 5.0), coverage
 
 
-def way_over_the_tumour(length: float) -> Way:
+def way_over_the_tumour(length: float) -> SweepPath:
     """Poses whose faces are 1, 3 and 0.5 mm in the ball, the second tilted and the third turned; one above it, and one beside it."""
     faces = np.array([[0, 0, R - 1], [0, -4, R - 3], [3, 0, R - 0.5], [0, 5, R + 3]])
     down = np.stack([pose_at(face, -Z, X, length) for face in faces])
     down[1] = fanned(down[1], length, 12.0)
     down[2] = pose_at(faces[2], -Z, X + Y, length)
-    return Way((down, pose_at(R * Z + 60 * X, -Z, X, length)[None]))
+    return SweepPath((down, pose_at(R * Z + 60 * X, -Z, X, length)[None]))
 
 
 @pytest.mark.parametrize("name", ["linear", "drop-in", "curvilinear"])
@@ -113,8 +113,8 @@ def depth_of_array(probe, pose: np.ndarray, length: float) -> np.ndarray:
 
 def test_the_forecast_of_no_pass_is_nothing_and_of_the_same_way_the_same(monkeypatch):
     found, _ = forecast_of(monkeypatch, load_probe("linear"))
-    assert found.parts(Way(())) == Parts.nothing()
+    assert found.parts(SweepPath(())) == ScoreTerms.nothing()
     way = way_over_the_tumour(SIZE[2])
     assert found.parts(way) == found.parts(way)
     # It lays ways with fewer samples, and leaves the hand of the trials as it is.
-    assert len(found.hand.samples) < len(found.rehearsal.hand.samples)
+    assert len(found.manipulator.samples) < len(found.rehearsal.manipulator.samples)

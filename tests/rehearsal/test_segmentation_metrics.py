@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rehearsal.reconstruction.segmentation_metrics import Agreement, agreement
+from rehearsal.reconstruction.segmentation_metrics import SegmentationMetrics, segmentation_metrics
 
 VOXEL = 0.5
 
@@ -14,13 +14,17 @@ def voxel_ball(centre: list[float], radius: float) -> np.ndarray:
 
 
 def test_a_region_agrees_with_itself():
-    assert agreement(voxel_ball([25, 25, 25], 9), voxel_ball([25, 25, 25], 9), VOXEL) == Agreement(1, 0, 0, 0)
+    assert segmentation_metrics(
+        voxel_ball([25, 25, 25], 9), voxel_ball([25, 25, 25], 9), VOXEL
+    ) == SegmentationMetrics(1, 0, 0, 0)
 
 
 @pytest.mark.parametrize("shift", [1, 4, 9])
 def test_a_shifted_ball_agrees_as_the_formula_of_two_balls_says(shift):
     radius = 18.0
-    got = agreement(voxel_ball([24 + shift, 25, 25], radius), voxel_ball([24, 25, 25], radius), VOXEL)
+    got = segmentation_metrics(
+        voxel_ball([24 + shift, 25, 25], radius), voxel_ball([24, 25, 25], radius), VOXEL
+    )
     # The lens of two balls; cutting it into voxels errs by less than a percent of so many.
     assert got.dice == pytest.approx(1 - 3 * shift / (4 * radius) + shift**3 / (16 * radius**3), abs=0.01)
     assert got.centroid_mm == pytest.approx(shift * VOXEL, abs=1e-9) and got.volume_percent == 0
@@ -31,7 +35,7 @@ def test_a_shifted_ball_agrees_as_the_formula_of_two_balls_says(shift):
 
 
 def test_a_larger_ball_is_larger_by_its_radius_to_the_third():
-    got = agreement(voxel_ball([25.3, 24.9, 25.1], 20), voxel_ball([25.3, 24.9, 25.1], 14), VOXEL)
+    got = segmentation_metrics(voxel_ball([25.3, 24.9, 25.1], 20), voxel_ball([25.3, 24.9, 25.1], 14), VOXEL)
     assert got.volume_percent == pytest.approx(100 * ((20 / 14) ** 3 - 1), rel=0.02)
     assert got.hd95_mm == pytest.approx(6 * VOXEL, abs=VOXEL) and got.centroid_mm < 0.1 * VOXEL
     assert got.dice == pytest.approx(2 * 14**3 / (14**3 + 20**3), abs=0.01)
@@ -40,7 +44,7 @@ def test_a_larger_ball_is_larger_by_its_radius_to_the_third():
 def test_a_hollow_has_a_surface_of_its_own():
     whole = voxel_ball([25, 25, 25], 16)
     # The inner surface is a quarter of both, and farther from the outer by what the radii differ in.
-    got = agreement(whole & ~voxel_ball([25, 25, 25], 9), whole, VOXEL)
+    got = segmentation_metrics(whole & ~voxel_ball([25, 25, 25], 9), whole, VOXEL)
     assert got.hd95_mm == pytest.approx((16 - 9) * VOXEL, abs=VOXEL)
 
 
@@ -51,16 +55,20 @@ def test_hd95_is_the_greater_of_both_ways_and_blind_to_a_twentieth():
     for extra, hd95 in ((8, 0.0), (16, 50 * VOXEL)):
         found = truth.copy()
         found[53, 1:3, 1 : 1 + extra // 2] = True
-        assert agreement(found, truth, VOXEL).hd95_mm == agreement(truth, found, VOXEL).hd95_mm == hd95
+        assert (
+            segmentation_metrics(found, truth, VOXEL).hd95_mm
+            == segmentation_metrics(truth, found, VOXEL).hd95_mm
+            == hd95
+        )
 
 
 def test_where_nothing_was_found_there_is_no_distance():
-    got = agreement(np.zeros((60, 50, 50), bool), voxel_ball([25, 25, 25], 9), VOXEL)
+    got = segmentation_metrics(np.zeros((60, 50, 50), bool), voxel_ball([25, 25, 25], 9), VOXEL)
     assert got.dice == 0 and got.volume_percent == -100 and np.isnan([got.hd95_mm, got.centroid_mm]).all()
 
 
 def test_regions_that_cannot_be_compared_are_refused():
     with pytest.raises(ValueError, match="empty"):
-        agreement(np.ones((3, 3, 3), bool), np.zeros((3, 3, 3), bool), VOXEL)
+        segmentation_metrics(np.ones((3, 3, 3), bool), np.zeros((3, 3, 3), bool), VOXEL)
     with pytest.raises(ValueError, match="grids"):
-        agreement(np.ones((3, 3, 3), bool), np.ones((3, 3, 4), bool), VOXEL)
+        segmentation_metrics(np.ones((3, 3, 3), bool), np.ones((3, 3, 4), bool), VOXEL)

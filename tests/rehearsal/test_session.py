@@ -16,14 +16,14 @@ import trimesh
 from test_undo_history import STEP_S, Numbers, ray, step
 
 import app
-from rehearsal.adaptive_iterations import Ladder
+from rehearsal.adaptive_iterations import AdaptiveIterations
 from rehearsal.configuration import probe_of
-from rehearsal.inputs.input_source import Played
-from rehearsal.inputs.user_input import Live
+from rehearsal.inputs.input_source import ReplayInput
+from rehearsal.inputs.user_input import UserInput
 from rehearsal.sessions import recorder
 from rehearsal.sessions.packed_coverage import pack_seen, unpack_seen
 from rehearsal.sessions.recorded_scene import scene_of_log
-from rehearsal.sessions.recorder import Recorded, record
+from rehearsal.sessions.recorder import SessionRecorder, record
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import (
@@ -47,12 +47,12 @@ def header() -> Header:
     return Header(anatomy="0", scene={}, probe={}, arch="x64", time_step_s=STEP_S)
 
 
-def live_into(path: Path, seen: Callable[[], np.ndarray] | None = None) -> Live:
+def live_into(path: Path, seen: Callable[[], np.ndarray] | None = None) -> UserInput:
     session = Session(Numbers(), seen=seen)
-    return Live(session, Ladder(1e6), Recorded(session, Recording(path, header())))
+    return UserInput(session, AdaptiveIterations(1e6), SessionRecorder(session, Recording(path, header())))
 
 
-def lead(live: Live, moments: int, seed: int) -> str:
+def lead(live: UserInput, moments: int, seed: int) -> str:
     """A user who does all there is to do, at random; the tissue's digest at the end."""
     random = np.random.default_rng(seed)
     settings = Settings(young_kpa=15.0)
@@ -197,7 +197,7 @@ def test_a_digest_that_differs_is_said_with_its_second_once(tmp_path, at_back):
     log = read_log(tmp_path / "session")
     for moment in (3 * SECOND, 5 * SECOND):
         log.digests[moment] = "another"
-    driver, said = Played(Replay(Numbers(), log), lambda: None), []
+    driver, said = ReplayInput(Replay(Numbers(), log), lambda: None), []
     while not driver.replay.is_over:
         pose = driver.move(Controls(Settings()))
         if pose is not None:
@@ -241,7 +241,7 @@ def test_poses_keep_every_bit_and_ways_back_are_no_numbers():
     assert all(back[i].tobytes() == pose.tobytes() for i, pose in enumerate(poses) if pose is not None)
 
 
-def on_disk(live: Live) -> None:
+def on_disk(live: UserInput) -> None:
     """Wait until the disk has all that was handed to it."""
     live.recorded.recording._disk.submit(int).result(10)
 
@@ -344,7 +344,7 @@ def test_a_full_disk_leaves_the_rehearsal_going_and_is_said_once(tmp_path):
     assert live.session.moment == 50 and len(read_log(tmp_path / "session").poses) == 16
 
 
-def recorded_at(folder: Path, ball: trimesh.Trimesh) -> Recorded:
+def recorded_at(folder: Path, ball: trimesh.Trimesh) -> SessionRecorder:
     """Numbers recorded in a scene whose files have a patient's name."""
     numbers = Numbers()
     files = dict(organ="/home/doe/organ.stl", tumour="doe.stl", ct="doe/ct.nrrd", labels="doe/labels.nrrd")
@@ -353,7 +353,7 @@ def recorded_at(folder: Path, ball: trimesh.Trimesh) -> Recorded:
     numbers.scene = Scene(anatomy=files, shape=shape, tissue=dict(cell_mm=7.0), transducer=probe)
     numbers.probe = probe_of(load_scene(EMBEDDED))
     kept = record(Session(numbers), LoadedAnatomy(ball, None, None, ()), "x64", folder)
-    lead(Live(kept.session, Ladder(1e6), kept), 30, 0)
+    lead(UserInput(kept.session, AdaptiveIterations(1e6), kept), 30, 0)
     kept.close({})
     return kept
 

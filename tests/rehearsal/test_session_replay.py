@@ -14,7 +14,7 @@ from rehearsal import headless, run
 from rehearsal.build_solver import step_settings
 from rehearsal.coordinates import probe_in_patient
 from rehearsal.frame_view import settings_of
-from rehearsal.measurements.live_measurements import Instruments
+from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions import recorder
 from rehearsal.sessions.open_session import opened
@@ -92,7 +92,7 @@ def rehearsed(built, monkeypatch, out: Path, script: Any, log: Log | None = None
     viewer = Watched(settings, script(settings))
     monkeypatch.setattr(run, "open_viewer", lambda *_, **__: viewer)
     # A budget that no step keeps: the ladder goes down.
-    each = run.Run(rehearsal, anatomy, "cpu", out, budget_ms=0.01)
+    each = run.RehearsalRun(rehearsal, anatomy, "cpu", out, budget_ms=0.01)
     each.in_window(log, at_s)
     return viewer.seen, rehearsal.digest(), each.recorded and read_log(each.recorded.recording.path)
 
@@ -108,8 +108,10 @@ def user(settings: Settings, frames: int = 150) -> Iterator[Controls]:
         keys = dict(undo=frame in (70, 71, 140), redo=frame == 72, bookmark=frame in (20, 98))
         keys |= dict(to_bookmark=frame in (110, 112), reset=frame == 130, freeze=frame in (80, 90))
         at = over if frame % 40 < 30 else None
-        fan_deg = 0.5 * (frame % 7 == 0)
-        yield Controls(settings, at, press=frame % 40 > 15, fan_deg=fan_deg, quit=frame == frames - 1, **keys)
+        tilt_deg = 0.5 * (frame % 7 == 0)
+        yield Controls(
+            settings, at, press=frame % 40 > 15, tilt_deg=tilt_deg, quit=frame == frames - 1, **keys
+        )
 
 
 def watching(frames: int, take_over_at: int = -1) -> Any:
@@ -149,21 +151,21 @@ def opened_at_each(built, log: Log, capsys) -> None:
     # From the beginning; from a bookmark, over a change of depth and two ways back; on a state, and from there over a way back.
     for begins, moment in ((0, 30), (88, 105), (120, 120), (120, 135)):
         rehearsal, settings = rewound(built[0]), settings_of(built[0])
-        instruments = Instruments(rehearsal)
+        instruments = LiveMeasurements(rehearsal)
         assert Replay(rehearsal, log).begin_at(moment / 60) == begins
         replay = opened(log, moment / 60, rewound(rehearsal), settings, instruments)
         assert replay.session.moment == moment and instruments.figures() == noted[moment], moment
         assert instruments.course.duration_s == pytest.approx(moment / 60)
         assert settings.depth_mm == 40 and replay.bookmarks == 1 + (moment > 88)
     assert "Mind" not in capsys.readouterr().out
-    instruments = Instruments(rehearsal)
+    instruments = LiveMeasurements(rehearsal)
     opened(replace(log, seen={}), 127 / 60, rehearsal, settings_of(rehearsal), instruments)
     assert "what was seen until 2 s; what was seen and done counts from there" in capsys.readouterr().out
     assert instruments.figures()["seen_organ"] < noted[120]["seen_organ"]
     assert instruments.course.duration_s == pytest.approx(7 / 60)
     other = replace(log, seen=dict.fromkeys(log.seen, pack_seen(np.zeros((2, 3, 4), bool))))
     with pytest.raises(SessionError, match=r"of \(2, 3, 4\) voxels what was seen, expected \([^\n]*$"):
-        opened(other, 127 / 60, rehearsal, settings_of(rehearsal), Instruments(rehearsal))
+        opened(other, 127 / 60, rehearsal, settings_of(rehearsal), LiveMeasurements(rehearsal))
 
 
 def test_a_session_that_goes_on_from_a_replay_is_one_too(built, monkeypatch, tmp_path, capsys):
@@ -188,15 +190,15 @@ def test_a_tracked_file_is_followed_headless_and_replayed(built, monkeypatch, tm
     monkeypatch.setattr(headless, "open_viewer", no_vulkan)
     poses = [probe_in_patient(rehearsal)]
     for _ in range(30):
-        rehearsal.hand.slide(0.3, -0.1)
-        rehearsal.pose = rehearsal.hand.pose()
+        rehearsal.manipulator.slide(0.3, -0.1)
+        rehearsal.pose = rehearsal.manipulator.pose()
         poses.append(probe_in_patient(rehearsal))
     rehearsal.reset()
     # The slides, 9.5 mm, in half a second.
     track = TimedPoses(
         np.linspace(2.0, 2.5, 31), [None if 8 <= k < 12 else pose for k, pose in enumerate(poses)]
     )
-    tracked = run.Run(rehearsal, anatomy, "cpu", tmp_path, budget_ms=0.01, track=track)
+    tracked = run.RehearsalRun(rehearsal, anatomy, "cpu", tmp_path, budget_ms=0.01, track=track)
     tracked.headless(None, 0.0, None, 0.0)
     log = read_log(tracked.recorded.recording.path)
     assert len(log.poses) == 31 and probe_in_patient(rehearsal) == pytest.approx(poses[-1])
@@ -205,7 +207,7 @@ def test_a_tracked_file_is_followed_headless_and_replayed(built, monkeypatch, tm
     assert "echo as far as" in capsys.readouterr().out and (tmp_path / "slices").is_dir()
     rehearsal.reset()
     (tmp_path / "bare").mkdir()
-    run.Run(rehearsal, anatomy, "cpu", tmp_path / "bare").headless(log, 0.0, None, 0.0, draws=False)
+    run.RehearsalRun(rehearsal, anatomy, "cpu", tmp_path / "bare").headless(log, 0.0, None, 0.0, draws=False)
     told = capsys.readouterr().out
     assert "identical in all 1 states" in told and "no pictures" in told and "a picture" not in told
     assert sorted(path.name for path in (tmp_path / "bare").iterdir()) == FILES

@@ -12,11 +12,11 @@ from test_session import header
 from test_undo_history import STEP_S, Numbers, ray, step
 
 import app
-from rehearsal.adaptive_iterations import Ladder
+from rehearsal.adaptive_iterations import AdaptiveIterations
 from rehearsal.coordinates import probe_in_patient
-from rehearsal.inputs.input_source import Played
-from rehearsal.inputs.user_input import Live
-from rehearsal.sessions.recorder import Recorded
+from rehearsal.inputs.input_source import ReplayInput
+from rehearsal.inputs.user_input import UserInput
+from rehearsal.sessions.recorder import SessionRecorder
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import Recording, read_log
@@ -51,23 +51,23 @@ class Tracker:
         return self.now
 
 
-def placed(x: float, y: float = 0.0, fan_deg: float = 0.0) -> np.ndarray:
+def placed(x: float, y: float = 0.0, tilt_deg: float = 0.0) -> np.ndarray:
     """A probe 20 mm over the middle of the ball, looking down, beside it by so much: in PLUS's axes, in the patient."""
     pose = np.eye(4)
-    pose[:3, :3] = rotation_about([1, 0, 0], fan_deg - 90.0)
+    pose[:3, :3] = rotation_about([1, 0, 0], tilt_deg - 90.0)
     pose[:3, 3] = Patient.origin + [x, y, 20.0]
     return pose
 
 
-def live_of(tracker: Any) -> Live:
-    return Live(Session(Patient()), Ladder(1e6), tracked=tracker)
+def live_of(tracker: Any) -> UserInput:
+    return UserInput(Session(Patient()), AdaptiveIterations(1e6), tracked=tracker)
 
 
-def at(live: Live) -> np.ndarray:
+def at(live: UserInput) -> np.ndarray:
     return probe_in_patient(live.session.rehearsal)
 
 
-def steps(live: Live, count: int, **did: Any) -> np.ndarray:
+def steps(live: UserInput, count: int, **did: Any) -> np.ndarray:
     for _ in range(count):
         step(live, **did)
     return at(live)
@@ -102,7 +102,7 @@ def test_where_it_is_lost_the_transducer_stays_and_that_is_said():
 
 def test_mouse_and_keys_do_not_lead_beside_a_tracker_but_go_back():
     live = live_of(Tracker(placed(2.0)))
-    assert steps(live, 8, ray=ray(-6.0), press=True, roll_deg=5.0) == pytest.approx(placed(2.0))
+    assert steps(live, 8, ray=ray(-6.0), press=True, rotate_deg=5.0) == pytest.approx(placed(2.0))
     steps(live, 10)
     step(live, undo=True)
     assert live.take_said() == "undo" and at(live) != pytest.approx(placed(2.0))
@@ -114,7 +114,12 @@ def test_who_takes_the_lead_twice_is_told_that_it_is_theirs():
         step(live, take_over=True)
         said.append(live.take_said())
     assert said == ["Yours now", "Yours already"]
-    replay, said = Played(SimpleNamespace(is_over=False), lambda: Live(Session(Patient()), Ladder(1e6))), []
+    replay, said = (
+        ReplayInput(
+            SimpleNamespace(is_over=False), lambda: UserInput(Session(Patient()), AdaptiveIterations(1e6))
+        ),
+        [],
+    )
     for controls in (Controls(Settings(), take_over=True), Controls(Settings())):
         replay.move(controls)
         said.append(replay.take_said())
@@ -129,7 +134,7 @@ def test_after_a_way_back_it_stays_until_the_tracked_probe_moves():
     assert step(live, reset=True) is None
     # Tremor and noise, in place and angle.
     for x, fan in ((0.0, 0.0), (2.5, 0.0), (-1.0, 2.5), (0.5, -2.0)):
-        tracker.now = placed(x, fan_deg=fan)
+        tracker.now = placed(x, tilt_deg=fan)
         step(live)
         assert np.array_equal(live.session.rehearsal.pose, begun)
     tracker.now = placed(3.5)
@@ -140,13 +145,13 @@ def test_after_a_way_back_it_stays_until_the_tracked_probe_moves():
     tracker.now = placed(-9.0)
     step(live)
     assert np.array_equal(live.session.rehearsal.pose, begun), "found again is not moved"
-    tracker.now = placed(-9.0, fan_deg=4.0)
+    tracker.now = placed(-9.0, tilt_deg=4.0)
     assert steps(live, 8) == pytest.approx(tracker.now)
 
 
 def test_one_that_takes_over_waits_as_well():
     tracker = Tracker(placed(5.0))
-    live = Live(Session(Patient()), Ladder(1e6), waits=True, tracked=tracker)
+    live = UserInput(Session(Patient()), AdaptiveIterations(1e6), waits=True, tracked=tracker)
     begun = at(live)
     assert np.array_equal(steps(live, 3), begun)
     tracker.now = placed(9.0)
@@ -154,10 +159,10 @@ def test_one_that_takes_over_waits_as_well():
 
 
 @pytest.mark.parametrize(
-    ("x", "fan_deg", "is_moved"), [(2.9, 0, False), (3.1, 0, True), (0, 2.9, False), (0, -3.1, True)]
+    ("x", "tilt_deg", "is_moved"), [(2.9, 0, False), (3.1, 0, True), (0, 2.9, False), (0, -3.1, True)]
 )
-def test_what_counts_as_moved(x, fan_deg, is_moved):
-    assert has_moved(placed(0.0), placed(x, fan_deg=fan_deg)) is is_moved
+def test_what_counts_as_moved(x, tilt_deg, is_moved):
+    assert has_moved(placed(0.0), placed(x, tilt_deg=tilt_deg)) is is_moved
 
 
 def test_each_move_of_the_probe_is_an_action_and_rest_is_none():
@@ -174,14 +179,14 @@ def test_each_move_of_the_probe_is_an_action_and_rest_is_none():
 
 def way(count: int = 9, lost: tuple[int, ...] = ()) -> TimedPoses:
     """A quarter of a second from each to the next, 1.5 mm and 4 degrees on."""
-    poses = [None if k in lost else placed(1.5 * k - 6.0, fan_deg=4.0 * k) for k in range(count)]
+    poses = [None if k in lost else placed(1.5 * k - 6.0, tilt_deg=4.0 * k) for k in range(count)]
     return TimedPoses(100.0 + 0.25 * np.arange(count), poses)
 
 
 def test_between_two_poses_it_is_even_in_place_and_angle():
     track = way()
     for time, share in ((0.0, 0.0), (0.25, 1.0), (0.1, 0.4), (1.1, 4.4), (2.0, 8.0), (5.0, 8.0)):
-        expected = placed(1.5 * share - 6.0, fan_deg=4.0 * share)
+        expected = placed(1.5 * share - 6.0, tilt_deg=4.0 * share)
         assert pose_at_time(track, time) == pytest.approx(expected), time
 
 
@@ -205,18 +210,18 @@ def test_beside_a_frame_that_is_lost_it_is_lost():
 
 def test_a_file_goes_by_the_sessions_time_and_then_the_user_leads():
     session = Session(Patient())
-    live = Live(session, Ladder(1e6), tracked=PlayedPoses(way(), session))
+    live = UserInput(session, AdaptiveIterations(1e6), tracked=PlayedPoses(way(), session))
     shown = [at(live) for _ in range(17) if step(live) is not None]
     # From the second on the transducer keeps up: 6 mm/s.
-    assert shown[-1] == pytest.approx(placed(6.0, fan_deg=32.0)) and shown[9] == pytest.approx(
-        placed(0.75, fan_deg=18.0)
+    assert shown[-1] == pytest.approx(placed(6.0, tilt_deg=32.0)) and shown[9] == pytest.approx(
+        placed(0.75, tilt_deg=18.0)
     )
     assert live.take_said() == ""
     step(live, ray=ray(4.0))
     assert live.take_said() == "The tracked file is over: yours now" and live.status == ""
     assert np.array_equal(steps(live, 4, ray=ray(4.0)), shown[-1])
     # A hand that fans by a degree turns what it has taken over where it is.
-    step(live, fan_deg=1.0)
+    step(live, tilt_deg=1.0)
     turned = shown[-1][:3, :3].T @ at(live)[:3, :3]
     assert np.degrees(np.arccos((np.trace(turned) - 1) / 2)) == pytest.approx(1.0, abs=1e-3)
     assert np.linalg.norm(at(live)[:3, 3] - shown[-1][:3, 3]) < 1.0
@@ -226,7 +231,7 @@ def test_a_file_goes_by_the_sessions_time_and_then_the_user_leads():
 def test_time_goes_on_through_ways_back():
     session = Session(Patient())
     played = PlayedPoses(way(), session)
-    live = Live(session, Ladder(1e6), tracked=played)
+    live = UserInput(session, AdaptiveIterations(1e6), tracked=played)
     steps(live, 6)
     for _ in range(4):
         step(live, reset=True)
@@ -246,7 +251,9 @@ def recorded(path: Path) -> str:
     """A tracked session recorded in a file; the tissue's digest at its end."""
     session = Session(Patient())
     played = PlayedPoses(way(25, lost=(5, 6, 13)), session)
-    live = Live(session, Ladder(1e6), Recorded(session, Recording(path, header())), tracked=played)
+    live = UserInput(
+        session, AdaptiveIterations(1e6), SessionRecorder(session, Recording(path, header())), tracked=played
+    )
     for moment in range(60):
         step(live, ray=ray(2.0), undo=moment == 30, reset=moment == 40, press=moment > 52)
         live.watch()

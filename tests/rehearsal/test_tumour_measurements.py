@@ -1,4 +1,4 @@
-"""The figures read off a rehearsal: a ball in a ball, and outlines whose place in the picture is known by hand."""
+"""The figures measure off a rehearsal: a ball in a ball, and outlines whose place in the picture is known by hand."""
 
 from types import SimpleNamespace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from rehearsal.measurements.tumour_measurements import read
+from rehearsal.measurements.tumour_measurements import measure
 from sim.fields import field_of
 from ultrasound.probe import load_probe
 
@@ -30,7 +30,7 @@ def posed(face=(0.0, 0.0, 40.0), probe=LINEAR) -> np.ndarray:
 def rehearsed(
     organ=None, tumour=None, shift=(0, 0, 0), now=None, pose=None, probe=LINEAR, outline=NOWHERE
 ) -> SimpleNamespace:
-    """What is read of a rehearsal: an organ that lies as it was, or as ``now``, and a tumour that has shifted."""
+    """What is measure of a rehearsal: an organ that lies as it was, or as ``now``, and a tumour that has shifted."""
     organ = organ or ball(30.0)
     lies = np.asarray(organ.vertices if now is None else now, np.float32)
     return SimpleNamespace(
@@ -46,7 +46,7 @@ def rehearsed(
 
 def reading(probe=LINEAR, touches=None, **parts):
     every = np.ones(probe.number_of_scanlines, bool)
-    return read(rehearsed(probe=probe, **parts), probe, every if touches is None else touches)
+    return measure(rehearsed(probe=probe, **parts), probe, every if touches is None else touches)
 
 
 def test_without_a_tumour_there_is_nothing_to_say_of_it():

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import trimesh
 
-from rehearsal.adaptive_iterations import Ladder
-from rehearsal.inputs.user_input import Live
+from rehearsal.adaptive_iterations import AdaptiveIterations
+from rehearsal.inputs.user_input import UserInput
 from rehearsal.rehearsal import RehearsalState
 from rehearsal.sessions.session import SETTLED, Session
 from rehearsal.sessions.undo_history import MOST_UNDONE, History
 from render.viewer import Controls, Settings
 from scenes.tissue import NeoHookeanTissue
 from sim.body import BodyState
-from sim.divergence_check import Watch
+from sim.divergence_check import DivergenceState
 from sim.solver import SolverState, StepSettings
-from ultrasound.probe_manipulator import Hand, approached, pose_at, touching
+from ultrasound.probe_manipulator import ProbeManipulator, approached, pose_at, touching
 
 # A power of two, so that times are exact: 4 steps are PAUSE_S, 40 are LONGEST_S.
 STEP_S = 1 / 8
@@ -36,25 +36,27 @@ class Numbers:
         vertices, faces = np.array(ball.vertices), np.array(ball.faces, np.int64)
         size = np.array([16.0, 9.0, 6.0])
         home = touching(pose_at(np.array([0, 0, 12.0]), DOWN, np.eye(3)[0], 6.0), size, vertices)
-        self.hand = Hand(vertices, faces, np.array(ball.vertex_normals), size, home, np.eye(3)[0])
-        self.pose = self.hand.pose()
+        self.manipulator = ProbeManipulator(
+            vertices, faces, np.array(ball.vertex_normals), size, home, np.eye(3)[0]
+        )
+        self.pose = self.manipulator.pose()
         self.young_kpa, self.steps = 15.0, 0
         self.position = np.arange(6, dtype=np.float32).reshape(2, 3)
         self.velocity = np.zeros((2, 3), np.float32)
         self.contacts = {"plane": np.zeros((2, 4), np.float32)}
-        self.watch = Watch(self._solver())
+        self.watch = DivergenceState(self._solver())
         self.settled = self.snapshot()
 
     def _solver(self) -> SolverState:
         return SolverState(BodyState(self.position, self.velocity), self.contacts)
 
     def snapshot(self) -> RehearsalState:
-        return RehearsalState(self._solver(), self.watch, self.pose, self.steps, self.hand.grip)
+        return RehearsalState(self._solver(), self.watch, self.pose, self.steps, self.manipulator.state)
 
     def restore(self, state: RehearsalState) -> None:
         self.position, self.velocity = state.solver.body.position, state.solver.body.velocity
         self.contacts, self.watch = state.solver.contacts, state.watch
-        self.pose, self.steps, self.hand.grip = state.pose, state.steps, state.grip
+        self.pose, self.steps, self.manipulator.state = state.pose, state.steps, state.manipulator
 
     def advance(self, pose: np.ndarray) -> None:
         """Each step turns on what was told, on the contacts, and on what the guard remembers."""
@@ -64,12 +66,14 @@ class Numbers:
         self.position = (0.99 * self.position + STEP_S * self.velocity).astype(np.float32)
         self.contacts = {"plane": np.sin(np.pad(self.position, ((0, 0), (0, 1))))}
         since = self.watch.steps_since_good + 1
-        self.watch = Watch(self._solver()) if since > 11 else replace(self.watch, steps_since_good=since)
+        self.watch = (
+            DivergenceState(self._solver()) if since > 11 else replace(self.watch, steps_since_good=since)
+        )
         self.pose = pose
         self.steps += 1
 
     def keep_good(self) -> None:
-        self.watch = Watch(self._solver())
+        self.watch = DivergenceState(self._solver())
 
     def pose_towards(self, goal: np.ndarray) -> np.ndarray:
         return approached(self.pose, goal, 150.0 * STEP_S, 180.0 * STEP_S)
@@ -243,11 +247,11 @@ def test_undo_and_redo_in_turn_keep_no_more_and_more(history):
     assert len(history.session.kept) <= 6
 
 
-def live_of(told: Told | None = None) -> Live:
-    return Live(Session(Numbers(), told), Ladder(1e6))
+def live_of(told: Told | None = None) -> UserInput:
+    return UserInput(Session(Numbers(), told), AdaptiveIterations(1e6))
 
 
-def step(live: Live, step_ms: float = 0.0, **did: Any) -> np.ndarray | None:
+def step(live: UserInput, step_ms: float = 0.0, **did: Any) -> np.ndarray | None:
     """A moment in which the user did something."""
     settings = did.pop("settings", None) or Settings(young_kpa=15.0)
     pose = live.move(Controls(settings, **did))
@@ -261,7 +265,7 @@ def ray(x_mm: float) -> tuple[np.ndarray, np.ndarray]:
     return np.array([x_mm, 0.0, 60.0]), DOWN
 
 
-def pressed_then_undone(at: Any) -> Live:
+def pressed_then_undone(at: Any) -> UserInput:
     """The mouse went to x = 5 mm, pressed there, and the press was undone."""
     live = live_of()
     for _ in range(8):
@@ -275,7 +279,7 @@ def pressed_then_undone(at: Any) -> Live:
 DID = [
     dict(ray=ray(2.0)),
     dict(press=True),
-    *({name: 0.5} for name in ("push_mm", "fan_deg", "tilt_deg", "roll_deg")),
+    *({name: 0.5} for name in ("push_mm", "tilt_deg", "rock_deg", "rotate_deg")),
     dict(slide_mm=(0.0, 0.5)),
 ]
 
@@ -305,12 +309,12 @@ def test_a_way_back_gives_the_hand_as_it_was_before_the_input():
     live = live_of()
     for _ in range(8):
         step(live, ray=ray(5.0))
-    hand = live.session.rehearsal.hand
-    before, pose = hand.grip, live.session.rehearsal.pose
-    step(live, ray=ray(-5.0), fan_deg=7.0, push_mm=0.5, press=True)
-    assert hand.grip.turn_deg == (7.0, 0.0, 0.0)
+    manipulator = live.session.rehearsal.manipulator
+    before, pose = manipulator.state, live.session.rehearsal.pose
+    step(live, ray=ray(-5.0), tilt_deg=7.0, push_mm=0.5, press=True)
+    assert manipulator.state.turn_deg == (7.0, 0.0, 0.0)
     step(live, undo=True)
-    grip = hand.grip
+    grip = manipulator.state
     assert (grip.depth_mm, grip.pressed_mm, grip.turn_deg) == (0.0, 0.0, (0.0, 0.0, 0.0))
     assert np.array_equal(grip.aim, before.aim)
     assert np.array_equal(live.session.rehearsal.pose, pose)
@@ -330,7 +334,7 @@ def test_the_iterations_that_were_done_are_recorded_not_those_asked_for():
 
 
 def test_a_step_that_is_too_slow_is_said_once():
-    live = Live(Session(Numbers()), Ladder(5.0))
+    live = UserInput(Session(Numbers()), AdaptiveIterations(5.0))
     live.move(Controls(Settings(young_kpa=15.0, iterations=8)))
     said = [live.stepped(step_ms) for step_ms in [9.0] * 21]
     assert [text for text in said if text] == ["LESS EXACT, TO KEEP PACE   6 of 8 iterations"]
@@ -358,9 +362,9 @@ def test_a_way_back_to_nowhere_is_said_and_no_moment_is_lost():
     assert live.session.moment == 5 and live.session.rehearsal.steps == 3
 
 
-def face(live: Live) -> np.ndarray:
+def face(live: UserInput) -> np.ndarray:
     """Where the hand aims."""
-    return (live.session.rehearsal.hand.aim @ [0, 0, -3.0, 1])[:3]
+    return (live.session.rehearsal.manipulator.aim @ [0, 0, -3.0, 1])[:3]
 
 
 def test_after_a_slide_the_mouse_leads_only_once_it_moves():
@@ -384,5 +388,5 @@ def test_a_press_by_a_share_goes_no_deeper():
     live = live_of()
     for _ in range(30):
         step(live, press=True, press_share=0.5)
-    hand = live.session.rehearsal.hand
-    assert hand.pressed_mm == pytest.approx(hand.most_mm / 2)
+    manipulator = live.session.rehearsal.manipulator
+    assert manipulator.pressed_mm == pytest.approx(manipulator.most_mm / 2)

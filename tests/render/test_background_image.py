@@ -14,9 +14,9 @@ from render.text import fitting_size, font, shortened, write
 from render.ultrasound_panel import ALERT, BEFORE, CALLIPER, OUTLINE, QUIET, TEXT
 from render.viewer import Geometry, Settings, View
 from render.window_frame import clock_box, findings_picture, readout_picture
-from render.window_layout import Layout, Rect
+from render.window_layout import Rect, WindowLayout
 
-LAYOUT = Layout(1280, 720)
+LAYOUT = WindowLayout(1280, 720)
 AXES = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, 1.0, 0]])
 FIGURES = {f"figure {k}": f"{k} mm" for k in range(14)}
 SQUARE = np.array([[[-4.0, 10.0], [4.0, 10.0]], [[4.0, 10.0], [4.0, 20.0]]])
@@ -36,7 +36,7 @@ def composed(page: Page, **changes) -> np.ndarray:
     return page.pixels.transpose(1, 0, 2)[::-1, :, :3].copy()
 
 
-def picture_boxes(layout: Layout) -> list[Rect]:
+def picture_boxes(layout: WindowLayout) -> list[Rect]:
     return layout.picture_boxes(2, 16.0, 40.0)
 
 
@@ -63,7 +63,7 @@ WHOLE = geometry(tumour_vertices=1, parts={"vessel": (1, 1)}, support_vertices=n
 
 @each_size
 def test_no_part_of_the_window_overlaps_another(size):
-    layout = Layout(*size)
+    layout = WindowLayout(*size)
     settings = Settings(young_kpa=15.0, show_scanner=True)
     placed = boxes_of(settings, WHOLE, layout)
     over = [layout.findings(layout.most_findings), layout.compass, placed["Echo"], placed["Gain over depth"]]
@@ -88,7 +88,7 @@ def test_echo_and_ct_of_the_drop_in_probe_fill_the_panel():
 
 @each_size
 def test_the_first_sliders_go_where_there_is_no_room(size):
-    layout = Layout(*size)
+    layout = WindowLayout(*size)
     names = list(boxes_of(Settings(young_kpa=15.0), WHOLE, layout))
     assert (layout.readouts.width == 0) == (size in ((700, 420), (1024, 576)))
     assert names == (["Picture", "View"] if size == (700, 420) else ["Tissue", "Picture", "View"])
@@ -98,7 +98,7 @@ def test_the_first_sliders_go_where_there_is_no_room(size):
 @pytest.mark.parametrize("tissue", ["young_kpa", "stiffness"])
 def test_labels_of_sliders_are_whole(width, tissue):
     settings = Settings(**{tissue: 0.9}, show_scanner=True)
-    layout = Layout(width, width * 9 // 16)
+    layout = WindowLayout(width, width * 9 // 16)
     groups = groups_of(settings, WHOLE)
     for name, box in boxes_of(settings, WHOLE, layout).items():
         for about in (member.metadata for member in groups[name]):
@@ -178,7 +178,7 @@ def test_no_contact_is_written_in_the_echo_alone():
 @pytest.mark.parametrize("size", [(1024, 576), (1088, 612), (1280, 720), (1920, 1080)])
 @pytest.mark.parametrize("hint", ["Left button or W presses", "Left button or Backspace presses"])
 def test_what_to_do_stands_whole_under_a_note(size, hint):
-    layout = Layout(*size)
+    layout = WindowLayout(*size)
     plain, hinted = (
         composed(Page(layout), notes={"B-mode": note}) for note in ("NO CONTACT", f"NO CONTACT\n{hint}")
     )
@@ -200,9 +200,9 @@ def test_what_to_do_stands_whole_under_a_note(size, hint):
         ((7.0, 20.0), (7.0, 20.0)),
     ],
 )
-def test_the_callipers_figure_stands_at_its_line(points):
+def test_the_calipers_figure_stands_at_its_line(points):
     bare, told = (
-        composed(Page(LAYOUT), calliper_mm=points, calliper=figure)
+        composed(Page(LAYOUT), caliper_mm=points, caliper=figure)
         for figure in ("", "24.0 mm\nat rest 25.1 mm")
     )
     for box in picture_boxes(LAYOUT):
@@ -248,7 +248,7 @@ def test_a_figure_that_has_nothing_to_say_is_a_dash():
 
 @pytest.mark.parametrize("size", [(1250, 703), (1280, 720), (1920, 1080), (3840, 2160)])
 def test_all_readouts_of_a_window_are_shown(size):
-    layout = Layout(*size)
+    layout = WindowLayout(*size)
     ends = [readout_picture(layout, dict(list(FIGURES.items())[:count])) for count in (6, 7)]
     rows = np.flatnonzero((ends[0] != ends[1]).any(axis=(1, 2)))
     # In a large window the lines move closer together for the seventh.
@@ -258,7 +258,7 @@ def test_all_readouts_of_a_window_are_shown(size):
 @each_size
 @pytest.mark.parametrize("help_key", ["H", "Backspace"])
 def test_clock_and_pace_stand_between_title_and_help_in_every_window(size, help_key):
-    layout, told = Layout(*size), {"clock": "1234.5 s", "title": "A long title of a patient " * 5}
+    layout, told = WindowLayout(*size), {"clock": "1234.5 s", "title": "A long title of a patient " * 5}
     page = Page(layout, Keys({**USUAL_KEYS, "help": help_key}))
     box = clock_box(layout, help_key)
     bare, real, slow = (composed(page, **told | more) for more in ({"clock": ""}, {}, {"pace": "0.2 x real"}))
@@ -273,7 +273,7 @@ def test_clock_and_pace_stand_between_title_and_help_in_every_window(size, help_
 
 @each_size
 def test_findings_grow_with_their_lines_and_the_last_go_where_room_ends(size):
-    layout = Layout(*size)
+    layout = WindowLayout(*size)
     assert layout.findings(11).height > layout.findings(9).height
     assert layout.most_findings >= (11 if size != (700, 420) else 7)
     empty, full = (composed(Page(layout), findings=figures, alert="figure 0") for figures in ({}, FIGURES))

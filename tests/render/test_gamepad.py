@@ -47,10 +47,10 @@ def test_sticks_slide_tilt_and_fan():
     (controls,) = read(PadState(left=(0.0, 1.0), right=(1.0, 0.0)))
     assert controls.slide_mm == pytest.approx((0.0, SLIDE_MM_S * SECONDS))
     # To the right is towards +x, and so a negative tilt.
-    assert (controls.tilt_deg, controls.fan_deg) == pytest.approx((-TILT_DEG_S * SECONDS, 0.0))
-    (controls,) = read(PadState(left=(-1.0, 0.0), right=(0.0, -1.0)), fan_deg=5.0)
+    assert (controls.rock_deg, controls.tilt_deg) == pytest.approx((-TILT_DEG_S * SECONDS, 0.0))
+    (controls,) = read(PadState(left=(-1.0, 0.0), right=(0.0, -1.0)), tilt_deg=5.0)
     assert controls.slide_mm == pytest.approx((-SLIDE_MM_S * SECONDS, 0.0))
-    assert (controls.tilt_deg, controls.fan_deg) == pytest.approx((0.0, 5.0 - TILT_DEG_S * SECONDS))
+    assert (controls.rock_deg, controls.tilt_deg) == pytest.approx((0.0, 5.0 - TILT_DEG_S * SECONDS))
 
 
 def test_the_trigger_presses_as_deep_as_it_is_pulled():
@@ -67,11 +67,11 @@ def test_buttons_begin_and_hold():
         PadState(pressed=("A", "Y")), PadState(held=frozenset({"A", "Pad up", "Left shoulder"}))
     )
     assert first.freeze and first.sweep and not first.undo and first.push_mm == 0.0
-    assert not then.freeze and then.push_mm == pytest.approx(0.3) and then.roll_deg == pytest.approx(0.9)
+    assert not then.freeze and then.push_mm == pytest.approx(0.3) and then.rotate_deg == pytest.approx(0.9)
     (down,) = read(
         PadState(held=frozenset({"Pad down", "Right shoulder"}), pressed=("B", "X", "Start", "Pad down"))
     )
-    assert down.push_mm == pytest.approx(-0.3) and down.roll_deg == pytest.approx(-0.9)
+    assert down.push_mm == pytest.approx(-0.3) and down.rotate_deg == pytest.approx(-0.9)
     assert down.undo and down.bookmark and down.reset
 
 

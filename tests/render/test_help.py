@@ -8,7 +8,7 @@ from PIL import ImageDraw
 from render.keys import Keys
 from render.viewer import KEY_MAP, LINES, key_table
 from render.window_frame import help_picture, in_columns
-from render.window_layout import FULL_SIZE, Layout
+from render.window_layout import FULL_SIZE, WindowLayout
 
 
 def test_key_map_names_every_key_and_action_once():
@@ -34,7 +34,7 @@ def test_the_readme_has_the_key_map():
     "size", [(700, 420), (1024, 600), (1202, 676), (1280, 720), (1920, 1080), (2560, 1440)]
 )
 def test_all_keys_fit_into_the_help_of_any_window(monkeypatch, size):
-    layout, written = Layout(*size), []
+    layout, written = WindowLayout(*size), []
     text = ImageDraw.ImageDraw.text
 
     def noted(draw, place, words, **how):

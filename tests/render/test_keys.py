@@ -9,7 +9,7 @@ import pytest
 from conftest import ROOT
 
 import app
-from rehearsal.frame import Loop
+from rehearsal.frame import FrameLoop
 from render.actions import ACTIONS, BY_MOUSE, CYCLES, HELD, STEPS, begin, hold
 from render.keys import KEYS, USUAL_BUTTONS, USUAL_KEYS, VIEW_ALONE, Keys, KeysError, keys_text, load_keys
 from render.viewer import KEY_MAP, LINES, Controls, NullViewer, Settings
@@ -61,12 +61,12 @@ def test_an_action_changes_what_it_is_named_for():
     [
         ("push", "push_mm", 15.0),
         ("lift", "push_mm", -15.0),
-        ("roll_left", "roll_deg", 45.0),
-        ("roll_right", "roll_deg", -45.0),
-        ("tilt_left", "tilt_deg", 30.0),
-        ("tilt_right", "tilt_deg", -30.0),
-        ("fan_back", "fan_deg", -30.0),
-        ("fan_forth", "fan_deg", 30.0),
+        ("rotate_left", "rotate_deg", 45.0),
+        ("rotate_right", "rotate_deg", -45.0),
+        ("rock_left", "rock_deg", 30.0),
+        ("rock_right", "rock_deg", -30.0),
+        ("tilt_back", "tilt_deg", -30.0),
+        ("tilt_forward", "tilt_deg", 30.0),
     ],
 )
 def test_a_held_action_goes_on_with_time(action, name, a_second):
@@ -80,7 +80,7 @@ def test_a_held_action_goes_on_with_time(action, name, a_second):
 def test_what_is_said_names_the_users_keys(tmp_path, capsys):
     keys = Keys(of=USUAL_KEYS | {"sweep": "Space", "plan_for": "L"})
     parts = [None, None, SimpleNamespace(status=""), None]
-    loop = Loop(None, NullViewer(), tmp_path, None, *parts, keys=keys)
+    loop = FrameLoop(None, NullViewer(), tmp_path, None, *parts, keys=keys)
     loop._announce("sweep-001: {sweep} ends it")
     assert capsys.readouterr().out == "sweep-001: Space ends it\n"
     assert loop._status(SimpleNamespace(status="")) == "Sweep-001: Space ends it"

@@ -16,11 +16,11 @@ from render.cut_face import FLESH
 from render.display import display_available, fitted, window_size
 from render.ultrasound_panel import Panel
 from render.viewer import Controls, Geometry, NullViewer, Settings, View
-from render.window_layout import FULL_SIZE, RULER_WIDTH, Layout
+from render.window_layout import FULL_SIZE, RULER_WIDTH, WindowLayout
 from sim.fields import fill
 
 BOUNDS = np.array([[-54.0, -33.0, -21.0], [54.0, 27.0, 21.0]])
-LAYOUT = Layout(1280, 720)
+LAYOUT = WindowLayout(1280, 720)
 
 
 def _camera(up=(0.0, 0.0, 1.0)) -> OrbitCamera:
@@ -117,7 +117,7 @@ def test_solids_face_outward(kind):
         inside = np.isin(parts.indices.reshape(-1, 3), lens).all(axis=1)
         middle = parts.vertices[lens].mean(axis=0)
         faces = parts.indices.reshape(-1, 3)[inside] - lens[0]
-        solid = transducer_shape.Solid(
+        solid = transducer_shape.TransducerShape(
             parts.vertices[lens] - middle, parts.normals[lens], parts.colours[lens], faces.reshape(-1)
         )
         # The arc's middle is the lowest, where the image starts.

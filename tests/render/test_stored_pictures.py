@@ -16,7 +16,7 @@ from PIL import Image
 
 from render.ultrasound_panel import OUTLINE, Panel, draw_segments, paste_picture
 from render.viewer import Geometry, Settings, View
-from render.window_layout import Layout
+from render.window_layout import WindowLayout
 from sim.device import start
 from sim.embedding import Embedding
 from sim.fields import array_of
@@ -94,7 +94,7 @@ class Scene:
         )
         panel, page = Panel(tuple(shown), WIDTH, DEPTH), np.zeros((*SMALL_WINDOW[::-1], 3), np.uint8)
         pasted = {}
-        for (name, picture), box in zip(shown.items(), panel.boxes(Layout(*SMALL_WINDOW)), strict=True):
+        for (name, picture), box in zip(shown.items(), panel.boxes(WindowLayout(*SMALL_WINDOW)), strict=True):
             paste_picture(page, box, picture)
             draw_segments(page, panel, box, outline, OUTLINE)
             pasted[name] = page[box.slices].copy()

@@ -5,9 +5,9 @@ import pytest
 
 from render import ultrasound_panel, window_frame
 from render.ultrasound_panel import Panel, font
-from render.window_layout import HEADER_HEIGHT, RULER_WIDTH, Layout
+from render.window_layout import HEADER_HEIGHT, RULER_WIDTH, WindowLayout
 
-LAYOUT = Layout(1280, 720)
+LAYOUT = WindowLayout(1280, 720)
 
 
 def test_slice_of_the_size_of_its_box_appears_unchanged_and_nothing_else_is_written():
@@ -114,7 +114,7 @@ PLANNING = "PLANNING   43 %, some 18 min left; Backspace stops"
     ["FROZEN", PLANNING, f"RECORDING 12 s   TISSUE SQUEEZED BY 12 mm   {PLANNING}"],
 )
 def test_a_status_is_as_large_as_it_can_be_in_the_panel(size, status):
-    layout = Layout(*size)
+    layout = WindowLayout(*size)
     plain, with_status = (
         window_frame.backdrop(layout, Panel(("CT",), 40.0, 60.0, status=each))[:, layout.panel.left :].astype(
             int

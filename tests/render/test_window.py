@@ -161,7 +161,7 @@ def test_the_mouse_moves_and_presses_the_transducer(screen):
         screen.do("mouseup", 1)
     measured = screen.picture()
     green = (measured == CALLIPER).all(axis=2)[PANEL]
-    assert green.sum() > 100, "two clicks on the echo draw no calliper"
+    assert green.sum() > 100, "two clicks on the echo draw no caliper"
     screen.do("key", "--window", screen.window, "e")
     exported = screen.out / "001-b-mode.dcm"
     end = time.monotonic() + 20

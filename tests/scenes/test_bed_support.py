@@ -10,7 +10,7 @@ from scenes.patients.bed_support import bed_of_file, bed_of_labels
 from scenes.patients.import_error import PatientError
 from scenes.patients.patient_import import SUPINE_GRAVITY, import_patient
 from scenes.patients.readers.label_maps import LabelMap
-from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.lazy_volume import LazyVolume
 
 # A muscle behind the left kidney, with 4 mm of fat between.
 MUSCLE = np.array([70.0, 79.0, 12.0]), np.array([45.0, 20.0, 70.0])
@@ -30,7 +30,7 @@ def small_organs_bed(muscle: tuple[np.ndarray, np.ndarray]) -> tuple[trimesh.Tri
 @pytest.fixture(scope="module")
 def ct_and_labels():
     ct, labels = body(spacing=(2.5, 2.5, 2.5))
-    return Volume.of(ct), drawn(labels, (4, MUSCLE), (2, LEFT), (3, TUMOUR))
+    return LazyVolume.of(ct), drawn(labels, (4, MUSCLE), (2, LEFT), (3, TUMOUR))
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from scenes.patients.check_picture import (
 from scenes.patients.import_summary import facts
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.label_maps import LabelMap
-from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.lazy_volume import LazyVolume
 from scenes.patients.readers.voxel_grid import VoxelGrid
 
 LETTER = {(1, 0, 0): "L", (-1, 0, 0): "R", (0, 1, 0): "P", (0, -1, 0): "A", (0, 0, 1): "S", (0, 0, -1): "I"}
@@ -30,7 +30,7 @@ NAMES = {2: "kidney_left", 3: "tumour"}
 @pytest.fixture(scope="module")
 def patient():
     ct, labels = body(spacing=(3.0, 3.0, 3.0))
-    return import_patient(Volume.of(ct), LabelMap.of(labels, NAMES), side="left", margin_mm=30.0)
+    return import_patient(LazyVolume.of(ct), LabelMap.of(labels, NAMES), side="left", margin_mm=30.0)
 
 
 @pytest.mark.parametrize("view", [*VIEWS, WHOLE], ids=lambda view: view.name)

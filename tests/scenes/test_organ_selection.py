@@ -13,7 +13,7 @@ from scenes.patients.organ_selection import hollow, midline_x, organs
 from scenes.patients.part_surfaces import PEDICLE_MM, bodies, colours_of_labels, near_organ
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.label_maps import LabelMap, Segment
-from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.lazy_volume import LazyVolume
 from scenes.patients.readers.voxel_grid import VoxelGrid
 
 
@@ -128,7 +128,7 @@ def test_vessels_are_no_bed(ct_and_labels, monkeypatch):
     ct, labels = ct_and_labels
     vessel = LEFT[0] + [0, 30, 0], np.array([20.0, 8.0, 40.0])
     named = LabelMap.of(drawn(labels, (4, vessel), (2, LEFT)), {2: "kidney_left", 4: "renal vein"})
-    import_patient(Volume.of(ct), named, margin_mm=5.0, support="labels")
+    import_patient(LazyVolume.of(ct), named, margin_mm=5.0, support="labels")
     assert set(given["own"]) == {2, 4}
 
 
@@ -140,5 +140,5 @@ def test_marks_of_the_organ_alone(ct_and_labels, monkeypatch):
     named = LabelMap.of(
         drawn(labels, (1, RIGHT), (2, LEFT), (3, other)), {1: "kidney_right", 2: "kidney_left", 3: "mass"}
     )
-    patient = import_patient(Volume.of(ct), named, side="left", margin_mm=150.0)
+    patient = import_patient(LazyVolume.of(ct), named, side="left", margin_mm=150.0)
     assert set(np.unique(sitk.GetArrayViewFromImage(patient.labels)).tolist()) == {0, 1} and not patient.parts

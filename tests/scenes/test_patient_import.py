@@ -32,7 +32,7 @@ from scenes.patients.patient_folder import save_patient
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.ct_files import open_ct
 from scenes.patients.readers.label_maps import LabelMap, with_tissues
-from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.lazy_volume import LazyVolume
 from scenes.patients.readers.voxel_grid import VoxelGrid
 from scenes.scene import SceneError
 
@@ -50,7 +50,7 @@ def label_map(labels, organ=(), **tissues):
 
 def imported(ct, labels, organ=(), side=None, margin_mm=60.0, **tissues):
     labelled = label_map(labels, organ, **tissues)
-    return import_patient(Volume.of(ct), *labelled, side, margin_mm, needed=set(tissues))
+    return import_patient(LazyVolume.of(ct), *labelled, side, margin_mm, needed=set(tissues))
 
 
 def found(ct, labels, organ=(), side=None, **tissues):
@@ -183,15 +183,15 @@ class TestImport:
         ct, labels = ct_and_labels
         near = [slice(ct.TransformPhysicalPointToIndex((30.0, 0, 0))[0], None), slice(None), slice(None)]
         named = LabelMap.of(labels[near], {2: "kidney_left", 3: "kidney tumour"})
-        assert import_patient(Volume.of(ct[near]), named, margin_mm=10.0).side == "left"
+        assert import_patient(LazyVolume.of(ct[near]), named, margin_mm=10.0).side == "left"
         with pytest.raises(PatientError, match="called by the other side's name"):
-            import_patient(Volume.of(ct[near]), named, side="right", margin_mm=10.0)
+            import_patient(LazyVolume.of(ct[near]), named, side="right", margin_mm=10.0)
         mirrored = LabelMap.of(labels, {1: "kidney_left", 2: "kidney_right", 3: "tumour"})
         with pytest.raises(PatientError, match="lies on the patient's left, which its name denies"):
-            import_patient(Volume.of(ct), mirrored, side="left", margin_mm=10.0)
+            import_patient(LazyVolume.of(ct), mirrored, side="left", margin_mm=10.0)
         other = LabelMap.of(labels, {1: "liver", 2: "spleen", 3: "stomach"})
         with pytest.raises(PatientError, match="no label says that it is a kidney: 1 liver, 2 spleen"):
-            import_patient(Volume.of(ct), other)
+            import_patient(LazyVolume.of(ct), other)
 
 
 class TestImportRefuses:
@@ -380,6 +380,6 @@ def test_what_touches_by_a_corner_is_held_and_what_only_touches_is_no_part(ct_an
     label = LabelMap.valued(grid, values, {1: "kidney", 2: "tumour"})
     (piece,) = organs(label)
     assert 16**3 + 5**3 < piece.mask.sum() <= 16**3 + 5**3 + 8
-    patient = import_patient(Volume.of(ct), label, side="left", margin_mm=10.0)
+    patient = import_patient(LazyVolume.of(ct), label, side="left", margin_mm=10.0)
     assert patient.organ.body_count == 1
     assert patient.organ.volume / 1000 == pytest.approx(patient.volumes_ml["organ"], rel=0.02)

@@ -28,7 +28,7 @@ from synthetic_body import DIRECTIONS, grid_around, with_voxels
 from scenes.patients.import_error import PatientError
 from scenes.patients.readers.ct_files import open_ct
 from scenes.patients.readers.label_files import open_labels
-from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.lazy_volume import LazyVolume
 
 AIR = -1000
 FAILING = "dicom/dicom2nifti/tests/data/failing"
@@ -140,7 +140,7 @@ class TestFiles:
 
     def test_image_in_memory(self):
         """A volume keeps its voxels when nobody keeps the image."""
-        volume = Volume.of(noise())
+        volume = LazyVolume.of(noise())
         others = [sitk.Image(noise().GetSize(), sitk.sitkInt16) + n for n in range(20)]
         assert np.array_equal(volume.hounsfield(), sitk.GetArrayFromImage(noise())), len(others)
 

@@ -12,7 +12,7 @@ from scenes.anatomy import PHANTOM_TISSUES, phantom_folder
 from scenes.patients.import_error import PatientError
 from scenes.patients.readers.ct_files import open_ct
 from scenes.patients.readers.label_maps import LabelMap, box_of, nearest
-from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.lazy_volume import LazyVolume
 from scenes.patients.readers.volume_readers import file_volume
 from scenes.patients.readers.voxel_grid import VoxelGrid
 from scenes.patients.region_growing import DRAFT, WORKING_MM, grown
@@ -64,7 +64,7 @@ def seeds_in(grid: VoxelGrid, inside: np.ndarray, count: int, deep_mm: float = 5
 
 def refused(ct, seed, words):
     with pytest.raises(PatientError, match=words) as error:
-        grown(Volume.of(ct), seed)
+        grown(LazyVolume.of(ct), seed)
     assert "\n" not in str(error.value) and "seed" in str(error.value)
 
 
@@ -86,7 +86,7 @@ class TestSynthetic:
     )
     def test_parts_from_what_touches(self, kidney, liver, touching, noise, off):
         ct = scanned([(55.0, PSOAS), (liver, touching), (kidney, KIDNEY)], noise)
-        labels = grown(Volume.of(ct), CENTRE + off)
+        labels = grown(LazyVolume.of(ct), CENTRE + off)
         truth = level(points_of(ct), KIDNEY) < 0
         assert dice(placed(labels, VoxelGrid.of(ct)), truth) > 1 - ONE_VOXEL
         assert labels.segments == {1: DRAFT} and labels.segments[1].tissue == "kidney"
@@ -95,13 +95,13 @@ class TestSynthetic:
         sinus = CENTRE, np.array([8.0, 8.0, 12.0])
         hilum = CENTRE + [-20.0, 0.0, 0.0], np.array([20.0, 3.0, 3.0])
         ct = scanned([(150.0, KIDNEY), (FAT_HU, sinus), (FAT_HU, hilum)])
-        found = placed(grown(Volume.of(ct), CENTRE + [12.0, -6.0, -30.0]), VoxelGrid.of(ct))
+        found = placed(grown(LazyVolume.of(ct), CENTRE + [12.0, -6.0, -30.0]), VoxelGrid.of(ct))
         assert found[level(points_of(ct), sinus) < 0].all()
 
     @pytest.mark.parametrize("direction", ["RAS", "oblique"])
     def test_lies_where_the_kidney_is(self, direction):
         ct = scanned([(150.0, KIDNEY)], direction=direction)
-        labels = grown(Volume.of(ct), CENTRE + [8.0, -4.0, 20.0])
+        labels = grown(LazyVolume.of(ct), CENTRE + [8.0, -4.0, 20.0])
         places = labels.grid.place(np.argwhere(labels.values)[:, ::-1])
         np.testing.assert_allclose(places.mean(axis=0), CENTRE, atol=0.5 * WORKING_MM)
         volume_ml = len(places) * np.prod(labels.grid.spacing) / 1000
@@ -111,15 +111,15 @@ class TestSynthetic:
         np.testing.assert_allclose(start, np.rint(start), atol=1e-6)
 
     def test_same_seed_same_voxels(self, crowded):
-        first, second = (grown(Volume.of(crowded), CENTRE) for _ in range(2))
+        first, second = (grown(LazyVolume.of(crowded), CENTRE) for _ in range(2))
         assert first.grid.same_as(second.grid)
         np.testing.assert_array_equal(first.values, second.values)
 
     def test_reads_only_around_the_seed(self, monkeypatch):
         monkeypatch.setattr("scenes.patients.region_growing.REACH_MM", 65.0)
         image = scanned([(150.0, KIDNEY)], spacing=(3.0, 3.0, 3.0), half_mm=80.0)
-        whole, read = Volume.of(image), []  # a view: the image has to stay
-        ct = Volume(whole.name, whole.grid, lambda box: (read.append(box), whole.read_box(box))[1])
+        whole, read = LazyVolume.of(image), []  # a view: the image has to stay
+        ct = LazyVolume(whole.name, whole.grid, lambda box: (read.append(box), whole.read_box(box))[1])
         grown(ct, CENTRE)
         assert len(read) == 1
         assert all((a.stop - a.start - 2) * 3.0 <= 2 * 65.0 for a in read[0])

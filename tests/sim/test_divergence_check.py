@@ -17,13 +17,13 @@ from sim.divergence_check import (
     PATIENCE_S,
     PATIENCE_STEPS,
     TORN,
-    Guard,
+    DivergenceCheck,
     tetrahedra_among,
 )
 from sim.fields import array_of, fill
 from sim.shapes import GRID_MM, HAIR_CELLS, ConvexTool, Plane, SignedDistanceField
 from sim.solver import Solver, StepSettings
-from sim.time_of_impact import DEEP_MM, FreeWay
+from sim.time_of_impact import DEEP_MM, TimeOfImpact
 
 DOWN = (0.0, 0.0, -G)
 DT = 1 / 60
@@ -84,7 +84,7 @@ def test_tetrahedra_are_small_and_none_is_flat():
 @pytest.mark.parametrize("model", MODELS)
 def test_a_guard_lets_tissue_be_pressed_and_puts_back_what_is_none(kept, ball, model):
     solver = kept(solver_of, model, ball, floor, tool)
-    guard = Guard(solver)
+    guard = DivergenceCheck(solver)
     poses = np.tile(np.eye(4), (settings(model).substeps + 1, 1, 1))
     for step in range(90):
         poses[:, 2, 3] = 17.0 - 4.0 * min(step / 60, 1.0)
@@ -109,7 +109,7 @@ def test_a_guard_lets_tissue_be_pressed_and_puts_back_what_is_none(kept, ball, m
 def test_a_tangle_is_given_time_and_then_put_back(kept, ball, model):
     solver = kept(solver_of, model, ball, floor, tool)
     away(solver)
-    guard = Guard(solver)
+    guard = DivergenceCheck(solver)
     mirrored = solver.body.rest_points * [1, 1, -1]
     flat = solver.body.rest_points * [1, 1, 1e-3]
     for state in (mirrored, flat, 5.0 * solver.body.rest_points):
@@ -124,7 +124,7 @@ def test_a_tangle_is_given_time_and_then_put_back(kept, ball, model):
 @pytest.mark.parametrize("model", MODELS)
 def test_tissue_is_torn_where_an_edge_is_as_many_times_its_own_length_as_that_takes(kept, ball, model):
     solver = kept(solver_of, model, ball, floor)
-    guard = Guard(solver)
+    guard = DivergenceCheck(solver)
     for share, tangled in ((0.99, 0.0), (1.01, 1.0)):
         put(solver, share * TORN * solver.body.rest_points)
         assert guard.health().tangled == tangled
@@ -132,7 +132,7 @@ def test_tissue_is_torn_where_an_edge_is_as_many_times_its_own_length_as_that_ta
 
 def test_a_tangle_that_was_undone_is_given_its_time_again(kept, ball):
     solver = kept(solver_of, "neo-hookean", ball, floor)
-    guard = Guard(solver)
+    guard = DivergenceCheck(solver)
     rest = solver.body.rest_points
     # Undone too early for a good state to be kept, which would begin anew as well.
     for count in (KEEP_STEPS - 10, PATIENCE_STEPS):
@@ -149,7 +149,7 @@ def test_a_tangle_that_was_undone_is_given_its_time_again(kept, ball):
 
 def test_what_the_tool_crushes_is_no_tangle(kept, ball):
     solver = kept(solver_of, "neo-hookean", ball, floor, tool)
-    guard = Guard(solver)
+    guard = DivergenceCheck(solver)
     put(solver, solver.body.rest_points * [1, 1, -1])
     at = np.eye(4)
     solver.tool.move(at, at)
@@ -206,7 +206,7 @@ def field_of(values) -> ti.Field:
 
 def share_of(shapes: list, start, way, free: float) -> float:
     out = ti.field(ti.f32, 1)
-    go(FreeWay(shapes), field_of(start), field_of(way), free, out)
+    go(TimeOfImpact(shapes), field_of(start), field_of(way), free, out)
     return float(out[0])
 
 
@@ -304,7 +304,7 @@ def test_a_pose_that_is_no_number_is_refused(kept, ball):
 
 def test_tissue_is_kept_for_good_when_asked_for_but_not_what_is_none(kept, ball):
     solver = kept(solver_of, "neo-hookean", ball, floor)
-    guard = Guard(solver)
+    guard = DivergenceCheck(solver)
     for _ in range(5):
         solver.step(settings("neo-hookean"))
         guard.check(DT)

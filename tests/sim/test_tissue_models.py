@@ -16,7 +16,7 @@ from scenes.scene import SolverSection
 from scenes.tissue import QUALITIES, TISSUES, TissueSection
 from sim.body import BodyState
 from sim.device import start
-from sim.divergence_check import Guard
+from sim.divergence_check import DivergenceCheck
 from sim.embedding import Embedding
 from sim.fields import array_of
 from sim.shapes import ConvexTool, Plane
@@ -250,7 +250,7 @@ ABUSES = {
 
 @pytest.mark.parametrize("abuse", ABUSES)
 def test_whatever_was_done_to_it_it_stays_finite(laid, abuse):
-    guard, rest = Guard(laid.solver), laid.solver.body.rest_points
+    guard, rest = DivergenceCheck(laid.solver), laid.solver.body.rest_points
     extremes = (
         laid.settings(G),
         laid.settings(10 * G, time_step_s=0.1, iterations=1),

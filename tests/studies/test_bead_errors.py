@@ -16,7 +16,7 @@ from rehearsal.configuration import PRESETS, SetupError, choose_setup, setup_of
 from scenes.scene import SolverSection
 from scenes.tissue import QUALITIES, TISSUES
 from sim.fields import array_of
-from studies.accuracy.bead_case import Case, load_case
+from studies.accuracy.bead_case import BeadCase, load_case
 from studies.accuracy.bead_errors import (
     bead_errors,
     correlation,
@@ -27,7 +27,7 @@ from studies.accuracy.bead_errors import (
     summary,
     table,
 )
-from studies.accuracy.bead_experiment import Experiment, Run
+from studies.accuracy.bead_experiment import BeadExperiment, BeadRun
 
 KEYS = {
     "case",
@@ -48,7 +48,7 @@ BRIEF = setup_of("shape-matching", radius_mm=3.0, warm_up_steps=12, stage_steps=
 
 
 @pytest.fixture
-def case(tmp_path) -> Case:
+def case(tmp_path) -> BeadCase:
     return load_case(write_case(tmp_path / "ball"))
 
 
@@ -95,9 +95,9 @@ def test_distance_from_the_probe_is_that_of_the_rounded_cuboid_at_its_pose(case)
 
 
 def test_report_and_table_show_these_figures(device, case):
-    experiment = Experiment(case, COARSE)
+    experiment = BeadExperiment(case, COARSE)
     off = np.linspace(0, 1, 12)[:, None] * np.array([0.0, 0.0, 1.0])
-    run = Run(case.measured + off, step_ms=[1.0, 2.0, 6.0])
+    run = BeadRun(case.measured + off, step_ms=[1.0, 2.0, 6.0])
     figures = report(experiment, COARSE, run)
     assert set(figures) == KEYS | {"clusters", "memberships"} and figures["case"] == "ball"
     assert figures["overall_mean_mm"] == pytest.approx(0.5)
@@ -114,7 +114,7 @@ def test_report_and_table_show_these_figures(device, case):
     assert rows[4].split() == ["all", "0.50", "1.00", f"{null.mean():.2f}", f"{0.5 / null.mean():.2f}"]
     assert sum(int(row.split("(")[1].split()[0]) for row in rows if "bead positions" in row) == 24
     # What is not finite is said, and is valid JSON.
-    lost = Run(np.full_like(case.measured, np.nan), [1.0], finite=False)
+    lost = BeadRun(np.full_like(case.measured, np.nan), [1.0], finite=False)
     figures = report(experiment, COARSE, lost)
     assert figures["finite"] is False and figures["overall_mean_mm"] is None
     json.dumps(figures, allow_nan=False)
@@ -126,7 +126,7 @@ def test_the_probe_waits_above_then_goes_to_each_stage_and_rests_there_wherever_
     organ, support = (mesh.copy().apply_translation(far) for mesh in (case.organ, case.support))
     poses = case.poses + np.pad(far[:, None], ((0, 1), (3, 0)))
     moved = replace(case, organ=organ, support=support, beads=case.beads + far, poses=poses)
-    experiment = Experiment(moved, COARSE)
+    experiment = BeadExperiment(moved, COARSE)
     seen = []
     experiment.solver.step = lambda settings, poses: seen.append(poses)
     run = experiment.run(COARSE)
@@ -144,7 +144,7 @@ def test_the_probe_waits_above_then_goes_to_each_stage_and_rests_there_wherever_
 
 
 def test_a_pressed_ball_sinks_the_same_every_time_whatever_ran_between(device, case):
-    experiment = Experiment(case, COARSE)
+    experiment = BeadExperiment(case, COARSE)
     first = experiment.run(BRIEF)
     other = experiment.run(BRIEF.but(stiffness=0.4, iterations=5))
     again = experiment.run(BRIEF)
@@ -218,5 +218,5 @@ def test_a_real_case_is_pressed(device, data):
     # The README of the truth names these displacements.
     assert null_errors(case).mean(axis=1) == pytest.approx([0, 0.86, 1.45, 1.96], abs=0.006)
     setup = BRIEF.but(radius_mm=6.0)
-    run = Experiment(case, setup).run(setup)
+    run = BeadExperiment(case, setup).run(setup)
     assert run.finite and 0.3 < bead_errors(case, run.beads).mean() < 2.0

@@ -14,7 +14,7 @@ from sim.fields import fill
 from sim.neo_hookean import HOURGLASS
 from studies.beam.beam_command import markers_on
 from studies.beam.beam_comparison import mean_length, measured_oscillation, theory
-from studies.beam.cantilever import Cantilever, Material
+from studies.beam.cantilever import BeamMaterial, Cantilever
 from studies.beam.motion_capture import COLUMNS, BeamError, load_captures, oscillation, read_capture
 
 FRAMES = 300
@@ -102,7 +102,7 @@ def test_no_frequency_without_enough_swings(height):
 
 def test_theory_of_a_heavy_load_is_a_spring_that_carries_some_of_the_beam():
     # Rayleigh: 33/140 of the beam's mass swings with the load, to 1 in 1000 where the load is five times the beam.
-    material = Material(263.8, 0.499, 1.07)
+    material = BeamMaterial(263.8, 0.499, 1.07)
     _, hz = theory([30.0, 30.0, 100.0], material, 500.0)
     stiffness = 3 * 263.8e3 * 0.03**4 / 12 / 0.1**3
     assert hz == pytest.approx(np.sqrt(stiffness / (0.5 + 33 / 140 * 0.0963)) / (2 * np.pi), rel=1e-3)
@@ -110,7 +110,7 @@ def test_theory_of_a_heavy_load_is_a_spring_that_carries_some_of_the_beam():
 
 @pytest.mark.parametrize("load_g", [0.0, 3.0])
 def test_a_slender_beam_sags_and_swings_as_beam_theory_says(device, load_g):
-    size, material = np.array([10.0, 10.0, 60.0]), Material(2000.0, 0.0, 1.07)
+    size, material = np.array([10.0, 10.0, 60.0]), BeamMaterial(2000.0, 0.0, 1.07)
     beam = Cantilever(size, material, 5.0, load_g)
     sag, hz = theory(size, material, load_g)
     rest = beam.rest()
@@ -139,7 +139,7 @@ def test_markers_stand_where_the_recordings_have_them():
 
 def test_markers_turn_with_the_end_that_they_stand_on(device):
     size = np.array([30.0, 30.0, 100.0])
-    beam = Cantilever(size, Material(263.8, 0.45, 1.07), 10.0, 0.0, markers_on(size))
+    beam = Cantilever(size, BeamMaterial(263.8, 0.45, 1.07), 10.0, 0.0, markers_on(size))
     turn = rotation_about([0.3, 1.0, 0.2], 25.0)
     fill((beam.body.position, (beam.body.rest_points @ turn.T)))
     # float32 keeps some 1e-5 of 100 mm.
@@ -167,7 +167,7 @@ def test_the_command_compares_draws_and_reports(tmp_path, capsys):
 
 def test_cells_that_do_not_fill_the_beam_are_refused(device):
     with pytest.raises(BeamError, match="no whole number of 7 mm cells"):
-        Cantilever(np.array([30.0, 30.0, 100.0]), Material(263.8, 0.45, 1.07), 7.0)
+        Cantilever(np.array([30.0, 30.0, 100.0]), BeamMaterial(263.8, 0.45, 1.07), 7.0)
 
 
 def test_what_the_command_misses_is_one_line(tmp_path, capsys):
@@ -188,7 +188,7 @@ def test_the_silicone_beam_within_a_tenth(device, data):
     # Poisson's ratio is 0.499; 0.45 is 10 times quicker and moves the rest by 2%, the frequency by 1%. The rest is for
     # what 10 mm cells add to 4%, by which the finer ones of the command are off.
     size = np.array([30.0, 30.0, 100.0])
-    beam = Cantilever(size, Material(263.8, 0.45, 1.07), 10.0, 0.0, markers_on(size))
+    beam = Cantilever(size, BeamMaterial(263.8, 0.45, 1.07), 10.0, 0.0, markers_on(size))
     assert mean_length(beam.rest().displacement_mm) == pytest.approx(
         mean_length(captures[0].final_mm()), rel=0.1
     )

@@ -18,12 +18,12 @@ import studies.accuracy.case_workers as workers
 from app import main
 from rehearsal.configuration import Setup, setup_of
 from sim.sampling import SamplingError
-from studies.accuracy.bead_case import Case, load_case
+from studies.accuracy.bead_case import BeadCase, load_case
 from studies.accuracy.bead_errors import null_errors
 from studies.accuracy.calibration import (
     MODEL,
     CalibrationError,
-    Trial,
+    CalibrationTrial,
     exhaustive,
     exhaustive_count,
     finer_grid,
@@ -47,11 +47,11 @@ def folders(tmp_path_factory) -> list[Path]:
 
 
 @pytest.fixture(scope="module")
-def cases(folders) -> list[Case]:
+def cases(folders) -> list[BeadCase]:
     return [load_case(folder) for folder in folders]
 
 
-def pretended(case: Case, setup: Setup) -> Measured:
+def pretended(case: BeadCase, setup: Setup) -> Measured:
     """Errors as if each radius had a best stiffness; the last stage has another, which must not be seen in a fit."""
     off = np.array(
         [setup.tissue.stiffness - BEST[setup.tissue.radius_mm]] * 2 + [setup.tissue.stiffness - 0.9]
@@ -107,8 +107,8 @@ def test_the_exhaustive_search_finds_the_best_of_what_is_fitted_on_and_judges_it
     assert found.null_mm() == pytest.approx(null)
 
 
-def trial(stiffness: float, fit_mm: float) -> Trial:
-    return Trial(setup_of(MODEL, stiffness=stiffness), (), fit_mm, 0.0)
+def trial(stiffness: float, fit_mm: float) -> CalibrationTrial:
+    return CalibrationTrial(setup_of(MODEL, stiffness=stiffness), (), fit_mm, 0.0)
 
 
 def test_a_quartic_is_found_again_and_its_least_too():

@@ -9,8 +9,8 @@ from small_bead_case import write_case
 
 from app import cli, main
 from rehearsal.configuration import PRESETS, Setup, choose_setup, setup_of
-from studies.accuracy.bead_case import Case, load_case
-from studies.accuracy.bead_experiment import Run
+from studies.accuracy.bead_case import BeadCase, load_case
+from studies.accuracy.bead_experiment import BeadRun
 from studies.accuracy.convergence_study import changes_of, moved
 
 
@@ -39,15 +39,15 @@ def test_each_change_is_of_one_setting(model):
 class Drifting:
     """Stands for an Experiment: its beads drift along x by what the setup has of iterations, steps and cells."""
 
-    def __init__(self, case: Case, setup: Setup) -> None:
+    def __init__(self, case: BeadCase, setup: Setup) -> None:
         self.case, self.cell_mm = case, setup.size_mm
 
-    def run(self, setup: Setup) -> Run:
+    def run(self, setup: Setup) -> BeadRun:
         assert setup.size_mm == self.cell_mm
         beads = self.case.measured.copy()
         beads[..., 0] += setup.iterations + 100 * setup.stage_steps * setup.time_step_s
         beads[-1, 0, 0] += setup.size_mm
-        return Run(beads)
+        return BeadRun(beads)
 
 
 def test_what_moves_is_told_stage_by_stage(tmp_path):

@@ -42,7 +42,7 @@ WITHOUT = (
 )
 
 
-def body_of(model: str) -> feature_costs.Body:
+def body_of(model: str) -> feature_costs.FeatureBody:
     return feature_costs.body_of(load_scene(PAPER), small_anatomy(), model, SIZES[model])
 
 

@@ -16,7 +16,7 @@ from rehearsal.reconstruction import compression_correction
 from rehearsal.reconstruction.patient_comparison import compared, inside, wider
 from rehearsal.reconstruction.reconstruction_figure import save_picture
 from rehearsal.reconstruction.reconstruction_files import save_volumes
-from rehearsal.reconstruction.segmentation_metrics import agreement
+from rehearsal.reconstruction.segmentation_metrics import segmentation_metrics
 from rehearsal.reconstruction.sweep_volumes import Rebuilt, lit, rebuild, track_of
 from rehearsal.result_files import write_csv
 from scenes.anatomy import Grid, LoadedAnatomy
@@ -82,7 +82,9 @@ def check_balls(rebuilt: Rebuilt, off_mm: float) -> None:
     """An outline that is off by a quarter of a voxel on average takes 3 / 8 of one over the radius off Dice."""
     at = rebuilt.box.places()
     for name, middle, radius in (("organ", CENTRE, RADIUS), ("tumour", TUMOUR, TUMOUR_RADIUS)):
-        figures = agreement(rebuilt.regions[name], near(at, middle, radius), rebuilt.box.spacing_mm)
+        figures = segmentation_metrics(
+            rebuilt.regions[name], near(at, middle, radius), rebuilt.box.spacing_mm
+        )
         assert figures.dice > 1 - 3 / 8 / radius and figures.centroid_mm < off_mm
 
 

@@ -13,16 +13,16 @@ from skfem import LinearForm, MeshTet, MeshTet2
 import app
 from studies.accuracy.bead_case import load_case
 from studies.reference.equilibrium import Equilibrium, NotConvergedError
-from studies.reference.fem_press import Experiment, Press
-from studies.reference.fem_solid import Material, Solid
+from studies.reference.fem_press import FemExperiment, FemPress
+from studies.reference.fem_solid import FemMaterial, FemSolid
 from studies.reference.make_reference import blue_noise, laid
-from studies.reference.penalty_contact import Contact, Law, Surface
-from studies.reference.reference_case import Case
+from studies.reference.penalty_contact import ContactSurface, Law, PenaltyContact
+from studies.reference.reference_case import ReferenceCase
 from studies.reference.smooth_obstacles import DistanceField, RoundedBox
 from studies.reference.tetrahedral_mesh import tetrahedra
 
 SIDE_MM = 10.0
-TISSUE = Material()
+TISSUE = FemMaterial()
 
 
 class Plane:
@@ -41,21 +41,21 @@ class Plane:
         return np.tile(self._normal, (len(points), 1)), np.zeros((len(points), 3, 3))
 
 
-def cube(cells: int, distortion_mm: float = 0.0) -> Solid:
+def cube(cells: int, distortion_mm: float = 0.0) -> FemSolid:
     """A cube of tissue from 0 to SIDE_MM, the corners inside it displaced at random."""
     mesh = MeshTet.init_tensor(*[np.linspace(0.0, SIDE_MM, cells + 1)] * 3)
     places = mesh.p.copy()
     inside = mesh.interior_nodes()
     places[:, inside] += np.random.default_rng(1).uniform(-1, 1, (3, len(inside))) * distortion_mm
-    return Solid(MeshTet2.from_mesh(MeshTet(places, mesh.t)), TISSUE)
+    return FemSolid(MeshTet2.from_mesh(MeshTet(places, mesh.t)), TISSUE)
 
 
-def on_faces(solid: Solid) -> np.ndarray:
+def on_faces(solid: FemSolid) -> np.ndarray:
     """Which nodes lie on which of the cube's six faces, shape (nodes, 3, 2): at 0 and at SIDE_MM along each axis."""
     return np.abs(solid.rest[..., None] - [0.0, SIDE_MM]) < 1e-9
 
 
-def held(solid: Solid, fixed: np.ndarray, contacts: list[Contact] | None = None) -> Equilibrium:
+def held(solid: FemSolid, fixed: np.ndarray, contacts: list[PenaltyContact] | None = None) -> Equilibrium:
     """A weightless solid of which some displacements, shape (nodes, 3) bool, are given."""
     return Equilibrium(solid, contacts or [], np.zeros_like(solid.rest), fixed)
 
@@ -76,8 +76,8 @@ def test_an_affine_deformation_passes_the_patch_test():
 
 @pytest.mark.parametrize("poisson", [0.3, 0.45])
 def test_uniaxial_compression_gives_the_closed_form_force(poisson):
-    material = Material(poisson=poisson)
-    solid = Solid(cube(2).mesh, material)
+    material = FemMaterial(poisson=poisson)
+    solid = FemSolid(cube(2).mesh, material)
     faces = on_faces(solid)
     fixed = faces[:, :, 0].copy()
     fixed[:, 2] |= faces[:, 2, 1]
@@ -122,17 +122,19 @@ def test_the_error_falls_with_the_third_power_of_the_mesh():
 def touching_cube(friction: float) -> tuple[Equilibrium, np.ndarray]:
     """A cube cut into by a box's edge, a ball and a plane, slid by less and more than what sticks."""
     solid = cube(3, distortion_mm=0.3)
-    surface = Surface(solid)
+    surface = ContactSurface(solid)
     ball = trimesh.creation.icosphere(subdivisions=3, radius=6.0)
     ball.apply_translation([5.0, 5.0, -5.5])
     rng = np.random.default_rng(2)
     state = rng.normal(size=solid.rest.shape) * 0.02
     contacts = [
-        Contact(
+        PenaltyContact(
             surface, RoundedBox(np.array([6.0, 4.0, 6.0]), 1.0), Law(2500.0, friction), np.array([5, 5, 12.9])
         ),
-        Contact(surface, DistanceField(ball), Law(300.0, friction)),
-        Contact(surface, Plane(np.array([0.6, 0.0, 0.0]), np.array([1.0, 0.1, 0.1])), Law(300.0, friction)),
+        PenaltyContact(surface, DistanceField(ball), Law(300.0, friction)),
+        PenaltyContact(
+            surface, Plane(np.array([0.6, 0.0, 0.0]), np.array([1.0, 0.1, 0.1])), Law(300.0, friction)
+        ),
     ]
     for contact in contacts:
         contact.carry(state)
@@ -161,7 +163,9 @@ def test_the_tangent_is_the_derivative_of_the_residual(friction):
 def test_friction_of_a_block_that_slides_is_coulombs():
     solid = cube(2)
     faces = on_faces(solid)
-    plane = Contact(Surface(solid), Plane(np.zeros(3), np.array([0.0, 0.0, 1.0])), Law(300.0, friction=0.35))
+    plane = PenaltyContact(
+        ContactSurface(solid), Plane(np.zeros(3), np.array([0.0, 0.0, 1.0])), Law(300.0, friction=0.35)
+    )
     lid = faces[:, 2, 1]
     equilibrium = held(solid, np.repeat(lid[:, None], 3, axis=1), [plane])
     equilibrium.tether_kpa_mm2 = 1e-6
@@ -185,7 +189,7 @@ def test_friction_of_a_block_that_slides_is_coulombs():
 
 def test_a_mesh_fills_a_round_surface_and_is_finer_where_asked(ball):
     mesh = tetrahedra(ball, lambda points: np.where(points[:, 2] > 6, 2.0, 6.0))
-    solid = Solid(mesh, TISSUE)
+    solid = FemSolid(mesh, TISSUE)
     weight = np.linalg.norm(solid.weight(np.array([0.0, 0.0, -9.81])).sum(axis=0)) / 1000
     assert weight == pytest.approx(ball.volume * 1e-9 * 1050 * 9.81, rel=2e-3)
     edges = mesh.p[:, mesh.edges]
@@ -193,26 +197,26 @@ def test_a_mesh_fills_a_round_surface_and_is_finer_where_asked(ball):
     assert np.median(lengths[heights > 7]) < 0.6 * np.median(lengths[heights < 0])
 
 
-def pressed_ball(indentations_mm: tuple[float, ...]) -> tuple[Experiment, list[trimesh.Trimesh]]:
+def pressed_ball(indentations_mm: tuple[float, ...]) -> tuple[FemExperiment, list[trimesh.Trimesh]]:
     """A flat ball on a block under a press, and both: small, with everything that a kidney's case has."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=12.0)
     ball.apply_scale([1.0, 0.9, 0.7])
     block = trimesh.creation.box([40.0, 40.0, 8.0])
     block.apply_translation([0.0, 0.0, -12.7])
-    press = Press(size_mm=(12.0, 6.0, 8.0), indentations_mm=indentations_mm)
+    press = FemPress(size_mm=(12.0, 6.0, 8.0), indentations_mm=indentations_mm)
     mesh = tetrahedra(ball, lambda points: np.full(len(points), 9.0))
-    return Experiment(mesh, block, TISSUE, press), [ball, block]
+    return FemExperiment(mesh, block, TISSUE, press), [ball, block]
 
 
 @pytest.fixture(scope="module")
-def solved_case() -> Case:
+def solved_case() -> ReferenceCase:
     """The ball pressed by 1 mm."""
     experiment, (ball, block) = pressed_ball((0.0, 1.0))
     stages = list(experiment.stages())
     made = dict(time_s=1.0, edge_near_probe_mm=9.0)
     # Deep, where tetrahedra are straight.
     beads = blue_noise(ball, count=12, depth_mm=6.0)
-    return Case(
+    return ReferenceCase(
         "ball",
         "a test",
         ball,
@@ -230,7 +234,7 @@ def solved_case() -> Case:
 def test_slow_motion_comes_to_the_same_rest_as_newtons_method(solved_case, monkeypatch):
     monkeypatch.setattr("studies.reference.fem_press.MOST_ITERATIONS", 0)
     monkeypatch.setattr("studies.reference.fem_press.LEAST_INCREMENT_MM", 1.0)
-    monkeypatch.setattr(Experiment, "_first_guess", lambda self, state: state)
+    monkeypatch.setattr(FemExperiment, "_first_guess", lambda self, state: state)
     experiment, _ = pressed_ball((0.0, 0.5, 1.0))
     *_, last = experiment.stages()
     pressed = solved_case.stages[-1]

@@ -12,7 +12,7 @@ import app
 from studies.robustness import stability_command, stress_bodies, stress_test
 from studies.robustness.rigid_fit import apart_after_fit
 from studies.robustness.stability_figure import FATES, fate_of
-from studies.robustness.stress_cases import MODELS, Case, Subject, cases_of, quick_cases_of
+from studies.robustness.stress_cases import MODELS, StressCase, Subject, cases_of, quick_cases_of
 from studies.robustness.stress_motion import PROBES, STATES
 from ultrasound.probe_manipulator import advanced
 
@@ -61,10 +61,10 @@ def test_bodies_start_and_transducers_move_as_their_names_say():
 @pytest.mark.parametrize("model", MODELS)
 def test_a_small_body_is_maltreated_let_go_and_measured(model):
     cases = [
-        Case("rest", "", ONE),
-        Case("lost", "", ONE, state=("nothing",)),
-        Case("gone", "", ONE, state=("lifted", 1e6)),
-        Case("beside", "", ONE, state=("lifted", 100.0)),
+        StressCase("rest", "", ONE),
+        StressCase("lost", "", ONE, state=("nothing",)),
+        StressCase("gone", "", ONE, state=("lifted", 1e6)),
+        StressCase("beside", "", ONE, state=("lifted", 100.0)),
     ]
     rest, lost, gone, beside = (stress_test.run(model, case) for case in cases)
     assert rest["finite"] and rest["recovered"] and rest["fallback"] is None and rest["reason"] is None
@@ -97,7 +97,7 @@ def test_reasons_tell_place_from_shape():
 
 
 def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, capsys):
-    few = [Case("rest", "long", ONE), Case("lost", "wholly", ONE, state=("nothing",))]
+    few = [StressCase("rest", "long", ONE), StressCase("lost", "wholly", ONE, state=("nothing",))]
     monkeypatch.setattr(stability_command, "quick_cases_of", lambda model: few)
     assert app.main(["study", "stability", "--quick", "--jobs", "1", "--out", str(tmp_path)]) == 0
     cases = json.loads((tmp_path / "stability.json").read_text())["cases"]

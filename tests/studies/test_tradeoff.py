@@ -10,7 +10,7 @@ from PIL import Image
 from small_bead_case import write_case
 
 import app
-from rehearsal.adaptive_iterations import RUNGS, STEPS_DOWN, STEPS_UP, Ladder
+from rehearsal.adaptive_iterations import RUNGS, STEPS_DOWN, STEPS_UP, AdaptiveIterations
 from rehearsal.build_solver import step_settings
 from rehearsal.commands.option_checks import refuse_sizes
 from rehearsal.commands.rehearse_command import as_asked
@@ -30,7 +30,7 @@ from scenes.scene import EMBEDDED, OPTIONS, PAPER, SolverSection, load_scene, wi
 from scenes.tissue import QUALITIES
 from sim.neo_hookean import LATTICE_SETTINGS
 from studies.accuracy.bead_case import load_case
-from studies.accuracy.bead_experiment import Experiment
+from studies.accuracy.bead_experiment import BeadExperiment
 from studies.performance import tradeoff_command
 
 
@@ -79,7 +79,7 @@ def test_what_was_measured_is_measured_again(device):
         and r["cell_mm"] == setup.size_mm
         and r["iterations"] == setup.iterations
     )
-    run = Experiment(case, setup).run(setup)
+    run = BeadExperiment(case, setup).run(setup)
     found = np.linalg.norm(run.beads - case.measured, axis=2).mean()
     # Another machine rounds otherwise: what sticks and slides then differs by hundredths of a millimetre.
     assert found == pytest.approx(row["errors_mm"][case.name], abs=0.02)
@@ -193,7 +193,7 @@ def test_a_quality_sets_size_and_passes_and_leaves_the_material():
 
 
 def test_a_slow_step_loses_iterations_rung_by_rung_and_gets_them_back():
-    ladder = Ladder(10.0)
+    ladder = AdaptiveIterations(10.0)
     assert not any(ladder.watch(9.0) for _ in range(STEPS_UP)) and ladder.says(8) == ""
     rungs = []
     for _ in range(4 * STEPS_DOWN):

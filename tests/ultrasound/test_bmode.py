@@ -19,7 +19,7 @@ from ultrasound.image_plane import PlaneInTissue
 from ultrasound.point_spread import MOST_LINES, axial_sd_mm, elevation_sd_mm, lateral_sd_mm
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import image_plane, pose_at
-from ultrasound.sampled_volume import Volume
+from ultrasound.sampled_volume import SampledVolume
 
 LINES, SAMPLES, PIXELS = 192, 640, 256
 TISSUE, FAT, GAS, STONE = 1.62, 1.38, 4e-4, 6.0
@@ -61,8 +61,8 @@ class Tank:
         self.at = low_mm[:, None, None, None] + voxel_mm[:, None, None, None] * np.indices(count)
         index_from_mm = np.diag([*(1 / voxel_mm), 1.0])
         index_from_mm[:3, 3] = -low_mm / voxel_mm
-        self.tissue = Volume(np.zeros((*count, 3)), index_from_mm, outside=0.0)
-        organ = organ or Volume(np.full((1, 1, 1), -1.0), np.diag([1e-6, 1e-6, 1e-6, 1.0]))
+        self.tissue = SampledVolume(np.zeros((*count, 3)), index_from_mm, outside=0.0)
+        organ = organ or SampledVolume(np.full((1, 1, 1), -1.0), np.diag([1e-6, 1e-6, 1e-6, 1.0]))
         self.plane = PlaneInTissue(embedding or Unmoved(), PIXELS)
         self.bmode = BMode(self.tissue, organ, self.plane, probe_of(), voxel_mm.min(), contact, 1.0)
 
@@ -74,11 +74,13 @@ class Tank:
         more = [(0, n) for n in np.subtract(self.tissue.count, self.tissue.shape)]
         fill((self.tissue.voxels, np.pad(values, [*more, (0, 0)], mode="edge").reshape(-1, 3)))
 
-    def look(self, probe, rung="reflection", at=(0, 0, 0), along=(0, 1, 0), lateral=(1, 0, 0)) -> np.ndarray:
+    def look(
+        self, probe, detail_level="reflection", at=(0, 0, 0), along=(0, 1, 0), lateral=(1, 0, 0)
+    ) -> np.ndarray:
         """Echoes (lines, samples) [dB] of a probe whose face is at a place and looks along a direction."""
         pose = pose_at(at, along, lateral, probe.housing_mm[2])
         self.plane.take(image_plane(pose, probe.housing_mm[2], *probe.extent_mm))
-        self.picture = self.bmode.render(probe, rung)
+        self.picture = self.bmode.render(probe, detail_level)
         return array_of(self.bmode.decibel).astype(float)
 
 
@@ -131,21 +133,21 @@ def peaks(decibel: np.ndarray, probe: Probe) -> tuple[np.ndarray, np.ndarray, np
     return (i + 0.5 + off) * probe.sample_mm, amplitude, probe.sample_mm * np.sqrt(-20 / np.log(10) / curve)
 
 
-@pytest.mark.parametrize("rung", RUNGS)
+@pytest.mark.parametrize("detail_level", RUNGS)
 @pytest.mark.parametrize("attenuation, frequency", [(0.18, 12.0), (0.5, 5.0), (1.0, 3.0)])
-def test_echo_falls_with_depth_by_what_tissue_takes(fine, rung, attenuation, frequency):
+def test_echo_falls_with_depth_by_what_tissue_takes(fine, detail_level, attenuation, frequency):
     probe = probe_of(frequency_mhz=frequency)
     fine.fill(backscatter=0.1)
-    lossless = fine.look(probe, rung)
+    lossless = fine.look(probe, detail_level)
     fine.fill(attenuation=attenuation, backscatter=0.1)
-    lost = lossless - fine.look(probe, rung)
+    lost = lossless - fine.look(probe, detail_level)
     wanted = 0.2 * attenuation * frequency * depths(probe)
     # Scatterers are the same, so every sample must fall alike, to 1 % of what 80 mm take: between two looks amplitude is a
     # chord of the exponential, 0.02 dB off, and 1e-9 is 0.1 % of speckle that is 40 dB down at -80 dB.
     assert np.abs(lost - wanted).max() < 0.01 * wanted[-1]
     slope = np.polyfit(depths(probe), lost.mean(axis=0), 1)[0]
     assert slope == pytest.approx(0.2 * attenuation * frequency, rel=1e-3)
-    if rung == "reflection":
+    if detail_level == "reflection":
         assert np.abs(lossless + 20.0).max() < 1e-3
 
 
@@ -262,33 +264,33 @@ def test_a_wire_is_drawn_as_wide_as_the_focus_makes_it(endless, focus_percent, t
 def test_an_interface_is_as_long_as_the_pulse_and_as_loud_on_every_rung(fine, frequency, cycles):
     probe = probe_of(frequency_mhz=frequency, pulse_cycles=cycles)
     fine.fill(interface(FAT, TISSUE, 0.4))
-    for rung in RUNGS:
+    for detail_level in RUNGS:
         # n cycles echo over n / 2 wavelengths: full width at half maximum.
-        _, amplitude, width = peaks(fine.look(probe, rung), probe)
+        _, amplitude, width = peaks(fine.look(probe, detail_level), probe)
         assert width == pytest.approx(cycles * 1.54 / frequency / 2 / FWHM, rel=1e-3)
         assert amplitude == pytest.approx(REFLECTION, rel=0.015)
 
 
-@pytest.mark.parametrize("rung", RUNGS[1:])
-def test_speckle_is_rayleigh(endless, rung):
+@pytest.mark.parametrize("detail_level", RUNGS[1:])
+def test_speckle_is_rayleigh(endless, detail_level):
     probe = probe_of()
     endless.fill(backscatter=0.1)
     # Four SD apart intensities correlate by exp(-8).
     along = int(4 * axial_sd_mm(probe) / 0.125) + 1
     across = int(4 * lateral_sd_mm(probe, depths(probe)).max() / (40.0 / LINES)) + 1
-    amplitude = 10 ** (endless.look(probe, rung, (3.0, 7.0, 0.4))[::across, ::along].ravel() / 20)
+    amplitude = 10 ** (endless.look(probe, detail_level, (3.0, 7.0, 0.4))[::across, ::along].ravel() / 20)
     assert len(amplitude) > 2000
     scale = np.sqrt((amplitude**2).mean() / 2)
     assert stats.kstest(amplitude, stats.rayleigh(scale=scale).cdf).pvalue > 0.01
 
 
 @pytest.mark.parametrize("geometry", list(GEOMETRIES))
-@pytest.mark.parametrize("rung", RUNGS[1:])
-def test_the_mean_square_of_speckle_is_the_backscatter_squared(endless, geometry, rung):
+@pytest.mark.parametrize("detail_level", RUNGS[1:])
+def test_the_mean_square_of_speckle_is_the_backscatter_squared(endless, geometry, detail_level):
     probe, place = probe_of(geometry), np.random.default_rng(4)
     endless.fill(backscatter=0.1)
     turns = Rotation.random(12, random_state=5).as_matrix()
-    echoes = [endless.look(probe, rung, place.uniform(-50, 50, 3), *turn[:2]) for turn in turns]
+    echoes = [endless.look(probe, detail_level, place.uniform(-50, 50, 3), *turn[:2]) for turn in turns]
     squares = (10 ** (np.array(echoes) / 10)).mean(axis=0) / 0.1**2
     # What the kernel adds up lies 1.4 entries apart in the mean where lines are dense: noise ends at the borders of blocks of
     # 64, which takes 3 % of it there, and, held over entries, is 5 % short aslant to them. Sampling has an SD of 1 to 3 %.
@@ -315,14 +317,14 @@ def test_speckle_correlates_as_the_point_spread_function_does(endless):
             assert correlation == pytest.approx(np.exp(-0.5 * (lag * step / width) ** 2).mean(), abs=0.06)
 
 
-@pytest.mark.parametrize("rung", RUNGS)
-def test_a_still_probe_shows_the_same_bits_also_after_it_was_away(fine, rung):
+@pytest.mark.parametrize("detail_level", RUNGS)
+def test_a_still_probe_shows_the_same_bits_also_after_it_was_away(fine, detail_level):
     probe = probe_of()
     fine.fill(interface(FAT, TISSUE, 0.4, 20.0), 0.5, 0.1)
-    first, picture = fine.look(probe, rung), fine.picture
-    assert (fine.look(probe, rung) == first).all()
-    assert np.abs(fine.look(probe_of(frequency_mhz=5.0), rung, (2.0, 1.0, 3.0)) - first).max() > 1.0
-    assert (fine.look(probe, rung) == first).all() and (fine.picture == picture).all()
+    first, picture = fine.look(probe, detail_level), fine.picture
+    assert (fine.look(probe, detail_level) == first).all()
+    assert np.abs(fine.look(probe_of(frequency_mhz=5.0), detail_level, (2.0, 1.0, 3.0)) - first).max() > 1.0
+    assert (fine.look(probe, detail_level) == first).all() and (fine.picture == picture).all()
 
 
 @pytest.fixture(scope="module")

@@ -17,10 +17,10 @@ from sim.embedding import Embedding, Unmoved, tetrahedra_around
 from sim.fields import array_of, fill
 from sim.shape_matching import ShapeMatching
 from sim.skinning import Skin
-from ultrasound.ct_slice import Slice
+from ultrasound.ct_slice import CtSlice
 from ultrasound.image_plane import ImagePlane, PlaneInTissue
 from ultrasound.probe_manipulator import image_plane, pose_at
-from ultrasound.sampled_volume import Volume, distance_volume
+from ultrasound.sampled_volume import SampledVolume, distance_volume
 
 RADIUS = 2.0
 GRADIENT = np.array([11.0, -7.0, 5.0])  # HU / mm
@@ -49,11 +49,11 @@ def noisy_image() -> sitk.Image:
     return noisy
 
 
-def volume_of(image: sitk.Image) -> Volume:
+def volume_of(image: sitk.Image) -> SampledVolume:
     mm_from_index = np.eye(4)
     mm_from_index[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
     mm_from_index[:3, 3] = image.GetOrigin()
-    return Volume(sitk.GetArrayFromImage(image).transpose(2, 1, 0), np.linalg.inv(mm_from_index))
+    return SampledVolume(sitk.GetArrayFromImage(image).transpose(2, 1, 0), np.linalg.inv(mm_from_index))
 
 
 def oblique_plane(width: float = 30.0, depth: float = 26.0):
@@ -71,7 +71,7 @@ def pixel_points(plane, pixels: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Embedded:
-    """A body with what carries an image plane, at rest or moved by another hand."""
+    """A body with what carries an image plane, at rest or moved from elsewhere."""
 
     model: ShapeMatching
     embedding: Embedding
@@ -94,9 +94,9 @@ def embedded(mesh, margin_mm: float = 0.0) -> Embedded:
     return Embedded(model, Embedding(model, mesh, 2 * RADIUS, margin_mm))
 
 
-def cut_of(embedding: Embedding | Unmoved, mesh, image: Callable, pixels: int, outside: str) -> Slice:
+def cut_of(embedding: Embedding | Unmoved, mesh, image: Callable, pixels: int, outside: str) -> CtSlice:
     organ = distance_volume(mesh, 1.0)
-    return Slice(volume_of(image()), organ, PlaneInTissue(embedding, pixels), outside)
+    return CtSlice(volume_of(image()), organ, PlaneInTissue(embedding, pixels), outside)
 
 
 def sliced(kept, mesh, image: Callable, move=None, pixels: int = 96, outside: str = "gel"):

@@ -1,4 +1,4 @@
-"""Marks: what each pixel is, against shapes cut by a plane; and the matrices beside a picture, against the picture."""
+"""GroundTruthLabels: what each pixel is, against shapes cut by a plane; and the matrices beside a picture, against the picture."""
 
 from types import SimpleNamespace
 
@@ -10,7 +10,7 @@ from conftest import rotation_about
 from rehearsal.coordinates import probe_in_patient
 from sim.embedding import Unmoved
 from sim.fields import fill
-from ultrasound.ground_truth_labels import Marks
+from ultrasound.ground_truth_labels import GroundTruthLabels
 from ultrasound.image_plane import ImagePlane, PlaneInTissue
 from ultrasound.probe import load_probe
 from ultrasound.probe_manipulator import image_plane, pose_at
@@ -58,7 +58,7 @@ def middle(shown: np.ndarray) -> tuple[float, float]:
 
 def test_a_box_is_marked_where_the_plane_cuts_it(device):
     # 26 x 14 mm on the plane, from w = -3 to 9: neither its sides nor its place are alike along the axes.
-    marks = Marks(taken(), distance_volume(box((26, 14, 12), -6, 31, 3), 1.0)).render()
+    marks = GroundTruthLabels(taken(), distance_volume(box((26, 14, 12), -6, 31, 3), 1.0)).render()
     aside = np.maximum(np.abs(U + 6) - 13, np.abs(V - 31) - 7)
     # Distances are linear near its faces; linear between points 1 mm apart they are off around its edges alone.
     assert np.array_equal(marks[np.abs(aside) > 0.3] == Mark.ORGAN, aside[np.abs(aside) > 0.3] < 0)
@@ -74,7 +74,7 @@ def test_balls_are_marked_as_large_as_the_plane_cuts_them(device):
     beads = np.array(
         [in_world(-6, 20, 1.2), in_world(-4, 12, -1.5), in_world(9, 33, 0), in_world(0, 15, 2.5)]
     )
-    marks = Marks(taken(), organ, tumour, beads, 2.4).render()
+    marks = GroundTruthLabels(taken(), organ, tumour, beads, 2.4).render()
     inside, bead = marks % Mark.BEAD, marks // Mark.BEAD
     # The last bead's middle is farther off the plane than it reaches.
     assert set(np.unique(inside)) == {0, 1, 2} and set(np.unique(bead)) == {0, 1, 2, 3}
@@ -96,7 +96,9 @@ def test_balls_are_marked_as_large_as_the_plane_cuts_them(device):
 
 def test_where_beads_overlap_the_last_is_marked(device):
     beads = np.array([in_world(0, 20, 0), in_world(1, 20, 0), in_world(0.5, 20.8, 0)])
-    marks = Marks(taken(), distance_volume(ball(20, 2, 25, 6)), beads=beads, radius_mm=2.4).render()
+    marks = GroundTruthLabels(
+        taken(), distance_volume(ball(20, 2, 25, 6)), beads=beads, radius_mm=2.4
+    ).render()
     assert set(np.unique(marks)) == {0, *(Mark.ORGAN + Mark.BEAD * k for k in range(4))}
     assert (marks[np.hypot(U - 0.5, V - 20.8) < 2.3] == Mark.ORGAN + 3 * Mark.BEAD).all()
 
@@ -107,7 +109,7 @@ def test_marks_are_of_where_tissue_was_at_rest(device):
     # Now it lies turned and shifted on the plane: u, v show what was at rest at v + 4, u - 9.
     moved = WORLD @ np.array([[0, 1, 0, 4], [1, 0, 0, -9], [0, 0, -1, 0], [0, 0, 0, 1.0]])
     fill((embedding.rest_from_plane, moved[None, :3]))
-    marks = Marks(plane, distance_volume(box((14, 6, 10), 30, -12, 0), 1.0)).render()
+    marks = GroundTruthLabels(plane, distance_volume(box((14, 6, 10), 30, -12, 0), 1.0)).render()
     assert middle(marks == Mark.ORGAN) == pytest.approx((-12 + 9, 30 - 4), abs=0.25)
     assert np.ptp(V[marks == Mark.ORGAN]) == pytest.approx(14, abs=0.51)
 
@@ -120,7 +122,7 @@ class Nowhere(Unmoved):
 
 def test_what_no_tissue_holds_is_outside(device):
     organ = distance_volume(ball(20, 0, 25, 0))
-    assert not Marks(taken(Nowhere()), organ, organ, in_world(0, 25, 0)[None]).render().any()
+    assert not GroundTruthLabels(taken(Nowhere()), organ, organ, in_world(0, 25, 0)[None]).render().any()
 
 
 def lying() -> tuple[SimpleNamespace, object]:

@@ -16,7 +16,7 @@ from conftest import rotation_about
 import app
 from rehearsal.coordinates import probe_in_patient
 from rehearsal.reconstruction import compression_correction
-from rehearsal.reconstruction.compression_correction import Unsqueezed
+from rehearsal.reconstruction.compression_correction import CompressionCorrection
 from rehearsal.reconstruction.sweep_volumes import track_of
 from rehearsal.tracking.sweep_recording import Sweeping
 from scenes.anatomy import phantom_folder
@@ -26,7 +26,7 @@ from sim.embedding import Unmoved
 from sim.mesh_distance import signed_distance
 from studies.freehand.freehand_sweeps import sweep_of
 from ultrasound import reconstruction
-from ultrasound.labelled_sweep import MARKS, SUFFIX, MarkedSweep, marks_beside
+from ultrasound.labelled_sweep import MARKS, SUFFIX, LabelledSweep, marks_beside
 from ultrasound.probe import load_probe
 from ultrasound.probe_manipulator import held_at, image_plane, pose_at
 from ultrasound.sweep import Mark, SweepError
@@ -178,7 +178,7 @@ def test_a_picture_of_another_size_ends_a_sweep_with_what_there_is(tmp_path):
 
 def test_both_files_or_none(tmp_path):
     rehearsal, view = recording()
-    sweep = MarkedSweep(tmp_path, "s", rehearsal.probe)
+    sweep = LabelledSweep(tmp_path, "s", rehearsal.probe)
     picture = view.pictures["B-mode"]
     sweep.add(picture, picture % 3, rehearsal.probe, probe_in_patient(rehearsal), 0.0)
     # The pictures find a folder where their file should be.
@@ -201,7 +201,7 @@ def over_tumour() -> np.ndarray:
 def test_the_matrices_of_a_frame_are_of_its_rows_and_columns(tmp_path):
     probe, pose = load_probe("curvilinear"), np.eye(4)
     pose[:3, 3] = 3.0, -2.0, 7.0
-    sweep = MarkedSweep(tmp_path, "sweep", probe)
+    sweep = LabelledSweep(tmp_path, "sweep", probe)
     sweep.add(*np.zeros((2, 50, 80), np.uint8), probe, pose, 0.0)
     sweep.close()
     for end in (SUFFIX, MARKS):
@@ -233,7 +233,7 @@ def test_undoing_takes_the_tracked_way_and_finds_still_tissue_where_the_tracker_
     on_probe, way = probe.image_to_probe(32, 32), over_tumour()[::5]
     sweep = sweep_of(np.zeros((len(way), 32, 32), np.uint8), way, np.array([0.0, 0.1, 9.0]), on_probe)
     still = Still(np.array([-61.0, 112.0, 1240.0]), 20.0)
-    places = Unsqueezed(still, sweep, track_of(sweep, "Reference"), "Reference")
+    places = CompressionCorrection(still, sweep, track_of(sweep, "Reference"), "Reference")
     begun = len(still.way)
     assert begun == (compression_correction.COMES_S + compression_correction.WAITS_S) * 60
     row, column = np.indices((32, 32))
@@ -252,7 +252,7 @@ def test_undoing_takes_the_tracked_way_and_finds_still_tissue_where_the_tracker_
 def test_what_no_probe_can_press_again_is_refused(device):
     sweep = sweep_of(np.zeros((1, 32, 30), np.uint8), np.eye(4)[None], np.zeros(1), np.eye(4))
     with pytest.raises(SweepError, match="32 x 30 pixels: expected a sweep that Nephron recorded"):
-        Unsqueezed(Still(np.zeros(3), 20.0), sweep, track_of(sweep, "Reference"), "Reference")
+        CompressionCorrection(Still(np.zeros(3), 20.0), sweep, track_of(sweep, "Reference"), "Reference")
 
 
 @pytest.fixture(scope="module")
@@ -261,7 +261,7 @@ def swept(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("swept")
     organ, tumour = (load_surface(phantom_folder() / f"{name}.stl") for name in ("organ", "tumour"))
     probe = load_probe("drop-in")
-    sweep = MarkedSweep(folder, "over", probe)
+    sweep = LabelledSweep(folder, "over", probe)
     row, column = np.indices((64, 64))
     pixels = np.stack([column, row, 0 * row, 1 + 0 * row], axis=-1).reshape(-1, 4)
     way = over_tumour()

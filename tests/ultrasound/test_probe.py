@@ -296,8 +296,8 @@ def test_gain_and_its_course_over_depth_are_added(tank):
     sliders = (50.0,) * 4 + (80.0,) * 4
     louder = probe_of(gain_percent=70.0, depth_compensation_db_cm_mhz=0.5, time_gain_compensation=sliders)
     tank.fill(attenuation=0.5, backscatter=0.1)
-    for rung in ("reflection", "speckle"):
-        added = tank.look(louder, rung) - tank.look(probe_of(), rung)
+    for detail_level in ("reflection", "speckle"):
+        added = tank.look(louder, detail_level) - tank.look(probe_of(), detail_level)
         assert np.abs(added - louder.gain_db()).max() < 1e-3
     # 12 dB of the knob, 0.75 dB/mm over depth and 7.2 dB of a slider.
     assert louder.gain_db()[-1] == pytest.approx(12 + 0.75 * depths(louder)[-1] + 7.2)

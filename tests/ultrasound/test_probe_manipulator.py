@@ -9,8 +9,8 @@ from rehearsal.build_solver import tool_of
 from sim.fields import array_of
 from ultrasound.probe import load_probe
 from ultrasound.probe_manipulator import (
-    Grip,
-    Hand,
+    ManipulatorState,
+    ProbeManipulator,
     advanced,
     approached,
     between,
@@ -86,85 +86,95 @@ def test_a_goal_is_approached_no_faster_than_told():
 
 
 @pytest.fixture
-def hand(ball: trimesh.Trimesh) -> Hand:
+def hand(ball: trimesh.Trimesh) -> ProbeManipulator:
     home = touching(pose_at(np.zeros(3), [0, 0, -1.0], [1.0, 0, 0], SIZE[2]), SIZE, ball.vertices)
     vertices, faces = np.array(ball.vertices), np.array(ball.faces, np.int64)
-    return Hand(vertices, faces, np.array(ball.vertex_normals), SIZE, home, np.array([1.0, 0, 0]))
+    return ProbeManipulator(vertices, faces, np.array(ball.vertex_normals), SIZE, home, np.array([1.0, 0, 0]))
 
 
-def test_pointing_at_the_organ_puts_the_face_on_it_perpendicular(hand):
-    hand.point(np.array([30.0, 0.0, 5.0]), np.array([-1.0, 0.0, 0.0]))
+def test_pointing_at_the_organ_puts_the_face_on_it_perpendicular(manipulator):
+    manipulator.point(np.array([30.0, 0.0, 5.0]), np.array([-1.0, 0.0, 0.0]))
     met = np.array([(12.0**2 - 25) ** 0.5, 0.0, 5.0])
     # The ball's facets lie up to 0.1 mm inside it.
-    assert (hand.aim @ [0, 0, -10, 1])[:3] == pytest.approx(met, abs=0.15)
-    pose = hand.pose()
+    assert (manipulator.aim @ [0, 0, -10, 1])[:3] == pytest.approx(met, abs=0.15)
+    pose = manipulator.pose()
     assert pose[:3, 2] @ met / 12 > 0.99
-    assert indentation(pose, SIZE, hand.samples) == pytest.approx(0.0, abs=1e-9)
-    hand.point(np.array([30.0, 0.0, 50.0]), np.array([-1.0, 0.0, 0.0]))
-    assert hand.pose() == pytest.approx(pose)
+    assert indentation(pose, SIZE, manipulator.samples) == pytest.approx(0.0, abs=1e-9)
+    manipulator.point(np.array([30.0, 0.0, 50.0]), np.array([-1.0, 0.0, 0.0]))
+    assert manipulator.pose() == pytest.approx(pose)
 
 
-def test_keys_push_and_the_button_presses_until_let_go(hand):
-    hand.push(2.0)
-    hand.hold(True, 0.25)
-    assert indentation(hand.pose(), SIZE, hand.samples) == pytest.approx(5.0)
+def test_keys_push_and_the_button_presses_until_let_go(manipulator):
+    manipulator.push(2.0)
+    manipulator.hold(True, 0.25)
+    assert indentation(manipulator.pose(), SIZE, manipulator.samples) == pytest.approx(5.0)
     for _ in range(100):
-        hand.hold(True, 0.1)
-    assert indentation(hand.pose(), SIZE, hand.samples) == pytest.approx(15.0)
+        manipulator.hold(True, 0.1)
+    assert indentation(manipulator.pose(), SIZE, manipulator.samples) == pytest.approx(15.0)
     for _ in range(10):
-        hand.hold(False, 0.1)
-    assert indentation(hand.pose(), SIZE, hand.samples) == pytest.approx(2.0)
-    hand.push(-5.0)
-    assert indentation(hand.pose(), SIZE, hand.samples) == pytest.approx(-3.0)
-    hand.grip = Grip()
-    assert hand.pose() == pytest.approx(hand.home)
+        manipulator.hold(False, 0.1)
+    assert indentation(manipulator.pose(), SIZE, manipulator.samples) == pytest.approx(2.0)
+    manipulator.push(-5.0)
+    assert indentation(manipulator.pose(), SIZE, manipulator.samples) == pytest.approx(-3.0)
+    manipulator.state = ManipulatorState()
+    assert manipulator.pose() == pytest.approx(manipulator.home)
 
 
 @pytest.mark.parametrize("turn, axis", [((8, 0, 0), 0), ((0, 8, 0), 1), ((0, 0, 8), 2)])
-def test_turns_are_about_the_transducers_own_axes(hand, turn, axis):
-    hand.turn(*turn)
-    turned = hand.home[:3, :3].T @ hand.pose()[:3, :3]
+def test_turns_are_about_the_transducers_own_axes(manipulator, turn, axis):
+    manipulator.turn(*turn)
+    turned = manipulator.home[:3, :3].T @ manipulator.pose()[:3, :3]
     assert turned == pytest.approx(rotation_about(list(np.eye(3)[axis]), 8))
 
 
-def held_aslant(hand: Hand) -> np.ndarray:
+def held_aslant(manipulator: ProbeManipulator) -> np.ndarray:
     """The aim of a hand that holds the probe where no axis of it is one of the world's."""
-    hand.aim_at(np.array([6.0, -4.0, 9.6]), np.array([1.0, 2.0, 0.5]))
-    return hand.aim
+    manipulator.aim_at(np.array([6.0, -4.0, 9.6]), np.array([1.0, 2.0, 0.5]))
+    return manipulator.aim
 
 
-def test_turns_follow_one_another_fan_then_tilt_then_roll_about_axes_that_turn_along(hand):
-    aim = held_aslant(hand)
-    hand.turn(20.0, -30.0, 50.0)
-    fan, tilt, roll = (
+def test_turns_follow_one_another_fan_then_tilt_then_roll_about_axes_that_turn_along(manipulator):
+    aim = held_aslant(manipulator)
+    manipulator.turn(20.0, -30.0, 50.0)
+    tilt, rock, rotate = (
         rotation_about(list(np.eye(3)[axis]), degrees) for axis, degrees in enumerate((20.0, -30.0, 50.0))
     )
-    assert hand.pose()[:3, :3] == pytest.approx(aim[:3, :3] @ fan @ tilt @ roll)
+    assert manipulator.pose()[:3, :3] == pytest.approx(aim[:3, :3] @ tilt @ rock @ rotate)
 
 
-def test_a_turned_probe_still_looks_from_where_it_is_aimed(hand):
-    aim = held_aslant(hand)
-    hand.turn(25.0, -35.0, 10.0)
-    pose = hand.pose()
+def test_a_turned_probe_still_looks_from_where_it_is_aimed(manipulator):
+    aim = held_aslant(manipulator)
+    manipulator.turn(25.0, -35.0, 10.0)
+    pose = manipulator.pose()
     from_aim = pose[:3, 3] - (aim @ [0, 0, -SIZE[2] / 2, 1])[:3]
     # Touching and pressing move it along its axis alone.
     assert np.cross(from_aim, pose[:3, 2]) == pytest.approx(np.zeros(3), abs=1e-9)
 
 
-def test_a_probe_is_held_as_it_is_taken(hand):
-    aim = held_aslant(hand)
+def test_a_probe_is_held_as_it_is_taken(manipulator):
+    aim = held_aslant(manipulator)
     for depth in (-5.0, 0.0, 3.0, 15.0):
-        pose = advanced(touching(aim, SIZE, hand.samples), depth)
-        hand.take(pose)
-        assert hand.pose() == pytest.approx(pose)
+        pose = advanced(touching(aim, SIZE, manipulator.samples), depth)
+        manipulator.take(pose)
+        assert manipulator.pose() == pytest.approx(pose)
         for _ in range(100):
-            hand.hold(False, 0.1)
-        assert indentation(hand.pose(), SIZE, hand.samples) == pytest.approx(min(depth, 0.0), abs=1e-9)
+            manipulator.hold(False, 0.1)
+        assert indentation(manipulator.pose(), SIZE, manipulator.samples) == pytest.approx(
+            min(depth, 0.0), abs=1e-9
+        )
 
 
-def test_a_hand_with_a_curved_probe_touches_with_its_arc(hand):
+def test_a_hand_with_a_curved_probe_touches_with_its_arc(manipulator):
     size, radius = np.array([20.0, 6.0, 20.0]), 25.0
-    curved = Hand(hand.vertices, hand.faces, hand.normals, size, hand.home, hand.lateral, radius)
+    curved = ProbeManipulator(
+        manipulator.vertices,
+        manipulator.faces,
+        manipulator.normals,
+        size,
+        manipulator.home,
+        manipulator.lateral,
+        radius,
+    )
     held_aslant(curved)
     curved.push(2.0)
     assert indentation(curved.pose(), size, curved.samples, radius) == pytest.approx(2.0)
@@ -172,19 +182,19 @@ def test_a_hand_with_a_curved_probe_touches_with_its_arc(hand):
     assert indentation(curved.pose(), size, curved.samples, radius) == pytest.approx(2.0)
 
 
-def test_normals_count_by_a_gaussian_of_their_distance(hand):
+def test_normals_count_by_a_gaussian_of_their_distance(manipulator):
     for away in (6.0, 12.0, 24.0):
-        hand.vertices, hand.normals = (
+        manipulator.vertices, manipulator.normals = (
             np.array([[0.0, 0, 0], [away, 0, 0]]),
             np.array([[0.0, 0, 1], [1, 0, 0]]),
         )
         other = np.exp(-((away / 12.0) ** 2))
-        assert hand.outward(np.zeros(3)) == pytest.approx([other, 0, 1] / np.hypot(other, 1))
+        assert manipulator.outward(np.zeros(3)) == pytest.approx([other, 0, 1] / np.hypot(other, 1))
 
 
-def test_tilts_end_where_a_hand_does(hand):
-    hand.turn(500, -500, 500)
-    assert hand.turn_deg == pytest.approx([60, -60, 500])
+def test_tilts_end_where_a_hand_does(manipulator):
+    manipulator.turn(500, -500, 500)
+    assert manipulator.turn_deg == pytest.approx([60, -60, 500])
 
 
 def test_a_curved_face_touches_where_its_arc_does():
@@ -211,42 +221,53 @@ def test_the_tool_of_a_curved_array_is_its_arc_to_a_tenth_of_a_millimetre(one_de
     assert arc[30] == pytest.approx([0, 0, -15.0])
 
 
-def test_a_probe_of_short_housing_is_not_pushed_in_beyond_what_holds_it(hand):
-    hand.push(100.0)
-    assert hand.depth_mm == hand.most_mm == 15.0
-    short = Hand(hand.vertices, hand.faces, hand.normals, np.array([16.0, 9.0, 6.0]), hand.home, hand.lateral)
+def test_a_probe_of_short_housing_is_not_pushed_in_beyond_what_holds_it(manipulator):
+    manipulator.push(100.0)
+    assert manipulator.depth_mm == manipulator.most_mm == 15.0
+    short = ProbeManipulator(
+        manipulator.vertices,
+        manipulator.faces,
+        manipulator.normals,
+        np.array([16.0, 9.0, 6.0]),
+        manipulator.home,
+        manipulator.lateral,
+    )
     short.push(100.0)
     assert short.depth_mm == 9.0
 
 
-def test_a_press_goes_as_deep_as_its_share_and_gives_way_where_that_falls(hand):
+def test_a_press_goes_as_deep_as_its_share_and_gives_way_where_that_falls(manipulator):
     for share, depth in ((0.4, 6.0), (0.8, 12.0), (0.2, 3.0)):
         for _ in range(20):
-            hand.hold(True, 0.1, share)
-        assert hand.pressed_mm == pytest.approx(depth)
-    hand.hold(True, 0.1, 1.0)
-    assert hand.pressed_mm == pytest.approx(3.0 + 1.2)
-    hand.hold(True, 0.1, 0.0)
-    assert hand.pressed_mm == pytest.approx(4.2 - 4.0)
+            manipulator.hold(True, 0.1, share)
+        assert manipulator.pressed_mm == pytest.approx(depth)
+    manipulator.hold(True, 0.1, 1.0)
+    assert manipulator.pressed_mm == pytest.approx(3.0 + 1.2)
+    manipulator.hold(True, 0.1, 0.0)
+    assert manipulator.pressed_mm == pytest.approx(4.2 - 4.0)
 
 
 RADIUS = 30.0
 
 
 @pytest.fixture
-def rider() -> Hand:
+def rider() -> ProbeManipulator:
     """A hand on top of a fine sphere."""
     sphere = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
     vertices, faces = np.array(sphere.vertices), np.array(sphere.faces, np.int64)
     top = pose_at(np.array([0, 0, RADIUS]), np.array([0, 0, -1.0]), np.array([1.0, 0, 0]), SIZE[2])
-    return Hand(vertices, faces, np.array(sphere.vertex_normals), SIZE, top, np.array([1.0, 0, 0]))
+    return ProbeManipulator(
+        vertices, faces, np.array(sphere.vertex_normals), SIZE, top, np.array([1.0, 0, 0])
+    )
 
 
-def slid(hand: Hand, lateral_mm: float, elevation_mm: float, steps: int = 50) -> np.ndarray:
+def slid(
+    manipulator: ProbeManipulator, lateral_mm: float, elevation_mm: float, steps: int = 50
+) -> np.ndarray:
     """Where the face is aimed at after so many equal steps."""
     for _ in range(steps):
-        hand.slide(lateral_mm / steps, elevation_mm / steps)
-    return (hand.aim @ [0, 0, -SIZE[2] / 2, 1])[:3]
+        manipulator.slide(lateral_mm / steps, elevation_mm / steps)
+    return (manipulator.aim @ [0, 0, -SIZE[2] / 2, 1])[:3]
 
 
 def on_the_arc(towards: np.ndarray, way_mm: float) -> np.ndarray:
@@ -255,7 +276,7 @@ def on_the_arc(towards: np.ndarray, way_mm: float) -> np.ndarray:
 
 
 # A step d along the tangent becomes R atan(d / R), 0.01 % less for 0.6 mm; the sphere's edges are 2.2 mm long, so that its
-# faces lie up to 2.2^2 / (8 R) = 0.02 mm under it, and their smoothed normals tilt a step by no more than that over an edge.
+# faces lie up to 2.2^2 / (8 R) = 0.02 mm under it, and their smoothed normals rock a step by no more than that over an edge.
 @pytest.mark.parametrize(
     ("lateral", "elevation"), [(20.0, 0.0), (-20.0, 0.0), (0.0, 20.0), (0.0, -20.0), (9.0, -12.0)]
 )

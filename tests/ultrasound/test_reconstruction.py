@@ -5,7 +5,7 @@ import pytest
 from conftest import rotation_about
 from numpy.typing import ArrayLike
 
-from rehearsal.reconstruction.segmentation_metrics import Agreement, agreement
+from rehearsal.reconstruction.segmentation_metrics import SegmentationMetrics, segmentation_metrics
 from ultrasound.reconstruction import METHODS, MOST_VOXELS, Reconstruction, VoxelBox
 
 VOXEL = 0.5
@@ -197,9 +197,9 @@ def field_error(method: str, apart_mm: float) -> float:
     return float(np.sqrt(np.mean((values - field(places))[inside] ** 2)))
 
 
-def ball_agreement(method: str, apart_mm: float) -> Agreement:
+def ball_agreement(method: str, apart_mm: float) -> SegmentationMetrics:
     values, _, places = swept(method, lambda at: 255 * ball(at), apart_mm)
-    return agreement(values > 127.5, ball(places), VOXEL)
+    return segmentation_metrics(values > 127.5, ball(places), VOXEL)
 
 
 @pytest.mark.parametrize("apart_mm", [1.5, 2.0])

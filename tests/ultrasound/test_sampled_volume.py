@@ -9,14 +9,17 @@ from conftest import rotation_about
 
 from sim.fields import array_of, fill
 from ultrasound.image_plane import LANES, Lanes
-from ultrasound.sampled_volume import Volume, distance_volume
+from ultrasound.sampled_volume import SampledVolume, distance_volume
 
 
 def test_a_volume_of_vectors_is_sampled_as_each_of_its_parts(device):
     voxels = np.random.default_rng(2).normal(size=(5, 4, 3, 2)).astype(np.float32)
     index_from_mm = np.eye(4)
     index_from_mm[:3, :3] = rotation_about([1, 2, 3], 30) * 0.8
-    whole, parts = Volume(voxels, index_from_mm), [Volume(voxels[..., k], index_from_mm) for k in range(2)]
+    whole, parts = (
+        SampledVolume(voxels, index_from_mm),
+        [SampledVolume(voxels[..., k], index_from_mm) for k in range(2)],
+    )
     points = np.random.default_rng(3).uniform(-1.0, 4.0, (200, 3)).astype(np.float32)
     given, found = ti.Vector.field(3, ti.f32, len(points)), ti.Vector.field(2, ti.f32, len(points))
     apart = ti.Vector.field(2, ti.f32, len(points))
@@ -39,7 +42,7 @@ def test_a_volume_of_vectors_is_sampled_as_each_of_its_parts(device):
 def test_places_sampled_together_have_the_values_that_they_have_alone(device, shape):
     index_from_mm = np.eye(4)
     index_from_mm[:3, :3] = rotation_about([1, 2, 3], 30) * 0.9
-    volume = Volume(
+    volume = SampledVolume(
         np.random.default_rng(6).normal(size=shape).astype(np.float32), index_from_mm, outside=-7.0
     )
     starts = (
@@ -71,7 +74,7 @@ def test_the_slope_of_a_volume_is_that_of_its_trilinear_value(device):
     voxels = np.random.default_rng(4).normal(size=(6, 5, 4, 3)).astype(np.float32)
     index_from_mm = np.eye(4)
     index_from_mm[:3, :3] = rotation_about([3, 1, 2], 40) * [1.3, 0.7, 0.9]
-    volume = Volume(voxels, index_from_mm)
+    volume = SampledVolume(voxels, index_from_mm)
     inside = np.random.default_rng(5).uniform([0.1] * 3, [4.9, 3.9, 2.9], (300, 3))
     # Away from voxel centres, where the slope jumps, by more than the step of the differences.
     inside = inside[(np.abs(inside - np.rint(inside)) > 0.02).all(axis=1)]
@@ -103,7 +106,7 @@ def test_the_slope_of_a_volume_is_that_of_its_trilinear_value(device):
 
 def test_a_volume_is_trilinear_between_voxels_and_ends_half_a_voxel_beyond(device):
     voxels = np.random.default_rng(1).normal(size=(5, 4, 3)).astype(np.float32)
-    volume = Volume(voxels, np.eye(4), outside=-7.0)
+    volume = SampledVolume(voxels, np.eye(4), outside=-7.0)
     points = np.array(
         [[0, 0, 0], [4, 3, 2], [1.25, 2.5, 0.75], [-0.4, 1, 1], [-0.6, 1, 1], [4.6, 3, 2]], np.float32
     )
@@ -124,7 +127,7 @@ def test_a_volume_is_trilinear_between_voxels_and_ends_half_a_voxel_beyond(devic
 
 
 def test_a_volume_of_one_slice_is_sampled_within_its_thickness(device):
-    volume = Volume(np.full((3, 3, 1), 5.0, np.float32), np.eye(4))
+    volume = SampledVolume(np.full((3, 3, 1), 5.0, np.float32), np.eye(4))
     found = ti.field(ti.f32, 2)
 
     @ti.kernel

@@ -6,14 +6,14 @@ from pathlib import Path
 
 from scenes.patients.import_error import PatientError
 from scenes.patients.readers.dicom_series import dicom_found, series_volume
-from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.lazy_volume import LazyVolume
 from scenes.patients.readers.volume_readers import file_volume, is_volume_file
 from scenes.progress import Progress, silent
 
 
 def open_ct(
     path: Path, series: str | None = None, referenced: str = "", progress: Progress = silent
-) -> Volume:
+) -> LazyVolume:
     """Find a CT and say where its voxels are; they are read when they are asked for.
 
     Args:

@@ -65,7 +65,7 @@ NOT_HU = {
 
 
 @dataclass(frozen=True)
-class Slice:
+class DicomSlice:
     """One slice of a CT: a file, or a frame of one."""
 
     item: Item
@@ -96,7 +96,7 @@ class Series:
     uid: str
     number: str
     frame_of_reference: str = ""
-    slices: list[Slice] = field(default_factory=list)
+    slices: list[DicomSlice] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)  # slices that cannot be used, a line each
     localizers: int = 0
 
@@ -159,7 +159,7 @@ def _add_slices(found: Found, item: Item, header: Dataset) -> None:
         series.faults.append(f"{item.name}: its header cannot be understood ({type(error).__name__})")
 
 
-def slices_of(item: Item, header: Dataset) -> Iterator[Slice | None]:
+def slices_of(item: Item, header: Dataset) -> Iterator[DicomSlice | None]:
     """The slices of one file; None for what shows a view and no slice."""
     if str(header.get("BurnedInAnnotation", "NO")).upper() == "YES":
         raise PatientError(f"{item.name}: has text burned into its pixels, which may name the patient")
@@ -187,7 +187,7 @@ def _groups(functional: Dataset) -> list[Dataset]:
 
 def _slice(
     item: Item, frame: int | None, number: Any, groups: list[Dataset], header: Dataset
-) -> Slice | None:
+) -> DicomSlice | None:
     def value(name: str, usual: Any = None) -> Any:
         found = (group.get(name) for group in groups if group.get(name) not in (None, ""))
         return next(found, usual)
@@ -207,7 +207,7 @@ def _slice(
     slope, intercept = float(value("RescaleSlope", 1)), float(value("RescaleIntercept", 0))
     if not np.isfinite([slope, intercept]).all() or slope == 0:
         raise PatientError(f"{item.name}: RescaleSlope is {slope:g} and RescaleIntercept {intercept:g}")
-    return Slice(
+    return DicomSlice(
         item=item,
         frame=frame,
         number=None if number in (None, "") else int(number),

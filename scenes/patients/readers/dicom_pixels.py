@@ -13,12 +13,12 @@ from pydicom.pixels import pixel_array
 
 from scenes.patients.import_error import PatientError
 from scenes.patients.readers.dicom_file import parsed
-from scenes.patients.readers.dicom_headers import Slice
+from scenes.patients.readers.dicom_headers import DicomSlice
 from scenes.patients.readers.dicom_source import Item
 from scenes.patients.readers.lazy_volume import AIR_HU, LEAST_HU, MOST_HU
 
 
-def hounsfield(slices: list[Slice]) -> Iterator[np.ndarray]:
+def hounsfield(slices: list[DicomSlice]) -> Iterator[np.ndarray]:
     """HU (rows, columns) int16 of each slice in turn; padding is air. Raises PatientError, which names the file."""
     file = None
     for one in slices:
@@ -36,7 +36,7 @@ class _File:
             self.data: Dataset = parsed(opened, item.name)
         self.by_gdcm: np.ndarray | None = None
 
-    def hounsfield(self, one: Slice) -> np.ndarray:
+    def hounsfield(self, one: DicomSlice) -> np.ndarray:
         raw = self._raw(one)
         if raw is None:
             values = self._gdcm(one)
@@ -50,7 +50,7 @@ class _File:
             )
         return np.clip(np.rint(values), LEAST_HU, MOST_HU).astype(np.int16)
 
-    def _raw(self, one: Slice) -> np.ndarray | None:
+    def _raw(self, one: DicomSlice) -> np.ndarray | None:
         """Stored values; None where no plugin of pydicom decodes them."""
         options: dict[str, Any] = {} if one.frame is None else {"index": one.frame}
         with warnings.catch_warnings():
@@ -62,7 +62,7 @@ class _File:
             except Exception as error:
                 raise self._fault(type(error).__name__) from error
 
-    def _gdcm(self, one: Slice) -> np.ndarray:
+    def _gdcm(self, one: DicomSlice) -> np.ndarray:
         if self.item.path is None:
             raise self._fault("its compression is rare: unpack the archive and give the folder")
         if self.by_gdcm is None:

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from scenes.patients.import_error import PatientError
-from scenes.patients.readers.dicom_headers import Found, Series, Slice, read_headers
+from scenes.patients.readers.dicom_headers import DicomSlice, Found, Series, read_headers
 from scenes.patients.readers.dicom_source import items_of
 from scenes.patients.readers.identifiers import secrets_of
-from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.lazy_volume import LazyVolume
 from scenes.patients.readers.slice_stack import stacked
 from scenes.patients.readers.volume_readers import ENDINGS
 from scenes.progress import Progress
@@ -38,7 +38,7 @@ def dicom_found(path: Path, progress: Progress) -> Found:
 
 def series_volume(
     path: Path, found: Found, wanted: str | None, referenced: str, progress: Progress
-) -> Volume:
+) -> LazyVolume:
     """The CT of a series: the wanted one, by number or uid, the one that labels refer to, or the best guess.
 
     Raises PatientError: none, not that one, or one that is no whole volume.
@@ -63,7 +63,7 @@ def series_volume(
     if not all(one.is_rescaled for one in slices):
         notes.append("the files do not say how their values become HU: they were taken as HU")
     stack = stacked(str(path), slices)
-    return Volume(
+    return LazyVolume(
         name=str(path),
         grid=stack.grid,
         read_box=lambda box: stack.read(box, lambda files: progress(files, "slices")),
@@ -138,10 +138,10 @@ def _described(series: Series, with_uid: bool) -> str:
     return f"series {series.number} (CT, {len(series.slices)} slices{gap}{uid})"
 
 
-def _one_view(series: Series) -> tuple[list[Slice], int]:
+def _one_view(series: Series) -> tuple[list[DicomSlice], int]:
     """The slices without the few that show another view."""
 
-    def view(one: Slice) -> tuple:
+    def view(one: DicomSlice) -> tuple:
         return (*np.round(np.concatenate([one.row, one.column]), 2).tolist(), one.rows, one.columns)
 
     views = [view(one) for one in series.slices]

@@ -11,14 +11,14 @@ import SimpleITK as sitk
 
 from scenes.patients.import_error import PatientError
 from scenes.patients.readers.file_checks import check_size, cut_off, no_scalar, not_3d
-from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.lazy_volume import LazyVolume
 from scenes.patients.readers.voxel_grid import Box, VoxelGrid
 
 NRRD, META = (".nrrd", ".nhdr"), (".mha", ".mhd")
 HEADER_BYTES, LINE_BYTES, NAME_LETTERS = 1 << 22, 1 << 16, 255
 
 
-def itk_volume(path: Path) -> Volume:
+def itk_volume(path: Path) -> LazyVolume:
     """The volume of a file. Raises PatientError: damaged, not 3D, sheared, or without its place in the patient."""
     reader = itk_header(path)
     kind = sitk.GetPixelIDValueAsString(reader.GetPixelID())
@@ -26,7 +26,9 @@ def itk_volume(path: Path) -> Volume:
         raise no_scalar(path, kind)
     texts = [text for key, text in metadata(reader).items() if not key.startswith(("NRRD_", "ITK_"))]
     grid = VoxelGrid.of(reader)
-    return Volume(str(path), grid, lambda box: _itk_box(path, box), secrets=frozenset(t for t in texts if t))
+    return LazyVolume(
+        str(path), grid, lambda box: _itk_box(path, box), secrets=frozenset(t for t in texts if t)
+    )
 
 
 def itk_header(path: Path) -> sitk.ImageFileReader:

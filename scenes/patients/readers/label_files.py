@@ -17,7 +17,7 @@ from scenes.patients.readers.dicom_series import dicom_found
 from scenes.patients.readers.identifiers import secrets_of
 from scenes.patients.readers.itk_files import itk_header, itk_layers, metadata
 from scenes.patients.readers.label_maps import LabelMap, Segment, box_of, whole_numbers
-from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.lazy_volume import LazyVolume
 from scenes.patients.readers.nifti import label_names
 from scenes.patients.readers.rtstruct import read_contours, referenced_series
 from scenes.patients.readers.segment_names import is_far, side_of, tissue_of
@@ -185,7 +185,7 @@ def _around(places: np.ndarray) -> np.ndarray:
     return np.array([places.min(axis=0) - NEAR_MM, places.max(axis=0) + NEAR_MM])
 
 
-def _organ(file: Path, volume: Volume, box: Box) -> LabelMap | None:
+def _organ(file: Path, volume: LazyVolume, box: Box) -> LabelMap | None:
     """What one file marks in a box; None where that is nothing."""
     if any(a.start == a.stop for a in box):
         return None

@@ -20,7 +20,7 @@ VOXEL_BYTES = 5
 
 
 @dataclass(frozen=True)
-class Volume:
+class LazyVolume:
     """A scalar volume in the patient, on a disk or in memory."""
 
     name: str  # for errors: the file or folder
@@ -31,7 +31,7 @@ class Volume:
     secrets: frozenset[str] = frozenset()  # what of the source no file of ours may hold
 
     @classmethod
-    def of(cls, image: sitk.Image, name: str = "the image") -> Volume:
+    def of(cls, image: sitk.Image, name: str = "the image") -> LazyVolume:
         """A volume that is in memory already."""
         # A view does not keep its image alive.
         return cls(

@@ -13,7 +13,7 @@ import numpy as np
 
 from scenes.patients.import_error import PatientError
 from scenes.patients.readers.file_checks import check_size, cut_off, no_scalar, not_3d
-from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.lazy_volume import LazyVolume
 from scenes.patients.readers.voxel_grid import Box, VoxelGrid
 
 # What is wrong is said in an error.
@@ -28,7 +28,7 @@ SCANNER_CODE = 1
 RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0])
 
 
-def nifti_volume(path: Path) -> Volume:
+def nifti_volume(path: Path) -> LazyVolume:
     """The volume of a file. Raises PatientError: damaged, not 3D, sheared, or without its place in the patient."""
     try:
         image: Any = nibabel.load(path, keep_file_open=True)
@@ -65,7 +65,7 @@ def nifti_volume(path: Path) -> Volume:
         for key in ("descrip", "aux_file", "intent_name", "db_name")
         if key in header
     ]
-    return Volume(str(path), grid, read_box, secrets=frozenset(text for text in texts if text))
+    return LazyVolume(str(path), grid, read_box, secrets=frozenset(text for text in texts if text))
 
 
 def label_names(path: Path) -> dict[int, str]:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage
 
 from scenes.patients.import_error import PatientError
-from scenes.patients.readers.dicom_headers import Slice
+from scenes.patients.readers.dicom_headers import DicomSlice
 from scenes.patients.readers.dicom_pixels import hounsfield
 from scenes.patients.readers.lazy_volume import AIR_HU
 from scenes.patients.readers.voxel_grid import Box, VoxelGrid
@@ -38,7 +38,7 @@ MOST_GAP_MM = 10.0
 class Stack:
     """Slices in order, and the upright, even grid that they are read onto."""
 
-    slices: list[Slice]
+    slices: list[DicomSlice]
     grid: VoxelGrid
     planes: np.ndarray  # (n,) place of each slice along the grid's third axis, in voxels from its first
     sideways: (
@@ -46,7 +46,9 @@ class Stack:
     )  # (n, 2) how far each slice's first pixel is from the grid's, in pixels along row and column
     notes: tuple[str, ...]
 
-    def read(self, box: Box, progress: Callable[[Iterable[Slice]], Iterable[Slice]] = iter) -> np.ndarray:
+    def read(
+        self, box: Box, progress: Callable[[Iterable[DicomSlice]], Iterable[DicomSlice]] = iter
+    ) -> np.ndarray:
         """HU (z, y, x) int16 of a box of the grid."""
         x, y, z = box
         first = int(np.searchsorted(self.planes, z.start + UNEVEN, side="right")) - 1
@@ -87,7 +89,7 @@ def _between(before: tuple[float, np.ndarray] | None, after: tuple[float, np.nda
     return np.rint(before[1] * (1 - share) + after[1] * share).astype(np.int16)
 
 
-def stacked(name: str, slices: list[Slice]) -> Stack:
+def stacked(name: str, slices: list[DicomSlice]) -> Stack:
     """Put slices in order on one grid. Raises PatientError: too few, not parallel, one missing, double or in conflict."""
     if len(slices) < 2:
         raise PatientError(
@@ -111,7 +113,7 @@ def stacked(name: str, slices: list[Slice]) -> Stack:
     return Stack(slices, grid.checked(name), planes, sideways, tuple(notes))
 
 
-def _check_alike(name: str, slices: list[Slice]) -> None:
+def _check_alike(name: str, slices: list[DicomSlice]) -> None:
     first = slices[0]
     for other in slices[1:]:
         turned = max(np.abs(other.row - first.row).max(), np.abs(other.column - first.column).max())
@@ -124,7 +126,7 @@ def _check_alike(name: str, slices: list[Slice]) -> None:
             )
 
 
-def _check_phases(name: str, slices: list[Slice], normal: np.ndarray) -> None:
+def _check_phases(name: str, slices: list[DicomSlice], normal: np.ndarray) -> None:
     """Refuse several phases in one series: every place is there as often."""
     places, counts = np.unique([round(float(s.position @ normal), 2) for s in slices], return_counts=True)
     often = int(counts.min())
@@ -140,14 +142,14 @@ def _check_phases(name: str, slices: list[Slice], normal: np.ndarray) -> None:
         )
 
 
-def _alike(slices: list[Slice], normal: np.ndarray) -> bool:
+def _alike(slices: list[DicomSlice], normal: np.ndarray) -> bool:
     """Whether the first two slices at one place are the same."""
     first = min(slices, key=lambda s: float(s.position @ normal))
     twin = [s for s in slices if abs((s.position - first.position) @ normal) < SAME_PLACE_MM][:2]
     return len(twin) == 2 and _same(*twin)
 
 
-def _once(name: str, slices: list[Slice], normal: np.ndarray, notes: list[str]) -> list[Slice]:
+def _once(name: str, slices: list[DicomSlice], normal: np.ndarray, notes: list[str]) -> list[DicomSlice]:
     """Slices that lie at one place: copies are left out, others in conflict."""
     kept, copies = [slices[0]], []
     for one in slices[1:]:
@@ -166,17 +168,17 @@ def _once(name: str, slices: list[Slice], normal: np.ndarray, notes: list[str]) 
     return kept
 
 
-def _same(one: Slice, other: Slice) -> bool:
+def _same(one: DicomSlice, other: DicomSlice) -> bool:
     sideways = np.abs(one.position - other.position).max() <= SAME_PLACE_MM
     mine, its = hounsfield([one, other])
     return bool(sideways) and np.array_equal(mine, its)
 
 
-def _at(one: Slice, normal: np.ndarray) -> str:
+def _at(one: DicomSlice, normal: np.ndarray) -> str:
     return f"at {one.position @ normal:.2f} mm"
 
 
-def _check_gaps(name: str, slices: list[Slice], along: np.ndarray) -> None:
+def _check_gaps(name: str, slices: list[DicomSlice], along: np.ndarray) -> None:
     gaps = np.diff(along)
     usual = float(np.percentile(gaps, 50, method="lower"))
     least, most = GAPS
@@ -219,7 +221,7 @@ def _even(along: np.ndarray, notes: list[str]) -> tuple[np.ndarray, float]:
 
 
 def _upright(
-    name: str, slices: list[Slice], normal: np.ndarray, notes: list[str]
+    name: str, slices: list[DicomSlice], normal: np.ndarray, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
     """Origin of an upright grid that holds all slices, their places on it in pixels, and its columns and rows."""
     first = slices[0]

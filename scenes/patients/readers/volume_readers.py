@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from scenes.patients.readers.itk_files import META, NRRD, itk_volume
-from scenes.patients.readers.lazy_volume import Volume
+from scenes.patients.readers.lazy_volume import LazyVolume
 
 NIFTI = (".nii", ".nii.gz")
 ENDINGS = (*NIFTI, *NRRD, *META)
@@ -16,7 +16,7 @@ def is_volume_file(path: Path) -> bool:
     return path.name.lower().endswith(ENDINGS)
 
 
-def file_volume(path: Path) -> Volume:
+def file_volume(path: Path) -> LazyVolume:
     """The volume of a file. Raises PatientError: damaged, not 3D, sheared, or without its place in the patient."""
     if not path.name.lower().endswith(NIFTI):
         return itk_volume(path)
