@@ -31,7 +31,7 @@ GOOD = ScoreTerms(
 )
 
 
-def hand_on(mesh: trimesh.Trimesh, size_mm: np.ndarray = SIZE) -> ProbeManipulator:
+def manipulator_on(mesh: trimesh.Trimesh, size_mm: np.ndarray = SIZE) -> ProbeManipulator:
     """A hand over a settled surface, straight above its origin."""
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces, np.int64)
     return ProbeManipulator(
@@ -98,5 +98,8 @@ def over_ball() -> SimpleNamespace:
     """What a guide and a plan's poses ask of a rehearsal; its organ is far below all ways."""
     far = big_ball().apply_translation([0.0, 0.0, -1000.0])
     return SimpleNamespace(
-        size_mm=SIZE, origin=ORIGIN, hand=hand_on(far), settings=SimpleNamespace(time_step_s=0.05)
+        size_mm=SIZE,
+        origin=ORIGIN,
+        manipulator=manipulator_on(far),
+        settings=SimpleNamespace(time_step_s=0.05),
     )

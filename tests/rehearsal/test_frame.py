@@ -189,7 +189,7 @@ def test_the_clock_is_the_sessions_and_says_where_it_is_slow(looping):
 
 def test_without_contact_whoever_leads_by_hand_is_told_how_to_press(looping, monkeypatch):
     monkeypatch.setattr(Moments, "onto", lambda each, view, _: replace(view, notes={"B-mode": "NO CONTACT"}))
-    monkeypatch.setattr(frame, "Live", SimpleNamespace)
+    monkeypatch.setattr(frame, "UserInput", SimpleNamespace)
     looping.keys = Keys({**USUAL_KEYS, "push": "Return"})
     monkeypatch.setattr(frame, "Played", Moments)
     by_hand, tracked = (SimpleNamespace(is_by_hand=each) for each in (True, False))
@@ -287,7 +287,7 @@ def test_without_pictures_none_is_taken_and_the_rest_is_written(monkeypatch, tmp
 
 def test_ctrl_c_in_a_run_says_so_before_how_it_went(monkeypatch, capsys):
     monkeypatch.setattr(run.RehearsalRun, "_end", lambda each, bookmarks: print(f"{bookmarks} bookmarks"))
-    monkeypatch.setattr(run, "Instruments", lambda rehearsal, guide: None)
+    monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide: None)
     driver = SimpleNamespace(session=SimpleNamespace(time_s=1.25), bookmarks=3)
     each = run.RehearsalRun(Moments(), None, "cpu", None)
     with pytest.raises(Exit) as ended, each._summed_up(driver, None):
@@ -310,7 +310,7 @@ def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scen
     monkeypatch.setattr(
         run, "Instruments", lambda rehearsal, guide: SimpleNamespace(guide=None, summary=lambda bookmarks: {})
     )
-    monkeypatch.setattr(run, "in_words", lambda summary: "")
+    monkeypatch.setattr(run, "summary_text", lambda summary: "")
     each = run.RehearsalRun(Moments(), None, "cpu", None, scene=scene)
     recording = SimpleNamespace(path=PurePosixPath("a/session-001.jsonl"), fault="")
     each.recorded = SimpleNamespace(recording=recording, close=lambda summary: None)
@@ -321,7 +321,7 @@ def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scen
 def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path, sent):
     link, given = SimpleNamespace(show=sent.append), []
     viewer = SimpleNamespace(close=lambda: None, settings=Settings())
-    monkeypatch.setattr(run, "Instruments", lambda rehearsal, guide: None)
+    monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide: None)
     monkeypatch.setattr(run, "open_viewer", lambda rehearsal, **_: viewer)
     monkeypatch.setattr(run, "settings_of", lambda rehearsal: Settings())
     looping = SimpleNamespace(run=lambda: None)
@@ -351,7 +351,7 @@ def test_the_command_opens_the_link_for_as_long_as_it_runs_and_names_its_scene(m
     monkeypatch.setattr(rehearse_command, "start_taichi", lambda arch: "cpu")
     monkeypatch.setattr(rehearse_command, "built", lambda *_: None)
     monkeypatch.setattr(rehearse_command, "compile_picture", lambda rehearsal: None)
-    monkeypatch.setattr(run, "Instruments", lambda rehearsal, guide: None)
+    monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide: None)
     monkeypatch.setattr(run.RehearsalRun, "headless", headless_run)
     line = [
         "rehearse",

@@ -35,7 +35,7 @@ def rehearsal() -> SimpleNamespace:
 
 @pytest.fixture
 def watching(monkeypatch, rehearsal) -> LiveMeasurements:
-    monkeypatch.setattr(live_measurements, "read", lambda *_: Measurement(1.0, 20.0))
+    monkeypatch.setattr(live_measurements, "measure", lambda *_: Measurement(1.0, 20.0))
     return LiveMeasurements(
         rehearsal, PlanGuidance(rehearsal, plan_of(sweep_of(FIRST, SECOND), margin_mm=8.0))
     )
@@ -90,7 +90,7 @@ def test_what_a_session_holds_is_recalled_as_it_was_watched(watching, rehearsal,
 
 def test_a_way_back_is_looked_at_and_read_anew_at_once(watching, rehearsal, one_device, monkeypatch):
     depths = iter([9.0, 0.2])
-    monkeypatch.setattr(live_measurements, "read", lambda *_: Measurement(next(depths), 20.0))
+    monkeypatch.setattr(live_measurements, "measure", lambda *_: Measurement(next(depths), 20.0))
     lines = np.ones(rehearsal.probe.number_of_scanlines, bool)
     looks = iter([lines, ~lines])
     monkeypatch.setattr(watching.coverage, "look", lambda *_: next(looks))

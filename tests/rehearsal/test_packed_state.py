@@ -21,7 +21,7 @@ from ultrasound.probe_manipulator import ManipulatorState
 def arrays_of(state: Any) -> list[np.ndarray]:
     """All that a state holds, depth first."""
     if isinstance(state, dict):
-        return [array for _, each in sorted(packed_state.items()) for array in arrays_of(each)]
+        return [array for _, each in sorted(state.items()) for array in arrays_of(each)]
     if is_dataclass(state):
         return [array for each in fields(state) for array in arrays_of(getattr(state, each.name))]
     return [np.asarray(state)]

@@ -6,7 +6,20 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import rotation_about
-from plan_ball import FACET_MM, GOOD, NORMAL_DEG, SIZE, R, X, Y, Z, big_ball, faces_in, from_above, hand_on
+from plan_ball import (
+    FACET_MM,
+    GOOD,
+    NORMAL_DEG,
+    SIZE,
+    R,
+    X,
+    Y,
+    Z,
+    big_ball,
+    faces_in,
+    from_above,
+    manipulator_on,
+)
 
 from rehearsal.planning.instrument_reach import NEAR_MM, Reach
 from rehearsal.planning.score import POINTS, SAID, in_words, points, score, why
@@ -26,8 +39,8 @@ from ultrasound.probe_manipulator import ProbeManipulator, advanced, pose_at
 
 
 @pytest.fixture(scope="module")
-def hand() -> ProbeManipulator:
-    return hand_on(big_ball())
+def manipulator() -> ProbeManipulator:
+    return manipulator_on(big_ball())
 
 
 def degrees_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -126,7 +139,7 @@ def test_a_pass_ends_where_the_organ_does_and_one_beside_it_is_left_out(manipula
 def test_of_two_lobes_the_longer_is_gone_over(sign):
     small = trimesh.creation.icosphere(subdivisions=3, radius=8.0).apply_translation([0, -22.0 * sign, 0])
     large = trimesh.creation.icosphere(subdivisions=3, radius=15.0).apply_translation([0, 22.0 * sign, 0])
-    lobes = hand_on(trimesh.util.concatenate([small, large]))
+    lobes = manipulator_on(trimesh.util.concatenate([small, large]))
     poses = gliding(lobes, from_above(), np.zeros(1), -40.0, 40.0, 0.0, 0.0).poses
     ahead = faces_in(poses)[:, 1] * sign
     assert ahead.min() > 22 - 15.1 and ahead.max() < 22 + 15.1 and np.ptp(ahead) > 26
@@ -205,7 +218,7 @@ def test_without_a_trocar_every_pose_can_be_reached(manipulator):
 @pytest.mark.parametrize("cone", [20.0, 45.0, 90.0])
 @pytest.mark.parametrize("axis", [None, (0.0, 0.0, -3.0)])
 def test_the_shaft_leans_no_farther_than_the_cone(cone, axis):
-    tiny = hand_on(trimesh.creation.icosphere(subdivisions=1, radius=1.0))
+    tiny = manipulator_on(trimesh.creation.icosphere(subdivisions=1, radius=1.0))
     trocar = Trocar(at_mm=(0, 0, 100), axis=axis, cone_deg=cone, wrist_deg=180)
     lean = np.radians(cone + np.array([-0.1, 0.1]))
     backs = 60 * np.column_stack([np.sin(lean), 0 * lean, -np.cos(lean)]) + [0, 0, 100]
@@ -221,7 +234,7 @@ def test_without_an_axis_the_cone_is_about_the_way_to_the_target(manipulator):
 
 @pytest.mark.parametrize("wrist", [0.0, 30.0, 90.0, 120.0])
 def test_the_probe_looks_no_farther_aside_than_the_wrist(wrist):
-    tiny = hand_on(trimesh.creation.icosphere(subdivisions=1, radius=1.0))
+    tiny = manipulator_on(trimesh.creation.icosphere(subdivisions=1, radius=1.0))
     trocar = Trocar(at_mm=(0, 0, 150), wrist_deg=wrist)
     bends = np.radians([wrist - 0.1, wrist, wrist + 0.1, -wrist - 0.1])
     poses = np.stack(

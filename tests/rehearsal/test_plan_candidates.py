@@ -6,7 +6,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from plan_ball import FACET_MM, ORIGIN, SIZE, X, Y, Z, big_ball, faces_in, hand_on, in_patient, sweep_of
+from plan_ball import (
+    FACET_MM,
+    ORIGIN,
+    SIZE,
+    X,
+    Y,
+    Z,
+    big_ball,
+    faces_in,
+    in_patient,
+    manipulator_on,
+    sweep_of,
+)
 
 from rehearsal.coordinates import probe_in_patient
 from rehearsal.planning.plan_file import MOST_SWEEPS
@@ -43,7 +55,9 @@ def everywhere(poses: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def rehearsal(one_device) -> SimpleNamespace:
     press = SimpleNamespace(direction=(0.0, 0.0, -1.0), lateral=(1.0, 0.0, 0.0))
-    return SimpleNamespace(hand=hand_on(big_ball()), press=press, probe=PROBE, size_mm=SIZE, origin=ORIGIN)
+    return SimpleNamespace(
+        manipulator=manipulator_on(big_ball()), press=press, probe=PROBE, size_mm=SIZE, origin=ORIGIN
+    )
 
 
 def coverage_of(at: np.ndarray, radius: float = 7.0) -> Coverage:

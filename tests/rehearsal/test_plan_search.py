@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from plan_ball import GOOD, big_ball, from_above, hand_on, straight_pass
+from plan_ball import GOOD, big_ball, from_above, manipulator_on, straight_pass
 
 from rehearsal.planning import evolution
 from rehearsal.planning.evolution import GENERATION, NEAR, Search, foreseen
@@ -353,7 +353,9 @@ def test_a_process_that_is_ended_is_said_in_one_line():
 @pytest.mark.parametrize(("target", "margin"), [("tumour", 5.0), ("margin", 0.0)])
 def test_a_target_without_a_voxel_is_refused(monkeypatch, target, margin):
     speck = trimesh.creation.icosphere(subdivisions=1, radius=0.3).apply_translation([0.7, 0.7, 0.7])
-    built = SimpleNamespace(organ=big_ball(), tumour=speck, hand=hand_on(big_ball()), origin=np.zeros(3))
+    built = SimpleNamespace(
+        organ=big_ball(), tumour=speck, manipulator=manipulator_on(big_ball()), origin=np.zeros(3)
+    )
     monkeypatch.setattr("rehearsal.planning.trial_workers.Rehearsal", lambda *_: built)
     monkeypatch.setattr("sim.device.start", lambda *_, **__: "cpu")
     anatomy = replace(problem_of().anatomy, tumour=speck)

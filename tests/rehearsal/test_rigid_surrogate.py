@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from plan_ball import SIZE, R, X, Y, Z, big_ball, hand_on
+from plan_ball import SIZE, R, X, Y, Z, big_ball, manipulator_on
 
 from rehearsal.planning import rigid_surrogate
 from rehearsal.planning.rigid_surrogate import RigidSurrogate
 from rehearsal.planning.score_terms import ScoreTerms
-from rehearsal.planning.sweep_path import SweepPath, fanned
+from rehearsal.planning.sweep_path import SweepPath, tilted
 from sim.fields import field_of
 from ultrasound.coverage import VOXEL_MM, Coverage
 from ultrasound.probe import load_probe
@@ -41,7 +41,9 @@ def forecast_of(monkeypatch, probe) -> tuple[RigidSurrogate, Coverage]:
         transducer=SimpleNamespace(compression_warning_mm=WARNING_MM),
     )
     size = np.array(probe.housing_mm)
-    held = SimpleNamespace(hand=hand_on(big_ball(), size), model=None, probe=probe, scene=scene, size_mm=size)
+    held = SimpleNamespace(
+        manipulator=manipulator_on(big_ball(), size), model=None, probe=probe, scene=scene, size_mm=size
+    )
     return RigidSurrogate(held, coverage, "tumour", lambda poses: poses[:, 0, 3] < 5.0), coverage
 
 
@@ -49,7 +51,7 @@ def way_over_the_tumour(length: float) -> SweepPath:
     """Poses whose faces are 1, 3 and 0.5 mm in the ball, the second tilted and the third turned; one above it, and one beside it."""
     faces = np.array([[0, 0, R - 1], [0, -4, R - 3], [3, 0, R - 0.5], [0, 5, R + 3]])
     down = np.stack([pose_at(face, -Z, X, length) for face in faces])
-    down[1] = fanned(down[1], length, 12.0)
+    down[1] = tilted(down[1], length, 12.0)
     down[2] = pose_at(faces[2], -Z, X + Y, length)
     return SweepPath((down, pose_at(R * Z + 60 * X, -Z, X, length)[None]))
 

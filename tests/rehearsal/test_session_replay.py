@@ -128,7 +128,7 @@ def watching(frames: int, take_over_at: int = -1) -> Any:
 def test_a_rehearsal_is_replayed_to_the_bit_and_the_pixel(built, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(recorder, "STATE_S", 1.0)
     summaries: list[dict] = []
-    monkeypatch.setattr(run, "in_words", lambda summary: summaries.append(summary) or "")
+    monkeypatch.setattr(run, "summary_text", lambda summary: summaries.append(summary) or "")
     seen, end, log = rehearsed(built, monkeypatch, tmp_path, user)
     assert len(seen) == len(log.poses) == 140 and len(set(seen)) > 120 and log.summary["went_back"] == 7
     told = [event.value for events in log.events.values() for event in events if event.kind == "solver"]
@@ -170,7 +170,7 @@ def opened_at_each(built, log: Log, capsys) -> None:
 
 def test_a_session_that_goes_on_from_a_replay_is_one_too(built, monkeypatch, tmp_path, capsys):
     summaries: list[dict] = []
-    monkeypatch.setattr(run, "in_words", lambda summary: summaries.append(summary) or "")
+    monkeypatch.setattr(run, "summary_text", lambda summary: summaries.append(summary) or "")
     _, _, first = rehearsed(built, monkeypatch, tmp_path, partial(user, frames=60))
     led, end, second = rehearsed(built, monkeypatch, tmp_path, watching(60, 20), first, 0.5)
     assert len(second.poses) == 40 and second.header.begins and second.header.version == VERSION

@@ -86,7 +86,7 @@ def test_a_goal_is_approached_no_faster_than_told():
 
 
 @pytest.fixture
-def hand(ball: trimesh.Trimesh) -> ProbeManipulator:
+def manipulator(ball: trimesh.Trimesh) -> ProbeManipulator:
     home = touching(pose_at(np.zeros(3), [0, 0, -1.0], [1.0, 0, 0], SIZE[2]), SIZE, ball.vertices)
     vertices, faces = np.array(ball.vertices), np.array(ball.faces, np.int64)
     return ProbeManipulator(vertices, faces, np.array(ball.vertex_normals), SIZE, home, np.array([1.0, 0, 0]))
