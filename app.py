@@ -4,23 +4,10 @@ import errno
 import signal
 import sys
 import threading
-from importlib import import_module
 
 try:
     import click
 
-    from rehearsal.configuration import SetupError
-    from rehearsal.planning.plan_file import PlanError
-    from rehearsal.sessions.session_file import SessionError
-    from rehearsal.tracking.pose_file import PoseError
-    from render.keys import KeysError
-    from scenes.patients.import_error import PatientError
-    from scenes.scene import SceneError
-    from sim.sampling import SamplingError
-    from studies.accuracy.bead_case import CaseError
-    from ultrasound.acoustics import TissueError
-    from ultrasound.probe import ProbeError
-    from ultrasound.sweep import SweepError
 except ModuleNotFoundError as missing:
     sys.exit(
         f"nephron: {missing.name} is not installed for this Python; run make run once, then use the Python of its environment: "
@@ -30,55 +17,56 @@ except KeyboardInterrupt:
     sys.stderr.write("Stopped.\n")
     sys.exit(130)
 
+from errors import UserError
+from rehearsal.commands.lazy_group import LazyGroup
 from version import VERSION
 
-# Where each command is; only the one that is called is imported, for the others' libraries take seconds to load.
+# Where each command is, and what it does in a line.
 COMMANDS = {
-    "rehearse": "rehearsal.commands.rehearse_command:rehearse",
-    "keys": "rehearsal.commands.rehearse_command:keys_command",
-    "import": "scenes.patients.import_command:import_patient_command",
-    "plan": "rehearsal.commands.plan_command:plan",
-    "export": "rehearsal.commands.export_command:export",
-    "scan": "rehearsal.commands.scan_command:scan",
-    "reconstruct": "rehearsal.commands.reconstruct_command:reconstruct",
-    "validate": "studies.accuracy.accuracy_commands:validate",
-    "calibrate": "studies.accuracy.accuracy_commands:calibrate",
-    "beam": "studies.beam.beam_command:beam",
-    "reference": "studies.reference.reference_command:reference",
-    "study": "studies.study_command:study",
+    "rehearse": (
+        "rehearsal.commands.rehearse_command:rehearse",
+        "Press the kidney of SCENE and see what the probe sees.",
+    ),
+    "keys": (
+        "rehearsal.commands.rehearse_command:keys_command",
+        "Print the keys as a file to change, for rehearse --keys.",
+    ),
+    "import": (
+        "scenes.patients.import_command:import_patient_command",
+        "Make a patient's folder out of a CT and its LABELS.",
+    ),
+    "plan": ("rehearsal.commands.plan_command:plan", "Plan a sweep over SCENE that shows the target."),
+    "export": (
+        "rehearsal.commands.export_command:export",
+        "Write surfaces, CT and labels of SCENE as files.",
+    ),
+    "scan": ("rehearsal.commands.scan_command:scan", "Take pictures of SCENE at a list of probe poses."),
+    "reconstruct": (
+        "rehearsal.commands.reconstruct_command:reconstruct",
+        "Make a volume of SWEEP, a tracked sweep (.igs.mha).",
+    ),
+    "validate": (
+        "studies.accuracy.accuracy_commands:validate",
+        "Compare with the bead experiment of CASE, a folder.",
+    ),
+    "calibrate": (
+        "studies.accuracy.accuracy_commands:calibrate",
+        "Fit shape matching to bead experiments, as the paper did.",
+    ),
+    "beam": ("studies.beam.beam_command:beam", "Compare with the silicone beam of FOLDER (motion capture)."),
+    "reference": (
+        "studies.reference.reference_command:reference",
+        "Make a bead experiment by finite elements, for `validate`.",
+    ),
+    "study": ("studies.study_command:study", "Measure on this machine: tables and a picture in a folder."),
 }
-# What is wrong with a file or a value, said in one line.
-MENDED_BY_USER = (
-    SceneError,
-    PatientError,
-    PoseError,
-    PlanError,
-    SessionError,
-    SweepError,
-    ProbeError,
-    TissueError,
-    SamplingError,
-    CaseError,
-    SetupError,
-    KeysError,
+
+
+@click.group(
+    cls=LazyGroup,
+    commands_at=COMMANDS,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
 )
-
-
-class Commands(click.Group):
-    """Commands that are imported when they are called."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(COMMANDS)
-
-    def get_command(self, ctx: click.Context, name: str) -> click.Command:
-        if name not in COMMANDS:
-            # click's own error suggests of the commands that it holds, and it holds none.
-            raise click.NoSuchCommand(name, possibilities=COMMANDS, ctx=ctx)
-        module, command = COMMANDS[name].split(":")
-        return getattr(import_module(module), command)
-
-
-@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(VERSION, prog_name="nephron")
 def cli() -> None:
     """Nephron: rehearse ultrasound on a patient's own deformable kidney.
@@ -110,7 +98,7 @@ def main(arguments: list[str]) -> int:
         return cli.main(args=arguments, prog_name="app.py", standalone_mode=False) or 0
     except click.ClickException as error:
         message = error.format_message()
-    except MENDED_BY_USER as error:
+    except UserError as error:
         message = str(error)
     except OSError as error:
         message = _told(error)

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+from errors import UserError
 from scenes.scene import OPTIONS, Scene, with_options
 from scenes.tissue import QUALITIES, TISSUES
 from ultrasound.probe import Probe, load_probe
@@ -52,7 +53,7 @@ class Setup:
 OWN = tuple(field.name for field in fields(Setup))[1:]
 
 
-class SetupError(ValueError):
+class SetupError(UserError):
     """A setup that does not fit its model or case; the message is one line."""
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from errors import UserError
 from render.actions import ACTIONS, BY_MOUSE, HELD
 from render.viewer import KEY_MAP, LINES
 
@@ -54,7 +55,7 @@ HEAD = """# The keys of Nephron's window: change some, leave out the rest, and g
 """
 
 
-class KeysError(ValueError):
+class KeysError(UserError):
     """A file of keys that cannot be used; the message is one line."""
 
 

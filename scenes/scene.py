@@ -12,10 +12,10 @@ from typing import Annotated, Literal
 import tomli_w
 from pydantic import AliasChoices, BaseModel, Field, ValidationError, model_validator
 
+from errors import UserError, explained, meant
 from scenes.section import Direction, Length, Section, Vector3
 from scenes.tissue import TISSUES, NeoHookeanTissue, Tissue
 from scenes.trocar import Trocar
-from validation import explained, meant
 
 # The scene that the program has with it.
 EMBEDDED = Path(__file__).parent / "phantom.toml"
@@ -37,7 +37,7 @@ OPTIONS = {
 }
 
 
-class SceneError(ValueError):
+class SceneError(UserError):
     """A scene that cannot be used; the message is one line that says where, what was found and what to do."""
 
 

@@ -12,11 +12,13 @@ import numpy as np
 import psutil
 from scipy.spatial import cKDTree
 
+from errors import UserError
+
 # What a fine voxel takes while it is asked whether it is inside: indices and places in 64 bits, and the answer.
 VOXEL_BYTES = 80
 
 
-class SamplingError(ValueError):
+class SamplingError(UserError):
     """The surface cannot be filled with particles; the message says why and what to change."""
 
 

@@ -1,22 +1,37 @@
-"""The commands ``study ...``: what Nephron costs, and what cannot break it, measured on the user's machine."""
+"""The commands ``study ...``: accuracy, performance and robustness, measured on the user's machine."""
 
 import click
 
-from studies.freehand.freehand_command import freehand
-from studies.performance.features_command import features
-from studies.performance.import_timing_command import intake
-from studies.performance.timing_command import timing
-from studies.performance.tradeoff_command import trade
-from studies.planning.plan_study_command import plan_study
-from studies.robustness.replay_command import replay
-from studies.robustness.soak_command import soak
-from studies.robustness.stability_command import stability
+from rehearsal.commands.lazy_group import LazyGroup
+
+STUDIES = {
+    "timing": ("studies.performance.timing_command:timing", "Measure how long a time step of SCENE takes."),
+    "features": (
+        "studies.performance.features_command:features",
+        "Measure what each feature of SCENE costs.",
+    ),
+    "trade": (
+        "studies.performance.tradeoff_command:trade",
+        "Measure the error of beads against the time of a step.",
+    ),
+    "stability": (
+        "studies.robustness.stability_command:stability",
+        "Maltreat the tissue, let go, and see whether it recovers.",
+    ),
+    "soak": ("studies.robustness.soak_command:soak", "Rehearse for an hour in SCENE, faster than real."),
+    "import": ("studies.performance.import_timing_command:intake", "Measure an import: seconds and memory."),
+    "freehand": (
+        "studies.freehand.freehand_command:freehand",
+        "Compare volumes of tracked sweeps with the truth.",
+    ),
+    "replay": ("studies.robustness.replay_command:replay", "Record a session in SCENE and compute it again."),
+    "plan": (
+        "studies.planning.plan_study_command:plan_study",
+        "Compare planned sweeps with straight ones, and such by chance.",
+    ),
+}
 
 
-@click.group()
+@click.group(cls=LazyGroup, commands_at=STUDIES)
 def study() -> None:
     """Measure on this machine: tables and a picture in a folder."""
-
-
-for command in (timing, features, trade, stability, soak, intake, freehand, replay, plan_study):
-    study.add_command(command)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from errors import UserError
 from ultrasound.tissue_classification import recognised
 
 TISSUES = Path(__file__).parent / "tissues.toml"
@@ -27,7 +28,7 @@ LEAST_HU, MOST_HU = -1024, 3071
 IMPEDANCE, ATTENUATION, BACKSCATTER = range(3)
 
 
-class TissueError(ValueError):
+class TissueError(UserError):
     """A tissue that the table does not have; the message is one line."""
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic.alias_generators import to_pascal
 
-from validation import explained, meant
+from errors import UserError, explained, meant
 
 PROBES = Path(__file__).parent / "probes"
 SOUND_MM_US = 1.54
@@ -29,7 +29,7 @@ DETAIL_LEVELS: tuple[DetailLevel, ...] = get_args(DetailLevel)
 Percent = Annotated[float, Field(ge=0, le=100)]
 
 
-class ProbeError(ValueError):
+class ProbeError(UserError):
     """A probe file that cannot be used; the message is one line."""
 
 

@@ -15,6 +15,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from errors import UserError
+
 # As IGSIO has it: the To of a name is followed by what is no small letter, so ToolToTracker has one.
 TRANSFORM_NAME = re.compile(r"(\w+?)To((?![a-z])\w+)")
 TRANSFORM_FIELD = re.compile(r"(\w+?To(?![a-z])\w+)Transform")
@@ -34,7 +36,7 @@ class Mark(IntEnum):
     BEAD = 4
 
 
-class SweepError(ValueError):
+class SweepError(UserError):
     """A sweep that cannot be used; the message is one line."""
 
 

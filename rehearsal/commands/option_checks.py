@@ -5,6 +5,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from errors import explained
 from rehearsal.commands.command_line import CommandError
 from rehearsal.planning.plan_file import Plan, PlanError, is_plan, read_plan
 from rehearsal.sessions.recorded_scene import scene_of_log
@@ -14,7 +15,6 @@ from rehearsal.tracking.track_file import check_near
 from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.scene import OPTIONS, Scene
 from ultrasound.probe import Probe, ProbeError, probe_of_values
-from validation import explained
 from version import VERSION
 
 # What of tissue and solver each option that chooses size and passes leaves to the user.

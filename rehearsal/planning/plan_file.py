@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
+from errors import UserError
 from rehearsal.numbered_files import next_number
 from scenes.atomic_files import whole
 from scenes.trocar import Trocar
@@ -26,7 +27,7 @@ Row = Annotated[list[float], Field(min_length=4, max_length=4)]
 Pose = Annotated[list[Row], Field(min_length=4, max_length=4)]
 
 
-class PlanError(ValueError):
+class PlanError(UserError):
     """A plan that cannot be made or used; the message is one line."""
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from typing_extensions import TypedDict
 
+from errors import UserError
 from rehearsal.sessions.packed_coverage import Seen, SeenVoxels
 
 FORMAT = 1
@@ -27,7 +28,7 @@ MOST_SECOND = 1_000_000
 MOST_BYTES = 2_000_000_000
 
 
-class SessionError(ValueError):
+class SessionError(UserError):
     """A session's file that cannot be used; the message is one line."""
 
 

@@ -8,13 +8,15 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from errors import UserError
+
 # How far the axes of a pose may be from orthonormal: what six digits in a file leave.
 RIGID = 1e-3
 
 EXPECTED = "expected poses as JSON or CSV"
 
 
-class PoseError(ValueError):
+class PoseError(UserError):
     """Poses that cannot be used; the message is one line."""
 
 

@@ -1,7 +1,9 @@
 """What is wrong with a patient's files, for the user."""
 
+from errors import UserError
 
-class PatientError(ValueError):
+
+class PatientError(UserError):
     """One line for the user: which file, what was found, what was expected, what to do."""
 
     def __init__(self, line: str) -> None:

@@ -15,18 +15,18 @@ import numpy as np
 import trimesh
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from errors import UserError, explained
 from scenes.patients.import_error import PatientError
 from scenes.section import Direction, Vector3
 from scenes.surface_files import load_surface
 from sim.mesh_distance import signed_distance
-from validation import explained
 
 UNITS = ("_mm", "_kPa")
 # Between the nominal indentation and where the probe was found.
 MOST_APART_MM = 0.5
 
 
-class CaseError(ValueError):
+class CaseError(UserError):
     """A case that cannot be used; the message is one line that says where, what was found and what to do."""
 
 

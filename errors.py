@@ -1,13 +1,19 @@
-"""What is wrong with the values of a file, in words; every layer reads files."""
+"""Errors that the user can mend, and what is wrong with the values of a file, in words; every layer reads files."""
 
 import difflib
 from collections.abc import Callable, Collection, Iterable
+from typing import TYPE_CHECKING
 
-from pydantic import ValidationError
+if TYPE_CHECKING:
+    from pydantic import ValidationError
+
+
+class UserError(ValueError):
+    """What the user can mend. The message is one line: where, what was found, what was expected, what to do."""
 
 
 def explained(
-    error: ValidationError,
+    error: "ValidationError",
     unknown: Callable[[list[str]], str] = lambda where: "unknown key",
     tags: Collection[str] = (),
 ) -> str:
