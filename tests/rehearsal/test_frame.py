@@ -191,7 +191,7 @@ def test_without_contact_whoever_leads_by_hand_is_told_how_to_press(looping, mon
     monkeypatch.setattr(Moments, "onto", lambda each, view, _: replace(view, notes={"B-mode": "NO CONTACT"}))
     monkeypatch.setattr(frame, "UserInput", SimpleNamespace)
     looping.keys = Keys({**USUAL_KEYS, "push": "Return"})
-    monkeypatch.setattr(frame, "Played", Moments)
+    monkeypatch.setattr(frame, "ReplayInput", Moments)
     by_hand, tracked = (SimpleNamespace(is_by_hand=each) for each in (True, False))
     told = []
     for looping.driver.live in (None, by_hand, tracked):
@@ -308,7 +308,9 @@ def test_ctrl_c_in_a_run_says_so_before_how_it_went(monkeypatch, capsys):
 )
 def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scene, words):
     monkeypatch.setattr(
-        run, "Instruments", lambda rehearsal, guide: SimpleNamespace(guide=None, summary=lambda bookmarks: {})
+        run,
+        "LiveMeasurements",
+        lambda rehearsal, guide: SimpleNamespace(guide=None, summary=lambda bookmarks: {}),
     )
     monkeypatch.setattr(run, "summary_text", lambda summary: "")
     each = run.RehearsalRun(Moments(), None, "cpu", None, scene=scene)

@@ -62,7 +62,7 @@ def test_what_a_session_holds_is_recalled_as_it_was_watched(watching, rehearsal,
     # The first is no press: as it is noted it is 1 mm.
     squeezed = iter([1.00004, 0.3, 9.0, 0.2])
     monkeypatch.setattr(
-        live_measurements, "read", lambda *_: Measurement(next(squeezed), 20.0, 5.0, 2.0, 1.0)
+        live_measurements, "measure", lambda *_: Measurement(next(squeezed), 20.0, 5.0, 2.0, 1.0)
     )
     events: dict[int, list] = {}
     session = SimpleNamespace(moment=0, kept={}, back=None)
@@ -109,7 +109,7 @@ def test_a_session_that_begins_is_read_with_what_touches_then(watching, rehearsa
     """Though its first moment is none at which it would be looked."""
     given = []
     monkeypatch.setattr(
-        live_measurements, "read", lambda *asked: given.append(asked[-1]) or Measurement(1.0, 20.0)
+        live_measurements, "measure", lambda *asked: given.append(asked[-1]) or Measurement(1.0, 20.0)
     )
     touches = np.arange(rehearsal.probe.number_of_scanlines) < 30
     monkeypatch.setattr(watching.coverage, "look", lambda *_: touches)

@@ -259,7 +259,7 @@ def test_what_is_built_is_kept_and_not_more_than_taichi_bears(monkeypatch, cases
     started, filled = [], []
     monkeypatch.setattr(workers.sim.device, "start", lambda *a, **options: started.append(options))
     monkeypatch.setattr(workers, "rest_body", lambda case, setup: filled.append(case.digest))
-    monkeypatch.setattr(workers, "Experiment", lambda case, setup, rest: None)
+    monkeypatch.setattr(workers, "BeadExperiment", lambda case, setup, rest: None)
     for radius in (2.0, 3.0, 4.0, 5.0, 6.0, 2.0, 6.0):
         setup = setup_of(MODEL, radius_mm=radius)
         key = (cases[0].digest, radius)

@@ -54,7 +54,7 @@ def test_what_moves_is_told_stage_by_stage(tmp_path):
     case, setup = load_case(write_case(tmp_path / "ball")), setup_of("neo-hookean", cell_mm=6.0, iterations=8)
     experiment = Drifting(case, setup)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("studies.accuracy.convergence_study.Experiment", Drifting)
+        patch.setattr("studies.accuracy.convergence_study.BeadExperiment", Drifting)
         halved, doubled, larger, smaller = moved(experiment, setup, experiment.run(setup).beads)
     count = case.measured.shape[1]
     assert halved["moved_max_mm"] == pytest.approx(0.0, abs=1e-6)
@@ -70,7 +70,7 @@ def test_validate_prints_and_writes_what_the_settings_change(monkeypatch, tmp_pa
         "studies.accuracy.accuracy_commands.choose_setup",
         partial(choose_setup, warm_up_steps=12, stage_steps=9),
     )
-    monkeypatch.setattr("studies.accuracy.convergence_study.Experiment", Drifting)
+    monkeypatch.setattr("studies.accuracy.convergence_study.BeadExperiment", Drifting)
     folder, file = write_case(tmp_path / "ball"), tmp_path / "a.json"
     arguments = ["validate", folder, "--cell", 6, "--check", "--arch", "cpu", "--json", file]
     done = CliRunner().invoke(cli, [str(argument) for argument in arguments])
