@@ -14,7 +14,7 @@ from rehearsal.adaptive_iterations import LEVELS, STEPS_DOWN, STEPS_UP, Adaptive
 from rehearsal.build_solver import step_settings
 from rehearsal.commands.option_checks import refuse_sizes
 from rehearsal.commands.rehearse_command import as_asked
-from rehearsal.configuration import PRESETS, Setup, scene_of, setup_of, setup_of_scene
+from rehearsal.configuration import PRESETS, Setup, scene_of, setup_of
 from rehearsal.measurements.run_report import expected_error_of
 from rehearsal.speed_accuracy import budget_choice
 from rehearsal.speed_accuracy.pareto_front import (
@@ -115,8 +115,7 @@ def test_a_scene_has_the_settings_of_the_setup_it_was_made_with():
         setup_of("shape-matching", radius_mm=3.0, stiffness=0.5, substeps=2),
     ):
         scene = scene_of(with_options(load_scene(PAPER), {"tissue.cell_mm": 9.0}), setup)
-        step = scene.solver
-        assert setup_of_scene(scene, step.substeps, step.iterations, step.relaxation_factor) == setup
+        assert Setup(scene.tissue, scene.solver) == setup
     of_its_own = scene_of(with_options(scene, {"tissue.cluster_spacing": 4.0}), setup)
     assert of_its_own.tissue.cluster_spacing == 4.0
 
