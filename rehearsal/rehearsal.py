@@ -93,7 +93,7 @@ class Rehearsal:
             echo = begin_echo(scanned) if shows_echo else None
         progress("Building the model: tissue and contacts")
         self._build_solver(anatomy)
-        self.guard = DivergenceCheck(self.solver)
+        self.divergence_check = DivergenceCheck(self.solver)
         self.notice = ""
         progress("Building the model: surfaces")
         self._build_surfaces()
@@ -104,7 +104,7 @@ class Rehearsal:
         self.pose = self._settle()
         self.manipulator = self._manipulator()
         self.pose = self.manipulator.pose()
-        self.guard.settle()
+        self.divergence_check.settle()
         self.settled = self.snapshot()
 
     def _build_solver(self, anatomy: LoadedAnatomy) -> None:
@@ -213,25 +213,25 @@ class Rehearsal:
         ``notice`` says what had to be put right; it is empty after most steps.
         """
         self.solver.step(self.settings, between(self.pose, pose, self.settings.substeps))
-        self.notice = self.guard.check(self.settings.time_step_s)
+        self.notice = self.divergence_check.check(self.settings.time_step_s)
         self.pose = pose
         self.steps += 1
 
     def snapshot(self) -> RehearsalState:
         """A copy of the current state."""
         return RehearsalState(
-            self.solver.snapshot(), self.guard.watch, self.pose, self.steps, self.manipulator.state
+            self.solver.snapshot(), self.divergence_check.watch, self.pose, self.steps, self.manipulator.state
         )
 
     def restore(self, state: RehearsalState) -> None:
         """Go back to a state; the steps that follow give the same bits as they did from it before."""
         self.solver.restore(state.solver)
-        self.guard.watch = state.watch
+        self.divergence_check.watch = state.watch
         self.pose, self.steps, self.manipulator.state = state.pose, state.steps, state.manipulator
 
     def keep_good(self) -> None:
         """Take the tissue, where it is well, for what its guard would put back."""
-        self.guard.keep()
+        self.divergence_check.keep()
 
     def update_surfaces(self) -> None:
         """Carry the surfaces that are drawn to where the body is."""

@@ -200,7 +200,9 @@ def of_frame(scene: Scene, anatomy: LoadedAnatomy, arch: str) -> Iterator[dict[s
     start(arch)
     rehearsal = Rehearsal(scene, anatomy)
     dt = rehearsal.settings.time_step_s
-    yield _alone("guard", lambda: rehearsal.guard.check(dt), [rehearsal.guard], rehearsal.solver)
+    yield _alone(
+        "guard", lambda: rehearsal.divergence_check.check(dt), [rehearsal.divergence_check], rehearsal.solver
+    )
     yield _alone("organ's surface", rehearsal.organ_skin.update, [rehearsal.organ_skin], rehearsal.model)
     if rehearsal.tumour_skin is not None:
         yield _alone(
@@ -245,7 +247,7 @@ def _whole_frame(rehearsal: Rehearsal) -> dict[str, Any]:
         for depth in np.linspace(0.0, rehearsal.press.indentations_mm[0], CALLS + 1)
     ]
 
-    whole = [rehearsal.solver, rehearsal.guard, rehearsal.organ_skin, rehearsal.tumour_skin]
+    whole = [rehearsal.solver, rehearsal.divergence_check, rehearsal.organ_skin, rehearsal.tumour_skin]
     whole += [rehearsal.embedding, rehearsal.scanner]
 
     def go_on() -> None:

@@ -1,4 +1,4 @@
-"""A guard sees what no tissue is, waits for what heals, and puts back the rest; fast bodies do not pass through shapes."""
+"""A divergence_check sees what no tissue is, waits for what heals, and puts back the rest; fast bodies do not pass through shapes."""
 
 from collections.abc import Callable
 
@@ -84,82 +84,82 @@ def test_tetrahedra_are_small_and_none_is_flat():
 @pytest.mark.parametrize("model", MODELS)
 def test_a_guard_lets_tissue_be_pressed_and_puts_back_what_is_none(kept, ball, model):
     solver = kept(solver_of, model, ball, floor, tool)
-    guard = DivergenceCheck(solver)
+    divergence_check = DivergenceCheck(solver)
     poses = np.tile(np.eye(4), (settings(model).substeps + 1, 1, 1))
     for step in range(90):
         poses[:, 2, 3] = 17.0 - 4.0 * min(step / 60, 1.0)
         solver.step(settings(model), poses)
-        assert guard.check(DT) == ""
-    assert guard.health().finite and guard.health().tangled == 0.0
-    good = guard.watch.good.body
+        assert divergence_check.check(DT) == ""
+    assert divergence_check.health().finite and divergence_check.health().tangled == 0.0
+    good = divergence_check.watch.good.body
     assert np.abs(good.position - solver.body.rest_state().position).max() > 0.5
     # Not a number: back at once, at rest.
     put(solver, np.full(good.position.shape, np.nan))
-    assert "no numbers" in guard.check(DT)
+    assert "no numbers" in divergence_check.check(DT)
     assert (array_of(solver.body.position) == good.position).all()
     assert (array_of(solver.body.velocity) == 0).all()
     # Gone: the same state has failed before, so it is the first one now.
     put(solver, good.position + [0, 0, 600.0])
-    assert "left the scene" in guard.check(DT)
-    assert (array_of(solver.body.position) == guard.home.body.position).all()
-    assert guard.fallbacks == 2
+    assert "left the scene" in divergence_check.check(DT)
+    assert (array_of(solver.body.position) == divergence_check.home.body.position).all()
+    assert divergence_check.fallbacks == 2
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_a_tangle_is_given_time_and_then_put_back(kept, ball, model):
     solver = kept(solver_of, model, ball, floor, tool)
     away(solver)
-    guard = DivergenceCheck(solver)
+    divergence_check = DivergenceCheck(solver)
     mirrored = solver.body.rest_points * [1, 1, -1]
     flat = solver.body.rest_points * [1, 1, 1e-3]
     for state in (mirrored, flat, 5.0 * solver.body.rest_points):
         put(solver, state)
-        assert guard.health().tangled > 0.99
-        said = [guard.check(DT) for _ in range(PATIENCE_STEPS + 1)]
+        assert divergence_check.health().tangled > 0.99
+        said = [divergence_check.check(DT) for _ in range(PATIENCE_STEPS + 1)]
         assert said[:-1] == [""] * PATIENCE_STEPS
         assert "torn, flat or inside out" in said[-1]
-        assert guard.health().tangled == 0.0
+        assert divergence_check.health().tangled == 0.0
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_tissue_is_torn_where_an_edge_is_as_many_times_its_own_length_as_that_takes(kept, ball, model):
     solver = kept(solver_of, model, ball, floor)
-    guard = DivergenceCheck(solver)
+    divergence_check = DivergenceCheck(solver)
     for share, tangled in ((0.99, 0.0), (1.01, 1.0)):
         put(solver, share * TORN * solver.body.rest_points)
-        assert guard.health().tangled == tangled
+        assert divergence_check.health().tangled == tangled
 
 
 def test_a_tangle_that_was_undone_is_given_its_time_again(kept, ball):
     solver = kept(solver_of, "neo-hookean", ball, floor)
-    guard = DivergenceCheck(solver)
+    divergence_check = DivergenceCheck(solver)
     rest = solver.body.rest_points
     # Undone too early for a good state to be kept, which would begin anew as well.
     for count in (KEEP_STEPS - 10, PATIENCE_STEPS):
         put(solver, rest * [1, 1, -1])
-        assert [guard.check(DT) for _ in range(count)] == [""] * count
+        assert [divergence_check.check(DT) for _ in range(count)] == [""] * count
         put(solver, rest)
-        assert guard.check(DT) == ""
+        assert divergence_check.check(DT) == ""
     # Of short steps there are more in the time that it is given.
     put(solver, rest * [1, 1, -1])
     count = round(PATIENCE_S / (DT / 3))
-    assert count > PATIENCE_STEPS and [guard.check(DT / 3) for _ in range(count)] == [""] * count
-    assert "inside out" in guard.check(DT / 3)
+    assert count > PATIENCE_STEPS and [divergence_check.check(DT / 3) for _ in range(count)] == [""] * count
+    assert "inside out" in divergence_check.check(DT / 3)
 
 
 def test_what_the_tool_crushes_is_no_tangle(kept, ball):
     solver = kept(solver_of, "neo-hookean", ball, floor, tool)
-    guard = DivergenceCheck(solver)
+    divergence_check = DivergenceCheck(solver)
     put(solver, solver.body.rest_points * [1, 1, -1])
     at = np.eye(4)
     solver.tool.move(at, at)
     # Everything is inside out: what counts is more than 10 mm from the tool's faces, or from the ball about its corners.
     half = np.array([5.0, 3.0, 5.0])
-    at = solver.body.rest_points[array_of(guard.corner)[:, 0]] * [1, 1, -1]
+    at = solver.body.rest_points[array_of(divergence_check.corner)[:, 0]] * [1, 1, -1]
     beyond = (np.abs(at) - half > CRUSHED_MM).any(axis=1)
     beyond |= np.linalg.norm(at, axis=1) > np.linalg.norm(half) + CRUSHED_MM
     assert 0 < beyond.mean() < 0.2
-    assert guard.health().tangled == pytest.approx(beyond.mean(), abs=1e-6)
+    assert divergence_check.health().tangled == pytest.approx(beyond.mean(), abs=1e-6)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -304,13 +304,16 @@ def test_a_pose_that_is_no_number_is_refused(kept, ball):
 
 def test_tissue_is_kept_for_good_when_asked_for_but_not_what_is_none(kept, ball):
     solver = kept(solver_of, "neo-hookean", ball, floor)
-    guard = DivergenceCheck(solver)
+    divergence_check = DivergenceCheck(solver)
     for _ in range(5):
         solver.step(settings("neo-hookean"))
-        guard.check(DT)
-    guard.keep()
+        divergence_check.check(DT)
+    divergence_check.keep()
     good = position(solver)
-    assert np.array_equal(guard.watch.good.body.position, good) and guard.watch.steps_since_good == 0
+    assert (
+        np.array_equal(divergence_check.watch.good.body.position, good)
+        and divergence_check.watch.steps_since_good == 0
+    )
     put(solver, np.zeros_like(good))
-    guard.keep()
-    assert np.array_equal(guard.watch.good.body.position, good)
+    divergence_check.keep()
+    assert np.array_equal(divergence_check.watch.good.body.position, good)

@@ -250,7 +250,7 @@ ABUSES = {
 
 @pytest.mark.parametrize("abuse", ABUSES)
 def test_whatever_was_done_to_it_it_stays_finite(laid, abuse):
-    guard, rest = DivergenceCheck(laid.solver), laid.solver.body.rest_points
+    divergence_check, rest = DivergenceCheck(laid.solver), laid.solver.body.rest_points
     extremes = (
         laid.settings(G),
         laid.settings(10 * G, time_step_s=0.1, iterations=1),
@@ -260,9 +260,9 @@ def test_whatever_was_done_to_it_it_stays_finite(laid, abuse):
         laid.put(ABUSES[abuse](rest), speed * np.sin(rest))
         for _ in range(10):
             laid.solver.step(settings)
-        assert guard.health().finite, (settings, speed)
-    laid.solver.restore(guard.home)
-    assert guard.health().fault == ""
+        assert divergence_check.health().finite, (settings, speed)
+    laid.solver.restore(divergence_check.home)
+    assert divergence_check.health().fault == ""
 
 
 def test_a_stiffer_material_gives_way_less(laid):
