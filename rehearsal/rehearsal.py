@@ -104,7 +104,7 @@ class Rehearsal:
         self.pose = self._settle()
         self.manipulator = self._manipulator()
         self.pose = self.manipulator.pose()
-        self.divergence_check.settle()
+        self.divergence_check.set_initial_state()
         self.settled = self.snapshot()
 
     def _build_solver(self, anatomy: LoadedAnatomy) -> None:
@@ -220,18 +220,18 @@ class Rehearsal:
     def snapshot(self) -> RehearsalState:
         """A copy of the current state."""
         return RehearsalState(
-            self.solver.snapshot(), self.divergence_check.watch, self.pose, self.steps, self.manipulator.state
+            self.solver.snapshot(), self.divergence_check.state, self.pose, self.steps, self.manipulator.state
         )
 
     def restore(self, state: RehearsalState) -> None:
         """Go back to a state; the steps that follow give the same bits as they did from it before."""
         self.solver.restore(state.solver)
-        self.divergence_check.watch = state.watch
+        self.divergence_check.state = state.watch
         self.pose, self.steps, self.manipulator.state = state.pose, state.steps, state.manipulator
 
     def keep_good(self) -> None:
         """Take the tissue, where it is well, for what its guard would put back."""
-        self.divergence_check.keep()
+        self.divergence_check.store_if_healthy()
 
     def update_surfaces(self) -> None:
         """Carry the surfaces that are drawn to where the body is."""

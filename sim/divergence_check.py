@@ -92,46 +92,46 @@ class DivergenceCheck:
             edges = rest[corners[:, 1:]] - rest[corners[:, :1]]
             self.per_volume = field_of(1.0 / np.linalg.det(edges))
             self.corner, self.longest = fields_of(corners, TORN * np.linalg.norm(edges, axis=2), within=1)
-        self.fallbacks = 0
-        self.settle()
+        self.restorations = 0
+        self.set_initial_state()
 
-    def settle(self) -> None:
+    def set_initial_state(self) -> None:
         """Take the body's state for the one to come home to."""
-        self.home = self.solver.snapshot()
-        self.watch = DivergenceState(self.home)
+        self.initial = self.solver.snapshot()
+        self.state = DivergenceState(self.initial)
 
-    def keep(self) -> None:
+    def store_if_healthy(self) -> None:
         """Take the body's state now for the last good one, where it is well."""
         health = self.health()
         if health.tangled == 0.0 and not health.is_lost:
-            self.watch = DivergenceState(self.solver.snapshot())
+            self.state = DivergenceState(self.solver.snapshot())
 
     def check(self, time_step_s: float) -> str:
         """Look at the body after a step; where it is no tissue any more put it back and say so, else an empty text."""
         health = self.health()
         is_tangled = health.tangled > MOST_SHARE
         watch = replace(
-            self.watch,
-            steps_since_good=self.watch.steps_since_good + 1,
-            steps_tangled=self.watch.steps_tangled + 1 if is_tangled else 0,
+            self.state,
+            steps_since_good=self.state.steps_since_good + 1,
+            steps_tangled=self.state.steps_tangled + 1 if is_tangled else 0,
         )
         patience = max(PATIENCE_STEPS, round(PATIENCE_S / time_step_s))
         if health.is_lost or watch.steps_tangled > patience:
             return self._put_back(health.fault, time_step_s)
         if health.tangled == 0.0 and watch.steps_since_good >= max(KEEP_STEPS, round(KEEP_S / time_step_s)):
             watch = DivergenceState(self.solver.snapshot())
-        self.watch = watch
+        self.state = watch
         return ""
 
     def _put_back(self, fault: str, time_step_s: float) -> str:
         """The last good state, at rest, so that what led here does not go on; where it led here before, home."""
-        state, where = self.watch.good, f"as it was {self.watch.steps_since_good * time_step_s:.1f} s before"
-        if self.watch.is_restored:
-            state, where = self.home, "as it was at the start"
+        state, where = self.state.good, f"as it was {self.state.steps_since_good * time_step_s:.1f} s before"
+        if self.state.is_restored:
+            state, where = self.initial, "as it was at the start"
         still = replace(state.body, velocity=np.zeros_like(state.body.velocity))
         self.solver.restore(SolverState(still, state.contacts))
-        self.watch = DivergenceState(state, is_restored=True)
-        self.fallbacks += 1
+        self.state = DivergenceState(state, is_restored=True)
+        self.restorations += 1
         return f"Tissue put back, {where}: {fault}"
 
     def health(self) -> Health:

@@ -50,7 +50,7 @@ class Specimen:
         self.up = -gravity / np.linalg.norm(gravity)
         self.mass = self._masses()
         self.divergence_check = DivergenceCheck(solver)
-        self.settled = self.divergence_check.home
+        self.settled = self.divergence_check.initial
         self.rest = self.settled.body.position.astype(float)
         skin.update()
         surface = array_of(skin.vertices).astype(float)

@@ -93,7 +93,7 @@ def _maltreat(specimen: Specimen, case: StressCase, extremes: Extremes) -> None:
     dt = settings.time_step_s
     position, velocity = _state(specimen, case)
     specimen.solver.restore(specimen.settled)
-    specimen.divergence_check.settle()
+    specimen.divergence_check.set_initial_state()
     if case.state[0] != "settled":
         specimen.body.restore(BodyState(position.astype(np.float32), velocity.astype(np.float32)))
         specimen.solver.contacts.forget()

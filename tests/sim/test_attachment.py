@@ -41,7 +41,7 @@ def test_held_nodes_stay_and_the_rest_hangs_from_them(device):
     far = rehearsal.body.rest_points[:, 0] > 8
     drop = moved[far] @ rehearsal.gravity_direction
     # Free fall for 0.5 s would be a metre.
-    assert 0.01 < drop.mean() < 20 and rehearsal.divergence_check.fallbacks == 0
+    assert 0.01 < drop.mean() < 20 and rehearsal.divergence_check.restorations == 0
 
 
 def test_without_a_radius_nothing_is_held(device):

@@ -91,7 +91,7 @@ def test_a_guard_lets_tissue_be_pressed_and_puts_back_what_is_none(kept, ball, m
         solver.step(settings(model), poses)
         assert divergence_check.check(DT) == ""
     assert divergence_check.health().finite and divergence_check.health().tangled == 0.0
-    good = divergence_check.watch.good.body
+    good = divergence_check.state.good.body
     assert np.abs(good.position - solver.body.rest_state().position).max() > 0.5
     # Not a number: back at once, at rest.
     put(solver, np.full(good.position.shape, np.nan))
@@ -101,8 +101,8 @@ def test_a_guard_lets_tissue_be_pressed_and_puts_back_what_is_none(kept, ball, m
     # Gone: the same state has failed before, so it is the first one now.
     put(solver, good.position + [0, 0, 600.0])
     assert "left the scene" in divergence_check.check(DT)
-    assert (array_of(solver.body.position) == divergence_check.home.body.position).all()
-    assert divergence_check.fallbacks == 2
+    assert (array_of(solver.body.position) == divergence_check.initial.body.position).all()
+    assert divergence_check.restorations == 2
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -308,12 +308,12 @@ def test_tissue_is_kept_for_good_when_asked_for_but_not_what_is_none(kept, ball)
     for _ in range(5):
         solver.step(settings("neo-hookean"))
         divergence_check.check(DT)
-    divergence_check.keep()
+    divergence_check.store_if_healthy()
     good = position(solver)
     assert (
-        np.array_equal(divergence_check.watch.good.body.position, good)
-        and divergence_check.watch.steps_since_good == 0
+        np.array_equal(divergence_check.state.good.body.position, good)
+        and divergence_check.state.steps_since_good == 0
     )
     put(solver, np.zeros_like(good))
-    divergence_check.keep()
-    assert np.array_equal(divergence_check.watch.good.body.position, good)
+    divergence_check.store_if_healthy()
+    assert np.array_equal(divergence_check.state.good.body.position, good)

@@ -261,7 +261,7 @@ def test_whatever_was_done_to_it_it_stays_finite(laid, abuse):
         for _ in range(10):
             laid.solver.step(settings)
         assert divergence_check.health().finite, (settings, speed)
-    laid.solver.restore(divergence_check.home)
+    laid.solver.restore(divergence_check.initial)
     assert divergence_check.health().fault == ""
 
 
