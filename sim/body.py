@@ -65,7 +65,7 @@ class Body:
         self.count = len(rest_points)
         self.position = ti.Vector.field(3, ti.f32, self.count)
         self.velocity = ti.Vector.field(3, ti.f32, self.count)
-        self.estimate = ti.Vector.field(3, ti.f32, self.count)
+        self.predicted = ti.Vector.field(3, ti.f32, self.count)
         self.rest = ti.Vector.field(3, ti.f32, self.count)
         self._put(self.rest_state(), (self.rest, self.rest_points))
 
@@ -84,7 +84,7 @@ class Body:
 
     def _put(self, state: BodyState, *others: tuple[ti.Field, np.ndarray]) -> None:
         at, speed = state.position, state.velocity
-        fill((self.position, at), (self.estimate, at), (self.velocity, speed), *others)
+        fill((self.position, at), (self.predicted, at), (self.velocity, speed), *others)
 
 
 @ti.data_oriented

@@ -96,7 +96,7 @@ class NeoHookean:
         self.mu = ti.field(ti.f32, ())
         self.lame = ti.field(ti.f32, ())
         self.target = ti.Vector.field(3, ti.f32, body.count)
-        self.estimate = ti.Vector.field(4, ti.f32, body.count)
+        self.predicted = ti.Vector.field(4, ti.f32, body.count)
         self.mass = field_of(1e-3 * density_g_cm3 * lattice.tissue + load_g)
         self._store_cells()
         self._store_hourglass()
@@ -153,15 +153,15 @@ class NeoHookean:
     def begin(self, dt: float):
         """Start from where the body is, moved rigidly; what the solver predicted is where inertia and gravity draw it."""
         for i in range(self.body.count):
-            self.target[i] = self.body.estimate[i]
-            self.body.estimate[i] = self.body.position[i]
+            self.target[i] = self.body.predicted[i]
+            self.body.predicted[i] = self.body.position[i]
         if ti.static(not self.has_held):
             self.rigid.move(dt)
         for c in range(self.count):
             x, y, z = tm.vec4(0.0), tm.vec4(0.0), tm.vec4(0.0)
             for k in ti.static(range(8)):
                 i = self.cell[c][k]
-                b, at = self.gradient[i, k], four(self.body.estimate[i])
+                b, at = self.gradient[i, k], four(self.body.predicted[i])
                 x += b.x * at
                 y += b.y * at
                 z += b.z * at
@@ -175,13 +175,13 @@ class NeoHookean:
     def gather(self):
         """Take over the estimates."""
         for i in range(self.body.count):
-            self.estimate[i] = four(self.body.estimate[i])
+            self.predicted[i] = four(self.body.predicted[i])
 
     @ti.func
     def scatter(self):
         """Give the estimates back."""
         for i in range(self.body.count):
-            self.body.estimate[i] = self.estimate[i].xyz
+            self.body.predicted[i] = self.predicted[i].xyz
 
     @ti.func
     def project(self, stiffness: float, relaxation_factor: float, dt: float):
@@ -205,7 +205,7 @@ class NeoHookean:
         """Node i goes to its balance with all others held."""
         inertia = self.mass[i] / (dt * dt)
         force, hessian, least = self.elastic(i)
-        force += inertia * (four(self.target[i]) - self.estimate[i])
+        force += inertia * (four(self.target[i]) - self.predicted[i])
         hessian += inertia * tm.eye(3)
         factor = relaxation_factor
         if ti.static(self.has_contacts):
@@ -225,7 +225,7 @@ class NeoHookean:
     @ti.func
     def move(self, i, change):
         """Node i moves, and the cells around it follow. No other node of its colour has them."""
-        self.estimate[i] = self.estimate[i] + change
+        self.predicted[i] = self.predicted[i] + change
         for k in range(8):
             b = self.gradient[i, k]
             # Not "+=", which is atomic.
@@ -267,10 +267,10 @@ class NeoHookean:
     @ti.func
     def hourglass_pull(self, i):
         """Force, for a shear modulus of 1, against deformation that varies inside the cells: blind to rotations."""
-        x = self.estimate[i]
+        x = self.predicted[i]
         pull = tm.vec4(0.0)
         for k in range(27):
-            pull += self.hourglass[i, k] * (self.estimate[self.neighbour[i, k]] - x)
+            pull += self.hourglass[i, k] * (self.predicted[self.neighbour[i, k]] - x)
         return pull
 
     def update_frames(self) -> None:

@@ -91,10 +91,10 @@ class ShapeContacts:
 
     @ti.func
     def find(self):
-        """Lines 6-9: the shapes that each particle's estimate is near to; none goes through one by its speed."""
+        """Lines 6-9: the shapes that each particle's predicted position is near to; none goes through one by its speed."""
         for i in range(self.body.count):
-            p = self.halted(self.body.position[i], self.body.estimate[i])
-            self.body.estimate[i] = p
+            p = self.halted(self.body.position[i], self.body.predicted[i])
+            self.body.predicted[i] = p
             reach = self.body.contact_radius[i] + self.margin
             touched = 0
             for s in ti.static(range(len(self.shapes))):
@@ -140,7 +140,7 @@ class ShapeContacts:
                             active += 1
                     moved += change / ti.cast(ti.max(active, 1), ti.f32)
                 self.body.position[i] = x + moved
-                self.body.estimate[i] = self.body.estimate[i] + moved
+                self.body.predicted[i] = self.body.predicted[i] + moved
 
     @ti.func
     def pushed(self, i, x, relaxation_factor: float):
@@ -201,8 +201,8 @@ class ShapeContacts:
         overlap, so that each sends a particle into the other, it leaves through that side of a tool which is free.
         """
         for i in range(self.body.count):
-            if not self.is_clear_of_all(i, self.body.estimate[i]):
-                self.body.estimate[i] = self.kept_out(i, self.body.estimate[i])
+            if not self.is_clear_of_all(i, self.body.predicted[i]):
+                self.body.predicted[i] = self.kept_out(i, self.body.predicted[i])
 
     @ti.func
     def is_clear_of_all(self, i, x):

@@ -88,7 +88,7 @@ class RigidMotion:
                     ti.atomic_min(self.share[None], self.contacts.free_share(start, self.moved(start)))
         for i in range(self.body.count):
             x = self.body.position[i]
-            self.body.estimate[i] = x + self.share[None] * (self.moved(x) - x)
+            self.body.predicted[i] = x + self.share[None] * (self.moved(x) - x)
 
     @ti.func
     def is_long(self):

@@ -70,7 +70,7 @@ class ParticleContacts:
         for c in range(CELLS):
             self.cell_count[c] = 0
         for i in range(self.body.count):
-            self.cell_count[self.hash(self.cell_of(self.body.estimate[i]))] += 1
+            self.cell_count[self.hash(self.cell_of(self.body.predicted[i]))] += 1
         for _ in range(1):
             total = 0
             for c in range(CELLS):
@@ -79,7 +79,7 @@ class ParticleContacts:
                 self.cell_count[c] = 0
             self.cell_start[CELLS] = total
         for i in range(self.body.count):
-            c = self.hash(self.cell_of(self.body.estimate[i]))
+            c = self.hash(self.cell_of(self.body.predicted[i]))
             self.sorted[self.cell_start[c] + ti.atomic_add(self.cell_count[c], 1)] = i
         for i in range(self.body.count):
             self.neighbour_count[i] = self.list_neighbours(i)
@@ -87,14 +87,14 @@ class ParticleContacts:
     @ti.func
     def list_neighbours(self, i):
         """Write the row of particle i; how many it holds."""
-        p = self.body.estimate[i]
+        p = self.body.predicted[i]
         count = 0
         for near in ti.grouped(ti.ndrange((-1, 2), (-1, 2), (-1, 2))):
             cell = self.cell_of(p) + near
             c = self.hash(cell)
             for k in range(self.cell_start[c], self.cell_start[c + 1]):
                 j = self.sorted[k]
-                q = self.body.estimate[j]
+                q = self.body.predicted[j]
                 # Two cells of the neighbourhood may share a hash: a particle counts in its own cell alone.
                 if j != i and (self.cell_of(q) == cell).all() and (p - q).norm() < self.reach:
                     if self.share_cluster(i, j) == 0:
@@ -121,12 +121,12 @@ class ParticleContacts:
         """Lines 18-20 for the group of pairs: C = distance - |x_i - x_j| <= 0 and its friction, gathered."""
         self.most_contacts[None] = 0
         for i in range(self.body.count):
-            x = self.body.estimate[i]
+            x = self.body.predicted[i]
             moved = x - self.body.position[i]
             change, contacts = tm.vec3(0.0), 0
             for k in range(self.neighbour_count[i]):
                 j = self.neighbour[i, k]
-                away = x - self.body.estimate[j]
+                away = x - self.body.predicted[j]
                 gap = away.norm()
                 if gap < self.distance:
                     normal = self.direction(i, j, away, gap)
@@ -136,7 +136,7 @@ class ParticleContacts:
                     depth = self.distance - gap
                     change += share * depth * normal
                     if ti.static(self.rough):
-                        slip = moved - (self.body.estimate[j] - self.body.position[j])
+                        slip = moved - (self.body.predicted[j] - self.body.position[j])
                         slip -= slip.dot(normal) * normal
                         hold = ti.min(1.0, self.friction * depth / ti.max(slip.norm(), 1e-12))
                         change -= share * hold * slip
@@ -148,9 +148,11 @@ class ParticleContacts:
             self.change[i] = relaxation_factor * change
         for i in range(self.body.count):
             if ti.static(self.relax_globally):
-                self.body.estimate[i] += self.change[i] / ti.cast(ti.max(self.most_contacts[None], 1), ti.f32)
+                self.body.predicted[i] += self.change[i] / ti.cast(
+                    ti.max(self.most_contacts[None], 1), ti.f32
+                )
             else:
-                self.body.estimate[i] += self.change[i]
+                self.body.predicted[i] += self.change[i]
 
     @ti.func
     def direction(self, i, j, away, gap):

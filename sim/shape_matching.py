@@ -95,7 +95,7 @@ class ShapeMatching:
         self.member_start, self.member, self.several_end = fields_of(
             members.offsets, members.members, members.offsets[:-1] + several.astype(np.int32)
         )
-        self.estimate = ti.Vector.field(4, ti.f32, self.body.count)
+        self.predicted = ti.Vector.field(4, ti.f32, self.body.count)
         self.goal = ti.Matrix.field(4, 4, ti.f32, self.patch_count)
         self.centre = ti.Vector.field(4, ti.f32, self.patch_count)
         self.moment = ti.Matrix.field(4, 4, ti.f32, self.patch_count)
@@ -193,23 +193,23 @@ class ShapeMatching:
         """Centres and moments of the patches where the estimates are."""
         for p in range(self.several):
             first, last = self.patch_start[p], self.patch_start[p + 1]
-            reference = four(self.body.estimate[first])
+            reference = four(self.body.predicted[first])
             sums = tm.mat4(0.0)
             for k in range(first, last):
-                estimate = four(self.body.estimate[k])
-                self.estimate[k] = estimate
-                sums += self.moment_of(k, estimate - reference)
+                predicted = four(self.body.predicted[k])
+                self.predicted[k] = predicted
+                sums += self.moment_of(k, predicted - reference)
             self.add_moment(p, reference, tm.mat4(0.0), sums)
         for p in range(self.several, self.patch_count):
             k = self.patch_start[p]
-            self.estimate[k] = four(self.body.estimate[k])
-            self.centre[p] = self.estimate[k]
+            self.predicted[k] = four(self.body.predicted[k])
+            self.centre[p] = self.predicted[k]
 
     @ti.func
     def scatter(self):
         """Give the estimates back."""
         for k in range(self.body.count):
-            self.body.estimate[k] = self.estimate[k].xyz
+            self.body.predicted[k] = self.predicted[k].xyz
 
     @ti.func
     def moment_of(self, k, moved):
@@ -285,7 +285,7 @@ class ShapeMatching:
 
     @ti.func
     def move_to_goals(self, step: float):
-        """Move each estimate by ``step`` times the averaged way to its goals (Eqs. 9 and 12)."""
+        """Move each predicted position by ``step`` times the averaged displacement to its goals (Eqs. 9 and 12)."""
         for p in range(self.several):
             keep = 1.0 - step * self.patch_scale[p].w
             frame = step * self.goal[p]
@@ -294,15 +294,15 @@ class ShapeMatching:
             sums = tm.mat4(0.0)
             for k in range(self.patch_start[p], self.patch_start[p + 1]):
                 at = self.local[k]
-                estimate = keep * self.estimate[k] + at.x * x + at.y * y + at.z * z + origin
-                self.estimate[k] = estimate
-                sums += self.moment_of(k, estimate - reference)
+                predicted = keep * self.predicted[k] + at.x * x + at.y * y + at.z * z + origin
+                self.predicted[k] = predicted
+                sums += self.moment_of(k, predicted - reference)
             self.add_moment(p, reference, tm.mat4(0.0), sums)
         for p in range(self.several, self.patch_count):
             k = self.patch_start[p]
             keep = 1.0 - step * self.patch_scale[p].w
-            self.estimate[k] = keep * self.estimate[k] + step * row(self.goal[p], 3)
-            self.centre[p] = self.estimate[k]
+            self.predicted[k] = keep * self.predicted[k] + step * row(self.goal[p], 3)
+            self.centre[p] = self.predicted[k]
 
     @ti.func
     def push_out(self, relaxation_factor: float):
@@ -312,9 +312,9 @@ class ShapeMatching:
                 sums = tm.mat4(0.0)
                 for k in range(self.patch_start[p], self.patch_start[p + 1]):
                     if self.contacts.touched[k] > 0:
-                        estimate = self.estimate[k]
-                        change = four(self.contacts.pushed(k, estimate.xyz, relaxation_factor))
-                        self.estimate[k] = estimate + change
+                        predicted = self.predicted[k]
+                        change = four(self.contacts.pushed(k, predicted.xyz, relaxation_factor))
+                        self.predicted[k] = predicted + change
                         sums += self.moment_of(k, change)
                 moment = tm.mat4(0.0)
                 if p < self.several:

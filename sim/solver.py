@@ -204,9 +204,9 @@ class Solver:
         for i in range(self.body.count):
             # Gravity does not decay, or a body at rest would weigh less.
             velocity = self.body.velocity[i] * decay + dt * gravity
-            self.body.estimate[i] = self.body.position[i] + dt * velocity
+            self.body.predicted[i] = self.body.position[i] + dt * velocity
             if ti.static(self.body.mass_scaled):  # line 4, with the height against gravity
-                height = -gravity.dot(self.body.estimate[i]) / ti.max(gravity.norm(), 1e-12)
+                height = -gravity.dot(self.body.predicted[i]) / ti.max(gravity.norm(), 1e-12)
                 exponent = tm.clamp(self.body.mass_scaling_per_mm * height, -MOST_EXPONENT, MOST_EXPONENT)
                 self.body.mass_scale[i] = ti.exp(-exponent)
 
@@ -231,7 +231,7 @@ class Solver:
     def settle(self, dt: float):
         """Lines 24 and 25."""
         for i in range(self.body.count):
-            x = self.body.estimate[i]
+            x = self.body.predicted[i]
             self.body.velocity[i] = (x - self.body.position[i]) / dt
             self.body.position[i] = x
 

@@ -92,9 +92,9 @@ class SurfaceContacts:
 
     @ti.func
     def find(self):
-        """Lines 6-9: the plane of each shape that a point's estimate is near to."""
+        """Lines 6-9: the plane of each shape that a point's predicted position is near to."""
         for q in range(self.count):
-            p = self.carried(self.body.estimate, q)
+            p = self.carried(self.body.predicted, q)
             self.point[q] = p
             self.start[q] = self.carried(self.body.position, q)
             near = 0

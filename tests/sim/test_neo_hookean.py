@@ -179,11 +179,11 @@ def test_a_pass_is_a_gauss_seidel_sweep_of_the_colours(one_device, with_held):
     x = deformed(lattice.nodes, 0.5)
     target = x + np.random.default_rng(6).normal(0, 3.0, x.shape)
     put(model, x)
-    fill((model.body.estimate, target))
+    fill((model.body.predicted, target))
     begin(model, DT)
     inertia = DENSITY * lattice.tissue / DT**2
     # It starts from the body moved as a whole, which has a test of its own.
-    x = array_of(model.body.estimate).astype(float)
+    x = array_of(model.body.predicted).astype(float)
     y, capped = x.copy(), 0
     project(model, factor, DT)
     for colour, (first, last) in enumerate(model.colours):
@@ -200,7 +200,7 @@ def test_a_pass_is_a_gauss_seidel_sweep_of_the_colours(one_device, with_held):
     # A force's rounding over a node's stiffness, at least mu cell / 4: the share of a cell with an eighth of tissue.
     tolerance = rounding(energy, y) / (energy.mu * 4.0 / 4)
     assert tolerance < 1e-3
-    assert np.abs(array_of(model.body.estimate) - y).max() < tolerance
+    assert np.abs(array_of(model.body.predicted) - y).max() < tolerance
     # The cells' F is carried along with the nodes, not made anew.
     carried = np.einsum("mia,mib->mab", y[lattice.cells], lattice.gradient)
     columns = array_of(model.deformation)[:-1, :, :3]
@@ -246,9 +246,9 @@ def test_a_fast_spin_is_found_whole_at_once(one_device, ball):
     centre = mass @ x / mass.sum()
     velocity = np.cross([0.0, 0.0, 1.0 / DT], x - centre) + [30.0, 0.0, 0.0]
     model.body.restore(BodyState(x.astype(np.float32), velocity.astype(np.float32)))
-    fill((model.body.estimate, (x + DT * velocity)))
+    fill((model.body.predicted, (x + DT * velocity)))
     begin(model, DT)
-    found = array_of(model.body.estimate)
+    found = array_of(model.body.predicted)
     wanted = centre + (x - centre) @ rotation_about([0, 0, 1], 45).T + DT * np.array([30.0, 0.0, 0.0])
     # Each Newton step leaves 1 - sqrt(2) of the angle before it, so that after one of 1e-4 mm less than that is left.
     assert np.abs(found - wanted).max() < 2e-4

@@ -305,20 +305,20 @@ def test_pushes_and_friction_are_the_oracles(kept, block, factor):
     @ti.kernel
     def push():
         for i in range(body.count):
-            body.estimate[i] += contacts.pushed(i, body.estimate[i], factor)
+            body.predicted[i] += contacts.pushed(i, body.predicted[i], factor)
 
     # The second time nothing is left of the first.
     for _ in range(2):
         begin(solver, [0.0, 0.0, -1e-3], 0.01)
         motion = np.array([[0.0] * 3, [0.0] * 3, [0.3, -0.2, -0.3]])
         wanted, slid, several = oracle_of_pushes(
-            solver, array_of(body.estimate).astype(float), motion, 3, factor
+            solver, array_of(body.predicted).astype(float), motion, 3, factor
         )
         assert slid > 30 and several > 10
         for _ in range(3):
             push()
         # Float32 positions of 12 mm carry 1e-6 mm, and the same of each plane's offset, in each of three passes.
-        assert np.abs(array_of(body.estimate) - wanted).max() < 2e-5
+        assert np.abs(array_of(body.predicted) - wanted).max() < 2e-5
 
 
 def test_stabilisation_gets_out_without_adding_velocity(kept, ball):
@@ -341,7 +341,7 @@ def test_stabilisation_moves_position_and_estimate_alike(one_device, ball):
     ends = []
     for passes in (0, 4):
         begin(solver, [0.0, 0.0, -9810.0], 1 / 180, passes)
-        ends.append((position(solver), array_of(solver.body.estimate)))
+        ends.append((position(solver), array_of(solver.body.predicted)))
     moved = ends[1][0] - ends[0][0], ends[1][1] - ends[0][1]
     assert moved[0][:, 2].max() > 1.0
     assert moved[1] == pytest.approx(moved[0], abs=1e-5)

@@ -137,13 +137,13 @@ def test_a_pass_over_pairs_is_the_oracles(one_device, relaxation, scaling):
         x[over, 2] += lift
         fill((body.position, x))
         begin(solver, [0.0, 0.0, -1e-3], 0.01)
-        moved = array_of(body.estimate).astype(float) - array_of(body.position)
+        moved = array_of(body.predicted).astype(float) - array_of(body.position)
         wanted, sticks, slides = pairs_pass(solver, moved, 1.3)
         assert sticks > least and slides > least
         project()
         most.append(pairs.most_contacts[None])
         # Float32 positions of 10 mm carry 1e-6 mm; a normal of two that are 1 mm apart, as much of its own.
-        assert np.abs(array_of(body.estimate) - wanted).max() < 1e-5
+        assert np.abs(array_of(body.predicted) - wanted).max() < 1e-5
     assert most[0] > most[1]
 
 
@@ -161,7 +161,7 @@ def test_a_pair_shares_its_push_by_the_scaled_masses(kept):
         pairs.project(1.0)
 
     project()
-    moved = np.linalg.norm(array_of(solver.body.estimate) - x, axis=1)
+    moved = np.linalg.norm(array_of(solver.body.predicted) - x, axis=1)
     apart = np.linalg.norm(x[upper][:, None] - x[~upper][None], axis=2) < pairs.distance
     top, bottom = np.flatnonzero(upper), np.flatnonzero(~upper)
     alone = [(i, j) for i, j in np.argwhere(apart) if apart[i].sum() == 1 and apart[:, j].sum() == 1]

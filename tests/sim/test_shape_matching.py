@@ -72,14 +72,14 @@ def test_a_pass_is_the_oracles(kept, block, relaxation, stiffness, factor):
     project(model, stiffness, factor)
     wanted = oracle(model, x, stiffness * factor)
     assert np.abs(wanted - x).max() > 0.3
-    assert np.abs(array_of(body.estimate) - wanted).max() < ROUNDING_MM
+    assert np.abs(array_of(body.predicted) - wanted).max() < ROUNDING_MM
 
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
 def test_a_pass_keeps_linear_and_angular_momentum(kept, block, relaxation):
     body, model, x = moved_body(kept, block, relaxation)
     project(model, 0.8, 1.0)
-    change = array_of(body.estimate) - x
+    change = array_of(body.predicted) - x
     # Each of n particles contributes its rounding, which adds like a random walk; the angular sum has lever arms.
     n = len(x)
     assert np.abs(change).sum() > 100
@@ -91,10 +91,10 @@ def test_a_pass_keeps_linear_and_angular_momentum(kept, block, relaxation):
 def test_a_rigid_motion_is_no_deformation(kept, block):
     body, model, _ = moved_body(kept, block, "local")
     turned = body.rest_points @ rotation_about([0, 1, 1], 130).T + [100.0, 20.0, -50.0]
-    fill((body.estimate, turned))
+    fill((body.predicted, turned))
     project(model, 1.0, 1.0)
     # At 100 mm float32 carries 1e-5 mm.
-    assert np.abs(array_of(body.estimate) - turned).max() < 10 * ROUNDING_MM
+    assert np.abs(array_of(body.predicted) - turned).max() < 10 * ROUNDING_MM
 
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
@@ -113,16 +113,16 @@ def test_pushed_patches_know_where_their_particles_are(one_device, block, relaxa
         model.project(0.9, 1.0, 0.0)
 
     pressed()
-    estimate = array_of(model.estimate)[:, :3].astype(float)
+    predicted = array_of(model.predicted)[:, :3].astype(float)
     touched = np.bincount(patches.of_particles(), array_of(model.contacts.touched) > 0)
     assert 10 < (touched[:several] > 0).sum() < several - 10
-    centre = np.add.reduceat(estimate, patches.start[:-1]) / patches.sizes[:, None]
+    centre = np.add.reduceat(predicted, patches.start[:-1]) / patches.sizes[:, None]
     assert np.abs(array_of(model.centre)[:, :3] - centre).max() < ROUNDING_MM
     share = 1 / patches.shared if relaxation == "local" else np.ones(len(patches))
     rest, moment = model.body.rest_points, array_of(model.moment)
     for p in range(several):
         of = slice(patches.start[p], patches.start[p + 1])
-        wanted = share[p] * (rest[of] - rest[of].mean(axis=0)).T @ (estimate[of] - centre[p])
+        wanted = share[p] * (rest[of] - rest[of].mean(axis=0)).T @ (predicted[of] - centre[p])
         # Each of a patch's particles rounds times its lever, which is at most 7 mm.
         assert np.abs(moment[p][:3, :3] - wanted).max() < 7 * patches.sizes[p] * ROUNDING_MM
 
@@ -140,7 +140,7 @@ def test_a_push_goes_as_far_as_the_relaxation_factor_but_not_beyond_the_surface(
     body = model.body
     push_out(model, factor)
     depth = array_of(body.contact_radius) - 7.5 - body.rest_points[:, 2]
-    moved = array_of(model.estimate)[:, 2] - body.rest_points[:, 2]
+    moved = array_of(model.predicted)[:, 2] - body.rest_points[:, 2]
     assert (depth > 0.4).sum() > 20
     assert np.abs(moved - (1 - left) * np.maximum(depth, 0.0)).max() < ROUNDING_MM
 
@@ -154,9 +154,9 @@ def test_collapsed_flat_and_inverted_bodies_come_back_to_finite_shapes(kept, blo
         np.diag([1.0, 0.0, 0.0]),
         np.diag([1.0, 1.0, -1.0]),
     ):
-        fill((body.estimate, (rest @ squash)))
+        fill((body.predicted, (rest @ squash)))
         project(model, 1.0, 1.0)
-        assert np.isfinite(array_of(body.estimate)).all()
+        assert np.isfinite(array_of(body.predicted)).all()
         turned = array_of(model.frame)[:, :3, :3].astype(float)
         assert np.abs(np.linalg.det(turned) - 1).max() < 1e-5
 
@@ -169,7 +169,7 @@ def test_scaled_masses_pull_the_clusters_towards_the_heavier(kept, block, relaxa
     project(model, 1.0, 1.0)
     wanted = oracle(model, x, 1.0, mass.astype(float))
     assert np.abs(wanted - oracle(model, x, 1.0)).max() > 100 * ROUNDING_MM
-    assert np.abs(array_of(body.estimate) - wanted).max() < ROUNDING_MM
+    assert np.abs(array_of(body.predicted) - wanted).max() < ROUNDING_MM
 
 
 def test_frames_do_not_depend_on_those_before(kept, block):

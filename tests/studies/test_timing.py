@@ -84,7 +84,7 @@ def test_the_bound_in_c_computes_what_shape_matching_does(device, block):
     assert plain.run(3, 2) > 0
     assert np.abs(plain.x - x).max() > 1e-3
     # Both round at 15 mm, 1e-6 mm, in each of the operations of three passes.
-    assert np.abs(array_of(model.body.estimate) - plain.x).max() < 3e-5
+    assert np.abs(array_of(model.body.predicted) - plain.x).max() < 3e-5
 
 
 def test_memory_is_that_of_the_fields(device, block):
