@@ -65,7 +65,7 @@ def build_solver(
     contact: Contact | None = None,
     section: SolverSection | None = None,
     serial: bool | None = None,
-    held: FixedRegion | None = None,
+    fixed: FixedRegion | None = None,
 ) -> Solver:
     """A solver of the organ [mm] among shapes, the tool among them. Raises SamplingError.
 
@@ -75,7 +75,7 @@ def build_solver(
     contact, section = contact or Contact(), section or SolverSection()
     scaling = section.mass_scaling_per_mm
     parts = ModelInputs(
-        organ, tissue, shapes, contact.shape_friction, held, serial, section.relaxation, scaling
+        organ, tissue, shapes, contact.shape_friction, fixed, serial, section.relaxation, scaling
     )
     model: Any = model_of(tissue).make(parts)
     pairs = ParticleContacts(model, contact.particle_friction) if contact.particles else None

@@ -112,15 +112,15 @@ class Rehearsal:
         self.tool = tool_of(self.probe)
         shapes = [*(self._shape(shape) for shape in anatomy.shapes), self.tool]
         tissue, section = self.scene.tissue, self.scene.solver
-        held = self._held()
+        fixed = self._fixed_region()
         self.solver = build_solver(
-            self.organ, tissue, shapes, self.tool, self.scene.contact, section, held=held
+            self.organ, tissue, shapes, self.tool, self.scene.contact, section, fixed=fixed
         )
         self.body, self.model, self.contacts = self.solver.body, self.solver.model, self.solver.contacts
         self.settings = step_settings(tissue, section)
         self.set_gravity(self.scene.gravity.acceleration_m_s2)
 
-    def _held(self) -> FixedRegion | None:
+    def _fixed_region(self) -> FixedRegion | None:
         attachment = self.scene.attachment
         if attachment.radius_mm == 0 or attachment.at_mm is None:
             return None

@@ -1,7 +1,7 @@
 """A tissue model true to a material: compressible neo-Hookean tissue on a lattice, node after node to its balance.
 
 The implicit time step is the minimum of |x - target|^2 m / 2 h^2 + elastic and contact energy over the positions
-(Liu et al. 2013, Eq. 3). Each node in turn goes to the minimum for itself with all others held (vertex block descent,
+(Liu et al. 2013, Eq. 3). Each node in turn goes to the minimum for itself with all others fixed (vertex block descent,
 Chen et al. 2024), over-relaxed. Where nothing moves any more every node is in balance with its neighbours, so what
 the tissue comes to rest at does not depend on iterations, substeps or time step.
 """
@@ -43,7 +43,7 @@ LATTICE_SETTINGS = StepSettings(substeps=1, iterations=4, relaxation_factor=1.7,
 class NeoHookean:
     """W = mu/2 (tr C - 3) - mu ln J + lambda/2 (ln J)^2 on a lattice's cells (Bonet & Wood 2008, Eq. 6.27).
 
-    Nodes are projected colour by colour, on one core where ``serial`` (left open, their number decides); those ``held``
+    Nodes are projected colour by colour, on one core where ``serial`` (left open, their number decides); those ``fixed``
     (n,) stay where they are, and ``load_g`` (n,) [g] hangs at them. ``deformation`` (m + 1,) has the columns of every
     cell's F as rows and follows its nodes; the last stands for cells that are not there.
     """
@@ -61,8 +61,8 @@ class NeoHookean:
             points, area_mm2 = surface_points(parts.organ, POINTS_A_CELL * tissue.cell_mm)
             contacts = SurfaceContacts(body, lattice, points, area_mm2, parts.shapes, parts.friction)
         material = (tissue.young_kpa, tissue.poisson, tissue.density_g_cm3)
-        held = None if parts.held is None else parts.held.nodes(lattice.nodes)
-        return cls(body, lattice, contacts, *material, held=held, serial=parts.serial)
+        fixed = None if parts.fixed is None else parts.fixed.nodes(lattice.nodes)
+        return cls(body, lattice, contacts, *material, fixed=fixed, serial=parts.serial)
 
     @staticmethod
     def reach_mm(tissue: Any) -> float:
@@ -77,7 +77,7 @@ class NeoHookean:
         young_kpa: float = 15.0,
         poisson: float = 0.45,
         density_g_cm3: float = 1.05,
-        held: np.ndarray | None = None,
+        fixed: np.ndarray | None = None,
         serial: bool | None = None,
         load_g: np.ndarray | float = 0.0,
     ) -> None:
@@ -88,9 +88,9 @@ class NeoHookean:
         self.has_contacts = contacts is not None
         self.colours = tuple(pairwise(starts))
         self.serial = is_too_small(body.count, PARALLEL_NODES) if serial is None else serial
-        self.has_held = held is not None
-        if held is not None:
-            self.held = field_of(held)
+        self.has_fixed = fixed is not None
+        if fixed is not None:
+            self.fixed = field_of(fixed)
         self.count = len(lattice.cells)
         self.most_mm = MOST_CELLS_A_PASS * lattice.cell_mm
         self.mu = ti.field(ti.f32, ())
@@ -101,7 +101,7 @@ class NeoHookean:
         self._store_cells()
         self._store_hourglass()
         self.rigid: Any = (
-            None if self.has_held else RigidMotion(body, self.mass, self.target, contacts, self.serial)
+            None if self.has_fixed else RigidMotion(body, self.mass, self.target, contacts, self.serial)
         )
         self.set_material(young_kpa, poisson)
 
@@ -155,7 +155,7 @@ class NeoHookean:
         for i in range(self.body.count):
             self.target[i] = self.body.predicted[i]
             self.body.predicted[i] = self.body.position[i]
-        if ti.static(not self.has_held):
+        if ti.static(not self.has_fixed):
             self.rigid.move(dt)
         for c in range(self.count):
             x, y, z = tm.vec4(0.0), tm.vec4(0.0), tm.vec4(0.0)
@@ -202,7 +202,7 @@ class NeoHookean:
 
     @ti.func
     def relax(self, i, relaxation_factor: float, dt: float):
-        """Node i goes to its balance with all others held."""
+        """Node i goes to its balance with all others fixed."""
         inertia = self.mass[i] / (dt * dt)
         force, hessian, least = self.elastic(i)
         force += inertia * (four(self.target[i]) - self.predicted[i])
@@ -216,8 +216,8 @@ class NeoHookean:
             hessian += layer
         change = factor * solve(hessian, force.xyz, least + inertia)
         change *= ti.min(1.0, self.most_mm / ti.max(change.norm(), 1e-12))
-        if ti.static(self.has_held):
-            change *= 1.0 - self.held[i]
+        if ti.static(self.has_fixed):
+            change *= 1.0 - self.fixed[i]
         self.move(i, four(change))
         if ti.static(self.has_contacts):
             self.contacts.follow(i, change)

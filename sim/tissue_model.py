@@ -23,15 +23,15 @@ class FixedRegion:
     radius_mm: float
 
     def nodes(self, nodes: np.ndarray) -> np.ndarray:
-        """Which nodes (n, 3) are held. Raises SamplingError where there are none, or where all are."""
+        """Which nodes (n, 3) are fixed. Raises SamplingError where there are none, or where all are."""
         apart = np.linalg.norm(nodes - self.at_mm, axis=1)
-        held = apart <= self.radius_mm
-        if held.all() or not held.any():
+        fixed = apart <= self.radius_mm
+        if fixed.all() or not fixed.any():
             raise SamplingError(
-                f"attachment.radius_mm = {self.radius_mm:g} holds {'all' if held.all() else 'none'} of the organ, which lies "
+                f"attachment.radius_mm = {self.radius_mm:g} holds {'all' if fixed.all() else 'none'} of the organ, which lies "
                 f"{apart.min():.1f} to {apart.max():.1f} mm from attachment.at_mm: choose another radius or place"
             )
-        return held
+        return fixed
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class ModelInputs:
     tissue: Any
     shapes: list
     friction: float
-    held: FixedRegion | None
+    fixed: FixedRegion | None
     serial: bool | None
     relaxation: str
     mass_scaling_per_mm: float

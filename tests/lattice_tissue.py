@@ -28,17 +28,17 @@ def tissue_of(
     shapes: list = (),
     friction: float = 0.0,
     poisson: float = 0.45,
-    held=None,
+    fixed=None,
 ) -> Solver:
-    """A solver of a closed surface [mm] among shapes; ``held`` tells of nodes (n, 3) which are."""
+    """A solver of a closed surface [mm] among shapes; ``fixed`` tells of nodes (n, 3) which are."""
     lattice = fill_with_cells(mesh, cell_mm)
     body = Body(lattice.nodes)
     contacts = None
     if shapes:
         points, area = surface_points(mesh, cell_mm / 2)
         contacts = SurfaceContacts(body, lattice, points, area, shapes, friction)
-    held = None if held is None else held(lattice.nodes)
-    model = NeoHookean(body, lattice, contacts, YOUNG_KPA, poisson, 1e3 * DENSITY, held)
+    fixed = None if fixed is None else fixed(lattice.nodes)
+    model = NeoHookean(body, lattice, contacts, YOUNG_KPA, poisson, 1e3 * DENSITY, fixed)
     return Solver(model, tool=next((s for s in shapes if isinstance(s, ConvexTool)), None))
 
 

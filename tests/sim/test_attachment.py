@@ -46,7 +46,7 @@ def test_held_nodes_stay_and_the_rest_hangs_from_them(device):
 
 def test_without_a_radius_nothing_is_held(device):
     rehearsal = hanging(0.0)
-    assert not rehearsal.model.has_held
+    assert not rehearsal.model.has_fixed
     assert (
         moved_mm(rehearsal, 12).min(axis=0)[1] > 100
     )  # it falls: 12 steps of 1/60 s are 196 mm without damping

@@ -169,12 +169,12 @@ def test_forces_go_on_smoothly_into_inversion(one_device, block):
     assert (forces_of(model, mirrored)[0][top, 2] > 0).all()
 
 
-@pytest.mark.parametrize("with_held", [False, True])
-def test_a_pass_is_a_gauss_seidel_sweep_of_the_colours(one_device, with_held):
+@pytest.mark.parametrize("with_fixed", [False, True])
+def test_a_pass_is_a_gauss_seidel_sweep_of_the_colours(one_device, with_fixed):
     lattice, factor = small_lattice(), 1.7
-    held = np.random.default_rng(5).uniform(size=len(lattice.nodes)) < 0.3 if with_held else None
+    fixed = np.random.default_rng(5).uniform(size=len(lattice.nodes)) < 0.3 if with_fixed else None
     # On one core and by colours.
-    model = NeoHookean(Body(lattice.nodes), lattice, held=held, serial=with_held)
+    model = NeoHookean(Body(lattice.nodes), lattice, fixed=fixed, serial=with_fixed)
     energy = Energy(lattice, 0.45)
     x = deformed(lattice.nodes, 0.5)
     target = x + np.random.default_rng(6).normal(0, 3.0, x.shape)
@@ -195,7 +195,7 @@ def test_a_pass_is_a_gauss_seidel_sweep_of_the_colours(one_device, with_held):
         length = np.linalg.norm(change, axis=1, keepdims=True)
         capped += (length > 2.0).sum()
         change *= np.minimum(1.0, 0.5 * 4.0 / length)
-        y[mine] += change if held is None else change * ~held[mine, None]
+        y[mine] += change if fixed is None else change * ~fixed[mine, None]
     assert capped > 0 and np.abs(y - x).max() > 1.0
     # A force's rounding over a node's stiffness, at least mu cell / 4: the share of a cell with an eighth of tissue.
     tolerance = rounding(energy, y) / (energy.mu * 4.0 / 4)
@@ -215,18 +215,18 @@ def shear(amount: float) -> np.ndarray:
 def test_a_held_skin_makes_the_inside_affine_with_the_closed_form_stress(one_device, block, wanted):
     lattice = fill_with_cells(block, 3.0)
     cut = lattice.volume < 3.0**3 * (1 - 1e-9)
-    held = np.zeros(len(lattice.nodes), bool)
-    held[lattice.cells[cut]] = True
-    assert 30 < (~held).sum() < held.sum()
+    fixed = np.zeros(len(lattice.nodes), bool)
+    fixed[lattice.cells[cut]] = True
+    assert 30 < (~fixed).sum() < fixed.sum()
     f = shear(0.4) if wanted == "simple shear" else rotation_about([1, 1, 0], 20) @ np.diag([1.2, 0.8, 0.9])
     affine = lattice.nodes @ f.T
-    start = np.where(held[:, None], affine, lattice.nodes)
-    model = NeoHookean(Body(lattice.nodes), lattice, held=held)
+    start = np.where(fixed[:, None], affine, lattice.nodes)
+    model = NeoHookean(Body(lattice.nodes), lattice, fixed=fixed)
     put(model, start)
     Solver(model).step(settings_of(150, time_step_s=10.0))
     x = array_of(model.body.position).astype(float)
     energy = Energy(lattice, 0.45)
-    assert np.abs(start - affine).max() > 1.0 and (x[held] == affine[held].astype(np.float32)).all()
+    assert np.abs(start - affine).max() > 1.0 and (x[fixed] == affine[fixed].astype(np.float32)).all()
     # A force's rounding over a whole node's stiffness, mu cell and more, spread by its neighbours, ten times.
     assert np.abs(x - affine).max() < 10 * rounding(energy, affine) / (energy.mu * 3.0)
     # Virtual work: the reactions' power at F' = e_a e_b is the volume times P_ab, with P = mu (F - F^-T) + lame ln J F^-T.
@@ -313,7 +313,7 @@ def sag(poisson: float, cell: float, passes: int, side: float = 8.0, span: float
     beam = trimesh.creation.box([span + 1.5 * cell, side, side])
     # So nodes lie in the plane x = 0, where it is clamped.
     beam.apply_translation([(span - 1.5 * cell) / 2, 0.0, 0.0])
-    solver = tissue_of(beam, cell, poisson=poisson, held=lambda nodes: nodes[:, 0] < 1e-9)
+    solver = tissue_of(beam, cell, poisson=poisson, fixed=lambda nodes: nodes[:, 0] < 1e-9)
     gravity = G / 100
     # Inertia is nothing over ten seconds, so this is one long solve.
     solver.step(settings_of(passes, (0, 0, -gravity), time_step_s=10.0, relaxation_factor=1.95))
