@@ -94,7 +94,7 @@ class NeoHookean:
         self.count = len(lattice.cells)
         self.most_mm = MOST_CELLS_A_PASS * lattice.cell_mm
         self.mu = ti.field(ti.f32, ())
-        self.lame = ti.field(ti.f32, ())
+        self.lambda_ = ti.field(ti.f32, ())
         self.target = ti.Vector.field(3, ti.f32, body.count)
         self.predicted = ti.Vector.field(4, ti.f32, body.count)
         self.mass = field_of(1e-3 * density_g_cm3 * lattice.tissue + load_g)
@@ -140,7 +140,7 @@ class NeoHookean:
         self.poisson = poisson
         # 1 kPa is 1000 g/(mm s^2).
         self.mu[None] = 1e3 * young_kpa / (2 * (1 + poisson))
-        self.lame[None] = 1e3 * young_kpa * poisson / ((1 + poisson) * (1 - 2 * poisson))
+        self.lambda_[None] = 1e3 * young_kpa * poisson / ((1 + poisson) * (1 - 2 * poisson))
         if self.contacts is not None:
             self.contacts.stiffness[None] = young_kpa / LAYER_MM
 
@@ -241,7 +241,7 @@ class NeoHookean:
         With B the node's gradient, f = -V (mu F B + (lambda ln J - mu) G / J), where G = dJ/dx = cof(F) B does not
         depend on the node's own position, so that d^2J/dx^2 = 0.
         """
-        mu, lame = self.mu[None], self.lame[None]
+        mu, lambda_ = self.mu[None], self.lambda_[None]
         force = -mu * self.hourglass_pull(i)
         x, y, z = tm.vec4(0.0), tm.vec4(0.0), tm.vec4(0.0)
         for k in range(8):
@@ -253,9 +253,9 @@ class NeoHookean:
             g = b.x * f23 + b.y * cross(f3, f1) + b.z * cross(f1, f2)
             at = ti.max(j, LEAST_J)
             one_by = 1.0 / at
-            pressure = (lame * (ln(at) + j * one_by - 1.0) - mu) * one_by
+            pressure = (lambda_ * (ln(at) + j * one_by - 1.0) - mu) * one_by
             force -= b.w * (mu * (b.x * f1 + b.y * f2 + b.z * f3) + pressure * g)
-            curvature = lame * one_by * one_by - (pressure * one_by if j > LEAST_J else 0.0)
+            curvature = lambda_ * one_by * one_by - (pressure * one_by if j > LEAST_J else 0.0)
             bent = (b.w * ti.max(curvature, 0.0)) * g
             x += g.x * bent
             y += g.y * bent

@@ -63,7 +63,7 @@ def jacobians(lattice: Lattice, x: np.ndarray) -> np.ndarray:
     return np.linalg.det(np.einsum("mia,mib->mab", x[lattice.cells], lattice.gradient))
 
 
-def lame_of(poisson: float) -> tuple[float, float]:
+def lame_parameters(poisson: float) -> tuple[float, float]:
     """Shear modulus and Lame's first parameter [g/(mm s^2)]."""
     return 1e3 * YOUNG_KPA / (2 * (1 + poisson)), 1e3 * YOUNG_KPA * poisson / (1 + poisson) / (
         1 - 2 * poisson
@@ -79,7 +79,7 @@ class Energy:
 
     def __init__(self, lattice: Lattice, poisson: float) -> None:
         self.lattice = lattice
-        self.mu, self.lame = lame_of(poisson)
+        self.mu, self.lambda_ = lame_parameters(poisson)
 
     def of_cells(self, x: np.ndarray) -> np.ndarray:
         corner = x[self.lattice.cells]
@@ -87,7 +87,7 @@ class Energy:
         j = (f[:, 0] * np.cross(f[:, 1], f[:, 2])).sum(axis=1)
         above = j.real > LEAST_J
         log_j = np.where(above, np.log(np.where(above, j, 1.0)), np.log(LEAST_J) + j / LEAST_J - 1)
-        density = self.mu / 2 * ((f * f).sum(axis=(1, 2)) - 3) - self.mu * log_j + self.lame / 2 * log_j**2
+        density = self.mu / 2 * ((f * f).sum(axis=(1, 2)) - 3) - self.mu * log_j + self.lambda_ / 2 * log_j**2
         inside = np.einsum("mia,mij,mja->m", corner, self.lattice.hourglass, corner)
         return self.lattice.volume * density + self.mu / 2 * HOURGLASS * inside
 

@@ -11,7 +11,7 @@ from lattice_tissue import (
     Energy,
     G,
     jacobians,
-    lame_of,
+    lame_parameters,
     lifted,
     position,
     put,
@@ -76,13 +76,13 @@ def rounding(energy: Energy, x: np.ndarray) -> float:
     """What float32 leaves uncertain in a force [uN].
 
     F is a sum of 8 positions times their gradients, 1 / 4 cell each, so that it is off by 8 ^ 0.5 EPS |x| / 4 cell;
-    a stress by (lame + 2 mu) / J^2 as much. A force sums it over 8 cells, times volume / 4 cell = cell^2 / 4 each,
+    a stress by (lambda_ + 2 mu) / J^2 as much. A force sums it over 8 cells, times volume / 4 cell = cell^2 / 4 each,
     and the worst of some hundred nodes is three times as far off as most.
     """
     cell = energy.lattice.cell_mm
     strain = 8**0.5 * EPS * np.abs(x).max() / 4 / cell
     least = max(jacobians(energy.lattice, x).min(), LEAST_J)
-    return 3 * (energy.lame + 2 * energy.mu) / min(least, 1.0) ** 2 * strain * 8**0.5 * cell**2 / 4
+    return 3 * (energy.lambda_ + 2 * energy.mu) / min(least, 1.0) ** 2 * strain * 8**0.5 * cell**2 / 4
 
 
 @pytest.mark.parametrize("noise_mm", [0.25, 0.8, 2.0])
@@ -114,8 +114,10 @@ def test_force_and_hessian_are_the_energys_derivatives(one_device, noise_mm):
 def test_another_youngs_modulus_leaves_poissons_ratio_and_stiffens_the_contact_layer(one_device, block):
     model = tissue_of(block, 8.0, [Plane(np.array([0.0, 0.0, 1.0]), -8.0)], poisson=0.3).model
     model.set_young(2 * YOUNG_KPA)
-    found = model.mu[None], model.lame[None], model.contacts.stiffness[None]
-    assert found == pytest.approx([2 * each for each in (*lame_of(0.3), YOUNG_KPA / LAYER_MM)], rel=1e-6)
+    found = model.mu[None], model.lambda_[None], model.contacts.stiffness[None]
+    assert found == pytest.approx(
+        [2 * each for each in (*lame_parameters(0.3), YOUNG_KPA / LAYER_MM)], rel=1e-6
+    )
 
 
 def test_the_logarithm_is_exact_to_rounding(one_device):
@@ -229,9 +231,9 @@ def test_a_held_skin_makes_the_inside_affine_with_the_closed_form_stress(one_dev
     assert np.abs(start - affine).max() > 1.0 and (x[fixed] == affine[fixed].astype(np.float32)).all()
     # A force's rounding over a whole node's stiffness, mu cell and more, spread by its neighbours, ten times.
     assert np.abs(x - affine).max() < 10 * rounding(energy, affine) / (energy.mu * 3.0)
-    # Virtual work: the reactions' power at F' = e_a e_b is the volume times P_ab, with P = mu (F - F^-T) + lame ln J F^-T.
+    # Virtual work: the reactions' power at F' = e_a e_b is the volume times P_ab, with P = mu (F - F^-T) + lambda_ ln J F^-T.
     inverse = np.linalg.inv(f).T
-    p = energy.mu * (f - inverse) + energy.lame * np.log(np.linalg.det(f)) * inverse
+    p = energy.mu * (f - inverse) + energy.lambda_ * np.log(np.linalg.det(f)) * inverse
     power = -forces_of(model, x)[0].T @ lattice.nodes
     volume = lattice.volume.sum()
     if wanted == "simple shear":
@@ -255,10 +257,10 @@ def test_a_fast_spin_is_found_whole_at_once(one_device, ball):
 
 
 def uniaxial(stretch: float, poisson: float) -> tuple[float, float]:
-    """Lateral stretch q and nominal stress [g/(mm s^2)] of a free bar: mu (q^2 - 1) + lame ln(q^2 stretch) = 0."""
-    mu, lame = lame_of(poisson)
-    q = brentq(lambda q: mu * (q * q - 1) + lame * np.log(q * q * stretch), 0.5, 2.0)
-    return q, mu * (stretch - 1 / stretch) + lame * np.log(q * q * stretch) / stretch
+    """Lateral stretch q and nominal stress [g/(mm s^2)] of a free bar: mu (q^2 - 1) + lambda_ ln(q^2 stretch) = 0."""
+    mu, lambda_ = lame_parameters(poisson)
+    q = brentq(lambda q: mu * (q * q - 1) + lambda_ * np.log(q * q * stretch), 0.5, 2.0)
+    return q, mu * (stretch - 1 / stretch) + lambda_ * np.log(q * q * stretch) / stretch
 
 
 def test_uniaxial_compression_between_frictionless_plates(one_device, block):
@@ -323,7 +325,7 @@ def sag(poisson: float, cell: float, passes: int, side: float = 8.0, span: float
     load, young = DENSITY * gravity * side**2, 1e3 * YOUNG_KPA
     shear_factor = 10 * (1 + poisson) / (12 + 11 * poisson)
     bending = load * span**4 / (8 * young * side**4 / 12)
-    shearing = load * span**2 / (2 * shear_factor * lame_of(poisson)[0] * side**2)
+    shearing = load * span**2 / (2 * shear_factor * lame_parameters(poisson)[0] * side**2)
     return -tip[2] / (bending + shearing)
 
 
