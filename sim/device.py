@@ -57,7 +57,7 @@ def start(arch: str = "cpu", **options) -> str:
     ti.set_logging_level(ti.ERROR)
     if arch == "auto":
         arch = "cuda" if ti.lang.misc.is_arch_supported(ti.cuda) else "cpu"
-    elif arch != "cpu" and not is_there(arch):
+    elif arch != "cpu" and not is_available(arch):
         raise NoDevice(f"this machine has no {arch} device or driver; use --arch cpu or --arch auto")
     if arch != "vulkan":
         # LLVM does it again: kernels run as fast, and large ones compile in a tenth of the time.
@@ -96,7 +96,7 @@ def _count(count: ti.types.ndarray(ndim=1), least: ti.types.ndarray(ndim=1)):
         count[t] = counted
 
 
-def is_there(arch: str) -> bool:
+def is_available(arch: str) -> bool:
     """Whether ``cuda`` or ``vulkan`` has a device and a driver; what a driver that is missing prints goes nowhere."""
     told, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)

@@ -48,9 +48,9 @@ def refuse_headless(headless: bool, gamepad: bool, link_leads: bool) -> None:
 
 def refuse_no_vulkan(headless: bool) -> None:
     """Raises CommandError where a window has no driver to be drawn with: before minutes are spent on what it would show."""
-    from sim.device import is_there
+    from sim.device import is_available
 
-    if not headless and not is_there("vulkan"):
+    if not headless and not is_available("vulkan"):
         raise CommandError(
             "no Vulkan driver found: the window needs one; install a Vulkan driver, or run with --headless"
         )
