@@ -118,7 +118,7 @@ class Solver:
         """A substep as many kernels, whose loops run in parallel."""
         self.launch_start(substep, dt, *settings.gravity, settings.damping, settings.stabilisation_iterations)
         for iteration in range(settings.iterations):
-            factor = last_exact(iteration, settings.iterations, settings.relaxation_factor)
+            factor = relaxation_at(iteration, settings.iterations, settings.relaxation_factor)
             self.launch_correct(settings.stiffness, factor, dt)
         self.launch_finish(dt)
 
@@ -153,7 +153,7 @@ class Solver:
             gravity = tm.vec3(gravity_x, gravity_y, gravity_z)
             self.start(substep, dt, gravity, damping, stabilisation_iterations)
             for iteration in range(iterations):
-                factor = last_exact(iteration, iterations, relaxation_factor)
+                factor = relaxation_at(iteration, iterations, relaxation_factor)
                 self.correct(stiffness, factor, dt)
             self.finish(dt)
 
@@ -237,6 +237,6 @@ class Solver:
 
 
 @ti.pyfunc
-def last_exact(iteration: int, iterations: int, relaxation_factor: float) -> float:
+def relaxation_at(iteration: int, iterations: int, relaxation_factor: float) -> float:
     """The relaxation factor of an iteration: an overshoot left by the last would be taken for velocity in line 24, and grow."""
     return relaxation_factor if iteration < iterations - 1 else 1.0

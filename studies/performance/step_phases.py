@@ -9,7 +9,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.shape_matching import ShapeMatching
-from sim.solver import Solver, StepSettings, last_exact
+from sim.solver import Solver, StepSettings, relaxation_at
 
 # Pieces of a substep before its iterations, of an iteration, and after them; "frames" is once a step.
 BEFORE = ("tool", "predict", "begin", "find contacts", "leave contacts", "gather")
@@ -54,7 +54,7 @@ class Phases:
             for name in BEFORE:
                 self._timed(name, substep, 1.0, *values, settings.stabilisation_iterations)
             for iteration in range(settings.iterations):
-                factor = last_exact(iteration, settings.iterations, settings.relaxation_factor)
+                factor = relaxation_at(iteration, settings.iterations, settings.relaxation_factor)
                 for name in self.passes:
                     self._timed(name, substep, factor, *values, 0)
             for name in AFTER:
