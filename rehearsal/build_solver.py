@@ -46,7 +46,7 @@ def tool_of(probe: Probe) -> ConvexTool:
 
 def embedding_cell_mm(tissue: TissueSection) -> float:
     """Width of the coarse tetrahedra that carry the image plane."""
-    return model_of(tissue).EMBEDDING_SIZES * tissue.size_mm
+    return model_of(tissue).EMBEDDING_CELL_RATIO * tissue.size_mm
 
 
 def step_settings(tissue: TissueSection, section: SolverSection) -> StepSettings:

@@ -48,7 +48,7 @@ class NeoHookean:
     cell's F as rows and follows its nodes; the last stands for cells that are not there.
     """
 
-    EMBEDDING_SIZES: ClassVar[float] = 1.35
+    EMBEDDING_CELL_RATIO: ClassVar[float] = 1.35
 
     @classmethod
     def make(cls, parts: ModelInputs) -> "NeoHookean":

@@ -47,7 +47,7 @@ class ShapeMatching:
     fourth entry.
     """
 
-    EMBEDDING_SIZES: ClassVar[float] = 2.0
+    EMBEDDING_CELL_RATIO: ClassVar[float] = 2.0
 
     @classmethod
     def make(cls, parts: ModelInputs) -> "ShapeMatching":

@@ -57,10 +57,10 @@ class TissueModel(Protocol):
     """Rest data, a projection of its constraints on the body's estimates, and a way to carry points along.
 
     One file a model. ``serial`` says that it is too small for more than one core of a CPU. The coarse tetrahedra that carry the
-    image plane are ``EMBEDDING_SIZES`` sizes of the tissue wide. ``begin`` to ``project`` are ti.funcs that the solver's kernels inline, so their outermost loops are parallel.
+    image plane are ``EMBEDDING_CELL_RATIO`` sizes of the tissue wide. ``begin`` to ``project`` are ti.funcs that the solver's kernels inline, so their outermost loops are parallel.
     """
 
-    EMBEDDING_SIZES: ClassVar[float]
+    EMBEDDING_CELL_RATIO: ClassVar[float]
 
     @classmethod
     def make(cls, parts: ModelInputs) -> "TissueModel":
