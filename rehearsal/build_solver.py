@@ -10,7 +10,7 @@ import trimesh
 from scenes.scene import Contact, SolverSection
 from scenes.tissue import TissueSection
 from sim.body import RestBody
-from sim.self_contact import ParticleContacts
+from sim.self_contact import SelfContacts
 from sim.shapes import ConvexTool, SignedDistanceField
 from sim.solver import Solver, StepSettings
 from sim.tissue_model import FixedRegion, ModelInputs, TissueModel
@@ -78,5 +78,5 @@ def build_solver(
         organ, tissue, shapes, contact.shape_friction, fixed, serial, section.relaxation, scaling
     )
     model: Any = model_of(tissue).make(parts)
-    pairs = ParticleContacts(model, contact.particle_friction) if contact.particles else None
-    return Solver(model, pairs, tool)
+    self_contacts = SelfContacts(model, contact.particle_friction) if contact.particles else None
+    return Solver(model, self_contacts, tool)

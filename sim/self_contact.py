@@ -11,7 +11,7 @@ CELLS = 1 << 15
 
 
 @ti.data_oriented
-class ParticleContacts:
+class SelfContacts:
     """Pairs of particles that share no cluster are kept one particle radius apart.
 
     That is the distance at which sampling placed them; those that share a cluster are held by its shape. Cells

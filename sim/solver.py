@@ -9,7 +9,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import BodyState
-from sim.self_contact import ParticleContacts
+from sim.self_contact import SelfContacts
 from sim.shapes import MOST_SUBSTEPS, ConvexTool
 from sim.tissue_model import TissueModel
 
@@ -72,17 +72,17 @@ class Solver:
     def __init__(
         self,
         model: TissueModel,
-        pairs: ParticleContacts | None = None,
+        self_contacts: SelfContacts | None = None,
         tool: ConvexTool | None = None,
     ) -> None:
         self.body: Any = model.body
         self.model = model
         self.contacts: Any = model.contacts
-        self.pairs = pairs
+        self.self_contacts = self_contacts
         self.tool = tool
         self.has_tool = tool is not None
         self.has_contacts = model.contacts is not None
-        self.has_pairs = pairs is not None
+        self.has_self_contacts = self_contacts is not None
 
     def step(self, settings: StepSettings, tool_poses: np.ndarray | None = None) -> None:
         """Advance by one time step.
@@ -190,8 +190,8 @@ class Solver:
                 self.tool.go(substep)
         self.predict(dt, gravity, damping)
         self.model.begin(dt)
-        if ti.static(self.has_pairs):
-            self.pairs.find()  # line 7
+        if ti.static(self.has_self_contacts):
+            self.self_contacts.find()  # line 7
         if ti.static(self.has_contacts):
             self.contacts.find()  # line 8
             self.contacts.stabilise(stabilisation_iterations)
@@ -214,9 +214,9 @@ class Solver:
     def correct(self, stiffness: float, relaxation_factor: float, dt: float):
         """Lines 17-21: one iteration, group by group."""
         self.model.project(stiffness, relaxation_factor, dt)
-        if ti.static(self.has_pairs):
+        if ti.static(self.has_self_contacts):
             self.model.scatter()
-            self.pairs.project(relaxation_factor)
+            self.self_contacts.project(relaxation_factor)
             self.model.gather()
 
     @ti.func

@@ -29,7 +29,7 @@ class Phases:
     """
 
     def __init__(self, solver: Solver) -> None:
-        if solver.has_pairs:
+        if solver.has_self_contacts:
             raise ValueError("phases know no contacts between particles")
         self.solver: Any = solver
         self.model: Any = solver.model

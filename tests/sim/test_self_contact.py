@@ -68,7 +68,7 @@ def test_neighbours_are_all_that_are_near_in_ascending_order(kept):
     x[upper, 2] -= 7.0
     fill((solver.body.position, x))
     begin(solver, [0.0, 0.0, 0.0])
-    count, rows = array_of(solver.pairs.neighbour_count), array_of(solver.pairs.neighbour)
+    count, rows = array_of(solver.self_contacts.neighbour_count), array_of(solver.self_contacts.neighbour)
     apart = np.linalg.norm(x[:, None] - x[None], axis=2)
     patches = solver.model.patches
     of_patch = [set(patches.clusters.members[a:b]) for a, b in pairwise(patches.clusters.offsets)]
@@ -76,7 +76,7 @@ def test_neighbours_are_all_that_are_near_in_ascending_order(kept):
     for i in range(len(x)):
         near = [
             j
-            for j in np.flatnonzero(apart[i] < solver.pairs.reach)
+            for j in np.flatnonzero(apart[i] < solver.self_contacts.reach)
             if j != i and not clusters[i] & clusters[j]
         ]
         assert rows[i, : count[i]].tolist() == near[:24]
@@ -85,7 +85,7 @@ def test_neighbours_are_all_that_are_near_in_ascending_order(kept):
 
 def pairs_pass(solver: Solver, moved: np.ndarray, factor: float) -> tuple[np.ndarray, int, int]:
     """Estimates (n, 3) after one pass over pairs in float64, and how many of these stick and slide."""
-    pairs, body = solver.pairs, solver.body
+    pairs, body = solver.self_contacts, solver.body
     x = moved + array_of(body.position)
     mass = array_of(body.mass_scale).astype(float) if body.mass_scaled else np.ones(len(x))
     row, count = array_of(pairs.neighbour), array_of(pairs.neighbour_count)
@@ -116,7 +116,7 @@ def test_a_pass_over_pairs_is_the_oracles(one_device, relaxation, scaling):
     upper = lower.copy().apply_translation([0, 0, 12.0])
     both = trimesh.util.concatenate([lower, upper])
     solver = solver_of(both, radius=1.5, relaxation=relaxation, scaling=scaling, pairs=True)
-    body, pairs = solver.body, solver.pairs
+    body, pairs = solver.body, solver.self_contacts
     x, random = position(solver), np.random.default_rng(5)
     over = x[:, 2] > 6
     x[over] -= [0.4, 0.3, 6.2]
@@ -154,7 +154,7 @@ def test_a_pair_shares_its_push_by_the_scaled_masses(kept):
     x[upper, 2] -= 5.0
     fill((solver.body.position, x))
     begin(solver, [0.0, 0.0, -1e-3])
-    pairs = solver.pairs
+    pairs = solver.self_contacts
 
     @ti.kernel
     def project():

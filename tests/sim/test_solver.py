@@ -5,7 +5,7 @@ import pytest
 from particle_tissue import tissue_of
 
 from sim.fields import array_of, fill
-from sim.self_contact import ParticleContacts
+from sim.self_contact import SelfContacts
 from sim.shapes import ConvexTool, Plane, SignedDistanceField
 from sim.solver import Solver, StepSettings
 
@@ -24,7 +24,7 @@ def solver_of(
     serial=None,
 ):
     model = tissue_of(mesh, radius, shapes, friction, relaxation, scaling, serial=serial)
-    particle_contacts = ParticleContacts(model, 0.25) if pairs else None
+    particle_contacts = SelfContacts(model, 0.25) if pairs else None
     return Solver(model, particle_contacts, tool)
 
 
@@ -216,6 +216,6 @@ def test_over_relaxation_converges_faster(kept, ball):
 
 def test_what_a_scene_switches_off_is_not_there(kept, block):
     solver = kept(solver_of, block)
-    assert not hasattr(solver.body, "mass_scale") and solver.contacts is None and solver.pairs is None
+    assert not hasattr(solver.body, "mass_scale") and solver.contacts is None and solver.self_contacts is None
     assert hasattr(solver_of(block, scaling=0.1).body, "mass_scale")
     assert not hasattr(kept(on_floor, block, -8.0, 0.0).contacts, "push")

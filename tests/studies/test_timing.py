@@ -17,7 +17,7 @@ from rehearsal.configuration import setup_of
 from sim.body import BodyState
 from sim.fields import array_of
 from sim.neo_hookean import LATTICE_SETTINGS
-from sim.self_contact import ParticleContacts
+from sim.self_contact import SelfContacts
 from sim.shapes import ConvexTool, Plane
 from sim.solver import Solver, StepSettings
 from studies.performance import lower_bound, step_timing, timing_command
@@ -92,8 +92,8 @@ def test_memory_is_that_of_the_fields(device, block):
     solver = Solver(tissue)
     n = tissue.body.count
     body = (4 * 3 + 1) * 4 * n
-    pairs = ParticleContacts(tissue, 0.25)
-    grown = Solver(tissue, pairs=pairs)
+    self_contacts = SelfContacts(tissue, 0.25)
+    grown = Solver(tissue, self_contacts=self_contacts)
     own = 4 * (2**15 + 1 + 2**15 + 3 * n + 24 * n + 3 * n + 1)
     assert 1e6 * (step_timing.memory_mb(grown) - step_timing.memory_mb(solver)) == pytest.approx(own)
     # What a body of particles takes, and its model not less.
