@@ -7,8 +7,8 @@ import taichi as ti
 import trimesh
 
 from sim.fields import array_of, field_of, fill
-from sim.mesh_distance import signed_distance
 from sim.sampling import sample_particles
+from sim.signed_distance import signed_distance
 
 
 @dataclass(frozen=True)

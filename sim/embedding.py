@@ -13,7 +13,7 @@ import trimesh
 
 from sim.device import is_too_small
 from sim.fields import field_of
-from sim.mesh_distance import signed_distance
+from sim.signed_distance import signed_distance
 from sim.skinning import Skin
 from sim.tissue_model import TissueModel
 

@@ -11,8 +11,8 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from sim.mesh_distance import signed_distance
 from sim.sampling import SamplingError, check_memory
+from sim.signed_distance import signed_distance
 
 # Corners of a cell, x slowest.
 CORNERS = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])

@@ -13,8 +13,8 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from sim.distance_grid import distance_grid
 from sim.fields import field_of
+from sim.signed_distance import distance_grid
 
 FAR = 1e6
 HAIR = 1e-3

@@ -22,10 +22,10 @@ from scenes.closed_surfaces import moved_by
 from scenes.scene import Contact, Scene, SolverSection, with_options
 from scenes.tissue import TISSUES, ShapeMatchingTissue, TissueSection
 from sim.device import start
-from sim.distance_grid import distance_grid
 from sim.embedding import Embedding
 from sim.shape_matching import fill
 from sim.shapes import GRID_MM, ConvexTool, SignedDistanceField
+from sim.signed_distance import distance_grid
 from sim.solver import Solver
 from studies.performance.step_timing import memory_mb
 from ultrasound.probe import DetailLevel, Mode

@@ -6,7 +6,7 @@ import pytest
 import trimesh
 from conftest import rotation_about
 
-from sim.distance_grid import COARSENESS, EXACT_MM, distance_grid
+from sim.signed_distance import COARSENESS, EXACT_MM, distance_grid
 
 # Float32 keeps places up to 64 mm from a corner of the grid so well; a distance takes some ten operations.
 ROUNDING_MM = 10 * 4e-6
