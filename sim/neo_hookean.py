@@ -16,8 +16,8 @@ import taichi.math as tm
 from sim.body import Body
 from sim.device import is_too_small
 from sim.fields import field_of, fields_of
-from sim.four_wide import cross, four, row
 from sim.lattice import Lattice, fill_with_cells, surface_points
+from sim.linear_algebra import cross, four, row
 from sim.rigid_correction import RigidMotion
 from sim.solver import StepSettings
 from sim.surface_contact import LAYER_MM, REACH_MM, SurfaceContacts

@@ -11,7 +11,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import Body
-from sim.rotation import cross_matrix
+from sim.linear_algebra import cross_matrix
 from sim.surface_contact import NEAR_MM, SurfaceContacts
 
 # Sums are made of blocks of so many terms, in an order that no thread changes.

@@ -15,10 +15,9 @@ from scipy.spatial import cKDTree
 from sim.body import ParticleBody, RestBody, fill_body
 from sim.device import is_too_small
 from sim.fields import field_of, fields_of
-from sim.four_wide import four, row
+from sim.linear_algebra import four, rotation_near, row
 from sim.particle_contact import REACH_RADII, ShapeContacts
 from sim.particle_patches import Patches, arrange
-from sim.rotation import rotation_near
 from sim.sampling import Clusters
 from sim.tissue_model import ModelInputs
 

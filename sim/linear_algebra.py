@@ -12,6 +12,24 @@ SQUARINGS = 20
 
 
 @ti.func
+def four(vector):
+    """A vector of three with 0 as the fourth entry."""
+    return tm.vec4(vector.x, vector.y, vector.z, 0.0)
+
+
+@ti.func
+def row(matrix, k: ti.template()):
+    """Row k of a matrix of four columns."""
+    return tm.vec4(matrix[k, 0], matrix[k, 1], matrix[k, 2], matrix[k, 3])
+
+
+@ti.func
+def cross(a, b):
+    """Cross product of the first three entries."""
+    return tm.vec4(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x, 0.0)
+
+
+@ti.func
 def nearest_rotation(matrix):
     """Proper rotation R (det R = +1) that maximises trace(R^T matrix), the solution of Eq. 8.
 

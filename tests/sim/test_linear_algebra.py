@@ -6,7 +6,7 @@ import taichi as ti
 from scipy.spatial.transform import Rotation
 
 from sim.fields import array_of, fill
-from sim.rotation import nearest_rotation, rotation_near
+from sim.linear_algebra import nearest_rotation, rotation_near
 
 COUNT = 336_000
 KIND = COUNT // 8
