@@ -6,8 +6,7 @@ import taichi.math as tm
 
 from sim.body import ParticleBody
 from sim.fields import array_of, fill
-from sim.shapes import FAR
-from sim.time_of_impact import TimeOfImpact
+from sim.shapes import FAR, TimeOfImpact
 
 KEEP_OUT_SWEEPS = 8
 # How far around a static shape its distances must be known, in particle radii.

@@ -12,8 +12,7 @@ import taichi.math as tm
 from sim.body import Body
 from sim.fields import array_of, fields_of, fill
 from sim.lattice import Lattice
-from sim.shapes import FAR
-from sim.time_of_impact import TimeOfImpact
+from sim.shapes import FAR, TimeOfImpact
 
 # A pressure as high as Young's modulus presses the surface this far into a shape.
 LAYER_MM = 0.05

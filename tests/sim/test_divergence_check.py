@@ -21,9 +21,8 @@ from sim.divergence_check import (
     tetrahedra_among,
 )
 from sim.fields import array_of, fill
-from sim.shapes import GRID_MM, HAIR_CELLS, ConvexTool, Plane, SignedDistanceField
+from sim.shapes import DEEP_MM, GRID_MM, HAIR_CELLS, ConvexTool, Plane, SignedDistanceField, TimeOfImpact
 from sim.solver import Solver, StepSettings
-from sim.time_of_impact import DEEP_MM, TimeOfImpact
 
 DOWN = (0.0, 0.0, -G)
 DT = 1 / 60
