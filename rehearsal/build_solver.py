@@ -9,7 +9,7 @@ import trimesh
 
 from scenes.scene import Contact, SolverSection
 from scenes.tissue import TissueSection
-from sim.body import RestBody
+from sim.sampling import RestBody
 from sim.self_contact import SelfContacts
 from sim.shapes import ConvexTool, SignedDistanceField
 from sim.solver import Solver, StepSettings

@@ -4,24 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
-import trimesh
 
 from sim.fields import array_of, field_of, fill
-from sim.sampling import sample_particles
-from sim.signed_distance import signed_distance
-
-
-@dataclass(frozen=True)
-class RestBody:
-    """The body as it was built; nothing changes it.
-
-    particles (n, 3) float64 [mm], in the frame of the surface, all of one mass; contact_radius (n,) [mm]: how near a
-    particle's centre may come to a shape.
-    """
-
-    particles: np.ndarray
-    radius_mm: float
-    contact_radius: np.ndarray
+from sim.sampling import RestBody
 
 
 @dataclass(frozen=True)
@@ -30,25 +15,6 @@ class BodyState:
 
     position: np.ndarray
     velocity: np.ndarray
-
-
-def fill_body(
-    surface: trimesh.Trimesh,
-    radius_mm: float,
-    volume_sampling: float = 4.0,
-    surface_samples_per_mm2: float = 0.0,
-) -> RestBody:
-    """Particles that fill a closed surface [mm].
-
-    A particle touches a shape where the surface above it would: its contact radius is its depth under the
-    surface, at most the particle radius, so that a body laid in a mould of its own shape rests without being
-    moved. Raises SamplingError when the radius is too large for the surface.
-    """
-    particles = sample_particles(
-        surface.vertices, surface.faces, radius_mm, volume_sampling, surface_samples_per_mm2
-    )
-    depth = -signed_distance(surface.vertices, surface.faces, particles)[0]
-    return RestBody(particles, radius_mm, np.clip(depth, 0.0, radius_mm))
 
 
 @ti.data_oriented

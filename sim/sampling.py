@@ -5,14 +5,16 @@ voxelisation, optionally samples on the surface, then one particle at a time, ea
 its bounds. The clusters are chosen among the particles in the same way.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import igl
 import numpy as np
 import psutil
+import trimesh
 from scipy.spatial import cKDTree
 
 from errors import UserError
+from sim.signed_distance import signed_distance
 
 # What a fine voxel takes while it is asked whether it is inside: indices and places in 64 bits, and the answer.
 VOXEL_BYTES = 80
@@ -20,6 +22,19 @@ VOXEL_BYTES = 80
 
 class SamplingError(UserError):
     """The surface cannot be filled with particles; the message says why and what to change."""
+
+
+@dataclass(frozen=True)
+class RestBody:
+    """The body as it was built; nothing changes it.
+
+    particles (n, 3) float64 [mm], in the frame of the surface, all of one mass; contact_radius (n,) [mm]: how near a
+    particle's centre may come to a shape.
+    """
+
+    particles: np.ndarray
+    radius_mm: float
+    contact_radius: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -42,6 +57,59 @@ class Clusters:
         order = np.argsort(self.members, kind="stable")
         counts = np.bincount(self.members, minlength=particle_count)
         return Clusters(offsets_of(counts), cluster[order])
+
+
+@dataclass(frozen=True)
+class Patches:
+    """Particles ``start[p]`` to ``start[p + 1]`` of a body are patch p; row p of ``clusters`` lists the clusters it is in.
+
+    The ``several`` first patches have more than one particle, the others one. Where a kidney has five memberships of particles in
+    clusters, it has two of patches.
+    """
+
+    start: np.ndarray
+    clusters: Clusters
+
+    def __len__(self) -> int:
+        return len(self.start) - 1
+
+    @property
+    def several(self) -> int:
+        """How many patches have more than one particle."""
+        return int((self.sizes > 1).sum())
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """How many particles each has (p,)."""
+        return np.diff(self.start)
+
+    @property
+    def shared(self) -> np.ndarray:
+        """How many clusters each is in (p,)."""
+        return np.diff(self.clusters.offsets)
+
+    def of_particles(self) -> np.ndarray:
+        """The patch of each particle (n,)."""
+        return np.repeat(np.arange(len(self), dtype=np.int32), self.sizes)
+
+
+def fill_body(
+    surface: trimesh.Trimesh,
+    radius_mm: float,
+    volume_sampling: float = 4.0,
+    surface_samples_per_mm2: float = 0.0,
+) -> RestBody:
+    """Particles that fill a closed surface [mm].
+
+    A particle touches a shape where the surface above it would: its contact radius is its depth under the
+    surface, at most the particle radius, so that a body laid in a mould of its own shape rests without being
+    moved. Raises SamplingError when the radius is too large for the surface.
+    """
+    particles = sample_particles(
+        surface.vertices, surface.faces, radius_mm, volume_sampling, surface_samples_per_mm2
+    )
+    depth = -signed_distance(surface.vertices, surface.faces, particles)[0]
+    return RestBody(particles, radius_mm, np.clip(depth, 0.0, radius_mm))
 
 
 def sample_particles(
@@ -90,6 +158,29 @@ def sample_clusters(particles: np.ndarray, spacing_mm: float) -> Clusters:
             free[near] = False
             rows.append(near.astype(np.int32))
     return Clusters(offsets_of([len(row) for row in rows]), np.concatenate(rows))
+
+
+def group_into_patches(rest: RestBody, cluster_spacing: float) -> tuple[RestBody, Patches]:
+    """A body's clusters, ``cluster_spacing`` radii apart, as patches; and the body with its particles in their order.
+
+    Patches of several particles and of one come in the order of their first particles, so that neighbours in space stay
+    neighbours in memory.
+    """
+    clusters = sample_clusters(rest.particles, cluster_spacing * rest.radius_mm)
+    rows = clusters.transposed(len(rest.particles))
+    number: dict[bytes, int] = {}
+    patch = np.empty(len(rest.particles), np.int64)
+    for i in range(len(patch)):
+        row = rows.members[rows.offsets[i] : rows.offsets[i + 1]]
+        patch[i] = number.setdefault(row.tobytes(), len(number))
+    sequence = np.argsort(np.bincount(patch) == 1, kind="stable")
+    patch = np.argsort(sequence)[patch]
+    order = np.argsort(patch, kind="stable")
+    found = list(number)
+    members = [np.frombuffer(found[p], rows.members.dtype) for p in sequence]
+    shared = Clusters(offsets_of([len(row) for row in members]), np.concatenate(members))
+    arranged = replace(rest, particles=rest.particles[order], contact_radius=rest.contact_radius[order])
+    return arranged, Patches(offsets_of(np.bincount(patch)), shared)
 
 
 def check_memory(needed_bytes: float, what: str, advice: str) -> None:

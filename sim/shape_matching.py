@@ -12,13 +12,12 @@ import taichi.math as tm
 import trimesh
 from scipy.spatial import cKDTree
 
-from sim.body import ParticleBody, RestBody, fill_body
+from sim.body import ParticleBody
 from sim.device import is_too_small
 from sim.fields import field_of, fields_of
 from sim.linear_algebra import four, rotation_near, row
 from sim.particle_contact import REACH_RADII, ShapeContacts
-from sim.particle_patches import Patches, arrange
-from sim.sampling import Clusters
+from sim.sampling import Clusters, Patches, RestBody, fill_body, group_into_patches
 from sim.tissue_model import ModelInputs
 
 RELAXATIONS = ("local", "global")
@@ -52,7 +51,7 @@ class ShapeMatching:
     def make(cls, parts: ModelInputs) -> "ShapeMatching":
         """Particles that fill the organ, or of an organ that was filled before, in clusters. Raises SamplingError."""
         rest = parts.organ if isinstance(parts.organ, RestBody) else fill(parts.organ, parts.tissue)
-        arranged, patches = arrange(rest, parts.tissue.cluster_spacing)
+        arranged, patches = group_into_patches(rest, parts.tissue.cluster_spacing)
         body = ParticleBody(arranged, parts.mass_scaling_per_mm)
         contacts = ShapeContacts(body, parts.shapes, parts.friction) if parts.shapes else None
         return cls(body, patches, contacts, parts.relaxation, parts.serial)

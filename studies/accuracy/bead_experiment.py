@@ -11,8 +11,8 @@ from rehearsal.stopwatch import timed
 from scenes.closed_surfaces import moved_by
 from scenes.scene import Contact, SolverSection
 from scenes.tissue import TissueSection
-from sim.body import RestBody
 from sim.fields import array_of
+from sim.sampling import RestBody
 from sim.shape_matching import fill
 from sim.shapes import ConvexTool
 from sim.skinning import Skin

@@ -14,8 +14,9 @@ from conftest import ROOT
 import scenes.tissue
 from rehearsal.configuration import setup_of
 from scenes.scene import Scene, SceneError, load_scene
-from sim.body import BodyState, ParticleBody, RestBody
+from sim.body import BodyState, ParticleBody
 from sim.device import start
+from sim.sampling import RestBody
 from sim.solver import Solver, StepSettings
 
 PAGE = (ROOT / "docs" / "adding-a-tissue-model.md").read_text("utf-8")

@@ -8,9 +8,8 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from sim.body import fill_body
 from sim.lattice import fill_with_cells
-from sim.sampling import SamplingError, occupied_voxels, sample_clusters, sample_particles
+from sim.sampling import SamplingError, fill_body, occupied_voxels, sample_clusters, sample_particles
 
 
 def test_particles_keep_their_distance_and_leave_no_room(ball):

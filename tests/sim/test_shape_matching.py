@@ -9,10 +9,9 @@ from conftest import rotation_about
 from particle_tissue import tissue_of
 from test_solver import on_floor, solver_of
 
-from sim.body import BodyState, ParticleBody, fill_body
+from sim.body import BodyState, ParticleBody
 from sim.fields import array_of, fill
-from sim.particle_patches import arrange
-from sim.sampling import sample_clusters
+from sim.sampling import fill_body, group_into_patches, sample_clusters
 from sim.shape_matching import ShapeMatching
 from sim.shapes import Plane
 
@@ -185,7 +184,7 @@ def test_frames_do_not_depend_on_those_before(kept, block):
 
 def test_patches_hold_each_membership_of_the_clusters(block):
     rest = fill_body(block, 2.0)
-    arranged, patches = arrange(rest, 3.33)
+    arranged, patches = group_into_patches(rest, 3.33)
     assert sorted(map(tuple, arranged.particles)) == sorted(map(tuple, rest.particles))
     clusters = sample_clusters(rest.particles, 3.33 * 2.0)
     wanted = {
