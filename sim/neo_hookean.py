@@ -18,7 +18,7 @@ from sim.device import is_too_small
 from sim.fields import field_of, fields_of
 from sim.lattice import Lattice, fill_with_cells, surface_points
 from sim.linear_algebra import cross, four, row
-from sim.rigid_correction import RigidMotion
+from sim.rigid_correction import RigidCorrection
 from sim.solver import StepSettings
 from sim.surface_contact import LAYER_MM, REACH_MM, SurfaceContacts
 from sim.tissue_model import ModelInputs
@@ -101,7 +101,7 @@ class NeoHookean:
         self._store_cells()
         self._store_hourglass()
         self.rigid: Any = (
-            None if self.has_fixed else RigidMotion(body, self.mass, self.target, contacts, self.serial)
+            None if self.has_fixed else RigidCorrection(body, self.mass, self.target, contacts, self.serial)
         )
         self.set_material(young_kpa, poisson)
 

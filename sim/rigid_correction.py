@@ -28,7 +28,7 @@ MOST_TURN = 0.5
 
 
 @ti.data_oriented
-class RigidMotion:
+class RigidCorrection:
     """Moves a body's estimates rigidly towards ``target`` (n,) [mm], where inertia and gravity draw its ``mass`` (n,) [g].
 
     Unknowns are the translation and the rotation vector about ``centre``, one of the nodes.
