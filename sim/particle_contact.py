@@ -44,10 +44,10 @@ class ShapeContacts:
         self.contact = ti.Struct.field(parts, shape=(body.count, len(shapes)))
         self.touched = ti.field(ti.i32, body.count)
         self.found = ti.Vector.field(4, ti.f32, (body.count, len(shapes)))
-        self.forget()
+        self.reset()
         self.penetration = ti.field(ti.f32, ())
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Drop what is known of the particles' distances, after they were moved by another hand."""
         self.found.fill(-FAR)
 

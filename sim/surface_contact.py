@@ -64,9 +64,9 @@ class SurfaceContacts:
         self.remembered = ("point", "near", "plane", "found") + ("stick",) * self.rough
         self.stiffness = ti.field(ti.f32, ())
         self.penetration = ti.field(ti.f32, ())
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Drop what is known of distances and of friction, after the body was moved by another hand."""
         self.found.fill(-FAR)
         self.near.fill(0)

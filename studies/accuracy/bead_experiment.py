@@ -112,7 +112,7 @@ class BeadExperiment:
 
     def _restore(self) -> None:
         self.body.restore(self.body.rest_state())
-        self.contacts.forget()
+        self.contacts.reset()
         self.model.update_frames()
 
     def _step_settings(self, setup: Setup) -> StepSettings:

@@ -96,7 +96,7 @@ def _maltreat(specimen: Specimen, case: StressCase, extremes: Extremes) -> None:
     specimen.divergence_check.set_initial_state()
     if case.state[0] != "settled":
         specimen.body.restore(BodyState(position.astype(np.float32), velocity.astype(np.float32)))
-        specimen.solver.contacts.forget()
+        specimen.solver.contacts.reset()
     _weigh(specimen, case.heaviest)
     _harden(specimen, case.material)
     kind, *numbers = case.probe
@@ -153,7 +153,7 @@ def _lifted(specimen: Specimen) -> float:
     state = specimen.solver.snapshot()
     up = (state.body.position + LIFT_MM * specimen.up).astype(np.float32)
     specimen.solver.restore(SolverState(BodyState(up, np.zeros_like(up)), state.contacts))
-    specimen.solver.contacts.forget()
+    specimen.solver.contacts.reset()
     weightless: StepSettings = replace(specimen.settings, gravity=(0.0, 0.0, 0.0))
     error = np.inf
     for step in range(1, LIFT_STEPS + 1):

@@ -65,7 +65,7 @@ def settings(model: str) -> StepSettings:
 def put(solver: Solver, x: np.ndarray, velocity=(0.0, 0.0, 0.0)) -> None:
     speeds = np.tile(np.float32(velocity), (len(x), 1))
     solver.body.restore(BodyState(x.astype(np.float32), speeds))
-    solver.contacts.forget()
+    solver.contacts.reset()
 
 
 def test_tetrahedra_are_small_and_none_is_flat():

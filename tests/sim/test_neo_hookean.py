@@ -272,7 +272,7 @@ def test_uniaxial_compression_between_frictionless_plates(one_device, block):
     for poisson in (0.45, 0.3):
         model.set_material(YOUNG_KPA, poisson)
         put(model, lattice.nodes)
-        contacts.forget()
+        contacts.reset()
         height = 16.0
         for _ in range(40):
             lower = max(height - 0.1, gap)

@@ -296,7 +296,7 @@ def test_a_restored_state_goes_on_with_the_same_bits(kept, dome):
     for forgets in (False, False, True):
         solver.restore(state)
         if forgets:
-            solver.contacts.forget()
+            solver.contacts.reset()
         press(solver, 2.5, tilted, 6, first_mm=2.0)
         ends.append(bits(solver))
     assert ends[0] == ends[1]
@@ -334,7 +334,7 @@ def test_extremes_are_survived(kept, dome):
         fall = np.tile(np.float32([0, 0, -speed]), (solver.body.count, 1))
         solver.restore(built)
         solver.body.restore(BodyState((lattice.nodes + [0, 0, 20.0]).astype(np.float32), fall))
-        solver.contacts.forget()
+        solver.contacts.reset()
         rest(solver, 120, settings_of(8, DOWN), AWAY)
         recovers(solver, wanted)
 
@@ -350,7 +350,7 @@ def test_inverted_cells_find_back(kept, dome, poisson):
     states = [lattice.nodes + s for s in scrambles] + [lattice.nodes * [1, 1, -1], lattice.nodes * [1, 1, 0]]
     for state in states:
         put(solver.model, state)
-        solver.contacts.forget()
+        solver.contacts.reset()
         assert jacobians(lattice, state).min() < 0.01
         rest(solver, 60, settings_of(12, DOWN), AWAY)
         # It may end lying on another side.
@@ -362,7 +362,7 @@ def test_inverted_cells_find_back(kept, dome, poisson):
     # A tool that goes through to the plane and below.
     put(solver.model, lattice.nodes)
     for depth, steps in ((19.0, 40), (19.0, 3)):
-        solver.contacts.forget()
+        solver.contacts.reset()
         press(solver, depth, settings_of(8, DOWN), steps)
         rest(solver, 10, settings_of(8, DOWN), np.array([lifted(22.0 - depth)] * 2))
         # The skin stays about as wide as twice the dome; it has nowhere else to go.

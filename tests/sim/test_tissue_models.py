@@ -55,7 +55,7 @@ class Subject:
         moving = np.broadcast_to(np.asarray(velocity, np.float32), at.shape).copy()
         self.solver.body.restore(BodyState(at.astype(np.float32), moving))
         if self.solver.contacts is not None:
-            self.solver.contacts.forget()
+            self.solver.contacts.reset()
         self.solver.model.update_frames()
 
     def press(self, settings: StepSettings, first_mm: float, last_mm: float, steps: int) -> None:

@@ -40,7 +40,7 @@ def test_a_step_in_pieces_is_the_step(device, ball, model):
     ends = []
     for step in (solver.step, phases.step):
         solver.body.restore(solver.body.rest_state())
-        solver.contacts.forget()
+        solver.contacts.reset()
         solver.model.update_frames()
         poses = np.tile(np.eye(4), (settings.substeps + 1, 1, 1))
         for n in range(10):
