@@ -25,7 +25,7 @@ from sim.tissue_model import ModelInputs
 
 # Stiffness, in units of the shear modulus, of deformation that varies inside a cell: between 1, exact for torsion,
 # and (1 + nu), exact for bending.
-HOURGLASS = 1.2
+HOURGLASS_STIFFNESS = 1.2
 # Below this volume ratio ln J goes on as its tangent, so that inverted cells find back.
 LEAST_J = 0.2
 LN2 = 0.6931471805599453
@@ -128,7 +128,7 @@ class NeoHookean:
             for b in range(8):
                 place = (corners[b] - corners[a] + 1) @ [9, 3, 1]
                 neighbour[cells[:, a], place] = cells[:, b]
-                weight[cells[:, a], place] += HOURGLASS * self.lattice.hourglass[:, a, b]
+                weight[cells[:, a], place] += HOURGLASS_STIFFNESS * self.lattice.hourglass[:, a, b]
         self.neighbour, self.hourglass = fields_of(neighbour, weight)
 
     def set_young(self, young_kpa: float) -> None:

@@ -24,7 +24,7 @@ from scipy.optimize import brentq
 from sim.body import Body, BodyState
 from sim.fields import array_of, fill
 from sim.lattice import ERSATZ, Lattice, fill_with_cells
-from sim.neo_hookean import HOURGLASS, LEAST_J, NeoHookean, ln
+from sim.neo_hookean import HOURGLASS_STIFFNESS, LEAST_J, NeoHookean, ln
 from sim.shapes import ConvexTool, Plane
 from sim.solver import Solver
 from sim.surface_contact import LAYER_MM
@@ -333,13 +333,13 @@ def beam_error(poisson: float, cell: float, side: float = 8.0, span: float = 40.
     """How far the sag may be from Timoshenko's, as a share.
 
     Empty space in cut cells adds ERSATZ times their second moment of area; edges lack tissue, in weight and in
-    stiffness; bending inside cells is HOURGLASS / (1 + nu) times as stiff as it should be, and is 1 / n^2 of it all
+    stiffness; bending inside cells is HOURGLASS_STIFFNESS / (1 + nu) times as stiff as it should be, and is 1 / n^2 of it all
     in a beam n cells thick; the clamp keeps the section from widening, which stiffens nu^2 of a length of one side.
     """
     n = side / cell
     empty = ERSATZ * ((1 + 1 / n) ** 4 - 1)
     edges = (cell / 2) ** 2 / 8 * 2 * np.pi / side**2
-    inside = abs(HOURGLASS / (1 + poisson) - 1) / n**2
+    inside = abs(HOURGLASS_STIFFNESS / (1 + poisson) - 1) / n**2
     return empty + edges + inside + poisson**2 * side / span
 
 
