@@ -20,7 +20,7 @@ from sim.lattice import Lattice, fill_with_cells, surface_points
 from sim.linear_algebra import cross, four, row
 from sim.rigid_correction import RigidCorrection
 from sim.solver import StepSettings
-from sim.surface_contact import LAYER_MM, REACH_MM, SurfaceContacts
+from sim.surface_contact import PENALTY_DEPTH_MM, REACH_MM, SurfaceContacts
 from sim.tissue_model import ModelInputs
 
 # Stiffness, in units of the shear modulus, of deformation that varies inside a cell: between 1, exact for torsion,
@@ -142,7 +142,7 @@ class NeoHookean:
         self.mu[None] = 1e3 * young_kpa / (2 * (1 + poisson))
         self.lambda_[None] = 1e3 * young_kpa * poisson / ((1 + poisson) * (1 - 2 * poisson))
         if self.contacts is not None:
-            self.contacts.stiffness[None] = young_kpa / LAYER_MM
+            self.contacts.stiffness[None] = young_kpa / PENALTY_DEPTH_MM
 
     def counts(self) -> dict[str, int]:
         """Nodes, which are its particles, and cells, and points of the surface that may touch."""

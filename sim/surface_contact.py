@@ -15,7 +15,7 @@ from sim.lattice import Lattice
 from sim.shapes import FAR, TimeOfImpact
 
 # A pressure as high as Young's modulus presses the surface this far into a shape.
-LAYER_MM = 0.05
+PENALTY_DEPTH_MM = 0.05
 # Along a surface the layer is softer than into it by this factor.
 STICK = 0.5
 # A plane is kept until the point has moved this far; a shape of 4 mm radius leaves it by 0.003 mm there.

@@ -27,7 +27,7 @@ from sim.lattice import ERSATZ, Lattice, fill_with_cells
 from sim.neo_hookean import HOURGLASS_STIFFNESS, LEAST_J, NeoHookean, ln
 from sim.shapes import ConvexTool, Plane
 from sim.solver import Solver
-from sim.surface_contact import LAYER_MM
+from sim.surface_contact import PENALTY_DEPTH_MM
 
 DT = 1 / 60
 EPS = 2.0**-23
@@ -116,7 +116,7 @@ def test_another_youngs_modulus_leaves_poissons_ratio_and_stiffens_the_contact_l
     model.set_young(2 * YOUNG_KPA)
     found = model.mu[None], model.lambda_[None], model.contacts.stiffness[None]
     assert found == pytest.approx(
-        [2 * each for each in (*lame_parameters(0.3), YOUNG_KPA / LAYER_MM)], rel=1e-6
+        [2 * each for each in (*lame_parameters(0.3), YOUNG_KPA / PENALTY_DEPTH_MM)], rel=1e-6
     )
 
 
@@ -286,7 +286,9 @@ def test_uniaxial_compression_between_frictionless_plates(one_device, block):
         assert np.abs(x - before).max() < 1e-3
         # The layers at both ends give way by pressure LAYER / E.
         stretch = brentq(
-            lambda s: 16 * s - gap + 2 * uniaxial(s, poisson)[1] * LAYER_MM / (1e3 * YOUNG_KPA), 0.7, 0.8
+            lambda s: 16 * s - gap + 2 * uniaxial(s, poisson)[1] * PENALTY_DEPTH_MM / (1e3 * YOUNG_KPA),
+            0.7,
+            0.8,
         )
         q, stress = uniaxial(stretch, poisson)
         inside = (np.abs(lattice.nodes) < [12, 10, 8]).all(axis=1)
@@ -303,7 +305,7 @@ def test_uniaxial_compression_between_frictionless_plates(one_device, block):
         assert np.diag(measured) == pytest.approx([q, q, stretch], abs=section * (1 - stretch))
         assert np.abs(measured - np.diag(np.diag(measured))).max() < section * (1 - stretch)
         at = np.einsum("pk,pkd->pd", array_of(contacts.weight), x[array_of(contacts.node)])[:, 2]
-        layer = 1e3 * YOUNG_KPA / LAYER_MM * area
+        layer = 1e3 * YOUNG_KPA / PENALTY_DEPTH_MM * area
         below, above = (layer * np.maximum(-8 - at, 0)).sum(), (layer * np.maximum(at - gap + 8, 0)).sum()
         # Heights of 8 nodes each, known to an ulp of 16 mm, of a depth of 0.017 mm.
         assert below == pytest.approx(above, rel=2 * 8 * 2.0**-20 / 0.017)

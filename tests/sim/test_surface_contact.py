@@ -9,7 +9,7 @@ from lattice_tissue import DENSITY, YOUNG_KPA, G, jacobians, lifted, position, p
 from sim.body import BodyState
 from sim.fields import array_of, fill
 from sim.shapes import ConvexTool, Plane, SignedDistanceField
-from sim.surface_contact import LAYER_MM, NEAR_MM, REACH_MM, STICK
+from sim.surface_contact import PENALTY_DEPTH_MM, NEAR_MM, REACH_MM, STICK
 
 FRICTION = 0.35
 UP = np.array([0.0, 0.0, 1.0])
@@ -68,7 +68,7 @@ def weight(solver) -> float:
 
 def layer_depth(solver, gravity) -> float:
     """How far a block of 24 x 20 mm presses itself into a plane [mm]: pressure LAYER / E."""
-    return weight(solver) * gravity / G / (24 * 20) / (1e3 * YOUNG_KPA) * LAYER_MM
+    return weight(solver) * gravity / G / (24 * 20) / (1e3 * YOUNG_KPA) * PENALTY_DEPTH_MM
 
 
 def test_friction_holds_below_its_angle_and_slides_above(one_device, block):
@@ -185,7 +185,7 @@ def layer_of(contacts, s: int, x: np.ndarray, shifted: np.ndarray, slid: np.ndar
     depth = np.where(near, np.maximum(plane[:, 3] - ((x - shifted) * normal).sum(axis=1), 0.0), 0.0)
     stick -= (stick * normal).sum(axis=1, keepdims=True) * normal
     share = np.minimum(FRICTION * depth / STICK / np.maximum(np.linalg.norm(stick, axis=1), 1e-12), 1.0)
-    layer = np.where(depth > 0, 1e3 * YOUNG_KPA / LAYER_MM * array_of(contacts.area), 0.0)
+    layer = np.where(depth > 0, 1e3 * YOUNG_KPA / PENALTY_DEPTH_MM * array_of(contacts.area), 0.0)
     force = layer[:, None] * (depth[:, None] * normal - STICK * share[:, None] * stick)
     out = np.einsum("pi,pj->pij", normal, normal)
     stiffness = layer[:, None, None] * (out + (STICK * share)[:, None, None] * (np.eye(3) - out))
