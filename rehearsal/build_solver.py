@@ -69,7 +69,7 @@ def build_solver(
 ) -> Solver:
     """A solver of the organ [mm] among shapes, the tool among them. Raises SamplingError.
 
-    Shape matching also takes an organ that was filled before (``sim.shape_matching.fill``). ``serial`` says whether a step is one
+    Shape matching also takes an organ that was filled before (``sim.shape_matching.fill_organ``). ``serial`` says whether a step is one
     kernel on one core; left open, the body's size and the machine decide.
     """
     contact, section = contact or Contact(), section or SolverSection()

@@ -50,7 +50,7 @@ class ShapeMatching:
     @classmethod
     def make(cls, parts: ModelInputs) -> "ShapeMatching":
         """Particles that fill the organ, or of an organ that was filled before, in clusters. Raises SamplingError."""
-        rest = parts.organ if isinstance(parts.organ, RestBody) else fill(parts.organ, parts.tissue)
+        rest = parts.organ if isinstance(parts.organ, RestBody) else fill_organ(parts.organ, parts.tissue)
         arranged, patches = group_into_patches(rest, parts.tissue.cluster_spacing)
         body = ParticleBody(arranged, parts.mass_scaling_per_mm)
         contacts = ShapeContacts(body, parts.shapes, parts.friction) if parts.shapes else None
@@ -357,6 +357,6 @@ class ShapeMatching:
             out[v] = x.xyz
 
 
-def fill(organ: trimesh.Trimesh, tissue: Any) -> RestBody:
+def fill_organ(organ: trimesh.Trimesh, tissue: Any) -> RestBody:
     """The organ [mm] filled with a tissue's particles, which takes seconds. Raises SamplingError."""
     return fill_body(organ, tissue.radius_mm, tissue.volume_sampling, tissue.surface_samples_per_mm2)

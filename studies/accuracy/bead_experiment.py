@@ -13,7 +13,7 @@ from scenes.scene import Contact, SolverSection
 from scenes.tissue import TissueSection
 from sim.fields import array_of
 from sim.sampling import RestBody
-from sim.shape_matching import fill
+from sim.shape_matching import fill_organ
 from sim.shapes import ConvexTool
 from sim.skinning import Skin
 from sim.solver import StepSettings
@@ -142,7 +142,7 @@ def tissue_of(case: BeadCase, setup: Setup) -> TissueSection:
 
 def rest_body(case: BeadCase, setup: Setup) -> RestBody:
     """Shape matching's particles of a case; Experiments of one radius can share them."""
-    return fill(_organ(case), setup.tissue)
+    return fill_organ(_organ(case), setup.tissue)
 
 
 def _organ(case: BeadCase) -> trimesh.Trimesh:

@@ -23,7 +23,7 @@ from scenes.scene import Contact, Scene, SolverSection, with_options
 from scenes.tissue import TISSUES, ShapeMatchingTissue, TissueSection
 from sim.device import start
 from sim.embedding import Embedding
-from sim.shape_matching import fill
+from sim.shape_matching import fill_organ
 from sim.shapes import GRID_MM, ConvexTool, SignedDistanceField
 from sim.signed_distance import distance_grid
 from sim.solver import Solver
@@ -94,7 +94,9 @@ class FeatureBody:
             for shape in anatomy.shapes
             if isinstance(shape, trimesh.Trimesh)
         ]
-        self.filled = fill(self.organ, tissue) if isinstance(tissue, ShapeMatchingTissue) else self.organ
+        self.filled = (
+            fill_organ(self.organ, tissue) if isinstance(tissue, ShapeMatchingTissue) else self.organ
+        )
         down = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
         x, y, z = (1e3 * scene.gravity.acceleration_m_s2 * down).tolist()
         self.settings.gravity = (x, y, z)
