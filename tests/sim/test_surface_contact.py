@@ -9,7 +9,7 @@ from lattice_tissue import DENSITY, YOUNG_KPA, G, jacobians, lifted, position, p
 from sim.body import BodyState
 from sim.fields import array_of, fill
 from sim.shapes import ConvexTool, Plane, SignedDistanceField
-from sim.surface_contact import PENALTY_DEPTH_MM, NEAR_MM, REACH_MM, STICK
+from sim.surface_contact import NEAR_MM, PENALTY_DEPTH_MM, REACH_MM, STICK
 
 FRICTION = 0.35
 UP = np.array([0.0, 0.0, 1.0])
