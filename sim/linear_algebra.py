@@ -1,25 +1,28 @@
-"""The rotation nearest to a 3 x 3 matrix, for every matrix: inverted, flat, collapsed and tiny ones too."""
+"""Linear algebra of small matrices in kernels: four-wide vectors, rotations, symmetric 3 x 3 systems.
+
+Four-wide vectors carry three numbers and a fourth: compilers use a processor's vector units only where no entry is left out.
+"""
 
 import taichi as ti
 import taichi.math as tm
 
-# Below this share of its size cubed, the best rotation is not unique to float32 and is left as it is.
-UNIQUE = 1e-3
-# Newton's method errs by the cube of its last turn [rad]: by no more than float32 does.
-LAST_TURN = 0.01
-MOST_TURNS = 3
+# Below this determinant, relative to trace(S) cubed, the best rotation is not unique in float32 and Newton's step is not taken.
+LEAST_DETERMINANT = 1e-3
+# The error of Newton's method is the cube of its last step [rad]: below float32's rounding.
+LAST_STEP_RAD = 0.01
+MOST_NEWTON_STEPS = 3
 SQUARINGS = 20
 
 
 @ti.func
 def four(vector):
-    """A vector of three with 0 as the fourth entry."""
+    """A 3-vector with 0 as the fourth entry."""
     return tm.vec4(vector.x, vector.y, vector.z, 0.0)
 
 
 @ti.func
 def row(matrix, k: ti.template()):
-    """Row k of a matrix of four columns."""
+    """Row k of a matrix with four columns."""
     return tm.vec4(matrix[k, 0], matrix[k, 1], matrix[k, 2], matrix[k, 3])
 
 
@@ -31,11 +34,10 @@ def cross(a, b):
 
 @ti.func
 def nearest_rotation(matrix):
-    """Proper rotation R (det R = +1) that maximises trace(R^T matrix), the solution of Eq. 8.
+    """Proper rotation R (det R = +1) that maximises trace(R^T matrix), for every matrix: also inverted, flat or tiny (Eq. 8).
 
     Its quaternion is the eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix (Horn 1987). The entries are
-    divided by the largest one first, so that those of tiny matrices keep their digits. No matrix, no rotation: the
-    identity.
+    first divided by the largest, so that tiny matrices keep their digits. The zero matrix gives the identity.
     """
     largest = 0.0
     for i, j in ti.static(ti.ndrange(3, 3)):
@@ -44,9 +46,9 @@ def nearest_rotation(matrix):
     if largest > 0.0:
         scaled = matrix / largest
         rotation = rotation_of(largest_eigenvector(horn_matrix(scaled)))
-        turn, unique = newton_turn(rotation, scaled)
+        step, unique = newton_step(rotation, scaled)
         if unique:
-            rotation = rotation @ small_rotation(turn)
+            rotation = rotation @ small_rotation(step)
     return rotation
 
 
@@ -66,9 +68,9 @@ def horn_matrix(m):
 
 @ti.func
 def largest_eigenvector(symmetric):
-    """Eigenvector (4,), not of unit length, of the largest eigenvalue of a symmetric matrix (4, 4): the power method by squaring.
+    """Eigenvector (4,), not of unit length, of the largest eigenvalue of a symmetric matrix (4, 4): power method by squaring.
 
-    Where two eigenvalues are nearer than 2^-SQUARINGS it is of their plane, which is as good to float32.
+    Where the two largest eigenvalues differ by less than 2^-SQUARINGS, any vector of their plane is as good in float32.
     """
     power = symmetric + symmetric.norm() * tm.eye(4)
     for _ in range(SQUARINGS):
@@ -83,7 +85,7 @@ def largest_eigenvector(symmetric):
 
 @ti.func
 def rotation_of(q):
-    """Rotation matrix of a quaternion (w, x, y, z) that need not be of unit length."""
+    """Rotation matrix of a quaternion (w, x, y, z) of any length."""
     v = tm.vec3(q[1], q[2], q[3])
     cross = cross_matrix(v)
     return ti.Matrix.identity(ti.f32, 3) + 2.0 / q.norm_sqr() * (q[0] * cross + cross @ cross)
@@ -91,26 +93,26 @@ def rotation_of(q):
 
 @ti.func
 def rotation_near(guess, matrix):
-    """The same rotation, from a guess: a fifth of the time where it is close, and no slower in vain than it must be."""
-    rotation, found, left = guess, False, MOST_TURNS
-    while left > 0:
-        turn, unique = newton_turn(rotation, matrix)
-        left -= 1
+    """The same as ``nearest_rotation``, from a guess: takes a fifth of the time where the guess is close."""
+    rotation, converged, steps_left = guess, False, MOST_NEWTON_STEPS
+    while steps_left > 0:
+        step, unique = newton_step(rotation, matrix)
+        steps_left -= 1
         if unique:
-            rotation = rotation @ small_rotation(turn)
-            found = turn.norm_sqr() < LAST_TURN**2
-        if found or not unique:
-            left = 0
-    if not found:
+            rotation = rotation @ small_rotation(step)
+            converged = step.norm_sqr() < LAST_STEP_RAD**2
+        if converged or not unique:
+            steps_left = 0
+    if not converged:
         rotation = nearest_rotation(matrix)
     return rotation
 
 
 @ti.func
-def newton_turn(rotation, matrix):
-    """The turn [rad] of one step of Newton's method for the maximum of trace(R^T matrix), and whether that is unique.
+def newton_step(rotation, matrix):
+    """Rotation vector [rad] of one Newton step to the maximum of trace(R^T matrix), and whether that maximum is unique.
 
-    With S = R^T matrix, the turn w solves (tr(S) I - sym(S)) w = axial(S - S^T) (Kugelstadt 2018). Where that
+    With S = R^T matrix, the step w solves (tr(S) I - sym(S)) w = axial(S - S^T) (Kugelstadt et al. 2018). Where that
     matrix is positive definite there is one maximum.
     """
     s = rotation.transpose() @ matrix
@@ -120,19 +122,53 @@ def newton_turn(rotation, matrix):
     a, b, c = tm.vec3(xx, xy, xz), tm.vec3(xy, yy, yz), tm.vec3(xz, yz, zz)
     bc = b.cross(c)
     determinant = a.dot(bc)
-    unique = xx > 0.0 and xx * yy - xy * xy > 0.0 and determinant > UNIQUE * size**3
+    unique = xx > 0.0 and xx * yy - xy * xy > 0.0 and determinant > LEAST_DETERMINANT * size**3
     g = tm.vec3(s[2, 1] - s[1, 2], s[0, 2] - s[2, 0], s[1, 0] - s[0, 1])
-    turn = tm.vec3(bc.dot(g), c.cross(a).dot(g), a.cross(b).dot(g)) / (determinant if unique else 1.0)
-    return turn, unique
+    step = tm.vec3(bc.dot(g), c.cross(a).dot(g), a.cross(b).dot(g)) / (determinant if unique else 1.0)
+    return step, unique
 
 
 @ti.func
-def small_rotation(turn):
-    """Rotation by about a small turn [rad], exactly orthogonal: of the quaternion (1, turn / 2)."""
-    return rotation_of(tm.vec4(1.0, turn / 2))
+def small_rotation(vector):
+    """Rotation of the quaternion (1, vector / 2): exactly orthogonal, and nearly that of a small rotation vector [rad]."""
+    return rotation_of(tm.vec4(1.0, vector / 2))
+
+
+@ti.func
+def rotation_by(vector):
+    """Rotation matrix of a rotation vector [rad] (Rodrigues)."""
+    angle = vector.norm()
+    axis = vector / ti.max(angle, 1e-12)
+    cross = cross_matrix(axis)
+    return tm.eye(3) + ti.sin(angle) * cross + (1.0 - ti.cos(angle)) * (cross @ cross)
 
 
 @ti.func
 def cross_matrix(a):
-    """The matrix of a x."""
+    """The matrix M with M b = a x b."""
     return tm.mat3(0.0, -a.z, a.y, a.z, 0.0, -a.x, -a.y, a.x, 0.0)
+
+
+@ti.func
+def inverse_of(matrix):
+    """Inverse of a positive definite 3 x 3 matrix, scaled by its trace: its determinant may overflow float32."""
+    unit = 1.0 / matrix.trace()
+    return unit * (unit * matrix).inverse()
+
+
+@ti.func
+def solve(matrix, right, least):
+    """Solution of a symmetric 3 x 3 system with eigenvalues of ``least`` or more, by its LDL^T factors.
+
+    In exact arithmetic no pivot is below ``least``; rounding can make one so, where a node is torn far away.
+    """
+    d0 = matrix[0, 0]
+    l10, l20 = matrix[1, 0] / d0, matrix[2, 0] / d0
+    d1 = ti.max(matrix[1, 1] - l10 * matrix[1, 0], least)
+    l21 = (matrix[2, 1] - l20 * matrix[1, 0]) / d1
+    d2 = ti.max(matrix[2, 2] - l20 * matrix[2, 0] - l21 * l21 * d1, least)
+    y1 = right.y - l10 * right.x
+    y2 = right.z - l20 * right.x - l21 * y1
+    z = y2 / d2
+    y = y1 / d1 - l21 * z
+    return tm.vec3(right.x / d0 - l10 * y - l20 * z, y, z)

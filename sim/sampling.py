@@ -1,8 +1,8 @@
-"""A closed surface becomes particles, and particles become overlapping clusters (NumPy, at build time).
+"""Sampling of particles in a closed surface, and of overlapping clusters of the particles (NumPy, at build time).
 
-The paper's greedy method (Camara 2016, "Collision and data preparation"): samples at each occupied voxel of a fine
-voxelisation, optionally samples on the surface, then one particle at a time, each removing the samples within
-its bounds. The clusters are chosen among the particles in the same way.
+The paper's greedy method (Camara et al. 2016, "Collision and data preparation"): samples at the voxels of a fine
+voxelisation, optionally also on the surface; then one particle at a time, each removing the samples nearer than the radius.
+The clusters are chosen among the particles in the same way.
 """
 
 from dataclasses import dataclass, replace
@@ -16,20 +16,20 @@ from scipy.spatial import cKDTree
 from errors import UserError
 from sim.signed_distance import signed_distance
 
-# What a fine voxel takes while it is asked whether it is inside: indices and places in 64 bits, and the answer.
+# Memory of one voxel during the inside test: index and position in 64 bits, and the result.
 VOXEL_BYTES = 80
 
 
 class SamplingError(UserError):
-    """The surface cannot be filled with particles; the message says why and what to change."""
+    """The surface cannot be filled with particles or cells; the message says why and what to change."""
 
 
 @dataclass(frozen=True)
 class RestBody:
-    """The body as it was built; nothing changes it.
+    """A body of particles at rest.
 
-    particles (n, 3) float64 [mm], in the frame of the surface, all of one mass; contact_radius (n,) [mm]: how near a
-    particle's centre may come to a shape.
+    particles (n, 3) float64 [mm], in the frame of the surface, all of one mass; contact_radius (n,) [mm]: smallest allowed
+    distance of a particle's centre from a shape.
     """
 
     particles: np.ndarray
@@ -41,8 +41,7 @@ class RestBody:
 class Clusters:
     """Overlapping shape-matching clusters in compressed rows.
 
-    ``members[offsets[c]:offsets[c + 1]]`` are the particles of cluster c, ascending. Every particle is in at
-    least one cluster.
+    ``members[offsets[c]:offsets[c + 1]]`` are the particles of cluster c, ascending. Every particle is in at least one cluster.
     """
 
     offsets: np.ndarray
@@ -61,10 +60,11 @@ class Clusters:
 
 @dataclass(frozen=True)
 class Patches:
-    """Particles ``start[p]`` to ``start[p + 1]`` of a body are patch p; row p of ``clusters`` lists the clusters it is in.
+    """Groups of particles that are in the same clusters: one affine map moves all particles of a patch to their goals.
 
-    The ``several`` first patches have more than one particle, the others one. Where a kidney has five memberships of particles in
-    clusters, it has two of patches.
+    Particles ``start[p]`` to ``start[p + 1]`` of a body are patch p; row p of ``clusters`` lists the clusters it is in.
+    The ``multi_count`` first patches have more than one particle, the others one. In a kidney, patches have 2.5 times fewer
+    memberships in clusters than particles have.
     """
 
     start: np.ndarray
@@ -74,22 +74,22 @@ class Patches:
         return len(self.start) - 1
 
     @property
-    def several(self) -> int:
-        """How many patches have more than one particle."""
+    def multi_count(self) -> int:
+        """Number of patches with more than one particle."""
         return int((self.sizes > 1).sum())
 
     @property
     def sizes(self) -> np.ndarray:
-        """How many particles each has (p,)."""
+        """Number of particles of each patch (p,)."""
         return np.diff(self.start)
 
     @property
-    def shared(self) -> np.ndarray:
-        """How many clusters each is in (p,)."""
+    def cluster_counts(self) -> np.ndarray:
+        """Number of clusters that each patch is in (p,)."""
         return np.diff(self.clusters.offsets)
 
     def of_particles(self) -> np.ndarray:
-        """The patch of each particle (n,)."""
+        """Patch of each particle (n,)."""
         return np.repeat(np.arange(len(self), dtype=np.int32), self.sizes)
 
 
@@ -99,11 +99,10 @@ def fill_body(
     volume_sampling: float = 4.0,
     surface_samples_per_mm2: float = 0.0,
 ) -> RestBody:
-    """Particles that fill a closed surface [mm].
+    """Particles that fill a closed surface [mm]. Raises SamplingError when the radius is too large for the surface.
 
-    A particle touches a shape where the surface above it would: its contact radius is its depth under the
-    surface, at most the particle radius, so that a body laid in a mould of its own shape rests without being
-    moved. Raises SamplingError when the radius is too large for the surface.
+    A particle touches a shape where the surface above it does: its contact radius is its depth under the surface, at most
+    the particle radius. So a body in a mould of its own shape is at rest.
     """
     particles = sample_particles(
         surface.vertices, surface.faces, radius_mm, volume_sampling, surface_samples_per_mm2
@@ -120,12 +119,11 @@ def sample_particles(
     surface_samples_per_mm2: float = 0.0,
     seed: int = 0,
 ) -> np.ndarray:
-    """Particles (n, 3) float64 [mm] that fill a closed surface, no two nearer than ``radius_mm``.
+    """Particles (n, 3) float64 [mm] that fill a closed surface, no two nearer than ``radius_mm``, along a space-filling curve.
 
-    ``vertices`` (v, 3) [mm] and ``faces`` (f, 3) are the surface; the voxels are ``radius_mm /
-    volume_sampling`` wide. Surface samples, where asked for, are drawn from ``seed`` and come first, so that thin
-    parts keep their boundary. Sorted along a space-filling curve. Raises SamplingError when nothing fits,
-    or when there is not enough memory.
+    ``vertices`` (v, 3) [mm] and ``faces`` (f, 3) are the surface; the voxels are ``radius_mm / volume_sampling`` wide.
+    Samples on the surface come before those inside, so that thin parts keep their boundary. Raises SamplingError when
+    nothing fits, or when there is not enough memory.
     """
     pitch = radius_mm / volume_sampling
     count = float(np.prod(np.ceil(np.ptp(vertices, axis=0) / pitch)))
@@ -144,10 +142,9 @@ def sample_particles(
 
 
 def sample_clusters(particles: np.ndarray, spacing_mm: float) -> Clusters:
-    """Clusters of the particles (n, 3) [mm]: centres greedily chosen ``spacing_mm`` apart, members within it.
+    """Clusters of the particles (n, 3) [mm]: centres greedily chosen ``spacing_mm`` apart, members within it (as in FleX).
 
-    As the greedy choice leaves no particle farther than the spacing from a centre, the clusters cover the body,
-    and as wide as they are spaced, they overlap (FleX's extension chooses them in the same way).
+    The greedy choice leaves no particle farther than the spacing from a centre, so the clusters cover the body and overlap.
     """
     tree = cKDTree(particles)
     free = np.ones(len(particles), bool)
@@ -161,10 +158,10 @@ def sample_clusters(particles: np.ndarray, spacing_mm: float) -> Clusters:
 
 
 def group_into_patches(rest: RestBody, cluster_spacing: float) -> tuple[RestBody, Patches]:
-    """A body's clusters, ``cluster_spacing`` radii apart, as patches; and the body with its particles in their order.
+    """The body with its particles sorted by patch, and the patches of its clusters, ``cluster_spacing`` radii apart.
 
-    Patches of several particles and of one come in the order of their first particles, so that neighbours in space stay
-    neighbours in memory.
+    Patches with several particles come first; otherwise they keep the order of their first particles, so that neighbours
+    in space stay neighbours in memory.
     """
     clusters = sample_clusters(rest.particles, cluster_spacing * rest.radius_mm)
     rows = clusters.transposed(len(rest.particles))
@@ -184,16 +181,16 @@ def group_into_patches(rest: RestBody, cluster_spacing: float) -> tuple[RestBody
 
 
 def check_memory(needed_bytes: float, what: str, advice: str) -> None:
-    """Raises SamplingError where something takes more memory than is free."""
+    """Raise SamplingError where ``what`` needs more memory than is free."""
     free = psutil.virtual_memory().available
     if needed_bytes > free:
         raise SamplingError(
-            f"{what} take {needed_bytes / 1e9:.1f} GB in this organ, and {free / 1e9:.1f} GB are free: {advice}"
+            f"{what} need {needed_bytes / 1e9:.1f} GB in this organ, and {free / 1e9:.1f} GB are free: {advice}"
         )
 
 
 def occupied_voxels(vertices: np.ndarray, faces: np.ndarray, pitch: float) -> tuple[np.ndarray, np.ndarray]:
-    """Centre (3,) [mm] of voxel 0 and the mask (nx, ny, nz) of voxels whose centre lies inside the surface."""
+    """Centre (3,) [mm] of voxel 0, and the mask (nx, ny, nz) of voxels whose centre is inside the surface."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     shape = np.maximum(np.ceil((high - low) / pitch).astype(int), 1)
     origin = (low + high) / 2 - pitch * (shape - 1) / 2
@@ -205,7 +202,7 @@ def occupied_voxels(vertices: np.ndarray, faces: np.ndarray, pitch: float) -> tu
 
 
 def morton_codes(points: np.ndarray, cell_mm: float) -> np.ndarray:
-    """Positions (n, 3) [mm] along a Z-order curve of cells, so that neighbours in space are neighbours in memory."""
+    """Morton codes (n,) of points (n, 3) [mm]: sorted by them, neighbours in space are neighbours in memory."""
     cells = ((points - points.min(axis=0)) / cell_mm).astype(np.uint64)
     code = np.zeros(len(points), np.uint64)
     for bit in range(16):
@@ -215,7 +212,7 @@ def morton_codes(points: np.ndarray, cell_mm: float) -> np.ndarray:
 
 
 def _greedy_voxels(occupied: np.ndarray, reach: float) -> np.ndarray:
-    """Indices (n, 3) of voxels taken in scan order, each removing those nearer than ``reach`` voxels."""
+    """Indices (n, 3) of voxels chosen in scan order, each removing those nearer than ``reach`` voxels."""
     pad = int(np.ceil(reach))
     padded = np.pad(occupied, pad)
     offset = np.arange(-pad, pad + 1)
@@ -236,7 +233,7 @@ def _greedy_voxels(occupied: np.ndarray, reach: float) -> np.ndarray:
 def _surface_particles(
     vertices: np.ndarray, faces: np.ndarray, radius_mm: float, per_mm2: float, seed: int
 ) -> np.ndarray:
-    """Particles (n, 3) [mm] on the surface, greedily from area-uniform random samples."""
+    """Particles (n, 3) [mm] on the surface, greedily chosen from random samples of uniform density."""
     corners = vertices[faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     count = int(per_mm2 * area.sum())
@@ -259,7 +256,7 @@ def _surface_particles(
 def _clear_near(
     occupied: np.ndarray, origin: np.ndarray, pitch: float, points: np.ndarray, radius_mm: float
 ) -> None:
-    """Remove in place the occupied voxels nearer than the radius to any of the points (n, 3) [mm]."""
+    """Clear in place the occupied voxels nearer than the radius to any of the points (n, 3) [mm]."""
     if len(points):
         voxels = np.argwhere(occupied)
         distance, _ = cKDTree(points).query(origin + pitch * voxels)
@@ -268,5 +265,5 @@ def _clear_near(
 
 
 def offsets_of(counts: list[int] | np.ndarray) -> np.ndarray:
-    """Where each of rows of so many entries starts (n,), and where the last ends: int32 (n + 1,)."""
+    """Offsets (n + 1,), int32, of compressed rows with these numbers of entries (n,)."""
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)

@@ -104,7 +104,7 @@ class Phases:
     ):
         if ti.static(name == "tool" and self.solver.has_tool):
             for _ in range(1):
-                self.solver.tool.go(substep)
+                self.solver.tool.start_substep(substep)
         if ti.static(name == "predict"):
             self.solver.predict(dt, gravity, damping)
         if ti.static(name == "begin"):
@@ -130,7 +130,7 @@ class Phases:
         if ti.static(name == "keep out" and self.solver.has_contacts):
             self.solver.contacts.finish()
         if ti.static(name == "velocities"):
-            self.solver.settle(dt)
+            self.solver.update_velocities(dt)
 
 
 def without_calls(ms: dict[str, float], calls: dict[str, int], whole_ms: float) -> dict[str, float]:

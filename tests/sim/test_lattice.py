@@ -64,7 +64,7 @@ def test_tissue_has_the_surfaces_volume_and_centre(mesh, cell_mm):
 def test_cells_too_large_for_the_organ_are_refused(ball):
     with pytest.raises(SamplingError, match="choose smaller ones"):
         fill_with_cells(trimesh.creation.box([30.0, 30.0, 0.5]), 5.0)
-    with pytest.raises(SamplingError, match="hold 0 % of"):
+    with pytest.raises(SamplingError, match="fill 0 % of"):
         fill_with_cells(trimesh.creation.icosphere(subdivisions=2, radius=0.5), 20.0)
 
 

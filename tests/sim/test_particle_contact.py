@@ -77,7 +77,7 @@ def test_the_way_out_of_a_rounded_cuboid_ends_a_hair_outside_its_face(one_device
     @ti.kernel
     def ask():
         for k in range(6):
-            out[k] = tool.way_out(ti.Vector([1.0, 0.5, -0.5]), k)
+            out[k] = tool.outside(ti.Vector([1.0, 0.5, -0.5]), k)
 
     ask()
     for point, k in zip(array_of(out), range(6), strict=True):
@@ -267,7 +267,7 @@ def oracle_of_pushes(solver: Solver, x: np.ndarray, motion: np.ndarray, passes: 
         pushed, rubbed = dict.fromkeys(shapes, 0.0), {s: np.zeros(3) for s in shapes}
         for _ in range(passes):
             depth = {s: max(plane[i, s, 3] - plane[i, s, :3] @ x[i], 0.0) for s in shapes}
-            active = sum(depth[s] > 0 or (contacts.rough and pushed[s] > 0) for s in shapes)
+            active = sum(depth[s] > 0 or (contacts.has_friction and pushed[s] > 0) for s in shapes)
             share, change = min(factor / max(active, 1), 1.0), np.zeros(3)
             several += active > 1
             for s in shapes:

@@ -116,7 +116,7 @@ def test_what_no_memory_holds_is_refused_with_what_it_takes(ball, monkeypatch):
     # A box of 24 mm in voxels of 0.5 mm: 48 each way, of 80 bytes.
     free(80 * 48**3 - 1)
     with pytest.raises(
-        SamplingError, match=r"of 2 mm radius take 0\.0 GB .*, and 0\.0 GB are free: choose larger"
+        SamplingError, match=r"of 2 mm radius need 0\.0 GB .*, and 0\.0 GB are free: choose larger"
     ):
         sample_particles(ball.vertices, ball.faces, 2.0, 4)
     free(80 * 48**3)

@@ -37,10 +37,10 @@ def deformed(particles: np.ndarray) -> np.ndarray:
 def oracle(model: ShapeMatching, x: np.ndarray, step: float, mass: np.ndarray | None = None) -> np.ndarray:
     """One pass of Eqs. 8, 9, 12 and 7 in float64, cluster by cluster, for particles of a mass (n,)."""
     rest, patches = model.body.rest_points, model.patches
-    shared = patches.shared[patches.of_particles()].astype(float)
+    shared = patches.cluster_counts[patches.of_particles()].astype(float)
     weight = 1 / shared if model.relaxation == "local" else np.ones(len(rest))
     weight = weight if mass is None else weight * mass
-    of_patch = np.repeat(np.arange(len(patches)), patches.shared)
+    of_patch = np.repeat(np.arange(len(patches)), patches.cluster_counts)
     total = np.zeros_like(x)
     for c in range(model.count):
         i = np.flatnonzero(np.isin(patches.of_particles(), of_patch[patches.clusters.members == c]))
@@ -99,7 +99,7 @@ def test_a_rigid_motion_is_no_deformation(kept, block):
 @pytest.mark.parametrize("relaxation", ["local", "global"])
 def test_pushed_patches_know_where_their_particles_are(one_device, block, relaxation):
     model = tissue_of(block, shapes=[Plane(np.array([0.2, -0.1, 1.0]), -5.0)], relaxation=relaxation)
-    patches, several = model.patches, model.patches.several
+    patches, several = model.patches, model.patches.multi_count
     x = deformed(model.body.rest_points) * 0.9 - [4.0, -2.0, 7.0]
     model.body.restore(BodyState(x.astype(np.float32), np.zeros(x.shape, np.float32)))
     model.update_frames()
@@ -117,7 +117,7 @@ def test_pushed_patches_know_where_their_particles_are(one_device, block, relaxa
     assert 10 < (touched[:several] > 0).sum() < several - 10
     centre = np.add.reduceat(predicted, patches.start[:-1]) / patches.sizes[:, None]
     assert np.abs(array_of(model.centre)[:, :3] - centre).max() < ROUNDING_MM
-    share = 1 / patches.shared if relaxation == "local" else np.ones(len(patches))
+    share = 1 / patches.cluster_counts if relaxation == "local" else np.ones(len(patches))
     rest, moment = model.body.rest_points, array_of(model.moment)
     for p in range(several):
         of = slice(patches.start[p], patches.start[p + 1])
@@ -198,7 +198,9 @@ def test_patches_hold_each_membership_of_the_clusters(block):
     assert {frozenset(members) for members in found.values()} == wanted
     # No two patches are in the same clusters, and those of several particles come first.
     assert len({row.tobytes() for row in rows}) == len(patches)
-    assert (patches.sizes[: patches.several] > 1).all() and (patches.sizes[patches.several :] == 1).all()
+    assert (patches.sizes[: patches.multi_count] > 1).all() and (
+        patches.sizes[patches.multi_count :] == 1
+    ).all()
 
 
 def test_an_unknown_relaxation_is_refused_by_name(one_device, block):

@@ -9,7 +9,7 @@ from lattice_tissue import DENSITY, YOUNG_KPA, G, jacobians, lifted, position, p
 from sim.body import BodyState
 from sim.fields import array_of, fill
 from sim.shapes import ConvexTool, Plane, SignedDistanceField
-from sim.surface_contact import NEAR_MM, PENALTY_DEPTH_MM, REACH_MM, STICK
+from sim.surface_contact import NEAR_MM, PENALTY_DEPTH_MM, REACH_MM, TANGENTIAL_RATIO
 
 FRICTION = 0.35
 UP = np.array([0.0, 0.0, 1.0])
@@ -49,16 +49,16 @@ def rest(solver, steps, settings, poses=None) -> None:
 
 
 @ti.kernel
-def push(contacts: ti.template(), out: ti.template()):
+def node_forces(contacts: ti.template(), out: ti.template()):
     for i in out:
-        out[i] = contacts.push(i)[0]
+        out[i] = contacts.node_force(i)[0]
 
 
 def contact_force(solver, settings) -> np.ndarray:
     """Sum (3,) of what the shapes exert where the body is [uN]."""
     solver.launch_start(0, settings.time_step_s, *settings.gravity, settings.damping, 0)
     out = ti.Vector.field(3, ti.f32, solver.body.count)
-    push(solver.contacts, out)
+    node_forces(solver.contacts, out)
     return array_of(out).astype(float).sum(axis=0)
 
 
@@ -152,24 +152,24 @@ def test_what_a_tool_holds_moves_with_it(kept, dome):
         solver.step(settings_of(40, DOWN), poses)
     moved = array_of(contacts.point)[:, 0] - before[:, 0]
     depth = array_of(contacts.point)[:, 2].astype(float) - 10.0
-    most = FRICTION * depth / STICK
-    held = (depth > 0) & (np.linalg.norm(array_of(contacts.stick)[1], axis=1) < 0.8 * most)
+    most = FRICTION * depth / TANGENTIAL_RATIO
+    held = (depth > 0) & (np.linalg.norm(array_of(contacts.slip)[1], axis=1) < 0.8 * most)
     assert held.sum() > 3 and most[held].max() < aside / 2
-    # They go the tool's way but for the bending of their sticks, at most friction times depth over STICK each way.
+    # They go the tool's way but for the bending of their sticks, at most friction times depth over TANGENTIAL_RATIO each way.
     assert (np.abs(moved - aside) < 2 * most)[held].all()
 
 
 @ti.kernel
 def ask(contacts: ti.template(), pushed: ti.template(), held: ti.template(), at: ti.template()):
-    """Forces, as rows 0, and stiffnesses of ``push`` at each node, and of ``hold`` of each point at a place."""
+    """Forces, as rows 0, and stiffnesses of ``node_force`` at each node, and of ``point_force`` of each point at a place."""
     for i in pushed:
-        force, stiffness = contacts.push(i)
+        force, stiffness = contacts.node_force(i)
         for row in ti.static(range(3)):
             pushed[i][0, row] = force[row]
             for column in ti.static(range(3)):
                 pushed[i][1 + row, column] = stiffness[row, column]
     for q in held:
-        force, stiffness = contacts.hold(q, at[q], True)
+        force, stiffness = contacts.point_force(q, at[q], True)
         for row in ti.static(range(3)):
             held[q][0, row] = force[row]
             for column in ti.static(range(3)):
@@ -181,14 +181,16 @@ def layer_of(contacts, s: int, x: np.ndarray, shifted: np.ndarray, slid: np.ndar
     much since they were found and points slid on it by ``slid`` (p, 3); which touch, and which of these slide.
     """
     plane, near = array_of(contacts.plane)[s].astype(float), (array_of(contacts.near) >> s & 1) == 1
-    normal, stick = plane[:, :3], array_of(contacts.stick)[s].astype(float) + slid
+    normal, stick = plane[:, :3], array_of(contacts.slip)[s].astype(float) + slid
     depth = np.where(near, np.maximum(plane[:, 3] - ((x - shifted) * normal).sum(axis=1), 0.0), 0.0)
     stick -= (stick * normal).sum(axis=1, keepdims=True) * normal
-    share = np.minimum(FRICTION * depth / STICK / np.maximum(np.linalg.norm(stick, axis=1), 1e-12), 1.0)
+    share = np.minimum(
+        FRICTION * depth / TANGENTIAL_RATIO / np.maximum(np.linalg.norm(stick, axis=1), 1e-12), 1.0
+    )
     layer = np.where(depth > 0, 1e3 * YOUNG_KPA / PENALTY_DEPTH_MM * array_of(contacts.area), 0.0)
-    force = layer[:, None] * (depth[:, None] * normal - STICK * share[:, None] * stick)
+    force = layer[:, None] * (depth[:, None] * normal - TANGENTIAL_RATIO * share[:, None] * stick)
     out = np.einsum("pi,pj->pij", normal, normal)
-    stiffness = layer[:, None, None] * (out + (STICK * share)[:, None, None] * (np.eye(3) - out))
+    stiffness = layer[:, None, None] * (out + (TANGENTIAL_RATIO * share)[:, None, None] * (np.eye(3) - out))
     return force, stiffness, depth > 0, (depth > 0) & (share < 1)
 
 
@@ -239,9 +241,9 @@ def test_what_lets_go_forgets_how_it_was_bent(kept, dome):
     poses = np.array([lifted(20.0), lifted(20.0)])
     poses[1, 0, 3] = 0.1
     solver.step(settings_of(20, DOWN), poses)
-    assert (np.linalg.norm(array_of(solver.contacts.stick)[1], axis=1) > 1e-3).sum() > 3
+    assert (np.linalg.norm(array_of(solver.contacts.slip)[1], axis=1) > 1e-3).sum() > 3
     rest(solver, 2, settings_of(20, DOWN), AWAY)
-    assert (array_of(solver.contacts.stick)[1] == 0).all()
+    assert (array_of(solver.contacts.slip)[1] == 0).all()
 
 
 def beads(solver, x: np.ndarray) -> np.ndarray:
@@ -267,7 +269,7 @@ def test_rest_does_not_depend_on_step_iterations_or_substeps(kept, dome):
     first = at_rest(solver)
     assert np.linalg.norm(first - beads(solver, built.body.position), axis=1).mean() > 0.5
     # Friction remembers the way: what rests with sticks bent one way might rest with them bent the other.
-    memory = 2 * FRICTION * solver.contacts.measure_penetration() / STICK
+    memory = 2 * FRICTION * solver.contacts.measure_penetration() / TANGENTIAL_RATIO
     assert memory < 0.1
     for changed in (dict(time_step_s=1 / 120), dict(iterations=16), dict(substeps=2, iterations=12)):
         solver.restore(built)

@@ -27,7 +27,7 @@ OWN = {
     "the transducer": [(ConvexTool, "surface"), (ConvexTool, "motion")],
     "friction on shapes": [(SurfaceContacts, "bent"), (ShapeContacts, "rub")],
     "contacts of particles": [(SelfContacts, "find"), (SelfContacts, "project")],
-    "scaled masses": [(ShapeMatching, "weigh_patches"), (ShapeMatching, "weigh_clusters")],
+    "scaled masses": [(ShapeMatching, "update_patch_masses"), (ShapeMatching, "update_cluster_masses")],
 }
 # Options, and the features that none of them has.
 WITHOUT = (
