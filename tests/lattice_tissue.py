@@ -30,7 +30,7 @@ def tissue_of(
     poisson: float = 0.45,
     fixed=None,
 ) -> Solver:
-    """A solver of a closed surface [mm] among shapes; ``fixed`` tells of nodes (n, 3) which are."""
+    """A solver of a closed surface [mm] among shapes; ``fixed`` takes nodes (n, 3) and returns the mask of the fixed ones."""
     lattice = fill_with_cells(mesh, cell_mm)
     body = Body(lattice.nodes)
     contacts = None

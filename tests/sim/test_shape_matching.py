@@ -1,4 +1,4 @@
-"""The paper's tissue model against a NumPy float64 oracle, and the momentum that it must keep."""
+"""The paper's tissue model against a NumPy float64 oracle, and conservation of momentum."""
 
 from itertools import pairwise
 
@@ -28,14 +28,14 @@ def project(model: ti.template(), stiffness: float, factor: float):
 
 
 def deformed(particles: np.ndarray) -> np.ndarray:
-    """Bent, stretched, turned and moved away, with noise: no cluster is only rigid."""
+    """Positions bent, stretched, rotated and translated, with noise: no cluster moves rigidly."""
     random = np.random.default_rng(2)
     bent = particles + 0.02 * particles[:, [2, 0, 1]] ** 2 + random.normal(0, 0.2, particles.shape)
     return 1.1 * bent @ rotation_about([1, 2, 3], 70).T + [5.0, -3.0, 8.0]
 
 
 def oracle(model: ShapeMatching, x: np.ndarray, step: float, mass: np.ndarray | None = None) -> np.ndarray:
-    """One pass of Eqs. 8, 9, 12 and 7 in float64, cluster by cluster, for particles of a mass (n,)."""
+    """One iteration of Eqs. 8, 9, 12 and 7 in float64, cluster by cluster, for particles of a mass (n,)."""
     rest, patches = model.body.rest_points, model.patches
     shared = patches.cluster_counts[patches.of_particles()].astype(float)
     weight = 1 / shared if model.relaxation == "local" else np.ones(len(rest))
@@ -66,7 +66,7 @@ def moved_body(
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
 @pytest.mark.parametrize("stiffness, factor", [(1.0, 1.0), (0.4, 1.0), (0.9, 1.7)])
-def test_a_pass_is_the_oracles(kept, block, relaxation, stiffness, factor):
+def test_an_iteration_matches_the_oracle(kept, block, relaxation, stiffness, factor):
     body, model, x = moved_body(kept, block, relaxation)
     project(model, stiffness, factor)
     wanted = oracle(model, x, stiffness * factor)
@@ -75,7 +75,7 @@ def test_a_pass_is_the_oracles(kept, block, relaxation, stiffness, factor):
 
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
-def test_a_pass_keeps_linear_and_angular_momentum(kept, block, relaxation):
+def test_an_iteration_conserves_linear_and_angular_momentum(kept, block, relaxation):
     body, model, x = moved_body(kept, block, relaxation)
     project(model, 0.8, 1.0)
     change = array_of(body.predicted) - x
@@ -97,7 +97,7 @@ def test_a_rigid_motion_is_no_deformation(kept, block):
 
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
-def test_pushed_patches_know_where_their_particles_are(one_device, block, relaxation):
+def test_patches_follow_their_particles_after_contact(one_device, block, relaxation):
     model = tissue_of(block, shapes=[Plane(np.array([0.2, -0.1, 1.0]), -5.0)], relaxation=relaxation)
     patches, several = model.patches, model.patches.multi_count
     x = deformed(model.body.rest_points) * 0.9 - [4.0, -2.0, 7.0]
@@ -134,7 +134,7 @@ def push_out(model: ti.template(), factor: float):
 
 
 @pytest.mark.parametrize("factor, left", [(0.4, 0.6), (1.0, 0.0), (1.7, 0.0)])
-def test_a_push_goes_as_far_as_the_relaxation_factor_but_not_beyond_the_surface(kept, block, factor, left):
+def test_over_relaxation_does_not_move_particles_beyond_the_surface(kept, block, factor, left):
     model = kept(on_floor, block, -7.5, 0.0).model
     body = model.body
     push_out(model, factor)
@@ -161,7 +161,7 @@ def test_collapsed_flat_and_inverted_bodies_come_back_to_finite_shapes(kept, blo
 
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
-def test_scaled_masses_pull_the_clusters_towards_the_heavier(kept, block, relaxation):
+def test_scaled_masses_move_the_clusters_towards_the_heavier(kept, block, relaxation):
     body, model, x = moved_body(kept, block, relaxation, mass_scaling=0.1)
     mass = np.exp(-0.1 * body.rest_points[:, 2]).astype(np.float32)
     fill((body.mass_scale, mass))
@@ -182,7 +182,7 @@ def test_frames_do_not_depend_on_those_before(kept, block):
     assert np.array_equal(array_of(model.frame), first)
 
 
-def test_patches_hold_each_membership_of_the_clusters(block):
+def test_patches_have_each_membership_of_the_clusters(block):
     rest = fill_body(block, 2.0)
     arranged, patches = group_into_patches(rest, 3.33)
     assert sorted(map(tuple, arranged.particles)) == sorted(map(tuple, rest.particles))
@@ -196,7 +196,7 @@ def test_patches_hold_each_membership_of_the_clusters(block):
         for c in rows[p]:
             found.setdefault(int(c), set()).add(tuple(particle))
     assert {frozenset(members) for members in found.values()} == wanted
-    # No two patches are in the same clusters, and those of several particles come first.
+    # No two patches are in the same clusters, and those with several particles come first.
     assert len({row.tobytes() for row in rows}) == len(patches)
     assert (patches.sizes[: patches.multi_count] > 1).all() and (
         patches.sizes[patches.multi_count :] == 1
