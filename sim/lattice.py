@@ -62,15 +62,15 @@ class Lattice:
         Points outside all cells are extrapolated linearly from the nearest cell, for one width of a cell at most.
         """
         at = (np.asarray(points, float) - self.low_mm) / self.cell_mm
-        place = np.clip(np.floor(at).astype(int), 0, np.array(self.index_of.shape) - 1)
-        cell = self.index_of[tuple(place.T)]
+        index = np.clip(np.floor(at).astype(int), 0, np.array(self.index_of.shape) - 1)
+        cell = self.index_of[tuple(index.T)]
         centres = np.argwhere(self.index_of >= 0)
         outside = cell < 0
         if outside.any():
             nearest = cKDTree(centres + 0.5).query(at[outside])[1]
-            place[outside] = centres[nearest]
-            cell[outside] = self.index_of[tuple(place[outside].T)]
-        inside = np.clip(at - place, -EXTRAPOLATED_CELLS, 1 + EXTRAPOLATED_CELLS)
+            index[outside] = centres[nearest]
+            cell[outside] = self.index_of[tuple(index[outside].T)]
+        inside = np.clip(at - index, -EXTRAPOLATED_CELLS, 1 + EXTRAPOLATED_CELLS)
         return self.cells[cell], shape_functions(inside)
 
 
@@ -100,18 +100,18 @@ def fill_with_cells(surface: trimesh.Trimesh, cell_mm: float) -> Lattice:
             "choose larger ones"
         )
     check_memory(CELL_BYTES * surface.volume / cell_mm**3, f"cells of {cell_mm:g} mm", "choose larger ones")
-    places = np.indices(size).reshape(3, -1).T
+    indices = np.indices(size).reshape(3, -1).T
     samples = _samples()
-    places, filled = _filled(surface, low, cell_mm, places, samples)
-    return _assemble(low, cell_mm, size, places, filled, samples)
+    indices, filled = _filled(surface, low, cell_mm, indices, samples)
+    return _assemble(low, cell_mm, size, indices, filled, samples)
 
 
 def fill_block(counts: tuple[int, int, int], cell_mm: float) -> Lattice:
     """The lattice of a block with a corner at the origin and ``counts`` cells along each axis."""
-    places = np.indices(counts).reshape(3, -1).T
+    indices = np.indices(counts).reshape(3, -1).T
     samples = _samples()
-    filled = np.ones((len(places), len(samples)))
-    return _assemble(np.zeros(3), cell_mm, np.array(counts), places, filled, samples)
+    filled = np.ones((len(indices), len(samples)))
+    return _assemble(np.zeros(3), cell_mm, np.array(counts), indices, filled, samples)
 
 
 def _samples() -> np.ndarray:
@@ -121,16 +121,16 @@ def _samples() -> np.ndarray:
 
 
 def _filled(
-    surface: trimesh.Trimesh, low: np.ndarray, cell_mm: float, places: np.ndarray, samples: np.ndarray
+    surface: trimesh.Trimesh, low: np.ndarray, cell_mm: float, indices: np.ndarray, samples: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Grid positions (m, 3) of the cells that contain tissue, and the filled fraction (m, s) around each integration point."""
-    centre = signed_distance(surface.vertices, surface.faces, low + cell_mm * (places + 0.5))[0]
+    centre = signed_distance(surface.vertices, surface.faces, low + cell_mm * (indices + 0.5))[0]
     reach = cell_mm * np.sqrt(3) / 2
-    places, centre = places[centre < reach], centre[centre < reach]
-    filled = np.ones((len(places), len(samples)))
+    indices, centre = indices[centre < reach], centre[centre < reach]
+    filled = np.ones((len(indices), len(samples)))
     cut = centre > -reach
     halves = np.indices((3, 3, 3)).reshape(3, -1).T
-    grid = 2 * places[cut][:, None] + halves
+    grid = 2 * indices[cut][:, None] + halves
     unique, back = _unique_rows(grid.reshape(-1, 3))
     known = signed_distance(surface.vertices, surface.faces, low + cell_mm / 2 * unique)[0]
     distance = known[back].reshape(-1, 27) @ _from_halves(samples).T
@@ -146,7 +146,7 @@ def _filled(
             )
         offset += (surface.volume - volume) / surface.area
     has_tissue = filled.sum(axis=1) > 0
-    return places[has_tissue], filled[has_tissue]
+    return indices[has_tissue], filled[has_tissue]
 
 
 def _from_halves(at: np.ndarray) -> np.ndarray:
@@ -159,11 +159,11 @@ def _assemble(
     low: np.ndarray,
     cell_mm: float,
     size: np.ndarray,
-    places: np.ndarray,
+    indices: np.ndarray,
     filled: np.ndarray,
     samples: np.ndarray,
 ) -> Lattice:
-    corner = places[:, None] + CORNERS
+    corner = indices[:, None] + CORNERS
     flat = np.ravel_multi_index(tuple(np.moveaxis(corner, 2, 0)), tuple(size + 1))
     used = np.unique(flat)
     node = np.column_stack(np.unravel_index(used, tuple(size + 1)))
@@ -176,7 +176,7 @@ def _assemble(
     tissue_at = filled @ samples / filled.sum(axis=1, keepdims=True)
     carried = cell_mm**3 * filled.mean(axis=1)[:, None] * shape_functions(tissue_at)
     index_of = np.full(size, -1)
-    index_of[tuple(places.T)] = np.arange(len(places))
+    index_of[tuple(indices.T)] = np.arange(len(indices))
     volume = cell_mm**3 * weight.mean(axis=1)
     mean, variance = _gradients(weight / weight.sum(axis=1, keepdims=True), samples)
     return Lattice(

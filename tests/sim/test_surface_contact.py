@@ -177,8 +177,8 @@ def ask(contacts: ti.template(), pushed: ti.template(), held: ti.template(), at:
 
 
 def layer_of(contacts, s: int, x: np.ndarray, shifted: np.ndarray, slid: np.ndarray):
-    """Force (p, 3) [uN] and stiffness (p, 3, 3) of shape s on points at x (p, 3) in float64, where its planes were shifted by
-    much since they were found and points slid on it by ``slid`` (p, 3); which touch, and which of these slide.
+    """Force (p, 3) [uN] and stiffness (p, 3, 3) of shape s on points at x (p, 3) in float64, where its planes have moved
+    by ``shifted`` and the points have slid by ``slid`` (p, 3); which points touch, and which of them slide.
     """
     plane, near = array_of(contacts.plane)[s].astype(float), (array_of(contacts.near) >> s & 1) == 1
     normal, slip = plane[:, :3], array_of(contacts.slip)[s].astype(float) + slid
