@@ -217,10 +217,11 @@ class Rehearsal:
         self.pose = pose
         self.steps += 1
 
-    def snapshot(self) -> RehearsalState:
-        """A copy of the current state."""
+    def snapshot(self, manipulator: ManipulatorState | None = None) -> RehearsalState:
+        """A copy of the present state, with the manipulator's present state or another one."""
+        held = manipulator or self.manipulator.state
         return RehearsalState(
-            self.solver.snapshot(), self.divergence_check.state, self.pose, self.steps, self.manipulator.state
+            self.solver.snapshot(), self.divergence_check.state, self.pose, self.steps, held
         )
 
     def restore(self, state: RehearsalState) -> None:
