@@ -117,7 +117,6 @@ def sample_particles(
     radius_mm: float,
     volume_sampling: float = 4.0,
     surface_samples_per_mm2: float = 0.0,
-    seed: int = 0,
 ) -> np.ndarray:
     """Particles (n, 3) float64 [mm] that fill a closed surface, no two nearer than ``radius_mm``, along a space-filling curve.
 
@@ -129,7 +128,7 @@ def sample_particles(
     count = float(np.prod(np.ceil(np.ptp(vertices, axis=0) / pitch)))
     check_memory(VOXEL_BYTES * count, f"particles of {radius_mm:g} mm radius", "choose larger ones")
     origin, occupied = occupied_voxels(vertices, faces, pitch)
-    surface = _surface_particles(vertices, faces, radius_mm, surface_samples_per_mm2, seed)
+    surface = _surface_particles(vertices, faces, radius_mm, surface_samples_per_mm2)
     _clear_near(occupied, origin, pitch, surface, radius_mm)
     voxels = _greedy_voxels(occupied, volume_sampling)
     particles = np.concatenate([surface, origin + pitch * voxels])
@@ -231,7 +230,7 @@ def _greedy_voxels(occupied: np.ndarray, reach: float) -> np.ndarray:
 
 
 def _surface_particles(
-    vertices: np.ndarray, faces: np.ndarray, radius_mm: float, per_mm2: float, seed: int
+    vertices: np.ndarray, faces: np.ndarray, radius_mm: float, per_mm2: float
 ) -> np.ndarray:
     """Particles (n, 3) [mm] on the surface, greedily chosen from random samples of uniform density."""
     corners = vertices[faces]
@@ -239,7 +238,7 @@ def _surface_particles(
     count = int(per_mm2 * area.sum())
     if count == 0:
         return np.zeros((0, 3))
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     chosen = corners[random.choice(len(faces), count, p=area / area.sum())]
     u, v = random.random((2, count, 1))
     flip = u + v > 1

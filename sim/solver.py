@@ -110,17 +110,15 @@ class Solver:
             )
         else:
             for substep in range(settings.substeps):
-                self._launch_substep(substep, dt, settings)
+                self.launch_start(
+                    substep, dt, *settings.gravity, settings.damping, settings.stabilisation_iterations
+                )
+                for iteration in range(settings.iterations):
+                    factor = relaxation_at(iteration, settings.iterations, settings.relaxation_factor)
+                    self.launch_correct(settings.stiffness, factor, dt)
+                self.launch_finish(dt)
         # The same kernel as in ``restore``: another one may round differently.
         self.model.update_frames()
-
-    def _launch_substep(self, substep: int, dt: float, settings: StepSettings) -> None:
-        """A substep as several kernels, whose loops run in parallel."""
-        self.launch_start(substep, dt, *settings.gravity, settings.damping, settings.stabilisation_iterations)
-        for iteration in range(settings.iterations):
-            factor = relaxation_at(iteration, settings.iterations, settings.relaxation_factor)
-            self.launch_correct(settings.stiffness, factor, dt)
-        self.launch_finish(dt)
 
     def snapshot(self) -> SolverState:
         """A copy of the current state."""

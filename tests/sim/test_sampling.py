@@ -122,7 +122,7 @@ def test_too_little_memory_is_refused_with_the_amount_needed(ball, monkeypatch):
     free(80 * 48**3)
     assert len(sample_particles(ball.vertices, ball.faces, 2.0, 4)) > 100
     free(9000 * ball.volume / 8 - 1)
-    with pytest.raises(SamplingError, match="cells of 2 mm take"):
+    with pytest.raises(SamplingError, match="cells of 2 mm need"):
         fill_with_cells(ball, 2.0)
     free(9000 * ball.volume / 8 + 1)
     assert fill_with_cells(ball, 2.0).cell_mm == 2
