@@ -67,8 +67,8 @@ class ShapeContacts:
             result = self.shapes[s].is_beyond(p, distance)
         else:
             known = self.found[i, s]
-            room = known.w - distance - SAFETY
-            result = room > 0.0 and (p - known.xyz).norm_sqr() < room * room
+            slack = known.w - distance - SAFETY
+            result = slack > 0.0 and (p - known.xyz).norm_sqr() < slack * slack
         return result
 
     @ti.func

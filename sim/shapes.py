@@ -2,7 +2,7 @@
 
 Every shape has ``surface(p)``: outward unit normal (x, y, z) and signed distance (w) [mm] of the nearest surface, negative
 inside and ``FAR`` out of reach; ``motion(p)``: displacement of its material at p in this substep [mm]; ``is_beyond(p,
-distance)``: whether a quick test finds p farther away than a distance [mm]; and ``moves``: whether it can move. Static shapes
+distance)``: whether a quick test finds p farther away than a distance [mm]; and ``moves``: whether it can move. StaticShape shapes
 also have ``clearance(p)``: a lower bound of the distance [mm] of the surface from p at any distance, negative inside.
 """
 
@@ -31,7 +31,7 @@ Path = ti.types.ndarray(ti.f32, ndim=4)
 
 
 @ti.data_oriented
-class Static:
+class StaticShape:
     """A shape that does not move."""
 
     moves = False
@@ -46,7 +46,7 @@ class Static:
 
 
 @ti.data_oriented
-class Plane(Static):
+class Plane(StaticShape):
     """Half-space below the points with normal . x = offset [mm]."""
 
     def __init__(self, normal: np.ndarray, offset_mm: float) -> None:
@@ -64,7 +64,7 @@ class Plane(Static):
 
 
 @ti.data_oriented
-class SignedDistanceField(Static):
+class SignedDistanceField(StaticShape):
     """Distances [mm] on a regular grid, negative inside, linear in between; out of reach beyond the grid.
 
     ``distance`` (nx, ny, nz); ``origin_mm`` (3,) is the centre of its first entry, ``spacing_mm`` (3,).
