@@ -103,8 +103,8 @@ class Embedding:
             owner[pixel] = self.count
         self.rest_from_plane[self.count] = world_from_plane[:3, :]
         for v in self.on_plane:
-            place = plane_from_world @ tm.vec4(self.skin.vertices[v], 1.0)
-            self.on_plane[v], self.above_plane[v] = place.xy, place.z
+            projected = plane_from_world @ tm.vec4(self.skin.vertices[v], 1.0)
+            self.on_plane[v], self.above_plane[v] = projected.xy, projected.z
         ti.loop_config(serialize=serial)
         for n in range(self.count):
             # In serial order the last that marks a pixel has the lowest index.

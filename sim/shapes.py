@@ -27,7 +27,7 @@ IMPACT_DEPTH_MM = 1.0
 # Each step of sphere tracing is as long as the clearance; only paths along a surface need many.
 TRACING_STEPS = 32
 LEAST_STEP_MM = 0.01
-Path = ti.types.ndarray(ti.f32, ndim=4)
+Poses = ti.types.ndarray(ti.f32, ndim=4)
 
 
 @ti.data_oriented
@@ -184,7 +184,7 @@ class ConvexTool:
         self._start_substep()
 
     @ti.kernel
-    def _store_path(self, path: Path):
+    def _store_path(self, path: Poses):
         ti.loop_config(serialize=True)
         for leg in range(path.shape[0]):
             for k, i, j in ti.ndrange(2, 4, 4):
