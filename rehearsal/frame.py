@@ -10,18 +10,17 @@ import numpy as np
 
 from rehearsal.cine import Caliper, Cine, CineFrame
 from rehearsal.frame_view import image_view, probe_with_settings
+from rehearsal.image_and_surface_files import save_screenshot, save_surfaces, save_view
 from rehearsal.inputs.input_source import InputSource, ReplayInput
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import Tally
 from rehearsal.notices import Notices
-from rehearsal.planning.plans_in_window import Plans
+from rehearsal.planning.plans_in_window import PlanControl
 from rehearsal.rehearsal import Rehearsal
-from rehearsal.saving import save_screenshot, save_surfaces, save_view
 from rehearsal.stopwatch import timed
-from rehearsal.tracking.openigtlink_image import send_live
-from rehearsal.tracking.openigtlink_server import Server
-from rehearsal.tracking.sweep_recording import Sweeping
+from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer, send_live
+from rehearsal.tracking.sweep_recording import SweepRecorder
 from render.keys import Keys
 from render.viewer import Controls, Settings, View, Viewer
 from ultrasound.probe import Probe
@@ -41,7 +40,7 @@ class Frames:
     source: InputSource
     measurements: LiveMeasurements
     tally: Tally
-    link: Server | None = None
+    link: OpenIGTLinkServer | None = None
 
     def input(self, controls: Controls) -> np.ndarray | None:
         """Return the transducer's next pose (4, 4); None if this frame makes no step."""
@@ -75,8 +74,8 @@ class WindowFrames(Frames):
     viewer: Viewer
     out: Path
     notices: Notices
-    sweeping: Sweeping
-    plans: Plans
+    sweeping: SweepRecorder
+    plans: PlanControl
     keys: Keys = field(default_factory=Keys)
     cine: Cine = field(default_factory=Cine)
     caliper: Caliper = field(default_factory=Caliper)

@@ -8,13 +8,12 @@ from tqdm import tqdm
 
 from rehearsal.frame import Frames
 from rehearsal.frame_view import open_viewer, probe_with_settings
-from rehearsal.image_files import save_picture
+from rehearsal.image_and_surface_files import save_image_file, save_surfaces
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import summary
 from rehearsal.notices import Notices
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import write_json
-from rehearsal.saving import save_surfaces
 from render.animation import PICTURES_A_SECOND, empty_folder, save_animation, side_by_side, smaller
 from render.viewer import Controls, Settings, View, Viewer
 from render.window import NoVulkan
@@ -47,11 +46,11 @@ class Pictures:
         if step % self._every and step < self.steps:
             return
         picture = side_by_side(view)
-        save_picture(picture, self._slices / f"{step:05d}.png")
+        save_image_file(picture, self._slices / f"{step:05d}.png")
         if self.viewer is not None:
             self.viewer.draw(measurements.onto(view, settings))
             picture = Image.fromarray(self.viewer.picture())
-            save_picture(picture, self._frames / f"{step:05d}.png")
+            save_image_file(picture, self._frames / f"{step:05d}.png")
         if step % self._shown_every == 0 or step == self.steps:
             self._animation.append(smaller(picture))
 

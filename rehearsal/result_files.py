@@ -1,7 +1,8 @@
-"""Figures as reports have them, and their files: JSON and CSV."""
+"""Files of results: JSON, CSV and figures, numbered files, and the formats of numbers in them."""
 
 import csv
 import json
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,12 @@ def counted(number: int, name: str) -> str:
     """A number of things: "1 substep", "3 substeps", "2 presses"."""
     ending = "" if number == 1 else "es" if name.endswith("s") else "s"
     return f"{number} {name}{ending}"
+
+
+def next_number(folder: Path, pattern: str) -> int:
+    """One more than the highest number in a folder's file names that match a pattern in full; the number is its first group."""
+    numbers = [int(found[1]) for path in folder.glob("*") if (found := re.fullmatch(pattern, path.name))]
+    return 1 + max(numbers, default=0)
 
 
 def write_json(figures: dict[str, Any], path: Path) -> None:

@@ -25,17 +25,17 @@ from rehearsal.measurements.session_summary import summary_text
 from rehearsal.notices import Notices
 from rehearsal.planning.plan_file import Plan
 from rehearsal.planning.plan_guidance import PlanGuidance
-from rehearsal.planning.plans_in_window import Plans
+from rehearsal.planning.plans_in_window import PlanControl
 from rehearsal.rehearsal import Rehearsal, RehearsalState
 from rehearsal.sessions.open_session import open_session
 from rehearsal.sessions.recorder import SessionRecorder, record
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import Log
-from rehearsal.tracking.openigtlink_server import Server
+from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer
 from rehearsal.tracking.pose_file import TimedPoses
-from rehearsal.tracking.sweep_recording import Sweeping
-from rehearsal.tracking.tracked_probe import PlayedPoses, Tracked
+from rehearsal.tracking.sweep_recording import SweepRecorder
+from rehearsal.tracking.tracked_probe import PosePlayback, PoseSource
 from render.gamepad import Gamepad, SdlPads
 from render.keys import Keys
 from render.viewer import Settings
@@ -56,11 +56,11 @@ class RehearsalRun:
     arch: str
     out: Path
     budget_ms: float | None = None
-    tracked: Tracked | None = None
+    tracked: PoseSource | None = None
     track: TimedPoses | None = None
     keys: Keys = field(default_factory=Keys)
     gamepad: bool = False
-    link: Server | None = None
+    link: OpenIGTLinkServer | None = None
     plan: Plan | None = None
     scene: Path | None = None
     recorder: SessionRecorder | None = field(default=None, init=False)
@@ -93,8 +93,8 @@ class RehearsalRun:
             viewer=viewer,
             out=self.out,
             notices=self.notices,
-            sweeping=Sweeping(self.rehearsal),
-            plans=Plans(self.rehearsal, self.anatomy, self.measurements, self.out),
+            sweeping=SweepRecorder(self.rehearsal),
+            plans=PlanControl(self.rehearsal, self.anatomy, self.measurements, self.out),
             keys=self.keys,
         )
         try:
@@ -151,7 +151,7 @@ class RehearsalRun:
         adaptive = AdaptiveIterations(budget_ms or self.budget_ms or 1000 * self._step_s)
         session = self._session()
         recorder = self._record(session, begins)
-        tracked = self.tracked if self.track is None else PlayedPoses(self.track, session)
+        tracked = self.tracked if self.track is None else PosePlayback(self.track, session)
         return UserInput(session, adaptive, recorder, begins is not None, tracked, self.notices)
 
     def _replay_input(self, replay: Replay) -> ReplayInput:

@@ -1,10 +1,11 @@
-"""The command ``export``: a scene's surfaces and volumes, for other programs."""
+"""The command ``export``: the surfaces and volumes of a scene as files."""
 
 from pathlib import Path
 
 import click
 import trimesh
 
+from rehearsal.result_files import counted
 from scenes.anatomy import LoadedAnatomy, files_of, load_anatomy
 from scenes.patients.part_surfaces import PARTS
 from scenes.patients.patient_folder import check_folder, new_folder
@@ -25,13 +26,13 @@ from scenes.volume_files import save_image
     type=click.Choice(FORMATS),
     default="stl",
     show_default=True,
-    help="Of the surfaces; PLY keeps the order of their vertices.",
+    help="Format of the surfaces; PLY keeps the order of their vertices.",
 )
 def export(scene: Path, out: Path, suffix: str) -> None:
     """Write surfaces, CT and labels of SCENE as files.
 
-    SCENE is a scene file or a patient's folder; surfaces become STL or PLY, CT and label map NRRD.
-    All is in mm, in the patient's LPS, at rest. As they lie when they are pressed, rehearse writes them.
+    SCENE is a scene file or a patient's folder. Surfaces become STL or PLY, CT and label map NRRD.
+    All is in mm, in the patient's LPS, at rest; rehearse writes the deformed surfaces.
     """
     path = scene_file(scene)
     check_folder(out)
@@ -47,7 +48,9 @@ def export(scene: Path, out: Path, suffix: str) -> None:
     )
     without = sum(not isinstance(shape, trimesh.Trimesh) for shape in anatomy.shapes)
     if without:
-        click.echo(f"Left out: {without} of what the organ lies on, as planes and distances are no surfaces.")
+        click.echo(
+            f"Left out: {counted(without, 'shape')} under the organ; planes and distance fields are not surfaces."
+        )
 
 
 def surfaces(anatomy: LoadedAnatomy) -> dict[str, trimesh.Trimesh]:
@@ -61,7 +64,7 @@ def surfaces(anatomy: LoadedAnatomy) -> dict[str, trimesh.Trimesh]:
 
 
 def save_volumes(scene: Scene, folder: Path, out: Path) -> list[str]:
-    """Write the voxels of CT and label map as their files have them, without metadata; the names of the files. Raises OSError."""
+    """Write the voxels of CT and label map, unchanged and without metadata; return the names of the files. Raises OSError."""
     folder, files = files_of(scene, folder)
     wanted = {"ct.nrrd": files.ct, "labels.nrrd": files.labels}
     written = {name: file for name, file in wanted.items() if file}

@@ -1,4 +1,4 @@
-"""The command ``plan``: where to move the probe so that a target is seen, with little pressing and through a trocar."""
+"""The command ``plan``: a sweep that covers a target with little compression, through a trocar."""
 
 from pathlib import Path
 
@@ -29,24 +29,22 @@ from ultrasound.target import TARGETS, Target
 @click.option(
     "--target",
     type=click.Choice(TARGETS),
-    help="What must be seen: the tumour, the tumour with its margin, or the whole organ [margin, or organ without a tumour].",
+    help="What the sweep covers: the tumour, the tumour with its margin, or the whole organ [margin, or organ without a tumour].",
 )
 @click.option(
     "--margin-mm",
     type=NumberRange(0, MOST_MARGIN_MM),
     default=5.0,
     show_default=True,
-    help="How much around the tumour is to be seen.",
+    help="Width of the margin around the tumour.",
 )
 @click.option(
-    "--trocar", nargs=3, type=Number(), help="Where the instrument comes in: x y z, LPS, mm [the scene's]."
+    "--trocar", nargs=3, type=Number(), help="Position of the trocar: x y z, LPS, mm [the scene's]."
 )
 @click.option(
-    "--cone-deg", type=Number(), help="How far the shaft may lean from its middle direction [the scene's]."
+    "--cone-deg", type=Number(), help="Largest angle of the shaft to the axis of the trocar [the scene's]."
 )
-@click.option(
-    "--wrist-deg", type=Number(), help="How far the probe may look aside from the shaft [the scene's]."
-)
+@click.option("--wrist-deg", type=Number(), help="Largest angle of the probe to the shaft [the scene's].")
 @click.option("--probe", help="Probe, by its name or as a file [the scene's].")
 @quality_option
 @click.option(
@@ -54,14 +52,14 @@ from ultrasound.target import TARGETS, Target
     type=NumberRange(SLOWEST_MM_S, FASTEST_MM_S),
     default=10.0,
     show_default=True,
-    help="How fast the sweep will be gone.",
+    help="Speed of the planned sweep.",
 )
 @click.option(
     "--trials",
     type=WholeRange(MOST_SWEEPS, 100_000),
     default=96,
     show_default=True,
-    help="Scans that the search may make.",
+    help="Simulated sweeps in the search.",
 )
 @click.option("--jobs", type=WholeRange(1, 256), help="Processes [as many as there are processors].")
 def plan(
@@ -78,50 +76,49 @@ def plan(
     trials: int,
     jobs: int | None,
 ) -> None:
-    """Plan a sweep over SCENE that shows the target.
+    """Plan a sweep over SCENE that covers the target.
 
-    SCENE is a scene file or a patient's folder; the plan's poses show the target on the deforming organ.
+    SCENE is a scene file or a patient's folder. The organ deforms under the probe.
     """
     path = scene_file(scene)
     loaded = with_quality(with_options(load_scene(path), {"transducer.probe": probe}), quality)
     port = trocar_of(loaded.trocar, trocar, cone_deg, wrist_deg)
     anatomy = load_anatomy(loaded, path.parent)
-    held = probe_of(loaded)
+    scene_probe = probe_of(loaded)
     make_folder(out.parent)
     if out.is_dir():
         raise CommandError(f"{out}: is a folder; name a file after --out")
-    from rehearsal.planning.make_plan import make_plan
-    from rehearsal.planning.search import length_of
-    from rehearsal.planning.trial_workers import Problem, workers
+    from rehearsal.planning.plan_search import make_plan, total_work
+    from rehearsal.planning.trial_workers import PlanningProblem, TrialWorkers
 
-    aim: Target = target or ("organ" if anatomy.tumour is None else "margin")
-    problem = Problem(loaded, anatomy, held, aim, margin_mm, port)
+    chosen: Target = target or ("organ" if anatomy.tumour is None else "margin")
+    problem = PlanningProblem(loaded, anatomy, scene_probe, chosen, margin_mm, port)
     if port.at_mm is None:
-        click.echo("No trocar is given: every way in counts as free.")
+        click.echo("No trocar is given: all poses count as reachable.")
     with (
-        workers(problem, jobs) as crew,
-        tqdm(total=length_of(trials, speed_mm_s), desc="plan", unit="trial") as bar,
+        TrialWorkers(problem, jobs) as workers,
+        tqdm(total=total_work(trials, speed_mm_s), desc="plan", unit="trial") as bar,
     ):
-        made = make_plan(problem, crew, speed_mm_s, trials, bar.update)
+        made = make_plan(problem, workers, speed_mm_s, trials, bar.update)
         bar.update(bar.total - bar.n)
     write_plan(made, out)
     click.echo("\n".join(made.why))
     click.echo(
-        f"Wrote {len(made.sweeps)} sweeps to {out}; follow the first with: {following(scene, out, probe)}"
+        f"Wrote {len(made.sweeps)} sweeps to {out}; follow the first with: {rehearse_command_line(scene, out, probe)}"
     )
 
 
-def following(scene: Path, plan_file: Path, probe: str | None) -> str:
-    """The command line that follows a plan; it needs the probe that was planned for."""
-    named = [] if scene == EMBEDDED else [scene]
-    held = [] if probe is None else ["--probe", probe]
-    return pasted("rehearse", *named, *held, "--plan", plan_file)
+def rehearse_command_line(scene: Path, plan_file: Path, probe: str | None) -> str:
+    """The command line that follows a plan, with the same probe."""
+    scene_argument = [] if scene == EMBEDDED else [scene]
+    probe_option = [] if probe is None else ["--probe", probe]
+    return pasted("rehearse", *scene_argument, *probe_option, "--plan", plan_file)
 
 
 def trocar_of(
     scenes: Trocar, at_mm: tuple[float, float, float] | None, cone_deg: float | None, wrist_deg: float | None
 ) -> Trocar:
-    """The scene's trocar with what the command line changes. Raises CommandError."""
+    """The scene's trocar with the options of the command line. Raises CommandError."""
     given = {"at_mm": at_mm, "cone_deg": cone_deg, "wrist_deg": wrist_deg}
     values = scenes.model_dump() | {name: value for name, value in given.items() if value is not None}
     try:

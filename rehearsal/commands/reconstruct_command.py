@@ -1,4 +1,4 @@
-"""The command ``reconstruct``: a tracked sweep made into a volume, and compared with the patient."""
+"""The command ``reconstruct``: the volume of a tracked sweep, compared with the patient."""
 
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,16 @@ from rehearsal.commands.command_line import (
     start_taichi,
 )
 from rehearsal.configuration import probe_of
-from rehearsal.reconstruction.reconstruction_figure import save_picture
-from rehearsal.reconstruction.reconstruction_files import save_volumes
+from rehearsal.reconstruction.reconstruction_files import save_slices_figure, save_volumes
 from rehearsal.reconstruction.simulated_tracker import with_errors
-from rehearsal.reconstruction.sweep_volumes import Places, Rebuilt, Track, lit, rebuild, track_of
+from rehearsal.reconstruction.sweep_volumes import (
+    ImagePoses,
+    Places,
+    SweepVolumes,
+    image_poses_of,
+    lit_pixels,
+    reconstruct_volumes,
+)
 from rehearsal.result_files import write_json
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
@@ -31,8 +37,8 @@ from ultrasound.tracking_errors import TrackingErrors
 from version import VERSION
 
 MOST_REACH_MM = 5.0
-# Of less of the organ its figures say nothing, and of less than the second they are easily taken for the whole organ's.
-LEAST_SCANNED, LITTLE_SCANNED = 0.01, 0.3
+# A smaller scanned fraction of the organ is not compared; below the second, the summary calls it a small part.
+LEAST_SCANNED, SMALL_SCANNED = 0.01, 0.3
 
 
 @click.command()
@@ -43,7 +49,7 @@ LEAST_SCANNED, LITTLE_SCANNED = 0.01, 0.3
 @click.option(
     "--scene",
     type=click.Path(path_type=Path),
-    help="Scene or patient's folder that the sweep is of: compare with it.",
+    help="Scene or patient's folder of the sweep, to compare with.",
 )
 @click.option(
     "--config",
@@ -61,7 +67,7 @@ LEAST_SCANNED, LITTLE_SCANNED = 0.01, 0.3
     type=click.Choice(METHODS),
     default="smooth",
     show_default=True,
-    help="How pixels become voxels.",
+    help="Interpolation from pixels to voxels.",
 )
 @click.option(
     "--spacing-mm", type=NumberRange(0.05, 10), default=0.5, show_default=True, help="Width of a voxel."
@@ -69,29 +75,29 @@ LEAST_SCANNED, LITTLE_SCANNED = 0.01, 0.3
 @click.option(
     "--reach-mm",
     type=NumberRange(0, 20),
-    help="Gaps up to twice as wide are filled [as wide as most pictures are apart].",
+    help="Gaps up to twice this width are filled [the distance of most images].",
 )
 @click.option(
     "--undo-compression",
     is_flag=True,
-    help="Press the scene's organ once more on the tracked way, and put each pixel where its tissue was at rest.",
+    help="Compression correction: press the scene's organ along the tracked path, and move each pixel to its place at rest.",
 )
 @click.option(
-    "--noise-mm", type=NumberRange(0), default=0.0, help="Add a tracker's noise: SD of each coordinate."
+    "--noise-mm", type=NumberRange(0), default=0.0, help="Simulated tracker noise: SD of each coordinate."
 )
-@click.option("--noise-deg", type=NumberRange(0), default=0.0, help="The same of the angle about each axis.")
+@click.option("--noise-deg", type=NumberRange(0), default=0.0, help="SD of the angle about each axis.")
 @click.option(
     "--calibration-mm",
     type=NumberRange(0),
     default=0.0,
-    help="Image off the probe by so much, in all frames.",
+    help="Constant offset of the image on the probe.",
 )
 @click.option(
-    "--calibration-deg", type=NumberRange(0), default=0.0, help="Image turned on the probe by so much."
+    "--calibration-deg", type=NumberRange(0), default=0.0, help="Constant rotation of the image on the probe."
 )
-@click.option("--latency-s", type=NumberRange(0), default=0.0, help="Poses of so much earlier.")
-@click.option("--lost", type=NumberRange(0, 1), default=0.0, help="Share of frames without a pose.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of these errors.")
+@click.option("--latency-s", type=NumberRange(0), default=0.0, help="Delay of the poses.")
+@click.option("--lost", type=NumberRange(0, 1), default=0.0, help="Fraction of frames without a pose.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Random seed of these errors.")
 @arch_option
 def reconstruct(
     sweep: Path,
@@ -107,40 +113,43 @@ def reconstruct(
     arch: str,
     **tracker: float,
 ) -> None:
-    """Make a volume of SWEEP, a tracked sweep (.igs.mha).
+    """Reconstruct a volume from SWEEP, a tracked sweep (.igs.mha).
 
-    The sweep is Nephron's or PLUS's. Writes volume.nrrd, volume.png and report.json; beside a sweep of marks (SWEEP-marks.igs.mha, which a rehearsal records) the
-    organ and tumour as they were seen, in labels.nrrd. With a tracker's errors, the sweep that has them is left as tracked.igs.mha.
+    The sweep is from Nephron or PLUS. Writes volume.nrrd, volume.png and report.json; with ground-truth labels
+    (SWEEP-marks.igs.mha, which a rehearsal records) also organ and tumour in labels.nrrd. With simulated tracker
+    errors, it also writes the sweep that has them, tracked.igs.mha.
     """
     if undo_compression and scene is None:
-        raise CommandError("--undo-compression: presses the organ of a scene; name it with --scene")
-    pictures = read_sweep(sweep)
-    pictures.constant |= load_constants(config) if config else {}
-    marks = marks_beside(sweep)
+        raise CommandError("--undo-compression: needs the organ of a scene; name it with --scene")
+    images = read_sweep(sweep)
+    images.constant |= load_constants(config) if config else {}
+    labels = marks_beside(sweep)
     errors = _errors_of(tracker)
     if errors != TrackingErrors():
-        pictures = with_errors(pictures, reference, errors, seed)
-    track = track_of(pictures, reference)
-    about = _of_track(pictures, track)
+        images = with_errors(images, reference, errors, seed)
+    image_poses = image_poses_of(images, reference)
+    about = _describe(images, image_poses)
     patient = None if scene is None else load_patient(scene)
     make_folder(out)
     if errors != TrackingErrors():
-        write_sweep(out / "tracked.igs.mha", pictures)
+        write_sweep(out / "tracked.igs.mha", images)
     settings: dict[str, Any] = dict(
         method=method,
         spacing_mm=spacing_mm,
-        reach_mm=usual_reach_mm(track, spacing_mm) if reach_mm is None else reach_mm,
+        reach_mm=default_reach_mm(image_poses, spacing_mm) if reach_mm is None else reach_mm,
     )
     places = None
     if undo_compression and patient is not None:
-        places = _unsqueezed(patient, pictures, track, reference, arch)
-    with tqdm(total=len(track.frames), desc="reconstruct", unit="picture") as bar:
+        places = _compression_correction(patient, images, image_poses, reference, arch)
+    with tqdm(total=len(image_poses.frames), desc="reconstruct", unit="image") as bar:
         try:
-            seen = lit(pictures.images)
-            rebuilt = rebuild(pictures, track, seen, **settings, marks=marks, places=places, done=bar.update)
+            mask = lit_pixels(images.images)
+            volumes = reconstruct_volumes(
+                images, image_poses, mask, **settings, labels=labels, places=places, progress=bar.update
+            )
         except ValueError as error:
             raise CommandError(f"{sweep.name}: {error}") from None
-    save_volumes(rebuilt, out)
+    save_volumes(volumes, out)
     report = dict(
         version=VERSION,
         **settings,
@@ -148,10 +157,10 @@ def reconstruct(
         undo_compression=undo_compression,
         tracker=tracker,
         **about,
-        shape=list(rebuilt.box.shape),
-        agreement=_agreement(rebuilt, patient),
+        shape=list(volumes.box.shape),
+        agreement=_metrics(volumes, patient),
     )
-    save_picture(rebuilt, out / "volume.png")
+    save_slices_figure(volumes, out / "volume.png")
     write_json(report, out / "report.json")
     click.echo(in_words(report))
     click.echo(f"Wrote volume.nrrd, volume.png and report.json to {out}")
@@ -164,14 +173,14 @@ def _errors_of(tracker: dict[str, float]) -> TrackingErrors:
         raise CommandError(f"errors of a tracker: {error}") from None
 
 
-def usual_reach_mm(track: Track, spacing_mm: float) -> float:
-    """So far that most gaps between pictures close, and two voxels at least [mm]."""
-    usual = float(np.percentile(track.steps_mm, 95)) if len(track.frames) > 1 else 0.0
-    return max(2 * spacing_mm, min(usual, MOST_REACH_MM))
+def default_reach_mm(image_poses: ImagePoses, spacing_mm: float) -> float:
+    """The distance of most images, and at least two voxels [mm]."""
+    distance = float(np.percentile(image_poses.steps_mm, 95)) if len(image_poses.frames) > 1 else 0.0
+    return max(2 * spacing_mm, min(distance, MOST_REACH_MM))
 
 
-def _unsqueezed(
-    patient: tuple[Scene, LoadedAnatomy], pictures: Sweep, track: Track, reference: str, arch: str
+def _compression_correction(
+    patient: tuple[Scene, LoadedAnatomy], images: Sweep, image_poses: ImagePoses, reference: str, arch: str
 ) -> Places:
     scene, anatomy = patient
     start_taichi(arch)
@@ -180,24 +189,24 @@ def _unsqueezed(
 
     click.echo("Building the model.")
     probe = probe_of(scene)
-    taken_with = pictures.fields.get(PROBE_FIELD, probe.transducer_name)
-    if taken_with != probe.transducer_name:
+    sweep_probe = images.fields.get(PROBE_FIELD, probe.transducer_name)
+    if sweep_probe != probe.transducer_name:
         raise CommandError(
-            f"--undo-compression: the sweep was taken with the probe {taken_with}, the scene has {probe.transducer_name}: "
+            f"--undo-compression: the sweep was made with the probe {sweep_probe}, the scene has {probe.transducer_name}: "
             "set transducer.probe in the scene"
         )
     rehearsal = Rehearsal(scene, anatomy, probe)
-    return CompressionCorrection(rehearsal, pictures, track, reference)
+    return CompressionCorrection(rehearsal, images, image_poses, reference)
 
 
-def _of_track(pictures: Sweep, track: Track) -> dict[str, Any]:
-    """How many pictures there are, how far apart and how fast the probe went."""
-    steps = track.steps_mm
-    waits = np.diff(pictures.times_s[track.frames])
-    speed = steps[waits > 0] / waits[waits > 0]
+def _describe(images: Sweep, image_poses: ImagePoses) -> dict[str, Any]:
+    """The number of images, their distances, and the speed of the probe."""
+    steps = image_poses.steps_mm
+    intervals = np.diff(images.times_s[image_poses.frames])
+    speed = steps[intervals > 0] / intervals[intervals > 0]
     return dict(
-        frames=len(pictures),
-        used=len(track.frames),
+        frames=len(images),
+        used=len(image_poses.frames),
         way_mm=round(float(steps.sum()), 3),
         between_median_mm=round(float(np.median(steps)), 4) if len(steps) else 0.0,
         between_max_mm=round(float(steps.max()), 4) if len(steps) else 0.0,
@@ -206,51 +215,49 @@ def _of_track(pictures: Sweep, track: Track) -> dict[str, Any]:
     )
 
 
-def _agreement(rebuilt: Rebuilt, patient: tuple[Scene, LoadedAnatomy] | None) -> dict[str, Any]:
-    if patient is None or not rebuilt.regions:
+def _metrics(volumes: SweepVolumes, patient: tuple[Scene, LoadedAnatomy] | None) -> dict[str, Any]:
+    if patient is None or not volumes.regions:
         return {}
-    from rehearsal.reconstruction.patient_comparison import are_apart, compared, surfaces_of
+    from rehearsal.reconstruction.patient_comparison import are_apart, compare_with_surfaces, surfaces_of
 
     surfaces = surfaces_of(patient[1])
     try:
-        # A box around both could be larger than the memory.
-        found = {} if are_apart(rebuilt.box, surfaces["organ"]) else compared(rebuilt, surfaces)
+        # A box that encloses both could exceed the memory.
+        found = {} if are_apart(volumes.box, surfaces["organ"]) else compare_with_surfaces(volumes, surfaces)
     except ValueError as error:
         click.echo(f"Not compared with the whole organ: {error}")
         return {}
     scanned = found["organ"]["scanned"] if "organ" in found else 0.0
     if scanned < LEAST_SCANNED:
         click.echo(
-            f"Not compared: the sweep is not of this organ, or of another patient; it shows {100 * scanned:.1f} % of it. Name its own "
+            f"Not compared: the sweep covers {100 * scanned:.1f} % of this organ, so it is of another organ or patient. Name its own "
             "scene with --scene."
         )
         return {}
     return found
 
 
-def _of_that(scanned: float) -> str:
-    return "of that" if scanned >= LITTLE_SCANNED else "of that small part alone"
-
-
 def in_words(report: dict[str, Any]) -> str:
-    """The figures that matter, in a few lines for the terminal."""
+    """The main results, in a few lines for the terminal."""
     lines = [
-        f"pictures  {report['used']} of {report['frames']} with a pose, {report['between_median_mm']:.2f} mm apart (median; at most "
+        f"images    {report['used']} of {report['frames']} with a pose, {report['between_median_mm']:.2f} mm apart (median; at most "
         f"{report['between_max_mm']:.2f}), {report['speed_median_mm_s']:.0f} mm/s",
         f"volume    {' x '.join(map(str, report['shape']))} voxels of {report['spacing_mm']:g} mm, {report['method']}"
-        + (", compression undone" if report["undo_compression"] else ""),
+        + (", compression corrected" if report["undo_compression"] else ""),
     ]
     for name, figures in report["agreement"].items():
-        part = figures["scanned_part"]
-        lines.append(
-            f"{name:<9} {100 * figures['scanned']:.0f} % scanned"
-            + (
-                ""
-                if not part
-                else f"; {_of_that(figures['scanned'])} nothing found"
-                if part["centroid_mm"] is None
-                else f"; {_of_that(figures['scanned'])} Dice {part['dice']:.3f}, HD95 {part['hd95_mm']:.2f} mm, volume {part['volume_percent']:+.1f} %, "
-                f"centroid {part['centroid_mm']:.2f} mm off"
-            )
-        )
+        line = f"{name:<9} {100 * figures['scanned']:.0f} % scanned"
+        if part := figures["scanned_part"]:
+            line += "; in this part " if figures["scanned"] >= SMALL_SCANNED else "; only in this small part "
+            line += _metrics_in_words(part)
+        lines.append(line)
     return "\n".join(lines)
+
+
+def _metrics_in_words(part: dict[str, float | None]) -> str:
+    if part["centroid_mm"] is None:
+        return "nothing found"
+    return (
+        f"Dice {part['dice']:.3f}, HD95 {part['hd95_mm']:.2f} mm, volume {part['volume_percent']:+.1f} %, "
+        f"centroid {part['centroid_mm']:.2f} mm off"
+    )

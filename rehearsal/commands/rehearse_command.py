@@ -28,7 +28,7 @@ from rehearsal.commands.option_checks import (
 )
 from rehearsal.configuration import Setup, probe_of, scene_of, with_quality
 from rehearsal.planning.plan_file import read_plan
-from rehearsal.tracking.openigtlink_options import link_options, opened_link
+from rehearsal.tracking.openigtlink_options import link_options, open_link
 from rehearsal.tracking.track_file import PROBE_IN_PATIENT, load_track
 from render.display import display_available
 from render.keys import Keys, keys_text, load_keys
@@ -164,7 +164,7 @@ def rehearse(
         refuse_no_pictures(headless, link)
     make_folder(out)
     used = start_taichi(arch)
-    server = opened_link(link, link_host, link_port, link_leads)
+    server = open_link(link, link_host, link_port, link_leads)
     with Stages() as progress:
         anatomy = load_anatomy(loaded, path.parent, progress)
         check_files(anatomy, before.title, probe, log, track_file, track, plan)
@@ -184,7 +184,7 @@ def rehearse(
         click.echo(chosen)
     from rehearsal.run import RehearsalRun
 
-    tracked = server.hand if server is not None and link_leads else None
+    tracked = server.received_pose if server is not None and link_leads else None
     named = None if scene == EMBEDDED else scene
     run = RehearsalRun(
         rehearsal, anatomy, used, out, budget_ms, tracked, track, keys, gamepad, server, plan, named

@@ -1,4 +1,4 @@
-"""The command ``scan``: pictures of an anatomy at rest for a list of probe poses."""
+"""The command ``scan``: images of an anatomy at rest, for a list of probe poses."""
 
 from collections.abc import Collection
 from pathlib import Path
@@ -21,10 +21,10 @@ from ultrasound.probe import DETAIL_LEVELS, MODES, Probe
 from version import VERSION
 
 if TYPE_CHECKING:
-    from rehearsal.image_files import SavedPicture
+    from rehearsal.image_and_surface_files import SavedImage
 
-FRAMES_A_SECOND = 30
-# No hand presses a probe as deep as this into where an organ lies at rest.
+FRAMES_PER_SECOND = 30
+# A probe never reaches this depth below the surface of the organ at rest.
 DEEP_MM = 20.0
 
 
@@ -34,29 +34,29 @@ DEEP_MM = 20.0
     "--pose", "poses", type=click.Path(path_type=Path), required=True, help="Poses of the probe, JSON or CSV."
 )
 @click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="Folder for the pictures and scan.json."
+    "--out", type=click.Path(path_type=Path), required=True, help="Folder for the images and scan.json."
 )
 @click.option("--probe", help="Probe, by its name or as a file [the scene's].")
-@click.option("--picture", type=click.Choice(MODES), help="Echo, CT or both [the scene's].")
+@click.option("--picture", type=click.Choice(MODES), help="B-mode, CT or both [the scene's].")
 @click.option(
     "--detail-level",
     "--rung",
     "detail_level",
     type=click.Choice(DETAIL_LEVELS),
-    help="How much of the echo is computed [the scene's].",
+    help="Realism of the B-mode image [the scene's].",
 )
 @click.option(
     "--contact",
     type=click.Choice(["tissue", "organ"]),
     default="tissue",
     show_default=True,
-    help="What lets sound in where it touches the array: anything but gas, as the CT has it, or the organ alone.",
+    help="What counts as contact with the array: everything but gas in the CT, or the organ only.",
 )
-@click.option("--dicom", is_flag=True, help="Each echo picture as DICOM too.")
+@click.option("--dicom", is_flag=True, help="Write each B-mode image as DICOM too.")
 @click.option(
     "--sweep",
     is_flag=True,
-    help="All as one tracked sweep too, as PLUS writes them, with the truth beside it.",
+    help="Write all images as one tracked sweep too (PLUS), with ground-truth labels.",
 )
 @arch_option
 def scan(
@@ -71,22 +71,22 @@ def scan(
     sweep: bool,
     arch: str,
 ) -> None:
-    """Take pictures of SCENE at a list of probe poses.
+    """Make images of SCENE at a list of probe poses.
 
-    SCENE is a scene file or a patient's folder. It lies as in the CT: no body, no window.
-    For each pose of a file, what the probe shows there. Writes PNG pictures and scan.json, which says how large their pixels are.
+    SCENE is a scene file or a patient's folder, at rest as in the CT.
+    Writes a PNG image for each pose of a file, and scan.json with the size of the pixels.
     """
     path = scene_file(scene)
     options = {"transducer.probe": probe, "image.mode": picture, "image.detail_level": detail_level}
     loaded = with_options(load_scene(path), options)
-    placed = load_poses(poses)
+    pose_by_name = load_poses(poses)
     anatomy = load_anatomy(loaded, path.parent)
     if anatomy.ct is None:
-        raise CommandError(f"{path}: has no CT: expected anatomy.ct, of which pictures are made")
-    warn_of_deep(placed.values(), anatomy.organ)
-    held, image = probe_of(loaded), loaded.image
+        raise CommandError(f"{path}: has no CT: expected anatomy.ct, from which the images are made")
+    warn_of_deep_poses(pose_by_name.values(), anatomy.organ)
+    scan_probe, settings = probe_of(loaded), loaded.image
     used = start_taichi(arch)
-    from rehearsal.image_files import save_pictures
+    from rehearsal.image_and_surface_files import save_images
     from rehearsal.rehearsal import scanned_anatomy
     from sim.embedding import Unmoved
     from ultrasound.image_plane import ImagePlane
@@ -95,54 +95,58 @@ def scan(
 
     make_folder(out)
     scanned = scanned_anatomy(anatomy.organ, anatomy.ct, anatomy, np.zeros(3))
-    scanner = Scanner(scanned, Unmoved(), held, image.pixels, "background", contact, image.contact_gap_mm)
-    swept = LabelledSweep(out, "sweep", held) if sweep else None
+    scanner = Scanner(
+        scanned, Unmoved(), scan_probe, settings.pixels, "background", contact, settings.contact_gap_mm
+    )
+    recording = LabelledSweep(out, "sweep", scan_probe) if sweep else None
     rows, ms, empty = [], [], 0
-    for name, pose in tqdm(placed.items(), desc="scan", unit="pose"):
+    for name, pose in tqdm(pose_by_name.items(), desc="scan", unit="pose"):
         began = perf_counter()
-        plane = ImagePlane(pose, *held.extent_mm)
-        shown = scanner.look(plane, held, image.mode, image.detail_level, image.window_hu, image.level_hu)
+        plane = ImagePlane(pose, *scan_probe.extent_mm)
+        images = scanner.look(
+            plane, scan_probe, settings.mode, settings.detail_level, settings.window_hu, settings.level_hu
+        )
         ms.append(1000 * (perf_counter() - began))
-        marks = scanner.marks.render()
-        empty += not marks.any()
-        if swept is not None:
-            grey = next(iter(shown.values()))
-            swept.add(grey, marks, held, pose, swept.count / FRAMES_A_SECOND)
-        saved = save_pictures(shown, *held.extent_mm[:2], held, out / name, dicom)
-        rows += [dict(pose=name, probe_to_patient=pose.tolist()) | _row(each, held) for each in saved]
-    if swept is not None:
-        swept.close()
+        labels = scanner.marks.render()
+        empty += not labels.any()
+        if recording is not None:
+            grey = next(iter(images.values()))
+            recording.add(grey, labels, scan_probe, pose, recording.count / FRAMES_PER_SECOND)
+        saved = save_images(images, *scan_probe.extent_mm[:2], scan_probe, out / name, dicom)
+        rows += [dict(pose=name, probe_to_patient=pose.tolist()) | _row(each, scan_probe) for each in saved]
+    if recording is not None:
+        recording.close()
     report = dict(
         version=VERSION,
-        probe=held.model_dump(by_alias=True),
-        detail_level=image.detail_level,
+        probe=scan_probe.model_dump(by_alias=True),
+        detail_level=settings.detail_level,
         contact=contact,
-        contact_gap_mm=image.contact_gap_mm,
+        contact_gap_mm=settings.contact_gap_mm,
         arch=used,
         pictures=rows,
     )
     write_json(report, out / "scan.json")
     if empty:
         click.echo(
-            f"Mind: {empty} of {len(placed)} poses show nothing of the organ; they may be of another patient."
+            f"Warning: {empty} of {len(pose_by_name)} poses show nothing of the organ; they may be of another patient."
         )
     click.echo(
-        f"Wrote {len(rows)} pictures of {len(placed)} poses and scan.json to {out}; {np.median(ms):.1f} ms a pose (median)."
+        f"Wrote {len(rows)} images of {len(pose_by_name)} poses and scan.json to {out}; {np.median(ms):.1f} ms per pose (median)."
     )
 
 
-def warn_of_deep(poses: Collection[np.ndarray], organ: trimesh.Trimesh) -> None:
-    """Say how many poses (4, 4) no probe can take on this organ."""
+def warn_of_deep_poses(poses: Collection[np.ndarray], organ: trimesh.Trimesh) -> None:
+    """Print how many poses (4, 4) are impossible on this organ."""
     faces = np.array([pose[:3, 3] for pose in poses])
     deep = int((signed_distance(organ.vertices, organ.faces, faces)[0] < -DEEP_MM).sum())
     if deep:
         click.echo(
-            f"Mind: {deep} of {len(poses)} poses lie more than {DEEP_MM:g} mm inside the organ; they may be of another patient."
+            f"Warning: {deep} of {len(poses)} poses are more than {DEEP_MM:g} mm inside the organ; they may be of another patient."
         )
 
 
-def _row(saved: "SavedPicture", probe: Probe) -> dict[str, Any]:
-    """What scan.json says of a picture."""
+def _row(saved: "SavedImage", probe: Probe) -> dict[str, Any]:
+    """The entry of an image in scan.json."""
     return dict(
         picture=saved.kind,
         file=saved.path.name,

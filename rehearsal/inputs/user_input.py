@@ -10,7 +10,7 @@ from rehearsal.sessions.recorder import SessionRecorder
 from rehearsal.sessions.replay import set_solver
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.undo_history import History
-from rehearsal.tracking.tracked_probe import Follower, Tracked, TrackOver
+from rehearsal.tracking.tracked_probe import PoseSource, TrackEnded, TrackingInput
 from render.viewer import Controls, TissueSettings
 
 # A transducer that moves by no more than this in a step is at rest [mm].
@@ -29,7 +29,7 @@ class UserInput:
     adaptive_iterations: AdaptiveIterations
     recorder: SessionRecorder | None = None
     waits: bool = False
-    tracked: Tracked | None = None
+    tracked: PoseSource | None = None
     notices: Notices = field(default_factory=Notices)
     _ray: Ray | None = field(default=None, init=False)
     _ray_at_slide: Ray | None = field(default=None, init=False)
@@ -37,7 +37,7 @@ class UserInput:
 
     def __post_init__(self) -> None:
         self.history = History(self.session)
-        self._follower = None if self.tracked is None else Follower(self.tracked, self.session.rehearsal)
+        self._follower = None if self.tracked is None else TrackingInput(self.tracked, self.session.rehearsal)
         if self.waits:
             self._wait(None)
 
@@ -106,12 +106,12 @@ class UserInput:
         if self._follower is not None:
             self._follower.wait()
 
-    def _tracked_pose(self, follower: Follower, controls: Controls) -> np.ndarray:
+    def _tracked_pose(self, follower: TrackingInput, controls: Controls) -> np.ndarray:
         """The next pose towards the tracked probe."""
         rehearsal = self.session.rehearsal
         try:
             goal = follower.goal()
-        except TrackOver as over:
+        except TrackEnded as over:
             self._follower = None
             self._show(str(over))
             self._wait(controls.ray)

@@ -54,7 +54,7 @@ class LiveMeasurements:
         self._begin()
         self.coverage.forget()
         if self.guide is not None:
-            self.guide.begin_anew()
+            self.guide.restart()
 
     def recall(self, log: Log, until: int) -> bool:
         """Restore the measurements of a session's first steps if its file holds the coverage until then; return whether it does.

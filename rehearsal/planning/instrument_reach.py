@@ -6,14 +6,15 @@ import numpy as np
 from scenes.trocar import Trocar
 from ultrasound.probe_manipulator import ProbeManipulator
 
-# The shaft may touch the organ so far from where it holds the probe [mm].
+# Within this distance of the probe the shaft may touch the organ [mm].
 NEAR_MM = 2.0
 
 
-class Reach:
-    """A trocar about an organ as it settled; ``origin`` (3,) [mm] is the middle that places are relative to.
+class InstrumentReach:
+    """A trocar and the settled organ. ``origin`` (3,) is the rehearsal's origin in the patient [mm].
 
-    The shaft goes straight from the trocar to the middle of the probe's back.
+    The shaft is straight, from the trocar to the centre of the probe's back. Without an axis of its own, the cone is about the
+    direction to ``target`` (3,).
     """
 
     def __init__(
@@ -29,7 +30,7 @@ class Reach:
         self.axis = axis / max(float(np.linalg.norm(axis)), 1e-9)
 
     def __call__(self, poses: np.ndarray) -> np.ndarray:
-        """Which poses (n, 4, 4) can be reached, bool (n,)."""
+        """Which poses (n, 4, 4) are reachable, bool (n,)."""
         if self.at is None:
             return np.ones(len(poses), bool)
         backs = poses[:, :3, 3] + self.manipulator.size_mm[2] / 2 * poses[:, :3, 2]
@@ -43,7 +44,7 @@ class Reach:
         return can
 
     def _is_free(self, along: np.ndarray, length_mm: float) -> bool:
-        """Whether the shaft passes the organ by."""
+        """Whether the shaft does not pass through the organ."""
         hits = igl.ray_mesh_intersect(self.at, along, self.manipulator.vertices, self.manipulator.faces)
         return not hits or hits[0][1] > length_mm - NEAR_MM
 

@@ -1,42 +1,50 @@
-"""The file of a plan: sweeps over a target, the best first, with what each was worth. JSON; patient coordinates LPS, mm."""
+"""The file of a plan: sweeps over a target, the best first, with their scores. JSON; patient coordinates LPS, mm."""
 
 import json
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from scipy.spatial.transform import Rotation
 
 from errors import UserError
-from rehearsal.numbered_files import next_number
+from rehearsal.result_files import next_number
+from rehearsal.tracking.pose_file import Pose, TimedPoses, is_rigid
 from scenes.atomic_files import whole
 from scenes.trocar import Trocar
 from ultrasound.target import Target
 
 MOST_POSES, MOST_MARGIN_MM = 20_000, 30.0
-# Kinds of sweep that are compared, at most.
+# The most kinds of sweep that are compared.
 MOST_SWEEPS = 4
 SLOWEST_MM_S, FASTEST_MM_S = 1.0, 100.0
 NAME = r"plan-([0-9]{3,9})\.json"
-# How far the axes of a pose may be from orthonormal: what six digits in a file leave.
-RIGID = 1e-3
-# What a plan begins with.
+# The first bytes of a plan contain this.
 MARK = b'"nephron_plan"'
-
-Row = Annotated[list[float], Field(min_length=4, max_length=4)]
-Pose = Annotated[list[Row], Field(min_length=4, max_length=4)]
+# Between two passes the probe is lifted by this, and moves at this speed.
+LIFT_MM, LIFTED_MM_S = 6.0, 60.0
+# The time before the first pass, to come above its first pose from anywhere.
+APPROACH_S = 1.0
+# A rotation by this angle takes as long as one millimetre.
+DEG_PER_MM = 1.5
 
 
 class PlanError(UserError):
     """A plan that cannot be made or used; the message is one line."""
 
 
-class _Part(BaseModel):
+class _FileModel(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
-class PlannedSweep(_Part):
-    """One candidate. ``passes`` are its poses, probe to patient: the probe's axes are PLUS's (``ultrasound.image_plane``)."""
+class PlannedSweep(_FileModel):
+    """One candidate.
+
+    ``parts`` are its ``ScoreTerms`` by name, ``points`` what each adds to the score, ``values`` its parameters. ``passes`` are its poses,
+    probe to patient; the probe's axes are PLUS's (``ultrasound.image_plane``).
+    """
 
     name: str
     score: float
@@ -48,30 +56,32 @@ class PlannedSweep(_Part):
 
     @field_validator("parts")
     @classmethod
-    def _say_what_is_seen(cls, parts: dict[str, float]) -> dict[str, float]:
+    def _check_coverage(cls, parts: dict[str, float]) -> dict[str, float]:
         if "seen" not in parts:
-            raise ValueError("seen is missing: expected the share of the target that the sweep shows")
+            raise ValueError("seen is missing: expected the fraction of the target that the sweep covers")
         return parts
 
     @field_validator("passes")
     @classmethod
-    def _are_rigid(cls, passes: list[list[Pose]]) -> list[list[Pose]]:
-        poses = np.array([pose for each in passes for pose in each])
-        axes = poses[:, :3, :3]
-        off = np.abs(np.swapaxes(axes, 1, 2) @ axes - np.eye(3)).max()
-        if off > RIGID or (np.linalg.det(axes) < 0).any() or (poses[:, 3] != [0, 0, 0, 1]).any():
+    def _check_rigid(cls, passes: list[list[Pose]]) -> list[list[Pose]]:
+        if not is_rigid(np.array([pose for each in passes for pose in each])):
             raise ValueError(
                 "a pose is not rigid: expected three right-handed unit axes at right angles, and 0 0 0 1 below"
             )
         return passes
+
+    @property
+    def coverage(self) -> float:
+        """The planned coverage of the target, 0 to 1."""
+        return self.parts["seen"]
 
     def poses(self) -> list[np.ndarray]:
         """The poses (n, 4, 4) of each pass."""
         return [np.array(each) for each in self.passes]
 
 
-class Plan(_Part):
-    """``version`` is the Nephron that made it; ``anatomy`` is the fingerprint of the patient's files (``scenes.anatomy``); ``why`` says why the first sweep is first."""
+class Plan(_FileModel):
+    """``version`` is the Nephron that made it, ``anatomy`` the fingerprint of the patient's files, ``why`` the reasons for the order."""
 
     nephron_plan: Literal[1] = 1
     version: str | None = None
@@ -88,18 +98,18 @@ class Plan(_Part):
 
 
 def write_plan(plan: Plan, path: Path) -> None:
-    """Write a plan; the same plan makes the same bytes. Raises OSError."""
+    """Write a plan; the same plan gives the same bytes. Raises OSError."""
     with whole(path) as partial:
         partial.write_text(json.dumps(plan.model_dump(mode="json"), indent=1) + "\n", "utf-8")
 
 
-def next_free(folder: Path) -> Path:
-    """The place of the next plan in a folder."""
+def next_plan_path(folder: Path) -> Path:
+    """The path of the next plan in a folder."""
     return folder / f"plan-{next_number(folder, NAME):03d}.json"
 
 
 def is_plan(path: Path) -> bool:
-    """Whether a file says of itself that it is a plan."""
+    """Whether a file begins as a plan does."""
     try:
         return MARK in path.read_bytes()[:100]
     except OSError:
@@ -122,3 +132,27 @@ def read_plan(path: Path) -> Plan:
         raise PlanError(
             f"{path}: not a plan{f', {where}' if where else ''}: {first['msg'].lower()}; expected a file that app.py plan wrote"
         ) from None
+
+
+def timed_poses(sweep: PlannedSweep, speed_mm_s: float) -> TimedPoses:
+    """The poses of a sweep with times, at a speed on its passes; the probe starts above the first pose and is lifted between passes."""
+    poses: list[np.ndarray] = []
+    speeds: list[float] = []
+    for each in sweep.poses():
+        poses += [_lifted(each[0]), *each, _lifted(each[-1])]
+        speeds += [LIFTED_MM_S, speed_mm_s, *(speed_mm_s for _ in each[1:]), LIFTED_MM_S]
+    durations = [_length_mm(a, b) / speed for (a, b), speed in zip(pairwise(poses), speeds[1:], strict=True)]
+    return TimedPoses(np.cumsum([0.0, APPROACH_S, *durations]), [poses[0], *poses])
+
+
+def _lifted(pose: np.ndarray) -> np.ndarray:
+    """A probe's pose in the patient (4, 4), in PLUS's axes, moved back along the probe's axis."""
+    above = pose.copy()
+    above[:3, 3] -= LIFT_MM * pose[:3, 1]
+    return above
+
+
+def _length_mm(start: np.ndarray, end: np.ndarray) -> float:
+    """The length of a move, with rotations counted as a length; at least a micrometre, because times must increase."""
+    angle = np.degrees(Rotation.from_matrix(end[:3, :3] @ start[:3, :3].T).magnitude())
+    return max(float(np.linalg.norm(end[:3, 3] - start[:3, 3])), float(angle) / DEG_PER_MM, 1e-3)

@@ -1,4 +1,4 @@
-"""Ways of the probe over the settled organ: passes side by side, in each of which it glides on or tilts in place."""
+"""Paths of the probe over the settled organ: parallel passes, in each of which the probe slides or tilts."""
 
 from dataclasses import dataclass
 
@@ -7,29 +7,29 @@ from scipy.spatial.transform import Rotation
 
 from ultrasound.probe_manipulator import ProbeManipulator, advanced, pose_at, touching
 
-# Poses of a pass are no farther apart than this.
+# Largest distance and angle between poses of a pass.
 STEP_MM, STEP_DEG = 1.5, 2.0
-# From so far outside the organ its surface is looked for [mm].
+# Rays towards the organ's surface start this far outside [mm].
 FAR_MM = 300.0
 
 
 @dataclass(frozen=True)
 class SweepPath:
-    """``passes``: the poses (n, 4, 4) of each, along which the probe touches; between two of them it is lifted."""
+    """``passes``: the poses (n, 4, 4) of each pass, with the probe in contact; between passes it is lifted."""
 
     passes: tuple[np.ndarray, ...]
 
     @property
     def poses(self) -> np.ndarray:
-        """All of them (n, 4, 4)."""
+        """The poses (n, 4, 4) of all passes."""
         return np.concatenate(self.passes) if self.passes else np.zeros((0, 4, 4))
 
 
 @dataclass(frozen=True)
 class SweepLayout:
-    """Where passes lie: seen from ``outward``, around a ``centre`` (3,) [mm]; lateral is across the passes.
+    """The frame in which passes are placed: ``centre`` (3,) [mm], and the orthonormal axes (3,) of it.
 
-    ``outward``, ``ahead`` and ``lateral`` are unit vectors (3,) at right angles.
+    ``outward`` points away from the organ, ``ahead`` along the passes, ``lateral`` across them.
     """
 
     centre: np.ndarray
@@ -38,7 +38,7 @@ class SweepLayout:
     lateral: np.ndarray
 
     def turned(self, lean_deg: tuple[float, float], heading_deg: float) -> "SweepLayout":
-        """Leant about lateral, then about ahead, and turned about outward [degrees]."""
+        """Rotated about lateral, then about ahead, and about outward [degrees]."""
         axes = np.column_stack([self.lateral, self.ahead, self.outward])
         turn = Rotation.from_euler("xyz", [*lean_deg, 0.0], degrees=True) * Rotation.from_euler(
             "z", heading_deg, degrees=True
@@ -48,12 +48,12 @@ class SweepLayout:
 
 
 def layout_towards(centre: np.ndarray, outward: np.ndarray, lateral: np.ndarray) -> SweepLayout:
-    """A layout with the lateral direction nearest to one."""
+    """The layout whose lateral axis is nearest to a direction."""
     x, ahead, z = pose_at(centre, -outward, lateral, 0.0)[:3, :3].T
     return SweepLayout(centre, z, ahead, x)
 
 
-def gliding(
+def sliding(
     manipulator: ProbeManipulator,
     layout: SweepLayout,
     aside_mm: np.ndarray,
@@ -62,10 +62,10 @@ def gliding(
     depth_mm: float,
     follow: float,
 ) -> SweepPath:
-    """Passes along the surface, at places aside (k,), each from a start to an end ahead of the centre.
+    """Passes along the surface at lateral offsets (k,), each from a start to an end along ``ahead``.
 
-    The probe is so deep under the settled surface and looks along the layout (``follow`` 0) or square to the surface (1). A pass
-    ends where there is no organ under it; every other one goes back.
+    The array face is ``depth_mm`` below the settled surface. The probe's axis is the layout's (``follow`` 0) or the surface normal (1).
+    A pass ends where the organ ends; every second pass runs backwards.
     """
     count = max(2, int(np.ceil(abs(end_mm - start_mm) / STEP_MM)) + 1)
     passes = []
@@ -86,7 +86,7 @@ def tilting(
     angles_deg: tuple[float, float],
     depth_mm: float,
 ) -> SweepPath:
-    """Passes at places aside (k,), in each of which the probe turns about its face's middle, out of its image plane."""
+    """Passes at lateral offsets (k,), in each of which the probe tilts out of its image plane about the centre of the array face."""
     count = max(2, int(np.ceil(abs(angles_deg[1] - angles_deg[0]) / STEP_DEG)) + 1)
     passes = []
     for number, aside in enumerate(aside_mm):
@@ -105,18 +105,18 @@ def pose_over(
     depth_mm: float,
     follow: float,
 ) -> np.ndarray | None:
-    """The pose (4, 4) at a place of a layout; None where there is no organ."""
+    """The pose (4, 4) at an offset in a layout; None beside the organ."""
     over = layout.centre + aside_mm * layout.lateral + ahead_mm * layout.ahead
     place = manipulator.met(over + FAR_MM * layout.outward, -layout.outward)
     if place is None:
         return None
-    looks = (1 - follow) * layout.outward + follow * manipulator.outward(place)
-    pose = pose_at(place, -looks, layout.lateral, manipulator.size_mm[2])
+    axis = (1 - follow) * layout.outward + follow * manipulator.outward(place)
+    pose = pose_at(place, -axis, layout.lateral, manipulator.size_mm[2])
     return advanced(touching(pose, manipulator.size_mm, manipulator.samples, manipulator.radius_mm), depth_mm)
 
 
 def tilted(pose: np.ndarray, length_mm: float, angle_deg: float) -> np.ndarray:
-    """A pose turned about its lateral axis through the face's middle."""
+    """A pose rotated about its lateral axis through the centre of the array face."""
     turned = pose.copy()
     face = pose[:3, 3] - length_mm / 2 * pose[:3, 2]
     turned[:3, :3] = pose[:3, :3] @ Rotation.from_euler("x", angle_deg, degrees=True).as_matrix()

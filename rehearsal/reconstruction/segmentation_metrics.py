@@ -1,4 +1,4 @@
-"""How well a reconstructed region agrees with the true one: Dice, HD95, volume, centroid."""
+"""Segmentation metrics of a reconstructed region: Dice, HD95, volume, centroid."""
 
 import math
 from dataclasses import dataclass
@@ -9,17 +9,15 @@ from scipy import ndimage
 
 @dataclass(frozen=True)
 class SegmentationMetrics:
-    """Of a region that was found with the true one.
+    """Metrics of a region found, against the true region.
 
-    - ``dice``: twice what they share over what both have, 0 to 1.
-    - ``hd95_mm``: the Hausdorff distance at its 95th percentile: of each surface's distances to the other the
-      95th percentile, and of both the greater (MONAI's definition). A surface is the voxels of a region with
-      one outside among their six neighbours.
-    - ``volume_percent``: how much larger than the truth it is.
-    - ``centroid_mm``: how far the centroids are apart.
+    - ``dice``: Dice coefficient, 0 to 1.
+    - ``hd95_mm``: 95th percentile Hausdorff distance: the larger of the two directed percentiles (MONAI's definition). The
+      surface is the voxels of a region with one outside among their six neighbours.
+    - ``volume_percent``: volume relative to the truth, minus 100 %.
+    - ``centroid_mm``: distance of the centroids.
 
-    Where nothing was found Dice is 0 and the volume -100 %, and the two distances are nan: there is nothing
-    to measure from.
+    Where nothing was found, Dice is 0, the volume -100 %, and the two distances are nan.
     """
 
     dice: float
@@ -40,7 +38,7 @@ def segmentation_metrics(found: np.ndarray, truth: np.ndarray, spacing_mm: float
         raise ValueError("the true region is empty")
     if not found.any():
         return SegmentationMetrics(0.0, math.nan, -100.0, math.nan)
-    # Neither has anything beyond this, so that distances are the same.
+    # The bounding box of both: distances do not change.
     both = ndimage.find_objects((found | truth).astype(np.uint8))[0]
     found, truth = found[both], truth[both]
     shared, count, true_count = (int(np.count_nonzero(a)) for a in (found & truth, found, truth))

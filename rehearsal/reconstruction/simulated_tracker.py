@@ -1,4 +1,4 @@
-"""A recorded sweep as a tracker with errors would have written it."""
+"""A recorded sweep with the errors of a simulated tracker."""
 
 from dataclasses import replace
 
@@ -16,13 +16,12 @@ def with_errors(sweep: Sweep, reference: str, errors: TrackingErrors, seed: int)
     poses = [sweep.transform("Probe", reference, frame) for frame in range(len(sweep))]
     known = [frame for frame, pose in enumerate(poses) if pose is not None]
     if not known:
-        raise SweepError(f"no frame has a pose of the probe in {reference}, on which errors could be put")
+        raise SweepError(f"no frame has a pose of the probe in {reference}, to which errors could be added")
     try:
-        found = tracked(
-            np.stack([pose for pose in poses if pose is not None]), sweep.times_s[known], errors, seed
-        )
+        true_poses = np.stack([pose for pose in poses if pose is not None])
+        found = tracked(true_poses, sweep.times_s[known], errors, seed)
     except ValueError as error:
-        raise SweepError(f"errors of a tracker cannot be put on this sweep: {error}") from None
+        raise SweepError(f"errors of a tracker cannot be added to this sweep: {error}") from None
     name, frames = f"ProbeTo{reference}Transform", [dict(fields) for fields in sweep.frames]
     for frame, pose in zip(known, found, strict=True):
         frames[frame][name] = transform_text(np.eye(4) if pose is None else pose)
@@ -33,6 +32,6 @@ def with_errors(sweep: Sweep, reference: str, errors: TrackingErrors, seed: int)
     )
     if pose is not None and not np.array_equal(pose, after.transform("Probe", reference, first)):  # type: ignore[arg-type]
         raise SweepError(
-            f"the sweep holds {reference}ToProbe, on which no errors can be put: expected {name}"
+            f"the sweep holds {reference}ToProbe, to which no errors can be added: expected {name}"
         )
     return after

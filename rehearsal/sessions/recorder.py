@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from rehearsal.notices import Notices
-from rehearsal.numbered_files import next_number
 from rehearsal.rehearsal import RehearsalState
+from rehearsal.result_files import next_number
 from rehearsal.sessions.packed_state import to_text
 from rehearsal.sessions.recorded_scene import recorded_values
 from rehearsal.sessions.session import Session

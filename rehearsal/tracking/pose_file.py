@@ -1,4 +1,4 @@
-"""Files of probe poses: where the pictures of ``scan`` are taken, and what way a rehearsal follows."""
+"""Files of probe poses: for the images of ``scan``, and as a path that a rehearsal follows."""
 
 import json
 from dataclasses import dataclass
@@ -10,9 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from errors import UserError
 
-# How far the axes of a pose may be from orthonormal: what six digits in a file leave.
+# Tolerance of orthonormal axes: more than the rounding of six digits in a file or of a float32, less than a scaled matrix.
 RIGID = 1e-3
-
 EXPECTED = "expected poses as JSON or CSV"
 
 
@@ -20,17 +19,19 @@ class PoseError(UserError):
     """Poses that cannot be used; the message is one line."""
 
 
-class _Pose(BaseModel):
+Row = Annotated[list[float], Field(min_length=4, max_length=4)]
+Pose = Annotated[list[Row], Field(min_length=4, max_length=4)]
+
+
+class _FilePose(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     name: str = Field("", max_length=40, pattern=r"^[A-Za-z0-9_-]*$")
     time_s: float | None = None
-    probe_to_patient: Annotated[
-        list[Annotated[list[float], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)
-    ]
+    probe_to_patient: Pose
 
 
-class _Placed(NamedTuple):
+class _ReadPose(NamedTuple):
     name: str
     time_s: float | None
     pose: np.ndarray
@@ -38,7 +39,7 @@ class _Placed(NamedTuple):
 
 @dataclass(frozen=True)
 class TimedPoses:
-    """Poses (4, 4) of a probe, None where it was not seen, at times (n,) [s] that grow. Raises PoseError where they do not."""
+    """Poses (4, 4) of a probe, None where it was not tracked, at times (n,) [s]. Raises PoseError unless the times increase."""
 
     times_s: np.ndarray
     poses: list[np.ndarray | None]
@@ -48,8 +49,8 @@ class TimedPoses:
         if back.size:
             number = int(back[0]) + 1
             raise PoseError(
-                f"pose {number + 1} at {self.times_s[number]:g} s is no later than the one before, at "
-                f"{self.times_s[number - 1]:g} s; expected times that grow"
+                f"pose {number + 1} at {self.times_s[number]:g} s is not later than the one before, at "
+                f"{self.times_s[number - 1]:g} s; expected increasing times"
             )
 
     @property
@@ -58,29 +59,29 @@ class TimedPoses:
 
 
 def load_poses(path: Path) -> dict[str, np.ndarray]:
-    """Name -> pose (4, 4), patient (LPS, mm) from probe, of a JSON or CSV file. Raises PoseError.
+    """Name -> pose (4, 4), probe to patient (LPS, mm), from a JSON or CSV file. Raises PoseError.
 
-    The probe's axes are PLUS's: the origin in the middle of the array's face, x to the marked side, y away into the tissue,
-    z = x cross y. JSON holds a list of {"name": ..., "probe_to_patient": 4 x 4}; CSV sixteen numbers a line, row by row. Poses
-    without a name are numbered. Times, where there are some, change nothing.
+    The probe's axes are PLUS's: the origin at the centre of the array face, x to the marked side, y into the tissue, z = x cross y.
+    JSON holds a list of {"name": ..., "probe_to_patient": 4 x 4}, CSV sixteen numbers per line, row by row. Poses without a name are
+    numbered. Times are ignored.
     """
     poses: dict[str, np.ndarray] = {}
     for number, placed in enumerate(_read(path), 1):
         if placed.name in poses:
             raise PoseError(
-                f"{path}: pose {number}: the name {placed.name!r} is there twice; names must differ"
+                f"{path}: pose {number}: the name {placed.name!r} occurs twice; expected different names"
             )
         poses[placed.name or f"{number:04d}"] = placed.pose
     return poses
 
 
 def load_timed_poses(path: Path) -> TimedPoses:
-    """The poses of such a file with their times [s]: in JSON "time_s" of each, in CSV a number before the sixteen. Raises PoseError."""
+    """The poses of such a file with their times [s]: "time_s" in JSON, a number before the sixteen in CSV. Raises PoseError."""
     placed = _read(path)
     for number, each in enumerate(placed, 1):
         if each.time_s is None:
             raise PoseError(
-                f"{path}: pose {number} has no time; expected time_s in JSON, or in CSV seconds and sixteen numbers a line"
+                f"{path}: pose {number} has no time; expected time_s in JSON, or in CSV seconds and sixteen numbers per line"
             )
     try:
         return TimedPoses(np.array([each.time_s for each in placed]), [each.pose for each in placed])
@@ -88,13 +89,13 @@ def load_timed_poses(path: Path) -> TimedPoses:
         raise PoseError(f"{path}: {error}") from None
 
 
-def _read(path: Path) -> list[_Placed]:
+def _read(path: Path) -> list[_ReadPose]:
     try:
         text = path.read_text("utf-8")
     except FileNotFoundError:
-        raise PoseError(f"{path}: no such file of poses") from None
+        raise PoseError(f"{path}: no such pose file") from None
     except UnicodeDecodeError:
-        raise PoseError(f"{path}: is no text; {EXPECTED}") from None
+        raise PoseError(f"{path}: is not text; {EXPECTED}") from None
     except OSError as error:
         raise PoseError(f"{path}: cannot be read as poses ({error.strerror})") from None
     found = _of_csv(path, text) if path.suffix.lower() == ".csv" else _of_json(path, text)
@@ -105,55 +106,65 @@ def _read(path: Path) -> list[_Placed]:
     return found
 
 
-def _of_json(path: Path, text: str) -> list[_Placed]:
+def _of_json(path: Path, text: str) -> list[_ReadPose]:
     try:
         if not text.strip():
             raise PoseError(f"{path}: is empty; expected a list of poses")
-        poses = TypeAdapter(list[_Pose]).validate_python(json.loads(text))
+        poses = TypeAdapter(list[_FilePose]).validate_python(json.loads(text))
     except json.JSONDecodeError as error:
         raise PoseError(f"{path}: not valid JSON: {error}; {EXPECTED}") from None
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        where = (
-            f"pose {int(first['loc'][0]) + 1}, {'.'.join(map(str, first['loc'][1:]))}: "
-            if first["loc"]
-            else ""
-        )
+        where = ""
+        if first["loc"]:
+            number, *field = first["loc"]
+            where = f"pose {int(number) + 1}, {'.'.join(map(str, field))}: "
         raise PoseError(
             f"{path}: {where}{first['msg'].lower()}; expected a list of poses with probe_to_patient, 4 rows of 4 numbers"
         ) from None
-    return [_Placed(pose.name, pose.time_s, np.array(pose.probe_to_patient)) for pose in poses]
+    return [_ReadPose(pose.name, pose.time_s, np.array(pose.probe_to_patient)) for pose in poses]
 
 
-def _of_csv(path: Path, text: str) -> list[_Placed]:
+def _of_csv(path: Path, text: str) -> list[_ReadPose]:
     rows = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     sixteen = "sixteen, row by row, or before them the time in s"
     try:
         numbers = [[float(value) for value in line.replace(";", ",").split(",")] for line in rows]
     except ValueError as error:
         found = str(error).partition(": ")[2]
-        raise PoseError(f"{path}: {found} is no number; expected {sixteen}") from None
+        raise PoseError(f"{path}: {found} is not a number; expected {sixteen}") from None
     for number, row in enumerate(numbers, 1):
         if len(row) not in (16, 17) or len(row) != len(numbers[0]):
             raise PoseError(f"{path}: pose {number}: {len(row)} numbers; expected {sixteen}, as in each line")
         if not np.isfinite(row[0]):
-            raise PoseError(f"{path}: pose {number}: begins with {row[0]}; expected a finite number")
+            raise PoseError(f"{path}: pose {number}: starts with {row[0]}; expected a finite number")
     return [
-        _Placed("", row[0] if len(row) == 17 else None, np.array(row[-16:]).reshape(4, 4)) for row in numbers
+        _ReadPose("", row[0] if len(row) == 17 else None, np.array(row[-16:]).reshape(4, 4))
+        for row in numbers
     ]
 
 
+def is_rigid(poses: np.ndarray) -> bool:
+    """Whether all matrices (..., 4, 4) are finite rotations without mirroring, with a translation."""
+    axes = poses[..., :3, :3]
+    return bool(
+        np.isfinite(poses).all()
+        and _axes_error(axes) <= RIGID
+        and (np.linalg.det(axes) > 0).all()
+        and np.allclose(poses[..., 3, :], [0, 0, 0, 1])
+    )
+
+
 def check_rigid(what: str, pose: np.ndarray) -> None:
-    """Raises PoseError, which says of what, where a matrix (4, 4) is no rigid pose."""
-    axes = pose[:3, :3]
-    off = np.abs(axes.T @ axes - np.eye(3)).max()
-    if not (
-        np.isfinite(pose).all()
-        and off <= RIGID
-        and np.linalg.det(axes) > 0
-        and np.allclose(pose[3], [0, 0, 0, 1])
-    ):
+    """Raises PoseError, with ``what`` it is, unless a matrix (4, 4) is a rigid pose."""
+    if not is_rigid(pose):
+        axes = pose[:3, :3]
         raise PoseError(
             f"{what} is not rigid: expected three right-handed unit axes at right angles (found an error of "
-            f"{off:.2g}, determinant {np.linalg.det(axes):.3g}) and a last row of 0 0 0 1"
+            f"{_axes_error(axes):.2g}, determinant {np.linalg.det(axes):.3g}) and a last row of 0 0 0 1"
         )
+
+
+def _axes_error(axes: np.ndarray) -> float:
+    """The largest deviation of the axes' products from orthonormal."""
+    return float(np.abs(np.swapaxes(axes, -1, -2) @ axes - np.eye(3)).max())

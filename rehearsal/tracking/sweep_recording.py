@@ -1,10 +1,10 @@
-"""Sweeps that the user records in the window."""
+"""Tracked sweeps that the user records in the window."""
 
 from pathlib import Path
 
 from rehearsal.coordinates import probe_in_patient
-from rehearsal.numbered_files import next_number
 from rehearsal.rehearsal import Rehearsal
+from rehearsal.result_files import next_number
 from render.viewer import View
 from ultrasound.labelled_sweep import LabelledSweep
 from ultrasound.probe import Probe
@@ -14,71 +14,71 @@ FRAME_S = 1 / 30
 NAME = r"sweep-([0-9]{3,9})\.igs\.mha"
 
 
-class Sweeping:
-    """Nothing, or a sweep that grows."""
+class SweepRecorder:
+    """Records a sweep between two calls of ``toggle``; methods return a message for the user, or nothing."""
 
     def __init__(self, rehearsal: Rehearsal) -> None:
         self.rehearsal = rehearsal
         self._sweep: LabelledSweep | None = None
         self._began_s = self._due_s = 0.0
-        self._shows = ""
+        self._image_kind = ""
 
     def toggle(self, out: Path) -> str:
-        """Begin a sweep under the next free number of a folder, or end the one that goes on; what there is to say."""
+        """Begin a sweep under the next free number of a folder, or end the current one."""
         if self._sweep is not None:
             return self.end()
         if self.rehearsal.scanner is None:
-            return "No CT, no sweep"
+            return "No sweep: the scene has no CT"
         stem = f"sweep-{next_number(out, NAME):03d}"
         try:
             self._sweep = LabelledSweep(out, stem, self.rehearsal.probe)
         except OSError as error:
-            return f"{stem} cannot be written: {_words(error)}"
-        self._began_s, self._due_s, self._shows = 0.0, 0.0, ""
+            return f"{stem} cannot be written: {_reason(error)}"
+        self._began_s, self._due_s, self._image_kind = 0.0, 0.0, ""
         return f"{stem}: {{sweep}} ends it"
 
     @property
     def status(self) -> str:
-        """What stands in the panel while a sweep goes on."""
+        """A line for the panel during a recording."""
         return "" if self._sweep is None else f"RECORDING {self._due_s - self._began_s:.0f} s"
 
     def end(self) -> str:
-        """End the sweep, where there is one; what there is to say."""
+        """End the current sweep."""
         sweep, self._sweep = self._sweep, None
         if sweep is None:
             return ""
         try:
             sweep.close()
         except (OSError, SweepError) as error:
-            return f"No sweep: {_words(error)}"
-        return f"{sweep.name}: {sweep.count} pictures"
+            return f"No sweep: {_reason(error)}"
+        return f"{sweep.name}: {sweep.count} images"
 
     def watch(self, time_s: float, view: View, probe: Probe) -> str:
-        """Add what is seen now, where a sweep goes on and a frame is due; what there is to say."""
+        """Add the current image where a frame is due."""
         if time_s < self._due_s - FRAME_S - 1e-9:
-            # A replay was taken over: another session, with a time of its own.
+            # After the end of a replay another session begins, with its own time.
             return self.end()
         if self._sweep is None or time_s < self._due_s - 1e-9 or self.rehearsal.scanner is None:
             return ""
         if self._sweep.count == 0:
             self._began_s = time_s
         self._due_s = time_s + FRAME_S
-        name, picture = next(iter(view.pictures.items()))
-        if name != (self._shows or name):
-            # Echo and CT in one sweep would be no volume of either.
+        kind, image = next(iter(view.pictures.items()))
+        if kind != (self._image_kind or kind):
+            # A volume of B-mode and CT images would be neither.
             return self.end()
-        self._shows = name
-        marks = self.rehearsal.scanner.marks.render()
+        self._image_kind = kind
+        labels = self.rehearsal.scanner.marks.render()
         try:
-            self._sweep.add(picture, marks, probe, probe_in_patient(self.rehearsal), time_s)
+            self._sweep.add(image, labels, probe, probe_in_patient(self.rehearsal), time_s)
         except SweepError as error:
             return f"{self.end()}: {error}"
         except OSError as error:
-            # A frame that was half written would be in the file.
+            # The file would contain an incomplete frame.
             self._sweep = None
-            return f"No sweep: {_words(error)}"
+            return f"No sweep: {_reason(error)}"
         return ""
 
 
-def _words(error: OSError | SweepError) -> str:
+def _reason(error: OSError | SweepError) -> str:
     return error.strerror or str(error) if isinstance(error, OSError) else str(error)

@@ -1,31 +1,32 @@
-"""The way of a tracked probe that a rehearsal is to follow, from a file."""
+"""The path of a tracked probe, which a rehearsal follows, from a file."""
 
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rehearsal.planning.plan_file import is_plan, read_plan
-from rehearsal.planning.plan_poses import timed_poses
+from rehearsal.planning.plan_file import is_plan, read_plan, timed_poses
 from rehearsal.tracking.pose_file import PoseError, TimedPoses, check_rigid, load_timed_poses
 from ultrasound.sweep import TRANSFORM_NAME, SweepError
 from ultrasound.sweep_file import read_sweep
 
 PROBE_IN_PATIENT = "ProbeToReference"
-# Poses that are all farther from the organ than this are of something else.
+# If all poses are farther from the organ, they are not of this patient.
 FAR_MM = 50.0
 
 
 def load_track(path: Path, name: str | None = None) -> TimedPoses:
-    """The way of a probe in the patient, of a tracked sweep (.igs.mha), the first sweep of a plan, or a file of poses with times.
+    """The poses of a probe in the patient, from a tracked sweep (.igs.mha), the first sweep of a plan, or a pose file with times.
 
-    ``name`` is the sweep's transform that takes the probe to the patient, ProbeToReference where it is None. Raises PoseError,
-    SweepError, PlanError.
+    ``name`` is the sweep's transform from the probe to the patient, ProbeToReference where it is None. Raises PoseError, SweepError,
+    PlanError.
     """
     if path.suffix.lower() == ".mha":
-        return _of_sweep(path, name or PROBE_IN_PATIENT)
+        return _sweep_poses(path, name or PROBE_IN_PATIENT)
     if name is not None:
-        raise PoseError(f"--track-from {name}: {path.name} is no sweep (.igs.mha), whose transforms it names")
+        raise PoseError(
+            f"--track-from {name}: names a transform of a sweep, and {path.name} is not a sweep (.igs.mha); leave it out"
+        )
     if is_plan(path):
         plan = read_plan(path)
         return timed_poses(plan.sweeps[0], plan.speed_mm_s)
@@ -33,7 +34,7 @@ def load_track(path: Path, name: str | None = None) -> TimedPoses:
 
 
 def check_near(track: TimedPoses, organ: np.ndarray, path: Path) -> None:
-    """Raises PoseError where a track never comes near an organ's vertices (n, 3) in the patient (LPS, mm)."""
+    """Raises PoseError where no pose is near an organ's vertices (n, 3) in the patient (LPS, mm)."""
     places = np.array([pose[:3, 3] for pose in track.poses if pose is not None])
     nearest = float(cKDTree(organ).query(places)[0].min())
     if nearest > FAR_MM:
@@ -43,7 +44,7 @@ def check_near(track: TimedPoses, organ: np.ndarray, path: Path) -> None:
         )
 
 
-def _of_sweep(path: Path, name: str) -> TimedPoses:
+def _sweep_poses(path: Path, name: str) -> TimedPoses:
     found = TRANSFORM_NAME.fullmatch(name)
     if found is None:
         raise SweepError(f"--track-from {name!r}: expected a transform's name such as {PROBE_IN_PATIENT}")

@@ -1,4 +1,4 @@
-"""A tracked probe that leads the transducer: a tracker's newest pose, or those of a file at the rehearsal's time."""
+"""A tracked probe as input: the newest pose of a tracker, or the poses of a file at the rehearsal's time."""
 
 from typing import Protocol
 
@@ -11,40 +11,40 @@ from rehearsal.sessions.session import Session
 from rehearsal.tracking.pose_file import TimedPoses
 from ultrasound.probe_manipulator import interpolated
 
-# A probe that is held still moves no farther than this: a hand's tremor, and a tracker's noise.
+# A resting probe moves less than this: tremor of a hand, and noise of a tracker.
 STILL_MM, STILL_DEG = 3.0, 3.0
 
 
-class TrackOver(Exception):
-    """There will be no more poses; the message is for the user."""
+class TrackEnded(Exception):
+    """There are no more poses; the message is for the user."""
 
 
-class Tracked(Protocol):
-    """Whatever knows where a probe is."""
+class PoseSource(Protocol):
+    """Gives the pose of a probe."""
 
     def pose(self) -> np.ndarray | None:
-        """The probe's newest pose in the patient (4, 4), in PLUS's axes (LPS, mm); None where it is not known now.
+        """The probe's newest pose in the patient (4, 4), in PLUS's axes (LPS, mm); None while it is not tracked.
 
-        May raise TrackOver.
+        May raise TrackEnded.
         """
         ...
 
 
-class PlayedPoses:
-    """Poses of a file as a tracker would give them, by the simulated time of a session."""
+class PosePlayback:
+    """The poses of a file, at the simulated time of a session."""
 
     def __init__(self, poses: TimedPoses, session: Session) -> None:
         self.poses, self.session = poses, session
 
     def pose(self) -> np.ndarray | None:
-        # A sum of steps is not to miss the last pose by rounding.
+        # The time is a sum of steps: its rounding must not skip the last pose.
         if self.session.time_s > self.poses.length_s + 1e-9:
-            raise TrackOver("The tracked file is over: yours now")
+            raise TrackEnded("End of the tracked file: mouse and keys control the probe")
         return pose_at_time(self.poses, self.session.time_s)
 
 
 def pose_at_time(poses: TimedPoses, time_s: float) -> np.ndarray | None:
-    """The pose (4, 4) so long after the first, between two in position and angle; None where one of the two was not seen."""
+    """The pose (4, 4) at a time after the first, interpolated between two; None where one of the two was not tracked."""
     times, last = poses.times_s - poses.times_s[0], len(poses.times_s) - 1
     after = min(int(np.searchsorted(times, time_s)), last)
     end = poses.poses[after]
@@ -56,21 +56,21 @@ def pose_at_time(poses: TimedPoses, time_s: float) -> np.ndarray | None:
     return interpolated(start, end, float((time_s - times[after - 1]) / (times[after] - times[after - 1])))
 
 
-class Follower:
-    """Makes goals for the transducer of where a probe is tracked; ``is_lost`` while that is not known."""
+class TrackingInput:
+    """Goals for the transducer from a tracked probe; ``is_lost`` while it is not tracked."""
 
-    def __init__(self, tracked: Tracked, rehearsal: Rehearsal) -> None:
+    def __init__(self, tracked: PoseSource, rehearsal: Rehearsal) -> None:
         self.tracked, self.rehearsal = tracked, rehearsal
         self.is_lost = False
         self._waits = False
-        self._since: np.ndarray | None = None
+        self._resting_pose: np.ndarray | None = None
 
     def wait(self) -> None:
-        """Stay from now on until the tracked probe moves."""
-        self._waits, self._since = True, None
+        """Give no goals until the tracked probe moves."""
+        self._waits, self._resting_pose = True, None
 
     def goal(self) -> np.ndarray | None:
-        """The pose (4, 4) that the transducer is to go to, None where it stays. May raise TrackOver."""
+        """The transducer's next goal (4, 4); None to stay. May raise TrackEnded."""
         pose = self.tracked.pose()
         self.is_lost = pose is None
         if pose is None or self._is_waiting(pose):
@@ -79,12 +79,12 @@ class Follower:
 
     def _is_waiting(self, pose: np.ndarray) -> bool:
         if self._waits:
-            self._since = pose if self._since is None else self._since
-            self._waits = not has_moved(self._since, pose)
+            self._resting_pose = pose if self._resting_pose is None else self._resting_pose
+            self._waits = not has_moved(self._resting_pose, pose)
         return self._waits
 
 
 def has_moved(before: np.ndarray, now: np.ndarray) -> bool:
-    """Whether a pose is another, and not only by tremor and noise."""
+    """Whether two poses differ by more than tremor and noise."""
     turn = Rotation.from_matrix(now[:3, :3] @ before[:3, :3].T).magnitude()
     return bool(np.linalg.norm(now[:3, 3] - before[:3, 3]) > STILL_MM or np.degrees(turn) > STILL_DEG)

@@ -9,8 +9,8 @@ import trimesh
 
 from rehearsal.configuration import Setup, scene_of
 from rehearsal.reconstruction.compression_correction import CompressionCorrection
-from rehearsal.reconstruction.patient_comparison import compared, surfaces_of
-from rehearsal.reconstruction.sweep_volumes import Places, rebuild, track_of
+from rehearsal.reconstruction.patient_comparison import compare_with_surfaces, surfaces_of
+from rehearsal.reconstruction.sweep_volumes import Places, image_poses_of, reconstruct_volumes
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene, with_options
@@ -118,7 +118,7 @@ def compression(
     for depth in _depths(quick):
         truth = pressed(rehearsal, depth)
         rehearsal.reset()
-        track = track_of(truth.sweep, REFERENCE)
+        track = image_poses_of(truth.sweep, REFERENCE)
         unsqueezed = CompressionCorrection(rehearsal, truth.sweep, track, REFERENCE)
         for undone, places in ((False, None), (True, unsqueezed)):
             row = dict(depth_mm=depth, compression_mm=round(truth.compression_mm, 4), undone=undone)
@@ -135,8 +135,8 @@ def _row(
     method: str = "smooth",
 ) -> dict[str, Any]:
     sweep = sweep_of(truth.sweep.images, poses, truth.sweep.times_s, truth.on_probe)
-    track = track_of(sweep, REFERENCE)
-    rebuilt = rebuild(
+    track = image_poses_of(sweep, REFERENCE)
+    rebuilt = reconstruct_volumes(
         sweep, track, truth.mask, SPACING_MM, method, REACH_MM, sweep, places=places, with_grey=False
     )
-    return compared(rebuilt, surfaces, truth.beads_mm)
+    return compare_with_surfaces(rebuilt, surfaces, truth.beads_mm)

@@ -7,7 +7,7 @@ import trimesh
 
 from rehearsal.coordinates import probe_in_patient
 from rehearsal.measurements.tumour_measurements import measure
-from rehearsal.reconstruction.compression_correction import come
+from rehearsal.reconstruction.compression_correction import approach
 from rehearsal.rehearsal import Rehearsal, scanned_anatomy
 from scenes.anatomy import LoadedAnatomy
 from sim.embedding import Unmoved
@@ -101,7 +101,7 @@ def pressed(rehearsal: Rehearsal, depth_mm: float) -> Truth:
     beads = beads_of(rehearsal.organ, rehearsal.tumour)
     marks = _marks(rehearsal.scanner.plane, rehearsal.organ, rehearsal.tumour, beads)
     touches = np.ones(probe.number_of_scanlines, bool)
-    come(rehearsal, way[0])
+    approach(rehearsal, way[0])
     images, poses, squeezed = [], [], []
     every = round(1 / (FRAMES_A_SECOND * rehearsal.settings.time_step_s))
     for step, pose in enumerate(way):

@@ -6,10 +6,15 @@ from functools import partial
 import numpy as np
 
 from rehearsal.planning.plan_file import PlannedSweep
-from rehearsal.planning.plan_poses import passes_in
-from rehearsal.planning.sweep_candidates import UNPLANNED_MM, half_size, passes_needed, width_mm
-from rehearsal.planning.sweep_path import SweepLayout, SweepPath, gliding, layout_towards
-from rehearsal.planning.trial import Trial
+from rehearsal.planning.plan_guidance import passes_in
+from rehearsal.planning.sweep_candidates import (
+    DEFAULT_DEPTH_MM,
+    half_extent_mm,
+    image_width_mm,
+    passes_needed,
+)
+from rehearsal.planning.sweep_path import SweepLayout, SweepPath, layout_towards, sliding
+from rehearsal.planning.sweep_trial import Trial
 
 
 def straight(trial: Trial) -> SweepPath:
@@ -21,10 +26,10 @@ def straight(trial: Trial) -> SweepPath:
 def row_by_row(trial: Trial) -> SweepPath:
     """As many passes side by side, straight down, as the target is wide."""
     layout, half = _seen_from_above(trial)
-    return _rows(trial, layout, half, passes_needed(half[0], width_mm(trial.rehearsal, layout)))
+    return _rows(trial, layout, half, passes_needed(half[0], image_width_mm(trial.rehearsal, layout)))
 
 
-def by_chance(trial: Trial, count: int, seed: int) -> SweepPath:
+def random_sweep(trial: Trial, count: int, seed: int) -> SweepPath:
     """Passes anywhere over the target, each with a heading and depth of its own, square to the surface."""
     layout, half = _seen_from_above(trial)
     chance = np.random.default_rng(seed)
@@ -34,8 +39,8 @@ def by_chance(trial: Trial, count: int, seed: int) -> SweepPath:
         turned = layout.turned((0.0, 0.0), chance.uniform(-180.0, 180.0))
         centre = layout.centre + aside * layout.lateral + ahead * layout.ahead
         one = SweepLayout(centre, turned.outward, turned.ahead, turned.lateral)
-        depth = chance.uniform(0.0, 2 * UNPLANNED_MM)
-        passes += gliding(trial.rehearsal.manipulator, one, np.zeros(1), -half[1], half[1], depth, 1.0).passes
+        depth = chance.uniform(0.0, 2 * DEFAULT_DEPTH_MM)
+        passes += sliding(trial.rehearsal.manipulator, one, np.zeros(1), -half[1], half[1], depth, 1.0).passes
     return SweepPath(tuple(passes))
 
 
@@ -49,18 +54,18 @@ def _seen_from_above(trial: Trial) -> tuple[SweepLayout, np.ndarray]:
     coverage, press = trial.coverage, trial.rehearsal.press
     places = coverage.places(trial.target)
     layout = layout_towards(places.mean(axis=0), -np.array(press.direction), np.array(press.lateral))
-    return layout, half_size(layout, places)
+    return layout, half_extent_mm(layout, places)
 
 
 def _rows(trial: Trial, layout: SweepLayout, half: np.ndarray, count: int) -> SweepPath:
-    width = width_mm(trial.rehearsal, layout)
+    width = image_width_mm(trial.rehearsal, layout)
     aside = width * (np.arange(count) - (count - 1) / 2)
-    return gliding(trial.rehearsal.manipulator, layout, aside, -half[1], half[1], UNPLANNED_MM, 0.0)
+    return sliding(trial.rehearsal.manipulator, layout, aside, -half[1], half[1], DEFAULT_DEPTH_MM, 0.0)
 
 
 UNPLANNED = {"straight": straight, "row by row": row_by_row}
 
 
-def ways_by_chance(count: int, seeds: range) -> list[Callable[[Trial], SweepPath]]:
-    """One for each seed, as ``Workers.go_ways`` takes them."""
-    return [partial(by_chance, count=count, seed=seed) for seed in seeds]
+def random_sweeps(count: int, seeds: range) -> list[Callable[[Trial], SweepPath]]:
+    """One for each seed, as ``TrialWorkers.try_paths`` takes them."""
+    return [partial(random_sweep, count=count, seed=seed) for seed in seeds]

@@ -8,16 +8,14 @@ from typing import Any
 import numpy as np
 
 from rehearsal.configuration import PRESETS, probe_of, scene_of
-from rehearsal.planning.make_plan import make_plan
-from rehearsal.planning.score import score
-from rehearsal.planning.score_terms import ScoreTerms
-from rehearsal.planning.search import length_at, length_of
+from rehearsal.planning.plan_search import make_plan, total_work, work_at
 from rehearsal.planning.sweep_path import SweepPath
-from rehearsal.planning.trial import Trial
-from rehearsal.planning.trial_workers import Outcome, Problem, workers
+from rehearsal.planning.sweep_score import ScoreTerms, score
+from rehearsal.planning.sweep_trial import Trial
+from rehearsal.planning.trial_workers import PlanningProblem, TrialResult, TrialWorkers
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
-from studies.planning.baseline_sweeps import UNPLANNED, planned, ways_by_chance
+from studies.planning.baseline_sweeps import UNPLANNED, planned, random_sweeps
 from ultrasound.target import Target
 
 TARGET: Target = "margin"
@@ -30,7 +28,7 @@ JUDGED_ON = PLANNED_ON.but(cell_mm=2.7, iterations=8)
 
 def count_of(trials: int) -> int:
     """What ``compare`` says is done adds up to this."""
-    return length_of(trials, SPEED_MM_S) + (1 + len(UNPLANNED) + len(SEEDS)) * length_at(SPEED_MM_S)
+    return total_work(trials, SPEED_MM_S) + (1 + len(UNPLANNED) + len(SEEDS)) * work_at(SPEED_MM_S)
 
 
 def compare(
@@ -38,20 +36,20 @@ def compare(
 ) -> dict[str, Any]:
     """Plan for the tumour and its margin, and go planned and straight sweeps, and such by chance. Raises PlanError."""
     probe = probe_of(scene)
-    problem = Problem(scene_of(scene, PLANNED_ON), anatomy, probe, TARGET, MARGIN_MM, scene.trocar)
-    with workers(problem, jobs) as crew:
-        plan = make_plan(problem, crew, SPEED_MM_S, trials, done)
+    problem = PlanningProblem(scene_of(scene, PLANNED_ON), anatomy, probe, TARGET, MARGIN_MM, scene.trocar)
+    with TrialWorkers(problem, jobs) as workers:
+        plan = make_plan(problem, workers, SPEED_MM_S, trials, done)
     sweep = plan.sweeps[0]
     ways: list[Callable[[Trial], SweepPath]] = [
         partial(planned, sweep=sweep),
         *UNPLANNED.values(),
-        *ways_by_chance(len(sweep.passes), SEEDS),
+        *random_sweeps(len(sweep.passes), SEEDS),
     ]
-    outcomes: list[Outcome] = []
-    with workers(replace(problem, scene=scene_of(scene, JUDGED_ON)), jobs) as crew:
-        for one in crew.go_ways(ways, SPEED_MM_S):
+    outcomes: list[TrialResult] = []
+    with TrialWorkers(replace(problem, scene=scene_of(scene, JUDGED_ON)), jobs) as workers:
+        for one in workers.try_paths(ways, SPEED_MM_S):
             outcomes.append(one)
-            done(length_at(SPEED_MM_S))
+            done(work_at(SPEED_MM_S))
     rows = [_row(name, [one]) for name, one in zip(["planned", *UNPLANNED], outcomes, strict=False)]
     rows.append(_row("by chance", outcomes[len(rows) :]))
     return dict(
@@ -65,13 +63,13 @@ def compare(
     )
 
 
-def _row(name: str, outcomes: list[Outcome]) -> dict[str, Any]:
+def _row(name: str, outcomes: list[TrialResult]) -> dict[str, Any]:
     """Means over several sweeps, and of how many."""
-    parts = [asdict(one.parts) for one in outcomes]
+    parts = [asdict(one.terms) for one in outcomes]
     means = ScoreTerms(**{key: float(np.mean([each[key] for each in parts])) for key in parts[0]})
     return dict(
         sweep=name,
         count=len(outcomes),
         **asdict(means),
-        score=float(np.mean([score(one.parts) for one in outcomes])),
+        score=float(np.mean([score(one.terms) for one in outcomes])),
     )

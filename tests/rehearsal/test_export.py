@@ -12,7 +12,7 @@ import trimesh
 from conftest import rotation_about
 
 import app
-from rehearsal.saving import save_surfaces
+from rehearsal.image_and_surface_files import save_surfaces
 from scenes.surface_files import FORMATS, save_surface
 from scenes.volume_files import save_image
 from sim.fields import field_of
@@ -84,7 +84,7 @@ def test_all_surfaces_of_a_scene_come_out_where_they_are(patient, tmp_path, caps
         assert len(got) == len(wanted) > 400
         assert np.array_equal(np.unique(got, axis=0), np.unique(wanted, axis=0))
         assert trimesh.load_mesh(out / f"{name}.stl").volume > 0
-    assert "Left out: 1 of" in told and "vessels.stl" in told
+    assert "Left out: 1 shape" in told and "vessels.stl" in told
 
 
 def test_voxels_type_and_grid_come_out_as_they_were(patient, tmp_path):

@@ -92,7 +92,7 @@ def looping(monkeypatch, tmp_path, sent) -> WindowFrames:
     fake = Fake()
     monkeypatch.setattr(frame, "image_view", fake.image_view)
     return WindowFrames(
-        *(fake, fake, fake, FakeTally(), SimpleNamespace(show=sent.append)),
+        *(fake, fake, fake, FakeTally(), SimpleNamespace(send=sent.append)),
         **dict(viewer=None, out=tmp_path, notices=Notices(), sweeping=fake, plans=fake),
     )
 
@@ -266,7 +266,7 @@ def test_without_a_window_pictures_go_to_the_link_and_the_tissue_into_the_folder
     monkeypatch.setattr(frame, "image_view", fake.image_view)
     monkeypatch.setattr(headless, "summary", lambda report: "")
     monkeypatch.setattr(headless, "save_surfaces", lambda rehearsal, out: saved.append((fake.steps, out)))
-    frames = Frames(fake, fake, fake, FakeTally(), SimpleNamespace(show=sent.append))
+    frames = Frames(fake, fake, fake, FakeTally(), SimpleNamespace(send=sent.append))
     headless.run_headless(frames, Notices(), 3, Settings(), "cpu", tmp_path)
     assert [live.grey[0, 0] for live in sent] == [1, 2, 3] and sent[-1].time_s == 3 * STEP_S
     assert [live.image_to_probe[1, 1] for live in sent] == [51 / 4, 52 / 4, 53 / 4]
@@ -331,7 +331,7 @@ def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scen
 
 
 def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path, sent):
-    link, given = SimpleNamespace(show=sent.append), []
+    link, given = SimpleNamespace(send=sent.append), []
     viewer = SimpleNamespace(close=lambda: None, settings=Settings())
     monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide: None)
     monkeypatch.setattr(run, "open_viewer", lambda rehearsal, **_: viewer)

@@ -55,7 +55,7 @@ def test_the_instruments_watch_the_guide_and_record_it(watching, rehearsal, one_
     view = watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings())
     assert view.guidance.goal == pytest.approx(SECOND[0]) and view.findings["plan"] == "57 %"
     watching.restart()
-    assert watching.guide.at == 0
+    assert watching.guide.next_pose == 0
     watching.guide = None
     assert watching.onto(view, Settings()).guidance is None and "plan_followed" not in watching.figures()
 
@@ -82,7 +82,7 @@ def test_what_a_session_holds_is_recalled_as_it_was_watched(watching, rehearsal,
     log.seen[5] = pack_seen(watching.coverage.seen)
     assert again.recall(log, 5)
     assert again.figures() == watching.figures() and again.summary(2) == watching.summary(2)
-    assert (again.course.presses, again.course.went_back, again.guide.at) == (1, 1, 4)
+    assert (again.course.presses, again.course.went_back, again.guide.next_pose) == (1, 1, 4)
     view = again.onto(View(np.eye(4), {}, 40.0, 60.0), Settings(show_seen=True))
     assert view.findings["tumour seen"] == "100 %" and view.seen["tumour"].any()
     del log.events[1][0].value["contact_mm2"]

@@ -1,7 +1,7 @@
 """Files that are numbered."""
 
-from rehearsal.numbered_files import next_number
-from rehearsal.saving import PICTURE, SCREENSHOT
+from rehearsal.image_and_surface_files import IMAGE, SCREENSHOT
+from rehearsal.result_files import next_number
 
 
 def test_the_next_number_is_one_more_than_the_highest(tmp_path):
@@ -16,10 +16,10 @@ def test_the_next_number_is_one_more_than_the_highest(tmp_path):
     ):
         (tmp_path / name).touch()
     assert next_number(tmp_path, SCREENSHOT) == 8
-    assert next_number(tmp_path, PICTURE) == 14
+    assert next_number(tmp_path, IMAGE) == 14
 
 
 def test_numbers_go_on_after_three_digits(tmp_path):
     for name in ("screenshot-999.png", "screenshot-1000.png", "1000-no ct.png"):
         (tmp_path / name).touch()
-    assert next_number(tmp_path, SCREENSHOT) == next_number(tmp_path, PICTURE) == 1001
+    assert next_number(tmp_path, SCREENSHOT) == next_number(tmp_path, IMAGE) == 1001

@@ -1,4 +1,4 @@
-"""The link: what a client gets over a real socket, where it is in the patient, and clients that misbehave."""
+"""The OpenIGTLink server over real sockets: messages, coordinates, and clients that misbehave."""
 
 import io
 import socket
@@ -15,10 +15,16 @@ from conftest import rotation_about
 from pyigtl.messages import CRC64
 
 from rehearsal.tracking import openigtlink_server as server_module
-from rehearsal.tracking.openigtlink_image import send_live
-from rehearsal.tracking.openigtlink_messages import IMAGE, IMAGE_TO_PROBE, PROBE, LivePicture, packed
-from rehearsal.tracking.openigtlink_pose import HAND, STALE_S
-from rehearsal.tracking.openigtlink_server import Server
+from rehearsal.tracking.openigtlink_messages import (
+    HAND_TO_REFERENCE,
+    IMAGE,
+    IMAGE_TO_PROBE,
+    PROBE,
+    STALE_S,
+    LiveImage,
+    packed,
+)
+from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer, send_live
 from ultrasound.probe import Probe, load_probe
 
 # One of 3 x 5 pixels is 277 bytes.
@@ -36,15 +42,13 @@ def pose() -> np.ndarray:
     return pose
 
 
-def live(
-    number: int = 0, rows: int = ROWS, columns: int = COLUMNS, probe: Probe | None = None
-) -> LivePicture:
+def live(number: int = 0, rows: int = ROWS, columns: int = COLUMNS, probe: Probe | None = None) -> LiveImage:
     """Pictures that tell their number by pixels, place and time."""
     grey = ((np.arange(rows * columns) + number) % 251).astype(np.uint8).reshape(rows, columns)
     place = pose()
     place[0, 3] += number
     pixels = (probe or load_probe("linear")).image_to_probe(rows, columns)
-    return LivePicture(grey, pixels, place, number / 30)
+    return LiveImage(grey, pixels, place, number / 30)
 
 
 @pytest.fixture
@@ -53,9 +57,9 @@ def said() -> list[str]:
 
 
 @pytest.fixture
-def server(said) -> Iterator[Server]:
+def server(said) -> Iterator[OpenIGTLinkServer]:
     """A server on a free port of the loopback."""
-    with Server("127.0.0.1", 0, said.append) as server:
+    with OpenIGTLinkServer("127.0.0.1", 0, said.append) as server:
         yield server
 
 
@@ -66,7 +70,7 @@ def client(server) -> Iterator[pyigtl.OpenIGTLinkClient]:
     client.stop()
 
 
-def joined(server: Server) -> socket.socket:
+def joined(server: OpenIGTLinkServer) -> socket.socket:
     return socket.create_connection(("127.0.0.1", server.port), SOON_S)
 
 
@@ -102,14 +106,14 @@ def soon(holds: Callable[[], bool]) -> bool:
 
 
 def test_a_client_gets_pictures_and_poses_at_thirty_a_second(server, client):
-    server.show(live(0))
+    server.send(live(0))
     assert client.wait_for_message(IMAGE, SOON_S).image[0, 0, 0] == 0
     fed = 60
 
     def feed() -> None:
         for number in range(1, fed + 1):
             time.sleep(1 / 30)
-            server.show(live(number))
+            server.send(live(number))
 
     feeder = threading.Thread(target=feed)
     feeder.start()
@@ -141,7 +145,7 @@ def test_the_corner_pixels_are_where_they_are_in_the_patient(server):
     assert above > 1
     sent = live(7, rows, columns, probe)
     with joined(server) as connection:
-        server.show(sent)
+        server.send(sent)
         body = next_picture(connection)
     version, components, scalar, _, space, *size = struct.unpack(">HBBBBHHH", body[:12])
     assert (version, components, scalar, space, size) == (1, 1, 3, 1, [columns, rows, 1])
@@ -165,14 +169,14 @@ def test_the_corner_pixels_are_where_they_are_in_the_patient(server):
 
 def test_pyigtl_reads_the_same_corner(server, client):
     sent = live(3)
-    server.show(sent)
+    server.send(sent)
     message = client.wait_for_message(IMAGE, SOON_S)
     wanted = np.diag([-1, -1, 1, 1]) @ sent.probe_in_patient @ sent.image_to_probe
     assert message.world_coordinate_system == "ras" and message.image.shape == (1, ROWS, COLUMNS)
     assert np.allclose(message.ijk_to_world_matrix, wanted, atol=1e-4)
 
 
-def test_nothing_of_anybody_is_sent():
+def test_no_identifiers_are_sent():
     names = {b"IMAGE", b"TRANSFORM", IMAGE.encode(), PROBE.encode(), IMAGE_TO_PROBE.encode()}
     stream, found = packed(live()), set()
     while stream:
@@ -185,22 +189,22 @@ def test_nothing_of_anybody_is_sent():
     assert found == names and max(map(len, names)) <= 20
 
 
-def test_showing_packs_nothing_and_without_a_client_nobody_does(server, monkeypatch):
+def test_sending_packs_nothing_without_a_client(server, monkeypatch):
     packers: list[int] = []
 
-    def watched(picture: LivePicture) -> bytes:
+    def watched(picture: LiveImage) -> bytes:
         packers.append(threading.get_ident())
         return packed(picture)
 
     monkeypatch.setattr(server_module, "packed", watched)
     for number in range(20):
-        server.show(live(number))
+        server.send(live(number))
     time.sleep(0.1)
     assert packers == []
     with joined(server) as connection:
         # One that comes late has the newest picture at once, and that once.
         assert next_picture(connection)[72] == 19
-        server.show(live(20))
+        server.send(live(20))
         assert next_picture(connection)[72] == 20
         assert len(packers) == 2 and threading.get_ident() not in packers
 
@@ -209,7 +213,7 @@ def test_a_slow_client_skips_pictures_and_the_newest_reaches_it(server):
     with joined(server) as slow, joined(server) as quick:
         for number in range(200):
             # More than the sockets between them hold.
-            server.show(live(number, 512, 512))
+            server.send(live(number, 512, 512))
         while next_picture(quick)[72] != 199:
             pass
         seen = 0
@@ -218,8 +222,8 @@ def test_a_slow_client_skips_pictures_and_the_newest_reaches_it(server):
         assert seen < 150
 
 
-def test_clients_that_come_and_go_and_send_rubbish_harm_nobody(server, said):
-    half = struct.pack(HEADER, 1, b"TRANSFORM", HAND.encode(), 0, 0, 48, 0)
+def test_clients_that_disconnect_or_send_garbage_do_not_disturb_others(server, said):
+    half = struct.pack(HEADER, 1, b"TRANSFORM", HAND_TO_REFERENCE.encode(), 0, 0, 48, 0)
     rubbish = (
         b"GET / HTTP/1.1\r\nHost: here\r\nAccept: everything, twice over\r\n\r\n",
         bytes(range(255, 195, -1)),
@@ -234,31 +238,31 @@ def test_clients_that_come_and_go_and_send_rubbish_harm_nobody(server, said):
     for each in (b"", half[:20], half + b"\0" * 20):
         joined(server).sendall(each)
     with joined(server) as connection:
-        server.show(live(5))
+        server.send(live(5))
         assert next_picture(connection)[72] == 5
-    server.show(live(6))
-    assert len(said) == 1 and "was let go" in said[0]
-    assert soon(lambda: not server._clients) and server.hand.pose() is None
+    server.send(live(6))
+    assert len(said) == 1 and "was disconnected" in said[0]
+    assert soon(lambda: not server._clients) and server.received_pose.pose() is None
 
 
-def test_what_is_no_transform_is_passed_over(server, client):
+def test_other_messages_are_ignored(server, client):
     with joined(server) as connection:
-        picture = pyigtl.ImageMessage(np.zeros((1, 300, 300), np.uint8), device_name=HAND).pack()
+        picture = pyigtl.ImageMessage(np.zeros((1, 300, 300), np.uint8), device_name=HAND_TO_REFERENCE).pack()
         status = struct.pack(HEADER, 2, b"GET_STATUS", b"", 0, 0, 0, 0)
         connection.sendall(picture + status + hand_message(pose(), "Stylus") + hand_message(np.eye(4)))
-        assert soon(lambda: server.hand.pose() is not None)
-    assert np.allclose(server.hand.pose(), np.diag([-1, -1, 1, 1]))
+        assert soon(lambda: server.received_pose.pose() is not None)
+    assert np.allclose(server.received_pose.pose(), np.diag([-1, -1, 1, 1]))
 
 
 class Late:
     """A client that was let in while the server closed."""
 
-    is_here = False
+    is_connected = False
 
 
 @pytest.mark.parametrize("sent", [b"", b"\0" * 30], ids=["silent", "half a header"])
 def test_closing_ends_at_once_and_frees_the_port(said, sent):
-    server = Server("127.0.0.1", 0, said.append)
+    server = OpenIGTLinkServer("127.0.0.1", 0, said.append)
     port, before = server.port, threading.active_count()
     with joined(server) as connection:
         connection.sendall(sent)
@@ -272,12 +276,12 @@ def test_closing_ends_at_once_and_frees_the_port(said, sent):
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", port), SOON_S)
     late = Late()
-    server.enter(late)
-    assert server.newer(late, None) is None and said == []
-    Server("127.0.0.1", port, said.append).close()
+    server.add(late)
+    assert server.wait_for_newer(late, None) is None and said == []
+    OpenIGTLinkServer("127.0.0.1", port, said.append).close()
 
 
-def hand_message(matrix: np.ndarray, name: str = HAND, version: int = 1) -> bytes:
+def hand_message(matrix: np.ndarray, name: str = HAND_TO_REFERENCE, version: int = 1) -> bytes:
     message = pyigtl.TransformMessage(matrix, device_name=name)
     message.header_version = version
     return message.pack()
@@ -285,13 +289,13 @@ def hand_message(matrix: np.ndarray, name: str = HAND, version: int = 1) -> byte
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_a_clients_pose_comes_in(server, version):
-    assert server.hand.pose() is None
+    assert server.received_pose.pose() is None
     # Aslant, in RAS: a probe whose x is the patient's right is -x in LPS.
     sent = pose()
     with joined(server) as connection:
         connection.sendall(hand_message(sent, version=version))
-        assert soon(lambda: server.hand.pose() is not None)
-    got = server.hand.pose()
+        assert soon(lambda: server.received_pose.pose() is not None)
+    got = server.received_pose.pose()
     assert np.allclose(got[:3, 3], [-12.0, 80.5, -333.25]) and np.allclose(got[3], [0, 0, 0, 1])
     for axis in range(3):
         assert np.allclose(got[:3, axis], sent[:3, axis] * [-1, -1, 1], atol=1e-6)
@@ -301,15 +305,15 @@ def test_a_clients_pose_comes_in(server, version):
 
 def test_a_pose_goes_stale(said):
     now = [100.0]
-    hand = server_module.HandPose(said.append, lambda: now[0])
-    hand.take(HAND, pose())
+    received = server_module.ReceivedPose(said.append, lambda: now[0])
+    received.take(HAND_TO_REFERENCE, pose())
     now[0] += STALE_S
-    hand.take("ProbeToReference", np.eye(4))
-    assert np.allclose(hand.pose()[:3, 3], [-12.0, 80.5, -333.25])
+    received.take("ProbeToReference", np.eye(4))
+    assert np.allclose(received.pose()[:3, 3], [-12.0, 80.5, -333.25])
     now[0] += 1e-3
-    assert hand.pose() is None
-    hand.take(HAND, np.eye(4))
-    assert np.allclose(hand.pose(), np.diag([-1, -1, 1, 1])) and said == []
+    assert received.pose() is None
+    received.take(HAND_TO_REFERENCE, np.eye(4))
+    assert np.allclose(received.pose(), np.diag([-1, -1, 1, 1])) and said == []
 
 
 def changed(at: tuple, value: float) -> np.ndarray:
@@ -330,25 +334,25 @@ def changed(at: tuple, value: float) -> np.ndarray:
         np.array([[1, 0.01, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
     ],
 )
-def test_what_is_no_rigid_pose_is_refused_and_said_once(said, matrix):
-    hand = server_module.HandPose(said.append)
-    hand.take(HAND, pose())
+def test_a_pose_that_is_not_rigid_is_refused_with_one_warning(said, matrix):
+    received = server_module.ReceivedPose(said.append)
+    received.take(HAND_TO_REFERENCE, pose())
     for _ in range(2):
-        hand.take(HAND, matrix)
-        assert hand.pose() is None
-    assert len(said) == 1 and "no rigid transform" in said[0]
-    hand.take(HAND, pose())
-    assert isinstance(hand.pose(), np.ndarray)
+        received.take(HAND_TO_REFERENCE, matrix)
+        assert received.pose() is None
+    assert len(said) == 1 and "not a rigid transform" in said[0]
+    received.take(HAND_TO_REFERENCE, pose())
+    assert isinstance(received.pose(), np.ndarray)
 
 
-def test_a_rehearsals_first_picture_goes_out_with_the_probe_as_it_is_set():
-    shown: list[LivePicture] = []
+def test_the_first_image_of_a_view_is_sent_with_the_current_probe():
+    shown: list[LiveImage] = []
     plane, origin = pose(), np.array([10.0, 20.0, 30.0])
     rehearsal = SimpleNamespace(image_plane=lambda: SimpleNamespace(world_from_plane=plane), origin=origin)
     echo, ct = np.full((8, 6), 9, np.uint8), np.zeros((8, 6), np.uint8)
     probe = load_probe("linear").model_copy(update=dict(depth_mm=80.0, transducer_width_mm=30.0))
     send_live(None, rehearsal, SimpleNamespace(pictures={"B-mode": echo}), probe, 1.5)
-    link = SimpleNamespace(show=shown.append)
+    link = SimpleNamespace(send=shown.append)
     send_live(link, rehearsal, SimpleNamespace(pictures={"B-mode": echo, "CT": ct}), probe, 1.5)
     (sent,) = shown
     assert sent.grey is echo and sent.time_s == 1.5

@@ -7,13 +7,13 @@ import pytest
 from click.testing import CliRunner
 from test_openigtlink import SOON_S, joined, said, server  # noqa: F401 fixtures
 
-from rehearsal.tracking.openigtlink_options import link_options, opened_link
+from rehearsal.tracking.openigtlink_options import link_options, open_link
 
 
 @click.command()
 @link_options
 def linking(link: bool, link_host: str | None, link_leads: bool, link_port: int | None) -> None:
-    server = opened_link(link, link_host, link_port, link_leads)
+    server = open_link(link, link_host, link_port, link_leads)
     if server is not None:
         joined(server).close()
         click.echo(f"on {server.server_address[0]}")
@@ -29,7 +29,7 @@ def test_the_link_is_off_unless_asked_for_private_unless_told_and_ends_with_its_
     assert CliRunner().invoke(linking, []).output == ""
     port = free_port()
     done = CliRunner().invoke(linking, ["--link", "--link-port", str(port)])
-    assert done.exit_code == 0 and f"127.0.0.1, port {port}" in done.output and "Mind" not in done.output
+    assert done.exit_code == 0 and f"127.0.0.1, port {port}" in done.output and "Warning" not in done.output
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", port), SOON_S)
     done = CliRunner().invoke(linking, ["--link", "--link-host", "0.0.0.0", "--link-port", str(port)])

@@ -1,4 +1,4 @@
-"""The geometry of plans, on a ball: ways, layouts, reach, and what a way is worth."""
+"""The geometry of plans, on a ball: paths, layouts, reach and scores."""
 
 from dataclasses import replace
 
@@ -21,18 +21,28 @@ from plan_ball import (
     manipulator_on,
 )
 
-from rehearsal.planning.instrument_reach import NEAR_MM, Reach
-from rehearsal.planning.score import POINTS, SAID, in_words, points, score, why
-from rehearsal.planning.score_terms import ScoreTerms, faces_of, incidence_deg, path_mm
+from rehearsal.planning.instrument_reach import NEAR_MM, InstrumentReach
 from rehearsal.planning.sweep_path import (
     STEP_DEG,
     STEP_MM,
     SweepLayout,
     SweepPath,
-    gliding,
     layout_towards,
+    sliding,
     tilted,
     tilting,
+)
+from rehearsal.planning.sweep_score import (
+    POINTS,
+    WORDING,
+    ScoreTerms,
+    face_centres,
+    in_words,
+    incidence_deg,
+    path_mm,
+    points,
+    score,
+    why_better,
 )
 from scenes.trocar import Trocar
 from ultrasound.probe_manipulator import ProbeManipulator, advanced, pose_at
@@ -43,7 +53,7 @@ def manipulator() -> ProbeManipulator:
     return manipulator_on(big_ball())
 
 
-def degrees_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def angle_between_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.clip(np.einsum("...i,...i->...", a, b), -1, 1)))
 
 
@@ -81,17 +91,17 @@ def test_a_layout_leans_and_turns_about_its_own_axes(lean, heading, lateral, ahe
     assert turned.centre is before.centre
 
 
-# Gliding
+# Sliding
 
 
 @pytest.mark.parametrize("depth", [0.0, 2.5])
-def test_a_glide_square_to_the_surface_is_evenly_spaced_at_its_depth(manipulator, depth):
-    way = gliding(manipulator, from_above(), np.array([-6.0, 6.0]), -12.0, 13.0, depth, 1.0)
-    assert [len(each) for each in way.passes] == [int(np.ceil(25 / STEP_MM)) + 1] * 2
-    for each, aside, sign in zip(way.passes, (-6.0, 6.0), (1, -1), strict=True):
+def test_a_pass_along_the_surface_normal_is_evenly_spaced_at_its_depth(manipulator, depth):
+    path = sliding(manipulator, from_above(), np.array([-6.0, 6.0]), -12.0, 13.0, depth, 1.0)
+    assert [len(each) for each in path.passes] == [int(np.ceil(25 / STEP_MM)) + 1] * 2
+    for each, aside, sign in zip(path.passes, (-6.0, 6.0), (1, -1), strict=True):
         faces = faces_in(each)
         radii = faces / np.linalg.norm(faces, axis=1, keepdims=True)
-        assert degrees_between(each[:, :3, 2], radii).max() < NORMAL_DEG
+        assert angle_between_deg(each[:, :3, 2], radii).max() < NORMAL_DEG
         # A flat face on a ball touches with its middle.
         assert np.linalg.norm(faces, axis=1) == pytest.approx(R - depth, abs=FACET_MM)
         off = (depth + FACET_MM) * np.radians(NORMAL_DEG) + R * np.radians(NORMAL_DEG) / 2
@@ -101,10 +111,10 @@ def test_a_glide_square_to_the_surface_is_evenly_spaced_at_its_depth(manipulator
         assert (each[:, :3, 0] @ X > 0.9).all()
 
 
-def test_a_glide_along_its_layout_only_looks_as_that_does(manipulator):
+def test_a_pass_along_its_layout_has_the_axes_of_that(manipulator):
     layout = from_above().turned((0.0, 0.0), 90.0)
-    way = gliding(manipulator, layout, np.array([3.0]), -15.0, 15.0, 1.0, 0.0)
-    poses = way.poses
+    path = sliding(manipulator, layout, np.array([3.0]), -15.0, 15.0, 1.0, 0.0)
+    poses = path.poses
     assert poses[:, :3, 2] == pytest.approx(np.tile(Z, (len(poses), 1)))
     assert poses[:, :3, 0] == pytest.approx(np.tile(Y, (len(poses), 1)))
     faces = faces_in(poses)
@@ -117,8 +127,8 @@ def test_a_glide_along_its_layout_only_looks_as_that_does(manipulator):
     assert faces[beside == 0, 2] == pytest.approx(R - 1.0, abs=FACET_MM)
 
 
-def test_half_following_looks_halfway_between(manipulator):
-    poses = gliding(manipulator, from_above(), np.zeros(1), -14.0, 14.0, 0.0, 0.5).poses
+def test_half_following_is_halfway_between_layout_and_normal(manipulator):
+    poses = sliding(manipulator, from_above(), np.zeros(1), -14.0, 14.0, 0.0, 0.5).poses
     ahead = np.linspace(-14, 14, len(poses))
     # The place under the layout's line, not the face's middle, says where the surface looks.
     half = np.degrees(np.arcsin(ahead / R)) / 2
@@ -127,32 +137,32 @@ def test_half_following_looks_halfway_between(manipulator):
 
 
 def test_a_pass_ends_where_the_organ_does_and_one_beside_it_is_left_out(manipulator):
-    way = gliding(manipulator, from_above(), np.array([0.0, 45.0]), -40.0, 40.0, 0.0, 1.0)
+    path = sliding(manipulator, from_above(), np.array([0.0, 45.0]), -40.0, 40.0, 0.0, 1.0)
     ahead = np.linspace(-40, 40, int(np.ceil(80 / STEP_MM)) + 1)
-    (only,) = way.passes
+    (only,) = path.passes
     # Where the surface is as steep as its facets are long, a ray may pass by.
     assert abs(len(only) - (np.abs(ahead) < R).sum()) <= 2
-    assert gliding(manipulator, from_above(), np.array([45.0]), -4.0, 4.0, 0.0, 1.0).poses.shape == (0, 4, 4)
+    assert sliding(manipulator, from_above(), np.array([45.0]), -4.0, 4.0, 0.0, 1.0).poses.shape == (0, 4, 4)
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_of_two_lobes_the_longer_is_gone_over(sign):
+def test_of_two_lobes_the_longer_is_swept(sign):
     small = trimesh.creation.icosphere(subdivisions=3, radius=8.0).apply_translation([0, -22.0 * sign, 0])
     large = trimesh.creation.icosphere(subdivisions=3, radius=15.0).apply_translation([0, 22.0 * sign, 0])
     lobes = manipulator_on(trimesh.util.concatenate([small, large]))
-    poses = gliding(lobes, from_above(), np.zeros(1), -40.0, 40.0, 0.0, 0.0).poses
+    poses = sliding(lobes, from_above(), np.zeros(1), -40.0, 40.0, 0.0, 0.0).poses
     ahead = faces_in(poses)[:, 1] * sign
     assert ahead.min() > 22 - 15.1 and ahead.max() < 22 + 15.1 and np.ptp(ahead) > 26
 
 
-# Rocking
+# Tilting
 
 
-def test_rocking_turns_about_the_faces_middle_in_equal_steps(manipulator):
-    way = tilting(manipulator, from_above(), np.array([-5.0, 5.0]), 4.0, (-20.0, 31.0), 1.5)
+def test_tilting_turns_about_the_centre_of_the_face_in_equal_steps(manipulator):
+    path = tilting(manipulator, from_above(), np.array([-5.0, 5.0]), 4.0, (-20.0, 31.0), 1.5)
     count = int(np.ceil(51 / STEP_DEG)) + 1
-    assert [len(each) for each in way.passes] == [count, count]
-    for each, sign in zip(way.passes, (1, -1), strict=True):
+    assert [len(each) for each in path.passes] == [count, count]
+    for each, sign in zip(path.passes, (1, -1), strict=True):
         faces = faces_in(each)
         assert np.abs(faces - faces[0]).max() < 1e-9
         assert np.linalg.norm(faces[0]) == pytest.approx(R - 1.5, abs=FACET_MM)
@@ -168,7 +178,7 @@ def test_rocking_turns_about_the_faces_middle_in_equal_steps(manipulator):
     assert beside.passes == ()
 
 
-def test_a_fan_swings_the_beam_towards_y():
+def test_a_tilt_turns_the_beam_towards_y():
     pose = pose_at(np.array([1.0, 2, 3]), -Z, X, 20.0)
     turned = tilted(pose, 20.0, 30.0)
     assert -turned[:3, 2] == pytest.approx([0, 0.5, -np.sqrt(0.75)])
@@ -179,13 +189,13 @@ def test_a_fan_swings_the_beam_towards_y():
 # ScoreTerms
 
 
-def test_the_path_is_of_the_faces_middle(manipulator):
+def test_the_path_is_that_of_the_centre_of_the_face(manipulator):
     at = np.array([[0.0, 0, 0], [3, 4, 0], [3, 4, 12]])
     poses = np.stack([pose_at(place, -Z, X, SIZE[2]) for place in at])
-    assert faces_of(manipulator, poses) == pytest.approx(at)
+    assert face_centres(manipulator, poses) == pytest.approx(at)
     assert path_mm(manipulator, poses) == pytest.approx(5 + 12)
-    rocked = np.stack([tilted(poses[0], SIZE[2], angle) for angle in (0, 20, -30)])
-    assert path_mm(manipulator, rocked) == pytest.approx(0, abs=1e-9)
+    tilted_poses = np.stack([tilted(poses[0], SIZE[2], angle) for angle in (0, 20, -30)])
+    assert path_mm(manipulator, tilted_poses) == pytest.approx(0, abs=1e-9)
 
 
 def test_incidence_is_the_mean_angle_to_the_surface(manipulator):
@@ -204,7 +214,9 @@ def reached(
     origin = np.array([10.0, -20.0, 30.0])
     if trocar.at_mm is not None:
         trocar = trocar.model_copy(update=dict(at_mm=tuple(np.array(trocar.at_mm) + origin)))
-    return Reach(trocar, manipulator, origin, np.zeros(3) if target is None else target)(poses).tolist()
+    return InstrumentReach(trocar, manipulator, origin, np.zeros(3) if target is None else target)(
+        poses
+    ).tolist()
 
 
 def with_back_at(back: np.ndarray, outward: np.ndarray = Z) -> np.ndarray:
@@ -225,7 +237,7 @@ def test_the_shaft_leans_no_farther_than_the_cone(cone, axis):
     assert reached(trocar, np.stack([with_back_at(each) for each in backs]), tiny) == [True, False]
 
 
-def test_without_an_axis_the_cone_is_about_the_way_to_the_target(manipulator):
+def test_without_an_axis_the_cone_is_about_the_direction_to_the_target(manipulator):
     trocar = Trocar(at_mm=(0, 0, 100), cone_deg=10, wrist_deg=180)
     poses = np.stack([with_back_at(np.array([x, 0.0, 60])) for x in (0.0, 40.0)])
     assert reached(trocar, poses, manipulator) == [True, False]
@@ -233,7 +245,7 @@ def test_without_an_axis_the_cone_is_about_the_way_to_the_target(manipulator):
 
 
 @pytest.mark.parametrize("wrist", [0.0, 30.0, 90.0, 120.0])
-def test_the_probe_looks_no_farther_aside_than_the_wrist(wrist):
+def test_the_probe_turns_no_farther_from_the_shaft_than_the_wrist(wrist):
     tiny = manipulator_on(trimesh.creation.icosphere(subdivisions=1, radius=1.0))
     trocar = Trocar(at_mm=(0, 0, 150), wrist_deg=wrist)
     bends = np.radians([wrist - 0.1, wrist, wrist + 0.1, -wrist - 0.1])
@@ -250,7 +262,7 @@ def test_the_shaft_is_no_longer_than_the_instrument(manipulator):
     assert reached(trocar, poses, manipulator) == [True, False]
 
 
-def test_the_organ_is_not_gone_through(manipulator):
+def test_the_shaft_does_not_pass_through_the_organ(manipulator):
     """Against the chord of a ball, for poses all around it."""
     chance = np.random.default_rng(3)
     at = np.array([0.0, -70.0, 90.0])
@@ -265,7 +277,7 @@ def test_the_organ_is_not_gone_through(manipulator):
     under = R**2 - (at @ at - middle**2)
     enters = np.where(under > 0, middle - np.sqrt(np.maximum(under, 0)), np.inf)
     free = enters > length - NEAR_MM
-    # A grazing shaft passes facets by, and one that ends as near as it may is told by them.
+    # A grazing shaft passes facets by, and one that ends as near as it may is text by them.
     sure = (np.abs(under) > 2 * R * FACET_MM) & (np.abs(enters - length + NEAR_MM) > 0.3)
     assert sure.mean() > 0.9 and 0.2 < free[sure].mean() < 0.8
     assert np.array_equal(np.array(found)[sure], free[sure])
@@ -275,7 +287,7 @@ def test_the_organ_is_not_gone_through(manipulator):
 
 
 @pytest.mark.parametrize(
-    ("part", "worse"),
+    ("term", "worse"),
     [
         ("seen", 0.5),
         ("compression_mean_mm", 5.0),
@@ -286,43 +298,43 @@ def test_the_organ_is_not_gone_through(manipulator):
         ("reachable", 0.9),
     ],
 )
-def test_what_is_worse_is_worth_less_and_said(part, worse):
-    other = replace(GOOD, **{part: worse})
+def test_a_worse_term_lowers_the_score_and_is_explained(term, worse):
+    other = replace(GOOD, **{term: worse})
     assert score(other) < score(GOOD) == pytest.approx(sum(points(GOOD).values()))
-    lost = points(GOOD).get(part, 0.0) - points(other)[part]
+    lost = points(GOOD).get(term, 0.0) - points(other)[term]
     assert lost == pytest.approx(score(GOOD) - score(other)) and lost > 0
-    told = why(GOOD, other)
-    if part == "reachable":
-        assert told == "it can be reached everywhere, the other not at 10 % of its poses"
+    text = why_better(GOOD, other)
+    if term == "reachable":
+        assert text == "it is reachable at all poses, the other is not at 10 %"
     else:
-        share = 100 if part in ("seen", "over_limit", "contact") else 1
-        words, unit = SAID[part]
-        figures = [unit.format(share * getattr(each, part)) for each in (GOOD, other)]
-        assert told == f"it {words.format(figures[0])} rather than {figures[1]} ({lost:+.1f} points)"
+        share = 100 if term in ("seen", "over_limit", "contact") else 1
+        words, unit = WORDING[term]
+        figures = [unit.format(share * getattr(each, term)) for each in (GOOD, other)]
+        assert text == f"it {words.format(figures[0])} instead of {figures[1]} ({lost:+.1f} points)"
         assert words.format(figures[1]) in in_words(other)
 
 
-def test_what_speaks_for_the_other_is_said_too():
-    told = why(GOOD, replace(GOOD, seen=0.4, path_mm=20.0))
-    assert ", though it goes a way of 60 mm rather than 20 mm (" in told
-    assert set(POINTS) <= set(SAID)
+def test_the_largest_disadvantage_is_explained_too():
+    text = why_better(GOOD, replace(GOOD, seen=0.4, path_mm=20.0))
+    assert ", although it has a path of 60 mm instead of 20 mm (" in text
+    assert set(POINTS) <= set(WORDING)
 
 
-def test_what_a_sweep_is_worth_is_a_sentence():
+def test_the_score_terms_are_a_sentence():
     assert in_words(ScoreTerms(0.94, 2.2, 3.4, 0.0, 0.97, 4.6, 211.0, 21.0, 1.0)) == (
-        "it sees 94 % of the target, squeezes the tissue by 2.2 mm on average, is over the limit of squeezing at 0 % of its poses, "
-        "has contact on 97 % of the probe's face, stands 5 degrees off square to the surface, and goes a way of 211 mm"
+        "it covers 94 % of the target, compresses the tissue by 2.2 mm on average, exceeds the compression limit at 0 % of its poses, "
+        "has contact on 97 % of the array, has a mean angle of incidence of 5 degrees, and has a path of 211 mm"
     )
 
 
-def test_any_way_that_can_be_held_is_worth_more_than_one_that_cannot():
+def test_any_reachable_path_scores_more_than_one_that_is_not():
     poor = ScoreTerms(0.0, 15.0, 20.0, 1.0, 0.0, 90.0, 2000.0, 100.0, 1.0)
     perfect = ScoreTerms(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.99)
-    assert score(poor) > score(perfect) > score(replace(perfect, reachable=0.5)) > score(ScoreTerms.nothing())
-    assert why(poor, perfect) == "it can be reached everywhere, the other not at 1 % of its poses"
+    assert score(poor) > score(perfect) > score(replace(perfect, reachable=0.5)) > score(ScoreTerms.zero())
+    assert why_better(poor, perfect) == "it is reachable at all poses, the other is not at 1 %"
 
 
-def test_a_way_of_no_pass_has_no_poses():
+def test_a_path_without_passes_has_no_poses():
     assert SweepPath(()).poses.shape == (0, 4, 4)
     one = advanced(np.eye(4), 1.0)[None]
     assert SweepPath((one, np.stack([np.eye(4)] * 2))).poses.shape == (3, 4, 4)

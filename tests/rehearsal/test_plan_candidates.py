@@ -1,4 +1,4 @@
-"""What a plan chooses among, and sweeps that nobody planned, over a ball with a tumour in it."""
+"""The candidates of a plan, and unplanned sweeps, over a ball with a tumour."""
 
 from itertools import pairwise
 from types import SimpleNamespace
@@ -23,20 +23,20 @@ from plan_ball import (
 from rehearsal.coordinates import probe_in_patient
 from rehearsal.planning.plan_file import MOST_SWEEPS
 from rehearsal.planning.sweep_candidates import (
+    LEAST_COSINE,
     MOST_PASSES,
-    ROUND,
-    Candidate,
+    SweepCandidate,
     candidates_of,
     directions,
-    half_size,
+    half_extent_mm,
+    nearest_side,
     passes_needed,
-    shallowest,
 )
 from rehearsal.planning.sweep_path import layout_towards
 from scenes.anatomy import LoadedAnatomy
 from sim.signed_distance import signed_distance
 from studies.planning import virtual_tumour
-from studies.planning.baseline_sweeps import by_chance, planned, row_by_row, straight, ways_by_chance
+from studies.planning.baseline_sweeps import planned, random_sweep, random_sweeps, row_by_row, straight
 from ultrasound.coverage import VOXEL_MM, Coverage
 from ultrasound.probe import load_probe
 
@@ -69,7 +69,7 @@ def aside_by(degrees: float) -> np.ndarray:
     return np.array([0.0, np.sin(np.radians(degrees)), np.cos(np.radians(degrees))])
 
 
-def found_for(rehearsal, at: np.ndarray, reach=everywhere, radius: float = 7.0) -> list[Candidate]:
+def found_for(rehearsal, at: np.ndarray, reach=everywhere, radius: float = 7.0) -> list[SweepCandidate]:
     return candidates_of(rehearsal, coverage_of(at, radius), "tumour", reach)
 
 
@@ -87,9 +87,9 @@ def test_directions_are_units_evenly_around():
     assert found.T @ found / 300 == pytest.approx(np.eye(3) / 3, abs=0.01)
 
 
-def test_a_tumour_on_top_is_looked_at_from_above_only(rehearsal):
+def test_a_tumour_on_top_has_candidates_from_above_only(rehearsal):
     found = found_for(rehearsal, 18.0 * Z)
-    assert [each.motion for each in found] == ["glide", "glide", "tilt"]
+    assert [each.motion for each in found] == ["slide", "slide", "tilt"]
     assert all(each.side == "from above" for each in found)
     assert [each.count for each in found] == [1, 2, 1]
     for each in found:
@@ -98,9 +98,9 @@ def test_a_tumour_on_top_is_looked_at_from_above_only(rehearsal):
 
 
 @pytest.mark.parametrize("aside", [40.0, -60.0])
-def test_a_tumour_at_the_side_is_looked_at_from_there_too(rehearsal, aside):
+def test_a_tumour_at_the_side_has_candidates_from_there_too(rehearsal, aside):
     found = found_for(rehearsal, 18.0 * aside_by(aside))
-    assert [each.motion for each in found] == ["glide", "glide", "glide", "tilt"]
+    assert [each.motion for each in found] == ["slide", "slide", "slide", "tilt"]
     assert len(found) <= MOST_SWEEPS
     assert found[0].layout.outward == pytest.approx(Z)
     for each in found[1:]:
@@ -108,9 +108,9 @@ def test_a_tumour_at_the_side_is_looked_at_from_there_too(rehearsal, aside):
         assert each.side == "from the nearest side"
 
 
-def test_no_side_is_looked_at_from_under_the_organ(rehearsal):
-    outward = shallowest(rehearsal.manipulator, -20.0 * Z, Z, everywhere, X)
-    assert outward @ Z >= ROUND
+def test_no_side_is_below_the_organ(rehearsal):
+    outward = nearest_side(rehearsal.manipulator, -20.0 * Z, Z, everywhere, X)
+    assert outward @ Z >= LEAST_COSINE
     assert angle_deg(outward, np.array([*outward[:2], 0.0]) / np.linalg.norm(outward[:2])) < 2 * GRAIN_DEG
 
 
@@ -120,9 +120,9 @@ def test_the_nearest_side_is_one_that_can_be_reached(rehearsal):
     def from_left(poses: np.ndarray) -> np.ndarray:
         return poses[:, 1, 2] < -0.2
 
-    outward = shallowest(rehearsal.manipulator, centre, Z, from_left, X)
+    outward = nearest_side(rehearsal.manipulator, centre, Z, from_left, X)
     assert outward[1] < -0.1
-    assert shallowest(rehearsal.manipulator, centre, Z, lambda poses: ~everywhere(poses), X) is None
+    assert nearest_side(rehearsal.manipulator, centre, Z, lambda poses: ~everywhere(poses), X) is None
     nowhere = found_for(rehearsal, centre, lambda poses: ~everywhere(poses))
     assert len(nowhere) == 3 and all(each.side == "from above" for each in nowhere)
 
@@ -130,7 +130,7 @@ def test_the_nearest_side_is_one_that_can_be_reached(rehearsal):
 def test_half_of_a_target_is_measured_across_and_along():
     layout = layout_towards(np.array([1.0, 1, 1]), Z, Y)
     places = np.array([[1.0, 1, 1], [4, 1, 9], [1, -6, 1]])
-    assert half_size(layout, places) == pytest.approx([7, 3])
+    assert half_extent_mm(layout, places) == pytest.approx([7, 3])
 
 
 def test_passes_are_as_many_as_the_target_is_wide_in_pictures():
@@ -145,7 +145,7 @@ def test_no_two_candidates_are_the_same_where_passes_are_at_their_most(rehearsal
     )
     found = candidates_of(narrow, coverage_of(18.0 * Z), "organ", everywhere)
     assert {each.count for each in found} == {MOST_PASSES}
-    assert len({each.named(each.count) for each in found}) == len(found) == 3
+    assert len({each.name(each.count) for each in found}) == len(found) == 3
 
 
 @pytest.mark.parametrize("radius", [7.0, 12.0])
@@ -155,66 +155,66 @@ def test_each_begins_over_its_target_and_its_numbers_go_from_end_to_end(rehearsa
         start = each.start()
         assert ((start >= 0) & (start <= 1)).all()
         values = each.values(start)
-        assert list(values) == list(each.quantities)
-        for (name, value), (low, high, begins) in zip(values.items(), each.quantities.values(), strict=True):
+        assert list(values) == list(each.ranges)
+        for (name, value), (low, high, begins) in zip(values.items(), each.ranges.values(), strict=True):
             assert low < high and low <= begins <= high and value == pytest.approx(begins), name
         beyond = each.values(np.where(np.arange(len(start)) % 2, -3.0, 7.0))
-        ends = [q.low if n % 2 else q.high for n, q in enumerate(each.quantities.values())]
+        ends = [q.low if n % 2 else q.high for n, q in enumerate(each.ranges.values())]
         assert list(beyond.values()) == ends
-        passes = each.way(rehearsal.manipulator, values).passes
+        passes = each.path(rehearsal.manipulator, values).passes
         assert len(passes) == each.count
         faces = np.concatenate([faces_in(each) for each in passes])
         over = np.linalg.norm(np.cross(faces - each.layout.centre, each.layout.outward), axis=1)
         assert over.min() < WIDTH and over.max() < 3 * radius
 
 
-def test_a_glide_begins_as_the_straight_rows_that_it_is_held_against(rehearsal):
+def test_sliding_starts_as_straight_rows(rehearsal):
     coverage = coverage_of(16.0 * Z, 12.0)
-    glide = next(each for each in candidates_of(rehearsal, coverage, "tumour", everywhere) if each.count > 1)
+    slide = next(each for each in candidates_of(rehearsal, coverage, "tumour", everywhere) if each.count > 1)
     rows = row_by_row(SimpleNamespace(rehearsal=rehearsal, coverage=coverage, target="tumour"))
-    begun = glide.way(rehearsal.manipulator, glide.values(glide.start()))
-    assert glide.motion == "glide" and len(rows.passes) == glide.count
+    begun = slide.path(rehearsal.manipulator, slide.values(slide.start()))
+    assert slide.motion == "slide" and len(rows.passes) == slide.count
     assert begun.poses == pytest.approx(rows.poses, abs=1e-9)
 
 
-def glide_of(rehearsal, count: int) -> Candidate:
+def sliding_candidate(rehearsal, count: int) -> SweepCandidate:
     found = found_for(rehearsal, 18.0 * Z, radius=9.0)
-    return next(each for each in found if each.motion == "glide" and each.count == count)
+    return next(each for each in found if each.motion == "slide" and each.count == count)
 
 
-def values_of(candidate: Candidate, **changes: float) -> dict[str, float]:
+def values_of(candidate: SweepCandidate, **changes: float) -> dict[str, float]:
     values = candidate.values(candidate.start())
     assert changes.keys() <= values.keys()
     return values | dict(follow=0.0) | changes
 
 
-def test_a_glides_numbers_are_what_they_are_called(rehearsal):
-    glide, manipulator = glide_of(rehearsal, 2), rehearsal.manipulator
-    numbers = values_of(glide, aside_mm=2.0, apart_mm=9.0, start_mm=-7.0, end_mm=5.0, depth_mm=0.0)
-    one, two = (faces_in(each) - glide.layout.centre for each in glide.way(manipulator, numbers).passes)
+def test_sliding_follows_its_parameters(rehearsal):
+    slide, manipulator = sliding_candidate(rehearsal, 2), rehearsal.manipulator
+    numbers = values_of(slide, aside_mm=2.0, apart_mm=9.0, start_mm=-7.0, end_mm=5.0, depth_mm=0.0)
+    one, two = (faces_in(each) - slide.layout.centre for each in slide.path(manipulator, numbers).passes)
     assert one[:, 0] == pytest.approx(2.0 - 4.5) and two[:, 0] == pytest.approx(2.0 + 4.5)
     assert one[[0, -1], 1] == pytest.approx([-7, 5]) and two[[0, -1], 1] == pytest.approx([5, -7])
-    deeper = glide.way(manipulator, numbers | dict(depth_mm=3.0)).passes[0]
-    assert faces_in(deeper) - glide.layout.centre == pytest.approx(one - 3.0 * Z)
+    deeper = slide.path(manipulator, numbers | dict(depth_mm=3.0)).passes[0]
+    assert faces_in(deeper) - slide.layout.centre == pytest.approx(one - 3.0 * Z)
     turned = (
-        faces_in(glide.way(manipulator, numbers | dict(heading_deg=90.0)).passes[0]) - glide.layout.centre
+        faces_in(slide.path(manipulator, numbers | dict(heading_deg=90.0)).passes[0]) - slide.layout.centre
     )
     assert turned[[0, -1], 0] == pytest.approx([7, -5]) and turned[:, 1] == pytest.approx(-2.5)
     for name, axis in (("lean_deg", [0, -0.5, np.sqrt(0.75)]), ("lean_aside_deg", [0.5, 0, np.sqrt(0.75)])):
-        leant = glide.way(manipulator, numbers | {name: 30.0}).poses
+        leant = slide.path(manipulator, numbers | {name: 30.0}).poses
         assert leant[:, :3, 2] == pytest.approx(np.tile(axis, (len(leant), 1)))
 
 
-def test_rocking_turns_where_its_numbers_say(rehearsal):
+def test_tilting_follows_its_parameters(rehearsal):
     tilt = next(each for each in found_for(rehearsal, 18.0 * Z) if each.motion == "tilt")
     numbers = values_of(tilt, ahead_mm=0.0, first_deg=-10.0, last_deg=24.0, depth_mm=1.0)
-    (poses,) = tilt.way(rehearsal.manipulator, numbers).passes
+    (poses,) = tilt.path(rehearsal.manipulator, numbers).passes
     angles = np.degrees(np.arctan2(-poses[:, 1, 2], poses[:, 2, 2]))
     assert angles[[0, -1]] == pytest.approx([-10, 24], abs=1.5)
     assert faces_in(poses)[:, 2] == pytest.approx(R - 1.0, abs=FACET_MM)
 
 
-# Sweeps that nobody planned
+# Unplanned sweeps
 
 
 @pytest.fixture(scope="module")
@@ -222,7 +222,7 @@ def trial(rehearsal) -> SimpleNamespace:
     return SimpleNamespace(rehearsal=rehearsal, coverage=coverage_of(16.0 * Z, 12.0), target="tumour")
 
 
-def test_straight_sweeps_look_down_and_cover_the_target_side_by_side(trial):
+def test_straight_sweeps_point_down_and_cover_the_target_side_by_side(trial):
     (one,), rows = straight(trial).passes, row_by_row(trial).passes
     assert np.array([one[0], one[-1]])[:, :3, 2] == pytest.approx(np.stack([Z, Z]))
     assert faces_in(one)[:, 0] == pytest.approx(0, abs=VOXEL_MM / 2)
@@ -232,8 +232,8 @@ def test_straight_sweeps_look_down_and_cover_the_target_side_by_side(trial):
     assert np.diff(aside) == pytest.approx([WIDTH]) and np.mean(aside) == pytest.approx(0, abs=VOXEL_MM / 2)
 
 
-def test_sweeps_by_chance_are_the_seeds_and_over_the_target(trial):
-    first, again, other = (by_chance(trial, 3, seed) for seed in (5, 5, 6))
+def test_random_sweeps_depend_on_the_seed_and_are_over_the_target(trial):
+    first, again, other = (random_sweep(trial, 3, seed) for seed in (5, 5, 6))
     assert len(first.passes) == 3
     assert np.array_equal(first.poses, again.poses) and not np.array_equal(first.poses[0], other.poses[0])
     assert (np.linalg.norm(faces_in(first.poses)[:, :2], axis=1) < 12 * (np.sqrt(2) + 1)).all()
@@ -241,24 +241,26 @@ def test_sweeps_by_chance_are_the_seeds_and_over_the_target(trial):
     assert all(
         abs(angle_deg(a / np.linalg.norm(a), b / np.linalg.norm(b))) > 1 for a, b in pairwise(headings)
     )
-    ways = ways_by_chance(3, range(5, 7))
+    ways = random_sweeps(3, range(5, 7))
     assert [
-        np.array_equal(make(trial).poses, way.poses) for make, way in zip(ways, (first, other), strict=True)
+        np.array_equal(make(trial).poses, path.poses) for make, path in zip(ways, (first, other), strict=True)
     ] == [True] * 2
 
 
-def test_a_plans_poses_are_the_ways_in_the_patient(rehearsal):
-    way = glide_of(rehearsal, 2).way(rehearsal.manipulator, values_of(glide_of(rehearsal, 2)))
-    placed = np.stack([probe_in_patient(rehearsal, pose) for pose in way.poses])
+def test_the_poses_of_a_plan_are_those_of_the_path_in_the_patient(rehearsal):
+    path = sliding_candidate(rehearsal, 2).path(
+        rehearsal.manipulator, values_of(sliding_candidate(rehearsal, 2))
+    )
+    placed = np.stack([probe_in_patient(rehearsal, pose) for pose in path.poses])
     # PLUS's axes of a probe: x to the marked side, y into the tissue, from the middle of the face.
-    assert placed[:, :3, 3] == pytest.approx(faces_in(way.poses) + ORIGIN)
-    assert placed[:, :3, 0] == pytest.approx(way.poses[:, :3, 0])
-    assert placed[:, :3, 1] == pytest.approx(-way.poses[:, :3, 2])
+    assert placed[:, :3, 3] == pytest.approx(faces_in(path.poses) + ORIGIN)
+    assert placed[:, :3, 0] == pytest.approx(path.poses[:, :3, 0])
+    assert placed[:, :3, 1] == pytest.approx(-path.poses[:, :3, 2])
     assert np.linalg.det(placed[:, :3, :3]) == pytest.approx(1)
-    assert placed.tolist() == pytest.approx(np.array(in_patient(way.poses)))
-    again = planned(SimpleNamespace(rehearsal=rehearsal), sweep_of(*way.passes))
-    assert [len(each) for each in again.passes] == [len(each) for each in way.passes]
-    assert again.poses == pytest.approx(way.poses, abs=1e-9)
+    assert placed.tolist() == pytest.approx(np.array(in_patient(path.poses)))
+    again = planned(SimpleNamespace(rehearsal=rehearsal), sweep_of(*path.passes))
+    assert [len(each) for each in again.passes] == [len(each) for each in path.passes]
+    assert again.poses == pytest.approx(path.poses, abs=1e-9)
 
 
 def test_a_kidney_without_a_tumour_is_given_one_under_its_highest_place():

@@ -13,8 +13,17 @@ import app
 from rehearsal.commands.option_checks import check_plan
 from rehearsal.commands.plan_command import trocar_of
 from rehearsal.planning import trial_workers
-from rehearsal.planning.plan_file import PlanError, is_plan, next_free, read_plan, write_plan
-from rehearsal.planning.plan_poses import COMES_S, LIFT_MM, LIFTED_MM_S, timed_poses
+from rehearsal.planning.plan_file import (
+    APPROACH_S,
+    LIFT_MM,
+    LIFTED_MM_S,
+    PlanError,
+    is_plan,
+    next_plan_path,
+    read_plan,
+    timed_poses,
+    write_plan,
+)
 from rehearsal.tracking.track_file import load_track
 from scenes.trocar import Trocar
 from ultrasound.probe import load_probe
@@ -49,12 +58,12 @@ def test_a_plan_read_is_the_one_written_and_two_are_the_same_bytes(tmp_path):
 
 
 def test_plans_are_numbered_on(tmp_path):
-    assert next_free(tmp_path).name == "plan-001.json"
+    assert next_plan_path(tmp_path).name == "plan-001.json"
     for name in ("plan-002.json", "plan-010.json", "plan-x.json", "plan-099.txt", "my-plan-500.json"):
         (tmp_path / name).touch()
-    assert next_free(tmp_path) == tmp_path / "plan-011.json"
+    assert next_plan_path(tmp_path) == tmp_path / "plan-011.json"
     (tmp_path / "plan-999.json").touch()
-    assert next_free(tmp_path).name == "plan-1000.json"
+    assert next_plan_path(tmp_path).name == "plan-1000.json"
 
 
 def changed(values: dict, where: str, value) -> None:
@@ -166,7 +175,7 @@ def test_a_sweep_as_a_track_goes_at_its_speed_and_is_lifted_between_passes(tmp_p
     way = np.linalg.norm(np.diff(places, axis=0), axis=1)
     speeds = way / np.diff(track.times_s)
     assert speeds[[1, 2, 3, 6, 7]] == pytest.approx(5.0) and speeds[[4, 5, 8]] == pytest.approx(LIFTED_MM_S)
-    assert track.times_s[:2].tolist() == [0.0, COMES_S]
+    assert track.times_s[:2].tolist() == [0.0, APPROACH_S]
     turned = sweep_of(straight_pass(2, step_mm=0.0))
     turned.passes[0][1] = (np.array(turned.passes[0][1]) @ TURNED).tolist()
     assert np.diff(timed_poses(turned, 5.0).times_s)[2] == pytest.approx(40 / 1.5 / 5.0)
@@ -241,11 +250,11 @@ def test_the_plan_command_refuses_in_one_line(ball_scene, capsys, options, words
 def test_a_plan_is_made_on_the_tissue_of_the_quality(ball_scene, monkeypatch, capsys):
     cells_mm: list[float] = []
 
-    def nobody(problem: trial_workers.Problem, jobs: int | None) -> None:
+    def nobody(problem: trial_workers.PlanningProblem, jobs: int | None) -> None:
         cells_mm.append(problem.scene.tissue.cell_mm)
         raise PlanError("no workers")
 
-    monkeypatch.setattr(trial_workers, "workers", nobody)
+    monkeypatch.setattr(trial_workers, "TrialWorkers", nobody)
     for quality in ((), ("--quality", "fast"), ("--quality", "accurate")):
         assert app.main(["plan", str(ball_scene), "--out", str(ball_scene / "plan.json"), *quality]) == 2
         assert "nephron: no workers" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""A plan followed: the guide, its lines and the keys."""
+"""Guidance along a plan: progress, the lines in the 3D view, and the keys."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -9,7 +9,7 @@ import taichi as ti
 from conftest import rotation_about
 from plan_ball import SIZE, over_ball, plan_of, straight_pass, sweep_of
 
-from rehearsal.planning.plan_guidance import ABOVE_MM, AHEAD, DEG_BESIDE_A_MM, NEAR_MM, PlanGuidance
+from rehearsal.planning.plan_guidance import ABOVE_MM, AHEAD, DEG_PER_MM_OFF, NEAR_MM, PlanGuidance
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.undo_history import MOST_UNDONE, History
 from render import plan_lines, transducer_shape
@@ -38,7 +38,7 @@ def turned(pose: np.ndarray, degrees: float) -> np.ndarray:
 # Followed
 
 
-def test_a_plan_followed_exactly_is_followed_wholly_with_nothing_off():
+def test_a_plan_followed_exactly_is_completed_without_deviation():
     guide = guide_of()
     for number, pose in enumerate([*FIRST, *SECOND]):
         assert guide.guidance().goal == pytest.approx(pose)
@@ -48,13 +48,13 @@ def test_a_plan_followed_exactly_is_followed_wholly_with_nothing_off():
     assert guide.guidance().goal is None and guide.guidance().gone.all()
     assert guide.findings() == {"plan": "100 %", "off plan": "0.0 mm 0 deg"}
     assert guide.in_words(0.5) == (
-        "plan      two passes: 100 % of it followed, 0.0 mm and 0 degrees beside it; margin seen 50 % (planned 75 %)"
+        "plan      two passes: 100 % completed, mean deviation 0.0 mm and 0 degrees; coverage of margin 50 % (planned 75 %)"
     )
     guide.watch(SECOND[-1])
     assert guide.followed == 1.0
 
 
-def test_how_far_beside_it_went_is_the_faces_middles_way_and_the_turn():
+def test_the_deviation_is_the_distance_of_the_face_and_the_angle():
     sparse = straight_pass(7, step_mm=9.0)
     guide = guide_of(sweep_of(sparse))
     for number, pose in enumerate(sparse):
@@ -67,36 +67,36 @@ def test_how_far_beside_it_went_is_the_faces_middles_way_and_the_turn():
 
 
 @pytest.mark.parametrize("offset", [0.0, 2.0])
-def test_each_pose_is_judged_where_it_was_nearest_and_none_is_behind_before(offset):
+def test_each_pose_counts_at_its_least_distance_and_is_not_completed_before(offset):
     """In tenths of a step, from above the first: one that is gone to exactly is behind from a millimetre before it on, any other
     where the next is nearer, and the last where the one before it is not."""
     guide = guide_of(sweep_of(straight_pass(11, step_mm=1.5)))
     (begin,) = straight_pass(1, offset)
     for height in np.arange(8.0, 1.0, -0.25):
         guide.watch(advanced(begin, -height))
-        assert guide.at == 0
+        assert guide.next_pose == 0
     for number, pose in enumerate(straight_pass(101, offset, 0.15)):
         guide.watch(pose)
         if offset == 0:
-            assert guide.at == min((number + 6) // 10 + 1, 11)
+            assert guide.next_pose == min((number + 6) // 10 + 1, 11)
         elif number % 10 != 5:
-            assert guide.at == (number + 5) // 10 + (number > 95)
+            assert guide.next_pose == (number + 5) // 10 + (number > 95)
     off = dict(plan_followed=1.0, plan_off_mm=offset, plan_off_deg=0.0)
     assert guide.figures() == pytest.approx(off, abs=1e-6)
 
 
-def test_rocking_is_judged_where_each_pose_was_nearest_too():
-    rocked = np.stack([turned(straight_pass(1)[0], angle) for angle in np.arange(-30.0, 31.0, 2.0)])
-    guide = guide_of(sweep_of(rocked))
+def test_tilting_counts_each_pose_at_its_least_angle_too():
+    tilted = np.stack([turned(straight_pass(1)[0], angle) for angle in np.arange(-30.0, 31.0, 2.0)])
+    guide = guide_of(sweep_of(tilted))
     for angle in np.arange(-30.0, 30.1, 0.5):
         guide.watch(turned(straight_pass(1)[0], angle))
-        assert (angle + 30) / 2 < guide.at <= (angle + 30) / 2 + 3
+        assert (angle + 30) / 2 < guide.next_pose <= (angle + 30) / 2 + 3
     assert guide.figures() == pytest.approx(
         dict(plan_followed=1.0, plan_off_mm=0.0, plan_off_deg=0.0), abs=1e-4
     )
 
 
-def test_the_way_that_is_drawn_is_each_pass_and_not_between_them():
+def test_the_path_is_drawn_on_each_pass_and_not_between_them():
     guide = guide_of()
     places = [[0.0, 2 * n, 0.0] for n in range(4)], [[20.0, 2 * n, 0.0] for n in range(3)]
     segments = [[a, b] for each in places for a, b in pairwise(each)]
@@ -108,68 +108,66 @@ def test_the_way_that_is_drawn_is_each_pass_and_not_between_them():
     assert gone == [0, 1, 2, 3, 3, 4, 5]
 
 
-def test_poses_may_be_skipped_but_not_too_many_and_none_is_gone_back_to():
+def test_some_poses_may_be_skipped_and_progress_does_not_go_back():
     long = straight_pass(30, step_mm=5.0)
     guide = guide_of(sweep_of(long))
     guide.watch(long[3])
-    assert guide.at == 4 and guide.guidance().goal == pytest.approx(long[4])
+    assert guide.next_pose == 4 and guide.guidance().goal == pytest.approx(long[4])
     guide.watch(long[0])
     guide.watch(long[4 + AHEAD + 1])
-    assert guide.at == 4
+    assert guide.next_pose == 4
     guide.watch(long[4 + AHEAD - 1])
-    assert guide.at == 4 + AHEAD
+    assert guide.next_pose == 4 + AHEAD
 
 
 @pytest.mark.parametrize(
     ("mm", "degrees", "near"),
     [(5.9, 0, True), (6.1, 0, False), (0, 17.9, True), (0, 18.1, False), (3.1, 9, False)],
 )
-def test_what_is_near_is_a_way_and_a_turn_together(mm, degrees, near):
-    assert (NEAR_MM, DEG_BESIDE_A_MM) == (6.0, 3.0)
+def test_a_pose_is_near_by_distance_and_angle_together(mm, degrees, near):
+    assert (NEAR_MM, DEG_PER_MM_OFF) == (6.0, 3.0)
     sparse = straight_pass(4, step_mm=50.0)
     guide = guide_of(sweep_of(sparse))
     beside = turned(sparse[2], degrees)
     beside[0, 3] += mm
     guide.watch(beside)
-    assert guide.at == (2 if near else 0)
+    assert guide.next_pose == (2 if near else 0)
 
 
 def test_the_sweeps_are_shown_in_turn_and_then_none():
     guide = guide_of(sweep_of(FIRST), sweep_of(SECOND, name="tilting in one place", seen=0.6))
-    assert guide.said() == "Plan 1: two passes, sees 75 %"
+    assert guide.title() == "Plan 1: two passes, covers 75 %"
     guide.watch(FIRST[0])
-    assert guide.next_sweep() == "Plan 2: tilting in one place, sees 60 %"
-    assert guide.at == 0 and guide.guidance().goal == pytest.approx(SECOND[0])
+    assert guide.next_sweep() == "Plan 2: tilting in one place, covers 60 %"
+    assert guide.next_pose == 0 and guide.guidance().goal == pytest.approx(SECOND[0])
     assert guide.next_sweep() == "Plan hidden"
     guide.watch(FIRST[0])
     assert guide.guidance() is None and guide.figures() == {} == guide.findings()
     assert guide.in_words(0.5) == "" and guide.followed == 0.0
-    assert guide.next_sweep() == "Plan 1: two passes, sees 75 %" and len(guide.guidance().way_mm) == 3
+    assert guide.next_sweep() == "Plan 1: two passes, covers 75 %" and len(guide.guidance().way_mm) == 3
 
 
-def test_a_way_begun_anew_is_forgotten():
+def test_a_restart_clears_the_progress():
     guide = guide_of()
     assert guide.findings() == {"plan": "0 %", "off plan": ""}
-    assert guide.in_words(None) == "plan      two passes: 0 % of it followed"
+    assert guide.in_words(None) == "plan      two passes: 0 % completed"
     guide.watch(FIRST[0])
-    guide.begin_anew()
-    assert guide.at == 0 and guide.figures()["plan_followed"] == 0 and not guide.guidance().gone.any()
+    guide.restart()
+    assert guide.next_pose == 0 and guide.figures()["plan_followed"] == 0 and not guide.guidance().gone.any()
     assert guide.findings()["off plan"] == ""
 
 
-# Gone back
+# Undo, reset and bookmarks
 
 
-class Led:
+class SessionOverBall:
     """A session over the ball, in which each pose is an action, or the last one's sequel; its tissue is the pose."""
 
     def __init__(self) -> None:
         held = over_ball()
         held.pose = held.settled = advanced(FIRST[0], -50.0)
-        held.snapshot, held.restore = (
-            lambda manipulator=None: held.pose,
-            lambda pose: setattr(held, "pose", pose),
-        )
+        held.snapshot = lambda manipulator=None: held.pose
+        held.restore = lambda pose: setattr(held, "pose", pose)
         held.update_surfaces = lambda: None
         self.rehearsal, self.session = held, Session(held)
         self.session.record_state = lambda: None
@@ -197,64 +195,73 @@ class Led:
 
 
 @pytest.fixture
-def led() -> Led:
-    return Led()
+def session_over_ball() -> SessionOverBall:
+    return SessionOverBall()
 
 
-def test_an_undo_takes_what_was_gone_of_the_sweep_back_and_a_redo_forth(led):
-    nothing = led.guide.figures()
+def test_undo_and_redo_restore_the_progress(session_over_ball):
+    nothing = session_over_ball.guide.figures()
     beside = turned(FIRST[1], 3.0)
     beside[0, 3] += 0.6
-    steps = [nothing, led.act(FIRST[0]), led.act(beside, FIRST[2]), led.act(FIRST[3], SECOND[0])]
+    steps = [
+        nothing,
+        session_over_ball.act(FIRST[0]),
+        session_over_ball.act(beside, FIRST[2]),
+        session_over_ball.act(FIRST[3], SECOND[0]),
+    ]
     assert [each["plan_followed"] for each in steps] == pytest.approx([0, 1 / 7, 3 / 7, 5 / 7])
     assert steps[2]["plan_off_mm"] == pytest.approx(0.2) and steps[2]["plan_off_deg"] == pytest.approx(1.0)
     for before in steps[2::-1]:
-        assert led.back(led.history.undo) == before
-    assert led.guide.guidance().goal == pytest.approx(FIRST[0])
+        assert session_over_ball.back(session_over_ball.history.undo) == before
+    assert session_over_ball.guide.guidance().goal == pytest.approx(FIRST[0])
     for after in steps[1:]:
-        assert led.back(led.history.redo) == after
+        assert session_over_ball.back(session_over_ball.history.redo) == after
     # Another way from there on leaves what is kept of the one before as it was.
-    led.back(led.history.undo)
-    assert led.act(FIRST[3])["plan_off_mm"] == pytest.approx(0.15) and led.back(led.history.undo) == steps[2]
+    session_over_ball.back(session_over_ball.history.undo)
+    assert (
+        session_over_ball.act(FIRST[3])["plan_off_mm"] == pytest.approx(0.15)
+        and session_over_ball.back(session_over_ball.history.undo) == steps[2]
+    )
 
 
-def test_so_do_a_reset_and_a_bookmark(led):
-    nothing, beside = led.guide.figures(), FIRST[0].copy()
+def test_reset_and_bookmarks_restore_the_progress(session_over_ball):
+    nothing, beside = session_over_ball.guide.figures(), FIRST[0].copy()
     beside[0, 3] += 0.6
-    marked = led.act(beside, FIRST[1])
-    led.history.set_bookmark()
-    after = led.act(FIRST[2])
-    assert led.back(led.history.reset) == nothing
-    assert led.back(led.history.undo) == after
+    marked = session_over_ball.act(beside, FIRST[1])
+    session_over_ball.history.set_bookmark()
+    after = session_over_ball.act(FIRST[2])
+    assert session_over_ball.back(session_over_ball.history.reset) == nothing
+    assert session_over_ball.back(session_over_ball.history.undo) == after
     # Gone to twice, with a better way from there in between.
     for _ in range(2):
-        assert led.back(led.history.to_bookmark) == marked
-        better = led.act(FIRST[0], FIRST[2])
+        assert session_over_ball.back(session_over_ball.history.to_bookmark) == marked
+        better = session_over_ball.act(FIRST[0], FIRST[2])
         assert (
             better["plan_followed"] == after["plan_followed"]
             and better["plan_off_mm"] == 0 < marked["plan_off_mm"]
         )
-    assert led.back(led.history.undo) == marked
+    assert session_over_ball.back(session_over_ball.history.undo) == marked
 
 
-def test_of_another_sweep_nothing_was_gone_at_any_moment_before_it_was_shown(led):
-    led.act(FIRST[0], FIRST[1])
-    led.act(FIRST[2])
-    led.guide.next_sweep()
-    assert led.guide.figures()["plan_followed"] == 0
-    assert led.act(SECOND[0])["plan_followed"] == pytest.approx(1 / 3)
+def test_another_sweep_has_no_progress_at_steps_before_it_was_shown(session_over_ball):
+    session_over_ball.act(FIRST[0], FIRST[1])
+    session_over_ball.act(FIRST[2])
+    session_over_ball.guide.next_sweep()
+    assert session_over_ball.guide.figures()["plan_followed"] == 0
+    assert session_over_ball.act(SECOND[0])["plan_followed"] == pytest.approx(1 / 3)
     for _ in range(2):
-        assert led.back(led.history.undo)["plan_followed"] == 0
+        assert session_over_ball.back(session_over_ball.history.undo)["plan_followed"] == 0
     # Nor where it is shown and undone in one frame.
-    led.guide.next_sweep()
-    assert led.back(led.history.redo) == {}
+    session_over_ball.guide.next_sweep()
+    assert session_over_ball.back(session_over_ball.history.redo) == {}
 
 
-def test_no_more_is_kept_of_it_than_of_the_session(led):
+def test_the_history_is_as_long_as_that_of_the_session(session_over_ball):
     for number in range(MOST_UNDONE + 9):
-        led.act(FIRST[number % 4])
+        session_over_ball.act(FIRST[number % 4])
     assert (
-        led.guide._kept.keys() == led.session.kept_states.keys() and len(led.guide._kept) <= MOST_UNDONE + 1
+        session_over_ball.guide._history.keys() == session_over_ball.session.kept_states.keys()
+        and len(session_over_ball.guide._history) <= MOST_UNDONE + 1
     )
 
 
@@ -288,7 +295,7 @@ def drawn(lines: GuideLines, guidance: Guidance) -> tuple[np.ndarray, np.ndarray
     return segments[long], each[long, 0], more
 
 
-def test_the_lines_are_the_way_and_what_is_behind_has_another_colour(one_device):
+def test_the_completed_part_of_the_path_has_another_colour(one_device):
     guide, lines = guide_of(), GuideLines(EDGES)
     for pose in [None, *FIRST[:3]]:
         if pose is not None:
@@ -304,7 +311,7 @@ def test_the_lines_are_the_way_and_what_is_behind_has_another_colour(one_device)
     assert (colours == GONE).all() and more == []
 
 
-def test_of_two_sweeps_shown_one_after_the_other_each_has_its_own_lines(one_device):
+def test_two_sweeps_shown_in_turn_have_their_own_lines(one_device):
     """Arrays that are freed leave their identity to others."""
     lines, goal = GuideLines(EDGES), np.eye(4)
     for number in range(20):
@@ -314,7 +321,7 @@ def test_of_two_sweeps_shown_one_after_the_other_each_has_its_own_lines(one_devi
         del way
 
 
-def test_of_a_longer_way_than_there_are_lines_every_second_segment_is_drawn(one_device, monkeypatch):
+def test_every_second_segment_of_a_path_with_too_many_is_drawn(one_device, monkeypatch):
     monkeypatch.setattr(plan_lines, "MOST_SEGMENTS", 10)
     way = np.arange(15 * 6, dtype=float).reshape(15, 2, 3)
     gone = np.arange(15) < 7
@@ -326,7 +333,7 @@ def test_of_a_longer_way_than_there_are_lines_every_second_segment_is_drawn(one_
 # Keys
 
 
-def test_the_keys_are_those_that_the_window_hears():
+def test_the_keys_of_a_plan():
     keys = Keys()
     heard = {" ": "plan_for", "Return": "plan", "BackSpace": "next_plan"}
     assert {key: keys.action_of(key) for key in heard} == heard

@@ -1,4 +1,4 @@
-"""The search for a plan: evolution, who has how many trials, and what a plan is made of; with processes that only count."""
+"""The search for a plan: candidate_search, who has how many trials, and what a plan is made of; with processes that only count."""
 
 import os
 import re
@@ -14,15 +14,19 @@ import pytest
 import trimesh
 from plan_ball import GOOD, big_ball, from_above, manipulator_on, straight_pass
 
-from rehearsal.planning import evolution
-from rehearsal.planning.evolution import GENERATION, NEAR, Search, foreseen
-from rehearsal.planning.make_plan import make_plan
+from rehearsal.planning import candidate_search
+from rehearsal.planning.candidate_search import GENERATION, TRIAL_SIGMA, CandidateSearch, surrogate_optimum
 from rehearsal.planning.plan_file import PlanError, read_plan, write_plan
-from rehearsal.planning.score import score
-from rehearsal.planning.score_terms import ScoreTerms
-from rehearsal.planning.search import FORESEEN, TRIAL_MM_S, length_of, ranked, search
-from rehearsal.planning.sweep_candidates import Candidate, Quantity
-from rehearsal.planning.trial_workers import Outcome, Problem, SearchSpace, Workers, _trial, workers
+from rehearsal.planning.plan_search import SURROGATE_TRIALS, TRIAL_MM_S, make_plan, ranked, search, total_work
+from rehearsal.planning.sweep_candidates import ParameterRange, SweepCandidate
+from rehearsal.planning.sweep_score import ScoreTerms, score
+from rehearsal.planning.trial_workers import (
+    PlanningProblem,
+    SearchSpace,
+    TrialResult,
+    TrialWorkers,
+    _trial,
+)
 from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.scene import Scene
 from scenes.trocar import Trocar
@@ -31,12 +35,14 @@ from studies.planning.plan_study_command import table
 from ultrasound.probe import load_probe
 
 BEST = dict(a_mm=-3.0, b_mm=7.0, c_deg=20.0)
-RANGES = dict(a_mm=Quantity(-10, 10, 0), b_mm=Quantity(0, 8, 2), c_deg=Quantity(-45, 45, -30))
+RANGES = dict(
+    a_mm=ParameterRange(-10, 10, 0), b_mm=ParameterRange(0, 8, 2), c_deg=ParameterRange(-45, 45, -30)
+)
 
 
-def candidate(name: str, handicap: float = 0.0) -> Candidate:
+def candidate(name: str, handicap: float = 0.0) -> SweepCandidate:
     """One that is worth less by a handicap, which its count carries."""
-    return Candidate(name, "glide", int(100 * handicap), from_above(), RANGES)
+    return SweepCandidate(name, "slide", int(100 * handicap), from_above(), RANGES)
 
 
 def worth(values: dict[str, float], handicap: float = 0.0) -> ScoreTerms:
@@ -45,52 +51,54 @@ def worth(values: dict[str, float], handicap: float = 0.0) -> ScoreTerms:
     return replace(GOOD, seen=1.0 - handicap - off)
 
 
-class Counting(Workers):
+class Counting(TrialWorkers):
     """No processes: a way is worth what its numbers say, and every task is written down."""
 
-    def __init__(self, candidates: list[Candidate], reachable: float = 1.0, ways: int = 1) -> None:
+    def __init__(self, candidates: list[SweepCandidate], reachable: float = 1.0, ways: int = 1) -> None:
         self.candidates, self.reachable, self.ways = candidates, reachable, ways
-        self.tasks: list[tuple[Candidate, dict[str, float], float]] = []
-        self.foreseen = 0
+        self.tasks: list[tuple[SweepCandidate, dict[str, float], float]] = []
+        self.surrogate_optimum = 0
 
     def search_space(self) -> SearchSpace:
         return SearchSpace(self.candidates, dict(model="neo-hookean", cell_mm=8.0))
 
-    def foresee(self, candidates) -> Iterator[np.ndarray]:
+    def surrogate_optima(self, candidates) -> Iterator[np.ndarray]:
         for each in candidates:
-            self.foreseen += 1
+            self.surrogate_optimum += 1
             yield each.start()
 
-    def go(self, tasks) -> Iterator[Outcome]:
+    def try_candidates(self, tasks) -> Iterator[TrialResult]:
         for each, values, speed in tasks:
             self.tasks.append((each, values, speed))
             parts = replace(worth(values, each.count / 100), reachable=self.reachable)
-            yield Outcome(parts, [straight_pass(4)] * self.ways)
+            yield TrialResult(parts, [straight_pass(4)] * self.ways)
 
-    def go_ways(self, ways, speed_mm_s) -> Iterator[Outcome]:
+    def try_paths(self, ways, speed_mm_s) -> Iterator[TrialResult]:
         for number, _ in enumerate(ways):
-            yield Outcome(replace(GOOD, seen=0.1 * number), [straight_pass(4)])
+            yield TrialResult(replace(GOOD, seen=0.1 * number), [straight_pass(4)])
 
 
-def four() -> list[Candidate]:
+def four() -> list[SweepCandidate]:
     return [candidate(f"sweep {n}", handicap) for n, handicap in enumerate((0.3, 0.0, 0.2, 0.1))]
 
 
-def problem_of(**changes) -> Problem:
+def problem_of(**changes) -> PlanningProblem:
     anatomy = LoadedAnatomy(big_ball(), None, None, ())
     values = dict(scene=Scene(anatomy={}), anatomy=anatomy, probe=load_probe("linear"), target="organ")
-    return Problem(**(values | dict(margin_mm=5.0, trocar=Trocar()) | changes))
+    return PlanningProblem(**(values | dict(margin_mm=5.0, trocar=Trocar()) | changes))
 
 
-def with_tumour(**changes) -> Problem:
+def with_tumour(**changes) -> PlanningProblem:
     return problem_of(anatomy=LoadedAnatomy(big_ball(), big_ball(), None, ()), **changes)
 
 
-# Evolution
+# CMA-ES
 
 
-def evolved(generations: int, beside: bool = False) -> Search:
-    found, other = (Search(candidate("one"), candidate("one").start(), NEAR) for _ in range(2))
+def evolved(generations: int, beside: bool = False) -> CandidateSearch:
+    found, other = (
+        CandidateSearch(candidate("one"), candidate("one").start(), TRIAL_SIGMA) for _ in range(2)
+    )
     for _ in range(generations):
         asked = found.ask()
         if beside:
@@ -100,7 +108,7 @@ def evolved(generations: int, beside: bool = False) -> Search:
     return found
 
 
-def test_evolution_finds_the_best_numbers_and_says_what_they_are():
+def test_the_search_finds_the_best_parameters():
     found = evolved(40)
     for name, best in BEST.items():
         assert found.values[name] == pytest.approx(best, abs=0.01 * (RANGES[name].high - RANGES[name].low))
@@ -108,7 +116,7 @@ def test_evolution_finds_the_best_numbers_and_says_what_they_are():
     assert found.candidate.values(found.best) == found.values and found.trials == 40 * GENERATION
 
 
-def test_the_same_trials_give_the_same_and_no_other_search_or_chance_is_heard():
+def test_a_search_is_deterministic_and_independent_of_other_generators():
     np.random.seed(5)  # noqa: NPY002 the one that all share
     before = np.random.get_state()[1].copy()  # noqa: NPY002
     alone = evolved(5)
@@ -119,7 +127,7 @@ def test_the_same_trials_give_the_same_and_no_other_search_or_chance_is_heard():
 
 def test_the_first_generation_has_the_start_and_all_stay_in_range():
     start = np.array([0.0, 1.0, 0.5])
-    found = Search(candidate("one"), start, 0.5)
+    found = CandidateSearch(candidate("one"), start, 0.5)
     for generation in range(6):
         asked = found.ask()
         assert len(asked) == GENERATION and np.array_equal(asked[0], start) == (generation == 0)
@@ -129,22 +137,22 @@ def test_the_first_generation_has_the_start_and_all_stay_in_range():
 
 
 @pytest.mark.parametrize("better", [True, False])
-def test_a_search_goes_on_where_its_candidate_begins_if_that_is_better(better):
-    """Than where a forecast has led it."""
+def test_a_search_restarts_at_the_default_if_that_is_better(better):
+    """Than the optimum of the surrogate."""
     one, start = candidate("one"), np.array([0.9, 0.9, 0.9])
-    found = Search(one, start, NEAR)
+    found = CandidateSearch(one, start, TRIAL_SIGMA)
     asked = found.ask()
     assert np.array_equal(asked[:2], [start, one.start()])
     found.tell(asked, [1.0, 2.0 if better else 0.0, *[0.5] * (GENERATION - 2)])
     wanted = one.start() if better else start
     away = np.linalg.norm(found.ask() - wanted, axis=1)
-    # Steps of NEAR along each of three axes; what lies there is farther off.
-    assert away.max() < 5 * NEAR < np.linalg.norm(start - one.start())
+    # Steps of TRIAL_SIGMA along each of three axes; what lies there is farther off.
+    assert away.max() < 5 * TRIAL_SIGMA < np.linalg.norm(start - one.start())
     assert np.array_equal(found.best, wanted)
 
 
 def test_part_of_a_generation_counts_and_the_best_so_far_stays():
-    found = Search(candidate("one"), candidate("one").start(), NEAR)
+    found = CandidateSearch(candidate("one"), candidate("one").start(), TRIAL_SIGMA)
     asked = found.ask()
     found.tell(asked[:3], [1.0, 5.0, 2.0])
     assert (found.trials, found.score) == (3, 5.0) and np.array_equal(found.best, asked[1])
@@ -152,7 +160,7 @@ def test_part_of_a_generation_counts_and_the_best_so_far_stays():
     assert (found.trials, found.score) == (3 + GENERATION, 5.0) and np.array_equal(found.best, asked[1])
 
 
-def test_a_forecasts_best_is_no_worse_than_where_it_began():
+def test_the_surrogate_optimum_is_no_worse_than_the_default():
     asked: list[dict[str, float]] = []
 
     def seen(values: dict[str, float]) -> ScoreTerms:
@@ -160,28 +168,31 @@ def test_a_forecasts_best_is_no_worse_than_where_it_began():
         return worth(values)
 
     one = candidate("one")
-    best = foreseen(one, seen)
-    assert len(asked) == -(-evolution.FORECASTS // GENERATION) * GENERATION
+    best = surrogate_optimum(one, seen)
+    assert len(asked) == -(-candidate_search.SURROGATE_EVALUATIONS // GENERATION) * GENERATION
     assert asked[0] == pytest.approx(one.values(one.start()))
     assert worth(one.values(best)).seen == max(worth(values).seen for values in asked) > 0.99
 
 
-# Who has how many trials
+# Distribution of trials
 
 
 @pytest.mark.parametrize("trials", [4, 5, 37, 64, 96, 101])
 def test_all_trials_are_made_and_counted(trials):
-    crew, done = Counting(four()), []
-    searches = search(crew.candidates, crew, trials, done.append)
-    made = Counter(each.side for each, _, _ in crew.tasks)
-    assert sum(made.values()) == len(crew.tasks) == trials and Counter(done) == {1: trials, FORESEEN: 4}
+    workers, done = Counting(four()), []
+    searches = search(workers.candidates, workers, trials, done.append)
+    made = Counter(each.side for each, _, _ in workers.tasks)
+    assert sum(made.values()) == len(workers.tasks) == trials and Counter(done) == {
+        1: trials,
+        SURROGATE_TRIALS: 4,
+    }
     assert {one.candidate.side: one.trials for one in searches} == made
-    assert {speed for _, _, speed in crew.tasks} == {TRIAL_MM_S} and crew.foreseen == 4
+    assert {speed for _, _, speed in workers.tasks} == {TRIAL_MM_S} and workers.surrogate_optimum == 4
 
 
 def test_the_better_half_has_the_rest():
-    crew = Counting(four())
-    searches = search(crew.candidates, crew, 96, lambda _: None)
+    workers = Counting(four())
+    searches = search(workers.candidates, workers, 96, lambda _: None)
     trials = {one.candidate.side: one.trials for one in searches}
     half = (96 - 2 * GENERATION) // 2
     assert trials == {"sweep 0": GENERATION, "sweep 2": GENERATION, "sweep 1": half, "sweep 3": half}
@@ -190,9 +201,9 @@ def test_the_better_half_has_the_rest():
 
 
 def test_every_answer_goes_to_the_candidate_that_asked():
-    crew = Counting(four())
-    for one in search(crew.candidates, crew, 45, lambda _: None):
-        tried = [values for each, values, _ in crew.tasks if each is one.candidate]
+    workers = Counting(four())
+    for one in search(workers.candidates, workers, 45, lambda _: None):
+        tried = [values for each, values, _ in workers.tasks if each is one.candidate]
         scores = [score(worth(values, one.candidate.count / 100)) for values in tried]
         assert one.score == max(scores) and one.values == tried[int(np.argmax(scores))]
         assert tried[0] == pytest.approx(one.candidate.values(one.candidate.start()))
@@ -200,33 +211,33 @@ def test_every_answer_goes_to_the_candidate_that_asked():
 
 def test_two_searches_try_the_same():
     one, two = Counting(four()), Counting(four())
-    for crew in (one, two):
-        search(crew.candidates, crew, 70, lambda _: None)
+    for workers in (one, two):
+        search(workers.candidates, workers, 70, lambda _: None)
     assert [(each.side, values) for each, values, _ in one.tasks] == [
         (each.side, values) for each, values, _ in two.tasks
     ]
 
 
-def test_the_best_of_each_is_gone_once_more_and_ranked():
-    crew, done = Counting(four()), []
-    searches = search(crew.candidates, crew, 48, lambda _: None)
-    crew.tasks.clear()
-    rows = ranked(searches, crew, 12.0, done.append)
+def test_the_best_of_each_is_tried_once_more_and_ranked():
+    workers, done = Counting(four()), []
+    searches = search(workers.candidates, workers, 48, lambda _: None)
+    workers.tasks.clear()
+    rows = ranked(searches, workers, 12.0, done.append)
     assert [one.candidate.side for one, _ in rows] == ["sweep 1", "sweep 3", "sweep 2", "sweep 0"]
-    assert done == [3] * 4 and {speed for _, _, speed in crew.tasks} == {12.0}
-    assert all(outcome.parts == worth(one.values, one.candidate.count / 100) for one, outcome in rows)
-    # One that had no trial has no numbers to be gone with.
-    untried = Search(candidate("untried"), np.zeros(3), NEAR)
-    assert len(ranked([*searches, untried], crew, 12.0, lambda _: None)) == 4
+    assert done == [3] * 4 and {speed for _, _, speed in workers.tasks} == {12.0}
+    assert all(outcome.terms == worth(one.values, one.candidate.count / 100) for one, outcome in rows)
+    # A candidate without trials has no parameters to try.
+    untried = CandidateSearch(candidate("untried"), np.zeros(3), TRIAL_SIGMA)
+    assert len(ranked([*searches, untried], workers, 12.0, lambda _: None)) == 4
 
 
 # A plan made
 
 
-def test_a_plan_is_the_ranked_sweeps_with_what_they_are_for(tmp_path):
+def test_a_plan_contains_the_ranked_sweeps(tmp_path):
     problem, done = problem_of(trocar=Trocar(cone_deg=33)), []
     plans = [make_plan(problem, Counting(four()), 12.0, 96, done.append) for _ in range(2)]
-    assert sum(done) == 2 * length_of(96, 12.0), "what the command's progress bar expects"
+    assert sum(done) == 2 * total_work(96, 12.0), "what the command's progress bar expects"
     assert done[0] == 0 and done.count(0) == 2
     plan = plans[0]
     assert [each.name.split("passes ")[-1].removeprefix("one pass ") for each in plan.sweeps] == [
@@ -251,21 +262,23 @@ def test_a_plan_is_the_ranked_sweeps_with_what_they_are_for(tmp_path):
     assert read_plan(tmp_path / "a") == plan
 
 
-@pytest.mark.parametrize("crew", [Counting(four(), reachable=0.95), Counting(four(), ways=0), Counting([])])
-def test_where_no_sweep_can_be_held_that_is_said(crew):
-    if not crew.candidates:
-        crew.search_space = lambda: SearchSpace([], {})
-        crew.go = lambda tasks: iter(())
+@pytest.mark.parametrize(
+    "workers", [Counting(four(), reachable=0.95), Counting(four(), ways=0), Counting([])]
+)
+def test_without_a_reachable_sweep_there_is_an_error(workers):
+    if not workers.candidates:
+        workers.search_space = lambda: SearchSpace([], {})
+        workers.try_candidates = lambda tasks: iter(())
     with pytest.raises(PlanError, match="no sweep was found.*move the trocar, widen its cone") as error:
-        make_plan(problem_of(), crew, 10.0, 4 if crew.candidates else 0, lambda _: None)
+        make_plan(problem_of(), workers, 10.0, 4 if workers.candidates else 0, lambda _: None)
     assert "\n" not in str(error.value)
 
 
-def test_a_comparison_counts_what_it_does_and_means_its_sweeps_by_chance(monkeypatch):
+def test_a_comparison_reports_its_progress_and_averages_the_random_sweeps(monkeypatch):
     jobs: list[int | None] = []
 
     class Crew(Counting):
-        def __init__(self, problem: Problem, count: int | None) -> None:
+        def __init__(self, problem: PlanningProblem, count: int | None) -> None:
             super().__init__(four())
             jobs.append(count)
 
@@ -274,7 +287,7 @@ def test_a_comparison_counts_what_it_does_and_means_its_sweeps_by_chance(monkeyp
 
         def __exit__(self, *_) -> None: ...
 
-    monkeypatch.setattr(plan_comparison, "workers", Crew)
+    monkeypatch.setattr(plan_comparison, "TrialWorkers", Crew)
     done: list[int] = []
     run = plan_comparison.compare(Scene(anatomy={}), with_tumour().anatomy, 40, 3, done.append)
     assert sum(done) == plan_comparison.count_of(40) and jobs == [3, 3]
@@ -294,8 +307,8 @@ def test_a_comparison_counts_what_it_does_and_means_its_sweeps_by_chance(monkeyp
 # Processes
 
 
-def test_a_process_keeps_no_ground_for_another():
-    """What it has built is found by all that a trial turns on."""
+def test_a_process_distinguishes_problems():
+    """Its key contains all that a trial depends on."""
     problems = [
         problem_of(),
         problem_of(margin_mm=6.0),
@@ -306,46 +319,46 @@ def test_a_process_keeps_no_ground_for_another():
         problem_of(scene=Scene(anatomy={}, tissue=dict(cell_mm=8.0))),
         problem_of(anatomy=LoadedAnatomy(trimesh.creation.box([9.0] * 3), None, None, ())),
     ]
-    assert len({Workers(each, 1)._key for each in problems}) == len(problems)
-    assert Workers(problem_of(), 1)._key == Workers(problems[0], 1)._key
+    assert len({TrialWorkers(each, 1)._key for each in problems}) == len(problems)
+    assert TrialWorkers(problem_of(), 1)._key == TrialWorkers(problems[0], 1)._key
 
 
-def _end(key: str, problem: Problem) -> None:
+def _end(key: str, problem: PlanningProblem) -> None:
     os._exit(1)
 
 
-def _process(key: str, problem: Problem) -> tuple[int, list[str]]:
+def _process(key: str, problem: PlanningProblem) -> tuple[int, list[str]]:
     return os.getpid(), [thread.name for thread in threading.enumerate()]
 
 
 def test_one_process_is_not_this_one_and_watches_whether_this_one_is_there():
     """Taichi would be started anew under whatever this one computes."""
-    with workers(problem_of(), 1) as crew:
-        ((process, threads),) = crew._all(_process, [()])
+    with TrialWorkers(problem_of(), 1) as workers:
+        ((process, threads),) = workers._map(_process, [()])
     assert process != os.getpid() and any("_watch" in name for name in threads)
 
 
 @pytest.mark.parametrize("target", ["tumour", "margin"])
-def test_there_is_no_problem_of_a_tumour_without_one(target):
+def test_a_tumour_target_needs_a_tumour(target):
     with pytest.raises(PlanError, match=f"--target {target}: this scene has no tumour; expected organ"):
         problem_of(target=target)
 
 
-def test_who_waits_for_processes_that_are_stopped_is_told():
-    with workers(problem_of(), 1) as crew:
-        waiting = crew._all(_sleep, [()] * 9)
-        threading.Timer(0.5, crew.stop).start()
+def test_stopping_the_processes_is_an_error_for_a_waiting_thread():
+    with TrialWorkers(problem_of(), 1) as workers:
+        waiting = workers._map(_sleep, [()] * 9)
+        threading.Timer(0.5, workers.stop).start()
         with pytest.raises(PlanError, match="was ended"):
             list(waiting)
 
 
-def _sleep(key: str, problem: Problem) -> None:
+def _sleep(key: str, problem: PlanningProblem) -> None:
     time.sleep(60)
 
 
-def test_a_process_that_is_ended_is_said_in_one_line():
-    with workers(problem_of(), 2) as crew, pytest.raises(PlanError) as error:
-        list(crew._all(_end, [()]))
+def test_a_process_that_ended_is_an_error_in_one_line():
+    with TrialWorkers(problem_of(), 2) as workers, pytest.raises(PlanError) as error:
+        list(workers._map(_end, [()]))
     assert "a process of the search was ended" in str(error.value) and "\n" not in str(error.value)
 
 
@@ -361,12 +374,12 @@ def test_a_target_without_a_voxel_is_refused(monkeypatch, target, margin):
     anatomy = replace(problem_of().anatomy, tumour=speck)
     # Not in a process of its own, which would build a rehearsal.
     with pytest.raises(PlanError, match=f"--target {target}: it is smaller than a voxel of 1.5 mm"):
-        _trial("speck", problem_of(anatomy=anatomy, target=target, margin_mm=margin), 10.0)
+        _trial("speck", problem_of(anatomy=anatomy, target=target, margin_mm=margin))
 
 
-def test_no_pictures_go_to_the_processes():
+def test_no_images_are_sent_to_the_processes():
     grid = SimpleNamespace(voxels=np.zeros((2, 2, 2)))
     anatomy = replace(problem_of().anatomy, ct=grid, labels=grid, parts=dict(vessel=big_ball()))
-    bare = problem_of(anatomy=anatomy).bare
+    bare = problem_of(anatomy=anatomy).without_images
     assert bare.anatomy.ct is None and bare.anatomy.labels is None and bare.anatomy.parts == {}
     assert bare.anatomy.organ is anatomy.organ

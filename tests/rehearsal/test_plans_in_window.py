@@ -1,4 +1,4 @@
-"""Plans asked for in the window: made in a thread, with processes that do nothing."""
+"""Planning in the window, with a search that is stepped by the test."""
 
 import threading
 from contextlib import contextmanager
@@ -12,8 +12,8 @@ from rehearsal.frame_view import probe_with_settings
 from rehearsal.planning import plans_in_window
 from rehearsal.planning.plan_file import PlanError, read_plan
 from rehearsal.planning.plan_guidance import PlanGuidance
-from rehearsal.planning.plans_in_window import SPEED_MM_S, TRIALS, Plans, in_words
-from rehearsal.planning.search import length_of
+from rehearsal.planning.plan_search import total_work
+from rehearsal.planning.plans_in_window import SPEED_MM_S, TRIALS, PlanControl, minutes_in_words
 from render.viewer import Controls, Settings
 from scenes.scene import Scene
 from ultrasound.probe import load_probe
@@ -22,30 +22,30 @@ LONGEST_S = 10.0
 PROBE = load_probe("drop-in")
 
 
-class Search:
-    """Stands for ``make_plan``: it makes as many trials as it is let, and then what it is told."""
+class SteppedSearch:
+    """Replaces ``make_plan``: it waits before each trial, then returns a plan or raises ``end``."""
 
     def __init__(self, monkeypatch) -> None:
-        self.let, self.problems, self.jobs = threading.Semaphore(0), [], []
+        self.allowed, self.problems, self.jobs = threading.Semaphore(0), [], []
         self.begun = threading.Event()
         self.end: Exception | None = None
         self.is_stopped = False
         self.counted = threading.Semaphore(0)
         monkeypatch.setattr(plans_in_window, "make_plan", self.make)
-        monkeypatch.setattr(plans_in_window, "workers", self.workers)
+        monkeypatch.setattr(plans_in_window, "TrialWorkers", self.workers)
 
     @contextmanager
     def workers(self, problem, jobs):
         self.jobs.append(jobs)
         yield self
 
-    def make(self, problem, crew, speed_mm_s, trials, done):
-        assert crew is self and trials == TRIALS
+    def make(self, problem, workers, speed_mm_s, trials, done):
+        assert workers is self and trials == TRIALS
         self.problems.append(problem)
         done(0)
         self.begun.set()
         for _ in range(4):
-            assert self.let.acquire(timeout=LONGEST_S)
+            assert self.allowed.acquire(timeout=LONGEST_S)
             done(1)
             self.counted.release()
         if self.end is not None:
@@ -55,48 +55,50 @@ class Search:
     def stop(self) -> None:
         self.is_stopped = True
 
-    def go(self, trials: int) -> None:
+    def run_trials(self, trials: int) -> None:
         """Let it make some trials, and wait until they are counted."""
         for _ in range(trials):
-            self.let.release()
+            self.allowed.release()
             assert self.counted.acquire(timeout=LONGEST_S)
 
 
 @pytest.fixture
-def searching(monkeypatch) -> Search:
-    return Search(monkeypatch)
+def searching(monkeypatch) -> SteppedSearch:
+    return SteppedSearch(monkeypatch)
 
 
 @pytest.fixture
-def plans(tmp_path) -> Plans:
+def plans(tmp_path) -> PlanControl:
     held = SimpleNamespace(**vars(over_ball()), tumour="a tumour", scene=Scene(anatomy={}), probe=PROBE)
     followed = SimpleNamespace(guide=None)
     followed.follow = lambda guide: setattr(followed, "guide", guide)
-    return Plans(held, SimpleNamespace(tumour=held.tumour), followed, tmp_path)
+    return PlanControl(held, SimpleNamespace(tumour=held.tumour), followed, tmp_path)
 
 
-def said(plans: Plans, **controls) -> str:
+def message(plans: PlanControl, **controls) -> str:
     settings = controls.pop("settings", None) or Settings()
     return plans.watch(Controls(settings, **controls))
 
 
-def ended(plans: Plans) -> str:
-    """What is said once the search is over."""
-    plans._planning._thread.join(LONGEST_S)
-    return said(plans)
+def ended(plans: PlanControl) -> str:
+    """The message at the end of the search."""
+    plans._job._thread.join(LONGEST_S)
+    return message(plans)
 
 
-def test_a_plan_is_made_while_the_rehearsal_goes_on_and_then_followed(searching, plans, tmp_path):
+def test_a_plan_is_made_during_the_rehearsal_and_then_followed(searching, plans, tmp_path):
     assert plans.status == ""
-    assert said(plans, plan=True, settings=Settings(margin_mm=7)) == "Planning for the tumour and its margin"
-    assert said(plans) == "" and plans.status == "PLANNING   0 %; {next_plan} stops"
-    searching.go(3)
-    assert plans.status.startswith(f"PLANNING   {300 / length_of(TRIALS, SPEED_MM_S):.0f} %, ")
-    assert said(plans, plan=True) == "A plan is being made"
-    searching.go(1)
-    assert ended(plans) == "Plan 1: two passes, sees 75 % (plan-001.json)"
-    assert plans.status == "" and said(plans) == "" and len(searching.problems) == 1
-    guide = plans.instruments.guide
+    assert (
+        message(plans, plan=True, settings=Settings(margin_mm=7)) == "Planning for the tumour and its margin"
+    )
+    assert message(plans) == "" and plans.status == "PLANNING   0 %; {next_plan} stops"
+    searching.run_trials(3)
+    assert plans.status.startswith(f"PLANNING   {300 / total_work(TRIALS, SPEED_MM_S):.0f} %, ")
+    assert message(plans, plan=True) == "A plan is being made"
+    searching.run_trials(1)
+    assert ended(plans) == "Plan 1: two passes, covers 75 % (plan-001.json)"
+    assert plans.status == "" and message(plans) == "" and len(searching.problems) == 1
+    guide = plans.measurements.guide
     assert isinstance(guide, PlanGuidance) and read_plan(tmp_path / "plan-001.json") == guide.plan
     (problem,) = searching.problems
     assert (problem.target, problem.margin_mm, problem.anatomy, problem.probe) == (
@@ -106,26 +108,26 @@ def test_a_plan_is_made_while_the_rehearsal_goes_on_and_then_followed(searching,
         probe_with_settings(PROBE, Settings(margin_mm=7)),
     )
     assert problem.scene.solver.iterations == Settings().iterations
-    assert said(plans, plan=True) == "Planning for the tumour and its margin"
-    searching.go(4)
+    assert message(plans, plan=True) == "Planning for the tumour and its margin"
+    searching.run_trials(4)
     ended(plans)
-    assert (tmp_path / "plan-002.json").is_file() and plans.instruments.guide is not guide
+    assert (tmp_path / "plan-002.json").is_file() and plans.measurements.guide is not guide
 
 
-def test_how_long_it_will_take_is_said_once_there_is_a_pace(monkeypatch, searching, plans):
+def test_the_remaining_time_is_shown_once_there_is_a_pace(monkeypatch, searching, plans):
     clock = [100.0]
     monkeypatch.setattr(plans_in_window, "perf_counter", lambda: clock[0])
-    said(plans, plan=True)
+    message(plans, plan=True)
     assert searching.begun.wait(LONGEST_S)
     clock[0] += 30.0
     assert plans.status == "PLANNING   0 %; {next_plan} stops"
-    searching.go(2)
-    # So long for two, and then as long again for nothing.
+    searching.run_trials(2)
+    # 30 s for two trials, then 30 s more without one.
     for clock[0] in (130.0, 160.0):
-        left_s = (clock[0] - 100.0) * (length_of(TRIALS, SPEED_MM_S) - 2) / 2
-        assert plans._planning.left_s == pytest.approx(left_s)
-        assert plans.status.endswith(f" %, some {left_s / 60:.0f} min left; {{next_plan}} stops")
-    searching.go(2)
+        left_s = (clock[0] - 100.0) * (total_work(TRIALS, SPEED_MM_S) - 2) / 2
+        assert plans._job.left_s == pytest.approx(left_s)
+        assert plans.status.endswith(f" %, about {left_s / 60:.0f} min left; {{next_plan}} stops")
+    searching.run_trials(2)
     ended(plans)
 
 
@@ -134,39 +136,43 @@ def test_how_long_it_will_take_is_said_once_there_is_a_pace(monkeypatch, searchi
     [
         (0, "under a minute"),
         (29, "under a minute"),
-        (31, "some 1 min"),
-        (89, "some 1 min"),
-        (480, "some 8 min"),
+        (31, "about 1 min"),
+        (89, "about 1 min"),
+        (480, "about 8 min"),
     ],
 )
-def test_a_time_that_is_not_known_well_is_in_whole_minutes(seconds, words):
-    assert in_words(seconds) == words
+def test_a_rough_time_is_in_whole_minutes(seconds, words):
+    assert minutes_in_words(seconds) == words
 
 
 @pytest.mark.parametrize("began", [True, False])
-def test_a_key_stops_it_and_shows_the_next_sweep_otherwise(monkeypatch, searching, plans, tmp_path, began):
-    """Also before it has processes that could be stopped."""
+def test_the_key_stops_a_search_and_otherwise_shows_the_next_sweep(
+    monkeypatch, searching, plans, tmp_path, began
+):
+    """Also before it has processes."""
     made = threading.Event()
     if not began:
-        crew = searching.workers
+        workers = searching.workers
 
         @contextmanager
         def late(*given):
             assert made.wait(LONGEST_S)
-            with crew(*given) as each:
+            with workers(*given) as each:
                 yield each
 
-        monkeypatch.setattr(plans_in_window, "workers", late)
-    plans.instruments.guide = guide = PlanGuidance(plans.rehearsal, plan_of(sweep_of(straight_pass(3))))
-    said(plans, plan=True)
-    search = plans._planning
+        monkeypatch.setattr(plans_in_window, "TrialWorkers", late)
+    plans.measurements.guide = guide = PlanGuidance(plans.rehearsal, plan_of(sweep_of(straight_pass(3))))
+    message(plans, plan=True)
+    search = plans._job
     if began:
         assert searching.begun.wait(LONGEST_S)
-    threading.Timer(0.1, lambda: (made.set(), searching.let.release())).start()
-    assert said(plans, next_plan=True) == "Planning stopped" and plans.status == "" and said(plans) == ""
+    threading.Timer(0.1, lambda: (made.set(), searching.allowed.release())).start()
+    assert (
+        message(plans, next_plan=True) == "Planning stopped" and plans.status == "" and message(plans) == ""
+    )
     assert search.is_over and searching.is_stopped == began and list(tmp_path.iterdir()) == []
     assert len(searching.problems) == began and guide.number == 0
-    assert said(plans, next_plan=True) == "Plan hidden" and guide.number == 1
+    assert message(plans, next_plan=True) == "Plan hidden" and guide.number == 1
 
 
 @pytest.mark.parametrize(
@@ -176,61 +182,61 @@ def test_a_key_stops_it_and_shows_the_next_sweep_otherwise(monkeypatch, searchin
         (OSError(28, "No space left on device"), "plan-001.json cannot be written: No space left on device"),
     ],
 )
-def test_what_goes_wrong_is_said_and_another_can_be_asked_for(searching, plans, tmp_path, error, words):
+def test_an_error_is_shown_and_another_plan_can_be_made(searching, plans, tmp_path, error, words):
     searching.end = error
-    said(plans, plan=True)
-    searching.go(4)
-    assert ended(plans) == words and plans.instruments.guide is None and plans.status == ""
+    message(plans, plan=True)
+    searching.run_trials(4)
+    assert ended(plans) == words and plans.measurements.guide is None and plans.status == ""
     searching.end = None
-    said(plans, plan=True)
-    searching.go(4)
+    message(plans, plan=True)
+    searching.run_trials(4)
     assert ended(plans).startswith("Plan 1") and (tmp_path / "plan-001.json").is_file()
 
 
-def test_a_search_is_let_go_when_the_window_closes(searching, plans, tmp_path):
+def test_a_search_is_cancelled_when_the_window_closes(searching, plans, tmp_path):
     plans.stop()
-    said(plans, plan=True)
-    searching.go(2)
-    threading.Timer(0.2, searching.let.release).start()
-    search = plans._planning
+    message(plans, plan=True)
+    searching.run_trials(2)
+    threading.Timer(0.2, searching.allowed.release).start()
+    search = plans._job
     plans.stop()
-    assert searching.is_stopped and search.is_over and search.fault == "No plan: it was stopped"
-    assert list(tmp_path.iterdir()) == [] and plans.instruments.guide is None
+    assert searching.is_stopped and search.is_over and search.error == "No plan: it was stopped"
+    assert list(tmp_path.iterdir()) == [] and plans.measurements.guide is None
 
 
 @pytest.mark.parametrize(("processors", "jobs"), [(1, 1), (2, 1), (8, 7)])
 def test_one_processor_is_left_to_the_rehearsal(monkeypatch, searching, plans, processors, jobs):
     monkeypatch.setattr(plans_in_window, "cpu_count", lambda: processors)
-    said(plans, plan=True)
-    searching.go(4)
+    message(plans, plan=True)
+    searching.run_trials(4)
     ended(plans)
     assert searching.jobs == [jobs]
 
 
-def test_what_a_plan_is_for_is_said_and_an_organ_without_a_tumour_is_planned_for_itself(searching, plans):
+def test_the_target_is_shown_and_without_a_tumour_it_is_the_organ(searching, plans):
     settings = Settings()
     for target, words in (("tumour", "the tumour"), ("organ", "the whole kidney")):
         settings.plan_for = target
-        assert said(plans, settings=settings) == f"A plan for {words}: {{plan}}"
-        assert said(plans, settings=settings) == ""
+        assert message(plans, settings=settings) == f"A plan for {words}: {{plan}}"
+        assert message(plans, settings=settings) == ""
     settings.plan_for = "tumour"
-    said(plans, settings=settings)
+    message(plans, settings=settings)
     plans.rehearsal.tumour = None
     settings.plan_for = "margin"
-    assert said(plans, settings=settings) == "No tumour here. A plan for the whole kidney: {plan}"
-    assert said(plans, settings=settings, plan=True) == "Planning for the whole kidney"
-    searching.go(4)
+    assert message(plans, settings=settings) == "No tumour here. A plan for the whole kidney: {plan}"
+    assert message(plans, settings=settings, plan=True) == "Planning for the whole kidney"
+    searching.run_trials(4)
     ended(plans)
     assert searching.problems[0].target == "organ"
 
 
 def test_sweeps_are_shown_in_turn(plans):
-    assert said(plans, next_plan=True) == "No plan: {plan} makes one"
+    assert message(plans, next_plan=True) == "No plan: {plan} makes one"
     first, second = straight_pass(3), straight_pass(2)
-    plans.instruments.guide = guide = PlanGuidance(
+    plans.measurements.guide = guide = PlanGuidance(
         plans.rehearsal, plan_of(sweep_of(first), sweep_of(second, name="b", seen=0.5))
     )
     guide.watch(first[0])
-    assert guide.at == 1 and np.array_equal(guide.guidance().gone, [False, False])
-    assert said(plans, next_plan=True) == "Plan 2: b, sees 50 %"
-    assert said(plans, next_plan=True) == "Plan hidden"
+    assert guide.next_pose == 1 and np.array_equal(guide.guidance().gone, [False, False])
+    assert message(plans, next_plan=True) == "Plan 2: b, covers 50 %"
+    assert message(plans, next_plan=True) == "Plan hidden"

@@ -9,7 +9,7 @@ import trimesh
 from conftest import rotation_about
 from matplotlib.figure import Figure
 
-from rehearsal.image_files import save_pictures
+from rehearsal.image_and_surface_files import save_images
 from rehearsal.result_files import rounded, save_figure, spread, write_csv, write_json
 from scenes.closed_surfaces import moved_by, volume_mm3
 from studies.robustness.rigid_fit import apart_after_fit
@@ -49,7 +49,7 @@ def test_a_full_disk_leaves_what_was_there(tmp_path, bytes_to_a_file):
         "a.json": lambda: write_json({"mm": [1.5] * 999}, tmp_path / "a.json"),
         "a.csv": lambda: write_csv([dict(mm=1.5)] * 999, tmp_path / "a.csv"),
         "a.png": lambda: save_figure(figure, tmp_path / "a.png"),
-        "a-b-mode.png": lambda: save_pictures(grey, 40.0, 40.0, probe, tmp_path / "a"),
+        "a-b-mode.png": lambda: save_images(grey, 40.0, 40.0, probe, tmp_path / "a"),
     }
     for name in writers:
         (tmp_path / name).write_text("before")

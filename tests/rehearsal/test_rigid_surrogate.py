@@ -1,4 +1,4 @@
-"""A rigid forecast of a way, against counting voxels one by one."""
+"""The rigid surrogate, against counting voxels one by one."""
 
 from types import SimpleNamespace
 
@@ -9,8 +9,8 @@ from plan_ball import SIZE, R, X, Y, Z, big_ball, manipulator_on
 
 from rehearsal.planning import rigid_surrogate
 from rehearsal.planning.rigid_surrogate import RigidSurrogate
-from rehearsal.planning.score_terms import ScoreTerms
 from rehearsal.planning.sweep_path import SweepPath, tilted
+from rehearsal.planning.sweep_score import ScoreTerms
 from sim.fields import field_of
 from ultrasound.coverage import VOXEL_MM, Coverage
 from ultrasound.probe import load_probe
@@ -32,7 +32,7 @@ GAP_MM, WARNING_MM = 1.5, 2.0
 TUMOUR_MM, AT = 8.0, np.array([2.0, -3.0, 14.0])
 
 
-def forecast_of(monkeypatch, probe) -> tuple[RigidSurrogate, Coverage]:
+def surrogate_of(monkeypatch, probe) -> tuple[RigidSurrogate, Coverage]:
     monkeypatch.setattr(rigid_surrogate, "Skin", Unmoved)
     ball = trimesh.creation.icosphere(subdivisions=3, radius=TUMOUR_MM).apply_translation(AT)
     coverage = Coverage(big_ball(), ball)
@@ -47,7 +47,7 @@ def forecast_of(monkeypatch, probe) -> tuple[RigidSurrogate, Coverage]:
     return RigidSurrogate(held, coverage, "tumour", lambda poses: poses[:, 0, 3] < 5.0), coverage
 
 
-def way_over_the_tumour(length: float) -> SweepPath:
+def path_over_the_tumour(length: float) -> SweepPath:
     """Poses whose faces are 1, 3 and 0.5 mm in the ball, the second tilted and the third turned; one above it, and one beside it."""
     faces = np.array([[0, 0, R - 1], [0, -4, R - 3], [3, 0, R - 0.5], [0, 5, R + 3]])
     down = np.stack([pose_at(face, -Z, X, length) for face in faces])
@@ -57,29 +57,29 @@ def way_over_the_tumour(length: float) -> SweepPath:
 
 
 @pytest.mark.parametrize("name", ["linear", "drop-in", "curvilinear"])
-def test_a_forecast_is_what_counting_voxels_one_by_one_gives(monkeypatch, name):
+def test_the_surrogate_agrees_with_counting_voxels_one_by_one(monkeypatch, name):
     probe = load_probe(name)
-    found, coverage = forecast_of(monkeypatch, probe)
+    found, coverage = surrogate_of(monkeypatch, probe)
     length = float(probe.housing_mm[2])
-    way = way_over_the_tumour(length)
-    parts = found.parts(way)
+    path = path_over_the_tumour(length)
+    terms = found.evaluate(path)
     places = coverage.low_mm + VOXEL_MM * np.argwhere(coverage.targets["tumour"])
     surely, perhaps = np.zeros(len(places), bool), np.zeros(len(places), bool)
-    for pose in way.poses:
+    for pose in path.poses:
         slack = [shown_by(probe, pose, length, places, off) for off in (-0.3, 0.3)]
         surely |= slack[0]
         perhaps |= slack[1]
-    assert surely.mean() <= parts.seen <= perhaps.mean() and 0.2 < parts.seen < 0.99
+    assert surely.mean() <= terms.seen <= perhaps.mean() and 0.2 < terms.seen < 0.99
     assert perhaps.mean() - surely.mean() < 0.12
-    deep = [max(depth_of_array(probe, pose, length).max(), 0.0) for pose in way.poses]
+    deep = [max(depth_of_array(probe, pose, length).max(), 0.0) for pose in path.poses]
     # Distances between voxels are off by VOXEL^2 / 8 of the curvatures 2 / R, and the facets.
     off = VOXEL_MM**2 / 4 / R + 0.05
-    assert parts.compression_max_mm == pytest.approx(max(deep), abs=off)
-    assert parts.compression_mean_mm == pytest.approx(np.mean(deep), abs=off)
-    assert parts.over_limit == np.mean(np.array(deep) > WARNING_MM) == 0.2
-    touching = [(depth_of_array(probe, pose, length) >= -GAP_MM).mean() for pose in way.poses]
-    assert parts.contact == pytest.approx(np.mean(touching), abs=1.5 / rigid_surrogate.ELEMENTS)
-    assert parts.reachable == 0.8 and parts.time_s == 0.0
+    assert terms.compression_max_mm == pytest.approx(max(deep), abs=off)
+    assert terms.compression_mean_mm == pytest.approx(np.mean(deep), abs=off)
+    assert terms.over_limit == np.mean(np.array(deep) > WARNING_MM) == 0.2
+    touching = [(depth_of_array(probe, pose, length) >= -GAP_MM).mean() for pose in path.poses]
+    assert terms.contact == pytest.approx(np.mean(touching), abs=1.5 / rigid_surrogate.ELEMENTS)
+    assert terms.reachable == 0.8 and terms.time_s == 0.0
 
 
 def shown_by(probe, pose: np.ndarray, length: float, places: np.ndarray, slack: float) -> np.ndarray:
@@ -113,10 +113,10 @@ def depth_of_array(probe, pose: np.ndarray, length: float) -> np.ndarray:
     return R - np.linalg.norm(np.array(at)[:, :3], axis=1)
 
 
-def test_the_forecast_of_no_pass_is_nothing_and_of_the_same_way_the_same(monkeypatch):
-    found, _ = forecast_of(monkeypatch, load_probe("linear"))
-    assert found.parts(SweepPath(())) == ScoreTerms.nothing()
-    way = way_over_the_tumour(SIZE[2])
-    assert found.parts(way) == found.parts(way)
-    # It lays ways with fewer samples, and leaves the hand of the trials as it is.
+def test_the_surrogate_of_no_pass_is_nothing_and_of_the_same_way_the_same(monkeypatch):
+    found, _ = surrogate_of(monkeypatch, load_probe("linear"))
+    assert found.evaluate(SweepPath(())) == ScoreTerms.zero()
+    path = path_over_the_tumour(SIZE[2])
+    assert found.evaluate(path) == found.evaluate(path)
+    # It makes paths with fewer samples, and does not change the manipulator of the trials.
     assert len(found.manipulator.samples) < len(found.rehearsal.manipulator.samples)

@@ -10,7 +10,7 @@ from conftest import rotation_about
 from PIL import Image
 
 import app
-from rehearsal.commands.scan_command import warn_of_deep
+from rehearsal.commands.scan_command import warn_of_deep_poses
 from rehearsal.tracking.pose_file import PoseError, TimedPoses, load_poses, load_timed_poses
 from scenes.anatomy import phantom_folder
 from scenes.scene import EMBEDDED
@@ -65,7 +65,7 @@ def test_poses_of_both_formats_are_the_same(tmp_path):
         ('[{"matrix": []}]', "pose 1"),
         (json.dumps([dict(probe_to_patient=np.diag([1.0, 1, 2, 1]).tolist())]), "pose 1 is not rigid"),
         (json.dumps([dict(probe_to_patient=np.diag([1.0, 1, -1, 1]).tolist())]), "determinant -1"),
-        (json.dumps([dict(name="a", probe_to_patient=np.eye(4).tolist())] * 2), "'a' is there twice"),
+        (json.dumps([dict(name="a", probe_to_patient=np.eye(4).tolist())] * 2), "'a' occurs twice"),
         (json.dumps([dict(name="../a", probe_to_patient=np.eye(4).tolist())]), "pose 1, name"),
     ],
 )
@@ -75,13 +75,13 @@ def test_poses_that_cannot_be_used_are_refused_in_one_line(tmp_path, text, words
 
 def test_a_table_with_another_number_of_columns_is_refused(tmp_path):
     assert "pose 1: 3 numbers" in refused(tmp_path, "1,2,3", "poses.csv")
-    assert "'a' is no number; expected sixteen" in refused(tmp_path, "a,b", "poses.csv")
+    assert "'a' is not a number; expected sixteen" in refused(tmp_path, "a,b", "poses.csv")
     (tmp_path / "a.png").write_bytes(b"\x89PNG")
-    with pytest.raises(PoseError, match="is no text; expected poses as JSON or CSV"):
+    with pytest.raises(PoseError, match="is not text; expected poses as JSON or CSV"):
         load_poses(tmp_path / "a.png")
     with pytest.raises(PoseError, match="cannot be read as poses"):
         load_poses(tmp_path)
-    with pytest.raises(PoseError, match="no such file"):
+    with pytest.raises(PoseError, match="no such pose file"):
         load_poses(tmp_path / "none.json")
 
 
@@ -108,9 +108,9 @@ def test_poses_with_times_of_both_formats_are_the_same(tmp_path):
         ("a.csv", "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1", "pose 1 has no time"),
         ("a.json", json.dumps([dict(probe_to_patient=np.eye(4).tolist())]), "pose 1 has no time"),
         ("a.json", json.dumps([dict(time_s="soon", probe_to_patient=np.eye(4).tolist())]), "pose 1, time_s"),
-        ("a.csv", "nan,1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1", "pose 1: begins with nan"),
+        ("a.csv", "nan,1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1", "pose 1: starts with nan"),
         ("a.csv", "0,1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1\n1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1", "pose 2: 16 numbers"),
-        ("a.csv", "5,1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1\n" * 2, "pose 2 at 5 s is no later"),
+        ("a.csv", "5,1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1\n" * 2, "pose 2 at 5 s is not later"),
     ],
 )
 def test_times_that_cannot_be_used_are_refused_in_one_line(tmp_path, name, text, words):
@@ -120,8 +120,8 @@ def test_times_that_cannot_be_used_are_refused_in_one_line(tmp_path, name, text,
     assert "\n" not in str(error.value) and name in str(error.value)
 
 
-def test_times_that_go_back_are_no_way():
-    with pytest.raises(PoseError, match="pose 3 at 1 s is no later than the one before, at 2 s"):
+def test_times_that_do_not_increase_are_refused():
+    with pytest.raises(PoseError, match="pose 3 at 1 s is not later than the one before, at 2 s"):
         TimedPoses(np.array([0.0, 2.0, 1.0]), [None] * 3)
 
 
@@ -185,11 +185,11 @@ def test_poses_deep_inside_the_organ_are_counted(capsys):
     # Of a ball of 30 mm, whose facets lie up to 0.2 mm inside it; outside is not deep.
     poses[:, 0, 3] = [0.0, 9.5, 10.1, 55.0]
     organ = trimesh.creation.icosphere(subdivisions=4, radius=30.0)
-    warn_of_deep(poses, organ)
+    warn_of_deep_poses(poses, organ)
     assert (
-        "2 of 4 poses lie more than 20 mm inside the organ; they may be of another" in capsys.readouterr().out
+        "2 of 4 poses are more than 20 mm inside the organ; they may be of another" in capsys.readouterr().out
     )
-    warn_of_deep(poses[2:], organ)
+    warn_of_deep_poses(poses[2:], organ)
     assert capsys.readouterr().out == ""
 
 

@@ -12,9 +12,9 @@ from rehearsal.worker_processes import WATCH_S
 PARENT = """
 import os, time
 from joblib.externals.loky import ProcessPoolExecutor
-from rehearsal.worker_processes import end_with
+from rehearsal.worker_processes import end_with_parent
 if __name__ == "__main__":
-    pool = ProcessPoolExecutor(2, initializer=end_with, initargs=(os.getpid(),))
+    pool = ProcessPoolExecutor(2, initializer=end_with_parent, initargs=(os.getpid(),))
     busy = pool.submit(time.sleep, 60)
     pool.submit(os.getpid).result()
     print(*pool._processes, flush=True)

@@ -13,11 +13,15 @@ from PIL import Image
 
 from rehearsal.configuration import PRESETS
 from rehearsal.reconstruction import compression_correction
-from rehearsal.reconstruction.patient_comparison import compared, inside, wider
-from rehearsal.reconstruction.reconstruction_figure import save_picture
-from rehearsal.reconstruction.reconstruction_files import save_volumes
+from rehearsal.reconstruction.patient_comparison import compare_with_surfaces, enclosing, voxels_inside
+from rehearsal.reconstruction.reconstruction_files import save_slices_figure, save_volumes
 from rehearsal.reconstruction.segmentation_metrics import segmentation_metrics
-from rehearsal.reconstruction.sweep_volumes import Rebuilt, lit, rebuild, track_of
+from rehearsal.reconstruction.sweep_volumes import (
+    SweepVolumes,
+    image_poses_of,
+    lit_pixels,
+    reconstruct_volumes,
+)
 from rehearsal.result_files import write_csv
 from scenes.anatomy import Grid, LoadedAnatomy
 from scenes.scene import PlaneShape, Scene, with_options
@@ -78,7 +82,7 @@ def marked() -> Sweep:
     return swept(np.stack([marks_at(places_of(pose)) for pose in poses()]))
 
 
-def check_balls(rebuilt: Rebuilt, off_mm: float) -> None:
+def check_balls(rebuilt: SweepVolumes, off_mm: float) -> None:
     """An outline that is off by a quarter of a voxel on average takes 3 / 8 of one over the radius off Dice."""
     at = rebuilt.box.places()
     for name, middle, radius in (("organ", CENTRE, RADIUS), ("tumour", TUMOUR, TUMOUR_RADIUS)):
@@ -91,7 +95,9 @@ def check_balls(rebuilt: Rebuilt, off_mm: float) -> None:
 @pytest.mark.parametrize(("method", "off_mm"), [("smooth", 0.1), ("nearest", 0.5)])
 def test_balls_come_back_where_they_are(marked, method, off_mm):
     # Nearest voxels are off by up to half of one, all to one side where pictures lie as evenly as the voxels.
-    rebuilt = rebuild(marked, track_of(marked, "Reference"), ALL, 1.0, method, 2.0, marked, with_grey=False)
+    rebuilt = reconstruct_volumes(
+        marked, image_poses_of(marked, "Reference"), ALL, 1.0, method, 2.0, marked, with_grey=False
+    )
     check_balls(rebuilt, off_mm)
     assert sorted(rebuilt.beads) == [0, 1]
     # Some hundred pixels in a ball of 2 mm, of 0.5 x 0.8 x 0.8 mm: the mean of their middles is off by less than a tenth of one.
@@ -107,9 +113,9 @@ def test_what_was_squeezed_comes_back_as_it_was_at_rest(device, marked):
         return CENTRE + (places_of(way[frame]) - CENTRE) @ np.linalg.inv(now_from_rest).T
 
     squeezed = swept(np.stack([marks_at(at_rest(frame)) for frame in range(len(way))]))
-    path = track_of(squeezed, "Reference")
+    path = image_poses_of(squeezed, "Reference")
     seen, undone = (
-        rebuild(squeezed, path, ALL, 1.0, "smooth", 2.0, squeezed, places, with_grey=False)
+        reconstruct_volumes(squeezed, path, ALL, 1.0, "smooth", 2.0, squeezed, places, with_grey=False)
         for places in (None, at_rest)
     )
     check_balls(undone, 0.1)
@@ -124,12 +130,12 @@ def test_frames_without_pose_or_picture_are_left_out(marked):
     images[[3, 20]] = 255
     sweep = swept(images, lost=(3, 11))
     sweep.frames[20]["ImageStatus"] = "INVALID"
-    path = track_of(sweep, "Reference")
+    path = image_poses_of(sweep, "Reference")
     assert set(range(len(images))) - set(path.frames) == {3, 11, 20}
     assert path.matrices[3] == pytest.approx(poses()[4] @ ON_PROBE)
     # 0.8 mm each, and 1.6 over the three gaps.
     assert sorted(path.steps_mm.round(6))[-4:] == [0.8, 1.6, 1.6, 1.6]
-    rebuilt = rebuild(sweep, path, ALL, 1.0, "smooth", 2.0)
+    rebuilt = reconstruct_volumes(sweep, path, ALL, 1.0, "smooth", 2.0)
     # The box holds every pixel, and no voxel more.
     places = np.concatenate([places_of(poses()[frame]).reshape(-1, 3) for frame in path.frames])
     last = rebuilt.box.origin_mm + np.array(rebuilt.box.shape) - 1
@@ -141,28 +147,30 @@ def test_frames_without_pose_or_picture_are_left_out(marked):
 def test_only_the_sector_that_is_lit_counts():
     images = np.where(SECTOR, np.uint8(120), np.uint8(0)) * np.ones((len(poses()), 1, 1), np.uint8)
     sweep = swept(images)
-    mask = lit(np.concatenate([0 * images[:1], images]))
+    mask = lit_pixels(np.concatenate([0 * images[:1], images]))
     assert np.array_equal(mask, SECTOR)
-    rebuilt = rebuild(sweep, track_of(sweep, "Reference"), mask, 1.0, "smooth", 2.0)
+    rebuilt = reconstruct_volumes(sweep, image_poses_of(sweep, "Reference"), mask, 1.0, "smooth", 2.0)
     assert rebuilt.grey[rebuilt.known] == pytest.approx(120)
     # Voxels on the border count as soon as a pixel is in them: half a voxel farther out on average, and gaps are closed.
     volume, sides = SECTOR.sum() * 0.4 * 0.8 * len(images), 2 * (46 + 48) * 46 + 2 * 46 * 48
     assert volume < rebuilt.known.sum() < volume + 0.6 * sides
     small = replace(sweep, images=sweep.images[:, :20])
-    tight = rebuild(small, track_of(small, "Reference"), SECTOR[:20], 1.0, "smooth", 2.0)
+    tight = reconstruct_volumes(small, image_poses_of(small, "Reference"), SECTOR[:20], 1.0, "smooth", 2.0)
     assert np.prod(tight.box.shape) < 0.6 * np.prod(rebuilt.box.shape)
 
 
 def test_sweeps_that_make_no_volume_are_refused_in_words(marked):
-    path = track_of(marked, "Reference")
+    path = image_poses_of(marked, "Reference")
     with pytest.raises(SweepError, match="valid pose in Reference, of 58 frames"):
-        track_of(swept(marked.images, lost=tuple(range(58))), "Reference")
+        image_poses_of(swept(marked.images, lost=tuple(range(58))), "Reference")
     with pytest.raises(SweepError, match="black"):
-        rebuild(marked, path, ~ALL, 1.0, "smooth", 2.0)
-    with pytest.raises(SweepError, match=r"marks of \(58, 60, 91\): expected \(58, 60, 92\)"):
-        rebuild(marked, path, ALL, 1.0, "smooth", 2.0, replace(marked, images=marked.images[..., 1:]))
+        reconstruct_volumes(marked, path, ~ALL, 1.0, "smooth", 2.0)
+    with pytest.raises(SweepError, match=r"labels of \(58, 60, 91\): expected \(58, 60, 92\)"):
+        reconstruct_volumes(
+            marked, path, ALL, 1.0, "smooth", 2.0, replace(marked, images=marked.images[..., 1:])
+        )
     with pytest.raises(ValueError, match="take larger voxels"):
-        rebuild(marked, path, ALL, 0.01, "smooth", 2.0)
+        reconstruct_volumes(marked, path, ALL, 0.01, "smooth", 2.0)
 
 
 def a_box() -> VoxelBox:
@@ -175,34 +183,36 @@ def test_voxels_inside_a_block_are_those_whose_centres_are():
     for size, middle in (((10.4, 6.4, 14.4), (-8.2, 16.1, 66.3)), ((9.0, 5.2, 3.4), (0.3, 15.2, 50.1))):
         block = trimesh.creation.box(size).apply_translation(middle)
         expected = (np.abs(box.places() - middle) < np.array(size) / 2).all(axis=-1)
-        assert expected.any() and np.array_equal(inside(block, box), expected)
-    assert not inside(trimesh.creation.box([2.0] * 3), box).any()
+        assert expected.any() and np.array_equal(voxels_inside(block, box), expected)
+    assert not voxels_inside(trimesh.creation.box([2.0] * 3), box).any()
 
 
 def test_a_wider_box_leaves_all_where_it_was():
     box = a_box()
     region = near(box.places(), [-2.0, 12.0, 60.0], 5.0)
-    rebuilt = Rebuilt(box, region * np.float32(7), region, {"organ": region})
+    rebuilt = SweepVolumes(box, region * np.float32(7), region, {"organ": region})
     around = trimesh.creation.box([50.0, 60.0, 72.0]).apply_translation([3.0, 11.0, 52.0])
-    grown = wider(rebuilt, around)
+    grown = enclosing(rebuilt, around)
     at, before = grown.box.places(), box.places()[region]
     for volume in (grown.regions["organ"], grown.known, grown.grey == 7):
         assert at[volume] == pytest.approx(before, abs=1e-9)
     low, high = at.reshape(-1, 3).min(axis=0), at.reshape(-1, 3).max(axis=0)
     assert (low < around.bounds[0]).all() and (high > around.bounds[1]).all()
     # None of the block's faces goes through a voxel's centre.
-    assert inside(around, grown.box).sum() == 50 * 60 * 72
-    within = wider(rebuilt, trimesh.creation.box([2.0] * 3).apply_translation([0.0, 16.0, 55.0]))
+    assert voxels_inside(around, grown.box).sum() == 50 * 60 * 72
+    within = enclosing(rebuilt, trimesh.creation.box([2.0] * 3).apply_translation([0.0, 16.0, 55.0]))
     assert within.box.shape == box.shape
 
 
 def test_a_ball_of_which_half_was_scanned():
     ball = trimesh.creation.icosphere(subdivisions=4, radius=9.0).apply_translation([0.0, 16.0, 55.0])
     box = a_box()
-    truth, known = inside(ball, box), box.places()[..., 0] > 0
+    truth, known = voxels_inside(ball, box), box.places()[..., 0] > 0
     beads = {1: np.array([1.0, 2.0, 5.0]), 0: np.array([0.0, 0.0, 1.0])}
-    rebuilt = Rebuilt(box, truth * np.float32(1), known, {"organ": truth & known}, beads)
-    found = compared(rebuilt, {"organ": ball, "tumour": ball}, np.array([[0, 0, 0], [1, 2, 2], [9, 9, 9.0]]))
+    rebuilt = SweepVolumes(box, truth * np.float32(1), known, {"organ": truth & known}, beads)
+    found = compare_with_surfaces(
+        rebuilt, {"organ": ball, "tumour": ball}, np.array([[0, 0, 0], [1, 2, 2], [9, 9, 9.0]])
+    )
     assert set(found) == {"organ", "landmarks"}
     # Voxels are cut in halves by the plane x = 0, on which none has its centre.
     assert found["organ"]["scanned"] == 0.5
@@ -212,7 +222,9 @@ def test_a_ball_of_which_half_was_scanned():
     assert found["organ"]["whole"]["centroid_mm"] == pytest.approx(3 / 8 * 9, abs=0.05)
     assert found["organ"]["scanned_part"] == dict(dice=1, hd95_mm=0, volume_percent=0, centroid_mm=0)
     assert found["landmarks"] == dict(count=2, of=3, mean_mm=2.0, max_mm=3.0)
-    nothing = compared(replace(rebuilt, known=~known & ~truth, beads={}), {"organ": ball}, np.zeros((1, 3)))
+    nothing = compare_with_surfaces(
+        replace(rebuilt, known=~known & ~truth, beads={}), {"organ": ball}, np.zeros((1, 3))
+    )
     assert nothing["organ"]["scanned"] == 0 and nothing["organ"]["scanned_part"] is None
     assert nothing["landmarks"] == dict(count=0, of=1, mean_mm=None, max_mm=None)
 
@@ -221,8 +233,8 @@ def test_what_was_not_found_or_has_no_voxel_has_no_figures():
     ball = trimesh.creation.icosphere(subdivisions=2, radius=9.0).apply_translation([0.0, 16.0, 55.0])
     speck = trimesh.creation.icosphere(subdivisions=1, radius=0.3).apply_translation([0.0, 16.0, 55.0])
     empty, known = np.zeros(a_box().shape, bool), np.ones(a_box().shape, bool)
-    rebuilt = Rebuilt(a_box(), empty * np.float32(1), known, {"organ": empty, "tumour": empty})
-    found = compared(rebuilt, {"organ": ball, "tumour": speck})
+    rebuilt = SweepVolumes(a_box(), empty * np.float32(1), known, {"organ": empty, "tumour": empty})
+    found = compare_with_surfaces(rebuilt, {"organ": ball, "tumour": speck})
     assert set(found) == {"organ"}
     assert found["organ"]["whole"] == dict(dice=0, hd95_mm=None, volume_percent=-100, centroid_mm=None)
 
@@ -232,7 +244,7 @@ def test_files_have_each_voxel_at_its_place(tmp_path):
     organ, tumour = np.zeros((2, *box.shape), bool)
     organ[1:4, 2:6, 3:8], tumour[2, 3, 6] = True, True
     grey = np.arange(organ.size, dtype=np.float32).reshape(box.shape) - 20.4
-    rebuilt = Rebuilt(box, grey, organ | True, {"organ": organ, "tumour": tumour})
+    rebuilt = SweepVolumes(box, grey, organ | True, {"organ": organ, "tumour": tumour})
     save_volumes(rebuilt, tmp_path)
     volume, labels = (sitk.ReadImage(str(tmp_path / f"{name}.nrrd")) for name in ("volume", "labels"))
     for index in ((0, 0, 0), (2, 3, 6), (4, 1, 2), (1, 5, 7)):
@@ -244,10 +256,12 @@ def test_files_have_each_voxel_at_its_place(tmp_path):
 
 
 def test_the_picture_shows_the_cuts_through_the_tumour(tmp_path, marked):
-    path = track_of(marked, "Reference")
-    rebuilt = rebuild(replace(marked, images=marked.images * 60), path, ALL, 1.0, "smooth", 2.0, marked)
-    save_picture(rebuilt, tmp_path / "with.png")
-    save_picture(replace(rebuilt, regions={}), tmp_path / "without.png")
+    path = image_poses_of(marked, "Reference")
+    rebuilt = reconstruct_volumes(
+        replace(marked, images=marked.images * 60), path, ALL, 1.0, "smooth", 2.0, marked
+    )
+    save_slices_figure(rebuilt, tmp_path / "with.png")
+    save_slices_figure(replace(rebuilt, regions={}), tmp_path / "without.png")
     shown, bare = (
         np.asarray(Image.open(tmp_path / f"{name}.png").convert("RGB")) for name in ("with", "without")
     )
@@ -285,7 +299,7 @@ def runs() -> list[dict]:
         for module, values in (
             (freehand_accuracy, few),
             (freehand_sweeps, dict(SPEED_MM_S=30.0)),
-            (compression_correction, dict(FROM_MM=6.0, COMES_S=0.2, WAITS_S=0.3)),
+            (compression_correction, dict(APPROACH_MM=6.0, APPROACH_S=0.2, SETTLE_S=0.3)),
         ):
             for name, value in values.items():
                 patch.setattr(module, name, value)

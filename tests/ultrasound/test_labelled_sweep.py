@@ -17,8 +17,8 @@ import app
 from rehearsal.coordinates import probe_in_patient
 from rehearsal.reconstruction import compression_correction
 from rehearsal.reconstruction.compression_correction import CompressionCorrection
-from rehearsal.reconstruction.sweep_volumes import track_of
-from rehearsal.tracking.sweep_recording import Sweeping
+from rehearsal.reconstruction.sweep_volumes import image_poses_of
+from rehearsal.tracking.sweep_recording import SweepRecorder
 from scenes.anatomy import phantom_folder
 from scenes.scene import EMBEDDED
 from scenes.surface_files import load_surface
@@ -44,7 +44,7 @@ def refused(*arguments) -> str:
     told = io.StringIO()
     with redirect_stderr(told):
         status = app.main([str(argument) for argument in arguments])
-    lines = [line for line in told.getvalue().strip().splitlines() if "picture/s" not in line]
+    lines = [line for line in told.getvalue().strip().splitlines() if "image/s" not in line]
     assert status == 2 and len(lines) == 1 and lines[0].startswith("nephron: "), told.getvalue()
     return lines[0]
 
@@ -71,7 +71,7 @@ def moved_on(rehearsal: SimpleNamespace, by_mm: float) -> None:
 
 def test_a_recorded_sweep_says_where_each_pixel_is(tmp_path):
     rehearsal, view = recording()
-    sweeping, places, pictures = Sweeping(rehearsal), [], []
+    sweeping, places, pictures = SweepRecorder(rehearsal), [], []
     assert sweeping.watch(0.0, view, rehearsal.probe) == "" and sweeping.end() == ""
     assert sweeping.toggle(tmp_path) == "sweep-001: {sweep} ends it"
     for step in range(8):
@@ -86,7 +86,7 @@ def test_a_recorded_sweep_says_where_each_pixel_is(tmp_path):
             pictures.append(view.pictures["B-mode"])
         moved_on(rehearsal, 0.7)
         view.pictures["B-mode"] = np.roll(view.pictures["B-mode"], 1, axis=step % 2)
-    assert sweeping.toggle(tmp_path) == "sweep-001.igs.mha: 4 pictures"
+    assert sweeping.toggle(tmp_path) == "sweep-001.igs.mha: 4 images"
     sweep = read_sweep(tmp_path / "sweep-001.igs.mha")
     assert np.array_equal(sweep.images, pictures)
     assert sweep.times_s == pytest.approx(5 + np.arange(4) / 30)
@@ -104,13 +104,13 @@ def test_a_recorded_sweep_says_where_each_pixel_is(tmp_path):
     # Times of a sweep are those of the rehearsal, and a new one begins at once, whenever the last ended.
     assert sweeping.toggle(tmp_path) == "sweep-002: {sweep} ends it"
     sweeping.watch(1.0, view, rehearsal.probe)
-    assert sweeping.end() == "sweep-002.igs.mha: 1 pictures"
+    assert sweeping.end() == "sweep-002.igs.mha: 1 images"
     assert read_sweep(tmp_path / "sweep-002.igs.mha").times_s == [1.0]
 
 
 def test_as_long_as_a_sweep_is_recorded_its_length_is_said(tmp_path):
     rehearsal, view = recording()
-    sweeping = Sweeping(rehearsal)
+    sweeping = SweepRecorder(rehearsal)
     said = []
     for first in (100.0, 200.0):
         said.append(sweeping.status)
@@ -125,7 +125,7 @@ def test_as_long_as_a_sweep_is_recorded_its_length_is_said(tmp_path):
 
 
 def test_sweeps_are_numbered_after_the_last(tmp_path):
-    sweeping = Sweeping(recording()[0])
+    sweeping = SweepRecorder(recording()[0])
     for name in ("sweep-004.igs.mha", "sweep-009-marks.igs.mha", "sweep-x.igs.mha", "sweep-0.igs.mha"):
         (tmp_path / name).touch()
     assert sweeping.toggle(tmp_path).startswith("sweep-005:")
@@ -137,12 +137,12 @@ def test_sweeps_are_numbered_after_the_last(tmp_path):
 
 def test_a_sweep_without_frames_or_ct_leaves_words_and_no_file(tmp_path):
     rehearsal, _ = recording()
-    sweeping = Sweeping(rehearsal)
+    sweeping = SweepRecorder(rehearsal)
     sweeping.toggle(tmp_path)
     assert sweeping.end() == "No sweep: a sweep without frames"
     assert "cannot be written: No such file" in sweeping.toggle(tmp_path / "none")
     rehearsal.scanner = None
-    assert sweeping.toggle(tmp_path) == "No CT, no sweep"
+    assert sweeping.toggle(tmp_path) == "No sweep: the scene has no CT"
     assert list(tmp_path.iterdir()) == []
 
 
@@ -151,7 +151,7 @@ def test_a_full_disk_ends_a_sweep_in_words_and_leaves_nothing(tmp_path, marks_to
     rehearsal, view = recording(pixels=256)
     if marks_too:
         rehearsal.scanner.marks.render = lambda: view.pictures["B-mode"]
-    sweeping = Sweeping(rehearsal)
+    sweeping = SweepRecorder(rehearsal)
     sweeping.toggle(tmp_path)
     with bytes_to_a_file(150_000):
         # Noise: 65 kB each, of which two have room.
@@ -160,17 +160,17 @@ def test_a_full_disk_ends_a_sweep_in_words_and_leaves_nothing(tmp_path, marks_to
     assert list(tmp_path.iterdir()) == []
     sweeping.toggle(tmp_path)
     sweeping.watch(0.0, view, rehearsal.probe)
-    assert sweeping.end() == "sweep-001.igs.mha: 1 pictures"
+    assert sweeping.end() == "sweep-001.igs.mha: 1 images"
 
 
 def test_a_picture_of_another_size_ends_a_sweep_with_what_there_is(tmp_path):
     rehearsal, view = recording()
-    sweeping = Sweeping(rehearsal)
+    sweeping = SweepRecorder(rehearsal)
     sweeping.toggle(tmp_path)
     sweeping.watch(0.0, view, rehearsal.probe)
     view.pictures["B-mode"] = np.zeros((8, 8), np.uint8)
     said = sweeping.watch(1.0, view, rehearsal.probe)
-    assert said.startswith("sweep-001.igs.mha: 1 pictures: frame 1: image of uint8 (8, 8)")
+    assert said.startswith("sweep-001.igs.mha: 1 images: frame 1: image of uint8 (8, 8)")
     assert len(read_sweep(tmp_path / "sweep-001.igs.mha")) == len(
         read_sweep(tmp_path / "sweep-001-marks.igs.mha")
     )
@@ -233,9 +233,9 @@ def test_undoing_takes_the_tracked_way_and_finds_still_tissue_where_the_tracker_
     on_probe, way = probe.image_to_probe(32, 32), over_tumour()[::5]
     sweep = sweep_of(np.zeros((len(way), 32, 32), np.uint8), way, np.array([0.0, 0.1, 9.0]), on_probe)
     still = Still(np.array([-61.0, 112.0, 1240.0]), 20.0)
-    places = CompressionCorrection(still, sweep, track_of(sweep, "Reference"), "Reference")
+    places = CompressionCorrection(still, sweep, image_poses_of(sweep, "Reference"), "Reference")
     begun = len(still.way)
-    assert begun == (compression_correction.COMES_S + compression_correction.WAITS_S) * 60
+    assert begun == (compression_correction.APPROACH_S + compression_correction.SETTLE_S) * 60
     row, column = np.indices((32, 32))
     pixels = np.stack([column, row, 0 * row, 1 + 0 * row], axis=-1)
     for frame, pose in enumerate(way):
@@ -252,7 +252,9 @@ def test_undoing_takes_the_tracked_way_and_finds_still_tissue_where_the_tracker_
 def test_what_no_probe_can_press_again_is_refused(device):
     sweep = sweep_of(np.zeros((1, 32, 30), np.uint8), np.eye(4)[None], np.zeros(1), np.eye(4))
     with pytest.raises(SweepError, match="32 x 30 pixels: expected a sweep that Nephron recorded"):
-        CompressionCorrection(Still(np.zeros(3), 20.0), sweep, track_of(sweep, "Reference"), "Reference")
+        CompressionCorrection(
+            Still(np.zeros(3), 20.0), sweep, image_poses_of(sweep, "Reference"), "Reference"
+        )
 
 
 @pytest.fixture(scope="module")
@@ -292,8 +294,8 @@ def test_reconstruct_makes_a_volume_and_compares_it(swept, tmp_path, capsys):
     assert (
         "14 of 14 with a pose, 1.50 mm apart" in told and f"Dice {tumour['scanned_part']['dice']:.3f}" in told
     )
-    assert f"organ     {100 * organ['scanned']:.0f} % scanned; of that small part alone Dice" in told
-    assert f"tumour    {100 * tumour['scanned']:.0f} % scanned; of that Dice" in told
+    assert f"organ     {100 * organ['scanned']:.0f} % scanned; only in this small part Dice" in told
+    assert f"tumour    {100 * tumour['scanned']:.0f} % scanned; in this part Dice" in told
     volume, labels = (sitk.ReadImage(str(tmp_path / "out" / f"{name}.nrrd")) for name in ("volume", "labels"))
     assert list(volume.GetSize()) == report["shape"] == list(labels.GetSize())
     middle = load_surface(phantom_folder() / "tumour.stl").center_mass
@@ -311,9 +313,7 @@ def test_reconstruct_compares_no_sweep_with_an_organ_that_it_does_not_show(swept
     assert app.main([str(part) for part in command]) == 0
     report, told = json.loads((tmp_path / "report.json").read_text()), capsys.readouterr().out
     assert report["agreement"] == {} and "Dice" not in told
-    assert re.search(
-        r"the sweep is not of this organ, or of another patient; it shows 0\.[0-9] % of it", told
-    )
+    assert re.search(r"the sweep covers 0\.[0-9] % of this organ", told)
 
 
 def test_reconstruct_refuses_in_one_line(swept, tmp_path, monkeypatch):
@@ -339,11 +339,11 @@ def test_reconstruct_refuses_in_one_line(swept, tmp_path, monkeypatch):
     monkeypatch.undo()
     shutil.copy(swept, tmp_path / "a.igs.mha")
     write_sweep(tmp_path / "a-marks.igs.mha", type(sweep)(sweep.images[:3], sweep.frames[:3], sweep.fields))
-    assert "marks of (3, 64, 64)" in refused("reconstruct", tmp_path / "a.igs.mha", *out)
+    assert "labels of (3, 64, 64)" in refused("reconstruct", tmp_path / "a.igs.mha", *out)
     sweep.images = sweep.images * np.uint8(0)
     sweep.frames[5]["Timestamp"] = "0.5"
     write_sweep(tmp_path / "black.igs.mha", sweep)
-    assert "all pictures are black" in refused("reconstruct", tmp_path / "black.igs.mha", *out)
+    assert "all images are black" in refused("reconstruct", tmp_path / "black.igs.mha", *out)
 
 
 @pytest.mark.parametrize(("sample", "config", "used"), [(SPINE, SPINE_XML, 21), (NWIRE, NWIRE_XML, None)])
@@ -366,7 +366,7 @@ def test_reconstruct_takes_what_plus_wrote(data, tmp_path, capsys, sample, confi
 
 def test_poses_alone_make_no_volume(data, tmp_path):
     sweep = data / "us/SlidingProbeTrackingData.igs.mha"
-    assert "no picture with a valid pose" in refused("reconstruct", sweep, "--out", tmp_path)
+    assert "no image with a valid pose" in refused("reconstruct", sweep, "--out", tmp_path)
 
 
 def test_scan_leaves_a_sweep_at_the_poses_of_its_file(tmp_path):

@@ -1,0 +1,87 @@
+"""Files of images (PNG; B-mode as DICOM too) and surfaces (PLY) from a rehearsal or a scan."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+import numpy as np
+import trimesh
+from PIL import Image
+
+from rehearsal.rehearsal import Rehearsal
+from rehearsal.result_files import next_number
+from render.animation import in_proportion
+from render.viewer import View
+from scenes.atomic_files import whole
+from scenes.surface_files import save_surface
+from sim.fields import array_of
+from ultrasound.dicom_image import save_dicom
+from ultrasound.probe import Probe
+from ultrasound.scanner import ECHO
+
+SCREENSHOT, IMAGE = r"screenshot-([0-9]{3,9})\.png", r"([0-9]{3,9})-.*\.png"
+
+
+@dataclass(frozen=True)
+class SavedImage:
+    """An image file: its kind ("B-mode", "CT"), its shape (rows, columns), and the spacing of rows and columns."""
+
+    kind: str
+    path: Path
+    shape: tuple[int, int]
+    spacing_mm: tuple[float, float]
+
+
+def save_image_file(image: Image.Image, path: Path) -> None:
+    """Write an image in the format of its suffix, as an atomic write. Raises OSError."""
+    with whole(path) as partial:
+        image.save(partial)
+
+
+def save_images(
+    images: Mapping[str, np.ndarray],
+    width_mm: float,
+    depth_mm: float,
+    probe: Probe,
+    prefix: Path,
+    dicom: bool = True,
+) -> list[SavedImage]:
+    """Write images (rows, columns) by kind, with square pixels, to files that share a prefix. Raises OSError."""
+    saved = []
+    for kind, grey in images.items():
+        image = in_proportion(grey, width_mm, depth_mm)
+        path = prefix.with_name(f"{prefix.name}-{kind.lower()}.png")
+        save_image_file(image, path)
+        spacing_mm = depth_mm / image.height, width_mm / image.width
+        if dicom and kind == ECHO:
+            with whole(path.with_suffix(".dcm")) as partial:
+                save_dicom(partial, np.asarray(image), spacing_mm, probe)
+        saved.append(SavedImage(kind, path, (image.height, image.width), spacing_mm))
+    return saved
+
+
+def save_screenshot(image: np.ndarray, out: Path) -> None:
+    """Write an image of the window under the next free number, and print its path."""
+    path = out / f"screenshot-{next_number(out, SCREENSHOT):03d}.png"
+    save_image_file(Image.fromarray(image), path)
+    click.echo(f"Saved {path}")
+
+
+def save_view(view: View, probe: Probe, out: Path) -> str:
+    """Write the images of a view under the next free number, and print their paths; return the prefix of their names."""
+    prefix = out / f"{next_number(out, IMAGE):03d}"
+    for saved in save_images(view.pictures, view.width_mm, view.depth_mm, probe, prefix):
+        click.echo(f"Saved {saved.path}{' and .dcm' if saved.kind == ECHO else ''}")
+    return f"{prefix.name}-"
+
+
+def save_surfaces(rehearsal: Rehearsal, out: Path, prefix: str = "") -> None:
+    """Write organ and tumour in their deformed state (PLY, mm, LPS), and print the paths; vertices are in the order of the rest surfaces."""
+    deformed = {"organ": (rehearsal.organ, array_of(rehearsal.organ_skin.vertices))}
+    if rehearsal.tumour is not None:
+        deformed["tumour"] = rehearsal.tumour, rehearsal.tumour_vertices()
+    for name, (rest, vertices) in deformed.items():
+        path = out / f"{prefix}{name}.ply"
+        save_surface(trimesh.Trimesh(vertices + rehearsal.origin, rest.faces, process=False), path)
+        click.echo(f"Saved {path}")
