@@ -15,7 +15,6 @@ import taichi as ti
 from conftest import ROOT
 
 import app
-from rehearsal.adaptive_iterations import AdaptiveIterations
 from rehearsal.planning.plan_file import Plan, PlannedSweep
 from rehearsal.sessions.session_file import End, Event, Header, Second
 from rehearsal.tracking.pose_file import load_poses, load_timed_poses
@@ -26,7 +25,7 @@ from ultrasound.probe import Probe
 
 DOCS = ROOT / "docs"
 PAGES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
-FOLDERS = ("docs", "render", "scenes", "sim", "studies", "tests", "ultrasound")
+FOLDERS = ("docs", "rehearsal", "render", "scenes", "sim", "studies", "tests", "ultrasound")
 PICTURES = (".png", ".webp", ".gif", ".jpg", ".svg")
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 CODE = re.compile(r"`([^`\n]+)`")
@@ -96,8 +95,14 @@ def test_every_example_file_is_named():
     )
 
 
-def test_the_first_page_is_short_and_its_picture_light():
-    assert len(text(ROOT / "README.md").splitlines()) <= 140
+def test_the_readme_shows_picture_commands_and_figures_before_it_leads_on():
+    headings = re.findall(r"^#+ (.+)$", text(ROOT / "README.md"), flags=re.MULTILINE)
+    assert headings[-1] == "More" and len(headings) == len(set(headings))
+    before = text(ROOT / "README.md").partition("\n## More\n")[0]
+    assert (DOCS / "press.webp").resolve() in linked(ROOT / "README.md")
+    for command in ("make run", "make test", "python app.py import", "python app.py rehearse"):
+        assert command in before
+    # A page that loads at once.
     assert (DOCS / "press.webp").stat().st_size < 4_000_000
 
 
@@ -221,6 +226,13 @@ def test_the_method_names_a_place_for_every_step():
     assert len(PLACE.findall(text(DOCS / "method.md"))) > 20
 
 
+def test_the_index_answers_where_things_are_with_a_file_and_a_function():
+    answers = text(DOCS / "README.md").partition("## Where is ...")[2]
+    for subject in ("friction law", "key press", "caliper", "DICOM series", "tumour"):
+        (*_, last) = [row for row in answers.splitlines() if subject in row] or [""]
+        assert PLACE.search(last), subject
+
+
 # Examples and formats
 
 
@@ -246,13 +258,19 @@ def test_the_tool_of_the_example_presses_tissue():
     assert 0.01 < depth_mm < 0.5
 
 
-def test_what_the_window_says_in_capitals_is_explained():
-    ladder = AdaptiveIterations(1.0)
-    ladder.rung = 1
-    assert f"*{ladder.says(8).partition('   ')[0]}*" in text(DOCS / "rehearsal.md")
-    assert f"`image.contact_gap_mm` of the scene ({Image().contact_gap_mm} mm)" in text(
-        DOCS / "ultrasound.md"
+def test_the_notices_that_the_docs_explain_are_those_of_the_window():
+    sources = "".join(
+        text(file) for folder in ("rehearsal", "render") for file in (ROOT / folder).rglob("*.py")
     )
+    explained = set(re.findall(r"\*([A-Z]+(?: [A-Z]+)+)\*", "".join(map(text, DOCS.glob("*.md")))))
+    assert len(explained) >= 3
+    for notice in explained:
+        assert f'"{notice}' in sources, notice
+
+
+def test_the_gap_of_acoustic_coupling_is_the_scene_s():
+    named = f"`image.contact_gap_mm` of the scene ({Image().contact_gap_mm} mm)"
+    assert named in " ".join(text(DOCS / "ultrasound.md").split())
 
 
 def test_the_poses_that_come_along_can_be_read():

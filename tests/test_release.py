@@ -74,6 +74,14 @@ def test_citation_and_changelog_are_of_this_version():
     assert cited["license"] == PROJECT["license"]
 
 
+def test_the_methods_that_the_docs_cite_are_references_of_the_citation():
+    references = text("CITATION.cff").partition("\nreferences:\n")[2]
+    cited = text("docs/method.md").partition("\n## References\n")[2]
+    doi = r"10\.\d{4,}/[^\s)]+"
+    assert sorted(re.findall(doi, references)) == sorted(re.findall(doi, cited)) != []
+    assert references.count("  - type: ") == len(re.findall(r"^- ", cited, re.MULTILINE))
+
+
 def test_a_replay_by_another_version_or_on_another_backend_is_told():
     recorded = header()
     assert origin_in_words(recorded, "x64") == ""

@@ -1,4 +1,4 @@
-"""The key map, in the README and in the window's help."""
+"""The key map: in the documents and in the window's help."""
 
 import numpy as np
 import pytest
@@ -25,9 +25,24 @@ def test_key_table_has_a_row_for_every_line_and_group():
     assert [row for row in rows if "**" in row] == [f"| **{group}**" for group in KEY_MAP]
 
 
-def test_the_readme_has_the_key_map():
-    readme = ROOT / "README.md"
-    assert key_table() in readme.read_text("utf-8")
+def test_the_page_on_keys_has_the_key_map():
+    assert key_table() in (ROOT / "docs" / "keys.md").read_text("utf-8")
+
+
+def test_the_keys_of_the_readme_are_of_the_key_map_in_its_order():
+    section = (ROOT / "README.md").read_text("utf-8").partition("\n## Keys\n")[2].partition("\n## ")[0]
+    rows = [row for row in section.splitlines() if row.startswith("|")]
+    known = key_table().splitlines()
+    assert rows == [row for row in known if row in rows]
+    keys = [row for row in rows[2:] if "**" not in row]
+    assert 8 <= len(keys) < len(LINES)
+    actions = {
+        action
+        for line in LINES
+        for action in line.actions
+        if f"| {' / '.join(line.keys)} | {line.text} |" in keys
+    }
+    assert {"point", "press", "rock_left", "tilt_back", "rotate_left", "reset", "help"} <= actions
 
 
 @pytest.mark.parametrize(
