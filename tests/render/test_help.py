@@ -25,11 +25,11 @@ def test_key_table_has_a_row_for_every_line_and_group():
     assert [row for row in rows if "**" in row] == [f"| **{group}**" for group in KEY_MAP]
 
 
-def test_the_page_on_keys_has_the_key_map():
+def test_docs_keys_has_the_key_map():
     assert key_table() in (ROOT / "docs" / "keys.md").read_text("utf-8")
 
 
-def test_the_keys_of_the_readme_are_of_the_key_map_in_its_order():
+def test_readme_keys_are_rows_of_the_key_map():
     section = (ROOT / "README.md").read_text("utf-8").partition("\n## Keys\n")[2].partition("\n## ")[0]
     rows = [row for row in section.splitlines() if row.startswith("|")]
     known = key_table().splitlines()
@@ -67,7 +67,7 @@ def test_all_keys_fit_into_the_help_of_any_window(monkeypatch, size):
         assert min(size for _, size in written) >= 13
 
 
-def test_the_help_has_every_group_whole_under_its_name():
+def test_help_keeps_each_group_together_under_its_name():
     groups = Keys().lines()
     columns = in_columns(groups)
     assert max(map(len, columns)) <= 0.6 * sum(map(len, columns))
