@@ -13,7 +13,7 @@ from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 from test_session import header
 
-from rehearsal.commands.option_checks import origin_in_words
+from rehearsal.commands.option_checks import replay_warning
 from version import PROJECT, VERSION
 
 # Licences that a program under Apache-2.0 can use, as packages name them.
@@ -84,13 +84,13 @@ def test_the_citation_has_the_references_of_the_method():
 
 def test_a_replay_by_another_version_or_on_another_backend_is_reported():
     recorded = header()
-    assert origin_in_words(recorded, "x64") == ""
-    assert "recorded on x64, replayed on cuda" in origin_in_words(recorded, "cuda")
+    assert replay_warning(recorded, "x64") == ""
+    assert "recorded on x64, replayed on cuda" in replay_warning(recorded, "cuda")
     recorded.version = VERSION
-    assert origin_in_words(recorded, "x64") == ""
+    assert replay_warning(recorded, "x64") == ""
     recorded.version = "0.9"
     for arch in ("x64", "cuda"):
-        assert f"recorded by version 0.9, replayed by {VERSION}" in origin_in_words(recorded, arch)
+        assert f"recorded by version 0.9, replayed by {VERSION}" in replay_warning(recorded, arch)
 
 
 def test_third_party_list_has_every_pinned_package_with_its_version():
