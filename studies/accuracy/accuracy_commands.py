@@ -1,4 +1,4 @@
-"""The commands that measure how true a model is: ``validate`` and ``calibrate``."""
+"""The commands ``validate`` and ``calibrate``: the tissue models against bead experiments."""
 
 from pathlib import Path
 from time import perf_counter
@@ -62,14 +62,14 @@ if TYPE_CHECKING:
 @click.option(
     "--iterations",
     type=WholeRange(1, 1000),
-    help="Passes over the constraints in a substep [the preset's].",
+    help="Iterations over the constraints in a substep [the preset's].",
 )
 @click.option("--time-step", "time_step_s", type=NumberRange(1e-4, 0.1), help="Time step in s [1/60].")
 @click.option(
     "--check",
     "checked",
     is_flag=True,
-    help="Also show what time step, iterations and size change; takes long.",
+    help="Also a convergence study of time step, iterations and size; takes long.",
 )
 @arch_option
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file.")
@@ -118,14 +118,14 @@ def validate(
 
 @click.command()
 @click.argument("cases", metavar="CASE...", type=click.Path(path_type=Path), nargs=-1, required=True)
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for tables and pictures.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for tables and figures.")
 @click.option("--radii", default="2.2,2.5,2.7,3.0,3.3", show_default=True, help="Particle radii in mm.")
 @click.option(
     "--hold-out",
     type=click.Choice(["stages", "beads", "cases"]),
     default="stages",
     show_default=True,
-    help="What is not fitted on and judges the fit: each case's deepest stage, every third bead, or the last CASE.",
+    help="Data that is not fitted but judges the fit: each case's deepest stage, every third bead, or the last CASE.",
 )
 @click.option(
     "--grid",
@@ -139,7 +139,7 @@ def validate(
     "--search",
     "generations",
     type=WholeRange(1, 1000),
-    help="Instead of the stiffness alone, search stiffness, over-relaxation and iterations for so many generations.",
+    help="Instead of the stiffness alone, search stiffness, over-relaxation and iterations for this many generations.",
 )
 @click.option("--jobs", type=WholeRange(1, 1024), help="Processes on this machine [one a processor].")
 @click.option("--dask", "address", help="Run on the Dask cluster of this scheduler, such as tcp://host:8786.")
@@ -155,7 +155,7 @@ def calibrate(
 ) -> None:
     """Fit shape matching to bead experiments, as the paper did.
 
-    Every stiffness is tried for each particle radius, on the folders CASE..., and judged on what was held out.
+    Every stiffness is tried for each particle radius, on the folders CASE..., and judged on held-out data.
     """
     radii_mm = numbers(radii, "--radii", 0.5, 20)
     loaded = [load_case(case) for case in cases]
@@ -181,7 +181,7 @@ def calibrate(
 
 
 def write_calibration(found: "Calibration", out: Path, searched: bool) -> None:
-    """Tables and pictures into a folder, and what matters of them on the terminal."""
+    """Write tables and figures into a folder, and print the tables and a summary."""
     from studies.accuracy import calibration_figures
     from studies.accuracy.calibration_tables import summary_of, tables_of, write_calibration
 
@@ -196,4 +196,4 @@ def write_calibration(found: "Calibration", out: Path, searched: bool) -> None:
         calibration_figures.write_search(found, out / "search.png")
     else:
         calibration_figures.write_figure4(found, out / "figure4.png")
-    click.echo(f"\n{summary_of(found)}\nWrote tables, pictures and calibration.json to {out}")
+    click.echo(f"\n{summary_of(found)}\nWrote tables, figures and calibration.json to {out}")

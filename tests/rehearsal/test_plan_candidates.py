@@ -36,7 +36,7 @@ from rehearsal.planning.sweep_path import layout_towards
 from scenes.anatomy import LoadedAnatomy
 from sim.mesh_distance import signed_distance
 from studies.planning import virtual_tumour
-from studies.planning.baseline_sweeps import by_chance, planned, row_by_row, straight, ways_by_chance
+from studies.planning.baseline_sweeps import planned, random_sweep, random_sweeps, row_by_row, straight
 from ultrasound.coverage import VOXEL_MM, Coverage
 from ultrasound.probe import load_probe
 
@@ -233,7 +233,7 @@ def test_straight_sweeps_look_down_and_cover_the_target_side_by_side(trial):
 
 
 def test_sweeps_by_chance_are_the_seeds_and_over_the_target(trial):
-    first, again, other = (by_chance(trial, 3, seed) for seed in (5, 5, 6))
+    first, again, other = (random_sweep(trial, 3, seed) for seed in (5, 5, 6))
     assert len(first.passes) == 3
     assert np.array_equal(first.poses, again.poses) and not np.array_equal(first.poses[0], other.poses[0])
     assert (np.linalg.norm(faces_in(first.poses)[:, :2], axis=1) < 12 * (np.sqrt(2) + 1)).all()
@@ -241,7 +241,7 @@ def test_sweeps_by_chance_are_the_seeds_and_over_the_target(trial):
     assert all(
         abs(angle_deg(a / np.linalg.norm(a), b / np.linalg.norm(b))) > 1 for a, b in pairwise(headings)
     )
-    ways = ways_by_chance(3, range(5, 7))
+    ways = random_sweeps(3, range(5, 7))
     assert [
         np.array_equal(make(trial).poses, way.poses) for make, way in zip(ways, (first, other), strict=True)
     ] == [True] * 2

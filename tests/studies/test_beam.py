@@ -162,7 +162,7 @@ def test_the_command_compares_draws_and_reports(tmp_path, capsys):
     assert float(as_above[2]) == pytest.approx(row["computed_hz"], abs=1e-4)
     # Rests on cells twice as wide as the row's: stiffer in bending by the hourglass term, 5% with two cells in the height.
     assert float(as_above[1]) == pytest.approx(row["computed_mm"], rel=0.1)
-    assert all(f"  {name}  " in printed for name in ("half the time step", "twice the passes"))
+    assert all(f"  {name}  " in printed for name in ("half the time step", "twice the iterations"))
 
 
 def test_cells_that_do_not_fill_the_beam_are_refused(device):

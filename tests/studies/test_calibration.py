@@ -146,7 +146,7 @@ def test_calibrate_leaves_tables_pictures_and_json(monkeypatch, folders, cases, 
     assert main(["calibrate", *map(str, folders), "--radii", "4,3", "--out", str(out), *more]) == 0
     said = capsys.readouterr().out
     assert "Fitted on all stages but the deepest; held out: the deepest stage." in said
-    assert "The fit is no accuracy" in said
+    assert "no measure of accuracy" in said
     found = json.loads((out / "calibration.json").read_text())
     assert [radius["radius_mm"] for radius in found["radii"]] == [3.0, 4.0] and found["cases"] == [
         "ball",

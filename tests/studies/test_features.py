@@ -90,7 +90,7 @@ def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, cap
     rows = json.loads((tmp_path / "features.json").read_text())["features"]
     assert [row["feature"] for row in rows] == [
         "friction on shapes",
-        "guard",
+        "divergence check",
         "organ's surface",
     ]
     for row in rows:

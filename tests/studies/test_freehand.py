@@ -22,8 +22,7 @@ from rehearsal.result_files import write_csv
 from scenes.anatomy import Grid, LoadedAnatomy
 from scenes.scene import PlaneShape, Scene, with_options
 from studies.freehand import freehand_accuracy, freehand_sweeps
-from studies.freehand.freehand_command import rows_of, table
-from studies.freehand.freehand_figure import draw
+from studies.freehand.freehand_command import figure_of, rows_of, table
 from studies.freehand.freehand_sweeps import sweep_of
 from ultrasound.reconstruction import VoxelBox
 from ultrasound.sweep import Mark, Sweep, SweepError
@@ -340,16 +339,16 @@ def test_undoing_the_press_puts_the_tissue_back(runs):
     assert abs(still["landmarks"]["mean_mm"] - still_undone["landmarks"]["mean_mm"]) < 0.5
 
 
-def test_the_study_tells_and_draws_both(runs, tmp_path):
-    lines = [line for run in runs for line in table(run)]
+def test_the_study_prints_and_draws_both(runs, tmp_path):
+    lines = [line for run in runs for line in table(run).splitlines()]
     row = runs[0]["compression"][3]["tumour"]["scanned_part"]
-    told = next(
-        line for line in lines if line.startswith("pressed 4 mm") and "undone" in line and "tumour" in line
+    printed = next(
+        line for line in lines if line.startswith("pressed 4 mm") and "corrected" in line and "tumour" in line
     )
-    assert f"{row['dice']:.3f}" in told and f"{row['centroid_mm']:.2f}" in told
+    assert f"{row['dice']:.3f}" in printed and f"{row['centroid_mm']:.2f}" in printed
     # Two lines of head, then two methods, three of the noise or two, and two by two of the press; of two regions, or of one.
     assert len(lines) == 2 + 2 * (2 + 3 + 4) + 2 + (2 + 2)
-    assert sum(line.startswith("every third picture, no error") for line in lines) == 3
+    assert sum(line.startswith("every third image, no error") for line in lines) == 3
     write_csv([row for run in runs for row in rows_of(run)], tmp_path / "a.csv")
     with (tmp_path / "a.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -361,8 +360,8 @@ def test_the_study_tells_and_draws_both(runs, tmp_path):
     nothing = dict(dice=0.0, hd95_mm=None, volume_percent=-100.0, centroid_mm=None)
     lost["tumour"] = dict(scanned=0.1, whole=nothing, scanned_part=nothing)
     out = runs[0] | dict(compression=[gone, lost])
-    assert sum("-100.0" in line for line in table(out)) == 1
-    draw([*runs, out], tmp_path / "all.png")
+    assert sum("-100.0" in line for line in table(out).splitlines()) == 1
+    figure_of([*runs, out]).savefig(tmp_path / "all.png")
     drawn = np.asarray(Image.open(tmp_path / "all.png").convert("RGB")).astype(int)
     # The colours of the three: curves, and marks of the press.
     for colour in ([31, 119, 180], [255, 127, 14], [44, 160, 44]):
