@@ -8,7 +8,6 @@ import click
 from tqdm import tqdm
 
 from rehearsal.commands.command_line import (
-    CommandError,
     NumberRange,
     WholeRange,
     arch_option,
@@ -162,21 +161,18 @@ def calibrate(
     make_folder(out)
     from studies.accuracy import calibration, case_workers
 
-    try:
-        split = calibration.split_of(loaded, hold_out)
-        with case_workers.dask_workers(address) if address else case_workers.local_workers(jobs) as work:
+    split = calibration.split_of(loaded, hold_out)
+    with case_workers.dask_workers(address) if address else case_workers.local_workers(jobs) as work:
+        if generations:
+            count = calibration.search_count(len(loaded), len(radii_mm), generations)
+        else:
+            count = calibration.exhaustive_count(len(loaded), len(radii_mm), spacing)
+        with tqdm(total=count, desc="calibrate", unit="press") as bar:
             if generations:
-                count = calibration.search_count(len(loaded), len(radii_mm), generations)
+                found = calibration.search(loaded, split, radii_mm, generations, work, bar.update)
             else:
-                count = calibration.exhaustive_count(len(loaded), len(radii_mm), spacing)
-            with tqdm(total=count, desc="calibrate", unit="press") as bar:
-                if generations:
-                    found = calibration.search(loaded, split, radii_mm, generations, work, bar.update)
-                else:
-                    found = calibration.exhaustive(loaded, split, radii_mm, spacing, work, bar.update)
-                bar.total = bar.n
-    except (calibration.CalibrationError, case_workers.WorkerError) as error:
-        raise CommandError(str(error)) from None
+                found = calibration.exhaustive(loaded, split, radii_mm, spacing, work, bar.update)
+            bar.total = bar.n
     write_calibration(found, out, searched=generations is not None)
 
 

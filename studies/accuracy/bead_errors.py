@@ -1,5 +1,7 @@
 """Errors of simulated beads (the paper's Tables 2 to 4), and those of predicting no motion."""
 
+from typing import Any
+
 import numpy as np
 
 from rehearsal.configuration import Setup
@@ -101,7 +103,7 @@ def table(case: BeadCase, beads: np.ndarray) -> str:
     distance.
     """
     errors, null, distances = bead_errors(case, beads), null_errors(case), probe_distances(case)
-    rows = []
+    rows: list[list[Any]] = []
     for stage, row in enumerate(stage_figures(case.indentation_mm, errors, null)):
         mean, unmoved = row["mean_mm"], row["null_mean_mm"]
         ratio = mean / unmoved if mean is not None and unmoved else None

@@ -129,9 +129,7 @@ def tissue_of(case: BeadCase, setup: Setup) -> TissueSection:
     known = {name: value for name, value in material.items() if name in type(tissue).model_fields}
     known |= tissue.model_dump(exclude_unset=True)
     if None in known.values():
-        raise SetupError(
-            f"{case.name}: the case has no material; give --young-kpa and --poisson"
-        )
+        raise SetupError(f"{case.name}: the case has no material; give --young-kpa and --poisson")
     return type(tissue).model_validate(known)
 
 

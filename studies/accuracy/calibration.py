@@ -7,6 +7,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from scipy.optimize import differential_evolution
 
+from errors import UserError
 from rehearsal.configuration import Setup, setup_of
 from studies.accuracy.bead_case import BeadCase
 from studies.accuracy.bead_errors import null_errors
@@ -25,7 +26,7 @@ POPULATION = 5
 MOST_ERROR = 4.0
 
 
-class CalibrationError(ValueError):
+class CalibrationError(UserError):
     """A calibration that is not possible; the message is one line."""
 
 
@@ -86,9 +87,7 @@ class Calibration:
 def split_of(cases: Sequence[BeadCase], hold_out: str) -> Split:
     """Hold out each case's deepest stage, every third of its beads, or the last case. Raises CalibrationError."""
     if len({case.digest for case in cases}) < len(cases):
-        raise CalibrationError(
-            "a case is named twice: fitted data would be held out as well; name each once"
-        )
+        raise CalibrationError("a case is named twice: fitted data would be held out as well; name each once")
     masks: list[np.ndarray] = [np.ones(case.measured.shape[:2], bool) for case in cases]
     if hold_out == "stages":
         for mask in masks:

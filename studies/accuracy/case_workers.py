@@ -12,6 +12,7 @@ import numpy as np
 from joblib import Parallel, delayed, parallel_config
 
 import sim.device
+from errors import UserError
 from rehearsal.configuration import Setup
 from rehearsal.worker_processes import processes
 from sim.body import RestBody
@@ -29,7 +30,7 @@ _filled: dict[tuple[str, float], RestBody] = {}
 _turn = threading.Lock()
 
 
-class WorkerError(RuntimeError):
+class WorkerError(UserError):
     """Workers that are not available; the message is one line."""
 
 

@@ -10,6 +10,8 @@ import numpy as np
 from scipy.optimize import OptimizeWarning, curve_fit
 from scipy.signal import find_peaks
 
+from errors import UserError
+
 COLUMNS = (
     "t_s",
     *(f"tip{k}_{axis}_m" for k in (1, 2, 3) for axis in "xyz"),
@@ -26,7 +28,7 @@ WINDOWS = 3
 LEAST_SWING = 0.1
 
 
-class BeamError(ValueError):
+class BeamError(UserError):
     """A fault of the recordings or the beam; the message is one line."""
 
 

@@ -33,7 +33,7 @@ class FemMaterial:
 
 
 class MeshError(ValueError):
-    """Why a mesh does not make a body, in one line."""
+    """A mesh that is not valid; the message is one line."""
 
 
 class FemSolid:
@@ -42,7 +42,7 @@ class FemSolid:
     Attributes:
         rest: nodes [mm], shape (nodes, 3): corners first, then the middles of edges.
         nodes_of: nodes of each tetrahedron, shape (tets, 10), in scikit-fem's order.
-        volume_share: volume that each node stands for [mm^3], shape (nodes,); all positive.
+        volume_share: volume of each node [mm^3], shape (nodes,); all positive.
     """
 
     def __init__(self, mesh: MeshTet2, material: FemMaterial) -> None:
@@ -67,7 +67,7 @@ class FemSolid:
         return np.eye(3) + moved @ self._gradients
 
     def least_volume_ratio(self, displacement: np.ndarray) -> float:
-        """Least det F of all Gauss points; not positive where tissue is turned inside out."""
+        """Least det F of all Gauss points; not positive in inverted tetrahedra."""
         return float(np.linalg.det(self.deformation(displacement)).min())
 
     def volume_ratio(self, displacement: np.ndarray) -> float:
@@ -76,7 +76,7 @@ class FemSolid:
         return float((ratio * self._weights).sum() / self._weights.sum())
 
     def elastic_force(self, displacement: np.ndarray) -> np.ndarray:
-        """Forces that hold the nodes against the tissue's stress [mN], shape (nodes, 3): integral of P grad N."""
+        """Internal forces [mN], shape (nodes, 3): integral of P grad N."""
         deformation = self.deformation(displacement)
         spatial, log_ratio = self._spatial_gradients(deformation)
         mu, lam = self.material.mu_kpa, self.material.lambda_kpa
@@ -113,19 +113,12 @@ class FemSolid:
         return self.gathered(shares[..., None] * force_density)
 
     def shares_at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What each node has in a point inside the body.
+        """Nodes, shape (n, 10), and their shape functions, shape (n, 10), at points at rest [mm], shape (n, 3).
 
-        Args:
-            points: places at rest [mm], shape (n, 3).
-
-        Returns:
-            Nodes, shape (n, 10), and their shares, which sum to 1, shape (n, 10).
-
-        Raises:
-            ValueError: a point is outside.
+        Raises ValueError for a point outside the body.
         """
         corners = MeshTet(np.ascontiguousarray(self.rest[: self.mesh.nvertices].T), self.mesh.t)
-        # Straight tetrahedra tell which one it is, or a neighbour so near that its polynomial serves as well.
+        # The straight tetrahedron of a point is its own, or a neighbour so near that its polynomial can be used.
         nodes = self.nodes_of[corners.element_finder()(*points.T)]
         local = np.full(points.T.shape, 0.25)
         for _ in range(INVERSION_STEPS):
@@ -138,7 +131,7 @@ class FemSolid:
         return nodes, shares
 
     def gathered(self, of_tets: np.ndarray) -> np.ndarray:
-        """Sum of what each tetrahedron adds to its nodes: shape (tets, 10, 3) to (nodes, 3)."""
+        """Sum of the tetrahedra's contributions to the nodes: shape (tets, 10, 3) to (nodes, 3)."""
         nodes = self.nodes_of.ravel()
         parts = of_tets.reshape(-1, 3).T
         return np.stack([np.bincount(nodes, part, len(self.rest)) for part in parts], axis=1)
@@ -153,7 +146,7 @@ class FemSolid:
 
 
 class _Pattern:
-    """Where each entry of the tetrahedra's blocks goes in the sparse matrix: found once, used in every step."""
+    """Sparsity pattern: the entry of the matrix for each entry of the tetrahedra's blocks."""
 
     def __init__(self, nodes_of: np.ndarray, nodes: int) -> None:
         freedoms = (3 * nodes_of[:, :, None] + np.arange(3)).reshape(len(nodes_of), -1).astype(np.int64)

@@ -1,4 +1,4 @@
-"""The command ``reference``: a case for ``validate`` that the project makes itself."""
+"""The command ``reference``: a bead experiment for ``validate``, computed by finite elements."""
 
 from pathlib import Path
 

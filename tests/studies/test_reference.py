@@ -15,7 +15,7 @@ from studies.accuracy.bead_case import load_case
 from studies.reference.equilibrium import Equilibrium, NotConvergedError
 from studies.reference.fem_press import FemExperiment, FemPress
 from studies.reference.fem_solid import FemMaterial, FemSolid
-from studies.reference.make_reference import blue_noise, laid
+from studies.reference.make_reference import blue_noise, in_case_frame
 from studies.reference.penalty_contact import ContactSurface, Law, PenaltyContact
 from studies.reference.reference_case import ReferenceCase
 from studies.reference.smooth_obstacles import DistanceField, RoundedBox
@@ -329,7 +329,7 @@ def test_beads_are_deep_and_far_apart(ball):
 
 def test_the_frame_of_the_files_is_upright_and_right_handed(block):
     block.apply_translation([50.0, 20.0, -300.0])
-    upright = laid(block, np.array([0.0, 1.0, 0.0]), block)
+    upright = in_case_frame(block, np.array([0.0, 1.0, 0.0]), block)
     assert upright.volume == pytest.approx(block.volume)
     np.testing.assert_allclose(upright.center_mass, 0, atol=1e-9)
     np.testing.assert_allclose(np.ptp(upright.vertices, axis=0), [24, 16, 20])
