@@ -1,4 +1,4 @@
-"""What the commands ``study ...`` share: their options and the files that each of them writes."""
+"""The table, the files and the figure that a study leaves."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,15 +13,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DPI = 130
-
-out_option = click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="Folder for tables and figures."
-)
-
-
-def scene_argument(default: Path) -> Any:
-    """The argument SCENE of a command: a scene file or a patient's folder."""
-    return click.argument("scene", type=click.Path(path_type=Path), default=default, required=False)
 
 
 def text_table(headers: Sequence[str], rows: Sequence[Sequence[Any]], formats: Sequence[str] = ()) -> str:

@@ -8,7 +8,6 @@ import click
 from tqdm import tqdm
 
 from rehearsal.commands.command_line import (
-    NumberRange,
     WholeRange,
     arch_option,
     make_folder,
@@ -19,8 +18,9 @@ from rehearsal.commands.command_line import (
 )
 from rehearsal.configuration import choose_setup
 from scenes.scene import model_with
-from scenes.tissue import QUALITIES, TISSUES, USUAL
+from scenes.tissue import TISSUES, USUAL
 from studies.accuracy.bead_case import load_case
+from studies.study_options import jobs_option, number_option, out_option, preset_option
 
 if TYPE_CHECKING:
     from studies.accuracy.calibration import Calibration
@@ -31,39 +31,25 @@ if TYPE_CHECKING:
 @click.option(
     "--model", type=click.Choice(list(TISSUES)), help=f"[{USUAL}, or what the options below belong to]"
 )
-@click.option(
-    "--quality",
-    type=click.Choice(QUALITIES),
-    default="balanced",
-    show_default=True,
-    help="A preset of the model, the same for every case; the options below change single values of it.",
+@preset_option
+@number_option(
+    "--cell", "cell_mm", low=0.5, high=20, help="neo-hookean: width of a cell in mm [the preset's]."
 )
-@click.option(
-    "--cell",
-    "cell_mm",
-    type=NumberRange(0.5, 20),
-    help="neo-hookean: width of a cell in mm [the preset's].",
+@number_option(
+    "--young-kpa", low=0, high=1e6, min_open=True, help="neo-hookean: Young's modulus in kPa [the case's]."
 )
-@click.option(
-    "--young-kpa",
-    type=NumberRange(0, 1e6, min_open=True),
-    help="neo-hookean: Young's modulus in kPa [the case's].",
+@number_option("--poisson", low=0, high=0.4999, help="neo-hookean: Poisson's ratio [the case's].")
+@number_option(
+    "--radius", "radius_mm", low=0.5, high=20, help="shape-matching: particle radius in mm [the preset's]."
 )
-@click.option("--poisson", type=NumberRange(0, 0.4999), help="neo-hookean: Poisson's ratio [the case's].")
-@click.option(
-    "--radius",
-    "radius_mm",
-    type=NumberRange(0.5, 20),
-    help="shape-matching: particle radius in mm [the preset's].",
-)
-@click.option("--stiffness", type=NumberRange(0, 1), help="shape-matching: cluster stiffness [the preset's].")
+@number_option("--stiffness", low=0, high=1, help="shape-matching: cluster stiffness [the preset's].")
 @click.option("--substeps", type=WholeRange(1, 100), help="Substeps of a time step [the preset's].")
 @click.option(
     "--iterations",
     type=WholeRange(1, 1000),
     help="Iterations over the constraints in a substep [the preset's].",
 )
-@click.option("--time-step", "time_step_s", type=NumberRange(1e-4, 0.1), help="Time step in s [1/60].")
+@number_option("--time-step", "time_step_s", low=1e-4, high=0.1, help="Time step in s [1/60].")
 @click.option(
     "--check",
     "checked",
@@ -117,7 +103,7 @@ def validate(
 
 @click.command()
 @click.argument("cases", metavar="CASE...", type=click.Path(path_type=Path), nargs=-1, required=True)
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for tables and figures.")
+@out_option
 @click.option("--radii", default="2.2,2.5,2.7,3.0,3.3", show_default=True, help="Particle radii in mm.")
 @click.option(
     "--hold-out",
@@ -126,12 +112,12 @@ def validate(
     show_default=True,
     help="Data that is not fitted but judges the fit: each case's deepest stage, every third bead, or the last CASE.",
 )
-@click.option(
+@number_option(
     "--grid",
     "spacing",
-    type=NumberRange(0.01, 0.5),
+    low=0.01,
+    high=0.5,
     default=0.05,
-    show_default=True,
     help="Spacing of the stiffnesses tried; around the best it is a fifth of that.",
 )
 @click.option(
@@ -140,7 +126,7 @@ def validate(
     type=WholeRange(1, 1000),
     help="Instead of the stiffness alone, search stiffness, over-relaxation and iterations for this many generations.",
 )
-@click.option("--jobs", type=WholeRange(1, 1024), help="Processes on this machine [one a processor].")
+@jobs_option
 @click.option("--dask", "address", help="Run on the Dask cluster of this scheduler, such as tcp://host:8786.")
 def calibrate(
     cases: tuple[Path, ...],

@@ -4,7 +4,6 @@ A case is a folder with ``case.toml`` (``CaseFile`` below), two closed surfaces 
 the frame of the organ's surface. Other keys are ignored.
 """
 
-import csv
 import hashlib
 import tomllib
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from scenes.patients.import_error import PatientError
 from scenes.section import Direction, Vector3
 from scenes.surface_files import load_surface
 from sim.mesh_distance import signed_distance
+from studies.number_table import read_numbers
 
 UNITS = ("_mm", "_kPa")
 # Between the nominal indentation and the measured position of the probe.
@@ -237,33 +237,9 @@ def _surface(folder: Path, name: str) -> trimesh.Trimesh:
 def _read_beads(path: Path, stages: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions of the beads (n, 3) stress-free and (stages, n, 3) measured [mm]."""
     columns = [f"{axis}{stage}" for stage in ("", *range(stages)) for axis in "xyz"]
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file, skipinitialspace=True))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise CaseError(f"{path}: cannot be read ({error}); expected a table of beads in CSV") from None
-    if not rows:
-        raise CaseError(f"{path}: holds no beads; expected a header and one line a bead")
-    missing = [name for name in columns if name not in rows[0]]
-    if missing:
-        raise CaseError(
-            f"{path}: column {missing[0]} is missing; expected {columns[0]} to {columns[-1]} for {stages} stages"
-        )
-    values = np.array(
-        [[_number(path, line, row, name) for name in columns] for line, row in enumerate(rows, 2)]
-    )
-    places = values.reshape(len(rows), stages + 1, 3).transpose(1, 0, 2)
-    return places[0].copy(), places[1:].copy()
-
-
-def _number(path: Path, line: int, row: dict[str, str | None], column: str) -> float:
-    try:
-        value = float(row[column] or "")
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise CaseError(f"{path}: line {line}, {column} is {row[column]!r}: expected a finite number in mm")
-    return value
+    values = read_numbers(path, columns, CaseError)
+    positions = values.reshape(len(values), stages + 1, 3).transpose(1, 0, 2)
+    return positions[0].copy(), positions[1:].copy()
 
 
 def _check_beads(path: Path, beads: np.ndarray, measured: np.ndarray, organ: trimesh.Trimesh) -> None:

@@ -9,10 +9,11 @@ import numpy as np
 import trimesh
 from tqdm import tqdm
 
-from rehearsal.commands.command_line import NumberRange, make_folder, make_place, save_figures, start_taichi
+from rehearsal.commands.command_line import make_folder, make_place, save_figures, start_taichi
 from rehearsal.result_files import save_figure
 from studies.beam.beam_comparison import check, compare, figure_of, table
 from studies.beam.motion_capture import BeamError, load_captures
+from studies.study_options import number_option
 
 BEAM = "beam.stl"
 DPI = 110
@@ -25,35 +26,10 @@ OUTWARD = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 @click.command()
 @click.argument("folder", type=click.Path(path_type=Path))
-@click.option(
-    "--cell",
-    "cell_mm",
-    type=NumberRange(1, 30),
-    default=10.0,
-    show_default=True,
-    help="Width of a cell in mm.",
-)
-@click.option(
-    "--young-kpa",
-    type=NumberRange(0, 1e6, min_open=True),
-    default=263.8,
-    show_default=True,
-    help="Young's modulus in kPa.",
-)
-@click.option(
-    "--poisson",
-    type=NumberRange(0, 0.5, max_open=True),
-    default=0.499,
-    show_default=True,
-    help="Poisson's ratio.",
-)
-@click.option(
-    "--density",
-    type=NumberRange(0, 30, min_open=True),
-    default=1.07,
-    show_default=True,
-    help="Density in g/cm^3.",
-)
+@number_option("--cell", "cell_mm", low=1, high=30, default=10.0, help="Width of a cell in mm.")
+@number_option("--young-kpa", low=0, high=1e6, min_open=True, default=263.8, help="Young's modulus in kPa.")
+@number_option("--poisson", low=0, high=0.5, max_open=True, default=0.499, help="Poisson's ratio.")
+@number_option("--density", low=0, high=30, min_open=True, default=1.07, help="Density in g/cm^3.")
 @click.option(
     "--check",
     "checked",

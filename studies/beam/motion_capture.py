@@ -1,6 +1,5 @@
 """Motion capture of a clamped beam: recordings, deflection, frequency and damping."""
 
-import csv
 import re
 import warnings
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from scipy.optimize import OptimizeWarning, curve_fit
 from scipy.signal import find_peaks
 
 from errors import UserError
+from studies.number_table import read_numbers
 
 COLUMNS = (
     "t_s",
@@ -77,14 +77,11 @@ def read_capture(path: Path) -> Capture:
     load = re.search(r"load(\d+)", path.stem)
     if load is None and "gravity" not in path.stem:
         raise BeamError(f"{path}: its name has neither 'gravity' nor 'load' and grams, such as load52")
-    table = _table(path)
+    table = read_numbers(path, COLUMNS, BeamError)
     if len(table) < HELD_FRAMES + REST_FRAMES:
         raise BeamError(
             f"{path}: {len(table)} frames are too few; expected {HELD_FRAMES + REST_FRAMES} at least"
         )
-    if not np.isfinite(table).all():
-        row = int(np.argwhere(~np.isfinite(table))[0][0])
-        raise BeamError(f"{path}: row {row + 2} has a value that is missing or no number")
     if (np.diff(table[:, 0]) <= 0).any():
         raise BeamError(f"{path}: the times in t_s do not increase")
     tips = 1000.0 * table[:, 1:].reshape(-1, 3, 3)
@@ -92,30 +89,6 @@ def read_capture(path: Path) -> Capture:
     if capture.release() < 0:
         raise BeamError(f"{path}: the tip never falls by {FALLEN_MM} mm, so nothing was released")
     return capture
-
-
-def _table(path: Path) -> np.ndarray:
-    """Values (n, 10) of a recording, NaN where there is no number."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
-            if missing:
-                raise BeamError(
-                    f"{path}: column {missing[0]} is missing, {len(missing)} of {len(COLUMNS)} in all"
-                )
-            return np.array([[_number(row[name]) for name in COLUMNS] for row in reader]).reshape(
-                -1, len(COLUMNS)
-            )
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise BeamError(f"{path}: cannot be read ({error})") from None
-
-
-def _number(text: str | None) -> float:
-    try:
-        return float(text or "nan")
-    except ValueError:
-        return float("nan")
 
 
 def oscillation(time_s: np.ndarray, height_mm: np.ndarray) -> Oscillation:

@@ -15,7 +15,7 @@ from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene, with_options
 from sim.device import start
-from studies.freehand.freehand_sweeps import Truth, pressed, resting, sweep_of
+from studies.freehand.freehand_sweeps import GroundTruthSweep, pressed, resting, sweep_of
 from ultrasound.probe import load_probe
 from ultrasound.reconstruction import METHODS
 from ultrasound.tracking_errors import TrackingErrors, tracked
@@ -85,7 +85,7 @@ def _depths(quick: bool) -> tuple[float, ...]:
 
 
 def noise_curves(
-    truth: Truth, surfaces: dict[str, trimesh.Trimesh], quick: bool, done: Callable[[], Any]
+    truth: GroundTruthSweep, surfaces: dict[str, trimesh.Trimesh], quick: bool, done: Callable[[], Any]
 ) -> list[dict[str, Any]]:
     """Figures of the resting sweep for trackers with one error each."""
     times = truth.sweep.times_s[::EVERY]
@@ -128,7 +128,7 @@ def compression(
 
 
 def _row(
-    truth: Truth,
+    truth: GroundTruthSweep,
     poses: list[np.ndarray | None] | np.ndarray,
     surfaces: dict[str, trimesh.Trimesh],
     places: Places | None = None,

@@ -13,7 +13,8 @@ from tqdm import tqdm
 from rehearsal.commands.command_line import CommandError, arch_option, load_patient, make_folder, start_taichi
 from rehearsal.configuration import PRESETS
 from scenes.scene import EMBEDDED
-from studies.study_results import out_option, text_table, write_results
+from studies.study_options import out_option
+from studies.study_results import text_table, write_results
 
 HEADERS = (
     "sweep",

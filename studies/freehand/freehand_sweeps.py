@@ -31,7 +31,7 @@ BEAD_RADIUS_MM, BEADS_APART_MM, BEADS_WITHIN_MM = 1.5, 9.0, 24.0
 
 
 @dataclass
-class Truth:
+class GroundTruthSweep:
     """A sweep of ``Mark`` images with the true poses (n, 4, 4) of the probe in the patient, and the beads (k, 3) at rest (LPS, mm).
 
     ``on_probe`` (4, 4) is ImageToProbe, ``mask`` (rows, columns) is True in the field of view.
@@ -60,7 +60,7 @@ def beads_of(organ: trimesh.Trimesh, tumour: trimesh.Trimesh | None) -> np.ndarr
     return inside[np.sort(nearest)]
 
 
-def resting(anatomy: LoadedAnatomy, probe: Probe, direction: np.ndarray, pixels: int) -> Truth:
+def resting(anatomy: LoadedAnatomy, probe: Probe, direction: np.ndarray, pixels: int) -> GroundTruthSweep:
     """The slow sweep of the undeformed CT along the organ's long axis; Taichi must have been started."""
     if anatomy.ct is None:
         raise ValueError("a sweep needs a CT")
@@ -92,7 +92,7 @@ def _along(organ: trimesh.Trimesh, probe: Probe, direction: np.ndarray) -> np.nd
     return poses
 
 
-def pressed(rehearsal: Rehearsal, depth_mm: float) -> Truth:
+def pressed(rehearsal: Rehearsal, depth_mm: float) -> GroundTruthSweep:
     """A sweep of the deforming body over the tumour, at a depth [mm] and along the probe's elevation axis."""
     if rehearsal.tumour is None or rehearsal.scanner is None:
         raise ValueError("a pressed sweep needs a tumour and a CT")
@@ -146,10 +146,10 @@ def _marks(
 
 def _truth(
     images: np.ndarray, poses: np.ndarray, times_s: np.ndarray, probe: Probe, beads_mm: np.ndarray
-) -> Truth:
+) -> GroundTruthSweep:
     on_probe = probe.image_to_probe(*images.shape[1:])
     mask = source_of_pixels(probe, images.shape[1])[..., 0] > -1.0
-    return Truth(sweep_of(images, poses, times_s, on_probe), poses, beads_mm, on_probe, mask)
+    return GroundTruthSweep(sweep_of(images, poses, times_s, on_probe), poses, beads_mm, on_probe, mask)
 
 
 def sweep_of(

@@ -11,7 +11,8 @@ from rehearsal.commands.command_line import arch_option, load_patient, make_fold
 from rehearsal.configuration import PRESETS
 from scenes.scene import PAPER
 from scenes.tissue import USUAL
-from studies.study_results import out_option, scene_argument, text_table, write_results
+from studies.study_options import out_option, scene_argument
+from studies.study_results import text_table, write_results
 
 MEASURED = ("ms", "mb", "kernels", "launches")
 COLUMNS = ("model", "feature", *(f"{name}_{state}" for name in MEASURED for state in ("on", "off")))

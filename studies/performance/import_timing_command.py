@@ -12,7 +12,8 @@ from tqdm import tqdm
 
 from rehearsal.commands.command_line import WholeRange, make_folder
 from studies.performance.synthetic_trunk import write_whole_body
-from studies.study_results import out_option, write_results
+from studies.study_options import out_option
+from studies.study_results import write_results
 
 APP = Path(__file__).resolve().parents[2] / "app.py"
 POLL_S = 0.02

@@ -14,7 +14,8 @@ from rehearsal.commands.command_line import arch_option, load_patient, make_fold
 from rehearsal.configuration import PRESETS, Setup, setup_of
 from scenes.scene import PAPER
 from studies.performance.step_pieces import AFTER, BEFORE, CONTACTS, IN_ITERATION
-from studies.study_results import out_option, scene_argument, text_table, write_results
+from studies.study_options import out_option, scene_argument
+from studies.study_results import text_table, write_results
 
 if TYPE_CHECKING:
     from studies.performance.step_timing import TimedPress

@@ -13,7 +13,8 @@ from rehearsal.commands.command_line import arch_option, make_folder, start_taic
 from rehearsal.speed_accuracy.pareto_front import preset_of, setup_of_row
 from studies.accuracy.bead_case import load_case
 from studies.performance.tradeoff_settings import PAPER, setups
-from studies.study_results import out_option, text_table, write_results
+from studies.study_options import out_option
+from studies.study_results import text_table, write_results
 
 EMBEDDED_CASE = Path(__file__).parents[1] / "reference" / "embedded"
 FRAME_MS = 1000 / 60

@@ -11,7 +11,8 @@ from rehearsal.commands.command_line import WholeRange, make_folder
 from rehearsal.planning.plan_file import MOST_SWEEPS
 from scenes.anatomy import load_anatomy
 from scenes.scene import EMBEDDED, load_scene, scene_file, with_options
-from studies.study_results import out_option, text_table, write_results
+from studies.study_options import jobs_option, out_option
+from studies.study_results import text_table, write_results
 
 HEADERS = (
     "sweep",
@@ -38,7 +39,7 @@ FORMATS = ("", ".0f", ".1f", ".1f", ".0f", ".0f", ".0f", ".0f", ".1f")
     help="Scans a search.",
 )
 @click.option("--probe", default="drop-in", show_default=True, help="Probe, by its name or as a file.")
-@click.option("--jobs", type=WholeRange(1, 256), help="Processes [as many as there are processors].")
+@jobs_option
 def plan_study(scenes: tuple[Path, ...], out: Path, trials: int, probe: str, jobs: int | None) -> None:
     """Compare planned sweeps with straight and random ones.
 

@@ -1,10 +1,11 @@
 """Rigid obstacles as smooth distances with first and second derivatives, which Newton's method needs."""
 
-from collections.abc import Sequence
+from itertools import combinations_with_replacement
 
 import igl
 import numpy as np
 import trimesh
+from numpy.typing import ArrayLike
 from scipy.interpolate import NdBSpline
 from scipy.ndimage import spline_filter
 
@@ -70,11 +71,15 @@ class DistanceField:
     def slopes(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gradient, shape (n, 3), and second derivatives [1/mm], shape (n, 3, 3)."""
         axes = np.eye(3, dtype=int)
-        gradient = [self._derivative(points, order, 0.0) for order in axes]
-        second = [[self._derivative(points, a + b, 0.0) for b in axes] for a in axes]
-        return np.stack(gradient, axis=-1), np.moveaxis(np.array(second), -1, 0)
+        gradient = np.empty((len(points), 3))
+        second = np.empty((len(points), 3, 3))
+        for i, j in combinations_with_replacement(range(3), 2):
+            second[:, i, j] = second[:, j, i] = self._derivative(points, axes[i] + axes[j], 0.0)
+        for i in range(3):
+            gradient[:, i] = self._derivative(points, axes[i], 0.0)
+        return gradient, second
 
-    def _derivative(self, points: np.ndarray, order: Sequence[int], outside: float) -> np.ndarray:
+    def _derivative(self, points: np.ndarray, order: ArrayLike, outside: float) -> np.ndarray:
         values = self._spline(points, nu=order)
         return np.where(np.isnan(values), outside, values)
 

@@ -6,29 +6,22 @@ from typing import Any
 import click
 from tqdm import tqdm
 
-from rehearsal.commands.command_line import NumberRange, arch_option, load_patient, make_folder, start_taichi
+from rehearsal.commands.command_line import arch_option, load_patient, make_folder, start_taichi
 from rehearsal.configuration import PRESETS
 from scenes.scene import EMBEDDED
-from scenes.tissue import QUALITIES, TISSUES, USUAL
-from studies.study_results import out_option, scene_argument, write_results
+from scenes.tissue import TISSUES, USUAL
+from studies.study_options import number_option, out_option, preset_option, scene_argument
+from studies.study_results import write_results
 
 
 @click.command()
 @scene_argument(EMBEDDED)
 @out_option
-@click.option(
-    "--minutes", type=NumberRange(0.05, 600), default=10.0, show_default=True, help="Simulated minutes."
-)
+@number_option("--minutes", low=0.05, high=600, default=10.0, help="Simulated minutes.")
 @click.option(
     "--model", type=click.Choice(list(TISSUES)), default=USUAL, show_default=True, help="Tissue model."
 )
-@click.option(
-    "--quality",
-    type=click.Choice(QUALITIES),
-    default="balanced",
-    show_default=True,
-    help="A preset of the model.",
-)
+@preset_option
 @arch_option
 def replay(scene: Path, out: Path, minutes: float, model: str, quality: str, arch: str) -> None:
     """Record a session in SCENE and compute it again.

@@ -10,7 +10,8 @@ from tqdm import tqdm
 from rehearsal.commands.command_line import WholeRange, arch_option, load_patient, make_folder, start_taichi
 from rehearsal.configuration import PRESETS
 from scenes.scene import PAPER
-from studies.study_results import out_option, scene_argument, text_table, write_results
+from studies.study_options import out_option, scene_argument
+from studies.study_results import text_table, write_results
 
 HOUR = 60
 SHOWN = (

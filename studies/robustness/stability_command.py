@@ -12,10 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from tqdm import tqdm
 
-from rehearsal.commands.command_line import WholeRange, make_folder
+from rehearsal.commands.command_line import make_folder
 from rehearsal.worker_processes import processes
 from studies.robustness.stress_cases import MODELS, RECOVERED_MM, StressCase, cases_of, quick_cases_of
-from studies.study_results import out_option, text_table, write_results
+from studies.study_options import jobs_option, out_option
+from studies.study_results import text_table, write_results
 
 # Cases of one body in a task, after which the progress bar advances; the process keeps the body for the next task.
 BATCH = 4
@@ -34,7 +35,7 @@ HEADERS = ("model", "kind", "cases", "finite", "recovered", "restored", "worst r
 @click.command()
 @out_option
 @click.option("--quick", is_flag=True, help="One case of each kind, in one to two minutes.")
-@click.option("--jobs", type=WholeRange(1, 1024), help="Processes on this machine [one a processor].")
+@jobs_option
 def stability(out: Path, quick: bool, jobs: int | None) -> None:
     """Stress-test the tissue and see whether it recovers.
 

@@ -1,4 +1,4 @@
-"""The tables of a run against arithmetic done by hand, and the run that they are of."""
+"""The tables of a run against values computed by hand, and the run itself."""
 
 import json
 from dataclasses import replace
@@ -190,7 +190,7 @@ def test_validate_twice_prints_and_writes_the_same_but_for_times(monkeypatch, tm
     assert reports[0] == reports[1] and reports[0]["finite"] and reports[0]["cell_mm"] == 5
 
 
-def test_validate_says_mistakes_in_one_line(tmp_path, capsys):
+def test_validate_reports_mistakes_in_one_line(tmp_path, capsys):
     def refused(*arguments) -> str:
         assert main(["validate", *map(str, arguments)]) == 2
         line = capsys.readouterr().err.strip()

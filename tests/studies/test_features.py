@@ -81,7 +81,7 @@ def test_kernels_are_counted_where_a_step_is_parallel(device):
     assert base["launches"] > base["kernels"] > 10
 
 
-def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, capsys):
+def test_the_command_writes_table_figure_and_json(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(features_command, "load_patient", lambda _: (briefly(20), small_anatomy()))
     monkeypatch.setattr(feature_costs, "SETTLE_STEPS", 3)
     monkeypatch.setattr(feature_costs, "PRESS_STEPS", 3)

@@ -1,4 +1,4 @@
-"""Volumes of tracked sweeps: balls in closed form on oblique pictures, and a small soft block, pressed."""
+"""Volumes of tracked sweeps: balls in closed form on oblique images, and a small soft block, pressed."""
 
 import csv
 from dataclasses import replace
@@ -88,7 +88,7 @@ def check_balls(rebuilt: Rebuilt, off_mm: float) -> None:
 
 
 @pytest.mark.parametrize(("method", "off_mm"), [("smooth", 0.1), ("nearest", 0.5)])
-def test_balls_come_back_where_they_are(marked, method, off_mm):
+def test_balls_are_reconstructed_at_their_positions(marked, method, off_mm):
     # Nearest voxels are off by up to half of one, all to one side where pictures lie as evenly as the voxels.
     rebuilt = rebuild(marked, track_of(marked, "Reference"), ALL, 1.0, method, 2.0, marked, with_grey=False)
     check_balls(rebuilt, off_mm)
@@ -98,7 +98,7 @@ def test_balls_come_back_where_they_are(marked, method, off_mm):
         assert middle == pytest.approx(BEADS[bead], abs=0.08)
 
 
-def test_what_was_squeezed_comes_back_as_it_was_at_rest(device, marked):
+def test_the_compression_correction_restores_the_resting_shape(device, marked):
     now_from_rest = np.array([[1.0, 0.15, 0.0], [0.0, 0.8, 0.0], [0.05, 0.0, 1.1]])
     way = poses()
 
@@ -118,7 +118,7 @@ def test_what_was_squeezed_comes_back_as_it_was_at_rest(device, marked):
     assert seen.beads[0] == pytest.approx(CENTRE + now_from_rest @ (BEADS[0] - CENTRE), abs=0.1)
 
 
-def test_frames_without_pose_or_picture_are_left_out(marked):
+def test_frames_without_pose_or_image_are_left_out(marked):
     images = np.full((len(poses()), ROWS, COLUMNS), 90, np.uint8)
     images[[3, 20]] = 255
     sweep = swept(images, lost=(3, 11))
@@ -137,7 +137,7 @@ def test_frames_without_pose_or_picture_are_left_out(marked):
     assert rebuilt.grey[rebuilt.known] == pytest.approx(90) and not rebuilt.regions and not rebuilt.beads
 
 
-def test_only_the_sector_that_is_lit_counts():
+def test_only_the_field_of_view_counts():
     images = np.where(SECTOR, np.uint8(120), np.uint8(0)) * np.ones((len(poses()), 1, 1), np.uint8)
     sweep = swept(images)
     mask = lit(np.concatenate([0 * images[:1], images]))
@@ -178,7 +178,7 @@ def test_voxels_inside_a_block_are_those_whose_centres_are():
     assert not inside(trimesh.creation.box([2.0] * 3), box).any()
 
 
-def test_a_wider_box_leaves_all_where_it_was():
+def test_a_wider_box_moves_nothing():
     box = a_box()
     region = near(box.places(), [-2.0, 12.0, 60.0], 5.0)
     rebuilt = Rebuilt(box, region * np.float32(7), region, {"organ": region})
@@ -242,7 +242,7 @@ def test_files_have_each_voxel_at_its_place(tmp_path):
     assert not (tmp_path / ".." / "labels.nrrd").exists()
 
 
-def test_the_picture_shows_the_cuts_through_the_tumour(tmp_path, marked):
+def test_the_figure_shows_the_cuts_through_the_tumour(tmp_path, marked):
     path = track_of(marked, "Reference")
     rebuilt = rebuild(replace(marked, images=marked.images * 60), path, ALL, 1.0, "smooth", 2.0, marked)
     save_picture(rebuilt, tmp_path / "with.png")
@@ -300,7 +300,7 @@ def runs() -> list[dict]:
     return made
 
 
-def test_at_rest_the_bar_is_met(runs):
+def test_at_rest_the_accuracy_is_met(runs):
     for run in runs:
         assert [row["method"] for row in run["resting"]] == ["nearest", "smooth"]
         assert run["apart_mm"] == pytest.approx(1.0) and run["frames"] == 60
@@ -312,7 +312,7 @@ def test_at_rest_the_bar_is_met(runs):
     assert all("tumour" not in row for row in runs[1]["resting"]) and runs[1]["compression"] == []
 
 
-def test_a_probe_calibrated_wrong_shifts_all_alike(runs):
+def test_an_error_of_the_calibration_shifts_everything_equally(runs):
     # The quick run takes the third of the sizes.
     none, calibration, lost = runs[0]["noise"]
     assert (calibration["calibration_mm"], lost["lost"]) == (3.0, 0.3)
@@ -323,7 +323,7 @@ def test_a_probe_calibrated_wrong_shifts_all_alike(runs):
     assert [row["lost"] for row in runs[1]["noise"]] == [0.0, 0.3]
 
 
-def test_undoing_the_press_puts_the_tissue_back(runs):
+def test_the_compression_correction_reduces_the_error(runs):
     still, still_undone, seen, undone = runs[0]["compression"]
     assert [row["depth_mm"] for row in (still, still_undone, seen, undone)] == [0, 0, 4, 4]
     assert (seen["undone"], undone["undone"]) == (False, True) and seen["compression_mm"] > 1.0

@@ -36,7 +36,7 @@ def test_the_cases_are_many_and_each_is_another(model):
     assert {case.kind for case in quick_cases_of(model)} == kinds | {"one alone"}
 
 
-def test_bodies_start_and_transducers_move_as_their_names_say():
+def test_initial_states_and_motions_match_their_names():
     x = np.random.default_rng(0).normal(size=(50, 3))
     up, home = np.array([0.0, 0.0, 1.0]), np.eye(4)
     assert np.ptp(STATES["scaled"](x, up, 1.0, 1.0, 0.0)[0][:, 2]) == 0
@@ -96,7 +96,7 @@ def test_reasons_distinguish_position_and_shape():
     assert "shape differs by 3 mm" in stress_test._reason(12.0, 3.0)
 
 
-def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, capsys):
+def test_the_command_writes_table_figure_and_json(tmp_path, monkeypatch, capsys):
     few = [StressCase("rest", "long", ONE), StressCase("lost", "wholly", ONE, state=("nothing",))]
     monkeypatch.setattr(stability_command, "quick_cases_of", lambda model: few)
     assert app.main(["study", "stability", "--quick", "--jobs", "1", "--out", str(tmp_path)]) == 0
@@ -115,7 +115,7 @@ def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, cap
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_a_state_along_an_axis_is_what_its_name_says(model):
+def test_a_state_along_an_axis_matches_its_name(model):
     states = {case.name: case.state for case in cases_of(model)}
     assert states["collapsed: to a plane, x"] == ("scaled", 0.0, 1.0, 1.0)
     assert states["collapsed: to a line, y"] == ("scaled", 0.0, 1.0, 0.0)
