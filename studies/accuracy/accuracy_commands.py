@@ -2,7 +2,6 @@
 
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING
 
 import click
 from tqdm import tqdm
@@ -21,9 +20,6 @@ from scenes.scene import model_with
 from scenes.tissue import TISSUES, USUAL
 from studies.accuracy.bead_case import load_case
 from studies.study_options import jobs_option, number_option, out_option, preset_option
-
-if TYPE_CHECKING:
-    from studies.accuracy.calibration import Calibration
 
 
 @click.command()
@@ -145,7 +141,8 @@ def calibrate(
     radii_mm = numbers(radii, "--radii", 0.5, 20)
     loaded = [load_case(case) for case in cases]
     make_folder(out)
-    from studies.accuracy import calibration, case_workers
+    from studies.accuracy import calibration, calibration_figures, case_workers
+    from studies.accuracy.calibration_tables import summary_of, tables_of, write_calibration
 
     split = calibration.split_of(loaded, hold_out)
     with case_workers.dask_workers(address) if address else case_workers.local_workers(jobs) as work:
@@ -159,14 +156,6 @@ def calibrate(
             else:
                 found = calibration.exhaustive(loaded, split, radii_mm, spacing, work, bar.update)
             bar.total = bar.n
-    write_calibration(found, out, searched=generations is not None)
-
-
-def write_calibration(found: "Calibration", out: Path, searched: bool) -> None:
-    """Write tables and figures into a folder, and print the tables and a summary."""
-    from studies.accuracy import calibration_figures
-    from studies.accuracy.calibration_tables import summary_of, tables_of, write_calibration
-
     tables = tables_of(found)
     for table in tables:
         table.write_csv(out)
@@ -174,7 +163,7 @@ def write_calibration(found: "Calibration", out: Path, searched: bool) -> None:
         click.echo(f"\n{table.text()}")
     write_calibration(found, tables, out / "calibration.json")
     calibration_figures.write_figure5(found, out / "figure5.png")
-    if searched:
+    if generations:
         calibration_figures.write_search(found, out / "search.png")
     else:
         calibration_figures.write_figure4(found, out / "figure4.png")

@@ -7,7 +7,7 @@ W = mu/2 (tr C - 3) - mu ln J + lambda/2 (ln J)^2, so P = mu (F - F^-T) + lambda
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csc_matrix
+from scipy.sparse import coo_matrix, csc_matrix
 from skfem import Basis, ElementTetP2, MeshTet, MeshTet2
 
 INVERSION_STEPS = 12
@@ -59,7 +59,10 @@ class FemSolid:
         self._gradients = np.stack([f[0].grad for f in self.basis.basis]).transpose(2, 3, 0, 1).copy()
         share = np.repeat(self._weights.sum(axis=1) / 10, 10)
         self.volume_share = np.bincount(self.nodes_of.ravel(), share, len(self.rest))
-        self._pattern = _Pattern(self.nodes_of, len(self.rest))
+        freedoms = (
+            (3 * self.nodes_of[:, :, None] + np.arange(3)).reshape(len(self.nodes_of), -1).astype(np.int32)
+        )
+        self._entries = np.repeat(freedoms, 30, axis=1).ravel(), np.tile(freedoms, 30).ravel()
 
     def deformation(self, displacement: np.ndarray) -> np.ndarray:
         """Deformation gradients F at the Gauss points, shape (tets, 4, 3, 3), for displacements [mm] (nodes, 3)."""
@@ -138,25 +141,10 @@ class FemSolid:
 
     def assembled(self, of_tets: np.ndarray) -> csc_matrix:
         """Sparse matrix of blocks (tets, 10, 3, 10, 3); rows and columns are 3 node + axis."""
-        return self._pattern.matrix(of_tets)
+        rows, columns = self._entries
+        size = 3 * len(self.rest)
+        return coo_matrix((of_tets.ravel(), (rows, columns)), shape=(size, size)).tocsc()
 
     def _spatial_gradients(self, deformation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """F^-T grad N, shape (tets, 4, 10, 3), and ln J, shape (tets, 4)."""
         return self._gradients @ np.linalg.inv(deformation), np.log(np.linalg.det(deformation))
-
-
-class _Pattern:
-    """Sparsity pattern: the entry of the matrix for each entry of the tetrahedra's blocks."""
-
-    def __init__(self, nodes_of: np.ndarray, nodes: int) -> None:
-        freedoms = (3 * nodes_of[:, :, None] + np.arange(3)).reshape(len(nodes_of), -1).astype(np.int64)
-        self._size = 3 * nodes
-        keys = freedoms[:, None, :] * self._size + freedoms[:, :, None]
-        unique, slots = np.unique(keys, return_inverse=True)
-        self._slots = slots.ravel()
-        self._rows = (unique % self._size).astype(np.int32)
-        self._starts = np.searchsorted(unique // self._size, np.arange(self._size + 1)).astype(np.int32)
-
-    def matrix(self, blocks: np.ndarray) -> csc_matrix:
-        values = np.bincount(self._slots, blocks.ravel(), len(self._rows))
-        return csc_matrix((values, self._rows, self._starts), shape=(self._size, self._size))
