@@ -18,7 +18,7 @@ from errors import UserError, explained
 from scenes.patients.import_error import PatientError
 from scenes.section import Direction, Vector3
 from scenes.surface_files import load_surface
-from sim.mesh_distance import signed_distance
+from sim.signed_distance import signed_distance
 from studies.number_table import read_numbers
 
 UNITS = ("_mm", "_kPa")

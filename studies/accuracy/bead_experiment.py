@@ -11,9 +11,9 @@ from rehearsal.stopwatch import timed
 from scenes.closed_surfaces import moved_by
 from scenes.scene import Contact
 from scenes.tissue import TissueSection
-from sim.body import RestBody
 from sim.fields import array_of
-from sim.shape_matching import fill
+from sim.sampling import RestBody
+from sim.shape_matching import fill_organ
 from sim.shapes import ConvexTool
 from sim.skinning import Skin
 from sim.solver import StepSettings
@@ -84,7 +84,7 @@ class BeadExperiment:
     def prepare(self, setup: Setup) -> StepSettings:
         """Warm up from the stress-free shape, with the probe away; return the settings of its steps."""
         self.body.restore(self.body.rest_state())
-        self.contacts.forget()
+        self.contacts.reset()
         self.model.update_frames()
         step, pose = self._step_settings(setup), self._away()
         for _ in range(setup.warm_up_steps):
@@ -133,7 +133,7 @@ def tissue_of(case: BeadCase, setup: Setup) -> TissueSection:
 
 def rest_body(case: BeadCase, setup: Setup) -> RestBody:
     """The particles of a case for shape matching; experiments of one radius can share them."""
-    return fill(_organ(case), setup.tissue)
+    return fill_organ(_organ(case), setup.tissue)
 
 
 def _organ(case: BeadCase) -> trimesh.Trimesh:

@@ -96,19 +96,19 @@ def _apply(specimen: Specimen, case: StressCase, extremes: Extremes) -> None:
     settings.gravity = (case.gravity * x, case.gravity * y, case.gravity * z)
     dt = settings.time_step_s
     specimen.solver.restore(specimen.settled)
-    specimen.guard.settle()
+    specimen.divergence_check.set_initial_state()
     state, *numbers = case.state
     if state != "settled":
         position, velocity = STATES[state](specimen.rest, specimen.up, *numbers)
         specimen.body.restore(BodyState(position.astype(np.float32), velocity.astype(np.float32)))
-        specimen.solver.contacts.forget()
+        specimen.solver.contacts.reset()
     _set_material(specimen, case.heaviest, case.material)
     motion, *numbers = case.probe
     path = PROBES[motion](specimen.home, specimen.thickness_mm, dt, *numbers)
     for step in range(max(LEAST_STEPS, round(LEAST_S / dt))):
         times = dt * (step + np.linspace(0.0, 1.0, settings.substeps + 1))
         specimen.solver.step(settings, np.stack([path(float(t)) for t in times]))
-        extremes.record(specimen, specimen.guard.check(dt))
+        extremes.record(specimen, specimen.divergence_check.check(dt))
     _set_material(specimen, 1.0, {})
 
 
@@ -126,7 +126,7 @@ def _release(specimen: Specimen, extremes: Extremes) -> None:
     away = np.stack([advanced(specimen.home, -AWAY_MM)] * (specimen.settings.substeps + 1))
     for step in range(1, RELEASE_STEPS + 1):
         specimen.solver.step(specimen.settings, away)
-        notice = specimen.guard.check(specimen.settings.time_step_s)
+        notice = specimen.divergence_check.check(specimen.settings.time_step_s)
         if notice or step % CHECK_EVERY == 0:
             extremes.record(specimen, notice)
         if step % CHECK_EVERY == 0 and specimen.rest_error_mm() < RECOVERED_MM / 2:
@@ -141,7 +141,7 @@ def _free_shape_error(specimen: Specimen) -> float:
     state = specimen.solver.snapshot()
     up = (state.body.position + LIFT_MM * specimen.up).astype(np.float32)
     specimen.solver.restore(SolverState(BodyState(up, np.zeros_like(up)), state.contacts))
-    specimen.solver.contacts.forget()
+    specimen.solver.contacts.reset()
     weightless: StepSettings = replace(specimen.settings, gravity=(0.0, 0.0, 0.0))
     error = np.inf
     for step in range(1, LIFT_STEPS + 1):

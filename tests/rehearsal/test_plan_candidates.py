@@ -34,7 +34,7 @@ from rehearsal.planning.sweep_candidates import (
 )
 from rehearsal.planning.sweep_path import layout_towards
 from scenes.anatomy import LoadedAnatomy
-from sim.mesh_distance import signed_distance
+from sim.signed_distance import signed_distance
 from studies.planning import virtual_tumour
 from studies.planning.baseline_sweeps import planned, random_sweep, random_sweeps, row_by_row, straight
 from ultrasound.coverage import VOXEL_MM, Coverage

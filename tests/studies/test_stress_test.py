@@ -70,7 +70,7 @@ def test_a_small_body_is_stressed_released_and_measured(model):
     assert rest["finite"] and rest["recovered"] and rest["fallback"] is None and rest["reason"] is None
     assert rest["rest_error_mm"] < 0.01
     assert rest["volume_ratio"] == pytest.approx(1.0, abs=0.01)
-    for restored, why in ((lost, "no numbers"), (gone, "left the scene")):
+    for restored, why in ((lost, "not finite"), (gone, "left the scene")):
         assert why in restored["fallback"]
         assert restored["finite"] and restored["recovered"]
     # It falls 100 mm and comes to rest somewhere: where it was, or there is a reason.
