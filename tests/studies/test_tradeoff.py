@@ -168,7 +168,10 @@ def test_budgets_that_no_setting_meets_are_refused(monkeypatch):
         (["--error-mm", "1", "--stiffness", "0.9"], "--stiffness: --error-mm chooses this too"),
         (["--quality", "fast", "--cell", "5"], "--cell: --quality chooses this too"),
         (["--quality", "fast", "--iterations", "4"], "--iterations: --quality chooses this too"),
-        (["--quality", "fast", "--error-mm", "1"], "--quality: --error-mm chooses resolution and iterations too"),
+        (
+            ["--quality", "fast", "--error-mm", "1"],
+            "--quality: --error-mm chooses resolution and iterations too",
+        ),
     ],
 )
 def test_the_command_line_refuses_a_size_beside_what_chooses_it(line, words, capsys):
