@@ -16,22 +16,22 @@ STUDIES = {
     ),
     "stability": (
         "studies.robustness.stability_command:stability",
-        "Maltreat the tissue, let go, and see whether it recovers.",
+        "Stress-test the tissue and see whether it recovers.",
     ),
-    "soak": ("studies.robustness.soak_command:soak", "Rehearse for an hour in SCENE, faster than real."),
+    "soak": ("studies.robustness.soak_command:soak", "Rehearse for an hour in SCENE, faster than real time."),
     "import": ("studies.performance.import_timing_command:intake", "Measure an import: seconds and memory."),
     "freehand": (
         "studies.freehand.freehand_command:freehand",
-        "Compare volumes of tracked sweeps with the truth.",
+        "Compare volumes of tracked sweeps with the ground truth.",
     ),
     "replay": ("studies.robustness.replay_command:replay", "Record a session in SCENE and compute it again."),
     "plan": (
         "studies.planning.plan_study_command:plan_study",
-        "Compare planned sweeps with straight ones, and such by chance.",
+        "Compare planned sweeps with straight and random ones.",
     ),
 }
 
 
 @click.group(cls=LazyGroup, commands_at=STUDIES)
 def study() -> None:
-    """Measure on this machine: tables and a picture in a folder."""
+    """Measure on this machine: tables and figures in a folder."""

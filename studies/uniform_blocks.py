@@ -1,4 +1,4 @@
-"""Blocks of cells and of particles, of which a solver is made without a scene."""
+"""Solvers for blocks of cells or particles, without a scene."""
 
 import numpy as np
 import trimesh
@@ -18,7 +18,7 @@ FRICTION, CLUSTER_SPACING = 0.35, 3.33
 
 
 def block_of_cells(side: int, cell_mm: float, shapes: list, tool: ConvexTool | None = None) -> Solver:
-    """A cube from the origin on, so many cells along each side, among shapes, the tool among them."""
+    """A cube with a corner at the origin, ``side`` cells along each edge, in contact with shapes, one of which may be the tool."""
     lattice = fill_block((side, side, side), cell_mm)
     body = Body(lattice.nodes)
     cube = trimesh.creation.box(bounds=[[0.0] * 3, [side * cell_mm] * 3])
@@ -29,7 +29,7 @@ def block_of_cells(side: int, cell_mm: float, shapes: list, tool: ConvexTool | N
 def block_of_particles(
     points_mm: np.ndarray, radius_mm: float, shapes: list, tool: ConvexTool | None = None
 ) -> Solver:
-    """Particles at points (n, 3), a radius apart from each other, among shapes, the tool among them."""
+    """Particles at points (n, 3) [mm], a radius apart, in contact with shapes, one of which may be the tool."""
     rest = RestBody(points_mm, radius_mm, np.full(len(points_mm), radius_mm / 2))
     arranged, patches = group_into_patches(rest, CLUSTER_SPACING)
     body = ParticleBody(arranged)

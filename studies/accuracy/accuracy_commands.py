@@ -1,15 +1,12 @@
-"""The commands that measure how true a model is: ``validate`` and ``calibrate``."""
+"""The commands ``validate`` and ``calibrate``: the tissue models against bead experiments."""
 
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING
 
 import click
 from tqdm import tqdm
 
 from rehearsal.commands.command_line import (
-    CommandError,
-    NumberRange,
     WholeRange,
     arch_option,
     make_folder,
@@ -20,11 +17,9 @@ from rehearsal.commands.command_line import (
 )
 from rehearsal.configuration import choose_setup
 from scenes.scene import model_with
-from scenes.tissue import QUALITIES, TISSUES, USUAL
+from scenes.tissue import TISSUES, USUAL
 from studies.accuracy.bead_case import load_case
-
-if TYPE_CHECKING:
-    from studies.accuracy.calibration import Calibration
+from studies.study_options import jobs_option, number_option, out_option, preset_option
 
 
 @click.command()
@@ -32,44 +27,30 @@ if TYPE_CHECKING:
 @click.option(
     "--model", type=click.Choice(list(TISSUES)), help=f"[{USUAL}, or what the options below belong to]"
 )
-@click.option(
-    "--quality",
-    type=click.Choice(QUALITIES),
-    default="balanced",
-    show_default=True,
-    help="A preset of the model, the same for every case; the options below change single values of it.",
+@preset_option
+@number_option(
+    "--cell", "cell_mm", low=0.5, high=20, help="neo-hookean: width of a cell in mm [the preset's]."
 )
-@click.option(
-    "--cell",
-    "cell_mm",
-    type=NumberRange(0.5, 20),
-    help="neo-hookean: width of a cell in mm [the preset's].",
+@number_option(
+    "--young-kpa", low=0, high=1e6, min_open=True, help="neo-hookean: Young's modulus in kPa [the case's]."
 )
-@click.option(
-    "--young-kpa",
-    type=NumberRange(0, 1e6, min_open=True),
-    help="neo-hookean: Young's modulus in kPa [the case's].",
+@number_option("--poisson", low=0, high=0.4999, help="neo-hookean: Poisson's ratio [the case's].")
+@number_option(
+    "--radius", "radius_mm", low=0.5, high=20, help="shape-matching: particle radius in mm [the preset's]."
 )
-@click.option("--poisson", type=NumberRange(0, 0.4999), help="neo-hookean: Poisson's ratio [the case's].")
-@click.option(
-    "--radius",
-    "radius_mm",
-    type=NumberRange(0.5, 20),
-    help="shape-matching: particle radius in mm [the preset's].",
-)
-@click.option("--stiffness", type=NumberRange(0, 1), help="shape-matching: cluster stiffness [the preset's].")
+@number_option("--stiffness", low=0, high=1, help="shape-matching: cluster stiffness [the preset's].")
 @click.option("--substeps", type=WholeRange(1, 100), help="Substeps of a time step [the preset's].")
 @click.option(
     "--iterations",
     type=WholeRange(1, 1000),
-    help="Passes over the constraints in a substep [the preset's].",
+    help="Iterations over the constraints in a substep [the preset's].",
 )
-@click.option("--time-step", "time_step_s", type=NumberRange(1e-4, 0.1), help="Time step in s [1/60].")
+@number_option("--time-step", "time_step_s", low=1e-4, high=0.1, help="Time step in s [1/60].")
 @click.option(
     "--check",
     "checked",
     is_flag=True,
-    help="Also show what time step, iterations and size change; takes long.",
+    help="Also a convergence study of time step, iterations and size; takes long.",
 )
 @arch_option
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file.")
@@ -118,30 +99,30 @@ def validate(
 
 @click.command()
 @click.argument("cases", metavar="CASE...", type=click.Path(path_type=Path), nargs=-1, required=True)
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for tables and pictures.")
+@out_option
 @click.option("--radii", default="2.2,2.5,2.7,3.0,3.3", show_default=True, help="Particle radii in mm.")
 @click.option(
     "--hold-out",
     type=click.Choice(["stages", "beads", "cases"]),
     default="stages",
     show_default=True,
-    help="What is not fitted on and judges the fit: each case's deepest stage, every third bead, or the last CASE.",
+    help="Data that is not fitted but judges the fit: each case's deepest stage, every third bead, or the last CASE.",
 )
-@click.option(
+@number_option(
     "--grid",
     "spacing",
-    type=NumberRange(0.01, 0.5),
+    low=0.01,
+    high=0.5,
     default=0.05,
-    show_default=True,
     help="Spacing of the stiffnesses tried; around the best it is a fifth of that.",
 )
 @click.option(
     "--search",
     "generations",
     type=WholeRange(1, 1000),
-    help="Instead of the stiffness alone, search stiffness, over-relaxation and iterations for so many generations.",
+    help="Instead of the stiffness alone, search stiffness, over-relaxation and iterations for this many generations.",
 )
-@click.option("--jobs", type=WholeRange(1, 1024), help="Processes on this machine [one a processor].")
+@jobs_option
 @click.option("--dask", "address", help="Run on the Dask cluster of this scheduler, such as tcp://host:8786.")
 def calibrate(
     cases: tuple[Path, ...],
@@ -155,36 +136,26 @@ def calibrate(
 ) -> None:
     """Fit shape matching to bead experiments, as the paper did.
 
-    Every stiffness is tried for each particle radius, on the folders CASE..., and judged on what was held out.
+    Every stiffness is tried for each particle radius, on the folders CASE..., and judged on held-out data.
     """
     radii_mm = numbers(radii, "--radii", 0.5, 20)
     loaded = [load_case(case) for case in cases]
     make_folder(out)
-    from studies.accuracy import calibration, case_workers
-
-    try:
-        split = calibration.split_of(loaded, hold_out)
-        with case_workers.dask_workers(address) if address else case_workers.local_workers(jobs) as work:
-            if generations:
-                count = calibration.search_count(len(loaded), len(radii_mm), generations)
-            else:
-                count = calibration.exhaustive_count(len(loaded), len(radii_mm), spacing)
-            with tqdm(total=count, desc="calibrate", unit="press") as bar:
-                if generations:
-                    found = calibration.search(loaded, split, radii_mm, generations, work, bar.update)
-                else:
-                    found = calibration.exhaustive(loaded, split, radii_mm, spacing, work, bar.update)
-                bar.total = bar.n
-    except (calibration.CalibrationError, case_workers.WorkerError) as error:
-        raise CommandError(str(error)) from None
-    write_calibration(found, out, searched=generations is not None)
-
-
-def write_calibration(found: "Calibration", out: Path, searched: bool) -> None:
-    """Tables and pictures into a folder, and what matters of them on the terminal."""
-    from studies.accuracy import calibration_figures
+    from studies.accuracy import calibration, calibration_figures, case_workers
     from studies.accuracy.calibration_tables import summary_of, tables_of, write_calibration
 
+    split = calibration.split_of(loaded, hold_out)
+    with case_workers.dask_workers(address) if address else case_workers.local_workers(jobs) as work:
+        if generations:
+            count = calibration.search_count(len(loaded), len(radii_mm), generations)
+        else:
+            count = calibration.exhaustive_count(len(loaded), len(radii_mm), spacing)
+        with tqdm(total=count, desc="calibrate", unit="press") as bar:
+            if generations:
+                found = calibration.search(loaded, split, radii_mm, generations, work, bar.update)
+            else:
+                found = calibration.exhaustive(loaded, split, radii_mm, spacing, work, bar.update)
+            bar.total = bar.n
     tables = tables_of(found)
     for table in tables:
         table.write_csv(out)
@@ -192,8 +163,8 @@ def write_calibration(found: "Calibration", out: Path, searched: bool) -> None:
         click.echo(f"\n{table.text()}")
     write_calibration(found, tables, out / "calibration.json")
     calibration_figures.write_figure5(found, out / "figure5.png")
-    if searched:
+    if generations:
         calibration_figures.write_search(found, out / "search.png")
     else:
         calibration_figures.write_figure4(found, out / "figure4.png")
-    click.echo(f"\n{summary_of(found)}\nWrote tables, pictures and calibration.json to {out}")
+    click.echo(f"\n{summary_of(found)}\nWrote tables, figures and calibration.json to {out}")

@@ -1,10 +1,9 @@
-"""A bead experiment as files: an organ on its support, pressed stage by stage, with beads measured at each stage.
+"""Files of a bead experiment: an organ on its support, pressed stage by stage, with beads measured at each stage.
 
 A case is a folder with ``case.toml`` (``CaseFile`` below), two closed surfaces and a table of beads. Lengths are mm in
-the frame of the organ's surface. Keys that are not listed here are a laboratory's own and left alone.
+the frame of the organ's surface. Other keys are ignored.
 """
 
-import csv
 import hashlib
 import tomllib
 from dataclasses import dataclass
@@ -20,14 +19,15 @@ from scenes.patients.import_error import PatientError
 from scenes.section import Direction, Vector3
 from scenes.surface_files import load_surface
 from sim.signed_distance import signed_distance
+from studies.number_table import read_numbers
 
 UNITS = ("_mm", "_kPa")
-# Between the nominal indentation and where the probe was found.
+# Between the nominal indentation and the measured position of the probe.
 MOST_APART_MM = 0.5
 
 
 class CaseError(UserError):
-    """A case that cannot be used; the message is one line that says where, what was found and what to do."""
+    """A case that cannot be used; the message is one line with file, what was found and what to do."""
 
 
 def _proper(rows: tuple[Vector3, Vector3, Vector3]) -> tuple[Vector3, Vector3, Vector3]:
@@ -41,7 +41,7 @@ Rotation = Annotated[tuple[Vector3, Vector3, Vector3], AfterValidator(_proper)]
 
 
 class CaseSection(BaseModel):
-    """A table of case.toml. Keys that are not listed are a laboratory's own, but none of ours in another unit."""
+    """A table of case.toml. Other keys are ignored, unless they are a known key in another unit."""
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
 
@@ -68,7 +68,7 @@ class CaseGravity(CaseSection):
 
 
 class CaseMaterial(CaseSection):
-    """What is known of the tissue; not every model needs all of it."""
+    """Material of the tissue; not every model needs all of it."""
 
     young_kPa: float | None = Field(None, gt=0, le=1e6)
     poisson: float | None = Field(None, ge=0, lt=0.5)
@@ -108,7 +108,7 @@ class CaseProbe(CaseSection):
 
 
 class CaseStage(CaseSection):
-    """The probe's centre and how far it has come since stage 0; with a rotation of its own if it turned."""
+    """Centre of the probe and its travel since stage 0; with its own rotation if it has turned."""
 
     index: int
     indentation_mm: float = Field(ge=0, le=500)
@@ -158,8 +158,8 @@ class BeadCase:
     """One experiment: float64, mm, in the frame of the organ's stress-free surface.
 
     ``beads`` (n, 3) stress-free, ``measured`` (stages, n, 3), ``poses`` (stages, 4, 4) world from probe,
-    ``indentation_mm`` (stages,), ``press_direction`` (3,) unit, ``size_mm`` (3,), ``gravity`` (3,) in mm/s^2. What is
-    not known of the material is None. ``digest`` names the content of all files.
+    ``indentation_mm`` (stages,), ``press_direction`` (3,) unit, ``size_mm`` (3,), ``gravity`` (3,) in mm/s^2. Unknown
+    material values are None. ``digest`` is a hash of all files.
     """
 
     name: str
@@ -237,33 +237,9 @@ def _surface(folder: Path, name: str) -> trimesh.Trimesh:
 def _read_beads(path: Path, stages: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions of the beads (n, 3) stress-free and (stages, n, 3) measured [mm]."""
     columns = [f"{axis}{stage}" for stage in ("", *range(stages)) for axis in "xyz"]
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file, skipinitialspace=True))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise CaseError(f"{path}: cannot be read ({error}); expected a table of beads in CSV") from None
-    if not rows:
-        raise CaseError(f"{path}: holds no beads; expected a header and one line a bead")
-    missing = [name for name in columns if name not in rows[0]]
-    if missing:
-        raise CaseError(
-            f"{path}: column {missing[0]} is missing; expected {columns[0]} to {columns[-1]} for {stages} stages"
-        )
-    values = np.array(
-        [[_number(path, line, row, name) for name in columns] for line, row in enumerate(rows, 2)]
-    )
-    places = values.reshape(len(rows), stages + 1, 3).transpose(1, 0, 2)
-    return places[0].copy(), places[1:].copy()
-
-
-def _number(path: Path, line: int, row: dict[str, str | None], column: str) -> float:
-    try:
-        value = float(row[column] or "")
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise CaseError(f"{path}: line {line}, {column} is {row[column]!r}: expected a finite number in mm")
-    return value
+    values = read_numbers(path, columns, CaseError)
+    positions = values.reshape(len(values), stages + 1, 3).transpose(1, 0, 2)
+    return positions[0].copy(), positions[1:].copy()
 
 
 def _check_beads(path: Path, beads: np.ndarray, measured: np.ndarray, organ: trimesh.Trimesh) -> None:

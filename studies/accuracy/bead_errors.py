@@ -1,4 +1,6 @@
-"""How far simulated beads are from measured ones: the paper's Tables 2 to 4, and what they must be read against."""
+"""Errors of simulated beads (the paper's Tables 2 to 4), and those of predicting no motion."""
+
+from typing import Any
 
 import numpy as np
 
@@ -6,8 +8,11 @@ from rehearsal.configuration import Setup
 from rehearsal.result_files import counted, rounded, spread
 from studies.accuracy.bead_case import BeadCase
 from studies.accuracy.bead_experiment import BeadExperiment, BeadRun
+from studies.study_results import text_table
 
 DISTANCE_BANDS = 4
+HEADERS = ("stage", "indentation, mm", "mean", "% of travel", "SD", "max", "unmoved", "ratio", "r(distance)")
+FORMATS = ("", ".2f", ".2f", ".0f", *[".2f"] * 5)
 
 
 def bead_errors(case: BeadCase, beads: np.ndarray) -> np.ndarray:
@@ -16,7 +21,7 @@ def bead_errors(case: BeadCase, beads: np.ndarray) -> np.ndarray:
 
 
 def null_errors(case: BeadCase) -> np.ndarray:
-    """The errors (stages, n) [mm] of predicting no motion: beads that stay where they were measured at stage 0."""
+    """Errors (stages, n) [mm] of predicting no motion: beads that stay where they were measured at stage 0."""
     return np.linalg.norm(case.measured - case.measured[0], axis=2)
 
 
@@ -35,10 +40,9 @@ def probe_distances(case: BeadCase) -> np.ndarray:
 def stage_figures(
     indentation_mm: np.ndarray, errors: np.ndarray, null: np.ndarray
 ) -> list[dict[str, float | None]]:
-    """Each stage's mean, standard deviation (of all beads, not of a sample), maximum and share of the probe's travel.
+    """Each stage's mean, standard deviation (population), maximum and share of the probe's travel, if there is any.
 
-    ``indentation_mm`` (stages,), ``errors`` and ``null`` (stages, n) [mm]. Where the probe has not travelled there is no
-    share.
+    ``indentation_mm`` (stages,), ``errors`` and ``null`` (stages, n) [mm].
     """
     return [
         dict(
@@ -61,7 +65,7 @@ def correlation(first: np.ndarray, second: np.ndarray) -> float | None:
 
 
 def report(experiment: BeadExperiment, setup: Setup, run: BeadRun) -> dict:
-    """What ``validate --json`` writes; the correlation is over all beads at all stages at which the probe presses."""
+    """The figures of ``validate --json``; the correlation is over all beads at all stages with indentation."""
     case = experiment.case
     errors = bead_errors(case, run.beads)
     return dict(
@@ -80,7 +84,7 @@ def report(experiment: BeadExperiment, setup: Setup, run: BeadRun) -> dict:
 
 
 def summary(report: dict, model: str) -> str:
-    """What was computed and how fast, in a few lines for the terminal; ``model`` is ``BeadExperiment.describe``'s."""
+    """Model and speed in a few lines; ``model`` is from ``BeadExperiment.describe``."""
     time = report["ms_per_step"]
     lines = [
         f"case   {report['case']}",
@@ -89,35 +93,30 @@ def summary(report: dict, model: str) -> str:
         f"{counted(report['iterations'], 'iteration')}",
         f"speed  {time['median']:.1f} ms a step (median), {time['max']:.1f} at most",
     ]
-    return "\n".join(lines if report["finite"] else [*lines, "NOT FINITE: the figures below mean nothing"])
+    return "\n".join(lines if report["finite"] else [*lines, "NOT FINITE: the figures below are not valid"])
 
 
 def table(case: BeadCase, beads: np.ndarray) -> str:
-    """The paper's Tables 2 to 4 for one run's beads (stages, n, 3) [mm], beside what predicting no motion gives.
+    """The paper's Tables 2 to 4 for one run's beads (stages, n, 3) [mm], beside the errors of predicting no motion.
 
     The last column is the correlation of error and distance from the probe at that stage; below are the errors by
     distance.
     """
     errors, null, distances = bead_errors(case, beads), null_errors(case), probe_distances(case)
-    lines = ["stage  indentation   mean  of travel     SD    max  unmoved  ratio  r(distance)"]
+    rows: list[list[Any]] = []
     for stage, row in enumerate(stage_figures(case.indentation_mm, errors, null)):
-        share = "-" if row["percent_of_travel"] is None else f"{row['percent_of_travel']:.0f} %"
+        mean, unmoved = row["mean_mm"], row["null_mean_mm"]
+        ratio = mean / unmoved if mean is not None and unmoved else None
+        share = row["percent_of_travel"]
         related = correlation(distances[stage], errors[stage])
-        lines.append(
-            f"{stage:<5}  {row['indentation_mm']:8.2f} mm  {_plain(row['mean_mm']):>5}  {share:>9}  "
-            f"{_plain(row['sd_mm']):>5}  "
-            f"{_plain(row['max_mm']):>5}  {_against(row['mean_mm'], row['null_mean_mm'])}  {_plain(related):>11}"
-        )
-    overall = _against(errors.mean(), null.mean())
-    lines.append(f"{'all':<5}  {'':11}  {errors.mean():5.2f}  {'':9}  {'':5}  {errors.max():5.2f}  {overall}")
+        depth = row["indentation_mm"]
+        rows.append([stage, depth, mean, share, row["sd_mm"], row["max_mm"], unmoved, ratio, related])
+    overall = errors.mean() / null.mean()
+    rows.append(["all", None, errors.mean(), None, None, errors.max(), null.mean(), overall, None])
     related = correlation(distances[1:], errors[1:])
-    lines.append(f"\nError by distance from the probe, stages pressed; correlation {_plain(related)}:")
-    return "\n".join(lines + _bands(distances[1:].ravel(), errors[1:].ravel()))
-
-
-def _against(mean: float | None, null: float | None) -> str:
-    """Two columns: the error of the null model, and the model's error as a multiple of it."""
-    return f"{_plain(null):>7}  {_plain(mean / null if mean is not None and null else None):>5}"
+    title = f"Error by distance from the probe, stages pressed; correlation {_plain(related)}:"
+    bands = _bands(distances[1:].ravel(), errors[1:].ravel())
+    return "\n".join([text_table(HEADERS, rows, FORMATS), "", title, *bands])
 
 
 def _plain(value: float | None) -> str:

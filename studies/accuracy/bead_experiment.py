@@ -1,4 +1,4 @@
-"""A case put together on the device and pressed: the warm-up, then stage by stage, the beads read at each one's end."""
+"""A bead experiment on the device: the warm-up, then the press stage by stage."""
 
 from dataclasses import dataclass, field, replace
 
@@ -20,18 +20,18 @@ from sim.solver import StepSettings
 from studies.accuracy.bead_case import BeadCase
 from ultrasound.probe_manipulator import between
 
-# The share of a stage's steps in which the probe moves; in the others the tissue comes to rest, as it did for the scan.
+# Share of a stage's steps in which the probe moves; in the others the tissue comes to rest, as before the scan.
 MOVING = 2 / 3
-# How far back along the press the probe waits while the organ settles.
+# Distance of the probe, back along the press, while the organ settles.
 AWAY_MM = 60.0
-# Where a case does not say: the paper's. It scales all masses alike.
+# The paper's, where a case has none. It scales all masses equally.
 DENSITY_KG_M3 = 1050.0
 
 
 @dataclass
 class BeadRun:
-    """One run: beads (stages, n, 3) [mm] at each stage's end, and at the moment when the probe arrives; each stage step's
-    time, whether all stayed finite.
+    """One run: ``beads`` (stages, n, 3) [mm] at the end of each stage, and ``arriving`` when the probe has just arrived;
+    the time of each step in the stages, and whether all positions are finite.
     """
 
     beads: np.ndarray
@@ -41,10 +41,9 @@ class BeadRun:
 
 
 class BeadExperiment:
-    """A case on the device, which can be run with several setups that share model, size and material.
+    """A case on the device, for setups that share model, size and material; Taichi must be initialised.
 
-    Needs Taichi to be initialised. All positions on the device are relative to ``origin``, the middle of the organ.
-    Raises SamplingError and SetupError.
+    Positions on the device are relative to ``origin``, the middle of the organ. Raises SamplingError and SetupError.
     """
 
     def __init__(self, case: BeadCase, setup: Setup, rest: RestBody | None = None) -> None:
@@ -61,10 +60,9 @@ class BeadExperiment:
     def run(self, setup: Setup) -> BeadRun:
         """Press the organ from its stress-free shape.
 
-        It settles for the warm-up's 120 steps with the probe away, as at its stage-0 place the probe would be in the way
-        of an organ that is not yet down. Then each stage takes 90 steps: in the first 60 the probe goes evenly to its
-        pose of that stage (to that of stage 0 along the press), in the others it rests. The same setup
-        gives the same beads, whatever ran before.
+        It settles for 120 steps (warm-up) with the probe away: at stage 0 the probe would touch an organ that has not
+        yet sunk into its support. Each stage takes 90 steps: in the first 60 the probe moves at constant speed to its
+        pose, in the others it rests. The same setup gives the same beads, whatever was run before.
         """
         step = self.prepare(setup)
         pose = self._away()
@@ -76,44 +74,41 @@ class BeadExperiment:
                 poses = between(path[min(n, moving)], path[min(n + 1, moving)], step.substeps)
                 timed(lambda: self.solver.step(step, poses), run.step_ms)
                 if n + 1 == moving:
-                    run.arriving[stage] = self._found()
+                    run.arriving[stage] = self._bead_positions()
             pose = path[-1]
-            run.beads[stage] = self._found()
+            run.beads[stage] = self._bead_positions()
             run.finite &= bool(np.isfinite(array_of(self.body.position)).all())
         run.finite &= bool(np.isfinite(run.beads).all())
         return run
 
     def prepare(self, setup: Setup) -> StepSettings:
-        """From the stress-free shape through the warm-up, the probe away; the settings of its steps."""
-        self._restore()
+        """Warm up from the stress-free shape, with the probe away; return the settings of its steps."""
+        self.body.restore(self.body.rest_state())
+        self.contacts.reset()
+        self.model.update_frames()
         step, pose = self._step_settings(setup), self._away()
         for _ in range(setup.warm_up_steps):
             self.solver.step(step, between(pose, pose, step.substeps))
         return step
 
-    def _found(self) -> np.ndarray:
+    def _bead_positions(self) -> np.ndarray:
         self.beads.update()
         return array_of(self.beads.vertices) + self.origin
 
     def relative(self, pose: np.ndarray) -> np.ndarray:
-        """A pose (4, 4) of the case's frame, in the device's."""
+        """A pose (4, 4) of the case's frame, in that of the device."""
         moved = pose.copy()
         moved[:3, 3] -= self.origin
         return moved
 
     def size(self, setup: Setup) -> dict[str, float]:
-        """How large the model is, under the names of a report: ``radius_mm`` or ``cell_mm``, ``particles`` or ``nodes``."""
+        """Size of the model, under the names of a report: ``radius_mm`` or ``cell_mm``, ``particles`` or ``nodes``."""
         return {setup.tissue.SIZE: setup.size_mm, **self.model.counts()}
 
     def describe(self, setup: Setup) -> str:
-        """Size and settings in the model's own words, for the terminal."""
+        """Size and settings of the model, in words."""
         tissue = tissue_of(self.case, setup)
         return tissue.REPORTED.format(**tissue.model_dump(), **self.model.counts())
-
-    def _restore(self) -> None:
-        self.body.restore(self.body.rest_state())
-        self.contacts.reset()
-        self.model.update_frames()
 
     def _step_settings(self, setup: Setup) -> StepSettings:
         x, y, z = self.case.gravity.tolist()
@@ -126,20 +121,18 @@ class BeadExperiment:
 
 
 def tissue_of(case: BeadCase, setup: Setup) -> TissueSection:
-    """The setup's tissue with what is the case's own. Raises SetupError where neither gives the material."""
+    """The setup's tissue with the case's material. Raises SetupError where neither gives the material."""
     tissue, density = setup.tissue, (case.density_kg_m3 or DENSITY_KG_M3) / 1000
     material = dict(young_kpa=case.young_kpa, poisson=case.poisson, density_g_cm3=density)
-    told = {name: value for name, value in material.items() if name in type(tissue).model_fields}
-    told |= tissue.model_dump(exclude_unset=True)
-    if None in told.values():
-        raise SetupError(
-            f"{case.name}: the case does not say what its tissue is; give --young-kpa and --poisson"
-        )
-    return type(tissue).model_validate(told)
+    known = {name: value for name, value in material.items() if name in type(tissue).model_fields}
+    known |= tissue.model_dump(exclude_unset=True)
+    if None in known.values():
+        raise SetupError(f"{case.name}: the case has no material; give --young-kpa and --poisson")
+    return type(tissue).model_validate(known)
 
 
 def rest_body(case: BeadCase, setup: Setup) -> RestBody:
-    """Shape matching's particles of a case; Experiments of one radius can share them."""
+    """The particles of a case for shape matching; experiments of one radius can share them."""
     return fill_organ(_organ(case), setup.tissue)
 
 

@@ -1,49 +1,49 @@
-"""The paper's calibration: settings searched for the least mean bead error, and their worth on data held out."""
+"""The paper's calibration: a search for the settings with the least mean bead error, judged on held-out data."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import Polynomial
 from scipy.optimize import differential_evolution
 
+from errors import UserError
 from rehearsal.configuration import Setup, setup_of
 from studies.accuracy.bead_case import BeadCase
 from studies.accuracy.bead_errors import null_errors
 from studies.accuracy.case_workers import Map, Measured
 
-# The model that the paper calibrates.
 MODEL = "shape-matching"
-# Of the beads held out, each third: neighbours on a thread are then on either side.
+# Every third bead is held out, so that neighbours on a thread are in both parts.
 BEADS_EVERY = 3
-# The grid's spacing over that of the finer look around its best.
+# Ratio of the grid's spacing to that of the finer grid around its best value.
 FINER = 5
 QUARTIC = 4
 # stiffness, over-relaxation and iterations, with Eq. 7's range for the second.
 BOUNDS = ((0.05, 1.0), (1.0, 2.0), (3, 30))
 POPULATION = 5
-# An error this many times the least is that of a body that falls apart, which would spoil the fit for the others.
-TALLEST = 4.0
+# A larger error, in multiples of the least, is that of a body that falls apart; it is left out of the quartic fit.
+MOST_ERROR = 4.0
 
 
-class CalibrationError(ValueError):
-    """A calibration that cannot be made; the message is one line."""
+class CalibrationError(UserError):
+    """A calibration that is not possible; the message is one line."""
 
 
 @dataclass(frozen=True)
 class Split:
-    """What is fitted on: for each case a mask (stages, n), True where an error counts; the rest is held out."""
+    """Fitted and held-out data: for each case a mask (stages, n), True where an error is fitted."""
 
     fitted: tuple[np.ndarray, ...]
     fitted_name: str
     held_out_name: str
 
     def fit_mm(self, errors: Sequence[np.ndarray]) -> float:
-        """Mean of the cases' mean errors [mm], of those that are fitted on; ``errors`` (stages, n) of each case."""
+        """Mean of the cases' mean errors [mm] over the fitted data; ``errors`` (stages, n) of each case."""
         return _mean(errors, self.fitted)
 
     def held_out_mm(self, errors: Sequence[np.ndarray]) -> float:
-        """Mean of the cases' mean errors [mm], of those that are held out."""
+        """Mean of the cases' mean errors [mm] over the held-out data."""
         return _mean(errors, [~mask for mask in self.fitted])
 
 
@@ -59,7 +59,7 @@ class CalibrationTrial:
 
 @dataclass(frozen=True)
 class Fit:
-    """A quartic through mean errors over a range of the stiffness, and where it is least in that."""
+    """A quartic fitted to mean errors over a range of the stiffness, and its minimum there."""
 
     polynomial: Polynomial
     range: tuple[float, float]
@@ -69,27 +69,25 @@ class Fit:
 
 @dataclass(frozen=True)
 class Calibration:
-    """All trials of each radius, in the order in which they were made."""
+    """All trials of each radius, in their order."""
 
     cases: tuple[BeadCase, ...]
     split: Split
     trials: dict[float, list[CalibrationTrial]]
 
     def best(self, radius_mm: float) -> CalibrationTrial:
-        """The trial that fits best, the first of equals."""
+        """The trial with the least error on the fitted data, the first of equals."""
         return min(self.trials[radius_mm], key=lambda trial: trial.fit_mm)
 
     def null_mm(self) -> float:
-        """Error [mm] of predicting no motion, on what is held out."""
+        """Error [mm] of predicting no motion, on the held-out data."""
         return self.split.held_out_mm([null_errors(case) for case in self.cases])
 
 
 def split_of(cases: Sequence[BeadCase], hold_out: str) -> Split:
     """Hold out each case's deepest stage, every third of its beads, or the last case. Raises CalibrationError."""
     if len({case.digest for case in cases}) < len(cases):
-        raise CalibrationError(
-            "a case is named twice: what is fitted on would be held out as well; name each once"
-        )
+        raise CalibrationError("a case is named twice: fitted data would be held out as well; name each once")
     masks: list[np.ndarray] = [np.ones(case.measured.shape[:2], bool) for case in cases]
     if hold_out == "stages":
         for mask in masks:
@@ -119,9 +117,9 @@ def exhaustive(
     workers: Map,
     done: Callable[[int], object],
 ) -> Calibration:
-    """The paper's search: every stiffness on a grid for each radius, then a finer look around the best of each.
+    """The paper's search: every stiffness on a grid for each radius, then on a finer grid around the best of each.
 
-    ``done`` is told of evaluations as they are finished, ``exhaustive_count`` of them at most.
+    ``done`` is called with the number of finished evaluations, ``exhaustive_count`` in all at most.
     """
     grid = stiffness_grid(spacing)
     trials = try_all(
@@ -144,7 +142,7 @@ def exhaustive(
 
 
 def stiffness_grid(spacing: float) -> list[float]:
-    """Evenly to 1; at 0 nothing holds the tissue together and there is nothing to compare."""
+    """Equal steps to 1; without 0, at which nothing holds the tissue together."""
     return np.round(np.arange(1.0, spacing / 2, -spacing)[::-1], 6).tolist()
 
 
@@ -156,7 +154,7 @@ def finer_grid(best: float, spacing: float) -> list[float]:
 
 
 def exhaustive_count(cases: int, radii: int, spacing: float) -> int:
-    """Evaluations of an exhaustive search, at most."""
+    """Largest number of evaluations of an exhaustive search."""
     return cases * radii * (len(stiffness_grid(spacing)) + 2 * (FINER - 1))
 
 
@@ -168,9 +166,9 @@ def search(
     workers: Map,
     done: Callable[[int], object],
 ) -> Calibration:
-    """Stiffness, over-relaxation and iterations together for each radius, by differential evolution from a fixed seed.
+    """Stiffness, over-relaxation and iterations of each radius, by differential evolution from a fixed seed.
 
-    A generation is evaluated at once, so the outcome does not depend on the number of workers.
+    A generation is evaluated at once, so the result does not depend on the number of workers.
     """
     trials: dict[float, list[CalibrationTrial]] = {radius: [] for radius in radii_mm}
 
@@ -197,7 +195,7 @@ def search(
 
 
 def search_count(cases: int, radii: int, generations: int) -> int:
-    """Evaluations of a search."""
+    """Number of evaluations of a search."""
     return cases * radii * (generations + 1) * POPULATION * len(BOUNDS)
 
 
@@ -208,9 +206,12 @@ def try_all(
     workers: Map,
     done: Callable[[int], object],
 ) -> list[CalibrationTrial]:
-    """Evaluate setups on every case; case by case, as what a worker has built for one serves all setups of a radius."""
+    """Evaluate setups on every case; case by case, as a worker keeps what it has built for a case and a radius."""
     pairs = [(case, setup) for case in cases for setup in setups]
-    results = list(_told(workers(pairs), done))
+    results = []
+    for result in workers(pairs):
+        results.append(result)
+        done(1)
     trials = []
     for place, setup in enumerate(setups):
         measured = tuple(results[place :: len(setups)])
@@ -220,9 +221,9 @@ def try_all(
 
 
 def quartic(trials: Sequence[CalibrationTrial]) -> Fit | None:
-    """The paper's smooth curve through the errors up to TALLEST times the least; None where these are too few."""
+    """The paper's smooth curve through the errors up to MOST_ERROR times the least; None where there are too few."""
     at = np.array([(trial.setup.tissue.stiffness, trial.fit_mm) for trial in trials])
-    at = at[np.isfinite(at[:, 1]) & (at[:, 1] <= TALLEST * at[:, 1].min())]
+    at = at[np.isfinite(at[:, 1]) & (at[:, 1] <= MOST_ERROR * at[:, 1].min())]
     if len(np.unique(at[:, 0])) <= QUARTIC:
         return None
     polynomial = Polynomial.fit(at[:, 0], at[:, 1], QUARTIC)
@@ -240,12 +241,6 @@ def _setup_at(radius_mm: float, stiffness: float, relaxation_factor: float, iter
         relaxation_factor=float(relaxation_factor),
         iterations=round(iterations),
     )
-
-
-def _told(results: Iterable[Measured], done: Callable[[int], object]) -> Iterable[Measured]:
-    for result in results:
-        done(1)
-        yield result
 
 
 def _mean(errors: Sequence[np.ndarray], masks: Sequence[np.ndarray]) -> float:

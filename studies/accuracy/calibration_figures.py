@@ -1,4 +1,4 @@
-"""Pictures of a calibration: the paper's Figures 4 and 5, its tables, and how a search went."""
+"""Figures of a calibration: the paper's Figures 4 and 5, its tables as images, and the course of a search."""
 
 from pathlib import Path
 
@@ -9,16 +9,15 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
 from rehearsal.result_files import save_figure
-from studies.accuracy.calibration import TALLEST, Calibration, CalibrationTrial, quartic
+from studies.accuracy.calibration import MOST_ERROR, Calibration, CalibrationTrial, quartic
 from studies.accuracy.calibration_tables import Table
 
 DPI = 130
 
 
 def write_figure4(calibration: Calibration, path: Path) -> None:
-    """Mean error over the stiffness for each radius, fitted and held out; quartics with a ring where they are least."""
-    figure = Figure(figsize=(11, 4.6), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
+    """Mean error over the stiffness for each radius, fitted and held out; quartics with a ring at the minimum."""
+    figure, left, right = _two_panels(calibration)
     for colour, radius in zip(_colours(calibration), calibration.trials, strict=True):
         trials = sorted(calibration.trials[radius], key=lambda trial: trial.setup.tissue.stiffness)
         at = [trial.setup.tissue.stiffness for trial in trials]
@@ -29,15 +28,13 @@ def write_figure4(calibration: Calibration, path: Path) -> None:
             smooth = np.linspace(*fit.range, 200)
             left.plot(smooth, fit.polynomial(smooth), "-", color=colour, linewidth=1)
             left.plot(fit.stiffness, fit.error_mm, "o", color=colour, markersize=9, fillstyle="none")
-    right.axhline(calibration.null_mm(), color="0.4", linestyle="--", label="no motion at all")
-    _both(calibration, left, right, "stiffness α")
+    _finish(calibration, left, right, "stiffness α")
     save_figure(figure, path, dpi=DPI, bbox_inches="tight")
 
 
 def write_search(calibration: Calibration, path: Path) -> None:
     """Error of the best setup so far over the evaluations, fitted and held out."""
-    figure = Figure(figsize=(11, 4.6), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
+    figure, left, right = _two_panels(calibration)
     for colour, (radius, trials) in zip(_colours(calibration), calibration.trials.items(), strict=True):
         best = best_so_far(trials)
         left.plot([trial.fit_mm for trial in trials], ".", color=colour, alpha=0.35, markersize=4)
@@ -45,13 +42,12 @@ def write_search(calibration: Calibration, path: Path) -> None:
             [trial.fit_mm for trial in best], color=colour, drawstyle="steps-post", label=f"{radius:g} mm"
         )
         right.plot([trial.held_out_mm for trial in best], color=colour, drawstyle="steps-post")
-    right.axhline(calibration.null_mm(), color="0.4", linestyle="--", label="no motion at all")
-    _both(calibration, left, right, "setups tried")
+    _finish(calibration, left, right, "setups tried")
     save_figure(figure, path, dpi=DPI, bbox_inches="tight")
 
 
 def best_so_far(trials: list[CalibrationTrial]) -> list[CalibrationTrial]:
-    """After each trial, the one that fits best until then."""
+    """The best trial so far, after each trial."""
     best: list[CalibrationTrial] = []
     for trial in trials:
         best.append(trial if not best or trial.fit_mm < best[-1].fit_mm else best[-1])
@@ -75,7 +71,7 @@ def write_figure5(calibration: Calibration, path: Path) -> None:
 
 
 def write_table(table: Table, path: Path) -> None:
-    """A table as a picture."""
+    """A table as an image."""
     cells = table.cells()
     wide = [max(len(line[column]) for line in cells) + 3 for column in range(len(cells[0]))]
     figure = Figure(figsize=(0.085 * sum(wide) + 0.4, 0.26 * (len(cells) + 1.5)))
@@ -93,19 +89,28 @@ def write_table(table: Table, path: Path) -> None:
     save_figure(figure, path, dpi=DPI, bbox_inches="tight")
 
 
-def _both(calibration: Calibration, left: Axes, right: Axes, across: str) -> None:
-    split = calibration.split
-    left.set(title=f"Fit: {split.fitted_name}", xlabel=across, ylabel="mean bead error (mm)")
-    right.set(title=f"Held out: {split.held_out_name}", xlabel=across)
+def _two_panels(calibration: Calibration) -> tuple[Figure, Axes, Axes]:
+    """A figure with a panel of errors on the fitted data and one on the held-out data."""
+    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    left.set(title=f"Fit: {calibration.split.fitted_name}", ylabel="mean bead error (mm)")
+    right.set(title=f"Held out: {calibration.split.held_out_name}")
+    right.axhline(calibration.null_mm(), color="0.4", linestyle="--", label="no motion")
+    return figure, left, right
+
+
+def _finish(calibration: Calibration, left: Axes, right: Axes, x_label: str) -> None:
+    """Limits, legends and grids of both panels, once their curves are drawn."""
     least = min(calibration.best(radius).fit_mm for radius in calibration.trials)
     errors = [
         error for trials in calibration.trials.values() for t in trials for error in (t.fit_mm, t.held_out_mm)
     ]
     most = max(filter(np.isfinite, errors), default=1.0)
-    left.set_ylim(0, min(1.05 * most, TALLEST * max(least, calibration.null_mm())))
+    left.set_ylim(0, min(1.05 * most, MOST_ERROR * max(least, calibration.null_mm())))
     left.legend(title="particle radius")
     right.legend()
     for axes in (left, right):
+        axes.set_xlabel(x_label)
         axes.grid(alpha=0.3)
 
 

@@ -1,23 +1,23 @@
-"""What a calibration found, as the paper's Tables 2 to 5: text for the terminal, CSV, and JSON with all trials."""
+"""Results of a calibration as the paper's Tables 2 to 5: text, CSV, and JSON with all trials."""
 
-import csv
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from rehearsal.result_files import rounded, spread, write_json
-from scenes.atomic_files import whole
+from rehearsal.result_files import rounded, spread, write_csv, write_json
 from studies.accuracy.calibration import Calibration, CalibrationTrial, quartic
+from studies.study_results import text_table
 
 FIT, HELD_OUT = "fit", "held out"
+SUMMARY_HEADERS = ("radius, mm", "stiffness", "relaxation", "iterations", "fit, mm", "held out, mm")
 Row = list[float | None]
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of names and one figure a radius; ``shares``, where given, are these as % of the probe's travel."""
+    """Rows of names and one figure a radius; ``shares``, where given, are the figures as % of the probe's travel."""
 
     name: str
     title: str
@@ -36,26 +36,18 @@ class Table:
         return lines
 
     def text(self) -> str:
-        """Aligned columns under the title."""
-        cells = self.cells()
-        widths = [max(len(line[column]) for line in cells) for column in range(len(cells[0]))]
-        lines = [
-            "  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)) for line in cells
-        ]
-        return "\n".join([self.title, *(line.rstrip() for line in lines)])
+        """Title and aligned columns."""
+        head, *rows = self.cells()
+        return f"{self.title}\n{text_table(head, rows)}"
 
     def write_csv(self, folder: Path) -> None:
-        """``name``.csv: numbers alone in the columns of the radii, the shares in columns of their own."""
+        """``name``.csv: a column of numbers a radius, and of its shares."""
         columns = self.head + [f"{radius:g} mm" for radius in self.radii_mm]
         rows: list[list] = [names + figures for names, figures in zip(self.names, self.figures, strict=True)]
         if self.shares:
             columns += [f"{radius:g} mm, % of travel" for radius in self.radii_mm]
             rows = [row + shares for row, shares in zip(rows, self.shares, strict=True)]
-        with (
-            whole(folder / f"{self.name}.csv") as partial,
-            partial.open("w", newline="", encoding="utf-8") as file,
-        ):
-            csv.writer(file).writerows([columns, *rows])
+        write_csv([dict(zip(columns, row, strict=True)) for row in rows], folder / f"{self.name}.csv")
 
 
 def tables_of(calibration: Calibration) -> list[Table]:
@@ -94,22 +86,25 @@ def _bead_table(
 
 
 def summary_of(calibration: Calibration) -> str:
-    """For each radius what fitted best and what it is worth on what was held out."""
-    split = calibration.split
-    head = f"{'radius':8}{'stiffness':11}{'relaxation':12}{'iterations':12}{'fit':>9}{'held out':>13}"
-    lines = [f"Fitted on {split.fitted_name}; held out: {split.held_out_name}.", head]
+    """The best settings of each radius, and their errors on the fitted and the held-out data."""
+    rows = []
     for radius in calibration.trials:
         best = calibration.best(radius)
-        lines.append(
-            f"{f'{radius:g} mm':8}{best.setup.tissue.stiffness:<11.3f}{best.setup.relaxation_factor:<12.2f}"
-            f"{best.setup.iterations:<12}{best.fit_mm:>6.2f} mm{best.held_out_mm:>10.2f} mm"
-        )
-    lines.append(f"Held out, beads left where stage 0 has them: {calibration.null_mm():.2f} mm.")
-    return "\n".join([*lines, "The fit is no accuracy: what was not fitted on is the column held out."])
+        setup = best.setup
+        settings = (setup.tissue.stiffness, setup.relaxation_factor, setup.iterations)
+        rows.append([radius, *settings, best.fit_mm, best.held_out_mm])
+    split = calibration.split
+    lines = [
+        f"Fitted on {split.fitted_name}; held out: {split.held_out_name}.",
+        text_table(SUMMARY_HEADERS, rows, ("g", ".3f", ".2f", "g", ".2f", ".2f")),
+        f"Held out, no motion after stage 0: {calibration.null_mm():.2f} mm.",
+        "The column fit is no measure of accuracy; the column held out is, on data that was not fitted.",
+    ]
+    return "\n".join(lines)
 
 
 def write_calibration(calibration: Calibration, tables: list[Table], path: Path) -> None:
-    """Everything in one file: the split, every trial, the fits and the tables."""
+    """Write the split, all trials, the fits and the tables. Raises OSError."""
     split = calibration.split
     found = dict(
         cases=[case.name for case in calibration.cases],
@@ -152,7 +147,7 @@ def _trial(trial: CalibrationTrial) -> dict:
 
 
 def _rows(calibration: Calibration) -> Iterator[tuple[int, int, str, np.ndarray]]:
-    """Case, stage, what its beads (n,) were used for and which of them were."""
+    """Case, stage, the part of the data, and the mask (n,) of its beads."""
     for place, fitted in enumerate(calibration.split.fitted):
         for stage, mask in enumerate(fitted):
             for part, used in ((FIT, mask), (HELD_OUT, ~mask)):
@@ -161,7 +156,7 @@ def _rows(calibration: Calibration) -> Iterator[tuple[int, int, str, np.ndarray]
 
 
 def _times(calibration: Calibration, best: list[CalibrationTrial]) -> Table:
-    """Table 5; where several evaluations run at once, a time is that of one CPU thread among others."""
+    """Table 5; several evaluations may run at once, each on one CPU thread."""
     spreads = [spread([ms for measured in trial.measured for ms in measured.step_ms]) for trial in best]
     rows = {"mean": "mean", "standard deviation": "sd", "minimum": "min", "maximum": "max"}
     title = "Table 5: time of a step in the calibration, on one CPU thread (ms)"

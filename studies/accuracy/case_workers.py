@@ -1,6 +1,6 @@
-"""Evaluations of cases in parallel processes, here or on a Dask cluster; the figures do not depend on how many.
+"""Evaluations of cases in parallel processes, local or on a Dask cluster; the results do not depend on their number.
 
-A process computes on one CPU thread, so that several do not fight for the same ones, and keeps what it has built.
+Each process computes on one CPU thread and keeps the experiments that it has built.
 """
 
 import threading
@@ -12,6 +12,7 @@ import numpy as np
 from joblib import Parallel, delayed, parallel_config
 
 import sim.device
+from errors import UserError
 from rehearsal.configuration import Setup
 from rehearsal.worker_processes import processes
 from sim.sampling import RestBody
@@ -19,7 +20,7 @@ from studies.accuracy.bead_case import BeadCase
 from studies.accuracy.bead_errors import bead_errors
 from studies.accuracy.bead_experiment import BeadExperiment, rest_body
 
-# Taichi frees fields only when it starts anew, and does not bear hundreds of them.
+# Taichi frees fields only when it is started anew, and fails with hundreds of them.
 MOST_BUILT = 4
 CONNECT_S = 10
 
@@ -29,13 +30,13 @@ _filled: dict[tuple[str, float], RestBody] = {}
 _turn = threading.Lock()
 
 
-class WorkerError(RuntimeError):
-    """Workers that cannot be had; the message is one line."""
+class WorkerError(UserError):
+    """Workers that are not available; the message is one line."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What an evaluation of a case came to: bead errors (stages, n) [mm], times of the steps [ms], the model's size."""
+    """Result of an evaluation: bead errors (stages, n) [mm], times of the steps [ms], size of the model."""
 
     errors: np.ndarray
     step_ms: list[float]
@@ -70,14 +71,14 @@ def _build(key: tuple[str, float], case: BeadCase, setup: Setup) -> None:
 
 @contextmanager
 def local_workers(jobs: int | None = None) -> Iterator[Map]:
-    """Processes on this machine, as many as it has processors where ``jobs`` is None."""
+    """``jobs`` processes on this machine, or one a processor."""
     with processes(jobs):
         yield _map
 
 
 @contextmanager
 def dask_workers(address: str) -> Iterator[Map]:
-    """The workers of a running Dask cluster, which have this project in their PYTHONPATH. Raises WorkerError."""
+    """The workers of a running Dask cluster, with this project in their PYTHONPATH. Raises WorkerError."""
     try:
         from distributed import Client
     except ImportError:
@@ -93,7 +94,7 @@ def dask_workers(address: str) -> Iterator[Map]:
     with client:
         try:
             found = client.run(_ready)
-        except Exception as error:  # what fails on a worker comes back as anything
+        except Exception as error:  # any exception of a worker
             raise WorkerError(
                 f"--dask {address}: a worker is not ready ({error}); start workers with this project's requirements "
                 f"installed and its folder in PYTHONPATH"
@@ -107,7 +108,7 @@ def dask_workers(address: str) -> Iterator[Map]:
 
 
 def _ready() -> bool:
-    """Found by a worker which has the project's modules."""
+    """Importable by a worker that has the project's modules."""
     return True
 
 
@@ -120,7 +121,7 @@ def _map(pairs: Sequence[tuple[BeadCase, Setup]]) -> Iterator[Measured]:
 
 
 def _attempt(case: BeadCase, setup: Setup) -> Measured | Exception:
-    # joblib waits for ever for a task that raises on Dask.
+    # joblib would wait forever for a task that raises on Dask.
     try:
         return evaluate(case, setup)
     except Exception as error:

@@ -9,20 +9,16 @@ import numpy as np
 import trimesh
 from tqdm import tqdm
 
-from rehearsal.commands.command_line import (
-    CommandError,
-    NumberRange,
-    make_folder,
-    make_place,
-    save_figures,
-    start_taichi,
-)
-from studies.beam.beam_comparison import Row, check, compare, draw, table
-from studies.beam.motion_capture import BeamError, Capture, load_captures
+from rehearsal.commands.command_line import make_folder, make_place, save_figures, start_taichi
+from rehearsal.result_files import save_figure
+from studies.beam.beam_comparison import check, compare, figure_of, table
+from studies.beam.motion_capture import BeamError, load_captures
+from studies.study_options import number_option
 
 BEAM = "beam.stl"
-# Tip markers are balls that stand so far off the surface at the free end: on top, on one side, on the other, at these
-# shares of height and width (where the recordings' authors place them in their own simulation).
+DPI = 110
+# Tip markers are balls at this distance from the surface at the free end: on top, on one side, on the other, at these
+# shares of height and width (as in the simulation of the recordings' authors).
 STAND_OFF_MM = 6.0
 MARKERS = np.array([[1.0, 0.5], [0.8, 1.0], [0.2, 0.0]])
 OUTWARD = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
@@ -30,40 +26,15 @@ OUTWARD = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 @click.command()
 @click.argument("folder", type=click.Path(path_type=Path))
-@click.option(
-    "--cell",
-    "cell_mm",
-    type=NumberRange(1, 30),
-    default=10.0,
-    show_default=True,
-    help="Width of a cell in mm.",
-)
-@click.option(
-    "--young-kpa",
-    type=NumberRange(0, 1e6, min_open=True),
-    default=263.8,
-    show_default=True,
-    help="Young's modulus in kPa.",
-)
-@click.option(
-    "--poisson",
-    type=NumberRange(0, 0.5, max_open=True),
-    default=0.499,
-    show_default=True,
-    help="Poisson's ratio.",
-)
-@click.option(
-    "--density",
-    type=NumberRange(0, 30, min_open=True),
-    default=1.07,
-    show_default=True,
-    help="Density in g/cm^3.",
-)
+@number_option("--cell", "cell_mm", low=1, high=30, default=10.0, help="Width of a cell in mm.")
+@number_option("--young-kpa", low=0, high=1e6, min_open=True, default=263.8, help="Young's modulus in kPa.")
+@number_option("--poisson", low=0, high=0.5, max_open=True, default=0.499, help="Poisson's ratio.")
+@number_option("--density", low=0, high=30, min_open=True, default=1.07, help="Density in g/cm^3.")
 @click.option(
     "--check",
     "checked",
     is_flag=True,
-    help="Also show what time step, passes, cells and Poisson's ratio change.",
+    help="Also a convergence study of time step, iterations, cells and Poisson's ratio.",
 )
 @click.option("--json", "json_path", type=click.Path(path_type=Path), help="File for the results.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the figure, beam.png.")
@@ -79,32 +50,23 @@ def beam(
 ) -> None:
     """Compare with the silicone beam of FOLDER (motion capture).
 
-    The beam (beam.stl) is clamped and loaded; compared are where its tip comes to rest and its first frequency.
+    The beam (beam.stl) is clamped and loaded; compared are the rest position of its tip and its first frequency.
     """
-    try:
-        run(folder, (cell_mm, young_kpa, poisson, density), checked, json_path, out)
-    except BeamError as error:
-        raise CommandError(str(error)) from None
-
-
-def run(
-    folder: Path,
-    options: tuple[float, float, float, float],
-    checked: bool,
-    json_path: Path | None,
-    out: Path | None,
-) -> None:
-    """Read, compute, print, write. Raises BeamError and CommandError."""
-    cell_mm, *values = options
     captures = load_captures(folder)
     size = beam_size(folder)
     if out is not None:
         make_folder(out)
     make_place(json_path)
     start_taichi("cpu")
-    from studies.beam.cantilever import PASSES, REST_RELAXATION, REST_TOLERANCE_MM, BeamMaterial, Cantilever
+    from studies.beam.cantilever import (
+        ITERATIONS,
+        REST_RELAXATION,
+        REST_TOLERANCE_MM,
+        BeamMaterial,
+        Cantilever,
+    )
 
-    material = BeamMaterial(*values)
+    material = BeamMaterial(young_kpa, poisson, density)
     groups = [list(group) for _, group in groupby(captures, key=lambda capture: capture.load_g)]
 
     def build(
@@ -119,7 +81,7 @@ def run(
         **asdict(material),
         cell_mm=cell_mm,
         time_step_s=frame_s / build(cell_mm, 0.0).substeps(frame_s),
-        passes=PASSES,
+        passes=ITERATIONS,
         damping=0.0,
         rest_cell_mm=cell_mm / 2,
         rest_relaxation_factor=REST_RELAXATION,
@@ -130,7 +92,7 @@ def run(
     for row in rows:
         if row.rest_left_mm > REST_TOLERANCE_MM:
             click.echo(
-                f"{row.load_g:.0f} g: not quite at rest, it moved {row.rest_left_mm:.3f} mm in the last passes"
+                f"{row.load_g:.0f} g: not quite at rest, it moved {row.rest_left_mm:.3f} mm in the last iterations"
             )
     if checked:
         for first_or_last in sorted({0, len(rows) - 1}):
@@ -138,20 +100,12 @@ def run(
     if json_path is not None:
         save_figures(dict(settings=settings, loads=[asdict(row) for row in rows]), json_path)
     if out is not None:
-        save_picture(groups, traces, rows, out)
-
-
-def save_picture(groups: list[list[Capture]], traces: list[np.ndarray], rows: list[Row], out: Path) -> None:
-    """Draw beam.png into a folder and say so. Raises CommandError."""
-    try:
-        draw(groups, traces, rows, out / "beam.png")
-    except OSError as error:
-        raise CommandError(f"{out}: cannot be written to ({error.strerror}); choose another --out") from None
-    click.echo(f"Wrote {out / 'beam.png'}")
+        save_figure(figure_of(groups, traces, rows), out / "beam.png", dpi=DPI)
+        click.echo(f"Wrote {out / 'beam.png'}")
 
 
 def markers_on(size_mm: np.ndarray) -> np.ndarray:
-    """Tip markers (3, 3) [mm] in the frame of beam.stl, of a beam of height, width and length (3,)."""
+    """Tip markers (3, 3) [mm] in the frame of beam.stl, for a beam of height, width and length (3,)."""
     across = MARKERS * size_mm[:2] + STAND_OFF_MM * OUTWARD
     return np.column_stack([across, np.full(len(across), size_mm[2])])
 
@@ -161,7 +115,7 @@ def beam_size(folder: Path) -> np.ndarray:
     path = folder / BEAM
     try:
         size = np.ptp(trimesh.load_mesh(path).bounds, axis=0)
-    except Exception as error:  # what is no STL fails in many ways
+    except Exception as error:  # an invalid STL raises many types
         raise BeamError(f"{path}: cannot be read as a surface ({error})") from None
     if size.argmax() != 2:
         raise BeamError(f"{path}: the beam's length must be along z")

@@ -1,33 +1,46 @@
-"""A clamped beam as measured, as beam theory has it and as the tissue model computes it: rows, table, figure."""
+"""A clamped beam measured, from beam theory and computed by the tissue model: rows, table, figure."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.figure import Figure
 from scipy.optimize import brentq
 
-from rehearsal.result_files import save_figure
 from studies.beam.motion_capture import BeamError, Capture, Oscillation, oscillation
+from studies.study_results import text_table
 
 if TYPE_CHECKING:
     from studies.beam.cantilever import BeamMaterial, Cantilever
 
 FRAME_S = 0.01
-# Swings that are computed, in periods that beam theory expects.
+# Computed duration, in periods of beam theory.
 PERIODS = 5.0
-# The computed beam is looked at as often as the recorded one, or more often where it swings so fast.
+# The computed beam is sampled as often as the recorded one, or at least this often in a period.
 FRAMES_A_PERIOD = 10
 GRAVITY_M_S2 = 9.81
+HEADERS = (
+    "load, g",
+    "tip, measured, mm",
+    "computed",
+    "off, %",
+    "theory",
+    "first frequency, measured, Hz",
+    "computed",
+    "off, %",
+    "theory",
+    "damping ratio",
+)
+FORMATS = (".0f", "", ".2f", "+.1f", ".2f", "", ".3f", "+.1f", ".3f", ".3f")
 
 
 @dataclass(frozen=True)
 class Row:
     """Measured and computed for one load: length of the tip's final displacement [mm], first frequency [Hz].
 
-    Errors of what is measured cover its repeats; ``rest_left_mm`` is what the computed rest still moved when its
-    passes were doubled.
+    Measurement errors cover the repeats; ``rest_left_mm`` is the change of the computed rest position when its
+    iterations were doubled.
     """
 
     load_g: float
@@ -48,8 +61,7 @@ class Row:
 def theory(size_mm: np.ndarray, material: "BeamMaterial", load_g: float) -> tuple[float, float]:
     """Sag [mm] of a Timoshenko cantilever, frequency [Hz] of an Euler-Bernoulli one with a mass at its tip.
 
-    Small deflections, a clamped end that is free to change its width, and for the frequency no shear and no turning
-    mass.
+    Small deflections, a clamped end that is free to change its width; the frequency is without shear and rotary inertia.
     """
     height, width, length = 1e-3 * np.asarray(size_mm, float)
     young = 1e3 * material.young_kpa
@@ -74,7 +86,7 @@ def compare(
 ) -> tuple[Row, np.ndarray]:
     """One load's row, and time [s] and computed height [mm] of the markers after the release, shape (2, frames).
 
-    ``build`` makes a beam of a cell width and a load; the rest is found on cells of half the width.
+    ``build`` makes a beam from a cell width and a load; the rest position is computed on cells of half the width.
     """
     load_g = captures[0].load_g
     beam = build(cell_mm=cell_mm, load_g=load_g)
@@ -105,10 +117,10 @@ def compare(
 
 
 def released(
-    beam: "Cantilever", frames: int, frame_s: float, finer: int = 1, passes: int | None = None
+    beam: "Cantilever", frames: int, frame_s: float, finer: int = 1, iterations: int | None = None
 ) -> np.ndarray:
     """Time [s] and mean height [mm] of the markers after a release, shape (2, frames + 1)."""
-    height = beam.swing(frames, frame_s, finer * beam.substeps(frame_s), passes)[:, :, 0].mean(axis=1)
+    height = beam.swing(frames, frame_s, finer * beam.substeps(frame_s), iterations)[:, :, 0].mean(axis=1)
     return np.array([frame_s * np.arange(frames + 1), height])
 
 
@@ -121,7 +133,7 @@ def computed_oscillation(beam: "Cantilever", trace: np.ndarray) -> Oscillation:
 
 
 def mean_length(displacement_mm: np.ndarray) -> float:
-    """Mean length [mm] of the markers' displacements (n, 3): it asks for no frame common to capture and beam."""
+    """Mean length [mm] of the markers' displacements (n, 3); independent of the frames of capture and beam."""
     return float(np.linalg.norm(displacement_mm, axis=1).mean())
 
 
@@ -135,37 +147,35 @@ def measured_oscillation(capture: Capture) -> Oscillation:
 
 
 def table(rows: list[Row]) -> str:
-    """The rows as text."""
+    """Final displacement of the tip, first frequency and damping ratio of each load."""
     lines = [
-        "            tip's final displacement, mm                  first frequency, Hz                     damping ratio",
-        "load, g   measured      computed   off    theory    measured       computed   off    theory   measured",
+        [
+            row.load_g,
+            f"{row.measured_mm:.2f} ± {row.measured_error_mm:.2f}",
+            row.computed_mm,
+            100 * (row.computed_mm / row.measured_mm - 1),
+            row.theory_mm,
+            f"{row.measured_hz:.3f} ± {row.measured_error_hz:.3f}",
+            row.computed_hz,
+            100 * (row.computed_hz / row.measured_hz - 1),
+            row.theory_hz,
+            row.measured_damping_ratio,
+        ]
+        for row in rows
     ]
-    for row in rows:
-        lines.append(
-            f"{row.load_g:7.0f}   {row.measured_mm:5.2f} ± {row.measured_error_mm:4.2f}"
-            f"   {row.computed_mm:8.2f} {percent(row.computed_mm, row.measured_mm)}  {row.theory_mm:8.2f}"
-            f"    {row.measured_hz:5.3f} ± {row.measured_error_hz:5.3f}"
-            f"  {row.computed_hz:8.3f} {percent(row.computed_hz, row.measured_hz)} {row.theory_hz:8.3f}"
-            f"   {row.measured_damping_ratio:8.3f}"
-        )
-    return "\n".join(lines)
-
-
-def percent(value: float, reference: float) -> str:
-    """How far a value is off a reference."""
-    return f"{100 * (value / reference - 1):+6.1f}%"
+    return text_table(HEADERS, lines, FORMATS)
 
 
 def check(build: Callable[..., "Cantilever"], cell_mm: float, load_g: float, trace: np.ndarray) -> str:
-    """How much the frequency changes with time step and passes; it and the rest with cells, material and load's place.
+    """Convergence study: frequency against time step and iterations; frequency and rest against cells, material and load.
 
     Args:
-        build: makes a beam of a cell width, a load, a material and a height at which the load hangs.
-        cell_mm: of the motion; the rests are on cells as wide, so that lines compare.
+        build: makes a beam from a cell width, a load, a material and the height at which the load hangs.
+        cell_mm: cell width of motion and rest.
         load_g: at the tip.
         trace: of ``compare``, shape (2, frames).
     """
-    from studies.beam.cantilever import PASSES
+    from studies.beam.cantilever import ITERATIONS
 
     frames, frame_s = trace.shape[1] - 1, float(trace[0, 1])
 
@@ -178,10 +188,15 @@ def check(build: Callable[..., "Cantilever"], cell_mm: float, load_g: float, tra
 
     beam = build(cell_mm=cell_mm, load_g=load_g)
     lines = [
-        f"What the settings change, {load_g:.0f} g, cells of {cell_mm:g} mm:",
+        f"Convergence study, {load_g:.0f} g, cells of {cell_mm:g} mm:",
         line("as above", beam, trace),
         line("half the time step", beam, released(beam, frames, frame_s, finer=2), rest=False),
-        line("twice the passes", beam, released(beam, frames, frame_s, passes=2 * PASSES), rest=False),
+        line(
+            "twice the iterations",
+            beam,
+            released(beam, frames, frame_s, iterations=2 * ITERATIONS),
+            rest=False,
+        ),
     ]
     for poisson in (0.45, 0.49):
         material = replace(beam.material, poisson=poisson)
@@ -194,28 +209,21 @@ def check(build: Callable[..., "Cantilever"], cell_mm: float, load_g: float, tra
     return "\n".join(lines)
 
 
-def draw(groups: list[list[Capture]], traces: list[np.ndarray], rows: list[Row], path: Path) -> None:
-    """Tip height against time, measured and computed, a panel a load. Raises OSError."""
-    from matplotlib.figure import Figure
-
+def figure_of(groups: list[list[Capture]], traces: list[np.ndarray], rows: list[Row]) -> Figure:
+    """Tip height over time, measured and computed, a panel a load."""
     figure = Figure(figsize=(11, 3.2 * len(rows)), layout="constrained")
-    axes = figure.subplots(len(rows), squeeze=False)[:, 0]
-    for axis, captures, trace, row in zip(axes, groups, traces, rows, strict=True):
+    panels = figure.subplots(len(rows), squeeze=False)[:, 0]
+    for axes, captures, trace, row in zip(panels, groups, traces, rows, strict=True):
         for capture in captures:
             first = capture.release()
-            axis.plot(
-                capture.time_s[first:] - capture.time_s[first],
-                capture.height_mm()[first:],
-                label=capture.name,
-            )
-        axis.plot(*trace, "k--", lw=1, label="computed, undamped")
-        axis.set_xlim(0, 1.2 * trace[0, -1])
-        axis.set_ylabel("tip height, mm")
-        axis.set_title(
-            f"{row.load_g:.0f} g at the tip: measured {row.measured_hz:.2f} Hz, computed {row.computed_hz:.2f} Hz",
-            loc="left",
-        )
-        axis.grid(alpha=0.3)
-        axis.legend(loc="upper right", fontsize=8)
-    axes[-1].set_xlabel("time since the release, s")
-    save_figure(figure, path, dpi=110)
+            time_s = capture.time_s[first:] - capture.time_s[first]
+            axes.plot(time_s, capture.height_mm()[first:], label=capture.name)
+        axes.plot(*trace, "k--", lw=1, label="computed, undamped")
+        axes.set_xlim(0, 1.2 * trace[0, -1])
+        axes.set_ylabel("tip height, mm")
+        measured, computed = f"measured {row.measured_hz:.2f} Hz", f"computed {row.computed_hz:.2f} Hz"
+        axes.set_title(f"{row.load_g:.0f} g at the tip: {measured}, {computed}", loc="left")
+        axes.grid(alpha=0.3)
+        axes.legend(loc="upper right", fontsize=8)
+    panels[-1].set_xlabel("time since the release, s")
+    return figure

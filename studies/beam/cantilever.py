@@ -1,4 +1,4 @@
-"""A clamped beam on the lattice of the tissue model: what it comes to rest at, and how it swings."""
+"""A clamped beam in the lattice tissue model: its rest position and its oscillation."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,22 +14,22 @@ from sim.solver import Solver, StepSettings
 from studies.beam.motion_capture import BeamError
 
 GRAVITY_MM_S2 = 9810.0
-# A pressure wave goes through so many cells in a time step; with more, passes in the tens leave it unbalanced and
-# energy is made of nothing. The nearer Poisson's ratio is to 0.5, the shorter such a step; at 0.499 on 10 mm cells it is
-# 0.05 ms, and rounding in float32 takes 0.3% off the frequency (0.8% with half that step).
+# Cells that a pressure wave crosses in a time step. With more, some ten iterations do not balance it and the energy
+# grows. At Poisson's ratio 0.499 on 10 mm cells such a step is 0.05 ms, and rounding in float32 lowers the frequency
+# by 0.3% (0.8% with half that step).
 CELLS_A_STEP = 1.0
-PASSES = 20
-# At rest: passes of one step without inertia, doubled until the tip moves less than this from one to the next.
-REST_PASSES = 4000
+ITERATIONS = 20
+# At rest: iterations of one step without inertia, doubled until the tip moves less than REST_TOLERANCE_MM.
+REST_ITERATIONS = 4000
 REST_RELAXATION = 1.9
 REST_TOLERANCE_MM = 0.005
-MOST_REST_PASSES = 256_000
+MOST_REST_ITERATIONS = 256_000
 # The beam may differ from a whole number of cells by this.
 WHOLE_MM = 0.01
-# Where Poisson's ratio is higher, the rest position at this one is where the search starts, with so many passes: the
-# tip moves slowly at first.
+# With a higher Poisson's ratio the search starts from the rest position at this one, with HARD_ITERATIONS: the tip
+# moves slowly at first.
 EASY_POISSON = 0.49
-HARD_PASSES = 16_000
+HARD_ITERATIONS = 16_000
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class BeamMaterial:
 
 @dataclass(frozen=True)
 class Rest:
-    """Marker displacements (n, 3) [mm] at rest, how far the tip still moved in the last half of the passes [mm]."""
+    """Marker displacements (n, 3) [mm] at rest, and their change [mm] in the last half of the iterations."""
 
     displacement_mm: np.ndarray
     left_mm: float
-    passes: int
+    iterations: int
 
 
 class Cantilever:
@@ -97,59 +97,59 @@ class Cantilever:
         self.solver = Solver(self.model)
 
     def displacement(self) -> np.ndarray:
-        """Of the markers (n, 3) [mm], now. Raises BeamError where the computation failed."""
+        """Displacements of the markers (n, 3) [mm]. Raises BeamError where the computation failed."""
         moved = array_of(self.body.position).astype(float) - self.body.rest_points
         if not np.isfinite(moved).all():
-            raise BeamError("the computed beam flies apart; choose a lower --poisson or a higher --young-kpa")
+            raise BeamError("the computed beam diverges; choose a lower --poisson or a higher --young-kpa")
         feet = np.einsum("nk,nkd->nd", self.weight, moved[self.frame])
         rest = self.body.rest_points[self.end]
         now = rest + moved[self.end]
-        turn = Rotation.align_vectors(now - now.mean(axis=0), rest - rest.mean(axis=0))[0]
+        rotation = Rotation.align_vectors(now - now.mean(axis=0), rest - rest.mean(axis=0))[0]
         arm = self.markers - self.feet
-        return feet + turn.apply(arm) - arm
+        return feet + rotation.apply(arm) - arm
 
     def settings(self, **changes: Any) -> StepSettings:
-        """Gravity, no damping, and what else is given."""
+        """Settings with gravity and no damping, and the given changes."""
         gravity = (-GRAVITY_MM_S2, 0.0, 0.0)
         return StepSettings(stabilisation_iterations=0, damping=0.0, gravity=gravity, **changes)
 
     def rest(self) -> Rest:
-        """Where it comes to rest, from straight."""
+        """Rest position, found from the straight beam."""
         self.body.restore(self.body.rest_state())
         if self.material.poisson > EASY_POISSON:
             self.model.set_material(self.material.young_kpa, EASY_POISSON)
-            self._settle(REST_PASSES)
+            self._settle(REST_ITERATIONS)
             self.model.set_material(self.material.young_kpa, self.material.poisson)
-            return self._settle(HARD_PASSES)
-        return self._settle(REST_PASSES)
+            return self._settle(HARD_ITERATIONS)
+        return self._settle(REST_ITERATIONS)
 
-    def _settle(self, passes: int) -> Rest:
-        """Steps too long for inertia to matter, over-relaxed, each of as many passes as all before it."""
+    def _settle(self, iterations: int) -> Rest:
+        """Over-relaxed steps of 1 s, in which inertia is negligible, each with as many iterations as all before it."""
         total, left = 0, np.inf
         before = self.displacement()
-        while left > REST_TOLERANCE_MM and total < MOST_REST_PASSES:
+        while left > REST_TOLERANCE_MM and total < MOST_REST_ITERATIONS:
             step = self.settings(
-                time_step_s=1.0, substeps=1, iterations=passes, relaxation_factor=REST_RELAXATION
+                time_step_s=1.0, substeps=1, iterations=iterations, relaxation_factor=REST_RELAXATION
             )
             self.solver.step(step)
             now = self.displacement()
             left = float(np.abs(now - before).max())
-            before, total, passes = now, total + passes, total + passes
+            before, total, iterations = now, total + iterations, total + iterations
         return Rest(before, left, total)
 
     def substeps(self, frame_s: float) -> int:
-        """Time steps in a frame, so that a pressure wave passes CELLS_A_STEP cells in one."""
+        """Time steps in a frame, so that a pressure wave crosses CELLS_A_STEP cells in one."""
         return int(np.ceil(frame_s * self.material.pressure_wave_mm_s() / (CELLS_A_STEP * self.cell_mm)))
 
     def swing(
-        self, frames: int, frame_s: float, substeps: int | None = None, passes: int | None = None
+        self, frames: int, frame_s: float, substeps: int | None = None, iterations: int | None = None
     ) -> np.ndarray:
         """Marker displacements (frames + 1, n, 3) [mm] after a release from straight, the first at the release."""
         self.body.restore(self.body.rest_state())
         step = self.settings(
             time_step_s=frame_s,
             substeps=substeps or self.substeps(frame_s),
-            iterations=passes or PASSES,
+            iterations=iterations or ITERATIONS,
             relaxation_factor=1.0,
         )
         traces = [self.displacement()]

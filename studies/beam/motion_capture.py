@@ -1,6 +1,5 @@
-"""Motion capture of a clamped beam: its recordings read, and what is measured in them (NumPy, SciPy)."""
+"""Motion capture of a clamped beam: recordings, deflection, frequency and damping."""
 
-import csv
 import re
 import warnings
 from dataclasses import dataclass
@@ -10,24 +9,27 @@ import numpy as np
 from scipy.optimize import OptimizeWarning, curve_fit
 from scipy.signal import find_peaks
 
+from errors import UserError
+from studies.number_table import read_numbers
+
 COLUMNS = (
     "t_s",
     *(f"tip{k}_{axis}_m" for k in (1, 2, 3) for axis in "xyz"),
 )
-# Of the capture's axes x points up: that is how the tip falls. A tip that has fallen so far was let go.
+# The capture's x axis points up. A tip that has fallen by this distance was released.
 UP = 0
 FALLEN_MM = 0.5
-# Means over so many frames stand for "before the release" and "at rest".
+# Frames averaged before the release and at rest.
 HELD_FRAMES = 10
 REST_FRAMES = 50
-# The frequency is taken in windows of so many periods, one period apart; a swing is not noise from this share on.
+# The frequency is fitted in windows of WINDOW_PERIODS, one period apart; LEAST_SWING separates peaks from noise.
 WINDOW_PERIODS = 2.0
 WINDOWS = 3
 LEAST_SWING = 0.1
 
 
-class BeamError(ValueError):
-    """What is wrong with the recordings or the beam, in one line."""
+class BeamError(UserError):
+    """A fault of the recordings or the beam; the message is one line."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Capture:
     tips_mm: np.ndarray
 
     def height_mm(self) -> np.ndarray:
-        """Mean height (n,) of the tip markers above where they are held."""
+        """Mean height (n,) [mm] of the tip markers above their position before the release."""
         height = self.tips_mm[:, :, UP].mean(axis=1)
         return height - height[:HELD_FRAMES].mean()
 
@@ -49,7 +51,7 @@ class Capture:
         return int(np.argmax(self.height_mm() < -FALLEN_MM)) - 1
 
     def final_mm(self) -> np.ndarray:
-        """Displacement (3, 3) of the tip markers from held to at rest."""
+        """Displacement (3, 3) [mm] of the tip markers from before the release to rest."""
         return self.tips_mm[-REST_FRAMES:].mean(axis=0) - self.tips_mm[:HELD_FRAMES].mean(axis=0)
 
 
@@ -63,7 +65,7 @@ class Oscillation:
 
 
 def load_captures(folder: Path) -> list[Capture]:
-    """All recordings of a folder, the lightest load first. Raises BeamError."""
+    """All recordings of a folder, lightest load first. Raises BeamError."""
     paths = sorted(Path(folder).glob("*.csv"))
     if not paths:
         raise BeamError(f"{folder}: holds no recordings (*.csv)")
@@ -71,18 +73,15 @@ def load_captures(folder: Path) -> list[Capture]:
 
 
 def read_capture(path: Path) -> Capture:
-    """One recording; its name says the load, such as ``beam_gravity_a`` or ``beam_load52_a``. Raises BeamError."""
+    """One recording; its name gives the load, such as ``beam_gravity_a`` or ``beam_load52_a``. Raises BeamError."""
     load = re.search(r"load(\d+)", path.stem)
     if load is None and "gravity" not in path.stem:
-        raise BeamError(f"{path}: its name says neither 'gravity' nor 'load' and grams, such as load52")
-    table = _table(path)
+        raise BeamError(f"{path}: its name has neither 'gravity' nor 'load' and grams, such as load52")
+    table = read_numbers(path, COLUMNS, BeamError)
     if len(table) < HELD_FRAMES + REST_FRAMES:
         raise BeamError(
             f"{path}: {len(table)} frames are too few; expected {HELD_FRAMES + REST_FRAMES} at least"
         )
-    if not np.isfinite(table).all():
-        row = int(np.argwhere(~np.isfinite(table))[0][0])
-        raise BeamError(f"{path}: row {row + 2} has a value that is missing or no number")
     if (np.diff(table[:, 0]) <= 0).any():
         raise BeamError(f"{path}: the times in t_s do not increase")
     tips = 1000.0 * table[:, 1:].reshape(-1, 3, 3)
@@ -92,35 +91,11 @@ def read_capture(path: Path) -> Capture:
     return capture
 
 
-def _table(path: Path) -> np.ndarray:
-    """Values (n, 10) of a recording, NaN where there is no number."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
-            if missing:
-                raise BeamError(
-                    f"{path}: column {missing[0]} is missing, {len(missing)} of {len(COLUMNS)} in all"
-                )
-            return np.array([[_number(row[name]) for name in COLUMNS] for row in reader]).reshape(
-                -1, len(COLUMNS)
-            )
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise BeamError(f"{path}: cannot be read ({error})") from None
-
-
-def _number(text: str | None) -> float:
-    try:
-        return float(text or "nan")
-    except ValueError:
-        return float("nan")
-
-
 def oscillation(time_s: np.ndarray, height_mm: np.ndarray) -> Oscillation:
-    """First frequency of what swings after a release at the start of the signal. Raises BeamError.
+    """First frequency and damping after a release at the start of the signal. Raises BeamError.
 
-    A damped cosine about a slowly sinking mean (silicone creeps) is fitted to windows of two periods, one period
-    apart, a quarter of a period after the release; what the frequency differs by between them is its error.
+    A damped cosine about a slowly sinking mean (silicone creeps) is fitted in windows of two periods, one period
+    apart, from a quarter of a period after the release; the error is the spread of the frequency over the windows.
     """
     period = _period(time_s, height_mm)
     fits = []

@@ -1,4 +1,4 @@
-"""How true a volume made of a tracked sweep is: of the resting kidney, against noise, and against compression."""
+"""Accuracy of volumes reconstructed from tracked sweeps: at rest, with a tracker's errors, and under compression."""
 
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -15,7 +15,7 @@ from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene, with_options
 from sim.device import start
-from studies.freehand.freehand_sweeps import Truth, pressed, resting, sweep_of
+from studies.freehand.freehand_sweeps import GroundTruthSweep, pressed, resting, sweep_of
 from ultrasound.probe import load_probe
 from ultrasound.reconstruction import METHODS
 from ultrasound.tracking_errors import TrackingErrors, tracked
@@ -23,12 +23,12 @@ from ultrasound.tracking_errors import TrackingErrors, tracked
 REFERENCE, SEED = "Reference", 20161130
 PROBE = "curvilinear"
 SPACING_MM, REACH_MM, PIXELS = 1.0, 2.0, 192
-# Of the resting sweep every so manieth picture, for the curves.
+# The curves are of every third image of the resting sweep.
 EVERY = 3
-# How far around the hilum the organ is held, or a probe that glides would roll it away.
-HELD_MM = 15.0
+# Radius of the fixed nodes around the hilum; without them a sliding probe would roll the organ away.
+FIXED_MM = 15.0
 DEPTHS_MM = (0.5, 2.0, 4.0, 6.0, 8.0)
-# One error at a time, then all of a good optical and of a poor electromagnetic tracker.
+# One error at a time.
 VARIED: dict[str, tuple[float, ...]] = {
     "noise_mm": (0.25, 0.5, 1.0, 2.0),
     "noise_deg": (0.25, 0.5, 1.0, 2.0),
@@ -47,7 +47,7 @@ def measure(
     quick: bool,
     done: Callable[[], Any],
 ) -> dict[str, Any]:
-    """All figures of one patient; Taichi is started anew."""
+    """All figures of one patient; starts Taichi anew."""
     start(arch)
     probe = load_probe(PROBE)
     truth = resting(anatomy, probe, np.array(scene.gravity.direction), PIXELS)
@@ -57,7 +57,7 @@ def measure(
         rest.append(dict(method=method) | _row(truth, truth.poses, surfaces, method=method))
         done()
     curves = noise_curves(truth, surfaces, quick, done)
-    squeezed = [] if anatomy.tumour is None else compression(scene, anatomy, setup, arch, quick, done)
+    pressed_rows = [] if anatomy.tumour is None else compression(scene, anatomy, setup, arch, quick, done)
     return dict(
         probe=PROBE,
         spacing_mm=SPACING_MM,
@@ -66,12 +66,12 @@ def measure(
         apart_mm=round(float(np.linalg.norm(np.diff(truth.poses[:, :3, 3], axis=0), axis=1).mean()), 4),
         resting=rest,
         noise=curves,
-        compression=squeezed,
+        compression=pressed_rows,
     )
 
 
 def count_of(anatomy: LoadedAnatomy, quick: bool) -> int:
-    """How often ``measure`` says that something is done."""
+    """How often ``measure`` calls ``done``."""
     depths = 0 if anatomy.tumour is None else len(_depths(quick))
     return len(METHODS) + 1 + sum(len(_sizes(values, quick)) for values in VARIED.values()) + depths
 
@@ -85,9 +85,9 @@ def _depths(quick: bool) -> tuple[float, ...]:
 
 
 def noise_curves(
-    truth: Truth, surfaces: dict[str, trimesh.Trimesh], quick: bool, done: Callable[[], Any]
+    truth: GroundTruthSweep, surfaces: dict[str, trimesh.Trimesh], quick: bool, done: Callable[[], Any]
 ) -> list[dict[str, Any]]:
-    """Figures of the resting sweep, as trackers of one error each have it."""
+    """Figures of the resting sweep for trackers with one error each."""
     times = truth.sweep.times_s[::EVERY]
     few = replace(
         truth,
@@ -108,19 +108,19 @@ def noise_curves(
 def compression(
     scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str, quick: bool, done: Callable[[], Any]
 ) -> list[dict[str, Any]]:
-    """Figures of sweeps over the tumour, pressed in more and more: as they are, and with the compression undone."""
+    """Figures of sweeps pressed over the tumour at several depths, without and with the compression correction."""
     start(arch)
     small = with_options(scene_of(scene, setup), {"image.pixels": PIXELS})
-    held = scene.attachment.model_copy(update={"radius_mm": HELD_MM if scene.attachment.at_mm else 0.0})
-    rehearsal = Rehearsal(small.model_copy(update={"attachment": held}), anatomy)
+    fixed = scene.attachment.model_copy(update={"radius_mm": FIXED_MM if scene.attachment.at_mm else 0.0})
+    rehearsal = Rehearsal(small.model_copy(update={"attachment": fixed}), anatomy)
     surfaces = surfaces_of(anatomy)
     rows = []
     for depth in _depths(quick):
         truth = pressed(rehearsal, depth)
         rehearsal.reset()
         track = image_poses_of(truth.sweep, REFERENCE)
-        unsqueezed = CompressionCorrection(rehearsal, truth.sweep, track, REFERENCE)
-        for undone, places in ((False, None), (True, unsqueezed)):
+        correction = CompressionCorrection(rehearsal, truth.sweep, track, REFERENCE)
+        for undone, places in ((False, None), (True, correction)):
             row = dict(depth_mm=depth, compression_mm=round(truth.compression_mm, 4), undone=undone)
             rows.append(row | _row(truth, truth.poses, surfaces, places))
         done()
@@ -128,7 +128,7 @@ def compression(
 
 
 def _row(
-    truth: Truth,
+    truth: GroundTruthSweep,
     poses: list[np.ndarray | None] | np.ndarray,
     surfaces: dict[str, trimesh.Trimesh],
     places: Places | None = None,

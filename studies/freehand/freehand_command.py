@@ -1,28 +1,55 @@
-"""The command ``study freehand``: how true a volume made of a tracked sweep is."""
+"""The command ``study freehand``: accuracy of volumes reconstructed from tracked sweeps, its table and its figure."""
 
-from dataclasses import fields
+import math
 from pathlib import Path
 from typing import Any
 
 import click
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from tqdm import tqdm
 
 from rehearsal.commands.command_line import CommandError, arch_option, load_patient, make_folder, start_taichi
 from rehearsal.configuration import PRESETS
-from rehearsal.result_files import write_csv, write_json
 from scenes.scene import EMBEDDED
-from ultrasound.tracking_errors import TrackingErrors
+from studies.study_options import out_option
+from studies.study_results import text_table, write_results
 
-VARIED = tuple(each.name for each in fields(TrackingErrors))
+HEADERS = (
+    "sweep",
+    "region",
+    "scanned, %",
+    "Dice",
+    "HD95, mm",
+    "volume, %",
+    "centroid, mm",
+    "landmarks, mm",
+)
+FORMATS = ("", "", ".0f", ".3f", ".2f", "+.1f", ".2f", ".2f")
+TRACKING_ERRORS = {
+    "noise_mm": "noise of the position, mm",
+    "noise_deg": "noise of the angle, degrees",
+    "calibration_mm": "translation error of the calibration, mm",
+    "calibration_deg": "rotation error of the calibration, degrees",
+    "latency_s": "latency, s (at 10 mm/s)",
+    "lost": "share of images without a pose",
+}
+COMPRESSION_ERRORS = {
+    "centroid_mm": "error of the tumour's centroid, mm",
+    "dice": "tumour's Dice",
+    "landmarks": "error of landmarks, mm",
+}
+CORRECTED = "^:"
 
 
 @click.command()
 @click.argument("scenes", type=click.Path(path_type=Path), nargs=-1)
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for tables and picture.")
+@out_option
 @click.option("--quick", is_flag=True, help="One size of each error and two depths.")
 @arch_option
 def freehand(scenes: tuple[Path, ...], out: Path, quick: bool, arch: str) -> None:
-    """Compare volumes of tracked sweeps with the truth.
+    """Compare volumes of tracked sweeps with the ground truth.
 
     Of SCENES [the embedded patient]: at rest, with a tracker's errors, pressed.
     """
@@ -35,7 +62,6 @@ def freehand(scenes: tuple[Path, ...], out: Path, quick: bool, arch: str) -> Non
         loaded.append((one, anatomy))
     used = start_taichi(arch)
     from studies.freehand.freehand_accuracy import count_of, measure
-    from studies.freehand.freehand_figure import draw
 
     setup = PRESETS["neo-hookean"]["balanced"]
     runs = []
@@ -44,57 +70,106 @@ def freehand(scenes: tuple[Path, ...], out: Path, quick: bool, arch: str) -> Non
         for number, (one, anatomy) in enumerate(loaded, 1):
             figures = measure(one, anatomy, setup, used, quick, bar.update)
             runs.append(dict(patient=one.title or f"patient {number}") | figures)
-    write_json(dict(arch=used, runs=runs), out / "freehand.json")
-    write_csv([row for run in runs for row in rows_of(run)], out / "freehand.csv")
-    draw(runs, out / "freehand.png")
-    click.echo("\n".join(["", *(line for run in runs for line in table(run))]))
-    click.echo(f"\nWrote freehand.json, freehand.csv and freehand.png to {out}")
+    rows = [row for run in runs for row in rows_of(run)]
+    text = "\n\n".join(map(table, runs))
+    write_results(out, "freehand", dict(arch=used, runs=runs), text, rows, figure_of(runs))
 
 
 def rows_of(run: dict[str, Any]) -> list[dict[str, Any]]:
-    """A line a volume and region, of the part of it that was scanned."""
-    lines = []
+    """A row a volume and region, of the part of it that was scanned."""
+    rows = []
     for kind in ("resting", "noise", "compression"):
         for row in run[kind]:
-            about = {name: value for name, value in row.items() if not isinstance(value, dict)}
+            settings = {name: value for name, value in row.items() if not isinstance(value, dict)}
             for region in ("organ", "tumour"):
                 part = row.get(region, {}).get("scanned_part")
-                if part:
-                    lines.append(
-                        dict(
-                            patient=run["patient"], sweep=kind, region=region, scanned=row[region]["scanned"]
-                        )
-                        | part
-                        | dict(landmarks_mm=row["landmarks"]["mean_mm"])
-                        | about
-                    )
-    return lines
+                if not part:
+                    continue
+                place = dict(
+                    patient=run["patient"], sweep=kind, region=region, scanned=row[region]["scanned"]
+                )
+                rows.append(place | part | dict(landmarks_mm=row["landmarks"]["mean_mm"]) | settings)
+    return rows
 
 
-def table(run: dict[str, Any]) -> list[str]:
+def table(run: dict[str, Any]) -> str:
     """The figures of one patient."""
-    lines = [
-        f"{run['patient']}: {run['probe']} probe, {run['frames']} pictures {run['apart_mm']:.2f} mm apart, "
-        f"voxels of {run['spacing_mm']:g} mm",
-        f"{'sweep':<38}region  scanned   Dice  HD95, mm  volume, %  centroid, mm  landmarks, mm",
+    head = (
+        f"{run['patient']}: {run['probe']} probe, {run['frames']} images {run['apart_mm']:.2f} mm apart, "
+        f"voxels of {run['spacing_mm']:g} mm"
+    )
+    names = ("dice", "hd95_mm", "volume_percent", "centroid_mm", "landmarks_mm")
+    rows = [
+        [_named(row), row["region"], 100 * row["scanned"], *(row[name] for name in names)]
+        for row in rows_of(run)
     ]
-    for row in rows_of(run):
-        hd95, centroid, landmarks = (
-            "" if row[name] is None else f"{row[name]:.2f}"
-            for name in ("hd95_mm", "centroid_mm", "landmarks_mm")
-        )
-        lines.append(
-            f"{_named(row):<38}{row['region']:<8}{100 * row['scanned']:>5.0f} %{row['dice']:>8.3f}{hd95:>10}"
-            f"{row['volume_percent']:>+11.1f}{centroid:>14}{landmarks:>15}"
-        )
-    return lines
+    return f"{head}\n{text_table(HEADERS, rows, FORMATS)}"
 
 
 def _named(row: dict[str, Any]) -> str:
     if row["sweep"] == "resting":
         return f"at rest, {row['method']}"
     if row["sweep"] == "compression":
-        undone = ", undone" if row["undone"] else ""
-        return f"pressed {row['depth_mm']:g} mm, squeezed {row['compression_mm']:.1f}{undone}"
-    varied = [f"{name} {row[name]:g}" for name in VARIED if row[name]]
-    return ", ".join(varied) or "every third picture, no error"
+        corrected = ", corrected" if row["undone"] else ""
+        return f"pressed {row['depth_mm']:g} mm, compressed {row['compression_mm']:.1f}{corrected}"
+    errors = [f"{name} {row[name]:g}" for name in TRACKING_ERRORS if row[name]]
+    return ", ".join(errors) or "every third image, no error"
+
+
+def figure_of(runs: list[dict[str, Any]]) -> Figure:
+    """Error against tracking errors and against compression; a colour is a patient, a line style a quantity."""
+    figure = Figure(figsize=(13, 9.5), layout="constrained")
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(2, 1.1))[:, 0]
+    panels = above.subplots(2, 3).ravel()
+    for axes, (name, label) in zip(panels, TRACKING_ERRORS.items(), strict=True):
+        _against_noise(axes, runs, name, label)
+    above.suptitle("At rest, by a tracker's errors: error of the volume")
+    _legend(panels[0], {"landmarks": "o-", "tumour's centroid": "s--"})
+    panels = below.subplots(1, 3)
+    for axes, name in zip(panels, COMPRESSION_ERRORS, strict=True):
+        _against_compression(axes, runs, name)
+    below.suptitle("Pressed over the tumour: the part of it that was scanned")
+    _legend(panels[0], {"uncorrected": "o-", "compression corrected": CORRECTED})
+    colours = [Line2D([], [], color=f"C{n}", linewidth=3, label=run["patient"]) for n, run in enumerate(runs)]
+    figure.legend(handles=colours, loc="outside lower center", ncols=3)
+    return figure
+
+
+def _legend(axes: Axes, styles: dict[str, str]) -> None:
+    """The line styles of all panels in a row."""
+    handles = [axes.plot([], [], style, color="0.3", label=name)[0] for name, style in styles.items()]
+    axes.legend(handles=handles, loc="upper left", fontsize=9)
+
+
+def _against_noise(axes: Axes, runs: list[dict[str, Any]], name: str, label: str) -> None:
+    """Landmark error of the resting sweep, and the distance of the tumour's centroid."""
+    for number, run in enumerate(runs):
+        rows = [row for row in run["noise"] if row[name] or not any(row[other] for other in TRACKING_ERRORS)]
+        at = [row[name] for row in rows]
+        colour = f"C{number}"
+        axes.plot(at, [row["landmarks"]["mean_mm"] for row in rows], "o-", color=colour)
+        if "tumour" in rows[0]:
+            tumour = [(row["tumour"]["scanned_part"] or {}).get("centroid_mm", math.nan) for row in rows]
+            axes.plot(at, tumour, "s--", color=colour)
+    _finish(axes, label, "mm")
+
+
+def _against_compression(axes: Axes, runs: list[dict[str, Any]], name: str) -> None:
+    for number, run in enumerate(runs):
+        for undone, style in ((False, "o-"), (True, CORRECTED)):
+            depths, values = [], []
+            for row in run["compression"]:
+                tumour = row.get("tumour", {}).get("scanned_part")
+                # A press may move the tumour out of the images.
+                if row["undone"] == undone and tumour and row["landmarks"]["count"]:
+                    depths.append(row["depth_mm"])
+                    values.append(row["landmarks"]["mean_mm"] if name == "landmarks" else tumour[name])
+            axes.plot(depths, values, style, color=f"C{number}")
+    _finish(axes, "depth of the press, mm", COMPRESSION_ERRORS[name])
+
+
+def _finish(axes: Axes, x_label: str, y_label: str) -> None:
+    axes.set(xlabel=x_label, ylabel=y_label)
+    # A value near zero stays visible above the frame.
+    axes.set_ylim(bottom=-0.04 * axes.get_ylim()[1])
+    axes.grid(alpha=0.3)

@@ -1,4 +1,4 @@
-"""Freehand sweeps of which the truth is known: a slow one of the resting kidney, and ones pressed in, over the tumour."""
+"""Freehand sweeps with known ground truth: a slow one of the resting kidney, and ones pressed over the tumour."""
 
 from dataclasses import dataclass
 
@@ -22,19 +22,19 @@ from ultrasound.scanner import Scanner
 from ultrasound.sweep import Sweep, transform_text
 
 FRAMES_A_SECOND = 30
-# The slow sweep: so fast, its probe so far above the organ, which it passes by so much at either end.
+# The slow sweep: its speed, the height of the probe above the organ, and how far it goes beyond both ends.
 SPEED_MM_S, ABOVE_MM, BEYOND_MM = 10.0, 12.0, 4.0
-# The pressed one begins and ends that far beside the tumour.
+# The pressed sweep begins and ends at this distance from the tumour.
 BESIDE_MM = 4.0
-# Virtual beads, as the paper's: around the tumour, apart from each other and under the surface.
+# Virtual beads as in the paper, around the tumour.
 BEAD_RADIUS_MM, BEADS_APART_MM, BEADS_WITHIN_MM = 1.5, 9.0, 24.0
 
 
 @dataclass
-class Truth:
-    """A sweep of ``Mark`` pictures with the true poses (n, 4, 4) of the probe in the patient, and its beads (k, 3) at rest (LPS, mm).
+class GroundTruthSweep:
+    """A sweep of ``Mark`` images with the true poses (n, 4, 4) of the probe in the patient, and the beads (k, 3) at rest (LPS, mm).
 
-    ``on_probe`` (4, 4) is ImageToProbe, ``mask`` says which pixels (rows, columns) the probe shows.
+    ``on_probe`` (4, 4) is ImageToProbe, ``mask`` (rows, columns) is True in the field of view.
     """
 
     sweep: Sweep
@@ -46,7 +46,7 @@ class Truth:
 
 
 def beads_of(organ: trimesh.Trimesh, tumour: trimesh.Trimesh | None) -> np.ndarray:
-    """Places (k, 3) of beads [mm], on a grid around the middle of the tumour or the organ."""
+    """Positions (k, 3) of beads [mm], on a grid around the middle of the tumour or the organ."""
     middle = (tumour or organ).center_mass
     most = np.ceil(BEADS_WITHIN_MM / BEADS_APART_MM)
     steps = np.arange(-most, most + 1)
@@ -55,13 +55,13 @@ def beads_of(organ: trimesh.Trimesh, tumour: trimesh.Trimesh | None) -> np.ndarr
     near = grid[np.linalg.norm(grid - middle, axis=1) < BEADS_WITHIN_MM]
     depth = -signed_distance(organ.vertices, organ.faces, near)[0]
     inside = near[depth > 2 * BEAD_RADIUS_MM]
-    # Of more than there is room for, those nearest to the middle.
+    # At most MOST_BEADS, those nearest to the middle.
     nearest = np.argsort(np.linalg.norm(inside - middle, axis=1), kind="stable")[:MOST_BEADS]
     return inside[np.sort(nearest)]
 
 
-def resting(anatomy: LoadedAnatomy, probe: Probe, direction: np.ndarray, pixels: int) -> Truth:
-    """The slow sweep along the organ's long axis, of the CT as it is; Taichi must have been started."""
+def resting(anatomy: LoadedAnatomy, probe: Probe, direction: np.ndarray, pixels: int) -> GroundTruthSweep:
+    """The slow sweep of the undeformed CT along the organ's long axis; Taichi must have been started."""
     if anatomy.ct is None:
         raise ValueError("a sweep needs a CT")
     organ, tumour = anatomy.organ, anatomy.tumour
@@ -79,12 +79,12 @@ def resting(anatomy: LoadedAnatomy, probe: Probe, direction: np.ndarray, pixels:
 
 
 def _along(organ: trimesh.Trimesh, probe: Probe, direction: np.ndarray) -> np.ndarray:
-    """Poses (n, 4, 4) of a probe that goes along the organ's long axis, square to it, and looks along a direction."""
+    """Poses (n, 4, 4) along the organ's long axis, with the image planes perpendicular to it and the beam along a direction."""
     down = direction / np.linalg.norm(direction)
     centred = organ.vertices - organ.center_mass
     axis = np.linalg.svd(centred - np.outer(centred @ down, down), full_matrices=False)[2][0]
-    way, depth = centred @ axis, centred @ down
-    steps = np.arange(way.min() - BEYOND_MM, way.max() + BEYOND_MM, SPEED_MM_S / FRAMES_A_SECOND)
+    along, depth = centred @ axis, centred @ down
+    steps = np.arange(along.min() - BEYOND_MM, along.max() + BEYOND_MM, SPEED_MM_S / FRAMES_A_SECOND)
     pose = np.eye(4)
     pose[:3, :3] = np.column_stack([np.cross(down, axis), down, axis])
     poses = np.tile(pose, (len(steps), 1, 1))
@@ -92,19 +92,19 @@ def _along(organ: trimesh.Trimesh, probe: Probe, direction: np.ndarray) -> np.nd
     return poses
 
 
-def pressed(rehearsal: Rehearsal, depth_mm: float) -> Truth:
-    """A sweep over the tumour, pressed in by a depth, along the probe's elevation, with the body moving."""
+def pressed(rehearsal: Rehearsal, depth_mm: float) -> GroundTruthSweep:
+    """A sweep of the deforming body over the tumour, at a depth [mm] and along the probe's elevation axis."""
     if rehearsal.tumour is None or rehearsal.scanner is None:
         raise ValueError("a pressed sweep needs a tumour and a CT")
     rehearsal.reset()
-    probe, way = rehearsal.probe, _way(rehearsal, depth_mm)
+    probe, path = rehearsal.probe, _path(rehearsal, depth_mm)
     beads = beads_of(rehearsal.organ, rehearsal.tumour)
     marks = _marks(rehearsal.scanner.plane, rehearsal.organ, rehearsal.tumour, beads)
     touches = np.ones(probe.number_of_scanlines, bool)
-    approach(rehearsal, way[0])
-    images, poses, squeezed = [], [], []
+    approach(rehearsal, path[0])
+    images, poses, compression = [], [], []
     every = round(1 / (FRAMES_A_SECOND * rehearsal.settings.time_step_s))
-    for step, pose in enumerate(way):
+    for step, pose in enumerate(path):
         rehearsal.advance(pose)
         if step % every == 0:
             rehearsal.update_surfaces()
@@ -112,25 +112,25 @@ def pressed(rehearsal: Rehearsal, depth_mm: float) -> Truth:
             rehearsal.scanner.plane.take(rehearsal.image_plane())
             images.append(marks.render())
             poses.append(probe_in_patient(rehearsal))
-            squeezed.append(measure(rehearsal, probe, touches).compression_mm)
+            compression.append(measure(rehearsal, probe, touches).compression_mm)
     times = np.arange(len(poses)) * every * rehearsal.settings.time_step_s
     truth = _truth(np.stack(images), np.stack(poses), times, probe, beads + rehearsal.origin)
-    truth.compression_mm = float(np.mean(squeezed))
+    truth.compression_mm = float(np.mean(compression))
     return truth
 
 
-def _way(rehearsal: Rehearsal, depth_mm: float) -> np.ndarray:
-    """Poses (n, 4, 4), step by step, over the middle of the tumour at one depth under the settled surface."""
+def _path(rehearsal: Rehearsal, depth_mm: float) -> np.ndarray:
+    """Poses (n, 4, 4) of each step over the middle of the tumour, at a depth [mm] under the settled surface."""
     home = rehearsal.manipulator.home
     local = (np.asarray(rehearsal.tumour.vertices) - home[:3, 3]) @ home[:3, :3]  # type: ignore[union-attr]
     low, high = local.min(axis=0)[:2], local.max(axis=0)[:2]
     step_mm = SPEED_MM_S * rehearsal.settings.time_step_s
-    ways = np.arange(low[1] - BESIDE_MM, high[1] + BESIDE_MM, step_mm)
-    return np.stack([_over(rehearsal, (low[0] + high[0]) / 2, y, depth_mm) for y in ways])
+    offsets = np.arange(low[1] - BESIDE_MM, high[1] + BESIDE_MM, step_mm)
+    return np.stack([_over(rehearsal, (low[0] + high[0]) / 2, y, depth_mm) for y in offsets])
 
 
 def _over(rehearsal: Rehearsal, x: float, y: float, depth_mm: float) -> np.ndarray:
-    """The pose at a place beside home, turned as that, so deep under the settled surface."""
+    """The pose at an offset [mm] from home, with its orientation, at a depth under the settled surface."""
     manipulator = rehearsal.manipulator
     pose = manipulator.home.copy()
     pose[:3, 3] += pose[:3, :2] @ [x, y]
@@ -146,16 +146,16 @@ def _marks(
 
 def _truth(
     images: np.ndarray, poses: np.ndarray, times_s: np.ndarray, probe: Probe, beads_mm: np.ndarray
-) -> Truth:
+) -> GroundTruthSweep:
     on_probe = probe.image_to_probe(*images.shape[1:])
     mask = source_of_pixels(probe, images.shape[1])[..., 0] > -1.0
-    return Truth(sweep_of(images, poses, times_s, on_probe), poses, beads_mm, on_probe, mask)
+    return GroundTruthSweep(sweep_of(images, poses, times_s, on_probe), poses, beads_mm, on_probe, mask)
 
 
 def sweep_of(
     images: np.ndarray, poses: list[np.ndarray | None] | np.ndarray, times_s: np.ndarray, on_probe: np.ndarray
 ) -> Sweep:
-    """Pictures (n, rows, columns) with poses of the probe in the patient, None where they were lost, as a sweep."""
+    """A sweep of images (n, rows, columns) and poses of the probe in the patient, None where they were lost."""
     frames = [
         {
             "ProbeToReferenceTransform": transform_text(np.eye(4) if pose is None else pose),

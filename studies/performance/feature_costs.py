@@ -1,4 +1,4 @@
-"""What each feature of a scene costs: the same press with it and without, in turn."""
+"""Cost of each feature of a scene: the same press with it and without it, in turn."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ from ultrasound.probe import DetailLevel, Mode
 from ultrasound.probe_manipulator import advanced, between, image_plane, pose_at, touching
 from ultrasound.scanner import ScannedAnatomy, Scanner
 
-# A press so deep, in so many steps; those before it settle.
+# Depth and steps of the press, and the steps before it in which the body settles.
 PRESS_MM, PRESS_STEPS, SETTLE_STEPS = 8.0, 60, 30
 CALLS = 40
 NOT_COUNTED: dict[str, Any] = dict(kernels=None, launches=None)
@@ -40,7 +40,7 @@ NOT_COUNTED: dict[str, Any] = dict(kernels=None, launches=None)
 
 @dataclass(frozen=True)
 class Options:
-    """What of a scene takes part in a step; the defaults are the embedded patient's."""
+    """The features of a scene that a step computes; the defaults are those of the embedded patient."""
 
     support: bool = True
     transducer: bool = True
@@ -52,7 +52,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Feature:
-    """One feature: a step ``having`` it, and the same ``without``."""
+    """One feature: the options of a step ``having`` it, and of the same step ``without``."""
 
     name: str
     having: Options
@@ -79,9 +79,7 @@ FEATURES = {
 
 
 class FeatureBody:
-    """A scene's organ and support, of which solvers are made with some features or others. Positions are relative to the
-    middle of the organ [mm].
-    """
+    """A scene's organ and support, for solvers with different features; positions relative to the organ's middle [mm]."""
 
     def __init__(self, scene: Scene, anatomy: LoadedAnatomy, tissue: TissueSection) -> None:
         self.tissue = tissue
@@ -106,7 +104,7 @@ class FeatureBody:
         self.home = touching(pose, self.size_mm, self.organ.vertices)
 
     def solver(self, options: Options, serial: bool | None = None) -> Solver:
-        """A solver with these features."""
+        """A solver with some features."""
         tool = ConvexTool.cuboid(self.size_mm) if options.transducer else None
         shapes: list = []
         if options.support:
@@ -128,7 +126,7 @@ class FeatureBody:
         )
 
     def poses(self, solver: Solver, step: int) -> np.ndarray | None:
-        """The transducer's poses in a step of the press; None without one."""
+        """Poses of the transducer in a step of the press; None without a transducer."""
         if not solver.has_tool:
             return None
         depth = PRESS_MM * np.clip((step + np.array([0, 1]) - SETTLE_STEPS) / PRESS_STEPS, 0, 1)
@@ -136,7 +134,7 @@ class FeatureBody:
 
 
 def body_of(scene: Scene, anatomy: LoadedAnatomy, model: str, size_mm: float) -> FeatureBody:
-    """The scene's organ in a tissue model, of cells or particles of a size."""
+    """The scene's organ in a tissue model, of cells or particles of a size [mm]."""
     options: dict[str, str | float | None] = {"tissue.model": model, f"tissue.{TISSUES[model].SIZE}": size_mm}
     tissue = with_options(scene, options).tissue
     return FeatureBody(scene, anatomy, tissue)
@@ -145,33 +143,34 @@ def body_of(scene: Scene, anatomy: LoadedAnatomy, model: str, size_mm: float) ->
 def of_steps(
     body: FeatureBody, features: tuple[Feature, ...], arch: str, quick: bool, done: Callable[[], Any]
 ) -> list[dict[str, Any]]:
-    """What each feature adds to a step: medians with it and without, memory, and kernels where they run in parallel.
+    """Each feature's rows of features.json: median times, memory and parallel kernels, with it and without it.
 
-    Both ways are stepped in turn, unless ``quick``: then each way is stepped once, and no kernels are counted.
+    Solvers with and without are stepped in turn; ``quick`` steps each of them once and counts no kernels.
     """
     counted: dict[Options, dict[str, Any]] = {}
     alone: dict[Options, dict[str, float]] = {}
     rows = []
     for feature in features:
-        ways = {"on": feature.having, "off": feature.without}
-        for options in ways.values():
+        variants = {"on": feature.having, "off": feature.without}
+        for options in variants.values():
             if quick and options not in alone:
                 alone[options] = _stepped(body, [options], arch)[0]
             if options not in counted:
                 counted[options] = NOT_COUNTED if quick else kernels_of(body, options, arch)
-        stepped = [alone[o] for o in ways.values()] if quick else _stepped(body, list(ways.values()), arch)
+        both = list(variants.values())
+        stepped = [alone[options] for options in both] if quick else _stepped(body, both, arch)
         row: dict[str, Any] = dict(feature=feature.name)
-        for (way, options), figures in zip(ways.items(), stepped, strict=True):
-            row |= {f"{name}_{way}": value for name, value in (figures | counted[options]).items()}
+        for (state, options), figures in zip(variants.items(), stepped, strict=True):
+            row |= {f"{name}_{state}": value for name, value in (figures | counted[options]).items()}
         rows.append(row)
         done()
     return rows
 
 
-def _stepped(body: FeatureBody, ways: list[Options], arch: str) -> list[dict[str, Any]]:
-    """Median time of a step [ms] through a press and memory [MB] of some solvers, stepped in turn."""
+def _stepped(body: FeatureBody, variants: list[Options], arch: str) -> list[dict[str, Any]]:
+    """Median time of a step [ms] in a press, and memory [MB], of solvers that are stepped in turn."""
     start(arch)
-    solvers = [body.solver(options) for options in ways]
+    solvers = [body.solver(options) for options in variants]
     ms: list[list[float]] = [[] for _ in solvers]
     for step in range(SETTLE_STEPS + PRESS_STEPS):
         for solver, into in zip(solvers, ms, strict=True):
@@ -183,7 +182,7 @@ def _stepped(body: FeatureBody, ways: list[Options], arch: str) -> list[dict[str
 
 
 def kernels_of(body: FeatureBody, options: Options, arch: str) -> dict[str, int]:
-    """Kernels that a step has where it runs in parallel, as on a GPU, and how often they are launched."""
+    """Number of kernels of a step in parallel, as on a GPU, and number of their launches."""
     start(arch, kernel_profiler=True)
     solver = body.solver(options, serial=False)
     for _ in range(2):
@@ -198,37 +197,38 @@ def kernels_of(body: FeatureBody, options: Options, arch: str) -> dict[str, int]
 
 
 def of_frame(scene: Scene, anatomy: LoadedAnatomy, arch: str) -> Iterator[dict[str, Any]]:
-    """What else a frame does, each by itself: the guard, the drawn surfaces and the picture."""
+    """The other parts of a frame, each by itself: divergence check, surfaces and image."""
     start(arch)
     rehearsal = Rehearsal(scene, anatomy)
     dt = rehearsal.settings.time_step_s
     yield _alone(
-        "guard", lambda: rehearsal.divergence_check.check(dt), [rehearsal.divergence_check], rehearsal.solver
+        "divergence check",
+        lambda: rehearsal.divergence_check.check(dt),
+        [rehearsal.divergence_check],
+        rehearsal.solver,
     )
     yield _alone("organ's surface", rehearsal.organ_skin.update, [rehearsal.organ_skin], rehearsal.model)
-    if rehearsal.tumour_skin is not None:
-        yield _alone(
-            "tumour's surface", rehearsal.tumour_skin.update, [rehearsal.tumour_skin], rehearsal.model
-        )
+    if (tumour := rehearsal.tumour_skin) is not None:
+        yield _alone("tumour's surface", tumour.update, [tumour], rehearsal.model)
     if anatomy.ct is None:
         return
-    yield from _pictures(rehearsal, scanned_anatomy(rehearsal.organ, anatomy.ct, anatomy, rehearsal.origin))
+    yield from _images(rehearsal, scanned_anatomy(rehearsal.organ, anatomy.ct, anatomy, rehearsal.origin))
     yield _whole_frame(rehearsal)
 
 
-def _pictures(rehearsal: Rehearsal, scanned: ScannedAnatomy) -> Iterator[dict[str, Any]]:
-    """The rungs of the picture's ladder, each with all that it needs."""
+def _images(rehearsal: Rehearsal, scanned: ScannedAnatomy) -> Iterator[dict[str, Any]]:
+    """The image at each detail level, each with all that it needs."""
     image, probe = rehearsal.scene.image, rehearsal.probe
     plane = image_plane(rehearsal.pose_at_depth(1.0), probe.housing_mm[2], *probe.extent_mm)
-    ladder: tuple[tuple[str, float, str, Mode, DetailLevel], ...] = (
+    levels: tuple[tuple[str, float, str, Mode, DetailLevel], ...] = (
         ("CT, organ alone", 0.0, "gel", "ct", "speckle"),
         ("CT", SURROUNDINGS_MM, "background", "ct", "speckle"),
-        ("echo: reflection, attenuation", SURROUNDINGS_MM, "background", "b-mode", "reflection"),
-        ("echo: and speckle", SURROUNDINGS_MM, "background", "b-mode", "speckle"),
-        ("echo: and elevation", SURROUNDINGS_MM, "background", "b-mode", "elevation"),
-        ("echo and CT", SURROUNDINGS_MM, "background", "both", "speckle"),
+        ("B-mode: reflection, attenuation", SURROUNDINGS_MM, "background", "b-mode", "reflection"),
+        ("B-mode: and speckle", SURROUNDINGS_MM, "background", "b-mode", "speckle"),
+        ("B-mode: and elevation", SURROUNDINGS_MM, "background", "b-mode", "elevation"),
+        ("B-mode and CT", SURROUNDINGS_MM, "background", "both", "speckle"),
     )
-    for name, margin, outside, mode, detail_level in ladder:
+    for name, margin, outside, mode, detail_level in levels:
         cell = embedding_cell_mm(rehearsal.scene.tissue)
         embedding = Embedding(rehearsal.model, rehearsal.organ, cell, margin)
         scanner = Scanner(scanned, embedding, probe, image.pixels, outside)
@@ -236,11 +236,11 @@ def _pictures(rehearsal: Rehearsal, scanned: ScannedAnatomy) -> Iterator[dict[st
         def draw() -> None:
             scanner.look(plane, probe, mode, detail_level, image.window_hu, image.level_hu)
 
-        yield _alone(f"picture, {name}", draw, [embedding, scanner], rehearsal.model)
+        yield _alone(f"image, {name}", draw, [embedding, scanner], rehearsal.model)
 
 
 def _whole_frame(rehearsal: Rehearsal) -> dict[str, Any]:
-    """All that a frame does but drawing the 3D view: a step under the pressing transducer, skin, echo, window's picture."""
+    """A whole frame but the 3D view: a step in a press, surfaces, B-mode and the composed window."""
     rehearsal.reset()
     settings, tally, page = initial_settings(rehearsal), Tally(0.0), Page(WindowLayout(1280, 720))
     settings.mode = "b-mode"
@@ -252,17 +252,17 @@ def _whole_frame(rehearsal: Rehearsal) -> dict[str, Any]:
     whole = [rehearsal.solver, rehearsal.divergence_check, rehearsal.organ_skin, rehearsal.tumour_skin]
     whole += [rehearsal.embedding, rehearsal.scanner]
 
-    def go_on() -> None:
+    def compute_frame() -> None:
         rehearsal.advance(poses.pop(0))
         rehearsal.update_surfaces()
         probe = probe_with_settings(rehearsal.probe, settings)
         page.compose(image_view(rehearsal, probe, settings, tally), np.eye(3), patient=True)
 
-    return _alone("whole frame, with the echo", go_on, whole, None)
+    return _alone("whole frame, with B-mode", compute_frame, whole, None)
 
 
 def _alone(name: str, work: Callable[[], Any], owners: list, apart: Any) -> dict[str, Any]:
-    """A piece of a frame that is not there where it is off."""
+    """A part of a frame; where it is off, it takes no time and no memory."""
     work()
     ms: list[float] = []
     for _ in range(CALLS):

@@ -1,34 +1,30 @@
-"""The command ``study features``: what each feature of a scene costs, on and off."""
+"""The command ``study features``: the cost of each feature of a scene."""
 
 from pathlib import Path
 from typing import Any
 
 import click
+from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from rehearsal.commands.command_line import arch_option, load_patient, make_folder, start_taichi
 from rehearsal.configuration import PRESETS
-from rehearsal.result_files import write_csv, write_json
 from scenes.scene import PAPER
 from scenes.tissue import USUAL
+from studies.study_options import out_option, scene_argument
+from studies.study_results import text_table, write_results
 
-COLUMNS = (
-    "model",
-    "feature",
-    "ms_on",
-    "ms_off",
-    "mb_on",
-    "mb_off",
-    "kernels_on",
-    "kernels_off",
-    "launches_on",
-    "launches_off",
-)
+MEASURED = ("ms", "mb", "kernels", "launches")
+COLUMNS = ("model", "feature", *(f"{name}_{state}" for name in MEASURED for state in ("on", "off")))
+HEADERS = ("model", "feature", "ms with", "without", "adds", "MB", "kernels", "launches")
+FORMATS = ("", "", ".3f", ".3f", "+.3f", "+.2f", "+g", "+g")
+FRAME = "frame"
+UNITS = {"ms": "time (ms)", "mb": "memory: fields on the device (MB)"}
 
 
 @click.command()
-@click.argument("scene", type=click.Path(path_type=Path), default=PAPER, required=False)
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for table and picture.")
+@scene_argument(PAPER)
+@out_option
 @click.option(
     "--quick",
     is_flag=True,
@@ -44,42 +40,67 @@ def features(scene: Path, out: Path, quick: bool, arch: str) -> None:
     loaded, anatomy = load_patient(scene)
     used = start_taichi(arch)
     from studies.performance import feature_costs
-    from studies.performance.features_figure import draw
 
     models = [USUAL] if quick else list(feature_costs.FEATURES)
     rows: list[dict[str, Any]] = []
-    with tqdm(
-        total=sum(len(feature_costs.FEATURES[model]) for model in models) + 1, desc="features", unit="feature"
-    ) as bar:
+    total = sum(len(feature_costs.FEATURES[model]) for model in models) + 1
+    with tqdm(total=total, desc="features", unit="feature") as bar:
         for model in models:
             preset = PRESETS[model]["fast" if quick else "balanced"]
             body = feature_costs.body_of(loaded, anatomy, model, preset.size_mm)
             found = feature_costs.of_steps(body, feature_costs.FEATURES[model], used, quick, bar.update)
             rows += [dict(model=model) | row for row in found]
-        rows += [dict(model="frame") | row for row in feature_costs.of_frame(loaded, anatomy, used)]
+        rows += [dict(model=FRAME) | row for row in feature_costs.of_frame(loaded, anatomy, used)]
         bar.update()
     rows = [{name: row[name] for name in COLUMNS} for row in rows]
-    write_json(dict(arch=used, features=rows), out / "features.json")
-    write_csv(rows, out / "features.csv")
-    draw(rows, out / "features.png")
-    click.echo("\n".join(["", *table(rows)]))
-    click.echo(f"\nWrote features.json, features.csv and features.png to {out}")
+    write_results(out, "features", dict(arch=used, features=rows), table(rows), rows, figure_of(rows))
 
 
-def table(rows: list[dict[str, Any]]) -> list[str]:
-    """What each adds: time of a step or of a frame's piece, memory, kernels where they run in parallel and their launches."""
+def _added(row: dict[str, Any], name: str) -> float | None:
+    on = row[f"{name}_on"]
+    return None if on is None else on - row[f"{name}_off"]
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """What each feature adds: time of a step or of a part of a frame, memory, parallel kernels and their launches."""
     lines = [
-        "model            feature                        ms with  without   adds      MB  kernels  launches"
+        [row["model"], row["feature"], row["ms_on"], row["ms_off"], *(_added(row, name) for name in MEASURED)]
+        for row in rows
     ]
-    for row in rows:
-        adds = row["ms_on"] - row["ms_off"]
-        lines.append(
-            f"{row['model']:<17}{row['feature']:<29}{row['ms_on']:>9.3f}{row['ms_off']:>9.3f}{adds:>+8.3f}"
-            f"{row['mb_on'] - row['mb_off']:>+8.2f}{_added(row, 'kernels'):>9}{_added(row, 'launches'):>10}"
-        )
-    return lines
+    return text_table(HEADERS, lines, FORMATS)
 
 
-def _added(row: dict[str, Any], what: str) -> str:
-    on = row[f"{what}_on"]
-    return "" if on is None else f"{on - row[f'{what}_off']:+d}"
+def figure_of(rows: list[dict[str, Any]]) -> Figure:
+    """What features add to a step, and below it what the parts of a frame take."""
+    parts = {
+        "A time step: with each feature, less without it": [row for row in rows if row["model"] != FRAME],
+        "A frame: each part, and all that it needs, by itself": [
+            row for row in rows if row["model"] == FRAME
+        ],
+    }
+    figure = Figure(figsize=(12, 0.34 * len(rows) + 3), layout="constrained")
+    heights = [len(part) + 3 for part in parts.values()]
+    halves = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)[:, 0]
+    for half, (title, part) in zip(halves, parts.items(), strict=True):
+        half.suptitle(title)
+        _bars(half.subplots(1, 2, sharey=True), part)
+    return figure
+
+
+def _bars(panels: Any, rows: list[dict[str, Any]]) -> None:
+    names = [
+        row["feature"] if row["model"] == FRAME else f"{row['feature']}  ({row['model']})" for row in rows
+    ]
+    models = list(dict.fromkeys(row["model"] for row in rows))
+    colours = ["C2" if row["model"] == FRAME else f"C{models.index(row['model'])}" for row in rows]
+    for axes, (name, unit) in zip(panels, UNITS.items(), strict=True):
+        added = [_added(row, name) or 0.0 for row in rows]
+        axes.barh(range(len(rows)), added, color=colours)
+        for y, value in enumerate(added):
+            axes.annotate(f" {value:.2f}", (max(value, 0.0), y), va="center", fontsize=8)
+        axes.set_xlabel(unit)
+        axes.axvline(0.0, color="0.4", linewidth=0.8)
+        axes.grid(alpha=0.3, axis="x")
+        axes.margins(x=0.12)
+    panels[0].set_yticks(range(len(rows)), names)
+    panels[0].invert_yaxis()

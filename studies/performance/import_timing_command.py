@@ -1,6 +1,4 @@
-"""The command ``study import``: how long a large CT takes to a ready scene, and how much memory."""
-
-from __future__ import annotations
+"""The command ``study import``: time and memory from a large CT to a scene."""
 
 import subprocess
 import sys
@@ -13,8 +11,9 @@ import psutil
 from tqdm import tqdm
 
 from rehearsal.commands.command_line import WholeRange, make_folder
-from rehearsal.result_files import write_json
 from studies.performance.synthetic_trunk import write_whole_body
+from studies.study_options import out_option
+from studies.study_results import write_results
 
 APP = Path(__file__).resolve().parents[2] / "app.py"
 POLL_S = 0.02
@@ -23,7 +22,7 @@ TUMOUR_OF_PHANTOM = "6"
 
 
 @click.command("import")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the figures.")
+@out_option
 @click.option(
     "--slices",
     type=WholeRange(200, 2000),
@@ -44,10 +43,12 @@ def intake(out: Path, slices: int, runs: int) -> None:
         )
         found = [_run(body, Path(temporary) / f"patient-{n}") for n in range(runs)]
     figures = dict(slices=slices, seconds=[s for s, _ in found], peak_gb=[g for _, g in found])
-    write_json(figures, out / "import.json")
-    click.echo(f"512 x 512 x {slices} CT and labels to a ready scene, {runs} runs, one after another:")
-    click.echo("seconds    " + ", ".join(f"{s:.1f}" for s, _ in found))
-    click.echo("memory     " + ", ".join(f"{g:.2f}" for _, g in found) + " GB at most")
+    lines = [
+        f"512 x 512 x {slices} CT and labels to a scene, {runs} runs, one after another:",
+        "seconds    " + ", ".join(f"{s:.1f}" for s, _ in found),
+        "memory     " + ", ".join(f"{g:.2f}" for _, g in found) + " GB at most",
+    ]
+    write_results(out, "import", figures, "\n".join(lines))
 
 
 def _run(body: Path, folder: Path) -> tuple[float, float]:

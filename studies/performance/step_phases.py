@@ -1,4 +1,4 @@
-"""A step in pieces, each a kernel of its own, so that each can be timed: what the paper's Fig. 8 shows."""
+"""A step in pieces, each a kernel of its own, so that each can be timed (the paper's Fig. 8)."""
 
 from collections.abc import Callable
 from time import perf_counter
@@ -10,41 +10,32 @@ import taichi.math as tm
 
 from sim.shape_matching import ShapeMatching
 from sim.solver import Solver, StepSettings, relaxation_at
-
-# Pieces of a substep before its iterations, of an iteration, and after them; "frames" is once a step.
-BEFORE = ("tool", "predict", "begin", "find contacts", "leave contacts", "gather")
-PASSES = {
-    True: ("fit clusters", "average goals", "move to goals", "contacts"),
-    False: ("tissue and contacts",),
-}
-AFTER = ("scatter", "keep out", "velocities")
-CONTACTS = ("find contacts", "leave contacts", "contacts", "keep out")
+from studies.performance.step_pieces import AFTER, BEFORE, IN_ITERATION
 
 
 @ti.data_oriented
 class Phases:
     """A solver whose steps are taken piece by piece.
 
-    ``ms`` holds how long each piece of the last step took [ms], with the time of calling it ``calls`` times from Python.
+    ``ms``: time of each piece in the last step [ms], including that of ``calls`` calls from Python.
     """
 
     def __init__(self, solver: Solver) -> None:
         if solver.has_self_contacts:
-            raise ValueError("phases know no contacts between particles")
+            raise ValueError("pieces of a step are not measured with self-contact")
         self.solver: Any = solver
         self.model: Any = solver.model
         self.serial = solver.model.serial
-        self.is_matched = isinstance(solver.model, ShapeMatching)
-        self.passes = PASSES[self.is_matched]
+        self.in_iteration = IN_ITERATION[isinstance(solver.model, ShapeMatching)]
         self.ms: dict[str, float] = {}
         self.calls: dict[str, int] = {}
 
     def names(self) -> tuple[str, ...]:
         """All pieces, in their order."""
-        return (*BEFORE, *self.passes, *AFTER, "frames")
+        return (*BEFORE, *self.in_iteration, *AFTER, "frames")
 
     def step(self, settings: StepSettings, tool_poses: np.ndarray) -> None:
-        """One time step, as ``Solver.step`` takes it."""
+        """One time step, the same as ``Solver.step``."""
         dt = settings.time_step_s / settings.substeps
         self.ms, self.calls = dict.fromkeys(self.names(), 0.0), dict.fromkeys(self.names(), 0)
         values = (dt, ti.Vector(list(settings.gravity)), settings.damping, settings.stiffness)
@@ -55,7 +46,7 @@ class Phases:
                 self._timed(name, substep, 1.0, *values, settings.stabilisation_iterations)
             for iteration in range(settings.iterations):
                 factor = relaxation_at(iteration, settings.iterations, settings.relaxation_factor)
-                for name in self.passes:
+                for name in self.in_iteration:
                     self._timed(name, substep, factor, *values, 0)
             for name in AFTER:
                 self._timed(name, substep, 1.0, *values, 0)
@@ -134,9 +125,9 @@ class Phases:
 
 
 def without_calls(ms: dict[str, float], calls: dict[str, int], whole_ms: float) -> dict[str, float]:
-    """Times of pieces [ms] that sum to that of the ``whole`` step, in which they are not called one by one.
+    """Times of pieces [ms] that sum to ``whole_ms``, that of a step in one kernel.
 
-    What they take longer together is the calls', all alike.
+    The difference is the time of the calls, the same for each call.
     """
     call_ms = max(sum(ms.values()) - whole_ms, 0.0) / sum(calls.values())
     own = {name: max(taken - call_ms * calls[name], 0.0) for name, taken in ms.items()}

@@ -1,4 +1,4 @@
-"""How long steps take: the embedded or another scene's press at several sizes, and blocks of ever more particles."""
+"""Time of a step: a scene's press at several sizes, and blocks of more and more particles."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -26,16 +26,16 @@ from studies.uniform_blocks import block_of_cells, block_of_particles
 from ultrasound.probe_manipulator import advanced, between
 
 AWAY_MM = 100.0
-# A block's particles are as far apart as the paper's smallest.
+# The particle distance of a block is the paper's smallest.
 BLOCK_RADIUS_MM, BLOCK_CELL_MM = 2.2, 4.0
-# Of the memory that is free, a block takes at most this share.
+# A block takes at most this share of the free memory.
 MOST_MEMORY = 0.6
 ROUNDS, STEPS_A_ROUND = 9, 5
 
 
 @dataclass(frozen=True)
 class TimedPress:
-    """One press: when each step was, in simulated seconds, and how long it took; and the times of a step's pieces."""
+    """One press: simulated time and duration of each step, and the durations of its pieces."""
 
     setup: Setup
     case: dict[str, Any]
@@ -46,7 +46,7 @@ class TimedPress:
 
 
 def build(scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str) -> Rehearsal:
-    """The scene's body under its transducer, without a picture, on a device of which nothing else holds memory."""
+    """The scene's body under its transducer, without an image, on a freshly started device."""
     start(arch)
     return Rehearsal(scene_of(scene, setup), replace(anatomy, ct=None))
 
@@ -75,7 +75,7 @@ def press(
 
 
 def measure(rehearsal: Rehearsal, setup: Setup, share: float, arch: str) -> TimedPress:
-    """TimedPress twice: once timed as a whole, once piece by piece; the first step, which compiles, is taken before."""
+    """Press twice: once timed as a whole, once piece by piece; the first step, which compiles, is not timed."""
     solver = rehearsal.solver
     phases = Phases(solver)
     home = between(rehearsal.manipulator.home, rehearsal.manipulator.home, rehearsal.settings.substeps)
@@ -117,7 +117,7 @@ def mean_of(pieces: list[dict[str, float]]) -> dict[str, float]:
 
 
 def memory_mb(owner: Any, apart: Any = None) -> float:
-    """What a solver's, or another part's, fields take on the device [MB], with all that it refers to, ``apart`` from that."""
+    """Memory of the fields [MB] on the device that an object refers to, without those of ``apart``."""
     seen: set[int] = set()
     _bytes_in(apart, seen)
     return _bytes_in(owner, seen) / 1e6
@@ -143,30 +143,27 @@ def _entries(field: ti.Field) -> int:
 
 
 def compare(rehearsal: Rehearsal) -> tuple[dict[str, Any], list[str]]:
-    """The pressed body's step, contacts and all, in turn with its fits and averages in C and in pypbd; what is missing.
-
-    Medians [ms] of rounds, in each of which all of them run.
-    """
+    """Medians [ms] of the pressed body's step with contacts and of its references, run in turn; the references that are missing."""
     solver, settings, model = rehearsal.solver, rehearsal.settings, rehearsal.model
     assert isinstance(model, ShapeMatching) and isinstance(model.body, ParticleBody)
-    passes = settings.substeps * settings.iterations
+    iterations = settings.substeps * settings.iterations
     alone = Solver(ShapeMatching(model.body, model.patches))
     pose = rehearsal.scripted_pose(rehearsal.script_length_s())
     poses = between(pose, pose, settings.substeps)
-    others, missing = _others(model, passes)
+    others, missing = _others(model, iterations)
     runs = {
         "step_ms": lambda: _one(lambda: solver.step(settings, poses)),
         "without_contacts_ms": lambda: _one(lambda: alone.step(replace(settings, gravity=(0.0, 0.0, 0.0)))),
         **others,
     }
     times: dict[str, list[float]] = {name: [] for name in runs}
-    held = solver.snapshot()
+    pressed = solver.snapshot()
     for _ in range(ROUNDS):
         for name, run in runs.items():
-            solver.restore(held)
+            solver.restore(pressed)
             times[name] += [run() for _ in range(STEPS_A_ROUND)]
     figures: dict[str, Any] = {name: round(float(np.median(ms)), 4) for name, ms in times.items()}
-    work = model.counts()["memberships"] * passes / 1e3
+    work = model.counts()["memberships"] * iterations / 1e3
     figures |= dict(
         membership_iterations=round(1e3 * work),
         bound_ms=figures.get("bound_2_cores_ms"),
@@ -178,19 +175,19 @@ def compare(rehearsal: Rehearsal) -> tuple[dict[str, Any], list[str]]:
     return figures, missing
 
 
-def _others(model: ShapeMatching, passes: int) -> tuple[dict[str, Callable[[], float]], list[str]]:
-    """What the step is compared with, as far as it is on this machine, and what of it is not."""
+def _others(model: ShapeMatching, iterations: int) -> tuple[dict[str, Callable[[], float]], list[str]]:
+    """The references available on this machine, and why others are not."""
     runs: dict[str, Callable[[], float]] = {}
     missing = []
     try:
         bound = Bound(model)
-        runs["bound_1_core_ms"] = lambda: bound.run(passes, 1)
-        runs["bound_2_cores_ms"] = lambda: bound.run(passes, 2)
+        runs["bound_1_core_ms"] = lambda: bound.run(iterations, 1)
+        runs["bound_2_cores_ms"] = lambda: bound.run(iterations, 2)
     except NoBound as reason:
         missing.append(str(reason))
     try:
         other = Pypbd(model)
-        runs["pypbd_1_core_ms"] = lambda: other.run(passes)
+        runs["pypbd_1_core_ms"] = lambda: other.run(iterations)
     except NoBound as reason:
         missing.append(str(reason))
     return runs, missing
@@ -207,7 +204,7 @@ def _ratio(first: float | None, second: float | None) -> float | None:
 
 
 def blocks(counts: list[int], arch: str, steps: int) -> Iterator[dict[str, Any]]:
-    """Blocks of about so many particles or nodes at rest on a plane, smallest first, while there is memory for them."""
+    """Blocks of about ``counts`` particles or nodes at rest on a plane, smallest first, while memory suffices."""
     for make in (_block_of_cells, _block_of_particles):
         each_mb = 0.0
         for count in counts:
@@ -220,7 +217,7 @@ def blocks(counts: list[int], arch: str, steps: int) -> Iterator[dict[str, Any]]
             step_ms: list[float] = []
             for _ in range(steps):
                 timed(lambda: solver.step(settings), step_ms)
-            # Building takes more than what is left on the device.
+            # Building a block takes more memory than the block itself.
             used_mb = (psutil.Process().memory_info().rss - before) / 1e6
             each_mb = max(used_mb, memory_mb(solver)) / solver.body.count
             yield describe(setup, solver, arch) | dict(ms=spread(step_ms))

@@ -1,20 +1,29 @@
-"""The command ``study timing``: the paper's Figures 7 and 8 and its Table 5 for this machine, and what bounds them."""
+"""The command ``study timing``: the paper's Figures 7 and 8 and its Table 5 on this machine, and lower bounds of the time."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from rehearsal.commands.command_line import arch_option, load_patient, make_folder, start_taichi
 from rehearsal.configuration import PRESETS, Setup, setup_of
-from rehearsal.result_files import write_csv, write_json
 from scenes.scene import PAPER
+from studies.performance.step_pieces import AFTER, BEFORE, CONTACTS, IN_ITERATION
+from studies.study_options import out_option, scene_argument
+from studies.study_results import text_table, write_results
+
+if TYPE_CHECKING:
+    from studies.performance.step_timing import TimedPress
 
 RADII_MM = (2.2, 2.5, 2.7, 3.0, 3.3)
 COUNTS = [1_000, 4_000, 16_000, 64_000, 250_000, 1_000_000]
 QUICK_COUNTS = [1_000, 4_000, 16_000]
-# The size on which the paper says its figures are, and which is compared with other programs.
+# The particle radius of the paper's figures, which is compared with other programs.
 PAPERS = setup_of("shape-matching", radius_mm=2.2)
 STEPS, QUICK_STEPS, QUICK_SHARE = 7, 3, 0.1
 COLUMNS = (
@@ -30,23 +39,36 @@ COLUMNS = (
     "cores",
     "memory_mb",
 )
+MS = ("mean", "sd", "min", "max", "median")
+HEADERS = ("model", "size, mm", "particles", "substeps x iterations", *MS, "MB")
+FORMATS = ("", "g", "g", "", *[".2f"] * len(MS), ".1f")
+# The paper's Table 5: radius [mm], mean, minimum and maximum [ms].
+PAPER_MS = (
+    (2.2, 12.10, 11.68, 12.77),
+    (2.5, 12.10, 11.68, 12.77),
+    (2.7, 12.37, 11.96, 12.84),
+    (3.0, 12.66, 12.28, 13.37),
+    (3.3, 14.16, 13.67, 15.68),
+)
+FRAME_MS = 1000 / 60
+# Pieces of a step below this share [%] for every model and size are drawn as one.
+LEAST_SHARE = 2.0
 
 
 @click.command()
-@click.argument("scene", type=click.Path(path_type=Path), default=PAPER, required=False)
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for tables and pictures.")
+@scene_argument(PAPER)
+@out_option
 @click.option("--quick", is_flag=True, help="Fewer sizes and shorter presses, in less than a minute.")
 @arch_option
 def timing(scene: Path, out: Path, quick: bool, arch: str) -> None:
     """Measure how long a time step of SCENE takes.
 
-    Against time, by its pieces, by size, and against a plain loop in C.
+    Over time, by its pieces, by size, and against a plain loop in C.
     """
     make_folder(out)
     loaded, anatomy = load_patient(scene)
     used = start_taichi(arch)
     from studies.performance import step_timing
-    from studies.performance.timing_figure import draw
 
     setups = _setups(quick)
     counts = QUICK_COUNTS if quick else COUNTS
@@ -67,11 +89,9 @@ def timing(scene: Path, out: Path, quick: bool, arch: str) -> None:
     bound_ms = comparison.get("bound_ms")
     cases = [press.case | dict(bound_ms=bound_ms if press.setup == PAPERS else None) for press in presses]
     report = dict(arch=used, cases=cases, bound_ms=bound_ms, comparison=comparison, sizes=sizes)
-    write_json(report, out / "timing.json")
-    write_csv([_flat(case) for case in cases + sizes], out / "timing.csv")
-    draw(presses, sizes, out / "timing.png")
-    click.echo("\n".join(["", *table(cases, sizes), *pieces(cases), *against(comparison), *missing]))
-    click.echo(f"\nWrote timing.json, timing.csv and timing.png to {out}")
+    text = "\n".join([table(cases, sizes), *pieces(cases), *against(comparison), *missing])
+    rows = [_flat(case) for case in cases + sizes]
+    write_results(out, "timing", report, text, rows, figure_of(presses, sizes))
 
 
 def _setups(quick: bool) -> list[Setup]:
@@ -82,33 +102,38 @@ def _setups(quick: bool) -> list[Setup]:
 
 
 def _flat(case: dict) -> dict[str, Any]:
-    """A case's size, and mean, SD, min, max and median of its steps [ms]."""
+    """A case's size, and mean, SD, minimum, maximum and median of its steps [ms]."""
     return {name: case[name] for name in COLUMNS} | {f"{name}_ms": ms for name, ms in case["ms"].items()}
 
 
-def table(cases: list[dict], sizes: list[dict]) -> list[str]:
+def _size(case: dict) -> float:
+    return case["radius_mm"] or case["cell_mm"]
+
+
+def table(cases: list[dict], sizes: list[dict]) -> str:
     """The paper's Table 5, and the blocks."""
-    head = "model              size particles iterations    mean     SD    min     max  median      MB"
-    lines = ["Time of a step (ms), over warm-up and press (the paper's Table 5):", head, *map(_row, cases)]
-    return [*lines, "Blocks at rest on a plane:", *map(_row, sizes)]
 
+    def rows(given: list[dict]) -> str:
+        lines = []
+        for case in given:
+            iterations = f"{case['substeps']} x {case['iterations']}"
+            times = [case["ms"][name] for name in MS]
+            lines.append(
+                [case["model"], _size(case), case["particles"], iterations, *times, case["memory_mb"]]
+            )
+        return text_table(HEADERS, lines, FORMATS)
 
-def _row(case: dict) -> str:
-    size, ms = case["radius_mm"] or case["cell_mm"], case["ms"]
-    return (
-        f"{case['model']:15}{size:>5g} mm{case['particles']:>10}{case['substeps']:>6} x {case['iterations']:<2}"
-        f"{ms['mean']:>8.2f}{ms['sd']:>7.2f}{ms['min']:>7.2f}{ms['max']:>8.2f}{ms['median']:>8.2f}"
-        f"{case['memory_mb']:>8.1f}"
-    )
+    title = "Time of a step (ms), over warm-up and press (the paper's Table 5):"
+    return "\n".join([title, rows(cases), "\nBlocks at rest on a plane:", rows(sizes)])
 
 
 def pieces(cases: list[dict]) -> list[str]:
-    """The paper's Figure 8 in figures."""
+    """The numbers of the paper's Figure 8."""
     lines = []
     for case in cases:
-        phases, size = case["phases_ms"], case["radius_mm"] or case["cell_mm"]
+        phases = case["phases_ms"]
         total = sum(phases.values())
-        lines.append(f"\nPieces of a step, {case['model']} {size:g} mm (mean ms, share):")
+        lines.append(f"\nPieces of a step, {case['model']} {_size(case):g} mm (mean ms, share):")
         lines += [f"  {name:20}{ms:8.3f}{100 * ms / total:6.1f} %" for name, ms in phases.items()]
     return lines
 
@@ -132,3 +157,86 @@ def against(figures: dict) -> list[str]:
             f"membership-iterations a second against {figures['million_a_second']:.0f}: {figures['times_pypbd']:.1f} times"
         )
     return lines
+
+
+def figure_of(presses: list["TimedPress"], sizes: list[dict]) -> Figure:
+    """The paper's Figures 7 and 8, its Table 5 and time against size, in four panels."""
+    figure = Figure(figsize=(13, 9), layout="constrained")
+    panels = figure.subplots(2, 2)
+    matched = [press for press in presses if press.case["model"] == "shape-matching"]
+    _over_time(panels[0, 0], matched[0])
+    _pieces(panels[0, 1], presses)
+    _radii(panels[1, 0], matched)
+    _sizes(panels[1, 1], sizes)
+    for axes in (panels[0, 0], panels[1, 0], panels[1, 1]):
+        axes.grid(alpha=0.3, which="both")
+        axes.legend()
+    return figure
+
+
+def _over_time(axes: Axes, press: "TimedPress") -> None:
+    """The paper's Figure 7."""
+    case = press.case
+    contacts = [sum(ms.get(name, 0.0) for name in CONTACTS) for ms in press.pieces_ms]
+    axes.plot(press.elapsed_s, press.step_ms, linewidth=0.8, label="whole step")
+    axes.plot(press.elapsed_s, contacts, linewidth=0.8, label="contacts")
+    axes.axvline(press.warm_up_s, color="0.5", linestyle="--", linewidth=0.8)
+    axes.annotate(" press", (press.warm_up_s, 0), color="0.4", va="bottom")
+    axes.set_ylim(0, 1.5 * sorted(press.step_ms)[int(0.98 * len(press.step_ms))])
+    title = f"Time of a step, {case['particles']} particles of {case['radius_mm']:g} mm (the paper's Fig. 7)"
+    axes.set(title=title, xlabel="simulated time (s)", ylabel="ms")
+
+
+def _pieces(axes: Axes, presses: list["TimedPress"]) -> None:
+    """The paper's Figure 8, for every model and size."""
+    shares = []
+    for press in presses:
+        phases = press.case["phases_ms"]
+        shares.append({name: 100 * ms / sum(phases.values()) for name, ms in phases.items()})
+    names = [*BEFORE, *IN_ITERATION[False], *IN_ITERATION[True], *AFTER, "frames"]
+    shown = [name for name in names if max(share.get(name, 0.0) for share in shares) > LEAST_SHARE]
+    left = np.zeros(len(presses))
+    for number, name in enumerate(shown):
+        width = np.array([share.get(name, 0.0) for share in shares])
+        colour = colormaps["tab20"](number)
+        axes.barh(range(len(presses)), width, left=left, color=colour, label=name)
+        left += width
+    axes.barh(range(len(presses)), 100 - left, left=left, color="0.8", label="the rest")
+    axes.set_yticks(
+        range(len(presses)), [f"{each.case['model']} {_size(each.case):g} mm" for each in presses]
+    )
+    axes.invert_yaxis()
+    axes.set(title="Pieces of a step (the paper's Fig. 8)", xlabel="% of the step", xlim=(0, 100))
+    axes.legend(fontsize=8, ncols=1, loc="center left", bbox_to_anchor=(1.0, 0.5))
+
+
+def _radii(axes: Axes, matched: list["TimedPress"]) -> None:
+    """The paper's Table 5."""
+    cases = [press.case for press in matched]
+    rows = [(case["radius_mm"], *(case["ms"][key] for key in ("mean", "min", "max"))) for case in cases]
+    for shown, marker, colour, name in (
+        (rows, "o", "tab:blue", "here, one core"),
+        (PAPER_MS, "s", "0.5", "the paper's, a GPU of 1536 cores"),
+    ):
+        radius, mean, least, most = np.array(shown).T
+        spread = [mean - least, most - mean]
+        axes.errorbar(radius, mean, spread, fmt=marker, color=colour, capsize=3, label=name)
+    axes.axhline(FRAME_MS, color="0.6", linestyle=":", label="1/60 s")
+    title = "Mean, minimum and maximum of a step (the paper's Table 5)"
+    axes.set(title=title, xlabel="particle radius (mm)", ylabel="ms", ylim=(0, None))
+
+
+def _sizes(axes: Axes, sizes: list[dict]) -> None:
+    for model, name, place in (
+        ("shape-matching", "shape matching, 3 x 9", dict(xytext=(4, -9))),
+        ("neo-hookean", "neo-Hookean, 1 x 8", dict(xytext=(-4, 5), ha="right")),
+    ):
+        rows = [size for size in sizes if size["model"] == model]
+        points = [(row["particles"], row["ms"]["median"]) for row in rows]
+        axes.loglog(*zip(*points, strict=True), "o-", label=name)
+        for row, point in zip(rows, points, strict=True):
+            text = f"{row['memory_mb']:.0f} MB"
+            axes.annotate(text, point, fontsize=7, textcoords="offset points", **place)
+    axes.axhline(FRAME_MS, color="0.6", linestyle=":", label="1/60 s")
+    title = "Blocks at rest: time and memory against size"
+    axes.set(title=title, xlabel="particles or nodes", ylabel="median ms a step")

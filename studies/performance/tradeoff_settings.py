@@ -1,4 +1,4 @@
-"""Which settings ``study trade`` tries: model, resolution, substeps, iterations and relaxation."""
+"""The settings that ``study trade`` tries: model, resolution, substeps, iterations and relaxation."""
 
 from rehearsal.configuration import PRESETS, Setup, setup_of
 
@@ -6,7 +6,7 @@ CELLS_MM = (10.0, 8.0, 6.0, 5.0, 4.0, 3.5, 3.0, 2.5, 2.0)
 CELL_ITERATIONS = (1, 2, 4, 8, 12, 20)
 RADII_MM = (2.2, 2.5, 2.7, 3.0, 3.3, 4.0, 5.0)
 # Substeps and iterations; the paper's first.
-PASSES = ((3, 9), (1, 9), (3, 3), (1, 27), (3, 27))
+SUBSTEPS_ITERATIONS = ((3, 9), (1, 9), (3, 3), (1, 27), (3, 27))
 # The paper's Table 3: the best stiffness for each radius.
 PAPER = tuple(
     setup_of("shape-matching", radius_mm=radius, stiffness=stiffness)
@@ -21,7 +21,7 @@ QUICK = (
 
 
 def setups(quick: bool) -> list[Setup]:
-    """All that are tried, each once, those of one model and size together."""
+    """All settings, each once, those of one model and size together."""
     if quick:
         return _sorted(list(QUICK))
     balanced = PRESETS["neo-hookean"]["balanced"]
@@ -35,7 +35,7 @@ def setups(quick: bool) -> list[Setup]:
     particles = [
         setup_of("shape-matching", radius_mm=radius, substeps=substeps, iterations=iterations)
         for radius in RADII_MM
-        for substeps, iterations in PASSES
+        for substeps, iterations in SUBSTEPS_ITERATIONS
     ]
     stiff = [setup_of("shape-matching", radius_mm=radius, stiffness=1.0) for radius in (2.7, 3.3, 5.0)]
     relaxed = [setup_of("shape-matching", radius_mm=radius, relaxation_factor=1.5) for radius in (2.7, 3.3)]

@@ -1,4 +1,4 @@
-"""Sweeps that nobody planned, to hold a planned one against: straight, row by row, and by chance."""
+"""Baselines for a planned sweep: straight, row by row, and random."""
 
 from collections.abc import Callable
 from functools import partial
@@ -18,28 +18,28 @@ from rehearsal.planning.sweep_trial import Trial
 
 
 def straight(trial: Trial) -> SweepPath:
-    """One pass over the target's middle, straight down on the organ."""
+    """One pass over the middle of the target, pressed straight down on the organ."""
     layout, half = _seen_from_above(trial)
     return _rows(trial, layout, half, 1)
 
 
 def row_by_row(trial: Trial) -> SweepPath:
-    """As many passes side by side, straight down, as the target is wide."""
+    """Passes side by side, pressed straight down, that cover the width of the target."""
     layout, half = _seen_from_above(trial)
     return _rows(trial, layout, half, passes_needed(half[0], image_width_mm(trial.rehearsal, layout)))
 
 
 def random_sweep(trial: Trial, count: int, seed: int) -> SweepPath:
-    """Passes anywhere over the target, each with a heading and depth of its own, square to the surface."""
+    """Random passes over the target, each with its own heading and depth, perpendicular to the surface."""
     layout, half = _seen_from_above(trial)
-    chance = np.random.default_rng(seed)
+    random = np.random.default_rng(seed)
     passes: list[np.ndarray] = []
     while len(passes) < count:
-        aside, ahead = chance.uniform(-half, half)
-        turned = layout.turned((0.0, 0.0), chance.uniform(-180.0, 180.0))
+        aside, ahead = random.uniform(-half, half)
+        turned = layout.turned((0.0, 0.0), random.uniform(-180.0, 180.0))
         centre = layout.centre + aside * layout.lateral + ahead * layout.ahead
         one = SweepLayout(centre, turned.outward, turned.ahead, turned.lateral)
-        depth = chance.uniform(0.0, 2 * DEFAULT_DEPTH_MM)
+        depth = random.uniform(0.0, 2 * DEFAULT_DEPTH_MM)
         passes += sliding(trial.rehearsal.manipulator, one, np.zeros(1), -half[1], half[1], depth, 1.0).passes
     return SweepPath(tuple(passes))
 
@@ -50,7 +50,7 @@ def planned(trial: Trial, sweep: PlannedSweep) -> SweepPath:
 
 
 def _seen_from_above(trial: Trial) -> tuple[SweepLayout, np.ndarray]:
-    """The target's middle as the scene's press meets it, and half of its size across and along (2,) [mm]."""
+    """A layout over the target's middle along the scene's press, and half of the target's size across and along (2,) [mm]."""
     coverage, press = trial.coverage, trial.rehearsal.press
     places = coverage.places(trial.target)
     layout = layout_towards(places.mean(axis=0), -np.array(press.direction), np.array(press.lateral))
@@ -67,5 +67,5 @@ UNPLANNED = {"straight": straight, "row by row": row_by_row}
 
 
 def random_sweeps(count: int, seeds: range) -> list[Callable[[Trial], SweepPath]]:
-    """One for each seed, as ``TrialWorkers.try_paths`` takes them."""
+    """A random sweep for each seed, as ``TrialWorkers.try_paths`` takes them."""
     return [partial(random_sweep, count=count, seed=seed) for seed in seeds]

@@ -1,4 +1,4 @@
-"""The command ``study plan``: what planning a sweep is worth."""
+"""The command ``study plan``: planned sweeps against unplanned ones."""
 
 from pathlib import Path
 from typing import Any
@@ -9,14 +9,28 @@ from tqdm import tqdm
 
 from rehearsal.commands.command_line import WholeRange, make_folder
 from rehearsal.planning.plan_file import MOST_SWEEPS
-from rehearsal.result_files import write_json
 from scenes.anatomy import load_anatomy
 from scenes.scene import EMBEDDED, load_scene, scene_file, with_options
+from studies.study_options import jobs_option, out_option
+from studies.study_results import text_table, write_results
+
+HEADERS = (
+    "sweep",
+    "covered, %",
+    "compression, mean, mm",
+    "maximum, mm",
+    "contact, %",
+    "incidence, deg",
+    "path, mm",
+    "reachable, %",
+    "score",
+)
+FORMATS = ("", ".0f", ".1f", ".1f", ".0f", ".0f", ".0f", ".0f", ".1f")
 
 
 @click.command("plan")
 @click.argument("scenes", type=click.Path(path_type=Path), nargs=-1)
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the figures.")
+@out_option
 @click.option(
     "--trials",
     type=WholeRange(MOST_SWEEPS, 100_000),
@@ -25,9 +39,9 @@ from scenes.scene import EMBEDDED, load_scene, scene_file, with_options
     help="Scans a search.",
 )
 @click.option("--probe", default="drop-in", show_default=True, help="Probe, by its name or as a file.")
-@click.option("--jobs", type=WholeRange(1, 256), help="Processes [as many as there are processors].")
+@jobs_option
 def plan_study(scenes: tuple[Path, ...], out: Path, trials: int, probe: str, jobs: int | None) -> None:
-    """Compare planned sweeps with straight ones, and such by chance.
+    """Compare planned sweeps with straight and random ones.
 
     Over the tumour and 5 mm around it, in SCENES [the embedded patient].
     A kidney without a tumour is given one.
@@ -46,22 +60,23 @@ def plan_study(scenes: tuple[Path, ...], out: Path, trials: int, probe: str, job
             run = compare(scene, anatomy, trials, jobs, bar.update)
             runs.append(dict(patient=scene.title or f"patient {number}") | run)
             bar.update(number * bar.total // len(patients) - bar.n)
-    write_json(dict(trials=trials, runs=runs), out / "plan.json")
-    click.echo("\n".join(["", *(line for run in runs for line in table(run))]))
-    click.echo(f"\nWrote plan.json to {out}")
+    write_results(out, "plan", dict(trials=trials, runs=runs), "\n".join(map(table, runs)))
 
 
-def table(run: dict[str, Any]) -> list[str]:
+def table(run: dict[str, Any]) -> str:
     """The figures of one patient."""
-    lines = [
-        f"{run['patient']}, {run['probe']}: {run['plan']}",
-        f"{'sweep':<14}seen  squeezed, mean and most, mm  lines touching       off square  path, mm  reachable  points",
+    rows = [
+        [
+            row["sweep"] if row["count"] == 1 else f"{row['sweep']} ({row['count']})",
+            100 * row["seen"],
+            row["compression_mean_mm"],
+            row["compression_max_mm"],
+            100 * row["contact"],
+            row["incidence_deg"],
+            row["path_mm"],
+            100 * row["reachable"],
+            row["score"],
+        ]
+        for row in run["rows"]
     ]
-    for row in run["rows"]:
-        name = row["sweep"] if row["count"] == 1 else f"{row['sweep']} ({row['count']})"
-        lines.append(
-            f"{name:<14}{100 * row['seen']:>3.0f} %{row['compression_mean_mm']:>20.1f}{row['compression_max_mm']:>10.1f}"
-            f"{100 * row['contact']:>14.0f} %{row['incidence_deg']:>12.0f} deg{row['path_mm']:>10.0f}"
-            f"{100 * row['reachable']:>9.0f} %{row['score']:>8.1f}"
-        )
-    return [*lines, ""]
+    return f"{run['patient']}, {run['probe']}: {run['plan']}\n{text_table(HEADERS, rows, FORMATS)}\n"

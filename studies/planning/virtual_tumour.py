@@ -1,4 +1,4 @@
-"""A tumour put into a kidney that has none, so that there is something to plan for."""
+"""A virtual tumour for a kidney that has none, as a target of planning."""
 
 from dataclasses import replace
 
@@ -8,12 +8,12 @@ import trimesh
 from scenes.anatomy import LoadedAnatomy
 
 RADIUS_MM = 10.0
-# So far under the surface its top lies [mm], and there along the organ it is: a share of its length from the lower pole.
+# Depth of its top under the surface [mm], and its place along the organ: a share of the length from the lower pole.
 UNDER_MM, ALONG = 1.5, 0.35
 
 
 def with_tumour(anatomy: LoadedAnatomy, gravity: np.ndarray) -> LoadedAnatomy:
-    """The anatomy with a ball just under the highest place of its organ there, where it has no tumour of its own."""
+    """The anatomy with a ball just under the highest point of its organ, unless it has a tumour of its own."""
     if anatomy.tumour is not None:
         return anatomy
     organ, up = anatomy.organ, -np.asarray(gravity) / np.linalg.norm(gravity)

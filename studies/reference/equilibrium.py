@@ -11,9 +11,9 @@ from studies.reference.penalty_contact import PenaltyContact
 
 LEAST_VOLUME_RATIO = 0.05
 SEARCHES, LEAST_REACH = 6, 1e-6
-# Tethers that let a body find its way: each tighter or looser by a factor than the one before, as its iterations tell.
+# The stiffness of the tether is changed by a factor from step to step, according to the number of iterations.
 TETHER_FACTOR, EASY_ITERATIONS, TETHERED_ITERATIONS, MOST_TETHERS = 4.0, 6, 12, 80
-# Their steps are found to within this, and to within this share of what was left.
+# Tolerance of a tethered step, absolute and as a share of the residual before.
 TETHERED_TOLERANCE, LESS = 1e-4, 0.1
 
 
@@ -23,30 +23,30 @@ class NotConvergedError(Exception):
 
 @dataclass
 class Balance:
-    """How far a state is from equilibrium."""
+    """Unbalanced forces of a state."""
 
-    residual: np.ndarray  # what is left of all forces on the nodes [mN], shape (nodes, 3)
-    forces: float  # sum of the loads', contacts' and constraints' lengths [mN]
+    residual: np.ndarray  # sum of all forces on the nodes [mN], shape (nodes, 3)
+    forces: float  # sum of the magnitudes of loads, contact and constraint forces [mN]
 
     @property
     def relative(self) -> float:
-        """Sum of the residual's lengths, as a share of the forces'."""
+        """Magnitude of the residual, as a share of that of the forces."""
         return self.size / max(self.forces, 1e-12)
 
     @property
     def size(self) -> float:
-        """Sum of the residual's lengths [mN]."""
+        """Sum of the residual's magnitudes over the nodes [mN]."""
         return float(np.linalg.norm(self.residual, axis=1).sum())
 
 
 class Equilibrium:
-    """A solid, what it touches and what it carries.
+    """A solid with its contacts and loads.
 
     Attributes:
-        contacts: obstacles that may touch it.
+        contacts: contacts with obstacles.
         load: forces on the nodes [mN], shape (nodes, 3).
-        fixed: displacements that are given, shape (nodes, 3) bool.
-        tether_kpa_mm2: stiffness per volume that holds each node to where it is tethered to: a proximal term.
+        fixed: prescribed displacements (Dirichlet), shape (nodes, 3) bool.
+        tether_kpa_mm2: stiffness per volume of a proximal term, springs to ``tethered_to``.
         tethered_to: displacements [mm], shape (nodes, 3).
     """
 
@@ -63,12 +63,12 @@ class Equilibrium:
         self._free = np.flatnonzero(~self.fixed.ravel())
 
     def balance(self, displacement: np.ndarray) -> Balance:
-        """Forces left over at displacements [mm], shape (nodes, 3)."""
+        """Unbalanced forces at displacements [mm], shape (nodes, 3)."""
         pushes = [contact.force(displacement)[0] for contact in self.contacts]
         tether = self.tether_kpa_mm2 * self.solid.volume_share[:, None] * (displacement - self.tethered_to)
         residual = self.solid.elastic_force(displacement) + tether - self.load - sum(pushes)
-        held = np.where(self.fixed, residual, 0.0)
-        forces = sum(np.linalg.norm(part, axis=1).sum() for part in (self.load, held, *pushes))
+        reactions = np.where(self.fixed, residual, 0.0)
+        forces = sum(np.linalg.norm(part, axis=1).sum() for part in (self.load, reactions, *pushes))
         return Balance(np.where(self.fixed, 0.0, residual), float(forces))
 
     def tangent(self, displacement: np.ndarray) -> csc_matrix:
@@ -86,21 +86,21 @@ class Equilibrium:
         tolerance: float,
         most: int = 40,
     ) -> tuple[np.ndarray, float, int]:
-        """Newton's method with a line search on the work that the residual does along the step.
+        """Newton's method with a line search on the residual's work along the step.
 
         Args:
-            guess: displacements to begin with [mm], shape (nodes, 3).
-            tolerance: the relative residual to reach.
-            most: number of iterations after which it gives up.
+            guess: initial displacements [mm], shape (nodes, 3).
+            tolerance: on the relative residual.
+            most: largest number of iterations.
 
         Returns:
-            Displacements [mm], shape (nodes, 3), the relative residual that is left, and the number of iterations.
+            Displacements [mm], shape (nodes, 3), relative residual, number of iterations.
 
         Raises:
             NotConvergedError: no equilibrium was found.
         """
         if self.solid.least_volume_ratio(guess) <= LEAST_VOLUME_RATIO:
-            raise NotConvergedError("the guess turns tissue inside out, or nearly")
+            raise NotConvergedError("the initial displacements invert tetrahedra, or nearly")
         state, balance = guess, self.balance(guess)
         least = np.inf
         for iteration in range(most + 1):
@@ -113,21 +113,21 @@ class Equilibrium:
     def relaxed(
         self, state: np.ndarray, tolerance: float, tether_kpa_mm2: float
     ) -> tuple[np.ndarray, float, int]:
-        """Where a body that is out of balance goes by itself: steps of slow motion, longer while they come easily.
+        """Equilibrium by slow motion, in which each step is tethered to the end of the last one.
 
-        Pseudo-transient continuation (Kelley & Keyes, SIAM J. Numer. Anal. 35, 1998): each step is tethered to where
-        the last one ended, and so is found even where the body jumps. Friction's anchors are carried along.
+        Pseudo-transient continuation (Kelley & Keyes, SIAM J. Numer. Anal. 35, 1998): it converges even where the body
+        jumps. Steps become longer while they converge easily. The anchors of friction are updated after each step.
 
         Args:
-            state: displacements to begin with [mm], shape (nodes, 3).
-            tolerance: the relative residual to reach without a tether.
+            state: initial displacements [mm], shape (nodes, 3).
+            tolerance: on the relative residual without a tether.
             tether_kpa_mm2: stiffness per volume of the first tether.
 
         Returns:
-            Displacements [mm], shape (nodes, 3), the relative residual that is left, and the number of steps.
+            Displacements [mm], shape (nodes, 3), relative residual, number of steps.
 
         Raises:
-            NotConvergedError: it came to no end.
+            NotConvergedError: no equilibrium was found.
         """
         left = np.inf
         for step in range(1, MOST_TETHERS + 1):
@@ -152,7 +152,7 @@ class Equilibrium:
     def _newton_step(self, state: np.ndarray, balance: Balance) -> np.ndarray:
         matrix = self.tangent(state)[self._free][:, self._free].tocsc()
         try:
-            # The order is made for little fill: pivots stay on the diagonal unless they vanish.
+            # Ordering for little fill-in; pivots stay on the diagonal unless they vanish.
             factor = splu(
                 matrix,
                 permc_spec="MMD_AT_PLUS_A",
@@ -168,13 +168,12 @@ class Equilibrium:
         return step.reshape(state.shape)
 
     def _searched(self, state: np.ndarray, balance: Balance, step: np.ndarray) -> tuple[np.ndarray, Balance]:
-        """Somewhere along a step that is neither too far for the work nor, where that can be had, for the residual.
+        """A line search for the residual's work, then a shorter step if it also reduces the residual.
 
-        Without friction the residual's work is the slope of the energy, so the first search is for its valley.
-        Points that stick on one side of the step and slide on the other let Newton's method go to and fro
-        between two states; shorter steps break that.
+        Without friction the residual's work is the slope of the energy. Points that stick at one end of the step and
+        slide at the other make Newton's method alternate between two states; shorter steps prevent that.
         """
-        reach, found = self._in_the_valley(state, step)
+        reach, found = self._line_search(state, step)
         for shorter in (reach / 2, reach / 4, reach / 8):
             if found.size <= balance.size:
                 break
@@ -183,17 +182,17 @@ class Equilibrium:
                 reach, found = shorter, tried
         return state + reach * step, found
 
-    def _in_the_valley(self, state: np.ndarray, step: np.ndarray) -> tuple[float, Balance]:
-        """The share of a step where the work has fallen to half, or all of it if that does not go too far.
+    def _line_search(self, state: np.ndarray, step: np.ndarray) -> tuple[float, Balance]:
+        """The share of a step at which the work is at most half, 1 where that is enough.
 
-        By false position, kept off the ends (Crisfield, *Non-linear Finite Element Analysis of Solids and
+        Regula falsi with a safeguard (Crisfield, *Non-linear Finite Element Analysis of Solids and
         Structures* 1, 1991, section 9.2.2).
         """
         reach = 1.0
         while self.solid.least_volume_ratio(state + reach * step) <= LEAST_VOLUME_RATIO:
             reach /= 2
             if reach < LEAST_REACH:
-                raise NotConvergedError("the way on turns tissue inside out")
+                raise NotConvergedError("the step inverts tetrahedra")
         low, high = 0.0, np.inf
         work_low = before = self._work(state, step)[0]
         work_high = 0.0

@@ -1,7 +1,7 @@
-"""The bead experiment: a kidney laid into its support, left to its weight, and pressed by a transducer.
+"""The bead experiment: a kidney that settles in its support under gravity and is pressed by a transducer.
 
-z is up, gravity and press go down. The answer depends on the way there, as friction does: lowered until it
-touches, settled in slow motion, then the transducer in increments.
+z is up. The solution depends on the loading path, as friction does: the kidney is lowered until it touches, settles in
+slow motion, and then the transducer moves down in increments.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,20 +18,20 @@ from studies.reference.smooth_obstacles import FAR_MM, DistanceField, RoundedBox
 
 GRAVITY_M_S2, FRICTION = 9.81, 0.35
 STAGE_TOLERANCE, PATH_TOLERANCE = 1e-5, 5e-5
-# First tethers: of the kidney that gravity pulls into its support, and of tissue that jumps round the probe's edge,
-# where there is no equilibrium on the way.
+# First tethers: while the kidney settles, and where tissue jumps around the edge of the probe, so that there is no
+# continuous path of equilibria.
 SETTLING_KPA_MM2, JUMPING_KPA_MM2 = 1e-2, 4.0
-# The transducer starts with small increments, as the first contact grows fastest, and tries longer ones.
+# Increments of the press; the first ones are small, as the contact area then grows fastest.
 FIRST_INCREMENT_MM, MOST_INCREMENT_MM, LEAST_INCREMENT_MM = 0.3, 1.2, 0.15
 LONGER, EASY_ITERATIONS, MOST_ITERATIONS = 1.4, 7, 15
 TOUCHING_MM = 1e-6
-# A pressure of the size that tissue bears, and no more, tells Newton's method where the first contact is.
+# A softer contact, with pressures of the order of the tissue's stiffness, gives the first guess.
 SOFT_KPA_MM, SOFT_TOLERANCE = 100.0, 2e-2
 
 
 @dataclass(frozen=True)
 class FemPress:
-    """A transducer cuboid that goes straight down, its long side along x.
+    """A transducer cuboid that moves straight down, its long side along x.
 
     Attributes:
         over_mm: x and y of its centre.
@@ -60,9 +60,9 @@ class FemStage:
 
 @dataclass
 class _Path:
-    """How far the press has come; displacements [mm], shape (nodes, 3)."""
+    """Progress of the press; displacements [mm], shape (nodes, 3)."""
 
-    home_mm: float  # height of the transducer's centre where it just touched
+    home_mm: float  # height of the transducer's centre at first contact
     state: np.ndarray
     before: np.ndarray  # displacements an increment earlier
     depth_mm: float = 0.0
@@ -70,18 +70,18 @@ class _Path:
     step_mm: float = FIRST_INCREMENT_MM
 
     def extrapolated(self, depth_mm: float) -> np.ndarray:
-        """Displacements at a depth if all went on as in the last increment."""
+        """Displacements at a depth [mm], extrapolated from the last increment."""
         return self.state + (self.state - self.before) * (depth_mm - self.depth_mm) / self.last_mm
 
-    def go_on(self, state: np.ndarray, depth_mm: float, easily: bool) -> None:
-        """Take a solution; try a longer increment next if it came easily."""
+    def append(self, state: np.ndarray, depth_mm: float, easily: bool) -> None:
+        """Take a solution; the next increment is longer if this one converged easily."""
         self.before, self.state = self.state, state
         self.last_mm, self.depth_mm = depth_mm - self.depth_mm, depth_mm
         if easily:
             self.step_mm = min(LONGER * self.step_mm, MOST_INCREMENT_MM)
 
     def jump(self, state: np.ndarray, depth_mm: float) -> None:
-        """Take a solution that is no continuation: the path goes on from it as it went before."""
+        """Take a solution after a jump; the extrapolation keeps the increment before the jump."""
         self.before = state - (self.state - self.before)
         self.state, self.depth_mm = state, depth_mm
 
@@ -102,13 +102,13 @@ class FemExperiment:
         friction: float = FRICTION,
         report: Callable[[str], None] = lambda text: None,
     ) -> None:
-        """Set up; meshes in one frame [mm], the kidney not yet touching its support."""
+        """Meshes are in one frame [mm], and the kidney does not yet touch its support."""
         self.solid, self.press, self._report = FemSolid(mesh, material), press, report
         self.worst_residual = 0.0
         surface = ContactSurface(self.solid)
         box = RoundedBox(np.array(press.size_mm), press.edge_mm)
         self.support = PenaltyContact(surface, DistanceField(support), Law(300.0, friction))
-        # Stiff enough for 0.05 mm of overlap at 20 kPa; stiffer ones cost many iterations at the probe's edges.
+        # 0.05 mm of overlap at 20 kPa; stiffer contact needs many more iterations at the edges of the probe.
         law = Law(800.0, friction, soft_mm=0.05)
         self.probe = PenaltyContact(surface, box, law, np.array([*press.over_mm, FAR_MM]))
         weight = self.solid.weight(np.array([0.0, 0.0, -GRAVITY_M_S2]))
@@ -127,11 +127,11 @@ class FemExperiment:
             yield self._stage(goal, path.state, residual)
 
     def _advance(self, path: _Path, goal: float) -> float:
-        """One increment towards a goal [mm], shorter or in slow motion where Newton's method has no solution.
+        """One increment towards a goal [mm], shorter or in slow motion where Newton's method does not converge.
 
-        Returns the relative residual. Raises NotConvergedError.
+        Return the relative residual. Raises NotConvergedError.
         """
-        # A rest too short for an increment of its own is taken along.
+        # A remainder too short for its own increment is included.
         after = goal if goal - path.depth_mm < 1.1 * path.step_mm else path.depth_mm + path.step_mm
         self._move_probe(path.home_mm - after)
         guess = path.extrapolated(after) if path.last_mm else self._first_guess(path.state)
@@ -142,23 +142,23 @@ class FemExperiment:
             if after - path.depth_mm > LEAST_INCREMENT_MM:
                 path.step_mm = (after - path.depth_mm) / 2
                 return self._advance(path, goal)
-            sound = self.solid.least_volume_ratio(guess) > LEAST_VOLUME_RATIO
-            start = guess if sound else path.state
+            valid = self.solid.least_volume_ratio(guess) > LEAST_VOLUME_RATIO
+            start = guess if valid else path.state
             solved, residual, steps = self.equilibrium.relaxed(start, tolerance, JUMPING_KPA_MM2)
             path.jump(solved, after)
         else:
             self._carry(solved)
-            path.go_on(solved, after, steps <= EASY_ITERATIONS)
+            path.append(solved, after, steps <= EASY_ITERATIONS)
         self._report(f"{after:6.2f} mm deep, {steps} steps, residual {residual:.0e}")
         self.worst_residual = max(self.worst_residual, residual)
         return residual
 
     def _settled(self) -> tuple[np.ndarray, float]:
-        """Lowered until it touches, then left to its weight: displacements and what is left of the residual."""
+        """Displacements and relative residual after lowering to contact and settling under gravity."""
         state = np.zeros_like(self.solid.rest)
         while abs(gap := self.support.gaps(state).min()) > 1e-4:
             if gap == FAR_MM:
-                raise NotConvergedError("the kidney does not lie over its support")
+                raise NotConvergedError("the kidney is not above its support")
             state = state - [0.0, 0.0, gap]
         self._carry(state)
         state, residual, steps = self.equilibrium.relaxed(state, STAGE_TOLERANCE, SETTLING_KPA_MM2)
@@ -166,7 +166,7 @@ class FemExperiment:
         return state, residual
 
     def _first_guess(self, state: np.ndarray) -> np.ndarray:
-        """The first contact against a softer transducer: a whole increment's depth is no pressure for tissue."""
+        """Contact with a softer transducer, as a whole increment of overlap would be an unrealistic pressure."""
         stiff = self.probe.law
         self.probe.law = replace(stiff, stiffness_kpa_mm=SOFT_KPA_MM)
         try:
@@ -177,10 +177,10 @@ class FemExperiment:
             self.probe.law = stiff
 
     def _touching_height(self, state: np.ndarray) -> float:
-        """Height of the transducer's centre [mm] where, coming from above, it touches the surface and no more."""
+        """Height of the transducer's centre [mm] at first contact from above."""
         height = self.probe.surface.points(state)[:, 2].max() + self.press.size_mm[2]
         self._move_probe(height)
-        # It cannot touch before it has gone as far as it is away.
+        # Lowering by the gap cannot pass the first contact.
         while (gap := self.probe.gaps(state).min()) > TOUCHING_MM:
             height -= gap
             if height < self.probe.surface.points(state)[:, 2].min():

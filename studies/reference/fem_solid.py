@@ -7,7 +7,7 @@ W = mu/2 (tr C - 3) - mu ln J + lambda/2 (ln J)^2, so P = mu (F - F^-T) + lambda
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csc_matrix
+from scipy.sparse import coo_matrix, csc_matrix
 from skfem import Basis, ElementTetP2, MeshTet, MeshTet2
 
 INVERSION_STEPS = 12
@@ -33,7 +33,7 @@ class FemMaterial:
 
 
 class MeshError(ValueError):
-    """Why a mesh does not make a body, in one line."""
+    """A mesh that is not valid; the message is one line."""
 
 
 class FemSolid:
@@ -42,7 +42,7 @@ class FemSolid:
     Attributes:
         rest: nodes [mm], shape (nodes, 3): corners first, then the middles of edges.
         nodes_of: nodes of each tetrahedron, shape (tets, 10), in scikit-fem's order.
-        volume_share: volume that each node stands for [mm^3], shape (nodes,); all positive.
+        volume_share: volume of each node [mm^3], shape (nodes,); all positive.
     """
 
     def __init__(self, mesh: MeshTet2, material: FemMaterial) -> None:
@@ -59,7 +59,10 @@ class FemSolid:
         self._gradients = np.stack([f[0].grad for f in self.basis.basis]).transpose(2, 3, 0, 1).copy()
         share = np.repeat(self._weights.sum(axis=1) / 10, 10)
         self.volume_share = np.bincount(self.nodes_of.ravel(), share, len(self.rest))
-        self._pattern = _Pattern(self.nodes_of, len(self.rest))
+        freedoms = (
+            (3 * self.nodes_of[:, :, None] + np.arange(3)).reshape(len(self.nodes_of), -1).astype(np.int32)
+        )
+        self._entries = np.repeat(freedoms, 30, axis=1).ravel(), np.tile(freedoms, 30).ravel()
 
     def deformation(self, displacement: np.ndarray) -> np.ndarray:
         """Deformation gradients F at the Gauss points, shape (tets, 4, 3, 3), for displacements [mm] (nodes, 3)."""
@@ -67,7 +70,7 @@ class FemSolid:
         return np.eye(3) + moved @ self._gradients
 
     def least_volume_ratio(self, displacement: np.ndarray) -> float:
-        """Least det F of all Gauss points; not positive where tissue is turned inside out."""
+        """Least det F of all Gauss points; not positive in inverted tetrahedra."""
         return float(np.linalg.det(self.deformation(displacement)).min())
 
     def volume_ratio(self, displacement: np.ndarray) -> float:
@@ -76,7 +79,7 @@ class FemSolid:
         return float((ratio * self._weights).sum() / self._weights.sum())
 
     def elastic_force(self, displacement: np.ndarray) -> np.ndarray:
-        """Forces that hold the nodes against the tissue's stress [mN], shape (nodes, 3): integral of P grad N."""
+        """Internal forces [mN], shape (nodes, 3): integral of P grad N."""
         deformation = self.deformation(displacement)
         spatial, log_ratio = self._spatial_gradients(deformation)
         mu, lam = self.material.mu_kpa, self.material.lambda_kpa
@@ -113,19 +116,12 @@ class FemSolid:
         return self.gathered(shares[..., None] * force_density)
 
     def shares_at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What each node has in a point inside the body.
+        """Nodes, shape (n, 10), and their shape functions, shape (n, 10), at points at rest [mm], shape (n, 3).
 
-        Args:
-            points: places at rest [mm], shape (n, 3).
-
-        Returns:
-            Nodes, shape (n, 10), and their shares, which sum to 1, shape (n, 10).
-
-        Raises:
-            ValueError: a point is outside.
+        Raises ValueError for a point outside the body.
         """
         corners = MeshTet(np.ascontiguousarray(self.rest[: self.mesh.nvertices].T), self.mesh.t)
-        # Straight tetrahedra tell which one it is, or a neighbour so near that its polynomial serves as well.
+        # The straight tetrahedron of a point is its own, or a neighbour so near that its polynomial can be used.
         nodes = self.nodes_of[corners.element_finder()(*points.T)]
         local = np.full(points.T.shape, 0.25)
         for _ in range(INVERSION_STEPS):
@@ -138,32 +134,17 @@ class FemSolid:
         return nodes, shares
 
     def gathered(self, of_tets: np.ndarray) -> np.ndarray:
-        """Sum of what each tetrahedron adds to its nodes: shape (tets, 10, 3) to (nodes, 3)."""
+        """Sum of the tetrahedra's contributions to the nodes: shape (tets, 10, 3) to (nodes, 3)."""
         nodes = self.nodes_of.ravel()
         parts = of_tets.reshape(-1, 3).T
         return np.stack([np.bincount(nodes, part, len(self.rest)) for part in parts], axis=1)
 
     def assembled(self, of_tets: np.ndarray) -> csc_matrix:
         """Sparse matrix of blocks (tets, 10, 3, 10, 3); rows and columns are 3 node + axis."""
-        return self._pattern.matrix(of_tets)
+        rows, columns = self._entries
+        size = 3 * len(self.rest)
+        return coo_matrix((of_tets.ravel(), (rows, columns)), shape=(size, size)).tocsc()
 
     def _spatial_gradients(self, deformation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """F^-T grad N, shape (tets, 4, 10, 3), and ln J, shape (tets, 4)."""
         return self._gradients @ np.linalg.inv(deformation), np.log(np.linalg.det(deformation))
-
-
-class _Pattern:
-    """Where each entry of the tetrahedra's blocks goes in the sparse matrix: found once, used in every step."""
-
-    def __init__(self, nodes_of: np.ndarray, nodes: int) -> None:
-        freedoms = (3 * nodes_of[:, :, None] + np.arange(3)).reshape(len(nodes_of), -1).astype(np.int64)
-        self._size = 3 * nodes
-        keys = freedoms[:, None, :] * self._size + freedoms[:, :, None]
-        unique, slots = np.unique(keys, return_inverse=True)
-        self._slots = slots.ravel()
-        self._rows = (unique % self._size).astype(np.int32)
-        self._starts = np.searchsorted(unique // self._size, np.arange(self._size + 1)).astype(np.int32)
-
-    def matrix(self, blocks: np.ndarray) -> csc_matrix:
-        values = np.bincount(self._slots, blocks.ravel(), len(self._rows))
-        return csc_matrix((values, self._rows, self._starts), shape=(self._size, self._size))

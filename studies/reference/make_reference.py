@@ -31,7 +31,7 @@ class Sizes:
         return BULK_OF_NEAR * self.near_mm
 
     def coarser(self) -> "Sizes":
-        """Sizes for the mesh that shows how much the mesh matters."""
+        """Sizes of the coarser mesh of the convergence study."""
         return Sizes(COARSER * self.near_mm)
 
     def mesh(self, kidney: trimesh.Trimesh, press: FemPress) -> MeshTet2:
@@ -55,20 +55,20 @@ def make_reference(
     sizes: Sizes,
     report: Callable[[str], None],
 ) -> ReferenceCase:
-    """The case of the embedded patient, solved on a mesh and, for its error, on a coarser one.
+    """The case of the embedded patient, solved on a mesh and, for the discretisation error, on a coarser one.
 
     Args:
         organ: its surface in LPS [mm].
         mould: the support's surface in LPS [mm].
         gravity: its direction in LPS, shape (3,).
         sizes: of the mesh that the case is made of.
-        report: told what happens, a line at a time.
+        report: called with each line of progress.
 
     Raises:
         MeshError: no mesh fills the organ.
         NotConvergedError: no equilibrium was found.
     """
-    kidney, support = laid(organ, gravity, organ), laid(mould, gravity, organ)
+    kidney, support = in_case_frame(organ, gravity, organ), in_case_frame(mould, gravity, organ)
     beads = blue_noise(kidney)
     coarse = solved(kidney, support, beads, sizes.coarser(), report)
     case = solved(kidney, support, beads, sizes, report)
@@ -112,7 +112,7 @@ def solved(
     )
 
 
-def laid(surface: trimesh.Trimesh, gravity: np.ndarray, organ: trimesh.Trimesh) -> trimesh.Trimesh:
+def in_case_frame(surface: trimesh.Trimesh, gravity: np.ndarray, organ: trimesh.Trimesh) -> trimesh.Trimesh:
     """A surface in the frame of the files: z against gravity, x along the organ's length, its centre of mass 0."""
     up = -np.asarray(gravity, float) / np.linalg.norm(gravity)
     length = np.linalg.svd(organ.vertices - organ.vertices.mean(axis=0), full_matrices=False)[2][0]

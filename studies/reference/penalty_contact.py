@@ -1,8 +1,8 @@
-"""PenaltyContact of the tissue's surface with rigid obstacles: a penalty on the gap, and Coulomb friction.
+"""Penalty contact of the tissue's surface with rigid obstacles: a penalty on the gap, and Coulomb friction.
 
 At each of 12 points of a face, with d = -gap > 0, the pressure is eps d^2 / (2 delta) for d < delta and
-eps (d - delta/2) beyond. Friction is an elastic stick that gives way at Coulomb's limit, a return mapping with
-anchors that are carried from increment to increment (Wriggers, *Computational PenaltyContact Mechanics*, 2nd ed. 2006,
+eps (d - delta/2) beyond. Friction is elastic up to Coulomb's limit, a return mapping with anchors
+that are updated after each increment (Wriggers, *Computational Contact Mechanics*, 2nd ed. 2006,
 chapters 5.2 and 10.5). Areas are those at rest.
 """
 
@@ -31,7 +31,7 @@ class Obstacle(Protocol):
 
 @dataclass(frozen=True)
 class Law:
-    """What an obstacle does to the tissue that touches it."""
+    """Contact law of an obstacle."""
 
     stiffness_kpa_mm: float
     friction: float = 0.35
@@ -51,15 +51,10 @@ class Law:
         return (1 + self.blend) * self.friction * pressure / self.stick_kpa_mm
 
     def friction_share(self, stretch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How the elastic stick gives way at Coulomb's limit.
+        """Transition from elastic slip to sliding, phi(r) / r and phi'(r), shapes (n,).
 
-        Args:
-            stretch: what the stick alone would carry, as a share of the limit, shape (n,).
-
-        Returns:
-            What is carried as a share of what the stick alone would carry, phi(r) / r, and phi'(r); shapes (n,).
-            A parabola joins phi = r to phi = 1: with a corner there, points that stick on one side and slide on the
-            other send Newton's method to and fro.
+        ``stretch`` is r, the elastic friction as a share of Coulomb's limit, shape (n,). A parabola joins phi = r and
+        phi = 1: with a corner there Newton's method would alternate between sticking and sliding points.
         """
         beyond = np.clip(stretch - (1 - self.blend), 0.0, 2 * self.blend)
         carried = np.minimum(stretch, 1 + self.blend) - beyond**2 / (4 * self.blend)
@@ -68,12 +63,12 @@ class Law:
 
 
 class ContactSurface:
-    """The points of a solid's boundary at which contact is looked at: 12 on each face of 6 nodes.
+    """Contact points on the boundary of a solid: 12 on each face of 6 nodes.
 
     Attributes:
-        tets: tetrahedron that each point belongs to, shape (points,).
-        shares: what each of its 10 nodes has in the point, shape (points, 10).
-        areas: area at rest that each point stands for [mm^2], shape (points,).
+        tets: tetrahedron of each point, shape (points,).
+        shares: shape functions of its 10 nodes at the point, shape (points, 10).
+        areas: area at rest of each point [mm^2], shape (points,).
     """
 
     def __init__(self, solid: FemSolid) -> None:
@@ -97,7 +92,7 @@ class ContactSurface:
         self.areas = np.linalg.norm(np.cross(*across), axis=1) * np.tile(weights, len(faces))
 
     def points(self, displacement: np.ndarray) -> np.ndarray:
-        """Where the points are [mm], shape (points, 3), for displacements (nodes, 3)."""
+        """Positions [mm], shape (points, 3), for displacements (nodes, 3)."""
         nodes = (self.solid.rest + displacement)[self.solid.nodes_of[self.tets]]
         return np.einsum("pa,pai->pi", self.shares, nodes)
 
@@ -106,7 +101,7 @@ class PenaltyContact:
     """One obstacle against one surface.
 
     Attributes:
-        offset: where the obstacle's frame stands [mm], shape (3,).
+        offset: origin of the obstacle's frame [mm], shape (3,).
     """
 
     def __init__(
@@ -121,22 +116,18 @@ class PenaltyContact:
         return self.obstacle.gap(self.surface.points(displacement) - self.offset)
 
     def carry(self, displacement: np.ndarray) -> None:
-        """End an increment: each anchor follows its point as far as that one slid, and a free point's altogether."""
+        """End an increment: the anchor of a sliding point follows it by its slip, that of a free point wholly."""
         places = self.surface.points(displacement) - self.offset
         touching = np.flatnonzero(self.obstacle.gap(places) < 0)
         pressure = self.law.pressure(self.obstacle.gap(places[touching]))[0]
         slip = self._slip(places[touching], touching)[0]
         length = np.linalg.norm(slip, axis=1)
-        held = np.minimum(self.law.most_slip(pressure) / np.maximum(length, TINY), 1.0)
+        share = np.minimum(self.law.most_slip(pressure) / np.maximum(length, TINY), 1.0)
         self._anchors = places
-        self._anchors[touching] -= held[:, None] * slip
+        self._anchors[touching] -= share[:, None] * slip
 
     def force(self, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What the obstacle does to the tissue.
-
-        Returns:
-            Forces on the nodes [mN], shape (nodes, 3), and their sum, shape (3,).
-        """
+        """Contact forces on the nodes [mN], shape (nodes, 3), and their sum, shape (3,)."""
         places, touching = self._touching(displacement)
         traction = self._pressure(places)[0] + self._friction(places, touching)[0]
         on_points = traction * self.surface.areas[touching, None]
@@ -146,7 +137,7 @@ class PenaltyContact:
         return self.surface.solid.gathered(of_tets), on_points.sum(axis=0)
 
     def add_stiffness(self, displacement: np.ndarray, blocks: np.ndarray) -> None:
-        """Take the derivative of `force` off the tetrahedra's blocks [mN/mm], shape (tets, 10, 3, 10, 3)."""
+        """Subtract the derivative of `force` from the tetrahedra's blocks [mN/mm], shape (tets, 10, 3, 10, 3)."""
         places, touching = self._touching(displacement)
         slope = self._pressure(places)[1] + self._friction(places, touching)[1]
         slope *= self.surface.areas[touching, None, None]

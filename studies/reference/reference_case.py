@@ -1,7 +1,7 @@
 """The reference as a case folder, which `validate` reads.
 
-The format is version 1 of what studies/accuracy/bead_case.py reads: case.toml, kidney.stl, support.stl, beads.csv, and for a look at
-the solution result.npz; lengths mm, forces N, z up, the kidney's centre of mass at the origin.
+The format is version 1 of what studies/accuracy/bead_case.py reads: case.toml, kidney.stl, support.stl, beads.csv, and the solution in
+result.npz; lengths mm, forces N, z up, the kidney's centre of mass at the origin.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ DIGITS = 6
 
 @dataclass(frozen=True)
 class ReferenceCase:
-    """A solved experiment and all that went into it; lengths mm, in the frame of the files."""
+    """A solved experiment and its inputs; lengths mm, in the frame of the files."""
 
     name: str
     note: str
@@ -34,15 +34,14 @@ class ReferenceCase:
     press: FemPress
     friction: float
     stages: list[FemStage]
-    mesh: dict  # how it was made, for case.toml's [fem]
+    mesh: dict  # for case.toml's [fem]
     provenance: dict
-    to_coarser_mm: np.ndarray | None = (
-        None  # how far the beads are from a coarser mesh's, shape (stages, beads)
-    )
+    # Distance of the beads from those of a coarser mesh [mm], shape (stages, beads).
+    to_coarser_mm: np.ndarray | None = None
 
     @cached_property
     def moved_beads(self) -> np.ndarray:
-        """Where the beads are at each stage [mm], shape (stages, beads, 3)."""
+        """Positions of the beads at each stage [mm], shape (stages, beads, 3)."""
         nodes, shares = self.solid.shares_at(self.beads)
         return np.stack(
             [
@@ -60,7 +59,7 @@ class ReferenceCase:
         (folder / "case.toml").write_text(tomli_w.dumps(self.description()), "utf-8")
 
     def summary(self) -> str:
-        """What was solved and how good it is, for the terminal."""
+        """The solution and its discretisation error."""
         lines = [
             f"mesh      {len(self.solid.nodes_of)} tetrahedra of 10 nodes, {len(self.solid.rest)} nodes; "
             f"{self.mesh['time_s']:.0f} s"
@@ -73,11 +72,13 @@ class ReferenceCase:
             )
             if self.to_coarser_mm is not None:
                 apart = self.to_coarser_mm[index]
-                lines[-1] += f"; a coarser mesh is {apart.mean():.3f} mm off, {apart.max():.3f} at most"
+                lines[-1] += (
+                    f"; difference to a coarser mesh {apart.mean():.3f} mm, {apart.max():.3f} at most"
+                )
         return "\n".join(lines)
 
     def description(self) -> dict:
-        """What case.toml says."""
+        """Contents of case.toml."""
         material, weight = (
             self.solid.material,
             np.linalg.norm(self.solid.weight(np.array([0, 0, -GRAVITY_M_S2])).sum(axis=0)),
@@ -203,5 +204,5 @@ class ReferenceCase:
 
 
 def _rounded(value):
-    """A number or an array as TOML has it: to a nanometre or a micronewton."""
+    """A number or an array for TOML, to a nanometre or a micronewton."""
     return np.round(np.asarray(value, float), DIGITS).tolist()

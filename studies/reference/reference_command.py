@@ -1,4 +1,4 @@
-"""The command ``reference``: a case for ``validate`` that the project makes itself."""
+"""The command ``reference``: a bead experiment for ``validate``, computed by finite elements."""
 
 from pathlib import Path
 
@@ -6,19 +6,20 @@ import click
 import numpy as np
 import trimesh
 
-from rehearsal.commands.command_line import CommandError, NumberRange, make_folder
+from rehearsal.commands.command_line import CommandError, make_folder
 from scenes.anatomy import load_anatomy
 from scenes.scene import PAPER, load_scene
+from studies.study_options import number_option
 
 
 @click.command()
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder to write the case to.")
-@click.option(
+@number_option(
     "--edge",
     "edge_mm",
-    type=NumberRange(2, 10),
+    low=2,
+    high=10,
     default=4.0,
-    show_default=True,
     help="Length in mm of the elements' edges by the transducer.",
 )
 def reference(out: Path, edge_mm: float) -> None:

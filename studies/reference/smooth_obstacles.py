@@ -1,8 +1,12 @@
 """Rigid obstacles as smooth distances with first and second derivatives, which Newton's method needs."""
 
+from itertools import combinations_with_replacement
+
 import igl
 import numpy as np
 import trimesh
+from numpy.typing import ArrayLike
+from scipy.interpolate import NdBSpline
 from scipy.ndimage import spline_filter
 
 FAR_MM = 1e3
@@ -42,50 +46,42 @@ class RoundedBox:
 
 
 class DistanceField:
-    """A closed surface through a tricubic B-spline of its signed distance, sampled on a grid.
+    """A closed surface as a tricubic B-spline of its signed distance, sampled on a grid.
 
     Args:
         surface: closed, normals outward, vertices [mm].
         grid_mm: spacing of the samples.
-        margin_mm: how far around the surface's box the field reaches; beyond it everything is far.
+        margin_mm: margin of the field around the surface's bounds.
     """
 
     def __init__(self, surface: trimesh.Trimesh, grid_mm: float = 1.0, margin_mm: float = 4.0) -> None:
         low, high = surface.bounds
-        self._origin, self._step = low - margin_mm, grid_mm
+        origin = low - margin_mm
         count = np.ceil((high - low + 2 * margin_mm) / grid_mm).astype(int) + 1
-        nodes = self._origin + grid_mm * np.indices(count).reshape(3, -1).T
-        self._coefficients = spline_filter(
-            signed_distance(surface, nodes).reshape(count), order=3, mode="mirror"
-        )
+        nodes = origin + grid_mm * np.indices(count).reshape(3, -1).T
+        coefficients = spline_filter(signed_distance(surface, nodes).reshape(count), order=3, mode="mirror")
+        # Basis function j is centred at sample j, so the first of its five knots is at j - 2.
+        knots = [start + grid_mm * np.arange(-2, n + 2) for start, n in zip(origin, count, strict=True)]
+        self._spline = NdBSpline(tuple(knots), coefficients, 3, extrapolate=False)
 
     def gap(self, points: np.ndarray) -> np.ndarray:
-        """Signed distance [mm], shape (n,)."""
-        return self._evaluated(points, [(0, 0, 0)], FAR_MM)[0]
+        """Signed distance [mm], shape (n,); FAR_MM outside the field."""
+        return self._derivative(points, (0, 0, 0), FAR_MM)
 
     def slopes(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gradient, shape (n, 3), and second derivatives [1/mm], shape (n, 3, 3)."""
         axes = np.eye(3, dtype=int)
-        orders = [*axes] + [axes[i] + axes[j] for i in range(3) for j in range(3)]
-        values = self._evaluated(points, [tuple(order) for order in orders], 0.0)
-        return values[:3].T, values[3:].T.reshape(-1, 3, 3)
+        gradient = np.empty((len(points), 3))
+        second = np.empty((len(points), 3, 3))
+        for i, j in combinations_with_replacement(range(3), 2):
+            second[:, i, j] = second[:, j, i] = self._derivative(points, axes[i] + axes[j], 0.0)
+        for i in range(3):
+            gradient[:, i] = self._derivative(points, axes[i], 0.0)
+        return gradient, second
 
-    def _evaluated(self, points: np.ndarray, orders: list[tuple[int, ...]], elsewhere: float) -> np.ndarray:
-        """Derivatives of the spline, each of its orders along x, y and z; shape (orders, n)."""
-        values = np.full((len(orders), len(points)), elsewhere)
-        place = (points - self._origin) / self._step
-        cell = np.floor(place).astype(int)
-        inside = ((cell >= 1) & (cell < np.array(self._coefficients.shape) - 2)).all(axis=1)
-        cell, place = cell[inside], (place - cell)[inside]
-        window = cell[:, :, None] + np.arange(-1, 3)
-        near = self._coefficients[
-            window[:, 0, :, None, None], window[:, 1, None, :, None], window[:, 2, None, None, :]
-        ]
-        weights = [_cubic(place, order) / self._step**order for order in range(3)]
-        for value, (i, j, k) in zip(values, orders, strict=True):
-            along_z = np.einsum("nxyz,nz->nxy", near, weights[k][:, 2])
-            value[inside] = np.einsum("nxy,nx,ny->n", along_z, weights[i][:, 0], weights[j][:, 1])
-        return values
+    def _derivative(self, points: np.ndarray, order: ArrayLike, outside: float) -> np.ndarray:
+        values = self._spline(points, nu=order)
+        return np.where(np.isnan(values), outside, values)
 
 
 def signed_distance(surface: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
@@ -96,19 +92,3 @@ def signed_distance(surface: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
         np.ascontiguousarray(surface.faces, np.int64),
         igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER,
     )[0]
-
-
-def _cubic(t: np.ndarray, order: int) -> np.ndarray:
-    """The four uniform cubic B-splines that reach a place t in [0, 1) of a cell, or a derivative of them."""
-    if order == 0:
-        pieces = [
-            (1 - t) ** 3 / 6,
-            2 / 3 - t**2 + t**3 / 2,
-            2 / 3 - (1 - t) ** 2 + (1 - t) ** 3 / 2,
-            t**3 / 6,
-        ]
-    elif order == 1:
-        pieces = [-((1 - t) ** 2) / 2, 1.5 * t**2 - 2 * t, 2 * (1 - t) - 1.5 * (1 - t) ** 2, t**2 / 2]
-    else:
-        pieces = [1 - t, 3 * t - 2, 1 - 3 * t, t]
-    return np.stack(pieces, axis=-1)

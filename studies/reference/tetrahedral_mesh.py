@@ -29,7 +29,7 @@ def tetrahedra(surface: trimesh.Trimesh, size_mm: Callable[[np.ndarray], np.ndar
         size_mm: wanted lengths of edges [mm], shape (n,), at points [mm], shape (n, 3).
 
     Returns:
-        The mesh [mm]; all its nodes on the boundary lie on the surface.
+        The mesh [mm]; all its boundary nodes are on the surface.
 
     Raises:
         MeshError: Mmg fails, or its mesh does not fill the surface.
@@ -58,7 +58,7 @@ def tetrahedra(surface: trimesh.Trimesh, size_mm: Callable[[np.ndarray], np.ndar
     volume = Basis(mesh, ElementTetP2(), intorder=3).dx.sum()
     if abs(volume / surface.volume - 1) > VOLUME_ERROR:
         raise MeshError(
-            f"the mesh holds {volume:.0f} of {surface.volume:.0f} mm^3: too coarse for this surface"
+            f"the mesh has {volume:.0f} of {surface.volume:.0f} mm^3: too coarse for this surface"
         )
     return mesh
 

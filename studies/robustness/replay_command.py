@@ -1,4 +1,4 @@
-"""The command ``study replay``: is a recorded session, computed again, the same to the bit?"""
+"""The command ``study replay``: is a recorded session, computed again, identical to the bit?"""
 
 from pathlib import Path
 from typing import Any
@@ -6,40 +6,27 @@ from typing import Any
 import click
 from tqdm import tqdm
 
-from rehearsal.commands.command_line import NumberRange, arch_option, load_patient, make_folder, start_taichi
+from rehearsal.commands.command_line import arch_option, load_patient, make_folder, start_taichi
 from rehearsal.configuration import PRESETS
-from rehearsal.result_files import write_json
 from scenes.scene import EMBEDDED
-from scenes.tissue import QUALITIES, TISSUES, USUAL
+from scenes.tissue import TISSUES, USUAL
+from studies.study_options import number_option, out_option, preset_option, scene_argument
+from studies.study_results import write_results
 
 
 @click.command()
-@click.argument("scene", type=click.Path(path_type=Path), default=EMBEDDED, required=False)
+@scene_argument(EMBEDDED)
+@out_option
+@number_option("--minutes", low=0.05, high=600, default=10.0, help="Simulated minutes.")
 @click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="Folder for the session and the figures."
+    "--model", type=click.Choice(list(TISSUES)), default=USUAL, show_default=True, help="Tissue model."
 )
-@click.option(
-    "--minutes", type=NumberRange(0.05, 600), default=10.0, show_default=True, help="Simulated minutes."
-)
-@click.option(
-    "--model",
-    type=click.Choice(list(TISSUES)),
-    default=USUAL,
-    show_default=True,
-    help="Tissue model.",
-)
-@click.option(
-    "--quality",
-    type=click.Choice(QUALITIES),
-    default="balanced",
-    show_default=True,
-    help="A preset of the model.",
-)
+@preset_option
 @arch_option
 def replay(scene: Path, out: Path, minutes: float, model: str, quality: str, arch: str) -> None:
     """Record a session in SCENE and compute it again.
 
-    It is led by chance; from its file it is computed twice, and once from its middle.
+    Its input is random; from its file it is computed twice, and once from its middle.
     """
     make_folder(out)
     loaded, anatomy = load_patient(scene)
@@ -51,21 +38,19 @@ def replay(scene: Path, out: Path, minutes: float, model: str, quality: str, arc
     with tqdm(total=total, desc="replay", unit="step") as bar:
         found = measure(loaded, anatomy, setup, minutes, used, out, bar.update)
     figures = dict(arch=used, model=model, quality=quality) | found
-    write_json(figures, out / "replay.json")
-    click.echo("\n".join(["", *lines_of(figures)]))
-    click.echo(f"\nWrote {found['file']} and replay.json to {out}")
+    write_results(out, "replay", figures, summary(figures))
 
 
-def lines_of(figures: dict[str, Any]) -> list[str]:
-    """The figures in words."""
+def summary(figures: dict[str, Any]) -> str:
+    """The session and its replays, a line each."""
     lines = [
-        f"recorded  {figures['minutes']:g} minutes, {figures['moments']} moments, {figures['ways_back']} of them undone, redone, reset or "
-        f"gone back to a bookmark; {figures['megabytes']:.1f} MB; ends in state {figures['digest']}"
+        f"recorded  {figures['minutes']:g} minutes, {figures['moments']} steps, {figures['ways_back']} of them undone, redone, reset or "
+        f"returned to a bookmark; {figures['megabytes']:.1f} MB in {figures['file']}; final state {figures['digest']}"
     ]
     for run in figures["replays"]:
         same = run["digest"] == figures["digest"] and run["differs_s"] is None
         verdict = "identical" if same else f"DIFFERS from {run['differs_s']} s on"
         lines.append(
-            f"replayed  from {run['begins_s']:.0f} s: ends in state {run['digest']}, {verdict} in {run['compared']} states compared"
+            f"replayed  from {run['begins_s']:.0f} s: final state {run['digest']}, {verdict} in {run['compared']} states compared"
         )
-    return lines
+    return "\n".join(lines)

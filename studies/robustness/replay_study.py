@@ -1,4 +1,4 @@
-"""A long session, led by chance and recorded, and computed again from its file: does it end in the same bits?"""
+"""A long session of random input, recorded, and computed again from its file: is the final state identical?"""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,22 +21,22 @@ from scenes.scene import Scene
 from sim.device import start
 
 SEED = 20161130
-# Chance changes what the user does so often; the mouse comes from so far above the organ.
+# Time between two changes of the input, and distance of the mouse ray's origin from the organ.
 CHANGE_S, FROM_MM = 0.7, 60.0
-# How often one of these is done instead of leading the transducer.
-SELDOM = {"undo": 0.06, "redo": 0.03, "bookmark": 0.03, "to_bookmark": 0.02, "reset": 0.01}
+# Probability of each of these at a change of the input.
+PROBABILITY = {"undo": 0.06, "redo": 0.03, "bookmark": 0.03, "to_bookmark": 0.02, "reset": 0.01}
 
 
-def chance(rehearsal: Rehearsal, settings: Settings, moments: int) -> Iterator[Controls]:
-    """What a restless user would do: the same each time."""
+def random_input(rehearsal: Rehearsal, settings: Settings, steps: int) -> Iterator[Controls]:
+    """Input of a restless user, the same each time."""
     random = np.random.default_rng(SEED)
     manipulator = rehearsal.manipulator
     above = np.flatnonzero(manipulator.normals @ rehearsal.gravity_direction < -0.5)
     every = round(CHANGE_S / rehearsal.settings.time_step_s)
     lasting: dict[str, Any] = {}
-    for moment in range(moments):
+    for step in range(steps):
         controls = Controls(settings)
-        if moment % every == 0:
+        if step % every == 0:
             at = int(random.choice(above))
             lasting = dict(
                 ray=(manipulator.vertices[at] + FROM_MM * manipulator.normals[at], -manipulator.normals[at]),
@@ -46,8 +46,8 @@ def chance(rehearsal: Rehearsal, settings: Settings, moments: int) -> Iterator[C
                 rock_deg=float(random.normal(0, 0.2)),
                 tilt_deg=float(random.normal(0, 0.2)),
             )
-            for name, share in SELDOM.items():
-                setattr(controls, name, bool(random.random() < share))
+            for name, probability in PROBABILITY.items():
+                setattr(controls, name, bool(random.random() < probability))
             if settings.young_kpa is not None and random.random() < 0.1:
                 settings.young_kpa = float(random.uniform(8, 25))
             if random.random() < 0.1:
@@ -66,15 +66,15 @@ def recorded_session(
     out: Path,
     done: Callable[[int], Any],
 ) -> tuple[Path, str]:
-    """Record a session led by chance; its file, and the state's digest at its end."""
+    """Record a session of random input; its file, and the digest of its final state."""
     start(arch)
     rehearsal = Rehearsal(scene_of(scene, setup), anatomy)
     session = Session(rehearsal)
-    # What a step costs would otherwise have its say, and another session would be recorded each time.
     recorded = record(session, anatomy, arch, out)
+    # Without a limit of time: iterations that adapt to it would record another session each time.
     live = UserInput(session, AdaptiveIterations(np.inf), recorded)
-    moments = round(60 * minutes / rehearsal.settings.time_step_s)
-    for controls in chance(rehearsal, initial_settings(rehearsal), moments):
+    steps = round(60 * minutes / rehearsal.settings.time_step_s)
+    for controls in random_input(rehearsal, initial_settings(rehearsal), steps):
         pose = live.next_pose(controls)
         if pose is not None:
             rehearsal.advance(pose)
@@ -94,12 +94,12 @@ def replayed(
     arch: str,
     done: Callable[[int], Any],
 ) -> dict[str, Any]:
-    """Compute a session again, from the last stored state before a time on; how it ended."""
+    """Compute a session again from the last stored state before a time [s]."""
     start(arch)
     rehearsal = Rehearsal(scene_of(scene, setup), anatomy)
     replay = Replay(rehearsal, log)
     begins = replay.begin_at(from_s)
-    # The way from there to the time itself is not counted.
+    # The steps from there to the time itself are not counted.
     done(begins - replay.step_at(from_s))
     for _ in replay.go_to(log.length_s):
         done(1)
@@ -114,7 +114,7 @@ def replayed(
 def measure(
     scene: Scene, anatomy: LoadedAnatomy, setup: Setup, minutes: float, arch: str, out: Path, done: Callable
 ) -> dict[str, Any]:
-    """Record, replay twice, and once from the stored state in the middle."""
+    """Record a session, replay it twice, and once from the stored state in the middle."""
     path, digest = recorded_session(scene, anatomy, setup, minutes, arch, out, done)
     log = read_log(path)
     runs = [

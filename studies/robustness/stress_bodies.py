@@ -1,4 +1,4 @@
-"""The bodies that ``study stability`` maltreats: each settled, with its guard, its transducer and its skin."""
+"""The bodies of the stress test: each at rest, with its divergence check, its transducer and its surface."""
 
 from dataclasses import replace
 
@@ -24,19 +24,19 @@ from studies.robustness.stress_motion import AWAY_MM
 from studies.uniform_blocks import block_of_cells, block_of_particles
 from ultrasound.probe_manipulator import advanced, pose_at, touching
 
-# Bodies other than the kidney lie on a plane [mm].
+# Bodies other than the kidney rest on a plane [mm].
 ELLIPSOID_MM, BALL_MM, APART_MM = (30.0, 18.0, 15.0), 12.0, 40.0
 SIZE_MM = {"neo-hookean": 6.0, "shape-matching": 3.3}
 TRANSDUCER_MM = np.array([20.0, 6.0, 20.0])
 DENSITY = 1.05e-3
 DOWN = (0.0, 0.0, -9810.0)
-# So many steps at a time, until nothing moves any more.
+# Steps between two checks of whether the body still moves.
 SETTLE_STEPS, MOST_SETTLES, STILL_MM_S = 180, 20, 0.05
 
 
 class Specimen:
-    """A body at rest in its scene. ``home`` is the transducer's pose (4, 4) where it just touches, ``parts`` the indices of
-    the points of each separate piece, ``mass`` (n,) [g], ``rest`` (n, 3) [mm] where the points came to rest.
+    """A body at rest in its scene. ``home`` is the transducer's pose (4, 4) of first contact, ``parts`` the indices of
+    the points of each separate piece, ``mass`` (n,) [g], ``rest`` (n, 3) [mm] the points at rest.
     """
 
     def __init__(
@@ -63,18 +63,27 @@ class Specimen:
         return np.full(self.body.count, DENSITY * self.volume / self.body.count)
 
     def volume_ratio(self) -> float:
-        """Volume inside the carried surface, as a share of the resting one."""
+        """Volume inside the surface, as a share of that of the resting shape."""
         self.skin.update()
         return volume_mm3(array_of(self.skin.vertices), self.faces) / self.volume
 
     def kinetic_mj(self) -> float:
-        """Kinetic energy now [mJ]."""
+        """Kinetic energy [mJ]."""
         velocity = array_of(self.body.velocity).astype(float)
         return float(0.5e-6 * self.mass @ (velocity**2).sum(axis=1))
 
+    def is_finite(self) -> bool:
+        """Whether all positions are finite."""
+        return bool(np.isfinite(array_of(self.body.position)).all())
+
+    def rest_error_mm(self) -> float:
+        """Mean distance [mm] of the points from their rest positions."""
+        position = array_of(self.body.position).astype(float)
+        return float(np.linalg.norm(position - self.rest, axis=1).mean())
+
 
 def prepared(model: str, subject: Subject) -> Specimen:
-    """Put a body on a fresh device and let it come to rest."""
+    """A body on a freshly started device, at rest."""
     start("cpu")
     if subject.kind == "kidney":
         return _kidney(model)
@@ -104,7 +113,7 @@ def _kidney(model: str) -> Specimen:
     scene = load_scene(PAPER)
     anatomy = replace(load_anatomy(scene, PAPER.parent), ct=None)
     rehearsal = Rehearsal(with_options(scene, {"tissue.model": model, **size}), anatomy)
-    # What is measured from is where the tissue does not move any more.
+    # Recovery is measured from where the tissue has stopped moving.
     away = advanced(rehearsal.manipulator.home, -AWAY_MM)
     for _ in range(SETTLE_STEPS):
         rehearsal.advance(away)
@@ -145,7 +154,7 @@ def _filled(
 
 
 def _block(model: str, side: int, shapes: list, tool: ConvexTool) -> tuple[Solver, StepSettings]:
-    """A cell or a particle alone, or two of them along each edge, which are one cluster."""
+    """One cell or particle, or two of them along each edge, which are one cluster."""
     size = SIZE_MM[model]
     if model == "neo-hookean":
         return block_of_cells(side, size, shapes, tool), replace(LATTICE_SETTINGS)
@@ -159,6 +168,6 @@ def _settle(solver: Solver, settings: StepSettings, tool: ConvexTool) -> None:
     for _ in range(MOST_SETTLES):
         for _ in range(SETTLE_STEPS):
             solver.step(settings)
-        # A cell that falls alone tumbles on for seconds, on some processors longer than on others.
+        # A single falling cell tumbles for seconds, on some processors longer than on others.
         if np.abs(array_of(solver.body.velocity)).max() < STILL_MM_S:
             return

@@ -1,11 +1,16 @@
-"""What is done to a body in ``study stability``: some 290 maltreatments of each tissue model, in words and numbers."""
+"""What the stress test of ``study stability`` does: some 290 cases for each tissue model, in words and numbers."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any
 
 SIZES_MM = (1.0, 1.5, 2.2, 3.3, 5.0, 7.0, 10.0)
 MODELS = ("neo-hookean", "shape-matching")
+AXES = ("x", "y", "z")
+PRESS = ("press", 12.38)
+# A body or its shape has recovered within this mean distance.
+RECOVERED_MM = 0.1
 
 
 @dataclass(frozen=True)
@@ -25,11 +30,11 @@ KIDNEY = Subject("kidney")
 
 @dataclass(frozen=True)
 class StressCase:
-    """One maltreatment: of whom, with which settings of the step, moved how by the transducer, from which state.
+    """One stress test: the body, the settings of the step, the motion of the transducer and the initial state.
 
-    ``settings`` are StepSettings' names, ``material`` young_kpa and poisson; ``probe`` and ``state`` a name in
-    ``motion.PROBES`` and ``motion.STATES`` and its numbers; ``gravity`` and ``heaviest`` multiply the scene's gravity and
-    the mass of one node. ``kind`` is what cases of one sort share.
+    ``settings`` are names of StepSettings, ``material`` young_kpa and poisson; ``probe`` and ``state`` are a name in
+    ``stress_motion.PROBES`` and ``stress_motion.STATES`` and its numbers; ``gravity`` and ``heaviest`` multiply the
+    scene's gravity and the mass of one node. Cases of one ``kind`` belong together.
     """
 
     kind: str
@@ -44,11 +49,8 @@ class StressCase:
 
     @property
     def name(self) -> str:
-        """The kind and its extreme, which no two cases of a model share."""
+        """Kind and extreme; unique among the cases of a model."""
         return f"{self.kind}: {self.extreme}"
-
-
-PRESS = ("press", 12.38)
 
 
 def cases_of(model: str) -> list[StressCase]:
@@ -67,106 +69,83 @@ def cases_of(model: str) -> list[StressCase]:
 
 
 def quick_cases_of(model: str) -> list[StressCase]:
-    """The last case of each kind on the kidney, which is the hardest, and the small bodies."""
+    """The last case of each kind on the kidney, which is the hardest, and the first ones of a particle or cell alone."""
     chosen: list[StressCase] = []
     for kind in dict.fromkeys(case.kind for case in cases_of(model)):
-        alike = [case for case in cases_of(model) if case.kind == kind]
-        if alike[0].subject == KIDNEY:
-            chosen.append(alike[-1])
-        elif alike[0].subject.kind == "one":
-            chosen += alike[:3]
+        of_kind = [case for case in cases_of(model) if case.kind == kind]
+        if of_kind[0].subject == KIDNEY:
+            chosen.append(of_kind[-1])
+        elif of_kind[0].subject.kind == "one":
+            chosen += of_kind[:3]
     return chosen
 
 
 def _step_settings() -> Iterator[StressCase]:
-    for dt in (1e-4, 1e-3, 1 / 240, 1 / 60, 1 / 30, 0.1, 0.3, 1.0):
-        for iterations in (1, 3, 10, 30, 100):
-            settings: dict[str, Any] = dict(time_step_s=dt, iterations=iterations)
-            yield StressCase(
-                "time step", f"{dt:.4g} s, {iterations} iterations", settings=settings, probe=PRESS
-            )
-    for factor in (1.0, 1.25, 1.5, 1.75, 1.9, 2.0):
-        for iterations in (2, 10, 100):
-            settings = dict(relaxation_factor=factor, iterations=iterations)
-            yield StressCase(
-                "over-relaxation", f"{factor:g}, {iterations} iterations", settings=settings, probe=PRESS
-            )
-    for substeps in (1, 2, 5, 20, 100):
-        for iterations in (1, 10):
-            settings = dict(substeps=substeps, iterations=iterations)
-            yield StressCase(
-                "substeps", f"{substeps}, {iterations} iterations", settings=settings, probe=PRESS
-            )
+    def case(kind: str, extreme: str, iterations: int, **settings: Any) -> StressCase:
+        settings["iterations"] = iterations
+        return StressCase(kind, f"{extreme}, {iterations} iterations", settings=settings, probe=PRESS)
+
+    for dt, n in product((1e-4, 1e-3, 1 / 240, 1 / 60, 1 / 30, 0.1, 0.3, 1.0), (1, 3, 10, 30, 100)):
+        yield case("time step", f"{dt:.4g} s", n, time_step_s=dt)
+    for factor, n in product((1.0, 1.25, 1.5, 1.75, 1.9, 2.0), (2, 10, 100)):
+        yield case("over-relaxation", f"{factor:g}", n, relaxation_factor=factor)
+    for substeps, n in product((1, 2, 5, 20, 100), (1, 10)):
+        yield case("substeps", f"{substeps}", n, substeps=substeps)
 
 
 def _material() -> Iterator[StressCase]:
-    for poisson in (0.0, 0.3, 0.45, 0.49, 0.499):
-        for iterations in (1, 8, 100):
-            material, settings = dict(poisson=poisson), dict(iterations=iterations)
-            extreme = f"{poisson:g}, {iterations} iterations"
-            yield StressCase("Poisson's ratio", extreme, material=material, settings=settings, probe=PRESS)
-    for young in (0.01, 0.1, 1.0, 100.0, 1e4, 1e6):
-        for dt in (1 / 240, 1 / 60, 0.1):
-            material, step = dict(young_kpa=young), dict(time_step_s=dt)
-            extreme = f"{young:g} kPa, {dt:.4g} s"
-            yield StressCase("Young's modulus", extreme, material=material, settings=step, probe=PRESS)
+    for poisson, n in product((0.0, 0.3, 0.45, 0.49, 0.499), (1, 8, 100)):
+        material, settings = dict(poisson=poisson), dict(iterations=n)
+        extreme = f"{poisson:g}, {n} iterations"
+        yield StressCase("Poisson's ratio", extreme, material=material, settings=settings, probe=PRESS)
+    for young, dt in product((0.01, 0.1, 1.0, 100.0, 1e4, 1e6), (1 / 240, 1 / 60, 0.1)):
+        material, step = dict(young_kpa=young), dict(time_step_s=dt)
+        extreme = f"{young:g} kPa, {dt:.4g} s"
+        yield StressCase("Young's modulus", extreme, material=material, settings=step, probe=PRESS)
 
 
 def _cluster_stiffness() -> Iterator[StressCase]:
-    for stiffness in (0.0, 0.01, 0.25, 0.5, 0.75, 1.0):
-        for dt in (1e-3, 1 / 240, 1 / 60, 0.1):
-            settings = dict(stiffness=stiffness, time_step_s=dt)
-            yield StressCase("stiffness", f"{stiffness:g}, {dt:.4g} s", settings=settings, probe=PRESS)
+    for stiffness, dt in product((0.0, 0.01, 0.25, 0.5, 0.75, 1.0), (1e-3, 1 / 240, 1 / 60, 0.1)):
+        settings = dict(stiffness=stiffness, time_step_s=dt)
+        yield StressCase("stiffness", f"{stiffness:g}, {dt:.4g} s", settings=settings, probe=PRESS)
 
 
 def _gravity() -> Iterator[StressCase]:
-    for times in (0.0, 0.1, 10.0, 100.0, 1000.0):
-        for dt in (1e-3, 1 / 240, 1 / 60, 0.1, 1.0):
-            yield StressCase(
-                "gravity", f"x {times:g}, {dt:.4g} s", settings=dict(time_step_s=dt), gravity=times
-            )
+    for times, dt in product((0.0, 0.1, 10.0, 100.0, 1000.0), (1e-3, 1 / 240, 1 / 60, 0.1, 1.0)):
+        settings = dict(time_step_s=dt)
+        yield StressCase("gravity", f"x {times:g}, {dt:.4g} s", settings=settings, gravity=times)
 
 
 def _probes() -> Iterator[StressCase]:
-    for depth in (2.0, 10.0, 20.0, 30.0, 40.0):
-        for dt in (1e-3, 1 / 60, 0.1):
-            settings = dict(time_step_s=dt)
-            yield StressCase(
-                "teleported", f"{depth:g} mm deep, {dt:.4g} s", settings=settings, probe=("teleport", depth)
-            )
-    for gap in (5.0, 1.0, 0.0, -2.0):
-        for iterations in (3, 30):
-            settings = dict(iterations=iterations)
-            extreme = f"to {gap:g} mm, {iterations} iterations"
-            yield StressCase("pressed flat", extreme, settings=settings, probe=("flat", gap))
-    for speed in (0.1, 1.0, 10.0):
-        for depth in (5.0, 15.0, 25.0):
-            yield StressCase(
-                "swept", f"{speed:g} m/s, {depth:g} mm deep", probe=("sweep", 1000 * speed, depth)
-            )
-    for speed in (10.0, 100.0, 1000.0):
-        for axis, name in enumerate(("lateral", "elevation", "long")):
-            yield StressCase("spun", f"{speed:g} rad/s, {name} axis", probe=("spin", speed, axis))
-    for name in ("in and out", "jitter", "tumble"):
-        for dt in (1e-3, 1 / 60, 0.1):
-            yield StressCase(name, f"{dt:.4g} s", settings=dict(time_step_s=dt), probe=(name,))
+    for depth, dt in product((2.0, 10.0, 20.0, 30.0, 40.0), (1e-3, 1 / 60, 0.1)):
+        extreme, settings = f"{depth:g} mm deep, {dt:.4g} s", dict(time_step_s=dt)
+        yield StressCase("teleported", extreme, settings=settings, probe=("teleport", depth))
+    for gap, n in product((5.0, 1.0, 0.0, -2.0), (3, 30)):
+        extreme, settings = f"to {gap:g} mm, {n} iterations", dict(iterations=n)
+        yield StressCase("pressed flat", extreme, settings=settings, probe=("flat", gap))
+    for speed, depth in product((0.1, 1.0, 10.0), (5.0, 15.0, 25.0)):
+        extreme = f"{speed:g} m/s, {depth:g} mm deep"
+        yield StressCase("swept", extreme, probe=("sweep", 1000 * speed, depth))
+    for speed, (axis, name) in product((10.0, 100.0, 1000.0), enumerate(("lateral", "elevation", "long"))):
+        yield StressCase("spun", f"{speed:g} rad/s, {name} axis", probe=("spin", speed, axis))
+    for name, dt in product(("in and out", "jitter", "tumble"), (1e-3, 1 / 60, 0.1)):
+        yield StressCase(name, f"{dt:.4g} s", settings=dict(time_step_s=dt), probe=(name,))
 
 
 def _states() -> Iterator[StressCase]:
-    for usual, settings in (("", {}), (", 1 iteration", dict(iterations=1))):
+    for suffix, settings in (("", {}), (", 1 iteration", dict(iterations=1))):
         for kind, states in STATES.items():
             for extreme, state in states:
-                yield StressCase(kind, extreme + usual, settings=settings, state=state)
+                yield StressCase(kind, extreme + suffix, settings=settings, state=state)
 
 
 def _each_axis(extreme: str, name: str, along: float, across: float) -> list[tuple[str, tuple]]:
-    """A state once for each axis, by its number along that and across it."""
+    """A state for each axis, with one number along that axis and another across it."""
     return [
         (extreme.format(axis), (name, *(along if each == axis else across for each in AXES))) for axis in AXES
     ]
 
 
-AXES = ("x", "y", "z")
 STATES: dict[str, list[tuple[str, tuple]]] = {
     "collapsed": [
         *_each_axis("to a plane, {}", "scaled", 0.0, 1.0),
@@ -222,39 +201,28 @@ def _small() -> Iterator[StressCase]:
 
 
 def _two() -> Iterator[StressCase]:
-    two = Subject("two")
-    for extreme, share in (("a quarter", 0.25), ("half", 0.5), ("wholly", 1.0)):
-        for iterations in (1, 9):
-            settings = dict(iterations=iterations)
-            yield StressCase(
-                "two overlapping",
-                f"{extreme}, {iterations} iterations",
-                two,
-                settings,
-                state=("overlapped", share),
-            )
-    yield StressCase("two overlapping", "pressed together", two, probe=("press", 6.0))
+    two, kind = Subject("two"), "two overlapping"
+    for (extreme, share), n in product((("a quarter", 0.25), ("half", 0.5), ("wholly", 1.0)), (1, 9)):
+        name, state = f"{extreme}, {n} iterations", ("overlapped", share)
+        yield StressCase(kind, name, two, dict(iterations=n), state=state)
+    yield StressCase(kind, "pressed together", two, probe=("press", 6.0))
 
 
 def _masses(model: str) -> Iterator[StressCase]:
-    for power in range(1, 7):
-        for name, probe in (("at rest", ("away",)), ("pressed", ("press", 6.0))):
-            ratio = 10.0**power
-            extreme = f"1e{power}, {name}"
-            if model == "neo-hookean":
-                yield StressCase(
-                    "mass ratio", extreme, Subject("ellipsoid", 5.0), probe=probe, heaviest=ratio
-                )
-            else:
-                yield StressCase("mass ratio", extreme, Subject("ellipsoid", 3.3, ratio), probe=probe)
+    probes = (("at rest", ("away",)), ("pressed", ("press", 6.0)))
+    for power, (name, probe) in product(range(1, 7), probes):
+        ratio, extreme = 10.0**power, f"1e{power}, {name}"
+        if model == "neo-hookean":
+            yield StressCase("mass ratio", extreme, Subject("ellipsoid", 5.0), probe=probe, heaviest=ratio)
+        else:
+            yield StressCase("mass ratio", extreme, Subject("ellipsoid", 3.3, ratio), probe=probe)
 
 
 def _sizes() -> Iterator[StressCase]:
+    press = ("press", 8.0)
     for size in SIZES_MM:
         subject = Subject("ellipsoid", size)
-        yield StressCase("size", f"{size:g} mm, pressed", subject, probe=("press", 8.0))
-        yield StressCase(
-            "size", f"{size:g} mm, 1 iteration", subject, dict(iterations=1), probe=("press", 8.0)
-        )
+        yield StressCase("size", f"{size:g} mm, pressed", subject, probe=press)
+        yield StressCase("size", f"{size:g} mm, 1 iteration", subject, dict(iterations=1), probe=press)
         yield StressCase("size", f"{size:g} mm, swept 10 m/s", subject, probe=("sweep", 1e4, 8.0))
         yield StressCase("size", f"{size:g} mm, scattered by 3 mm", subject, state=("scattered", 3.0))

@@ -1,4 +1,4 @@
-"""Where a maltreated body starts from, and how the transducer moves through it."""
+"""Initial states of the stress test, and motions of the transducer."""
 
 from collections.abc import Callable
 
@@ -8,15 +8,15 @@ from scipy.spatial.transform import Rotation
 from ultrasound.probe_manipulator import advanced
 
 AWAY_MM = 200.0
-# How far to both sides a sweep goes, and how deep what spins and shakes is on average [mm].
+# Reach of a sweep to both sides, and mean depth of spinning and shaking [mm].
 SWEEP_MM, MIDDLE_MM = 80.0, 15.0
-# A press takes so long, or so many steps where that is longer.
+# Duration of a press, or its number of steps where that is longer.
 PRESS_S, PRESS_STEPS = 0.02, 20
 SEED = 20161130
 
-# Positions (n, 3) [mm] and velocities (n, 3) [mm/s] made of settled positions and the direction that is up.
+# From settled positions and the upward direction: positions (n, 3) [mm] and velocities (n, 3) [mm/s].
 State = Callable[..., tuple[np.ndarray, np.ndarray]]
-# The pose (4, 4) at a time [s], made of the pose that just touches, the thickness below it [mm] and the time step [s].
+# From the pose of first contact, the thickness below it [mm] and the time step [s]: the pose (4, 4) at a time [s].
 Path = Callable[[float], np.ndarray]
 
 
@@ -56,7 +56,7 @@ def _one_out(x: np.ndarray, up: np.ndarray, mm: float) -> tuple[np.ndarray, np.n
 
 
 def _overlapped(x: np.ndarray, up: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """The right one of two bodies shifted along x into the left one."""
+    """The right of two bodies shifted along x into the left one."""
     moved, right = x.copy(), x[:, 0] > 0
     apart = x[right, 0].mean() - x[~right, 0].mean()
     wide = np.ptp(x[right, 0])

@@ -1,4 +1,4 @@
-"""One case: maltreat a body, let go of it, and see what is left."""
+"""One stress test: an extreme applied to a body, its release, and what remains of the deformation."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -11,15 +11,14 @@ from sim.body import BodyState
 from sim.fields import array_of, fill
 from sim.neo_hookean import NeoHookean
 from sim.solver import SolverState, StepSettings
-from studies.robustness.rigid_fit import apart_after_fit
+from studies.robustness.rigid_fit import distances_after_fit
 from studies.robustness.stress_bodies import Specimen, prepared
-from studies.robustness.stress_cases import StressCase, Subject
+from studies.robustness.stress_cases import RECOVERED_MM, StressCase, Subject
 from studies.robustness.stress_motion import AWAY_MM, PROBES, STATES
 from ultrasound.probe_manipulator import advanced
 
-RECOVERED_MM = 0.1
-# Long enough for the guard's patience and for what was thrown to come down and to rest.
-RELEASE_STEPS, LIFT_STEPS, LOOK_EVERY = 300, 240, 30
+# Long enough for the divergence check to restore a state, and for a thrown body to fall and come to rest.
+RELEASE_STEPS, LIFT_STEPS, CHECK_EVERY = 300, 240, 30
 LEAST_STEPS, LEAST_S = 40, 0.04
 LIFT_MM = 400.0
 YOUNG_KPA, POISSON = 15.0, 0.45
@@ -28,7 +27,7 @@ _prepared: dict[tuple[str, Subject], Specimen] = {}
 
 @dataclass
 class Extremes:
-    """What was seen from the beginning to the end."""
+    """Extreme values over a whole stress test."""
 
     finite: bool = True
     kinetic_peak_mj: float = 0.0
@@ -36,19 +35,24 @@ class Extremes:
     volume_most: float = 1.0
     fallbacks: list[str] = field(default_factory=list)
 
-    def look(self, specimen: Specimen, notice: str) -> None:
-        """After a step, which the guard has seen."""
+    def record(self, specimen: Specimen, notice: str) -> None:
+        """Take the state after a step and the divergence check's notice."""
         if notice:
             self.fallbacks.append(notice)
-        finite = bool(np.isfinite(array_of(specimen.body.position)).all())
-        self.finite &= finite
-        if finite:
-            volume = specimen.volume_ratio()
-            self.volume_least, self.volume_most = (
-                min(self.volume_least, volume),
-                max(self.volume_most, volume),
-            )
-            self.kinetic_peak_mj = max(self.kinetic_peak_mj, specimen.kinetic_mj())
+        if not specimen.is_finite():
+            self.finite = False
+            return
+        volume = specimen.volume_ratio()
+        self.volume_least = min(self.volume_least, volume)
+        self.volume_most = max(self.volume_most, volume)
+        self.kinetic_peak_mj = max(self.kinetic_peak_mj, specimen.kinetic_mj())
+
+    def fallback(self) -> str | None:
+        """The first notice of the divergence check, and how many there were."""
+        if not self.fallbacks:
+            return None
+        times = f" ({len(self.fallbacks)} times)" if len(self.fallbacks) > 1 else ""
+        return self.fallbacks[0] + times
 
 
 def run(model: str, case: StressCase) -> dict[str, Any]:
@@ -59,12 +63,12 @@ def run(model: str, case: StressCase) -> dict[str, Any]:
         _prepared[key] = prepared(model, case.subject)
     specimen = _prepared[key]
     extremes = Extremes()
-    _maltreat(specimen, case, extremes)
-    _let_go(specimen, extremes)
-    rest_error = _distance(specimen)
+    _apply(specimen, case, extremes)
+    _release(specimen, extremes)
+    rest_error = specimen.rest_error_mm()
     end = dict(volume_ratio=specimen.volume_ratio(), kinetic_end_mj=specimen.kinetic_mj())
     recovered = rest_error <= RECOVERED_MM
-    shape_error = None if recovered else _lifted(specimen)
+    shape_error = None if recovered else _free_shape_error(specimen)
     return dict(
         name=case.name,
         model=model,
@@ -72,7 +76,7 @@ def run(model: str, case: StressCase) -> dict[str, Any]:
         extreme=case.extreme,
         body=case.subject.kind,
         points=specimen.body.count,
-        finite=extremes.finite and bool(np.isfinite(array_of(specimen.body.position)).all()),
+        finite=extremes.finite and specimen.is_finite(),
         recovered=recovered,
         rest_error_mm=rounded(rest_error),
         shape_error_mm=rounded(shape_error),
@@ -80,75 +84,59 @@ def run(model: str, case: StressCase) -> dict[str, Any]:
         volume_ratio_min=rounded(extremes.volume_least),
         volume_ratio_max=rounded(extremes.volume_most),
         kinetic_peak_mj=rounded(extremes.kinetic_peak_mj),
-        fallback=_told(extremes.fallbacks),
+        fallback=extremes.fallback(),
         reason=_reason(rest_error, shape_error),
     )
 
 
-def _maltreat(specimen: Specimen, case: StressCase, extremes: Extremes) -> None:
-    """From the settled state, under the case's own settings."""
+def _apply(specimen: Specimen, case: StressCase, extremes: Extremes) -> None:
+    """The extreme, from the settled state and with the case's own settings."""
     settings = replace(specimen.settings, **case.settings)
     x, y, z = specimen.settings.gravity
     settings.gravity = (case.gravity * x, case.gravity * y, case.gravity * z)
     dt = settings.time_step_s
-    position, velocity = _state(specimen, case)
     specimen.solver.restore(specimen.settled)
     specimen.divergence_check.set_initial_state()
-    if case.state[0] != "settled":
+    state, *numbers = case.state
+    if state != "settled":
+        position, velocity = STATES[state](specimen.rest, specimen.up, *numbers)
         specimen.body.restore(BodyState(position.astype(np.float32), velocity.astype(np.float32)))
         specimen.solver.contacts.reset()
-    _weigh(specimen, case.heaviest)
-    _harden(specimen, case.material)
-    kind, *numbers = case.probe
-    path = PROBES[kind](specimen.home, specimen.thickness_mm, dt, *numbers)
+    _set_material(specimen, case.heaviest, case.material)
+    motion, *numbers = case.probe
+    path = PROBES[motion](specimen.home, specimen.thickness_mm, dt, *numbers)
     for step in range(max(LEAST_STEPS, round(LEAST_S / dt))):
         times = dt * (step + np.linspace(0.0, 1.0, settings.substeps + 1))
         specimen.solver.step(settings, np.stack([path(float(t)) for t in times]))
-        extremes.look(specimen, specimen.divergence_check.check(dt))
-    _weigh(specimen, 1.0)
-    _harden(specimen, {})
+        extremes.record(specimen, specimen.divergence_check.check(dt))
+    _set_material(specimen, 1.0, {})
 
 
-def _state(specimen: Specimen, case: StressCase) -> tuple[np.ndarray, np.ndarray]:
-    kind, *numbers = case.state
-    return STATES[kind](specimen.rest, specimen.up, *numbers)
-
-
-def _weigh(specimen: Specimen, heaviest: float) -> None:
-    """Make the middle node so many times as heavy; shape matching has its ratio from the start."""
+def _set_material(specimen: Specimen, heaviest: float, material: Mapping[str, float]) -> None:
+    """Multiply the mass of the middle node and change the material; shape matching has its mass ratio from the start."""
     if isinstance(specimen.model, NeoHookean):
         mass = specimen.mass.copy()
         mass[len(mass) // 2] *= heaviest
         fill((specimen.model.mass, mass))
-
-
-def _harden(specimen: Specimen, material: Mapping[str, float]) -> None:
-    if isinstance(specimen.model, NeoHookean):
         specimen.model.set_material(**{"young_kpa": YOUNG_KPA, "poisson": POISSON, **material})
 
 
-def _let_go(specimen: Specimen, extremes: Extremes) -> None:
-    """The transducer taken away, usual settings, until it rests or time is over."""
+def _release(specimen: Specimen, extremes: Extremes) -> None:
+    """The default settings without the transducer, until the body is at rest or RELEASE_STEPS are over."""
     away = np.stack([advanced(specimen.home, -AWAY_MM)] * (specimen.settings.substeps + 1))
     for step in range(1, RELEASE_STEPS + 1):
         specimen.solver.step(specimen.settings, away)
         notice = specimen.divergence_check.check(specimen.settings.time_step_s)
-        if notice or step % LOOK_EVERY == 0:
-            extremes.look(specimen, notice)
-        if step % LOOK_EVERY == 0 and _distance(specimen) < RECOVERED_MM / 2:
+        if notice or step % CHECK_EVERY == 0:
+            extremes.record(specimen, notice)
+        if step % CHECK_EVERY == 0 and specimen.rest_error_mm() < RECOVERED_MM / 2:
             return
 
 
-def _distance(specimen: Specimen) -> float:
-    """Mean distance [mm] of the body's points from where they were at rest."""
-    position = array_of(specimen.body.position).astype(float)
-    return float(np.linalg.norm(position - specimen.rest, axis=1).mean())
+def _free_shape_error(specimen: Specimen) -> float:
+    """Mean distance [mm] from the stress-free shape after a rigid fit, lifted off the support and without gravity.
 
-
-def _lifted(specimen: Specimen) -> float:
-    """Mean distance [mm] from the stress-free shape, turned and moved to fit, after it was taken off its support, weightless.
-
-    What friction or another place on the support has kept is gone then, and what the tissue itself has not undone is left.
+    This removes the effect of friction and of another position on the support.
     """
     state = specimen.solver.snapshot()
     up = (state.body.position + LIFT_MM * specimen.up).astype(np.float32)
@@ -158,7 +146,7 @@ def _lifted(specimen: Specimen) -> float:
     error = np.inf
     for step in range(1, LIFT_STEPS + 1):
         specimen.solver.step(weightless)
-        if step % LOOK_EVERY == 0:
+        if step % CHECK_EVERY == 0:
             error = _shape_error(specimen)
             if error < RECOVERED_MM / 2:
                 break
@@ -167,27 +155,17 @@ def _lifted(specimen: Specimen) -> float:
 
 def _shape_error(specimen: Specimen) -> float:
     position = array_of(specimen.body.position).astype(float)
-    wanted = specimen.body.rest_points
     if not np.isfinite(position).all():
         return np.inf
-    return float(
-        np.concatenate([apart_after_fit(position[part], wanted[part]) for part in specimen.parts]).mean()
-    )
+    rest = specimen.body.rest_points
+    apart = [distances_after_fit(position[part], rest[part]) for part in specimen.parts]
+    return float(np.concatenate(apart).mean())
 
 
 def _reason(rest_error: float, shape_error: float | None) -> str | None:
-    """Why a body is not back where it was."""
+    """Why a body has not recovered its position; None where it has."""
     if shape_error is None:
         return None
     if shape_error <= RECOVERED_MM:
-        return (
-            f"lies {rest_error:.2g} mm from where it lay, held by friction or its support; its shape is whole"
-        )
-    return f"keeps a tangle too small to be put back, or is still on its way: shape {shape_error:.2g} mm off"
-
-
-def _told(fallbacks: list[str]) -> str | None:
-    if not fallbacks:
-        return None
-    times = f" ({len(fallbacks)} times)" if len(fallbacks) > 1 else ""
-    return fallbacks[0] + times
+        return f"its shape has recovered, {rest_error:.2g} mm from its rest position (friction or another place on the support)"
+    return f"its shape differs by {shape_error:.2g} mm: entangled below what the divergence check detects, or not yet at rest"

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from rehearsal.image_and_surface_files import save_images
 from rehearsal.result_files import rounded, save_figure, spread, write_csv, write_json
 from scenes.closed_surfaces import moved_by, volume_mm3
-from studies.robustness.rigid_fit import apart_after_fit
+from studies.robustness.rigid_fit import distances_after_fit
 from ultrasound.probe import load_probe
 from ultrasound.scanner import ECHO
 
@@ -75,9 +75,9 @@ def test_a_surface_holds_the_same_volume_wherever_it_is():
 def test_a_shape_is_compared_whatever_its_place_and_turn():
     wanted = np.random.default_rng(3).normal(size=(20, 3))
     moved = wanted @ rotation_about([1.0, 2.0, -1.0], 115.0).T + [30.0, -7.0, 1.0]
-    assert apart_after_fit(moved, wanted) == pytest.approx(np.zeros(20), abs=1e-12)
+    assert distances_after_fit(moved, wanted) == pytest.approx(np.zeros(20), abs=1e-12)
     # Twice as large about its middle: each point is as far off as it was from there.
-    assert apart_after_fit(2 * moved, wanted) == pytest.approx(
+    assert distances_after_fit(2 * moved, wanted) == pytest.approx(
         np.linalg.norm(wanted - wanted.mean(axis=0), axis=1)
     )
-    assert apart_after_fit(moved[:1], wanted[:1]) == pytest.approx([0.0])
+    assert distances_after_fit(moved[:1], wanted[:1]) == pytest.approx([0.0])

@@ -1,4 +1,4 @@
-"""Case folders: what is read, and what is refused, in which words."""
+"""Case folders: what is read, and what is refused."""
 
 from pathlib import Path
 
@@ -55,7 +55,7 @@ def test_a_stage_may_have_the_probe_turned(tmp_path):
     assert np.array_equal(case.poses[1, :3, :3], turned) and np.array_equal(case.poses[2, :3, :3], np.eye(3))
 
 
-def test_the_digest_tells_contents_apart(tmp_path):
+def test_the_digest_differs_with_the_contents(tmp_path):
     one, same = load_case(write_case(tmp_path / "a")), load_case(write_case(tmp_path / "b"))
     other = load_case(write_case(tmp_path / "c", places=beads() * [1, 1, 0.999]))
     assert one.digest == same.digest != other.digest
@@ -112,8 +112,8 @@ def test_an_open_surface_is_refused(tmp_path):
 @pytest.mark.parametrize(
     "old, new, words",
     [
-        ("x2,", "q2,", "column x2 is missing; expected x to z2 for 3 stages"),
-        (None, "", "holds no beads"),
+        ("x2,", "q2,", "column x2 is missing; expected 12 columns, x to z2"),
+        (None, "", "has no rows"),
         ("\n1,", "\n1,nan,", "line 3, x is 'nan': expected a finite number"),
         ("\n1,", "\n1,here,", "line 3, x is 'here': expected a finite number"),
     ],

@@ -1,4 +1,4 @@
-"""The tables of a run against arithmetic done by hand, and the run that they are of."""
+"""The tables of a run against values computed by hand, and the run itself."""
 
 import json
 from dataclasses import replace
@@ -108,17 +108,17 @@ def test_report_and_table_show_these_figures(device, case):
     rows = table(case, run.beads).splitlines()
     null = null_errors(case).mean(axis=1)
     assert rows[2].split() == [
-        *["1", "2.00", "mm", "0.50", "25", "%", "0.31", "1.00", f"{null[1]:.2f}", f"{0.5 / null[1]:.2f}"],
+        *["1", "2.00", "0.50", "25", "0.31", "1.00", f"{null[1]:.2f}", f"{0.5 / null[1]:.2f}"],
         f"{np.corrcoef(probe_distances(case)[1], off[:, 2])[0, 1]:.2f}",
     ]
     assert rows[4].split() == ["all", "0.50", "1.00", f"{null.mean():.2f}", f"{0.5 / null.mean():.2f}"]
     assert sum(int(row.split("(")[1].split()[0]) for row in rows if "bead positions" in row) == 24
-    # What is not finite is said, and is valid JSON.
+    # A result that is not finite is reported, in valid JSON.
     lost = BeadRun(np.full_like(case.measured, np.nan), [1.0], finite=False)
     figures = report(experiment, COARSE, lost)
     assert figures["finite"] is False and figures["overall_mean_mm"] is None
     json.dumps(figures, allow_nan=False)
-    assert "NOT FINITE" in summary(figures, experiment.describe(COARSE)) and "-" in table(case, lost.beads)
+    assert "NOT FINITE" in summary(figures, experiment.describe(COARSE)) and "nan" in table(case, lost.beads)
 
 
 def test_the_probe_waits_above_then_goes_to_each_stage_and_rests_there_wherever_the_case_is(device, case):
@@ -137,8 +137,8 @@ def test_the_probe_waits_above_then_goes_to_each_stage_and_rests_there_wherever_
     assert np.array_equal(np.concatenate([seen[0][:1], ends[:-1]]), [poses[0] for poses in seen])
     lowest = ends[:, 2, 3] - case.size_mm[2] / 2
     assert (lowest[:120] > 40).all()
-    way = np.diff(lowest[119:])
-    assert way[:60] == pytest.approx(way[0]) and way[90:150] == pytest.approx(-2.0 / 60)
+    moved = np.diff(lowest[119:])
+    assert moved[:60] == pytest.approx(moved[0]) and moved[90:150] == pytest.approx(-2.0 / 60)
     for stage, depth in enumerate(DEPTHS):
         assert lowest[120 + stage * 90 + 59 : 120 + (stage + 1) * 90] == pytest.approx(12.0 - depth)
 
@@ -190,7 +190,7 @@ def test_validate_twice_prints_and_writes_the_same_but_for_times(monkeypatch, tm
     assert reports[0] == reports[1] and reports[0]["finite"] and reports[0]["cell_mm"] == 5
 
 
-def test_validate_says_mistakes_in_one_line(tmp_path, capsys):
+def test_validate_reports_mistakes_in_one_line(tmp_path, capsys):
     def refused(*arguments) -> str:
         assert main(["validate", *map(str, arguments)]) == 2
         line = capsys.readouterr().err.strip()

@@ -59,24 +59,24 @@ def test_a_recording_is_read_in_mm_with_its_load(tmp_path):
     ("name", "spoil", "words"),
     [
         ("beam_load52", lambda v: v[:, :-1], "tip3_z_m is missing"),
-        ("beam_load52", lambda v: np.where(np.indices(v.shape)[0] == 7, np.nan, v), "row 9 has a value"),
+        ("beam_load52", lambda v: np.where(np.indices(v.shape)[0] == 7, np.nan, v), "line 9, t_s is .nan."),
         ("beam_load52", lambda v: v[:40], "40 frames are too few"),
         ("beam_load52", lambda v: v[::-1], "do not increase"),
         ("beam_load52", lambda v: np.where(np.arange(v.shape[1]) > 0, 0.0, v), "never falls"),
         ("beam_heavy", lambda v: v, "neither 'gravity' nor 'load'"),
     ],
 )
-def test_what_is_wrong_with_a_recording_is_said(tmp_path, name, spoil, words):
+def test_a_fault_of_a_recording_is_named(tmp_path, name, spoil, words):
     values = spoil(recording())
     path = save(tmp_path / f"{name}.csv", values, COLUMNS[: values.shape[1]])
     with pytest.raises(BeamError, match=words):
         read_capture(path)
 
 
-def test_a_value_that_is_no_number_is_said(tmp_path):
+def test_a_value_that_is_no_number_is_named(tmp_path):
     path = save(tmp_path / "beam_gravity.csv", recording())
     path.write_text(path.read_text().replace("1.000000000000000021e-02", "soon", 1))
-    with pytest.raises(BeamError, match="row 3 has a value that is missing or no number"):
+    with pytest.raises(BeamError, match="line 3, t_s is .soon."):
         read_capture(path)
 
 
@@ -162,7 +162,7 @@ def test_the_command_compares_draws_and_reports(tmp_path, capsys):
     assert float(as_above[2]) == pytest.approx(row["computed_hz"], abs=1e-4)
     # Rests on cells twice as wide as the row's: stiffer in bending by the hourglass term, 5% with two cells in the height.
     assert float(as_above[1]) == pytest.approx(row["computed_mm"], rel=0.1)
-    assert all(f"  {name}  " in printed for name in ("half the time step", "twice the passes"))
+    assert all(f"  {name}  " in printed for name in ("half the time step", "twice the iterations"))
 
 
 def test_cells_that_do_not_fill_the_beam_are_refused(device):
@@ -170,7 +170,7 @@ def test_cells_that_do_not_fill_the_beam_are_refused(device):
         Cantilever(np.array([30.0, 30.0, 100.0]), BeamMaterial(263.8, 0.45, 1.07), 7.0)
 
 
-def test_what_the_command_misses_is_one_line(tmp_path, capsys):
+def test_a_missing_file_is_one_line(tmp_path, capsys):
     assert main(["beam", str(tmp_path)]) == 2
     assert capsys.readouterr().err.strip() == f"nephron: {tmp_path}: holds no recordings (*.csv)"
     save(tmp_path / "beam_gravity_a.csv", recording())

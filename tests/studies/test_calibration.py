@@ -1,4 +1,4 @@
-"""Calibration: what is fitted on and what is not, searches with a known answer, and workers that agree."""
+"""Calibration: fitted and held-out data, searches with a known result, and workers that agree."""
 
 import csv
 import json
@@ -65,7 +65,7 @@ def pretending(pairs):
     return (pretended(*pair) for pair in pairs)
 
 
-def test_a_split_holds_out_what_it_says(cases):
+def test_a_split_holds_out_what_is_named(cases):
     stages, thirds, whole = (split_of(cases, what) for what in ("stages", "beads", "cases"))
     assert all(mask[:-1].all() and not mask[-1].any() for mask in stages.fitted)
     assert all((mask == (np.arange(12) % 3 != 2)).all() for mask in thirds.fitted)
@@ -94,10 +94,10 @@ def test_grids():
     assert finer_grid(1.0, 0.05) == pytest.approx([0.96, 0.97, 0.98, 0.99])
 
 
-def test_the_exhaustive_search_finds_the_best_of_what_is_fitted_on_and_judges_it_elsewhere(cases):
-    told = []
-    found = exhaustive(cases, split_of(cases, "stages"), [3.0, 4.0], 0.1, pretending, told.append)
-    assert sum(told) == exhaustive_count(2, 2, 0.1) == 2 * 2 * 18
+def test_the_exhaustive_search_finds_the_best_fit_and_judges_it_on_held_out_data(cases):
+    done = []
+    found = exhaustive(cases, split_of(cases, "stages"), [3.0, 4.0], 0.1, pretending, done.append)
+    assert sum(done) == exhaustive_count(2, 2, 0.1) == 2 * 2 * 18
     for radius, best in BEST.items():
         trial = found.best(radius)
         assert trial.setup.tissue.stiffness == pytest.approx(best, abs=0.011)
@@ -111,7 +111,7 @@ def trial(stiffness: float, fit_mm: float) -> CalibrationTrial:
     return CalibrationTrial(setup_of(MODEL, stiffness=stiffness), (), fit_mm, 0.0)
 
 
-def test_a_quartic_is_found_again_and_its_least_too():
+def test_a_quartic_and_its_minimum_are_found():
     x = np.linspace(0.1, 1, 19)
     y = 1 + 2 * (x - 0.4) ** 2 + 3 * (x - 0.4) ** 4
     fallen = [trial(0.02, 900.0), trial(0.05, np.inf)]
@@ -121,14 +121,14 @@ def test_a_quartic_is_found_again_and_its_least_too():
     assert quartic([trial(a, 1 + a) for a in (0.1, 0.2, 0.3, 0.4)]) is None
 
 
-def test_a_search_of_several_settings_finds_them_the_same_each_time(cases):
-    told = []
+def test_a_search_of_several_settings_is_reproducible(cases):
+    done = []
     split = split_of(cases, "stages")
-    first, again = (search(cases, split, [3.0], 12, pretending, told.append) for _ in range(2))
+    first, again = (search(cases, split, [3.0], 12, pretending, done.append) for _ in range(2))
     best = first.best(3.0).setup
     assert best.iterations in (8, 9, 10) and best.tissue.stiffness == pytest.approx(0.62, abs=0.1)
     assert [t.setup for t in first.trials[3.0]] == [t.setup for t in again.trials[3.0]]
-    assert sum(told) == 2 * search_count(2, 1, 12) and len(first.trials[3.0]) == 15 * 13
+    assert sum(done) == 2 * search_count(2, 1, 12) and len(first.trials[3.0]) == 15 * 13
     course = [t.fit_mm for t in best_so_far(first.trials[3.0])]
     assert course == sorted(course, reverse=True) and course[-1] == first.best(3.0).fit_mm
 
@@ -139,14 +139,14 @@ def pretended_workers(jobs=None):
 
 
 @pytest.mark.parametrize("searched", [False, True])
-def test_calibrate_leaves_tables_pictures_and_json(monkeypatch, folders, cases, tmp_path, capsys, searched):
+def test_calibrate_writes_tables_figures_and_json(monkeypatch, folders, cases, tmp_path, capsys, searched):
     monkeypatch.setattr(workers, "local_workers", pretended_workers)
     out = tmp_path / "out"
     more = ["--search", "2"] if searched else ["--grid", "0.1"]
     assert main(["calibrate", *map(str, folders), "--radii", "4,3", "--out", str(out), *more]) == 0
-    said = capsys.readouterr().out
-    assert "Fitted on all stages but the deepest; held out: the deepest stage." in said
-    assert "The fit is no accuracy" in said
+    printed = capsys.readouterr().out
+    assert "Fitted on all stages but the deepest; held out: the deepest stage." in printed
+    assert "no measure of accuracy" in printed
     found = json.loads((out / "calibration.json").read_text())
     assert [radius["radius_mm"] for radius in found["radii"]] == [3.0, 4.0] and found["cases"] == [
         "ball",
@@ -178,14 +178,14 @@ def test_calibrate_leaves_tables_pictures_and_json(monkeypatch, folders, cases, 
         assert [float(row[1]) for row in list(csv.reader(file))[1:]] == pytest.approx(
             [3, (14 / 3) ** 0.5, 1, 6], abs=1e-3
         )
-    pictures = {path.name for path in out.glob("*.png")}
+    figures = {path.name for path in out.glob("*.png")}
     other = "search.png" if searched else "figure4.png"
-    assert pictures == {"figure5.png", other, *(f"table{n}.png" for n in (2, 3, 4, 5))}
-    for name in pictures:
+    assert figures == {"figure5.png", other, *(f"table{n}.png" for n in (2, 3, 4, 5))}
+    for name in figures:
         assert np.asarray(Image.open(out / name).convert("L")).std() > 5
 
 
-def test_calibrate_says_mistakes_in_one_line(monkeypatch, folders, tmp_path, capsys):
+def test_calibrate_reports_mistakes_in_one_line(monkeypatch, folders, tmp_path, capsys):
     def refused(*arguments) -> str:
         assert main(["calibrate", *map(str, arguments)]) == 2
         line = capsys.readouterr().err.strip()
@@ -253,7 +253,7 @@ def test_a_cluster_without_workers_or_with_some_that_lack_modules_is_refused(mon
             monkeypatch.setattr(distributed.Client, "run", failing)
 
 
-def test_what_is_built_is_kept_and_not_more_than_taichi_bears(monkeypatch, cases):
+def test_experiments_are_kept_up_to_the_limit_of_taichi(monkeypatch, cases):
     monkeypatch.setattr(workers, "_built", {})
     monkeypatch.setattr(workers, "_filled", {})
     started, filled = [], []

@@ -1,4 +1,4 @@
-"""What the settings change, by hand and on the command line."""
+"""The convergence study, by hand and on the command line."""
 
 import json
 from functools import partial
@@ -54,7 +54,7 @@ class Drifting:
         return BeadRun(beads)
 
 
-def test_what_moves_is_told_stage_by_stage(tmp_path):
+def test_displacements_are_reported_stage_by_stage(tmp_path):
     case, setup = load_case(write_case(tmp_path / "ball")), setup_of("neo-hookean", cell_mm=6.0, iterations=8)
     experiment = Drifting(case, setup)
     with pytest.MonkeyPatch.context() as patch:

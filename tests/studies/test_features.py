@@ -18,7 +18,7 @@ from sim.shapes import ConvexTool, SignedDistanceField
 from sim.surface_contact import SurfaceContacts
 from studies.performance import feature_costs, features_command
 from studies.performance.step_timing import memory_mb
-from studies.robustness import soak as soak
+from studies.robustness import soak_test
 
 SIZES = {"neo-hookean": 6.0, "shape-matching": 4.0}
 # What only the feature has kernels use.
@@ -81,7 +81,7 @@ def test_kernels_are_counted_where_a_step_is_parallel(device):
     assert base["launches"] > base["kernels"] > 10
 
 
-def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, capsys):
+def test_the_command_writes_table_figure_and_json(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(features_command, "load_patient", lambda _: (briefly(20), small_anatomy()))
     monkeypatch.setattr(feature_costs, "SETTLE_STEPS", 3)
     monkeypatch.setattr(feature_costs, "PRESS_STEPS", 3)
@@ -90,7 +90,7 @@ def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, cap
     rows = json.loads((tmp_path / "features.json").read_text())["features"]
     assert [row["feature"] for row in rows] == [
         "friction on shapes",
-        "guard",
+        "divergence check",
         "organ's surface",
     ]
     for row in rows:
@@ -106,11 +106,11 @@ def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, cap
     ids=lambda setup: setup.model,
 )
 def test_a_soak_ends_where_it_began_and_replays(setup, monkeypatch):
-    monkeypatch.setattr(soak, "REST_S", 3.0)
-    monkeypatch.setattr(soak, "REPLAYED_MINUTES", 1)
-    told = []
-    found = soak.soak(briefly(60), small_anatomy(), setup, 2, 5.0, "cpu", lambda: told.append(1))
-    assert len(found["minutes"]) == 2 and len(told) == 3
+    monkeypatch.setattr(soak_test, "REST_S", 3.0)
+    monkeypatch.setattr(soak_test, "REPLAYED_MINUTES", 1)
+    done = []
+    found = soak_test.run_soak(briefly(60), small_anatomy(), setup, 2, 5.0, "cpu", lambda: done.append(1))
+    assert len(found["minutes"]) == 2 and len(done) == 3
     assert found["replay_equal"] and found["reset_equal"] and found["fallbacks"] == 0
     for row in found["minutes"]:
         assert row["finite"] and row["shape_mm"] < 1.0 and abs(row["volume_ratio"] - 1) < 0.1

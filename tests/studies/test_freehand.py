@@ -1,4 +1,4 @@
-"""Volumes of tracked sweeps: balls in closed form on oblique pictures, and a small soft block, pressed."""
+"""Volumes of tracked sweeps: balls in closed form on oblique images, and a small soft block, pressed."""
 
 import csv
 from dataclasses import replace
@@ -26,8 +26,7 @@ from rehearsal.result_files import write_csv
 from scenes.anatomy import Grid, LoadedAnatomy
 from scenes.scene import PlaneShape, Scene, with_options
 from studies.freehand import freehand_accuracy, freehand_sweeps
-from studies.freehand.freehand_command import rows_of, table
-from studies.freehand.freehand_figure import draw
+from studies.freehand.freehand_command import figure_of, rows_of, table
 from studies.freehand.freehand_sweeps import sweep_of
 from ultrasound.reconstruction import VoxelBox
 from ultrasound.sweep import Mark, Sweep, SweepError
@@ -93,7 +92,7 @@ def check_balls(rebuilt: SweepVolumes, off_mm: float) -> None:
 
 
 @pytest.mark.parametrize(("method", "off_mm"), [("smooth", 0.1), ("nearest", 0.5)])
-def test_balls_come_back_where_they_are(marked, method, off_mm):
+def test_balls_are_reconstructed_at_their_positions(marked, method, off_mm):
     # Nearest voxels are off by up to half of one, all to one side where pictures lie as evenly as the voxels.
     rebuilt = reconstruct_volumes(
         marked, image_poses_of(marked, "Reference"), ALL, 1.0, method, 2.0, marked, with_grey=False
@@ -105,7 +104,7 @@ def test_balls_come_back_where_they_are(marked, method, off_mm):
         assert middle == pytest.approx(BEADS[bead], abs=0.08)
 
 
-def test_what_was_squeezed_comes_back_as_it_was_at_rest(device, marked):
+def test_the_compression_correction_restores_the_resting_shape(device, marked):
     now_from_rest = np.array([[1.0, 0.15, 0.0], [0.0, 0.8, 0.0], [0.05, 0.0, 1.1]])
     way = poses()
 
@@ -125,7 +124,7 @@ def test_what_was_squeezed_comes_back_as_it_was_at_rest(device, marked):
     assert seen.beads[0] == pytest.approx(CENTRE + now_from_rest @ (BEADS[0] - CENTRE), abs=0.1)
 
 
-def test_frames_without_pose_or_picture_are_left_out(marked):
+def test_frames_without_pose_or_image_are_left_out(marked):
     images = np.full((len(poses()), ROWS, COLUMNS), 90, np.uint8)
     images[[3, 20]] = 255
     sweep = swept(images, lost=(3, 11))
@@ -144,7 +143,7 @@ def test_frames_without_pose_or_picture_are_left_out(marked):
     assert rebuilt.grey[rebuilt.known] == pytest.approx(90) and not rebuilt.regions and not rebuilt.beads
 
 
-def test_only_the_sector_that_is_lit_counts():
+def test_only_the_field_of_view_counts():
     images = np.where(SECTOR, np.uint8(120), np.uint8(0)) * np.ones((len(poses()), 1, 1), np.uint8)
     sweep = swept(images)
     mask = lit_pixels(np.concatenate([0 * images[:1], images]))
@@ -187,7 +186,7 @@ def test_voxels_inside_a_block_are_those_whose_centres_are():
     assert not voxels_inside(trimesh.creation.box([2.0] * 3), box).any()
 
 
-def test_a_wider_box_leaves_all_where_it_was():
+def test_a_wider_box_moves_nothing():
     box = a_box()
     region = near(box.places(), [-2.0, 12.0, 60.0], 5.0)
     rebuilt = SweepVolumes(box, region * np.float32(7), region, {"organ": region})
@@ -255,7 +254,7 @@ def test_files_have_each_voxel_at_its_place(tmp_path):
     assert not (tmp_path / ".." / "labels.nrrd").exists()
 
 
-def test_the_picture_shows_the_cuts_through_the_tumour(tmp_path, marked):
+def test_the_figure_shows_the_cuts_through_the_tumour(tmp_path, marked):
     path = image_poses_of(marked, "Reference")
     rebuilt = reconstruct_volumes(
         replace(marked, images=marked.images * 60), path, ALL, 1.0, "smooth", 2.0, marked
@@ -315,7 +314,7 @@ def runs() -> list[dict]:
     return made
 
 
-def test_at_rest_the_bar_is_met(runs):
+def test_at_rest_the_accuracy_is_met(runs):
     for run in runs:
         assert [row["method"] for row in run["resting"]] == ["nearest", "smooth"]
         assert run["apart_mm"] == pytest.approx(1.0) and run["frames"] == 60
@@ -327,7 +326,7 @@ def test_at_rest_the_bar_is_met(runs):
     assert all("tumour" not in row for row in runs[1]["resting"]) and runs[1]["compression"] == []
 
 
-def test_a_probe_calibrated_wrong_shifts_all_alike(runs):
+def test_an_error_of_the_calibration_shifts_everything_equally(runs):
     # The quick run takes the third of the sizes.
     none, calibration, lost = runs[0]["noise"]
     assert (calibration["calibration_mm"], lost["lost"]) == (3.0, 0.3)
@@ -338,7 +337,7 @@ def test_a_probe_calibrated_wrong_shifts_all_alike(runs):
     assert [row["lost"] for row in runs[1]["noise"]] == [0.0, 0.3]
 
 
-def test_undoing_the_press_puts_the_tissue_back(runs):
+def test_the_compression_correction_reduces_the_error(runs):
     still, still_undone, seen, undone = runs[0]["compression"]
     assert [row["depth_mm"] for row in (still, still_undone, seen, undone)] == [0, 0, 4, 4]
     assert (seen["undone"], undone["undone"]) == (False, True) and seen["compression_mm"] > 1.0
@@ -354,16 +353,16 @@ def test_undoing_the_press_puts_the_tissue_back(runs):
     assert abs(still["landmarks"]["mean_mm"] - still_undone["landmarks"]["mean_mm"]) < 0.5
 
 
-def test_the_study_tells_and_draws_both(runs, tmp_path):
-    lines = [line for run in runs for line in table(run)]
+def test_the_study_prints_and_draws_both(runs, tmp_path):
+    lines = [line for run in runs for line in table(run).splitlines()]
     row = runs[0]["compression"][3]["tumour"]["scanned_part"]
-    told = next(
-        line for line in lines if line.startswith("pressed 4 mm") and "undone" in line and "tumour" in line
+    printed = next(
+        line for line in lines if line.startswith("pressed 4 mm") and "corrected" in line and "tumour" in line
     )
-    assert f"{row['dice']:.3f}" in told and f"{row['centroid_mm']:.2f}" in told
+    assert f"{row['dice']:.3f}" in printed and f"{row['centroid_mm']:.2f}" in printed
     # Two lines of head, then two methods, three of the noise or two, and two by two of the press; of two regions, or of one.
     assert len(lines) == 2 + 2 * (2 + 3 + 4) + 2 + (2 + 2)
-    assert sum(line.startswith("every third picture, no error") for line in lines) == 3
+    assert sum(line.startswith("every third image, no error") for line in lines) == 3
     write_csv([row for run in runs for row in rows_of(run)], tmp_path / "a.csv")
     with (tmp_path / "a.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -375,8 +374,8 @@ def test_the_study_tells_and_draws_both(runs, tmp_path):
     nothing = dict(dice=0.0, hd95_mm=None, volume_percent=-100.0, centroid_mm=None)
     lost["tumour"] = dict(scanned=0.1, whole=nothing, scanned_part=nothing)
     out = runs[0] | dict(compression=[gone, lost])
-    assert sum("-100.0" in line for line in table(out)) == 1
-    draw([*runs, out], tmp_path / "all.png")
+    assert sum("-100.0" in line for line in table(out).splitlines()) == 1
+    figure_of([*runs, out]).savefig(tmp_path / "all.png")
     drawn = np.asarray(Image.open(tmp_path / "all.png").convert("RGB")).astype(int)
     # The colours of the three: curves, and marks of the press.
     for colour in ([31, 119, 180], [255, 127, 14], [44, 160, 44]):

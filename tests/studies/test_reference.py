@@ -1,4 +1,4 @@
-"""The finite-element reference against closed forms; what it writes, against its format."""
+"""The finite-element reference against closed forms, and its files against their format."""
 
 import csv
 import sys
@@ -15,7 +15,7 @@ from studies.accuracy.bead_case import load_case
 from studies.reference.equilibrium import Equilibrium, NotConvergedError
 from studies.reference.fem_press import FemExperiment, FemPress
 from studies.reference.fem_solid import FemMaterial, FemSolid
-from studies.reference.make_reference import blue_noise, laid
+from studies.reference.make_reference import blue_noise, in_case_frame
 from studies.reference.penalty_contact import ContactSurface, Law, PenaltyContact
 from studies.reference.reference_case import ReferenceCase
 from studies.reference.smooth_obstacles import DistanceField, RoundedBox
@@ -261,7 +261,7 @@ def test_support_and_probe_hold_the_weight(solved_case):
         assert moved == pytest.approx([0, 0, stage.indentation_mm], abs=1e-9)
 
 
-def test_a_case_folder_holds_what_the_format_asks_for(solved_case, tmp_path):
+def test_a_case_folder_follows_the_format(solved_case, tmp_path):
     solved_case.write(tmp_path)
     case = tomllib.loads((tmp_path / "case.toml").read_text())
     assert case["format_version"] == 1 and case["files"]["fem"] == "result.npz"
@@ -282,7 +282,7 @@ def test_a_case_folder_holds_what_the_format_asks_for(solved_case, tmp_path):
 def test_the_command_writes_a_case_that_validate_reads(solved_case, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr("studies.reference.make_reference.solved", lambda *arguments: solved_case)
     assert app.main(["reference", "--out", str(tmp_path / "case")]) == 0
-    assert "a coarser mesh is 0.000 mm off" in capsys.readouterr().out
+    assert "difference to a coarser mesh 0.000 mm" in capsys.readouterr().out
     case = load_case(tmp_path / "case")
     np.testing.assert_allclose(case.beads, solved_case.beads, atol=1e-4)
     np.testing.assert_allclose(case.measured, solved_case.moved_beads, atol=1e-4)
@@ -292,7 +292,7 @@ def test_the_command_writes_a_case_that_validate_reads(solved_case, monkeypatch,
     assert case.organ.volume == pytest.approx(solved_case.kidney.volume, rel=1e-6)
 
 
-def test_the_files_tell_one_deformation(solved_case, tmp_path):
+def test_the_files_agree_on_the_deformation(solved_case, tmp_path):
     """Beads through result.npz alone: shape functions of the file's order of nodes, in the straight tetrahedra."""
     solved_case.write(tmp_path)
     result = np.load(tmp_path / "result.npz")
@@ -329,13 +329,13 @@ def test_beads_are_deep_and_far_apart(ball):
 
 def test_the_frame_of_the_files_is_upright_and_right_handed(block):
     block.apply_translation([50.0, 20.0, -300.0])
-    upright = laid(block, np.array([0.0, 1.0, 0.0]), block)
+    upright = in_case_frame(block, np.array([0.0, 1.0, 0.0]), block)
     assert upright.volume == pytest.approx(block.volume)
     np.testing.assert_allclose(upright.center_mass, 0, atol=1e-9)
     np.testing.assert_allclose(np.ptp(upright.vertices, axis=0), [24, 16, 20])
 
 
-def test_a_body_without_a_hold_is_refused():
+def test_a_body_without_fixed_nodes_is_refused():
     solid = cube(2)
     free = Equilibrium(solid, [], solid.weight(np.array([0.0, 0.0, -9.81])))
     with pytest.raises(NotConvergedError):

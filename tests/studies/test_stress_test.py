@@ -1,4 +1,4 @@
-"""``study stability`` maltreats what it says, measures it from where it lay, and says why a body is not back."""
+"""The stress test applies what a case names, measures recovery from the rest position, and gives a reason where there is none."""
 
 import csv
 import json
@@ -10,8 +10,8 @@ from PIL import Image
 
 import app
 from studies.robustness import stability_command, stress_bodies, stress_test
-from studies.robustness.rigid_fit import apart_after_fit
-from studies.robustness.stability_figure import FATES, fate_of
+from studies.robustness.rigid_fit import distances_after_fit
+from studies.robustness.stability_command import OUTCOMES, outcome_of
 from studies.robustness.stress_cases import MODELS, StressCase, Subject, cases_of, quick_cases_of
 from studies.robustness.stress_motion import PROBES, STATES
 from ultrasound.probe_manipulator import advanced
@@ -36,7 +36,7 @@ def test_the_cases_are_many_and_each_is_another(model):
     assert {case.kind for case in quick_cases_of(model)} == kinds | {"one alone"}
 
 
-def test_bodies_start_and_transducers_move_as_their_names_say():
+def test_initial_states_and_motions_match_their_names():
     x = np.random.default_rng(0).normal(size=(50, 3))
     up, home = np.array([0.0, 0.0, 1.0]), np.eye(4)
     assert np.ptp(STATES["scaled"](x, up, 1.0, 1.0, 0.0)[0][:, 2]) == 0
@@ -59,7 +59,7 @@ def test_bodies_start_and_transducers_move_as_their_names_say():
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_a_small_body_is_maltreated_let_go_and_measured(model):
+def test_a_small_body_is_stressed_released_and_measured(model):
     cases = [
         StressCase("rest", "", ONE),
         StressCase("lost", "", ONE, state=("nothing",)),
@@ -70,9 +70,9 @@ def test_a_small_body_is_maltreated_let_go_and_measured(model):
     assert rest["finite"] and rest["recovered"] and rest["fallback"] is None and rest["reason"] is None
     assert rest["rest_error_mm"] < 0.01
     assert rest["volume_ratio"] == pytest.approx(1.0, abs=0.01)
-    for put_back, why in ((lost, "not finite"), (gone, "left the scene")):
-        assert why in put_back["fallback"]
-        assert put_back["finite"] and put_back["recovered"]
+    for restored, why in ((lost, "not finite"), (gone, "left the scene")):
+        assert why in restored["fallback"]
+        assert restored["finite"] and restored["recovered"]
     # It falls 100 mm and comes to rest somewhere: where it was, or there is a reason.
     assert beside["fallback"] is None and beside["kinetic_peak_mj"] > rest["kinetic_peak_mj"]
     assert beside["recovered"] == (beside["rest_error_mm"] <= 0.1) == (beside["reason"] is None)
@@ -84,19 +84,19 @@ def test_two_bodies_are_fitted_apart(device):
     assert min(len(part) for part in specimen.parts) > 0.4 * specimen.body.count
     turned = specimen.body.rest_points.copy()
     turned[specimen.parts[1]] = turned[specimen.parts[1]] @ np.diag([-1.0, -1.0, 1.0]) + [5.0, 3.0, 1.0]
-    assert apart_after_fit(turned, specimen.body.rest_points).mean() > 1.0
+    assert distances_after_fit(turned, specimen.body.rest_points).mean() > 1.0
     state = specimen.solver.snapshot().body
     specimen.body.restore(type(state)(turned.astype(np.float32), state.velocity))
     assert stress_test._shape_error(specimen) < 1e-4
 
 
-def test_reasons_tell_place_from_shape():
+def test_reasons_distinguish_position_and_shape():
     assert stress_test._reason(0.05, None) is None
-    assert "its shape is whole" in stress_test._reason(12.0, 0.01)
-    assert "shape 3 mm off" in stress_test._reason(12.0, 3.0)
+    assert "shape has recovered, 12 mm" in stress_test._reason(12.0, 0.01)
+    assert "shape differs by 3 mm" in stress_test._reason(12.0, 3.0)
 
 
-def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, capsys):
+def test_the_command_writes_table_figure_and_json(tmp_path, monkeypatch, capsys):
     few = [StressCase("rest", "long", ONE), StressCase("lost", "wholly", ONE, state=("nothing",))]
     monkeypatch.setattr(stability_command, "quick_cases_of", lambda model: few)
     assert app.main(["study", "stability", "--quick", "--jobs", "1", "--out", str(tmp_path)]) == 0
@@ -111,11 +111,11 @@ def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, cap
         assert [row["fallback"] != "" for row in csv.DictReader(file)] == [False, True, False, True]
     assert Image.open(tmp_path / "stability.png").size[0] > 900
     printed = capsys.readouterr().out
-    assert "2 cases, 2 finite; 2 came back to within 0.1 mm, 1 after the tissue was put back" in printed
+    assert "2 cases, 2 finite; 2 recovered to within 0.1 mm; the state was restored in 1" in printed
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_a_state_along_an_axis_is_what_its_name_says(model):
+def test_a_state_along_an_axis_matches_its_name(model):
     states = {case.name: case.state for case in cases_of(model)}
     assert states["collapsed: to a plane, x"] == ("scaled", 0.0, 1.0, 1.0)
     assert states["collapsed: to a line, y"] == ("scaled", 0.0, 1.0, 0.0)
@@ -124,20 +124,20 @@ def test_a_state_along_an_axis_is_what_its_name_says(model):
 
 
 @pytest.mark.parametrize(
-    "changes, fate",
+    "changes, outcome",
     [
-        (dict(), "came back to where it lay"),
-        (dict(fallback="torn"), "put back by the program, to where it lay"),
-        (dict(recovered=False, shape_error_mm=0.1), "its shape whole, lies elsewhere"),
+        (dict(), "recovered its position"),
+        (dict(fallback="torn"), "recovered its position after the state was restored"),
+        (dict(recovered=False, shape_error_mm=0.1), "recovered its shape in another position"),
         (
             dict(recovered=False, shape_error_mm=0.1, fallback="torn"),
-            "put back by the program, its shape whole",
+            "recovered its shape in another position after the state was restored",
         ),
         (dict(recovered=False, shape_error_mm=0.2, fallback="torn"), "shape changed"),
         (dict(recovered=False), "shape changed"),
         (dict(finite=False), "not finite"),
     ],
 )
-def test_the_picture_says_how_a_case_ended(changes, fate):
+def test_the_outcome_of_a_case(changes, outcome):
     row = dict(finite=True, recovered=True, fallback=None, shape_error_mm=None)
-    assert fate_of(row | changes).startswith(fate) and fate_of(row | changes) in FATES
+    assert outcome_of(row | changes) == outcome and outcome in OUTCOMES

@@ -1,4 +1,4 @@
-"""What ``study timing`` measures is the step itself, and what it compares with computes the same."""
+"""``study timing`` measures the step itself, and its references compute the same."""
 
 import csv
 import json
@@ -100,7 +100,7 @@ def test_memory_is_that_of_the_fields(device, block):
     assert 1e6 * step_timing.memory_mb(solver) > 2 * body
 
 
-def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, capsys):
+def test_the_command_writes_table_figure_and_json(tmp_path, monkeypatch, capsys):
     small = setup_of("shape-matching", radius_mm=4.0)
     coarse = setup_of("neo-hookean", cell_mm=6.0, substeps=1, iterations=8)
     monkeypatch.setattr(timing_command, "load_patient", lambda _: (briefly(20), small_anatomy()))

@@ -1,4 +1,4 @@
-"""What speed costs: the front is one, the presets lie on it, and budgets choose from it."""
+"""The speed-accuracy trade-off: the Pareto front, the presets on it, and choices by a budget."""
 
 import csv
 import json
@@ -38,7 +38,7 @@ def point(ms: float, error: float, cell: float = 4.0) -> Point:
     return Point(setup_of("neo-hookean", cell_mm=cell), ms, error, True)
 
 
-def test_the_front_is_what_nothing_beats():
+def test_no_point_dominates_the_pareto_front():
     rng = np.random.default_rng(0)
     ms, error = rng.uniform(size=(2, 60)).round(1)
     best = pareto(ms, error)
@@ -97,7 +97,7 @@ def test_settings_near_measured_ones_have_an_expected_error():
     assert expected_error_mm(soft, setup_of("shape-matching", stiffness=0.9)) is None
 
 
-def test_a_rehearsals_expected_error_is_of_the_passes_that_it_takes_now():
+def test_a_rehearsals_expected_error_is_of_its_current_iterations():
     setup = PRESETS["neo-hookean"]["balanced"]
     scene = scene_of(load_scene(EMBEDDED), setup)
     passes = {name: getattr(setup, name) for name in ("substeps", "iterations", "relaxation_factor")}
@@ -136,7 +136,7 @@ class Machine:
 FRONT = [point(10 / cell, cell / 10, cell) for cell in (10.0, 5.0, 2.0, 1.0)]
 
 
-def test_a_time_budget_takes_the_truest_that_keeps_it(monkeypatch):
+def test_a_time_budget_takes_the_most_accurate_setting_within_it(monkeypatch):
     for slower, budget, wanted in ((1.0, 5.0, 2.0), (2.0, 5.0, 5.0), (0.4, 5.0, 1.0), (1.0, 1.5, 10.0)):
         machine = Machine(monkeypatch, slower)
         _, chosen, here_ms = budget_choice.choose(FRONT, machine.build, budget, None)
@@ -144,14 +144,14 @@ def test_a_time_budget_takes_the_truest_that_keeps_it(monkeypatch):
         assert here_ms <= budget and machine.built[-1] == wanted and len(machine.built) <= 2
 
 
-def test_an_error_budget_takes_the_fastest_that_keeps_it(monkeypatch):
+def test_an_error_budget_takes_the_fastest_setting_within_it(monkeypatch):
     machine = Machine(monkeypatch, 1.0)
     assert budget_choice.choose(FRONT, machine.build, None, 0.4)[1].setup.size_mm == 2.0
     # With time for more, both take the truest.
     assert budget_choice.choose(FRONT, machine.build, 20.0, 0.4)[1].setup.size_mm == 1.0
 
 
-def test_budgets_that_nothing_keeps_are_refused_in_words(monkeypatch):
+def test_budgets_that_no_setting_meets_are_refused(monkeypatch):
     machine = Machine(monkeypatch, 3.0)
     with pytest.raises(budget_choice.NoPoint, match="--budget-ms 1: .* takes 3.00 ms here"):
         budget_choice.choose(FRONT, machine.build, 1.0, None)
@@ -168,7 +168,10 @@ def test_budgets_that_nothing_keeps_are_refused_in_words(monkeypatch):
         (["--error-mm", "1", "--stiffness", "0.9"], "--stiffness: --error-mm chooses this too"),
         (["--quality", "fast", "--cell", "5"], "--cell: --quality chooses this too"),
         (["--quality", "fast", "--iterations", "4"], "--iterations: --quality chooses this too"),
-        (["--quality", "fast", "--error-mm", "1"], "--quality: --error-mm chooses size and passes too"),
+        (
+            ["--quality", "fast", "--error-mm", "1"],
+            "--quality: --error-mm chooses resolution and iterations too",
+        ),
     ],
 )
 def test_the_command_line_refuses_a_size_beside_what_chooses_it(line, words, capsys):
@@ -176,7 +179,7 @@ def test_the_command_line_refuses_a_size_beside_what_chooses_it(line, words, cap
     assert words in capsys.readouterr().err
 
 
-def test_a_quality_sets_size_and_passes_and_leaves_the_material():
+def test_a_quality_sets_size_and_iterations_and_leaves_the_material():
     scene, said = load_scene(PAPER), dict.fromkeys(OPTIONS)
     firm = said | {"tissue.young_kpa": 33.0}
     for quality, cell_mm, iterations in (("fast", 5.0, 4), ("accurate", 2.0, 12)):
@@ -209,7 +212,7 @@ def test_a_slow_step_loses_iterations_rung_by_rung_and_gets_them_back():
     assert ladder.iterations(1) == 1
 
 
-def test_the_command_leaves_table_picture_and_figures(tmp_path, monkeypatch, capsys):
+def test_the_command_writes_table_figure_and_json(tmp_path, monkeypatch, capsys):
     tried = (
         setup_of("neo-hookean", cell_mm=6.0, iterations=2, warm_up_steps=20, stage_steps=12),
         setup_of("shape-matching", radius_mm=3.0, warm_up_steps=20, stage_steps=12),

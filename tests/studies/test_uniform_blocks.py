@@ -1,4 +1,4 @@
-"""Blocks without a scene: they come to rest on a floor where their size says."""
+"""Blocks without a scene come to rest on a floor at the height of their size."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def test_a_particle_of_a_block_is_half_a_radius_thick_to_either_side(one_device)
     assert lowest_mm(block_of_particles(points, 2.0, [FLOOR]), StepSettings()) == pytest.approx(0.0, abs=0.02)
 
 
-def test_a_block_of_cells_lies_on_its_nodes(one_device):
+def test_a_block_of_cells_rests_on_its_nodes(one_device):
     solver = block_of_cells(2, 4.0, [FLOOR])
     assert np.ptp(solver.body.rest_points, axis=0) == pytest.approx([8.0] * 3)
     assert lowest_mm(solver, replace(LATTICE_SETTINGS)) == pytest.approx(-1.0, abs=0.02)

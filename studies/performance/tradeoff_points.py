@@ -1,4 +1,4 @@
-"""Error and cost of settings: bead experiments for the one, presses in turn for the other."""
+"""Error and time of settings: bead experiments for the error, presses in turn for the time."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -17,7 +17,7 @@ from studies.accuracy.bead_errors import bead_errors
 from studies.accuracy.bead_experiment import BeadExperiment
 from ultrasound.probe_manipulator import between
 
-# The machine's speed changes in minutes: every setting is timed in each round, and the median counts.
+# The machine's speed changes within minutes: every setting is timed in each round, and the median is taken.
 ROUNDS, TIMED_STEPS = 3, 45
 
 Built = Iterator[tuple[BeadExperiment, list[Setup]]]
@@ -26,18 +26,17 @@ Built = Iterator[tuple[BeadExperiment, list[Setup]]]
 def points(
     cases: list[BeadCase], tried: list[Setup], arch: str, rounds: int, done: Callable[[], Any]
 ) -> list[dict[str, Any]]:
-    """Rows of trade.json: error over all cases, cost on the first. ``done`` is told of each setting's runs.
+    """Rows of trade.json: error over all cases, time on the first; ``done`` is called after each run.
 
-    Each stage counts twice: when the transducer arrives, as the surgeon sees it on the way, and when it has rested.
-
-    Without ``rounds`` the cost is that of the steps whose error was measured, at another time for each setting.
+    Each stage counts twice: when the transducer arrives, as in a moving press, and after it has rested.
+    With 0 ``rounds`` the time is that of the steps whose error was measured.
     """
     resting: dict[Setup, dict[str, float]] = {setup: {} for setup in tried}
     arriving: dict[Setup, dict[str, float]] = {setup: {} for setup in tried}
     ms: dict[Setup, list[float]] = {setup: [] for setup in tried}
     for case in cases:
-        for experiment, alike in _built(case, tried, arch):
-            for setup in alike:
+        for experiment, setups in _built(case, tried, arch):
+            for setup in setups:
                 run = experiment.run(setup)
                 if rounds == 0 and case is cases[0]:
                     ms[setup].append(float(np.median(run.step_ms)))
@@ -45,25 +44,27 @@ def points(
                 arriving[setup][case.name] = _mean_error(case, run.arriving, run.finite)
                 done()
     for _ in range(rounds):
-        for experiment, alike in _built(cases[0], tried, arch):
-            for setup in alike:
+        for experiment, setups in _built(cases[0], tried, arch):
+            for setup in setups:
                 ms[setup].append(_time(experiment, setup))
                 done()
-    cost = np.array([np.median(ms[setup]) for setup in tried])
+    time_ms = np.array([np.median(ms[setup]) for setup in tried])
     error = np.array([np.mean([*resting[setup].values(), *arriving[setup].values()]) for setup in tried])
-    best = pareto(cost, error)
-    return [_row(setup, cost[k], best[k], resting[setup], arriving[setup]) for k, setup in enumerate(tried)]
+    best = pareto(time_ms, error)
+    return [
+        _row(setup, time_ms[k], best[k], resting[setup], arriving[setup]) for k, setup in enumerate(tried)
+    ]
 
 
 def count(cases: list[BeadCase], tried: list[Setup], rounds: int) -> int:
-    """How often ``points`` reports."""
+    """How often ``points`` calls ``done``."""
     return (len(cases) + rounds) * len(tried)
 
 
 def _built(case: BeadCase, tried: list[Setup], arch: str) -> Built:
-    """Each model and size on a device of its own, with the settings that share it."""
-    for _, alike in groupby(tried, key=lambda setup: (setup.model, setup.size_mm)):
-        group = list(alike)
+    """Each model and size on a freshly started device, with the settings that share it."""
+    for _, sharing in groupby(tried, key=lambda setup: (setup.model, setup.size_mm)):
+        group = list(sharing)
         start(arch)
         yield BeadExperiment(case, group[0]), group
 
@@ -73,7 +74,7 @@ def _mean_error(case: BeadCase, beads: np.ndarray, finite: bool) -> float:
 
 
 def _time(experiment: BeadExperiment, setup: Setup) -> float:
-    """Median of a step [ms] on the way to the deepest stage."""
+    """Median time of a step [ms] in a press to the deepest stage."""
     short = replace(setup, warm_up_steps=10)
     step = experiment.prepare(short)
     first, last = experiment.case.poses[0], experiment.case.poses[-1]

@@ -1,4 +1,4 @@
-"""Hours of rehearsal without a window, faster than real: does anything drift, grow or differ?"""
+"""Soak test: hours of rehearsal without a window, faster than real time; checked for drift, growth and differences."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -15,21 +15,21 @@ from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
 from sim.device import start
 from sim.fields import array_of
-from studies.robustness.rigid_fit import apart_after_fit
+from studies.robustness.rigid_fit import distances_after_fit
 from ultrasound.probe_manipulator import advanced
 
 SEED = 20161130
-# At each minute's end the transducer is away, and the tissue comes to rest.
+# At the end of each minute the transducer is away and the tissue comes to rest.
 MINUTE_S, QUICK_MINUTE_S, REST_S = 60.0, 16.0, 10.0
-# A new place to go to so often; as far to the sides, as oblique and as deep as that.
+# Time between two goals of the probe; their reach to the sides, obliquity and depth.
 CHANGE_S = 1.5
 ASIDE_MM, OBLIQUE_DEG, DEEPEST_MM = (20.0, 10.0), 20.0, 12.0
 AWAY_MM = 100.0
-# So much of the end is computed again from a snapshot.
+# The last minutes are computed again from a snapshot.
 REPLAYED_MINUTES = 2
 
 
-def soak(
+def run_soak(
     scene: Scene,
     anatomy: LoadedAnatomy,
     setup: Setup,
@@ -38,22 +38,19 @@ def soak(
     arch: str,
     done: Callable[[], Any],
 ) -> dict[str, Any]:
-    """Rehearse for some minutes of simulated time; figures of each, and whether its end can be replayed bit for bit.
-
-    A minute takes ``minute_s`` [s], so that a quick look need not wait for a whole one.
-    """
+    """Figures of each simulated minute of ``minute_s`` [s], and whether replay and reset are identical to the bit."""
     start(arch)
     rehearsal = Rehearsal(scene_of(scene, setup), replace(anatomy, ct=None))
     first, begun = rehearsal.snapshot(), rehearsal.digest()
     replayed = min(REPLAYED_MINUTES, minutes)
-    rows, kept = [], first
+    rows, snapshot = [], first
     for minute in range(minutes):
         if minute == minutes - replayed:
-            kept = rehearsal.snapshot()
+            snapshot = rehearsal.snapshot()
         rows.append(_minute(rehearsal, minute, minute_s, first))
         done()
     ended = rehearsal.digest()
-    rehearsal.restore(kept)
+    rehearsal.restore(snapshot)
     for minute in range(minutes - replayed, minutes):
         _minute(rehearsal, minute, minute_s, first)
         done()
@@ -71,7 +68,7 @@ def soak(
 
 
 def _minute(rehearsal: Rehearsal, minute: int, minute_s: float, first: RehearsalState) -> dict[str, Any]:
-    """One minute of rehearsal, and how far from its first rest the tissue then lies."""
+    """One minute of rehearsal, and the distance of the tissue from its first rest position."""
     dt = rehearsal.settings.time_step_s
     ms: list[float] = []
     fallbacks = 0
@@ -89,7 +86,7 @@ def _minute(rehearsal: Rehearsal, minute: int, minute_s: float, first: Rehearsal
     return dict(
         minute=minute + 1,
         moved_mm=round(float(np.linalg.norm(position - rest, axis=1).mean()), 6),
-        shape_mm=round(float(apart_after_fit(position, rest).mean()), 6),
+        shape_mm=round(float(distances_after_fit(position, rest).mean()), 6),
         volume_ratio=round(rehearsal.volume_ratio(), 6),
         tangled=rehearsal.divergence_check.health().tangled,
         finite=bool(np.isfinite(position).all()),
@@ -100,7 +97,7 @@ def _minute(rehearsal: Rehearsal, minute: int, minute_s: float, first: Rehearsal
 
 
 def _goals(rehearsal: Rehearsal, minute: int) -> Iterator[np.ndarray]:
-    """Poses over the organ and in it, the same for every minute of one number."""
+    """Random poses over and in the organ, the same for the same minute."""
     random = np.random.default_rng([SEED, minute])
     home = rehearsal.manipulator.home
     while True:

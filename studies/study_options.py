@@ -1,0 +1,36 @@
+"""Arguments and options that several commands of the studies share."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rehearsal.commands.command_line import NumberRange, WholeRange
+from scenes.tissue import QUALITIES
+
+out_option = click.option(
+    "--out", type=click.Path(path_type=Path), required=True, help="Folder for tables and figures."
+)
+jobs_option = click.option(
+    "--jobs", type=WholeRange(1, 1024), help="Processes on this machine [one a processor]."
+)
+preset_option = click.option(
+    "--quality",
+    type=click.Choice(QUALITIES),
+    default="balanced",
+    show_default=True,
+    help="A preset of the model; other options change single values of it.",
+)
+
+
+def scene_argument(default: Path) -> Any:
+    """The argument SCENE of a command: a scene file or a patient's folder."""
+    return click.argument("scene", type=click.Path(path_type=Path), default=default, required=False)
+
+
+def number_option(
+    *names: str, low: float, high: float, help: str, default: float | None = None, **bounds: bool
+) -> Any:
+    """An option for a number from low to high; ``bounds`` are ``min_open`` and ``max_open``."""
+    range = NumberRange(low, high, **bounds)
+    return click.option(*names, type=range, default=default, show_default=default is not None, help=help)

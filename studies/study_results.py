@@ -1,0 +1,40 @@
+"""The table, the files and the figure that a study leaves."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from tabulate import tabulate
+
+from rehearsal.result_files import save_figure, write_csv, write_json
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DPI = 130
+
+
+def text_table(headers: Sequence[str], rows: Sequence[Sequence[Any]], formats: Sequence[str] = ()) -> str:
+    """Aligned columns; ``formats`` are those of the columns' numbers, None is an empty cell."""
+    return tabulate(rows, headers, tablefmt="plain", floatfmt=formats or "g", missingval="")
+
+
+def write_results(
+    out: Path,
+    name: str,
+    report: dict[str, Any],
+    text: str,
+    rows: list[dict[str, Any]] | None = None,
+    figure: "Figure | None" = None,
+) -> None:
+    """Write name.json and, where there are any, name.csv and name.png into a folder; print the text and their names."""
+    files = [f"{name}.json"]
+    write_json(report, out / files[0])
+    if rows is not None:
+        files.append(f"{name}.csv")
+        write_csv(rows, out / files[-1])
+    if figure is not None:
+        files.append(f"{name}.png")
+        save_figure(figure, out / files[-1], dpi=DPI)
+    click.echo(f"\n{text}\n\nWrote {', '.join(files)} to {out}")
