@@ -14,9 +14,9 @@ import trimesh
 from rehearsal.build_solver import build_solver, embedding_cell_mm, static_shape, step_settings, tool_of
 from rehearsal.configuration import probe_of
 from scenes.anatomy import Grid, LoadedAnatomy, press_on
-from scenes.closed_surfaces import moved_by, volume_mm3
-from scenes.progress import ReportProgress, no_progress
 from scenes.scene import PlaneShape, Scene
+from scenes.surfaces import moved_by, volume_mm3
+from scenes.terminal import ReportProgress, no_progress
 from sim.divergence_check import DivergenceCheck, DivergenceState
 from sim.embedding import Embedding
 from sim.fields import array_of

@@ -40,7 +40,7 @@ from render.keys import Keys
 from render.viewer import Settings
 from render.window import NoVulkan
 from scenes.anatomy import LoadedAnatomy
-from scenes.shell_quoting import pasted
+from scenes.terminal import pasted
 
 
 @dataclass

@@ -11,7 +11,7 @@ from rehearsal.image_files import save_picture, save_pictures
 from rehearsal.numbered_files import next_number
 from rehearsal.rehearsal import Rehearsal
 from render.viewer import View
-from scenes.surface_files import save_surface
+from scenes.surfaces import save_surface
 from sim.fields import array_of
 from ultrasound.probe import Probe
 from ultrasound.scanner import ECHO

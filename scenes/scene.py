@@ -15,7 +15,6 @@ from pydantic import AliasChoices, BaseModel, Field, ValidationError, model_vali
 from errors import UserError, explained, meant
 from scenes.section import Direction, Length, Section, Vector3
 from scenes.tissue import TISSUES, NeoHookeanTissue, Tissue
-from scenes.trocar import Trocar
 
 # The scene that the program has with it.
 EMBEDDED = Path(__file__).parent / "phantom.toml"
@@ -140,6 +139,20 @@ class Transducer(Section):
     size_mm: tuple[Length, Length, Length] | None = None
     speed_mm_s: float = Field(150.0, gt=0, le=2000)
     compression_warning_mm: float = Field(8.0, gt=0, le=100)
+
+
+class Trocar(Section):
+    """A remote centre of motion: the shaft goes through ``at_mm``, within a cone, and bends at its end by a wrist.
+
+    ``axis`` points into the body; without it, it is to what is to be seen. ``wrist_deg`` is how far the probe may look aside from
+    the shaft: 0 for a stiff one. A scene without ``at_mm`` asks nothing of the way in.
+    """
+
+    at_mm: Vector3 | None = None
+    axis: Direction | None = None
+    cone_deg: float = Field(50.0, gt=0, le=90)
+    wrist_deg: float = Field(90.0, ge=0, le=180)
+    longest_mm: Length = 250.0
 
 
 class Image(Section):

@@ -26,9 +26,9 @@ from pydicom.uid import (
 )
 from synthetic_body import DIRECTIONS
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.ct_files import open_ct
-from scenes.patients.readers.lazy_volume import LazyVolume
+from scenes.volumes.lazy_volume import LazyVolume
 
 PERSON = {
     "PatientName": "Doe^Jane",

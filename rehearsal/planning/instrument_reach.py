@@ -3,7 +3,7 @@
 import igl
 import numpy as np
 
-from scenes.trocar import Trocar
+from scenes.scene import Trocar
 from ultrasound.probe_manipulator import ProbeManipulator
 
 # The shaft may touch the organ so far from where it holds the probe [mm].

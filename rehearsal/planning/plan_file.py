@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from errors import UserError
 from rehearsal.numbered_files import next_number
 from scenes.atomic_files import whole
-from scenes.trocar import Trocar
+from scenes.scene import Trocar
 from ultrasound.target import Target
 
 MOST_POSES, MOST_MARGIN_MM = 20_000, 30.0

@@ -6,7 +6,7 @@ import numpy as np
 import SimpleITK as sitk
 
 from rehearsal.reconstruction.sweep_volumes import Rebuilt
-from scenes.volume_files import save_image
+from scenes.volumes.volume_files import save_image
 from ultrasound.reconstruction import VoxelBox
 from ultrasound.sweep import Mark
 

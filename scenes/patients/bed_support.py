@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from scipy import ndimage
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.moulded_support import (
     CLEARANCE_MM,
     GRID_MM,
@@ -21,8 +21,8 @@ from scenes.patients.moulded_support import (
     round_meet,
 )
 from scenes.patients.readers.label_maps import LabelMap, nearest
-from scenes.patients.readers.voxel_grid import VoxelGrid
-from scenes.surface_files import load_surface
+from scenes.surfaces import load_surface
+from scenes.volumes.voxel_grid import VoxelGrid
 
 # The organ rests on what lies under it within this distance; what is between is fat, and part of the bed.
 REACH_MM = 40.0

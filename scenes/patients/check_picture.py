@@ -20,8 +20,8 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from scenes.patients.import_summary import told
 from scenes.patients.patient_import import Patient
 from scenes.patients.readers.label_maps import Colour
-from scenes.patients.readers.lazy_volume import AIR_HU
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.volumes.lazy_volume import AIR_HU
+from scenes.volumes.voxel_grid import VoxelGrid
 
 BACKGROUND, WARNING = "#101014", "#ffb000"
 PIXEL_MM = 0.5

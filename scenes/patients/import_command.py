@@ -5,12 +5,11 @@ from pathlib import Path
 import click
 import numpy as np
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.patient_folder import check_folder, save_patient
 from scenes.patients.readers.segment_names import Side
-from scenes.progress import bar
 from scenes.scene import scene_text
-from scenes.shell_quoting import pasted
+from scenes.terminal import bar, pasted
 
 # Options that say which labels are of a tissue.
 TISSUE_OPTIONS = {"tumour": "tumour", "cyst": "cyst", "vessels": "vessel", "collecting": "urine"}
@@ -60,10 +59,10 @@ def import_patient_command(
     """
     check_folder(out)
     # What draws and what reads segmentations takes half a second that no other command should wait for.
-    from scenes.anatomy import patient_scene
     from scenes.patients.check_picture import draw_check
     from scenes.patients.import_request import Request, take_in
     from scenes.patients.import_summary import facts, told
+    from scenes.patients.patient_scene import patient_scene
 
     tissues = {TISSUE_OPTIONS[o]: label_words(text, o) for o, text in words.items() if text is not None}
     own = [] if organ is None else label_words(organ, "organ")

@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.patient_import import Patient, import_patient
 from scenes.patients.readers.ct_files import open_ct
 from scenes.patients.readers.dicom_series import dicom_found
 from scenes.patients.readers.label_files import Drawing, drawing_of, open_labels
 from scenes.patients.readers.label_maps import LabelMap, merged, with_tissues
-from scenes.patients.readers.lazy_volume import LazyVolume
 from scenes.patients.readers.segment_names import Side
 from scenes.patients.region_growing import grown
-from scenes.progress import Progress, silent
+from scenes.terminal import Progress, silent
+from scenes.volumes.lazy_volume import LazyVolume
 
 
 @dataclass(frozen=True)

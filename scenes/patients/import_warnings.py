@@ -8,7 +8,7 @@ from scipy import ndimage
 from scenes.patients.organ_selection import BODY_ABOVE_HU, Organ
 from scenes.patients.readers.label_maps import LabelMap, listed
 from scenes.patients.readers.segment_names import is_understood
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.volumes.voxel_grid import VoxelGrid
 
 BONE_ABOVE_HU = 300
 COARSE_MM = 3.0

@@ -9,10 +9,10 @@ from typing import cast
 import numpy as np
 from scipy import ndimage
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.label_maps import LabelMap, box_of, listed
 from scenes.patients.readers.segment_names import Side
-from scenes.patients.readers.voxel_grid import Box, VoxelGrid
+from scenes.volumes.voxel_grid import Box, VoxelGrid
 
 PLAUSIBLE_ORGAN_ML = (20.0, 2000.0)
 ORGAN_FROM_ML = 20.0  # a connected piece from this volume on is an organ, below it an island of the label

@@ -14,12 +14,12 @@ from joblib import cpu_count
 from joblib.externals.loky import ProcessPoolExecutor
 from scipy import ndimage
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.label_surfaces import surface_from_mask
 from scenes.patients.organ_selection import GROWN, INNER, Organ
 from scenes.patients.readers.label_maps import Colour, LabelMap
-from scenes.patients.readers.voxel_grid import VoxelGrid
-from scenes.progress import Progress
+from scenes.terminal import Progress
+from scenes.volumes.voxel_grid import VoxelGrid
 
 # Vessels and the collecting system are modelled as far as this from the organ: its pedicle.
 PEDICLE_MM = 15.0

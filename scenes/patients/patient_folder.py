@@ -13,13 +13,13 @@ from pathlib import Path
 
 import SimpleITK as sitk
 
+from errors import PatientError
 from scenes.atomic_files import check_writable, whole
-from scenes.patients.import_error import PatientError
 from scenes.patients.part_surfaces import PARTS
 from scenes.patients.patient_import import Patient
 from scenes.scene import AnatomyFiles, Scene, scene_text
-from scenes.surface_files import STL_HEADER_BYTES, save_surface
-from scenes.volume_files import save_image
+from scenes.surfaces import STL_HEADER_BYTES, save_surface
+from scenes.volumes.volume_files import save_image
 
 # Shorter texts, such as the id 7, say nothing, and numbers under six digits are in every file.
 LEAST_TEXT, LEAST_DIGITS = 3, 6

@@ -15,8 +15,8 @@ import numpy as np
 import SimpleITK as sitk
 import trimesh
 
+from errors import PatientError
 from scenes.patients.bed_support import bed_of_file, bed_of_labels
-from scenes.patients.import_error import PatientError
 from scenes.patients.import_warnings import as_stone, in_fat, taken, turned
 from scenes.patients.moulded_support import mould
 from scenes.patients.organ_selection import (
@@ -37,10 +37,10 @@ from scenes.patients.part_surfaces import (
     volume_ml,
 )
 from scenes.patients.readers.label_maps import Colour, LabelMap, nearest, present
-from scenes.patients.readers.lazy_volume import LazyVolume
 from scenes.patients.readers.segment_names import Side
-from scenes.patients.readers.voxel_grid import Box, VoxelGrid
-from scenes.progress import Progress, silent
+from scenes.terminal import Progress, silent
+from scenes.volumes.lazy_volume import LazyVolume
+from scenes.volumes.voxel_grid import Box, VoxelGrid
 
 SUPINE_GRAVITY = np.array([0.0, 1.0, 0.0])  # as the CT was taken: on the back, posterior is down
 PLAUSIBLE_ORGAN_HU = (-150.0, 600.0)

@@ -15,10 +15,10 @@ import SimpleITK as sitk
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.label_maps import LabelMap, Segment, box_of
-from scenes.patients.readers.lazy_volume import LazyVolume
-from scenes.patients.readers.voxel_grid import Box, VoxelGrid
+from scenes.volumes.lazy_volume import LazyVolume
+from scenes.volumes.voxel_grid import Box, VoxelGrid
 
 DRAFT = Segment("kidney (draft, grown from a seed)", None, "kidney", None)
 REACH_MM = 110.0  # around the seed: a kidney is 9 to 13 cm long and the seed may be at its pole

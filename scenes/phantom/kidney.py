@@ -48,6 +48,17 @@ class Label(IntEnum):
     TUMOUR = 6
 
 
+# The tissues of ultrasound/tissues.toml.
+TISSUE_OF_LABEL: dict[int, str] = {
+    Label.CORTEX: "cortex",
+    Label.MEDULLA: "medulla",
+    Label.SINUS_FAT: "sinus",
+    Label.COLLECTING_SYSTEM: "urine",
+    Label.VESSEL: "vessel",
+    Label.TUMOUR: "tumour",
+}
+
+
 # Attenuation [HU] late in the corticomedullary phase (about 70 s after injection): the medulla has begun to
 # enhance, nothing is excreted yet. Measured for comparison in CRLM-CT-1004 (TCIA, somewhat later): renal
 # parenchyma 200 in the median, noise SD 9 to 10.

@@ -8,8 +8,8 @@ import trimesh
 from rehearsal.build_solver import build_solver, static_shape, step_settings
 from rehearsal.configuration import Setup, SetupError
 from rehearsal.stopwatch import timed
-from scenes.closed_surfaces import moved_by
 from scenes.scene import Contact, SolverSection
+from scenes.surfaces import moved_by
 from scenes.tissue import TissueSection
 from sim.body import RestBody
 from sim.fields import array_of

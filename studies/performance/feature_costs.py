@@ -18,8 +18,8 @@ from rehearsal.stopwatch import timed
 from render.background_image import Page
 from render.window_layout import WindowLayout
 from scenes.anatomy import LoadedAnatomy
-from scenes.closed_surfaces import moved_by
 from scenes.scene import Contact, Scene, SolverSection, with_options
+from scenes.surfaces import moved_by
 from scenes.tissue import TISSUES, ShapeMatchingTissue, TissueSection
 from sim.device import start
 from sim.distance_grid import distance_grid

@@ -13,8 +13,8 @@ from conftest import rotation_about
 
 import app
 from rehearsal.saving import save_surfaces
-from scenes.surface_files import FORMATS, save_surface
-from scenes.volume_files import save_image
+from scenes.surfaces import FORMATS, save_surface
+from scenes.volumes.volume_files import save_image
 from sim.fields import field_of
 
 pytestmark = pytest.mark.usefixtures("one_device")

@@ -19,7 +19,7 @@ from render.keys import USUAL_KEYS, Keys
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
 from scenes.scene import EMBEDDED
-from scenes.shell_quoting import pasted
+from scenes.terminal import pasted
 from ultrasound.probe import load_probe
 
 STEP_S = 0.25

@@ -34,7 +34,7 @@ from rehearsal.planning.sweep_path import (
     tilted,
     tilting,
 )
-from scenes.trocar import Trocar
+from scenes.scene import Trocar
 from ultrasound.probe_manipulator import ProbeManipulator, advanced, pose_at
 
 

@@ -16,7 +16,7 @@ from rehearsal.planning import trial_workers
 from rehearsal.planning.plan_file import PlanError, is_plan, next_free, read_plan, write_plan
 from rehearsal.planning.plan_poses import COMES_S, LIFT_MM, LIFTED_MM_S, timed_poses
 from rehearsal.tracking.track_file import load_track
-from scenes.trocar import Trocar
+from scenes.scene import Trocar
 from ultrasound.probe import load_probe
 
 BALL = """

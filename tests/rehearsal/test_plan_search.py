@@ -24,8 +24,7 @@ from rehearsal.planning.search import FORESEEN, TRIAL_MM_S, length_of, ranked, s
 from rehearsal.planning.sweep_candidates import Candidate, Quantity
 from rehearsal.planning.trial_workers import Outcome, Problem, SearchSpace, Workers, _trial, workers
 from scenes.anatomy import LoadedAnatomy, fingerprint
-from scenes.scene import Scene
-from scenes.trocar import Trocar
+from scenes.scene import Scene, Trocar
 from studies.planning import plan_comparison
 from studies.planning.plan_study_command import table
 from ultrasound.probe import load_probe

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from rehearsal.image_files import save_pictures
 from rehearsal.result_files import rounded, save_figure, spread, write_csv, write_json
-from scenes.closed_surfaces import moved_by, volume_mm3
+from scenes.surfaces import moved_by, volume_mm3
 from studies.robustness.rigid_fit import apart_after_fit
 from ultrasound.probe import load_probe
 from ultrasound.scanner import ECHO

@@ -6,11 +6,11 @@ import pytest
 import trimesh
 from synthetic_body import LEFT, TUMOUR, assert_sound, body, drawn, grid_around, least_gap, level
 
+from errors import PatientError
 from scenes.patients.bed_support import bed_of_file, bed_of_labels
-from scenes.patients.import_error import PatientError
 from scenes.patients.patient_import import SUPINE_GRAVITY, import_patient
 from scenes.patients.readers.label_maps import LabelMap
-from scenes.patients.readers.lazy_volume import LazyVolume
+from scenes.volumes.lazy_volume import LazyVolume
 
 # A muscle behind the left kidney, with 4 mm of fat between.
 MUSCLE = np.array([70.0, 79.0, 12.0]), np.array([45.0, 20.0, 70.0])

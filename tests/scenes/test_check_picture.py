@@ -20,8 +20,8 @@ from scenes.patients.check_picture import (
 from scenes.patients.import_summary import facts
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.label_maps import LabelMap
-from scenes.patients.readers.lazy_volume import LazyVolume
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.volumes.lazy_volume import LazyVolume
+from scenes.volumes.voxel_grid import VoxelGrid
 
 LETTER = {(1, 0, 0): "L", (-1, 0, 0): "R", (0, 1, 0): "P", (0, -1, 0): "A", (0, 0, 1): "S", (0, 0, -1): "I"}
 NAMES = {2: "kidney_left", 3: "tumour"}

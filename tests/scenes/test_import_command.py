@@ -9,17 +9,16 @@ from pydicom.dataset import Dataset
 from synthetic_body import BODY, DIRECTIONS, LEFT, RIGHT, TUMOUR, coarsely, level
 
 from app import main
+from errors import PatientError
 from scenes.anatomy import load_anatomy
 from scenes.patients.import_command import place_mm
-from scenes.patients.import_error import PatientError
 from scenes.patients.import_request import Request, take_in, with_labels
 from scenes.patients.patient_folder import save_patient, telling
 from scenes.patients.readers.ct_files import open_ct
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import LabelMap
-from scenes.progress import silent
 from scenes.scene import load_scene
-from scenes.shell_quoting import pasted
+from scenes.terminal import pasted, silent
 
 SPINE = np.array([0.0, 70.0, 0.0]), np.array([22.0, 20.0, 400.0])
 ORIGIN = (-175.0, -120.0, -56.0)

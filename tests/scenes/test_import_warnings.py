@@ -6,7 +6,7 @@ import SimpleITK as sitk
 from scipy import ndimage
 
 from scenes.patients.import_warnings import STONE_ABOVE_MEDIAN_HU, as_stone
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.volumes.voxel_grid import VoxelGrid
 
 KIDNEY_HU, WHOLE, NOWHERE = 100.0, np.ones((10, 10, 10), bool), np.zeros((10, 10, 10), bool)
 

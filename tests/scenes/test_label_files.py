@@ -10,7 +10,7 @@ from test_readers_labels import KIDNEY, by_name, ct_grid, ring
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import LabelMap, merged, with_tissues
 from scenes.patients.readers.segment_names import side_of
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.volumes.voxel_grid import VoxelGrid
 
 GRID = VoxelGrid.of(grid_around((-33, 18, -401), (-22, 30, -385), (0.7, 0.9, 1.6)))
 

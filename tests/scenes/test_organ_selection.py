@@ -8,13 +8,13 @@ from synthetic_body import BODY, LEFT, RIGHT, body, drawn, grid_around, with_vox
 from test_patient_import import found, imported
 
 import scenes.patients.patient_import
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.organ_selection import hollow, midline_x, organs
 from scenes.patients.part_surfaces import PEDICLE_MM, bodies, colours_of_labels, near_organ
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.label_maps import LabelMap, Segment
-from scenes.patients.readers.lazy_volume import LazyVolume
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.volumes.lazy_volume import LazyVolume
+from scenes.volumes.voxel_grid import VoxelGrid
 
 
 @pytest.fixture(scope="module")

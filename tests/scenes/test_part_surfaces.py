@@ -5,11 +5,11 @@ import os
 import numpy as np
 import pytest
 
+from errors import PatientError
 from scenes.patients import part_surfaces
-from scenes.patients.import_error import PatientError
 from scenes.patients.part_surfaces import surfaces_aside
-from scenes.patients.readers.voxel_grid import VoxelGrid
-from scenes.progress import silent
+from scenes.terminal import silent
+from scenes.volumes.voxel_grid import VoxelGrid
 
 GRID = VoxelGrid((40, 36, 32), np.array([0.9, 1.0, 1.2]), np.array([5.0, -7.0, 3.0]), np.eye(3))
 

@@ -23,8 +23,7 @@ from synthetic_body import (
 )
 
 import scenes.patients.patient_import
-from scenes import anatomy
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.import_summary import facts, told
 from scenes.patients.import_warnings import STONE_ABOVE_MEDIAN_HU
 from scenes.patients.organ_selection import midline_x, organs, single_out
@@ -32,9 +31,10 @@ from scenes.patients.patient_folder import save_patient
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.ct_files import open_ct
 from scenes.patients.readers.label_maps import LabelMap, with_tissues
-from scenes.patients.readers.lazy_volume import LazyVolume
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.phantom import embedded_patient
 from scenes.scene import SceneError
+from scenes.volumes.lazy_volume import LazyVolume
+from scenes.volumes.voxel_grid import VoxelGrid
 
 PELVIS = np.array([62.0, 35.0, 12.0]), np.array([8.0, 7.0, 12.0])
 CYST = np.array([70.0, 20.0, -30.0]), np.array([12.0, 12.0, 12.0])  # sticks out, too
@@ -305,19 +305,21 @@ class TestSave:
         assert {each.name for each in tmp_path.iterdir()} == {"patient", ".0a1b2c3d.partial-another"}
 
     def test_the_embedded_patient_is_saved_where_it_can_be(self, patient, tmp_path, monkeypatch):
-        monkeypatch.setattr(anatomy, "_phantom_patient", lambda told: patient)
+        monkeypatch.setattr(embedded_patient, "make_embedded_patient", lambda progress: patient)
         monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path / "temporary"))
         cache = tmp_path / "cache"
         cache.write_text("a file in the way")
-        monkeypatch.setattr(anatomy, "CACHE", cache)
-        folder = anatomy.phantom_folder()
+        monkeypatch.setattr(embedded_patient, "CACHE", cache)
+        folder = embedded_patient.phantom_folder()
         assert folder.parent == tmp_path / "temporary" / "nephron" and (folder / "organ.stl").is_file()
-        monkeypatch.setattr(anatomy, "_phantom_patient", lambda told: pytest.fail("made twice"))
-        assert anatomy.phantom_folder() == folder
-        monkeypatch.setattr(anatomy, "_phantom_patient", lambda told: patient)
+        monkeypatch.setattr(
+            embedded_patient, "make_embedded_patient", lambda progress: pytest.fail("made twice")
+        )
+        assert embedded_patient.phantom_folder() == folder
+        monkeypatch.setattr(embedded_patient, "make_embedded_patient", lambda progress: patient)
         monkeypatch.setattr("tempfile.gettempdir", lambda: str(cache))
         with pytest.raises(SceneError, match="can be written to neither; free"):
-            anatomy.phantom_folder()
+            embedded_patient.phantom_folder()
 
 
 @pytest.mark.usefixtures("patient", "without_support", "coarse")

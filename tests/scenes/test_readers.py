@@ -25,10 +25,10 @@ from dicom_series import (
 from pydicom.uid import DeflatedExplicitVRLittleEndian, generate_uid
 from synthetic_body import DIRECTIONS, grid_around, with_voxels
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.ct_files import open_ct
 from scenes.patients.readers.label_files import open_labels
-from scenes.patients.readers.lazy_volume import LazyVolume
+from scenes.volumes.lazy_volume import LazyVolume
 
 AIR = -1000
 FAILING = "dicom/dicom2nifti/tests/data/failing"

@@ -9,10 +9,10 @@ import SimpleITK as sitk
 from synthetic_body import DIRECTIONS, grid_around, with_voxels
 from test_readers import AIR, ENDINGS, RAS, affine_of, nifti, noise, written
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.ct_files import open_ct
 from scenes.patients.readers.label_files import open_labels
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.volumes.voxel_grid import VoxelGrid
 
 
 class TestFiles:

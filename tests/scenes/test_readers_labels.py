@@ -11,12 +11,12 @@ from dicom_series import Series, refusal, write_segmentation, write_structures, 
 from scipy.spatial.transform import Rotation
 from synthetic_body import DIRECTIONS, drawn, grid_around, level
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.ct_files import open_ct
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import LabelMap, Segment, merged, with_tissues
 from scenes.patients.readers.segment_names import is_far, side_of, tissue_of
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.volumes.voxel_grid import VoxelGrid
 
 NAMES = {
     "kidney_left": ("kidney", "left"), "kidney_right": ("kidney", "right"), "Kidney L": ("kidney", "left"),

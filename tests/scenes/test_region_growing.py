@@ -8,14 +8,15 @@ import SimpleITK as sitk
 from scipy import ndimage
 from synthetic_body import DIRECTIONS, grid_around, level, points_of
 
-from scenes.anatomy import PHANTOM_TISSUES, phantom_folder
-from scenes.patients.import_error import PatientError
+from errors import PatientError
+from scenes.anatomy import files_of
 from scenes.patients.readers.ct_files import open_ct
 from scenes.patients.readers.label_maps import LabelMap, box_of, nearest
-from scenes.patients.readers.lazy_volume import LazyVolume
-from scenes.patients.readers.volume_readers import file_volume
-from scenes.patients.readers.voxel_grid import VoxelGrid
 from scenes.patients.region_growing import DRAFT, WORKING_MM, grown
+from scenes.scene import EMBEDDED, load_scene
+from scenes.volumes.lazy_volume import LazyVolume
+from scenes.volumes.volume_files import file_volume
+from scenes.volumes.voxel_grid import VoxelGrid
 
 CENTRE = np.array([62.0, 31.0, -118.0])
 KIDNEY = CENTRE, np.array([30.0, 24.0, 52.0])
@@ -161,9 +162,10 @@ class TestRefused:
 
 def test_phantom():
     """Cortex and medulla are grown from; the tumour, the sinus and its fat are of the organ and may be missed."""
-    ct, labels = (file_volume(phantom_folder() / f"{name}.nrrd") for name in ("ct", "labels"))
+    folder, files = files_of(load_scene(EMBEDDED), EMBEDDED.parent)
+    ct, labels = (file_volume(folder / name) for name in (files.ct, files.labels))
     tissue = labels.read(labels.grid.whole())
-    firm = [int(code) for code, name in PHANTOM_TISSUES.items() if name in ("cortex", "medulla")]
+    firm = [int(code) for code, name in files.tissues.items() if name in ("cortex", "medulla")]
     (seed,) = seeds_in(ct.grid, np.isin(tissue, firm), count=1, deep_mm=3.0)
     assert dice(placed(grown(ct, seed), ct.grid), tissue > 0) > 0.9
 

@@ -7,10 +7,11 @@ import pytest
 import SimpleITK as sitk
 import trimesh
 
+from errors import PatientError
 from rehearsal.build_solver import step_settings
 from rehearsal.configuration import probe_of
-from scenes.anatomy import load_anatomy, phantom_folder, press_on
-from scenes.patients.import_error import PatientError
+from scenes.anatomy import load_anatomy, press_on
+from scenes.phantom.embedded_patient import phantom_folder
 from scenes.scene import (
     EMBEDDED,
     AnatomyFiles,

@@ -19,9 +19,9 @@ from rehearsal.reconstruction import compression_correction
 from rehearsal.reconstruction.compression_correction import CompressionCorrection
 from rehearsal.reconstruction.sweep_volumes import track_of
 from rehearsal.tracking.sweep_recording import Sweeping
-from scenes.anatomy import phantom_folder
+from scenes.phantom.embedded_patient import phantom_folder
 from scenes.scene import EMBEDDED
-from scenes.surface_files import load_surface
+from scenes.surfaces import load_surface
 from sim.embedding import Unmoved
 from sim.mesh_distance import signed_distance
 from studies.freehand.freehand_sweeps import sweep_of

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.dicom_series import dicom_found, series_volume
-from scenes.patients.readers.lazy_volume import LazyVolume
-from scenes.patients.readers.volume_readers import file_volume, is_volume_file
-from scenes.progress import Progress, silent
+from scenes.terminal import Progress, silent
+from scenes.volumes.lazy_volume import LazyVolume
+from scenes.volumes.volume_files import file_volume, is_volume_file
 
 
 def open_ct(

@@ -12,7 +12,7 @@ from pydicom import config
 from pydicom.dataset import Dataset, FileDataset
 from pydicom.uid import ExplicitVRLittleEndian, ImplicitVRLittleEndian
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 
 # A value that breaks the standard is found where it matters; warnings and logs would print it, whatever it says of whom.
 config.settings.reading_validation_mode = config.IGNORE

@@ -11,11 +11,11 @@ import SimpleITK as sitk
 from pydicom.dataset import Dataset
 from pydicom.pixels import pixel_array
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.dicom_file import parsed
 from scenes.patients.readers.dicom_headers import DicomSlice
 from scenes.patients.readers.dicom_source import Item
-from scenes.patients.readers.lazy_volume import AIR_HU, LEAST_HU, MOST_HU
+from scenes.volumes.lazy_volume import AIR_HU, LEAST_HU, MOST_HU
 
 
 def hounsfield(slices: list[DicomSlice]) -> Iterator[np.ndarray]:

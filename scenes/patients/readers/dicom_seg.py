@@ -9,14 +9,14 @@ from dataclasses import replace
 import highdicom as hd
 import numpy as np
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.dicom_file import parsed
 from scenes.patients.readers.dicom_headers import read_header, slices_of
 from scenes.patients.readers.dicom_source import Item
 from scenes.patients.readers.label_maps import LabelMap, Segment
 from scenes.patients.readers.segment_names import tissue_of
 from scenes.patients.readers.slice_stack import stacked
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.volumes.voxel_grid import VoxelGrid
 
 # A voxel of a fractional segment is in it from this share on.
 HALF = 0.5

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.dicom_headers import DicomSlice, Found, Series, read_headers
 from scenes.patients.readers.dicom_source import items_of
 from scenes.patients.readers.identifiers import secrets_of
-from scenes.patients.readers.lazy_volume import LazyVolume
 from scenes.patients.readers.slice_stack import stacked
-from scenes.patients.readers.volume_readers import ENDINGS
-from scenes.progress import Progress
+from scenes.terminal import Progress
+from scenes.volumes.lazy_volume import LazyVolume
+from scenes.volumes.volume_files import ENDINGS
 
 # Slices in another view than this share of their series are scouts that do not say so.
 STRAY = 0.1

@@ -10,20 +10,20 @@ from pathlib import Path
 import numpy as np
 import SimpleITK as sitk
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.dicom_headers import Found, read_header
 from scenes.patients.readers.dicom_seg import read_segmentation
 from scenes.patients.readers.dicom_series import dicom_found
 from scenes.patients.readers.identifiers import secrets_of
-from scenes.patients.readers.itk_files import itk_header, itk_layers, metadata
 from scenes.patients.readers.label_maps import LabelMap, Segment, box_of, whole_numbers
-from scenes.patients.readers.lazy_volume import LazyVolume
-from scenes.patients.readers.nifti import label_names
 from scenes.patients.readers.rtstruct import read_contours, referenced_series
 from scenes.patients.readers.segment_names import is_far, side_of, tissue_of
-from scenes.patients.readers.volume_readers import ENDINGS, NIFTI, file_volume, is_volume_file
-from scenes.patients.readers.voxel_grid import Box, VoxelGrid
-from scenes.progress import Progress, silent
+from scenes.terminal import Progress, silent
+from scenes.volumes.itk_files import itk_header, itk_layers, metadata
+from scenes.volumes.lazy_volume import LazyVolume
+from scenes.volumes.nifti_files import label_names
+from scenes.volumes.volume_files import ENDINGS, NIFTI, file_volume, is_volume_file
+from scenes.volumes.voxel_grid import Box, VoxelGrid
 
 # An import keeps 60 mm around its organ, and a probe sees as far.
 NEAR_MM = 80.0

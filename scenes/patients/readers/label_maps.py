@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import SimpleITK as sitk
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.segment_names import Side, side_of, tissue_of
-from scenes.patients.readers.voxel_grid import Box, VoxelGrid
+from scenes.volumes.voxel_grid import Box, VoxelGrid
 
 # Painted in this order, so that what is small and matters is not lost under what surrounds it.
 PAINTED = (None, "fat", "muscle", "bone", "liver", "kidney", "cortex", "medulla", "sinus", "vessel", "urine", "cyst", "tumour", "necrosis", "stone")  # fmt: skip

@@ -6,11 +6,11 @@ import numpy as np
 from pydicom.dataset import Dataset
 from skimage.draw import polygon
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.dicom_file import parsed
 from scenes.patients.readers.dicom_source import Item
 from scenes.patients.readers.label_maps import LabelMap, Segment
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.volumes.voxel_grid import VoxelGrid
 
 # Part of a plane's distance by which a contour's points may lie off their plane.
 OFF_PLANE = 0.3

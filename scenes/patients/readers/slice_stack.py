@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.dicom_headers import DicomSlice
 from scenes.patients.readers.dicom_pixels import hounsfield
-from scenes.patients.readers.lazy_volume import AIR_HU
-from scenes.patients.readers.voxel_grid import Box, VoxelGrid
+from scenes.volumes.lazy_volume import AIR_HU
+from scenes.volumes.voxel_grid import Box, VoxelGrid
 
 # Part of a slice distance by which a slice may lie off the even grid: scanners round positions, to 0.1 mm at
 # worst, and a missing slice is off by a whole distance.

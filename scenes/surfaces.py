@@ -1,4 +1,4 @@
-"""Surfaces as files that other programs put in the right place in the patient."""
+"""Closed surfaces in LPS [mm]: read and written as files, translated, and the volume inside one."""
 
 from pathlib import Path
 
@@ -7,8 +7,8 @@ import trimesh
 from trimesh.exchange.ply import export_ply
 from trimesh.exchange.stl import export_stl
 
+from errors import PatientError
 from scenes.atomic_files import whole
-from scenes.patients.import_error import PatientError
 
 # What 3D Slicer looks for in an STL's header and in a PLY's comments.
 SPACE = b"SPACE=LPS"
@@ -61,3 +61,14 @@ def _ply(surface: trimesh.Trimesh) -> bytes:
 
 WRITERS = {"stl": _stl, "ply": _ply}
 FORMATS = tuple(WRITERS)
+
+
+def moved_by(mesh: trimesh.Trimesh, by_mm: np.ndarray) -> trimesh.Trimesh:
+    """A surface moved by (3,) [mm], its vertices and faces in the order that they had."""
+    return trimesh.Trimesh(mesh.vertices + by_mm, mesh.faces, process=False)
+
+
+def volume_mm3(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Volume [mm^3] inside a closed surface of vertices (n, 3) [mm] and faces (m, 3)."""
+    corner = vertices[faces].astype(float)
+    return float(np.einsum("ij,ij->", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6)

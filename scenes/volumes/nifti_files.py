@@ -11,10 +11,9 @@ from typing import Any, cast
 import nibabel
 import numpy as np
 
-from scenes.patients.import_error import PatientError
-from scenes.patients.readers.file_checks import check_size, cut_off, no_scalar, not_3d
-from scenes.patients.readers.lazy_volume import LazyVolume
-from scenes.patients.readers.voxel_grid import Box, VoxelGrid
+from errors import PatientError
+from scenes.volumes.lazy_volume import LazyVolume, check_size, cut_off, no_scalar, not_3d
+from scenes.volumes.voxel_grid import Box, VoxelGrid
 
 # What is wrong is said in an error.
 logging.getLogger("nibabel").setLevel(logging.CRITICAL)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import shlex
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterable
+from pathlib import PurePath
 from typing import Protocol, TypeVar
 
 from tqdm import tqdm
@@ -54,3 +58,9 @@ class Stages:
     def _tick(self) -> None:
         while not self._ended.wait(REFRESH_S):
             self._bar.refresh()
+
+
+def pasted(*words: str | PurePath) -> str:
+    """A command line of app.py with these words, quoted where this system's shell needs it."""
+    line = ["python", "app.py", *map(str, words)]
+    return subprocess.list2cmdline(line) if sys.platform == "win32" else shlex.join(line)

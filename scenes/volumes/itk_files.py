@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import SimpleITK as sitk
 
-from scenes.patients.import_error import PatientError
-from scenes.patients.readers.file_checks import check_size, cut_off, no_scalar, not_3d
-from scenes.patients.readers.lazy_volume import LazyVolume
-from scenes.patients.readers.voxel_grid import Box, VoxelGrid
+from errors import PatientError
+from scenes.volumes.lazy_volume import LazyVolume, check_size, cut_off, no_scalar, not_3d
+from scenes.volumes.voxel_grid import Box, VoxelGrid
 
 NRRD, META = (".nrrd", ".nhdr"), (".mha", ".mhd")
 HEADER_BYTES, LINE_BYTES, NAME_LETTERS = 1 << 22, 1 << 16, 255

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import SimpleITK as sitk
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 
 Box = tuple[slice, slice, slice]
 
