@@ -19,7 +19,7 @@ from rehearsal.tracking.openigtlink_server import Server
 from render.animation import PICTURES_A_SECOND, empty_folder, save_animation, side_by_side, smaller
 from render.viewer import Controls, Settings, View, Viewer
 from render.window import NoVulkan
-from scenes.atomic_files import whole
+from scenes.atomic_files import atomic_write
 
 # An animation is in memory before it is written: of a long session it has fewer pictures.
 MOST_SHOWN = 240
@@ -58,7 +58,7 @@ class Pictures:
 
     def save(self) -> str:
         """Write the animation; what there is now."""
-        with whole(self.out / "press.webp") as partial:
+        with atomic_write(self.out / "press.webp") as partial:
             save_animation(self._animation, partial)
         return f"{-(-self.steps // self._every)} pictures, press.webp"
 
@@ -97,7 +97,7 @@ def run_headless(
     save_surfaces(rehearsal, out)
     drawn = [pictures.save()] if pictures is not None else []
     report = tally.report(rehearsal, arch) | dict(reading=instruments.figures())
-    with whole(out / "report.json") as partial:
+    with atomic_write(out / "report.json") as partial:
         partial.write_text(json.dumps(report, indent=2) + "\n", "utf-8")
     click.echo(summary(report))
     click.echo(f"Wrote {' and '.join([*drawn, 'report.json'])} to {out}")

@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 
 from render.animation import in_proportion
-from scenes.atomic_files import whole
+from scenes.atomic_files import atomic_write
 from ultrasound.dicom_image import save_dicom
 from ultrasound.probe import Probe
 from ultrasound.scanner import ECHO
@@ -26,7 +26,7 @@ class SavedPicture:
 
 def save_picture(picture: Image.Image, path: Path) -> None:
     """Write a picture in the format of its suffix, whole or not at all. Raises OSError."""
-    with whole(path) as partial:
+    with atomic_write(path) as partial:
         picture.save(partial)
 
 
@@ -46,7 +46,7 @@ def save_pictures(
         save_picture(picture, path)
         spacing_mm = depth_mm / picture.height, width_mm / picture.width
         if dicom and kind == ECHO:
-            with whole(path.with_suffix(".dcm")) as partial:
+            with atomic_write(path.with_suffix(".dcm")) as partial:
                 save_dicom(partial, np.asarray(picture), spacing_mm, probe)
         saved.append(SavedPicture(kind, path, (picture.height, picture.width), spacing_mm))
     return saved

@@ -40,7 +40,7 @@ from render.keys import Keys
 from render.viewer import Settings
 from render.window import NoVulkan
 from scenes.anatomy import LoadedAnatomy
-from scenes.terminal import pasted
+from scenes.terminal import shell_command
 
 
 @dataclass
@@ -179,7 +179,7 @@ class RehearsalRun:
     def _replaying(self, session: Path) -> str:
         """The command line that replays a session, to be pasted."""
         scene = [] if self.scene is None else [self.scene]
-        return pasted("rehearse", *scene, "--replay", session)
+        return shell_command("rehearse", *scene, "--replay", session)
 
 
 def _verdict(replay: Replay | None) -> str:

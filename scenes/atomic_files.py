@@ -18,7 +18,7 @@ def check_writable(folder: Path) -> None:
 
 
 @contextmanager
-def whole(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """A place beside a path to write its file or folder to; what ends in order takes the path's name, what does not is removed.
 
     A folder's place must be made, and the path be free or an empty folder. Raises OSError, which names the path.

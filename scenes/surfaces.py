@@ -8,7 +8,7 @@ from trimesh.exchange.ply import export_ply
 from trimesh.exchange.stl import export_stl
 
 from errors import PatientError
-from scenes.atomic_files import whole
+from scenes.atomic_files import atomic_write
 
 # What 3D Slicer looks for in an STL's header and in a PLY's comments.
 SPACE = b"SPACE=LPS"
@@ -46,7 +46,7 @@ def save_surface(surface: trimesh.Trimesh, path: Path) -> None:
     Coordinates are float32 there. A PLY keeps the order of the vertices, an STL has none. Raises OSError.
     """
     bare = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
-    with whole(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_bytes(WRITERS[path.suffix.removeprefix(".")](bare))
 
 
@@ -63,7 +63,7 @@ WRITERS = {"stl": _stl, "ply": _ply}
 FORMATS = tuple(WRITERS)
 
 
-def moved_by(mesh: trimesh.Trimesh, by_mm: np.ndarray) -> trimesh.Trimesh:
+def translated(mesh: trimesh.Trimesh, by_mm: np.ndarray) -> trimesh.Trimesh:
     """A surface moved by (3,) [mm], its vertices and faces in the order that they had."""
     return trimesh.Trimesh(mesh.vertices + by_mm, mesh.faces, process=False)
 

@@ -60,7 +60,7 @@ class Stages:
             self._bar.refresh()
 
 
-def pasted(*words: str | PurePath) -> str:
+def shell_command(*words: str | PurePath) -> str:
     """A command line of app.py with these words, quoted where this system's shell needs it."""
     line = ["python", "app.py", *map(str, words)]
     return subprocess.list2cmdline(line) if sys.platform == "win32" else shlex.join(line)

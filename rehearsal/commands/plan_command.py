@@ -18,7 +18,7 @@ from rehearsal.configuration import probe_of, with_quality
 from rehearsal.planning.plan_file import FASTEST_MM_S, MOST_MARGIN_MM, MOST_SWEEPS, SLOWEST_MM_S, write_plan
 from scenes.anatomy import load_anatomy
 from scenes.scene import EMBEDDED, Trocar, load_scene, scene_file, with_options
-from scenes.terminal import pasted
+from scenes.terminal import shell_command
 from ultrasound.target import TARGETS, Target
 
 
@@ -114,7 +114,7 @@ def following(scene: Path, plan_file: Path, probe: str | None) -> str:
     """The command line that follows a plan; it needs the probe that was planned for."""
     named = [] if scene == EMBEDDED else [scene]
     held = [] if probe is None else ["--probe", probe]
-    return pasted("rehearse", *named, *held, "--plan", plan_file)
+    return shell_command("rehearse", *named, *held, "--plan", plan_file)
 
 
 def trocar_of(

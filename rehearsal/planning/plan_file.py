@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from errors import UserError
 from rehearsal.numbered_files import next_number
-from scenes.atomic_files import whole
+from scenes.atomic_files import atomic_write
 from scenes.scene import Trocar
 from ultrasound.target import Target
 
@@ -89,7 +89,7 @@ class Plan(_Part):
 
 def write_plan(plan: Plan, path: Path) -> None:
     """Write a plan; the same plan makes the same bytes. Raises OSError."""
-    with whole(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text(json.dumps(plan.model_dump(mode="json"), indent=1) + "\n", "utf-8")
 
 

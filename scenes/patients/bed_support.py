@@ -12,15 +12,15 @@ from errors import PatientError
 from scenes.patients.moulded_support import (
     CLEARANCE_MM,
     GRID_MM,
-    clear_of,
     contour,
     distance_to_swept,
     gravity_frame,
     grid_over,
     least_gap,
-    round_meet,
+    rounded_intersection,
+    with_clearance,
 )
-from scenes.patients.readers.label_maps import LabelMap, nearest
+from scenes.patients.readers.label_maps import LabelMap, resample_nearest
 from scenes.surfaces import load_surface
 from scenes.volumes.voxel_grid import VoxelGrid
 
@@ -67,13 +67,13 @@ def bed_of_labels(
             "what it lies on, or leave --support out for a mould"
         )
     level = _smooth_distance((tissue & (gap > 0)) | under)
-    level = round_meet(level, np.broadcast_to(grid[2] - top, gap.shape), radius=FILLET_MM)
+    level = rounded_intersection(level, np.broadcast_to(grid[2] - top, gap.shape), radius=FILLET_MM)
 
     def carved(gap_mm: float) -> trimesh.Trimesh:
-        return contour(_closed(round_meet(level, gap_mm - gap, radius=FILLET_MM)), grid)
+        return contour(_closed(rounded_intersection(level, gap_mm - gap, radius=FILLET_MM)), grid)
 
     try:
-        bed = clear_of(upright, faces, carved, CLEARANCE_MM)
+        bed = with_clearance(upright, faces, carved, CLEARANCE_MM)
     except ValueError as error:
         raise PatientError(f"no bed of labels fits: {error}; leave --support out for a mould") from error
     return trimesh.Trimesh(bed.vertices @ frame, bed.faces, process=False)
@@ -85,7 +85,7 @@ def _tissue(labels: LabelMap, own: list[int], grid: tuple[np.ndarray, ...], fram
     size = len(grid[0]), len(grid[1]), len(grid[2])
     start = np.array([axis[0] for axis in grid])
     onto = VoxelGrid(size, np.full(3, GRID_MM), frame.T @ start, frame.T)
-    return nearest(labels.grid, solid, onto).transpose(2, 1, 0)
+    return resample_nearest(labels.grid, solid, onto).transpose(2, 1, 0)
 
 
 def _with_fat(tissue: np.ndarray, swept: np.ndarray) -> np.ndarray:

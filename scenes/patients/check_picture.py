@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from scenes.patients.import_summary import told
+from scenes.patients.import_summary import as_table
 from scenes.patients.patient_import import Patient
 from scenes.patients.readers.label_maps import Colour
 from scenes.volumes.lazy_volume import AIR_HU
@@ -79,7 +79,7 @@ def draw_check(patient: Patient, rows: list[tuple[str, str]], folder: Path) -> N
     draft = " (DRAFT, grown from a seed)" if patient.draft else ""
     question = "is this the side, the organ and the way up that you expect?"
     colour = "white"
-    if patient.cautions:
+    if patient.warnings:
         question, colour = "read the CAUTION, and compare with the patient", WARNING
     figure.suptitle(f"{patient.side.upper()} KIDNEY{draft}: {question}", color=colour, fontsize=15)
     colours = colours_of(patient)
@@ -123,7 +123,7 @@ def _draw_cut(
     right, down = np.array(view.right, float), np.array(view.down, float)
     low, high = VoxelGrid.of(ct).bounds()
     spans = [sorted((low @ axis, high @ axis)) for axis in (right, down)]
-    picture = cut(ct, right, down, spans, middle)
+    picture = resample_plane(ct, right, down, spans, middle)
     black = LEVEL_HU - WINDOW_HU / 2
     extent = (*spans[0], spans[1][1], spans[1][0])
     axes.imshow(
@@ -139,7 +139,7 @@ def _draw_cut(
         axes.text(*place, letter, transform=axes.transAxes, fontsize=17, **LETTER)
 
 
-def cut(
+def resample_plane(
     image: sitk.Image, right: np.ndarray, down: np.ndarray, spans: list[list[float]], middle: np.ndarray
 ) -> np.ndarray:
     """HU on a plane through the middle, across two spans [mm]."""
@@ -201,7 +201,7 @@ def _draw_words(axes: Axes, rows: list[tuple[str, str]], shown: dict[str, Colour
         wrapped = textwrap.wrap(line, TEXT_WIDTH - 11) or [""]
         lines += [(word, wrapped[0]), *(("", more) for more in wrapped[1:])]
     place: dict[str, Any] = dict(transform=axes.transAxes)
-    axes.text(0.0, 0.95, told(lines), color="white", family="monospace", fontsize=8.5, va="top", **place)
+    axes.text(0.0, 0.95, as_table(lines), color="white", family="monospace", fontsize=8.5, va="top", **place)
     for n, (name, colour) in enumerate(shown.items()):
         left, low = 0.5 * (n % 2), 0.12 - 0.055 * (n // 2)
         axes.text(left, low, WORD.get(name, name), color=colour, fontsize=11, weight="bold", **place)

@@ -9,7 +9,7 @@ from errors import PatientError
 from scenes.patients.patient_folder import check_folder, save_patient
 from scenes.patients.readers.segment_names import Side
 from scenes.scene import scene_text
-from scenes.terminal import bar, pasted
+from scenes.terminal import bar, shell_command
 
 # Options that say which labels are of a tissue.
 TISSUE_OPTIONS = {"tumour": "tumour", "cyst": "cyst", "vessels": "vessel", "collecting": "urine"}
@@ -60,20 +60,22 @@ def import_patient_command(
     check_folder(out)
     # What draws and what reads segmentations takes half a second that no other command should wait for.
     from scenes.patients.check_picture import draw_check
-    from scenes.patients.import_request import Request, take_in
-    from scenes.patients.import_summary import facts, told
+    from scenes.patients.import_request import ImportRequest, import_request
+    from scenes.patients.import_summary import as_table, summary_rows
     from scenes.patients.patient_scene import patient_scene
 
     tissues = {TISSUE_OPTIONS[o]: label_words(text, o) for o, text in words.items() if text is not None}
     own = [] if organ is None else label_words(organ, "organ")
     place = None if seed is None else place_mm(seed)
-    patient, private = take_in(Request(ct, labels, own, tissues, side, series, place, support), bar)
-    rows = facts(patient)
+    patient, private = import_request(
+        ImportRequest(ct, labels, own, tissues, side, series, place, support), bar
+    )
+    rows = summary_rows(patient)
     texts = {"scene.toml": scene_text(patient_scene(patient))}
     searched = save_patient(patient, out, texts, lambda folder: draw_check(patient, rows, folder), private)
     rows.append(("private", f"{searched} names, ids, dates, uids, paths of the source: none is in the files"))
-    click.echo(told(rows))
-    click.echo(f"Written to {out}. Look at {out / 'check.png'}, then: {pasted('rehearse', out)}")
+    click.echo(as_table(rows))
+    click.echo(f"Written to {out}. Look at {out / 'check.png'}, then: {shell_command('rehearse', out)}")
 
 
 def label_words(text: str, option: str) -> list[str]:

@@ -11,17 +11,17 @@ import numpy as np
 from errors import PatientError
 from scenes.patients.patient_import import Patient, import_patient
 from scenes.patients.readers.ct_files import open_ct
-from scenes.patients.readers.dicom_series import dicom_found
-from scenes.patients.readers.label_files import Drawing, drawing_of, open_labels
-from scenes.patients.readers.label_maps import LabelMap, merged, with_tissues
+from scenes.patients.readers.dicom_series import read_dicom_headers
+from scenes.patients.readers.label_files import Segmentation, open_labels, segmentation_of
+from scenes.patients.readers.label_maps import LabelMap, assign_tissues, merge_label_maps
 from scenes.patients.readers.segment_names import Side
-from scenes.patients.region_growing import grown
+from scenes.patients.region_growing import draft_segmentation
 from scenes.terminal import Progress, silent
 from scenes.volumes.lazy_volume import LazyVolume
 
 
 @dataclass(frozen=True)
-class Request:
+class ImportRequest:
     """What the user asked for: paths, and words on labels, by names or values."""
 
     ct: Path
@@ -34,7 +34,7 @@ class Request:
     support: str = "mould"
 
 
-def take_in(request: Request, progress: Progress = silent) -> tuple[Patient, set[str]]:
+def import_request(request: ImportRequest, progress: Progress = silent) -> tuple[Patient, set[str]]:
     """Import a patient, and what of its source none of its files may hold. Raises PatientError."""
     if not request.ct.exists():
         raise PatientError(f"{request.ct}: no such file or folder; check the path")
@@ -43,9 +43,9 @@ def take_in(request: Request, progress: Progress = silent) -> tuple[Patient, set
             raise PatientError(
                 "--seed grows the organ where there are no labels: give it, or labels, not both"
             )
-        drawings: list[Drawing] = []
+        drawings: list[Segmentation] = []
         volume = open_ct(request.ct, request.series, progress=progress)
-        labels = grown(volume, request.seed_mm)
+        labels = draft_segmentation(volume, request.seed_mm)
         notes: tuple[str, ...] = ()
     else:
         volume, drawings, labels = with_labels(request, progress)
@@ -60,12 +60,14 @@ def take_in(request: Request, progress: Progress = silent) -> tuple[Patient, set
         needed=set(request.tissues),
         progress=progress,
     )
-    private = set(volume.secrets).union(*(drawing.secrets for drawing in drawings))
+    private = set(volume.identifiers).union(*(drawing.identifiers for drawing in drawings))
     is_draft = request.seed_mm is not None
     return replace(patient, notes=(*patient.notes, *notes), draft=is_draft), private | _paths(request)
 
 
-def with_labels(request: Request, progress: Progress) -> tuple[LazyVolume, list[Drawing], LabelMap]:
+def with_labels(
+    request: ImportRequest, progress: Progress
+) -> tuple[LazyVolume, list[Segmentation], LabelMap]:
     """A CT, the labels found for it, and one map of them all with the user's words on it. Raises PatientError."""
     words = [*request.organ, *(word for several in request.tissues.values() for word in several)]
     drawings = [open_labels(path, words, progress) for path in request.labels]
@@ -80,12 +82,12 @@ def with_labels(request: Request, progress: Progress) -> tuple[LazyVolume, list[
                 "were drawn on; choose it with --series, or give its folder"
             )
     maps = [one for drawing in drawings for one in drawing.maps(volume.grid)]
-    return volume, drawings, merged(with_tissues(maps, request.organ, request.tissues))
+    return volume, drawings, merge_label_maps(assign_tissues(maps, request.organ, request.tissues))
 
 
-def _beside(ct: Path, progress: Progress) -> Drawing:
+def _beside(ct: Path, progress: Progress) -> Segmentation:
     """The labels that lie with a CT."""
-    found = drawing_of(dicom_found(ct, progress)) if ct.is_dir() else None
+    found = segmentation_of(read_dicom_headers(ct, progress)) if ct.is_dir() else None
     if found is None:
         raise PatientError(
             f"{ct}: no labels lie with this CT; give a file or folder with LABELS, or --seed X,Y,Z for a draft"
@@ -93,7 +95,7 @@ def _beside(ct: Path, progress: Progress) -> Drawing:
     return found
 
 
-def _paths(request: Request) -> set[str]:
+def _paths(request: ImportRequest) -> set[str]:
     """The paths of the source, as they are and as they were given."""
     given = [request.ct, *request.labels]
     return {str(path.resolve()) for path in given} | {str(path) for path in given if len(path.parts) > 1}

@@ -24,7 +24,7 @@ LEAST_LEFT_OUT_ML = 0.5
 STONE_ABOVE_MEDIAN_HU, LEAST_STONE_ML = 130.0, 0.1
 
 
-def turned(
+def orientation_warnings(
     grid: VoxelGrid, hounsfield: np.ndarray, labels: LabelMap, midline: float | None
 ) -> tuple[str, ...]:
     """Lines for the user: bones in front of the body's middle, a liver on the left.
@@ -58,7 +58,7 @@ def _bones_ahead(grid: VoxelGrid, hounsfield: np.ndarray) -> bool:
     return bool(bone_y < body_y - AHEAD_MM)
 
 
-def in_fat(
+def fat_warnings(
     grid: VoxelGrid, hounsfield: np.ndarray, organ: np.ndarray, parenchyma: np.ndarray
 ) -> tuple[str, ...]:
     """A line where much of an organ's rim is fat or gas: its label belongs to another CT, or is shifted or mirrored.
@@ -76,7 +76,7 @@ def in_fat(
     )
 
 
-def as_stone(
+def stone_warnings(
     grid: VoxelGrid, hounsfield: np.ndarray, parenchyma: np.ndarray, urine: np.ndarray
 ) -> tuple[str, ...]:
     """A line where the echo will show stones in parenchyma (z, y, x): a kidney that excretes contrast agent is as bright there.
@@ -95,7 +95,7 @@ def as_stone(
     )
 
 
-def taken(labels: LabelMap, piece: Organ, is_named: bool) -> tuple[str, ...]:
+def label_warnings(labels: LabelMap, piece: Organ, is_named: bool) -> tuple[str, ...]:
     """Lines on labels without a meaning: all taken as the organ, or left out though they touch it."""
     found = []
     unnamed = [value for value in piece.present if not labels.segments[value].name]

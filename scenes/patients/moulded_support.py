@@ -68,11 +68,11 @@ def mould(
     def carved(gap_mm: float) -> trimesh.Trimesh:
         return contour(_carved_block(grid, gap - gap_mm, block_low, block_high, FILLET_MM), grid)
 
-    support = clear_of(upright, organ_faces, carved, clearance_mm)
+    support = with_clearance(upright, organ_faces, carved, clearance_mm)
     return trimesh.Trimesh(support.vertices @ frame, support.faces, process=False)
 
 
-def clear_of(
+def with_clearance(
     organ_vertices: np.ndarray,
     organ_faces: np.ndarray,
     carved: Callable[[float], trimesh.Trimesh],
@@ -157,14 +157,16 @@ def _carved_block(
 ) -> np.ndarray:
     """Level function of block minus cavity, negative in the material, its convex edges rounded."""
     x, y, z = np.meshgrid(*grid, indexing="ij", sparse=True)
-    sides = round_meet(
+    sides = rounded_intersection(
         np.maximum(low[0] - x, x - high[0]), np.maximum(low[1] - y, y - high[1]), radius=fillet
     )
     walls = np.maximum(sides, low[2] - z)
-    return round_meet(round_meet(walls, z - high[2], radius=0.25 * fillet), -cavity, radius=fillet)
+    return rounded_intersection(
+        rounded_intersection(walls, z - high[2], radius=0.25 * fillet), -cavity, radius=fillet
+    )
 
 
-def round_meet(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
+def rounded_intersection(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
     """Intersection of two solids given by signed distances, their common edge rounded to `radius`."""
     corner = np.hypot(np.maximum(a + radius, 0.0), np.maximum(b + radius, 0.0)) - radius
     return np.minimum(np.maximum(a, b), -radius) + np.maximum(corner + radius, 0.0)

@@ -25,8 +25,8 @@ COARSE_MM = 4.0
 # Vessels and the collecting system are of the organ where they lie in a hollow of it no wider than twice this.
 HOLLOW_MM = 10.0
 PARENCHYMA = ("kidney", "cortex", "medulla", "sinus", "stone")
-GROWN = ("tumour", "cyst", "necrosis")  # in the organ or out of it, they move with it
-INNER = ("vessel", "urine", "fat")
+LESIONS = ("tumour", "cyst", "necrosis")  # in the organ or out of it, they move with it
+HILAR = ("vessel", "urine", "fat")
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Organ:
         return f"the organ (label {listed(self.names)})"
 
 
-def organs(labels: LabelMap, organ: Sequence[int] | None = None) -> list[Organ]:
+def find_organs(labels: LabelMap, organ: Sequence[int] | None = None) -> list[Organ]:
     """Large connected pieces of organ, tumours and cysts, from right to left.
 
     Islands belong to none, and neither does a tumour apart from every kidney. Two values that touch are one
@@ -65,7 +65,7 @@ def organs(labels: LabelMap, organ: Sequence[int] | None = None) -> list[Organ]:
         PatientError: no label is an organ's.
     """
     own = _organ_values(labels, organ)
-    grown = [value for value in labels.of_tissues(*GROWN) if value not in own]
+    grown = [value for value in labels.of_tissues(*LESIONS) if value not in own]
     wanted = np.isin(labels.values, own + grown)
     box = box_of(wanted)
     if box is None:
@@ -117,9 +117,9 @@ def _piece(labels: LabelMap, grid: VoxelGrid, values: np.ndarray, mask: np.ndarr
     box = cast(Box, box_of(mask))  # a piece has voxels
     z, y, x = (slice(a.start, a.stop) for a in box[::-1])
     inside, around = mask[z, y, x], values[z, y, x]
-    inner = np.isin(around, [v for v in labels.of_tissues(*INNER) if v not in own])
+    inner = np.isin(around, [v for v in labels.of_tissues(*HILAR) if v not in own])
     if inner.any():
-        inside = inside | (inner & hollow(inside, grid.spacing[::-1]))
+        inside = inside | (inner & closing(inside, grid.spacing[::-1]))
     present = [int(v) for v in np.unique(around[inside]) if int(v) in own]
     segments = [labels.segments[v] for v in present]
     indices = np.argwhere(inside).mean(axis=0)[::-1] + [a.start for a in box]
@@ -135,7 +135,7 @@ def _piece(labels: LabelMap, grid: VoxelGrid, values: np.ndarray, mask: np.ndarr
     )
 
 
-def hollow(mask: np.ndarray, spacing: np.ndarray) -> np.ndarray:
+def closing(mask: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     """What a mask (z, y, x) encloses: its closing by a ball of HOLLOW_MM."""
     rim = [(int(n), int(n)) for n in np.ceil(HOLLOW_MM / spacing) + 1]
     grown = ndimage.distance_transform_edt(~np.pad(mask, rim), sampling=spacing) <= HOLLOW_MM
@@ -158,7 +158,7 @@ def midline_x(grid: VoxelGrid, hounsfield: np.ndarray, low_z_mm: float, high_z_m
     return float(x.mean()) if x.size and np.ptp(x) >= BODY_WIDTH_MM else None
 
 
-def single_out(pieces: list[Organ], midline: float | None, side: Side | None) -> tuple[Organ, Side]:
+def choose_organ(pieces: list[Organ], midline: float | None, side: Side | None) -> tuple[Organ, Side]:
     """The piece on the wanted side; with no body around it, the user's word or the label's name stands for the midline.
 
     Raises PatientError: there is none, there are several, or it is called by the other side's name.

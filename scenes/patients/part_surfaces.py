@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from errors import PatientError
 from scenes.patients.label_surfaces import surface_from_mask
-from scenes.patients.organ_selection import GROWN, INNER, Organ
+from scenes.patients.organ_selection import HILAR, LESIONS, Organ
 from scenes.patients.readers.label_maps import Colour, LabelMap
 from scenes.terminal import Progress
 from scenes.volumes.voxel_grid import VoxelGrid
@@ -34,7 +34,7 @@ ASIDE_FROM_MM2 = 5000.0
 # What has a surface of its own: tissue -> file.
 PARTS = {"tumour": "tumour", "cyst": "cyst", "urine": "collecting-system", "vessel": "vessels"}
 # Where parts are: tissue -> grid and which of its voxels.
-Found: TypeAlias = dict[str, tuple[VoxelGrid, np.ndarray]]
+PartMasks: TypeAlias = dict[str, tuple[VoxelGrid, np.ndarray]]
 
 
 def organ_surface(piece: Organ) -> trimesh.Trimesh:
@@ -42,7 +42,7 @@ def organ_surface(piece: Organ) -> trimesh.Trimesh:
     return _surface(piece.grid.image(piece.mask.astype(np.uint8)), "organ", FACES)
 
 
-def parts_of(labels: LabelMap, piece: Organ, needed: Collection[str]) -> Found:
+def part_masks(labels: LabelMap, piece: Organ, needed: Collection[str]) -> PartMasks:
     """What is told apart in the organ, and its vessels and collecting system near it. Raises PatientError where a needed
     tissue is not there.
     """
@@ -52,7 +52,7 @@ def parts_of(labels: LabelMap, piece: Organ, needed: Collection[str]) -> Found:
         if not values:
             continue
         grid, inside = piece.grid, piece.mask & np.isin(piece.values, values)
-        if tissue in INNER:
+        if tissue in HILAR:
             grid, inside = near_organ(labels, piece, values)
         if inside.any():
             found[tissue] = grid, inside
@@ -65,17 +65,19 @@ def parts_of(labels: LabelMap, piece: Organ, needed: Collection[str]) -> Found:
 
 
 @contextmanager
-def surfaces_aside(found: Found) -> Iterator[Callable[[Progress], dict[str, trimesh.Trimesh]]]:
+def part_surfaces_in_processes(
+    found: PartMasks,
+) -> Iterator[Callable[[Progress], dict[str, trimesh.Trimesh]]]:
     """Starts on the surfaces of parts, in processes of their own where that is worth it, and gives what waits for them:
     surfaces of all parts that have one. Raises PatientError where what the user must see has none.
     """
     jobs = min(cpu_count(), len(found))
     if jobs < 2 or sum(_area_mm2(*part) for part in found.values()) < ASIDE_FROM_MM2:
-        yield lambda progress: _there((t, bodies(*found[t], t)) for t in progress(found, "surfaces"))
+        yield lambda progress: _there((t, part_surface(*found[t], t)) for t in progress(found, "surfaces"))
         return
     with ProcessPoolExecutor(jobs) as pool:
         # The last ones take longest.
-        made = {tissue: pool.submit(bodies, *found[tissue], tissue) for tissue in reversed(found)}
+        made = {tissue: pool.submit(part_surface, *found[tissue], tissue) for tissue in reversed(found)}
         try:
             yield lambda progress: _there((t, made[t].result()) for t in progress(found, "surfaces"))
         except BrokenExecutor:
@@ -118,11 +120,11 @@ def _surface(mask: sitk.Image, name: str, faces: int) -> trimesh.Trimesh:
         raise PatientError(f"the {name} has no surface: {error}; check the {name}'s label") from error
 
 
-def bodies(grid: VoxelGrid, inside: np.ndarray, tissue: str) -> trimesh.Trimesh | None:
+def part_surface(grid: VoxelGrid, inside: np.ndarray, tissue: str) -> trimesh.Trimesh | None:
     """Surface of a part; its several bodies are bodies of one mesh, specks are left out. None: too thin, and not needed."""
     labelled, _ = ndimage.label(inside)
     sizes = np.bincount(labelled.ravel())[1:]
-    finer = BRANCHING if tissue in INNER else 1.0
+    finer = BRANCHING if tissue in HILAR else 1.0
     surfaces = []
     for n in np.flatnonzero(sizes >= 0.1 * sizes.max()):
         body = labelled == n + 1
@@ -131,7 +133,7 @@ def bodies(grid: VoxelGrid, inside: np.ndarray, tissue: str) -> trimesh.Trimesh 
             name = PARTS[tissue].replace("-", " ")
             surfaces.append(_surface(grid.image(body.astype(np.uint8)), name, int(faces)))
         except PatientError:
-            if tissue in GROWN:
+            if tissue in LESIONS:
                 raise
     if not surfaces:
         return None

@@ -14,7 +14,7 @@ from pathlib import Path
 import SimpleITK as sitk
 
 from errors import PatientError
-from scenes.atomic_files import check_writable, whole
+from scenes.atomic_files import atomic_write, check_writable
 from scenes.patients.part_surfaces import PARTS
 from scenes.patients.patient_import import Patient
 from scenes.scene import AnatomyFiles, Scene, scene_text
@@ -67,7 +67,7 @@ def new_folder(folder: Path) -> Iterator[Path]:
         shutil.rmtree(left, ignore_errors=True)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with whole(folder) as partial:
+        with atomic_write(folder) as partial:
             partial.mkdir()
             yield partial
     except OSError as error:
@@ -103,7 +103,7 @@ def _write(patient: Patient, folder: Path, texts: dict[str, str]) -> None:
 
 def _searched(folder: Path, private: Collection[str]) -> int:
     """Search all files of a folder. Raises PatientError where something private is in one."""
-    wanted = [text for text in private if telling(text)]
+    wanted = [text for text in private if is_identifying(text)]
     for file in sorted(folder.iterdir()):
         words, everything = _contents(file)
         if any(_holds(words, everything, text) for text in wanted):
@@ -114,7 +114,7 @@ def _searched(folder: Path, private: Collection[str]) -> int:
     return len(wanted)
 
 
-def telling(text: str) -> bool:
+def is_identifying(text: str) -> bool:
     """Whether a text is long enough to name somebody, and more than words that every patient's files hold."""
     if len(text) < (LEAST_DIGITS if text.isdigit() else LEAST_TEXT):
         return False

@@ -17,26 +17,26 @@ import trimesh
 
 from errors import PatientError
 from scenes.patients.bed_support import bed_of_file, bed_of_labels
-from scenes.patients.import_warnings import as_stone, in_fat, taken, turned
+from scenes.patients.import_warnings import fat_warnings, label_warnings, orientation_warnings, stone_warnings
 from scenes.patients.moulded_support import mould
 from scenes.patients.organ_selection import (
-    GROWN,
-    INNER,
+    HILAR,
+    LESIONS,
     PARENCHYMA,
     Organ,
     check_volume,
+    choose_organ,
+    find_organs,
     midline_x,
-    organs,
-    single_out,
 )
 from scenes.patients.part_surfaces import (
     colours_of_labels,
     organ_surface,
-    parts_of,
-    surfaces_aside,
+    part_masks,
+    part_surfaces_in_processes,
     volume_ml,
 )
-from scenes.patients.readers.label_maps import Colour, LabelMap, nearest, present
+from scenes.patients.readers.label_maps import Colour, LabelMap, present_values, resample_nearest
 from scenes.patients.readers.segment_names import Side
 from scenes.terminal import Progress, silent
 from scenes.volumes.lazy_volume import LazyVolume
@@ -69,7 +69,7 @@ class Patient:
     )  # int16 [HU], the CT's whole width at the organ's level, coarse; not kept in a folder
     spacing_mm: tuple[float, float, float]  # of the CT's voxels along the image's own axes
     notes: tuple[str, ...] = ()  # what was chosen, left out, resampled
-    cautions: tuple[str, ...] = ()  # what looks wrong
+    warnings: tuple[str, ...] = ()  # what looks wrong
     colours: dict[str, Colour] = field(default_factory=dict)  # of organ and parts, where labels have one
     draft: bool = False  # grown from a seed, and drawn by nobody
 
@@ -119,13 +119,13 @@ def import_patient(
         return np.isin(marks, [code for code, tissue in tissues.items() if tissue in wanted])
 
     warned = (
-        *turned(at.level, at.level_hu, labels, at.midline),
-        *in_fat(at.grid, at.hounsfield, at.on_ct, of("kidney")),
-        *as_stone(at.grid, at.hounsfield, of("kidney", "cortex", "medulla", "sinus"), of("urine")),
-        *taken(labels, piece, organ is not None),
+        *orientation_warnings(at.level, at.level_hu, labels, at.midline),
+        *fat_warnings(at.grid, at.hounsfield, at.on_ct, of("kidney")),
+        *stone_warnings(at.grid, at.hounsfield, of("kidney", "cortex", "medulla", "sinus"), of("urine")),
+        *label_warnings(labels, piece, organ is not None),
     )
-    found = parts_of(labels, piece, needed)
-    with surfaces_aside(found) as parts_made:
+    found = part_masks(labels, piece, needed)
+    with part_surfaces_in_processes(found) as parts_made:
         surface = organ_surface(piece)
         _check_surface(surface, piece)
         bed = _support(support, surface, labels, piece)
@@ -142,7 +142,7 @@ def import_patient(
         overview=_overview(at.level, at.level_hu),
         spacing_mm=tuple(at.grid.spacing.tolist()),
         notes=ct.notes,
-        cautions=warned,
+        warnings=warned,
         colours=colours_of_labels(labels, [*parts]),
     )
 
@@ -167,16 +167,16 @@ def _located(
     """The one organ that is asked for, whole and in soft tissue. Raises PatientError."""
     if not margin_mm >= 0:
         raise PatientError(f"the margin is {margin_mm} mm: expected 0 or more")
-    pieces = organs(labels, organ)
+    pieces = find_organs(labels, organ)
     slab, level_hu = _level(ct, pieces, margin_mm)
     level = ct.grid.part(slab)
     heights = np.concatenate([piece.grid.corners()[:, 2] for piece in pieces])
     midline = midline_x(level, level_hu, heights.min(), heights.max())
-    piece, told_side = single_out(pieces, midline, side)
+    piece, told_side = choose_organ(pieces, midline, side)
     check_volume(piece)
     _check_overlap(ct.grid, piece)
     grid, hounsfield = _cropped(ct.grid, slab, level_hu, piece, margin_mm)
-    on_ct = nearest(piece.grid, piece.mask, grid)
+    on_ct = resample_nearest(piece.grid, piece.mask, grid)
     _check_place(ct.grid, grid, on_ct, hounsfield, piece)
     return _Located(piece, told_side, midline, level, level_hu, grid, hounsfield, on_ct)
 
@@ -184,7 +184,7 @@ def _located(
 def _support(kind: str, organ: trimesh.Trimesh, labels: LabelMap, piece: Organ) -> trimesh.Trimesh:
     if kind == "labels":
         own = [int(value) for value in np.unique(piece.values[piece.mask])]
-        return bed_of_labels(organ, labels, [*own, *labels.of_tissues(*INNER)], SUPINE_GRAVITY)
+        return bed_of_labels(organ, labels, [*own, *labels.of_tissues(*HILAR)], SUPINE_GRAVITY)
     if kind != "mould":
         return bed_of_file(Path(kind), organ)
     try:
@@ -287,13 +287,13 @@ def _marks(
     labels: LabelMap, piece: Organ, grid: VoxelGrid, on_ct: np.ndarray
 ) -> tuple[np.ndarray, dict[int, str]]:
     """Tissue codes (z, y, x) of the cropped CT, and what they are: the organ's own, and of other organs all that is there."""
-    values = nearest(labels.grid, labels.values, grid)
-    there = set(present(values))
+    values = resample_nearest(labels.grid, labels.values, grid)
+    there = set(present_values(values))
     tissue_of = {v: s.tissue for v, s in labels.segments.items() if v in there and s.tissue}
     codes = tissue_codes(list(tissue_of.values()))
     marks = on_ct.astype(np.uint8)
     for value, tissue in tissue_of.items():
         if tissue != "kidney":
             here = values == value
-            marks[here & on_ct if tissue in (*GROWN, *PARENCHYMA) else here] = codes[tissue]
+            marks[here & on_ct if tissue in (*LESIONS, *PARENCHYMA) else here] = codes[tissue]
     return marks, {code: tissue for tissue, code in codes.items()}

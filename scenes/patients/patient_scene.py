@@ -4,7 +4,7 @@ import numpy as np
 import SimpleITK as sitk
 import trimesh
 
-from scenes.patients.organ_selection import GROWN, PARENCHYMA
+from scenes.patients.organ_selection import LESIONS, PARENCHYMA
 from scenes.patients.part_surfaces import PARTS
 from scenes.patients.patient_import import Patient
 from scenes.patients.readers.segment_names import Side
@@ -40,7 +40,7 @@ def hilum(organ: trimesh.Trimesh, side: Side) -> tuple[float, float, float]:
 def patient_scene(patient: Patient) -> Scene:
     """The scene that an import writes beside the patient's files: on the back, on the moulded support."""
     tumour = None if patient.tumour is None else "tumour.stl"
-    own = [code for code, tissue in patient.tissues.items() if tissue in (*PARENCHYMA, *GROWN)]
+    own = [code for code, tissue in patient.tissues.items() if tissue in (*PARENCHYMA, *LESIONS)]
     hu = sitk.GetArrayViewFromImage(patient.ct)[np.isin(sitk.GetArrayViewFromImage(patient.labels), own)]
     # From fat to the brightest of the organ, whatever contrast agent it holds.
     darkest = FAT_HU

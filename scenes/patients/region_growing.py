@@ -41,7 +41,7 @@ LEAST_EDGE, LEAST_SOLIDITY = 0.75, 0.65
 ELSEWHERE = "give a point deeper in the parenchyma, or draw labels"
 
 
-def grown(ct: LazyVolume, seed_mm: np.ndarray) -> LabelMap:
+def draft_segmentation(ct: LazyVolume, seed_mm: np.ndarray) -> LabelMap:
     """The kidney around a seed, on the CT's grid; the same call gives the same voxels.
 
     It knows tissue and shape, not anatomy: from a seed in another compact organ with fat around it, that is what grows.

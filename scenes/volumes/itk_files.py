@@ -26,7 +26,7 @@ def itk_volume(path: Path) -> LazyVolume:
     texts = [text for key, text in metadata(reader).items() if not key.startswith(("NRRD_", "ITK_"))]
     grid = VoxelGrid.of(reader)
     return LazyVolume(
-        str(path), grid, lambda box: _itk_box(path, box), secrets=frozenset(t for t in texts if t)
+        str(path), grid, lambda box: _itk_box(path, box), identifiers=frozenset(t for t in texts if t)
     )
 
 

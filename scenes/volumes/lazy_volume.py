@@ -32,7 +32,7 @@ class LazyVolume:
     read_box: Callable[[Box], np.ndarray]  # voxels (z, y, x) of a box
     notes: tuple[str, ...] = ()  # what was chosen, left out or resampled, for the user
     frame_of_reference: str = ""  # DICOM's uid, where there is one
-    secrets: frozenset[str] = frozenset()  # what of the source no file of ours may hold
+    identifiers: frozenset[str] = frozenset()  # what of the source no file of ours may hold
 
     @classmethod
     def of(cls, image: sitk.Image, name: str = "the image") -> LazyVolume:

@@ -64,7 +64,7 @@ def nifti_volume(path: Path) -> LazyVolume:
         for key in ("descrip", "aux_file", "intent_name", "db_name")
         if key in header
     ]
-    return LazyVolume(str(path), grid, read_box, secrets=frozenset(text for text in texts if text))
+    return LazyVolume(str(path), grid, read_box, identifiers=frozenset(text for text in texts if text))
 
 
 def label_names(path: Path) -> dict[int, str]:

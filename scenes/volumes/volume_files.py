@@ -7,7 +7,7 @@ from pathlib import Path
 
 import SimpleITK as sitk
 
-from scenes.atomic_files import whole
+from scenes.atomic_files import atomic_write
 from scenes.volumes.itk_files import META, NRRD, itk_volume
 from scenes.volumes.lazy_volume import LazyVolume
 
@@ -32,7 +32,7 @@ def file_volume(path: Path) -> LazyVolume:
 
 def save_image(image: sitk.Image, path: Path) -> None:
     """Write an image, compressed, as NRRD or MetaImage as the suffix says. Raises OSError: a full disk, a folder that is not there."""
-    with whole(path) as partial:
+    with atomic_write(path) as partial:
         try:
             sitk.WriteImage(image, str(partial), useCompression=True)
             sitk.ReadImage(str(partial))  # as ITK does not notice a disk that is full from the last bytes on

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rehearsal.result_files import rounded, spread, write_json
-from scenes.atomic_files import whole
+from scenes.atomic_files import atomic_write
 from studies.accuracy.calibration import Calibration, CalibrationTrial, quartic
 
 FIT, HELD_OUT = "fit", "held out"
@@ -52,7 +52,7 @@ class Table:
             columns += [f"{radius:g} mm, % of travel" for radius in self.radii_mm]
             rows = [row + shares for row, shares in zip(rows, self.shares, strict=True)]
         with (
-            whole(folder / f"{self.name}.csv") as partial,
+            atomic_write(folder / f"{self.name}.csv") as partial,
             partial.open("w", newline="", encoding="utf-8") as file,
         ):
             csv.writer(file).writerows([columns, *rows])

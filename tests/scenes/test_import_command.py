@@ -12,13 +12,13 @@ from app import main
 from errors import PatientError
 from scenes.anatomy import load_anatomy
 from scenes.patients.import_command import place_mm
-from scenes.patients.import_request import Request, take_in, with_labels
-from scenes.patients.patient_folder import save_patient, telling
+from scenes.patients.import_request import ImportRequest, import_request, with_labels
+from scenes.patients.patient_folder import is_identifying, save_patient
 from scenes.patients.readers.ct_files import open_ct
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import LabelMap
 from scenes.scene import load_scene
-from scenes.terminal import pasted, silent
+from scenes.terminal import shell_command, silent
 
 SPINE = np.array([0.0, 70.0, 0.0]), np.array([22.0, 20.0, 400.0])
 ORIGIN = (-175.0, -120.0, -56.0)
@@ -65,11 +65,11 @@ def imported(hospital, tmp_path_factory):
     out, found = tmp_path_factory.mktemp("patients") / "a", []
 
     def watched(*request):
-        found.append(take_in(*request))
+        found.append(import_request(*request))
         return found[0]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("scenes.patients.import_request.take_in", watched)
+        patch.setattr("scenes.patients.import_request.import_request", watched)
         assert main(["import", str(hospital[0]), "--side", "left", "--out", str(out)]) == 0
     return out, *found
 
@@ -99,9 +99,9 @@ def test_the_folder_is_a_scene(written):
 
 def test_nothing_names_the_patient(written, hospital):
     folder, series = hospital
-    secrets = [*PERSON.values(), "Doe", "Jane", series.uid, series.frame_of_reference, series.study]
-    secrets += [str(folder), "Doe_Jane", *series.sops]
-    words = [value for value in secrets if len(value) > 3]
+    identifiers = [*PERSON.values(), "Doe", "Jane", series.uid, series.frame_of_reference, series.study]
+    identifiers += [str(folder), "Doe_Jane", *series.sops]
+    words = [value for value in identifiers if len(value) > 3]
     assert len(words) > 40
     for file in written.iterdir():
         content = file.read_bytes()
@@ -112,7 +112,7 @@ def test_the_terminal_names_nobody_and_tells_the_facts(hospital, tmp_path, capfd
     out = tmp_path / "a b"
     assert main(["import", str(hospital[0]), "--side", "right", "--out", str(out)]) == 0
     said = capfd.readouterr()
-    assert said.out.endswith(f"then: {pasted('rehearse', out)}\n")
+    assert said.out.endswith(f"then: {shell_command('rehearse', out)}\n")
     assert "right kidney" in said.out and "none is in the files" in said.out
     for text in ("Doe", "Jane", "4711", "19600229", hospital[1].uid):
         assert text not in said.out + said.err
@@ -139,7 +139,7 @@ def test_contours_on_an_archive(hospital, tmp_path):
             contours.append(np.column_stack([x, y, np.full(90, z)]))
     structures = write_structures(tmp_path / "rt.dcm", {"Kidney_L": contours, "External": []}, series.uid)
     archive = zipped(folder / "ct", tmp_path / "ct.zip")
-    patient, _ = take_in(Request(archive, [structures]))
+    patient, _ = import_request(ImportRequest(archive, [structures]))
     assert patient.side == "left"
     assert patient.volumes_ml["organ"] == pytest.approx(4 / 3 * np.pi * LEFT[1].prod() / 1000, rel=0.02)
     np.testing.assert_allclose(patient.organ.center_mass, LEFT[0], atol=0.5)
@@ -150,9 +150,9 @@ def test_labels_of_another_examination(hospital, tmp_path):
     other = Series(tmp_path / "ct", DIRECTIONS["identity"], size=(20, 20, 6), origin=ORIGIN, field=hounsfield)
     other.write()
     with pytest.raises(PatientError, match="another frame of reference"):
-        take_in(Request(tmp_path / "ct", [folder / "seg"]))
+        import_request(ImportRequest(tmp_path / "ct", [folder / "seg"]))
     with pytest.raises(PatientError, match="no labels lie with this CT.*--seed"):
-        take_in(Request(tmp_path / "ct"))
+        import_request(ImportRequest(tmp_path / "ct"))
 
 
 class TestPrivate:
@@ -178,8 +178,13 @@ class TestPrivate:
         assert list(tmp_path.iterdir()) == []
 
     def test_words_of_every_file_name_nobody(self):
-        assert telling("Doe") and telling("Left^Doe") and telling("123456") and telling("1.2.3")
-        assert not any(map(telling, ["", "7", "AB", "12345", "kidney", "Left Kidney", "STL"]))
+        assert (
+            is_identifying("Doe")
+            and is_identifying("Left^Doe")
+            and is_identifying("123456")
+            and is_identifying("1.2.3")
+        )
+        assert not any(map(is_identifying, ["", "7", "AB", "12345", "kidney", "Left Kidney", "STL"]))
 
     def test_an_interrupted_import_leaves_nothing(self, patient, tmp_path):
         def draw(_):
@@ -207,7 +212,7 @@ def test_a_seed_is_three_numbers(text):
 
 def test_a_seed_or_labels(tmp_path):
     with pytest.raises(PatientError, match="not both"):
-        take_in(Request(tmp_path, [tmp_path], seed_mm=np.zeros(3)))
+        import_request(ImportRequest(tmp_path, [tmp_path], seed_mm=np.zeros(3)))
 
 
 def test_the_series_that_labels_were_drawn_on(tmp_path):
@@ -219,13 +224,13 @@ def test_the_series_that_labels_were_drawn_on(tmp_path):
     thin.write()
     thick.write()
     seg = write_segmentation(tmp_path / "seg.dcm", thick, {"Kidney": np.ones((3, 10, 12))})
-    assert with_labels(Request(tmp_path / "ct", [seg]), silent)[0].grid.spacing[2] == pytest.approx(5.0)
+    assert with_labels(ImportRequest(tmp_path / "ct", [seg]), silent)[0].grid.spacing[2] == pytest.approx(5.0)
 
 
 def test_each_source_is_private(hospital, taken_in):
     """The CT's header by itself, and the labels'."""
     folder, series = hospital
-    for said in (open_ct(folder / "ct").secrets, open_labels(folder / "seg").secrets):
+    for said in (open_ct(folder / "ct").identifiers, open_labels(folder / "seg").identifiers):
         assert {"Doe^Jane", "Doe", "Jane", "19600229", "A1234567", series.study} <= said
 
 
@@ -236,17 +241,19 @@ def test_what_labels_say_and_paths_are_private(hospital, taken_in, tmp_path, mon
     made.header["descrip"] = b"drawn by Roe"
     nibabel.save(made, tmp_path / "kidney.nii.gz")
     given = type(tmp_path)("../") / tmp_path.name / "kidney.nii.gz"
-    private = take_in(Request(hospital[0] / "ct", [given]))[1]
+    private = import_request(ImportRequest(hospital[0] / "ct", [given]))[1]
     assert {"drawn by Roe", "Doe^Jane", str(given), str(tmp_path.resolve() / "kidney.nii.gz")} <= private
 
 
 def test_a_seed_makes_a_draft(hospital, taken_in, monkeypatch):
     labels = LabelMap.of(sitk.Image([4, 4, 4], sitk.sitkUInt8) + 1)
-    monkeypatch.setattr("scenes.patients.import_request.grown", lambda ct, seed: labels)
+    monkeypatch.setattr("scenes.patients.import_request.draft_segmentation", lambda ct, seed: labels)
     monkeypatch.setattr(
         "scenes.patients.import_request.import_patient", lambda ct, labels, *_, **__: taken_in[0]
     )
-    assert take_in(Request(hospital[0] / "ct", seed_mm=LEFT[0]))[0].draft and not taken_in[0].draft
+    assert (
+        import_request(ImportRequest(hospital[0] / "ct", seed_mm=LEFT[0]))[0].draft and not taken_in[0].draft
+    )
 
 
 def test_what_one_header_says(tmp_path):
@@ -259,8 +266,8 @@ def test_what_one_header_says(tmp_path):
         data.OtherPatientIDs, data.InstitutionName = ["X-1", "X-22"], "St Elsewhere"
         data.private_block(0x0099, "MAKER", create=True).add_new(1, "LO", "Ward 12")
 
-    secrets = open_ct(Series(tmp_path).write(edit=edit)).secrets
-    assert {"Roe^Ann", "Roe", "Ann", "calls himself Jim", "X-22", "St Elsewhere", "Ward 12"} <= secrets
+    identifiers = open_ct(Series(tmp_path).write(edit=edit)).identifiers
+    assert {"Roe^Ann", "Roe", "Ann", "calls himself Jim", "X-22", "St Elsewhere", "Ward 12"} <= identifiers
 
 
 class TestSearch:

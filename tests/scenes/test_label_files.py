@@ -8,7 +8,7 @@ from synthetic_body import DIRECTIONS, drawn, grid_around
 from test_readers_labels import KIDNEY, by_name, ct_grid, ring
 
 from scenes.patients.readers.label_files import open_labels
-from scenes.patients.readers.label_maps import LabelMap, merged, with_tissues
+from scenes.patients.readers.label_maps import LabelMap, assign_tissues, merge_label_maps
 from scenes.patients.readers.segment_names import side_of
 from scenes.volumes.voxel_grid import VoxelGrid
 
@@ -25,13 +25,13 @@ def strips(*names):
 
 class TestTogether:
     def test_the_users_word_is_all_that_is(self):
-        (told,) = with_tissues(
+        (told,) = assign_tissues(
             [strips("kidney_left", "old tumour", "new mass")], [], {"tumour": ["new mass"]}
         )
         assert [s.tissue for s in told.segments.values()] == ["kidney", None, "tumour"]
 
     def test_what_of_the_organ_has_a_tissue_keeps_it(self):
-        (told,) = with_tissues([strips("kidney_left", "mass", "x")], ["kidney_left", "mass", "x"], {})
+        (told,) = assign_tissues([strips("kidney_left", "mass", "x")], ["kidney_left", "mass", "x"], {})
         assert [s.tissue for s in told.segments.values()] == ["kidney", "tumour", "kidney"]
 
     @pytest.mark.parametrize(
@@ -41,7 +41,7 @@ class TestTogether:
         inside = np.zeros(GRID.size[::-1], np.uint8)
         inside[2:6, 2:6, 2:6] = 1
         maps = [LabelMap.valued(GRID, inside, {1: name}) for name in (over, under)]
-        for one in (merged(maps), merged(maps[::-1])):
+        for one in (merge_label_maps(maps), merge_label_maps(maps[::-1])):
             assert [s.name for s in one.segments.values()] == [over] and len(one.segments) == 1
 
     def test_many_values(self):
@@ -60,7 +60,7 @@ class TestTogether:
             LabelMap.valued(grid, np.ones(grid.size[::-1], np.uint8), {1: name})
             for grid, name in ((fine, "kidney"), (coarse, "mass"))
         ]
-        one = merged(maps)
+        one = merge_label_maps(maps)
         assert np.isin(one.values, one.of_tissues("tumour")).sum() == pytest.approx(24 * 120, rel=0.03)
 
 
@@ -115,7 +115,7 @@ class TestSegmentations:
         image.SetMetaData("Comment", "Doe^Jane")
         sitk.WriteImage(image, str(tmp_path / "a.seg.nrrd"))
         for path in (seg, rt, tmp_path / "a.seg.nrrd"):
-            assert "Doe^Jane" in open_labels(path).secrets, path.name
+            assert "Doe^Jane" in open_labels(path).identifiers, path.name
 
 
 class TestContours:

@@ -7,7 +7,7 @@ import pytest
 
 from errors import PatientError
 from scenes.patients import part_surfaces
-from scenes.patients.part_surfaces import surfaces_aside
+from scenes.patients.part_surfaces import part_surfaces_in_processes
 from scenes.terminal import silent
 from scenes.volumes.voxel_grid import VoxelGrid
 
@@ -23,7 +23,7 @@ def ball(at: tuple[float, float, float], radius_mm: float) -> np.ndarray:
 def made(monkeypatch, found, aside: bool):
     monkeypatch.setattr(part_surfaces, "ASIDE_FROM_MM2", 0.0 if aside else np.inf)
     monkeypatch.setattr(part_surfaces, "cpu_count", lambda: 2)
-    with surfaces_aside(found) as surfaces:
+    with part_surfaces_in_processes(found) as surfaces:
         return surfaces(silent)
 
 
@@ -50,7 +50,7 @@ def test_of_what_is_too_thin_what_must_be_seen_stops_an_import(monkeypatch, asid
 
 
 def test_a_process_that_dies_is_said(monkeypatch):
-    monkeypatch.setattr(part_surfaces, "bodies", lambda *part: os._exit(1))
+    monkeypatch.setattr(part_surfaces, "part_surface", lambda *part: os._exit(1))
     found = {tissue: (GRID, ball((14, 14, 15), 9.0)) for tissue in ("tumour", "cyst")}
     with pytest.raises(PatientError, match="want of memory"):
         made(monkeypatch, found, aside=True)

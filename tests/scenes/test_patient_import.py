@@ -24,13 +24,13 @@ from synthetic_body import (
 
 import scenes.patients.patient_import
 from errors import PatientError
-from scenes.patients.import_summary import facts, told
+from scenes.patients.import_summary import as_table, summary_rows
 from scenes.patients.import_warnings import STONE_ABOVE_MEDIAN_HU
-from scenes.patients.organ_selection import midline_x, organs, single_out
+from scenes.patients.organ_selection import choose_organ, find_organs, midline_x
 from scenes.patients.patient_folder import save_patient
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.ct_files import open_ct
-from scenes.patients.readers.label_maps import LabelMap, with_tissues
+from scenes.patients.readers.label_maps import LabelMap, assign_tissues
 from scenes.phantom import embedded_patient
 from scenes.scene import SceneError
 from scenes.volumes.lazy_volume import LazyVolume
@@ -44,7 +44,7 @@ LIVER = np.array([20.0, 0.0, 40.0]), np.array([20.0, 20.0, 20.0])
 def label_map(labels, organ=(), **tissues):
     """A label map with values said to be of tissues, and the values of its organ, None where they are not said."""
     words = {tissue: [str(v) for v in values] for tissue, values in tissues.items()}
-    (told_map,) = with_tissues([LabelMap.of(labels)], [str(v) for v in organ], words)
+    (told_map,) = assign_tissues([LabelMap.of(labels)], [str(v) for v in organ], words)
     return told_map, list(organ) or None
 
 
@@ -55,9 +55,9 @@ def imported(ct, labels, organ=(), side=None, margin_mm=60.0, **tissues):
 
 def found(ct, labels, organ=(), side=None, **tissues):
     """The organ that an import would take, and its side."""
-    pieces = organs(*label_map(labels, organ, **tissues))
+    pieces = find_organs(*label_map(labels, organ, **tissues))
     midline = midline_x(VoxelGrid.of(ct), sitk.GetArrayFromImage(ct), -1000, 1000)
-    return single_out(pieces, midline, side)
+    return choose_organ(pieces, midline, side)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +97,7 @@ class TestImport:
         np.testing.assert_allclose(patient.tumour.center_mass, TUMOUR[0], atol=1.0)
         assert least_gap(patient.support, patient.organ) > 0
         assert patient.support.bounds[1, 1] > patient.organ.bounds[1, 1]  # posterior of it: supine
-        text = told(facts(patient))
+        text = as_table(summary_rows(patient))
         assert "left" in text and f"{patient.volumes_ml['organ']:.1f} ml" in text and "2.50" in text
 
     def test_crop_keeps_voxels_where_they_were(self, patient, ct_and_labels):
@@ -327,7 +327,7 @@ class TestCautions:
     """What looks wrong is said, though the import goes on."""
 
     def test_a_body_as_it_should_be(self, patient):
-        assert patient.cautions == () and patient.notes == ()
+        assert patient.warnings == () and patient.notes == ()
 
     def test_turned_over_or_mirrored(self, ct_and_labels):
         ct, labels = ct_and_labels
@@ -338,17 +338,17 @@ class TestCautions:
             voxels[level(points_of(ct), (sign * spine[0], spine[1])) < 0] = 500
             marked = drawn(labels, (4, (liver[0] * [sign, 1, 1], liver[1])), (2, LEFT))
             patient = imported(with_voxels(ct, voxels), marked, [2], margin_mm=20.0, liver=[4])
-            assert len(patient.cautions) == len(words)
-            assert all(word in line for word, line in zip(words, patient.cautions, strict=True))
+            assert len(patient.warnings) == len(words)
+            assert all(word in line for word, line in zip(words, patient.warnings, strict=True))
 
     def test_labels_shifted_into_fat(self, ct_and_labels):
         ct, labels = ct_and_labels
         voxels = sitk.GetArrayFromImage(ct)
         voxels[voxels == 40] = -100
-        assert not imported(with_voxels(ct, voxels), labels, [2], margin_mm=20.0, tumour=[3]).cautions
+        assert not imported(with_voxels(ct, voxels), labels, [2], margin_mm=20.0, tumour=[3]).warnings
         shifted = sitk.Image(labels)
         shifted.SetOrigin(np.add(labels.GetOrigin(), (0, 8.0, 0)).tolist())
-        (said,) = imported(with_voxels(ct, voxels), shifted, [2], margin_mm=20.0, tumour=[3]).cautions
+        (said,) = imported(with_voxels(ct, voxels), shifted, [2], margin_mm=20.0, tumour=[3]).warnings
         assert "of the organ's rim is fat or gas" in said
 
     def test_what_is_as_bright_as_stone_unless_its_label_says_that_it_is_urine(self, ct_and_labels):
@@ -358,14 +358,14 @@ class TestCautions:
         voxels, marks = sitk.GetArrayFromImage(ct), sitk.GetArrayFromImage(labels)
         voxels[stone | pelvis], marks[pelvis] = 120 + STONE_ABOVE_MEDIAN_HU + 1, 4
         bright, told = with_voxels(ct, voxels), with_voxels(labels, marks)
-        (said,) = imported(bright, told, [2], margin_mm=20.0, tumour=[3], urine=[4]).cautions
+        (said,) = imported(bright, told, [2], margin_mm=20.0, tumour=[3], urine=[4]).warnings
         ml = stone.sum() * np.prod(ct.GetSpacing()) / 1000
         assert f"{ml:.1f} ml inside the organ are as bright as stone" in said and "--collecting" in said
 
     def test_labels_without_a_meaning(self, ct_and_labels):
-        (said,) = imported(*ct_and_labels, side="left", margin_mm=20.0).cautions
+        (said,) = imported(*ct_and_labels, side="left", margin_mm=20.0).warnings
         assert "labels 2, 3 say nothing, and were all taken as the kidney" in said
-        (said,) = imported(*ct_and_labels, organ=[2], margin_mm=20.0).cautions
+        (said,) = imported(*ct_and_labels, organ=[2], margin_mm=20.0).warnings
         assert "were left out: 3 (5." in said and "--tumour" in said
 
 
@@ -377,10 +377,10 @@ def test_what_touches_by_a_corner_is_held_and_what_only_touches_is_no_part(ct_an
     x, y, z = (int(n) for n in grid.index(LEFT[0][None])[0])
     values[z - 8 : z + 8, y - 8 : y + 8, x - 8 : x + 8] = 1
     values[z + 8 : z + 13, y + 8 : y + 13, x + 8 : x + 13] = 2
-    apart = organs(LabelMap.valued(grid, values), [1, 2])
+    apart = find_organs(LabelMap.valued(grid, values), [1, 2])
     assert [piece.mask.sum() for piece in apart] == [16**3]
     label = LabelMap.valued(grid, values, {1: "kidney", 2: "tumour"})
-    (piece,) = organs(label)
+    (piece,) = find_organs(label)
     assert 16**3 + 5**3 < piece.mask.sum() <= 16**3 + 5**3 + 8
     patient = import_patient(LazyVolume.of(ct), label, side="left", margin_mm=10.0)
     assert patient.organ.body_count == 1

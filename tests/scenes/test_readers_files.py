@@ -32,7 +32,7 @@ class TestFiles:
             marked = noise()
             marked.SetMetaData("descrip", "Doe^Jane")
             written(path, marked)
-        assert "Doe^Jane" in open_ct(path).secrets and "Doe^Jane" in open_labels(path).secrets
+        assert "Doe^Jane" in open_ct(path).identifiers and "Doe^Jane" in open_labels(path).identifiers
 
     def test_what_no_memory_holds_is_refused_with_what_it_takes(self, tmp_path, monkeypatch):
         ct = open_ct(written(tmp_path / "ct.mha", noise()))

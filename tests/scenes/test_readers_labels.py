@@ -14,7 +14,7 @@ from synthetic_body import DIRECTIONS, drawn, grid_around, level
 from errors import PatientError
 from scenes.patients.readers.ct_files import open_ct
 from scenes.patients.readers.label_files import open_labels
-from scenes.patients.readers.label_maps import LabelMap, Segment, merged, with_tissues
+from scenes.patients.readers.label_maps import LabelMap, Segment, assign_tissues, merge_label_maps
 from scenes.patients.readers.segment_names import is_far, side_of, tissue_of
 from scenes.volumes.voxel_grid import VoxelGrid
 
@@ -343,7 +343,7 @@ class TestTogether:
     def test_tumour_wins(self):
         """Nearest neighbour moves a border by half a voxel's diagonal at most."""
         mass, kidney = self.maps()
-        one = merged([mass, kidney])
+        one = merge_label_maps([mass, kidney])
         np.testing.assert_allclose(one.grid.spacing, kidney.grid.spacing)
         index = np.argwhere(np.ones(one.values.shape, bool))[:, ::-1]
         places, values = one.grid.place(index), one.values.ravel()
@@ -357,16 +357,16 @@ class TestTogether:
 
     def test_words(self):
         maps = self.maps()
-        mass, kidney = with_tissues(maps, ["kidney_left"], {"cyst": ["MASS"]})
+        mass, kidney = assign_tissues(maps, ["kidney_left"], {"cyst": ["MASS"]})
         assert [s.tissue for one in (mass, kidney) for s in one.segments.values()] == ["cyst", "kidney"]
         with pytest.raises(
             PatientError, match="label 4 is not in the label map: it holds 1 mass, 1 kidney_left"
         ):
-            with_tissues(maps, ["4"], {})
+            assign_tissues(maps, ["4"], {})
         with pytest.raises(PatientError, match="given as cyst and as tumour: give it as one"):
-            with_tissues(maps, [], {"cyst": ["mass"], "tumour": ["mass"]})
+            assign_tissues(maps, [], {"cyst": ["mass"], "tumour": ["mass"]})
         plain = LabelMap.of(drawn(grid_around((-33, 18, -401), (-22, 30, -385), (1, 1, 1)), (5, KIDNEY)))
-        (told,) = with_tissues([plain], ["5"], {})
+        (told,) = assign_tissues([plain], ["5"], {})
         assert told.segments[5].tissue == "kidney"
 
 

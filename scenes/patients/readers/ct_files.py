@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from errors import PatientError
-from scenes.patients.readers.dicom_series import dicom_found, series_volume
+from scenes.patients.readers.dicom_series import read_dicom_headers, series_volume
 from scenes.terminal import Progress, silent
 from scenes.volumes.lazy_volume import LazyVolume
 from scenes.volumes.volume_files import file_volume, is_volume_file
@@ -31,4 +31,4 @@ def open_ct(
         if series is not None:
             raise PatientError(f"{path}: holds no series; leave --series out")
         return file_volume(path)
-    return series_volume(path, dicom_found(path, progress), series, referenced, progress)
+    return series_volume(path, read_dicom_headers(path, progress), series, referenced, progress)

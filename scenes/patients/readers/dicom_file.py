@@ -29,7 +29,7 @@ def looks_like_dicom(start: bytes) -> bool:
     return start[MAGIC_AT:] == MAGIC or (start[:2] in (b"\x08\x00", b"\x02\x00") and start[3:4] == b"\x00")
 
 
-def parsed(file: BinaryIO, name: str, **options: Any) -> FileDataset:
+def parse_dicom(file: BinaryIO, name: str, **options: Any) -> FileDataset:
     """A DICOM data set, read with pydicom's options; memory is bounded and faults are in words. Raises PatientError."""
     try:
         start = file.read(4096)

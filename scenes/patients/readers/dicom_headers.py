@@ -11,8 +11,8 @@ import numpy as np
 from pydicom.dataset import Dataset, FileDataset
 
 from errors import PatientError
-from scenes.patients.readers.dicom_file import is_directory, parsed, text_of
-from scenes.patients.readers.dicom_source import Item
+from scenes.patients.readers.dicom_file import is_directory, parse_dicom, text_of
+from scenes.patients.readers.dicom_source import SourceFile
 
 CT_CLASSES = {
     "1.2.840.10008.5.1.4.1.1.2",
@@ -68,7 +68,7 @@ NOT_HU = {
 class DicomSlice:
     """One slice of a CT: a file, or a frame of one."""
 
-    item: Item
+    item: SourceFile
     frame: int | None  # None in a file with one slice
     number: int | None  # InstanceNumber, or the frame's number from 1
     sop: str
@@ -102,18 +102,20 @@ class Series:
 
 
 @dataclass
-class Found:
+class DicomContents:
     """What DICOM files hold."""
 
     series: dict[str, Series] = field(default_factory=dict)
-    segmentations: list[Item] = field(default_factory=list)  # DICOM-SEG
-    structure_sets: list[Item] = field(default_factory=list)  # RTSTRUCT
+    segmentations: list[SourceFile] = field(default_factory=list)  # DICOM-SEG
+    structure_sets: list[SourceFile] = field(default_factory=list)  # RTSTRUCT
     others: dict[str, int] = field(default_factory=dict)  # what else there is, by modality
 
 
-def read_headers(items: list[Item], progress: Callable[[Iterable[Item]], Iterable[Item]] = iter) -> Found:
+def read_headers(
+    items: list[SourceFile], progress: Callable[[Iterable[SourceFile]], Iterable[SourceFile]] = iter
+) -> DicomContents:
     """Sort DICOM files by what they are. Raises PatientError where one is cut off."""
-    found = Found()
+    found = DicomContents()
     for item in progress(items):
         header = read_header(item)
         sop_class = text_of(item.name, header, "SOPClassUID")
@@ -137,13 +139,13 @@ def read_headers(items: list[Item], progress: Callable[[Iterable[Item]], Iterabl
     return found
 
 
-def read_header(item: Item, tags: list[str] | None = TAGS) -> FileDataset:
+def read_header(item: SourceFile, tags: list[str] | None = TAGS) -> FileDataset:
     """A file's elements but its pixels, all of them with tags None. Raises PatientError."""
     with item.open() as file:
-        return parsed(file, item.name, stop_before_pixels=True, specific_tags=tags)
+        return parse_dicom(file, item.name, stop_before_pixels=True, specific_tags=tags)
 
 
-def _add_slices(found: Found, item: Item, header: Dataset) -> None:
+def _add_slices(found: DicomContents, item: SourceFile, header: Dataset) -> None:
     uid, number = text_of(item.name, header, "SeriesInstanceUID"), text_of(item.name, header, "SeriesNumber")
     series = found.series.setdefault(uid, Series(uid, number if number.isdecimal() else "without a number"))
     series.frame_of_reference = text_of(item.name, header, "FrameOfReferenceUID")
@@ -159,7 +161,7 @@ def _add_slices(found: Found, item: Item, header: Dataset) -> None:
         series.faults.append(f"{item.name}: its header cannot be understood ({type(error).__name__})")
 
 
-def slices_of(item: Item, header: Dataset) -> Iterator[DicomSlice | None]:
+def slices_of(item: SourceFile, header: Dataset) -> Iterator[DicomSlice | None]:
     """The slices of one file; None for what shows a view and no slice."""
     if str(header.get("BurnedInAnnotation", "NO")).upper() == "YES":
         raise PatientError(f"{item.name}: has text burned into its pixels, which may name the patient")
@@ -186,7 +188,7 @@ def _groups(functional: Dataset) -> list[Dataset]:
 
 
 def _slice(
-    item: Item, frame: int | None, number: Any, groups: list[Dataset], header: Dataset
+    item: SourceFile, frame: int | None, number: Any, groups: list[Dataset], header: Dataset
 ) -> DicomSlice | None:
     def value(name: str, usual: Any = None) -> Any:
         found = (group.get(name) for group in groups if group.get(name) not in (None, ""))
@@ -225,7 +227,7 @@ def _slice(
     )
 
 
-def _numbers(item: Item, name: str, found: Any, count: int) -> np.ndarray:
+def _numbers(item: SourceFile, name: str, found: Any, count: int) -> np.ndarray:
     if found is None:
         raise PatientError(f"{item.name}: says no {name}")
     numbers = np.array([float(n) for n in found] if isinstance(found, Iterable) else [])
@@ -234,7 +236,7 @@ def _numbers(item: Item, name: str, found: Any, count: int) -> np.ndarray:
     return numbers
 
 
-def _orientation(item: Item, found: Any) -> tuple[np.ndarray, np.ndarray]:
+def _orientation(item: SourceFile, found: Any) -> tuple[np.ndarray, np.ndarray]:
     """Unit vectors along a slice's rows and columns, at right angles."""
     both = _numbers(item, "ImageOrientationPatient", found, 6).reshape(2, 3)
     lengths = np.linalg.norm(both, axis=1)

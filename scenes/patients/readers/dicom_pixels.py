@@ -12,9 +12,9 @@ from pydicom.dataset import Dataset
 from pydicom.pixels import pixel_array
 
 from errors import PatientError
-from scenes.patients.readers.dicom_file import parsed
+from scenes.patients.readers.dicom_file import parse_dicom
 from scenes.patients.readers.dicom_headers import DicomSlice
-from scenes.patients.readers.dicom_source import Item
+from scenes.patients.readers.dicom_source import SourceFile
 from scenes.volumes.lazy_volume import AIR_HU, LEAST_HU, MOST_HU
 
 
@@ -30,10 +30,10 @@ def hounsfield(slices: list[DicomSlice]) -> Iterator[np.ndarray]:
 class _File:
     """One DICOM file; the last one stays in memory, for it may hold many slices."""
 
-    def __init__(self, item: Item) -> None:
+    def __init__(self, item: SourceFile) -> None:
         self.item = item
         with item.open() as opened:
-            self.data: Dataset = parsed(opened, item.name)
+            self.data: Dataset = parse_dicom(opened, item.name)
         self.by_gdcm: np.ndarray | None = None
 
     def hounsfield(self, one: DicomSlice) -> np.ndarray:

@@ -10,12 +10,12 @@ import highdicom as hd
 import numpy as np
 
 from errors import PatientError
-from scenes.patients.readers.dicom_file import parsed
+from scenes.patients.readers.dicom_file import parse_dicom
 from scenes.patients.readers.dicom_headers import read_header, slices_of
-from scenes.patients.readers.dicom_source import Item
+from scenes.patients.readers.dicom_source import SourceFile
 from scenes.patients.readers.label_maps import LabelMap, Segment
 from scenes.patients.readers.segment_names import tissue_of
-from scenes.patients.readers.slice_stack import stacked
+from scenes.patients.readers.slice_stack import stack_slices
 from scenes.volumes.voxel_grid import VoxelGrid
 
 # A voxel of a fractional segment is in it from this share on.
@@ -24,14 +24,14 @@ HALF = 0.5
 FULL_HU = 1000.0
 
 
-def read_segmentation(item: Item) -> tuple[list[LabelMap], list[str], str]:
+def read_segmentation(item: SourceFile) -> tuple[list[LabelMap], list[str], str]:
     """The segments of a DICOM-SEG, a map each; notes; and the uid of the series that it was drawn on.
 
     Raises PatientError: damaged, or not in the patient's coordinates.
     """
     logging.getLogger("highdicom").setLevel(logging.ERROR)
     with item.open() as file:
-        data = parsed(file, item.name)
+        data = parse_dicom(file, item.name)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -54,7 +54,7 @@ def read_segmentation(item: Item) -> tuple[list[LabelMap], list[str], str]:
     return found, notes, str(referenced[0].get("SeriesInstanceUID", "")) if referenced else ""
 
 
-def _maps(item: Item, segmentation: hd.seg.Segmentation) -> list[LabelMap]:
+def _maps(item: SourceFile, segmentation: hd.seg.Segmentation) -> list[LabelMap]:
     if segmentation.get("FrameOfReferenceUID") is None:
         raise PatientError(
             f"{item.name}: has no frame of reference, so it was drawn on no volume; expected labels of a CT; choose another file"
@@ -75,7 +75,9 @@ def _maps(item: Item, segmentation: hd.seg.Segmentation) -> list[LabelMap]:
     return maps
 
 
-def _upright(item: Item, segmentation: hd.seg.Segmentation, number: int) -> tuple[VoxelGrid, np.ndarray]:
+def _upright(
+    item: SourceFile, segmentation: hd.seg.Segmentation, number: int
+) -> tuple[VoxelGrid, np.ndarray]:
     """A segment's grid, and which of its voxels (z, y, x) it holds."""
     volume = segmentation.get_volume(segment_numbers=[number], allow_missing_positions=True)
     place = np.array(volume.spacing), np.array(volume.position), np.array(volume.direction)
@@ -83,7 +85,7 @@ def _upright(item: Item, segmentation: hd.seg.Segmentation, number: int) -> tupl
     return grid, np.asarray(volume.array[..., 0] >= HALF).T
 
 
-def _tilted(item: Item, segmentation: hd.seg.Segmentation, number: int) -> tuple[VoxelGrid, np.ndarray]:
+def _tilted(item: SourceFile, segmentation: hd.seg.Segmentation, number: int) -> tuple[VoxelGrid, np.ndarray]:
     """The same of frames that lean, as a tilted gantry's slices do: straightened as those are, as if they were HU."""
     most = float(segmentation.get("MaximumFractionalValue") or 1)
     shared = segmentation.SharedFunctionalGroupsSequence[0].get("SegmentIdentificationSequence")
@@ -94,5 +96,5 @@ def _tilted(item: Item, segmentation: hd.seg.Segmentation, number: int) -> tuple
         for one, frame in zip(slices_of(item, read_header(item)), told, strict=True)
         if one is not None and frame.ReferencedSegmentNumber == number
     ]
-    stack = stacked(item.name, own)
+    stack = stack_slices(item.name, own)
     return stack.grid, stack.read(stack.grid.whole()) >= HALF * FULL_HU

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from errors import PatientError
-from scenes.patients.readers.dicom_headers import DicomSlice, Found, Series, read_headers
-from scenes.patients.readers.dicom_source import items_of
-from scenes.patients.readers.identifiers import secrets_of
-from scenes.patients.readers.slice_stack import stacked
+from scenes.patients.readers.dicom_headers import DicomContents, DicomSlice, Series, read_headers
+from scenes.patients.readers.dicom_source import find_dicom_files
+from scenes.patients.readers.identifiers import identifiers_of
+from scenes.patients.readers.slice_stack import stack_slices
 from scenes.terminal import Progress
 from scenes.volumes.lazy_volume import LazyVolume
 from scenes.volumes.volume_files import ENDINGS
@@ -21,9 +21,9 @@ STRAY = 0.1
 UID_END = 6
 
 
-def dicom_found(path: Path, progress: Progress) -> Found:
+def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
     """What the DICOM files of a folder, DICOMDIR or archive hold. Raises PatientError where there are none."""
-    items = items_of(path)
+    items = find_dicom_files(path)
     if not items and path.is_file():
         raise PatientError(
             f"{path}: unknown kind of file; expected DICOM (a folder, a DICOMDIR or a zip archive), or a file that ends in "
@@ -37,7 +37,7 @@ def dicom_found(path: Path, progress: Progress) -> Found:
 
 
 def series_volume(
-    path: Path, found: Found, wanted: str | None, referenced: str, progress: Progress
+    path: Path, found: DicomContents, wanted: str | None, referenced: str, progress: Progress
 ) -> LazyVolume:
     """The CT of a series: the wanted one, by number or uid, the one that labels refer to, or the best guess.
 
@@ -62,18 +62,18 @@ def series_volume(
         notes.append(f"left out, no CT slices: {others}")
     if not all(one.is_rescaled for one in slices):
         notes.append("the files do not say how their values become HU: they were taken as HU")
-    stack = stacked(str(path), slices)
+    stack = stack_slices(str(path), slices)
     return LazyVolume(
         name=str(path),
         grid=stack.grid,
         read_box=lambda box: stack.read(box, lambda files: progress(files, "slices")),
         notes=(*notes, *stack.notes),
         frame_of_reference=series.frame_of_reference,
-        secrets=secrets_of(slices[0].item),
+        identifiers=identifiers_of(slices[0].item),
     )
 
 
-def _instead(found: Found) -> str:
+def _instead(found: DicomContents) -> str:
     kinds = [f"{count} {what}" for what, count in sorted(found.others.items())]
     kinds += [f"{len(found.segmentations)} SEG"] * bool(found.segmentations)
     kinds += [f"{len(found.structure_sets)} RTSTRUCT"] * bool(found.structure_sets)

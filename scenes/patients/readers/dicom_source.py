@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO, cast
 
 from errors import PatientError
-from scenes.patients.readers.dicom_file import MAGIC, MAGIC_AT, looks_like_dicom, parsed
+from scenes.patients.readers.dicom_file import MAGIC, MAGIC_AT, looks_like_dicom, parse_dicom
 
 MOST_FILES = 100_000
 # One file of an archive may be a whole enhanced CT; the archive, several series.
@@ -21,7 +21,7 @@ MOST_ARCHIVE_BYTES = 16 * 2**30
 
 
 @dataclass(frozen=True)
-class Item:
+class SourceFile:
     """One file that may be DICOM."""
 
     name: str  # within what the user gave
@@ -29,7 +29,7 @@ class Item:
     path: Path | None  # None within an archive
 
 
-def items_of(path: Path) -> list[Item]:
+def find_dicom_files(path: Path) -> list[SourceFile]:
     """The files that begin as DICOM does, of a folder and its subfolders, a DICOMDIR, a zip archive or one file.
 
     Raises PatientError: too many or too large, an archive that is broken, encrypted or leads outside, a DICOMDIR
@@ -46,11 +46,11 @@ def items_of(path: Path) -> list[Item]:
     return [item for item in items if _begins_as_dicom(item)]
 
 
-def _on_disk(path: Path, name: str) -> Item:
-    return Item(name, lambda: cast(BinaryIO, path.open("rb")), path)
+def _on_disk(path: Path, name: str) -> SourceFile:
+    return SourceFile(name, lambda: cast(BinaryIO, path.open("rb")), path)
 
 
-def _begins_as_dicom(item: Item) -> bool:
+def _begins_as_dicom(item: SourceFile) -> bool:
     try:
         with item.open() as file:
             return looks_like_dicom(file.read(MAGIC_AT + len(MAGIC)))
@@ -60,8 +60,8 @@ def _begins_as_dicom(item: Item) -> bool:
         ) from error
 
 
-def _of_folder(folder: Path) -> list[Item]:
-    items: list[Item] = []
+def _of_folder(folder: Path) -> list[SourceFile]:
+    items: list[SourceFile] = []
     for root, folders, files in os.walk(folder):
         folders.sort()
         for name in sorted(files):
@@ -75,7 +75,7 @@ def _of_folder(folder: Path) -> list[Item]:
     return items
 
 
-def _of_directory_file(path: Path) -> list[Item]:
+def _of_directory_file(path: Path) -> list[SourceFile]:
     """The images that a DICOMDIR lists; they lie beside it or below."""
     root = path.parent.resolve()
     items = []
@@ -106,7 +106,7 @@ def _listed(path: Path) -> list[list[str]]:
             if not looks_like_dicom(file.read(MAGIC_AT + len(MAGIC))):
                 raise ValueError
             file.seek(0)
-            records = parsed(file, str(path)).get("DirectoryRecordSequence") or []
+            records = parse_dicom(file, str(path)).get("DirectoryRecordSequence") or []
         names = [record.get("ReferencedFileID") for record in records]
         return [[name] if isinstance(name, str) else [str(part) for part in name] for name in names if name]
     except PatientError:
@@ -117,7 +117,7 @@ def _listed(path: Path) -> list[list[str]]:
         ) from error
 
 
-def _of_archive(path: Path) -> list[Item]:
+def _of_archive(path: Path) -> list[SourceFile]:
     try:
         archive = zipfile.ZipFile(path)
         entries = [entry for entry in archive.infolist() if not entry.is_dir()]
@@ -138,7 +138,7 @@ def _of_archive(path: Path) -> list[Item]:
     def opened(entry: zipfile.ZipInfo) -> BinaryIO:
         return io.BytesIO(_unpacked(path, archive, entry, MOST_FILE_BYTES))
 
-    return [Item(entry.filename, partial(opened, entry), None) for entry in found]
+    return [SourceFile(entry.filename, partial(opened, entry), None) for entry in found]
 
 
 def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:

@@ -8,7 +8,7 @@ from pydicom.dataelem import DataElement
 from pydicom.dataset import Dataset
 
 from scenes.patients.readers.dicom_headers import read_header
-from scenes.patients.readers.dicom_source import Item
+from scenes.patients.readers.dicom_source import SourceFile
 
 # Of DICOM's kinds of text those that name persons, dates and things; UI also holds standard uids, which name nobody.
 NAMING = ("PN", "DA", "DT", "UI")
@@ -22,7 +22,7 @@ PERSONAL_KEYWORDS = (
 )  # fmt: skip
 
 
-def secrets_of(item: Item) -> frozenset[str]:
+def identifiers_of(item: SourceFile) -> frozenset[str]:
     """Every name, id, date, institution, uid and private text of one DICOM file; of what cannot be parsed, its bytes."""
     return frozenset(text for text in _texts(read_header(item, tags=None)) if text)
 

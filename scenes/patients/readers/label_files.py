@@ -11,10 +11,10 @@ import numpy as np
 import SimpleITK as sitk
 
 from errors import PatientError
-from scenes.patients.readers.dicom_headers import Found, read_header
+from scenes.patients.readers.dicom_headers import DicomContents, read_header
 from scenes.patients.readers.dicom_seg import read_segmentation
-from scenes.patients.readers.dicom_series import dicom_found
-from scenes.patients.readers.identifiers import secrets_of
+from scenes.patients.readers.dicom_series import read_dicom_headers
+from scenes.patients.readers.identifiers import identifiers_of
 from scenes.patients.readers.label_maps import LabelMap, Segment, box_of, whole_numbers
 from scenes.patients.readers.rtstruct import read_contours, referenced_series
 from scenes.patients.readers.segment_names import is_far, side_of, tissue_of
@@ -31,17 +31,17 @@ SLICER_KEY = re.compile(r"Segment(\d+)_Name$")
 
 
 @dataclass(frozen=True)
-class Drawing:
+class Segmentation:
     """Labels that were found; contours are filled once the CT is known."""
 
     maps: Callable[[VoxelGrid], list[LabelMap]]
     referenced: str = ""  # uid of the series that they were drawn on, where they say
     notes: tuple[str, ...] = ()
-    secrets: frozenset[str] = frozenset()
+    identifiers: frozenset[str] = frozenset()
     frame_of_reference: str = ""  # DICOM's uid, where they have one
 
 
-def open_labels(path: Path, wanted: Collection[str] = (), progress: Progress = silent) -> Drawing:
+def open_labels(path: Path, wanted: Collection[str] = (), progress: Progress = silent) -> Segmentation:
     """Read labels.
 
     Args:
@@ -59,7 +59,7 @@ def open_labels(path: Path, wanted: Collection[str] = (), progress: Progress = s
     organs = sorted(file for file in path.iterdir() if is_volume_file(file)) if path.is_dir() else []
     if organs:
         return _one_an_organ(path, organs, wanted, progress)
-    drawing = drawing_of(dicom_found(path, progress))
+    drawing = segmentation_of(read_dicom_headers(path, progress))
     if drawing is None:
         raise PatientError(
             f"{path}: holds no labels; expected a DICOM segmentation or structure set, or label maps; choose another"
@@ -67,7 +67,7 @@ def open_labels(path: Path, wanted: Collection[str] = (), progress: Progress = s
     return drawing
 
 
-def drawing_of(found: Found) -> Drawing | None:
+def segmentation_of(found: DicomContents) -> Segmentation | None:
     """The labels among DICOM files; None where there are none. Raises PatientError where there are several."""
     objects = [*found.segmentations, *found.structure_sets]
     if len(objects) > 1:
@@ -78,29 +78,29 @@ def drawing_of(found: Found) -> Drawing | None:
     if found.segmentations:
         maps, notes, referenced = read_segmentation(objects[0])
         frame = str(read_header(objects[0]).get("FrameOfReferenceUID") or "")
-        return Drawing(lambda _: maps, referenced, tuple(notes), secrets_of(objects[0]), frame)
+        return Segmentation(lambda _: maps, referenced, tuple(notes), identifiers_of(objects[0]), frame)
     if found.structure_sets:
         item = objects[0]
         referenced = referenced_series(read_header(item, tags=["ReferencedFrameOfReferenceSequence"]))
-        return Drawing(lambda ct: read_contours(item, ct), referenced, (), secrets_of(item))
+        return Segmentation(lambda ct: read_contours(item, ct), referenced, (), identifiers_of(item))
     return None
 
 
-def _file(path: Path) -> Drawing:
+def _file(path: Path) -> Segmentation:
     if path.name.lower().endswith(NIFTI):
         volume = file_volume(path)
         maps = [_map(path, volume.grid, volume.read(), label_names(path))]
-        return Drawing(lambda _: maps, secrets=volume.secrets)
+        return Segmentation(lambda _: maps, identifiers=volume.identifiers)
     header = itk_header(path)
     names = _slicer_names(header)
     kept = {n: text for n, text in metadata(header).items() if not n.startswith(("NRRD_", "ITK_", "Segment"))}
-    secrets = frozenset(text for text in kept.values() if text)
+    identifiers = frozenset(text for text in kept.values() if text)
     if not names and header.GetNumberOfComponents() == 1:
         volume = file_volume(path)
         maps = [_map(path, volume.grid, volume.read())]
     else:
         maps = _slicer_maps(path, VoxelGrid.of(header), names)
-    return Drawing(lambda _: maps, secrets=secrets)
+    return Segmentation(lambda _: maps, identifiers=identifiers)
 
 
 def _map(path: Path, grid: VoxelGrid, voxels: np.ndarray, names: Mapping[int, str] | None = None) -> LabelMap:
@@ -151,18 +151,20 @@ def _slicer_maps(path: Path, grid: VoxelGrid, names: dict[tuple[int, int], Segme
     return maps
 
 
-def _one_an_organ(folder: Path, files: list[Path], wanted: Collection[str], progress: Progress) -> Drawing:
+def _one_an_organ(
+    folder: Path, files: list[Path], wanted: Collection[str], progress: Progress
+) -> Segmentation:
     """One file an organ, as TotalSegmentator leaves them: named by their files, and empty where an organ is not there."""
     asked = {word.casefold() for word in wanted}
     near = [f for f in files if _stem(f).casefold() in asked or not is_far(_stem(f))]
     # Kidneys first: of the rest, what is near them is read.
     near.sort(key=lambda file: tissue_of(_stem(file)) != "kidney")
     maps: list[LabelMap] = []
-    secrets: set[str] = set()
+    identifiers: set[str] = set()
     around: np.ndarray | None = None
     for file in progress(near, "labels"):
         volume = file_volume(file)
-        secrets |= volume.secrets
+        identifiers |= volume.identifiers
         is_kidney = tissue_of(_stem(file)) == "kidney"
         box = volume.grid.whole()
         if around is not None and not is_kidney:
@@ -177,7 +179,7 @@ def _one_an_organ(folder: Path, files: list[Path], wanted: Collection[str], prog
         raise PatientError(
             f"{folder}: all {len(near)} label files are empty; expected an organ; choose other labels"
         )
-    return Drawing(lambda _: maps, secrets=frozenset(secrets))
+    return Segmentation(lambda _: maps, identifiers=frozenset(identifiers))
 
 
 def _around(places: np.ndarray) -> np.ndarray:

@@ -59,7 +59,7 @@ class LabelMap:
     @classmethod
     def valued(cls, grid: VoxelGrid, values: np.ndarray, names: Mapping[int, str] | None = None) -> LabelMap:
         """A label map whose values have names, or none."""
-        found = {v: Segment.named((names or {}).get(v, ""), v) for v in present(values)}
+        found = {v: Segment.named((names or {}).get(v, ""), v) for v in present_values(values)}
         return cls(grid, values, found)
 
     @classmethod
@@ -103,7 +103,7 @@ def whole_numbers(voxels: np.ndarray, name: str) -> np.ndarray:
     return voxels.astype(np.uint8 if high < 256 else np.uint16)
 
 
-def with_tissues(
+def assign_tissues(
     maps: list[LabelMap], organ: Sequence[str], chosen: Mapping[str, Sequence[str]]
 ) -> list[LabelMap]:
     """The maps with the user's word on what segments are, by names or values.
@@ -141,7 +141,7 @@ def with_tissues(
     return [replace(one, segments={v: told(s) for v, s in one.segments.items()}) for one in maps]
 
 
-def merged(maps: list[LabelMap]) -> LabelMap:
+def merge_label_maps(maps: list[LabelMap]) -> LabelMap:
     """One map of several that may overlap and lie on different grids: on that of the first with a kidney, widened to hold all."""
     if len(maps) == 1:
         return maps[0]
@@ -153,11 +153,11 @@ def merged(maps: list[LabelMap]) -> LabelMap:
     for code, (one, value, _) in enumerate(pieces, start=1):
         inside, box = _onto(grid, one.grid, one.values == value)
         values[box[::-1]][inside] = code
-    left = set(present(values))
+    left = set(present_values(values))
     return LabelMap(grid, values, {n: piece[2] for n, piece in enumerate(pieces, start=1) if n in left})
 
 
-def present(values: np.ndarray) -> list[int]:
+def present_values(values: np.ndarray) -> list[int]:
     """The values but 0 that occur, a plane at a time: counting widens them eightfold."""
     there = np.zeros(1 + np.iinfo(values.dtype).max, bool)
     for plane in values:
@@ -178,7 +178,7 @@ def box_of(inside: np.ndarray) -> Box | None:
     return x, y, z
 
 
-def nearest(grid: VoxelGrid, voxels: np.ndarray, onto: VoxelGrid) -> np.ndarray:
+def resample_nearest(grid: VoxelGrid, voxels: np.ndarray, onto: VoxelGrid) -> np.ndarray:
     """Voxels (z, y, x) of one grid on another, by nearest neighbour; 0 beyond the first grid."""
     if grid.same_as(onto):
         return voxels
@@ -204,4 +204,4 @@ def _onto(grid: VoxelGrid, own: VoxelGrid, inside: np.ndarray) -> tuple[np.ndarr
     reach = 0.5 * np.abs(own.direction) @ own.spacing
     low, high = own.bounds()
     box = grid.box_around(low - reach, high + reach)
-    return nearest(own, inside, grid.part(box)), box
+    return resample_nearest(own, inside, grid.part(box)), box

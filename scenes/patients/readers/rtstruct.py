@@ -7,8 +7,8 @@ from pydicom.dataset import Dataset
 from skimage.draw import polygon
 
 from errors import PatientError
-from scenes.patients.readers.dicom_file import parsed
-from scenes.patients.readers.dicom_source import Item
+from scenes.patients.readers.dicom_file import parse_dicom
+from scenes.patients.readers.dicom_source import SourceFile
 from scenes.patients.readers.label_maps import LabelMap, Segment
 from scenes.volumes.voxel_grid import VoxelGrid
 
@@ -17,14 +17,14 @@ OFF_PLANE = 0.3
 MOST_POINTS = 20_000_000
 
 
-def read_contours(item: Item, ct: VoxelGrid) -> list[LabelMap]:
+def read_contours(item: SourceFile, ct: VoxelGrid) -> list[LabelMap]:
     """The regions of an RTSTRUCT, a map each, with the pixels of a CT, on the planes of the contours.
 
     Contours of one region on one plane take turns to be inside and outside, as a ring's do.
     Raises PatientError: damaged, or drawn across the CT's slices.
     """
     with item.open() as file:
-        data = parsed(file, item.name)
+        data = parse_dicom(file, item.name)
     try:
         names = {int(roi.ROINumber): str(roi.get("ROIName", "")) for roi in data.StructureSetROISequence}
         regions = [

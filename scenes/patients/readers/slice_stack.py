@@ -89,7 +89,7 @@ def _between(before: tuple[float, np.ndarray] | None, after: tuple[float, np.nda
     return np.rint(before[1] * (1 - share) + after[1] * share).astype(np.int16)
 
 
-def stacked(name: str, slices: list[DicomSlice]) -> Stack:
+def stack_slices(name: str, slices: list[DicomSlice]) -> Stack:
     """Put slices in order on one grid. Raises PatientError: too few, not parallel, one missing, double or in conflict."""
     if len(slices) < 2:
         raise PatientError(
