@@ -1,4 +1,4 @@
-"""Load what a scene names: surfaces, CT and labels of a patient's folder, or of the embedded patient."""
+"""Load the files of a scene: surfaces, CT and labels of a patient's folder, or of the embedded patient."""
 
 import hashlib
 from dataclasses import dataclass, field
@@ -26,7 +26,7 @@ from scenes.volumes.volume_files import file_volume
 
 @dataclass(frozen=True)
 class Grid:
-    """Voxels (nx, ny, nz) float32 and the affine map (4, 4) from patient coordinates [mm] to voxel indices."""
+    """Voxels (nx, ny, nz) float32, and the affine transform (4, 4) from LPS [mm] to voxel indices."""
 
     voxels: np.ndarray
     index_from_mm: np.ndarray
@@ -34,7 +34,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class LoadedAnatomy:
-    """Everything of one patient that a rehearsal needs; LPS [mm]."""
+    """The surfaces and volumes of one patient in LPS [mm]."""
 
     organ: trimesh.Trimesh
     tumour: trimesh.Trimesh | None
@@ -42,13 +42,13 @@ class LoadedAnatomy:
     shapes: tuple[PlaneShape | trimesh.Trimesh | Grid, ...]
     labels: Grid | None = None
     tissues: dict[int, str] = field(default_factory=dict)
-    """Which tissue each label is."""
+    """The tissue of each label value."""
     parts: dict[str, trimesh.Trimesh] = field(default_factory=dict)
     """Surfaces of cysts, vessels and collecting system, by tissue."""
 
 
 def load_anatomy(scene: Scene, folder: Path, progress: ReportProgress = no_progress) -> LoadedAnatomy:
-    """Read the files that a scene names, relative to ``folder``. Raises SceneError, PatientError."""
+    """Read the files of a scene, relative to ``folder``. Raises SceneError, PatientError."""
     folder, anatomy = files_of(scene, folder, progress)
     return LoadedAnatomy(
         organ=load_surface(folder / anatomy.organ),
@@ -62,7 +62,7 @@ def load_anatomy(scene: Scene, folder: Path, progress: ReportProgress = no_progr
 
 
 def files_of(scene: Scene, folder: Path, progress: ReportProgress = no_progress) -> tuple[Path, AnatomyFiles]:
-    """A scene's files and the folder that they are in: its own, or the embedded patient's. Raises SceneError."""
+    """The files of a scene and their folder: its own, or the embedded patient's. Raises SceneError."""
     if not scene.anatomy.phantom:
         return folder, scene.anatomy
     embedded = phantom_folder(progress)
@@ -70,7 +70,7 @@ def files_of(scene: Scene, folder: Path, progress: ReportProgress = no_progress)
 
 
 def fingerprint(anatomy: LoadedAnatomy) -> str:
-    """A short name of what a rehearsal's body and pictures are made of: other surfaces or voxels, another name."""
+    """A hash of all surfaces and voxels."""
     digest = hashlib.sha256()
     parts = [anatomy.parts[name] for name in sorted(anatomy.parts)]
     for each in (anatomy.organ, anatomy.tumour, *parts, anatomy.ct, anatomy.labels, *anatomy.shapes):
@@ -84,17 +84,17 @@ def fingerprint(anatomy: LoadedAnatomy) -> str:
 
 
 def press_on(press: Press, anatomy: LoadedAnatomy, gravity: np.ndarray) -> Press:
-    """A press with what it leaves open filled in.
+    """The press with defaults for what the scene leaves out.
 
-    The axis follows gravity through the middle of the tumour, or of the organ where there is none; the image is
-    taken along the organ's long axis.
+    The direction is gravity's, through the centre of mass of the tumour, or else of the organ; the image plane contains the
+    organ's long axis.
     """
     direction = np.array(press.direction or gravity, float)
     middle = (anatomy.tumour or anatomy.organ).center_mass
     long_axis = np.linalg.svd(
         anatomy.organ.vertices - anatomy.organ.vertices.mean(axis=0), full_matrices=False
     )[2][0]
-    # The sign of a principal axis is arbitrary; the head, or the patient's left, is to the marked side.
+    # The sign of a principal axis is arbitrary: its largest component is made positive.
     long_axis *= np.sign(long_axis[np.argmax(np.abs(long_axis))])
     return press.model_copy(
         update={
@@ -119,7 +119,7 @@ def _grid(folder: Path, name: str) -> Grid:
 
 
 def _labels(folder: Path, anatomy: AnatomyFiles) -> Grid | None:
-    """The label map, on the CT's grid."""
+    """The label map. Raises SceneError where it is on another grid than the CT."""
     if anatomy.labels is None or anatomy.ct is None:
         return None
     labels, ct = _grid(folder, anatomy.labels), _grid(folder, anatomy.ct)
@@ -127,7 +127,7 @@ def _labels(folder: Path, anatomy: AnatomyFiles) -> Grid | None:
         labels.index_from_mm, ct.index_from_mm, atol=1e-3
     ):
         raise SceneError(
-            f"{folder / anatomy.labels}: is on another grid than {anatomy.ct}; expected the same"
+            f"{folder / anatomy.labels}: is on another voxel grid than {anatomy.ct}; expected the same grid"
         )
     return labels
 
@@ -143,6 +143,6 @@ def _shape(
     axes = grid.index_from_mm[:3, :3]
     if not np.allclose(axes, np.diag(np.diag(axes))) or (np.diag(axes) <= 0).any():
         raise SceneError(
-            f"{folder / shape.file}: its axes are not the patient's; expected the identity direction"
+            f"{folder / shape.file}: its axes are not the patient's; expected the identity as direction"
         )
     return grid

@@ -10,7 +10,7 @@ from trimesh.exchange.stl import export_stl
 from errors import PatientError
 from scenes.atomic_files import atomic_write
 
-# What 3D Slicer looks for in an STL's header and in a PLY's comments.
+# The coordinate system, as 3D Slicer reads it from an STL's header and a PLY's comments.
 SPACE = b"SPACE=LPS"
 STL_HEADER_BYTES = 80
 
@@ -31,7 +31,7 @@ def load_surface(path: Path) -> trimesh.Trimesh:
         or not np.isfinite(surface.vertices).all()
     ):
         raise PatientError(
-            f"{path}: holds no triangles, or some that are no numbers; expected a closed surface in mm, LPS"
+            f"{path}: holds no triangles, or coordinates that are not finite; expected a closed surface in mm, LPS"
         )
     if not surface.is_watertight or surface.volume <= 0:
         raise PatientError(
@@ -41,9 +41,9 @@ def load_surface(path: Path) -> trimesh.Trimesh:
 
 
 def save_surface(surface: trimesh.Trimesh, path: Path) -> None:
-    """Write vertices and triangles [mm, LPS] as binary STL or PLY, as the suffix says, and nothing else that is known of them.
+    """Write vertices and triangles [mm, LPS] as binary STL or PLY, by the suffix, without any metadata.
 
-    Coordinates are float32 there. A PLY keeps the order of the vertices, an STL has none. Raises OSError.
+    Coordinates are float32. A PLY keeps the order of the vertices. Raises OSError.
     """
     bare = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     with atomic_write(path) as partial:
@@ -64,7 +64,7 @@ FORMATS = tuple(WRITERS)
 
 
 def translated(mesh: trimesh.Trimesh, by_mm: np.ndarray) -> trimesh.Trimesh:
-    """A surface moved by (3,) [mm], its vertices and faces in the order that they had."""
+    """The surface translated by (3,) [mm], with the same order of vertices and faces."""
     return trimesh.Trimesh(mesh.vertices + by_mm, mesh.faces, process=False)
 
 

@@ -1,4 +1,4 @@
-"""How far it is: a bar or a line for the terminal, or nothing."""
+"""Terminal output: progress bars, the current step of a long task, command lines to paste."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from typing import Protocol, TypeVar
 from tqdm import tqdm
 
 Thing = TypeVar("Thing")
-# Is told what is being made.
+# Called with a message when the next step of a task begins.
 ReportProgress = Callable[[str], None]
 REFRESH_S = 0.5
 
 
 class Progress(Protocol):
-    """Hands things on, one by one, and shows how far it is."""
+    """Iterates over things and shows the progress under a title."""
 
-    def __call__(self, things: Iterable[Thing], what: str) -> Iterable[Thing]: ...
+    def __call__(self, things: Iterable[Thing], title: str) -> Iterable[Thing]: ...
 
 
-def silent(things: Iterable[Thing], what: str) -> Iterable[Thing]:
-    """No bar."""
+def silent(things: Iterable[Thing], title: str) -> Iterable[Thing]:
+    """Iterate without a progress bar."""
     return things
 
 
-def bar(things: Iterable[Thing], what: str) -> Iterable[Thing]:
-    """A bar on the terminal's error stream; none where that is no terminal."""
-    return tqdm(things, desc=f"{what:10}", leave=False, disable=None)
+def bar(things: Iterable[Thing], title: str) -> Iterable[Thing]:
+    """Iterate with a progress bar on stderr, if stderr is a terminal."""
+    return tqdm(things, desc=f"{title:10}", leave=False, disable=None)
 
 
-def no_progress(what: str) -> None:
-    """No line."""
+def no_progress(message: str) -> None:
+    """Ignore the message."""
 
 
 class Stages:
-    """A line on the terminal's error stream that says what is being made, and for how long; none where that is no terminal."""
+    """Show the current message and the elapsed time in one line on stderr, if stderr is a terminal."""
 
     def __init__(self) -> None:
         self._bar = tqdm(bar_format="{desc} ({elapsed})", leave=False, disable=None)
@@ -61,6 +61,6 @@ class Stages:
 
 
 def shell_command(*words: str | PurePath) -> str:
-    """A command line of app.py with these words, quoted where this system's shell needs it."""
+    """A command line of app.py with these words, quoted for this system's shell."""
     line = ["python", "app.py", *map(str, words)]
     return subprocess.list2cmdline(line) if sys.platform == "win32" else shlex.join(line)

@@ -6,8 +6,8 @@ import click
 import trimesh
 
 from scenes.anatomy import LoadedAnatomy, files_of, load_anatomy
+from scenes.atomic_files import check_folder, new_folder
 from scenes.patients.part_surfaces import PARTS
-from scenes.patients.patient_folder import check_folder, new_folder
 from scenes.scene import Scene, load_scene, scene_file
 from scenes.surfaces import FORMATS, save_surface
 from scenes.volumes.volume_files import file_volume, save_image

@@ -6,7 +6,8 @@ import click
 import numpy as np
 
 from errors import PatientError
-from scenes.patients.patient_folder import check_folder, save_patient
+from scenes.atomic_files import check_folder
+from scenes.patients.patient_folder import save_patient
 from scenes.patients.readers.segment_names import Side
 from scenes.scene import scene_text
 from scenes.terminal import bar, shell_command

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import glob
 import re
-import shutil
 import zlib
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection
 from functools import cache
 from pathlib import Path
 
 import SimpleITK as sitk
 
 from errors import PatientError
-from scenes.atomic_files import atomic_write, check_writable
+from scenes.atomic_files import new_folder
 from scenes.patients.part_surfaces import PARTS
 from scenes.patients.patient_import import Patient
 from scenes.scene import AnatomyFiles, Scene, scene_text
@@ -57,35 +54,6 @@ def save_patient(
         if draw is not None:
             draw(partial)
         return _searched(partial, private)
-
-
-@contextmanager
-def new_folder(folder: Path) -> Iterator[Path]:
-    """A place to write a folder's files to; they appear together, once all are there. Raises PatientError."""
-    check_folder(folder)
-    for left in folder.parent.glob(f".*.partial-{glob.escape(folder.name)}"):  # of a run that was killed
-        shutil.rmtree(left, ignore_errors=True)
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(folder) as partial:
-            partial.mkdir()
-            yield partial
-    except OSError as error:
-        raise PatientError(f"{folder}: {error.strerror}; choose a folder that can be written") from error
-
-
-def check_folder(folder: Path) -> None:
-    """Refuse a folder that cannot become a patient's, before the work. Raises PatientError."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise PatientError(f"{folder}: exists and is not an empty folder; choose another folder or remove it")
-    # Its files are written beside it, and then take its place.
-    above = next(path for path in folder.absolute().parents if path.exists())
-    try:
-        check_writable(above)
-    except OSError as error:
-        raise PatientError(
-            f"{folder}: cannot be made in {above} ({error.strerror}); choose a folder that can be written"
-        ) from None
 
 
 def _write(patient: Patient, folder: Path, texts: dict[str, str]) -> None:

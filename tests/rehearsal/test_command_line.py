@@ -8,7 +8,7 @@ import pytest
 from errors import PatientError
 from rehearsal.commands.command_line import CommandError, load_patient, make_folder, save_figures
 from rehearsal.commands.plan_command import following
-from scenes.patients.patient_folder import check_folder
+from scenes.atomic_files import check_folder
 from scenes.scene import EMBEDDED
 from scenes.terminal import shell_command
 
