@@ -1,4 +1,4 @@
-"""A volume that is known by its header, and read where it is needed."""
+"""A volume whose header is known and whose voxels are read on demand, and checks of headers and voxels."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from scenes.volumes.voxel_grid import Box, VoxelGrid
 AIR_HU = -1000
 PADDING_BELOW_HU = -1024
 LEAST_HU, MOST_HU = -32768, 32767
-# What a voxel takes until its organ is cropped: 4.8 bytes, measured on a label map and its CT.
+# Memory per voxel until the CT is cropped: 4.8 bytes were measured on a label map and its CT.
 VOXEL_BYTES = 5
 MOST_BYTES = 8 * 2**30
-# Deflate cannot pack tighter.
-MOST_PACKED = 1040
+# The highest compression ratio of deflate.
+MOST_COMPRESSION = 1040
 
 
 @dataclass(frozen=True)
 class LazyVolume:
-    """A scalar volume in the patient, on a disk or in memory."""
+    """A scalar volume in patient coordinates, on disk or in memory."""
 
     name: str  # for errors: the file or folder
     grid: VoxelGrid
     read_box: Callable[[Box], np.ndarray]  # voxels (z, y, x) of a box
-    notes: tuple[str, ...] = ()  # what was chosen, left out or resampled, for the user
-    frame_of_reference: str = ""  # DICOM's uid, where there is one
-    identifiers: frozenset[str] = frozenset()  # what of the source no file of ours may hold
+    notes: tuple[str, ...] = ()  # for the user: what was chosen, left out or resampled
+    frame_of_reference: str = ""  # DICOM's UID, where there is one
+    identifiers: frozenset[str] = frozenset()  # of the patient (PHI); no written file may contain them
 
     @classmethod
     def of(cls, image: sitk.Image, name: str = "the image") -> LazyVolume:
-        """A volume that is in memory already."""
+        """A volume in memory."""
         # A view does not keep its image alive.
         return cls(
             name,
@@ -45,8 +45,8 @@ class LazyVolume:
         )
 
     def read(self, box: Box | None = None) -> np.ndarray:
-        """Voxels (z, y, x) of a box, all of them without one. Raises PatientError: they are too many, or one is no number."""
-        box = box or self.grid.whole()
+        """Voxels (z, y, x) of a box, or all. Raises PatientError: more than fit in memory, or not finite."""
+        box = box or self.grid.full_box()
         self._check_memory(box)
         voxels = self.read_box(box)
         if voxels.dtype.kind == "f":
@@ -67,7 +67,7 @@ class LazyVolume:
             )
 
     def hounsfield(self, box: Box | None = None) -> np.ndarray:
-        """HU (z, y, x) of a box as int16; what lies around the field of view is air."""
+        """HU (z, y, x) of a box as int16; padding outside the field of view becomes air."""
         voxels = self.read(box)
         if voxels.dtype != np.int16:
             voxels = np.clip(np.rint(voxels), LEAST_HU, MOST_HU).astype(np.int16)
@@ -76,13 +76,13 @@ class LazyVolume:
 
     def image(self, box: Box | None = None) -> sitk.Image:
         """The voxels of a box as an image, without metadata."""
-        return self.grid.part(box or self.grid.whole()).image(self.read(box))
+        return self.grid.part(box or self.grid.full_box()).image(self.read(box))
 
 
-def check_size(path: Path, grid: VoxelGrid, voxel_bytes: int, held_bytes: int, packed: bool) -> None:
-    """Refuse a header that claims more than the file can hold, or than the memory should. Raises PatientError."""
+def check_size(path: Path, grid: VoxelGrid, voxel_bytes: int, held_bytes: int, compressed: bool) -> None:
+    """Check the size that a header claims against the file's and against 8 GiB. Raises PatientError."""
     claimed = float(np.prod(np.array(grid.size, float))) * voxel_bytes
-    if claimed > min(held_bytes * (MOST_PACKED if packed else 1), MOST_BYTES):
+    if claimed > min(held_bytes * (MOST_COMPRESSION if compressed else 1), MOST_BYTES):
         size = " x ".join(map(str, grid.size))
         raise PatientError(
             f"{path}: its header claims {size} voxels, more than the file can hold; copy or export it again"
@@ -90,16 +90,16 @@ def check_size(path: Path, grid: VoxelGrid, voxel_bytes: int, held_bytes: int, p
 
 
 def not_3d(path: Path, shape: tuple[int, ...]) -> PatientError:
-    """The refusal of an image that is no volume."""
+    """The error for an image that is not a volume."""
     size = " x ".join(map(str, shape))
     return PatientError(f"{path}: the image has {size} voxels; expected one 3D volume; export one volume")
 
 
 def no_scalar(path: Path, kind: object) -> PatientError:
-    """The refusal of an image whose voxels are colours, vectors or complex."""
+    """The error for voxels that are colours, vectors or complex numbers."""
     return PatientError(f"{path}: each voxel holds a {kind}; expected one number; export a scalar volume")
 
 
 def cut_off(path: Path) -> PatientError:
-    """The refusal of a file that ends too early."""
+    """The error for a truncated file."""
     return PatientError(f"{path}: cannot be read to its end; expected a whole file; copy or export it again")

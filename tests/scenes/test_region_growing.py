@@ -164,7 +164,7 @@ def test_phantom():
     """Cortex and medulla are grown from; the tumour, the sinus and its fat are of the organ and may be missed."""
     folder, files = files_of(load_scene(EMBEDDED), EMBEDDED.parent)
     ct, labels = (file_volume(folder / name) for name in (files.ct, files.labels))
-    tissue = labels.read(labels.grid.whole())
+    tissue = labels.read(labels.grid.full_box())
     firm = [int(code) for code, name in files.tissues.items() if name in ("cortex", "medulla")]
     (seed,) = seeds_in(ct.grid, np.isin(tissue, firm), count=1, deep_mm=3.0)
     assert dice(placed(draft_segmentation(ct, seed), ct.grid), tissue > 0) > 0.9

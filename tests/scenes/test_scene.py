@@ -77,7 +77,7 @@ def refused(tmp_path: Path, text: str) -> str:
             "[anatomy]\n[[shape]]\nkind = 'plane'\nnormal = [0, 0, 1]\noffset_cm = 1",
             "shape.0.offset_cm: unknown key; the unit is in the key: write offset_mm",
         ),
-        ("[anatomy]\n[attachment]\nradius_mm = 5", "a.toml: attachment.radius_mm needs a place"),
+        ("[anatomy]\n[attachment]\nradius_mm = 5", "a.toml: attachment.radius_mm needs a position"),
         ("[anatomy]\n[[shape]]\nkind = 'ball'", "'plane', 'mesh', 'sdf'"),
         ("[anatomy]\n[organs]\n", "organs: unknown key"),
         ("[anatomy\n", "; expected a scene file (TOML) or a patient's folder"),
@@ -93,7 +93,7 @@ def test_missing_and_unreadable_files_are_named(tmp_path):
     with pytest.raises(SceneError, match="no such scene file"):
         load_scene(tmp_path / "none.toml")
     (tmp_path / "b.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(SceneError, match="is no text; expected a scene file"):
+    with pytest.raises(SceneError, match="is not a text file; expected a scene file"):
         load_scene(tmp_path / "b.toml")
     with pytest.raises(SceneError, match="cannot be read"):
         load_scene(tmp_path)

@@ -97,4 +97,4 @@ def _tilted(item: SourceFile, segmentation: hd.seg.Segmentation, number: int) ->
         if one is not None and frame.ReferencedSegmentNumber == number
     ]
     stack = stack_slices(item.name, own)
-    return stack.grid, stack.read(stack.grid.whole()) >= HALF * FULL_HU
+    return stack.grid, stack.read(stack.grid.full_box()) >= HALF * FULL_HU

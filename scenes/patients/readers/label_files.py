@@ -166,7 +166,7 @@ def _one_an_organ(
         volume = file_volume(file)
         identifiers |= volume.identifiers
         is_kidney = tissue_of(_stem(file)) == "kidney"
-        box = volume.grid.whole()
+        box = volume.grid.full_box()
         if around is not None and not is_kidney:
             box = volume.grid.box_around(around[0], around[1])
         one = _organ(file, volume, box)
