@@ -1,4 +1,4 @@
-"""From paths and the user's words to a patient: finds CT and labels, puts them together, remembers what is private."""
+"""Carry out an import request: find CT and labels, combine them, collect the patient's identifiers (PHI)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from scenes.volumes.lazy_volume import LazyVolume
 
 @dataclass(frozen=True)
 class ImportRequest:
-    """What the user asked for: paths, and words on labels, by names or values."""
+    """The user's request: paths, and labels by names or values."""
 
     ct: Path
     labels: Sequence[Path] = ()
@@ -35,21 +35,21 @@ class ImportRequest:
 
 
 def import_request(request: ImportRequest, progress: Progress = silent) -> tuple[Patient, set[str]]:
-    """Import a patient, and what of its source none of its files may hold. Raises PatientError."""
+    """The imported patient, and the identifiers that none of its files may contain. Raises PatientError."""
     if not request.ct.exists():
         raise PatientError(f"{request.ct}: no such file or folder; check the path")
     if request.seed_mm is not None:
         if request.labels or request.organ or request.tissues:
             raise PatientError(
-                "--seed grows the organ where there are no labels: give it, or labels, not both"
+                "--seed segments the organ where there are no labels: give it, or labels, not both"
             )
-        drawings: list[Segmentation] = []
+        segmentations: list[Segmentation] = []
         volume = open_ct(request.ct, request.series, progress=progress)
         labels = draft_segmentation(volume, request.seed_mm)
         notes: tuple[str, ...] = ()
     else:
-        volume, drawings, labels = with_labels(request, progress)
-        notes = tuple(note for drawing in drawings for note in drawing.notes)
+        volume, segmentations, labels = with_labels(request, progress)
+        notes = tuple(note for segmentation in segmentations for note in segmentation.notes)
     organ = labels.called(request.organ) if request.organ else None
     patient = import_patient(
         volume,
@@ -60,42 +60,44 @@ def import_request(request: ImportRequest, progress: Progress = silent) -> tuple
         needed=set(request.tissues),
         progress=progress,
     )
-    private = set(volume.identifiers).union(*(drawing.identifiers for drawing in drawings))
+    identifiers = set(volume.identifiers).union(*(segmentation.identifiers for segmentation in segmentations))
     is_draft = request.seed_mm is not None
-    return replace(patient, notes=(*patient.notes, *notes), draft=is_draft), private | _paths(request)
+    return replace(patient, notes=(*patient.notes, *notes), draft=is_draft), identifiers | _paths(request)
 
 
 def with_labels(
     request: ImportRequest, progress: Progress
 ) -> tuple[LazyVolume, list[Segmentation], LabelMap]:
-    """A CT, the labels found for it, and one map of them all with the user's words on it. Raises PatientError."""
+    """The CT, its segmentations, and one label map of all with the tissues that the user assigned. Raises PatientError."""
     words = [*request.organ, *(word for several in request.tissues.values() for word in several)]
-    drawings = [open_labels(path, words, progress) for path in request.labels]
-    drawings = drawings or [_beside(request.ct, progress)]
-    referenced = next((drawing.referenced for drawing in drawings if drawing.referenced), "")
+    segmentations = [open_labels(path, words, progress) for path in request.labels]
+    segmentations = segmentations or [_beside(request.ct, progress)]
+    referenced = next(
+        (segmentation.referenced for segmentation in segmentations if segmentation.referenced), ""
+    )
     volume = open_ct(request.ct, request.series, referenced, progress)
-    for drawing in drawings:
-        frames = {drawing.frame_of_reference, volume.frame_of_reference} - {""}
+    for segmentation in segmentations:
+        frames = {segmentation.frame_of_reference, volume.frame_of_reference} - {""}
         if len(frames) > 1:
             raise PatientError(
-                f"{request.ct}: the labels were drawn in another frame of reference than this series; expected the CT that they "
+                f"{request.ct}: the labels have another frame of reference than this series; expected the CT that they "
                 "were drawn on; choose it with --series, or give its folder"
             )
-    maps = [one for drawing in drawings for one in drawing.maps(volume.grid)]
-    return volume, drawings, merge_label_maps(assign_tissues(maps, request.organ, request.tissues))
+    maps = [one for segmentation in segmentations for one in segmentation.maps(volume.grid)]
+    return volume, segmentations, merge_label_maps(assign_tissues(maps, request.organ, request.tissues))
 
 
 def _beside(ct: Path, progress: Progress) -> Segmentation:
-    """The labels that lie with a CT."""
+    """The segmentation in a CT's folder."""
     found = segmentation_of(read_dicom_headers(ct, progress)) if ct.is_dir() else None
     if found is None:
         raise PatientError(
-            f"{ct}: no labels lie with this CT; give a file or folder with LABELS, or --seed X,Y,Z for a draft"
+            f"{ct}: no labels are with this CT; give a file or folder with LABELS, or --seed X,Y,Z for a draft"
         )
     return found
 
 
 def _paths(request: ImportRequest) -> set[str]:
-    """The paths of the source, as they are and as they were given."""
+    """The paths of the source, absolute and as given."""
     given = [request.ct, *request.labels]
     return {str(path.resolve()) for path in given} | {str(path) for path in given if len(path.parts) > 1}

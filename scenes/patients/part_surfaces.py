@@ -1,4 +1,4 @@
-"""Surfaces of an organ and of what is told apart in it: tumours, cysts, vessels, collecting system."""
+"""Surfaces of an organ and of its parts: tumours, cysts, vessels, collecting system."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ from scenes.patients.readers.label_maps import Colour, LabelMap
 from scenes.terminal import Progress
 from scenes.volumes.voxel_grid import VoxelGrid
 
-# Vessels and the collecting system are modelled as far as this from the organ: its pedicle.
+# Vessels and the collecting system are modelled up to this distance from the organ: its pedicle.
 PEDICLE_MM = 15.0
-# Faces of a surface grow with its area, so that a tumour is meshed as finely as a kidney of this area; what branches, finer.
+# The number of faces is proportional to the area: a tumour is meshed as finely as a kidney of this area; branching parts, finer.
 FACES, FACES_AT_MM2 = 5000, 17000.0
 LEAST_FACES = 500
 BRANCHING = 3.0
-# Of the label's area, which is all steps.
+# Smooth area per area of voxel faces.
 SMOOTH_AREA = 2 / 3
-# Surfaces of less area than this are made before a process for them is there.
-ASIDE_FROM_MM2 = 5000.0
-# What has a surface of its own: tissue -> file.
+# Surfaces of less area than this are made sooner than a process starts.
+PROCESSES_FROM_MM2 = 5000.0
+# Parts with a surface: tissue -> file name.
 PARTS = {"tumour": "tumour", "cyst": "cyst", "urine": "collecting-system", "vessel": "vessels"}
-# Where parts are: tissue -> grid and which of its voxels.
+# Tissue -> grid and mask (z, y, x).
 PartMasks: TypeAlias = dict[str, tuple[VoxelGrid, np.ndarray]]
 
 
 def organ_surface(piece: Organ) -> trimesh.Trimesh:
-    """Surface of the organ with all that grows on it. Raises PatientError."""
+    """Surface of the organ with its tumours and cysts. Raises PatientError."""
     return _surface(piece.grid.image(piece.mask.astype(np.uint8)), "organ", FACES)
 
 
 def part_masks(labels: LabelMap, piece: Organ, needed: Collection[str]) -> PartMasks:
-    """What is told apart in the organ, and its vessels and collecting system near it. Raises PatientError where a needed
-    tissue is not there.
+    """Masks of the parts in the organ, and of vessels and collecting system near it. Raises PatientError where a needed one is
+    missing.
     """
     found = {}
     for tissue in PARTS:
@@ -68,37 +68,40 @@ def part_masks(labels: LabelMap, piece: Organ, needed: Collection[str]) -> PartM
 def part_surfaces_in_processes(
     found: PartMasks,
 ) -> Iterator[Callable[[Progress], dict[str, trimesh.Trimesh]]]:
-    """Starts on the surfaces of parts, in processes of their own where that is worth it, and gives what waits for them:
-    surfaces of all parts that have one. Raises PatientError where what the user must see has none.
+    """Start to make the surfaces of all parts, in processes where they are large; yield a function that waits for them.
+
+    Raises PatientError where a tumour or cyst has no surface.
     """
     jobs = min(cpu_count(), len(found))
-    if jobs < 2 or sum(_area_mm2(*part) for part in found.values()) < ASIDE_FROM_MM2:
-        yield lambda progress: _there((t, part_surface(*found[t], t)) for t in progress(found, "surfaces"))
+    if jobs < 2 or sum(_area_mm2(*part) for part in found.values()) < PROCESSES_FROM_MM2:
+        yield lambda progress: _without_empty(
+            (t, part_surface(*found[t], t)) for t in progress(found, "surfaces")
+        )
         return
     with ProcessPoolExecutor(jobs) as pool:
-        # The last ones take longest.
+        # The last parts take longest.
         made = {tissue: pool.submit(part_surface, *found[tissue], tissue) for tissue in reversed(found)}
         try:
-            yield lambda progress: _there((t, made[t].result()) for t in progress(found, "surfaces"))
+            yield lambda progress: _without_empty((t, made[t].result()) for t in progress(found, "surfaces"))
         except BrokenExecutor:
             raise PatientError(
-                "a process that made surfaces was ended, perhaps for want of memory; close other programs and try again"
+                "a process that made surfaces was ended, perhaps for lack of memory; close other programs and try again"
             ) from None
 
 
-def _there(made: Iterable[tuple[str, trimesh.Trimesh | None]]) -> dict[str, trimesh.Trimesh]:
+def _without_empty(made: Iterable[tuple[str, trimesh.Trimesh | None]]) -> dict[str, trimesh.Trimesh]:
     return {tissue: surface for tissue, surface in made if surface is not None}
 
 
 def colours_of_labels(labels: LabelMap, tissues: Sequence[str]) -> dict[str, Colour]:
-    """What their files draw the organ and its parts in."""
+    """Colours of the organ and its parts in the label files."""
     found = {s.tissue: s.colour for s in reversed(labels.segments.values()) if s.tissue and s.colour}
     named = {"organ": found.get("kidney"), **{tissue: found.get(tissue) for tissue in tissues}}
     return {name: colour for name, colour in named.items() if colour}
 
 
 def near_organ(labels: LabelMap, piece: Organ, values: list[int]) -> tuple[VoxelGrid, np.ndarray]:
-    """Where labels lie within PEDICLE_MM of the organ."""
+    """Grid and mask (z, y, x) of labels within PEDICLE_MM of the organ."""
     start = np.rint(labels.grid.index(piece.grid.origin)).astype(int)
     rim = np.ceil(PEDICLE_MM / labels.grid.spacing).astype(int)
     low = np.maximum(start - rim, 0)
@@ -121,7 +124,7 @@ def _surface(mask: sitk.Image, name: str, faces: int) -> trimesh.Trimesh:
 
 
 def part_surface(grid: VoxelGrid, inside: np.ndarray, tissue: str) -> trimesh.Trimesh | None:
-    """Surface of a part; its several bodies are bodies of one mesh, specks are left out. None: too thin, and not needed."""
+    """Surface of a part: all its bodies but specks in one mesh. None where a part other than a lesion is too thin."""
     labelled, _ = ndimage.label(inside)
     sizes = np.bincount(labelled.ravel())[1:]
     finer = BRANCHING if tissue in HILAR else 1.0
@@ -146,7 +149,7 @@ def volume_ml(grid: VoxelGrid, inside: np.ndarray) -> float:
 
 
 def _area_mm2(grid: VoxelGrid, inside: np.ndarray) -> float:
-    """Area of a label's surface, about."""
+    """Approximate area of a label's surface."""
     padded = np.pad(inside, 1)
     steps = [int((np.diff(padded.view(np.int8), axis=axis) != 0).sum()) for axis in range(3)]
     faces_mm2 = (np.prod(grid.spacing) / grid.spacing)[::-1]

@@ -11,19 +11,16 @@ from scenes.patients.readers.segment_names import Side
 from scenes.scene import AnatomyFiles, Attachment, Image, MeshShape, Scene
 
 FAT_HU = -110.0
-LEAST_WINDOW_HU = 310.0  # to 200 HU, or an unenhanced kidney is white
+LEAST_WINDOW_HU = 310.0  # up to 200 HU at least, or an unenhanced kidney is white
 
-# The hollow's floor is taken over this distance around its deepest place.
+# The hilum is the mean of the vertices within this distance of the deepest one.
 FLOOR_MM = 8.0
-# How squarely a place must face the midline to be of the hilum.
+# Least medial component of the normal at the hilum.
 LEAST_MEDIAL = 0.3
 
 
 def hilum(organ: trimesh.Trimesh, side: Side) -> tuple[float, float, float]:
-    """The middle of the hilum [mm], LPS, of a kidney's surface.
-
-    The medial vertex farthest under the surface's convex hull; vessels reach a kidney from the midline.
-    """
+    """Centre of the hilum, LPS [mm]: around the medial vertex that is deepest below the surface's convex hull."""
     medial = np.array([-1.0 if side == "left" else 1.0, 0.0, 0.0])
     hull = organ.convex_hull
     normals, offsets = hull.face_normals, (hull.face_normals * hull.triangles[:, 0]).sum(axis=1)
@@ -38,11 +35,11 @@ def hilum(organ: trimesh.Trimesh, side: Side) -> tuple[float, float, float]:
 
 
 def patient_scene(patient: Patient) -> Scene:
-    """The scene that an import writes beside the patient's files: on the back, on the moulded support."""
+    """The scene that an import writes into the patient's folder: supine, on its support."""
     tumour = None if patient.tumour is None else "tumour.stl"
     own = [code for code, tissue in patient.tissues.items() if tissue in (*PARENCHYMA, *LESIONS)]
     hu = sitk.GetArrayViewFromImage(patient.ct)[np.isin(sitk.GetArrayViewFromImage(patient.labels), own)]
-    # From fat to the brightest of the organ, whatever contrast agent it holds.
+    # From fat to the organ's 99th percentile, with any contrast agent.
     darkest = FAT_HU
     brightest = max(round(float(np.percentile(hu, 99)), -1), darkest + LEAST_WINDOW_HU)
     return Scene(

@@ -9,9 +9,9 @@ from synthetic_body import LEFT, TUMOUR, body, points_of, with_voxels
 
 from scenes.patients.check_picture import (
     COLOUR,
+    OVERVIEW,
     PIXEL_MM,
     VIEWS,
-    WHOLE,
     colours_of,
     draw_check,
     is_wider,
@@ -33,7 +33,7 @@ def patient():
     return import_patient(LazyVolume.of(ct), LabelMap.of(labels, NAMES), side="left", margin_mm=30.0)
 
 
-@pytest.mark.parametrize("view", [*VIEWS, WHOLE], ids=lambda view: view.name)
+@pytest.mark.parametrize("view", [*VIEWS, OVERVIEW], ids=lambda view: view.name)
 def test_letters_are_those_of_the_axes(view):
     right, down = np.array(view.right), np.array(view.down)
     assert view.letters == tuple(LETTER[tuple(axis)] for axis in (-right, right, -down, down))

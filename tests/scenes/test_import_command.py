@@ -11,7 +11,7 @@ from synthetic_body import BODY, DIRECTIONS, LEFT, RIGHT, TUMOUR, coarsely, leve
 from app import main
 from errors import PatientError
 from scenes.anatomy import load_anatomy
-from scenes.patients.import_command import place_mm
+from scenes.patients.import_command import position_mm
 from scenes.patients.import_request import ImportRequest, import_request, with_labels
 from scenes.patients.patient_folder import is_identifying, save_patient
 from scenes.patients.readers.ct_files import open_ct
@@ -207,7 +207,7 @@ def test_the_folder_is_checked_before_the_work(tmp_path, capfd):
 @pytest.mark.parametrize("text", ["", "1,2", "1,2,3,4", "a,b,c", "1,2,nan"])
 def test_a_seed_is_three_numbers(text):
     with pytest.raises(PatientError, match="three numbers X,Y,Z"):
-        place_mm(text)
+        position_mm(text)
 
 
 def test_a_seed_or_labels(tmp_path):

@@ -21,7 +21,7 @@ def ball(at: tuple[float, float, float], radius_mm: float) -> np.ndarray:
 
 
 def made(monkeypatch, found, aside: bool):
-    monkeypatch.setattr(part_surfaces, "ASIDE_FROM_MM2", 0.0 if aside else np.inf)
+    monkeypatch.setattr(part_surfaces, "PROCESSES_FROM_MM2", 0.0 if aside else np.inf)
     monkeypatch.setattr(part_surfaces, "cpu_count", lambda: 2)
     with part_surfaces_in_processes(found) as surfaces:
         return surfaces(silent)

@@ -81,7 +81,7 @@ def refused(tmp_path: Path, text: str) -> str:
         ("[anatomy]\n[[shape]]\nkind = 'ball'", "'plane', 'mesh', 'sdf'"),
         ("[anatomy]\n[organs]\n", "organs: unknown key"),
         ("[anatomy\n", "; expected a scene file (TOML) or a patient's folder"),
-        ("[anatomy]\nphantom = true\nct = 'ct.nrrd'", "which has files of its own"),
+        ("[anatomy]\nphantom = true\nct = 'ct.nrrd'", "which has its own files"),
         ("[anatomy]\n[press]\nindentations_mm = [300.0]", "less than or equal to 40"),
     ],
 )
@@ -188,7 +188,7 @@ def test_an_oblique_distance_field_is_refused(tmp_path):
     image.SetDirection((-1, 0, 0, 0, -1, 0, 0, 0, 1))
     sitk.WriteImage(image, str(tmp_path / "bed.nrrd"))
     scene = with_ball(tmp_path, shape=({"kind": "sdf", "file": "bed.nrrd"},))
-    with pytest.raises(SceneError, match="bed.nrrd.*identity direction"):
+    with pytest.raises(SceneError, match="bed.nrrd.*identity as direction"):
         load_anatomy(scene, tmp_path)
 
 
@@ -217,7 +217,7 @@ def test_the_embedded_patient_is_made_once():
         ("a.PNG", "is a picture; expected a scene file"),
         ("ct.nii.gz", "app.py import"),
         ("sweep-001.igs.mha", "a tracked sweep: app.py reconstruct"),
-        ("session-001.jsonl", "a session: rehearse --replay takes it"),
+        ("session-001.jsonl", "a session: give it to rehearse --replay"),
         ("plan.json", "rehearse --plan"),
     ],
 )
