@@ -50,7 +50,7 @@ def import_request(request: ImportRequest, progress: Progress = silent) -> tuple
     else:
         volume, segmentations, labels = with_labels(request, progress)
         notes = tuple(note for segmentation in segmentations for note in segmentation.notes)
-    organ = labels.called(request.organ) if request.organ else None
+    organ = labels.values_of(request.organ) if request.organ else None
     patient = import_patient(
         volume,
         labels,

@@ -66,7 +66,7 @@ def test_the_surface_lies_where_the_label_is(tmp_path_factory, ct_grid, label_gr
     label_map = merge_label_maps(assign_tissues(open_labels(folder / f"label{ending}").maps(None), ["1"], {}))
 
     patient = import_patient(
-        open_ct(folder / f"ct{ending}"), label_map, label_map.called(["1"]), margin_mm=5.0
+        open_ct(folder / f"ct{ending}"), label_map, label_map.values_of(["1"]), margin_mm=5.0
     )
 
     assert patient.side == side

@@ -1,4 +1,4 @@
-"""A CT from whatever a hospital sends: DICOM folders, DICOMDIR, zip archives, NIfTI, NRRD, MetaImage."""
+"""Read a CT: DICOM folders, DICOMDIR, zip archives, NIfTI, NRRD, MetaImage."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from scenes.volumes.volume_files import file_volume, is_volume_file
 def open_ct(
     path: Path, series: str | None = None, referenced: str = "", progress: Progress = silent
 ) -> LazyVolume:
-    """Find a CT and say where its voxels are; they are read when they are asked for.
+    """Find a CT and read its headers; voxels are read on demand.
 
     Args:
         path: a folder with DICOM files, in subfolders too; a DICOMDIR; a zip archive of DICOM files; an enhanced CT;
             a .nii, .nii.gz, .nrrd, .nhdr, .mha or .mhd file.
-        series: number or uid (or its end) of the series, where there are several.
-        referenced: uid of the series that labels were drawn on, which is the best guess.
+        series: number or UID (or its end) of one of several series.
+        referenced: UID of the series that the labels refer to, which is preferred.
 
     Raises:
-        PatientError: nothing readable, or nothing that is one whole, upright CT; a line for the user.
+        PatientError: not readable, or not one complete CT.
     """
     if not path.exists():
         raise PatientError(f"{path}: no such file or folder; check the path")
     if path.is_file() and is_volume_file(path):
         if series is not None:
-            raise PatientError(f"{path}: holds no series; leave --series out")
+            raise PatientError(f"{path}: has no series; leave --series out")
         return file_volume(path)
     return series_volume(path, read_dicom_headers(path, progress), series, referenced, progress)
