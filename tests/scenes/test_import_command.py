@@ -151,7 +151,7 @@ def test_labels_of_another_examination(hospital, tmp_path):
     other.write()
     with pytest.raises(PatientError, match="another frame of reference"):
         import_request(ImportRequest(tmp_path / "ct", [folder / "seg"]))
-    with pytest.raises(PatientError, match="no labels lie with this CT.*--seed"):
+    with pytest.raises(PatientError, match="no labels are with this CT.*--seed"):
         import_request(ImportRequest(tmp_path / "ct"))
 
 
@@ -163,7 +163,7 @@ class TestPrivate:
     @pytest.mark.parametrize("secret", ["Doe", "Doe^Jane", "19600229", "1.2.826.0.1.3680043.8.498.1", "Ünal"])
     def test_a_file_that_would_name_somebody_is_not_written(self, patient, tmp_path, secret):
         texts = {"scene.toml": f'title = "kidney of {secret}"\n'}
-        with pytest.raises(PatientError, match=r"scene\.toml would have held something") as caught:
+        with pytest.raises(PatientError, match=r"scene\.toml would have contained an identifier") as caught:
             save_patient(patient, tmp_path / "p", texts, private={secret, "Nobody"})
         assert secret not in str(caught.value) and list(tmp_path.iterdir()) == []
         assert save_patient(patient, tmp_path / "p", {"scene.toml": ""}, private={secret, "Nobody"}) == 2
@@ -173,7 +173,7 @@ class TestPrivate:
             organ = folder / "organ.stl"
             organ.write_bytes(b"solid of Doe".ljust(80) + organ.read_bytes()[80:])
 
-        with pytest.raises(PatientError, match=r"organ\.stl would have held"):
+        with pytest.raises(PatientError, match=r"organ\.stl would have contained"):
             save_patient(patient, tmp_path / "p", draw=draw, private={"Doe"})
         assert list(tmp_path.iterdir()) == []
 
@@ -276,7 +276,7 @@ class TestSearch:
         def draw(folder):
             (folder / "check.png").write_bytes(b"\0\1" + "Özgür Ünal".encode(encoding) + b"\2")
 
-        with pytest.raises(PatientError, match=r"check\.png would have held"):
+        with pytest.raises(PatientError, match=r"check\.png would have contained"):
             save_patient(taken_in[0], tmp_path / "p", draw=draw, private={"Özgür Ünal"})
 
     def test_packed_voxels_are_searched(self, taken_in, tmp_path):
@@ -284,7 +284,7 @@ class TestSearch:
             words = sitk.GetImageFromArray(np.frombuffer(b"\0\0of Doe^Jane\0", np.uint8).reshape(1, 1, -1))
             sitk.WriteImage(words, str(folder / "labels.nrrd"), useCompression=True)
 
-        with pytest.raises(PatientError, match=r"labels\.nrrd would have held"):
+        with pytest.raises(PatientError, match=r"labels\.nrrd would have contained"):
             save_patient(taken_in[0], tmp_path / "p", draw=draw, private={"Doe^Jane"})
 
     def test_a_word_within_another_names_nobody(self, taken_in, tmp_path):

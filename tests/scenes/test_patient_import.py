@@ -184,10 +184,10 @@ class TestImport:
         near = [slice(ct.TransformPhysicalPointToIndex((30.0, 0, 0))[0], None), slice(None), slice(None)]
         named = LabelMap.of(labels[near], {2: "kidney_left", 3: "kidney tumour"})
         assert import_patient(LazyVolume.of(ct[near]), named, margin_mm=10.0).side == "left"
-        with pytest.raises(PatientError, match="called by the other side's name"):
+        with pytest.raises(PatientError, match="has a name of the other side"):
             import_patient(LazyVolume.of(ct[near]), named, side="right", margin_mm=10.0)
         mirrored = LabelMap.of(labels, {1: "kidney_left", 2: "kidney_right", 3: "tumour"})
-        with pytest.raises(PatientError, match="lies on the patient's left, which its name denies"):
+        with pytest.raises(PatientError, match="is on the patient's left, but its name has the other side"):
             import_patient(LazyVolume.of(ct), mirrored, side="left", margin_mm=10.0)
         other = LabelMap.of(labels, {1: "liver", 2: "spleen", 3: "stomach"})
         with pytest.raises(PatientError, match="no label says that it is a kidney: 1 liver, 2 spleen"):
@@ -217,7 +217,7 @@ class TestImportRefuses:
         ct, labels = ct_and_labels
         with pytest.raises(PatientError, match="empty"):
             imported(ct, labels * 0)
-        with pytest.raises(PatientError, match="swapped"):
+        with pytest.raises(PatientError, match="exchanged"):
             imported(labels, ct)
         with pytest.raises(PatientError, match="whole numbers"):
             imported(ct, sitk.Cast(labels, sitk.sitkFloat32) * 0.3)
@@ -232,7 +232,7 @@ class TestImportRefuses:
             imported(ct, far)
         half = sitk.Image(labels)
         half.SetOrigin(np.add(labels.GetOrigin(), (0, 0, 80.0)).tolist())
-        with pytest.raises(PatientError, match=r"lies in the CT with \d\d% of its voxels"):
+        with pytest.raises(PatientError, match=r"has \d\d% of its voxels in the CT"):
             imported(ct, half, [2], "left")
 
     def test_organ_cut_off(self):
@@ -333,7 +333,7 @@ class TestCautions:
         ct, labels = ct_and_labels
         spine = np.array([0.0, 75.0, 0.0]), np.array([22.0, 18.0, 400.0])
         liver = np.array([-60.0, -40.0, 20.0]), np.array([40.0, 30.0, 50.0])
-        for sign, words in ((1, []), (-1, ["bones lie in front", "liver lies on the patient's left"])):
+        for sign, words in ((1, []), (-1, ["bones are in front", "liver is on the patient's left"])):
             voxels = sitk.GetArrayFromImage(ct)
             voxels[level(points_of(ct), (sign * spine[0], spine[1])) < 0] = 500
             marked = drawn(labels, (4, (liver[0] * [sign, 1, 1], liver[1])), (2, LEFT))
@@ -364,7 +364,7 @@ class TestCautions:
 
     def test_labels_without_a_meaning(self, ct_and_labels):
         (said,) = imported(*ct_and_labels, side="left", margin_mm=20.0).warnings
-        assert "labels 2, 3 say nothing, and were all taken as the kidney" in said
+        assert "labels 2, 3 have no names, and were all taken as the kidney" in said
         (said,) = imported(*ct_and_labels, organ=[2], margin_mm=20.0).warnings
         assert "were left out: 3 (5." in said and "--tumour" in said
 

@@ -183,7 +183,7 @@ class TestFiles:
         refused(tmp_path / f"a{ending}")
 
     def test_series_of_a_file(self, tmp_path, refused):
-        assert "holds no series" in refused(written(tmp_path / "a.mha"), series="3")
+        assert "has no series" in refused(written(tmp_path / "a.mha"), series="3")
 
     def test_components_count_too(self, tmp_path, refused):
         """Segments of 3D Slicer are components of a voxel; so many fit into no file of this size."""
@@ -314,13 +314,13 @@ class TestArchives:
         "name", ["../a.dcm", "a/../../a.dcm", "/etc/a.dcm", "C:\\a.dcm", "..\\a.dcm", "\\\\host\\a.dcm"]
     )
     def test_names_that_lead_outside(self, tmp_path, refused, slice_bytes, name):
-        assert "leads outside" in refused(
+        assert "with a path outside" in refused(
             archive(tmp_path / "a.zip", {"b.dcm": slice_bytes, name: slice_bytes})
         )
 
     def test_huge_entry(self, tmp_path, refused, slice_bytes):
         bomb = declared(archive(tmp_path / "a.zip", {"b.dcm": slice_bytes}), size=3 * 2**30)
-        assert "unpacks to 3 GiB" in refused(bomb)
+        assert "extracts to 3 GiB" in refused(bomb)
 
     def test_packed_entry(self, tmp_path, refused, slice_bytes):
         """Zeros behind a slice: a thousandth of the room that they take."""
@@ -362,8 +362,8 @@ class TestArchives:
     @pytest.mark.parametrize(
         ("name", "words"),
         [
-            (["..", "..", "x.dcm"], "lies outside"), ("/etc/passwd", "lies outside"), ("C:\\x.dcm", "lies outside"),
-            (["IM", "..", "..", "x"], "lies outside"), ("link.dcm", "lies outside"), (["IM", "1"], "not there"),
+            (["..", "..", "x.dcm"], "is outside"), ("/etc/passwd", "is outside"), ("C:\\x.dcm", "is outside"),
+            (["IM", "..", "..", "x"], "is outside"), ("link.dcm", "is outside"), (["IM", "1"], "is missing"),
             ("a\0b", ""), ("q" * 300, ""), ("a\nb", ""),
         ],
     )  # fmt: skip

@@ -148,7 +148,7 @@ class TestLabelMaps:
         ("voxels", "words"),
         [
             (np.full((4, 4, 4), 0.5, np.float32), "probability"), (np.zeros((4, 4, 4), np.uint8), "is empty"),
-            (np.full((4, 4, 4), -1000, np.int16), "swapped"), (np.full((4, 4, 4), 70_000, np.int32), "whole numbers"),
+            (np.full((4, 4, 4), -1000, np.int16), "exchanged"), (np.full((4, 4, 4), 70_000, np.int32), "whole numbers"),
             (np.full((4, 4, 4), np.nan, np.float32), "finite"),
         ],
     )  # fmt: skip
@@ -218,7 +218,7 @@ class TestLabelMaps:
         sitk.WriteImage(sitk.Image([8, 8, 8], sitk.sitkUInt8), str(tmp_path / "kidney_left.nii.gz"))
         assert "1 label files are empty" in refusal(tmp_path, read=open_labels)
         assert "no such file" in refusal(tmp_path / "absent", read=open_labels)
-        assert "holds no labels" in refusal(Series(tmp_path / "ct").write(), read=open_labels)
+        assert "has no labels" in refusal(Series(tmp_path / "ct").write(), read=open_labels)
 
 
 class TestSegmentations:
@@ -312,7 +312,7 @@ class TestContours:
         turned = Rotation.from_rotvec(0.9 * series.direction[:, 0]).as_matrix() @ series.direction
         path = write_structures(tmp_path / "rt.dcm", {"Kidney": [ring(KIDNEY[0], 5, turned)]})
         grid = open_ct(tmp_path / "ct").grid
-        assert "run across the slices" in refusal(path, read=lambda path: open_labels(path).maps(grid))
+        assert "cross the slices" in refusal(path, read=lambda path: open_labels(path).maps(grid))
 
     @pytest.mark.parametrize("kind", ["POINT", "OPEN_PLANAR"])
     def test_no_closed_contour(self, series, tmp_path, kind):

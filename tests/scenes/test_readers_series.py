@@ -69,7 +69,7 @@ class TestSeries:
 
     def test_no_word_on_hounsfield(self, tmp_path):
         volume = Series(tmp_path).write(RescaleIntercept=None, RescaleSlope=None)
-        assert any("the files do not say how" in note for note in read_ct(volume)[0].notes)
+        assert any("the files have no rescale" in note for note in read_ct(volume)[0].notes)
 
     def test_a_frames_own_values_count(self, tmp_path):
         """Not those that stand at the file's top, too."""
