@@ -1,7 +1,5 @@
 """Terminal output: progress bars, the current step of a long task, command lines to paste."""
 
-from __future__ import annotations
-
 import shlex
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Supports other than the mould: a bed made from the labels around the organ, or a surface file of the user."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The check image of an import: slices with outlines, the surfaces, orientation letters, the summary."""
 
-from __future__ import annotations
-
 import textwrap
 from dataclasses import dataclass
 from pathlib import Path

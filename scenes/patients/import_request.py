@@ -1,7 +1,5 @@
 """Carry out an import request: find CT and labels, combine them, collect the patient's identifiers (PHI)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Warnings of an import: what looks wrong in a CT and its labels, or was assumed."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import ndimage
 

@@ -6,8 +6,6 @@ added before it, because clinical slices are up to 5 mm apart, is the shape-base
 Udupa (1990): the signed distance of the label is resampled, not the label, which avoids steps between slices.
 """
 
-from __future__ import annotations
-
 import igl
 import numpy as np
 import SimpleITK as sitk

@@ -5,8 +5,6 @@ lower 35 % of the organ's height, dilated by 0.3 mm and swept upwards, taken out
 filleted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import igl

@@ -1,7 +1,5 @@
 """Select one organ of a label map: its voxels and its side; an ambiguous choice is refused."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast

@@ -1,7 +1,5 @@
 """Surfaces of an organ and of its parts: tumours, cysts, vessels, collecting system."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager

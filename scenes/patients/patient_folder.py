@@ -1,7 +1,5 @@
 """Write a patient's folder, and search its files for identifiers of the patient (PHI)."""
 
-from __future__ import annotations
-
 import re
 import zlib
 from collections.abc import Callable, Collection

@@ -3,8 +3,6 @@
 All coordinates are DICOM's: LPS [mm], +x to the patient's left, +y posterior, +z to the head. Voxels are cropped, and resampled only where a series is tilted or unevenly spaced.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

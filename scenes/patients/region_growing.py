@@ -5,8 +5,6 @@ radii. The region most like a kidney is returned: convex, with an edge in HU alo
 seed is refused with the reason.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import cast
 

@@ -1,7 +1,5 @@
 """Read NRRD and MetaImage with ITK, after checks of what ITK trusts: the header, and which file holds the voxels."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

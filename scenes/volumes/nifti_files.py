@@ -1,7 +1,5 @@
 """Read NIfTI with nibabel: RAS becomes LPS; a file without an orientation is refused."""
 
-from __future__ import annotations
-
 import logging
 import re
 import warnings

@@ -1,7 +1,5 @@
 """Read and write one volume in one file: NIfTI, NRRD, MetaImage."""
 
-from __future__ import annotations
-
 import errno
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Read a CT: DICOM folders, DICOMDIR, zip archives, NIfTI, NRRD, MetaImage."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from errors import PatientError

@@ -1,7 +1,5 @@
 """Parse one DICOM data set with bounded memory; every damage becomes a PatientError."""
 
-from __future__ import annotations
-
 import logging
 import warnings
 import zlib

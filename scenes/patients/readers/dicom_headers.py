@@ -1,7 +1,5 @@
 """Read DICOM headers: the series, their slices and positions, segmentations and structure sets."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Decode CT slices to HU: with pydicom and its plugins, else with the GDCM of SimpleITK."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """Read DICOM segmentation objects (binary, fractional, label map) with highdicom."""
 
-from __future__ import annotations
-
 import logging
 import warnings
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Choose one CT series of several, and open it as a volume."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

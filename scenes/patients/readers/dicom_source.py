@@ -1,7 +1,5 @@
 """Find the DICOM files of a folder, a DICOMDIR or a zip archive. Nothing is extracted to disk."""
 
-from __future__ import annotations
-
 import io
 import os
 import zipfile

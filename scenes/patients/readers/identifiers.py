@@ -1,7 +1,5 @@
 """Collect the identifiers (PHI) of a DICOM file, so that written files can be searched for them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 from pydicom.dataelem import DataElement

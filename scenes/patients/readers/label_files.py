@@ -1,7 +1,5 @@
 """Read labels: label maps, folders with one file per organ, 3D Slicer's .seg.nrrd, DICOM-SEG, RTSTRUCT."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass

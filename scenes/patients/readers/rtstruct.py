@@ -1,7 +1,5 @@
 """Read the contours of a DICOM RTSTRUCT and fill them on their planes."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydicom.dataset import Dataset
 from skimage.draw import polygon

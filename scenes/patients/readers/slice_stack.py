@@ -3,8 +3,6 @@
 A tilted gantry shears the stack: its slices are shifted within their planes, without interpolation between them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
