@@ -253,9 +253,9 @@ def scene_file(named: Path) -> Path:
     if not path.is_file():
         if session := next(named.glob("session-*.jsonl"), None):
             raise SceneError(
-                f"{named}: holds {session.name}, a session: give that file to rehearse --replay; {EXPECTED}"
+                f"{named}: contains {session.name}, a session: give that file to rehearse --replay; {EXPECTED}"
             )
-        raise SceneError(f"{named}: holds no scene.toml; make a patient's folder of a CT with: app.py import")
+        raise SceneError(f"{named}: has no scene.toml; make a patient's folder from a CT with: app.py import")
     return path
 
 
@@ -292,7 +292,7 @@ def _with_probe_beside(path: Path, scene: Scene) -> Scene:
 def with_options(scene: Scene, options: Mapping[str, float | int | str | None]) -> Scene:
     """The scene with single values changed, such as ``{"tissue.radius_mm": 3.0}``; None leaves what is there.
 
-    A value that only another tissue model has asks for that model, which starts from its own defaults. A probe's file is named
+    A value that only another tissue model has selects that model, which starts from its own defaults. A probe's file is named
     from where the program was started, not from beside the scene. Raises SceneError for a value out of range, and for values of
     two models.
     """

@@ -21,7 +21,7 @@ def load_surface(path: Path) -> trimesh.Trimesh:
         raise PatientError(f"{path}: no such surface file; give an STL, PLY or OBJ file")
     try:
         surface = trimesh.load_mesh(path)
-    except Exception as error:  # trimesh's readers raise whatever their parsers do
+    except Exception as error:  # trimesh's readers raise many kinds of error
         raise PatientError(
             f"{path}: cannot be read as a surface ({type(error).__name__}); export it as STL"
         ) from None
@@ -31,7 +31,7 @@ def load_surface(path: Path) -> trimesh.Trimesh:
         or not np.isfinite(surface.vertices).all()
     ):
         raise PatientError(
-            f"{path}: holds no triangles, or coordinates that are not finite; expected a closed surface in mm, LPS"
+            f"{path}: has no triangles, or coordinates that are not finite; expected a closed surface in mm, LPS"
         )
     if not surface.is_watertight or surface.volume <= 0:
         raise PatientError(

@@ -65,7 +65,7 @@ VIEWS = (
     CheckView("coronal, from the front", (1, 0, 0), (0, 0, -1), ("R", "L", "S", "I")),
     CheckView("sagittal, from the left", (0, 1, 0), (0, 0, -1), ("A", "P", "S", "I")),
 )
-OVERVIEW = CheckView("coronal, the whole width", (1, 0, 0), (0, 0, -1), ("R", "L", "S", "I"))
+OVERVIEW = CheckView("coronal, full width", (1, 0, 0), (0, 0, -1), ("R", "L", "S", "I"))
 
 
 def draw_check(patient: Patient, rows: list[tuple[str, str]], folder: Path) -> None:

@@ -55,7 +55,7 @@ def import_patient_command(
 ) -> None:
     """Make a patient's folder from a CT and its LABELS.
 
-    The folder holds the scene to rehearse in.
+    The folder contains the scene to rehearse.
 
     CT: a folder with DICOM, a DICOMDIR or zip archive, a NIfTI, NRRD or MHA file. LABELS: label maps, a folder with one
     file per organ, DICOM-SEG, RTSTRUCT; by default the segmentation in the CT's folder.

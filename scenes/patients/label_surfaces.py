@@ -80,7 +80,7 @@ def _iso_surface(solid: np.ndarray, spacing: np.ndarray, step: float) -> trimesh
     rim = np.ceil(3 * step / spacing).astype(int) + 2
     padded = np.pad(solid, [(n, n) for n in rim])
     # The difference of both distances changes sign midway between voxel centres, that is at voxel faces; the
-    # distance to the inner voxels alone would lie half a voxel inside.
+    # distance to the inner voxels alone would be half a voxel inside.
     distance = ndimage.distance_transform_edt(~padded, sampling=spacing)
     distance -= ndimage.distance_transform_edt(padded, sampling=spacing)
 
@@ -186,7 +186,7 @@ def self_intersections(surface: trimesh.Trimesh) -> int:
 
 
 def _crosses(start: np.ndarray, end: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-    """Whether each segment passes through its triangle: signs of tetrahedron volumes, shape (n,)."""
+    """Whether each segment crosses its triangle: signs of tetrahedron volumes, shape (n,)."""
     a, b, c = triangle[:, 0], triangle[:, 1], triangle[:, 2]
 
     def side(p, q, r, s):

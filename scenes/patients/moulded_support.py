@@ -78,7 +78,7 @@ def with_clearance(
 ) -> trimesh.Trimesh:
     """A support with a clearance to the organ at rest; ``carved`` makes one with a given gap [mm]. Raises ValueError.
 
-    Decimation moves the mould towards the organ; the gap grows until the clearance is met.
+    Decimation moves the mould towards the organ; the gap is increased until the clearance is met.
     """
     gap_mm = clearance_mm
     for _ in range(ATTEMPTS):

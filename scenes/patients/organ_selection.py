@@ -61,8 +61,8 @@ def find_organs(labels: LabelMap, organ: Sequence[int] | None = None) -> list[Or
         PatientError: no label is an organ.
     """
     own = _organ_values(labels, organ)
-    grown = [value for value in labels.of_tissues(*LESIONS) if value not in own]
-    wanted = np.isin(labels.values, own + grown)
+    lesions = [value for value in labels.of_tissues(*LESIONS) if value not in own]
+    wanted = np.isin(labels.values, own + lesions)
     box = box_of(wanted)
     if box is None:
         raise PatientError(f"the labels contain no voxel of an organ: {labels.listed()}; choose other labels")
@@ -85,8 +85,8 @@ def _with_touching(parts: np.ndarray, n: int, of_organ: list[int]) -> np.ndarray
     around = ndimage.binary_dilation(mask, CORNERS)
     for other in np.unique(parts[around & ~mask]).tolist():
         if other and other not in of_organ:
-            grown = parts == other
-            mask |= grown | (around & ndimage.binary_dilation(grown, CORNERS) & (parts == 0))
+            lesion = parts == other
+            mask |= lesion | (around & ndimage.binary_dilation(lesion, CORNERS) & (parts == 0))
     return mask
 
 
@@ -134,8 +134,8 @@ def _piece(labels: LabelMap, grid: VoxelGrid, values: np.ndarray, mask: np.ndarr
 def closing(mask: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     """Morphological closing of a mask (z, y, x) by a ball of CLOSING_MM; spacing [mm] along the same axes."""
     rim = [(int(n), int(n)) for n in np.ceil(CLOSING_MM / spacing) + 1]
-    grown = ndimage.distance_transform_edt(~np.pad(mask, rim), sampling=spacing) <= CLOSING_MM
-    closed = ndimage.distance_transform_edt(grown, sampling=spacing) > CLOSING_MM
+    dilated = ndimage.distance_transform_edt(~np.pad(mask, rim), sampling=spacing) <= CLOSING_MM
+    closed = ndimage.distance_transform_edt(dilated, sampling=spacing) > CLOSING_MM
     return closed[tuple(slice(low, n - high) for (low, high), n in zip(rim, closed.shape, strict=True))]
 
 

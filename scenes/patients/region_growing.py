@@ -131,7 +131,7 @@ def _bands(level: float) -> list[tuple[float, float]]:
 
 
 def _opened_regions(tissue: sitk.Image, away: np.ndarray, low: float, high: float) -> Iterator[np.ndarray]:
-    """Regions (z, y, x) of a band of HU connected to the seed, cut off at thin bridges; ``away`` is the distance to it [mm].
+    """Regions (z, y, x) of a band of HU connected to the seed, separated at thin bridges; ``away`` is the distance to it [mm].
 
     sitk.ConnectedThreshold, erosion by sitk.SignedMaurerDistanceMap, then sitk.BinaryDilate of the core at the seed only; a
     plain opening would restore the neighbours' cores, too.

@@ -97,7 +97,7 @@ def not_3d(path: Path, shape: tuple[int, ...]) -> PatientError:
 
 def no_scalar(path: Path, kind: object) -> PatientError:
     """The error for voxels that are colours, vectors or complex numbers."""
-    return PatientError(f"{path}: each voxel holds a {kind}; expected one number; export a scalar volume")
+    return PatientError(f"{path}: each voxel is a {kind}; expected one number; export a scalar volume")
 
 
 def cut_off(path: Path) -> PatientError:

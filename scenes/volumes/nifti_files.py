@@ -84,9 +84,9 @@ def _narrow(voxels: np.ndarray) -> np.ndarray:
     """Integral values as int16, others as float32: float64 takes up to four times the memory."""
     if voxels.dtype.kind != "f" or not np.isfinite(voxels).all():
         return voxels
-    whole = np.rint(voxels)
-    if np.array_equal(whole, voxels) and np.abs(whole).max(initial=0) < 2**15:
-        return whole.astype(np.int16)
+    integral = np.rint(voxels)
+    if np.array_equal(integral, voxels) and np.abs(integral).max(initial=0) < 2**15:
+        return integral.astype(np.int16)
     return voxels.astype(np.float32)
 
 

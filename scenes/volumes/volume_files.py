@@ -35,4 +35,4 @@ def save_image(image: sitk.Image, path: Path) -> None:
             sitk.WriteImage(image, str(partial), useCompression=True)
             sitk.ReadImage(str(partial))  # ITK does not report a disk that is full at the last bytes
         except RuntimeError:  # ITK's message has many lines and no cause
-            raise OSError(errno.EIO, "cannot be written whole (is the disk full?)") from None
+            raise OSError(errno.EIO, "cannot be written completely (is the disk full?)") from None

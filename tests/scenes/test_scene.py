@@ -226,12 +226,12 @@ def test_what_is_no_scene_is_named_with_what_takes_it(tmp_path, name, words):
     with pytest.raises(SceneError, match=words):
         load_scene(tmp_path / name)
     (tmp_path / "session-001.jsonl").touch()
-    with pytest.raises(SceneError, match="holds session-001.jsonl, a session: rehearse --replay"):
+    with pytest.raises(SceneError, match="contains session-001.jsonl, a session: give that file to rehearse --replay"):
         scene_file(tmp_path)
 
 
 def test_a_folder_is_its_scene_and_without_one_is_refused(tmp_path):
-    with pytest.raises(SceneError, match=r"holds no scene\.toml; make"):
+    with pytest.raises(SceneError, match=r"has no scene\.toml; make"):
         scene_file(tmp_path)
     (tmp_path / "scene.toml").write_text("")
     assert scene_file(tmp_path) == scene_file(tmp_path / "scene.toml") == tmp_path / "scene.toml"

@@ -21,45 +21,19 @@ SEGMENTATIONS = {"1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7"}
 STRUCTURE_SET = "1.2.840.10008.5.1.4.1.1.481.3"
 MOST_PIXELS = 8192 * 8192
 TAGS = [
-    "SOPClassUID",
-    "SOPInstanceUID",
-    "Modality",
-    "SeriesInstanceUID",
-    "SeriesNumber",
-    "InstanceNumber",
-    "ImageType",
-    "FrameOfReferenceUID",
-    "ImagePositionPatient",
-    "ImageOrientationPatient",
-    "PixelSpacing",
-    "Rows",
-    "Columns",
-    "NumberOfFrames",
-    "RescaleSlope",
-    "RescaleIntercept",
-    "RescaleType",
-    "PixelPaddingValue",
-    "PixelPaddingRangeLimit",
-    "BurnedInAnnotation",
-    "SamplesPerPixel",
-    "SharedFunctionalGroupsSequence",
-    "PerFrameFunctionalGroupsSequence",
-]
+    "SOPClassUID", "SOPInstanceUID", "Modality", "SeriesInstanceUID", "SeriesNumber", "InstanceNumber",
+    "ImageType", "FrameOfReferenceUID", "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing",
+    "Rows", "Columns", "NumberOfFrames", "RescaleSlope", "RescaleIntercept", "RescaleType",
+    "PixelPaddingValue", "PixelPaddingRangeLimit", "BurnedInAnnotation", "SamplesPerPixel",
+    "SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence",
+]  # fmt: skip
 MODALITY = re.compile("[A-Z]{2,8}")
 LOCALIZERS = {"LOCALIZER", "SCOUT", "TOPOGRAM"}
 # Values of ImageType whose pixels are not HU.
 NOT_HU = {
-    "PERFUSION",
-    "RCBF",
-    "RCBV",
-    "MTT",
-    "TTP",
-    "ANGIO",
-    "DENSITY_MAP",
-    "MAT_FRACTION",
-    "MAT_SPECIFIC",
+    "PERFUSION", "RCBF", "RCBV", "MTT", "TTP", "ANGIO", "DENSITY_MAP", "MAT_FRACTION", "MAT_SPECIFIC",
     "EFF_ATOMIC_NUM",
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
