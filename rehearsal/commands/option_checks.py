@@ -134,7 +134,7 @@ def check_track(track: TimedPoses, path: Path, anatomy: LoadedAnatomy, probe: Pr
         check_plan(read_plan(path), fingerprint(anatomy), probe)
 
 
-def origin_in_words(header: Header, arch: str) -> str:
+def replay_warning(header: Header, arch: str) -> str:
     """Why a replay may not be bit for bit what was recorded; nothing where the backend and the version, if it is known, are the same."""
     if header.version not in (None, VERSION):
         return f"Mind: recorded by version {header.version}, replayed by {VERSION}: what changed between them may show."

@@ -236,10 +236,10 @@ def built(
 
 def compile_picture(rehearsal: "Rehearsal") -> None:
     """Take a picture that nobody sees, so that the first frame need not wait for its kernels."""
-    from rehearsal.frame_view import settings_of, take_view
+    from rehearsal.frame_view import image_view, initial_settings
     from rehearsal.measurements.run_report import Tally
 
-    take_view(rehearsal, settings_of(rehearsal), None, Tally(0.0))
+    image_view(rehearsal, rehearsal.probe, initial_settings(rehearsal), Tally(0.0))
 
 
 def built_within(

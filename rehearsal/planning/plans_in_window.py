@@ -6,7 +6,7 @@ from time import perf_counter
 
 from joblib import cpu_count
 
-from rehearsal.frame_view import probe_as_set
+from rehearsal.frame_view import probe_with_settings
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.planning.make_plan import make_plan
 from rehearsal.planning.plan_file import Plan, PlanError, next_free, write_plan
@@ -149,7 +149,10 @@ class Plans:
         if self._planning is not None:
             return "A plan is being made"
         target = self._target(settings)
-        scene, probe = as_set(self.rehearsal.scene, settings), probe_as_set(self.rehearsal.probe, settings)
+        scene, probe = (
+            as_set(self.rehearsal.scene, settings),
+            probe_with_settings(self.rehearsal.probe, settings),
+        )
         problem = Problem(scene, self.anatomy, probe, target, float(settings.margin_mm), scene.trocar)
         self._planning = Planning(problem, next_free(self.out))
         return f"Planning for {NAMED[target]}"

@@ -216,7 +216,7 @@ def test_the_embedded_patient_is_made_once():
     [
         ("a.PNG", "is a picture; expected a scene file"),
         ("ct.nii.gz", "app.py import"),
-        ("sweep-001.igs.mha", "a tracked sweep: app.py reconstruct"),
+        ("sweep-001.igs.mha", "a tracked sweep: give it to app.py reconstruct"),
         ("session-001.jsonl", "a session: give it to rehearse --replay"),
         ("plan.json", "rehearse --plan"),
     ],
@@ -226,7 +226,9 @@ def test_what_is_no_scene_is_named_with_what_takes_it(tmp_path, name, words):
     with pytest.raises(SceneError, match=words):
         load_scene(tmp_path / name)
     (tmp_path / "session-001.jsonl").touch()
-    with pytest.raises(SceneError, match="contains session-001.jsonl, a session: give that file to rehearse --replay"):
+    with pytest.raises(
+        SceneError, match="contains session-001.jsonl, a session: give that file to rehearse --replay"
+    ):
         scene_file(tmp_path)
 
 
