@@ -61,7 +61,7 @@ class TestBedOfLabels:
 
     def test_nothing_under_the_organ(self):
         aside = SMALL[0] + [-36, 30, 0], np.array([20.0, 14.0, 40.0])
-        with pytest.raises(PatientError, match=r"lies under \d+% of the organ: expected 50% or more"):
+        with pytest.raises(PatientError, match=r"supports \d+% of the organ: expected 50% or more"):
             small_organs_bed(aside)
 
     def test_ends_at_half_of_the_organs_height(self):

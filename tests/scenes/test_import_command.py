@@ -61,7 +61,7 @@ def hospital(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def imported(hospital, tmp_path_factory):
-    """The folder that the command leaves of it; the patient, and what is private of it."""
+    """The folder that the command leaves of it; the patient and its identifiers."""
     out, found = tmp_path_factory.mktemp("patients") / "a", []
 
     def watched(*request):
@@ -111,18 +111,18 @@ def test_nothing_names_the_patient(written, hospital):
 def test_the_terminal_names_nobody_and_tells_the_facts(hospital, tmp_path, capfd):
     out = tmp_path / "a b"
     assert main(["import", str(hospital[0]), "--side", "right", "--out", str(out)]) == 0
-    said = capfd.readouterr()
-    assert said.out.endswith(f"then: {shell_command('rehearse', out)}\n")
-    assert "right kidney" in said.out and "none is in the files" in said.out
+    printed = capfd.readouterr()
+    assert printed.out.endswith(f"then: {shell_command('rehearse', out)}\n")
+    assert "right kidney" in printed.out and "none is in the files" in printed.out
     for text in ("Doe", "Jane", "4711", "19600229", hospital[1].uid):
-        assert text not in said.out + said.err
+        assert text not in printed.out + printed.err
 
 
-def test_what_was_read_is_known_to_be_private(hospital, taken_in):
+def test_identifiers_of_the_source_are_collected(hospital, taken_in):
     folder, series = hospital
-    private = taken_in[1]
-    assert {"Doe^Jane", "Doe", "Jane", "19600229", "A1234567", series.uid, series.sops[0]} <= private
-    assert str(folder.resolve()) in private
+    identifiers = taken_in[1]
+    assert {"Doe^Jane", "Doe", "Jane", "19600229", "A1234567", series.uid, series.sops[0]} <= identifiers
+    assert str(folder.resolve()) in identifiers
 
 
 def test_contours_on_an_archive(hospital, tmp_path):
@@ -155,18 +155,22 @@ def test_labels_of_another_examination(hospital, tmp_path):
         import_request(ImportRequest(tmp_path / "ct"))
 
 
-class TestPrivate:
+class TestIdentifiers:
     @pytest.fixture
     def patient(self, taken_in):
         return taken_in[0]
 
-    @pytest.mark.parametrize("secret", ["Doe", "Doe^Jane", "19600229", "1.2.826.0.1.3680043.8.498.1", "Ünal"])
-    def test_a_file_that_would_name_somebody_is_not_written(self, patient, tmp_path, secret):
-        texts = {"scene.toml": f'title = "kidney of {secret}"\n'}
+    @pytest.mark.parametrize(
+        "identifier", ["Doe", "Doe^Jane", "19600229", "1.2.826.0.1.3680043.8.498.1", "Ünal"]
+    )
+    def test_a_file_with_an_identifier_is_not_written(self, patient, tmp_path, identifier):
+        texts = {"scene.toml": f'title = "kidney of {identifier}"\n'}
         with pytest.raises(PatientError, match=r"scene\.toml would have contained an identifier") as caught:
-            save_patient(patient, tmp_path / "p", texts, private={secret, "Nobody"})
-        assert secret not in str(caught.value) and list(tmp_path.iterdir()) == []
-        assert save_patient(patient, tmp_path / "p", {"scene.toml": ""}, private={secret, "Nobody"}) == 2
+            save_patient(patient, tmp_path / "p", texts, identifiers={identifier, "Nobody"})
+        assert identifier not in str(caught.value) and list(tmp_path.iterdir()) == []
+        assert (
+            save_patient(patient, tmp_path / "p", {"scene.toml": ""}, identifiers={identifier, "Nobody"}) == 2
+        )
 
     def test_headers_of_images_and_surfaces_are_searched(self, patient, tmp_path):
         def draw(folder):
@@ -174,7 +178,7 @@ class TestPrivate:
             organ.write_bytes(b"solid of Doe".ljust(80) + organ.read_bytes()[80:])
 
         with pytest.raises(PatientError, match=r"organ\.stl would have contained"):
-            save_patient(patient, tmp_path / "p", draw=draw, private={"Doe"})
+            save_patient(patient, tmp_path / "p", draw=draw, identifiers={"Doe"})
         assert list(tmp_path.iterdir()) == []
 
     def test_words_of_every_file_name_nobody(self):
@@ -227,22 +231,22 @@ def test_the_series_that_labels_were_drawn_on(tmp_path):
     assert with_labels(ImportRequest(tmp_path / "ct", [seg]), silent)[0].grid.spacing[2] == pytest.approx(5.0)
 
 
-def test_each_source_is_private(hospital, taken_in):
+def test_identifiers_of_each_source(hospital, taken_in):
     """The CT's header by itself, and the labels'."""
     folder, series = hospital
-    for said in (open_ct(folder / "ct").identifiers, open_labels(folder / "seg").identifiers):
-        assert {"Doe^Jane", "Doe", "Jane", "19600229", "A1234567", series.study} <= said
+    for identifiers in (open_ct(folder / "ct").identifiers, open_labels(folder / "seg").identifiers):
+        assert {"Doe^Jane", "Doe", "Jane", "19600229", "A1234567", series.study} <= identifiers
 
 
-def test_what_labels_say_and_paths_are_private(hospital, taken_in, tmp_path, monkeypatch):
+def test_identifiers_of_labels_and_paths(hospital, taken_in, tmp_path, monkeypatch):
     monkeypatch.setattr("scenes.patients.import_request.import_patient", lambda *_, **__: taken_in[0])
     monkeypatch.chdir(tmp_path)
     made = nibabel.Nifti1Image(np.ones((5, 5, 5), np.uint8), np.eye(4))
     made.header["descrip"] = b"drawn by Roe"
     nibabel.save(made, tmp_path / "kidney.nii.gz")
     given = type(tmp_path)("../") / tmp_path.name / "kidney.nii.gz"
-    private = import_request(ImportRequest(hospital[0] / "ct", [given]))[1]
-    assert {"drawn by Roe", "Doe^Jane", str(given), str(tmp_path.resolve() / "kidney.nii.gz")} <= private
+    identifiers = import_request(ImportRequest(hospital[0] / "ct", [given]))[1]
+    assert {"drawn by Roe", "Doe^Jane", str(given), str(tmp_path.resolve() / "kidney.nii.gz")} <= identifiers
 
 
 def test_a_seed_makes_a_draft(hospital, taken_in, monkeypatch):
@@ -277,7 +281,7 @@ class TestSearch:
             (folder / "check.png").write_bytes(b"\0\1" + "Özgür Ünal".encode(encoding) + b"\2")
 
         with pytest.raises(PatientError, match=r"check\.png would have contained"):
-            save_patient(taken_in[0], tmp_path / "p", draw=draw, private={"Özgür Ünal"})
+            save_patient(taken_in[0], tmp_path / "p", draw=draw, identifiers={"Özgür Ünal"})
 
     def test_packed_voxels_are_searched(self, taken_in, tmp_path):
         def draw(folder):
@@ -285,8 +289,8 @@ class TestSearch:
             sitk.WriteImage(words, str(folder / "labels.nrrd"), useCompression=True)
 
         with pytest.raises(PatientError, match=r"labels\.nrrd would have contained"):
-            save_patient(taken_in[0], tmp_path / "p", draw=draw, private={"Doe^Jane"})
+            save_patient(taken_in[0], tmp_path / "p", draw=draw, identifiers={"Doe^Jane"})
 
     def test_a_word_within_another_names_nobody(self, taken_in, tmp_path):
         texts = {"scene.toml": 'title = "monroe\'s doer"\n'}
-        assert save_patient(taken_in[0], tmp_path / "p", texts, private={"roe", "doe"}) == 2
+        assert save_patient(taken_in[0], tmp_path / "p", texts, identifiers={"roe", "doe"}) == 2

@@ -1,4 +1,4 @@
-"""What an import minds of a CT: as bright as stone is what the echo takes for one. The other warnings: test_import.py."""
+"""Import warnings: the brightness that the B-mode image takes for stone. The other warnings: test_patient_import.py."""
 
 import numpy as np
 import pytest

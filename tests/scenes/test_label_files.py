@@ -25,14 +25,14 @@ def strips(*names):
 
 class TestTogether:
     def test_the_users_word_is_all_that_is(self):
-        (told,) = assign_tissues(
+        (assigned,) = assign_tissues(
             [strips("kidney_left", "old tumour", "new mass")], [], {"tumour": ["new mass"]}
         )
-        assert [s.tissue for s in told.segments.values()] == ["kidney", None, "tumour"]
+        assert [s.tissue for s in assigned.segments.values()] == ["kidney", None, "tumour"]
 
     def test_what_of_the_organ_has_a_tissue_keeps_it(self):
-        (told,) = assign_tissues([strips("kidney_left", "mass", "x")], ["kidney_left", "mass", "x"], {})
-        assert [s.tissue for s in told.segments.values()] == ["kidney", "tumour", "kidney"]
+        (assigned,) = assign_tissues([strips("kidney_left", "mass", "x")], ["kidney_left", "mass", "x"], {})
+        assert [s.tissue for s in assigned.segments.values()] == ["kidney", "tumour", "kidney"]
 
     @pytest.mark.parametrize(
         ("over", "under"), [("tumour", "cyst"), ("cyst", "kidney"), ("stone", "tumour"), ("vein", "kidney")]
@@ -97,7 +97,7 @@ class TestNames:
 
 class TestSegmentations:
     def test_what_is_meant(self, series, tmp_path):
-        """A name that says nothing: the coded property does."""
+        """The coded property names the tissue where the label does not."""
         mask = np.ones(series.size[::-1])
         (one,) = open_labels(write_segmentation(tmp_path / "seg.dcm", series, {"Xidney 1": mask})).maps(None)
         assert [(s.name, s.tissue) for s in one.segments.values()] == [("Xidney 1", "kidney")]
@@ -106,7 +106,7 @@ class TestSegmentations:
     def series(self, tmp_path):
         return Series(tmp_path / "ct")
 
-    def test_what_labels_say_is_private(self, series, tmp_path):
+    def test_identifiers_of_labels(self, series, tmp_path):
         seg = write_segmentation(tmp_path / "seg.dcm", series, {"Kidney": np.ones(series.size[::-1])})
         rt = write_structures(
             tmp_path / "rt.dcm", {"Kidney": [ring(series.positions(2), 5, series.direction)]}

@@ -42,7 +42,7 @@ LIVER = np.array([20.0, 0.0, 40.0]), np.array([20.0, 20.0, 20.0])
 
 
 def label_map(labels, organ=(), **tissues):
-    """A label map with values said to be of tissues, and the values of its organ, None where they are not said."""
+    """A label map with assigned tissues, and the values of its organ or None."""
     words = {tissue: [str(v) for v in values] for tissue, values in tissues.items()}
     (told_map,) = assign_tissues([LabelMap.of(labels)], [str(v) for v in organ], words)
     return told_map, list(organ) or None
@@ -190,7 +190,7 @@ class TestImport:
         with pytest.raises(PatientError, match="is on the patient's left, but its name has the other side"):
             import_patient(LazyVolume.of(ct), mirrored, side="left", margin_mm=10.0)
         other = LabelMap.of(labels, {1: "liver", 2: "spleen", 3: "stomach"})
-        with pytest.raises(PatientError, match="no label says that it is a kidney: 1 liver, 2 spleen"):
+        with pytest.raises(PatientError, match="no label is named as a kidney: 1 liver, 2 spleen"):
             import_patient(LazyVolume.of(ct), other)
 
 
@@ -293,7 +293,7 @@ class TestSave:
             save_patient(patient, tmp_path / "patient", draw=full)
         assert list(tmp_path.iterdir()) == []
 
-    def test_a_disk_that_is_full_is_told_and_leaves_nothing(self, patient, tmp_path, bytes_to_a_file):
+    def test_a_full_disk_is_reported_and_leaves_nothing(self, patient, tmp_path, bytes_to_a_file):
         with bytes_to_a_file(100), pytest.raises(PatientError, match="is the disk full.*; choose a folder"):
             save_patient(patient, tmp_path / "patient")
         assert list(tmp_path.iterdir()) == []
@@ -323,8 +323,8 @@ class TestSave:
 
 
 @pytest.mark.usefixtures("patient", "without_support", "coarse")
-class TestCautions:
-    """What looks wrong is said, though the import goes on."""
+class TestWarnings:
+    """What looks wrong gives warnings, and the import continues."""
 
     def test_a_body_as_it_should_be(self, patient):
         assert patient.warnings == () and patient.notes == ()
@@ -348,8 +348,8 @@ class TestCautions:
         assert not imported(with_voxels(ct, voxels), labels, [2], margin_mm=20.0, tumour=[3]).warnings
         shifted = sitk.Image(labels)
         shifted.SetOrigin(np.add(labels.GetOrigin(), (0, 8.0, 0)).tolist())
-        (said,) = imported(with_voxels(ct, voxels), shifted, [2], margin_mm=20.0, tumour=[3]).warnings
-        assert "of the organ's rim is fat or gas" in said
+        (warning,) = imported(with_voxels(ct, voxels), shifted, [2], margin_mm=20.0, tumour=[3]).warnings
+        assert "of the organ's rim is fat or gas" in warning
 
     def test_what_is_as_bright_as_stone_unless_its_label_says_that_it_is_urine(self, ct_and_labels):
         ct, labels = ct_and_labels
@@ -357,16 +357,16 @@ class TestCautions:
         stone, pelvis = level(points, (LEFT[0] + [0, 0, 25], np.full(3, 6.0))) < 0, level(points, PELVIS) < 0
         voxels, marks = sitk.GetArrayFromImage(ct), sitk.GetArrayFromImage(labels)
         voxels[stone | pelvis], marks[pelvis] = 120 + STONE_ABOVE_MEDIAN_HU + 1, 4
-        bright, told = with_voxels(ct, voxels), with_voxels(labels, marks)
-        (said,) = imported(bright, told, [2], margin_mm=20.0, tumour=[3], urine=[4]).warnings
+        bright, marked = with_voxels(ct, voxels), with_voxels(labels, marks)
+        (warning,) = imported(bright, marked, [2], margin_mm=20.0, tumour=[3], urine=[4]).warnings
         ml = stone.sum() * np.prod(ct.GetSpacing()) / 1000
-        assert f"{ml:.1f} ml inside the organ are as bright as stone" in said and "--collecting" in said
+        assert f"{ml:.1f} ml inside the organ are as bright as stone" in warning and "--collecting" in warning
 
     def test_labels_without_a_meaning(self, ct_and_labels):
-        (said,) = imported(*ct_and_labels, side="left", margin_mm=20.0).warnings
-        assert "labels 2, 3 have no names, and were all taken as the kidney" in said
-        (said,) = imported(*ct_and_labels, organ=[2], margin_mm=20.0).warnings
-        assert "were left out: 3 (5." in said and "--tumour" in said
+        (warning,) = imported(*ct_and_labels, side="left", margin_mm=20.0).warnings
+        assert "labels 2, 3 have no names, and were all taken as the kidney" in warning
+        (warning,) = imported(*ct_and_labels, organ=[2], margin_mm=20.0).warnings
+        assert "were left out: 3 (5." in warning and "--tumour" in warning
 
 
 def test_what_touches_by_a_corner_is_held_and_what_only_touches_is_no_part(ct_and_labels, without_support):

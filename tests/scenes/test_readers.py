@@ -225,8 +225,8 @@ class TestRealData:
 
     def test_perfusion_map(self, data):
         file = data / SYNTAXES / "CT0012.fragmented_no_bot_jpeg_baseline.51.dcm"
-        said = refusal(file)
-        assert "PERFUSION" in said and said.count(file.name) == 0
+        message = refusal(file)
+        assert "PERFUSION" in message and message.count(file.name) == 0
 
     @pytest.mark.parametrize(
         ("folder", "words"),
@@ -243,8 +243,8 @@ class TestRealData:
         ],
     )
     def test_refused(self, data, folder, words):
-        said = refusal(data / folder)
-        assert all(part in said for part in words)
+        message = refusal(data / folder)
+        assert all(part in message for part in words)
 
     def test_tilted(self, data):
         volume, voxels = read_ct(data / FAILING / "gantrytilting/001")
@@ -299,14 +299,14 @@ def test_count_of_dimensions(tmp_path):
     paths = [tmp_path / f"{count}.mha" for count in (-3, 0, 11, 1000000000)]
     for path in paths:
         path.write_bytes(sound.replace(b"NDims = 3", f"NDims = {path.stem}".encode()))
-    said = in_another_process("read", *paths)
-    assert [line.split(".mha")[0] for line in said] == [path.stem for path in paths]
+    lines = in_another_process("read", *paths)
+    assert [line.split(".mha")[0] for line in lines] == [path.stem for path in paths]
 
 
 def test_chance_damage(tmp_path):
     """Flipped, inserted and lost bytes: a volume or labels that read, or one line."""
-    said = in_another_process("damage", tmp_path)
-    assert said[-1] == "sound", said
+    lines = in_another_process("damage", tmp_path)
+    assert message[-1] == "sound", message
 
 
 def samples(folder, kind):

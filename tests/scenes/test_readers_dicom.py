@@ -295,16 +295,18 @@ class TestGeometry:
         ],
     )
     def test_missing_slices(self, tmp_path, order, words):
-        said = refusal(Series(tmp_path, size=(12, 10, 10)).write(order))
-        assert all(part in said for part in words)
+        message = refusal(Series(tmp_path, size=(12, 10, 10)).write(order))
+        assert all(part in message for part in words)
 
     def test_gap_too_small(self, tmp_path):
         series = Series(tmp_path)
         series.write()
         between = series.positions(2.4).round(6).tolist()
         save(series.slice(2, ImagePositionPatient=between, InstanceNumber=30), tmp_path / "z.dcm")
-        said = refusal(tmp_path)
-        assert "slice 3 (s1-2.dcm)" in said and "slice 30 (z.dcm)" in said and "1.00 mm apart" in said
+        message = refusal(tmp_path)
+        assert (
+            "slice 3 (s1-2.dcm)" in message and "slice 30 (z.dcm)" in message and "1.00 mm apart" in message
+        )
 
     def test_copies_are_left_out(self, tmp_path):
         series = Series(tmp_path)
@@ -319,8 +321,8 @@ class TestGeometry:
         other = series.slice(3, InstanceNumber=40, SOPInstanceUID=generate_uid())
         other.PixelData = bytes(reversed(other.PixelData))
         save(other, tmp_path / "z.dcm")
-        said = refusal(tmp_path)
-        assert "slice 4 (s1-3.dcm)" in said and "slice 40 (z.dcm)" in said and "one position" in said
+        message = refusal(tmp_path)
+        assert "slice 4 (s1-3.dcm)" in message and "slice 40 (z.dcm)" in message and "one position" in message
 
 
 class TestRefused:

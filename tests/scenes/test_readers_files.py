@@ -1,4 +1,4 @@
-"""Volumes in files, in detail: values, what is private, where a box is."""
+"""Volumes in files, in detail: values, identifiers, where a box is."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -24,7 +24,7 @@ class TestFiles:
         assert open_ct(path).hounsfield()[0, 0, :2].tolist() == [32767, AIR]
 
     @pytest.mark.parametrize("ending", ENDINGS)
-    def test_what_a_header_says_is_private(self, tmp_path, ending):
+    def test_identifiers_of_a_header(self, tmp_path, ending):
         path = tmp_path / f"a{ending}"
         if ending.startswith(".nii"):
             nifti(path, noise(), descrip=b"Doe^Jane")

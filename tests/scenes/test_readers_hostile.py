@@ -45,10 +45,10 @@ def refused(tmp_path):
 
     def check(path, **options):
         before, peak = files_in(tmp_path), peak_mib()
-        said = refusal(path, **options)
+        message = refusal(path, **options)
         assert files_in(tmp_path) == before
         assert peak_mib() - peak < BOUND_MIB
-        return said
+        return message
 
     return check
 
@@ -92,8 +92,8 @@ class TestDicom:
         series.write()
         file = tmp_path / "ct" / "s1-2.dcm"
         file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
-        said = refused(tmp_path / "ct", name="s1-")
-        assert "s1-2.dcm" in said or "slice 2 (s1-1.dcm)" in said
+        message = refused(tmp_path / "ct", name="s1-")
+        assert "s1-2.dcm" in message or "slice 2 (s1-1.dcm)" in message
 
     def test_empty_files_and_other_kinds_are_passed_over(self, tmp_path):
         series = Series(tmp_path)

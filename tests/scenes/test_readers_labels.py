@@ -366,8 +366,8 @@ class TestTogether:
         with pytest.raises(PatientError, match="given as cyst and as tumour: give it as one"):
             assign_tissues(maps, [], {"cyst": ["mass"], "tumour": ["mass"]})
         plain = LabelMap.of(drawn(grid_around((-33, 18, -401), (-22, 30, -385), (1, 1, 1)), (5, KIDNEY)))
-        (told,) = assign_tissues([plain], ["5"], {})
-        assert told.segments[5].tissue == "kidney"
+        (assigned,) = assign_tissues([plain], ["5"], {})
+        assert assigned.segments[5].tissue == "kidney"
 
 
 def test_names_in_a_nifti_header(tmp_path):

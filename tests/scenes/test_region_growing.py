@@ -1,4 +1,4 @@
-"""A kidney grown from a seed: synthetic bodies known in LPS mm, the phantom, and real CTs with labels where they are there."""
+"""Region growing from a seed: synthetic bodies known in LPS mm, the phantom, and real CTs with labels where they are there."""
 
 from pathlib import Path
 
@@ -161,7 +161,7 @@ class TestRefused:
 
 
 def test_phantom():
-    """Cortex and medulla are grown from; the tumour, the sinus and its fat are of the organ and may be missed."""
+    """Seeds are in cortex and medulla; the tumour, the sinus and its fat belong to the organ and may be missed."""
     folder, files = files_of(load_scene(EMBEDDED), EMBEDDED.parent)
     ct, labels = (file_volume(folder / name) for name in (files.ct, files.labels))
     tissue = labels.read(labels.grid.full_box())
