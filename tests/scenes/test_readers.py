@@ -306,7 +306,7 @@ def test_count_of_dimensions(tmp_path):
 def test_chance_damage(tmp_path):
     """Flipped, inserted and lost bytes: a volume or labels that read, or one line."""
     lines = in_another_process("damage", tmp_path)
-    assert message[-1] == "sound", message
+    assert lines[-1] == "sound", lines
 
 
 def samples(folder, kind):

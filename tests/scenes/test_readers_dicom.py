@@ -1,4 +1,4 @@
-"""CT series as DICOM: any order, orientation and packing; what is missing, double, tilted or no CT is said."""
+"""CT series as DICOM: any order, orientation and container; missing, duplicate and tilted slices and other images are reported."""
 
 import shutil
 
