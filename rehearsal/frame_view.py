@@ -10,7 +10,7 @@ from rehearsal.stopwatch import timed
 from render.display import window_size
 from render.gamepad import Gamepad
 from render.keys import Keys
-from render.viewer import Geometry, Settings, View, Viewer
+from render.viewer import Geometry, ScannerSettings, Settings, View, Viewer
 from render.window_layout import FULL_SIZE
 from ultrasound.probe import TGC_SLIDERS, Probe
 
@@ -42,7 +42,7 @@ def initial_settings(rehearsal: Rehearsal) -> Settings:
     return settings
 
 
-def probe_with_settings(probe: Probe, settings: Settings) -> Probe:
+def probe_with_settings(probe: Probe, settings: ScannerSettings) -> Probe:
     """The probe with the scanner's settings."""
     low, high = probe.frequency_range_mhz
     return probe.model_copy(
@@ -111,7 +111,7 @@ def image_view(rehearsal: Rehearsal, probe: Probe, settings: Settings, tally: Ta
     )
 
 
-def captions(probe: Probe, settings: Settings) -> tuple[str, str, str]:
+def captions(probe: Probe, settings: ScannerSettings) -> tuple[str, str, str]:
     """The probe's name, and the settings of the B-mode image and of the CT."""
     b_mode = (
         f"{probe.frequency_mhz:.1f} MHz   G {probe.gain_percent:.0f} %   DR {probe.dyn_range_db:.0f} dB   "

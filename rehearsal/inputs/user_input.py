@@ -11,7 +11,7 @@ from rehearsal.sessions.replay import set_solver
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.undo_history import History
 from rehearsal.tracking.tracked_probe import Follower, Tracked, TrackOver
-from render.viewer import Controls
+from render.viewer import Controls, TissueSettings
 
 # A transducer that moves by no more than this in a step is at rest [mm].
 STILL_MM = 1e-3
@@ -66,7 +66,7 @@ class UserInput:
             return None
         if controls.take_over:
             self._take_over()
-        self._set_solver(controls)
+        self._set_solver(controls.settings)
         rehearsal, follower = self.session.rehearsal, self._follower
         before = rehearsal.manipulator.state
         pose = self._manual_pose(controls) if follower is None else self._tracked_pose(follower, controls)
@@ -164,8 +164,7 @@ class UserInput:
         self._show(what if done else f"Nothing to {what}")
         return done
 
-    def _set_solver(self, controls: Controls) -> None:
-        settings = controls.settings
+    def _set_solver(self, settings: TissueSettings) -> None:
         self._iterations_set = settings.iterations
         values = dict(
             iterations=self.adaptive_iterations.iterations(settings.iterations),

@@ -14,7 +14,7 @@ from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.search import length_of
 from rehearsal.planning.trial_workers import Problem, Workers, workers
 from rehearsal.rehearsal import Rehearsal
-from render.viewer import Controls, Settings
+from render.viewer import Controls, Settings, TissueSettings
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene, with_options
 from ultrasound.target import Target
@@ -175,7 +175,7 @@ def in_words(seconds: float) -> str:
     return f"some {minutes} min" if minutes > 0 else "under a minute"
 
 
-def as_set(scene: Scene, settings: Settings) -> Scene:
+def as_set(scene: Scene, settings: TissueSettings) -> Scene:
     """A scene with its tissue, passes and gravity as the sliders are."""
     values = {
         "tissue.young_kpa": settings.young_kpa,

@@ -18,7 +18,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from errors import PatientError, UserError, explained
 from scenes.section import Direction, Vector3
 from scenes.surfaces import load_surface
-from sim.mesh_distance import signed_distance
+from sim.signed_distance import signed_distance
 
 UNITS = ("_mm", "_kPa")
 # Between the nominal indentation and where the probe was found.

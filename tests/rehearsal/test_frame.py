@@ -151,6 +151,13 @@ def test_a_sweep_that_is_recorded_stands_in_the_panel_beside_all_else(looping, m
     )
 
 
+def test_notices_name_the_users_keys_on_the_screen_and_in_the_terminal(looping, capsys):
+    looping.keys = Keys(of=USUAL_KEYS | {"sweep": "Space", "plan_for": "L"})
+    looping.notices.post("sweep-001: {sweep} ends it")
+    assert looping.frame(Controls(Settings())).status == "Sweep-001: Space ends it"
+    assert capsys.readouterr().out == "sweep-001: Space ends it\n"
+
+
 def test_what_is_wrong_with_the_tissue_stands_before_all_that_is_technical(looping, monkeypatch):
     monkeypatch.setattr(frame, "perf_counter", lambda: 100.0)
     monkeypatch.setattr(Fake, "onto", lambda each, view, settings: replace(view, status="SQUEEZED"))

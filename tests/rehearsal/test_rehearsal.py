@@ -19,7 +19,7 @@ from scenes.phantom.embedded_patient import phantom_folder
 from scenes.scene import PAPER, Press, Scene, load_scene, with_options
 from scenes.volumes.lazy_volume import LazyVolume
 from sim.fields import array_of
-from sim.mesh_distance import signed_distance
+from sim.signed_distance import signed_distance
 from sim.skinning import Skin
 from ultrasound.probe_manipulator import image_plane
 

@@ -353,8 +353,8 @@ def test_a_way_of_other_coordinates_is_told_by_its_distance(tmp_path):
     [
         (("--track", "none.csv"), "no such file of poses"),
         (("--track", "none.igs.mha"), "none.igs.mha: No such file"),
-        (("--track-from", "ProbeToReference"), "name its file with --track"),
-        (("--track", "a.csv", "--replay", "b.jsonl"), "--track: a replay goes the recorded way"),
+        (("--track-from", "ProbeToReference"), "add its file with --track"),
+        (("--track", "a.csv", "--replay", "b.jsonl"), "--track: a replay has the recorded poses"),
     ],
 )
 def test_the_command_line_refuses_in_one_line(options, words, capsys):

@@ -23,7 +23,7 @@ from scenes.phantom.embedded_patient import phantom_folder
 from scenes.scene import EMBEDDED
 from scenes.surfaces import load_surface
 from sim.embedding import Unmoved
-from sim.mesh_distance import signed_distance
+from sim.signed_distance import signed_distance
 from studies.freehand.freehand_sweeps import sweep_of
 from ultrasound import reconstruction
 from ultrasound.labelled_sweep import MARKS, SUFFIX, LabelledSweep, marks_beside
