@@ -81,7 +81,7 @@ class TestOrgan:
     def test_ct_without_a_negative_value(self, ct_and_labels):
         ct, labels = ct_and_labels
         clipped = with_voxels(ct, np.maximum(sitk.GetArrayFromImage(ct), 0))
-        with pytest.raises(PatientError, match="holds values from 0 to 120: expected HU"):
+        with pytest.raises(PatientError, match="has values from 0 to 120: expected HU"):
             imported(clipped, labels, organ=[2])
 
 

@@ -52,5 +52,5 @@ def test_of_what_is_too_thin_what_must_be_seen_stops_an_import(monkeypatch, asid
 def test_a_process_that_dies_is_said(monkeypatch):
     monkeypatch.setattr(part_surfaces, "part_surface", lambda *part: os._exit(1))
     found = {tissue: (GRID, ball((14, 14, 15), 9.0)) for tissue in ("tumour", "cyst")}
-    with pytest.raises(PatientError, match="want of memory"):
+    with pytest.raises(PatientError, match="lack of memory"):
         made(monkeypatch, found, aside=True)

@@ -199,7 +199,7 @@ class TestImportRefuses:
         ("options", "words"),
         [
             ({}, r"2 organs .*label 1, right, \d+\.\d ml; label 2\+3, left, \d+\.\d ml.*--side"),
-            ({"organ": [5]}, "label 5 is not in the label map: it holds 1, 2, 3; give one of these"),
+            ({"organ": [5]}, "label 5 is not in the label map: it has 1, 2, 3; give one of these"),
             ({"tumour": [8], "organ": [1]}, "tumour's label 8 is not"),
             ({"organ": [1, 3], "tumour": [3]}, "label 3 is given as organ and as tumour"),
             ({"organ": [1], "tumour": [3]}, "the tumour does not touch the organ"),

@@ -313,7 +313,7 @@ class TestGeometry:
         series.write()
         shutil.copy(tmp_path / "s1-3.dcm", tmp_path / "copy.dcm")
         notes = assert_whole(series, tmp_path).notes
-        assert len(notes) == 1 and "there twice, alike, and taken once" in notes[0] and "slice 4" in notes[0]
+        assert len(notes) == 1 and "duplicates, taken once" in notes[0] and "slice 4" in notes[0]
 
     def test_conflict(self, tmp_path):
         series = Series(tmp_path)
