@@ -221,7 +221,7 @@ class TestImportRefuses:
             imported(labels, ct)
         with pytest.raises(PatientError, match="whole numbers"):
             imported(ct, sitk.Cast(labels, sitk.sitkFloat32) * 0.3)
-        with pytest.raises(PatientError, match="no organ, but 3; expected a kidney's too"):
+        with pytest.raises(PatientError, match="no organ, only 3; expected a kidney too"):
             imported(ct, mapped(labels, [0, 0, 0, 3]), tumour=[3])
 
     def test_labels_of_another_place(self, ct_and_labels):
