@@ -12,6 +12,13 @@ class UserError(ValueError):
     """What the user can mend. The message is one line: where, what was found, what was expected, what to do."""
 
 
+class PatientError(UserError):
+    """What is wrong with a patient's files. Letters that do not print, which could control a terminal, become question marks."""
+
+    def __init__(self, line: str) -> None:
+        super().__init__("".join(letter if letter.isprintable() else "?" for letter in line))
+
+
 def explained(
     error: "ValidationError",
     unknown: Callable[[list[str]], str] = lambda where: "unknown key",

@@ -17,7 +17,7 @@ from rehearsal.result_files import write_json
 from render.animation import PICTURES_A_SECOND, empty_folder, save_animation, side_by_side, smaller
 from render.viewer import Controls, Settings, View, Viewer
 from render.window import NoVulkan
-from scenes.atomic_files import whole
+from scenes.atomic_files import atomic_write
 
 # An animation is held in memory: a long session has fewer images in it.
 MOST_SHOWN = 240
@@ -56,7 +56,7 @@ class Pictures:
 
     def save(self) -> str:
         """Write the animation; return what was written."""
-        with whole(self.out / "press.webp") as partial:
+        with atomic_write(self.out / "press.webp") as partial:
             save_animation(self._animation, partial)
         return f"{-(-self.steps // self._every)} pictures, press.webp"
 

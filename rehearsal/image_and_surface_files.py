@@ -8,13 +8,13 @@ import click
 import numpy as np
 import trimesh
 from PIL import Image
+from scenes.surface_files import save_surface
 
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import next_number
 from render.animation import in_proportion
 from render.viewer import View
-from scenes.atomic_files import whole
-from scenes.surface_files import save_surface
+from scenes.atomic_files import atomic_write
 from sim.fields import array_of
 from ultrasound.dicom_image import save_dicom
 from ultrasound.probe import Probe
@@ -35,7 +35,7 @@ class SavedImage:
 
 def save_image_file(image: Image.Image, path: Path) -> None:
     """Write an image in the format of its suffix, as an atomic write. Raises OSError."""
-    with whole(path) as partial:
+    with atomic_write(path) as partial:
         image.save(partial)
 
 
@@ -55,7 +55,7 @@ def save_images(
         save_image_file(image, path)
         spacing_mm = depth_mm / image.height, width_mm / image.width
         if dicom and kind == ECHO:
-            with whole(path.with_suffix(".dcm")) as partial:
+            with atomic_write(path.with_suffix(".dcm")) as partial:
                 save_dicom(partial, np.asarray(image), spacing_mm, probe)
         saved.append(SavedImage(kind, path, (image.height, image.width), spacing_mm))
     return saved

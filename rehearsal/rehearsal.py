@@ -14,9 +14,9 @@ import trimesh
 from rehearsal.build_solver import build_solver, embedding_cell_mm, static_shape, step_settings, tool_of
 from rehearsal.configuration import probe_of
 from scenes.anatomy import Grid, LoadedAnatomy, press_on
-from scenes.closed_surfaces import moved_by, volume_mm3
-from scenes.progress import ReportProgress, no_progress
 from scenes.scene import PlaneShape, Scene
+from scenes.surfaces import translated, volume_mm3
+from scenes.terminal import ReportProgress, no_progress
 from sim.divergence_check import DivergenceCheck, DivergenceState
 from sim.embedding import Embedding
 from sim.fields import array_of
@@ -81,12 +81,12 @@ class Rehearsal:
         self.scene = scene
         self.probe = probe or probe_of(scene)
         self.origin = anatomy.organ.bounds.mean(axis=0)
-        self.organ = moved_by(anatomy.organ, -self.origin)
-        self.tumour = anatomy.tumour and moved_by(anatomy.tumour, -self.origin)
-        self.parts = {tissue: moved_by(part, -self.origin) for tissue, part in anatomy.parts.items()}
+        self.organ = translated(anatomy.organ, -self.origin)
+        self.tumour = anatomy.tumour and translated(anatomy.tumour, -self.origin)
+        self.parts = {tissue: translated(part, -self.origin) for tissue, part in anatomy.parts.items()}
         self.gravity_direction = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
         meshes = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
-        self.supports = [_shrunk(moved_by(mesh, -self.origin), SUPPORT_SUNK_MM) for mesh in meshes]
+        self.supports = [_shrunk(translated(mesh, -self.origin), SUPPORT_SUNK_MM) for mesh in meshes]
         scanned, echo = None, None
         if anatomy.ct is not None:
             scanned = scanned_anatomy(self.organ, anatomy.ct, anatomy, self.origin)
@@ -131,7 +131,7 @@ class Rehearsal:
             normal = np.array(shape.normal) / np.linalg.norm(shape.normal)
             return Plane(normal, shape.offset_mm / np.linalg.norm(shape.normal) - normal @ self.origin)
         if isinstance(shape, trimesh.Trimesh):
-            return static_shape(moved_by(shape, -self.origin), self.scene.tissue)
+            return static_shape(translated(shape, -self.origin), self.scene.tissue)
         spacing = 1 / np.diag(shape.index_from_mm)[:3]
         return SignedDistanceField(shape.voxels, -spacing * shape.index_from_mm[:3, 3] - self.origin, spacing)
 
@@ -316,5 +316,5 @@ def scanned_anatomy(
     shift = np.eye(4)
     shift[:3, 3] = origin
     marks = None if labels is None else labels.voxels.astype(np.int32)
-    tumour = anatomy.tumour and moved_by(anatomy.tumour, -origin)
+    tumour = anatomy.tumour and translated(anatomy.tumour, -origin)
     return ScannedAnatomy(organ, ct.voxels, ct.index_from_mm @ shift, marks, anatomy.tissues, tumour)

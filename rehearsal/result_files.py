@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from scenes.atomic_files import whole
+from scenes.atomic_files import atomic_write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,14 +41,14 @@ def next_number(folder: Path, pattern: str) -> int:
 def write_json(figures: dict[str, Any], path: Path) -> None:
     """Write figures as JSON. Raises ValueError for NaN and infinity, OSError."""
     text = json.dumps(figures, indent=2, allow_nan=False) + "\n"
-    with whole(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text(text, "utf-8")
 
 
 def write_csv(rows: list[dict[str, Any]], path: Path) -> None:
     """Write rows under the names that any of them has; missing values stay empty. Raises OSError."""
     names = dict.fromkeys(name for row in rows for name in row)
-    with whole(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+    with atomic_write(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         lines = csv.DictWriter(file, list(names))
         lines.writeheader()
         lines.writerows(rows)
@@ -56,5 +56,5 @@ def write_csv(rows: list[dict[str, Any]], path: Path) -> None:
 
 def save_figure(figure: "Figure", path: Path, **options: Any) -> None:
     """Write a figure with Matplotlib's options. Raises OSError."""
-    with whole(path) as partial:
+    with atomic_write(path) as partial:
         figure.savefig(partial, **options)

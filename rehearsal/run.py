@@ -41,7 +41,7 @@ from render.keys import Keys
 from render.viewer import Settings
 from render.window import NoVulkan
 from scenes.anatomy import LoadedAnatomy
-from scenes.shell_quoting import pasted
+from scenes.terminal import shell_command
 
 
 @dataclass
@@ -202,7 +202,7 @@ class RehearsalRun:
     def _replay_command(self, session: Path) -> str:
         """The command line that replays a session, quoted for the shell."""
         scene = [] if self.scene is None else [self.scene]
-        return pasted("rehearse", *scene, "--replay", session)
+        return shell_command("rehearse", *scene, "--replay", session)
 
 
 def _verdict(replay: Replay | None) -> str:

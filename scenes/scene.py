@@ -1,7 +1,7 @@
-"""The scene file: what is modelled and how, one TOML file with a unit in the name of every key that has one.
+"""The scene file: one TOML file that states what is modelled and how; the unit is in the name of each key.
 
 Lengths are mm in patient coordinates (LPS), times s, angles degrees. ``load_scene`` refuses unknown keys, units
-other than the schema's, and values out of range, each by name.
+other than the schema's, and values out of range, and names each.
 """
 
 import tomllib
@@ -15,13 +15,12 @@ from pydantic import AliasChoices, BaseModel, Field, ValidationError, model_vali
 from errors import UserError, explained, meant
 from scenes.section import Direction, Length, Section, Vector3
 from scenes.tissue import TISSUES, NeoHookeanTissue, Tissue
-from scenes.trocar import Trocar
 
-# The scene that the program has with it.
+# The scene of the embedded patient.
 EMBEDDED = Path(__file__).parent / "phantom.toml"
-# The same patient, pressed with a transducer of the paper's size as deep as the paper does; what studies measure.
+# The same patient, with the transducer and the indentation depths of the paper; the studies use it.
 PAPER = Path(__file__).parent / "paper.toml"
-# The command line's names for single values of a scene.
+# Command line options for single values of a scene.
 OPTIONS = {
     "tissue.model": "--model",
     "tissue.cell_mm": "--cell",
@@ -38,13 +37,14 @@ OPTIONS = {
 
 
 class SceneError(UserError):
-    """A scene that cannot be used; the message is one line that says where, what was found and what to do."""
+    """A scene that cannot be used."""
 
 
 class AnatomyFiles(Section):
-    """The embedded patient, or files beside the scene; without a CT there is no picture.
+    """The embedded patient, or files in the scene's folder; without a CT there is no image.
 
-    ``parts`` are surfaces of what else is in the organ, by tissue. ``tissues`` says what each value of ``labels`` is for sound: a tissue of ``ultrasound/tissues.toml``.
+    ``parts`` are further surfaces in the organ, by tissue. ``tissues`` maps each value of ``labels`` to a tissue of
+    ``ultrasound/tissues.toml``.
     """
 
     phantom: bool = False
@@ -62,15 +62,15 @@ class AnatomyFiles(Section):
         )
         if self.phantom and named:
             raise ValueError(
-                "phantom = true is the embedded patient, which has files of its own: name no others"
+                "phantom = true is the embedded patient, which has its own files: name no others"
             )
         return self
 
 
 class SolverSection(Section):
-    """One time step. What is left out is the tissue model's own choice; that of shape matching is the paper's Table 1.
+    """One time step. Values that are left out are the tissue model's defaults; those of shape matching are the paper's Table 1.
 
-    ``relaxation`` (Eq. 7), ``stabilisation_iterations`` and ``mass_scaling_per_mm`` are shape matching's.
+    ``relaxation`` (Eq. 7), ``stabilisation_iterations`` and ``mass_scaling_per_mm`` belong to shape matching.
     """
 
     time_step_s: float = Field(1 / 60, gt=0, le=0.1)
@@ -89,7 +89,7 @@ class Gravity(Section):
 
 
 class Contact(Section):
-    """``particles`` switches contacts of shape matching's particles with each other on."""
+    """``particles`` switches self-contact of shape matching's particles on."""
 
     shape_friction: float = Field(0.35, ge=0, le=10)
     particle_friction: float = Field(0.25, ge=0, le=10)
@@ -97,7 +97,7 @@ class Contact(Section):
 
 
 class Attachment(Section):
-    """Tissue that stays where it is, such as the hilum by its vessels: all within ``radius_mm`` of ``at_mm``; 0: none."""
+    """A fixed boundary, such as the hilum: all nodes within ``radius_mm`` of ``at_mm``; 0: none."""
 
     at_mm: Vector3 | None = None
     radius_mm: float = Field(0.0, ge=0, le=100)
@@ -105,7 +105,9 @@ class Attachment(Section):
     @model_validator(mode="after")
     def _somewhere(self) -> "Attachment":
         if self.radius_mm > 0 and self.at_mm is None:
-            raise ValueError("attachment.radius_mm needs a place: give attachment.at_mm, or leave both out")
+            raise ValueError(
+                "attachment.radius_mm needs a position: give attachment.at_mm, or leave both out"
+            )
         return self
 
 
@@ -130,10 +132,10 @@ class DistanceShape(Section):
 
 
 class Transducer(Section):
-    """A probe, by the name of one that comes with the program or of a file beside the scene; it moves as fast as a hand.
+    """A probe: the name of one in ``ultrasound/probes``, or of a file in the scene's folder; it moves at ``speed_mm_s`` at most.
 
-    It is a cuboid, lateral x elevation x length: the probe's housing, unless ``size_mm`` says otherwise. The window warns where it
-    squeezes the tissue before it by more than ``compression_warning_mm``.
+    Its shape is a cuboid, lateral x elevation x length: the probe's housing, or ``size_mm``. The window warns where the tissue
+    under it is compressed by more than ``compression_warning_mm``.
     """
 
     probe: str = "linear"
@@ -142,11 +144,25 @@ class Transducer(Section):
     compression_warning_mm: float = Field(8.0, gt=0, le=100)
 
 
-class Image(Section):
-    """The ultrasound panel: which picture, its level of detail (``rung`` in scenes of version 1.0), and the CT window.
+class Trocar(Section):
+    """The instrument's port, a remote centre of motion: the shaft passes ``at_mm``, within a cone, and ends in a wrist.
 
-    The depth is the probe's, unless it is given. Sound leaves where the organ is nearer to the array than ``contact_gap_mm``; with
-    ``contact`` "tissue", where anything but gas is.
+    ``axis`` points into the body; its default is the direction to the target. ``wrist_deg`` is the largest angle between probe and
+    shaft: 0 for a rigid one. Without ``at_mm`` the instrument's path is not checked.
+    """
+
+    at_mm: Vector3 | None = None
+    axis: Direction | None = None
+    cone_deg: float = Field(50.0, gt=0, le=90)
+    wrist_deg: float = Field(90.0, ge=0, le=180)
+    longest_mm: Length = 250.0
+
+
+class Image(Section):
+    """The ultrasound panel: the kind of image, its detail level (``rung`` in scenes of version 1.0), and the CT window.
+
+    The default depth is the probe's. An element is in contact where the organ is closer to the array than ``contact_gap_mm``; with
+    ``contact`` "tissue", where the CT shows anything but gas.
     """
 
     mode: Literal["ct", "b-mode", "both"] = "both"
@@ -163,10 +179,10 @@ class Image(Section):
 
 
 class Press(Section):
-    """The scripted press, with the paper's warm-up and steps a stage.
+    """The scripted press, with the paper's warm-up and number of steps per stage.
 
-    After the warm-up, in which the organ settles on its support, the transducer's axis goes through ``target_mm``
-    along ``direction``, its image's width along ``lateral``; it starts where it just touches the organ and goes down
+    After the warm-up, in which the organ settles on its support, the transducer's axis passes ``target_mm`` along
+    ``direction``, with the image's lateral axis along ``lateral``. It starts where it just touches the organ and presses
     to each of ``indentations_mm``.
     """
 
@@ -179,7 +195,7 @@ class Press(Section):
 
 
 class Scene(Section):
-    """A whole scene. ``shape`` lists what does not move: the support first."""
+    """A scene. ``shape`` lists the rigid shapes: the support first."""
 
     title: str = ""
     anatomy: AnatomyFiles
@@ -204,14 +220,14 @@ class Scene(Section):
         if self.attachment.radius_mm > 0 and not self.tissue.CAN_BE_HELD:
             able = " or ".join(name for name, section in TISSUES.items() if section.CAN_BE_HELD)
             raise ValueError(
-                f"attachment.radius_mm holds nodes: set tissue.model to {able}, or the radius to 0"
+                f"attachment.radius_mm fixes nodes: set tissue.model to {able}, or the radius to 0"
             )
         return self
 
 
-# What a file is that is given in a scene's place, by how its name ends, and what takes it.
-NO_SCENES: dict[str | tuple[str, ...], str] = {
-    ".igs.mha": "a tracked sweep: app.py reconstruct and rehearse --track take it",
+# Files that are given by mistake instead of a scene, by the end of their names, and the commands that read them.
+NOT_SCENES: dict[str | tuple[str, ...], str] = {
+    ".igs.mha": "a tracked sweep: give it to app.py reconstruct or rehearse --track",
     (
         ".dcm",
         ".nii",
@@ -219,35 +235,33 @@ NO_SCENES: dict[str | tuple[str, ...], str] = {
         ".nrrd",
         ".mha",
         ".zip",
-    ): "a CT or labels: app.py import makes a patient's folder of them",
-    ".jsonl": "a session: rehearse --replay takes it",
-    (".json", ".csv"): "a plan or poses: rehearse --plan, rehearse --track and scan --pose take them",
-    (".stl", ".ply"): "a surface: a scene's [anatomy] names it",
-    ".xml": "a PLUS configuration: reconstruct --config takes it",
+    ): "a CT or labels: app.py import makes a patient's folder from them",
+    ".jsonl": "a session: give it to rehearse --replay",
+    (".json", ".csv"): "a plan or poses: give it to rehearse --plan, rehearse --track or scan --pose",
+    (".stl", ".ply"): "a surface: name it in a scene's [anatomy]",
+    ".xml": "a PLUS configuration: give it to reconstruct --config",
     (".png", ".webp", ".jpg", ".jpeg"): "a picture",
 }
 EXPECTED = "expected a scene file (TOML) or a patient's folder"
 
 
 def scene_file(named: Path) -> Path:
-    """The scene file that a path names: itself, or that of a patient's folder. Raises SceneError."""
+    """A path to a scene file: ``named`` itself, or scene.toml of a patient's folder. Raises SceneError."""
     if not named.is_dir():
         return named
     path = named / "scene.toml"
     if not path.is_file():
         if session := next(named.glob("session-*.jsonl"), None):
             raise SceneError(
-                f"{named}: holds {session.name}, a session: rehearse --replay takes that file; {EXPECTED}"
+                f"{named}: contains {session.name}, a session: give that file to rehearse --replay; {EXPECTED}"
             )
-        raise SceneError(f"{named}: holds no scene.toml; make a patient's folder of a CT with: app.py import")
+        raise SceneError(f"{named}: has no scene.toml; make a patient's folder from a CT with: app.py import")
     return path
 
 
 def load_scene(path: Path) -> Scene:
-    """Read a scene file; a probe's file is named by its whole path. Raises SceneError with one line that names the file, the key and
-    the mend.
-    """
-    for ends, what in NO_SCENES.items():
+    """Read a scene file; a probe's file gets its absolute path. Raises SceneError that names the file, the key and the remedy."""
+    for ends, what in NOT_SCENES.items():
         if path.name.lower().endswith(ends) and path.is_file():
             raise SceneError(f"{path}: is {what}; {EXPECTED}")
     try:
@@ -255,7 +269,7 @@ def load_scene(path: Path) -> Scene:
     except FileNotFoundError:
         raise SceneError(f"{path}: no such scene file or patient's folder") from None
     except UnicodeDecodeError:
-        raise SceneError(f"{path}: is no text; {EXPECTED}") from None
+        raise SceneError(f"{path}: is not a text file; {EXPECTED}") from None
     except OSError as error:
         raise SceneError(f"{path}: cannot be read as a scene ({_first_line(error)})") from None
     except tomllib.TOMLDecodeError as error:
@@ -267,7 +281,7 @@ def load_scene(path: Path) -> Scene:
 
 
 def _with_probe_beside(path: Path, scene: Scene) -> Scene:
-    """A scene that names its probe's file from anywhere; probes that come with the program have names without a suffix."""
+    """The scene with the absolute path of its probe's file; the program's own probes have names without a suffix."""
     named = path.parent / scene.transducer.probe
     if not named.suffix:
         return scene
@@ -278,7 +292,7 @@ def _with_probe_beside(path: Path, scene: Scene) -> Scene:
 def with_options(scene: Scene, options: Mapping[str, float | int | str | None]) -> Scene:
     """The scene with single values changed, such as ``{"tissue.radius_mm": 3.0}``; None leaves what is there.
 
-    A value that only another tissue model has asks for that model, which starts from its own defaults. A probe's file is named
+    A value that only another tissue model has selects that model, which starts from its own defaults. A probe's file is named
     from where the program was started, not from beside the scene. Raises SceneError for a value out of range, and for values of
     two models.
     """
@@ -302,14 +316,14 @@ def with_options(scene: Scene, options: Mapping[str, float | int | str | None]) 
 
 
 def model_with(keys: Iterable[str], usual: str) -> str:
-    """The tissue model that has all of some keys that belong to any: the usual one where it will do."""
+    """A tissue model that has all of the given keys of tissue models: ``usual`` where it has them."""
     special = {key for key in keys if any(key in section.model_fields for section in TISSUES.values())}
     having = [name for name, section in TISSUES.items() if special <= set(section.model_fields)]
     return having[0] if having and usual not in having else usual
 
 
 def scene_text(scene: Scene) -> str:
-    """The scene as TOML, every key with its value, so that a reader finds what can be changed."""
+    """The scene as TOML with the value of every key."""
     values = scene.model_dump(mode="json", exclude_none=True)
     return tomli_w.dumps(values)
 
@@ -319,12 +333,12 @@ def _explain(error: ValidationError) -> str:
 
 
 def _unknown(where: list[str]) -> str:
-    """What is to be done about a key that is unknown here."""
+    """The advice for an unknown key."""
     return _owner(where) or f"unknown key; {_suggest(where)}"
 
 
 def _owner(where: list[str]) -> str:
-    """Whose key it is that another tissue model does not have; empty where it is nobody's."""
+    """The advice for a key of another tissue model; empty for other keys."""
     owners = [model for model, section in TISSUES.items() if where[-1] in section.model_fields]
     if where[0] != "tissue" or not owners:
         return ""
@@ -332,7 +346,7 @@ def _owner(where: list[str]) -> str:
 
 
 def _suggest(where: list[str]) -> str:
-    """What the writer of an unknown key may have meant; a unit other than the schema's is named as such."""
+    """The likely intended key; a unit other than the schema's is reported as such."""
     known = _keys_beside(where)
     key = where[-1]
     for name in known:

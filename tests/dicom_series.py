@@ -26,9 +26,9 @@ from pydicom.uid import (
 )
 from synthetic_body import DIRECTIONS
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.ct_files import open_ct
-from scenes.patients.readers.lazy_volume import LazyVolume
+from scenes.volumes.lazy_volume import LazyVolume
 
 PERSON = {
     "PatientName": "Doe^Jane",
@@ -51,14 +51,14 @@ def read_ct(path: Path, **options: str) -> tuple[LazyVolume, np.ndarray]:
 def refusal(
     path: Path, read: Callable[[Path], object] = read_ct, name: str | None = None, **options: str
 ) -> str:
-    """What is said of a path, or a file in it, that cannot be read: one line that names it, and no person."""
+    """The error for a path or a file in it: one line that names the file, and no person."""
     with pytest.raises(PatientError) as caught:
         read(path, **options)
     words = str(caught.value)
     assert words.isprintable() and (name or path.name) in words
-    said = words.replace(str(path), "")
-    assert not any(part in said for part in ("Doe", "Jane", "4711", "19600229", "A1234567"))
-    return said
+    message = words.replace(str(path), "")
+    assert not any(part in message for part in ("Doe", "Jane", "4711", "19600229", "A1234567"))
+    return message
 
 
 class Series:

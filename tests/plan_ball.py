@@ -8,7 +8,7 @@ import trimesh
 from rehearsal.planning.plan_file import Plan, PlannedSweep
 from rehearsal.planning.sweep_path import SweepLayout, layout_towards
 from rehearsal.planning.sweep_score import ScoreTerms
-from scenes.trocar import Trocar
+from scenes.scene import Trocar
 from ultrasound.probe import load_probe
 from ultrasound.probe_manipulator import ProbeManipulator, image_plane, pose_at
 

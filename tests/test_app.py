@@ -235,7 +235,7 @@ def test_mistakes_are_one_line(tmp_path):
     (tmp_path / "scene.toml").write_text("[anatomy]\n[tissue]\ncell_cm = 1\n")
     assert "write cell_mm" in refused("rehearse", tmp_path)
     (tmp_path / "empty").mkdir()
-    assert "holds no scene.toml" in refused("rehearse", tmp_path / "empty")
+    assert "has no scene.toml" in refused("rehearse", tmp_path / "empty")
 
 
 @pytest.mark.parametrize(

@@ -18,9 +18,8 @@ import app
 from rehearsal.planning.plan_file import Plan, PlannedSweep
 from rehearsal.sessions.session_file import End, Event, Header, Second
 from rehearsal.tracking.pose_file import load_poses, load_timed_poses
-from scenes.scene import Image, Scene
+from scenes.scene import Image, Scene, Trocar
 from scenes.tissue import NeoHookeanTissue, ShapeMatchingTissue
-from scenes.trocar import Trocar
 from ultrasound.probe import Probe
 
 DOCS = ROOT / "docs"

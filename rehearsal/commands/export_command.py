@@ -7,12 +7,11 @@ import trimesh
 
 from rehearsal.result_files import counted
 from scenes.anatomy import LoadedAnatomy, files_of, load_anatomy
+from scenes.atomic_files import check_folder, new_folder
 from scenes.patients.part_surfaces import PARTS
-from scenes.patients.patient_folder import check_folder, new_folder
-from scenes.patients.readers.volume_readers import file_volume
 from scenes.scene import Scene, load_scene, scene_file
-from scenes.surface_files import FORMATS, save_surface
-from scenes.volume_files import save_image
+from scenes.surfaces import FORMATS, save_surface
+from scenes.volumes.volume_files import file_volume, save_image
 
 
 @click.command()

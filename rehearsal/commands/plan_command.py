@@ -17,9 +17,8 @@ from rehearsal.commands.command_line import (
 from rehearsal.configuration import probe_of, with_quality
 from rehearsal.planning.plan_file import FASTEST_MM_S, MOST_MARGIN_MM, MOST_SWEEPS, SLOWEST_MM_S, write_plan
 from scenes.anatomy import load_anatomy
-from scenes.scene import EMBEDDED, load_scene, scene_file, with_options
-from scenes.shell_quoting import pasted
-from scenes.trocar import Trocar
+from scenes.scene import EMBEDDED, Trocar, load_scene, scene_file, with_options
+from scenes.terminal import shell_command
 from ultrasound.target import TARGETS, Target
 
 
@@ -112,7 +111,7 @@ def rehearse_command_line(scene: Path, plan_file: Path, probe: str | None) -> st
     """The command line that follows a plan, with the same probe."""
     scene_argument = [] if scene == EMBEDDED else [scene]
     probe_option = [] if probe is None else ["--probe", probe]
-    return pasted("rehearse", *scene_argument, *probe_option, "--plan", plan_file)
+    return shell_command("rehearse", *scene_argument, *probe_option, "--plan", plan_file)
 
 
 def trocar_of(

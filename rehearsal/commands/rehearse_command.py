@@ -33,8 +33,8 @@ from rehearsal.tracking.track_file import PROBE_IN_PATIENT, load_track
 from render.display import display_available
 from render.keys import Keys, keys_text, load_keys
 from scenes.anatomy import LoadedAnatomy, load_anatomy
-from scenes.progress import ReportProgress, Stages
 from scenes.scene import EMBEDDED, OPTIONS, Scene, load_scene, scene_file, with_options
+from scenes.terminal import ReportProgress, Stages
 from scenes.tissue import TISSUES
 from ultrasound.probe import DETAIL_LEVELS, MODES, Probe
 

@@ -3,7 +3,7 @@
 import igl
 import numpy as np
 
-from scenes.trocar import Trocar
+from scenes.scene import Trocar
 from ultrasound.probe_manipulator import ProbeManipulator
 
 # Within this distance of the probe the shaft may touch the organ [mm].

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from errors import UserError
 from rehearsal.result_files import next_number
 from rehearsal.tracking.pose_file import Pose, TimedPoses, is_rigid
-from scenes.atomic_files import whole
-from scenes.trocar import Trocar
+from scenes.atomic_files import atomic_write
+from scenes.scene import Trocar
 from ultrasound.target import Target
 
 MOST_POSES, MOST_MARGIN_MM = 20_000, 30.0
@@ -99,7 +99,7 @@ class Plan(_FileModel):
 
 def write_plan(plan: Plan, path: Path) -> None:
     """Write a plan; the same plan gives the same bytes. Raises OSError."""
-    with whole(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text(json.dumps(plan.model_dump(mode="json"), indent=1) + "\n", "utf-8")
 
 

@@ -29,8 +29,7 @@ from rehearsal.planning.sweep_trial import Trial
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.worker_processes import end_with_parent
 from scenes.anatomy import LoadedAnatomy, fingerprint
-from scenes.scene import Scene
-from scenes.trocar import Trocar
+from scenes.scene import Scene, Trocar
 from ultrasound.coverage import VOXEL_MM, Coverage
 from ultrasound.probe import Probe
 from ultrasound.target import Target

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from rehearsal.reconstruction.sweep_volumes import SweepVolumes
 from rehearsal.result_files import save_figure
-from scenes.volume_files import save_image
+from scenes.volumes.volume_files import save_image
 from ultrasound.reconstruction import VoxelBox
 from ultrasound.sweep import Mark
 

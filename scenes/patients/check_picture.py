@@ -1,6 +1,4 @@
-"""The checking picture of an import: three slices with outlines, the surfaces, orientation letters, what was found."""
-
-from __future__ import annotations
+"""The check image of an import: slices with outlines, the surfaces, orientation letters, the summary."""
 
 import textwrap
 from dataclasses import dataclass
@@ -17,11 +15,11 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from scenes.patients.import_summary import told
+from scenes.patients.import_summary import as_table
 from scenes.patients.patient_import import Patient
 from scenes.patients.readers.label_maps import Colour
-from scenes.patients.readers.lazy_volume import AIR_HU
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.volumes.lazy_volume import AIR_HU
+from scenes.volumes.voxel_grid import VoxelGrid
 
 BACKGROUND, WARNING = "#101014", "#ffb000"
 PIXEL_MM = 0.5
@@ -37,7 +35,7 @@ COLOUR = {
 WORD = {"organ": "kidney", "urine": "collecting system", "vessel": "vessels"}
 LEAST_BRIGHT = 0.85
 TEXT_WIDTH = 56
-# White with a black rim, to be read on bone and on air.
+# White with a black outline, readable on bone and on air.
 LETTER: dict[str, Any] = dict(
     color="white",
     weight="bold",
@@ -46,15 +44,15 @@ LETTER: dict[str, Any] = dict(
     path_effects=[withStroke(linewidth=3, foreground="black")],
 )
 LIGHT = np.array([-0.4, -0.8, 0.45])  # from the front, the patient's right and above
-# From where surfaces are looked at, and to which side of the patient their light is turned.
+# View azimuth [degrees], and the signs of the light's direction.
 AZIMUTH = {"from the front": (-105, np.ones(3)), "from behind": (75, np.array([-1.0, -1.0, 1.0]))}
-# An overview is worth a panel that shows so many times the width.
-WIDER = 1.2
+# The overview has a panel where it is this many times as wide as the CT around the organ.
+LEAST_WIDER = 1.2
 
 
 @dataclass(frozen=True)
 class CheckView:
-    """A cut as a radiologist sees it: where right and down of the picture point in the patient, and the letters there."""
+    """A slice in radiological convention: the image's right and down axes in LPS, and the orientation letters."""
 
     name: str
     right: tuple[int, int, int]
@@ -67,30 +65,30 @@ VIEWS = (
     CheckView("coronal, from the front", (1, 0, 0), (0, 0, -1), ("R", "L", "S", "I")),
     CheckView("sagittal, from the left", (0, 1, 0), (0, 0, -1), ("A", "P", "S", "I")),
 )
-WHOLE = CheckView("coronal, the whole width", (1, 0, 0), (0, 0, -1), ("R", "L", "S", "I"))
+OVERVIEW = CheckView("coronal, full width", (1, 0, 0), (0, 0, -1), ("R", "L", "S", "I"))
 
 
 def draw_check(patient: Patient, rows: list[tuple[str, str]], folder: Path) -> None:
-    """Draw check.png into a folder: cuts through the tumour, or the organ where there is none, and all that was found."""
+    """Draw check.png into a folder: slices through the tumour, or else the organ, the surfaces and the summary."""
     figure = Figure(figsize=(13, 9.6), facecolor=BACKGROUND)
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 3, hspace=0.08, wspace=0.06)
     grid.update(left=0.03, right=0.97, top=0.92, bottom=0.02)
-    draft = " (DRAFT, grown from a seed)" if patient.draft else ""
-    question = "is this the side, the organ and the way up that you expect?"
+    draft = " (DRAFT, region growing from a seed)" if patient.draft else ""
+    question = "are the side, the organ and the orientation correct?"
     colour = "white"
-    if patient.cautions:
-        question, colour = "read the CAUTION, and compare with the patient", WARNING
+    if patient.warnings:
+        question, colour = "read the WARNING, and compare with the patient", WARNING
     figure.suptitle(f"{patient.side.upper()} KIDNEY{draft}: {question}", color=colour, fontsize=15)
     colours = colours_of(patient)
     surfaces = {"organ": patient.organ, **patient.parts}
     middle = (patient.tumour or patient.organ).bounds.mean(axis=0)
     around = {"support": patient.support, **surfaces}
     for n, view in enumerate(VIEWS):
-        _draw_cut(figure.add_subplot(grid[0, n]), view, patient.ct, around, middle, colours)
+        _draw_slice(figure.add_subplot(grid[0, n]), view, patient.ct, around, middle, colours)
     _draw_surfaces(_solid(figure, grid[1, 0]), "from the front", surfaces, colours)
     if is_wider(patient.overview, patient.ct):
-        _draw_cut(figure.add_subplot(grid[1, 1]), WHOLE, patient.overview, surfaces, middle, colours)
+        _draw_slice(figure.add_subplot(grid[1, 1]), OVERVIEW, patient.overview, surfaces, middle, colours)
     else:
         _draw_surfaces(_solid(figure, grid[1, 1]), "from behind", surfaces, colours)
     words = figure.add_subplot(grid[1, 2])
@@ -102,7 +100,7 @@ def draw_check(patient: Patient, rows: list[tuple[str, str]], folder: Path) -> N
 
 
 def colours_of(patient: Patient) -> dict[str, Colour]:
-    """What organ, parts and support are drawn in: their files' own colours, made bright enough for a dark ground."""
+    """Colours of organ, parts and support: those of the label files, brightened for the dark background."""
     own = {name: _bright(colour) for name, colour in patient.colours.items()}
     return {name: to_rgb(colour) for name, colour in COLOUR.items()} | own
 
@@ -112,7 +110,7 @@ def _bright(colour: Colour) -> Colour:
     return colour[0] * scale, colour[1] * scale, colour[2] * scale
 
 
-def _draw_cut(
+def _draw_slice(
     axes: Axes,
     view: CheckView,
     ct: sitk.Image,
@@ -123,7 +121,7 @@ def _draw_cut(
     right, down = np.array(view.right, float), np.array(view.down, float)
     low, high = VoxelGrid.of(ct).bounds()
     spans = [sorted((low @ axis, high @ axis)) for axis in (right, down)]
-    picture = cut(ct, right, down, spans, middle)
+    picture = resample_plane(ct, right, down, spans, middle)
     black = LEVEL_HU - WINDOW_HU / 2
     extent = (*spans[0], spans[1][1], spans[1][0])
     axes.imshow(
@@ -139,10 +137,10 @@ def _draw_cut(
         axes.text(*place, letter, transform=axes.transAxes, fontsize=17, **LETTER)
 
 
-def cut(
+def resample_plane(
     image: sitk.Image, right: np.ndarray, down: np.ndarray, spans: list[list[float]], middle: np.ndarray
 ) -> np.ndarray:
-    """HU on a plane through the middle, across two spans [mm]."""
+    """HU on a plane through ``middle``, over two spans [mm]."""
     across = np.cross(right, down)
     origin = right * spans[0][0] + down * spans[1][0] + across * (middle @ across)
     width, height = (int((high - low) / PIXEL_MM) + 1 for low, high in spans)
@@ -152,11 +150,11 @@ def cut(
 
 
 def is_wider(overview: sitk.Image, ct: sitk.Image) -> bool:
-    """Whether an overview shows more of the body's width than a CT that was cut out of it."""
+    """Whether the overview shows more of the body's width than the cropped CT."""
     width_mm, shown_mm = (
         np.ptp([corner[0] for corner in VoxelGrid.of(each).bounds()]) for each in (overview, ct)
     )
-    return bool(width_mm > WIDER * shown_mm)
+    return bool(width_mm > LEAST_WIDER * shown_mm)
 
 
 def _solid(figure: Figure, place: Any) -> Any:
@@ -166,7 +164,7 @@ def _solid(figure: Figure, place: Any) -> Any:
 def _draw_surfaces(
     axes: Any, view: str, surfaces: dict[str, trimesh.Trimesh], colours: dict[str, Colour]
 ) -> None:
-    """The surfaces from the front or from behind, a little from aside and above."""
+    """The surfaces, from the front or from behind."""
     azimuth_deg, towards = AZIMUTH[view]
     corners = np.concatenate([surface.bounds for surface in surfaces.values()])
     low, high = corners.min(axis=0), corners.max(axis=0)
@@ -201,7 +199,7 @@ def _draw_words(axes: Axes, rows: list[tuple[str, str]], shown: dict[str, Colour
         wrapped = textwrap.wrap(line, TEXT_WIDTH - 11) or [""]
         lines += [(word, wrapped[0]), *(("", more) for more in wrapped[1:])]
     place: dict[str, Any] = dict(transform=axes.transAxes)
-    axes.text(0.0, 0.95, told(lines), color="white", family="monospace", fontsize=8.5, va="top", **place)
+    axes.text(0.0, 0.95, as_table(lines), color="white", family="monospace", fontsize=8.5, va="top", **place)
     for n, (name, colour) in enumerate(shown.items()):
         left, low = 0.5 * (n % 2), 0.12 - 0.055 * (n // 2)
         axes.text(left, low, WORD.get(name, name), color=colour, fontsize=11, weight="bold", **place)

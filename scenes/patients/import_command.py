@@ -1,18 +1,18 @@
-"""The command ``import``: a patient's folder, with a scene, out of a CT and its labels."""
+"""The command ``import``: makes a patient's folder with a scene from a CT and its labels."""
 
 from pathlib import Path
 
 import click
 import numpy as np
 
-from scenes.patients.import_error import PatientError
-from scenes.patients.patient_folder import check_folder, save_patient
+from errors import PatientError
+from scenes.atomic_files import check_folder
+from scenes.patients.patient_folder import save_patient
 from scenes.patients.readers.segment_names import Side
-from scenes.progress import bar
 from scenes.scene import scene_text
-from scenes.shell_quoting import pasted
+from scenes.terminal import bar, shell_command
 
-# Options that say which labels are of a tissue.
+# Options that assign labels to a tissue.
 TISSUE_OPTIONS = {"tumour": "tumour", "cyst": "cyst", "vessels": "vessel", "collecting": "urine"}
 LABEL = "Names or values of the labels"
 
@@ -32,12 +32,14 @@ LABEL = "Names or values of the labels"
 @click.option("--collecting", help=f"{LABEL} of the collecting system [by name].")
 @click.option("--side", type=click.Choice(["left", "right"]), help="Which kidney, where there are both.")
 @click.option("--series", help="Number of the CT series, or the end of its uid [the best guess].")
-@click.option("--seed", help="X,Y,Z in mm, LPS: without labels, grow a draft of the kidney from there.")
+@click.option(
+    "--seed", help="X,Y,Z in mm, LPS: without labels, a draft of the kidney by region growing from there."
+)
 @click.option(
     "--support",
     default="mould",
     show_default=True,
-    help="What the organ lies on: a mould of its underside, the bed that the labels around it make (labels), or a surface in a "
+    help="What the organ rests on: a mould of its underside, a bed made from the labels around it (labels), or a surface in a "
     "file (LPS, mm).",
 )
 def import_patient_command(
@@ -51,48 +53,54 @@ def import_patient_command(
     support: str,
     **words: str | None,
 ) -> None:
-    """Make a patient's folder out of a CT and its LABELS.
+    """Make a patient's folder from a CT and its LABELS.
 
-    The folder holds the scene to rehearse in.
+    The folder contains the scene to rehearse.
 
-    CT: a folder with DICOM, a DICOMDIR or zip archive, a NIfTI, NRRD or MHA file. LABELS: label maps, a folder with a file
-    an organ, DICOM-SEG, RTSTRUCT; without them those that lie with the CT.
+    CT: a folder with DICOM, a DICOMDIR or zip archive, a NIfTI, NRRD or MHA file. LABELS: label maps, a folder with one
+    file per organ, DICOM-SEG, RTSTRUCT; by default the segmentation in the CT's folder.
     """
     check_folder(out)
-    # What draws and what reads segmentations takes half a second that no other command should wait for.
-    from scenes.anatomy import patient_scene
+    # Matplotlib and highdicom take 0.5 s to import.
     from scenes.patients.check_picture import draw_check
-    from scenes.patients.import_request import Request, take_in
-    from scenes.patients.import_summary import facts, told
+    from scenes.patients.import_request import ImportRequest, import_request
+    from scenes.patients.import_summary import as_table, summary_rows
+    from scenes.patients.patient_scene import patient_scene
 
     tissues = {TISSUE_OPTIONS[o]: label_words(text, o) for o, text in words.items() if text is not None}
     own = [] if organ is None else label_words(organ, "organ")
-    place = None if seed is None else place_mm(seed)
-    patient, private = take_in(Request(ct, labels, own, tissues, side, series, place, support), bar)
-    rows = facts(patient)
+    position = None if seed is None else position_mm(seed)
+    patient, identifiers = import_request(
+        ImportRequest(ct, labels, own, tissues, side, series, position, support), bar
+    )
+    rows = summary_rows(patient)
     texts = {"scene.toml": scene_text(patient_scene(patient))}
-    searched = save_patient(patient, out, texts, lambda folder: draw_check(patient, rows, folder), private)
-    rows.append(("private", f"{searched} names, ids, dates, uids, paths of the source: none is in the files"))
-    click.echo(told(rows))
-    click.echo(f"Written to {out}. Look at {out / 'check.png'}, then: {pasted('rehearse', out)}")
+    searched = save_patient(
+        patient, out, texts, lambda folder: draw_check(patient, rows, folder), identifiers
+    )
+    rows.append(
+        ("privacy", f"{searched} names, IDs, dates, UIDs and paths of the source: none is in the files")
+    )
+    click.echo(as_table(rows))
+    click.echo(f"Written to {out}. Check {out / 'check.png'}, then: {shell_command('rehearse', out)}")
 
 
 def label_words(text: str, option: str) -> list[str]:
-    """Names or values of an option's text, such as "1,2"."""
+    """Names or values of labels in an option's text, such as "1,2"."""
     words = [word.strip() for word in text.split(",")]
     if not all(words):
         raise PatientError(f"--{option} is {text!r}: expected names or values of labels, such as 1 or 1,2")
     return words
 
 
-def place_mm(text: str) -> np.ndarray:
-    """A place in LPS [mm] of an option's text."""
+def position_mm(text: str) -> np.ndarray:
+    """A position in LPS [mm] in an option's text."""
     try:
-        place = np.array([float(number) for number in text.split(",")])
+        position = np.array([float(number) for number in text.split(",")])
     except ValueError:
-        place = np.array([])
-    if place.shape != (3,) or not np.isfinite(place).all():
+        position = np.array([])
+    if position.shape != (3,) or not np.isfinite(position).all():
         raise PatientError(
             f"--seed is {text!r}: expected three numbers X,Y,Z in mm, LPS, such as -60,25,-310"
         )
-    return place
+    return position

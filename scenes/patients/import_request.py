@@ -1,6 +1,4 @@
-"""From paths and the user's words to a patient: finds CT and labels, puts them together, remembers what is private."""
-
-from __future__ import annotations
+"""Carry out an import request: find CT and labels, combine them, collect the patient's identifiers (PHI)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -8,21 +6,21 @@ from pathlib import Path
 
 import numpy as np
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.patient_import import Patient, import_patient
 from scenes.patients.readers.ct_files import open_ct
-from scenes.patients.readers.dicom_series import dicom_found
-from scenes.patients.readers.label_files import Drawing, drawing_of, open_labels
-from scenes.patients.readers.label_maps import LabelMap, merged, with_tissues
-from scenes.patients.readers.lazy_volume import LazyVolume
+from scenes.patients.readers.dicom_series import read_dicom_headers
+from scenes.patients.readers.label_files import Segmentation, open_labels, segmentation_of
+from scenes.patients.readers.label_maps import LabelMap, assign_tissues, merge_label_maps
 from scenes.patients.readers.segment_names import Side
-from scenes.patients.region_growing import grown
-from scenes.progress import Progress, silent
+from scenes.patients.region_growing import draft_segmentation
+from scenes.terminal import Progress, silent
+from scenes.volumes.lazy_volume import LazyVolume
 
 
 @dataclass(frozen=True)
-class Request:
-    """What the user asked for: paths, and words on labels, by names or values."""
+class ImportRequest:
+    """The user's request: paths, and labels by names or values."""
 
     ct: Path
     labels: Sequence[Path] = ()
@@ -34,23 +32,23 @@ class Request:
     support: str = "mould"
 
 
-def take_in(request: Request, progress: Progress = silent) -> tuple[Patient, set[str]]:
-    """Import a patient, and what of its source none of its files may hold. Raises PatientError."""
+def import_request(request: ImportRequest, progress: Progress = silent) -> tuple[Patient, set[str]]:
+    """The imported patient, and the identifiers that none of its files may contain. Raises PatientError."""
     if not request.ct.exists():
         raise PatientError(f"{request.ct}: no such file or folder; check the path")
     if request.seed_mm is not None:
         if request.labels or request.organ or request.tissues:
             raise PatientError(
-                "--seed grows the organ where there are no labels: give it, or labels, not both"
+                "--seed segments the organ where there are no labels: give it, or labels, not both"
             )
-        drawings: list[Drawing] = []
+        segmentations: list[Segmentation] = []
         volume = open_ct(request.ct, request.series, progress=progress)
-        labels = grown(volume, request.seed_mm)
+        labels = draft_segmentation(volume, request.seed_mm)
         notes: tuple[str, ...] = ()
     else:
-        volume, drawings, labels = with_labels(request, progress)
-        notes = tuple(note for drawing in drawings for note in drawing.notes)
-    organ = labels.called(request.organ) if request.organ else None
+        volume, segmentations, labels = with_labels(request, progress)
+        notes = tuple(note for segmentation in segmentations for note in segmentation.notes)
+    organ = labels.values_of(request.organ) if request.organ else None
     patient = import_patient(
         volume,
         labels,
@@ -60,40 +58,44 @@ def take_in(request: Request, progress: Progress = silent) -> tuple[Patient, set
         needed=set(request.tissues),
         progress=progress,
     )
-    private = set(volume.secrets).union(*(drawing.secrets for drawing in drawings))
+    identifiers = set(volume.identifiers).union(*(segmentation.identifiers for segmentation in segmentations))
     is_draft = request.seed_mm is not None
-    return replace(patient, notes=(*patient.notes, *notes), draft=is_draft), private | _paths(request)
+    return replace(patient, notes=(*patient.notes, *notes), draft=is_draft), identifiers | _paths(request)
 
 
-def with_labels(request: Request, progress: Progress) -> tuple[LazyVolume, list[Drawing], LabelMap]:
-    """A CT, the labels found for it, and one map of them all with the user's words on it. Raises PatientError."""
+def with_labels(
+    request: ImportRequest, progress: Progress
+) -> tuple[LazyVolume, list[Segmentation], LabelMap]:
+    """The CT, its segmentations, and one label map of all with the tissues that the user assigned. Raises PatientError."""
     words = [*request.organ, *(word for several in request.tissues.values() for word in several)]
-    drawings = [open_labels(path, words, progress) for path in request.labels]
-    drawings = drawings or [_beside(request.ct, progress)]
-    referenced = next((drawing.referenced for drawing in drawings if drawing.referenced), "")
+    segmentations = [open_labels(path, words, progress) for path in request.labels]
+    segmentations = segmentations or [_beside(request.ct, progress)]
+    referenced = next(
+        (segmentation.referenced for segmentation in segmentations if segmentation.referenced), ""
+    )
     volume = open_ct(request.ct, request.series, referenced, progress)
-    for drawing in drawings:
-        frames = {drawing.frame_of_reference, volume.frame_of_reference} - {""}
+    for segmentation in segmentations:
+        frames = {segmentation.frame_of_reference, volume.frame_of_reference} - {""}
         if len(frames) > 1:
             raise PatientError(
-                f"{request.ct}: the labels were drawn in another frame of reference than this series; expected the CT that they "
+                f"{request.ct}: the labels have another frame of reference than this series; expected the CT that they "
                 "were drawn on; choose it with --series, or give its folder"
             )
-    maps = [one for drawing in drawings for one in drawing.maps(volume.grid)]
-    return volume, drawings, merged(with_tissues(maps, request.organ, request.tissues))
+    maps = [one for segmentation in segmentations for one in segmentation.maps(volume.grid)]
+    return volume, segmentations, merge_label_maps(assign_tissues(maps, request.organ, request.tissues))
 
 
-def _beside(ct: Path, progress: Progress) -> Drawing:
-    """The labels that lie with a CT."""
-    found = drawing_of(dicom_found(ct, progress)) if ct.is_dir() else None
+def _beside(ct: Path, progress: Progress) -> Segmentation:
+    """The segmentation in a CT's folder."""
+    found = segmentation_of(read_dicom_headers(ct, progress)) if ct.is_dir() else None
     if found is None:
         raise PatientError(
-            f"{ct}: no labels lie with this CT; give a file or folder with LABELS, or --seed X,Y,Z for a draft"
+            f"{ct}: no labels are with this CT; give a file or folder with LABELS, or --seed X,Y,Z for a draft"
         )
     return found
 
 
-def _paths(request: Request) -> set[str]:
-    """The paths of the source, as they are and as they were given."""
+def _paths(request: ImportRequest) -> set[str]:
+    """The paths of the source, absolute and as given."""
     given = [request.ct, *request.labels]
     return {str(path.resolve()) for path in given} | {str(path) for path in given if len(path.parts) > 1}

@@ -3,10 +3,8 @@
 The order is the paper's (Camara et al. 2016, "Patient-specific modelling"): the label's iso-surface, smoothed
 with the HC-Laplacian of Vollmer, Mencl and Mueller (1999), then simplified by quadric edge collapse. What is
 added before it, because clinical slices are up to 5 mm apart, is the shape-based interpolation of Raya and
-Udupa (1990): the signed distance of the label, not the label, is resampled, so that slices leave no stairs.
+Udupa (1990): the signed distance of the label is resampled, not the label, which avoids steps between slices.
 """
-
-from __future__ import annotations
 
 import igl
 import numpy as np
@@ -18,10 +16,10 @@ from skimage.measure import marching_cubes
 
 FACES = 5000
 SMOOTHING_ITERATIONS = 20
-# The grid on which it is contoured: so many cells along a cube of the body's volume, of sizes between these [mm].
+# The contouring grid: cells along the edge of a cube of the body's volume, and limits of the cell size [mm].
 CELLS, CELL_MM = 40, (0.3, 1.0)
-# Standard deviation, in voxels, of the low-pass on the signed distance. A label knows its boundary to half a
-# voxel, so terraces of that size are not anatomy; the HC filter alone keeps them, as it pulls back by design.
+# Standard deviation, in voxels, of the low-pass filter on the signed distance. A label's boundary is known to half a
+# voxel, so terraces of that size are not anatomy; the HC filter alone preserves them.
 TERRACE_SD = 0.7
 
 
@@ -32,7 +30,7 @@ def surface_from_mask(mask: sitk.Image, faces: int = FACES) -> trimesh.Trimesh:
 
     Args:
         mask: 3D image, non-zero inside the body; any spacing [mm], origin and direction.
-        faces: wanted number of triangles; met within a few.
+        faces: number of triangles, met within a few.
 
     Returns:
         Watertight mesh of one body, normals outward; vertices in LPS [mm], shape (vertex_count, 3).
@@ -51,7 +49,7 @@ def surface_from_mask(mask: sitk.Image, faces: int = FACES) -> trimesh.Trimesh:
     even = _match_volume(_even_triangles(coarse, fine), volume)
     coarse = even if self_intersections(even) == 0 else _match_volume(coarse, volume)
 
-    # The image's own axes carry everything up to here; this is the only place where direction enters.
+    # Up to here all is in the image's axes; direction and origin are applied only here.
     direction = np.array(mask.GetDirection()).reshape(3, 3)
     origin = np.array(mask.GetOrigin()) + direction @ (corner * spacing)
     surface = trimesh.Trimesh(coarse.vertices @ direction.T + origin, coarse.faces, process=False)
@@ -65,9 +63,8 @@ def surface_from_mask(mask: sitk.Image, faces: int = FACES) -> trimesh.Trimesh:
 def _largest_solid(mask: sitk.Image) -> tuple[np.ndarray, np.ndarray]:
     """Largest face-connected body, holes filled, cropped; axes (x, y, z) and index of its first voxel.
 
-    Islands are specks of the segmentation and would become loose bodies that fall off the organ. Internal
-    holes (a cyst, a stone or sinus fat that the label leaves out) would be closed surfaces inside the tissue,
-    on which contact, sampling and skinning have no meaning; in the model they are tissue.
+    Islands would become loose bodies. Internal holes (a cyst, a stone or sinus fat that the label leaves out) would be
+    closed surfaces inside the tissue, where contact, sampling and skinning have no meaning; the model fills them.
     """
     voxels = sitk.GetArrayViewFromImage(mask).transpose(2, 1, 0) != 0
     if not voxels.any():
@@ -83,7 +80,7 @@ def _iso_surface(solid: np.ndarray, spacing: np.ndarray, step: float) -> trimesh
     rim = np.ceil(3 * step / spacing).astype(int) + 2
     padded = np.pad(solid, [(n, n) for n in rim])
     # The difference of both distances changes sign midway between voxel centres, that is at voxel faces; the
-    # distance to the inner voxels alone would lie half a voxel inside.
+    # distance to the inner voxels alone would be half a voxel inside.
     distance = ndimage.distance_transform_edt(~padded, sampling=spacing)
     distance -= ndimage.distance_transform_edt(padded, sampling=spacing)
 
@@ -114,8 +111,7 @@ def _iso_surface(solid: np.ndarray, spacing: np.ndarray, step: float) -> trimesh
 def _one_solid(levels: np.ndarray, clear_of_zero: float) -> np.ndarray:
     """Keep the largest region of negative levels, without cavities; no level nearer to zero than stated.
 
-    The low-pass may tear a thin bridge or close a cleft, and a level of exactly zero gives triangles of no
-    area, so what holds for the label is made to hold again on the grid that is contoured.
+    The low-pass filter may cut a thin bridge or close a cleft, and a level of exactly zero gives triangles of zero area.
     """
     labelled, count = ndimage.label(levels < 0)
     if count == 0:
@@ -127,8 +123,8 @@ def _one_solid(levels: np.ndarray, clear_of_zero: float) -> np.ndarray:
 def decimate(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
     """Quadric edge collapse (Garland and Heckbert 1997) to about `faces` triangles.
 
-    libigl rather than fast_simplification, though it takes a second longer: it refuses collapses that would
-    break the manifold or push the surface through itself.
+    libigl, not fast_simplification, though it takes a second longer: it refuses collapses that break the manifold or
+    make the surface intersect itself.
     """
     if len(surface.faces) <= faces:
         return surface
@@ -138,16 +134,16 @@ def decimate(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, triangles, process=False)
 
 
-def _even_triangles(coarse: trimesh.Trimesh, fine: trimesh.Trimesh, passes: int = 8) -> trimesh.Trimesh:
-    """Slide the vertices along the fine surface towards the middle of their neighbours.
+def _even_triangles(coarse: trimesh.Trimesh, fine: trimesh.Trimesh, iterations: int = 8) -> trimesh.Trimesh:
+    """Move the vertices along the fine surface towards the mean of their neighbours (tangential Laplacian smoothing).
 
-    Edge collapse leaves needles, and needles make poor contact normals and skinning weights. Connectivity
-    and shape stay: each pass ends on the fine surface again.
+    Edge collapse leaves needles, which have poor contact normals and skinning weights. Connectivity and shape are kept:
+    each iteration projects onto the fine surface.
     """
     neighbours = trimesh.smoothing.laplacian_calculation(coarse)
     vertices = coarse.vertices.view(np.ndarray)
     fine_vertices, fine_faces = fine.vertices.view(np.ndarray), fine.faces.view(np.ndarray)
-    for _ in range(passes):
+    for _ in range(iterations):
         middle = 0.5 * (vertices + neighbours.dot(vertices))
         _, _, vertices = igl.point_mesh_squared_distance(middle, fine_vertices, fine_faces)
     return trimesh.Trimesh(vertices, coarse.faces, process=False)
@@ -156,8 +152,8 @@ def _even_triangles(coarse: trimesh.Trimesh, fine: trimesh.Trimesh, passes: int 
 def _match_volume(surface: trimesh.Trimesh, volume: float) -> trimesh.Trimesh:
     """The surface with its vertices offset along their normals until it encloses `volume` [mm^3].
 
-    dV = A * offset to first order, so three Newton steps leave nothing that could be measured; the offset
-    itself is what smoothing and chords took, about a tenth of a millimetre.
+    dV = A * offset to first order, so three Newton steps suffice; the offset is what smoothing and chords removed, about
+    0.1 mm.
     """
     matched = surface.copy()
     for _ in range(3):
@@ -167,11 +163,11 @@ def _match_volume(surface: trimesh.Trimesh, volume: float) -> trimesh.Trimesh:
 
 
 def self_intersections(surface: trimesh.Trimesh) -> int:
-    """Number of edge-through-triangle crossings of a mesh with itself (triangles that share no vertex)."""
+    """Number of crossings of edges and triangles that share no vertex."""
     triangles, faces = surface.triangles.view(np.ndarray), surface.faces.view(np.ndarray)
     low, high, centres = triangles.min(axis=1), triangles.max(axis=1), triangles.mean(axis=1)
     reach = np.linalg.norm(triangles - centres[:, None], axis=2).max(axis=1)
-    # Each pair is found from its larger triangle, so that the few large ones do not widen every search.
+    # Search from the larger triangle of each pair, so that a few large ones do not widen every search.
     near = cKDTree(centres).query_ball_point(centres, 2 * reach, return_sorted=False)
     first = np.repeat(np.arange(len(faces)), [len(n) for n in near])
     second = np.concatenate([np.asarray(n, int) for n in near])
@@ -190,7 +186,7 @@ def self_intersections(surface: trimesh.Trimesh) -> int:
 
 
 def _crosses(start: np.ndarray, end: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-    """Whether each segment passes through its triangle: signs of tetrahedron volumes, shape (n,)."""
+    """Whether each segment crosses its triangle: signs of tetrahedron volumes, shape (n,)."""
     a, b, c = triangle[:, 0], triangle[:, 1], triangle[:, 2]
 
     def side(p, q, r, s):

@@ -1,11 +1,9 @@
-"""The support that the organ lies in: the paper's bed of plasticine, moulded on the organ's underside.
+"""The mould under the organ: the paper's bed of plasticine.
 
 Camara et al. 2016 laid the kidney phantom in plasticine; the virtual bead experiments describe it as the
 lower 35 % of the organ's height, dilated by 0.3 mm and swept upwards, taken out of a block; its rim is
 filleted.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable
 
@@ -16,18 +14,18 @@ from skimage.measure import marching_cubes
 
 from scenes.patients.label_surfaces import decimate
 
-# Part of the organ's height, along gravity, that lies in the mould.
+# Share of the organ's height, along gravity, inside the mould.
 DEPTH = 0.35
 CLEARANCE_MM = 0.3
 # Least width of the block around the mould, and its thickness under the organ's lowest point.
 WALL_MM, FLOOR_MM = 12.0, 8.0
 # Radius of the mould's rim and of the block's edges.
 FILLET_MM = 4.0
-# Spacing of the grid that a shape is sampled on.
+# Spacing of the sampling grid.
 GRID_MM = 1.0
 FACES = 5000
 ATTEMPTS = 4
-# Part of the clearance that must be left everywhere.
+# Least share of the clearance anywhere.
 LEAST_CLEARANCE = 0.25
 
 
@@ -40,15 +38,15 @@ def mould(
 
     Args:
         organ: watertight surface at rest, normals outward; vertices [mm], shape (vertex_count, 3).
-        gravity_direction: the way that things fall, shape (3,), any length but zero.
+        gravity_direction: shape (3,), any length but zero.
         clearance_mm: gap between organ at rest and mould [mm]; the least gap is at least a quarter of it.
 
     Returns:
         Watertight mesh of one body, normals outward; same frame as `organ`, [mm].
 
     Raises:
-        ValueError: gravity without direction, organ not watertight, or no shape found
-            that stays clear of the organ.
+        ValueError: gravity without direction, organ not watertight, or no shape with the
+            clearance found.
     """
     frame = gravity_frame(np.asarray(gravity_direction, float))
     if not organ.is_watertight:
@@ -68,19 +66,19 @@ def mould(
     def carved(gap_mm: float) -> trimesh.Trimesh:
         return contour(_carved_block(grid, gap - gap_mm, block_low, block_high, FILLET_MM), grid)
 
-    support = clear_of(upright, organ_faces, carved, clearance_mm)
+    support = with_clearance(upright, organ_faces, carved, clearance_mm)
     return trimesh.Trimesh(support.vertices @ frame, support.faces, process=False)
 
 
-def clear_of(
+def with_clearance(
     organ_vertices: np.ndarray,
     organ_faces: np.ndarray,
     carved: Callable[[float], trimesh.Trimesh],
     clearance_mm: float,
 ) -> trimesh.Trimesh:
-    """A support that an organ at rest does not touch, carved as deep as that takes. Raises ValueError.
+    """A support with a clearance to the organ at rest; ``carved`` makes one with a given gap [mm]. Raises ValueError.
 
-    Chords of a decimated mould bulge towards the organ; what is missing is carved deeper.
+    Decimation moves the mould towards the organ; the gap is increased until the clearance is met.
     """
     gap_mm = clearance_mm
     for _ in range(ATTEMPTS):
@@ -90,7 +88,7 @@ def clear_of(
             return support
         gap_mm += clearance_mm - least
     raise ValueError(
-        f"the support stays only {least:.2f} mm clear of the organ, {clearance_mm} mm were wanted"
+        f"the support has a clearance of {least:.2f} mm to the organ; expected {clearance_mm} mm"
     )
 
 
@@ -118,7 +116,7 @@ def least_gap(
 
 
 def gravity_frame(gravity: np.ndarray) -> np.ndarray:
-    """Right-handed rotation whose rows are two level axes and the way up; patient axes where they fit."""
+    """Rotation matrix whose rows are two horizontal axes and the upward axis; patient axes where possible."""
     length = np.linalg.norm(gravity)
     if gravity.shape != (3,) or not np.isfinite(length) or length == 0:
         raise ValueError(f"gravity_direction is {gravity}: expected three numbers, not all zero")
@@ -130,17 +128,17 @@ def gravity_frame(gravity: np.ndarray) -> np.ndarray:
 
 
 def grid_over(low: np.ndarray, high: np.ndarray, step: float) -> tuple[np.ndarray, ...]:
-    """Axes of a grid around the block, one cell of air at every side; the block's faces lie between nodes."""
+    """Axes of a grid around a block with one empty cell on each side; the block's faces are between nodes."""
     return tuple(
         np.arange(start - 1.5 * step, end + 2.0 * step, step) for start, end in zip(low, high, strict=True)
     )
 
 
 def distance_to_swept(vertices: np.ndarray, faces: np.ndarray, grid: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Distance [mm] from the grid's nodes to the organ swept upwards without end; negative inside.
+    """Distance [mm] from the grid's nodes to the organ swept upwards to infinity; negative inside.
 
-    The distance to a union is the least of the distances to its parts, and the copy of the organ raised by t
-    is as far from a point as the organ itself is from the point t lower: a running minimum along the way up.
+    The distance to a union is the minimum of the distances to its parts, and a copy of the organ raised by t is as far from
+    a point as the organ is from the point t lower: a running minimum along the upward axis.
     """
     nodes = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1)
     distance = igl.signed_distance(
@@ -157,14 +155,16 @@ def _carved_block(
 ) -> np.ndarray:
     """Level function of block minus cavity, negative in the material, its convex edges rounded."""
     x, y, z = np.meshgrid(*grid, indexing="ij", sparse=True)
-    sides = round_meet(
+    sides = rounded_intersection(
         np.maximum(low[0] - x, x - high[0]), np.maximum(low[1] - y, y - high[1]), radius=fillet
     )
     walls = np.maximum(sides, low[2] - z)
-    return round_meet(round_meet(walls, z - high[2], radius=0.25 * fillet), -cavity, radius=fillet)
+    return rounded_intersection(
+        rounded_intersection(walls, z - high[2], radius=0.25 * fillet), -cavity, radius=fillet
+    )
 
 
-def round_meet(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
+def rounded_intersection(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
     """Intersection of two solids given by signed distances, their common edge rounded to `radius`."""
     corner = np.hypot(np.maximum(a + radius, 0.0), np.maximum(b + radius, 0.0)) - radius
     return np.minimum(np.maximum(a, b), -radius) + np.maximum(corner + radius, 0.0)

@@ -1,6 +1,4 @@
-"""Surfaces of an organ and of what is told apart in it: tumours, cysts, vessels, collecting system."""
-
-from __future__ import annotations
+"""Surfaces of an organ and of its parts: tumours, cysts, vessels, collecting system."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
@@ -14,37 +12,37 @@ from joblib import cpu_count
 from joblib.externals.loky import ProcessPoolExecutor
 from scipy import ndimage
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.label_surfaces import surface_from_mask
-from scenes.patients.organ_selection import GROWN, INNER, Organ
+from scenes.patients.organ_selection import HILAR, LESIONS, Organ
 from scenes.patients.readers.label_maps import Colour, LabelMap
-from scenes.patients.readers.voxel_grid import VoxelGrid
-from scenes.progress import Progress
+from scenes.terminal import Progress
+from scenes.volumes.voxel_grid import VoxelGrid
 
-# Vessels and the collecting system are modelled as far as this from the organ: its pedicle.
+# Vessels and the collecting system are modelled up to this distance from the organ: its pedicle.
 PEDICLE_MM = 15.0
-# Faces of a surface grow with its area, so that a tumour is meshed as finely as a kidney of this area; what branches, finer.
+# The number of faces is proportional to the area: a tumour is meshed as finely as a kidney of this area; branching parts, finer.
 FACES, FACES_AT_MM2 = 5000, 17000.0
 LEAST_FACES = 500
 BRANCHING = 3.0
-# Of the label's area, which is all steps.
+# Smooth area per area of voxel faces.
 SMOOTH_AREA = 2 / 3
-# Surfaces of less area than this are made before a process for them is there.
-ASIDE_FROM_MM2 = 5000.0
-# What has a surface of its own: tissue -> file.
+# Surfaces of less area than this are made sooner than a process starts.
+PROCESSES_FROM_MM2 = 5000.0
+# Parts with a surface: tissue -> file name.
 PARTS = {"tumour": "tumour", "cyst": "cyst", "urine": "collecting-system", "vessel": "vessels"}
-# Where parts are: tissue -> grid and which of its voxels.
-Found: TypeAlias = dict[str, tuple[VoxelGrid, np.ndarray]]
+# Tissue -> grid and mask (z, y, x).
+PartMasks: TypeAlias = dict[str, tuple[VoxelGrid, np.ndarray]]
 
 
 def organ_surface(piece: Organ) -> trimesh.Trimesh:
-    """Surface of the organ with all that grows on it. Raises PatientError."""
+    """Surface of the organ with its tumours and cysts. Raises PatientError."""
     return _surface(piece.grid.image(piece.mask.astype(np.uint8)), "organ", FACES)
 
 
-def parts_of(labels: LabelMap, piece: Organ, needed: Collection[str]) -> Found:
-    """What is told apart in the organ, and its vessels and collecting system near it. Raises PatientError where a needed
-    tissue is not there.
+def part_masks(labels: LabelMap, piece: Organ, needed: Collection[str]) -> PartMasks:
+    """Masks of the parts in the organ, and of vessels and collecting system near it. Raises PatientError where a needed one is
+    missing.
     """
     found = {}
     for tissue in PARTS:
@@ -52,7 +50,7 @@ def parts_of(labels: LabelMap, piece: Organ, needed: Collection[str]) -> Found:
         if not values:
             continue
         grid, inside = piece.grid, piece.mask & np.isin(piece.values, values)
-        if tissue in INNER:
+        if tissue in HILAR:
             grid, inside = near_organ(labels, piece, values)
         if inside.any():
             found[tissue] = grid, inside
@@ -65,38 +63,43 @@ def parts_of(labels: LabelMap, piece: Organ, needed: Collection[str]) -> Found:
 
 
 @contextmanager
-def surfaces_aside(found: Found) -> Iterator[Callable[[Progress], dict[str, trimesh.Trimesh]]]:
-    """Starts on the surfaces of parts, in processes of their own where that is worth it, and gives what waits for them:
-    surfaces of all parts that have one. Raises PatientError where what the user must see has none.
+def part_surfaces_in_processes(
+    found: PartMasks,
+) -> Iterator[Callable[[Progress], dict[str, trimesh.Trimesh]]]:
+    """Start to make the surfaces of all parts, in processes where they are large; yield a function that waits for them.
+
+    Raises PatientError where a tumour or cyst has no surface.
     """
     jobs = min(cpu_count(), len(found))
-    if jobs < 2 or sum(_area_mm2(*part) for part in found.values()) < ASIDE_FROM_MM2:
-        yield lambda progress: _there((t, bodies(*found[t], t)) for t in progress(found, "surfaces"))
+    if jobs < 2 or sum(_area_mm2(*part) for part in found.values()) < PROCESSES_FROM_MM2:
+        yield lambda progress: _without_empty(
+            (t, part_surface(*found[t], t)) for t in progress(found, "surfaces")
+        )
         return
     with ProcessPoolExecutor(jobs) as pool:
-        # The last ones take longest.
-        made = {tissue: pool.submit(bodies, *found[tissue], tissue) for tissue in reversed(found)}
+        # The last parts take longest.
+        made = {tissue: pool.submit(part_surface, *found[tissue], tissue) for tissue in reversed(found)}
         try:
-            yield lambda progress: _there((t, made[t].result()) for t in progress(found, "surfaces"))
+            yield lambda progress: _without_empty((t, made[t].result()) for t in progress(found, "surfaces"))
         except BrokenExecutor:
             raise PatientError(
-                "a process that made surfaces was ended, perhaps for want of memory; close other programs and try again"
+                "a process that made surfaces was ended, perhaps for lack of memory; close other programs and try again"
             ) from None
 
 
-def _there(made: Iterable[tuple[str, trimesh.Trimesh | None]]) -> dict[str, trimesh.Trimesh]:
+def _without_empty(made: Iterable[tuple[str, trimesh.Trimesh | None]]) -> dict[str, trimesh.Trimesh]:
     return {tissue: surface for tissue, surface in made if surface is not None}
 
 
 def colours_of_labels(labels: LabelMap, tissues: Sequence[str]) -> dict[str, Colour]:
-    """What their files draw the organ and its parts in."""
+    """Colours of the organ and its parts in the label files."""
     found = {s.tissue: s.colour for s in reversed(labels.segments.values()) if s.tissue and s.colour}
     named = {"organ": found.get("kidney"), **{tissue: found.get(tissue) for tissue in tissues}}
     return {name: colour for name, colour in named.items() if colour}
 
 
 def near_organ(labels: LabelMap, piece: Organ, values: list[int]) -> tuple[VoxelGrid, np.ndarray]:
-    """Where labels lie within PEDICLE_MM of the organ."""
+    """Grid and mask (z, y, x) of labels within PEDICLE_MM of the organ."""
     start = np.rint(labels.grid.index(piece.grid.origin)).astype(int)
     rim = np.ceil(PEDICLE_MM / labels.grid.spacing).astype(int)
     low = np.maximum(start - rim, 0)
@@ -118,11 +121,11 @@ def _surface(mask: sitk.Image, name: str, faces: int) -> trimesh.Trimesh:
         raise PatientError(f"the {name} has no surface: {error}; check the {name}'s label") from error
 
 
-def bodies(grid: VoxelGrid, inside: np.ndarray, tissue: str) -> trimesh.Trimesh | None:
-    """Surface of a part; its several bodies are bodies of one mesh, specks are left out. None: too thin, and not needed."""
+def part_surface(grid: VoxelGrid, inside: np.ndarray, tissue: str) -> trimesh.Trimesh | None:
+    """Surface of a part: all its bodies but specks in one mesh. None where a part other than a lesion is too thin."""
     labelled, _ = ndimage.label(inside)
     sizes = np.bincount(labelled.ravel())[1:]
-    finer = BRANCHING if tissue in INNER else 1.0
+    finer = BRANCHING if tissue in HILAR else 1.0
     surfaces = []
     for n in np.flatnonzero(sizes >= 0.1 * sizes.max()):
         body = labelled == n + 1
@@ -131,7 +134,7 @@ def bodies(grid: VoxelGrid, inside: np.ndarray, tissue: str) -> trimesh.Trimesh 
             name = PARTS[tissue].replace("-", " ")
             surfaces.append(_surface(grid.image(body.astype(np.uint8)), name, int(faces)))
         except PatientError:
-            if tissue in GROWN:
+            if tissue in LESIONS:
                 raise
     if not surfaces:
         return None
@@ -144,7 +147,7 @@ def volume_ml(grid: VoxelGrid, inside: np.ndarray) -> float:
 
 
 def _area_mm2(grid: VoxelGrid, inside: np.ndarray) -> float:
-    """Area of a label's surface, about."""
+    """Approximate area of a label's surface."""
     padded = np.pad(inside, 1)
     steps = [int((np.diff(padded.view(np.int8), axis=axis) != 0).sum()) for axis in range(3)]
     faces_mm2 = (np.prod(grid.spacing) / grid.spacing)[::-1]

@@ -1,32 +1,27 @@
-"""A patient's folder: written whole or not at all, and searched for what would name the patient."""
+"""Write a patient's folder, and search its files for identifiers of the patient (PHI)."""
 
-from __future__ import annotations
-
-import glob
 import re
-import shutil
 import zlib
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection
 from functools import cache
 from pathlib import Path
 
 import SimpleITK as sitk
 
-from scenes.atomic_files import check_writable, whole
-from scenes.patients.import_error import PatientError
+from errors import PatientError
+from scenes.atomic_files import new_folder
 from scenes.patients.part_surfaces import PARTS
 from scenes.patients.patient_import import Patient
 from scenes.scene import AnatomyFiles, Scene, scene_text
-from scenes.surface_files import STL_HEADER_BYTES, save_surface
-from scenes.volume_files import save_image
+from scenes.surfaces import STL_HEADER_BYTES, save_surface
+from scenes.volumes.volume_files import save_image
 
-# Shorter texts, such as the id 7, say nothing, and numbers under six digits are in every file.
-LEAST_TEXT, LEAST_DIGITS = 3, 6
-# Longer ones cannot be in voxels or triangles by chance.
+# Shorter texts, such as the ID 7, and numbers under six digits identify nobody.
+LEAST_LETTERS, LEAST_DIGITS = 3, 6
+# Texts of this length do not occur in voxels or triangles by chance.
 SURE_BYTES = 7
 ENCODINGS = ("utf-8", "utf-16-le", "latin-1")
-GZIP = 31  # zlib's code
+GZIP = 31  # zlib's wbits for gzip
 COMMON = "left right kidney cyst vessels collecting system STL LPS ITK NRRD complete type int short unsigned char gzip space"
 
 
@@ -35,57 +30,28 @@ def save_patient(
     folder: Path,
     texts: dict[str, str] | None = None,
     draw: Callable[[Path], None] | None = None,
-    private: Collection[str] = (),
+    identifiers: Collection[str] = (),
 ) -> int:
     """Write ct.nrrd, labels.nrrd, organ.stl, support.stl and a surface for each part: all or nothing.
 
     Args:
-        patient: what was imported; nothing of its source but voxels and geometry is written.
+        patient: only its voxels and geometry are written.
         folder: new or empty.
-        texts: further files, name to content (the scene), that appear together with the rest.
-        draw: draws further files into a folder (the checking picture).
-        private: what none of the files may hold: names, ids, dates, paths.
+        texts: further text files (the scene), name -> content.
+        draw: writes further files into a folder (the check image).
+        identifiers: names, IDs, dates, paths that no file may contain.
 
     Returns:
-        How many private texts were searched for, and not found.
+        The number of identifiers that were searched for and not found.
 
     Raises:
-        PatientError: the folder exists and is not empty, cannot be written, or would have held something private.
+        PatientError: the folder exists and is not empty, cannot be written, or would have contained an identifier.
     """
     with new_folder(folder) as partial:
         _write(patient, partial, texts or {})
         if draw is not None:
             draw(partial)
-        return _searched(partial, private)
-
-
-@contextmanager
-def new_folder(folder: Path) -> Iterator[Path]:
-    """A place to write a folder's files to; they appear together, once all are there. Raises PatientError."""
-    check_folder(folder)
-    for left in folder.parent.glob(f".*.partial-{glob.escape(folder.name)}"):  # of a run that was killed
-        shutil.rmtree(left, ignore_errors=True)
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with whole(folder) as partial:
-            partial.mkdir()
-            yield partial
-    except OSError as error:
-        raise PatientError(f"{folder}: {error.strerror}; choose a folder that can be written") from error
-
-
-def check_folder(folder: Path) -> None:
-    """Refuse a folder that cannot become a patient's, before the work. Raises PatientError."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise PatientError(f"{folder}: exists and is not an empty folder; choose another folder or remove it")
-    # Its files are written beside it, and then take its place.
-    above = next(path for path in folder.absolute().parents if path.exists())
-    try:
-        check_writable(above)
-    except OSError as error:
-        raise PatientError(
-            f"{folder}: cannot be made in {above} ({error.strerror}); choose a folder that can be written"
-        ) from None
+        return _search(partial, identifiers)
 
 
 def _write(patient: Patient, folder: Path, texts: dict[str, str]) -> None:
@@ -101,22 +67,22 @@ def _write(patient: Patient, folder: Path, texts: dict[str, str]) -> None:
         (folder / name).write_text(text, encoding="utf-8")
 
 
-def _searched(folder: Path, private: Collection[str]) -> int:
-    """Search all files of a folder. Raises PatientError where something private is in one."""
-    wanted = [text for text in private if telling(text)]
+def _search(folder: Path, identifiers: Collection[str]) -> int:
+    """Search all files of a folder, return the number of identifiers searched. Raises PatientError where one is found."""
+    wanted = [text for text in identifiers if is_identifying(text)]
     for file in sorted(folder.iterdir()):
         words, everything = _contents(file)
         if any(_holds(words, everything, text) for text in wanted):
             raise PatientError(
-                f"{file.name} would have held something of the source that names the patient; nothing was written; this is a "
+                f"{file.name} would have contained an identifier of the patient; nothing was written; this is a "
                 "fault of the program: please report it"
             )
     return len(wanted)
 
 
-def telling(text: str) -> bool:
-    """Whether a text is long enough to name somebody, and more than words that every patient's files hold."""
-    if len(text) < (LEAST_DIGITS if text.isdigit() else LEAST_TEXT):
+def is_identifying(text: str) -> bool:
+    """Whether a text can identify somebody: long enough, and not only words that are in every patient's files."""
+    if len(text) < (LEAST_DIGITS if text.isdigit() else LEAST_LETTERS):
         return False
     return not set(re.findall(r"\w+", text.lower())) <= _common_words()
 
@@ -128,7 +94,7 @@ def _common_words() -> frozenset[str]:
 
 
 def _contents(file: Path) -> tuple[bytes, bytes]:
-    """What of a file is words, and all of it, unpacked."""
+    """The text of a file (header), and all its bytes, decompressed."""
     content = file.read_bytes()
     if file.suffix == ".nrrd":
         header, _, packed = content.partition(b"\n\n")
@@ -137,7 +103,7 @@ def _contents(file: Path) -> tuple[bytes, bytes]:
 
 
 def _holds(words: bytes, everything: bytes, text: str) -> bool:
-    """Whether a text is in a file: anywhere where it is long, else as a word among words."""
+    """Whether a file contains a text: anywhere if it is long, else as a whole word of its text."""
     for encoding in ENCODINGS:
         wanted = text.encode(encoding, "ignore")
         if len(wanted) >= SURE_BYTES and not text.isdigit():

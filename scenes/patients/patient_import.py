@@ -1,10 +1,7 @@
-"""Patient import: a CT and its labels become an organ's surface, what is in it, its support, its CT.
+"""Patient import: from a CT and its labels to surfaces of an organ and its parts, a support, and the cropped CT.
 
-Everything stays in patient coordinates: LPS [mm], +x to the patient's left, +y posterior, +z to the head, as
-DICOM has them. Voxels are cropped, and resampled only where a series is tilted or unevenly spaced.
+All coordinates are DICOM's: LPS [mm], +x to the patient's left, +y posterior, +z to the head. Voxels are cropped, and resampled only where a series is tilted or unevenly spaced.
 """
-
-from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,63 +12,61 @@ import numpy as np
 import SimpleITK as sitk
 import trimesh
 
+from errors import PatientError
 from scenes.patients.bed_support import bed_of_file, bed_of_labels
-from scenes.patients.import_error import PatientError
-from scenes.patients.import_warnings import as_stone, in_fat, taken, turned
+from scenes.patients.import_warnings import fat_warnings, label_warnings, orientation_warnings, stone_warnings
 from scenes.patients.moulded_support import mould
 from scenes.patients.organ_selection import (
-    GROWN,
-    INNER,
+    HILAR,
+    LESIONS,
     PARENCHYMA,
     Organ,
     check_volume,
+    choose_organ,
+    find_organs,
     midline_x,
-    organs,
-    single_out,
 )
 from scenes.patients.part_surfaces import (
     colours_of_labels,
     organ_surface,
-    parts_of,
-    surfaces_aside,
+    part_masks,
+    part_surfaces_in_processes,
     volume_ml,
 )
-from scenes.patients.readers.label_maps import Colour, LabelMap, nearest, present
-from scenes.patients.readers.lazy_volume import LazyVolume
+from scenes.patients.readers.label_maps import Colour, LabelMap, present_values, resample_nearest
 from scenes.patients.readers.segment_names import Side
-from scenes.patients.readers.voxel_grid import Box, VoxelGrid
-from scenes.progress import Progress, silent
+from scenes.terminal import Progress, silent
+from scenes.volumes.lazy_volume import LazyVolume
+from scenes.volumes.voxel_grid import Box, VoxelGrid
 
-SUPINE_GRAVITY = np.array([0.0, 1.0, 0.0])  # as the CT was taken: on the back, posterior is down
+SUPINE_GRAVITY = np.array([0.0, 1.0, 0.0])  # as in the CT: on the back, posterior is down
 PLAUSIBLE_ORGAN_HU = (-150.0, 600.0)
-CUT_AREA_MM2 = 100.0  # a pole that just grazes the border is whole to within the thickness of a slice
+CUT_AREA_MM2 = 100.0  # a pole that only touches the border is complete to within a slice
 LEAST_OVERLAP = 0.99
 MOST_VOLUME_OFF = 0.05
 OVERVIEW_MM = 1.5
-# A CT of a body holds fat, if not air, and much that is brighter.
+# A CT of a body contains fat and much brighter tissue.
 FAT_HU, LEAST_SPAN_HU = -60, 200
 
 
 @dataclass(frozen=True)
 class Patient:
-    """One organ with what is in it and around it; meshes in LPS [mm], watertight, normals outward."""
+    """One imported organ; meshes in LPS [mm], watertight, normals outward."""
 
     ct: sitk.Image  # int16 [HU], cropped around the organ, original voxels and direction
-    labels: sitk.Image  # uint8 on the grid of `ct`: a tissue each
-    tissues: dict[int, str]  # what the labels are: 1 = kidney, 2 = tumour, and more where the import was told
+    labels: sitk.Image  # uint8 on the grid of `ct`: a tissue code each
+    tissues: dict[int, str]  # of the codes: 1 = kidney, 2 = tumour, ...
     organ: trimesh.Trimesh  # tumours and cysts included
-    parts: dict[str, trimesh.Trimesh]  # PARTS that are there, by tissue
+    parts: dict[str, trimesh.Trimesh]  # by tissue
     support: trimesh.Trimesh
     side: Side
-    volumes_ml: dict[str, float]  # of the labels: "organ" with all that is in it, and each part
-    overview: (
-        sitk.Image
-    )  # int16 [HU], the CT's whole width at the organ's level, coarse; not kept in a folder
+    volumes_ml: dict[str, float]  # of the labels: "organ" with all its parts, and each part
+    overview: sitk.Image  # int16 [HU], the CT's full width at the organ's level, coarse; only for check.png
     spacing_mm: tuple[float, float, float]  # of the CT's voxels along the image's own axes
     notes: tuple[str, ...] = ()  # what was chosen, left out, resampled
-    cautions: tuple[str, ...] = ()  # what looks wrong
+    warnings: tuple[str, ...] = ()  # what looks wrong or was assumed
     colours: dict[str, Colour] = field(default_factory=dict)  # of organ and parts, where labels have one
-    draft: bool = False  # grown from a seed, and drawn by nobody
+    draft: bool = False  # made by region growing
 
     @property
     def tumour(self) -> trimesh.Trimesh | None:
@@ -79,7 +74,7 @@ class Patient:
 
 
 def tissue_codes(tissues: Sequence[str]) -> dict[str, int]:
-    """The value that each tissue has in a patient's label map: 1 = kidney, 2 = tumour, the rest by name from 3."""
+    """The code of each tissue in a patient's label map: 1 = kidney, 2 = tumour, the rest by name from 3."""
     others = sorted(set(tissues) - {"kidney", "tumour"})
     return {"kidney": 1, "tumour": 2} | {tissue: code for code, tissue in enumerate(others, start=3)}
 
@@ -94,45 +89,44 @@ def import_patient(
     needed: Collection[str] = (),
     progress: Progress = silent,
 ) -> Patient:
-    """Cut one organ out of a CT and its label map and build its surfaces and its support.
+    """Crop one organ from a CT and its label map, and make its surfaces and its support.
 
     Args:
-        ct: scalar volume [HU]; read where the organ is.
-        labels: what is labelled, on any grid; surfaces are made on it, and the CT's labels by nearest neighbour.
-        organ: label values that together are the organ; None: those of a kidney by their names, or all that are nothing else.
-        side: which kidney, where the label map holds both, and a check where it holds one; needed where neither the CT
-            shows the body's whole width nor the labels say the side.
+        ct: scalar volume [HU]; only the part around the organ is read.
+        labels: on any grid; surfaces are made on it, and resampled to the CT's by nearest neighbour.
+        organ: label values of the organ; None: those named as a kidney, or all that are nothing else.
+        side: which of two kidneys, or a check of the only one; needed where neither the CT nor the labels' names show the
+            side.
         margin_mm: CT kept around the organ [mm].
-        support: what the organ lies on: a "mould" of its underside, the bed that surrounding "labels" make, or a file with a
-            surface.
-        needed: tissues that must be in the organ, because the user said where they are.
-        progress: shows how far it is.
+        support: what the organ rests on: a "mould" of its underside, a bed of the surrounding "labels", or a surface file.
+        needed: tissues that must be in the organ, because the user named their labels.
+        progress: shows the progress of the surfaces.
 
     Raises:
-        PatientError: one line that says what was found, what was expected and what to do.
+        PatientError: what was found, what was expected and what to do.
     """
     at = _located(ct, labels, organ, side, margin_mm)
     piece = at.piece
-    marks, tissues = _marks(labels, piece, at.grid, at.on_ct)
+    coded, tissues = _tissue_labels(labels, piece, at.grid, at.on_ct)
 
     def of(*wanted: str) -> np.ndarray:
-        return np.isin(marks, [code for code, tissue in tissues.items() if tissue in wanted])
+        return np.isin(coded, [code for code, tissue in tissues.items() if tissue in wanted])
 
-    warned = (
-        *turned(at.level, at.level_hu, labels, at.midline),
-        *in_fat(at.grid, at.hounsfield, at.on_ct, of("kidney")),
-        *as_stone(at.grid, at.hounsfield, of("kidney", "cortex", "medulla", "sinus"), of("urine")),
-        *taken(labels, piece, organ is not None),
+    warnings = (
+        *orientation_warnings(at.level, at.level_hu, labels, at.midline),
+        *fat_warnings(at.grid, at.hounsfield, at.on_ct, of("kidney")),
+        *stone_warnings(at.grid, at.hounsfield, of("kidney", "cortex", "medulla", "sinus"), of("urine")),
+        *label_warnings(labels, piece, organ is not None),
     )
-    found = parts_of(labels, piece, needed)
-    with surfaces_aside(found) as parts_made:
+    found = part_masks(labels, piece, needed)
+    with part_surfaces_in_processes(found) as parts_made:
         surface = organ_surface(piece)
         _check_surface(surface, piece)
         bed = _support(support, surface, labels, piece)
         parts = parts_made(progress)
     return Patient(
         ct=at.grid.image(at.hounsfield),
-        labels=at.grid.image(marks),
+        labels=at.grid.image(coded),
         tissues=tissues,
         organ=surface,
         parts=parts,
@@ -142,14 +136,14 @@ def import_patient(
         overview=_overview(at.level, at.level_hu),
         spacing_mm=tuple(at.grid.spacing.tolist()),
         notes=ct.notes,
-        cautions=warned,
+        warnings=warnings,
         colours=colours_of_labels(labels, [*parts]),
     )
 
 
 @dataclass(frozen=True)
 class _Located:
-    """An organ in its CT: ``level`` is the CT at the height of all organs, ``grid`` the part around this one, each with its HU."""
+    """An organ in its CT: ``level`` is the CT at the level of all organs, ``grid`` the part around this one, each with its HU."""
 
     piece: Organ
     side: Side
@@ -158,33 +152,33 @@ class _Located:
     level_hu: np.ndarray
     grid: VoxelGrid
     hounsfield: np.ndarray
-    on_ct: np.ndarray  # which voxels of that part are the organ
+    on_ct: np.ndarray  # organ mask on ``grid``
 
 
 def _located(
     ct: LazyVolume, labels: LabelMap, organ: Sequence[int] | None, side: Side | None, margin_mm: float
 ) -> _Located:
-    """The one organ that is asked for, whole and in soft tissue. Raises PatientError."""
+    """The requested organ, complete and in soft tissue. Raises PatientError."""
     if not margin_mm >= 0:
         raise PatientError(f"the margin is {margin_mm} mm: expected 0 or more")
-    pieces = organs(labels, organ)
+    pieces = find_organs(labels, organ)
     slab, level_hu = _level(ct, pieces, margin_mm)
     level = ct.grid.part(slab)
     heights = np.concatenate([piece.grid.corners()[:, 2] for piece in pieces])
     midline = midline_x(level, level_hu, heights.min(), heights.max())
-    piece, told_side = single_out(pieces, midline, side)
+    piece, actual_side = choose_organ(pieces, midline, side)
     check_volume(piece)
     _check_overlap(ct.grid, piece)
     grid, hounsfield = _cropped(ct.grid, slab, level_hu, piece, margin_mm)
-    on_ct = nearest(piece.grid, piece.mask, grid)
+    on_ct = resample_nearest(piece.grid, piece.mask, grid)
     _check_place(ct.grid, grid, on_ct, hounsfield, piece)
-    return _Located(piece, told_side, midline, level, level_hu, grid, hounsfield, on_ct)
+    return _Located(piece, actual_side, midline, level, level_hu, grid, hounsfield, on_ct)
 
 
 def _support(kind: str, organ: trimesh.Trimesh, labels: LabelMap, piece: Organ) -> trimesh.Trimesh:
     if kind == "labels":
         own = [int(value) for value in np.unique(piece.values[piece.mask])]
-        return bed_of_labels(organ, labels, [*own, *labels.of_tissues(*INNER)], SUPINE_GRAVITY)
+        return bed_of_labels(organ, labels, [*own, *labels.of_tissues(*HILAR)], SUPINE_GRAVITY)
     if kind != "mould":
         return bed_of_file(Path(kind), organ)
     try:
@@ -194,10 +188,10 @@ def _support(kind: str, organ: trimesh.Trimesh, labels: LabelMap, piece: Organ) 
 
 
 def _level(ct: LazyVolume, pieces: list[Organ], margin_mm: float) -> tuple[Box, np.ndarray]:
-    """The box of a CT at the height of all organs, and its HU: enough to tell sides and to crop from."""
+    """The box of a CT at the level of all organs, and its HU: enough to find the midline and to crop."""
     if max(_overlap(ct.grid, piece) for piece in pieces) == 0:
         raise PatientError(
-            "the labels lie outside the CT, with 0 % of the organ in it: expected both to overlap in patient coordinates; "
+            "the labels are outside the CT, with 0 % of the organ in it: expected both to overlap in patient coordinates; "
             "choose labels that were drawn on this CT"
         )
     places = np.concatenate([piece.grid.corners() for piece in pieces])
@@ -208,7 +202,7 @@ def _level(ct: LazyVolume, pieces: list[Organ], margin_mm: float) -> tuple[Box, 
     darkest, brightest = int(hounsfield.min()), int(hounsfield.max())
     if darkest > FAT_HU or brightest - darkest < LEAST_SPAN_HU:
         raise PatientError(
-            f"the CT holds values from {darkest} to {brightest}: expected HU, fat about -100 and air -1000; give the CT first, then the "
+            f"the CT has values from {darkest} to {brightest}: expected HU, fat about -100 and air -1000; give the CT first, then the "
             "labels, and export it with its rescale and without normalising"
         )
     return box, hounsfield
@@ -221,7 +215,7 @@ def _overview(grid: VoxelGrid, hounsfield: np.ndarray) -> sitk.Image:
 
 
 def _overlap(grid: VoxelGrid, piece: Organ) -> float:
-    """Share of an organ's voxels that lie within a grid."""
+    """Share of an organ's voxels within a grid."""
     indices = np.argwhere(piece.mask)[:, ::-1]
     found = grid.index(piece.grid.place(indices[:: max(1, len(indices) // 200_000)]))
     return float(((found >= -0.5) & (found <= np.array(grid.size) - 0.5)).all(axis=1).mean())
@@ -231,7 +225,7 @@ def _check_overlap(grid: VoxelGrid, piece: Organ) -> None:
     share = _overlap(grid, piece)
     if share < LEAST_OVERLAP:
         raise PatientError(
-            f"{piece.title} lies in the CT with {share:.0%} of its voxels: expected a whole organ; choose a CT that shows all of "
+            f"{piece.title} has {share:.0%} of its voxels in the CT: expected all of the organ; choose a CT that shows all of "
             "it, or the labels that were drawn on this one"
         )
 
@@ -252,12 +246,12 @@ def _cropped(
 
 
 def _check_place(
-    whole: VoxelGrid, grid: VoxelGrid, on_ct: np.ndarray, hounsfield: np.ndarray, piece: Organ
+    full: VoxelGrid, grid: VoxelGrid, on_ct: np.ndarray, hounsfield: np.ndarray, piece: Organ
 ) -> None:
-    """Refuse what is no whole organ in soft tissue."""
-    first = np.rint(whole.index(grid.origin)).astype(int)
+    """Raises PatientError where the organ is cut off by the CT's border or is not soft tissue."""
+    first = np.rint(full.index(grid.origin)).astype(int)
     for axis in range(3):
-        at_border = {0: first[axis] == 0, -1: first[axis] + grid.size[axis] == whole.size[axis]}
+        at_border = {0: first[axis] == 0, -1: first[axis] + grid.size[axis] == full.size[axis]}
         ends = [on_ct.take(end, axis=2 - axis).sum() for end, there in at_border.items() if there]
         cut = max(ends, default=0) * np.prod(grid.spacing) / grid.spacing[axis]
         if cut > CUT_AREA_MM2:
@@ -274,26 +268,26 @@ def _check_place(
 
 
 def _check_surface(surface: trimesh.Trimesh, piece: Organ) -> None:
-    """Refuse a surface that leaves out some of its label."""
+    """Raises PatientError where a surface leaves out a part of its label."""
     found_ml = surface.volume / 1000
     if found_ml < (1 - MOST_VOLUME_OFF) * piece.volume_ml:
         raise PatientError(
             f"{piece.title} has {piece.volume_ml:.1f} ml, and its surface encloses {found_ml:.1f}: expected all of it; parts of it "
-            "hang together by a thread; mend the label, or name the organ's own with --organ"
+            "are connected by thin bridges; correct the label, or name the organ's own with --organ"
         )
 
 
-def _marks(
+def _tissue_labels(
     labels: LabelMap, piece: Organ, grid: VoxelGrid, on_ct: np.ndarray
 ) -> tuple[np.ndarray, dict[int, str]]:
-    """Tissue codes (z, y, x) of the cropped CT, and what they are: the organ's own, and of other organs all that is there."""
-    values = nearest(labels.grid, labels.values, grid)
-    there = set(present(values))
+    """Tissue codes (z, y, x) of the cropped CT and their tissues: parts of this organ, and all of other tissues."""
+    values = resample_nearest(labels.grid, labels.values, grid)
+    there = set(present_values(values))
     tissue_of = {v: s.tissue for v, s in labels.segments.items() if v in there and s.tissue}
     codes = tissue_codes(list(tissue_of.values()))
-    marks = on_ct.astype(np.uint8)
+    coded = on_ct.astype(np.uint8)
     for value, tissue in tissue_of.items():
         if tissue != "kidney":
             here = values == value
-            marks[here & on_ct if tissue in (*GROWN, *PARENCHYMA) else here] = codes[tissue]
-    return marks, {code: tissue for tissue, code in codes.items()}
+            coded[here & on_ct if tissue in (*LESIONS, *PARENCHYMA) else here] = codes[tissue]
+    return coded, {code: tissue for tissue, code in codes.items()}

@@ -1,4 +1,4 @@
-"""The grid that the embedded patient is painted on, and the abdomen around the left kidney painted on it.
+"""Draw the abdomen of the embedded patient around its left kidney, and the canvas to draw on.
 
 LPS mm; signed distances [mm] are negative inside. The layout (vertebra, psoas, body wall, kidney bed) follows
 an axial CT of a slim adult, CRLM-CT-1004 (TCIA).
@@ -30,7 +30,7 @@ HU_COMPACTA = 480.0
 
 
 class Canvas:
-    """The volume being painted: hu [HU], shape (z, y, x), with the voxel centres x, y, z [mm].
+    """The volume to draw on: hu [HU], shape (z, y, x), with the voxel centres x, y, z [mm].
 
     coarse and fine are random fields of unit SD that make outlines irregular and tissues uneven.
     """
@@ -54,7 +54,7 @@ class Canvas:
         return tuple(spans[::-1]), x, y[:, None], z[:, None, None]
 
     def paint(self, distance: np.ndarray, value: float | np.ndarray, where: tuple = (...,)) -> None:
-        """Lays value [HU] over the inside of a distance field; the voxels cut by its surface mix both."""
+        """Set the inside of a distance field to value [HU]; voxels on its surface are mixed."""
         self.hu[where] += np.clip(0.5 - distance / SPACING, 0, 1) * (value - self.hu[where])
 
     def loft(
@@ -66,7 +66,7 @@ class Canvas:
         rough: float = 0.7,
         texture: float = 0.0,
     ) -> None:
-        """Paints an organ given by ellipses (z, x, y, half-width, half-depth, turn in degrees), one a row.
+        """Draw an organ given by ellipses (z, x, y, half-width, half-depth, turn in degrees), one a row.
 
         With rim, the outermost `wall` mm have that value instead. `rough` [mm] is the SD of the outline,
         `texture` [HU] that of the inside.
@@ -127,7 +127,7 @@ def _wave_vectors(wavelength: float, rng: np.random.Generator, count: int) -> li
 
 
 def waves_at(points: np.ndarray, wavelength: float, rng: np.random.Generator, count: int = 6) -> np.ndarray:
-    """As Canvas.waves, at points [mm], shape (n, 3)."""
+    """Canvas.waves at points [mm], shape (n, 3)."""
     waves = (
         np.cos(points @ k.astype(np.float32) + np.float32(phase))
         for k, phase in _wave_vectors(wavelength, rng, count)
@@ -194,7 +194,7 @@ def _paint_spine(canvas: Canvas) -> None:
 
 
 def _paint_muscles(canvas: Canvas) -> None:
-    """Each in a sheath of fat, which is what tells neighbours apart in CT."""
+    """Muscles in sheaths of fat, which separate them in CT."""
     top, bottom = canvas.z[-1] + 1, canvas.z[0] - 1
     sheath = {"rim": -30.0, "wall": 0.9, "rough": 0.7, "texture": 6.0}
     for sections in (
@@ -304,7 +304,7 @@ def _paint_vessels(canvas: Canvas, rng: np.random.Generator) -> None:
 
 
 def paint_abdomen(canvas: Canvas, rng: np.random.Generator) -> None:
-    """Everything but the kidney and its perirenal space."""
+    """Draw all but the kidney and its perirenal space."""
     _paint_body_wall(canvas)
     _paint_muscles(canvas)
     _paint_spine(canvas)

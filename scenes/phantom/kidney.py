@@ -1,7 +1,7 @@
 """The embedded patient: a contrast CT of a left kidney with a tumour, and its labels, from closed formulas.
 
-Supine, patient coordinates LPS in mm (+x left, +y posterior, +z head), so gravity points along +y. Nothing is
-read or downloaded, and the same call gives the same voxels. Signed distances [mm] are negative inside.
+Supine, patient coordinates LPS in mm (+x left, +y posterior, +z head), so gravity points along +y. The result is
+deterministic. Signed distances [mm] are negative inside.
 
 The kidney is built in a *kidney frame* (u, v, w) [mm]: w along the long axis to the upper pole, u away from
 the hilum, v to the anterior face. The frame is bent so that both poles lean to the hilum: the bean.
@@ -46,6 +46,17 @@ class Label(IntEnum):
     COLLECTING_SYSTEM = 4
     VESSEL = 5
     TUMOUR = 6
+
+
+# The tissues of ultrasound/tissues.toml.
+TISSUE_OF_LABEL: dict[int, str] = {
+    Label.CORTEX: "cortex",
+    Label.MEDULLA: "medulla",
+    Label.SINUS_FAT: "sinus",
+    Label.COLLECTING_SYSTEM: "urine",
+    Label.VESSEL: "vessel",
+    Label.TUMOUR: "tumour",
+}
 
 
 # Attenuation [HU] late in the corticomedullary phase (about 70 s after injection): the medulla has begun to
@@ -202,7 +213,7 @@ def _medulla(points: np.ndarray, depth: np.ndarray) -> np.ndarray:
 
 
 def _sinus(points: np.ndarray) -> np.ndarray:
-    """Distance to the renal sinus: its core, the way out at the hilum, and a recess about every calyx."""
+    """Distance to the renal sinus: its core, the opening at the hilum, and a recess around each calyx."""
     core = ellipsoid(points, SINUS_CENTRE, SINUS_HALF_AXES)
     hilum = ellipsoid(points, np.array([-24.0, 0.5, -1.0]), np.array([15.0, 7.5, 15.0]))
     sinus = smooth_min(core, hilum, 5.0)
@@ -212,7 +223,7 @@ def _sinus(points: np.ndarray) -> np.ndarray:
 
 
 def _calyces(points: np.ndarray) -> np.ndarray:
-    """Distance to the cups that hold the papillae; the papilla itself is left out by the medulla on top."""
+    """Distance to the cups around the papillae; the medulla is drawn over them."""
     cups = np.full(len(points), 99.0, dtype=np.float32)
     for tip, axis in zip(PAPILLAE.astype(np.float32), PYRAMID_AXES.astype(np.float32), strict=True):
         height = (points - tip) @ axis
@@ -333,7 +344,7 @@ def _kidney_parts(canvas: Canvas, bean: np.ndarray, rng: np.random.Generator) ->
 
 
 def _paint_kidney(canvas: Canvas, parts: _Parts, rng: np.random.Generator) -> None:
-    """The kidney, and the vessels and ureter as far as the canvas goes; each lies over those before it."""
+    """Draw the kidney, its vessels and ureter up to the canvas's border; each over those before it."""
     points, near = parts.points, parts.near
     modulation = 5 * waves_at(points, 26, rng) + 4 * waves_at(points, 9, rng)
     canvas.paint(parts.hull, HU_CORTEX + modulation, near)
@@ -361,7 +372,7 @@ def _labels(parts: _Parts) -> np.ndarray:
     tissue[parts.tumour < 0] = Label.TUMOUR
     labels = np.zeros(parts.urine.shape, dtype=np.uint8)
     labels[near] = tissue
-    # Fat between the stubs of the hilar vessels joins the solid, which would else have slits and cavities.
+    # Fat between the stubs of the hilar vessels is added to the solid, which would otherwise have slits and cavities.
     closed = ndimage.binary_fill_holes(ndimage.binary_closing(labels > 0, iterations=3))
     tissue[gate & closed[near] & (tissue == Label.OUTSIDE)] = Label.SINUS_FAT
     labels[near] = tissue
@@ -369,7 +380,7 @@ def _labels(parts: _Parts) -> np.ndarray:
 
 
 def _scan(hu: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """What a CT makes of the tissue: its point spread, and noise as correlated as a soft kernel leaves it."""
+    """The CT's point spread, and noise with the correlation of a soft kernel."""
     noise = rng.standard_normal(hu.shape, dtype=np.float32)
     noise = ndimage.gaussian_filter(noise, NOISE_CORRELATION / SPACING, truncate=3)
     noise *= np.float32(NOISE_SD) / noise.std()

@@ -14,10 +14,9 @@ import numpy as np
 import trimesh
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from errors import UserError, explained
-from scenes.patients.import_error import PatientError
+from errors import PatientError, UserError, explained
 from scenes.section import Direction, Vector3
-from scenes.surface_files import load_surface
+from scenes.surfaces import load_surface
 from sim.signed_distance import signed_distance
 from studies.number_table import read_numbers
 

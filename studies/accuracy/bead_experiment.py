@@ -8,8 +8,8 @@ import trimesh
 from rehearsal.build_solver import build_solver, static_shape, step_settings
 from rehearsal.configuration import Setup, SetupError
 from rehearsal.stopwatch import timed
-from scenes.closed_surfaces import moved_by
 from scenes.scene import Contact
+from scenes.surfaces import translated
 from scenes.tissue import TissueSection
 from sim.fields import array_of
 from sim.sampling import RestBody
@@ -51,7 +51,7 @@ class BeadExperiment:
         self.origin = case.organ.bounds.mean(axis=0)
         tissue = tissue_of(case, setup)
         tool = ConvexTool.cuboid(case.size_mm, case.edge_radius_mm)
-        shapes = [static_shape(moved_by(case.support, -self.origin), tissue), tool]
+        shapes = [static_shape(translated(case.support, -self.origin), tissue), tool]
         contact = Contact(shape_friction=case.friction)
         self.solver = build_solver(rest or _organ(case), tissue, shapes, tool, contact)
         self.body, self.model, self.contacts = self.solver.body, self.solver.model, self.solver.contacts
@@ -137,4 +137,4 @@ def rest_body(case: BeadCase, setup: Setup) -> RestBody:
 
 
 def _organ(case: BeadCase) -> trimesh.Trimesh:
-    return moved_by(case.organ, -case.organ.bounds.mean(axis=0))
+    return translated(case.organ, -case.organ.bounds.mean(axis=0))

@@ -18,8 +18,8 @@ from rehearsal.stopwatch import timed
 from render.background_image import Page
 from render.window_layout import WindowLayout
 from scenes.anatomy import LoadedAnatomy
-from scenes.closed_surfaces import moved_by
 from scenes.scene import Contact, Scene, SolverSection, with_options
+from scenes.surfaces import translated
 from scenes.tissue import TISSUES, ShapeMatchingTissue, TissueSection
 from sim.device import start
 from sim.embedding import Embedding
@@ -85,7 +85,7 @@ class FeatureBody:
         self.tissue = tissue
         self.settings = step_settings(tissue, scene.solver)
         middle = anatomy.organ.bounds.mean(axis=0)
-        self.organ = moved_by(anatomy.organ, -middle)
+        self.organ = translated(anatomy.organ, -middle)
         reach_mm = model_of(tissue).reach_mm(tissue)
         self.supports = [
             distance_grid(shape.vertices - middle, shape.faces, GRID_MM, reach_mm)

@@ -10,9 +10,9 @@ import SimpleITK as sitk
 from pydicom.dataset import FileDataset, FileMetaDataset
 from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
 
-from scenes.patients.readers.lazy_volume import AIR_HU
-from scenes.patients.readers.voxel_grid import VoxelGrid
 from scenes.phantom.kidney import make_phantom
+from scenes.volumes.lazy_volume import AIR_HU
+from scenes.volumes.voxel_grid import VoxelGrid
 
 PIXELS, PIXEL_MM = 512, 0.78
 GAP_MM = 0.75

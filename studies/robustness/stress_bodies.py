@@ -9,8 +9,8 @@ from rehearsal.build_solver import build_solver, step_settings
 from rehearsal.configuration import PRESETS
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import load_anatomy
-from scenes.closed_surfaces import volume_mm3
 from scenes.scene import PAPER, Contact, SolverSection, load_scene, with_options
+from scenes.surfaces import volume_mm3
 from scenes.tissue import TISSUES
 from sim.device import start
 from sim.divergence_check import DivergenceCheck

@@ -5,12 +5,12 @@ from pathlib import Path, PurePosixPath
 import click.testing
 import pytest
 
+from errors import PatientError
 from rehearsal.commands.command_line import CommandError, load_patient, make_folder, save_figures
 from rehearsal.commands.plan_command import following
-from scenes.patients.import_error import PatientError
-from scenes.patients.patient_folder import check_folder
+from scenes.atomic_files import check_folder
 from scenes.scene import EMBEDDED
-from scenes.shell_quoting import pasted
+from scenes.terminal import shell_command
 
 
 def test_a_folder_stands_for_its_scene(tmp_path):
@@ -35,9 +35,9 @@ def test_a_folder_is_tried_before_the_work(tmp_path, bytes_to_a_file):
     ("system", "quoted"), [("linux", """'Fritz "$HOME"/a b'"""), ("win32", r'"Fritz \"$HOME\"/a b"')]
 )
 def test_a_command_to_be_pasted_is_quoted_as_its_shell_needs_it(monkeypatch, system, quoted):
-    monkeypatch.setattr("scenes.shell_quoting.sys.platform", system)
+    monkeypatch.setattr("scenes.terminal.sys.platform", system)
     path = PurePosixPath('Fritz "$HOME"/a b')
-    assert pasted("rehearse", path, "--at", "3") == f"python app.py rehearse {quoted} --at 3"
+    assert shell_command("rehearse", path, "--at", "3") == f"python app.py rehearse {quoted} --at 3"
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,9 @@ def test_a_command_to_be_pasted_is_quoted_as_its_shell_needs_it(monkeypatch, sys
     [(EMBEDDED, None, []), (Path("a b"), "linear", ["a b", "--probe", "linear"])],
 )
 def test_what_follows_a_plan_names_its_scene_and_probe(scene, probe, words):
-    assert following(scene, Path("plan.json"), probe) == pasted("rehearse", *words, "--plan", "plan.json")
+    assert following(scene, Path("plan.json"), probe) == shell_command(
+        "rehearse", *words, "--plan", "plan.json"
+    )
 
 
 def test_figures_that_cannot_be_written_say_so(tmp_path, capsys):

@@ -10,11 +10,11 @@ import pytest
 import SimpleITK as sitk
 import trimesh
 from conftest import rotation_about
+from scenes.surface_files import FORMATS, save_surface
 
 import app
 from rehearsal.image_and_surface_files import save_surfaces
-from scenes.surface_files import FORMATS, save_surface
-from scenes.volume_files import save_image
+from scenes.volumes.volume_files import save_image
 from sim.fields import field_of
 
 pytestmark = pytest.mark.usefixtures("one_device")

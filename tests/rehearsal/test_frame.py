@@ -19,7 +19,7 @@ from render.keys import USUAL_KEYS, Keys
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
 from scenes.scene import EMBEDDED
-from scenes.shell_quoting import pasted
+from scenes.terminal import shell_command
 from ultrasound.probe import load_probe
 
 STEP_S = 0.25
@@ -327,7 +327,7 @@ def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scen
     recording = SimpleNamespace(path=PurePosixPath("a/session-001.jsonl"), fault="")
     each.recorder = SimpleNamespace(recording=recording, close=lambda summary: None)
     each._end(0)
-    assert capsys.readouterr().out.endswith(f"replay it with: {pasted('rehearse', *words)}\n")
+    assert capsys.readouterr().out.endswith(f"replay it with: {shell_command('rehearse', *words)}\n")
 
 
 def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path, sent):

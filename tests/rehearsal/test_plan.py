@@ -44,7 +44,7 @@ from rehearsal.planning.sweep_score import (
     score,
     why_better,
 )
-from scenes.trocar import Trocar
+from scenes.scene import Trocar
 from ultrasound.probe_manipulator import ProbeManipulator, advanced, pose_at
 
 

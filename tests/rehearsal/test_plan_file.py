@@ -25,7 +25,7 @@ from rehearsal.planning.plan_file import (
     write_plan,
 )
 from rehearsal.tracking.track_file import load_track
-from scenes.trocar import Trocar
+from scenes.scene import Trocar
 from ultrasound.probe import load_probe
 
 BALL = """

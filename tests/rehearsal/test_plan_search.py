@@ -28,8 +28,7 @@ from rehearsal.planning.trial_workers import (
     _trial,
 )
 from scenes.anatomy import LoadedAnatomy, fingerprint
-from scenes.scene import Scene
-from scenes.trocar import Trocar
+from scenes.scene import Scene, Trocar
 from studies.planning import plan_comparison
 from studies.planning.plan_study_command import table
 from ultrasound.probe import load_probe

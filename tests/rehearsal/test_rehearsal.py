@@ -9,13 +9,15 @@ import trimesh
 from slicing import organ_mask
 
 from rehearsal.rehearsal import Rehearsal
-from scenes.anatomy import load_anatomy, patient_scene, phantom_folder
+from scenes.anatomy import load_anatomy
 from scenes.patients.patient_folder import save_patient
 from scenes.patients.patient_import import import_patient
+from scenes.patients.patient_scene import patient_scene
 from scenes.patients.readers.ct_files import open_ct
 from scenes.patients.readers.label_maps import LabelMap
-from scenes.patients.readers.lazy_volume import LazyVolume
+from scenes.phantom.embedded_patient import phantom_folder
 from scenes.scene import PAPER, Press, Scene, load_scene, with_options
+from scenes.volumes.lazy_volume import LazyVolume
 from sim.fields import array_of
 from sim.signed_distance import signed_distance
 from sim.skinning import Skin

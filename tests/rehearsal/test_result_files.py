@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from rehearsal.image_and_surface_files import save_images
 from rehearsal.result_files import rounded, save_figure, spread, write_csv, write_json
-from scenes.closed_surfaces import moved_by, volume_mm3
+from scenes.surfaces import translated, volume_mm3
 from studies.robustness.rigid_fit import distances_after_fit
 from ultrasound.probe import load_probe
 from ultrasound.scanner import ECHO
@@ -65,7 +65,7 @@ def test_a_full_disk_leaves_what_was_there(tmp_path, bytes_to_a_file):
 
 def test_a_surface_holds_the_same_volume_wherever_it_is():
     box = trimesh.creation.box((2.0, 3.0, 4.0))
-    far = moved_by(box, [100.0, -50.0, 7.0])
+    far = translated(box, [100.0, -50.0, 7.0])
     assert far.bounds.mean(axis=0) == pytest.approx([100.0, -50.0, 7.0])
     # 24 mm^3, less what is lost where the corners' products of 1e6 mm^3 cancel.
     assert volume_mm3(far.vertices, far.faces) == pytest.approx(24.0, abs=1e-8)

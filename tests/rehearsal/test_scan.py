@@ -12,9 +12,9 @@ from PIL import Image
 import app
 from rehearsal.commands.scan_command import warn_of_deep_poses
 from rehearsal.tracking.pose_file import PoseError, TimedPoses, load_poses, load_timed_poses
-from scenes.anatomy import phantom_folder
+from scenes.phantom.embedded_patient import phantom_folder
 from scenes.scene import EMBEDDED
-from scenes.surface_files import load_surface
+from scenes.surfaces import load_surface
 from ultrasound.probe import load_probe
 from version import VERSION
 

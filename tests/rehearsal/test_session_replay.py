@@ -24,7 +24,8 @@ from rehearsal.sessions.session_file import Log, SessionError, read_log
 from rehearsal.tracking.pose_file import TimedPoses
 from render.viewer import Controls, NullViewer, Settings, View
 from render.window import NoVulkan
-from scenes.anatomy import LoadedAnatomy, load_anatomy, phantom_folder
+from scenes.anatomy import LoadedAnatomy, load_anatomy
+from scenes.phantom.embedded_patient import phantom_folder
 from scenes.scene import EMBEDDED, load_scene, with_options
 from sim.device import start
 from ultrasound import coverage

@@ -4,19 +4,19 @@ from pathlib import Path
 
 import pytest
 
-from scenes.atomic_files import whole
+from scenes.atomic_files import atomic_write
 
 
 def written(path: Path, fault: BaseException) -> None:
     """Half of a file, and then a fault."""
-    with whole(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text("half")
         raise fault
 
 
 def made(path: Path, content: str) -> None:
     """A folder with one file."""
-    with whole(path) as partial:
+    with atomic_write(path) as partial:
         partial.mkdir()
         (partial / "b").write_text(content)
 
@@ -35,7 +35,7 @@ def test_a_file_stays_as_it_was_where_the_new_one_cannot_be_written(tmp_path, fa
 def test_a_file_takes_its_name_and_suffix_at_the_end(tmp_path):
     path = tmp_path / "a.nii.gz"
     path.write_text("before")
-    with whole(path) as partial:
+    with atomic_write(path) as partial:
         assert partial.name.endswith("a.nii.gz")
         partial.write_text("after")
         assert path.read_text() == "before"

@@ -6,11 +6,11 @@ import pytest
 import trimesh
 from synthetic_body import LEFT, TUMOUR, assert_sound, body, drawn, grid_around, least_gap, level
 
+from errors import PatientError
 from scenes.patients.bed_support import bed_of_file, bed_of_labels
-from scenes.patients.import_error import PatientError
 from scenes.patients.patient_import import SUPINE_GRAVITY, import_patient
 from scenes.patients.readers.label_maps import LabelMap
-from scenes.patients.readers.lazy_volume import LazyVolume
+from scenes.volumes.lazy_volume import LazyVolume
 
 # A muscle behind the left kidney, with 4 mm of fat between.
 MUSCLE = np.array([70.0, 79.0, 12.0]), np.array([45.0, 20.0, 70.0])
@@ -61,7 +61,7 @@ class TestBedOfLabels:
 
     def test_nothing_under_the_organ(self):
         aside = SMALL[0] + [-36, 30, 0], np.array([20.0, 14.0, 40.0])
-        with pytest.raises(PatientError, match=r"lies under \d+% of the organ: expected 50% or more"):
+        with pytest.raises(PatientError, match=r"supports \d+% of the organ: expected 50% or more"):
             small_organs_bed(aside)
 
     def test_ends_at_half_of_the_organs_height(self):
@@ -95,7 +95,7 @@ class TestBedOfFile:
             ("inside", "mm into the organ"),
             ("far", "mm from the organ"),
             ("open", "not a closed surface"),
-            ("text", "cannot be read as a surface|holds no triangles"),
+            ("text", "cannot be read as a surface|has no triangles"),
             ("absent", "no such file"),
         ]:
             with pytest.raises(PatientError, match=words) as caught:

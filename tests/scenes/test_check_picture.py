@@ -9,19 +9,19 @@ from synthetic_body import LEFT, TUMOUR, body, points_of, with_voxels
 
 from scenes.patients.check_picture import (
     COLOUR,
+    OVERVIEW,
     PIXEL_MM,
     VIEWS,
-    WHOLE,
     colours_of,
-    cut,
     draw_check,
     is_wider,
+    resample_plane,
 )
-from scenes.patients.import_summary import facts
+from scenes.patients.import_summary import summary_rows
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.label_maps import LabelMap
-from scenes.patients.readers.lazy_volume import LazyVolume
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.volumes.lazy_volume import LazyVolume
+from scenes.volumes.voxel_grid import VoxelGrid
 
 LETTER = {(1, 0, 0): "L", (-1, 0, 0): "R", (0, 1, 0): "P", (0, -1, 0): "A", (0, 0, 1): "S", (0, 0, -1): "I"}
 NAMES = {2: "kidney_left", 3: "tumour"}
@@ -33,7 +33,7 @@ def patient():
     return import_patient(LazyVolume.of(ct), LabelMap.of(labels, NAMES), side="left", margin_mm=30.0)
 
 
-@pytest.mark.parametrize("view", [*VIEWS, WHOLE], ids=lambda view: view.name)
+@pytest.mark.parametrize("view", [*VIEWS, OVERVIEW], ids=lambda view: view.name)
 def test_letters_are_those_of_the_axes(view):
     right, down = np.array(view.right), np.array(view.down)
     assert view.letters == tuple(LETTER[tuple(axis)] for axis in (-right, right, -down, down))
@@ -51,14 +51,14 @@ def test_a_spot_is_drawn_on_its_side(patient, view):
     voxels[patient.ct.TransformPhysicalPointToIndex(spot.tolist())[::-1]] = 1000
     right, down = np.array(view.right, float), np.array(view.down, float)
     spans = [sorted((low @ axis, high @ axis)) for axis in (right, down)]
-    picture = cut(with_voxels(patient.ct, voxels), right, down, spans, spot)
+    picture = resample_plane(with_voxels(patient.ct, voxels), right, down, spans, spot)
     row, column = np.unravel_index(picture.argmax(), picture.shape)
     assert column * PIXEL_MM + spans[0][0] == pytest.approx(spot @ right, abs=2.0)  # a voxel is 3 mm
     assert row * PIXEL_MM + spans[1][0] == pytest.approx(spot @ down, abs=2.0)
 
 
 def test_outlines_and_surfaces_are_in_the_picture(patient, tmp_path):
-    draw_check(patient, facts(patient), tmp_path)
+    draw_check(patient, summary_rows(patient), tmp_path)
     picture = matplotlib.image.imread(tmp_path / "check.png")[..., :3]
     assert picture.shape[:2] == (960, 1300)
     half = picture.shape[0] // 2
@@ -83,7 +83,7 @@ def test_files_own_colours_are_shown_brightly(patient):
 
 
 def test_the_file_says_nothing_of_its_maker(patient, tmp_path):
-    draw_check(patient, facts(patient), tmp_path)
+    draw_check(patient, summary_rows(patient), tmp_path)
     content = (tmp_path / "check.png").read_bytes()
     assert not any(word in content for word in (b"tEXt", b"iTXt", b"eXIf", str(tmp_path).encode()))
 
@@ -103,7 +103,7 @@ def test_ct_lies_under_its_letters(patient, tmp_path):
     places = points_of(patient.ct)
     block = ((places > (85, 5, 14)) & (places < (105, 32, 40))).all(axis=-1)
     bright = with_voxels(patient.ct, np.where(block, 1000, -1000).astype(np.int16))
-    draw_check(replace(patient, ct=bright), facts(patient), tmp_path)
+    draw_check(replace(patient, ct=bright), summary_rows(patient), tmp_path)
     picture = matplotlib.image.imread(tmp_path / "check.png")[..., :3]
     for n, sense in enumerate((1, 1, -1)):
         panel, column, row = panel_of(picture, n)
@@ -113,7 +113,7 @@ def test_ct_lies_under_its_letters(patient, tmp_path):
 
 def test_outlines_lie_under_their_letters(patient, tmp_path):
     """The tumour is in all cuts, to the left, in front and above the kidney's middle."""
-    draw_check(patient, facts(patient), tmp_path)
+    draw_check(patient, summary_rows(patient), tmp_path)
     picture = matplotlib.image.imread(tmp_path / "check.png")[..., :3]
     for n, sense in enumerate((1, 1, -1)):
         panel, middle = panel_of(picture, n)[0], {}
@@ -131,7 +131,7 @@ def test_the_whole_width_is_shown_where_it_is_wider_than_the_cuts(patient, tmp_p
     assert is_wider(patient.overview, patient.ct) and not is_wider(patient.ct, patient.ct)
     grey = []
     for each in (patient, replace(patient, overview=patient.ct)):
-        draw_check(each, facts(each), tmp_path)
+        draw_check(each, summary_rows(each), tmp_path)
         panel = matplotlib.image.imread(tmp_path / "check.png")[560:, 460:840, :3]
         grey.append(((np.ptp(panel, axis=2) < 0.01) & (panel[..., 0] > 0.3)).sum())
     assert grey[0] > 20 * grey[1]

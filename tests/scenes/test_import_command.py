@@ -9,17 +9,16 @@ from pydicom.dataset import Dataset
 from synthetic_body import BODY, DIRECTIONS, LEFT, RIGHT, TUMOUR, coarsely, level
 
 from app import main
+from errors import PatientError
 from scenes.anatomy import load_anatomy
-from scenes.patients.import_command import place_mm
-from scenes.patients.import_error import PatientError
-from scenes.patients.import_request import Request, take_in, with_labels
-from scenes.patients.patient_folder import save_patient, telling
+from scenes.patients.import_command import position_mm
+from scenes.patients.import_request import ImportRequest, import_request, with_labels
+from scenes.patients.patient_folder import is_identifying, save_patient
 from scenes.patients.readers.ct_files import open_ct
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import LabelMap
-from scenes.progress import silent
 from scenes.scene import load_scene
-from scenes.shell_quoting import pasted
+from scenes.terminal import shell_command, silent
 
 SPINE = np.array([0.0, 70.0, 0.0]), np.array([22.0, 20.0, 400.0])
 ORIGIN = (-175.0, -120.0, -56.0)
@@ -62,15 +61,15 @@ def hospital(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def imported(hospital, tmp_path_factory):
-    """The folder that the command leaves of it; the patient, and what is private of it."""
+    """The folder that the command leaves of it; the patient and its identifiers."""
     out, found = tmp_path_factory.mktemp("patients") / "a", []
 
     def watched(*request):
-        found.append(take_in(*request))
+        found.append(import_request(*request))
         return found[0]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("scenes.patients.import_request.take_in", watched)
+        patch.setattr("scenes.patients.import_request.import_request", watched)
         assert main(["import", str(hospital[0]), "--side", "left", "--out", str(out)]) == 0
     return out, *found
 
@@ -100,9 +99,9 @@ def test_the_folder_is_a_scene(written):
 
 def test_nothing_names_the_patient(written, hospital):
     folder, series = hospital
-    secrets = [*PERSON.values(), "Doe", "Jane", series.uid, series.frame_of_reference, series.study]
-    secrets += [str(folder), "Doe_Jane", *series.sops]
-    words = [value for value in secrets if len(value) > 3]
+    identifiers = [*PERSON.values(), "Doe", "Jane", series.uid, series.frame_of_reference, series.study]
+    identifiers += [str(folder), "Doe_Jane", *series.sops]
+    words = [value for value in identifiers if len(value) > 3]
     assert len(words) > 40
     for file in written.iterdir():
         content = file.read_bytes()
@@ -112,18 +111,18 @@ def test_nothing_names_the_patient(written, hospital):
 def test_the_terminal_names_nobody_and_tells_the_facts(hospital, tmp_path, capfd):
     out = tmp_path / "a b"
     assert main(["import", str(hospital[0]), "--side", "right", "--out", str(out)]) == 0
-    said = capfd.readouterr()
-    assert said.out.endswith(f"then: {pasted('rehearse', out)}\n")
-    assert "right kidney" in said.out and "none is in the files" in said.out
+    printed = capfd.readouterr()
+    assert printed.out.endswith(f"then: {shell_command('rehearse', out)}\n")
+    assert "right kidney" in printed.out and "none is in the files" in printed.out
     for text in ("Doe", "Jane", "4711", "19600229", hospital[1].uid):
-        assert text not in said.out + said.err
+        assert text not in printed.out + printed.err
 
 
-def test_what_was_read_is_known_to_be_private(hospital, taken_in):
+def test_identifiers_of_the_source_are_collected(hospital, taken_in):
     folder, series = hospital
-    private = taken_in[1]
-    assert {"Doe^Jane", "Doe", "Jane", "19600229", "A1234567", series.uid, series.sops[0]} <= private
-    assert str(folder.resolve()) in private
+    identifiers = taken_in[1]
+    assert {"Doe^Jane", "Doe", "Jane", "19600229", "A1234567", series.uid, series.sops[0]} <= identifiers
+    assert str(folder.resolve()) in identifiers
 
 
 def test_contours_on_an_archive(hospital, tmp_path):
@@ -140,7 +139,7 @@ def test_contours_on_an_archive(hospital, tmp_path):
             contours.append(np.column_stack([x, y, np.full(90, z)]))
     structures = write_structures(tmp_path / "rt.dcm", {"Kidney_L": contours, "External": []}, series.uid)
     archive = zipped(folder / "ct", tmp_path / "ct.zip")
-    patient, _ = take_in(Request(archive, [structures]))
+    patient, _ = import_request(ImportRequest(archive, [structures]))
     assert patient.side == "left"
     assert patient.volumes_ml["organ"] == pytest.approx(4 / 3 * np.pi * LEFT[1].prod() / 1000, rel=0.02)
     np.testing.assert_allclose(patient.organ.center_mass, LEFT[0], atol=0.5)
@@ -151,36 +150,45 @@ def test_labels_of_another_examination(hospital, tmp_path):
     other = Series(tmp_path / "ct", DIRECTIONS["identity"], size=(20, 20, 6), origin=ORIGIN, field=hounsfield)
     other.write()
     with pytest.raises(PatientError, match="another frame of reference"):
-        take_in(Request(tmp_path / "ct", [folder / "seg"]))
-    with pytest.raises(PatientError, match="no labels lie with this CT.*--seed"):
-        take_in(Request(tmp_path / "ct"))
+        import_request(ImportRequest(tmp_path / "ct", [folder / "seg"]))
+    with pytest.raises(PatientError, match="no labels are with this CT.*--seed"):
+        import_request(ImportRequest(tmp_path / "ct"))
 
 
-class TestPrivate:
+class TestIdentifiers:
     @pytest.fixture
     def patient(self, taken_in):
         return taken_in[0]
 
-    @pytest.mark.parametrize("secret", ["Doe", "Doe^Jane", "19600229", "1.2.826.0.1.3680043.8.498.1", "Ünal"])
-    def test_a_file_that_would_name_somebody_is_not_written(self, patient, tmp_path, secret):
-        texts = {"scene.toml": f'title = "kidney of {secret}"\n'}
-        with pytest.raises(PatientError, match=r"scene\.toml would have held something") as caught:
-            save_patient(patient, tmp_path / "p", texts, private={secret, "Nobody"})
-        assert secret not in str(caught.value) and list(tmp_path.iterdir()) == []
-        assert save_patient(patient, tmp_path / "p", {"scene.toml": ""}, private={secret, "Nobody"}) == 2
+    @pytest.mark.parametrize(
+        "identifier", ["Doe", "Doe^Jane", "19600229", "1.2.826.0.1.3680043.8.498.1", "Ünal"]
+    )
+    def test_a_file_with_an_identifier_is_not_written(self, patient, tmp_path, identifier):
+        texts = {"scene.toml": f'title = "kidney of {identifier}"\n'}
+        with pytest.raises(PatientError, match=r"scene\.toml would have contained an identifier") as caught:
+            save_patient(patient, tmp_path / "p", texts, identifiers={identifier, "Nobody"})
+        assert identifier not in str(caught.value) and list(tmp_path.iterdir()) == []
+        assert (
+            save_patient(patient, tmp_path / "p", {"scene.toml": ""}, identifiers={identifier, "Nobody"}) == 2
+        )
 
     def test_headers_of_images_and_surfaces_are_searched(self, patient, tmp_path):
         def draw(folder):
             organ = folder / "organ.stl"
             organ.write_bytes(b"solid of Doe".ljust(80) + organ.read_bytes()[80:])
 
-        with pytest.raises(PatientError, match=r"organ\.stl would have held"):
-            save_patient(patient, tmp_path / "p", draw=draw, private={"Doe"})
+        with pytest.raises(PatientError, match=r"organ\.stl would have contained"):
+            save_patient(patient, tmp_path / "p", draw=draw, identifiers={"Doe"})
         assert list(tmp_path.iterdir()) == []
 
     def test_words_of_every_file_name_nobody(self):
-        assert telling("Doe") and telling("Left^Doe") and telling("123456") and telling("1.2.3")
-        assert not any(map(telling, ["", "7", "AB", "12345", "kidney", "Left Kidney", "STL"]))
+        assert (
+            is_identifying("Doe")
+            and is_identifying("Left^Doe")
+            and is_identifying("123456")
+            and is_identifying("1.2.3")
+        )
+        assert not any(map(is_identifying, ["", "7", "AB", "12345", "kidney", "Left Kidney", "STL"]))
 
     def test_an_interrupted_import_leaves_nothing(self, patient, tmp_path):
         def draw(_):
@@ -203,12 +211,12 @@ def test_the_folder_is_checked_before_the_work(tmp_path, capfd):
 @pytest.mark.parametrize("text", ["", "1,2", "1,2,3,4", "a,b,c", "1,2,nan"])
 def test_a_seed_is_three_numbers(text):
     with pytest.raises(PatientError, match="three numbers X,Y,Z"):
-        place_mm(text)
+        position_mm(text)
 
 
 def test_a_seed_or_labels(tmp_path):
     with pytest.raises(PatientError, match="not both"):
-        take_in(Request(tmp_path, [tmp_path], seed_mm=np.zeros(3)))
+        import_request(ImportRequest(tmp_path, [tmp_path], seed_mm=np.zeros(3)))
 
 
 def test_the_series_that_labels_were_drawn_on(tmp_path):
@@ -220,34 +228,36 @@ def test_the_series_that_labels_were_drawn_on(tmp_path):
     thin.write()
     thick.write()
     seg = write_segmentation(tmp_path / "seg.dcm", thick, {"Kidney": np.ones((3, 10, 12))})
-    assert with_labels(Request(tmp_path / "ct", [seg]), silent)[0].grid.spacing[2] == pytest.approx(5.0)
+    assert with_labels(ImportRequest(tmp_path / "ct", [seg]), silent)[0].grid.spacing[2] == pytest.approx(5.0)
 
 
-def test_each_source_is_private(hospital, taken_in):
+def test_identifiers_of_each_source(hospital, taken_in):
     """The CT's header by itself, and the labels'."""
     folder, series = hospital
-    for said in (open_ct(folder / "ct").secrets, open_labels(folder / "seg").secrets):
-        assert {"Doe^Jane", "Doe", "Jane", "19600229", "A1234567", series.study} <= said
+    for identifiers in (open_ct(folder / "ct").identifiers, open_labels(folder / "seg").identifiers):
+        assert {"Doe^Jane", "Doe", "Jane", "19600229", "A1234567", series.study} <= identifiers
 
 
-def test_what_labels_say_and_paths_are_private(hospital, taken_in, tmp_path, monkeypatch):
+def test_identifiers_of_labels_and_paths(hospital, taken_in, tmp_path, monkeypatch):
     monkeypatch.setattr("scenes.patients.import_request.import_patient", lambda *_, **__: taken_in[0])
     monkeypatch.chdir(tmp_path)
     made = nibabel.Nifti1Image(np.ones((5, 5, 5), np.uint8), np.eye(4))
     made.header["descrip"] = b"drawn by Roe"
     nibabel.save(made, tmp_path / "kidney.nii.gz")
     given = type(tmp_path)("../") / tmp_path.name / "kidney.nii.gz"
-    private = take_in(Request(hospital[0] / "ct", [given]))[1]
-    assert {"drawn by Roe", "Doe^Jane", str(given), str(tmp_path.resolve() / "kidney.nii.gz")} <= private
+    identifiers = import_request(ImportRequest(hospital[0] / "ct", [given]))[1]
+    assert {"drawn by Roe", "Doe^Jane", str(given), str(tmp_path.resolve() / "kidney.nii.gz")} <= identifiers
 
 
 def test_a_seed_makes_a_draft(hospital, taken_in, monkeypatch):
     labels = LabelMap.of(sitk.Image([4, 4, 4], sitk.sitkUInt8) + 1)
-    monkeypatch.setattr("scenes.patients.import_request.grown", lambda ct, seed: labels)
+    monkeypatch.setattr("scenes.patients.import_request.draft_segmentation", lambda ct, seed: labels)
     monkeypatch.setattr(
         "scenes.patients.import_request.import_patient", lambda ct, labels, *_, **__: taken_in[0]
     )
-    assert take_in(Request(hospital[0] / "ct", seed_mm=LEFT[0]))[0].draft and not taken_in[0].draft
+    assert (
+        import_request(ImportRequest(hospital[0] / "ct", seed_mm=LEFT[0]))[0].draft and not taken_in[0].draft
+    )
 
 
 def test_what_one_header_says(tmp_path):
@@ -260,8 +270,8 @@ def test_what_one_header_says(tmp_path):
         data.OtherPatientIDs, data.InstitutionName = ["X-1", "X-22"], "St Elsewhere"
         data.private_block(0x0099, "MAKER", create=True).add_new(1, "LO", "Ward 12")
 
-    secrets = open_ct(Series(tmp_path).write(edit=edit)).secrets
-    assert {"Roe^Ann", "Roe", "Ann", "calls himself Jim", "X-22", "St Elsewhere", "Ward 12"} <= secrets
+    identifiers = open_ct(Series(tmp_path).write(edit=edit)).identifiers
+    assert {"Roe^Ann", "Roe", "Ann", "calls himself Jim", "X-22", "St Elsewhere", "Ward 12"} <= identifiers
 
 
 class TestSearch:
@@ -270,17 +280,17 @@ class TestSearch:
         def draw(folder):
             (folder / "check.png").write_bytes(b"\0\1" + "Özgür Ünal".encode(encoding) + b"\2")
 
-        with pytest.raises(PatientError, match=r"check\.png would have held"):
-            save_patient(taken_in[0], tmp_path / "p", draw=draw, private={"Özgür Ünal"})
+        with pytest.raises(PatientError, match=r"check\.png would have contained"):
+            save_patient(taken_in[0], tmp_path / "p", draw=draw, identifiers={"Özgür Ünal"})
 
     def test_packed_voxels_are_searched(self, taken_in, tmp_path):
         def draw(folder):
             words = sitk.GetImageFromArray(np.frombuffer(b"\0\0of Doe^Jane\0", np.uint8).reshape(1, 1, -1))
             sitk.WriteImage(words, str(folder / "labels.nrrd"), useCompression=True)
 
-        with pytest.raises(PatientError, match=r"labels\.nrrd would have held"):
-            save_patient(taken_in[0], tmp_path / "p", draw=draw, private={"Doe^Jane"})
+        with pytest.raises(PatientError, match=r"labels\.nrrd would have contained"):
+            save_patient(taken_in[0], tmp_path / "p", draw=draw, identifiers={"Doe^Jane"})
 
     def test_a_word_within_another_names_nobody(self, taken_in, tmp_path):
         texts = {"scene.toml": 'title = "monroe\'s doer"\n'}
-        assert save_patient(taken_in[0], tmp_path / "p", texts, private={"roe", "doe"}) == 2
+        assert save_patient(taken_in[0], tmp_path / "p", texts, identifiers={"roe", "doe"}) == 2

@@ -1,12 +1,12 @@
-"""What an import minds of a CT: as bright as stone is what the echo takes for one. The other cautions: test_import.py."""
+"""Import warnings: the brightness that the B-mode image takes for stone. The other warnings: test_patient_import.py."""
 
 import numpy as np
 import pytest
 import SimpleITK as sitk
 from scipy import ndimage
 
-from scenes.patients.import_warnings import STONE_ABOVE_MEDIAN_HU, as_stone
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.patients.import_warnings import STONE_ABOVE_MEDIAN_HU, stone_warnings
+from scenes.volumes.voxel_grid import VoxelGrid
 
 KIDNEY_HU, WHOLE, NOWHERE = 100.0, np.ones((10, 10, 10), bool), np.zeros((10, 10, 10), bool)
 
@@ -23,7 +23,7 @@ def grid() -> VoxelGrid:
 def test_as_bright_as_stone_is_what_the_echo_takes_for_one_and_no_speck(grid, above, edge, lines):
     hounsfield = np.full((10, 10, 10), KIDNEY_HU)
     hounsfield[2:][:edge, :edge, :edge] = KIDNEY_HU + STONE_ABOVE_MEDIAN_HU + above
-    found = as_stone(grid, hounsfield, WHOLE, NOWHERE)
+    found = stone_warnings(grid, hounsfield, WHOLE, NOWHERE)
     assert len(found) == lines and all("0.2 ml inside the organ" in line for line in found)
 
 
@@ -31,5 +31,5 @@ def test_the_rim_of_urine_is_bright_where_voxels_are_cut(grid):
     urine = NOWHERE.copy()
     urine[4, 4, 2:8] = True
     hounsfield = np.where(ndimage.binary_dilation(urine), 400.0, KIDNEY_HU)
-    assert as_stone(grid, hounsfield, ~urine, urine) == ()
-    assert len(as_stone(grid, hounsfield, ~urine, NOWHERE)) == 1
+    assert stone_warnings(grid, hounsfield, ~urine, urine) == ()
+    assert len(stone_warnings(grid, hounsfield, ~urine, NOWHERE)) == 1

@@ -8,9 +8,9 @@ from synthetic_body import DIRECTIONS, drawn, grid_around
 from test_readers_labels import KIDNEY, by_name, ct_grid, ring
 
 from scenes.patients.readers.label_files import open_labels
-from scenes.patients.readers.label_maps import LabelMap, merged, with_tissues
+from scenes.patients.readers.label_maps import LabelMap, assign_tissues, merge_label_maps
 from scenes.patients.readers.segment_names import side_of
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.volumes.voxel_grid import VoxelGrid
 
 GRID = VoxelGrid.of(grid_around((-33, 18, -401), (-22, 30, -385), (0.7, 0.9, 1.6)))
 
@@ -25,14 +25,14 @@ def strips(*names):
 
 class TestTogether:
     def test_the_users_word_is_all_that_is(self):
-        (told,) = with_tissues(
+        (assigned,) = assign_tissues(
             [strips("kidney_left", "old tumour", "new mass")], [], {"tumour": ["new mass"]}
         )
-        assert [s.tissue for s in told.segments.values()] == ["kidney", None, "tumour"]
+        assert [s.tissue for s in assigned.segments.values()] == ["kidney", None, "tumour"]
 
     def test_what_of_the_organ_has_a_tissue_keeps_it(self):
-        (told,) = with_tissues([strips("kidney_left", "mass", "x")], ["kidney_left", "mass", "x"], {})
-        assert [s.tissue for s in told.segments.values()] == ["kidney", "tumour", "kidney"]
+        (assigned,) = assign_tissues([strips("kidney_left", "mass", "x")], ["kidney_left", "mass", "x"], {})
+        assert [s.tissue for s in assigned.segments.values()] == ["kidney", "tumour", "kidney"]
 
     @pytest.mark.parametrize(
         ("over", "under"), [("tumour", "cyst"), ("cyst", "kidney"), ("stone", "tumour"), ("vein", "kidney")]
@@ -41,7 +41,7 @@ class TestTogether:
         inside = np.zeros(GRID.size[::-1], np.uint8)
         inside[2:6, 2:6, 2:6] = 1
         maps = [LabelMap.valued(GRID, inside, {1: name}) for name in (over, under)]
-        for one in (merged(maps), merged(maps[::-1])):
+        for one in (merge_label_maps(maps), merge_label_maps(maps[::-1])):
             assert [s.name for s in one.segments.values()] == [over] and len(one.segments) == 1
 
     def test_many_values(self):
@@ -60,7 +60,7 @@ class TestTogether:
             LabelMap.valued(grid, np.ones(grid.size[::-1], np.uint8), {1: name})
             for grid, name in ((fine, "kidney"), (coarse, "mass"))
         ]
-        one = merged(maps)
+        one = merge_label_maps(maps)
         assert np.isin(one.values, one.of_tissues("tumour")).sum() == pytest.approx(24 * 120, rel=0.03)
 
 
@@ -97,7 +97,7 @@ class TestNames:
 
 class TestSegmentations:
     def test_what_is_meant(self, series, tmp_path):
-        """A name that says nothing: the coded property does."""
+        """The coded property names the tissue where the label does not."""
         mask = np.ones(series.size[::-1])
         (one,) = open_labels(write_segmentation(tmp_path / "seg.dcm", series, {"Xidney 1": mask})).maps(None)
         assert [(s.name, s.tissue) for s in one.segments.values()] == [("Xidney 1", "kidney")]
@@ -106,7 +106,7 @@ class TestSegmentations:
     def series(self, tmp_path):
         return Series(tmp_path / "ct")
 
-    def test_what_labels_say_is_private(self, series, tmp_path):
+    def test_identifiers_of_labels(self, series, tmp_path):
         seg = write_segmentation(tmp_path / "seg.dcm", series, {"Kidney": np.ones(series.size[::-1])})
         rt = write_structures(
             tmp_path / "rt.dcm", {"Kidney": [ring(series.positions(2), 5, series.direction)]}
@@ -115,7 +115,7 @@ class TestSegmentations:
         image.SetMetaData("Comment", "Doe^Jane")
         sitk.WriteImage(image, str(tmp_path / "a.seg.nrrd"))
         for path in (seg, rt, tmp_path / "a.seg.nrrd"):
-            assert "Doe^Jane" in open_labels(path).secrets, path.name
+            assert "Doe^Jane" in open_labels(path).identifiers, path.name
 
 
 class TestContours:

@@ -8,13 +8,13 @@ from synthetic_body import BODY, LEFT, RIGHT, body, drawn, grid_around, with_vox
 from test_patient_import import found, imported
 
 import scenes.patients.patient_import
-from scenes.patients.import_error import PatientError
-from scenes.patients.organ_selection import hollow, midline_x, organs
-from scenes.patients.part_surfaces import PEDICLE_MM, bodies, colours_of_labels, near_organ
+from errors import PatientError
+from scenes.patients.organ_selection import closing, find_organs, midline_x
+from scenes.patients.part_surfaces import PEDICLE_MM, colours_of_labels, near_organ, part_surface
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.label_maps import LabelMap, Segment
-from scenes.patients.readers.lazy_volume import LazyVolume
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.volumes.lazy_volume import LazyVolume
+from scenes.volumes.voxel_grid import VoxelGrid
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ class TestOrgan:
     def test_island_is_no_organ(self):
         empty = grid_around((-110, -30, -60), (110, 90, 80), (3.0, 3.0, 3.0))
         island = RIGHT[0], np.full(3, 9.0)  # 3 ml
-        (one,) = organs(LabelMap.of(drawn(empty, (1, LEFT), (1, island))))
+        (one,) = find_organs(LabelMap.of(drawn(empty, (1, LEFT), (1, island))))
         assert one.centre_x_mm == pytest.approx(LEFT[0][0], abs=0.5)
 
     @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -49,7 +49,7 @@ class TestOrgan:
         notch[axis - 1] = slice(values.shape[axis - 1] // 2)
         values[tuple(notch)] = 2
         grid = VoxelGrid(values.shape[::-1], spacing[::-1], np.zeros(3), np.eye(3))
-        (piece,) = organs(LabelMap.valued(grid, values, {1: "kidney", 2: "renal vein"}))
+        (piece,) = find_organs(LabelMap.valued(grid, values, {1: "kidney", 2: "renal vein"}))
         at = [n // 2 for n in values.shape]
         at[axis - 1] //= 2
         assert piece.mask[tuple(at)] == closed
@@ -60,8 +60,8 @@ class TestOrgan:
         mask = (np.linalg.norm((points - (9, 12, 11)) / (10, 12, 11), axis=-1) < 1) & (
             np.linalg.norm(places - (0, 12, 11), axis=-1) > 7
         )
-        wide = hollow(np.pad(mask, 20), np.full(3, 2.0))[20:-20, 20:-20, 20:-20]
-        assert np.array_equal(hollow(mask, np.full(3, 2.0)), wide) and wide.sum() > mask.sum()
+        wide = closing(np.pad(mask, 20), np.full(3, 2.0))[20:-20, 20:-20, 20:-20]
+        assert np.array_equal(closing(mask, np.full(3, 2.0)), wide) and wide.sum() > mask.sum()
 
     def test_kidney_halves_without_a_body(self):
         """Two pieces near each other may be one kidney's: no midline lies between them."""
@@ -81,7 +81,7 @@ class TestOrgan:
     def test_ct_without_a_negative_value(self, ct_and_labels):
         ct, labels = ct_and_labels
         clipped = with_voxels(ct, np.maximum(sitk.GetArrayFromImage(ct), 0))
-        with pytest.raises(PatientError, match="holds values from 0 to 120: expected HU"):
+        with pytest.raises(PatientError, match="has values from 0 to 120: expected HU"):
             imported(clipped, labels, organ=[2])
 
 
@@ -95,7 +95,7 @@ class TestParts:
         )
 
     def test_vessels_as_far_as_the_pedicle(self, labels):
-        (piece,) = organs(labels)
+        (piece,) = find_organs(labels)
         grid, inside = near_organ(labels, piece, [1])
         organ = piece.grid.place(np.argwhere(piece.mask)[:, ::-1])
         everything = labels.grid.place(np.argwhere(labels.values == 1)[:, ::-1])
@@ -107,7 +107,7 @@ class TestParts:
         empty = grid_around((-40, -20, -20), (60, 20, 20), (1.5, 1.5, 1.5))
         balls = [(np.array([x, 0.0, 0.0]), np.full(3, r)) for x, r in ((-20, 14), (18, 10), (50, 3))]
         image = drawn(empty, *((1, ball) for ball in balls))
-        surface = bodies(VoxelGrid.of(image), sitk.GetArrayFromImage(image) > 0, "tumour")
+        surface = part_surface(VoxelGrid.of(image), sitk.GetArrayFromImage(image) > 0, "tumour")
         assert surface.body_count == 2 and surface.bounds[1, 0] == pytest.approx(28, abs=1.5)
 
     def test_the_first_colour_counts(self):

@@ -5,11 +5,11 @@ import os
 import numpy as np
 import pytest
 
+from errors import PatientError
 from scenes.patients import part_surfaces
-from scenes.patients.import_error import PatientError
-from scenes.patients.part_surfaces import surfaces_aside
-from scenes.patients.readers.voxel_grid import VoxelGrid
-from scenes.progress import silent
+from scenes.patients.part_surfaces import part_surfaces_in_processes
+from scenes.terminal import silent
+from scenes.volumes.voxel_grid import VoxelGrid
 
 GRID = VoxelGrid((40, 36, 32), np.array([0.9, 1.0, 1.2]), np.array([5.0, -7.0, 3.0]), np.eye(3))
 
@@ -21,9 +21,9 @@ def ball(at: tuple[float, float, float], radius_mm: float) -> np.ndarray:
 
 
 def made(monkeypatch, found, aside: bool):
-    monkeypatch.setattr(part_surfaces, "ASIDE_FROM_MM2", 0.0 if aside else np.inf)
+    monkeypatch.setattr(part_surfaces, "PROCESSES_FROM_MM2", 0.0 if aside else np.inf)
     monkeypatch.setattr(part_surfaces, "cpu_count", lambda: 2)
-    with surfaces_aside(found) as surfaces:
+    with part_surfaces_in_processes(found) as surfaces:
         return surfaces(silent)
 
 
@@ -50,7 +50,7 @@ def test_of_what_is_too_thin_what_must_be_seen_stops_an_import(monkeypatch, asid
 
 
 def test_a_process_that_dies_is_said(monkeypatch):
-    monkeypatch.setattr(part_surfaces, "bodies", lambda *part: os._exit(1))
+    monkeypatch.setattr(part_surfaces, "part_surface", lambda *part: os._exit(1))
     found = {tissue: (GRID, ball((14, 14, 15), 9.0)) for tissue in ("tumour", "cyst")}
-    with pytest.raises(PatientError, match="want of memory"):
+    with pytest.raises(PatientError, match="lack of memory"):
         made(monkeypatch, found, aside=True)

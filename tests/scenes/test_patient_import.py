@@ -23,18 +23,18 @@ from synthetic_body import (
 )
 
 import scenes.patients.patient_import
-from scenes import anatomy
-from scenes.patients.import_error import PatientError
-from scenes.patients.import_summary import facts, told
+from errors import PatientError
+from scenes.patients.import_summary import as_table, summary_rows
 from scenes.patients.import_warnings import STONE_ABOVE_MEDIAN_HU
-from scenes.patients.organ_selection import midline_x, organs, single_out
+from scenes.patients.organ_selection import choose_organ, find_organs, midline_x
 from scenes.patients.patient_folder import save_patient
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.ct_files import open_ct
-from scenes.patients.readers.label_maps import LabelMap, with_tissues
-from scenes.patients.readers.lazy_volume import LazyVolume
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.patients.readers.label_maps import LabelMap, assign_tissues
+from scenes.phantom import embedded_patient
 from scenes.scene import SceneError
+from scenes.volumes.lazy_volume import LazyVolume
+from scenes.volumes.voxel_grid import VoxelGrid
 
 PELVIS = np.array([62.0, 35.0, 12.0]), np.array([8.0, 7.0, 12.0])
 CYST = np.array([70.0, 20.0, -30.0]), np.array([12.0, 12.0, 12.0])  # sticks out, too
@@ -42,9 +42,9 @@ LIVER = np.array([20.0, 0.0, 40.0]), np.array([20.0, 20.0, 20.0])
 
 
 def label_map(labels, organ=(), **tissues):
-    """A label map with values said to be of tissues, and the values of its organ, None where they are not said."""
+    """A label map with assigned tissues, and the values of its organ or None."""
     words = {tissue: [str(v) for v in values] for tissue, values in tissues.items()}
-    (told_map,) = with_tissues([LabelMap.of(labels)], [str(v) for v in organ], words)
+    (told_map,) = assign_tissues([LabelMap.of(labels)], [str(v) for v in organ], words)
     return told_map, list(organ) or None
 
 
@@ -55,9 +55,9 @@ def imported(ct, labels, organ=(), side=None, margin_mm=60.0, **tissues):
 
 def found(ct, labels, organ=(), side=None, **tissues):
     """The organ that an import would take, and its side."""
-    pieces = organs(*label_map(labels, organ, **tissues))
+    pieces = find_organs(*label_map(labels, organ, **tissues))
     midline = midline_x(VoxelGrid.of(ct), sitk.GetArrayFromImage(ct), -1000, 1000)
-    return single_out(pieces, midline, side)
+    return choose_organ(pieces, midline, side)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +97,7 @@ class TestImport:
         np.testing.assert_allclose(patient.tumour.center_mass, TUMOUR[0], atol=1.0)
         assert least_gap(patient.support, patient.organ) > 0
         assert patient.support.bounds[1, 1] > patient.organ.bounds[1, 1]  # posterior of it: supine
-        text = told(facts(patient))
+        text = as_table(summary_rows(patient))
         assert "left" in text and f"{patient.volumes_ml['organ']:.1f} ml" in text and "2.50" in text
 
     def test_crop_keeps_voxels_where_they_were(self, patient, ct_and_labels):
@@ -184,13 +184,13 @@ class TestImport:
         near = [slice(ct.TransformPhysicalPointToIndex((30.0, 0, 0))[0], None), slice(None), slice(None)]
         named = LabelMap.of(labels[near], {2: "kidney_left", 3: "kidney tumour"})
         assert import_patient(LazyVolume.of(ct[near]), named, margin_mm=10.0).side == "left"
-        with pytest.raises(PatientError, match="called by the other side's name"):
+        with pytest.raises(PatientError, match="has a name of the other side"):
             import_patient(LazyVolume.of(ct[near]), named, side="right", margin_mm=10.0)
         mirrored = LabelMap.of(labels, {1: "kidney_left", 2: "kidney_right", 3: "tumour"})
-        with pytest.raises(PatientError, match="lies on the patient's left, which its name denies"):
+        with pytest.raises(PatientError, match="is on the patient's left, but its name has the other side"):
             import_patient(LazyVolume.of(ct), mirrored, side="left", margin_mm=10.0)
         other = LabelMap.of(labels, {1: "liver", 2: "spleen", 3: "stomach"})
-        with pytest.raises(PatientError, match="no label says that it is a kidney: 1 liver, 2 spleen"):
+        with pytest.raises(PatientError, match="no label is named as a kidney: 1 liver, 2 spleen"):
             import_patient(LazyVolume.of(ct), other)
 
 
@@ -199,7 +199,7 @@ class TestImportRefuses:
         ("options", "words"),
         [
             ({}, r"2 organs .*label 1, right, \d+\.\d ml; label 2\+3, left, \d+\.\d ml.*--side"),
-            ({"organ": [5]}, "label 5 is not in the label map: it holds 1, 2, 3; give one of these"),
+            ({"organ": [5]}, "label 5 is not in the label map: it has 1, 2, 3; give one of these"),
             ({"tumour": [8], "organ": [1]}, "tumour's label 8 is not"),
             ({"organ": [1, 3], "tumour": [3]}, "label 3 is given as organ and as tumour"),
             ({"organ": [1], "tumour": [3]}, "the tumour does not touch the organ"),
@@ -217,11 +217,11 @@ class TestImportRefuses:
         ct, labels = ct_and_labels
         with pytest.raises(PatientError, match="empty"):
             imported(ct, labels * 0)
-        with pytest.raises(PatientError, match="swapped"):
+        with pytest.raises(PatientError, match="exchanged"):
             imported(labels, ct)
         with pytest.raises(PatientError, match="whole numbers"):
             imported(ct, sitk.Cast(labels, sitk.sitkFloat32) * 0.3)
-        with pytest.raises(PatientError, match="no organ, but 3; expected a kidney's too"):
+        with pytest.raises(PatientError, match="no organ, only 3; expected a kidney too"):
             imported(ct, mapped(labels, [0, 0, 0, 3]), tumour=[3])
 
     def test_labels_of_another_place(self, ct_and_labels):
@@ -232,7 +232,7 @@ class TestImportRefuses:
             imported(ct, far)
         half = sitk.Image(labels)
         half.SetOrigin(np.add(labels.GetOrigin(), (0, 0, 80.0)).tolist())
-        with pytest.raises(PatientError, match=r"lies in the CT with \d\d% of its voxels"):
+        with pytest.raises(PatientError, match=r"has \d\d% of its voxels in the CT"):
             imported(ct, half, [2], "left")
 
     def test_organ_cut_off(self):
@@ -293,7 +293,7 @@ class TestSave:
             save_patient(patient, tmp_path / "patient", draw=full)
         assert list(tmp_path.iterdir()) == []
 
-    def test_a_disk_that_is_full_is_told_and_leaves_nothing(self, patient, tmp_path, bytes_to_a_file):
+    def test_a_full_disk_is_reported_and_leaves_nothing(self, patient, tmp_path, bytes_to_a_file):
         with bytes_to_a_file(100), pytest.raises(PatientError, match="is the disk full.*; choose a folder"):
             save_patient(patient, tmp_path / "patient")
         assert list(tmp_path.iterdir()) == []
@@ -305,49 +305,51 @@ class TestSave:
         assert {each.name for each in tmp_path.iterdir()} == {"patient", ".0a1b2c3d.partial-another"}
 
     def test_the_embedded_patient_is_saved_where_it_can_be(self, patient, tmp_path, monkeypatch):
-        monkeypatch.setattr(anatomy, "_phantom_patient", lambda told: patient)
+        monkeypatch.setattr(embedded_patient, "make_embedded_patient", lambda progress: patient)
         monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path / "temporary"))
         cache = tmp_path / "cache"
         cache.write_text("a file in the way")
-        monkeypatch.setattr(anatomy, "CACHE", cache)
-        folder = anatomy.phantom_folder()
+        monkeypatch.setattr(embedded_patient, "CACHE", cache)
+        folder = embedded_patient.phantom_folder()
         assert folder.parent == tmp_path / "temporary" / "nephron" and (folder / "organ.stl").is_file()
-        monkeypatch.setattr(anatomy, "_phantom_patient", lambda told: pytest.fail("made twice"))
-        assert anatomy.phantom_folder() == folder
-        monkeypatch.setattr(anatomy, "_phantom_patient", lambda told: patient)
+        monkeypatch.setattr(
+            embedded_patient, "make_embedded_patient", lambda progress: pytest.fail("made twice")
+        )
+        assert embedded_patient.phantom_folder() == folder
+        monkeypatch.setattr(embedded_patient, "make_embedded_patient", lambda progress: patient)
         monkeypatch.setattr("tempfile.gettempdir", lambda: str(cache))
         with pytest.raises(SceneError, match="can be written to neither; free"):
-            anatomy.phantom_folder()
+            embedded_patient.phantom_folder()
 
 
 @pytest.mark.usefixtures("patient", "without_support", "coarse")
-class TestCautions:
-    """What looks wrong is said, though the import goes on."""
+class TestWarnings:
+    """What looks wrong gives warnings, and the import continues."""
 
     def test_a_body_as_it_should_be(self, patient):
-        assert patient.cautions == () and patient.notes == ()
+        assert patient.warnings == () and patient.notes == ()
 
     def test_turned_over_or_mirrored(self, ct_and_labels):
         ct, labels = ct_and_labels
         spine = np.array([0.0, 75.0, 0.0]), np.array([22.0, 18.0, 400.0])
         liver = np.array([-60.0, -40.0, 20.0]), np.array([40.0, 30.0, 50.0])
-        for sign, words in ((1, []), (-1, ["bones lie in front", "liver lies on the patient's left"])):
+        for sign, words in ((1, []), (-1, ["bones are in front", "liver is on the patient's left"])):
             voxels = sitk.GetArrayFromImage(ct)
             voxels[level(points_of(ct), (sign * spine[0], spine[1])) < 0] = 500
             marked = drawn(labels, (4, (liver[0] * [sign, 1, 1], liver[1])), (2, LEFT))
             patient = imported(with_voxels(ct, voxels), marked, [2], margin_mm=20.0, liver=[4])
-            assert len(patient.cautions) == len(words)
-            assert all(word in line for word, line in zip(words, patient.cautions, strict=True))
+            assert len(patient.warnings) == len(words)
+            assert all(word in line for word, line in zip(words, patient.warnings, strict=True))
 
     def test_labels_shifted_into_fat(self, ct_and_labels):
         ct, labels = ct_and_labels
         voxels = sitk.GetArrayFromImage(ct)
         voxels[voxels == 40] = -100
-        assert not imported(with_voxels(ct, voxels), labels, [2], margin_mm=20.0, tumour=[3]).cautions
+        assert not imported(with_voxels(ct, voxels), labels, [2], margin_mm=20.0, tumour=[3]).warnings
         shifted = sitk.Image(labels)
         shifted.SetOrigin(np.add(labels.GetOrigin(), (0, 8.0, 0)).tolist())
-        (said,) = imported(with_voxels(ct, voxels), shifted, [2], margin_mm=20.0, tumour=[3]).cautions
-        assert "of the organ's rim is fat or gas" in said
+        (warning,) = imported(with_voxels(ct, voxels), shifted, [2], margin_mm=20.0, tumour=[3]).warnings
+        assert "of the organ's rim is fat or gas" in warning
 
     def test_what_is_as_bright_as_stone_unless_its_label_says_that_it_is_urine(self, ct_and_labels):
         ct, labels = ct_and_labels
@@ -355,16 +357,16 @@ class TestCautions:
         stone, pelvis = level(points, (LEFT[0] + [0, 0, 25], np.full(3, 6.0))) < 0, level(points, PELVIS) < 0
         voxels, marks = sitk.GetArrayFromImage(ct), sitk.GetArrayFromImage(labels)
         voxels[stone | pelvis], marks[pelvis] = 120 + STONE_ABOVE_MEDIAN_HU + 1, 4
-        bright, told = with_voxels(ct, voxels), with_voxels(labels, marks)
-        (said,) = imported(bright, told, [2], margin_mm=20.0, tumour=[3], urine=[4]).cautions
+        bright, marked = with_voxels(ct, voxels), with_voxels(labels, marks)
+        (warning,) = imported(bright, marked, [2], margin_mm=20.0, tumour=[3], urine=[4]).warnings
         ml = stone.sum() * np.prod(ct.GetSpacing()) / 1000
-        assert f"{ml:.1f} ml inside the organ are as bright as stone" in said and "--collecting" in said
+        assert f"{ml:.1f} ml inside the organ are as bright as stone" in warning and "--collecting" in warning
 
     def test_labels_without_a_meaning(self, ct_and_labels):
-        (said,) = imported(*ct_and_labels, side="left", margin_mm=20.0).cautions
-        assert "labels 2, 3 say nothing, and were all taken as the kidney" in said
-        (said,) = imported(*ct_and_labels, organ=[2], margin_mm=20.0).cautions
-        assert "were left out: 3 (5." in said and "--tumour" in said
+        (warning,) = imported(*ct_and_labels, side="left", margin_mm=20.0).warnings
+        assert "labels 2, 3 have no names, and were all taken as the kidney" in warning
+        (warning,) = imported(*ct_and_labels, organ=[2], margin_mm=20.0).warnings
+        assert "were left out: 3 (5." in warning and "--tumour" in warning
 
 
 def test_what_touches_by_a_corner_is_held_and_what_only_touches_is_no_part(ct_and_labels, without_support):
@@ -375,10 +377,10 @@ def test_what_touches_by_a_corner_is_held_and_what_only_touches_is_no_part(ct_an
     x, y, z = (int(n) for n in grid.index(LEFT[0][None])[0])
     values[z - 8 : z + 8, y - 8 : y + 8, x - 8 : x + 8] = 1
     values[z + 8 : z + 13, y + 8 : y + 13, x + 8 : x + 13] = 2
-    apart = organs(LabelMap.valued(grid, values), [1, 2])
+    apart = find_organs(LabelMap.valued(grid, values), [1, 2])
     assert [piece.mask.sum() for piece in apart] == [16**3]
     label = LabelMap.valued(grid, values, {1: "kidney", 2: "tumour"})
-    (piece,) = organs(label)
+    (piece,) = find_organs(label)
     assert 16**3 + 5**3 < piece.mask.sum() <= 16**3 + 5**3 + 8
     patient = import_patient(LazyVolume.of(ct), label, side="left", margin_mm=10.0)
     assert patient.organ.body_count == 1

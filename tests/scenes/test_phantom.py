@@ -1,4 +1,4 @@
-"""The embedded patient is what it says: a left kidney with a tumour, in LPS, as a contrast CT shows it."""
+"""The embedded patient is a left kidney with a tumour, in LPS, in a contrast-enhanced CT."""
 
 import numpy as np
 import pytest

@@ -25,10 +25,10 @@ from dicom_series import (
 from pydicom.uid import DeflatedExplicitVRLittleEndian, generate_uid
 from synthetic_body import DIRECTIONS, grid_around, with_voxels
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.ct_files import open_ct
 from scenes.patients.readers.label_files import open_labels
-from scenes.patients.readers.lazy_volume import LazyVolume
+from scenes.volumes.lazy_volume import LazyVolume
 
 AIR = -1000
 FAILING = "dicom/dicom2nifti/tests/data/failing"
@@ -176,10 +176,10 @@ class TestNifti:
         volume = open_ct(path)
         np.testing.assert_allclose(volume.grid.origin, (RAS @ shifted)[:3, 3], atol=1e-3)
         path = nifti(tmp_path / "ct.nii", noise(), [("s", 1), ("q", 1)], affines=both)
-        assert "sform and qform place it up to 30.0 mm apart" in refusal(path)
+        assert "sform and qform differ by up to 30.0 mm" in refusal(path)
 
     def test_no_orientation(self, tmp_path):
-        assert "says no orientation" in refusal(nifti(tmp_path / "ct.nii", noise(), []))
+        assert "has no orientation" in refusal(nifti(tmp_path / "ct.nii", noise(), []))
 
 
 def doubled(file, folder):
@@ -225,8 +225,8 @@ class TestRealData:
 
     def test_perfusion_map(self, data):
         file = data / SYNTAXES / "CT0012.fragmented_no_bot_jpeg_baseline.51.dcm"
-        said = refusal(file)
-        assert "PERFUSION" in said and said.count(file.name) == 0
+        message = refusal(file)
+        assert "PERFUSION" in message and message.count(file.name) == 0
 
     @pytest.mark.parametrize(
         ("folder", "words"),
@@ -243,8 +243,8 @@ class TestRealData:
         ],
     )
     def test_refused(self, data, folder, words):
-        said = refusal(data / folder)
-        assert all(part in said for part in words)
+        message = refusal(data / folder)
+        assert all(part in message for part in words)
 
     def test_tilted(self, data):
         volume, voxels = read_ct(data / FAILING / "gantrytilting/001")
@@ -299,14 +299,14 @@ def test_count_of_dimensions(tmp_path):
     paths = [tmp_path / f"{count}.mha" for count in (-3, 0, 11, 1000000000)]
     for path in paths:
         path.write_bytes(sound.replace(b"NDims = 3", f"NDims = {path.stem}".encode()))
-    said = in_another_process("read", *paths)
-    assert [line.split(".mha")[0] for line in said] == [path.stem for path in paths]
+    lines = in_another_process("read", *paths)
+    assert [line.split(".mha")[0] for line in lines] == [path.stem for path in paths]
 
 
 def test_chance_damage(tmp_path):
     """Flipped, inserted and lost bytes: a volume or labels that read, or one line."""
-    said = in_another_process("damage", tmp_path)
-    assert said[-1] == "sound", said
+    lines = in_another_process("damage", tmp_path)
+    assert lines[-1] == "sound", lines
 
 
 def samples(folder, kind):

@@ -1,4 +1,4 @@
-"""Volumes in files, in detail: values, what is private, where a box is."""
+"""Volumes in files, in detail: values, identifiers, where a box is."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -9,10 +9,10 @@ import SimpleITK as sitk
 from synthetic_body import DIRECTIONS, grid_around, with_voxels
 from test_readers import AIR, ENDINGS, RAS, affine_of, nifti, noise, written
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.ct_files import open_ct
 from scenes.patients.readers.label_files import open_labels
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.volumes.voxel_grid import VoxelGrid
 
 
 class TestFiles:
@@ -24,7 +24,7 @@ class TestFiles:
         assert open_ct(path).hounsfield()[0, 0, :2].tolist() == [32767, AIR]
 
     @pytest.mark.parametrize("ending", ENDINGS)
-    def test_what_a_header_says_is_private(self, tmp_path, ending):
+    def test_identifiers_of_a_header(self, tmp_path, ending):
         path = tmp_path / f"a{ending}"
         if ending.startswith(".nii"):
             nifti(path, noise(), descrip=b"Doe^Jane")
@@ -32,7 +32,7 @@ class TestFiles:
             marked = noise()
             marked.SetMetaData("descrip", "Doe^Jane")
             written(path, marked)
-        assert "Doe^Jane" in open_ct(path).secrets and "Doe^Jane" in open_labels(path).secrets
+        assert "Doe^Jane" in open_ct(path).identifiers and "Doe^Jane" in open_labels(path).identifiers
 
     def test_what_no_memory_holds_is_refused_with_what_it_takes(self, tmp_path, monkeypatch):
         ct = open_ct(written(tmp_path / "ct.mha", noise()))

@@ -11,12 +11,12 @@ from dicom_series import Series, refusal, write_segmentation, write_structures, 
 from scipy.spatial.transform import Rotation
 from synthetic_body import DIRECTIONS, drawn, grid_around, level
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.ct_files import open_ct
 from scenes.patients.readers.label_files import open_labels
-from scenes.patients.readers.label_maps import LabelMap, Segment, merged, with_tissues
+from scenes.patients.readers.label_maps import LabelMap, Segment, assign_tissues, merge_label_maps
 from scenes.patients.readers.segment_names import is_far, side_of, tissue_of
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.volumes.voxel_grid import VoxelGrid
 
 NAMES = {
     "kidney_left": ("kidney", "left"), "kidney_right": ("kidney", "right"), "Kidney L": ("kidney", "left"),
@@ -148,7 +148,7 @@ class TestLabelMaps:
         ("voxels", "words"),
         [
             (np.full((4, 4, 4), 0.5, np.float32), "probability"), (np.zeros((4, 4, 4), np.uint8), "is empty"),
-            (np.full((4, 4, 4), -1000, np.int16), "swapped"), (np.full((4, 4, 4), 70_000, np.int32), "whole numbers"),
+            (np.full((4, 4, 4), -1000, np.int16), "exchanged"), (np.full((4, 4, 4), 70_000, np.int32), "whole numbers"),
             (np.full((4, 4, 4), np.nan, np.float32), "finite"),
         ],
     )  # fmt: skip
@@ -218,7 +218,7 @@ class TestLabelMaps:
         sitk.WriteImage(sitk.Image([8, 8, 8], sitk.sitkUInt8), str(tmp_path / "kidney_left.nii.gz"))
         assert "1 label files are empty" in refusal(tmp_path, read=open_labels)
         assert "no such file" in refusal(tmp_path / "absent", read=open_labels)
-        assert "holds no labels" in refusal(Series(tmp_path / "ct").write(), read=open_labels)
+        assert "has no labels" in refusal(Series(tmp_path / "ct").write(), read=open_labels)
 
 
 class TestSegmentations:
@@ -312,7 +312,7 @@ class TestContours:
         turned = Rotation.from_rotvec(0.9 * series.direction[:, 0]).as_matrix() @ series.direction
         path = write_structures(tmp_path / "rt.dcm", {"Kidney": [ring(KIDNEY[0], 5, turned)]})
         grid = open_ct(tmp_path / "ct").grid
-        assert "run across the slices" in refusal(path, read=lambda path: open_labels(path).maps(grid))
+        assert "cross the slices" in refusal(path, read=lambda path: open_labels(path).maps(grid))
 
     @pytest.mark.parametrize("kind", ["POINT", "OPEN_PLANAR"])
     def test_no_closed_contour(self, series, tmp_path, kind):
@@ -343,7 +343,7 @@ class TestTogether:
     def test_tumour_wins(self):
         """Nearest neighbour moves a border by half a voxel's diagonal at most."""
         mass, kidney = self.maps()
-        one = merged([mass, kidney])
+        one = merge_label_maps([mass, kidney])
         np.testing.assert_allclose(one.grid.spacing, kidney.grid.spacing)
         index = np.argwhere(np.ones(one.values.shape, bool))[:, ::-1]
         places, values = one.grid.place(index), one.values.ravel()
@@ -357,17 +357,17 @@ class TestTogether:
 
     def test_words(self):
         maps = self.maps()
-        mass, kidney = with_tissues(maps, ["kidney_left"], {"cyst": ["MASS"]})
+        mass, kidney = assign_tissues(maps, ["kidney_left"], {"cyst": ["MASS"]})
         assert [s.tissue for one in (mass, kidney) for s in one.segments.values()] == ["cyst", "kidney"]
         with pytest.raises(
-            PatientError, match="label 4 is not in the label map: it holds 1 mass, 1 kidney_left"
+            PatientError, match="label 4 is not in the label map: it has 1 mass, 1 kidney_left"
         ):
-            with_tissues(maps, ["4"], {})
+            assign_tissues(maps, ["4"], {})
         with pytest.raises(PatientError, match="given as cyst and as tumour: give it as one"):
-            with_tissues(maps, [], {"cyst": ["mass"], "tumour": ["mass"]})
+            assign_tissues(maps, [], {"cyst": ["mass"], "tumour": ["mass"]})
         plain = LabelMap.of(drawn(grid_around((-33, 18, -401), (-22, 30, -385), (1, 1, 1)), (5, KIDNEY)))
-        (told,) = with_tissues([plain], ["5"], {})
-        assert told.segments[5].tissue == "kidney"
+        (assigned,) = assign_tissues([plain], ["5"], {})
+        assert assigned.segments[5].tissue == "kidney"
 
 
 def test_names_in_a_nifti_header(tmp_path):

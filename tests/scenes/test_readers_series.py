@@ -43,8 +43,8 @@ class TestGeometry:
         series = Series(tmp_path)
         aside = (series.positions(3) + 0.5 * series.direction[:, 0]).round(6).tolist()
         save(series.slice(3, ImagePositionPatient=aside, InstanceNumber=40), series.write() / "z.dcm")
-        said = refusal(tmp_path)
-        assert "slice 4 (s1-3.dcm)" in said and "slice 40 (z.dcm)" in said and "one position" in said
+        message = refusal(tmp_path)
+        assert "slice 4 (s1-3.dcm)" in message and "slice 40 (z.dcm)" in message and "one position" in message
 
     def test_the_last_of_uneven_slices(self, tmp_path):
         """Of 7 gaps of 1.1 mm, which divided by their length are a hair less than 7."""
@@ -69,7 +69,7 @@ class TestSeries:
 
     def test_no_word_on_hounsfield(self, tmp_path):
         volume = Series(tmp_path).write(RescaleIntercept=None, RescaleSlope=None)
-        assert any("the files do not say how" in note for note in read_ct(volume)[0].notes)
+        assert any("the files have no rescale" in note for note in read_ct(volume)[0].notes)
 
     def test_a_frames_own_values_count(self, tmp_path):
         """Not those that stand at the file's top, too."""

@@ -1,4 +1,4 @@
-"""A kidney grown from a seed: synthetic bodies known in LPS mm, the phantom, and real CTs with labels where they are there."""
+"""Region growing from a seed: synthetic bodies known in LPS mm, the phantom, and real CTs with labels where they are there."""
 
 from pathlib import Path
 
@@ -8,14 +8,15 @@ import SimpleITK as sitk
 from scipy import ndimage
 from synthetic_body import DIRECTIONS, grid_around, level, points_of
 
-from scenes.anatomy import PHANTOM_TISSUES, phantom_folder
-from scenes.patients.import_error import PatientError
+from errors import PatientError
+from scenes.anatomy import files_of
 from scenes.patients.readers.ct_files import open_ct
-from scenes.patients.readers.label_maps import LabelMap, box_of, nearest
-from scenes.patients.readers.lazy_volume import LazyVolume
-from scenes.patients.readers.volume_readers import file_volume
-from scenes.patients.readers.voxel_grid import VoxelGrid
-from scenes.patients.region_growing import DRAFT, WORKING_MM, grown
+from scenes.patients.readers.label_maps import LabelMap, box_of, resample_nearest
+from scenes.patients.region_growing import DRAFT, WORKING_MM, draft_segmentation
+from scenes.scene import EMBEDDED, load_scene
+from scenes.volumes.lazy_volume import LazyVolume
+from scenes.volumes.volume_files import file_volume
+from scenes.volumes.voxel_grid import VoxelGrid
 
 CENTRE = np.array([62.0, 31.0, -118.0])
 KIDNEY = CENTRE, np.array([30.0, 24.0, 52.0])
@@ -45,7 +46,7 @@ def scanned(solids, noise_hu=10.0, direction="identity", spacing=(1.8, 1.8, 2.5)
 
 
 def placed(labels: LabelMap, grid: VoxelGrid) -> np.ndarray:
-    return nearest(labels.grid, labels.values, grid) > 0
+    return resample_nearest(labels.grid, labels.values, grid) > 0
 
 
 def dice(a, b):
@@ -64,7 +65,7 @@ def seeds_in(grid: VoxelGrid, inside: np.ndarray, count: int, deep_mm: float = 5
 
 def refused(ct, seed, words):
     with pytest.raises(PatientError, match=words) as error:
-        grown(LazyVolume.of(ct), seed)
+        draft_segmentation(LazyVolume.of(ct), seed)
     assert "\n" not in str(error.value) and "seed" in str(error.value)
 
 
@@ -86,7 +87,7 @@ class TestSynthetic:
     )
     def test_parts_from_what_touches(self, kidney, liver, touching, noise, off):
         ct = scanned([(55.0, PSOAS), (liver, touching), (kidney, KIDNEY)], noise)
-        labels = grown(LazyVolume.of(ct), CENTRE + off)
+        labels = draft_segmentation(LazyVolume.of(ct), CENTRE + off)
         truth = level(points_of(ct), KIDNEY) < 0
         assert dice(placed(labels, VoxelGrid.of(ct)), truth) > 1 - ONE_VOXEL
         assert labels.segments == {1: DRAFT} and labels.segments[1].tissue == "kidney"
@@ -95,13 +96,13 @@ class TestSynthetic:
         sinus = CENTRE, np.array([8.0, 8.0, 12.0])
         hilum = CENTRE + [-20.0, 0.0, 0.0], np.array([20.0, 3.0, 3.0])
         ct = scanned([(150.0, KIDNEY), (FAT_HU, sinus), (FAT_HU, hilum)])
-        found = placed(grown(LazyVolume.of(ct), CENTRE + [12.0, -6.0, -30.0]), VoxelGrid.of(ct))
+        found = placed(draft_segmentation(LazyVolume.of(ct), CENTRE + [12.0, -6.0, -30.0]), VoxelGrid.of(ct))
         assert found[level(points_of(ct), sinus) < 0].all()
 
     @pytest.mark.parametrize("direction", ["RAS", "oblique"])
     def test_lies_where_the_kidney_is(self, direction):
         ct = scanned([(150.0, KIDNEY)], direction=direction)
-        labels = grown(LazyVolume.of(ct), CENTRE + [8.0, -4.0, 20.0])
+        labels = draft_segmentation(LazyVolume.of(ct), CENTRE + [8.0, -4.0, 20.0])
         places = labels.grid.place(np.argwhere(labels.values)[:, ::-1])
         np.testing.assert_allclose(places.mean(axis=0), CENTRE, atol=0.5 * WORKING_MM)
         volume_ml = len(places) * np.prod(labels.grid.spacing) / 1000
@@ -111,7 +112,7 @@ class TestSynthetic:
         np.testing.assert_allclose(start, np.rint(start), atol=1e-6)
 
     def test_same_seed_same_voxels(self, crowded):
-        first, second = (grown(LazyVolume.of(crowded), CENTRE) for _ in range(2))
+        first, second = (draft_segmentation(LazyVolume.of(crowded), CENTRE) for _ in range(2))
         assert first.grid.same_as(second.grid)
         np.testing.assert_array_equal(first.values, second.values)
 
@@ -120,7 +121,7 @@ class TestSynthetic:
         image = scanned([(150.0, KIDNEY)], spacing=(3.0, 3.0, 3.0), half_mm=80.0)
         whole, read = LazyVolume.of(image), []  # a view: the image has to stay
         ct = LazyVolume(whole.name, whole.grid, lambda box: (read.append(box), whole.read_box(box))[1])
-        grown(ct, CENTRE)
+        draft_segmentation(ct, CENTRE)
         assert len(read) == 1
         assert all((a.stop - a.start - 2) * 3.0 <= 2 * 65.0 for a in read[0])
 
@@ -160,12 +161,13 @@ class TestRefused:
 
 
 def test_phantom():
-    """Cortex and medulla are grown from; the tumour, the sinus and its fat are of the organ and may be missed."""
-    ct, labels = (file_volume(phantom_folder() / f"{name}.nrrd") for name in ("ct", "labels"))
-    tissue = labels.read(labels.grid.whole())
-    firm = [int(code) for code, name in PHANTOM_TISSUES.items() if name in ("cortex", "medulla")]
+    """Seeds are in cortex and medulla; the tumour, the sinus and its fat belong to the organ and may be missed."""
+    folder, files = files_of(load_scene(EMBEDDED), EMBEDDED.parent)
+    ct, labels = (file_volume(folder / name) for name in (files.ct, files.labels))
+    tissue = labels.read(labels.grid.full_box())
+    firm = [int(code) for code, name in files.tissues.items() if name in ("cortex", "medulla")]
     (seed,) = seeds_in(ct.grid, np.isin(tissue, firm), count=1, deep_mm=3.0)
-    assert dice(placed(grown(ct, seed), ct.grid), tissue > 0) > 0.9
+    assert dice(placed(draft_segmentation(ct, seed), ct.grid), tissue > 0) > 0.9
 
 
 class TestReal:
@@ -184,9 +186,9 @@ class TestReal:
         image = sitk.ReadImage(str(data / "ct" / kidneys))
         grid, truth = VoxelGrid.of(image), sitk.GetArrayFromImage(image) == value
         (seed,) = seeds_in(grid, truth, count=1)
-        assert dice(placed(grown(volume, seed), grid), truth) > least
+        assert dice(placed(draft_segmentation(volume, seed), grid), truth) > least
 
     def test_spleen_and_kidney_in_one_refused(self, data: Path):
         volume = open_ct(data / "ct" / "crlm_1004")
         with pytest.raises(PatientError, match="convex hull"):
-            grown(volume, volume.grid.place(np.array([390.0, 290.0, 22.0])))
+            draft_segmentation(volume, volume.grid.place(np.array([390.0, 290.0, 22.0])))

@@ -7,10 +7,11 @@ import pytest
 import SimpleITK as sitk
 import trimesh
 
+from errors import PatientError
 from rehearsal.build_solver import step_settings
 from rehearsal.configuration import probe_of
-from scenes.anatomy import load_anatomy, phantom_folder, press_on
-from scenes.patients.import_error import PatientError
+from scenes.anatomy import load_anatomy, press_on
+from scenes.phantom.embedded_patient import phantom_folder
 from scenes.scene import (
     EMBEDDED,
     AnatomyFiles,
@@ -76,11 +77,11 @@ def refused(tmp_path: Path, text: str) -> str:
             "[anatomy]\n[[shape]]\nkind = 'plane'\nnormal = [0, 0, 1]\noffset_cm = 1",
             "shape.0.offset_cm: unknown key; the unit is in the key: write offset_mm",
         ),
-        ("[anatomy]\n[attachment]\nradius_mm = 5", "a.toml: attachment.radius_mm needs a place"),
+        ("[anatomy]\n[attachment]\nradius_mm = 5", "a.toml: attachment.radius_mm needs a position"),
         ("[anatomy]\n[[shape]]\nkind = 'ball'", "'plane', 'mesh', 'sdf'"),
         ("[anatomy]\n[organs]\n", "organs: unknown key"),
         ("[anatomy\n", "; expected a scene file (TOML) or a patient's folder"),
-        ("[anatomy]\nphantom = true\nct = 'ct.nrrd'", "which has files of its own"),
+        ("[anatomy]\nphantom = true\nct = 'ct.nrrd'", "which has its own files"),
         ("[anatomy]\n[press]\nindentations_mm = [300.0]", "less than or equal to 40"),
     ],
 )
@@ -92,7 +93,7 @@ def test_missing_and_unreadable_files_are_named(tmp_path):
     with pytest.raises(SceneError, match="no such scene file"):
         load_scene(tmp_path / "none.toml")
     (tmp_path / "b.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(SceneError, match="is no text; expected a scene file"):
+    with pytest.raises(SceneError, match="is not a text file; expected a scene file"):
         load_scene(tmp_path / "b.toml")
     with pytest.raises(SceneError, match="cannot be read"):
         load_scene(tmp_path)
@@ -187,7 +188,7 @@ def test_an_oblique_distance_field_is_refused(tmp_path):
     image.SetDirection((-1, 0, 0, 0, -1, 0, 0, 0, 1))
     sitk.WriteImage(image, str(tmp_path / "bed.nrrd"))
     scene = with_ball(tmp_path, shape=({"kind": "sdf", "file": "bed.nrrd"},))
-    with pytest.raises(SceneError, match="bed.nrrd.*identity direction"):
+    with pytest.raises(SceneError, match="bed.nrrd.*identity as direction"):
         load_anatomy(scene, tmp_path)
 
 
@@ -215,8 +216,8 @@ def test_the_embedded_patient_is_made_once():
     [
         ("a.PNG", "is a picture; expected a scene file"),
         ("ct.nii.gz", "app.py import"),
-        ("sweep-001.igs.mha", "a tracked sweep: app.py reconstruct"),
-        ("session-001.jsonl", "a session: rehearse --replay takes it"),
+        ("sweep-001.igs.mha", "a tracked sweep: give it to app.py reconstruct"),
+        ("session-001.jsonl", "a session: give it to rehearse --replay"),
         ("plan.json", "rehearse --plan"),
     ],
 )
@@ -225,12 +226,14 @@ def test_what_is_no_scene_is_named_with_what_takes_it(tmp_path, name, words):
     with pytest.raises(SceneError, match=words):
         load_scene(tmp_path / name)
     (tmp_path / "session-001.jsonl").touch()
-    with pytest.raises(SceneError, match="holds session-001.jsonl, a session: rehearse --replay"):
+    with pytest.raises(
+        SceneError, match="contains session-001.jsonl, a session: give that file to rehearse --replay"
+    ):
         scene_file(tmp_path)
 
 
 def test_a_folder_is_its_scene_and_without_one_is_refused(tmp_path):
-    with pytest.raises(SceneError, match=r"holds no scene\.toml; make"):
+    with pytest.raises(SceneError, match=r"has no scene\.toml; make"):
         scene_file(tmp_path)
     (tmp_path / "scene.toml").write_text("")
     assert scene_file(tmp_path) == scene_file(tmp_path / "scene.toml") == tmp_path / "scene.toml"

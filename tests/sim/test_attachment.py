@@ -5,8 +5,9 @@ import pytest
 import trimesh
 
 from rehearsal.rehearsal import Rehearsal
-from scenes.anatomy import LoadedAnatomy, load_anatomy, phantom_folder
-from scenes.patients.hilum import hilum
+from scenes.anatomy import LoadedAnatomy, load_anatomy
+from scenes.patients.patient_scene import hilum
+from scenes.phantom.embedded_patient import phantom_folder
 from scenes.scene import PAPER, AnatomyFiles, Attachment, Scene, SceneError, load_scene, with_options
 from sim.fields import array_of
 from sim.sampling import SamplingError

@@ -21,7 +21,7 @@ from rehearsal.reconstruction.sweep_volumes import image_poses_of
 from rehearsal.tracking.sweep_recording import SweepRecorder
 from scenes.anatomy import phantom_folder
 from scenes.scene import EMBEDDED
-from scenes.surface_files import load_surface
+from scenes.surfaces import load_surface
 from sim.embedding import Unmoved
 from sim.signed_distance import signed_distance
 from studies.freehand.freehand_sweeps import sweep_of

@@ -1,6 +1,4 @@
-"""One DICOM data set from an open file: damage is said in words, and memory is bounded."""
-
-from __future__ import annotations
+"""Parse one DICOM data set with bounded memory; every damage becomes a PatientError."""
 
 import logging
 import warnings
@@ -12,25 +10,25 @@ from pydicom import config
 from pydicom.dataset import Dataset, FileDataset
 from pydicom.uid import ExplicitVRLittleEndian, ImplicitVRLittleEndian
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 
-# A value that breaks the standard is found where it matters; warnings and logs would print it, whatever it says of whom.
+# Values are validated where they are used; pydicom's warnings and logs would print them, also identifiers of the patient.
 config.settings.reading_validation_mode = config.IGNORE
 logging.getLogger("pydicom").setLevel(logging.CRITICAL)
 
 MAGIC_AT, MAGIC = 128, b"DICM"
 MEDIA_DIRECTORY = "1.2.840.10008.1.3.10"
-# A deflated data set names its syntax in its meta header; after it there may be a bomb.
+# The transfer syntax of deflated data sets, and the limit against decompression bombs.
 DEFLATED, MOST_INFLATED = b"1.2.840.10008.1.2.1.99", 2 * 2**30
 
 
 def looks_like_dicom(start: bytes) -> bool:
-    """Whether a file's first 132 bytes are DICOM's: a preamble, or a data set without one (group 8, little endian)."""
+    """Whether a file's first 132 bytes are DICOM: with a preamble, or without one (group 2 or 8, little endian)."""
     return start[MAGIC_AT:] == MAGIC or (start[:2] in (b"\x08\x00", b"\x02\x00") and start[3:4] == b"\x00")
 
 
-def parsed(file: BinaryIO, name: str, **options: Any) -> FileDataset:
-    """A DICOM data set, read with pydicom's options; memory is bounded and faults are in words. Raises PatientError."""
+def parse_dicom(file: BinaryIO, name: str, **options: Any) -> FileDataset:
+    """A DICOM data set; ``options`` are pydicom.dcmread's. Raises PatientError."""
     try:
         start = file.read(4096)
         file.seek(0)
@@ -47,14 +45,14 @@ def parsed(file: BinaryIO, name: str, **options: Any) -> FileDataset:
             return data
     except PatientError:
         raise
-    except Exception as error:  # a parser's faults are many; all of them are the file's
+    except Exception as error:  # a parser raises many kinds of error; each is the file's fault
         raise PatientError(
             f"{name}: a damaged DICOM file ({type(error).__name__}); copy or export it again"
         ) from error
 
 
 def _check_inflated(file: BinaryIO, name: str) -> None:
-    """Refuse a deflated data set that would fill the memory. Its meta header's own length may lie."""
+    """Raises PatientError where a deflated data set inflates to more than MOST_INFLATED. The meta header's length is not trusted."""
     at, deflated = MAGIC_AT + 4, False
     while True:
         file.seek(at)
@@ -84,10 +82,10 @@ def _check_inflated(file: BinaryIO, name: str) -> None:
 
 
 def text_of(name: str, header: Dataset, keyword: str) -> str:
-    """A value as text; empty where there is none. Raises PatientError where it is damaged."""
+    """A value as text, empty where it is missing. Raises PatientError where it is damaged."""
     try:
         found = header.get(keyword)
-    except Exception as error:  # a parser's faults are many; all of them are the file's
+    except Exception as error:  # a parser raises many kinds of error; each is the file's fault
         raise PatientError(
             f"{name}: a damaged DICOM file ({keyword}: {type(error).__name__}); copy or export it again"
         ) from error
@@ -95,8 +93,8 @@ def text_of(name: str, header: Dataset, keyword: str) -> str:
 
 
 def is_directory(header: FileDataset) -> bool:
-    """Whether a data set is a medium's DICOMDIR."""
+    """Whether a data set is a DICOMDIR."""
     try:
         return str(header.file_meta.get("MediaStorageSOPClassUID", "")) == MEDIA_DIRECTORY
-    except Exception:  # a damaged meta header is no directory's
+    except Exception:  # a damaged meta header
         return False

@@ -1,6 +1,4 @@
-"""The headers of DICOM files: which slice of which series lies where. Pixels stay where they are."""
-
-from __future__ import annotations
+"""Read DICOM headers: the series, their slices and positions, segmentations and structure sets."""
 
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -10,9 +8,9 @@ from typing import Any
 import numpy as np
 from pydicom.dataset import Dataset, FileDataset
 
-from scenes.patients.import_error import PatientError
-from scenes.patients.readers.dicom_file import is_directory, parsed, text_of
-from scenes.patients.readers.dicom_source import Item
+from errors import PatientError
+from scenes.patients.readers.dicom_file import is_directory, parse_dicom, text_of
+from scenes.patients.readers.dicom_source import SourceFile
 
 CT_CLASSES = {
     "1.2.840.10008.5.1.4.1.1.2",
@@ -23,56 +21,30 @@ SEGMENTATIONS = {"1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7"}
 STRUCTURE_SET = "1.2.840.10008.5.1.4.1.1.481.3"
 MOST_PIXELS = 8192 * 8192
 TAGS = [
-    "SOPClassUID",
-    "SOPInstanceUID",
-    "Modality",
-    "SeriesInstanceUID",
-    "SeriesNumber",
-    "InstanceNumber",
-    "ImageType",
-    "FrameOfReferenceUID",
-    "ImagePositionPatient",
-    "ImageOrientationPatient",
-    "PixelSpacing",
-    "Rows",
-    "Columns",
-    "NumberOfFrames",
-    "RescaleSlope",
-    "RescaleIntercept",
-    "RescaleType",
-    "PixelPaddingValue",
-    "PixelPaddingRangeLimit",
-    "BurnedInAnnotation",
-    "SamplesPerPixel",
-    "SharedFunctionalGroupsSequence",
-    "PerFrameFunctionalGroupsSequence",
-]
+    "SOPClassUID", "SOPInstanceUID", "Modality", "SeriesInstanceUID", "SeriesNumber", "InstanceNumber",
+    "ImageType", "FrameOfReferenceUID", "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing",
+    "Rows", "Columns", "NumberOfFrames", "RescaleSlope", "RescaleIntercept", "RescaleType",
+    "PixelPaddingValue", "PixelPaddingRangeLimit", "BurnedInAnnotation", "SamplesPerPixel",
+    "SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence",
+]  # fmt: skip
 MODALITY = re.compile("[A-Z]{2,8}")
 LOCALIZERS = {"LOCALIZER", "SCOUT", "TOPOGRAM"}
-# Third and fourth values of ImageType whose pixels are no HU.
+# Values of ImageType whose pixels are not HU.
 NOT_HU = {
-    "PERFUSION",
-    "RCBF",
-    "RCBV",
-    "MTT",
-    "TTP",
-    "ANGIO",
-    "DENSITY_MAP",
-    "MAT_FRACTION",
-    "MAT_SPECIFIC",
+    "PERFUSION", "RCBF", "RCBV", "MTT", "TTP", "ANGIO", "DENSITY_MAP", "MAT_FRACTION", "MAT_SPECIFIC",
     "EFF_ATOMIC_NUM",
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class DicomSlice:
-    """One slice of a CT: a file, or a frame of one."""
+    """One slice of a CT: a file, or one of its frames."""
 
-    item: Item
-    frame: int | None  # None in a file with one slice
+    item: SourceFile
+    frame: int | None  # None in a single-frame file
     number: int | None  # InstanceNumber, or the frame's number from 1
     sop: str
-    position: np.ndarray  # (3,) middle of the first pixel, LPS [mm]
+    position: np.ndarray  # (3,) centre of the first pixel, LPS [mm]
     row: np.ndarray  # (3,) along which the column index grows
     column: np.ndarray  # (3,) along which the row index grows
     spacing: tuple[float, float]  # along row and column [mm]
@@ -80,40 +52,42 @@ class DicomSlice:
     rows: int
     slope: float
     intercept: float
-    is_rescaled: bool  # whether its header says how stored values become HU
-    padding: tuple[int, int] | None  # raw values between which pixels mean nothing
+    is_rescaled: bool  # whether the header has a rescale
+    padding: tuple[int, int] | None  # range of raw values outside the field of view
 
     @property
     def label(self) -> str:
-        """How errors name it."""
+        """Its name in errors."""
         return f"slice {'without a number' if self.number is None else self.number} ({self.item.name})"
 
 
 @dataclass
 class Series:
-    """The slices of one SeriesInstanceUID, in the order of their files."""
+    """The slices of one SeriesInstanceUID, in file order."""
 
     uid: str
     number: str
     frame_of_reference: str = ""
     slices: list[DicomSlice] = field(default_factory=list)
-    faults: list[str] = field(default_factory=list)  # slices that cannot be used, a line each
+    faults: list[str] = field(default_factory=list)  # a line for each slice that cannot be used
     localizers: int = 0
 
 
 @dataclass
-class Found:
-    """What DICOM files hold."""
+class DicomContents:
+    """The contents of DICOM files."""
 
     series: dict[str, Series] = field(default_factory=dict)
-    segmentations: list[Item] = field(default_factory=list)  # DICOM-SEG
-    structure_sets: list[Item] = field(default_factory=list)  # RTSTRUCT
-    others: dict[str, int] = field(default_factory=dict)  # what else there is, by modality
+    segmentations: list[SourceFile] = field(default_factory=list)  # DICOM-SEG
+    structure_sets: list[SourceFile] = field(default_factory=list)  # RTSTRUCT
+    others: dict[str, int] = field(default_factory=dict)  # modality -> number of other files
 
 
-def read_headers(items: list[Item], progress: Callable[[Iterable[Item]], Iterable[Item]] = iter) -> Found:
-    """Sort DICOM files by what they are. Raises PatientError where one is cut off."""
-    found = Found()
+def read_headers(
+    items: list[SourceFile], progress: Callable[[Iterable[SourceFile]], Iterable[SourceFile]] = iter
+) -> DicomContents:
+    """Read all headers and sort them by kind. Raises PatientError where a file is damaged."""
+    found = DicomContents()
     for item in progress(items):
         header = read_header(item)
         sop_class = text_of(item.name, header, "SOPClassUID")
@@ -126,24 +100,22 @@ def read_headers(items: list[Item], progress: Callable[[Iterable[Item]], Iterabl
         elif sop_class in CT_CLASSES:
             _add_slices(found, item, header)
         elif not sop_class and header.preamble is not None:
-            raise PatientError(
-                f"{item.name}: a damaged DICOM file (it says not what it is); copy or export it again"
-            )
+            raise PatientError(f"{item.name}: a damaged DICOM file (no SOPClassUID); copy or export it again")
         else:
             what = text_of(item.name, header, "Modality")
-            # Anything else may be free text, which may name the patient.
-            what = what if MODALITY.fullmatch(what) else "files of no known kind"
+            # Free text may name the patient.
+            what = what if MODALITY.fullmatch(what) else "files of unknown kind"
             found.others[what] = found.others.get(what, 0) + 1
     return found
 
 
-def read_header(item: Item, tags: list[str] | None = TAGS) -> FileDataset:
-    """A file's elements but its pixels, all of them with tags None. Raises PatientError."""
+def read_header(item: SourceFile, tags: list[str] | None = TAGS) -> FileDataset:
+    """The elements of a file without pixels; tags None: all. Raises PatientError."""
     with item.open() as file:
-        return parsed(file, item.name, stop_before_pixels=True, specific_tags=tags)
+        return parse_dicom(file, item.name, stop_before_pixels=True, specific_tags=tags)
 
 
-def _add_slices(found: Found, item: Item, header: Dataset) -> None:
+def _add_slices(found: DicomContents, item: SourceFile, header: Dataset) -> None:
     uid, number = text_of(item.name, header, "SeriesInstanceUID"), text_of(item.name, header, "SeriesNumber")
     series = found.series.setdefault(uid, Series(uid, number if number.isdecimal() else "without a number"))
     series.frame_of_reference = text_of(item.name, header, "FrameOfReferenceUID")
@@ -155,12 +127,12 @@ def _add_slices(found: Found, item: Item, header: Dataset) -> None:
                 series.slices.append(slice_)
     except PatientError as error:
         series.faults.append(str(error))
-    except Exception as error:  # values that are no numbers, and groups that are not there
-        series.faults.append(f"{item.name}: its header cannot be understood ({type(error).__name__})")
+    except Exception as error:  # values that are not numbers, missing groups
+        series.faults.append(f"{item.name}: its header cannot be read ({type(error).__name__})")
 
 
-def slices_of(item: Item, header: Dataset) -> Iterator[DicomSlice | None]:
-    """The slices of one file; None for what shows a view and no slice."""
+def slices_of(item: SourceFile, header: Dataset) -> Iterator[DicomSlice | None]:
+    """The slices of one file; None for a localizer. Raises PatientError."""
     if str(header.get("BurnedInAnnotation", "NO")).upper() == "YES":
         raise PatientError(f"{item.name}: has text burned into its pixels, which may name the patient")
     if int(header.get("SamplesPerPixel", 1)) != 1:
@@ -168,25 +140,25 @@ def slices_of(item: Item, header: Dataset) -> Iterator[DicomSlice | None]:
     frames = header.get("PerFrameFunctionalGroupsSequence")
     if frames is None:
         if int(header.get("NumberOfFrames") or 1) > 1:
-            raise PatientError(f"{item.name}: holds {header.NumberOfFrames} frames, and not where they lie")
+            raise PatientError(f"{item.name}: has {header.NumberOfFrames} frames without positions")
         yield _slice(item, None, header.get("InstanceNumber"), [header], header)
         return
     shared = (header.get("SharedFunctionalGroupsSequence") or [Dataset()])[0]
     if len(frames) != int(header.get("NumberOfFrames") or 1):
         raise PatientError(
-            f"{item.name}: says {header.get('NumberOfFrames')} frames, and where {len(frames)} of them lie"
+            f"{item.name}: has {header.get('NumberOfFrames')} frames and positions of {len(frames)}"
         )
     for n, frame in enumerate(frames):
         yield _slice(item, n, n + 1, [*_groups(frame), *_groups(shared), header], header)
 
 
 def _groups(functional: Dataset) -> list[Dataset]:
-    """The single items of functional groups: each a macro's values."""
+    """The items of the functional group macros."""
     return [element.value[0] for element in functional if element.VR == "SQ" and element.value]
 
 
 def _slice(
-    item: Item, frame: int | None, number: Any, groups: list[Dataset], header: Dataset
+    item: SourceFile, frame: int | None, number: Any, groups: list[Dataset], header: Dataset
 ) -> DicomSlice | None:
     def value(name: str, usual: Any = None) -> Any:
         found = (group.get(name) for group in groups if group.get(name) not in (None, ""))
@@ -225,21 +197,21 @@ def _slice(
     )
 
 
-def _numbers(item: Item, name: str, found: Any, count: int) -> np.ndarray:
-    if found is None:
-        raise PatientError(f"{item.name}: says no {name}")
-    numbers = np.array([float(n) for n in found] if isinstance(found, Iterable) else [])
+def _numbers(item: SourceFile, name: str, given: Any, count: int) -> np.ndarray:
+    if given is None:
+        raise PatientError(f"{item.name}: has no {name}")
+    numbers = np.array([float(n) for n in given] if isinstance(given, Iterable) else [])
     if numbers.shape != (count,) or not np.isfinite(numbers).all():
         raise PatientError(f"{item.name}: {name} is not {count} numbers")
     return numbers
 
 
-def _orientation(item: Item, found: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors along a slice's rows and columns, at right angles."""
-    both = _numbers(item, "ImageOrientationPatient", found, 6).reshape(2, 3)
+def _orientation(item: SourceFile, given: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Orthonormal vectors along a slice's rows and columns."""
+    both = _numbers(item, "ImageOrientationPatient", given, 6).reshape(2, 3)
     lengths = np.linalg.norm(both, axis=1)
     if np.abs(lengths - 1).max() > 0.01 or abs(both[0] @ both[1]) > 0.01:
-        raise PatientError(f"{item.name}: ImageOrientationPatient is not two directions at right angles")
+        raise PatientError(f"{item.name}: ImageOrientationPatient is not two orthogonal unit vectors")
     row = both[0] / lengths[0]
     column = both[1] - (both[1] @ row) * row
     return row, column / np.linalg.norm(column)

@@ -1,6 +1,4 @@
-"""The pixels of CT slices in HU, whatever their transfer syntax: pydicom and its plugins, then the GDCM in SimpleITK."""
-
-from __future__ import annotations
+"""Decode CT slices to HU: with pydicom and its plugins, else with the GDCM of SimpleITK."""
 
 import warnings
 from collections.abc import Iterator
@@ -11,29 +9,29 @@ import SimpleITK as sitk
 from pydicom.dataset import Dataset
 from pydicom.pixels import pixel_array
 
-from scenes.patients.import_error import PatientError
-from scenes.patients.readers.dicom_file import parsed
+from errors import PatientError
+from scenes.patients.readers.dicom_file import parse_dicom
 from scenes.patients.readers.dicom_headers import DicomSlice
-from scenes.patients.readers.dicom_source import Item
-from scenes.patients.readers.lazy_volume import AIR_HU, LEAST_HU, MOST_HU
+from scenes.patients.readers.dicom_source import SourceFile
+from scenes.volumes.lazy_volume import AIR_HU, LEAST_HU, MOST_HU
 
 
 def hounsfield(slices: list[DicomSlice]) -> Iterator[np.ndarray]:
-    """HU (rows, columns) int16 of each slice in turn; padding is air. Raises PatientError, which names the file."""
+    """HU (rows, columns) int16 of each slice; padding becomes air. Raises PatientError that names the file."""
     file = None
     for one in slices:
         if file is None or file.item is not one.item:
-            file = _File(one.item)
+            file = _ParsedFile(one.item)
         yield file.hounsfield(one)
 
 
-class _File:
-    """One DICOM file; the last one stays in memory, for it may hold many slices."""
+class _ParsedFile:
+    """One parsed DICOM file, which may have many slices."""
 
-    def __init__(self, item: Item) -> None:
+    def __init__(self, item: SourceFile) -> None:
         self.item = item
         with item.open() as opened:
-            self.data: Dataset = parsed(opened, item.name)
+            self.data: Dataset = parse_dicom(opened, item.name)
         self.by_gdcm: np.ndarray | None = None
 
     def hounsfield(self, one: DicomSlice) -> np.ndarray:
@@ -46,12 +44,12 @@ class _File:
                 values[_padded(raw, one.padding)] = AIR_HU
         if values.shape != (one.rows, one.columns):
             raise PatientError(
-                f"{self.item.name}: its pixels are {values.shape}, its header says {(one.rows, one.columns)}"
+                f"{self.item.name}: it has pixels of shape {values.shape}, expected {(one.rows, one.columns)}, as in its header"
             )
         return np.clip(np.rint(values), LEAST_HU, MOST_HU).astype(np.int16)
 
     def _raw(self, one: DicomSlice) -> np.ndarray | None:
-        """Stored values; None where no plugin of pydicom decodes them."""
+        """Stored values; None where no pydicom plugin decodes them."""
         options: dict[str, Any] = {} if one.frame is None else {"index": one.frame}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -64,13 +62,13 @@ class _File:
 
     def _gdcm(self, one: DicomSlice) -> np.ndarray:
         if self.item.path is None:
-            raise self._fault("its compression is rare: unpack the archive and give the folder")
+            raise self._fault("its compression is rare: extract the archive and give the folder")
         if self.by_gdcm is None:
             try:
                 self.by_gdcm = sitk.GetArrayFromImage(sitk.ReadImage(str(self.item.path)))
             except RuntimeError as error:
-                raise self._fault("no decoder reads it") from error
-        # GDCM applies one slope and intercept to the whole file.
+                raise self._fault("no decoder can read it") from error
+        # GDCM applies one slope and intercept to the file.
         return np.array(self.by_gdcm[one.frame or 0], np.float32)
 
     def _fault(self, why: str) -> PatientError:
@@ -83,7 +81,7 @@ class _File:
 
 
 def _padded(raw: np.ndarray, padding: tuple[int, int]) -> np.ndarray:
-    """Where raw values are padding; the tag may have the other sign than the pixels."""
+    """Mask of padding; the tag and the pixels may differ in signedness."""
     low, high = padding
     if low == high:
         return (raw.astype(np.int64) & 0xFFFF) == (low & 0xFFFF)

@@ -1,6 +1,4 @@
-"""Labels from DICOM: segmentation objects (binary, fractional, label map), by highdicom."""
-
-from __future__ import annotations
+"""Read DICOM segmentation objects (binary, fractional, label map) with highdicom."""
 
 import logging
 import warnings
@@ -9,29 +7,29 @@ from dataclasses import replace
 import highdicom as hd
 import numpy as np
 
-from scenes.patients.import_error import PatientError
-from scenes.patients.readers.dicom_file import parsed
+from errors import PatientError
+from scenes.patients.readers.dicom_file import parse_dicom
 from scenes.patients.readers.dicom_headers import read_header, slices_of
-from scenes.patients.readers.dicom_source import Item
+from scenes.patients.readers.dicom_source import SourceFile
 from scenes.patients.readers.label_maps import LabelMap, Segment
 from scenes.patients.readers.segment_names import tissue_of
-from scenes.patients.readers.slice_stack import stacked
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.patients.readers.slice_stack import stack_slices
+from scenes.volumes.voxel_grid import VoxelGrid
 
-# A voxel of a fractional segment is in it from this share on.
+# Threshold of fractional segments.
 HALF = 0.5
-# What stands for wholly inside where a segment is straightened; beyond its frames there is air.
+# The value for "inside" where tilted frames are resampled as if they were HU.
 FULL_HU = 1000.0
 
 
-def read_segmentation(item: Item) -> tuple[list[LabelMap], list[str], str]:
-    """The segments of a DICOM-SEG, a map each; notes; and the uid of the series that it was drawn on.
+def read_segmentation(item: SourceFile) -> tuple[list[LabelMap], list[str], str]:
+    """One label map per segment; notes; and the UID of the referenced series.
 
     Raises PatientError: damaged, or not in the patient's coordinates.
     """
     logging.getLogger("highdicom").setLevel(logging.ERROR)
     with item.open() as file:
-        data = parsed(file, item.name)
+        data = parse_dicom(file, item.name)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -39,14 +37,14 @@ def read_segmentation(item: Item) -> tuple[list[LabelMap], list[str], str]:
             found = _maps(item, segmentation)
     except PatientError:
         raise
-    except Exception as error:  # a parser's faults are many; all of them are the file's
+    except Exception as error:  # a parser raises many kinds of error; each is the file's fault
         raise PatientError(
             f"{item.name}: cannot be read as a DICOM segmentation ({type(error).__name__}); expected evenly spaced frames in the "
             "patient's coordinates; export it as a label map, for example NRRD"
         ) from error
     if not found:
         raise PatientError(
-            f"{item.name}: is empty, no voxel is marked; expected an organ; choose another file"
+            f"{item.name}: is empty, no voxel is labelled; expected an organ; choose another file"
         )
     fractional = segmentation.segmentation_type == hd.seg.SegmentationTypeValues.FRACTIONAL
     notes = [f"fractional segments were cut at {HALF:.0%}"] if fractional else []
@@ -54,16 +52,16 @@ def read_segmentation(item: Item) -> tuple[list[LabelMap], list[str], str]:
     return found, notes, str(referenced[0].get("SeriesInstanceUID", "")) if referenced else ""
 
 
-def _maps(item: Item, segmentation: hd.seg.Segmentation) -> list[LabelMap]:
+def _maps(item: SourceFile, segmentation: hd.seg.Segmentation) -> list[LabelMap]:
     if segmentation.get("FrameOfReferenceUID") is None:
         raise PatientError(
-            f"{item.name}: has no frame of reference, so it was drawn on no volume; expected labels of a CT; choose another file"
+            f"{item.name}: has no frame of reference, so it belongs to no volume; expected labels of a CT; choose another file"
         )
     is_upright = segmentation.get_volume_geometry(allow_missing_positions=True) is not None
     read = _upright if is_upright else _tilted
     maps = []
     for number in segmentation.segment_numbers:
-        if number == 0:  # background of a label map
+        if number == 0:  # background
             continue
         described = segmentation.get_segment_description(number)
         segment = Segment.named(described.segment_label, int(number))
@@ -75,24 +73,26 @@ def _maps(item: Item, segmentation: hd.seg.Segmentation) -> list[LabelMap]:
     return maps
 
 
-def _upright(item: Item, segmentation: hd.seg.Segmentation, number: int) -> tuple[VoxelGrid, np.ndarray]:
-    """A segment's grid, and which of its voxels (z, y, x) it holds."""
+def _upright(
+    item: SourceFile, segmentation: hd.seg.Segmentation, number: int
+) -> tuple[VoxelGrid, np.ndarray]:
+    """A segment's grid and mask (z, y, x)."""
     volume = segmentation.get_volume(segment_numbers=[number], allow_missing_positions=True)
     place = np.array(volume.spacing), np.array(volume.position), np.array(volume.direction)
     grid = VoxelGrid(volume.spatial_shape, *place).checked(item.name)
     return grid, np.asarray(volume.array[..., 0] >= HALF).T
 
 
-def _tilted(item: Item, segmentation: hd.seg.Segmentation, number: int) -> tuple[VoxelGrid, np.ndarray]:
-    """The same of frames that lean, as a tilted gantry's slices do: straightened as those are, as if they were HU."""
+def _tilted(item: SourceFile, segmentation: hd.seg.Segmentation, number: int) -> tuple[VoxelGrid, np.ndarray]:
+    """The same for frames of a tilted gantry: resampled as CT slices are, as if they were HU."""
     most = float(segmentation.get("MaximumFractionalValue") or 1)
     shared = segmentation.SharedFunctionalGroupsSequence[0].get("SegmentIdentificationSequence")
     groups = segmentation.PerFrameFunctionalGroupsSequence
-    told = [frame.get("SegmentIdentificationSequence", shared)[0] for frame in groups]
+    identified = [frame.get("SegmentIdentificationSequence", shared)[0] for frame in groups]
     own = [
         replace(one, slope=FULL_HU / most, intercept=0.0)
-        for one, frame in zip(slices_of(item, read_header(item)), told, strict=True)
+        for one, frame in zip(slices_of(item, read_header(item)), identified, strict=True)
         if one is not None and frame.ReferencedSegmentNumber == number
     ]
-    stack = stacked(item.name, own)
-    return stack.grid, stack.read(stack.grid.whole()) >= HALF * FULL_HU
+    stack = stack_slices(item.name, own)
+    return stack.grid, stack.read(stack.grid.full_box()) >= HALF * FULL_HU

@@ -1,29 +1,27 @@
-"""Which CT series of many, and the volume that it is."""
-
-from __future__ import annotations
+"""Choose one CT series of several, and open it as a volume."""
 
 from pathlib import Path
 
 import numpy as np
 
-from scenes.patients.import_error import PatientError
-from scenes.patients.readers.dicom_headers import DicomSlice, Found, Series, read_headers
-from scenes.patients.readers.dicom_source import items_of
-from scenes.patients.readers.identifiers import secrets_of
-from scenes.patients.readers.lazy_volume import LazyVolume
-from scenes.patients.readers.slice_stack import stacked
-from scenes.patients.readers.volume_readers import ENDINGS
-from scenes.progress import Progress
+from errors import PatientError
+from scenes.patients.readers.dicom_headers import DicomContents, DicomSlice, Series, read_headers
+from scenes.patients.readers.dicom_source import find_dicom_files
+from scenes.patients.readers.identifiers import identifiers_of
+from scenes.patients.readers.slice_stack import stack_slices
+from scenes.terminal import Progress
+from scenes.volumes.lazy_volume import LazyVolume
+from scenes.volumes.volume_files import ENDINGS
 
-# Slices in another view than this share of their series are scouts that do not say so.
+# Up to this share of slices in another view are taken for unmarked localizers.
 STRAY = 0.1
-# As much of a uid as tells series apart and is no number of one.
+# Characters of a UID that identify a series; series numbers are shorter.
 UID_END = 6
 
 
-def dicom_found(path: Path, progress: Progress) -> Found:
-    """What the DICOM files of a folder, DICOMDIR or archive hold. Raises PatientError where there are none."""
-    items = items_of(path)
+def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
+    """The contents of a folder, DICOMDIR or archive with DICOM files. Raises PatientError where there are none."""
+    items = find_dicom_files(path)
     if not items and path.is_file():
         raise PatientError(
             f"{path}: unknown kind of file; expected DICOM (a folder, a DICOMDIR or a zip archive), or a file that ends in "
@@ -31,22 +29,24 @@ def dicom_found(path: Path, progress: Progress) -> Found:
         )
     if not items:
         raise PatientError(
-            f"{path}: no DICOM file in there; give the folder that holds the slices, or a NIfTI, NRRD or MHA file"
+            f"{path}: no DICOM file found; give the folder of the slices, or a NIfTI, NRRD or MHA file"
         )
     return read_headers(items, lambda files: progress(files, "headers"))
 
 
 def series_volume(
-    path: Path, found: Found, wanted: str | None, referenced: str, progress: Progress
+    path: Path, found: DicomContents, wanted: str | None, referenced: str, progress: Progress
 ) -> LazyVolume:
-    """The CT of a series: the wanted one, by number or uid, the one that labels refer to, or the best guess.
+    """The CT of one series: the ``wanted`` one by number or UID, else the ``referenced`` one, else the best.
 
-    Raises PatientError: none, not that one, or one that is no whole volume.
+    Raises PatientError: no CT, no such series, or an incomplete one.
     """
     candidates = [s for s in found.series.values() if s.slices or s.faults]
     if not candidates:
-        raise PatientError(f"{path}: {_instead(found)}; expected a CT; give the folder of a CT series")
-    series, notes = _chosen(path, candidates, wanted, referenced)
+        raise PatientError(
+            f"{path}: {_contents_without_ct(found)}; expected a CT; give the folder of a CT series"
+        )
+    series, notes = choose_series(path, candidates, wanted, referenced)
     if series.faults:
         more = len(series.faults) - 1
         fault = series.faults[0].removeprefix(f"{path.name}: ")
@@ -61,19 +61,19 @@ def series_volume(
         others = ", ".join(f"{count} {what}" for what, count in sorted(found.others.items()))
         notes.append(f"left out, no CT slices: {others}")
     if not all(one.is_rescaled for one in slices):
-        notes.append("the files do not say how their values become HU: they were taken as HU")
-    stack = stacked(str(path), slices)
+        notes.append("the files have no rescale: their values were taken as HU")
+    stack = stack_slices(str(path), slices)
     return LazyVolume(
         name=str(path),
         grid=stack.grid,
         read_box=lambda box: stack.read(box, lambda files: progress(files, "slices")),
         notes=(*notes, *stack.notes),
         frame_of_reference=series.frame_of_reference,
-        secrets=secrets_of(slices[0].item),
+        identifiers=identifiers_of(slices[0].item),
     )
 
 
-def _instead(found: Found) -> str:
+def _contents_without_ct(found: DicomContents) -> str:
     kinds = [f"{count} {what}" for what, count in sorted(found.others.items())]
     kinds += [f"{len(found.segmentations)} SEG"] * bool(found.segmentations)
     kinds += [f"{len(found.structure_sets)} RTSTRUCT"] * bool(found.structure_sets)
@@ -82,10 +82,10 @@ def _instead(found: Found) -> str:
     return f"no CT slices, but {', '.join(kinds)}" if kinds else "no CT slices"
 
 
-def _chosen(
+def choose_series(
     path: Path, candidates: list[Series], wanted: str | None, referenced: str
 ) -> tuple[Series, list[str]]:
-    """The series, and why, where there are several."""
+    """The chosen series, and a note with the reason where there are several. Raises PatientError."""
     ranked = sorted(candidates, key=lambda s: _rank(s, referenced), reverse=True)
     numbers = [s.number for s in candidates]
     listed = "; ".join(
@@ -99,24 +99,24 @@ def _chosen(
         if len(matching) != 1:
             what = "no series" if not matching else f"{len(matching)} series"
             raise PatientError(
-                f"{path}: --series {wanted} is {what}; expected the number of one of these, or the end of its uid: {listed}"
+                f"{path}: --series {wanted} is {what}; expected the number of one of these, or the end of its UID: {listed}"
             )
         return matching[0], []
     best = ranked[0]
     if len(candidates) == 1:
         return best, []
-    why = "it shows most of the body in the thinnest slices"
+    why = "it covers most of the body with the thinnest slices"
     if best.uid == referenced:
-        why = "the labels were drawn on it"
+        why = "the labels refer to it"
     elif _rank(best, "")[:-1] == _rank(ranked[1], "")[:-1]:
-        why = "of several that are alike the lowest number"
+        why = "of several equal ones the lowest number"
     return best, [
         f"of {len(candidates)} series, number {best.number} was taken: {why}; there are: {listed}; --series N takes another"
     ]
 
 
 def _rank(series: Series, referenced: str) -> tuple:
-    """Larger is better: drawn on, usable, axial, tall in steps of 5 cm, many slices."""
+    """Sort key, larger is better: referenced by labels, usable, axial, extent in steps of 5 cm, number of slices."""
     along = [float(s.position @ np.cross(s.row, s.column)) for s in series.slices] or [0.0]
     axial = bool(series.slices) and abs(np.cross(series.slices[0].row, series.slices[0].column)[2]) > 0.9
     number = float(series.number) if series.number.isdecimal() else 1e9
@@ -131,15 +131,15 @@ def _rank(series: Series, referenced: str) -> tuple:
 
 
 def _described(series: Series, with_uid: bool) -> str:
-    """Number, slices and distance, and where that is not enough the end of the uid; free text may name the patient."""
+    """Number, slices and spacing, and if needed the end of the UID; no free text, which may name the patient."""
     places = np.unique([round(float(s.position @ np.cross(s.row, s.column)), 2) for s in series.slices])
     gap = f", {np.median(np.diff(places)):.2f} mm apart" if len(places) > 1 else ""
-    uid = f", uid ends in {series.uid[-UID_END:]}" if with_uid else ""
+    uid = f", UID ends in {series.uid[-UID_END:]}" if with_uid else ""
     return f"series {series.number} (CT, {len(series.slices)} slices{gap}{uid})"
 
 
 def _one_view(series: Series) -> tuple[list[DicomSlice], int]:
-    """The slices without the few that show another view."""
+    """The slices without a few in another view, and how many those are."""
 
     def view(one: DicomSlice) -> tuple:
         return (*np.round(np.concatenate([one.row, one.column]), 2).tolist(), one.rows, one.columns)

@@ -1,6 +1,4 @@
-"""The DICOM files of a folder, a DICOMDIR or a zip archive. Nothing is unpacked onto the disk."""
-
-from __future__ import annotations
+"""Find the DICOM files of a folder, a DICOMDIR or a zip archive. Nothing is extracted to disk."""
 
 import io
 import os
@@ -11,29 +9,29 @@ from functools import partial
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO, cast
 
-from scenes.patients.import_error import PatientError
-from scenes.patients.readers.dicom_file import MAGIC, MAGIC_AT, looks_like_dicom, parsed
+from errors import PatientError
+from scenes.patients.readers.dicom_file import MAGIC, MAGIC_AT, looks_like_dicom, parse_dicom
 
 MOST_FILES = 100_000
-# One file of an archive may be a whole enhanced CT; the archive, several series.
+# One file of an archive may be an enhanced CT; an archive may have several series.
 MOST_FILE_BYTES = 2 * 2**30
 MOST_ARCHIVE_BYTES = 16 * 2**30
 
 
 @dataclass(frozen=True)
-class Item:
-    """One file that may be DICOM."""
+class SourceFile:
+    """A file on disk or in an archive."""
 
-    name: str  # within what the user gave
+    name: str  # relative to the user's path
     open: Callable[[], BinaryIO]
-    path: Path | None  # None within an archive
+    path: Path | None  # None in an archive
 
 
-def items_of(path: Path) -> list[Item]:
-    """The files that begin as DICOM does, of a folder and its subfolders, a DICOMDIR, a zip archive or one file.
+def find_dicom_files(path: Path) -> list[SourceFile]:
+    """The files with a DICOM signature in a folder and its subfolders, a DICOMDIR, a zip archive or one file.
 
-    Raises PatientError: too many or too large, an archive that is broken, encrypted or leads outside, a DICOMDIR
-    whose files are missing or lie elsewhere.
+    Raises PatientError: too many or too large files, an archive that is damaged, encrypted or has paths outside itself, a
+    DICOMDIR whose files are missing or elsewhere.
     """
     if path.is_dir():
         items = _of_folder(path)
@@ -42,15 +40,15 @@ def items_of(path: Path) -> list[Item]:
     elif path.name.upper() == "DICOMDIR":
         items = _of_directory_file(path)
     else:
-        items = [_on_disk(path, path.name)]
+        items = [_disk_file(path, path.name)]
     return [item for item in items if _begins_as_dicom(item)]
 
 
-def _on_disk(path: Path, name: str) -> Item:
-    return Item(name, lambda: cast(BinaryIO, path.open("rb")), path)
+def _disk_file(path: Path, name: str) -> SourceFile:
+    return SourceFile(name, lambda: cast(BinaryIO, path.open("rb")), path)
 
 
-def _begins_as_dicom(item: Item) -> bool:
+def _begins_as_dicom(item: SourceFile) -> bool:
     try:
         with item.open() as file:
             return looks_like_dicom(file.read(MAGIC_AT + len(MAGIC)))
@@ -60,14 +58,14 @@ def _begins_as_dicom(item: Item) -> bool:
         ) from error
 
 
-def _of_folder(folder: Path) -> list[Item]:
-    items: list[Item] = []
+def _of_folder(folder: Path) -> list[SourceFile]:
+    items: list[SourceFile] = []
     for root, folders, files in os.walk(folder):
         folders.sort()
         for name in sorted(files):
             file = Path(root, name)
             if file.is_file():
-                items.append(_on_disk(file, str(file.relative_to(folder))))
+                items.append(_disk_file(file, str(file.relative_to(folder))))
         if len(items) > MOST_FILES:
             raise PatientError(
                 f"{folder}: more than {MOST_FILES} files; expected one patient's; give the folder of the CT itself"
@@ -75,25 +73,25 @@ def _of_folder(folder: Path) -> list[Item]:
     return items
 
 
-def _of_directory_file(path: Path) -> list[Item]:
-    """The images that a DICOMDIR lists; they lie beside it or below."""
+def _of_directory_file(path: Path) -> list[SourceFile]:
+    """The images that a DICOMDIR lists, in its folder or below."""
     root = path.parent.resolve()
     items = []
     for parts in _listed(path):
         name = "/".join(parts)
-        plain = all(part.isprintable() and 0 < len(part) < 256 and not _leads_outside(part) for part in parts)
+        plain = all(part.isprintable() and 0 < len(part) < 256 and not _is_outside(part) for part in parts)
         file = (root / Path(*parts)).resolve() if plain else root
         if not plain or not file.is_relative_to(root):
             raise PatientError(
-                f"{path}: lists {name!r}, which lies outside its folder; expected files beside it; "
+                f"{path}: lists {name!r}, which is outside its folder; expected files in its folder; "
                 "give the folder of the slices instead"
             )
         if not file.is_file():
             raise PatientError(
-                f"{path}: lists {name}, which is not there; expected the whole medium; copy it again, "
+                f"{path}: lists {name}, which is missing; expected the complete medium; copy it again, "
                 "or give the folder of the slices instead"
             )
-        items.append(_on_disk(file, name))
+        items.append(_disk_file(file, name))
     if not items:
         raise PatientError(f"{path}: lists no image; give the folder of the slices instead")
     return items
@@ -106,68 +104,68 @@ def _listed(path: Path) -> list[list[str]]:
             if not looks_like_dicom(file.read(MAGIC_AT + len(MAGIC))):
                 raise ValueError
             file.seek(0)
-            records = parsed(file, str(path)).get("DirectoryRecordSequence") or []
+            records = parse_dicom(file, str(path)).get("DirectoryRecordSequence") or []
         names = [record.get("ReferencedFileID") for record in records]
         return [[name] if isinstance(name, str) else [str(part) for part in name] for name in names if name]
     except PatientError:
         raise
-    except Exception as error:  # a parser's faults are many; all of them are the file's
+    except Exception as error:  # a parser raises many kinds of error; each is the file's fault
         raise PatientError(
             f"{path}: cannot be read as a DICOMDIR; give the folder of the slices instead"
         ) from error
 
 
-def _of_archive(path: Path) -> list[Item]:
+def _of_archive(path: Path) -> list[SourceFile]:
     try:
         archive = zipfile.ZipFile(path)
         entries = [entry for entry in archive.infolist() if not entry.is_dir()]
-    except Exception as error:  # a parser's faults are many; all of them are the archive's
-        raise PatientError(f"{path}: a broken archive ({error}); copy or export it again") from error
+    except Exception as error:  # a parser raises many kinds of error; each is the archive's fault
+        raise PatientError(f"{path}: a damaged archive ({error}); copy or export it again") from error
     if len(entries) > MOST_FILES:
-        raise PatientError(f"{path}: holds {len(entries)} files; expected at most {MOST_FILES}")
+        raise PatientError(f"{path}: has {len(entries)} files; expected at most {MOST_FILES}")
     for entry in entries:
         _check_entry(path, entry)
-    found = [entry for entry in entries if looks_like_dicom(_unpacked(path, archive, entry, 132))]
+    found = [entry for entry in entries if looks_like_dicom(_extracted(path, archive, entry, 132))]
     total = sum(entry.file_size for entry in found)
     if total > MOST_ARCHIVE_BYTES:
         raise PatientError(
-            f"{path}: unpacks to {total / 2**30:.0f} GiB of DICOM; expected at most {MOST_ARCHIVE_BYTES / 2**30:.0f}; "
+            f"{path}: extracts to {total / 2**30:.0f} GiB of DICOM; expected at most {MOST_ARCHIVE_BYTES / 2**30:.0f}; "
             "give an archive of the CT alone"
         )
 
     def opened(entry: zipfile.ZipInfo) -> BinaryIO:
-        return io.BytesIO(_unpacked(path, archive, entry, MOST_FILE_BYTES))
+        return io.BytesIO(_extracted(path, archive, entry, MOST_FILE_BYTES))
 
-    return [Item(entry.filename, partial(opened, entry), None) for entry in found]
+    return [SourceFile(entry.filename, partial(opened, entry), None) for entry in found]
 
 
 def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:
     name = entry.filename
-    if _leads_outside(name):
+    if _is_outside(name):
         raise PatientError(
-            f"{path}: holds an entry {name[:60]!r} that leads outside; expected a plain archive of DICOM files; "
+            f"{path}: has an entry {name[:60]!r} with a path outside the archive; expected a plain archive of DICOM files; "
             "do not trust it"
         )
     if entry.flag_bits & 1:
-        raise PatientError(f"{path}: {name[:60]} is encrypted; unpack the archive and give the folder")
+        raise PatientError(f"{path}: {name[:60]} is encrypted; extract the archive and give the folder")
     if entry.file_size > MOST_FILE_BYTES:
         raise PatientError(
-            f"{path}: {name[:60]} unpacks to {entry.file_size / 2**30:.0f} GiB; expected at most "
+            f"{path}: {name[:60]} extracts to {entry.file_size / 2**30:.0f} GiB; expected at most "
             f"{MOST_FILE_BYTES / 2**30:.0f}; unpack the archive and give the folder of the CT"
         )
 
 
-def _leads_outside(name: str) -> bool:
-    """Whether a name is absolute or climbs, on any system."""
+def _is_outside(name: str) -> bool:
+    """Whether a path is absolute or contains "..", on any system."""
     kinds = PurePosixPath(name), PureWindowsPath(name)
     return any(p.is_absolute() or p.drive or p.root or ".." in p.parts for p in kinds)
 
 
-def _unpacked(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo, most: int) -> bytes:
+def _extracted(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo, most: int) -> bytes:
     try:
         with archive.open(entry) as file:
             return file.read(most)
-    except Exception as error:  # a decompressor's faults are many; all of them are the archive's
+    except Exception as error:  # a decompressor raises many kinds of error; each is the archive's fault
         raise PatientError(
-            f"{path}: {entry.filename[:60]} cannot be unpacked; the archive is damaged; copy it again"
+            f"{path}: {entry.filename[:60]} cannot be extracted; the archive is damaged; copy it again"
         ) from error

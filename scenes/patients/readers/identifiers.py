@@ -1,6 +1,4 @@
-"""What a source says about a person, so that what an import wrote can be searched for it."""
-
-from __future__ import annotations
+"""Collect the identifiers (PHI) of a DICOM file, so that written files can be searched for them."""
 
 from collections.abc import Iterator
 
@@ -8,13 +6,13 @@ from pydicom.dataelem import DataElement
 from pydicom.dataset import Dataset
 
 from scenes.patients.readers.dicom_headers import read_header
-from scenes.patients.readers.dicom_source import Item
+from scenes.patients.readers.dicom_source import SourceFile
 
-# Of DICOM's kinds of text those that name persons, dates and things; UI also holds standard uids, which name nobody.
+# Value representations that identify persons, dates and objects; UI also has standard UIDs, which identify nobody.
 NAMING = ("PN", "DA", "DT", "UI")
 FREE_TEXT = ("LO", "SH", "ST", "LT", "UT", "UC", "UN", "AE")
 STANDARD_UID = "1.2.840.10008."
-# Free text that is the scanner's, of public groups.
+# Public elements of free text that may identify a person; the others describe the scanner.
 PERSONAL_KEYWORDS = (
     "Patient", "Physician", "Operator", "Institution", "Accession", "StudyID", "StudyDescription", "SeriesDescription",
     "Station", "SerialNumber", "Address", "Telephone", "Comments", "History", "Occupation", "Department", "Protocol",
@@ -22,8 +20,8 @@ PERSONAL_KEYWORDS = (
 )  # fmt: skip
 
 
-def secrets_of(item: Item) -> frozenset[str]:
-    """Every name, id, date, institution, uid and private text of one DICOM file; of what cannot be parsed, its bytes."""
+def identifiers_of(item: SourceFile) -> frozenset[str]:
+    """Names, IDs, dates, institutions, UIDs and private texts of one DICOM file; elements that cannot be parsed as raw text."""
     return frozenset(text for text in _texts(read_header(item, tags=None)) if text)
 
 
@@ -32,7 +30,7 @@ def _texts(data: Dataset) -> Iterator[str]:
         try:
             element = data[tag]
             nested = list(element.value) if element.VR == "SQ" else []
-        except Exception:  # a parser's faults are many
+        except Exception:  # a parser raises many kinds of error
             yield from _plain(getattr(data.get_item(tag), "value", None))
             continue
         if element.VR == "SQ":
@@ -53,7 +51,7 @@ def _words(element: DataElement) -> Iterator[str]:
 
 
 def _plain(value: object) -> Iterator[str]:
-    """A value as text, where it is text that names somebody."""
+    """A value as text, if it is printable and not a standard UID."""
     text = (value.decode("latin-1") if isinstance(value, bytes) else str(value)).strip("\0 ")
     if text.isprintable() and not text.startswith(STANDARD_UID):
         yield text

@@ -1,6 +1,4 @@
-"""Labels from whatever draws them: label maps, one file an organ, 3D Slicer's .seg.nrrd, DICOM-SEG, RTSTRUCT."""
-
-from __future__ import annotations
+"""Read labels: label maps, folders with one file per organ, 3D Slicer's .seg.nrrd, DICOM-SEG, RTSTRUCT."""
 
 import re
 from collections.abc import Callable, Collection, Mapping
@@ -10,101 +8,101 @@ from pathlib import Path
 import numpy as np
 import SimpleITK as sitk
 
-from scenes.patients.import_error import PatientError
-from scenes.patients.readers.dicom_headers import Found, read_header
+from errors import PatientError
+from scenes.patients.readers.dicom_headers import DicomContents, read_header
 from scenes.patients.readers.dicom_seg import read_segmentation
-from scenes.patients.readers.dicom_series import dicom_found
-from scenes.patients.readers.identifiers import secrets_of
-from scenes.patients.readers.itk_files import itk_header, itk_layers, metadata
+from scenes.patients.readers.dicom_series import read_dicom_headers
+from scenes.patients.readers.identifiers import identifiers_of
 from scenes.patients.readers.label_maps import LabelMap, Segment, box_of, whole_numbers
-from scenes.patients.readers.lazy_volume import LazyVolume
-from scenes.patients.readers.nifti import label_names
 from scenes.patients.readers.rtstruct import read_contours, referenced_series
 from scenes.patients.readers.segment_names import is_far, side_of, tissue_of
-from scenes.patients.readers.volume_readers import ENDINGS, NIFTI, file_volume, is_volume_file
-from scenes.patients.readers.voxel_grid import Box, VoxelGrid
-from scenes.progress import Progress, silent
+from scenes.terminal import Progress, silent
+from scenes.volumes.itk_files import itk_header, itk_layers, metadata
+from scenes.volumes.lazy_volume import LazyVolume
+from scenes.volumes.nifti_files import label_names
+from scenes.volumes.volume_files import ENDINGS, NIFTI, file_volume, is_volume_file
+from scenes.volumes.voxel_grid import Box, VoxelGrid
 
-# An import keeps 60 mm around its organ, and a probe sees as far.
+# An import keeps 60 mm around its organ.
 NEAR_MM = 80.0
 SLICER_KEY = re.compile(r"Segment(\d+)_Name$")
 
 
 @dataclass(frozen=True)
-class Drawing:
-    """Labels that were found; contours are filled once the CT is known."""
+class Segmentation:
+    """Labels of one source; contours are filled once the CT's grid is known."""
 
-    maps: Callable[[VoxelGrid], list[LabelMap]]
-    referenced: str = ""  # uid of the series that they were drawn on, where they say
+    maps: Callable[[VoxelGrid], list[LabelMap]]  # on the CT's grid
+    referenced: str = ""  # UID of the referenced series
     notes: tuple[str, ...] = ()
-    secrets: frozenset[str] = frozenset()
-    frame_of_reference: str = ""  # DICOM's uid, where they have one
+    identifiers: frozenset[str] = frozenset()
+    frame_of_reference: str = ""  # DICOM's UID
 
 
-def open_labels(path: Path, wanted: Collection[str] = (), progress: Progress = silent) -> Drawing:
+def open_labels(path: Path, wanted: Collection[str] = (), progress: Progress = silent) -> Segmentation:
     """Read labels.
 
     Args:
-        path: a label map or .seg.nrrd file, a folder with a file for each organ, a DICOM-SEG or RTSTRUCT, or a folder
-            or archive that holds one.
-        wanted: names of files of a folder that are read though their names say nothing.
+        path: a label map or .seg.nrrd file, a folder with one file per organ, a DICOM-SEG or RTSTRUCT, or a folder or
+            archive with one of these.
+        wanted: files of a folder to read, whatever their names.
 
     Raises:
-        PatientError: nothing readable, no labels, none marked; a line for the user.
+        PatientError: not readable, no labels, or all empty.
     """
     if not path.exists():
         raise PatientError(f"{path}: no such file or folder; check the path")
     if path.is_file() and is_volume_file(path):
         return _file(path)
-    organs = sorted(file for file in path.iterdir() if is_volume_file(file)) if path.is_dir() else []
-    if organs:
-        return _one_an_organ(path, organs, wanted, progress)
-    drawing = drawing_of(dicom_found(path, progress))
-    if drawing is None:
+    organ_files = sorted(file for file in path.iterdir() if is_volume_file(file)) if path.is_dir() else []
+    if organ_files:
+        return _file_per_organ(path, organ_files, wanted, progress)
+    found = segmentation_of(read_dicom_headers(path, progress))
+    if found is None:
         raise PatientError(
-            f"{path}: holds no labels; expected a DICOM segmentation or structure set, or label maps; choose another"
+            f"{path}: has no labels; expected a DICOM segmentation or structure set, or label maps; choose another"
         )
-    return drawing
+    return found
 
 
-def drawing_of(found: Found) -> Drawing | None:
-    """The labels among DICOM files; None where there are none. Raises PatientError where there are several."""
-    objects = [*found.segmentations, *found.structure_sets]
+def segmentation_of(contents: DicomContents) -> Segmentation | None:
+    """The segmentation among DICOM files, or None. Raises PatientError where there are several."""
+    objects = [*contents.segmentations, *contents.structure_sets]
     if len(objects) > 1:
         names = ", ".join(item.name for item in objects[:6])
         raise PatientError(
             f"{len(objects)} segmentations and structure sets were found: {names}; expected one; give its file as LABELS"
         )
-    if found.segmentations:
+    if contents.segmentations:
         maps, notes, referenced = read_segmentation(objects[0])
         frame = str(read_header(objects[0]).get("FrameOfReferenceUID") or "")
-        return Drawing(lambda _: maps, referenced, tuple(notes), secrets_of(objects[0]), frame)
-    if found.structure_sets:
+        return Segmentation(lambda _: maps, referenced, tuple(notes), identifiers_of(objects[0]), frame)
+    if contents.structure_sets:
         item = objects[0]
         referenced = referenced_series(read_header(item, tags=["ReferencedFrameOfReferenceSequence"]))
-        return Drawing(lambda ct: read_contours(item, ct), referenced, (), secrets_of(item))
+        return Segmentation(lambda ct: read_contours(item, ct), referenced, (), identifiers_of(item))
     return None
 
 
-def _file(path: Path) -> Drawing:
+def _file(path: Path) -> Segmentation:
     if path.name.lower().endswith(NIFTI):
         volume = file_volume(path)
         maps = [_map(path, volume.grid, volume.read(), label_names(path))]
-        return Drawing(lambda _: maps, secrets=volume.secrets)
+        return Segmentation(lambda _: maps, identifiers=volume.identifiers)
     header = itk_header(path)
     names = _slicer_names(header)
     kept = {n: text for n, text in metadata(header).items() if not n.startswith(("NRRD_", "ITK_", "Segment"))}
-    secrets = frozenset(text for text in kept.values() if text)
+    identifiers = frozenset(text for text in kept.values() if text)
     if not names and header.GetNumberOfComponents() == 1:
         volume = file_volume(path)
         maps = [_map(path, volume.grid, volume.read())]
     else:
         maps = _slicer_maps(path, VoxelGrid.of(header), names)
-    return Drawing(lambda _: maps, secrets=secrets)
+    return Segmentation(lambda _: maps, identifiers=identifiers)
 
 
 def _map(path: Path, grid: VoxelGrid, voxels: np.ndarray, names: Mapping[int, str] | None = None) -> LabelMap:
-    """A label map; one of a single value is called as its file where that says what it is."""
+    """A label map; a single label without a name gets the file's name where that names a tissue or side."""
     values = whole_numbers(voxels, str(path))
     one = LabelMap.valued(grid, values, names)
     if names:
@@ -117,7 +115,7 @@ def _map(path: Path, grid: VoxelGrid, voxels: np.ndarray, names: Mapping[int, st
 
 
 def _slicer_names(header: sitk.ImageFileReader) -> dict[tuple[int, int], Segment]:
-    """Segments of 3D Slicer's header, by layer and value."""
+    """Segments in the header of 3D Slicer, by layer and value."""
     found = {}
     for key in metadata(header):
         number = SLICER_KEY.match(key)
@@ -147,24 +145,26 @@ def _slicer_maps(path: Path, grid: VoxelGrid, names: dict[tuple[int, int], Segme
         known = {v: names.get((layer, v), s) for v, s in one.segments.items()}
         maps.append(LabelMap(one.grid, one.values, known))
     if not maps:
-        raise PatientError(f"{path}: is empty, no voxel is marked; expected an organ; choose another file")
+        raise PatientError(f"{path}: is empty, no voxel is labelled; expected an organ; choose another file")
     return maps
 
 
-def _one_an_organ(folder: Path, files: list[Path], wanted: Collection[str], progress: Progress) -> Drawing:
-    """One file an organ, as TotalSegmentator leaves them: named by their files, and empty where an organ is not there."""
+def _file_per_organ(
+    folder: Path, files: list[Path], wanted: Collection[str], progress: Progress
+) -> Segmentation:
+    """One mask per organ, as TotalSegmentator writes: the files name the organs, and may be empty."""
     asked = {word.casefold() for word in wanted}
     near = [f for f in files if _stem(f).casefold() in asked or not is_far(_stem(f))]
-    # Kidneys first: of the rest, what is near them is read.
+    # Kidneys first: of the others only the part near them is read.
     near.sort(key=lambda file: tissue_of(_stem(file)) != "kidney")
     maps: list[LabelMap] = []
-    secrets: set[str] = set()
+    identifiers: set[str] = set()
     around: np.ndarray | None = None
     for file in progress(near, "labels"):
         volume = file_volume(file)
-        secrets |= volume.secrets
+        identifiers |= volume.identifiers
         is_kidney = tissue_of(_stem(file)) == "kidney"
-        box = volume.grid.whole()
+        box = volume.grid.full_box()
         if around is not None and not is_kidney:
             box = volume.grid.box_around(around[0], around[1])
         one = _organ(file, volume, box)
@@ -177,30 +177,30 @@ def _one_an_organ(folder: Path, files: list[Path], wanted: Collection[str], prog
         raise PatientError(
             f"{folder}: all {len(near)} label files are empty; expected an organ; choose other labels"
         )
-    return Drawing(lambda _: maps, secrets=frozenset(secrets))
+    return Segmentation(lambda _: maps, identifiers=frozenset(identifiers))
 
 
 def _around(places: np.ndarray) -> np.ndarray:
-    """Corners (2, 3) of the box of LPS [mm] that a picture of what is at places can show."""
+    """Corners (2, 3) of the LPS box [mm] within NEAR_MM of some places."""
     return np.array([places.min(axis=0) - NEAR_MM, places.max(axis=0) + NEAR_MM])
 
 
 def _organ(file: Path, volume: LazyVolume, box: Box) -> LabelMap | None:
-    """What one file marks in a box; None where that is nothing."""
+    """The label of one file within a box, or None."""
     if any(a.start == a.stop for a in box):
         return None
     voxels = volume.read(box)
-    marked = box_of(voxels)
-    if marked is None:
+    labelled = box_of(voxels)
+    if labelled is None:
         return None
-    # Other numbers than whole ones are shares, or an image among the labels.
-    values = whole_numbers(voxels[marked[::-1]], str(file))
-    grid = volume.grid.part(box).part(marked)
+    # Fractions, or an image among the labels, are refused.
+    values = whole_numbers(voxels[labelled[::-1]], str(file))
+    grid = volume.grid.part(box).part(labelled)
     return LabelMap.single(grid, values > 0, Segment.named(_stem(file)))
 
 
 def _stem(path: Path) -> str:
-    """A file's name without the ending of its kind."""
+    """A file's name without its extension."""
     name = path.name
     for ending in (".seg.nrrd", ".nii.gz", *ENDINGS):
         if name.lower().endswith(ending):

@@ -1,4 +1,4 @@
-"""Label maps: what each value is, the user's word on it, and several maps made into one."""
+"""Label maps: the segment of each value, tissues assigned by the user, several maps merged into one."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import SimpleITK as sitk
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.segment_names import Side, side_of, tissue_of
-from scenes.patients.readers.voxel_grid import Box, VoxelGrid
+from scenes.volumes.voxel_grid import Box, VoxelGrid
 
-# Painted in this order, so that what is small and matters is not lost under what surrounds it.
-PAINTED = (None, "fat", "muscle", "bone", "liver", "kidney", "cortex", "medulla", "sinus", "vessel", "urine", "cyst", "tumour", "necrosis", "stone")  # fmt: skip
+# Of overlapping segments, later tissues cover earlier ones: small structures cover their surroundings.
+MERGE_ORDER = (None, "fat", "muscle", "bone", "liver", "kidney", "cortex", "medulla", "sinus", "vessel", "urine", "cyst", "tumour", "necrosis", "stone")  # fmt: skip
 
 
 Colour = tuple[float, float, float]  # red, green, blue, 0 to 1
@@ -21,21 +21,21 @@ Colour = tuple[float, float, float]  # red, green, blue, 0 to 1
 
 @dataclass(frozen=True)
 class Segment:
-    """One thing that is labelled."""
+    """One labelled structure."""
 
     name: str
-    value: int | None  # in its file, where values tell things apart
-    tissue: str | None  # by its name, or the user's word; None: HU tell
+    value: int | None  # in its file, if it has one
+    tissue: str | None  # by its name or the user; None: unknown, left to HU
     side: Side | None  # by its name
-    colour: Colour | None = None  # where the file gives one
+    colour: Colour | None = None  # in its file
 
     @classmethod
     def named(cls, name: str, value: int | None = None, colour: Colour | None = None) -> Segment:
-        """A segment whose name says what it is."""
+        """A segment with tissue and side by its name."""
         return cls(name, value, tissue_of(name), side_of(name), colour)
 
-    def called(self, word: str) -> bool:
-        """Whether a user's word, a name or a number, is this segment."""
+    def matches(self, word: str) -> bool:
+        """Whether a user's word is its name or its value."""
         return word.casefold() == self.name.casefold() or (self.value is not None and word == str(self.value))
 
     def __str__(self) -> str:
@@ -44,49 +44,49 @@ class Segment:
 
 @dataclass(frozen=True)
 class LabelMap:
-    """Voxels of one value each, in the patient."""
+    """Voxels with one label value each, in patient coordinates."""
 
     grid: VoxelGrid
-    values: np.ndarray  # uint8 or uint16 (z, y, x), 0 = nothing
+    values: np.ndarray  # uint8 or uint16 (z, y, x), 0 = background
     segments: dict[int, Segment]  # of each value that occurs
 
     @classmethod
     def of(cls, image: sitk.Image, names: Mapping[int, str] | None = None) -> LabelMap:
-        """An image's label map. Raises PatientError where it holds no labels."""
+        """The label map of an image. Raises PatientError where it has no labels."""
         voxels = sitk.GetArrayViewFromImage(image)
         return cls.valued(VoxelGrid.of(image), whole_numbers(voxels, "the label map"), names)
 
     @classmethod
     def valued(cls, grid: VoxelGrid, values: np.ndarray, names: Mapping[int, str] | None = None) -> LabelMap:
-        """A label map whose values have names, or none."""
-        found = {v: Segment.named((names or {}).get(v, ""), v) for v in present(values)}
+        """A label map of voxel values, with names where they are known."""
+        found = {v: Segment.named((names or {}).get(v, ""), v) for v in present_values(values)}
         return cls(grid, values, found)
 
     @classmethod
     def single(cls, grid: VoxelGrid, inside: np.ndarray, segment: Segment) -> LabelMap | None:
-        """The map of one segment, cropped to it; None where it is empty."""
+        """The map of one segment, cropped; None where it is empty."""
         box = box_of(inside)
         if box is None:
             return None
         return cls(grid.part(box), inside[box[::-1]].astype(np.uint8), {1: segment})
 
     def of_tissues(self, *tissues: str | None) -> list[int]:
-        """Values of the segments of some tissues."""
+        """Values of the segments of the given tissues."""
         return [value for value, segment in self.segments.items() if segment.tissue in tissues]
 
-    def called(self, words: Sequence[str]) -> list[int]:
-        """Values of the segments that words, names or numbers, call."""
+    def values_of(self, words: Sequence[str]) -> list[int]:
+        """Values of the segments with the given names or values."""
         return [
-            value for value, segment in self.segments.items() if any(segment.called(word) for word in words)
+            value for value, segment in self.segments.items() if any(segment.matches(word) for word in words)
         ]
 
     def listed(self) -> str:
-        """What there is, for errors."""
+        """All segments, for errors."""
         return listed([str(segment) for segment in self.segments.values()])
 
 
 def listed(names: Sequence[str]) -> str:
-    """Names for an error, not too many."""
+    """At most twelve names, for errors."""
     return ", ".join(names[:12]) + (f" and {len(names) - 12} more" if len(names) > 12 else "")
 
 
@@ -95,39 +95,39 @@ def whole_numbers(voxels: np.ndarray, name: str) -> np.ndarray:
     low, high = voxels.min(), voxels.max()
     if low < 0 or high > 65535 or (voxels.dtype.kind == "f" and (voxels != np.rint(voxels)).any()):
         raise PatientError(
-            f"{name}: holds values from {low:g} to {high:g}; expected whole numbers from 0 up; check that CT and "
-            "labels are not swapped and that the map is no probability"
+            f"{name}: has values from {low:g} to {high:g}; expected whole numbers from 0 up; check that CT and "
+            "labels are not exchanged and that the map is not a probability"
         )
     if high == 0:
         raise PatientError(f"{name}: is empty, every voxel is 0; expected an organ; choose another file")
     return voxels.astype(np.uint8 if high < 256 else np.uint16)
 
 
-def with_tissues(
+def assign_tissues(
     maps: list[LabelMap], organ: Sequence[str], chosen: Mapping[str, Sequence[str]]
 ) -> list[LabelMap]:
-    """The maps with the user's word on what segments are, by names or values.
+    """The maps with the tissues that the user assigned, by names or values.
 
     Args:
-        maps: what is labelled.
-        organ: what together is the organ; what of it says no tissue is kidney.
-        chosen: tissue -> what is of it, which is all that is.
+        maps: all label maps.
+        organ: segments of the organ; those without a tissue become kidney.
+        chosen: tissue -> all of its segments.
 
     Raises:
-        PatientError: a word that nothing is called, or one segment given twice.
+        PatientError: an unknown name or value, or one segment given twice.
     """
     segments = [segment for one in maps for segment in one.segments.values()]
-    said = {"organ": organ, **chosen}
-    for option, words in said.items():
+    given = {"organ": organ, **chosen}
+    for option, words in given.items():
         for word in words:
-            if not any(segment.called(word) for segment in segments):
+            if not any(segment.matches(word) for segment in segments):
                 raise PatientError(
-                    f"the {option}'s label {word} is not in the label map: it holds {listed([str(s) for s in segments])}; "
+                    f"the {option}'s label {word} is not in the label map: it has {listed([str(s) for s in segments])}; "
                     "give one of these"
                 )
 
-    def told(segment: Segment) -> Segment:
-        found = [option for option, words in said.items() if any(segment.called(word) for word in words)]
+    def assigned(segment: Segment) -> Segment:
+        found = [option for option, words in given.items() if any(segment.matches(word) for word in words)]
         if len(found) > 1:
             raise PatientError(
                 f"label {segment} is given as {' and as '.join(found)}: give it as one of them"
@@ -138,27 +138,27 @@ def with_tissues(
             segment = replace(segment, tissue=None)
         return replace(segment, tissue=segment.tissue or "kidney") if found else segment
 
-    return [replace(one, segments={v: told(s) for v, s in one.segments.items()}) for one in maps]
+    return [replace(one, segments={v: assigned(s) for v, s in one.segments.items()}) for one in maps]
 
 
-def merged(maps: list[LabelMap]) -> LabelMap:
-    """One map of several that may overlap and lie on different grids: on that of the first with a kidney, widened to hold all."""
+def merge_label_maps(maps: list[LabelMap]) -> LabelMap:
+    """Merge maps that may overlap and have different grids, on the grid of the first with a kidney, extended to cover all."""
     if len(maps) == 1:
         return maps[0]
     main = next((one for one in maps if one.of_tissues("kidney")), maps[0])
-    grid = _widened(main.grid, maps)
+    grid = _extended(main.grid, maps)
     pieces = [(one, value, segment) for one in maps for value, segment in one.segments.items()]
-    pieces.sort(key=lambda piece: PAINTED.index(piece[2].tissue))
+    pieces.sort(key=lambda piece: MERGE_ORDER.index(piece[2].tissue))
     values = np.zeros(grid.size[::-1], np.uint8 if len(pieces) < 256 else np.uint16)
     for code, (one, value, _) in enumerate(pieces, start=1):
         inside, box = _onto(grid, one.grid, one.values == value)
         values[box[::-1]][inside] = code
-    left = set(present(values))
+    left = set(present_values(values))
     return LabelMap(grid, values, {n: piece[2] for n, piece in enumerate(pieces, start=1) if n in left})
 
 
-def present(values: np.ndarray) -> list[int]:
-    """The values but 0 that occur, a plane at a time: counting widens them eightfold."""
+def present_values(values: np.ndarray) -> list[int]:
+    """The non-zero values that occur; plane by plane, as np.unique takes eight times the memory."""
     there = np.zeros(1 + np.iinfo(values.dtype).max, bool)
     for plane in values:
         there[plane.ravel()] = True
@@ -166,7 +166,7 @@ def present(values: np.ndarray) -> list[int]:
 
 
 def box_of(inside: np.ndarray) -> Box | None:
-    """The box (x, y, z) around what is not zero in voxels (z, y, x)."""
+    """The box (x, y, z) around non-zero voxels (z, y, x), or None."""
     spans = []
     for axis in range(3):
         others = tuple(a for a in range(3) if a != axis)
@@ -178,25 +178,25 @@ def box_of(inside: np.ndarray) -> Box | None:
     return x, y, z
 
 
-def nearest(grid: VoxelGrid, voxels: np.ndarray, onto: VoxelGrid) -> np.ndarray:
-    """Voxels (z, y, x) of one grid on another, by nearest neighbour; 0 beyond the first grid."""
+def resample_nearest(grid: VoxelGrid, voxels: np.ndarray, onto: VoxelGrid) -> np.ndarray:
+    """Voxels (z, y, x) of one grid on another, by nearest neighbour; 0 outside the first grid."""
     if grid.same_as(onto):
         return voxels
     image = grid.image(voxels.astype(np.uint8) if voxels.dtype == bool else voxels)
     return onto.sampled(image, sitk.sitkNearestNeighbor, 0).astype(voxels.dtype)
 
 
-def _widened(grid: VoxelGrid, maps: Iterable[LabelMap]) -> VoxelGrid:
-    """A grid, continued so that it covers all maps."""
+def _extended(grid: VoxelGrid, maps: Iterable[LabelMap]) -> VoxelGrid:
+    """A grid extended to cover all maps."""
     places = np.concatenate([grid.index(one.grid.corners()) for one in maps])
     low = np.floor(places.min(axis=0) + 1e-3).astype(int)
     high = np.ceil(places.max(axis=0) - 1e-3).astype(int)
-    wide = replace(grid, size=tuple((high - low + 1).tolist()), origin=grid.place(low))
-    return wide.checked("the labels")
+    extended = replace(grid, size=tuple((high - low + 1).tolist()), origin=grid.place(low))
+    return extended.checked("the labels")
 
 
 def _onto(grid: VoxelGrid, own: VoxelGrid, inside: np.ndarray) -> tuple[np.ndarray, Box]:
-    """Voxels on a grid that covers theirs, by nearest neighbour, and the box of it that they fill."""
+    """A mask on a grid that covers its own, by nearest neighbour, and its box there."""
     start = np.rint(grid.index(own.origin)).astype(int)
     x, y, z = (slice(int(a), int(a) + n) for a, n in zip(start, own.size, strict=True))
     if grid.part((x, y, z)).same_as(own):
@@ -204,4 +204,4 @@ def _onto(grid: VoxelGrid, own: VoxelGrid, inside: np.ndarray) -> tuple[np.ndarr
     reach = 0.5 * np.abs(own.direction) @ own.spacing
     low, high = own.bounds()
     box = grid.box_around(low - reach, high + reach)
-    return nearest(own, inside, grid.part(box)), box
+    return resample_nearest(own, inside, grid.part(box)), box

@@ -1,30 +1,28 @@
-"""Labels from DICOM: the contours of an RTSTRUCT, filled on the planes that they were drawn on."""
-
-from __future__ import annotations
+"""Read the contours of a DICOM RTSTRUCT and fill them on their planes."""
 
 import numpy as np
 from pydicom.dataset import Dataset
 from skimage.draw import polygon
 
-from scenes.patients.import_error import PatientError
-from scenes.patients.readers.dicom_file import parsed
-from scenes.patients.readers.dicom_source import Item
+from errors import PatientError
+from scenes.patients.readers.dicom_file import parse_dicom
+from scenes.patients.readers.dicom_source import SourceFile
 from scenes.patients.readers.label_maps import LabelMap, Segment
-from scenes.patients.readers.voxel_grid import VoxelGrid
+from scenes.volumes.voxel_grid import VoxelGrid
 
-# Part of a plane's distance by which a contour's points may lie off their plane.
+# Largest deviation of a contour from the even planes, as a share of their distance.
 OFF_PLANE = 0.3
 MOST_POINTS = 20_000_000
 
 
-def read_contours(item: Item, ct: VoxelGrid) -> list[LabelMap]:
-    """The regions of an RTSTRUCT, a map each, with the pixels of a CT, on the planes of the contours.
+def read_contours(item: SourceFile, ct: VoxelGrid) -> list[LabelMap]:
+    """One label map per region, with the pixels of a CT, on the planes of the contours.
 
-    Contours of one region on one plane take turns to be inside and outside, as a ring's do.
-    Raises PatientError: damaged, or drawn across the CT's slices.
+    Nested contours on one plane alternate between inside and outside.
+    Raises PatientError: damaged, or not parallel to the CT's slices.
     """
     with item.open() as file:
-        data = parsed(file, item.name)
+        data = parse_dicom(file, item.name)
     try:
         names = {int(roi.ROINumber): str(roi.get("ROIName", "")) for roi in data.StructureSetROISequence}
         regions = [
@@ -32,7 +30,7 @@ def read_contours(item: Item, ct: VoxelGrid) -> list[LabelMap]:
             for roi in data.ROIContourSequence
             for number in [int(roi.ReferencedROINumber)]
         ]
-    except Exception as error:  # a parser's faults are many; all of them are the file's
+    except Exception as error:  # a parser raises many kinds of error; each is the file's fault
         raise PatientError(
             f"{item.name}: cannot be read as an RTSTRUCT ({type(error).__name__}); export it again"
         ) from error
@@ -42,18 +40,18 @@ def read_contours(item: Item, ct: VoxelGrid) -> list[LabelMap]:
             maps.append(LabelMap.single(*_filled(item.name, contours, ct), segment))
     found = [one for one in maps if one is not None]
     if not found:
-        raise PatientError(f"{item.name}: holds no closed contour; expected an organ's; choose another file")
+        raise PatientError(f"{item.name}: has no closed contour; expected an organ's; choose another file")
     return found
 
 
 def referenced_series(data: Dataset) -> str:
-    """The uid of the series that a structure set was drawn on; empty where it does not say."""
+    """The UID of the series that a structure set refers to, or an empty text."""
     try:
         for frame in data.get("ReferencedFrameOfReferenceSequence") or []:
             for study in frame.get("RTReferencedStudySequence") or []:
                 for series in study.get("RTReferencedSeriesSequence") or []:
                     return str(series.get("SeriesInstanceUID", ""))
-    except Exception:  # a parser's faults are many; without it the best series is taken
+    except Exception:  # a parser raises many kinds of error; without it the best series is taken
         return ""
     return ""
 
@@ -80,17 +78,17 @@ def _contours(roi: Dataset) -> list[np.ndarray]:
 
 
 def _filled(name: str, contours: list[np.ndarray], ct: VoxelGrid) -> tuple[VoxelGrid, np.ndarray]:
-    """A region's voxels, and their grid: a CT's pixels, on the planes of its contours."""
+    """Grid and mask (z, y, x) of a region: a CT's pixels on the planes of its contours."""
     places = [ct.index(points) for points in contours]
     ends = np.array(ct.size)
     if any((place < -ends).any() or (place > 2 * ends).any() for place in places):
         raise PatientError(
-            f"{name}: contours lie far outside this CT; expected contours on it; give the CT that they were drawn on"
+            f"{name}: contours are far outside this CT; expected contours on it; give the CT that they were drawn on"
         )
     heights = np.array([place[:, 2].mean() for place in places])
     if max(np.ptp(place[:, 2]) for place in places) > 1:
         raise PatientError(
-            f"{name}: contours run across the slices of this CT; expected contours on them; give the CT that they were drawn on"
+            f"{name}: contours cross the slices of this CT; expected contours on them; give the CT that they were drawn on"
         )
     planes = np.unique(np.round(heights, 2))
     gaps = np.diff(planes)

@@ -1,11 +1,11 @@
-"""What a segment's name says: which tissue it is for sound, and on which side it should lie."""
+"""Recognise the tissue and the side of a segment by its name."""
 
 import re
 from typing import Literal
 
 Side = Literal["left", "right"]
 
-# In this order: a renal mass is a tumour and a kidney cyst a cyst before either is a kidney. "" is known, and no tissue of ours.
+# The first match counts: a renal mass is a tumour and a kidney cyst a cyst, not a kidney. "": a known structure that is not modelled.
 TISSUE_OF_NAME: tuple[tuple[str, str], ...] = (
     ("", r"adrenal|suprarenal|gall ?bladder|cystic duct|spleen|milz|pancrea|stomach|colon|bowel|duoden|intestin|diaphragm|lymph|skin|\bbody\b|external"),
     ("tumour", r"tumou?r|tumeur|\bmass\b|\bmasse\b|raumforderung|lesion|läsion|neoplas|carcinom|karzinom|cancer|krebs|malignan|\b[cp]?rcc\b|\bgtv"),
@@ -22,7 +22,7 @@ TISSUE_OF_NAME: tuple[tuple[str, str], ...] = (
     ("muscle", r"muscle|psoas|autochthon|gluteus|quadratus"),
     ("fat", r"\bfat\b|adipose"),
 )  # fmt: skip
-# Organs that TotalSegmentator names, too far from a kidney to be in its picture.
+# Structures of TotalSegmentator that are too far from a kidney to be in its image.
 FAR = (
     r"brain|skull|face|heart|atri(um|al)|ventric|myocard|lung|pulmon|humerus|clavic|scapula|femur|sacrum|\bhips?\b|"
     r"vertebrae (c\d|t[1-8]\b)|rib (left|right) [1-7]\b|trachea|o?esophagus|thyroid|prostate|bladder|gluteus|"
@@ -35,30 +35,30 @@ SIDE_OF_NAME: tuple[tuple[Side, str], ...] = (
 
 
 def tissue_of(name: str) -> str | None:
-    """The tissue of a segment's name (``ultrasound/tissues.toml``); None where it says none."""
+    """The tissue of ``ultrasound/tissues.toml`` that a name means, or None."""
     plain = _plain(name)
     found = next((tissue for tissue, pattern in TISSUE_OF_NAME if re.search(pattern, plain)), "")
     return found or None
 
 
 def is_understood(name: str) -> bool:
-    """Whether a name is one of ours, or of an organ that is none of a kidney's tissues."""
+    """Whether a name is of a known structure, modelled or not."""
     return bool(name) and any(re.search(pattern, _plain(name)) for _, pattern in TISSUE_OF_NAME)
 
 
 def is_far(name: str) -> bool:
-    """Whether what is named lies far from every kidney."""
+    """Whether a name is of a structure far from the kidneys."""
     return re.search(FAR, _plain(name)) is not None
 
 
 def side_of(name: str) -> Side | None:
-    """The side that a segment's name says, such as kidney_left or "Kidney R"; None where it says none, or both."""
+    """The side in a name such as kidney_left or "Kidney R"; None where it has none, or both."""
     plain = _plain(name)
     found = [side for side, pattern in SIDE_OF_NAME if re.search(pattern, plain)]
     return found[0] if len(found) == 1 else None
 
 
 def _plain(name: str) -> str:
-    """Small letters, one space between words: kidneyL, kidney_L and "Kidney-L" are the same."""
+    """Lower case, one space between words: kidneyL, kidney_L and "Kidney-L" become equal."""
     apart = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
     return re.sub(r"[\W_]+", " ", apart).strip().lower()

@@ -1,10 +1,7 @@
-"""CT slices in any order -> one upright, evenly spaced volume; what is missing, double or tilted is said or refused.
+"""Stack CT slices in any order into one rectangular, evenly spaced volume; missing and conflicting slices are refused.
 
-A tilted gantry shears the stack: its slices stay as they are and are shifted in their own plane, so that nothing is
-interpolated between them.
+A tilted gantry shears the stack: its slices are shifted within their planes, without interpolation between them.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -12,22 +9,21 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 from scenes.patients.readers.dicom_headers import DicomSlice
 from scenes.patients.readers.dicom_pixels import hounsfield
-from scenes.patients.readers.lazy_volume import AIR_HU
-from scenes.patients.readers.voxel_grid import Box, VoxelGrid
+from scenes.volumes.lazy_volume import AIR_HU
+from scenes.volumes.voxel_grid import Box, VoxelGrid
 
-# Part of a slice distance by which a slice may lie off the even grid: scanners round positions, to 0.1 mm at
-# worst, and a missing slice is off by a whole distance.
+# Largest deviation of a slice from the even grid, as a share of the spacing: scanners round positions to 0.1 mm at worst.
 UNEVEN = 0.1
-# Part of a pixel by which slices may be shifted sideways before they are shifted back.
+# In-plane shift of slices, in pixels, that is not corrected.
 SIDEWAYS = 0.25
-# Pixels by which a slice may lie off the line of a tilted stack.
+# Largest deviation of a slice from the line of a tilted stack, in pixels.
 OUT_OF_LINE = 1.0
-# Gantries tilt by 30 degrees at most.
+# [degrees]; gantries tilt by 30 at most.
 MOST_TILT = 45.0
-# Gaps between slices, as parts of the usual one, that are resampled; beyond them something is missing or double.
+# Spacings, relative to the median, that are resampled; outside this range a slice is missing or duplicated.
 GAPS = (0.5, 1.5)
 PARALLEL = 1e-3
 SAME_PLACE_MM = 1e-3
@@ -36,14 +32,12 @@ MOST_GAP_MM = 10.0
 
 @dataclass(frozen=True)
 class Stack:
-    """Slices in order, and the upright, even grid that they are read onto."""
+    """Sorted slices, and the rectangular, even grid that they are resampled on."""
 
     slices: list[DicomSlice]
     grid: VoxelGrid
-    planes: np.ndarray  # (n,) place of each slice along the grid's third axis, in voxels from its first
-    sideways: (
-        np.ndarray
-    )  # (n, 2) how far each slice's first pixel is from the grid's, in pixels along row and column
+    planes: np.ndarray  # (n,) position of each slice along the grid's third axis [voxels]
+    sideways: np.ndarray  # (n, 2) in-plane shift of each slice along row and column [pixels]
     notes: tuple[str, ...]
 
     def read(
@@ -68,7 +62,7 @@ class Stack:
         return voxels
 
     def _shifted(self, plane: np.ndarray, n: int) -> np.ndarray:
-        """A slice on the grid's pixels; air beyond it."""
+        """A slice resampled on the grid's pixels; air outside it."""
         columns, rows, _ = self.grid.size
         if plane.shape == (rows, columns) and not self.sideways[n].any():
             return plane
@@ -80,7 +74,7 @@ class Stack:
 
 
 def _between(before: tuple[float, np.ndarray] | None, after: tuple[float, np.ndarray], k: int) -> np.ndarray:
-    """The plane at k between two slices, or the nearer one where it is as good as there."""
+    """The plane k interpolated between two slices, or a slice that is within UNEVEN of it."""
     if before is None or abs(after[0] - k) <= UNEVEN:
         return after[1]
     if abs(before[0] - k) <= UNEVEN:
@@ -89,31 +83,31 @@ def _between(before: tuple[float, np.ndarray] | None, after: tuple[float, np.nda
     return np.rint(before[1] * (1 - share) + after[1] * share).astype(np.int16)
 
 
-def stacked(name: str, slices: list[DicomSlice]) -> Stack:
-    """Put slices in order on one grid. Raises PatientError: too few, not parallel, one missing, double or in conflict."""
+def stack_slices(name: str, slices: list[DicomSlice]) -> Stack:
+    """Sort slices on one grid. Raises PatientError: too few, not parallel, or one missing or in conflict."""
     if len(slices) < 2:
         raise PatientError(
             f"{name}: one slice only; expected a series of slices; give the folder of the whole series"
         )
-    _check_alike(name, slices)
+    _check_same_geometry(name, slices)
     normal = np.cross(slices[0].row, slices[0].column)
     _check_phases(name, slices, normal)
     notes: list[str] = []
     slices = sorted(slices, key=lambda s: (float(s.position @ normal), s.number or 0))
-    slices = _once(name, slices, normal, notes)
+    slices = _without_duplicates(name, slices, normal, notes)
     if len(slices) < 2:
-        raise PatientError(f"{name}: all slices lie at one position; expected a stack; choose another series")
+        raise PatientError(f"{name}: all slices are at one position; expected a stack; choose another series")
     along = np.array([s.position @ normal for s in slices])
     _check_gaps(name, slices, along)
     planes, gap = _even(along, notes)
-    origin, sideways, size = _upright(name, slices, normal, notes)
+    origin, sideways, size = _straightened(name, slices, normal, notes)
     direction = np.column_stack([slices[0].row, slices[0].column, normal])
     planes_count = int(np.floor(planes[-1] + UNEVEN)) + 1
     grid = VoxelGrid((*size, planes_count), np.array([*slices[0].spacing, gap]), origin, direction)
     return Stack(slices, grid.checked(name), planes, sideways, tuple(notes))
 
 
-def _check_alike(name: str, slices: list[DicomSlice]) -> None:
+def _check_same_geometry(name: str, slices: list[DicomSlice]) -> None:
     first = slices[0]
     for other in slices[1:]:
         turned = max(np.abs(other.row - first.row).max(), np.abs(other.column - first.column).max())
@@ -122,35 +116,37 @@ def _check_alike(name: str, slices: list[DicomSlice]) -> None:
             what = "orientation" if turned > PARALLEL else "pixel spacing" if scaled else "size"
             raise PatientError(
                 f"{name}: {first.label} and {other.label} are of different {what}; expected one stack of parallel "
-                "slices; put the slices of one view in a folder of their own"
+                "slices; put the slices of one view in a separate folder"
             )
 
 
 def _check_phases(name: str, slices: list[DicomSlice], normal: np.ndarray) -> None:
-    """Refuse several phases in one series: every place is there as often."""
+    """Raises PatientError where a series has several phases: every position occurs as often."""
     places, counts = np.unique([round(float(s.position @ normal), 2) for s in slices], return_counts=True)
     often = int(counts.min())
     if (
         len(places) > 2
         and often > 1
         and len({s.sop for s in slices}) == len(slices)
-        and not _alike(slices, normal)
+        and not _first_two_equal(slices, normal)
     ):
         raise PatientError(
-            f"{name}: all {len(places)} positions are there {often} times: several phases in one series; expected one; put the slices "
-            "of one phase, which their acquisition numbers or times tell apart, in a folder of their own"
+            f"{name}: all {len(places)} positions occur {often} times: several phases in one series; expected one; put the slices "
+            "of one phase, by acquisition number or time, in a separate folder"
         )
 
 
-def _alike(slices: list[DicomSlice], normal: np.ndarray) -> bool:
-    """Whether the first two slices at one place are the same."""
+def _first_two_equal(slices: list[DicomSlice], normal: np.ndarray) -> bool:
+    """Whether the first two slices at one position are equal."""
     first = min(slices, key=lambda s: float(s.position @ normal))
     twin = [s for s in slices if abs((s.position - first.position) @ normal) < SAME_PLACE_MM][:2]
     return len(twin) == 2 and _same(*twin)
 
 
-def _once(name: str, slices: list[DicomSlice], normal: np.ndarray, notes: list[str]) -> list[DicomSlice]:
-    """Slices that lie at one place: copies are left out, others in conflict."""
+def _without_duplicates(
+    name: str, slices: list[DicomSlice], normal: np.ndarray, notes: list[str]
+) -> list[DicomSlice]:
+    """The slices without equal copies. Raises PatientError where slices at one position differ."""
     kept, copies = [slices[0]], []
     for one in slices[1:]:
         if (one.position - kept[-1].position) @ normal > SAME_PLACE_MM:
@@ -159,12 +155,12 @@ def _once(name: str, slices: list[DicomSlice], normal: np.ndarray, notes: list[s
             copies.append(one)
         else:
             raise PatientError(
-                f"{name}: {kept[-1].label} and {one.label} lie at one position, {_at(one, normal)}, and differ; expected each "
-                "slice once; take out other phases, or the wrong copy"
+                f"{name}: {kept[-1].label} and {one.label} are at one position, at {one.position @ normal:.2f} mm, and differ; expected "
+                "each slice once; remove other phases, or the wrong copy"
             )
     if copies:
         named = ", ".join(one.label for one in copies[:3]) + (" and others" if len(copies) > 3 else "")
-        notes.append(f"there twice, alike, and taken once: {named}")
+        notes.append(f"duplicates, taken once: {named}")
     return kept
 
 
@@ -172,10 +168,6 @@ def _same(one: DicomSlice, other: DicomSlice) -> bool:
     sideways = np.abs(one.position - other.position).max() <= SAME_PLACE_MM
     mine, its = hounsfield([one, other])
     return bool(sideways) and np.array_equal(mine, its)
-
-
-def _at(one: DicomSlice, normal: np.ndarray) -> str:
-    return f"at {one.position @ normal:.2f} mm"
 
 
 def _check_gaps(name: str, slices: list[DicomSlice], along: np.ndarray) -> None:
@@ -197,7 +189,7 @@ def _check_gaps(name: str, slices: list[DicomSlice], along: np.ndarray) -> None:
     if gaps.min() < least * usual:
         raise PatientError(
             f"{name}: {pair(int(np.argmin(gaps)))}; expected one stack, no gap under {least:g} times the usual; "
-            "two acquisitions may overlap here: take one out"
+            "two acquisitions may overlap here: remove one"
         )
     if usual > MOST_GAP_MM + SAME_PLACE_MM:
         raise PatientError(
@@ -206,7 +198,7 @@ def _check_gaps(name: str, slices: list[DicomSlice], along: np.ndarray) -> None:
 
 
 def _even(along: np.ndarray, notes: list[str]) -> tuple[np.ndarray, float]:
-    """Where slices lie on an even grid, in its spacings from the first, and that spacing [mm]."""
+    """Positions of the slices on an even grid [voxels], and its spacing [mm]."""
     gap = (along[-1] - along[0]) / (len(along) - 1)
     planes = (along - along[0]) / gap
     if np.abs(planes - np.arange(len(along))).max() <= UNEVEN:
@@ -220,10 +212,10 @@ def _even(along: np.ndarray, notes: list[str]) -> tuple[np.ndarray, float]:
     return (along - along[0]) / gap, float(gap)
 
 
-def _upright(
+def _straightened(
     name: str, slices: list[DicomSlice], normal: np.ndarray, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    """Origin of an upright grid that holds all slices, their places on it in pixels, and its columns and rows."""
+    """Origin of a rectangular grid that covers all slices, their in-plane shifts [pixels], and its columns and rows."""
     first = slices[0]
     axes = np.column_stack([first.row, first.column])
     positions = np.array([s.position for s in slices])
@@ -233,26 +225,24 @@ def _upright(
     if np.abs(offsets).max() <= SIDEWAYS * spacing.min():
         return first.position, np.zeros((len(slices), 2)), size
     along = (positions - first.position) @ normal
-    lean = np.median(
-        np.diff(offsets, axis=0) / np.diff(along)[:, None], axis=0
-    )  # a tilt's, the same everywhere
-    off = offsets - along[:, None] * lean
+    shear = np.median(np.diff(offsets, axis=0) / np.diff(along)[:, None], axis=0)  # of a tilted gantry
+    off = offsets - along[:, None] * shear
     off = np.abs(off - np.median(off, axis=0)).max(axis=1)
     worst = int(np.argmax(off))
     if off[worst] > OUT_OF_LINE * spacing.min():
         raise PatientError(
-            f"{name}: {slices[worst].label} lies {off[worst]:.1f} mm to the side of its neighbours; expected slices in one "
-            "line; take out the wrong slice, or export the series again"
+            f"{name}: {slices[worst].label} is {off[worst]:.1f} mm to the side of its neighbours; expected slices in one "
+            "line; remove the wrong slice, or export the series again"
         )
-    angle = float(np.degrees(np.arctan(np.linalg.norm(lean))))
+    angle = float(np.degrees(np.arctan(np.linalg.norm(shear))))
     if angle > MOST_TILT:
         raise PatientError(
-            f"{name}: its slices lean by {angle:.1f} degrees; expected at most {MOST_TILT:g}; export the series again"
+            f"{name}: its slices are tilted by {angle:.1f} degrees; expected at most {MOST_TILT:g}; export the series again"
         )
     low, high = offsets.min(axis=0), offsets.max(axis=0)
     extra = np.ceil((high - low) / spacing - 1e-6).astype(int)
     notes.append(
-        f"the gantry was tilted by {angle:.1f} degrees: slices shifted back in their planes by up to {np.abs(offsets).max():.1f} mm"
+        f"the gantry was tilted by {angle:.1f} degrees: slices shifted within their planes by up to {np.abs(offsets).max():.1f} mm"
     )
     return (
         first.position + axes @ low,

@@ -1,4 +1,4 @@
-"""Where voxels are in the patient: LPS [mm], the origin in the middle of voxel 0."""
+"""Voxel grids in patient coordinates: LPS [mm], the origin at the centre of voxel 0."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ import numpy as np
 import numpy.typing as npt
 import SimpleITK as sitk
 
-from scenes.patients.import_error import PatientError
+from errors import PatientError
 
 Box = tuple[slice, slice, slice]
 
-# A voxel of a CT, or of labels on one.
+# Plausible voxel sizes of a CT.
 SPACING_MM = (0.05, 15.0)
-# Largest cosine between two axes that rounding in files leaves.
-SQUARE = 2e-3
-# A CT of the whole body has a third of a billion.
+# Largest cosine between two axes; files round them.
+MOST_SHEAR = 2e-3
+# A whole-body CT has 0.3 billion voxels.
 MOST_VOXELS = 1_200_000_000
 
 
 @dataclass(frozen=True)
 class VoxelGrid:
-    """Size, spacing, origin and direction of voxels, in the order x, y, z of their indices."""
+    """Size, spacing, origin and direction; indices in the order x, y, z."""
 
     size: tuple[int, int, int]
     spacing: np.ndarray  # (3,) [mm]
@@ -31,7 +31,7 @@ class VoxelGrid:
 
     @classmethod
     def of(cls, image: sitk.Image | sitk.ImageFileReader) -> VoxelGrid:
-        """The grid of an image, or of a file whose header was read."""
+        """The grid of an image, or of a reader that has read a header."""
         return cls(
             tuple(image.GetSize()),
             np.array(image.GetSpacing()),
@@ -40,7 +40,7 @@ class VoxelGrid:
         )
 
     def checked(self, name: str) -> VoxelGrid:
-        """This grid, once it is one that voxels of a patient can have. Raises PatientError, which begins with a name."""
+        """This grid, if it is plausible. Raises PatientError that begins with ``name``."""
         size = " x ".join(map(str, self.size))
         if min(self.size) < 2:
             raise PatientError(
@@ -53,13 +53,13 @@ class VoxelGrid:
             )
         least, most = SPACING_MM
         if not np.isfinite(np.concatenate([self.spacing, self.origin, self.direction.ravel()])).all():
-            raise PatientError(f"{name}: its place in the patient is not a number; export the volume again")
+            raise PatientError(f"{name}: its position in the patient is not finite; export the volume again")
         if not ((self.spacing >= least) & (self.spacing <= most)).all():
             voxel = " x ".join(f"{s:g}" for s in self.spacing)
             raise PatientError(
-                f"{name}: voxels of {voxel} mm; expected {least:g} to {most:g} mm each way; export the volume again in mm"
+                f"{name}: voxels of {voxel} mm; expected {least:g} to {most:g} mm along each axis; export the volume again in mm"
             )
-        if np.abs(self.direction.T @ self.direction - np.eye(3)).max() > SQUARE:
+        if np.abs(self.direction.T @ self.direction - np.eye(3)).max() > MOST_SHEAR:
             raise PatientError(
                 f"{name}: the axes are sheared; expected axes at right angles; resample the volume, for example in 3D Slicer"
             )
@@ -74,8 +74,8 @@ class VoxelGrid:
         return (np.asarray(places) - self.origin) @ self.direction / self.spacing
 
     def corners(self, box: Box | None = None) -> np.ndarray:
-        """LPS of the outermost voxel centres (8, 3) of the grid or a part of it."""
-        box = box or self.whole()
+        """LPS [mm] of the eight outermost voxel centres (8, 3) of the grid or of a box."""
+        box = box or self.full_box()
         return self.place(
             np.array(np.meshgrid(*[(a.start, a.stop - 1) for a in box], indexing="ij")).reshape(3, -1).T
         )
@@ -90,13 +90,13 @@ class VoxelGrid:
         """Volume of a voxel [ml]."""
         return float(np.prod(self.spacing)) / 1000
 
-    def whole(self) -> Box:
+    def full_box(self) -> Box:
         """The box of all voxels."""
         x, y, z = (slice(0, n) for n in self.size)
         return x, y, z
 
     def box_around(self, low: np.ndarray, high: np.ndarray) -> Box:
-        """The smallest box of voxels that covers places between two corners in LPS [mm]; it may be empty."""
+        """The smallest box of voxels that covers an LPS box [mm] between two corners; it may be empty."""
         corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(3, -1).T
         found = self.index(corners)
         first = np.clip(np.floor(found.min(axis=0)).astype(int), 0, self.size)
@@ -118,7 +118,7 @@ class VoxelGrid:
         return image
 
     def sampled(self, image: sitk.Image, interpolator: int, beyond: float) -> np.ndarray:
-        """What an image holds at these voxels (z, y, x), and beyond it a value."""
+        """An image resampled at these voxels (z, y, x); ``beyond`` outside the image."""
         found = sitk.Resample(
             image,
             list(self.size),
@@ -132,7 +132,7 @@ class VoxelGrid:
         return sitk.GetArrayFromImage(found)
 
     def same_as(self, other: VoxelGrid) -> bool:
-        """Whether size and, to a hundredth of a voxel, all corners agree: files round their geometry."""
+        """Whether the sizes are equal and the corners agree to 0.01 voxel; files round their geometry."""
         if self.size != other.size:
             return False
         apart = np.abs(self.corners() - other.corners()).max()

@@ -1,6 +1,4 @@
-"""NIfTI, by nibabel: its RAS becomes LPS, and a file that does not say its orientation is refused."""
-
-from __future__ import annotations
+"""Read NIfTI with nibabel: RAS becomes LPS; a file without an orientation is refused."""
 
 import logging
 import re
@@ -11,16 +9,15 @@ from typing import Any, cast
 import nibabel
 import numpy as np
 
-from scenes.patients.import_error import PatientError
-from scenes.patients.readers.file_checks import check_size, cut_off, no_scalar, not_3d
-from scenes.patients.readers.lazy_volume import LazyVolume
-from scenes.patients.readers.voxel_grid import Box, VoxelGrid
+from errors import PatientError
+from scenes.volumes.lazy_volume import LazyVolume, check_size, cut_off, no_scalar, not_3d
+from scenes.volumes.voxel_grid import Box, VoxelGrid
 
-# What is wrong is said in an error.
+# Problems are reported as errors here.
 logging.getLogger("nibabel").setLevel(logging.CRITICAL)
 
 SLAB_VOXELS = 8_000_000
-# Not parsed as XML: all that is wanted is the names, and an extension may be anything.
+# A pattern, no XML parser: an extension may contain anything, and only the names are needed.
 LABEL_ENTRY = re.compile(r'<Label\s[^<>]*?Key="(\d{1,5})"[^<>]*>(?:<!\[CDATA\[)?([^<>\]]{1,200})')
 MOST_NAMES_BYTES = 1 << 20
 MM_OF_UNIT = {"meter": 1000.0, "micron": 0.001}
@@ -29,12 +26,12 @@ RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0])
 
 
 def nifti_volume(path: Path) -> LazyVolume:
-    """The volume of a file. Raises PatientError: damaged, not 3D, sheared, or without its place in the patient."""
+    """Read the header of a volume; voxels are read on demand. Raises PatientError: damaged, not 3D, sheared, no orientation."""
     try:
         image: Any = nibabel.load(path, keep_file_open=True)
         header, shape = image.header, image.shape
         kind = image.get_data_dtype()
-    except Exception as error:  # a parser's faults are many; all of them are the file's
+    except Exception as error:  # a parser raises many kinds of error; each is the file's fault
         raise PatientError(
             f"{path}: cannot be read as NIfTI ({type(error).__name__}); expected a whole file; copy or export it again"
         ) from error
@@ -45,7 +42,7 @@ def nifti_volume(path: Path) -> LazyVolume:
     if kind.fields or kind.kind not in "iuf":
         raise no_scalar(path, kind)
     grid = _grid(path, header, shape).checked(str(path))
-    check_size(path, grid, kind.itemsize, path.stat().st_size, packed=path.name.lower().endswith(".gz"))
+    check_size(path, grid, kind.itemsize, path.stat().st_size, compressed=path.name.lower().endswith(".gz"))
     last = (0,) * (len(image.shape) - 3)
 
     def read_box(box: Box) -> np.ndarray:
@@ -56,7 +53,7 @@ def nifti_volume(path: Path) -> LazyVolume:
             for k in range(z.start, z.stop, slabs):
                 part = image.dataobj[(x, y, slice(k, min(k + slabs, z.stop)), *last)]
                 planes.append(_narrow(np.asarray(part)).T)
-        except Exception as error:  # a parser's faults are many; all of them are the file's
+        except Exception as error:  # a parser raises many kinds of error; each is the file's fault
             raise cut_off(path) from error
         return np.concatenate(planes)
 
@@ -65,15 +62,15 @@ def nifti_volume(path: Path) -> LazyVolume:
         for key in ("descrip", "aux_file", "intent_name", "db_name")
         if key in header
     ]
-    return LazyVolume(str(path), grid, read_box, secrets=frozenset(text for text in texts if text))
+    return LazyVolume(str(path), grid, read_box, identifiers=frozenset(text for text in texts if text))
 
 
 def label_names(path: Path) -> dict[int, str]:
-    """Names of label values, where a header's extension has Connectome Workbench's table of them, as TotalSegmentator writes."""
+    """Names of label values from the header extension of Connectome Workbench, which TotalSegmentator writes."""
     try:
         image: Any = nibabel.load(path)
         texts = [extension.get_content() for extension in image.header.extensions]
-    except Exception:  # a damaged extension names nothing
+    except Exception:  # a damaged extension has no names
         return {}
     found: dict[int, str] = {}
     for text in texts:
@@ -84,12 +81,12 @@ def label_names(path: Path) -> dict[int, str]:
 
 
 def _narrow(voxels: np.ndarray) -> np.ndarray:
-    """Whole numbers as integers: scaled or stored as float64 they take four times the memory."""
+    """Integral values as int16, others as float32: float64 takes up to four times the memory."""
     if voxels.dtype.kind != "f" or not np.isfinite(voxels).all():
         return voxels
-    whole = np.rint(voxels)
-    if np.array_equal(whole, voxels) and np.abs(whole).max(initial=0) < 2**15:
-        return whole.astype(np.int16)
+    integral = np.rint(voxels)
+    if np.array_equal(integral, voxels) and np.abs(integral).max(initial=0) < 2**15:
+        return integral.astype(np.int16)
     return voxels.astype(np.float32)
 
 
@@ -102,9 +99,9 @@ def _grid(path: Path, header: Any, shape: tuple[int, ...]) -> VoxelGrid:
                 (int(header["sform_code"]), header.get_sform()),
                 (int(header["qform_code"]), header.get_qform()),
             )
-        except Exception as error:  # a parser's faults are many; all of them are the file's
+        except Exception as error:  # a parser raises many kinds of error; each is the file's fault
             raise PatientError(
-                f"{path}: its place in the patient cannot be understood ({type(error).__name__}); export it again"
+                f"{path}: its position in the patient cannot be read ({type(error).__name__}); export it again"
             ) from error
     affine = _affine(path, [form for form in forms if form[0] > 0], shape)
     scale = MM_OF_UNIT.get(unit, 1.0)
@@ -117,10 +114,10 @@ def _grid(path: Path, header: Any, shape: tuple[int, ...]) -> VoxelGrid:
 
 
 def _affine(path: Path, forms: list[tuple[int, np.ndarray]], shape: tuple[int, ...]) -> np.ndarray:
-    """RAS from indices (4, 4), of the one or two places that a header says; the scanner's where they disagree."""
+    """The affine (4, 4) from indices to RAS, of sform and qform; the scanner's where they disagree."""
     if not forms:
         raise PatientError(
-            f"{path}: says no orientation (sform and qform codes are 0), so left may be right; export it again with its orientation"
+            f"{path}: has no orientation (sform and qform codes are 0), so left and right may be exchanged; export it again with its orientation"
         )
     affine = forms[0][1]
     corners = np.array(np.meshgrid(*[(0, n - 1) for n in shape], [1])).reshape(4, -1)
@@ -130,6 +127,6 @@ def _affine(path: Path, forms: list[tuple[int, np.ndarray]], shape: tuple[int, .
     scanner = [other for code, other in forms if code == SCANNER_CODE]
     if len(scanner) != 1:
         raise PatientError(
-            f"{path}: sform and qform place it up to {apart:.1f} mm apart; expected one place; export it again"
+            f"{path}: sform and qform differ by up to {apart:.1f} mm; expected one position; export it again"
         )
     return scanner[0]

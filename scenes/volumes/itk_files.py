@@ -1,6 +1,4 @@
-"""NRRD and MetaImage, by ITK, once it is known that their voxels lie where they should."""
-
-from __future__ import annotations
+"""Read NRRD and MetaImage with ITK, after checks of what ITK trusts: the header, and which file holds the voxels."""
 
 import re
 from collections.abc import Iterator
@@ -9,17 +7,16 @@ from pathlib import Path
 import numpy as np
 import SimpleITK as sitk
 
-from scenes.patients.import_error import PatientError
-from scenes.patients.readers.file_checks import check_size, cut_off, no_scalar, not_3d
-from scenes.patients.readers.lazy_volume import LazyVolume
-from scenes.patients.readers.voxel_grid import Box, VoxelGrid
+from errors import PatientError
+from scenes.volumes.lazy_volume import LazyVolume, check_size, cut_off, no_scalar, not_3d
+from scenes.volumes.voxel_grid import Box, VoxelGrid
 
 NRRD, META = (".nrrd", ".nhdr"), (".mha", ".mhd")
 HEADER_BYTES, LINE_BYTES, NAME_LETTERS = 1 << 22, 1 << 16, 255
 
 
 def itk_volume(path: Path) -> LazyVolume:
-    """The volume of a file. Raises PatientError: damaged, not 3D, sheared, or without its place in the patient."""
+    """Read the header of a scalar volume; voxels are read on demand. Raises PatientError."""
     reader = itk_header(path)
     kind = sitk.GetPixelIDValueAsString(reader.GetPixelID())
     if reader.GetNumberOfComponents() != 1 or "complex" in kind:
@@ -27,7 +24,7 @@ def itk_volume(path: Path) -> LazyVolume:
     texts = [text for key, text in metadata(reader).items() if not key.startswith(("NRRD_", "ITK_"))]
     grid = VoxelGrid.of(reader)
     return LazyVolume(
-        str(path), grid, lambda box: _itk_box(path, box), secrets=frozenset(t for t in texts if t)
+        str(path), grid, lambda box: _itk_box(path, box), identifiers=frozenset(t for t in texts if t)
     )
 
 
@@ -47,10 +44,10 @@ def itk_header(path: Path) -> sitk.ImageFileReader:
         raise not_3d(path, reader.GetSize())
     if path.suffix.lower() in NRRD and not reader.HasMetaDataKey("NRRD_space"):
         raise PatientError(
-            f"{path}: says no space (such as left-posterior-superior), so left may be right; export it again"
+            f"{path}: has no space field (such as left-posterior-superior), so left and right may be exchanged; export it again"
         )
     grid = VoxelGrid.of(reader).checked(str(path))
-    check_size(path, grid, _bytes_of(reader), data_file.stat().st_size, packed=True)
+    check_size(path, grid, _bytes_of(reader), data_file.stat().st_size, compressed=True)
     return reader
 
 
@@ -75,7 +72,7 @@ def _itk_box(path: Path, box: Box) -> np.ndarray:
 
 
 def metadata(reader: sitk.ImageFileReader) -> dict[str, str]:
-    """What a header says; keys that are no text say nothing."""
+    """The metadata of a header whose keys are printable."""
     return {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys() if key.isprintable()}
 
 
@@ -87,18 +84,18 @@ def _bytes_of(reader: sitk.ImageFileReader) -> int:
 
 
 def file_with_voxels(path: Path) -> Path:
-    """The file that a header's voxels lie in: the same, or one beside it.
+    """The file that holds the voxels of a header: the same, or one in its folder.
 
-    Raises PatientError: elsewhere, in several, or, of MetaImage, not three dimensions, which ITK does not survive.
+    Raises PatientError: elsewhere, several files, or a MetaImage that is not 3D, which makes ITK crash.
     """
-    said = list(_said(path))
-    names = [value for key, value in said if key in ("datafile", "elementdatafile")]
+    fields = list(_header_fields(path))
+    names = [value for key, value in fields if key in ("datafile", "elementdatafile")]
     if path.suffix.lower() in META:
-        dimensions = [value for key, value in said if key == "ndims"]
+        dimensions = [value for key, value in fields if key == "ndims"]
         if len(names) != 1 or dimensions != ["3"]:
             found = " and ".join(dimensions)[:20] or "no"
             raise PatientError(
-                f"{path}: its header says {found} dimensions; expected one 3D volume, and where its voxels lie; export one volume"
+                f"{path}: its header has {found} dimensions; expected one 3D volume and one file with its voxels; export one volume"
             )
     if not names or names in (["LOCAL"], ["local"]):
         return path
@@ -109,17 +106,15 @@ def file_with_voxels(path: Path) -> Path:
     beside = (path.parent / name).resolve() if is_plain else path
     if not is_plain or len(names) > 1 or not beside.is_relative_to(path.parent.resolve()):
         raise PatientError(
-            f"{path}: its voxels lie in {name[:60]!r}; expected one file beside it; convert it to one NRRD file"
+            f"{path}: its voxels are in {name[:60]!r}; expected one file in the same folder; convert it to one NRRD file"
         )
     if not beside.is_file():
-        raise PatientError(
-            f"{path}: its voxels should lie in {name[:60]!r}, which is not there; copy both files"
-        )
+        raise PatientError(f"{path}: its voxels are in {name[:60]!r}, which is missing; copy both files")
     return beside
 
 
-def _said(path: Path) -> Iterator[tuple[str, str]]:
-    """Keys and values of a header, split as ITK splits them. Raises PatientError where it has no end."""
+def _header_fields(path: Path) -> Iterator[tuple[str, str]]:
+    """Keys and values of a header, split as ITK does. Raises PatientError where the header has no end."""
     is_nrrd = path.suffix.lower() in NRRD
     with path.open("rb") as file:
         while len(line := file.readline(LINE_BYTES)) < LINE_BYTES and file.tell() < HEADER_BYTES:

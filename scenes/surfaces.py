@@ -1,4 +1,4 @@
-"""Surfaces as files that other programs put in the right place in the patient."""
+"""Closed surfaces in LPS [mm]: read and written as files, translated, and the volume inside one."""
 
 from pathlib import Path
 
@@ -7,10 +7,10 @@ import trimesh
 from trimesh.exchange.ply import export_ply
 from trimesh.exchange.stl import export_stl
 
-from scenes.atomic_files import whole
-from scenes.patients.import_error import PatientError
+from errors import PatientError
+from scenes.atomic_files import atomic_write
 
-# What 3D Slicer looks for in an STL's header and in a PLY's comments.
+# The coordinate system, as 3D Slicer reads it from an STL's header and a PLY's comments.
 SPACE = b"SPACE=LPS"
 STL_HEADER_BYTES = 80
 
@@ -21,7 +21,7 @@ def load_surface(path: Path) -> trimesh.Trimesh:
         raise PatientError(f"{path}: no such surface file; give an STL, PLY or OBJ file")
     try:
         surface = trimesh.load_mesh(path)
-    except Exception as error:  # trimesh's readers raise whatever their parsers do
+    except Exception as error:  # trimesh's readers raise many kinds of error
         raise PatientError(
             f"{path}: cannot be read as a surface ({type(error).__name__}); export it as STL"
         ) from None
@@ -31,7 +31,7 @@ def load_surface(path: Path) -> trimesh.Trimesh:
         or not np.isfinite(surface.vertices).all()
     ):
         raise PatientError(
-            f"{path}: holds no triangles, or some that are no numbers; expected a closed surface in mm, LPS"
+            f"{path}: has no triangles, or coordinates that are not finite; expected a closed surface in mm, LPS"
         )
     if not surface.is_watertight or surface.volume <= 0:
         raise PatientError(
@@ -41,12 +41,12 @@ def load_surface(path: Path) -> trimesh.Trimesh:
 
 
 def save_surface(surface: trimesh.Trimesh, path: Path) -> None:
-    """Write vertices and triangles [mm, LPS] as binary STL or PLY, as the suffix says, and nothing else that is known of them.
+    """Write vertices and triangles [mm, LPS] as binary STL or PLY, by the suffix, without any metadata.
 
-    Coordinates are float32 there. A PLY keeps the order of the vertices, an STL has none. Raises OSError.
+    Coordinates are float32. A PLY keeps the order of the vertices. Raises OSError.
     """
     bare = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
-    with whole(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_bytes(WRITERS[path.suffix.removeprefix(".")](bare))
 
 
@@ -61,3 +61,14 @@ def _ply(surface: trimesh.Trimesh) -> bytes:
 
 WRITERS = {"stl": _stl, "ply": _ply}
 FORMATS = tuple(WRITERS)
+
+
+def translated(mesh: trimesh.Trimesh, by_mm: np.ndarray) -> trimesh.Trimesh:
+    """The surface translated by (3,) [mm], with the same order of vertices and faces."""
+    return trimesh.Trimesh(mesh.vertices + by_mm, mesh.faces, process=False)
+
+
+def volume_mm3(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Volume [mm^3] inside a closed surface of vertices (n, 3) [mm] and faces (m, 3)."""
+    corner = vertices[faces].astype(float)
+    return float(np.einsum("ij,ij->", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6)

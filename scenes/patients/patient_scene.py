@@ -1,0 +1,59 @@
+"""The scene of an imported patient: its files, the CT window, the hilum, the support."""
+
+import numpy as np
+import SimpleITK as sitk
+import trimesh
+
+from scenes.patients.organ_selection import LESIONS, PARENCHYMA
+from scenes.patients.part_surfaces import PARTS
+from scenes.patients.patient_import import Patient
+from scenes.patients.readers.segment_names import Side
+from scenes.scene import AnatomyFiles, Attachment, Image, MeshShape, Scene
+
+FAT_HU = -110.0
+LEAST_WINDOW_HU = 310.0  # up to 200 HU at least, or an unenhanced kidney is white
+
+# The hilum is the mean of the vertices within this distance of the deepest one.
+FLOOR_MM = 8.0
+# Least medial component of the normal at the hilum.
+LEAST_MEDIAL = 0.3
+
+
+def hilum(organ: trimesh.Trimesh, side: Side) -> tuple[float, float, float]:
+    """Centre of the hilum, LPS [mm]: around the medial vertex that is deepest below the surface's convex hull."""
+    medial = np.array([-1.0 if side == "left" else 1.0, 0.0, 0.0])
+    hull = organ.convex_hull
+    normals, offsets = hull.face_normals, (hull.face_normals * hull.triangles[:, 0]).sum(axis=1)
+    depth = np.min(offsets - organ.vertices @ normals.T, axis=1)
+    facing = organ.vertex_normals @ medial > LEAST_MEDIAL
+    if not facing.any():
+        facing[:] = True
+    deepest = organ.vertices[np.argmax(np.where(facing, depth, -1.0))]
+    floor = organ.vertices[np.linalg.norm(organ.vertices - deepest, axis=1) <= FLOOR_MM]
+    x, y, z = floor.mean(axis=0).round(1).tolist()
+    return x, y, z
+
+
+def patient_scene(patient: Patient) -> Scene:
+    """The scene that an import writes into the patient's folder: supine, on its support."""
+    tumour = None if patient.tumour is None else "tumour.stl"
+    own = [code for code, tissue in patient.tissues.items() if tissue in (*PARENCHYMA, *LESIONS)]
+    hu = sitk.GetArrayViewFromImage(patient.ct)[np.isin(sitk.GetArrayViewFromImage(patient.labels), own)]
+    # From fat to the organ's 99th percentile, with any contrast agent.
+    darkest = FAT_HU
+    brightest = max(round(float(np.percentile(hu, 99)), -1), darkest + LEAST_WINDOW_HU)
+    return Scene(
+        image=Image(window_hu=brightest - darkest, level_hu=(brightest + darkest) / 2),
+        title=f"{patient.side.capitalize()} kidney{' (draft)' if patient.draft else ''}",
+        anatomy=AnatomyFiles.model_validate(
+            dict(
+                tumour=tumour,
+                parts={tissue: f"{PARTS[tissue]}.stl" for tissue in patient.parts if tissue != "tumour"},
+                ct="ct.nrrd",
+                labels="labels.nrrd",
+                tissues={str(code): tissue for code, tissue in patient.tissues.items()},
+            )
+        ),
+        attachment=Attachment(at_mm=hilum(patient.organ, patient.side)),
+        shape=(MeshShape(kind="mesh", file="support.stl"),),
+    )

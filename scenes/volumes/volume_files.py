@@ -1,0 +1,38 @@
+"""Read and write one volume in one file: NIfTI, NRRD, MetaImage."""
+
+import errno
+from pathlib import Path
+
+import SimpleITK as sitk
+
+from scenes.atomic_files import atomic_write
+from scenes.volumes.itk_files import META, NRRD, itk_volume
+from scenes.volumes.lazy_volume import LazyVolume
+
+NIFTI = (".nii", ".nii.gz")
+ENDINGS = (*NIFTI, *NRRD, *META)
+
+
+def is_volume_file(path: Path) -> bool:
+    """Whether a file name ends like that of a volume."""
+    return path.name.lower().endswith(ENDINGS)
+
+
+def file_volume(path: Path) -> LazyVolume:
+    """Read the header of a volume file; voxels are read on demand. Raises PatientError: damaged, not 3D, sheared, no orientation."""
+    if not path.name.lower().endswith(NIFTI):
+        return itk_volume(path)
+    # nibabel takes 0.2 s to import.
+    from scenes.volumes.nifti_files import nifti_volume
+
+    return nifti_volume(path)
+
+
+def save_image(image: sitk.Image, path: Path) -> None:
+    """Write an image, compressed, as NRRD or MetaImage by the suffix. Raises OSError."""
+    with atomic_write(path) as partial:
+        try:
+            sitk.WriteImage(image, str(partial), useCompression=True)
+            sitk.ReadImage(str(partial))  # ITK does not report a disk that is full at the last bytes
+        except RuntimeError:  # ITK's message has many lines and no cause
+            raise OSError(errno.EIO, "cannot be written completely (is the disk full?)") from None
