@@ -244,10 +244,10 @@ class Rehearsal:
     def look(
         self, probe: Probe, mode: Mode, detail_level: DetailLevel, window_hu: float, level_hu: float
     ) -> dict[str, np.ndarray]:
-        """What the scanner shows now, by name (``Scanner.look``); black in a scene without a CT."""
+        """What the scanner shows now, by name (``Scanner.images``); black in a scene without a CT."""
         if self.scanner is None:
             return {"no CT": np.zeros((self.scene.image.pixels, self.scene.image.pixels), np.uint8)}
-        return self.scanner.look(self.image_plane(probe), probe, mode, detail_level, window_hu, level_hu)
+        return self.scanner.images(self.image_plane(probe), probe, mode, detail_level, window_hu, level_hu)
 
     def find_plane(self, probe: Probe) -> None:
         """Find the tissue that a picture would be of, and make none."""

@@ -101,7 +101,7 @@ def scan(
     for name, pose in tqdm(placed.items(), desc="scan", unit="pose"):
         began = perf_counter()
         plane = ImagePlane(pose, *held.extent_mm)
-        shown = scanner.look(plane, held, image.mode, image.detail_level, image.window_hu, image.level_hu)
+        shown = scanner.images(plane, held, image.mode, image.detail_level, image.window_hu, image.level_hu)
         ms.append(1000 * (perf_counter() - began))
         marks = scanner.marks.render()
         empty += not marks.any()

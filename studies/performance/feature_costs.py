@@ -230,7 +230,7 @@ def _pictures(rehearsal: Rehearsal, scanned: ScannedAnatomy) -> Iterator[dict[st
         scanner = Scanner(scanned, embedding, probe, image.pixels, outside)
 
         def draw() -> None:
-            scanner.look(plane, probe, mode, detail_level, image.window_hu, image.level_hu)
+            scanner.images(plane, probe, mode, detail_level, image.window_hu, image.level_hu)
 
         yield _alone(f"picture, {name}", draw, [embedding, scanner], rehearsal.model)
 

@@ -88,7 +88,7 @@ class Scene:
 
     def pictures(self, plane: ImagePlane) -> dict[str, np.ndarray]:
         """CT and echo as the panel shows them, with the organ's outline, uint8 (rows, columns, 3) each."""
-        shown = self.scanner.look(plane, PROBE, "both", "speckle", 350.0, 40.0)
+        shown = self.scanner.images(plane, PROBE, "both", "speckle", 350.0, 40.0)
         outline = section(
             array_of(self.surface.vertices), self.anatomy.organ.faces, np.linalg.inv(plane.world_from_plane)
         )
@@ -171,7 +171,7 @@ def window(scene):
 
 def drawn(window, scene: Scene, plane: ImagePlane) -> np.ndarray:
     """The 3D view, uint8 (rows, columns, 3), of means over blocks of pixels."""
-    shown = scene.scanner.look(plane, PROBE, "ct", "speckle", 350.0, 40.0)
+    shown = scene.scanner.images(plane, PROBE, "ct", "speckle", 350.0, 40.0)
     window.draw(View(held_at(plane.world_from_plane, 20.0), shown, WIDTH, DEPTH))
     area = window.layout.scene
     rows, columns = area.height // BLOCK, area.width // BLOCK

@@ -170,7 +170,7 @@ def test_the_matrices_beside_a_picture_lead_to_what_it_shows(device):
         for r in (30.0, 12.0)
     )
     scanner = Scanner(ScannedAnatomy(organ, hu, index_from_mm, tumour=mass), Unmoved(), probe, PIXELS)
-    picture = scanner.look(plane_of(rehearsal, probe), probe, "ct", "speckle", 1000.0, -500.0)["CT"].astype(
+    picture = scanner.images(plane_of(rehearsal, probe), probe, "ct", "speckle", 1000.0, -500.0)["CT"].astype(
         float
     )
     rows, columns = np.indices(picture.shape)

@@ -52,7 +52,7 @@ def plane_at(above: float = 0.0) -> ImagePlane:
 
 def echo(scanner: Scanner, plane: ImagePlane) -> np.ndarray:
     """What the middle line holds [dB], but for the gain."""
-    scanner.look(plane, PROBE, "b-mode", "reflection", 350.0, 40.0)
+    scanner.images(plane, PROBE, "b-mode", "reflection", 350.0, 40.0)
     return array_of(scanner.bmode.decibel)[16].astype(float) - PROBE.gain_db()
 
 
@@ -63,7 +63,7 @@ def test_voxels_are_measured_along_their_own_axes(spacing):
 
 def test_the_slice_is_windowed_as_asked_for(device):
     scanner = Scanner(anatomy(), Unmoved(), PROBE, PIXELS)
-    picture = scanner.look(plane_at(), PROBE, "ct", "speckle", 400.0, 20.0)[CT]
+    picture = scanner.images(plane_at(), PROBE, "ct", "speckle", 400.0, 20.0)[CT]
     wanted = np.clip((scanner.slice.hounsfield().astype(float) - 20.0) / 400.0 + 0.5, 0, 1) * 255
     assert np.ptp(wanted) > 50 and np.abs(picture - wanted).max() <= 0.51
 
@@ -78,7 +78,7 @@ def test_each_look_is_at_where_the_body_is_now(device):
     embedding = Followed()
     scanner = Scanner(anatomy(), embedding, PROBE, PIXELS)
     for looks in (1, 2):
-        scanner.look(plane_at(), PROBE, "ct", "speckle", 400.0, 20.0)
+        scanner.images(plane_at(), PROBE, "ct", "speckle", 400.0, 20.0)
         assert embedding.looks == looks
 
 
