@@ -252,7 +252,7 @@ class Rehearsal:
     def find_plane(self, probe: Probe) -> None:
         """Find the tissue that a picture would be of, and make none."""
         if self.scanner is not None:
-            self.scanner.take(self.image_plane(probe))
+            self.scanner.locate(self.image_plane(probe))
 
     def image_plane(self, probe: Probe | None = None) -> ImagePlane:
         """The plane that the transducer shows now, as far as its probe, or another set like it, sees."""

@@ -32,7 +32,7 @@ class ImagePlane:
 class PlaneInTissue:
     """Which tetrahedron of an embedding holds each of ``pixels`` x ``pixels`` places of an image plane.
 
-    ``owner`` (rows, columns) since the last ``take``; slice and echo are made of the same one.
+    ``owner`` (rows, columns) since the last ``locate``; slice and echo are made of the same one.
     """
 
     def __init__(self, embedding: Embedding | Unmoved, pixels: int) -> None:
@@ -40,7 +40,7 @@ class PlaneInTissue:
         self.pixels = pixels
         self.owner = ti.field(ti.i32, (pixels, pixels))
 
-    def take(self, plane: ImagePlane) -> None:
+    def locate(self, plane: ImagePlane) -> None:
         """Find the tissue on a plane, the embedding being up to date; ``pixel_mm`` and ``first_mm`` say where pixels are."""
         pixel = np.array([plane.width_mm, plane.depth_mm]) / self.pixels
         first = np.array([-plane.width_mm / 2, -plane.above_mm]) + pixel / 2

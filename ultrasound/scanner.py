@@ -111,12 +111,12 @@ class Scanner:
     def _organ(self) -> SampledVolume:
         return distance_volume(self.anatomy.organ)
 
-    def take(self, plane: ImagePlane) -> None:
+    def locate(self, plane: ImagePlane) -> None:
         """Find the tissue on a plane, of which there is no picture yet."""
         self.embedding.update()
-        self.plane.take(plane)
+        self.plane.locate(plane)
 
-    def look(
+    def images(
         self,
         plane: ImagePlane,
         probe: Probe,
@@ -126,7 +126,7 @@ class Scanner:
         level_hu: float,
     ) -> dict[str, np.ndarray]:
         """Grey values (pixels, pixels) uint8 of what a mode shows of a plane, by name, the first the one that matters."""
-        self.take(plane)
+        self.locate(plane)
         show = {
             CT: lambda: self.slice.render(window_hu, level_hu),
             ECHO: lambda: self.bmode.render(probe, detail_level),

@@ -91,7 +91,7 @@ class Trial:
     def _look(self) -> None:
         rehearsal = self.rehearsal
         rehearsal.embedding.update()
-        self.plane.take(rehearsal.image_plane())
+        self.plane.locate(rehearsal.image_plane())
         gap = rehearsal.scene.image.contact_gap_mm
         touches = self.coverage.look(self.plane.rest_grid(PLACES), rehearsal.probe, gap)
         rehearsal.organ_skin.update()

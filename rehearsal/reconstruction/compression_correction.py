@@ -50,7 +50,7 @@ class CompressionCorrection:
             go(self.rehearsal, self._poses[frame], min(waited, LONGEST_S))
             self._frame = frame
         self.rehearsal.embedding.update()
-        self.plane.take(self._plane_of(frame))
+        self.plane.locate(self._plane_of(frame))
         return self.plane.rest_grid(self.plane.pixels) + self.rehearsal.origin
 
     def _plane_of(self, frame: int) -> ImagePlane:

@@ -73,7 +73,7 @@ def resting(anatomy: LoadedAnatomy, probe: Probe, direction: np.ndarray, pixels:
     images = []
     for pose in poses:
         scanner.embedding.update()
-        scanner.plane.take(ImagePlane(pose, *probe.extent_mm))
+        scanner.plane.locate(ImagePlane(pose, *probe.extent_mm))
         images.append(marks.render())
     return _truth(np.stack(images), poses, np.arange(len(poses)) / FRAMES_A_SECOND, probe, beads)
 
@@ -109,7 +109,7 @@ def pressed(rehearsal: Rehearsal, depth_mm: float) -> Truth:
         if step % every == 0:
             rehearsal.update_surfaces()
             rehearsal.embedding.update()
-            rehearsal.scanner.plane.take(rehearsal.image_plane())
+            rehearsal.scanner.plane.locate(rehearsal.image_plane())
             images.append(marks.render())
             poses.append(probe_in_patient(rehearsal))
             squeezed.append(measure(rehearsal, probe, touches).compression_mm)

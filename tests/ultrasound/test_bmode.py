@@ -79,7 +79,7 @@ class Tank:
     ) -> np.ndarray:
         """Echoes (lines, samples) [dB] of a probe whose face is at a place and looks along a direction."""
         pose = pose_at(at, along, lateral, probe.housing_mm[2])
-        self.plane.take(image_plane(pose, probe.housing_mm[2], *probe.extent_mm))
+        self.plane.locate(image_plane(pose, probe.housing_mm[2], *probe.extent_mm))
         self.picture = self.bmode.render(probe, detail_level)
         return array_of(self.bmode.decibel).astype(float)
 

@@ -48,7 +48,7 @@ def ball(radius: float, *place: float) -> trimesh.Trimesh:
 
 def taken(embedding: Unmoved | None = None) -> PlaneInTissue:
     plane = PlaneInTissue(embedding or Unmoved(), PIXELS)
-    plane.take(PLANE)
+    plane.locate(PLANE)
     return plane
 
 
@@ -146,7 +146,7 @@ def patient_from_pixels(rehearsal, probe, shape) -> np.ndarray:
 def test_the_matrices_beside_a_picture_lead_to_where_its_pixels_were_at_rest(device):
     rehearsal, probe = lying()
     plane = PlaneInTissue(Unmoved(), PIXELS)
-    plane.take(plane_of(rehearsal, probe))
+    plane.locate(plane_of(rehearsal, probe))
     column, row = np.meshgrid(np.arange(PIXELS), np.arange(PIXELS))
     pixels = np.stack([column, row, 0 * row, 1 + 0 * row], axis=-1)
     places = pixels @ patient_from_pixels(rehearsal, probe, (PIXELS, PIXELS)).T
