@@ -9,9 +9,9 @@ import taichi.math as tm
 from sim.fields import field_of
 from ultrasound.image_plane import Picture, PlaneInTissue
 from ultrasound.sampled_volume import SampledVolume
-from ultrasound.sweep import Mark
+from ultrasound.sweep import PixelLabel
 
-MOST_BEADS = 255 // Mark.BEAD
+MOST_BEADS = 255 // PixelLabel.BEAD
 
 
 @ti.data_oriented
@@ -48,15 +48,15 @@ class GroundTruthLabels:
     def _render(self, pixel_mm: tm.vec2, first_mm: tm.vec2, picture: Picture):
         for row, column in ti.ndrange(self.plane.pixels, self.plane.pixels):
             rest = self.plane.rest_at(row, column, pixel_mm, first_mm)
-            mark = ti.cast(Mark.OUTSIDE, ti.i32)
+            mark = ti.cast(PixelLabel.OUTSIDE, ti.i32)
             if self.plane.is_tissue(row, column):
                 if self.organ.sample(rest) < 0.0:
-                    mark = Mark.ORGAN
+                    mark = PixelLabel.ORGAN
                 if ti.static(self.has_tumour):
                     if self.tumour.sample(rest) < 0.0:
-                        mark = Mark.TUMOUR
+                        mark = PixelLabel.TUMOUR
                 if ti.static(self.beads > 0):
                     for k in range(self.beads):
                         if (rest - self.bead[k]).norm_sqr() < self.radius_mm**2:
-                            mark = mark % Mark.BEAD + Mark.BEAD * (k + 1)
+                            mark = mark % PixelLabel.BEAD + PixelLabel.BEAD * (k + 1)
             picture[row, column] = ti.cast(mark, ti.u8)

@@ -40,7 +40,7 @@ class LabelledSweep:
         reference_from_probe: np.ndarray,
         time_s: float,
     ) -> None:
-        """One frame: grey values and ``Mark`` values (rows, columns), of a probe at a pose (4, 4). Raises OSError, SweepError."""
+        """One frame: grey values and ``PixelLabel`` values (rows, columns), of a probe at a pose (4, 4). Raises OSError, SweepError."""
         transforms: dict[str, np.ndarray | None] = {
             "ProbeToReference": reference_from_probe,
             "ImageToProbe": probe.image_to_probe(*picture.shape),
@@ -58,7 +58,7 @@ class LabelledSweep:
             raise
 
 
-def marks_beside(sweep: Path) -> Sweep | None:
+def read_ground_truth(sweep: Path) -> Sweep | None:
     """The marks of a sweep, where they were recorded. Raises SweepError."""
     path = sweep.with_name(sweep.name.removesuffix(SUFFIX) + MARKS)
     return read_sweep(path) if sweep.name.endswith(SUFFIX) and path != sweep and path.is_file() else None

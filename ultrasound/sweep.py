@@ -27,7 +27,7 @@ ORIENTATIONS = {each: each for each in ("MF", "MN", "UF", "UN", "FM", "NM", "FU"
 ORIENTATIONS |= {f"{each}A": each for each in ORIENTATIONS} | {"UFD": "UF", "MND": "MN"}
 
 
-class Mark(IntEnum):
+class PixelLabel(IntEnum):
     """Pixels of a sweep of marks, the truth beside a sweep of Nephron's. To what it is in, a bead adds its number times BEAD."""
 
     OUTSIDE = 0

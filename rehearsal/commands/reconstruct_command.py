@@ -23,7 +23,7 @@ from rehearsal.reconstruction.sweep_volumes import Places, Rebuilt, Track, lit, 
 from rehearsal.result_files import write_json
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
-from ultrasound.labelled_sweep import PROBE_FIELD, marks_beside
+from ultrasound.labelled_sweep import PROBE_FIELD, read_ground_truth
 from ultrasound.reconstruction import METHODS
 from ultrasound.sweep import Sweep, load_constants
 from ultrasound.sweep_file import read_sweep, write_sweep
@@ -116,7 +116,7 @@ def reconstruct(
         raise CommandError("--undo-compression: presses the organ of a scene; name it with --scene")
     pictures = read_sweep(sweep)
     pictures.constant |= load_constants(config) if config else {}
-    marks = marks_beside(sweep)
+    marks = read_ground_truth(sweep)
     errors = _errors_of(tracker)
     if errors != TrackingErrors():
         pictures = with_errors(pictures, reference, errors, seed)

@@ -103,7 +103,7 @@ def scan(
         plane = ImagePlane(pose, *held.extent_mm)
         shown = scanner.images(plane, held, image.mode, image.detail_level, image.window_hu, image.level_hu)
         ms.append(1000 * (perf_counter() - began))
-        marks = scanner.marks.render()
+        marks = scanner.ground_truth.render()
         empty += not marks.any()
         if swept is not None:
             grey = next(iter(shown.values()))

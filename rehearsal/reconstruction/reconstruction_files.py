@@ -8,17 +8,17 @@ import SimpleITK as sitk
 from rehearsal.reconstruction.sweep_volumes import Rebuilt
 from scenes.volume_files import save_image
 from ultrasound.reconstruction import VoxelBox
-from ultrasound.sweep import Mark
+from ultrasound.sweep import PixelLabel
 
 
 def save_volumes(rebuilt: Rebuilt, out: Path) -> None:
-    """Write volume.nrrd and, where there are regions, labels.nrrd with ``Mark`` values."""
+    """Write volume.nrrd and, where there are regions, labels.nrrd with ``PixelLabel`` values."""
     grey = np.clip(np.rint(rebuilt.grey), 0, 255).astype(np.uint8)
     save_volume(grey, rebuilt.box, out / "volume.nrrd")
     if "organ" in rebuilt.regions:
-        labels = np.where(rebuilt.regions["organ"], np.uint8(Mark.ORGAN), np.uint8(Mark.OUTSIDE))
+        labels = np.where(rebuilt.regions["organ"], np.uint8(PixelLabel.ORGAN), np.uint8(PixelLabel.OUTSIDE))
         if "tumour" in rebuilt.regions:
-            labels[rebuilt.regions["tumour"]] = Mark.TUMOUR
+            labels[rebuilt.regions["tumour"]] = PixelLabel.TUMOUR
         save_volume(labels, rebuilt.box, out / "labels.nrrd")
 
 

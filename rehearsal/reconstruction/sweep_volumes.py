@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion, find_objects
 
 from ultrasound.reconstruction import Reconstruction, VoxelBox
-from ultrasound.sweep import Mark, Sweep, SweepError
+from ultrasound.sweep import PixelLabel, Sweep, SweepError
 
 GREY = "grey"
 # A share of pixels from which on a voxel is of a region.
@@ -78,7 +78,7 @@ def rebuild(
 ) -> Rebuilt:
     """Put the pictures of a sweep together.
 
-    ``marks`` are the same frames with ``Mark`` values. ``places`` says where each frame's pixels are, asked for in the order of frames;
+    ``marks`` are the same frames with ``PixelLabel`` values. ``places`` says where each frame's pixels are, asked for in the order of frames;
     without it they are where the tracker says. Without grey values there must be marks. ``done`` is told of each frame.
 
     Raises SweepError where marks and pictures do not go together, ValueError as ``VoxelBox.around``.
@@ -121,9 +121,9 @@ def _channels(marks: Sweep | None) -> dict[str, Callable[[np.ndarray], np.ndarra
     """What is put together: the grey values, and of marks the shares of organ and tumour."""
     channels: dict[str, Callable[[np.ndarray], np.ndarray] | None] = {GREY: None}
     if marks is not None:
-        channels["organ"] = lambda image: image % Mark.BEAD >= Mark.ORGAN
-        if (marks.images % Mark.BEAD == Mark.TUMOUR).any():
-            channels["tumour"] = lambda image: image % Mark.BEAD == Mark.TUMOUR
+        channels["organ"] = lambda image: image % PixelLabel.BEAD >= PixelLabel.ORGAN
+        if (marks.images % PixelLabel.BEAD == PixelLabel.TUMOUR).any():
+            channels["tumour"] = lambda image: image % PixelLabel.BEAD == PixelLabel.TUMOUR
     return channels
 
 
@@ -137,13 +137,13 @@ class _Beads:
 
     def add(self, marks: np.ndarray, matrix: np.ndarray, at: np.ndarray | None, is_end: bool) -> None:
         """A picture of marks (rows, columns): where its pixels are by a matrix, or one by one (rows, columns, 3) [mm]."""
-        rows, columns = np.nonzero(marks >= Mark.BEAD)
+        rows, columns = np.nonzero(marks >= PixelLabel.BEAD)
         if at is not None:
             places = at[rows, columns]
         else:
             pixels = np.column_stack([columns, rows, np.zeros(len(rows)), np.ones(len(rows))])
             places = pixels @ matrix[:3].T
-        beads = marks[rows, columns] // Mark.BEAD - 1
+        beads = marks[rows, columns] // PixelLabel.BEAD - 1
         cut = beads if is_end else beads[self._edge[rows, columns]]
         self._cut |= set(cut.tolist())
         for bead in map(int, np.unique(beads)):

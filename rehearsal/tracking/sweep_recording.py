@@ -68,7 +68,7 @@ class Sweeping:
             # Echo and CT in one sweep would be no volume of either.
             return self.end()
         self._shows = name
-        marks = self.rehearsal.scanner.marks.render()
+        marks = self.rehearsal.scanner.ground_truth.render()
         try:
             self._sweep.add(picture, marks, probe, probe_in_patient(self.rehearsal), time_s)
         except SweepError as error:

@@ -32,7 +32,7 @@ BEAD_RADIUS_MM, BEADS_APART_MM, BEADS_WITHIN_MM = 1.5, 9.0, 24.0
 
 @dataclass
 class Truth:
-    """A sweep of ``Mark`` pictures with the true poses (n, 4, 4) of the probe in the patient, and its beads (k, 3) at rest (LPS, mm).
+    """A sweep of ``PixelLabel`` pictures with the true poses (n, 4, 4) of the probe in the patient, and its beads (k, 3) at rest (LPS, mm).
 
     ``on_probe`` (4, 4) is ImageToProbe, ``mask`` says which pixels (rows, columns) the probe shows.
     """

@@ -26,10 +26,10 @@ from sim.embedding import Unmoved
 from sim.mesh_distance import signed_distance
 from studies.freehand.freehand_sweeps import sweep_of
 from ultrasound import reconstruction
-from ultrasound.labelled_sweep import MARKS, SUFFIX, LabelledSweep, marks_beside
+from ultrasound.labelled_sweep import MARKS, SUFFIX, LabelledSweep, read_ground_truth
 from ultrasound.probe import load_probe
 from ultrasound.probe_manipulator import held_at, image_plane, pose_at
-from ultrasound.sweep import Mark, SweepError
+from ultrasound.sweep import PixelLabel, SweepError
 from ultrasound.sweep_file import read_sweep, write_sweep
 from version import VERSION
 
@@ -94,13 +94,13 @@ def test_a_recorded_sweep_says_where_each_pixel_is(tmp_path):
     for frame, place in enumerate(places):
         at = sweep.transform("Image", "Reference", frame) @ [12, 22, 0, 1]
         assert at[:3] == pytest.approx(place, abs=1e-6)
-    marks = marks_beside(tmp_path / "sweep-001.igs.mha")
+    marks = read_ground_truth(tmp_path / "sweep-001.igs.mha")
     assert np.array_equal(marks.images, sweep.images % 3)
     assert sweep.fields["NephronVersion"] == marks.fields["NephronVersion"] == VERSION
     assert [frame["ProbeToReferenceTransform"] for frame in marks.frames] == [
         frame["ProbeToReferenceTransform"] for frame in sweep.frames
     ]
-    assert marks_beside(tmp_path / "sweep-001-marks.igs.mha") is None
+    assert read_ground_truth(tmp_path / "sweep-001-marks.igs.mha") is None
     # Times of a sweep are those of the rehearsal, and a new one begins at once, whenever the last ended.
     assert sweeping.toggle(tmp_path) == "sweep-002: {sweep} ends it"
     sweeping.watch(1.0, view, rehearsal.probe)
@@ -150,7 +150,7 @@ def test_a_sweep_without_frames_or_ct_leaves_words_and_no_file(tmp_path):
 def test_a_full_disk_ends_a_sweep_in_words_and_leaves_nothing(tmp_path, marks_too, bytes_to_a_file):
     rehearsal, view = recording(pixels=256)
     if marks_too:
-        rehearsal.scanner.marks.render = lambda: view.pictures["B-mode"]
+        rehearsal.scanner.ground_truth.render = lambda: view.pictures["B-mode"]
     sweeping = Sweeping(rehearsal)
     sweeping.toggle(tmp_path)
     with bytes_to_a_file(150_000):
@@ -267,7 +267,7 @@ def swept(tmp_path_factory) -> Path:
     way = over_tumour()
     places = np.concatenate([(pixels @ (pose @ probe.image_to_probe(64, 64)).T)[:, :3] for pose in way])
     inside = [signed_distance(each.vertices, each.faces, places)[0] < 0 for each in (organ, tumour)]
-    marks = np.where(inside[1], Mark.TUMOUR, inside[0]).astype(np.uint8).reshape(-1, 64, 64)
+    marks = np.where(inside[1], PixelLabel.TUMOUR, inside[0]).astype(np.uint8).reshape(-1, 64, 64)
     for k, (pose, each) in enumerate(zip(way, marks, strict=True)):
         sweep.add(40 + 80 * each, each, probe, pose, k / 10)
     sweep.close()
@@ -298,7 +298,7 @@ def test_reconstruct_makes_a_volume_and_compares_it(swept, tmp_path, capsys):
     assert list(volume.GetSize()) == report["shape"] == list(labels.GetSize())
     middle = load_surface(phantom_folder() / "tumour.stl").center_mass
     at = volume.TransformPhysicalPointToIndex(middle.tolist())
-    assert (volume[at], labels[at]) == (40 + 80 * Mark.TUMOUR, Mark.TUMOUR)
+    assert (volume[at], labels[at]) == (40 + 80 * PixelLabel.TUMOUR, PixelLabel.TUMOUR)
     assert (tmp_path / "out" / "volume.png").stat().st_size > 10_000
 
 
@@ -375,7 +375,7 @@ def test_scan_leaves_a_sweep_at_the_poses_of_its_file(tmp_path):
     command = ["scan", EMBEDDED, "--pose", tmp_path / "poses.json", "--out", tmp_path / "out", "--sweep"]
     assert app.main([str(part) for part in [*command, "--picture", "ct", "--arch", "cpu"]]) == 0
     sweep = read_sweep(tmp_path / "out/sweep.igs.mha")
-    marks = marks_beside(tmp_path / "out/sweep.igs.mha")
+    marks = read_ground_truth(tmp_path / "out/sweep.igs.mha")
     probe, rows = load_probe("drop-in"), sweep.images.shape[1]
     for frame, pose in enumerate(way):
         for each in (sweep, marks):
@@ -386,12 +386,17 @@ def test_scan_leaves_a_sweep_at_the_poses_of_its_file(tmp_path):
     # The tumour's middle, 20 mm before the face, lies half a step beside the two last pictures.
     middle = load_surface(phantom_folder() / "tumour.stl").center_mass
     column, row, aside, _ = np.linalg.inv(sweep.transform("Image", "Reference", 1)) @ [*middle, 1]
-    assert abs(aside) == pytest.approx(0.75) and marks.images[1, round(row), round(column)] == Mark.TUMOUR
-    assert np.argwhere(marks.images == Mark.TUMOUR).size and (marks.images[1][0] == Mark.OUTSIDE).any()
+    assert (
+        abs(aside) == pytest.approx(0.75) and marks.images[1, round(row), round(column)] == PixelLabel.TUMOUR
+    )
+    assert (
+        np.argwhere(marks.images == PixelLabel.TUMOUR).size
+        and (marks.images[1][0] == PixelLabel.OUTSIDE).any()
+    )
 
 
 def test_marks_of_another_file_are_not_taken(tmp_path):
     (tmp_path / "a-marks.igs.mha").write_text("no sweep")
-    assert marks_beside(tmp_path / "a.mha") is None and marks_beside(tmp_path / "b.igs.mha") is None
+    assert read_ground_truth(tmp_path / "a.mha") is None and read_ground_truth(tmp_path / "b.igs.mha") is None
     with pytest.raises(SweepError, match="a-marks"):
-        marks_beside(tmp_path / "a.igs.mha")
+        read_ground_truth(tmp_path / "a.igs.mha")
