@@ -31,11 +31,11 @@ from ultrasound.probe_manipulator import (
     ManipulatorState,
     ProbeManipulator,
     advanced,
-    approached,
-    between,
     image_plane,
     indentation,
+    moved_towards,
     pose_at,
+    poses_between,
     touching,
 )
 from ultrasound.scanner import ScannedAnatomy, Scanner, begin_echo
@@ -201,7 +201,7 @@ class Rehearsal:
     def pose_towards(self, goal: np.ndarray) -> np.ndarray:
         """The transducer's next pose on its way to a goal (4, 4): no faster than a hand, and over the organ."""
         most_mm = self.scene.transducer.speed_mm_s * self.settings.time_step_s
-        pose = approached(self.pose, goal, most_mm, TURN_DEG_S * self.settings.time_step_s)
+        pose = moved_towards(self.pose, goal, most_mm, TURN_DEG_S * self.settings.time_step_s)
         # Between two places of the surface the straight way leads through the organ.
         wanted = max(self._indentation(goal), 0.0)
         through = self._indentation(pose) - max(wanted, self.indentation_mm())
@@ -212,7 +212,7 @@ class Rehearsal:
 
         ``notice`` says what had to be put right; it is empty after most steps.
         """
-        self.solver.step(self.settings, between(self.pose, pose, self.settings.substeps))
+        self.solver.step(self.settings, poses_between(self.pose, pose, self.settings.substeps))
         self.notice = self.guard.check(self.settings.time_step_s)
         self.pose = pose
         self.steps += 1

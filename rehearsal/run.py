@@ -136,7 +136,7 @@ class RehearsalRun:
 
     def _take_over(self) -> UserInput:
         """The user leads on from where a replay is: a session of its own."""
-        self.rehearsal.manipulator.take(self.rehearsal.pose)
+        self.rehearsal.manipulator.match(self.rehearsal.pose)
         self.instruments.begin_anew()
         return self._live(self.rehearsal.snapshot())
 

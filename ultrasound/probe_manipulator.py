@@ -47,7 +47,7 @@ def image_plane(
     return ImagePlane(pose @ _face(length_mm), width_mm, depth_mm, above_mm)
 
 
-def held_at(world_from_plane: np.ndarray, length_mm: float) -> np.ndarray:
+def pose_of_image_plane(world_from_plane: np.ndarray, length_mm: float) -> np.ndarray:
     """The pose of a transducer whose image plane (4, 4) is there: PLUS's axes of a probe are the plane's."""
     return world_from_plane @ np.linalg.inv(_face(length_mm))
 
@@ -93,12 +93,12 @@ def advanced(pose: np.ndarray, depth_mm: float) -> np.ndarray:
     return moved
 
 
-def between(start: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
+def poses_between(start: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
     """Poses (count + 1, 4, 4) evenly from start to end, as ``interpolated``."""
     return interpolated(start, end, np.linspace(0.0, 1.0, count + 1))
 
 
-def approached(pose: np.ndarray, goal: np.ndarray, most_mm: float, most_deg: float) -> np.ndarray:
+def moved_towards(pose: np.ndarray, goal: np.ndarray, most_mm: float, most_deg: float) -> np.ndarray:
     """The pose moved towards a goal by at most a distance [mm] and an angle [degrees]."""
     way = float(np.linalg.norm(goal[:3, 3] - pose[:3, 3]))
     turn = np.degrees(Rotation.from_matrix(goal[:3, :3] @ pose[:3, :3].T).magnitude())
@@ -165,7 +165,7 @@ class ProbeManipulator:
         self.depth_mm, self.pressed_mm = state.depth_mm, state.pressed_mm
         self.turn_deg, self.aim = np.array(state.turn_deg), state.aim
 
-    def take(self, pose: np.ndarray) -> None:
+    def match(self, pose: np.ndarray) -> None:
         """Hold a transducer as it is at a pose (4, 4), as if pressed in by a button that is then let go."""
         depth = indentation(pose, self.size_mm, self.samples, self.radius_mm)
         pressed = float(np.clip(depth, 0.0, self.most_mm)) if np.isfinite(depth) else 0.0
@@ -175,22 +175,22 @@ class ProbeManipulator:
 
     def point(self, origin: np.ndarray, direction: np.ndarray) -> None:
         """Aim where a ray [mm] first meets the settled organ, perpendicular to its surface; a miss changes nothing."""
-        place = self.met(origin, direction)
+        place = self.ray_hit(origin, direction)
         if place is not None:
             self.aim_at(place)
 
     def aim_at(self, target: np.ndarray, lateral: np.ndarray | None = None) -> None:
         """Aim at a point of the surface [mm], perpendicular to the patch around it; x is nearest to ``lateral``."""
         lateral = self.lateral if lateral is None else lateral
-        self.aim = pose_at(target, -self.outward(target), lateral, self.size_mm[2])
+        self.aim = pose_at(target, -self.surface_normal(target), lateral, self.size_mm[2])
 
-    def outward(self, place: np.ndarray) -> np.ndarray:
+    def surface_normal(self, place: np.ndarray) -> np.ndarray:
         """Unit normal (3,) of the patch of surface around a place [mm]."""
         distance = np.linalg.norm(self.vertices - place, axis=1)
         normal = np.exp(-((distance / NORMAL_PATCH_MM) ** 2)) @ self.normals
         return normal / np.linalg.norm(normal)
 
-    def met(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
+    def ray_hit(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
         """Where a ray [mm] first meets the settled organ (3,), None where it misses."""
         # Not its first=True, which invents a hit where there is none.
         hits = igl.ray_mesh_intersect(np.array(origin), np.array(direction), self.vertices, self.faces)
@@ -212,7 +212,7 @@ class ProbeManipulator:
         """Press in by a depth [mm], or lift where negative."""
         self.depth_mm = float(np.clip(self.depth_mm + depth_mm, LEAST_DEPTH_MM, self.most_mm))
 
-    def hold(self, pressing: bool, time_s: float, share: float = 1.0) -> None:
+    def press(self, pressing: bool, time_s: float, share: float = 1.0) -> None:
         """Press further while the button is held, to a share of the deepest; let go when it is not."""
         goal = share * self.most_mm if pressing else 0.0
         least, most = self.pressed_mm - RELEASE_MM_S * time_s, self.pressed_mm + PRESS_MM_S * time_s

@@ -100,7 +100,7 @@ class Scanner:
         )
 
     @cached_property
-    def marks(self) -> GroundTruthLabels:
+    def ground_truth(self) -> GroundTruthLabels:
         """What the pictures show, in truth."""
         tumour = self.anatomy.tumour
         return GroundTruthLabels(

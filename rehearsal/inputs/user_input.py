@@ -83,7 +83,7 @@ class UserInput:
             self._said = "Yours already"
             return
         self._follower, self._said = None, "Yours now"
-        self.session.rehearsal.manipulator.take(self.session.rehearsal.pose)
+        self.session.rehearsal.manipulator.match(self.session.rehearsal.pose)
 
     def _wait(self, ray: Ray | None) -> None:
         """The transducer stays until the user moves it."""
@@ -101,7 +101,7 @@ class UserInput:
             self._wait(controls.ray)
             return rehearsal.pose
         pose = rehearsal.pose if goal is None else rehearsal.pose_towards(goal)
-        rehearsal.manipulator.take(pose)
+        rehearsal.manipulator.match(pose)
         return pose
 
     def _led(self, controls: Controls) -> np.ndarray:
@@ -161,7 +161,7 @@ class UserInput:
         elif controls.ray is not None and mouse_moved(controls.ray, self._left):
             manipulator.point(*controls.ray)
             self._left = None
-        manipulator.hold(controls.press, rehearsal.settings.time_step_s, controls.press_share)
+        manipulator.press(controls.press, rehearsal.settings.time_step_s, controls.press_share)
         manipulator.push(controls.push_mm)
         manipulator.turn(controls.tilt_deg, controls.rock_deg, controls.rotate_deg)
         return rehearsal.pose_towards(manipulator.pose())

@@ -45,6 +45,6 @@ def path_mm(manipulator: ProbeManipulator, poses: np.ndarray) -> float:
 
 def incidence_deg(manipulator: ProbeManipulator, poses: np.ndarray) -> float:
     """The mean angle between the probe's axis and the settled surface's normal."""
-    normals = np.stack([manipulator.outward(face) for face in faces_of(manipulator, poses)])
+    normals = np.stack([manipulator.surface_normal(face) for face in faces_of(manipulator, poses)])
     cosine = np.einsum("ij,ij->i", normals, poses[:, :3, 2])
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).mean())

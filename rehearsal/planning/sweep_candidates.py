@@ -102,7 +102,7 @@ def half_size(layout: SweepLayout, places: np.ndarray) -> np.ndarray:
 
 def width_mm(rehearsal: Rehearsal, layout: SweepLayout) -> float:
     """How wide the picture is at a layout's centre, where the probe looks on it from outside."""
-    top = rehearsal.manipulator.met(layout.centre + FAR_MM * layout.outward, -layout.outward)
+    top = rehearsal.manipulator.ray_hit(layout.centre + FAR_MM * layout.outward, -layout.outward)
     depth = 0.0 if top is None else float((top - layout.centre) @ layout.outward)
     probe = rehearsal.probe
     return float(probe.number_of_scanlines * probe.line_spacing_mm(np.array([max(depth, 0.0)]))[0])
@@ -119,7 +119,7 @@ def shallowest(
     """The direction (3,) from a place to the nearest surface on which a probe can be set; None where there is none."""
     best, found = np.inf, None
     for outward in directions(SIDES):
-        place = manipulator.met(centre + FAR_MM * outward, -outward)
+        place = manipulator.ray_hit(centre + FAR_MM * outward, -outward)
         if outward @ above < ROUND or place is None:
             continue
         distance = float((place - centre) @ outward)

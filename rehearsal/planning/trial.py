@@ -13,7 +13,7 @@ from sim.fields import array_of
 from ultrasound.array_contact import pressing
 from ultrasound.coverage import PLACES, Coverage
 from ultrasound.image_plane import PlaneInTissue
-from ultrasound.probe_manipulator import advanced, between
+from ultrasound.probe_manipulator import advanced, poses_between
 
 # Between two passes the probe is over its next place after so many steps at the latest.
 MOST_STEPS = 240
@@ -41,7 +41,7 @@ class Trial:
             self._come(each[0])
             self._look()
             for start, end in pairwise(each):
-                for pose in between(start, end, self._steps(start, end))[1:]:
+                for pose in poses_between(start, end, self._steps(start, end))[1:]:
                     self._step(pose)
                 self._look()
         return self._parts(way)
@@ -62,7 +62,7 @@ class Trial:
         else:
             for goal in (advanced(self.rehearsal.pose, -LIFT_MM), advanced(pose, -LIFT_MM)):
                 self._go(goal)
-        for down in between(self.rehearsal.pose, pose, self._steps(self.rehearsal.pose, pose))[1:]:
+        for down in poses_between(self.rehearsal.pose, pose, self._steps(self.rehearsal.pose, pose))[1:]:
             self._step(down)
 
     def _go(self, goal: np.ndarray) -> None:

@@ -6,7 +6,7 @@ from rehearsal.coordinates import transducer_at
 from rehearsal.reconstruction.sweep_volumes import Track
 from rehearsal.rehearsal import Rehearsal
 from ultrasound.image_plane import ImagePlane, PlaneInTissue
-from ultrasound.probe_manipulator import advanced, between, image_plane
+from ultrasound.probe_manipulator import advanced, image_plane, poses_between
 from ultrasound.sweep import Sweep, SweepError
 
 # The probe comes from so far above its first place, in so long, and waits so long there for the tissue to come to rest.
@@ -71,5 +71,5 @@ def come(rehearsal: Rehearsal, pose: np.ndarray) -> None:
 def go(rehearsal: Rehearsal, pose: np.ndarray, seconds: float) -> None:
     """Move the transducer evenly to a pose in so many seconds."""
     steps = max(1, round(seconds / rehearsal.settings.time_step_s))
-    for step in between(rehearsal.pose, pose, steps)[1:]:
+    for step in poses_between(rehearsal.pose, pose, steps)[1:]:
         rehearsal.advance(step)

@@ -29,7 +29,7 @@ from sim.shapes import GRID_MM, ConvexTool, SignedDistanceField
 from sim.solver import Solver
 from studies.performance.step_timing import memory_mb
 from ultrasound.probe import DetailLevel, Mode
-from ultrasound.probe_manipulator import advanced, between, image_plane, pose_at, touching
+from ultrasound.probe_manipulator import advanced, image_plane, pose_at, poses_between, touching
 from ultrasound.scanner import ScannedAnatomy, Scanner
 
 # A press so deep, in so many steps; those before it settle.
@@ -130,7 +130,9 @@ class FeatureBody:
         if not solver.has_tool:
             return None
         depth = PRESS_MM * np.clip((step + np.array([0, 1]) - SETTLE_STEPS) / PRESS_STEPS, 0, 1)
-        return between(advanced(self.home, depth[0]), advanced(self.home, depth[1]), self.settings.substeps)
+        return poses_between(
+            advanced(self.home, depth[0]), advanced(self.home, depth[1]), self.settings.substeps
+        )
 
 
 def body_of(scene: Scene, anatomy: LoadedAnatomy, model: str, size_mm: float) -> FeatureBody:

@@ -24,7 +24,7 @@ from sim.skinning import Skin
 from ultrasound.image_plane import ImagePlane
 from ultrasound.outline import section
 from ultrasound.probe import Probe
-from ultrasound.probe_manipulator import held_at, image_plane, pose_at
+from ultrasound.probe_manipulator import image_plane, pose_at, pose_of_image_plane
 from ultrasound.scanner import CT, ECHO, ScannedAnatomy, Scanner
 
 STORED = Path(__file__).parent / "pictures"
@@ -172,7 +172,7 @@ def window(scene):
 def drawn(window, scene: Scene, plane: ImagePlane) -> np.ndarray:
     """The 3D view, uint8 (rows, columns, 3), of means over blocks of pixels."""
     shown = scene.scanner.images(plane, PROBE, "ct", "speckle", 350.0, 40.0)
-    window.draw(View(held_at(plane.world_from_plane, 20.0), shown, WIDTH, DEPTH))
+    window.draw(View(pose_of_image_plane(plane.world_from_plane, 20.0), shown, WIDTH, DEPTH))
     area = window.layout.scene
     rows, columns = area.height // BLOCK, area.width // BLOCK
     part = window.picture()[area.slices][: rows * BLOCK, : columns * BLOCK]

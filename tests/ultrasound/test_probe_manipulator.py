@@ -12,12 +12,12 @@ from ultrasound.probe_manipulator import (
     ManipulatorState,
     ProbeManipulator,
     advanced,
-    approached,
-    between,
-    held_at,
     image_plane,
     indentation,
+    moved_towards,
     pose_at,
+    pose_of_image_plane,
+    poses_between,
     touching,
 )
 
@@ -49,7 +49,7 @@ def test_image_plane_starts_at_the_face_with_x_to_the_marked_side_and_y_down():
 def test_a_probe_is_held_where_its_image_plane_lies():
     pose = pose_at(np.array([3.0, -2.0, 7.0]), np.array([1.0, 2.0, -1.5]), np.array([0.3, 1.0, 0.2]), SIZE[2])
     plane = image_plane(pose, SIZE[2], 30.0, 40.0)
-    assert held_at(plane.world_from_plane, SIZE[2]) == pytest.approx(pose)
+    assert pose_of_image_plane(plane.world_from_plane, SIZE[2]) == pytest.approx(pose)
 
 
 def test_touching_pressing_and_measuring_agree(ball):
@@ -68,7 +68,7 @@ def test_touching_pressing_and_measuring_agree(ball):
 def test_poses_between_are_even_in_place_and_angle():
     start, end = np.eye(4), np.eye(4)
     end[:3, :3], end[:3, 3] = rotation_about([0, 0, 1], 30), [3.0, 0, 0]
-    poses = between(start, end, 3)
+    poses = poses_between(start, end, 3)
     assert poses[[0, 3]] == pytest.approx(np.stack([start, end]))
     assert poses[1, :3, :3] == pytest.approx(rotation_about([0, 0, 1], 10)) and poses[
         1, 0, 3
@@ -78,10 +78,10 @@ def test_poses_between_are_even_in_place_and_angle():
 def test_a_goal_is_approached_no_faster_than_told():
     goal = np.eye(4)
     goal[:3, 3] = [10.0, 0, 0]
-    assert approached(np.eye(4), goal, 4.0, 90.0)[:3, 3] == pytest.approx([4, 0, 0])
-    assert approached(np.eye(4), goal, 40.0, 90.0) == pytest.approx(goal)
+    assert moved_towards(np.eye(4), goal, 4.0, 90.0)[:3, 3] == pytest.approx([4, 0, 0])
+    assert moved_towards(np.eye(4), goal, 40.0, 90.0) == pytest.approx(goal)
     goal[:3, :3] = rotation_about([1, 0, 0], 60)
-    slow = approached(np.eye(4), goal, 40.0, 6.0)
+    slow = moved_towards(np.eye(4), goal, 40.0, 6.0)
     assert slow[:3, :3] == pytest.approx(rotation_about([1, 0, 0], 6)) and slow[0, 3] == pytest.approx(1.0)
 
 
@@ -106,13 +106,13 @@ def test_pointing_at_the_organ_puts_the_face_on_it_perpendicular(manipulator):
 
 def test_keys_push_and_the_button_presses_until_let_go(manipulator):
     manipulator.push(2.0)
-    manipulator.hold(True, 0.25)
+    manipulator.press(True, 0.25)
     assert indentation(manipulator.pose(), SIZE, manipulator.samples) == pytest.approx(5.0)
     for _ in range(100):
-        manipulator.hold(True, 0.1)
+        manipulator.press(True, 0.1)
     assert indentation(manipulator.pose(), SIZE, manipulator.samples) == pytest.approx(15.0)
     for _ in range(10):
-        manipulator.hold(False, 0.1)
+        manipulator.press(False, 0.1)
     assert indentation(manipulator.pose(), SIZE, manipulator.samples) == pytest.approx(2.0)
     manipulator.push(-5.0)
     assert indentation(manipulator.pose(), SIZE, manipulator.samples) == pytest.approx(-3.0)
@@ -155,10 +155,10 @@ def test_a_probe_is_held_as_it_is_taken(manipulator):
     aim = held_aslant(manipulator)
     for depth in (-5.0, 0.0, 3.0, 15.0):
         pose = advanced(touching(aim, SIZE, manipulator.samples), depth)
-        manipulator.take(pose)
+        manipulator.match(pose)
         assert manipulator.pose() == pytest.approx(pose)
         for _ in range(100):
-            manipulator.hold(False, 0.1)
+            manipulator.press(False, 0.1)
         assert indentation(manipulator.pose(), SIZE, manipulator.samples) == pytest.approx(
             min(depth, 0.0), abs=1e-9
         )
@@ -189,7 +189,7 @@ def test_normals_count_by_a_gaussian_of_their_distance(manipulator):
             np.array([[0.0, 0, 1], [1, 0, 0]]),
         )
         other = np.exp(-((away / 12.0) ** 2))
-        assert manipulator.outward(np.zeros(3)) == pytest.approx([other, 0, 1] / np.hypot(other, 1))
+        assert manipulator.surface_normal(np.zeros(3)) == pytest.approx([other, 0, 1] / np.hypot(other, 1))
 
 
 def test_tilts_end_where_a_hand_does(manipulator):
@@ -239,11 +239,11 @@ def test_a_probe_of_short_housing_is_not_pushed_in_beyond_what_holds_it(manipula
 def test_a_press_goes_as_deep_as_its_share_and_gives_way_where_that_falls(manipulator):
     for share, depth in ((0.4, 6.0), (0.8, 12.0), (0.2, 3.0)):
         for _ in range(20):
-            manipulator.hold(True, 0.1, share)
+            manipulator.press(True, 0.1, share)
         assert manipulator.pressed_mm == pytest.approx(depth)
-    manipulator.hold(True, 0.1, 1.0)
+    manipulator.press(True, 0.1, 1.0)
     assert manipulator.pressed_mm == pytest.approx(3.0 + 1.2)
-    manipulator.hold(True, 0.1, 0.0)
+    manipulator.press(True, 0.1, 0.0)
     assert manipulator.pressed_mm == pytest.approx(4.2 - 4.0)
 
 
