@@ -20,7 +20,7 @@ VOXEL_MM = 1.5
 # Distances from the organ are known so far around it.
 REACH_MM = 6.0
 # Places of a picture that are asked where they were at rest, along each side.
-PLACES = 96
+GRID_POINTS = 96
 # To so much of its length at rest tissue may be squeezed and still leave no voxel between two places.
 SQUEEZED = 0.7
 # Smaller gaps than this are of the voxels [ml].
@@ -44,7 +44,7 @@ class Coverage:
     def __init__(
         self, organ: trimesh.Trimesh, tumour: trimesh.Trimesh | None = None, margin_mm: float = 5.0
     ) -> None:
-        self.distance, self.low_mm = distance_grid(organ.vertices, organ.faces, VOXEL_MM, REACH_MM)
+        self.distance, self.origin_mm = distance_grid(organ.vertices, organ.faces, VOXEL_MM, REACH_MM)
         self.targets = {"organ": self.distance < 0}
         if tumour is not None:
             around = self._around(tumour, margin_mm)
@@ -59,18 +59,18 @@ class Coverage:
         low = np.maximum(np.floor(low).astype(int), 0)
         high = np.minimum(np.ceil(high).astype(int) + 1, self.distance.shape)
         box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-        places = self.low_mm + VOXEL_MM * (np.indices(high - low).reshape(3, -1).T + low)
+        places = self.origin_mm + VOXEL_MM * (np.indices(high - low).reshape(3, -1).T + low)
         around[box] = signed_distance(tumour.vertices, tumour.faces, places)[0].reshape(high - low)
         return around
 
     def _indices(self, places_mm: np.ndarray) -> np.ndarray:
-        return (places_mm - self.low_mm) / VOXEL_MM
+        return (places_mm - self.origin_mm) / VOXEL_MM
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Nothing was seen yet."""
         self.seen[:] = False
 
-    def look(self, rest_mm: np.ndarray, probe: Probe, gap_mm: float | None) -> np.ndarray:
+    def add(self, rest_mm: np.ndarray, probe: Probe, gap_mm: float | None) -> np.ndarray:
         """Add what a picture shows; which of its lines touch.
 
         ``rest_mm`` (n, n, 3) is where the tissue was at rest at places evenly over the picture (``PlaneInTissue.rest_grid``). Lines
@@ -83,7 +83,7 @@ class Coverage:
             touches = self._distance_at(rest_mm[_elements_of(probe, count)]) <= gap_mm
         shown = np.flatnonzero(in_picture & touches[lines])
         # One axis after the other, in voxels.
-        at = ((rest_mm.reshape(-1, 3) - self.low_mm) / VOXEL_MM).astype(np.float32).T.copy()
+        at = ((rest_mm.reshape(-1, 3) - self.origin_mm) / VOXEL_MM).astype(np.float32).T.copy()
         near = np.ones(len(shown), bool)
         for along, last in zip(at, np.array(self.seen.shape) - 1, strict=True):
             near &= np.abs(along[shown] - last / 2) < (last + 1) / 2 + probe.elevation_width_mm / VOXEL_MM
@@ -97,14 +97,14 @@ class Coverage:
         at = self._indices(places_mm).T
         return map_coordinates(self.distance, at, order=1, mode="constant", cval=np.inf)
 
-    def share(self, target: str) -> float:
+    def fraction(self, target: str) -> float:
         """How much of a target was seen, 0 to 1; not a number without that target."""
         mask = self.targets.get(target)
         return float(self.seen[mask].mean()) if mask is not None and mask.any() else float("nan")
 
-    def places(self, target: str) -> np.ndarray:
+    def voxel_centres(self, target: str) -> np.ndarray:
         """The middles (n, 3) of a target's voxels [mm]."""
-        return self.low_mm + VOXEL_MM * np.argwhere(self.targets[target])
+        return self.origin_mm + VOXEL_MM * np.argwhere(self.targets[target])
 
     def gaps(self, target: str) -> list[Gap]:
         """What of a target was not seen, the largest part first."""
@@ -119,7 +119,7 @@ class Coverage:
                 found.append(Gap(volume, float(thickness[mask].max())))
         return sorted(found, key=lambda gap: -gap.volume_ml)
 
-    def at(self, places_mm: np.ndarray) -> np.ndarray:
+    def is_seen(self, places_mm: np.ndarray) -> np.ndarray:
         """Whether the tissue at places (n, 3) at rest was seen."""
         index = np.clip(np.rint(self._indices(places_mm)).astype(int), 0, np.array(self.seen.shape) - 1)
         return self.seen[tuple(index.T)]

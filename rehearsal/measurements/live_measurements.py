@@ -14,7 +14,7 @@ from rehearsal.sessions.packed_coverage import unpack_seen
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import Log, SessionError
 from render.viewer import Settings, View
-from ultrasound.coverage import PLACES, Coverage, Gap
+from ultrasound.coverage import GRID_POINTS, Coverage, Gap
 from ultrasound.probe import Probe
 from ultrasound.scanner import ECHO
 
@@ -50,7 +50,7 @@ class LiveMeasurements:
     def begin_anew(self) -> None:
         """Nothing was seen or done yet."""
         self._begin()
-        self.coverage.forget()
+        self.coverage.clear()
         if self.guide is not None:
             self.guide.begin_anew()
 
@@ -98,8 +98,8 @@ class LiveMeasurements:
         is_anew = pose is None or self.reading is None
         if (is_anew or session.moment % self._look_every == 0) and self.rehearsal.scanner is not None:
             image = self.rehearsal.scene.image
-            rest = self.rehearsal.scanner.plane.rest_grid(PLACES)
-            self._touches = self.coverage.look(rest, probe, image.contact_gap_mm)
+            rest = self.rehearsal.scanner.plane.rest_grid(GRID_POINTS)
+            self._touches = self.coverage.add(rest, probe, image.contact_gap_mm)
         if self.guide is not None:
             self.guide.go_with(session)
         if is_anew or session.moment % self._read_every == 0:
@@ -116,7 +116,7 @@ class LiveMeasurements:
         """What the window shows from now on."""
         surfaces = {"organ": self.rehearsal.organ, "tumour": self.rehearsal.tumour}
         self._seen = {
-            name: self.coverage.at(np.asarray(surface.vertices))
+            name: self.coverage.is_seen(np.asarray(surface.vertices))
             for name, surface in surfaces.items()
             if surface is not None
         }
@@ -126,7 +126,7 @@ class LiveMeasurements:
         """The reading and the shares seen so far, rounded, for the record."""
         values = asdict(self.reading) if self.reading is not None else {}
         if self.rehearsal.scanner is not None:
-            values |= {f"seen_{target}": self.coverage.share(target) for target in self.coverage.targets}
+            values |= {f"seen_{target}": self.coverage.fraction(target) for target in self.coverage.targets}
         if self.guide is not None:
             values |= self.guide.figures()
         return {name: None if value is None else round(value, DIGITS) for name, value in values.items()}
@@ -183,7 +183,7 @@ class LiveMeasurements:
         }
 
     def _share(self, target: str) -> str:
-        return f"{100 * self.coverage.share(target):.0f} %"
+        return f"{100 * self.coverage.fraction(target):.0f} %"
 
 
 def _mm(length: float | None) -> str:

@@ -74,7 +74,7 @@ class Candidate:
 
 def candidates_of(rehearsal: Rehearsal, coverage: Coverage, target: str, reach: Reach) -> list[Candidate]:
     """What may cover a target: from above and from the side where it lies shallowest, gliding and tilting."""
-    places = coverage.places(target)
+    places = coverage.voxel_centres(target)
     centre = places.mean(axis=0)
     above = -np.array(rehearsal.press.direction)
     outwards = {"from above": above}

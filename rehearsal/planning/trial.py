@@ -11,7 +11,7 @@ from rehearsal.planning.sweep_path import SweepPath
 from rehearsal.rehearsal import Rehearsal
 from sim.fields import array_of
 from ultrasound.array_contact import pressing
-from ultrasound.coverage import PLACES, Coverage
+from ultrasound.coverage import GRID_POINTS, Coverage
 from ultrasound.image_plane import PlaneInTissue
 from ultrasound.probe_manipulator import advanced, poses_between
 
@@ -32,7 +32,7 @@ class Trial:
     ) -> None:
         self.rehearsal, self.coverage, self.target, self.reach = rehearsal, coverage, target, reach
         self.speed_mm_s = speed_mm_s
-        self.plane = PlaneInTissue(rehearsal.embedding, PLACES)
+        self.plane = PlaneInTissue(rehearsal.embedding, GRID_POINTS)
 
     def run(self, way: SweepPath) -> ScoreTerms:
         """Go the way; the same way gives the same figures."""
@@ -48,7 +48,7 @@ class Trial:
 
     def _begin(self) -> None:
         self.rehearsal.reset()
-        self.coverage.forget()
+        self.coverage.clear()
         self._squeezed: list[float] = []
         self._touching: list[float] = []
         self._troubled: list[bool] = []
@@ -93,7 +93,7 @@ class Trial:
         rehearsal.embedding.update()
         self.plane.locate(rehearsal.image_plane())
         gap = rehearsal.scene.image.contact_gap_mm
-        touches = self.coverage.look(self.plane.rest_grid(PLACES), rehearsal.probe, gap)
+        touches = self.coverage.add(self.plane.rest_grid(GRID_POINTS), rehearsal.probe, gap)
         rehearsal.organ_skin.update()
         now = array_of(rehearsal.organ_skin.vertices).astype(float)
         organ, probe = rehearsal.organ, rehearsal.probe
@@ -110,7 +110,7 @@ class Trial:
             return ScoreTerms.nothing()
         squeezed, limit = np.array(self._squeezed), self.rehearsal.scene.transducer.compression_warning_mm
         return ScoreTerms(
-            seen=self.coverage.share(self.target),
+            seen=self.coverage.fraction(self.target),
             compression_mean_mm=float(squeezed.mean()),
             compression_max_mm=float(squeezed.max()),
             over_limit=float(((squeezed > limit) | self._troubled).mean()),

@@ -152,7 +152,7 @@ def _trial(key: str, problem: Problem, speed_mm_s: float) -> Trial:
             raise PlanError(
                 f"--target {problem.target}: it is smaller than a voxel of {VOXEL_MM:g} mm; expected a larger one"
             )
-        middle = coverage.low_mm + VOXEL_MM * np.argwhere(coverage.targets[problem.target]).mean(axis=0)
+        middle = coverage.origin_mm + VOXEL_MM * np.argwhere(coverage.targets[problem.target]).mean(axis=0)
         reach = Reach(problem.trocar, rehearsal.manipulator, rehearsal.origin, middle)
         _built[key] = Trial(rehearsal, coverage, problem.target, reach, speed_mm_s)
     _built[key].speed_mm_s = speed_mm_s

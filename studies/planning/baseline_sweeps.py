@@ -47,7 +47,7 @@ def planned(trial: Trial, sweep: PlannedSweep) -> SweepPath:
 def _seen_from_above(trial: Trial) -> tuple[SweepLayout, np.ndarray]:
     """The target's middle as the scene's press meets it, and half of its size across and along (2,) [mm]."""
     coverage, press = trial.coverage, trial.rehearsal.press
-    places = coverage.places(trial.target)
+    places = coverage.voxel_centres(trial.target)
     layout = layout_towards(places.mean(axis=0), -np.array(press.direction), np.array(press.lateral))
     return layout, half_size(layout, places)
 

@@ -129,7 +129,7 @@ def test_another_plan_brings_its_margin_and_what_was_seen_stays(watching, rehear
     assert watching.coverage is before
     watching.follow(PlanGuidance(rehearsal, plan_of(margin_mm=2.0)))
     assert watching.margin_mm == 2.0 and watching.coverage.targets["margin"].sum() < volume / 2
-    assert watching.coverage.share("tumour") == 1.0 and watching.guide.plan.margin_mm == 2.0
+    assert watching.coverage.fraction("tumour") == 1.0 and watching.guide.plan.margin_mm == 2.0
     assert LiveMeasurements(rehearsal).margin_mm == live_measurements.MARGIN_MM
 
 

@@ -63,7 +63,7 @@ def test_a_forecast_is_what_counting_voxels_one_by_one_gives(monkeypatch, name):
     length = float(probe.housing_mm[2])
     way = way_over_the_tumour(length)
     parts = found.parts(way)
-    places = coverage.low_mm + VOXEL_MM * np.argwhere(coverage.targets["tumour"])
+    places = coverage.origin_mm + VOXEL_MM * np.argwhere(coverage.targets["tumour"])
     surely, perhaps = np.zeros(len(places), bool), np.zeros(len(places), bool)
     for pose in way.poses:
         slack = [shown_by(probe, pose, length, places, off) for off in (-0.3, 0.3)]

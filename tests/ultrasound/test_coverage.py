@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from conftest import rotation_about
 
-from ultrasound.coverage import PLACES, VOXEL_MM, Coverage, _lines_of
+from ultrasound.coverage import GRID_POINTS, VOXEL_MM, Coverage, _lines_of
 from ultrasound.probe import load_probe
 
 pytestmark = pytest.mark.usefixtures("one_device")
@@ -23,12 +23,14 @@ def big_ball(radius: float = R, at=(0, 0, 0), subdivisions: int = 3) -> trimesh.
 def places(probe, axes: np.ndarray, origin) -> np.ndarray:
     """Rest places of a picture that is mapped by u, v, w -> axes @ (u, v, w) + origin."""
     width, depth, above = probe.extent_mm
-    u, v = np.meshgrid(np.linspace(-width / 2, width / 2, PLACES), np.linspace(-above, depth - above, PLACES))
+    u, v = np.meshgrid(
+        np.linspace(-width / 2, width / 2, GRID_POINTS), np.linspace(-above, depth - above, GRID_POINTS)
+    )
     return (np.stack([u, v, 0 * u], axis=-1) @ axes.T + origin).astype(np.float32)
 
 
 def centres(coverage: Coverage) -> np.ndarray:
-    return coverage.low_mm + VOXEL_MM * np.moveaxis(np.indices(coverage.seen.shape), 0, -1)
+    return coverage.origin_mm + VOXEL_MM * np.moveaxis(np.indices(coverage.seen.shape), 0, -1)
 
 
 def on_picture(coverage: Coverage, axes: np.ndarray, origin) -> np.ndarray:
@@ -71,7 +73,7 @@ def test_a_plane_shows_a_slab_of_its_thickness(organ, axes, thickness):
     # A middle in the slab is half a step of the parts from one of theirs, along each axis: nearer than half a voxel.
     parts = np.ceil(thickness / VOXEL_MM)
     steps = [
-        *np.linalg.norm(axes[:, :2], axis=0) * [40 / (PLACES - 1), 50 / (PLACES - 1)],
+        *np.linalg.norm(axes[:, :2], axis=0) * [40 / (GRID_POINTS - 1), 50 / (GRID_POINTS - 1)],
         thickness / parts,
     ]
     inside = (np.abs(off) <= thickness / 2) & (aside < -1)
@@ -132,7 +134,7 @@ def test_lines_that_do_not_touch_show_nothing(organ, shift):
 def test_the_first_and_last_places_stand_for_as_much_as_the_others(organ):
     probe, count = PROBE.model_copy(update=dict(transducer_width_mm=36.0, depth_mm=36.0)), 8
     organ.forget()
-    few = np.linspace(0, PLACES - 1, count).astype(int)
+    few = np.linspace(0, GRID_POINTS - 1, count).astype(int)
     organ.look(places(probe, UPRIGHT, (0, 0, 18))[np.ix_(few, few)], probe, None)
     u, v, _ = on_picture(organ, UPRIGHT, (0, 0, 18))
     # Half a place beyond the ends, less half of a part: of those there is one a voxel where tissue is squeezed by 0.7.
@@ -147,7 +149,7 @@ def test_the_first_and_last_places_stand_for_as_much_as_the_others(organ):
 def test_the_columns_of_places_are_together_as_wide_as_the_picture(lines):
     """Each stands for what is half a step to either side of it: of as many as there are, one too many."""
     probe = PROBE.model_copy(update=dict(number_of_scanlines=lines))
-    assert _lines_of(probe, PLACES)[1].all(axis=0).sum() == PLACES - 1
+    assert _lines_of(probe, GRID_POINTS)[1].all(axis=0).sum() == GRID_POINTS - 1
 
 
 def test_off_the_organ_nothing_is_seen(organ):
@@ -163,7 +165,7 @@ def test_a_sector_shows_all_of_itself_and_nothing_beside(name, middle):
     probe = load_probe(name)
     # The ball lies across the sector's edge, or across its end.
     coverage, origin = Coverage(big_ball()), np.array([-middle[0], 0, middle[1]])
-    coverage.look(places(probe, UPRIGHT, origin), probe, None)
+    coverage.add(places(probe, UPRIGHT, origin), probe, None)
     u, v, off = on_picture(coverage, UPRIGHT, origin)
     angle, along = np.arctan2(u, v + probe.radius_mm), np.hypot(u, v + probe.radius_mm) - probe.radius_mm
     start, stop = np.radians([probe.theta_start_deg, probe.theta_stop_deg])
@@ -182,7 +184,7 @@ def test_a_sector_shows_all_of_itself_and_nothing_beside(name, middle):
 def test_squeezed_tissue_leaves_no_voxel_between_two_places(squeezed):
     probe = load_probe("curvilinear")
     coverage, axes, origin = Coverage(big_ball()), UPRIGHT / squeezed, np.array([0.0, 0, 60 / squeezed])
-    coverage.look(places(probe, axes, origin), probe, None)
+    coverage.add(places(probe, axes, origin), probe, None)
     off = on_picture(coverage, axes, origin)[2]
     assert coverage.seen[coverage.targets["organ"] & (np.abs(off) <= probe.elevation_width_mm / 2)].all()
 
@@ -192,7 +194,7 @@ def sweep(coverage: Coverage, first: float, last: float) -> None:
     probe = PROBE.model_copy(update=dict(transducer_width_mm=50.0, elevation_width_mm=2.0))
     axes = rotation_about([0, 0, 1], 90) @ UPRIGHT
     for x in np.arange(first + 1, last - 0.9, 1.0):
-        coverage.look(places(probe, axes, (x, 0, 25)), probe, None)
+        coverage.add(places(probe, axes, (x, 0, 25)), probe, None)
 
 
 def cap(height: float) -> float:
@@ -258,4 +260,4 @@ def test_the_margin_is_the_organ_around_the_tumour_and_the_tumour(away, margin):
     assert at == pytest.approx(away * direction, abs=0.1)
     # What is sunk in the organ is in its distances too; what is swept of both is told apart.
     sweep(coverage, away * direction[0] - 25, away * direction[0])
-    assert coverage.share("tumour") == pytest.approx(0.5, abs=VOXEL_MM / 2 * 0.75 / 6 + 0.02)
+    assert coverage.fraction("tumour") == pytest.approx(0.5, abs=VOXEL_MM / 2 * 0.75 / 6 + 0.02)
