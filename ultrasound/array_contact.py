@@ -14,7 +14,7 @@ SEAM = 1e-9
 
 
 @dataclass(frozen=True)
-class Pressing:
+class ArrayContact:
     """``area_mm2`` of the face touches. ``compression_mm`` is the most by which tissue before it is shorter than at rest, on a way
     along the transducer's axis from where that enters the organ to where it leaves it; 0 where nothing touches.
     """
@@ -33,14 +33,14 @@ def face_points(size_mm: np.ndarray, radius_mm: float) -> tuple[np.ndarray, np.n
     return points, slope * np.prod(np.asarray(size_mm[:2]) / counts)
 
 
-def pressing(
+def measure_contact(
     pose: np.ndarray,
     size_mm: np.ndarray,
     radius_mm: float,
     now_mm: np.ndarray,
     rest_mm: np.ndarray,
     faces: np.ndarray,
-) -> Pressing:
+) -> ArrayContact:
     """How a transducer at a pose (4, 4) touches a closed surface whose vertices (v, 3) are now and were at rest [mm]."""
     points, area = face_points(size_mm, radius_mm)
     local = (now_mm - pose[:3, 3]) @ pose[:3, :3]
@@ -50,7 +50,7 @@ def pressing(
     under = np.flatnonzero(~beside.any(axis=1))
     weights, covered = _weights(corners[under], points[:, :2])
     if not covered.any():
-        return Pressing()
+        return ArrayContact()
     z = np.einsum("tkc,tc->tk", weights, corners[under, :, 2])
     upward = _upward(corners[under])[:, None]
     enters = np.where(covered & upward & (z <= points[:, 2] + TOUCH_MM), z, -np.inf)
@@ -67,7 +67,7 @@ def pressing(
         ]
         shorter = np.linalg.norm(at_rest[0] - at_rest[1], axis=1) - (top[through] - bottom[through])
         compression = max(float(shorter.max()), 0.0)
-    return Pressing(float(area[touches].sum()), compression)
+    return ArrayContact(float(area[touches].sum()), compression)
 
 
 def _weights(corners: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

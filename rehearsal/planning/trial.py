@@ -10,7 +10,7 @@ from rehearsal.planning.score_terms import ScoreTerms, faces_of, incidence_deg
 from rehearsal.planning.sweep_path import SweepPath
 from rehearsal.rehearsal import Rehearsal
 from sim.fields import array_of
-from ultrasound.array_contact import pressing
+from ultrasound.array_contact import measure_contact
 from ultrasound.coverage import GRID_POINTS, Coverage
 from ultrasound.image_plane import PlaneInTissue
 from ultrasound.probe_manipulator import advanced, poses_between
@@ -97,7 +97,7 @@ class Trial:
         rehearsal.organ_skin.update()
         now = array_of(rehearsal.organ_skin.vertices).astype(float)
         organ, probe = rehearsal.organ, rehearsal.probe
-        pressed = pressing(
+        pressed = measure_contact(
             rehearsal.pose, rehearsal.size_mm, probe.radius_mm, now, np.asarray(organ.vertices), organ.faces
         )
         self._squeezed.append(pressed.compression_mm)

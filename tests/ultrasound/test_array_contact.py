@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from conftest import rotation_about
 
-from ultrasound.array_contact import TOUCH_MM, face_points, pressing
+from ultrasound.array_contact import TOUCH_MM, face_points, measure_contact
 
 # 20 x 10 places of 0.75 x 0.75 mm.
 SIZE = np.array([15.0, 7.5, 20.0])
@@ -31,7 +31,9 @@ def tilted(degrees: float) -> np.ndarray:
 
 
 def pressed(pose, now, mesh, size=SIZE, radius=0.0):
-    return pressing(pose, size, radius, np.asarray(now), np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    return measure_contact(
+        pose, size, radius, np.asarray(now), np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    )
 
 
 @pytest.mark.parametrize("x, y, wide, high", [(0, 0, 15, 7.5), (6, 7.75, 13.5, 6), (-6, -7.75, 13.5, 6)])
