@@ -11,7 +11,7 @@ from render.animation import in_proportion
 from scenes.atomic_files import whole
 from ultrasound.dicom_image import save_dicom
 from ultrasound.probe import Probe
-from ultrasound.scanner import ECHO
+from ultrasound.scanner import B_MODE
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def save_pictures(
         path = begin.with_name(f"{begin.name}-{kind.lower()}.png")
         save_picture(picture, path)
         spacing_mm = depth_mm / picture.height, width_mm / picture.width
-        if dicom and kind == ECHO:
+        if dicom and kind == B_MODE:
             with whole(path.with_suffix(".dcm")) as partial:
                 save_dicom(partial, np.asarray(picture), spacing_mm, probe)
         saved.append(SavedPicture(kind, path, (picture.height, picture.width), spacing_mm))

@@ -38,7 +38,7 @@ from ultrasound.probe_manipulator import (
     poses_between,
     touching,
 )
-from ultrasound.scanner import ScannedAnatomy, Scanner, begin_echo
+from ultrasound.scanner import ScannedAnatomy, Scanner, start_acoustics
 
 TURN_DEG_S = 180.0
 AWAY_MM = 200.0
@@ -90,7 +90,7 @@ class Rehearsal:
         scanned, echo = None, None
         if anatomy.ct is not None:
             scanned = scanned_anatomy(self.organ, anatomy.ct, anatomy, self.origin)
-            echo = begin_echo(scanned) if shows_echo else None
+            echo = start_acoustics(scanned) if shows_echo else None
         progress("Building the model: tissue and contacts")
         self._build_solver(anatomy)
         self.guard = DivergenceCheck(self.solver)

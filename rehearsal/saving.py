@@ -14,7 +14,7 @@ from render.viewer import View
 from scenes.surface_files import save_surface
 from sim.fields import array_of
 from ultrasound.probe import Probe
-from ultrasound.scanner import ECHO
+from ultrasound.scanner import B_MODE
 
 SCREENSHOT, PICTURE = r"screenshot-([0-9]{3,9})\.png", r"([0-9]{3,9})-.*\.png"
 
@@ -30,7 +30,7 @@ def save_view(view: View, probe: Probe, out: Path) -> str:
     """Save what the scanner shows as PNG, an echo as DICOM too, under the next free number, and say where; how their names begin."""
     begin = out / f"{next_number(out, PICTURE):03d}"
     for saved in save_pictures(view.pictures, view.width_mm, view.depth_mm, probe, begin):
-        click.echo(f"Saved {saved.path}{' and .dcm' if saved.kind == ECHO else ''}")
+        click.echo(f"Saved {saved.path}{' and .dcm' if saved.kind == B_MODE else ''}")
     return f"{begin.name}-"
 
 

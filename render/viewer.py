@@ -13,9 +13,9 @@ import numpy as np
 from ultrasound.probe import DetailLevel, Mode
 from ultrasound.target import Target
 
-ECHO, TGC = "Echo", "Gain over depth"
+B_MODE, TGC = "Echo", "Gain over depth"
 # Groups of settings that stand beside the picture, as on a scanner.
-ASIDE = (ECHO, TGC)
+ASIDE = (B_MODE, TGC)
 
 
 class Line(NamedTuple):
@@ -113,10 +113,10 @@ class Settings:
     window_hu: int = _slider(350, "W", "HU", 1, 2000, "Picture")
     level_hu: int = _slider(40, "L", "HU", -500, 500, "Picture")
     margin_mm: int = _slider(5, "Margin", "mm", 0, 20, "Picture")
-    gain_percent: int = _slider(50, "Gain", "%", 0, 100, ECHO)
-    dyn_range_db: int = _slider(60, "DR", "dB", 20, 120, ECHO)
-    frequency_mhz: float = _slider(7.5, "", "MHz", 2.0, 15.0, ECHO)
-    focus_percent: int = _slider(40, "Focus", "%", 0, 100, ECHO)
+    gain_percent: int = _slider(50, "Gain", "%", 0, 100, B_MODE)
+    dyn_range_db: int = _slider(60, "DR", "dB", 20, 120, B_MODE)
+    frequency_mhz: float = _slider(7.5, "", "MHz", 2.0, 15.0, B_MODE)
+    focus_percent: int = _slider(40, "Focus", "%", 0, 100, B_MODE)
     tgc_1: int = _level(1)
     tgc_2: int = _level(2)
     tgc_3: int = _level(3)

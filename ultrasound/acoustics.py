@@ -15,7 +15,7 @@ import numpy as np
 from scipy import ndimage
 
 from errors import UserError
-from ultrasound.tissue_classification import recognised
+from ultrasound.tissue_classification import classify_tissues
 
 TISSUES = Path(__file__).parent / "tissues.toml"
 # Amplitude of renal cortex against a perfect reflector: its speckle lies some 16 dB under the echo of fat on kidney.
@@ -122,7 +122,7 @@ def _labelled(
     if labels is not None:
         for tissue in dict.fromkeys(tissue_of_label.values()):
             found[tissue] = np.isin(labels, [v for v, name in tissue_of_label.items() if name == tissue])
-    for tissue, here in recognised(hu, found, spacing_mm).items():
+    for tissue, here in classify_tissues(hu, found, spacing_mm).items():
         found[tissue] = found[tissue] | here if tissue in found else here
     return {tissue: where for tissue, where in found.items() if where.any()}
 

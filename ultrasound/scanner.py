@@ -19,8 +19,8 @@ from ultrasound.sampled_volume import SampledVolume, distance_volume
 
 # What is around the organ where the picture shows no CT there [MRayl].
 AROUND = {"background": None, "gel": 1.5, "air": 4e-4}
-CT, ECHO = "CT", "B-mode"
-SHOWN: dict[Mode, tuple[str, ...]] = {"ct": (CT,), "b-mode": (ECHO,), "both": (ECHO, CT)}
+CT, B_MODE = "CT", "B-mode"
+SHOWN: dict[Mode, tuple[str, ...]] = {"ct": (CT,), "b-mode": (B_MODE,), "both": (B_MODE, CT)}
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class ScannedAnatomy:
         return np.linalg.norm(np.linalg.inv(self.index_from_mm[:3, :3]), axis=0)
 
 
-def begin_echo(anatomy: ScannedAnatomy) -> Future[np.ndarray]:
+def start_acoustics(anatomy: ScannedAnatomy) -> Future[np.ndarray]:
     """Begin with what an echo of an anatomy needs, on a thread of its own, while other things are made."""
     worker = ThreadPoolExecutor(1)
     values = worker.submit(properties, anatomy.hu, anatomy.labels, anatomy.tissues, anatomy.voxel_mm)
@@ -86,7 +86,7 @@ class Scanner:
     @cached_property
     def bmode(self) -> BMode:
         """The echo's side of the scanner."""
-        values, self._echo = (self._echo or begin_echo(self.anatomy)).result(), None
+        values, self._echo = (self._echo or start_acoustics(self.anatomy)).result(), None
         tissue = SampledVolume(values, self.anatomy.index_from_mm, outside=0.0)
         return BMode(
             tissue,
@@ -129,6 +129,6 @@ class Scanner:
         self.locate(plane)
         show = {
             CT: lambda: self.slice.render(window_hu, level_hu),
-            ECHO: lambda: self.bmode.render(probe, detail_level),
+            B_MODE: lambda: self.bmode.render(probe, detail_level),
         }
         return {name: show[name]() for name in SHOWN[mode]}

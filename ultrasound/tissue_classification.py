@@ -17,7 +17,7 @@ COARSE_MM, BEYOND_MM = 1.8, 45.0
 KIDNEY = ("kidney", "cortex", "medulla", "sinus", "urine")
 
 
-def recognised(
+def classify_tissues(
     hu: np.ndarray, labelled: dict[str, np.ndarray], spacing_mm: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Tissue -> which voxels (nx, ny, nz) are of it besides those that labels say, in the order in which they win."""

@@ -33,7 +33,7 @@ class TrackingErrors:
             raise ValueError(f"lost is a share of the frames, at most 1, not {self.lost:g}")
 
 
-def tracked(
+def with_tracking_errors(
     poses: np.ndarray, times_s: np.ndarray, errors: TrackingErrors, seed: int = 0
 ) -> list[np.ndarray | None]:
     """What a tracker reports of rigid ``poses`` (n, 4, 4) [mm], reference from probe: None where it is lost.

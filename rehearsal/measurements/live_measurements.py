@@ -16,7 +16,7 @@ from rehearsal.sessions.session_file import Log, SessionError
 from render.viewer import Settings, View
 from ultrasound.coverage import GRID_POINTS, Coverage, Gap
 from ultrasound.probe import Probe
-from ultrasound.scanner import ECHO
+from ultrasound.scanner import B_MODE
 
 READ_S, LOOK_S = 0.25, 1 / 30
 MARGIN_MM = 5.0
@@ -156,7 +156,7 @@ class LiveMeasurements:
             seen=self._seen if settings.show_seen else {},
             guidance=self.guide.guidance() if self.guide is not None else None,
             status=status,
-            notes={ECHO: "NO CONTACT"} if self._touches.mean() < BLACK_BELOW else {},
+            notes={B_MODE: "NO CONTACT"} if self._touches.mean() < BLACK_BELOW else {},
         )
 
     def findings(self) -> dict[str, str]:

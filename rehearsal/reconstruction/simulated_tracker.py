@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ultrasound.sweep import Sweep, SweepError, transform_text
-from ultrasound.tracking_errors import TrackingErrors, tracked
+from ultrasound.tracking_errors import TrackingErrors, with_tracking_errors
 
 
 def with_errors(sweep: Sweep, reference: str, errors: TrackingErrors, seed: int) -> Sweep:
@@ -18,7 +18,7 @@ def with_errors(sweep: Sweep, reference: str, errors: TrackingErrors, seed: int)
     if not known:
         raise SweepError(f"no frame has a pose of the probe in {reference}, on which errors could be put")
     try:
-        found = tracked(
+        found = with_tracking_errors(
             np.stack([pose for pose in poses if pose is not None]), sweep.times_s[known], errors, seed
         )
     except ValueError as error:

@@ -25,7 +25,7 @@ from ultrasound.image_plane import ImagePlane
 from ultrasound.outline import section
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import image_plane, pose_at, pose_of_image_plane
-from ultrasound.scanner import CT, ECHO, ScannedAnatomy, Scanner
+from ultrasound.scanner import B_MODE, CT, ScannedAnatomy, Scanner
 
 STORED = Path(__file__).parent / "pictures"
 PIXELS, WIDTH, DEPTH = 256, 36.0, 30.0
@@ -43,7 +43,7 @@ FACE, DOWN, LATERAL = np.array([1.0, -0.5, 11.0]), np.array([0.15, 0.1, -1.0]), 
 # Two pictures are alike that differ by so little: by mean grey value, and by the share of pixels that are more than SEEN off.
 # Slice and echo: other rounding (no fast_math, LLVM's advanced optimisation) leaves 0.004 and none, the organ's points 1e-4 mm
 # off 0.03 and 0.01 %. 3D view: another driver may draw edges half a pixel off, which leaves 0.5 and 0.1 %.
-LIMITS = {CT: (0.2, 0.001), ECHO: (0.2, 0.001), "3D": (1.0, 0.005)}
+LIMITS = {CT: (0.2, 0.001), B_MODE: (0.2, 0.001), "3D": (1.0, 0.005)}
 SEEN = 12
 # What a millimetre or a degree of the probe must exceed one of them by.
 APART = 4.0
@@ -142,7 +142,7 @@ def check(name: str, picture_of, request: pytest.FixtureRequest) -> None:
         assert excess(picture_of(*moved), wanted, name) > APART, f"{move} is not seen"
 
 
-@pytest.mark.parametrize("name", [CT, ECHO])
+@pytest.mark.parametrize("name", [CT, B_MODE])
 def test_slice_and_echo_are_the_stored_ones(scene, request, name):
     check(name, lambda shift, turn: scene.pictures(scene.plane(shift, turn))[name], request)
 

@@ -13,7 +13,7 @@ from ultrasound.acoustics import CORTEX_DB
 from ultrasound.image_plane import ImagePlane
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import image_plane, pose_at
-from ultrasound.scanner import CT, ScannedAnatomy, Scanner, begin_echo
+from ultrasound.scanner import CT, ScannedAnatomy, Scanner, start_acoustics
 
 PIXELS, RADIUS, REACH = 64, 12.0, 20.0
 PROBE = Probe(
@@ -84,7 +84,7 @@ def test_each_look_is_at_where_the_body_is_now(device):
 
 def test_an_echo_begun_before_is_the_one_that_is_shown(device):
     bones, plane = replace(anatomy(), tissues={1: "bone"}), plane_at()
-    begun = echo(Scanner(anatomy(), Unmoved(), PROBE, PIXELS, echo=begin_echo(bones)), plane)
+    begun = echo(Scanner(anatomy(), Unmoved(), PROBE, PIXELS, echo=start_acoustics(bones)), plane)
     assert np.array_equal(begun, echo(Scanner(bones, Unmoved(), PROBE, PIXELS), plane))
     assert np.abs(begun - echo(Scanner(anatomy(), Unmoved(), PROBE, PIXELS), plane)).max() > 10.0
 

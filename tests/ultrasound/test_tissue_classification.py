@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from scenes.patients import import_warnings
 from ultrasound.acoustics import ATTENUATION, IMPEDANCE, properties, tissue_table
-from ultrasound.tissue_classification import STONE_ABOVE_MEDIAN_HU, _filled, bones, hollow, recognised
+from ultrasound.tissue_classification import STONE_ABOVE_MEDIAN_HU, _filled, bones, classify_tissues, hollow
 
 SPACING = np.array([0.9, 0.9, 0.9])
 FAT, MARROW, SHELL, CORTEX, BLOOD = -100.0, 150.0, 600.0, 180.0, 200.0
@@ -56,7 +56,7 @@ def test_a_bone_is_found_where_it_lies_whatever_its_voxels(spacing):
 def test_what_has_a_label_is_no_bone():
     hu, bone, kidney, _ = abdomen()
     muscle = bone & (np.arange(70)[:, None] < 34)
-    found = recognised(hu, {"kidney": kidney, "muscle": muscle}, SPACING)["bone"]
+    found = classify_tissues(hu, {"kidney": kidney, "muscle": muscle}, SPACING)["bone"]
     assert not (found & muscle).any() and found[bone & ~muscle].mean() > 0.9
 
 
@@ -108,7 +108,7 @@ def test_all_sections_are_filled_as_each_alone(axis, share):
 
 def test_what_is_bright_by_contrast_agent_is_no_bone_and_outside_the_labels_blood():
     hu, bone, kidney, vessel = abdomen()
-    found = recognised(hu, {"kidney": kidney}, SPACING)
+    found = classify_tissues(hu, {"kidney": kidney}, SPACING)
     assert not (found["bone"] & (kidney | vessel)).any()
     assert (found["vessel"] & vessel).sum() > 0.6 * vessel.sum()
     assert not (found["vessel"] & (kidney | bone)).any()
@@ -117,7 +117,7 @@ def test_what_is_bright_by_contrast_agent_is_no_bone_and_outside_the_labels_bloo
 def test_without_contrast_agent_nothing_is_taken_for_blood():
     hu, _, kidney, _ = abdomen()
     hu[kidney] -= CORTEX - 30.0
-    assert "vessel" not in recognised(hu, {"kidney": kidney}, SPACING)
+    assert "vessel" not in classify_tissues(hu, {"kidney": kidney}, SPACING)
 
 
 def test_contrast_agent_in_labelled_urine_and_about_it_is_no_stone_but_without_agent_what_is_bright_there_is():
@@ -125,9 +125,9 @@ def test_contrast_agent_in_labelled_urine_and_about_it_is_no_stone_but_without_a
     urine, agent = ball((50.0, 30.0, 27.0), 4.0), ball((50.0, 30.0, 27.0), 4.5)
     hu[agent] = CORTEX + STONE_ABOVE_MEDIAN_HU + 100.0
     named = {"kidney": kidney & ~urine, "urine": urine}
-    assert not recognised(hu, named, SPACING)["stone"].any()
-    assert (recognised(hu, {"kidney": kidney}, SPACING)["stone"] == agent).all()
-    assert (recognised(hu - CORTEX + 30.0, named, SPACING)["stone"] == agent).all()
+    assert not classify_tissues(hu, named, SPACING)["stone"].any()
+    assert (classify_tissues(hu, {"kidney": kidney}, SPACING)["stone"] == agent).all()
+    assert (classify_tissues(hu - CORTEX + 30.0, named, SPACING)["stone"] == agent).all()
 
 
 def test_an_import_warns_of_what_the_echo_takes_for_stone():
