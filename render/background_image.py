@@ -42,7 +42,7 @@ def panel_of(view: View) -> Panel:
     )
 
 
-class Page:
+class BackgroundImage:
     """``pixels`` uint8 (width, height, 4) as GGUI wants them: columns first, bottom up."""
 
     def __init__(self, layout: WindowLayout, keys: Keys | None = None) -> None:

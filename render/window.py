@@ -18,7 +18,7 @@ import taichi as ti
 from taichi.ui.utils import get_field_info
 
 from render.actions import begin, hold
-from render.background_image import Page
+from render.background_image import BackgroundImage
 from render.camera import FIELD_OF_VIEW_DEG, OrbitCamera
 from render.display import display_available
 from render.gamepad import Gamepad
@@ -103,7 +103,7 @@ class Window:
         part = self.layout.window_coordinates(self.layout.clear)
         self.camera = OrbitCamera(geometry.bounds, geometry.up, part, size[0] / size[1])
         self._stage = SceneView(geometry, self.camera)
-        self._page = Page(self.layout, self.keys)
+        self._page = BackgroundImage(self.layout, self.keys)
 
     # What the user does
 
@@ -247,7 +247,7 @@ class Window:
             return
         self.layout = WindowLayout(*size)
         self._boxes_placed += 1
-        self._page = Page(self.layout, self.keys)
+        self._page = BackgroundImage(self.layout, self.keys)
         self.camera.aspect = size[0] / size[1]
         self.camera.part = self.layout.window_coordinates(self.layout.clear)
 

@@ -15,7 +15,7 @@ from rehearsal.frame_view import settings_of, take_view
 from rehearsal.measurements.run_report import Tally
 from rehearsal.rehearsal import SURROUNDINGS_MM, Rehearsal, scanned_anatomy
 from rehearsal.stopwatch import timed
-from render.background_image import Page
+from render.background_image import BackgroundImage
 from render.window_layout import WindowLayout
 from scenes.anatomy import LoadedAnatomy
 from scenes.closed_surfaces import moved_by
@@ -240,7 +240,7 @@ def _pictures(rehearsal: Rehearsal, scanned: ScannedAnatomy) -> Iterator[dict[st
 def _whole_frame(rehearsal: Rehearsal) -> dict[str, Any]:
     """All that a frame does but drawing the 3D view: a step under the pressing transducer, skin, echo, window's picture."""
     rehearsal.reset()
-    settings, tally, page = settings_of(rehearsal), Tally(0.0), Page(WindowLayout(1280, 720))
+    settings, tally, page = settings_of(rehearsal), Tally(0.0), BackgroundImage(WindowLayout(1280, 720))
     settings.mode = "b-mode"
     poses = [
         rehearsal.pose_at_depth(depth)

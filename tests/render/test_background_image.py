@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from render.background_image import Page
+from render.background_image import BackgroundImage
 from render.camera import OrbitCamera
 from render.compass import ARM, compass_picture, ends_of
 from render.keys import USUAL_KEYS, Keys
@@ -30,7 +30,7 @@ def view(**changes) -> View:
     )
 
 
-def composed(page: Page, **changes) -> np.ndarray:
+def composed(page: BackgroundImage, **changes) -> np.ndarray:
     """The page (rows, columns, 3) with a view on it."""
     page.compose(view(**changes), AXES)
     return page.pixels.transpose(1, 0, 2)[::-1, :, :3].copy()
@@ -167,7 +167,9 @@ def test_what_is_written_lies_in_its_box_or_is_left_out():
 
 
 def test_no_contact_is_written_in_the_echo_alone():
-    plain, noted = (composed(Page(LAYOUT), notes=notes) for notes in ({}, {"B-mode": "NO CONTACT"}))
+    plain, noted = (
+        composed(BackgroundImage(LAYOUT), notes=notes) for notes in ({}, {"B-mode": "NO CONTACT"})
+    )
     echo, ct = picture_boxes(LAYOUT)
     at = coloured(noted, echo, QUIET)
     assert len(at) > 100 and len(coloured(plain, echo, QUIET)) == 0
@@ -180,7 +182,8 @@ def test_no_contact_is_written_in_the_echo_alone():
 def test_what_to_do_stands_whole_under_a_note(size, hint):
     layout = WindowLayout(*size)
     plain, hinted = (
-        composed(Page(layout), notes={"B-mode": note}) for note in ("NO CONTACT", f"NO CONTACT\n{hint}")
+        composed(BackgroundImage(layout), notes={"B-mode": note})
+        for note in ("NO CONTACT", f"NO CONTACT\n{hint}")
     )
     echo = layout.picture_boxes(2, 16.0, 40.0)[0]
     rows, columns = np.nonzero((plain != hinted).any(axis=2))
@@ -202,7 +205,7 @@ def test_what_to_do_stands_whole_under_a_note(size, hint):
 )
 def test_the_calipers_figure_stands_at_its_line(points):
     bare, told = (
-        composed(Page(LAYOUT), caliper_mm=points, caliper=figure)
+        composed(BackgroundImage(LAYOUT), caliper_mm=points, caliper=figure)
         for figure in ("", "24.0 mm\nat rest 25.1 mm")
     )
     for box in picture_boxes(LAYOUT):
@@ -223,7 +226,7 @@ def test_the_calipers_figure_stands_at_its_line(points):
 
 def test_outlines_have_a_legend_under_the_picture():
     plain, outlined = (
-        composed(Page(LAYOUT), outline_mm=now, outline_before_mm=now) for now in (None, SQUARE)
+        composed(BackgroundImage(LAYOUT), outline_mm=now, outline_before_mm=now) for now in (None, SQUARE)
     )
     foot = picture_boxes(LAYOUT)[0].bottom
     under = Rect(LAYOUT.panel.left, foot, LAYOUT.panel.width, 24)
@@ -235,7 +238,7 @@ def test_outlines_have_a_legend_under_the_picture():
 
 
 def test_findings_that_become_fewer_leave_nothing_behind():
-    page = Page(LAYOUT)
+    page = BackgroundImage(LAYOUT)
     few = composed(page, findings=dict(list(FIGURES.items())[:4]))
     assert not np.array_equal(composed(page, findings=FIGURES), few)
     assert np.array_equal(composed(page, findings=dict(list(FIGURES.items())[:4])), few)
@@ -259,7 +262,7 @@ def test_all_readouts_of_a_window_are_shown(size):
 @pytest.mark.parametrize("help_key", ["H", "Backspace"])
 def test_clock_and_pace_stand_between_title_and_help_in_every_window(size, help_key):
     layout, told = WindowLayout(*size), {"clock": "1234.5 s", "title": "A long title of a patient " * 5}
-    page = Page(layout, Keys({**USUAL_KEYS, "help": help_key}))
+    page = BackgroundImage(layout, Keys({**USUAL_KEYS, "help": help_key}))
     box = clock_box(layout, help_key)
     bare, real, slow = (composed(page, **told | more) for more in ({"clock": ""}, {}, {"pace": "0.2 x real"}))
     assert set(np.unique(bare[box.slices])) == {17, 20, 24}
@@ -276,14 +279,16 @@ def test_findings_grow_with_their_lines_and_the_last_go_where_room_ends(size):
     layout = WindowLayout(*size)
     assert layout.findings(11).height > layout.findings(9).height
     assert layout.most_findings >= (11 if size != (700, 420) else 7)
-    empty, full = (composed(Page(layout), findings=figures, alert="figure 0") for figures in ({}, FIGURES))
+    empty, full = (
+        composed(BackgroundImage(layout), findings=figures, alert="figure 0") for figures in ({}, FIGURES)
+    )
     rows = np.flatnonzero((empty != full).any(axis=(1, 2)))
     assert rows.max() < layout.compass.top
     assert len(coloured(full, layout.findings(1), ALERT)) > 20
 
 
 def test_the_help_covers_all_and_leaves_nothing_behind():
-    page = Page(LAYOUT)
+    page = BackgroundImage(LAYOUT)
     before = composed(page, findings=FIGURES)
     box = picture_boxes(LAYOUT)[0]
     assert page.place_at(box.left + 5, box.top + 5) == pytest.approx(
@@ -327,7 +332,7 @@ def test_what_points_up_in_the_compass_is_drawn_up():
 
 
 def test_the_compass_is_drawn_anew_when_the_camera_turns():
-    page, turned = Page(LAYOUT), np.array([[0, 0, -1.0], [1.0, 0, 0], [0, 1.0, 0]])
+    page, turned = BackgroundImage(LAYOUT), np.array([[0, 0, -1.0], [1.0, 0, 0], [0, 1.0, 0]])
     box = LAYOUT.compass
     first = composed(page)[box.slices]
     assert np.array_equal(first, compass_picture(LAYOUT, AXES))
