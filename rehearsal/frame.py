@@ -91,7 +91,7 @@ class FrameLoop:
             self.frozen = not self.frozen
         if controls.reset:
             self.caliper.points = ()
-        self._announce(controls.news)
+        self._announce(controls.message)
         self._announce(self.plans.watch(controls))
         shown = self._looked_back(controls) or self._taken(controls)
         if controls.sweep:

@@ -72,11 +72,11 @@ class Gamepad:
         if is_there == self._is_there:
             return
         if is_there:
-            controls.news = "Gamepad ready"
+            controls.message = "Gamepad ready"
         elif self._is_there is None:
-            controls.news = "No gamepad is plugged in: mouse and keys lead until one is"
+            controls.message = "No gamepad is plugged in: mouse and keys lead until one is"
         else:
-            controls.news = "Gamepad unplugged: mouse and keys lead"
+            controls.message = "Gamepad unplugged: mouse and keys lead"
         self._is_there = is_there
 
 

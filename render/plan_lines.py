@@ -11,12 +11,12 @@ from render.viewer import Guidance
 from sim.fields import fill
 
 MOST_SEGMENTS = 2000
-TO_GO, GONE = np.array([1.0, 0.72, 0.20], np.float32), np.array([0.30, 0.75, 0.42], np.float32)
+TO_GO, DONE = np.array([1.0, 0.72, 0.20], np.float32), np.array([0.30, 0.75, 0.42], np.float32)
 GOAL = (1.0, 0.86, 0.45)
 WIDTH, GOAL_WIDTH = 2.6, 1.8
 
 
-class GuideLines:
+class PlanLines:
     """The fields of what is drawn; of a longer way every so manieth segment is."""
 
     def __init__(self, edges: np.ndarray) -> None:
@@ -27,7 +27,7 @@ class GuideLines:
 
     def draw(self, scene, guidance: Guidance) -> None:
         """Hand the lines to a scene."""
-        way, gone = guidance.way_mm, int(guidance.gone.sum())
+        way, done = guidance.path_mm, int(guidance.done.sum())
         if self._shown[0] is not way or self._shown[1] != gone:
             self._fill(guidance)
             self._shown = way, gone
@@ -37,11 +37,11 @@ class GuideLines:
             scene.lines(self._goal, GOAL_WIDTH, color=GOAL)
 
     def _fill(self, guidance: Guidance) -> None:
-        every = -(-len(guidance.way_mm) // MOST_SEGMENTS)
-        segments, gone = guidance.way_mm[::every], guidance.gone[::every]
+        every = -(-len(guidance.path_mm) // MOST_SEGMENTS)
+        segments, done = guidance.path_mm[::every], guidance.done[::every]
         # What is left over has no length.
         points = np.repeat(segments[-1:, 1:], 2 * MOST_SEGMENTS, axis=1)[0].astype(np.float32)
-        colours = np.tile(GONE, (2 * MOST_SEGMENTS, 1))
+        colours = np.tile(DONE, (2 * MOST_SEGMENTS, 1))
         points[: 2 * len(segments)] = segments.reshape(-1, 3)
-        colours[: 2 * len(segments)] = np.where(np.repeat(gone, 2)[:, None], GONE, TO_GO)
+        colours[: 2 * len(segments)] = np.where(np.repeat(gone, 2)[:, None], DONE, TO_GO)
         fill((self._way, points), (self._colours, colours))

@@ -8,7 +8,7 @@ import numpy as np
 from render import transducer_shape
 from render.camera import OrbitCamera
 from render.cut_face import CutFace, side_of_eye
-from render.plan_lines import GuideLines
+from render.plan_lines import PlanLines
 from render.surface_shading import CUT_EDGE_MM, GLASS, SOLID, Cut, ShadedSurface
 from render.viewer import Geometry, Settings, View
 from sim.fields import field_of, fields_of, fill
@@ -41,7 +41,7 @@ class SceneView:
         self._probe_vertices, self._probe_normals, self._probe_colours = fields_of(*self._probe[:3], within=1)
         self._probe_edges = transducer_shape.edges(geometry.transducer_size_mm, geometry.transducer_radius_mm)
         self._edge_points = field_of(self._probe_edges, within=1)
-        self._guide: GuideLines | None = None
+        self._guide: PlanLines | None = None
         self._cut_face: CutFace | None = None
         self._cut_side = 0.0
         self._plane, self._plane_indices = transducer_shape.image_plane_grid(PLANE_ROWS, PLANE_COLUMNS)
@@ -88,7 +88,7 @@ class SceneView:
         if cut is not None:
             self._draw_inner(scene, inner, eye, key, ahead, cut)
         if view.guidance is not None:
-            self._guide = self._guide or GuideLines(self._probe_edges)
+            self._guide = self._guide or PlanLines(self._probe_edges)
             self._guide.draw(scene, view.guidance)
         opacity = GLASS if settings.translucent else SOLID
         self._organ.tint(view.seen.get("organ"))

@@ -172,9 +172,9 @@ class Guidance:
 
     goal: np.ndarray | None
     """Where the transducer is to go next, world from transducer [mm], shape (4, 4); None where all of the sweep is behind."""
-    way_mm: np.ndarray
+    path_mm: np.ndarray
     """The way of the face's middle, segments of shape (n, 2, 3)."""
-    gone: np.ndarray
+    done: np.ndarray
     """Which of them are behind, bool, shape (n,)."""
 
 
@@ -270,7 +270,7 @@ class Controls:
     """The freeze key went down: the app toggles."""
     screenshot: bool = False
     quit: bool = False
-    news: str = ""
+    message: str = ""
     """What a device has to say, such as that it was unplugged."""
 
 

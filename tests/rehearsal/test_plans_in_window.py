@@ -231,6 +231,6 @@ def test_sweeps_are_shown_in_turn(plans):
         plans.rehearsal, plan_of(sweep_of(first), sweep_of(second, name="b", seen=0.5))
     )
     guide.watch(first[0])
-    assert guide.at == 1 and np.array_equal(guide.guidance().gone, [False, False])
+    assert guide.at == 1 and np.array_equal(guide.guidance().done, [False, False])
     assert said(plans, next_plan=True) == "Plan 2: b, sees 50 %"
     assert said(plans, next_plan=True) == "Plan hidden"

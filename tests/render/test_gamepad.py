@@ -77,7 +77,7 @@ def test_buttons_begin_and_hold():
 
 def test_plugging_in_and_out_is_said_once():
     there = PadState()
-    said = [controls.news for controls in read(None, None, there, there, None, None, there)]
+    said = [controls.message for controls in read(None, None, there, there, None, None, there)]
     assert [text.split(":")[0] for text in said] == [
         "No gamepad is plugged in",
         "",
@@ -87,7 +87,7 @@ def test_plugging_in_and_out_is_said_once():
         "",
         "Gamepad ready",
     ]
-    assert read(there)[0].news == "Gamepad ready"
+    assert read(there)[0].message == "Gamepad ready"
 
 
 def test_buttons_are_numbered_as_sdl_has_them():
