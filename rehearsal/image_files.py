@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from render.animation import in_proportion
+from render.animation import with_square_pixels
 from scenes.atomic_files import whole
 from ultrasound.dicom_image import save_dicom
 from ultrasound.probe import Probe
@@ -41,7 +41,7 @@ def save_pictures(
     """Write what a probe shows (rows, columns) by kind, as wide and deep as said, under names that begin alike. Raises OSError."""
     saved = []
     for kind, grey in shown.items():
-        picture = in_proportion(grey, width_mm, depth_mm)
+        picture = with_square_pixels(grey, width_mm, depth_mm)
         path = begin.with_name(f"{begin.name}-{kind.lower()}.png")
         save_picture(picture, path)
         spacing_mm = depth_mm / picture.height, width_mm / picture.width

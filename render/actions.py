@@ -1,6 +1,6 @@
 """What the actions of the key map do to the controls and settings, by whichever key or button they come."""
 
-from render.viewer import LINES, Controls
+from render.viewer import KEY_MAP_ENTRIES, Controls
 from ultrasound.probe import DETAIL_LEVELS, MODES
 from ultrasound.target import TARGETS
 
@@ -22,7 +22,7 @@ STEPS = {"cine_back": -1, "cine_forth": 1}
 CYCLES = {"mode": MODES, "detail_level": DETAIL_LEVELS, "plan_for": TARGETS}
 # What is the mouse's alone.
 BY_MOUSE = ("point", "press", "orbit", "pan", "measure")
-ACTIONS = tuple(action for line in LINES for action in line.actions if action not in BY_MOUSE)
+ACTIONS = tuple(action for line in KEY_MAP_ENTRIES for action in line.actions if action not in BY_MOUSE)
 
 
 def hold(action: str, controls: Controls, seconds: float) -> None:

@@ -7,12 +7,12 @@ from PIL import Image
 
 from render.viewer import View
 
-PICTURES_A_SECOND = 15
+ANIMATION_FPS = 15
 ANIMATION_WIDTH = 960
 ANIMATION_QUALITY = 80
 
 
-def in_proportion(picture: np.ndarray, width_mm: float, depth_mm: float) -> Image.Image:
+def with_square_pixels(picture: np.ndarray, width_mm: float, depth_mm: float) -> Image.Image:
     """A picture of a plane with square pixels, as long on its longer side as it was sampled."""
     scale = max(picture.shape) / max(width_mm, depth_mm)
     size = max(1, round(width_mm * scale)), max(1, round(depth_mm * scale))
@@ -21,7 +21,9 @@ def in_proportion(picture: np.ndarray, width_mm: float, depth_mm: float) -> Imag
 
 def side_by_side(view: View) -> Image.Image:
     """The pictures of a view in a row, with square pixels."""
-    pictures = [in_proportion(picture, view.width_mm, view.depth_mm) for picture in view.pictures.values()]
+    pictures = [
+        with_square_pixels(picture, view.width_mm, view.depth_mm) for picture in view.pictures.values()
+    ]
     row = np.concatenate([np.asarray(picture) for picture in pictures], axis=1)
     return Image.fromarray(row)
 
@@ -34,7 +36,7 @@ def empty_folder(folder: Path) -> Path:
     return folder
 
 
-def smaller(picture: Image.Image) -> Image.Image:
+def scaled_down(picture: Image.Image) -> Image.Image:
     """A picture no wider than the animation."""
     width = min(ANIMATION_WIDTH, picture.width)
     return picture.resize((width, round(picture.height * width / picture.width)), Image.Resampling.LANCZOS)
@@ -47,7 +49,7 @@ def save_animation(pictures: list[Image.Image], path: Path) -> None:
         path,
         save_all=True,
         append_images=others,
-        duration=round(1000 / PICTURES_A_SECOND),
+        duration=round(1000 / ANIMATION_FPS),
         loop=0,
         quality=ANIMATION_QUALITY,
     )

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from errors import UserError
 from render.actions import ACTIONS, BY_MOUSE, HELD
-from render.viewer import KEY_MAP, LINES
+from render.viewer import KEY_MAP, KEY_MAP_ENTRIES
 
 # A key as it is printed -> as GGUI names it, which hears no digits and no punctuation.
 KEYS = {each: each.lower() for each in string.ascii_uppercase}
@@ -23,19 +23,19 @@ BUTTONS = (
     *("A", "B", "X", "Y", "Back", "Guide", "Start", "Left stick", "Right stick"),
     *("Left shoulder", "Right shoulder", "Pad up", "Pad down", "Pad left", "Pad right"),
 )
-USUAL_KEYS = {
+DEFAULT_KEYS = {
     action: key
-    for line in LINES
+    for line in KEY_MAP_ENTRIES
     for action, key in zip(line.actions, line.keys, strict=True)
     if action in ACTIONS
 }
 MOUSE = {
     action: key
-    for line in LINES
+    for line in KEY_MAP_ENTRIES
     for action, key in zip(line.actions, line.keys, strict=True)
     if action in BY_MOUSE
 }
-USUAL_BUTTONS = {
+DEFAULT_BUTTONS = {
     "freeze": "A",
     "undo": "B",
     "bookmark": "X",
@@ -70,8 +70,8 @@ class _File(BaseModel):
 class Keys:
     """``of`` is action -> key, ``buttons`` action -> gamepad button, both as printed."""
 
-    of: Mapping[str, str] = field(default_factory=lambda: USUAL_KEYS)
-    buttons: Mapping[str, str] = field(default_factory=lambda: USUAL_BUTTONS)
+    of: Mapping[str, str] = field(default_factory=lambda: DEFAULT_KEYS)
+    buttons: Mapping[str, str] = field(default_factory=lambda: DEFAULT_BUTTONS)
 
     def action_of(self, pressed: str) -> str:
         """What a key, as GGUI names it, does; empty where it does nothing."""
@@ -112,8 +112,8 @@ def load_keys(path: Path) -> Keys:
     try:
         buttons = [action for action in ACTIONS if action not in (*VIEW_ALONE, "help")]
         return Keys(
-            _with("keys", given.keys, USUAL_KEYS, ACTIONS, KEYS),
-            _with("gamepad", given.gamepad, USUAL_BUTTONS, buttons, BUTTONS),
+            _with("keys", given.keys, DEFAULT_KEYS, ACTIONS, KEYS),
+            _with("gamepad", given.gamepad, DEFAULT_BUTTONS, buttons, BUTTONS),
         )
     except KeysError as error:
         raise KeysError(f"{path}: {error}") from None
@@ -126,8 +126,8 @@ def keys_text() -> str:
     rows = []
     for group, lines in KEY_MAP.items():
         keyed = [(action, line.text) for line in lines for action in line.actions if action in ACTIONS]
-        rows += [f"# {group}", *(f'{action} = "{USUAL_KEYS[action]}"  # {text}' for action, text in keyed)]
-    pad = [f'{action} = "{button}"' for action, button in USUAL_BUTTONS.items()]
+        rows += [f"# {group}", *(f'{action} = "{DEFAULT_KEYS[action]}"  # {text}' for action, text in keyed)]
+    pad = [f'{action} = "{button}"' for action, button in DEFAULT_BUTTONS.items()]
     return "\n".join([head, "[keys]", *rows, "", "[gamepad]", *pad, ""])
 
 

@@ -18,7 +18,7 @@ B_MODE, TGC = "Echo", "Gain over depth"
 ASIDE = (B_MODE, TGC)
 
 
-class Line(NamedTuple):
+class KeyMapEntry(NamedTuple):
     """One line of the key map: ``keys`` as they are printed, ``actions`` (their names in the code), ``text`` for the reader."""
 
     keys: tuple[str, ...]
@@ -28,52 +28,56 @@ class Line(NamedTuple):
 
 KEY_MAP = {
     "Transducer": (
-        Line(("Mouse",), ("point",), "move it over the organ"),
-        Line(("Left button",), ("press",), "press it in, the deeper the longer it is held"),
-        Line(("W", "S"), ("push", "lift"), "push it in, lift it"),
-        Line(("A", "D"), ("rotate_left", "rotate_right"), "roll it about its axis, left and right"),
-        Line(("Q", "E"), ("rock_left", "rock_right"), "turn the beam in the image plane, left and right"),
-        Line(("Z", "C"), ("tilt_back", "tilt_forward"), "tilt it out of the image plane, either way"),
+        KeyMapEntry(("Mouse",), ("point",), "move it over the organ"),
+        KeyMapEntry(("Left button",), ("press",), "press it in, the deeper the longer it is held"),
+        KeyMapEntry(("W", "S"), ("push", "lift"), "push it in, lift it"),
+        KeyMapEntry(("A", "D"), ("rotate_left", "rotate_right"), "roll it about its axis, left and right"),
+        KeyMapEntry(
+            ("Q", "E"), ("rock_left", "rock_right"), "turn the beam in the image plane, left and right"
+        ),
+        KeyMapEntry(("Z", "C"), ("tilt_back", "tilt_forward"), "tilt it out of the image plane, either way"),
     ),
     "View": (
-        Line(("Right drag",), ("orbit",), "turn it"),
-        Line(("Middle drag",), ("pan",), "shift it (also Shift + right drag)"),
-        Line(("Up", "Down"), ("zoom_in", "zoom_out"), "zoom in and out"),
-        Line(("T",), ("translucent",), "organ translucent or solid"),
-        Line(("X",), ("cut",), "organ cut along the image plane"),
-        Line(("N",), ("show_seen",), "what has been in the picture, in green"),
+        KeyMapEntry(("Right drag",), ("orbit",), "turn it"),
+        KeyMapEntry(("Middle drag",), ("pan",), "shift it (also Shift + right drag)"),
+        KeyMapEntry(("Up", "Down"), ("zoom_in", "zoom_out"), "zoom in and out"),
+        KeyMapEntry(("T",), ("translucent",), "organ translucent or solid"),
+        KeyMapEntry(("X",), ("cut",), "organ cut along the image plane"),
+        KeyMapEntry(("N",), ("show_seen",), "what has been in the picture, in green"),
     ),
     "Picture": (
-        Line(("B",), ("mode",), "echo and CT, echo alone, CT alone"),
-        Line(("V",), ("detail_level",), "echo: how much of it is computed"),
-        Line(("G",), ("show_scanner",), "the scanner's sliders, gain over depth too"),
-        Line(("O",), ("outline",), "outline of the tumour, now and in the CT"),
-        Line(("Click on picture",), ("measure",), "caliper from click to click, in mm; a third ends it"),
-        Line(("F",), ("freeze",), "freeze and go on"),
-        Line(
+        KeyMapEntry(("B",), ("mode",), "echo and CT, echo alone, CT alone"),
+        KeyMapEntry(("V",), ("detail_level",), "echo: how much of it is computed"),
+        KeyMapEntry(("G",), ("show_scanner",), "the scanner's sliders, gain over depth too"),
+        KeyMapEntry(("O",), ("outline",), "outline of the tumour, now and in the CT"),
+        KeyMapEntry(
+            ("Click on picture",), ("measure",), "caliper from click to click, in mm; a third ends it"
+        ),
+        KeyMapEntry(("F",), ("freeze",), "freeze and go on"),
+        KeyMapEntry(
             ("Left", "Right"),
             ("cine_back", "cine_forth"),
             "while frozen: back through the last ten seconds, forth",
         ),
-        Line(("I",), ("export",), "save the picture (PNG, DICOM) and the organ (PLY)"),
+        KeyMapEntry(("I",), ("export",), "save the picture (PNG, DICOM) and the organ (PLY)"),
     ),
     "Plan": (
-        Line(("Space",), ("plan_for",), "what it is for: tumour and margin, tumour, kidney"),
-        Line(("Return",), ("plan",), "make one: a sweep that shows that"),
-        Line(("Backspace",), ("next_plan",), "stop planning; or its next sweep, then none"),
+        KeyMapEntry(("Space",), ("plan_for",), "what it is for: tumour and margin, tumour, kidney"),
+        KeyMapEntry(("Return",), ("plan",), "make one: a sweep that shows that"),
+        KeyMapEntry(("Backspace",), ("next_plan",), "stop planning; or its next sweep, then none"),
     ),
     "Session": (
-        Line(("U", "Y"), ("undo", "redo"), "undo the last press, turn or way; take that back"),
-        Line(("M", "J"), ("bookmark", "to_bookmark"), "bookmark this moment; go back to bookmarks"),
-        Line(("L",), ("sweep",), "begin to record a tracked sweep, or end it"),
-        Line(("K",), ("take_over",), "take the lead from a replay or a tracked probe"),
-        Line(("R",), ("reset",), "reset tissue, transducer and view"),
-        Line(("P",), ("screenshot",), "save a picture of the window"),
-        Line(("H",), ("help",), "show or hide this list"),
-        Line(("Esc",), ("quit",), "quit"),
+        KeyMapEntry(("U", "Y"), ("undo", "redo"), "undo the last press, turn or way; take that back"),
+        KeyMapEntry(("M", "J"), ("bookmark", "to_bookmark"), "bookmark this moment; go back to bookmarks"),
+        KeyMapEntry(("L",), ("sweep",), "begin to record a tracked sweep, or end it"),
+        KeyMapEntry(("K",), ("take_over",), "take the lead from a replay or a tracked probe"),
+        KeyMapEntry(("R",), ("reset",), "reset tissue, transducer and view"),
+        KeyMapEntry(("P",), ("screenshot",), "save a picture of the window"),
+        KeyMapEntry(("H",), ("help",), "show or hide this list"),
+        KeyMapEntry(("Esc",), ("quit",), "quit"),
     ),
 }
-LINES = tuple(line for group in KEY_MAP.values() for line in group)
+KEY_MAP_ENTRIES = tuple(line for group in KEY_MAP.values() for line in group)
 
 
 def key_table() -> str:

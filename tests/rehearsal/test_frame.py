@@ -15,7 +15,7 @@ from rehearsal import frame, headless, run
 from rehearsal.commands import rehearse_command
 from rehearsal.frame import FrameLoop
 from rehearsal.frame_view import probe_as_set
-from render.keys import USUAL_KEYS, Keys
+from render.keys import DEFAULT_KEYS, Keys
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
 from scenes.scene import EMBEDDED
@@ -190,7 +190,7 @@ def test_the_clock_is_the_sessions_and_says_where_it_is_slow(looping):
 def test_without_contact_whoever_leads_by_hand_is_told_how_to_press(looping, monkeypatch):
     monkeypatch.setattr(Moments, "onto", lambda each, view, _: replace(view, notes={"B-mode": "NO CONTACT"}))
     monkeypatch.setattr(frame, "UserInput", SimpleNamespace)
-    looping.keys = Keys({**USUAL_KEYS, "push": "Return"})
+    looping.keys = Keys({**DEFAULT_KEYS, "push": "Return"})
     monkeypatch.setattr(frame, "ReplayInput", Moments)
     by_hand, tracked = (SimpleNamespace(is_by_hand=each) for each in (True, False))
     told = []

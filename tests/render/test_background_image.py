@@ -8,7 +8,7 @@ import pytest
 from render.background_image import BackgroundImage
 from render.camera import OrbitCamera
 from render.compass import ARM, compass_picture, ends_of
-from render.keys import USUAL_KEYS, Keys
+from render.keys import DEFAULT_KEYS, Keys
 from render.sliders import boxes_of, groups_of
 from render.text import fitting_size, font, shortened, write
 from render.ultrasound_panel import ALERT, BEFORE, CALLIPER, OUTLINE, QUIET, TEXT
@@ -262,7 +262,7 @@ def test_all_readouts_of_a_window_are_shown(size):
 @pytest.mark.parametrize("help_key", ["H", "Backspace"])
 def test_clock_and_pace_stand_between_title_and_help_in_every_window(size, help_key):
     layout, told = WindowLayout(*size), {"clock": "1234.5 s", "title": "A long title of a patient " * 5}
-    page = BackgroundImage(layout, Keys({**USUAL_KEYS, "help": help_key}))
+    page = BackgroundImage(layout, Keys({**DEFAULT_KEYS, "help": help_key}))
     box = clock_box(layout, help_key)
     bare, real, slow = (composed(page, **told | more) for more in ({"clock": ""}, {}, {"pace": "0.2 x real"}))
     assert set(np.unique(bare[box.slices])) == {17, 20, 24}

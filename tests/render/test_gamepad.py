@@ -9,7 +9,7 @@ import pytest
 
 from render.actions import TILT_DEG_S
 from render.gamepad import DEAD_STICK, SLIDE_MM_S, Gamepad, PadState, SdlPads, shaped
-from render.keys import BUTTONS, USUAL_BUTTONS
+from render.keys import BUTTONS, DEFAULT_BUTTONS
 from render.viewer import Controls, Settings
 
 SECONDS = 0.02
@@ -26,7 +26,7 @@ class MadeUp:
 
 
 def read(*states: PadState | None, **did) -> list[Controls]:
-    pad = Gamepad(MadeUp(*states), USUAL_BUTTONS)
+    pad = Gamepad(MadeUp(*states), DEFAULT_BUTTONS)
     found = [Controls(Settings(), **did) for _ in states]
     for controls in found:
         pad.read(controls, SECONDS)

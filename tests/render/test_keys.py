@@ -11,8 +11,8 @@ from conftest import ROOT
 import app
 from rehearsal.frame import FrameLoop
 from render.actions import ACTIONS, BY_MOUSE, CYCLES, HELD, STEPS, begin, hold
-from render.keys import KEYS, USUAL_BUTTONS, USUAL_KEYS, VIEW_ALONE, Keys, KeysError, keys_text, load_keys
-from render.viewer import KEY_MAP, LINES, Controls, NullViewer, Settings
+from render.keys import DEFAULT_BUTTONS, DEFAULT_KEYS, KEYS, VIEW_ALONE, Keys, KeysError, keys_text, load_keys
+from render.viewer import KEY_MAP, KEY_MAP_ENTRIES, Controls, NullViewer, Settings
 
 
 def file_of(tmp_path, text: str):
@@ -34,7 +34,7 @@ def test_every_action_does_one_thing():
     }
     switches = {each.name for each in dataclasses.fields(Settings) if isinstance(each.default, bool)}
     does = [*BY_MOUSE, *HELD, *STEPS, *CYCLES, *VIEW_ALONE, "help"]
-    for action in (each for line in LINES for each in line.actions):
+    for action in (each for line in KEY_MAP_ENTRIES for each in line.actions):
         kinds = does.count(action) + (action in flags) + (action in switches)
         assert kinds == 1, action
     assert flags <= set(ACTIONS), "controls that no key reaches"
@@ -78,7 +78,7 @@ def test_a_held_action_goes_on_with_time(action, name, a_second):
 
 
 def test_what_is_said_names_the_users_keys(tmp_path, capsys):
-    keys = Keys(of=USUAL_KEYS | {"sweep": "Space", "plan_for": "L"})
+    keys = Keys(of=DEFAULT_KEYS | {"sweep": "Space", "plan_for": "L"})
     parts = [None, None, SimpleNamespace(status=""), None]
     loop = FrameLoop(None, NullViewer(), tmp_path, None, *parts, keys=keys)
     loop._announce("sweep-001: {sweep} ends it")
@@ -91,8 +91,8 @@ def test_the_printed_file_is_the_usual_map(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert printed == keys_text()
     keys = load_keys(file_of(tmp_path, printed))
-    assert keys.of == USUAL_KEYS and keys.buttons == USUAL_BUTTONS
-    assert load_keys(file_of(tmp_path, "")).of == USUAL_KEYS
+    assert keys.of == DEFAULT_KEYS and keys.buttons == DEFAULT_BUTTONS
+    assert load_keys(file_of(tmp_path, "")).of == DEFAULT_KEYS
 
 
 def test_a_file_changes_behaviour_help_and_words(tmp_path):
@@ -114,7 +114,7 @@ def test_a_file_changes_behaviour_help_and_words(tmp_path):
     ]
     assert dict(keys.held())["push"] == "i" and dict(keys.held())["zoom_in"] == "Up"
     groups = keys.lines()
-    assert list(groups) == list(KEY_MAP) and sum(map(len, groups.values())) == len(LINES)
+    assert list(groups) == list(KEY_MAP) and sum(map(len, groups.values())) == len(KEY_MAP_ENTRIES)
     lines = {text: key for rows in groups.values() for key, text in rows}
     assert lines["push it in, lift it"] == "I / S" and lines["freeze and go on"] == "Space"
     assert [key for key, _ in groups["Transducer"]][:2] == ["Mouse", "Left button"]
@@ -123,8 +123,8 @@ def test_a_file_changes_behaviour_help_and_words(tmp_path):
 
 
 def test_every_usual_key_is_a_key_and_there_once():
-    assert set(USUAL_KEYS.values()) <= set(KEYS) and len(set(USUAL_KEYS.values())) == len(USUAL_KEYS)
-    assert [Keys().action_of(KEYS[key]) for key in USUAL_KEYS.values()] == list(USUAL_KEYS)
+    assert set(DEFAULT_KEYS.values()) <= set(KEYS) and len(set(DEFAULT_KEYS.values())) == len(DEFAULT_KEYS)
+    assert [Keys().action_of(KEYS[key]) for key in DEFAULT_KEYS.values()] == list(DEFAULT_KEYS)
     assert len(set(KEYS.values())) == len(KEYS)
 
 
