@@ -28,9 +28,9 @@ class PlanLines:
     def draw(self, scene, guidance: Guidance) -> None:
         """Hand the lines to a scene."""
         way, done = guidance.path_mm, int(guidance.done.sum())
-        if self._shown[0] is not way or self._shown[1] != gone:
+        if self._shown[0] is not way or self._shown[1] != done:
             self._fill(guidance)
-            self._shown = way, gone
+            self._shown = way, done
         scene.lines(self._way, WIDTH, per_vertex_color=self._colours)
         if guidance.goal is not None:
             fill((self._goal, transducer_shape.placed(self._edges, guidance.goal)))
@@ -43,5 +43,5 @@ class PlanLines:
         points = np.repeat(segments[-1:, 1:], 2 * MOST_SEGMENTS, axis=1)[0].astype(np.float32)
         colours = np.tile(DONE, (2 * MOST_SEGMENTS, 1))
         points[: 2 * len(segments)] = segments.reshape(-1, 3)
-        colours[: 2 * len(segments)] = np.where(np.repeat(gone, 2)[:, None], DONE, TO_GO)
+        colours[: 2 * len(segments)] = np.where(np.repeat(done, 2)[:, None], DONE, TO_GO)
         fill((self._way, points), (self._colours, colours))

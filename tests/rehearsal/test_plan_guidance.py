@@ -104,7 +104,7 @@ def test_the_way_that_is_drawn_is_each_pass_and_not_between_them():
     done = []
     for pose in [*FIRST, *SECOND]:
         guide.watch(pose)
-        gone.append(guide.guidance().done.sum())
+        done.append(guide.guidance().done.sum())
     assert done == [0, 1, 2, 3, 3, 4, 5]
 
 
@@ -313,7 +313,7 @@ def test_of_a_longer_way_than_there_are_lines_every_second_segment_is_drawn(one_
     monkeypatch.setattr(plan_lines, "MOST_SEGMENTS", 10)
     way = np.arange(15 * 6, dtype=float).reshape(15, 2, 3)
     done = np.arange(15) < 7
-    segments, colours, _ = drawn(PlanLines(EDGES), Guidance(None, way, gone))
+    segments, colours, _ = drawn(PlanLines(EDGES), Guidance(None, way, done))
     assert segments == pytest.approx(way[::2])
     assert np.array_equal(colours, np.where(done[::2, None], DONE, TO_GO))
 
