@@ -35,7 +35,7 @@ class Screen:
         self.environment = os.environ | {"DISPLAY": display}
         self.environment.pop("WAYLAND_DISPLAY", None)
         keys = out / "keys.toml"
-        keys.write_text('[keys]\nfreeze = "Space"\nplan_for = "F"\nexport = "E"\ntilt_right = "I"\n')
+        keys.write_text('[keys]\nfreeze = "Space"\nplan_for = "F"\nexport = "E"\nrock_right = "I"\n')
         self.program = subprocess.Popen(
             [
                 sys.executable,

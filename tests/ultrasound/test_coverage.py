@@ -60,8 +60,8 @@ def organ(one_device) -> Coverage:
 def test_a_plane_shows_a_slab_of_its_thickness(organ, axes, thickness):
     origin = axes @ [3, -24, 4]
     probe = PROBE.model_copy(update=dict(elevation_width_mm=thickness))
-    organ.forget()
-    assert organ.look(places(probe, axes, origin), probe, None).all()
+    organ.clear()
+    assert organ.add(places(probe, axes, origin), probe, None).all()
     u, v, off = on_picture(organ, axes, origin)
     # No voxel is seen whose own half extent does not reach the slab.
     normal = np.cross(axes[:, 0], axes[:, 1])
@@ -103,8 +103,8 @@ def test_on_average_a_plane_along_the_voxels_is_as_thick_as_it_is(organ, thickne
     probe = PROBE.model_copy(update=dict(elevation_width_mm=thickness))
     volumes = []
     for y in (np.arange(12) + 0.5) / 12 * VOXEL_MM:
-        organ.forget()
-        organ.look(places(probe, UPRIGHT, (0, y, 22)), probe, None)
+        organ.clear()
+        organ.add(places(probe, UPRIGHT, (0, y, 22)), probe, None)
         volumes.append((organ.seen & organ.targets["organ"]).sum() * VOXEL_MM**3)
     # Parts of equal thickness, each in the voxel of its middle; one voxel at least. Facets take 1.2 %, and counting.
     parts = np.ceil(thickness / VOXEL_MM)
@@ -113,8 +113,8 @@ def test_on_average_a_plane_along_the_voxels_is_as_thick_as_it_is(organ, thickne
 
 @pytest.mark.parametrize("shift", [0.0, 5.0, -8.0])
 def test_lines_that_do_not_touch_show_nothing(organ, shift):
-    organ.forget()
-    touches = organ.look(places(PROBE, UPRIGHT, (shift, 0, R)), PROBE, 1.5)
+    organ.clear()
+    touches = organ.add(places(PROBE, UPRIGHT, (shift, 0, R)), PROBE, 1.5)
     x = PROBE.elements()[:, 0] + shift
     # The face lies in a tangent plane: an element at x is hypot(x, R) - R from the ball. That is known to what facets
     # (0.4 % of the radius) and voxels (VOXEL^2 / 8 of the curvatures 2 / R) leave, at the nearest of places 0.42 mm apart.
@@ -133,9 +133,9 @@ def test_lines_that_do_not_touch_show_nothing(organ, shift):
 
 def test_the_first_and_last_places_stand_for_as_much_as_the_others(organ):
     probe, count = PROBE.model_copy(update=dict(transducer_width_mm=36.0, depth_mm=36.0)), 8
-    organ.forget()
+    organ.clear()
     few = np.linspace(0, GRID_POINTS - 1, count).astype(int)
-    organ.look(places(probe, UPRIGHT, (0, 0, 18))[np.ix_(few, few)], probe, None)
+    organ.add(places(probe, UPRIGHT, (0, 0, 18))[np.ix_(few, few)], probe, None)
     u, v, _ = on_picture(organ, UPRIGHT, (0, 0, 18))
     # Half a place beyond the ends, less half of a part: of those there is one a voxel where tissue is squeezed by 0.7.
     spacing = 36.0 / (count - 1)
@@ -153,9 +153,9 @@ def test_the_columns_of_places_are_together_as_wide_as_the_picture(lines):
 
 
 def test_off_the_organ_nothing_is_seen(organ):
-    organ.forget()
-    assert not organ.look(places(PROBE, UPRIGHT, (0, 0, R + 3)), PROBE, 1.5).any()
-    assert not organ.seen.any() and organ.share("organ") == 0
+    organ.clear()
+    assert not organ.add(places(PROBE, UPRIGHT, (0, 0, R + 3)), PROBE, 1.5).any()
+    assert not organ.seen.any() and organ.fraction("organ") == 0
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def cap(height: float) -> float:
 
 @pytest.mark.parametrize("first, last", [(-25, 0), (-4, 8), (5, 25)])
 def test_what_was_not_swept_is_the_gap(organ, first, last):
-    organ.forget()
+    organ.clear()
     sweep(organ, first, last)
     caps = sorted([cap(R + x) for x in (first, -last) if R + x > 0], reverse=True)
     sides = {first: -1, last: 1}
@@ -219,22 +219,22 @@ def test_what_was_not_swept_is_the_gap(organ, first, last):
         height = R - sides[edge] * edge
         assert height - VOXEL_MM <= gap.thickness_mm <= height + 2 * VOXEL_MM
     missing = sum(caps) / (4 / 3 * np.pi * R**3 / 1000)
-    assert organ.share("organ") == pytest.approx(1 - missing, abs=VOXEL_MM / 2 * 0.75 / R * len(caps) + 0.01)
+    assert organ.fraction("organ") == pytest.approx(1 - missing, abs=VOXEL_MM / 2 * 0.75 / R * len(caps) + 0.01)
 
 
 def test_seen_at_places_adds_up_and_is_forgotten(organ):
-    organ.forget()
+    organ.clear()
     sweep(organ, -10, 0)
     once = organ.seen.copy()
     sweep(organ, 5, 12)
     assert organ.seen[once].all()
-    assert organ.at(np.array([[-5.0, 3, 4], [2.5, 3, 4], [8, -2, 1], [16, 0, 0]])).tolist() == [1, 0, 1, 0]
+    assert organ.is_seen(np.array([[-5.0, 3, 4], [2.5, 3, 4], [8, -2, 1], [16, 0, 0]])).tolist() == [1, 0, 1, 0]
     off = np.random.default_rng(3).uniform(-0.49, 0.49, (*organ.seen.shape, 3)) * VOXEL_MM
-    assert np.array_equal(organ.at((centres(organ) + off).reshape(-1, 3)), organ.seen.ravel())
+    assert np.array_equal(organ.is_seen((centres(organ) + off).reshape(-1, 3)), organ.seen.ravel())
     assert len(organ.gaps("organ")) == 3
-    organ.forget()
-    assert organ.share("organ") == 0 and not organ.at(np.zeros((1, 3))).any()
-    assert np.isnan(organ.share("tumour"))
+    organ.clear()
+    assert organ.fraction("organ") == 0 and not organ.is_seen(np.zeros((1, 3))).any()
+    assert np.isnan(organ.fraction("tumour"))
 
 
 def lens(a: float, b: float, d: float) -> float:
