@@ -16,7 +16,7 @@ from sim.embedding import Embedding, Unmoved
 from sim.fields import array_of, fill
 from ultrasound.bmode import BMode
 from ultrasound.image_plane import PlaneInTissue
-from ultrasound.point_spread import MOST_LINES, axial_sd_mm, elevation_sd_mm, lateral_sd_mm
+from ultrasound.point_spread import MAX_HALF_WIDTH, axial_sd_mm, elevation_sd_mm, lateral_sd_mm
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import image_plane, pose_at
 from ultrasound.sampled_volume import SampledVolume
@@ -248,8 +248,8 @@ def test_a_wire_is_drawn_as_wide_as_the_focus_makes_it(endless, focus_percent, t
     axial = 2 * 1.54 / 7.5 / 2 / FWHM
     u = probe.scanlines()[0][:, 0] - probe.scanlines()[0][LINES // 2, 0]
     profile = (u == 0).astype(float) if thin else np.exp(-0.5 * (u / axial) ** 2)
-    fill((endless.bmode.beams.real, np.repeat(profile[:, None], SAMPLES, axis=1)))
-    endless.bmode.beams.imaginary.fill(0.0)
+    fill((endless.bmode.scanlines.real, np.repeat(profile[:, None], SAMPLES, axis=1)))
+    endless.bmode.scanlines.imaginary.fill(0.0)
     endless.bmode._spread()
     for depth in (8.0, 16.0, 32.0, 56.0, 72.0):
         line = array_of(endless.bmode.decibel)[:, int(depth / 0.125)].astype(float)
@@ -294,7 +294,7 @@ def test_the_mean_square_of_speckle_is_the_backscatter_squared(endless, geometry
     squares = (10 ** (np.array(echoes) / 10)).mean(axis=0) / 0.1**2
     # What the kernel adds up lies 1.4 entries apart in the mean where lines are dense: noise ends at the borders of blocks of
     # 64, which takes 3 % of it there, and, held over entries, is 5 % short aslant to them. Sampling has an SD of 1 to 3 %.
-    inner = squares[MOST_LINES:-MOST_LINES]
+    inner = squares[MAX_HALF_WIDTH:-MAX_HALF_WIDTH]
     assert inner.mean() == pytest.approx(1.0, abs=0.05)
     assert inner.mean(axis=0).reshape(8, -1).mean(axis=1) == pytest.approx(np.ones(8), abs=0.12)
     # At the array's ends, where half of the kernel has no lines to take from, to 0.6 dB.

@@ -219,7 +219,9 @@ def test_what_was_not_swept_is_the_gap(organ, first, last):
         height = R - sides[edge] * edge
         assert height - VOXEL_MM <= gap.thickness_mm <= height + 2 * VOXEL_MM
     missing = sum(caps) / (4 / 3 * np.pi * R**3 / 1000)
-    assert organ.fraction("organ") == pytest.approx(1 - missing, abs=VOXEL_MM / 2 * 0.75 / R * len(caps) + 0.01)
+    assert organ.fraction("organ") == pytest.approx(
+        1 - missing, abs=VOXEL_MM / 2 * 0.75 / R * len(caps) + 0.01
+    )
 
 
 def test_seen_at_places_adds_up_and_is_forgotten(organ):
@@ -228,7 +230,12 @@ def test_seen_at_places_adds_up_and_is_forgotten(organ):
     once = organ.seen.copy()
     sweep(organ, 5, 12)
     assert organ.seen[once].all()
-    assert organ.is_seen(np.array([[-5.0, 3, 4], [2.5, 3, 4], [8, -2, 1], [16, 0, 0]])).tolist() == [1, 0, 1, 0]
+    assert organ.is_seen(np.array([[-5.0, 3, 4], [2.5, 3, 4], [8, -2, 1], [16, 0, 0]])).tolist() == [
+        1,
+        0,
+        1,
+        0,
+    ]
     off = np.random.default_rng(3).uniform(-0.49, 0.49, (*organ.seen.shape, 3)) * VOXEL_MM
     assert np.array_equal(organ.is_seen((centres(organ) + off).reshape(-1, 3)), organ.seen.ravel())
     assert len(organ.gaps("organ")) == 3
