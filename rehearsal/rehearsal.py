@@ -24,8 +24,7 @@ from sim.shapes import Plane, SignedDistanceField
 from sim.skinning import Skin
 from sim.solver import SolverState
 from sim.tissue_model import FixedRegion, MaterialModel
-from ultrasound.image_plane import ImagePlane
-from ultrasound.outline import section
+from ultrasound.image_plane import ImagePlane, plane_section
 from ultrasound.probe import DetailLevel, Mode, Probe
 from ultrasound.probe_manipulator import (
     ManipulatorState,
@@ -271,7 +270,7 @@ class Rehearsal:
             return None
         plane = self.image_plane()
         vertices = np.asarray(self.tumour.vertices) if at_rest else self.tumour_vertices()
-        return section(vertices, self.tumour.faces, np.linalg.inv(plane.world_from_plane))
+        return plane_section(vertices, self.tumour.faces, np.linalg.inv(plane.world_from_plane))
 
     def tumour_vertices(self) -> np.ndarray:
         """Where the tumour's surface is now (n, 3) [mm]; none of an organ without one."""

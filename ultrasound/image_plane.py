@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 import taichi.math as tm
+import trimesh
+from trimesh.intersections import mesh_plane
 
 from sim.embedding import Embedding, Unmoved
 
@@ -110,6 +112,16 @@ class PlaneInTissue:
     def is_tissue(self, row, column):
         """Whether the embedding contains the pixel."""
         return self.owner[row, column] < self.embedding.count
+
+
+def plane_section(vertices: np.ndarray, faces: np.ndarray, plane_from_world: np.ndarray) -> np.ndarray:
+    """Return the section of a closed surface (v, 3), (f, 3) [mm] with the plane w = 0: segments (n, 2, 2) of (u, v) [mm].
+
+    ``plane_from_world`` (4, 4) is rigid: u to the marked side, v down into the tissue, w out of the plane.
+    """
+    in_plane = vertices @ plane_from_world[:3, :3].T + plane_from_world[:3, 3]
+    surface = trimesh.Trimesh(in_plane, faces, process=False)
+    return mesh_plane(surface, plane_normal=[0.0, 0.0, 1.0], plane_origin=[0.0, 0.0, 0.0])[..., :2]
 
 
 def _matrix(values: np.ndarray) -> ti.Matrix:

@@ -13,7 +13,7 @@ from scenes.anatomy import LoadedAnatomy
 from sim.embedding import Unmoved
 from sim.mesh_distance import signed_distance
 from ultrasound.bmode import source_of_pixels
-from ultrasound.ground_truth_labels import MOST_BEADS, GroundTruthLabels
+from ultrasound.ground_truth_labels import MAX_BEADS, GroundTruthLabels
 from ultrasound.image_plane import ImagePlane, PlaneInTissue
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import advanced, touching
@@ -56,7 +56,7 @@ def beads_of(organ: trimesh.Trimesh, tumour: trimesh.Trimesh | None) -> np.ndarr
     depth = -signed_distance(organ.vertices, organ.faces, near)[0]
     inside = near[depth > 2 * BEAD_RADIUS_MM]
     # Of more than there is room for, those nearest to the middle.
-    nearest = np.argsort(np.linalg.norm(inside - middle, axis=1), kind="stable")[:MOST_BEADS]
+    nearest = np.argsort(np.linalg.norm(inside - middle, axis=1), kind="stable")[:MAX_BEADS]
     return inside[np.sort(nearest)]
 
 

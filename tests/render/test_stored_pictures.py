@@ -21,8 +21,7 @@ from sim.device import start
 from sim.embedding import Embedding
 from sim.fields import array_of
 from sim.skinning import Skin
-from ultrasound.image_plane import ImagePlane
-from ultrasound.outline import section
+from ultrasound.image_plane import ImagePlane, plane_section
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import image_plane, pose_at, pose_of_image_plane
 from ultrasound.scanner import B_MODE, CT, ScannedAnatomy, Scanner
@@ -89,7 +88,7 @@ class Scene:
     def pictures(self, plane: ImagePlane) -> dict[str, np.ndarray]:
         """CT and echo as the panel shows them, with the organ's outline, uint8 (rows, columns, 3) each."""
         shown = self.scanner.images(plane, PROBE, "both", "speckle", 350.0, 40.0)
-        outline = section(
+        outline = plane_section(
             array_of(self.surface.vertices), self.anatomy.organ.faces, np.linalg.inv(plane.world_from_plane)
         )
         panel, page = Panel(tuple(shown), WIDTH, DEPTH), np.zeros((*SMALL_WINDOW[::-1], 3), np.uint8)

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from conftest import rotation_about
 
-from ultrasound.coverage import GRID_POINTS, VOXEL_MM, Coverage, _lines_of
+from ultrasound.coverage import GRID_POINTS, VOXEL_MM, Coverage, _scanlines_of
 from ultrasound.probe import load_probe
 
 pytestmark = pytest.mark.usefixtures("one_device")
@@ -149,7 +149,7 @@ def test_the_first_and_last_places_stand_for_as_much_as_the_others(organ):
 def test_the_columns_of_places_are_together_as_wide_as_the_picture(lines):
     """Each stands for what is half a step to either side of it: of as many as there are, one too many."""
     probe = PROBE.model_copy(update=dict(number_of_scanlines=lines))
-    assert _lines_of(probe, GRID_POINTS)[1].all(axis=0).sum() == GRID_POINTS - 1
+    assert _scanlines_of(probe, GRID_POINTS)[1].all(axis=0).sum() == GRID_POINTS - 1
 
 
 def test_off_the_organ_nothing_is_seen(organ):

@@ -26,7 +26,7 @@ from sim.embedding import Unmoved
 from sim.mesh_distance import signed_distance
 from studies.freehand.freehand_sweeps import sweep_of
 from ultrasound import reconstruction
-from ultrasound.labelled_sweep import MARKS, SUFFIX, LabelledSweep, read_ground_truth
+from ultrasound.labelled_sweep import LABELS_SUFFIX, SUFFIX, LabelledSweep, read_ground_truth
 from ultrasound.probe import load_probe
 from ultrasound.probe_manipulator import held_at, image_plane, pose_at
 from ultrasound.sweep import PixelLabel, SweepError
@@ -204,7 +204,7 @@ def test_the_matrices_of_a_frame_are_of_its_rows_and_columns(tmp_path):
     sweep = LabelledSweep(tmp_path, "sweep", probe)
     sweep.add(*np.zeros((2, 50, 80), np.uint8), probe, pose, 0.0)
     sweep.close()
-    for end in (SUFFIX, MARKS):
+    for end in (SUFFIX, LABELS_SUFFIX):
         read = read_sweep(tmp_path / f"sweep{end}")
         assert read.images.shape == (1, 50, 80)
         assert np.array_equal(read.transform("Image", "Probe", 0), probe.image_to_probe(50, 80))

@@ -7,7 +7,7 @@ from test_bmode import LINES, flat_tank, probe_of
 
 from sim.device import start
 from sim.fields import array_of
-from ultrasound.point_spread import MAX_HALF_WIDTH, HALF_WIDTH_SD, axial_sd_mm, lateral_sd_mm, lateral_weights
+from ultrasound.point_spread import HALF_WIDTH_SD, MAX_HALF_WIDTH, axial_sd_mm, lateral_sd_mm, lateral_weights
 from ultrasound.probe import Probe
 
 GEOMETRIES = {

@@ -84,7 +84,7 @@ def test_each_look_is_at_where_the_body_is_now(device):
 
 def test_an_echo_begun_before_is_the_one_that_is_shown(device):
     bones, plane = replace(anatomy(), tissues={1: "bone"}), plane_at()
-    begun = echo(Scanner(anatomy(), Unmoved(), PROBE, PIXELS, echo=start_acoustics(bones)), plane)
+    begun = echo(Scanner(anatomy(), Unmoved(), PROBE, PIXELS, acoustics=start_acoustics(bones)), plane)
     assert np.array_equal(begun, echo(Scanner(bones, Unmoved(), PROBE, PIXELS), plane))
     assert np.abs(begun - echo(Scanner(anatomy(), Unmoved(), PROBE, PIXELS), plane)).max() > 10.0
 

@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from scenes.patients import import_warnings
 from ultrasound.acoustics import ATTENUATION, IMPEDANCE, properties, tissue_table
-from ultrasound.tissue_classification import STONE_ABOVE_MEDIAN_HU, _filled, bones, classify_tissues, hollow
+from ultrasound.tissue_classification import STONE_ABOVE_MEDIAN_HU, _filled, bones, classify_tissues, enclosed
 
 SPACING = np.array([0.9, 0.9, 0.9])
 FAT, MARROW, SHELL, CORTEX, BLOOD = -100.0, 150.0, 600.0, 180.0, 200.0
@@ -66,7 +66,7 @@ def test_a_groove_is_a_hollow_where_no_ball_of_20_mm_goes_in(across, down, width
     spacing = np.array([1.0, 2.0, 0.5])
     places = np.moveaxis(np.indices((60 / spacing).astype(int) + 1), 0, -1) * spacing - 30.0
     groove = (np.abs(places[..., across]) < width / 2) & (places[..., down] > -20.0)
-    found = hollow(~groove, spacing)
+    found = enclosed(~groove, spacing)
     assert not (found & ~groove).any()
     # Amid the groove: at a width of 17 mm a ball on its open end reaches 5 mm in, and where one goes in it touches the walls.
     along = np.delete(places, [across, down], -1)[..., 0]
