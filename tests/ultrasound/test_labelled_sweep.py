@@ -333,7 +333,7 @@ def test_reconstruct_refuses_in_one_line(swept, tmp_path, monkeypatch):
     assert "frame 5: Timestamp" in refused("reconstruct", tmp_path / "timeless.igs.mha", *out)
     # Nothing of this is found out after a folder was made.
     assert not (tmp_path / "out").exists()
-    monkeypatch.setattr(reconstruction, "MOST_VOXELS", 5000)
+    monkeypatch.setattr(reconstruction, "MAX_VOXELS", 5000)
     large = refused("reconstruct", swept, *out)
     assert "over.igs.mha: " in large and "take larger voxels" in large
     monkeypatch.undo()
