@@ -251,7 +251,7 @@ def _whole_frame(rehearsal: Rehearsal) -> dict[str, Any]:
     whole += [rehearsal.embedding, rehearsal.scanner]
 
     def go_on() -> None:
-        page.compose(take_view(rehearsal, settings, poses.pop(0), tally), np.eye(3), patient=True)
+        page.compose(take_view(rehearsal, settings, poses.pop(0), tally), np.eye(3), slow_figures=True)
 
     return _alone("whole frame, with the echo", go_on, whole, None)
 

@@ -310,7 +310,7 @@ def test_of_two_sweeps_shown_one_after_the_other_each_has_its_own_lines(one_devi
 
 
 def test_of_a_longer_way_than_there_are_lines_every_second_segment_is_drawn(one_device, monkeypatch):
-    monkeypatch.setattr(plan_lines, "MOST_SEGMENTS", 10)
+    monkeypatch.setattr(plan_lines, "MAX_SEGMENTS", 10)
     way = np.arange(15 * 6, dtype=float).reshape(15, 2, 3)
     done = np.arange(15) < 7
     segments, colours, _ = drawn(PlanLines(EDGES), Guidance(None, way, done))

@@ -11,8 +11,8 @@ from render.compass import ARM, compass_picture, ends_of
 from render.keys import DEFAULT_KEYS, Keys
 from render.sliders import boxes_of, groups_of
 from render.text import fitting_size, font, shortened, write
-from render.ultrasound_panel import ALERT, BEFORE, CALLIPER, OUTLINE, QUIET, TEXT
-from render.viewer import Geometry, Settings, View
+from render.ultrasound_panel import ALERT, CALIPER, OUTLINE, OUTLINE_AT_REST, QUIET, TEXT
+from render.viewer import SCANNER_GROUPS, Geometry, Settings, View
 from render.window_frame import clock_box, findings_picture, readout_picture
 from render.window_layout import Rect, WindowLayout
 
@@ -66,8 +66,8 @@ def test_no_part_of_the_window_overlaps_another(size):
     layout = WindowLayout(*size)
     settings = Settings(young_kpa=15.0, show_scanner=True)
     placed = boxes_of(settings, WHOLE, layout)
-    over = [layout.findings(layout.most_findings), layout.compass, placed["Echo"], placed["Gain over depth"]]
-    below = [box for name, box in placed.items() if name not in ("Echo", "Gain over depth")]
+    over = [layout.findings(layout.most_findings), layout.compass, *(placed[name] for name in SCANNER_GROUPS)]
+    below = [box for name, box in placed.items() if name not in SCANNER_GROUPS]
     parts = [*over, *below, layout.readouts, *picture_boxes(layout)]
     for one, other in combinations(parts, 2):
         assert apart(one, other) or 0 in (*one[2:], *other[2:])
@@ -81,7 +81,7 @@ def test_no_part_of_the_window_overlaps_another(size):
             assert area.top <= box.top and box.bottom <= area.bottom
 
 
-def test_echo_and_ct_of_the_drop_in_probe_fill_the_panel():
+def test_b_mode_and_ct_of_the_drop_in_probe_fill_the_panel():
     box = picture_boxes(LAYOUT)[0]
     assert box.height > 0.95 * (720 - 74 - 52) and LAYOUT.scene.width > 720
 
@@ -166,14 +166,14 @@ def test_what_is_written_lies_in_its_box_or_is_left_out():
 # Over the pictures
 
 
-def test_no_contact_is_written_in_the_echo_alone():
+def test_no_contact_is_written_in_the_b_mode_image_only():
     plain, noted = (
         composed(BackgroundImage(LAYOUT), notes=notes) for notes in ({}, {"B-mode": "NO CONTACT"})
     )
-    echo, ct = picture_boxes(LAYOUT)
-    at = coloured(noted, echo, QUIET)
-    assert len(at) > 100 and len(coloured(plain, echo, QUIET)) == 0
-    assert at.mean(axis=0) == pytest.approx([echo.height / 2, echo.width / 2], abs=6)
+    b_mode, ct = picture_boxes(LAYOUT)
+    at = coloured(noted, b_mode, QUIET)
+    assert len(at) > 100 and len(coloured(plain, b_mode, QUIET)) == 0
+    assert at.mean(axis=0) == pytest.approx([b_mode.height / 2, b_mode.width / 2], abs=6)
     assert np.array_equal(plain[ct.slices], noted[ct.slices])
 
 
@@ -185,11 +185,11 @@ def test_what_to_do_stands_whole_under_a_note(size, hint):
         composed(BackgroundImage(layout), notes={"B-mode": note})
         for note in ("NO CONTACT", f"NO CONTACT\n{hint}")
     )
-    echo = layout.picture_boxes(2, 16.0, 40.0)[0]
+    b_mode = layout.picture_boxes(2, 16.0, 40.0)[0]
     rows, columns = np.nonzero((plain != hinted).any(axis=2))
-    assert echo.left <= columns.min() and columns.max() < echo.right
-    assert np.ptp(columns) > 0.4 * echo.width
-    noted = coloured(plain, echo, QUIET)[:, 0].max() + echo.top
+    assert b_mode.left <= columns.min() and columns.max() < b_mode.right
+    assert np.ptp(columns) > 0.4 * b_mode.width
+    noted = coloured(plain, b_mode, QUIET)[:, 0].max() + b_mode.top
     assert noted < rows.min() and rows.max() < noted + 50
 
 
@@ -217,7 +217,7 @@ def test_the_calipers_figure_stands_at_its_line(points):
         # A line down the right half has it on its left, one down the left half on its right.
         assert points[0][0] != points[1][0] or (changed[:, 1].mean() - middle[1]) * points[0][0] < 0
         # The line stays whole.
-        assert len(coloured(told, box, CALLIPER)) > len(coloured(bare, box, CALLIPER))
+        assert len(coloured(told, box, CALIPER)) > len(coloured(bare, box, CALIPER))
     outside = np.ones(bare.shape[:2], bool)
     for box in picture_boxes(LAYOUT):
         outside[box.slices] = False
@@ -230,7 +230,7 @@ def test_outlines_have_a_legend_under_the_picture():
     )
     foot = picture_boxes(LAYOUT)[0].bottom
     under = Rect(LAYOUT.panel.left, foot, LAYOUT.panel.width, 24)
-    for colour in (OUTLINE, BEFORE):
+    for colour in (OUTLINE, OUTLINE_AT_REST):
         assert len(coloured(outlined, under, colour)) > 30 and len(coloured(plain, under, colour)) == 0
 
 
@@ -291,12 +291,12 @@ def test_the_help_covers_all_and_leaves_nothing_behind():
     page = BackgroundImage(LAYOUT)
     before = composed(page, findings=FIGURES)
     box = picture_boxes(LAYOUT)[0]
-    assert page.place_at(box.left + 5, box.top + 5) == pytest.approx(
+    assert page.plane_point_at(box.left + 5, box.top + 5) == pytest.approx(
         page.panel.to_plane(box, box.left + 5, box.top + 5)
     )
     page.show_help()
     helped = page.pixels.transpose(1, 0, 2)[::-1, :, :3]
-    assert np.ptp(helped[-1], axis=0).max() == 0 and page.place_at(box.left + 5, box.top + 5) is None
+    assert np.ptp(helped[-1], axis=0).max() == 0 and page.plane_point_at(box.left + 5, box.top + 5) is None
     assert np.array_equal(composed(page, findings=FIGURES), before)
 
 

@@ -43,7 +43,7 @@ def test_a_stick_is_dead_near_its_middle_and_whole_at_its_end():
     assert shaped(0.6 * half, -0.8 * half) == pytest.approx((0.15, -0.2))
 
 
-def test_sticks_slide_tilt_and_fan():
+def test_sticks_slide_rock_and_tilt():
     (controls,) = read(PadState(left=(0.0, 1.0), right=(1.0, 0.0)))
     assert controls.slide_mm == pytest.approx((0.0, SLIDE_MM_S * SECONDS))
     # To the right is towards +x, and so a negative tilt.
@@ -75,15 +75,15 @@ def test_buttons_begin_and_hold():
     assert down.undo and down.bookmark and down.reset
 
 
-def test_plugging_in_and_out_is_said_once():
+def test_connecting_and_disconnecting_is_reported_once():
     there = PadState()
     said = [controls.message for controls in read(None, None, there, there, None, None, there)]
     assert [text.split(":")[0] for text in said] == [
-        "No gamepad is plugged in",
+        "No gamepad connected",
         "",
         "Gamepad ready",
         "",
-        "Gamepad unplugged",
+        "Gamepad disconnected",
         "",
         "Gamepad ready",
     ]

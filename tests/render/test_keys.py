@@ -11,7 +11,16 @@ from conftest import ROOT
 import app
 from rehearsal.frame import FrameLoop
 from render.actions import ACTIONS, BY_MOUSE, CYCLES, HELD, STEPS, begin, hold
-from render.keys import DEFAULT_BUTTONS, DEFAULT_KEYS, KEYS, VIEW_ALONE, Keys, KeysError, keys_text, load_keys
+from render.keys import (
+    DEFAULT_BUTTONS,
+    DEFAULT_KEYS,
+    KEYS,
+    VIEW_ACTIONS,
+    Keys,
+    KeysError,
+    keys_text,
+    load_keys,
+)
 from render.viewer import KEY_MAP, KEY_MAP_ENTRIES, Controls, NullViewer, Settings
 
 
@@ -33,7 +42,7 @@ def test_every_action_does_one_thing():
         each.name for each in dataclasses.fields(Controls) if each.default is False and each.name != "press"
     }
     switches = {each.name for each in dataclasses.fields(Settings) if isinstance(each.default, bool)}
-    does = [*BY_MOUSE, *HELD, *STEPS, *CYCLES, *VIEW_ALONE, "help"]
+    does = [*BY_MOUSE, *HELD, *STEPS, *CYCLES, *VIEW_ACTIONS, "help"]
     for action in (each for line in KEY_MAP_ENTRIES for each in line.actions):
         kinds = does.count(action) + (action in flags) + (action in switches)
         assert kinds == 1, action
@@ -116,7 +125,7 @@ def test_a_file_changes_behaviour_help_and_words(tmp_path):
     groups = keys.lines()
     assert list(groups) == list(KEY_MAP) and sum(map(len, groups.values())) == len(KEY_MAP_ENTRIES)
     lines = {text: key for rows in groups.values() for key, text in rows}
-    assert lines["push it in, lift it"] == "I / S" and lines["freeze and go on"] == "Space"
+    assert lines["push it in, lift it"] == "I / S" and lines["freeze and unfreeze"] == "Space"
     assert [key for key, _ in groups["Transducer"]][:2] == ["Mouse", "Left button"]
     assert keys.worded("{help} shows, {quit} quits {so} {}") == "Return shows, Esc quits {so} {}"
     assert keys.buttons["undo"] == "Guide" and keys.buttons["redo"] == "B"
@@ -131,21 +140,21 @@ def test_every_usual_key_is_a_key_and_there_once():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ('[keys]\npusch = "i"', "keys.pusch: no such action; did you mean push?"),
-        ('[keys]\npush = "F13"', "keys.push = 'F13': no such key; known: A B"),
-        ('[keys]\npush = "1"', "keys.push = '1': no such key; known: A B"),
+        ('[keys]\npusch = "i"', "keys.pusch: unknown action; did you mean push?"),
+        ('[keys]\npush = "F13"', "keys.push = 'F13': unknown key; known here: A, B"),
+        ('[keys]\npush = "1"', "keys.push = '1': unknown key; known here: A, B"),
         ('[keys]\npush = "Spce"', "did you mean Space?"),
-        ('[keys]\npush = "u"', "keys: push and undo are both on U; give one another"),
+        ('[keys]\npush = "u"', "keys: push and undo are both on U; change one of them"),
         ('[keys]\npush = "Space"\nlift = "space"', "keys: push and lift are both on Space"),
-        ('[keys]\npoint = "m"', "keys.point: is done with the mouse; leave it out"),
+        ('[keys]\npoint = "m"', "keys.point: is an action of the mouse; leave it out"),
         ('[gamepad]\nundo = "A"', "gamepad: freeze and undo are both on A"),
-        ('[gamepad]\nundo = "Q"', "gamepad.undo = 'Q': no such button"),
-        ('[gamepad]\nzoom_in = "Guide"', "gamepad.zoom_in: no such action"),
-        ('[gamepad]\npress = "Guide"', "gamepad.press: is done with the mouse"),
-        ("[keys]\npush = 1", "keys.push = 1: expected a text"),
-        ('[kesy]\npush = "i"', "kesy: unknown; expected the sections"),
-        ('push = "i"', "push: unknown; expected the sections"),
-        ("[keys", "cannot be read as a TOML file"),
+        ('[gamepad]\nundo = "Q"', "gamepad.undo = 'Q': unknown button"),
+        ('[gamepad]\nzoom_in = "Guide"', "gamepad.zoom_in: unknown action"),
+        ('[gamepad]\npress = "Guide"', "gamepad.press: is an action of the mouse"),
+        ("[keys]\npush = 1", "keys.push = 1: input should be a valid string"),
+        ('[kesy]\npush = "i"', "kesy: unknown key; expected the sections"),
+        ('push = "i"', "push: unknown key; expected the sections"),
+        ("[keys", "cannot be read as a TOML key file"),
     ],
 )
 def test_a_file_that_cannot_be_used_is_refused_in_words(tmp_path, text, words):
@@ -154,7 +163,7 @@ def test_a_file_that_cannot_be_used_is_refused_in_words(tmp_path, text, words):
 
 def test_the_command_line_refuses_in_one_line(tmp_path, capsys):
     assert app.main(["rehearse", "--keys", str(tmp_path / "none.toml")]) == 2
-    assert "no such file of keys; app.py keys prints one" in capsys.readouterr().err
+    assert "no such key file; app.py keys prints one" in capsys.readouterr().err
     assert app.main(["rehearse", "--gamepad", "--headless"]) == 2
     assert "--gamepad: leads in a window" in capsys.readouterr().err
 

@@ -107,25 +107,23 @@ def test_up_is_up_and_the_tissue_follows_a_pan():
 # Solids
 
 
-@pytest.mark.parametrize("kind", ["cuboid", "curved"])
-def test_solids_face_outward(kind):
-    size = (40.0, 10.0, 20.0)
-    solid = transducer_shape.cuboid(size)
-    if kind == "curved":
-        parts = transducer_shape.transducer(size, radius=25.0)
-        lens = np.flatnonzero((parts.colours == transducer_shape.LENS).all(axis=1))
-        inside = np.isin(parts.indices.reshape(-1, 3), lens).all(axis=1)
-        middle = parts.vertices[lens].mean(axis=0)
-        faces = parts.indices.reshape(-1, 3)[inside] - lens[0]
-        solid = transducer_shape.TransducerShape(
-            parts.vertices[lens] - middle, parts.normals[lens], parts.colours[lens], faces.reshape(-1)
-        )
-        # The arc's middle is the lowest, where the image starts.
-        assert parts.vertices[:, 2].min() == pytest.approx(-10.0)
-    a, b, c = (solid.vertices[solid.indices.reshape(-1, 3)[:, i]] for i in range(3))
-    centre = (a + b + c) / 3
-    assert np.all(np.einsum("ij,ij->i", np.cross(b - a, c - a), centre) > 0)
-    assert np.all(np.einsum("ij,ij->i", solid.normals, solid.vertices) > 0)
+@pytest.mark.parametrize("radius", [0.0, 25.0])
+def test_the_parts_of_the_transducer_are_closed_and_face_outward(radius):
+    size = np.array([40.0, 10.0, 20.0])
+    shape = transducer_shape.transducer(size, radius)
+    faces = shape.indices.reshape(-1, 3)
+    for colour in (transducer_shape.BODY, transducer_shape.LENS, transducer_shape.MARKER):
+        part = faces[(shape.colours[faces[:, 0]] == colour).all(axis=1)]
+        corners, normals = shape.vertices[part], shape.normals[part]
+        middle = corners.reshape(-1, 3).mean(axis=0)
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        assert np.all(np.einsum("ij,ij->i", cross, corners.mean(axis=1) - middle) > 0)
+        assert np.all(np.einsum("ikj,ikj->ik", normals, corners - middle) > 0)
+        # The area vectors of a closed surface add up to nothing.
+        assert cross.sum(axis=0) == pytest.approx(np.zeros(3), abs=1e-9)
+    # The marker stands out by a quarter of a millimetre; a curved array is lowest in its centre, where the image starts.
+    assert shape.vertices.min(axis=0) == pytest.approx(-size / 2)
+    assert shape.vertices.max(axis=0)[:2] == pytest.approx(size[:2] / 2 + [0.25, 0.0])
 
 
 def test_image_plane_carries_the_picture_the_right_way_round():
@@ -134,7 +132,7 @@ def test_image_plane_carries_the_picture_the_right_way_round():
     grey[0, -1] = 255
     view = _view(pictures={"CT": grey})
     places = transducer_shape.on_plane(shares, view)
-    bright = transducer_shape.standing(places)[transducer_shape.sampled(grey, places, view) == 1.0]
+    bright = transducer_shape.on_transducer(places)[transducer_shape.sampled(grey, places, view) == 1.0]
     assert np.allclose(bright, [[20.0, 0.0, 0.0]])
     assert indices.max() == len(shares) - 1 and len(indices) == 6 * 5 * 3
 

@@ -40,7 +40,7 @@ PROBE = Probe(
 )
 FACE, DOWN, LATERAL = np.array([1.0, -0.5, 11.0]), np.array([0.15, 0.1, -1.0]), np.array([1.0, 0.3, 0.0])
 # Two pictures are alike that differ by so little: by mean grey value, and by the share of pixels that are more than SEEN off.
-# Slice and echo: other rounding (no fast_math, LLVM's advanced optimisation) leaves 0.004 and none, the organ's points 1e-4 mm
+# CT and B-mode: other rounding (no fast_math, LLVM's advanced optimisation) leaves 0.004 and none, the organ's points 1e-4 mm
 # off 0.03 and 0.01 %. 3D view: another driver may draw edges half a pixel off, which leaves 0.5 and 0.1 %.
 LIMITS = {CT: (0.2, 0.001), B_MODE: (0.2, 0.001), "3D": (1.0, 0.005)}
 SEEN = 12
@@ -86,7 +86,7 @@ class Scene:
         return image_plane(pose_at(face, -axes[:, 2], axes[:, 0], 20.0), 20.0, WIDTH, DEPTH)
 
     def pictures(self, plane: ImagePlane) -> dict[str, np.ndarray]:
-        """CT and echo as the panel shows them, with the organ's outline, uint8 (rows, columns, 3) each."""
+        """CT and B-mode as the panel shows them, with the organ's outline, uint8 (rows, columns, 3) each."""
         shown = self.scanner.images(plane, PROBE, "both", "speckle", 350.0, 40.0)
         outline = plane_section(
             array_of(self.surface.vertices), self.anatomy.organ.faces, np.linalg.inv(plane.world_from_plane)
@@ -142,7 +142,7 @@ def check(name: str, picture_of, request: pytest.FixtureRequest) -> None:
 
 
 @pytest.mark.parametrize("name", [CT, B_MODE])
-def test_slice_and_echo_are_the_stored_ones(scene, request, name):
+def test_ct_and_b_mode_are_the_stored_ones(scene, request, name):
     check(name, lambda shift, turn: scene.pictures(scene.plane(shift, turn))[name], request)
 
 

@@ -28,7 +28,7 @@ from studies.freehand.freehand_sweeps import sweep_of
 from ultrasound import reconstruction
 from ultrasound.labelled_sweep import LABELS_SUFFIX, SUFFIX, LabelledSweep, read_ground_truth
 from ultrasound.probe import load_probe
-from ultrasound.probe_manipulator import held_at, image_plane, pose_at
+from ultrasound.probe_manipulator import image_plane, pose_at, pose_of_image_plane
 from ultrasound.sweep import PixelLabel, SweepError
 from ultrasound.sweep_file import read_sweep, write_sweep
 from version import VERSION
@@ -60,7 +60,7 @@ def recording(pixels: int = 24) -> tuple[SimpleNamespace, SimpleNamespace]:
     draw = np.random.default_rng(5)
     view = SimpleNamespace(pictures={"B-mode": draw.integers(0, 256, (pixels, pixels), np.uint8), "CT": None})
     marks = SimpleNamespace(render=lambda: view.pictures["B-mode"] % 3)
-    rehearsal.scanner = SimpleNamespace(marks=marks)
+    rehearsal.scanner = SimpleNamespace(ground_truth=marks)
     return rehearsal, view
 
 
@@ -213,7 +213,9 @@ def test_the_matrices_of_a_frame_are_of_its_rows_and_columns(tmp_path):
 
 def test_a_probe_is_held_where_its_image_plane_is():
     pose = pose_at(np.array([9.0, -4, 17]), np.array([0.3, -0.2, -1]), np.array([1, 0.5, 0.2]), 30.0)
-    assert held_at(image_plane(pose, 22.0, 40, 50, 6).world_from_plane, 22.0) == pytest.approx(pose)
+    assert pose_of_image_plane(image_plane(pose, 22.0, 40, 50, 6).world_from_plane, 22.0) == pytest.approx(
+        pose
+    )
 
 
 class Still:

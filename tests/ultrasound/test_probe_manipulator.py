@@ -223,7 +223,7 @@ def test_the_tool_of_a_curved_array_is_its_arc_to_a_tenth_of_a_millimetre(one_de
 
 def test_a_probe_of_short_housing_is_not_pushed_in_beyond_what_holds_it(manipulator):
     manipulator.push(100.0)
-    assert manipulator.depth_mm == manipulator.most_mm == 15.0
+    assert manipulator.depth_mm == manipulator.max_mm == 15.0
     short = ProbeManipulator(
         manipulator.vertices,
         manipulator.faces,

@@ -178,7 +178,7 @@ def test_poses_without_their_times_are_refused():
     poses, times = sweep(5)
     with pytest.raises(ValueError, match="times"):
         with_tracking_errors(poses, times[:4], TrackingErrors())
-    with pytest.raises(ValueError, match="grow"):
+    with pytest.raises(ValueError, match="increase"):
         with_tracking_errors(poses, times[::-1], TrackingErrors())
 
 
