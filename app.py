@@ -25,7 +25,7 @@ from version import VERSION
 COMMANDS = {
     "rehearse": (
         "rehearsal.commands.rehearse_command:rehearse",
-        "Press the kidney of SCENE and see what the probe sees.",
+        "Press the kidney of SCENE with the probe and see its ultrasound image.",
     ),
     "keys": (
         "rehearsal.commands.rehearse_command:keys_command",
@@ -81,8 +81,8 @@ def _stop_in_order() -> None:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
-def _told(error: OSError) -> str:
-    """What is wrong with a disk or a file, where no command had better words."""
+def _file_error(error: OSError) -> str:
+    """The message for an error of disk or file that no command has handled."""
     full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     advice = "free some space" if full else "check that it can be read and written"
     where = error.filename or "what was to be written"
@@ -101,7 +101,7 @@ def main(arguments: list[str]) -> int:
     except UserError as error:
         message = str(error)
     except OSError as error:
-        message = _told(error)
+        message = _file_error(error)
     except MemoryError:
         message = "the memory is full: close other programs, or take a smaller volume, larger cells or particles, or fewer --jobs"
     except (click.Abort, KeyboardInterrupt):

@@ -1,7 +1,6 @@
 """A scene's tissue put on the device with its contacts, ready to step, and what touches it there."""
 
 from dataclasses import fields, replace
-from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,9 @@ import trimesh
 from scenes.scene import Contact, SolverSection
 from scenes.tissue import TissueSection
 from sim.body import RestBody
+from sim.neo_hookean import NeoHookean
 from sim.self_contact import ParticleContacts
+from sim.shape_matching import ShapeMatching
 from sim.shapes import ConvexTool, SignedDistanceField
 from sim.solver import Solver, StepSettings
 from sim.tissue_model import FixedRegion, ModelInputs, TissueModel
@@ -20,9 +21,13 @@ from ultrasound.probe import Probe
 ARC_FLATS = 11
 
 
+# The class that computes each tissue model of scenes/tissue.py.
+TISSUE_MODELS: dict[str, type[TissueModel]] = {"neo-hookean": NeoHookean, "shape-matching": ShapeMatching}
+
+
 def model_of(tissue: TissueSection) -> type[TissueModel]:
-    """What a tissue is built by."""
-    return resolve_name(tissue.BUILT_BY)
+    """The class that computes a tissue."""
+    return TISSUE_MODELS[tissue.model]
 
 
 def static_shape(mesh: trimesh.Trimesh, tissue: TissueSection) -> SignedDistanceField:

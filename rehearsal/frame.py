@@ -1,57 +1,93 @@
-"""The interactive loop: input -> transducer -> step -> surfaces and pictures -> window."""
+"""One frame: input -> step -> image -> observe -> present. Data flows in this direction only."""
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 
 import click
+import numpy as np
 
 from rehearsal.cine import Caliper, Cine, CineFrame
-from rehearsal.frame_view import probe_as_set, take_view
+from rehearsal.frame_view import image_view, probe_with_settings
 from rehearsal.inputs.input_source import InputSource, ReplayInput
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import Tally
+from rehearsal.notices import Notices
 from rehearsal.planning.plans_in_window import Plans
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.saving import save_screenshot, save_surfaces, save_view
+from rehearsal.stopwatch import timed
 from rehearsal.tracking.openigtlink_image import send_live
 from rehearsal.tracking.openigtlink_server import Server
 from rehearsal.tracking.sweep_recording import Sweeping
 from render.keys import Keys
 from render.viewer import Controls, Settings, View, Viewer
+from ultrasound.probe import Probe
 
-# How long what was done is said, and that the guard put the tissue back.
-SAID_S, PUT_BACK_S = 2.0, 4.0
-# A share of real time that is as good as that.
-REAL = 0.9
+# How long a notice stays on the screen, and the one that the tissue's state was restored.
+NOTICE_S, RESTORED_S = 2.0, 4.0
+# The simulation counts as real time from this share of it on.
+REAL_TIME = 0.9
 HOW_TO_PRESS = "{press} or {push} presses"
 
 
 @dataclass
-class FrameLoop:
-    """The frames of one rehearsal in a window, led by a driver."""
+class Frames:
+    """The frames of one rehearsal, with a window (``WindowFrames``) or without one."""
 
     rehearsal: Rehearsal
+    source: InputSource
+    measurements: LiveMeasurements
+    tally: Tally
+    link: Server | None = None
+
+    def input(self, controls: Controls) -> np.ndarray | None:
+        """Return the transducer's next pose (4, 4); None if this frame makes no step."""
+        return self.source.next_pose(controls)
+
+    def step(self, pose: np.ndarray | None) -> None:
+        """Advance the tissue by a time step to a pose, and the surfaces with it."""
+        if pose is not None:
+            timed(partial(self.rehearsal.advance, pose), self.tally.step_ms)
+            self.rehearsal.update_surfaces()
+            self.source.after_step(self.tally.step_ms[-1])
+
+    def image(self, probe: Probe, settings: Settings) -> View:
+        """Compute the images of the probe at its present pose."""
+        return image_view(self.rehearsal, probe, settings, self.tally)
+
+    def observe(self, probe: Probe, pose: np.ndarray | None) -> None:
+        """Measure, and record the session."""
+        self.measurements.watch(self.source.session, probe, pose)
+        self.source.after_frame()
+
+    def send(self, view: View, probe: Probe) -> None:
+        """Send the image over OpenIGTLink, if the link is open."""
+        send_live(self.link, self.rehearsal, view, probe, self.source.session.time_s)
+
+
+@dataclass(kw_only=True)
+class WindowFrames(Frames):
+    """The frames in a window; a frozen one makes no step."""
+
     viewer: Viewer
     out: Path
-    tally: Tally
-    driver: InputSource
-    instruments: LiveMeasurements
+    notices: Notices
     sweeping: Sweeping
     plans: Plans
+    keys: Keys = field(default_factory=Keys)
     cine: Cine = field(default_factory=Cine)
     caliper: Caliper = field(default_factory=Caliper)
-    keys: Keys = field(default_factory=Keys)
-    link: Server | None = None
     frozen: bool = False
     rate: float = 0.0
-    _said: str = ""
-    _said_until: float = 0.0
-    _put_back_until: float = 0.0
+    _notice: str = field(default="", init=False)
+    _notice_until: float = field(default=0.0, init=False)
+    _restored_until: float = field(default=0.0, init=False)
 
     def run(self) -> None:
-        """Go on until the window is closed."""
+        """Draw frames until the window is closed."""
         before = perf_counter()
         while self.viewer.running:
             controls = self.viewer.read_controls()
@@ -60,128 +96,139 @@ class FrameLoop:
             self.rate = 0.9 * self.rate + 0.1 / max(now - before, 1e-6)
             before = now
             self.viewer.draw(view)
-            try:
-                self._save(controls, view)
-            except OSError as error:
-                self._say(f"Not saved: {error.strerror}")
-
-    def _save(self, controls: Controls, view: View) -> None:
-        """What the user wants as files. Raises OSError."""
-        if controls.screenshot:
-            save_screenshot(self.viewer.picture(), self.out)
-        if controls.export:
-            self._export(controls.settings, view)
-
-    def _export(self, settings: Settings, view: View) -> None:
-        """Save the picture and the tissue, and say what is not in them, and why. Raises OSError."""
-        begin, missing = save_view(view, probe_as_set(self.rehearsal.probe, settings), self.out), []
-        if view.notes.keys() & view.pictures.keys():
-            missing.append("echo black: the probe does not touch the organ")
-        if self.frozen and self.cine.back:
-            missing.append("no organ (PLY), which has moved since: {freeze} goes on")
-        else:
-            save_surfaces(self.rehearsal, self.out, begin)
-        self._say("   ".join([f"saved {begin.rstrip('-')}", *missing]))
-        self._tell("; ".join(missing))
+            self._save(controls, view)
 
     def frame(self, controls: Controls) -> View:
-        """One frame: what the user did, a moment unless frozen, and what is to be seen."""
+        """One frame."""
+        pose = self.input(controls)
+        self.step(pose)
+        probe = probe_with_settings(self.rehearsal.probe, controls.settings)
+        view = self.image(probe, controls.settings)
+        self.observe(probe, pose)
+        self._record_sweep(probe, view, controls)
+        return self.present(view, probe, controls)
+
+    def input(self, controls: Controls) -> np.ndarray | None:
+        """Apply the keys of freeze, cine and plans; return the next pose, None if frozen or after a rollback."""
         ends_freeze = (controls.reset, controls.undo, controls.redo, controls.bookmark, controls.to_bookmark)
         if controls.freeze or (self.frozen and (any(ends_freeze) or controls.take_over)):
             self.frozen = not self.frozen
         if controls.reset:
             self.caliper.points = ()
-        self._announce(controls.message)
-        self._announce(self.plans.watch(controls))
-        shown = self._looked_back(controls) or self._taken(controls)
-        if controls.sweep:
-            self._announce(self.sweeping.toggle(self.out))
+        self.notices.post(controls.message)
+        self.notices.post(self.plans.watch(controls))
+        if self.frozen:
+            self.cine.go(controls.cine)
+        return None if self.frozen else super().input(controls)
+
+    def step(self, pose: np.ndarray | None) -> None:
+        """Advance the tissue; post a notice if the divergence check restored its state."""
+        super().step(pose)
+        if pose is not None and self.rehearsal.notice:
+            self.notices.post(self.rehearsal.notice, on_screen=False)
+            self._restored_until = perf_counter() + RESTORED_S
+
+    def image(self, probe: Probe, settings: Settings) -> View:
+        """Compute the images, also of frozen tissue with other settings; of an earlier frame return those that it had."""
+        return self.cine.shown.view if self._shows_earlier else super().image(probe, settings)
+
+    def observe(self, probe: Probe, pose: np.ndarray | None) -> None:
+        """Measure and record, unless frozen."""
+        if not self.frozen:
+            super().observe(probe, pose)
+
+    def present(self, view: View, probe: Probe, controls: Controls) -> View:
+        """Add measurements, caliper and status to the view."""
+        shown = self.cine.shown if self._shows_earlier else self._measured(view, probe, controls.settings)
         view = shown.view
         self.caliper.point(controls.pointed_mm, view.transducer_pose)
         if not self.frozen:
             self.caliper.go_with(view.transducer_pose)
+        self._show_notices()
         return replace(
             view,
             caliper_mm=self.caliper.points,
             caliper=self.caliper.figure(shown),
             readouts=view.readouts | {"frames": f"{self.rate:.0f} /s"},
-            clock=f"{self.driver.session.time_s:.1f} s",
+            clock=f"{self.source.session.time_s:.1f} s",
             pace=self._pace(),
             status=self._status(view),
-            notes={name: self._hinted(note) for name, note in view.notes.items()},
+            notes={name: self._with_hint(note) for name, note in view.notes.items()},
         )
 
-    def _pace(self) -> str:
-        """How slowly simulated time goes, where it is slower than real; a frozen one stands."""
-        speed = self.rate * self.rehearsal.settings.time_step_s
-        return "" if self.frozen or speed >= REAL else f"{speed:.1g} x real"
+    def _record_sweep(self, probe: Probe, view: View, controls: Controls) -> None:
+        if not self.frozen:
+            self.notices.post(self.sweeping.watch(self.source.session.time_s, view, probe))
+        if controls.sweep:
+            self.notices.post(self.sweeping.toggle(self.out))
 
-    def _hinted(self, note: str) -> str:
-        """A note that there is no contact, with what the user can do about it, if anything."""
-        live = self.driver.live if isinstance(self.driver, ReplayInput) else self.driver
-        if self.frozen or not isinstance(live, UserInput) or not live.is_by_hand:
+    @property
+    def _shows_earlier(self) -> bool:
+        """Whether the user looks at an earlier frame of the cine memory."""
+        return self.frozen and self.cine.back > 0
+
+    def _measured(self, view: View, probe: Probe, settings: Settings) -> CineFrame:
+        """The view with its measurements, sent over the link and, unless frozen, kept in the cine memory."""
+        self.send(view, probe)
+        rest = self.rehearsal.rest_grid()
+        shown = CineFrame(perf_counter(), self.measurements.onto(view, settings), rest)
+        if not self.frozen:
+            self.cine.keep(shown)
+        return shown
+
+    def _pace(self) -> str:
+        """Simulated over real time, if the simulation is slower; empty while frozen."""
+        speed = self.rate * self.rehearsal.settings.time_step_s
+        return "" if self.frozen or speed >= REAL_TIME else f"{speed:.1g} x real"
+
+    def _with_hint(self, note: str) -> str:
+        """A note that there is no contact, with the keys that press if these control the probe."""
+        source = self.source.user_input if isinstance(self.source, ReplayInput) else self.source
+        if self.frozen or not isinstance(source, UserInput) or not source.is_manual:
             return note
         return self.keys.worded(f"{note}\n{HOW_TO_PRESS}")
 
     def _status(self, view: View) -> str:
-        """What stands over the pictures, by weight: the tissue before all else, for the last words go where there is no room."""
+        """The text over the images, the most important first: the last words are cut where room ends."""
         now = perf_counter()
-        put_back = "TISSUE PUT BACK" if now < self._put_back_until else ""
-        news = [self._said] if now < self._said_until else [self._state(), self.plans.status]
-        return self.keys.worded(
-            "   ".join(filter(None, [put_back, view.status, self.sweeping.status, *news]))
-        )
+        restored = "STATE RESTORED" if now < self._restored_until else ""
+        news = [self._notice] if now < self._notice_until else [self._state(), self.plans.status]
+        parts = [restored, view.status, self.sweeping.status, *news]
+        return self.keys.worded("   ".join(filter(None, parts)))
 
     def _state(self) -> str:
         if not self.frozen:
-            return self.driver.status
+            return self.source.status
         return f"FROZEN   {self.cine.age_s:.1f} s" if self.cine.back else "FROZEN"
 
-    def _announce(self, text: str) -> None:
-        """Say something in the window and in the terminal."""
-        self._say(text)
-        self._tell(text)
+    def _show_notices(self) -> None:
+        """Show the notices of this frame in the panel and in the terminal."""
+        for notice in self.notices.take():
+            text = self.keys.worded(notice.text)
+            if notice.in_terminal:
+                click.echo(text)
+            if notice.on_screen:
+                self._notice, self._notice_until = text[0].upper() + text[1:], perf_counter() + NOTICE_S
 
-    def _say(self, text: str) -> None:
-        if text:
-            words = self.keys.worded(text)
-            self._said, self._said_until = words[0].upper() + words[1:], perf_counter() + SAID_S
+    def _save(self, controls: Controls, view: View) -> None:
+        """Save what the user asked for."""
+        try:
+            if controls.screenshot:
+                save_screenshot(self.viewer.picture(), self.out)
+            if controls.export:
+                self._export(controls.settings, view)
+        except OSError as error:
+            self.notices.post(f"Not saved: {error.strerror}", in_terminal=False)
 
-    def _looked_back(self, controls: Controls) -> CineFrame | None:
-        """A frame of the last seconds, where the user is looking at one."""
-        if self.frozen:
-            self.cine.go(controls.cine)
-        if not self.frozen or self.cine.back == 0:
-            return None
-        return self.cine.shown
-
-    def _taken(self, controls: Controls) -> CineFrame:
-        """A new frame. A frozen one shows the same tissue with the scanner set anew, and is not kept."""
-        if self.frozen:
-            view = take_view(self.rehearsal, controls.settings, None, self.tally)
-            return self._sent(view, controls.settings)
-        pose = self.driver.move(controls)
-        self._say(self.driver.take_said())
-        view = take_view(self.rehearsal, controls.settings, pose, self.tally)
-        if pose is not None:
-            if self.rehearsal.notice:
-                self._tell(self.rehearsal.notice)
-                self._put_back_until = perf_counter() + PUT_BACK_S
-            self._tell(self.driver.stepped(self.tally.step_ms[-1]))
-        probe = probe_as_set(self.rehearsal.probe, controls.settings)
-        self.instruments.watch(self.driver.session, probe, pose)
-        self._announce(self.sweeping.watch(self.driver.session.time_s, view, probe))
-        self._tell(self.driver.watch())
-        frame = self._sent(view, controls.settings)
-        self.cine.keep(frame)
-        return frame
-
-    def _sent(self, view: View, settings: Settings) -> CineFrame:
-        """A view sent over the link, and with what the instruments read."""
-        probe = probe_as_set(self.rehearsal.probe, settings)
-        send_live(self.link, self.rehearsal, view, probe, self.driver.session.time_s)
-        return CineFrame(perf_counter(), self.instruments.onto(view, settings), self.rehearsal.rest_grid())
-
-    def _tell(self, news: str) -> None:
-        if news:
-            click.echo(self.keys.worded(news))
+    def _export(self, settings: Settings, view: View) -> None:
+        """Save images and surfaces; say what is missing, and why. Raises OSError."""
+        probe = probe_with_settings(self.rehearsal.probe, settings)
+        begin, missing = save_view(view, probe, self.out), []
+        if view.notes.keys() & view.pictures.keys():
+            missing.append("B-mode image black: the probe does not touch the organ")
+        if self._shows_earlier:
+            missing.append("no organ (PLY), which has moved since: {freeze} continues")
+        else:
+            save_surfaces(self.rehearsal, self.out, begin)
+        self.notices.post("   ".join([f"saved {begin.rstrip('-')}", *missing]), in_terminal=False)
+        self.notices.post("; ".join(missing), on_screen=False)

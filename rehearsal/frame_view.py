@@ -1,4 +1,4 @@
-"""What one frame of a rehearsal shows: pictures, read-outs, and what the sliders start from."""
+"""The view of one frame: images, overlays and read-outs; the window's geometry; where the sliders start."""
 
 from functools import partial
 
@@ -10,15 +10,15 @@ from rehearsal.stopwatch import timed
 from render.display import window_size
 from render.gamepad import Gamepad
 from render.keys import Keys
-from render.viewer import Geometry, Settings, View, Viewer
+from render.viewer import Geometry, ScannerSettings, Settings, View, Viewer
 from render.window_layout import FULL_SIZE
 from ultrasound.probe import TGC_SLIDERS, Probe
 
 TGC = tuple(f"tgc_{i + 1}" for i in range(TGC_SLIDERS))
 
 
-def settings_of(rehearsal: Rehearsal) -> Settings:
-    """What the sliders start from."""
+def initial_settings(rehearsal: Rehearsal) -> Settings:
+    """The settings at the start: those of scene and probe."""
     scene, step, probe = rehearsal.scene, rehearsal.settings, rehearsal.probe
     tissue = scene.tissue
     settings = Settings(
@@ -42,8 +42,8 @@ def settings_of(rehearsal: Rehearsal) -> Settings:
     return settings
 
 
-def probe_as_set(probe: Probe, settings: Settings) -> Probe:
-    """The probe with the scanner set as the sliders are."""
+def probe_with_settings(probe: Probe, settings: ScannerSettings) -> Probe:
+    """The probe with the scanner's settings."""
     low, high = probe.frequency_range_mhz
     return probe.model_copy(
         update=dict(
@@ -60,7 +60,7 @@ def probe_as_set(probe: Probe, settings: Settings) -> Probe:
 def open_viewer(
     rehearsal: Rehearsal, visible: bool, keys: Keys | None = None, gamepad: Gamepad | None = None
 ) -> Viewer:
-    """The window, or its off-screen twin. Raises NoVulkan."""
+    """Open the window, on the screen or off it. Raises NoVulkan."""
     from render.window import Window
 
     support, tumour = rehearsal.supports, rehearsal.tumour
@@ -82,7 +82,7 @@ def open_viewer(
             support_vertices=np.asarray(support[0].vertices, np.float32) if support else None,
             support_faces=np.asarray(support[0].faces, np.int32) if support else None,
         ),
-        settings_of(rehearsal),
+        initial_settings(rehearsal),
         window_size() if visible else FULL_SIZE,
         visible,
         keys=keys,
@@ -90,25 +90,8 @@ def open_viewer(
     )
 
 
-def take_step(rehearsal: Rehearsal, pose: np.ndarray | None, tally: Tally) -> None:
-    """Step with the transducer going to a pose, where there is one, and carry the surfaces."""
-    if pose is not None:
-        timed(partial(rehearsal.advance, pose), tally.step_ms)
-        rehearsal.update_surfaces()
-
-
-def take_view(
-    rehearsal: Rehearsal,
-    settings: Settings,
-    pose: np.ndarray | None,
-    tally: Tally,
-) -> View:
-    """One frame, on screen and off: step with the transducer going to a pose, carry the surfaces, take the pictures.
-
-    Without a pose, as when frozen, the pictures alone are taken anew.
-    """
-    take_step(rehearsal, pose, tally)
-    probe = probe_as_set(rehearsal.probe, settings)
+def image_view(rehearsal: Rehearsal, probe: Probe, settings: Settings, tally: Tally) -> View:
+    """Compute the images of the probe at its present pose, with overlays and read-outs."""
     shown = settings.mode, settings.detail_level, settings.window_hu, settings.level_hu
     pictures = timed(partial(rehearsal.look, probe, *shown), tally.slice_ms)
     width, depth, above = probe.extent_mm
@@ -128,13 +111,16 @@ def take_view(
     )
 
 
-def captions(probe: Probe, settings: Settings) -> tuple[str, str, str]:
-    """The probe, and what echo and CT are shown with."""
-    echo = f"{probe.frequency_mhz:.1f} MHz   G {probe.gain_percent:.0f} %   DR {probe.dyn_range_db:.0f} dB   {settings.detail_level}"
+def captions(probe: Probe, settings: ScannerSettings) -> tuple[str, str, str]:
+    """The probe's name, and the settings of the B-mode image and of the CT."""
+    b_mode = (
+        f"{probe.frequency_mhz:.1f} MHz   G {probe.gain_percent:.0f} %   DR {probe.dyn_range_db:.0f} dB   "
+        f"{settings.detail_level}"
+    )
     ct = f"W {settings.window_hu}   L {settings.level_hu} HU"
     return (
         probe.transducer_name,
-        "" if settings.mode == "ct" else echo,
+        "" if settings.mode == "ct" else b_mode,
         "" if settings.mode == "b-mode" else ct,
     )
 

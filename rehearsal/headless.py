@@ -1,21 +1,20 @@
-"""A rehearsal without a screen: the scripted press, or a session that was recorded."""
+"""A rehearsal without a screen: the scripted press, or a recorded session."""
 
-import json
 from pathlib import Path
 
 import click
 from PIL import Image
 from tqdm import tqdm
 
-from rehearsal.frame_view import open_viewer, probe_as_set, take_step, take_view
+from rehearsal.frame import Frames
+from rehearsal.frame_view import open_viewer, probe_with_settings
 from rehearsal.image_files import save_picture
-from rehearsal.inputs.input_source import InputSource
 from rehearsal.measurements.live_measurements import LiveMeasurements
-from rehearsal.measurements.run_report import Tally, summary
+from rehearsal.measurements.run_report import summary
+from rehearsal.notices import Notices
 from rehearsal.rehearsal import Rehearsal
+from rehearsal.result_files import write_json
 from rehearsal.saving import save_surfaces
-from rehearsal.tracking.openigtlink_image import send_live
-from rehearsal.tracking.openigtlink_server import Server
 from render.animation import ANIMATION_FPS, empty_folder, save_animation, scaled_down, side_by_side
 from render.viewer import Controls, Settings, View, Viewer
 from render.window import NoVulkan
@@ -43,14 +42,14 @@ class Pictures:
         self._frames, self._slices = map(empty_folder, folders)
         self._animation: list[Image.Image] = []
 
-    def draw(self, step: int, view: View, settings: Settings, instruments: LiveMeasurements) -> None:
+    def draw(self, step: int, view: View, settings: Settings, measurements: LiveMeasurements) -> None:
         """A step's, where they are due."""
         if step % self._every and step < self.steps:
             return
         picture = side_by_side(view)
         save_picture(picture, self._slices / f"{step:05d}.png")
         if self.viewer is not None:
-            self.viewer.draw(instruments.onto(view, settings))
+            self.viewer.draw(measurements.onto(view, settings))
             picture = Image.fromarray(self.viewer.picture())
             save_picture(picture, self._frames / f"{step:05d}.png")
         if step % self._shown_every == 0 or step == self.steps:
@@ -64,45 +63,38 @@ class Pictures:
 
 
 def run_headless(
-    rehearsal: Rehearsal,
-    driver: InputSource,
+    frames: Frames,
+    notices: Notices,
     steps: int,
     settings: Settings,
-    instruments: LiveMeasurements,
     arch: str,
     out: Path,
-    build_s: float,
     draws: bool = True,
-    link: Server | None = None,
 ) -> None:
-    """So many moments that a driver leads: surfaces and report.json; where it ``draws``, pictures too, also for the link."""
+    """Compute so many frames; write surfaces and report.json, and where it ``draws``, images too, also for the link."""
+    rehearsal, tally = frames.rehearsal, frames.tally
     pictures = Pictures(rehearsal, steps, out) if draws else None
-    tally = Tally(build_s)
     for step in tqdm(range(1, steps + 1), desc="press", unit="step"):
-        pose = driver.move(Controls(settings))
-        probe = probe_as_set(rehearsal.probe, settings)
-        view = None if pictures is None else take_view(rehearsal, settings, pose, tally)
-        if view is None:
-            take_step(rehearsal, pose, tally)
+        pose = frames.input(Controls(settings))
+        frames.step(pose)
+        probe = probe_with_settings(rehearsal.probe, settings)
+        if pictures is None:
             rehearsal.find_plane(probe)
+        else:
+            view = frames.image(probe, settings)
         if pose is not None:
-            _tell(driver.stepped(tally.step_ms[-1]))
-            # After a way back the tissue is where it was, but the tool only with the next step.
+            # After a rollback the tissue is restored, but the tool only with the next step.
             tally.watch(rehearsal)
-        instruments.watch(driver.session, probe, pose)
-        _tell(driver.watch())
-        if pictures is not None and view is not None:
-            send_live(link, rehearsal, view, probe, driver.session.time_s)
-            pictures.draw(step, view, settings, instruments)
+        frames.observe(probe, pose)
+        if pictures is not None:
+            frames.send(view, probe)
+            pictures.draw(step, view, settings, frames.measurements)
+        for notice in notices.take():
+            if notice.in_terminal:
+                click.echo(notice.text)
     save_surfaces(rehearsal, out)
     drawn = [pictures.save()] if pictures is not None else []
-    report = tally.report(rehearsal, arch) | dict(reading=instruments.figures())
-    with whole(out / "report.json") as partial:
-        partial.write_text(json.dumps(report, indent=2) + "\n", "utf-8")
+    report = tally.report(rehearsal, arch) | dict(reading=frames.measurements.figures())
+    write_json(report, out / "report.json")
     click.echo(summary(report))
     click.echo(f"Wrote {' and '.join([*drawn, 'report.json'])} to {out}")
-
-
-def _tell(news: str) -> None:
-    if news:
-        click.echo(news)

@@ -216,11 +216,10 @@ class Rehearsal:
         self.pose = pose
         self.steps += 1
 
-    def snapshot(self) -> RehearsalState:
-        """A copy of the current state."""
-        return RehearsalState(
-            self.solver.snapshot(), self.guard.watch, self.pose, self.steps, self.manipulator.state
-        )
+    def snapshot(self, manipulator: ManipulatorState | None = None) -> RehearsalState:
+        """A copy of the present state, with the manipulator's present state or another one."""
+        held = manipulator or self.manipulator.state
+        return RehearsalState(self.solver.snapshot(), self.guard.watch, self.pose, self.steps, held)
 
     def restore(self, state: RehearsalState) -> None:
         """Go back to a state; the steps that follow give the same bits as they did from it before."""

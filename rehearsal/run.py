@@ -1,4 +1,4 @@
-"""A rehearsal from its first moment to its last: who leads it, what is recorded of it, and what is said at its end."""
+"""A rehearsal from start to end: its input source, its recording, and its summary."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,20 +13,21 @@ from psutil import Process
 
 from rehearsal.adaptive_iterations import AdaptiveIterations
 from rehearsal.commands.command_line import STOPPED, CommandError
-from rehearsal.commands.option_checks import origin_in_words
-from rehearsal.frame import FrameLoop
-from rehearsal.frame_view import open_viewer, settings_of
+from rehearsal.commands.option_checks import replay_warning
+from rehearsal.frame import Frames, WindowFrames
+from rehearsal.frame_view import initial_settings, open_viewer
 from rehearsal.headless import run_headless
 from rehearsal.inputs.input_source import InputSource, ReplayInput, ScriptedInput
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import Tally
 from rehearsal.measurements.session_summary import summary_text
+from rehearsal.notices import Notices
 from rehearsal.planning.plan_file import Plan
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.plans_in_window import Plans
 from rehearsal.rehearsal import Rehearsal, RehearsalState
-from rehearsal.sessions.open_session import opened
+from rehearsal.sessions.open_session import open_session
 from rehearsal.sessions.recorder import SessionRecorder, record
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session import Session
@@ -45,9 +46,9 @@ from scenes.shell_quoting import pasted
 
 @dataclass
 class RehearsalRun:
-    """One rehearsal, its anatomy, the folder for what comes of it, and what leads beside the mouse.
+    """One rehearsal, its anatomy, its output folder, and what moves the transducer beside the mouse.
 
-    ``tracked`` is a probe that is tracked now, ``track`` the way of one that was; ``scene`` is the path that the user named, if any.
+    ``tracked`` is a probe that is tracked now, ``track`` recorded poses of one; ``scene`` is the path that the user named, if any.
     """
 
     rehearsal: Rehearsal
@@ -62,122 +63,144 @@ class RehearsalRun:
     link: Server | None = None
     plan: Plan | None = None
     scene: Path | None = None
-    recorded: SessionRecorder | None = field(default=None, init=False)
+    recorder: SessionRecorder | None = field(default=None, init=False)
+    notices: Notices = field(default_factory=Notices, init=False)
 
     def __post_init__(self) -> None:
         guide = None if self.plan is None else PlanGuidance(self.rehearsal, self.plan)
-        self.instruments = LiveMeasurements(self.rehearsal, guide)
+        self.measurements = LiveMeasurements(self.rehearsal, guide)
 
     def in_window(self, log: Log | None, at_s: float) -> None:
-        """Led by the user, in a window; with a log by that first. Raises CommandError, SessionError."""
+        """Run in a window, after a replay of the log if there is one. Raises CommandError, SessionError."""
         pad = Gamepad(SdlPads(), self.keys.buttons) if self.gamepad else None
         try:
             viewer = open_viewer(self.rehearsal, visible=True, keys=self.keys, gamepad=pad)
         except NoVulkan as reason:
             raise CommandError(f"{reason}; install a Vulkan driver, or run with --headless") from None
         replay = None if log is None else self._replay(log, at_s, viewer.settings)
-        driver: InputSource = self._live() if replay is None else ReplayInput(replay, self._take_over)
-        sweeping = Sweeping(self.rehearsal)
+        source = self._user_input() if replay is None else self._replay_input(replay)
         after_s = time() - Process().create_time()
-        told = (
+        text = (
             f"The window is open, {after_s:.0f} s after the start; {{help}} shows the keys, {{quit}} quits."
         )
-        click.echo(self.keys.worded(told))
-        plans = Plans(self.rehearsal, self.anatomy, self.instruments, self.out)
-        parts = driver, self.instruments, sweeping, plans
-        loop = FrameLoop(self.rehearsal, viewer, self.out, Tally(0.0), *parts, keys=self.keys, link=self.link)
+        click.echo(self.keys.worded(text))
+        frames = WindowFrames(
+            self.rehearsal,
+            source,
+            self.measurements,
+            Tally(0.0),
+            self.link,
+            viewer=viewer,
+            out=self.out,
+            notices=self.notices,
+            sweeping=Sweeping(self.rehearsal),
+            plans=Plans(self.rehearsal, self.anatomy, self.measurements, self.out),
+            keys=self.keys,
+        )
         try:
-            with self._summed_up(driver, replay):
-                loop.run()
+            with self._summarised(source, replay):
+                frames.run()
         finally:
             viewer.close()
-            plans.stop()
-            _say(sweeping.end())
+            frames.plans.stop()
+            _echo(frames.sweeping.end())
 
     def headless(
         self, log: Log | None, at_s: float, seconds: float | None, build_s: float, draws: bool = True
     ) -> None:
-        """Led by the scene's script, a log, or a tracked file, as long as that is. Raises CommandError, SessionError."""
-        rehearsal, settings = self.rehearsal, settings_of(self.rehearsal)
+        """Run the scripted press, a log or recorded poses to their end. Raises CommandError, SessionError."""
+        settings = initial_settings(self.rehearsal)
         replay = None if log is None else self._replay(log, at_s, settings)
-        step_s = rehearsal.settings.time_step_s
-        driver: InputSource
-        if self.track is not None:
-            length_s = self.track.length_s if seconds is None else min(seconds, self.track.length_s)
-            # A moment at 0 s, and one at the end; no step is too slow, so that the bits do not turn on the machine.
-            steps = 1 + int(length_s / step_s + 1e-9)
-            driver = self._live(budget_ms=np.inf)
-        elif replay is None:
-            steps = max(1, round((seconds or rehearsal.script_length_s()) / step_s))
-            session = self._session()
-            driver = ScriptedInput(session, self._record(session), steps)
+        source: InputSource
+        if replay is not None:
+            source, steps = self._replay_input(replay), self._replayed_steps(replay, at_s, seconds)
+        elif self.track is not None:
+            source, steps = self._tracked_input(self.track, seconds)
         else:
-            steps = len(replay.log.poses) - replay.session.moment
-            if seconds:
-                steps = min(steps, max(1, round(seconds / step_s)))
-            if steps == 0:
-                raise CommandError(
-                    f"the session has nothing after {at_s:g} s: it is {replay.log.length_s:.1f} s long"
-                )
-            driver = ReplayInput(replay, self._take_over)
-        told = self.instruments, self.arch, self.out, build_s, draws, self.link
-        with self._summed_up(driver, replay):
-            run_headless(rehearsal, driver, steps, settings, *told)
+            source, steps = self._scripted_input(seconds)
+        frames = Frames(self.rehearsal, source, self.measurements, Tally(build_s), self.link)
+        with self._summarised(source, replay):
+            run_headless(frames, self.notices, steps, settings, self.arch, self.out, draws)
+
+    def _replayed_steps(self, replay: Replay, at_s: float, seconds: float | None) -> int:
+        steps = len(replay.log.poses) - replay.session.step_index
+        if steps == 0:
+            raise CommandError(
+                f"the session has nothing after {at_s:g} s: it is {replay.log.length_s:.1f} s long"
+            )
+        return steps if not seconds else min(steps, max(1, round(seconds / self._step_s)))
+
+    def _tracked_input(self, track: TimedPoses, seconds: float | None) -> tuple[InputSource, int]:
+        length_s = track.length_s if seconds is None else min(seconds, track.length_s)
+        # One step at 0 s and one at the end; without a budget, so that the bits do not depend on the machine's speed.
+        return self._user_input(budget_ms=np.inf), 1 + int(length_s / self._step_s + 1e-9)
+
+    def _scripted_input(self, seconds: float | None) -> tuple[InputSource, int]:
+        steps = max(1, round((seconds or self.rehearsal.script_length_s()) / self._step_s))
+        session = self._session()
+        return ScriptedInput(session, self._record(session), steps), steps
+
+    @property
+    def _step_s(self) -> float:
+        return self.rehearsal.settings.time_step_s
 
     def _session(self) -> Session:
-        return Session(self.rehearsal, seen=lambda: self.instruments.coverage.seen)
+        return Session(self.rehearsal, coverage=lambda: self.measurements.coverage.seen)
 
-    def _live(self, begins: RehearsalState | None = None, budget_ms: float | None = None) -> UserInput:
-        ladder = AdaptiveIterations(budget_ms or self.budget_ms or 1000 * self.rehearsal.settings.time_step_s)
+    def _user_input(self, begins: RehearsalState | None = None, budget_ms: float | None = None) -> UserInput:
+        adaptive = AdaptiveIterations(budget_ms or self.budget_ms or 1000 * self._step_s)
         session = self._session()
+        recorder = self._record(session, begins)
         tracked = self.tracked if self.track is None else PlayedPoses(self.track, session)
-        waits = begins is not None
-        return UserInput(session, ladder, self._record(session, begins), waits=waits, tracked=tracked)
+        return UserInput(session, adaptive, recorder, begins is not None, tracked, self.notices)
+
+    def _replay_input(self, replay: Replay) -> ReplayInput:
+        return ReplayInput(replay, self._take_over, self.notices)
 
     def _take_over(self) -> UserInput:
-        """The user leads on from where a replay is: a session of its own."""
+        """The user continues where the replay is: in a new session."""
         self.rehearsal.manipulator.match(self.rehearsal.pose)
-        self.instruments.begin_anew()
-        return self._live(self.rehearsal.snapshot())
+        self.measurements.restart()
+        return self._user_input(self.rehearsal.snapshot())
 
     def _record(self, session: Session, begins: RehearsalState | None = None) -> SessionRecorder | None:
         try:
-            self.recorded = record(session, self.anatomy, self.arch, self.out, begins)
+            self.recorder = record(session, self.anatomy, self.arch, self.out, begins, self.notices)
         except OSError as error:
             click.echo(
-                f"Mind: this session is not recorded: {self.out} cannot be written to ({error.strerror})"
+                f"Warning: this session is not recorded: {self.out} cannot be written to ({error.strerror})"
             )
-        return self.recorded
+        return self.recorder
 
     def _replay(self, log: Log, at_s: float, settings: Settings) -> Replay:
-        _say(origin_in_words(log.header, self.arch))
-        return opened(log, at_s, self.rehearsal, settings, self.instruments)
+        _echo(replay_warning(log.header, self.arch))
+        return open_session(log, at_s, self.rehearsal, settings, self.measurements)
 
     @contextmanager
-    def _summed_up(self, driver: InputSource, replay: Replay | None) -> Iterator[None]:
-        """Say at the end how it went, also where Ctrl-C is the end."""
+    def _summarised(self, source: InputSource, replay: Replay | None) -> Iterator[None]:
+        """Print the summary at the end, also after Ctrl-C."""
         try:
             yield
         except KeyboardInterrupt:
-            click.echo(f"\nStopped at {driver.session.time_s:.1f} s; until then:")
+            click.echo(f"\nStopped at {source.session.time_s:.1f} s; until then:")
             raise Exit(STOPPED) from None
         finally:
-            self._end(driver.bookmarks)
-            _say(_verdict(replay))
+            self._end(source.bookmarks)
+            _echo(_verdict(replay))
 
     def _end(self, bookmarks: int) -> None:
-        summary = self.instruments.summary(bookmarks)
+        summary = self.measurements.summary(bookmarks)
         click.echo(summary_text(summary))
-        guide = self.instruments.guide
+        guide = self.measurements.guide
         if guide is not None:
-            _say(guide.in_words(summary.get(f"seen_{guide.plan.target}")))
-        if self.recorded is not None:
-            self.recorded.close(summary)
-            told = f"SessionRecorder; replay it with: {self._replaying(self.recorded.recording.path)}"
-            click.echo(self.recorded.recording.fault or told)
+            _echo(guide.in_words(summary.get(f"seen_{guide.plan.target}")))
+        if self.recorder is not None:
+            self.recorder.close(summary)
+            text = f"Recorded; replay it with: {self._replay_command(self.recorder.recording.path)}"
+            click.echo(self.recorder.recording.fault or text)
 
-    def _replaying(self, session: Path) -> str:
-        """The command line that replays a session, to be pasted."""
+    def _replay_command(self, session: Path) -> str:
+        """The command line that replays a session, quoted for the shell."""
         scene = [] if self.scene is None else [self.scene]
         return pasted("rehearse", *scene, "--replay", session)
 
@@ -193,6 +216,6 @@ def _verdict(replay: Replay | None) -> str:
     return f"replay    identical in all {replay.compared} states compared, to {replay.time_s:.1f} s; state {replay.state}"
 
 
-def _say(text: str) -> None:
+def _echo(text: str) -> None:
     if text:
         click.echo(text)

@@ -97,22 +97,26 @@ def _level(number: int):
     return _slider(50, f"{number}", "", 0, 100, TGC)
 
 
+# The metadata of a setting (label, unit, low, high, group) is all that its slider is made of. One that is None or has no metadata has
+# no slider.
 @dataclass
-class Settings:
-    """What the user sets. The metadata of a field (label, unit, low, high, group) is all that its slider is made of.
-
-    A field that is None or has no metadata has no slider: of the first two, each tissue model has one.
-    """
+class TissueSettings:
+    """Settings of tissue and solver; each tissue model has one of the first two."""
 
     young_kpa: float | None = _slider(None, "Young", "kPa", 1.0, 100.0, "Tissue")
     stiffness: float | None = _slider(None, "Stiffness", "", 0.1, 1.0, "Tissue")
     iterations: int = _slider(9, "Iter.", "", 1, 40, "Tissue")
     substeps: int = _slider(3, "Substeps", "", 1, 10, "Tissue")
     gravity_m_s2: float = _slider(9.81, "g", "m/s2", 0.0, 20.0, "Tissue")
+
+
+@dataclass
+class ScannerSettings:
+    """Settings of the ultrasound scanner, and of the CT beside it."""
+
     depth_mm: int = _slider(60, "Depth", "mm", 5, 300, "Picture")
     window_hu: int = _slider(350, "W", "HU", 1, 2000, "Picture")
     level_hu: int = _slider(40, "L", "HU", -500, 500, "Picture")
-    margin_mm: int = _slider(5, "Margin", "mm", 0, 20, "Picture")
     gain_percent: int = _slider(50, "Gain", "%", 0, 100, B_MODE)
     dyn_range_db: int = _slider(60, "DR", "dB", 20, 120, B_MODE)
     frequency_mhz: float = _slider(7.5, "", "MHz", 2.0, 15.0, B_MODE)
@@ -125,6 +129,14 @@ class Settings:
     tgc_6: int = _level(6)
     tgc_7: int = _level(7)
     tgc_8: int = _level(8)
+    mode: Mode = "both"
+    detail_level: DetailLevel = "speckle"
+
+
+@dataclass
+class ViewSettings:
+    """What the window shows."""
+
     translucent: bool = _switch(True, "Translucent")
     cut: bool = _switch(False, "Cut open")
     show_tumour: bool = _switch(True, "Tumour")
@@ -133,9 +145,19 @@ class Settings:
     outline: bool = _switch(False, "Outline")
     show_scanner: bool = False
     show_seen: bool = False
-    mode: Mode = "both"
-    detail_level: DetailLevel = "speckle"
+
+
+@dataclass
+class PlanSettings:
+    """What the next plan is made for."""
+
+    margin_mm: int = _slider(5, "Margin", "mm", 0, 20, "Picture")
     plan_for: Target = "margin"
+
+
+@dataclass
+class Settings(PlanSettings, ViewSettings, ScannerSettings, TissueSettings):
+    """What the user sets; each part of the program is handed its own part. A session records them by their names."""
 
 
 @dataclass(frozen=True)

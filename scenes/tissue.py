@@ -1,7 +1,7 @@
 """The tissue models as a scene names them: what each is told, and which there are."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, SerializeAsAny
 
@@ -14,16 +14,14 @@ USUAL = "neo-hookean"
 
 
 class TissueSection(Section):
-    """What a model is told: a section of a scene file. Each subclass is a model that a scene can name.
+    """The section ``[tissue]`` of a scene file. Each subclass is a tissue model that a scene can name; ``TISSUES`` lists them.
 
-    ``BUILT_BY`` is its ``sim.tissue_model.TissueModel``, imported when it is built. ``SIZE`` is the key that says how fine it is,
-    ``PIECES`` what that is the size of, among its counts. ``REPORTED`` is its line of a report, with names of keys and counts.
-    ``STEP`` is its own choice of a step, by names of the solver's section, where it is not the paper's; ``PRESETS`` are what each
-    quality changes of keys and step, from coarse to fine. ``CAN_TOUCH_ITSELF``: it takes contacts of particles;
-    ``CAN_BE_HELD``: an attachment.
+    ``SIZE`` is the key of the resolution, ``PIECES`` what that is the size of, among the model's counts. ``REPORTED`` is its line of
+    a report, with names of keys and counts. ``STEP`` has its own defaults of the solver's section, where these are not the paper's;
+    ``PRESETS`` has what each quality changes of keys and step, from coarse to fine. ``CAN_TOUCH_ITSELF``: it supports self-contact;
+    ``CAN_BE_HELD``: an attachment (fixed nodes).
     """
 
-    BUILT_BY: ClassVar[str]
     SIZE: ClassVar[str]
     PIECES: ClassVar[str]
     REPORTED: ClassVar[str]
@@ -34,19 +32,10 @@ class TissueSection(Section):
 
     model: str
 
-    @classmethod
-    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        super().__pydantic_init_subclass__(**kwargs)
-        TISSUES[get_args(cls.model_fields["model"].annotation)[0]] = cls
-
     @property
     def size_mm(self) -> float:
-        """How fine the model is [mm]."""
+        """The resolution [mm]."""
         return getattr(self, self.SIZE)
-
-
-# All models by name, in the order in which they stand here.
-TISSUES: dict[str, type[TissueSection]] = {}
 
 
 class NeoHookeanTissue(TissueSection):
@@ -55,7 +44,6 @@ class NeoHookeanTissue(TissueSection):
     The presets are points of the front that ``study trade`` measures.
     """
 
-    BUILT_BY = "sim.neo_hookean:NeoHookean"
     SIZE, PIECES = "cell_mm", "cells"
     REPORTED = (
         "neo-Hookean, E {young_kpa:g} kPa, nu {poisson:g}: {cells} cells of {cell_mm:g} mm, {nodes} nodes"
@@ -80,7 +68,6 @@ class ShapeMatchingTissue(TissueSection):
     its motion, for all particles weigh the same. The presets are the paper's particles.
     """
 
-    BUILT_BY = "sim.shape_matching:ShapeMatching"
     SIZE, PIECES = "radius_mm", "particles"
     REPORTED = (
         "shape matching, stiffness {stiffness:g}: {particles} particles of {radius_mm:g} mm, {clusters} clusters, "
@@ -96,6 +83,13 @@ class ShapeMatchingTissue(TissueSection):
     volume_sampling: float = Field(4.0, ge=1, le=8)
     cluster_spacing: float = Field(3.33, ge=1, le=20)
     surface_samples_per_mm2: float = Field(0.0, ge=0, le=10)
+
+
+# The tissue models by name; rehearsal/build_solver.py has the class of sim/ that computes each.
+TISSUES: dict[str, type[TissueSection]] = {
+    "neo-hookean": NeoHookeanTissue,
+    "shape-matching": ShapeMatchingTissue,
+}
 
 
 def _of_its_model(values: Any) -> Any:

@@ -248,8 +248,8 @@ def test_the_tool_of_the_example_presses_tissue():
 
 def test_what_the_window_says_in_capitals_is_explained():
     ladder = AdaptiveIterations(1.0)
-    ladder.rung = 1
-    assert f"*{ladder.says(8).partition('   ')[0]}*" in text(DOCS / "rehearsal.md")
+    ladder.level = 1
+    assert f"*{ladder.status(8).partition('   ')[0]}*" in text(DOCS / "rehearsal.md")
     assert f"`image.contact_gap_mm` of the scene ({Image().contact_gap_mm} mm)" in text(
         DOCS / "ultrasound.md"
     )

@@ -45,40 +45,39 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("scene", type=click.Path(path_type=Path), default=EMBEDDED, required=False)
 @click.option(
-    "--headless", is_flag=True, help="No window: run the scripted press, write pictures and a report."
+    "--headless", is_flag=True, help="No window: run the scripted press, write images and a report."
 )
 @click.option(
     "--no-pictures",
     is_flag=True,
-    help="With --headless: no pictures, which take most of the time; the report, the surfaces and the session all the same.",
+    help="With --headless: no images, which take most of the time; only report, surfaces and session.",
 )
 @click.option(
     "--seconds",
     type=NumberRange(0.02, 3600),
-    help="Simulated seconds without a window [the scene's press]; the scripted press is as fast or slow as fills them, a replay or a "
-    "track is cut off.",
+    help="Simulated seconds without a window [the scene's press]; the scripted press is stretched to them, a replay or a track is cut off.",
 )
 @click.option(
     "--replay",
     type=click.Path(path_type=Path),
-    help="A session recorded before, of this SCENE: the same once more, bit for bit.",
+    help="Replay a recorded session of this SCENE, bit for bit.",
 )
-@click.option("--at", type=NumberRange(0), default=0.0, help="With --replay: open it at this second.")
+@click.option("--at", type=NumberRange(0), default=0.0, help="With --replay: start at this second.")
 @click.option(
     "--track",
     "track_file",
     type=click.Path(path_type=Path),
-    help="A probe's way to be followed: a tracked sweep (.igs.mha), or poses with times (CSV, JSON).",
+    help="Recorded poses that move the probe: a tracked sweep (.igs.mha), or poses with times (CSV, JSON).",
 )
 @click.option(
     "--track-from", help=f"With --track: the sweep's transform from probe to patient [{PROBE_IN_PATIENT}]."
 )
-@click.option("--gamepad", is_flag=True, help="A gamepad leads beside mouse and keys.")
+@click.option("--gamepad", is_flag=True, help="Use a gamepad beside mouse and keys.")
 @click.option(
     "--keys",
     "keys_file",
     type=click.Path(path_type=Path),
-    help="Keys and buttons of your own: a TOML file as app.py keys prints it.",
+    help="Your own key map: a TOML file as printed by app.py keys.",
 )
 @click.option(
     "--plan", "plan_file", type=click.Path(path_type=Path), help="A sweep to follow: a file of app.py plan."
@@ -88,7 +87,7 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path),
     default=Path("out"),
     show_default=True,
-    help="Folder for pictures and the report; a run without a window replaces those of the run before.",
+    help="Folder for images and report; a run without a window replaces those of an earlier one.",
 )
 @arch_option
 @click.option("--model", type=click.Choice(list(TISSUES)), help="Tissue model [the scene's].")
@@ -98,10 +97,10 @@ if TYPE_CHECKING:
 @click.option("--radius", type=Number(), help="shape-matching: particle radius in mm [the scene's].")
 @click.option("--stiffness", type=Number(), help="shape-matching: cluster stiffness, 0 to 1 [the scene's].")
 @click.option("--substeps", type=int, help="Substeps of a time step [the model's].")
-@click.option("--iterations", type=int, help="Passes over the constraints in a substep [the model's].")
+@click.option("--iterations", type=int, help="Iterations of the solver in a substep [the model's].")
 @quality_option
 @click.option("--probe", help="Probe, by its name or as a file [the scene's].")
-@click.option("--picture", type=click.Choice(MODES), help="Echo, CT or both [the scene's].")
+@click.option("--picture", type=click.Choice(MODES), help="B-mode, CT or both [the scene's].")
 @click.option(
     "--detail-level",
     "--rung",
@@ -112,12 +111,12 @@ if TYPE_CHECKING:
 @click.option(
     "--budget-ms",
     type=NumberRange(0.01, 10_000),
-    help="Choose size and passes: the truest whose step takes no longer on this machine, measured first.",
+    help="Choose the most accurate resolution and iterations whose step takes no longer on this machine (measured first).",
 )
 @click.option(
     "--error-mm",
     type=NumberRange(0, 100),
-    help="Choose size and passes: the fastest whose mean error, as study trade measured it, is no larger.",
+    help="Choose the fastest resolution and iterations whose mean bead error (study trade) is no larger.",
 )
 @link_options
 def rehearse(
@@ -143,7 +142,7 @@ def rehearse(
     link_leads: bool,
     **changes: Any,
 ) -> None:
-    """Press the kidney of SCENE and see what the probe sees.
+    """Press the kidney of SCENE with the probe and see its ultrasound image.
 
     SCENE is a scene file or a patient's folder; without one it is the embedded patient.
     """
@@ -199,7 +198,7 @@ def rehearse(
 def as_asked(
     scene: Scene, changed: dict[str, float | str | None], quality: str | None
 ) -> tuple[Scene, Probe]:
-    """A scene as the command line changes it, and its probe; says so where that is another tissue model.
+    """A scene with the options of the command line, and its probe; prints if they change the tissue model.
 
     Raises SceneError, ProbeError.
     """
@@ -216,7 +215,7 @@ def keys_command() -> None:
 
 
 def found_display() -> bool:
-    """Whether there is a screen for a window; says so where there is none."""
+    """Whether there is a screen for a window; prints if there is none."""
     found = display_available()
     if not found:
         display = os.environ.get("DISPLAY")
@@ -228,18 +227,18 @@ def found_display() -> bool:
 def built(
     scene: Scene, anatomy: LoadedAnatomy, probe: Probe, progress: ReportProgress, draws: bool = True
 ) -> "Rehearsal":
-    """The rehearsal of a scene, of which pictures are drawn or not."""
+    """The rehearsal of a scene; ``draws``: images will be computed."""
     from rehearsal.rehearsal import Rehearsal
 
     return Rehearsal(scene, anatomy, probe, progress, shows_echo=draws and scene.image.mode != "ct")
 
 
 def compile_picture(rehearsal: "Rehearsal") -> None:
-    """Take a picture that nobody sees, so that the first frame need not wait for its kernels."""
-    from rehearsal.frame_view import settings_of, take_view
+    """Compute one image in advance, so that the first frame need not wait for its kernels."""
+    from rehearsal.frame_view import image_view, initial_settings
     from rehearsal.measurements.run_report import Tally
 
-    take_view(rehearsal, settings_of(rehearsal), None, Tally(0.0))
+    image_view(rehearsal, rehearsal.probe, initial_settings(rehearsal), Tally(0.0))
 
 
 def built_within(
@@ -252,7 +251,7 @@ def built_within(
     budget_ms: float | None,
     error_mm: float | None,
 ) -> tuple["Rehearsal", str]:
-    """The rehearsal with the settings that fit the budgets on this machine, and which they are. Raises CommandError."""
+    """The rehearsal with the settings that meet the budgets on this machine, and a text that names them. Raises CommandError."""
     from rehearsal.speed_accuracy.budget_choice import NoPoint, choose, described
     from rehearsal.speed_accuracy.pareto_front import front_of, load_points
 

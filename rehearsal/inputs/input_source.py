@@ -1,4 +1,4 @@
-"""Who leads the transducer in a rehearsal: the user (``live.py``), a recorded session, or the scene's script."""
+"""Input sources, which move the transducer: the user (``user_input.py``), a recorded session, or the scene's scripted press."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from rehearsal.inputs.user_input import UserInput
+from rehearsal.notices import Notices
 from rehearsal.sessions.recorder import SessionRecorder
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session import Session
@@ -16,91 +17,94 @@ from ultrasound.probe import DETAIL_LEVELS, MODES
 from ultrasound.target import TARGETS
 
 CHOICES: dict[str, tuple[str, ...]] = {"mode": MODES, "detail_level": DETAIL_LEVELS, "plan_for": TARGETS}
-
 # What sessions of version 1.0 call a setting -> its name now.
 RENAMED = {"rung": "detail_level"}
 
 
 class InputSource(Protocol):
-    """For each moment: ``move``, then, where that gave a pose, the step and ``stepped``; then ``watch``."""
+    """Each frame: ``next_pose``; where that gave a pose, the step and ``after_step``; then ``after_frame``."""
 
     @property
     def session(self) -> Session:
-        """The session that the moments are of."""
+        """The session that the steps belong to."""
 
     @property
     def status(self) -> str:
-        """What stands in the panel; empty where there is nothing to say."""
+        """The text in the panel; empty if there is none."""
 
     @property
     def bookmarks(self) -> int:
-        """How many the session has."""
+        """Number of bookmarks in the session."""
 
-    def move(self, controls: Controls) -> np.ndarray | None:
-        """The pose (4, 4) to step to; None where this moment goes back to another."""
+    def next_pose(self, controls: Controls) -> np.ndarray | None:
+        """Return the pose (4, 4) to step to; None where the state was restored to an earlier one."""
 
-    def stepped(self, step_ms: float) -> str:
-        """The rehearsal has just advanced to that pose, in so many ms; what the terminal has to say of it."""
+    def after_step(self, step_ms: float) -> None:
+        """The rehearsal has just made the step, in so many ms."""
 
-    def watch(self) -> str:
-        """After each moment: what the terminal has to say of it."""
-
-    def take_said(self) -> str:
-        """What there was to say to the user since this was last asked."""
+    def after_frame(self) -> None:
+        """The frame is complete."""
 
 
 class ReplayInput:
-    """A recorded session, a ``InputSource``, until it is over or the user takes over: from then on ``lead()``."""
+    """A recorded session, until it ends or the user takes over: from then on what ``user_input()`` makes."""
 
-    def __init__(self, replay: Replay, lead: Callable[[], UserInput]) -> None:
-        self.replay, self._lead = replay, lead
-        self.live: UserInput | None = None
-        self._said = ""
+    def __init__(
+        self, replay: Replay, user_input: Callable[[], UserInput], notices: Notices | None = None
+    ) -> None:
+        self.replay, self._make_user_input = replay, user_input
+        self.user_input: UserInput | None = None
+        self.notices = notices or Notices()
         self._has_warned = False
 
     @property
+    def _source(self) -> "UserInput | Replay":
+        return self.user_input or self.replay
+
+    @property
     def session(self) -> Session:
-        return self.live.session if self.live else self.replay.session
+        return self._source.session
 
     @property
     def status(self) -> str:
-        if self.live is not None:
-            return self.live.status
-        return f"REPLAY   {self.replay.time_s:.1f} s   {{take_over}} leads from here"
+        if self.user_input is not None:
+            return self.user_input.status
+        return f"REPLAY   {self.replay.time_s:.1f} s   {{take_over}} takes control"
 
     @property
     def bookmarks(self) -> int:
-        return self.live.bookmarks if self.live else self.replay.bookmarks
+        return self._source.bookmarks
 
-    def move(self, controls: Controls) -> np.ndarray | None:
-        if self.live is None and (controls.take_over or self.replay.is_over):
-            self._said = "Yours now" if controls.take_over else "The replay is over: yours now"
-            self.live, controls = self._lead(), replace(controls, take_over=False)
-        if self.live is not None:
-            return self.live.move(controls)
+    def next_pose(self, controls: Controls) -> np.ndarray | None:
+        if self.user_input is None and (controls.take_over or self.replay.is_over):
+            ended = "" if controls.take_over else "The replay has ended. "
+            self.notices.post(f"{ended}Mouse and keys control the probe", in_terminal=False)
+            self.user_input, controls = self._make_user_input(), replace(controls, take_over=False)
+        if self.user_input is not None:
+            return self.user_input.next_pose(controls)
         pose, settings = self.replay.move()
         set_settings(controls.settings, settings)
         return pose
 
-    def stepped(self, step_ms: float) -> str:
-        if self.live is not None:
-            return self.live.stepped(step_ms)
-        self.replay.stepped()
+    def after_step(self, step_ms: float) -> None:
+        if self.user_input is not None:
+            self.user_input.after_step(step_ms)
+            return
+        self.replay.end_step()
         if self.replay.differs_s is not None and not self._has_warned:
             self._has_warned = True
-            return f"Mind: from {self.replay.differs_s:.0f} s on the tissue is not bit for bit the recorded one's."
-        return ""
+            self.notices.post(
+                f"Warning: from {self.replay.differs_s:.0f} s on the tissue differs from the recorded one.",
+                on_screen=False,
+            )
 
-    def watch(self) -> str:
-        return self.live.watch() if self.live else ""
-
-    def take_said(self) -> str:
-        said, self._said = self._said, ""
-        return said or (self.live.take_said() if self.live else "")
+    def after_frame(self) -> None:
+        if self.user_input is not None:
+            self.user_input.after_frame()
 
 
 def set_settings(settings: Settings, values: dict[str, Any]) -> None:
-    """Set what a session says. Raises SessionError for what is no setting, or none that there can be."""
+    """Set what a session recorded. Raises SessionError for an unknown setting or a value out of its range."""
     known = {each.name: each.metadata for each in fields(settings)}
     for recorded, value in values.items():
         name = RENAMED.get(recorded, recorded)
@@ -125,23 +129,20 @@ def _fits(usual: Any, value: Any, name: str, about: Mapping[str, Any]) -> bool:
 
 
 class ScriptedInput:
-    """The scene's scripted press in so many steps, a ``InputSource``."""
+    """The scene's scripted press in so many steps."""
 
-    def __init__(self, session: Session, recorded: SessionRecorder | None, steps: int) -> None:
-        self.session, self.recorded, self.steps = session, recorded, steps
+    def __init__(self, session: Session, recorder: SessionRecorder | None, steps: int) -> None:
+        self.session, self.recorder, self.steps = session, recorder, steps
         self.status, self.bookmarks = "", 0
 
-    def move(self, controls: Controls) -> np.ndarray | None:
+    def next_pose(self, controls: Controls) -> np.ndarray | None:
         rehearsal = self.session.rehearsal
-        share = (self.session.moment + 1) / self.steps
+        share = (self.session.step_index + 1) / self.steps
         return rehearsal.pose_towards(rehearsal.scripted_pose(rehearsal.script_length_s() * share))
 
-    def stepped(self, step_ms: float) -> str:
-        self.session.stepped()
-        return ""
+    def after_step(self, step_ms: float) -> None:
+        self.session.end_step()
 
-    def watch(self) -> str:
-        return self.recorded.watch() if self.recorded else ""
-
-    def take_said(self) -> str:
-        return ""
+    def after_frame(self) -> None:
+        if self.recorder is not None:
+            self.recorder.keep_up()

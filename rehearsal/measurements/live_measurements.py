@@ -1,7 +1,6 @@
 """What the window reads off a rehearsal while it goes on: figures four times a second, and what has been in the picture."""
 
 from dataclasses import asdict, fields, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -33,6 +32,7 @@ class LiveMeasurements:
     def __init__(self, rehearsal: Rehearsal, guide: PlanGuidance | None = None) -> None:
         self.rehearsal, self.guide = rehearsal, guide
         self.margin_mm = MARGIN_MM if guide is None else guide.plan.margin_mm
+        self._coverage: Coverage | None = None
         step_s = rehearsal.settings.time_step_s
         self._read_every, self._look_every = (max(1, round(s / step_s)) for s in (READ_S, LOOK_S))
         self._begin()
@@ -47,7 +47,7 @@ class LiveMeasurements:
         self._findings: dict[str, str] = {}
         self._touches = np.ones(rehearsal.probe.number_of_scanlines, bool)
 
-    def begin_anew(self) -> None:
+    def restart(self) -> None:
         """Nothing was seen or done yet."""
         self._begin()
         self.coverage.clear()
@@ -80,29 +80,34 @@ class LiveMeasurements:
         return True
 
     def follow(self, guide: PlanGuidance) -> None:
-        """Follow a plan from now on; what was seen stays so."""
+        """Follow a plan from now on; the coverage so far is kept."""
         self.guide = guide
         if guide.plan.margin_mm != self.margin_mm:
             self.margin_mm, seen = guide.plan.margin_mm, self.coverage.seen
-            del self.coverage
-            self.coverage.seen = seen
+            self._coverage = self._new_coverage()
+            self._coverage.seen = seen
 
-    @cached_property
+    @property
     def coverage(self) -> Coverage:
-        """What has been in the picture; made when it is first asked for."""
+        """The coverage of the whole session; computed only if somebody asks for it."""
+        if self._coverage is None:
+            self._coverage = self._new_coverage()
+        return self._coverage
+
+    def _new_coverage(self) -> Coverage:
         return Coverage(self.rehearsal.organ, self.rehearsal.tumour, self.margin_mm)
 
     def watch(self, session: Session, probe: Probe, pose: np.ndarray | None) -> None:
         """Look at a moment (its step's pose, None of a way back) whose pictures were taken, and note a new reading in the session."""
         # What was measure before a way back is not so any more.
         is_anew = pose is None or self.reading is None
-        if (is_anew or session.moment % self._look_every == 0) and self.rehearsal.scanner is not None:
+        if (is_anew or session.step_index % self._look_every == 0) and self.rehearsal.scanner is not None:
             image = self.rehearsal.scene.image
             rest = self.rehearsal.scanner.plane.rest_grid(GRID_POINTS)
             self._touches = self.coverage.add(rest, probe, image.contact_gap_mm)
         if self.guide is not None:
             self.guide.go_with(session)
-        if is_anew or session.moment % self._read_every == 0:
+        if is_anew or session.step_index % self._read_every == 0:
             self.reading = measure(self.rehearsal, probe, self._touches)
             session.note("reading", self.figures())
             self._show()
@@ -129,7 +134,10 @@ class LiveMeasurements:
             values |= {f"seen_{target}": self.coverage.fraction(target) for target in self.coverage.targets}
         if self.guide is not None:
             values |= self.guide.figures()
-        return {name: None if value is None else round(value, DIGITS) for name, value in values.items()}
+        return {
+            name: None if value is None or not np.isfinite(value) else round(value, DIGITS)
+            for name, value in values.items()
+        }
 
     def summary(self, bookmarks: int = 0) -> dict[str, Any]:
         """How the rehearsal went so far."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rehearsal.configuration import setup_of_scene
+from rehearsal.configuration import STEP, Setup
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import counted, spread
 from rehearsal.speed_accuracy.pareto_front import expected_error_mm, load_points
@@ -19,7 +19,8 @@ NOT_EVERYWHERE = dict(radius_mm=None, stiffness=None, clusters=0, memberships=0)
 def expected_error_of(rehearsal: Rehearsal) -> float | None:
     """Mean error of beads [mm] that ``study trade`` measured with settings like a rehearsal's; None where it measured none."""
     step = rehearsal.settings
-    setup = setup_of_scene(rehearsal.scene, step.substeps, step.iterations, step.relaxation_factor)
+    changed = {name: getattr(step, name) for name in STEP}
+    setup = Setup(rehearsal.scene.tissue, rehearsal.scene.solver.model_copy(update=changed))
     return expected_error_mm(load_points(), setup)
 
 

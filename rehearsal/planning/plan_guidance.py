@@ -81,11 +81,11 @@ class PlanGuidance:
     def go_with(self, session: Session) -> None:
         """Watch a session's last moment; one that went back takes what was gone of the sweep back too."""
         now = _Gone(self.at, self._off, self._far)
-        kept = dict.fromkeys(session.kept, now) | self._kept
-        if session.back is not None:
-            then = kept.get(session.back, now)
+        kept = dict.fromkeys(session.kept_states, now) | self._kept
+        if session.rolled_back_to is not None:
+            then = kept.get(session.rolled_back_to, now)
             self.at, self._off, self._far = then.at, then.off, then.far
-        self._kept = {moment: kept[moment] for moment in session.kept}
+        self._kept = {moment: kept[moment] for moment in session.kept_states}
         self.watch(self.rehearsal.pose)
 
     def watch(self, pose: np.ndarray) -> None:

@@ -6,7 +6,7 @@ from time import perf_counter
 
 from joblib import cpu_count
 
-from rehearsal.frame_view import probe_as_set
+from rehearsal.frame_view import probe_with_settings
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.planning.make_plan import make_plan
 from rehearsal.planning.plan_file import Plan, PlanError, next_free, write_plan
@@ -14,7 +14,7 @@ from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.search import length_of
 from rehearsal.planning.trial_workers import Problem, Workers, workers
 from rehearsal.rehearsal import Rehearsal
-from render.viewer import Controls, Settings
+from render.viewer import Controls, Settings, TissueSettings
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene, with_options
 from ultrasound.target import Target
@@ -149,7 +149,10 @@ class Plans:
         if self._planning is not None:
             return "A plan is being made"
         target = self._target(settings)
-        scene, probe = as_set(self.rehearsal.scene, settings), probe_as_set(self.rehearsal.probe, settings)
+        scene, probe = (
+            as_set(self.rehearsal.scene, settings),
+            probe_with_settings(self.rehearsal.probe, settings),
+        )
         problem = Problem(scene, self.anatomy, probe, target, float(settings.margin_mm), scene.trocar)
         self._planning = Planning(problem, next_free(self.out))
         return f"Planning for {NAMED[target]}"
@@ -172,7 +175,7 @@ def in_words(seconds: float) -> str:
     return f"some {minutes} min" if minutes > 0 else "under a minute"
 
 
-def as_set(scene: Scene, settings: Settings) -> Scene:
+def as_set(scene: Scene, settings: TissueSettings) -> Scene:
     """A scene with its tissue, passes and gravity as the sliders are."""
     values = {
         "tissue.young_kpa": settings.young_kpa,

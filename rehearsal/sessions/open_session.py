@@ -1,9 +1,9 @@
-"""A recorded session opened at a time: the tissue as it was, and what had been set, seen and done until then."""
+"""Open a recorded session at a time: the tissue, the settings, the measurements and the coverage until then."""
 
 import click
 from tqdm import tqdm
 
-from rehearsal.frame_view import probe_as_set
+from rehearsal.frame_view import probe_with_settings
 from rehearsal.inputs.input_source import set_settings
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.rehearsal import Rehearsal
@@ -12,18 +12,18 @@ from rehearsal.sessions.session_file import Log
 from render.viewer import Settings
 
 
-def opened(
-    log: Log, at_s: float, rehearsal: Rehearsal, settings: Settings, instruments: LiveMeasurements
+def open_session(
+    log: Log, at_s: float, rehearsal: Rehearsal, settings: Settings, measurements: LiveMeasurements
 ) -> Replay:
-    """A replay that has come to a time, by way of the last state before it. Raises SessionError."""
+    """Replay a session up to a time [s], from the last state recorded before it. Raises SessionError."""
     replay = Replay(rehearsal, log)
-    begins, aim = replay.begin_at(at_s), replay.moment_at(at_s)
+    begins, aim = replay.begin_at(at_s), replay.step_at(at_s)
     set_settings(settings, replay.settings_until_now())
-    if not instruments.recall(log, begins):
+    if not measurements.recall(log, begins):
         click.echo(
-            f"Mind: the session does not hold what was seen until {replay.time_s:.0f} s; what was seen and done counts from there."
+            f"Warning: the session has no record of the coverage until {replay.time_s:.0f} s; coverage and summary begin there."
         )
-    way = tqdm(
+    steps = tqdm(
         replay.go_to(at_s),
         desc=f"to {at_s:g} s",
         total=aim,
@@ -31,10 +31,10 @@ def opened(
         unit="step",
         disable=aim == 0,
     )
-    for pose, changed in way:
+    for pose, changed in steps:
         set_settings(settings, changed)
-        probe = probe_as_set(rehearsal.probe, settings)
+        probe = probe_with_settings(rehearsal.probe, settings)
         rehearsal.update_surfaces()
         rehearsal.find_plane(probe)
-        instruments.watch(replay.session, probe, pose)
+        measurements.watch(replay.session, probe, pose)
     return replay

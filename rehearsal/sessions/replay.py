@@ -1,4 +1,4 @@
-"""A recorded session once more, with the same bits."""
+"""Replay a recorded session, bit for bit."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -12,10 +12,10 @@ from rehearsal.sessions.session_file import Log, SessionError
 
 
 class Replay:
-    """Drives a rehearsal through a log. ``differs_s`` is when its tissue first was not the recorded one's, None so far; ``state`` its
-    digest when it was compared last. ``bookmarks`` counts those set so far.
+    """Repeat a log on a rehearsal. ``differs_s`` is the time [s] at which the tissue first differed from the recorded one, if it did;
+    ``state`` is its digest at the last comparison; ``bookmarks`` counts those set so far.
 
-    Raises SessionError where the log's states are of another body.
+    Raises SessionError if the log's states belong to another body.
     """
 
     def __init__(self, rehearsal: Rehearsal, log: Log) -> None:
@@ -25,83 +25,81 @@ class Replay:
         self.state = ""
         self.differs_s: float | None = None
         backs = [
-            (moment, event.value) for moment, e in log.events.items() for event in e if event.kind == "back"
+            (index, event.value) for index, e in log.events.items() for event in e if event.kind == "back"
         ]
-        if not all(isinstance(to, int) and SETTLED <= to <= moment for moment, to in backs):
-            raise SessionError("the session goes back to a moment that had not been: its file is damaged")
-        if {moment for moment, _ in backs} != set(np.flatnonzero(np.isnan(log.poses).any(axis=(1, 2)))):
-            raise SessionError("the session has a moment without a pose: its file is damaged")
+        if not all(isinstance(to, int) and SETTLED <= to <= index for index, to in backs):
+            raise SessionError("the session restores a step that had not been made: its file is damaged")
+        if {index for index, _ in backs} != set(np.flatnonzero(np.isnan(log.poses).any(axis=(1, 2)))):
+            raise SessionError("the session has a step without a pose: its file is damaged")
         self._backs = backs
         if log.header.begins is not None:
             rehearsal.restore(self._state(log.header.begins))
 
     @property
     def is_over(self) -> bool:
-        """Whether there is no moment left."""
-        return self.session.moment >= len(self.log.poses)
+        """Whether all steps have been made."""
+        return self.session.step_index >= len(self.log.poses)
 
     @property
     def time_s(self) -> float:
         """Simulated time since the session began."""
         return self.session.time_s
 
-    def moment_at(self, seconds: float) -> int:
-        """The moment at a time, or the last."""
+    def step_at(self, seconds: float) -> int:
+        """The step at a time [s], or the last."""
         return min(round(seconds / self.log.header.time_step_s), len(self.log.poses))
 
     def begin_at(self, seconds: float) -> int:
-        """Go to the last state before a time that all which follows can be had from; the moment that it is of."""
-        aim = self.moment_at(seconds)
-        start = max(
-            (moment for moment in self.log.states if moment <= aim and self._holds(moment)), default=0
-        )
+        """Restore the last recorded state before a time [s] from which the rest can be replayed; return its step."""
+        aim = self.step_at(seconds)
+        start = max((index for index in self.log.states if index <= aim and self._holds(index)), default=0)
         if start > 0:
-            for moment in range(start):
-                self._set(moment)
+            for index in range(start):
+                self._set(index)
             self.rehearsal.restore(self._state(self.log.states[start]))
-            self.session.moment = start
+            self.session.step_index = start
         self.rehearsal.update_surfaces()
         return start
 
     def go_to(self, seconds: float) -> Iterator[tuple[np.ndarray | None, dict[str, Any]]]:
-        """Go on to a time; after each moment what ``move`` had for it. The surfaces are left behind."""
-        aim = self.moment_at(seconds)
-        while self.session.moment < aim:
+        """Continue to a time [s] and yield what ``move`` returned for each step. The drawn surfaces are not updated."""
+        aim = self.step_at(seconds)
+        while self.session.step_index < aim:
             pose, settings = self.move()
             if pose is not None:
                 self.rehearsal.advance(pose)
-                self.stepped()
+                self.end_step()
             yield pose, settings
 
     def move(self) -> tuple[np.ndarray | None, dict[str, Any]]:
-        """The pose to step to, None where this moment was a way back; and the pictures' settings that changed.
+        """Return the pose to step to, None for a rollback, and the settings of the images that changed.
 
-        ``stepped`` comes after the step. Raises SessionError where the log is over.
+        Call ``end_step`` after the step. Raises SessionError at the end of the log.
         """
-        moment = self.session.moment
+        index = self.session.step_index
         if self.is_over:
             raise SessionError("the session is over")
-        back, settings = self._set(moment)
-        if any(to == moment for _, to in self._backs):
-            self.session.keep()
+        back, settings = self._set(index)
+        if any(to == index for _, to in self._backs):
+            self.session.keep_state()
         if back is not None:
-            if back not in self.session.kept:
-                self.session.kept[back] = self._state(self.log.states[back])
-            self.session.go_back(back)
+            if back not in self.session.kept_states:
+                self.session.kept_states[back] = self._state(self.log.states[back])
+            self.session.roll_back(back)
             self._compare()
             return None, settings
-        return self.log.poses[moment], settings
+        return self.log.poses[index], settings
 
-    def stepped(self) -> None:
-        """The rehearsal has just advanced to the pose of a move."""
-        self.session.stepped()
+    def end_step(self) -> None:
+        """Count the step that the rehearsal has just made."""
+        self.session.end_step()
         self._compare()
 
-    def _set(self, moment: int) -> tuple[int | None, dict[str, Any]]:
-        """Set solver and tissue as a moment has them; where it goes back to, and its pictures' settings."""
+    def _set(self, index: int) -> tuple[int | None, dict[str, Any]]:
+        """Set solver and tissue as at a step; return the step that it restores, if any, and its settings of the images."""
         back: int | None = None
         settings: dict[str, Any] = {}
-        for event in self.log.events.get(moment, []):
+        for event in self.log.events.get(index, []):
             if event.kind == "solver":
                 set_solver(self.rehearsal, event.value)
             elif event.kind == "settings":
@@ -115,15 +113,15 @@ class Replay:
         return back, settings
 
     def settings_until_now(self) -> dict[str, Any]:
-        """The pictures' settings as they have become since the beginning."""
+        """The settings of the images at the present step."""
         settings: dict[str, Any] = {}
-        for moment in sorted(m for m in self.log.events if m <= self.session.moment):
-            for event in self.log.events[moment]:
+        for index in sorted(m for m in self.log.events if m <= self.session.step_index):
+            for event in self.log.events[index]:
                 settings |= event.value if event.kind == "settings" else {}
         return settings
 
     def _compare(self) -> None:
-        digest = self.log.digests.get(self.session.moment)
+        digest = self.log.digests.get(self.session.step_index)
         if digest is None:
             return
         self.compared += 1
@@ -132,10 +130,10 @@ class Replay:
             self.differs_s = self.time_s
 
     def _holds(self, start: int) -> bool:
-        """Whether nothing after a moment goes back to before it."""
+        """Whether no later rollback restores a state from before a step that was not recorded."""
         return all(
-            moment < start or to >= start or to == SETTLED or to in self.log.states
-            for moment, to in self._backs
+            index < start or to >= start or to == SETTLED or to in self.log.states
+            for index, to in self._backs
         )
 
     def _state(self, text: str) -> RehearsalState:
@@ -146,7 +144,7 @@ class Replay:
 
 
 def set_solver(rehearsal: Rehearsal, values: dict[str, Any]) -> None:
-    """Set what a step is told, as recorded."""
+    """Set the recorded values of solver and material."""
     step = rehearsal.settings
     for name in ("iterations", "substeps", "stiffness"):
         setattr(step, name, values.get(name, getattr(step, name)))

@@ -1,4 +1,4 @@
-"""A rehearsal as a row of moments, each a step or a way back to an earlier one: what undo, bookmarks and replay stand on."""
+"""A rehearsal as a sequence of steps and rollbacks: the basis of undo, bookmarks and replay."""
 
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -9,97 +9,99 @@ from rehearsal.rehearsal import Rehearsal, RehearsalState
 from rehearsal.sessions.packed_coverage import SeenVoxels, pack_seen
 from rehearsal.sessions.packed_state import to_text
 from rehearsal.sessions.session_file import Kind
+from ultrasound.probe_manipulator import ManipulatorState
 
-# The moment before the first: tissue settled, transducer just touching.
+# The index before the first step: tissue settled, transducer just touching.
 SETTLED = -1
 
 
 class Recorder(Protocol):
-    """What is told of each moment."""
+    """Records what happens in a session."""
 
     def note(self, kind: Kind, value: Any) -> None: ...
 
-    def moment(self, pose: np.ndarray | None) -> None: ...
+    def add_step(self, pose: np.ndarray | None) -> None: ...
 
 
 class Session:
-    """``moment`` counts what has happened to a rehearsal since the session began, ways back too: no two states share one.
+    """``step_index`` counts the steps and the rollbacks since the session began, so that no two states share an index.
 
-    ``recorder``, where there is one, is told of all, so that the same session can be had again; ``seen``, where somebody looks, says
-    which voxels (nx, ny, nz) of the organ were seen so far. ``back`` is the moment that the last one went back to, None where that
-    was a step.
+    ``recorder``, if any, gets everything that a replay needs. ``coverage`` returns which voxels (nx, ny, nz) of the organ have been
+    imaged so far. ``rolled_back_to`` is the index that the last rollback restored, None after a step.
     """
 
     def __init__(
         self,
         rehearsal: Rehearsal,
         recorder: Recorder | None = None,
-        seen: Callable[[], np.ndarray] | None = None,
+        coverage: Callable[[], np.ndarray] | None = None,
     ) -> None:
         self.rehearsal = rehearsal
         self.recorder = recorder
-        self._seen = seen
-        self.moment = 0
-        self.back: int | None = None
-        self.kept: dict[int, RehearsalState] = {SETTLED: rehearsal.settled}
-        self._told: dict[str, Any] = {}
+        self._coverage = coverage
+        self.step_index = 0
+        self.rolled_back_to: int | None = None
+        self.kept_states: dict[int, RehearsalState] = {SETTLED: rehearsal.settled}
+        self._noted: dict[str, Any] = {}
 
     @property
     def time_s(self) -> float:
         """Simulated time since the session began."""
-        return self.moment * self.rehearsal.settings.time_step_s
+        return self.step_index * self.rehearsal.settings.time_step_s
 
-    def tell(self, kind: Kind, values: dict[str, Any]) -> None:
-        """Note those of some values that are not as they were told last."""
-        new = {name: value for name, value in values.items() if self._told.get(f"{kind}.{name}") != value}
+    def note_changes(self, kind: Kind, values: dict[str, Any]) -> None:
+        """Note those of some values that differ from the last ones noted."""
+        new = {name: value for name, value in values.items() if self._noted.get(f"{kind}.{name}") != value}
         if new:
-            self._told |= {f"{kind}.{name}": value for name, value in new.items()}
+            self._noted |= {f"{kind}.{name}": value for name, value in new.items()}
             self.note(kind, new)
 
     def note(self, kind: Kind, value: Any) -> None:
-        """Note something of the moment to come."""
+        """Note something about the coming step."""
         if self.recorder is not None:
             self.recorder.note(kind, value)
 
-    def stepped(self) -> None:
-        """The rehearsal has just advanced by a step."""
-        self.back = None
-        self._end_moment(self.rehearsal.pose)
+    def end_step(self) -> None:
+        """Count the step that the rehearsal has just made."""
+        self.rolled_back_to = None
+        self._count(self.rehearsal.pose)
 
-    def go_back(self, moment: int) -> None:
-        """Tissue and probe as they were at a moment that was kept; the time goes on."""
-        self.note("back", moment)
-        self.rehearsal.restore(self.kept[moment])
+    def roll_back(self, step_index: int) -> None:
+        """Restore a state that was kept; time goes on."""
+        self.note("back", step_index)
+        self.rehearsal.restore(self.kept_states[step_index])
         self.rehearsal.update_surfaces()
-        self.back = moment
-        self._end_moment(None)
+        self.rolled_back_to = step_index
+        self._count(None)
 
-    def keep(self) -> int:
-        """Keep the state of this moment, to be gone back to; which moment it is."""
-        if self.moment not in self.kept:
-            self.kept[self.moment] = self.rehearsal.snapshot()
-        return self.moment
+    def keep_state(self, manipulator: ManipulatorState | None = None) -> int:
+        """Keep the present state for a rollback, with the manipulator's present state or another one; return its index."""
+        if self.step_index not in self.kept_states:
+            self.kept_states[self.step_index] = self.rehearsal.snapshot(manipulator)
+        return self.step_index
 
-    def store(self) -> None:
-        """Note the whole state of this moment, from which the session can be had without all that was before.
+    def record_state(self) -> None:
+        """Note the whole present state, so that a replay can start here.
 
-        Its tissue becomes what its guard would put back, so that it need not be noted twice; a replay does the same.
+        The tissue also becomes what the divergence check would restore, so that it is recorded once; a replay does the same.
         """
         self.rehearsal.keep_good()
         self.note("state", to_text(self.rehearsal.snapshot()))
-        seen = self.seen()
-        if seen is not None:
-            self.note("seen", seen)
+        coverage = self.packed_coverage()
+        if coverage is not None:
+            self.note("seen", coverage)
 
-    def seen(self) -> SeenVoxels | None:
-        """What was seen so far, packed; None where nobody looks."""
-        return None if self._seen is None else pack_seen(self._seen())
+    def packed_coverage(self) -> SeenVoxels | None:
+        """The voxels imaged so far; None if nobody measures them."""
+        return None if self._coverage is None else pack_seen(self._coverage())
 
-    def forget(self, is_needed: Callable[[int], bool]) -> None:
-        """Let go of what was kept and is no longer needed."""
-        self.kept = {moment: s for moment, s in self.kept.items() if moment == SETTLED or is_needed(moment)}
+    def discard_states(self, is_needed: Callable[[int], bool]) -> None:
+        """Discard the kept states that are no longer needed."""
+        self.kept_states = {
+            index: state for index, state in self.kept_states.items() if index == SETTLED or is_needed(index)
+        }
 
-    def _end_moment(self, pose: np.ndarray | None) -> None:
+    def _count(self, pose: np.ndarray | None) -> None:
         if self.recorder is not None:
-            self.recorder.moment(pose)
-        self.moment += 1
+            self.recorder.add_step(pose)
+        self.step_index += 1

@@ -37,7 +37,7 @@ class _Line(BaseModel):
 
 
 class Header(_Line):
-    """What is rehearsed, by which version of Nephron. ``anatomy`` is the fingerprint of the files that a scene names, not in here."""
+    """What is rehearsed, by which version of Nephron. ``anatomy`` is the fingerprint of the scene's files."""
 
     nephron_session: Literal[1] = 1
     version: str | None = Field(None, pattern=r"^[0-9A-Za-z.+-]{1,40}$")
@@ -51,7 +51,7 @@ class Header(_Line):
 
 
 class SolverValues(TypedDict, total=False):
-    """What a step is told; what is left out stays as it was."""
+    """Settings of a step; what is left out stays unchanged."""
 
     __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)  # type: ignore[misc]
     iterations: Annotated[int, Field(ge=1, le=1000)]
@@ -75,7 +75,7 @@ Kind = Literal["settings", "solver", "back", "bookmark", "reading", "state", "se
 
 
 class Event(_Line):
-    """Something of the moment ``at``, before its step."""
+    """Something that happened before step ``at``."""
 
     at: int = Field(ge=0)
     kind: Kind
@@ -88,7 +88,7 @@ class Event(_Line):
 
 
 class Second(_Line):
-    """Moments from ``at`` on: their poses, packed; the tissue's digest after the last of them."""
+    """Steps from ``at`` on: their poses, packed; the tissue's digest after the last one."""
 
     at: int = Field(ge=0)
     poses: str
@@ -97,7 +97,7 @@ class Second(_Line):
 
 
 class End(_Line):
-    """How a session that ended in order went, and the state that it can go on from, with what was seen until then."""
+    """The summary of a session that ended in order, its final state, and the coverage so far."""
 
     summary: dict[str, Any]
     state: str
@@ -106,7 +106,7 @@ class End(_Line):
 
 @dataclass
 class Log:
-    """A session as read: ``poses`` (moments, 4, 4), not a number where a moment is a way back; the rest by moment."""
+    """A session as read: ``poses`` (steps, 4, 4), NaN for a rollback; the rest by step index."""
 
     header: Header
     poses: np.ndarray
@@ -123,7 +123,7 @@ class Log:
 
 
 def pack(poses: list[np.ndarray | None]) -> str:
-    """Poses (4, 4), or None for a way back, with all of their bits."""
+    """Poses (4, 4), or None for a rollback, with all of their bits."""
     rows = np.full((len(poses), NUMBERS), np.nan)
     for row, pose in zip(rows, poses, strict=True):
         if pose is not None:
@@ -144,9 +144,9 @@ def unpack(text: str) -> np.ndarray:
 
 
 class Recording:
-    """A session's file as it grows; lines are written beside the rehearsal, which does not wait for the disk.
+    """A session's file as it grows; a thread writes its lines, so that the rehearsal does not wait for the disk.
 
-    Raises OSError where the file cannot be made; what goes wrong later is said by ``fault``, and the rehearsal goes on.
+    Raises OSError if the file cannot be created; a later error is in ``fault``, and the rehearsal continues.
     """
 
     def __init__(self, path: Path, header: Header) -> None:
@@ -160,20 +160,20 @@ class Recording:
         self._write(header)
 
     @property
-    def moments(self) -> int:
-        """How many there are since the last line."""
+    def pending_steps(self) -> int:
+        """Number of steps since the last line."""
         return len(self._poses)
 
     def note(self, kind: Kind, value: Any) -> None:
-        """Something of the moment to come."""
+        """Note something about the coming step."""
         self._events.append(Event(at=self._at + len(self._poses), kind=kind, value=value))
 
-    def moment(self, pose: np.ndarray | None) -> None:
-        """A moment: the pose of its step, None for a way back."""
+    def add_step(self, pose: np.ndarray | None) -> None:
+        """Add a step by its pose (4, 4), or a rollback by None."""
         self._poses.append(pose)
 
-    def line(self, digest: str) -> None:
-        """Write what there is since the last line, with the tissue's digest now."""
+    def write_second(self, digest: str) -> None:
+        """Write the steps since the last line, with the tissue's present digest."""
         if not self._poses:
             return
         self._write(Second(at=self._at, poses=pack(self._poses), events=self._events, digest=digest))
@@ -210,7 +210,7 @@ class Recording:
 
 
 def read_log(path: Path) -> Log:
-    """A session's file; what a crash left of its last line is left out. Raises SessionError."""
+    """Read a session's file, without a last line that a crash cut off. Raises SessionError."""
     name = path.name
     try:
         if path.stat().st_size > MOST_BYTES:
@@ -225,18 +225,18 @@ def read_log(path: Path) -> Log:
     header = _header(name, lines[0])
     log = Log(header, np.zeros((0, 4, 4)))
     parts: list[np.ndarray] = []
-    # Without a line's end it was being written when the session was cut off.
+    # A last line without its end was being written when the session was cut off.
     for number, line in enumerate(lines[1:-1], 2):
         second = _line_of(name, number, line)
-        moments = sum(len(part) for part in parts)
+        steps = sum(len(part) for part in parts)
         if isinstance(second, End):
             log.summary = second.summary
-            log.states[moments] = second.state
+            log.states[steps] = second.state
             if second.seen is not None:
-                log.seen[moments] = second.seen
+                log.seen[steps] = second.seen
             break
-        parts.append(_poses_of(name, number, second, moments))
-        _file_away(second, len(parts[-1]), log)
+        parts.append(_poses_of(name, number, second, steps))
+        _sort_events(second, len(parts[-1]), log)
     log.poses = np.concatenate([log.poses, *parts])
     return log
 
@@ -285,7 +285,7 @@ def _poses_of(name: str, number: int, second: Second, expected: int) -> np.ndarr
     return poses
 
 
-def _file_away(second: Second, count: int, log: Log) -> None:
+def _sort_events(second: Second, count: int, log: Log) -> None:
     for event in second.events:
         if event.kind == "state":
             log.states[event.at] = event.value

@@ -1,16 +1,17 @@
-"""Undo, redo and bookmarks: which moments of a session there is to go back to."""
+"""Undo, redo and bookmarks: the states of a session that can be restored."""
 
 from collections import deque
 
 from rehearsal.sessions.session import SETTLED, Session
+from ultrasound.probe_manipulator import ManipulatorState
 
 MOST_UNDONE = 40
-# Input that comes sooner than this after the last goes on with the same action; an action takes no longer than that.
+# Input that follows the last one sooner than this belongs to the same action; an action lasts no longer than that.
 PAUSE_S, LONGEST_S = 0.5, 5.0
 
 
 class History:
-    """An action is what the user does without a pause: a press, a turn, a way over the organ. Undo goes to before the last one."""
+    """An action is what the user does without a pause: a press, a turn, a path over the organ. Undo restores the state before it."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -21,68 +22,68 @@ class History:
         self._at = 0
         self._was_pressing = False
 
-    def watch(self, is_acting: bool, is_pressing: bool) -> None:
-        """Look at what the user does, before the step that does it."""
+    def watch(self, is_acting: bool, is_pressing: bool, manipulator: ManipulatorState | None = None) -> None:
+        """Note the user's input before its step; ``manipulator`` is the manipulator's state before this input."""
         now, begins = self.session.time_s, is_pressing and not self._was_pressing
         self._was_pressing = is_pressing
         if not is_acting:
             return
         if begins or now - self._acted_s > PAUSE_S or now - self._began_s > LONGEST_S:
-            self._begin()
+            self._begin(manipulator)
         self._acted_s = now
 
-    def _begin(self) -> None:
+    def _begin(self, manipulator: ManipulatorState | None = None) -> None:
         self._began_s = self.session.time_s
         self._at = 0
-        self._before.append(self.session.keep())
+        self._before.append(self.session.keep_state(manipulator))
         self.undone.clear()
-        self._forget()
+        self._discard()
 
     def undo(self) -> bool:
-        """Go to before the last action; whether there was one."""
+        """Restore the state before the last action; return whether there was one."""
         if not self._before:
             return False
-        self.undone.append(self.session.keep())
-        self._go(self._before.pop())
+        self.undone.append(self.session.keep_state())
+        self._restore(self._before.pop())
         return True
 
     def redo(self) -> bool:
-        """Take the last undo back; whether there was one."""
+        """Revert the last undo; return whether there was one."""
         if not self.undone:
             return False
-        self._before.append(self.session.keep())
-        self._go(self.undone.pop())
+        self._before.append(self.session.keep_state())
+        self._restore(self.undone.pop())
         return True
 
     def reset(self) -> None:
-        """Go to the settled tissue: an action, which can be undone."""
+        """Restore the settled tissue: an action that can be undone."""
         self._begin()
-        self._go(SETTLED)
+        self._restore(SETTLED)
 
     def set_bookmark(self) -> int:
-        """Keep this moment; how many bookmarks there are now."""
-        # However much later it is gone to, a replay need not compute all from here on.
-        self.session.store()
-        self.bookmarks.append(self.session.keep())
+        """Keep this state; return the number of bookmarks."""
+        # A replay can start here, however much later the bookmark is used.
+        self.session.record_state()
+        self.bookmarks.append(self.session.keep_state())
         self._at = 0
         self.session.note("bookmark", len(self.bookmarks))
         return len(self.bookmarks)
 
     def to_bookmark(self) -> int:
-        """Go to the last bookmark, or the one before where this was the last way; its number, 0 where there is none."""
+        """Restore the last bookmark, or the one before it when called again; return its number, 0 if there is none."""
         if not self.bookmarks:
             return 0
         at = (self._at - 1) % len(self.bookmarks)
         self._begin()
         self._at = at
-        self._go(self.bookmarks[at])
+        self._restore(self.bookmarks[at])
         return at + 1
 
-    def _go(self, moment: int) -> None:
-        self.session.go_back(moment)
+    def _restore(self, step_index: int) -> None:
+        self.session.roll_back(step_index)
         self._acted_s = -LONGEST_S
-        self._forget()
+        self._discard()
 
-    def _forget(self) -> None:
+    def _discard(self) -> None:
         needed = {*self._before, *self.undone, *self.bookmarks}
-        self.session.forget(needed.__contains__)
+        self.session.discard_states(needed.__contains__)

@@ -70,7 +70,7 @@ def report(experiment: BeadExperiment, setup: Setup, run: BeadRun) -> dict:
         **experiment.size(setup),
         substeps=setup.substeps,
         iterations=setup.iterations,
-        time_step_s=setup.time_step_s,
+        time_step_s=setup.solver.time_step_s,
         stages=stage_figures(case.indentation_mm, errors, null_errors(case)),
         overall_mean_mm=rounded(errors.mean()),
         ms_per_step=spread(run.step_ms),

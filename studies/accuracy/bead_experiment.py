@@ -9,7 +9,7 @@ from rehearsal.build_solver import build_solver, static_shape, step_settings
 from rehearsal.configuration import Setup, SetupError
 from rehearsal.stopwatch import timed
 from scenes.closed_surfaces import moved_by
-from scenes.scene import Contact, SolverSection
+from scenes.scene import Contact
 from scenes.tissue import TissueSection
 from sim.body import RestBody
 from sim.fields import array_of
@@ -116,10 +116,8 @@ class BeadExperiment:
         self.model.update_frames()
 
     def _step_settings(self, setup: Setup) -> StepSettings:
-        names = ("time_step_s", "substeps", "iterations", "relaxation_factor")
-        section = SolverSection.model_validate({name: getattr(setup, name) for name in names})
         x, y, z = self.case.gravity.tolist()
-        return replace(step_settings(tissue_of(self.case, setup), section), gravity=(x, y, z))
+        return replace(step_settings(tissue_of(self.case, setup), setup.solver), gravity=(x, y, z))
 
     def _away(self) -> np.ndarray:
         pose = self.relative(self.case.poses[0])

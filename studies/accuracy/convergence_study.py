@@ -1,7 +1,6 @@
 """How much of a case's result is its settings': the beads once more, with one setting changed at a time."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -27,9 +26,8 @@ def changes_of(setup: Setup) -> dict[str, Setup]:
         )
     if setup.iterations > MOST_ITERATIONS:
         raise SetupError(f"--check: twice the iterations needs --iterations of {MOST_ITERATIONS} at most")
-    halved = replace(
-        setup,
-        time_step_s=setup.time_step_s / 2,
+    halved = setup.but(
+        time_step_s=setup.solver.time_step_s / 2,
         warm_up_steps=2 * setup.warm_up_steps,
         stage_steps=2 * setup.stage_steps,
     )
@@ -39,7 +37,7 @@ def changes_of(setup: Setup) -> dict[str, Setup]:
     }
     return {
         "half the time step": halved,
-        "twice the iterations": replace(setup, iterations=2 * setup.iterations),
+        "twice the iterations": setup.but(iterations=2 * setup.iterations),
         **sizes,
     }
 

@@ -11,7 +11,7 @@ from taichi.profiler.kernel_profiler import get_default_kernel_profiler
 
 from rehearsal.build_solver import build_solver, embedding_cell_mm, model_of, step_settings
 from rehearsal.configuration import probe_of
-from rehearsal.frame_view import settings_of, take_view
+from rehearsal.frame_view import image_view, initial_settings, probe_with_settings
 from rehearsal.measurements.run_report import Tally
 from rehearsal.rehearsal import SURROUNDINGS_MM, Rehearsal, scanned_anatomy
 from rehearsal.stopwatch import timed
@@ -240,7 +240,7 @@ def _pictures(rehearsal: Rehearsal, scanned: ScannedAnatomy) -> Iterator[dict[st
 def _whole_frame(rehearsal: Rehearsal) -> dict[str, Any]:
     """All that a frame does but drawing the 3D view: a step under the pressing transducer, skin, echo, window's picture."""
     rehearsal.reset()
-    settings, tally, page = settings_of(rehearsal), Tally(0.0), BackgroundImage(WindowLayout(1280, 720))
+    settings, tally, page = initial_settings(rehearsal), Tally(0.0), BackgroundImage(WindowLayout(1280, 720))
     settings.mode = "b-mode"
     poses = [
         rehearsal.pose_at_depth(depth)
@@ -251,7 +251,10 @@ def _whole_frame(rehearsal: Rehearsal) -> dict[str, Any]:
     whole += [rehearsal.embedding, rehearsal.scanner]
 
     def go_on() -> None:
-        page.compose(take_view(rehearsal, settings, poses.pop(0), tally), np.eye(3), slow_figures=True)
+        rehearsal.advance(poses.pop(0))
+        rehearsal.update_surfaces()
+        probe = probe_with_settings(rehearsal.probe, settings)
+        page.compose(image_view(rehearsal, probe, settings, tally), np.eye(3), slow_figures=True)
 
     return _alone("whole frame, with the echo", go_on, whole, None)
 

@@ -104,7 +104,7 @@ def describe(setup: Setup, solver: Solver, arch: str) -> dict[str, Any]:
         memberships=counts.get("memberships"),
         substeps=setup.substeps,
         iterations=setup.iterations,
-        time_step_s=setup.time_step_s,
+        time_step_s=setup.solver.time_step_s,
         arch=arch,
         cores=1 if solver.model.serial else ti.cfg.cpu_max_num_threads,
         memory_mb=round(memory_mb(solver), 3),

@@ -92,7 +92,7 @@ def _row(
     return dict(
         model=setup.model,
         **settings,
-        time_step_s=setup.time_step_s,
+        time_step_s=setup.solver.time_step_s,
         ms_median=round(float(ms), 4),
         error_mean_mm=rounded(float(np.mean([*resting.values(), *arriving.values()]))),
         error_resting_mm=rounded(float(np.mean(list(resting.values())))),

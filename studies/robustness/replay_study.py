@@ -8,7 +8,7 @@ import numpy as np
 
 from rehearsal.adaptive_iterations import AdaptiveIterations
 from rehearsal.configuration import Setup, scene_of
-from rehearsal.frame_view import settings_of
+from rehearsal.frame_view import initial_settings
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions.recorder import record
@@ -74,12 +74,12 @@ def recorded_session(
     recorded = record(session, anatomy, arch, out)
     live = UserInput(session, AdaptiveIterations(np.inf), recorded)
     moments = round(60 * minutes / rehearsal.settings.time_step_s)
-    for controls in chance(rehearsal, settings_of(rehearsal), moments):
-        pose = live.move(controls)
+    for controls in chance(rehearsal, initial_settings(rehearsal), moments):
+        pose = live.next_pose(controls)
         if pose is not None:
             rehearsal.advance(pose)
-            live.stepped(0.0)
-        live.watch()
+            live.after_step(0.0)
+        live.after_frame()
         done(1)
     recorded.close({})
     return recorded.recording.path, rehearsal.digest()
@@ -100,7 +100,7 @@ def replayed(
     replay = Replay(rehearsal, log)
     begins = replay.begin_at(from_s)
     # The way from there to the time itself is not counted.
-    done(begins - replay.moment_at(from_s))
+    done(begins - replay.step_at(from_s))
     for _ in replay.go_to(log.length_s):
         done(1)
     return dict(

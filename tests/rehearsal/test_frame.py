@@ -13,8 +13,8 @@ from click.exceptions import Exit
 import app
 from rehearsal import frame, headless, run
 from rehearsal.commands import rehearse_command
-from rehearsal.frame import FrameLoop
-from rehearsal.frame_view import probe_as_set
+from rehearsal.frame import Frames, WindowFrames
+from rehearsal.notices import Notices
 from render.keys import DEFAULT_KEYS, Keys
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
@@ -25,60 +25,61 @@ from ultrasound.probe import load_probe
 STEP_S = 0.25
 
 
-class Moments:
-    """A driver, a rehearsal and its instruments in one, of which each moment is one mm further; a replay that sets the depth."""
+class Fake:
+    """A rehearsal, its input source and its measurements in one: each step is 1 mm further, and sets the depth as a replay does."""
 
     def __init__(self) -> None:
         self.probe, self.origin = load_probe("linear"), np.array([100.0, 200.0, 300.0])
-        self.settings, self.notice, self.status, self.moment = SimpleNamespace(time_step_s=STEP_S), "", "", 0
+        self.settings, self.notice, self.status, self.steps = SimpleNamespace(time_step_s=STEP_S), "", "", 0
 
     @property
     def session(self) -> SimpleNamespace:
-        return SimpleNamespace(time_s=self.moment * STEP_S)
+        return SimpleNamespace(time_s=self.steps * STEP_S)
 
-    def move(self, controls: Controls) -> np.ndarray:
-        self.moment += 1
-        controls.settings.depth_mm = 50 + self.moment
+    def next_pose(self, controls: Controls) -> np.ndarray:
+        self.steps += 1
+        controls.settings.depth_mm = 50 + self.steps
         return np.eye(4)
 
     def image_plane(self) -> SimpleNamespace:
         place = np.eye(4)
-        place[0, 3] = self.moment
+        place[0, 3] = self.steps
         return SimpleNamespace(world_from_plane=place)
 
-    def take_view(self, rehearsal, settings, pose, tally) -> View:
-        tally.step_ms.append(1.0)
-        grey = np.full((4, 4), self.moment + 100 * (pose is None), np.uint8)
-        probe = probe_as_set(self.probe, settings)
+    def image_view(self, rehearsal, probe, settings, tally) -> View:
+        grey = np.full((4, 4), self.steps, np.uint8)
         width, depth, _ = probe.extent_mm
         return View(np.eye(4), {"B-mode": grey, "CT": 255 - grey}, width, depth)
 
+    def advance(self, pose) -> None: ...
+    def update_surfaces(self) -> None: ...
     def rest_grid(self) -> None: ...
-    def stepped(self, step_ms: float) -> str:
-        return ""
-
+    def after_step(self, step_ms: float) -> None: ...
+    def after_frame(self) -> None: ...
     def watch(self, *_) -> str:
         return ""
 
     def onto(self, view: View, settings: Settings) -> View:
-        return replace(view, alert="read")
-
-    def take_said(self) -> str:
-        return ""
+        return replace(view, alert="measured")
 
     def figures(self) -> dict:
         return {}
 
 
-class Nothing:
+class FakeTally:
     """A tally of nothing."""
 
-    def __init__(self, build_s: float) -> None:
+    def __init__(self) -> None:
         self.step_ms: list[float] = []
 
-    def watch(self, rehearsal: Moments) -> None: ...
-    def report(self, rehearsal: Moments, arch: str) -> dict:
+    def watch(self, rehearsal: Fake) -> None: ...
+    def report(self, rehearsal: Fake, arch: str) -> dict:
         return {}
+
+
+@pytest.fixture(autouse=True)
+def no_device(monkeypatch):
+    monkeypatch.setattr(frame, "timed", lambda work, into_ms: into_ms.append(1.0) or work())
 
 
 @pytest.fixture
@@ -87,11 +88,13 @@ def sent() -> list:
 
 
 @pytest.fixture
-def looping(monkeypatch, tmp_path, sent) -> FrameLoop:
-    moments = Moments()
-    monkeypatch.setattr(frame, "take_view", moments.take_view)
-    link = SimpleNamespace(show=sent.append)
-    return FrameLoop(moments, None, tmp_path, Nothing(0.0), *[moments] * 4, frozen=False, link=link)
+def looping(monkeypatch, tmp_path, sent) -> WindowFrames:
+    fake = Fake()
+    monkeypatch.setattr(frame, "image_view", fake.image_view)
+    return WindowFrames(
+        *(fake, fake, fake, FakeTally(), SimpleNamespace(show=sent.append)),
+        **dict(viewer=None, out=tmp_path, notices=Notices(), sweeping=fake, plans=fake),
+    )
 
 
 def test_each_frame_goes_to_the_link_as_it_is_shown(looping, sent):
@@ -101,7 +104,7 @@ def test_each_frame_goes_to_the_link_as_it_is_shown(looping, sent):
         assert live.grey is view.pictures["B-mode"] and live.time_s == number * STEP_S
         assert (
             np.array_equal(live.probe_in_patient[:3, 3], [100.0 + number, 200.0, 300.0])
-            and view.alert == "read"
+            and view.alert == "measured"
         )
         # The depth that the replay has just set, not that of the frame before.
         assert live.image_to_probe[1, 1] == pytest.approx(view.depth_mm / 4) == (50 + number) / 4
@@ -113,21 +116,21 @@ def test_a_frozen_picture_is_sent_as_the_scanner_is_set_and_one_looked_back_at_i
     looping.cine.frames.append(looping.cine.frames[-1])
     settings.depth_mm = 80
     looping.frame(Controls(settings, freeze=True))
-    assert sent[-1].grey[0, 0] == 101 and sent[-1].image_to_probe[1, 1] == 20 and len(sent) == 2
+    assert sent[-1].grey[0, 0] == 1 and sent[-1].image_to_probe[1, 1] == 20 and len(sent) == 2
     looping.frame(Controls(settings, cine=-1))
     assert len(sent) == 2
 
 
-def test_what_the_guard_put_back_is_told_and_stands_in_the_panel_for_a_while(looping, monkeypatch, capsys):
+def test_a_restored_state_is_a_notice_and_stands_in_the_panel_for_a_while(looping, monkeypatch, capsys):
     clock = [100.0]
     monkeypatch.setattr(frame, "perf_counter", lambda: clock[0])
-    looping.rehearsal.notice = "Tissue put back"
+    looping.rehearsal.notice = "Tissue restored"
     shown = [looping.frame(Controls(Settings())).status]
     looping.rehearsal.notice = ""
     for clock[0] in (103.9, 104.1):
         shown.append(looping.frame(Controls(Settings())).status)
     assert (
-        shown == ["TISSUE PUT BACK", "TISSUE PUT BACK", ""] and capsys.readouterr().out == "Tissue put back\n"
+        shown == ["STATE RESTORED", "STATE RESTORED", ""] and capsys.readouterr().out == "Tissue restored\n"
     )
 
 
@@ -138,9 +141,9 @@ def test_a_sweep_that_is_recorded_stands_in_the_panel_beside_all_else(looping, m
     looping.plans = SimpleNamespace(status="PLANNING; {next_plan} stops", watch=lambda *_: "")
     controls = Controls(Settings())
     assert looping.frame(controls).status == "RECORDING 3 s   PLANNING; Backspace stops"
-    looping.driver.status = "TRACKING LOST"
+    looping.source.status = "TRACKING LOST"
     assert looping.frame(controls).status == "RECORDING 3 s   TRACKING LOST   PLANNING; Backspace stops"
-    looping._say("undo: {undo}")
+    looping.notices.post("undo: {undo}", in_terminal=False)
     assert looping.frame(controls).status == "RECORDING 3 s   Undo: U"
     clock[0] += 2.1
     assert looping.frame(Controls(Settings(), freeze=True)).status == (
@@ -148,25 +151,32 @@ def test_a_sweep_that_is_recorded_stands_in_the_panel_beside_all_else(looping, m
     )
 
 
+def test_notices_name_the_users_keys_on_the_screen_and_in_the_terminal(looping, capsys):
+    looping.keys = Keys(of=DEFAULT_KEYS | {"sweep": "Space", "plan_for": "L"})
+    looping.notices.post("sweep-001: {sweep} ends it")
+    assert looping.frame(Controls(Settings())).status == "Sweep-001: Space ends it"
+    assert capsys.readouterr().out == "sweep-001: Space ends it\n"
+
+
 def test_what_is_wrong_with_the_tissue_stands_before_all_that_is_technical(looping, monkeypatch):
     monkeypatch.setattr(frame, "perf_counter", lambda: 100.0)
-    monkeypatch.setattr(Moments, "onto", lambda each, view, settings: replace(view, status="SQUEEZED"))
+    monkeypatch.setattr(Fake, "onto", lambda each, view, settings: replace(view, status="SQUEEZED"))
     looping.sweeping = SimpleNamespace(status="RECORDING 3 s", watch=lambda *_: "")
     looping.plans = SimpleNamespace(status="PLANNING", watch=lambda *_: "")
-    looping.driver.status = "LESS EXACT"
+    looping.source.status = "REDUCED ITERATIONS"
     controls = Controls(Settings())
-    assert looping.frame(controls).status == "SQUEEZED   RECORDING 3 s   LESS EXACT   PLANNING"
-    looping._say("undo")
+    assert looping.frame(controls).status == "SQUEEZED   RECORDING 3 s   REDUCED ITERATIONS   PLANNING"
+    looping.notices.post("undo", in_terminal=False)
     assert looping.frame(controls).status == "SQUEEZED   RECORDING 3 s   Undo"
-    looping._said_until, looping._put_back_until = 0.0, 104.0
+    looping._notice_until, looping._restored_until = 0.0, 104.0
     status = looping.frame(Controls(Settings(), freeze=True)).status
-    assert status == "TISSUE PUT BACK   SQUEEZED   RECORDING 3 s   FROZEN   PLANNING"
+    assert status == "STATE RESTORED   SQUEEZED   RECORDING 3 s   FROZEN   PLANNING"
 
 
 def test_a_frozen_picture_keeps_its_caliper_and_a_live_one_until_the_probe_moves(looping, monkeypatch):
-    take_view, at = looping.rehearsal.take_view, np.eye(4)
+    image_view, at = looping.rehearsal.image_view, np.eye(4)
     monkeypatch.setattr(
-        frame, "take_view", lambda *told: replace(take_view(*told), transducer_pose=at.copy())
+        frame, "image_view", lambda *given: replace(image_view(*given), transducer_pose=at.copy())
     )
     place = (1.0, 2.0)
     assert looping.frame(Controls(Settings(), pointed_mm=place)).caliper_mm == (place,)
@@ -188,16 +198,16 @@ def test_the_clock_is_the_sessions_and_says_where_it_is_slow(looping):
 
 
 def test_without_contact_whoever_leads_by_hand_is_told_how_to_press(looping, monkeypatch):
-    monkeypatch.setattr(Moments, "onto", lambda each, view, _: replace(view, notes={"B-mode": "NO CONTACT"}))
+    monkeypatch.setattr(Fake, "onto", lambda each, view, _: replace(view, notes={"B-mode": "NO CONTACT"}))
     monkeypatch.setattr(frame, "UserInput", SimpleNamespace)
     looping.keys = Keys({**DEFAULT_KEYS, "push": "Return"})
-    monkeypatch.setattr(frame, "ReplayInput", Moments)
-    by_hand, tracked = (SimpleNamespace(is_by_hand=each) for each in (True, False))
+    monkeypatch.setattr(frame, "ReplayInput", Fake)
+    by_hand, tracked = (SimpleNamespace(is_manual=each) for each in (True, False))
     told = []
-    for looping.driver.live in (None, by_hand, tracked):
+    for looping.source.user_input in (None, by_hand, tracked):
         told.append(looping.frame(Controls(Settings())).notes["B-mode"])
     assert told == ["NO CONTACT", "NO CONTACT\nLeft button or Return presses", "NO CONTACT"]
-    looping.driver.live = by_hand
+    looping.source.user_input = by_hand
     frozen = looping.frame(Controls(Settings(), freeze=True))
     assert frozen.notes["B-mode"] == "NO CONTACT"
 
@@ -226,8 +236,8 @@ def test_the_export_key_saves_the_tissue_beside_its_picture_and_says_what_it_can
     looping._save(Controls(settings, export=True), before)
     assert len(begins) == 3 and (tmp_path / "004-b-mode.png").is_file()
     missing = (
-        "echo black: the probe does not touch the organ",
-        "no organ (PLY), which has moved since: F goes on",
+        "B-mode image black: the probe does not touch the organ",
+        "no organ (PLY), which has moved since: F continues",
     )
     assert looping.frame(Controls(settings)).status == "   ".join(["Saved 004", *missing])
     assert capsys.readouterr().out.endswith(f"\n{'; '.join(missing)}\n")
@@ -242,7 +252,7 @@ def test_pictures_of_an_earlier_run_are_not_replaced_without_a_word(monkeypatch,
     picture.parent.mkdir()
     if earlier:
         picture.touch()
-    headless.Pictures(Moments(), 3, tmp_path)
+    headless.Pictures(Fake(), 3, tmp_path)
     said = f"Replacing the pictures of an earlier run in {tmp_path}.\n" if earlier else ""
     assert capsys.readouterr().out == said and not picture.exists()
 
@@ -251,37 +261,37 @@ def test_without_a_window_pictures_go_to_the_link_and_the_tissue_into_the_folder
     def no_viewer(rehearsal, visible):
         raise NoVulkan("no Vulkan")
 
-    moments, saved = Moments(), []
+    fake, saved = Fake(), []
     monkeypatch.setattr(headless, "open_viewer", no_viewer)
-    monkeypatch.setattr(headless, "take_view", moments.take_view)
-    monkeypatch.setattr(headless, "Tally", Nothing)
+    monkeypatch.setattr(frame, "image_view", fake.image_view)
     monkeypatch.setattr(headless, "summary", lambda report: "")
-    monkeypatch.setattr(headless, "save_surfaces", lambda rehearsal, out: saved.append((moments.moment, out)))
-    link = SimpleNamespace(show=sent.append)
-    headless.run_headless(moments, moments, 3, Settings(), moments, "cpu", tmp_path, 0.0, True, link)
+    monkeypatch.setattr(headless, "save_surfaces", lambda rehearsal, out: saved.append((fake.steps, out)))
+    frames = Frames(fake, fake, fake, FakeTally(), SimpleNamespace(show=sent.append))
+    headless.run_headless(frames, Notices(), 3, Settings(), "cpu", tmp_path)
     assert [live.grey[0, 0] for live in sent] == [1, 2, 3] and sent[-1].time_s == 3 * STEP_S
     assert [live.image_to_probe[1, 1] for live in sent] == [51 / 4, 52 / 4, 53 / 4]
     assert saved == [(3, tmp_path)] and json.loads((tmp_path / "report.json").read_text()) == {"reading": {}}
 
 
 def test_without_pictures_none_is_taken_and_the_rest_is_written(monkeypatch, tmp_path):
-    moments, done = Moments(), []
-    monkeypatch.setattr("rehearsal.frame_view.timed", lambda act, ms: ms.append(1.0) or act())
-    monkeypatch.setattr(headless, "Tally", Nothing)
+    fake, done = Fake(), []
     monkeypatch.setattr(headless, "summary", lambda report: "")
     monkeypatch.setattr(headless, "save_surfaces", lambda rehearsal, out: done.append("surfaces"))
-    moments.advance = lambda pose: done.append("step")
-    moments.update_surfaces = lambda: done.append("carried")
+    fake.advance = lambda pose: done.append("step")
+    fake.update_surfaces = lambda: done.append("surfaces moved")
     # The plane of the depth that the replay has just set.
-    moments.find_plane = lambda probe: done.append(probe.depth_mm)
-    moments.watch = lambda *told: done.append("watched") if told else ""
-    monkeypatch.setattr(Nothing, "watch", lambda tally, rehearsal: done.append("tallied"))
-    move = moments.move
-    # The last moment is a way back: nothing is stepped, and the tool is not yet where the tissue has it.
-    moments.move = lambda controls: None if move(controls) is not None and moments.moment == 3 else np.eye(4)
-    headless.run_headless(moments, moments, 3, Settings(), moments, "cpu", tmp_path, 0.0, draws=False)
-    steps = [["step", "carried", depth_mm, "tallied", "watched"] for depth_mm in (51, 52)]
-    assert done == [*steps[0], *steps[1], 53, "watched", "surfaces"]
+    fake.find_plane = lambda probe: done.append(probe.depth_mm)
+    fake.watch = lambda *given: done.append("measured")
+    monkeypatch.setattr(FakeTally, "watch", lambda tally, rehearsal: done.append("tallied"))
+    next_pose = fake.next_pose
+    # The last frame is a rollback: nothing is stepped, and the tool is not yet where the tissue has it.
+    fake.next_pose = lambda controls: (
+        None if next_pose(controls) is not None and fake.steps == 3 else np.eye(4)
+    )
+    frames = Frames(fake, fake, fake, FakeTally())
+    headless.run_headless(frames, Notices(), 3, Settings(), "cpu", tmp_path, draws=False)
+    steps = [["step", "surfaces moved", depth_mm, "tallied", "measured"] for depth_mm in (51, 52)]
+    assert done == [*steps[0], *steps[1], 53, "measured", "surfaces"]
     assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
 
 
@@ -289,12 +299,12 @@ def test_ctrl_c_in_a_run_says_so_before_how_it_went(monkeypatch, capsys):
     monkeypatch.setattr(run.RehearsalRun, "_end", lambda each, bookmarks: print(f"{bookmarks} bookmarks"))
     monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide: None)
     driver = SimpleNamespace(session=SimpleNamespace(time_s=1.25), bookmarks=3)
-    each = run.RehearsalRun(Moments(), None, "cpu", None)
-    with pytest.raises(Exit) as ended, each._summed_up(driver, None):
+    each = run.RehearsalRun(Fake(), None, "cpu", None)
+    with pytest.raises(Exit) as ended, each._summarised(driver, None):
         raise KeyboardInterrupt
     assert ended.value.exit_code == 130
     assert capsys.readouterr().out == "\nStopped at 1.2 s; until then:\n3 bookmarks\n"
-    with each._summed_up(driver, None):
+    with each._summarised(driver, None):
         pass
     assert capsys.readouterr().out == "3 bookmarks\n"
 
@@ -313,9 +323,9 @@ def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scen
         lambda rehearsal, guide: SimpleNamespace(guide=None, summary=lambda bookmarks: {}),
     )
     monkeypatch.setattr(run, "summary_text", lambda summary: "")
-    each = run.RehearsalRun(Moments(), None, "cpu", None, scene=scene)
+    each = run.RehearsalRun(Fake(), None, "cpu", None, scene=scene)
     recording = SimpleNamespace(path=PurePosixPath("a/session-001.jsonl"), fault="")
-    each.recorded = SimpleNamespace(recording=recording, close=lambda summary: None)
+    each.recorder = SimpleNamespace(recording=recording, close=lambda summary: None)
     each._end(0)
     assert capsys.readouterr().out.endswith(f"replay it with: {pasted('rehearse', *words)}\n")
 
@@ -325,14 +335,15 @@ def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path
     viewer = SimpleNamespace(close=lambda: None, settings=Settings())
     monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide: None)
     monkeypatch.setattr(run, "open_viewer", lambda rehearsal, **_: viewer)
-    monkeypatch.setattr(run, "settings_of", lambda rehearsal: Settings())
+    monkeypatch.setattr(run, "initial_settings", lambda rehearsal: Settings())
     looping = SimpleNamespace(run=lambda: None)
-    monkeypatch.setattr(run, "FrameLoop", lambda *_, keys, link: given.append(link) or looping)
-    monkeypatch.setattr(run, "run_headless", lambda *arguments: given.append(arguments[-1]))
-    monkeypatch.setattr(run, "Session", lambda rehearsal, seen: None)
-    for name in ("_live", "_record", "_end"):
+    looping.plans = looping.sweeping = SimpleNamespace(stop=lambda: None, end=lambda: "")
+    monkeypatch.setattr(run, "WindowFrames", lambda *fixed, **_: given.append(fixed[4]) or looping)
+    monkeypatch.setattr(run, "run_headless", lambda frames, *_: given.append(frames.link))
+    monkeypatch.setattr(run, "Session", lambda rehearsal, coverage: None)
+    for name in ("_user_input", "_record", "_end"):
         monkeypatch.setattr(run.RehearsalRun, name, lambda *_: SimpleNamespace(bookmarks=0))
-    each = run.RehearsalRun(Moments(), None, "cpu", tmp_path, link=link)
+    each = run.RehearsalRun(Fake(), None, "cpu", tmp_path, link=link)
     each.in_window(None, 0.0)
     each.headless(None, 0.0, 1.0, 0.0)
     assert given == [link, link]

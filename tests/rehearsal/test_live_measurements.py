@@ -43,16 +43,18 @@ def watching(monkeypatch, rehearsal) -> LiveMeasurements:
 
 def test_the_instruments_watch_the_guide_and_record_it(watching, rehearsal, one_device):
     noted: list[dict] = []
-    session = SimpleNamespace(moment=0, kept={}, back=None, note=lambda name, figures: noted.append(figures))
+    session = SimpleNamespace(
+        step_index=0, kept_states={}, rolled_back_to=None, note=lambda name, figures: noted.append(figures)
+    )
     for pose in FIRST:
         rehearsal.pose = pose
         watching.watch(session, rehearsal.probe, pose)
-        session.moment += 5
+        session.step_index += 5
     assert [round(each["plan_followed"], 3) for each in noted] == [round(n / 7, 3) for n in (1, 2, 3, 4)]
     assert all(each["plan_off_mm"] == 0 and "seen_margin" in each for each in noted)
     view = watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings())
     assert view.guidance.goal == pytest.approx(SECOND[0]) and view.findings["plan"] == "57 %"
-    watching.begin_anew()
+    watching.restart()
     assert watching.guide.at == 0
     watching.guide = None
     assert watching.onto(view, Settings()).guidance is None and "plan_followed" not in watching.figures()
@@ -65,11 +67,11 @@ def test_what_a_session_holds_is_recalled_as_it_was_watched(watching, rehearsal,
         live_measurements, "measure", lambda *_: Measurement(next(squeezed), 20.0, 5.0, 2.0, 1.0)
     )
     events: dict[int, list] = {}
-    session = SimpleNamespace(moment=0, kept={}, back=None)
-    session.note = lambda kind, value: events.setdefault(session.moment, []).append(
-        Event(at=session.moment, kind=kind, value=value)
+    session = SimpleNamespace(step_index=0, kept_states={}, rolled_back_to=None)
+    session.note = lambda kind, value: events.setdefault(session.step_index, []).append(
+        Event(at=session.step_index, kind=kind, value=value)
     )
-    for session.moment, rehearsal.pose in enumerate(FIRST, 1):
+    for session.step_index, rehearsal.pose in enumerate(FIRST, 1):
         watching._read_every = 1
         watching.watch(session, rehearsal.probe, rehearsal.pose)
     watching.course.add(None, 0.2)
@@ -96,9 +98,9 @@ def test_a_way_back_is_looked_at_and_read_anew_at_once(watching, rehearsal, one_
     monkeypatch.setattr(watching.coverage, "look", lambda *_: next(looks))
     noted: list[float] = []
     watching._look_every = 2
-    session = SimpleNamespace(moment=0, kept={}, back=None)
+    session = SimpleNamespace(step_index=0, kept_states={}, rolled_back_to=None)
     session.note = lambda kind, figures: noted.append(figures["compression_mm"])
-    for session.moment, pose in ((0, FIRST[0]), (1, FIRST[0]), (3, None)):
+    for session.step_index, pose in ((0, FIRST[0]), (1, FIRST[0]), (3, None)):
         watching.watch(session, rehearsal.probe, pose)
     view = watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings())
     assert view.findings["compression"] == "0.2 mm" and noted == [9.0, 0.2] and view.notes
@@ -115,9 +117,9 @@ def test_a_session_that_begins_is_read_with_what_touches_then(watching, rehearsa
     monkeypatch.setattr(watching.coverage, "look", lambda *_: touches)
     watching._look_every = 2
     for _ in range(2):
-        session = SimpleNamespace(moment=1, kept={}, back=None, note=lambda *_: None)
+        session = SimpleNamespace(step_index=1, kept_states={}, rolled_back_to=None, note=lambda *_: None)
         watching.watch(session, rehearsal.probe, FIRST[0])
-        watching.begin_anew()
+        watching.restart()
     assert len(given) == 2 and all(np.array_equal(each, touches) for each in given)
 
 
@@ -142,7 +144,9 @@ def test_an_echo_is_said_to_be_black_where_hardly_a_line_touches(
     touches = np.arange(rehearsal.probe.number_of_scanlines) < touching
     monkeypatch.setattr(watching.coverage, "look", lambda *_: touches)
     watching.watch(
-        SimpleNamespace(moment=0, kept={}, back=None, note=lambda *_: None), rehearsal.probe, FIRST[0]
+        SimpleNamespace(step_index=0, kept_states={}, rolled_back_to=None, note=lambda *_: None),
+        rehearsal.probe,
+        FIRST[0],
     )
     assert watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings()).notes == notes
 

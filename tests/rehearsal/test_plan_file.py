@@ -141,7 +141,7 @@ def test_a_turned_pose_is_taken_and_no_file_or_a_folder_refused(tmp_path):
 def test_a_plan_is_followed_only_on_its_anatomy_with_its_probe():
     plan, probe = plan_of(), load_probe("linear")
     check_plan(plan, plan.anatomy, probe)
-    with pytest.raises(PlanError, match="the plan is of other anatomy than this scene's"):
+    with pytest.raises(PlanError, match="the plan is for other anatomy"):
         check_plan(plan, "b" * 16, probe)
     with pytest.raises(PlanError, match="for the probe 'Linear.*found 'Drop-in.*choose it with --probe"):
         check_plan(plan, plan.anatomy, load_probe("drop-in"))
@@ -255,7 +255,7 @@ def test_a_plan_is_made_on_the_tissue_of_the_quality(ball_scene, monkeypatch, ca
 def test_rehearse_refuses_a_plan_of_another_patient_before_it_builds_anything(ball_scene, capsys):
     write_plan(plan_of(), ball_scene / "plan.json")
     assert app.main(["rehearse", str(ball_scene), "--plan", str(ball_scene / "plan.json")]) == 2
-    assert "the plan is of other anatomy than this scene's" in capsys.readouterr().err
+    assert "the plan is for other anatomy" in capsys.readouterr().err
     (ball_scene / "plan.json").write_text("{}")
     assert app.main(["rehearse", str(ball_scene), "--plan", str(ball_scene / "plan.json")]) == 2
     told = capsys.readouterr().err

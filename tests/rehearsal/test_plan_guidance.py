@@ -166,17 +166,20 @@ class Led:
     def __init__(self) -> None:
         held = over_ball()
         held.pose = held.settled = advanced(FIRST[0], -50.0)
-        held.snapshot, held.restore = lambda: held.pose, lambda pose: setattr(held, "pose", pose)
+        held.snapshot, held.restore = (
+            lambda manipulator=None: held.pose,
+            lambda pose: setattr(held, "pose", pose),
+        )
         held.update_surfaces = lambda: None
         self.rehearsal, self.session = held, Session(held)
-        self.session.store = lambda: None
+        self.session.record_state = lambda: None
         self.history = History(self.session)
         self.guide = PlanGuidance(held, plan_of(sweep_of(FIRST, SECOND), sweep_of(SECOND)))
 
     def step(self, pose: np.ndarray, acts: bool = True) -> None:
         self.history.watch(acts, False)
         self.rehearsal.pose = pose
-        self.session.stepped()
+        self.session.end_step()
         self.guide.go_with(self.session)
 
     def act(self, *poses: np.ndarray) -> dict[str, float]:
@@ -250,7 +253,9 @@ def test_of_another_sweep_nothing_was_gone_at_any_moment_before_it_was_shown(led
 def test_no_more_is_kept_of_it_than_of_the_session(led):
     for number in range(MOST_UNDONE + 9):
         led.act(FIRST[number % 4])
-    assert led.guide._kept.keys() == led.session.kept.keys() and len(led.guide._kept) <= MOST_UNDONE + 1
+    assert (
+        led.guide._kept.keys() == led.session.kept_states.keys() and len(led.guide._kept) <= MOST_UNDONE + 1
+    )
 
 
 # Its lines

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from plan_ball import over_ball, plan_of, straight_pass, sweep_of
 
-from rehearsal.frame_view import probe_as_set
+from rehearsal.frame_view import probe_with_settings
 from rehearsal.planning import plans_in_window
 from rehearsal.planning.plan_file import PlanError, read_plan
 from rehearsal.planning.plan_guidance import PlanGuidance
@@ -103,7 +103,7 @@ def test_a_plan_is_made_while_the_rehearsal_goes_on_and_then_followed(searching,
         "margin",
         7.0,
         plans.anatomy,
-        probe_as_set(PROBE, Settings(margin_mm=7)),
+        probe_with_settings(PROBE, Settings(margin_mm=7)),
     )
     assert problem.scene.solver.iterations == Settings().iterations
     assert said(plans, plan=True) == "Planning for the tumour and its margin"

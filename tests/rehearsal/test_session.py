@@ -48,7 +48,7 @@ def header() -> Header:
 
 
 def live_into(path: Path, seen: Callable[[], np.ndarray] | None = None) -> UserInput:
-    session = Session(Numbers(), seen=seen)
+    session = Session(Numbers(), coverage=seen)
     return UserInput(session, AdaptiveIterations(1e6), SessionRecorder(session, Recording(path, header())))
 
 
@@ -61,19 +61,19 @@ def lead(live: UserInput, moments: int, seed: int) -> str:
         pressing ^= random.random() < 0.1
         settings.young_kpa = float(random.choice([5.0, 15.0, 1 / 3])) if random.random() < 0.05 else 15.0
         settings.iterations = int(random.integers(1, 20)) if random.random() < 0.1 else settings.iterations
-        live.ladder.rung = int(random.integers(4))
+        live.adaptive_iterations.level = int(random.integers(4))
         keys = ("undo", "redo", "reset", "bookmark", "to_bookmark")
         did = {key: bool(random.random() < 0.04) for key in keys}
         x_mm = float(random.uniform(-8, 8))
         step(live, settings=settings, ray=ray(x_mm) if random.random() < 0.2 else None, press=pressing, **did)
-        live.watch()
+        live.after_frame()
     return live.session.rehearsal.digest()
 
 
 def written(path: Path, moments: int = 100, seed: int = 0) -> str:
     live = live_into(path)
     digest = lead(live, moments, seed)
-    live.recorded.close({"presses": 1})
+    live.recorder.close({"presses": 1})
     return digest
 
 
@@ -81,7 +81,7 @@ def played(log: Log, at_s: float = 0.0) -> Replay:
     """A replay opened at a time and played to its end."""
     replay = Replay(Numbers(), log)
     replay.begin_at(at_s)
-    assert len(list(replay.go_to(at_s))) <= replay.session.moment == replay.moment_at(at_s)
+    assert len(list(replay.go_to(at_s))) <= replay.session.step_index == replay.step_at(at_s)
     for _ in replay.go_to(log.length_s):
         pass
     assert replay.is_over
@@ -115,8 +115,8 @@ def marked_then_gone_to(path: Path) -> Log:
     live = live_into(path)
     for moment in range(48):
         step(live, ray=ray(moment % 7 - 3.0), bookmark=moment == 5, to_bookmark=moment == 32)
-        live.watch()
-    live.recorded.close({})
+        live.after_frame()
+    live.recorder.close({})
     return read_log(path)
 
 
@@ -130,9 +130,9 @@ def test_a_state_that_a_later_way_back_goes_behind_is_not_begun_at(monkeypatch, 
     del log.states[5]
     for moment, begun_at in ((5, 0), (25, 0), (32, 0), (33, 0), (39, 0), (40, 40), (47, 40)):
         replay = Replay(Numbers(), log)
-        assert replay.begin_at(moment * STEP_S) == begun_at == replay.session.moment
+        assert replay.begin_at(moment * STEP_S) == begun_at == replay.session.step_index
         assert len(list(replay.go_to(moment * STEP_S))) == moment - begun_at
-        assert replay.session.moment == moment and replay.bookmarks == (moment > 5)
+        assert replay.session.step_index == moment and replay.bookmarks == (moment > 5)
     assert played(log, 25 * STEP_S).differs_s is None
 
 
@@ -142,11 +142,11 @@ def voxels(count: int) -> np.ndarray:
 
 
 def test_beside_each_whole_state_stands_what_was_seen_until_then(often, tmp_path):
-    live = live_into(tmp_path / "session", lambda: voxels(live.session.moment))
+    live = live_into(tmp_path / "session", lambda: voxels(live.session.step_index))
     for moment in range(50):
         step(live, bookmark=moment == 13, ray=ray(moment % 7 - 3.0))
-        live.watch()
-    live.recorded.close({})
+        live.after_frame()
+    live.recorder.close({})
     log = read_log(tmp_path / "session")
     assert sorted(log.seen) == sorted(log.states) == [13, 16, 32, 48, 50]
     assert all(np.array_equal(unpack_seen(seen), voxels(moment)) for moment, seen in log.seen.items())
@@ -172,8 +172,8 @@ def test_what_was_seen_that_is_damaged_is_named_by_its_line(tmp_path):
     live = live_into(tmp_path / "session", lambda: voxels(60))
     for moment in range(9):
         step(live, bookmark=moment == 3)
-        live.watch()
-    live.recorded.close({})
+        live.after_frame()
+    live.recorder.close({})
     lines = (tmp_path / "session").read_text().splitlines()
     second, end = json.loads(lines[1]), json.loads(lines[-1])
     assert end["seen"] == whole == next(e["value"] for e in second["events"] if e["kind"] == "seen")
@@ -192,21 +192,20 @@ def test_a_digest_that_differs_is_said_with_its_second_once(tmp_path, at_back):
     live = live_into(tmp_path / "session")
     for moment in range(50):
         step(live, reset=at_back and moment == 3 * SECOND - 1)
-        live.watch()
-    live.recorded.close({})
+        live.after_frame()
+    live.recorder.close({})
     log = read_log(tmp_path / "session")
     for moment in (3 * SECOND, 5 * SECOND):
         log.digests[moment] = "another"
-    driver, said = ReplayInput(Replay(Numbers(), log), lambda: None), []
+    driver = ReplayInput(Replay(Numbers(), log), lambda: None)
     while not driver.replay.is_over:
-        pose = driver.move(Controls(Settings()))
+        pose = driver.next_pose(Controls(Settings()))
         if pose is not None:
             driver.replay.rehearsal.advance(pose)
-            said.append(driver.stepped(0.0))
+            driver.after_step(0.0)
     assert driver.replay.differs_s == 3.0
-    assert [text for text in said if text] == [
-        "Mind: from 3 s on the tissue is not bit for bit the recorded one's."
-    ]
+    (notice,) = driver.notices.take()
+    assert "from 3 s on" in notice.text and "differs" in notice.text and notice.in_terminal
 
 
 @pytest.mark.parametrize(
@@ -243,7 +242,7 @@ def test_poses_keep_every_bit_and_ways_back_are_no_numbers():
 
 def on_disk(live: UserInput) -> None:
     """Wait until the disk has all that was handed to it."""
-    live.recorded.recording._disk.submit(int).result(10)
+    live.recorder.recording._disk.submit(int).result(10)
 
 
 def test_the_file_is_on_the_disk_each_second(tmp_path):
@@ -254,7 +253,7 @@ def test_the_file_is_on_the_disk_each_second(tmp_path):
         log = read_log(tmp_path / "session")
         assert len(log.poses) == second * SECOND and log.digests[second * SECOND] == digest
         assert log.summary is None and log.length_s == second
-    live.recorded.close({})
+    live.recorder.close({})
 
 
 def test_of_a_file_that_a_crash_cut_all_whole_seconds_are_read(tmp_path):
@@ -330,18 +329,18 @@ class FullDisk(io.RawIOBase):
 
 def test_a_full_disk_leaves_the_rehearsal_going_and_is_said_once(tmp_path):
     live = live_into(tmp_path / "session")
-    said = []
     for moment in range(50):
         if moment in (20, 40):
             on_disk(live)
         if moment == 20:
-            live.recorded.recording._file = io.TextIOWrapper(io.BufferedWriter(FullDisk()))
+            live.recorder.recording._file = io.TextIOWrapper(io.BufferedWriter(FullDisk()))
         step(live)
-        said.append(live.watch())
-    live.recorded.close({})
-    assert [text for text in said if text] == ["session: no longer written (No space left on device)"]
-    assert live.recorded.recording.fault == "session: no longer written (No space left on device)"
-    assert live.session.moment == 50 and len(read_log(tmp_path / "session").poses) == 16
+        live.after_frame()
+    live.recorder.close({})
+    (notice,) = live.recorder.notices.take()
+    assert notice.text == "session: no longer written (No space left on device)"
+    assert live.recorder.recording.fault == "session: no longer written (No space left on device)"
+    assert live.session.step_index == 50 and len(read_log(tmp_path / "session").poses) == 16
 
 
 def recorded_at(folder: Path, ball: trimesh.Trimesh) -> SessionRecorder:

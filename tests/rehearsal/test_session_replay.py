@@ -13,11 +13,11 @@ import taichi as ti
 from rehearsal import headless, run
 from rehearsal.build_solver import step_settings
 from rehearsal.coordinates import probe_in_patient
-from rehearsal.frame_view import settings_of
+from rehearsal.frame_view import initial_settings
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions import recorder
-from rehearsal.sessions.open_session import opened
+from rehearsal.sessions.open_session import open_session
 from rehearsal.sessions.packed_coverage import pack_seen
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session_file import Log, SessionError, read_log
@@ -88,13 +88,13 @@ def rewound(rehearsal: Rehearsal) -> Rehearsal:
 def rehearsed(built, monkeypatch, out: Path, script: Any, log: Log | None = None, at_s: float = 0.0):
     """What a rehearsal showed, frame by frame, the tissue's digest at its end, and what it recorded."""
     rehearsal, anatomy = rewound(built[0]), built[1]
-    settings = settings_of(rehearsal)
+    settings = initial_settings(rehearsal)
     viewer = Watched(settings, script(settings))
     monkeypatch.setattr(run, "open_viewer", lambda *_, **__: viewer)
     # A budget that no step keeps: the ladder goes down.
     each = run.RehearsalRun(rehearsal, anatomy, "cpu", out, budget_ms=0.01)
     each.in_window(log, at_s)
-    return viewer.seen, rehearsal.digest(), each.recorded and read_log(each.recorded.recording.path)
+    return viewer.seen, rehearsal.digest(), each.recorder and read_log(each.recorder.recording.path)
 
 
 def user(settings: Settings, frames: int = 150) -> Iterator[Controls]:
@@ -150,22 +150,22 @@ def opened_at_each(built, log: Log, capsys) -> None:
     }
     # From the beginning; from a bookmark, over a change of depth and two ways back; on a state, and from there over a way back.
     for begins, moment in ((0, 30), (88, 105), (120, 120), (120, 135)):
-        rehearsal, settings = rewound(built[0]), settings_of(built[0])
+        rehearsal, settings = rewound(built[0]), initial_settings(built[0])
         instruments = LiveMeasurements(rehearsal)
         assert Replay(rehearsal, log).begin_at(moment / 60) == begins
-        replay = opened(log, moment / 60, rewound(rehearsal), settings, instruments)
-        assert replay.session.moment == moment and instruments.figures() == noted[moment], moment
+        replay = open_session(log, moment / 60, rewound(rehearsal), settings, instruments)
+        assert replay.session.step_index == moment and instruments.figures() == noted[moment], moment
         assert instruments.course.duration_s == pytest.approx(moment / 60)
         assert settings.depth_mm == 40 and replay.bookmarks == 1 + (moment > 88)
     assert "Mind" not in capsys.readouterr().out
     instruments = LiveMeasurements(rehearsal)
-    opened(replace(log, seen={}), 127 / 60, rehearsal, settings_of(rehearsal), instruments)
-    assert "what was seen until 2 s; what was seen and done counts from there" in capsys.readouterr().out
+    open_session(replace(log, seen={}), 127 / 60, rehearsal, initial_settings(rehearsal), instruments)
+    assert "no record of the coverage until 2 s" in capsys.readouterr().out
     assert instruments.figures()["seen_organ"] < noted[120]["seen_organ"]
     assert instruments.course.duration_s == pytest.approx(7 / 60)
     other = replace(log, seen=dict.fromkeys(log.seen, pack_seen(np.zeros((2, 3, 4), bool))))
     with pytest.raises(SessionError, match=r"of \(2, 3, 4\) voxels what was seen, expected \([^\n]*$"):
-        opened(other, 127 / 60, rehearsal, settings_of(rehearsal), LiveMeasurements(rehearsal))
+        open_session(other, 127 / 60, rehearsal, initial_settings(rehearsal), LiveMeasurements(rehearsal))
 
 
 def test_a_session_that_goes_on_from_a_replay_is_one_too(built, monkeypatch, tmp_path, capsys):
@@ -200,7 +200,7 @@ def test_a_tracked_file_is_followed_headless_and_replayed(built, monkeypatch, tm
     )
     tracked = run.RehearsalRun(rehearsal, anatomy, "cpu", tmp_path, budget_ms=0.01, track=track)
     tracked.headless(None, 0.0, None, 0.0)
-    log = read_log(tracked.recorded.recording.path)
+    log = read_log(tracked.recorder.recording.path)
     assert len(log.poses) == 31 and probe_in_patient(rehearsal) == pytest.approx(poses[-1])
     told = [event.value for events in log.events.values() for event in events if event.kind == "solver"]
     assert len({values["iterations"] for values in told if "iterations" in values}) == 1

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import rotation_about
 from test_session import header
-from test_undo_history import STEP_S, Numbers, ray, step
+from test_undo_history import STEP_S, Numbers, ray, shown, step
 
 import app
 from rehearsal.adaptive_iterations import AdaptiveIterations
@@ -105,15 +105,15 @@ def test_mouse_and_keys_do_not_lead_beside_a_tracker_but_go_back():
     assert steps(live, 8, ray=ray(-6.0), press=True, rotate_deg=5.0) == pytest.approx(placed(2.0))
     steps(live, 10)
     step(live, undo=True)
-    assert live.take_said() == "undo" and at(live) != pytest.approx(placed(2.0))
+    assert shown(live) == "undo" and at(live) != pytest.approx(placed(2.0))
 
 
 def test_who_takes_the_lead_twice_is_told_that_it_is_theirs():
     live, said = live_of(Tracker(placed(2.0))), []
     for _ in range(2):
         step(live, take_over=True)
-        said.append(live.take_said())
-    assert said == ["Yours now", "Yours already"]
+        said.append(shown(live))
+    assert said == ["Mouse and keys control the probe", "Mouse and keys control the probe already"]
     replay, said = (
         ReplayInput(
             SimpleNamespace(is_over=False), lambda: UserInput(Session(Patient()), AdaptiveIterations(1e6))
@@ -121,9 +121,9 @@ def test_who_takes_the_lead_twice_is_told_that_it_is_theirs():
         [],
     )
     for controls in (Controls(Settings(), take_over=True), Controls(Settings())):
-        replay.move(controls)
-        said.append(replay.take_said())
-    assert said == ["Yours now", ""]
+        replay.next_pose(controls)
+        said.append(shown(replay))
+    assert said == ["Mouse and keys control the probe", ""]
 
 
 def test_after_a_way_back_it_stays_until_the_tracked_probe_moves():
@@ -169,12 +169,12 @@ def test_each_move_of_the_probe_is_an_action_and_rest_is_none():
     tracker = Tracker(placed(3.0))
     live = live_of(tracker)
     steps(live, 20)
-    kept = len(live.session.kept)
+    kept = len(live.session.kept_states)
     steps(live, 20, press=True)
-    assert len(live.session.kept) == kept
+    assert len(live.session.kept_states) == kept
     tracker.now = placed(-3.0)
     steps(live, 3)
-    assert len(live.session.kept) == kept + 1
+    assert len(live.session.kept_states) == kept + 1
 
 
 def way(count: int = 9, lost: tuple[int, ...] = ()) -> TimedPoses:
@@ -211,20 +211,20 @@ def test_beside_a_frame_that_is_lost_it_is_lost():
 def test_a_file_goes_by_the_sessions_time_and_then_the_user_leads():
     session = Session(Patient())
     live = UserInput(session, AdaptiveIterations(1e6), tracked=PlayedPoses(way(), session))
-    shown = [at(live) for _ in range(17) if step(live) is not None]
+    places = [at(live) for _ in range(17) if step(live) is not None]
     # From the second on the transducer keeps up: 6 mm/s.
-    assert shown[-1] == pytest.approx(placed(6.0, tilt_deg=32.0)) and shown[9] == pytest.approx(
+    assert places[-1] == pytest.approx(placed(6.0, tilt_deg=32.0)) and places[9] == pytest.approx(
         placed(0.75, tilt_deg=18.0)
     )
-    assert live.take_said() == ""
+    assert shown(live) == ""
     step(live, ray=ray(4.0))
-    assert live.take_said() == "The tracked file is over: yours now" and live.status == ""
-    assert np.array_equal(steps(live, 4, ray=ray(4.0)), shown[-1])
+    assert shown(live) == "The tracked file is over: yours now" and live.status == ""
+    assert np.array_equal(steps(live, 4, ray=ray(4.0)), places[-1])
     # A hand that fans by a degree turns what it has taken over where it is.
     step(live, tilt_deg=1.0)
-    turned = shown[-1][:3, :3].T @ at(live)[:3, :3]
+    turned = places[-1][:3, :3].T @ at(live)[:3, :3]
     assert np.degrees(np.arccos((np.trace(turned) - 1) / 2)) == pytest.approx(1.0, abs=1e-3)
-    assert np.linalg.norm(at(live)[:3, 3] - shown[-1][:3, 3]) < 1.0
+    assert np.linalg.norm(at(live)[:3, 3] - places[-1][:3, 3]) < 1.0
     assert steps(live, 4, ray=ray(-4.0))[0, 3] < Patient.origin[0]
 
 
@@ -238,11 +238,11 @@ def test_time_goes_on_through_ways_back():
     assert np.array_equal(played.pose(), pose_at_time(way(), 10 * STEP_S))
     # 0.57 - 0.07 is less than a half by rounding.
     half = PlayedPoses(TimedPoses(np.array([0.07, 0.57]), [placed(0.0), placed(1.0)]), Session(Patient()))
-    half.session.moment = 4
+    half.session.step_index = 4
     assert half.poses.length_s < 0.5 and np.array_equal(half.pose(), placed(1.0))
-    session.moment = 16
+    session.step_index = 16
     assert isinstance(played.pose(), np.ndarray)
-    session.moment = 17
+    session.step_index = 17
     with pytest.raises(TrackOver):
         played.pose()
 
@@ -256,8 +256,8 @@ def recorded(path: Path) -> str:
     )
     for moment in range(60):
         step(live, ray=ray(2.0), undo=moment == 30, reset=moment == 40, press=moment > 52)
-        live.watch()
-    live.recorded.close({})
+        live.after_frame()
+    live.recorder.close({})
     return session.rehearsal.digest()
 
 
@@ -272,7 +272,7 @@ def test_a_tracked_session_is_the_same_again_and_when_it_is_replayed(tmp_path):
         pose, _ = replay.move()
         if pose is not None:
             replay.rehearsal.advance(pose)
-            replay.stepped()
+            replay.end_step()
     assert replay.differs_s is None and replay.compared == len(one.digests) > 5
     assert replay.rehearsal.digest() == digest
 
@@ -353,8 +353,8 @@ def test_a_way_of_other_coordinates_is_told_by_its_distance(tmp_path):
     [
         (("--track", "none.csv"), "no such file of poses"),
         (("--track", "none.igs.mha"), "none.igs.mha: No such file"),
-        (("--track-from", "ProbeToReference"), "name its file with --track"),
-        (("--track", "a.csv", "--replay", "b.jsonl"), "--track: a replay goes the recorded way"),
+        (("--track-from", "ProbeToReference"), "add its file with --track"),
+        (("--track", "a.csv", "--replay", "b.jsonl"), "--track: a replay has the recorded poses"),
     ],
 )
 def test_the_command_line_refuses_in_one_line(options, words, capsys):

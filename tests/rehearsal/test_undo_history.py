@@ -19,7 +19,7 @@ from scenes.tissue import NeoHookeanTissue
 from sim.body import BodyState
 from sim.divergence_check import DivergenceState
 from sim.solver import SolverState, StepSettings
-from ultrasound.probe_manipulator import ProbeManipulator, moved_towards, pose_at, touching
+from ultrasound.probe_manipulator import ManipulatorState, ProbeManipulator, moved_towards, pose_at, touching
 
 # A power of two, so that times are exact: 4 steps are PAUSE_S, 40 are LONGEST_S.
 STEP_S = 1 / 8
@@ -50,8 +50,9 @@ class Numbers:
     def _solver(self) -> SolverState:
         return SolverState(BodyState(self.position, self.velocity), self.contacts)
 
-    def snapshot(self) -> RehearsalState:
-        return RehearsalState(self._solver(), self.watch, self.pose, self.steps, self.manipulator.state)
+    def snapshot(self, manipulator: ManipulatorState | None = None) -> RehearsalState:
+        held = manipulator or self.manipulator.state
+        return RehearsalState(self._solver(), self.watch, self.pose, self.steps, held)
 
     def restore(self, state: RehearsalState) -> None:
         self.position, self.velocity = state.solver.body.position, state.solver.body.velocity
@@ -100,7 +101,7 @@ class Told:
     def note(self, kind: str, value: Any) -> None:
         self.notes.append((kind, value))
 
-    def moment(self, pose: np.ndarray | None) -> None:
+    def add_step(self, pose: np.ndarray | None) -> None:
         self.poses.append(pose)
 
     def of(self, kind: str) -> list[Any]:
@@ -117,7 +118,7 @@ def go(history: History, steps: int = 1, acting: bool = True, pressing: bool = F
     for _ in range(steps):
         history.watch(acting, pressing)
         history.session.rehearsal.advance(history.session.rehearsal.pose)
-        history.session.stepped()
+        history.session.end_step()
     return history.session.rehearsal.digest()
 
 
@@ -128,7 +129,7 @@ def act(history: History) -> str:
 
 
 def begun(history: History) -> list[int]:
-    return sorted(set(history.session.kept) - {SETTLED})
+    return sorted(set(history.session.kept_states) - {SETTLED})
 
 
 def now(history: History) -> str:
@@ -175,7 +176,7 @@ def test_time_goes_on_with_every_way_back(history):
     history.undo()
     history.redo()
     history.redo()
-    assert history.session.moment == 10 and history.session.time_s == 10 * STEP_S
+    assert history.session.step_index == 10 and history.session.time_s == 10 * STEP_S
     told = history.session.recorder
     assert [pose is None for pose in told.poses] == [False] * 8 + [True] * 2
     assert told.of("back") == [5, 8]
@@ -195,7 +196,7 @@ def test_forty_actions_can_be_undone_and_no_more(history):
     for _ in range(MOST_UNDONE + 3):
         states.append(go(history, 5, acting=False))
         go(history, 2)
-    assert MOST_UNDONE == 40 and len(history.session.kept) == 41
+    assert MOST_UNDONE == 40 and len(history.session.kept_states) == 41
     for before in states[:2:-1]:
         assert history.undo() and now(history) == before
     assert not history.undo()
@@ -211,7 +212,7 @@ def test_a_reset_can_be_undone(history):
 
 
 def test_bookmarks_are_gone_to_last_first_then_round(history):
-    assert history.to_bookmark() == 0 and history.session.moment == 0
+    assert history.to_bookmark() == 0 and history.session.step_index == 0
     marked = []
     for number in (1, 2, 3):
         marked.append(act(history))
@@ -231,7 +232,7 @@ def test_a_bookmark_outlives_the_undo_states(history):
     history.set_bookmark()
     for _ in range(MOST_UNDONE + 5):
         act(history)
-    assert len(history.session.kept) == 1 + 1 + MOST_UNDONE
+    assert len(history.session.kept_states) == 1 + 1 + MOST_UNDONE
     assert history.to_bookmark() == 1 and now(history) == marked
 
 
@@ -244,7 +245,7 @@ def test_undo_and_redo_in_turn_keep_no_more_and_more(history):
         history.redo()
         history.redo()
     # The settled state, three to be undone, and the two that were redone last at most.
-    assert len(history.session.kept) <= 6
+    assert len(history.session.kept_states) <= 6
 
 
 def live_of(told: Told | None = None) -> UserInput:
@@ -254,11 +255,16 @@ def live_of(told: Told | None = None) -> UserInput:
 def step(live: UserInput, step_ms: float = 0.0, **did: Any) -> np.ndarray | None:
     """A moment in which the user did something."""
     settings = did.pop("settings", None) or Settings(young_kpa=15.0)
-    pose = live.move(Controls(settings, **did))
+    pose = live.next_pose(Controls(settings, **did))
     if pose is not None:
         live.session.rehearsal.advance(pose)
-        live.stepped(step_ms)
+        live.after_step(step_ms)
     return pose
+
+
+def shown(live: UserInput) -> str:
+    """The notices since the last call."""
+    return "".join(notice.text for notice in live.notices.take())
 
 
 def ray(x_mm: float) -> tuple[np.ndarray, np.ndarray]:
@@ -272,7 +278,7 @@ def pressed_then_undone(at: Any) -> UserInput:
         step(live, ray=ray(5.0))
     for _ in range(5):
         step(live, ray=ray(5.0), press=True)
-    assert step(live, ray=at, undo=True) is None and live.take_said() == "undo"
+    assert step(live, ray=at, undo=True) is None and shown(live) == "undo"
     return live
 
 
@@ -323,21 +329,22 @@ def test_a_way_back_gives_the_hand_as_it_was_before_the_input():
 def test_the_iterations_that_were_done_are_recorded_not_those_asked_for():
     told = Told()
     live = live_of(told)
-    live.ladder.rung = 2
+    live.adaptive_iterations.level = 2
     step(live, settings=Settings(young_kpa=15.0, iterations=10))
     assert told.of("solver")[0]["iterations"] == live.session.rehearsal.settings.iterations == 5
     assert told.of("settings")[0]["iterations"] == 10
-    live.ladder.rung = 3
+    live.adaptive_iterations.level = 3
     step(live, settings=Settings(young_kpa=15.0, iterations=10))
     assert told.of("solver")[1:] == [{"iterations": 3}] and len(told.of("settings")) == 1
-    assert live.status == "LESS EXACT, TO KEEP PACE   3 of 10 iterations"
+    assert live.status == "REDUCED ITERATIONS   3 of 10"
 
 
 def test_a_step_that_is_too_slow_is_said_once():
     live = UserInput(Session(Numbers()), AdaptiveIterations(5.0))
-    live.move(Controls(Settings(young_kpa=15.0, iterations=8)))
-    said = [live.stepped(step_ms) for step_ms in [9.0] * 21]
-    assert [text for text in said if text] == ["LESS EXACT, TO KEEP PACE   6 of 8 iterations"]
+    live.next_pose(Controls(Settings(young_kpa=15.0, iterations=8)))
+    for _ in range(21):
+        live.after_step(9.0)
+    assert [notice.text for notice in live.notices.take()] == ["REDUCED ITERATIONS   6 of 8"]
 
 
 def test_only_what_changes_is_told():
@@ -356,10 +363,10 @@ def test_a_way_back_to_nowhere_is_said_and_no_moment_is_lost():
     live, said = live_of(), []
     for key in ("undo", "redo", "to_bookmark", "bookmark", "to_bookmark"):
         step(live, **{key: True})
-        said.append(live.take_said())
+        said.append(shown(live))
     nothing = ["Nothing to undo", "Nothing to redo", "No bookmark: {bookmark} sets one"]
-    assert said == [*nothing, "Bookmark 1", "Bookmark 1"] and live.take_said() == ""
-    assert live.session.moment == 5 and live.session.rehearsal.steps == 3
+    assert said == [*nothing, "Bookmark 1", "Bookmark 1"] and shown(live) == ""
+    assert live.session.step_index == 5 and live.session.rehearsal.steps == 3
 
 
 def face(live: UserInput) -> np.ndarray:

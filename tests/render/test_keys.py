@@ -3,13 +3,11 @@
 import dataclasses
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import pytest
 from conftest import ROOT
 
 import app
-from rehearsal.frame import FrameLoop
 from render.actions import ACTIONS, BY_MOUSE, CYCLES, HELD, STEPS, begin, hold
 from render.keys import (
     DEFAULT_BUTTONS,
@@ -21,7 +19,7 @@ from render.keys import (
     keys_text,
     load_keys,
 )
-from render.viewer import KEY_MAP, KEY_MAP_ENTRIES, Controls, NullViewer, Settings
+from render.viewer import KEY_MAP, KEY_MAP_ENTRIES, Controls, Settings
 
 
 def file_of(tmp_path, text: str):
@@ -84,15 +82,6 @@ def test_a_held_action_goes_on_with_time(action, name, a_second):
     assert controls == Controls(controls.settings, **{name: pytest.approx(1.0 + 0.1 * a_second)})
     hold("undo", controls, 0.1)
     assert not controls.undo
-
-
-def test_what_is_said_names_the_users_keys(tmp_path, capsys):
-    keys = Keys(of=DEFAULT_KEYS | {"sweep": "Space", "plan_for": "L"})
-    parts = [None, None, SimpleNamespace(status=""), None]
-    loop = FrameLoop(None, NullViewer(), tmp_path, None, *parts, keys=keys)
-    loop._announce("sweep-001: {sweep} ends it")
-    assert capsys.readouterr().out == "sweep-001: Space ends it\n"
-    assert loop._status(SimpleNamespace(status="")) == "Sweep-001: Space ends it"
 
 
 def test_the_printed_file_is_the_usual_map(tmp_path, capsys):
@@ -165,7 +154,7 @@ def test_the_command_line_refuses_in_one_line(tmp_path, capsys):
     assert app.main(["rehearse", "--keys", str(tmp_path / "none.toml")]) == 2
     assert "no such key file; app.py keys prints one" in capsys.readouterr().err
     assert app.main(["rehearse", "--gamepad", "--headless"]) == 2
-    assert "--gamepad: leads in a window" in capsys.readouterr().err
+    assert "--gamepad: needs a window" in capsys.readouterr().err
 
 
 def test_the_program_starts_without_pygame_and_taichi():

@@ -12,6 +12,7 @@ import test_tissue_models as every
 from conftest import ROOT
 
 import scenes.tissue
+from rehearsal.build_solver import TISSUE_MODELS
 from rehearsal.configuration import setup_of
 from scenes.scene import Scene, SceneError, load_scene
 from sim.body import BodyState, ParticleBody, RestBody
@@ -33,9 +34,10 @@ def added(tmp_path_factory) -> Iterator[type]:
         module = module_from_spec(spec)
         patch.setitem(sys.modules, spec.name, module)
         spec.loader.exec_module(module)
-        # Entered by its definition alone, and taken out again.
-        patch.setitem(scenes.tissue.TISSUES, MODEL, scenes.tissue.TissueSection)
-        exec(SECTION, dict(vars(scenes.tissue)))
+        names = dict(vars(scenes.tissue))
+        exec(SECTION, names)
+        patch.setitem(scenes.tissue.TISSUES, MODEL, names["MassSpringTissue"])
+        patch.setitem(TISSUE_MODELS, MODEL, module.MassSpring)
         start("cpu")
         yield module.MassSpring
         ti.reset()

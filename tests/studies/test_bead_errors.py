@@ -171,7 +171,7 @@ def test_a_scene_is_rehearsed_as_balanced_is_validated(model):
     tissue = TISSUES[model].model_validate({"model": model})
     stepped = step_settings(tissue, SolverSection())
     for name in ("time_step_s", "substeps", "iterations", "relaxation_factor"):
-        assert getattr(balanced, name) == getattr(stepped, name)
+        assert getattr(balanced.solver, name) == getattr(stepped, name)
     assert balanced.tissue == tissue
 
 

@@ -15,7 +15,9 @@ from studies.accuracy.convergence_study import changes_of, moved
 
 
 def values_of(setup: Setup) -> dict[str, object]:
-    return vars(setup) | setup.tissue.model_dump() | dict(tissue=None)
+    return (
+        vars(setup) | setup.tissue.model_dump() | setup.solver.model_dump() | dict(tissue=None, solver=None)
+    )
 
 
 @pytest.mark.parametrize("model", PRESETS)
@@ -33,7 +35,9 @@ def test_each_change_is_of_one_setting(model):
         {size},
     ]
     halved = changes_of(setup)["half the time step"]
-    assert halved.stage_steps * halved.time_step_s == pytest.approx(setup.stage_steps * setup.time_step_s)
+    assert halved.stage_steps * halved.solver.time_step_s == pytest.approx(
+        setup.stage_steps * setup.solver.time_step_s
+    )
 
 
 class Drifting:
@@ -45,7 +49,7 @@ class Drifting:
     def run(self, setup: Setup) -> BeadRun:
         assert setup.size_mm == self.cell_mm
         beads = self.case.measured.copy()
-        beads[..., 0] += setup.iterations + 100 * setup.stage_steps * setup.time_step_s
+        beads[..., 0] += setup.iterations + 100 * setup.stage_steps * setup.solver.time_step_s
         beads[-1, 0, 0] += setup.size_mm
         return BeadRun(beads)
 

@@ -10,11 +10,11 @@ from PIL import Image
 from small_bead_case import write_case
 
 import app
-from rehearsal.adaptive_iterations import RUNGS, STEPS_DOWN, STEPS_UP, AdaptiveIterations
+from rehearsal.adaptive_iterations import LEVELS, STEPS_DOWN, STEPS_UP, AdaptiveIterations
 from rehearsal.build_solver import step_settings
 from rehearsal.commands.option_checks import refuse_sizes
 from rehearsal.commands.rehearse_command import as_asked
-from rehearsal.configuration import PRESETS, Setup, scene_of, setup_of, setup_of_scene
+from rehearsal.configuration import PRESETS, Setup, scene_of, setup_of
 from rehearsal.measurements.run_report import expected_error_of
 from rehearsal.speed_accuracy import budget_choice
 from rehearsal.speed_accuracy.pareto_front import (
@@ -115,8 +115,7 @@ def test_a_scene_has_the_settings_of_the_setup_it_was_made_with():
         setup_of("shape-matching", radius_mm=3.0, stiffness=0.5, substeps=2),
     ):
         scene = scene_of(with_options(load_scene(PAPER), {"tissue.cell_mm": 9.0}), setup)
-        step = scene.solver
-        assert setup_of_scene(scene, step.substeps, step.iterations, step.relaxation_factor) == setup
+        assert Setup(scene.tissue, scene.solver) == setup
     of_its_own = scene_of(with_options(scene, {"tissue.cluster_spacing": 4.0}), setup)
     assert of_its_own.tissue.cluster_spacing == 4.0
 
@@ -194,14 +193,14 @@ def test_a_quality_sets_size_and_passes_and_leaves_the_material():
 
 def test_a_slow_step_loses_iterations_rung_by_rung_and_gets_them_back():
     ladder = AdaptiveIterations(10.0)
-    assert not any(ladder.watch(9.0) for _ in range(STEPS_UP)) and ladder.says(8) == ""
+    assert not any(ladder.watch(9.0) for _ in range(STEPS_UP)) and ladder.status(8) == ""
     rungs = []
     for _ in range(4 * STEPS_DOWN):
         if ladder.watch(11.0):
             rungs.append(ladder.iterations(8))
     # No further than the last rung, and said.
-    assert rungs == [6, 4, 2] and ladder.rung == len(RUNGS) - 1
-    assert ladder.says(8) == "LESS EXACT, TO KEEP PACE   2 of 8 iterations"
+    assert rungs == [6, 4, 2] and ladder.level == len(LEVELS) - 1
+    assert ladder.status(8) == "REDUCED ITERATIONS   2 of 8"
     # At half the budget twice the iterations would just fill it: not enough room.
     assert not any(ladder.watch(5.0) for _ in range(2 * STEPS_UP))
     assert [ladder.watch(3.0) for _ in range(STEPS_UP)].count(True) == 1 and ladder.iterations(8) == 4
