@@ -6,7 +6,6 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 from render.actions import TILT_DEG_S, begin, hold
 from render.keys import BUTTONS
@@ -34,18 +33,10 @@ class PadState:
     """Went down since the last read, even if released again."""
 
 
-class Pads(Protocol):
-    """The source of the gamepad's state."""
-
-    def read(self) -> PadState | None:
-        """Return the state of the connected gamepad, None where there is none."""
-        ...
-
-
 class Gamepad:
     """Left stick: slide; right stick: rock and tilt; right trigger: press; ``buttons`` are action -> button."""
 
-    def __init__(self, pads: Pads, buttons: Mapping[str, str]) -> None:
+    def __init__(self, pads: SdlPads, buttons: Mapping[str, str]) -> None:
         self._pads, self._buttons = pads, buttons
         self._connected: bool | None = None
 
@@ -110,6 +101,7 @@ class SdlPads:
         self._pad: controller.Controller | None = None
 
     def read(self) -> PadState | None:
+        """Return the state of the connected gamepad, None where there is none."""
         events = self._pygame.event.get()
         if self._pad is not None and not self._pad.attached():
             self._pad = None

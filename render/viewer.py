@@ -114,9 +114,9 @@ class TissueSettings:
 class ScannerSettings:
     """Settings of the ultrasound scanner, and of the CT beside it."""
 
-    depth_mm: int = _slider(60, "Depth", "mm", 5, 300, "Picture")
-    window_hu: int = _slider(350, "W", "HU", 1, 2000, "Picture")
-    level_hu: int = _slider(40, "L", "HU", -500, 500, "Picture")
+    depth_mm: int = _slider(60, "Depth", "mm", 5, 300, "Image")
+    window_hu: int = _slider(350, "W", "HU", 1, 2000, "Image")
+    level_hu: int = _slider(40, "L", "HU", -500, 500, "Image")
     gain_percent: int = _slider(50, "Gain", "%", 0, 100, B_MODE)
     dyn_range_db: int = _slider(60, "DR", "dB", 20, 120, B_MODE)
     frequency_mhz: float = _slider(7.5, "", "MHz", 2.0, 15.0, B_MODE)
@@ -151,7 +151,7 @@ class ViewSettings:
 class PlanSettings:
     """What the next plan is made for."""
 
-    margin_mm: int = _slider(5, "Margin", "mm", 0, 20, "Picture")
+    margin_mm: int = _slider(5, "Margin", "mm", 0, 20, "Image")
     plan_for: Target = "margin"
 
 

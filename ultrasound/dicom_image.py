@@ -33,15 +33,15 @@ REGION_2D, REGION_TISSUE, CENTIMETRES = 1, 1, 3
 
 
 def save_dicom(
-    path: Path, picture: np.ndarray, spacing_mm: tuple[float, float], probe: Probe | None = None
+    path: Path, image: np.ndarray, spacing_mm: tuple[float, float], probe: Probe | None = None
 ) -> None:
     """Write grey values (rows, columns) uint8 with row and column spacing [mm].
 
     With a probe, whose ``extent_mm`` the image covers, the file also has transducer data and the centre of the array face.
     Raises ValueError for an invalid image or spacing, and OSError where the file cannot be written.
     """
-    if picture.dtype != np.uint8 or picture.ndim != 2 or picture.size == 0:
-        raise ValueError(f"a picture of {picture.dtype} {picture.shape}: expected uint8 (rows, columns)")
+    if image.dtype != np.uint8 or image.ndim != 2 or image.size == 0:
+        raise ValueError(f"a image of {image.dtype} {image.shape}: expected uint8 (rows, columns)")
     if len(spacing_mm) != 2 or not all(0 < each < np.inf for each in spacing_mm):
         raise ValueError(
             f"spacing {spacing_mm}: expected the distances of rows and of columns in mm, above 0"
@@ -67,14 +67,14 @@ def save_dicom(
     data.LossyImageCompression = "00"
     # Not part of this IOD, which has the region's deltas, but read by ITK.
     data.PixelSpacing = [DS(float(each), auto_format=True) for each in spacing_mm]
-    data.SequenceOfUltrasoundRegions = [_region(picture.shape, spacing_mm, probe)]
+    data.SequenceOfUltrasoundRegions = [_region(image.shape, spacing_mm, probe)]
     if probe is not None:
         data.TransducerType = TRANSDUCER_TYPES[probe.transducer_geometry]
         data.DepthOfScanField = round(probe.depth_mm)
 
     data.file_meta = FileMetaDataset()
     data.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
-    data.set_pixel_data(picture, "MONOCHROME2", bits_stored=8, generate_instance_uid=False)
+    data.set_pixel_data(image, "MONOCHROME2", bits_stored=8, generate_instance_uid=False)
     content = io.BytesIO()  # so that an error of the disk names the file
     data.save_as(content, enforce_file_format=True)
     path.write_bytes(content.getvalue())

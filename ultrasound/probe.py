@@ -146,16 +146,14 @@ class Probe(BaseModel):
         matrix[:2, 3] = width / columns / 2 - width / 2, depth / rows / 2 - above
         return matrix
 
-    def line_angles(self) -> np.ndarray:
-        """Return the angle of each scanline from straight down [rad], (scanlines,)."""
+    def scanlines(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return start [mm] and unit direction of each scanline, each (scanlines, 2) on the image plane."""
         start, stop = np.radians([self.theta_start_deg, self.theta_stop_deg])
         if self.transducer_geometry == "LINEAR":
             start = stop = 0.0
-        return start + (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines * (stop - start)
-
-    def scanlines(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return start [mm] and unit direction of each scanline, each (scanlines, 2) on the image plane."""
-        angle = self.line_angles()
+        angle = start + (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines * (
+            stop - start
+        )
         direction = np.column_stack([np.sin(angle), np.cos(angle)])
         if self.transducer_geometry == "LINEAR":
             share = (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines - 0.5

@@ -87,11 +87,11 @@ def test_b_mode_and_ct_of_the_drop_in_probe_fill_the_panel():
 
 
 @each_size
-def test_the_first_sliders_go_where_there_is_no_room(size):
+def test_the_first_sliders_are_left_out_where_there_is_no_room(size):
     layout = WindowLayout(*size)
     names = list(boxes_of(Settings(young_kpa=15.0), WHOLE, layout))
     assert (layout.readouts.width == 0) == (size in ((700, 420), (1024, 576)))
-    assert names == (["Picture", "View"] if size == (700, 420) else ["Tissue", "Picture", "View"])
+    assert names == (["Image", "View"] if size == (700, 420) else ["Tissue", "Image", "View"])
 
 
 @pytest.mark.parametrize("width", [*range(704, 1600, 64), 1250])
@@ -107,7 +107,7 @@ def test_labels_of_sliders_are_whole(width, tissue):
             assert label <= (box.width - 35 if name == "View" else 0.35 * box.width - 16)
 
 
-def test_what_is_not_there_has_no_slider():
+def test_a_missing_structure_has_no_slider():
     def named(shown: Geometry) -> set[str]:
         groups = groups_of(Settings(young_kpa=15.0), shown)
         return {each.name for members in groups.values() for each in members}
@@ -148,7 +148,7 @@ def test_the_font_is_as_large_as_fits():
     assert fitting_size(rows, 900, 15) == 15
 
 
-def test_what_is_written_lies_in_its_box_or_is_left_out():
+def test_a_text_is_in_its_box_or_left_out():
     page, box = np.full((60, 90, 4), 200, np.uint8), Rect(10, 5, 70, 40)
     write(page, box, (12.0, 6.0), "12.3 mm", 13, (0, 255, 0))
     rows, columns = np.nonzero((page[..., :3] != 200).any(axis=-1))
@@ -244,7 +244,7 @@ def test_findings_that_become_fewer_leave_nothing_behind():
     assert np.array_equal(composed(page, findings=dict(list(FIGURES.items())[:4])), few)
 
 
-def test_a_figure_that_has_nothing_to_say_is_a_dash():
+def test_a_figure_without_a_value_is_a_dash():
     pictures = [findings_picture(LAYOUT, {"margin": figure}) for figure in ("", "-", "4.2 mm")]
     assert np.array_equal(pictures[0], pictures[1]) and not np.array_equal(pictures[0], pictures[2])
 
@@ -275,7 +275,7 @@ def test_clock_and_pace_stand_between_title_and_help_in_every_window(size, help_
 
 
 @each_size
-def test_findings_grow_with_their_lines_and_the_last_go_where_room_ends(size):
+def test_findings_grow_with_their_lines_and_the_last_are_left_out(size):
     layout = WindowLayout(*size)
     assert layout.findings(11).height > layout.findings(9).height
     assert layout.most_findings >= (11 if size != (700, 420) else 7)

@@ -90,7 +90,7 @@ def test_without_a_section_nothing_is_covered():
         (-10, 0.0, -1),
     ],
 )
-def test_the_half_before_the_eye_goes_and_edge_on_the_one_of_before(degrees, before, side):
+def test_the_half_before_the_eye_is_removed_and_edge_on_the_side_is_kept(degrees, before, side):
     angle = np.radians(degrees)
     pose = plane((3.0, 4.0, 5.0), (0, 0, 1), 30.0)
     eye = pose[:3, :3] @ [200 * np.cos(angle), 200 * np.sin(angle), 0] + pose[:3, 3]

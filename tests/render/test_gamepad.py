@@ -33,7 +33,7 @@ def read(*states: PadState | None, **did) -> list[Controls]:
     return found
 
 
-def test_a_stick_is_dead_near_its_middle_and_whole_at_its_end():
+def test_a_stick_has_a_dead_zone_and_full_deflection_at_its_end():
     assert shaped(0.1, -0.1) == (0.0, 0.0) and shaped(DEAD_STICK, 0.0) == (0.0, 0.0)
     assert shaped(0.0, -1.0) == pytest.approx((0.0, -1.0)) and shaped(1.0, 1.0) == pytest.approx(
         (0.5**0.5, 0.5**0.5)

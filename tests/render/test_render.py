@@ -64,7 +64,7 @@ def test_the_camera_goes_home():
 
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.3, -0.8, 0.2)])
-def test_ray_under_the_mouse_passes_through_the_projected_point(up):
+def test_the_ray_under_the_mouse_contains_the_projected_point(up):
     camera = _camera(up)
     camera.orbit(0.13, -0.07)
     camera.pan(0.05, 0.02)
@@ -126,7 +126,7 @@ def test_the_parts_of_the_transducer_are_closed_and_face_outward(radius):
     assert shape.vertices.max(axis=0)[:2] == pytest.approx(size[:2] / 2 + [0.25, 0.0])
 
 
-def test_image_plane_carries_the_picture_the_right_way_round():
+def test_the_image_plane_shows_the_image_in_the_right_orientation():
     shares, indices = transducer_shape.image_plane_grid(6, 4)
     grey = np.zeros((60, 40), dtype=np.uint8)
     grey[0, -1] = 255
@@ -314,7 +314,7 @@ def test_settings_are_seen(window, setting, value):
     assert opened.read_controls().settings is opened.settings
 
 
-def test_the_cut_is_filled_and_the_half_before_it_gone(window):
+def test_the_cut_is_filled_and_the_half_before_it_removed(window):
     opened, _, _ = window
     opened.settings.cut = True
     pose = np.array(_view().transducer_pose)
@@ -349,7 +349,7 @@ except NoVulkan as reason:
 """
 
 
-def test_missing_vulkan_is_said_and_not_died_of():
+def test_missing_vulkan_is_an_error_with_a_message():
     pytest.importorskip("taichi")
     nowhere = {"VK_ICD_FILENAMES": "/nonexistent", "VK_DRIVER_FILES": "/nonexistent"}
     done = subprocess.run(
@@ -367,7 +367,7 @@ def test_missing_vulkan_is_said_and_not_died_of():
 
 @pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="these always have a display")
 @pytest.mark.parametrize("display", [None, ":4242"])
-def test_no_display_is_noticed(monkeypatch, display):
+def test_a_missing_display_is_detected(monkeypatch, display):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     if display:

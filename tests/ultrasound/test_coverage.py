@@ -112,7 +112,7 @@ def test_on_average_a_plane_along_the_voxels_is_as_thick_as_it_is(organ, thickne
 
 
 @pytest.mark.parametrize("shift", [0.0, 5.0, -8.0])
-def test_lines_that_do_not_touch_show_nothing(organ, shift):
+def test_scanlines_without_contact_add_nothing(organ, shift):
     organ.clear()
     touches = organ.add(places(PROBE, UPRIGHT, (shift, 0, R)), PROBE, 1.5)
     x = PROBE.elements()[:, 0] + shift
@@ -181,7 +181,7 @@ def test_a_sector_shows_all_of_itself_and_nothing_beside(name, middle):
 
 
 @pytest.mark.parametrize("squeezed", [1.0, 0.75])
-def test_squeezed_tissue_leaves_no_voxel_between_two_places(squeezed):
+def test_compressed_tissue_leaves_no_voxel_between_two_points(squeezed):
     probe = load_probe("curvilinear")
     coverage, axes, origin = Coverage(big_ball()), UPRIGHT / squeezed, np.array([0.0, 0, 60 / squeezed])
     coverage.add(places(probe, axes, origin), probe, None)
@@ -203,7 +203,7 @@ def cap(height: float) -> float:
 
 
 @pytest.mark.parametrize("first, last", [(-25, 0), (-4, 8), (5, 25)])
-def test_what_was_not_swept_is_the_gap(organ, first, last):
+def test_what_was_not_imaged_is_the_gap(organ, first, last):
     organ.clear()
     sweep(organ, first, last)
     caps = sorted([cap(R + x) for x in (first, -last) if R + x > 0], reverse=True)
@@ -224,7 +224,7 @@ def test_what_was_not_swept_is_the_gap(organ, first, last):
     )
 
 
-def test_seen_at_places_adds_up_and_is_forgotten(organ):
+def test_coverage_accumulates_and_can_be_cleared(organ):
     organ.clear()
     sweep(organ, -10, 0)
     once = organ.seen.copy()

@@ -300,7 +300,7 @@ def test_flat_collapsed_and_inverted_tissue_still_gives_a_picture(kept, ball, sq
     assert np.isfinite(cut.hounsfield()).all()
 
 
-def test_what_lies_around_the_organ_gives_way_to_it_and_far_away_stays(kept, ball):
+def test_surroundings_deform_with_the_organ_and_far_tissue_is_fixed(kept, ball):
     shift = np.array([0.0, 0.0, 4.0])
     body = kept(embedded, ball, margin_mm=25.0)
     body.move(body.model.body.rest_points + shift)
@@ -327,7 +327,7 @@ def test_surroundings_that_fold_over_the_organ_do_not_cover_it(kept, ball):
     assert (array_of(cut.plane.owner) == owner)[organ].all()
 
 
-def test_what_does_not_move_is_shown_where_it_lies(kept, ball):
+def test_tissue_that_does_not_move_is_shown_in_place(kept, ball):
     cut = cut_of(Unmoved(), ball, noisy_image, 96, "background")
     plane = oblique_plane()
     cut.plane.locate(plane)

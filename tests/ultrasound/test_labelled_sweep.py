@@ -69,7 +69,7 @@ def moved_on(rehearsal: SimpleNamespace, by_mm: float) -> None:
     rehearsal.pose[:3, 3] += by_mm * rehearsal.pose[:3, 1]
 
 
-def test_a_recorded_sweep_says_where_each_pixel_is(tmp_path):
+def test_a_recorded_sweep_gives_the_position_of_each_pixel(tmp_path):
     rehearsal, view = recording()
     sweeping, places, pictures = Sweeping(rehearsal), [], []
     assert sweeping.watch(0.0, view, rehearsal.probe) == "" and sweeping.end() == ""
@@ -108,7 +108,7 @@ def test_a_recorded_sweep_says_where_each_pixel_is(tmp_path):
     assert read_sweep(tmp_path / "sweep-002.igs.mha").times_s == [1.0]
 
 
-def test_as_long_as_a_sweep_is_recorded_its_length_is_said(tmp_path):
+def test_the_length_of_a_sweep_is_shown_while_it_is_recorded(tmp_path):
     rehearsal, view = recording()
     sweeping = Sweeping(rehearsal)
     said = []
@@ -230,7 +230,7 @@ class Still:
         self.way.append(pose)
 
 
-def test_undoing_takes_the_tracked_way_and_finds_still_tissue_where_the_tracker_says(device):
+def test_compression_correction_follows_the_tracked_path_and_leaves_tissue_at_rest_in_place(device):
     probe = load_probe("curvilinear")
     on_probe, way = probe.image_to_probe(32, 32), over_tumour()[::5]
     sweep = sweep_of(np.zeros((len(way), 32, 32), np.uint8), way, np.array([0.0, 0.1, 9.0]), on_probe)
@@ -397,7 +397,7 @@ def test_scan_leaves_a_sweep_at_the_poses_of_its_file(tmp_path):
     )
 
 
-def test_marks_of_another_file_are_not_taken(tmp_path):
+def test_labels_of_another_file_are_not_used(tmp_path):
     (tmp_path / "a-marks.igs.mha").write_text("no sweep")
     assert read_ground_truth(tmp_path / "a.mha") is None and read_ground_truth(tmp_path / "b.igs.mha") is None
     with pytest.raises(SweepError, match="a-marks"):

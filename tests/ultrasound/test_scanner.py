@@ -68,7 +68,7 @@ def test_the_slice_is_windowed_as_asked_for(device):
     assert np.ptp(wanted) > 50 and np.abs(picture - wanted).max() <= 0.51
 
 
-def test_each_look_is_at_where_the_body_is_now(device):
+def test_each_image_is_of_the_body_as_it_is_now(device):
     class Followed(Unmoved):
         looks = 0
 
@@ -82,7 +82,7 @@ def test_each_look_is_at_where_the_body_is_now(device):
         assert embedding.looks == looks
 
 
-def test_an_echo_begun_before_is_the_one_that_is_shown(device):
+def test_acoustics_started_before_give_the_same_image(device):
     bones, plane = replace(anatomy(), tissues={1: "bone"}), plane_at()
     begun = echo(Scanner(anatomy(), Unmoved(), PROBE, PIXELS, acoustics=start_acoustics(bones)), plane)
     assert np.array_equal(begun, echo(Scanner(bones, Unmoved(), PROBE, PIXELS), plane))
@@ -105,7 +105,7 @@ def test_beyond_the_ct_is_silence(device):
     assert decibel[within].min() > -120.0 and decibel[depth > RADIUS + REACH + 1.0].max() < -179.9
 
 
-def test_what_lies_around_the_organ_reflects_as_gel_or_as_air(device):
+def test_the_surroundings_reflect_as_gel_or_as_air(device):
     depth = (np.arange(320) + 0.5) * PROBE.sample_mm
     border = np.abs(depth - 2 * RADIUS + 1.0) < 2.0
     peak = {}

@@ -45,7 +45,7 @@ def test_a_bone_is_filled_with_its_marrow_even_where_the_ct_ends_and_is_no_large
 
 
 @pytest.mark.parametrize("spacing", list(permutations((0.6, 0.9, 1.8))))
-def test_a_bone_is_found_where_it_lies_whatever_its_voxels(spacing):
+def test_a_bone_is_found_at_any_voxel_size(spacing):
     places = np.moveaxis(np.indices(np.ceil(60 / np.array(spacing)).astype(int)), 0, -1) * spacing
     away = np.linalg.norm(places - [24.0, 30.0, 35.0], axis=-1)
     found = bones(np.select([away < 14.0, away < 16.0], [MARROW, SHELL], FAT), np.array(spacing))
@@ -130,7 +130,7 @@ def test_contrast_agent_in_labelled_urine_and_about_it_is_no_stone_but_without_a
     assert (classify_tissues(hu - CORTEX + 30.0, named, SPACING)["stone"] == agent).all()
 
 
-def test_an_import_warns_of_what_the_echo_takes_for_stone():
+def test_an_import_warns_of_what_is_classified_as_stone():
     assert import_warnings.STONE_ABOVE_MEDIAN_HU == STONE_ABOVE_MEDIAN_HU
 
 
