@@ -95,7 +95,7 @@ def test_a_way_back_is_looked_at_and_read_anew_at_once(watching, rehearsal, one_
     monkeypatch.setattr(live_measurements, "measure", lambda *_: Measurement(next(depths), 20.0))
     lines = np.ones(rehearsal.probe.number_of_scanlines, bool)
     looks = iter([lines, ~lines])
-    monkeypatch.setattr(watching.coverage, "look", lambda *_: next(looks))
+    monkeypatch.setattr(watching.coverage, "add", lambda *_: next(looks))
     noted: list[float] = []
     watching._look_every = 2
     session = SimpleNamespace(step_index=0, kept_states={}, rolled_back_to=None)
@@ -114,7 +114,7 @@ def test_a_session_that_begins_is_read_with_what_touches_then(watching, rehearsa
         live_measurements, "measure", lambda *asked: given.append(asked[-1]) or Measurement(1.0, 20.0)
     )
     touches = np.arange(rehearsal.probe.number_of_scanlines) < 30
-    monkeypatch.setattr(watching.coverage, "look", lambda *_: touches)
+    monkeypatch.setattr(watching.coverage, "add", lambda *_: touches)
     watching._look_every = 2
     for _ in range(2):
         session = SimpleNamespace(step_index=1, kept_states={}, rolled_back_to=None, note=lambda *_: None)
@@ -142,7 +142,7 @@ def test_an_echo_is_said_to_be_black_where_hardly_a_line_touches(
     one_device, watching, rehearsal, monkeypatch, touching, notes
 ):
     touches = np.arange(rehearsal.probe.number_of_scanlines) < touching
-    monkeypatch.setattr(watching.coverage, "look", lambda *_: touches)
+    monkeypatch.setattr(watching.coverage, "add", lambda *_: touches)
     watching.watch(
         SimpleNamespace(step_index=0, kept_states={}, rolled_back_to=None, note=lambda *_: None),
         rehearsal.probe,
