@@ -8,9 +8,9 @@ import trimesh
 
 from scenes.scene import Contact, SolverSection
 from scenes.tissue import TissueSection
-from sim.body import RestBody
 from sim.neo_hookean import NeoHookean
-from sim.self_contact import ParticleContacts
+from sim.sampling import RestBody
+from sim.self_contact import SelfContacts
 from sim.shape_matching import ShapeMatching
 from sim.shapes import ConvexTool, SignedDistanceField
 from sim.solver import Solver, StepSettings
@@ -51,7 +51,7 @@ def tool_of(probe: Probe) -> ConvexTool:
 
 def embedding_cell_mm(tissue: TissueSection) -> float:
     """Width of the coarse tetrahedra that carry the image plane."""
-    return model_of(tissue).EMBEDDING_SIZES * tissue.size_mm
+    return model_of(tissue).EMBEDDING_CELL_RATIO * tissue.size_mm
 
 
 def step_settings(tissue: TissueSection, section: SolverSection) -> StepSettings:
@@ -70,18 +70,18 @@ def build_solver(
     contact: Contact | None = None,
     section: SolverSection | None = None,
     serial: bool | None = None,
-    held: FixedRegion | None = None,
+    fixed: FixedRegion | None = None,
 ) -> Solver:
     """A solver of the organ [mm] among shapes, the tool among them. Raises SamplingError.
 
-    Shape matching also takes an organ that was filled before (``sim.shape_matching.fill``). ``serial`` says whether a step is one
+    Shape matching also takes an organ that was filled before (``sim.shape_matching.fill_organ``). ``serial`` says whether a step is one
     kernel on one core; left open, the body's size and the machine decide.
     """
     contact, section = contact or Contact(), section or SolverSection()
     scaling = section.mass_scaling_per_mm
     parts = ModelInputs(
-        organ, tissue, shapes, contact.shape_friction, held, serial, section.relaxation, scaling
+        organ, tissue, shapes, contact.shape_friction, fixed, serial, section.relaxation, scaling
     )
     model: Any = model_of(tissue).make(parts)
-    pairs = ParticleContacts(model, contact.particle_friction) if contact.particles else None
-    return Solver(model, pairs, tool)
+    self_contacts = SelfContacts(model, contact.particle_friction) if contact.particles else None
+    return Solver(model, self_contacts, tool)

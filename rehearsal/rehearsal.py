@@ -92,7 +92,7 @@ class Rehearsal:
             echo = start_acoustics(scanned) if shows_echo else None
         progress("Building the model: tissue and contacts")
         self._build_solver(anatomy)
-        self.guard = DivergenceCheck(self.solver)
+        self.divergence_check = DivergenceCheck(self.solver)
         self.notice = ""
         progress("Building the model: surfaces")
         self._build_surfaces()
@@ -103,7 +103,7 @@ class Rehearsal:
         self.pose = self._settle()
         self.manipulator = self._manipulator()
         self.pose = self.manipulator.pose()
-        self.guard.settle()
+        self.divergence_check.set_initial_state()
         self.settled = self.snapshot()
 
     def _build_solver(self, anatomy: LoadedAnatomy) -> None:
@@ -111,15 +111,15 @@ class Rehearsal:
         self.tool = tool_of(self.probe)
         shapes = [*(self._shape(shape) for shape in anatomy.shapes), self.tool]
         tissue, section = self.scene.tissue, self.scene.solver
-        held = self._held()
+        fixed = self._fixed_region()
         self.solver = build_solver(
-            self.organ, tissue, shapes, self.tool, self.scene.contact, section, held=held
+            self.organ, tissue, shapes, self.tool, self.scene.contact, section, fixed=fixed
         )
         self.body, self.model, self.contacts = self.solver.body, self.solver.model, self.solver.contacts
         self.settings = step_settings(tissue, section)
         self.set_gravity(self.scene.gravity.acceleration_m_s2)
 
-    def _held(self) -> FixedRegion | None:
+    def _fixed_region(self) -> FixedRegion | None:
         attachment = self.scene.attachment
         if attachment.radius_mm == 0 or attachment.at_mm is None:
             return None
@@ -212,24 +212,26 @@ class Rehearsal:
         ``notice`` says what had to be put right; it is empty after most steps.
         """
         self.solver.step(self.settings, poses_between(self.pose, pose, self.settings.substeps))
-        self.notice = self.guard.check(self.settings.time_step_s)
+        self.notice = self.divergence_check.check(self.settings.time_step_s)
         self.pose = pose
         self.steps += 1
 
     def snapshot(self, manipulator: ManipulatorState | None = None) -> RehearsalState:
         """A copy of the present state, with the manipulator's present state or another one."""
         held = manipulator or self.manipulator.state
-        return RehearsalState(self.solver.snapshot(), self.guard.watch, self.pose, self.steps, held)
+        return RehearsalState(
+            self.solver.snapshot(), self.divergence_check.state, self.pose, self.steps, held
+        )
 
     def restore(self, state: RehearsalState) -> None:
         """Go back to a state; the steps that follow give the same bits as they did from it before."""
         self.solver.restore(state.solver)
-        self.guard.watch = state.watch
+        self.divergence_check.state = state.watch
         self.pose, self.steps, self.manipulator.state = state.pose, state.steps, state.manipulator
 
     def keep_good(self) -> None:
         """Take the tissue, where it is well, for what its guard would put back."""
-        self.guard.keep()
+        self.divergence_check.store_if_healthy()
 
     def update_surfaces(self) -> None:
         """Carry the surfaces that are drawn to where the body is."""

@@ -1,8 +1,8 @@
 import os
 from pathlib import Path
 
-# Before Taichi is imported, by whichever module: no banner, and no look on the network for newer versions.
+# Set before any module imports Taichi: no banner, and no check for newer versions on the network.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "False")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
-# Without it, as of a service, Taichi ends the process where it looks for its cache.
+# Taichi ends the process where HOME is not set, as in a service.
 os.environ.setdefault("HOME", str(Path.home()))

@@ -1,61 +1,27 @@
-"""One soft body: its rest state, which is fixed, and its current state, which the solver changes."""
+"""A soft body on the device: its rest positions and its current state, which the solver changes."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
-import trimesh
 
 from sim.fields import array_of, field_of, fill
-from sim.mesh_distance import signed_distance
-from sim.sampling import sample_particles
-
-
-@dataclass(frozen=True)
-class RestBody:
-    """The body as it was built; nothing changes it.
-
-    particles (n, 3) float64 [mm], in the frame of the surface, all of one mass; contact_radius (n,) [mm]: how near a
-    particle's centre may come to a shape.
-    """
-
-    particles: np.ndarray
-    radius_mm: float
-    contact_radius: np.ndarray
+from sim.sampling import RestBody
 
 
 @dataclass(frozen=True)
 class BodyState:
-    """What changes while a body moves: positions (n, 3) [mm] and velocities (n, 3) [mm/s], float32."""
+    """Positions (n, 3) [mm] and velocities (n, 3) [mm/s], float32."""
 
     position: np.ndarray
     velocity: np.ndarray
 
 
-def fill_body(
-    surface: trimesh.Trimesh,
-    radius_mm: float,
-    volume_sampling: float = 4.0,
-    surface_samples_per_mm2: float = 0.0,
-) -> RestBody:
-    """Particles that fill a closed surface [mm].
-
-    A particle touches a shape where the surface above it would: its contact radius is its depth under the
-    surface, at most the particle radius, so that a body laid in a mould of its own shape rests without being
-    moved. Raises SamplingError when the radius is too large for the surface.
-    """
-    particles = sample_particles(
-        surface.vertices, surface.faces, radius_mm, volume_sampling, surface_samples_per_mm2
-    )
-    depth = -signed_distance(surface.vertices, surface.faces, particles)[0]
-    return RestBody(particles, radius_mm, np.clip(depth, 0.0, radius_mm))
-
-
 @ti.data_oriented
 class Body:
-    """Points that move, and their current state on the device; vectors are float32 fields of shape (n,).
+    """Particles or nodes; vectors are float32 fields of shape (n,).
 
-    ``rest_points`` (n, 3) float64 [mm] is where they are at rest.
+    ``rest_points`` (n, 3) float64 [mm] are the rest positions; ``predicted`` [mm] the predicted positions of a substep.
     """
 
     mass_scaled = False
@@ -65,12 +31,13 @@ class Body:
         self.count = len(rest_points)
         self.position = ti.Vector.field(3, ti.f32, self.count)
         self.velocity = ti.Vector.field(3, ti.f32, self.count)
-        self.estimate = ti.Vector.field(3, ti.f32, self.count)
+        self.predicted = ti.Vector.field(3, ti.f32, self.count)
         self.rest = ti.Vector.field(3, ti.f32, self.count)
-        self._put(self.rest_state(), (self.rest, self.rest_points))
+        fill((self.rest, self.rest_points))
+        self.restore(self.rest_state())
 
     def rest_state(self) -> BodyState:
-        """The state at build time: at rest in the rest position."""
+        """The state without deformation or motion."""
         position = self.rest_points.astype(np.float32)
         return BodyState(position, np.zeros_like(position))
 
@@ -79,17 +46,14 @@ class Body:
         return BodyState(array_of(self.position), array_of(self.velocity))
 
     def restore(self, state: BodyState) -> None:
-        """Go back to a state; the steps that follow give the same bits as they did from it before."""
-        self._put(state)
-
-    def _put(self, state: BodyState, *others: tuple[ti.Field, np.ndarray]) -> None:
-        at, speed = state.position, state.velocity
-        fill((self.position, at), (self.estimate, at), (self.velocity, speed), *others)
+        """Restore a state; the steps that follow give the same bits as they did from it before."""
+        position, velocity = state.position, state.velocity
+        fill((self.position, position), (self.predicted, position), (self.velocity, velocity))
 
 
 @ti.data_oriented
 class ParticleBody(Body):
-    """A body of particles. ``contact_radius`` (n,) [mm]: how near each may come to a shape.
+    """A body of particles. ``contact_radius`` (n,) [mm]: smallest allowed distance of each particle's centre from a shape.
 
     ``mass_scaling_per_mm`` is k of Algorithm 1, line 4; at 0 there is no ``mass_scale`` (n,).
     """

@@ -1,4 +1,4 @@
-"""Start Taichi on one backend, quietly. Fields of an earlier start are gone afterwards."""
+"""Start Taichi on one backend, without its console output. A new start invalidates all earlier fields."""
 
 import contextlib
 import functools
@@ -17,50 +17,50 @@ from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 BACKENDS = {"cuda": ti.cuda, "vulkan": ti.vulkan, "cpu": ti.cpu}
 FEW_CORES = 4
-# Taichi drops compiled kernels from 100 MB on. A rehearsal leaves 4 MB for each patient and each choice of settings.
+# Taichi's default for its kernel cache is 100 MB. A rehearsal adds 4 MB for each patient and each choice of settings.
 CACHE_BYTES = 1 << 30
 COUNTS = 64
 TEMPORARY = Path(tempfile.gettempdir()) / "nephron" / "kernels"
 
 
-def _place(context: ASTTransformerContext, node) -> str:
-    """Where an expression stands, for the case of an error in it."""
+def _source_position(context: ASTTransformerContext, node) -> str:
+    """File, line and function of an expression, for error messages."""
     line = context.src[node.lineno - 1]
     return f'File "{context.file}", line {node.lineno + context.lineno_offset}, in {context.func.func.__name__}:\n{line}\n'
 
 
-# To build a kernel Taichi reads the source of a function at each call of it and wraps each of its lines, draws each
-# expression's place with a caret, and writes the whole stack down for each field, whether there is an error or not:
-# together more than half of the time.
-ASTTransformerContext.get_pos_info = _place
+# While Taichi builds a kernel, it reads and wraps the source of a function at each call of it, formats the position of each
+# expression, and formats the call stack for each field, even without an error. This takes more than half of the time, so
+# it is cached or left out here.
+ASTTransformerContext.get_pos_info = _source_position
 kernel_impl.getsourcelines = functools.cache(kernel_impl.getsourcelines)
 kernel_impl.getsourcefile = functools.cache(kernel_impl.getsourcefile)
 kernel_impl.textwrap = SimpleNamespace(
     fill=functools.cache(textwrap.fill), dedent=functools.cache(textwrap.dedent)
 )
 impl.get_traceback = snode.get_traceback = lambda stacklevel=1: ""
-# And to learn whether a function stands in a class it reads the file that holds it.
+# Taichi reads the source file to find out whether a function is in a class; the calling frame shows it too.
 kernel_impl._inside_class = lambda level_of_class_stackframe: (
     "__qualname__" in sys._getframe(level_of_class_stackframe - 1).f_locals
 )
 
 
 class NoDevice(RuntimeError):
-    """The backend that was asked for is not there; the message is one line."""
+    """The requested backend is not available; the message is one line."""
 
 
 def start(arch: str = "cpu", **options) -> str:
-    """Initialise Taichi on ``auto`` (CUDA where there is one, else the CPU) or a named backend; the one it is.
+    """Initialise Taichi on a named backend or ``auto`` (CUDA if available, else the CPU); return the backend's name.
 
-    ``options`` go to ``ti.init``. Raises NoDevice.
+    ``options`` are passed to ``ti.init``. Raises NoDevice.
     """
     ti.set_logging_level(ti.ERROR)
     if arch == "auto":
         arch = "cuda" if ti.lang.misc.is_arch_supported(ti.cuda) else "cpu"
-    elif arch != "cpu" and not is_there(arch):
+    elif arch != "cpu" and not is_available(arch):
         raise NoDevice(f"this machine has no {arch} device or driver; use --arch cpu or --arch auto")
     if arch != "vulkan":
-        # LLVM does it again: kernels run as fast, and large ones compile in a tenth of the time.
+        # LLVM optimises too: without Taichi's own pass kernels are as fast, and large ones compile ten times as fast.
         options = {"advanced_optimization": False, **options}
     options = {
         "offline_cache_file_path": str(_kernel_folder()),
@@ -69,16 +69,16 @@ def start(arch: str = "cpu", **options) -> str:
     }
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(arch=BACKENDS[arch], log_level=ti.ERROR, **options)
-    if arch == "vulkan" and not counts_right():
+    if arch == "vulkan" and not counts_correctly():
         ti.reset()
         raise NoDevice(
-            "the Vulkan driver of this machine computes wrongly, as Mesa 22's software driver does; use --arch cpu, or a newer driver"
+            "the Vulkan driver of this machine gives wrong results, as Mesa 22's software driver does; use --arch cpu, or a newer driver"
         )
     return arch
 
 
-def counts_right() -> bool:
-    """Whether a loop in a loop runs to its end with an atomic minimum in it, as the image plane's does."""
+def counts_correctly() -> bool:
+    """Whether a nested loop with an atomic minimum, as in the image plane, runs to its end."""
     count, least = np.zeros(COUNTS, np.int32), np.full(8, COUNTS, np.int32)
     _count(count, least)
     expected = [sum(max(min(r, 8) - max(r - 5, 0), 0) for r in range(t % 7, 12)) for t in range(COUNTS)]
@@ -96,22 +96,22 @@ def _count(count: ti.types.ndarray(ndim=1), least: ti.types.ndarray(ndim=1)):
         count[t] = counted
 
 
-def is_there(arch: str) -> bool:
-    """Whether ``cuda`` or ``vulkan`` has a device and a driver; what a driver that is missing prints goes nowhere."""
-    told, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 2)
+def is_available(arch: str) -> bool:
+    """Whether ``cuda`` or ``vulkan`` has a device and a driver; output of a missing driver is discarded."""
+    stderr, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 2)
     try:
         return bool(ti.lang.misc.is_arch_supported(BACKENDS[arch]))
     finally:
-        os.dup2(told, 2)
-        os.close(told)
-        os.close(nowhere)
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        os.close(null)
 
 
 def _kernel_folder() -> Path:
-    """Where compiled kernels are kept for the next run: where Taichi keeps them, or else a temporary folder.
+    """Folder of the kernel cache: Taichi's default, or a temporary folder if that is not writable.
 
-    Of a folder that cannot be made or written Taichi crashes as the process ends, even when it is told to keep nothing.
+    With a folder that is not writable Taichi crashes at the end of the process, even with the cache off.
     """
     usual = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or impl.default_cfg().offline_cache_file_path)
     try:
@@ -127,9 +127,9 @@ def on_cpu() -> bool:
 
 
 def is_too_small(count: int, parallel_from: int) -> bool:
-    """Whether a body of so many particles or nodes steps faster on one core of a CPU than on all of them.
+    """Whether a body of ``count`` particles or nodes steps faster on one core of a CPU than on all cores.
 
-    Of few cores the second never paid: what one has computed the other must fetch. The machine decides, not how many
-    threads Taichi was given, on which no bit of a result may depend.
+    With few cores, exchanging data between them takes longer than they save. This depends on the machine and not on the
+    number of threads that Taichi uses, because results must not depend on that.
     """
     return on_cpu() and ((os.cpu_count() or 1) < FEW_CORES or count < parallel_from)

@@ -1,7 +1,7 @@
-"""A coarse tetrahedral mesh embedded in the body: deformed point -> tetrahedron -> rest point.
+"""A coarse tetrahedral mesh embedded in the body: it maps deformed points to rest points.
 
-The paper's way from the ultrasound plane back to the CT ("Weighted matrix blending"): the plane is expressed
-barycentrically in deformed tetrahedra and mapped back to where the tissue was at rest.
+The paper's method for the CT slice in the ultrasound plane ("Weighted matrix blending"): barycentric coordinates of the plane in
+the deformed tetrahedra give its rest positions.
 """
 
 from itertools import permutations
@@ -13,56 +13,56 @@ import trimesh
 
 from sim.device import is_too_small
 from sim.fields import field_of
-from sim.mesh_distance import signed_distance
+from sim.signed_distance import signed_distance
 from sim.skinning import Skin
 from sim.tissue_model import TissueModel
 
-# Barycentric slack that closes the seams between tetrahedra against rounding.
+# Barycentric tolerance, so that rounding leaves no gaps between tetrahedra.
 SEAM = 1e-5
 SEAM_MM = 1e-2
 PARALLEL = 1e-12
-# Volume times six [mm^3] up to which a tetrahedron holds no pixel.
+# Six times the volume [mm^3] up to which a tetrahedron is flat and contains no pixel.
 FLAT = 1e-3
 FAR_MM = 1e9
-# Fewer tetrahedra than these one core of a CPU finds faster by itself.
+# With fewer tetrahedra, one core of a CPU is faster than several.
 PARALLEL_FROM = 1_000_000
 
 
 @ti.data_oriented
 class Embedding:
-    """Tetrahedra of a regular grid around a closed surface, carried by the skin of their vertices.
+    """Tetrahedra of a regular grid around a closed surface, whose vertices move with the tissue model.
 
-    ``tetrahedron`` (m,) holds four vertex indices each, of a rest mesh that fills space without gaps (Kuhn's six
-    tetrahedra a cell). Around the body the vertices follow it less and less, to nothing at ``margin_mm``, so that
-    what lies around the organ gives way to it without a gap; ``share`` (n,) is how far each follows.
+    ``tetrahedron`` (m,): four vertex indices each, of a rest mesh without gaps (Kuhn's six tetrahedra per cell). Outside the
+    body the displacement of the vertices falls to zero at ``margin_mm``, so that the surroundings deform without gaps;
+    ``share`` (n,) is the factor of each vertex.
 
-    ``rest_from_plane`` (m + 1,) takes (u, v, w) of an image plane [mm] to where the material there was at rest, for each
-    tetrahedron that ``locate_on_plane`` found on it; the last is for what no tetrahedron holds, which does not move.
+    ``rest_from_plane`` (m + 1,) maps (u, v, w) of an image plane [mm] to rest positions, for each tetrahedron that
+    ``locate_on_plane`` found on it; the last is for points in no tetrahedron, which do not move.
     """
 
     def __init__(
         self, model: TissueModel, surface: trimesh.Trimesh, cell_mm: float, margin_mm: float = 0.0
     ) -> None:
         vertices, tetrahedra = tetrahedra_around(surface, cell_mm, margin_mm)
-        # A tetrahedron that holds tissue reaches this far out: all of its vertices must follow it wholly.
-        wholly = np.sqrt(3) * cell_mm
+        # A tetrahedron that contains tissue extends this far outside: all of its vertices must move with the tissue.
+        extent = np.sqrt(3) * cell_mm
         outside = np.maximum(signed_distance(surface.vertices, surface.faces, vertices)[0], 0.0)
-        beyond = np.maximum(outside - wholly, 0.0)
-        # Where surroundings fold over each other or over the organ, what is nearer to it, or of it, is taken.
+        beyond = np.maximum(outside - extent, 0.0)
+        # Where tetrahedra overlap after deformation, the lowest index is taken: those in or nearest to the organ come first.
         layer = np.ceil(outside[tetrahedra].min(axis=1) / cell_mm)
         tetrahedra = tetrahedra[np.argsort(layer, kind="stable")]
-        share = np.clip(1.0 - beyond / max(margin_mm - wholly, cell_mm), 0.0, 1.0)
+        share = np.clip(1.0 - beyond / max(margin_mm - extent, cell_mm), 0.0, 1.0)
         self.skin = Skin(model, vertices)
         self.share = field_of(share)
         self.count = len(tetrahedra)
         self.tetrahedron = field_of(tetrahedra, 1)
         self.on_plane = ti.Vector.field(2, ti.f32, len(vertices))
-        # Apart, so that what all tetrahedra are asked for stays in a core's nearest cache.
+        # A field of its own: all tetrahedra read it, and so it fits in a core's cache.
         self.above_plane = ti.field(ti.f32, len(vertices))
         self.rest_from_plane = ti.Matrix.field(3, 4, ti.f32, self.count + 1)
 
     def update(self) -> None:
-        """Carry the vertices to where the body is now."""
+        """Move the vertices with the body."""
         self.skin.update()
         self._fade()
 
@@ -80,12 +80,11 @@ class Embedding:
         first_mm: ti.Matrix,
         owner: ti.Field,
     ) -> None:
-        """Which tetrahedron holds each pixel of an image plane; ``count``, one more than the last, where none does.
+        """Write to ``owner`` (rows, columns), i32, the tetrahedron at each pixel of an image plane, ``count`` where there is none.
 
-        The two matrices take world [mm] to (u, v, w), with the plane at w = 0, and back; pixel (row, column) is at u =
-        first.x + column * pixel.x, v = first.y + row * pixel.y. ``owner`` (rows, columns) i32 comes out. Of
-        tetrahedra that overlap, which a folded mesh has, the one of lowest index is taken, whatever thread was first;
-        those turned inside out, by tissue squeezed shut, and those squashed flat are left out.
+        The two matrices map world [mm] to (u, v, w), with the plane at w = 0, and back; pixel (row, column) is at u =
+        first.x + column * pixel.x, v = first.y + row * pixel.y. Of overlapping tetrahedra the lowest index is taken,
+        independent of threads; inverted and flat ones are left out.
         """
         serial = is_too_small(self.count, PARALLEL_FROM)
         self._locate(serial, plane_from_world, world_from_plane, pixel_mm, first_mm, owner)
@@ -104,11 +103,11 @@ class Embedding:
             owner[pixel] = self.count
         self.rest_from_plane[self.count] = world_from_plane[:3, :]
         for v in self.on_plane:
-            place = plane_from_world @ tm.vec4(self.skin.vertices[v], 1.0)
-            self.on_plane[v], self.above_plane[v] = place.xy, place.z
+            projected = plane_from_world @ tm.vec4(self.skin.vertices[v], 1.0)
+            self.on_plane[v], self.above_plane[v] = projected.xy, projected.z
         ti.loop_config(serialize=serial)
         for n in range(self.count):
-            # One after the other, the last that marks a pixel is the lowest.
+            # In serial order the last that marks a pixel has the lowest index.
             t = self.count - 1 - n
             node = self.tetrahedron[t]
             w = ti.Vector([self.above_plane[node[k]] for k in ti.static(range(4))])
@@ -117,7 +116,7 @@ class Embedding:
 
     @ti.func
     def mark(self, serial: ti.template(), t, node, pixel_mm, first_mm, owner: ti.template()):
-        """Mark the pixels of a tetrahedron that the plane cuts, and where at rest they are, if any are in the picture."""
+        """Mark the pixels of a tetrahedron that the plane cuts, and store its map to rest positions, if any are in the image."""
         corner, rest = tm.mat4(0.0), ti.Matrix.zero(ti.f32, 3, 4)
         low, high = tm.vec2(FAR_MM), tm.vec2(-FAR_MM)
         for k in ti.static(range(4)):
@@ -161,7 +160,7 @@ class Embedding:
                     right = ti.min(right, -at / slope)
                 elif at < 0.0:
                     right = -1.0
-            # Of a nearly flat tetrahedron the ends may be no numbers at all: the picture's own bound them.
+            # The ends may be NaN for a nearly flat tetrahedron: clamp them to the image.
             first = ti.max(ti.cast(ti.ceil(left), ti.i32), 0)
             last = ti.min(ti.cast(ti.floor(right), ti.i32), owner.shape[1] - 1)
             for column in range(first, last + 1):
@@ -173,7 +172,7 @@ class Embedding:
 
 @ti.data_oriented
 class Unmoved:
-    """The embedding of what does not move: one piece holds all, and every point is where it was at rest."""
+    """The embedding of a body that does not move: every point is at its rest position."""
 
     count = 1
 
@@ -181,7 +180,7 @@ class Unmoved:
         self.rest_from_plane = ti.Matrix.field(3, 4, ti.f32, 1)
 
     def update(self) -> None:
-        """Nothing is to be carried."""
+        """Nothing to do."""
 
     @ti.kernel
     def locate_on_plane(
@@ -201,9 +200,9 @@ class Unmoved:
 def tetrahedra_around(
     surface: trimesh.Trimesh, cell_mm: float, margin_mm: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (v, 3) float64 [mm] and tetrahedra (t, 4) of the grid cells that hold any of the surface's inside.
+    """Vertices (v, 3) float64 [mm] and tetrahedra (t, 4) of the grid cells whose centre is in the surface or near to it.
 
-    A cell counts where its centre is no farther outside than the margin and half the cell's diagonal.
+    Near: no farther outside than the margin and half of the cell's diagonal.
     """
     low = surface.vertices.min(axis=0) - cell_mm - margin_mm
     shape = np.ceil((surface.vertices.max(axis=0) + cell_mm + margin_mm - low) / cell_mm).astype(int)

@@ -1,4 +1,4 @@
-"""Arrays on the device. On a CPU they are written and read where they lie: to make a kernel for that takes longer."""
+"""Copy arrays to and from Taichi fields. On a CPU directly in memory: compiling a kernel for each field takes longer."""
 
 import ctypes
 from weakref import WeakKeyDictionary
@@ -9,20 +9,20 @@ from taichi.lang import impl
 
 from sim.device import on_cpu
 
-# The address of each tree of fields, for each start of Taichi.
+# Address of each tree of fields, for each start of Taichi.
 _ROOTS: WeakKeyDictionary[object, dict[int, int]] = WeakKeyDictionary()
 
 
 def field_of(values: np.ndarray, within: int = 0) -> ti.Field:
-    """A field that holds an array: floats as f32, all else as i32.
+    """A field with the values of an array: floats as f32, others as i32.
 
-    The last ``within`` axes are those of each element: 0 for scalars, 1 for vectors, 2 for matrices.
+    The last ``within`` axes are those of an element: 0 for scalars, 1 for vectors, 2 for matrices.
     """
     return fields_of(values, within=within)[0]
 
 
 def fields_of(*arrays: np.ndarray, within: int = 0) -> list[ti.Field]:
-    """``field_of`` each of some arrays."""
+    """``field_of`` for each array."""
     arrays = tuple(map(np.asarray, arrays))
     fields = [_empty(values, within) for values in arrays]
     fill(*zip(fields, arrays, strict=True))
@@ -37,20 +37,20 @@ def _empty(values: np.ndarray, within: int) -> ti.Field:
 
 
 def fill(*pairs: tuple[ti.Field, np.ndarray]) -> None:
-    """Write arrays into fields of their shapes. Raises ValueError for another shape."""
+    """Write arrays into fields. Raises ValueError if the shapes differ."""
     for field, values in pairs:
         values = np.asarray(values)
         if values.shape != _shape(field):
             raise ValueError(f"an array of shape {values.shape} for a field of shape {_shape(field)}")
         if on_cpu():
-            _lying(field)[...] = values
+            _memory(field)[...] = values
         else:
             field.from_numpy(np.ascontiguousarray(values, _kind(field)))
 
 
 def array_of(field: ti.Field) -> np.ndarray:
-    """The array that a field holds, (*its shape, *its element's)."""
-    return _lying(field).copy() if on_cpu() else field.to_numpy()
+    """The values of a field, of shape (*field, *element)."""
+    return _memory(field).copy() if on_cpu() else field.to_numpy()
 
 
 def _kind(field: ti.Field) -> type[np.float32] | type[np.int32]:
@@ -65,8 +65,8 @@ def _element(field: ti.Field) -> tuple[int, ...]:
     return () if isinstance(field, ti.ScalarField) else (field.n, field.m)[: field.ndim]
 
 
-def _lying(field: ti.Field) -> np.ndarray:
-    """A field's own memory: an element in one piece, in each cell beside those of the other fields of a struct."""
+def _memory(field: ti.Field) -> np.ndarray:
+    """View of a field's memory; each element is contiguous, next to those of the other fields of a struct."""
     impl.get_runtime().materialize()
     place = field.snode.ptr
     size = place.parent.cell_size_bytes

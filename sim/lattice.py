@@ -1,7 +1,7 @@
-"""A closed surface filled with cubic cells, those that it cuts holding only their share of tissue (NumPy).
+"""A regular lattice of hexahedral elements, the cells of a grid, that fills a closed surface (NumPy).
 
-No mesh has to fit the organ: the cells of a regular grid are kept where there is any tissue, and what is cut is
-integrated over its filled part (the finite cell method, Parvizian, Duester & Rank 2007).
+No mesh has to fit the organ: cells that contain tissue are kept, and those cut by the surface are integrated over their
+filled part (finite cell method, Parvizian, Duester & Rank 2007).
 """
 
 from dataclasses import dataclass
@@ -11,39 +11,38 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from sim.mesh_distance import signed_distance
 from sim.sampling import SamplingError, check_memory
+from sim.signed_distance import signed_distance
 
 # Corners of a cell, x slowest.
 CORNERS = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
-# A cut cell is integrated over this many samples along an edge, from distances known at its corners, edge middles,
-# face middles and middle.
+# A cut cell is integrated over this many samples along each edge; distances are interpolated from 3 x 3 x 3 points.
 SAMPLES = 6
-# Empty space in a cut cell is given this share of the tissue's stiffness, so that no node is left loose.
+# Stiffness of the empty part of a cut cell, relative to the tissue's, so that every node has some.
 ERSATZ = 0.02
-# Beyond its cells a lattice moves as its outermost cell does, this many cells further at most.
+# Displacements are extrapolated from the nearest cell over at most this many widths of a cell.
 EXTRAPOLATED_CELLS = 1.0
 MOST_CELLS = 400_000
-# What a cell takes while the model is built: measured on 243000 cells of a kidney.
+# Memory of a cell while the model is built: measured on 243000 cells of a kidney.
 CELL_BYTES = 9000
-# Points of the surface that stand for less than this share of the mean area give it to their neighbours.
+# Surface points with less than this fraction of the mean area are merged with their neighbours.
 LEAST_AREA = 0.4
-# Neighbours that look another way are farther than any that look the same.
+# Separates points that face different directions by more than any distance between points.
 APART_MM = 1e6
-VOLUME_PASSES = 4
-# What the cells hold may differ from the organ's volume by this share.
-MOST_VOLUME_OFF = 0.1
+VOLUME_ITERATIONS = 4
+# Largest relative error of the volume before it is corrected.
+MOST_VOLUME_ERROR = 0.1
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Cells and nodes at rest [mm]; nodes of one colour share no cell, and are numbered one after another.
+    """Cells and nodes at rest [mm]; nodes of one colour share no cell and are numbered consecutively.
 
-    nodes (n, 3); colour_start (9,): where each of the 8 colours starts; cells (m, 8): nodes at CORNERS; gradient
-    (m, 8, 3) [1/mm]: B, the corners' shape functions' gradients, averaged over the cell's filled part; volume (m,)
-    [mm^3]: that which resists; hourglass (m, 8, 8) [mm]: integral of (B - mean B)(B - mean B)^T over the filled part;
-    tissue (n,) [mm^3]: volume of tissue that each node carries; index_of (x, y, z): the cell at a place of the grid
-    that starts at low_mm, -1 where there is none.
+    nodes (n, 3); colour_start (9,): first node of each of the 8 colours; cells (m, 8): nodes at CORNERS; gradient
+    (m, 8, 3) [1/mm]: B, the gradients of the corners' shape functions, averaged over the cell's filled part; volume (m,)
+    [mm^3]: elastic volume; hourglass (m, 8, 8) [mm]: integral of (B - mean B)(B - mean B)^T over the filled part;
+    tissue (n,) [mm^3]: volume of tissue of each node; index_of (x, y, z): the cell at a position of the grid that starts at
+    low_mm, -1 where there is none.
     """
 
     cell_mm: float
@@ -58,30 +57,30 @@ class Lattice:
     index_of: np.ndarray
 
     def interpolation(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes (k, 8) and weights (k, 8), which sum to 1, that carry points (k, 3) [mm].
+        """Nodes (k, 8) and trilinear weights (k, 8), which sum to 1, of points (k, 3) [mm].
 
-        Points outside all cells go with the nearest, extrapolated linearly for a cell's width and no further.
+        Points outside all cells are extrapolated linearly from the nearest cell, for one width of a cell at most.
         """
         at = (np.asarray(points, float) - self.low_mm) / self.cell_mm
-        place = np.clip(np.floor(at).astype(int), 0, np.array(self.index_of.shape) - 1)
-        cell = self.index_of[tuple(place.T)]
+        index = np.clip(np.floor(at).astype(int), 0, np.array(self.index_of.shape) - 1)
+        cell = self.index_of[tuple(index.T)]
         centres = np.argwhere(self.index_of >= 0)
         outside = cell < 0
         if outside.any():
             nearest = cKDTree(centres + 0.5).query(at[outside])[1]
-            place[outside] = centres[nearest]
-            cell[outside] = self.index_of[tuple(place[outside].T)]
-        inside = np.clip(at - place, -EXTRAPOLATED_CELLS, 1 + EXTRAPOLATED_CELLS)
+            index[outside] = centres[nearest]
+            cell[outside] = self.index_of[tuple(index[outside].T)]
+        inside = np.clip(at - index, -EXTRAPOLATED_CELLS, 1 + EXTRAPOLATED_CELLS)
         return self.cells[cell], shape_functions(inside)
 
 
 def shape_functions(at: np.ndarray) -> np.ndarray:
-    """Trilinear weights (k, 8) of a unit cell's corners at places (k, 3)."""
+    """Trilinear shape functions (k, 8) of a unit cell's corners at points (k, 3)."""
     return np.where(CORNERS == 1, at[:, None], 1 - at[:, None]).prod(axis=2)
 
 
 def shape_gradients(at: np.ndarray) -> np.ndarray:
-    """Their derivatives (k, 8, 3) along the unit cell's edges."""
+    """Gradients (k, 8, 3) of the shape functions in the unit cell."""
     factor = np.where(CORNERS == 1, at[:, None], 1 - at[:, None])
     sign = np.where(CORNERS == 1, 1.0, -1.0)
     other = [factor[..., (axis + 1) % 3] * factor[..., (axis + 2) % 3] for axis in range(3)]
@@ -91,7 +90,7 @@ def shape_gradients(at: np.ndarray) -> np.ndarray:
 def fill_with_cells(surface: trimesh.Trimesh, cell_mm: float) -> Lattice:
     """The lattice of a closed surface [mm].
 
-    Raises SamplingError when the cells are too many for a step to end or for the memory, or too large for the surface's shape.
+    Raises SamplingError when the cells are too many for a step or for the memory, or too large for the surface's shape.
     """
     low = surface.bounds[0] - cell_mm / 2
     size = np.ceil((surface.bounds[1] - low) / cell_mm).astype(int)
@@ -101,57 +100,57 @@ def fill_with_cells(surface: trimesh.Trimesh, cell_mm: float) -> Lattice:
             "choose larger ones"
         )
     check_memory(CELL_BYTES * surface.volume / cell_mm**3, f"cells of {cell_mm:g} mm", "choose larger ones")
-    places = np.indices(size).reshape(3, -1).T
+    indices = np.indices(size).reshape(3, -1).T
     samples = _samples()
-    places, filled = _filled(surface, low, cell_mm, places, samples)
-    return _assemble(low, cell_mm, size, places, filled, samples)
+    indices, filled = _filled(surface, low, cell_mm, indices, samples)
+    return _assemble(low, cell_mm, size, indices, filled, samples)
 
 
 def fill_block(counts: tuple[int, int, int], cell_mm: float) -> Lattice:
-    """The lattice of a block from the origin on, so many whole cells along each axis."""
-    places = np.indices(counts).reshape(3, -1).T
+    """The lattice of a block with a corner at the origin and ``counts`` cells along each axis."""
+    indices = np.indices(counts).reshape(3, -1).T
     samples = _samples()
-    filled = np.ones((len(places), len(samples)))
-    return _assemble(np.zeros(3), cell_mm, np.array(counts), places, filled, samples)
+    filled = np.ones((len(indices), len(samples)))
+    return _assemble(np.zeros(3), cell_mm, np.array(counts), indices, filled, samples)
 
 
 def _samples() -> np.ndarray:
-    """Places (s, 3) in a unit cell at which it is integrated."""
+    """Integration points (s, 3) in a unit cell."""
     at = (np.arange(SAMPLES) + 0.5) / SAMPLES
     return np.stack(np.meshgrid(at, at, at, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _filled(
-    surface: trimesh.Trimesh, low: np.ndarray, cell_mm: float, places: np.ndarray, samples: np.ndarray
+    surface: trimesh.Trimesh, low: np.ndarray, cell_mm: float, indices: np.ndarray, samples: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Places (m, 3) of the cells that hold tissue, and how much of each sample's surroundings (m, s) is tissue."""
-    centre = signed_distance(surface.vertices, surface.faces, low + cell_mm * (places + 0.5))[0]
+    """Grid positions (m, 3) of the cells that contain tissue, and the filled fraction (m, s) around each integration point."""
+    centre = signed_distance(surface.vertices, surface.faces, low + cell_mm * (indices + 0.5))[0]
     reach = cell_mm * np.sqrt(3) / 2
-    places, centre = places[centre < reach], centre[centre < reach]
-    filled = np.ones((len(places), len(samples)))
+    indices, centre = indices[centre < reach], centre[centre < reach]
+    filled = np.ones((len(indices), len(samples)))
     cut = centre > -reach
     halves = np.indices((3, 3, 3)).reshape(3, -1).T
-    grid = 2 * places[cut][:, None] + halves
-    unique, back = _different_rows(grid.reshape(-1, 3))
+    grid = 2 * indices[cut][:, None] + halves
+    unique, back = _unique_rows(grid.reshape(-1, 3))
     known = signed_distance(surface.vertices, surface.faces, low + cell_mm / 2 * unique)[0]
     distance = known[back].reshape(-1, 27) @ _from_halves(samples).T
-    # Straight interpolation cuts convex surfaces short: they are moved out until the volume is right.
-    out = 0.0
-    for step in range(VOLUME_PASSES):
-        filled[cut] = np.clip(0.5 - (distance - out) / (cell_mm / SAMPLES), 0, 1)
-        held = cell_mm**3 * filled.mean(axis=1).sum()
-        if step == 0 and abs(held / surface.volume - 1) > MOST_VOLUME_OFF:
+    # Linear interpolation cuts off convex surfaces: offset the surface outwards until the volume is right.
+    offset = 0.0
+    for iteration in range(VOLUME_ITERATIONS):
+        filled[cut] = np.clip(0.5 - (distance - offset) / (cell_mm / SAMPLES), 0, 1)
+        volume = cell_mm**3 * filled.mean(axis=1).sum()
+        if iteration == 0 and abs(volume / surface.volume - 1) > MOST_VOLUME_ERROR:
             raise SamplingError(
-                f"cells of {cell_mm:g} mm hold {100 * held / surface.volume:.0f} % of the organ's "
+                f"cells of {cell_mm:g} mm fill {100 * volume / surface.volume:.0f} % of the organ's "
                 f"{surface.volume / 1000:.3g} ml: choose smaller ones"
             )
-        out += (surface.volume - held) / surface.area
-    some = filled.sum(axis=1) > 0
-    return places[some], filled[some]
+        offset += (surface.volume - volume) / surface.area
+    has_tissue = filled.sum(axis=1) > 0
+    return indices[has_tissue], filled[has_tissue]
 
 
 def _from_halves(at: np.ndarray) -> np.ndarray:
-    """Weights (k, 27) that interpolate values on the 3 x 3 x 3 half-grid of a unit cell at places (k, 3)."""
+    """Weights (k, 27) that interpolate values on the 3 x 3 x 3 half-grid of a unit cell at points (k, 3)."""
     hat = np.maximum(1 - np.abs(2 * at[:, :, None] - np.arange(3)), 0)
     return np.einsum("ki,kj,kl->kijl", hat[:, 0], hat[:, 1], hat[:, 2]).reshape(len(at), 27)
 
@@ -160,11 +159,11 @@ def _assemble(
     low: np.ndarray,
     cell_mm: float,
     size: np.ndarray,
-    places: np.ndarray,
+    indices: np.ndarray,
     filled: np.ndarray,
     samples: np.ndarray,
 ) -> Lattice:
-    corner = places[:, None] + CORNERS
+    corner = indices[:, None] + CORNERS
     flat = np.ravel_multi_index(tuple(np.moveaxis(corner, 2, 0)), tuple(size + 1))
     used = np.unique(flat)
     node = np.column_stack(np.unravel_index(used, tuple(size + 1)))
@@ -177,7 +176,7 @@ def _assemble(
     tissue_at = filled @ samples / filled.sum(axis=1, keepdims=True)
     carried = cell_mm**3 * filled.mean(axis=1)[:, None] * shape_functions(tissue_at)
     index_of = np.full(size, -1)
-    index_of[tuple(places.T)] = np.arange(len(places))
+    index_of[tuple(indices.T)] = np.arange(len(indices))
     volume = cell_mm**3 * weight.mean(axis=1)
     mean, variance = _gradients(weight / weight.sum(axis=1, keepdims=True), samples)
     return Lattice(
@@ -194,16 +193,16 @@ def _assemble(
     )
 
 
-def _gradients(share: np.ndarray, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (m, 8, 3) and variance (m, 8, 8), summed over the axes, of B over samples with given shares (m, s)."""
+def _gradients(weight: np.ndarray, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (m, 8, 3) and variance (m, 8, 8), summed over the axes, of B over samples with weights (m, s)."""
     at_samples = shape_gradients(samples)
-    mean = np.einsum("ms,sia->mia", share, at_samples)
+    mean = np.einsum("ms,sia->mia", weight, at_samples)
     square = np.einsum("sia,sja->sij", at_samples, at_samples).reshape(len(samples), 64)
-    return mean, (share @ square).reshape(-1, 8, 8) - np.einsum("mia,mja->mij", mean, mean)
+    return mean, (weight @ square).reshape(-1, 8, 8) - np.einsum("mia,mja->mij", mean, mean)
 
 
 def surface_points(surface: trimesh.Trimesh, spacing_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points (k, 3) [mm] on a surface, about a spacing apart, and the area (k,) [mm^2] that each stands for."""
+    """Points (k, 3) [mm] on a surface, about a spacing apart, and the area (k,) [mm^2] of each."""
     vertices, faces = trimesh.remesh.subdivide_to_size(
         surface.vertices, surface.faces, spacing_mm / 2, max_iter=30
     )
@@ -211,28 +210,25 @@ def surface_points(surface: trimesh.Trimesh, spacing_mm: float) -> tuple[np.ndar
     middle = corner.mean(axis=1)
     area = trimesh.triangles.area(corner)
     bins = np.floor((middle - surface.bounds[0]) / spacing_mm).astype(int)
-    # Faces that look different ways have points of their own: what lies on a table is only what faces it.
+    # Points are separate for faces of different direction: only what faces a support is in contact with it.
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     axis = np.abs(normal).argmax(axis=1)
     side = 2 * axis + (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] > 0)
-    keys, owner = _different_rows(np.column_stack([bins, side]))
+    keys, owner = _unique_rows(np.column_stack([bins, side]))
     total = np.bincount(owner, area)
     mean = np.column_stack([np.bincount(owner, area * middle[:, axis]) for axis in range(3)]) / total[:, None]
-    # A bin that the surface only grazes would make a point of little weight, which sinks in deep.
-    whole = total >= LEAST_AREA * total.mean()
+    # A point of very small area would have little stiffness and penetrate deeply.
+    kept = total >= LEAST_AREA * total.mean()
     apart = np.column_stack([mean, keys[:, 3] * APART_MM])
-    nearest = cKDTree(apart[whole]).query(apart)[1]
+    nearest = cKDTree(apart[kept]).query(apart)[1]
     on_surface = igl.point_mesh_squared_distance(
-        mean[whole], surface.vertices, np.asarray(surface.faces, np.int64)
+        mean[kept], surface.vertices, np.asarray(surface.faces, np.int64)
     )[2]
     return on_surface, np.bincount(nearest, total)
 
 
-def _different_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The different ones of rows (n, k) of whole numbers, in order, and which of them each row (n,) is.
-
-    One number a row: they sort ten times as fast as rows do.
-    """
+def _unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``np.unique`` with its inverse for rows (n, k) of integers, ten times as fast: it sorts one number for each row."""
     least = rows.min(axis=0)
     shape = tuple(rows.max(axis=0) - least + 1)
     keys, which = np.unique(np.ravel_multi_index(tuple((rows - least).T), shape), return_inverse=True)

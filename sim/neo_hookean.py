@@ -1,9 +1,10 @@
-"""A tissue model true to a material: compressible neo-Hookean tissue on a lattice, node after node to its balance.
+"""Compressible neo-Hookean tissue on a lattice of hexahedral elements, solved by vertex block descent.
 
-The implicit time step is the minimum of |x - target|^2 m / 2 h^2 + elastic and contact energy over the positions
-(Liu et al. 2013, Eq. 3). Each node in turn goes to the minimum for itself with all others held (vertex block descent,
-Chen et al. 2024), over-relaxed. Where nothing moves any more every node is in balance with its neighbours, so what
-the tissue comes to rest at does not depend on iterations, substeps or time step.
+Implicit Euler as minimisation (Liu et al. 2013, Eq. 3): a step minimises m |x - inertial target|^2 / 2 h^2 + elastic and
+contact energy over the positions x. Vertex block descent (Chen et al. 2024) is a nonlinear Gauss-Seidel method: one Newton
+step for each node, all others fixed; here with successive over-relaxation. Elements have one integration point and hourglass
+stabilisation (Flanagan & Belytschko 1981); those cut by the surface are integrated as in the finite cell method.
+At convergence every node is in equilibrium, so the rest state does not depend on iterations, substeps or time step.
 """
 
 from itertools import pairwise
@@ -16,57 +17,57 @@ import taichi.math as tm
 from sim.body import Body
 from sim.device import is_too_small
 from sim.fields import field_of, fields_of
-from sim.four_wide import cross, four, row
 from sim.lattice import Lattice, fill_with_cells, surface_points
-from sim.rigid_correction import RigidMotion
+from sim.linear_algebra import cross, four, row, solve
+from sim.rigid_correction import RigidCorrection
 from sim.solver import StepSettings
-from sim.surface_contact import LAYER_MM, REACH_MM, SurfaceContacts
+from sim.surface_contact import PENALTY_DEPTH_MM, REACH_MM, SurfaceContacts
 from sim.tissue_model import ModelInputs
 
-# Stiffness, in units of the shear modulus, of deformation that varies inside a cell: between 1, exact for torsion,
-# and (1 + nu), exact for bending.
-HOURGLASS = 1.2
-# Below this volume ratio ln J goes on as its tangent, so that inverted cells find back.
+# Stiffness, in units of the shear modulus, of deformation that varies inside an element. 1 is exact for torsion and
+# (1 + nu) for bending; at nu = 0.45 their geometric mean is 1.2.
+HOURGLASS_STIFFNESS = 1.2
+# Below this volume ratio J, ln J is continued by its tangent, so that inverted elements recover.
 LEAST_J = 0.2
 LN2 = 0.6931471805599453
 SQRT_HALF_BITS = 0x3F3504F3
-# With fewer nodes, starting threads for eight colours costs a CPU more than they save.
+# With fewer nodes, starting threads for eight colours takes a CPU longer than they save.
 PARALLEL_NODES = 16_000
-# Points of the surface that can touch are this share of a cell apart.
-POINTS_A_CELL = 0.5
-# No node moves farther in a pass than this share of a cell.
-MOST_CELLS_A_PASS = 0.5
+# Spacing of the contact points on the surface, in widths of a cell.
+POINT_SPACING_CELLS = 0.5
+# Largest displacement of a node in one iteration, in widths of a cell.
+MOST_CELLS_AN_ITERATION = 0.5
 LATTICE_SETTINGS = StepSettings(substeps=1, iterations=4, relaxation_factor=1.7, stabilisation_iterations=0)
 
 
 @ti.data_oriented
 class NeoHookean:
-    """W = mu/2 (tr C - 3) - mu ln J + lambda/2 (ln J)^2 on a lattice's cells (Bonet & Wood 2008, Eq. 6.27).
+    """W = mu/2 (tr C - 3) - mu ln J + lambda/2 (ln J)^2 in the elements of a lattice (Bonet & Wood 2008, Eq. 6.27).
 
-    Nodes are projected colour by colour, on one core where ``serial`` (left open, their number decides); those ``held``
-    (n,) stay where they are, and ``load_g`` (n,) [g] hangs at them. ``deformation`` (m + 1,) has the columns of every
-    cell's F as rows and follows its nodes; the last stands for cells that are not there.
+    ``fixed`` (n,) marks nodes that cannot move; ``load_g`` (n,) [g] is added to the nodes' masses; ``serial`` runs on one core
+    (None: by the number of nodes). ``deformation`` (m + 1,) has the columns of each element's deformation gradient F as rows;
+    the last is for elements that do not exist.
     """
 
-    EMBEDDING_SIZES: ClassVar[float] = 1.35
+    EMBEDDING_CELL_RATIO: ClassVar[float] = 1.35
 
     @classmethod
-    def make(cls, parts: ModelInputs) -> "NeoHookean":
-        """Cells that fill the organ, and points of its surface where there is something to touch. Raises SamplingError."""
-        tissue = parts.tissue
-        lattice = fill_with_cells(parts.organ, tissue.cell_mm)
+    def make(cls, inputs: ModelInputs) -> "NeoHookean":
+        """Elements that fill the organ, with contact points on its surface where there are shapes. Raises SamplingError."""
+        tissue = inputs.tissue
+        lattice = fill_with_cells(inputs.organ, tissue.cell_mm)
         body = Body(lattice.nodes)
         contacts = None
-        if parts.shapes:
-            points, area_mm2 = surface_points(parts.organ, POINTS_A_CELL * tissue.cell_mm)
-            contacts = SurfaceContacts(body, lattice, points, area_mm2, parts.shapes, parts.friction)
+        if inputs.shapes:
+            points, area_mm2 = surface_points(inputs.organ, POINT_SPACING_CELLS * tissue.cell_mm)
+            contacts = SurfaceContacts(body, lattice, points, area_mm2, inputs.shapes, inputs.friction)
         material = (tissue.young_kpa, tissue.poisson, tissue.density_g_cm3)
-        held = None if parts.held is None else parts.held.nodes(lattice.nodes)
-        return cls(body, lattice, contacts, *material, held=held, serial=parts.serial)
+        fixed = None if inputs.fixed is None else inputs.fixed.nodes(lattice.nodes)
+        return cls(body, lattice, contacts, *material, fixed=fixed, serial=inputs.serial)
 
     @staticmethod
     def reach_mm(tissue: Any) -> float:
-        """As far as its contacts look, whatever the cells [mm]."""
+        """Distance [mm] within which contacts need the distance to a shape, the same for all cell widths."""
         return REACH_MM
 
     def __init__(
@@ -77,7 +78,7 @@ class NeoHookean:
         young_kpa: float = 15.0,
         poisson: float = 0.45,
         density_g_cm3: float = 1.05,
-        held: np.ndarray | None = None,
+        fixed: np.ndarray | None = None,
         serial: bool | None = None,
         load_g: np.ndarray | float = 0.0,
     ) -> None:
@@ -88,24 +89,24 @@ class NeoHookean:
         self.has_contacts = contacts is not None
         self.colours = tuple(pairwise(starts))
         self.serial = is_too_small(body.count, PARALLEL_NODES) if serial is None else serial
-        self.has_held = held is not None
-        if held is not None:
-            self.held = field_of(held)
+        self.has_fixed = fixed is not None
+        if fixed is not None:
+            self.fixed = field_of(fixed)
         self.count = len(lattice.cells)
-        self.most_mm = MOST_CELLS_A_PASS * lattice.cell_mm
+        self.most_mm = MOST_CELLS_AN_ITERATION * lattice.cell_mm
         self.mu = ti.field(ti.f32, ())
-        self.lame = ti.field(ti.f32, ())
-        self.target = ti.Vector.field(3, ti.f32, body.count)
-        self.estimate = ti.Vector.field(4, ti.f32, body.count)
+        self.lambda_ = ti.field(ti.f32, ())
+        self.inertial_target = ti.Vector.field(3, ti.f32, body.count)
+        self.predicted = ti.Vector.field(4, ti.f32, body.count)
         self.mass = field_of(1e-3 * density_g_cm3 * lattice.tissue + load_g)
-        self._store_cells()
+        self._store_elements()
         self._store_hourglass()
-        self.rigid: Any = (
-            None if self.has_held else RigidMotion(body, self.mass, self.target, contacts, self.serial)
-        )
+        self.rigid: Any = None
+        if not self.has_fixed:
+            self.rigid = RigidCorrection(body, self.mass, self.inertial_target, contacts, self.serial)
         self.set_material(young_kpa, poisson)
 
-    def _store_cells(self) -> None:
+    def _store_elements(self) -> None:
         cells, nodes = self.lattice.cells, self.body.count
         around = np.full((nodes, 8), self.count)
         gradient = np.zeros((nodes, 8, 4))
@@ -119,7 +120,7 @@ class NeoHookean:
         self.deformation = field_of(np.tile(np.eye(3, 4), (self.count + 1, 1, 1)), 2)
 
     def _store_hourglass(self) -> None:
-        """Rows of the hourglass matrix, over the 27 nodes around each node and itself, for a shear modulus of 1."""
+        """Rows of the hourglass matrix over the 27 nodes around each node, itself included, for a shear modulus of 1."""
         cells, nodes = self.lattice.cells, self.body.count
         neighbour = np.tile(np.arange(nodes)[:, None], (1, 27))
         weight = np.zeros((nodes, 27))
@@ -128,67 +129,66 @@ class NeoHookean:
             for b in range(8):
                 place = (corners[b] - corners[a] + 1) @ [9, 3, 1]
                 neighbour[cells[:, a], place] = cells[:, b]
-                weight[cells[:, a], place] += HOURGLASS * self.lattice.hourglass[:, a, b]
+                weight[cells[:, a], place] += HOURGLASS_STIFFNESS * self.lattice.hourglass[:, a, b]
         self.neighbour, self.hourglass = fields_of(neighbour, weight)
 
     def set_young(self, young_kpa: float) -> None:
-        """Change Young's modulus [kPa], Poisson's ratio stays."""
+        """Change Young's modulus [kPa]; Poisson's ratio stays the same."""
         self.set_material(young_kpa, self.poisson)
 
     def set_material(self, young_kpa: float, poisson: float) -> None:
-        """Change Young's modulus [kPa] and Poisson's ratio; the contact layer is as much stiffer as the tissue is."""
+        """Change Young's modulus [kPa] and Poisson's ratio; the contacts' penalty stiffness is proportional to Young's modulus."""
         self.poisson = poisson
         # 1 kPa is 1000 g/(mm s^2).
         self.mu[None] = 1e3 * young_kpa / (2 * (1 + poisson))
-        self.lame[None] = 1e3 * young_kpa * poisson / ((1 + poisson) * (1 - 2 * poisson))
+        self.lambda_[None] = 1e3 * young_kpa * poisson / ((1 + poisson) * (1 - 2 * poisson))
         if self.contacts is not None:
-            self.contacts.stiffness[None] = young_kpa / LAYER_MM
+            self.contacts.stiffness[None] = young_kpa / PENALTY_DEPTH_MM
 
     def counts(self) -> dict[str, int]:
-        """Nodes, which are its particles, and cells, and points of the surface that may touch."""
+        """Nodes (also as particles), cells, and contact points on the surface."""
         nodes, points = self.body.count, self.contacts.count if self.has_contacts else 0
         return dict(nodes=nodes, particles=nodes, cells=self.count, points=points)
 
     @ti.func
     def begin(self, dt: float):
-        """Start from where the body is, moved rigidly; what the solver predicted is where inertia and gravity draw it."""
+        """The solver's prediction is the inertial target; start from the last positions and the rigid-body coarse correction."""
         for i in range(self.body.count):
-            self.target[i] = self.body.estimate[i]
-            self.body.estimate[i] = self.body.position[i]
-        if ti.static(not self.has_held):
+            self.inertial_target[i] = self.body.predicted[i]
+            self.body.predicted[i] = self.body.position[i]
+        if ti.static(not self.has_fixed):
             self.rigid.move(dt)
         for c in range(self.count):
             x, y, z = tm.vec4(0.0), tm.vec4(0.0), tm.vec4(0.0)
             for k in ti.static(range(8)):
                 i = self.cell[c][k]
-                b, at = self.gradient[i, k], four(self.body.estimate[i])
+                b, at = self.gradient[i, k], four(self.body.predicted[i])
                 x += b.x * at
                 y += b.y * at
                 z += b.z * at
             self.deformation[c] = ti.Matrix.rows([x, y, z])
-        # Every node at the skin adds nothing to it, but nothing times infinity stays.
+        # Nodes at the surface add zero to it, but zero times infinity would make it NaN for ever.
         self.deformation[self.count] = ti.Matrix.rows(
             [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
         )
 
     @ti.func
     def gather(self):
-        """Take over the estimates."""
+        """Read the predicted positions."""
         for i in range(self.body.count):
-            self.estimate[i] = four(self.body.estimate[i])
+            self.predicted[i] = four(self.body.predicted[i])
 
     @ti.func
     def scatter(self):
-        """Give the estimates back."""
+        """Write the predicted positions."""
         for i in range(self.body.count):
-            self.body.estimate[i] = self.estimate[i].xyz
+            self.body.predicted[i] = self.predicted[i].xyz
 
     @ti.func
     def project(self, stiffness: float, relaxation_factor: float, dt: float):
-        """Nodes one after another or a colour at once, which is the same, to their balance: each by a Newton step on its
-        own 3 x 3 system, over-relaxed.
+        """One Gauss-Seidel iteration over all nodes; serial and colour by colour give the same result.
 
-        All ranges are known when the kernel compiles: that makes the code twice as fast, and on Vulkan any other starts
+        All ranges are known when the kernel compiles: this makes the code twice as fast, and on Vulkan any other range starts
         65536 threads.
         """
         if ti.static(self.serial):
@@ -202,30 +202,30 @@ class NeoHookean:
 
     @ti.func
     def relax(self, i, relaxation_factor: float, dt: float):
-        """Node i goes to its balance with all others held."""
+        """One over-relaxed Newton step of node i on its 3 x 3 system, all other nodes fixed."""
         inertia = self.mass[i] / (dt * dt)
         force, hessian, least = self.elastic(i)
-        force += inertia * (four(self.target[i]) - self.estimate[i])
+        force += inertia * (four(self.inertial_target[i]) - self.predicted[i])
         hessian += inertia * tm.eye(3)
         factor = relaxation_factor
         if ti.static(self.has_contacts):
-            pushed, layer = self.contacts.push(i)
-            if layer[0, 0] + layer[1, 1] + layer[2, 2] > 0.0:
+            contact_force, stiffness = self.contacts.node_force(i)
+            if stiffness[0, 0] + stiffness[1, 1] + stiffness[2, 2] > 0.0:
                 factor = 1.0
-            force += four(pushed)
-            hessian += layer
+            force += four(contact_force)
+            hessian += stiffness
         change = factor * solve(hessian, force.xyz, least + inertia)
         change *= ti.min(1.0, self.most_mm / ti.max(change.norm(), 1e-12))
-        if ti.static(self.has_held):
-            change *= 1.0 - self.held[i]
+        if ti.static(self.has_fixed):
+            change *= 1.0 - self.fixed[i]
         self.move(i, four(change))
         if ti.static(self.has_contacts):
             self.contacts.follow(i, change)
 
     @ti.func
     def move(self, i, change):
-        """Node i moves, and the cells around it follow. No other node of its colour has them."""
-        self.estimate[i] = self.estimate[i] + change
+        """Move node i and update the deformation of the elements around it, which no other node of its colour has."""
+        self.predicted[i] = self.predicted[i] + change
         for k in range(8):
             b = self.gradient[i, k]
             # Not "+=", which is atomic.
@@ -235,14 +235,14 @@ class NeoHookean:
 
     @ti.func
     def elastic(self, i):
-        """Force [uN] of the cells around node i and of the hourglass, its negative derivative by the node's position, and
-        the least eigenvalue of that.
+        """Force [uN] on node i of the elements around it, its negative derivative by the node's position (3, 3), and that
+        matrix's least eigenvalue.
 
         With B the node's gradient, f = -V (mu F B + (lambda ln J - mu) G / J), where G = dJ/dx = cof(F) B does not
         depend on the node's own position, so that d^2J/dx^2 = 0.
         """
-        mu, lame = self.mu[None], self.lame[None]
-        force = -mu * self.hourglass_pull(i)
+        mu, lambda_ = self.mu[None], self.lambda_[None]
+        force = -mu * self.hourglass_gradient(i)
         x, y, z = tm.vec4(0.0), tm.vec4(0.0), tm.vec4(0.0)
         for k in range(8):
             b = self.gradient[i, k]
@@ -253,28 +253,28 @@ class NeoHookean:
             g = b.x * f23 + b.y * cross(f3, f1) + b.z * cross(f1, f2)
             at = ti.max(j, LEAST_J)
             one_by = 1.0 / at
-            pressure = (lame * (ln(at) + j * one_by - 1.0) - mu) * one_by
+            pressure = (lambda_ * (ln(at) + j * one_by - 1.0) - mu) * one_by
             force -= b.w * (mu * (b.x * f1 + b.y * f2 + b.z * f3) + pressure * g)
-            curvature = lame * one_by * one_by - (pressure * one_by if j > LEAST_J else 0.0)
-            bent = (b.w * ti.max(curvature, 0.0)) * g
-            x += g.x * bent
-            y += g.y * bent
-            z += g.z * bent
-        # Shear and hourglass resist in all directions alike, wherever the node is.
-        alike = mu * (self.shear[i] + self.hourglass[i, 13])
-        return force, tm.mat3(x.x, x.y, x.z, y.x, y.y, y.z, z.x, z.y, z.z) + alike * tm.eye(3), alike
+            curvature = lambda_ * one_by * one_by - (pressure * one_by if j > LEAST_J else 0.0)
+            weighted = (b.w * ti.max(curvature, 0.0)) * g
+            x += g.x * weighted
+            y += g.y * weighted
+            z += g.z * weighted
+        # Shear and hourglass stiffness are isotropic and do not depend on the positions.
+        isotropic = mu * (self.shear[i] + self.hourglass[i, 13])
+        return force, tm.mat3(x.x, x.y, x.z, y.x, y.y, y.z, z.x, z.y, z.z) + isotropic * tm.eye(3), isotropic
 
     @ti.func
-    def hourglass_pull(self, i):
-        """Force, for a shear modulus of 1, against deformation that varies inside the cells: blind to rotations."""
-        x = self.estimate[i]
-        pull = tm.vec4(0.0)
+    def hourglass_gradient(self, i):
+        """Gradient by node i of the hourglass energy for a shear modulus of 1; zero for linear fields, so for rotations too."""
+        x = self.predicted[i]
+        gradient = tm.vec4(0.0)
         for k in range(27):
-            pull += self.hourglass[i, k] * (self.estimate[self.neighbour[i, k]] - x)
-        return pull
+            gradient += self.hourglass[i, k] * (self.predicted[self.neighbour[i, k]] - x)
+        return gradient
 
     def update_frames(self) -> None:
-        """Nothing to do: points are carried by the nodes themselves."""
+        """Nothing to do: points are interpolated from the nodes."""
 
     def attach(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nodes (n, 8) around points (n, 3) [mm], and their trilinear weights (n, 8)."""
@@ -282,7 +282,7 @@ class NeoHookean:
 
     @ti.kernel
     def carry(self, rest: ti.template(), frame: ti.template(), weight: ti.template(), out: ti.template()):
-        """Points moved by the weighted displacements of their nodes."""
+        """Write the current positions of points by the weighted displacements of their nodes."""
         for v in rest:
             x = rest[v]
             for k in ti.static(range(frame.n)):
@@ -293,29 +293,11 @@ class NeoHookean:
 
 @ti.func
 def ln(x):
-    """Natural logarithm of a normal positive number to float32's rounding; a call of the library's would not inline."""
+    """Natural logarithm of a normal positive number to float32's rounding; unlike the library's it is inlined."""
     bits = ti.bit_cast(x, ti.i32)
     exponent = (bits - SQRT_HALF_BITS) >> 23
     z = ti.bit_cast(bits - (exponent << 23), ti.f32)
-    # The series of 2 artanh(z), |z| < 0.172.
+    # Series of 2 artanh(z), |z| < 0.172.
     z = (z - 1.0) / (z + 1.0)
     s = z * z
     return exponent * LN2 + 2.0 * z * (1.0 + s * (1 / 3 + s * (1 / 5 + s * (1 / 7 + s / 9))))
-
-
-@ti.func
-def solve(matrix, right, least):
-    """Solution of a symmetric 3 x 3 system whose eigenvalues are ``least`` or more, by its square-root-free Cholesky factors.
-
-    No pivot is less either, but by rounding, where a node torn far away is stiff one way and not the others.
-    """
-    d0 = matrix[0, 0]
-    l10, l20 = matrix[1, 0] / d0, matrix[2, 0] / d0
-    d1 = ti.max(matrix[1, 1] - l10 * matrix[1, 0], least)
-    l21 = (matrix[2, 1] - l20 * matrix[1, 0]) / d1
-    d2 = ti.max(matrix[2, 2] - l20 * matrix[2, 0] - l21 * l21 * d1, least)
-    y1 = right.y - l10 * right.x
-    y2 = right.z - l20 * right.x - l21 * y1
-    z = y2 / d2
-    y = y1 / d1 - l21 * z
-    return tm.vec3(right.x / d0 - l10 * y - l20 * z, y, z)

@@ -1,4 +1,4 @@
-"""Contacts of particles with shapes: found once a substep, solved with Coulomb friction, never left violated."""
+"""Contacts of particles with shapes and their Coulomb friction, found once a substep and never left violated."""
 
 import numpy as np
 import taichi as ti
@@ -6,80 +6,79 @@ import taichi.math as tm
 
 from sim.body import ParticleBody
 from sim.fields import array_of, fill
-from sim.shapes import FAR
-from sim.time_of_impact import TimeOfImpact
+from sim.shapes import FAR, TimeOfImpact
 
-KEEP_OUT_SWEEPS = 8
-# How far around a static shape its distances must be known, in particle radii.
+PROJECTION_ITERATIONS = 8
+# Distance around a static shape within which the distance to it must be known, in particle radii.
 REACH_RADII = 2.0
-# Float32 positions of a body of 200 mm carry about 1e-5 mm; distances are compared with room for that.
+# Tolerance of distances [mm]: float32 positions of a body of 200 mm round to about 1e-5 mm.
 ROUNDING = 1e-4
-# A plane is as good as the shape itself so far around where it was found: a shape of 2 mm radius leaves it by ROUNDING there.
+# A contact plane is exact within this distance of where it was found: a shape of 2 mm radius is ROUNDING off its plane there.
 EXACT_MM = 0.02
 SAFETY = 1e-3
 
 
 @ti.data_oriented
 class ShapeContacts:
-    """Contact planes of each particle with each shape, and the push that each has given in this substep.
+    """Contact planes of each particle with each shape, and the displacements by contact in this substep.
 
-    ``plane`` (n, shapes): normal and offset of the nearest surface, n . x = offset [mm]; of a shape that does not move
-    it is kept while the particle stays near to where it was ``found`` (n, shapes), a point and its distance [mm].
-    ``touched`` (n,): bits of the shapes that may be touched in this substep. ``push`` (n, shapes): friction (x, y, z) and
-    normal (w) displacement so far [mm]. As the clusters keep momentum, the sums of the pushes are the impulses
-    exchanged with the shape, so Coulomb's law holds for them: |friction| <= coefficient * normal. A coefficient of 0
-    takes no memory for pushes and no time.
+    ``plane`` (n, shapes): normal and offset of the nearest surface, n . x = offset [mm]; that of a static shape is reused
+    while the particle is near to where it was ``found`` (n, shapes), a point and its distance [mm].
+    ``touched`` (n,): bits of the shapes that may be touched in this substep. ``push`` (n, shapes): displacement by friction
+    (x, y, z) and along the normal (w) so far [mm]. The clusters conserve momentum, so the sums of the displacements are
+    the impulses exchanged with the shape, and Coulomb's law applies to them: |friction| <= coefficient * normal. With
+    coefficient 0, ``push`` does not exist.
     """
 
     def __init__(self, body: ParticleBody, shapes: list, friction: float) -> None:
         self.body = body
         self.shapes = list(shapes)
-        self.free_way = TimeOfImpact(shapes)
+        self.time_of_impact = TimeOfImpact(shapes)
         self.friction = friction
-        self.rough = friction > 0
+        self.has_friction = friction > 0
         self.margin = body.radius_mm / 2
-        self.fresh = body.radius_mm / 4
-        # A shape knows no distances beyond its reach, so "farther than that" is all that can be remembered.
+        self.reuse_mm = body.radius_mm / 4
+        # Distances beyond the reach of a shape are unknown, so no larger distance is stored.
         self.reach = REACH_RADII * body.radius_mm
-        parts = {"plane": tm.vec4, "push": tm.vec4} if self.rough else {"plane": tm.vec4}
+        parts = {"plane": tm.vec4, "push": tm.vec4} if self.has_friction else {"plane": tm.vec4}
         self.contact = ti.Struct.field(parts, shape=(body.count, len(shapes)))
         self.touched = ti.field(ti.i32, body.count)
         self.found = ti.Vector.field(4, ti.f32, (body.count, len(shapes)))
-        self.forget()
+        self.reset()
         self.penetration = ti.field(ti.f32, ())
 
-    def forget(self) -> None:
-        """Drop what is known of the particles' distances, after they were moved by another hand."""
+    def reset(self) -> None:
+        """Clear stored distances; call it after other code has moved the particles."""
         self.found.fill(-FAR)
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """What it carries from step to step: planes, and where they were found."""
+        """A copy of what persists from step to step: contact planes, and where they were found."""
         return dict(plane=array_of(self.contact.plane), found=array_of(self.found))
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Go back to a snapshot; the steps that follow give the same bits."""
+        """Restore a snapshot; the steps that follow give the same bits."""
         fill((self.contact.plane, state["plane"]), (self.found, state["found"]))
 
     @ti.func
     def is_clear(self, s: ti.template(), i, p, distance):
-        """Whether it is known at once that p, where particle i is, is farther than a distance from shape s."""
+        """Whether particle i, at p, is farther than a distance from shape s, as far as a quick test can tell."""
         result = False
         if ti.static(self.shapes[s].moves):
             result = self.shapes[s].is_beyond(p, distance)
         else:
             known = self.found[i, s]
-            room = known.w - distance - SAFETY
-            result = room > 0.0 and (p - known.xyz).norm_sqr() < room * room
+            slack = known.w - distance - SAFETY
+            result = slack > 0.0 and (p - known.xyz).norm_sqr() < slack * slack
         return result
 
     @ti.func
-    def nearest(self, s: ti.template(), i, p, fresh: float):
-        """Normal and distance of shape s from p, where particle i is; from memory if it was measured within ``fresh`` [mm]."""
+    def nearest(self, s: ti.template(), i, p, reuse_mm: float):
+        """Normal and distance of shape s from particle i, at p, by the stored plane if it was found within ``reuse_mm``."""
         result = tm.vec4(0.0)
         if ti.static(self.shapes[s].moves):
             result = self.shapes[s].surface(p)
         else:
-            if (p - self.found[i, s].xyz).norm_sqr() > fresh * fresh:
+            if (p - self.found[i, s].xyz).norm_sqr() > reuse_mm * reuse_mm:
                 near = self.shapes[s].surface(p)
                 self.found[i, s] = tm.vec4(p, ti.min(near.w, self.reach))
                 self.contact[i, s].plane = tm.vec4(
@@ -91,43 +90,43 @@ class ShapeContacts:
 
     @ti.func
     def find(self):
-        """Lines 6-9: the shapes that each particle's estimate is near to; none goes through one by its speed."""
+        """Lines 6-9: the shapes that each particle's predicted position is near to; fast particles stop at the first on their path."""
         for i in range(self.body.count):
-            p = self.halted(self.body.position[i], self.body.estimate[i])
-            self.body.estimate[i] = p
+            p = self.path_end(self.body.position[i], self.body.predicted[i])
+            self.body.predicted[i] = p
             reach = self.body.contact_radius[i] + self.margin
             touched = 0
             for s in ti.static(range(len(self.shapes))):
                 if not self.is_clear(s, i, p, reach):
-                    near = self.nearest(s, i, p, self.fresh)
+                    near = self.nearest(s, i, p, self.reuse_mm)
                     if near.w < reach:
                         touched |= 1 << s
                         if ti.static(self.shapes[s].moves):
                             self.contact[i, s].plane = tm.vec4(
                                 near.xyz, near.xyz.dot(p) - near.w + self.body.contact_radius[i]
                             )
-                        if ti.static(self.rough):
+                        if ti.static(self.has_friction):
                             self.contact[i, s].push = tm.vec4(0.0)
             self.touched[i] = touched
 
     @ti.func
-    def halted(self, start, end):
-        """The end of a particle's way, or, of a long one that meets a shape, where it does."""
-        way, most = end - start, self.body.radius_mm
-        if way.norm_sqr() > most * most:
-            way *= self.free_way.share(start, way, most)
-        return start + way
+    def path_end(self, start, end):
+        """End of a particle's path; where a path longer than the radius meets a static shape, the point of impact."""
+        path, most = end - start, self.body.radius_mm
+        if path.norm_sqr() > most * most:
+            path *= self.time_of_impact.fraction(start, path, most)
+        return start + path
 
     @ti.func
     def depth(self, s: ti.template(), i, x):
-        """How deep particle i, at x, is in the plane of shape s [mm]; less than 0 outside."""
+        """Depth [mm] of particle i, at x, below the contact plane of shape s; negative outside."""
         plane = self.contact[i, s].plane
         depth = plane.w - plane.xyz.dot(x)
         return depth if (self.touched[i] >> s) & 1 else -FAR
 
     @ti.func
     def stabilise(self, iterations: int):
-        """Lines 10-15: move positions and estimates alike out of what they start in, which adds no velocity."""
+        """Lines 10-15: move positions and predicted positions together out of shapes, which adds no velocity."""
         for i in range(self.body.count):
             if self.touched[i] > 0:
                 x, moved = self.body.position[i], tm.vec3(0.0)
@@ -140,43 +139,43 @@ class ShapeContacts:
                             active += 1
                     moved += change / ti.cast(ti.max(active, 1), ti.f32)
                 self.body.position[i] = x + moved
-                self.body.estimate[i] = self.body.estimate[i] + moved
+                self.body.predicted[i] = self.body.predicted[i] + moved
 
     @ti.func
     def pushed(self, i, x, relaxation_factor: float):
-        """How far the shapes push particle i, at x, with their friction, averaged over the shapes [mm] (lines 18-20)."""
+        """Displacement [mm] of particle i, at x, by contact and friction, averaged over the shapes (lines 18-20)."""
         touched, active = self.touched[i], 1
         if touched & (touched - 1) != 0:
             pushing = 0
             for s in ti.static(range(len(self.shapes))):
                 pushing += ti.cast(self.pushes(s, i, x), ti.i32)
             active = ti.max(pushing, 1)
-        # A push beyond the surface would throw the particle off: averaging is undone, no more.
-        share = ti.min(relaxation_factor / ti.cast(active, ti.f32), 1.0)
+        # Over-relaxation only compensates for averaging: beyond the surface it would throw the particle off.
+        factor = ti.min(relaxation_factor / ti.cast(active, ti.f32), 1.0)
         change = tm.vec3(0.0)
         for s in ti.static(range(len(self.shapes))):
             if (touched >> s) & 1:
                 normal = self.contact[i, s].plane.xyz
-                depth = share * ti.max(self.depth(s, i, x), 0.0)
+                depth = factor * ti.max(self.depth(s, i, x), 0.0)
                 change += depth * normal
-                if ti.static(self.rough):
-                    change += self.rub(s, i, x, normal, depth, share)
+                if ti.static(self.has_friction):
+                    change += self.friction_change(s, i, x, normal, depth, factor)
         return change
 
     @ti.func
     def pushes(self, s: ti.template(), i, x):
-        """Whether shape s pushes particle i, at x, or has done so in this substep."""
+        """Whether shape s displaces particle i, at x, or has done so in this substep."""
         result = self.depth(s, i, x) > 0.0
-        if ti.static(self.rough):
+        if ti.static(self.has_friction):
             result |= (self.touched[i] >> s) & 1 and self.contact[i, s].push.w > 0.0
         return result
 
     @ti.func
-    def rub(self, s: ti.template(), i, x, normal, depth, share):
-        """Friction's displacement of particle i by shape s, which pushes it by a further depth now.
+    def friction_change(self, s: ti.template(), i, x, normal, depth, factor):
+        """Displacement of particle i by friction on shape s, which displaces it by ``depth`` along the normal.
 
-        It opposes the motion along the surface since the start of the substep, relative to the shape's own (Macklin
-        2014, Eq. 24), up to the coefficient times all of the normal push so far.
+        It opposes the tangential motion since the start of the substep, relative to the shape's motion (Macklin et al.
+        2014, Eq. 24), up to the coefficient times the total normal displacement.
         """
         push = self.contact[i, s].push
         normal_push = push.w + depth
@@ -184,7 +183,7 @@ class ShapeContacts:
         if normal_push > 0.0:
             slip = x - self.body.position[i] - self.shapes[s].motion(x)
             slip -= slip.dot(normal) * normal
-            friction = push.xyz - share * slip
+            friction = push.xyz - factor * slip
             limit = self.friction * normal_push
             squared = friction.norm_sqr()
             if squared > limit * limit:
@@ -195,29 +194,29 @@ class ShapeContacts:
 
     @ti.func
     def finish(self):
-        """End of a substep: leave no particle inside a shape, by exact projections of those that the averaging left there.
+        """End of a substep: project out of the shapes every particle that is still inside one.
 
-        Where shapes leave no room for the contact radius, its half, then the centre alone must be clear. Where they
-        overlap, so that each sends a particle into the other, it leaves through that side of a tool which is free.
+        Where the gap between shapes is too narrow for the contact radius, half of it, then the centre alone must be outside.
+        Where shapes overlap, so that each projects a particle into the other, it leaves through a free side of a tool.
         """
         for i in range(self.body.count):
-            if not self.is_clear_of_all(i, self.body.estimate[i]):
-                self.body.estimate[i] = self.kept_out(i, self.body.estimate[i])
+            if not self.is_clear_of_all(i, self.body.predicted[i]):
+                self.body.predicted[i] = self.projected_out(i, self.body.predicted[i])
 
     @ti.func
     def is_clear_of_all(self, i, x):
-        """Whether it costs next to nothing to tell that particle i touches no shape from x."""
+        """Whether particle i, at x, touches no shape, as far as a quick test can tell."""
         result = True
         for s in ti.static(range(len(self.shapes))):
             result = result and self.is_clear(s, i, x, self.body.contact_radius[i])
         return result
 
     @ti.func
-    def kept_out(self, i, x):
-        """The place outside all shapes that particle i goes to from x."""
+    def projected_out(self, i, x):
+        """Position of particle i outside all shapes, projected from x."""
         radius = self.body.contact_radius[i]
         clear = False
-        for sweep in range(KEEP_OUT_SWEEPS):
+        for iteration in range(PROJECTION_ITERATIONS):
             if not clear:
                 clear = True
                 for s in ti.static(range(len(self.shapes))):
@@ -226,28 +225,28 @@ class ShapeContacts:
                         if near.w < radius - ROUNDING:
                             x += (radius - near.w) * near.xyz
                             clear = False
-                if sweep % 2 == 1:
-                    radius = radius / 2 if sweep < KEEP_OUT_SWEEPS - 3 else 0.0
+                if iteration % 2 == 1:
+                    radius = radius / 2 if iteration < PROJECTION_ITERATIONS - 3 else 0.0
         if not clear:
-            x = self.leave_by_a_free_side(x)
+            x = self.projected_through_free_side(x)
         return x
 
     @ti.func
-    def leave_by_a_free_side(self, x):
-        """The nearest point that is out of a tool through one of its sides, and out of every other shape as well."""
+    def projected_through_free_side(self, x):
+        """The nearest point outside one of a tool's half-spaces that is outside all shapes; x itself if there is none."""
         best, least = x, FAR
         if self.depth_inside(x) > ROUNDING:
             for s in ti.static(range(len(self.shapes))):
                 if ti.static(self.shapes[s].moves):
                     for k in range(self.shapes[s].count):
-                        out = self.shapes[s].way_out(x, k)
+                        out = self.shapes[s].outside(x, k)
                         if (out - x).norm() < least and self.depth_inside(out) <= ROUNDING:
                             best, least = out, (out - x).norm()
         return best
 
     @ti.func
     def depth_inside(self, x):
-        """How deep x lies inside the shapes [mm]; negative outside."""
+        """Depth [mm] of x inside the shapes; negative outside."""
         depth = -FAR
         for s in ti.static(range(len(self.shapes))):
             depth = ti.max(depth, -self.shapes[s].surface(x).w)
@@ -255,9 +254,9 @@ class ShapeContacts:
 
     @ti.kernel
     def measure_penetration(self) -> float:
-        """Deepest a particle's centre lies inside a shape at the moment [mm], 0 where none does."""
+        """Largest depth [mm] of a particle's centre in a shape, 0 without penetration."""
         self.penetration[None] = 0.0
         for i in range(self.body.count):
-            # The maximum of numbers does not depend on the order, so this atomic keeps runs alike.
+            # A maximum does not depend on the order, so this atomic is deterministic.
             ti.atomic_max(self.penetration[None], self.depth_inside(self.body.position[i]))
         return self.penetration[None]

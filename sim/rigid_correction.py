@@ -1,7 +1,7 @@
-"""How the whole organ moves as if it were rigid, found at once: node by node that takes hundreds of passes.
+"""Rigid-body coarse correction: the rigid motion of the whole body, which Gauss-Seidel takes hundreds of iterations to find.
 
-A coarse correction with six unknowns: Newton's steps on the time step's energy over rotations and translations of all
-nodes, under inertia, gravity and the contacts that the last substep knew. Elastic energy does not see it.
+Newton's method with six unknowns minimises the energy of the time step over rigid motions of all nodes, under inertia,
+gravity and the contacts of the last substep. Elastic energy is invariant to them.
 """
 
 from typing import Any
@@ -11,40 +11,40 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import Body
-from sim.rotation import cross_matrix
+from sim.linear_algebra import cross_matrix, inverse_of, rotation_by
 from sim.surface_contact import NEAR_MM, SurfaceContacts
 
-# Sums are made of blocks of so many terms, in an order that no thread changes.
+# Sums are made in blocks of this many terms, in an order that does not depend on threads.
 BLOCK = 64
-# Newton's steps go on until one moves no node by more than this [mm], but are no more than so many; in parallel each of
-# them is three kernels, whether it has something to do or not.
-ENOUGH_MM = 1e-4
+# Newton's method ends when a step moves no node by more than this [mm], or after this many steps. In parallel each step is
+# three kernels even when converged, so there are fewer.
+CONVERGED_MM = 1e-4
 NEWTON_STEPS = 12
 NEWTON_STEPS_IN_PARALLEL = 3
-# Share of the moments of inertia and contact that is added, so that the system is never singular.
-LEAST_HOLD = 1e-5
-# No body turns by more in a substep [rad].
-MOST_TURN = 0.5
+# Regularisation of the rotational system, relative to its trace.
+REGULARISATION = 1e-5
+# Largest rotation in one Newton step [rad].
+MOST_ROTATION = 0.5
 
 
 @ti.data_oriented
-class RigidMotion:
-    """Moves a body's estimates rigidly towards ``target`` (n,) [mm], where inertia and gravity draw its ``mass`` (n,) [g].
+class RigidCorrection:
+    """Moves a body's predicted positions rigidly towards ``inertial_target`` (n,) [mm], weighted with ``mass`` (n,) [g].
 
-    Unknowns are the translation and the rotation vector about ``centre``, one of the nodes.
+    The unknowns are the translation and the rotation vector about the node ``centre``.
     """
 
     def __init__(
         self,
         body: Body,
         mass: ti.Field,
-        target: ti.Field,
+        inertial_target: ti.Field,
         contacts: SurfaceContacts | None = None,
         serial: bool = False,
     ) -> None:
         self.body = body
         self.mass = mass
-        self.target = target
+        self.inertial_target = inertial_target
         self.contacts: Any = contacts
         self.has_contacts = contacts is not None
         self.serial = serial
@@ -54,70 +54,71 @@ class RigidMotion:
         self.centre = int(np.linalg.norm(body.rest_points - middle, axis=1).argmin())
         self.force = ti.Vector.field(3, ti.f32, self.blocks)
         self.torque = ti.Vector.field(3, ti.f32, self.blocks)
-        self.along = ti.Matrix.field(3, 3, ti.f32, self.blocks)
+        # Negative derivatives of force and torque: by translation, mixed, and by rotation.
+        self.translational = ti.Matrix.field(3, 3, ti.f32, self.blocks)
         self.mixed = ti.Matrix.field(3, 3, ti.f32, self.blocks)
-        self.about = ti.Matrix.field(3, 3, ti.f32, self.blocks)
-        # How far the body reaches from its centre, at rest.
+        self.rotational = ti.Matrix.field(3, 3, ti.f32, self.blocks)
+        # Largest distance of a node from the centre at rest.
         self.extent_mm = float(np.linalg.norm(body.rest_points - middle, axis=1).max())
         self.rotation = ti.Matrix.field(3, 3, ti.f32, ())
         self.translation = ti.Vector.field(3, ti.f32, ())
         self.change_mm = ti.field(ti.f32, ())
-        self.share = ti.field(ti.f32, ())
+        self.fraction = ti.field(ti.f32, ())
 
     @ti.func
     def move(self, dt: float):
-        """The motion that goes on, then Newton steps, in which contacts close, open, stick and slide; all estimates moved."""
+        """Move all predicted positions by the rigid part of their velocities, corrected by Newton steps, up to the time of impact."""
         for _ in range(1):
             self.rotation[None] = tm.eye(3)
             self.translation[None] = tm.vec3(0.0)
         if ti.static(self.serial):
             for step in range(1 + NEWTON_STEPS):
-                if step < 2 or self.change_mm[None] > ENOUGH_MM:
-                    self.improve(step > 0, dt)
+                if step < 2 or self.change_mm[None] > CONVERGED_MM:
+                    self.newton_step(step > 0, dt)
         else:
             # Only outermost loops run in parallel.
             for step in ti.static(range(1 + NEWTON_STEPS_IN_PARALLEL)):
-                self.improve(step > 0, dt)
+                self.newton_step(step > 0, dt)
         for _ in range(1):
-            self.share[None] = 1.0
+            self.fraction[None] = 1.0
         if ti.static(self.has_contacts):
             for q in range(self.contacts.count):
                 if self.is_long():
-                    start = self.contacts.carried(self.body.position, q)
-                    # The least of numbers does not depend on the order, so this atomic keeps runs alike.
-                    ti.atomic_min(self.share[None], self.contacts.free_share(start, self.moved(start)))
+                    start = self.contacts.interpolated(self.body.position, q)
+                    # A minimum does not depend on the order, so this atomic is deterministic.
+                    ti.atomic_min(self.fraction[None], self.contacts.free_fraction(start, self.moved(start)))
         for i in range(self.body.count):
             x = self.body.position[i]
-            self.body.estimate[i] = x + self.share[None] * (self.moved(x) - x)
+            self.body.predicted[i] = x + self.fraction[None] * (self.moved(x) - x)
 
     @ti.func
     def is_long(self):
-        """Whether any point may be moved so far that it could go through a shape."""
-        turned = (self.rotation[None] - tm.eye(3)).norm() * self.extent_mm
-        return self.translation[None].norm() + turned > NEAR_MM
+        """Whether a point may move so far that it could pass through a shape."""
+        rotated = (self.rotation[None] - tm.eye(3)).norm() * self.extent_mm
+        return self.translation[None].norm() + rotated > NEAR_MM
 
     @ti.func
-    def improve(self, newton, dt: float):
-        """One more step to the motion."""
+    def newton_step(self, has_forces, dt: float):
+        """One step; the first, without forces, takes the rigid part of the velocities."""
         for block in range(self.blocks):
-            self.sum_block(block, dt, newton)
+            self.sum_block(block, dt, has_forces)
         for _ in range(1):
             self.solve()
 
     @ti.func
     def moved(self, x):
-        """Where the motion found so far takes a point."""
+        """Position of a point after the rigid motion found so far."""
         centre = self.body.position[self.centre]
         return centre + self.translation[None] + self.rotation[None] @ (x - centre)
 
     @ti.func
-    def sum_block(self, block, dt: float, newton):
-        """Force, torque and their derivatives of a block's terms, nodes first, then points of contact.
+    def sum_block(self, block, dt: float, has_forces):
+        """Force, torque and their derivatives of a block's terms: nodes first, then contact points.
 
-        Without ``newton`` they draw the nodes to where their velocities would take them, whatever is in the way.
+        Without ``has_forces`` the forces move the nodes by their velocities and ignore contacts.
         """
         force, torque = tm.vec3(0.0), tm.vec3(0.0)
-        along, mixed, about = tm.mat3(0.0), tm.mat3(0.0), tm.mat3(0.0)
+        translational, mixed, rotational = tm.mat3(0.0), tm.mat3(0.0), tm.mat3(0.0)
         centre = self.body.position[self.centre] + self.translation[None]
         for term in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.terms)):
             f, k, x = tm.vec3(0.0), tm.mat3(0.0), centre
@@ -125,56 +126,44 @@ class RigidMotion:
                 inertia = self.mass[term] / (dt * dt)
                 x = self.moved(self.body.position[term])
                 f = inertia * dt * self.body.velocity[term]
-                if newton:
-                    f = inertia * (self.target[term] - x)
+                if has_forces:
+                    f = inertia * (self.inertial_target[term] - x)
                 k = inertia * tm.eye(3)
             elif ti.static(self.has_contacts):
                 q = term - self.body.count
                 x = self.moved(self.contacts.point[q])
-                f, k = self.contacts.hold(q, x, newton)
-            turn = cross_matrix(x - centre)
+                f, k = self.contacts.point_force(q, x, has_forces)
+            arm = cross_matrix(x - centre)
             force += f
-            torque += turn @ f
-            along += k
-            mixed -= k @ turn
-            about -= turn @ k @ turn
+            torque += arm @ f
+            translational += k
+            mixed -= k @ arm
+            rotational -= arm @ k @ arm
         self.force[block], self.torque[block] = force, torque
-        self.along[block], self.mixed[block], self.about[block] = along, mixed, about
+        self.translational[block], self.mixed[block], self.rotational[block] = (
+            translational,
+            mixed,
+            rotational,
+        )
 
     @ti.func
     def solve(self):
-        """The 6 x 6 system by its Schur complement; the motion as a rotation and a translation."""
+        """Solve the 6 x 6 system by its Schur complement, and add the step to the rigid motion."""
         force, torque = tm.vec3(0.0), tm.vec3(0.0)
-        along, mixed, about = tm.mat3(0.0), tm.mat3(0.0), tm.mat3(0.0)
+        translational, mixed, rotational = tm.mat3(0.0), tm.mat3(0.0), tm.mat3(0.0)
         for block in range(self.blocks):
             force += self.force[block]
             torque += self.torque[block]
-            along += self.along[block]
+            translational += self.translational[block]
             mixed += self.mixed[block]
-            about += self.about[block]
-        compliance = inverse_of(along)
-        schur = about - mixed.transpose() @ compliance @ mixed
-        # A body drawn out to a line, or less, has no hold about it.
-        schur += (LEAST_HOLD * about.trace() + 1e-12) * tm.eye(3)
-        turn = inverse_of(schur) @ (torque - mixed.transpose() @ compliance @ force)
-        turn *= ti.min(1.0, MOST_TURN / ti.max(turn.norm(), 1e-12))
-        shift = compliance @ (force - mixed @ turn)
-        self.change_mm[None] = shift.norm() + turn.norm() * self.extent_mm
+            rotational += self.rotational[block]
+        compliance = inverse_of(translational)
+        schur = rotational - mixed.transpose() @ compliance @ mixed
+        # A body collapsed to a line or a point has no resistance to rotation about it.
+        schur += (REGULARISATION * rotational.trace() + 1e-12) * tm.eye(3)
+        vector = inverse_of(schur) @ (torque - mixed.transpose() @ compliance @ force)
+        vector *= ti.min(1.0, MOST_ROTATION / ti.max(vector.norm(), 1e-12))
+        shift = compliance @ (force - mixed @ vector)
+        self.change_mm[None] = shift.norm() + vector.norm() * self.extent_mm
         self.translation[None] += shift
-        self.rotation[None] = rotation_by(turn) @ self.rotation[None]
-
-
-@ti.func
-def inverse_of(matrix):
-    """Inverse of a positive definite 3 x 3 matrix, in units of its trace: a determinant may have no room in float32."""
-    unit = 1.0 / matrix.trace()
-    return unit * (unit * matrix).inverse()
-
-
-@ti.func
-def rotation_by(turn):
-    """Rotation by a vector's length [rad] about it (Rodrigues)."""
-    angle = turn.norm()
-    axis = turn / ti.max(angle, 1e-12)
-    cross = cross_matrix(axis)
-    return tm.eye(3) + ti.sin(angle) * cross + (1.0 - ti.cos(angle)) * (cross @ cross)
+        self.rotation[None] = rotation_by(vector) @ self.rotation[None]

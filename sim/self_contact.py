@@ -1,4 +1,4 @@
-"""Particle against particle: neighbours in a grid, and their contacts with friction."""
+"""Self-contact: contacts between particles that share no cluster, found in a hashed grid, with friction."""
 
 import taichi as ti
 import taichi.math as tm
@@ -11,12 +11,11 @@ CELLS = 1 << 15
 
 
 @ti.data_oriented
-class ParticleContacts:
-    """Pairs of particles that share no cluster are kept one particle radius apart.
+class SelfContacts:
+    """Keeps pairs of particles that share no cluster at least one particle radius apart, their distance in the sampling.
 
-    That is the distance at which sampling placed them; those that share a cluster are held by its shape. Cells
-    of a hashed grid hold lists of particles; the neighbours of each particle are sorted, so that no order in
-    which threads filled a list reaches a sum.
+    Cells of a hashed grid have lists of particles. The neighbours of each particle are sorted, so that sums do not depend
+    on the order in which threads filled a list.
     """
 
     def __init__(self, model: ShapeMatching, friction: float) -> None:
@@ -24,9 +23,9 @@ class ParticleContacts:
         self.model = model
         self.relax_globally = model.relaxation == "global"
         self.friction = friction
-        self.rough = friction > 0
+        self.has_friction = friction > 0
         self.distance = body.radius_mm
-        # Particles come nearer than they started during the substep, so some are listed before they touch.
+        # Particles approach each other during the substep, so some are listed before they touch.
         self.reach = 1.5 * self.distance
         self.patch = field_of(model.patches.of_particles())
         self.cell_start = ti.field(ti.i32, CELLS + 1)
@@ -39,12 +38,12 @@ class ParticleContacts:
 
     @ti.func
     def cell_of(self, p):
-        """The cell (3,) of the endless grid that a place lies in."""
+        """The cell (3,) of the unbounded grid that contains p."""
         return ti.cast(ti.floor(p / self.reach), ti.i32)
 
     @ti.func
     def hash(self, cell):
-        """The list, of CELLS, that a cell's particles are in (Teschner 2003)."""
+        """The list, of CELLS, that a cell's particles are in (Teschner et al. 2003)."""
         mixed = (cell.x * 73856093) ^ (cell.y * 19349663) ^ (cell.z * 83492791)
         return mixed & (CELLS - 1)
 
@@ -52,25 +51,25 @@ class ParticleContacts:
     def share_cluster(self, i, j):
         """Whether two particles have a cluster in common; both rows of clusters ascend."""
         p, q = self.patch[i], self.patch[j]
-        a, b = self.model.shared_start[p], self.model.shared_start[q]
-        shared = 0
-        while a < self.model.shared_start[p + 1] and b < self.model.shared_start[q + 1] and shared == 0:
-            ca, cb = self.model.shared[a], self.model.shared[b]
+        a, b = self.model.cluster_start[p], self.model.cluster_start[q]
+        found = 0
+        while a < self.model.cluster_start[p + 1] and b < self.model.cluster_start[q + 1] and found == 0:
+            ca, cb = self.model.cluster_list[a], self.model.cluster_list[b]
             if ca == cb:
-                shared = 1
+                found = 1
             elif ca < cb:
                 a += 1
             else:
                 b += 1
-        return shared
+        return found
 
     @ti.func
     def find(self):
-        """Line 7: the sorted neighbours of every particle, at the estimates."""
+        """Line 7: the sorted neighbours of every particle, at the predicted positions."""
         for c in range(CELLS):
             self.cell_count[c] = 0
         for i in range(self.body.count):
-            self.cell_count[self.hash(self.cell_of(self.body.estimate[i]))] += 1
+            self.cell_count[self.hash(self.cell_of(self.body.predicted[i]))] += 1
         for _ in range(1):
             total = 0
             for c in range(CELLS):
@@ -79,23 +78,23 @@ class ParticleContacts:
                 self.cell_count[c] = 0
             self.cell_start[CELLS] = total
         for i in range(self.body.count):
-            c = self.hash(self.cell_of(self.body.estimate[i]))
+            c = self.hash(self.cell_of(self.body.predicted[i]))
             self.sorted[self.cell_start[c] + ti.atomic_add(self.cell_count[c], 1)] = i
         for i in range(self.body.count):
             self.neighbour_count[i] = self.list_neighbours(i)
 
     @ti.func
     def list_neighbours(self, i):
-        """Write the row of particle i; how many it holds."""
-        p = self.body.estimate[i]
+        """Write the neighbours of particle i; return their number."""
+        p = self.body.predicted[i]
         count = 0
         for near in ti.grouped(ti.ndrange((-1, 2), (-1, 2), (-1, 2))):
             cell = self.cell_of(p) + near
             c = self.hash(cell)
             for k in range(self.cell_start[c], self.cell_start[c + 1]):
                 j = self.sorted[k]
-                q = self.body.estimate[j]
-                # Two cells of the neighbourhood may share a hash: a particle counts in its own cell alone.
+                q = self.body.predicted[j]
+                # Two cells of the neighbourhood may have the same hash: a particle counts only in its own cell.
                 if j != i and (self.cell_of(q) == cell).all() and (p - q).norm() < self.reach:
                     if self.share_cluster(i, j) == 0:
                         count = self.insert(i, j, count)
@@ -103,7 +102,7 @@ class ParticleContacts:
 
     @ti.func
     def insert(self, i, j, count):
-        """Keep the row ascending; beyond its length the particles of highest index are dropped."""
+        """Insert j into the ascending row of particle i; a full row drops the highest index."""
         slot = count
         if count == MOST_NEIGHBOURS:
             slot = -1
@@ -118,28 +117,28 @@ class ParticleContacts:
 
     @ti.func
     def project(self, relaxation_factor: float):
-        """Lines 18-20 for the group of pairs: C = distance - |x_i - x_j| <= 0 and its friction, gathered."""
+        """Lines 18-20 for pairs of particles: C = distance - |x_i - x_j| <= 0 and its friction, gathered."""
         self.most_contacts[None] = 0
         for i in range(self.body.count):
-            x = self.body.estimate[i]
+            x = self.body.predicted[i]
             moved = x - self.body.position[i]
             change, contacts = tm.vec3(0.0), 0
             for k in range(self.neighbour_count[i]):
                 j = self.neighbour[i, k]
-                away = x - self.body.estimate[j]
+                away = x - self.body.predicted[j]
                 gap = away.norm()
                 if gap < self.distance:
                     normal = self.direction(i, j, away, gap)
-                    share = 0.5
+                    weight = 0.5
                     if ti.static(self.body.mass_scaled):
-                        share = self.body.mass_scale[j] / (self.body.mass_scale[i] + self.body.mass_scale[j])
+                        weight = self.body.mass_scale[j] / (self.body.mass_scale[i] + self.body.mass_scale[j])
                     depth = self.distance - gap
-                    change += share * depth * normal
-                    if ti.static(self.rough):
-                        slip = moved - (self.body.estimate[j] - self.body.position[j])
+                    change += weight * depth * normal
+                    if ti.static(self.has_friction):
+                        slip = moved - (self.body.predicted[j] - self.body.position[j])
                         slip -= slip.dot(normal) * normal
-                        hold = ti.min(1.0, self.friction * depth / ti.max(slip.norm(), 1e-12))
-                        change -= share * hold * slip
+                        factor = ti.min(1.0, self.friction * depth / ti.max(slip.norm(), 1e-12))
+                        change -= weight * factor * slip
                     contacts += 1
             if contacts > 0:
                 ti.atomic_max(self.most_contacts[None], contacts)
@@ -148,13 +147,15 @@ class ParticleContacts:
             self.change[i] = relaxation_factor * change
         for i in range(self.body.count):
             if ti.static(self.relax_globally):
-                self.body.estimate[i] += self.change[i] / ti.cast(ti.max(self.most_contacts[None], 1), ti.f32)
+                self.body.predicted[i] += self.change[i] / ti.cast(
+                    ti.max(self.most_contacts[None], 1), ti.f32
+                )
             else:
-                self.body.estimate[i] += self.change[i]
+                self.body.predicted[i] += self.change[i]
 
     @ti.func
     def direction(self, i, j, away, gap):
-        """Unit vector from j to i; of two particles at one place the one of higher index goes up."""
+        """Unit vector from j to i; of two particles at the same point the one with the higher index moves up."""
         normal = tm.vec3(0.0, 0.0, 1.0 if i > j else -1.0)
         if gap > 1e-6:
             normal = away / gap

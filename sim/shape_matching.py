@@ -1,7 +1,7 @@
-"""The paper's tissue model: overlapping clusters, each matched rigidly to its rest shape (Eqs. 8-12).
+"""The paper's tissue model: position-based dynamics with clustered shape matching (Eqs. 8-12; Mueller et al. 2005).
 
-It computes on patches, particles that are in the same clusters: a cluster's moments are sums of its patches' moments,
-and one averaged frame moves a whole patch. Vectors are four wide, so that compilers use a processor's vector units.
+The clusters overlap, and each is matched rigidly to its rest shape. The model computes on patches, groups of particles that
+are in the same clusters: a cluster's moments are sums of its patches' moments, and one averaged frame moves a whole patch.
 """
 
 from typing import Any, ClassVar
@@ -12,22 +12,20 @@ import taichi.math as tm
 import trimesh
 from scipy.spatial import cKDTree
 
-from sim.body import ParticleBody, RestBody, fill_body
+from sim.body import ParticleBody
 from sim.device import is_too_small
 from sim.fields import field_of, fields_of
-from sim.four_wide import four, row
+from sim.linear_algebra import four, rotation_near, row
 from sim.particle_contact import REACH_RADII, ShapeContacts
-from sim.particle_patches import Patches, arrange
-from sim.rotation import rotation_near
-from sim.sampling import Clusters
+from sim.sampling import Clusters, Patches, RestBody, fill_body, group_into_patches
 from sim.tissue_model import ModelInputs
 
 RELAXATIONS = ("local", "global")
-# Points are carried by this many clusters at most.
+# A point is interpolated from this many clusters at most.
 MOST_FRAMES = 4
-# Keeps the weight of a point on a cluster's very origin finite.
+# Keeps the weight of a point at a cluster's origin finite.
 LEAST_SQUARED_MM2 = 1e-6
-# With fewer particles, starting threads costs a CPU more than they save.
+# With fewer particles, starting threads takes a CPU longer than they save.
 PARALLEL_PARTICLES = 100_000
 
 
@@ -35,32 +33,32 @@ PARALLEL_PARTICLES = 100_000
 class ShapeMatching:
     """Clusters of a body's particles and their current frames.
 
-    ``relaxation`` says how a particle's goals are combined (Eq. 7): ``local`` divides by the number of clusters
-    that hold the particle, ``global`` by the largest such number of all particles. Each keeps the body's linear
-    and angular momentum because of the masses with which the clusters are fitted: under ``local`` a particle
-    gives each of its n clusters 1/n of its mass, under ``global`` the whole of it to each.
+    ``relaxation`` is how a particle's goals are combined (Eq. 7): ``local`` divides by the number of clusters that the
+    particle is in, ``global`` by the largest such number of all particles. Both conserve linear and angular momentum, by the
+    masses with which the clusters are fitted: under ``local`` a particle in n clusters counts with 1/n of its mass in each,
+    under ``global`` with its whole mass.
 
     Of each patch: ``patch_rest``, its centre [mm] and mass, in units of a particle's, at rest; ``centre`` now; ``moment``,
     rows that are the columns of the sum of m (x - centre) (x0 - centre0)^T; ``goal``, as ``frame``, the sum over its
     clusters. Of each cluster: ``cluster_rest``; ``frame``, rows that are the columns of the rotation R, then the
-    translation T [mm] of x = R x0 + T. ``local`` (n,) is where the particles are in their patches at rest, with 1 as the
-    fourth entry.
+    translation T [mm] of x = R x0 + T. ``local`` (n,) are the particles' rest positions relative to their patches' centres,
+    with 1 as the fourth entry.
     """
 
-    EMBEDDING_SIZES: ClassVar[float] = 2.0
+    EMBEDDING_CELL_RATIO: ClassVar[float] = 2.0
 
     @classmethod
-    def make(cls, parts: ModelInputs) -> "ShapeMatching":
-        """Particles that fill the organ, or of an organ that was filled before, in clusters. Raises SamplingError."""
-        rest = parts.organ if isinstance(parts.organ, RestBody) else fill(parts.organ, parts.tissue)
-        arranged, patches = arrange(rest, parts.tissue.cluster_spacing)
-        body = ParticleBody(arranged, parts.mass_scaling_per_mm)
-        contacts = ShapeContacts(body, parts.shapes, parts.friction) if parts.shapes else None
-        return cls(body, patches, contacts, parts.relaxation, parts.serial)
+    def make(cls, inputs: ModelInputs) -> "ShapeMatching":
+        """Clusters of the particles that fill the organ; the organ may already be a RestBody. Raises SamplingError."""
+        rest = inputs.organ if isinstance(inputs.organ, RestBody) else fill_organ(inputs.organ, inputs.tissue)
+        sorted_rest, patches = group_into_patches(rest, inputs.tissue.cluster_spacing)
+        body = ParticleBody(sorted_rest, inputs.mass_scaling_per_mm)
+        contacts = ShapeContacts(body, inputs.shapes, inputs.friction) if inputs.shapes else None
+        return cls(body, patches, contacts, inputs.relaxation, inputs.serial)
 
     @staticmethod
     def reach_mm(tissue: Any) -> float:
-        """As far as particles of its radius look [mm]."""
+        """Distance [mm] within which particles need the distance to a shape."""
         return REACH_RADII * tissue.radius_mm
 
     def __init__(
@@ -79,7 +77,7 @@ class ShapeMatching:
         self.serial = is_too_small(body.count, PARALLEL_PARTICLES) if serial is None else serial
         self.patches = patches
         self.patch_count = len(patches)
-        self.several = patches.several
+        self.multi_count = patches.multi_count
         self.count = int(patches.clusters.members.max()) + 1
         self.relaxation = relaxation
         self._allocate(patches, patches.clusters.transposed(self.count))
@@ -88,14 +86,14 @@ class ShapeMatching:
 
     def _allocate(self, patches: Patches, members: Clusters) -> None:
         row = np.repeat(np.arange(self.count), np.diff(members.offsets))
-        several = np.bincount(row, members.members < patches.several, minlength=self.count)
-        self.patch_start, self.shared_start, self.shared = fields_of(
+        multi = np.bincount(row, members.members < patches.multi_count, minlength=self.count)
+        self.patch_start, self.cluster_start, self.cluster_list = fields_of(
             patches.start, patches.clusters.offsets, patches.clusters.members
         )
-        self.member_start, self.member, self.several_end = fields_of(
-            members.offsets, members.members, members.offsets[:-1] + several.astype(np.int32)
+        self.member_start, self.member, self.multi_end = fields_of(
+            members.offsets, members.members, members.offsets[:-1] + multi.astype(np.int32)
         )
-        self.estimate = ti.Vector.field(4, ti.f32, self.body.count)
+        self.predicted = ti.Vector.field(4, ti.f32, self.body.count)
         self.goal = ti.Matrix.field(4, 4, ti.f32, self.patch_count)
         self.centre = ti.Vector.field(4, ti.f32, self.patch_count)
         self.moment = ti.Matrix.field(4, 4, ti.f32, self.patch_count)
@@ -106,8 +104,8 @@ class ShapeMatching:
         self.frame = ti.Matrix.field(4, 4, ti.f32, self.count)
 
     def _store_rest(self, patches: Patches) -> None:
-        shared, sizes = patches.shared, patches.sizes
-        # Of global relaxation's mean, over as many goals as any particle has, those that are not there are no way.
+        shared, sizes = patches.cluster_counts, patches.sizes
+        # Global relaxation divides by the largest number of goals; the goals that a particle lacks are no displacement.
         share, goals = 1.0 / shared, shared
         if self.relaxation == "global":
             share, goals = np.ones(len(shared)), np.full(len(shared), shared.max())
@@ -130,20 +128,20 @@ class ShapeMatching:
         )
 
     def counts(self) -> dict[str, int]:
-        """Particles, clusters, and memberships of the ones in the others."""
-        memberships = int(self.patches.sizes @ self.patches.shared)
+        """Particles, clusters, and memberships of particles in clusters."""
+        memberships = int(self.patches.sizes @ self.patches.cluster_counts)
         return dict(particles=self.body.count, clusters=self.count, memberships=memberships)
 
     @ti.func
     def begin(self, dt: float):
-        """Where masses are scaled they have just changed, and with them the centres."""
+        """Update masses and rest centres, where the masses are scaled: they have just changed."""
         if ti.static(self.body.mass_scaled):
-            self.weigh_patches()
-            self.weigh_clusters()
+            self.update_patch_masses()
+            self.update_cluster_masses()
 
     @ti.func
-    def weigh_patches(self):
-        """Masses and centres of the patches at rest, by the scaled masses of their particles."""
+    def update_patch_masses(self):
+        """Masses and rest centres of the patches, by the scaled masses of their particles."""
         for p in range(self.patch_count):
             first, last = self.patch_start[p], self.patch_start[p + 1]
             moment, mass = tm.vec4(0.0), 0.0
@@ -156,8 +154,8 @@ class ShapeMatching:
             self.patch_scale[p].y = 1.0 / mass
 
     @ti.func
-    def weigh_clusters(self):
-        """The same of the clusters, by their patches'."""
+    def update_cluster_masses(self):
+        """Masses and rest centres of the clusters, by their patches'."""
         for c in range(self.count):
             first, last = self.member_start[c], self.member_start[c + 1]
             origin = self.patch_rest[self.member[first]]
@@ -170,7 +168,7 @@ class ShapeMatching:
 
     @ti.func
     def project(self, stiffness: float, relaxation_factor: float, dt: float):
-        """One pass over all clusters on the estimates: fit them, then move particles to their goals."""
+        """One iteration over all clusters: fit them, then move the particles to their goals."""
         self.fit(False)
         self.average()
         self.move_to_goals(stiffness * relaxation_factor)
@@ -179,7 +177,7 @@ class ShapeMatching:
 
     @ti.func
     def gather(self):
-        """Take over the estimates, and note the patches that touch a shape."""
+        """Read the predicted positions, and mark the patches that touch a shape."""
         self.sum_patches()
         if ti.static(self.has_contacts):
             for p in range(self.patch_count):
@@ -190,30 +188,30 @@ class ShapeMatching:
 
     @ti.func
     def sum_patches(self):
-        """Centres and moments of the patches where the estimates are."""
-        for p in range(self.several):
+        """Centres and moments of the patches at the predicted positions."""
+        for p in range(self.multi_count):
             first, last = self.patch_start[p], self.patch_start[p + 1]
-            reference = four(self.body.estimate[first])
+            reference = four(self.body.predicted[first])
             sums = tm.mat4(0.0)
             for k in range(first, last):
-                estimate = four(self.body.estimate[k])
-                self.estimate[k] = estimate
-                sums += self.moment_of(k, estimate - reference)
+                predicted = four(self.body.predicted[k])
+                self.predicted[k] = predicted
+                sums += self.moment_of(k, predicted - reference)
             self.add_moment(p, reference, tm.mat4(0.0), sums)
-        for p in range(self.several, self.patch_count):
+        for p in range(self.multi_count, self.patch_count):
             k = self.patch_start[p]
-            self.estimate[k] = four(self.body.estimate[k])
-            self.centre[p] = self.estimate[k]
+            self.predicted[k] = four(self.body.predicted[k])
+            self.centre[p] = self.predicted[k]
 
     @ti.func
     def scatter(self):
-        """Give the estimates back."""
+        """Write the predicted positions."""
         for k in range(self.body.count):
-            self.body.estimate[k] = self.estimate[k].xyz
+            self.body.predicted[k] = self.predicted[k].xyz
 
     @ti.func
     def moment_of(self, k, moved):
-        """What particle k of the patches adds to its patch's moment (rows: columns of the moment) and sum (last row)."""
+        """Contribution of particle k, displaced by ``moved``, to its patch's moment (rows: columns of the moment) and sum (last row)."""
         if ti.static(self.body.mass_scaled):
             moved *= self.body.mass_scale[k]
         at = self.local[k]
@@ -221,7 +219,7 @@ class ShapeMatching:
 
     @ti.func
     def add_moment(self, p, centre, moment, sums):
-        """Centre and moment of patch p after its particles moved, by sums over how far: so float32 keeps its digits."""
+        """Centre and moment of patch p from sums over its particles' displacements, which keeps digits in float32."""
         scale, total = self.patch_scale[p], row(sums, 3)
         if ti.static(self.body.mass_scaled):
             sums -= (self.patch_rest[p] - self.patch_centre[p]).outer_product(total)
@@ -229,25 +227,25 @@ class ShapeMatching:
         self.centre[p] = centre + scale.y * total
 
     @ti.func
-    def fit(self, anew: ti.template()):
-        """Least-squares rigid frames of the clusters (Eq. 8), near to those before or ``anew``.
+    def fit(self, from_scratch: ti.template()):
+        """Least-squares rigid frames of the clusters (Eq. 8), from their last rotations or from scratch.
 
-        Apart from the sums, whose lengths no processor foresees, several rotations are found at a time.
+        A loop for the sums, whose lengths differ, and one for the rotations, so that the second is vectorised.
         """
         for c in range(self.count):
             first, last = self.member_start[c], self.member_start[c + 1]
             reference = self.centre[self.member[first]]
             centre0 = self.cluster_rest[c]
             x, y, z, total = tm.vec4(0.0), tm.vec4(0.0), tm.vec4(0.0), tm.vec4(0.0)
-            several = self.several_end[c]
-            for k in range(first, several):
+            multi_end = self.multi_end[c]
+            for k in range(first, multi_end):
                 moment = self.moment[self.member[k]]
                 at, moved = self.apart(self.member[k], centre0, reference)
                 x += row(moment, 0) + at.x * moved
                 y += row(moment, 1) + at.y * moved
                 z += row(moment, 2) + at.z * moved
                 total += moved
-            for k in range(several, last):
+            for k in range(multi_end, last):
                 at, moved = self.apart(self.member[k], centre0, reference)
                 x += at.x * moved
                 y += at.y * moved
@@ -257,7 +255,7 @@ class ShapeMatching:
         for c in range(self.count):
             fitted = self.sum[c]
             guess = tm.eye(3)
-            if ti.static(not anew):
+            if ti.static(not from_scratch):
                 guess = self.frame[c][:3, :3].transpose()
             rotation = rotation_near(guess, fitted[:3, :3].transpose())
             origin = fitted[3, :3] - rotation @ self.cluster_rest[c].xyz
@@ -268,25 +266,25 @@ class ShapeMatching:
 
     @ti.func
     def apart(self, p, centre0, reference):
-        """How far patch p's centre is from a cluster's at rest, and, times its mass, from a reference now."""
+        """Offset of patch p's centre from a cluster's at rest, and its offset from a reference now, times its mass."""
         rest = self.patch_rest[p]
         return rest - centre0, rest.w * (self.centre[p] - reference)
 
     @ti.func
     def average(self):
-        """The sum of the frames of each patch's clusters: the mean of R_c x0 + T_c is (mean R_c) x0 + mean T_c (Eq. 7)."""
+        """Averaged frame of each patch's clusters: the mean of R_c x0 + T_c is (mean R_c) x0 + mean T_c (Eq. 7)."""
         for p in range(self.patch_count):
             frame = tm.mat4(0.0)
-            for k in range(self.shared_start[p], self.shared_start[p + 1]):
-                frame += self.frame[self.shared[k]]
+            for k in range(self.cluster_start[p], self.cluster_start[p + 1]):
+                frame += self.frame[self.cluster_list[k]]
             x, y, z, centre = row(frame, 0), row(frame, 1), row(frame, 2), self.patch_centre[p]
             origin = row(frame, 3) + centre.x * x + centre.y * y + centre.z * z
             self.goal[p] = self.patch_scale[p].z * ti.Matrix.rows([x, y, z, origin])
 
     @ti.func
     def move_to_goals(self, step: float):
-        """Move each estimate by ``step`` times the averaged way to its goals (Eqs. 9 and 12)."""
-        for p in range(self.several):
+        """Move each predicted position by ``step`` times the averaged displacement to its goals (Eqs. 9 and 12)."""
+        for p in range(self.multi_count):
             keep = 1.0 - step * self.patch_scale[p].w
             frame = step * self.goal[p]
             x, y, z, origin = row(frame, 0), row(frame, 1), row(frame, 2), row(frame, 3)
@@ -294,36 +292,36 @@ class ShapeMatching:
             sums = tm.mat4(0.0)
             for k in range(self.patch_start[p], self.patch_start[p + 1]):
                 at = self.local[k]
-                estimate = keep * self.estimate[k] + at.x * x + at.y * y + at.z * z + origin
-                self.estimate[k] = estimate
-                sums += self.moment_of(k, estimate - reference)
+                predicted = keep * self.predicted[k] + at.x * x + at.y * y + at.z * z + origin
+                self.predicted[k] = predicted
+                sums += self.moment_of(k, predicted - reference)
             self.add_moment(p, reference, tm.mat4(0.0), sums)
-        for p in range(self.several, self.patch_count):
+        for p in range(self.multi_count, self.patch_count):
             k = self.patch_start[p]
             keep = 1.0 - step * self.patch_scale[p].w
-            self.estimate[k] = keep * self.estimate[k] + step * row(self.goal[p], 3)
-            self.centre[p] = self.estimate[k]
+            self.predicted[k] = keep * self.predicted[k] + step * row(self.goal[p], 3)
+            self.centre[p] = self.predicted[k]
 
     @ti.func
     def push_out(self, relaxation_factor: float):
-        """Particles that touch a shape are pushed out of it."""
+        """Push particles that touch a shape out of it."""
         for p in range(self.patch_count):
             if self.touched[p] > 0:
                 sums = tm.mat4(0.0)
                 for k in range(self.patch_start[p], self.patch_start[p + 1]):
                     if self.contacts.touched[k] > 0:
-                        estimate = self.estimate[k]
-                        change = four(self.contacts.pushed(k, estimate.xyz, relaxation_factor))
-                        self.estimate[k] = estimate + change
+                        predicted = self.predicted[k]
+                        change = four(self.contacts.pushed(k, predicted.xyz, relaxation_factor))
+                        self.predicted[k] = predicted + change
                         sums += self.moment_of(k, change)
                 moment = tm.mat4(0.0)
-                if p < self.several:
+                if p < self.multi_count:
                     moment = self.moment[p]
                 self.add_moment(p, self.centre[p], moment, sums)
 
     @ti.kernel
     def update_frames(self):
-        """Fit the frames to where the particles are now, for ``carry``; they do not depend on those before."""
+        """Fit the frames to the current positions, for ``carry``, independently of earlier frames."""
         if ti.static(self.serial):
             ti.loop_config(serialize=True)
             for _ in range(1):
@@ -337,9 +335,9 @@ class ShapeMatching:
         self.fit(True)
 
     def attach(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The up to four nearest clusters of points (n, 3) [mm] and their weights (Kavan 2014).
+        """The up to four nearest clusters of points (n, 3) [mm], and their weights (Kavan 2014).
 
-        Weights fall off with the inverse square of the distance from point to cluster origin and sum to 1.
+        Weights are proportional to the inverse squared distance from the cluster's origin, and sum to 1.
         """
         frames = min(MOST_FRAMES, self.count)
         distance, nearest = cKDTree(self.rest_centres).query(points, list(range(1, frames + 1)))
@@ -348,7 +346,7 @@ class ShapeMatching:
 
     @ti.kernel
     def carry(self, rest: ti.template(), frame: ti.template(), weight: ti.template(), out: ti.template()):
-        """Points carried by weighted frames (weighted matrix blending)."""
+        """Write the current positions of points by their weighted frames (weighted matrix blending)."""
         for v in rest:
             x = tm.vec4(0.0)
             for k in ti.static(range(frame.n)):
@@ -359,6 +357,6 @@ class ShapeMatching:
             out[v] = x.xyz
 
 
-def fill(organ: trimesh.Trimesh, tissue: Any) -> RestBody:
-    """The organ [mm] filled with a tissue's particles, which takes seconds. Raises SamplingError."""
+def fill_organ(organ: trimesh.Trimesh, tissue: Any) -> RestBody:
+    """The organ [mm] filled with a tissue's particles; takes seconds. Raises SamplingError."""
     return fill_body(organ, tissue.radius_mm, tissue.volume_sampling, tissue.surface_samples_per_mm2)

@@ -1,10 +1,9 @@
-"""Rigid shapes that particles touch: planes, signed distance fields, of closed surfaces too, and convex tools.
+"""Rigid shapes for contact: planes, signed distance fields, convex tools; and the time of impact with static shapes.
 
-Every shape answers ``surface(p)`` with the outward unit normal (x, y, z) and the signed distance (w) [mm] of
-the nearest surface, negative inside and ``FAR`` where the shape is out of reach, ``motion(p)`` with how far its
-material at p moved in this substep [mm], and ``is_beyond(p, distance)`` with whether it costs next to nothing to tell
-that p is farther than a distance [mm]. ``moves`` says whether it ever does; those that do not also answer ``room(p)`` with
-a distance [mm] which that of the surface from p is not under, however far it is, negative inside.
+Every shape has ``surface(p)``: outward unit normal (x, y, z) and signed distance (w) [mm] of the nearest surface, negative
+inside and ``FAR`` out of reach; ``motion(p)``: displacement of its material at p in this substep [mm]; ``is_beyond(p,
+distance)``: whether a quick test finds p farther away than a distance [mm]; and ``moves``: whether it can move. StaticShape shapes
+also have ``clearance(p)``: a lower bound of the distance [mm] of the surface from p at any distance, negative inside.
 """
 
 from itertools import combinations
@@ -13,20 +12,26 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from sim.distance_grid import distance_grid
 from sim.fields import field_of
+from sim.signed_distance import distance_grid
 
 FAR = 1e6
-HAIR = 1e-3
-HAIR_CELLS = 0.5
-# A grid of distances so fine is within 0.005 mm of a support on average, but for its sharp edges.
+# A point moved outside a half-space is this far outside [mm].
+OUTSIDE_MM = 1e-3
+OUTSIDE_GRID_CELLS = 0.5
+# Spacing of a distance grid: on average within 0.005 mm of a support's surface, except at sharp edges.
 GRID_MM = 1.0
 MOST_SUBSTEPS = 100
-Path = ti.types.ndarray(ti.f32, ndim=4)
+# A path ends this deep in a shape [mm], so that a body can slide along it; thinner shapes stop nothing fast.
+IMPACT_DEPTH_MM = 1.0
+# Each step of sphere tracing is as long as the clearance; only paths along a surface need many.
+TRACING_STEPS = 32
+LEAST_STEP_MM = 0.01
+Poses = ti.types.ndarray(ti.f32, ndim=4)
 
 
 @ti.data_oriented
-class Static:
+class StaticShape:
     """A shape that does not move."""
 
     moves = False
@@ -41,7 +46,7 @@ class Static:
 
 
 @ti.data_oriented
-class Plane(Static):
+class Plane(StaticShape):
     """Half-space below the points with normal . x = offset [mm]."""
 
     def __init__(self, normal: np.ndarray, offset_mm: float) -> None:
@@ -51,15 +56,15 @@ class Plane(Static):
 
     @ti.func
     def surface(self, p):
-        return tm.vec4(self.normal, self.room(p))
+        return tm.vec4(self.normal, self.clearance(p))
 
     @ti.func
-    def room(self, p):
+    def clearance(self, p):
         return self.normal.dot(p) - self.offset
 
 
 @ti.data_oriented
-class SignedDistanceField(Static):
+class SignedDistanceField(StaticShape):
     """Distances [mm] on a regular grid, negative inside, linear in between; out of reach beyond the grid.
 
     ``distance`` (nx, ny, nz); ``origin_mm`` (3,) is the centre of its first entry, ``spacing_mm`` (3,).
@@ -73,7 +78,7 @@ class SignedDistanceField(Static):
 
     @staticmethod
     def of_surface(vertices: np.ndarray, faces: np.ndarray, reach_mm: float) -> "SignedDistanceField":
-        """Distances as far as a reach around a closed surface of vertices (v, 3) [mm] and faces (f, 3)."""
+        """Distances up to ``reach_mm`` around a closed surface of vertices (v, 3) [mm] and faces (f, 3)."""
         distance, origin = distance_grid(vertices, faces, GRID_MM, reach_mm)
         return SignedDistanceField(distance, origin, np.full(3, GRID_MM))
 
@@ -85,7 +90,7 @@ class SignedDistanceField(Static):
         last = ti.Vector([self.shape[0] - 2, self.shape[1] - 2, self.shape[2] - 2])
         if (base >= 0).all() and (base <= last).all():
             t = at - base
-            # Along x first, then y, then z: values at the ends of what is left, and their differences.
+            # Interpolate along x, then y, then z: values at the remaining ends, and their differences.
             value, slope = ti.Matrix.zero(ti.f32, 2, 2), ti.Matrix.zero(ti.f32, 2, 2)
             for j, k in ti.static(ti.ndrange(2, 2)):
                 low = self.distance[base + ti.Vector([0, j, k])]
@@ -93,36 +98,36 @@ class SignedDistanceField(Static):
                 value[j, k] = low + t.x * slope[j, k]
             along_x, along_y = slope[0, :] + t.y * (slope[1, :] - slope[0, :]), value[1, :] - value[0, :]
             ends = value[0, :] + t.y * along_y
-            along = tm.vec3(mixed(along_x, t.z), mixed(along_y, t.z), ends[1] - ends[0])
+            along = tm.vec3(interpolated(along_x, t.z), interpolated(along_y, t.z), ends[1] - ends[0])
             gradient = along / self.spacing
             length = gradient.norm()
             if length > 1e-6:
-                result = tm.vec4(gradient / length, mixed(ends, t.z))
+                result = tm.vec4(gradient / length, interpolated(ends, t.z))
         return result
 
     @ti.func
-    def room(self, p):
+    def clearance(self, p):
         last = ti.Vector([self.shape[0] - 1, self.shape[1] - 1, self.shape[2] - 1])
         at = (p - self.origin) / self.spacing
         inside = tm.clamp(at, 0.0, ti.cast(last, ti.f32))
-        # Beyond the grid what counts is the way to it, and a hair into it.
+        # Outside the grid: the distance to it, and a little more to step into it.
         beyond = ((at - inside) * self.spacing).norm()
-        room = beyond + HAIR_CELLS * self.spacing.min()
+        clearance = beyond + OUTSIDE_GRID_CELLS * self.spacing.min()
         if beyond == 0.0:
             base = ti.min(ti.cast(inside, ti.i32), last - 1)
             t = inside - base
-            room = 0.0
+            clearance = 0.0
             for corner in ti.static(ti.grouped(ti.ndrange(2, 2, 2))):
                 weight = 1.0
                 for k in ti.static(range(3)):
                     weight *= t[k] if corner[k] == 1 else 1.0 - t[k]
-                room += weight * self.distance[base + corner]
-        return room
+                clearance += weight * self.distance[base + corner]
+        return clearance
 
 
 @ti.func
-def mixed(ends, t):
-    """Linear between two ends."""
+def interpolated(ends, t):
+    """Linear interpolation between two ends."""
     return ends[0] + t * (ends[1] - ends[0])
 
 
@@ -130,8 +135,8 @@ def mixed(ends, t):
 class ConvexTool:
     """A rigid tool that moves: the intersection of half-spaces normal . x <= offset in its own frame.
 
-    ``normals`` (k, 3) unit, ``offsets_mm`` (k,). ``move`` sets its pose at the start and end of a substep. With an
-    edge radius it is all that a ball of this radius covers which stays within the half-spaces.
+    ``normals`` (k, 3) unit, ``offsets_mm`` (k,). With an edge radius, it is the union of all balls of this radius inside
+    the half-spaces: edges and corners are rounded.
     """
 
     moves = True
@@ -139,10 +144,10 @@ class ConvexTool:
     def __init__(self, normals: np.ndarray, offsets_mm: np.ndarray, edge_radius_mm: float = 0.0) -> None:
         self.count = len(normals)
         self.edge_radius = float(edge_radius_mm)
-        # The half-spaces of the core, in which the ball's centre stays.
+        # The half-spaces of the balls' centres.
         core = np.column_stack([normals, np.asarray(offsets_mm, float) - self.edge_radius])
         self.half_space = field_of(core, 1)
-        self.ball_mm = self.edge_radius + _farthest(core)
+        self.ball_mm = self.edge_radius + _farthest_vertex(core)
         self.pose = ti.Matrix.field(4, 4, ti.f32, ())
         self.step_back = ti.Matrix.field(4, 4, ti.f32, ())
         self.path = ti.Matrix.field(4, 4, ti.f32, (MOST_SUBSTEPS, 2))
@@ -150,9 +155,9 @@ class ConvexTool:
 
     @staticmethod
     def cuboid(size_mm: np.ndarray, edge_radius_mm: float = 0.0) -> "ConvexTool":
-        """Three parallel pairs of orthogonal half-spaces about the origin (the paper's transducer).
+        """A cuboid of ``size_mm`` (3,) about the origin (the paper's transducer), its edges rounded.
 
-        Edges and corners are rounded inside ``size_mm`` (3,). Raises ValueError where the size leaves no room for that.
+        Raises ValueError for an edge radius larger than half of the smallest side.
         """
         half = np.asarray(size_mm, float) / 2
         if not 0 <= edge_radius_mm <= half.min():
@@ -161,9 +166,9 @@ class ConvexTool:
         return ConvexTool(np.concatenate([np.eye(3), -np.eye(3)]), offsets, edge_radius_mm)
 
     def follow(self, poses: np.ndarray) -> None:
-        """Poses (substeps + 1, 4, 4), world from tool [mm], at the start of a time step and at the end of each substep.
+        """Set the poses (substeps + 1, 4, 4), world from tool [mm], at the start of a time step and at the end of each substep.
 
-        Raises ValueError for more substeps than there is room for, and for poses that are no numbers.
+        Raises ValueError for more than MOST_SUBSTEPS substeps and for poses that are not finite.
         """
         if not 1 <= len(poses) - 1 <= MOST_SUBSTEPS:
             raise ValueError(f"{len(poses) - 1} substeps: expected 1 to {MOST_SUBSTEPS}")
@@ -174,34 +179,36 @@ class ConvexTool:
         self._store_path(np.stack([poses[1:], back], axis=1).astype(np.float32))
 
     def move(self, before: np.ndarray, now: np.ndarray) -> None:
-        """Poses (4, 4), world from tool [mm], at the start and at the end of the substep."""
+        """Set the poses (4, 4), world from tool [mm], at the start and at the end of the substep."""
         self.follow(np.stack([before, now]))
-        self._go()
+        self._start_substep()
 
     @ti.kernel
-    def _store_path(self, path: Path):
+    def _store_path(self, path: Poses):
         ti.loop_config(serialize=True)
         for leg in range(path.shape[0]):
             for k, i, j in ti.ndrange(2, 4, 4):
                 self.path[leg, k][i, j] = path[leg, k, i, j]
 
     @ti.kernel
-    def _go(self):
-        self.go(0)
+    def _start_substep(self):
+        self.start_substep(0)
 
     @ti.func
-    def go(self, substep):
-        """To the pose at the end of a substep."""
+    def start_substep(self, substep):
+        """Take the pose at the end of a substep."""
         self.pose[None] = self.path[substep, 0]
         self.step_back[None] = self.path[substep, 1]
 
     @ti.func
-    def way_out(self, p, k):
-        """The nearest point to p outside half-space k, which is out of the tool, and a hair more."""
+    def outside(self, p, k):
+        """The point nearest to p that is OUTSIDE_MM outside half-space k, and so outside the tool."""
         pose = self.pose[None]
         plane = self.half_space[k]
         local = pose[:3, :3].transpose() @ (p - pose[:3, 3])
-        return p + (plane.w + self.edge_radius - plane.xyz.dot(local) + HAIR) * (pose[:3, :3] @ plane.xyz)
+        return p + (plane.w + self.edge_radius - plane.xyz.dot(local) + OUTSIDE_MM) * (
+            pose[:3, :3] @ plane.xyz
+        )
 
     @ti.func
     def motion(self, p):
@@ -231,7 +238,7 @@ class ConvexTool:
             d = plane.xyz.dot(local) - plane.w
             if d > depth:
                 depth, normal = d, plane.xyz
-            # One sweep of projections is the nearest point of a cuboid, and of any tool near its faces.
+            # One projection on each half-space gives the nearest point of a cuboid, and of any tool near its faces.
             nearest -= ti.max(plane.xyz.dot(nearest) - plane.w, 0.0) * plane.xyz
         outward = local - nearest
         distance = outward.norm()
@@ -240,8 +247,38 @@ class ConvexTool:
         return tm.vec4(rotation @ normal, depth - self.edge_radius)
 
 
-def _farthest(half_spaces: np.ndarray) -> float:
-    """How far [mm] the intersection of half-spaces (k, 4), normal and offset, reaches from the origin: to a vertex."""
+@ti.data_oriented
+class TimeOfImpact:
+    """Time of impact with the static shapes, as a fraction of a path, by sphere tracing (Hart 1996)."""
+
+    def __init__(self, shapes: list) -> None:
+        self.shapes = [shape for shape in shapes if not shape.moves]
+
+    @ti.func
+    def fraction(self, start, path, free: float):
+        """Fraction of a path [mm] from a start up to the first shape; 1 for paths not longer than ``free`` [mm]."""
+        length = path.norm()
+        fraction = 1.0
+        if length > free:
+            travelled = 0.0
+            for _ in range(TRACING_STEPS):
+                if travelled < length:
+                    step = self.clearance(start + travelled / length * path) + IMPACT_DEPTH_MM
+                    travelled += step if step > LEAST_STEP_MM else 0.0
+            fraction = ti.min(1.0, ti.max(travelled, free) / length)
+        return fraction
+
+    @ti.func
+    def clearance(self, p):
+        """Lower bound of the distance [mm] from p to the nearest shape."""
+        clearance = FAR
+        for s in ti.static(range(len(self.shapes))):
+            clearance = ti.min(clearance, self.shapes[s].clearance(p))
+        return clearance
+
+
+def _farthest_vertex(half_spaces: np.ndarray) -> float:
+    """Distance [mm] from the origin of the farthest vertex of an intersection of half-spaces (k, 4), normal and offset."""
     triples = np.array(list(combinations(half_spaces, 3)))
     crossing = triples[np.abs(np.linalg.det(triples[:, :, :3])) > 1e-9]
     vertex = np.linalg.solve(crossing[:, :, :3], crossing[:, :, 3:])[:, :, 0]

@@ -1,4 +1,4 @@
-"""Points carried by the body through its tissue model: surfaces, fiducials, embedding vertices."""
+"""Skinning: points that move with a tissue model, such as surfaces, beads and the vertices of the embedding."""
 
 import numpy as np
 import taichi as ti
@@ -11,7 +11,7 @@ from sim.tissue_model import TissueModel
 class Skin:
     """Points (n, 3) [mm] attached to a tissue model's frames (the paper's "skinning").
 
-    ``vertices`` (n,) holds where the points are since the last ``update``.
+    ``vertices`` (n,): positions [mm] at the last ``update``.
     """
 
     def __init__(self, model: TissueModel, points: np.ndarray) -> None:
@@ -23,5 +23,5 @@ class Skin:
         self.update()
 
     def update(self) -> None:
-        """Carry the points to where the model's frames are now."""
+        """Move the points with the model's current frames."""
         self.model.carry(self.rest, self.frame, self.weight, self.vertices)

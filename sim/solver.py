@@ -1,4 +1,4 @@
-"""One time step of the paper's Algorithm 1; line numbers in the comments are those of its listing."""
+"""A time step: the paper's Algorithm 1. Line numbers in docstrings and comments are those of its listing."""
 
 from dataclasses import dataclass
 from math import isfinite
@@ -9,11 +9,11 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import BodyState
-from sim.self_contact import ParticleContacts
+from sim.self_contact import SelfContacts
 from sim.shapes import MOST_SUBSTEPS, ConvexTool
 from sim.tissue_model import TissueModel
 
-# What a step can be told, least and most; more substeps than that have no room on the device.
+# Smallest and largest allowed values of a step's settings.
 RANGES = {
     "stiffness": (0.0, 1.0),
     "time_step_s": (1e-6, 10.0),
@@ -23,16 +23,16 @@ RANGES = {
     "relaxation_factor": (0.0, 2.0),
     "damping": (0.0, 1e6),
 }
-# Far from the origin the scaled masses must still have room in float32.
+# Keeps scaled masses far from the origin finite in float32.
 MOST_EXPONENT = 30.0
 
 
 @dataclass
 class StepSettings:
-    """What a step may be told anew each time; the defaults are the paper's Table 1, which leaves the stiffness open.
+    """Settings of a step; the defaults are the paper's Table 1, except the stiffness, which it does not give.
 
-    ``stiffness`` is alpha of Eq. 12, ``relaxation_factor`` is w of Eq. 7, ``gravity`` (3,) is in mm/s^2,
-    ``damping`` [1/s] is the rate at which velocities decay.
+    ``stiffness`` is alpha of Eq. 12, ``relaxation_factor`` is w of Eq. 7 (successive over-relaxation), ``gravity`` (3,) is in
+    mm/s^2, ``damping`` [1/s] is the rate at which velocities decay.
     """
 
     stiffness: float = 0.95
@@ -45,7 +45,7 @@ class StepSettings:
     gravity: tuple[float, float, float] = (0.0, 0.0, -9810.0)
 
     def check(self) -> None:
-        """Raises ValueError for what no step can be computed with, and names it."""
+        """Raise ValueError that names the setting which is out of range."""
         for name, (least, most) in RANGES.items():
             value = getattr(self, name)
             if not least <= value <= most:
@@ -56,7 +56,7 @@ class StepSettings:
 
 @dataclass(frozen=True)
 class SolverState:
-    """All that steps change: the body's state and what its contacts remember."""
+    """All that steps change: the state of the body and of its contacts."""
 
     body: BodyState
     contacts: dict[str, np.ndarray]
@@ -64,32 +64,32 @@ class SolverState:
 
 @ti.data_oriented
 class Solver:
-    """Steps one body with its tissue model, that one's contacts with shapes, contacts of pairs of particles and a moving tool.
+    """Steps one body with its tissue model and contacts with shapes, and optionally self-contact and a moving tool.
 
-    What is None does not exist: no kernel is compiled and no memory taken for it.
+    For what is None no kernel is compiled and no memory taken.
     """
 
     def __init__(
         self,
         model: TissueModel,
-        pairs: ParticleContacts | None = None,
+        self_contacts: SelfContacts | None = None,
         tool: ConvexTool | None = None,
     ) -> None:
         self.body: Any = model.body
         self.model = model
         self.contacts: Any = model.contacts
-        self.pairs = pairs
+        self.self_contacts = self_contacts
         self.tool = tool
         self.has_tool = tool is not None
         self.has_contacts = model.contacts is not None
-        self.has_pairs = pairs is not None
+        self.has_self_contacts = self_contacts is not None
 
     def step(self, settings: StepSettings, tool_poses: np.ndarray | None = None) -> None:
         """Advance by one time step.
 
-        ``tool_poses`` (substeps + 1, 4, 4), world from tool [mm], are the tool's poses at the start of the step
-        and at the end of each substep; without them it stays where it is. Raises ValueError for settings and poses that
-        no step can be computed with, before anything has moved.
+        ``tool_poses`` (substeps + 1, 4, 4), world from tool [mm], are the tool's poses at the start of the step and at the
+        end of each substep; without them the tool does not move. Raises ValueError for settings out of range and poses that
+        are not finite, before anything has moved.
         """
         settings.check()
         dt = settings.time_step_s / settings.substeps
@@ -97,7 +97,7 @@ class Solver:
             still = np.stack([self.tool.last_pose] * (settings.substeps + 1))
             self.tool.follow(still if tool_poses is None else tool_poses)
         if self.model.serial:
-            # Three numbers: a vector would take three times as long to hand over.
+            # Gravity as three numbers: passing a vector to a kernel takes three times as long.
             self.advance(
                 dt,
                 *settings.gravity,
@@ -110,24 +110,22 @@ class Solver:
             )
         else:
             for substep in range(settings.substeps):
-                self._launch_substep(substep, dt, settings)
-        # The very kernel that follows a restored state: another one may round in another way.
+                self.launch_start(
+                    substep, dt, *settings.gravity, settings.damping, settings.stabilisation_iterations
+                )
+                for iteration in range(settings.iterations):
+                    factor = relaxation_at(iteration, settings.iterations, settings.relaxation_factor)
+                    self.launch_correct(settings.stiffness, factor, dt)
+                self.launch_finish(dt)
+        # The same kernel as in ``restore``: another one may round differently.
         self.model.update_frames()
-
-    def _launch_substep(self, substep: int, dt: float, settings: StepSettings) -> None:
-        """A substep as many kernels, whose loops run in parallel."""
-        self.launch_start(substep, dt, *settings.gravity, settings.damping, settings.stabilisation_iterations)
-        for iteration in range(settings.iterations):
-            factor = last_exact(iteration, settings.iterations, settings.relaxation_factor)
-            self.launch_correct(settings.stiffness, factor, dt)
-        self.launch_finish(dt)
 
     def snapshot(self) -> SolverState:
         """A copy of the current state."""
         return SolverState(self.body.snapshot(), self.contacts.snapshot() if self.contacts else {})
 
     def restore(self, state: SolverState) -> None:
-        """Go back to a state; the steps that follow give the same bits as they did from it before."""
+        """Restore a state; the steps that follow give the same bits as they did from it before."""
         self.body.restore(state.body)
         if self.contacts:
             self.contacts.restore(state.contacts)
@@ -147,13 +145,13 @@ class Solver:
         stiffness: float,
         relaxation_factor: float,
     ):
-        """A step as one kernel on one core, for bodies so small that starting threads costs more than they save."""
+        """A step as one kernel on one core, for bodies so small that starting threads takes longer than they save."""
         ti.loop_config(serialize=True)
         for substep in range(substeps):
             gravity = tm.vec3(gravity_x, gravity_y, gravity_z)
             self.start(substep, dt, gravity, damping, stabilisation_iterations)
             for iteration in range(iterations):
-                factor = last_exact(iteration, iterations, relaxation_factor)
+                factor = relaxation_at(iteration, iterations, relaxation_factor)
                 self.correct(stiffness, factor, dt)
             self.finish(dt)
 
@@ -168,30 +166,30 @@ class Solver:
         damping: float,
         stabilisation_iterations: int,
     ):
-        """``start`` as a kernel of its own."""
+        """``start`` as a kernel."""
         gravity = tm.vec3(gravity_x, gravity_y, gravity_z)
         self.start(substep, dt, gravity, damping, stabilisation_iterations)
 
     @ti.kernel
     def launch_correct(self, stiffness: float, relaxation_factor: float, dt: float):
-        """``correct`` as a kernel of its own."""
+        """``correct`` as a kernel."""
         self.correct(stiffness, relaxation_factor, dt)
 
     @ti.kernel
     def launch_finish(self, dt: float):
-        """``finish`` as a kernel of its own."""
+        """``finish`` as a kernel."""
         self.finish(dt)
 
     @ti.func
     def start(self, substep, dt: float, gravity: tm.vec3, damping: float, stabilisation_iterations: int):
-        """Lines 1-15: where the particles would go, what they may touch, and out of what they start in."""
+        """Lines 1-15: prediction, search for contacts, and stabilisation of contacts violated at the start."""
         if ti.static(self.has_tool):
             for _ in range(1):
-                self.tool.go(substep)
+                self.tool.start_substep(substep)
         self.predict(dt, gravity, damping)
         self.model.begin(dt)
-        if ti.static(self.has_pairs):
-            self.pairs.find()  # line 7
+        if ti.static(self.has_self_contacts):
+            self.self_contacts.find()  # line 7
         if ti.static(self.has_contacts):
             self.contacts.find()  # line 8
             self.contacts.stabilise(stabilisation_iterations)
@@ -199,44 +197,44 @@ class Solver:
 
     @ti.func
     def predict(self, dt: float, gravity: tm.vec3, damping: float):
-        """Lines 1-5: estimates, and scaled masses where there are any."""
+        """Lines 1-5: predicted positions, and scaled masses if the body has them."""
         decay = ti.exp(-damping * dt)
         for i in range(self.body.count):
-            # Gravity does not decay, or a body at rest would weigh less.
+            # Damping does not apply to gravity, or a body at rest would weigh less.
             velocity = self.body.velocity[i] * decay + dt * gravity
-            self.body.estimate[i] = self.body.position[i] + dt * velocity
+            self.body.predicted[i] = self.body.position[i] + dt * velocity
             if ti.static(self.body.mass_scaled):  # line 4, with the height against gravity
-                height = -gravity.dot(self.body.estimate[i]) / ti.max(gravity.norm(), 1e-12)
+                height = -gravity.dot(self.body.predicted[i]) / ti.max(gravity.norm(), 1e-12)
                 exponent = tm.clamp(self.body.mass_scaling_per_mm * height, -MOST_EXPONENT, MOST_EXPONENT)
                 self.body.mass_scale[i] = ti.exp(-exponent)
 
     @ti.func
     def correct(self, stiffness: float, relaxation_factor: float, dt: float):
-        """Lines 17-21: one iteration, group by group."""
+        """Lines 17-21: one iteration over all groups of constraints."""
         self.model.project(stiffness, relaxation_factor, dt)
-        if ti.static(self.has_pairs):
+        if ti.static(self.has_self_contacts):
             self.model.scatter()
-            self.pairs.project(relaxation_factor)
+            self.self_contacts.project(relaxation_factor)
             self.model.gather()
 
     @ti.func
     def finish(self, dt: float):
-        """Lines 23-26: velocities, and where the particles are."""
+        """Lines 23-26: velocities and positions from the predicted positions."""
         self.model.scatter()
         if ti.static(self.has_contacts):
             self.contacts.finish()
-        self.settle(dt)
+        self.update_velocities(dt)
 
     @ti.func
-    def settle(self, dt: float):
+    def update_velocities(self, dt: float):
         """Lines 24 and 25."""
         for i in range(self.body.count):
-            x = self.body.estimate[i]
+            x = self.body.predicted[i]
             self.body.velocity[i] = (x - self.body.position[i]) / dt
             self.body.position[i] = x
 
 
 @ti.pyfunc
-def last_exact(iteration: int, iterations: int, relaxation_factor: float) -> float:
-    """The relaxation factor of an iteration: an overshoot left by the last would be taken for velocity in line 24, and grow."""
+def relaxation_at(iteration: int, iterations: int, relaxation_factor: float) -> float:
+    """Relaxation factor of an iteration, 1 in the last: line 24 would turn its overshoot into velocity, which would grow."""
     return relaxation_factor if iteration < iterations - 1 else 1.0

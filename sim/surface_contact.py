@@ -1,8 +1,8 @@
-"""Contacts of a body's surface with shapes: a stiff layer on points of the surface, with Coulomb friction.
+"""Contacts of a body's surface with shapes: the penalty method at points of the surface, with Coulomb friction.
 
-The tissue model solves them together with its own forces (``push``), so that where it comes to rest both are in
-balance, however few iterations it was given. Laws as in finite elements: pressure = depth x stiffness, friction by
-an elastic stick that slides at the coefficient times the pressure (Wriggers 2006, ch. 5 and 10).
+The tissue model solves them together with its own forces (``node_force``), so that both are in equilibrium at rest, however
+few iterations a step has. The laws are those of finite elements: pressure = depth x penalty stiffness, and friction
+with elastic tangential slip, limited by the coefficient times the pressure (Wriggers 2006, ch. 5 and 10).
 """
 
 import numpy as np
@@ -12,27 +12,27 @@ import taichi.math as tm
 from sim.body import Body
 from sim.fields import array_of, fields_of, fill
 from sim.lattice import Lattice
-from sim.shapes import FAR
-from sim.time_of_impact import TimeOfImpact
+from sim.shapes import FAR, TimeOfImpact
 
-# A pressure as high as Young's modulus presses the surface this far into a shape.
-LAYER_MM = 0.05
-# Along a surface the layer is softer than into it by this factor.
-STICK = 0.5
-# A plane is kept until the point has moved this far; a shape of 4 mm radius leaves it by 0.003 mm there.
-FRESH_MM = 0.15
-# Points as far as this from a shape may touch it within the step.
+# Depth in a shape at which the contact pressure is Young's modulus.
+PENALTY_DEPTH_MM = 0.05
+# Tangential stiffness over normal stiffness.
+TANGENTIAL_RATIO = 0.5
+# A contact plane is reused until the point has moved this far; a shape of 4 mm radius is 0.003 mm off its plane there.
+REUSE_MM = 0.15
+# Points nearer than this to a shape may touch it within the step.
 NEAR_MM = 3.0
-# How far around a static shape its distances must be known [mm].
+# Distance around a static shape within which the distance to it must be known [mm].
 REACH_MM = 6.0
 
 
 @ti.data_oriented
 class SurfaceContacts:
-    """Points on the surface, each carried by 8 nodes, and what they touch; at most 31 shapes.
+    """Contact points on the surface, each interpolated from 8 nodes, and their contacts; at most 31 shapes.
 
-    point (p,): where they are [mm]. plane (shapes, p): normal and offset of n . x >= offset [mm]. stick (shapes, p):
-    how far the elastic stick is bent [mm]. near (p,): bits of the shapes that are. ``stiffness`` [kPa/mm] of the layer.
+    point (p,): current positions [mm]. plane (shapes, p): normal and offset of n . x >= offset [mm]. slip (shapes, p): elastic
+    tangential slip [mm]. near (p,): bits of the shapes that are near. found (shapes, p): point and distance [mm] of the last
+    distance query. ``stiffness`` [kPa/mm]: penalty stiffness.
     """
 
     def __init__(
@@ -46,45 +46,47 @@ class SurfaceContacts:
     ) -> None:
         self.body = body
         self.shapes = list(shapes)
-        self.free_way = TimeOfImpact(shapes)
+        self.time_of_impact = TimeOfImpact(shapes)
         self.friction = friction
-        self.rough = friction > 0
+        self.has_friction = friction > 0
         self.count = len(points)
         nodes, weights = lattice.interpolation(points)
         self.point = ti.Vector.field(3, ti.f32, self.count)
         self.start = ti.Vector.field(3, ti.f32, self.count)
         self.near = ti.field(ti.i32, self.count)
         self.node, self.weight = fields_of(nodes, weights, within=1)
-        self.area, self.listed_from, self.listed, self.listed_weight = fields_of(
+        self.area, self.node_start, self.node_point, self.node_weight = fields_of(
             area_mm2, *_by_node(nodes, weights, body.count)
         )
         self.plane = ti.Vector.field(4, ti.f32, (len(shapes), self.count))
         self.found = ti.Vector.field(4, ti.f32, (len(shapes), self.count))
-        if self.rough:
-            self.stick = ti.Vector.field(3, ti.f32, (len(shapes), self.count))
-        self.remembered = ("point", "near", "plane", "found") + ("stick",) * self.rough
+        self.state = dict(point=self.point, near=self.near, plane=self.plane, found=self.found)
+        if self.has_friction:
+            self.slip = ti.Vector.field(3, ti.f32, (len(shapes), self.count))
+            # The name in session files.
+            self.state["stick"] = self.slip
         self.stiffness = ti.field(ti.f32, ())
         self.penetration = ti.field(ti.f32, ())
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
-        """Drop what is known of distances and of friction, after the body was moved by another hand."""
+    def reset(self) -> None:
+        """Clear stored distances and friction; call it after other code has moved the body."""
         self.found.fill(-FAR)
         self.near.fill(0)
-        if self.rough:
-            self.stick.fill(0.0)
+        if self.has_friction:
+            self.slip.fill(0.0)
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """What it carries from step to step: friction, and the planes that were found."""
-        return {name: array_of(getattr(self, name)) for name in self.remembered}
+        """A copy of what persists from step to step: friction and contact planes."""
+        return {name: array_of(field) for name, field in self.state.items()}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Go back to a snapshot; the steps that follow give the same bits."""
-        fill(*((getattr(self, name), values) for name, values in state.items()))
+        """Restore a snapshot; the steps that follow give the same bits."""
+        fill(*((self.state[name], values) for name, values in state.items()))
 
     @ti.func
-    def carried(self, field: ti.template(), q):
-        """Where point q is when the nodes are at a field's positions."""
+    def interpolated(self, field: ti.template(), q):
+        """Position of point q for the nodes' positions in a field."""
         x = tm.vec3(0.0)
         for k in ti.static(range(8)):
             x += self.weight[q][k] * field[self.node[q][k]]
@@ -92,11 +94,11 @@ class SurfaceContacts:
 
     @ti.func
     def find(self):
-        """Lines 6-9: the plane of each shape that a point's estimate is near to."""
+        """Lines 6-9: the contact planes of the shapes that each point's predicted position is near to."""
         for q in range(self.count):
-            p = self.carried(self.body.estimate, q)
+            p = self.interpolated(self.body.predicted, q)
             self.point[q] = p
-            self.start[q] = self.carried(self.body.position, q)
+            self.start[q] = self.interpolated(self.body.position, q)
             near = 0
             for s in ti.static(range(len(self.shapes))):
                 if ti.static(self.shapes[s].moves) or not self.is_known(s, q, p):
@@ -108,127 +110,132 @@ class SurfaceContacts:
             self.near[q] = near
 
     @ti.func
-    def free_share(self, start, end):
-        """Share of a point's way that it can go until it meets a shape; ways within which shapes are found are free."""
-        return self.free_way.share(start, end - start, NEAR_MM)
+    def free_fraction(self, start, end):
+        """Fraction of a point's path that is free of shapes; 1 for paths so short that ``find`` sees the shapes."""
+        return self.time_of_impact.fraction(start, end - start, NEAR_MM)
 
     @ti.func
     def is_known(self, s: ti.template(), q, p):
-        """Whether what was last measured from point q to shape s still holds at p."""
+        """Whether the last distance query of point q to shape s is still valid at p."""
         known = self.found[s, q]
         moved = (p - known.xyz).norm()
-        return known.w - moved > NEAR_MM or (moved < FRESH_MM and known.w > -FAR)
+        return known.w - moved > NEAR_MM or (moved < REUSE_MM and known.w > -FAR)
 
     @ti.func
-    def touching(self, s: ti.template(), q):
-        """Depth [mm] of point q in shape s, 0 where it does not touch."""
+    def depth(self, s: ti.template(), q):
+        """Depth [mm] of point q in shape s, 0 without contact."""
         plane = self.plane[s, q]
         depth = ti.max(plane.w - plane.xyz.dot(self.point[q]), 0.0)
         return depth if (self.near[q] >> s) & 1 else 0.0
 
     @ti.func
-    def bent(self, s: ti.template(), q, depth):
-        """The stick of point q on shape s, sliding where it must (return mapping), and whether it holds."""
+    def tangential_slip(self, s: ti.template(), q, depth):
+        """Elastic slip of point q on shape s, limited by friction (return mapping), and the factor of the limit: 1 if it sticks."""
         normal = self.plane[s, q].xyz
         p = self.point[q]
-        stick = self.stick[s, q] + p - self.start[q] - self.shapes[s].motion(p)
-        stick -= stick.dot(normal) * normal
-        most = self.friction * depth / STICK
-        length = stick.norm()
-        share = most / ti.max(length, 1e-12)
-        return stick * ti.min(share, 1.0), ti.min(share, 1.0)
+        slip = self.slip[s, q] + p - self.start[q] - self.shapes[s].motion(p)
+        slip -= slip.dot(normal) * normal
+        most = self.friction * depth / TANGENTIAL_RATIO
+        length = slip.norm()
+        factor = most / ti.max(length, 1e-12)
+        return slip * ti.min(factor, 1.0), ti.min(factor, 1.0)
 
     @ti.func
-    def push(self, i):
+    def node_force(self, i):
         """Force [uN] of the shapes on node i, and its negative derivative (3, 3) by the node's position."""
         force, stiffness = tm.vec3(0.0), tm.mat3(0.0)
-        for k in range(self.listed_from[i], self.listed_from[i + 1]):
-            q = self.listed[k]
+        for k in range(self.node_start[i], self.node_start[i + 1]):
+            q = self.node_point[k]
             if self.near[q] > 0:
-                weight = self.listed_weight[k]
-                layer = weight * 1e3 * self.stiffness[None] * self.area[q]
+                weight = self.node_weight[k]
+                penalty = weight * 1e3 * self.stiffness[None] * self.area[q]
                 for s in ti.static(range(len(self.shapes))):
-                    depth = self.touching(s, q)
+                    depth = self.depth(s, q)
                     if depth > 0.0:
                         normal = self.plane[s, q].xyz
-                        force += layer * depth * normal
-                        along = 0.0
-                        if ti.static(self.rough):
-                            stick, holds = self.bent(s, q, depth)
-                            force -= layer * STICK * stick
-                            along = STICK * holds
+                        force += penalty * depth * normal
+                        tangential = 0.0
+                        if ti.static(self.has_friction):
+                            slip, factor = self.tangential_slip(s, q, depth)
+                            force -= penalty * TANGENTIAL_RATIO * slip
+                            tangential = TANGENTIAL_RATIO * factor
                         stiffness += (
                             weight
-                            * layer
-                            * ((1.0 - along) * normal.outer_product(normal) + along * tm.eye(3))
+                            * penalty
+                            * ((1.0 - tangential) * normal.outer_product(normal) + tangential * tm.eye(3))
                         )
         return force, stiffness
 
     @ti.func
-    def hold(self, q, p, pushing):
-        """Force [uN] on point q if it were at p, on the planes that the last substep knew, and its stiffness; where it is not
-        ``pushing``, no force, and the stiffness into and off the shapes alone.
+    def point_force(self, q, p, has_force):
+        """Force [uN] on point q if it were at p, with the contact planes of the last substep, and its stiffness (3, 3).
 
-        What slides resists by its friction over its way, which is more than the derivative: then Newton's steps converge.
+        Without ``has_force``: no force, and the normal stiffness alone. Sliding points resist by friction over slip, which is
+        more than the derivative: so Newton's method converges.
         """
         force, stiffness = tm.vec3(0.0), tm.mat3(0.0)
         if self.near[q] > 0:
-            layer = 1e3 * self.stiffness[None] * self.area[q]
+            penalty = 1e3 * self.stiffness[None] * self.area[q]
             for s in ti.static(range(len(self.shapes))):
                 plane = self.plane[s, q]
                 normal = plane.xyz
                 shift = p - self.shapes[s].motion(p)
                 depth = plane.w - normal.dot(shift)
                 if (self.near[q] >> s) & 1 and depth > 0.0:
-                    stiffness += layer * normal.outer_product(normal)
-                    if pushing:
-                        force += layer * depth * normal
-                        if ti.static(self.rough):
-                            stick = self.stick[s, q] + shift - self.point[q]
-                            stick -= stick.dot(normal) * normal
-                            length = ti.max(stick.norm(), 1e-12)
-                            share = ti.min(self.friction * depth / STICK / length, 1.0)
-                            force -= layer * STICK * share * stick
-                            stiffness += layer * STICK * share * (tm.eye(3) - normal.outer_product(normal))
+                    stiffness += penalty * normal.outer_product(normal)
+                    if has_force:
+                        force += penalty * depth * normal
+                        if ti.static(self.has_friction):
+                            slip = self.slip[s, q] + shift - self.point[q]
+                            slip -= slip.dot(normal) * normal
+                            length = ti.max(slip.norm(), 1e-12)
+                            factor = ti.min(self.friction * depth / TANGENTIAL_RATIO / length, 1.0)
+                            force -= penalty * TANGENTIAL_RATIO * factor * slip
+                            stiffness += (
+                                penalty
+                                * TANGENTIAL_RATIO
+                                * factor
+                                * (tm.eye(3) - normal.outer_product(normal))
+                            )
         return force, stiffness
 
     @ti.func
     def follow(self, i, change):
-        """Carry the points of node i along when it moves. Nodes of one colour have no point in common."""
-        for k in range(self.listed_from[i], self.listed_from[i + 1]):
-            q = self.listed[k]
-            self.point[q] = self.point[q] + self.listed_weight[k] * change
+        """Move the points of node i with it. Nodes of one colour have no point in common."""
+        for k in range(self.node_start[i], self.node_start[i + 1]):
+            q = self.node_point[k]
+            self.point[q] = self.point[q] + self.node_weight[k] * change
 
     @ti.func
     def stabilise(self, iterations: int):
-        """Nothing to do: what starts inside a shape is pushed out by the layer's force."""
+        """Nothing to do: the penalty force pushes out what starts inside a shape."""
 
     @ti.func
     def finish(self):
-        """End of a substep: how far the sticks are bent is remembered."""
-        if ti.static(self.rough):
+        """End of a substep: store the tangential slip."""
+        if ti.static(self.has_friction):
             for q in range(self.count):
                 for s in ti.static(range(len(self.shapes))):
-                    stick = tm.vec3(0.0)
-                    depth = self.touching(s, q)
+                    slip = tm.vec3(0.0)
+                    depth = self.depth(s, q)
                     if depth > 0.0:
-                        stick, _ = self.bent(s, q, depth)
-                    self.stick[s, q] = stick
+                        slip, _ = self.tangential_slip(s, q, depth)
+                    self.slip[s, q] = slip
 
     @ti.kernel
     def measure_penetration(self) -> float:
-        """Deepest a point of the surface lies inside a shape at the moment [mm], 0 where none does."""
+        """Largest depth [mm] of a point of the surface in a shape, 0 without penetration."""
         self.penetration[None] = 0.0
         for q in range(self.count):
-            p = self.carried(self.body.position, q)
+            p = self.interpolated(self.body.position, q)
             for s in ti.static(range(len(self.shapes))):
-                # The maximum of numbers does not depend on the order, so this atomic keeps runs alike.
+                # A maximum does not depend on the order, so this atomic is deterministic.
                 ti.atomic_max(self.penetration[None], -self.shapes[s].surface(p).w)
         return self.penetration[None]
 
 
 def _by_node(nodes: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (n, 8) by their nodes: where each node's points begin in a list, that list, and their weights in it."""
+    """Nodes (p, 8) of points, transposed: start of each node's points in a list (count + 1,), that list, and their weights."""
     order = np.argsort(nodes.ravel(), kind="stable")
-    begins = np.searchsorted(nodes.ravel()[order], np.arange(count + 1))
-    return begins, order // 8, weights.ravel()[order]
+    start = np.searchsorted(nodes.ravel()[order], np.arange(count + 1))
+    return start, order // 8, weights.ravel()[order]

@@ -1,6 +1,6 @@
-"""What a tissue model is: the interface that solver, contacts, skin and embedding know, and nothing else of it.
+"""The interface of a tissue model: all that solver, contacts, skin and embedding know of it.
 
-How another one is added is in docs/adding-a-tissue-model.md.
+docs/adding-a-tissue-model.md shows how to add one.
 """
 
 from dataclasses import dataclass
@@ -17,59 +17,60 @@ from sim.surface_contact import SurfaceContacts
 
 @dataclass(frozen=True)
 class FixedRegion:
-    """Tissue that stays where it is: all within a distance [mm] of a place (3,) [mm]."""
+    """Tissue that cannot move (Dirichlet boundary): all within a distance [mm] of a point (3,) [mm]."""
 
     at_mm: np.ndarray
     radius_mm: float
 
     def nodes(self, nodes: np.ndarray) -> np.ndarray:
-        """Which nodes (n, 3) are held. Raises SamplingError where there are none, or where all are."""
-        apart = np.linalg.norm(nodes - self.at_mm, axis=1)
-        held = apart <= self.radius_mm
-        if held.all() or not held.any():
+        """Mask (n,) of the nodes (n, 3) that are fixed. Raises SamplingError where it is none or all of them."""
+        distance = np.linalg.norm(nodes - self.at_mm, axis=1)
+        fixed = distance <= self.radius_mm
+        if fixed.all() or not fixed.any():
             raise SamplingError(
-                f"attachment.radius_mm = {self.radius_mm:g} holds {'all' if held.all() else 'none'} of the organ, which lies "
-                f"{apart.min():.1f} to {apart.max():.1f} mm from attachment.at_mm: choose another radius or place"
+                f"attachment.radius_mm = {self.radius_mm:g} fixes {'all' if fixed.all() else 'none'} of the organ, which is "
+                f"{distance.min():.1f} to {distance.max():.1f} mm from attachment.at_mm: choose another radius or point"
             )
-        return held
+        return fixed
 
 
 @dataclass(frozen=True)
 class ModelInputs:
-    """What a tissue model is made of: an organ [mm] among shapes, and all that a scene says of the tissue.
+    """What a tissue model is made from: an organ [mm], the shapes around it, and the scene's settings of the tissue.
 
-    ``organ`` is a closed surface, or what the model itself takes in its stead; ``tissue`` has the model's parameters by the names
-    of its section; ``friction`` is Coulomb's coefficient on shapes. ``serial`` says whether a step is one kernel on one core; left
-    open, size and machine decide. ``relaxation`` and ``mass_scaling_per_mm`` are shape matching's.
+    ``organ`` is a closed surface, or what the model itself accepts instead; ``tissue`` has the model's parameters by the names
+    of its section; ``friction`` is Coulomb's coefficient on shapes. ``serial``: run a step as one kernel on one core; None
+    decides by size and machine. ``relaxation`` and ``mass_scaling_per_mm`` are for shape matching.
     """
 
     organ: Any
     tissue: Any
     shapes: list
     friction: float
-    held: FixedRegion | None
+    fixed: FixedRegion | None
     serial: bool | None
     relaxation: str
     mass_scaling_per_mm: float
 
 
 class TissueModel(Protocol):
-    """Rest data, a projection of its constraints on the body's estimates, and a way to carry points along.
+    """Rest state, projection of the constraints on the predicted positions, and interpolation of points in the tissue.
 
-    One file a model. ``serial`` says that it is too small for more than one core of a CPU. The coarse tetrahedra that carry the
-    image plane are ``EMBEDDING_SIZES`` sizes of the tissue wide. ``begin`` to ``project`` are ti.funcs that the solver's kernels inline, so their outermost loops are parallel.
+    ``serial``: the model is too small for more than one core of a CPU. ``EMBEDDING_CELL_RATIO``: width of the coarse tetrahedra
+    that carry the image plane, over the resolution of the tissue. ``begin`` to ``project`` are ti.funcs that the solver's
+    kernels inline, so their outermost loops are parallel.
     """
 
-    EMBEDDING_SIZES: ClassVar[float]
+    EMBEDDING_CELL_RATIO: ClassVar[float]
 
     @classmethod
-    def make(cls, parts: ModelInputs) -> "TissueModel":
+    def make(cls, inputs: ModelInputs) -> "TissueModel":
         """The organ at rest, with its contacts. Raises SamplingError."""
         ...
 
     @staticmethod
     def reach_mm(tissue: Any) -> float:
-        """How far around a shape that does not move a tissue asks for its distance [mm]."""
+        """Distance [mm] around a static shape within which the model needs to know the distance to it."""
         ...
 
     @property
@@ -82,35 +83,35 @@ class TissueModel(Protocol):
     def serial(self) -> bool: ...
 
     def begin(self, dt: float) -> None:
-        """Once a substep [s], when the solver has predicted the estimates."""
+        """Called once a substep [s], after the solver's prediction."""
 
     def gather(self) -> None:
-        """Before passes, when something else has moved the estimates."""
+        """Read the body's predicted positions. Called before iterations, when other code has changed them."""
 
     def scatter(self) -> None:
-        """After passes, when something else needs the estimates."""
+        """Write the body's predicted positions. Called after iterations, when other code needs them."""
 
     def project(self, stiffness: float, relaxation_factor: float, dt: float) -> None:
-        """One pass over all constraints, those of contact with shapes too."""
+        """One iteration over all constraints, contacts with shapes included."""
 
     def update_frames(self) -> None:
-        """Once a step, when positions are final, for ``carry``."""
+        """Prepare ``carry``. Called once a step, when positions are final."""
 
     def attach(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Frames (n, k) and weights (n, k) of rest points (n, 3) [mm], for ``carry``."""
         ...
 
     def carry(self, rest: ti.Field, frame: ti.Field, weight: ti.Field, out: ti.Field) -> None:
-        """Where attached points are now."""
+        """Write the current positions of attached points."""
 
     def counts(self) -> dict[str, int]:
-        """Its size, for reports: ``particles`` or ``nodes`` first."""
+        """Sizes of the model, for reports: ``particles`` or ``nodes`` first."""
         ...
 
 
 @runtime_checkable
 class MaterialModel(Protocol):
-    """A tissue model of a material, which can be changed between steps."""
+    """A tissue model whose material can be changed between steps."""
 
     def set_young(self, young_kpa: float) -> None:
         """Change Young's modulus [kPa]."""

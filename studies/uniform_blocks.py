@@ -3,11 +3,11 @@
 import numpy as np
 import trimesh
 
-from sim.body import Body, ParticleBody, RestBody
+from sim.body import Body, ParticleBody
 from sim.lattice import fill_block, surface_points
 from sim.neo_hookean import NeoHookean
 from sim.particle_contact import ShapeContacts
-from sim.particle_patches import arrange
+from sim.sampling import RestBody, group_into_patches
 from sim.shape_matching import ShapeMatching
 from sim.shapes import ConvexTool
 from sim.solver import Solver
@@ -31,7 +31,7 @@ def block_of_particles(
 ) -> Solver:
     """Particles at points (n, 3), a radius apart from each other, among shapes, the tool among them."""
     rest = RestBody(points_mm, radius_mm, np.full(len(points_mm), radius_mm / 2))
-    arranged, patches = arrange(rest, CLUSTER_SPACING)
+    arranged, patches = group_into_patches(rest, CLUSTER_SPACING)
     body = ParticleBody(arranged)
     contacts = ShapeContacts(body, shapes, FRICTION)
     return Solver(ShapeMatching(body, patches, contacts), tool=tool)

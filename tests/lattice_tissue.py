@@ -6,7 +6,7 @@ import trimesh
 from sim.body import Body, BodyState
 from sim.fields import array_of
 from sim.lattice import Lattice, fill_with_cells, surface_points
-from sim.neo_hookean import HOURGLASS, LATTICE_SETTINGS, LEAST_J, NeoHookean
+from sim.neo_hookean import HOURGLASS_STIFFNESS, LATTICE_SETTINGS, LEAST_J, NeoHookean
 from sim.shapes import ConvexTool
 from sim.solver import Solver, StepSettings
 from sim.surface_contact import SurfaceContacts
@@ -28,17 +28,17 @@ def tissue_of(
     shapes: list = (),
     friction: float = 0.0,
     poisson: float = 0.45,
-    held=None,
+    fixed=None,
 ) -> Solver:
-    """A solver of a closed surface [mm] among shapes; ``held`` tells of nodes (n, 3) which are."""
+    """A solver of a closed surface [mm] among shapes; ``fixed`` takes nodes (n, 3) and returns the mask of the fixed ones."""
     lattice = fill_with_cells(mesh, cell_mm)
     body = Body(lattice.nodes)
     contacts = None
     if shapes:
         points, area = surface_points(mesh, cell_mm / 2)
         contacts = SurfaceContacts(body, lattice, points, area, shapes, friction)
-    held = None if held is None else held(lattice.nodes)
-    model = NeoHookean(body, lattice, contacts, YOUNG_KPA, poisson, 1e3 * DENSITY, held)
+    fixed = None if fixed is None else fixed(lattice.nodes)
+    model = NeoHookean(body, lattice, contacts, YOUNG_KPA, poisson, 1e3 * DENSITY, fixed)
     return Solver(model, tool=next((s for s in shapes if isinstance(s, ConvexTool)), None))
 
 
@@ -63,7 +63,7 @@ def jacobians(lattice: Lattice, x: np.ndarray) -> np.ndarray:
     return np.linalg.det(np.einsum("mia,mib->mab", x[lattice.cells], lattice.gradient))
 
 
-def lame_of(poisson: float) -> tuple[float, float]:
+def lame_parameters(poisson: float) -> tuple[float, float]:
     """Shear modulus and Lame's first parameter [g/(mm s^2)]."""
     return 1e3 * YOUNG_KPA / (2 * (1 + poisson)), 1e3 * YOUNG_KPA * poisson / (1 + poisson) / (
         1 - 2 * poisson
@@ -79,7 +79,7 @@ class Energy:
 
     def __init__(self, lattice: Lattice, poisson: float) -> None:
         self.lattice = lattice
-        self.mu, self.lame = lame_of(poisson)
+        self.mu, self.lambda_ = lame_parameters(poisson)
 
     def of_cells(self, x: np.ndarray) -> np.ndarray:
         corner = x[self.lattice.cells]
@@ -87,9 +87,9 @@ class Energy:
         j = (f[:, 0] * np.cross(f[:, 1], f[:, 2])).sum(axis=1)
         above = j.real > LEAST_J
         log_j = np.where(above, np.log(np.where(above, j, 1.0)), np.log(LEAST_J) + j / LEAST_J - 1)
-        density = self.mu / 2 * ((f * f).sum(axis=(1, 2)) - 3) - self.mu * log_j + self.lame / 2 * log_j**2
+        density = self.mu / 2 * ((f * f).sum(axis=(1, 2)) - 3) - self.mu * log_j + self.lambda_ / 2 * log_j**2
         inside = np.einsum("mia,mij,mja->m", corner, self.lattice.hourglass, corner)
-        return self.lattice.volume * density + self.mu / 2 * HOURGLASS * inside
+        return self.lattice.volume * density + self.mu / 2 * HOURGLASS_STIFFNESS * inside
 
     def slope(self, x: np.ndarray, colour: int, axis: int) -> np.ndarray:
         """dE/dx (n of the colour,) along an axis, by a complex step: exact to rounding."""

@@ -149,7 +149,7 @@ def test_without_vulkan_it_says_so_in_one_line_and_still_writes_slices_and_repor
 
 def test_a_window_without_vulkan_is_refused_before_anything_is_built(monkeypatch, tmp_path):
     monkeypatch.setattr("rehearsal.commands.rehearse_command.found_display", lambda: True)
-    monkeypatch.setattr("sim.device.is_there", lambda arch: arch != "vulkan")
+    monkeypatch.setattr("sim.device.is_available", lambda arch: arch != "vulkan")
     assert "install a Vulkan driver" in refused("rehearse", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

@@ -12,8 +12,7 @@ import numpy as np
 import trimesh
 from scipy.ndimage import distance_transform_edt, label, map_coordinates
 
-from sim.distance_grid import distance_grid
-from sim.mesh_distance import signed_distance
+from sim.signed_distance import distance_grid, signed_distance
 from ultrasound.probe import Probe
 
 VOXEL_MM = 1.5

@@ -5,8 +5,8 @@ import taichi as ti
 import taichi.math as tm
 import trimesh
 
-from sim.distance_grid import distance_grid
 from sim.fields import field_of
+from sim.signed_distance import distance_grid
 from ultrasound.image_plane import LANES, Lanes
 
 AIR_HU = -1000.0

@@ -43,9 +43,9 @@ def refuse_headless(headless: bool, gamepad: bool, link_leads: bool) -> None:
 
 def refuse_no_vulkan(headless: bool) -> None:
     """Raises CommandError if a window has no Vulkan driver, before minutes are spent on building the model."""
-    from sim.device import is_there
+    from sim.device import is_available
 
-    if not headless and not is_there("vulkan"):
+    if not headless and not is_available("vulkan"):
         raise CommandError(
             "no Vulkan driver found: the window needs one; install a Vulkan driver, or run with --headless"
         )

@@ -16,7 +16,7 @@ from rehearsal.result_files import write_json
 from rehearsal.tracking.pose_file import load_poses
 from scenes.anatomy import load_anatomy
 from scenes.scene import load_scene, scene_file, with_options
-from sim.mesh_distance import signed_distance
+from sim.signed_distance import signed_distance
 from ultrasound.probe import DETAIL_LEVELS, MODES, Probe
 from version import VERSION
 

@@ -1,4 +1,4 @@
-"""How a rehearsal went, in the figures that its readings gave."""
+"""Summary of a session: duration, path, presses, compression, coverage."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -9,13 +9,13 @@ import numpy as np
 from rehearsal.result_files import counted
 from ultrasound.coverage import Gap
 
-# Tissue squeezed by more than this is pressed [mm], and by less than that let go.
+# A press begins above the first compression [mm] and ends below the second.
 PRESSED_MM, RELEASED_MM = 1.0, 0.5
 
 
 @dataclass
 class SessionCourse:
-    """Gathers what a summary is made of, moment by moment."""
+    """Accumulates the figures of a summary, step by step."""
 
     warning_mm: float
     step_s: float
@@ -26,29 +26,29 @@ class SessionCourse:
     too_deep_s: float = 0.0
     fastest_mm_s: float = 0.0
     went_back: int = 0
-    _squeezed: bool = field(default=False, init=False)
+    _is_pressed: bool = field(default=False, init=False)
     _at: np.ndarray | None = field(default=None, init=False)
 
     def add(self, pose: np.ndarray | None, compression_mm: float) -> None:
-        """A moment: the pose (4, 4) of its step or None for a way back, and how far the tissue is squeezed."""
+        """Add a step by its pose (4, 4), or a rollback by None, with the compression [mm]."""
         self.duration_s += self.step_s
         if pose is None:
             self.went_back += 1
             self._at = None
             return
         if self._at is not None:
-            way = float(np.linalg.norm(pose[:3, 3] - self._at))
-            self.path_mm += way
-            self.fastest_mm_s = max(self.fastest_mm_s, way / self.step_s)
+            path = float(np.linalg.norm(pose[:3, 3] - self._at))
+            self.path_mm += path
+            self.fastest_mm_s = max(self.fastest_mm_s, path / self.step_s)
         self._at = pose[:3, 3].copy()
         self.compression_mm = max(self.compression_mm, compression_mm)
         self.too_deep_s += self.step_s * (compression_mm > self.warning_mm)
-        if not self._squeezed and compression_mm > PRESSED_MM:
+        if not self._is_pressed and compression_mm > PRESSED_MM:
             self.presses += 1
-        self._squeezed = compression_mm > (RELEASED_MM if self._squeezed else PRESSED_MM)
+        self._is_pressed = compression_mm > (RELEASED_MM if self._is_pressed else PRESSED_MM)
 
-    def summary(self, reading: dict[str, Any], gaps: Iterable[Gap], bookmarks: int) -> dict[str, Any]:
-        """Everything in one dictionary; ``reading`` is the last one, ``gaps`` are those of what was to be seen."""
+    def summary(self, latest: dict[str, Any], gaps: Iterable[Gap], bookmarks: int) -> dict[str, Any]:
+        """The summary; ``latest`` is the last measurement, ``gaps`` are the regions not imaged."""
         figures = dict(
             duration_s=self.duration_s,
             path_mm=self.path_mm,
@@ -58,7 +58,7 @@ class SessionCourse:
             over_warning_s=self.too_deep_s,
         )
         counts = dict(presses=self.presses, went_back=self.went_back, bookmarks=bookmarks)
-        seen = {name: value for name, value in reading.items() if name.startswith("seen_")}
+        seen = {name: value for name, value in latest.items() if name.startswith("seen_")}
         return {
             **{name: round(float(value), 3) for name, value in figures.items()},
             **counts,
@@ -81,13 +81,13 @@ def summary_text(summary: dict[str, Any]) -> str:
     largest = ""
     if gaps:
         volume_ml, thickness_mm = gaps[0]["volume_ml"], gaps[0]["thickness_mm"]
-        largest = f"; the largest part unseen is {volume_ml:.1f} ml, up to {thickness_mm:.1f} mm thick"
+        largest = f"; the largest region not imaged is {volume_ml:.1f} ml, up to {thickness_mm:.1f} mm thick"
     return "\n".join(
         [
-            f"session   {summary['duration_s']:.1f} s, {counted(summary['presses'], 'press')}, the way of the transducer "
+            f"session     {summary['duration_s']:.1f} s, {counted(summary['presses'], 'press')}, the path of the transducer "
             f"{summary['path_mm']:.0f} mm, at most {summary['fastest_mm_s']:.0f} mm/s; {counted(summary['bookmarks'], 'bookmark')}",
-            f"squeezed  {summary['compression_max_mm']:.1f} mm at most; {summary['over_warning_s']:.1f} s above the limit of "
+            f"compression {summary['compression_max_mm']:.1f} mm at most; {summary['over_warning_s']:.1f} s above the limit of "
             f"{summary['compression_warning_mm']:g} mm",
-            f"seen      {seen or 'nothing: there is no CT'}{largest}",
+            f"coverage    {seen or 'none: there is no CT'}{largest}",
         ]
     )

@@ -1,4 +1,4 @@
-"""The figures that matter in a partial nephrectomy, measure off a rehearsal: in the window, in its record, and for a plan."""
+"""Measurements for a partial nephrectomy: compression, contact, and the tumour's distance, depth, shift, visibility and margin."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,40 +17,40 @@ class Measurement:
     """Lengths in mm; None where there is no tumour, or none on the image plane."""
 
     compression_mm: float
-    """The most by which tissue before the face is shorter than at rest (``ultrasound.array_contact.ArrayContact``)."""
+    """Greatest compression of the tissue in front of the array face (``ultrasound.array_contact.ArrayContact``)."""
     contact_mm2: float
-    """Area of the face that touches."""
+    """Area of the array face in contact."""
     to_tumour_mm: float | None = None
-    """From the face to the nearest point of the tumour."""
+    """Distance from the array face to the nearest point of the tumour."""
     tumour_depth_mm: float | None = None
-    """From the organ's surface to the nearest point of the tumour, as the tissue lies; 0 where it sticks out."""
+    """Distance from the organ's deformed surface to the nearest point of the tumour; 0 if that is outside."""
     tumour_shift_mm: float | None = None
-    """How far the tumour's middle is from where it was in the CT."""
+    """Displacement of the tumour's centroid from the CT."""
     in_view: float | None = None
-    """Share of the tumour's outline on the image plane that is in the picture, 0 to 1."""
+    """Share of the tumour's outline on the image plane that is in the image, 0 to 1."""
     margin_mm: float | None = None
-    """Least width of what the picture shows beside and under that outline; negative where it is cut off."""
+    """Least width of tissue that the image shows beside and below that outline; negative if it is cut off."""
 
 
 def measure(rehearsal: Rehearsal, probe: Probe, touches: np.ndarray) -> Measurement:
-    """Read a rehearsal whose surfaces are up to date; ``touches`` says which lines of the probe touch."""
+    """Measure a rehearsal whose surfaces are up to date; ``touches`` (n,): which scanlines are in contact."""
     organ = rehearsal.organ
     now = array_of(rehearsal.organ_skin.vertices).astype(float)
     pressed = measure_contact(
         rehearsal.pose, rehearsal.size_mm, probe.radius_mm, now, np.asarray(organ.vertices), organ.faces
     )
-    reading: dict[str, Any] = dict(compression_mm=pressed.compression_mm, contact_mm2=pressed.area_mm2)
+    always: dict[str, Any] = dict(compression_mm=pressed.compression_mm, contact_mm2=pressed.area_mm2)
     outline = rehearsal.tumour_outline()
     if outline is None or rehearsal.tumour is None:
-        return Measurement(**reading)
+        return Measurement(**always)
     tumour = rehearsal.tumour_vertices()
     middle, before = tumour.mean(axis=0), np.asarray(rehearsal.tumour.vertices).mean(axis=0)
     return Measurement(
-        **reading,
+        **always,
         to_tumour_mm=_to_tumour_mm(rehearsal, probe, tumour),
         tumour_depth_mm=_depth_mm(tumour, now, organ.faces),
         tumour_shift_mm=float(np.linalg.norm(middle - before)),
-        **_in_picture(outline, probe, touches),
+        **_in_image(outline, probe, touches),
     )
 
 
@@ -61,7 +61,7 @@ def _to_tumour_mm(rehearsal: Rehearsal, probe: Probe, tumour: np.ndarray) -> flo
 
 
 def _depth_mm(tumour: np.ndarray, organ: np.ndarray, faces: np.ndarray) -> float:
-    """How far the nearest vertex of a tumour is under the organ's surface."""
+    """Depth of the tumour's nearest vertex under the organ's surface."""
     squared, face, near = _nearest(tumour, organ, faces)
     a, b, c = np.moveaxis(organ[faces[face]], 1, 0)
     outside = np.einsum("ij,ij->i", tumour - near, np.cross(b - a, c - a)) > 0
@@ -69,14 +69,14 @@ def _depth_mm(tumour: np.ndarray, organ: np.ndarray, faces: np.ndarray) -> float
 
 
 def _nearest(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Of points (n, 3): squared distances to a surface, the nearest faces and the points on them."""
+    """Squared distances of points (n, 3) to a surface, the nearest faces and the nearest points."""
     return igl.point_mesh_squared_distance(
         np.ascontiguousarray(points), np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64)
     )
 
 
-def _in_picture(outline_mm: np.ndarray, probe: Probe, touches: np.ndarray) -> dict[str, Any]:
-    """Share of an outline (n, 2, 2) on the plane that the picture shows, and what it shows around it."""
+def _in_image(outline_mm: np.ndarray, probe: Probe, touches: np.ndarray) -> dict[str, Any]:
+    """Share of an outline (n, 2, 2) in the image, and the margin that the image shows around it."""
     if len(outline_mm) == 0:
         return dict(in_view=None, margin_mm=None)
     middle, length = outline_mm.mean(axis=1), np.linalg.norm(outline_mm[:, 1] - outline_mm[:, 0], axis=1)

@@ -9,8 +9,8 @@ from rehearsal.planning.instrument_reach import Reach
 from rehearsal.planning.score_terms import ScoreTerms, incidence_deg, path_mm
 from rehearsal.planning.sweep_path import SweepPath
 from rehearsal.rehearsal import Rehearsal
-from sim.distance_grid import distance_grid
 from sim.fields import array_of
+from sim.signed_distance import distance_grid
 from sim.skinning import Skin
 from ultrasound.coverage import REACH_MM, VOXEL_MM, Coverage
 from ultrasound.probe_manipulator import image_plane

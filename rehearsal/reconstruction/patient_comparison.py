@@ -10,7 +10,7 @@ import trimesh
 from rehearsal.reconstruction.segmentation_metrics import SegmentationMetrics, segmentation_metrics
 from rehearsal.reconstruction.sweep_volumes import Rebuilt
 from scenes.anatomy import LoadedAnatomy
-from sim.mesh_distance import signed_distance
+from sim.signed_distance import signed_distance
 from ultrasound.reconstruction import VoxelBox
 
 

@@ -19,7 +19,7 @@ from errors import UserError, explained
 from scenes.patients.import_error import PatientError
 from scenes.section import Direction, Vector3
 from scenes.surface_files import load_surface
-from sim.mesh_distance import signed_distance
+from sim.signed_distance import signed_distance
 
 UNITS = ("_mm", "_kPa")
 # Between the nominal indentation and where the probe was found.

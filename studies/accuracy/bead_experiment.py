@@ -11,9 +11,9 @@ from rehearsal.stopwatch import timed
 from scenes.closed_surfaces import moved_by
 from scenes.scene import Contact
 from scenes.tissue import TissueSection
-from sim.body import RestBody
 from sim.fields import array_of
-from sim.shape_matching import fill
+from sim.sampling import RestBody
+from sim.shape_matching import fill_organ
 from sim.shapes import ConvexTool
 from sim.skinning import Skin
 from sim.solver import StepSettings
@@ -112,7 +112,7 @@ class BeadExperiment:
 
     def _restore(self) -> None:
         self.body.restore(self.body.rest_state())
-        self.contacts.forget()
+        self.contacts.reset()
         self.model.update_frames()
 
     def _step_settings(self, setup: Setup) -> StepSettings:
@@ -140,7 +140,7 @@ def tissue_of(case: BeadCase, setup: Setup) -> TissueSection:
 
 def rest_body(case: BeadCase, setup: Setup) -> RestBody:
     """Shape matching's particles of a case; Experiments of one radius can share them."""
-    return fill(_organ(case), setup.tissue)
+    return fill_organ(_organ(case), setup.tissue)
 
 
 def _organ(case: BeadCase) -> trimesh.Trimesh:

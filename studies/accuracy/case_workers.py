@@ -14,7 +14,7 @@ from joblib import Parallel, delayed, parallel_config
 import sim.device
 from rehearsal.configuration import Setup
 from rehearsal.worker_processes import processes
-from sim.body import RestBody
+from sim.sampling import RestBody
 from studies.accuracy.bead_case import BeadCase
 from studies.accuracy.bead_errors import bead_errors
 from studies.accuracy.bead_experiment import BeadExperiment, rest_body

@@ -90,10 +90,10 @@ class Cantilever:
         line = np.column_stack([np.full(31, height), along, np.full(31, size[2])])
         node, share = lattice.interpolation(line)
         load = np.bincount(node.ravel(), load_g / len(line) * share.ravel(), len(lattice.nodes))
-        held = lattice.nodes[:, 2] < 1e-6 * size[2]
+        fixed = lattice.nodes[:, 2] < 1e-6 * size[2]
         self.body = Body(lattice.nodes)
         values = (material.young_kpa, material.poisson, material.density_g_cm3)
-        self.model = NeoHookean(self.body, lattice, None, *values, held, load_g=load)
+        self.model = NeoHookean(self.body, lattice, None, *values, fixed, load_g=load)
         self.solver = Solver(self.model)
 
     def displacement(self) -> np.ndarray:

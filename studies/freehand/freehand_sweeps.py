@@ -11,7 +11,7 @@ from rehearsal.reconstruction.compression_correction import come
 from rehearsal.rehearsal import Rehearsal, scanned_anatomy
 from scenes.anatomy import LoadedAnatomy
 from sim.embedding import Unmoved
-from sim.mesh_distance import signed_distance
+from sim.signed_distance import signed_distance
 from ultrasound.bmode import source_of_pixels
 from ultrasound.ground_truth_labels import MAX_BEADS, GroundTruthLabels
 from ultrasound.image_plane import ImagePlane, PlaneInTissue

@@ -22,10 +22,10 @@ from scenes.closed_surfaces import moved_by
 from scenes.scene import Contact, Scene, SolverSection, with_options
 from scenes.tissue import TISSUES, ShapeMatchingTissue, TissueSection
 from sim.device import start
-from sim.distance_grid import distance_grid
 from sim.embedding import Embedding
-from sim.shape_matching import fill
+from sim.shape_matching import fill_organ
 from sim.shapes import GRID_MM, ConvexTool, SignedDistanceField
+from sim.signed_distance import distance_grid
 from sim.solver import Solver
 from studies.performance.step_timing import memory_mb
 from ultrasound.probe import DetailLevel, Mode
@@ -94,7 +94,9 @@ class FeatureBody:
             for shape in anatomy.shapes
             if isinstance(shape, trimesh.Trimesh)
         ]
-        self.filled = fill(self.organ, tissue) if isinstance(tissue, ShapeMatchingTissue) else self.organ
+        self.filled = (
+            fill_organ(self.organ, tissue) if isinstance(tissue, ShapeMatchingTissue) else self.organ
+        )
         down = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
         x, y, z = (1e3 * scene.gravity.acceleration_m_s2 * down).tolist()
         self.settings.gravity = (x, y, z)
@@ -202,7 +204,9 @@ def of_frame(scene: Scene, anatomy: LoadedAnatomy, arch: str) -> Iterator[dict[s
     start(arch)
     rehearsal = Rehearsal(scene, anatomy)
     dt = rehearsal.settings.time_step_s
-    yield _alone("guard", lambda: rehearsal.guard.check(dt), [rehearsal.guard], rehearsal.solver)
+    yield _alone(
+        "guard", lambda: rehearsal.divergence_check.check(dt), [rehearsal.divergence_check], rehearsal.solver
+    )
     yield _alone("organ's surface", rehearsal.organ_skin.update, [rehearsal.organ_skin], rehearsal.model)
     if rehearsal.tumour_skin is not None:
         yield _alone(
@@ -247,7 +251,7 @@ def _whole_frame(rehearsal: Rehearsal) -> dict[str, Any]:
         for depth in np.linspace(0.0, rehearsal.press.indentations_mm[0], CALLS + 1)
     ]
 
-    whole = [rehearsal.solver, rehearsal.guard, rehearsal.organ_skin, rehearsal.tumour_skin]
+    whole = [rehearsal.solver, rehearsal.divergence_check, rehearsal.organ_skin, rehearsal.tumour_skin]
     whole += [rehearsal.embedding, rehearsal.scanner]
 
     def go_on() -> None:

@@ -9,7 +9,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.shape_matching import ShapeMatching
-from sim.solver import Solver, StepSettings, last_exact
+from sim.solver import Solver, StepSettings, relaxation_at
 
 # Pieces of a substep before its iterations, of an iteration, and after them; "frames" is once a step.
 BEFORE = ("tool", "predict", "begin", "find contacts", "leave contacts", "gather")
@@ -29,7 +29,7 @@ class Phases:
     """
 
     def __init__(self, solver: Solver) -> None:
-        if solver.has_pairs:
+        if solver.has_self_contacts:
             raise ValueError("phases know no contacts between particles")
         self.solver: Any = solver
         self.model: Any = solver.model
@@ -54,7 +54,7 @@ class Phases:
             for name in BEFORE:
                 self._timed(name, substep, 1.0, *values, settings.stabilisation_iterations)
             for iteration in range(settings.iterations):
-                factor = last_exact(iteration, settings.iterations, settings.relaxation_factor)
+                factor = relaxation_at(iteration, settings.iterations, settings.relaxation_factor)
                 for name in self.passes:
                     self._timed(name, substep, factor, *values, 0)
             for name in AFTER:
@@ -104,7 +104,7 @@ class Phases:
     ):
         if ti.static(name == "tool" and self.solver.has_tool):
             for _ in range(1):
-                self.solver.tool.go(substep)
+                self.solver.tool.start_substep(substep)
         if ti.static(name == "predict"):
             self.solver.predict(dt, gravity, damping)
         if ti.static(name == "begin"):
@@ -130,7 +130,7 @@ class Phases:
         if ti.static(name == "keep out" and self.solver.has_contacts):
             self.solver.contacts.finish()
         if ti.static(name == "velocities"):
-            self.solver.settle(dt)
+            self.solver.update_velocities(dt)
 
 
 def without_calls(ms: dict[str, float], calls: dict[str, int], whole_ms: float) -> dict[str, float]:

@@ -57,7 +57,7 @@ def press(
     """The paper's warm-up from the resting shape, then the scripted press, or a ``share`` of both; yields the time [s]."""
     solver, settings, script = rehearsal.solver, rehearsal.settings, rehearsal.script_length_s()
     solver.body.restore(solver.body.rest_state())
-    solver.contacts.forget()
+    solver.contacts.reset()
     solver.model.update_frames()
     dt = settings.time_step_s
     warm_up = max(1, round(share * rehearsal.press.warm_up_steps))

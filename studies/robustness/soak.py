@@ -91,7 +91,7 @@ def _minute(rehearsal: Rehearsal, minute: int, minute_s: float, first: Rehearsal
         moved_mm=round(float(np.linalg.norm(position - rest, axis=1).mean()), 6),
         shape_mm=round(float(apart_after_fit(position, rest).mean()), 6),
         volume_ratio=round(rehearsal.volume_ratio(), 6),
-        tangled=rehearsal.guard.health().tangled,
+        tangled=rehearsal.divergence_check.health().tangled,
         finite=bool(np.isfinite(position).all()),
         fallbacks=fallbacks,
         ms_median=round(float(np.median(ms)), 4),

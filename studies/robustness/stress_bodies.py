@@ -49,8 +49,8 @@ class Specimen:
         gravity = np.array(settings.gravity)
         self.up = -gravity / np.linalg.norm(gravity)
         self.mass = self._masses()
-        self.guard = DivergenceCheck(solver)
-        self.settled = self.guard.home
+        self.divergence_check = DivergenceCheck(solver)
+        self.settled = self.divergence_check.initial
         self.rest = self.settled.body.position.astype(float)
         skin.update()
         surface = array_of(skin.vertices).astype(float)

@@ -93,10 +93,10 @@ def _maltreat(specimen: Specimen, case: StressCase, extremes: Extremes) -> None:
     dt = settings.time_step_s
     position, velocity = _state(specimen, case)
     specimen.solver.restore(specimen.settled)
-    specimen.guard.settle()
+    specimen.divergence_check.set_initial_state()
     if case.state[0] != "settled":
         specimen.body.restore(BodyState(position.astype(np.float32), velocity.astype(np.float32)))
-        specimen.solver.contacts.forget()
+        specimen.solver.contacts.reset()
     _weigh(specimen, case.heaviest)
     _harden(specimen, case.material)
     kind, *numbers = case.probe
@@ -104,7 +104,7 @@ def _maltreat(specimen: Specimen, case: StressCase, extremes: Extremes) -> None:
     for step in range(max(LEAST_STEPS, round(LEAST_S / dt))):
         times = dt * (step + np.linspace(0.0, 1.0, settings.substeps + 1))
         specimen.solver.step(settings, np.stack([path(float(t)) for t in times]))
-        extremes.look(specimen, specimen.guard.check(dt))
+        extremes.look(specimen, specimen.divergence_check.check(dt))
     _weigh(specimen, 1.0)
     _harden(specimen, {})
 
@@ -132,7 +132,7 @@ def _let_go(specimen: Specimen, extremes: Extremes) -> None:
     away = np.stack([advanced(specimen.home, -AWAY_MM)] * (specimen.settings.substeps + 1))
     for step in range(1, RELEASE_STEPS + 1):
         specimen.solver.step(specimen.settings, away)
-        notice = specimen.guard.check(specimen.settings.time_step_s)
+        notice = specimen.divergence_check.check(specimen.settings.time_step_s)
         if notice or step % LOOK_EVERY == 0:
             extremes.look(specimen, notice)
         if step % LOOK_EVERY == 0 and _distance(specimen) < RECOVERED_MM / 2:
@@ -153,7 +153,7 @@ def _lifted(specimen: Specimen) -> float:
     state = specimen.solver.snapshot()
     up = (state.body.position + LIFT_MM * specimen.up).astype(np.float32)
     specimen.solver.restore(SolverState(BodyState(up, np.zeros_like(up)), state.contacts))
-    specimen.solver.contacts.forget()
+    specimen.solver.contacts.reset()
     weightless: StepSettings = replace(specimen.settings, gravity=(0.0, 0.0, 0.0))
     error = np.inf
     for step in range(1, LIFT_STEPS + 1):

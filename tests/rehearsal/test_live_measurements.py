@@ -72,7 +72,7 @@ def test_what_a_session_holds_is_recalled_as_it_was_watched(watching, rehearsal,
         Event(at=session.step_index, kind=kind, value=value)
     )
     for session.step_index, rehearsal.pose in enumerate(FIRST, 1):
-        watching._read_every = 1
+        watching._measure_every = 1
         watching.watch(session, rehearsal.probe, rehearsal.pose)
     watching.course.add(None, 0.2)
     watching.coverage.seen[watching.coverage.targets["tumour"]] = True
@@ -97,7 +97,7 @@ def test_a_way_back_is_looked_at_and_read_anew_at_once(watching, rehearsal, one_
     looks = iter([lines, ~lines])
     monkeypatch.setattr(watching.coverage, "add", lambda *_: next(looks))
     noted: list[float] = []
-    watching._look_every = 2
+    watching._coverage_every = 2
     session = SimpleNamespace(step_index=0, kept_states={}, rolled_back_to=None)
     session.note = lambda kind, figures: noted.append(figures["compression_mm"])
     for session.step_index, pose in ((0, FIRST[0]), (1, FIRST[0]), (3, None)):
@@ -115,7 +115,7 @@ def test_a_session_that_begins_is_read_with_what_touches_then(watching, rehearsa
     )
     touches = np.arange(rehearsal.probe.number_of_scanlines) < 30
     monkeypatch.setattr(watching.coverage, "add", lambda *_: touches)
-    watching._look_every = 2
+    watching._coverage_every = 2
     for _ in range(2):
         session = SimpleNamespace(step_index=1, kept_states={}, rolled_back_to=None, note=lambda *_: None)
         watching.watch(session, rehearsal.probe, FIRST[0])
@@ -156,5 +156,5 @@ def test_an_echo_is_said_to_be_black_where_hardly_a_line_touches(
     [(0.5, -0.04, "0.0 mm"), (0.5, 0.0, "0.0 mm"), (0.5, -0.06, "-0.1 mm"), (0.0, 1.0, ""), (None, None, "")],
 )
 def test_a_margin_of_nothing_has_no_minus(one_device, watching, in_view, margin, shown):
-    watching.reading = Measurement(1.0, 20.0, 5.0, 2.0, 1.0, in_view, margin)
+    watching.latest = Measurement(1.0, 20.0, 5.0, 2.0, 1.0, in_view, margin)
     assert watching.findings()["margin"] == shown

@@ -93,6 +93,6 @@ def test_a_course_counts_presses_ways_and_time_over_the_limit():
     assert "contact_mm2" not in figures and "2 presses" in summary_text(figures)
     assert "4 bookmarks" in summary_text(
         figures
-    ) and "largest part unseen is 1.5 ml, up to 2.0 mm thick" in summary_text(figures)
+    ) and "largest region not imaged is 1.5 ml, up to 2.0 mm thick" in summary_text(figures)
     said = summary_text(figures | dict(presses=1, bookmarks=1))
     assert "1 press," in said and "1 bookmark\n" in said

@@ -34,7 +34,7 @@ from rehearsal.planning.sweep_candidates import (
 )
 from rehearsal.planning.sweep_path import layout_towards
 from scenes.anatomy import LoadedAnatomy
-from sim.mesh_distance import signed_distance
+from sim.signed_distance import signed_distance
 from studies.planning import virtual_tumour
 from studies.planning.baseline_sweeps import by_chance, planned, row_by_row, straight, ways_by_chance
 from ultrasound.coverage import VOXEL_MM, Coverage

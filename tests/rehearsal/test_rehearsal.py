@@ -17,7 +17,7 @@ from scenes.patients.readers.label_maps import LabelMap
 from scenes.patients.readers.lazy_volume import LazyVolume
 from scenes.scene import PAPER, Press, Scene, load_scene, with_options
 from sim.fields import array_of
-from sim.mesh_distance import signed_distance
+from sim.signed_distance import signed_distance
 from sim.skinning import Skin
 from ultrasound.probe_manipulator import image_plane
 

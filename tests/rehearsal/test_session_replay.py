@@ -164,7 +164,7 @@ def opened_at_each(built, log: Log, capsys) -> None:
     assert instruments.figures()["seen_organ"] < noted[120]["seen_organ"]
     assert instruments.course.duration_s == pytest.approx(7 / 60)
     other = replace(log, seen=dict.fromkeys(log.seen, pack_seen(np.zeros((2, 3, 4), bool))))
-    with pytest.raises(SessionError, match=r"of \(2, 3, 4\) voxels what was seen, expected \([^\n]*$"):
+    with pytest.raises(SessionError, match=r"coverage of \(2, 3, 4\) voxels, expected \([^\n]*$"):
         open_session(other, 127 / 60, rehearsal, initial_settings(rehearsal), LiveMeasurements(rehearsal))
 
 

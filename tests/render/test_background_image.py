@@ -128,11 +128,11 @@ def test_a_missing_structure_has_no_slider():
 
 
 def test_a_long_line_loses_its_last_parts_and_a_long_part_its_end():
-    line = "TISSUE SQUEEZED BY 9 mm   SWEEP   122 pictures"
+    line = "TISSUE COMPRESSED BY 9 mm   SWEEP   122 pictures"
     length = font(17).getlength
     assert shortened(line, 17, 1000) == line and shortened("", 17, 10) == ""
-    cut = shortened(line, 17, int(length("TISSUE SQUEEZED BY 9 mm   SWEEP")) + 1)
-    assert cut == "TISSUE SQUEEZED BY 9 mm   SWEEP"
+    cut = shortened(line, 17, int(length("TISSUE COMPRESSED BY 9 mm   SWEEP")) + 1)
+    assert cut == "TISSUE COMPRESSED BY 9 mm   SWEEP"
     cut = shortened(line, 17, 100)
     assert cut.endswith("...") and line.startswith(cut[:-3]) and 70 < length(cut) <= 100
 

@@ -111,7 +111,7 @@ PLANNING = "PLANNING   43 %, some 18 min left; Backspace stops"
 @pytest.mark.parametrize("size", [(1280, 720), (1920, 1080)])
 @pytest.mark.parametrize(
     "status",
-    ["FROZEN", PLANNING, f"RECORDING 12 s   TISSUE SQUEEZED BY 12 mm   {PLANNING}"],
+    ["FROZEN", PLANNING, f"RECORDING 12 s   TISSUE COMPRESSED BY 12 mm   {PLANNING}"],
 )
 def test_a_status_is_as_large_as_it_can_be_in_the_panel(size, status):
     layout = WindowLayout(*size)

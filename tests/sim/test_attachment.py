@@ -1,4 +1,4 @@
-"""Tissue that is held in place: what is near the hilum stays, the rest gives way; off, nothing is held."""
+"""Fixed boundary: tissue near the hilum does not move, the rest deforms; without attachment no node is fixed."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ AT = (-15.0, 0.0, 0.0)
 
 
 def hanging(radius_mm: float, at=AT) -> Rehearsal:
-    """A ball that lies on nothing: without an attachment it falls."""
+    """A ball without support: without an attachment it falls."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=15.0)
     scene = Scene(
         anatomy=AnatomyFiles(),
@@ -32,7 +32,7 @@ def moved_mm(rehearsal: Rehearsal, steps: int = 30) -> np.ndarray:
     return array_of(rehearsal.body.position) - rehearsal.body.rest_points
 
 
-def test_held_nodes_stay_and_the_rest_hangs_from_them(device):
+def test_fixed_nodes_do_not_move_and_the_rest_hangs_from_them(device):
     rehearsal = hanging(6.0)
     moved = moved_mm(rehearsal)
     held = np.linalg.norm(rehearsal.body.rest_points - AT, axis=1) <= 6.0
@@ -41,21 +41,21 @@ def test_held_nodes_stay_and_the_rest_hangs_from_them(device):
     far = rehearsal.body.rest_points[:, 0] > 8
     drop = moved[far] @ rehearsal.gravity_direction
     # Free fall for 0.5 s would be a metre.
-    assert 0.01 < drop.mean() < 20 and rehearsal.guard.fallbacks == 0
+    assert 0.01 < drop.mean() < 20 and rehearsal.divergence_check.restorations == 0
 
 
-def test_without_a_radius_nothing_is_held(device):
+def test_without_a_radius_no_node_is_fixed(device):
     rehearsal = hanging(0.0)
-    assert not rehearsal.model.has_held
+    assert not rehearsal.model.has_fixed
     assert (
         moved_mm(rehearsal, 12).min(axis=0)[1] > 100
     )  # it falls: 12 steps of 1/60 s are 196 mm without damping
 
 
-def test_what_cannot_be_held(device):
-    with pytest.raises(SamplingError, match="holds none of the organ"):
+def test_a_region_with_no_or_all_nodes_is_refused(device):
+    with pytest.raises(SamplingError, match="fixes none of the organ"):
         hanging(1.0, at=(100.0, 0.0, 0.0))
-    with pytest.raises(SamplingError, match="holds all of the organ"):
+    with pytest.raises(SamplingError, match="fixes all of the organ"):
         hanging(100.0)
     with pytest.raises(ValueError, match=r"give attachment\.at_mm"):
         Attachment(radius_mm=5.0)

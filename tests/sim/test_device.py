@@ -1,4 +1,4 @@
-"""What Taichi is started with, and what it still says of a kernel that is wrong."""
+"""How Taichi is started, and its error messages for a wrong kernel."""
 
 import os
 import subprocess
@@ -14,14 +14,14 @@ from sim.device import NoDevice, start
 from sim.fields import array_of, field_of
 
 
-def test_compiled_kernels_of_many_patients_are_kept(device):
+def test_the_kernel_cache_has_space_for_many_patients(device):
     assert ti.cfg.offline_cache and ti.cfg.offline_cache_max_size_of_files == sim.device.CACHE_BYTES
     start("cpu", offline_cache_max_size_of_files=7)
     assert ti.cfg.offline_cache_max_size_of_files == 7
 
 
 @pytest.mark.parametrize("name", ["a file in the way", "new"])
-def test_kernels_are_kept_where_they_can_be(tmp_path, name):
+def test_the_kernel_cache_is_in_a_writable_folder(tmp_path, name):
     (tmp_path / "a file in the way").write_text("")
     program = "import sim.device, taichi as ti; sim.device.start(); print(ti.cfg.offline_cache_file_path); ti.field(int, 3).fill(1)"
     done = subprocess.run(
@@ -32,7 +32,7 @@ def test_kernels_are_kept_where_they_can_be(tmp_path, name):
         text=True,
     )
     kept = tmp_path / name if name == "new" else sim.device.TEMPORARY
-    # Of a folder that it cannot write Taichi would crash at the end.
+    # With a folder that is not writable Taichi would crash at the end.
     assert (done.returncode, done.stdout) == (0, f"{kept}\n"), done.stderr
 
 
@@ -44,7 +44,7 @@ def test_without_a_home_taichi_starts():
     assert done.returncode == 0
 
 
-def test_a_driver_that_is_missing_is_one_refusal_and_prints_nothing():
+def test_a_missing_driver_gives_one_error_and_no_output():
     program = "import sim.device; sim.device.start('vulkan')"
     done = subprocess.run(
         [sys.executable, "-c", program],
@@ -57,16 +57,16 @@ def test_a_driver_that_is_missing_is_one_refusal_and_prints_nothing():
     assert "no vulkan device or driver; use --arch cpu" in last and not any("RHI" in line for line in above)
 
 
-def test_a_driver_that_computes_wrongly_is_refused(device, monkeypatch):
-    assert sim.device.counts_right()
+def test_a_driver_with_wrong_results_is_refused(device, monkeypatch):
+    assert sim.device.counts_correctly()
     monkeypatch.setattr("sim.device._count", lambda count, least: None)
-    assert not sim.device.counts_right()
-    # Where there is no driver at all, that is the refusal.
-    with pytest.raises(NoDevice, match="computes wrongly|no vulkan device"):
+    assert not sim.device.counts_correctly()
+    # Without any driver the error is another one.
+    with pytest.raises(NoDevice, match="gives wrong results|no vulkan device"):
         start("vulkan")
 
 
-def test_a_field_is_made_without_the_stack_being_written_down(device, monkeypatch):
+def test_a_field_is_made_without_formatting_the_call_stack(device, monkeypatch):
     def written(*_):
         raise AssertionError("the stack was written down")
 

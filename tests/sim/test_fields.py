@@ -1,4 +1,4 @@
-"""Arrays on the device are the arrays that they were."""
+"""Arrays written to the device and read again are unchanged."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def test_the_order_in_memory_does_not_matter(one_device):
     assert np.array_equal(field_of(values.T).to_numpy(), values.T)
 
 
-def test_arrays_written_together_are_each_what_they_were(one_device):
+def test_arrays_written_together_are_unchanged(one_device):
     random = np.random.default_rng(1)
     counts, places, turns = (
         random.integers(-9, 9, 7),
@@ -39,7 +39,7 @@ def test_arrays_written_together_are_each_what_they_were(one_device):
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (7,), (3, 5), (6, 1, 9)])
-def test_what_is_read_where_it_lies_is_what_taichi_reads(one_device, shape):
+def test_values_read_from_memory_are_those_that_taichi_reads(one_device, shape):
     random = np.random.default_rng(2)
     fields = [
         (ti.field(ti.f32, shape), shape),
@@ -67,8 +67,8 @@ def test_an_array_of_another_shape_is_not_written(one_device):
 
 
 @pytest.mark.parametrize("first", ["plane", "push", "turn", "count"])
-def test_fields_of_a_struct_lie_side_by_side(one_device, first):
-    """Whichever of them is asked for first in a tree of its own."""
+def test_fields_of_a_struct_are_read_separately(one_device, first):
+    """For each field that is read first."""
     shapes = {"plane": (4,), "count": (), "turn": (2, 3), "push": (3,)}
     kinds = {
         "plane": ti.math.vec4,

@@ -53,10 +53,10 @@ def test_tissue_has_the_surfaces_volume_and_centre(mesh, cell_mm):
     lattice = fill_with_cells(mesh, cell_mm)
     bound = most_missing(mesh, cell_mm)
     assert bound < 0.03 * mesh.volume
-    # The surface is moved out until the volume is right; edges take a few passes more.
+    # The surface is offset until the volume is right; edges take a few more iterations.
     assert abs(lattice.tissue.sum() - mesh.volume) < 0.05 * bound
     centre = lattice.tissue @ lattice.nodes / lattice.tissue.sum()
-    # What is missing lies on both sides; all of it on one, half the size away, would move the centre so far.
+    # Bound of the centre: all missing volume on one side, at half of the size.
     reach = mesh.extents.max() / 2
     assert np.abs(centre - mesh.center_mass).max() < bound / mesh.volume * reach / 4
 
@@ -64,11 +64,11 @@ def test_tissue_has_the_surfaces_volume_and_centre(mesh, cell_mm):
 def test_cells_too_large_for_the_organ_are_refused(ball):
     with pytest.raises(SamplingError, match="choose smaller ones"):
         fill_with_cells(trimesh.creation.box([30.0, 30.0, 0.5]), 5.0)
-    with pytest.raises(SamplingError, match="hold 0 % of"):
+    with pytest.raises(SamplingError, match="fill 0 % of"):
         fill_with_cells(trimesh.creation.icosphere(subdivisions=2, radius=0.5), 20.0)
 
 
-def test_empty_space_in_cut_cells_resists_a_little(mesh):
+def test_empty_space_in_cut_cells_has_little_stiffness(mesh):
     lattice = fill_with_cells(mesh, 3.0)
     tissue = lattice.tissue.sum()
     cells = len(lattice.cells) * 3.0**3
@@ -84,7 +84,7 @@ def test_cells_are_cubes_and_cover_the_organ(mesh):
     centres = lattice.low_mm + 3.0 * (np.argwhere(lattice.index_of >= 0) + 0.5)
     assert np.abs(corner.mean(axis=1) - centres).max() < 1e-12
     assert (lattice.index_of[lattice.index_of >= 0] == np.arange(len(lattice.cells))).all()
-    # A sliver thinner than a sample may go without a cell.
+    # A sliver thinner than a sample may have no cell.
     points = np.random.default_rng(1).uniform(*mesh.bounds, (4000, 3))
     points = points[signed(mesh, points) < -3.0 / 6]
     place = np.floor((points - lattice.low_mm) / 3.0).astype(int)
@@ -131,7 +131,7 @@ def test_hourglass_is_the_energy_left_out_by_the_mean_gradient(block):
     assert energy == pytest.approx(h**5 / 6 * (1 - 1 / 36), rel=1e-12)
     values = np.linalg.eigvalsh(lattice.hourglass)
     assert values.min() > -1e-12 * h
-    # Only rigid shifts and the three linear fields cost nothing.
+    # Only translations and the three linear fields have no energy.
     assert (values[:, 3] < 1e-12 * h).all() and (values[:, 4] > 1e-4 * lattice.volume / h**2).all()
 
 
@@ -145,7 +145,7 @@ def test_interpolation_is_exact_for_linear_fields_inside(mesh):
     assert np.abs(carried - points @ F.T - OFFSET).max() < 1e-12
 
 
-def test_points_outside_all_cells_go_with_the_nearest(ball):
+def test_points_outside_all_cells_move_with_the_nearest_cell(ball):
     lattice = fill_with_cells(ball, 3.0)
     points = np.random.default_rng(6).uniform(-16, 16, (500, 3))
     nodes, _ = lattice.interpolation(points)
@@ -170,19 +170,19 @@ def test_extrapolation_ends_after_a_cell(ball):
         assert np.abs(weights).max() <= (1 + EXTRAPOLATED_CELLS) ** 3 + 1e-12
         carried = np.einsum("pk,pkd->pd", weights, linear[nodes])
         assert (np.abs(carried - points @ F.T - OFFSET).max() < 1e-11) == exact
-        # A displacement that varies from cell to cell grows no further than that either.
+        # The bound also applies to a displacement that varies from cell to cell.
         wave = np.sin(lattice.nodes)
         assert np.abs(np.einsum("pk,pkd->pd", weights, wave[nodes])).max() < 27.0
 
 
-def test_surface_points_share_the_area_and_lie_on_the_surface(mesh):
+def test_surface_points_are_on_the_surface_and_their_areas_sum_to_its_area(mesh):
     points, area = surface_points(mesh, 2.0)
     assert area.sum() == pytest.approx(mesh.area, rel=1e-12) and area.min() > 0
     assert np.abs(signed(mesh, points)).max() < 1e-12
     # A cube of 2 mm is cut by at most about three faces' worth of its own; a face at 45 degrees has sqrt(3) of it.
     assert area.max() < 3 * 2.0**2
     assert 0.5 * mesh.area / 2.0**2 < len(points) < 3 * mesh.area / 2.0**2
-    # No place of the surface is farther from a point than a cube's diagonal and the half triangle it may reach out.
+    # No position on the surface is farther from a point than a cube's diagonal and the half triangle it may reach out.
     samples = trimesh.sample.sample_surface(mesh, 2000, seed=1)[0]
     nearest = np.linalg.norm(samples[:, None] - points[None], axis=2).min(axis=1)
     assert nearest.max() < 2.0 * np.sqrt(3) + 1.0
@@ -195,7 +195,7 @@ def test_a_thin_plate_has_points_on_both_of_its_sides():
         assert area[np.abs(points[:, 2] - side) < 1e-9].sum() >= 400.0 - 1e-9
 
 
-def test_the_points_forces_are_the_surfaces(ball):
+def test_pressure_at_the_surface_points_has_the_resultant_of_the_surface(ball):
     # Pressure on a closed surface has no resultant; on its lower half it has pressure times the disc's area.
     points, area = surface_points(ball, 2.0)
     normal = points / np.linalg.norm(points, axis=1, keepdims=True)
@@ -219,8 +219,8 @@ def test_the_same_surface_gives_the_same_lattice(ball):
         assert (getattr(first, name) == getattr(second, name)).all()
 
 
-def test_a_turned_body_is_the_same_body(block):
-    # The cells of a quarter turn fall on each other, for all edges are whole numbers of them.
+def test_a_rotated_body_gives_the_rotated_lattice(block):
+    # After a quarter turn the cells coincide, because all edges are multiples of a cell.
     turned = block.copy()
     turn = np.eye(4)
     turn[:3, :3] = np.round(rotation_about([0, 0, 1], 90))

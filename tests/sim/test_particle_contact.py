@@ -1,4 +1,4 @@
-"""Shapes against closed forms, and contacts that leave nothing inside."""
+"""Shapes against closed forms; contacts leave no particle inside a shape."""
 
 import igl
 import numpy as np
@@ -14,7 +14,7 @@ from sim.solver import Solver, StepSettings
 
 
 def measured(shape, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Normals (n, 3) and signed distances (n,) that a shape answers with."""
+    """Normals (n, 3) and signed distances (n,) of a shape."""
     given = ti.Vector.field(3, ti.f32, len(points))
     answer = ti.Vector.field(4, ti.f32, len(points))
     fill((given, points))
@@ -70,14 +70,14 @@ def test_a_rounded_cuboid_keeps_its_size_and_loses_its_corners(one_device):
     assert distance == pytest.approx([0, 0, 2**0.5 - 1, 3**0.5 - 1], abs=1e-6)
 
 
-def test_the_way_out_of_a_rounded_cuboid_ends_a_hair_outside_its_face(one_device):
+def test_the_nearest_point_outside_a_rounded_cuboid_is_just_outside_its_face(one_device):
     tool = ConvexTool.cuboid(np.array([12.0, 6.0, 8.0]), 1.0)
     out = ti.Vector.field(3, ti.f32, 6)
 
     @ti.kernel
     def ask():
         for k in range(6):
-            out[k] = tool.way_out(ti.Vector([1.0, 0.5, -0.5]), k)
+            out[k] = tool.outside(ti.Vector([1.0, 0.5, -0.5]), k)
 
     ask()
     for point, k in zip(array_of(out), range(6), strict=True):
@@ -87,12 +87,12 @@ def test_the_way_out_of_a_rounded_cuboid_ends_a_hair_outside_its_face(one_device
 
 
 @pytest.mark.parametrize("edge_radius", [-0.1, 3.1])
-def test_an_edge_radius_without_room_is_refused(one_device, edge_radius):
+def test_an_edge_radius_too_large_is_refused(one_device, edge_radius):
     with pytest.raises(ValueError, match="expected 0 to 3 mm"):
         ConvexTool.cuboid(np.array([12.0, 6.0, 8.0]), edge_radius)
 
 
-def test_a_tool_knows_how_its_material_moved(one_device):
+def test_the_motion_of_a_tools_material_is_that_of_its_poses(one_device):
     tool = ConvexTool.cuboid(np.array([4.0, 4.0, 4.0]))
     before, now = np.eye(4), np.eye(4)
     now[:3, :3], now[:3, 3] = rotation_about([0, 0, 1], 3), [0.5, 0.0, -0.2]
@@ -108,7 +108,7 @@ def test_a_tool_knows_how_its_material_moved(one_device):
     assert np.abs(array_of(moved) - (now @ material - material)[:3]).max() < 1e-6
 
 
-def test_more_poses_than_a_step_has_room_for_are_refused(one_device):
+def test_too_many_poses_are_refused(one_device):
     tool = ConvexTool.cuboid(np.array([4.0, 4.0, 4.0]))
     tool.follow(np.tile(np.eye(4), (101, 1, 1)))
     for poses in (1, 102):
@@ -150,7 +150,7 @@ def test_a_closed_surface_becomes_its_distances(one_device, ball):
 
 @pytest.mark.parametrize("edge_radius", [0.0, 1.0])
 @pytest.mark.parametrize("offsets", [(6.0, 3.0, 4.0, 6.0, 3.0, 4.0), (2.0, 3.0, 1.5, 9.0, 5.0, 4.0)])
-def test_a_tool_is_beyond_a_distance_only_where_it_is(one_device, edge_radius, offsets):
+def test_the_quick_distance_test_of_a_tool_has_no_false_positives(one_device, edge_radius, offsets):
     tool = ConvexTool(np.concatenate([np.eye(3), -np.eye(3)]), np.array(offsets), edge_radius)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation_about([1, 2, 0], 50), [1.0, -2.0, 3.0]
@@ -172,7 +172,7 @@ def test_a_tool_is_beyond_a_distance_only_where_it_is(one_device, edge_radius, o
     assert told.sum() > 0.9 * (distance > 2.0).sum()
 
 
-def test_a_body_laid_in_a_mould_of_its_shape_does_not_move_without_gravity(one_device, ball):
+def test_a_body_in_a_mould_of_its_shape_does_not_move_without_gravity(one_device, ball):
     outside = trimesh.creation.box([60, 60, 60])
     mould = trimesh.Trimesh(
         np.concatenate([outside.vertices, ball.vertices]),
@@ -214,7 +214,7 @@ def test_no_particle_ends_a_step_inside_tool_or_floor(kept, ball, speed_mm_s):
     assert deepest < 1e-3
 
 
-def test_a_tool_driven_into_the_floor_leaves_no_particle_in_either(kept, ball):
+def test_no_particle_is_left_inside_overlapping_tool_and_floor(kept, ball):
     solver = kept(under_a_tool, ball)
     poses = np.tile(np.eye(4), (4, 1, 1))
     for step in range(60):
@@ -226,7 +226,7 @@ def test_a_tool_driven_into_the_floor_leaves_no_particle_in_either(kept, ball):
     assert np.isfinite(position(solver)).all()
 
 
-def test_pressing_squeezes_between_tool_and_floor(one_device, ball):
+def test_pressing_compresses_between_tool_and_floor(one_device, ball):
     tool = ConvexTool.cuboid(np.array([40.0, 40.0, 10.0]))
     solver = solver_of(ball, [Plane(np.array([0.0, 0.0, 1.0]), -12.0), tool], tool=tool)
     poses = np.tile(np.eye(4), (4, 1, 1))
@@ -239,7 +239,7 @@ def test_pressing_squeezes_between_tool_and_floor(one_device, ball):
     assert np.ptp(x[:, 0]) > wide
 
 
-def test_a_dragged_tool_drags_the_surface_by_its_friction(one_device, block):
+def test_a_dragged_tool_moves_the_surface_by_friction(one_device, block):
     moved = {}
     for friction in (0.0, 0.5):
         tool = ConvexTool.cuboid(np.array([60.0, 60.0, 10.0]))
@@ -257,17 +257,17 @@ def test_a_dragged_tool_drags_the_surface_by_its_friction(one_device, block):
     assert 0.7 < moved[0.5] < 2.1
 
 
-def oracle_of_pushes(solver: Solver, x: np.ndarray, motion: np.ndarray, passes: int, factor: float):
-    """Where particles (n, 3) go in passes of pushes with Coulomb's friction in float64; how many of those slid, and had two shapes."""
+def oracle_of_pushes(solver: Solver, x: np.ndarray, motion: np.ndarray, iterations: int, factor: float):
+    """Where particles (n, 3) go in iterations of pushes with Coulomb's friction in float64; how many of those slid, and had two shapes."""
     contacts, start = solver.contacts, position(solver)
     plane, touched = array_of(contacts.contact.plane).astype(float), array_of(contacts.touched)
     x, slid, several = x.copy(), 0, 0
     for i in range(len(x)):
         shapes = [s for s in range(len(contacts.shapes)) if touched[i] >> s & 1]
         pushed, rubbed = dict.fromkeys(shapes, 0.0), {s: np.zeros(3) for s in shapes}
-        for _ in range(passes):
+        for _ in range(iterations):
             depth = {s: max(plane[i, s, 3] - plane[i, s, :3] @ x[i], 0.0) for s in shapes}
-            active = sum(depth[s] > 0 or (contacts.rough and pushed[s] > 0) for s in shapes)
+            active = sum(depth[s] > 0 or (contacts.has_friction and pushed[s] > 0) for s in shapes)
             share, change = min(factor / max(active, 1), 1.0), np.zeros(3)
             several += active > 1
             for s in shapes:
@@ -305,28 +305,28 @@ def test_pushes_and_friction_are_the_oracles(kept, block, factor):
     @ti.kernel
     def push():
         for i in range(body.count):
-            body.estimate[i] += contacts.pushed(i, body.estimate[i], factor)
+            body.predicted[i] += contacts.pushed(i, body.predicted[i], factor)
 
     # The second time nothing is left of the first.
     for _ in range(2):
         begin(solver, [0.0, 0.0, -1e-3], 0.01)
         motion = np.array([[0.0] * 3, [0.0] * 3, [0.3, -0.2, -0.3]])
         wanted, slid, several = oracle_of_pushes(
-            solver, array_of(body.estimate).astype(float), motion, 3, factor
+            solver, array_of(body.predicted).astype(float), motion, 3, factor
         )
         assert slid > 30 and several > 10
         for _ in range(3):
             push()
-        # Float32 positions of 12 mm carry 1e-6 mm, and the same of each plane's offset, in each of three passes.
-        assert np.abs(array_of(body.estimate) - wanted).max() < 2e-5
+        # Float32 positions of 12 mm carry 1e-6 mm, and the same of each plane's offset, in each of three iterations.
+        assert np.abs(array_of(body.predicted) - wanted).max() < 2e-5
 
 
 def test_stabilisation_gets_out_without_adding_velocity(kept, ball):
     fastest = []
-    for passes in (0, 4):
+    for iterations in (0, 4):
         solver = kept(on_floor, ball, -10.0, 0.0)
         settings = StepSettings(
-            gravity=(0, 0, 0), damping=0.0, stabilisation_iterations=passes, stiffness=0.0
+            gravity=(0, 0, 0), damping=0.0, stabilisation_iterations=iterations, stiffness=0.0
         )
         solver.step(settings)
         fastest.append(np.abs(array_of(solver.body.velocity)).max())
@@ -339,9 +339,9 @@ def test_stabilisation_gets_out_without_adding_velocity(kept, ball):
 def test_stabilisation_moves_position_and_estimate_alike(one_device, ball):
     solver = solver_of(ball, [Plane(np.array([0.0, 0.0, 1.0]), -10.0)])
     ends = []
-    for passes in (0, 4):
-        begin(solver, [0.0, 0.0, -9810.0], 1 / 180, passes)
-        ends.append((position(solver), array_of(solver.body.estimate)))
+    for iterations in (0, 4):
+        begin(solver, [0.0, 0.0, -9810.0], 1 / 180, iterations)
+        ends.append((position(solver), array_of(solver.body.predicted)))
     moved = ends[1][0] - ends[0][0], ends[1][1] - ends[0][1]
     assert moved[0][:, 2].max() > 1.0
     assert moved[1] == pytest.approx(moved[0], abs=1e-5)

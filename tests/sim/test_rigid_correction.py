@@ -37,7 +37,7 @@ def test_any_rigid_way_is_found_whole(device, serial, spin):
     wanted = (x - centre) @ rotation_about([2, -1, 1], 25).T + centre + [1.5, -0.8, 2.0]
     velocity = np.cross(spin, x - centre) / DT
     model.body.restore(BodyState(x.astype(np.float32), velocity.astype(np.float32)))
-    fill((model.body.estimate, wanted))
+    fill((model.body.predicted, wanted))
     begin(model, DT)
     # However it moved before. Places of up to 25 mm carry 2e-6 mm in float32, and a turn of as many digits has them for its lever.
-    assert np.abs(array_of(model.body.estimate) - wanted).max() < 1.2e-5
+    assert np.abs(array_of(model.body.predicted) - wanted).max() < 1.2e-5

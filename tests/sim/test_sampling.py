@@ -8,9 +8,8 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from sim.body import fill_body
 from sim.lattice import fill_with_cells
-from sim.sampling import SamplingError, occupied_voxels, sample_clusters, sample_particles
+from sim.sampling import SamplingError, fill_body, occupied_voxels, sample_clusters, sample_particles
 
 
 def test_particles_keep_their_distance_and_leave_no_room(ball):
@@ -31,7 +30,7 @@ def test_occupied_voxels_have_the_volume_of_the_surface(ball):
     assert occupied.sum() * pitch**3 == pytest.approx(ball.volume, rel=0.01)
 
 
-def test_voxels_lie_evenly_within_the_surfaces_bounds(ball):
+def test_voxels_are_centred_in_the_surfaces_bounds(ball):
     ball = ball.copy().apply_translation([3.0, -1.0, 2.0])
     for pitch in (0.7, 1.0):
         origin, occupied = occupied_voxels(ball.vertices, ball.faces, pitch)
@@ -74,7 +73,7 @@ def test_clusters_cover_and_overlap(ball):
         assert cKDTree(members).query_ball_point(members, spacing, return_length=True).max() == len(members)
 
 
-def test_memberships_seen_from_the_particles_are_the_same(ball):
+def test_transposed_clusters_have_the_same_memberships(ball):
     particles = sample_particles(ball.vertices, ball.faces, 2.0, 4)
     clusters = sample_clusters(particles, 6.0)
     seen = clusters.transposed(len(particles))
@@ -96,7 +95,7 @@ def test_a_body_touches_where_its_surface_does(ball):
     assert np.abs(body.contact_radius - np.minimum(depth, 2.0)).max() < 0.1
 
 
-def test_a_radius_too_large_is_refused_in_words(ball):
+def test_a_radius_too_large_is_refused(ball):
     with pytest.raises(SamplingError, match="choose a smaller radius"):
         sample_particles(ball.vertices, ball.faces, 30.0)
 
@@ -110,20 +109,20 @@ def test_counts_on_a_real_kidney_are_those_of_the_papers_scale(data, radius, par
     assert 100 < len(sample_clusters(found, 3.33 * radius)) < 450
 
 
-def test_what_no_memory_holds_is_refused_with_what_it_takes(ball, monkeypatch):
+def test_too_little_memory_is_refused_with_the_amount_needed(ball, monkeypatch):
     def free(count):
         monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=count))
 
     # A box of 24 mm in voxels of 0.5 mm: 48 each way, of 80 bytes.
     free(80 * 48**3 - 1)
     with pytest.raises(
-        SamplingError, match=r"of 2 mm radius take 0\.0 GB .*, and 0\.0 GB are free: choose larger"
+        SamplingError, match=r"of 2 mm radius need 0\.0 GB .*, and 0\.0 GB are free: choose larger"
     ):
         sample_particles(ball.vertices, ball.faces, 2.0, 4)
     free(80 * 48**3)
     assert len(sample_particles(ball.vertices, ball.faces, 2.0, 4)) > 100
     free(9000 * ball.volume / 8 - 1)
-    with pytest.raises(SamplingError, match="cells of 2 mm take"):
+    with pytest.raises(SamplingError, match="cells of 2 mm need"):
         fill_with_cells(ball, 2.0)
     free(9000 * ball.volume / 8 + 1)
     assert fill_with_cells(ball, 2.0).cell_mm == 2

@@ -1,4 +1,4 @@
-"""Contacts of particles with each other: who is near, how a push is shared, and friction, against float64 oracles."""
+"""Self-contact: neighbours, displacements and friction, against float64 oracles."""
 
 from itertools import pairwise
 
@@ -18,7 +18,7 @@ def two_blocks(pairs: bool, scaling: float = 0.0, floor: bool = True) -> Solver:
     """One block over another, on a floor."""
     lower = trimesh.creation.box([12.0, 12.0, 8.0])
     upper = lower.copy()
-    # Clusters reach 5 mm: nearer bodies would be held together by them.
+    # Clusters reach 5 mm: nearer bodies would share clusters.
     upper.apply_translation([0, 0, 14.0])
     shapes = [Plane(np.array([0.0, 0.0, 1.0]), -4.0)] * floor
     both = trimesh.util.concatenate([lower, upper])
@@ -26,7 +26,7 @@ def two_blocks(pairs: bool, scaling: float = 0.0, floor: bool = True) -> Solver:
 
 
 def of_upper(solver: Solver) -> np.ndarray:
-    """Which particles (n,) are the upper block's."""
+    """Mask (n,) of the upper block's particles."""
     return solver.body.rest_points[:, 2] > 7
 
 
@@ -40,14 +40,14 @@ def test_particles_that_share_no_cluster_keep_their_distance(kept):
         x = position(solver)
         height[pairs] = x[upper][:, 2].mean() - x[~upper][:, 2].mean()
         if pairs:
-            # The lowest layer, a twelfth of the block, holds its weight, g h^2 = 0.3 mm a substep, in 30 passes that
+            # The lowest layer, a twelfth of the block, holds its weight, g h^2 = 0.3 mm a substep, in 30 iterations that
             # share each push between two: 0.3 * 12 / 30 * 2 mm short of the distance, at the averaged pushes.
             assert np.linalg.norm(x[upper][:, None] - x[~upper][None], axis=2).min() > 0.75 * 1.5
     assert height[True] == pytest.approx(8.0, abs=1.5)
     assert height[False] < 4.0
 
 
-def test_contacts_of_particles_keep_momentum_of_a_symmetric_hit(kept):
+def test_self_contact_conserves_momentum_of_a_symmetric_impact(kept):
     solver = kept(two_blocks, True, floor=False)
     upper = of_upper(solver)
     velocity = np.where(upper[:, None], [0, 0, -150.0], [0, 0, 150.0])
@@ -68,7 +68,7 @@ def test_neighbours_are_all_that_are_near_in_ascending_order(kept):
     x[upper, 2] -= 7.0
     fill((solver.body.position, x))
     begin(solver, [0.0, 0.0, 0.0])
-    count, rows = array_of(solver.pairs.neighbour_count), array_of(solver.pairs.neighbour)
+    count, rows = array_of(solver.self_contacts.neighbour_count), array_of(solver.self_contacts.neighbour)
     apart = np.linalg.norm(x[:, None] - x[None], axis=2)
     patches = solver.model.patches
     of_patch = [set(patches.clusters.members[a:b]) for a, b in pairwise(patches.clusters.offsets)]
@@ -76,7 +76,7 @@ def test_neighbours_are_all_that_are_near_in_ascending_order(kept):
     for i in range(len(x)):
         near = [
             j
-            for j in np.flatnonzero(apart[i] < solver.pairs.reach)
+            for j in np.flatnonzero(apart[i] < solver.self_contacts.reach)
             if j != i and not clusters[i] & clusters[j]
         ]
         assert rows[i, : count[i]].tolist() == near[:24]
@@ -84,8 +84,8 @@ def test_neighbours_are_all_that_are_near_in_ascending_order(kept):
 
 
 def pairs_pass(solver: Solver, moved: np.ndarray, factor: float) -> tuple[np.ndarray, int, int]:
-    """Estimates (n, 3) after one pass over pairs in float64, and how many of these stick and slide."""
-    pairs, body = solver.pairs, solver.body
+    """Predicted positions (n, 3) after one iteration over pairs in float64, and how many pairs stick and slide."""
+    pairs, body = solver.self_contacts, solver.body
     x = moved + array_of(body.position)
     mass = array_of(body.mass_scale).astype(float) if body.mass_scaled else np.ones(len(x))
     row, count = array_of(pairs.neighbour), array_of(pairs.neighbour_count)
@@ -111,16 +111,16 @@ def pairs_pass(solver: Solver, moved: np.ndarray, factor: float) -> tuple[np.nda
 
 
 @pytest.mark.parametrize("relaxation, scaling", [("local", 0.0), ("global", 0.0), ("local", 0.5)])
-def test_a_pass_over_pairs_is_the_oracles(one_device, relaxation, scaling):
+def test_an_iteration_over_pairs_matches_the_oracle(one_device, relaxation, scaling):
     lower = trimesh.creation.box([9.0, 9.0, 6.0])
     upper = lower.copy().apply_translation([0, 0, 12.0])
     both = trimesh.util.concatenate([lower, upper])
     solver = solver_of(both, radius=1.5, relaxation=relaxation, scaling=scaling, pairs=True)
-    body, pairs = solver.body, solver.pairs
+    body, pairs = solver.body, solver.self_contacts
     x, random = position(solver), np.random.default_rng(5)
     over = x[:, 2] > 6
     x[over] -= [0.4, 0.3, 6.2]
-    # Two are at one place, and stay so.
+    # Two are at the same point, and stay there.
     x[x[:, 2].argmax()] = x[x[:, 2].argmin()]
     top, bottom = np.flatnonzero((x == x[x[:, 2].argmin()]).all(axis=1))
     moved = random.normal(0, 0.05, x.shape) * random.uniform(0, 1, (len(x), 1)) ** 3
@@ -137,31 +137,31 @@ def test_a_pass_over_pairs_is_the_oracles(one_device, relaxation, scaling):
         x[over, 2] += lift
         fill((body.position, x))
         begin(solver, [0.0, 0.0, -1e-3], 0.01)
-        moved = array_of(body.estimate).astype(float) - array_of(body.position)
+        moved = array_of(body.predicted).astype(float) - array_of(body.position)
         wanted, sticks, slides = pairs_pass(solver, moved, 1.3)
         assert sticks > least and slides > least
         project()
         most.append(pairs.most_contacts[None])
         # Float32 positions of 10 mm carry 1e-6 mm; a normal of two that are 1 mm apart, as much of its own.
-        assert np.abs(array_of(body.estimate) - wanted).max() < 1e-5
+        assert np.abs(array_of(body.predicted) - wanted).max() < 1e-5
     assert most[0] > most[1]
 
 
-def test_a_pair_shares_its_push_by_the_scaled_masses(kept):
+def test_a_pair_is_displaced_by_the_inverse_scaled_masses(kept):
     solver = kept(two_blocks, True, scaling=0.5, floor=False)
     upper = of_upper(solver)
     x = position(solver)
     x[upper, 2] -= 5.0
     fill((solver.body.position, x))
     begin(solver, [0.0, 0.0, -1e-3])
-    pairs = solver.pairs
+    pairs = solver.self_contacts
 
     @ti.kernel
     def project():
         pairs.project(1.0)
 
     project()
-    moved = np.linalg.norm(array_of(solver.body.estimate) - x, axis=1)
+    moved = np.linalg.norm(array_of(solver.body.predicted) - x, axis=1)
     apart = np.linalg.norm(x[upper][:, None] - x[~upper][None], axis=2) < pairs.distance
     top, bottom = np.flatnonzero(upper), np.flatnonzero(~upper)
     alone = [(i, j) for i, j in np.argwhere(apart) if apart[i].sum() == 1 and apart[:, j].sum() == 1]

@@ -1,4 +1,4 @@
-"""The paper's tissue model against a NumPy float64 oracle, and the momentum that it must keep."""
+"""The paper's tissue model against a NumPy float64 oracle, and conservation of momentum."""
 
 from itertools import pairwise
 
@@ -9,10 +9,9 @@ from conftest import rotation_about
 from particle_tissue import tissue_of
 from test_solver import on_floor, solver_of
 
-from sim.body import BodyState, ParticleBody, fill_body
+from sim.body import BodyState, ParticleBody
 from sim.fields import array_of, fill
-from sim.particle_patches import arrange
-from sim.sampling import sample_clusters
+from sim.sampling import fill_body, group_into_patches, sample_clusters
 from sim.shape_matching import ShapeMatching
 from sim.shapes import Plane
 
@@ -29,19 +28,19 @@ def project(model: ti.template(), stiffness: float, factor: float):
 
 
 def deformed(particles: np.ndarray) -> np.ndarray:
-    """Bent, stretched, turned and moved away, with noise: no cluster is only rigid."""
+    """Positions bent, stretched, rotated and translated, with noise: no cluster moves rigidly."""
     random = np.random.default_rng(2)
     bent = particles + 0.02 * particles[:, [2, 0, 1]] ** 2 + random.normal(0, 0.2, particles.shape)
     return 1.1 * bent @ rotation_about([1, 2, 3], 70).T + [5.0, -3.0, 8.0]
 
 
 def oracle(model: ShapeMatching, x: np.ndarray, step: float, mass: np.ndarray | None = None) -> np.ndarray:
-    """One pass of Eqs. 8, 9, 12 and 7 in float64, cluster by cluster, for particles of a mass (n,)."""
+    """One iteration of Eqs. 8, 9, 12 and 7 in float64, cluster by cluster, for particles of a mass (n,)."""
     rest, patches = model.body.rest_points, model.patches
-    shared = patches.shared[patches.of_particles()].astype(float)
+    shared = patches.cluster_counts[patches.of_particles()].astype(float)
     weight = 1 / shared if model.relaxation == "local" else np.ones(len(rest))
     weight = weight if mass is None else weight * mass
-    of_patch = np.repeat(np.arange(len(patches)), patches.shared)
+    of_patch = np.repeat(np.arange(len(patches)), patches.cluster_counts)
     total = np.zeros_like(x)
     for c in range(model.count):
         i = np.flatnonzero(np.isin(patches.of_particles(), of_patch[patches.clusters.members == c]))
@@ -67,19 +66,19 @@ def moved_body(
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
 @pytest.mark.parametrize("stiffness, factor", [(1.0, 1.0), (0.4, 1.0), (0.9, 1.7)])
-def test_a_pass_is_the_oracles(kept, block, relaxation, stiffness, factor):
+def test_an_iteration_matches_the_oracle(kept, block, relaxation, stiffness, factor):
     body, model, x = moved_body(kept, block, relaxation)
     project(model, stiffness, factor)
     wanted = oracle(model, x, stiffness * factor)
     assert np.abs(wanted - x).max() > 0.3
-    assert np.abs(array_of(body.estimate) - wanted).max() < ROUNDING_MM
+    assert np.abs(array_of(body.predicted) - wanted).max() < ROUNDING_MM
 
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
-def test_a_pass_keeps_linear_and_angular_momentum(kept, block, relaxation):
+def test_an_iteration_conserves_linear_and_angular_momentum(kept, block, relaxation):
     body, model, x = moved_body(kept, block, relaxation)
     project(model, 0.8, 1.0)
-    change = array_of(body.estimate) - x
+    change = array_of(body.predicted) - x
     # Each of n particles contributes its rounding, which adds like a random walk; the angular sum has lever arms.
     n = len(x)
     assert np.abs(change).sum() > 100
@@ -91,16 +90,16 @@ def test_a_pass_keeps_linear_and_angular_momentum(kept, block, relaxation):
 def test_a_rigid_motion_is_no_deformation(kept, block):
     body, model, _ = moved_body(kept, block, "local")
     turned = body.rest_points @ rotation_about([0, 1, 1], 130).T + [100.0, 20.0, -50.0]
-    fill((body.estimate, turned))
+    fill((body.predicted, turned))
     project(model, 1.0, 1.0)
     # At 100 mm float32 carries 1e-5 mm.
-    assert np.abs(array_of(body.estimate) - turned).max() < 10 * ROUNDING_MM
+    assert np.abs(array_of(body.predicted) - turned).max() < 10 * ROUNDING_MM
 
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
-def test_pushed_patches_know_where_their_particles_are(one_device, block, relaxation):
+def test_patches_follow_their_particles_after_contact(one_device, block, relaxation):
     model = tissue_of(block, shapes=[Plane(np.array([0.2, -0.1, 1.0]), -5.0)], relaxation=relaxation)
-    patches, several = model.patches, model.patches.several
+    patches, several = model.patches, model.patches.multi_count
     x = deformed(model.body.rest_points) * 0.9 - [4.0, -2.0, 7.0]
     model.body.restore(BodyState(x.astype(np.float32), np.zeros(x.shape, np.float32)))
     model.update_frames()
@@ -113,16 +112,16 @@ def test_pushed_patches_know_where_their_particles_are(one_device, block, relaxa
         model.project(0.9, 1.0, 0.0)
 
     pressed()
-    estimate = array_of(model.estimate)[:, :3].astype(float)
+    predicted = array_of(model.predicted)[:, :3].astype(float)
     touched = np.bincount(patches.of_particles(), array_of(model.contacts.touched) > 0)
     assert 10 < (touched[:several] > 0).sum() < several - 10
-    centre = np.add.reduceat(estimate, patches.start[:-1]) / patches.sizes[:, None]
+    centre = np.add.reduceat(predicted, patches.start[:-1]) / patches.sizes[:, None]
     assert np.abs(array_of(model.centre)[:, :3] - centre).max() < ROUNDING_MM
-    share = 1 / patches.shared if relaxation == "local" else np.ones(len(patches))
+    share = 1 / patches.cluster_counts if relaxation == "local" else np.ones(len(patches))
     rest, moment = model.body.rest_points, array_of(model.moment)
     for p in range(several):
         of = slice(patches.start[p], patches.start[p + 1])
-        wanted = share[p] * (rest[of] - rest[of].mean(axis=0)).T @ (estimate[of] - centre[p])
+        wanted = share[p] * (rest[of] - rest[of].mean(axis=0)).T @ (predicted[of] - centre[p])
         # Each of a patch's particles rounds times its lever, which is at most 7 mm.
         assert np.abs(moment[p][:3, :3] - wanted).max() < 7 * patches.sizes[p] * ROUNDING_MM
 
@@ -135,12 +134,12 @@ def push_out(model: ti.template(), factor: float):
 
 
 @pytest.mark.parametrize("factor, left", [(0.4, 0.6), (1.0, 0.0), (1.7, 0.0)])
-def test_a_push_goes_as_far_as_the_relaxation_factor_but_not_beyond_the_surface(kept, block, factor, left):
+def test_over_relaxation_does_not_move_particles_beyond_the_surface(kept, block, factor, left):
     model = kept(on_floor, block, -7.5, 0.0).model
     body = model.body
     push_out(model, factor)
     depth = array_of(body.contact_radius) - 7.5 - body.rest_points[:, 2]
-    moved = array_of(model.estimate)[:, 2] - body.rest_points[:, 2]
+    moved = array_of(model.predicted)[:, 2] - body.rest_points[:, 2]
     assert (depth > 0.4).sum() > 20
     assert np.abs(moved - (1 - left) * np.maximum(depth, 0.0)).max() < ROUNDING_MM
 
@@ -154,22 +153,22 @@ def test_collapsed_flat_and_inverted_bodies_come_back_to_finite_shapes(kept, blo
         np.diag([1.0, 0.0, 0.0]),
         np.diag([1.0, 1.0, -1.0]),
     ):
-        fill((body.estimate, (rest @ squash)))
+        fill((body.predicted, (rest @ squash)))
         project(model, 1.0, 1.0)
-        assert np.isfinite(array_of(body.estimate)).all()
+        assert np.isfinite(array_of(body.predicted)).all()
         turned = array_of(model.frame)[:, :3, :3].astype(float)
         assert np.abs(np.linalg.det(turned) - 1).max() < 1e-5
 
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
-def test_scaled_masses_pull_the_clusters_towards_the_heavier(kept, block, relaxation):
+def test_scaled_masses_move_the_clusters_towards_the_heavier(kept, block, relaxation):
     body, model, x = moved_body(kept, block, relaxation, mass_scaling=0.1)
     mass = np.exp(-0.1 * body.rest_points[:, 2]).astype(np.float32)
     fill((body.mass_scale, mass))
     project(model, 1.0, 1.0)
     wanted = oracle(model, x, 1.0, mass.astype(float))
     assert np.abs(wanted - oracle(model, x, 1.0)).max() > 100 * ROUNDING_MM
-    assert np.abs(array_of(body.estimate) - wanted).max() < ROUNDING_MM
+    assert np.abs(array_of(body.predicted) - wanted).max() < ROUNDING_MM
 
 
 def test_frames_do_not_depend_on_those_before(kept, block):
@@ -183,9 +182,9 @@ def test_frames_do_not_depend_on_those_before(kept, block):
     assert np.array_equal(array_of(model.frame), first)
 
 
-def test_patches_hold_each_membership_of_the_clusters(block):
+def test_patches_have_each_membership_of_the_clusters(block):
     rest = fill_body(block, 2.0)
-    arranged, patches = arrange(rest, 3.33)
+    arranged, patches = group_into_patches(rest, 3.33)
     assert sorted(map(tuple, arranged.particles)) == sorted(map(tuple, rest.particles))
     clusters = sample_clusters(rest.particles, 3.33 * 2.0)
     wanted = {
@@ -197,9 +196,11 @@ def test_patches_hold_each_membership_of_the_clusters(block):
         for c in rows[p]:
             found.setdefault(int(c), set()).add(tuple(particle))
     assert {frozenset(members) for members in found.values()} == wanted
-    # No two patches are in the same clusters, and those of several particles come first.
+    # No two patches are in the same clusters, and those with several particles come first.
     assert len({row.tobytes() for row in rows}) == len(patches)
-    assert (patches.sizes[: patches.several] > 1).all() and (patches.sizes[patches.several :] == 1).all()
+    assert (patches.sizes[: patches.multi_count] > 1).all() and (
+        patches.sizes[patches.multi_count :] == 1
+    ).all()
 
 
 def test_an_unknown_relaxation_is_refused_by_name(one_device, block):

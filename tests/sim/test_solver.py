@@ -1,11 +1,11 @@
-"""A time step as Algorithm 1 has it: against closed forms, and the same bits every time."""
+"""A time step of Algorithm 1 against closed forms, and its determinism."""
 
 import numpy as np
 import pytest
 from particle_tissue import tissue_of
 
 from sim.fields import array_of, fill
-from sim.self_contact import ParticleContacts
+from sim.self_contact import SelfContacts
 from sim.shapes import ConvexTool, Plane, SignedDistanceField
 from sim.solver import Solver, StepSettings
 
@@ -24,7 +24,7 @@ def solver_of(
     serial=None,
 ):
     model = tissue_of(mesh, radius, shapes, friction, relaxation, scaling, serial=serial)
-    particle_contacts = ParticleContacts(model, 0.25) if pairs else None
+    particle_contacts = SelfContacts(model, 0.25) if pairs else None
     return Solver(model, particle_contacts, tool)
 
 
@@ -43,7 +43,7 @@ def position(solver: Solver) -> np.ndarray:
 
 
 @pytest.mark.parametrize("damping", [0.0, 12.0])
-def test_a_falling_body_falls_as_the_scheme_says(kept, block, damping):
+def test_free_fall_matches_the_integrator(kept, block, damping):
     solver = kept(solver_of, block)
     settings = StepSettings(damping=damping, stiffness=0.9)
     start_at = position(solver)
@@ -76,7 +76,7 @@ def test_without_damping_the_scheme_is_first_order_in_the_exact_parabola(kept, b
 
 
 @pytest.mark.parametrize("relaxation", ["local", "global"])
-def test_linear_momentum_is_kept_without_contact_and_gravity(kept, block, relaxation):
+def test_linear_momentum_is_conserved_without_contact_and_gravity(kept, block, relaxation):
     solver = kept(solver_of, block, relaxation=relaxation)
     x = position(solver)
     velocity = np.cross([0.0, 2.0, 9.0], x) + 40 * np.sin(x[:, [1, 2, 0]]) + [100.0, 50.0, 20.0]
@@ -84,7 +84,7 @@ def test_linear_momentum_is_kept_without_contact_and_gravity(kept, block, relaxa
     for _ in range(10):
         solver.step(StepSettings(gravity=(0, 0, 0), damping=0.0, stiffness=0.7))
     later = array_of(solver.body.velocity).astype(np.float64)
-    # A cluster's frame rounds by three operations at 40 mm (4e-6 mm), for all its members and the nine passes of a
+    # A cluster's frame rounds by three operations at 40 mm (4e-6 mm), for all its members and the nine iterations of a
     # substep alike; over clusters and the thirty substeps it adds at random.
     spread = solver.body.count / solver.model.count**0.5
     rounding = 4e-6 * 180 * spread * 9 * 30**0.5
@@ -92,7 +92,7 @@ def test_linear_momentum_is_kept_without_contact_and_gravity(kept, block, relaxa
     assert np.abs(later.sum(axis=0) - velocity.sum(axis=0)).max() < 3 * rounding
 
 
-def test_angular_momentum_is_kept_to_the_order_of_the_scheme(kept, block):
+def test_angular_momentum_is_conserved_to_the_order_of_the_scheme(kept, block):
     turning, steps, time_step = 10.0, 8, 1 / 60
     lost = []
     for substeps in (4, 8):
@@ -127,7 +127,7 @@ def test_stiffness_one_moves_a_small_body_rigidly(one_device):
 
 
 def slide(kept, block, slope_deg: float, friction: float = 0.35) -> tuple[float, float]:
-    """Acceleration down a slope over 0.2 s, as a share of g, and the speed then [mm/s]; it starts from rest."""
+    """Acceleration down a slope over 0.2 s, relative to g, and the final speed [mm/s]; it starts from rest."""
     angle = np.radians(slope_deg)
     solver = kept(on_floor, block, -8.0, friction)
     settings = StepSettings(
@@ -156,12 +156,12 @@ def test_beyond_it_the_block_accelerates_by_coulombs_law(kept, block, slope_deg)
     assert slide(kept, block, slope_deg)[0] == pytest.approx(wanted, rel=0.05)
 
 
-def test_without_friction_a_slope_holds_nothing(kept, block):
+def test_without_friction_a_block_slides_on_any_slope(kept, block):
     assert slide(kept, block, 10.0, friction=0.0)[0] == pytest.approx(np.sin(np.radians(10)), rel=0.02)
 
 
 @pytest.mark.parametrize("serial", [True, False])
-def test_the_tool_goes_along_its_poses_and_stays_where_it_came_to(kept, block, serial):
+def test_the_tool_follows_its_poses_and_stays_at_the_last(kept, block, serial):
     tool = ConvexTool.cuboid(np.array([4.0, 4.0, 4.0]))
     solver = solver_of(block, [tool], tool=tool, serial=serial)
     poses = np.tile(np.eye(4), (4, 1, 1))
@@ -214,8 +214,8 @@ def test_over_relaxation_converges_faster(kept, ball):
     assert sag[1] < 0.8 * sag[0]
 
 
-def test_what_a_scene_switches_off_is_not_there(kept, block):
+def test_features_switched_off_take_no_memory(kept, block):
     solver = kept(solver_of, block)
-    assert not hasattr(solver.body, "mass_scale") and solver.contacts is None and solver.pairs is None
+    assert not hasattr(solver.body, "mass_scale") and solver.contacts is None and solver.self_contacts is None
     assert hasattr(solver_of(block, scaling=0.1).body, "mass_scale")
     assert not hasattr(kept(on_floor, block, -8.0, 0.0).contacts, "push")

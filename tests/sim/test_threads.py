@@ -1,4 +1,4 @@
-"""What gives the same bits although Taichi was started anew, with as many threads or another number."""
+"""The same bits after another start of Taichi, with any number of threads."""
 
 import hashlib
 from dataclasses import replace
@@ -30,7 +30,7 @@ def pressed(mesh, threads: int, serial: bool) -> bytes:
 
 
 @pytest.mark.parametrize("serial", [True, False])
-def test_pairs_give_the_same_bits_whatever_the_threads(ball, serial):
+def test_self_contact_gives_the_same_bits_for_any_number_of_threads(ball, serial):
     assert pressed(ball, 1, serial) == pressed(ball, 2, serial)
     ti.reset()
 

@@ -1,4 +1,4 @@
-"""What every tissue model must do, whichever they are: a model that is registered is tested here without a line of its own."""
+"""Tests of every registered tissue model."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -33,7 +33,7 @@ AWAY_MM, FACE_MM = 60.0, 5.0
 
 @dataclass
 class Subject:
-    """A ball of a model's tissue, with the carried points of its surface, and the state in which it was built."""
+    """A ball of a model's tissue, with its skin and its initial state."""
 
     model: str
     mesh: trimesh.Trimesh
@@ -51,15 +51,15 @@ class Subject:
         return replace(settings, gravity=(0.0, 0.0, -gravity), **changed)
 
     def put(self, at: np.ndarray, velocity: np.ndarray | float = 0.0) -> None:
-        """The body by another hand at places (n, 3) with velocities (n, 3)."""
+        """Set the body's positions (n, 3) and velocities (n, 3)."""
         moving = np.broadcast_to(np.asarray(velocity, np.float32), at.shape).copy()
         self.solver.body.restore(BodyState(at.astype(np.float32), moving))
         if self.solver.contacts is not None:
-            self.solver.contacts.forget()
+            self.solver.contacts.reset()
         self.solver.model.update_frames()
 
     def press(self, settings: StepSettings, first_mm: float, last_mm: float, steps: int) -> None:
-        """Lead the tool's middle evenly from one height to another."""
+        """Move the tool's centre evenly from one height to another."""
         way = np.linspace(first_mm, last_mm, steps * settings.substeps + 1)
         for n in range(0, len(way) - 1, settings.substeps):
             self.solver.step(settings, np.stack([lifted(z) for z in way[n : n + settings.substeps + 1]]))
@@ -68,7 +68,7 @@ class Subject:
         return array_of(self.solver.body.position).astype(float)
 
     def surface(self) -> np.ndarray:
-        """Where the points of the surface are now (n, 3)."""
+        """Current positions (n, 3) of the surface points."""
         self.skin.update()
         return array_of(self.skin.vertices).astype(float)
 
@@ -88,7 +88,7 @@ def lifted(z: float) -> np.ndarray:
 
 
 def ball_of(model: str, on_table: bool, serial: bool | None = None) -> Subject:
-    """Nothing touches it, or a table under it, and a tool that is away."""
+    """A free ball, or one on a table, with the tool far away."""
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS_MM)
     tool = ConvexTool.cuboid(np.array([10.0, 6.0, 2 * FACE_MM]))
     tool.move(lifted(AWAY_MM), lifted(AWAY_MM))
@@ -126,7 +126,7 @@ def test_a_model_has_presets_from_coarse_to_fine():
         assert PRESETS[model]["balanced"].tissue == tissue_of(model)
 
 
-def test_it_tells_its_size(free):
+def test_it_reports_its_size(free):
     first, count = next(iter(free.solver.model.counts().items()))
     counts = free.solver.model.counts()
     assert (
@@ -139,18 +139,18 @@ def test_it_tells_its_size(free):
     assert min(static_shape(free.mesh, free.tissue).shape) > 26
 
 
-def test_left_alone_it_stays_as_it_is(free):
+def test_without_forces_it_does_not_move(free):
     settings = free.settings()
     for _ in range(20):
         free.solver.step(settings)
     n = 20 * settings.substeps
-    # Each of n substeps rounds some ten operations a pass, at random; what that moves the body by goes on as a velocity, so
+    # Each of n substeps rounds some ten operations an iteration, at random; what that moves the body by goes on as a velocity, so
     # that the errors add up twice: to sqrt(n^3 / 3) of one.
     rounding = ROUNDING_MM * (10 * settings.iterations) ** 0.5 * (n**3 / 3) ** 0.5
     assert np.abs(free.position() - free.solver.body.rest_points).max() < 3 * rounding
 
 
-def test_it_falls_as_all_things_do(free):
+def test_it_falls_freely(free):
     settings = free.settings(G)
     before = free.position()
     for _ in range(10):
@@ -162,7 +162,7 @@ def test_it_falls_as_all_things_do(free):
     assert np.abs(fallen[:, :2]).max() < 1e-5 * n**2
 
 
-def test_what_drifts_goes_on(free):
+def test_linear_motion_continues(free):
     settings, before, drift = free.settings(), free.surface(), np.array([50.0, -20.0, 10.0])
     free.put(free.solver.body.rest_points, drift)
     for _ in range(10):
@@ -171,7 +171,7 @@ def test_what_drifts_goes_on(free):
     assert free.surface() == pytest.approx(before + 10 * settings.time_step_s * drift, abs=1e-5 * n**2)
 
 
-def test_what_spins_goes_on(free):
+def test_rotation_continues(free):
     spin, settings, rest, before = 5.0, free.settings(), free.solver.body.rest_points, free.surface()
     free.put(rest, np.cross([0.0, 0.0, spin], rest))
     for _ in range(10):
@@ -185,7 +185,7 @@ def test_what_spins_goes_on(free):
 
 
 @pytest.mark.parametrize("model", TISSUES)
-def test_the_same_bits_whatever_the_threads(model):
+def test_the_same_bits_for_any_number_of_threads(model):
     found = []
     for threads in (1, 2):
         start("cpu", cpu_max_num_threads=threads)
@@ -198,7 +198,7 @@ def test_the_same_bits_whatever_the_threads(model):
     assert found[0] == found[1]
 
 
-def test_a_restored_state_goes_on_with_the_same_bits(laid):
+def test_a_restored_state_continues_with_the_same_bits(laid):
     settings = laid.settings(G)
     laid.press(settings, 18.0, 14.0, 10)
     state, seen, ends = laid.solver.snapshot(), laid.surface(), []
@@ -210,7 +210,7 @@ def test_a_restored_state_goes_on_with_the_same_bits(laid):
     assert ends[0] == ends[1] != laid.bits()
 
 
-def test_points_are_carried_as_the_body_is(free):
+def test_attached_points_move_with_the_body(free):
     rest = free.solver.body.rest_points
     assert np.abs(free.surface() - free.mesh.vertices).max() < 10 * ROUNDING_MM
     turn, way = rotation_about([1, 2, 3], 70), np.array([20.0, -30.0, 40.0])
@@ -224,7 +224,7 @@ def test_points_are_carried_as_the_body_is(free):
     assert np.abs(array_of(embedding.skin.vertices) - vertices).max() < 1e-4
 
 
-def test_pressed_it_gives_way_and_comes_back(laid):
+def test_pressed_it_deforms_and_recovers(laid):
     settings = laid.settings(G, damping=12.0)
     laid.press(settings, AWAY_MM, AWAY_MM, 60)
     height = laid.surface()[:, 2].max()
@@ -233,7 +233,7 @@ def test_pressed_it_gives_way_and_comes_back(laid):
     under = under[(np.abs(under[:, :2]) < [4.0, 2.0]).all(axis=1), 2].max()
     # A coarse skin bulges between what touches, by less than half of the press.
     assert under < height - 3.0
-    # A contact's layer of 0.05 mm yields by itself under a pressure of Young's modulus; four times that is at a tool's edge.
+    # Penetration is 0.05 mm at a pressure of Young's modulus; at a tool's edge the pressure is up to four times that.
     assert laid.solver.contacts.measure_penetration() < 0.2
     laid.press(settings, AWAY_MM, AWAY_MM, 120)
     assert laid.surface()[:, 2].max() == pytest.approx(height, abs=0.3)
@@ -249,8 +249,8 @@ ABUSES = {
 
 
 @pytest.mark.parametrize("abuse", ABUSES)
-def test_whatever_was_done_to_it_it_stays_finite(laid, abuse):
-    guard, rest = DivergenceCheck(laid.solver), laid.solver.body.rest_points
+def test_it_stays_finite_under_extreme_states(laid, abuse):
+    divergence_check, rest = DivergenceCheck(laid.solver), laid.solver.body.rest_points
     extremes = (
         laid.settings(G),
         laid.settings(10 * G, time_step_s=0.1, iterations=1),
@@ -260,12 +260,12 @@ def test_whatever_was_done_to_it_it_stays_finite(laid, abuse):
         laid.put(ABUSES[abuse](rest), speed * np.sin(rest))
         for _ in range(10):
             laid.solver.step(settings)
-        assert guard.health().finite, (settings, speed)
-    laid.solver.restore(guard.home)
-    assert guard.health().fault == ""
+        assert divergence_check.health().finite, (settings, speed)
+    laid.solver.restore(divergence_check.initial)
+    assert divergence_check.health().fault == ""
 
 
-def test_a_stiffer_material_gives_way_less(laid):
+def test_a_stiffer_material_deforms_less(laid):
     if "young_kpa" not in TISSUES[laid.model].model_fields:
         pytest.skip("a model without a Young's modulus")
     assert isinstance(laid.solver.model, MaterialModel)

@@ -11,7 +11,7 @@ from conftest import rotation_about
 
 from app import main
 from sim.fields import fill
-from sim.neo_hookean import HOURGLASS
+from sim.neo_hookean import HOURGLASS_STIFFNESS
 from studies.beam.beam_command import markers_on
 from studies.beam.beam_comparison import mean_length, measured_oscillation, theory
 from studies.beam.cantilever import BeamMaterial, Cantilever
@@ -114,10 +114,10 @@ def test_a_slender_beam_sags_and_swings_as_beam_theory_says(device, load_g):
     beam = Cantilever(size, material, 5.0, load_g)
     sag, hz = theory(size, material, load_g)
     rest = beam.rest()
-    # With n cells in the height 1/n^2 of the bending is inside the cells, where at nu = 0 the model is HOURGLASS times
+    # With n cells in the height 1/n^2 of the bending is inside the cells, where at nu = 0 the model is HOURGLASS_STIFFNESS times
     # as stiff as the tissue; shear is 2% of the sag. The sag is 4% of the length at most: theory's small angles cost
     # 0.1%, and straight cells along the length 1/(4 x 12^2) = 0.2%.
-    stiffer = 1 + (HOURGLASS - 1) / 2**2
+    stiffer = 1 + (HOURGLASS_STIFFNESS - 1) / 2**2
     assert -rest.displacement_mm[0, 0] == pytest.approx(sag / stiffer, rel=0.01)
     assert rest.left_mm < 0.005
     frame = 0.04 / hz

@@ -12,7 +12,7 @@ import app
 from rehearsal.configuration import PRESETS, setup_of
 from scenes.scene import PAPER, load_scene
 from sim.particle_contact import ShapeContacts
-from sim.self_contact import ParticleContacts
+from sim.self_contact import SelfContacts
 from sim.shape_matching import ShapeMatching
 from sim.shapes import ConvexTool, SignedDistanceField
 from sim.surface_contact import SurfaceContacts
@@ -26,8 +26,8 @@ OWN = {
     "contact with the support": [(SignedDistanceField, "surface"), (SignedDistanceField, "room")],
     "the transducer": [(ConvexTool, "surface"), (ConvexTool, "motion")],
     "friction on shapes": [(SurfaceContacts, "bent"), (ShapeContacts, "rub")],
-    "contacts of particles": [(ParticleContacts, "find"), (ParticleContacts, "project")],
-    "scaled masses": [(ShapeMatching, "weigh_patches"), (ShapeMatching, "weigh_clusters")],
+    "contacts of particles": [(SelfContacts, "find"), (SelfContacts, "project")],
+    "scaled masses": [(ShapeMatching, "update_patch_masses"), (ShapeMatching, "update_cluster_masses")],
 }
 # Options, and the features that none of them has.
 WITHOUT = (

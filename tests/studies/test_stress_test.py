@@ -70,7 +70,7 @@ def test_a_small_body_is_maltreated_let_go_and_measured(model):
     assert rest["finite"] and rest["recovered"] and rest["fallback"] is None and rest["reason"] is None
     assert rest["rest_error_mm"] < 0.01
     assert rest["volume_ratio"] == pytest.approx(1.0, abs=0.01)
-    for put_back, why in ((lost, "no numbers"), (gone, "left the scene")):
+    for put_back, why in ((lost, "not finite"), (gone, "left the scene")):
         assert why in put_back["fallback"]
         assert put_back["finite"] and put_back["recovered"]
     # It falls 100 mm and comes to rest somewhere: where it was, or there is a reason.

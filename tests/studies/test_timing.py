@@ -17,7 +17,7 @@ from rehearsal.configuration import setup_of
 from sim.body import BodyState
 from sim.fields import array_of
 from sim.neo_hookean import LATTICE_SETTINGS
-from sim.self_contact import ParticleContacts
+from sim.self_contact import SelfContacts
 from sim.shapes import ConvexTool, Plane
 from sim.solver import Solver, StepSettings
 from studies.performance import lower_bound, step_timing, timing_command
@@ -40,7 +40,7 @@ def test_a_step_in_pieces_is_the_step(device, ball, model):
     ends = []
     for step in (solver.step, phases.step):
         solver.body.restore(solver.body.rest_state())
-        solver.contacts.forget()
+        solver.contacts.reset()
         solver.model.update_frames()
         poses = np.tile(np.eye(4), (settings.substeps + 1, 1, 1))
         for n in range(10):
@@ -84,7 +84,7 @@ def test_the_bound_in_c_computes_what_shape_matching_does(device, block):
     assert plain.run(3, 2) > 0
     assert np.abs(plain.x - x).max() > 1e-3
     # Both round at 15 mm, 1e-6 mm, in each of the operations of three passes.
-    assert np.abs(array_of(model.body.estimate) - plain.x).max() < 3e-5
+    assert np.abs(array_of(model.body.predicted) - plain.x).max() < 3e-5
 
 
 def test_memory_is_that_of_the_fields(device, block):
@@ -92,8 +92,8 @@ def test_memory_is_that_of_the_fields(device, block):
     solver = Solver(tissue)
     n = tissue.body.count
     body = (4 * 3 + 1) * 4 * n
-    pairs = ParticleContacts(tissue, 0.25)
-    grown = Solver(tissue, pairs=pairs)
+    self_contacts = SelfContacts(tissue, 0.25)
+    grown = Solver(tissue, self_contacts=self_contacts)
     own = 4 * (2**15 + 1 + 2**15 + 3 * n + 24 * n + 3 * n + 1)
     assert 1e6 * (step_timing.memory_mb(grown) - step_timing.memory_mb(solver)) == pytest.approx(own)
     # What a body of particles takes, and its model not less.

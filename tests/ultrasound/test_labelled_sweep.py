@@ -23,7 +23,7 @@ from scenes.anatomy import phantom_folder
 from scenes.scene import EMBEDDED
 from scenes.surface_files import load_surface
 from sim.embedding import Unmoved
-from sim.mesh_distance import signed_distance
+from sim.signed_distance import signed_distance
 from studies.freehand.freehand_sweeps import sweep_of
 from ultrasound import reconstruction
 from ultrasound.labelled_sweep import LABELS_SUFFIX, SUFFIX, LabelledSweep, read_ground_truth

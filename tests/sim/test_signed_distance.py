@@ -6,7 +6,7 @@ import pytest
 import trimesh
 from conftest import rotation_about
 
-from sim.distance_grid import COARSENESS, EXACT_MM, distance_grid
+from sim.signed_distance import COARSENESS, EXACT_MM, distance_grid
 
 # Float32 keeps places up to 64 mm from a corner of the grid so well; a distance takes some ten operations.
 ROUNDING_MM = 10 * 4e-6
@@ -36,7 +36,7 @@ SURFACES = {
 
 @pytest.mark.parametrize("spacing_mm", [0.7, 2.0])
 @pytest.mark.parametrize("surface", SURFACES)
-def test_distances_are_those_to_the_nearest_face(one_device, surface, spacing_mm):
+def test_distances_are_to_the_nearest_face(one_device, surface, spacing_mm):
     mesh = SURFACES[surface]
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64)
     distance, low = distance_grid(vertices, faces, spacing_mm, 8.0)
@@ -45,7 +45,7 @@ def test_distances_are_those_to_the_nearest_face(one_device, surface, spacing_mm
     exact = np.sqrt(squared).reshape(distance.shape)
     near = exact < EXACT_MM - ROUNDING_MM
     assert np.abs(np.abs(distance) - exact)[near].max() < ROUNDING_MM
-    # From the corners of a coarse cell a distance changes by no more than the way to them.
+    # A distance changes by no more than the distance to the corners of the coarse cell.
     off = COARSENESS * spacing_mm * 3**0.5
     assert np.abs(np.abs(distance) - exact).max() < max(off, ROUNDING_MM)
     assert np.abs(distance)[~near].min() >= EXACT_MM - ROUNDING_MM

@@ -1,4 +1,4 @@
-"""Every matrix has a right rotation: a million of all kinds, a third from each start, against NumPy's float64."""
+"""The nearest rotation of a million matrices of all kinds, from three kinds of guess, against NumPy in float64."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import taichi as ti
 from scipy.spatial.transform import Rotation
 
 from sim.fields import array_of, fill
-from sim.rotation import nearest_rotation, rotation_near
+from sim.linear_algebra import nearest_rotation, rotation_near
 
 COUNT = 336_000
 KIND = COUNT // 8
@@ -53,7 +53,7 @@ def rotations(values: np.ndarray, guesses: np.ndarray | None = None) -> np.ndarr
 
 
 @pytest.mark.parametrize("guess", [None, "any", "near"])
-def test_every_matrix_gets_the_proper_rotation_that_fits_best(one_device, guess):
+def test_the_rotation_is_the_nearest_proper_one(one_device, guess):
     values = matrices()
     guesses = None
     if guess == "any":
@@ -76,12 +76,12 @@ def test_every_matrix_gets_the_proper_rotation_that_fits_best(one_device, guess)
     reached = np.einsum("nij,nij->n", found, values)
     assert (best - reached).max() < ROUNDING
 
-    # Where the best rotation is unique by a margin, it is that very one: the error is rounding over the margin.
+    # Where the best rotation is unique by a margin, the error is rounding over the margin.
     unique = s[:, 1] + handed * s[:, 2] > 0.1
     u[:, :, 2] *= handed[:, None]
     assert unique.sum() > COUNT // 2
     assert np.abs(found - u @ vt)[unique].max() < 10 * ROUNDING
 
 
-def test_of_nothing_it_is_the_identity(one_device):
+def test_the_zero_matrix_gives_the_identity(one_device):
     assert np.array_equal(rotations(np.zeros((2, 3, 3), np.float32)), np.stack([np.eye(3)] * 2))

@@ -1,4 +1,4 @@
-"""Signed distances of a regular grid's points to a closed surface, at build time; Taichi must be started."""
+"""Signed distances to a closed surface, at build time: of points, and of a regular grid (for which Taichi must be started)."""
 
 import igl
 import numpy as np
@@ -6,21 +6,36 @@ import taichi as ti
 import taichi.math as tm
 from scipy.ndimage import label
 
-# Every so manieth point of a grid of distances is computed everywhere, the others as near to the surface as this [mm].
+# Grid points nearer to the surface than EXACT_MM get exact distances, the others are interpolated from every third point.
 COARSENESS, EXACT_MM = 3, 5.0
-# A little more than half of a cell.
+# A little more than half of the spacing.
 NEAR_CELLS = 0.51
 TINY = 1e-30
+
+
+def signed_distance(
+    vertices: np.ndarray, faces: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distances (n,) [mm] of points (n, 3), negative inside, and the nearest faces (n,) of a closed surface.
+
+    Nearest triangles and winding numbers are two calls: libigl's one call with pseudonormals takes four times as long.
+    """
+    vertices = np.ascontiguousarray(vertices, np.float64)
+    faces = np.ascontiguousarray(faces, np.int64)
+    points = np.ascontiguousarray(points, np.float64)
+    squared, nearest, _ = igl.point_mesh_squared_distance(points, vertices, faces)
+    inside = igl.fast_winding_number(vertices, faces, points) > 0.5
+    return np.where(inside, -1.0, 1.0) * np.sqrt(squared), nearest
 
 
 def distance_grid(
     vertices: np.ndarray, faces: np.ndarray, spacing_mm: float, reach_mm: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Signed distances (nx, ny, nz) [mm] of a closed surface on a regular grid that reaches around it, and its origin.
+    """Signed distances (nx, ny, nz) [mm] to a closed surface on a grid that extends ``reach_mm`` around it, and its origin (3,).
 
-    They are exact near the surface, where points touch it; farther off they are interpolated in a coarser grid, which is off
-    by its half at most. Winding numbers, which make light of folds and slivers, are taken near the
-    surface; regions that it parts have one sign each.
+    Exact near the surface; farther away interpolated in a coarser grid, with an error of half its spacing at most. The sign
+    is from winding numbers, which are robust to folds and slivers: point by point near the surface, one for each region
+    that it separates.
     """
     vertices, faces = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
     low = vertices.min(axis=0) - reach_mm
@@ -28,32 +43,32 @@ def distance_grid(
     squared = np.full(tuple(shape), EXACT_MM**2, np.float32)
     _squares_near(((vertices - low) / spacing_mm).astype(np.float32)[faces], spacing_mm, EXACT_MM, squared)
     exact = np.sqrt(squared.ravel().astype(np.float64))
-    coarse = np.maximum(_coarsely(vertices, faces, low, shape, spacing_mm), EXACT_MM)
+    coarse = np.maximum(_coarse_distances(vertices, faces, low, shape, spacing_mm), EXACT_MM)
     distance = np.where(exact < EXACT_MM, exact, coarse)
-    # Neighbours that are both farther from the surface than half their way are on one side of it.
+    # Neighbours that are both farther from the surface than half their distance are on the same side of it.
     near = distance <= NEAR_CELLS * spacing_mm
     region = label(~near.reshape(shape))[0].ravel()
-    one_of = np.unique(region, return_index=True)[1]
-    asked = np.concatenate([one_of, np.flatnonzero(near)])
-    points = low + spacing_mm * np.stack(np.unravel_index(asked, shape), axis=1)
+    samples = np.unique(region, return_index=True)[1]
+    queried = np.concatenate([samples, np.flatnonzero(near)])
+    points = low + spacing_mm * np.stack(np.unravel_index(queried, shape), axis=1)
     inside = igl.fast_winding_number(vertices, faces, points) > 0.5
-    sign = np.where(inside[: len(one_of)], -1.0, 1.0)[region]
-    sign[near] = np.where(inside[len(one_of) :], -1.0, 1.0)
+    sign = np.where(inside[: len(samples)], -1.0, 1.0)[region]
+    sign[near] = np.where(inside[len(samples) :], -1.0, 1.0)
     return (sign * distance).reshape(shape), low
 
 
-def _coarsely(
+def _coarse_distances(
     vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, shape: np.ndarray, spacing_mm: float
 ) -> np.ndarray:
-    """Distances (n,) [mm] of a grid's points, linear between those of every so manieth along each axis."""
+    """Distances (n,) [mm] of a grid's points, interpolated linearly between those of every third along each axis."""
     coarse = -(-(shape - 1) // COARSENESS) + 1
     points = low + COARSENESS * spacing_mm * np.indices(tuple(coarse)).reshape(3, -1).T
     known = np.sqrt(igl.point_mesh_squared_distance(points, vertices, faces)[0]).reshape(coarse)
     for axis, count in enumerate(shape):
         at = np.arange(count) / COARSENESS
         first = np.minimum(at.astype(int), coarse[axis] - 2)
-        share = (at - first).reshape([-1 if k == axis else 1 for k in range(3)])
-        known = (1 - share) * known.take(first, axis) + share * known.take(first + 1, axis)
+        weight = (at - first).reshape([-1 if k == axis else 1 for k in range(3)])
+        known = (1 - weight) * known.take(first, axis) + weight * known.take(first + 1, axis)
     return known.ravel()
 
 
@@ -64,7 +79,7 @@ def _squares_near(
     within_mm: ti.f32,
     squared: ti.types.ndarray(ndim=3),
 ):
-    """Squares of distances [mm^2] of a grid's points from the triangles (n, 3) that are nearer than so [cells]."""
+    """Squared distances [mm^2] of a grid's points from triangles with corners (n, 3) [cells], where nearer than ``within_mm``."""
     for face in range(corners.shape[0]):
         a, b, c = corners[face, 0], corners[face, 1], corners[face, 2]
         margin = within_mm / spacing_mm
@@ -73,14 +88,14 @@ def _squares_near(
         high = ti.min(ti.cast(ti.floor(tm.max(a, b, c) + margin), ti.i32), last)
         for i, j, k in ti.ndrange((low.x, high.x + 1), (low.y, high.y + 1), (low.z, high.z + 1)):
             found = spacing_mm * spacing_mm * _square_to_triangle(tm.vec3(i, j, k), a, b, c)
-            # The least of them is the same in whatever order they come.
+            # A minimum does not depend on the order.
             if found < squared[i, j, k]:
                 ti.atomic_min(squared[i, j, k], found)
 
 
 @ti.func
 def _square_to_triangle(p, a, b, c):
-    """The nearest of the three edges, or the plane where p lies over the triangle."""
+    """Squared distance to the nearest of the three edges, or to the plane where p is above the triangle."""
     normal = tm.cross(b - a, c - a)
     over = _beside(p, a, b, normal) and _beside(p, b, c, normal) and _beside(p, c, a, normal)
     result = ti.min(_square_to_edge(p, a, b), _square_to_edge(p, b, c), _square_to_edge(p, c, a))
@@ -96,7 +111,7 @@ def _beside(p, a, b, normal):
 
 @ti.func
 def _square_to_edge(p, a, b):
-    along, way = b - a, p - a
-    share = tm.clamp(tm.dot(along, way) / ti.max(tm.dot(along, along), TINY), 0.0, 1.0)
-    apart = way - share * along
+    edge, offset = b - a, p - a
+    fraction = tm.clamp(tm.dot(edge, offset) / ti.max(tm.dot(edge, edge), TINY), 0.0, 1.0)
+    apart = offset - fraction * edge
     return tm.dot(apart, apart)
