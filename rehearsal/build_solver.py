@@ -1,4 +1,4 @@
-"""A scene's tissue put on the device with its contacts, ready to step, and what touches it there."""
+"""Build the solver of a scene: tissue model, contacts and tool; the settings of its steps."""
 
 from dataclasses import fields, replace
 from typing import Any
@@ -17,7 +17,7 @@ from sim.solver import Solver, StepSettings
 from sim.tissue_model import FixedRegion, ModelInputs, TissueModel
 from ultrasound.probe import Probe
 
-# Flats that stand for the arc of a curved array: of 60 mm and 60 degrees, they are nowhere 0.1 mm off it.
+# Flats that approximate the arc of a curved array: of 60 mm and 60 degrees, to 0.1 mm.
 ARC_FLATS = 11
 
 
@@ -31,31 +31,31 @@ def model_of(tissue: TissueSection) -> type[TissueModel]:
 
 
 def static_shape(mesh: trimesh.Trimesh, tissue: TissueSection) -> SignedDistanceField:
-    """What a closed surface [mm] that does not move is to a tissue: distances as far around as it asks for them."""
+    """The signed distance field of a fixed closed surface [mm], as far around as the tissue model needs it."""
     return SignedDistanceField.of_surface(mesh.vertices, mesh.faces, model_of(tissue).reach_mm(tissue))
 
 
 def tool_of(probe: Probe) -> ConvexTool:
-    """What touches the tissue: the probe's housing, its face an arc of flats where the array is curved."""
+    """The tool: the probe's housing, with an arc of flats as the face of a curved array."""
     size = np.array(probe.housing_mm)
     if probe.radius_mm == 0:
         return ConvexTool.cuboid(size, probe.edge_radius_mm)
     angle = np.radians(np.linspace(probe.theta_start_deg, probe.theta_stop_deg, ARC_FLATS))
     arc = np.column_stack([np.sin(angle), np.zeros(ARC_FLATS), -np.cos(angle)])
     centre = np.array([0.0, 0.0, probe.radius_mm - size[2] / 2])
-    # All sides of the cuboid but the one that the arc takes the place of.
+    # All sides of the cuboid except the one that the arc replaces.
     sides = np.concatenate([np.eye(3), -np.eye(3)[:2]])
     offsets = np.concatenate([size / 2, size[:2] / 2, arc @ centre + probe.radius_mm])
     return ConvexTool(np.concatenate([sides, arc]), offsets, probe.edge_radius_mm)
 
 
 def embedding_cell_mm(tissue: TissueSection) -> float:
-    """Width of the coarse tetrahedra that carry the image plane."""
+    """Width [mm] of the coarse tetrahedra that embed the image plane."""
     return model_of(tissue).EMBEDDING_CELL_RATIO * tissue.size_mm
 
 
 def step_settings(tissue: TissueSection, section: SolverSection) -> StepSettings:
-    """The scene's settings of a step; what it leaves out is the tissue's own choice, then the paper's."""
+    """The settings of a step: the scene's, else the tissue model's, else the paper's."""
     names = {field.name for field in fields(StepSettings)}
     own = {name: value for name, value in tissue.model_dump().items() if name in names}
     given = {name: value for name, value in section.model_dump(exclude_none=True).items() if name in names}

@@ -1,4 +1,4 @@
-"""What a frozen scanner offers: the pictures of the last seconds, and a caliper."""
+"""Cine memory (the images of the last seconds) and caliper of the scanner."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ KEPT_S, KEPT_A_SECOND = 10.0, 30
 
 @dataclass(frozen=True)
 class CineFrame:
-    """A view, when it was there [s], and where its tissue was at rest (rows, columns, 3) [mm]; None without a CT."""
+    """A view, its time [s], and the rest positions (rows, columns, 3) [mm] of its tissue; None without a CT."""
 
     time_s: float
     view: View
@@ -23,13 +23,13 @@ class CineFrame:
 
 @dataclass
 class Cine:
-    """The frames of the last KEPT_S seconds. ``back`` says how many before the newest is looked at."""
+    """The frames of the last KEPT_S seconds. ``back`` counts from the newest to the one shown."""
 
     frames: deque[CineFrame] = field(default_factory=deque)
     back: int = 0
 
     def keep(self, frame: CineFrame) -> None:
-        """Add a frame, now the newest, and let go of those that are too old; of a fast machine's not each is kept."""
+        """Add a frame unless the last was kept just before, and discard those that are too old."""
         self.back = 0
         if self.frames and frame.time_s - self.frames[-1].time_s < 0.99 / KEPT_A_SECOND:
             return
@@ -38,29 +38,29 @@ class Cine:
             self.frames.popleft()
 
     def go(self, frames: int) -> None:
-        """Look so many frames on (back, negative), as far as there are any."""
+        """Move by so many frames, back if negative, within those kept."""
         self.back = int(np.clip(self.back - frames, 0, max(len(self.frames) - 1, 0)))
 
     @property
     def shown(self) -> CineFrame:
-        """The frame that is looked at."""
+        """The frame shown."""
         return self.frames[-1 - self.back]
 
     @property
     def age_s(self) -> float:
-        """How much older than the newest frame the one looked at is, negative [s]."""
+        """Time of the shown frame relative to the newest, negative [s]."""
         return self.shown.time_s - self.frames[-1].time_s
 
 
 @dataclass
 class Caliper:
-    """Two points on the image plane [mm], set by clicks; a third click removes them, or a probe that moves."""
+    """Two points on the image plane [mm], set by clicks; a third click or a moving probe removes them."""
 
     points: tuple[tuple[float, float], ...] = ()
     _pose: np.ndarray | None = None
 
     def point(self, place_mm: tuple[float, float] | None, pose: np.ndarray) -> None:
-        """Set the next point, or remove both, if there was a click in a picture whose probe has a pose (4, 4)."""
+        """Set the next point, or remove both, after a click into an image of a probe at a pose (4, 4)."""
         if place_mm is None:
             return
         if not self.points:
@@ -68,12 +68,12 @@ class Caliper:
         self.points = () if len(self.points) == 2 else (*self.points, place_mm)
 
     def go_with(self, pose: np.ndarray) -> None:
-        """Remove the points where the probe of a live picture is elsewhere (4, 4) than when the first was set."""
+        """Remove the points if the probe of a live image has left the pose (4, 4) of the first point."""
         if self.points and self._pose is not None and np.abs(pose - self._pose).max() > STILL_MM:
             self.points = ()
 
     def figure(self, frame: CineFrame) -> str:
-        """The distance of the points as the tissue lies, and of the same tissue at rest; empty of fewer than two."""
+        """The distance of the points in the deformed tissue and at rest, as text; empty for fewer than two."""
         if len(self.points) < 2:
             return ""
         start, end = np.array(self.points)
@@ -85,7 +85,7 @@ class Caliper:
 
 
 def at_rest(rest: np.ndarray, points_mm: np.ndarray, view: View) -> np.ndarray:
-    """Where the tissue at points (n, 2) of a view's plane was at rest (n, 3) [mm]; ``rest`` (rows, columns, 3) is over its picture."""
+    """Rest positions (n, 3) [mm] of points (n, 2) on a view's plane; ``rest`` (rows, columns, 3) are those of its image."""
     share = (points_mm + [view.width_mm / 2, view.above_mm]) / [view.width_mm, view.depth_mm]
     at = share[:, ::-1].T * (np.array(rest.shape[:2])[:, None] - 1)
     return np.column_stack(

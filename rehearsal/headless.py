@@ -20,12 +20,12 @@ from render.viewer import Controls, Settings, View, Viewer
 from render.window import NoVulkan
 from scenes.atomic_files import whole
 
-# An animation is in memory before it is written: of a long session it has fewer pictures.
+# An animation is held in memory: a long session has fewer images in it.
 MOST_SHOWN = 240
 
 
 class Pictures:
-    """What is drawn of so many steps: frames, slices, and an animation in a folder."""
+    """The images of a run: frames, slices and an animation in a folder."""
 
     def __init__(self, rehearsal: Rehearsal, steps: int, out: Path) -> None:
         self.steps, self.out = steps, out
@@ -43,7 +43,7 @@ class Pictures:
         self._animation: list[Image.Image] = []
 
     def draw(self, step: int, view: View, settings: Settings, measurements: LiveMeasurements) -> None:
-        """A step's, where they are due."""
+        """Draw a step, if its images are due."""
         if step % self._every and step < self.steps:
             return
         picture = side_by_side(view)
@@ -56,7 +56,7 @@ class Pictures:
             self._animation.append(scaled_down(picture))
 
     def save(self) -> str:
-        """Write the animation; what there is now."""
+        """Write the animation; return what was written."""
         with whole(self.out / "press.webp") as partial:
             save_animation(self._animation, partial)
         return f"{-(-self.steps // self._every)} pictures, press.webp"

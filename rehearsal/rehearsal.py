@@ -1,6 +1,6 @@
-"""One scene put together: the body under its probe, advanced and imaged one frame at a time.
+"""One scene assembled: the body under its probe, advanced and imaged step by step.
 
-The window, the headless run and every measurement go through this class, so that they compute the same.
+The window, the headless run and every study use this class, so that they compute the same.
 """
 
 import hashlib
@@ -41,19 +41,19 @@ from ultrasound.scanner import ScannedAnatomy, Scanner, start_acoustics
 
 TURN_DEG_S = 180.0
 AWAY_MM = 200.0
-# Where the tumour sticks out, the organ has the same surface: the tumour's is drawn this far outside it.
+# Where the tumour protrudes, organ and tumour share a surface: the tumour's is drawn this far outside.
 TUMOUR_LIFT_MM = 0.8
-# Where the organ lies on a support both have the same surface: the support is drawn this far inside its own.
+# Organ and support share a surface where they touch: the support is drawn this far inside.
 SUPPORT_SUNK_MM = 0.4
-# How far around the organ the tissue in the picture gives way to it.
+# How far around the organ the surrounding tissue in the image moves with it.
 SURROUNDINGS_MM = 25.0
-# Places along each side of a picture whose rest is asked for.
+# Points along each side of an image whose rest positions are computed.
 REST_PLACES = 48
 
 
 @dataclass(frozen=True)
 class RehearsalState:
-    """All that frames change: the tissue, what its guard remembers, the transducer's pose (4, 4), the hand that holds it."""
+    """What changes: the tissue, the divergence check, the transducer's pose (4, 4), its manipulator."""
 
     solver: SolverState
     watch: DivergenceState
@@ -65,8 +65,8 @@ class RehearsalState:
 class Rehearsal:
     """A scene on the device. All positions are mm relative to ``origin``, the middle of the resting organ (LPS).
 
-    Needs Taichi to be initialised; a new one for another scene needs it initialised anew, which frees the old. ``told`` hears
-    what is being made; one that ``shows_echo`` from its first frame on gets ready for it meanwhile.
+    Taichi must be initialised, and initialised again for another scene, which frees this one. ``progress`` is called with what is
+    being built; ``shows_echo`` prepares the B-mode image meanwhile.
     """
 
     def __init__(
@@ -153,7 +153,7 @@ class Rehearsal:
             self.scanner = Scanner(scanned, self.embedding, self.probe, image.pixels, *around, echo)
 
     def _settle(self) -> np.ndarray:
-        """Let the organ come to rest on its support, the transducer far away: the paper's warm-up."""
+        """Let the organ come to rest on its support with the transducer far away: the paper's warm-up."""
         target = np.array(self.press.target_mm) - self.origin
         pose = pose_at(target, np.array(self.press.direction), np.array(self.press.lateral), self.size_mm[2])
         self.pose = advanced(pose, -AWAY_MM)
@@ -179,29 +179,29 @@ class Rehearsal:
         self.settings.gravity = tuple(1000.0 * acceleration_m_s2 * self.gravity_direction)
 
     def set_young(self, young_kpa: float) -> None:
-        """Change Young's modulus of a tissue that has one; of others nothing."""
+        """Change Young's modulus, if the tissue model has one."""
         if isinstance(self.model, MaterialModel):
             self.model.set_young(young_kpa)
 
     def scripted_pose(self, time_s: float) -> np.ndarray:
-        """The transducer's pose at a time of the scripted press: just touching at first, then down stage by stage."""
+        """The transducer's pose at a time of the scripted press: touching at first, then deeper stage by stage."""
         depths = [0.0, *self.press.indentations_mm]
         stage = time_s / self.scene.solver.time_step_s / self.press.stage_steps
         return self.pose_at_depth(float(np.interp(stage, np.arange(len(depths)), depths)))
 
     def pose_at_depth(self, depth_mm: float) -> np.ndarray:
-        """The transducer's pose so deep in the organ, along the scripted press."""
+        """The transducer's pose at a depth of the scripted press."""
         return advanced(self.manipulator.home, depth_mm)
 
     def script_length_s(self) -> float:
-        """How long the scripted press takes [s]."""
+        """Duration of the scripted press [s]."""
         return len(self.press.indentations_mm) * self.press.stage_steps * self.scene.solver.time_step_s
 
     def pose_towards(self, goal: np.ndarray) -> np.ndarray:
-        """The transducer's next pose on its way to a goal (4, 4): no faster than a hand, and over the organ."""
+        """The transducer's next pose towards a goal (4, 4): at most at the scene's speed, and not through the organ."""
         most_mm = self.scene.transducer.speed_mm_s * self.settings.time_step_s
         pose = moved_towards(self.pose, goal, most_mm, TURN_DEG_S * self.settings.time_step_s)
-        # Between two places of the surface the straight way leads through the organ.
+        # The straight path between two points of the surface may cross the organ.
         wanted = max(self._indentation(goal), 0.0)
         through = self._indentation(pose) - max(wanted, self.indentation_mm())
         return advanced(pose, -through) if through > 0 else pose
@@ -209,7 +209,7 @@ class Rehearsal:
     def advance(self, pose: np.ndarray) -> None:
         """Advance one time step, at whose end the transducer has a pose (4, 4).
 
-        ``notice`` says what had to be put right; it is empty after most steps.
+        ``notice`` says if the divergence check restored the state; it is empty after most steps.
         """
         self.solver.step(self.settings, poses_between(self.pose, pose, self.settings.substeps))
         self.notice = self.divergence_check.check(self.settings.time_step_s)
@@ -224,17 +224,17 @@ class Rehearsal:
         )
 
     def restore(self, state: RehearsalState) -> None:
-        """Go back to a state; the steps that follow give the same bits as they did from it before."""
+        """Restore a state; the steps that follow give the same bits as before."""
         self.solver.restore(state.solver)
         self.divergence_check.state = state.watch
         self.pose, self.steps, self.manipulator.state = state.pose, state.steps, state.manipulator
 
     def keep_good(self) -> None:
-        """Take the tissue, where it is well, for what its guard would put back."""
+        """Make the present tissue, if it is valid, the state that the divergence check restores."""
         self.divergence_check.store_if_healthy()
 
     def update_surfaces(self) -> None:
-        """Carry the surfaces that are drawn to where the body is."""
+        """Move the drawn surfaces with the body."""
         self.organ_skin.update()
         if self.tumour_skin is not None:
             self.tumour_skin.update()
@@ -250,20 +250,20 @@ class Rehearsal:
         return self.scanner.images(self.image_plane(probe), probe, mode, detail_level, window_hu, level_hu)
 
     def find_plane(self, probe: Probe) -> None:
-        """Find the tissue that a picture would be of, and make none."""
+        """Locate the image plane in the tissue without computing an image."""
         if self.scanner is not None:
             self.scanner.locate(self.image_plane(probe))
 
     def image_plane(self, probe: Probe | None = None) -> ImagePlane:
-        """The plane that the transducer shows now, as far as its probe, or another set like it, sees."""
+        """The present image plane, of the extent of the probe or of the probe with other settings."""
         return image_plane(self.pose, self.size_mm[2], *(probe or self.probe).extent_mm)
 
     def rest_grid(self) -> np.ndarray | None:
-        """Where the tissue of the picture taken last was at rest, evenly over it, (n, n, 3) [mm]; None without a CT."""
+        """Rest positions (n, n, 3) [mm] of a grid over the last image; None without a CT."""
         return None if self.scanner is None else self.scanner.plane.rest_grid(REST_PLACES)
 
     def tumour_outline(self, at_rest: bool = False) -> np.ndarray | None:
-        """Where the image plane cuts the tumour as it lies, or as it lay in the CT: segments (n, 2, 2) on the plane [mm].
+        """The tumour's outline on the image plane, deformed or as in the CT: segments (n, 2, 2) on the plane [mm].
 
         None without a tumour.
         """
@@ -274,31 +274,31 @@ class Rehearsal:
         return plane_section(vertices, self.tumour.faces, np.linalg.inv(plane.world_from_plane))
 
     def tumour_vertices(self) -> np.ndarray:
-        """Where the tumour's surface is now (n, 3) [mm]; none of an organ without one."""
+        """Present vertices (n, 3) [mm] of the tumour's surface; empty without a tumour."""
         if self._tumour_border is None:
             return np.zeros((0, 3))
         self._tumour_border.update()
         return array_of(self._tumour_border.vertices).astype(float)
 
     def indentation_mm(self) -> float:
-        """How deep the transducer is pressed into the settled surface; negative above it."""
+        """Depth of the transducer below the settled surface [mm]; negative above it."""
         return self._indentation(self.pose)
 
     def _indentation(self, pose: np.ndarray) -> float:
         return indentation(pose, self.size_mm, self.manipulator.samples, self.probe.radius_mm)
 
     def volume_ratio(self) -> float:
-        """Volume inside the carried surface, as a share of the resting one."""
+        """Volume inside the deformed surface relative to the one at rest."""
         carried = array_of(self.organ_skin.vertices)
         return float(volume_mm3(carried, self.organ.faces) / self.organ.volume)
 
     def reset(self) -> None:
-        """Tissue and transducer as they were at the start: settled, and just touching."""
+        """Restore the start: tissue settled, transducer just touching."""
         self.restore(self.settled)
         ti.sync()
 
     def digest(self) -> str:
-        """A short name of the tissue's state: other bits, another name."""
+        """A hash of the tissue's state: it changes with every bit."""
         state = self.body.snapshot()
         return hashlib.sha256(state.position.tobytes() + state.velocity.tobytes()).hexdigest()[:16]
 
@@ -310,7 +310,7 @@ def _shrunk(mesh: trimesh.Trimesh, by_mm: float) -> trimesh.Trimesh:
 def scanned_anatomy(
     organ: trimesh.Trimesh, ct: Grid, anatomy: LoadedAnatomy, origin: np.ndarray
 ) -> ScannedAnatomy:
-    """What there is to scan, with an origin that the organ has already been moved to."""
+    """The anatomy as the scanner needs it, relative to an origin; the organ is already moved there."""
     labels = anatomy.labels
     shift = np.eye(4)
     shift[:3, 3] = origin

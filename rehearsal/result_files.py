@@ -1,4 +1,4 @@
-"""Figures as reports have them, and their files: JSON and CSV."""
+"""Figures of reports and their files: JSON, CSV, pictures."""
 
 import csv
 import json
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def rounded(value: float | None) -> float | None:
-    """As files have it, in which rounding of the last bits is not seen; None for what JSON has no number for."""
+    """Round to 6 digits; None for NaN and infinity, which JSON does not have."""
     return None if value is None or not np.isfinite(value) else round(float(value), 6)
 
 
@@ -32,14 +32,14 @@ def counted(number: int, name: str) -> str:
 
 
 def write_json(figures: dict[str, Any], path: Path) -> None:
-    """Write figures as JSON. Raises ValueError for a number that JSON has none for, OSError."""
+    """Write figures as JSON. Raises ValueError for NaN and infinity, OSError."""
     text = json.dumps(figures, indent=2, allow_nan=False) + "\n"
     with whole(path) as partial:
         partial.write_text(text, "utf-8")
 
 
 def write_csv(rows: list[dict[str, Any]], path: Path) -> None:
-    """Write a line a row under all names that rows have, in their order; a row without one leaves it empty. Raises OSError."""
+    """Write rows under the names that any of them has; missing values stay empty. Raises OSError."""
     names = dict.fromkeys(name for row in rows for name in row)
     with whole(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         lines = csv.DictWriter(file, list(names))

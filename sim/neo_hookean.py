@@ -24,8 +24,8 @@ from sim.solver import StepSettings
 from sim.surface_contact import PENALTY_DEPTH_MM, REACH_MM, SurfaceContacts
 from sim.tissue_model import ModelInputs
 
-# Stiffness, in units of the shear modulus, of deformation that varies inside an element. 1 is exact for torsion and
-# (1 + nu) for bending; at nu = 0.45 their geometric mean is 1.2.
+# Stiffness, in units of the shear modulus, of deformation that varies inside an element. 1 is exact for u_x ~ y z and
+# 1 + nu for bending; at nu = 0.45 their geometric mean is 1.2. Bead errors hardly depend on it (docs/method.md).
 HOURGLASS_STIFFNESS = 1.2
 # Below this volume ratio J, ln J is continued by its tangent, so that inverted elements recover.
 LEAST_J = 0.2

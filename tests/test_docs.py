@@ -1,4 +1,4 @@
-"""README and docs: links, pictures, commands, places in the code and examples are what the program has."""
+"""README and docs: links, pictures, commands, names in the code and examples are valid."""
 
 import ast
 import contextlib
@@ -15,7 +15,6 @@ import taichi as ti
 from conftest import ROOT
 
 import app
-from rehearsal.adaptive_iterations import AdaptiveIterations
 from rehearsal.planning.plan_file import Plan, PlannedSweep
 from rehearsal.sessions.session_file import End, Event, Header, Second
 from rehearsal.tracking.pose_file import load_poses, load_timed_poses
@@ -26,7 +25,7 @@ from ultrasound.probe import Probe
 
 DOCS = ROOT / "docs"
 PAGES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
-FOLDERS = ("docs", "render", "scenes", "sim", "studies", "tests", "ultrasound")
+FOLDERS = ("docs", "rehearsal", "render", "scenes", "sim", "studies", "tests", "ultrasound")
 PICTURES = (".png", ".webp", ".gif", ".jpg", ".svg")
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 CODE = re.compile(r"`([^`\n]+)`")
@@ -52,7 +51,7 @@ def links(page: Path) -> list[str]:
 
 
 def anchors(page: Path) -> set[str]:
-    """The places of a page as GitHub names them."""
+    """The anchors of a page, as GitHub makes them from its headings."""
     headings = re.findall(r"^#+ (.+)$", prose(page), flags=re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
@@ -67,7 +66,7 @@ def example(page: str, language: str) -> str:
 
 
 @each_page
-def test_every_link_leads_somewhere(page):
+def test_link_targets_exist(page):
     for link in links(page):
         name, _, place = link.partition("#")
         target = page.parent / name if name else page
@@ -84,7 +83,7 @@ def test_every_picture_is_used():
     assert pictures - set.union(*map(linked, PAGES)) == set()
 
 
-def test_the_index_has_every_page_and_the_readme_leads_to_it():
+def test_the_index_links_every_page_and_the_readme_links_the_index():
     assert set(DOCS.glob("*.md")) - linked(DOCS / "README.md") == {DOCS / "README.md"}
     assert DOCS / "README.md" in linked(ROOT / "README.md")
 
@@ -96,8 +95,13 @@ def test_every_example_file_is_named():
     )
 
 
-def test_the_first_page_is_short_and_its_picture_light():
-    assert len(text(ROOT / "README.md").splitlines()) <= 140
+def test_the_readme_has_its_picture_and_first_commands_before_more():
+    headings = re.findall(r"^#+ (.+)$", text(ROOT / "README.md"), flags=re.MULTILINE)
+    assert headings[-1] == "More" and len(headings) == len(set(headings))
+    before = text(ROOT / "README.md").partition("\n## More\n")[0]
+    assert (DOCS / "press.webp").resolve() in linked(ROOT / "README.md")
+    for command in ("make run", "make test", "python app.py import", "python app.py rehearse"):
+        assert command in before
     assert (DOCS / "press.webp").stat().st_size < 4_000_000
 
 
@@ -105,7 +109,7 @@ def test_the_first_page_is_short_and_its_picture_light():
 
 
 def command_lines() -> list[tuple[str, str]]:
-    """(page, what stands after python app.py), in blocks and in the text."""
+    """(page, the arguments of python app.py), from code blocks and text."""
     found = []
     for page in PAGES:
         for line in re.findall(r"python app\.py ?([^`\n]*)", text(page)):
@@ -114,7 +118,7 @@ def command_lines() -> list[tuple[str, str]]:
 
 
 def command_of(arguments: list[str]) -> tuple[click.Command, list[str]]:
-    """The command that a line names, and what it is given."""
+    """The command of a line, and its arguments."""
     command: click.Command = app.cli
     while isinstance(command, click.Group) and arguments and not arguments[0].startswith("-"):
         found = command.get_command(click.Context(command), arguments[0])
@@ -125,7 +129,7 @@ def command_of(arguments: list[str]) -> tuple[click.Command, list[str]]:
 
 @cache
 def commands() -> list[click.Command]:
-    """All of them, groups too."""
+    """All commands and groups."""
     found: list[click.Command] = [app.cli]
     for each in found:
         if isinstance(each, click.Group):
@@ -141,7 +145,7 @@ def options(command: click.Command) -> set[str]:
     return {name for each in command.params for name in each.opts} | {"--help", "-h"}
 
 
-def test_every_command_line_is_understood():
+def test_command_lines_are_valid():
     lines = command_lines()
     assert len(lines) > 40
     for page, line in lines:
@@ -156,7 +160,7 @@ def test_every_command_line_is_understood():
 
 
 @each_page
-def test_every_option_in_the_text_is_of_the_command_that_it_is_named_with(page):
+def test_options_in_the_text_exist(page):
     known = set.union(*map(options, commands()))
     for code in CODE.findall(prose(page)):
         if re.match(r"(python|pip|make)\b", code):
@@ -168,20 +172,20 @@ def test_every_option_in_the_text_is_of_the_command_that_it_is_named_with(page):
             assert option in of, f"{page.name}: {code}"
 
 
-def test_the_lines_of_the_help_are_whole():
+def test_help_lines_are_not_truncated():
     for each in commands():
         if isinstance(each, click.Group):
-            told = each.get_help(click.Context(each, terminal_width=80))
-            assert "..." not in told.partition("Commands:")[2]
-            assert max(map(len, told.splitlines())) <= 80
+            shown = each.get_help(click.Context(each, terminal_width=80))
+            assert "..." not in shown.partition("Commands:")[2]
+            assert max(map(len, shown.splitlines())) <= 80
 
 
-# Places in the code
+# Names in the code
 
 
 @cache
 def names_in(file: Path) -> frozenset[str]:
-    """Functions, classes and their methods of a source."""
+    """Functions, classes and methods of a source file."""
     names = set()
     for node in ast.parse(text(file)).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
@@ -192,8 +196,8 @@ def names_in(file: Path) -> frozenset[str]:
 
 
 @each_page
-def test_every_file_and_folder_that_is_named_is_there(page):
-    # What a heading names is what the page tells how to make.
+def test_named_files_and_folders_exist(page):
+    # A file named in a heading is made by following the page.
     made = {
         name
         for heading in re.findall(r"^#.*$", prose(page), flags=re.MULTILINE)
@@ -206,7 +210,7 @@ def test_every_file_and_folder_that_is_named_is_there(page):
 
 
 @each_page
-def test_every_place_in_the_code_is_there(page):
+def test_named_functions_and_classes_exist(page):
     named = CODE.findall(prose(page))
     for file, name in (found.groups() for code in named if (found := PLACE.fullmatch(code))):
         assert name in names_in(ROOT / file), f"{page.name}: {file}: {name}"
@@ -217,54 +221,67 @@ def test_every_place_in_the_code_is_there(page):
         assert not METHOD.fullmatch(code) or code in methods, f"{page.name}: {code}"
 
 
-def test_the_method_names_a_place_for_every_step():
+def test_the_method_names_its_functions():
     assert len(PLACE.findall(text(DOCS / "method.md"))) > 20
+
+
+def test_the_index_answers_where_is_with_a_file_and_a_function():
+    answers = text(DOCS / "README.md").partition("## Where is ...")[2]
+    for subject in ("friction law", "key press", "caliper", "DICOM series", "tumour"):
+        (*_, last) = [row for row in answers.splitlines() if subject in row] or [""]
+        assert PLACE.search(last), subject
 
 
 # Examples and formats
 
 
-def test_the_probe_of_the_example_is_one():
+def test_the_example_of_a_probe_is_valid():
     probe = Probe.model_validate(tomllib.loads(example("adding-a-probe.md", "toml")))
     assert probe.housing_mm[0] >= probe.transducer_width_mm
 
 
-def test_the_scene_of_the_example_is_one():
+def test_the_example_of_a_scene_is_valid():
     scene = Scene.model_validate(tomllib.loads(example("adding-a-tool.md", "toml")))
     assert [shape.kind for shape in scene.shape] == ["mesh", "plane"]
 
 
-def test_the_tool_of_the_example_presses_tissue():
-    told = io.StringIO()
+def test_the_example_of_a_tool_presses_tissue():
+    printed = io.StringIO()
     try:
-        with contextlib.redirect_stdout(told):
+        with contextlib.redirect_stdout(printed):
             exec(compile(example("adding-a-tool.md", "python"), "rod.py", "exec"), {})
     finally:
         ti.reset()
-    depth_mm = float(re.findall(r"at most ([\d.]+) mm", told.getvalue())[0])
-    # Pressed, so the layer gives way, but by no more than a few times its thickness at Young's modulus.
+    depth_mm = float(re.findall(r"at most ([\d.]+) mm", printed.getvalue())[0])
+    # The tissue is in contact, with at most a few times the depth at which the pressure equals Young's modulus.
     assert 0.01 < depth_mm < 0.5
 
 
-def test_what_the_window_says_in_capitals_is_explained():
-    ladder = AdaptiveIterations(1.0)
-    ladder.level = 1
-    assert f"*{ladder.status(8).partition('   ')[0]}*" in text(DOCS / "rehearsal.md")
-    assert f"`image.contact_gap_mm` of the scene ({Image().contact_gap_mm} mm)" in text(
-        DOCS / "ultrasound.md"
+def test_the_notices_that_the_docs_explain_are_those_of_the_window():
+    sources = "".join(
+        text(file) for folder in ("rehearsal", "render") for file in (ROOT / folder).rglob("*.py")
     )
+    explained = set(re.findall(r"\*([A-Z]+(?: [A-Z]+)+)\*", "".join(map(text, DOCS.glob("*.md")))))
+    assert len(explained) >= 3
+    for notice in explained:
+        assert f'"{notice}' in sources, notice
 
 
-def test_the_poses_that_come_along_can_be_read():
+def test_the_coupling_gap_in_the_docs_is_the_default():
+    named = f"`image.contact_gap_mm` of the scene ({Image().contact_gap_mm} mm)"
+    assert named in " ".join(text(DOCS / "ultrasound.md").split())
+
+
+def test_the_example_poses_can_be_read():
     assert len(load_poses(DOCS / "poses.json")) == 3
     press = load_timed_poses(DOCS / "press.json")
     assert press.length_s == 4.0
-    # It ends where it began, so that the picture goes round without a jump.
+    # First and last pose are the same, so that the animation loops without a jump.
     assert (press.poses[0] == press.poses[-1]).all()
 
 
 def section(heading: str) -> set[str]:
-    """The names in code of a part of the page on formats."""
+    """The names in code of one section of the page on formats."""
     part = re.split(rf"^## {heading}$", text(DOCS / "data-formats.md"), flags=re.MULTILINE)[1]
     return set(CODE.findall(part.partition("\n## ")[0]))
 
@@ -277,7 +294,7 @@ def section(heading: str) -> set[str]:
         ("Plan", [Plan, PlannedSweep]),
     ],
 )
-def test_the_formats_have_every_key(heading, models):
+def test_data_formats_list_every_key(heading, models):
     keys = {key for model in models for key in model.model_fields}
     if heading == "Scene":
         keys |= {"title"}

@@ -1,4 +1,4 @@
-"""What commands share: their faults, the numbers, scenes and folders that they take, and the start of Taichi."""
+"""Shared by the commands: errors, types of options, scenes, output folders, the start of Taichi."""
 
 import math
 from contextlib import suppress
@@ -14,28 +14,28 @@ from scenes.atomic_files import check_writable
 from scenes.scene import Scene, load_scene, scene_file
 from scenes.tissue import QUALITIES
 
-# The exit status of a program that Ctrl-C has ended.
+# Exit status after Ctrl-C.
 STOPPED = 130
 
 
 class CommandError(click.ClickException):
-    """What the user must know, in one line."""
+    """An error of the command line, in one line."""
 
 
 class Number(click.types.FloatParamType):
-    """A number, by that name in the help."""
+    """A number, shown as such in the help."""
 
     name = "number"
 
 
 class WholeRange(click.IntRange):
-    """Whole numbers between two."""
+    """An integer within a range, shown as such in the help."""
 
     name = "integer"
 
 
 class NumberRange(click.FloatRange):
-    """Numbers between two; click's own range lets nan through."""
+    """A number within a range; click's own range accepts nan."""
 
     name = "number"
 
@@ -47,7 +47,7 @@ class NumberRange(click.FloatRange):
 
 
 def start_taichi(arch: str) -> str:
-    """Initialise Taichi where the user wants it; the backend it is. Raises CommandError."""
+    """Initialise Taichi on the chosen backend and return its name. Raises CommandError."""
     from sim.device import NoDevice, start
 
     try:
@@ -57,9 +57,9 @@ def start_taichi(arch: str) -> str:
 
 
 def make_folder(folder: Path, option: str = "--out") -> None:
-    """Make sure that a folder can be written to before time is spent on what goes there. Raises CommandError.
+    """Create a folder and check that it is writable before time is spent. Raises CommandError.
 
-    Of a command that ends without anything in it the folder goes again.
+    If the command ends without output, the folder is removed.
     """
     made = [each for each in (folder, *folder.parents) if not each.exists()]
     if context := click.get_current_context(silent=True):
@@ -68,7 +68,7 @@ def make_folder(folder: Path, option: str = "--out") -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise CommandError(
-            f"{folder}: cannot be made a folder for results ({error.strerror}); choose another {option}"
+            f"{folder}: cannot be created ({error.strerror}); choose another {option}"
         ) from None
     try:
         check_writable(folder)
@@ -79,14 +79,14 @@ def make_folder(folder: Path, option: str = "--out") -> None:
 
 
 def _remove_empty(folders: list[Path]) -> None:
-    """Remove folders, each within the next, as far as nothing is in them."""
+    """Remove folders, each within the next, while they are empty."""
     with suppress(OSError):
         for each in folders:
             each.rmdir()
 
 
 def make_place(json_file: Path | None) -> None:
-    """Make sure that the file of --json, where it is asked for, can be written before time is spent. Raises CommandError."""
+    """Check that the file of --json, if given, can be written. Raises CommandError."""
     if json_file is None:
         return
     make_folder(json_file.parent, "--json")
@@ -95,7 +95,7 @@ def make_place(json_file: Path | None) -> None:
 
 
 def save_figures(figures: dict[str, Any], json_file: Path) -> None:
-    """Write figures to the file of --json and say so. Raises CommandError."""
+    """Write figures to the file of --json. Raises CommandError."""
     try:
         write_json(figures, json_file)
     except OSError as error:
@@ -106,14 +106,14 @@ def save_figures(figures: dict[str, Any], json_file: Path) -> None:
 
 
 def load_patient(scene: Path) -> tuple[Scene, LoadedAnatomy]:
-    """A scene file or a patient's folder, and the anatomy that it names. Raises SceneError, PatientError."""
+    """Load a scene file or a patient's folder, and its anatomy. Raises SceneError, PatientError."""
     path = scene_file(scene)
     loaded = load_scene(path)
     return loaded, load_anatomy(loaded, path.parent)
 
 
 def numbers(text: str, option: str, least: float, most: float) -> list[float]:
-    """Different numbers of an option's text, such as "2.2,2.7", in ascending order. Raises CommandError."""
+    """The distinct numbers of an option such as "2.2,2.7", ascending. Raises CommandError."""
     try:
         values = sorted({float(value) for value in text.split(",")})
     except ValueError:
@@ -135,5 +135,5 @@ arch_option = click.option(
 quality_option = click.option(
     "--quality",
     type=click.Choice(QUALITIES),
-    help="Size and passes as a preset of the tissue model has them [the scene's].",
+    help="Resolution and iterations of a preset of the tissue model [the scene's].",
 )

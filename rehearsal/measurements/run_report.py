@@ -1,4 +1,4 @@
-"""What a headless run measured, as ``report.json`` has it."""
+"""The report of a run without a window: ``report.json`` and its summary."""
 
 from dataclasses import dataclass, field
 
@@ -12,12 +12,12 @@ from scenes.tissue import TISSUES
 from sim.fields import array_of
 from version import VERSION
 
-# Keys that not every tissue model fills.
+# Keys that some tissue models leave open.
 NOT_EVERYWHERE = dict(radius_mm=None, stiffness=None, clusters=0, memberships=0)
 
 
 def expected_error_of(rehearsal: Rehearsal) -> float | None:
-    """Mean error of beads [mm] that ``study trade`` measured with settings like a rehearsal's; None where it measured none."""
+    """Mean bead error [mm] that ``study trade`` measured with similar settings; None if there are none."""
     step = rehearsal.settings
     changed = {name: getattr(step, name) for name in STEP}
     setup = Setup(rehearsal.scene.tissue, rehearsal.scene.solver.model_copy(update=changed))
@@ -26,7 +26,7 @@ def expected_error_of(rehearsal: Rehearsal) -> float | None:
 
 @dataclass
 class Tally:
-    """Figures gathered while a rehearsal runs; the first step and slice, which compile, count as building."""
+    """Figures of a running rehearsal; the first step and image, which compile kernels, are not timed."""
 
     build_s: float
     step_ms: list[float] = field(default_factory=list)
@@ -38,7 +38,7 @@ class Tally:
     indentation_max_mm: float = 0.0
 
     def watch(self, rehearsal: Rehearsal) -> None:
-        """Look at the state at the end of a step; the surfaces must be up to date."""
+        """Add the state after a step; the surfaces must be up to date."""
         if rehearsal.notice:
             self.fallbacks.append(rehearsal.notice)
         self.finite &= bool(np.isfinite(array_of(rehearsal.body.position)).all())
@@ -49,9 +49,7 @@ class Tally:
         self.indentation_max_mm = max(self.indentation_max_mm, rehearsal.indentation_mm())
 
     def report(self, rehearsal: Rehearsal, arch: str) -> dict:
-        """Everything in one dictionary; times in ms are over all steps but the first, if there are more, and None of what was not done;
-        of tissue that was not finite there are no figures.
-        """
+        """The report; times [ms] without the first step, None if nothing was timed; no figures of tissue that is not finite."""
         settings = rehearsal.settings
         return dict(
             version=VERSION,
@@ -86,10 +84,10 @@ def _times(ms: list[float]) -> dict[str, float] | None:
 
 
 def summary(report: dict) -> str:
-    """The figures that matter, in a few lines for the terminal."""
+    """The main figures, in a few lines for the terminal."""
     measured = {"step": report["ms_per_step"], "picture": report["ms_per_slice"]}
     times = ", ".join(f"{ms['median']:.1f} ms a {name}" for name, ms in measured.items() if ms is not None)
-    shown = f"picture {report['picture']}, echo as far as {report['detail_level']}"
+    shown = f"picture {report['picture']}, B-mode at detail level {report['detail_level']}"
     return "\n".join(
         [
             f"model     {TISSUES[report['model']].REPORTED.format(**report)}, {report['tetrahedra']} tetrahedra",
@@ -99,14 +97,14 @@ def summary(report: dict) -> str:
             f"probe     {report['probe']}; {shown if measured['picture'] else 'no pictures'}",
             f"press     {_press(report)}",
             f"error     {_error(report['expected_error_mm'])}",
-            *(f"MIND      {text}" for text in report["fallbacks"]),
+            *(f"WARNING   {text}" for text in report["fallbacks"]),
         ]
     )
 
 
 def _press(report: dict) -> str:
     if not report["finite"]:
-        return "NOT FINITE: the tissue was lost, and there are no figures of it"
+        return "NOT FINITE: the tissue diverged, and there are no figures of it"
     return (
         f"{report['indentation_max_mm']:.2f} mm deep; least volume {100 * report['volume_ratio_min']:.1f} %; "
         f"penetration at most {report['max_penetration_mm']:.3f} mm; all finite"
@@ -115,5 +113,5 @@ def _press(report: dict) -> str:
 
 def _error(expected_mm: float | None) -> str:
     if expected_mm is None:
-        return "not known: study trade measured no settings like these"
-    return f"{expected_mm:.2f} mm expected, the mean of beads with settings like these (study trade)"
+        return "not known: study trade measured no similar settings"
+    return f"{expected_mm:.2f} mm expected: mean bead error with similar settings (study trade)"

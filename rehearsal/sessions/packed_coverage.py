@@ -1,4 +1,4 @@
-"""What of an organ was seen, packed for a session's file: a bit a voxel."""
+"""The coverage of an organ, packed for a session's file: one bit per voxel."""
 
 import base64
 import math
@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field, with_config
 from typing_extensions import TypedDict
 
-# A grid of 1.5 mm over half a metre has less.
+# A grid of 1.5 mm over half a metre has fewer.
 MOST_VOXELS = 100_000_000
 
 
@@ -22,13 +22,13 @@ class SeenVoxels(TypedDict):
 
 
 def pack_seen(seen: np.ndarray) -> SeenVoxels:
-    """Which voxels (nx, ny, nz) were seen."""
+    """Pack which voxels (nx, ny, nz) were imaged."""
     bits = zlib.compress(np.packbits(seen).tobytes())
     return SeenVoxels(shape=list(seen.shape), bits=base64.b64encode(bits).decode("ascii"))
 
 
 def unpack_seen(packed: SeenVoxels) -> np.ndarray:
-    """Which voxels (nx, ny, nz) were seen. Raises ValueError."""
+    """Unpack which voxels (nx, ny, nz) were imaged. Raises ValueError."""
     count = math.prod(packed["shape"])
     if count > MOST_VOXELS:
         raise ValueError(f"{count} voxels, expected at most {MOST_VOXELS}")

@@ -1,4 +1,4 @@
-"""A rehearsal's state as text, to be put into a session's file and taken out again with the same bits."""
+"""A rehearsal's state as text for a session's file, without loss of bits."""
 
 import base64
 import io
@@ -16,10 +16,10 @@ from sim.divergence_check import DivergenceState
 from sim.solver import SolverState
 from ultrasound.probe_manipulator import ManipulatorState
 
-# Of all arrays: a body of a million particles has less.
+# Limit of all arrays together: a body of a million particles has less.
 MOST_BYTES = 1 << 30
 
-# What NumPy and zipfile raise for what they cannot read.
+# What NumPy and zipfile raise for unreadable data.
 UNREADABLE = (
     *(ValueError, LookupError, TypeError, RuntimeError, OSError, EOFError, MemoryError),
     *(zipfile.BadZipFile, zlib.error, struct.error),
@@ -27,11 +27,11 @@ UNREADABLE = (
 
 
 class StateError(ValueError):
-    """A text that holds no state of this body."""
+    """A text that is no state of this body."""
 
 
 def to_text(state: RehearsalState) -> str:
-    """The state, packed."""
+    """Pack a state."""
     watch = state.watch
     arrays: dict[str, Any] = {
         **_of_solver("now", state.solver),
@@ -46,7 +46,7 @@ def to_text(state: RehearsalState) -> str:
 
 
 def from_text(text: str, like: RehearsalState) -> RehearsalState:
-    """The state that a text holds, of a body ``like`` another. Raises StateError."""
+    """Unpack a state of the same body as ``like``. Raises StateError."""
     try:
         packed = zipfile.ZipFile(io.BytesIO(base64.b64decode(text, validate=True)))
         if sum(member.file_size for member in packed.infolist()) > MOST_BYTES:

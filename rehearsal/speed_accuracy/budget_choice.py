@@ -1,4 +1,4 @@
-"""Settings for a budget: the best point of the front that this machine and this patient can pay for."""
+"""Settings for a budget of time or error: the best point of the Pareto front on this machine."""
 
 from collections.abc import Callable
 
@@ -9,12 +9,12 @@ from rehearsal.rehearsal import Rehearsal
 from rehearsal.speed_accuracy.pareto_front import Point
 from rehearsal.stopwatch import timed
 
-# A press so deep, in so many steps, tells what a step costs here.
+# The press that measures the time of a step on this machine.
 TRIAL_MM, TRIAL_STEPS = 8.0, 40
 
 
 class NoPoint(ValueError):
-    """Budgets that no settings meet; the message is one line."""
+    """Raised for budgets that no settings meet; the message is one line."""
 
 
 def choose(
@@ -70,6 +70,6 @@ def trial_ms(rehearsal: Rehearsal) -> float:
 
 
 def described(setup: Setup) -> str:
-    """Settings in words."""
+    """Settings as text."""
     size = f"{setup.tissue.PIECES} of {setup.size_mm:g} mm"
-    return f"{setup.model}, {size}, {setup.substeps} x {setup.iterations} passes"
+    return f"{setup.model}, {size}, {setup.substeps} x {setup.iterations} iterations"

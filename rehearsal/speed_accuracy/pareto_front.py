@@ -1,4 +1,4 @@
-"""The points that ``study trade`` found, and which of them is best for a budget of time or of error."""
+"""The speed-accuracy points measured by ``study trade``, and their Pareto front."""
 
 import json
 from collections.abc import Sequence
@@ -14,13 +14,13 @@ from rehearsal.configuration import PRESETS, Setup, setup_of
 # Written by ``study trade``, copied here whole.
 MEASURED = Path(__file__).with_name("points.json")
 SETTINGS = ("radius_mm", "cell_mm", "stiffness", "substeps", "iterations", "relaxation_factor")
-# Settings farther from every point that was measured than this factor in size times passes have no expected error.
+# Settings farther from every measured point than this factor in resolution times iterations have no expected error.
 NEAR = 1.6
 
 
 @dataclass(frozen=True)
 class Point:
-    """Settings and what they came to: median of a step [ms] on the machine that measured, mean error of the beads [mm]."""
+    """Settings, median time of a step [ms] on the measuring machine, and mean bead error [mm]."""
 
     setup: Setup
     ms_median: float
@@ -30,7 +30,7 @@ class Point:
 
 @lru_cache
 def load_points() -> tuple[Point, ...]:
-    """What was measured, cheapest first."""
+    """The measured points, fastest first."""
     rows = json.loads(MEASURED.read_text("utf-8"))["points"]
     found = [Point(setup_of_row(row), row["ms_median"], row["error_mean_mm"], row["pareto"]) for row in rows]
     return tuple(sorted(found, key=lambda point: point.ms_median))
@@ -68,14 +68,14 @@ def front_of(points: Sequence[Point], model: str | None) -> list[Point]:
 def expected_error_mm(points: Sequence[Point], setup: Setup) -> float | None:
     """The mean error of the nearest settings that were measured; None where none is near.
 
-    Half a size or double the passes are equally far.
+    Half the resolution and double the iterations are equally far.
     """
 
     def away(point: Point) -> float:
         other = point.setup
         size = np.log(setup.size_mm / other.size_mm) + stiffness_of(setup) - stiffness_of(other)
-        passes = np.log(setup.substeps * setup.iterations / (other.substeps * other.iterations))
-        return abs(size) + abs(passes) + 0.1 * abs(setup.relaxation_factor - other.relaxation_factor)
+        iterations = np.log(setup.substeps * setup.iterations / (other.substeps * other.iterations))
+        return abs(size) + abs(iterations) + 0.1 * abs(setup.relaxation_factor - other.relaxation_factor)
 
     def stiffness_of(setup: Setup) -> float:
         return getattr(setup.tissue, "stiffness", 0.0)

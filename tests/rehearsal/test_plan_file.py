@@ -226,7 +226,7 @@ def ball_scene(tmp_path):
         (("--trials", "3"), "3 is not in the range"),
         (("--probe", "none"), "known by name are"),
         (("--out", "{}"), "is a folder; name a file after --out"),
-        (("--out", "{}/taken/plan.json"), "cannot be made a folder for results"),
+        (("--out", "{}/taken/plan.json"), "cannot be created"),
     ],
 )
 def test_the_plan_command_refuses_in_one_line(ball_scene, capsys, options, words):

@@ -1,4 +1,4 @@
-"""The key map, in the README and in the window's help."""
+"""The key map: in the documents and in the window's help."""
 
 import numpy as np
 import pytest
@@ -27,9 +27,20 @@ def test_key_table_has_a_row_for_every_line_and_group():
     assert [row for row in rows if "**" in row] == [f"| **{group}**" for group in KEY_MAP]
 
 
-def test_the_readme_has_the_key_map():
-    readme = ROOT / "README.md"
-    assert key_table() in readme.read_text("utf-8")
+def test_docs_keys_has_the_key_map():
+    assert key_table() in (ROOT / "docs" / "keys.md").read_text("utf-8")
+
+
+def test_readme_keys_are_rows_of_the_key_map():
+    section = (ROOT / "README.md").read_text("utf-8").partition("\n## Keys\n")[2].partition("\n## ")[0]
+    rows = [row for row in section.splitlines() if row.startswith("|")]
+    known = key_table().splitlines()
+    assert rows == [row for row in known if row in rows]
+    shown = {row.split(" | ")[0].removeprefix("| ") for row in rows}
+    entries = [entry for group in KEY_MAP.values() for entry in group]
+    actions = {action for entry in entries if " / ".join(entry.keys) in shown for action in entry.actions}
+    assert {"point", "press", "rock_left", "tilt_back", "rotate_left", "reset", "help"} <= actions
+    assert len(actions) < sum(len(entry.actions) for entry in entries) / 2
 
 
 @pytest.mark.parametrize(
@@ -58,7 +69,7 @@ def test_all_keys_fit_into_the_help_of_any_window(monkeypatch, size):
         assert min(size for _, size in written) >= 13
 
 
-def test_the_help_has_every_group_whole_under_its_name():
+def test_help_keeps_each_group_together_under_its_name():
     groups = Keys().lines()
     columns = in_columns(groups)
     assert max(map(len, columns)) <= 0.6 * sum(map(len, columns))

@@ -23,9 +23,9 @@ from studies.robustness import soak as soak
 SIZES = {"neo-hookean": 6.0, "shape-matching": 4.0}
 # What only the feature has kernels use.
 OWN = {
-    "contact with the support": [(SignedDistanceField, "surface"), (SignedDistanceField, "room")],
+    "contact with the support": [(SignedDistanceField, "surface"), (SignedDistanceField, "clearance")],
     "the transducer": [(ConvexTool, "surface"), (ConvexTool, "motion")],
-    "friction on shapes": [(SurfaceContacts, "bent"), (ShapeContacts, "rub")],
+    "friction on shapes": [(SurfaceContacts, "tangential_slip"), (ShapeContacts, "friction_change")],
     "contacts of particles": [(SelfContacts, "find"), (SelfContacts, "project")],
     "scaled masses": [(ShapeMatching, "update_patch_masses"), (ShapeMatching, "update_cluster_masses")],
 }
