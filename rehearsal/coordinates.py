@@ -3,7 +3,7 @@
 import numpy as np
 
 from rehearsal.rehearsal import Rehearsal
-from ultrasound.probe_manipulator import held_at, image_plane
+from ultrasound.probe_manipulator import image_plane, pose_of_image_plane
 
 
 def probe_in_patient(rehearsal: Rehearsal, pose: np.ndarray | None = None) -> np.ndarray:
@@ -14,7 +14,7 @@ def probe_in_patient(rehearsal: Rehearsal, pose: np.ndarray | None = None) -> np
 
 def transducer_at(rehearsal: Rehearsal, probe: np.ndarray) -> np.ndarray:
     """The transducer's pose (4, 4) where the probe, in PLUS's axes, is at a pose (4, 4) in the patient."""
-    return held_at(shifted(probe, -rehearsal.origin), rehearsal.size_mm[2])
+    return pose_of_image_plane(shifted(probe, -rehearsal.origin), rehearsal.size_mm[2])
 
 
 def shifted(pose: np.ndarray, by_mm: np.ndarray) -> np.ndarray:

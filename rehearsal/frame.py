@@ -114,7 +114,7 @@ class WindowFrames(Frames):
             self.frozen = not self.frozen
         if controls.reset:
             self.caliper.points = ()
-        self.notices.post(controls.news)
+        self.notices.post(controls.message)
         self.notices.post(self.plans.watch(controls))
         if self.frozen:
             self.cine.go(controls.cine)

@@ -14,7 +14,7 @@ from rehearsal.measurements.run_report import summary
 from rehearsal.notices import Notices
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import write_json
-from render.animation import PICTURES_A_SECOND, empty_folder, save_animation, side_by_side, smaller
+from render.animation import ANIMATION_FPS, empty_folder, save_animation, scaled_down, side_by_side
 from render.viewer import Controls, Settings, View, Viewer
 from render.window import NoVulkan
 from scenes.atomic_files import atomic_write
@@ -33,7 +33,7 @@ class Pictures:
             self.viewer = open_viewer(rehearsal, visible=False)
         except NoVulkan as reason:
             click.echo(f"{reason}; writing the pictures and the report without 3D frames.")
-        self._every = max(1, round(1 / (PICTURES_A_SECOND * rehearsal.settings.time_step_s)))
+        self._every = max(1, round(1 / (ANIMATION_FPS * rehearsal.settings.time_step_s)))
         self._shown_every = self._every * (1 + steps // self._every // MOST_SHOWN)
         folders = out / "frames", out / "slices"
         if any(next(folder.glob("*.png"), None) for folder in folders):
@@ -52,7 +52,7 @@ class Pictures:
             picture = Image.fromarray(self.viewer.picture())
             save_image_file(picture, self._frames / f"{step:05d}.png")
         if step % self._shown_every == 0 or step == self.steps:
-            self._animation.append(smaller(picture))
+            self._animation.append(scaled_down(picture))
 
     def save(self) -> str:
         """Write the animation; return what was written."""

@@ -12,13 +12,13 @@ from scenes.surface_files import save_surface
 
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import next_number
-from render.animation import in_proportion
+from render.animation import with_square_pixels
 from render.viewer import View
 from scenes.atomic_files import atomic_write
 from sim.fields import array_of
 from ultrasound.dicom_image import save_dicom
 from ultrasound.probe import Probe
-from ultrasound.scanner import ECHO
+from ultrasound.scanner import B_MODE
 
 SCREENSHOT, IMAGE = r"screenshot-([0-9]{3,9})\.png", r"([0-9]{3,9})-.*\.png"
 
@@ -50,11 +50,11 @@ def save_images(
     """Write images (rows, columns) by kind, with square pixels, to files that share a prefix. Raises OSError."""
     saved = []
     for kind, grey in images.items():
-        image = in_proportion(grey, width_mm, depth_mm)
+        image = with_square_pixels(grey, width_mm, depth_mm)
         path = prefix.with_name(f"{prefix.name}-{kind.lower()}.png")
         save_image_file(image, path)
         spacing_mm = depth_mm / image.height, width_mm / image.width
-        if dicom and kind == ECHO:
+        if dicom and kind == B_MODE:
             with atomic_write(path.with_suffix(".dcm")) as partial:
                 save_dicom(partial, np.asarray(image), spacing_mm, probe)
         saved.append(SavedImage(kind, path, (image.height, image.width), spacing_mm))
@@ -72,7 +72,7 @@ def save_view(view: View, probe: Probe, out: Path) -> str:
     """Write the images of a view under the next free number, and print their paths; return the prefix of their names."""
     prefix = out / f"{next_number(out, IMAGE):03d}"
     for saved in save_images(view.pictures, view.width_mm, view.depth_mm, probe, prefix):
-        click.echo(f"Saved {saved.path}{' and .dcm' if saved.kind == ECHO else ''}")
+        click.echo(f"Saved {saved.path}{' and .dcm' if saved.kind == B_MODE else ''}")
     return f"{prefix.name}-"
 
 

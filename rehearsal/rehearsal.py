@@ -24,21 +24,20 @@ from sim.shapes import Plane, SignedDistanceField
 from sim.skinning import Skin
 from sim.solver import SolverState
 from sim.tissue_model import FixedRegion, MaterialModel
-from ultrasound.image_plane import ImagePlane
-from ultrasound.outline import section
+from ultrasound.image_plane import ImagePlane, plane_section
 from ultrasound.probe import DetailLevel, Mode, Probe
 from ultrasound.probe_manipulator import (
     ManipulatorState,
     ProbeManipulator,
     advanced,
-    approached,
-    between,
     image_plane,
     indentation,
+    moved_towards,
     pose_at,
+    poses_between,
     touching,
 )
-from ultrasound.scanner import ScannedAnatomy, Scanner, begin_echo
+from ultrasound.scanner import ScannedAnatomy, Scanner, start_acoustics
 
 TURN_DEG_S = 180.0
 AWAY_MM = 200.0
@@ -90,7 +89,7 @@ class Rehearsal:
         scanned, echo = None, None
         if anatomy.ct is not None:
             scanned = scanned_anatomy(self.organ, anatomy.ct, anatomy, self.origin)
-            echo = begin_echo(scanned) if shows_echo else None
+            echo = start_acoustics(scanned) if shows_echo else None
         progress("Building the model: tissue and contacts")
         self._build_solver(anatomy)
         self.divergence_check = DivergenceCheck(self.solver)
@@ -201,7 +200,7 @@ class Rehearsal:
     def pose_towards(self, goal: np.ndarray) -> np.ndarray:
         """The transducer's next pose towards a goal (4, 4): at most at the scene's speed, and not through the organ."""
         most_mm = self.scene.transducer.speed_mm_s * self.settings.time_step_s
-        pose = approached(self.pose, goal, most_mm, TURN_DEG_S * self.settings.time_step_s)
+        pose = moved_towards(self.pose, goal, most_mm, TURN_DEG_S * self.settings.time_step_s)
         # The straight path between two points of the surface may cross the organ.
         wanted = max(self._indentation(goal), 0.0)
         through = self._indentation(pose) - max(wanted, self.indentation_mm())
@@ -212,7 +211,7 @@ class Rehearsal:
 
         ``notice`` says if the divergence check restored the state; it is empty after most steps.
         """
-        self.solver.step(self.settings, between(self.pose, pose, self.settings.substeps))
+        self.solver.step(self.settings, poses_between(self.pose, pose, self.settings.substeps))
         self.notice = self.divergence_check.check(self.settings.time_step_s)
         self.pose = pose
         self.steps += 1
@@ -245,15 +244,15 @@ class Rehearsal:
     def look(
         self, probe: Probe, mode: Mode, detail_level: DetailLevel, window_hu: float, level_hu: float
     ) -> dict[str, np.ndarray]:
-        """What the scanner shows now, by name (``Scanner.look``); black in a scene without a CT."""
+        """What the scanner shows now, by name (``Scanner.images``); black in a scene without a CT."""
         if self.scanner is None:
             return {"no CT": np.zeros((self.scene.image.pixels, self.scene.image.pixels), np.uint8)}
-        return self.scanner.look(self.image_plane(probe), probe, mode, detail_level, window_hu, level_hu)
+        return self.scanner.images(self.image_plane(probe), probe, mode, detail_level, window_hu, level_hu)
 
     def find_plane(self, probe: Probe) -> None:
         """Locate the image plane in the tissue without computing an image."""
         if self.scanner is not None:
-            self.scanner.take(self.image_plane(probe))
+            self.scanner.locate(self.image_plane(probe))
 
     def image_plane(self, probe: Probe | None = None) -> ImagePlane:
         """The present image plane, of the extent of the probe or of the probe with other settings."""
@@ -272,7 +271,7 @@ class Rehearsal:
             return None
         plane = self.image_plane()
         vertices = np.asarray(self.tumour.vertices) if at_rest else self.tumour_vertices()
-        return section(vertices, self.tumour.faces, np.linalg.inv(plane.world_from_plane))
+        return plane_section(vertices, self.tumour.faces, np.linalg.inv(plane.world_from_plane))
 
     def tumour_vertices(self) -> np.ndarray:
         """Present vertices (n, 3) [mm] of the tumour's surface; empty without a tumour."""

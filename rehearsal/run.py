@@ -159,7 +159,7 @@ class RehearsalRun:
 
     def _take_over(self) -> UserInput:
         """The user continues where the replay is: in a new session."""
-        self.rehearsal.manipulator.take(self.rehearsal.pose)
+        self.rehearsal.manipulator.match(self.rehearsal.pose)
         self.measurements.restart()
         return self._user_input(self.rehearsal.snapshot())
 

@@ -1,11 +1,11 @@
-"""What the actions of the key map do to the controls and settings, by whichever key or button they come."""
+"""Effects of the key map's actions on controls and settings."""
 
-from render.viewer import LINES, Controls
+from render.viewer import KEY_MAP_ENTRIES, Controls
 from ultrasound.probe import DETAIL_LEVELS, MODES
 from ultrasound.target import TARGETS
 
 PUSH_MM_S, ROTATE_DEG_S, TILT_DEG_S = 15.0, 45.0, 30.0
-# While held: what of the controls changes, and how much in a second.
+# Actions of held keys: the control that changes, and its rate per second.
 HELD = {
     "push": ("push_mm", PUSH_MM_S),
     "lift": ("push_mm", -PUSH_MM_S),
@@ -16,24 +16,24 @@ HELD = {
     "tilt_back": ("tilt_deg", -TILT_DEG_S),
     "tilt_forward": ("tilt_deg", TILT_DEG_S),
 }
-# The rest begins as the key goes down: steps through pictures, settings of several values, settings that are on or off,
-# and what the controls name as the action is named.
+# The others act when the key goes down: cine steps, settings of several values, settings that are on or off, and controls with the
+# name of the action.
 STEPS = {"cine_back": -1, "cine_forth": 1}
 CYCLES = {"mode": MODES, "detail_level": DETAIL_LEVELS, "plan_for": TARGETS}
-# What is the mouse's alone.
+# Actions of the mouse only.
 BY_MOUSE = ("point", "press", "orbit", "pan", "measure")
-ACTIONS = tuple(action for line in LINES for action in line.actions if action not in BY_MOUSE)
+ACTIONS = tuple(action for line in KEY_MAP_ENTRIES for action in line.actions if action not in BY_MOUSE)
 
 
 def hold(action: str, controls: Controls, seconds: float) -> None:
-    """An action's key was held for so long; nothing for one that is not held."""
+    """Apply an action whose key was held for a time; ignore other actions."""
     if action in HELD:
         name, rate = HELD[action]
         setattr(controls, name, getattr(controls, name) + rate * seconds)
 
 
 def begin(action: str, controls: Controls) -> None:
-    """An action's key went down; nothing for one that is held, or is the window's own."""
+    """Apply an action whose key went down; ignore held actions and those of the window itself."""
     settings = controls.settings
     if action in STEPS:
         controls.cine += STEPS[action]

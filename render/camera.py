@@ -1,4 +1,4 @@
-"""The camera that orbits the organ, and the way back from the mouse to a ray. NumPy only; lengths in mm.
+"""The camera that orbits the organ, and the ray under the mouse. NumPy only; lengths in mm.
 
 Window coordinates run from (0, 0) bottom left to (1, 1) top right, as GGUI gives the mouse.
 """
@@ -30,21 +30,21 @@ class OrbitCamera:
         self.aspect = aspect
         self.part = part
         self.azimuth_deg, self.elevation_deg = HOME_DEG
-        # The long side of the organ lies across the view: that is how a kidney is looked at.
+        # The long side of the organ is horizontal in the view, as usual for a kidney.
         flat = np.eye(3) - np.outer(self.up, self.up)
         spread = (bounds[1] - bounds[0]) * np.linalg.norm(flat, axis=1)
         side = flat[int(np.argmax(spread))]
         self._side = side / np.linalg.norm(side)
         self._ahead = np.cross(self.up, self._side)
-        self.distance = self.distance_home = self._distance_that_frames(bounds)
+        self.distance = self.distance_home = self._framing_distance(bounds)
 
     def go_home(self) -> None:
-        """Back to where it started from."""
+        """Return to the initial view."""
         self.target = self._middle
         self.azimuth_deg, self.elevation_deg = HOME_DEG
         self.distance = self.distance_home
 
-    def _distance_that_frames(self, bounds: np.ndarray) -> float:
+    def _framing_distance(self, bounds: np.ndarray) -> float:
         corners = np.array(
             [[bounds[i][0], bounds[j][1], bounds[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
         )
@@ -52,13 +52,13 @@ class OrbitCamera:
         offset = corners - self.target
         left, bottom, right_edge, top = self.part
         half = self._half_extent() * [right_edge - left, top - bottom]
-        # What lies behind the target drifts towards the middle of the window, as the eye stands aside of the target.
-        drift = np.outer(offset @ ahead, self._aside())
-        reach = np.abs(np.stack([offset @ right, offset @ up], axis=1) - drift) / half
+        # The eye is beside the target: what is behind the target is shifted towards the centre of the window.
+        shift = np.outer(offset @ ahead, self._aside())
+        reach = np.abs(np.stack([offset @ right, offset @ up], axis=1) - shift) / half
         return float(MARGIN * np.max(reach.max(axis=1) - offset @ ahead))
 
     def axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Unit vectors to the right, up and ahead of the camera, world."""
+        """Return unit vectors to the right, up and ahead of the camera, world."""
         azimuth, elevation = np.radians([self.azimuth_deg, self.elevation_deg])
         level = np.cos(azimuth) * self._ahead + np.sin(azimuth) * self._side
         ahead = np.cos(elevation) * level - np.sin(elevation) * self.up
@@ -72,12 +72,12 @@ class OrbitCamera:
         return np.array([half_height * self.aspect, half_height])
 
     def _aside(self) -> np.ndarray:
-        """Slopes to the right and up at which the middle of the part is seen."""
+        """Slopes to the right and up of the ray through the centre of the part."""
         left, bottom, right_edge, top = self.part
         return np.array([left + right_edge - 1.0, bottom + top - 1.0]) * self._half_extent()
 
     def eye(self) -> np.ndarray:
-        """Position [mm]. It stands aside of the target, so that the target falls in the middle of its part."""
+        """Position [mm]. It is beside the target, so that the target is in the centre of its part."""
         right, up, ahead = self.axes()
         across, along = self._aside()
         return self.target - self.distance * (ahead + across * right + along * up)
@@ -101,7 +101,7 @@ class OrbitCamera:
         return 0.5 + 0.5 * plane / self._half_extent()
 
     def orbit(self, across: float, along: float) -> None:
-        """Turn by a drag of the mouse, in window coordinates. The poles stay out of reach: up would be lost."""
+        """Turn by a drag of the mouse, in window coordinates. The poles are excluded: up is undefined there."""
         self.azimuth_deg += 220.0 * across
         self.elevation_deg = float(np.clip(self.elevation_deg - 160.0 * along, -80.0, 85.0))
 

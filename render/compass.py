@@ -1,4 +1,4 @@
-"""Which way the patient lies: a cross of the patient's axes as the camera sees them. Lengths in shares of its box."""
+"""The compass: the patient's axes as seen by the camera. Lengths in fractions of its box."""
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -11,12 +11,12 @@ from render.window_layout import WindowLayout
 LETTERS = (("R", "L"), ("A", "P"), ("I", "S"))
 ARM, BEYOND = 0.27, 0.11
 LETTER_PX, LINE_PX = 14, 2
-# An axis that is seen nearly end on has no room for its letters.
+# A shorter projected axis has no letters.
 LEAST_LENGTH = 0.3
 
 
 def ends_of(axes: np.ndarray) -> list[tuple[str, np.ndarray]]:
-    """The letters of the patient's axes and where they point on the screen (2,), right and up, the farthest first.
+    """Return the letters of the patient's axes and their directions on the screen (2,), right and up, the farthest first.
 
     ``axes`` (3, 3) are the camera's right, up and ahead, in the patient.
     """
@@ -26,20 +26,20 @@ def ends_of(axes: np.ndarray) -> list[tuple[str, np.ndarray]]:
         for side in (-1, 1)
         if np.hypot(*axes[:2, axis]) > LEAST_LENGTH
     ]
-    return [(letter, way[:2]) for letter, way in sorted(ends, key=lambda end: -end[1][2])]
+    return [(letter, end[:2]) for letter, end in sorted(ends, key=lambda end: -end[1][2])]
 
 
 def compass_picture(layout: WindowLayout, axes: np.ndarray) -> np.ndarray:
-    """The cross for a camera's axes (3, 3), uint8, shape of layout.compass."""
+    """Return the compass for a camera's axes (3, 3), uint8, shape of layout.compass."""
     size = layout.compass.width
     image = Image.new("RGB", (size, size), FINDINGS)
     draw = ImageDraw.Draw(image)
     draw.rectangle([0, 0, size - 1, size - 1], outline=LINE)
     middle = np.array([size, size]) / 2
     ends = ends_of(axes)
-    for place, (letter, way) in enumerate(ends):
+    for place, (letter, axis) in enumerate(ends):
         near = place >= len(ends) / 2
-        colour, down = TEXT if near else QUIET, way * [1, -1]
+        colour, down = TEXT if near else QUIET, axis * [1, -1]
         tip = middle + size * ARM * down
         end = tip + size * BEYOND * down / np.linalg.norm(down)
         draw.line([*middle, *tip], fill=colour, width=layout.px(LINE_PX))

@@ -1,6 +1,6 @@
-"""The face of a cut along the image plane: what of each surface lies on it, in its colour.
+"""The section of the organ on the image plane, filled with the colours of what it cuts.
 
-The scene is a parameter, so that window.py alone imports the user interface. Lengths in mm.
+The scene is a parameter: only window.py imports taichi.ui. Lengths in mm.
 """
 
 from dataclasses import dataclass
@@ -12,22 +12,22 @@ from sim.fields import array_of, fields_of, fill
 
 CELLS = 160
 FLESH = (0.78, 0.50, 0.44)
-# So much of a cell is covered at the face's border, which is so much sharper than a cell: what is left of cells there hides no organ.
+# Coverage of a cell at which the border is drawn, and the sharpness of the border.
 BORDER, SHARPER = 0.25, 3.0
-# An organ seen so nearly along the cut (sine of the angle) keeps the half that it kept before.
+# At a smaller angle between view and cut (its sine) the half that is removed does not change.
 EDGE_ON = 0.2
 
 
 def side_of_eye(pose: np.ndarray, eye: np.ndarray, before: float) -> float:
-    """The side of the image plane of a pose (4, 4) that the eye is on, 1 or -1; seen edge on, the one of before, 0 where none was."""
+    """Return the side of the image plane of a pose (4, 4) that the eye is on, 1 or -1; edge on, the side ``before`` (0: none)."""
     toward = (eye - pose[:3, 3]) / np.linalg.norm(eye - pose[:3, 3])
     sine = float(toward @ pose[:3, 1])
     return before if before and abs(sine) < EDGE_ON else float(np.copysign(1.0, sine))
 
 
-def section(vertices: np.ndarray, faces: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Where the image plane of a pose (4, 4) cuts a closed surface (n, 3), (m, 3): segments (k, 2, 2) along the pose's x and z,
-    all of which go round what is inside in the same sense."""
+def oriented_section(vertices: np.ndarray, faces: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Return the section of a closed surface (n, 3), (m, 3) with the image plane of a pose (4, 4): segments (k, 2, 2) along the
+    pose's x and z, all in the same sense around the inside."""
     local = (vertices - pose[:3, 3]) @ pose[:3, :3]
     below = local[:, 1] < 0
     cut = faces[below[faces].any(axis=1) & ~below[faces].all(axis=1)]
@@ -41,7 +41,7 @@ def section(vertices: np.ndarray, faces: np.ndarray, pose: np.ndarray) -> np.nda
 
 @dataclass(frozen=True)
 class Raster:
-    """Square cells of a plane: the first one's middle (2,) and their width."""
+    """Square cells of a plane: the centre (2,) of the first one, and their width."""
 
     low: np.ndarray
     width: float
@@ -49,20 +49,20 @@ class Raster:
 
     @classmethod
     def around(cls, segments: list[np.ndarray], count: int) -> "Raster":
-        """The cells, ``count`` along each side, that hold segments (k, 2, 2)."""
+        """Return cells, ``count`` along each side, that contain segments (k, 2, 2)."""
         points = np.concatenate([*segments, np.zeros((1, 2, 2))]).reshape(-1, 2)
         low, high = points.min(axis=0), points.max(axis=0)
-        # Two cells more at each side: the outermost are empty.
+        # Two more cells at each side: the outermost are empty.
         width = max(float((high - low).max()) / (count - 5), 1e-3)
         return cls(low - 2 * width, width, count)
 
     def places(self) -> np.ndarray:
-        """The cells' middles (count * count, 2), row by row."""
+        """Return the centres (count * count, 2) of the cells, row by row."""
         along = self.width * np.arange(self.count)
         return self.low + np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
 
     def covered(self, segments: np.ndarray) -> np.ndarray:
-        """How much of each cell lies inside segments (k, 2, 2) of one sense, 0 to 1, shape (count, count), by rows."""
+        """Return the covered fraction of each cell inside segments (k, 2, 2) of one sense, shape (count, count), by rows."""
         start, end = np.moveaxis((segments - self.low) / self.width, 1, 0)
         low, high = np.sort(np.stack([start[:, 1], end[:, 1]]), axis=0)
         first = np.ceil(low).astype(int)
@@ -71,20 +71,20 @@ class Raster:
         row = first[which] + np.arange(len(which)) - np.repeat(np.cumsum(times) - times, times)
         run = end[which] - start[which]
         at = start[which, 0] + (row - start[which, 1]) / run[:, 1] * run[:, 0]
-        # Right of where a segment goes up a row lies one side of the surface, right of where one goes down the other.
+        # Scan conversion: along a row, a segment that goes up enters the surface, one that goes down leaves it, or the reverse.
         sense, column = np.sign(run[:, 1]), np.floor(at + 0.5).astype(int)
         change = np.zeros((self.count, self.count + 1))
         part = column + 0.5 - at
         np.add.at(change, (row, column), sense * part)
         np.add.at(change, (row, column + 1), sense * (1 - part))
         inside = np.clip(np.abs(np.cumsum(change, axis=1)[:, :-1]), 0.0, 1.0)
-        # Rows are looked at along their middle: their neighbours make a slope of a step.
+        # Rows are sampled at their centres: smooth the steps between them.
         inside[1:-1] = inside[:-2] / 4 + inside[1:-1] / 2 + inside[2:] / 4
         return inside
 
 
 class CutFace:
-    """The fields of what is drawn."""
+    """Fields of the drawn section."""
 
     def __init__(self) -> None:
         count = CELLS**2
@@ -97,8 +97,8 @@ class CutFace:
     def draw(
         self, scene, organ: ShadedSurface, inner: list[ShadedSurface], pose: np.ndarray, key: np.ndarray
     ) -> None:
-        """Hand the face on the image plane of a pose (4, 4) to a scene, evenly lit by a light at ``key`` (3,)."""
-        cuts = [section(array_of(each.vertices), each.faces, pose) for each in (organ, *inner)]
+        """Draw the section on the image plane of a pose (4, 4) into a scene, evenly lit by a light at ``key`` (3,)."""
+        cuts = [oriented_section(array_of(each.vertices), each.faces, pose) for each in (organ, *inner)]
         raster = Raster.around(cuts, CELLS)
         covered = [raster.covered(each).reshape(-1, 1) for each in cuts]
         colour = np.tile(FLESH, (CELLS**2, 1))

@@ -1,4 +1,4 @@
-"""The screen that a window would open on, asked of the system itself: GLFW ends the process where there is none."""
+"""The screen, as reported by the system: GLFW would end the process where there is none."""
 
 import ctypes
 import os
@@ -7,8 +7,8 @@ from functools import cache
 
 from render.window_layout import FULL_SIZE
 
-# So much of a small screen's height a window takes, as its title and a task bar leave; its width is a multiple of STEP.
-SHARE, STEP = 0.88, 64
+# Fraction of a small screen's height for a window below its title and a task bar; its width is a multiple of STEP.
+HEIGHT_FRACTION, STEP = 0.88, 64
 
 
 def display_available() -> bool:
@@ -17,7 +17,7 @@ def display_available() -> bool:
 
 
 def window_size() -> tuple[int, int]:
-    """Width and height in pixels that suit the screen: FULL_SIZE where nothing is known of it."""
+    """Return width and height of a window [pixels] that fit the screen; FULL_SIZE where it is unknown."""
     screen = None
     if sys.platform == "win32":
         metrics = ctypes.windll.user32.GetSystemMetrics
@@ -28,15 +28,15 @@ def window_size() -> tuple[int, int]:
 
 
 def fitted(width: int, height: int) -> tuple[int, int]:
-    """The size of a window on a screen of so many pixels: FULL_SIZE, or as large as there is room for."""
-    room = min(width, SHARE * height * FULL_SIZE[0] / FULL_SIZE[1])
+    """Return the size of a window on a screen of a size [pixels]: FULL_SIZE, or as large as fits."""
+    room = min(width, HEIGHT_FRACTION * height * FULL_SIZE[0] / FULL_SIZE[1])
     wide = min(FULL_SIZE[0], int(room) // STEP * STEP)
     return wide, wide * FULL_SIZE[1] // FULL_SIZE[0]
 
 
 @cache
 def _of_x11(display: str | None) -> tuple[int, int] | None:
-    """Width and height of an X server's screen. It is asked once: one that nobody is connected to may begin anew."""
+    """Return width and height of an X server's screen. Cached: a server without clients may reset when asked again."""
     if not display:
         return None
     try:

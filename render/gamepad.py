@@ -1,4 +1,4 @@
-"""A gamepad beside mouse and keys: it fills the same controls. pygame's SDL reads it, without a window of its own."""
+"""Gamepad input, read by pygame's SDL; it fills the same controls as mouse and keys."""
 
 from __future__ import annotations
 
@@ -6,17 +6,16 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 from render.actions import TILT_DEG_S, begin, hold
 from render.keys import BUTTONS
 from render.viewer import Controls
 
 SLIDE_MM_S = 40.0
-# A stick at rest is not quite at 0; a worn trigger neither. A stick moves finely near its middle.
+# Dead zones: sticks and triggers at rest are not exactly at 0. A power law makes a stick fine near its centre.
 DEAD_STICK, DEAD_TRIGGER = 0.15, 0.05
 STICK_POWER = 2.0
-# SDL's game controllers, whatever their make: axes of the sticks (down is positive) and of the right trigger.
+# SDL's game controllers of any make: axes of the sticks (down is positive) and of the right trigger.
 LEFT_X, LEFT_Y, RIGHT_X, RIGHT_Y, RIGHT_TRIGGER = 0, 1, 2, 3, 5
 FULL = 32767
 
@@ -31,26 +30,18 @@ class PadState:
     held: frozenset[str] = frozenset()
     """Down now."""
     pressed: tuple[str, ...] = ()
-    """Went down since the last time, even if they are up again."""
-
-
-class Pads(Protocol):
-    """Where gamepads are plugged in and out."""
-
-    def read(self) -> PadState | None:
-        """The state of one that is plugged in, None where there is none."""
-        ...
+    """Went down since the last read, even if released again."""
 
 
 class Gamepad:
-    """Left stick: over the surface; right: tilt and fan; right trigger: press; ``buttons`` are action -> button."""
+    """Left stick: slide; right stick: rock and tilt; right trigger: press; ``buttons`` are action -> button."""
 
-    def __init__(self, pads: Pads, buttons: Mapping[str, str]) -> None:
+    def __init__(self, pads: SdlPads, buttons: Mapping[str, str]) -> None:
         self._pads, self._buttons = pads, buttons
-        self._is_there: bool | None = None
+        self._connected: bool | None = None
 
     def read(self, controls: Controls, seconds: float) -> None:
-        """Add to the controls what was done in so many seconds."""
+        """Add the input of the last seconds to the controls."""
         state = self._pads.read()
         self._watch(state is not None, controls)
         if state is None:
@@ -68,20 +59,20 @@ class Gamepad:
             if button in state.held:
                 hold(action, controls, seconds)
 
-    def _watch(self, is_there: bool, controls: Controls) -> None:
-        if is_there == self._is_there:
+    def _watch(self, connected: bool, controls: Controls) -> None:
+        if connected == self._connected:
             return
-        if is_there:
-            controls.news = "Gamepad ready"
-        elif self._is_there is None:
-            controls.news = "No gamepad is plugged in: mouse and keys lead until one is"
+        if connected:
+            controls.message = "Gamepad ready"
+        elif self._connected is None:
+            controls.message = "No gamepad connected: use mouse and keys"
         else:
-            controls.news = "Gamepad unplugged: mouse and keys lead"
-        self._is_there = is_there
+            controls.message = "Gamepad disconnected: use mouse and keys"
+        self._connected = connected
 
 
 def shaped(x: float, y: float) -> tuple[float, float]:
-    """A stick without its dead zone, fine near the middle; its direction stays, and its length is 1 at most."""
+    """Return a stick's deflection without its dead zone, fine near the centre, of length 1 at most, in the same direction."""
     length = math.hypot(x, y)
     if length <= DEAD_STICK:
         return 0.0, 0.0
@@ -94,10 +85,10 @@ def _beyond(value: float, dead: float) -> float:
 
 
 class SdlPads:
-    """The first gamepad that SDL knows the layout of."""
+    """The first gamepad with a layout known to SDL."""
 
     def __init__(self) -> None:
-        # GGUI has the window: SDL gets a display that shows nothing, and so never the focus.
+        # GGUI has the window: SDL gets a dummy display, which never has the focus.
         os.environ.update(
             SDL_VIDEODRIVER="dummy", SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS="1", PYGAME_HIDE_SUPPORT_PROMPT="1"
         )
@@ -110,6 +101,7 @@ class SdlPads:
         self._pad: controller.Controller | None = None
 
     def read(self) -> PadState | None:
+        """Return the state of the connected gamepad, None where there is none."""
         events = self._pygame.event.get()
         if self._pad is not None and not self._pad.attached():
             self._pad = None
@@ -121,7 +113,7 @@ class SdlPads:
 
     def _state(self, pad, events) -> PadState:
         axes = [max(-1.0, pad.get_axis(axis) / FULL) for axis in range(RIGHT_TRIGGER + 1)]
-        # Of gamepads that are not read there are no events.
+        # Only a gamepad that is open sends events.
         down = [event.button for event in events if event.type == self._pygame.CONTROLLERBUTTONDOWN]
         held = frozenset(name for number, name in enumerate(BUTTONS) if pad.get_button(number))
         return PadState(

@@ -1,6 +1,6 @@
-"""The 3D view: organ, what is in it, support, transducer and image plane, handed to a GGUI scene.
+"""The 3D view: organ, internal structures, support, transducer and image plane in a GGUI scene.
 
-The scene is a parameter, so that window.py alone imports the user interface. Lengths in mm.
+The scene is a parameter: only window.py imports taichi.ui. Lengths in mm.
 """
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy as np
 from render import transducer_shape
 from render.camera import OrbitCamera
 from render.cut_face import CutFace, side_of_eye
-from render.plan_lines import GuideLines
+from render.plan_lines import PlanLines
 from render.surface_shading import CUT_EDGE_MM, GLASS, SOLID, Cut, ShadedSurface
 from render.viewer import Geometry, Settings, View
 from sim.fields import field_of, fields_of, fill
@@ -22,7 +22,7 @@ MASKS = 5
 
 
 class SceneView:
-    """The fields of what is drawn, and one method that draws them all."""
+    """Fields of the drawn objects; ``draw`` draws them all."""
 
     def __init__(self, geometry: Geometry, camera: OrbitCamera):
         self.camera = camera
@@ -41,7 +41,7 @@ class SceneView:
         self._probe_vertices, self._probe_normals, self._probe_colours = fields_of(*self._probe[:3], within=1)
         self._probe_edges = transducer_shape.edges(geometry.transducer_size_mm, geometry.transducer_radius_mm)
         self._edge_points = field_of(self._probe_edges, within=1)
-        self._guide: GuideLines | None = None
+        self._guide: PlanLines | None = None
         self._cut_face: CutFace | None = None
         self._cut_side = 0.0
         self._plane, self._plane_indices = transducer_shape.image_plane_grid(PLANE_ROWS, PLANE_COLUMNS)
@@ -56,7 +56,7 @@ class SceneView:
 
     def _matt_support(self, vertices: np.ndarray, faces: np.ndarray) -> ShadedSurface:
         support = ShadedSurface(field_of(vertices, within=1), faces, SUPPORT, gloss=0.0)
-        # It neither moves nor shines, so its colours are worked out once, as seen from far above.
+        # It is fixed and matt, so its colours are computed once, as seen from far above.
         above = self.camera.target + 10.0 * self.camera.distance_home * self.camera.up
         support.shade(above, above)
         return support
@@ -64,9 +64,9 @@ class SceneView:
     def draw(
         self, scene, view: View, settings: Settings, masked: list[tuple[float, float, float, float]]
     ) -> None:
-        """Hand everything to `scene`, in the order that depth and blending need.
+        """Draw everything into `scene`, in the order that depth and blending need.
 
-        masked: at most MASKS parts of the window (left, bottom, right, top) that nothing may cover.
+        masked: at most MASKS boxes of the window (left, bottom, right, top) that nothing may cover.
         """
         right, up, ahead = self.camera.axes()
         eye, distance = self.camera.eye(), self.camera.distance_home
@@ -76,7 +76,7 @@ class SceneView:
         scene.point_light((eye + distance * (0.9 * right - 0.2 * up)).tolist(), FILL_LIGHT)
         self._mask(scene, masked)
         if self._support is not None and settings.show_support:
-            # A reduced mesh has slivers that face the wrong way, which would show as black specks.
+            # A decimated mesh has slivers that face the wrong way, which would appear as black specks.
             _draw_surface(scene, self._support, two_sided=True)
         self._draw_transducer(scene, view.transducer_pose)
         inner = self._inner(view, settings)
@@ -88,7 +88,7 @@ class SceneView:
         if cut is not None:
             self._draw_inner(scene, inner, eye, key, ahead, cut)
         if view.guidance is not None:
-            self._guide = self._guide or GuideLines(self._probe_edges)
+            self._guide = self._guide or PlanLines(self._probe_edges)
             self._guide.draw(scene, view.guidance)
         opacity = GLASS if settings.translucent else SOLID
         self._organ.tint(view.seen.get("organ"))
@@ -96,7 +96,7 @@ class SceneView:
         _draw_surface(scene, self._organ, ahead if opacity < SOLID or cut is not None else None, cut)
 
     def _inner(self, view: View, settings: Settings) -> list[ShadedSurface]:
-        """What is shown of what is in the organ."""
+        """Return the shown surfaces inside the organ."""
         shown = list(self._parts) if settings.show_parts else []
         if self._tumour is not None and settings.show_tumour:
             self._tumour.tint(view.seen.get("tumour"))
@@ -111,7 +111,7 @@ class SceneView:
             _draw_surface(scene, surface, None if cut is None else ahead, cut)
 
     def _mask(self, scene, masked) -> None:
-        """Quads of alpha 0 just behind the near plane: they leave the image behind and stop whatever comes later."""
+        """Draw quads of alpha 0 just behind the near plane: the background stays visible, what is drawn later is hidden."""
         corners = np.full((MASKS, 6, 2), -1.0)
         for quad, (left, bottom, right, top) in zip(corners, masked, strict=False):
             quad[:] = [
@@ -141,11 +141,11 @@ class SceneView:
         scene.lines(self._edge_points, LINE_WIDTH, color=EDGE)
 
     def _draw_cut_face(self, scene, view: View, inner: list[ShadedSurface], eye, key) -> Cut:
-        """Draw the face of the half away from the eye, and say what is cut off."""
+        """Draw the section and return the cut that removes the half before the eye."""
         self._cut_side = side_of_eye(view.transducer_pose, eye, self._cut_side)
         self._cut_face = self._cut_face or CutFace()
         away, behind = self._cut_side * view.transducer_pose[:3, 1], np.array(view.transducer_pose)
-        # What is cut ends where the picture lies: before it nothing of a soft edge is seen.
+        # The cut is shifted by half its soft edge, which must not be in front of the image.
         behind[:3, 3] -= CUT_EDGE_MM / 2 * away
         self._cut_face.draw(scene, self._organ, inner, behind, key)
         return behind[:3, 3], away
@@ -154,9 +154,9 @@ class SceneView:
         face = np.array(view.transducer_pose, dtype=np.float64)
         face[:3, 3] -= face[:3, 2] * self._half_axis_mm
         places = transducer_shape.on_plane(self._plane, view)
-        points = transducer_shape.placed(transducer_shape.standing(places), face)
+        points = transducer_shape.placed(transducer_shape.on_transducer(places), face)
         toward = key - points
-        # Facing the key light everywhere, the plane is evenly bright: its grey is the slice's, not the light's.
+        # Normals towards the key light make the plane evenly bright: grey values are those of the image.
         grey = transducer_shape.sampled(next(iter(view.pictures.values())), places, view)
         fill(
             (self._plane_points, points),

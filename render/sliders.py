@@ -1,44 +1,44 @@
-"""Sliders and switches, generated from the metadata of ``Settings``: in the strip under the 3D view, and the scanner's in it, beside the panel."""
+"""Sliders and switches from the metadata of ``Settings``: in the strip under the 3D view; the scanner's beside the panel."""
 
 import dataclasses
 
-from render.viewer import ASIDE, Geometry, Settings
+from render.viewer import SCANNER_GROUPS, Geometry, Settings
 from render.window_layout import Rect, WindowLayout
 
-# Dear ImGui's glyphs are 7 pixels wide, its rows are 23 pixels high. Its labels get 35 % of a box, a switch's all of it, but for so many
-# pixels around them.
+# Dear ImGui's glyphs are 7 pixels wide, its rows 23 pixels high. A slider's label gets 35 % of a box, a switch's all of it, less
+# these pixels around them.
 GLYPH_WIDTH, LABEL_SHARE, ROW_HEIGHT = 7, 0.35, 23
 AROUND_LABEL, AROUND_SWITCH = 16, 35
 
 
 def groups_of(settings: Settings, geometry: Geometry) -> dict[str, list[dataclasses.Field]]:
-    """Name of a group -> its settings that there is something to set of."""
-    idle = without_effect(geometry)
+    """Return the adjustable settings by group."""
+    unused = unused_settings(geometry)
     groups: dict[str, list[dataclasses.Field]] = {}
     for each in dataclasses.fields(settings):
-        if each.metadata and getattr(settings, each.name) is not None and each.name not in idle:
+        if each.metadata and getattr(settings, each.name) is not None and each.name not in unused:
             groups.setdefault(each.metadata["group"], []).append(each)
     return groups
 
 
-def without_effect(geometry: Geometry) -> set[str]:
-    """Names of the settings of what is not there."""
+def unused_settings(geometry: Geometry) -> set[str]:
+    """Return the names of settings of structures that the scene does not have."""
     tumour = {"show_tumour", "outline", "margin_mm"} if geometry.tumour_vertices is None else set()
     parts = set() if geometry.parts else {"show_parts"}
     return tumour | parts | ({"show_support"} if geometry.support_vertices is None else set())
 
 
 def boxes_of(settings: Settings, geometry: Geometry, layout: WindowLayout) -> dict[str, Rect]:
-    """Where each group is now."""
+    """Return the box of each group."""
     groups = groups_of(settings, geometry)
-    below = {name: _width(members) for name, members in groups.items() if name not in ASIDE}
-    # Where boxes would be too narrow for their labels, the first is left out.
+    below = {name: _width(members) for name, members in groups.items() if name not in SCANNER_GROUPS}
+    # Where boxes would be too narrow for their labels, leave out the first.
     while len(below) > 1 and sum(below.values()) > layout.slider_room(len(below)):
         del below[next(iter(below))]
     boxes = dict(zip(below, layout.sliders(list(below.values())), strict=True))
     if settings.show_scanner:
-        heights = [ROW_HEIGHT * len(groups[name]) + 32 for name in ASIDE]
-        boxes |= dict(zip(ASIDE, layout.aside(heights), strict=True))
+        heights = [ROW_HEIGHT * len(groups[name]) + 32 for name in SCANNER_GROUPS]
+        boxes |= dict(zip(SCANNER_GROUPS, layout.scanner_sliders(heights), strict=True))
     return boxes
 
 
@@ -50,10 +50,9 @@ def draw_sliders(
     first_size: tuple[int, int],
     placed: int,
 ) -> None:
-    """Draw all that have a box, and write into the settings what the user set.
+    """Draw the groups that have a box, and update the settings from them.
 
-    GGUI measures in shares of the size that the window was opened with, and keeps a box where it first was: another ``placed`` makes
-    new ones.
+    GGUI measures in fractions of the window's first size, and keeps the position of a box: a new ``placed`` makes new boxes.
     """
     groups = groups_of(settings, geometry)
     width, height = first_size
@@ -78,7 +77,7 @@ def _draw_slider(gui, settings: Settings, member: dataclasses.Field, mhz: tuple[
 
 
 def _width(members: list[dataclasses.Field]) -> float:
-    """Pixels that the labels of a group need."""
+    """Return the width that the labels of a group need [pixels]."""
     longest = max(GLYPH_WIDTH * len(_label(member)) for member in members)
     if isinstance(members[0].metadata["low"], bool):
         return longest + AROUND_SWITCH

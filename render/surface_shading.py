@@ -1,8 +1,7 @@
-"""How the organ's surface is lit and in which order its faces are drawn.
+"""Shading of surfaces, and the drawing order of their faces.
 
-GGUI shades by Lambert's law alone and blends by vertex alpha without sorting. What makes tissue look like tissue
-(a moist sheen, a rim that stays visible when the organ is translucent) is therefore put in the vertex colours, and
-the faces are sent farthest first.
+GGUI shades by Lambert's law alone and blends by vertex alpha without sorting. Specular sheen and a rim that stays visible on a
+translucent organ are therefore part of the vertex colours, and faces are sorted farthest first.
 """
 
 import numpy as np
@@ -14,7 +13,7 @@ ORGAN, TINT = (0.66, 0.27, 0.23), (0.24, 0.60, 0.36)
 SOLID, GLASS = 1.0, 0.30
 CUT_EDGE_MM = 0.4
 
-# A point on the plane of a cut, and the unit normal on the side to take away, (3,) each.
+# A point on the plane of a cut, and the unit normal towards the side that is removed, (3,) each.
 Cut = tuple[np.ndarray, np.ndarray]
 
 
@@ -42,7 +41,7 @@ def _shade(
     normal: ti.template(),
     colour: ti.template(),
 ):
-    """A zero cut_normal cuts nothing; else what lies on its side of the plane disappears."""
+    """A zero cut_normal cuts nothing; else what is on its side of the plane is transparent."""
     for v in vertices:
         total = ti.Vector([0.0, 0.0, 0.0])
         for k in range(start[v], start[v + 1]):
@@ -63,7 +62,7 @@ def _shade(
 
 
 def faces_around_vertices(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """CSR lists of the faces at each of `count` vertices: start (count + 1,), faces (3 m,), int32."""
+    """Return CSR lists of the faces at each of `count` vertices: start (count + 1,), faces (3 m,), int32."""
     corner = faces.reshape(-1)
     order = np.argsort(corner, kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(corner, minlength=count))])
@@ -71,7 +70,7 @@ def faces_around_vertices(faces: np.ndarray, count: int) -> tuple[np.ndarray, np
 
 
 def farthest_first(vertices: np.ndarray, faces: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """Faces (m, 3) in order of decreasing distance along the view, so that blending comes out right."""
+    """Return faces (m, 3) by decreasing distance along the view, as blending needs."""
     depth = vertices @ ahead.astype(vertices.dtype)
     return faces[np.argsort(-depth[faces].sum(axis=1), kind="stable")]
 
@@ -103,7 +102,7 @@ class ShadedSurface:
         fill((self._faces, self.faces), (self._start, start), (self._around, around))
 
     def shade(self, eye, light, opacity: float = SOLID, cut: Cut | None = None) -> None:
-        """Bring normals and colours up to date. What a cut leaves is solid."""
+        """Update normals and colours. A cut surface is solid."""
         point, side = cut if cut is not None else (np.zeros(3), np.zeros(3))
         _area_normals(self.vertices, self._faces, self._area_normal)
         _shade(
@@ -121,7 +120,7 @@ class ShadedSurface:
         )
 
     def tint(self, vertices: np.ndarray | None) -> None:
-        """Which vertices (n,) bool are shown in TINT; None: none of them."""
+        """Set which vertices (n,) bool are shown in TINT; None for none of them."""
         if vertices is not self._tinted:
             self._tinted = vertices
             if vertices is None:
@@ -130,12 +129,12 @@ class ShadedSurface:
                 fill((self._tint, vertices))
 
     def indices(self, ahead: np.ndarray | None = None, cut: Cut | None = None) -> np.ndarray:
-        """Vertex indices of the faces, int32 (3 m,), farthest first along `ahead` if given, without those that a cut takes away."""
+        """Return vertex indices of the faces, int32 (3 m,), farthest first along `ahead` if given, without faces removed by a cut."""
         if ahead is None:
             return self.faces.reshape(-1)
         vertices, faces = array_of(self.vertices), self.faces
         if cut is not None:
             point, side = cut
-            # Unseen as they are, they would hide what is drawn behind them later.
+            # Though transparent, they would hide what is drawn behind them later.
             faces = faces[((vertices - point) @ side < 0)[faces].any(axis=1)]
         return np.ascontiguousarray(farthest_first(vertices, faces, ahead)).reshape(-1)

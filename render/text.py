@@ -1,4 +1,4 @@
-"""Texts in pictures: one font, the size at which they fit, and writing over what changes every frame. Pillow."""
+"""Texts in images: font, fitting size, and text over images that change every frame. Pillow."""
 
 from collections.abc import Iterable
 from functools import lru_cache
@@ -9,20 +9,20 @@ from PIL import Image, ImageDraw, ImageFont
 from render.window_layout import Rect
 
 LEAST_FONT_PX = 8
-# What is between the parts of a line; of a long one the last part goes first.
-BETWEEN = "   "
-# How much a text leaves of what it is written over, and how far around it.
+# Separates the parts of a line; of a long one the last parts are left out.
+SEPARATOR = "   "
+# How much a text dims the image behind it, and how far around it [pixels].
 PLATE, PLATE_PX = 0.35, 4
 
 
 @lru_cache(maxsize=64)
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """The font of all texts."""
+    """Return the font of all texts."""
     return ImageFont.load_default(size=size)
 
 
 def fitting_size(rows: Iterable[tuple[str, ...]], width: int, most: int) -> int:
-    """The largest size of font, up to the most, at which the longest text of each column fits beside the others."""
+    """Return the largest font size, up to ``most``, at which the longest texts of all columns fit beside each other."""
     columns = list(zip(*rows, strict=True))
     for size in range(most, LEAST_FONT_PX, -1):
         if sum(max(map(font(size).getlength, column)) for column in columns) <= width:
@@ -31,11 +31,11 @@ def fitting_size(rows: Iterable[tuple[str, ...]], width: int, most: int) -> int:
 
 
 def shortened(text: str, size: int, width: int) -> str:
-    """A line without so many of its last parts, and of one part without so much of its end, as do not fit."""
-    parts = text.split(BETWEEN)
-    while len(parts) > 1 and font(size).getlength(BETWEEN.join(parts)) > width:
+    """Return a line without the last parts, and a single part without the end, that do not fit."""
+    parts = text.split(SEPARATOR)
+    while len(parts) > 1 and font(size).getlength(SEPARATOR.join(parts)) > width:
         parts.pop()
-    line = BETWEEN.join(parts)
+    line = SEPARATOR.join(parts)
     if font(size).getlength(line) <= width:
         return line
     while line and font(size).getlength(line + "...") > width:
@@ -45,7 +45,7 @@ def shortened(text: str, size: int, width: int) -> str:
 
 @lru_cache(maxsize=64)
 def _coverage(text: str, size: int) -> np.ndarray:
-    """How much of each pixel a text covers, 0 to 1, shape (rows, columns), with room around it."""
+    """Return the covered fraction of each pixel of a text, (rows, columns, 1), with a border."""
     left, top, right, bottom = ImageDraw.Draw(Image.new("L", (1, 1))).textbbox((0, 0), text, font=font(size))
     image = Image.new("L", (int(right - left) + 2 * PLATE_PX, int(bottom - top) + 2 * PLATE_PX))
     ImageDraw.Draw(image).text((PLATE_PX - left, PLATE_PX - top), text, fill=255, font=font(size))
@@ -53,16 +53,13 @@ def _coverage(text: str, size: int) -> np.ndarray:
 
 
 def written_size(text: str, size: int) -> tuple[int, int]:
-    """Width and height of a text as ``write`` writes it [pixels]."""
+    """Return width and height of a text as ``write`` draws it [pixels]."""
     rows, columns, _ = _coverage(text, size).shape
     return columns, rows
 
 
 def write(page: np.ndarray, box: Rect, centre: tuple[float, float], text: str, size: int, colour) -> None:
-    """Write over a picture (rows, columns, 3 or more), about a centre (x, y) or as near to it as the text lies in a box.
-
-    A text that the box has no room for is left out.
-    """
+    """Write over an image (rows, columns, 3 or more), centred at (x, y) or shifted into a box. A text larger than the box is left out."""
     covered = _coverage(text, size)
     rows, columns, _ = covered.shape
     if rows > box.height or columns > box.width:

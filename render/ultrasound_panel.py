@@ -1,6 +1,6 @@
-"""The ultrasound panel as on a scanner: pictures, ruler, focus, marker dot, settings, outline and caliper. NumPy and Pillow.
+"""The ultrasound panel as on a scanner: images, ruler, focus, marker dot, settings, outline and caliper. NumPy and Pillow.
 
-Pixels count from the top left. Places on the image plane are (u, v) [mm]: u from the middle to the right, v down from the face.
+Pixels count from the top left. Points of the image plane are (u, v) [mm]: u from the centre to the right, v down from the face.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from render.window_layout import Rect, WindowLayout
 PANEL, FINDINGS, LINE = (8, 9, 11), (20, 24, 29), (44, 50, 58)
 TEXT, QUIET = (222, 227, 232), (132, 142, 153)
 MARK, ALERT = (64, 196, 255), (255, 176, 46)
-OUTLINE, BEFORE, CALLIPER = (237, 194, 71), (150, 128, 196), (120, 230, 140)
+OUTLINE, OUTLINE_AT_REST, CALIPER = (237, 194, 71), (150, 128, 196), (120, 230, 140)
 CROSS_PX, NUMBER_PX, NOTE_PX, HINT_PX, FIGURE_PX = 5, 16, 17, 14, 15
-# Under the pictures while the tumour's outline is in them.
-LEGEND = (("tumour now", OUTLINE), ("in the CT", BEFORE))
+# Legend of the tumour's outlines.
+LEGEND = (("tumour now", OUTLINE), ("in the CT", OUTLINE_AT_REST))
 
 Points = tuple[tuple[float, float], ...]
 # A text, its size and its colour.
@@ -28,10 +28,9 @@ Written = tuple[str, int, tuple[int, int, int]]
 
 @dataclass(frozen=True)
 class Panel:
-    """What the panel says around its pictures. All of it stays the same for many frames.
+    """The parts of the panel that stay the same for many frames.
 
-    ``captions`` are the probe's name, above, and what the echo and the CT are shown with, below. ``legend``: whether there are
-    outlines of the tumour to explain.
+    ``captions`` are the probe's name, above, and the settings of B-mode and CT, below. ``legend``: whether to explain outlines.
     """
 
     names: tuple[str, ...]
@@ -46,22 +45,22 @@ class Panel:
     legend: bool = False
 
     def boxes(self, layout: WindowLayout) -> list[Rect]:
-        """Where the pictures lie, one for each name."""
+        """Return the boxes of the images, one for each name."""
         return layout.picture_boxes(len(self.names), self.width_mm, self.depth_mm)
 
     def to_pixels(self, box: Rect, places_mm: np.ndarray) -> np.ndarray:
-        """Columns and rows (..., 2), as fractions, of places (..., 2) on the plane."""
+        """Return columns and rows (..., 2), fractional, of points (..., 2) of the plane."""
         share = (places_mm + [self.width_mm / 2, self.above_mm]) / [self.width_mm, self.depth_mm]
         return share * [box.width, box.height] + [box.left, box.top]
 
     def to_plane(self, box: Rect, column: float, row: float) -> tuple[float, float]:
-        """The place on the plane [mm] under a pixel."""
+        """Return the point of the plane [mm] at a pixel."""
         across, down = (column - box.left) / box.width, (row - box.top) / box.height
         return (across - 0.5) * self.width_mm, down * self.depth_mm - self.above_mm
 
 
 def ruler_ticks(panel: Panel, box: Rect) -> list[tuple[int, int | None]]:
-    """Ticks every 5 mm of depth under the face: (row in pixels, whole centimetres or None between them)."""
+    """Return ticks every 5 mm of depth: (row in pixels, whole centimetres or None between them)."""
     ticks = []
     for half_cm in range(int((panel.depth_mm - panel.above_mm) / 5.0 + 1e-9) + 1):
         share = (panel.above_mm + half_cm * 5.0) / panel.depth_mm
@@ -70,7 +69,7 @@ def ruler_ticks(panel: Panel, box: Rect) -> list[tuple[int, int | None]]:
 
 
 def marker_centre(layout: WindowLayout, box: Rect, marked_side: str) -> tuple[int, int]:
-    """Centre (x, y) of the marker dot, above the picture at its marked side. Raises ValueError for another side."""
+    """Return the centre (x, y) of the marker dot, above the image at its marked side. Raises ValueError for another side."""
     if marked_side not in ("left", "right"):
         raise ValueError(f"marked_side is {marked_side!r}: it must be 'left' or 'right'")
     x = box.left + layout.px(9) if marked_side == "left" else box.right - layout.px(10)
@@ -78,7 +77,7 @@ def marker_centre(layout: WindowLayout, box: Rect, marked_side: str) -> tuple[in
 
 
 def paste_picture(page: np.ndarray, box: Rect, picture: np.ndarray) -> None:
-    """Put a picture, uint8 (rows, columns), into its box; one of the box's own size is not resampled."""
+    """Draw an image, uint8 (rows, columns), into its box, resampled unless it has the size of the box."""
     if picture.shape != (box.height, box.width):
         resized = Image.fromarray(picture).resize((box.width, box.height), Image.Resampling.BILINEAR)
         picture = np.asarray(resized)
@@ -88,17 +87,17 @@ def paste_picture(page: np.ndarray, box: Rect, picture: np.ndarray) -> None:
 
 
 def draw_note(page: np.ndarray, layout: WindowLayout, box: Rect, note: str) -> None:
-    """Write over the middle of the picture in a box; a second line is smaller, and as small as it must be to fit."""
+    """Write a note over the centre of an image; a second line is smaller, to fit."""
     px, (x, y) = layout.px, (box.left + box.width / 2, box.top + box.height / 2)
-    said, _, hint = note.partition("\n")
-    write(page, box, (x, y), said, px(NOTE_PX), QUIET)
+    text, _, hint = note.partition("\n")
+    write(page, box, (x, y), text, px(NOTE_PX), QUIET)
     if hint:
         size = fitting_size([(hint,)], box.width - 3 * PLATE_PX, px(HINT_PX))
         write(page, box, (x, y + 1.5 * px(NOTE_PX)), hint, size, QUIET)
 
 
 def draw_segments(page: np.ndarray, panel: Panel, box: Rect, segments_mm: np.ndarray, colour) -> None:
-    """Draw line segments (n, 2, 2) of the plane [mm] over the picture in a box, as far as they are in it."""
+    """Draw line segments (n, 2, 2) of the plane [mm] over an image, clipped to its box."""
     if len(segments_mm) == 0:
         return
     start, end = np.moveaxis(panel.to_pixels(box, np.asarray(segments_mm, float)), 1, 0)
@@ -110,19 +109,19 @@ def draw_segments(page: np.ndarray, panel: Panel, box: Rect, segments_mm: np.nda
 
 
 def draw_caliper(page: np.ndarray, panel: Panel, box: Rect, points_mm: Points, figure: str, px: int) -> None:
-    """Draw a cross at each of up to two points [mm], the line between them, and beside it what it measures, ``px`` high."""
+    """Draw a caliper: a cross at each of up to two points [mm], the line between them, and the distance beside it, ``px`` high."""
     reach = CROSS_PX * np.array([panel.width_mm / box.width, panel.depth_mm / box.height])
     points = np.array(points_mm, float).reshape(-1, 2)
     crosses = [[point - reach * axis, point + reach * axis] for point in points for axis in np.eye(2)]
     line = [points] if len(points) == 2 else []
-    draw_segments(page, panel, box, np.array([*crosses, *line]), CALLIPER)
+    draw_segments(page, panel, box, np.array([*crosses, *line]), CALIPER)
     if line and figure:
         start, end = panel.to_pixels(box, points)
-        write(page, box, beside(start, end, written_size(figure, px), box), figure, px, CALLIPER)
+        write(page, box, beside(start, end, written_size(figure, px), box), figure, px, CALIPER)
 
 
 def beside(start: np.ndarray, end: np.ndarray, size: tuple[int, int], box: Rect) -> tuple[float, float]:
-    """The middle of a text of a size [pixels] that stands beside a line, at the side where more of it is in the box."""
+    """Return the centre of a text of a size [pixels] beside a line, on the side towards the centre of the box."""
     along = (end - start) / max(float(np.linalg.norm(end - start)), 1.0)
     across = np.array([along[1], -along[0]]) if along.any() else np.array([1.0, 0.0])
     away = across * (CROSS_PX + np.abs(across) @ size / 2)
@@ -132,15 +131,15 @@ def beside(start: np.ndarray, end: np.ndarray, size: tuple[int, int], box: Rect)
 
 
 def draw_panel(draw: ImageDraw.ImageDraw, layout: WindowLayout, panel: Panel) -> None:
-    """All of the panel but its pictures."""
+    """Draw the panel without its images."""
     area, boxes, px = layout.panel, panel.boxes(layout), layout.px
     draw.rectangle([area.left, area.top, area.right, area.bottom], fill=PANEL)
     draw.line([(area.left, 0), (area.left, area.bottom)], fill=LINE)
     left, width = area.left + px(16), area.width - 2 * px(16)
-    probe, echo, ct = panel.captions
+    probe, b_mode, ct = panel.captions
     depth = f"Depth {(panel.depth_mm - panel.above_mm) / 10:.1f} cm"
     _draw_row(draw, left, width, px(22), (probe, px(17), TEXT), (depth, px(15), TEXT))
-    _draw_row(draw, left, width, area.bottom - px(17), (echo, px(14), QUIET), (ct, px(14), QUIET))
+    _draw_row(draw, left, width, area.bottom - px(17), (b_mode, px(14), QUIET), (ct, px(14), QUIET))
     status = shortened(panel.status, px(17), width)
     draw.text((left + width // 2, px(43)), status, font=font(px(17)), fill=ALERT, anchor="mm")
     if panel.legend:
@@ -156,7 +155,7 @@ def draw_panel(draw: ImageDraw.ImageDraw, layout: WindowLayout, panel: Panel) ->
 
 
 def _draw_row(draw: ImageDraw.ImageDraw, x: int, width: int, y: int, left: Written, right: Written) -> None:
-    """Two texts at both ends of a row; the left one takes what the right one leaves."""
+    """Draw two texts at both ends of a row; the left one is shortened to fit."""
     text, size, colour = right
     draw.text((x + width, y), text, font=font(size), fill=colour, anchor="rm")
     room = width - int(font(size).getlength(text)) - size
@@ -175,7 +174,7 @@ def _draw_legend(draw: ImageDraw.ImageDraw, layout: WindowLayout, x: int, bottom
 
 def _draw_ruler(draw: ImageDraw.ImageDraw, layout: WindowLayout, panel: Panel, box: Rect) -> None:
     px, x = layout.px, box.left - layout.px(6)
-    # Where centimetres are small, not each of them has room for its number.
+    # Where centimetres are too small, number only every few of them.
     every = int(np.ceil(px(NUMBER_PX) / (10.0 * box.height / panel.depth_mm)))
     for row, centimetres in ruler_ticks(panel, box):
         length = px(5 if centimetres is None else 10)
@@ -190,7 +189,7 @@ def _draw_ruler(draw: ImageDraw.ImageDraw, layout: WindowLayout, panel: Panel, b
 
 
 def _draw_wedge(draw: ImageDraw.ImageDraw, layout: WindowLayout, box: Rect) -> None:
-    """The grey scale, white at the top, as a scanner shows it beside its picture."""
+    """Draw the grey scale beside the image, white at the top."""
     height = min(layout.px(128), box.height)
     left, right = box.right + layout.px(12), box.right + layout.px(19)
     for i in range(height):

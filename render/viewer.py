@@ -1,4 +1,4 @@
-"""What a front end is given, what it gives back, and the front end that draws nothing.
+"""The interface of a front end: geometry, views, settings, controls; and a front end that draws nothing.
 
 Lengths are in mm, angles in degrees, patient coordinates LPS. Nothing here needs a screen, Vulkan or Taichi.
 """
@@ -13,13 +13,13 @@ import numpy as np
 from ultrasound.probe import DetailLevel, Mode
 from ultrasound.target import Target
 
-ECHO, TGC = "Echo", "Gain over depth"
-# Groups of settings that stand beside the picture, as on a scanner.
-ASIDE = (ECHO, TGC)
+B_MODE, TGC = "B-mode", "TGC"
+# Groups of settings beside the image, as on a scanner.
+SCANNER_GROUPS = (B_MODE, TGC)
 
 
-class Line(NamedTuple):
-    """One line of the key map: ``keys`` as they are printed, ``actions`` (their names in the code), ``text`` for the reader."""
+class KeyMapEntry(NamedTuple):
+    """A line of the key map: ``keys`` as printed, names of ``actions``, ``text`` for the user."""
 
     keys: tuple[str, ...]
     actions: tuple[str, ...]
@@ -28,56 +28,56 @@ class Line(NamedTuple):
 
 KEY_MAP = {
     "Transducer": (
-        Line(("Mouse",), ("point",), "move it over the organ"),
-        Line(("Left button",), ("press",), "press it in, the deeper the longer it is held"),
-        Line(("W", "S"), ("push", "lift"), "push it in, lift it"),
-        Line(("A", "D"), ("rotate_left", "rotate_right"), "roll it about its axis, left and right"),
-        Line(("Q", "E"), ("rock_left", "rock_right"), "turn the beam in the image plane, left and right"),
-        Line(("Z", "C"), ("tilt_back", "tilt_forward"), "tilt it out of the image plane, either way"),
+        KeyMapEntry(("Mouse",), ("point",), "move it over the organ"),
+        KeyMapEntry(("Left button",), ("press",), "press it in, deeper the longer it is held"),
+        KeyMapEntry(("W", "S"), ("push", "lift"), "push it in, lift it"),
+        KeyMapEntry(("A", "D"), ("rotate_left", "rotate_right"), "rotate it about its axis"),
+        KeyMapEntry(("Q", "E"), ("rock_left", "rock_right"), "rock it in the image plane, heel to toe"),
+        KeyMapEntry(("Z", "C"), ("tilt_back", "tilt_forward"), "tilt it out of the image plane (fan)"),
     ),
     "View": (
-        Line(("Right drag",), ("orbit",), "turn it"),
-        Line(("Middle drag",), ("pan",), "shift it (also Shift + right drag)"),
-        Line(("Up", "Down"), ("zoom_in", "zoom_out"), "zoom in and out"),
-        Line(("T",), ("translucent",), "organ translucent or solid"),
-        Line(("X",), ("cut",), "organ cut along the image plane"),
-        Line(("N",), ("show_seen",), "what has been in the picture, in green"),
+        KeyMapEntry(("Right drag",), ("orbit",), "turn the view"),
+        KeyMapEntry(("Middle drag",), ("pan",), "pan the view (also Shift + right drag)"),
+        KeyMapEntry(("Up", "Down"), ("zoom_in", "zoom_out"), "zoom in and out"),
+        KeyMapEntry(("T",), ("translucent",), "organ translucent or solid"),
+        KeyMapEntry(("X",), ("cut",), "organ cut along the image plane"),
+        KeyMapEntry(("N",), ("show_seen",), "coverage: imaged tissue in green"),
     ),
-    "Picture": (
-        Line(("B",), ("mode",), "echo and CT, echo alone, CT alone"),
-        Line(("V",), ("detail_level",), "echo: how much of it is computed"),
-        Line(("G",), ("show_scanner",), "the scanner's sliders, gain over depth too"),
-        Line(("O",), ("outline",), "outline of the tumour, now and in the CT"),
-        Line(("Click on picture",), ("measure",), "caliper from click to click, in mm; a third ends it"),
-        Line(("F",), ("freeze",), "freeze and go on"),
-        Line(
-            ("Left", "Right"),
-            ("cine_back", "cine_forth"),
-            "while frozen: back through the last ten seconds, forth",
+    "Image": (
+        KeyMapEntry(("B",), ("mode",), "B-mode and CT, B-mode alone, CT alone"),
+        KeyMapEntry(("V",), ("detail_level",), "detail level of the B-mode image"),
+        KeyMapEntry(("G",), ("show_scanner",), "the scanner's sliders, with TGC"),
+        KeyMapEntry(("O",), ("outline",), "outline of the tumour, now and in the CT"),
+        KeyMapEntry(
+            ("Click on image",), ("measure",), "caliper from click to click, in mm; a third removes it"
         ),
-        Line(("I",), ("export",), "save the picture (PNG, DICOM) and the organ (PLY)"),
+        KeyMapEntry(("F",), ("freeze",), "freeze and unfreeze"),
+        KeyMapEntry(
+            ("Left", "Right"), ("cine_back", "cine_forth"), "while frozen: cine of the last ten seconds"
+        ),
+        KeyMapEntry(("I",), ("export",), "save the image (PNG, DICOM) and the organ (PLY)"),
     ),
     "Plan": (
-        Line(("Space",), ("plan_for",), "what it is for: tumour and margin, tumour, kidney"),
-        Line(("Return",), ("plan",), "make one: a sweep that shows that"),
-        Line(("Backspace",), ("next_plan",), "stop planning; or its next sweep, then none"),
+        KeyMapEntry(("Space",), ("plan_for",), "target: tumour and margin, tumour, kidney"),
+        KeyMapEntry(("Return",), ("plan",), "plan a sweep of the target"),
+        KeyMapEntry(("Backspace",), ("next_plan",), "stop planning; or show the next sweep, then none"),
     ),
     "Session": (
-        Line(("U", "Y"), ("undo", "redo"), "undo the last press, turn or way; take that back"),
-        Line(("M", "J"), ("bookmark", "to_bookmark"), "bookmark this moment; go back to bookmarks"),
-        Line(("L",), ("sweep",), "begin to record a tracked sweep, or end it"),
-        Line(("K",), ("take_over",), "take the lead from a replay or a tracked probe"),
-        Line(("R",), ("reset",), "reset tissue, transducer and view"),
-        Line(("P",), ("screenshot",), "save a picture of the window"),
-        Line(("H",), ("help",), "show or hide this list"),
-        Line(("Esc",), ("quit",), "quit"),
+        KeyMapEntry(("U", "Y"), ("undo", "redo"), "undo the last press, turn or path; redo it"),
+        KeyMapEntry(("M", "J"), ("bookmark", "to_bookmark"), "set a bookmark; return to bookmarks"),
+        KeyMapEntry(("L",), ("sweep",), "start and stop recording a tracked sweep"),
+        KeyMapEntry(("K",), ("take_over",), "take control from a replay or a tracked probe"),
+        KeyMapEntry(("R",), ("reset",), "reset tissue, transducer and view"),
+        KeyMapEntry(("P",), ("screenshot",), "save a screenshot of the window"),
+        KeyMapEntry(("H",), ("help",), "show or hide this list"),
+        KeyMapEntry(("Esc",), ("quit",), "quit"),
     ),
 }
-LINES = tuple(line for group in KEY_MAP.values() for line in group)
+KEY_MAP_ENTRIES = tuple(line for group in KEY_MAP.values() for line in group)
 
 
 def key_table() -> str:
-    """The key map as a Markdown table, for the README."""
+    """Return the key map as a Markdown table, for the README."""
     rows = ["| Key | What it does |", "| --- | --- |"]
     for group, lines in KEY_MAP.items():
         rows += [f"| **{group}** | |", *(f"| {' / '.join(line.keys)} | {line.text} |" for line in lines)]
@@ -114,13 +114,13 @@ class TissueSettings:
 class ScannerSettings:
     """Settings of the ultrasound scanner, and of the CT beside it."""
 
-    depth_mm: int = _slider(60, "Depth", "mm", 5, 300, "Picture")
-    window_hu: int = _slider(350, "W", "HU", 1, 2000, "Picture")
-    level_hu: int = _slider(40, "L", "HU", -500, 500, "Picture")
-    gain_percent: int = _slider(50, "Gain", "%", 0, 100, ECHO)
-    dyn_range_db: int = _slider(60, "DR", "dB", 20, 120, ECHO)
-    frequency_mhz: float = _slider(7.5, "", "MHz", 2.0, 15.0, ECHO)
-    focus_percent: int = _slider(40, "Focus", "%", 0, 100, ECHO)
+    depth_mm: int = _slider(60, "Depth", "mm", 5, 300, "Image")
+    window_hu: int = _slider(350, "W", "HU", 1, 2000, "Image")
+    level_hu: int = _slider(40, "L", "HU", -500, 500, "Image")
+    gain_percent: int = _slider(50, "Gain", "%", 0, 100, B_MODE)
+    dyn_range_db: int = _slider(60, "DR", "dB", 20, 120, B_MODE)
+    frequency_mhz: float = _slider(7.5, "", "MHz", 2.0, 15.0, B_MODE)
+    focus_percent: int = _slider(40, "Focus", "%", 0, 100, B_MODE)
     tgc_1: int = _level(1)
     tgc_2: int = _level(2)
     tgc_3: int = _level(3)
@@ -151,7 +151,7 @@ class ViewSettings:
 class PlanSettings:
     """What the next plan is made for."""
 
-    margin_mm: int = _slider(5, "Margin", "mm", 0, 20, "Picture")
+    margin_mm: int = _slider(5, "Margin", "mm", 0, 20, "Image")
     plan_for: Target = "margin"
 
 
@@ -162,27 +162,27 @@ class Settings(PlanSettings, ViewSettings, ScannerSettings, TissueSettings):
 
 @dataclass(frozen=True)
 class Geometry:
-    """What is fixed for a scene. Vertices that move are Taichi fields, which the app keeps up to date."""
+    """The fixed geometry of a scene. Moving vertices are Taichi fields, which the application updates."""
 
     organ_vertices: Any
     """Surface of the organ [mm], ti.Vector.field(3, ti.f32), shape (n,)."""
     organ_faces: np.ndarray
     """Triangles, normals outward, int32, shape (m, 3)."""
     bounds: np.ndarray
-    """Box that the camera frames, least and greatest corner [mm], shape (2, 3)."""
+    """Box that the camera frames, minimum and maximum corner [mm], shape (2, 3)."""
     up: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     """Direction opposite to gravity, shape (3,)."""
     transducer_size_mm: np.ndarray = field(default_factory=lambda: np.array([40.0, 10.0, 20.0]))
     """The cuboid, shape (3,): x lateral and to the marked side, y elevation, z axis. The image leaves at z = -size/2."""
     transducer_radius_mm: float = 0.0
-    """Radius of a curved face, in the x-z plane; 0 where it is flat."""
+    """Radius of a curved array face, in the x-z plane; 0 where it is flat."""
     frequency_range_mhz: tuple[float, float] = (2.0, 15.0)
-    """What the probe can be set to."""
+    """Range of the probe's frequency."""
     tumour_vertices: Any = None
     """As organ_vertices, or None."""
     tumour_faces: np.ndarray | None = None
     parts: dict[str, tuple[Any, np.ndarray]] = field(default_factory=dict)
-    """What else is in the organ: tissue -> vertices and triangles, as the organ's."""
+    """Other structures in the organ: tissue -> vertices and triangles, as the organ's."""
     support_vertices: np.ndarray | None = None
     """Fixed [mm], shape (k, 3), or None."""
     support_faces: np.ndarray | None = None
@@ -190,68 +190,67 @@ class Geometry:
 
 @dataclass(frozen=True)
 class Guidance:
-    """A plan's sweep, to be followed."""
+    """A planned sweep to follow."""
 
     goal: np.ndarray | None
-    """Where the transducer is to go next, world from transducer [mm], shape (4, 4); None where all of the sweep is behind."""
-    way_mm: np.ndarray
-    """The way of the face's middle, segments of shape (n, 2, 3)."""
-    gone: np.ndarray
-    """Which of them are behind, bool, shape (n,)."""
+    """Next pose, world from transducer [mm], shape (4, 4); None at the end of the sweep."""
+    path_mm: np.ndarray
+    """Path of the centre of the array face, segments of shape (n, 2, 3)."""
+    done: np.ndarray
+    """Whether each segment is done, bool, shape (n,)."""
 
 
 @dataclass(frozen=True)
 class View:
-    """What changes each frame."""
+    """The content of one frame."""
 
     transducer_pose: np.ndarray
     """World from transducer [mm], shape (4, 4)."""
     pictures: dict[str, np.ndarray]
-    """Name -> grey values, uint8, shape (rows = depth, columns = lateral, local x growing to the right); the first is the one that
-    the 3D view shows on the image plane."""
+    """Name -> grey values, uint8, shape (rows = depth, columns = lateral, local x to the right). The 3D view shows the first."""
     width_mm: float
     depth_mm: float
     above_mm: float = 0.0
-    """How much of the depth lies behind the middle of the array's face."""
+    """Part of the depth behind the centre of the array face."""
     sector: tuple[float, float, float] | None = None
-    """Radius of the array's face [mm] and the angles of the first and last line [rad], where lines fan out."""
+    """Radius of the array face [mm] and angles of the first and last scanline [rad]; None for parallel scanlines."""
     focus_mm: float | None = None
     outline_mm: np.ndarray | None = None
-    """Line segments on the plane, shape (n, 2, 2) [mm]: x from the middle to the right, y down from the face."""
+    """Outline of the tumour: segments on the plane, shape (n, 2, 2) [mm], x from the centre to the right, y down from the face."""
     outline_before_mm: np.ndarray | None = None
-    """The same of where it was in the CT."""
+    """The same at rest, in the CT."""
     seen: dict[str, np.ndarray] = field(default_factory=dict)
-    """Which vertices of "organ" and "tumour" lie in tissue that has been in the picture, bool, shape (n,)."""
+    """Coverage: whether the tissue at each vertex of "organ" and "tumour" has been imaged, bool, shape (n,)."""
     guidance: Guidance | None = None
     caliper_mm: tuple[tuple[float, float], ...] = ()
     """Up to two points on the plane [mm]."""
     caliper: str = ""
-    """What is between them."""
+    """The distance between them, as text."""
     notes: dict[str, str] = field(default_factory=dict)
-    """Name of a picture -> what is written in it, such as that it is black for want of contact; in a second line what to do."""
+    """Image name -> text written in it, such as NO CONTACT; a second line says what to do."""
     captions: tuple[str, str, str] = ("", "", "")
-    """What is said around the pictures: the probe, above; the echo's and the CT's settings, below."""
+    """Texts around the images: the probe, above; settings of B-mode and CT, below."""
     readouts: dict[str, str] = field(default_factory=dict)
-    """Name -> text with its unit, in the order of display: {"step": "9.1 ms"}."""
+    """Name -> value with unit, in the order of display: {"step": "9.1 ms"}."""
     findings: dict[str, str] = field(default_factory=dict)
-    """The same of what the surgeon looks for: {"to tumour": "4.2 mm"}."""
+    """The same for clinical measurements: {"to tumour": "4.2 mm"}."""
     alert: str = ""
-    """Which of them is more than it should be."""
+    """Name of the finding that exceeds its limit."""
     status: str = ""
-    """Short words over the picture, such as FROZEN, three spaces apart; the weightiest first: the last go where room ends."""
+    """Short status texts over the image, such as FROZEN, three spaces apart, by falling priority: the last are left out first."""
     clock: str = ""
     """The session's time, in simulated seconds: "42.6 s"."""
     pace: str = ""
-    """How slowly that goes, where it is slower than real: "0.2 x real"."""
+    """Its rate, where slower than real time: "0.2 x real"."""
     title: str = ""
-    """What is shown (scene or case); no patient's name, id or date."""
+    """Scene or case; no identifiers of the patient."""
     marked_side: str = "right"
-    """Where the marker dot stands in the picture: "right" is local +x, "left" for a probe that is marked at -x."""
+    """Side of the marker dot in the image: "right" is local +x, "left" for a probe marked at -x."""
 
 
 @dataclass
 class Controls:
-    """What the user did since the last frame: lengths and angles are the changes asked for in that time.
+    """The user's input since the last frame; lengths and angles are changes in that time.
 
     Angles are right-handed about the transducer's own axes.
     """
@@ -260,11 +259,11 @@ class Controls:
     ray: tuple[np.ndarray, np.ndarray] | None = None
     """Origin [mm] and unit direction under the mouse, world, each (3,); None off the 3D view or while the view turns."""
     press: bool = False
-    """The button that presses the transducer in is held."""
+    """The press button is held."""
     press_share: float = 1.0
-    """How far a press goes, as a share of the deepest: less under a trigger that is pulled halfway."""
+    """Depth of a press as a fraction of the greatest; below 1 for a trigger that is pulled partly."""
     slide_mm: tuple[float, float] = (0.0, 0.0)
-    """Over the organ's surface, along the transducer's own x (lateral) and y (elevation)."""
+    """Over the organ's surface, along the transducer's x (lateral) and y (elevation)."""
     push_mm: float = 0.0
     """Along the transducer's axis, positive into the tissue, negative lifts."""
     rotate_deg: float = 0.0
@@ -279,21 +278,21 @@ class Controls:
     bookmark: bool = False
     to_bookmark: bool = False
     sweep: bool = False
-    """The key that begins and ends a sweep went down."""
+    """Start or stop recording a sweep."""
     take_over: bool = False
     plan: bool = False
     next_plan: bool = False
     pointed_mm: tuple[float, float] | None = None
-    """The place on the image plane that was clicked on in a picture."""
+    """The point of the image plane that was clicked on."""
     cine: int = 0
-    """Pictures to go on (or back, negative) in those of the last seconds."""
+    """Frames to move forward (negative: back) in the cine memory."""
     export: bool = False
     freeze: bool = False
-    """The freeze key went down: the app toggles."""
+    """Freeze or unfreeze."""
     screenshot: bool = False
     quit: bool = False
-    news: str = ""
-    """What a device has to say, such as that it was unplugged."""
+    message: str = ""
+    """Message of an input device, such as that it was unplugged."""
 
 
 class Viewer(Protocol):
@@ -316,7 +315,7 @@ class Viewer(Protocol):
 
 
 class NullViewer:
-    """Draws nothing: for tests and benches. It runs until `close`; `script` feeds it controls, frame by frame."""
+    """Draws nothing: for tests. It runs until `close`; `script` gives the controls, frame by frame."""
 
     def __init__(self, settings: Settings | None = None, script=(), size: tuple[int, int] = (1280, 720)):
         self.settings = settings or Settings()

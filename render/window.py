@@ -1,11 +1,10 @@
-"""The window of the surgeon, on a screen or off it: 3D view, ultrasound panel, sliders, mouse and keys.
+"""The window, on a screen or off-screen: 3D view, ultrasound panel, sliders, mouse and keys.
 
-The only file that imports taichi.ui. How one frame is put together:
-1. a full-window image (frame.py: panel, slice, texts) lies behind everything;
-2. invisible quads right before the eye, over the panel and the strip, take the depth buffer there, so that no organ is
-   ever drawn over them, however far one zooms in;
+The only file that imports taichi.ui. A frame is drawn in this order:
+1. a full-window background image (background_image.py): panel, images, texts;
+2. invisible quads near the camera, over the panel and the strip, which fill the depth buffer there, so that no organ covers them;
 3. support, transducer, image plane, tumour, and last the organ, whose faces may be translucent;
-4. the sliders, generated from the metadata of `Settings`.
+4. the sliders, from the metadata of `Settings`.
 """
 
 import atexit
@@ -18,7 +17,7 @@ import taichi as ti
 from taichi.ui.utils import get_field_info
 
 from render.actions import begin, hold
-from render.background_image import Page
+from render.background_image import BackgroundImage
 from render.camera import FIELD_OF_VIEW_DEG, OrbitCamera
 from render.display import display_available
 from render.gamepad import Gamepad
@@ -33,14 +32,11 @@ FRAMES_A_SECOND = 60
 
 
 class NoVulkan(RuntimeError):
-    """There is no Vulkan driver that Taichi could draw with."""
+    """Taichi found no Vulkan driver to draw with."""
 
 
 def _put_image(canvas, pixels: np.ndarray) -> None:
-    """Show RGBA pixels, uint8 (width, height, 4), behind everything.
-
-    Canvas.set_image would spend 10 ms on packing them into 32-bit words, which they already are in memory.
-    """
+    """Show RGBA pixels, uint8 (width, height, 4), behind everything, without the 10 ms that Canvas.set_image needs to pack them."""
     canvas.canvas.set_image(get_field_info(pixels.view(np.uint32)[..., 0]))
 
 
@@ -48,13 +44,13 @@ class Window:
     """A `Viewer` on GGUI. `ti.init` comes before it, and one window is open at a time.
 
     Args:
-        geometry: what is fixed.
-        settings: what the sliders start from and change.
+        geometry: fixed geometry of the scene.
+        settings: values of the sliders.
         size: width, height in pixels.
-        visible: a real window, at most FRAMES_A_SECOND; else off-screen, where nothing is drawn before `picture` asks.
+        visible: a real window, at most FRAMES_A_SECOND; else off-screen, drawn only by `picture`.
         name: in the title bar.
-        keys: which key does what.
-        gamepad: what is read beside mouse and keys, if anything.
+        keys: assignment of keys.
+        gamepad: read beside mouse and keys, if given.
 
     Raises:
         NoVulkan: no Vulkan loader, driver or device.
@@ -76,7 +72,7 @@ class Window:
         self.settings = settings or Settings()
         self.keys, self._gamepad = keys or Keys(), gamepad
         self.layout = WindowLayout(*size)
-        # GGUI goes on to measure sliders in shares of the size that the window was opened with.
+        # GGUI measures sliders in fractions of the size that the window was opened with.
         self._first_size = size
         self._visible = visible
         self._ini_was_there = Path("imgui.ini").exists()
@@ -95,17 +91,17 @@ class Window:
         self._drag: str | None = None
         self._cursor: np.ndarray | None = None
         self._pressing = False
-        self._at_press: tuple[np.ndarray, tuple] | None = None
+        self._before_drag: tuple[np.ndarray, tuple] | None = None
         self._boxes_placed = 0
         self._slider_places: tuple[tuple[str, Rect], ...] = ()
         self._last_read = time.perf_counter()
-        self._lens = ti.ui.Camera()
+        self._ui_camera = ti.ui.Camera()
         part = self.layout.window_coordinates(self.layout.clear)
         self.camera = OrbitCamera(geometry.bounds, geometry.up, part, size[0] / size[1])
-        self._stage = SceneView(geometry, self.camera)
-        self._page = Page(self.layout, self.keys)
+        self._scene_view = SceneView(geometry, self.camera)
+        self._background = BackgroundImage(self.layout, self.keys)
 
-    # What the user does
+    # Input
 
     @property
     def running(self) -> bool:
@@ -135,7 +131,7 @@ class Window:
 
     def _read_cursor(self) -> None:
         cursor = np.array(self._window.get_cursor_pos(), dtype=np.float64)
-        # Before the mouse first moves GGUI says (0, 1), which is no place that anybody pointed at.
+        # Before the mouse first moves GGUI reports (0, 1).
         known = self._cursor is not None or tuple(cursor) != (0.0, 1.0)
         self._moved = cursor - self._cursor if self._cursor is not None else np.zeros(2)
         self._cursor = cursor if known else None
@@ -144,18 +140,18 @@ class Window:
         if self._cursor is None:
             return False
         place = self._pixel(self._cursor)
-        over = self._over_view() + [box for _, box in self._slider_places]
-        return self.layout.scene.holds(*place) and not any(box.holds(*place) for box in over)
+        over = self._boxes_over_scene() + [box for _, box in self._slider_places]
+        return self.layout.scene.contains(*place) and not any(box.contains(*place) for box in over)
 
-    def _over_view(self) -> list[Rect]:
-        """What of the page lies over the 3D view now."""
+    def _boxes_over_scene(self) -> list[Rect]:
+        """Return the boxes of the background image that cover the 3D view."""
         if self._help_shown:
             return [self.layout.whole]
         count = min(len(self._view.findings), self.layout.most_findings) if self._view is not None else 0
         return [self.layout.compass, *([self.layout.findings(count)] if count else [])]
 
     def _pixel(self, cursor: np.ndarray) -> tuple[float, float]:
-        """Column and row under window coordinates."""
+        """Return column and row at window coordinates."""
         return cursor[0] * self.layout.width, (1 - cursor[1]) * self.layout.height
 
     def _read_events(self, controls: Controls) -> None:
@@ -164,18 +160,18 @@ class Window:
         for event in self._window.get_events(ti.ui.RELEASE):
             if event.key == ti.ui.LMB:
                 self._pressing = False
-                self._put_sliders_back()
+                self._restore_sliders()
             elif event.key in (ti.ui.RMB, ti.ui.MMB):
                 self._drag = None
 
     def _key_down(self, key: str, controls: Controls) -> None:
         if key == ti.ui.LMB:
             self._pressing = self._over_scene()
-            self._at_press = None
+            self._before_drag = None
             if self._cursor is not None:
-                controls.pointed_mm = self._page.place_at(*self._pixel(self._cursor))
+                controls.pointed_mm = self._background.plane_point_at(*self._pixel(self._cursor))
             if not self._pressing and self._cursor is not None:
-                self._at_press = self._cursor, dataclasses.astuple(self.settings)
+                self._before_drag = self._cursor, dataclasses.astuple(self.settings)
         elif key in (ti.ui.RMB, ti.ui.MMB) and self._over_scene():
             pans = key == ti.ui.MMB or self._window.is_pressed(ti.ui.SHIFT)
             self._drag = "pan" if pans else "orbit"
@@ -184,12 +180,12 @@ class Window:
         else:
             begin(action, controls)
 
-    def _put_sliders_back(self) -> None:
-        """A drag that changed no setting may have moved a box of sliders: GGUI can only place a new one."""
-        at_press, self._at_press = self._at_press, None
-        if at_press is None or self._cursor is None:
+    def _restore_sliders(self) -> None:
+        """After a drag that may have moved a box of sliders, make new ones: GGUI cannot move a box."""
+        before_drag, self._before_drag = self._before_drag, None
+        if before_drag is None or self._cursor is None:
             return
-        cursor, settings = at_press
+        cursor, settings = before_drag
         moved = np.abs(self._cursor - cursor).max() > 0.002
         if moved and settings == dataclasses.astuple(self.settings):
             self._boxes_placed += 1
@@ -203,26 +199,26 @@ class Window:
             if action in held:
                 self.camera.zoom(np.exp(sense * elapsed / ZOOM_S))
 
-    # What is drawn
+    # Drawing
 
     def draw(self, view: View) -> None:
-        """Show a view. Off-screen it is only kept, for `picture`."""
+        """Show a view. Off-screen, only store it for `picture`."""
         self._view = view
         if self._visible:
-            self._submit(view)
+            self._draw_frame(view)
             self._window.show()
-            self._follow_size()
+            self._update_size()
 
     def picture(self) -> np.ndarray:
-        """The last view drawn, uint8, shape (height, width, 3). Raises RuntimeError if nothing was drawn."""
+        """Return the last view drawn, uint8, shape (height, width, 3). Raises RuntimeError if nothing was drawn."""
         if self._view is None:
             raise RuntimeError("nothing was drawn yet")
-        # GGUI makes its widgets while it draws the first frame, and Dear ImGui shows a new box one frame late.
+        # GGUI creates its widgets in the first frame, and Dear ImGui shows a new box one frame late.
         while not self._visible and self._warm_up > 0:
             self._warm_up -= 1
-            self._submit(self._view)
+            self._draw_frame(self._view)
             self._window.get_image_buffer_as_numpy()
-        self._submit(self._view)
+        self._draw_frame(self._view)
         colours = self._window.get_image_buffer_as_numpy()
         if self._visible:
             self._window.show()
@@ -230,52 +226,52 @@ class Window:
         return np.ascontiguousarray(levels.transpose(1, 0, 2)[::-1, :, :3])
 
     def close(self) -> None:
-        """Give the window back. A second call does nothing."""
+        """Close the window. A second call does nothing."""
         if self._window is None:
             return
         window, self._window, self._quit = self._window, None, True
         self._canvas = self._scene = self._gui = None
         window.destroy()
-        # Dear ImGui leaves its layout file in the working directory; GGUI offers no switch against it.
+        # Dear ImGui writes its layout file into the working directory; GGUI has no option against it.
         if not self._ini_was_there:
             Path("imgui.ini").unlink(missing_ok=True)
         atexit.unregister(self.close)
 
-    def _follow_size(self) -> None:
+    def _update_size(self) -> None:
         size = self._window.get_window_shape()
         if tuple(size) == (self.layout.width, self.layout.height) or min(size) < 200:
             return
         self.layout = WindowLayout(*size)
         self._boxes_placed += 1
-        self._page = Page(self.layout, self.keys)
+        self._background = BackgroundImage(self.layout, self.keys)
         self.camera.aspect = size[0] / size[1]
         self.camera.part = self.layout.window_coordinates(self.layout.clear)
 
-    def _submit(self, view: View) -> None:
+    def _draw_frame(self, view: View) -> None:
         if self._help_shown:
-            self._page.show_help()
+            self._background.show_help()
         else:
-            self._page.compose(view, np.stack(self.camera.axes()), self._visible)
-        _put_image(self._canvas, self._page.pixels)
-        self._aim()
-        rects = [self.layout.panel, self.layout.title, self.layout.strip, *self._over_view()]
+            self._background.compose(view, np.stack(self.camera.axes()), self._visible)
+        _put_image(self._canvas, self._background.pixels)
+        self._set_camera()
+        rects = [self.layout.panel, self.layout.title, self.layout.strip, *self._boxes_over_scene()]
         masked = [self.layout.window_coordinates(rect) for rect in rects]
-        self._stage.draw(self._scene, view, self.settings, masked)
+        self._scene_view.draw(self._scene, view, self.settings, masked)
         self._canvas.scene(self._scene)
         if not self._help_shown:
             self._draw_sliders()
 
-    def _aim(self) -> None:
+    def _set_camera(self) -> None:
         _, up, ahead = self.camera.axes()
         eye = self.camera.eye()
-        self._lens.position(*eye)
-        self._lens.lookat(*(eye + ahead * self.camera.distance))
-        self._lens.up(*up)
-        self._lens.fov(FIELD_OF_VIEW_DEG)
+        self._ui_camera.position(*eye)
+        self._ui_camera.lookat(*(eye + ahead * self.camera.distance))
+        self._ui_camera.up(*up)
+        self._ui_camera.fov(FIELD_OF_VIEW_DEG)
         near, far = self.camera.near_far()
-        self._lens.z_near(near)
-        self._lens.z_far(far)
-        self._scene.set_camera(self._lens)
+        self._ui_camera.z_near(near)
+        self._ui_camera.z_far(far)
+        self._scene.set_camera(self._ui_camera)
 
     def _draw_sliders(self) -> None:
         places = tuple(boxes_of(self.settings, self._geometry, self.layout).items())

@@ -1,4 +1,4 @@
-"""The picture around the 3D view: backdrop, title, help and read-outs; the panel is panel.py's, the compass compass.py's.
+"""The frame around the 3D view: backdrop, title, clock, help, read-outs and findings.
 
 A picture is uint8 with shape (height, width, 3 or more); only its first three channels are written.
 """
@@ -17,15 +17,15 @@ from render.window_layout import CLOCK_WIDTH, FIGURE_HEIGHT, FIGURES_PAD, Rect, 
 
 BACKDROP_TOP, BACKDROP_FOOT = (30, 35, 42), (13, 15, 19)
 STRIP, HELP = (17, 20, 24), (22, 26, 31)
-# Lines of figures are no closer than this where the strip is as low as in a small window.
+# Least distance of lines of figures, in a small window.
 LEAST_PITCH = 19
-# Stands where a figure has nothing to say.
-NOTHING = "-"
+# A figure without a value.
+NO_VALUE = "-"
 HELP_COLUMNS, HELP_PX, HELP_GAP_PX, FIGURES_GAP_PX = 2, 17, 12, 18
 
 
 def backdrop(layout: WindowLayout, panel: Panel, help_key: str = "H") -> np.ndarray:
-    """All that stays the same from frame to frame, uint8, shape (height, width, 3)."""
+    """Return what stays the same from frame to frame, uint8, shape (height, width, 3)."""
     fade = np.linspace(0, 1, layout.scene.height)[:, None]
     rows = (1 - fade) * np.array(BACKDROP_TOP) + fade * np.array(BACKDROP_FOOT)
     picture = np.empty((layout.height, layout.width, 3), dtype=np.uint8)
@@ -43,25 +43,25 @@ def backdrop(layout: WindowLayout, panel: Panel, help_key: str = "H") -> np.ndar
 def _draw_title(draw: ImageDraw.ImageDraw, layout: WindowLayout, panel: Panel, help_key: str) -> None:
     px, middle = layout.px, layout.title.height // 2
     right = layout.title.right - px(16)
-    draw.text((right, middle), _of_help(help_key), font=font(px(14)), fill=TEXT, anchor="rm")
+    draw.text((right, middle), _help_hint(help_key), font=font(px(14)), fill=TEXT, anchor="rm")
     room = clock_box(layout, help_key).left - 2 * px(16)
     title = shortened(panel.title or "Nephron", px(17), room)
     draw.text((px(16), middle), title, font=font(px(17)), fill=TEXT, anchor="lm")
 
 
-def _of_help(key: str) -> str:
+def _help_hint(key: str) -> str:
     return f"{key}  all keys"
 
 
 def clock_box(layout: WindowLayout, help_key: str = "H") -> Rect:
-    """Where the clock is, in the title's row, left of what is said of the help."""
+    """Return the box of the clock, in the title's row, left of the help hint."""
     px = layout.px
-    right = layout.title.right - 2 * px(16) - int(font(px(14)).getlength(_of_help(help_key)))
+    right = layout.title.right - 2 * px(16) - int(font(px(14)).getlength(_help_hint(help_key)))
     return Rect(right - px(CLOCK_WIDTH), 0, px(CLOCK_WIDTH), layout.title.height - 1)
 
 
 def clock_picture(layout: WindowLayout, box: Rect, clock: str, pace: str) -> np.ndarray:
-    """The session's time, and before it how slowly that goes, uint8, shape of the box."""
+    """Return the session's time and its rate, uint8, shape of the box."""
     image = Image.new("RGB", (box.width, box.height), STRIP)
     draw, letters, middle = ImageDraw.Draw(image), font(layout.px(14)), layout.title.height // 2
     draw.text((box.width, middle), clock, font=letters, fill=TEXT, anchor="rm")
@@ -71,7 +71,7 @@ def clock_picture(layout: WindowLayout, box: Rect, clock: str, pace: str) -> np.
 
 
 def help_picture(layout: WindowLayout, groups: Mapping[str, list[tuple[str, str]]]) -> np.ndarray:
-    """All keys and what they do, group by group, uint8, shape (height, width, 3)."""
+    """Return the list of keys by group, uint8, shape (height, width, 3)."""
     box, px = layout.whole, layout.px
     image = Image.new("RGB", (box.width, box.height), HELP)
     draw = ImageDraw.Draw(image)
@@ -91,7 +91,7 @@ def help_picture(layout: WindowLayout, groups: Mapping[str, list[tuple[str, str]
 
 
 def in_columns(groups: Mapping[str, list[tuple[str, str]]]) -> list[list[tuple[str, str]]]:
-    """Groups of rows in HELP_COLUMNS columns, none of them torn, each under its name, an empty row between them."""
+    """Arrange groups of rows in HELP_COLUMNS columns without splitting a group, each under its name."""
     blocks = [[("", name), *rows, ("", "")] for name, rows in groups.items()]
     columns: list[list[tuple[str, str]]] = [[] for _ in range(HELP_COLUMNS)]
     share = sum(map(len, blocks)) / HELP_COLUMNS
@@ -102,7 +102,7 @@ def in_columns(groups: Mapping[str, list[tuple[str, str]]]) -> list[list[tuple[s
 
 
 def readout_picture(layout: WindowLayout, readouts: Mapping[str, str]) -> np.ndarray:
-    """Names and values, one line each, as many as there is room for, uint8, shape of layout.readouts."""
+    """Return names and values, one line each, as many as fit, uint8, shape of layout.readouts."""
     box = layout.readouts
     image = Image.new("RGB", (box.width, box.height), STRIP)
     draw = ImageDraw.Draw(image)
@@ -114,7 +114,7 @@ def readout_picture(layout: WindowLayout, readouts: Mapping[str, str]) -> np.nda
 
 
 def findings_picture(layout: WindowLayout, findings: Mapping[str, str], alert: str = "") -> np.ndarray:
-    """Names and values, uint8, shape of layout.findings(their count); the one that ``alert`` names stands out."""
+    """Return names and values, uint8, shape of layout.findings(count); the one named ``alert`` is highlighted."""
     box = layout.findings(len(findings))
     image = Image.new("RGB", (box.width, box.height), FINDINGS)
     draw = ImageDraw.Draw(image)
@@ -124,7 +124,7 @@ def findings_picture(layout: WindowLayout, findings: Mapping[str, str], alert: s
 
 
 def first_of(figures: Mapping[str, str], most: int) -> dict[str, str]:
-    """The first figures, so many at most."""
+    """Return the first figures, at most ``most``."""
     return dict(islice(figures.items(), most))
 
 
@@ -139,4 +139,4 @@ def _draw_figures(
         y = FIGURES_PAD + (i + 0.5) * pitch
         colours = (ALERT, ALERT) if name == alert else (QUIET, TEXT)
         draw.text((8, y), name, font=font(size), fill=colours[0], anchor="lm")
-        draw.text((box.width - 10, y), value or NOTHING, font=font(size), fill=colours[1], anchor="rm")
+        draw.text((box.width - 10, y), value or NO_VALUE, font=font(size), fill=colours[1], anchor="rm")

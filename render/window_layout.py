@@ -1,4 +1,4 @@
-"""Where each part of the window lies. Pixels count from the top left; lengths below are those of a window of 1280 x 720."""
+"""Layout of the window. Pixels count from the top left; lengths below are those of a window of 1280 x 720."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -6,20 +6,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-# Of 1280 x 720 pixels echo and CT of the drop-in probe, 16 x 40 mm each, nearly fill a panel of this share.
+# B-mode and CT of the drop-in probe, 16 x 40 mm each, nearly fill a panel of this fraction of 1280 x 720 pixels.
 PANEL_SHARE = 0.43
 TITLE_HEIGHT, CLOCK_WIDTH = 42, 150
 STRIP_HEIGHT, STRIP_GAP, READOUT_WIDTH = 184, 4, 134
 HEADER_HEIGHT, FOOTER_HEIGHT = 74, 52
 RULER_WIDTH, WEDGE_WIDTH, PICTURE_GAP, NAME_HEIGHT = 42, 30, 10, 26
-ASIDE_WIDTH, ASIDE_GAP = 196, 6
+SCANNER_WIDTH, SCANNER_GAP = 196, 6
 FINDINGS_GAP, FINDINGS_WIDTH, FIGURE_HEIGHT, FIGURES_PAD = 10, 178, 20, 7
 COMPASS_SIZE = 92
-# A strip narrower than this is left to the sliders, whose labels would be cut.
+# A narrower strip shows no read-outs, so that the labels of its sliders fit.
 STRIP_WITH_READOUTS = 712
-# Texts grow with the window; Dear ImGui's sliders, and so what holds them, cannot.
+# Texts scale with the window; Dear ImGui's sliders and their boxes do not.
 FULL_SIZE, LEAST_SCALE, MOST_SCALE = (1280, 720), 0.8, 4.0
-# How much larger pictures one under the other must be than side by side.
+# How much larger images must be one under the other to be preferred to side by side.
 BELOW_FROM = 1.2
 
 
@@ -39,8 +39,8 @@ class Rect(NamedTuple):
     def bottom(self) -> int:
         return self.top + self.height
 
-    def holds(self, column: float, row: float) -> bool:
-        """Whether a pixel is in it."""
+    def contains(self, column: float, row: float) -> bool:
+        """Whether a pixel is inside."""
         return self.left <= column < self.right and self.top <= row < self.bottom
 
     @property
@@ -51,19 +51,19 @@ class Rect(NamedTuple):
 
 @dataclass(frozen=True)
 class WindowLayout:
-    """Where each part of the window lies, for a window of width x height pixels."""
+    """The boxes of all parts of a window of width x height pixels."""
 
     width: int
     height: int
 
     @property
     def scale(self) -> float:
-        """How large texts and what is measured by them are, 1 in a window of FULL_SIZE."""
+        """Scale of texts and what depends on them, 1 in a window of FULL_SIZE."""
         share = min(self.width / FULL_SIZE[0], self.height / FULL_SIZE[1])
         return float(np.clip(share, LEAST_SCALE, MOST_SCALE))
 
     def px(self, pixels: float) -> int:
-        """Pixels in this window of so many in one of FULL_SIZE."""
+        """Return a length in this window of one in a window of FULL_SIZE [pixels]."""
         return round(self.scale * pixels)
 
     @property
@@ -89,7 +89,7 @@ class WindowLayout:
 
     @property
     def clear(self) -> Rect:
-        """What of the 3D view the findings leave free: the organ is in its middle."""
+        """The part of the 3D view beside the findings: the organ is in its centre."""
         left = self.findings(0).right
         return Rect(left, self.scene.top, self.scene.right - left, self.scene.height)
 
@@ -100,23 +100,23 @@ class WindowLayout:
 
     @property
     def compass(self) -> Rect:
-        """Which way the patient lies, in the 3D view's lower left corner."""
+        """The compass of patient axes, in the 3D view's lower left corner."""
         gap, size = self.px(FINDINGS_GAP), self.px(COMPASS_SIZE)
         return Rect(gap, self.scene.bottom - gap - size, size, size)
 
     @property
     def most_findings(self) -> int:
-        """How many lines of findings there is room for."""
+        """How many lines of findings fit."""
         room = self.compass.top - 2 * self.px(FINDINGS_GAP) - self.scene.top - 2 * FIGURES_PAD
         return max(0, room // self.px(FIGURE_HEIGHT))
 
     def findings(self, count: int) -> Rect:
-        """So many lines of what the surgeon looks for, over the 3D view's upper left corner."""
+        """Return the box of this many findings, over the 3D view's upper left corner."""
         gap, height = self.px(FINDINGS_GAP), count * self.px(FIGURE_HEIGHT) + 2 * FIGURES_PAD
         return Rect(gap, self.scene.top + gap, self.px(FINDINGS_WIDTH), height)
 
     def sliders(self, widths: list[float]) -> list[Rect]:
-        """Boxes for groups of sliders, side by side in the strip; `widths` share out the room."""
+        """Return boxes for groups of sliders, side by side in the strip, in proportion to `widths`."""
         edges = np.concatenate([[0.0], np.cumsum(widths)]) / sum(widths) * self.slider_room(len(widths))
         return [
             Rect(
@@ -129,29 +129,29 @@ class WindowLayout:
         ]
 
     def slider_room(self, count: int) -> int:
-        """Pixels that so many boxes of sliders share."""
+        """Return the total width of this many boxes of sliders [pixels]."""
         return self.readouts.left - STRIP_GAP * (count + 1)
 
-    def aside(self, heights: list[int]) -> list[Rect]:
-        """Boxes of the scanner's sliders, one under the other in the 3D view beside the panel; lower ones where room is short."""
-        room = self.scene.height - ASIDE_GAP * (len(heights) + 1)
+    def scanner_sliders(self, heights: list[int]) -> list[Rect]:
+        """Return boxes of the scanner's sliders, one under the other beside the panel, scaled down to fit."""
+        room = self.scene.height - SCANNER_GAP * (len(heights) + 1)
         share = min(1.0, room / sum(heights))
-        edges = np.concatenate([[0], np.cumsum([int(share * height) + ASIDE_GAP for height in heights])])
-        left, top = self.scene.right - ASIDE_WIDTH, self.scene.top + ASIDE_GAP
+        edges = np.concatenate([[0], np.cumsum([int(share * height) + SCANNER_GAP for height in heights])])
+        left, top = self.scene.right - SCANNER_WIDTH, self.scene.top + SCANNER_GAP
         return [
-            Rect(left, int(top + start), ASIDE_WIDTH - ASIDE_GAP, int(stop - start) - ASIDE_GAP)
+            Rect(left, int(top + start), SCANNER_WIDTH - SCANNER_GAP, int(stop - start) - SCANNER_GAP)
             for start, stop in pairwise(edges)
         ]
 
     @property
     def whole(self) -> Rect:
-        """All of the window, which the help covers."""
+        """The whole window."""
         return Rect(0, 0, self.width, self.height)
 
     def picture_boxes(self, count: int, width_mm: float, depth_mm: float) -> list[Rect]:
-        """The largest boxes in the panel with the shape of the image plane, side by side or one under the other.
+        """Return the largest boxes in the panel with the shape of the image plane, side by side or one under the other.
 
-        Ruler and texts are left free. Raises ValueError unless both lengths are positive.
+        Raises ValueError unless both lengths are positive.
         """
         if not (width_mm > 0 and depth_mm > 0):
             raise ValueError(f"image plane of {width_mm} x {depth_mm} mm: both lengths must be positive")
@@ -161,7 +161,7 @@ class WindowLayout:
         room_y = self.panel.height - header - self.px(FOOTER_HEIGHT)
         beside = min((room_x - (count - 1) * gap) / count / width_mm, room_y / depth_mm)
         below = min(room_x / width_mm, (room_y - (count - 1) * between) / count / depth_mm)
-        # Places at one depth are easier to compare where they are at one height.
+        # Side by side is preferred: equal depths are then at equal heights.
         rows = count if below > BELOW_FROM * beside else 1
         columns, scale = count // rows, below if rows > 1 else beside
         width, height = max(1, round(width_mm * scale)), max(1, round(depth_mm * scale))
@@ -173,7 +173,7 @@ class WindowLayout:
         ]
 
     def window_coordinates(self, rect: Rect) -> tuple[float, float, float, float]:
-        """Left, bottom, right, top with (0, 0) at the bottom left and (1, 1) at the top right of the window."""
+        """Return left, bottom, right, top with (0, 0) at the bottom left and (1, 1) at the top right of the window."""
         return (
             rect.left / self.width,
             1 - rect.bottom / self.height,

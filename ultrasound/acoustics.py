@@ -1,8 +1,8 @@
-"""What sound meets in a CT: impedance, attenuation and backscatter of every voxel, from labels and HU. NumPy.
+"""Acoustic properties of a CT's voxels from labels and HU: impedance, attenuation and backscatter. NumPy.
 
-Where a voxel has a label, its tissue's values hold (``tissues.toml``), for contrast agent raises HU by iodine, not by density; but fat
-and stones within a kidney are told by HU, which no agent lowers to fat's nor, in parenchyma, raises to a stone's. Urine with agent
-is as bright as stone: only a label tells it.
+A labelled voxel has its tissue's values (``tissues.toml``), as contrast agent raises HU by iodine, not by density. Fat and stones
+within a kidney are classified by HU: no agent lowers parenchyma to fat or raises it to stone. Enhanced urine is as bright as stone,
+so that it needs a label.
 """
 
 import tomllib
@@ -15,31 +15,31 @@ import numpy as np
 from scipy import ndimage
 
 from errors import UserError
-from ultrasound.tissue_classification import recognised
+from ultrasound.tissue_classification import classify_tissues
 
 TISSUES = Path(__file__).parent / "tissues.toml"
-# Amplitude of renal cortex against a perfect reflector: its speckle lies some 16 dB under the echo of fat on kidney.
+# Amplitude of renal cortex relative to a perfect reflector: its speckle is some 16 dB below the echo of fat on kidney.
 CORTEX_DB = -38.0
-# Labels have steps of a voxel, where tissue has none.
+# Smooths the voxel steps of labels.
 SMOOTHING_VOXELS = 0.8
 SEED = 20160101
-LEAST_HU, MOST_HU = -1024, 3071
+MIN_HU, MAX_HU = -1024, 3071
 
 IMPEDANCE, ATTENUATION, BACKSCATTER = range(3)
 
 
 class TissueError(UserError):
-    """A tissue that the table does not have; the message is one line."""
+    """A tissue that is not in the table; the message is one line."""
 
 
 @cache
 def tissue_table() -> dict[str, dict]:
-    """Tissue -> its values, as the file has them, and "hounsfield"."""
+    """Return the values by tissue, as in the file, and "hounsfield"."""
     return tomllib.loads(TISSUES.read_text("utf-8"))
 
 
 def check_tissues(tissue_of_label: Mapping[int, str]) -> None:
-    """Raises TissueError for a label of a tissue that the table does not have."""
+    """Raise TissueError for a label of a tissue that is not in the table."""
     known = [name for name in tissue_table() if name != "hounsfield"]
     for label, tissue in tissue_of_label.items():
         if tissue not in known:
@@ -49,7 +49,7 @@ def check_tissues(tissue_of_label: Mapping[int, str]) -> None:
 
 
 def impedance_of_hu(hu: np.ndarray) -> np.ndarray:
-    """Acoustic impedance [MRayl] of HU: density by Schneider's piecewise fit (k-Wave's ``hounsfield2density``), speed of sound
+    """Return acoustic impedance [MRayl] of HU: density by Schneider's piecewise fit (k-Wave's ``hounsfield2density``), speed of sound
     from density by Mast 2000, for soft tissue."""
     h = np.asarray(hu, np.float32) + np.float32(1000)
     pieces = [h < 930, h < 1098, h < 1260]
@@ -65,10 +65,9 @@ def properties(
     tissue_of_label: Mapping[int, str] | None = None,
     spacing_mm: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Impedance [MRayl], attenuation [dB/cm/MHz] and backscattered amplitude (1 for a perfect reflector) of voxels (..., 3), float32.
+    """Return impedance [MRayl], attenuation [dB/cm/MHz] and backscattered amplitude (1: perfect reflector), (..., 3) float32.
 
-    ``hu`` and ``labels``, whole numbers, have the same shape; 0 and labels without a tissue go by HU.
-    Raises TissueError.
+    ``hu`` and ``labels`` are integers of the same shape; 0 and labels without a tissue are classified by HU. Raises TissueError.
     """
     check_tissues(tissue_of_label or {})
     spacing = np.ones(3) if spacing_mm is None else np.asarray(spacing_mm, float)
@@ -92,7 +91,7 @@ def properties(
 
 
 def _add_stones(values: np.ndarray, stone: np.ndarray) -> None:
-    """Stones as hard as they are: smoothed like the rest, one of a few voxels would be soft."""
+    """Add stones at full impedance: smoothed like the rest, one of a few voxels would be soft."""
     table = tissue_table()["stone"]
     share = np.minimum(
         2 * ndimage.gaussian_filter(stone.astype(np.float32), SMOOTHING_VOXELS, truncate=2.5), 1
@@ -103,42 +102,42 @@ def _add_stones(values: np.ndarray, stone: np.ndarray) -> None:
 
 
 def _by_hounsfield(hu: np.ndarray) -> np.ndarray:
-    """Values (..., 3) of HU, backscatter in dB; by a table of whole HU, of which a large CT has few."""
+    """Return values (..., 3) of HU, backscatter in dB, from a table of integer HU."""
     table = tissue_table()["hounsfield"]
-    every = np.arange(LEAST_HU, MOST_HU + 1)
+    every = np.arange(MIN_HU, MAX_HU + 1)
     attenuation = np.interp(every, table["hu"], table["attenuation_db_cm_mhz"])
     level = np.interp(every, table["hu"], table["backscatter_db"])
     values = np.column_stack([impedance_of_hu(every), attenuation, level]).astype(np.float32)
-    # A CT's noise is not the tissue's.
+    # Removes the noise of the CT.
     smooth = ndimage.gaussian_filter(np.asarray(hu, np.float32), SMOOTHING_VOXELS, truncate=2.5)
-    return values[np.clip(np.rint(smooth), LEAST_HU, MOST_HU).astype(np.int16) - LEAST_HU]
+    return values[np.clip(np.rint(smooth), MIN_HU, MAX_HU).astype(np.int16) - MIN_HU]
 
 
 def _labelled(
     hu: np.ndarray, labels: np.ndarray | None, tissue_of_label: Mapping[int, str], spacing_mm: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Tissue -> which voxels are of it, by label and by what HU and shape tell besides, in the order in which they win."""
+    """Return masks by tissue, from labels and from HU and shape, in rising priority."""
     found: dict[str, np.ndarray] = {}
     if labels is not None:
         for tissue in dict.fromkeys(tissue_of_label.values()):
             found[tissue] = np.isin(labels, [v for v, name in tissue_of_label.items() if name == tissue])
-    for tissue, here in recognised(hu, found, spacing_mm).items():
+    for tissue, here in classify_tissues(hu, found, spacing_mm).items():
         found[tissue] = found[tissue] | here if tissue in found else here
     return {tissue: where for tissue, where in found.items() if where.any()}
 
 
 class _Texture:
-    """Unevenness [dB] of backscatter over a distance, the same for the same voxels on every machine."""
+    """Texture of the backscatter level [dB], the same for the same voxels on every machine."""
 
     def __init__(self, shape: tuple[int, ...], spacing_mm: np.ndarray) -> None:
         self.shape, self.spacing_mm = shape, spacing_mm
-        self.made: dict[float, np.ndarray] = {}
+        self.fields: dict[float, np.ndarray] = {}
 
     def of(self, table: dict, where: Any) -> np.ndarray:
-        """SD ``texture_db`` over ``texture_mm``, at some voxels; one field serves all tissues of one distance."""
+        """Return noise of SD ``texture_db`` correlated over ``texture_mm``, at some voxels; one field per distance."""
         distance = float(table["texture_mm"])
-        if distance not in self.made:
+        if distance not in self.fields:
             noise = np.random.default_rng(SEED).standard_normal(self.shape, dtype=np.float32)
             noise = ndimage.gaussian_filter(noise, distance / 2 / self.spacing_mm, truncate=2, mode="wrap")
-            self.made[distance] = noise / max(float(noise.std()), 1e-6)
-        return np.float32(table["texture_db"]) * self.made[distance][where]
+            self.fields[distance] = noise / max(float(noise.std()), 1e-6)
+        return np.float32(table["texture_db"]) * self.fields[distance][where]

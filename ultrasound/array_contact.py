@@ -1,4 +1,4 @@
-"""What lies under the transducer's face: how much of it touches, and how far it has squeezed the tissue before it."""
+"""Contact of the array face: contact area and compression of the tissue in front of it."""
 
 from dataclasses import dataclass
 
@@ -7,16 +7,18 @@ import numpy as np
 from ultrasound.probe_manipulator import sagitta
 
 SPACING_MM = 0.75
-# Nearer to the face than this the surface touches; so far through it contacts let none.
-TOUCH_MM = 0.5
-# Barycentric slack that closes the seams between triangles against rounding.
-SEAM = 1e-9
+# The surface is in contact where it is nearer to the face than this; contacts prevent more penetration.
+CONTACT_MM = 0.5
+# Barycentric tolerance: no gaps between triangles from rounding.
+TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
-class Pressing:
-    """``area_mm2`` of the face touches. ``compression_mm`` is the most by which tissue before it is shorter than at rest, on a way
-    along the transducer's axis from where that enters the organ to where it leaves it; 0 where nothing touches.
+class ArrayContact:
+    """Contact area of the face, and the greatest compression of the tissue in front of it.
+
+    Compression is how much shorter the tissue is than at rest, along the transducer's axis from where it enters the organ to where
+    it exits it; 0 without contact.
     """
 
     area_mm2: float = 0.0
@@ -24,7 +26,7 @@ class Pressing:
 
 
 def face_points(size_mm: np.ndarray, radius_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) evenly over the face, in the transducer's axes [mm], and the area (n,) that each stands for [mm^2]."""
+    """Return points (n, 3) evenly over the face, in the transducer's axes [mm], and the area (n,) of each [mm^2]."""
     counts = np.maximum(np.rint(np.asarray(size_mm[:2]) / SPACING_MM).astype(int), 1)
     x, y = ((np.arange(n) + 0.5) / n * s - s / 2 for n, s in zip(counts, size_mm[:2], strict=True))
     x, y = (each.ravel() for each in np.meshgrid(x, y))
@@ -33,32 +35,32 @@ def face_points(size_mm: np.ndarray, radius_mm: float) -> tuple[np.ndarray, np.n
     return points, slope * np.prod(np.asarray(size_mm[:2]) / counts)
 
 
-def pressing(
+def measure_contact(
     pose: np.ndarray,
     size_mm: np.ndarray,
     radius_mm: float,
     now_mm: np.ndarray,
     rest_mm: np.ndarray,
     faces: np.ndarray,
-) -> Pressing:
-    """How a transducer at a pose (4, 4) touches a closed surface whose vertices (v, 3) are now and were at rest [mm]."""
+) -> ArrayContact:
+    """Return the contact of a transducer at a pose (4, 4) with a closed surface, vertices (v, 3) deformed and at rest [mm]."""
     points, area = face_points(size_mm, radius_mm)
     local = (now_mm - pose[:3, 3]) @ pose[:3, :3]
     corners = local[faces]
     half = np.asarray(size_mm[:2]) / 2
-    beside = (corners[..., :2].min(axis=1) > half) | (corners[..., :2].max(axis=1) < -half)
-    under = np.flatnonzero(~beside.any(axis=1))
+    outside = (corners[..., :2].min(axis=1) > half) | (corners[..., :2].max(axis=1) < -half)
+    under = np.flatnonzero(~outside.any(axis=1))
     weights, covered = _weights(corners[under], points[:, :2])
     if not covered.any():
-        return Pressing()
+        return ArrayContact()
     z = np.einsum("tkc,tc->tk", weights, corners[under, :, 2])
     upward = _upward(corners[under])[:, None]
-    enters = np.where(covered & upward & (z <= points[:, 2] + TOUCH_MM), z, -np.inf)
+    enters = np.where(covered & upward & (z <= points[:, 2] + CONTACT_MM), z, -np.inf)
     first, top = enters.argmax(axis=0), enters.max(axis=0)
-    touches = points[:, 2] - top <= TOUCH_MM
-    leaves = np.where(covered & ~upward & (z < top), z, -np.inf)
-    last, bottom = leaves.argmax(axis=0), leaves.max(axis=0)
-    through = np.flatnonzero(touches & np.isfinite(bottom))
+    contact = points[:, 2] - top <= CONTACT_MM
+    exits = np.where(covered & ~upward & (z < top), z, -np.inf)
+    last, bottom = exits.argmax(axis=0), exits.max(axis=0)
+    through = np.flatnonzero(contact & np.isfinite(bottom))
     compression = 0.0
     if len(through):
         at_rest = [
@@ -67,23 +69,23 @@ def pressing(
         ]
         shorter = np.linalg.norm(at_rest[0] - at_rest[1], axis=1) - (top[through] - bottom[through])
         compression = max(float(shorter.max()), 0.0)
-    return Pressing(float(area[touches].sum()), compression)
+    return ArrayContact(float(area[contact].sum()), compression)
 
 
-def _weights(corners: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Barycentric weights (t, k, 3) of places (k, 2) in triangles (t, 3, 3) seen along z, and whether they are in them."""
+def _weights(corners: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return barycentric weights (t, k, 3) of points (k, 2) in triangles (t, 3, 3) projected along z, and whether inside."""
     a, b, c = (corners[:, i, :2] for i in range(3))
     twice = _cross(b - a, c - a)
     safe = np.where(np.abs(twice) < 1e-12, np.inf, twice)
-    to = places[None] - a[:, None]
+    to = points[None] - a[:, None]
     second = _cross(to, (c - a)[:, None]) / safe[:, None]
     third = _cross((b - a)[:, None], to) / safe[:, None]
     weights = np.stack([1 - second - third, second, third], axis=-1)
-    return weights, (weights >= -SEAM).all(axis=-1) & (np.abs(twice) >= 1e-12)[:, None]
+    return weights, (weights >= -TOLERANCE).all(axis=-1) & (np.abs(twice) >= 1e-12)[:, None]
 
 
 def _upward(corners: np.ndarray) -> np.ndarray:
-    """Which triangles (t, 3, 3) face the transducer."""
+    """Whether triangles (t, 3, 3) face the transducer."""
     return _cross(corners[:, 1, :2] - corners[:, 0, :2], corners[:, 2, :2] - corners[:, 0, :2]) > 0
 
 

@@ -1,9 +1,9 @@
-"""The echo picture: sound sent along each line through the deformed tissue, its echoes made into grey values.
+"""The B-mode image: the echo signal of each scanline through the deformed tissue, converted to grey values.
 
-1. ``Beams.touch``: which elements of the array touch tissue.
-2. ``Beams.send``: along each line, where the tissue was at rest, what it reflects and scatters, and what is left of the sound.
-3. ``_spread``: the point-spread function across the lines, then the envelope in dB, with gain and compensation over depth.
-4. ``_scan_convert``: from lines and samples to the pixels of the picture.
+1. ``Scanlines.find_contact``: which elements of the array are in contact.
+2. ``Scanlines.simulate``: reflection, scattering and attenuation along each scanline.
+3. ``_spread``: the point-spread function across the scanlines, then the envelope in dB, with gain and TGC.
+4. ``_scan_convert``: from scanlines and samples to the pixels of the image.
 """
 
 import numpy as np
@@ -12,27 +12,27 @@ import taichi.math as tm
 
 from sim.fields import fill
 from ultrasound.image_plane import Picture, PlaneInTissue
-from ultrasound.point_spread import MOST_LINES, axial_sd_mm, elevation_sd_mm, lateral_weights
+from ultrasound.point_spread import MAX_HALF_WIDTH, axial_sd_mm, elevation_sd_mm, lateral_weights
 from ultrasound.probe import DETAIL_LEVELS, DetailLevel, Probe
 from ultrasound.sampled_volume import SampledVolume
-from ultrasound.scanline_echo import DB, Beams
+from ultrasound.scanline_echo import DB, Scanlines
 
 # A probe's samples are a multiple of this.
 LANES = 16
 Packet = ti.types.vector(LANES, ti.f32)
-# Samples from one look into the tissue to the next: the more, if they are no longer than a voxel, for so fast tissue changes.
+# Samples between two tissue samples: the larger stride where it is no longer than a voxel.
 STRIDES = (8, 4)
-SILENCE = 1e-9
+NOISE_FLOOR = 1e-9
 
 
 @ti.data_oriented
 class BMode:
-    """The echo of a plane in tissue.
+    """B-mode images of an image plane in tissue.
 
-    ``tissue`` is a volume (.., 3) of impedance, attenuation and backscatter (``acoustics.properties``) and ``organ`` the signed
-    distance from the organ's surface [mm], both at rest. Sound leaves only where tissue touches the array: the organ, nearer than
-    ``contact_gap_mm``, or, with ``contact`` "tissue", anything that is not gas. ``around`` is the impedance [MRayl] of what lies
-    outside the organ in the picture; None for what the CT shows there.
+    ``tissue`` is a volume (.., 3) of impedance, attenuation and backscatter (``acoustics.properties``), ``organ`` the signed
+    distance from the organ's surface [mm], both at rest. An element transmits only in contact: with the organ, nearer than
+    ``contact_gap_mm``, or, where ``contact`` is "tissue", with anything but gas. ``around`` is the impedance [MRayl] of all that is
+    outside the organ; None for what the CT shows there.
     """
 
     def __init__(
@@ -48,34 +48,34 @@ class BMode:
     ) -> None:
         shape = probe.number_of_scanlines, probe.number_of_samples_per_scanline
         self.plane, self.voxel_mm = plane, voxel_mm
-        self.beams = Beams(tissue, organ, plane, shape, voxel_mm, contact, contact_gap_mm, around)
+        self.scanlines = Scanlines(tissue, organ, plane, shape, voxel_mm, contact, contact_gap_mm, around)
         self.lines, self.samples = shape
         self.decibel = ti.field(ti.f32, shape)
-        self.weight = ti.field(ti.f32, (2 * MOST_LINES + 1, self.samples))
+        self.weight = ti.field(ti.f32, (2 * MAX_HALF_WIDTH + 1, self.samples))
         self.half = ti.field(ti.i32, self.samples // LANES)
         self.gain = ti.field(ti.f32, self.samples)
         self.source = ti.Vector.field(2, ti.f32, (plane.pixels, plane.pixels))
-        self._tables_of: tuple | None = None
+        self._table_settings: tuple | None = None
 
     def render(self, probe: Probe, detail_level: DetailLevel = "speckle") -> np.ndarray:
-        """Grey values (pixels, pixels) uint8 of the plane that was taken last; ``decibel`` holds its lines.
+        """Return grey values (pixels, pixels) uint8 of the plane located last; ``decibel`` holds its scanlines.
 
-        Raises ValueError for a probe of other lines or samples than this was made for.
+        Raises ValueError for a probe with other numbers of scanlines or samples.
         """
         if (probe.number_of_scanlines, probe.number_of_samples_per_scanline) != (self.lines, self.samples):
             raise ValueError(
-                f"{probe.number_of_scanlines} lines of {probe.number_of_samples_per_scanline} samples: this picture "
+                f"{probe.number_of_scanlines} scanlines of {probe.number_of_samples_per_scanline} samples: this image "
                 f"was made for {self.lines} of {self.samples}"
             )
         self._make_tables(probe)
         places = self.plane.pixel_mm, self.plane.first_mm
-        self.beams.touch(*places)
-        # A phased array sends every line with all of its elements.
+        self.scanlines.find_contact(*places)
+        # A phased array transmits every scanline with all of its elements.
         pitch = 0.0 if probe.transducer_geometry == "PHASED" else float(probe.line_spacing_mm(np.zeros(1))[0])
         aperture = 0.5 / (probe.f_number * pitch) if pitch else 1e6
         sd = axial_sd_mm(probe), elevation_sd_mm(probe)
         stride = STRIDES[0] if STRIDES[0] * probe.sample_mm <= self.voxel_mm else STRIDES[1]
-        self.beams.send(
+        self.scanlines.simulate(
             DETAIL_LEVELS.index(detail_level),
             stride,
             *places,
@@ -93,19 +93,19 @@ class BMode:
         return picture
 
     def _make_tables(self, probe: Probe) -> None:
-        """What depends on the probe's settings alone, made anew when these change."""
+        """Update the tables of the probe's settings, if these changed."""
         fill((self.gain, probe.gain_db()))
         fixed = probe.model_dump(exclude={"gain_percent", "dyn_range_db", "time_gain_compensation"})
-        if self._tables_of == tuple(fixed.items()):
+        if self._table_settings == tuple(fixed.items()):
             return
-        self._tables_of = tuple(fixed.items())
+        self._table_settings = tuple(fixed.items())
         start, direction = probe.scanlines()
-        weights, half, loudness = lateral_weights(probe)
+        weights, half, speckle_gain = lateral_weights(probe)
         fill(
-            (self.beams.start, start),
-            (self.beams.direction, direction),
-            (self.beams.element, probe.elements()),
-            (self.beams.loudness, loudness),
+            (self.scanlines.start, start),
+            (self.scanlines.direction, direction),
+            (self.scanlines.element, probe.elements()),
+            (self.scanlines.speckle_gain, speckle_gain),
             (self.weight, weights),
             (self.half, half.reshape(-1, LANES).max(axis=1)),
             (self.source, source_of_pixels(probe, self.plane.pixels)),
@@ -114,35 +114,35 @@ class BMode:
     @ti.kernel
     def _add(self):
         for line, sample in self.decibel:
-            envelope = ti.abs(self.beams.real[line, sample])
-            self.decibel[line, sample] = DB * ti.log(envelope + SILENCE) + self.gain[sample]
+            envelope = ti.abs(self.scanlines.real[line, sample])
+            self.decibel[line, sample] = DB * ti.log(envelope + NOISE_FLOOR) + self.gain[sample]
 
     @ti.kernel
     def _spread(self):
-        # Line by line at one depth, so that what neighbours share stays in the nearest cache.
+        # Scanline by scanline at one depth: the samples that neighbours share stay in the L1 cache.
         for packet, line in ti.ndrange(self.samples // LANES, self.lines):
             first = packet * LANES
             real, imaginary = Packet(0.0), Packet(0.0)
             half = self.half[packet]
             for k in range(-half, half + 1):
-                # At the array's ends the lines beyond are taken as those before, mirrored.
+                # Beyond the ends of the array the scanlines are mirrored.
                 m = ti.abs(line + k)
                 m = ti.min(m, 2 * (self.lines - 1) - m)
-                # Conjugate, so that noise does not add up with itself; reflections are real.
+                # Conjugate, so that noise does not add coherently to itself; reflections are real.
                 turned = 1.0 if m == line + k else -1.0
-                weight = self.packet(self.weight, k + MOST_LINES, first)
-                real += weight * self.packet(self.beams.real, m, first)
-                imaginary += turned * weight * self.packet(self.beams.imaginary, m, first)
-            loudness = Packet([self.beams.loudness[first + i] for i in ti.static(range(LANES))])
-            envelope = loudness * ti.sqrt(real * real + imaginary * imaginary)
+                weight = self.packet(self.weight, k + MAX_HALF_WIDTH, first)
+                real += weight * self.packet(self.scanlines.real, m, first)
+                imaginary += turned * weight * self.packet(self.scanlines.imaginary, m, first)
+            speckle_gain = Packet([self.scanlines.speckle_gain[first + i] for i in ti.static(range(LANES))])
+            envelope = speckle_gain * ti.sqrt(real * real + imaginary * imaginary)
             gain = Packet([self.gain[first + i] for i in ti.static(range(LANES))])
-            decibel = DB * ti.log(envelope + SILENCE) + gain
+            decibel = DB * ti.log(envelope + NOISE_FLOOR) + gain
             for i in ti.static(range(LANES)):
                 self.decibel[line, first + i] = decibel[i]
 
     @ti.func
     def packet(self, field: ti.template(), row, first):
-        """LANES entries of a row of a field."""
+        """Return LANES entries of a row of a field."""
         return Packet([field[row, first + i] for i in ti.static(range(LANES))])
 
     @ti.kernel
@@ -161,7 +161,7 @@ class BMode:
 
 
 def source_of_pixels(probe: Probe, pixels: int) -> np.ndarray:
-    """Line and sample, as fractions of indices, of each pixel's centre (pixels, pixels, 2) float32; -1 outside the picture."""
+    """Return scanline and sample index, fractional, of each pixel's centre, (pixels, pixels, 2) float32; -1 outside the image."""
     width, depth, above = probe.extent_mm
     u = (np.arange(pixels) + 0.5) / pixels * width - width / 2
     v = (np.arange(pixels) + 0.5) / pixels * depth - above

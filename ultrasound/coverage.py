@@ -1,6 +1,6 @@
-"""What of the organ has been in the picture: its tissue by where it was at rest, looked at through the deformed body.
+"""Coverage: which tissue of the organ has been imaged, by its rest position.
 
-A place counts as seen where the picture's lines went through it from elements that touched the organ. Shadows are not asked for.
+A voxel counts as imaged where a scanline of an element in contact passed through it. Acoustic shadows are not considered.
 """
 
 from collections.abc import Iterator
@@ -16,34 +16,34 @@ from sim.signed_distance import distance_grid, signed_distance
 from ultrasound.probe import Probe
 
 VOXEL_MM = 1.5
-# Distances from the organ are known so far around it.
+# The voxels cover the organ and this much around it.
 REACH_MM = 6.0
-# Places of a picture that are asked where they were at rest, along each side.
-PLACES = 96
-# To so much of its length at rest tissue may be squeezed and still leave no voxel between two places.
-SQUEEZED = 0.7
-# Smaller gaps than this are of the voxels [ml].
-LEAST_GAP_ML = 0.05
+# Points along each side of an image whose rest positions are sampled.
+GRID_POINTS = 96
+# Least compressed length, as a fraction of the rest length, at which no voxel between two points is missed.
+MIN_STRETCH = 0.7
+# Smaller gaps come from the voxel size.
+MIN_GAP_ML = 0.05
 
 
 @dataclass(frozen=True)
 class Gap:
-    """A coherent part of a target that was not seen: how large, and how thick at most."""
+    """A connected part of a target that was not imaged: its volume and greatest thickness."""
 
     volume_ml: float
     thickness_mm: float
 
 
 class Coverage:
-    """``seen`` (nx, ny, nz): voxels of the resting organ and around it that were in the picture; ``targets`` the same for each target.
+    """``seen`` (nx, ny, nz): voxels of the organ at rest, and around it, that were imaged; ``targets``: those of each target.
 
-    ``organ`` and ``tumour`` are closed surfaces at rest [mm]; ``margin_mm`` is how much of the organ around the tumour must be seen.
+    ``organ`` and ``tumour`` are closed surfaces at rest [mm]; ``margin_mm`` is the width of the margin around the tumour.
     """
 
     def __init__(
         self, organ: trimesh.Trimesh, tumour: trimesh.Trimesh | None = None, margin_mm: float = 5.0
     ) -> None:
-        self.distance, self.low_mm = distance_grid(organ.vertices, organ.faces, VOXEL_MM, REACH_MM)
+        self.distance, self.origin_mm = distance_grid(organ.vertices, organ.faces, VOXEL_MM, REACH_MM)
         self.targets = {"organ": self.distance < 0}
         if tumour is not None:
             around = self._around(tumour, margin_mm)
@@ -52,61 +52,61 @@ class Coverage:
         self.seen = np.zeros(self.distance.shape, bool)
 
     def _around(self, tumour: trimesh.Trimesh, margin_mm: float) -> np.ndarray:
-        """Signed distances [mm] of the voxels near a tumour, and far ones of all others."""
+        """Return signed distances [mm] from the tumour: of the voxels near it, infinity elsewhere."""
         around = np.full(self.distance.shape, np.inf)
         low, high = self._indices(tumour.bounds + np.array([[-margin_mm], [margin_mm]]))
         low = np.maximum(np.floor(low).astype(int), 0)
         high = np.minimum(np.ceil(high).astype(int) + 1, self.distance.shape)
         box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-        places = self.low_mm + VOXEL_MM * (np.indices(high - low).reshape(3, -1).T + low)
-        around[box] = signed_distance(tumour.vertices, tumour.faces, places)[0].reshape(high - low)
+        points = self.origin_mm + VOXEL_MM * (np.indices(high - low).reshape(3, -1).T + low)
+        around[box] = signed_distance(tumour.vertices, tumour.faces, points)[0].reshape(high - low)
         return around
 
-    def _indices(self, places_mm: np.ndarray) -> np.ndarray:
-        return (places_mm - self.low_mm) / VOXEL_MM
+    def _indices(self, points_mm: np.ndarray) -> np.ndarray:
+        return (points_mm - self.origin_mm) / VOXEL_MM
 
-    def forget(self) -> None:
-        """Nothing was seen yet."""
+    def clear(self) -> None:
+        """Reset to nothing imaged."""
         self.seen[:] = False
 
-    def look(self, rest_mm: np.ndarray, probe: Probe, gap_mm: float | None) -> np.ndarray:
-        """Add what a picture shows; which of its lines touch.
+    def add(self, rest_mm: np.ndarray, probe: Probe, gap_mm: float | None) -> np.ndarray:
+        """Add an image; return which of its scanlines are in contact.
 
-        ``rest_mm`` (n, n, 3) is where the tissue was at rest at places evenly over the picture (``PlaneInTissue.rest_grid``). Lines
-        whose element is nearer to the organ than ``gap_mm`` touch; without it, all.
+        ``rest_mm`` (n, n, 3) are rest positions at points evenly over the image (``PlaneInTissue.rest_grid``). A scanline is in
+        contact where its element is nearer to the organ than ``gap_mm``; without it, all are.
         """
         count = len(rest_mm)
-        lines, in_picture = _lines_of(probe, count)
-        touches = np.ones(probe.number_of_scanlines, bool)
+        lines, in_image = _scanlines_of(probe, count)
+        contact = np.ones(probe.number_of_scanlines, bool)
         if gap_mm is not None:
-            touches = self._distance_at(rest_mm[_elements_of(probe, count)]) <= gap_mm
-        shown = np.flatnonzero(in_picture & touches[lines])
-        # One axis after the other, in voxels.
-        at = ((rest_mm.reshape(-1, 3) - self.low_mm) / VOXEL_MM).astype(np.float32).T.copy()
+            contact = self._distance_at(rest_mm[_elements_of(probe, count)]) <= gap_mm
+        shown = np.flatnonzero(in_image & contact[lines])
+        # In voxels, axis by axis.
+        at = ((rest_mm.reshape(-1, 3) - self.origin_mm) / VOXEL_MM).astype(np.float32).T.copy()
         near = np.ones(len(shown), bool)
         for along, last in zip(at, np.array(self.seen.shape) - 1, strict=True):
             near &= np.abs(along[shown] - last / 2) < (last + 1) / 2 + probe.elevation_width_mm / VOXEL_MM
-        for part in _parts(at, shown[near], probe, count):
+        for part in _subdivisions(at, shown[near], probe, count):
             index = np.rint(part).astype(np.int32)
             x, y, z = index[:, _within(index, self.seen.shape)]
             self.seen[x, y, z] = True
-        return touches
+        return contact
 
-    def _distance_at(self, places_mm: np.ndarray) -> np.ndarray:
-        at = self._indices(places_mm).T
+    def _distance_at(self, points_mm: np.ndarray) -> np.ndarray:
+        at = self._indices(points_mm).T
         return map_coordinates(self.distance, at, order=1, mode="constant", cval=np.inf)
 
-    def share(self, target: str) -> float:
-        """How much of a target was seen, 0 to 1; not a number without that target."""
+    def fraction(self, target: str) -> float:
+        """Return the imaged fraction of a target, 0 to 1; NaN without that target."""
         mask = self.targets.get(target)
         return float(self.seen[mask].mean()) if mask is not None and mask.any() else float("nan")
 
-    def places(self, target: str) -> np.ndarray:
-        """The middles (n, 3) of a target's voxels [mm]."""
-        return self.low_mm + VOXEL_MM * np.argwhere(self.targets[target])
+    def voxel_centres(self, target: str) -> np.ndarray:
+        """Return the centres (n, 3) of a target's voxels [mm]."""
+        return self.origin_mm + VOXEL_MM * np.argwhere(self.targets[target])
 
     def gaps(self, target: str) -> list[Gap]:
-        """What of a target was not seen, the largest part first."""
+        """Return the parts of a target that were not imaged, the largest first."""
         missing = self.targets[target] & ~self.seen
         parts, count = label(missing)
         thickness = 2 * VOXEL_MM * distance_transform_edt(missing)
@@ -114,46 +114,46 @@ class Coverage:
         for part in range(1, count + 1):
             mask = parts == part
             volume = float(mask.sum()) * VOXEL_MM**3 / 1000
-            if volume >= LEAST_GAP_ML:
+            if volume >= MIN_GAP_ML:
                 found.append(Gap(volume, float(thickness[mask].max())))
         return sorted(found, key=lambda gap: -gap.volume_ml)
 
-    def at(self, places_mm: np.ndarray) -> np.ndarray:
-        """Whether the tissue at places (n, 3) at rest was seen."""
-        index = np.clip(np.rint(self._indices(places_mm)).astype(int), 0, np.array(self.seen.shape) - 1)
+    def is_seen(self, points_mm: np.ndarray) -> np.ndarray:
+        """Whether the tissue at rest positions (n, 3) was imaged."""
+        index = np.clip(np.rint(self._indices(points_mm)).astype(int), 0, np.array(self.seen.shape) - 1)
         return self.seen[tuple(index.T)]
 
 
 @lru_cache(maxsize=4)
-def _lines_of(probe: Probe, places: int) -> tuple[np.ndarray, np.ndarray]:
-    """Which line each place (n, n) of a picture is on, and whether it is in the picture."""
+def _scanlines_of(probe: Probe, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the scanline of each of count x count points of an image, and whether the point is in the sector."""
     width, depth, above = probe.extent_mm
-    share = np.linspace(0.0, 1.0, places)
+    share = np.linspace(0.0, 1.0, count)
     line, along = probe.beam_coordinates(*np.meshgrid(width * (share - 0.5), depth * share - above))
     last = probe.number_of_scanlines - 1
-    # Of the places on the two edges one counts, so that all that places stand for is as wide as the picture.
+    # Only one of the two edges counts, so that the points together are as wide as the image.
     inside = (line >= -0.5) & (line < last + 0.5) & (along >= 0) & (along <= probe.depth_mm)
     return np.clip(np.rint(line).astype(int), 0, last), inside
 
 
-def _elements_of(probe: Probe, places: int) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column of the place of a picture nearest to each element."""
+def _elements_of(probe: Probe, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return row and column of the grid point nearest to each element."""
     width, depth, above = probe.extent_mm
     share = (probe.elements() + [width / 2, above]) / [width, depth]
-    column, row = np.clip(np.rint(share * (places - 1)).astype(int), 0, places - 1).T
+    column, row = np.clip(np.rint(share * (count - 1)).astype(int), 0, count - 1).T
     return row, column
 
 
 def _within(index: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Which indices (3, n) are of a grid."""
+    """Which indices (3, n) are within a grid."""
     x, y, z = index
     return (x >= 0) & (y >= 0) & (z >= 0) & (x < shape[0]) & (y < shape[1]) & (z < shape[2])
 
 
-def _parts(at: np.ndarray, shown: np.ndarray, probe: Probe, count: int) -> Iterator[np.ndarray]:
-    """Middles (3, n) of the parts of what places of a picture stand for, its thickness too, no larger than voxels are.
+def _subdivisions(at: np.ndarray, shown: np.ndarray, probe: Probe, count: int) -> Iterator[np.ndarray]:
+    """Yield centres (3, n) of the parts, no larger than a voxel, into which the box of tissue around each grid point is divided.
 
-    ``at`` (3, count * count) are all places at rest [voxels], ``shown`` those that count.
+    ``at`` (3, count * count) are the rest positions of all points [voxels], ``shown`` the points to use.
     """
     width, depth, _ = probe.extent_mm
     row, column = np.divmod(shown, count)
@@ -163,16 +163,16 @@ def _parts(at: np.ndarray, shown: np.ndarray, probe: Probe, count: int) -> Itera
     across = (at[:, count * row + last] - at[:, count * row + first]) / (last - first).astype(np.float32)
     normal = np.stack([across[k - 2] * down[k - 1] - across[k - 1] * down[k - 2] for k in range(3)])
     normal *= probe.elevation_width_mm / VOXEL_MM / np.maximum(np.sqrt((normal**2).sum(axis=0)), 1e-9)
-    spacing = np.array([width, depth]) / (count - 1) / SQUEEZED
+    spacing = np.array([width, depth]) / (count - 1) / MIN_STRETCH
     sizes = [*spacing, probe.elevation_width_mm]
     middle = at[:, shown]
-    for shares in product(*(_middles(int(np.ceil(size / VOXEL_MM))) for size in sizes)):
-        place = middle
+    for shares in product(*(_offsets(int(np.ceil(size / VOXEL_MM))) for size in sizes)):
+        point = middle
         for share, along in zip(shares, (across, down, normal), strict=True):
-            place = place + share * along if share else place
-        yield place
+            point = point + share * along if share else point
+        yield point
 
 
-def _middles(count: int) -> list[float]:
-    """Of so many equal parts of a length of 1 about 0."""
+def _offsets(count: int) -> list[float]:
+    """Return the centres of the equal parts of a unit length about 0."""
     return [(k + 0.5) / count - 0.5 for k in range(count)]

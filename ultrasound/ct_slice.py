@@ -1,4 +1,4 @@
-"""The CT slice that the transducer would see: image plane -> deformed tetrahedra -> rest voxels (the paper's way)."""
+"""The CT slice on the image plane: image plane -> deformed tetrahedra -> voxels at rest (the paper's method)."""
 
 import numpy as np
 import taichi as ti
@@ -7,7 +7,7 @@ import taichi.math as tm
 from ultrasound.image_plane import LANES, Picture, PlaneInTissue
 from ultrasound.sampled_volume import AIR_HU, SampledVolume
 
-# What the picture shows of all that is not the organ; the background is the CT itself.
+# HU outside the organ; the background is the CT itself.
 OUTSIDE_HU = {"background": 0.0, "gel": 0.0, "air": AIR_HU}
 
 
@@ -16,8 +16,8 @@ class CtSlice:
     """The CT on an image plane through the deformed body.
 
     ``ct`` [HU] and ``organ``, the signed distance from its surface [mm], negative inside, are volumes in the body's
-    rest frame. ``outside`` is what the picture shows of all that is not the organ: ``background``, the CT around it,
-    which gives way to the organ as far as the embedding reaches; ``gel`` (0 HU); ``air`` (-1000 HU).
+    rest frame. ``outside`` is what is shown outside the organ: ``background``, the CT around it, which deforms with the organ as
+    far as the embedding reaches; ``gel`` (0 HU); ``air`` (-1000 HU).
     """
 
     def __init__(
@@ -33,16 +33,13 @@ class CtSlice:
         self.packets = (plane.pixels + LANES - 1) // LANES
 
     def render(self, window_hu: float, level_hu: float) -> np.ndarray:
-        """Grey values (pixels, pixels) uint8, 0 to 255 over the window, of the plane that was taken last.
-
-        Pixels are sampled at their centres.
-        """
+        """Return grey values (pixels, pixels) uint8, 0 to 255 over the window, of the plane located last, at pixel centres."""
         picture = np.empty((self.plane.pixels, self.plane.pixels), np.uint8)
         self._render(self.plane.pixel_mm, self.plane.first_mm, window_hu, level_hu, picture)
         return picture
 
     def hounsfield(self) -> np.ndarray:
-        """HU (pixels, pixels) float32 of the plane that was taken last."""
+        """Return HU (pixels, pixels) float32 of the plane located last."""
         values = np.empty((self.plane.pixels, self.plane.pixels), np.float32)
         self._hounsfield(self.plane.pixel_mm, self.plane.first_mm, values)
         return values
@@ -68,7 +65,7 @@ class CtSlice:
 
     @ti.func
     def sample(self, row, first, pixel_mm, first_mm):
-        """HU of LANES pixels of a row."""
+        """Return HU of LANES pixels of a row."""
         x, y, z, in_line = self.plane.rest_lanes(row, first, pixel_mm, first_mm)
         hu = self.ct.sample_lanes(x, y, z, in_line)
         if ti.static(not self.show_background):
@@ -80,5 +77,5 @@ class CtSlice:
 
     @ti.func
     def in_organ(self, row, column, rest):
-        """Whether the tissue of a pixel, at a place at rest [mm], is the organ's."""
+        """Whether the tissue of a pixel, at a rest position [mm], is of the organ."""
         return self.plane.is_tissue(row, column) and self.organ.sample(rest) <= 0.0

@@ -1,4 +1,4 @@
-"""A picture as a DICOM Ultrasound Image that names nobody (PS3.3 A.6.4, with the US modules of C.8.5.5 and C.8.5.6)."""
+"""Images as de-identified DICOM Ultrasound Images (PS3.3 A.6.4, with the US modules of C.8.5.5 and C.8.5.6)."""
 
 import io
 from pathlib import Path
@@ -12,7 +12,7 @@ from pydicom.valuerep import DS
 from ultrasound.probe import Probe
 from version import VERSION
 
-# What the standard wants present though it is unknown (its type 2).
+# Attributes of type 2: required, empty where unknown.
 EMPTY = (
     "PatientName",
     "PatientID",
@@ -33,15 +33,15 @@ REGION_2D, REGION_TISSUE, CENTIMETRES = 1, 1, 3
 
 
 def save_dicom(
-    path: Path, picture: np.ndarray, spacing_mm: tuple[float, float], probe: Probe | None = None
+    path: Path, image: np.ndarray, spacing_mm: tuple[float, float], probe: Probe | None = None
 ) -> None:
-    """Write grey values (rows, columns) uint8 with the distance of neighbouring rows and that of neighbouring columns [mm].
+    """Write grey values (rows, columns) uint8 with row and column spacing [mm].
 
-    A probe, whose ``extent_mm`` the picture then shows, adds what it is and where the middle of its face is.
-    Raises ValueError where picture or distances are none, and OSError where the file cannot be written.
+    With a probe, whose ``extent_mm`` the image covers, the file also has transducer data and the centre of the array face.
+    Raises ValueError for an invalid image or spacing, and OSError where the file cannot be written.
     """
-    if picture.dtype != np.uint8 or picture.ndim != 2 or picture.size == 0:
-        raise ValueError(f"a picture of {picture.dtype} {picture.shape}: expected uint8 (rows, columns)")
+    if image.dtype != np.uint8 or image.ndim != 2 or image.size == 0:
+        raise ValueError(f"a image of {image.dtype} {image.shape}: expected uint8 (rows, columns)")
     if len(spacing_mm) != 2 or not all(0 < each < np.inf for each in spacing_mm):
         raise ValueError(
             f"spacing {spacing_mm}: expected the distances of rows and of columns in mm, above 0"
@@ -53,35 +53,35 @@ def save_dicom(
     data.PatientIdentityRemoved = "YES"
     data.DeidentificationMethod = "Nothing of the patient is written"
     data.SOPClassUID = UltrasoundImageStorage
-    # Without a prefix they are random UUIDs, which tell nothing of patient, machine or time.
+    # Without a prefix they are random UUIDs, which identify neither patient nor machine nor time.
     for keyword in ("SOPInstanceUID", "SeriesInstanceUID", "StudyInstanceUID"):
         setattr(data, keyword, generate_uid(prefix=None))
     data.Modality = "US"
     data.Manufacturer = "Nephron"
     data.SoftwareVersions = VERSION
-    # No examination made this picture; its tissue comes from the pixels of another.
+    # Not acquired: derived from the pixels of another image.
     data.ImageType = ["DERIVED", "SECONDARY"]
     data.DerivationDescription = "Simulated, not for diagnosis"
     data.SyntheticData = "YES"
     data.BurnedInAnnotation = "NO"
     data.LossyImageCompression = "00"
-    # Not of this IOD, which has the region's deltas, but what ITK reads.
+    # Not part of this IOD, which has the region's deltas, but read by ITK.
     data.PixelSpacing = [DS(float(each), auto_format=True) for each in spacing_mm]
-    data.SequenceOfUltrasoundRegions = [_region(picture.shape, spacing_mm, probe)]
+    data.SequenceOfUltrasoundRegions = [_region(image.shape, spacing_mm, probe)]
     if probe is not None:
         data.TransducerType = TRANSDUCER_TYPES[probe.transducer_geometry]
         data.DepthOfScanField = round(probe.depth_mm)
 
     data.file_meta = FileMetaDataset()
     data.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
-    data.set_pixel_data(picture, "MONOCHROME2", bits_stored=8, generate_instance_uid=False)
-    content = io.BytesIO()  # pydicom does not say what a disk has against its file
+    data.set_pixel_data(image, "MONOCHROME2", bits_stored=8, generate_instance_uid=False)
+    content = io.BytesIO()  # so that an error of the disk names the file
     data.save_as(content, enforce_file_format=True)
     path.write_bytes(content.getvalue())
 
 
 def _region(shape: tuple[int, ...], spacing_mm: tuple[float, float], probe: Probe | None) -> Dataset:
-    """The whole picture as one region; its reference is the pixel that holds the middle of the face, where (u, v) is 0 [cm]."""
+    """Return the whole image as one region; its reference pixel contains the centre of the face, where (u, v) is 0 [cm]."""
     rows, columns = shape
     row_cm, column_cm = (float(each) / 10 for each in spacing_mm)
     region = Dataset()
@@ -97,7 +97,7 @@ def _region(shape: tuple[int, ...], spacing_mm: tuple[float, float], probe: Prob
         above_cm = probe.extent_mm[2] / 10
         column, row = columns // 2, int(above_cm / row_cm)
         region.ReferencePixelX0, region.ReferencePixelY0 = column, row
-        # Its centre is off the face's middle by a part of a pixel.
+        # The pixel's centre is off the face's centre by a part of a pixel.
         region.ReferencePixelPhysicalValueX = (column + 0.5 - columns / 2) * column_cm
         region.ReferencePixelPhysicalValueY = (row + 0.5) * row_cm - above_cm
     return region

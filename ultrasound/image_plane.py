@@ -1,24 +1,26 @@
-"""The image plane of a transducer, carried back through the deformed tissue: a place on it -> where that was at rest."""
+"""The image plane of a transducer and the rest positions of the tissue on it."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
 import taichi.math as tm
+import trimesh
+from trimesh.intersections import mesh_plane
 
 from sim.embedding import Embedding, Unmoved
 
 Picture = ti.types.ndarray(ti.u8, ndim=2)
-# Places that are computed together where there are many in a row.
+# Pixels of a row that are computed together (SIMD).
 LANES = 8
 Lanes = ti.types.vector(LANES, ti.f32)
 
 
 @dataclass(frozen=True)
 class ImagePlane:
-    """The part of the transducer's plane that is drawn.
+    """The imaged rectangle of the transducer's plane.
 
-    ``width_mm`` along the transducer's x, ``depth_mm`` along its -z, which starts ``above_mm`` behind its face.
+    ``width_mm`` along the transducer's x, ``depth_mm`` along its -z, starting ``above_mm`` behind its face.
     ``world_from_plane`` (4, 4): x to the marked side, y down into the tissue, z to the transducer's y [mm].
     """
 
@@ -30,9 +32,9 @@ class ImagePlane:
 
 @ti.data_oriented
 class PlaneInTissue:
-    """Which tetrahedron of an embedding holds each of ``pixels`` x ``pixels`` places of an image plane.
+    """The tetrahedron of an embedding that contains each of ``pixels`` x ``pixels`` pixels of an image plane.
 
-    ``owner`` (rows, columns) since the last ``take``; slice and echo are made of the same one.
+    ``owner`` (rows, columns) is its index, since the last ``locate``.
     """
 
     def __init__(self, embedding: Embedding | Unmoved, pixels: int) -> None:
@@ -40,8 +42,8 @@ class PlaneInTissue:
         self.pixels = pixels
         self.owner = ti.field(ti.i32, (pixels, pixels))
 
-    def take(self, plane: ImagePlane) -> None:
-        """Find the tissue on a plane, the embedding being up to date; ``pixel_mm`` and ``first_mm`` say where pixels are."""
+    def locate(self, plane: ImagePlane) -> None:
+        """Find the tissue on a plane; the embedding must be up to date. Sets pixel size and first pixel's centre [mm]."""
         pixel = np.array([plane.width_mm, plane.depth_mm]) / self.pixels
         first = np.array([-plane.width_mm / 2, -plane.above_mm]) + pixel / 2
         self.pixel_mm, self.first_mm = ti.Vector(pixel.tolist()), ti.Vector(first.tolist())
@@ -50,7 +52,7 @@ class PlaneInTissue:
         self.embedding.locate_on_plane(inverse, world, self.pixel_mm, self.first_mm, self.owner)
 
     def rest_grid(self, count: int) -> np.ndarray:
-        """Where the tissue of the plane was at rest [mm], at count x count places evenly over it, (rows, columns, 3)."""
+        """Return rest positions (rows, columns, 3) [mm] at count x count points evenly over the plane."""
         places = np.empty((count, count, 3), np.float32)
         self._rest_grid(self.pixel_mm, self.first_mm, places)
         return places
@@ -66,25 +68,25 @@ class PlaneInTissue:
 
     @ti.func
     def rest_at(self, row, column, pixel_mm, first_mm):
-        """Where the tissue at a pixel's centre was at rest [mm]."""
+        """Return the rest position of the tissue at a pixel's centre [mm]."""
         linear = self.embedding.rest_from_plane[self.owner[row, column]]
         u, v = first_mm.x + column * pixel_mm.x, first_mm.y + row * pixel_mm.y
         return linear[:, 0] * u + linear[:, 1] * v + linear[:, 3]
 
     @ti.func
     def rest_lanes(self, row, first, pixel_mm, first_mm):
-        """As ``rest_at``, of LANES pixels of a row, each axis by itself, and whether they are on one line at rest too.
+        """As ``rest_at`` for LANES pixels of a row, axis by axis, and whether they are collinear at rest too.
 
-        Those beyond the picture are its last.
+        Pixels beyond the image repeat its last.
         """
         last = self.pixels - 1
         x, y, z = Lanes(0.0), Lanes(0.0), Lanes(0.0)
         owner = self.owner[row, first]
-        alike = True
+        same = True
         for lane in ti.static(range(1, LANES)):
-            alike &= self.owner[row, ti.min(first + lane, last)] == owner
-        if alike:
-            # Most neighbours lie in one tetrahedron, which takes them back along a line.
+            same &= self.owner[row, ti.min(first + lane, last)] == owner
+        if same:
+            # Most neighbours are in one tetrahedron, whose map keeps them on a line.
             start = self.rest_at(row, first, pixel_mm, first_mm)
             on = self.embedding.rest_from_plane[owner][:, 0] * pixel_mm.x
             steps = Lanes([float(lane) for lane in ti.static(range(LANES))])
@@ -93,23 +95,33 @@ class PlaneInTissue:
             for lane in ti.static(range(LANES)):
                 rest = self.rest_at(row, ti.min(first + lane, last), pixel_mm, first_mm)
                 x[lane], y[lane], z[lane] = rest.x, rest.y, rest.z
-        return x, y, z, alike
+        return x, y, z, same
 
     @ti.func
     def pixel_near(self, place, pixel_mm, first_mm):
-        """Row and column of the pixel nearest to a place (u, v) [mm]."""
+        """Return row and column of the pixel nearest to (u, v) [mm]."""
         at = ti.round((place - first_mm) / pixel_mm, ti.i32)
         return tm.clamp(at.y, 0, self.pixels - 1), tm.clamp(at.x, 0, self.pixels - 1)
 
     @ti.func
-    def map_of(self, row, column):
-        """The map (3, 4) from (u, v, w, 1) of the plane to where the tissue of a pixel was at rest [mm]."""
+    def rest_from_plane(self, row, column):
+        """Return the map (3, 4) from (u, v, w, 1) of the plane to the rest position [mm], at a pixel."""
         return self.embedding.rest_from_plane[self.owner[row, column]]
 
     @ti.func
     def is_tissue(self, row, column):
-        """Whether the embedding holds what a pixel shows."""
+        """Whether the embedding contains the pixel."""
         return self.owner[row, column] < self.embedding.count
+
+
+def plane_section(vertices: np.ndarray, faces: np.ndarray, plane_from_world: np.ndarray) -> np.ndarray:
+    """Return the section of a closed surface (v, 3), (f, 3) [mm] with the plane w = 0: segments (n, 2, 2) of (u, v) [mm].
+
+    ``plane_from_world`` (4, 4) is rigid: u to the marked side, v down into the tissue, w out of the plane.
+    """
+    in_plane = vertices @ plane_from_world[:3, :3].T + plane_from_world[:3, 3]
+    surface = trimesh.Trimesh(in_plane, faces, process=False)
+    return mesh_plane(surface, plane_normal=[0.0, 0.0, 1.0], plane_origin=[0.0, 0.0, 0.0])[..., :2]
 
 
 def _matrix(values: np.ndarray) -> ti.Matrix:

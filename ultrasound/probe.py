@@ -1,7 +1,7 @@
-"""The array of a probe and the scanner's settings: probe files, scanlines, and the way back from a pixel to its line.
+"""The array of a probe and the scanner's settings: probe files and scanline geometry.
 
-A probe file is TOML with PLUS's names (TransducerGeometry, DepthMm, FrequencyMhz, ...), each with its unit. Places on the image
-plane are (u, v) [mm]: u to the marked side, v down into the tissue, the origin at the middle of the array's face.
+A probe file is TOML with PLUS's names (TransducerGeometry, DepthMm, FrequencyMhz, ...), each with its unit. Points on the image
+plane are (u, v) [mm]: u to the marked side, v down into the tissue, the origin at the centre of the array face.
 """
 
 import tomllib
@@ -22,7 +22,7 @@ GAIN_RANGE_DB, TGC_RANGE_DB, TGC_SLIDERS = 60.0, 24.0, 8
 
 Mode = Literal["both", "b-mode", "ct"]
 MODES: tuple[Mode, ...] = get_args(Mode)
-# The echo's ladder of realism: reflection and attenuation; and speckle and point spread; and the thickness of the plane.
+# Realism of the B-mode image: reflection and attenuation; also speckle and point spread; also the slice thickness.
 DetailLevel = Literal["reflection", "speckle", "elevation"]
 DETAIL_LEVELS: tuple[DetailLevel, ...] = get_args(DetailLevel)
 
@@ -36,10 +36,10 @@ class ProbeError(UserError):
 class Probe(BaseModel):
     """One probe with the scanner's settings, as its file has them in PLUS's spelling (``frequency_mhz`` is FrequencyMhz).
 
-    ``housing_mm`` is the cuboid that touches: lateral x elevation x length, its edges rounded by ``edge_radius_mm``: sharp ones
-    plough through tissue that they are led over. ``elevation_width_mm`` is the thickness of the image
-    plane, and ``focal_zone_mm`` how far from the focus the beam is wider by sqrt(2). ``depth_compensation_db_cm_mhz`` is the
-    gain over depth that the scanner adds by itself, to which the sliders of ``time_gain_compensation`` [%] come.
+    ``housing_mm`` is the cuboid in contact: lateral x elevation x length. ``edge_radius_mm`` rounds its edges; sharp ones cut into
+    tissue that they slide over. ``elevation_width_mm`` is the slice thickness, ``focal_zone_mm`` the distance from the focus at
+    which the beam is wider by sqrt(2). ``depth_compensation_db_cm_mhz`` is the scanner's built-in TGC, to which the sliders of
+    ``time_gain_compensation`` [%] add.
     """
 
     model_config = ConfigDict(
@@ -99,22 +99,22 @@ class Probe(BaseModel):
 
     @property
     def wavelength_mm(self) -> float:
-        """Of the sound in soft tissue."""
+        """Wavelength in soft tissue."""
         return SOUND_MM_US / self.frequency_mhz
 
     @property
     def sample_mm(self) -> float:
-        """Depth from one sample to the next."""
+        """Distance between samples."""
         return self.depth_mm / self.number_of_samples_per_scanline
 
     @property
     def radius_mm(self) -> float:
-        """Radius of the array's face; 0 where all lines leave from one point."""
+        """Radius of the array face; 0 where it is flat or all scanlines start at one point."""
         return self.radius_start_mm if self.transducer_geometry == "CURVILINEAR" else 0.0
 
     @property
     def sector(self) -> tuple[float, float, float] | None:
-        """Radius of the face [mm], first and last angle [rad], of lines that fan out; None of parallel ones."""
+        """Radius of the face [mm], first and last angle [rad] of a sector; None for parallel scanlines."""
         if self.transducer_geometry == "LINEAR":
             return None
         start, stop = np.radians([self.theta_start_deg, self.theta_stop_deg])
@@ -127,7 +127,7 @@ class Probe(BaseModel):
 
     @property
     def extent_mm(self) -> tuple[float, float, float]:
-        """Width and depth of the box around the picture, and how much of the depth lies behind the face's middle."""
+        """Width and depth of the image's bounding box, and the part of the depth behind the centre of the face."""
         if self.transducer_geometry == "LINEAR":
             return self.transducer_width_mm, self.depth_mm, 0.0
         reach = self.radius_mm + self.depth_mm
@@ -137,25 +137,23 @@ class Probe(BaseModel):
         return float(2 * half), float(self.depth_mm + above), float(above)
 
     def image_to_probe(self, rows: int, columns: int) -> np.ndarray:
-        """The matrix (4, 4) that takes pixels (column, row, 0) of its picture, counted from the first one's centre, to its axes [mm].
+        """Return the matrix (4, 4) from pixels (column, row, 0), counted from the first one's centre, to the probe's axes [mm].
 
-        The probe's axes are PLUS's: the origin in the middle of the array's face, x to the marked side, y away into the tissue.
+        The axes are PLUS's: origin at the centre of the array face, x to the marked side, y into the tissue.
         """
         width, depth, above = self.extent_mm
         matrix = np.diag([width / columns, depth / rows, 1.0, 1.0])
         matrix[:2, 3] = width / columns / 2 - width / 2, depth / rows / 2 - above
         return matrix
 
-    def line_angles(self) -> np.ndarray:
-        """Angle of each scanline from straight down [rad], shape (lines,)."""
+    def scanlines(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return start [mm] and unit direction of each scanline, each (scanlines, 2) on the image plane."""
         start, stop = np.radians([self.theta_start_deg, self.theta_stop_deg])
         if self.transducer_geometry == "LINEAR":
             start = stop = 0.0
-        return start + (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines * (stop - start)
-
-    def scanlines(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where each line leaves the face [mm] and its unit direction, each (lines, 2) on the image plane."""
-        angle = self.line_angles()
+        angle = start + (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines * (
+            stop - start
+        )
         direction = np.column_stack([np.sin(angle), np.cos(angle)])
         if self.transducer_geometry == "LINEAR":
             share = (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines - 0.5
@@ -163,21 +161,21 @@ class Probe(BaseModel):
         return self.radius_mm * (direction - [0.0, 1.0]), direction
 
     def elements(self) -> np.ndarray:
-        """Places on the face that must touch for sound to leave, (lines, 2) [mm]: those where the lines leave, or across the array."""
+        """Return the elements on the face (scanlines, 2) [mm]: the starts of the scanlines, or across a phased array."""
         share = (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines - 0.5
         if self.transducer_geometry == "PHASED":
             return np.column_stack([share * self.transducer_width_mm, np.zeros_like(share)])
         return self.scanlines()[0]
 
     def line_spacing_mm(self, depth_mm: np.ndarray) -> np.ndarray:
-        """Distance of neighbouring lines at depths [mm]."""
+        """Return the distance of neighbouring scanlines at depths [mm]."""
         if self.transducer_geometry == "LINEAR":
             return np.full_like(depth_mm, self.transducer_width_mm / self.number_of_scanlines)
         step = np.radians(self.theta_stop_deg - self.theta_start_deg) / self.number_of_scanlines
         return (self.radius_mm + depth_mm) * step
 
     def beam_coordinates(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Scanline (a fraction of an index between two) and depth along it [mm] of places on the plane [mm]."""
+        """Return scanline (fractional index) and depth along it [mm] of points on the plane [mm]."""
         if self.transducer_geometry == "LINEAR":
             line = (u / self.transducer_width_mm + 0.5) * self.number_of_scanlines - 0.5
             return line, np.array(v, float)
@@ -187,7 +185,7 @@ class Probe(BaseModel):
         return share * self.number_of_scanlines - 0.5, depth
 
     def gain_db(self) -> np.ndarray:
-        """What the scanner adds at each sample of a line [dB], shape (samples,): gain, its own over depth, and the sliders'."""
+        """Return gain and TGC at each sample of a scanline [dB], (samples,)."""
         depth = (np.arange(self.number_of_samples_per_scanline) + 0.5) * self.sample_mm
         own = 2 * self.depth_compensation_db_cm_mhz * self.frequency_mhz * depth / 10
         places = (np.arange(TGC_SLIDERS) + 0.5) * self.depth_mm / TGC_SLIDERS
@@ -196,9 +194,9 @@ class Probe(BaseModel):
 
 
 def load_probe(name: str) -> Probe:
-    """The probe that comes with the program by a name, else that of a file. Raises ProbeError."""
-    own = PROBES / f"{name}.toml"
-    path = own if own.is_file() else Path(name)
+    """Return a built-in probe by name, else the probe of a file. Raises ProbeError."""
+    built_in = PROBES / f"{name}.toml"
+    path = built_in if built_in.is_file() else Path(name)
     try:
         return probe_of_values(tomllib.loads(path.read_text("utf-8")))
     except FileNotFoundError:
@@ -211,7 +209,7 @@ def load_probe(name: str) -> Probe:
 
 
 def probe_of_values(values: Mapping[str, Any]) -> Probe:
-    """The probe of a file's values. Raises ProbeError, which names the key."""
+    """Return the probe of a file's values. Raises ProbeError, which names the key."""
     try:
         return Probe.model_validate(values)
     except ValidationError as error:

@@ -1,4 +1,4 @@
-"""The transducer: its pose, and how a hand moves it over the organ.
+"""Poses of the transducer, and the probe manipulator that moves it over the organ.
 
 A pose is a rigid (4, 4) matrix, world from transducer [mm]. The transducer is a cuboid about its origin: x lateral
 to the marked side, y elevation, z along its axis; the image leaves its face at z = -length / 2 along -z.
@@ -12,18 +12,18 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ultrasound.image_plane import ImagePlane
 
-# How wide a patch of surface the probe's axis is perpendicular to, as a hand would hold it.
+# Radius of the surface patch to whose mean normal the probe is aligned.
 NORMAL_PATCH_MM = 12.0
-LEAST_DEPTH_MM, MOST_DEPTH_MM = -40.0, 15.0
-# How deep a hand presses, in lengths of the transducer: what holds it must stay out of the tissue.
-MOST_LENGTHS = 1.5
+MIN_DEPTH_MM, MAX_DEPTH_MM = -40.0, 15.0
+# Greatest depth in lengths of the transducer: its holder must stay out of the tissue.
+MAX_DEPTH_LENGTHS = 1.5
 PRESS_MM_S, RELEASE_MM_S = 12.0, 40.0
 
 
 def pose_at(
     face_centre: np.ndarray, direction: np.ndarray, lateral: np.ndarray, length_mm: float
 ) -> np.ndarray:
-    """Pose whose face is centred at a point [mm] and looks along ``direction``; x is nearest to ``lateral``."""
+    """Return the pose with its face centred at a point [mm], beam along ``direction``, x nearest to ``lateral``."""
     z = -np.asarray(direction, float) / np.linalg.norm(direction)
     x = np.asarray(lateral, float) - np.dot(lateral, z) * z
     if np.linalg.norm(x) < 1e-6:
@@ -34,7 +34,7 @@ def pose_at(
 
 
 def rigid(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Matrices (..., 4, 4) of rotations (..., 3, 3) and positions (..., 3)."""
+    """Return matrices (..., 4, 4) of rotations (..., 3, 3) and positions (..., 3)."""
     matrix = np.zeros((*position.shape[:-1], 4, 4))
     matrix[..., :3, :3], matrix[..., :3, 3], matrix[..., 3, 3] = rotation, position, 1.0
     return matrix
@@ -43,26 +43,26 @@ def rigid(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
 def image_plane(
     pose: np.ndarray, length_mm: float, width_mm: float, depth_mm: float, above_mm: float = 0.0
 ) -> ImagePlane:
-    """The plane under the transducer's face: x to the marked side, y down into the tissue, origin at the face."""
+    """Return the image plane of a pose: x to the marked side, y down into the tissue, origin at the face."""
     return ImagePlane(pose @ _face(length_mm), width_mm, depth_mm, above_mm)
 
 
-def held_at(world_from_plane: np.ndarray, length_mm: float) -> np.ndarray:
-    """The pose of a transducer whose image plane (4, 4) is there: PLUS's axes of a probe are the plane's."""
+def pose_of_image_plane(world_from_plane: np.ndarray, length_mm: float) -> np.ndarray:
+    """Return the pose of the transducer with a given image plane (4, 4), whose axes are PLUS's axes of a probe."""
     return world_from_plane @ np.linalg.inv(_face(length_mm))
 
 
 def _face(length_mm: float) -> np.ndarray:
-    """The image plane's axes in the transducer's."""
+    """Return the transform from the image plane's axes to the transducer's."""
     return np.array(
         [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, -length_mm / 2], [0.0, 0.0, 0.0, 1.0]]
     )
 
 
 def indentation(pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray, radius_mm: float = 0.0) -> float:
-    """How deep the transducer's face is below the highest point (n, 3) of the settled surface under it [mm].
+    """Return the depth [mm] of the array face below the highest point (n, 3) of the settled surface under its footprint.
 
-    Negative above the surface; -inf where the transducer's footprint misses it. The face is flat, or an arc of a radius.
+    Negative above the surface; -inf where the footprint misses it. The face is flat, or an arc of a radius.
     """
     local = (surface - pose[:3, 3]) @ pose[:3, :3]
     half = np.asarray(size_mm) / 2
@@ -72,7 +72,7 @@ def indentation(pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray, radi
 
 
 def sagitta(x_mm: np.ndarray, radius_mm: float) -> np.ndarray:
-    """How far a face of a radius (0: flat) lies behind its middle, at lateral places [mm]."""
+    """Return how far a face of a radius (0: flat) is behind its centre, at lateral positions [mm]."""
     if radius_mm == 0:
         return np.zeros_like(x_mm)
     return radius_mm - np.sqrt(np.maximum(radius_mm**2 - x_mm**2, 0.0))
@@ -81,44 +81,44 @@ def sagitta(x_mm: np.ndarray, radius_mm: float) -> np.ndarray:
 def touching(
     pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray, radius_mm: float = 0.0
 ) -> np.ndarray:
-    """The pose moved along its axis to where it just touches the settled surface (n, 3)."""
+    """Return the pose moved along its axis to first contact with the settled surface (n, 3)."""
     depth = indentation(pose, size_mm, surface, radius_mm)
     return advanced(pose, -depth) if np.isfinite(depth) else pose.copy()
 
 
 def advanced(pose: np.ndarray, depth_mm: float) -> np.ndarray:
-    """The pose moved by a depth along the way it looks [mm]."""
+    """Return the pose moved by a depth along the beam [mm]."""
     moved = pose.copy()
     moved[:3, 3] -= depth_mm * pose[:3, 2]
     return moved
 
 
-def between(start: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
-    """Poses (count + 1, 4, 4) evenly from start to end, as ``interpolated``."""
+def poses_between(start: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
+    """Return poses (count + 1, 4, 4) evenly from start to end, as ``interpolated``."""
     return interpolated(start, end, np.linspace(0.0, 1.0, count + 1))
 
 
-def approached(pose: np.ndarray, goal: np.ndarray, most_mm: float, most_deg: float) -> np.ndarray:
-    """The pose moved towards a goal by at most a distance [mm] and an angle [degrees]."""
-    way = float(np.linalg.norm(goal[:3, 3] - pose[:3, 3]))
+def moved_towards(pose: np.ndarray, goal: np.ndarray, max_mm: float, max_deg: float) -> np.ndarray:
+    """Return the pose moved towards a goal by at most a distance [mm] and an angle [degrees]."""
+    distance = float(np.linalg.norm(goal[:3, 3] - pose[:3, 3]))
     turn = np.degrees(Rotation.from_matrix(goal[:3, :3] @ pose[:3, :3].T).magnitude())
-    share = min(1.0, most_mm / max(way, 1e-9), most_deg / max(turn, 1e-9))
+    share = min(1.0, max_mm / max(distance, 1e-9), max_deg / max(turn, 1e-9))
     return goal.copy() if share >= 1.0 else interpolated(pose, goal, share)
 
 
 def interpolated(start: np.ndarray, end: np.ndarray, share: float | np.ndarray) -> np.ndarray:
-    """The pose (4, 4), or poses (n, 4, 4), at a share (0 to 1), or shares (n,), of the way from start to end.
+    """Return the pose (4, 4), or poses (n, 4, 4), at a fraction (0 to 1), or fractions (n,), of the path from start to end.
 
-    It is straight in position, and the short way round in angle.
+    Positions are interpolated linearly, rotations spherically.
     """
     turns = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([start[:3, :3], end[:3, :3]])))
-    way = np.asarray(share)[..., None] * (end[:3, 3] - start[:3, 3])
-    return rigid(turns(share).as_matrix(), start[:3, 3] + way)
+    shift = np.asarray(share)[..., None] * (end[:3, 3] - start[:3, 3])
+    return rigid(turns(share).as_matrix(), start[:3, 3] + shift)
 
 
 @dataclass(frozen=True)
 class ManipulatorState:
-    """What of a hand changes: how deep it presses [mm], how it is turned (3,) [degrees], where it aims (4, 4), home where None."""
+    """State of the manipulator: depths [mm], turn (3,) [degrees], and the pose aimed at (4, 4), None for home."""
 
     depth_mm: float = 0.0
     pressed_mm: float = 0.0
@@ -128,11 +128,10 @@ class ManipulatorState:
 
 @dataclass
 class ProbeManipulator:
-    """What holds the transducer: where on the settled organ it aims, how it is turned, how deep it presses.
+    """Moves the transducer over the settled organ: aim, turn and depth.
 
-    ``vertices`` (n, 3), ``faces`` (m, 3) and ``normals`` (n, 3) are the settled surface [mm]; ``home`` is the pose it
-    starts from. ``radius_mm`` is that of a curved face. ``depth_mm`` is what keys push, ``pressed_mm`` what a held button
-    adds until it is let go.
+    ``vertices`` (n, 3), ``faces`` (m, 3) and ``normals`` (n, 3) are the settled surface [mm]; ``home`` is the initial pose.
+    ``radius_mm`` is that of a curved face. ``depth_mm`` is set by keys, ``pressed_mm`` is added while a button is held.
     """
 
     vertices: np.ndarray
@@ -148,15 +147,15 @@ class ProbeManipulator:
     aim: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        # The transducer's corners find their way between the vertices: edges and faces count too.
+        # The corners of the transducer may be between vertices: edges and faces are sampled too.
         corners = self.vertices[self.faces]
         middles = (corners + np.roll(corners, 1, axis=1)).reshape(-1, 3) / 2
         self.samples = np.concatenate([self.vertices, corners.mean(axis=1), middles])
-        self.most_mm = min(MOST_DEPTH_MM, MOST_LENGTHS * float(self.size_mm[2]))
+        self.max_mm = min(MAX_DEPTH_MM, MAX_DEPTH_LENGTHS * float(self.size_mm[2]))
 
     @property
     def state(self) -> ManipulatorState:
-        """How it holds the transducer now; set, it holds it so."""
+        """The current state; it can be set."""
         tilt, rock, rotate = map(float, self.turn_deg)
         return ManipulatorState(self.depth_mm, self.pressed_mm, (tilt, rock, rotate), self.aim)
 
@@ -165,39 +164,39 @@ class ProbeManipulator:
         self.depth_mm, self.pressed_mm = state.depth_mm, state.pressed_mm
         self.turn_deg, self.aim = np.array(state.turn_deg), state.aim
 
-    def take(self, pose: np.ndarray) -> None:
-        """Hold a transducer as it is at a pose (4, 4), as if pressed in by a button that is then let go."""
+    def match(self, pose: np.ndarray) -> None:
+        """Take over a transducer at a pose (4, 4), as if a button had pressed it in that is now released."""
         depth = indentation(pose, self.size_mm, self.samples, self.radius_mm)
-        pressed = float(np.clip(depth, 0.0, self.most_mm)) if np.isfinite(depth) else 0.0
+        pressed = float(np.clip(depth, 0.0, self.max_mm)) if np.isfinite(depth) else 0.0
         self.state = ManipulatorState(
             depth - pressed if np.isfinite(depth) else 0.0, pressed, aim=pose.copy()
         )
 
     def point(self, origin: np.ndarray, direction: np.ndarray) -> None:
-        """Aim where a ray [mm] first meets the settled organ, perpendicular to its surface; a miss changes nothing."""
-        place = self.met(origin, direction)
+        """Aim at the first intersection of a ray [mm] with the settled organ, perpendicular to its surface; ignore a miss."""
+        place = self.ray_hit(origin, direction)
         if place is not None:
             self.aim_at(place)
 
     def aim_at(self, target: np.ndarray, lateral: np.ndarray | None = None) -> None:
-        """Aim at a point of the surface [mm], perpendicular to the patch around it; x is nearest to ``lateral``."""
+        """Aim at a point of the surface [mm], perpendicular to the patch around it, x nearest to ``lateral``."""
         lateral = self.lateral if lateral is None else lateral
-        self.aim = pose_at(target, -self.outward(target), lateral, self.size_mm[2])
+        self.aim = pose_at(target, -self.surface_normal(target), lateral, self.size_mm[2])
 
-    def outward(self, place: np.ndarray) -> np.ndarray:
-        """Unit normal (3,) of the patch of surface around a place [mm]."""
-        distance = np.linalg.norm(self.vertices - place, axis=1)
+    def surface_normal(self, point: np.ndarray) -> np.ndarray:
+        """Return the unit normal (3,) of the surface patch around a point [mm]."""
+        distance = np.linalg.norm(self.vertices - point, axis=1)
         normal = np.exp(-((distance / NORMAL_PATCH_MM) ** 2)) @ self.normals
         return normal / np.linalg.norm(normal)
 
-    def met(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
-        """Where a ray [mm] first meets the settled organ (3,), None where it misses."""
-        # Not its first=True, which invents a hit where there is none.
+    def ray_hit(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
+        """Return the first intersection (3,) of a ray [mm] with the settled organ, None where it misses."""
+        # Not its first=True, which reports a hit where there is none.
         hits = igl.ray_mesh_intersect(np.array(origin), np.array(direction), self.vertices, self.faces)
         return np.array(origin) + hits[0][1] * np.array(direction) if hits else None
 
     def slide(self, lateral_mm: float, elevation_mm: float) -> None:
-        """Move the aim over the surface, along the turned transducer's own x and y."""
+        """Move the aim over the surface, along the turned transducer's x and y [mm]."""
         aim = self.home if self.aim is None else self.aim
         outward = aim[:3, 2]
         along = self._turned(aim)[:3, :2]
@@ -205,28 +204,28 @@ class ProbeManipulator:
         along /= np.linalg.norm(along, axis=0)
         wanted = _face_centre(aim, self.size_mm[2]) + along @ [lateral_mm, elevation_mm]
         _, _, nearest = igl.point_mesh_squared_distance(wanted[None], self.vertices, self.faces)
-        # With the hand's own lateral it would turn about where the surface looks along that, and come back.
+        # With the fixed lateral the probe would flip where the surface normal is along it.
         self.aim_at(nearest.reshape(3), aim[:3, 0])
 
     def push(self, depth_mm: float) -> None:
-        """Press in by a depth [mm], or lift where negative."""
-        self.depth_mm = float(np.clip(self.depth_mm + depth_mm, LEAST_DEPTH_MM, self.most_mm))
+        """Push in by a depth [mm]; lift where negative."""
+        self.depth_mm = float(np.clip(self.depth_mm + depth_mm, MIN_DEPTH_MM, self.max_mm))
 
-    def hold(self, pressing: bool, time_s: float, share: float = 1.0) -> None:
-        """Press further while the button is held, to a share of the deepest; let go when it is not."""
-        goal = share * self.most_mm if pressing else 0.0
+    def press(self, pressing: bool, time_s: float, share: float = 1.0) -> None:
+        """Press further while the button is held, up to a fraction of the greatest depth; release otherwise."""
+        goal = share * self.max_mm if pressing else 0.0
         least, most = self.pressed_mm - RELEASE_MM_S * time_s, self.pressed_mm + PRESS_MM_S * time_s
         self.pressed_mm = float(np.clip(goal, least, most))
 
     def turn(self, tilt_deg: float, rock_deg: float, rotate_deg: float) -> None:
-        """Turn about the transducer's x, y and z axes [degrees]; tilt and rock end where a hand's do."""
+        """Turn about the transducer's x, y and z axes [degrees]; tilt and rock are limited."""
         self.turn_deg = self.turn_deg + [tilt_deg, rock_deg, rotate_deg]
         self.turn_deg[:2] = np.clip(self.turn_deg[:2], -60.0, 60.0)
 
     def pose(self) -> np.ndarray:
-        """The pose that the hand wants now: turned about the face's centre, touching, then pressed in."""
+        """Return the commanded pose: turned about the face's centre, moved to contact, then pressed in."""
         pose = self._turned(self.home if self.aim is None else self.aim)
-        depth = min(self.depth_mm + self.pressed_mm, self.most_mm)
+        depth = min(self.depth_mm + self.pressed_mm, self.max_mm)
         return advanced(touching(pose, self.size_mm, self.samples, self.radius_mm), depth)
 
     def _turned(self, aim: np.ndarray) -> np.ndarray:

@@ -1,8 +1,8 @@
-"""A volume out of tracked pictures: freehand 3D ultrasound, a pixel-based method of Solberg et al. 2007.
+"""Volume reconstruction from tracked images: freehand 3D ultrasound, a pixel-based method of Solberg et al. 2007.
 
-1. Distribution: pixels go into a grid of voxels, each into its nearest, or into the eight around it.
-2. Hole filling, where a ball finds no room: so gaps between pictures close, and the region scanned does not
-   grow. They take the nearest voxel that was seen, or an interpolation between the pictures on both sides.
+1. Distribution: each pixel is added to the nearest voxel, or to the eight around it.
+2. Hole filling within the closing of the scanned region by a ball, which does not extend the region. Holes take the nearest
+   voxel with data, or an interpolation between the images on both sides.
 
 O. V. Solberg, F. Lindseth, H. Torp, R. E. Blake, T. A. Nagelhus Hernes, Freehand 3D ultrasound reconstruction
 algorithms - a review, Ultrasound in Medicine & Biology 33(7), 2007, doi 10.1016/j.ultrasmedbio.2007.02.015.
@@ -15,19 +15,18 @@ import numpy as np
 from scipy import ndimage
 
 METHODS = ("nearest", "smooth")
-# Making a volume of so many takes some 4 GB.
-MOST_VOXELS = 64_000_000
-# Standard deviation [voxels] of the Gaussian that rounds off the steps that single lines leave in gaps.
-ROUNDING_VOXELS = 1.0
+# A volume of this size takes some 4 GB.
+MAX_VOXELS = 64_000_000
+# Standard deviation [voxels] of the Gaussian that smooths interpolated holes.
+SMOOTHING_VOXELS = 1.0
 
 
 @dataclass(frozen=True)
 class VoxelBox:
     """Cubic voxels along the axes of the reference frame.
 
-    ``origin_mm`` (3,) is the centre of the first voxel, ``spacing_mm`` the way to the next, ``shape`` how
-    many along x, y and z. A voxel holds what is less than half a spacing from its centre along each axis.
-    Raises ValueError for a spacing that is not above 0, no voxels, or more than MOST_VOXELS.
+    ``origin_mm`` (3,) is the centre of the first voxel, ``spacing_mm`` the distance to the next, ``shape`` the counts
+    along x, y and z. Raises ValueError for a spacing that is not above 0, no voxels, or more than MAX_VOXELS.
     """
 
     origin_mm: np.ndarray
@@ -39,7 +38,7 @@ class VoxelBox:
 
     @classmethod
     def around(cls, corners_mm: np.ndarray, spacing_mm: float) -> "VoxelBox":
-        """The smallest box from the least of ``corners_mm`` (n, 3) whose voxels go as far as the greatest.
+        """Return the smallest box from the minimum of ``corners_mm`` (n, 3) that covers their maximum.
 
         Raises ValueError for corners that are none, not (n, 3) or not finite, and as the box itself does.
         """
@@ -60,7 +59,7 @@ class VoxelBox:
         return matrix
 
     def places(self) -> np.ndarray:
-        """Centres (x, y, z, 3) [mm] of all voxels."""
+        """Return the centres (x, y, z, 3) [mm] of all voxels."""
         return np.moveaxis(np.indices(self.shape), 0, -1) * self.spacing_mm + self.origin_mm
 
 
@@ -69,21 +68,21 @@ def _check(spacing_mm: float, counts: np.ndarray) -> None:
         raise ValueError(f"the spacing of voxels must be above 0 mm, not {spacing_mm:g}")
     if not (counts >= 1).all():
         raise ValueError(f"a box needs a voxel along each axis, not {counts}")
-    if math.prod(counts.tolist()) > MOST_VOXELS:
+    if math.prod(counts.tolist()) > MAX_VOXELS:
         raise ValueError(
-            f"{' x '.join(f'{n:g}' for n in counts)} voxels of {spacing_mm:g} mm are over {MOST_VOXELS:,}: "
+            f"{' x '.join(f'{n:g}' for n in counts)} voxels of {spacing_mm:g} mm are over {MAX_VOXELS:,}: "
             "take larger voxels or a smaller region"
         )
 
 
 class Reconstruction:
-    """Pictures gathered in a box of voxels. The same pictures in the same order give the same bits.
+    """Images accumulated in a box of voxels. The same images in the same order give the same bits.
 
-    - "nearest": pixel nearest neighbour (Solberg et al. 2007). A voxel is the mean of the pixels in it; a gap
-      takes the nearest voxel that was seen.
-    - "smooth": a pixel is shared out among the eight voxels around it by trilinear weights (PLUS's LINEAR).
-      Gaps are interpolated along lines by distance (``_along_sticks``), and then smoothed by normalised
-      convolution (Knutsson & Westin 1993, doi 10.1109/CVPR.1993.341081). What was seen stays as it was.
+    - "nearest": pixel nearest neighbour (Solberg et al. 2007). A voxel is the mean of its pixels; a hole takes the nearest
+      voxel with data.
+    - "smooth": a pixel is distributed to the eight voxels around it by trilinear weights (PLUS's LINEAR). Holes are
+      interpolated along sticks (``_along_sticks``) and smoothed by normalised convolution (Knutsson & Westin 1993,
+      doi 10.1109/CVPR.1993.341081). Voxels with data are not changed.
 
     Raises ValueError for another ``method``.
     """
@@ -92,7 +91,7 @@ class Reconstruction:
         if method not in METHODS:
             raise ValueError(f"method {method!r} is none of {', '.join(METHODS)}")
         self.box, self.method = box, method
-        # One voxel more on each side: what is shared out beyond the box has a place, and needs no test.
+        # One voxel more on each side, for weights that fall outside the box.
         self._shape = np.array(box.shape) + 2
         self._sum, self._weight = np.zeros(self._shape.prod()), np.zeros(self._shape.prod())
         self._seen = np.zeros(self._shape.prod(), bool)
@@ -100,14 +99,13 @@ class Reconstruction:
     def add(
         self, image: np.ndarray, reference_from_image: np.ndarray, mask: np.ndarray | None = None
     ) -> None:
-        """Take in a picture (rows, columns) of any numbers, where ``mask`` (rows, columns) says so.
+        """Add an image (rows, columns) of any numbers, where ``mask`` (rows, columns) is true.
 
-        ``reference_from_image`` (4, 4) takes (column, row, 0, 1), counted from the first pixel's centre, to
-        the reference frame [mm]; what falls outside the box is left out. Raises ValueError for shapes that
-        do not fit and a matrix that is not finite.
+        ``reference_from_image`` (4, 4) maps (column, row, 0, 1), counted from the first pixel's centre, to the reference
+        frame [mm]; pixels outside the box are ignored. Raises ValueError for shapes that do not fit and a matrix that is not finite.
         """
         if image.ndim != 2 or (mask is not None and mask.shape != image.shape):
-            raise ValueError("a picture must be (rows, columns), and its mask of the same shape")
+            raise ValueError("an image must be (rows, columns), and its mask of the same shape")
         if np.shape(reference_from_image) != (4, 4) or not np.isfinite(reference_from_image).all():
             raise ValueError("reference_from_image must be a finite matrix (4, 4)")
         matrix = self.box.index_from_mm @ reference_from_image
@@ -118,18 +116,18 @@ class Reconstruction:
         if mask is not None:
             chosen = np.asarray(mask, bool).ravel()
             values, at = values[chosen], np.compress(chosen, at, axis=1)
-        self._put(values, at)
+        self._distribute(values, at)
 
-    def add_points(self, values: np.ndarray, places_mm: np.ndarray) -> None:
-        """As ``add``, values (m,) at any places (m, 3) [mm]; what has no finite place is left out.
+    def add_points(self, values: np.ndarray, points_mm: np.ndarray) -> None:
+        """As ``add`` for values (m,) at points (m, 3) [mm]; points that are not finite are ignored.
 
         Raises ValueError where shapes do not fit.
         """
-        if values.ndim != 1 or places_mm.shape != (len(values), 3):
-            raise ValueError("points must be values (m,) at places (m, 3)")
-        self._put(values, (places_mm - self.box.origin_mm).T / self.box.spacing_mm)
+        if values.ndim != 1 or points_mm.shape != (len(values), 3):
+            raise ValueError("points must be values (m,) at positions (m, 3)")
+        self._distribute(values, (points_mm - self.box.origin_mm).T / self.box.spacing_mm)
 
-    def _put(self, values: np.ndarray, at: np.ndarray) -> None:
+    def _distribute(self, values: np.ndarray, at: np.ndarray) -> None:
         """Add values (m,) at voxel coordinates (3, m)."""
         inside = ((at >= -0.5) & (at < np.array(self.box.shape)[:, None] - 0.5)).all(axis=0)
         value, at = values[inside].astype(float), np.compress(inside, at, axis=1) + 1.0
@@ -154,10 +152,10 @@ class Reconstruction:
         return ((voxel[0] * self._shape[1] + voxel[1]) * self._shape[2] + voxel[2]).astype(np.intp)
 
     def volume(self, reach_mm: float) -> tuple[np.ndarray, np.ndarray]:
-        """Values (x, y, z) float32 and where there are any, (x, y, z) bool: seen, or in a gap.
+        """Return values (x, y, z) float32 and the mask (x, y, z) of voxels with data or in a hole.
 
-        The region is the closing, by a ball of ``reach_mm``, of the voxels that a pixel fell in: gaps up to
-        twice as wide are filled. Elsewhere values are 0. Raises ValueError for a reach below 0 or not finite.
+        The mask is the closing, by a ball of ``reach_mm``, of the voxels with data: holes up to twice as wide are filled.
+        Elsewhere values are 0. Raises ValueError for a reach below 0 or not finite.
         """
         if not (math.isfinite(reach_mm) and reach_mm >= 0):
             raise ValueError(f"reach_mm must be 0 or more, not {reach_mm:g}")
@@ -175,13 +173,13 @@ class Reconstruction:
 
 
 def _filled(values: np.ndarray, seen: np.ndarray, reach: float, method: str) -> tuple[np.ndarray, np.ndarray]:
-    """Values (x, y, z) with gaps filled, and the closing of ``seen`` (x, y, z) by ``reach`` voxels."""
-    # The ball must find room outside, else the border would count as seen.
+    """Return values (x, y, z) with holes filled, and the closing of ``seen`` (x, y, z) by ``reach`` voxels."""
+    # Padding: without it the closing would include the border.
     margin = int(reach) + 2
     inner = (slice(margin, -margin),) * 3
     values, seen = np.pad(values, margin), np.pad(seen, margin)
     nearest = _nearest(seen)
-    # Division by the spacing leaves a reach of whole voxels a little off them.
+    # A reach of whole voxels is off them by rounding.
     within = (reach + 1e-6) ** 2
     grown = _squared_distance(nearest) <= within
     closed = _squared_distance(_nearest(~grown)) > within
@@ -194,12 +192,12 @@ def _filled(values: np.ndarray, seen: np.ndarray, reach: float, method: str) -> 
 
 
 def _nearest(true: np.ndarray) -> np.ndarray:
-    """For each voxel the indices (3, x, y, z) of the nearest one where ``true`` is."""
+    """Return for each voxel the indices (3, x, y, z) of the nearest one where ``true``."""
     return ndimage.distance_transform_edt(~true, return_distances=False, return_indices=True)
 
 
 def _squared_distance(nearest: np.ndarray) -> np.ndarray:
-    """How far [voxels], squared, each voxel is from its ``nearest`` (3, x, y, z)."""
+    """Return the squared distance [voxels] of each voxel from its ``nearest`` (3, x, y, z)."""
     own: tuple[np.ndarray, ...] = np.indices(nearest.shape[1:], np.int32, sparse=True)
     x, y, z = (there - here for there, here in zip(nearest, own, strict=True))
     return x * x + y * y + z * z
@@ -208,8 +206,8 @@ def _squared_distance(nearest: np.ndarray) -> np.ndarray:
 def _fill_smoothly(
     values: np.ndarray, seen: np.ndarray, gaps: np.ndarray, nearest: np.ndarray, longest: int
 ) -> None:
-    """Fill ``gaps`` of ``values``, both (x, y, z), in place."""
-    # Slice by slice, so that it needs little memory. Sticks end at what was seen, never at what is filled.
+    """Fill the holes ``gaps`` of ``values``, both (x, y, z), in place."""
+    # Slice by slice, to save memory. Sticks end at voxels with data, never at filled ones.
     for x in np.flatnonzero(gaps.any(axis=(1, 2))):
         y, z = np.nonzero(gaps[x])
         gap = np.stack([np.full(len(y), x), y, z])
@@ -220,17 +218,17 @@ def _fill_smoothly(
 
 
 def _gaussian(values: np.ndarray) -> np.ndarray:
-    return ndimage.gaussian_filter(values, ROUNDING_VOXELS, mode="constant", truncate=3.0)
+    return ndimage.gaussian_filter(values, SMOOTHING_VOXELS, mode="constant", truncate=3.0)
 
 
 def _along_sticks(
     values: np.ndarray, seen: np.ndarray, gap: np.ndarray, near: np.ndarray, longest: int
 ) -> np.ndarray:
-    """Values (m,) at voxels ``gap`` (3, m): between the nearest seen, ``near`` (3, m), and the first beyond.
+    """Return values (m,) at voxels ``gap`` (3, m): between the nearest voxel with data, ``near`` (3, m), and the first beyond.
 
     Weighted by distance, as in Vaughan, Lasso, Ungi, Fichtinger, Hole filling with oriented sticks in
     ultrasound volume reconstruction, J Med Imaging 2(3), 2015, doi 10.1117/1.JMI.2.3.034002; the stick points
-    to the nearest seen voxel instead of the best of 13 ways. With none within ``longest``: the nearest's.
+    to the nearest voxel with data instead of the best of 13 directions. With none within ``longest``: the nearest's value.
     """
     distance = np.linalg.norm(gap - near, axis=0)
     direction = (gap - near) / distance
@@ -239,7 +237,7 @@ def _along_sticks(
     searching = np.arange(gap.shape[1])
     for step in range(1, longest + 1):
         beyond = np.rint(gap[:, searching] + step * direction[:, searching]).astype(np.intp)
-        # The margin, where nothing was seen, stands for what is farther.
+        # The margin has no data; it stands for what is farther.
         beyond = np.clip(beyond, 0, np.array(seen.shape)[:, None] - 1)
         hit = seen[tuple(beyond)]
         met = searching[hit]

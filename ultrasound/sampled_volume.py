@@ -22,7 +22,7 @@ class SampledVolume:
     """
 
     def __init__(self, voxels: np.ndarray, index_from_mm: np.ndarray, outside: float = AIR_HU) -> None:
-        # Between the last voxel and the next there is no weight, but the next must be there.
+        # Interpolation reads one voxel beyond the last, with weight 0.
         thin = [(0, 1 if n == 1 else 0) for n in voxels.shape[:3]]
         filled = np.pad(np.asarray(voxels, np.float32), thin + [(0, 0)] * (voxels.ndim - 3), mode="edge")
         self.shape, self.count = voxels.shape[:3], filled.shape[:3]
@@ -34,8 +34,8 @@ class SampledVolume:
         self.offset = ti.Vector(index_from_mm[:3, 3].tolist())
 
     @ti.func
-    def place(self, p):
-        """Where p [mm] lies: the first of the eight voxels around it, the way on to the next ones (0 to 1), whether inside."""
+    def cell_at(self, p):
+        """Return the first of the eight voxels around p [mm], the offsets to the next ones (0 to 1), and whether p is inside."""
         at = self.linear @ p + self.offset
         last = tm.vec3(self.shape[0] - 1, self.shape[1] - 1, self.shape[2] - 1)
         inside = (at >= -0.5).all() and (at <= last + 0.5).all()
@@ -46,8 +46,8 @@ class SampledVolume:
 
     @ti.func
     def sample(self, p):
-        """Trilinear value at p [mm]."""
-        first, t, inside = self.place(p)
+        """Return the trilinear value at p [mm]."""
+        first, t, inside = self.cell_at(p)
         value = self.voxels[0] * 0.0 + self.outside
         if inside:
             x, y = ti.static(self.strides)
@@ -58,7 +58,7 @@ class SampledVolume:
 
     @ti.func
     def sample_lanes(self, x, y, z, in_line):
-        """Trilinear values at LANES places [mm], one a lane; ``in_line`` says that they are evenly spaced on a line."""
+        """Return trilinear values at LANES points [mm]; ``in_line``: they are evenly spaced on a line."""
         a, o = self.linear, self.offset
         first_i, along_i, off_i = self.lanes_along(0, a[0, 0] * x + a[0, 1] * y + a[0, 2] * z + o[0])
         first_j, along_j, off_j = self.lanes_along(1, a[1, 0] * x + a[1, 1] * y + a[1, 2] * z + o[1])
@@ -66,7 +66,7 @@ class SampledVolume:
         first = first_i * self.strides[0] + first_j * self.strides[1] + first_k
         low, high = Lanes(0.0), Lanes(0.0)
         if in_line and first[0] == first[LANES - 1]:
-            # A picture has many pixels a voxel: both ends of a line between the same eight, all of it is.
+            # An image has many pixels per voxel: where both ends are in one cell, all points between are.
             low = self.between(first[0], 0, along_j, along_k)
             high = self.between(first[0], self.strides[0], along_j, along_k)
         else:
@@ -78,14 +78,14 @@ class SampledVolume:
 
     @ti.func
     def lanes_along(self, axis: ti.template(), at):
-        """Along one axis: the voxels before places (in voxels), the way on to the next, how far outside the voxels' centres."""
+        """Along one axis: the voxels before the points [voxels], the offsets to the next, the distances outside."""
         clamped = ti.min(ti.max(at, 0.0), float(self.shape[axis] - 1))
         base = ti.min(ti.cast(clamped, ti.i32), self.count[axis] - 2)
         return base, clamped - base, ti.abs(at - clamped)
 
     @ti.func
     def between(self, voxel, shift: ti.template(), tj, tk):
-        """Values at lanes between the four voxels of a plane, the first of which is ``shift`` on."""
+        """Return values at lanes between the four voxels of a plane, the first of which is ``shift`` further."""
         v, y = ti.static(self.voxels, shift + self.strides[1])
         low = v[voxel + shift] + tk * (v[voxel + shift + 1] - v[voxel + shift])
         high = v[voxel + y] + tk * (v[voxel + y + 1] - v[voxel + y])
@@ -93,7 +93,7 @@ class SampledVolume:
 
     @ti.func
     def lanes_between(self, first, shift: ti.template(), tj, tk):
-        """As ``between``, each lane with voxels of its own."""
+        """As ``between``, each lane with its own voxels."""
         y = ti.static(shift + self.strides[1])
         a, b = self.lanes_of(first, shift), self.lanes_of(first, shift + 1)
         c, d = self.lanes_of(first, y), self.lanes_of(first, y + 1)
@@ -102,18 +102,18 @@ class SampledVolume:
 
     @ti.func
     def lanes_of(self, first, shift: ti.template()):
-        """The voxels ``shift`` after those of the lanes."""
+        """Return the voxels ``shift`` after those of the lanes."""
         return Lanes([self.voxels[first[lane] + shift] for lane in ti.static(range(LANES))])
 
     @ti.func
     def along_z(self, voxel, t):
-        """Linear between a voxel and the next."""
+        """Interpolate between a voxel and the next along z."""
         return tm.mix(self.voxels[voxel], self.voxels[voxel + 1], t)
 
     @ti.func
     def slope(self, p):
-        """Gradient [1/mm] of the trilinear first value at p [mm]; zero outside."""
-        first, t, inside = self.place(p)
+        """Return the gradient [1/mm] of the first trilinear value at p [mm]; zero outside."""
+        first, t, inside = self.cell_at(p)
         along = tm.vec3(0.0)
         if inside:
             x, y = ti.static(self.strides)
@@ -132,7 +132,7 @@ class SampledVolume:
 def distance_volume(
     surface: trimesh.Trimesh, spacing_mm: float = 2.0, reach_mm: float = 6.0
 ) -> SampledVolume:
-    """Signed distances [mm] to a closed surface, negative inside, as far as ``reach_mm`` around it (``distance_grid``); FAR_MM beyond."""
+    """Return signed distances [mm] to a closed surface, negative inside, up to ``reach_mm`` around it; FAR_MM beyond."""
     distance, low = distance_grid(surface.vertices, surface.faces, spacing_mm, reach_mm)
     index_from_mm = np.eye(4)
     index_from_mm[:3] /= spacing_mm

@@ -1,4 +1,4 @@
-"""What comes back along one line of the array: sound sent through the deformed tissue, reflected and scattered on its way."""
+"""The echo signal of each scanline: a pulse travels through the deformed tissue, is attenuated, reflected and scattered."""
 
 import taichi as ti
 import taichi.math as tm
@@ -7,73 +7,81 @@ from ultrasound.image_plane import PlaneInTissue
 from ultrasound.sampled_volume import SampledVolume
 from ultrasound.speckle import Speckle
 
-# The planes that a thick one is made of: how far off in standard deviations, the weight in a mean, and in a sum of noise that
-# keeps its mean square.
-MIDDLE = ((0.0, 1.0, 1.0),)
-THICK = tuple((off, weight / 2.0, weight / 1.5**0.5) for off, weight in ((0.0, 1.0), (-1.2, 0.5), (1.2, 0.5)))
-# What changes less from look to look is no interface.
-LEAST_REFLECTION = 3e-4
-# dB of a natural logarithm of amplitude.
+# Parallel planes that sample the slice thickness: offset in standard deviations, weight in a mean, and weight in a sum of noise
+# that preserves its mean square.
+CENTRAL_PLANE = ((0.0, 1.0, 1.0),)
+THICK_PLANE = tuple(
+    (offset, weight / 2.0, weight / 1.5**0.5) for offset, weight in ((0.0, 1.0), (-1.2, 0.5), (1.2, 0.5))
+)
+# A smaller relative change of impedance between two samples is no interface.
+MIN_REFLECTION = 3e-4
+# Decibels per neper of amplitude.
 DB = 8.685889638065037
 
 
 @ti.dataclass
 class Interface:
-    """A step of impedance, which a CT blurs over some looks into the tissue.
+    """A step of impedance that the CT blurs over several tissue samples.
 
-    ``steps`` adds up what it reflects, ``middle`` and ``squarely`` its depth [mm] and how squarely it is met, each times that;
-    ``thick`` is its width [mm]. ``before`` is the tissue before it, from ``begins`` [mm] on, where the sound was ``loud``.
+    ``steps`` is the sum of the reflections; ``middle`` and ``incidence`` are depth [mm] and incidence factor, weighted by them;
+    ``thickness`` is in mm. ``before`` is the tissue in front of it, from depth ``begins`` [mm], where the pulse has ``amplitude``.
     """
 
     steps: ti.f32
     middle: ti.f32
-    squarely: ti.f32
-    thick: ti.f32
+    incidence: ti.f32
+    thickness: ti.f32
     before: tm.vec3
     begins: ti.f32
-    loud: ti.f32
+    amplitude: ti.f32
 
     @ti.func
-    def begin(self, tissue, depth_mm, loud):
-        """Nothing yet, after some tissue."""
-        self.steps, self.middle, self.squarely, self.thick = 0.0, 0.0, 0.0, 0.0
-        self.before, self.begins, self.loud = tissue, depth_mm, loud
+    def begin(self, tissue, depth_mm, amplitude):
+        """Reset to no reflection, behind the given tissue."""
+        self.steps, self.middle, self.incidence, self.thickness = 0.0, 0.0, 0.0, 0.0
+        self.before, self.begins, self.amplitude = tissue, depth_mm, amplitude
 
     @ti.func
-    def add(self, step, depth_mm, square, way_mm):
-        """One more step, met so squarely (root of the cosine) on a way through it."""
+    def add(self, step, depth_mm, incidence, path_mm):
+        """Add one step of impedance over a part of the path."""
         self.steps += step
         self.middle += step * depth_mm
-        self.squarely += step * square
-        # Across the interface, however aslant the beam goes through it.
-        self.thick += square * square * way_mm
+        self.incidence += step * incidence
+        # Thickness along the normal, not along the beam.
+        self.thickness += incidence * incidence * path_mm
 
     @ti.func
-    def ends(self, step, most_mm):
-        """Whether what comes next is no longer of it."""
-        other = step * self.steps <= 0.0 or ti.abs(step) < LEAST_REFLECTION or self.thick > most_mm
+    def ends(self, step, max_mm):
+        """Whether the next step no longer belongs to this interface."""
+        other = step * self.steps <= 0.0 or ti.abs(step) < MIN_REFLECTION or self.thickness > max_mm
         return self.steps != 0.0 and other
 
     @ti.func
     def reflection(self, after):
-        """Share of the amplitude that it turns back, signed, between what was before it and what is after it [MRayl]."""
+        """Reflection coefficient of amplitude between the impedance before it and the one after it [MRayl]."""
         return (after - self.before.x) / (after + self.before.x)
 
     @ti.func
     def depth_mm(self):
-        """Its middle."""
+        """Depth of its centre."""
         return self.middle / self.steps
 
     @ti.func
-    def loudness(self, after, frequency_mhz):
-        """Amplitude of its echo: one step at its middle, with the tissue before it up to there."""
-        way_db = 2.0 * self.before.y * frequency_mhz * (self.depth_mm() - self.begins) / 10.0
-        return ti.abs(self.reflection(after)) * self.loud * ti.exp(-way_db / DB) * self.squarely / self.steps
+    def echo(self, after, frequency_mhz):
+        """Amplitude of its echo, as one step at its centre; the tissue before it attenuates up to there."""
+        path_db = 2.0 * self.before.y * frequency_mhz * (self.depth_mm() - self.begins) / 10.0
+        return (
+            ti.abs(self.reflection(after))
+            * self.amplitude
+            * ti.exp(-path_db / DB)
+            * self.incidence
+            / self.steps
+        )
 
 
 @ti.dataclass
-class Look:
-    """Impedance, attenuation and backscatter at a place, where its tissue was at rest [mm], and the map from the plane there."""
+class TissueSample:
+    """Impedance, attenuation and backscatter; the rest position [mm]; the map (3, 4) from the image plane to it."""
 
     tissue: tm.vec3
     rest: tm.vec3
@@ -81,14 +89,14 @@ class Look:
 
 
 @ti.func
-def known(impedance, other):
-    """An impedance, or where there is none another."""
+def impedance_or(impedance, other):
+    """The impedance, or the other where it is not known."""
     return ti.select(impedance < 1e-6, other, impedance)
 
 
 @ti.data_oriented
-class Beams:
-    """Echoes (lines, samples), ``real`` and ``imaginary``, of every line; arguments as ``BMode``."""
+class Scanlines:
+    """Echo signals (scanlines, samples), ``real`` and ``imaginary``, of all scanlines; arguments as for ``BMode``."""
 
     def __init__(
         self,
@@ -102,40 +110,40 @@ class Beams:
         around: float | None,
     ) -> None:
         self.tissue, self.organ, self.plane = tissue, organ, plane
-        # An interface is blurred in a CT by about a voxel to each side.
+        # A CT blurs an interface by about a voxel to each side.
         self.interface_mm = 5.0 * voxel_mm
         self.by_organ, self.gap_mm = contact == "organ", contact_gap_mm
         self.organ_alone, self.around = around is not None, around or 0.0
         self.speckle = Speckle()
-        self.lines, self.samples = shape
-        self.start, self.direction, self.element = (ti.Vector.field(2, ti.f32, self.lines) for _ in range(3))
-        self.touching = ti.field(ti.i32, self.lines + 1)
+        self.count, self.samples = shape
+        self.start, self.direction, self.element = (ti.Vector.field(2, ti.f32, self.count) for _ in range(3))
+        self.contacts_before = ti.field(ti.i32, self.count + 1)
         self.real, self.imaginary = (ti.field(ti.f32, shape) for _ in range(2))
-        # What the point-spread function makes of speckle of unit mean square, by sample.
-        self.loudness = ti.field(ti.f32, self.samples)
+        # Factor by sample that restores unit mean square of speckle after the point-spread function.
+        self.speckle_gain = ti.field(ti.f32, self.samples)
 
     @ti.kernel
-    def touch(self, pixel_mm: tm.vec2, first_mm: tm.vec2):
-        """Elements that touch, counted from the first on: ``touching[i]`` of those before i."""
+    def find_contact(self, pixel_mm: tm.vec2, first_mm: tm.vec2):
+        """Count the array elements in contact: ``contacts_before[i]`` is the number among the elements before i."""
         ti.loop_config(serialize=True)
-        for i in range(self.lines):
+        for i in range(self.count):
             place = self.element[i]
             if ti.static(not self.by_organ):
                 place.y += 0.5 * self.gap_mm
             row, column = self.plane.pixel_near(place, pixel_mm, first_mm)
-            rest = self.plane.map_of(row, column) @ tm.vec4(place, 0.0, 1.0)
+            rest = self.plane.rest_from_plane(row, column) @ tm.vec4(place, 0.0, 1.0)
             near = 0
             if ti.static(self.by_organ):
                 near = self.plane.is_tissue(row, column) and self.organ.sample(rest) <= self.gap_mm
             else:
                 near = self.tissue.sample(rest)[0] > 1.0
-            self.touching[i + 1] = self.touching[i] + near
+            self.contacts_before[i + 1] = self.contacts_before[i] + near
 
     @ti.func
-    def look(self, planes: ti.template(), place, pixel_mm, first_mm, elevation_sd: ti.f32):
-        """What is at a place (u, v) of the plane."""
+    def sample_tissue(self, planes: ti.template(), place, pixel_mm, first_mm, elevation_sd: ti.f32):
+        """The TissueSample at (u, v) of the image plane [mm]."""
         row, column = self.plane.pixel_near(place, pixel_mm, first_mm)
-        linear = self.plane.map_of(row, column)
+        linear = self.plane.rest_from_plane(row, column)
         rest = linear @ tm.vec4(place, 0.0, 1.0)
         found = tm.vec3(0.0)
         for off, weight, _ in ti.static(planes):
@@ -143,10 +151,10 @@ class Beams:
         if ti.static(self.organ_alone):
             if not (self.plane.is_tissue(row, column) and self.organ.sample(rest) <= 0.0):
                 found = tm.vec3(self.around, 0.0, 0.0)
-        return Look(found, rest, linear)  # type: ignore[call-arg]
+        return TissueSample(found, rest, linear)  # type: ignore[call-arg]
 
     @ti.kernel
-    def send(
+    def simulate(
         self,
         detail_level: ti.template(),
         stride: ti.template(),
@@ -158,52 +166,50 @@ class Beams:
         axial_sd: float,
         elevation_sd: float,
     ):
-        """Send sound along every line and write what comes back, a detail_level (its index) up the ladder; ``touch`` comes before.
+        """Write the echo signal of every scanline, at a detail level (its index); needs ``find_contact`` before.
 
-        The tissue is looked at every ``stride`` samples. A line uses ``aperture`` elements a mm of depth to each side.
+        The tissue is sampled every ``stride`` samples. ``aperture`` is in elements to each side, per mm of depth.
         """
-        planes = ti.static(THICK if detail_level == 2 else MIDDLE)
+        planes = ti.static(THICK_PLANE if detail_level == 2 else CENTRAL_PLANE)
         stride_mm = stride * sample_mm
-        for line in range(self.lines):
+        for line in range(self.count):
             start, direction = self.start[line], self.direction[line]
             for i in range(self.samples):
                 self.real[line, i] = 0.0
-            near = self.look(planes, start, pixel_mm, first_mm, elevation_sd)
-            loss_db, passed, loud = 0.0, 1.0, 1.0
+            near = self.sample_tissue(planes, start, pixel_mm, first_mm, elevation_sd)
+            loss_db, transmitted, amplitude = 0.0, 1.0, 1.0
             interface = Interface()
-            interface.begin(near.tissue, 0.0, loud)
+            interface.begin(near.tissue, 0.0, amplitude)
             for k in range(self.samples // stride):
                 depth = k * stride_mm
                 place = start + (depth + stride_mm) * direction
-                far = self.look(planes, place, pixel_mm, first_mm, elevation_sd)
+                far = self.sample_tissue(planes, place, pixel_mm, first_mm, elevation_sd)
                 # Beyond the CT nothing is known: nothing scatters, nothing reflects.
-                far.tissue.x = known(far.tissue.x, near.tissue.x)
-                near.tissue.x = known(near.tissue.x, far.tissue.x)
+                far.tissue.x = impedance_or(far.tissue.x, near.tissue.x)
+                near.tissue.x = impedance_or(near.tissue.x, far.tissue.x)
                 before, after = near.tissue, far.tissue
                 step = (after.x - before.x) / ti.max(after.x + before.x, 1e-6)
                 if interface.ends(step, self.interface_mm):
                     at = interface.depth_mm()
-                    echo = interface.loudness(before.x, frequency_mhz) * self.heard(line, at, aperture)
-                    self.reflect(detail_level, line, at, echo, sample_mm, axial_sd)
-                    passed *= 1.0 - interface.reflection(before.x) ** 2
-                    interface.begin(before, depth, loud)
+                    echo = interface.echo(before.x, frequency_mhz) * self.contact_fraction(line, at, aperture)
+                    self.add_reflection(detail_level, line, at, echo, sample_mm, axial_sd)
+                    transmitted *= 1.0 - interface.reflection(before.x) ** 2
+                    interface.begin(before, depth, amplitude)
                 if interface.steps == 0.0:
-                    interface.begin(before, depth, loud)
-                if ti.abs(step) >= LEAST_REFLECTION:
-                    square = self.squareness(0.5 * (near.rest + far.rest), far.linear, direction)
-                    interface.add(step, depth + 0.5 * stride_mm, square, stride_mm)
-                # There and back, over the stride in cm.
+                    interface.begin(before, depth, amplitude)
+                if ti.abs(step) >= MIN_REFLECTION:
+                    incidence = self.incidence_factor(0.5 * (near.rest + far.rest), far.linear, direction)
+                    interface.add(step, depth + 0.5 * stride_mm, incidence, stride_mm)
+                # Both directions, over the stride in cm.
                 loss_db += (before.y + after.y) * frequency_mhz * stride_mm / 10.0
-                loud_far = passed * ti.exp(-loss_db / DB)
-                heard = self.heard(line, depth + 0.5 * stride_mm, aperture)
-                loudness = tm.vec3(loud, loud_far, heard)
-                self.scatter_between(
-                    detail_level, stride, line, k, near, far, loudness, axial_sd, elevation_sd
-                )
-                near, loud = far, loud_far
+                amplitude_far = transmitted * ti.exp(-loss_db / DB)
+                contact = self.contact_fraction(line, depth + 0.5 * stride_mm, aperture)
+                levels = tm.vec3(amplitude, amplitude_far, contact)
+                self.add_scatter(detail_level, stride, line, k, near, far, levels, axial_sd, elevation_sd)
+                near, amplitude = far, amplitude_far
 
     @ti.func
-    def scatter_between(
+    def add_scatter(
         self,
         detail_level: ti.template(),
         stride: ti.template(),
@@ -211,54 +217,54 @@ class Beams:
         k,
         near,
         far,
-        loudness,
+        levels,
         axial_sd,
         elevation_sd,
     ):
-        """Write the samples of stride ``k``: what scatters there, ``loudness`` the sound at its ends and the share of it that is heard."""
+        """Write the scattered signal of stride ``k``; ``levels`` are the amplitude at its two ends and the contact fraction."""
         for j in range(stride):
             t = (j + 0.5) / stride
             rest, across = tm.mix(near.rest, far.rest, t), tm.mix(near.linear[:, 2], far.linear[:, 2], t)
             echo = self.scatter(detail_level, rest, across, axial_sd, elevation_sd)
-            echo *= loudness.z * tm.mix(loudness.x, loudness.y, t) * tm.mix(near.tissue.z, far.tissue.z, t)
+            echo *= levels.z * tm.mix(levels.x, levels.y, t) * tm.mix(near.tissue.z, far.tissue.z, t)
             self.real[line, stride * k + j] = self.real[line, stride * k + j] + echo.x
             self.imaginary[line, stride * k + j] = echo.y
 
     @ti.func
     def scatter(self, detail_level: ti.template(), rest, across, axial_sd, elevation_sd):
-        """Echo (2,) of scatterers at a place at rest [mm], of unit mean square; without speckle the root of that."""
+        """Speckle (2,) at a rest position [mm], of unit mean square; the constant 1 at the level without speckle."""
         echo = tm.vec2(ti.static(1.0 if detail_level == 0 else 0.0), 0.0)
-        for off, _, weight in ti.static(((), MIDDLE, THICK)[detail_level]):
+        for off, _, weight in ti.static(((), CENTRAL_PLANE, THICK_PLANE)[detail_level]):
             echo += weight * self.speckle.at(rest + (off * elevation_sd) * across, axial_sd)
         return echo
 
     @ti.func
-    def heard(self, line, depth_mm, aperture):
-        """Share of the elements that a line uses at a depth which touch tissue."""
-        half = ti.min(ti.cast(depth_mm * aperture, ti.i32), self.lines)
-        first, last = ti.max(line - half, 0), ti.min(line + half + 1, self.lines)
-        return (self.touching[last] - self.touching[first]) / ti.cast(last - first, ti.f32)
+    def contact_fraction(self, line, depth_mm, aperture):
+        """Fraction of the active aperture of a scanline at a depth that is in contact."""
+        half = ti.min(ti.cast(depth_mm * aperture, ti.i32), self.count)
+        first, last = ti.max(line - half, 0), ti.min(line + half + 1, self.count)
+        return (self.contacts_before[last] - self.contacts_before[first]) / ti.cast(last - first, ti.f32)
 
     @ti.func
-    def squareness(self, rest, linear, direction):
-        """Root of the cosine between beam and the normal of an interface: Lambert's law for the intensity (Wein 2008)."""
-        # The gradient at rest, carried into the deformed tissue by the inverse transpose of the deformation gradient.
+    def incidence_factor(self, rest, linear, direction):
+        """Root of the cosine between beam and interface normal: Lambert's law for the intensity (Wein 2008)."""
+        # The gradient at rest is carried into the deformed tissue by the inverse transpose of the deformation gradient.
         slope = linear[:, :3].transpose() @ self.tissue.slope(rest)
-        # An interface thinner than the way from look to look has no slope halfway: taken as square.
-        square, steep = 1.0, slope.norm()
+        # An interface thinner than the distance between samples has no gradient halfway: perpendicular incidence is assumed.
+        factor, steep = 1.0, slope.norm()
         if steep > 1e-9:
-            square = ti.sqrt(ti.abs(slope.x * direction.x + slope.y * direction.y) / steep)
-        return square
+            factor = ti.sqrt(ti.abs(slope.x * direction.x + slope.y * direction.y) / steep)
+        return factor
 
     @ti.func
-    def reflect(self, detail_level: ti.template(), line, depth_mm, loud, sample_mm, axial_sd):
-        """Add the echo of an interface to a line, as wide as the pulse; what makes speckle louder leaves it as it is."""
+    def add_reflection(self, detail_level: ti.template(), line, depth_mm, amplitude, sample_mm, axial_sd):
+        """Add the echo of an interface to a scanline, as wide as the pulse and not scaled by ``speckle_gain``."""
         at, reach = depth_mm / sample_mm - 0.5, ti.ceil(3.5 * axial_sd / sample_mm, ti.i32)
         first = ti.max(ti.floor(at, ti.i32) - reach, 0)
         last = ti.min(ti.floor(at, ti.i32) + reach + 1, self.samples - 1)
         for i in range(first, last + 1):
             off = (i - at) * sample_mm / axial_sd
-            echo = loud * ti.exp(-0.5 * off * off)
+            echo = amplitude * ti.exp(-0.5 * off * off)
             if ti.static(detail_level > 0):
-                echo /= self.loudness[i]
+                echo /= self.speckle_gain[i]
             self.real[line, i] = self.real[line, i] + echo

@@ -1,4 +1,4 @@
-"""The scanner: what a probe at a pose shows of tissue, as CT, as echo, or both on the same plane."""
+"""The scanner: CT slice and B-mode image on the same image plane of a probe."""
 
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -17,17 +17,17 @@ from ultrasound.image_plane import ImagePlane, PlaneInTissue
 from ultrasound.probe import DetailLevel, Mode, Probe
 from ultrasound.sampled_volume import SampledVolume, distance_volume
 
-# What is around the organ where the picture shows no CT there [MRayl].
-AROUND = {"background": None, "gel": 1.5, "air": 4e-4}
-CT, ECHO = "CT", "B-mode"
-SHOWN: dict[Mode, tuple[str, ...]] = {"ct": (CT,), "b-mode": (ECHO,), "both": (ECHO, CT)}
+# Impedance around the organ where the image does not show the CT there [MRayl].
+OUTSIDE_IMPEDANCE = {"background": None, "gel": 1.5, "air": 4e-4}
+CT, B_MODE = "CT", "B-mode"
+IMAGES_OF_MODE: dict[Mode, tuple[str, ...]] = {"ct": (CT,), "b-mode": (B_MODE,), "both": (B_MODE, CT)}
 
 
 @dataclass(frozen=True)
 class ScannedAnatomy:
-    """What is scanned, all in one frame [mm] in which it is at rest.
+    """The anatomy at rest, all in one coordinate system [mm].
 
-    ``hu`` (nx, ny, nz) and ``labels``, on the same grid, with ``index_from_mm`` (4, 4); ``tissues`` says which tissue a label is.
+    ``hu`` (nx, ny, nz) and ``labels`` on the same grid, with ``index_from_mm`` (4, 4); ``tissues`` are the tissues by label.
     """
 
     organ: trimesh.Trimesh
@@ -43,8 +43,8 @@ class ScannedAnatomy:
         return np.linalg.norm(np.linalg.inv(self.index_from_mm[:3, :3]), axis=0)
 
 
-def begin_echo(anatomy: ScannedAnatomy) -> Future[np.ndarray]:
-    """Begin with what an echo of an anatomy needs, on a thread of its own, while other things are made."""
+def start_acoustics(anatomy: ScannedAnatomy) -> Future[np.ndarray]:
+    """Start computing the acoustic properties that B-mode images need, on a thread of its own."""
     worker = ThreadPoolExecutor(1)
     values = worker.submit(properties, anatomy.hu, anatomy.labels, anatomy.tissues, anatomy.voxel_mm)
     worker.shutdown(wait=False)
@@ -52,10 +52,10 @@ def begin_echo(anatomy: ScannedAnatomy) -> Future[np.ndarray]:
 
 
 class Scanner:
-    """Pictures of ``pixels`` x ``pixels`` of an anatomy that an embedding carries along.
+    """Images of ``pixels`` x ``pixels`` of an anatomy that an embedding deforms.
 
-    ``outside`` (see ``CtSlice``), ``contact`` and ``contact_gap_mm`` (see ``BMode``) say what lies around the organ and what lets
-    sound in. What a mode needs is made when it is first asked for, but for an ``echo`` begun before. Raises TissueError.
+    ``outside`` see ``CtSlice``, ``contact`` and ``contact_gap_mm`` see ``BMode``. A mode is set up at its first image; ``acoustics``
+    are properties whose computation has already been started. Raises TissueError.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Scanner:
         outside: str = "background",
         contact: str = "organ",
         contact_gap_mm: float = 1.5,
-        echo: Future[np.ndarray] | None = None,
+        acoustics: Future[np.ndarray] | None = None,
     ) -> None:
         check_tissues(anatomy.tissues)
         self.anatomy = anatomy
@@ -75,18 +75,18 @@ class Scanner:
         self.probe = probe
         self.plane = PlaneInTissue(embedding, pixels)
         self.outside, self.contact, self.contact_gap_mm = outside, contact, contact_gap_mm
-        self._echo = echo
+        self._acoustics = acoustics
 
     @cached_property
     def slice(self) -> CtSlice:
-        """The CT's side of the scanner."""
+        """The CT slice on the plane."""
         ct = SampledVolume(self.anatomy.hu, self.anatomy.index_from_mm)
         return CtSlice(ct, self._organ, self.plane, self.outside)
 
     @cached_property
     def bmode(self) -> BMode:
-        """The echo's side of the scanner."""
-        values, self._echo = (self._echo or begin_echo(self.anatomy)).result(), None
+        """The B-mode image of the plane."""
+        values, self._acoustics = (self._acoustics or start_acoustics(self.anatomy)).result(), None
         tissue = SampledVolume(values, self.anatomy.index_from_mm, outside=0.0)
         return BMode(
             tissue,
@@ -96,12 +96,12 @@ class Scanner:
             float(self.anatomy.voxel_mm.mean()),
             self.contact,
             self.contact_gap_mm,
-            AROUND[self.outside],
+            OUTSIDE_IMPEDANCE[self.outside],
         )
 
     @cached_property
-    def marks(self) -> GroundTruthLabels:
-        """What the pictures show, in truth."""
+    def ground_truth(self) -> GroundTruthLabels:
+        """The ground-truth labels of the plane."""
         tumour = self.anatomy.tumour
         return GroundTruthLabels(
             self.plane, self._organ, None if tumour is None else distance_volume(tumour, 1.0)
@@ -111,12 +111,12 @@ class Scanner:
     def _organ(self) -> SampledVolume:
         return distance_volume(self.anatomy.organ)
 
-    def take(self, plane: ImagePlane) -> None:
-        """Find the tissue on a plane, of which there is no picture yet."""
+    def locate(self, plane: ImagePlane) -> None:
+        """Find the tissue on a plane, without an image."""
         self.embedding.update()
-        self.plane.take(plane)
+        self.plane.locate(plane)
 
-    def look(
+    def images(
         self,
         plane: ImagePlane,
         probe: Probe,
@@ -125,10 +125,10 @@ class Scanner:
         window_hu: float,
         level_hu: float,
     ) -> dict[str, np.ndarray]:
-        """Grey values (pixels, pixels) uint8 of what a mode shows of a plane, by name, the first the one that matters."""
-        self.take(plane)
-        show = {
+        """Return the images of a plane in a mode by name, grey values (pixels, pixels) uint8, the main one first."""
+        self.locate(plane)
+        render = {
             CT: lambda: self.slice.render(window_hu, level_hu),
-            ECHO: lambda: self.bmode.render(probe, detail_level),
+            B_MODE: lambda: self.bmode.render(probe, detail_level),
         }
-        return {name: show[name]() for name in SHOWN[mode]}
+        return {name: render[name]() for name in IMAGES_OF_MODE[mode]}

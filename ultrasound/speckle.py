@@ -1,8 +1,8 @@
-"""Speckle that lives in the tissue: scatterers as complex noise of the rest position, so that it travels and stretches with it.
+"""Speckle: scatterers as complex noise of the rest position, so that it moves and deforms with the tissue.
 
-Scatterers much smaller than the wavelength and many in a resolution cell give circular complex Gaussian echoes (Goodman 1975); what
-the pulse makes of white ones is noise of the pulse's own correlation. So the noise has the axial width of the point-spread
-function built in, and the carrier's phase, which no magnitude shows, is left out: samples 0.1 mm apart could not hold it.
+Many scatterers per resolution cell, much smaller than the wavelength, give circular complex Gaussian echoes (Goodman 1975), whose
+correlation is that of the pulse. So the noise has the axial width of the point-spread function built in. The phase of the carrier,
+which does not affect the magnitude, is left out: samples 0.1 mm apart would not resolve it.
 """
 
 import numpy as np
@@ -13,18 +13,19 @@ from sim.fields import field_of
 
 SIZE_BITS = 6
 SIZE = 1 << SIZE_BITS
-# Entries of the noise in one standard deviation of its correlation kernel.
+# Noise entries per standard deviation of the correlation kernel.
 PITCHES = 1.25
 SEED = 20130629
-OFF_ZERO = 0.37
-# Real and imaginary part share the two halves of a word, so that the block stays in a core's cache.
+# Many points are exactly on the planes through 0, where rounding would choose the cell: cells begin elsewhere.
+CELL_OFFSET = 0.37
+# Real and imaginary part share one 32-bit word, so that the block fits into the cache.
 UNIT = 1 / 4096
 
 
 def noise_block() -> np.ndarray:
-    """Periodic complex Gaussian noise (SIZE, SIZE, SIZE, 2) float32 of unit mean square, the same on every machine.
+    """Return periodic complex Gaussian noise (SIZE, SIZE, SIZE, 2) float32 of unit mean square, the same on every machine.
 
-    White noise convolved with a Gaussian of PITCHES entries SD: two places d entries apart correlate by exp(-d^2 / (4 PITCHES^2)).
+    White noise convolved with a Gaussian of PITCHES entries SD: entries at a distance d correlate by exp(-d^2 / (4 PITCHES^2)).
     """
     white = np.random.default_rng(SEED).standard_normal((2, SIZE, SIZE, SIZE))
     frequency = 2 * np.pi * np.fft.fftfreq(SIZE)
@@ -37,7 +38,7 @@ def noise_block() -> np.ndarray:
 
 @ti.data_oriented
 class Speckle:
-    """The noise block on the device. Each block of space holds it, shifted by a hash of the block, so that it nowhere repeats."""
+    """The noise block on the device. Each block of space holds it, shifted by a hash of the block, so that it does not repeat."""
 
     def __init__(self) -> None:
         real, imaginary = np.rint(noise_block().reshape(-1, 2).T / UNIT).astype(np.int32)
@@ -45,9 +46,8 @@ class Speckle:
 
     @ti.func
     def at(self, rest, sd_mm):
-        """Echo (2,), real and imaginary, of the scatterers at a place at rest [mm], correlated over ``sd_mm``."""
-        # Cells do not border on the planes through 0, where many places lie exactly and rounding would choose for them.
-        cell = ti.floor(rest * (PITCHES / sd_mm) + OFF_ZERO, ti.i32)
+        """Return the noise (2,), real and imaginary, at a rest position [mm], correlated over ``sd_mm``."""
+        cell = ti.floor(rest * (PITCHES / sd_mm) + CELL_OFFSET, ti.i32)
         block = cell >> SIZE_BITS
         key = (block.x * 73856093) ^ (block.y * 19349663) ^ (block.z * 83492791)
         key = (key ^ ((key >> 15) & 0x1FFFF)) * 0x2C1B3C6D

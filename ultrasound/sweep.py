@@ -1,7 +1,7 @@
-"""A tracked ultrasound sweep: pictures, and where probe and patient were at each of them (what an IGSIO sequence metafile holds).
+"""A tracked ultrasound sweep: images and tracked transforms, as in an IGSIO sequence metafile.
 
-A transform is named by what it takes to what, ``ImageToProbe``: a point (x, y, z, 1) of Image times it is the same point of Probe.
-Image is in pixels (column, row, 0) of orientation MF, every other system in mm.
+The transform ``ImageToProbe`` maps a point (x, y, z, 1) of Image to Probe. Image is in pixels (column, row, 0) of orientation MF,
+every other coordinate system in mm.
 """
 
 import re
@@ -17,18 +17,18 @@ import numpy as np
 
 from errors import UserError
 
-# As IGSIO has it: the To of a name is followed by what is no small letter, so ToolToTracker has one.
+# As in IGSIO: the To of a name is not followed by a small letter, so that ToolToTracker has only one.
 TRANSFORM_NAME = re.compile(r"(\w+?)To((?![a-z])\w+)")
 TRANSFORM_FIELD = re.compile(r"(\w+?To(?![a-z])\w+)Transform")
 CONFIGURATION_LIMIT = 1 << 22
-# What the column's index grows towards and what the row's does: (un)marked side, far or near. U with F, and M with N, make a
-# left-handed picture, whose own third axis IGSIO has descending; a third letter moves no pixel of a single slice.
+# Directions of increasing column and row: (un)marked side, far or near. U with F, and M with N, make a left-handed image, whose
+# third axis is descending in IGSIO; a third letter has no effect on a single slice.
 ORIENTATIONS = {each: each for each in ("MF", "MN", "UF", "UN", "FM", "NM", "FU", "NU")}
 ORIENTATIONS |= {f"{each}A": each for each in ORIENTATIONS} | {"UFD": "UF", "MND": "MN"}
 
 
-class Mark(IntEnum):
-    """Pixels of a sweep of marks, the truth beside a sweep of Nephron's. To what it is in, a bead adds its number times BEAD."""
+class PixelLabel(IntEnum):
+    """Ground-truth labels of pixels. A bead adds its number (from 1) times BEAD to the label around it."""
 
     OUTSIDE = 0
     ORGAN = 1
@@ -42,13 +42,13 @@ class SweepError(UserError):
 
 @dataclass
 class Sweep:
-    """Pictures and poses of one sweep (IGSIO sequence metafile).
+    """Images and transforms of one sweep.
 
-    ``images`` is uint8 (n, rows, columns) in orientation MF: columns grow to the marked side, rows away from the face; (n, 0, 0)
-    where there are poses alone. It may be read-only. ``frames`` are each frame's fields and ``fields`` the header's, as their
-    texts and in the file's order. ``constant`` are transforms (4, 4) that hold in all frames, by name (see ``load_constants``).
+    ``images`` is uint8 (n, rows, columns) in orientation MF: columns increase to the marked side, rows away from the face;
+    (n, 0, 0) for a sweep of poses only. It may be read-only. ``frames`` are the fields of each frame and ``fields`` those of the
+    header, as text, in the file's order. ``constant`` are transforms (4, 4) of all frames, by name (see ``load_constants``).
 
-    Raises SweepError where pictures and frames do not go together.
+    Raises SweepError where images and frames differ in number.
     """
 
     images: np.ndarray
@@ -67,22 +67,22 @@ class Sweep:
 
     @property
     def times_s(self) -> np.ndarray:
-        """Time of each frame (n,) [s]; SweepError where a timestamp is missing or no finite number."""
+        """Time of each frame (n,) [s]; SweepError where a timestamp is missing or not a finite number."""
         return np.array([self._time(frame) for frame in range(len(self))])
 
     def transform(self, start: str, end: str, frame: int) -> np.ndarray | None:
-        """Matrix (4, 4) from ``start`` to ``end``, as "Image" and "Reference", along the shortest chain of the frame's transforms.
+        """Return the matrix (4, 4) from ``start`` to ``end``, such as "Image" and "Reference", along the shortest chain of transforms.
 
-        None where the chain needs one that the tracker did not see, so whose status is not OK. Raises SweepError where no
-        chain joins the two, or where one of it is no affine matrix.
+        None where a transform of the chain was not tracked (status not OK). Raises SweepError where no chain joins the two, or
+        where one of its transforms is not an affine matrix.
         """
         fields = self.frames[frame]
         tracked = [match[1] for key in fields if (match := TRANSFORM_FIELD.fullmatch(key))]
         names = [*tracked, *(name for name in self.constant if name not in tracked)]
         chain = shortest_chain(names, start, end)
         if chain is None:
-            there = ", ".join(names) or "none"
-            raise SweepError(f"frame {frame}: no chain of transforms from {start} to {end}, of {there}")
+            known = ", ".join(names) or "none"
+            raise SweepError(f"frame {frame}: no chain of transforms from {start} to {end}, of {known}")
         matrix = np.eye(4)
         for name, inverted in chain:
             step = self._tracked(name, frame) if name in tracked else self.constant[name]
@@ -92,7 +92,7 @@ class Sweep:
         return matrix
 
     def is_image_ok(self, frame: int) -> bool:
-        """Whether there are pixels, and no status that says they are none."""
+        """Whether there are pixels and no status other than OK."""
         return self.images[frame].size > 0 and _is_ok(self.frames[frame].get("ImageStatus", "OK"))
 
     def _time(self, frame: int) -> float:
@@ -109,14 +109,14 @@ class Sweep:
 
     def _tracked(self, name: str, frame: int) -> np.ndarray | None:
         fields = self.frames[frame]
-        # What a tracker did not see still stands in the file, as a matrix that means nothing.
+        # A transform that was not tracked is in the file as a matrix without meaning.
         if not _is_ok(fields.get(f"{name}TransformStatus", "")):
             return None
         return matrix_of(fields[f"{name}Transform"], f"frame {frame}: {name}Transform")
 
 
 def shortest_chain(names: Iterable[str], start: str, end: str) -> list[tuple[str, bool]] | None:
-    """The transforms from ``start`` to ``end``, each with whether it is to be inverted; None where none join them."""
+    """Return the transforms from ``start`` to ``end``, each with whether to invert it; None where no chain joins them."""
     steps: dict[str, list[tuple[str, str, bool]]] = {}
     for name in names:
         if match := TRANSFORM_NAME.fullmatch(name):
@@ -134,8 +134,8 @@ def shortest_chain(names: Iterable[str], start: str, end: str) -> list[tuple[str
     return chains.get(end)
 
 
-def turned(images: np.ndarray, orientation: str) -> np.ndarray:
-    """Images (n, rows, columns) of one of the ORIENTATIONS in MF."""
+def reoriented(images: np.ndarray, orientation: str) -> np.ndarray:
+    """Return images (n, rows, columns) of one of the ORIENTATIONS in MF."""
     column, row = tuple(ORIENTATIONS[orientation])
     if column in "FN":
         images, column, row = images.transpose(0, 2, 1), row, column
@@ -143,9 +143,9 @@ def turned(images: np.ndarray, orientation: str) -> np.ndarray:
 
 
 def load_constants(path: Path) -> dict[str, np.ndarray]:
-    """The transforms (4, 4) of a PLUS configuration's CoordinateDefinitions, by name: {"ImageToProbe": ...} [mm, Image in pixels].
+    """Return the transforms (4, 4) of a PLUS configuration's CoordinateDefinitions, by name: {"ImageToProbe": ...}.
 
-    Raises SweepError in one line for a file that cannot be read, that has none, or one of them wrong.
+    Raises SweepError for a file that cannot be read, has no transform, or an invalid one.
     """
     try:
         return _constants_of(_configuration(path))
@@ -156,14 +156,14 @@ def load_constants(path: Path) -> dict[str, np.ndarray]:
 
 
 def transform_text(matrix: np.ndarray) -> str:
-    """Sixteen numbers row by row that read back to the same float64; SweepError where it is no affine matrix (4, 4)."""
+    """Return sixteen numbers row by row that read back to the same float64; SweepError for what is not an affine matrix (4, 4)."""
     affine = _affine(np.asarray(matrix, float), "a transform", reprlib.repr(np.asarray(matrix).tolist()))
-    # Adding 0 takes the sign of a negative zero, which no tracker means.
+    # Adding 0 removes the sign of a negative zero.
     return " ".join(repr(float(number) + 0.0).removesuffix(".0") for number in affine.flat)
 
 
 def matrix_of(text: str, what: str) -> np.ndarray:
-    """Affine matrix (4, 4) of sixteen numbers row by row; SweepError, which names ``what``, where they are none."""
+    """Return the affine matrix (4, 4) of sixteen numbers row by row; else raise SweepError, which names ``what``."""
     try:
         numbers = np.array(text.split(), float)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Sweeps as IGSIO sequence metafiles (.igs.mha) of PLUS and 3D Slicer: a MetaImage of frames whose header has their poses and times."""
+"""Sweeps as IGSIO sequence metafiles (.igs.mha) of PLUS and 3D Slicer: a MetaImage whose header has poses and times."""
 
 import os
 import re
@@ -12,13 +12,15 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ultrasound.sweep import ORIENTATIONS, TRANSFORM_NAME, Sweep, SweepError, transform_text, turned
+from ultrasound.sweep import ORIENTATIONS, TRANSFORM_NAME, Sweep, SweepError, reoriented, transform_text
 
 HEADER_LIMIT = 64 << 20
-FAST = 1  # Of zlib: speckle packs no better with more time, and a sweep is written while it is taken.
+COMPRESSION_LEVEL = (
+    1  # A higher level compresses speckle no better, and a sweep is written while it is recorded.
+)
 PIXEL_LIMIT = (1 << 32) - 1  # PLUS counts a sweep's bytes in 32 bits.
 FRAME_FIELD = re.compile(r"Seq_Frame([0-9]{4,9})_(.+)", re.DOTALL)
-# What a sweep with pixels must have; what is not required is the first of these where it is missing.
+# Accepted values of a sweep with pixels; the first is the default where the field is not required.
 PIXEL_FORMAT = {
     "NDims": ("3",),
     "Kinds": ("domain domain list", "domain domain time"),
@@ -51,10 +53,9 @@ NO_PIXELS = {"ElementType": "MET_OTHER", "UltrasoundImageOrientation": "XX", "Ul
 
 
 def read_sweep(path: Path) -> Sweep:
-    """The pictures, turned to MF, and fields of a sequence metafile.
+    """Return a sequence metafile's images, in MF, and fields. Times and transforms are parsed on demand.
 
-    Raises SweepError in one line, with the file's name, for one that cannot be read, is damaged, or holds what is no B-mode
-    sweep of 8 bits. Times and transforms are only read when the sweep is asked for them.
+    Raises SweepError with the file's name for a file that cannot be read, is damaged, or is not an 8-bit B-mode sweep.
     """
     try:
         with path.open("rb") as file:
@@ -64,9 +65,9 @@ def read_sweep(path: Path) -> Sweep:
 
 
 def write_sweep(path: Path, sweep: Sweep, compress: bool = True) -> None:
-    """Write a sweep; one that was read keeps its header's lines. The same sweep gives the same bytes, and nothing is added.
+    """Write a sweep; a sweep that was read keeps the lines of its header. The same sweep gives the same bytes.
 
-    Raises SweepError for a sweep that no file can hold, and OSError; then what stood at ``path`` stands there still.
+    Raises SweepError for a sweep that does not fit into a file, and OSError; an existing file is then not changed.
     """
     with SweepWriter(path, sweep.fields, compress) as writer:
         for image, fields in zip(sweep.images, sweep.frames, strict=True):
@@ -74,10 +75,10 @@ def write_sweep(path: Path, sweep: Sweep, compress: bool = True) -> None:
 
 
 class SweepWriter:
-    """Writes a sweep frame by frame, of which only the fields stay in memory; ``close`` makes the file, all or nothing.
+    """Writes a sweep frame by frame, pixels to disk; ``close`` writes the file atomically. ``count`` is the number of frames so far.
 
-    ``fields`` come to PLUS's own, or stand for them where they are those of a sweep that was read. As a context manager it
-    closes at the end, and leaves nothing behind after an exception. ``count`` is the number of frames so far.
+    ``fields`` add to PLUS's own, or replace them where they are those of a sweep that was read. As a context manager it closes at the
+    end, and leaves no file after an exception.
     """
 
     def __init__(self, path: Path, fields: dict[str, str] | None = None, compress: bool = True) -> None:
@@ -85,9 +86,9 @@ class SweepWriter:
         given = fields or {}
         self._header = dict(given) if "ObjectType" in given else NEW_HEADER | given
         self._shape: tuple[int, int] | None = None
-        self._lines, self._black_due = bytearray(), 0
-        self._compress = zlib.compressobj(FAST) if compress else None
-        # A file without a name goes away by itself, even with a process that is killed.
+        self._lines, self._pending_black = bytearray(), 0
+        self._compress = zlib.compressobj(COMPRESSION_LEVEL) if compress else None
+        # Deleted by the system, even if the process is killed.
         self._pixels = tempfile.TemporaryFile(dir=path.parent)
 
     def __enter__(self) -> "SweepWriter":
@@ -105,9 +106,9 @@ class SweepWriter:
         time_s: float,
         extra: dict[str, str] | None = None,
     ) -> None:
-        """One frame: image uint8 (rows, columns) in MF, transforms (4, 4) by name ("ProbeToReference"), time [s].
+        """Add a frame: image uint8 (rows, columns) in MF, transforms (4, 4) by name ("ProbeToReference"), time [s].
 
-        None for a transform or the image says that it was not seen: its status is INVALID. Raises SweepError as ``append`` does.
+        A transform or image of None gets the status INVALID. Raises SweepError as ``append``.
         """
         fields: dict[str, str] = {}
         for name, matrix in transforms.items():
@@ -123,35 +124,35 @@ class SweepWriter:
         self.append(image, fields)
 
     def append(self, image: np.ndarray | None, fields: dict[str, str]) -> None:
-        """One frame with its fields as texts; a picture that is None is black.
+        """Add a frame with its fields as text; an image of None is black.
 
-        Raises SweepError where image or texts do not fit into the file, which then goes on without this frame.
+        Raises SweepError for an image or text that does not fit into the file, which then continues without this frame.
         """
         shape = self._shape_with(image)
         lines = b"".join(_line(f"Seq_Frame{self.count:04}_{name}", text) for name, text in fields.items())
         self._shape, self.count = shape, self.count + 1
         self._lines += lines
         if image is None:
-            self._black_due += 1
+            self._pending_black += 1
         else:
-            self._put_black()
-            self._put(image.tobytes())
+            self._write_black()
+            self._write(image.tobytes())
 
     def close(self) -> None:
-        """Put header and pixels together in the file; SweepError where there is no frame. A second time does nothing."""
+        """Write the file; SweepError without frames. A second call does nothing."""
         if self._pixels.closed:
             return
         with self._pixels:
             if not self.count:
                 raise SweepError("a sweep without frames")
-            self._put_black()
+            self._write_black()
             if self._compress and self._shape:
                 self._pixels.write(self._compress.flush())
-            header = b"".join(_line(*each) for each in self._filled_header().items())
+            header = b"".join(_line(*each) for each in self._final_header().items())
             header += self._lines + b"ElementDataFile = LOCAL\n"
             if len(header) > HEADER_LIMIT:
                 raise SweepError(f"a header of {len(header)} bytes: at most {HEADER_LIMIT} can be read again")
-            self._put_together(header)
+            self._write_file(header)
 
     def _shape_with(self, image: np.ndarray | None) -> tuple[int, int] | None:
         shape = self._shape
@@ -164,22 +165,22 @@ class SweepWriter:
             raise SweepError(f"frame {self.count}: more than {PIXEL_LIMIT} bytes of pixels")
         return shape
 
-    def _put_black(self) -> None:
-        """The pictures that are owed, as soon as their size is known."""
+    def _write_black(self) -> None:
+        """Write the pending black images, once their size is known."""
         if self._shape:
             black = bytes(self._shape[0] * self._shape[1])
-            for _ in range(self._black_due):
-                self._put(black)
-            self._black_due = 0
+            for _ in range(self._pending_black):
+                self._write(black)
+            self._pending_black = 0
 
-    def _put(self, pixels: bytes) -> None:
+    def _write(self, pixels: bytes) -> None:
         self._pixels.write(self._compress.compress(pixels) if self._compress else pixels)
 
-    def _filled_header(self) -> dict[str, str]:
+    def _final_header(self) -> dict[str, str]:
         rows, columns = self._shape or (0, 0)
         header = dict(self._header)
         size = f"{columns} {rows} {self.count}"
-        # A text that says the same stays as it was, with PLUS's spaces.
+        # An equal value keeps its text, with PLUS's spaces.
         if header.get("DimSize", "").split() != size.split():
             header["DimSize"] = size
         if not self._shape:
@@ -196,7 +197,7 @@ class SweepWriter:
             header.pop("CompressedDataSize", None)
         return header
 
-    def _put_together(self, header: bytes) -> None:
+    def _write_file(self, header: bytes) -> None:
         partial = self.path.with_name(f".{self.path.name}.partial-{secrets.token_hex(4)}")
         try:
             with partial.open("xb") as file:
@@ -234,16 +235,16 @@ def _read(file: BinaryIO) -> Sweep:
     pixels = np.frombuffer(_read_pixels(file, fields, columns * rows * count), np.uint8)
     if ORIENTATIONS[orientation] != "MF":
         fields["UltrasoundImageOrientation"] = "MF"
-    return Sweep(turned(pixels.reshape(count, rows, columns), orientation), frames, fields)
+    return Sweep(reoriented(pixels.reshape(count, rows, columns), orientation), frames, fields)
 
 
 def _read_header(file: BinaryIO) -> tuple[dict[str, str], dict[int, dict[str, str]]]:
-    """The header's own fields, and each frame's by its number; the file then stands at the pixels."""
+    """Return the fields of the header and of each frame by number; leave the file at the pixels."""
     fields: dict[str, str] = {}
     frames: dict[int, dict[str, str]] = {}
     if b"".join(file.readline(HEADER_LIMIT).split()) != b"ObjectType=Image":
         raise SweepError(
-            "is no sweep; expected a tracked one (.igs.mha), which begins with ObjectType = Image"
+            "is not a sweep; expected a tracked one (.igs.mha), which begins with ObjectType = Image"
         )
     file.seek(0)
     while True:
@@ -258,7 +259,7 @@ def _read_header(file: BinaryIO) -> tuple[dict[str, str], dict[int, dict[str, st
                 raise SweepError(f"field {reprlib.repr(name)}: expected Seq_Frame0000_Name")
             into, key = frames.setdefault(int(match[1]), {}), match[2]
         if key in into:
-            raise SweepError(f"field {reprlib.repr(name)} stands twice")
+            raise SweepError(f"field {reprlib.repr(name)}: found twice")
         into[key] = text
 
 
@@ -290,14 +291,16 @@ def _read_pixels(file: BinaryIO, fields: dict[str, str], size: int) -> bytes:
             raise SweepError(f"{found} bytes of pixels: expected {size}")
         return file.read(size)
     text = fields.get("CompressedDataSize", "")
-    # Deflate makes nothing longer by more than five bytes in some thousands.
+    # Deflate adds at most five bytes in some thousands.
     if text.strip() != str(found) or found > size + size // 1000 + 1024:
-        raise SweepError(f"CompressedDataSize = {reprlib.repr(text)}, but {found} bytes are there for {size}")
+        raise SweepError(
+            f"CompressedDataSize = {reprlib.repr(text)}, but {found} bytes were found for {size}"
+        )
     decoder = zlib.decompressobj()
     try:
         pixels = decoder.decompress(file.read(found), size + 1)
     except zlib.error as error:
-        raise SweepError(f"the pixels are no zlib data: {error}") from error
+        raise SweepError(f"the pixels are not zlib data: {error}") from error
     if len(pixels) != size or not decoder.eof or decoder.unused_data:
         raise SweepError(f"{len(pixels)} bytes of pixels or more in the zlib data: expected {size}")
     return pixels

@@ -1,4 +1,4 @@
-"""Tissues that no label tells, but HU and shape do: fat and stones of a kidney, dead parts of a tumour, bone, enhanced vessels. NumPy."""
+"""HU-based classification of unlabelled tissue: fat and stones of a kidney, tumour necrosis, bone, enhanced vessels. NumPy."""
 
 import numpy as np
 from scipy import ndimage
@@ -6,36 +6,36 @@ from scipy import ndimage
 FAT_BELOW_HU = -30.0
 STONE_ABOVE_MEDIAN_HU = 130.0
 NECROSIS_BELOW_MEDIAN_HU = 40.0
-# Fat in a hollow of the kidney no wider than twice this is the sinus's.
-HOLLOW_MM = 10.0
-# A kidney brighter than this has taken up contrast agent, and soft tissue as bright as that is blood.
+# Fat in a concavity of the kidney no wider than twice this is renal sinus.
+CONCAVITY_MM = 10.0
+# A kidney above this is enhanced by contrast agent; soft tissue above the second value is then blood.
 ENHANCED_FROM_HU, BLOOD_ABOVE_HU = 100.0, 140.0
-# The shell of a bone, the least that only bone has, and the least of it that is not a stone or calcified vessel.
-SHELL_ABOVE_HU, BONE_ABOVE_HU, BONE_FROM_ML = 250.0, 350.0, 0.4
-# Bones are large: voxels are taken together to this size to find them, and continue beyond the CT's border as far as this.
+# Cortical bone; what only bone reaches; the least volume of that which is no stone or calcified vessel.
+SHELL_ABOVE_HU, BONE_ABOVE_HU, MIN_BONE_ML = 250.0, 350.0, 0.4
+# Bones are searched in blocks of voxels of this size, and continued beyond the CT's border as far as this.
 COARSE_MM, BEYOND_MM = 1.8, 45.0
 KIDNEY = ("kidney", "cortex", "medulla", "sinus", "urine")
 
 
-def recognised(
+def classify_tissues(
     hu: np.ndarray, labelled: dict[str, np.ndarray], spacing_mm: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Tissue -> which voxels (nx, ny, nz) are of it besides those that labels say, in the order in which they win."""
-    everything = np.logical_or.reduce([np.zeros(hu.shape, bool), *labelled.values()])
-    bone = bones(hu, spacing_mm) & ~everything
+    """Return masks (nx, ny, nz) of tissues found besides the labelled ones, in rising priority."""
+    any_label = np.logical_or.reduce([np.zeros(hu.shape, bool), *labelled.values()])
+    bone = bones(hu, spacing_mm) & ~any_label
     found = {"bone": bone}
     kidney = np.logical_or.reduce([np.zeros(hu.shape, bool), *(labelled[t] for t in KIDNEY if t in labelled)])
     if kidney.any():
         median = float(np.median(hu[kidney]))
         if median > ENHANCED_FROM_HU:
-            found["vessel"] = _vessels(hu, everything | bone)
+            found["vessel"] = _vessels(hu, any_label | bone)
         if "sinus" not in labelled:
-            found["sinus"] = hollow(kidney, spacing_mm) & (hu < FAT_BELOW_HU)
+            found["sinus"] = enclosed(kidney, spacing_mm) & (hu < FAT_BELOW_HU)
         fat = kidney & (hu < FAT_BELOW_HU)
         found["sinus"] = found["sinus"] | fat if "sinus" in found else fat
         found["stone"] = kidney & (hu > median + STONE_ABOVE_MEDIAN_HU)
         if median > ENHANCED_FROM_HU and "urine" in labelled:
-            # A rim of it is as bright, where voxels are cut.
+            # Partial-volume voxels around enhanced urine are as bright.
             found["stone"] &= ~ndimage.binary_dilation(labelled["urine"])
     tumour = labelled.get("tumour")
     if tumour is not None and tumour.any():
@@ -44,18 +44,18 @@ def recognised(
 
 
 def _vessels(hu: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Blood with contrast agent, away from other tissues, whose rims are as bright where voxels are cut."""
+    """Return enhanced blood, away from other tissues, whose partial-volume voxels are as bright."""
     smooth = ndimage.gaussian_filter(np.asarray(hu, np.float32), 1.0, truncate=2)
     return (smooth > BLOOD_ABOVE_HU) & ~ndimage.binary_dilation(others, iterations=3)
 
 
-def hollow(kidney: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """What a kidney encloses besides itself: its closing by a ball of HOLLOW_MM, without it."""
-    rim = np.ceil(HOLLOW_MM / spacing_mm).astype(int) + 1
+def enclosed(kidney: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
+    """Return the closing of a kidney by a ball of CONCAVITY_MM, without the kidney."""
+    rim = np.ceil(CONCAVITY_MM / spacing_mm).astype(int) + 1
     box = ndimage.find_objects(kidney.astype(np.uint8))[0]
     part = np.pad(kidney[box], [(int(r), int(r)) for r in rim])
-    grown = ndimage.distance_transform_edt(~part, sampling=spacing_mm) <= HOLLOW_MM
-    closed = ndimage.distance_transform_edt(grown, sampling=spacing_mm) > HOLLOW_MM
+    grown = ndimage.distance_transform_edt(~part, sampling=spacing_mm) <= CONCAVITY_MM
+    closed = ndimage.distance_transform_edt(grown, sampling=spacing_mm) > CONCAVITY_MM
     inside = np.zeros_like(kidney)
     inner = tuple(slice(int(r), n - int(r)) for r, n in zip(rim, part.shape, strict=True))
     inside[box] = (closed & ~part)[inner]
@@ -63,14 +63,14 @@ def hollow(kidney: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
 
 
 def bones(hu: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
-    """Bones, shell and marrow: marrow may be no denser than soft tissue with contrast agent, but is enclosed."""
+    """Return cortical bone and marrow. Marrow may be no denser than enhanced soft tissue, but is enclosed by cortical bone."""
     step = np.maximum(1, np.rint(COARSE_MM / spacing_mm)).astype(int)
     if not (hu > BONE_ABOVE_HU).any():
         return np.zeros(hu.shape, bool)
-    # The brightest of each block, for a shell may be thinner than one.
+    # The maximum of each block, as cortical bone may be thinner than a block.
     coarse = ndimage.maximum_filter(hu, size=tuple(step))[:: step[0], :: step[1], :: step[2]]
     shell = _large_parts(coarse, float(np.prod(spacing_mm * step)))
-    # A bone cut by the CT's border goes on beyond it as its mirror image.
+    # A bone cut by the CT's border is continued beyond it as its mirror image.
     beyond = [min(n, int(BEYOND_MM / (s * k))) for n, s, k in zip(shell.shape, spacing_mm, step, strict=True)]
     whole = np.pad(shell, [(n, n) for n in beyond], mode="symmetric")
     whole = ndimage.binary_closing(whole, iterations=2)
@@ -81,7 +81,7 @@ def bones(hu: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
 
 
 def _filled(solid: np.ndarray, axis: int) -> np.ndarray:
-    """Each section across an axis with its holes filled: what reaches no edge of the section."""
+    """Fill the holes of each section across an axis."""
     beside = ndimage.generate_binary_structure(3, 1)
     beside[tuple(slice(None) if k != axis else [0, 2] for k in range(3))] = False
     parts, count = ndimage.label(~solid, beside)
@@ -94,9 +94,9 @@ def _filled(solid: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _large_parts(hu: np.ndarray, voxel_mm3: float) -> np.ndarray:
-    """Connected parts of what may be a bone's shell that hold some of what only bone is."""
+    """Return the connected parts above SHELL_ABOVE_HU that contain MIN_BONE_ML above BONE_ABOVE_HU."""
     parts, count = ndimage.label(hu > SHELL_ABOVE_HU)
     hard = np.bincount(parts[hu > BONE_ABOVE_HU], minlength=count + 1) * voxel_mm3 / 1000
-    is_bone = hard >= BONE_FROM_ML
+    is_bone = hard >= MIN_BONE_ML
     is_bone[0] = False
     return is_bone[parts]

@@ -1,4 +1,4 @@
-"""What a tracker gets wrong of a probe's poses: noise, calibration, latency, frames that are lost."""
+"""Tracking errors of a probe's poses: noise, calibration, latency, lost frames."""
 
 import math
 from dataclasses import dataclass, fields
@@ -11,17 +11,17 @@ from ultrasound.probe_manipulator import rigid
 
 @dataclass(frozen=True)
 class TrackingErrors:
-    """All 0 is a perfect tracker. Raises ValueError for what is negative or not finite, or a share over 1."""
+    """Sizes of the errors; all 0 is a perfect tracker. Raises ValueError for a negative or infinite value, or a fraction over 1."""
 
-    # Standard deviation of each coordinate of the position, and of the turn about each axis; frame by frame.
+    # Standard deviation of each coordinate and of the rotation about each axis, frame by frame.
     noise_mm: float = 0.0
     noise_deg: float = 0.0
-    # The same in every frame: how far the image is off the probe, and turned; the seed says which way.
+    # Constant shift and rotation of the image relative to the probe; the seed gives the direction.
     calibration_mm: float = 0.0
     calibration_deg: float = 0.0
-    # A picture comes with the pose of so much earlier.
+    # An image comes with the pose of this time earlier.
     latency_s: float = 0.0
-    # Share of the frames that have no pose (PLUS's status INVALID).
+    # Fraction of the frames without a pose (PLUS's status INVALID).
     lost: float = 0.0
 
     def __post_init__(self) -> None:
@@ -33,30 +33,30 @@ class TrackingErrors:
             raise ValueError(f"lost is a share of the frames, at most 1, not {self.lost:g}")
 
 
-def tracked(
+def with_tracking_errors(
     poses: np.ndarray, times_s: np.ndarray, errors: TrackingErrors, seed: int = 0
 ) -> list[np.ndarray | None]:
-    """What a tracker reports of rigid ``poses`` (n, 4, 4) [mm], reference from probe: None where it is lost.
+    """Return rigid ``poses`` (n, 4, 4) [mm], reference from probe, as a tracker reports them: None where lost.
 
-    In this order: latency; noise, turning about the probe's own origin; calibration, on the image's side
-    (``pose @ calibration``). One ``seed`` draws the same pattern at whatever size of the errors, so that
-    sizes can be compared. Raises ValueError where shapes do not fit, or ``times_s`` (n,) do not grow.
+    In this order: latency; noise, with rotation about the probe's origin; calibration, on the image's side (``pose @ calibration``).
+    A ``seed`` draws the same pattern at every size of the errors, so that sizes can be compared.
+    Raises ValueError where shapes do not fit, or ``times_s`` (n,) do not increase.
     """
     poses, times = np.asarray(poses, float), np.asarray(times_s, float)
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or times.shape != poses.shape[:1]:
         raise ValueError(f"poses (n, 4, 4) need times (n,), not {poses.shape} and {times.shape}")
     if not (np.diff(times) > 0).all():
-        raise ValueError("the times of poses must grow from each to the next")
+        raise ValueError("the times of poses must increase from each to the next")
     noise, calibration, losses = np.random.default_rng(seed).spawn(3)
     reported = _noisy(_delayed(poses, times, errors.latency_s), errors, noise) @ _calibration(
         errors, calibration
     )
     lost = losses.random(len(poses)) < errors.lost
-    return [None if gone else pose for pose, gone in zip(reported, lost, strict=True)]
+    return [None if is_lost else pose for pose, is_lost in zip(reported, lost, strict=True)]
 
 
 def _delayed(poses: np.ndarray, times: np.ndarray, latency_s: float) -> np.ndarray:
-    """Poses of ``latency_s`` earlier; before the first it is the first."""
+    """Return the poses of ``latency_s`` earlier; before the first, the first."""
     if latency_s == 0 or len(poses) < 2:
         return poses
     earlier = np.maximum(times - latency_s, times[0])
@@ -73,7 +73,7 @@ def _noisy(poses: np.ndarray, errors: TrackingErrors, draw: np.random.Generator)
 
 
 def _calibration(errors: TrackingErrors, draw: np.random.Generator) -> np.ndarray:
-    """The map (4, 4) from where the image is taken to be to where it is."""
+    """Return the calibration error (4, 4): from the assumed image position to the true one."""
     direction, axis = (v / np.linalg.norm(v) for v in draw.standard_normal((2, 3)))
     turn = Rotation.from_rotvec(np.radians(errors.calibration_deg) * axis)
     return rigid(turn.as_matrix(), errors.calibration_mm * direction)

@@ -29,7 +29,7 @@ from rehearsal.reconstruction.sweep_volumes import (
 from rehearsal.result_files import write_json
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
-from ultrasound.labelled_sweep import PROBE_FIELD, marks_beside
+from ultrasound.labelled_sweep import PROBE_FIELD, read_ground_truth
 from ultrasound.reconstruction import METHODS
 from ultrasound.sweep import Sweep, load_constants
 from ultrasound.sweep_file import read_sweep, write_sweep
@@ -123,7 +123,7 @@ def reconstruct(
         raise CommandError("--undo-compression: needs the organ of a scene; name it with --scene")
     images = read_sweep(sweep)
     images.constant |= load_constants(config) if config else {}
-    labels = marks_beside(sweep)
+    labels = read_ground_truth(sweep)
     errors = _errors_of(tracker)
     if errors != TrackingErrors():
         images = with_errors(images, reference, errors, seed)

@@ -103,11 +103,11 @@ def scan(
     for name, pose in tqdm(pose_by_name.items(), desc="scan", unit="pose"):
         began = perf_counter()
         plane = ImagePlane(pose, *scan_probe.extent_mm)
-        images = scanner.look(
+        images = scanner.images(
             plane, scan_probe, settings.mode, settings.detail_level, settings.window_hu, settings.level_hu
         )
         ms.append(1000 * (perf_counter() - began))
-        labels = scanner.marks.render()
+        labels = scanner.ground_truth.render()
         empty += not labels.any()
         if recording is not None:
             grey = next(iter(images.values()))

@@ -95,7 +95,7 @@ class UserInput:
             return
         self._follower = None
         self._show("Mouse and keys control the probe")
-        self.session.rehearsal.manipulator.take(self.session.rehearsal.pose)
+        self.session.rehearsal.manipulator.match(self.session.rehearsal.pose)
 
     def _show(self, text: str) -> None:
         self.notices.post(text, in_terminal=False)
@@ -117,7 +117,7 @@ class UserInput:
             self._wait(controls.ray)
             return rehearsal.pose
         pose = rehearsal.pose if goal is None else rehearsal.pose_towards(goal)
-        rehearsal.manipulator.take(pose)
+        rehearsal.manipulator.match(pose)
         return pose
 
     def _manual_pose(self, controls: Controls) -> np.ndarray:
@@ -139,7 +139,7 @@ class UserInput:
         elif controls.ray is not None and mouse_moved(controls.ray, self._ray_at_slide):
             manipulator.point(*controls.ray)
             self._ray_at_slide = None
-        manipulator.hold(controls.press, rehearsal.settings.time_step_s, controls.press_share)
+        manipulator.press(controls.press, rehearsal.settings.time_step_s, controls.press_share)
         manipulator.push(controls.push_mm)
         manipulator.turn(controls.tilt_deg, controls.rock_deg, controls.rotate_deg)
 

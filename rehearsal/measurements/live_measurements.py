@@ -13,9 +13,9 @@ from rehearsal.sessions.packed_coverage import unpack_seen
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import Log, SessionError
 from render.viewer import Settings, View
-from ultrasound.coverage import PLACES, Coverage, Gap
+from ultrasound.coverage import GRID_POINTS, Coverage, Gap
 from ultrasound.probe import Probe
-from ultrasound.scanner import ECHO
+from ultrasound.scanner import B_MODE
 
 MEASURE_S, COVERAGE_S = 0.25, 1 / 30
 MARGIN_MM = 5.0
@@ -52,7 +52,7 @@ class LiveMeasurements:
     def restart(self) -> None:
         """Start a new session: no coverage, nothing to sum up."""
         self._begin()
-        self.coverage.forget()
+        self.coverage.clear()
         if self.guide is not None:
             self.guide.restart()
 
@@ -105,8 +105,8 @@ class LiveMeasurements:
         is_due = pose is None or self.latest is None
         if (is_due or session.step_index % self._coverage_every == 0) and self.rehearsal.scanner is not None:
             image = self.rehearsal.scene.image
-            rest = self.rehearsal.scanner.plane.rest_grid(PLACES)
-            self._touches = self.coverage.look(rest, probe, image.contact_gap_mm)
+            rest = self.rehearsal.scanner.plane.rest_grid(GRID_POINTS)
+            self._touches = self.coverage.add(rest, probe, image.contact_gap_mm)
         if self.guide is not None:
             self.guide.go_with(session)
         if is_due or session.step_index % self._measure_every == 0:
@@ -123,7 +123,7 @@ class LiveMeasurements:
         """Update what the window shows."""
         surfaces = {"organ": self.rehearsal.organ, "tumour": self.rehearsal.tumour}
         self._seen = {
-            name: self.coverage.at(np.asarray(surface.vertices))
+            name: self.coverage.is_seen(np.asarray(surface.vertices))
             for name, surface in surfaces.items()
             if surface is not None
         }
@@ -133,7 +133,7 @@ class LiveMeasurements:
         """The latest measurement and the coverage so far, rounded, for the record."""
         values = asdict(self.latest) if self.latest is not None else {}
         if self.rehearsal.scanner is not None:
-            values |= {f"seen_{target}": self.coverage.share(target) for target in self.coverage.targets}
+            values |= {f"seen_{target}": self.coverage.fraction(target) for target in self.coverage.targets}
         if self.guide is not None:
             values |= self.guide.figures()
         return {
@@ -166,7 +166,7 @@ class LiveMeasurements:
             seen=self._seen if settings.show_seen else {},
             guidance=self.guide.guidance() if self.guide is not None else None,
             status=status,
-            notes={ECHO: "NO CONTACT"} if self._touches.mean() < LEAST_CONTACT else {},
+            notes={B_MODE: "NO CONTACT"} if self._touches.mean() < LEAST_CONTACT else {},
         )
 
     def findings(self) -> dict[str, str]:
@@ -193,7 +193,7 @@ class LiveMeasurements:
         }
 
     def _share(self, target: str) -> str:
-        return f"{100 * self.coverage.share(target):.0f} %"
+        return f"{100 * self.coverage.fraction(target):.0f} %"
 
 
 def _mm(length: float | None) -> str:

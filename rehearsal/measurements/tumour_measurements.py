@@ -8,7 +8,7 @@ import numpy as np
 
 from rehearsal.rehearsal import Rehearsal
 from sim.fields import array_of
-from ultrasound.array_contact import face_points, pressing
+from ultrasound.array_contact import face_points, measure_contact
 from ultrasound.probe import Probe
 
 
@@ -17,7 +17,7 @@ class Measurement:
     """Lengths in mm; None where there is no tumour, or none on the image plane."""
 
     compression_mm: float
-    """Greatest compression of the tissue in front of the array face (``ultrasound.array_contact.Pressing``)."""
+    """Greatest compression of the tissue in front of the array face (``ultrasound.array_contact.ArrayContact``)."""
     contact_mm2: float
     """Area of the array face in contact."""
     to_tumour_mm: float | None = None
@@ -36,7 +36,7 @@ def measure(rehearsal: Rehearsal, probe: Probe, touches: np.ndarray) -> Measurem
     """Measure a rehearsal whose surfaces are up to date; ``touches`` (n,): which scanlines are in contact."""
     organ = rehearsal.organ
     now = array_of(rehearsal.organ_skin.vertices).astype(float)
-    pressed = pressing(
+    pressed = measure_contact(
         rehearsal.pose, rehearsal.size_mm, probe.radius_mm, now, np.asarray(organ.vertices), organ.faces
     )
     always: dict[str, Any] = dict(compression_mm=pressed.compression_mm, contact_mm2=pressed.area_mm2)

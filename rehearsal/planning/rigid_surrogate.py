@@ -26,7 +26,7 @@ class RigidSurrogate:
         self.rehearsal, self.reach = rehearsal, reach
         self.manipulator = copy.copy(rehearsal.manipulator)
         self.manipulator.samples = self.manipulator.vertices
-        places = coverage.places(target)
+        places = coverage.voxel_centres(target)
         settled = Skin(rehearsal.model, places[:: -(-len(places) // PLACES)])
         settled.update()
         self._places = array_of(settled.vertices).astype(float)

@@ -76,7 +76,7 @@ def candidates_of(
     rehearsal: Rehearsal, coverage: Coverage, target: str, reach: InstrumentReach
 ) -> list[SweepCandidate]:
     """Candidates that may cover a target: from above and from the side nearest to it, sliding and tilting."""
-    places = coverage.places(target)
+    places = coverage.voxel_centres(target)
     centre = places.mean(axis=0)
     above = -np.array(rehearsal.press.direction)
     lateral = np.array(rehearsal.press.lateral)
@@ -105,7 +105,7 @@ def half_extent_mm(layout: SweepLayout, places: np.ndarray) -> np.ndarray:
 
 def image_width_mm(rehearsal: Rehearsal, layout: SweepLayout) -> float:
     """The width of the image at a layout's centre, with the probe on the surface above it."""
-    top = rehearsal.manipulator.met(layout.centre + FAR_MM * layout.outward, -layout.outward)
+    top = rehearsal.manipulator.ray_hit(layout.centre + FAR_MM * layout.outward, -layout.outward)
     depth = 0.0 if top is None else float((top - layout.centre) @ layout.outward)
     probe = rehearsal.probe
     return float(probe.number_of_scanlines * probe.line_spacing_mm(np.array([max(depth, 0.0)]))[0])
@@ -126,7 +126,7 @@ def nearest_side(
     """The direction (3,) from a place to the nearest surface where a probe can be placed; None where there is none."""
     least, found = np.inf, None
     for outward in directions(DIRECTIONS):
-        place = manipulator.met(centre + FAR_MM * outward, -outward)
+        place = manipulator.ray_hit(centre + FAR_MM * outward, -outward)
         if outward @ above < LEAST_COSINE or place is None:
             continue
         distance = float((place - centre) @ outward)

@@ -107,10 +107,10 @@ def pose_over(
 ) -> np.ndarray | None:
     """The pose (4, 4) at an offset in a layout; None beside the organ."""
     over = layout.centre + aside_mm * layout.lateral + ahead_mm * layout.ahead
-    place = manipulator.met(over + FAR_MM * layout.outward, -layout.outward)
+    place = manipulator.ray_hit(over + FAR_MM * layout.outward, -layout.outward)
     if place is None:
         return None
-    axis = (1 - follow) * layout.outward + follow * manipulator.outward(place)
+    axis = (1 - follow) * layout.outward + follow * manipulator.surface_normal(place)
     pose = pose_at(place, -axis, layout.lateral, manipulator.size_mm[2])
     return advanced(touching(pose, manipulator.size_mm, manipulator.samples, manipulator.radius_mm), depth_mm)
 

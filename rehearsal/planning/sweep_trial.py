@@ -10,10 +10,10 @@ from rehearsal.planning.sweep_path import SweepPath
 from rehearsal.planning.sweep_score import ScoreTerms, face_centres, incidence_deg
 from rehearsal.rehearsal import Rehearsal
 from sim.fields import array_of
-from ultrasound.array_contact import pressing
-from ultrasound.coverage import PLACES, Coverage
+from ultrasound.array_contact import measure_contact
+from ultrasound.coverage import GRID_POINTS, Coverage
 from ultrasound.image_plane import PlaneInTissue
-from ultrasound.probe_manipulator import advanced, between
+from ultrasound.probe_manipulator import advanced, poses_between
 
 # The most steps of a move between passes.
 MOST_STEPS = 240
@@ -26,7 +26,7 @@ class Trial:
 
     def __init__(self, rehearsal: Rehearsal, coverage: Coverage, target: str, reach: InstrumentReach) -> None:
         self.rehearsal, self.coverage, self.target, self.reach = rehearsal, coverage, target, reach
-        self.plane = PlaneInTissue(rehearsal.embedding, PLACES)
+        self.plane = PlaneInTissue(rehearsal.embedding, GRID_POINTS)
 
     def run(self, path: SweepPath, speed_mm_s: float) -> ScoreTerms:
         """Follow a path at a speed on its passes; deterministic."""
@@ -42,7 +42,7 @@ class Trial:
 
     def _restart(self) -> None:
         self.rehearsal.reset()
-        self.coverage.forget()
+        self.coverage.clear()
         self._compressions: list[float] = []
         self._contacts: list[float] = []
         self._restored: list[bool] = []
@@ -66,7 +66,7 @@ class Trial:
             self._step(self.rehearsal.pose_towards(goal))
 
     def _move(self, start: np.ndarray, end: np.ndarray) -> None:
-        for pose in between(start, end, self._steps(start, end))[1:]:
+        for pose in poses_between(start, end, self._steps(start, end))[1:]:
             self._step(pose)
 
     def _step(self, pose: np.ndarray) -> None:
@@ -89,13 +89,13 @@ class Trial:
     def _measure(self) -> None:
         rehearsal = self.rehearsal
         rehearsal.embedding.update()
-        self.plane.take(rehearsal.image_plane())
+        self.plane.locate(rehearsal.image_plane())
         gap = rehearsal.scene.image.contact_gap_mm
-        touches = self.coverage.look(self.plane.rest_grid(PLACES), rehearsal.probe, gap)
+        touches = self.coverage.add(self.plane.rest_grid(GRID_POINTS), rehearsal.probe, gap)
         rehearsal.organ_skin.update()
         now = array_of(rehearsal.organ_skin.vertices).astype(float)
         organ, probe = rehearsal.organ, rehearsal.probe
-        pressed = pressing(
+        pressed = measure_contact(
             rehearsal.pose, rehearsal.size_mm, probe.radius_mm, now, np.asarray(organ.vertices), organ.faces
         )
         self._compressions.append(pressed.compression_mm)
@@ -109,7 +109,7 @@ class Trial:
         compression = np.array(self._compressions)
         limit = self.rehearsal.scene.transducer.compression_warning_mm
         return ScoreTerms(
-            seen=self.coverage.share(self.target),
+            seen=self.coverage.fraction(self.target),
             compression_mean_mm=float(compression.mean()),
             compression_max_mm=float(compression.max()),
             over_limit=float(((compression > limit) | self._restored).mean()),

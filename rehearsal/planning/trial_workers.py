@@ -149,7 +149,7 @@ def _trial(key: str, problem: PlanningProblem) -> Trial:
             raise PlanError(
                 f"--target {problem.target}: it is smaller than a voxel of {VOXEL_MM:g} mm; expected a larger one"
             )
-        centre = coverage.low_mm + VOXEL_MM * np.argwhere(coverage.targets[problem.target]).mean(axis=0)
+        centre = coverage.origin_mm + VOXEL_MM * np.argwhere(coverage.targets[problem.target]).mean(axis=0)
         reach = InstrumentReach(problem.trocar, rehearsal.manipulator, rehearsal.origin, centre)
         _built[key] = Trial(rehearsal, coverage, problem.target, reach)
     return _built[key]

@@ -6,7 +6,7 @@ from rehearsal.coordinates import transducer_at
 from rehearsal.reconstruction.sweep_volumes import ImagePoses
 from rehearsal.rehearsal import Rehearsal
 from ultrasound.image_plane import ImagePlane, PlaneInTissue
-from ultrasound.probe_manipulator import advanced, between, image_plane
+from ultrasound.probe_manipulator import advanced, image_plane, poses_between
 from ultrasound.sweep import Sweep, SweepError
 
 # The probe starts this far above its first pose, takes this time to come there, and this time for the tissue to come to rest.
@@ -49,7 +49,7 @@ class CompressionCorrection:
             move_to(self.rehearsal, self._poses[frame], min(elapsed, LONGEST_S))
             self._frame = frame
         self.rehearsal.embedding.update()
-        self.plane.take(self._plane_of(frame))
+        self.plane.locate(self._plane_of(frame))
         return self.plane.rest_grid(self.plane.pixels) + self.rehearsal.origin
 
     def _plane_of(self, frame: int) -> ImagePlane:
@@ -70,5 +70,5 @@ def approach(rehearsal: Rehearsal, pose: np.ndarray) -> None:
 def move_to(rehearsal: Rehearsal, pose: np.ndarray, seconds: float) -> None:
     """Move the transducer to a pose at a constant speed."""
     steps = max(1, round(seconds / rehearsal.settings.time_step_s))
-    for step in between(rehearsal.pose, pose, steps)[1:]:
+    for step in poses_between(rehearsal.pose, pose, steps)[1:]:
         rehearsal.advance(step)

@@ -11,20 +11,20 @@ from rehearsal.reconstruction.sweep_volumes import SweepVolumes
 from rehearsal.result_files import save_figure
 from scenes.volumes.volume_files import save_image
 from ultrasound.reconstruction import VoxelBox
-from ultrasound.sweep import Mark
+from ultrasound.sweep import PixelLabel
 
 COLOUR = {"organ": "#ff8c69", "tumour": "#ffe14d"}
 AXES = "xyz"
 
 
 def save_volumes(volumes: SweepVolumes, out: Path) -> None:
-    """Write volume.nrrd and, where there are regions, labels.nrrd with ``Mark`` values."""
+    """Write volume.nrrd and, where there are regions, labels.nrrd with ``PixelLabel`` values."""
     grey = np.clip(np.rint(volumes.grey), 0, 255).astype(np.uint8)
     save_volume(grey, volumes.box, out / "volume.nrrd")
     if "organ" in volumes.regions:
-        labels = np.where(volumes.regions["organ"], np.uint8(Mark.ORGAN), np.uint8(Mark.OUTSIDE))
+        labels = np.where(volumes.regions["organ"], np.uint8(PixelLabel.ORGAN), np.uint8(PixelLabel.OUTSIDE))
         if "tumour" in volumes.regions:
-            labels[volumes.regions["tumour"]] = Mark.TUMOUR
+            labels[volumes.regions["tumour"]] = PixelLabel.TUMOUR
         save_volume(labels, volumes.box, out / "labels.nrrd")
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ultrasound.sweep import Sweep, SweepError, transform_text
-from ultrasound.tracking_errors import TrackingErrors, tracked
+from ultrasound.tracking_errors import TrackingErrors, with_tracking_errors
 
 
 def with_errors(sweep: Sweep, reference: str, errors: TrackingErrors, seed: int) -> Sweep:
@@ -19,7 +19,7 @@ def with_errors(sweep: Sweep, reference: str, errors: TrackingErrors, seed: int)
         raise SweepError(f"no frame has a pose of the probe in {reference}, to which errors could be added")
     try:
         true_poses = np.stack([pose for pose in poses if pose is not None])
-        found = tracked(true_poses, sweep.times_s[known], errors, seed)
+        found = with_tracking_errors(true_poses, sweep.times_s[known], errors, seed)
     except ValueError as error:
         raise SweepError(f"errors of a tracker cannot be added to this sweep: {error}") from None
     name, frames = f"ProbeTo{reference}Transform", [dict(fields) for fields in sweep.frames]

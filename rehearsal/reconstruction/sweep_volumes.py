@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion, find_objects
 
 from ultrasound.reconstruction import Reconstruction, VoxelBox
-from ultrasound.sweep import Mark, Sweep, SweepError
+from ultrasound.sweep import PixelLabel, Sweep, SweepError
 
 GREY = "grey"
 # A voxel belongs to a region from this fraction of its pixels.
@@ -78,7 +78,7 @@ def reconstruct_volumes(
 ) -> SweepVolumes:
     """Reconstruct volumes from the images of a sweep.
 
-    ``labels`` are the same frames with ``Mark`` values. ``places`` is called with the frames in order; without it the pixels are where
+    ``labels`` are the same frames with ``PixelLabel`` values. ``places`` is called with the frames in order; without it the pixels are where
     the tracked poses place them. Without grey values there must be labels. ``progress`` is called after each frame.
 
     Raises SweepError where labels and images do not match, ValueError as ``VoxelBox.around``.
@@ -122,9 +122,9 @@ def _channels(labels: Sweep | None) -> dict[str, Callable[[np.ndarray], np.ndarr
     """What is reconstructed: the grey values, and from labels the fractions of organ and tumour."""
     channels: dict[str, Callable[[np.ndarray], np.ndarray] | None] = {GREY: None}
     if labels is not None:
-        channels["organ"] = lambda image: image % Mark.BEAD >= Mark.ORGAN
-        if (labels.images % Mark.BEAD == Mark.TUMOUR).any():
-            channels["tumour"] = lambda image: image % Mark.BEAD == Mark.TUMOUR
+        channels["organ"] = lambda image: image % PixelLabel.BEAD >= PixelLabel.ORGAN
+        if (labels.images % PixelLabel.BEAD == PixelLabel.TUMOUR).any():
+            channels["tumour"] = lambda image: image % PixelLabel.BEAD == PixelLabel.TUMOUR
     return channels
 
 
@@ -138,13 +138,13 @@ class _Beads:
 
     def add(self, labels: np.ndarray, matrix: np.ndarray, at: np.ndarray | None, is_end: bool) -> None:
         """Add a label image (rows, columns), with its pose, or the places of its pixels (rows, columns, 3) [mm]."""
-        rows, columns = np.nonzero(labels >= Mark.BEAD)
+        rows, columns = np.nonzero(labels >= PixelLabel.BEAD)
         if at is not None:
             places = at[rows, columns]
         else:
             pixels = np.column_stack([columns, rows, np.zeros(len(rows)), np.ones(len(rows))])
             places = pixels @ matrix[:3].T
-        beads = labels[rows, columns] // Mark.BEAD - 1
+        beads = labels[rows, columns] // PixelLabel.BEAD - 1
         cut = beads if is_end else beads[self._edge[rows, columns]]
         self._cut |= set(cut.tolist())
         for bead in map(int, np.unique(beads)):

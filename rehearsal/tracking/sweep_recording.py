@@ -68,7 +68,7 @@ class SweepRecorder:
             # A volume of B-mode and CT images would be neither.
             return self.end()
         self._image_kind = kind
-        labels = self.rehearsal.scanner.marks.render()
+        labels = self.rehearsal.scanner.ground_truth.render()
         try:
             self._sweep.add(image, labels, probe, probe_in_patient(self.rehearsal), time_s)
         except SweepError as error:

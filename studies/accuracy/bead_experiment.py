@@ -18,7 +18,7 @@ from sim.shapes import ConvexTool
 from sim.skinning import Skin
 from sim.solver import StepSettings
 from studies.accuracy.bead_case import BeadCase
-from ultrasound.probe_manipulator import between
+from ultrasound.probe_manipulator import poses_between
 
 # Share of a stage's steps in which the probe moves; in the others the tissue comes to rest, as before the scan.
 MOVING = 2 / 3
@@ -69,9 +69,9 @@ class BeadExperiment:
         run = BeadRun(np.zeros_like(self.case.measured), arriving=np.zeros_like(self.case.measured))
         moving = max(1, round(MOVING * setup.stage_steps))
         for stage, goal in enumerate(self.case.poses):
-            path = between(pose, self.relative(goal), moving)
+            path = poses_between(pose, self.relative(goal), moving)
             for n in range(setup.stage_steps):
-                poses = between(path[min(n, moving)], path[min(n + 1, moving)], step.substeps)
+                poses = poses_between(path[min(n, moving)], path[min(n + 1, moving)], step.substeps)
                 timed(lambda: self.solver.step(step, poses), run.step_ms)
                 if n + 1 == moving:
                     run.arriving[stage] = self._bead_positions()
@@ -88,7 +88,7 @@ class BeadExperiment:
         self.model.update_frames()
         step, pose = self._step_settings(setup), self._away()
         for _ in range(setup.warm_up_steps):
-            self.solver.step(step, between(pose, pose, step.substeps))
+            self.solver.step(step, poses_between(pose, pose, step.substeps))
         return step
 
     def _bead_positions(self) -> np.ndarray:

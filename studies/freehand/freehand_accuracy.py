@@ -18,7 +18,7 @@ from sim.device import start
 from studies.freehand.freehand_sweeps import GroundTruthSweep, pressed, resting, sweep_of
 from ultrasound.probe import load_probe
 from ultrasound.reconstruction import METHODS
-from ultrasound.tracking_errors import TrackingErrors, tracked
+from ultrasound.tracking_errors import TrackingErrors, with_tracking_errors
 
 REFERENCE, SEED = "Reference", 20161130
 PROBE = "curvilinear"
@@ -99,7 +99,7 @@ def noise_curves(
     ]
     rows = []
     for errors in trials:
-        poses = tracked(few.poses, few.sweep.times_s, errors, SEED)
+        poses = with_tracking_errors(few.poses, few.sweep.times_s, errors, SEED)
         rows.append(asdict(errors) | _row(few, poses, surfaces))
         done()
     return rows

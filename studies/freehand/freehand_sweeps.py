@@ -13,7 +13,7 @@ from scenes.anatomy import LoadedAnatomy
 from sim.embedding import Unmoved
 from sim.signed_distance import signed_distance
 from ultrasound.bmode import source_of_pixels
-from ultrasound.ground_truth_labels import MOST_BEADS, GroundTruthLabels
+from ultrasound.ground_truth_labels import MAX_BEADS, GroundTruthLabels
 from ultrasound.image_plane import ImagePlane, PlaneInTissue
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import advanced, touching
@@ -32,7 +32,7 @@ BEAD_RADIUS_MM, BEADS_APART_MM, BEADS_WITHIN_MM = 1.5, 9.0, 24.0
 
 @dataclass
 class GroundTruthSweep:
-    """A sweep of ``Mark`` images with the true poses (n, 4, 4) of the probe in the patient, and the beads (k, 3) at rest (LPS, mm).
+    """A sweep of ``PixelLabel`` images with the true poses (n, 4, 4) of the probe in the patient, and the beads (k, 3) at rest (LPS, mm).
 
     ``on_probe`` (4, 4) is ImageToProbe, ``mask`` (rows, columns) is True in the field of view.
     """
@@ -55,8 +55,8 @@ def beads_of(organ: trimesh.Trimesh, tumour: trimesh.Trimesh | None) -> np.ndarr
     near = grid[np.linalg.norm(grid - middle, axis=1) < BEADS_WITHIN_MM]
     depth = -signed_distance(organ.vertices, organ.faces, near)[0]
     inside = near[depth > 2 * BEAD_RADIUS_MM]
-    # At most MOST_BEADS, those nearest to the middle.
-    nearest = np.argsort(np.linalg.norm(inside - middle, axis=1), kind="stable")[:MOST_BEADS]
+    # At most MAX_BEADS, those nearest to the middle.
+    nearest = np.argsort(np.linalg.norm(inside - middle, axis=1), kind="stable")[:MAX_BEADS]
     return inside[np.sort(nearest)]
 
 
@@ -73,7 +73,7 @@ def resting(anatomy: LoadedAnatomy, probe: Probe, direction: np.ndarray, pixels:
     images = []
     for pose in poses:
         scanner.embedding.update()
-        scanner.plane.take(ImagePlane(pose, *probe.extent_mm))
+        scanner.plane.locate(ImagePlane(pose, *probe.extent_mm))
         images.append(marks.render())
     return _truth(np.stack(images), poses, np.arange(len(poses)) / FRAMES_A_SECOND, probe, beads)
 
@@ -109,7 +109,7 @@ def pressed(rehearsal: Rehearsal, depth_mm: float) -> GroundTruthSweep:
         if step % every == 0:
             rehearsal.update_surfaces()
             rehearsal.embedding.update()
-            rehearsal.scanner.plane.take(rehearsal.image_plane())
+            rehearsal.scanner.plane.locate(rehearsal.image_plane())
             images.append(marks.render())
             poses.append(probe_in_patient(rehearsal))
             compression.append(measure(rehearsal, probe, touches).compression_mm)

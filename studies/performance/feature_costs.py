@@ -15,7 +15,7 @@ from rehearsal.frame_view import image_view, initial_settings, probe_with_settin
 from rehearsal.measurements.run_report import Tally
 from rehearsal.rehearsal import SURROUNDINGS_MM, Rehearsal, scanned_anatomy
 from rehearsal.stopwatch import timed
-from render.background_image import Page
+from render.background_image import BackgroundImage
 from render.window_layout import WindowLayout
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Contact, Scene, SolverSection, with_options
@@ -29,7 +29,7 @@ from sim.signed_distance import distance_grid
 from sim.solver import Solver
 from studies.performance.step_timing import memory_mb
 from ultrasound.probe import DetailLevel, Mode
-from ultrasound.probe_manipulator import advanced, between, image_plane, pose_at, touching
+from ultrasound.probe_manipulator import advanced, image_plane, pose_at, poses_between, touching
 from ultrasound.scanner import ScannedAnatomy, Scanner
 
 # Depth and steps of the press, and the steps before it in which the body settles.
@@ -130,7 +130,9 @@ class FeatureBody:
         if not solver.has_tool:
             return None
         depth = PRESS_MM * np.clip((step + np.array([0, 1]) - SETTLE_STEPS) / PRESS_STEPS, 0, 1)
-        return between(advanced(self.home, depth[0]), advanced(self.home, depth[1]), self.settings.substeps)
+        return poses_between(
+            advanced(self.home, depth[0]), advanced(self.home, depth[1]), self.settings.substeps
+        )
 
 
 def body_of(scene: Scene, anatomy: LoadedAnatomy, model: str, size_mm: float) -> FeatureBody:
@@ -234,7 +236,7 @@ def _images(rehearsal: Rehearsal, scanned: ScannedAnatomy) -> Iterator[dict[str,
         scanner = Scanner(scanned, embedding, probe, image.pixels, outside)
 
         def draw() -> None:
-            scanner.look(plane, probe, mode, detail_level, image.window_hu, image.level_hu)
+            scanner.images(plane, probe, mode, detail_level, image.window_hu, image.level_hu)
 
         yield _alone(f"image, {name}", draw, [embedding, scanner], rehearsal.model)
 
@@ -242,7 +244,7 @@ def _images(rehearsal: Rehearsal, scanned: ScannedAnatomy) -> Iterator[dict[str,
 def _whole_frame(rehearsal: Rehearsal) -> dict[str, Any]:
     """A whole frame but the 3D view: a step in a press, surfaces, B-mode and the composed window."""
     rehearsal.reset()
-    settings, tally, page = initial_settings(rehearsal), Tally(0.0), Page(WindowLayout(1280, 720))
+    settings, tally, page = initial_settings(rehearsal), Tally(0.0), BackgroundImage(WindowLayout(1280, 720))
     settings.mode = "b-mode"
     poses = [
         rehearsal.pose_at_depth(depth)
@@ -256,7 +258,7 @@ def _whole_frame(rehearsal: Rehearsal) -> dict[str, Any]:
         rehearsal.advance(poses.pop(0))
         rehearsal.update_surfaces()
         probe = probe_with_settings(rehearsal.probe, settings)
-        page.compose(image_view(rehearsal, probe, settings, tally), np.eye(3), patient=True)
+        page.compose(image_view(rehearsal, probe, settings, tally), np.eye(3), slow_figures=True)
 
     return _alone("whole frame, with B-mode", compute_frame, whole, None)
 

@@ -23,7 +23,7 @@ from sim.solver import Solver, StepSettings
 from studies.performance.lower_bound import Bound, NoBound, Pypbd
 from studies.performance.step_phases import Phases, without_calls
 from studies.uniform_blocks import block_of_cells, block_of_particles
-from ultrasound.probe_manipulator import advanced, between
+from ultrasound.probe_manipulator import advanced, poses_between
 
 AWAY_MM = 100.0
 # The particle distance of a block is the paper's smallest.
@@ -64,12 +64,12 @@ def press(
     pressed = max(1, round(share * script / dt))
     away = advanced(rehearsal.manipulator.home, -AWAY_MM)
     for n in range(warm_up):
-        step(settings, between(away, away, settings.substeps))
+        step(settings, poses_between(away, away, settings.substeps))
         yield (n + 1) * dt
     pose = rehearsal.scripted_pose(0.0)
     for n in range(pressed):
         goal = rehearsal.scripted_pose(script * (n + 1) / pressed)
-        step(settings, between(pose, goal, settings.substeps))
+        step(settings, poses_between(pose, goal, settings.substeps))
         pose = goal
         yield (warm_up + n + 1) * dt
 
@@ -78,7 +78,7 @@ def measure(rehearsal: Rehearsal, setup: Setup, share: float, arch: str) -> Time
     """Press twice: once timed as a whole, once piece by piece; the first step, which compiles, is not timed."""
     solver = rehearsal.solver
     phases = Phases(solver)
-    home = between(rehearsal.manipulator.home, rehearsal.manipulator.home, rehearsal.settings.substeps)
+    home = poses_between(rehearsal.manipulator.home, rehearsal.manipulator.home, rehearsal.settings.substeps)
     phases.step(rehearsal.settings, home)
     step_ms: list[float] = []
     pieces: list[dict[str, float]] = []
@@ -149,7 +149,7 @@ def compare(rehearsal: Rehearsal) -> tuple[dict[str, Any], list[str]]:
     iterations = settings.substeps * settings.iterations
     alone = Solver(ShapeMatching(model.body, model.patches))
     pose = rehearsal.scripted_pose(rehearsal.script_length_s())
-    poses = between(pose, pose, settings.substeps)
+    poses = poses_between(pose, pose, settings.substeps)
     others, missing = _others(model, iterations)
     runs = {
         "step_ms": lambda: _one(lambda: solver.step(settings, poses)),

@@ -15,7 +15,7 @@ from sim.device import start
 from studies.accuracy.bead_case import BeadCase
 from studies.accuracy.bead_errors import bead_errors
 from studies.accuracy.bead_experiment import BeadExperiment
-from ultrasound.probe_manipulator import between
+from ultrasound.probe_manipulator import poses_between
 
 # The machine's speed changes within minutes: every setting is timed in each round, and the median is taken.
 ROUNDS, TIMED_STEPS = 3, 45
@@ -78,10 +78,10 @@ def _time(experiment: BeadExperiment, setup: Setup) -> float:
     short = replace(setup, warm_up_steps=10)
     step = experiment.prepare(short)
     first, last = experiment.case.poses[0], experiment.case.poses[-1]
-    path = between(experiment.relative(first), experiment.relative(last), TIMED_STEPS)
+    path = poses_between(experiment.relative(first), experiment.relative(last), TIMED_STEPS)
     ms: list[float] = []
     for n in range(TIMED_STEPS):
-        poses = between(path[n], path[n + 1], step.substeps)
+        poses = poses_between(path[n], path[n + 1], step.substeps)
         timed(lambda: experiment.solver.step(step, poses), ms)
     return float(np.median(ms))
 

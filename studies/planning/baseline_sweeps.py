@@ -52,7 +52,7 @@ def planned(trial: Trial, sweep: PlannedSweep) -> SweepPath:
 def _seen_from_above(trial: Trial) -> tuple[SweepLayout, np.ndarray]:
     """A layout over the target's middle along the scene's press, and half of the target's size across and along (2,) [mm]."""
     coverage, press = trial.coverage, trial.rehearsal.press
-    places = coverage.places(trial.target)
+    places = coverage.voxel_centres(trial.target)
     layout = layout_towards(places.mean(axis=0), -np.array(press.direction), np.array(press.lateral))
     return layout, half_extent_mm(layout, places)
 

@@ -15,7 +15,7 @@ from rehearsal import frame, headless, run
 from rehearsal.commands import rehearse_command
 from rehearsal.frame import Frames, WindowFrames
 from rehearsal.notices import Notices
-from render.keys import USUAL_KEYS, Keys
+from render.keys import DEFAULT_KEYS, Keys
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
 from scenes.scene import EMBEDDED
@@ -152,7 +152,7 @@ def test_a_sweep_that_is_recorded_stands_in_the_panel_beside_all_else(looping, m
 
 
 def test_notices_name_the_users_keys_on_the_screen_and_in_the_terminal(looping, capsys):
-    looping.keys = Keys(of=USUAL_KEYS | {"sweep": "Space", "plan_for": "L"})
+    looping.keys = Keys(of=DEFAULT_KEYS | {"sweep": "Space", "plan_for": "L"})
     looping.notices.post("sweep-001: {sweep} ends it")
     assert looping.frame(Controls(Settings())).status == "Sweep-001: Space ends it"
     assert capsys.readouterr().out == "sweep-001: Space ends it\n"
@@ -200,7 +200,7 @@ def test_the_clock_is_the_sessions_and_says_where_it_is_slow(looping):
 def test_without_contact_whoever_leads_by_hand_is_told_how_to_press(looping, monkeypatch):
     monkeypatch.setattr(Fake, "onto", lambda each, view, _: replace(view, notes={"B-mode": "NO CONTACT"}))
     monkeypatch.setattr(frame, "UserInput", SimpleNamespace)
-    looping.keys = Keys({**USUAL_KEYS, "push": "Return"})
+    looping.keys = Keys({**DEFAULT_KEYS, "push": "Return"})
     monkeypatch.setattr(frame, "ReplayInput", Fake)
     by_hand, tracked = (SimpleNamespace(is_manual=each) for each in (True, False))
     told = []

@@ -95,7 +95,7 @@ def test_a_way_back_is_looked_at_and_read_anew_at_once(watching, rehearsal, one_
     monkeypatch.setattr(live_measurements, "measure", lambda *_: Measurement(next(depths), 20.0))
     lines = np.ones(rehearsal.probe.number_of_scanlines, bool)
     looks = iter([lines, ~lines])
-    monkeypatch.setattr(watching.coverage, "look", lambda *_: next(looks))
+    monkeypatch.setattr(watching.coverage, "add", lambda *_: next(looks))
     noted: list[float] = []
     watching._coverage_every = 2
     session = SimpleNamespace(step_index=0, kept_states={}, rolled_back_to=None)
@@ -114,7 +114,7 @@ def test_a_session_that_begins_is_read_with_what_touches_then(watching, rehearsa
         live_measurements, "measure", lambda *asked: given.append(asked[-1]) or Measurement(1.0, 20.0)
     )
     touches = np.arange(rehearsal.probe.number_of_scanlines) < 30
-    monkeypatch.setattr(watching.coverage, "look", lambda *_: touches)
+    monkeypatch.setattr(watching.coverage, "add", lambda *_: touches)
     watching._coverage_every = 2
     for _ in range(2):
         session = SimpleNamespace(step_index=1, kept_states={}, rolled_back_to=None, note=lambda *_: None)
@@ -131,7 +131,7 @@ def test_another_plan_brings_its_margin_and_what_was_seen_stays(watching, rehear
     assert watching.coverage is before
     watching.follow(PlanGuidance(rehearsal, plan_of(margin_mm=2.0)))
     assert watching.margin_mm == 2.0 and watching.coverage.targets["margin"].sum() < volume / 2
-    assert watching.coverage.share("tumour") == 1.0 and watching.guide.plan.margin_mm == 2.0
+    assert watching.coverage.fraction("tumour") == 1.0 and watching.guide.plan.margin_mm == 2.0
     assert LiveMeasurements(rehearsal).margin_mm == live_measurements.MARGIN_MM
 
 
@@ -142,7 +142,7 @@ def test_an_echo_is_said_to_be_black_where_hardly_a_line_touches(
     one_device, watching, rehearsal, monkeypatch, touching, notes
 ):
     touches = np.arange(rehearsal.probe.number_of_scanlines) < touching
-    monkeypatch.setattr(watching.coverage, "look", lambda *_: touches)
+    monkeypatch.setattr(watching.coverage, "add", lambda *_: touches)
     watching.watch(
         SimpleNamespace(step_index=0, kept_states={}, rolled_back_to=None, note=lambda *_: None),
         rehearsal.probe,

@@ -15,7 +15,7 @@ from rehearsal.sessions.undo_history import MOST_UNDONE, History
 from render import plan_lines, transducer_shape
 from render.actions import begin
 from render.keys import Keys
-from render.plan_lines import GONE, TO_GO, GuideLines
+from render.plan_lines import DONE, TO_GO, PlanLines
 from render.viewer import Controls, Guidance, Settings
 from sim.fields import array_of
 from ultrasound.probe_manipulator import advanced
@@ -45,7 +45,7 @@ def test_a_plan_followed_exactly_is_completed_without_deviation():
         assert guide.followed == pytest.approx(number / 7)
         guide.watch(pose)
     assert guide.figures() == pytest.approx(dict(plan_followed=1.0, plan_off_mm=0.0, plan_off_deg=0.0))
-    assert guide.guidance().goal is None and guide.guidance().gone.all()
+    assert guide.guidance().goal is None and guide.guidance().done.all()
     assert guide.findings() == {"plan": "100 %", "off plan": "0.0 mm 0 deg"}
     assert guide.in_words(0.5) == (
         "plan      two passes: 100 % completed, mean deviation 0.0 mm and 0 degrees; coverage of margin 50 % (planned 75 %)"
@@ -100,12 +100,12 @@ def test_the_path_is_drawn_on_each_pass_and_not_between_them():
     guide = guide_of()
     places = [[0.0, 2 * n, 0.0] for n in range(4)], [[20.0, 2 * n, 0.0] for n in range(3)]
     segments = [[a, b] for each in places for a, b in pairwise(each)]
-    assert guide.guidance().way_mm == pytest.approx(np.array(segments) + [0, 0, ABOVE_MM])
-    gone = []
+    assert guide.guidance().path_mm == pytest.approx(np.array(segments) + [0, 0, ABOVE_MM])
+    done = []
     for pose in [*FIRST, *SECOND]:
         guide.watch(pose)
-        gone.append(guide.guidance().gone.sum())
-    assert gone == [0, 1, 2, 3, 3, 4, 5]
+        done.append(guide.guidance().done.sum())
+    assert done == [0, 1, 2, 3, 3, 4, 5]
 
 
 def test_some_poses_may_be_skipped_and_progress_does_not_go_back():
@@ -144,7 +144,7 @@ def test_the_sweeps_are_shown_in_turn_and_then_none():
     guide.watch(FIRST[0])
     assert guide.guidance() is None and guide.figures() == {} == guide.findings()
     assert guide.in_words(0.5) == "" and guide.followed == 0.0
-    assert guide.next_sweep() == "Plan 1: two passes, covers 75 %" and len(guide.guidance().way_mm) == 3
+    assert guide.next_sweep() == "Plan 1: two passes, covers 75 %" and len(guide.guidance().path_mm) == 3
 
 
 def test_a_restart_clears_the_progress():
@@ -284,7 +284,7 @@ class Drawn:
 EDGES = transducer_shape.edges(SIZE, 0.0)
 
 
-def drawn(lines: GuideLines, guidance: Guidance) -> tuple[np.ndarray, np.ndarray, list]:
+def drawn(lines: PlanLines, guidance: Guidance) -> tuple[np.ndarray, np.ndarray, list]:
     """Segments (n, 2, 3) that have a length, their colours (n, 3), and what else was drawn."""
     scene = Drawn()
     lines.draw(scene, guidance)
@@ -296,24 +296,24 @@ def drawn(lines: GuideLines, guidance: Guidance) -> tuple[np.ndarray, np.ndarray
 
 
 def test_the_completed_part_of_the_path_has_another_colour(one_device):
-    guide, lines = guide_of(), GuideLines(EDGES)
+    guide, lines = guide_of(), PlanLines(EDGES)
     for pose in [None, *FIRST[:3]]:
         if pose is not None:
             guide.watch(pose)
         guidance = guide.guidance()
         segments, colours, (goal,) = drawn(lines, guidance)
-        assert segments == pytest.approx(guidance.way_mm)
-        assert np.array_equal(colours, np.where(guidance.gone[:, None], GONE, TO_GO))
+        assert segments == pytest.approx(guidance.path_mm)
+        assert np.array_equal(colours, np.where(guidance.done[:, None], DONE, TO_GO))
         assert goal[0] == pytest.approx(transducer_shape.placed(EDGES, guidance.goal), abs=1e-5)
     for pose in [FIRST[3], *SECOND]:
         guide.watch(pose)
     _, colours, more = drawn(lines, guide.guidance())
-    assert (colours == GONE).all() and more == []
+    assert (colours == DONE).all() and more == []
 
 
 def test_two_sweeps_shown_in_turn_have_their_own_lines(one_device):
     """Arrays that are freed leave their identity to others."""
-    lines, goal = GuideLines(EDGES), np.eye(4)
+    lines, goal = PlanLines(EDGES), np.eye(4)
     for number in range(20):
         way = np.array([[[number, 0.0, 0.0], [number, 1.0, 0.0]]])
         segments, _, _ = drawn(lines, Guidance(goal, way, np.zeros(1, bool)))
@@ -324,10 +324,10 @@ def test_two_sweeps_shown_in_turn_have_their_own_lines(one_device):
 def test_every_second_segment_of_a_path_with_too_many_is_drawn(one_device, monkeypatch):
     monkeypatch.setattr(plan_lines, "MOST_SEGMENTS", 10)
     way = np.arange(15 * 6, dtype=float).reshape(15, 2, 3)
-    gone = np.arange(15) < 7
-    segments, colours, _ = drawn(GuideLines(EDGES), Guidance(None, way, gone))
+    done = np.arange(15) < 7
+    segments, colours, _ = drawn(PlanLines(EDGES), Guidance(None, way, done))
     assert segments == pytest.approx(way[::2])
-    assert np.array_equal(colours, np.where(gone[::2, None], GONE, TO_GO))
+    assert np.array_equal(colours, np.where(done[::2, None], DONE, TO_GO))
 
 
 # Keys

@@ -14,7 +14,7 @@ from rehearsal.result_files import rounded, save_figure, spread, write_csv, writ
 from scenes.surfaces import translated, volume_mm3
 from studies.robustness.rigid_fit import distances_after_fit
 from ultrasound.probe import load_probe
-from ultrasound.scanner import ECHO
+from ultrasound.scanner import B_MODE
 
 
 def test_what_json_has_no_number_for_is_none():
@@ -44,7 +44,7 @@ def test_a_full_disk_leaves_what_was_there(tmp_path, bytes_to_a_file):
     """Of figures, tables, pictures and DICOM, and nothing that is half written."""
     figure, probe = Figure(), load_probe("linear")
     figure.subplots().plot(np.arange(100))
-    grey = {ECHO: np.random.default_rng(4).integers(0, 255, (64, 64), np.uint8)}
+    grey = {B_MODE: np.random.default_rng(4).integers(0, 255, (64, 64), np.uint8)}
     writers = {
         "a.json": lambda: write_json({"mm": [1.5] * 999}, tmp_path / "a.json"),
         "a.csv": lambda: write_csv([dict(mm=1.5)] * 999, tmp_path / "a.csv"),

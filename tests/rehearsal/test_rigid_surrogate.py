@@ -63,7 +63,7 @@ def test_the_surrogate_agrees_with_counting_voxels_one_by_one(monkeypatch, name)
     length = float(probe.housing_mm[2])
     path = path_over_the_tumour(length)
     terms = found.evaluate(path)
-    places = coverage.low_mm + VOXEL_MM * np.argwhere(coverage.targets["tumour"])
+    places = coverage.origin_mm + VOXEL_MM * np.argwhere(coverage.targets["tumour"])
     surely, perhaps = np.zeros(len(places), bool), np.zeros(len(places), bool)
     for pose in path.poses:
         slack = [shown_by(probe, pose, length, places, off) for off in (-0.3, 0.3)]

@@ -121,7 +121,7 @@ def watching(frames: int, take_over_at: int = -1) -> Any:
             press = 0 <= take_over_at < frame
             news = "Gamepad ready" if frame == 0 else ""
             last = frame == frames - 1
-            yield Controls(settings, take_over=frame == take_over_at, press=press, quit=last, news=news)
+            yield Controls(settings, take_over=frame == take_over_at, press=press, quit=last, message=news)
 
     return script
 

@@ -19,7 +19,7 @@ from scenes.tissue import NeoHookeanTissue
 from sim.body import BodyState
 from sim.divergence_check import DivergenceState
 from sim.solver import SolverState, StepSettings
-from ultrasound.probe_manipulator import ManipulatorState, ProbeManipulator, approached, pose_at, touching
+from ultrasound.probe_manipulator import ManipulatorState, ProbeManipulator, moved_towards, pose_at, touching
 
 # A power of two, so that times are exact: 4 steps are PAUSE_S, 40 are LONGEST_S.
 STEP_S = 1 / 8
@@ -77,7 +77,7 @@ class Numbers:
         self.watch = DivergenceState(self._solver())
 
     def pose_towards(self, goal: np.ndarray) -> np.ndarray:
-        return approached(self.pose, goal, 150.0 * STEP_S, 180.0 * STEP_S)
+        return moved_towards(self.pose, goal, 150.0 * STEP_S, 180.0 * STEP_S)
 
     def set_young(self, young_kpa: float) -> None:
         self.young_kpa = young_kpa
@@ -396,4 +396,4 @@ def test_a_press_by_a_share_goes_no_deeper():
     for _ in range(30):
         step(live, press=True, press_share=0.5)
     manipulator = live.session.rehearsal.manipulator
-    assert manipulator.pressed_mm == pytest.approx(manipulator.most_mm / 2)
+    assert manipulator.pressed_mm == pytest.approx(manipulator.max_mm / 2)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from render.animation import PICTURES_A_SECOND, save_animation, smaller
+from render.animation import ANIMATION_FPS, save_animation, scaled_down
 
 
 def test_an_animation_runs_in_real_time_for_ever_and_keeps_its_greys(tmp_path):
-    count = PICTURES_A_SECOND * 2
+    count = ANIMATION_FPS * 2
     ramp = np.tile(np.linspace(0, 255, 1280).astype(np.uint8), (720, 1))
-    frames = [smaller(Image.fromarray(np.roll(ramp, 32 * i, axis=1))) for i in range(count)]
+    frames = [scaled_down(Image.fromarray(np.roll(ramp, 32 * i, axis=1))) for i in range(count)]
     save_animation(frames, tmp_path / "press.webp")
     with Image.open(tmp_path / "press.webp") as animation:
         assert (animation.size, animation.n_frames, animation.info["loop"]) == ((960, 540), count, 0)

@@ -5,14 +5,14 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from render.background_image import Page
+from render.background_image import BackgroundImage
 from render.camera import OrbitCamera
 from render.compass import ARM, compass_picture, ends_of
-from render.keys import USUAL_KEYS, Keys
+from render.keys import DEFAULT_KEYS, Keys
 from render.sliders import boxes_of, groups_of
 from render.text import fitting_size, font, shortened, write
-from render.ultrasound_panel import ALERT, BEFORE, CALLIPER, OUTLINE, QUIET, TEXT
-from render.viewer import Geometry, Settings, View
+from render.ultrasound_panel import ALERT, CALIPER, OUTLINE, OUTLINE_AT_REST, QUIET, TEXT
+from render.viewer import SCANNER_GROUPS, Geometry, Settings, View
 from render.window_frame import clock_box, findings_picture, readout_picture
 from render.window_layout import Rect, WindowLayout
 
@@ -30,7 +30,7 @@ def view(**changes) -> View:
     )
 
 
-def composed(page: Page, **changes) -> np.ndarray:
+def composed(page: BackgroundImage, **changes) -> np.ndarray:
     """The page (rows, columns, 3) with a view on it."""
     page.compose(view(**changes), AXES)
     return page.pixels.transpose(1, 0, 2)[::-1, :, :3].copy()
@@ -66,8 +66,8 @@ def test_no_part_of_the_window_overlaps_another(size):
     layout = WindowLayout(*size)
     settings = Settings(young_kpa=15.0, show_scanner=True)
     placed = boxes_of(settings, WHOLE, layout)
-    over = [layout.findings(layout.most_findings), layout.compass, placed["Echo"], placed["Gain over depth"]]
-    below = [box for name, box in placed.items() if name not in ("Echo", "Gain over depth")]
+    over = [layout.findings(layout.most_findings), layout.compass, *(placed[name] for name in SCANNER_GROUPS)]
+    below = [box for name, box in placed.items() if name not in SCANNER_GROUPS]
     parts = [*over, *below, layout.readouts, *picture_boxes(layout)]
     for one, other in combinations(parts, 2):
         assert apart(one, other) or 0 in (*one[2:], *other[2:])
@@ -81,17 +81,17 @@ def test_no_part_of_the_window_overlaps_another(size):
             assert area.top <= box.top and box.bottom <= area.bottom
 
 
-def test_echo_and_ct_of_the_drop_in_probe_fill_the_panel():
+def test_b_mode_and_ct_of_the_drop_in_probe_fill_the_panel():
     box = picture_boxes(LAYOUT)[0]
     assert box.height > 0.95 * (720 - 74 - 52) and LAYOUT.scene.width > 720
 
 
 @each_size
-def test_the_first_sliders_go_where_there_is_no_room(size):
+def test_the_first_sliders_are_left_out_where_there_is_no_room(size):
     layout = WindowLayout(*size)
     names = list(boxes_of(Settings(young_kpa=15.0), WHOLE, layout))
     assert (layout.readouts.width == 0) == (size in ((700, 420), (1024, 576)))
-    assert names == (["Picture", "View"] if size == (700, 420) else ["Tissue", "Picture", "View"])
+    assert names == (["Image", "View"] if size == (700, 420) else ["Tissue", "Image", "View"])
 
 
 @pytest.mark.parametrize("width", [*range(704, 1600, 64), 1250])
@@ -107,7 +107,7 @@ def test_labels_of_sliders_are_whole(width, tissue):
             assert label <= (box.width - 35 if name == "View" else 0.35 * box.width - 16)
 
 
-def test_what_is_not_there_has_no_slider():
+def test_a_missing_structure_has_no_slider():
     def named(shown: Geometry) -> set[str]:
         groups = groups_of(Settings(young_kpa=15.0), shown)
         return {each.name for members in groups.values() for each in members}
@@ -148,7 +148,7 @@ def test_the_font_is_as_large_as_fits():
     assert fitting_size(rows, 900, 15) == 15
 
 
-def test_what_is_written_lies_in_its_box_or_is_left_out():
+def test_a_text_is_in_its_box_or_left_out():
     page, box = np.full((60, 90, 4), 200, np.uint8), Rect(10, 5, 70, 40)
     write(page, box, (12.0, 6.0), "12.3 mm", 13, (0, 255, 0))
     rows, columns = np.nonzero((page[..., :3] != 200).any(axis=-1))
@@ -166,12 +166,14 @@ def test_what_is_written_lies_in_its_box_or_is_left_out():
 # Over the pictures
 
 
-def test_no_contact_is_written_in_the_echo_alone():
-    plain, noted = (composed(Page(LAYOUT), notes=notes) for notes in ({}, {"B-mode": "NO CONTACT"}))
-    echo, ct = picture_boxes(LAYOUT)
-    at = coloured(noted, echo, QUIET)
-    assert len(at) > 100 and len(coloured(plain, echo, QUIET)) == 0
-    assert at.mean(axis=0) == pytest.approx([echo.height / 2, echo.width / 2], abs=6)
+def test_no_contact_is_written_in_the_b_mode_image_only():
+    plain, noted = (
+        composed(BackgroundImage(LAYOUT), notes=notes) for notes in ({}, {"B-mode": "NO CONTACT"})
+    )
+    b_mode, ct = picture_boxes(LAYOUT)
+    at = coloured(noted, b_mode, QUIET)
+    assert len(at) > 100 and len(coloured(plain, b_mode, QUIET)) == 0
+    assert at.mean(axis=0) == pytest.approx([b_mode.height / 2, b_mode.width / 2], abs=6)
     assert np.array_equal(plain[ct.slices], noted[ct.slices])
 
 
@@ -180,13 +182,14 @@ def test_no_contact_is_written_in_the_echo_alone():
 def test_what_to_do_stands_whole_under_a_note(size, hint):
     layout = WindowLayout(*size)
     plain, hinted = (
-        composed(Page(layout), notes={"B-mode": note}) for note in ("NO CONTACT", f"NO CONTACT\n{hint}")
+        composed(BackgroundImage(layout), notes={"B-mode": note})
+        for note in ("NO CONTACT", f"NO CONTACT\n{hint}")
     )
-    echo = layout.picture_boxes(2, 16.0, 40.0)[0]
+    b_mode = layout.picture_boxes(2, 16.0, 40.0)[0]
     rows, columns = np.nonzero((plain != hinted).any(axis=2))
-    assert echo.left <= columns.min() and columns.max() < echo.right
-    assert np.ptp(columns) > 0.4 * echo.width
-    noted = coloured(plain, echo, QUIET)[:, 0].max() + echo.top
+    assert b_mode.left <= columns.min() and columns.max() < b_mode.right
+    assert np.ptp(columns) > 0.4 * b_mode.width
+    noted = coloured(plain, b_mode, QUIET)[:, 0].max() + b_mode.top
     assert noted < rows.min() and rows.max() < noted + 50
 
 
@@ -202,7 +205,7 @@ def test_what_to_do_stands_whole_under_a_note(size, hint):
 )
 def test_the_calipers_figure_stands_at_its_line(points):
     bare, told = (
-        composed(Page(LAYOUT), caliper_mm=points, caliper=figure)
+        composed(BackgroundImage(LAYOUT), caliper_mm=points, caliper=figure)
         for figure in ("", "24.0 mm\nat rest 25.1 mm")
     )
     for box in picture_boxes(LAYOUT):
@@ -214,7 +217,7 @@ def test_the_calipers_figure_stands_at_its_line(points):
         # A line down the right half has it on its left, one down the left half on its right.
         assert points[0][0] != points[1][0] or (changed[:, 1].mean() - middle[1]) * points[0][0] < 0
         # The line stays whole.
-        assert len(coloured(told, box, CALLIPER)) > len(coloured(bare, box, CALLIPER))
+        assert len(coloured(told, box, CALIPER)) > len(coloured(bare, box, CALIPER))
     outside = np.ones(bare.shape[:2], bool)
     for box in picture_boxes(LAYOUT):
         outside[box.slices] = False
@@ -223,11 +226,11 @@ def test_the_calipers_figure_stands_at_its_line(points):
 
 def test_outlines_have_a_legend_under_the_picture():
     plain, outlined = (
-        composed(Page(LAYOUT), outline_mm=now, outline_before_mm=now) for now in (None, SQUARE)
+        composed(BackgroundImage(LAYOUT), outline_mm=now, outline_before_mm=now) for now in (None, SQUARE)
     )
     foot = picture_boxes(LAYOUT)[0].bottom
     under = Rect(LAYOUT.panel.left, foot, LAYOUT.panel.width, 24)
-    for colour in (OUTLINE, BEFORE):
+    for colour in (OUTLINE, OUTLINE_AT_REST):
         assert len(coloured(outlined, under, colour)) > 30 and len(coloured(plain, under, colour)) == 0
 
 
@@ -235,13 +238,13 @@ def test_outlines_have_a_legend_under_the_picture():
 
 
 def test_findings_that_become_fewer_leave_nothing_behind():
-    page = Page(LAYOUT)
+    page = BackgroundImage(LAYOUT)
     few = composed(page, findings=dict(list(FIGURES.items())[:4]))
     assert not np.array_equal(composed(page, findings=FIGURES), few)
     assert np.array_equal(composed(page, findings=dict(list(FIGURES.items())[:4])), few)
 
 
-def test_a_figure_that_has_nothing_to_say_is_a_dash():
+def test_a_figure_without_a_value_is_a_dash():
     pictures = [findings_picture(LAYOUT, {"margin": figure}) for figure in ("", "-", "4.2 mm")]
     assert np.array_equal(pictures[0], pictures[1]) and not np.array_equal(pictures[0], pictures[2])
 
@@ -259,7 +262,7 @@ def test_all_readouts_of_a_window_are_shown(size):
 @pytest.mark.parametrize("help_key", ["H", "Backspace"])
 def test_clock_and_pace_stand_between_title_and_help_in_every_window(size, help_key):
     layout, told = WindowLayout(*size), {"clock": "1234.5 s", "title": "A long title of a patient " * 5}
-    page = Page(layout, Keys({**USUAL_KEYS, "help": help_key}))
+    page = BackgroundImage(layout, Keys({**DEFAULT_KEYS, "help": help_key}))
     box = clock_box(layout, help_key)
     bare, real, slow = (composed(page, **told | more) for more in ({"clock": ""}, {}, {"pace": "0.2 x real"}))
     assert set(np.unique(bare[box.slices])) == {17, 20, 24}
@@ -272,26 +275,28 @@ def test_clock_and_pace_stand_between_title_and_help_in_every_window(size, help_
 
 
 @each_size
-def test_findings_grow_with_their_lines_and_the_last_go_where_room_ends(size):
+def test_findings_grow_with_their_lines_and_the_last_are_left_out(size):
     layout = WindowLayout(*size)
     assert layout.findings(11).height > layout.findings(9).height
     assert layout.most_findings >= (11 if size != (700, 420) else 7)
-    empty, full = (composed(Page(layout), findings=figures, alert="figure 0") for figures in ({}, FIGURES))
+    empty, full = (
+        composed(BackgroundImage(layout), findings=figures, alert="figure 0") for figures in ({}, FIGURES)
+    )
     rows = np.flatnonzero((empty != full).any(axis=(1, 2)))
     assert rows.max() < layout.compass.top
     assert len(coloured(full, layout.findings(1), ALERT)) > 20
 
 
 def test_the_help_covers_all_and_leaves_nothing_behind():
-    page = Page(LAYOUT)
+    page = BackgroundImage(LAYOUT)
     before = composed(page, findings=FIGURES)
     box = picture_boxes(LAYOUT)[0]
-    assert page.place_at(box.left + 5, box.top + 5) == pytest.approx(
+    assert page.plane_point_at(box.left + 5, box.top + 5) == pytest.approx(
         page.panel.to_plane(box, box.left + 5, box.top + 5)
     )
     page.show_help()
     helped = page.pixels.transpose(1, 0, 2)[::-1, :, :3]
-    assert np.ptp(helped[-1], axis=0).max() == 0 and page.place_at(box.left + 5, box.top + 5) is None
+    assert np.ptp(helped[-1], axis=0).max() == 0 and page.plane_point_at(box.left + 5, box.top + 5) is None
     assert np.array_equal(composed(page, findings=FIGURES), before)
 
 
@@ -327,7 +332,7 @@ def test_what_points_up_in_the_compass_is_drawn_up():
 
 
 def test_the_compass_is_drawn_anew_when_the_camera_turns():
-    page, turned = Page(LAYOUT), np.array([[0, 0, -1.0], [1.0, 0, 0], [0, 1.0, 0]])
+    page, turned = BackgroundImage(LAYOUT), np.array([[0, 0, -1.0], [1.0, 0, 0], [0, 1.0, 0]])
     box = LAYOUT.compass
     first = composed(page)[box.slices]
     assert np.array_equal(first, compass_picture(LAYOUT, AXES))

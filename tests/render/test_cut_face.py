@@ -8,7 +8,7 @@ import trimesh
 from conftest import rotation_about
 
 from render import cut_face
-from render.cut_face import Raster, section, side_of_eye
+from render.cut_face import Raster, oriented_section, side_of_eye
 from sim.fields import array_of, field_of
 
 RADIUS = 12.0
@@ -25,7 +25,7 @@ def plane(at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0), degrees=0.0) -> np.ndarray:
 def test_a_ball_is_cut_in_a_circle(ball, height, degrees):
     pose = plane(axis=(0.3, 0.2, 1.0), degrees=degrees)
     pose[:3, 3] = [1.0, -2.0, 0.5] + height * pose[:3, 1]
-    segments = section(ball.vertices + [1.0, -2.0, 0.5], ball.faces, pose)
+    segments = oriented_section(ball.vertices + [1.0, -2.0, 0.5], ball.faces, pose)
     # The chords of the ball's triangles lie 2 % of its radius in at most.
     true = np.sqrt(RADIUS**2 - height**2)
     away = np.linalg.norm(segments, axis=-1)
@@ -36,12 +36,12 @@ def test_a_ball_is_cut_in_a_circle(ball, height, degrees):
 
 
 def test_a_plane_that_misses_cuts_nothing(ball):
-    assert section(ball.vertices, ball.faces, plane((0, 12.5, 0))).shape == (0, 2, 2)
+    assert oriented_section(ball.vertices, ball.faces, plane((0, 12.5, 0))).shape == (0, 2, 2)
 
 
 def test_a_block_covers_the_cells_that_it_covers(block):
     # 24 x 16 mm in x and z, the middle 3 mm aside.
-    segments = section(block.vertices + [3.0, 0.0, 0.0], block.faces, plane())
+    segments = oriented_section(block.vertices + [3.0, 0.0, 0.0], block.faces, plane())
     raster = Raster.around([segments], 61)
     covered = raster.covered(segments)
     u, v = raster.places().reshape(61, 61, 2).transpose(2, 0, 1)
@@ -58,7 +58,7 @@ def test_a_block_covers_the_cells_that_it_covers(block):
 def test_a_hole_is_not_covered(ball):
     hole = trimesh.creation.icosphere(subdivisions=3, radius=6.0)
     segments = [
-        section(each.vertices, faces, plane((0, 1, 0)))
+        oriented_section(each.vertices, faces, plane((0, 1, 0)))
         for each, faces in ((ball, ball.faces), (hole, hole.faces[:, ::-1]))
     ]
     raster = Raster.around(segments, 101)
@@ -67,7 +67,7 @@ def test_a_hole_is_not_covered(ball):
 
 
 def test_surfaces_of_either_sense_cover(ball):
-    segments = section(ball.vertices, ball.faces[:, ::-1], plane())
+    segments = oriented_section(ball.vertices, ball.faces[:, ::-1], plane())
     raster = Raster.around([segments], 61)
     assert raster.covered(segments).sum() * raster.width**2 == pytest.approx(np.pi * RADIUS**2, rel=0.02)
 
@@ -90,7 +90,7 @@ def test_without_a_section_nothing_is_covered():
         (-10, 0.0, -1),
     ],
 )
-def test_the_half_before_the_eye_goes_and_edge_on_the_one_of_before(degrees, before, side):
+def test_the_half_before_the_eye_is_removed_and_edge_on_the_side_is_kept(degrees, before, side):
     angle = np.radians(degrees)
     pose = plane((3.0, 4.0, 5.0), (0, 0, 1), 30.0)
     eye = pose[:3, :3] @ [200 * np.cos(angle), 200 * np.sin(angle), 0] + pose[:3, 3]

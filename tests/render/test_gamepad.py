@@ -9,7 +9,7 @@ import pytest
 
 from render.actions import TILT_DEG_S
 from render.gamepad import DEAD_STICK, SLIDE_MM_S, Gamepad, PadState, SdlPads, shaped
-from render.keys import BUTTONS, USUAL_BUTTONS
+from render.keys import BUTTONS, DEFAULT_BUTTONS
 from render.viewer import Controls, Settings
 
 SECONDS = 0.02
@@ -26,14 +26,14 @@ class MadeUp:
 
 
 def read(*states: PadState | None, **did) -> list[Controls]:
-    pad = Gamepad(MadeUp(*states), USUAL_BUTTONS)
+    pad = Gamepad(MadeUp(*states), DEFAULT_BUTTONS)
     found = [Controls(Settings(), **did) for _ in states]
     for controls in found:
         pad.read(controls, SECONDS)
     return found
 
 
-def test_a_stick_is_dead_near_its_middle_and_whole_at_its_end():
+def test_a_stick_has_a_dead_zone_and_full_deflection_at_its_end():
     assert shaped(0.1, -0.1) == (0.0, 0.0) and shaped(DEAD_STICK, 0.0) == (0.0, 0.0)
     assert shaped(0.0, -1.0) == pytest.approx((0.0, -1.0)) and shaped(1.0, 1.0) == pytest.approx(
         (0.5**0.5, 0.5**0.5)
@@ -43,7 +43,7 @@ def test_a_stick_is_dead_near_its_middle_and_whole_at_its_end():
     assert shaped(0.6 * half, -0.8 * half) == pytest.approx((0.15, -0.2))
 
 
-def test_sticks_slide_tilt_and_fan():
+def test_sticks_slide_rock_and_tilt():
     (controls,) = read(PadState(left=(0.0, 1.0), right=(1.0, 0.0)))
     assert controls.slide_mm == pytest.approx((0.0, SLIDE_MM_S * SECONDS))
     # To the right is towards +x, and so a negative tilt.
@@ -75,19 +75,19 @@ def test_buttons_begin_and_hold():
     assert down.undo and down.bookmark and down.reset
 
 
-def test_plugging_in_and_out_is_said_once():
+def test_connecting_and_disconnecting_is_reported_once():
     there = PadState()
-    said = [controls.news for controls in read(None, None, there, there, None, None, there)]
+    said = [controls.message for controls in read(None, None, there, there, None, None, there)]
     assert [text.split(":")[0] for text in said] == [
-        "No gamepad is plugged in",
+        "No gamepad connected",
         "",
         "Gamepad ready",
         "",
-        "Gamepad unplugged",
+        "Gamepad disconnected",
         "",
         "Gamepad ready",
     ]
-    assert read(there)[0].news == "Gamepad ready"
+    assert read(there)[0].message == "Gamepad ready"
 
 
 def test_buttons_are_numbered_as_sdl_has_them():

@@ -6,22 +6,24 @@ from conftest import ROOT
 from PIL import ImageDraw
 
 from render.keys import Keys
-from render.viewer import KEY_MAP, LINES, key_table
+from render.viewer import KEY_MAP, KEY_MAP_ENTRIES, key_table
 from render.window_frame import help_picture, in_columns
 from render.window_layout import FULL_SIZE, WindowLayout
 
 
 def test_key_map_names_every_key_and_action_once():
     for column in ("keys", "actions"):
-        values = [each.lower() for line in LINES for each in getattr(line, column)]
+        values = [each.lower() for line in KEY_MAP_ENTRIES for each in getattr(line, column)]
         assert len(set(values)) == len(values)
-    assert all(len(line.keys) == len(line.actions) for line in LINES)
-    assert len({line.text for line in LINES}) == len(LINES)
+    assert all(len(line.keys) == len(line.actions) for line in KEY_MAP_ENTRIES)
+    assert len({line.text for line in KEY_MAP_ENTRIES}) == len(KEY_MAP_ENTRIES)
 
 
 def test_key_table_has_a_row_for_every_line_and_group():
     rows = [row.split(" | ")[0] for row in key_table().splitlines()[2:]]
-    assert [row for row in rows if "**" not in row] == [f"| {' / '.join(line.keys)}" for line in LINES]
+    assert [row for row in rows if "**" not in row] == [
+        f"| {' / '.join(line.keys)}" for line in KEY_MAP_ENTRIES
+    ]
     assert [row for row in rows if "**" in row] == [f"| **{group}**" for group in KEY_MAP]
 
 

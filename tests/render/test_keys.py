@@ -9,8 +9,17 @@ from conftest import ROOT
 
 import app
 from render.actions import ACTIONS, BY_MOUSE, CYCLES, HELD, STEPS, begin, hold
-from render.keys import KEYS, USUAL_BUTTONS, USUAL_KEYS, VIEW_ALONE, Keys, KeysError, keys_text, load_keys
-from render.viewer import KEY_MAP, LINES, Controls, Settings
+from render.keys import (
+    DEFAULT_BUTTONS,
+    DEFAULT_KEYS,
+    KEYS,
+    VIEW_ACTIONS,
+    Keys,
+    KeysError,
+    keys_text,
+    load_keys,
+)
+from render.viewer import KEY_MAP, KEY_MAP_ENTRIES, Controls, Settings
 
 
 def file_of(tmp_path, text: str):
@@ -31,8 +40,8 @@ def test_every_action_does_one_thing():
         each.name for each in dataclasses.fields(Controls) if each.default is False and each.name != "press"
     }
     switches = {each.name for each in dataclasses.fields(Settings) if isinstance(each.default, bool)}
-    does = [*BY_MOUSE, *HELD, *STEPS, *CYCLES, *VIEW_ALONE, "help"]
-    for action in (each for line in LINES for each in line.actions):
+    does = [*BY_MOUSE, *HELD, *STEPS, *CYCLES, *VIEW_ACTIONS, "help"]
+    for action in (each for line in KEY_MAP_ENTRIES for each in line.actions):
         kinds = does.count(action) + (action in flags) + (action in switches)
         assert kinds == 1, action
     assert flags <= set(ACTIONS), "controls that no key reaches"
@@ -80,8 +89,8 @@ def test_the_printed_file_is_the_usual_map(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert printed == keys_text()
     keys = load_keys(file_of(tmp_path, printed))
-    assert keys.of == USUAL_KEYS and keys.buttons == USUAL_BUTTONS
-    assert load_keys(file_of(tmp_path, "")).of == USUAL_KEYS
+    assert keys.of == DEFAULT_KEYS and keys.buttons == DEFAULT_BUTTONS
+    assert load_keys(file_of(tmp_path, "")).of == DEFAULT_KEYS
 
 
 def test_a_file_changes_behaviour_help_and_words(tmp_path):
@@ -103,38 +112,38 @@ def test_a_file_changes_behaviour_help_and_words(tmp_path):
     ]
     assert dict(keys.held())["push"] == "i" and dict(keys.held())["zoom_in"] == "Up"
     groups = keys.lines()
-    assert list(groups) == list(KEY_MAP) and sum(map(len, groups.values())) == len(LINES)
+    assert list(groups) == list(KEY_MAP) and sum(map(len, groups.values())) == len(KEY_MAP_ENTRIES)
     lines = {text: key for rows in groups.values() for key, text in rows}
-    assert lines["push it in, lift it"] == "I / S" and lines["freeze and go on"] == "Space"
+    assert lines["push it in, lift it"] == "I / S" and lines["freeze and unfreeze"] == "Space"
     assert [key for key, _ in groups["Transducer"]][:2] == ["Mouse", "Left button"]
     assert keys.worded("{help} shows, {quit} quits {so} {}") == "Return shows, Esc quits {so} {}"
     assert keys.buttons["undo"] == "Guide" and keys.buttons["redo"] == "B"
 
 
 def test_every_usual_key_is_a_key_and_there_once():
-    assert set(USUAL_KEYS.values()) <= set(KEYS) and len(set(USUAL_KEYS.values())) == len(USUAL_KEYS)
-    assert [Keys().action_of(KEYS[key]) for key in USUAL_KEYS.values()] == list(USUAL_KEYS)
+    assert set(DEFAULT_KEYS.values()) <= set(KEYS) and len(set(DEFAULT_KEYS.values())) == len(DEFAULT_KEYS)
+    assert [Keys().action_of(KEYS[key]) for key in DEFAULT_KEYS.values()] == list(DEFAULT_KEYS)
     assert len(set(KEYS.values())) == len(KEYS)
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ('[keys]\npusch = "i"', "keys.pusch: no such action; did you mean push?"),
-        ('[keys]\npush = "F13"', "keys.push = 'F13': no such key; known: A B"),
-        ('[keys]\npush = "1"', "keys.push = '1': no such key; known: A B"),
+        ('[keys]\npusch = "i"', "keys.pusch: unknown action; did you mean push?"),
+        ('[keys]\npush = "F13"', "keys.push = 'F13': unknown key; known here: A, B"),
+        ('[keys]\npush = "1"', "keys.push = '1': unknown key; known here: A, B"),
         ('[keys]\npush = "Spce"', "did you mean Space?"),
-        ('[keys]\npush = "u"', "keys: push and undo are both on U; give one another"),
+        ('[keys]\npush = "u"', "keys: push and undo are both on U; change one of them"),
         ('[keys]\npush = "Space"\nlift = "space"', "keys: push and lift are both on Space"),
-        ('[keys]\npoint = "m"', "keys.point: is done with the mouse; leave it out"),
+        ('[keys]\npoint = "m"', "keys.point: is an action of the mouse; leave it out"),
         ('[gamepad]\nundo = "A"', "gamepad: freeze and undo are both on A"),
-        ('[gamepad]\nundo = "Q"', "gamepad.undo = 'Q': no such button"),
-        ('[gamepad]\nzoom_in = "Guide"', "gamepad.zoom_in: no such action"),
-        ('[gamepad]\npress = "Guide"', "gamepad.press: is done with the mouse"),
-        ("[keys]\npush = 1", "keys.push = 1: expected a text"),
-        ('[kesy]\npush = "i"', "kesy: unknown; expected the sections"),
-        ('push = "i"', "push: unknown; expected the sections"),
-        ("[keys", "cannot be read as a TOML file"),
+        ('[gamepad]\nundo = "Q"', "gamepad.undo = 'Q': unknown button"),
+        ('[gamepad]\nzoom_in = "Guide"', "gamepad.zoom_in: unknown action"),
+        ('[gamepad]\npress = "Guide"', "gamepad.press: is an action of the mouse"),
+        ("[keys]\npush = 1", "keys.push = 1: input should be a valid string"),
+        ('[kesy]\npush = "i"', "kesy: unknown key; expected the sections"),
+        ('push = "i"', "push: unknown key; expected the sections"),
+        ("[keys", "cannot be read as a TOML key file"),
     ],
 )
 def test_a_file_that_cannot_be_used_is_refused_in_words(tmp_path, text, words):
@@ -143,7 +152,7 @@ def test_a_file_that_cannot_be_used_is_refused_in_words(tmp_path, text, words):
 
 def test_the_command_line_refuses_in_one_line(tmp_path, capsys):
     assert app.main(["rehearse", "--keys", str(tmp_path / "none.toml")]) == 2
-    assert "no such file of keys; app.py keys prints one" in capsys.readouterr().err
+    assert "no such key file; app.py keys prints one" in capsys.readouterr().err
     assert app.main(["rehearse", "--gamepad", "--headless"]) == 2
     assert "--gamepad: needs a window" in capsys.readouterr().err
 

@@ -64,7 +64,7 @@ def test_the_camera_goes_home():
 
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.3, -0.8, 0.2)])
-def test_ray_under_the_mouse_passes_through_the_projected_point(up):
+def test_the_ray_under_the_mouse_contains_the_projected_point(up):
     camera = _camera(up)
     camera.orbit(0.13, -0.07)
     camera.pan(0.05, 0.02)
@@ -107,34 +107,32 @@ def test_up_is_up_and_the_tissue_follows_a_pan():
 # Solids
 
 
-@pytest.mark.parametrize("kind", ["cuboid", "curved"])
-def test_solids_face_outward(kind):
-    size = (40.0, 10.0, 20.0)
-    solid = transducer_shape.cuboid(size)
-    if kind == "curved":
-        parts = transducer_shape.transducer(size, radius=25.0)
-        lens = np.flatnonzero((parts.colours == transducer_shape.LENS).all(axis=1))
-        inside = np.isin(parts.indices.reshape(-1, 3), lens).all(axis=1)
-        middle = parts.vertices[lens].mean(axis=0)
-        faces = parts.indices.reshape(-1, 3)[inside] - lens[0]
-        solid = transducer_shape.TransducerShape(
-            parts.vertices[lens] - middle, parts.normals[lens], parts.colours[lens], faces.reshape(-1)
-        )
-        # The arc's middle is the lowest, where the image starts.
-        assert parts.vertices[:, 2].min() == pytest.approx(-10.0)
-    a, b, c = (solid.vertices[solid.indices.reshape(-1, 3)[:, i]] for i in range(3))
-    centre = (a + b + c) / 3
-    assert np.all(np.einsum("ij,ij->i", np.cross(b - a, c - a), centre) > 0)
-    assert np.all(np.einsum("ij,ij->i", solid.normals, solid.vertices) > 0)
+@pytest.mark.parametrize("radius", [0.0, 25.0])
+def test_the_parts_of_the_transducer_are_closed_and_face_outward(radius):
+    size = np.array([40.0, 10.0, 20.0])
+    shape = transducer_shape.transducer(size, radius)
+    faces = shape.indices.reshape(-1, 3)
+    for colour in (transducer_shape.BODY, transducer_shape.LENS, transducer_shape.MARKER):
+        part = faces[(shape.colours[faces[:, 0]] == colour).all(axis=1)]
+        corners, normals = shape.vertices[part], shape.normals[part]
+        middle = corners.reshape(-1, 3).mean(axis=0)
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        assert np.all(np.einsum("ij,ij->i", cross, corners.mean(axis=1) - middle) > 0)
+        assert np.all(np.einsum("ikj,ikj->ik", normals, corners - middle) > 0)
+        # The area vectors of a closed surface add up to nothing.
+        assert cross.sum(axis=0) == pytest.approx(np.zeros(3), abs=1e-9)
+    # The marker stands out by a quarter of a millimetre; a curved array is lowest in its centre, where the image starts.
+    assert shape.vertices.min(axis=0) == pytest.approx(-size / 2)
+    assert shape.vertices.max(axis=0)[:2] == pytest.approx(size[:2] / 2 + [0.25, 0.0])
 
 
-def test_image_plane_carries_the_picture_the_right_way_round():
+def test_the_image_plane_shows_the_image_in_the_right_orientation():
     shares, indices = transducer_shape.image_plane_grid(6, 4)
     grey = np.zeros((60, 40), dtype=np.uint8)
     grey[0, -1] = 255
     view = _view(pictures={"CT": grey})
     places = transducer_shape.on_plane(shares, view)
-    bright = transducer_shape.standing(places)[transducer_shape.sampled(grey, places, view) == 1.0]
+    bright = transducer_shape.on_transducer(places)[transducer_shape.sampled(grey, places, view) == 1.0]
     assert np.allclose(bright, [[20.0, 0.0, 0.0]])
     assert indices.max() == len(shares) - 1 and len(indices) == 6 * 5 * 3
 
@@ -316,7 +314,7 @@ def test_settings_are_seen(window, setting, value):
     assert opened.read_controls().settings is opened.settings
 
 
-def test_the_cut_is_filled_and_the_half_before_it_gone(window):
+def test_the_cut_is_filled_and_the_half_before_it_removed(window):
     opened, _, _ = window
     opened.settings.cut = True
     pose = np.array(_view().transducer_pose)
@@ -351,7 +349,7 @@ except NoVulkan as reason:
 """
 
 
-def test_missing_vulkan_is_said_and_not_died_of():
+def test_missing_vulkan_is_an_error_with_a_message():
     pytest.importorskip("taichi")
     nowhere = {"VK_ICD_FILENAMES": "/nonexistent", "VK_DRIVER_FILES": "/nonexistent"}
     done = subprocess.run(
@@ -369,7 +367,7 @@ def test_missing_vulkan_is_said_and_not_died_of():
 
 @pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="these always have a display")
 @pytest.mark.parametrize("display", [None, ":4242"])
-def test_no_display_is_noticed(monkeypatch, display):
+def test_a_missing_display_is_detected(monkeypatch, display):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     if display:

@@ -21,11 +21,10 @@ from sim.device import start
 from sim.embedding import Embedding
 from sim.fields import array_of
 from sim.skinning import Skin
-from ultrasound.image_plane import ImagePlane
-from ultrasound.outline import section
+from ultrasound.image_plane import ImagePlane, plane_section
 from ultrasound.probe import Probe
-from ultrasound.probe_manipulator import held_at, image_plane, pose_at
-from ultrasound.scanner import CT, ECHO, ScannedAnatomy, Scanner
+from ultrasound.probe_manipulator import image_plane, pose_at, pose_of_image_plane
+from ultrasound.scanner import B_MODE, CT, ScannedAnatomy, Scanner
 
 STORED = Path(__file__).parent / "pictures"
 PIXELS, WIDTH, DEPTH = 256, 36.0, 30.0
@@ -41,9 +40,9 @@ PROBE = Probe(
 )
 FACE, DOWN, LATERAL = np.array([1.0, -0.5, 11.0]), np.array([0.15, 0.1, -1.0]), np.array([1.0, 0.3, 0.0])
 # Two pictures are alike that differ by so little: by mean grey value, and by the share of pixels that are more than SEEN off.
-# Slice and echo: other rounding (no fast_math, LLVM's advanced optimisation) leaves 0.004 and none, the organ's points 1e-4 mm
+# CT and B-mode: other rounding (no fast_math, LLVM's advanced optimisation) leaves 0.004 and none, the organ's points 1e-4 mm
 # off 0.03 and 0.01 %. 3D view: another driver may draw edges half a pixel off, which leaves 0.5 and 0.1 %.
-LIMITS = {CT: (0.2, 0.001), ECHO: (0.2, 0.001), "3D": (1.0, 0.005)}
+LIMITS = {CT: (0.2, 0.001), B_MODE: (0.2, 0.001), "3D": (1.0, 0.005)}
 SEEN = 12
 # What a millimetre or a degree of the probe must exceed one of them by.
 APART = 4.0
@@ -87,9 +86,9 @@ class Scene:
         return image_plane(pose_at(face, -axes[:, 2], axes[:, 0], 20.0), 20.0, WIDTH, DEPTH)
 
     def pictures(self, plane: ImagePlane) -> dict[str, np.ndarray]:
-        """CT and echo as the panel shows them, with the organ's outline, uint8 (rows, columns, 3) each."""
-        shown = self.scanner.look(plane, PROBE, "both", "speckle", 350.0, 40.0)
-        outline = section(
+        """CT and B-mode as the panel shows them, with the organ's outline, uint8 (rows, columns, 3) each."""
+        shown = self.scanner.images(plane, PROBE, "both", "speckle", 350.0, 40.0)
+        outline = plane_section(
             array_of(self.surface.vertices), self.anatomy.organ.faces, np.linalg.inv(plane.world_from_plane)
         )
         panel, page = Panel(tuple(shown), WIDTH, DEPTH), np.zeros((*SMALL_WINDOW[::-1], 3), np.uint8)
@@ -142,8 +141,8 @@ def check(name: str, picture_of, request: pytest.FixtureRequest) -> None:
         assert excess(picture_of(*moved), wanted, name) > APART, f"{move} is not seen"
 
 
-@pytest.mark.parametrize("name", [CT, ECHO])
-def test_slice_and_echo_are_the_stored_ones(scene, request, name):
+@pytest.mark.parametrize("name", [CT, B_MODE])
+def test_ct_and_b_mode_are_the_stored_ones(scene, request, name):
     check(name, lambda shift, turn: scene.pictures(scene.plane(shift, turn))[name], request)
 
 
@@ -171,8 +170,8 @@ def window(scene):
 
 def drawn(window, scene: Scene, plane: ImagePlane) -> np.ndarray:
     """The 3D view, uint8 (rows, columns, 3), of means over blocks of pixels."""
-    shown = scene.scanner.look(plane, PROBE, "ct", "speckle", 350.0, 40.0)
-    window.draw(View(held_at(plane.world_from_plane, 20.0), shown, WIDTH, DEPTH))
+    shown = scene.scanner.images(plane, PROBE, "ct", "speckle", 350.0, 40.0)
+    window.draw(View(pose_of_image_plane(plane.world_from_plane, 20.0), shown, WIDTH, DEPTH))
     area = window.layout.scene
     rows, columns = area.height // BLOCK, area.width // BLOCK
     part = window.picture()[area.slices][: rows * BLOCK, : columns * BLOCK]

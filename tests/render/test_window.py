@@ -12,7 +12,7 @@ import pytest
 from conftest import ROOT
 from PIL import Image
 
-from render.ultrasound_panel import CALLIPER
+from render.ultrasound_panel import CALIPER
 
 pytestmark = pytest.mark.skipif(
     not (shutil.which("Xvfb") and shutil.which("xdotool")), reason="needs Xvfb and xdotool"
@@ -23,8 +23,8 @@ ASK_S, APART_S = 2.0, 1.0
 # The slice and what is drawn of organ and transducer, and how much two pictures of a still one differ at most.
 PANEL, SCENE = np.s_[80:640, 860:1240], np.s_[60:570, 20:780]
 STILL = 0.5
-# Two places on the echo where it stands beside the CT.
-ECHO_TOP, ECHO_FOOT = (950, 150), (950, 400)
+# Two points on the B-mode image beside the CT.
+B_MODE_TOP, B_MODE_FOOT = (950, 150), (950, 400)
 
 
 class Screen:
@@ -35,7 +35,7 @@ class Screen:
         self.environment = os.environ | {"DISPLAY": display}
         self.environment.pop("WAYLAND_DISPLAY", None)
         keys = out / "keys.toml"
-        keys.write_text('[keys]\nfreeze = "Space"\nplan_for = "F"\nexport = "E"\ntilt_right = "I"\n')
+        keys.write_text('[keys]\nfreeze = "Space"\nplan_for = "F"\nexport = "E"\nrock_right = "I"\n')
         self.program = subprocess.Popen(
             [
                 sys.executable,
@@ -151,17 +151,17 @@ def test_the_mouse_moves_and_presses_the_transducer(screen):
     assert np.abs(let_go - second)[PANEL].mean() < 0.5 * np.abs(pressed - second)[PANEL].mean()
     screen.do("key", "--window", screen.window, "b")
     both = screen.at_rest()
-    assert np.abs(both - let_go)[PANEL].mean() > 5.0, "the key for the echo changes nothing"
+    assert np.abs(both - let_go)[PANEL].mean() > 5.0, "the key for the B-mode image changes nothing"
     screen.do("key", "--window", screen.window, "space")
-    for place in (ECHO_TOP, ECHO_FOOT):
+    for place in (B_MODE_TOP, B_MODE_FOOT):
         screen.point(*place)
         time.sleep(1.0)
         screen.do("mousedown", 1)
         time.sleep(0.5)
         screen.do("mouseup", 1)
     measured = screen.picture()
-    green = (measured == CALLIPER).all(axis=2)[PANEL]
-    assert green.sum() > 100, "two clicks on the echo draw no caliper"
+    green = (measured == CALIPER).all(axis=2)[PANEL]
+    assert green.sum() > 100, "two clicks on the B-mode image draw no caliper"
     screen.do("key", "--window", screen.window, "e")
     exported = screen.out / "001-b-mode.dcm"
     end = time.monotonic() + 20

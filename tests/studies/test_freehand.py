@@ -29,7 +29,7 @@ from studies.freehand import freehand_accuracy, freehand_sweeps
 from studies.freehand.freehand_command import figure_of, rows_of, table
 from studies.freehand.freehand_sweeps import sweep_of
 from ultrasound.reconstruction import VoxelBox
-from ultrasound.sweep import Mark, Sweep, SweepError
+from ultrasound.sweep import PixelLabel, Sweep, SweepError
 
 ROWS, COLUMNS = 60, 92
 # Pixels of 0.5 x 0.8 mm, pictures 0.8 mm apart, square to none of the axes.
@@ -65,9 +65,9 @@ def near(places: np.ndarray, middle: np.ndarray, radius: float) -> np.ndarray:
 def marks_at(places: np.ndarray) -> np.ndarray:
     """What is in truth where pixels were at rest."""
     marks = near(places, CENTRE, RADIUS).astype(np.uint8)
-    marks[near(places, TUMOUR, TUMOUR_RADIUS)] = Mark.TUMOUR
+    marks[near(places, TUMOUR, TUMOUR_RADIUS)] = PixelLabel.TUMOUR
     for bead, middle in enumerate(BEADS):
-        marks[near(places, middle, BEAD_RADIUS)] += Mark.BEAD * (bead + 1)
+        marks[near(places, middle, BEAD_RADIUS)] += PixelLabel.BEAD * (bead + 1)
     return marks
 
 
@@ -249,7 +249,7 @@ def test_files_have_each_voxel_at_its_place(tmp_path):
     for index in ((0, 0, 0), (2, 3, 6), (4, 1, 2), (1, 5, 7)):
         assert volume.TransformIndexToPhysicalPoint(index) == pytest.approx(box.places()[index])
         assert volume[index] == np.clip(round(float(grey[index])), 0, 255)
-        assert labels[index] == (Mark.TUMOUR if tumour[index] else int(organ[index]))
+        assert labels[index] == (PixelLabel.TUMOUR if tumour[index] else int(organ[index]))
     save_volumes(replace(rebuilt, regions={}), tmp_path / "..")
     assert not (tmp_path / ".." / "labels.nrrd").exists()
 

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from conftest import rotation_about
 
-from ultrasound.array_contact import TOUCH_MM, face_points, pressing
+from ultrasound.array_contact import CONTACT_MM, face_points, measure_contact
 
 # 20 x 10 places of 0.75 x 0.75 mm.
 SIZE = np.array([15.0, 7.5, 20.0])
@@ -31,7 +31,9 @@ def tilted(degrees: float) -> np.ndarray:
 
 
 def pressed(pose, now, mesh, size=SIZE, radius=0.0):
-    return pressing(pose, size, radius, np.asarray(now), np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    return measure_contact(
+        pose, size, radius, np.asarray(now), np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    )
 
 
 @pytest.mark.parametrize("x, y, wide, high", [(0, 0, 15, 7.5), (6, 7.75, 13.5, 6), (-6, -7.75, 13.5, 6)])
@@ -55,7 +57,7 @@ def test_beside_the_organ_nothing_touches(block, x, y):
 @pytest.mark.parametrize("degrees", [4.0, 10.0, -10.0])
 def test_a_tilted_face_touches_in_a_strip_along_its_lower_edge(block, degrees):
     # The gap grows with the tangent; a strip of places is off by half of one.
-    strip = TOUCH_MM / np.tan(np.radians(abs(degrees)))
+    strip = CONTACT_MM / np.tan(np.radians(abs(degrees)))
     assert pressed(tilted(degrees), block.vertices, block).area_mm2 == pytest.approx(
         strip * SIZE[1], abs=CELL / 2 * SIZE[1]
     )
@@ -66,8 +68,8 @@ def test_a_tilted_face_touches_in_a_strip_along_its_lower_edge(block, degrees):
 
 
 def test_a_curved_face_touches_over_the_chord_of_its_sagitta(block):
-    # Its middle touches; a chord c lies TOUCH_MM behind the middle where c^2 = 2 r s - s^2. Places are off by half of one a side.
-    half = np.sqrt(2 * RADIUS * TOUCH_MM - TOUCH_MM**2)
+    # Its middle touches; a chord c lies CONTACT_MM behind the middle where c^2 = 2 r s - s^2. Places are off by half of one a side.
+    half = np.sqrt(2 * RADIUS * CONTACT_MM - CONTACT_MM**2)
     arc = RADIUS * np.arcsin(half / RADIUS)
     at = over(length=CURVED[2])
     found = pressed(at, block.vertices, block, CURVED, RADIUS).area_mm2

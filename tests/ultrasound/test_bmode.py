@@ -16,7 +16,7 @@ from sim.embedding import Embedding, Unmoved
 from sim.fields import array_of, fill
 from ultrasound.bmode import BMode
 from ultrasound.image_plane import PlaneInTissue
-from ultrasound.point_spread import MOST_LINES, axial_sd_mm, elevation_sd_mm, lateral_sd_mm
+from ultrasound.point_spread import MAX_HALF_WIDTH, axial_sd_mm, elevation_sd_mm, lateral_sd_mm
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import image_plane, pose_at
 from ultrasound.sampled_volume import SampledVolume
@@ -79,7 +79,7 @@ class Tank:
     ) -> np.ndarray:
         """Echoes (lines, samples) [dB] of a probe whose face is at a place and looks along a direction."""
         pose = pose_at(at, along, lateral, probe.housing_mm[2])
-        self.plane.take(image_plane(pose, probe.housing_mm[2], *probe.extent_mm))
+        self.plane.locate(image_plane(pose, probe.housing_mm[2], *probe.extent_mm))
         self.picture = self.bmode.render(probe, detail_level)
         return array_of(self.bmode.decibel).astype(float)
 
@@ -135,7 +135,7 @@ def peaks(decibel: np.ndarray, probe: Probe) -> tuple[np.ndarray, np.ndarray, np
 
 @pytest.mark.parametrize("detail_level", RUNGS)
 @pytest.mark.parametrize("attenuation, frequency", [(0.18, 12.0), (0.5, 5.0), (1.0, 3.0)])
-def test_echo_falls_with_depth_by_what_tissue_takes(fine, detail_level, attenuation, frequency):
+def test_the_echo_falls_with_depth_by_the_attenuation(fine, detail_level, attenuation, frequency):
     probe = probe_of(frequency_mhz=frequency)
     fine.fill(backscatter=0.1)
     lossless = fine.look(probe, detail_level)
@@ -153,7 +153,7 @@ def test_echo_falls_with_depth_by_what_tissue_takes(fine, detail_level, attenuat
 
 @pytest.mark.parametrize("tilt", [0, 20, 40, 60])
 @pytest.mark.parametrize("size", ["fine", "coarse"])
-def test_an_interface_echoes_what_it_reflects_from_where_it_is(request, size, tilt):
+def test_the_echo_of_an_interface_has_its_reflection_and_depth(request, size, tilt):
     tank, probe = request.getfixturevalue(size), probe_of()
     u, blur, cosine = probe.scanlines()[0][:, 0], 0.8 * tank.voxel_mm, np.cos(np.radians(tilt))
     lines = np.abs(u) < 8.0
@@ -175,7 +175,7 @@ def test_an_interface_echoes_what_it_reflects_from_where_it_is(request, size, ti
 
 
 @pytest.mark.parametrize("size", ["fine", "coarse"])
-def test_an_interface_as_sharp_as_voxels_can_be_is_not_lost_between_looks(request, size):
+def test_an_interface_as_sharp_as_a_voxel_is_not_missed_between_samples(request, size):
     tank, probe = request.getfixturevalue(size), probe_of()
     tank.fill(lambda x, y, z: np.where(y < 40.0, FAT, TISSUE))
     true = tank.at[1][tank.at[1] < 40.0].max() + tank.voxel_mm / 2
@@ -187,7 +187,7 @@ def test_an_interface_as_sharp_as_voxels_can_be_is_not_lost_between_looks(reques
 
 
 @pytest.mark.parametrize("before, behind", [(0.5, 0.5), (0.5, 10.0), (1.0, 0.01)])
-def test_an_interface_in_lossy_tissue_is_as_loud_as_what_reaches_it(fine, before, behind):
+def test_the_echo_of_an_interface_is_attenuated_by_the_tissue_before_it(fine, before, behind):
     probe = probe_of()
     fine.fill(interface(FAT, TISSUE, 0.4), interface(before, behind, 0.4))
     found, amplitude, _ = peaks(fine.look(probe), probe)
@@ -214,7 +214,7 @@ def test_behind_a_layer_is_the_shadow_of_its_faces_and_of_what_it_takes(fine, wi
     assert np.abs(fine.look(probe)[:, 320:] - wanted).max() < bound
 
 
-def test_behind_a_cyst_the_echo_is_brighter_by_what_it_does_not_take(fine):
+def test_behind_a_cyst_the_echo_is_enhanced_by_the_missing_attenuation(fine):
     tissue, cyst, radius, probe = 0.7, 0.01, 6.0, probe_of()
     # With a rim of 1 mm, which looks 0.5 mm apart see.
     fine.fill(TISSUE, lambda x, y, z: cyst + (tissue - cyst) * np.clip(np.hypot(x, y - 30) - 5.5, 0, 1), 0.1)
@@ -248,8 +248,8 @@ def test_a_wire_is_drawn_as_wide_as_the_focus_makes_it(endless, focus_percent, t
     axial = 2 * 1.54 / 7.5 / 2 / FWHM
     u = probe.scanlines()[0][:, 0] - probe.scanlines()[0][LINES // 2, 0]
     profile = (u == 0).astype(float) if thin else np.exp(-0.5 * (u / axial) ** 2)
-    fill((endless.bmode.beams.real, np.repeat(profile[:, None], SAMPLES, axis=1)))
-    endless.bmode.beams.imaginary.fill(0.0)
+    fill((endless.bmode.scanlines.real, np.repeat(profile[:, None], SAMPLES, axis=1)))
+    endless.bmode.scanlines.imaginary.fill(0.0)
     endless.bmode._spread()
     for depth in (8.0, 16.0, 32.0, 56.0, 72.0):
         line = array_of(endless.bmode.decibel)[:, int(depth / 0.125)].astype(float)
@@ -261,7 +261,9 @@ def test_a_wire_is_drawn_as_wide_as_the_focus_makes_it(endless, focus_percent, t
 
 
 @pytest.mark.parametrize("frequency, cycles", [(5.0, 2.0), (3.0, 3.0), (7.5, 4.0)])
-def test_an_interface_is_as_long_as_the_pulse_and_as_loud_on_every_rung(fine, frequency, cycles):
+def test_an_interface_has_the_pulses_length_and_the_same_amplitude_at_every_detail_level(
+    fine, frequency, cycles
+):
     probe = probe_of(frequency_mhz=frequency, pulse_cycles=cycles)
     fine.fill(interface(FAT, TISSUE, 0.4))
     for detail_level in RUNGS:
@@ -294,7 +296,7 @@ def test_the_mean_square_of_speckle_is_the_backscatter_squared(endless, geometry
     squares = (10 ** (np.array(echoes) / 10)).mean(axis=0) / 0.1**2
     # What the kernel adds up lies 1.4 entries apart in the mean where lines are dense: noise ends at the borders of blocks of
     # 64, which takes 3 % of it there, and, held over entries, is 5 % short aslant to them. Sampling has an SD of 1 to 3 %.
-    inner = squares[MOST_LINES:-MOST_LINES]
+    inner = squares[MAX_HALF_WIDTH:-MAX_HALF_WIDTH]
     assert inner.mean() == pytest.approx(1.0, abs=0.05)
     assert inner.mean(axis=0).reshape(8, -1).mean(axis=1) == pytest.approx(np.ones(8), abs=0.12)
     # At the array's ends, where half of the kernel has no lines to take from, to 0.6 dB.
@@ -318,7 +320,7 @@ def test_speckle_correlates_as_the_point_spread_function_does(endless):
 
 
 @pytest.mark.parametrize("detail_level", RUNGS)
-def test_a_still_probe_shows_the_same_bits_also_after_it_was_away(fine, detail_level):
+def test_the_same_pose_gives_the_same_bits_again(fine, detail_level):
     probe = probe_of()
     fine.fill(interface(FAT, TISSUE, 0.4, 20.0), 0.5, 0.1)
     first, picture = fine.look(probe, detail_level), fine.picture

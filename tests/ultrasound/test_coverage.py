@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from conftest import rotation_about
 
-from ultrasound.coverage import PLACES, VOXEL_MM, Coverage, _lines_of
+from ultrasound.coverage import GRID_POINTS, VOXEL_MM, Coverage, _scanlines_of
 from ultrasound.probe import load_probe
 
 pytestmark = pytest.mark.usefixtures("one_device")
@@ -23,12 +23,14 @@ def big_ball(radius: float = R, at=(0, 0, 0), subdivisions: int = 3) -> trimesh.
 def places(probe, axes: np.ndarray, origin) -> np.ndarray:
     """Rest places of a picture that is mapped by u, v, w -> axes @ (u, v, w) + origin."""
     width, depth, above = probe.extent_mm
-    u, v = np.meshgrid(np.linspace(-width / 2, width / 2, PLACES), np.linspace(-above, depth - above, PLACES))
+    u, v = np.meshgrid(
+        np.linspace(-width / 2, width / 2, GRID_POINTS), np.linspace(-above, depth - above, GRID_POINTS)
+    )
     return (np.stack([u, v, 0 * u], axis=-1) @ axes.T + origin).astype(np.float32)
 
 
 def centres(coverage: Coverage) -> np.ndarray:
-    return coverage.low_mm + VOXEL_MM * np.moveaxis(np.indices(coverage.seen.shape), 0, -1)
+    return coverage.origin_mm + VOXEL_MM * np.moveaxis(np.indices(coverage.seen.shape), 0, -1)
 
 
 def on_picture(coverage: Coverage, axes: np.ndarray, origin) -> np.ndarray:
@@ -58,8 +60,8 @@ def organ(one_device) -> Coverage:
 def test_a_plane_shows_a_slab_of_its_thickness(organ, axes, thickness):
     origin = axes @ [3, -24, 4]
     probe = PROBE.model_copy(update=dict(elevation_width_mm=thickness))
-    organ.forget()
-    assert organ.look(places(probe, axes, origin), probe, None).all()
+    organ.clear()
+    assert organ.add(places(probe, axes, origin), probe, None).all()
     u, v, off = on_picture(organ, axes, origin)
     # No voxel is seen whose own half extent does not reach the slab.
     normal = np.cross(axes[:, 0], axes[:, 1])
@@ -71,7 +73,7 @@ def test_a_plane_shows_a_slab_of_its_thickness(organ, axes, thickness):
     # A middle in the slab is half a step of the parts from one of theirs, along each axis: nearer than half a voxel.
     parts = np.ceil(thickness / VOXEL_MM)
     steps = [
-        *np.linalg.norm(axes[:, :2], axis=0) * [40 / (PLACES - 1), 50 / (PLACES - 1)],
+        *np.linalg.norm(axes[:, :2], axis=0) * [40 / (GRID_POINTS - 1), 50 / (GRID_POINTS - 1)],
         thickness / parts,
     ]
     inside = (np.abs(off) <= thickness / 2) & (aside < -1)
@@ -101,8 +103,8 @@ def test_on_average_a_plane_along_the_voxels_is_as_thick_as_it_is(organ, thickne
     probe = PROBE.model_copy(update=dict(elevation_width_mm=thickness))
     volumes = []
     for y in (np.arange(12) + 0.5) / 12 * VOXEL_MM:
-        organ.forget()
-        organ.look(places(probe, UPRIGHT, (0, y, 22)), probe, None)
+        organ.clear()
+        organ.add(places(probe, UPRIGHT, (0, y, 22)), probe, None)
         volumes.append((organ.seen & organ.targets["organ"]).sum() * VOXEL_MM**3)
     # Parts of equal thickness, each in the voxel of its middle; one voxel at least. Facets take 1.2 %, and counting.
     parts = np.ceil(thickness / VOXEL_MM)
@@ -110,9 +112,9 @@ def test_on_average_a_plane_along_the_voxels_is_as_thick_as_it_is(organ, thickne
 
 
 @pytest.mark.parametrize("shift", [0.0, 5.0, -8.0])
-def test_lines_that_do_not_touch_show_nothing(organ, shift):
-    organ.forget()
-    touches = organ.look(places(PROBE, UPRIGHT, (shift, 0, R)), PROBE, 1.5)
+def test_scanlines_without_contact_add_nothing(organ, shift):
+    organ.clear()
+    touches = organ.add(places(PROBE, UPRIGHT, (shift, 0, R)), PROBE, 1.5)
     x = PROBE.elements()[:, 0] + shift
     # The face lies in a tangent plane: an element at x is hypot(x, R) - R from the ball. That is known to what facets
     # (0.4 % of the radius) and voxels (VOXEL^2 / 8 of the curvatures 2 / R) leave, at the nearest of places 0.42 mm apart.
@@ -131,9 +133,9 @@ def test_lines_that_do_not_touch_show_nothing(organ, shift):
 
 def test_the_first_and_last_places_stand_for_as_much_as_the_others(organ):
     probe, count = PROBE.model_copy(update=dict(transducer_width_mm=36.0, depth_mm=36.0)), 8
-    organ.forget()
-    few = np.linspace(0, PLACES - 1, count).astype(int)
-    organ.look(places(probe, UPRIGHT, (0, 0, 18))[np.ix_(few, few)], probe, None)
+    organ.clear()
+    few = np.linspace(0, GRID_POINTS - 1, count).astype(int)
+    organ.add(places(probe, UPRIGHT, (0, 0, 18))[np.ix_(few, few)], probe, None)
     u, v, _ = on_picture(organ, UPRIGHT, (0, 0, 18))
     # Half a place beyond the ends, less half of a part: of those there is one a voxel where tissue is squeezed by 0.7.
     spacing = 36.0 / (count - 1)
@@ -147,13 +149,13 @@ def test_the_first_and_last_places_stand_for_as_much_as_the_others(organ):
 def test_the_columns_of_places_are_together_as_wide_as_the_picture(lines):
     """Each stands for what is half a step to either side of it: of as many as there are, one too many."""
     probe = PROBE.model_copy(update=dict(number_of_scanlines=lines))
-    assert _lines_of(probe, PLACES)[1].all(axis=0).sum() == PLACES - 1
+    assert _scanlines_of(probe, GRID_POINTS)[1].all(axis=0).sum() == GRID_POINTS - 1
 
 
 def test_off_the_organ_nothing_is_seen(organ):
-    organ.forget()
-    assert not organ.look(places(PROBE, UPRIGHT, (0, 0, R + 3)), PROBE, 1.5).any()
-    assert not organ.seen.any() and organ.share("organ") == 0
+    organ.clear()
+    assert not organ.add(places(PROBE, UPRIGHT, (0, 0, R + 3)), PROBE, 1.5).any()
+    assert not organ.seen.any() and organ.fraction("organ") == 0
 
 
 @pytest.mark.parametrize(
@@ -163,7 +165,7 @@ def test_a_sector_shows_all_of_itself_and_nothing_beside(name, middle):
     probe = load_probe(name)
     # The ball lies across the sector's edge, or across its end.
     coverage, origin = Coverage(big_ball()), np.array([-middle[0], 0, middle[1]])
-    coverage.look(places(probe, UPRIGHT, origin), probe, None)
+    coverage.add(places(probe, UPRIGHT, origin), probe, None)
     u, v, off = on_picture(coverage, UPRIGHT, origin)
     angle, along = np.arctan2(u, v + probe.radius_mm), np.hypot(u, v + probe.radius_mm) - probe.radius_mm
     start, stop = np.radians([probe.theta_start_deg, probe.theta_stop_deg])
@@ -179,10 +181,10 @@ def test_a_sector_shows_all_of_itself_and_nothing_beside(name, middle):
 
 
 @pytest.mark.parametrize("squeezed", [1.0, 0.75])
-def test_squeezed_tissue_leaves_no_voxel_between_two_places(squeezed):
+def test_compressed_tissue_leaves_no_voxel_between_two_points(squeezed):
     probe = load_probe("curvilinear")
     coverage, axes, origin = Coverage(big_ball()), UPRIGHT / squeezed, np.array([0.0, 0, 60 / squeezed])
-    coverage.look(places(probe, axes, origin), probe, None)
+    coverage.add(places(probe, axes, origin), probe, None)
     off = on_picture(coverage, axes, origin)[2]
     assert coverage.seen[coverage.targets["organ"] & (np.abs(off) <= probe.elevation_width_mm / 2)].all()
 
@@ -192,7 +194,7 @@ def sweep(coverage: Coverage, first: float, last: float) -> None:
     probe = PROBE.model_copy(update=dict(transducer_width_mm=50.0, elevation_width_mm=2.0))
     axes = rotation_about([0, 0, 1], 90) @ UPRIGHT
     for x in np.arange(first + 1, last - 0.9, 1.0):
-        coverage.look(places(probe, axes, (x, 0, 25)), probe, None)
+        coverage.add(places(probe, axes, (x, 0, 25)), probe, None)
 
 
 def cap(height: float) -> float:
@@ -201,8 +203,8 @@ def cap(height: float) -> float:
 
 
 @pytest.mark.parametrize("first, last", [(-25, 0), (-4, 8), (5, 25)])
-def test_what_was_not_swept_is_the_gap(organ, first, last):
-    organ.forget()
+def test_what_was_not_imaged_is_the_gap(organ, first, last):
+    organ.clear()
     sweep(organ, first, last)
     caps = sorted([cap(R + x) for x in (first, -last) if R + x > 0], reverse=True)
     sides = {first: -1, last: 1}
@@ -217,22 +219,29 @@ def test_what_was_not_swept_is_the_gap(organ, first, last):
         height = R - sides[edge] * edge
         assert height - VOXEL_MM <= gap.thickness_mm <= height + 2 * VOXEL_MM
     missing = sum(caps) / (4 / 3 * np.pi * R**3 / 1000)
-    assert organ.share("organ") == pytest.approx(1 - missing, abs=VOXEL_MM / 2 * 0.75 / R * len(caps) + 0.01)
+    assert organ.fraction("organ") == pytest.approx(
+        1 - missing, abs=VOXEL_MM / 2 * 0.75 / R * len(caps) + 0.01
+    )
 
 
-def test_seen_at_places_adds_up_and_is_forgotten(organ):
-    organ.forget()
+def test_coverage_accumulates_and_can_be_cleared(organ):
+    organ.clear()
     sweep(organ, -10, 0)
     once = organ.seen.copy()
     sweep(organ, 5, 12)
     assert organ.seen[once].all()
-    assert organ.at(np.array([[-5.0, 3, 4], [2.5, 3, 4], [8, -2, 1], [16, 0, 0]])).tolist() == [1, 0, 1, 0]
+    assert organ.is_seen(np.array([[-5.0, 3, 4], [2.5, 3, 4], [8, -2, 1], [16, 0, 0]])).tolist() == [
+        1,
+        0,
+        1,
+        0,
+    ]
     off = np.random.default_rng(3).uniform(-0.49, 0.49, (*organ.seen.shape, 3)) * VOXEL_MM
-    assert np.array_equal(organ.at((centres(organ) + off).reshape(-1, 3)), organ.seen.ravel())
+    assert np.array_equal(organ.is_seen((centres(organ) + off).reshape(-1, 3)), organ.seen.ravel())
     assert len(organ.gaps("organ")) == 3
-    organ.forget()
-    assert organ.share("organ") == 0 and not organ.at(np.zeros((1, 3))).any()
-    assert np.isnan(organ.share("tumour"))
+    organ.clear()
+    assert organ.fraction("organ") == 0 and not organ.is_seen(np.zeros((1, 3))).any()
+    assert np.isnan(organ.fraction("tumour"))
 
 
 def lens(a: float, b: float, d: float) -> float:
@@ -258,4 +267,4 @@ def test_the_margin_is_the_organ_around_the_tumour_and_the_tumour(away, margin):
     assert at == pytest.approx(away * direction, abs=0.1)
     # What is sunk in the organ is in its distances too; what is swept of both is told apart.
     sweep(coverage, away * direction[0] - 25, away * direction[0])
-    assert coverage.share("tumour") == pytest.approx(0.5, abs=VOXEL_MM / 2 * 0.75 / 6 + 0.02)
+    assert coverage.fraction("tumour") == pytest.approx(0.5, abs=VOXEL_MM / 2 * 0.75 / 6 + 0.02)

@@ -105,7 +105,7 @@ def sliced(kept, mesh, image: Callable, move=None, pixels: int = 96, outside: st
         body.move(move(body.model.body.rest_points))
     cut = kept(cut_of, body.embedding, mesh, image, pixels, outside)
     plane = oblique_plane()
-    cut.plane.take(plane)
+    cut.plane.locate(plane)
     cut.render(350.0, 40.0)
     return cut, plane, body.model, body.embedding
 
@@ -195,7 +195,7 @@ def test_pixels_drawn_together_show_what_each_shows_alone(kept, ball, pixels, ou
 
 def test_the_pixel_near_a_place_is_the_nearest(one_device):
     plane = PlaneInTissue(Unmoved(), 24)
-    plane.take(ImagePlane(np.eye(4), 30.0, 18.0, 4.0))
+    plane.locate(ImagePlane(np.eye(4), 30.0, 18.0, 4.0))
     places = np.random.default_rng(6).uniform([-20, -8], [20, 18], (300, 2)).astype(np.float32)
     found = np.zeros((300, 2), np.int32)
 
@@ -257,7 +257,7 @@ def test_no_pixel_falls_between_tetrahedra_where_the_plane_goes_along_their_side
         # Each of the probe's axes in turn is square to the plane.
         world[:3, :3] = np.roll(axes[:3, :3], int(out.argmax()), axis=1)
         world[:3, 3] = centre - world[:3, :3] @ [0.0, 8.25, 0.0]
-        plane.take(ImagePlane(world, 16.5, 16.5))
+        plane.locate(ImagePlane(world, 16.5, 16.5))
         assert (array_of(plane.owner) < embedding.count).all()
 
 
@@ -300,7 +300,7 @@ def test_flat_collapsed_and_inverted_tissue_still_gives_a_picture(kept, ball, sq
     assert np.isfinite(cut.hounsfield()).all()
 
 
-def test_what_lies_around_the_organ_gives_way_to_it_and_far_away_stays(kept, ball):
+def test_surroundings_deform_with_the_organ_and_far_tissue_is_fixed(kept, ball):
     shift = np.array([0.0, 0.0, 4.0])
     body = kept(embedded, ball, margin_mm=25.0)
     body.move(body.model.body.rest_points + shift)
@@ -316,21 +316,21 @@ def test_what_lies_around_the_organ_gives_way_to_it_and_far_away_stays(kept, bal
 def test_surroundings_that_fold_over_the_organ_do_not_cover_it(kept, ball):
     embedding = kept(embedded, ball, margin_mm=25.0).embedding
     cut = cut_of(embedding, ball, ramp_image, 96, "background")
-    cut.plane.take(oblique_plane())
+    cut.plane.locate(oblique_plane())
     organ, owner = organ_mask(cut), array_of(cut.plane.owner)
     vertices = array_of(embedding.skin.vertices)
     outside = np.linalg.norm(array_of(embedding.skin.rest), axis=1) > 12.0 + 2 * RADIUS * np.sqrt(3)
     vertices[outside & (vertices[:, 2] > 0)] -= [0.0, 0.0, 26.0]
     fill((embedding.skin.vertices, vertices))
-    cut.plane.take(oblique_plane())
+    cut.plane.locate(oblique_plane())
     assert organ.sum() > 1000 and (array_of(cut.plane.owner) != owner)[~organ].sum() > 100
     assert (array_of(cut.plane.owner) == owner)[organ].all()
 
 
-def test_what_does_not_move_is_shown_where_it_lies(kept, ball):
+def test_tissue_that_does_not_move_is_shown_in_place(kept, ball):
     cut = cut_of(Unmoved(), ball, noisy_image, 96, "background")
     plane = oblique_plane()
-    cut.plane.take(plane)
+    cut.plane.locate(plane)
     cut.render(350.0, 40.0)
     assert np.abs(cut.plane.rest_grid(96) - pixel_points(plane, 96)).max() < 1e-4
     still, _, _, _ = sliced(kept, ball, noisy_image, outside="background")

@@ -93,7 +93,7 @@ def test_the_region_has_what_the_standard_requires(file):
     "geometry, kind",
     [("LINEAR", "LINEAR"), ("CURVILINEAR", "CURVED LINEAR"), ("PHASED", "SECTOR_PHASED")],
 )
-def test_a_probe_is_told_in_the_standards_terms_and_units(tmp_path, geometry, kind):
+def test_a_probe_is_described_in_the_standards_terms_and_units(tmp_path, geometry, kind):
     sector = {"radius_start_mm": 35.0, "theta_start_deg": -30.0, "theta_stop_deg": 30.0}
     probe = Probe(
         transducer_name="any", transducer_geometry=geometry, frequency_mhz=3.5, depth_mm=129.6, **sector
@@ -121,7 +121,7 @@ def test_the_reference_pixel_leads_to_the_probes_coordinates(tmp_path, name, sha
     assert (left_cm, top_cm) == pytest.approx((-width_mm / 20, -above_mm / 10))
 
 
-def test_without_a_probe_nothing_is_said_of_one(tmp_path):
+def test_without_a_probe_its_attributes_are_absent(tmp_path):
     save_dicom(tmp_path / "picture.dcm", PICTURE, SPACING_MM)
     keywords = {element.keyword for element in pydicom.dcmread(tmp_path / "picture.dcm").iterall()}
     assert {keyword for keyword in keywords if re.match("Transducer|Depth|Reference", keyword)} == set()

@@ -16,7 +16,7 @@ from ultrasound.probe import load_probe
 from ultrasound.probe_manipulator import image_plane, pose_at
 from ultrasound.sampled_volume import distance_volume
 from ultrasound.scanner import ScannedAnatomy, Scanner
-from ultrasound.sweep import Mark
+from ultrasound.sweep import PixelLabel
 
 PIXELS = 120
 WIDTH, DEPTH, ABOVE = 48.0, 60.0, 6.0
@@ -48,7 +48,7 @@ def ball(radius: float, *place: float) -> trimesh.Trimesh:
 
 def taken(embedding: Unmoved | None = None) -> PlaneInTissue:
     plane = PlaneInTissue(embedding or Unmoved(), PIXELS)
-    plane.take(PLANE)
+    plane.locate(PLANE)
     return plane
 
 
@@ -61,11 +61,11 @@ def test_a_box_is_marked_where_the_plane_cuts_it(device):
     marks = GroundTruthLabels(taken(), distance_volume(box((26, 14, 12), -6, 31, 3), 1.0)).render()
     aside = np.maximum(np.abs(U + 6) - 13, np.abs(V - 31) - 7)
     # Distances are linear near its faces; linear between points 1 mm apart they are off around its edges alone.
-    assert np.array_equal(marks[np.abs(aside) > 0.3] == Mark.ORGAN, aside[np.abs(aside) > 0.3] < 0)
-    assert set(np.unique(marks)) == {Mark.OUTSIDE, Mark.ORGAN}
+    assert np.array_equal(marks[np.abs(aside) > 0.3] == PixelLabel.ORGAN, aside[np.abs(aside) > 0.3] < 0)
+    assert set(np.unique(marks)) == {PixelLabel.OUTSIDE, PixelLabel.ORGAN}
     # Half a pixel along each side.
-    assert (marks == Mark.ORGAN).sum() * PIXEL_MM == pytest.approx(26 * 14, abs=26 * 0.5 + 14 * 0.4)
-    assert middle(marks == Mark.ORGAN) == pytest.approx((-6, 31), abs=0.25)
+    assert (marks == PixelLabel.ORGAN).sum() * PIXEL_MM == pytest.approx(26 * 14, abs=26 * 0.5 + 14 * 0.4)
+    assert middle(marks == PixelLabel.ORGAN) == pytest.approx((-6, 31), abs=0.25)
 
 
 def test_balls_are_marked_as_large_as_the_plane_cuts_them(device):
@@ -75,13 +75,13 @@ def test_balls_are_marked_as_large_as_the_plane_cuts_them(device):
         [in_world(-6, 20, 1.2), in_world(-4, 12, -1.5), in_world(9, 33, 0), in_world(0, 15, 2.5)]
     )
     marks = GroundTruthLabels(taken(), organ, tumour, beads, 2.4).render()
-    inside, bead = marks % Mark.BEAD, marks // Mark.BEAD
+    inside, bead = marks % PixelLabel.BEAD, marks // PixelLabel.BEAD
     # The last bead's middle is farther off the plane than it reaches.
     assert set(np.unique(inside)) == {0, 1, 2} and set(np.unique(bead)) == {0, 1, 2, 3}
     # Linear distances 2 mm apart, of facets that are 0.1 % in, move an outline by a tenth of a millimetre; a pixel has 0.4 x 0.5.
     for shown, radius, off, place in [
-        (inside >= Mark.ORGAN, 20, 6, (2, 25)),
-        (inside == Mark.TUMOUR, 7, -4, (9, 33)),
+        (inside >= PixelLabel.ORGAN, 20, 6, (2, 25)),
+        (inside == PixelLabel.TUMOUR, 7, -4, (9, 33)),
         (bead == 1, 2.4, 1.2, (-6, 20)),
         (bead == 2, 2.4, -1.5, (-4, 12)),
         (bead == 3, 2.4, 0, (9, 33)),
@@ -99,8 +99,8 @@ def test_where_beads_overlap_the_last_is_marked(device):
     marks = GroundTruthLabels(
         taken(), distance_volume(ball(20, 2, 25, 6)), beads=beads, radius_mm=2.4
     ).render()
-    assert set(np.unique(marks)) == {0, *(Mark.ORGAN + Mark.BEAD * k for k in range(4))}
-    assert (marks[np.hypot(U - 0.5, V - 20.8) < 2.3] == Mark.ORGAN + 3 * Mark.BEAD).all()
+    assert set(np.unique(marks)) == {0, *(PixelLabel.ORGAN + PixelLabel.BEAD * k for k in range(4))}
+    assert (marks[np.hypot(U - 0.5, V - 20.8) < 2.3] == PixelLabel.ORGAN + 3 * PixelLabel.BEAD).all()
 
 
 def test_marks_are_of_where_tissue_was_at_rest(device):
@@ -110,8 +110,8 @@ def test_marks_are_of_where_tissue_was_at_rest(device):
     moved = WORLD @ np.array([[0, 1, 0, 4], [1, 0, 0, -9], [0, 0, -1, 0], [0, 0, 0, 1.0]])
     fill((embedding.rest_from_plane, moved[None, :3]))
     marks = GroundTruthLabels(plane, distance_volume(box((14, 6, 10), 30, -12, 0), 1.0)).render()
-    assert middle(marks == Mark.ORGAN) == pytest.approx((-12 + 9, 30 - 4), abs=0.25)
-    assert np.ptp(V[marks == Mark.ORGAN]) == pytest.approx(14, abs=0.51)
+    assert middle(marks == PixelLabel.ORGAN) == pytest.approx((-12 + 9, 30 - 4), abs=0.25)
+    assert np.ptp(V[marks == PixelLabel.ORGAN]) == pytest.approx(14, abs=0.51)
 
 
 class Nowhere(Unmoved):
@@ -146,7 +146,7 @@ def patient_from_pixels(rehearsal, probe, shape) -> np.ndarray:
 def test_the_matrices_beside_a_picture_lead_to_where_its_pixels_were_at_rest(device):
     rehearsal, probe = lying()
     plane = PlaneInTissue(Unmoved(), PIXELS)
-    plane.take(plane_of(rehearsal, probe))
+    plane.locate(plane_of(rehearsal, probe))
     column, row = np.meshgrid(np.arange(PIXELS), np.arange(PIXELS))
     pixels = np.stack([column, row, 0 * row, 1 + 0 * row], axis=-1)
     places = pixels @ patient_from_pixels(rehearsal, probe, (PIXELS, PIXELS)).T
@@ -170,7 +170,7 @@ def test_the_matrices_beside_a_picture_lead_to_what_it_shows(device):
         for r in (30.0, 12.0)
     )
     scanner = Scanner(ScannedAnatomy(organ, hu, index_from_mm, tumour=mass), Unmoved(), probe, PIXELS)
-    picture = scanner.look(plane_of(rehearsal, probe), probe, "ct", "speckle", 1000.0, -500.0)["CT"].astype(
+    picture = scanner.images(plane_of(rehearsal, probe), probe, "ct", "speckle", 1000.0, -500.0)["CT"].astype(
         float
     )
     rows, columns = np.indices(picture.shape)
@@ -178,9 +178,9 @@ def test_the_matrices_beside_a_picture_lead_to_what_it_shows(device):
     # A spot of 4 mm in voxels of 1.5 mm and pixels of 1.5 x 1.1.
     assert (light * columns).sum() / light.sum() == pytest.approx(83, abs=0.1)
     assert (light * rows).sum() / light.sum() == pytest.approx(41, abs=0.1)
-    marks = scanner.marks.render()
-    assert columns[marks == Mark.TUMOUR].mean() == pytest.approx(30, abs=0.5)
-    assert rows[marks == Mark.TUMOUR].mean() == pytest.approx(95, abs=0.5)
+    marks = scanner.ground_truth.render()
+    assert columns[marks == PixelLabel.TUMOUR].mean() == pytest.approx(30, abs=0.5)
+    assert rows[marks == PixelLabel.TUMOUR].mean() == pytest.approx(95, abs=0.5)
     width, depth, _ = probe.extent_mm
-    area = (marks == Mark.TUMOUR).sum() * width * depth / PIXELS**2
+    area = (marks == PixelLabel.TUMOUR).sum() * width * depth / PIXELS**2
     assert area == pytest.approx(np.pi * 12**2, rel=0.06)

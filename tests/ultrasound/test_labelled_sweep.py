@@ -26,10 +26,10 @@ from sim.embedding import Unmoved
 from sim.signed_distance import signed_distance
 from studies.freehand.freehand_sweeps import sweep_of
 from ultrasound import reconstruction
-from ultrasound.labelled_sweep import MARKS, SUFFIX, LabelledSweep, marks_beside
+from ultrasound.labelled_sweep import LABELS_SUFFIX, SUFFIX, LabelledSweep, read_ground_truth
 from ultrasound.probe import load_probe
-from ultrasound.probe_manipulator import held_at, image_plane, pose_at
-from ultrasound.sweep import Mark, SweepError
+from ultrasound.probe_manipulator import image_plane, pose_at, pose_of_image_plane
+from ultrasound.sweep import PixelLabel, SweepError
 from ultrasound.sweep_file import read_sweep, write_sweep
 from version import VERSION
 
@@ -60,7 +60,7 @@ def recording(pixels: int = 24) -> tuple[SimpleNamespace, SimpleNamespace]:
     draw = np.random.default_rng(5)
     view = SimpleNamespace(pictures={"B-mode": draw.integers(0, 256, (pixels, pixels), np.uint8), "CT": None})
     marks = SimpleNamespace(render=lambda: view.pictures["B-mode"] % 3)
-    rehearsal.scanner = SimpleNamespace(marks=marks)
+    rehearsal.scanner = SimpleNamespace(ground_truth=marks)
     return rehearsal, view
 
 
@@ -69,7 +69,7 @@ def moved_on(rehearsal: SimpleNamespace, by_mm: float) -> None:
     rehearsal.pose[:3, 3] += by_mm * rehearsal.pose[:3, 1]
 
 
-def test_a_recorded_sweep_says_where_each_pixel_is(tmp_path):
+def test_a_recorded_sweep_gives_the_position_of_each_pixel(tmp_path):
     rehearsal, view = recording()
     sweeping, places, pictures = SweepRecorder(rehearsal), [], []
     assert sweeping.watch(0.0, view, rehearsal.probe) == "" and sweeping.end() == ""
@@ -94,13 +94,13 @@ def test_a_recorded_sweep_says_where_each_pixel_is(tmp_path):
     for frame, place in enumerate(places):
         at = sweep.transform("Image", "Reference", frame) @ [12, 22, 0, 1]
         assert at[:3] == pytest.approx(place, abs=1e-6)
-    marks = marks_beside(tmp_path / "sweep-001.igs.mha")
+    marks = read_ground_truth(tmp_path / "sweep-001.igs.mha")
     assert np.array_equal(marks.images, sweep.images % 3)
     assert sweep.fields["NephronVersion"] == marks.fields["NephronVersion"] == VERSION
     assert [frame["ProbeToReferenceTransform"] for frame in marks.frames] == [
         frame["ProbeToReferenceTransform"] for frame in sweep.frames
     ]
-    assert marks_beside(tmp_path / "sweep-001-marks.igs.mha") is None
+    assert read_ground_truth(tmp_path / "sweep-001-marks.igs.mha") is None
     # Times of a sweep are those of the rehearsal, and a new one begins at once, whenever the last ended.
     assert sweeping.toggle(tmp_path) == "sweep-002: {sweep} ends it"
     sweeping.watch(1.0, view, rehearsal.probe)
@@ -108,7 +108,7 @@ def test_a_recorded_sweep_says_where_each_pixel_is(tmp_path):
     assert read_sweep(tmp_path / "sweep-002.igs.mha").times_s == [1.0]
 
 
-def test_as_long_as_a_sweep_is_recorded_its_length_is_said(tmp_path):
+def test_the_length_of_a_sweep_is_shown_while_it_is_recorded(tmp_path):
     rehearsal, view = recording()
     sweeping = SweepRecorder(rehearsal)
     said = []
@@ -150,7 +150,7 @@ def test_a_sweep_without_frames_or_ct_leaves_words_and_no_file(tmp_path):
 def test_a_full_disk_ends_a_sweep_in_words_and_leaves_nothing(tmp_path, marks_too, bytes_to_a_file):
     rehearsal, view = recording(pixels=256)
     if marks_too:
-        rehearsal.scanner.marks.render = lambda: view.pictures["B-mode"]
+        rehearsal.scanner.ground_truth.render = lambda: view.pictures["B-mode"]
     sweeping = SweepRecorder(rehearsal)
     sweeping.toggle(tmp_path)
     with bytes_to_a_file(150_000):
@@ -204,7 +204,7 @@ def test_the_matrices_of_a_frame_are_of_its_rows_and_columns(tmp_path):
     sweep = LabelledSweep(tmp_path, "sweep", probe)
     sweep.add(*np.zeros((2, 50, 80), np.uint8), probe, pose, 0.0)
     sweep.close()
-    for end in (SUFFIX, MARKS):
+    for end in (SUFFIX, LABELS_SUFFIX):
         read = read_sweep(tmp_path / f"sweep{end}")
         assert read.images.shape == (1, 50, 80)
         assert np.array_equal(read.transform("Image", "Probe", 0), probe.image_to_probe(50, 80))
@@ -213,7 +213,9 @@ def test_the_matrices_of_a_frame_are_of_its_rows_and_columns(tmp_path):
 
 def test_a_probe_is_held_where_its_image_plane_is():
     pose = pose_at(np.array([9.0, -4, 17]), np.array([0.3, -0.2, -1]), np.array([1, 0.5, 0.2]), 30.0)
-    assert held_at(image_plane(pose, 22.0, 40, 50, 6).world_from_plane, 22.0) == pytest.approx(pose)
+    assert pose_of_image_plane(image_plane(pose, 22.0, 40, 50, 6).world_from_plane, 22.0) == pytest.approx(
+        pose
+    )
 
 
 class Still:
@@ -228,7 +230,7 @@ class Still:
         self.way.append(pose)
 
 
-def test_undoing_takes_the_tracked_way_and_finds_still_tissue_where_the_tracker_says(device):
+def test_compression_correction_follows_the_tracked_path_and_leaves_tissue_at_rest_in_place(device):
     probe = load_probe("curvilinear")
     on_probe, way = probe.image_to_probe(32, 32), over_tumour()[::5]
     sweep = sweep_of(np.zeros((len(way), 32, 32), np.uint8), way, np.array([0.0, 0.1, 9.0]), on_probe)
@@ -269,7 +271,7 @@ def swept(tmp_path_factory) -> Path:
     way = over_tumour()
     places = np.concatenate([(pixels @ (pose @ probe.image_to_probe(64, 64)).T)[:, :3] for pose in way])
     inside = [signed_distance(each.vertices, each.faces, places)[0] < 0 for each in (organ, tumour)]
-    marks = np.where(inside[1], Mark.TUMOUR, inside[0]).astype(np.uint8).reshape(-1, 64, 64)
+    marks = np.where(inside[1], PixelLabel.TUMOUR, inside[0]).astype(np.uint8).reshape(-1, 64, 64)
     for k, (pose, each) in enumerate(zip(way, marks, strict=True)):
         sweep.add(40 + 80 * each, each, probe, pose, k / 10)
     sweep.close()
@@ -300,7 +302,7 @@ def test_reconstruct_makes_a_volume_and_compares_it(swept, tmp_path, capsys):
     assert list(volume.GetSize()) == report["shape"] == list(labels.GetSize())
     middle = load_surface(phantom_folder() / "tumour.stl").center_mass
     at = volume.TransformPhysicalPointToIndex(middle.tolist())
-    assert (volume[at], labels[at]) == (40 + 80 * Mark.TUMOUR, Mark.TUMOUR)
+    assert (volume[at], labels[at]) == (40 + 80 * PixelLabel.TUMOUR, PixelLabel.TUMOUR)
     assert (tmp_path / "out" / "volume.png").stat().st_size > 10_000
 
 
@@ -333,7 +335,7 @@ def test_reconstruct_refuses_in_one_line(swept, tmp_path, monkeypatch):
     assert "frame 5: Timestamp" in refused("reconstruct", tmp_path / "timeless.igs.mha", *out)
     # Nothing of this is found out after a folder was made.
     assert not (tmp_path / "out").exists()
-    monkeypatch.setattr(reconstruction, "MOST_VOXELS", 5000)
+    monkeypatch.setattr(reconstruction, "MAX_VOXELS", 5000)
     large = refused("reconstruct", swept, *out)
     assert "over.igs.mha: " in large and "take larger voxels" in large
     monkeypatch.undo()
@@ -375,7 +377,7 @@ def test_scan_leaves_a_sweep_at_the_poses_of_its_file(tmp_path):
     command = ["scan", EMBEDDED, "--pose", tmp_path / "poses.json", "--out", tmp_path / "out", "--sweep"]
     assert app.main([str(part) for part in [*command, "--picture", "ct", "--arch", "cpu"]]) == 0
     sweep = read_sweep(tmp_path / "out/sweep.igs.mha")
-    marks = marks_beside(tmp_path / "out/sweep.igs.mha")
+    marks = read_ground_truth(tmp_path / "out/sweep.igs.mha")
     probe, rows = load_probe("drop-in"), sweep.images.shape[1]
     for frame, pose in enumerate(way):
         for each in (sweep, marks):
@@ -386,12 +388,17 @@ def test_scan_leaves_a_sweep_at_the_poses_of_its_file(tmp_path):
     # The tumour's middle, 20 mm before the face, lies half a step beside the two last pictures.
     middle = load_surface(phantom_folder() / "tumour.stl").center_mass
     column, row, aside, _ = np.linalg.inv(sweep.transform("Image", "Reference", 1)) @ [*middle, 1]
-    assert abs(aside) == pytest.approx(0.75) and marks.images[1, round(row), round(column)] == Mark.TUMOUR
-    assert np.argwhere(marks.images == Mark.TUMOUR).size and (marks.images[1][0] == Mark.OUTSIDE).any()
+    assert (
+        abs(aside) == pytest.approx(0.75) and marks.images[1, round(row), round(column)] == PixelLabel.TUMOUR
+    )
+    assert (
+        np.argwhere(marks.images == PixelLabel.TUMOUR).size
+        and (marks.images[1][0] == PixelLabel.OUTSIDE).any()
+    )
 
 
-def test_marks_of_another_file_are_not_taken(tmp_path):
+def test_labels_of_another_file_are_not_used(tmp_path):
     (tmp_path / "a-marks.igs.mha").write_text("no sweep")
-    assert marks_beside(tmp_path / "a.mha") is None and marks_beside(tmp_path / "b.igs.mha") is None
+    assert read_ground_truth(tmp_path / "a.mha") is None and read_ground_truth(tmp_path / "b.igs.mha") is None
     with pytest.raises(SweepError, match="a-marks"):
-        marks_beside(tmp_path / "a.igs.mha")
+        read_ground_truth(tmp_path / "a.igs.mha")

@@ -7,7 +7,7 @@ from test_bmode import LINES, flat_tank, probe_of
 
 from sim.device import start
 from sim.fields import array_of
-from ultrasound.point_spread import MOST_LINES, REACH_SD, axial_sd_mm, lateral_sd_mm, lateral_weights
+from ultrasound.point_spread import HALF_WIDTH_SD, MAX_HALF_WIDTH, axial_sd_mm, lateral_sd_mm, lateral_weights
 from ultrasound.probe import Probe
 
 GEOMETRIES = {
@@ -35,23 +35,23 @@ def test_weights_are_a_gaussian_at_the_middle_of_each_sample(probe):
     assert weights.sum(axis=0) == pytest.approx(np.ones(64)) and np.array_equal(weights, weights[::-1])
     for sample in range(64):
         width = width_lines(probe, (sample + 0.5) * 1.0)
-        assert half[sample] == min(np.ceil(REACH_SD * width), MOST_LINES)
+        assert half[sample] == min(np.ceil(HALF_WIDTH_SD * width), MAX_HALF_WIDTH)
         lag = half[sample]
-        assert weights[MOST_LINES + lag, sample] / weights[MOST_LINES, sample] == pytest.approx(
+        assert weights[MAX_HALF_WIDTH + lag, sample] / weights[MAX_HALF_WIDTH, sample] == pytest.approx(
             np.exp(-0.5 * (lag / width) ** 2)
         )
-        assert (weights[MOST_LINES + lag + 1 :, sample] == 0).all()
+        assert (weights[MAX_HALF_WIDTH + lag + 1 :, sample] == 0).all()
 
 
-def test_loudness_gives_noise_its_mean_square_back(probe):
-    weights, _, loudness = lateral_weights(probe)
-    lines = np.arange(2 * MOST_LINES + 1)
+def test_the_speckle_gain_restores_the_mean_square_of_noise(probe):
+    weights, _, speckle_gain = lateral_weights(probe)
+    lines = np.arange(2 * MAX_HALF_WIDTH + 1)
     for sample in (0, 20, 40, 63):
         apart = (lines[:, None] - lines) * probe.line_spacing_mm(np.array([sample + 0.5]))[0]
         # Noise of the axial width: of white one through a Gaussian of SD s, exp(-d^2 / 4 s^2).
         correlation = np.exp(-(apart**2) / (4 * axial_sd_mm(probe) ** 2))
         mean_square = weights[:, sample] @ correlation @ weights[:, sample]
-        assert loudness[sample] ** 2 * mean_square == pytest.approx(1.0)
+        assert speckle_gain[sample] ** 2 * mean_square == pytest.approx(1.0)
 
 
 def test_lines_are_spread_by_all_weights_and_mirrored_at_the_arrays_ends():
@@ -59,20 +59,20 @@ def test_lines_are_spread_by_all_weights_and_mirrored_at_the_arrays_ends():
     tank, probe = flat_tank(0.5), probe_of(focus_depth_percent=70.0, focal_zone_mm=6.0, f_number=2.0)
     tank.fill(backscatter=0.1)
     found = tank.look(probe, "speckle") - probe.gain_db()
-    weights, half, loudness = lateral_weights(probe)
+    weights, half, speckle_gain = lateral_weights(probe)
     assert half.max() > 8 and np.ptp(half) > 4
     real, imaginary = (
-        array_of(each).astype(float) for each in (tank.bmode.beams.real, tank.bmode.beams.imaginary)
+        array_of(each).astype(float) for each in (tank.bmode.scanlines.real, tank.bmode.scanlines.imaginary)
     )
     ti.reset()
     lines = np.arange(LINES)
     echo = np.zeros(real.shape, complex)
-    for k in range(-MOST_LINES, MOST_LINES + 1):
+    for k in range(-MAX_HALF_WIDTH, MAX_HALF_WIDTH + 1):
         # The end lines are not doubled, and what is mirrored is conjugate.
-        there = np.pad(lines, MOST_LINES, mode="reflect")[lines + MOST_LINES + k]
+        there = np.pad(lines, MAX_HALF_WIDTH, mode="reflect")[lines + MAX_HALF_WIDTH + k]
         turned = np.where(there == lines + k, 1.0, -1.0)[:, None]
-        echo += weights[k + MOST_LINES] * (real[there] + 1j * turned * imaginary[there])
-    wanted = 20 * np.log10(loudness * np.abs(echo) + 1e-9)
+        echo += weights[k + MAX_HALF_WIDTH] * (real[there] + 1j * turned * imaginary[there])
+    wanted = 20 * np.log10(speckle_gain * np.abs(echo) + 1e-9)
     # Sums of some 20 terms in float32, of which as much as all but a hundredth may cancel.
     seen = np.abs(echo) > 1e-3
     assert seen.mean() > 0.9 and np.abs(found - wanted)[seen].max() < 0.01

@@ -108,7 +108,7 @@ def test_a_wrong_probe_file_is_refused_with_a_line_that_names_the_key(tmp_path, 
     assert "\n" not in message and message.startswith(str(tmp_path / "mine.toml"))
 
 
-def test_a_missing_probe_file_is_told_with_those_known():
+def test_a_missing_probe_file_is_reported_with_the_known_names():
     with pytest.raises(ProbeError, match="'none' is no file, and known by name are " + ", ".join(KNOWN)):
         load_probe("none")
 
@@ -139,7 +139,7 @@ def test_lines_leave_the_face_at_the_middles_of_equal_shares(geometry):
 
 
 @pytest.mark.parametrize("geometry", list(GEOMETRIES))
-def test_beam_coordinates_are_the_way_back_from_a_place_to_its_line(geometry):
+def test_beam_coordinates_invert_the_scanlines(geometry):
     probe = probe_of(geometry)
     start, direction = probe.scanlines()
     lines, along = np.meshgrid(np.arange(LINES), [1.0, 17.3, 40.0, 79.9], indexing="ij")
@@ -220,7 +220,7 @@ def test_a_lifted_probe_is_dark_and_sees_again_when_pressed(gated):
         assert (gated.picture == 0).all() if dark else gated.picture.min() > 0
 
 
-def test_of_a_tilted_probe_the_elements_that_touch_are_heard(gated):
+def test_of_a_tilted_probe_only_the_aperture_in_contact_receives(gated):
     probe, tilted = probe_of(), (np.sin(0.1), np.cos(0.1), 0.0)
     # Its middle at the gap's end, and the side lower that looks away.
     decibel = gated.look(probe, "reflection", (0.0, -1.0, 0.0), tilted)

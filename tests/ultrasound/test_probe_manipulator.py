@@ -12,19 +12,19 @@ from ultrasound.probe_manipulator import (
     ManipulatorState,
     ProbeManipulator,
     advanced,
-    approached,
-    between,
-    held_at,
     image_plane,
     indentation,
+    moved_towards,
     pose_at,
+    pose_of_image_plane,
+    poses_between,
     touching,
 )
 
 SIZE = np.array([10.0, 6.0, 20.0])
 
 
-def test_pose_looks_along_its_direction_from_the_face():
+def test_the_beam_of_a_pose_is_along_its_direction_from_the_face():
     pose = pose_at(np.array([1.0, 2.0, 3.0]), np.array([0.0, 2.0, 0.0]), np.array([1.0, 5.0, 0.0]), 20.0)
     assert pose[:3, :3] @ pose[:3, :3].T == pytest.approx(np.eye(3))
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
@@ -46,10 +46,10 @@ def test_image_plane_starts_at_the_face_with_x_to_the_marked_side_and_y_down():
     assert np.linalg.det(plane.world_from_plane[:3, :3]) == pytest.approx(1.0)
 
 
-def test_a_probe_is_held_where_its_image_plane_lies():
+def test_the_pose_of_an_image_plane_is_the_pose_it_came_from():
     pose = pose_at(np.array([3.0, -2.0, 7.0]), np.array([1.0, 2.0, -1.5]), np.array([0.3, 1.0, 0.2]), SIZE[2])
     plane = image_plane(pose, SIZE[2], 30.0, 40.0)
-    assert held_at(plane.world_from_plane, SIZE[2]) == pytest.approx(pose)
+    assert pose_of_image_plane(plane.world_from_plane, SIZE[2]) == pytest.approx(pose)
 
 
 def test_touching_pressing_and_measuring_agree(ball):
@@ -68,20 +68,20 @@ def test_touching_pressing_and_measuring_agree(ball):
 def test_poses_between_are_even_in_place_and_angle():
     start, end = np.eye(4), np.eye(4)
     end[:3, :3], end[:3, 3] = rotation_about([0, 0, 1], 30), [3.0, 0, 0]
-    poses = between(start, end, 3)
+    poses = poses_between(start, end, 3)
     assert poses[[0, 3]] == pytest.approx(np.stack([start, end]))
     assert poses[1, :3, :3] == pytest.approx(rotation_about([0, 0, 1], 10)) and poses[
         1, 0, 3
     ] == pytest.approx(1.0)
 
 
-def test_a_goal_is_approached_no_faster_than_told():
+def test_a_goal_is_approached_no_faster_than_the_limits():
     goal = np.eye(4)
     goal[:3, 3] = [10.0, 0, 0]
-    assert approached(np.eye(4), goal, 4.0, 90.0)[:3, 3] == pytest.approx([4, 0, 0])
-    assert approached(np.eye(4), goal, 40.0, 90.0) == pytest.approx(goal)
+    assert moved_towards(np.eye(4), goal, 4.0, 90.0)[:3, 3] == pytest.approx([4, 0, 0])
+    assert moved_towards(np.eye(4), goal, 40.0, 90.0) == pytest.approx(goal)
     goal[:3, :3] = rotation_about([1, 0, 0], 60)
-    slow = approached(np.eye(4), goal, 40.0, 6.0)
+    slow = moved_towards(np.eye(4), goal, 40.0, 6.0)
     assert slow[:3, :3] == pytest.approx(rotation_about([1, 0, 0], 6)) and slow[0, 3] == pytest.approx(1.0)
 
 
@@ -106,13 +106,13 @@ def test_pointing_at_the_organ_puts_the_face_on_it_perpendicular(manipulator):
 
 def test_keys_push_and_the_button_presses_until_let_go(manipulator):
     manipulator.push(2.0)
-    manipulator.hold(True, 0.25)
+    manipulator.press(True, 0.25)
     assert indentation(manipulator.pose(), SIZE, manipulator.samples) == pytest.approx(5.0)
     for _ in range(100):
-        manipulator.hold(True, 0.1)
+        manipulator.press(True, 0.1)
     assert indentation(manipulator.pose(), SIZE, manipulator.samples) == pytest.approx(15.0)
     for _ in range(10):
-        manipulator.hold(False, 0.1)
+        manipulator.press(False, 0.1)
     assert indentation(manipulator.pose(), SIZE, manipulator.samples) == pytest.approx(2.0)
     manipulator.push(-5.0)
     assert indentation(manipulator.pose(), SIZE, manipulator.samples) == pytest.approx(-3.0)
@@ -133,7 +133,7 @@ def held_aslant(manipulator: ProbeManipulator) -> np.ndarray:
     return manipulator.aim
 
 
-def test_turns_follow_one_another_fan_then_tilt_then_roll_about_axes_that_turn_along(manipulator):
+def test_turns_are_tilt_then_rock_then_rotate_about_axes_that_turn_along(manipulator):
     aim = held_aslant(manipulator)
     manipulator.turn(20.0, -30.0, 50.0)
     tilt, rock, rotate = (
@@ -142,7 +142,7 @@ def test_turns_follow_one_another_fan_then_tilt_then_roll_about_axes_that_turn_a
     assert manipulator.pose()[:3, :3] == pytest.approx(aim[:3, :3] @ tilt @ rock @ rotate)
 
 
-def test_a_turned_probe_still_looks_from_where_it_is_aimed(manipulator):
+def test_a_turned_probe_keeps_its_face_at_the_aim(manipulator):
     aim = held_aslant(manipulator)
     manipulator.turn(25.0, -35.0, 10.0)
     pose = manipulator.pose()
@@ -155,10 +155,10 @@ def test_a_probe_is_held_as_it_is_taken(manipulator):
     aim = held_aslant(manipulator)
     for depth in (-5.0, 0.0, 3.0, 15.0):
         pose = advanced(touching(aim, SIZE, manipulator.samples), depth)
-        manipulator.take(pose)
+        manipulator.match(pose)
         assert manipulator.pose() == pytest.approx(pose)
         for _ in range(100):
-            manipulator.hold(False, 0.1)
+            manipulator.press(False, 0.1)
         assert indentation(manipulator.pose(), SIZE, manipulator.samples) == pytest.approx(
             min(depth, 0.0), abs=1e-9
         )
@@ -189,7 +189,7 @@ def test_normals_count_by_a_gaussian_of_their_distance(manipulator):
             np.array([[0.0, 0, 1], [1, 0, 0]]),
         )
         other = np.exp(-((away / 12.0) ** 2))
-        assert manipulator.outward(np.zeros(3)) == pytest.approx([other, 0, 1] / np.hypot(other, 1))
+        assert manipulator.surface_normal(np.zeros(3)) == pytest.approx([other, 0, 1] / np.hypot(other, 1))
 
 
 def test_tilts_end_where_a_hand_does(manipulator):
@@ -223,7 +223,7 @@ def test_the_tool_of_a_curved_array_is_its_arc_to_a_tenth_of_a_millimetre(one_de
 
 def test_a_probe_of_short_housing_is_not_pushed_in_beyond_what_holds_it(manipulator):
     manipulator.push(100.0)
-    assert manipulator.depth_mm == manipulator.most_mm == 15.0
+    assert manipulator.depth_mm == manipulator.max_mm == 15.0
     short = ProbeManipulator(
         manipulator.vertices,
         manipulator.faces,
@@ -236,14 +236,14 @@ def test_a_probe_of_short_housing_is_not_pushed_in_beyond_what_holds_it(manipula
     assert short.depth_mm == 9.0
 
 
-def test_a_press_goes_as_deep_as_its_share_and_gives_way_where_that_falls(manipulator):
+def test_the_depth_of_a_press_follows_its_share(manipulator):
     for share, depth in ((0.4, 6.0), (0.8, 12.0), (0.2, 3.0)):
         for _ in range(20):
-            manipulator.hold(True, 0.1, share)
+            manipulator.press(True, 0.1, share)
         assert manipulator.pressed_mm == pytest.approx(depth)
-    manipulator.hold(True, 0.1, 1.0)
+    manipulator.press(True, 0.1, 1.0)
     assert manipulator.pressed_mm == pytest.approx(3.0 + 1.2)
-    manipulator.hold(True, 0.1, 0.0)
+    manipulator.press(True, 0.1, 0.0)
     assert manipulator.pressed_mm == pytest.approx(4.2 - 4.0)
 
 
@@ -288,7 +288,7 @@ def test_a_slide_goes_so_far_over_the_surface(rider, lateral, elevation):
     assert rider.aim[:3, 2] @ normal > np.cos(np.radians(0.5))
 
 
-def test_a_slide_goes_on_where_the_surface_looks_along_the_hands_lateral(rider):
+def test_a_slide_continues_where_the_surface_normal_is_along_the_lateral_axis(rider):
     way = np.radians(150) * RADIUS
     assert slid(rider, way, 0.0, 150) == pytest.approx(on_the_arc([1, 0, 0], way), abs=0.8)
 

@@ -6,7 +6,7 @@ from conftest import rotation_about
 from numpy.typing import ArrayLike
 
 from rehearsal.reconstruction.segmentation_metrics import SegmentationMetrics, segmentation_metrics
-from ultrasound.reconstruction import METHODS, MOST_VOXELS, Reconstruction, VoxelBox
+from ultrasound.reconstruction import MAX_VOXELS, METHODS, Reconstruction, VoxelBox
 
 VOXEL = 0.5
 both_methods = pytest.mark.parametrize("method", METHODS)
@@ -234,7 +234,7 @@ def test_what_does_not_fit_is_refused():
         ("corners", lambda: VoxelBox.around(np.zeros((2, 2)), 0.5)),
         ("spacing", lambda: VoxelBox.around(np.zeros((2, 3)), 0.0)),
         ("spacing", lambda: VoxelBox.around(np.zeros((2, 3)), np.nan)),
-        ("larger voxels", lambda: VoxelBox.around(np.array([[0, 0, 0], [MOST_VOXELS, 0, 0]]), 1.0)),
+        ("larger voxels", lambda: VoxelBox.around(np.array([[0, 0, 0], [MAX_VOXELS, 0, 0]]), 1.0)),
         ("larger voxels", lambda: VoxelBox.around(np.array([[0, 0, 0], [1e300] * 3]), 0.5)),
         ("voxel along each axis", lambda: box_of(3, 0, 5)),
         ("median", lambda: Reconstruction(box_of(4, 4, 4), "median")),

@@ -13,7 +13,7 @@ from ultrasound.acoustics import CORTEX_DB
 from ultrasound.image_plane import ImagePlane
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import image_plane, pose_at
-from ultrasound.scanner import CT, ScannedAnatomy, Scanner, begin_echo
+from ultrasound.scanner import CT, ScannedAnatomy, Scanner, start_acoustics
 
 PIXELS, RADIUS, REACH = 64, 12.0, 20.0
 PROBE = Probe(
@@ -52,7 +52,7 @@ def plane_at(above: float = 0.0) -> ImagePlane:
 
 def echo(scanner: Scanner, plane: ImagePlane) -> np.ndarray:
     """What the middle line holds [dB], but for the gain."""
-    scanner.look(plane, PROBE, "b-mode", "reflection", 350.0, 40.0)
+    scanner.images(plane, PROBE, "b-mode", "reflection", 350.0, 40.0)
     return array_of(scanner.bmode.decibel)[16].astype(float) - PROBE.gain_db()
 
 
@@ -63,12 +63,12 @@ def test_voxels_are_measured_along_their_own_axes(spacing):
 
 def test_the_slice_is_windowed_as_asked_for(device):
     scanner = Scanner(anatomy(), Unmoved(), PROBE, PIXELS)
-    picture = scanner.look(plane_at(), PROBE, "ct", "speckle", 400.0, 20.0)[CT]
+    picture = scanner.images(plane_at(), PROBE, "ct", "speckle", 400.0, 20.0)[CT]
     wanted = np.clip((scanner.slice.hounsfield().astype(float) - 20.0) / 400.0 + 0.5, 0, 1) * 255
     assert np.ptp(wanted) > 50 and np.abs(picture - wanted).max() <= 0.51
 
 
-def test_each_look_is_at_where_the_body_is_now(device):
+def test_each_image_is_of_the_body_as_it_is_now(device):
     class Followed(Unmoved):
         looks = 0
 
@@ -78,13 +78,13 @@ def test_each_look_is_at_where_the_body_is_now(device):
     embedding = Followed()
     scanner = Scanner(anatomy(), embedding, PROBE, PIXELS)
     for looks in (1, 2):
-        scanner.look(plane_at(), PROBE, "ct", "speckle", 400.0, 20.0)
+        scanner.images(plane_at(), PROBE, "ct", "speckle", 400.0, 20.0)
         assert embedding.looks == looks
 
 
-def test_an_echo_begun_before_is_the_one_that_is_shown(device):
+def test_acoustics_started_before_give_the_same_image(device):
     bones, plane = replace(anatomy(), tissues={1: "bone"}), plane_at()
-    begun = echo(Scanner(anatomy(), Unmoved(), PROBE, PIXELS, echo=begin_echo(bones)), plane)
+    begun = echo(Scanner(anatomy(), Unmoved(), PROBE, PIXELS, acoustics=start_acoustics(bones)), plane)
     assert np.array_equal(begun, echo(Scanner(bones, Unmoved(), PROBE, PIXELS), plane))
     assert np.abs(begun - echo(Scanner(anatomy(), Unmoved(), PROBE, PIXELS), plane)).max() > 10.0
 
@@ -105,7 +105,7 @@ def test_beyond_the_ct_is_silence(device):
     assert decibel[within].min() > -120.0 and decibel[depth > RADIUS + REACH + 1.0].max() < -179.9
 
 
-def test_what_lies_around_the_organ_reflects_as_gel_or_as_air(device):
+def test_the_surroundings_reflect_as_gel_or_as_air(device):
     depth = (np.arange(320) + 0.5) * PROBE.sample_mm
     border = np.abs(depth - 2 * RADIUS + 1.0) < 2.0
     peak = {}

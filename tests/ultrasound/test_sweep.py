@@ -138,7 +138,7 @@ def test_a_status_that_is_not_ok_is_none(status):
     assert frame_of(**fields).transform("B", "A", 0) is None
 
 
-def test_names_that_nothing_joins_are_told():
+def test_names_that_no_chain_joins_are_reported():
     sweep = frame_of(**tracked(ImageToProbe=SCALED))
     with pytest.raises(
         SweepError, match="frame 0: no chain of transforms from Image to World, of ImageToProbe$"

@@ -40,7 +40,7 @@ HOSTILE = {
     "a gap": (dict(DimSize="4 3 2", Seq_Frame0002_A="b"), "2 have fields, the last is 2"),
     "no number": (dict(Seq_FrameABCD_A="b"), "'Seq_FrameABCD_A': expected Seq_Frame0000_Name"),
     "no field": (dict(Seq_Frame0000="b"), "'Seq_Frame0000': expected"),
-    "twice": (dict(raw="NDims = 3\n"), "'NDims' stands twice"),
+    "twice": (dict(raw="NDims = 3\n"), "'NDims'.*twice"),
     "no equals": (dict(raw="what is this\n"), "'what is this.n': expected Name = value"),
     "no name": (dict(raw=" = 3\n"), "expected Name = value"),
     "short": (dict(pixels=bytes(11)), "11 bytes of pixels: expected 12"),
@@ -53,13 +53,13 @@ def squeezed(pixels: bytes, size: str | None = None) -> dict:
 
 
 HOSTILE |= {
-    "no zlib": (squeezed(b"nonsense"), "no zlib data"),
-    "bad checksum": (squeezed(SQUEEZED[:-1] + b"x"), "no zlib data"),
+    "no zlib": (squeezed(b"nonsense"), "zlib data"),
+    "bad checksum": (squeezed(SQUEEZED[:-1] + b"x"), "zlib data"),
     "cut off": (squeezed(SQUEEZED[:-4]), "expected 12"),
     "size too small": (squeezed(SQUEEZED, "3"), "CompressedDataSize = '3'"),
     "size none": (squeezed(SQUEEZED, "some"), "CompressedDataSize = 'some'"),
     "left over": (squeezed(SQUEEZED + b"x"), "expected 12"),
-    "a bomb": (squeezed(zlib.compress(bytes(10_000_000))), "bytes are there for 12"),
+    "a bomb": (squeezed(zlib.compress(bytes(10_000_000))), "bytes .* for 12"),
     "a small bomb": (
         squeezed(zlib.compress(bytes(10_000))),
         "13 bytes of pixels or more in the zlib data: expected 12",

@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from scenes.patients import import_warnings
 from ultrasound.acoustics import ATTENUATION, IMPEDANCE, properties, tissue_table
-from ultrasound.tissue_classification import STONE_ABOVE_MEDIAN_HU, _filled, bones, hollow, recognised
+from ultrasound.tissue_classification import STONE_ABOVE_MEDIAN_HU, _filled, bones, classify_tissues, enclosed
 
 SPACING = np.array([0.9, 0.9, 0.9])
 FAT, MARROW, SHELL, CORTEX, BLOOD = -100.0, 150.0, 600.0, 180.0, 200.0
@@ -45,7 +45,7 @@ def test_a_bone_is_filled_with_its_marrow_even_where_the_ct_ends_and_is_no_large
 
 
 @pytest.mark.parametrize("spacing", list(permutations((0.6, 0.9, 1.8))))
-def test_a_bone_is_found_where_it_lies_whatever_its_voxels(spacing):
+def test_a_bone_is_found_at_any_voxel_size(spacing):
     places = np.moveaxis(np.indices(np.ceil(60 / np.array(spacing)).astype(int)), 0, -1) * spacing
     away = np.linalg.norm(places - [24.0, 30.0, 35.0], axis=-1)
     found = bones(np.select([away < 14.0, away < 16.0], [MARROW, SHELL], FAT), np.array(spacing))
@@ -56,7 +56,7 @@ def test_a_bone_is_found_where_it_lies_whatever_its_voxels(spacing):
 def test_what_has_a_label_is_no_bone():
     hu, bone, kidney, _ = abdomen()
     muscle = bone & (np.arange(70)[:, None] < 34)
-    found = recognised(hu, {"kidney": kidney, "muscle": muscle}, SPACING)["bone"]
+    found = classify_tissues(hu, {"kidney": kidney, "muscle": muscle}, SPACING)["bone"]
     assert not (found & muscle).any() and found[bone & ~muscle].mean() > 0.9
 
 
@@ -66,7 +66,7 @@ def test_a_groove_is_a_hollow_where_no_ball_of_20_mm_goes_in(across, down, width
     spacing = np.array([1.0, 2.0, 0.5])
     places = np.moveaxis(np.indices((60 / spacing).astype(int) + 1), 0, -1) * spacing - 30.0
     groove = (np.abs(places[..., across]) < width / 2) & (places[..., down] > -20.0)
-    found = hollow(~groove, spacing)
+    found = enclosed(~groove, spacing)
     assert not (found & ~groove).any()
     # Amid the groove: at a width of 17 mm a ball on its open end reaches 5 mm in, and where one goes in it touches the walls.
     along = np.delete(places, [across, down], -1)[..., 0]
@@ -108,7 +108,7 @@ def test_all_sections_are_filled_as_each_alone(axis, share):
 
 def test_what_is_bright_by_contrast_agent_is_no_bone_and_outside_the_labels_blood():
     hu, bone, kidney, vessel = abdomen()
-    found = recognised(hu, {"kidney": kidney}, SPACING)
+    found = classify_tissues(hu, {"kidney": kidney}, SPACING)
     assert not (found["bone"] & (kidney | vessel)).any()
     assert (found["vessel"] & vessel).sum() > 0.6 * vessel.sum()
     assert not (found["vessel"] & (kidney | bone)).any()
@@ -117,7 +117,7 @@ def test_what_is_bright_by_contrast_agent_is_no_bone_and_outside_the_labels_bloo
 def test_without_contrast_agent_nothing_is_taken_for_blood():
     hu, _, kidney, _ = abdomen()
     hu[kidney] -= CORTEX - 30.0
-    assert "vessel" not in recognised(hu, {"kidney": kidney}, SPACING)
+    assert "vessel" not in classify_tissues(hu, {"kidney": kidney}, SPACING)
 
 
 def test_contrast_agent_in_labelled_urine_and_about_it_is_no_stone_but_without_agent_what_is_bright_there_is():
@@ -125,12 +125,12 @@ def test_contrast_agent_in_labelled_urine_and_about_it_is_no_stone_but_without_a
     urine, agent = ball((50.0, 30.0, 27.0), 4.0), ball((50.0, 30.0, 27.0), 4.5)
     hu[agent] = CORTEX + STONE_ABOVE_MEDIAN_HU + 100.0
     named = {"kidney": kidney & ~urine, "urine": urine}
-    assert not recognised(hu, named, SPACING)["stone"].any()
-    assert (recognised(hu, {"kidney": kidney}, SPACING)["stone"] == agent).all()
-    assert (recognised(hu - CORTEX + 30.0, named, SPACING)["stone"] == agent).all()
+    assert not classify_tissues(hu, named, SPACING)["stone"].any()
+    assert (classify_tissues(hu, {"kidney": kidney}, SPACING)["stone"] == agent).all()
+    assert (classify_tissues(hu - CORTEX + 30.0, named, SPACING)["stone"] == agent).all()
 
 
-def test_an_import_warns_of_what_the_echo_takes_for_stone():
+def test_an_import_warns_of_what_is_classified_as_stone():
     assert import_warnings.STONE_ABOVE_MEDIAN_HU == STONE_ABOVE_MEDIAN_HU
 
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from rehearsal.reconstruction.simulated_tracker import with_errors
 from studies.freehand.freehand_sweeps import sweep_of
 from ultrasound.sweep import Sweep, SweepError
-from ultrasound.tracking_errors import TrackingErrors, tracked
+from ultrasound.tracking_errors import TrackingErrors, with_tracking_errors
 
 FRAMES = 4000
 # Estimates are off by a standard error now and then, hardly ever by four.
@@ -28,7 +28,7 @@ def sweep(count: int = FRAMES) -> tuple[np.ndarray, np.ndarray]:
 
 def reported(errors: TrackingErrors, seed: int = 0) -> np.ndarray:
     poses, times = sweep()
-    return np.array(tracked(poses, times, errors, seed))
+    return np.array(with_tracking_errors(poses, times, errors, seed))
 
 
 def turns_deg(found: np.ndarray, poses: np.ndarray) -> np.ndarray:
@@ -64,7 +64,7 @@ def test_noise_turns_about_the_probes_own_axes_whatever_its_pose():
     poses, times = sweep(50)
     upright = np.tile(np.eye(4), (50, 1, 1))
     errors = TrackingErrors(noise_deg=3.0)
-    turns = [turns_deg(np.array(tracked(way, times, errors)), way) for way in (poses, upright)]
+    turns = [turns_deg(np.array(with_tracking_errors(way, times, errors)), way) for way in (poses, upright)]
     np.testing.assert_allclose(*turns, atol=1e-9)
 
 
@@ -82,7 +82,7 @@ def test_calibration_is_one_shift_and_turn_of_the_image_against_the_probe():
 
 def test_the_directions_of_calibration_come_from_the_seed():
     errors, (poses, times) = TrackingErrors(calibration_mm=1.0, calibration_deg=1.0), sweep(1)
-    found = np.concatenate([np.array(tracked(poses, times, errors, seed)) for seed in range(30)])
+    found = np.concatenate([np.array(with_tracking_errors(poses, times, errors, seed)) for seed in range(30)])
     shifts, axes = (found - poses)[:, :3, 3], turns_deg(found, poses)
     # Of n directions the mean is 0, each of its coordinates with a standard error of 1 / sqrt(3 n).
     assert np.abs([shifts.mean(axis=0), axes.mean(axis=0)]).max() < SIGMAS / np.sqrt(3 * 30)
@@ -115,13 +115,15 @@ def test_latency_is_the_pose_of_so_much_earlier():
 
 def test_a_single_pose_has_nothing_earlier():
     poses, times = sweep(1)
-    np.testing.assert_array_equal(tracked(poses, times, TrackingErrors(latency_s=1.0))[0], poses[0])
+    np.testing.assert_array_equal(
+        with_tracking_errors(poses, times, TrackingErrors(latency_s=1.0))[0], poses[0]
+    )
 
 
 @pytest.mark.parametrize("lost", [0.03, 0.4])
 def test_the_share_of_lost_frames_is_that_asked_for(lost):
     poses, times = sweep()
-    gone = np.array([pose is None for pose in tracked(poses, times, TrackingErrors(lost=lost))])
+    gone = np.array([pose is None for pose in with_tracking_errors(poses, times, TrackingErrors(lost=lost))])
     # The standard error of a share of n independent frames.
     assert abs(gone.mean() - lost) < SIGMAS * np.sqrt(lost * (1 - lost) / FRAMES)
     # In a row as often as chance has it, whose standard error is at most that of so many pairs.
@@ -129,7 +131,7 @@ def test_the_share_of_lost_frames_is_that_asked_for(lost):
 
 
 def test_all_frames_can_be_lost():
-    assert tracked(*sweep(50), TrackingErrors(lost=1.0)) == [None] * 50
+    assert with_tracking_errors(*sweep(50), TrackingErrors(lost=1.0)) == [None] * 50
 
 
 def test_what_is_reported_is_rigid():
@@ -150,7 +152,7 @@ def test_a_seed_gives_the_same_poses_and_another_gives_others():
 def test_a_seed_draws_one_pattern_at_any_size_and_whatever_is_lost():
     poses, times = sweep()
     small = reported(TrackingErrors(noise_mm=0.1)) - poses
-    found = tracked(poses, times, TrackingErrors(noise_mm=0.8, lost=0.3))
+    found = with_tracking_errors(poses, times, TrackingErrors(noise_mm=0.8, lost=0.3))
     for pose, true, step in zip(found, poses, small, strict=True):
         if pose is not None:
             np.testing.assert_allclose((pose - true)[:3, 3], 8 * step[:3, 3], atol=1e-11)
@@ -175,9 +177,9 @@ def test_an_impossible_error_is_refused_by_name(field, value):
 def test_poses_without_their_times_are_refused():
     poses, times = sweep(5)
     with pytest.raises(ValueError, match="times"):
-        tracked(poses, times[:4], TrackingErrors())
-    with pytest.raises(ValueError, match="grow"):
-        tracked(poses, times[::-1], TrackingErrors())
+        with_tracking_errors(poses, times[:4], TrackingErrors())
+    with pytest.raises(ValueError, match="increase"):
+        with_tracking_errors(poses, times[::-1], TrackingErrors())
 
 
 def recorded(count: int = 6) -> Sweep:
@@ -192,7 +194,7 @@ def test_a_recorded_sweep_gets_the_errors_of_a_tracker_and_keeps_what_it_had_los
     after = with_errors(before, "Reference", errors, seed=3)
     known = [0, 1, 3, 4, 5]
     poses = np.stack([before.transform("Probe", "Reference", k) for k in known])
-    expected = tracked(poses, before.times_s[known], errors, 3)
+    expected = with_tracking_errors(poses, before.times_s[known], errors, 3)
     for k, pose in zip(known, expected, strict=True):
         assert np.array_equal(after.transform("Probe", "Reference", k), pose)
         assert not np.allclose(pose, before.transform("Probe", "Reference", k))

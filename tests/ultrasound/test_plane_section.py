@@ -6,7 +6,7 @@ import trimesh
 from conftest import rotation_about
 from scipy.spatial.distance import cdist
 
-from ultrasound.outline import section
+from ultrasound.image_plane import plane_section
 from ultrasound.probe_manipulator import image_plane, pose_at
 
 RADIUS = 12.0
@@ -21,7 +21,7 @@ def oblique_plane() -> np.ndarray:
 
 
 def cut(mesh: trimesh.Trimesh, plane: np.ndarray) -> np.ndarray:
-    return section(np.array(mesh.vertices), np.array(mesh.faces), plane)
+    return plane_section(np.array(mesh.vertices), np.array(mesh.faces), plane)
 
 
 def is_closed(segments: np.ndarray) -> bool:
