@@ -26,7 +26,7 @@ def explained(
 ) -> str:
     """The first problem in a line: the key, what was found, what was expected, and how many more there are.
 
-    ``unknown`` says what the writer of an unknown key, given by its place, may have meant. ``tags`` are the kinds of a union, which
+    ``unknown`` suggests what the writer of an unknown key, given by its place, may have meant. ``tags`` are the kinds of a union, which
     pydantic names among the keys. A validator's own message that begins with its key is left as it is.
     """
     problems = error.errors(include_url=False)
@@ -34,17 +34,17 @@ def explained(
     problems.sort(key=lambda problem: problem["type"] != "extra_forbidden")
     first = problems[0]
     where = [str(part) for part in first["loc"] if part not in tags]
-    name, said = ".".join(where), first["msg"][0].lower() + first["msg"][1:]
+    name, message = ".".join(where), first["msg"][0].lower() + first["msg"][1:]
     if first["type"] == "value_error":
-        said = str(first["ctx"]["error"])
+        message = str(first["ctx"]["error"])
     if first["type"] == "extra_forbidden":
         text = f"{name}: {unknown(where)}"
     elif first["type"] == "missing":
         text = f"{name}: missing"
     elif isinstance(first["input"], dict):
-        text = said if said.startswith(name) else f"{name}: {said}"
+        text = message if message.startswith(name) else f"{name}: {message}"
     else:
-        text = f"{name} = {first['input']!r}: {said}"
+        text = f"{name} = {first['input']!r}: {message}"
     more = len(problems) - 1
     return text + (f" (and {more} more)" if more else "")
 

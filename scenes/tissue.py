@@ -1,4 +1,4 @@
-"""The tissue models as a scene names them: what each is told, and which there are."""
+"""The tissue models that a scene can name, and their parameters."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal

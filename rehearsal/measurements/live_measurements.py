@@ -101,7 +101,7 @@ class LiveMeasurements:
 
     def watch(self, session: Session, probe: Probe, pose: np.ndarray | None) -> None:
         """Update the coverage, and measure and record when due, after the images of a step (its pose, None for a rollback)."""
-        # What was measure before a way back is not so any more.
+        # After a rollback the latest measurement is out of date.
         is_due = pose is None or self.latest is None
         if (is_due or session.step_index % self._coverage_every == 0) and self.rehearsal.scanner is not None:
             image = self.rehearsal.scene.image

@@ -1,8 +1,7 @@
 """The file of a session: one line of JSON a second, each on the disk when it is written, so that a crash costs a second at most.
 
-The first line says what is rehearsed, each other one is a second of it: what was noted, the transducer's poses, and the tissue's
-digest after it. Now and then one holds the whole state and what was seen until then, as does the last, of a session that ended in
-order, with its summary. No line names a patient or a path.
+The first line names what is rehearsed; each other line is a second: events, the transducer's poses, and the tissue's digest after
+it. Once a minute and at the end a line has the whole state and the coverage; the last line has the summary. No line names a patient or a path.
 """
 
 import base64
