@@ -18,13 +18,13 @@ STUDIES = {
         "studies.robustness.stability_command:stability",
         "Stress-test the tissue and see whether it recovers.",
     ),
-    "soak": ("studies.robustness.soak_command:soak", "Rehearse for an hour in SCENE, faster than real time."),
+    "soak": ("studies.robustness.soak_test:soak", "Rehearse for an hour in SCENE, faster than real time."),
     "import": ("studies.performance.import_timing_command:intake", "Measure an import: seconds and memory."),
     "freehand": (
         "studies.freehand.freehand_command:freehand",
         "Compare volumes of tracked sweeps with the ground truth.",
     ),
-    "replay": ("studies.robustness.replay_command:replay", "Record a session in SCENE and compute it again."),
+    "replay": ("studies.robustness.replay_study:replay", "Record a session in SCENE and compute it again."),
     "plan": (
         "studies.planning.plan_study_command:plan_study",
         "Compare planned sweeps with straight and random ones.",

@@ -5,7 +5,9 @@ from typing import Any
 
 import click
 
-from rehearsal.commands.command_line import NumberRange, WholeRange
+from rehearsal.commands.command_line import NumberRange, WholeRange, load_patient, make_folder, start_taichi
+from scenes.anatomy import LoadedAnatomy
+from scenes.scene import Scene
 from scenes.tissue import QUALITIES
 
 out_option = click.option(
@@ -34,3 +36,10 @@ def number_option(
     """An option for a number from low to high; ``bounds`` are ``min_open`` and ``max_open``."""
     range = NumberRange(low, high, **bounds)
     return click.option(*names, type=range, default=default, show_default=default is not None, help=help)
+
+
+def open_study(out: Path, scene: Path, arch: str) -> tuple[Scene, LoadedAnatomy, str]:
+    """Create the folder, load the scene and start Taichi; the scene, its anatomy and the backend's name."""
+    make_folder(out)
+    loaded, anatomy = load_patient(scene)
+    return loaded, anatomy, start_taichi(arch)

@@ -10,6 +10,7 @@ from tabulate import tabulate
 from rehearsal.result_files import save_figure, write_csv, write_json
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 DPI = 130
@@ -18,6 +19,14 @@ DPI = 130
 def text_table(headers: Sequence[str], rows: Sequence[Sequence[Any]], formats: Sequence[str] = ()) -> str:
     """Aligned columns; ``formats`` are those of the columns' numbers, None is an empty cell."""
     return tabulate(rows, headers, tablefmt="plain", floatfmt=formats or "g", missingval="")
+
+
+def finish_axes(axes: "Axes", legend: dict[str, Any] | None = None, **settings: Any) -> None:
+    """Titles, labels and scales of a panel, as ``Axes.set`` takes them; its grid, and a legend with these options."""
+    axes.set(**settings)
+    axes.grid(alpha=0.3, which="both")
+    if legend is not None:
+        axes.legend(**legend)
 
 
 def write_results(

@@ -1,13 +1,16 @@
-"""A long session of random input, recorded, and computed again from its file: is the final state identical?"""
+"""The command ``study replay``: is a long session of random input, computed again from its file, identical to the bit?"""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
+from tqdm import tqdm
 
 from rehearsal.adaptive_iterations import AdaptiveIterations
-from rehearsal.configuration import Setup, scene_of
+from rehearsal.commands.command_line import arch_option
+from rehearsal.configuration import PRESETS
 from rehearsal.frame_view import initial_settings
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.rehearsal import Rehearsal
@@ -16,15 +19,73 @@ from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import Log, read_log
 from render.viewer import Controls, Settings
-from scenes.anatomy import LoadedAnatomy
-from scenes.scene import Scene
-from sim.device import start
+from scenes.scene import EMBEDDED
+from scenes.tissue import TISSUES, USUAL
+from studies.harness import Watch, build
+from studies.study_options import number_option, open_study, out_option, preset_option, scene_argument
+from studies.study_results import write_results
 
 SEED = 20161130
 # Time between two changes of the input, and distance of the mouse ray's origin from the organ.
 CHANGE_S, FROM_MM = 0.7, 60.0
 # Probability of each of these at a change of the input.
 PROBABILITY = {"undo": 0.06, "redo": 0.03, "bookmark": 0.03, "to_bookmark": 0.02, "reset": 0.01}
+
+
+@click.command()
+@scene_argument(EMBEDDED)
+@out_option
+@number_option("--minutes", low=0.05, high=600, default=10.0, help="Simulated minutes.")
+@click.option(
+    "--model", type=click.Choice(list(TISSUES)), default=USUAL, show_default=True, help="Tissue model."
+)
+@preset_option
+@arch_option
+def replay(scene: Path, out: Path, minutes: float, model: str, quality: str, arch: str) -> None:
+    """Record a session in SCENE and compute it again.
+
+    Its input is random; from its file it is computed twice, and once from its middle.
+    """
+    loaded, anatomy, used = open_study(out, scene, arch)
+    steps = round(60 * minutes / loaded.solver.time_step_s)
+
+    def rehearsal() -> Rehearsal:
+        return build(loaded, anatomy, PRESETS[model][quality], used, with_image=True)
+
+    with tqdm(total=round(3.5 * steps), desc="replay", unit="step") as bar:
+        session = Session(rehearsal())
+        recorded = record(session, anatomy, used, out)
+        # Without a limit of time: iterations that adapt to it would record another session each time.
+        live = UserInput(session, AdaptiveIterations(np.inf), recorded)
+        Watch().rehearse(session.rehearsal, random_poses(live, session.rehearsal, steps, bar))
+        recorded.close({})
+        path, digest = recorded.recording.path, session.rehearsal.digest()
+        log = read_log(path)
+        runs = [replayed(rehearsal(), log, from_s, bar) for from_s in (0.0, 0.0, log.length_s / 2)]
+    figures = dict(
+        arch=used,
+        model=model,
+        quality=quality,
+        file=path.name,
+        minutes=minutes,
+        moments=len(log.poses),
+        ways_back=sum(event.kind == "back" for events in log.events.values() for event in events),
+        megabytes=round(path.stat().st_size / 1e6, 3),
+        digest=digest,
+        replays=runs,
+    )
+    write_results(out, "replay", figures, summary(figures))
+
+
+def random_poses(live: UserInput, rehearsal: Rehearsal, steps: int, bar: tqdm) -> Iterator[np.ndarray]:
+    """Poses of a restless user, who also undoes, redoes and resets; the same each time."""
+    for controls in random_input(rehearsal, initial_settings(rehearsal), steps):
+        pose = live.next_pose(controls)
+        if pose is not None:
+            yield pose
+            live.after_step(0.0)
+        live.after_frame()
+        bar.update()
 
 
 def random_input(rehearsal: Rehearsal, settings: Settings, steps: int) -> Iterator[Controls]:
@@ -57,52 +118,14 @@ def random_input(rehearsal: Rehearsal, settings: Settings, steps: int) -> Iterat
         yield controls
 
 
-def recorded_session(
-    scene: Scene,
-    anatomy: LoadedAnatomy,
-    setup: Setup,
-    minutes: float,
-    arch: str,
-    out: Path,
-    done: Callable[[int], Any],
-) -> tuple[Path, str]:
-    """Record a session of random input; its file, and the digest of its final state."""
-    start(arch)
-    rehearsal = Rehearsal(scene_of(scene, setup), anatomy)
-    session = Session(rehearsal)
-    recorded = record(session, anatomy, arch, out)
-    # Without a limit of time: iterations that adapt to it would record another session each time.
-    live = UserInput(session, AdaptiveIterations(np.inf), recorded)
-    steps = round(60 * minutes / rehearsal.settings.time_step_s)
-    for controls in random_input(rehearsal, initial_settings(rehearsal), steps):
-        pose = live.next_pose(controls)
-        if pose is not None:
-            rehearsal.advance(pose)
-            live.after_step(0.0)
-        live.after_frame()
-        done(1)
-    recorded.close({})
-    return recorded.recording.path, rehearsal.digest()
-
-
-def replayed(
-    scene: Scene,
-    anatomy: LoadedAnatomy,
-    setup: Setup,
-    log: Log,
-    from_s: float,
-    arch: str,
-    done: Callable[[int], Any],
-) -> dict[str, Any]:
+def replayed(rehearsal: Rehearsal, log: Log, from_s: float, bar: tqdm) -> dict[str, Any]:
     """Compute a session again from the last stored state before a time [s]."""
-    start(arch)
-    rehearsal = Rehearsal(scene_of(scene, setup), anatomy)
     replay = Replay(rehearsal, log)
     begins = replay.begin_at(from_s)
     # The steps from there to the time itself are not counted.
-    done(begins - replay.step_at(from_s))
+    bar.update(begins - replay.step_at(from_s))
     for _ in replay.go_to(log.length_s):
-        done(1)
+        bar.update()
     return dict(
         begins_s=begins * log.header.time_step_s,
         digest=rehearsal.digest(),
@@ -111,22 +134,16 @@ def replayed(
     )
 
 
-def measure(
-    scene: Scene, anatomy: LoadedAnatomy, setup: Setup, minutes: float, arch: str, out: Path, done: Callable
-) -> dict[str, Any]:
-    """Record a session, replay it twice, and once from the stored state in the middle."""
-    path, digest = recorded_session(scene, anatomy, setup, minutes, arch, out, done)
-    log = read_log(path)
-    runs = [
-        replayed(scene, anatomy, setup, log, from_s, arch, done) for from_s in (0.0, 0.0, log.length_s / 2)
+def summary(figures: dict[str, Any]) -> str:
+    """The session and its replays, a line each."""
+    lines = [
+        f"recorded  {figures['minutes']:g} minutes, {figures['moments']} steps, {figures['ways_back']} of them undone, redone, reset or "
+        f"returned to a bookmark; {figures['megabytes']:.1f} MB in {figures['file']}; final state {figures['digest']}"
     ]
-    backs = sum(event.kind == "back" for events in log.events.values() for event in events)
-    return dict(
-        file=path.name,
-        minutes=minutes,
-        moments=len(log.poses),
-        ways_back=backs,
-        megabytes=round(path.stat().st_size / 1e6, 3),
-        digest=digest,
-        replays=runs,
-    )
+    for run in figures["replays"]:
+        same = run["digest"] == figures["digest"] and run["differs_s"] is None
+        verdict = "identical" if same else f"DIFFERS from {run['differs_s']} s on"
+        lines.append(
+            f"replayed  from {run['begins_s']:.0f} s: final state {run['digest']}, {verdict} in {run['compared']} states compared"
+        )
+    return "\n".join(lines)

@@ -1,24 +1,27 @@
-"""Soak test: hours of rehearsal without a window, faster than real time; checked for drift, growth and differences."""
+"""The command ``study soak``: hours of rehearsal, faster than real time; checked for drift, growth and differences."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
-import psutil
+from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
+from tqdm import tqdm
 
-from rehearsal.configuration import Setup, scene_of
+from rehearsal.commands.command_line import WholeRange, arch_option
+from rehearsal.configuration import PRESETS, Setup
 from rehearsal.rehearsal import Rehearsal, RehearsalState
-from rehearsal.stopwatch import timed
 from scenes.anatomy import LoadedAnatomy
-from scenes.scene import Scene
-from sim.device import start
-from sim.fields import array_of
-from studies.robustness.rigid_fit import distances_after_fit
+from scenes.scene import PAPER, Scene
+from studies.harness import Watch, build, distances_after_fit, memory_of_process_mb, positions_of
+from studies.study_options import open_study, out_option, scene_argument
+from studies.study_results import finish_axes, text_table, write_results
 from ultrasound.probe_manipulator import advanced
 
 SEED = 20161130
+HOUR = 60
 # At the end of each minute the transducer is away and the tissue comes to rest.
 MINUTE_S, QUICK_MINUTE_S, REST_S = 60.0, 16.0, 10.0
 # Time between two goals of the probe; their reach to the sides, obliquity and depth.
@@ -27,6 +30,41 @@ ASIDE_MM, OBLIQUE_DEG, DEEPEST_MM = (20.0, 10.0), 20.0, 12.0
 AWAY_MM = 100.0
 # The last minutes are computed again from a snapshot.
 REPLAYED_MINUTES = 2
+SHOWN = {
+    "shape_mm": "shape: mean distance from the first rest,\nafter a rigid fit (mm)",
+    "moved_mm": "position: mean distance from the first rest (mm);\nfriction alone holds the pushed kidney",
+    "memory_mb": "memory of the process since the first minute (MB)",
+    "ms_median": "time of a step (ms)",
+}
+# Half the least range of the axis of memory.
+LEAST_MB = 10.0
+HEADERS = ("model", "minute", "moved, mm", "shape, mm", "volume", "ms a step", "memory, MB")
+FORMATS = ("", "g", ".3f", ".4f", ".4f", ".2f", ".1f")
+COLUMNS = ("minute", "moved_mm", "shape_mm", "volume_ratio", "ms_median", "memory_mb")
+
+
+@click.command()
+@scene_argument(PAPER)
+@out_option
+@click.option(
+    "--minutes", type=WholeRange(1, 6000), default=HOUR, show_default=True, help="Simulated minutes."
+)
+@click.option("--quick", is_flag=True, help="A quarter of a simulated minute of each model.")
+@click.option("--model", type=click.Choice(list(PRESETS)), help="One tissue model [all].")
+@arch_option
+def soak(scene: Path, out: Path, minutes: int, quick: bool, model: str | None, arch: str) -> None:
+    """Rehearse for an hour in SCENE, faster than real time.
+
+    Does the rest shape drift, memory grow, a replay differ?
+    """
+    loaded, anatomy, used = open_study(out, scene, arch)
+    minutes, minute_s = (1, QUICK_MINUTE_S) if quick else (minutes, MINUTE_S)
+    setups = [presets["fast"] for name, presets in PRESETS.items() if model in (None, name)]
+    total = len(setups) * (minutes + min(minutes, REPLAYED_MINUTES))
+    with tqdm(total=total, desc="soak", unit="min") as bar:
+        runs = [run_soak(loaded, anatomy, setup, minutes, minute_s, used, bar.update) for setup in setups]
+    rows = [dict(model=run["model"]) | row for run in runs for row in run["minutes"]]
+    write_results(out, "soak", dict(arch=used, runs=runs), table(runs), rows, figure_of(runs))
 
 
 def run_soak(
@@ -39,21 +77,23 @@ def run_soak(
     done: Callable[[], Any],
 ) -> dict[str, Any]:
     """Figures of each simulated minute of ``minute_s`` [s], and whether replay and reset are identical to the bit."""
-    start(arch)
-    rehearsal = Rehearsal(scene_of(scene, setup), replace(anatomy, ct=None))
+    rehearsal = build(scene, anatomy, setup, arch)
     first, begun = rehearsal.snapshot(), rehearsal.digest()
-    replayed = min(REPLAYED_MINUTES, minutes)
-    rows, snapshot = [], first
-    for minute in range(minutes):
-        if minute == minutes - replayed:
-            snapshot = rehearsal.snapshot()
-        rows.append(_minute(rehearsal, minute, minute_s, first))
-        done()
+
+    def drive(numbers: range) -> list[dict[str, Any]]:
+        rows = []
+        for number in numbers:
+            rows.append(_minute(rehearsal, number, minute_s, first))
+            done()
+        return rows
+
+    replayed = range(max(minutes - REPLAYED_MINUTES, 0), minutes)
+    rows = drive(range(replayed.start))
+    snapshot = rehearsal.snapshot()
+    rows += drive(replayed)
     ended = rehearsal.digest()
     rehearsal.restore(snapshot)
-    for minute in range(minutes - replayed, minutes):
-        _minute(rehearsal, minute, minute_s, first)
-        done()
+    drive(replayed)
     again = rehearsal.digest()
     rehearsal.restore(first)
     return dict(
@@ -69,18 +109,9 @@ def run_soak(
 
 def _minute(rehearsal: Rehearsal, minute: int, minute_s: float, first: RehearsalState) -> dict[str, Any]:
     """One minute of rehearsal, and the distance of the tissue from its first rest position."""
-    dt = rehearsal.settings.time_step_s
-    ms: list[float] = []
-    fallbacks = 0
-    goals = _goals(rehearsal, minute)
-    for step in range(round(minute_s / dt)):
-        if step * dt >= minute_s - REST_S:
-            goal = advanced(rehearsal.manipulator.home, -AWAY_MM)
-        elif step % round(CHANGE_S / dt) == 0:
-            goal = next(goals)
-        timed(lambda: rehearsal.advance(rehearsal.pose_towards(goal)), ms)
-        fallbacks += bool(rehearsal.notice)
-    position = array_of(rehearsal.body.position).astype(float)
+    watch = Watch()
+    watch.rehearse(rehearsal, _poses(rehearsal, minute, minute_s))
+    position = positions_of(rehearsal.solver)
     rest = first.solver.body.position.astype(float)
     rehearsal.update_surfaces()
     return dict(
@@ -90,19 +121,62 @@ def _minute(rehearsal: Rehearsal, minute: int, minute_s: float, first: Rehearsal
         volume_ratio=round(rehearsal.volume_ratio(), 6),
         tangled=rehearsal.divergence_check.health().tangled,
         finite=bool(np.isfinite(position).all()),
-        fallbacks=fallbacks,
-        ms_median=round(float(np.median(ms)), 4),
-        memory_mb=round(psutil.Process().memory_info().rss / 1e6, 3),
+        fallbacks=len(watch.restored),
+        ms_median=round(float(np.median(watch.step_ms)), 4),
+        memory_mb=round(memory_of_process_mb(), 3),
     )
 
 
-def _goals(rehearsal: Rehearsal, minute: int) -> Iterator[np.ndarray]:
-    """Random poses over and in the organ, the same for the same minute."""
+def _poses(rehearsal: Rehearsal, minute: int, minute_s: float) -> Iterator[np.ndarray]:
+    """Moves to random goals over and in the organ, the same for the same minute; then away, to rest."""
     random = np.random.default_rng([SEED, minute])
-    home = rehearsal.manipulator.home
-    while True:
-        goal = advanced(home, random.uniform(-5.0, DEEPEST_MM))
-        goal[:3, 3] += home[:3, :2] @ (random.uniform(-1, 1, 2) * ASIDE_MM)
-        oblique = Rotation.from_rotvec(np.radians(OBLIQUE_DEG) * random.uniform(-1, 1, 3))
-        goal[:3, :3] = home[:3, :3] @ oblique.as_matrix()
-        yield goal
+    home, dt = rehearsal.manipulator.home, rehearsal.settings.time_step_s
+    for step in range(round(minute_s / dt)):
+        if step * dt >= minute_s - REST_S:
+            goal = advanced(home, -AWAY_MM)
+        elif step % round(CHANGE_S / dt) == 0:
+            goal = advanced(home, random.uniform(-5.0, DEEPEST_MM))
+            goal[:3, 3] += home[:3, :2] @ (random.uniform(-1, 1, 2) * ASIDE_MM)
+            oblique = Rotation.from_rotvec(np.radians(OBLIQUE_DEG) * random.uniform(-1, 1, 3))
+            goal[:3, :3] = home[:3, :3] @ oblique.as_matrix()
+        yield rehearsal.pose_towards(goal)
+
+
+def table(runs: list[dict[str, Any]]) -> str:
+    """The first, the middle and the last minute of each model, and what must be equal."""
+    rows, lines = [], []
+    for run in runs:
+        minutes = run["minutes"]
+        for at in sorted({0, len(minutes) // 2, len(minutes) - 1}):
+            rows.append([run["model"], *(minutes[at][name] for name in COLUMNS)])
+        worst = max(row["shape_mm"] for row in minutes)
+        same = {name: "identical" if run[f"{name}_equal"] else "DIFFERS" for name in ("replay", "reset")}
+        lines.append(
+            f"{run['model']}: shape at most {worst:.4f} mm from the first rest; memory {run['memory_growth_mb']:+.1f} MB; "
+            f"replay {same['replay']}; reset {same['reset']}; state restored {run['fallbacks']} times"
+        )
+    return "\n".join([text_table(HEADERS, rows, FORMATS), *lines])
+
+
+def figure_of(runs: list[dict[str, Any]]) -> Figure:
+    """Shape, position, memory and time of a step over the minutes."""
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    panels = figure.subplots(2, 2, sharex=True)
+    for axes, (name, label) in zip(panels.ravel(), SHOWN.items(), strict=True):
+        for run in runs:
+            rows = run["minutes"]
+            begins = rows[0][name] if name == "memory_mb" else 0.0
+            at = [row["minute"] for row in rows]
+            axes.plot(at, [row[name] - begins for row in rows], marker=".", label=run["model"])
+        axes.set_title(label, fontsize=10)
+        finish_axes(axes)
+        low, high = axes.get_ylim()
+        if name == "memory_mb":
+            axes.set_ylim(min(low, -LEAST_MB), max(high, LEAST_MB))
+        else:
+            axes.set_ylim(0, 1.05 * high)
+    for axes in panels[1]:
+        axes.set_xlabel("simulated minutes, each of random presses and drags and a rest")
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(runs))
+    figure.suptitle("An hour of rehearsal" if len(runs[0]["minutes"]) == HOUR else "Soak test")
+    return figure

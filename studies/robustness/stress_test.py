@@ -11,7 +11,7 @@ from sim.body import BodyState
 from sim.fields import array_of, fill
 from sim.neo_hookean import NeoHookean
 from sim.solver import SolverState, StepSettings
-from studies.robustness.rigid_fit import distances_after_fit
+from studies.harness import distances_after_fit
 from studies.robustness.stress_bodies import Specimen, prepared
 from studies.robustness.stress_cases import RECOVERED_MM, StressCase, Subject
 from studies.robustness.stress_motion import AWAY_MM, PROBES, STATES

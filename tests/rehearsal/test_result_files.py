@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from rehearsal.image_and_surface_files import save_images
 from rehearsal.result_files import rounded, save_figure, spread, write_csv, write_json
 from scenes.surfaces import translated, volume_mm3
-from studies.robustness.rigid_fit import distances_after_fit
+from studies.harness import distances_after_fit
 from ultrasound.probe import load_probe
 from ultrasound.scanner import B_MODE
 

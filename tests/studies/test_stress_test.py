@@ -9,8 +9,8 @@ from conftest import rotation_about
 from PIL import Image
 
 import app
+from studies.harness import distances_after_fit
 from studies.robustness import stability_command, stress_bodies, stress_test
-from studies.robustness.rigid_fit import distances_after_fit
 from studies.robustness.stability_command import OUTCOMES, outcome_of
 from studies.robustness.stress_cases import MODELS, StressCase, Subject, cases_of, quick_cases_of
 from studies.robustness.stress_motion import PROBES, STATES
