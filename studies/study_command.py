@@ -11,11 +11,11 @@ STUDIES = {
         "Measure what each feature of SCENE costs.",
     ),
     "trade": (
-        "studies.performance.tradeoff_command:trade",
+        "studies.performance.tradeoff:trade",
         "Measure the error of beads against the time of a step.",
     ),
     "stability": (
-        "studies.robustness.stability_command:stability",
+        "studies.robustness.stress_test:stability",
         "Stress-test the tissue and see whether it recovers.",
     ),
     "soak": ("studies.robustness.soak_test:soak", "Rehearse for an hour in SCENE, faster than real time."),

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 from tabulate import tabulate
@@ -21,10 +21,12 @@ def text_table(headers: Sequence[str], rows: Sequence[Sequence[Any]], formats: S
     return tabulate(rows, headers, tablefmt="plain", floatfmt=formats or "g", missingval="")
 
 
-def finish_axes(axes: "Axes", legend: dict[str, Any] | None = None, **settings: Any) -> None:
+def finish_axes(
+    axes: "Axes", legend: dict[str, Any] | None = None, grid: Literal["both", "x"] = "both", **settings: Any
+) -> None:
     """Titles, labels and scales of a panel, as ``Axes.set`` takes them; its grid, and a legend with these options."""
     axes.set(**settings)
-    axes.grid(alpha=0.3, which="both")
+    axes.grid(alpha=0.3, which="both", axis=grid)
     if legend is not None:
         axes.legend(**legend)
 

@@ -7,7 +7,6 @@ import trimesh
 
 from rehearsal.build_solver import build_solver, step_settings
 from rehearsal.configuration import PRESETS
-from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import load_anatomy
 from scenes.scene import PAPER, Contact, SolverSection, load_scene, with_options
 from scenes.surfaces import volume_mm3
@@ -19,6 +18,7 @@ from sim.neo_hookean import LATTICE_SETTINGS, NeoHookean
 from sim.shapes import ConvexTool, Plane
 from sim.skinning import Skin
 from sim.solver import Solver, StepSettings
+from studies.harness import build, positions_of
 from studies.robustness.stress_cases import Subject
 from studies.robustness.stress_motion import AWAY_MM
 from studies.uniform_blocks import block_of_cells, block_of_particles
@@ -62,6 +62,11 @@ class Specimen:
             return array_of(self.model.mass).astype(float)
         return np.full(self.body.count, DENSITY * self.volume / self.body.count)
 
+    def advance(self, settings: StepSettings, poses: np.ndarray) -> str:
+        """One step of the transducer over poses (substeps + 1, 4, 4); the message of the divergence check."""
+        self.solver.step(settings, poses)
+        return self.divergence_check.check(settings.time_step_s)
+
     def volume_ratio(self) -> float:
         """Volume inside the surface, as a share of that of the resting shape."""
         self.skin.update()
@@ -74,19 +79,18 @@ class Specimen:
 
     def is_finite(self) -> bool:
         """Whether all positions are finite."""
-        return bool(np.isfinite(array_of(self.body.position)).all())
+        return bool(np.isfinite(positions_of(self.solver)).all())
 
     def rest_error_mm(self) -> float:
         """Mean distance [mm] of the points from their rest positions."""
-        position = array_of(self.body.position).astype(float)
-        return float(np.linalg.norm(position - self.rest, axis=1).mean())
+        return float(np.linalg.norm(positions_of(self.solver) - self.rest, axis=1).mean())
 
 
 def prepared(model: str, subject: Subject) -> Specimen:
     """A body on a freshly started device, at rest."""
-    start("cpu")
     if subject.kind == "kidney":
         return _kidney(model)
+    start("cpu")
     mesh = _mesh(model, subject)
     tool = ConvexTool.cuboid(TRANSDUCER_MM)
     shapes = [Plane(np.array([0.0, 0.0, 1.0]), mesh.bounds[0, 2]), tool]
@@ -108,11 +112,8 @@ def prepared(model: str, subject: Subject) -> Specimen:
 
 
 def _kidney(model: str) -> Specimen:
-    fast = PRESETS[model]["fast"]
-    size = {f"tissue.{fast.tissue.SIZE}": fast.size_mm}
     scene = load_scene(PAPER)
-    anatomy = replace(load_anatomy(scene, PAPER.parent), ct=None)
-    rehearsal = Rehearsal(with_options(scene, {"tissue.model": model, **size}), anatomy)
+    rehearsal = build(scene, load_anatomy(scene, PAPER.parent), PRESETS[model]["fast"], "cpu")
     # Recovery is measured from where the tissue has stopped moving.
     away = advanced(rehearsal.manipulator.home, -AWAY_MM)
     for _ in range(SETTLE_STEPS):

@@ -10,10 +10,10 @@ from PIL import Image
 
 import app
 from studies.harness import distances_after_fit
-from studies.robustness import stability_command, stress_bodies, stress_test
-from studies.robustness.stability_command import OUTCOMES, outcome_of
+from studies.robustness import stress_bodies, stress_test
 from studies.robustness.stress_cases import MODELS, StressCase, Subject, cases_of, quick_cases_of
 from studies.robustness.stress_motion import PROBES, STATES
+from studies.robustness.stress_test import OUTCOMES, outcome_of
 from ultrasound.probe_manipulator import advanced
 
 ONE = Subject("one")
@@ -98,7 +98,7 @@ def test_reasons_distinguish_position_and_shape():
 
 def test_the_command_writes_table_figure_and_json(tmp_path, monkeypatch, capsys):
     few = [StressCase("rest", "long", ONE), StressCase("lost", "wholly", ONE, state=("nothing",))]
-    monkeypatch.setattr(stability_command, "quick_cases_of", lambda model: few)
+    monkeypatch.setattr(stress_test, "quick_cases_of", lambda model: few)
     assert app.main(["study", "stability", "--quick", "--jobs", "1", "--out", str(tmp_path)]) == 0
     cases = json.loads((tmp_path / "stability.json").read_text())["cases"]
     assert [(case["model"], case["name"]) for case in cases] == [

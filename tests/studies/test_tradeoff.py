@@ -31,7 +31,7 @@ from scenes.tissue import QUALITIES
 from sim.neo_hookean import LATTICE_SETTINGS
 from studies.accuracy.bead_case import load_case
 from studies.accuracy.bead_experiment import BeadExperiment
-from studies.performance import tradeoff_command
+from studies.performance import tradeoff
 
 
 def point(ms: float, error: float, cell: float = 4.0) -> Point:
@@ -68,7 +68,7 @@ def test_the_presets_are_points_of_the_measured_front():
 
 
 def test_what_was_measured_is_measured_again(device):
-    case = load_case(tradeoff_command.EMBEDDED_CASE)
+    case = load_case(tradeoff.EMBEDDED_CASE)
     setup = PRESETS["neo-hookean"]["fast"]
     rows = json.loads(MEASURED.read_text())["points"]
     row = next(
@@ -217,8 +217,8 @@ def test_the_command_writes_table_figure_and_json(tmp_path, monkeypatch, capsys)
         setup_of("neo-hookean", cell_mm=6.0, iterations=2, warm_up_steps=20, stage_steps=12),
         setup_of("shape-matching", radius_mm=3.0, warm_up_steps=20, stage_steps=12),
     )
-    monkeypatch.setattr("studies.performance.tradeoff_settings.QUICK", tried)
-    monkeypatch.setattr(tradeoff_command, "EMBEDDED_CASE", write_case(tmp_path / "case"))
+    monkeypatch.setattr(tradeoff, "QUICK", tried)
+    monkeypatch.setattr(tradeoff, "EMBEDDED_CASE", write_case(tmp_path / "case"))
     assert app.main(["study", "trade", "--quick", "--out", str(tmp_path)]) == 0
     report = json.loads((tmp_path / "trade.json").read_text())
     assert [p["model"] for p in report["points"]] == ["neo-hookean", "shape-matching"]

@@ -1,0 +1,258 @@
+"""The command ``study trade``: the speed-accuracy trade-off of settings, and their Pareto front.
+
+Bead experiments give the error of each setting, presses in turn its time.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+from rehearsal.commands.command_line import arch_option, make_folder, start_taichi
+from rehearsal.configuration import PRESETS, Setup, setup_of
+from rehearsal.result_files import rounded
+from rehearsal.speed_accuracy.pareto_front import SETTINGS, pareto, preset_of, setup_of_row
+from rehearsal.stopwatch import timed
+from sim.device import start
+from studies.accuracy.bead_case import BeadCase, load_case
+from studies.accuracy.bead_errors import bead_errors
+from studies.accuracy.bead_experiment import BeadExperiment
+from studies.study_options import out_option
+from studies.study_results import finish_axes, text_table, write_results
+from ultrasound.probe_manipulator import poses_between
+
+EMBEDDED_CASE = Path(__file__).parents[1] / "reference" / "embedded"
+FRAME_MS = 1000 / 60
+HEADERS = ("model", "size, mm", "substeps x iterations", "relax.", "ms a step", "error, mm", "arriving", "")
+FORMATS = ("", "g", "", "g", ".2f", ".3f", ".3f")
+CELLS_MM = (10.0, 8.0, 6.0, 5.0, 4.0, 3.5, 3.0, 2.5, 2.0)
+CELL_ITERATIONS = (1, 2, 4, 8, 12, 20)
+RADII_MM = (2.2, 2.5, 2.7, 3.0, 3.3, 4.0, 5.0)
+# Substeps and iterations; the paper's first.
+SUBSTEPS_ITERATIONS = ((3, 9), (1, 9), (3, 3), (1, 27), (3, 27))
+# The paper's Table 3: the best stiffness for each radius.
+PAPER = tuple(
+    setup_of("shape-matching", radius_mm=radius, stiffness=stiffness)
+    for radius, stiffness in ((2.2, 0.95), (2.5, 0.6), (2.7, 0.5), (3.0, 0.45), (3.3, 0.35))
+)
+QUICK = (
+    setup_of("neo-hookean", cell_mm=8.0, iterations=4),
+    *(PRESETS["neo-hookean"][name] for name in ("fast", "balanced")),
+    PRESETS["shape-matching"]["fast"],
+    PAPER[-1],
+)
+# The machine's speed changes within minutes: every setting is timed in each round, and the median is taken.
+ROUNDS, TIMED_STEPS = 3, 45
+
+
+@click.command()
+@click.argument("cases", metavar="[CASE]...", type=click.Path(path_type=Path), nargs=-1)
+@out_option
+@click.option(
+    "--quick", is_flag=True, help="A handful of settings on the embedded case, in less than a minute."
+)
+@arch_option
+def trade(cases: tuple[Path, ...], out: Path, quick: bool, arch: str) -> None:
+    """Measure the error of beads against the time of a step.
+
+    Over model, resolution, substeps, iterations and relaxation.
+    The error is the mean over the embedded patient's bead experiment and those of CASE..., folders as `validate` takes them.
+    """
+    make_folder(out)
+    loaded = [load_case(EMBEDDED_CASE), *(load_case(case) for case in cases)]
+    used = start_taichi(arch)
+    tried, rounds = setups(quick), 0 if quick else ROUNDS
+    with tqdm(total=(len(loaded) + rounds) * len(tried), desc="trade", unit="run") as bar:
+        found = points(loaded, tried, used, rounds, bar.update)
+    report = dict(arch=used, cases=[case.name for case in loaded], points=found)
+    # In the table the errors of single cases have columns of their own.
+    rows = [
+        {name: value for name, value in point.items() if name != "errors_mm"}
+        | {f"error_{name}_mm": value for name, value in point["errors_mm"].items()}
+        for point in found
+    ]
+    write_results(out, "trade", report, table(found), rows, figure_of(found))
+
+
+def setups(quick: bool) -> list[Setup]:
+    """All settings, each once, those of one model and size together."""
+    if quick:
+        return _sorted(list(QUICK))
+    balanced = PRESETS["neo-hookean"]["balanced"]
+    cells = [
+        setup_of("neo-hookean", cell_mm=cell, iterations=iterations)
+        for cell in CELLS_MM
+        for iterations in CELL_ITERATIONS
+    ]
+    around = [balanced.but(relaxation_factor=factor) for factor in (1.0, 1.4, 1.9)]
+    around += [balanced.but(substeps=substeps) for substeps in (2, 4)]
+    particles = [
+        setup_of("shape-matching", radius_mm=radius, substeps=substeps, iterations=iterations)
+        for radius in RADII_MM
+        for substeps, iterations in SUBSTEPS_ITERATIONS
+    ]
+    stiff = [setup_of("shape-matching", radius_mm=radius, stiffness=1.0) for radius in (2.7, 3.3, 5.0)]
+    relaxed = [setup_of("shape-matching", radius_mm=radius, relaxation_factor=1.5) for radius in (2.7, 3.3)]
+    named = [setup for presets in PRESETS.values() for setup in presets.values()]
+    return _sorted([*cells, *around, *particles, *stiff, *relaxed, *PAPER, *named])
+
+
+def _sorted(given: list[Setup]) -> list[Setup]:
+    return sorted(dict.fromkeys(given), key=lambda setup: (setup.model, -setup.size_mm))
+
+
+def points(
+    cases: list[BeadCase], tried: list[Setup], arch: str, rounds: int, done: Callable[[], Any]
+) -> list[dict[str, Any]]:
+    """Rows of trade.json: error over all cases, time on the first; ``done`` is called after each run.
+
+    Each stage counts twice: when the transducer arrives, as in a moving press, and after it has rested.
+    With 0 ``rounds`` the time is that of the steps whose error was measured.
+    """
+    resting: dict[Setup, dict[str, float]] = {setup: {} for setup in tried}
+    arriving: dict[Setup, dict[str, float]] = {setup: {} for setup in tried}
+    ms: dict[Setup, list[float]] = {setup: [] for setup in tried}
+    for case in cases:
+        for experiment, setups in _built(case, tried, arch):
+            for setup in setups:
+                run = experiment.run(setup)
+                if rounds == 0 and case is cases[0]:
+                    ms[setup].append(float(np.median(run.step_ms)))
+                resting[setup][case.name] = _mean_error(case, run.beads, run.finite)
+                arriving[setup][case.name] = _mean_error(case, run.arriving, run.finite)
+                done()
+    for _ in range(rounds):
+        for experiment, setups in _built(cases[0], tried, arch):
+            for setup in setups:
+                ms[setup].append(_time(experiment, setup))
+                done()
+    time_ms = np.array([np.median(ms[setup]) for setup in tried])
+    error = np.array([np.mean([*resting[setup].values(), *arriving[setup].values()]) for setup in tried])
+    best = pareto(time_ms, error)
+    return [
+        _row(setup, time_ms[k], best[k], resting[setup], arriving[setup]) for k, setup in enumerate(tried)
+    ]
+
+
+def _built(case: BeadCase, tried: list[Setup], arch: str) -> Iterator[tuple[BeadExperiment, list[Setup]]]:
+    """Each model and size on a freshly started device, with the settings that share it."""
+    for _, sharing in groupby(tried, key=lambda setup: (setup.model, setup.size_mm)):
+        group = list(sharing)
+        start(arch)
+        yield BeadExperiment(case, group[0]), group
+
+
+def _mean_error(case: BeadCase, beads: np.ndarray, finite: bool) -> float:
+    return float(bead_errors(case, beads).mean()) if finite else float("inf")
+
+
+def _time(experiment: BeadExperiment, setup: Setup) -> float:
+    """Median time of a step [ms] in a press to the deepest stage."""
+    short = replace(setup, warm_up_steps=10)
+    step = experiment.prepare(short)
+    first, last = experiment.case.poses[0], experiment.case.poses[-1]
+    path = poses_between(experiment.relative(first), experiment.relative(last), TIMED_STEPS)
+    ms: list[float] = []
+    for n in range(TIMED_STEPS):
+        poses = poses_between(path[n], path[n + 1], step.substeps)
+        timed(lambda: experiment.solver.step(step, poses), ms)
+    return float(np.median(ms))
+
+
+def _row(
+    setup: Setup, ms: float, best: bool, resting: dict[str, float], arriving: dict[str, float]
+) -> dict[str, Any]:
+    settings = {name: getattr(setup, name, getattr(setup.tissue, name, None)) for name in SETTINGS}
+    return dict(
+        model=setup.model,
+        **settings,
+        time_step_s=setup.solver.time_step_s,
+        ms_median=round(float(ms), 4),
+        error_mean_mm=rounded(float(np.mean([*resting.values(), *arriving.values()]))),
+        error_resting_mm=rounded(float(np.mean(list(resting.values())))),
+        error_arriving_mm=rounded(float(np.mean(list(arriving.values())))),
+        errors_mm={name: rounded(value) for name, value in resting.items()},
+        pareto=bool(best),
+    )
+
+
+def _size(point: dict[str, Any]) -> float:
+    return point["cell_mm"] or point["radius_mm"]
+
+
+def table(points: list[dict[str, Any]]) -> str:
+    """All points, fastest first; those on the front, the presets and the paper's are marked."""
+    rows = []
+    for point in sorted(points, key=lambda point: point["ms_median"]):
+        setup = setup_of_row(point)
+        stiffness = "" if point["stiffness"] is None else f"alpha {point['stiffness']:g}"
+        front = "front" if point["pareto"] else ""
+        name = preset_of(setup) or ("the paper's" if setup in PAPER else "")
+        rows.append(
+            [
+                point["model"],
+                _size(point),
+                f"{point['substeps']} x {point['iterations']}",
+                point["relaxation_factor"],
+                point["ms_median"],
+                point["error_mean_mm"],
+                point["error_arriving_mm"],
+                ", ".join(filter(None, (stiffness, front, name))),
+            ]
+        )
+    return text_table(HEADERS, rows, FORMATS)
+
+
+def figure_of(points: list[dict[str, Any]]) -> Figure:
+    """Every point by its time and its error, the Pareto front, the presets and the paper's settings."""
+    points = [point for point in points if point["error_mean_mm"] is not None]
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    axes = figure.subplots()
+    for model in sorted({point["model"] for point in points}):
+        _scatter(axes, [point for point in points if point["model"] == model], model)
+    front = sorted(_place(point) for point in points if point["pareto"])
+    ms, error = [place[0] for place in front], [place[1] for place in front]
+    axes.plot(ms, error, color="black", linewidth=1.2, label="Pareto front", drawstyle="steps-post")
+    axes.axvline(FRAME_MS, color="0.5", linestyle="--", linewidth=0.8)
+    axes.annotate(" a frame at 60 Hz", (FRAME_MS, axes.get_ylim()[1]), color="0.4", va="top")
+    finish_axes(
+        axes,
+        dict(loc="center right"),
+        title="Speed-accuracy trade-off",
+        xlabel="time of a step (ms, median)",
+        ylabel="mean error of the beads (mm)",
+        xscale="log",
+        yscale="log",
+    )
+    return figure
+
+
+def _place(point: dict[str, Any]) -> tuple[float, float]:
+    return point["ms_median"], point["error_mean_mm"]
+
+
+def _scatter(axes: Axes, points: list[dict[str, Any]], model: str) -> None:
+    ms, error = np.array([_place(point) for point in points]).T
+    size = np.array([_size(point) for point in points])
+    axes.scatter(ms, error, s=7 * size, alpha=0.55, label=f"{model} (area: size of cells or particles)")
+    for k, point in enumerate(point for point in points if setup_of_row(point) in PAPER):
+        label = "the paper's radii (mm), with its best stiffness" if k == 0 else None
+        axes.scatter(*_place(point), marker="x", color="tab:red", zorder=3, label=label)
+        _annotate(axes, point, f"{point['radius_mm']:g}", 6, fontsize=9, color="tab:red")
+    for point in points:
+        name = preset_of(setup_of_row(point))
+        # The presets of shape matching have the paper's particles, and finer ones are not more accurate.
+        if name and point["pareto"]:
+            axes.scatter(*_place(point), marker="D", facecolors="none", edgecolors="black", zorder=3)
+            _annotate(axes, point, name, -15, fontsize=10, weight="bold")
+
+
+def _annotate(axes: Axes, point: dict[str, Any], text: str, up: int, **style: Any) -> None:
+    axes.annotate(text, _place(point), xytext=(0, up), textcoords="offset points", ha="center", **style)
