@@ -2,10 +2,11 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import psutil
+import taichi as ti
 from scipy.spatial.transform import Rotation
 
 from rehearsal.configuration import Setup, scene_of
@@ -64,6 +65,32 @@ class Watch:
 def memory_of_process_mb() -> float:
     """Memory of this process [MB]."""
     return psutil.Process().memory_info().rss / 1e6
+
+
+def memory_mb(owner: Any, apart: Any = None) -> float:
+    """Memory of the fields [MB] on the device that an object refers to, without those of ``apart``."""
+    seen: set[int] = set()
+    _bytes_in(apart, seen)
+    return _bytes_in(owner, seen) / 1e6
+
+
+def _bytes_in(owner: Any, seen: set[int]) -> int:
+    if id(owner) in seen:
+        return 0
+    seen.add(id(owner))
+    if isinstance(owner, ti.Field):
+        return int(np.prod(owner.shape, dtype=np.int64)) * 4 * _entries(owner)
+    if isinstance(owner, list | tuple):
+        return sum(_bytes_in(part, seen) for part in owner)
+    if type(owner).__module__.startswith(("sim.", "ultrasound.")):
+        return sum(_bytes_in(part, seen) for part in vars(owner).values())
+    return 0
+
+
+def _entries(field: ti.Field) -> int:
+    if isinstance(field, ti.StructField):
+        return sum(_entries(field.get_member_field(name)) for name in field.keys)
+    return getattr(field, "n", 1) * getattr(field, "m", 1)
 
 
 def positions_of(solver: Solver) -> np.ndarray:

@@ -5,9 +5,9 @@ import click
 from rehearsal.commands.lazy_group import LazyGroup
 
 STUDIES = {
-    "timing": ("studies.performance.timing_command:timing", "Measure how long a time step of SCENE takes."),
+    "timing": ("studies.performance.step_timing:timing", "Measure how long a time step of SCENE takes."),
     "features": (
-        "studies.performance.features_command:features",
+        "studies.performance.feature_costs:features",
         "Measure what each feature of SCENE costs.",
     ),
     "trade": (

@@ -1,16 +1,21 @@
-"""Cost of each feature of a scene: the same press with it and without it, in turn."""
+"""The command ``study features``: the cost of each feature of a scene, by the same press with it and without it, in turn."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import taichi as ti
 import trimesh
+from matplotlib.figure import Figure
 from taichi.profiler.kernel_profiler import get_default_kernel_profiler
+from tqdm import tqdm
 
 from rehearsal.build_solver import build_solver, embedding_cell_mm, model_of, step_settings
-from rehearsal.configuration import probe_of
+from rehearsal.commands.command_line import arch_option
+from rehearsal.configuration import PRESETS, probe_of
 from rehearsal.frame_view import image_view, initial_settings, probe_with_settings
 from rehearsal.measurements.run_report import Tally
 from rehearsal.rehearsal import SURROUNDINGS_MM, Rehearsal, scanned_anatomy
@@ -18,16 +23,18 @@ from rehearsal.stopwatch import timed
 from render.background_image import BackgroundImage
 from render.window_layout import WindowLayout
 from scenes.anatomy import LoadedAnatomy
-from scenes.scene import Contact, Scene, SolverSection, with_options
+from scenes.scene import PAPER, Contact, Scene, SolverSection, with_options
 from scenes.surfaces import translated
-from scenes.tissue import TISSUES, ShapeMatchingTissue, TissueSection
+from scenes.tissue import TISSUES, USUAL, ShapeMatchingTissue
 from sim.device import start
 from sim.embedding import Embedding
 from sim.shape_matching import fill_organ
 from sim.shapes import GRID_MM, ConvexTool, SignedDistanceField
 from sim.signed_distance import distance_grid
 from sim.solver import Solver
-from studies.performance.step_timing import memory_mb
+from studies.harness import memory_mb
+from studies.study_options import open_study, out_option, scene_argument
+from studies.study_results import finish_axes, text_table, write_results
 from ultrasound.probe import DetailLevel, Mode
 from ultrasound.probe_manipulator import advanced, image_plane, pose_at, poses_between, touching
 from ultrasound.scanner import ScannedAnatomy, Scanner
@@ -36,6 +43,12 @@ from ultrasound.scanner import ScannedAnatomy, Scanner
 PRESS_MM, PRESS_STEPS, SETTLE_STEPS = 8.0, 60, 30
 CALLS = 40
 NOT_COUNTED: dict[str, Any] = dict(kernels=None, launches=None)
+MEASURED = ("ms", "mb", "kernels", "launches")
+COLUMNS = ("model", "feature", *(f"{name}_{state}" for name in MEASURED for state in ("on", "off")))
+HEADERS = ("model", "feature", "ms with", "without", "adds", "MB", "kernels", "launches")
+FORMATS = ("", "", ".3f", ".3f", "+.3f", "+.2f", "+g", "+g")
+FRAME = "frame"
+UNITS = {"ms": "time (ms)", "mb": "memory: fields on the device (MB)"}
 
 
 @dataclass(frozen=True)
@@ -78,11 +91,49 @@ FEATURES = {
 }
 
 
-class FeatureBody:
-    """A scene's organ and support, for solvers with different features; positions relative to the organ's middle [mm]."""
+@click.command()
+@scene_argument(PAPER)
+@out_option
+@click.option(
+    "--quick",
+    is_flag=True,
+    help="Neo-Hookean alone, coarse, not in turn, no kernels counted: in less than a minute.",
+)
+@arch_option
+def features(scene: Path, out: Path, quick: bool, arch: str) -> None:
+    """Measure what each feature of SCENE costs.
 
-    def __init__(self, scene: Scene, anatomy: LoadedAnatomy, tissue: TissueSection) -> None:
-        self.tissue = tissue
+    In time, memory and kernels: the same press with it and without, in turn.
+    """
+    loaded, anatomy, used = open_study(out, scene, arch)
+    models = [USUAL] if quick else list(FEATURES)
+    rows: list[dict[str, Any]] = []
+    total = sum(len(FEATURES[model]) for model in models) + 1
+    with tqdm(total=total, desc="features", unit="feature") as bar:
+        for model in models:
+            preset = PRESETS[model]["fast" if quick else "balanced"]
+            body = FeatureBody(loaded, anatomy, model, preset.size_mm)
+            for row in of_steps(body, FEATURES[model], used, quick):
+                rows.append(dict(model=model) | row)
+                bar.update()
+        rows += [dict(model=FRAME) | row for row in of_frame(loaded, anatomy, used)]
+        bar.update()
+    rows = [{name: row[name] for name in COLUMNS} for row in rows]
+    write_results(out, "features", dict(arch=used, features=rows), table(rows), rows, figure_of(rows))
+
+
+class FeatureBody:
+    """A scene's organ and support, for solvers with different features; positions relative to the organ's middle [mm].
+
+    The organ is of cells or particles of a size [mm].
+    """
+
+    def __init__(self, scene: Scene, anatomy: LoadedAnatomy, model: str, size_mm: float) -> None:
+        options: dict[str, str | float | None] = {
+            "tissue.model": model,
+            f"tissue.{TISSUES[model].SIZE}": size_mm,
+        }
+        tissue = self.tissue = with_options(scene, options).tissue
         self.settings = step_settings(tissue, scene.solver)
         middle = anatomy.organ.bounds.mean(axis=0)
         self.organ = translated(anatomy.organ, -middle)
@@ -135,38 +186,27 @@ class FeatureBody:
         )
 
 
-def body_of(scene: Scene, anatomy: LoadedAnatomy, model: str, size_mm: float) -> FeatureBody:
-    """The scene's organ in a tissue model, of cells or particles of a size [mm]."""
-    options: dict[str, str | float | None] = {"tissue.model": model, f"tissue.{TISSUES[model].SIZE}": size_mm}
-    tissue = with_options(scene, options).tissue
-    return FeatureBody(scene, anatomy, tissue)
-
-
 def of_steps(
-    body: FeatureBody, features: tuple[Feature, ...], arch: str, quick: bool, done: Callable[[], Any]
-) -> list[dict[str, Any]]:
-    """Each feature's rows of features.json: median times, memory and parallel kernels, with it and without it.
+    body: FeatureBody, features: tuple[Feature, ...], arch: str, quick: bool
+) -> Iterator[dict[str, Any]]:
+    """Each feature's row of features.json: median times, memory and parallel kernels, with it and without it.
 
     Solvers with and without are stepped in turn; ``quick`` steps each of them once and counts no kernels.
     """
     counted: dict[Options, dict[str, Any]] = {}
     alone: dict[Options, dict[str, float]] = {}
-    rows = []
     for feature in features:
-        variants = {"on": feature.having, "off": feature.without}
-        for options in variants.values():
+        both = [feature.having, feature.without]
+        for options in both:
             if quick and options not in alone:
-                alone[options] = _stepped(body, [options], arch)[0]
+                (alone[options],) = _stepped(body, [options], arch)
             if options not in counted:
                 counted[options] = NOT_COUNTED if quick else kernels_of(body, options, arch)
-        both = list(variants.values())
         stepped = [alone[options] for options in both] if quick else _stepped(body, both, arch)
         row: dict[str, Any] = dict(feature=feature.name)
-        for (state, options), figures in zip(variants.items(), stepped, strict=True):
+        for state, options, figures in zip(("on", "off"), both, stepped, strict=True):
             row |= {f"{name}_{state}": value for name, value in (figures | counted[options]).items()}
-        rows.append(row)
-        done()
-    return rows
+        yield row
 
 
 def _stepped(body: FeatureBody, variants: list[Options], arch: str) -> list[dict[str, Any]]:
@@ -272,3 +312,52 @@ def _alone(name: str, work: Callable[[], Any], owners: list, apart: Any) -> dict
     mb = round(memory_mb(owners, apart), 4)
     nothing = dict(ms_off=0.0, mb_off=0.0, kernels_on=None, kernels_off=0, launches_on=None, launches_off=0)
     return dict(feature=name, ms_on=round(float(np.median(ms)), 4), mb_on=mb, **nothing)
+
+
+def _added(row: dict[str, Any], name: str) -> float | None:
+    on = row[f"{name}_on"]
+    return None if on is None else on - row[f"{name}_off"]
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """What each feature adds: time of a step or of a part of a frame, memory, parallel kernels and their launches."""
+    lines = [
+        [row["model"], row["feature"], row["ms_on"], row["ms_off"], *(_added(row, name) for name in MEASURED)]
+        for row in rows
+    ]
+    return text_table(HEADERS, lines, FORMATS)
+
+
+def figure_of(rows: list[dict[str, Any]]) -> Figure:
+    """What features add to a step, and below it what the parts of a frame take."""
+    parts = {
+        "A time step: with each feature, less without it": [row for row in rows if row["model"] != FRAME],
+        "A frame: each part, and all that it needs, by itself": [
+            row for row in rows if row["model"] == FRAME
+        ],
+    }
+    figure = Figure(figsize=(12, 0.34 * len(rows) + 3), layout="constrained")
+    heights = [len(part) + 3 for part in parts.values()]
+    halves = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)[:, 0]
+    for half, (title, part) in zip(halves, parts.items(), strict=True):
+        half.suptitle(title)
+        _bars(half.subplots(1, 2, sharey=True), part)
+    return figure
+
+
+def _bars(panels: Any, rows: list[dict[str, Any]]) -> None:
+    names = [
+        row["feature"] if row["model"] == FRAME else f"{row['feature']}  ({row['model']})" for row in rows
+    ]
+    models = list(dict.fromkeys(row["model"] for row in rows))
+    colours = ["C2" if row["model"] == FRAME else f"C{models.index(row['model'])}" for row in rows]
+    for axes, (name, unit) in zip(panels, UNITS.items(), strict=True):
+        added = [_added(row, name) or 0.0 for row in rows]
+        axes.barh(range(len(rows)), added, color=colours)
+        for y, value in enumerate(added):
+            axes.annotate(f" {value:.2f}", (max(value, 0.0), y), va="center", fontsize=8)
+        axes.axvline(0.0, color="0.4", linewidth=0.8)
+        axes.margins(x=0.12)
+        finish_axes(axes, grid="x", xlabel=unit)
+    panels[0].set_yticks(range(len(rows)), names)
+    panels[0].invert_yaxis()

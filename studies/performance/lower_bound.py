@@ -1,24 +1,32 @@
-"""References for the speed of shape matching: its arithmetic as a plain loop in C, and pypbd."""
+"""The step of shape matching beside references: its arithmetic as a plain loop in C, and pypbd."""
 
 import ctypes
 import os
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from time import perf_counter
+from typing import Any
 
 import numpy as np
 
+from rehearsal.rehearsal import Rehearsal
+from rehearsal.stopwatch import timed
+from sim.body import ParticleBody
 from sim.sampling import Clusters
 from sim.shape_matching import ShapeMatching
+from sim.solver import Solver
+from ultrasound.probe_manipulator import poses_between
 
 SOURCE = Path(__file__).with_name("bound.c")
 FLAGS = ["-O3", "-march=native", "-ffast-math", "-fopenmp", "-fPIC"]
 # Linked apart and without -ffast-math, which would flush denormal numbers to zero in the whole process.
 LINKED = ["-shared", "-fopenmp"]
 STIFFNESS = 0.95
+ROUNDS, STEPS_A_ROUND = 9, 5
 # Idle threads sleep; otherwise they would slow down what is timed next.
 IDLE = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0"}
 
@@ -66,11 +74,9 @@ class Bound:
             for value in (*of_clusters, *of_particles, *arrays)
         ]
 
-    def run(self, iterations: int, threads: int) -> float:
-        """Time [ms] of some iterations on some cores."""
-        started = perf_counter()
+    def run(self, iterations: int, threads: int) -> None:
+        """Some iterations on some cores."""
         self._match(threads, iterations, ctypes.c_float(STIFFNESS), *self._arguments)
-        return 1e3 * (perf_counter() - started)
 
 
 class Pypbd:
@@ -103,9 +109,58 @@ class Pypbd:
                 len(members), members.tolist(), shared[members].tolist(), STIFFNESS
             )
 
-    def run(self, iterations: int) -> float:
-        """Time [ms] of a step of some iterations, without contacts."""
+    def run(self, iterations: int) -> None:
+        """A step of some iterations, without contacts."""
         self._stepper.setValueUInt(self._key, iterations)
-        started = perf_counter()
         self._stepper.step(self._model)
-        return 1e3 * (perf_counter() - started)
+
+
+def compare(rehearsal: Rehearsal) -> tuple[dict[str, Any], list[str]]:
+    """Medians [ms] of the pressed body's step with contacts and of its references, run in turn; the references that are missing."""
+    solver, settings, model = rehearsal.solver, rehearsal.settings, rehearsal.model
+    assert isinstance(model, ShapeMatching) and isinstance(model.body, ParticleBody)
+    iterations = settings.substeps * settings.iterations
+    alone, weightless = (
+        Solver(ShapeMatching(model.body, model.patches)),
+        replace(settings, gravity=(0.0,) * 3),
+    )
+    pose = rehearsal.scripted_pose(rehearsal.script_length_s())
+    poses = poses_between(pose, pose, settings.substeps)
+    runs: dict[str, Callable[[], None]] = {
+        "step_ms": lambda: solver.step(settings, poses),
+        "without_contacts_ms": lambda: alone.step(weightless),
+    }
+    missing = []
+    try:
+        bound = Bound(model)
+        runs["bound_1_core_ms"] = lambda: bound.run(iterations, 1)
+        runs["bound_2_cores_ms"] = lambda: bound.run(iterations, 2)
+    except NoBound as reason:
+        missing.append(str(reason))
+    try:
+        other = Pypbd(model)
+        runs["pypbd_1_core_ms"] = lambda: other.run(iterations)
+    except NoBound as reason:
+        missing.append(str(reason))
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    pressed = solver.snapshot()
+    for _ in range(ROUNDS):
+        for name, run in runs.items():
+            solver.restore(pressed)
+            for _ in range(STEPS_A_ROUND):
+                timed(run, times[name])
+    figures: dict[str, Any] = {name: round(float(np.median(ms)), 4) for name, ms in times.items()}
+    work = model.counts()["memberships"] * iterations / 1e3
+    figures |= dict(
+        membership_iterations=round(1e3 * work),
+        bound_ms=figures.get("bound_2_cores_ms"),
+        ratio_to_bound=_ratio(figures["step_ms"], figures.get("bound_2_cores_ms")),
+        million_a_second=round(work / figures["without_contacts_ms"], 2),
+        pypbd_million_a_second=_ratio(work, figures.get("pypbd_1_core_ms")),
+        times_pypbd=_ratio(figures.get("pypbd_1_core_ms"), figures["without_contacts_ms"]),
+    )
+    return figures, missing
+
+
+def _ratio(first: float | None, second: float | None) -> float | None:
+    return round(first / second, 3) if first and second else None

@@ -10,7 +10,15 @@ import taichi.math as tm
 
 from sim.shape_matching import ShapeMatching
 from sim.solver import Solver, StepSettings, relaxation_at
-from studies.performance.step_pieces import AFTER, BEFORE, IN_ITERATION
+
+# Before the iterations of a substep, in an iteration (of shape matching or not), after them; "frames" is once a step.
+BEFORE = ("tool", "predict", "begin", "find contacts", "leave contacts", "gather")
+IN_ITERATION = {
+    True: ("fit clusters", "average goals", "move to goals", "contacts"),
+    False: ("tissue and contacts",),
+}
+AFTER = ("scatter", "keep out", "velocities")
+CONTACTS = ("find contacts", "leave contacts", "contacts", "keep out")
 
 
 @ti.data_oriented

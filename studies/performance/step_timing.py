@@ -1,27 +1,37 @@
-"""Time of a step: a scene's press at several sizes, and blocks of more and more particles."""
+"""The command ``study timing``: the paper's Figures 7 and 8 and its Table 5 on this machine, and lower bounds of the time.
+
+Timed are a scene's press at several sizes, and blocks of more and more particles.
+"""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import psutil
 import taichi as ti
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from tqdm import tqdm
 
-from rehearsal.configuration import Setup, scene_of, setup_of
+from rehearsal.commands.command_line import arch_option
+from rehearsal.configuration import PRESETS, Setup, setup_of
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import spread
 from rehearsal.stopwatch import timed
-from scenes.anatomy import LoadedAnatomy
-from scenes.scene import Scene
-from sim.body import ParticleBody
+from scenes.scene import PAPER
 from sim.device import start
 from sim.neo_hookean import LATTICE_SETTINGS
-from sim.shape_matching import ShapeMatching
 from sim.shapes import Plane
 from sim.solver import Solver, StepSettings
-from studies.performance.lower_bound import Bound, NoBound, Pypbd
-from studies.performance.step_phases import Phases, without_calls
+from studies.harness import build, memory_mb, memory_of_process_mb, restart
+from studies.performance.lower_bound import compare
+from studies.performance.step_phases import AFTER, BEFORE, CONTACTS, IN_ITERATION, Phases, without_calls
+from studies.study_options import open_study, out_option, scene_argument
+from studies.study_results import finish_axes, text_table, write_results
 from studies.uniform_blocks import block_of_cells, block_of_particles
 from ultrasound.probe_manipulator import advanced, poses_between
 
@@ -30,7 +40,39 @@ AWAY_MM = 100.0
 BLOCK_RADIUS_MM, BLOCK_CELL_MM = 2.2, 4.0
 # A block takes at most this share of the free memory.
 MOST_MEMORY = 0.6
-ROUNDS, STEPS_A_ROUND = 9, 5
+RADII_MM = (2.2, 2.5, 2.7, 3.0, 3.3)
+COUNTS = [1_000, 4_000, 16_000, 64_000, 250_000, 1_000_000]
+QUICK_COUNTS = [1_000, 4_000, 16_000]
+# The particle radius of the paper's figures, which is compared with other programs.
+PAPERS = setup_of("shape-matching", radius_mm=2.2)
+STEPS, QUICK_STEPS, QUICK_SHARE = 7, 3, 0.1
+COLUMNS = (
+    "model",
+    "radius_mm",
+    "cell_mm",
+    "particles",
+    "clusters",
+    "memberships",
+    "substeps",
+    "iterations",
+    "arch",
+    "cores",
+    "memory_mb",
+)
+MS = ("mean", "sd", "min", "max", "median")
+HEADERS = ("model", "size, mm", "particles", "substeps x iterations", *MS, "MB")
+FORMATS = ("", "g", "g", "", *[".2f"] * len(MS), ".1f")
+# The paper's Table 5: radius [mm], mean, minimum and maximum [ms].
+PAPER_MS = (
+    (2.2, 12.10, 11.68, 12.77),
+    (2.5, 12.10, 11.68, 12.77),
+    (2.7, 12.37, 11.96, 12.84),
+    (3.0, 12.66, 12.28, 13.37),
+    (3.3, 14.16, 13.67, 15.68),
+)
+FRAME_MS = 1000 / 60
+# Pieces of a step below this share [%] for every model and size are drawn as one.
+LEAST_SHARE = 2.0
 
 
 @dataclass(frozen=True)
@@ -45,10 +87,46 @@ class TimedPress:
     warm_up_s: float
 
 
-def build(scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str) -> Rehearsal:
-    """The scene's body under its transducer, without an image, on a freshly started device."""
-    start(arch)
-    return Rehearsal(scene_of(scene, setup), replace(anatomy, ct=None))
+@click.command()
+@scene_argument(PAPER)
+@out_option
+@click.option("--quick", is_flag=True, help="Fewer sizes and shorter presses, in less than a minute.")
+@arch_option
+def timing(scene: Path, out: Path, quick: bool, arch: str) -> None:
+    """Measure how long a time step of SCENE takes.
+
+    Over time, by its pieces, by size, and against a plain loop in C.
+    """
+    loaded, anatomy, used = open_study(out, scene, arch)
+    setups = _setups(quick)
+    counts = QUICK_COUNTS if quick else COUNTS
+    presses, sizes = [], []
+    comparison: dict[str, Any] = {}
+    missing: list[str] = []
+    with tqdm(total=len(setups) + 2 * len(counts), desc="timing", unit="size") as bar:
+        for setup in setups:
+            rehearsal = build(loaded, anatomy, setup, used)
+            presses.append(measure(rehearsal, setup, QUICK_SHARE if quick else 1.0, used))
+            if setup == PAPERS:
+                comparison, missing = compare(rehearsal)
+            bar.update()
+        for size in blocks(counts, used, QUICK_STEPS if quick else STEPS):
+            sizes.append(size)
+            bar.update()
+        bar.total = bar.n
+    bound_ms = comparison.get("bound_ms")
+    cases = [press.case | dict(bound_ms=bound_ms if press.setup == PAPERS else None) for press in presses]
+    report = dict(arch=used, cases=cases, bound_ms=bound_ms, comparison=comparison, sizes=sizes)
+    text = "\n".join([table(cases, sizes), *pieces(cases), *against(comparison), *missing])
+    rows = [_flat(case) for case in cases + sizes]
+    write_results(out, "timing", report, text, rows, figure_of(presses, sizes))
+
+
+def _setups(quick: bool) -> list[Setup]:
+    presets = PRESETS["neo-hookean"]
+    if quick:
+        return [presets["balanced"], PAPERS]
+    return [*presets.values(), *(setup_of("shape-matching", radius_mm=radius) for radius in RADII_MM)]
 
 
 def press(
@@ -56,9 +134,7 @@ def press(
 ) -> Iterator[float]:
     """The paper's warm-up from the resting shape, then the scripted press, or a ``share`` of both; yields the time [s]."""
     solver, settings, script = rehearsal.solver, rehearsal.settings, rehearsal.script_length_s()
-    solver.body.restore(solver.body.rest_state())
-    solver.contacts.reset()
-    solver.model.update_frames()
+    restart(solver)
     dt = settings.time_step_s
     warm_up = max(1, round(share * rehearsal.press.warm_up_steps))
     pressed = max(1, round(share * script / dt))
@@ -116,93 +192,6 @@ def mean_of(pieces: list[dict[str, float]]) -> dict[str, float]:
     return {name: round(float(np.mean([ms[name] for ms in pieces])), 4) for name in pieces[0]}
 
 
-def memory_mb(owner: Any, apart: Any = None) -> float:
-    """Memory of the fields [MB] on the device that an object refers to, without those of ``apart``."""
-    seen: set[int] = set()
-    _bytes_in(apart, seen)
-    return _bytes_in(owner, seen) / 1e6
-
-
-def _bytes_in(owner: Any, seen: set[int]) -> int:
-    if id(owner) in seen:
-        return 0
-    seen.add(id(owner))
-    if isinstance(owner, ti.Field):
-        return int(np.prod(owner.shape, dtype=np.int64)) * 4 * _entries(owner)
-    if isinstance(owner, list | tuple):
-        return sum(_bytes_in(part, seen) for part in owner)
-    if type(owner).__module__.startswith(("sim.", "ultrasound.")):
-        return sum(_bytes_in(part, seen) for part in vars(owner).values())
-    return 0
-
-
-def _entries(field: ti.Field) -> int:
-    if isinstance(field, ti.StructField):
-        return sum(_entries(field.get_member_field(name)) for name in field.keys)
-    return getattr(field, "n", 1) * getattr(field, "m", 1)
-
-
-def compare(rehearsal: Rehearsal) -> tuple[dict[str, Any], list[str]]:
-    """Medians [ms] of the pressed body's step with contacts and of its references, run in turn; the references that are missing."""
-    solver, settings, model = rehearsal.solver, rehearsal.settings, rehearsal.model
-    assert isinstance(model, ShapeMatching) and isinstance(model.body, ParticleBody)
-    iterations = settings.substeps * settings.iterations
-    alone = Solver(ShapeMatching(model.body, model.patches))
-    pose = rehearsal.scripted_pose(rehearsal.script_length_s())
-    poses = poses_between(pose, pose, settings.substeps)
-    others, missing = _others(model, iterations)
-    runs = {
-        "step_ms": lambda: _one(lambda: solver.step(settings, poses)),
-        "without_contacts_ms": lambda: _one(lambda: alone.step(replace(settings, gravity=(0.0, 0.0, 0.0)))),
-        **others,
-    }
-    times: dict[str, list[float]] = {name: [] for name in runs}
-    pressed = solver.snapshot()
-    for _ in range(ROUNDS):
-        for name, run in runs.items():
-            solver.restore(pressed)
-            times[name] += [run() for _ in range(STEPS_A_ROUND)]
-    figures: dict[str, Any] = {name: round(float(np.median(ms)), 4) for name, ms in times.items()}
-    work = model.counts()["memberships"] * iterations / 1e3
-    figures |= dict(
-        membership_iterations=round(1e3 * work),
-        bound_ms=figures.get("bound_2_cores_ms"),
-        ratio_to_bound=_ratio(figures["step_ms"], figures.get("bound_2_cores_ms")),
-        million_a_second=round(work / figures["without_contacts_ms"], 2),
-        pypbd_million_a_second=_ratio(work, figures.get("pypbd_1_core_ms")),
-        times_pypbd=_ratio(figures.get("pypbd_1_core_ms"), figures["without_contacts_ms"]),
-    )
-    return figures, missing
-
-
-def _others(model: ShapeMatching, iterations: int) -> tuple[dict[str, Callable[[], float]], list[str]]:
-    """The references available on this machine, and why others are not."""
-    runs: dict[str, Callable[[], float]] = {}
-    missing = []
-    try:
-        bound = Bound(model)
-        runs["bound_1_core_ms"] = lambda: bound.run(iterations, 1)
-        runs["bound_2_cores_ms"] = lambda: bound.run(iterations, 2)
-    except NoBound as reason:
-        missing.append(str(reason))
-    try:
-        other = Pypbd(model)
-        runs["pypbd_1_core_ms"] = lambda: other.run(iterations)
-    except NoBound as reason:
-        missing.append(str(reason))
-    return runs, missing
-
-
-def _one(work: Callable[[], None]) -> float:
-    into: list[float] = []
-    timed(work, into)
-    return into[0]
-
-
-def _ratio(first: float | None, second: float | None) -> float | None:
-    return round(first / second, 3) if first and second else None
-
-
 def blocks(counts: list[int], arch: str, steps: int) -> Iterator[dict[str, Any]]:
     """Blocks of about ``counts`` particles or nodes at rest on a plane, smallest first, while memory suffices."""
     for make in (_block_of_cells, _block_of_particles):
@@ -211,14 +200,14 @@ def blocks(counts: list[int], arch: str, steps: int) -> Iterator[dict[str, Any]]
             if each_mb * count > MOST_MEMORY * psutil.virtual_memory().available / 1e6:
                 break
             start(arch)
-            before = psutil.Process().memory_info().rss
+            before = memory_of_process_mb()
             solver, settings, setup = make(count)
             solver.step(settings)
             step_ms: list[float] = []
             for _ in range(steps):
                 timed(lambda: solver.step(settings), step_ms)
             # Building a block takes more memory than the block itself.
-            used_mb = (psutil.Process().memory_info().rss - before) / 1e6
+            used_mb = memory_of_process_mb() - before
             each_mb = max(used_mb, memory_mb(solver)) / solver.body.count
             yield describe(setup, solver, arch) | dict(ms=spread(step_ms))
 
@@ -236,3 +225,143 @@ def _block_of_cells(count: int) -> tuple[Solver, StepSettings, Setup]:
     solver = block_of_cells(side, BLOCK_CELL_MM, [Plane(np.array([0.0, 0.0, 1.0]), 0.0)])
     setup = setup_of("neo-hookean", cell_mm=BLOCK_CELL_MM, iterations=8)
     return solver, LATTICE_SETTINGS, setup
+
+
+def _flat(case: dict) -> dict[str, Any]:
+    """A case's size, and mean, SD, minimum, maximum and median of its steps [ms]."""
+    return {name: case[name] for name in COLUMNS} | {f"{name}_ms": ms for name, ms in case["ms"].items()}
+
+
+def _size(case: dict) -> float:
+    return case["radius_mm"] or case["cell_mm"]
+
+
+def table(cases: list[dict], sizes: list[dict]) -> str:
+    """The paper's Table 5, and the blocks."""
+
+    def rows(given: list[dict]) -> str:
+        lines = []
+        for case in given:
+            iterations = f"{case['substeps']} x {case['iterations']}"
+            times = [case["ms"][name] for name in MS]
+            lines.append(
+                [case["model"], _size(case), case["particles"], iterations, *times, case["memory_mb"]]
+            )
+        return text_table(HEADERS, lines, FORMATS)
+
+    title = "Time of a step (ms), over warm-up and press (the paper's Table 5):"
+    return "\n".join([title, rows(cases), "\nBlocks at rest on a plane:", rows(sizes)])
+
+
+def pieces(cases: list[dict]) -> list[str]:
+    """The numbers of the paper's Figure 8."""
+    lines = []
+    for case in cases:
+        phases = case["phases_ms"]
+        total = sum(phases.values())
+        lines.append(f"\nPieces of a step, {case['model']} {_size(case):g} mm (mean ms, share):")
+        lines += [f"  {name:20}{ms:8.3f}{100 * ms / total:6.1f} %" for name, ms in phases.items()]
+    return lines
+
+
+def against(figures: dict) -> list[str]:
+    """The step beside the loop in C and pypbd."""
+    if not figures:
+        return []
+    lines = [
+        f"\nIn turn, {PAPERS.size_mm:g} mm, medians: a step with all contacts {figures['step_ms']:.2f} ms, without any "
+        f"{figures['without_contacts_ms']:.2f} ms"
+    ]
+    if figures["bound_ms"]:
+        lines.append(
+            f"  fits and averages alone in plain C: {figures['bound_1_core_ms']:.2f} ms on one core, "
+            f"{figures['bound_2_cores_ms']:.2f} ms on two; the step with contacts is {figures['ratio_to_bound']:.2f} times that"
+        )
+    if figures["times_pypbd"]:
+        lines.append(
+            f"  pypbd's shape matching: {figures['pypbd_1_core_ms']:.2f} ms; {figures['pypbd_million_a_second']:.0f} million "
+            f"membership-iterations a second against {figures['million_a_second']:.0f}: {figures['times_pypbd']:.1f} times"
+        )
+    return lines
+
+
+def figure_of(presses: list[TimedPress], sizes: list[dict]) -> Figure:
+    """The paper's Figures 7 and 8, its Table 5 and time against size, in four panels."""
+    figure = Figure(figsize=(13, 9), layout="constrained")
+    panels = figure.subplots(2, 2)
+    matched = [press for press in presses if press.case["model"] == "shape-matching"]
+    _over_time(panels[0, 0], matched[0])
+    _pieces(panels[0, 1], presses)
+    _radii(panels[1, 0], matched)
+    _sizes(panels[1, 1], sizes)
+    for axes in (panels[0, 0], panels[1, 0], panels[1, 1]):
+        finish_axes(axes, legend={})
+    return figure
+
+
+def _over_time(axes: Axes, press: TimedPress) -> None:
+    """The paper's Figure 7."""
+    case = press.case
+    contacts = [sum(ms.get(name, 0.0) for name in CONTACTS) for ms in press.pieces_ms]
+    axes.plot(press.elapsed_s, press.step_ms, linewidth=0.8, label="whole step")
+    axes.plot(press.elapsed_s, contacts, linewidth=0.8, label="contacts")
+    axes.axvline(press.warm_up_s, color="0.5", linestyle="--", linewidth=0.8)
+    axes.annotate(" press", (press.warm_up_s, 0), color="0.4", va="bottom")
+    axes.set_ylim(0, 1.5 * sorted(press.step_ms)[int(0.98 * len(press.step_ms))])
+    title = f"Time of a step, {case['particles']} particles of {case['radius_mm']:g} mm (the paper's Fig. 7)"
+    axes.set(title=title, xlabel="simulated time (s)", ylabel="ms")
+
+
+def _pieces(axes: Axes, presses: list[TimedPress]) -> None:
+    """The paper's Figure 8, for every model and size."""
+    shares = []
+    for press in presses:
+        phases = press.case["phases_ms"]
+        shares.append({name: 100 * ms / sum(phases.values()) for name, ms in phases.items()})
+    names = [*BEFORE, *IN_ITERATION[False], *IN_ITERATION[True], *AFTER, "frames"]
+    shown = [name for name in names if max(share.get(name, 0.0) for share in shares) > LEAST_SHARE]
+    left = np.zeros(len(presses))
+    for number, name in enumerate(shown):
+        width = np.array([share.get(name, 0.0) for share in shares])
+        colour = colormaps["tab20"](number)
+        axes.barh(range(len(presses)), width, left=left, color=colour, label=name)
+        left += width
+    axes.barh(range(len(presses)), 100 - left, left=left, color="0.8", label="the rest")
+    axes.set_yticks(
+        range(len(presses)), [f"{each.case['model']} {_size(each.case):g} mm" for each in presses]
+    )
+    axes.invert_yaxis()
+    axes.set(title="Pieces of a step (the paper's Fig. 8)", xlabel="% of the step", xlim=(0, 100))
+    axes.legend(fontsize=8, ncols=1, loc="center left", bbox_to_anchor=(1.0, 0.5))
+
+
+def _radii(axes: Axes, matched: list[TimedPress]) -> None:
+    """The paper's Table 5."""
+    cases = [press.case for press in matched]
+    rows = [(case["radius_mm"], *(case["ms"][key] for key in ("mean", "min", "max"))) for case in cases]
+    for shown, marker, colour, name in (
+        (rows, "o", "tab:blue", "here, one core"),
+        (PAPER_MS, "s", "0.5", "the paper's, a GPU of 1536 cores"),
+    ):
+        radius, mean, least, most = np.array(shown).T
+        spread = [mean - least, most - mean]
+        axes.errorbar(radius, mean, spread, fmt=marker, color=colour, capsize=3, label=name)
+    axes.axhline(FRAME_MS, color="0.6", linestyle=":", label="1/60 s")
+    title = "Mean, minimum and maximum of a step (the paper's Table 5)"
+    axes.set(title=title, xlabel="particle radius (mm)", ylabel="ms", ylim=(0, None))
+
+
+def _sizes(axes: Axes, sizes: list[dict]) -> None:
+    for model, name, place in (
+        ("shape-matching", "shape matching, 3 x 9", dict(xytext=(4, -9))),
+        ("neo-hookean", "neo-Hookean, 1 x 8", dict(xytext=(-4, 5), ha="right")),
+    ):
+        rows = [size for size in sizes if size["model"] == model]
+        points = [(row["particles"], row["ms"]["median"]) for row in rows]
+        axes.loglog(*zip(*points, strict=True), "o-", label=name)
+        for row, point in zip(rows, points, strict=True):
+            text = f"{row['memory_mb']:.0f} MB"
+            axes.annotate(text, point, fontsize=7, textcoords="offset points", **place)
+    axes.axhline(FRAME_MS, color="0.6", linestyle=":", label="1/60 s")
+    title = "Blocks at rest: time and memory against size"
+    axes.set(title=title, xlabel="particles or nodes", ylabel="median ms a step")

@@ -16,8 +16,9 @@ from sim.self_contact import SelfContacts
 from sim.shape_matching import ShapeMatching
 from sim.shapes import ConvexTool, SignedDistanceField
 from sim.surface_contact import SurfaceContacts
-from studies.performance import feature_costs, features_command
-from studies.performance.step_timing import memory_mb
+from studies import study_options
+from studies.harness import memory_mb
+from studies.performance import feature_costs
 from studies.robustness import soak_test
 
 SIZES = {"neo-hookean": 6.0, "shape-matching": 4.0}
@@ -43,7 +44,7 @@ WITHOUT = (
 
 
 def body_of(model: str) -> feature_costs.FeatureBody:
-    return feature_costs.body_of(load_scene(PAPER), small_anatomy(), model, SIZES[model])
+    return feature_costs.FeatureBody(load_scene(PAPER), small_anatomy(), model, SIZES[model])
 
 
 @pytest.mark.parametrize("model", list(feature_costs.FEATURES))
@@ -82,7 +83,7 @@ def test_kernels_are_counted_where_a_step_is_parallel(device):
 
 
 def test_the_command_writes_table_figure_and_json(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(features_command, "load_patient", lambda _: (briefly(20), small_anatomy()))
+    monkeypatch.setattr(study_options, "load_patient", lambda _: (briefly(20), small_anatomy()))
     monkeypatch.setattr(feature_costs, "SETTLE_STEPS", 3)
     monkeypatch.setattr(feature_costs, "PRESS_STEPS", 3)
     monkeypatch.setitem(feature_costs.FEATURES, "neo-hookean", feature_costs.EVERYWHERE[2:])
