@@ -151,10 +151,11 @@ def calibrate(
         else:
             count = calibration.exhaustive_count(len(loaded), len(radii_mm), spacing)
         with tqdm(total=count, desc="calibrate", unit="press") as bar:
+            found = calibration.Calibration(loaded, split, work, bar.update)
             if generations:
-                found = calibration.search(loaded, split, radii_mm, generations, work, bar.update)
+                found.search(radii_mm, generations)
             else:
-                found = calibration.exhaustive(loaded, split, radii_mm, spacing, work, bar.update)
+                found.exhaustive(radii_mm, spacing)
             bar.total = bar.n
     tables = tables_of(found)
     for table in tables:

@@ -18,6 +18,7 @@ from sim.shapes import ConvexTool
 from sim.skinning import Skin
 from sim.solver import StepSettings
 from studies.accuracy.bead_case import BeadCase
+from studies.harness import positions_of, restart
 from ultrasound.probe_manipulator import poses_between
 
 # Share of a stage's steps in which the probe moves; in the others the tissue comes to rest, as before the scan.
@@ -54,7 +55,7 @@ class BeadExperiment:
         shapes = [static_shape(translated(case.support, -self.origin), tissue), tool]
         contact = Contact(shape_friction=case.friction)
         self.solver = build_solver(rest or _organ(case), tissue, shapes, tool, contact)
-        self.body, self.model, self.contacts = self.solver.body, self.solver.model, self.solver.contacts
+        self.body, self.model = self.solver.body, self.solver.model
         self.beads = Skin(self.model, case.beads - self.origin)
 
     def run(self, setup: Setup) -> BeadRun:
@@ -77,15 +78,13 @@ class BeadExperiment:
                     run.arriving[stage] = self._bead_positions()
             pose = path[-1]
             run.beads[stage] = self._bead_positions()
-            run.finite &= bool(np.isfinite(array_of(self.body.position)).all())
+            run.finite &= bool(np.isfinite(positions_of(self.solver)).all())
         run.finite &= bool(np.isfinite(run.beads).all())
         return run
 
     def prepare(self, setup: Setup) -> StepSettings:
         """Warm up from the stress-free shape, with the probe away; return the settings of its steps."""
-        self.body.restore(self.body.rest_state())
-        self.contacts.reset()
-        self.model.update_frames()
+        restart(self.solver)
         step, pose = self._step_settings(setup), self._away()
         for _ in range(setup.warm_up_steps):
             self.solver.step(step, poses_between(pose, pose, step.substeps))

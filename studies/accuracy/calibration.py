@@ -1,7 +1,7 @@
 """The paper's calibration: a search for the settings with the least mean bead error, judged on held-out data."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -67,13 +67,18 @@ class Fit:
     error_mm: float
 
 
-@dataclass(frozen=True)
+@dataclass
 class Calibration:
-    """All trials of each radius, in their order."""
+    """A search by ``workers``, and all trials of each radius, in their order.
 
-    cases: tuple[BeadCase, ...]
+    ``done`` is called with the number of finished evaluations.
+    """
+
+    cases: Sequence[BeadCase]
     split: Split
-    trials: dict[float, list[CalibrationTrial]]
+    workers: Map
+    done: Callable[[int], object]
+    trials: dict[float, list[CalibrationTrial]] = field(default_factory=dict)
 
     def best(self, radius_mm: float) -> CalibrationTrial:
         """The trial with the least error on the fitted data, the first of equals."""
@@ -82,6 +87,57 @@ class Calibration:
     def null_mm(self) -> float:
         """Error [mm] of predicting no motion, on the held-out data."""
         return self.split.held_out_mm([null_errors(case) for case in self.cases])
+
+    def exhaustive(self, radii_mm: Sequence[float], spacing: float) -> None:
+        """The paper's search: every stiffness on a grid for each radius, then on a finer grid around the best of each."""
+        grid = stiffness_grid(spacing)
+        self._try_all([setup_of(MODEL, radius_mm=r, stiffness=a) for r in radii_mm for a in grid])
+        finer = {r: finer_grid(self.best(r).setup.tissue.stiffness, spacing) for r in radii_mm}
+        self._try_all([setup_of(MODEL, radius_mm=r, stiffness=a) for r in radii_mm for a in finer[r]])
+
+    def search(self, radii_mm: Sequence[float], generations: int) -> None:
+        """Stiffness, over-relaxation and iterations of each radius, by differential evolution from a fixed seed.
+
+        A generation is evaluated at once, so the result does not depend on the number of workers.
+        """
+
+        def errors_of(x: np.ndarray, radius: float) -> np.ndarray:
+            columns = x.reshape(len(BOUNDS), -1).T
+            return np.array(
+                [trial.fit_mm for trial in self._try_all([_setup_at(radius, *c) for c in columns])]
+            )
+
+        for radius in radii_mm:
+            differential_evolution(
+                errors_of,
+                BOUNDS,
+                args=(radius,),
+                integrality=[False, False, True],
+                popsize=POPULATION,
+                maxiter=generations,
+                tol=0,
+                rng=0,
+                polish=False,
+                updating="deferred",
+                vectorized=True,
+            )
+
+    def _try_all(self, setups: Sequence[Setup]) -> list[CalibrationTrial]:
+        """Evaluate setups on every case; case by case, as a worker keeps what it has built for a case and a radius."""
+        results = []
+        for result in self.workers([(case, setup) for case in self.cases for setup in setups]):
+            results.append(result)
+            self.done(1)
+        trials = []
+        for place, setup in enumerate(setups):
+            measured = tuple(results[place :: len(setups)])
+            errors = [each.errors for each in measured]
+            trial = CalibrationTrial(
+                setup, measured, self.split.fit_mm(errors), self.split.held_out_mm(errors)
+            )
+            trials.append(trial)
+            self.trials.setdefault(setup.tissue.radius_mm, []).append(trial)
+        return trials
 
 
 def split_of(cases: Sequence[BeadCase], hold_out: str) -> Split:
@@ -109,38 +165,6 @@ def split_of(cases: Sequence[BeadCase], hold_out: str) -> Split:
     return Split(tuple(masks), ", ".join(case.name for case in cases[:-1]), cases[-1].name)
 
 
-def exhaustive(
-    cases: Sequence[BeadCase],
-    split: Split,
-    radii_mm: Sequence[float],
-    spacing: float,
-    workers: Map,
-    done: Callable[[int], object],
-) -> Calibration:
-    """The paper's search: every stiffness on a grid for each radius, then on a finer grid around the best of each.
-
-    ``done`` is called with the number of finished evaluations, ``exhaustive_count`` in all at most.
-    """
-    grid = stiffness_grid(spacing)
-    trials = try_all(
-        cases,
-        split,
-        [setup_of(MODEL, radius_mm=r, stiffness=a) for r in radii_mm for a in grid],
-        workers,
-        done,
-    )
-    by_radius = {r: [trial for trial in trials if trial.setup.tissue.radius_mm == r] for r in radii_mm}
-    coarse = Calibration(tuple(cases), split, by_radius)
-    finer = [
-        setup_of(MODEL, radius_mm=r, stiffness=a)
-        for r in radii_mm
-        for a in finer_grid(coarse.best(r).setup.tissue.stiffness, spacing)
-    ]
-    for trial in try_all(cases, split, finer, workers, done):
-        by_radius[trial.setup.tissue.radius_mm].append(trial)
-    return coarse
-
-
 def stiffness_grid(spacing: float) -> list[float]:
     """Equal steps to 1; without 0, at which nothing holds the tissue together."""
     return np.round(np.arange(1.0, spacing / 2, -spacing)[::-1], 6).tolist()
@@ -158,66 +182,9 @@ def exhaustive_count(cases: int, radii: int, spacing: float) -> int:
     return cases * radii * (len(stiffness_grid(spacing)) + 2 * (FINER - 1))
 
 
-def search(
-    cases: Sequence[BeadCase],
-    split: Split,
-    radii_mm: Sequence[float],
-    generations: int,
-    workers: Map,
-    done: Callable[[int], object],
-) -> Calibration:
-    """Stiffness, over-relaxation and iterations of each radius, by differential evolution from a fixed seed.
-
-    A generation is evaluated at once, so the result does not depend on the number of workers.
-    """
-    trials: dict[float, list[CalibrationTrial]] = {radius: [] for radius in radii_mm}
-
-    def errors_of(radius: float, x: np.ndarray) -> np.ndarray:
-        setups = [_setup_at(radius, *column) for column in x.reshape(len(BOUNDS), -1).T]
-        made = try_all(cases, split, setups, workers, done)
-        trials[radius].extend(made)
-        return np.array([trial.fit_mm for trial in made])
-
-    for radius in radii_mm:
-        differential_evolution(
-            lambda x, radius=radius: errors_of(radius, x),
-            BOUNDS,
-            integrality=[False, False, True],
-            popsize=POPULATION,
-            maxiter=generations,
-            tol=0,
-            rng=0,
-            polish=False,
-            updating="deferred",
-            vectorized=True,
-        )
-    return Calibration(tuple(cases), split, trials)
-
-
 def search_count(cases: int, radii: int, generations: int) -> int:
     """Number of evaluations of a search."""
     return cases * radii * (generations + 1) * POPULATION * len(BOUNDS)
-
-
-def try_all(
-    cases: Sequence[BeadCase],
-    split: Split,
-    setups: Sequence[Setup],
-    workers: Map,
-    done: Callable[[int], object],
-) -> list[CalibrationTrial]:
-    """Evaluate setups on every case; case by case, as a worker keeps what it has built for a case and a radius."""
-    pairs = [(case, setup) for case in cases for setup in setups]
-    results = []
-    for result in workers(pairs):
-        results.append(result)
-        done(1)
-    trials = []
-    for place, setup in enumerate(setups):
-        measured = tuple(results[place :: len(setups)])
-        errors = [each.errors for each in measured]
-        trials.append(CalibrationTrial(setup, measured, split.fit_mm(errors), split.held_out_mm(errors)))
-    return trials
 
 
 def quartic(trials: Sequence[CalibrationTrial]) -> Fit | None:

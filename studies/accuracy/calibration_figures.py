@@ -1,5 +1,6 @@
 """Figures of a calibration: the paper's Figures 4 and 5, its tables as images, and the course of a search."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,9 @@ from matplotlib.transforms import Bbox
 from rehearsal.result_files import save_figure
 from studies.accuracy.calibration import MOST_ERROR, Calibration, CalibrationTrial, quartic
 from studies.accuracy.calibration_tables import Table
+from studies.study_results import DPI, finish_axes
 
-DPI = 130
+_save = partial(save_figure, dpi=DPI, bbox_inches="tight")
 
 
 def write_figure4(calibration: Calibration, path: Path) -> None:
@@ -29,7 +31,7 @@ def write_figure4(calibration: Calibration, path: Path) -> None:
             left.plot(smooth, fit.polynomial(smooth), "-", color=colour, linewidth=1)
             left.plot(fit.stiffness, fit.error_mm, "o", color=colour, markersize=9, fillstyle="none")
     _finish(calibration, left, right, "stiffness α")
-    save_figure(figure, path, dpi=DPI, bbox_inches="tight")
+    _save(figure, path)
 
 
 def write_search(calibration: Calibration, path: Path) -> None:
@@ -43,7 +45,7 @@ def write_search(calibration: Calibration, path: Path) -> None:
         )
         right.plot([trial.held_out_mm for trial in best], color=colour, drawstyle="steps-post")
     _finish(calibration, left, right, "setups tried")
-    save_figure(figure, path, dpi=DPI, bbox_inches="tight")
+    _save(figure, path)
 
 
 def best_so_far(trials: list[CalibrationTrial]) -> list[CalibrationTrial]:
@@ -64,10 +66,8 @@ def write_figure5(calibration: Calibration, path: Path) -> None:
         left.plot(radii, [each.particles for each in measured], "o-", label=case.name)
         right.plot(radii, [each.clusters for each in measured], "o-", label=case.name)
     for axes, what in ((left, "particles"), (right, "clusters")):
-        axes.set(xlabel="particle radius (mm)", ylabel=what, ylim=(0, None))
-        axes.grid(alpha=0.3)
-        axes.legend()
-    save_figure(figure, path, dpi=DPI, bbox_inches="tight")
+        finish_axes(axes, {}, xlabel="particle radius (mm)", ylabel=what, ylim=(0, None))
+    _save(figure, path)
 
 
 def write_table(table: Table, path: Path) -> None:
@@ -86,7 +86,7 @@ def write_table(table: Table, path: Path) -> None:
         cell.set_linewidth(0.3)
         cell.set_text_props(ha="left", weight="bold" if row == 0 else "normal")
     axes.set_title(table.title, fontsize=10)
-    save_figure(figure, path, dpi=DPI, bbox_inches="tight")
+    _save(figure, path)
 
 
 def _two_panels(calibration: Calibration) -> tuple[Figure, Axes, Axes]:
@@ -107,11 +107,8 @@ def _finish(calibration: Calibration, left: Axes, right: Axes, x_label: str) -> 
     ]
     most = max(filter(np.isfinite, errors), default=1.0)
     left.set_ylim(0, min(1.05 * most, MOST_ERROR * max(least, calibration.null_mm())))
-    left.legend(title="particle radius")
-    right.legend()
-    for axes in (left, right):
-        axes.set_xlabel(x_label)
-        axes.grid(alpha=0.3)
+    finish_axes(left, dict(title="particle radius"), xlabel=x_label)
+    finish_axes(right, {}, xlabel=x_label)
 
 
 def _colours(calibration: Calibration) -> list:

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from rehearsal.build_solver import build_solver, embedding_cell_mm, model_of, step_settings
 from rehearsal.commands.command_line import arch_option
-from rehearsal.configuration import PRESETS, probe_of
+from rehearsal.configuration import PRESETS, Setup, probe_of, scene_of
 from rehearsal.frame_view import image_view, initial_settings, probe_with_settings
 from rehearsal.measurements.run_report import Tally
 from rehearsal.rehearsal import SURROUNDINGS_MM, Rehearsal, scanned_anatomy
@@ -23,7 +23,7 @@ from rehearsal.stopwatch import timed
 from render.background_image import BackgroundImage
 from render.window_layout import WindowLayout
 from scenes.anatomy import LoadedAnatomy
-from scenes.scene import PAPER, Contact, Scene, SolverSection, with_options
+from scenes.scene import PAPER, Contact, Scene, SolverSection
 from scenes.surfaces import translated
 from scenes.tissue import TISSUES, USUAL, ShapeMatchingTissue
 from sim.device import start
@@ -111,8 +111,7 @@ def features(scene: Path, out: Path, quick: bool, arch: str) -> None:
     total = sum(len(FEATURES[model]) for model in models) + 1
     with tqdm(total=total, desc="features", unit="feature") as bar:
         for model in models:
-            preset = PRESETS[model]["fast" if quick else "balanced"]
-            body = FeatureBody(loaded, anatomy, model, preset.size_mm)
+            body = FeatureBody(loaded, anatomy, PRESETS[model]["fast" if quick else "balanced"])
             for row in of_steps(body, FEATURES[model], used, quick):
                 rows.append(dict(model=model) | row)
                 bar.update()
@@ -123,17 +122,11 @@ def features(scene: Path, out: Path, quick: bool, arch: str) -> None:
 
 
 class FeatureBody:
-    """A scene's organ and support, for solvers with different features; positions relative to the organ's middle [mm].
+    """A scene's organ and support, for solvers with different features; positions relative to the organ's middle [mm]."""
 
-    The organ is of cells or particles of a size [mm].
-    """
-
-    def __init__(self, scene: Scene, anatomy: LoadedAnatomy, model: str, size_mm: float) -> None:
-        options: dict[str, str | float | None] = {
-            "tissue.model": model,
-            f"tissue.{TISSUES[model].SIZE}": size_mm,
-        }
-        tissue = self.tissue = with_options(scene, options).tissue
+    def __init__(self, scene: Scene, anatomy: LoadedAnatomy, setup: Setup) -> None:
+        scene = scene_of(scene, setup)
+        tissue = self.tissue = scene.tissue
         self.settings = step_settings(tissue, scene.solver)
         middle = anatomy.organ.bounds.mean(axis=0)
         self.organ = translated(anatomy.organ, -middle)

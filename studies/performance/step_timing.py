@@ -3,8 +3,9 @@
 Timed are a scene's press at several sizes, and blocks of more and more particles.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise, repeat
 from pathlib import Path
 from typing import Any
 
@@ -77,14 +78,13 @@ LEAST_SHARE = 2.0
 
 @dataclass(frozen=True)
 class TimedPress:
-    """One press: simulated time and duration of each step, and the durations of its pieces."""
+    """One press: the duration of each step, and the durations of its pieces."""
 
     setup: Setup
     case: dict[str, Any]
-    elapsed_s: list[float]
     step_ms: list[float]
     pieces_ms: list[dict[str, float]]
-    warm_up_s: float
+    warm_up_steps: int
 
 
 @click.command()
@@ -129,43 +129,34 @@ def _setups(quick: bool) -> list[Setup]:
     return [*presets.values(), *(setup_of("shape-matching", radius_mm=radius) for radius in RADII_MM)]
 
 
-def press(
-    rehearsal: Rehearsal, share: float, step: Callable[[StepSettings, np.ndarray], None]
-) -> Iterator[float]:
-    """The paper's warm-up from the resting shape, then the scripted press, or a ``share`` of both; yields the time [s]."""
-    solver, settings, script = rehearsal.solver, rehearsal.settings, rehearsal.script_length_s()
-    restart(solver)
-    dt = settings.time_step_s
-    warm_up = max(1, round(share * rehearsal.press.warm_up_steps))
-    pressed = max(1, round(share * script / dt))
+def press(rehearsal: Rehearsal, warm_up_steps: int, share: float) -> Iterator[np.ndarray]:
+    """Poses of each step, from the stress-free shape: the paper's warm-up, then the scripted press or a share of it."""
+    restart(rehearsal.solver)
+    substeps, script = rehearsal.settings.substeps, rehearsal.script_length_s()
     away = advanced(rehearsal.manipulator.home, -AWAY_MM)
-    for n in range(warm_up):
-        step(settings, poses_between(away, away, settings.substeps))
-        yield (n + 1) * dt
-    pose = rehearsal.scripted_pose(0.0)
-    for n in range(pressed):
-        goal = rehearsal.scripted_pose(script * (n + 1) / pressed)
-        step(settings, poses_between(pose, goal, settings.substeps))
-        pose = goal
-        yield (warm_up + n + 1) * dt
+    yield from repeat(poses_between(away, away, substeps), warm_up_steps)
+    steps = max(1, round(share * script / rehearsal.settings.time_step_s))
+    path = [rehearsal.scripted_pose(script * n / steps) for n in range(steps + 1)]
+    for first, last in pairwise(path):
+        yield poses_between(first, last, substeps)
 
 
 def measure(rehearsal: Rehearsal, setup: Setup, share: float, arch: str) -> TimedPress:
     """Press twice: once timed as a whole, once piece by piece; the first step, which compiles, is not timed."""
-    solver = rehearsal.solver
+    solver, settings, home = rehearsal.solver, rehearsal.settings, rehearsal.manipulator.home
+    warm_up_steps = max(1, round(share * rehearsal.press.warm_up_steps))
     phases = Phases(solver)
-    home = poses_between(rehearsal.manipulator.home, rehearsal.manipulator.home, rehearsal.settings.substeps)
-    phases.step(rehearsal.settings, home)
+    phases.step(settings, poses_between(home, home, settings.substeps))
     step_ms: list[float] = []
+    for poses in press(rehearsal, warm_up_steps, share):
+        timed(lambda: solver.step(settings, poses), step_ms)
     pieces: list[dict[str, float]] = []
-    elapsed = []
-    for time_s in press(rehearsal, share, lambda s, poses: timed(lambda: solver.step(s, poses), step_ms)):
-        elapsed.append(time_s)
-    for n, _ in enumerate(press(rehearsal, share, phases.step)):
-        pieces.append(without_calls(phases.ms, phases.calls, step_ms[n]))
-    case = describe(setup, solver, arch) | dict(ms=spread(step_ms), phases_ms=mean_of(pieces))
-    warm_up_s = max(1, round(share * rehearsal.press.warm_up_steps)) * rehearsal.settings.time_step_s
-    return TimedPress(setup, case, elapsed, step_ms, pieces, warm_up_s)
+    for poses, ms in zip(press(rehearsal, warm_up_steps, share), step_ms, strict=True):
+        phases.step(settings, poses)
+        pieces.append(without_calls(phases.ms, phases.calls, ms))
+    means = {name: round(float(np.mean([ms[name] for ms in pieces])), 4) for name in pieces[0]}
+    case = describe(setup, solver, arch) | dict(ms=spread(step_ms), phases_ms=means)
+    return TimedPress(setup, case, step_ms, pieces, warm_up_steps)
 
 
 def describe(setup: Setup, solver: Solver, arch: str) -> dict[str, Any]:
@@ -185,11 +176,6 @@ def describe(setup: Setup, solver: Solver, arch: str) -> dict[str, Any]:
         cores=1 if solver.model.serial else ti.cfg.cpu_max_num_threads,
         memory_mb=round(memory_mb(solver), 3),
     )
-
-
-def mean_of(pieces: list[dict[str, float]]) -> dict[str, float]:
-    """Mean time of each piece over the steps [ms]."""
-    return {name: round(float(np.mean([ms[name] for ms in pieces])), 4) for name in pieces[0]}
 
 
 def blocks(counts: list[int], arch: str, steps: int) -> Iterator[dict[str, Any]]:
@@ -303,10 +289,12 @@ def _over_time(axes: Axes, press: TimedPress) -> None:
     """The paper's Figure 7."""
     case = press.case
     contacts = [sum(ms.get(name, 0.0) for name in CONTACTS) for ms in press.pieces_ms]
-    axes.plot(press.elapsed_s, press.step_ms, linewidth=0.8, label="whole step")
-    axes.plot(press.elapsed_s, contacts, linewidth=0.8, label="contacts")
-    axes.axvline(press.warm_up_s, color="0.5", linestyle="--", linewidth=0.8)
-    axes.annotate(" press", (press.warm_up_s, 0), color="0.4", va="bottom")
+    elapsed_s = case["time_step_s"] * np.arange(1, len(press.step_ms) + 1)
+    warm_up_s = case["time_step_s"] * press.warm_up_steps
+    axes.plot(elapsed_s, press.step_ms, linewidth=0.8, label="whole step")
+    axes.plot(elapsed_s, contacts, linewidth=0.8, label="contacts")
+    axes.axvline(warm_up_s, color="0.5", linestyle="--", linewidth=0.8)
+    axes.annotate(" press", (warm_up_s, 0), color="0.4", va="bottom")
     axes.set_ylim(0, 1.5 * sorted(press.step_ms)[int(0.98 * len(press.step_ms))])
     title = f"Time of a step, {case['particles']} particles of {case['radius_mm']:g} mm (the paper's Fig. 7)"
     axes.set(title=title, xlabel="simulated time (s)", ylabel="ms")

@@ -20,62 +20,47 @@ State = Callable[..., tuple[np.ndarray, np.ndarray]]
 Path = Callable[[float], np.ndarray]
 
 
-def _scaled(x: np.ndarray, up: np.ndarray, *factors: float) -> tuple[np.ndarray, np.ndarray]:
-    middle = x.mean(axis=0)
-    return middle + (x - middle) * factors, np.zeros_like(x)
+def _placed(positions: Callable[..., np.ndarray]) -> State:
+    """A state at other positions, without velocities."""
+    return lambda x, up, *numbers: (positions(x, up, *numbers), np.zeros_like(x))
 
 
-def _scattered(x: np.ndarray, up: np.ndarray, mm: float) -> tuple[np.ndarray, np.ndarray]:
-    return x + np.random.default_rng(SEED).normal(0.0, mm, x.shape), np.zeros_like(x)
+def _moving(velocities: Callable[..., np.ndarray]) -> State:
+    """A state at the settled positions, with velocities."""
+    return lambda x, up, *numbers: (x, velocities(x, *numbers))
 
 
-def _boxed(x: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return np.random.default_rng(SEED).uniform(x.min(axis=0), x.max(axis=0), x.shape), np.zeros_like(x)
+def _random() -> np.random.Generator:
+    return np.random.default_rng(SEED)
 
 
-def _thrown(x: np.ndarray, up: np.ndarray, *velocity: float) -> tuple[np.ndarray, np.ndarray]:
-    return x, np.tile(velocity, (len(x), 1))
-
-
-def _heated(x: np.ndarray, up: np.ndarray, speed: float) -> tuple[np.ndarray, np.ndarray]:
-    return x, np.random.default_rng(SEED).normal(0.0, speed, x.shape)
-
-
-def _turning(x: np.ndarray, up: np.ndarray, axis: int, rad_s: float) -> tuple[np.ndarray, np.ndarray]:
-    return x, np.cross(rad_s * np.eye(3)[axis], x - x.mean(axis=0))
-
-
-def _lifted(x: np.ndarray, up: np.ndarray, mm: float) -> tuple[np.ndarray, np.ndarray]:
-    return x + mm * up, np.zeros_like(x)
-
-
-def _one_out(x: np.ndarray, up: np.ndarray, mm: float) -> tuple[np.ndarray, np.ndarray]:
+def _one_out(x: np.ndarray, up: np.ndarray, mm: float) -> np.ndarray:
     moved = x.copy()
     moved[len(x) // 2] += mm * up
-    return moved, np.zeros_like(x)
+    return moved
 
 
-def _overlapped(x: np.ndarray, up: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+def _overlapped(x: np.ndarray, up: np.ndarray, share: float) -> np.ndarray:
     """The right of two bodies shifted along x into the left one."""
     moved, right = x.copy(), x[:, 0] > 0
     apart = x[right, 0].mean() - x[~right, 0].mean()
     wide = np.ptp(x[right, 0])
     moved[right, 0] -= apart - (1 - share) * wide
-    return moved, np.zeros_like(x)
+    return moved
 
 
 STATES: dict[str, State] = {
-    "settled": lambda x, up: (x, np.zeros_like(x)),
-    "scaled": _scaled,
-    "scattered": _scattered,
-    "boxed": _boxed,
-    "thrown": _thrown,
-    "heated": _heated,
-    "turning": _turning,
-    "lifted": _lifted,
-    "one out": _one_out,
-    "nothing": lambda x, up: (np.full_like(x, np.nan), np.zeros_like(x)),
-    "overlapped": _overlapped,
+    "settled": _placed(lambda x, up: x),
+    "scaled": _placed(lambda x, up, *factors: x.mean(axis=0) + (x - x.mean(axis=0)) * factors),
+    "scattered": _placed(lambda x, up, mm: x + _random().normal(0.0, mm, x.shape)),
+    "boxed": _placed(lambda x, up: _random().uniform(x.min(axis=0), x.max(axis=0), x.shape)),
+    "thrown": _moving(lambda x, *velocity: np.tile(velocity, (len(x), 1))),
+    "heated": _moving(lambda x, speed: _random().normal(0.0, speed, x.shape)),
+    "turning": _moving(lambda x, axis, rad_s: np.cross(rad_s * np.eye(3)[axis], x - x.mean(axis=0))),
+    "lifted": _placed(lambda x, up, mm: x + mm * up),
+    "one out": _placed(_one_out),
+    "nothing": _placed(lambda x, up: np.full_like(x, np.nan)),
+    "overlapped": _placed(_overlapped),
 }
 
 
@@ -95,31 +80,27 @@ def _swept(home: np.ndarray, thickness_mm: float, dt: float, speed: float, depth
     return at
 
 
+def _turned(pose: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    turned = pose.copy()
+    turned[:3, :3] = rotation
+    return turned
+
+
 def _spun(home: np.ndarray, thickness_mm: float, dt: float, rad_s: float, axis: int) -> Path:
     pose = advanced(home, MIDDLE_MM)
-
-    def at(t: float) -> np.ndarray:
-        turned = pose.copy()
-        turned[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(rad_s * t * np.eye(3)[axis]).as_matrix()
-        return turned
-
-    return at
+    return lambda t: _turned(
+        pose, pose[:3, :3] @ Rotation.from_rotvec(rad_s * t * np.eye(3)[axis]).as_matrix()
+    )
 
 
 def _jitter(home: np.ndarray, thickness_mm: float, dt: float) -> Path:
-    depths = MIDDLE_MM + np.random.default_rng(SEED).uniform(-MIDDLE_MM, MIDDLE_MM, 1000)
+    depths = MIDDLE_MM + _random().uniform(-MIDDLE_MM, MIDDLE_MM, 1000)
     return lambda t: advanced(home, float(np.interp(t / dt, np.arange(1000), depths)))
 
 
 def _tumble(home: np.ndarray, thickness_mm: float, dt: float) -> Path:
     pose, turns = advanced(home, MIDDLE_MM), Rotation.random(1000, random_state=SEED).as_matrix()
-
-    def at(t: float) -> np.ndarray:
-        turned = pose.copy()
-        turned[:3, :3] = turns[round(t / dt) % 1000]
-        return turned
-
-    return at
+    return lambda t: _turned(pose, turns[round(t / dt) % 1000])
 
 
 PROBES: dict[str, Callable[..., Path]] = {

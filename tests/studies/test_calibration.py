@@ -22,13 +22,12 @@ from studies.accuracy.bead_case import BeadCase, load_case
 from studies.accuracy.bead_errors import null_errors
 from studies.accuracy.calibration import (
     MODEL,
+    Calibration,
     CalibrationError,
     CalibrationTrial,
-    exhaustive,
     exhaustive_count,
     finer_grid,
     quartic,
-    search,
     search_count,
     split_of,
     stiffness_grid,
@@ -96,7 +95,8 @@ def test_grids():
 
 def test_the_exhaustive_search_finds_the_best_fit_and_judges_it_on_held_out_data(cases):
     done = []
-    found = exhaustive(cases, split_of(cases, "stages"), [3.0, 4.0], 0.1, pretending, done.append)
+    found = Calibration(cases, split_of(cases, "stages"), pretending, done.append)
+    found.exhaustive([3.0, 4.0], 0.1)
     assert sum(done) == exhaustive_count(2, 2, 0.1) == 2 * 2 * 18
     for radius, best in BEST.items():
         trial = found.best(radius)
@@ -124,7 +124,9 @@ def test_a_quartic_and_its_minimum_are_found():
 def test_a_search_of_several_settings_is_reproducible(cases):
     done = []
     split = split_of(cases, "stages")
-    first, again = (search(cases, split, [3.0], 12, pretending, done.append) for _ in range(2))
+    first, again = (Calibration(cases, split, pretending, done.append) for _ in range(2))
+    for one in (first, again):
+        one.search([3.0], 12)
     best = first.best(3.0).setup
     assert best.iterations in (8, 9, 10) and best.tissue.stiffness == pytest.approx(0.62, abs=0.1)
     assert [t.setup for t in first.trials[3.0]] == [t.setup for t in again.trials[3.0]]

@@ -21,7 +21,10 @@ from studies.harness import memory_mb
 from studies.performance import feature_costs
 from studies.robustness import soak_test
 
-SIZES = {"neo-hookean": 6.0, "shape-matching": 4.0}
+SETUPS = {
+    "neo-hookean": setup_of("neo-hookean", cell_mm=6.0),
+    "shape-matching": setup_of("shape-matching", radius_mm=4.0),
+}
 # What only the feature has kernels use.
 OWN = {
     "contact with the support": [(SignedDistanceField, "surface"), (SignedDistanceField, "clearance")],
@@ -44,7 +47,7 @@ WITHOUT = (
 
 
 def body_of(model: str) -> feature_costs.FeatureBody:
-    return feature_costs.FeatureBody(load_scene(PAPER), small_anatomy(), model, SIZES[model])
+    return feature_costs.FeatureBody(load_scene(PAPER), small_anatomy(), SETUPS[model])
 
 
 @pytest.mark.parametrize("model", list(feature_costs.FEATURES))
