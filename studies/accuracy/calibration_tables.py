@@ -1,6 +1,6 @@
 """Results of a calibration as the paper's Tables 2 to 5: text, CSV, and JSON with all trials."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -56,12 +56,12 @@ def tables_of(calibration: Calibration) -> list[Table]:
     means = _bead_table(calibration, best, "table2", "Table 2: bead error, mean (mm)", np.mean)
     means.names.extend([["all", "mean", FIT], ["all", "mean", HELD_OUT]])
     means.figures.extend([[rounded(t.fit_mm) for t in best], [rounded(t.held_out_mm) for t in best]])
-    means.shares.extend([[None for _ in best], [None for _ in best]])
-    deviations = _bead_table(
-        calibration, best, "table3", "Table 3: bead error, standard deviation (mm)", np.std
-    )
-    most = _bead_table(calibration, best, "table4", "Table 4: bead error, maximum (mm)", np.max)
-    return [means, replace(deviations, shares=[]), replace(most, shares=[]), _times(calibration, best)]
+    means.shares.extend([[None] * len(best)] * 2)
+    others = [
+        _bead_table(calibration, best, "table3", "Table 3: bead error, standard deviation (mm)", np.std),
+        _bead_table(calibration, best, "table4", "Table 4: bead error, maximum (mm)", np.max),
+    ]
+    return [means, *(replace(each, shares=[]) for each in others), _times(calibration, best)]
 
 
 def _bead_table(
@@ -75,13 +75,15 @@ def _bead_table(
     names = [["", "", "stiffness"]]
     figures: list[Row] = [[trial.setup.tissue.stiffness for trial in best]]
     shares: list[Row] = [[None for _ in best]]
-    for place, stage, part, used in _rows(calibration):
-        case = calibration.cases[place]
-        depth = case.indentation_mm[stage]
-        row = [float(figure(trial.measured[place].errors[stage][used])) for trial in best]
-        names.append([case.name, f"{stage} ({depth:.2f} mm)", part])
-        figures.append([rounded(value) for value in row])
-        shares.append([rounded(100 * value / depth) if depth > 0 else None for value in row])
+    for place, (case, fitted) in enumerate(zip(calibration.cases, calibration.split.fitted, strict=True)):
+        for stage, depth in enumerate(case.indentation_mm):
+            for part, used in ((FIT, fitted[stage]), (HELD_OUT, ~fitted[stage])):
+                if not used.any():
+                    continue
+                row = [float(figure(trial.measured[place].errors[stage][used])) for trial in best]
+                names.append([case.name, f"{stage} ({depth:.2f} mm)", part])
+                figures.append([rounded(value) for value in row])
+                shares.append([rounded(100 * value / depth) if depth > 0 else None for value in row])
     return Table(name, title, ["case", "stage", "part"], list(calibration.trials), names, figures, shares)
 
 
@@ -144,15 +146,6 @@ def _trial(trial: CalibrationTrial) -> dict:
         fit_mm=rounded(trial.fit_mm),
         held_out_mm=rounded(trial.held_out_mm),
     )
-
-
-def _rows(calibration: Calibration) -> Iterator[tuple[int, int, str, np.ndarray]]:
-    """Case, stage, the part of the data, and the mask (n,) of its beads."""
-    for place, fitted in enumerate(calibration.split.fitted):
-        for stage, mask in enumerate(fitted):
-            for part, used in ((FIT, mask), (HELD_OUT, ~mask)):
-                if used.any():
-                    yield place, stage, part, used
 
 
 def _times(calibration: Calibration, best: list[CalibrationTrial]) -> Table:

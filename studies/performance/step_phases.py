@@ -1,13 +1,12 @@
 """A step in pieces, each a kernel of its own, so that each can be timed (the paper's Fig. 8)."""
 
-from collections.abc import Callable
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 import taichi as ti
 import taichi.math as tm
 
+from rehearsal.stopwatch import timed
 from sim.shape_matching import ShapeMatching
 from sim.solver import Solver, StepSettings, relaxation_at
 
@@ -58,16 +57,12 @@ class Phases:
                     self._timed(name, substep, factor, *values, 0)
             for name in AFTER:
                 self._timed(name, substep, 1.0, *values, 0)
-        self._clocked("frames", self.model.update_frames)
+        self._timed("frames")
 
     def _timed(self, name: str, *values) -> None:
-        self._clocked(name, lambda: self._piece(name, *values))
-
-    def _clocked(self, name: str, work: Callable[[], None]) -> None:
-        started = perf_counter()
-        work()
-        ti.sync()
-        self.ms[name] += 1e3 * (perf_counter() - started)
+        taken: list[float] = []
+        timed(lambda: self._piece(name, *values) if values else self.model.update_frames(), taken)
+        self.ms[name] += taken[0]
         self.calls[name] += 1
 
     @ti.kernel

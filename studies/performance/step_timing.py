@@ -47,19 +47,8 @@ QUICK_COUNTS = [1_000, 4_000, 16_000]
 # The particle radius of the paper's figures, which is compared with other programs.
 PAPERS = setup_of("shape-matching", radius_mm=2.2)
 STEPS, QUICK_STEPS, QUICK_SHARE = 7, 3, 0.1
-COLUMNS = (
-    "model",
-    "radius_mm",
-    "cell_mm",
-    "particles",
-    "clusters",
-    "memberships",
-    "substeps",
-    "iterations",
-    "arch",
-    "cores",
-    "memory_mb",
-)
+# Figures of a case that are not in the table of CSV, beside the times.
+JSON_ONLY = ("time_step_s", "ms", "phases_ms", "bound_ms")
 MS = ("mean", "sd", "min", "max", "median")
 HEADERS = ("model", "size, mm", "particles", "substeps x iterations", *MS, "MB")
 FORMATS = ("", "g", "g", "", *[".2f"] * len(MS), ".1f")
@@ -215,7 +204,8 @@ def _block_of_cells(count: int) -> tuple[Solver, StepSettings, Setup]:
 
 def _flat(case: dict) -> dict[str, Any]:
     """A case's size, and mean, SD, minimum, maximum and median of its steps [ms]."""
-    return {name: case[name] for name in COLUMNS} | {f"{name}_ms": ms for name, ms in case["ms"].items()}
+    size = {name: value for name, value in case.items() if name not in JSON_ONLY}
+    return size | {f"{name}_ms": ms for name, ms in case["ms"].items()}
 
 
 def _size(case: dict) -> float:

@@ -18,7 +18,7 @@ from rehearsal.sessions.recorder import record
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import Log, read_log
-from render.viewer import Controls, Settings
+from render.viewer import Controls
 from scenes.scene import EMBEDDED
 from scenes.tissue import TISSUES, USUAL
 from studies.harness import Watch, build
@@ -79,18 +79,7 @@ def replay(scene: Path, out: Path, minutes: float, model: str, quality: str, arc
 
 def random_poses(live: UserInput, rehearsal: Rehearsal, steps: int, bar: tqdm) -> Iterator[np.ndarray]:
     """Poses of a restless user, who also undoes, redoes and resets; the same each time."""
-    for controls in random_input(rehearsal, initial_settings(rehearsal), steps):
-        pose = live.next_pose(controls)
-        if pose is not None:
-            yield pose
-            live.after_step(0.0)
-        live.after_frame()
-        bar.update()
-
-
-def random_input(rehearsal: Rehearsal, settings: Settings, steps: int) -> Iterator[Controls]:
-    """Input of a restless user, the same each time."""
-    random = np.random.default_rng(SEED)
+    random, settings = np.random.default_rng(SEED), initial_settings(rehearsal)
     manipulator = rehearsal.manipulator
     above = np.flatnonzero(manipulator.normals @ rehearsal.gravity_direction < -0.5)
     every = round(CHANGE_S / rehearsal.settings.time_step_s)
@@ -115,7 +104,12 @@ def random_input(rehearsal: Rehearsal, settings: Settings, steps: int) -> Iterat
                 settings.iterations = int(random.integers(3, 7))
         for name, value in lasting.items():
             setattr(controls, name, value)
-        yield controls
+        pose = live.next_pose(controls)
+        if pose is not None:
+            yield pose
+            live.after_step(0.0)
+        live.after_frame()
+        bar.update()
 
 
 def replayed(rehearsal: Rehearsal, log: Log, from_s: float, bar: tqdm) -> dict[str, Any]:

@@ -6,11 +6,10 @@ import numpy as np
 import trimesh
 
 from rehearsal.build_solver import build_solver, step_settings
-from rehearsal.configuration import PRESETS
+from rehearsal.configuration import PRESETS, scene_of, setup_of
 from scenes.anatomy import load_anatomy
-from scenes.scene import PAPER, Contact, SolverSection, load_scene, with_options
+from scenes.scene import PAPER, Contact, SolverSection, load_scene
 from scenes.surfaces import volume_mm3
-from scenes.tissue import TISSUES
 from sim.device import start
 from sim.divergence_check import DivergenceCheck
 from sim.fields import array_of
@@ -145,9 +144,8 @@ def _mesh(model: str, subject: Subject) -> trimesh.Trimesh:
 def _filled(
     model: str, subject: Subject, mesh: trimesh.Trimesh, shapes: list, tool: ConvexTool
 ) -> tuple[Solver, StepSettings]:
-    size = subject.size_mm or SIZE_MM[model]
-    options: dict[str, str | float | None] = {"tissue.model": model, f"tissue.{TISSUES[model].SIZE}": size}
-    tissue = with_options(load_scene(PAPER), options).tissue
+    setup = setup_of(model).sized(subject.size_mm or SIZE_MM[model])
+    tissue = scene_of(load_scene(PAPER), setup).tissue
     scaling = np.log(subject.mass_ratio) / np.ptp(mesh.bounds[:, 2])
     section = SolverSection(mass_scaling_per_mm=min(float(scaling), 1.0))
     contact = Contact(particles=subject.kind == "two" and tissue.CAN_TOUCH_ITSELF)
