@@ -33,17 +33,17 @@ COMMANDS = {
     ),
     "import": (
         "scenes.patients.import_command:import_patient_command",
-        "Make a patient's folder out of a CT and its LABELS.",
+        "Make a patient's folder from a CT and its LABELS.",
     ),
-    "plan": ("rehearsal.commands.plan_command:plan", "Plan a sweep over SCENE that shows the target."),
+    "plan": ("rehearsal.commands.plan_command:plan", "Plan a sweep over SCENE that covers the target."),
     "export": (
         "rehearsal.commands.export_command:export",
         "Write surfaces, CT and labels of SCENE as files.",
     ),
-    "scan": ("rehearsal.commands.scan_command:scan", "Take pictures of SCENE at a list of probe poses."),
+    "scan": ("rehearsal.commands.scan_command:scan", "Make images of SCENE at a list of probe poses."),
     "reconstruct": (
         "rehearsal.commands.reconstruct_command:reconstruct",
-        "Make a volume of SWEEP, a tracked sweep (.igs.mha).",
+        "Reconstruct a volume from SWEEP, a tracked sweep (.igs.mha).",
     ),
     "validate": (
         "studies.accuracy.accuracy_commands:validate",
@@ -58,7 +58,7 @@ COMMANDS = {
         "studies.reference.reference_command:reference",
         "Make a bead experiment by finite elements, for `validate`.",
     ),
-    "study": ("studies.study_command:study", "Measure on this machine: tables and a picture in a folder."),
+    "study": ("studies.study_command:study", "Measure on this machine: tables and figures in a folder."),
 }
 
 

@@ -132,7 +132,7 @@ def readouts(rehearsal: Rehearsal, tally: Tally) -> dict[str, str]:
     return {
         "step": f"{np.median(tally.step_ms[-30:]):.1f} ms" if tally.step_ms else "",
         "error": "not known" if error is None else f"± {error:.2f} mm",
-        "picture": f"{np.median(tally.slice_ms[-30:]):.1f} ms",
+        "image": f"{np.median(tally.slice_ms[-30:]):.1f} ms",
         size: f"{count}",
         "indentation": f"{max(rehearsal.indentation_mm(), 0.0):.1f} mm",
     }

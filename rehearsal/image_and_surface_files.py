@@ -8,13 +8,13 @@ import click
 import numpy as np
 import trimesh
 from PIL import Image
-from scenes.surface_files import save_surface
 
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import next_number
 from render.animation import with_square_pixels
 from render.viewer import View
 from scenes.atomic_files import atomic_write
+from scenes.surfaces import save_surface
 from sim.fields import array_of
 from ultrasound.dicom_image import save_dicom
 from ultrasound.probe import Probe

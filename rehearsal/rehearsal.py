@@ -66,7 +66,7 @@ class Rehearsal:
     """A scene on the device. All positions are mm relative to ``origin``, the middle of the resting organ (LPS).
 
     Taichi must be initialised, and initialised again for another scene, which frees this one. ``progress`` is called with what is
-    being built; ``shows_echo`` prepares the B-mode image meanwhile.
+    being built; ``needs_b_mode`` prepares the B-mode image meanwhile.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Rehearsal:
         anatomy: LoadedAnatomy,
         probe: Probe | None = None,
         progress: ReportProgress = no_progress,
-        shows_echo: bool = False,
+        needs_b_mode: bool = False,
     ) -> None:
         self.scene = scene
         self.probe = probe or probe_of(scene)
@@ -89,7 +89,7 @@ class Rehearsal:
         scanned, echo = None, None
         if anatomy.ct is not None:
             scanned = scanned_anatomy(self.organ, anatomy.ct, anatomy, self.origin)
-            echo = start_acoustics(scanned) if shows_echo else None
+            echo = start_acoustics(scanned) if needs_b_mode else None
         progress("Building the model: tissue and contacts")
         self._build_solver(anatomy)
         self.divergence_check = DivergenceCheck(self.solver)

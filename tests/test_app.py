@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import redirect_stderr
 from functools import partial
 from pathlib import Path
+from pkgutil import resolve_name
 
 import click
 import numpy as np
@@ -23,6 +24,7 @@ import app
 from rehearsal.commands.command_line import CommandError
 from rehearsal.commands.option_checks import refuse_no_pictures
 from rehearsal.commands.rehearse_command import found_display
+from studies.study_command import STUDIES
 from version import VERSION
 
 REPORTED = {
@@ -274,6 +276,21 @@ def test_no_range_of_numbers_lets_one_through_that_is_none():
         for word in ("nan", "inf", "-inf"):
             with pytest.raises(click.BadParameter):
                 each.convert(word, None, None)
+
+
+@pytest.mark.parametrize(
+    ("table", "name"), [(table, name) for table in (app.COMMANDS, STUDIES) for name in table]
+)
+def test_the_list_of_commands_has_each_commands_own_first_sentence(table, name):
+    place, text = table[name]
+    own = resolve_name(place).help.split("\n\n")[0]
+    assert text == " ".join(own.split())
+
+
+def test_help_comes_without_the_libraries_that_take_seconds():
+    asked = "import sys, app; app.main(['--help']); print({'taichi', 'trimesh', 'matplotlib', 'pydantic'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, cwd=ROOT)
+    assert done.stdout.strip().endswith("set()"), done.stdout
 
 
 def test_numbers_have_everyday_names_in_the_help():

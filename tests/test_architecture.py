@@ -49,6 +49,11 @@ def modules() -> dict[str, Path]:
     return {module_of(path): path for path in (ROOT / "app.py", *sorted(files))}
 
 
+def packages() -> dict[str, Path]:
+    """The folders of the program, by name."""
+    return {module_of(path.parent / "__init__.py"): path.parent for path in modules().values()}
+
+
 @cache
 def nodes() -> list[tuple[str, str, ast.AST]]:
     """All that the program's sources consist of, each with its module and file."""
@@ -94,6 +99,16 @@ def test_the_program_is_found():
         0,
     ) in {each._replace(line=0) for each in imports()}
     assert {"taichi.ui.utils", "sim.embedding"} <= {each.name for each in imports()}
+
+
+def test_every_import_of_the_program_exists():
+    # mypy ignores imports that it cannot find, for the libraries' sake.
+    wrong = [
+        each
+        for each in imports()
+        if layer_of(each.name) in LAYERS and each.name not in modules() | packages()
+    ]
+    assert not wrong, f"no such module:{listed(wrong)}"
 
 
 @pytest.mark.parametrize("layer", FORBIDDEN)

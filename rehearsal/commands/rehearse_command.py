@@ -106,7 +106,7 @@ if TYPE_CHECKING:
     "--rung",
     "detail_level",
     type=click.Choice(DETAIL_LEVELS),
-    help="How much of the echo is computed [the scene's].",
+    help="Detail level (realism) of the B-mode image [the scene's].",
 )
 @click.option(
     "--budget-ms",
@@ -230,7 +230,7 @@ def built(
     """The rehearsal of a scene; ``draws``: images will be computed."""
     from rehearsal.rehearsal import Rehearsal
 
-    return Rehearsal(scene, anatomy, probe, progress, shows_echo=draws and scene.image.mode != "ct")
+    return Rehearsal(scene, anatomy, probe, progress, needs_b_mode=draws and scene.image.mode != "ct")
 
 
 def compile_picture(rehearsal: "Rehearsal") -> None:

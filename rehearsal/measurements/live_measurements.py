@@ -155,7 +155,7 @@ class LiveMeasurements:
         return self.latest is not None and self.latest.compression_mm > limit
 
     def onto(self, view: View, settings: Settings) -> View:
-        """A view with what was measure."""
+        """A view with the measurements."""
         status = view.status
         if self.is_over_limit and self.latest is not None and not status:
             status = f"TISSUE COMPRESSED BY {self.latest.compression_mm:.0f} mm"

@@ -85,16 +85,16 @@ def _times(ms: list[float]) -> dict[str, float] | None:
 
 def summary(report: dict) -> str:
     """The main figures, in a few lines for the terminal."""
-    measured = {"step": report["ms_per_step"], "picture": report["ms_per_slice"]}
-    times = ", ".join(f"{ms['median']:.1f} ms a {name}" for name, ms in measured.items() if ms is not None)
-    shown = f"picture {report['picture']}, B-mode at detail level {report['detail_level']}"
+    measured = {"step": report["ms_per_step"], "image": report["ms_per_slice"]}
+    times = ", ".join(f"{ms['median']:.1f} ms per {name}" for name, ms in measured.items() if ms is not None)
+    shown = f"image {report['picture']}, B-mode at detail level {report['detail_level']}"
     return "\n".join(
         [
             f"model     {TISSUES[report['model']].REPORTED.format(**report)}, {report['tetrahedra']} tetrahedra",
             f"step      1/{1 / report['time_step_s']:.0f} s in {counted(report['substeps'], 'substep')} of "
             f"{counted(report['iterations'], 'iteration')}",
             f"speed     {times} (medians of {report['steps']}) on {report['arch']}; built in {report['build_s']:.1f} s",
-            f"probe     {report['probe']}; {shown if measured['picture'] else 'no pictures'}",
+            f"probe     {report['probe']}; {shown if measured['image'] else 'no images'}",
             f"press     {_press(report)}",
             f"error     {_error(report['expected_error_mm'])}",
             *(f"WARNING   {text}" for text in report["fallbacks"]),

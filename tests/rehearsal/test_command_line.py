@@ -7,7 +7,7 @@ import pytest
 
 from errors import PatientError
 from rehearsal.commands.command_line import CommandError, load_patient, make_folder, save_figures
-from rehearsal.commands.plan_command import following
+from rehearsal.commands.plan_command import rehearse_command_line
 from scenes.atomic_files import check_folder
 from scenes.scene import EMBEDDED
 from scenes.terminal import shell_command
@@ -45,7 +45,7 @@ def test_a_command_to_be_pasted_is_quoted_as_its_shell_needs_it(monkeypatch, sys
     [(EMBEDDED, None, []), (Path("a b"), "linear", ["a b", "--probe", "linear"])],
 )
 def test_what_follows_a_plan_names_its_scene_and_probe(scene, probe, words):
-    assert following(scene, Path("plan.json"), probe) == shell_command(
+    assert rehearse_command_line(scene, Path("plan.json"), probe) == shell_command(
         "rehearse", *words, "--plan", "plan.json"
     )
 

@@ -10,10 +10,10 @@ import pytest
 import SimpleITK as sitk
 import trimesh
 from conftest import rotation_about
-from scenes.surface_files import FORMATS, save_surface
 
 import app
 from rehearsal.image_and_surface_files import save_surfaces
+from scenes.surfaces import FORMATS, save_surface
 from scenes.volumes.volume_files import save_image
 from sim.fields import field_of
 

@@ -153,7 +153,7 @@ def test_a_restart_clears_the_progress():
     assert guide.in_words(None) == "plan      two passes: 0 % completed"
     guide.watch(FIRST[0])
     guide.restart()
-    assert guide.next_pose == 0 and guide.figures()["plan_followed"] == 0 and not guide.guidance().gone.any()
+    assert guide.next_pose == 0 and guide.figures()["plan_followed"] == 0 and not guide.guidance().done.any()
     assert guide.findings()["off plan"] == ""
 
 
@@ -322,7 +322,7 @@ def test_two_sweeps_shown_in_turn_have_their_own_lines(one_device):
 
 
 def test_every_second_segment_of_a_path_with_too_many_is_drawn(one_device, monkeypatch):
-    monkeypatch.setattr(plan_lines, "MOST_SEGMENTS", 10)
+    monkeypatch.setattr(plan_lines, "MAX_SEGMENTS", 10)
     way = np.arange(15 * 6, dtype=float).reshape(15, 2, 3)
     done = np.arange(15) < 7
     segments, colours, _ = drawn(PlanLines(EDGES), Guidance(None, way, done))

@@ -237,6 +237,6 @@ def test_sweeps_are_shown_in_turn(plans):
         plans.rehearsal, plan_of(sweep_of(first), sweep_of(second, name="b", seen=0.5))
     )
     guide.watch(first[0])
-    assert guide.next_pose == 1 and np.array_equal(guide.guidance().gone, [False, False])
+    assert guide.next_pose == 1 and np.array_equal(guide.guidance().done, [False, False])
     assert message(plans, next_plan=True) == "Plan 2: b, covers 50 %"
     assert message(plans, next_plan=True) == "Plan hidden"

@@ -381,7 +381,7 @@ def test_a_session_is_refused_with_another_patient_and_with_options_of_its_own(t
     assert refused("--at", 3).startswith("nephron: --at: ")
     length_s = read_log(path).length_s
     beyond = refused("--replay", path, "--at", length_s + 1)
-    assert f"--at {length_s + 1:g}: the session is {length_s:.1f} s long; open it at" in beyond
+    assert f"--at {length_s + 1:g}: the session is {length_s:.1f} s long; choose an earlier" in beyond
     assert "other anatomy" in refused("--replay", path, "--at", length_s)
     assert "no such session file" in refused("--replay", tmp_path / "none")
 

@@ -205,7 +205,7 @@ def test_a_tracked_file_is_followed_headless_and_replayed(built, monkeypatch, tm
     assert len(log.poses) == 31 and probe_in_patient(rehearsal) == pytest.approx(poses[-1])
     told = [event.value for events in log.events.values() for event in events if event.kind == "solver"]
     assert len({values["iterations"] for values in told if "iterations" in values}) == 1
-    assert "echo as far as" in capsys.readouterr().out and (tmp_path / "slices").is_dir()
+    assert "B-mode at detail level" in capsys.readouterr().out and (tmp_path / "slices").is_dir()
     rehearsal.reset()
     (tmp_path / "bare").mkdir()
     run.RehearsalRun(rehearsal, anatomy, "cpu", tmp_path / "bare").headless(log, 0.0, None, 0.0, draws=False)
