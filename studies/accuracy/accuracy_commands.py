@@ -141,8 +141,7 @@ def calibrate(
     radii_mm = numbers(radii, "--radii", 0.5, 20)
     loaded = [load_case(case) for case in cases]
     make_folder(out)
-    from studies.accuracy import calibration, calibration_figures, case_workers
-    from studies.accuracy.calibration_tables import summary_of, tables_of, write_calibration
+    from studies.accuracy import calibration, calibration_results, case_workers
 
     split = calibration.split_of(loaded, hold_out)
     with case_workers.dask_workers(address) if address else case_workers.local_workers(jobs) as work:
@@ -157,15 +156,17 @@ def calibrate(
             else:
                 found.exhaustive(radii_mm, spacing)
             bar.total = bar.n
-    tables = tables_of(found)
+    tables = calibration_results.tables_of(found)
     for table in tables:
         table.write_csv(out)
-        calibration_figures.write_table(table, out / f"{table.name}.png")
+        table.write_png(out)
         click.echo(f"\n{table.text()}")
-    write_calibration(found, tables, out / "calibration.json")
-    calibration_figures.write_figure5(found, out / "figure5.png")
+    calibration_results.write_calibration(found, tables, out / "calibration.json")
+    calibration_results.write_figure5(found, out / "figure5.png")
     if generations:
-        calibration_figures.write_search(found, out / "search.png")
+        calibration_results.write_search(found, out / "search.png")
     else:
-        calibration_figures.write_figure4(found, out / "figure4.png")
-    click.echo(f"\n{summary_of(found)}\nWrote tables, figures and calibration.json to {out}")
+        calibration_results.write_figure4(found, out / "figure4.png")
+    click.echo(
+        f"\n{calibration_results.summary_of(found)}\nWrote tables, figures and calibration.json to {out}"
+    )

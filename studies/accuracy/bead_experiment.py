@@ -61,9 +61,8 @@ class BeadExperiment:
     def run(self, setup: Setup) -> BeadRun:
         """Press the organ from its stress-free shape.
 
-        It settles for 120 steps (warm-up) with the probe away: at stage 0 the probe would touch an organ that has not
-        yet sunk into its support. Each stage takes 90 steps: in the first 60 the probe moves at constant speed to its
-        pose, in the others it rests. The same setup gives the same beads, whatever was run before.
+        It settles with the probe away: at stage 0 the probe would touch an organ that has not yet sunk into its support.
+        In each stage the probe moves at constant speed to its pose and rests. The same setup gives the same beads.
         """
         step = self.prepare(setup)
         pose = self._away()

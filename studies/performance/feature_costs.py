@@ -150,33 +150,25 @@ class FeatureBody:
     def solver(self, options: Options, serial: bool | None = None) -> Solver:
         """A solver with some features."""
         tool = ConvexTool.cuboid(self.size_mm) if options.transducer else None
-        shapes: list = []
-        if options.support:
-            shapes = [SignedDistanceField(*grid, np.full(3, GRID_MM)) for grid in self.supports]
+        supports = self.supports if options.support else []
+        shapes: list = [SignedDistanceField(*grid, np.full(3, GRID_MM)) for grid in supports]
         contact = Contact(
             shape_friction=options.shape_friction,
             particles=options.particles,
             particle_friction=options.particle_friction,
         )
         section = SolverSection(mass_scaling_per_mm=options.mass_scaling_per_mm)
-        return build_solver(
-            self.filled,
-            self.tissue,
-            [*shapes, tool] if tool else shapes,
-            tool,
-            contact,
-            section,
-            serial=serial,
-        )
+        if tool:
+            shapes.append(tool)
+        return build_solver(self.filled, self.tissue, shapes, tool, contact, section, serial=serial)
 
     def poses(self, solver: Solver, step: int) -> np.ndarray | None:
         """Poses of the transducer in a step of the press; None without a transducer."""
         if not solver.has_tool:
             return None
         depth = PRESS_MM * np.clip((step + np.array([0, 1]) - SETTLE_STEPS) / PRESS_STEPS, 0, 1)
-        return poses_between(
-            advanced(self.home, depth[0]), advanced(self.home, depth[1]), self.settings.substeps
-        )
+        first, last = (advanced(self.home, mm) for mm in depth)
+        return poses_between(first, last, self.settings.substeps)
 
 
 def of_steps(
@@ -235,13 +227,8 @@ def of_frame(scene: Scene, anatomy: LoadedAnatomy, arch: str) -> Iterator[dict[s
     """The other parts of a frame, each by itself: divergence check, surfaces and image."""
     start(arch)
     rehearsal = Rehearsal(scene, anatomy)
-    dt = rehearsal.settings.time_step_s
-    yield _alone(
-        "divergence check",
-        lambda: rehearsal.divergence_check.check(dt),
-        [rehearsal.divergence_check],
-        rehearsal.solver,
-    )
+    check, dt = rehearsal.divergence_check, rehearsal.settings.time_step_s
+    yield _alone("divergence check", lambda: check.check(dt), [check], rehearsal.solver)
     yield _alone("organ's surface", rehearsal.organ_skin.update, [rehearsal.organ_skin], rehearsal.model)
     if (tumour := rehearsal.tumour_skin) is not None:
         yield _alone("tumour's surface", tumour.update, [tumour], rehearsal.model)
@@ -255,16 +242,17 @@ def _images(rehearsal: Rehearsal, scanned: ScannedAnatomy) -> Iterator[dict[str,
     """The image at each detail level, each with all that it needs."""
     image, probe = rehearsal.scene.image, rehearsal.probe
     plane = image_plane(rehearsal.pose_at_depth(1.0), probe.housing_mm[2], *probe.extent_mm)
-    levels: tuple[tuple[str, float, str, Mode, DetailLevel], ...] = (
-        ("CT, organ alone", 0.0, "gel", "ct", "speckle"),
-        ("CT", SURROUNDINGS_MM, "background", "ct", "speckle"),
-        ("B-mode: reflection, attenuation", SURROUNDINGS_MM, "background", "b-mode", "reflection"),
-        ("B-mode: and speckle", SURROUNDINGS_MM, "background", "b-mode", "speckle"),
-        ("B-mode: and elevation", SURROUNDINGS_MM, "background", "b-mode", "elevation"),
-        ("B-mode and CT", SURROUNDINGS_MM, "background", "both", "speckle"),
+    levels: tuple[tuple[str, str, Mode, DetailLevel], ...] = (
+        ("CT, organ alone", "gel", "ct", "speckle"),
+        ("CT", "background", "ct", "speckle"),
+        ("B-mode: reflection, attenuation", "background", "b-mode", "reflection"),
+        ("B-mode: and speckle", "background", "b-mode", "speckle"),
+        ("B-mode: and elevation", "background", "b-mode", "elevation"),
+        ("B-mode and CT", "background", "both", "speckle"),
     )
-    for name, margin, outside, mode, detail_level in levels:
-        cell = embedding_cell_mm(rehearsal.scene.tissue)
+    cell = embedding_cell_mm(rehearsal.scene.tissue)
+    for name, outside, mode, detail_level in levels:
+        margin = SURROUNDINGS_MM if outside == "background" else 0.0
         embedding = Embedding(rehearsal.model, rehearsal.organ, cell, margin)
         scanner = Scanner(scanned, embedding, probe, image.pixels, outside)
 

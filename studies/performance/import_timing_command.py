@@ -8,7 +8,6 @@ from pathlib import Path
 
 import click
 import psutil
-from tqdm import tqdm
 
 from rehearsal.commands.command_line import WholeRange, make_folder
 from studies.performance.synthetic_trunk import write_whole_body
@@ -38,9 +37,7 @@ def intake(out: Path, slices: int, runs: int) -> None:
     """
     make_folder(out)
     with tempfile.TemporaryDirectory() as temporary:
-        body = write_whole_body(
-            Path(temporary), slices, lambda planes: tqdm(planes, desc="writing", unit="slice")
-        )
+        body = write_whole_body(Path(temporary), slices)
         found = [_run(body, Path(temporary) / f"patient-{n}") for n in range(runs)]
     figures = dict(slices=slices, seconds=[s for s, _ in found], peak_gb=[g for _, g in found])
     lines = [

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
 import SimpleITK as sitk
 from pydicom.dataset import FileDataset, FileMetaDataset
 from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
+from tqdm import tqdm
 
 from scenes.phantom.kidney import make_phantom
 from scenes.volumes.lazy_volume import AIR_HU
@@ -21,9 +21,7 @@ BODY_HU, NOISE_HU = 40, 12.0
 SEED = 20160101
 
 
-def write_whole_body(
-    folder: Path, slices: int, progress: Callable[[Iterable[int]], Iterable[int]] = iter
-) -> Path:
+def write_whole_body(folder: Path, slices: int) -> Path:
     """Write folder/ct, a DICOM series of 512 x 512 pixels, and folder/labels.nii.gz on the same grid; return the folder."""
     ct, labels = make_phantom()
     centre = np.array(ct.TransformContinuousIndexToPhysicalPoint([n / 2 for n in ct.GetSize()]))
@@ -33,7 +31,7 @@ def write_whole_body(
     noise = np.random.default_rng(SEED).normal(0, NOISE_HU, (PIXELS, PIXELS))
     series, frame = generate_uid(), generate_uid()
     marked = np.zeros((slices, PIXELS, PIXELS), np.uint8)
-    for k in progress(range(slices)):
+    for k in tqdm(range(slices), desc="writing", unit="slice"):
         place = origin + (0, 0, k * GAP_MM)
         marked[k] = _plane(labels, place, sitk.sitkNearestNeighbor, 0)
         pixels = _body(place, centre[1]) + np.roll(noise, 17 * k)

@@ -120,33 +120,43 @@ def points(
     arriving: dict[Setup, dict[str, float]] = {setup: {} for setup in tried}
     ms: dict[Setup, list[float]] = {setup: [] for setup in tried}
     for case in cases:
-        for experiment, setups in _built(case, tried, arch):
-            for setup in setups:
-                run = experiment.run(setup)
-                if rounds == 0 and case is cases[0]:
-                    ms[setup].append(float(np.median(run.step_ms)))
-                resting[setup][case.name] = _mean_error(case, run.beads, run.finite)
-                arriving[setup][case.name] = _mean_error(case, run.arriving, run.finite)
-                done()
+        for experiment, setup in _built(case, tried, arch):
+            run = experiment.run(setup)
+            if rounds == 0 and case is cases[0]:
+                ms[setup].append(float(np.median(run.step_ms)))
+            resting[setup][case.name] = _mean_error(case, run.beads, run.finite)
+            arriving[setup][case.name] = _mean_error(case, run.arriving, run.finite)
+            done()
     for _ in range(rounds):
-        for experiment, setups in _built(cases[0], tried, arch):
-            for setup in setups:
-                ms[setup].append(_time(experiment, setup))
-                done()
+        for experiment, setup in _built(cases[0], tried, arch):
+            ms[setup].append(_time(experiment, setup))
+            done()
     time_ms = np.array([np.median(ms[setup]) for setup in tried])
     error = np.array([np.mean([*resting[setup].values(), *arriving[setup].values()]) for setup in tried])
-    best = pareto(time_ms, error)
+    figures = zip(tried, time_ms, error, pareto(time_ms, error), strict=True)
     return [
-        _row(setup, time_ms[k], best[k], resting[setup], arriving[setup]) for k, setup in enumerate(tried)
+        dict(
+            model=setup.model,
+            **{name: getattr(setup, name, getattr(setup.tissue, name, None)) for name in SETTINGS},
+            time_step_s=setup.solver.time_step_s,
+            ms_median=round(float(median), 4),
+            error_mean_mm=rounded(mean),
+            error_resting_mm=rounded(float(np.mean(list(resting[setup].values())))),
+            error_arriving_mm=rounded(float(np.mean(list(arriving[setup].values())))),
+            errors_mm={name: rounded(value) for name, value in resting[setup].items()},
+            pareto=bool(best),
+        )
+        for setup, median, mean, best in figures
     ]
 
 
-def _built(case: BeadCase, tried: list[Setup], arch: str) -> Iterator[tuple[BeadExperiment, list[Setup]]]:
-    """Each model and size on a freshly started device, with the settings that share it."""
+def _built(case: BeadCase, tried: list[Setup], arch: str) -> Iterator[tuple[BeadExperiment, Setup]]:
+    """Each setting with the experiment for it, built anew on a freshly started device for each model and size."""
     for _, sharing in groupby(tried, key=lambda setup: (setup.model, setup.size_mm)):
-        group = list(sharing)
+        first, *others = sharing
         start(arch)
-        yield BeadExperiment(case, group[0]), group
+        experiment = BeadExperiment(case, first)
+        yield from ((experiment, setup) for setup in (first, *others))
 
 
 def _mean_error(case: BeadCase, beads: np.ndarray, finite: bool) -> float:
@@ -164,23 +174,6 @@ def _time(experiment: BeadExperiment, setup: Setup) -> float:
         poses = poses_between(path[n], path[n + 1], step.substeps)
         timed(lambda: experiment.solver.step(step, poses), ms)
     return float(np.median(ms))
-
-
-def _row(
-    setup: Setup, ms: float, best: bool, resting: dict[str, float], arriving: dict[str, float]
-) -> dict[str, Any]:
-    settings = {name: getattr(setup, name, getattr(setup.tissue, name, None)) for name in SETTINGS}
-    return dict(
-        model=setup.model,
-        **settings,
-        time_step_s=setup.solver.time_step_s,
-        ms_median=round(float(ms), 4),
-        error_mean_mm=rounded(float(np.mean([*resting.values(), *arriving.values()]))),
-        error_resting_mm=rounded(float(np.mean(list(resting.values())))),
-        error_arriving_mm=rounded(float(np.mean(list(arriving.values())))),
-        errors_mm={name: rounded(value) for name, value in resting.items()},
-        pareto=bool(best),
-    )
 
 
 def _size(point: dict[str, Any]) -> float:

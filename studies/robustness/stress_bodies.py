@@ -117,13 +117,8 @@ def _kidney(model: str) -> Specimen:
     away = advanced(rehearsal.manipulator.home, -AWAY_MM)
     for _ in range(SETTLE_STEPS):
         rehearsal.advance(away)
-    return Specimen(
-        rehearsal.solver,
-        rehearsal.organ_skin,
-        rehearsal.organ,
-        rehearsal.settings,
-        rehearsal.manipulator.home,
-    )
+    home, skin = rehearsal.manipulator.home, rehearsal.organ_skin
+    return Specimen(rehearsal.solver, skin, rehearsal.organ, rehearsal.settings, home)
 
 
 def _mesh(model: str, subject: Subject) -> trimesh.Trimesh:

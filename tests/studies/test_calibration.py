@@ -32,7 +32,7 @@ from studies.accuracy.calibration import (
     split_of,
     stiffness_grid,
 )
-from studies.accuracy.calibration_figures import best_so_far
+from studies.accuracy.calibration_results import best_so_far
 from studies.accuracy.case_workers import Measured, WorkerError, dask_workers, local_workers
 
 BEST = {3.0: 0.62, 4.0: 0.33}
