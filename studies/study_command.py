@@ -26,7 +26,7 @@ STUDIES = {
     ),
     "replay": ("studies.robustness.replay_study:replay", "Record a session in SCENE and compute it again."),
     "plan": (
-        "studies.planning.plan_study_command:plan_study",
+        "studies.planning.plan_comparison:plan_study",
         "Compare planned sweeps with straight and random ones.",
     ),
 }

@@ -30,7 +30,7 @@ from rehearsal.planning.trial_workers import (
 from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.scene import Scene, Trocar
 from studies.planning import plan_comparison
-from studies.planning.plan_study_command import table
+from studies.planning.plan_comparison import table
 from ultrasound.probe import load_probe
 
 BEST = dict(a_mm=-3.0, b_mm=7.0, c_deg=20.0)
