@@ -21,7 +21,7 @@ STUDIES = {
     "soak": ("studies.robustness.soak_test:soak", "Rehearse for an hour in SCENE, faster than real time."),
     "import": ("studies.performance.import_timing_command:intake", "Measure an import: seconds and memory."),
     "freehand": (
-        "studies.freehand.freehand_command:freehand",
+        "studies.freehand.freehand_accuracy:freehand",
         "Compare volumes of tracked sweeps with the ground truth.",
     ),
     "replay": ("studies.robustness.replay_study:replay", "Record a session in SCENE and compute it again."),

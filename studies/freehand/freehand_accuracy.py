@@ -1,21 +1,34 @@
-"""Accuracy of volumes reconstructed from tracked sweeps: at rest, with a tracker's errors, and under compression."""
+"""The command ``study freehand``: accuracy of volumes reconstructed from tracked sweeps, its table and its figure.
 
+At rest, with a tracker's errors, and under compression.
+"""
+
+import math
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import trimesh
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from tqdm import tqdm
 
-from rehearsal.configuration import Setup, scene_of
+from rehearsal.commands.command_line import CommandError, arch_option, load_patient, make_folder, start_taichi
+from rehearsal.configuration import PRESETS, Setup, scene_of
 from rehearsal.reconstruction.compression_correction import CompressionCorrection
 from rehearsal.reconstruction.patient_comparison import compare_with_surfaces, surfaces_of
 from rehearsal.reconstruction.sweep_volumes import Places, image_poses_of, reconstruct_volumes
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy
-from scenes.scene import Scene, with_options
+from scenes.scene import EMBEDDED, Scene, with_options
 from sim.device import start
 from studies.freehand.freehand_sweeps import GroundTruthSweep, pressed, resting, sweep_of
+from studies.study_options import out_option
+from studies.study_results import finish_axes, text_table, write_results
 from ultrasound.probe import load_probe
 from ultrasound.reconstruction import METHODS
 from ultrasound.tracking_errors import TrackingErrors, with_tracking_errors
@@ -37,6 +50,61 @@ VARIED: dict[str, tuple[float, ...]] = {
     "latency_s": (0.05, 0.1, 0.2, 0.4),
     "lost": (0.1, 0.25, 0.5, 0.75),
 }
+HEADERS = (
+    "sweep",
+    "region",
+    "scanned, %",
+    "Dice",
+    "HD95, mm",
+    "volume, %",
+    "centroid, mm",
+    "landmarks, mm",
+)
+FORMATS = ("", "", ".0f", ".3f", ".2f", "+.1f", ".2f", ".2f")
+TRACKING_ERRORS = {
+    "noise_mm": "noise of the position, mm",
+    "noise_deg": "noise of the angle, degrees",
+    "calibration_mm": "translation error of the calibration, mm",
+    "calibration_deg": "rotation error of the calibration, degrees",
+    "latency_s": "latency, s (at 10 mm/s)",
+    "lost": "share of images without a pose",
+}
+COMPRESSION_ERRORS = {
+    "centroid_mm": "error of the tumour's centroid, mm",
+    "dice": "tumour's Dice",
+    "landmarks": "error of landmarks, mm",
+}
+CORRECTED = "^:"
+
+
+@click.command()
+@click.argument("scenes", type=click.Path(path_type=Path), nargs=-1)
+@out_option
+@click.option("--quick", is_flag=True, help="One size of each error and two depths.")
+@arch_option
+def freehand(scenes: tuple[Path, ...], out: Path, quick: bool, arch: str) -> None:
+    """Compare volumes of tracked sweeps with the ground truth.
+
+    Of SCENES [the embedded patient]: at rest, with a tracker's errors, pressed.
+    """
+    make_folder(out)
+    loaded = []
+    for scene in scenes or (EMBEDDED,):
+        one, anatomy = load_patient(scene)
+        if anatomy.ct is None:
+            raise CommandError(f"{scene}: has no CT: expected anatomy.ct, which a sweep shows")
+        loaded.append((one, anatomy))
+    used = start_taichi(arch)
+    setup = PRESETS["neo-hookean"]["balanced"]
+    runs = []
+    total = sum(count_of(anatomy, quick) for _, anatomy in loaded)
+    with tqdm(total=total, desc="freehand", unit="volume") as bar:
+        for number, (one, anatomy) in enumerate(loaded, 1):
+            figures = measure(one, anatomy, setup, used, quick, bar.update)
+            runs.append(dict(patient=one.title or f"patient {number}") | figures)
+    rows = [row for run in runs for row in rows_of(run)]
+    text = "\n\n".join(map(table, runs))
+    write_results(out, "freehand", dict(arch=used, runs=runs), text, rows, figure_of(runs))
 
 
 def measure(
@@ -140,3 +208,102 @@ def _row(
         sweep, track, truth.mask, SPACING_MM, method, REACH_MM, sweep, places=places, with_grey=False
     )
     return compare_with_surfaces(rebuilt, surfaces, truth.beads_mm)
+
+
+def rows_of(run: dict[str, Any]) -> list[dict[str, Any]]:
+    """A row a volume and region, of the part of it that was scanned."""
+    rows = []
+    for kind in ("resting", "noise", "compression"):
+        for row in run[kind]:
+            settings = {name: value for name, value in row.items() if not isinstance(value, dict)}
+            for region in ("organ", "tumour"):
+                part = row.get(region, {}).get("scanned_part")
+                if not part:
+                    continue
+                place = dict(
+                    patient=run["patient"], sweep=kind, region=region, scanned=row[region]["scanned"]
+                )
+                rows.append(place | part | dict(landmarks_mm=row["landmarks"]["mean_mm"]) | settings)
+    return rows
+
+
+def table(run: dict[str, Any]) -> str:
+    """The figures of one patient."""
+    head = (
+        f"{run['patient']}: {run['probe']} probe, {run['frames']} images {run['apart_mm']:.2f} mm apart, "
+        f"voxels of {run['spacing_mm']:g} mm"
+    )
+    names = ("dice", "hd95_mm", "volume_percent", "centroid_mm", "landmarks_mm")
+    rows = [
+        [_named(row), row["region"], 100 * row["scanned"], *(row[name] for name in names)]
+        for row in rows_of(run)
+    ]
+    return f"{head}\n{text_table(HEADERS, rows, FORMATS)}"
+
+
+def _named(row: dict[str, Any]) -> str:
+    if row["sweep"] == "resting":
+        return f"at rest, {row['method']}"
+    if row["sweep"] == "compression":
+        corrected = ", corrected" if row["undone"] else ""
+        return f"pressed {row['depth_mm']:g} mm, compressed {row['compression_mm']:.1f}{corrected}"
+    errors = [f"{name} {row[name]:g}" for name in TRACKING_ERRORS if row[name]]
+    return ", ".join(errors) or "every third image, no error"
+
+
+def figure_of(runs: list[dict[str, Any]]) -> Figure:
+    """Error against tracking errors and against compression; a colour is a patient, a line style a quantity."""
+    figure = Figure(figsize=(13, 9.5), layout="constrained")
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(2, 1.1))[:, 0]
+    panels = above.subplots(2, 3).ravel()
+    for axes, (name, label) in zip(panels, TRACKING_ERRORS.items(), strict=True):
+        _against_noise(axes, runs, name, label)
+    above.suptitle("At rest, by a tracker's errors: error of the volume")
+    _legend(panels[0], {"landmarks": "o-", "tumour's centroid": "s--"})
+    panels = below.subplots(1, 3)
+    for axes, name in zip(panels, COMPRESSION_ERRORS, strict=True):
+        _against_compression(axes, runs, name)
+    below.suptitle("Pressed over the tumour: the part of it that was scanned")
+    _legend(panels[0], {"uncorrected": "o-", "compression corrected": CORRECTED})
+    colours = [Line2D([], [], color=f"C{n}", linewidth=3, label=run["patient"]) for n, run in enumerate(runs)]
+    figure.legend(handles=colours, loc="outside lower center", ncols=3)
+    return figure
+
+
+def _legend(axes: Axes, styles: dict[str, str]) -> None:
+    """The line styles of all panels in a row."""
+    handles = [axes.plot([], [], style, color="0.3", label=name)[0] for name, style in styles.items()]
+    axes.legend(handles=handles, loc="upper left", fontsize=9)
+
+
+def _against_noise(axes: Axes, runs: list[dict[str, Any]], name: str, label: str) -> None:
+    """Landmark error of the resting sweep, and the distance of the tumour's centroid."""
+    for number, run in enumerate(runs):
+        rows = [row for row in run["noise"] if row[name] or not any(row[other] for other in TRACKING_ERRORS)]
+        at = [row[name] for row in rows]
+        colour = f"C{number}"
+        axes.plot(at, [row["landmarks"]["mean_mm"] for row in rows], "o-", color=colour)
+        if "tumour" in rows[0]:
+            tumour = [(row["tumour"]["scanned_part"] or {}).get("centroid_mm", math.nan) for row in rows]
+            axes.plot(at, tumour, "s--", color=colour)
+    _finish(axes, label, "mm")
+
+
+def _against_compression(axes: Axes, runs: list[dict[str, Any]], name: str) -> None:
+    for number, run in enumerate(runs):
+        for undone, style in ((False, "o-"), (True, CORRECTED)):
+            depths, values = [], []
+            for row in run["compression"]:
+                tumour = row.get("tumour", {}).get("scanned_part")
+                # A press may move the tumour out of the images.
+                if row["undone"] == undone and tumour and row["landmarks"]["count"]:
+                    depths.append(row["depth_mm"])
+                    values.append(row["landmarks"]["mean_mm"] if name == "landmarks" else tumour[name])
+            axes.plot(depths, values, style, color=f"C{number}")
+    _finish(axes, "depth of the press, mm", COMPRESSION_ERRORS[name])
+
+
+def _finish(axes: Axes, x_label: str, y_label: str) -> None:
+    finish_axes(axes, xlabel=x_label, ylabel=y_label)
+    # A value near zero stays visible above the frame.
+    axes.set_ylim(bottom=-0.04 * axes.get_ylim()[1])

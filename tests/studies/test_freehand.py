@@ -26,7 +26,7 @@ from rehearsal.result_files import write_csv
 from scenes.anatomy import Grid, LoadedAnatomy
 from scenes.scene import PlaneShape, Scene, with_options
 from studies.freehand import freehand_accuracy, freehand_sweeps
-from studies.freehand.freehand_command import figure_of, rows_of, table
+from studies.freehand.freehand_accuracy import figure_of, rows_of, table
 from studies.freehand.freehand_sweeps import sweep_of
 from ultrasound.reconstruction import VoxelBox
 from ultrasound.sweep import PixelLabel, Sweep, SweepError
