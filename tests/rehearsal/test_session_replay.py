@@ -210,7 +210,7 @@ def test_a_tracked_file_is_followed_headless_and_replayed(built, monkeypatch, tm
     (tmp_path / "bare").mkdir()
     run.RehearsalRun(rehearsal, anatomy, "cpu", tmp_path / "bare").headless(log, 0.0, None, 0.0, draws=False)
     told = capsys.readouterr().out
-    assert "identical in all 1 states" in told and "no pictures" in told and "a picture" not in told
+    assert "identical in all 1 states" in told and "no images" in told and "per image" not in told
     assert sorted(path.name for path in (tmp_path / "bare").iterdir()) == FILES
 
 
