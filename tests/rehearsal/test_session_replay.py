@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import taichi as ti
+from null_viewer import NullViewer
 
 from rehearsal import headless, run
 from rehearsal.build_solver import step_settings
@@ -22,7 +23,7 @@ from rehearsal.sessions.packed_coverage import pack_seen
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session_file import Log, SessionError, read_log
 from rehearsal.tracking.pose_file import TimedPoses
-from render.viewer import Controls, NullViewer, Settings, View
+from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
 from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.phantom.embedded_patient import phantom_folder
