@@ -1,4 +1,4 @@
-"""The interface of a front end: geometry, views, settings, controls; and a front end that draws nothing.
+"""The interface of a front end: geometry, views, settings, controls.
 
 Lengths are in mm, angles in degrees, patient coordinates LPS. Nothing here needs a screen, Vulkan or Taichi.
 """
@@ -77,7 +77,7 @@ KEY_MAP_ENTRIES = tuple(line for group in KEY_MAP.values() for line in group)
 
 
 def key_table() -> str:
-    """Return the key map as a Markdown table, for the README."""
+    """Return the key map as a Markdown table, for docs/keys.md."""
     rows = ["| Key | What it does |", "| --- | --- |"]
     for group, lines in KEY_MAP.items():
         rows += [f"| **{group}** | |", *(f"| {' / '.join(line.keys)} | {line.text} |" for line in lines)]
@@ -312,33 +312,3 @@ class Viewer(Protocol):
         ...
 
     def close(self) -> None: ...
-
-
-class NullViewer:
-    """Draws nothing: for tests. It runs until `close`; `script` gives the controls, frame by frame."""
-
-    def __init__(self, settings: Settings | None = None, script=(), size: tuple[int, int] = (1280, 720)):
-        self.settings = settings or Settings()
-        self.frames = 0
-        self._script = iter(script)
-        self._size = size
-        self._running = True
-
-    @property
-    def running(self) -> bool:
-        return self._running
-
-    def read_controls(self) -> Controls:
-        controls = next(self._script, None) or Controls(settings=self.settings)
-        self._running = self._running and not controls.quit
-        return controls
-
-    def draw(self, view: View) -> None:
-        self.frames += 1
-
-    def picture(self) -> np.ndarray:
-        width, height = self._size
-        return np.zeros((height, width, 3), dtype=np.uint8)
-
-    def close(self) -> None:
-        self._running = False

@@ -1,6 +1,7 @@
 """The layers of the program: which folder may import which, and no module in a circle."""
 
 import ast
+from collections import Counter
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from itertools import pairwise
@@ -184,3 +185,16 @@ def test_a_name_with_an_underscore_stays_in_its_module():
         and ast.unparse(node.value) not in ("self", "cls")
     ]
     assert not wrong, f"private to another module:{listed(wrong)}"
+
+
+def test_no_two_public_classes_and_no_two_files_share_a_name():
+    classes = [
+        (node.name, file)
+        for _, file, node in nodes()
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+    ]
+    named = [(path.name, str(path)) for path in modules().values() if path.name != "__init__.py"]
+    for names in (classes, named):
+        counted = Counter(name for name, _ in names)
+        wrong = [f"{name}: {place}" for name, place in names if counted[name] > 1]
+        assert not wrong, f"one name for two things:{listed(wrong)}"

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import ROOT
+from null_viewer import NullViewer
 
 from render import transducer_shape, ultrasound_panel, window_frame
 from render.camera import OrbitCamera
 from render.cut_face import FLESH
 from render.display import display_available, fitted, window_size
 from render.ultrasound_panel import Panel
-from render.viewer import Controls, Geometry, NullViewer, Settings, View
+from render.viewer import Controls, Geometry, Settings, View
 from render.window_layout import FULL_SIZE, RULER_WIDTH, WindowLayout
 from sim.fields import fill
 

@@ -1,0 +1,35 @@
+"""A viewer that draws nothing."""
+
+import numpy as np
+
+from render.viewer import Controls, Settings, View
+
+
+class NullViewer:
+    """Draws nothing: for tests. It runs until `close`; `script` gives the controls, frame by frame."""
+
+    def __init__(self, settings: Settings | None = None, script=(), size: tuple[int, int] = (1280, 720)):
+        self.settings = settings or Settings()
+        self.frames = 0
+        self._script = iter(script)
+        self._size = size
+        self._running = True
+
+    @property
+    def running(self) -> bool:
+        return self._running
+
+    def read_controls(self) -> Controls:
+        controls = next(self._script, None) or Controls(settings=self.settings)
+        self._running = self._running and not controls.quit
+        return controls
+
+    def draw(self, view: View) -> None:
+        self.frames += 1
+
+    def picture(self) -> np.ndarray:
+        width, height = self._size
+        return np.zeros((height, width, 3), dtype=np.uint8)
+
+    def close(self) -> None:
+        self._running = False
