@@ -1,6 +1,7 @@
 """Shared by the commands: errors, types of options, scenes, output folders, the start of Taichi."""
 
 import math
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -13,6 +14,7 @@ from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.atomic_files import check_writable
 from scenes.scene import Scene, load_scene, scene_file
 from scenes.tissue import QUALITIES
+from ultrasound.probe import DETAIL_LEVELS, MODES
 
 # Exit status after Ctrl-C.
 STOPPED = 130
@@ -137,3 +139,21 @@ quality_option = click.option(
     type=click.Choice(QUALITIES),
     help="Resolution and iterations of a preset of the tissue model [the scene's].",
 )
+
+
+def image_options(command: Callable) -> Callable:
+    """Add --probe, --picture and --detail-level to a command."""
+    options = (
+        click.option("--probe", help="Probe, by its name or as a file [the scene's]."),
+        click.option("--picture", type=click.Choice(MODES), help="B-mode, CT or both [the scene's]."),
+        click.option(
+            "--detail-level",
+            "--rung",
+            "detail_level",
+            type=click.Choice(DETAIL_LEVELS),
+            help="Detail level (realism) of the B-mode image [the scene's].",
+        ),
+    )
+    for option in reversed(options):
+        command = option(command)
+    return command

@@ -12,6 +12,7 @@ from rehearsal.commands.command_line import (
     Number,
     NumberRange,
     arch_option,
+    image_options,
     make_folder,
     quality_option,
     start_taichi,
@@ -36,7 +37,7 @@ from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.scene import EMBEDDED, OPTIONS, Scene, load_scene, scene_file, with_options
 from scenes.terminal import ReportProgress, Stages
 from scenes.tissue import TISSUES
-from ultrasound.probe import DETAIL_LEVELS, MODES, Probe
+from ultrasound.probe import Probe
 
 if TYPE_CHECKING:
     from rehearsal.rehearsal import Rehearsal
@@ -99,15 +100,7 @@ if TYPE_CHECKING:
 @click.option("--substeps", type=int, help="Substeps of a time step [the model's].")
 @click.option("--iterations", type=int, help="Iterations of the solver in a substep [the model's].")
 @quality_option
-@click.option("--probe", help="Probe, by its name or as a file [the scene's].")
-@click.option("--picture", type=click.Choice(MODES), help="B-mode, CT or both [the scene's].")
-@click.option(
-    "--detail-level",
-    "--rung",
-    "detail_level",
-    type=click.Choice(DETAIL_LEVELS),
-    help="Detail level (realism) of the B-mode image [the scene's].",
-)
+@image_options
 @click.option(
     "--budget-ms",
     type=NumberRange(0.01, 10_000),

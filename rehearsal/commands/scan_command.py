@@ -10,14 +10,20 @@ import numpy as np
 import trimesh
 from tqdm import tqdm
 
-from rehearsal.commands.command_line import CommandError, arch_option, make_folder, start_taichi
+from rehearsal.commands.command_line import (
+    CommandError,
+    arch_option,
+    image_options,
+    make_folder,
+    start_taichi,
+)
 from rehearsal.configuration import probe_of
 from rehearsal.result_files import write_json
 from rehearsal.tracking.pose_file import load_poses
 from scenes.anatomy import load_anatomy
 from scenes.scene import load_scene, scene_file, with_options
 from sim.signed_distance import signed_distance
-from ultrasound.probe import DETAIL_LEVELS, MODES, Probe
+from ultrasound.probe import Probe
 from version import VERSION
 
 if TYPE_CHECKING:
@@ -36,15 +42,7 @@ DEEP_MM = 20.0
 @click.option(
     "--out", type=click.Path(path_type=Path), required=True, help="Folder for the images and scan.json."
 )
-@click.option("--probe", help="Probe, by its name or as a file [the scene's].")
-@click.option("--picture", type=click.Choice(MODES), help="B-mode, CT or both [the scene's].")
-@click.option(
-    "--detail-level",
-    "--rung",
-    "detail_level",
-    type=click.Choice(DETAIL_LEVELS),
-    help="Realism of the B-mode image [the scene's].",
-)
+@image_options
 @click.option(
     "--contact",
     type=click.Choice(["tissue", "organ"]),

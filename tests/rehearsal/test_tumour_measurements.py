@@ -1,4 +1,4 @@
-"""The figures measure off a rehearsal: a ball in a ball, and outlines whose place in the picture is known by hand."""
+"""The measurements of a rehearsal: a ball in a ball, and outlines whose place in the picture is known by hand."""
 
 from types import SimpleNamespace
 
@@ -30,7 +30,7 @@ def posed(face=(0.0, 0.0, 40.0), probe=LINEAR) -> np.ndarray:
 def rehearsed(
     organ=None, tumour=None, shift=(0, 0, 0), now=None, pose=None, probe=LINEAR, outline=NOWHERE
 ) -> SimpleNamespace:
-    """What is measure of a rehearsal: an organ that lies as it was, or as ``now``, and a tumour that has shifted."""
+    """The part of a rehearsal that is measured: an organ at rest, or deformed as ``now``, and a tumour that has shifted."""
     organ = organ or ball(30.0)
     lies = np.asarray(organ.vertices if now is None else now, np.float32)
     return SimpleNamespace(
