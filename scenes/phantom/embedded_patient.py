@@ -20,23 +20,13 @@ if TYPE_CHECKING:
 SCENES = Path(__file__).parents[1]
 CACHE = SCENES.parent / ".cache"
 # When one of these changes, the embedded patient is made again.
-PHANTOM_SOURCES = (
-    "phantom/embedded_patient.py",
-    "phantom/kidney.py",
-    "phantom/abdomen.py",
-    "patients/label_surfaces.py",
-    "patients/moulded_support.py",
-    "patients/organ_selection.py",
-    "patients/part_surfaces.py",
-    "patients/patient_import.py",
-    "patients/patient_scene.py",
-    "patients/readers/label_maps.py",
-)
+SOURCES = ("phantom/*", "patients/*.py", "patients/readers/label_maps.py")
 
 
 def phantom_folder(progress: ReportProgress = no_progress) -> Path:
     """The embedded patient's folder, from the cache where it is there. Raises SceneError where it cannot be written."""
-    sources = b"".join((SCENES / name).read_bytes() for name in PHANTOM_SOURCES)
+    files = sorted(path for pattern in SOURCES for path in SCENES.glob(pattern) if path.is_file())
+    sources = b"".join(path.read_bytes() for path in files)
     name = f"phantom-{hashlib.sha256(sources).hexdigest()[:12]}"
     places = [root / name for root in (CACHE, Path(tempfile.gettempdir()) / "nephron")]
     cached = next((folder for folder in places if folder.is_dir()), None)
@@ -47,14 +37,14 @@ def make_embedded_patient(progress: ReportProgress = no_progress) -> "Patient":
     """Draw CT and labels, and import them. All labels but the tumour are the organ."""
     from scenes.patients.patient_import import import_patient
     from scenes.patients.readers.label_maps import LabelMap
-    from scenes.phantom.kidney import TISSUE_OF_LABEL, Label, make_phantom
+    from scenes.phantom.kidney import Label, make_phantom
     from scenes.volumes.lazy_volume import LazyVolume
 
     progress("Making the embedded patient, only once: its CT")
     ct, image = make_phantom()
     progress("Making the embedded patient, only once: its surfaces")
     labels = LabelMap.of(image)
-    segments = {v: replace(segment, tissue=TISSUE_OF_LABEL[v]) for v, segment in labels.segments.items()}
+    segments = {v: replace(segment, tissue=Label(v).name.lower()) for v, segment in labels.segments.items()}
     organ = [value for value in segments if value != Label.TUMOUR]
     return import_patient(LazyVolume.of(ct), replace(labels, segments=segments), organ, side="left")
 

@@ -112,8 +112,8 @@ def test_organ_keeps_clear_of_the_border(labels):
     [
         (Label.CORTEX, 2, 170, 195),
         (Label.MEDULLA, 2, 100, 120),
-        (Label.SINUS_FAT, 2, -115, -80),
-        (Label.COLLECTING_SYSTEM, 2, 0, 20),
+        (Label.SINUS, 2, -115, -80),
+        (Label.URINE, 2, 0, 20),
         (Label.VESSEL, 2, 175, 215),
         (Label.TUMOUR, 1, 70, 90),
     ],
@@ -167,7 +167,7 @@ def test_upper_pole_leans_medially_and_backward(phantom, labels):
 def test_calyces_and_vessels_lie_within_the_kidney_or_a_few_mm_out_of_the_hilum(phantom, labels):
     """All that is labelled beyond cortex and tumour is central; only the medial side may show it."""
     surface = (labels > 0) & ~ndimage.binary_erosion(labels > 0)
-    shown = surface & np.isin(labels, (Label.SINUS_FAT, Label.COLLECTING_SYSTEM, Label.VESSEL))
+    shown = surface & np.isin(labels, (Label.SINUS, Label.URINE, Label.VESSEL))
     assert 20 < shown.sum() < 0.1 * surface.sum()
     assert _positions(shown, phantom[1])[:, 0].max() < _positions(labels > 0, phantom[1])[:, 0].mean()
 
