@@ -130,10 +130,12 @@ def test_it_reports_its_size(free):
     first, count = next(iter(free.solver.model.counts().items()))
     counts = free.solver.model.counts()
     assert (
-        first in ("particles", "nodes") and count == free.solver.body.count and free.tissue.PIECES in counts
+        first in ("particles", "nodes")
+        and count == free.solver.body.count
+        and free.tissue.piece_name in counts
     )
-    assert str(count) in free.tissue.REPORTED.format(**free.tissue.model_dump(), **counts)
-    finer = tissue_of(free.model, **{free.tissue.SIZE: 0.8 * free.tissue.size_mm})
+    assert str(count) in free.tissue.report_line.format(**free.tissue.model_dump(), **counts)
+    finer = tissue_of(free.model, **{free.tissue.size_key: 0.8 * free.tissue.size_mm})
     assert embedding_cell_mm(finer) == pytest.approx(0.8 * embedding_cell_mm(free.tissue))
     # Its distances are known beyond the 24 mm of the ball.
     assert min(static_shape(free.mesh, free.tissue).shape) > 26
