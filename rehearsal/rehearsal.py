@@ -23,7 +23,7 @@ from sim.fields import array_of
 from sim.shapes import Plane, SignedDistanceField
 from sim.skinning import Skin
 from sim.solver import SolverState
-from sim.tissue_model import FixedRegion, MaterialModel
+from sim.tissue_model import FixedRegion
 from ultrasound.image_plane import ImagePlane, plane_section
 from ultrasound.probe import DetailLevel, Mode, Probe
 from ultrasound.probe_manipulator import (
@@ -180,7 +180,7 @@ class Rehearsal:
 
     def set_young(self, young_kpa: float) -> None:
         """Change Young's modulus, if the tissue model has one."""
-        if isinstance(self.model, MaterialModel):
+        if hasattr(self.model, "set_young"):
             self.model.set_young(young_kpa)
 
     def scripted_pose(self, time_s: float) -> np.ndarray:

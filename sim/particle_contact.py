@@ -6,6 +6,7 @@ import taichi.math as tm
 
 from sim.body import ParticleBody
 from sim.fields import array_of, fill
+from sim.friction import sticking_fraction, tangential
 from sim.shapes import FAR, TimeOfImpact
 
 PROJECTION_ITERATIONS = 8
@@ -181,13 +182,9 @@ class ShapeContacts:
         normal_push = push.w + depth
         change = tm.vec3(0.0)
         if normal_push > 0.0:
-            slip = x - self.body.position[i] - self.shapes[s].motion(x)
-            slip -= slip.dot(normal) * normal
+            slip = tangential(x - self.body.position[i] - self.shapes[s].motion(x), normal)
             friction = push.xyz - factor * slip
-            limit = self.friction * normal_push
-            squared = friction.norm_sqr()
-            if squared > limit * limit:
-                friction *= limit / ti.sqrt(squared)
+            friction *= sticking_fraction(friction, self.friction * normal_push)
             change = friction - push.xyz
             self.contact[i, s].push = tm.vec4(friction, normal_push)
         return change
@@ -200,16 +197,7 @@ class ShapeContacts:
         Where shapes overlap, so that each projects a particle into the other, it leaves through a free side of a tool.
         """
         for i in range(self.body.count):
-            if not self.is_clear_of_all(i, self.body.predicted[i]):
-                self.body.predicted[i] = self.projected_out(i, self.body.predicted[i])
-
-    @ti.func
-    def is_clear_of_all(self, i, x):
-        """Whether particle i, at x, touches no shape, as far as a quick test can tell."""
-        result = True
-        for s in ti.static(range(len(self.shapes))):
-            result = result and self.is_clear(s, i, x, self.body.contact_radius[i])
-        return result
+            self.body.predicted[i] = self.projected_out(i, self.body.predicted[i])
 
     @ti.func
     def projected_out(self, i, x):

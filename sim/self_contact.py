@@ -4,6 +4,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.fields import field_of
+from sim.friction import sticking_fraction, tangential
 from sim.shape_matching import ShapeMatching
 
 MOST_NEIGHBOURS = 24
@@ -135,9 +136,8 @@ class SelfContacts:
                     depth = self.distance - gap
                     change += weight * depth * normal
                     if ti.static(self.has_friction):
-                        slip = moved - (self.body.predicted[j] - self.body.position[j])
-                        slip -= slip.dot(normal) * normal
-                        factor = ti.min(1.0, self.friction * depth / ti.max(slip.norm(), 1e-12))
+                        slip = tangential(moved - (self.body.predicted[j] - self.body.position[j]), normal)
+                        factor = sticking_fraction(slip, self.friction * depth)
                         change -= weight * factor * slip
                     contacts += 1
             if contacts > 0:

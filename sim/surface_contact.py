@@ -11,6 +11,7 @@ import taichi.math as tm
 
 from sim.body import Body
 from sim.fields import array_of, fields_of, fill
+from sim.friction import sticking_fraction, tangential
 from sim.lattice import Lattice
 from sim.shapes import FAR, TimeOfImpact
 
@@ -130,15 +131,12 @@ class SurfaceContacts:
 
     @ti.func
     def tangential_slip(self, s: ti.template(), q, depth):
-        """Elastic slip of point q on shape s, limited by friction (return mapping), and the factor of the limit: 1 if it sticks."""
+        """Elastic slip of point q on shape s, limited by friction (return mapping), and the fraction that is left."""
         normal = self.plane[s, q].xyz
         p = self.point[q]
-        slip = self.slip[s, q] + p - self.start[q] - self.shapes[s].motion(p)
-        slip -= slip.dot(normal) * normal
-        most = self.friction * depth / TANGENTIAL_RATIO
-        length = slip.norm()
-        factor = most / ti.max(length, 1e-12)
-        return slip * ti.min(factor, 1.0), ti.min(factor, 1.0)
+        slip = tangential(self.slip[s, q] + p - self.start[q] - self.shapes[s].motion(p), normal)
+        fraction = sticking_fraction(slip, self.friction * depth / TANGENTIAL_RATIO)
+        return slip * fraction, fraction
 
     @ti.func
     def node_force(self, i):
@@ -186,10 +184,8 @@ class SurfaceContacts:
                     if has_force:
                         force += penalty * depth * normal
                         if ti.static(self.has_friction):
-                            slip = self.slip[s, q] + shift - self.point[q]
-                            slip -= slip.dot(normal) * normal
-                            length = ti.max(slip.norm(), 1e-12)
-                            factor = ti.min(self.friction * depth / TANGENTIAL_RATIO / length, 1.0)
+                            slip = tangential(self.slip[s, q] + shift - self.point[q], normal)
+                            factor = sticking_fraction(slip, self.friction * depth / TANGENTIAL_RATIO)
                             force -= penalty * TANGENTIAL_RATIO * factor * slip
                             stiffness += (
                                 penalty

@@ -124,14 +124,9 @@ def _site_on_hull(angle: float, latitude: float) -> np.ndarray:
 PYRAMID_BASES = np.array([_site_on_hull(*site) for site in PYRAMID_SITES])
 
 
-def _papillae() -> np.ndarray:
-    """Tips of the pyramids on the sinus, kidney frame [mm], shape (pyramids, 3)."""
-    direction = PYRAMID_BASES / KIDNEY_HALF_AXES
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return SINUS_CENTRE + SINUS_HALF_AXES * direction
-
-
-PAPILLAE = _papillae()
+_DIRECTIONS = PYRAMID_BASES / KIDNEY_HALF_AXES
+# Tips of the pyramids on the sinus, kidney frame [mm], shape (pyramids, 3).
+PAPILLAE = SINUS_CENTRE + SINUS_HALF_AXES * (_DIRECTIONS / np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True))
 PYRAMID_AXES = (PYRAMID_BASES - PAPILLAE) / np.linalg.norm(PYRAMID_BASES - PAPILLAE, axis=1, keepdims=True)
 
 
