@@ -140,22 +140,11 @@ class DivergenceCheck:
 
     @ti.kernel
     def _examine(self) -> tm.vec3:
-        if ti.static(self.serial):
-            ti.loop_config(serialize=True)
-            for _ in range(1):
-                self.examine()
-        else:
-            self.examine()
-        found = self.faults[None]
-        return tm.vec3(found.x, found.y, self.farthest[None])
-
-    @ti.func
-    def examine(self):
-        """Count faults, and find the distance of the farthest point."""
-        for _ in range(1):
-            self.faults[None] = ti.Vector([0, 0])
-            self.farthest[None] = 0.0
+        """Numbers of points that are not finite and of tangled tetrahedra, and the distance of the farthest point."""
         # Counts and maxima do not depend on the order, so these atomics are deterministic.
+        self.faults[None] = ti.Vector([0, 0])
+        self.farthest[None] = 0.0
+        ti.loop_config(serialize=self.serial)
         for i in range(self.body.count):
             distance = (self.body.position[i] - self.middle).norm()
             if distance < INFINITE_MM:
@@ -163,9 +152,12 @@ class DivergenceCheck:
             else:
                 self.faults[None][0] += 1
         if ti.static(self.has_tetrahedra):
+            ti.loop_config(serialize=self.serial)
             for t in range(self.count):
                 if self.is_tangled(t):
                     self.faults[None][1] += 1
+        found = self.faults[None]
+        return tm.vec3(found.x, found.y, self.farthest[None])
 
     @ti.func
     def is_tangled(self, t):

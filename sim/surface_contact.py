@@ -8,6 +8,7 @@ with elastic tangential slip, limited by the coefficient times the pressure (Wri
 import numpy as np
 import taichi as ti
 import taichi.math as tm
+from scipy.sparse import csr_array
 
 from sim.body import Body
 from sim.fields import array_of, fields_of, fill
@@ -56,8 +57,12 @@ class SurfaceContacts:
         self.start = ti.Vector.field(3, ti.f32, self.count)
         self.near = ti.field(ti.i32, self.count)
         self.node, self.weight = fields_of(nodes, weights, within=1)
+        offsets = np.arange(0, nodes.size + 1, nodes.shape[1])
+        points_of = csr_array(
+            (weights.ravel(), nodes.ravel(), offsets), shape=(len(nodes), body.count)
+        ).T.tocsr()
         self.area, self.node_start, self.node_point, self.node_weight = fields_of(
-            area_mm2, *_by_node(nodes, weights, body.count)
+            area_mm2, points_of.indptr, points_of.indices, points_of.data
         )
         self.plane = ti.Vector.field(4, ti.f32, (len(shapes), self.count))
         self.found = ti.Vector.field(4, ti.f32, (len(shapes), self.count))
@@ -228,10 +233,3 @@ class SurfaceContacts:
                 # A maximum does not depend on the order, so this atomic is deterministic.
                 ti.atomic_max(self.penetration[None], -self.shapes[s].surface(p).w)
         return self.penetration[None]
-
-
-def _by_node(nodes: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nodes (p, 8) of points, transposed: start of each node's points in a list (count + 1,), that list, and their weights."""
-    order = np.argsort(nodes.ravel(), kind="stable")
-    start = np.searchsorted(nodes.ravel()[order], np.arange(count + 1))
-    return start, order // 8, weights.ravel()[order]
