@@ -82,12 +82,11 @@ class DivergenceCheck:
         rest = self.body.rest_points
         corners = tetrahedra_among(rest)
         self.count = len(corners)
-        self.has_tetrahedra = self.count > 0
         self.middle = ti.Vector(rest.mean(axis=0).tolist())
         self.farthest = ti.field(ti.f32, ())
         # Numbers of points that are not finite, and of tangled tetrahedra.
         self.faults = ti.Vector.field(2, ti.i32, ())
-        if self.has_tetrahedra:
+        if self.count > 0:
             edges = rest[corners[:, 1:]] - rest[corners[:, :1]]
             self.per_volume = field_of(1.0 / np.linalg.det(edges))
             self.corner, self.longest = fields_of(corners, TORN * np.linalg.norm(edges, axis=2), within=1)
@@ -151,7 +150,7 @@ class DivergenceCheck:
                 ti.atomic_max(self.farthest[None], distance)
             else:
                 self.faults[None][0] += 1
-        if ti.static(self.has_tetrahedra):
+        if ti.static(self.count > 0):
             ti.loop_config(serialize=self.serial)
             for t in range(self.count):
                 if self.is_tangled(t):

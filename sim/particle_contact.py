@@ -36,12 +36,11 @@ class ShapeContacts:
         self.shapes = list(shapes)
         self.time_of_impact = TimeOfImpact(shapes)
         self.friction = friction
-        self.has_friction = friction > 0
         self.margin = body.radius_mm / 2
         self.reuse_mm = body.radius_mm / 4
         # Distances beyond the reach of a shape are unknown, so no larger distance is stored.
         self.reach = REACH_RADII * body.radius_mm
-        parts = {"plane": tm.vec4, "push": tm.vec4} if self.has_friction else {"plane": tm.vec4}
+        parts = {"plane": tm.vec4, "push": tm.vec4} if self.friction > 0 else {"plane": tm.vec4}
         self.contact = ti.Struct.field(parts, shape=(body.count, len(shapes)))
         self.touched = ti.field(ti.i32, body.count)
         self.found = ti.Vector.field(4, ti.f32, (body.count, len(shapes)))
@@ -106,7 +105,7 @@ class ShapeContacts:
                             self.contact[i, s].plane = tm.vec4(
                                 near.xyz, near.xyz.dot(p) - near.w + self.body.contact_radius[i]
                             )
-                        if ti.static(self.has_friction):
+                        if ti.static(self.friction > 0):
                             self.contact[i, s].push = tm.vec4(0.0)
             self.touched[i] = touched
 
@@ -159,7 +158,7 @@ class ShapeContacts:
                 normal = self.contact[i, s].plane.xyz
                 depth = factor * ti.max(self.depth(s, i, x), 0.0)
                 change += depth * normal
-                if ti.static(self.has_friction):
+                if ti.static(self.friction > 0):
                     change += self.friction_change(s, i, x, normal, depth, factor)
         return change
 
@@ -167,7 +166,7 @@ class ShapeContacts:
     def pushes(self, s: ti.template(), i, x):
         """Whether shape s displaces particle i, at x, or has done so in this substep."""
         result = self.depth(s, i, x) > 0.0
-        if ti.static(self.has_friction):
+        if ti.static(self.friction > 0):
             result |= (self.touched[i] >> s) & 1 and self.contact[i, s].push.w > 0.0
         return result
 

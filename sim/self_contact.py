@@ -24,7 +24,6 @@ class SelfContacts:
         self.model = model
         self.relax_globally = model.relaxation == "global"
         self.friction = friction
-        self.has_friction = friction > 0
         self.distance = body.radius_mm
         # Particles approach each other during the substep, so some are listed before they touch.
         self.reach = 1.5 * self.distance
@@ -135,7 +134,7 @@ class SelfContacts:
                         weight = self.body.mass_scale[j] / (self.body.mass_scale[i] + self.body.mass_scale[j])
                     depth = self.distance - gap
                     change += weight * depth * normal
-                    if ti.static(self.has_friction):
+                    if ti.static(self.friction > 0):
                         slip = tangential(moved - (self.body.predicted[j] - self.body.position[j]), normal)
                         factor = sticking_fraction(slip, self.friction * depth)
                         change -= weight * factor * slip

@@ -50,7 +50,6 @@ class SurfaceContacts:
         self.shapes = list(shapes)
         self.time_of_impact = TimeOfImpact(shapes)
         self.friction = friction
-        self.has_friction = friction > 0
         self.count = len(points)
         nodes, weights = lattice.interpolation(points)
         self.point = ti.Vector.field(3, ti.f32, self.count)
@@ -67,7 +66,7 @@ class SurfaceContacts:
         self.plane = ti.Vector.field(4, ti.f32, (len(shapes), self.count))
         self.found = ti.Vector.field(4, ti.f32, (len(shapes), self.count))
         self.state = dict(point=self.point, near=self.near, plane=self.plane, found=self.found)
-        if self.has_friction:
+        if self.friction > 0:
             self.slip = ti.Vector.field(3, ti.f32, (len(shapes), self.count))
             # The name in session files.
             self.state["stick"] = self.slip
@@ -79,7 +78,7 @@ class SurfaceContacts:
         """Clear stored distances and friction; call it after other code has moved the body."""
         self.found.fill(-FAR)
         self.near.fill(0)
-        if self.has_friction:
+        if self.friction > 0:
             self.slip.fill(0.0)
 
     def snapshot(self) -> dict[str, np.ndarray]:
@@ -158,7 +157,7 @@ class SurfaceContacts:
                         normal = self.plane[s, q].xyz
                         force += penalty * depth * normal
                         tangential = 0.0
-                        if ti.static(self.has_friction):
+                        if ti.static(self.friction > 0):
                             slip, factor = self.tangential_slip(s, q, depth)
                             force -= penalty * TANGENTIAL_RATIO * slip
                             tangential = TANGENTIAL_RATIO * factor
@@ -188,7 +187,7 @@ class SurfaceContacts:
                     stiffness += penalty * normal.outer_product(normal)
                     if has_force:
                         force += penalty * depth * normal
-                        if ti.static(self.has_friction):
+                        if ti.static(self.friction > 0):
                             slip = tangential(self.slip[s, q] + shift - self.point[q], normal)
                             factor = sticking_fraction(slip, self.friction * depth / TANGENTIAL_RATIO)
                             force -= penalty * TANGENTIAL_RATIO * factor * slip
@@ -214,7 +213,7 @@ class SurfaceContacts:
     @ti.func
     def finish(self):
         """End of a substep: store the tangential slip."""
-        if ti.static(self.has_friction):
+        if ti.static(self.friction > 0):
             for q in range(self.count):
                 for s in ti.static(range(len(self.shapes))):
                     slip = tm.vec3(0.0)

@@ -45,18 +45,6 @@ class Label(IntEnum):
     TUMOUR = 6
 
 
-# Attenuation [HU] late in the corticomedullary phase (about 70 s after injection): the medulla has begun to
-# enhance, nothing is excreted yet. Measured for comparison in CRLM-CT-1004 (TCIA, somewhat later): renal
-# parenchyma 200 in the median, noise SD 9 to 10.
-HU_CORTEX = 185.0
-HU_MEDULLA = 108.0
-HU_URINE = 8.0
-HU_TUMOUR = 90.0
-HU_NECROSIS = 28.0
-HU_PSEUDOCAPSULE = 48.0
-HU_FASCIA = 10.0
-HU_SEPTA = -48.0
-
 # Half-axes along (u, v, w): a kidney of 11 x 6 x 4.5 cm, blunter at the poles than an ellipsoid.
 KIDNEY_CENTRE = np.array([66.0, 30.0, -328.0])
 KIDNEY_HALF_AXES = np.array([29.8, 23.4, 55.5])
@@ -283,8 +271,8 @@ def _paint_perirenal_space(canvas: Canvas, bean: np.ndarray, rng: np.random.Gene
     canvas.paint(fascia, HU["fat"])
     for wavelength, thickness in ((44, 0.04), (30, 0.03)):
         sheet = np.abs(canvas.waves(wavelength, rng)) / 6 - np.float32(thickness)
-        canvas.paint(np.maximum(sheet * np.float32(0.6 * wavelength), fascia), HU_SEPTA)
-    canvas.paint(np.abs(fascia) - 0.35, HU_FASCIA)
+        canvas.paint(np.maximum(sheet * np.float32(0.6 * wavelength), fascia), HU["septa"])
+    canvas.paint(np.abs(fascia) - 0.35, HU["fascia"])
 
 
 def _kidney_parts(
@@ -315,15 +303,15 @@ def _paint_kidney(
     """Draw the kidney, its vessels and ureter up to the canvas's border; each over those before it."""
     modulation = 5 * waves_at(points, 26, rng) + 4 * waves_at(points, 9, rng)
     values = dict(
-        hull=HU_CORTEX + modulation,
+        hull=HU["cortex"] + modulation,
         sinus=HU["fat"] + 6,
-        urine=HU_URINE,
-        medulla=HU_MEDULLA + modulation,
+        urine=HU["urine"],
+        medulla=HU["medulla"] + modulation,
         veins=HU["vein"],
         arteries=HU["artery"],
-        tumour=HU_PSEUDOCAPSULE,
-        viable=HU_TUMOUR + 9 * waves_at(points, 12, rng) + 6 * waves_at(points, 6, rng),
-        necrosis=HU_NECROSIS,
+        tumour=HU["pseudocapsule"],
+        viable=HU["tumour"] + 9 * waves_at(points, 12, rng) + 6 * waves_at(points, 6, rng),
+        necrosis=HU["necrosis"],
     )
     for part, hu in values.items():
         canvas.paint(parts[part], hu, near if parts[part].ndim == 1 else (...,))
