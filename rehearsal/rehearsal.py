@@ -180,8 +180,8 @@ class Rehearsal:
 
     def set_young(self, young_kpa: float) -> None:
         """Change Young's modulus, if the tissue model has one."""
-        if hasattr(self.model, "set_young"):
-            self.model.set_young(young_kpa)
+        if hasattr(self.model, "set_material"):
+            self.model.set_material(young_kpa)
 
     def scripted_pose(self, time_s: float) -> np.ndarray:
         """The transducer's pose at a time of the scripted press: touching at first, then deeper stage by stage."""

@@ -281,17 +281,14 @@ def load_scene(path: Path) -> Scene:
             f"{path}: cannot be read as TOML ({str(error).splitlines()[0]}); {EXPECTED}"
         ) from None
     try:
-        return _with_probe_beside(path, Scene.model_validate(values))
+        scene = Scene.model_validate(values)
     except ValidationError as error:
         raise SceneError(f"{path}: {_explain(error)}") from None
-
-
-def _with_probe_beside(path: Path, scene: Scene) -> Scene:
-    """The scene with the absolute path of its probe's file; the program's own probes have names without a suffix."""
-    named = path.parent / scene.transducer.probe
-    if not named.suffix:
+    # The program's own probes have names without a suffix.
+    beside = path.parent / scene.transducer.probe
+    if not beside.suffix:
         return scene
-    transducer = scene.transducer.model_copy(update={"probe": str(named.resolve())})
+    transducer = scene.transducer.model_copy(update={"probe": str(beside.resolve())})
     return scene.model_copy(update={"transducer": transducer})
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from errors import PatientError
-from scenes.scene import SceneError
+from scenes.scene import SceneError, scene_text
 from scenes.terminal import ReportProgress, no_progress
 
 if TYPE_CHECKING:
@@ -29,8 +29,21 @@ def phantom_folder(progress: ReportProgress = no_progress) -> Path:
     sources = b"".join(path.read_bytes() for path in files)
     name = f"phantom-{hashlib.sha256(sources).hexdigest()[:12]}"
     places = [root / name for root in (CACHE, Path(tempfile.gettempdir()) / "nephron")]
-    cached = next((folder for folder in places if folder.is_dir()), None)
-    return cached or _save(make_embedded_patient(progress), places)
+    if cached := next((folder for folder in places if folder.is_dir()), None):
+        return cached
+    from scenes.patients.patient_folder import save_patient
+    from scenes.patients.patient_scene import patient_scene
+
+    patient = make_embedded_patient(progress)
+    for folder in places:
+        with contextlib.suppress(PatientError):
+            save_patient(patient, folder, {"scene.toml": scene_text(patient_scene(patient))})
+        if folder.is_dir():  # also where another process was first
+            return folder
+    roots = " and ".join(str(folder.parent) for folder in places)
+    raise SceneError(
+        f"{roots}: the embedded patient's files can be written to neither; free 20 MB in one of them"
+    )
 
 
 def make_embedded_patient(progress: ReportProgress = no_progress) -> "Patient":
@@ -47,20 +60,3 @@ def make_embedded_patient(progress: ReportProgress = no_progress) -> "Patient":
     segments = {v: replace(segment, tissue=Label(v).name.lower()) for v, segment in labels.segments.items()}
     organ = [value for value in segments if value != Label.TUMOUR]
     return import_patient(LazyVolume.of(ct), replace(labels, segments=segments), organ, side="left")
-
-
-def _save(patient: "Patient", places: list[Path]) -> Path:
-    """Save into the first folder that can be written. Raises SceneError."""
-    from scenes.patients.patient_folder import save_patient
-    from scenes.patients.patient_scene import patient_scene
-    from scenes.scene import scene_text
-
-    for folder in places:
-        with contextlib.suppress(PatientError):
-            save_patient(patient, folder, {"scene.toml": scene_text(patient_scene(patient))})
-        if folder.is_dir():  # also where another process was first
-            return folder
-    roots = " and ".join(str(folder.parent) for folder in places)
-    raise SceneError(
-        f"{roots}: the embedded patient's files can be written to neither; free 20 MB in one of them"
-    )

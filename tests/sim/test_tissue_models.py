@@ -272,7 +272,7 @@ def test_a_stiffer_material_deforms_less(laid):
     settings, heights = laid.settings(G, damping=12.0), []
     for young_kpa in (3.0, 30.0, laid.tissue.young_kpa):
         laid.solver.restore(laid.built)
-        laid.solver.model.set_young(young_kpa)
+        laid.solver.model.set_material(young_kpa)
         laid.press(settings, AWAY_MM, AWAY_MM, 60)
         heights.append(np.ptp(laid.surface()[:, 2]))
     assert heights[0] < heights[2] < heights[1]
