@@ -59,7 +59,7 @@ def step_settings(tissue: TissueSection, section: SolverSection) -> StepSettings
     names = {field.name for field in fields(StepSettings)}
     own = {name: value for name, value in tissue.model_dump().items() if name in names}
     given = {name: value for name, value in section.model_dump(exclude_none=True).items() if name in names}
-    return replace(StepSettings(damping=section.damping_per_s), **(own | dict(tissue.STEP) | given))
+    return replace(StepSettings(damping=section.damping_per_s), **(own | dict(tissue.step_defaults) | given))
 
 
 def build_solver(

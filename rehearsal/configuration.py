@@ -55,7 +55,7 @@ class Setup:
 
     def sized(self, size_mm: float) -> "Setup":
         """The same with another resolution."""
-        return self.but(**{self.tissue.SIZE: size_mm})
+        return self.but(**{self.tissue.size_key: size_mm})
 
     def but(self, **values: Any) -> "Setup":
         """The same with some values changed, by their names in any of the sections. Raises SetupError for an unknown one."""
@@ -77,14 +77,14 @@ class Setup:
 def setup_of(model: str, **values: Any) -> Setup:
     """A tissue model with its own choice of a step, and some values changed. Raises SetupError."""
     section = TISSUES[model]
-    step = PAPER_STEP | {name: value for name, value in section.STEP.items() if name in STEP}
+    step = PAPER_STEP | {name: value for name, value in section.step_defaults.items() if name in STEP}
     tissue = section.model_validate({"model": model})
     return Setup(tissue, SolverSection.model_validate(step)).but(**values)
 
 
 # Each model's presets, which hold for every case.
 PRESETS: Mapping[str, Mapping[str, Setup]] = {
-    model: {quality: setup_of(model, **section.PRESETS[quality]) for quality in QUALITIES}
+    model: {quality: setup_of(model, **section.presets[quality]) for quality in QUALITIES}
     for model, section in TISSUES.items()
 }
 
@@ -97,7 +97,7 @@ def option_of(name: str) -> str:
 def scene_of(scene: Scene, setup: Setup) -> Scene:
     """A scene with a setup's model, resolution and step; what its tissue leaves open stays the scene's."""
     step = {f"solver.{name}": getattr(setup, name) for name in STEP}
-    values = setup.tissue.model_dump(exclude_unset=True) | {setup.tissue.SIZE: setup.size_mm}
+    values = setup.tissue.model_dump(exclude_unset=True) | {setup.tissue.size_key: setup.size_mm}
     tissue = {f"tissue.{name}": value for name, value in values.items()}
     return with_options(scene, tissue | step | {"tissue.model": setup.model})
 

@@ -23,7 +23,7 @@ from sim.fields import array_of
 from sim.shapes import Plane, SignedDistanceField
 from sim.skinning import Skin
 from sim.solver import SolverState
-from sim.tissue_model import FixedRegion, MaterialModel
+from sim.tissue_model import FixedRegion
 from ultrasound.image_plane import ImagePlane, plane_section
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import (
@@ -178,8 +178,8 @@ class Rehearsal:
 
     def set_young(self, young_kpa: float) -> None:
         """Change Young's modulus, if the tissue model has one."""
-        if isinstance(self.model, MaterialModel):
-            self.model.set_young(young_kpa)
+        if hasattr(self.model, "set_material"):
+            self.model.set_material(young_kpa)
 
     def scripted_pose(self, time_s: float) -> np.ndarray:
         """The transducer's pose at a time of the scripted press: touching at first, then deeper stage by stage."""

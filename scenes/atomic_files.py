@@ -4,6 +4,7 @@ import glob
 import os
 import secrets
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,11 +14,8 @@ from errors import PatientError
 
 def check_writable(folder: Path) -> None:
     """Write a file into a folder and remove it: permissions alone do not show a full or read-only disk. Raises OSError."""
-    tried = folder / f".{secrets.token_hex(4)}.tried"
-    try:
-        tried.write_bytes(b"0")
-    finally:
-        tried.unlink(missing_ok=True)
+    with tempfile.TemporaryFile(dir=folder, buffering=0) as file:
+        file.write(b"0")
 
 
 @contextmanager

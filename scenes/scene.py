@@ -4,13 +4,14 @@ Lengths are mm in patient coordinates (LPS), times s, angles degrees. ``load_sce
 other than the schema's, and values out of range, and names each.
 """
 
+import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tomli_w
-from pydantic import AliasChoices, BaseModel, Field, ValidationError, model_validator
+from pydantic import AliasChoices, Field, ValidationError, model_validator
 
 from errors import UserError, explained, meant
 from scenes.section import Direction, Length, Section, Vector3
@@ -36,6 +37,9 @@ OPTIONS = {
 }
 
 
+UNIT = re.compile("_(mm2|mm|m_s2|mm_s|g_cm3|per_mm|per_s|deg|hu|s)$")
+
+
 class SceneError(UserError):
     """A scene that cannot be used."""
 
@@ -57,10 +61,7 @@ class AnatomyFiles(Section):
 
     @model_validator(mode="after")
     def _one_patient(self) -> "AnatomyFiles":
-        named = (
-            self.tumour or self.parts or self.ct or self.labels or self.tissues or self.organ != "organ.stl"
-        )
-        if self.phantom and named:
+        if self.phantom and self != AnatomyFiles.model_construct(phantom=True):
             raise ValueError(
                 "phantom = true is the embedded patient, which has its own files: name no others"
             )
@@ -212,16 +213,21 @@ class Scene(Section):
 
     @model_validator(mode="after")
     def _suits_its_tissue(self) -> "Scene":
-        if self.contact.particles and not self.tissue.CAN_TOUCH_ITSELF:
-            able = " or ".join(name for name, section in TISSUES.items() if section.CAN_TOUCH_ITSELF)
-            raise ValueError(
-                f"contact.particles = true needs particles: set tissue.model to {able}, or leave it out"
-            )
-        if self.attachment.radius_mm > 0 and not self.tissue.CAN_BE_HELD:
-            able = " or ".join(name for name, section in TISSUES.items() if section.CAN_BE_HELD)
-            raise ValueError(
-                f"attachment.radius_mm fixes nodes: set tissue.model to {able}, or the radius to 0"
-            )
+        for wanted, support, refusal in (
+            (
+                self.contact.particles,
+                "self_contact",
+                "contact.particles = true needs particles: {}, or leave it out",
+            ),
+            (
+                self.attachment.radius_mm > 0,
+                "attachment",
+                "attachment.radius_mm fixes nodes: {}, or the radius to 0",
+            ),
+        ):
+            able = [name for name, each in TISSUES.items() if getattr(each, f"supports_{support}")]
+            if wanted and self.tissue.model not in able:
+                raise ValueError(refusal.format(f"set tissue.model to {' or '.join(able)}"))
         return self
 
 
@@ -270,22 +276,19 @@ def load_scene(path: Path) -> Scene:
         raise SceneError(f"{path}: no such scene file or patient's folder") from None
     except UnicodeDecodeError:
         raise SceneError(f"{path}: is not a text file; {EXPECTED}") from None
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read as a scene ({_first_line(error)})") from None
-    except tomllib.TOMLDecodeError as error:
-        raise SceneError(f"{path}: not valid TOML: {_first_line(error)}; {EXPECTED}") from None
+    except (OSError, tomllib.TOMLDecodeError) as error:
+        raise SceneError(
+            f"{path}: cannot be read as TOML ({str(error).splitlines()[0]}); {EXPECTED}"
+        ) from None
     try:
-        return _with_probe_beside(path, Scene.model_validate(values))
+        scene = Scene.model_validate(values)
     except ValidationError as error:
         raise SceneError(f"{path}: {_explain(error)}") from None
-
-
-def _with_probe_beside(path: Path, scene: Scene) -> Scene:
-    """The scene with the absolute path of its probe's file; the program's own probes have names without a suffix."""
-    named = path.parent / scene.transducer.probe
-    if not named.suffix:
+    # The program's own probes have names without a suffix.
+    beside = path.parent / scene.transducer.probe
+    if not beside.suffix:
         return scene
-    transducer = scene.transducer.model_copy(update={"probe": str(named.resolve())})
+    transducer = scene.transducer.model_copy(update={"probe": str(beside.resolve())})
     return scene.model_copy(update={"transducer": transducer})
 
 
@@ -333,53 +336,21 @@ def _explain(error: ValidationError) -> str:
 
 
 def _unknown(where: list[str]) -> str:
-    """The advice for an unknown key."""
-    return _owner(where) or f"unknown key; {_suggest(where)}"
-
-
-def _owner(where: list[str]) -> str:
-    """The advice for a key of another tissue model; empty for other keys."""
-    owners = [model for model, section in TISSUES.items() if where[-1] in section.model_fields]
-    if where[0] != "tissue" or not owners:
-        return ""
-    return f"belongs to the tissue model {owners[0]}; choose it with tissue.model, or leave this out"
-
-
-def _suggest(where: list[str]) -> str:
-    """The likely intended key; a unit other than the schema's is reported as such."""
-    known = _keys_beside(where)
-    key = where[-1]
-    for name in known:
-        if name != key and key.startswith(_quantity(name)) and _quantity(name) != name:
-            return f"the unit is in the key: write {name}"
+    """The advice for an unknown key: the model that it belongs to, its unit, or the likely intended key."""
+    *sections, key = where
+    owners = [model for model, section in TISSUES.items() if key in section.model_fields]
+    if sections == ["tissue"] and owners:
+        return f"belongs to the tissue model {owners[0]}; choose it with tissue.model, or leave this out"
     if where == ["image", "width_mm"]:
-        return "the picture is as wide as the probe's array (TransducerWidthMm in its file): leave this out"
-    return meant(key, known)
-
-
-def _quantity(name: str) -> str:
-    """A key without its unit: radius_mm -> radius."""
-    for unit in ("_mm2", "_mm", "_m_s2", "_mm_s", "_g_cm3", "_per_mm", "_per_s", "_deg", "_hu", "_s"):
-        if name.endswith(unit):
-            return name[: -len(unit)]
-    return name
-
-
-def _keys_beside(where: list[str]) -> list[str]:
-    section: type[BaseModel] = Scene
-    for part in where[:-1]:
-        if part == "tissue":
-            return sorted({key for kind in TISSUES.values() for key in kind.model_fields})
-        if part == "shape":
-            return sorted(
-                {key for kind in (PlaneShape, MeshShape, DistanceShape) for key in kind.model_fields}
-            )
-        if part in section.model_fields:
-            annotation = section.model_fields[part].annotation
-            if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-                section = annotation
-    return list(section.model_fields)
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0]
+        return "unknown key; the picture is as wide as the probe's array (TransducerWidthMm in its file): leave this out"
+    kinds: Iterable[Any] = [Scene]
+    if sections:
+        kinds = {"tissue": TISSUES.values(), "shape": (PlaneShape, MeshShape, DistanceShape)}.get(
+            sections[0], [Scene.model_fields[sections[0]].annotation]
+        )
+    known = list(dict.fromkeys(name for kind in kinds for name in kind.model_fields))
+    for name in known:
+        quantity = UNIT.sub("", name)
+        if name not in (key, quantity) and key.startswith(quantity):
+            return f"unknown key; the unit is in the key: write {name}"
+    return f"unknown key; {meant(key, known)}"

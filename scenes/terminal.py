@@ -4,30 +4,26 @@ import shlex
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import PurePath
-from typing import Protocol, TypeVar
+from typing import Any
 
 from tqdm import tqdm
 
-Thing = TypeVar("Thing")
+# Iterates over things and shows the progress under a title.
+Progress = Callable[[Iterable[Any], str], Iterable[Any]]
 # Called with a message when the next step of a task begins.
 ReportProgress = Callable[[str], None]
 REFRESH_S = 0.5
 
 
-class Progress(Protocol):
-    """Iterates over things and shows the progress under a title."""
-
-    def __call__(self, things: Iterable[Thing], title: str) -> Iterable[Thing]: ...
-
-
-def silent(things: Iterable[Thing], title: str) -> Iterable[Thing]:
+def silent(things: Iterable[Any], title: str) -> Iterable[Any]:
     """Iterate without a progress bar."""
     return things
 
 
-def bar(things: Iterable[Thing], title: str) -> Iterable[Thing]:
+def bar(things: Iterable[Any], title: str) -> Iterable[Any]:
     """Iterate with a progress bar on stderr, if stderr is a terminal."""
     return tqdm(things, desc=f"{title:10}", leave=False, disable=None)
 
@@ -36,26 +32,23 @@ def no_progress(message: str) -> None:
     """Ignore the message."""
 
 
-class Stages:
+@contextmanager
+def stages() -> Iterator[ReportProgress]:
     """Show the current message and the elapsed time in one line on stderr, if stderr is a terminal."""
+    ended = threading.Event()
+    with tqdm(bar_format="{desc} ({elapsed})", leave=False, disable=None) as line:
 
-    def __init__(self) -> None:
-        self._bar = tqdm(bar_format="{desc} ({elapsed})", leave=False, disable=None)
-        self._ended = threading.Event()
-        self._clock = threading.Thread(target=self._tick, daemon=True)
+        def refresh() -> None:
+            while not ended.wait(REFRESH_S):
+                line.refresh()
 
-    def __enter__(self) -> ReportProgress:
-        self._clock.start()
-        return self._bar.set_description_str
-
-    def __exit__(self, *reason: object) -> None:
-        self._ended.set()
-        self._clock.join()
-        self._bar.close()
-
-    def _tick(self) -> None:
-        while not self._ended.wait(REFRESH_S):
-            self._bar.refresh()
+        clock = threading.Thread(target=refresh, daemon=True)
+        clock.start()
+        try:
+            yield line.set_description_str
+        finally:
+            ended.set()
+            clock.join()
 
 
 def shell_command(*words: str | PurePath) -> str:

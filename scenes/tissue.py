@@ -16,26 +16,25 @@ USUAL = "neo-hookean"
 class TissueSection(Section):
     """The section ``[tissue]`` of a scene file. Each subclass is a tissue model that a scene can name; ``TISSUES`` lists them.
 
-    ``SIZE`` is the key of the resolution, ``PIECES`` what that is the size of, among the model's counts. ``REPORTED`` is its line of
-    a report, with names of keys and counts. ``STEP`` has its own defaults of the solver's section, where these are not the paper's;
-    ``PRESETS`` has what each quality changes of keys and step, from coarse to fine. ``CAN_TOUCH_ITSELF``: it supports self-contact;
-    ``CAN_BE_HELD``: an attachment (fixed nodes).
+    ``size_key`` is the key of the resolution, ``piece_name`` what has that size, among the model's counts. ``report_line`` has names of
+    keys and counts. ``step_defaults`` are the model's own defaults of the solver's section, where these are not the paper's;
+    ``presets`` has what each quality changes of keys and step, from coarse to fine.
     """
 
-    SIZE: ClassVar[str]
-    PIECES: ClassVar[str]
-    REPORTED: ClassVar[str]
-    STEP: ClassVar[Mapping[str, Any]] = {}
-    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]]
-    CAN_TOUCH_ITSELF: ClassVar[bool] = False
-    CAN_BE_HELD: ClassVar[bool] = False
+    size_key: ClassVar[str]
+    piece_name: ClassVar[str]
+    report_line: ClassVar[str]
+    step_defaults: ClassVar[Mapping[str, Any]] = {}
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]]
+    supports_self_contact: ClassVar[bool] = False
+    supports_attachment: ClassVar[bool] = False
 
     model: str
 
     @property
     def size_mm(self) -> float:
         """The resolution [mm]."""
-        return getattr(self, self.SIZE)
+        return getattr(self, self.size_key)
 
 
 class NeoHookeanTissue(TissueSection):
@@ -44,13 +43,15 @@ class NeoHookeanTissue(TissueSection):
     The presets are points of the front that ``study trade`` measures.
     """
 
-    SIZE, PIECES = "cell_mm", "cells"
-    REPORTED = (
+    size_key, piece_name = "cell_mm", "cells"
+    report_line = (
         "neo-Hookean, E {young_kpa:g} kPa, nu {poisson:g}: {cells} cells of {cell_mm:g} mm, {nodes} nodes"
     )
-    STEP: ClassVar = dict(substeps=1, iterations=4, relaxation_factor=1.7, stabilisation_iterations=0)
-    PRESETS: ClassVar = dict(fast=dict(cell_mm=5.0), balanced={}, accurate=dict(cell_mm=2.0, iterations=12))
-    CAN_BE_HELD = True
+    step_defaults: ClassVar = dict(
+        substeps=1, iterations=4, relaxation_factor=1.7, stabilisation_iterations=0
+    )
+    presets: ClassVar = dict(fast=dict(cell_mm=5.0), balanced={}, accurate=dict(cell_mm=2.0, iterations=12))
+    supports_attachment = True
 
     model: Literal["neo-hookean"] = "neo-hookean"
     cell_mm: float = Field(3.5, ge=0.5, le=20)
@@ -68,13 +69,13 @@ class ShapeMatchingTissue(TissueSection):
     its motion, for all particles weigh the same. The presets are the paper's particles.
     """
 
-    SIZE, PIECES = "radius_mm", "particles"
-    REPORTED = (
+    size_key, piece_name = "radius_mm", "particles"
+    report_line = (
         "shape matching, stiffness {stiffness:g}: {particles} particles of {radius_mm:g} mm, {clusters} clusters, "
         "{memberships} memberships"
     )
-    PRESETS: ClassVar = dict(fast=dict(radius_mm=3.3), balanced={}, accurate=dict(radius_mm=2.2))
-    CAN_TOUCH_ITSELF = True
+    presets: ClassVar = dict(fast=dict(radius_mm=3.3), balanced={}, accurate=dict(radius_mm=2.2))
+    supports_self_contact = True
 
     model: Literal["shape-matching"]
     radius_mm: float = Field(2.7, ge=0.5, le=20)

@@ -82,12 +82,11 @@ class DivergenceCheck:
         rest = self.body.rest_points
         corners = tetrahedra_among(rest)
         self.count = len(corners)
-        self.has_tetrahedra = self.count > 0
         self.middle = ti.Vector(rest.mean(axis=0).tolist())
         self.farthest = ti.field(ti.f32, ())
         # Numbers of points that are not finite, and of tangled tetrahedra.
         self.faults = ti.Vector.field(2, ti.i32, ())
-        if self.has_tetrahedra:
+        if self.count > 0:
             edges = rest[corners[:, 1:]] - rest[corners[:, :1]]
             self.per_volume = field_of(1.0 / np.linalg.det(edges))
             self.corner, self.longest = fields_of(corners, TORN * np.linalg.norm(edges, axis=2), within=1)
@@ -140,32 +139,24 @@ class DivergenceCheck:
 
     @ti.kernel
     def _examine(self) -> tm.vec3:
-        if ti.static(self.serial):
-            ti.loop_config(serialize=True)
-            for _ in range(1):
-                self.examine()
-        else:
-            self.examine()
-        found = self.faults[None]
-        return tm.vec3(found.x, found.y, self.farthest[None])
-
-    @ti.func
-    def examine(self):
-        """Count faults, and find the distance of the farthest point."""
-        for _ in range(1):
-            self.faults[None] = ti.Vector([0, 0])
-            self.farthest[None] = 0.0
+        """Numbers of points that are not finite and of tangled tetrahedra, and the distance of the farthest point."""
         # Counts and maxima do not depend on the order, so these atomics are deterministic.
+        self.faults[None] = ti.Vector([0, 0])
+        self.farthest[None] = 0.0
+        ti.loop_config(serialize=self.serial)
         for i in range(self.body.count):
             distance = (self.body.position[i] - self.middle).norm()
             if distance < INFINITE_MM:
                 ti.atomic_max(self.farthest[None], distance)
             else:
                 self.faults[None][0] += 1
-        if ti.static(self.has_tetrahedra):
+        if ti.static(self.count > 0):
+            ti.loop_config(serialize=self.serial)
             for t in range(self.count):
                 if self.is_tangled(t):
                     self.faults[None][1] += 1
+        found = self.faults[None]
+        return tm.vec3(found.x, found.y, self.farthest[None])
 
     @ti.func
     def is_tangled(self, t):

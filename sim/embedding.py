@@ -12,7 +12,7 @@ import taichi.math as tm
 import trimesh
 
 from sim.device import is_too_small
-from sim.fields import field_of
+from sim.fields import field_of, fill
 from sim.signed_distance import signed_distance
 from sim.skinning import Skin
 from sim.tissue_model import TissueModel
@@ -55,6 +55,7 @@ class Embedding:
         self.skin = Skin(model, vertices)
         self.share = field_of(share)
         self.count = len(tetrahedra)
+        self.serial = is_too_small(self.count, PARALLEL_FROM)
         self.tetrahedron = field_of(tetrahedra, 1)
         self.on_plane = ti.Vector.field(2, ti.f32, len(vertices))
         # A field of its own: all tetrahedra read it, and so it fits in a core's cache.
@@ -72,50 +73,38 @@ class Embedding:
             rest = self.skin.rest[v]
             self.skin.vertices[v] = rest + self.share[v] * (self.skin.vertices[v] - rest)
 
+    @ti.kernel
     def locate_on_plane(
         self,
-        plane_from_world: ti.Matrix,
-        world_from_plane: ti.Matrix,
-        pixel_mm: ti.Matrix,
-        first_mm: ti.Matrix,
-        owner: ti.Field,
-    ) -> None:
-        """Write to ``owner`` (rows, columns), i32, the tetrahedron at each pixel of an image plane, ``count`` where there is none.
-
-        The two matrices map world [mm] to (u, v, w), with the plane at w = 0, and back; pixel (row, column) is at u =
-        first.x + column * pixel.x, v = first.y + row * pixel.y. Of overlapping tetrahedra the lowest index is taken,
-        independent of threads; inverted and flat ones are left out.
-        """
-        serial = is_too_small(self.count, PARALLEL_FROM)
-        self._locate(serial, plane_from_world, world_from_plane, pixel_mm, first_mm, owner)
-
-    @ti.kernel
-    def _locate(
-        self,
-        serial: ti.template(),
         plane_from_world: tm.mat4,
         world_from_plane: tm.mat4,
         pixel_mm: tm.vec2,
         first_mm: tm.vec2,
         owner: ti.template(),
     ):
+        """Write to ``owner`` (rows, columns), i32, the tetrahedron at each pixel of an image plane, ``count`` where there is none.
+
+        The two matrices map world [mm] to (u, v, w), with the plane at w = 0, and back; pixel (row, column) is at u =
+        first.x + column * pixel.x, v = first.y + row * pixel.y. Of overlapping tetrahedra the lowest index is taken,
+        independent of threads; inverted and flat ones are left out.
+        """
         for pixel in ti.grouped(owner):
             owner[pixel] = self.count
         self.rest_from_plane[self.count] = world_from_plane[:3, :]
         for v in self.on_plane:
             projected = plane_from_world @ tm.vec4(self.skin.vertices[v], 1.0)
             self.on_plane[v], self.above_plane[v] = projected.xy, projected.z
-        ti.loop_config(serialize=serial)
+        ti.loop_config(serialize=self.serial)
         for n in range(self.count):
             # In serial order the last that marks a pixel has the lowest index.
             t = self.count - 1 - n
             node = self.tetrahedron[t]
             w = ti.Vector([self.above_plane[node[k]] for k in ti.static(range(4))])
             if w.min() <= 0.0 and w.max() >= 0.0:
-                self.mark(serial, t, node, pixel_mm, first_mm, owner)
+                self.mark(t, node, pixel_mm, first_mm, owner)
 
     @ti.func
-    def mark(self, serial: ti.template(), t, node, pixel_mm, first_mm, owner: ti.template()):
+    def mark(self, t, node, pixel_mm, first_mm, owner: ti.template()):
         """Mark the pixels of a tetrahedron that the plane cuts, and store its map to rest positions, if any are in the image."""
         corner, rest = tm.mat4(0.0), ti.Matrix.zero(ti.f32, 3, 4)
         low, high = tm.vec2(FAR_MM), tm.vec2(-FAR_MM)
@@ -132,12 +121,10 @@ class Embedding:
         ):
             weights = corner.inverse()
             self.rest_from_plane[t] = rest @ weights
-            self.mark_pixels(serial, t, corner, weights, pixel_mm, first_mm, owner)
+            self.mark_pixels(t, corner, weights, pixel_mm, first_mm, owner)
 
     @ti.func
-    def mark_pixels(
-        self, serial: ti.template(), t, corner, weights, pixel_mm, first_mm, owner: ti.template()
-    ):
+    def mark_pixels(self, t, corner, weights, pixel_mm, first_mm, owner: ti.template()):
         """Row by row, the span of columns in which all four barycentric coordinates are positive."""
         bottom, top = 1e30, -1e30
         for a, b in ti.static([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]):
@@ -164,13 +151,12 @@ class Embedding:
             first = ti.max(ti.cast(ti.ceil(left), ti.i32), 0)
             last = ti.min(ti.cast(ti.floor(right), ti.i32), owner.shape[1] - 1)
             for column in range(first, last + 1):
-                if ti.static(serial):
+                if ti.static(self.serial):
                     owner[row, column] = t
                 else:
                     ti.atomic_min(owner[row, column], t)
 
 
-@ti.data_oriented
 class Unmoved:
     """The embedding of a body that does not move: every point is at its rest position."""
 
@@ -182,19 +168,18 @@ class Unmoved:
     def update(self) -> None:
         """Nothing to do."""
 
-    @ti.kernel
     def locate_on_plane(
         self,
-        plane_from_world: tm.mat4,
-        world_from_plane: tm.mat4,
-        pixel_mm: tm.vec2,
-        first_mm: tm.vec2,
-        owner: ti.template(),
-    ):
+        plane_from_world: ti.Matrix,
+        world_from_plane: ti.Matrix,
+        pixel_mm: ti.Matrix,
+        first_mm: ti.Matrix,
+        owner: ti.Field,
+    ) -> None:
         """As ``Embedding.locate_on_plane``."""
-        for pixel in ti.grouped(owner):
-            owner[pixel] = 0
-        self.rest_from_plane[0] = world_from_plane[:3, :]
+        fill(
+            (owner, np.zeros(owner.shape, int)), (self.rest_from_plane, world_from_plane.to_numpy()[None, :3])
+        )
 
 
 def tetrahedra_around(

@@ -18,6 +18,7 @@ from sim.signed_distance import signed_distance
 CORNERS = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
 # A cut cell is integrated over this many samples along each edge; distances are interpolated from 3 x 3 x 3 points.
 SAMPLES = 6
+SAMPLE_POINTS = (np.indices((SAMPLES,) * 3).reshape(3, -1).T + 0.5) / SAMPLES
 # Stiffness of the empty part of a cut cell, relative to the tissue's, so that every node has some.
 ERSATZ = 0.02
 # Displacements are extrapolated from the nearest cell over at most this many widths of a cell.
@@ -101,39 +102,30 @@ def fill_with_cells(surface: trimesh.Trimesh, cell_mm: float) -> Lattice:
         )
     check_memory(CELL_BYTES * surface.volume / cell_mm**3, f"cells of {cell_mm:g} mm", "choose larger ones")
     indices = np.indices(size).reshape(3, -1).T
-    samples = _samples()
-    indices, filled = _filled(surface, low, cell_mm, indices, samples)
-    return _assemble(low, cell_mm, size, indices, filled, samples)
+    return _assemble(low, cell_mm, size, *_filled(surface, low, cell_mm, indices))
 
 
 def fill_block(counts: tuple[int, int, int], cell_mm: float) -> Lattice:
     """The lattice of a block with a corner at the origin and ``counts`` cells along each axis."""
     indices = np.indices(counts).reshape(3, -1).T
-    samples = _samples()
-    filled = np.ones((len(indices), len(samples)))
-    return _assemble(np.zeros(3), cell_mm, np.array(counts), indices, filled, samples)
-
-
-def _samples() -> np.ndarray:
-    """Integration points (s, 3) in a unit cell."""
-    at = (np.arange(SAMPLES) + 0.5) / SAMPLES
-    return np.stack(np.meshgrid(at, at, at, indexing="ij"), axis=-1).reshape(-1, 3)
+    filled = np.ones((len(indices), len(SAMPLE_POINTS)))
+    return _assemble(np.zeros(3), cell_mm, np.array(counts), indices, filled)
 
 
 def _filled(
-    surface: trimesh.Trimesh, low: np.ndarray, cell_mm: float, indices: np.ndarray, samples: np.ndarray
+    surface: trimesh.Trimesh, low: np.ndarray, cell_mm: float, indices: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Grid positions (m, 3) of the cells that contain tissue, and the filled fraction (m, s) around each integration point."""
     centre = signed_distance(surface.vertices, surface.faces, low + cell_mm * (indices + 0.5))[0]
     reach = cell_mm * np.sqrt(3) / 2
     indices, centre = indices[centre < reach], centre[centre < reach]
-    filled = np.ones((len(indices), len(samples)))
+    filled = np.ones((len(indices), len(SAMPLE_POINTS)))
     cut = centre > -reach
     halves = np.indices((3, 3, 3)).reshape(3, -1).T
     grid = 2 * indices[cut][:, None] + halves
     unique, back = _unique_rows(grid.reshape(-1, 3))
     known = signed_distance(surface.vertices, surface.faces, low + cell_mm / 2 * unique)[0]
-    distance = known[back].reshape(-1, 27) @ _from_halves(samples).T
+    distance = known[back].reshape(-1, 27) @ _from_halves(SAMPLE_POINTS).T
     # Linear interpolation cuts off convex surfaces: offset the surface outwards until the volume is right.
     offset = 0.0
     for iteration in range(VOLUME_ITERATIONS):
@@ -156,12 +148,7 @@ def _from_halves(at: np.ndarray) -> np.ndarray:
 
 
 def _assemble(
-    low: np.ndarray,
-    cell_mm: float,
-    size: np.ndarray,
-    indices: np.ndarray,
-    filled: np.ndarray,
-    samples: np.ndarray,
+    low: np.ndarray, cell_mm: float, size: np.ndarray, indices: np.ndarray, filled: np.ndarray
 ) -> Lattice:
     corner = indices[:, None] + CORNERS
     flat = np.ravel_multi_index(tuple(np.moveaxis(corner, 2, 0)), tuple(size + 1))
@@ -173,12 +160,12 @@ def _assemble(
     number[order] = np.arange(len(used))
     cells = number[np.searchsorted(used, flat)]
     weight = ERSATZ + (1 - ERSATZ) * filled
-    tissue_at = filled @ samples / filled.sum(axis=1, keepdims=True)
+    tissue_at = filled @ SAMPLE_POINTS / filled.sum(axis=1, keepdims=True)
     carried = cell_mm**3 * filled.mean(axis=1)[:, None] * shape_functions(tissue_at)
     index_of = np.full(size, -1)
     index_of[tuple(indices.T)] = np.arange(len(indices))
     volume = cell_mm**3 * weight.mean(axis=1)
-    mean, variance = _gradients(weight / weight.sum(axis=1, keepdims=True), samples)
+    mean, variance = _gradients(weight / weight.sum(axis=1, keepdims=True))
     return Lattice(
         cell_mm=cell_mm,
         low_mm=low,
@@ -193,11 +180,11 @@ def _assemble(
     )
 
 
-def _gradients(weight: np.ndarray, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _gradients(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean (m, 8, 3) and variance (m, 8, 8), summed over the axes, of B over samples with weights (m, s)."""
-    at_samples = shape_gradients(samples)
+    at_samples = shape_gradients(SAMPLE_POINTS)
     mean = np.einsum("ms,sia->mia", weight, at_samples)
-    square = np.einsum("sia,sja->sij", at_samples, at_samples).reshape(len(samples), 64)
+    square = np.einsum("sia,sja->sij", at_samples, at_samples).reshape(-1, 64)
     return mean, (weight @ square).reshape(-1, 8, 8) - np.einsum("mia,mja->mij", mean, mean)
 
 

@@ -17,7 +17,7 @@ import taichi.math as tm
 from sim.body import Body
 from sim.device import is_too_small
 from sim.fields import field_of, fields_of
-from sim.lattice import Lattice, fill_with_cells, surface_points
+from sim.lattice import CORNERS, Lattice, fill_with_cells, surface_points
 from sim.linear_algebra import cross, four, row, solve
 from sim.rigid_correction import RigidCorrection
 from sim.solver import StepSettings
@@ -104,7 +104,8 @@ class NeoHookean:
         self.rigid: Any = None
         if not self.has_fixed:
             self.rigid = RigidCorrection(body, self.mass, self.inertial_target, contacts, self.serial)
-        self.set_material(young_kpa, poisson)
+        self.poisson = poisson
+        self.set_material(young_kpa)
 
     def _store_elements(self) -> None:
         cells, nodes = self.lattice.cells, self.body.count
@@ -124,21 +125,16 @@ class NeoHookean:
         cells, nodes = self.lattice.cells, self.body.count
         neighbour = np.tile(np.arange(nodes)[:, None], (1, 27))
         weight = np.zeros((nodes, 27))
-        corners = np.indices((2, 2, 2)).reshape(3, -1).T
         for a in range(8):
             for b in range(8):
-                place = (corners[b] - corners[a] + 1) @ [9, 3, 1]
+                place = (CORNERS[b] - CORNERS[a] + 1) @ [9, 3, 1]
                 neighbour[cells[:, a], place] = cells[:, b]
                 weight[cells[:, a], place] += HOURGLASS_STIFFNESS * self.lattice.hourglass[:, a, b]
         self.neighbour, self.hourglass = fields_of(neighbour, weight)
 
-    def set_young(self, young_kpa: float) -> None:
-        """Change Young's modulus [kPa]; Poisson's ratio stays the same."""
-        self.set_material(young_kpa, self.poisson)
-
-    def set_material(self, young_kpa: float, poisson: float) -> None:
-        """Change Young's modulus [kPa] and Poisson's ratio; the contacts' penalty stiffness is proportional to Young's modulus."""
-        self.poisson = poisson
+    def set_material(self, young_kpa: float, poisson: float | None = None) -> None:
+        """Change Young's modulus [kPa], and the contacts' penalty stiffness with it; without a Poisson's ratio that stays the same."""
+        self.poisson = poisson = self.poisson if poisson is None else poisson
         # 1 kPa is 1000 g/(mm s^2).
         self.mu[None] = 1e3 * young_kpa / (2 * (1 + poisson))
         self.lambda_[None] = 1e3 * young_kpa * poisson / ((1 + poisson) * (1 - 2 * poisson))

@@ -6,6 +6,7 @@ import taichi.math as tm
 
 from sim.body import ParticleBody
 from sim.fields import array_of, fill
+from sim.friction import sticking_fraction, tangential
 from sim.shapes import FAR, TimeOfImpact
 
 PROJECTION_ITERATIONS = 8
@@ -35,12 +36,11 @@ class ShapeContacts:
         self.shapes = list(shapes)
         self.time_of_impact = TimeOfImpact(shapes)
         self.friction = friction
-        self.has_friction = friction > 0
         self.margin = body.radius_mm / 2
         self.reuse_mm = body.radius_mm / 4
         # Distances beyond the reach of a shape are unknown, so no larger distance is stored.
         self.reach = REACH_RADII * body.radius_mm
-        parts = {"plane": tm.vec4, "push": tm.vec4} if self.has_friction else {"plane": tm.vec4}
+        parts = {"plane": tm.vec4, "push": tm.vec4} if self.friction > 0 else {"plane": tm.vec4}
         self.contact = ti.Struct.field(parts, shape=(body.count, len(shapes)))
         self.touched = ti.field(ti.i32, body.count)
         self.found = ti.Vector.field(4, ti.f32, (body.count, len(shapes)))
@@ -105,7 +105,7 @@ class ShapeContacts:
                             self.contact[i, s].plane = tm.vec4(
                                 near.xyz, near.xyz.dot(p) - near.w + self.body.contact_radius[i]
                             )
-                        if ti.static(self.has_friction):
+                        if ti.static(self.friction > 0):
                             self.contact[i, s].push = tm.vec4(0.0)
             self.touched[i] = touched
 
@@ -158,7 +158,7 @@ class ShapeContacts:
                 normal = self.contact[i, s].plane.xyz
                 depth = factor * ti.max(self.depth(s, i, x), 0.0)
                 change += depth * normal
-                if ti.static(self.has_friction):
+                if ti.static(self.friction > 0):
                     change += self.friction_change(s, i, x, normal, depth, factor)
         return change
 
@@ -166,7 +166,7 @@ class ShapeContacts:
     def pushes(self, s: ti.template(), i, x):
         """Whether shape s displaces particle i, at x, or has done so in this substep."""
         result = self.depth(s, i, x) > 0.0
-        if ti.static(self.has_friction):
+        if ti.static(self.friction > 0):
             result |= (self.touched[i] >> s) & 1 and self.contact[i, s].push.w > 0.0
         return result
 
@@ -181,13 +181,9 @@ class ShapeContacts:
         normal_push = push.w + depth
         change = tm.vec3(0.0)
         if normal_push > 0.0:
-            slip = x - self.body.position[i] - self.shapes[s].motion(x)
-            slip -= slip.dot(normal) * normal
+            slip = tangential(x - self.body.position[i] - self.shapes[s].motion(x), normal)
             friction = push.xyz - factor * slip
-            limit = self.friction * normal_push
-            squared = friction.norm_sqr()
-            if squared > limit * limit:
-                friction *= limit / ti.sqrt(squared)
+            friction *= sticking_fraction(friction, self.friction * normal_push)
             change = friction - push.xyz
             self.contact[i, s].push = tm.vec4(friction, normal_push)
         return change
@@ -200,16 +196,7 @@ class ShapeContacts:
         Where shapes overlap, so that each projects a particle into the other, it leaves through a free side of a tool.
         """
         for i in range(self.body.count):
-            if not self.is_clear_of_all(i, self.body.predicted[i]):
-                self.body.predicted[i] = self.projected_out(i, self.body.predicted[i])
-
-    @ti.func
-    def is_clear_of_all(self, i, x):
-        """Whether particle i, at x, touches no shape, as far as a quick test can tell."""
-        result = True
-        for s in ti.static(range(len(self.shapes))):
-            result = result and self.is_clear(s, i, x, self.body.contact_radius[i])
-        return result
+            self.body.predicted[i] = self.projected_out(i, self.body.predicted[i])
 
     @ti.func
     def projected_out(self, i, x):

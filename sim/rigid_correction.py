@@ -27,6 +27,18 @@ REGULARISATION = 1e-5
 MOST_ROTATION = 0.5
 
 
+# The negative derivatives of force and torque are by translation, mixed, and by rotation.
+Sums = ti.types.struct(
+    force=tm.vec3, torque=tm.vec3, translational=tm.mat3, mixed=tm.mat3, rotational=tm.mat3
+)
+
+
+@ti.func
+def nothing():
+    """Sums of no terms."""
+    return Sums(tm.vec3(0.0), tm.vec3(0.0), tm.mat3(0.0), tm.mat3(0.0), tm.mat3(0.0))
+
+
 @ti.data_oriented
 class RigidCorrection:
     """Moves a body's predicted positions rigidly towards ``inertial_target`` (n,) [mm], weighted with ``mass`` (n,) [g].
@@ -52,12 +64,7 @@ class RigidCorrection:
         self.blocks = -(-self.terms // BLOCK)
         middle = body.rest_points.mean(axis=0)
         self.centre = int(np.linalg.norm(body.rest_points - middle, axis=1).argmin())
-        self.force = ti.Vector.field(3, ti.f32, self.blocks)
-        self.torque = ti.Vector.field(3, ti.f32, self.blocks)
-        # Negative derivatives of force and torque: by translation, mixed, and by rotation.
-        self.translational = ti.Matrix.field(3, 3, ti.f32, self.blocks)
-        self.mixed = ti.Matrix.field(3, 3, ti.f32, self.blocks)
-        self.rotational = ti.Matrix.field(3, 3, ti.f32, self.blocks)
+        self.sums = Sums.field(shape=self.blocks)
         # Largest distance of a node from the centre at rest.
         self.extent_mm = float(np.linalg.norm(body.rest_points - middle, axis=1).max())
         self.rotation = ti.Matrix.field(3, 3, ti.f32, ())
@@ -117,8 +124,7 @@ class RigidCorrection:
 
         Without ``has_forces`` the forces move the nodes by their velocities and ignore contacts.
         """
-        force, torque = tm.vec3(0.0), tm.vec3(0.0)
-        translational, mixed, rotational = tm.mat3(0.0), tm.mat3(0.0), tm.mat3(0.0)
+        sums = nothing()
         centre = self.body.position[self.centre] + self.translation[None]
         for term in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.terms)):
             f, k, x = tm.vec3(0.0), tm.mat3(0.0), centre
@@ -134,36 +140,31 @@ class RigidCorrection:
                 x = self.moved(self.contacts.point[q])
                 f, k = self.contacts.point_force(q, x, has_forces)
             arm = cross_matrix(x - centre)
-            force += f
-            torque += arm @ f
-            translational += k
-            mixed -= k @ arm
-            rotational -= arm @ k @ arm
-        self.force[block], self.torque[block] = force, torque
-        self.translational[block], self.mixed[block], self.rotational[block] = (
-            translational,
-            mixed,
-            rotational,
-        )
+            sums.force += f
+            sums.torque += arm @ f
+            sums.translational += k
+            sums.mixed -= k @ arm
+            sums.rotational -= arm @ k @ arm
+        self.sums[block] = sums
 
     @ti.func
     def solve(self):
         """Solve the 6 x 6 system by its Schur complement, and add the step to the rigid motion."""
-        force, torque = tm.vec3(0.0), tm.vec3(0.0)
-        translational, mixed, rotational = tm.mat3(0.0), tm.mat3(0.0), tm.mat3(0.0)
+        total = nothing()
         for block in range(self.blocks):
-            force += self.force[block]
-            torque += self.torque[block]
-            translational += self.translational[block]
-            mixed += self.mixed[block]
-            rotational += self.rotational[block]
-        compliance = inverse_of(translational)
-        schur = rotational - mixed.transpose() @ compliance @ mixed
+            sums = self.sums[block]
+            total.force += sums.force
+            total.torque += sums.torque
+            total.translational += sums.translational
+            total.mixed += sums.mixed
+            total.rotational += sums.rotational
+        compliance = inverse_of(total.translational)
+        schur = total.rotational - total.mixed.transpose() @ compliance @ total.mixed
         # A body collapsed to a line or a point has no resistance to rotation about it.
-        schur += (REGULARISATION * rotational.trace() + 1e-12) * tm.eye(3)
-        vector = inverse_of(schur) @ (torque - mixed.transpose() @ compliance @ force)
+        schur += (REGULARISATION * total.rotational.trace() + 1e-12) * tm.eye(3)
+        vector = inverse_of(schur) @ (total.torque - total.mixed.transpose() @ compliance @ total.force)
         vector *= ti.min(1.0, MOST_ROTATION / ti.max(vector.norm(), 1e-12))
-        shift = compliance @ (force - mixed @ vector)
+        shift = compliance @ (total.force - total.mixed @ vector)
         self.change_mm[None] = shift.norm() + vector.norm() * self.extent_mm
         self.translation[None] += shift
         self.rotation[None] = rotation_by(vector) @ self.rotation[None]

@@ -5,12 +5,14 @@ voxelisation, optionally also on the surface; then one particle at a time, each 
 The clusters are chosen among the particles in the same way.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import igl
 import numpy as np
 import psutil
 import trimesh
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from errors import UserError
@@ -38,27 +40,6 @@ class RestBody:
 
 
 @dataclass(frozen=True)
-class Clusters:
-    """Overlapping shape-matching clusters in compressed rows.
-
-    ``members[offsets[c]:offsets[c + 1]]`` are the particles of cluster c, ascending. Every particle is in at least one cluster.
-    """
-
-    offsets: np.ndarray
-    members: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.offsets) - 1
-
-    def transposed(self, particle_count: int) -> "Clusters":
-        """The same memberships seen from the particles: row i lists the clusters of particle i, ascending."""
-        cluster = np.repeat(np.arange(len(self), dtype=np.int32), np.diff(self.offsets))
-        order = np.argsort(self.members, kind="stable")
-        counts = np.bincount(self.members, minlength=particle_count)
-        return Clusters(offsets_of(counts), cluster[order])
-
-
-@dataclass(frozen=True)
 class Patches:
     """Groups of particles that are in the same clusters: one affine map moves all particles of a patch to their goals.
 
@@ -68,7 +49,7 @@ class Patches:
     """
 
     start: np.ndarray
-    clusters: Clusters
+    clusters: csr_array
 
     def __len__(self) -> int:
         return len(self.start) - 1
@@ -86,7 +67,7 @@ class Patches:
     @property
     def cluster_counts(self) -> np.ndarray:
         """Number of clusters that each patch is in (p,)."""
-        return np.diff(self.clusters.offsets)
+        return np.diff(self.clusters.indptr)
 
     def of_particles(self) -> np.ndarray:
         """Patch of each particle (n,)."""
@@ -99,61 +80,41 @@ def fill_body(
     volume_sampling: float = 4.0,
     surface_samples_per_mm2: float = 0.0,
 ) -> RestBody:
-    """Particles that fill a closed surface [mm]. Raises SamplingError when the radius is too large for the surface.
+    """Particles that fill a closed surface [mm], no two nearer than ``radius_mm``, along a space-filling curve.
 
-    A particle touches a shape where the surface above it does: its contact radius is its depth under the surface, at most
-    the particle radius. So a body in a mould of its own shape is at rest.
+    The voxels are ``radius_mm / volume_sampling`` wide. Samples on the surface come before those inside, so that thin parts keep
+    their boundary. A particle touches a shape where the surface above it does: its contact radius is its depth under the surface, at
+    most the particle radius. So a body in a mould of its own shape is at rest. Raises SamplingError when nothing fits, or when
+    there is not enough memory.
     """
-    particles = sample_particles(
-        surface.vertices, surface.faces, radius_mm, volume_sampling, surface_samples_per_mm2
-    )
-    depth = -signed_distance(surface.vertices, surface.faces, particles)[0]
-    return RestBody(particles, radius_mm, np.clip(depth, 0.0, radius_mm))
-
-
-def sample_particles(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    radius_mm: float,
-    volume_sampling: float = 4.0,
-    surface_samples_per_mm2: float = 0.0,
-) -> np.ndarray:
-    """Particles (n, 3) float64 [mm] that fill a closed surface, no two nearer than ``radius_mm``, along a space-filling curve.
-
-    ``vertices`` (v, 3) [mm] and ``faces`` (f, 3) are the surface; the voxels are ``radius_mm / volume_sampling`` wide.
-    Samples on the surface come before those inside, so that thin parts keep their boundary. Raises SamplingError when
-    nothing fits, or when there is not enough memory.
-    """
+    vertices, faces = surface.vertices, surface.faces
     pitch = radius_mm / volume_sampling
     count = float(np.prod(np.ceil(np.ptp(vertices, axis=0) / pitch)))
     check_memory(VOXEL_BYTES * count, f"particles of {radius_mm:g} mm radius", "choose larger ones")
     origin, occupied = occupied_voxels(vertices, faces, pitch)
-    surface = _surface_particles(vertices, faces, radius_mm, surface_samples_per_mm2)
-    _clear_near(occupied, origin, pitch, surface, radius_mm)
-    voxels = _greedy_voxels(occupied, volume_sampling)
-    particles = np.concatenate([surface, origin + pitch * voxels])
+    outer = _surface_particles(vertices, faces, radius_mm, surface_samples_per_mm2)
+    _clear_near(occupied, origin, pitch, outer, radius_mm)
+    particles = np.concatenate([outer, origin + pitch * _greedy_voxels(occupied, volume_sampling)])
     if len(particles) < 4:
         raise SamplingError(
             f"a particle radius of {radius_mm:g} mm leaves {len(particles)} particles in the organ: "
             f"expected at least 4, choose a smaller radius"
         )
-    return particles[np.argsort(morton_codes(particles, radius_mm), kind="stable")]
+    particles = particles[np.argsort(morton_codes(particles, radius_mm), kind="stable")]
+    depth = -signed_distance(vertices, faces, particles)[0]
+    return RestBody(particles, radius_mm, np.clip(depth, 0.0, radius_mm))
 
 
-def sample_clusters(particles: np.ndarray, spacing_mm: float) -> Clusters:
+def sample_clusters(particles: np.ndarray, spacing_mm: float) -> csr_array:
     """Clusters of the particles (n, 3) [mm]: centres greedily chosen ``spacing_mm`` apart, members within it (as in FleX).
 
-    The greedy choice leaves no particle farther than the spacing from a centre, so the clusters cover the body and overlap.
+    Row c has the particles of cluster c, ascending. The greedy choice leaves no particle farther than the spacing from a centre, so
+    the clusters cover the body and overlap.
     """
-    tree = cKDTree(particles)
-    free = np.ones(len(particles), bool)
-    rows = []
-    for i in range(len(particles)):
-        if free[i]:
-            near = np.sort(tree.query_ball_point(particles[i], spacing_mm))
-            free[near] = False
-            rows.append(near.astype(np.int32))
-    return Clusters(offsets_of([len(row) for row in rows]), np.concatenate(rows))
+    rows = [near for _, near in _greedy(particles, spacing_mm)]
+    members = np.concatenate(rows)
+    offsets = np.cumsum([0, *map(len, rows)])
+    return csr_array((np.ones(len(members), bool), members, offsets), shape=(len(rows), len(particles)))
 
 
 def group_into_patches(rest: RestBody, cluster_spacing: float) -> tuple[RestBody, Patches]:
@@ -162,21 +123,18 @@ def group_into_patches(rest: RestBody, cluster_spacing: float) -> tuple[RestBody
     Patches with several particles come first; otherwise they keep the order of their first particles, so that neighbours
     in space stay neighbours in memory.
     """
-    clusters = sample_clusters(rest.particles, cluster_spacing * rest.radius_mm)
-    rows = clusters.transposed(len(rest.particles))
+    rows = sample_clusters(rest.particles, cluster_spacing * rest.radius_mm).T.tocsr()
     number: dict[bytes, int] = {}
     patch = np.empty(len(rest.particles), np.int64)
     for i in range(len(patch)):
-        row = rows.members[rows.offsets[i] : rows.offsets[i + 1]]
+        row = rows.indices[rows.indptr[i] : rows.indptr[i + 1]]
         patch[i] = number.setdefault(row.tobytes(), len(number))
+    first = np.unique(patch, return_index=True)[1]
     sequence = np.argsort(np.bincount(patch) == 1, kind="stable")
     patch = np.argsort(sequence)[patch]
     order = np.argsort(patch, kind="stable")
-    found = list(number)
-    members = [np.frombuffer(found[p], rows.members.dtype) for p in sequence]
-    shared = Clusters(offsets_of([len(row) for row in members]), np.concatenate(members))
     arranged = replace(rest, particles=rest.particles[order], contact_radius=rest.contact_radius[order])
-    return arranged, Patches(offsets_of(np.bincount(patch)), shared)
+    return arranged, Patches(np.cumsum([0, *np.bincount(patch)]), rows[first[sequence]])
 
 
 def check_memory(needed_bytes: float, what: str, advice: str) -> None:
@@ -244,12 +202,17 @@ def _surface_particles(
     flip = u + v > 1
     u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
     samples = chosen[:, 0] + u * (chosen[:, 1] - chosen[:, 0]) + v * (chosen[:, 2] - chosen[:, 0])
-    tree, free, taken = cKDTree(samples), np.ones(count, bool), []
-    for i in range(count):
+    return samples[[i for i, _ in _greedy(samples, radius_mm)]]
+
+
+def _greedy(points: np.ndarray, spacing_mm: float) -> Iterator[tuple[int, np.ndarray]]:
+    """Points chosen in their order, none within the spacing of an earlier one, and all points within it, ascending."""
+    tree, free = cKDTree(points), np.ones(len(points), bool)
+    for i in range(len(points)):
         if free[i]:
-            free[tree.query_ball_point(samples[i], radius_mm)] = False
-            taken.append(i)
-    return samples[taken]
+            near = np.sort(tree.query_ball_point(points[i], spacing_mm))
+            free[near] = False
+            yield i, near
 
 
 def _clear_near(
@@ -261,8 +224,3 @@ def _clear_near(
         distance, _ = cKDTree(points).query(origin + pitch * voxels)
         near = voxels[distance < radius_mm]
         occupied[near[:, 0], near[:, 1], near[:, 2]] = False
-
-
-def offsets_of(counts: list[int] | np.ndarray) -> np.ndarray:
-    """Offsets (n + 1,), int32, of compressed rows with these numbers of entries (n,)."""
-    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)

@@ -4,6 +4,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.fields import field_of
+from sim.friction import sticking_fraction, tangential
 from sim.shape_matching import ShapeMatching
 
 MOST_NEIGHBOURS = 24
@@ -23,7 +24,6 @@ class SelfContacts:
         self.model = model
         self.relax_globally = model.relaxation == "global"
         self.friction = friction
-        self.has_friction = friction > 0
         self.distance = body.radius_mm
         # Particles approach each other during the substep, so some are listed before they touch.
         self.reach = 1.5 * self.distance
@@ -134,10 +134,9 @@ class SelfContacts:
                         weight = self.body.mass_scale[j] / (self.body.mass_scale[i] + self.body.mass_scale[j])
                     depth = self.distance - gap
                     change += weight * depth * normal
-                    if ti.static(self.has_friction):
-                        slip = moved - (self.body.predicted[j] - self.body.position[j])
-                        slip -= slip.dot(normal) * normal
-                        factor = ti.min(1.0, self.friction * depth / ti.max(slip.norm(), 1e-12))
+                    if ti.static(self.friction > 0):
+                        slip = tangential(moved - (self.body.predicted[j] - self.body.position[j]), normal)
+                        factor = sticking_fraction(slip, self.friction * depth)
                         change -= weight * factor * slip
                     contacts += 1
             if contacts > 0:

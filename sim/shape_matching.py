@@ -17,7 +17,7 @@ from sim.device import is_too_small
 from sim.fields import field_of, fields_of
 from sim.linear_algebra import four, rotation_near, row
 from sim.particle_contact import REACH_RADII, ShapeContacts
-from sim.sampling import Clusters, Patches, RestBody, fill_body, group_into_patches
+from sim.sampling import Patches, RestBody, fill_body, group_into_patches
 from sim.tissue_model import ModelInputs
 
 RELAXATIONS = ("local", "global")
@@ -78,20 +78,21 @@ class ShapeMatching:
         self.patches = patches
         self.patch_count = len(patches)
         self.multi_count = patches.multi_count
-        self.count = int(patches.clusters.members.max()) + 1
+        self.count = patches.clusters.shape[1]
         self.relaxation = relaxation
-        self._allocate(patches, patches.clusters.transposed(self.count))
+        self._allocate(patches)
         self._store_rest(patches)
         self.update_frames()
 
-    def _allocate(self, patches: Patches, members: Clusters) -> None:
-        row = np.repeat(np.arange(self.count), np.diff(members.offsets))
-        multi = np.bincount(row, members.members < patches.multi_count, minlength=self.count)
+    def _allocate(self, patches: Patches) -> None:
+        members = patches.clusters.T.tocsr()
+        row = np.repeat(np.arange(self.count), np.diff(members.indptr))
+        multi = np.bincount(row, members.indices < patches.multi_count, minlength=self.count)
         self.patch_start, self.cluster_start, self.cluster_list = fields_of(
-            patches.start, patches.clusters.offsets, patches.clusters.members
+            patches.start, patches.clusters.indptr, patches.clusters.indices
         )
         self.member_start, self.member, self.multi_end = fields_of(
-            members.offsets, members.members, members.offsets[:-1] + multi.astype(np.int32)
+            members.indptr, members.indices, members.indptr[:-1] + multi.astype(np.int32)
         )
         self.predicted = ti.Vector.field(4, ti.f32, self.body.count)
         self.goal = ti.Matrix.field(4, 4, ti.f32, self.patch_count)
@@ -113,7 +114,7 @@ class ShapeMatching:
         centre = np.add.reduceat(rest, patches.start[:-1]) / sizes[:, None]
         mass = share * sizes
         row = np.repeat(np.arange(len(patches)), shared)
-        member = patches.clusters.members
+        member = patches.clusters.indices
         total = np.bincount(member, mass[row])
         moment = [np.bincount(member, (mass * centre[:, axis])[row]) for axis in range(3)]
         self.rest_centres = np.stack(moment, axis=1) / total[:, None]

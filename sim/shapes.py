@@ -12,7 +12,7 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from sim.fields import field_of
+from sim.fields import array_of, field_of, fill
 from sim.signed_distance import distance_grid
 
 FAR = 1e6
@@ -27,7 +27,6 @@ IMPACT_DEPTH_MM = 1.0
 # Each step of sphere tracing is as long as the clearance; only paths along a surface need many.
 TRACING_STEPS = 32
 LEAST_STEP_MM = 0.01
-Poses = ti.types.ndarray(ti.f32, ndim=4)
 
 
 @ti.data_oriented
@@ -176,23 +175,15 @@ class ConvexTool:
             raise ValueError("a pose of the tool is not finite: expected rigid matrices in mm")
         self.last_pose = poses[-1]
         back = poses[:-1] @ np.linalg.inv(poses[1:]) - np.eye(4)
-        self._store_path(np.stack([poses[1:], back], axis=1).astype(np.float32))
+        path = np.zeros((MOST_SUBSTEPS, 2, 4, 4))
+        path[: len(back)] = np.stack([poses[1:], back], axis=1)
+        fill((self.path, path))
 
     def move(self, before: np.ndarray, now: np.ndarray) -> None:
         """Set the poses (4, 4), world from tool [mm], at the start and at the end of the substep."""
         self.follow(np.stack([before, now]))
-        self._start_substep()
-
-    @ti.kernel
-    def _store_path(self, path: Poses):
-        ti.loop_config(serialize=True)
-        for leg in range(path.shape[0]):
-            for k, i, j in ti.ndrange(2, 4, 4):
-                self.path[leg, k][i, j] = path[leg, k, i, j]
-
-    @ti.kernel
-    def _start_substep(self):
-        self.start_substep(0)
+        pose, step_back = array_of(self.path)[0]
+        fill((self.pose, pose), (self.step_back, step_back))
 
     @ti.func
     def start_substep(self, substep):

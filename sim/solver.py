@@ -1,57 +1,39 @@
 """A time step: the paper's Algorithm 1. Line numbers in docstrings and comments are those of its listing."""
 
 from dataclasses import dataclass
-from math import isfinite
 from typing import Any
 
 import numpy as np
 import taichi as ti
 import taichi.math as tm
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from sim.body import BodyState
 from sim.self_contact import SelfContacts
 from sim.shapes import MOST_SUBSTEPS, ConvexTool
 from sim.tissue_model import TissueModel
 
-# Smallest and largest allowed values of a step's settings.
-RANGES = {
-    "stiffness": (0.0, 1.0),
-    "time_step_s": (1e-6, 10.0),
-    "substeps": (1, MOST_SUBSTEPS),
-    "iterations": (1, 100_000),
-    "stabilisation_iterations": (0, 100_000),
-    "relaxation_factor": (0.0, 2.0),
-    "damping": (0.0, 1e6),
-}
 # Keeps scaled masses far from the origin finite in float32.
 MOST_EXPONENT = 30.0
 
 
-@dataclass
+@checked_dataclass(config=ConfigDict(validate_assignment=True, allow_inf_nan=False))
 class StepSettings:
     """Settings of a step; the defaults are the paper's Table 1, except the stiffness, which it does not give.
 
     ``stiffness`` is alpha of Eq. 12, ``relaxation_factor`` is w of Eq. 7 (successive over-relaxation), ``gravity`` (3,) is in
-    mm/s^2, ``damping`` [1/s] is the rate at which velocities decay.
+    mm/s^2, ``damping`` [1/s] is the rate at which velocities decay. Raises ValueError for a value out of range.
     """
 
-    stiffness: float = 0.95
-    time_step_s: float = 1 / 60
-    substeps: int = 3
-    iterations: int = 9
-    stabilisation_iterations: int = 1
-    relaxation_factor: float = 1.0
-    damping: float = 12.0
+    stiffness: float = Field(default=0.95, ge=0, le=1)
+    time_step_s: float = Field(default=1 / 60, ge=1e-6, le=10)
+    substeps: int = Field(default=3, ge=1, le=MOST_SUBSTEPS)
+    iterations: int = Field(default=9, ge=1, le=100_000)
+    stabilisation_iterations: int = Field(default=1, ge=0, le=100_000)
+    relaxation_factor: float = Field(default=1.0, ge=0, le=2)
+    damping: float = Field(default=12.0, ge=0, le=1e6)
     gravity: tuple[float, float, float] = (0.0, 0.0, -9810.0)
-
-    def check(self) -> None:
-        """Raise ValueError that names the setting which is out of range."""
-        for name, (least, most) in RANGES.items():
-            value = getattr(self, name)
-            if not least <= value <= most:
-                raise ValueError(f"{name} is {value}: expected {least:g} to {most:g}")
-        if not all(map(isfinite, self.gravity)):
-            raise ValueError(f"gravity is {self.gravity}: expected three finite numbers in mm/s^2")
 
 
 @dataclass(frozen=True)
@@ -88,35 +70,30 @@ class Solver:
         """Advance by one time step.
 
         ``tool_poses`` (substeps + 1, 4, 4), world from tool [mm], are the tool's poses at the start of the step and at the
-        end of each substep; without them the tool does not move. Raises ValueError for settings out of range and poses that
-        are not finite, before anything has moved.
+        end of each substep; without them the tool does not move. Raises ValueError for poses that are not finite, before anything
+        has moved.
         """
-        settings.check()
         dt = settings.time_step_s / settings.substeps
         if self.tool is not None:
             still = np.stack([self.tool.last_pose] * (settings.substeps + 1))
             self.tool.follow(still if tool_poses is None else tool_poses)
+        # Gravity as three numbers: passing a vector to a kernel takes three times as long.
+        always = (
+            dt,
+            *settings.gravity,
+            settings.damping,
+            settings.stabilisation_iterations,
+            settings.stiffness,
+        )
         if self.model.serial:
-            # Gravity as three numbers: passing a vector to a kernel takes three times as long.
-            self.advance(
-                dt,
-                *settings.gravity,
-                settings.damping,
-                settings.substeps,
-                settings.stabilisation_iterations,
-                settings.iterations,
-                settings.stiffness,
-                settings.relaxation_factor,
-            )
+            self.advance(*always, settings.substeps, settings.iterations, settings.relaxation_factor)
         else:
             for substep in range(settings.substeps):
-                self.launch_start(
-                    substep, dt, *settings.gravity, settings.damping, settings.stabilisation_iterations
-                )
+                self.launch("start", substep, 1.0, *always)
                 for iteration in range(settings.iterations):
                     factor = relaxation_at(iteration, settings.iterations, settings.relaxation_factor)
-                    self.launch_correct(settings.stiffness, factor, dt)
-                self.launch_finish(dt)
+                    self.launch("correct", substep, factor, *always)
+                self.launch("finish", substep, 1.0, *always)
         # The same kernel as in ``restore``: another one may round differently.
         self.model.update_frames()
 
@@ -139,10 +116,10 @@ class Solver:
         gravity_y: float,
         gravity_z: float,
         damping: float,
-        substeps: int,
         stabilisation_iterations: int,
-        iterations: int,
         stiffness: float,
+        substeps: int,
+        iterations: int,
         relaxation_factor: float,
     ):
         """A step as one kernel on one core, for bodies so small that starting threads takes longer than they save."""
@@ -156,29 +133,27 @@ class Solver:
             self.finish(dt)
 
     @ti.kernel
-    def launch_start(
+    def launch(
         self,
+        part: ti.template(),
         substep: int,
+        relaxation_factor: float,
         dt: float,
         gravity_x: float,
         gravity_y: float,
         gravity_z: float,
         damping: float,
         stabilisation_iterations: int,
+        stiffness: float,
     ):
-        """``start`` as a kernel."""
-        gravity = tm.vec3(gravity_x, gravity_y, gravity_z)
-        self.start(substep, dt, gravity, damping, stabilisation_iterations)
-
-    @ti.kernel
-    def launch_correct(self, stiffness: float, relaxation_factor: float, dt: float):
-        """``correct`` as a kernel."""
-        self.correct(stiffness, relaxation_factor, dt)
-
-    @ti.kernel
-    def launch_finish(self, dt: float):
-        """``finish`` as a kernel."""
-        self.finish(dt)
+        """One of the parts of a substep as a kernel on all cores."""
+        if ti.static(part == "start"):
+            gravity = tm.vec3(gravity_x, gravity_y, gravity_z)
+            self.start(substep, dt, gravity, damping, stabilisation_iterations)
+        elif ti.static(part == "correct"):
+            self.correct(stiffness, relaxation_factor, dt)
+        else:
+            self.finish(dt)
 
     @ti.func
     def start(self, substep, dt: float, gravity: tm.vec3, damping: float, stabilisation_iterations: int):

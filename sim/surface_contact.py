@@ -8,9 +8,11 @@ with elastic tangential slip, limited by the coefficient times the pressure (Wri
 import numpy as np
 import taichi as ti
 import taichi.math as tm
+from scipy.sparse import csr_array
 
 from sim.body import Body
 from sim.fields import array_of, fields_of, fill
+from sim.friction import sticking_fraction, tangential
 from sim.lattice import Lattice
 from sim.shapes import FAR, TimeOfImpact
 
@@ -48,20 +50,23 @@ class SurfaceContacts:
         self.shapes = list(shapes)
         self.time_of_impact = TimeOfImpact(shapes)
         self.friction = friction
-        self.has_friction = friction > 0
         self.count = len(points)
         nodes, weights = lattice.interpolation(points)
         self.point = ti.Vector.field(3, ti.f32, self.count)
         self.start = ti.Vector.field(3, ti.f32, self.count)
         self.near = ti.field(ti.i32, self.count)
         self.node, self.weight = fields_of(nodes, weights, within=1)
+        offsets = np.arange(0, nodes.size + 1, nodes.shape[1])
+        points_of = csr_array(
+            (weights.ravel(), nodes.ravel(), offsets), shape=(len(nodes), body.count)
+        ).T.tocsr()
         self.area, self.node_start, self.node_point, self.node_weight = fields_of(
-            area_mm2, *_by_node(nodes, weights, body.count)
+            area_mm2, points_of.indptr, points_of.indices, points_of.data
         )
         self.plane = ti.Vector.field(4, ti.f32, (len(shapes), self.count))
         self.found = ti.Vector.field(4, ti.f32, (len(shapes), self.count))
         self.state = dict(point=self.point, near=self.near, plane=self.plane, found=self.found)
-        if self.has_friction:
+        if self.friction > 0:
             self.slip = ti.Vector.field(3, ti.f32, (len(shapes), self.count))
             # The name in session files.
             self.state["stick"] = self.slip
@@ -73,7 +78,7 @@ class SurfaceContacts:
         """Clear stored distances and friction; call it after other code has moved the body."""
         self.found.fill(-FAR)
         self.near.fill(0)
-        if self.has_friction:
+        if self.friction > 0:
             self.slip.fill(0.0)
 
     def snapshot(self) -> dict[str, np.ndarray]:
@@ -130,15 +135,12 @@ class SurfaceContacts:
 
     @ti.func
     def tangential_slip(self, s: ti.template(), q, depth):
-        """Elastic slip of point q on shape s, limited by friction (return mapping), and the factor of the limit: 1 if it sticks."""
+        """Elastic slip of point q on shape s, limited by friction (return mapping), and the fraction that is left."""
         normal = self.plane[s, q].xyz
         p = self.point[q]
-        slip = self.slip[s, q] + p - self.start[q] - self.shapes[s].motion(p)
-        slip -= slip.dot(normal) * normal
-        most = self.friction * depth / TANGENTIAL_RATIO
-        length = slip.norm()
-        factor = most / ti.max(length, 1e-12)
-        return slip * ti.min(factor, 1.0), ti.min(factor, 1.0)
+        slip = tangential(self.slip[s, q] + p - self.start[q] - self.shapes[s].motion(p), normal)
+        fraction = sticking_fraction(slip, self.friction * depth / TANGENTIAL_RATIO)
+        return slip * fraction, fraction
 
     @ti.func
     def node_force(self, i):
@@ -155,7 +157,7 @@ class SurfaceContacts:
                         normal = self.plane[s, q].xyz
                         force += penalty * depth * normal
                         tangential = 0.0
-                        if ti.static(self.has_friction):
+                        if ti.static(self.friction > 0):
                             slip, factor = self.tangential_slip(s, q, depth)
                             force -= penalty * TANGENTIAL_RATIO * slip
                             tangential = TANGENTIAL_RATIO * factor
@@ -185,11 +187,9 @@ class SurfaceContacts:
                     stiffness += penalty * normal.outer_product(normal)
                     if has_force:
                         force += penalty * depth * normal
-                        if ti.static(self.has_friction):
-                            slip = self.slip[s, q] + shift - self.point[q]
-                            slip -= slip.dot(normal) * normal
-                            length = ti.max(slip.norm(), 1e-12)
-                            factor = ti.min(self.friction * depth / TANGENTIAL_RATIO / length, 1.0)
+                        if ti.static(self.friction > 0):
+                            slip = tangential(self.slip[s, q] + shift - self.point[q], normal)
+                            factor = sticking_fraction(slip, self.friction * depth / TANGENTIAL_RATIO)
                             force -= penalty * TANGENTIAL_RATIO * factor * slip
                             stiffness += (
                                 penalty
@@ -213,7 +213,7 @@ class SurfaceContacts:
     @ti.func
     def finish(self):
         """End of a substep: store the tangential slip."""
-        if ti.static(self.has_friction):
+        if ti.static(self.friction > 0):
             for q in range(self.count):
                 for s in ti.static(range(len(self.shapes))):
                     slip = tm.vec3(0.0)
@@ -232,10 +232,3 @@ class SurfaceContacts:
                 # A maximum does not depend on the order, so this atomic is deterministic.
                 ti.atomic_max(self.penetration[None], -self.shapes[s].surface(p).w)
         return self.penetration[None]
-
-
-def _by_node(nodes: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nodes (p, 8) of points, transposed: start of each node's points in a list (count + 1,), that list, and their weights."""
-    order = np.argsort(nodes.ravel(), kind="stable")
-    start = np.searchsorted(nodes.ravel()[order], np.arange(count + 1))
-    return start, order // 8, weights.ravel()[order]

@@ -4,7 +4,7 @@ docs/adding-a-tissue-model.md shows how to add one.
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import taichi as ti
@@ -58,7 +58,8 @@ class TissueModel(Protocol):
 
     ``serial``: the model is too small for more than one core of a CPU. ``EMBEDDING_CELL_RATIO``: width of the coarse tetrahedra
     that carry the image plane, over the resolution of the tissue. ``begin`` to ``project`` are ti.funcs that the solver's
-    kernels inline, so their outermost loops are parallel.
+    kernels inline, so their outermost loops are parallel. A model whose material can be changed between steps also has
+    ``set_material(young_kpa)``.
     """
 
     EMBEDDING_CELL_RATIO: ClassVar[float]
@@ -107,11 +108,3 @@ class TissueModel(Protocol):
     def counts(self) -> dict[str, int]:
         """Sizes of the model, for reports: ``particles`` or ``nodes`` first."""
         ...
-
-
-@runtime_checkable
-class MaterialModel(Protocol):
-    """A tissue model whose material can be changed between steps."""
-
-    def set_young(self, young_kpa: float) -> None:
-        """Change Young's modulus [kPa]."""

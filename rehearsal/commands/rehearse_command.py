@@ -35,7 +35,7 @@ from render.display import display_available
 from render.keys import Keys, keys_text, load_keys
 from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.scene import EMBEDDED, OPTIONS, Scene, load_scene, scene_file, with_options
-from scenes.terminal import ReportProgress, Stages
+from scenes.terminal import ReportProgress, stages
 from scenes.tissue import TISSUES
 from ultrasound.probe import Probe
 
@@ -158,7 +158,7 @@ def rehearse(
     make_folder(out)
     used = start_taichi(arch)
     server = open_link(link, link_host, link_port, link_leads)
-    with Stages() as progress:
+    with stages() as progress:
         anatomy = load_anatomy(loaded, path.parent, progress)
         check_files(anatomy, before.title, probe, log, track_file, track, plan)
         started, chosen = perf_counter(), ""

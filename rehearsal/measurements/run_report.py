@@ -90,7 +90,7 @@ def summary(report: dict) -> str:
     shown = f"image {report['picture']}, B-mode at detail level {report['detail_level']}"
     return "\n".join(
         [
-            f"model     {TISSUES[report['model']].REPORTED.format(**report)}, {report['tetrahedra']} tetrahedra",
+            f"model     {TISSUES[report['model']].report_line.format(**report)}, {report['tetrahedra']} tetrahedra",
             f"step      1/{1 / report['time_step_s']:.0f} s in {counted(report['substeps'], 'substep')} of "
             f"{counted(report['iterations'], 'iteration')}",
             f"speed     {times} (medians of {report['steps']}) on {report['arch']}; built in {report['build_s']:.1f} s",

@@ -71,5 +71,5 @@ def trial_ms(rehearsal: Rehearsal) -> float:
 
 def described(setup: Setup) -> str:
     """Settings as text."""
-    size = f"{setup.tissue.PIECES} of {setup.size_mm:g} mm"
+    size = f"{setup.tissue.piece_name} of {setup.size_mm:g} mm"
     return f"{setup.model}, {size}, {setup.substeps} x {setup.iterations} iterations"

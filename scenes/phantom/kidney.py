@@ -7,7 +7,6 @@ The kidney is built in a *kidney frame* (u, v, w) [mm]: w along the long axis to
 the hilum, v to the anterior face. The frame is bent so that both poles lean to the hilum: the bean.
 """
 
-from dataclasses import dataclass
 from enum import IntEnum
 from itertools import combinations, pairwise
 
@@ -17,9 +16,7 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from scenes.phantom.abdomen import (
-    HU_ARTERY,
-    HU_FAT,
-    HU_VEIN,
+    HU,
     ORIGIN,
     SPACING,
     Canvas,
@@ -37,39 +34,16 @@ NOISE_CORRELATION = 0.6
 
 
 class Label(IntEnum):
-    """Tissue of a voxel; the union of 1..6 is the organ, one solid without cavities."""
+    """Tissue of a voxel, by its name in ultrasound/tissues.toml; the union of 1..6 is the organ, one solid without cavities."""
 
     OUTSIDE = 0
     CORTEX = 1
     MEDULLA = 2
-    SINUS_FAT = 3
-    COLLECTING_SYSTEM = 4
+    SINUS = 3
+    URINE = 4
     VESSEL = 5
     TUMOUR = 6
 
-
-# The tissues of ultrasound/tissues.toml.
-TISSUE_OF_LABEL: dict[int, str] = {
-    Label.CORTEX: "cortex",
-    Label.MEDULLA: "medulla",
-    Label.SINUS_FAT: "sinus",
-    Label.COLLECTING_SYSTEM: "urine",
-    Label.VESSEL: "vessel",
-    Label.TUMOUR: "tumour",
-}
-
-
-# Attenuation [HU] late in the corticomedullary phase (about 70 s after injection): the medulla has begun to
-# enhance, nothing is excreted yet. Measured for comparison in CRLM-CT-1004 (TCIA, somewhat later): renal
-# parenchyma 200 in the median, noise SD 9 to 10.
-HU_CORTEX = 185.0
-HU_MEDULLA = 108.0
-HU_URINE = 8.0
-HU_TUMOUR = 90.0
-HU_NECROSIS = 28.0
-HU_PSEUDOCAPSULE = 48.0
-HU_FASCIA = 10.0
-HU_SEPTA = -48.0
 
 # Half-axes along (u, v, w): a kidney of 11 x 6 x 4.5 cm, blunter at the poles than an ellipsoid.
 KIDNEY_CENTRE = np.array([66.0, 30.0, -328.0])
@@ -138,14 +112,9 @@ def _site_on_hull(angle: float, latitude: float) -> np.ndarray:
 PYRAMID_BASES = np.array([_site_on_hull(*site) for site in PYRAMID_SITES])
 
 
-def _papillae() -> np.ndarray:
-    """Tips of the pyramids on the sinus, kidney frame [mm], shape (pyramids, 3)."""
-    direction = PYRAMID_BASES / KIDNEY_HALF_AXES
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return SINUS_CENTRE + SINUS_HALF_AXES * direction
-
-
-PAPILLAE = _papillae()
+_DIRECTIONS = PYRAMID_BASES / KIDNEY_HALF_AXES
+# Tips of the pyramids on the sinus, kidney frame [mm], shape (pyramids, 3).
+PAPILLAE = SINUS_CENTRE + SINUS_HALF_AXES * (_DIRECTIONS / np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True))
 PYRAMID_AXES = (PYRAMID_BASES - PAPILLAE) / np.linalg.norm(PYRAMID_BASES - PAPILLAE, axis=1, keepdims=True)
 
 
@@ -174,12 +143,9 @@ def _bean(canvas: Canvas) -> np.ndarray:
 
 def _lobulation(points: np.ndarray) -> np.ndarray:
     """Depth [mm] of the furrows between the renal lobes, one lobe a pyramid, at points near the surface."""
-    nearest = np.full((2, len(points)), np.inf, dtype=np.float32)
-    for base in PYRAMID_BASES.astype(np.float32):
-        distance = np.linalg.norm(points - base, axis=1)
-        nearest[1] = np.minimum(nearest[1], np.maximum(nearest[0], distance))
-        nearest[0] = np.minimum(nearest[0], distance)
-    return np.float32(LOBULATION_DEPTH) * np.exp(-(((nearest[1] - nearest[0]) / 5) ** 2))
+    distance = np.stack([np.linalg.norm(points - base, axis=1) for base in PYRAMID_BASES.astype(np.float32)])
+    first, second = np.partition(distance, 1, axis=0)[:2]
+    return np.float32(LOBULATION_DEPTH) * np.exp(-(((second - first) / 5) ** 2))
 
 
 def _tumour(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -197,19 +163,16 @@ def _medulla(points: np.ndarray, depth: np.ndarray) -> np.ndarray:
 
     Each is a cone on its papilla. Where two meet, a column of Bertin keeps them apart.
     """
-    nearest = np.full((2, len(points)), 99.0, dtype=np.float32)
-    offset = np.zeros(len(points), dtype=np.float32)
+    cones, radii = [], []
     for tip, axis in zip(PAPILLAE.astype(np.float32), PYRAMID_AXES.astype(np.float32), strict=True):
         height = (points - tip) @ axis
-        radius = np.linalg.norm(points - tip - height[:, None] * axis, axis=1)
-        cone = np.maximum((radius - 2.2 - 0.92 * np.maximum(height, 0)) * 0.8, -1.8 - height)
-        nearest[1] = np.minimum(nearest[1], np.maximum(nearest[0], cone))
-        closer = cone < nearest[0]
-        offset[closer] = radius[closer]
-        nearest[0] = np.minimum(nearest[0], cone)
-    column = (COLUMN_THICKNESS - (nearest[1] - nearest[0])) / 2
+        radii.append(np.linalg.norm(points - tip - height[:, None] * axis, axis=1))
+        cones.append(np.maximum((radii[-1] - 2.2 - 0.92 * np.maximum(height, 0)) * 0.8, -1.8 - height))
+    first, second = np.partition(cones, 1, axis=0)[:2]
+    offset = np.choose(np.argmin(cones, axis=0), radii)
+    column = (COLUMN_THICKNESS - (second - first)) / 2
     base = CORTEX_THICKNESS + 0.022 * offset**2 - depth
-    return np.maximum(np.maximum(nearest[0], column), base)
+    return np.maximum(np.maximum(first, column), base)
 
 
 def _sinus(points: np.ndarray) -> np.ndarray:
@@ -305,76 +268,71 @@ def _paint_perirenal_space(canvas: Canvas, bean: np.ndarray, rng: np.random.Gene
     lateral = np.clip((canvas.x - KIDNEY_CENTRE[0]) * 0.09, -3.5, 2).astype(np.float32)
     fascia = bean - 8.5 - widening - lateral - 3 * canvas.waves(70, rng)
     fascia = np.maximum(fascia, wall_depth(canvas) + 2.5)
-    canvas.paint(fascia, HU_FAT)
+    canvas.paint(fascia, HU["fat"])
     for wavelength, thickness in ((44, 0.04), (30, 0.03)):
         sheet = np.abs(canvas.waves(wavelength, rng)) / 6 - np.float32(thickness)
-        canvas.paint(np.maximum(sheet * np.float32(0.6 * wavelength), fascia), HU_SEPTA)
-    canvas.paint(np.abs(fascia) - 0.35, HU_FASCIA)
+        canvas.paint(np.maximum(sheet * np.float32(0.6 * wavelength), fascia), HU["septa"])
+    canvas.paint(np.abs(fascia) - 0.35, HU["fascia"])
 
 
-@dataclass
-class _Parts:
-    """Distances [mm] to the parts of the kidney: vessels and urine on the canvas, others at voxels `near`."""
-
-    near: tuple[np.ndarray, ...]
-    points: np.ndarray  # kidney frame [mm], shape (n, 3)
-    hull: np.ndarray
-    sinus: np.ndarray
-    medulla: np.ndarray
-    tumour: np.ndarray
-    necrosis: np.ndarray
-    urine: np.ndarray
-    arteries: np.ndarray
-    veins: np.ndarray
-
-
-def _kidney_parts(canvas: Canvas, bean: np.ndarray, rng: np.random.Generator) -> _Parts:
-    near = np.nonzero(bean < 12)
-    points = np.stack([canvas.x[near[2]], canvas.y[near[1]], canvas.z[near[0]]], axis=1)
-    points = to_kidney(points).astype(np.float32)
+def _kidney_parts(
+    canvas: Canvas, bean: np.ndarray, near: tuple, points: np.ndarray, rng: np.random.Generator
+) -> dict[str, np.ndarray]:
+    """Distances [mm] to the parts: of vessels and urine on the canvas, of the others at voxels ``near``, with these points."""
     tumour, necrosis = _tumour(points, rng)
     kidney = bean[near] + _lobulation(points)
-    sinus = np.maximum(_sinus(points), kidney - 0.5)
-    medulla = np.maximum(_medulla(points, -kidney), kidney + 1)
     urine, arteries, veins = (canvas.tube_distance(t()) for t in (_urinary_tract, _arteries, _veins))
     pelvis = ellipsoid(points, PELVIS, np.array([8.5, 4.2, 8.5]))
     urine[near] = smooth_min(smooth_min(urine[near], pelvis, 3.0), _calyces(points), 1.5)
-    hull = smooth_min(kidney, tumour, 5.0)
-    return _Parts(near, points, hull, sinus, medulla, tumour, necrosis, urine, arteries, veins)
+    return dict(
+        hull=smooth_min(kidney, tumour, 5.0),
+        sinus=np.maximum(_sinus(points), kidney - 0.5),
+        urine=urine,
+        medulla=np.maximum(_medulla(points, -kidney), kidney + 1),
+        veins=veins,
+        arteries=arteries,
+        tumour=tumour,
+        viable=tumour + 1.1,
+        necrosis=necrosis,
+    )
 
 
-def _paint_kidney(canvas: Canvas, parts: _Parts, rng: np.random.Generator) -> None:
+def _paint_kidney(
+    canvas: Canvas, near: tuple, points: np.ndarray, parts: dict[str, np.ndarray], rng: np.random.Generator
+) -> None:
     """Draw the kidney, its vessels and ureter up to the canvas's border; each over those before it."""
-    points, near = parts.points, parts.near
     modulation = 5 * waves_at(points, 26, rng) + 4 * waves_at(points, 9, rng)
-    canvas.paint(parts.hull, HU_CORTEX + modulation, near)
-    canvas.paint(parts.sinus, HU_FAT + 6, near)
-    canvas.paint(parts.urine, HU_URINE)
-    canvas.paint(parts.medulla, HU_MEDULLA + modulation, near)
-    canvas.paint(parts.veins, HU_VEIN)
-    canvas.paint(parts.arteries, HU_ARTERY)
-    canvas.paint(parts.tumour, HU_PSEUDOCAPSULE, near)
-    viable = HU_TUMOUR + 9 * waves_at(points, 12, rng) + 6 * waves_at(points, 6, rng)
-    canvas.paint(parts.tumour + 1.1, viable, near)
-    canvas.paint(parts.necrosis, HU_NECROSIS, near)
+    values = dict(
+        hull=HU["cortex"] + modulation,
+        sinus=HU["fat"] + 6,
+        urine=HU["urine"],
+        medulla=HU["medulla"] + modulation,
+        veins=HU["vein"],
+        arteries=HU["artery"],
+        tumour=HU["pseudocapsule"],
+        viable=HU["tumour"] + 9 * waves_at(points, 12, rng) + 6 * waves_at(points, 6, rng),
+        necrosis=HU["necrosis"],
+    )
+    for part, hu in values.items():
+        canvas.paint(parts[part], hu, near if parts[part].ndim == 1 else (...,))
 
 
-def _labels(parts: _Parts) -> np.ndarray:
+def _labels(near: tuple, points: np.ndarray, parts: dict[str, np.ndarray]) -> np.ndarray:
     """Label of each voxel, uint8, shape (z, y, x)."""
-    near, inside = parts.near, parts.hull < 0
-    gate = (parts.points[:, 0] < -12) & (np.abs(parts.points[:, 2]) < 22)
-    with_stubs = inside | (gate & (parts.hull < HILAR_STUB))
+    inside = parts["hull"] < 0
+    gate = (points[:, 0] < -12) & (np.abs(points[:, 2]) < 22)
+    with_stubs = inside | (gate & (parts["hull"] < HILAR_STUB))
     tissue = np.where(inside, np.uint8(Label.CORTEX), np.uint8(Label.OUTSIDE))
-    tissue[inside & (parts.sinus < 0)] = Label.SINUS_FAT
-    tissue[with_stubs & (parts.urine[near] < 0)] = Label.COLLECTING_SYSTEM
-    tissue[inside & (parts.medulla < 0)] = Label.MEDULLA
-    tissue[with_stubs & (np.minimum(parts.arteries, parts.veins)[near] < 0)] = Label.VESSEL
-    tissue[parts.tumour < 0] = Label.TUMOUR
-    labels = np.zeros(parts.urine.shape, dtype=np.uint8)
+    tissue[inside & (parts["sinus"] < 0)] = Label.SINUS
+    tissue[with_stubs & (parts["urine"][near] < 0)] = Label.URINE
+    tissue[inside & (parts["medulla"] < 0)] = Label.MEDULLA
+    tissue[with_stubs & (np.minimum(parts["arteries"], parts["veins"])[near] < 0)] = Label.VESSEL
+    tissue[parts["tumour"] < 0] = Label.TUMOUR
+    labels = np.zeros(parts["urine"].shape, dtype=np.uint8)
     labels[near] = tissue
     # Fat between the stubs of the hilar vessels is added to the solid, which would otherwise have slits and cavities.
     closed = ndimage.binary_fill_holes(ndimage.binary_closing(labels > 0, iterations=3))
-    tissue[gate & closed[near] & (tissue == Label.OUTSIDE)] = Label.SINUS_FAT
+    tissue[gate & closed[near] & (tissue == Label.OUTSIDE)] = Label.SINUS
     labels[near] = tissue
     return labels
 
@@ -402,6 +360,9 @@ def make_phantom() -> tuple[sitk.Image, sitk.Image]:
     paint_abdomen(canvas, rng)
     bean = _bean(canvas)
     _paint_perirenal_space(canvas, bean, rng)
-    parts = _kidney_parts(canvas, bean, rng)
-    _paint_kidney(canvas, parts, rng)
-    return _image(_scan(canvas.hu, rng)), _image(_labels(parts))
+    near = np.nonzero(bean < 12)
+    points = np.stack([canvas.x[near[2]], canvas.y[near[1]], canvas.z[near[0]]], axis=1)
+    points = to_kidney(points).astype(np.float32)
+    parts = _kidney_parts(canvas, bean, near, points, rng)
+    _paint_kidney(canvas, near, points, parts, rng)
+    return _image(_scan(canvas.hu, rng)), _image(_labels(near, points, parts))

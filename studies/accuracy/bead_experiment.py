@@ -101,12 +101,12 @@ class BeadExperiment:
 
     def size(self, setup: Setup) -> dict[str, float]:
         """Size of the model, under the names of a report: ``radius_mm`` or ``cell_mm``, ``particles`` or ``nodes``."""
-        return {setup.tissue.SIZE: setup.size_mm, **self.model.counts()}
+        return {setup.tissue.size_key: setup.size_mm, **self.model.counts()}
 
     def describe(self, setup: Setup) -> str:
         """Size and settings of the model, in words."""
         tissue = tissue_of(self.case, setup)
-        return tissue.REPORTED.format(**tissue.model_dump(), **self.model.counts())
+        return tissue.report_line.format(**tissue.model_dump(), **self.model.counts())
 
     def _step_settings(self, setup: Setup) -> StepSettings:
         x, y, z = self.case.gravity.tolist()

@@ -19,10 +19,10 @@ def changes_of(setup: Setup) -> dict[str, Setup]:
 
     With half the time step the press has the same duration. Raises SetupError where a changed value is out of range.
     """
-    pieces = setup.tissue.PIECES
+    pieces = setup.tissue.piece_name
     if not LEAST_MM <= setup.size_mm <= MOST_MM:
         raise SetupError(
-            f"--check: {pieces} a third larger and smaller need {option_of(setup.tissue.SIZE)} from {LEAST_MM:g} to {MOST_MM:g}"
+            f"--check: {pieces} a third larger and smaller need {option_of(setup.tissue.size_key)} from {LEAST_MM:g} to {MOST_MM:g}"
         )
     if setup.iterations > MOST_ITERATIONS:
         raise SetupError(f"--check: twice the iterations needs --iterations of {MOST_ITERATIONS} at most")

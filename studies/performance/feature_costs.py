@@ -87,7 +87,7 @@ OF_PARTICLES = (
     Feature("scaled masses", Options(mass_scaling_per_mm=0.02), BASE),
 )
 FEATURES = {
-    model: (*EVERYWHERE, *OF_PARTICLES) if section.CAN_TOUCH_ITSELF else EVERYWHERE
+    model: (*EVERYWHERE, *OF_PARTICLES) if section.supports_self_contact else EVERYWHERE
     for model, section in TISSUES.items()
 }
 

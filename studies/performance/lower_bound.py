@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.stopwatch import timed
 from sim.body import ParticleBody
-from sim.sampling import Clusters
 from sim.shape_matching import ShapeMatching
 from sim.solver import Solver
 from ultrasound.probe_manipulator import poses_between
@@ -35,14 +35,13 @@ class NoBound(RuntimeError):
     """A reference is not available on this machine; the message is one line."""
 
 
-def memberships_of(model: ShapeMatching) -> tuple[Clusters, Clusters]:
+def memberships_of(model: ShapeMatching) -> tuple[csr_array, csr_array]:
     """The particles of each cluster, and the clusters of each particle."""
-    patches = model.patches
-    rows = [patches.clusters.members[a:b] for a, b in pairwise(patches.clusters.offsets)]
-    of_particle = [rows[p] for p in patches.of_particles()]
-    offsets = np.concatenate([[0], np.cumsum([len(row) for row in of_particle])]).astype(np.int32)
-    particles = Clusters(offsets, np.concatenate(of_particle).astype(np.int32))
-    return particles.transposed(model.count), particles
+    particles = model.patches.clusters[model.patches.of_particles()]
+    clusters = particles.T.tocsr()
+    for rows in (clusters, particles):  # C reads 32 bits
+        rows.indptr, rows.indices = rows.indptr.astype(np.int32), rows.indices.astype(np.int32)
+    return clusters, particles
 
 
 class Bound:
@@ -61,13 +60,13 @@ class Bound:
         self._match = ctypes.CDLL(library).match
         clusters, particles = memberships_of(model)
         rest = model.body.rest_points.astype(np.float32)
-        weight = (1 / np.diff(particles.offsets)).astype(np.float32)
+        weight = (1 / np.diff(particles.indptr)).astype(np.float32)
         frames = np.tile(np.eye(3, dtype=np.float32).ravel(), (model.count, 1))
         self.x = rest.copy()
         self.x += 0.01 * np.sin(self.x[:, [1, 2, 0]])
         centres, translations = model.rest_centres.astype(np.float32), np.zeros((model.count, 3), np.float32)
-        of_clusters = (len(clusters), clusters.offsets, clusters.members)
-        of_particles = (len(rest), particles.offsets, particles.members)
+        of_clusters = (clusters.shape[0], clusters.indptr, clusters.indices)
+        of_particles = (len(rest), particles.indptr, particles.indices)
         arrays = (rest, centres, weight, frames, translations, self.x)
         self._arguments = [
             value if isinstance(value, int) else value.ctypes.data_as(ctypes.c_void_p)
@@ -98,13 +97,13 @@ class Pypbd:
         self._stepper.setValueUInt(pypbd.TimeStepController.NUM_SUB_STEPS, 1)
         pypbd.TimeManager.getCurrent().setTimeStepSize(1 / 180)
         clusters, particles = memberships_of(model)
-        shared = np.diff(particles.offsets)
+        shared = np.diff(particles.indptr)
         data = self._model.getParticles()
         for i, point in enumerate(model.body.rest_points):
             data.addVertex(point)
             data.setMass(i, 1.0)
-        for first, last in pairwise(clusters.offsets):
-            members = clusters.members[first:last]
+        for first, last in pairwise(clusters.indptr):
+            members = clusters.indices[first:last]
             self._model.addShapeMatchingConstraint(
                 len(members), members.tolist(), shared[members].tolist(), STIFFNESS
             )

@@ -143,7 +143,7 @@ def _filled(
     tissue = scene_of(load_scene(PAPER), setup).tissue
     scaling = np.log(subject.mass_ratio) / np.ptp(mesh.bounds[:, 2])
     section = SolverSection(mass_scaling_per_mm=min(float(scaling), 1.0))
-    contact = Contact(particles=subject.kind == "two" and tissue.CAN_TOUCH_ITSELF)
+    contact = Contact(particles=subject.kind == "two" and tissue.supports_self_contact)
     return build_solver(mesh, tissue, shapes, tool, contact, section), step_settings(tissue, section)
 
 

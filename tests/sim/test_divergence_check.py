@@ -286,19 +286,19 @@ def test_a_body_on_few_contact_points_is_at_rest(one_device):
 @pytest.mark.parametrize(
     ("changed", "named"),
     [
-        (dict(time_step_s=0.0), "time_step_s is 0.0"),
-        (dict(time_step_s=float("nan")), "time_step_s is nan"),
-        (dict(iterations=0), "iterations is 0"),
-        (dict(substeps=101), "substeps is 101: expected 1 to 100"),
-        (dict(relaxation_factor=2.1), "relaxation_factor is 2.1"),
-        (dict(stiffness=-0.1), "stiffness is -0.1: expected 0 to 1"),
-        (dict(gravity=(0.0, float("inf"), 0.0)), "gravity is"),
+        (dict(time_step_s=0.0), "time_step_s.*greater than or equal"),
+        (dict(time_step_s=float("nan")), "time_step_s.*finite"),
+        (dict(iterations=0), "iterations.*greater"),
+        (dict(substeps=101), "substeps.*less than or equal to 100"),
+        (dict(relaxation_factor=2.1), "relaxation_factor.*less"),
+        (dict(stiffness=-0.1), "stiffness.*greater than or equal to 0"),
+        (dict(gravity=(0.0, float("inf"), 0.0)), "gravity.*finite"),
     ],
 )
 def test_settings_out_of_range_are_named(kept, ball, changed, named):
     solver = kept(solver_of, "shape-matching", ball, floor)
     before = position(solver)
-    with pytest.raises(ValueError, match=named.replace("(", r"\(")):
+    with pytest.raises(ValueError, match=f"(?s){named}"):
         solver.step(StepSettings(**changed))
     assert (position(solver) == before).all()
 

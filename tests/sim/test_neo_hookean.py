@@ -113,7 +113,7 @@ def test_force_and_hessian_are_the_energys_derivatives(one_device, noise_mm):
 
 def test_youngs_modulus_changes_the_penalty_stiffness_and_not_poissons_ratio(one_device, block):
     model = tissue_of(block, 8.0, [Plane(np.array([0.0, 0.0, 1.0]), -8.0)], poisson=0.3).model
-    model.set_young(2 * YOUNG_KPA)
+    model.set_material(2 * YOUNG_KPA)
     found = model.mu[None], model.lambda_[None], model.contacts.stiffness[None]
     assert found == pytest.approx(
         [2 * each for each in (*lame_parameters(0.3), YOUNG_KPA / PENALTY_DEPTH_MM)], rel=1e-6

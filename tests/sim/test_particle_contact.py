@@ -34,7 +34,7 @@ def scattered(count: int = 4000, reach: float = 16.0) -> np.ndarray:
 
 
 def begin(solver: Solver, gravity: list[float], dt: float = 0.0, stabilisations: int = 0) -> None:
-    solver.launch_start(0, dt, *gravity, 0.0, stabilisations)
+    solver.launch("start", 0, 1.0, dt, *gravity, 0.0, stabilisations, 1.0)
 
 
 def test_plane(one_device):
@@ -267,7 +267,7 @@ def oracle_of_pushes(solver: Solver, x: np.ndarray, motion: np.ndarray, iteratio
         pushed, rubbed = dict.fromkeys(shapes, 0.0), {s: np.zeros(3) for s in shapes}
         for _ in range(iterations):
             depth = {s: max(plane[i, s, 3] - plane[i, s, :3] @ x[i], 0.0) for s in shapes}
-            active = sum(depth[s] > 0 or (contacts.has_friction and pushed[s] > 0) for s in shapes)
+            active = sum(depth[s] > 0 or (contacts.friction > 0 and pushed[s] > 0) for s in shapes)
             share, change = min(factor / max(active, 1), 1.0), np.zeros(3)
             several += active > 1
             for s in shapes:

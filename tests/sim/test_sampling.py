@@ -9,12 +9,12 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from sim.lattice import fill_with_cells
-from sim.sampling import SamplingError, fill_body, occupied_voxels, sample_clusters, sample_particles
+from sim.sampling import SamplingError, fill_body, occupied_voxels, sample_clusters
 
 
 def test_particles_keep_their_distance_and_leave_no_room(ball):
     radius, factor = 2.0, 4
-    particles = sample_particles(ball.vertices, ball.faces, radius, factor)
+    particles = fill_body(ball, radius, factor).particles
     nearest = cKDTree(particles).query(particles, 2)[0][:, 1]
     assert nearest.min() >= radius - 1e-9
     origin, occupied = occupied_voxels(ball.vertices, ball.faces, radius / factor)
@@ -42,49 +42,47 @@ def test_voxels_are_centred_in_the_surfaces_bounds(ball):
 
 def test_surface_samples_are_as_many_as_asked_for(ball):
     # So few that none is within the radius of another.
-    particles = sample_particles(ball.vertices, ball.faces, 0.5, 1, surface_samples_per_mm2=0.01)
+    particles = fill_body(ball, 0.5, 1, surface_samples_per_mm2=0.01).particles
     on = np.abs(igl.signed_distance(particles, ball.vertices, ball.faces)[0]) < 1e-6
     assert on.sum() == int(0.01 * ball.area) == 18
 
 
 def test_surface_samples_put_particles_on_the_surface(ball):
-    particles = sample_particles(ball.vertices, ball.faces, 2.0, 4, surface_samples_per_mm2=2.0)
+    particles = fill_body(ball, 2.0, 4, surface_samples_per_mm2=2.0).particles
     depth = np.abs(igl.signed_distance(particles, ball.vertices, ball.faces)[0])
     assert (depth < 1e-6).sum() > 200
     assert cKDTree(particles).query(particles, 2)[0][:, 1].min() >= 2.0 - 1e-9
 
 
 def test_same_surface_same_particles(ball):
-    a = sample_particles(ball.vertices, ball.faces, 2.0, 4, surface_samples_per_mm2=1.0)
-    b = sample_particles(ball.vertices, ball.faces, 2.0, 4, surface_samples_per_mm2=1.0)
+    a = fill_body(ball, 2.0, 4, surface_samples_per_mm2=1.0).particles
+    b = fill_body(ball, 2.0, 4, surface_samples_per_mm2=1.0).particles
     assert np.array_equal(a, b)
 
 
 def test_clusters_cover_and_overlap(ball):
-    particles = sample_particles(ball.vertices, ball.faces, 1.5, 4)
+    particles = fill_body(ball, 1.5, 4).particles
     spacing = 3.33 * 1.5
     clusters = sample_clusters(particles, spacing)
-    shared = np.bincount(clusters.members, minlength=len(particles))
+    shared = np.bincount(clusters.indices, minlength=len(particles))
     assert shared.min() >= 1 and shared.mean() > 2
-    for c in range(len(clusters)):
-        row = clusters.members[clusters.offsets[c] : clusters.offsets[c + 1]]
+    for c in range(clusters.shape[0]):
+        row = clusters.indices[clusters.indptr[c] : clusters.indptr[c + 1]]
         assert (np.diff(row) > 0).all()
         members = particles[row]
         assert cKDTree(members).query_ball_point(members, spacing, return_length=True).max() == len(members)
 
 
 def test_transposed_clusters_have_the_same_memberships(ball):
-    particles = sample_particles(ball.vertices, ball.faces, 2.0, 4)
+    particles = fill_body(ball, 2.0, 4).particles
     clusters = sample_clusters(particles, 6.0)
-    seen = clusters.transposed(len(particles))
+    seen = clusters.T.tocsr()
     pairs = {
         (c, i)
-        for c in range(len(clusters))
-        for i in clusters.members[clusters.offsets[c] : clusters.offsets[c + 1]]
+        for c in range(clusters.shape[0])
+        for i in clusters.indices[clusters.indptr[c] : clusters.indptr[c + 1]]
     }
-    back = {
-        (c, i) for i in range(len(particles)) for c in seen.members[seen.offsets[i] : seen.offsets[i + 1]]
-    }
+    back = {(c, i) for i in range(len(particles)) for c in seen.indices[seen.indptr[i] : seen.indptr[i + 1]]}
     assert pairs == back
 
 
@@ -97,16 +95,16 @@ def test_a_body_touches_where_its_surface_does(ball):
 
 def test_a_radius_too_large_is_refused(ball):
     with pytest.raises(SamplingError, match="choose a smaller radius"):
-        sample_particles(ball.vertices, ball.faces, 30.0)
+        fill_body(ball, 30.0)
 
 
 @pytest.mark.parametrize("radius, particles", [(2.2, 15149), (3.3, 4614)])
 def test_counts_on_a_real_kidney_are_those_of_the_papers_scale(data, radius, particles):
     # The paper's Fig. 5 has about 15 000 particles and 400 clusters at 2.2 mm for a kidney of this size.
     kidney = trimesh.load_mesh(data / "truth" / "kits040" / "kidney.stl")
-    found = sample_particles(kidney.vertices, kidney.faces, radius)
+    found = fill_body(kidney, radius).particles
     assert len(found) == pytest.approx(particles, rel=0.01)
-    assert 100 < len(sample_clusters(found, 3.33 * radius)) < 450
+    assert 100 < sample_clusters(found, 3.33 * radius).shape[0] < 450
 
 
 def test_too_little_memory_is_refused_with_the_amount_needed(ball, monkeypatch):
@@ -118,9 +116,9 @@ def test_too_little_memory_is_refused_with_the_amount_needed(ball, monkeypatch):
     with pytest.raises(
         SamplingError, match=r"of 2 mm radius need 0\.0 GB .*, and 0\.0 GB are free: choose larger"
     ):
-        sample_particles(ball.vertices, ball.faces, 2.0, 4)
+        fill_body(ball, 2.0, 4)
     free(80 * 48**3)
-    assert len(sample_particles(ball.vertices, ball.faces, 2.0, 4)) > 100
+    assert len(fill_body(ball, 2.0, 4).particles) > 100
     free(9000 * ball.volume / 8 - 1)
     with pytest.raises(SamplingError, match="cells of 2 mm need"):
         fill_with_cells(ball, 2.0)

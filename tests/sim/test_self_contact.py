@@ -71,7 +71,7 @@ def test_neighbours_are_all_that_are_near_in_ascending_order(kept):
     count, rows = array_of(solver.self_contacts.neighbour_count), array_of(solver.self_contacts.neighbour)
     apart = np.linalg.norm(x[:, None] - x[None], axis=2)
     patches = solver.model.patches
-    of_patch = [set(patches.clusters.members[a:b]) for a, b in pairwise(patches.clusters.offsets)]
+    of_patch = [set(patches.clusters.indices[a:b]) for a, b in pairwise(patches.clusters.indptr)]
     clusters = [of_patch[p] for p in patches.of_particles()]
     for i in range(len(x)):
         near = [

@@ -43,7 +43,7 @@ def oracle(model: ShapeMatching, x: np.ndarray, step: float, mass: np.ndarray | 
     of_patch = np.repeat(np.arange(len(patches)), patches.cluster_counts)
     total = np.zeros_like(x)
     for c in range(model.count):
-        i = np.flatnonzero(np.isin(patches.of_particles(), of_patch[patches.clusters.members == c]))
+        i = np.flatnonzero(np.isin(patches.of_particles(), of_patch[patches.clusters.indices == c]))
         m = weight[i, None]
         centre, centre0 = (m * x[i]).sum(0) / m.sum(), (m * rest[i]).sum(0) / m.sum()
         u, _, vt = np.linalg.svd((m * (x[i] - centre)).T @ (rest[i] - centre0))
@@ -188,9 +188,9 @@ def test_patches_have_each_membership_of_the_clusters(block):
     assert sorted(map(tuple, arranged.particles)) == sorted(map(tuple, rest.particles))
     clusters = sample_clusters(rest.particles, 3.33 * 2.0)
     wanted = {
-        frozenset(map(tuple, rest.particles[clusters.members[a:b]])) for a, b in pairwise(clusters.offsets)
+        frozenset(map(tuple, rest.particles[clusters.indices[a:b]])) for a, b in pairwise(clusters.indptr)
     }
-    rows = [patches.clusters.members[a:b] for a, b in pairwise(patches.clusters.offsets)]
+    rows = [patches.clusters.indices[a:b] for a, b in pairwise(patches.clusters.indptr)]
     found: dict[int, set] = {}
     for particle, p in zip(arranged.particles, patches.of_particles(), strict=True):
         for c in rows[p]:

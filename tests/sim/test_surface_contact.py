@@ -56,7 +56,7 @@ def node_forces(contacts: ti.template(), out: ti.template()):
 
 def contact_force(solver, settings) -> np.ndarray:
     """Sum (3,) [uN] of the contact forces at the body's current state."""
-    solver.launch_start(0, settings.time_step_s, *settings.gravity, settings.damping, 0)
+    solver.launch("start", 0, 1.0, settings.time_step_s, *settings.gravity, settings.damping, 0, 1.0)
     out = ti.Vector.field(3, ti.f32, solver.body.count)
     node_forces(solver.contacts, out)
     return array_of(out).astype(float).sum(axis=0)
@@ -137,7 +137,7 @@ def test_a_body_from_outside_a_distance_grid_touches_its_shape(one_device, dome)
     # Its lowest points, at z = -6, are 15, then 1 mm above the table, whose distances are known 6 mm around it.
     for above, is_near in ((15.0, False), (1.0, True), (15.0, False)):
         put(solver.model, solver.body.rest_points + [0.0, 0.0, above])
-        solver.launch_start(0, 1e-3, 0.0, 0.0, 0.0, 0.0, 0)
+        solver.launch("start", 0, 1.0, 1e-3, 0.0, 0.0, 0.0, 0.0, 0, 1.0)
         assert (array_of(solver.contacts.near) > 0).any() == is_near
 
 

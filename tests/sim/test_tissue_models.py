@@ -22,7 +22,6 @@ from sim.fields import array_of
 from sim.shapes import ConvexTool, Plane
 from sim.skinning import Skin
 from sim.solver import Solver, SolverState, StepSettings
-from sim.tissue_model import MaterialModel
 
 G, RADIUS_MM = 9810.0, 12.0
 # Float32 keeps places up to 16 mm from the origin so well.
@@ -130,10 +129,12 @@ def test_it_reports_its_size(free):
     first, count = next(iter(free.solver.model.counts().items()))
     counts = free.solver.model.counts()
     assert (
-        first in ("particles", "nodes") and count == free.solver.body.count and free.tissue.PIECES in counts
+        first in ("particles", "nodes")
+        and count == free.solver.body.count
+        and free.tissue.piece_name in counts
     )
-    assert str(count) in free.tissue.REPORTED.format(**free.tissue.model_dump(), **counts)
-    finer = tissue_of(free.model, **{free.tissue.SIZE: 0.8 * free.tissue.size_mm})
+    assert str(count) in free.tissue.report_line.format(**free.tissue.model_dump(), **counts)
+    finer = tissue_of(free.model, **{free.tissue.size_key: 0.8 * free.tissue.size_mm})
     assert embedding_cell_mm(finer) == pytest.approx(0.8 * embedding_cell_mm(free.tissue))
     # Its distances are known beyond the 24 mm of the ball.
     assert min(static_shape(free.mesh, free.tissue).shape) > 26
@@ -268,11 +269,10 @@ def test_it_stays_finite_under_extreme_states(laid, abuse):
 def test_a_stiffer_material_deforms_less(laid):
     if "young_kpa" not in TISSUES[laid.model].model_fields:
         pytest.skip("a model without a Young's modulus")
-    assert isinstance(laid.solver.model, MaterialModel)
     settings, heights = laid.settings(G, damping=12.0), []
     for young_kpa in (3.0, 30.0, laid.tissue.young_kpa):
         laid.solver.restore(laid.built)
-        laid.solver.model.set_young(young_kpa)
+        laid.solver.model.set_material(young_kpa)
         laid.press(settings, AWAY_MM, AWAY_MM, 60)
         heights.append(np.ptp(laid.surface()[:, 2]))
     assert heights[0] < heights[2] < heights[1]

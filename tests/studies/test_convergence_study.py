@@ -27,7 +27,7 @@ def test_each_change_is_of_one_setting(model):
         name: {key for key, value in values_of(changed).items() if values_of(setup)[key] != value}
         for name, changed in changes_of(setup).items()
     }
-    size = setup.tissue.SIZE
+    size = setup.tissue.size_key
     assert list(different.values()) == [
         {"time_step_s", "warm_up_steps", "stage_steps"},
         {"iterations"},

@@ -1,6 +1,7 @@
 """The slice: at rest the CT itself, deformed the analytic pull-back; the embedding against brute force."""
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -286,10 +287,11 @@ def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(kept
     matrices = [
         ti.Matrix(m.tolist()) for m in (np.linalg.inv(plane.world_from_plane), plane.world_from_plane)
     ]
-    for serial in (False, True):
-        cut.plane.owner.fill(-1)
-        embedding._locate(serial, *matrices, cut.plane.pixel_mm, cut.plane.first_mm, cut.plane.owner)
-        assert np.array_equal(array_of(cut.plane.owner), owner)
+    other = copy(embedding)
+    other.serial = not embedding.serial
+    cut.plane.owner.fill(-1)
+    other.locate_on_plane(*matrices, cut.plane.pixel_mm, cut.plane.first_mm, cut.plane.owner)
+    assert np.array_equal(array_of(cut.plane.owner), owner)
 
 
 @pytest.mark.parametrize("squash", [(1, 1, 0), (1, 0, 0), (0, 0, 0), (1, 1, -1), (1, 1, 1e-6)])
