@@ -13,10 +13,9 @@ from scenes.patients.moulded_support import mould
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.ct_files import open_ct
 
+# The left kidney of the first is imported in test_app.py.
 REAL = [
     ("crlm_1004", "crlm_1004_labels/kidneys_provisional.nii.gz", 1, "right", 108.8),
-    ("crlm_1004", "crlm_1004_labels/kidneys_provisional.nii.gz", 2, "left", 125.6),
-    ("totalseg/ct.nii.gz", "totalseg/kidneys.nii.gz", 1, "left", 138.9),
     ("totalseg/ct.nii.gz", "totalseg/kidneys.nii.gz", 2, "right", 188.8),
 ]
 
