@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csc_matrix
+from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import splu
 
 from studies.reference.fem_solid import FemSolid
@@ -71,14 +71,11 @@ class Equilibrium:
         forces = sum(np.linalg.norm(part, axis=1).sum() for part in (self.load, reactions, *pushes))
         return Balance(np.where(self.fixed, 0.0, residual), float(forces))
 
-    def tangent(self, displacement: np.ndarray) -> csc_matrix:
+    def tangent(self, displacement: np.ndarray) -> csc_array:
         """Derivative of the residual by the displacements [mN/mm], shape (3 nodes, 3 nodes)."""
-        blocks = self.solid.stiffness(displacement)
-        for contact in self.contacts:
-            contact.add_stiffness(displacement, blocks)
-        matrix = self.solid.assembled(blocks)
-        matrix.setdiag(matrix.diagonal() + np.repeat(self.tether_kpa_mm2 * self.solid.volume_share, 3))
-        return matrix
+        tether = diags_array(np.repeat(self.tether_kpa_mm2 * self.solid.volume_share, 3))
+        contacts = sum(contact.stiffness(displacement) for contact in self.contacts)
+        return (self.solid.stiffness(displacement) + tether - contacts).tocsc()
 
     def solve(
         self,
