@@ -110,13 +110,10 @@ def table(case: BeadCase, beads: np.ndarray) -> str:
     overall = errors.mean() / null.mean()
     rows.append(["all", None, errors.mean(), None, None, errors.max(), null.mean(), overall, None])
     related = correlation(distances[1:], errors[1:])
-    title = f"Error by distance from the probe, stages pressed; correlation {_plain(related)}:"
+    shown = "-" if related is None else f"{related:.2f}"
+    title = f"Error by distance from the probe, stages pressed; correlation {shown}:"
     bands = _bands(distances[1:].ravel(), errors[1:].ravel())
     return "\n".join([text_table(HEADERS, rows, FORMATS), "", title, *bands])
-
-
-def _plain(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
 
 
 def _bands(distances: np.ndarray, errors: np.ndarray) -> list[str]:

@@ -41,7 +41,7 @@ class MeshError(ValueError):
 class CurvedMapping(MappingIsoparametric):
     """scikit-fem's mapping, whose own inverse does not converge for points outside a curved tetrahedron; here they have nan."""
 
-    def invF(self, x: np.ndarray, tind: np.ndarray | None = None, **_: object) -> np.ndarray:
+    def invF(self, x: np.ndarray, tind: np.ndarray | None = None, **_unused: object) -> np.ndarray:
         """Reference coordinates of points x [mm], both of shape (3, tets, points)."""
         local = np.full(x.shape, 0.25)
         for _ in range(INVERSION_STEPS):
