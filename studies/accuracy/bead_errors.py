@@ -8,6 +8,7 @@ from rehearsal.configuration import Setup
 from rehearsal.result_files import counted, rounded, spread
 from studies.accuracy.bead_case import BeadCase
 from studies.accuracy.bead_experiment import BeadExperiment, BeadRun
+from studies.reference.smooth_obstacles import RoundedBox
 from studies.study_results import text_table
 
 DISTANCE_BANDS = 4
@@ -27,14 +28,9 @@ def null_errors(case: BeadCase) -> np.ndarray:
 
 def probe_distances(case: BeadCase) -> np.ndarray:
     """Distances (stages, n) [mm] of the measured beads from the probe's surface at their stage; negative inside it."""
-    core = case.size_mm / 2 - case.edge_radius_mm
-    rotation, centre = case.poses[:, None, :3, :3], case.poses[:, None, :3, 3]
-    local = np.einsum(
-        "snij,sni->snj", np.broadcast_to(rotation, (*case.measured.shape, 3)), case.measured - centre
-    )
-    beyond = np.abs(local) - core
-    outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=2)
-    return outside + np.minimum(beyond.max(axis=2), 0.0) - case.edge_radius_mm
+    box = RoundedBox(case.size_mm, case.edge_radius_mm)
+    placed = zip(case.measured, case.poses, strict=True)
+    return np.stack([box.gap((beads - pose[:3, 3]) @ pose[:3, :3]) for beads, pose in placed])
 
 
 def stage_figures(
@@ -114,13 +110,10 @@ def table(case: BeadCase, beads: np.ndarray) -> str:
     overall = errors.mean() / null.mean()
     rows.append(["all", None, errors.mean(), None, None, errors.max(), null.mean(), overall, None])
     related = correlation(distances[1:], errors[1:])
-    title = f"Error by distance from the probe, stages pressed; correlation {_plain(related)}:"
+    shown = "-" if related is None else f"{related:.2f}"
+    title = f"Error by distance from the probe, stages pressed; correlation {shown}:"
     bands = _bands(distances[1:].ravel(), errors[1:].ravel())
     return "\n".join([text_table(HEADERS, rows, FORMATS), "", title, *bands])
-
-
-def _plain(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
 
 
 def _bands(distances: np.ndarray, errors: np.ndarray) -> list[str]:

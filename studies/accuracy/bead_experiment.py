@@ -84,7 +84,9 @@ class BeadExperiment:
     def prepare(self, setup: Setup) -> StepSettings:
         """Warm up from the stress-free shape, with the probe away; return the settings of its steps."""
         restart(self.solver)
-        step, pose = self._step_settings(setup), self._away()
+        x, y, z = self.case.gravity.tolist()
+        step = replace(step_settings(tissue_of(self.case, setup), setup.solver), gravity=(x, y, z))
+        pose = self._away()
         for _ in range(setup.warm_up_steps):
             self.solver.step(step, poses_between(pose, pose, step.substeps))
         return step
@@ -107,10 +109,6 @@ class BeadExperiment:
         """Size and settings of the model, in words."""
         tissue = tissue_of(self.case, setup)
         return tissue.report_line.format(**tissue.model_dump(), **self.model.counts())
-
-    def _step_settings(self, setup: Setup) -> StepSettings:
-        x, y, z = self.case.gravity.tolist()
-        return replace(step_settings(tissue_of(self.case, setup), setup.solver), gravity=(x, y, z))
 
     def _away(self) -> np.ndarray:
         pose = self.relative(self.case.poses[0])

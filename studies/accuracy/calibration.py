@@ -57,16 +57,6 @@ class CalibrationTrial:
     held_out_mm: float
 
 
-@dataclass(frozen=True)
-class Fit:
-    """A quartic fitted to mean errors over a range of the stiffness, and its minimum there."""
-
-    polynomial: Polynomial
-    range: tuple[float, float]
-    stiffness: float
-    error_mm: float
-
-
 @dataclass
 class Calibration:
     """A search by ``workers``, and all trials of each radius, in their order.
@@ -102,10 +92,11 @@ class Calibration:
         """
 
         def errors_of(x: np.ndarray, radius: float) -> np.ndarray:
-            columns = x.reshape(len(BOUNDS), -1).T
-            return np.array(
-                [trial.fit_mm for trial in self._try_all([_setup_at(radius, *c) for c in columns])]
-            )
+            setups = [
+                setup_of(MODEL, radius_mm=radius, stiffness=a, relaxation_factor=factor, iterations=round(n))
+                for a, factor, n in x.reshape(len(BOUNDS), -1).T.tolist()
+            ]
+            return np.array([trial.fit_mm for trial in self._try_all(setups)])
 
         for radius in radii_mm:
             differential_evolution(
@@ -187,30 +178,20 @@ def search_count(cases: int, radii: int, generations: int) -> int:
     return cases * radii * (generations + 1) * POPULATION * len(BOUNDS)
 
 
-def quartic(trials: Sequence[CalibrationTrial]) -> Fit | None:
-    """The paper's smooth curve through the errors up to MOST_ERROR times the least; None where there are too few."""
+def quartic(trials: Sequence[CalibrationTrial]) -> tuple[Polynomial, float] | None:
+    """The paper's smooth curve through the errors up to MOST_ERROR times the least, over its ``domain``, and its best stiffness.
+
+    None where there are too few.
+    """
     at = np.array([(trial.setup.tissue.stiffness, trial.fit_mm) for trial in trials])
     at = at[np.isfinite(at[:, 1]) & (at[:, 1] <= MOST_ERROR * at[:, 1].min())]
     if len(np.unique(at[:, 0])) <= QUARTIC:
         return None
     polynomial = Polynomial.fit(at[:, 0], at[:, 1], QUARTIC)
-    first, last = float(at[:, 0].min()), float(at[:, 0].max())
-    stiffness = np.linspace(first, last, 1001)
-    least = np.argmin(polynomial(stiffness))
-    return Fit(polynomial, (first, last), float(stiffness[least]), float(polynomial(stiffness[least])))
-
-
-def _setup_at(radius_mm: float, stiffness: float, relaxation_factor: float, iterations: float) -> Setup:
-    return setup_of(
-        MODEL,
-        radius_mm=radius_mm,
-        stiffness=float(stiffness),
-        relaxation_factor=float(relaxation_factor),
-        iterations=round(iterations),
-    )
+    stiffness, error = polynomial.linspace(1001)
+    return polynomial, float(stiffness[error.argmin()])
 
 
 def _mean(errors: Sequence[np.ndarray], masks: Sequence[np.ndarray]) -> float:
-    return float(
-        np.mean([error[mask].mean() for error, mask in zip(errors, masks, strict=True) if mask.any()])
-    )
+    parts = zip(errors, masks, strict=True)
+    return float(np.mean([error[mask].mean() for error, mask in parts if mask.any()]))

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -152,9 +153,9 @@ def _radius(calibration: Calibration, radius: float) -> dict:
         best=_trial(best),
         quartic=fit
         and dict(
-            coefficients=fit.polynomial.convert().coef.tolist(),
-            stiffness=rounded(fit.stiffness),
-            fit_mm=rounded(fit.error_mm),
+            coefficients=fit[0].convert().coef.tolist(),
+            stiffness=rounded(fit[1]),
+            fit_mm=rounded(fit[0](fit[1])),
         ),
         trials=[_trial(trial) for trial in trials],
     )
@@ -195,9 +196,9 @@ def write_figure4(calibration: Calibration, path: Path) -> None:
         right.plot(at, [trial.held_out_mm for trial in trials], ".-", color=colour, linewidth=0.8)
         fit = quartic(trials)
         if fit is not None:
-            smooth = np.linspace(*fit.range, 200)
-            left.plot(smooth, fit.polynomial(smooth), "-", color=colour, linewidth=1)
-            left.plot(fit.stiffness, fit.error_mm, "o", color=colour, markersize=9, fillstyle="none")
+            curve, best = fit
+            left.plot(*curve.linspace(200), "-", color=colour, linewidth=1)
+            left.plot(best, curve(best), "o", color=colour, markersize=9, fillstyle="none")
     _finish(calibration, left, right, "stiffness α")
     _save(figure, path)
 
@@ -218,10 +219,7 @@ def write_search(calibration: Calibration, path: Path) -> None:
 
 def best_so_far(trials: list[CalibrationTrial]) -> list[CalibrationTrial]:
     """The best trial so far, after each trial."""
-    best: list[CalibrationTrial] = []
-    for trial in trials:
-        best.append(trial if not best or trial.fit_mm < best[-1].fit_mm else best[-1])
-    return best
+    return list(accumulate(trials, lambda *pair: min(pair, key=lambda trial: trial.fit_mm)))
 
 
 def write_figure5(calibration: Calibration, path: Path) -> None:

@@ -50,17 +50,14 @@ VARIED: dict[str, tuple[float, ...]] = {
     "latency_s": (0.05, 0.1, 0.2, 0.4),
     "lost": (0.1, 0.25, 0.5, 0.75),
 }
-HEADERS = (
-    "sweep",
-    "region",
-    "scanned, %",
-    "Dice",
-    "HD95, mm",
-    "volume, %",
-    "centroid, mm",
-    "landmarks, mm",
-)
-FORMATS = ("", "", ".0f", ".3f", ".2f", "+.1f", ".2f", ".2f")
+# The table's columns after sweep, region and scanned part: header and format of each figure of a row.
+COLUMNS = {
+    "dice": ("Dice", ".3f"),
+    "hd95_mm": ("HD95, mm", ".2f"),
+    "volume_percent": ("volume, %", "+.1f"),
+    "centroid_mm": ("centroid, mm", ".2f"),
+    "landmarks_mm": ("landmarks, mm", ".2f"),
+}
 TRACKING_ERRORS = {
     "noise_mm": "noise of the position, mm",
     "noise_deg": "noise of the angle, degrees",
@@ -233,12 +230,13 @@ def table(run: dict[str, Any]) -> str:
         f"{run['patient']}: {run['probe']} probe, {run['frames']} images {run['apart_mm']:.2f} mm apart, "
         f"voxels of {run['spacing_mm']:g} mm"
     )
-    names = ("dice", "hd95_mm", "volume_percent", "centroid_mm", "landmarks_mm")
+    headers, formats = zip(*COLUMNS.values(), strict=True)
     rows = [
-        [_named(row), row["region"], 100 * row["scanned"], *(row[name] for name in names)]
+        [_named(row), row["region"], 100 * row["scanned"], *(row[name] for name in COLUMNS)]
         for row in rows_of(run)
     ]
-    return f"{head}\n{text_table(HEADERS, rows, FORMATS)}"
+    figures = text_table(["sweep", "region", "scanned, %", *headers], rows, ["", "", ".0f", *formats])
+    return f"{head}\n{figures}"
 
 
 def _named(row: dict[str, Any]) -> str:

@@ -125,16 +125,13 @@ def _path(rehearsal: Rehearsal, depth_mm: float) -> np.ndarray:
     local = (np.asarray(rehearsal.tumour.vertices) - home[:3, 3]) @ home[:3, :3]  # type: ignore[union-attr]
     low, high = local.min(axis=0)[:2], local.max(axis=0)[:2]
     step_mm = SPEED_MM_S * rehearsal.settings.time_step_s
-    offsets = np.arange(low[1] - BESIDE_MM, high[1] + BESIDE_MM, step_mm)
-    return np.stack([_over(rehearsal, (low[0] + high[0]) / 2, y, depth_mm) for y in offsets])
-
-
-def _over(rehearsal: Rehearsal, x: float, y: float, depth_mm: float) -> np.ndarray:
-    """The pose at an offset [mm] from home, with its orientation, at a depth under the settled surface."""
-    manipulator = rehearsal.manipulator
-    pose = manipulator.home.copy()
-    pose[:3, 3] += pose[:3, :2] @ [x, y]
-    return advanced(touching(pose, rehearsal.size_mm, manipulator.samples, manipulator.radius_mm), depth_mm)
+    manipulator, poses = rehearsal.manipulator, []
+    for offset in np.arange(low[1] - BESIDE_MM, high[1] + BESIDE_MM, step_mm):
+        pose = home.copy()
+        pose[:3, 3] += pose[:3, :2] @ [(low[0] + high[0]) / 2, offset]
+        above = touching(pose, rehearsal.size_mm, manipulator.samples, manipulator.radius_mm)
+        poses.append(advanced(above, depth_mm))
+    return np.stack(poses)
 
 
 def _marks(

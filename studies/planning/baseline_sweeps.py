@@ -1,8 +1,5 @@
 """Baselines for a planned sweep: straight, row by row, and random."""
 
-from collections.abc import Callable
-from functools import partial
-
 import numpy as np
 
 from rehearsal.planning.plan_file import PlannedSweep
@@ -64,8 +61,3 @@ def _rows(trial: Trial, layout: SweepLayout, half: np.ndarray, count: int) -> Sw
 
 
 UNPLANNED = {"straight": straight, "row by row": row_by_row}
-
-
-def random_sweeps(count: int, seeds: range) -> list[Callable[[Trial], SweepPath]]:
-    """A random sweep for each seed, as ``TrialWorkers.try_paths`` takes them."""
-    return [partial(random_sweep, count=count, seed=seed) for seed in seeds]

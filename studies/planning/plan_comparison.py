@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 import numpy as np
+import trimesh
 from tqdm import tqdm
 
 from rehearsal.commands.command_line import WholeRange, make_folder
@@ -15,13 +16,12 @@ from rehearsal.configuration import PRESETS, probe_of, scene_of
 from rehearsal.planning.plan_file import MOST_SWEEPS
 from rehearsal.planning.plan_search import make_plan, total_work, work_at
 from rehearsal.planning.sweep_path import SweepPath
-from rehearsal.planning.sweep_score import ScoreTerms, score
+from rehearsal.planning.sweep_score import score
 from rehearsal.planning.sweep_trial import Trial
 from rehearsal.planning.trial_workers import PlanningProblem, TrialResult, TrialWorkers
 from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.scene import EMBEDDED, Scene, load_scene, scene_file, with_options
-from studies.planning.baseline_sweeps import UNPLANNED, planned, random_sweeps
-from studies.planning.virtual_tumour import with_tumour
+from studies.planning.baseline_sweeps import UNPLANNED, planned, random_sweep
 from studies.study_options import jobs_option, out_option
 from studies.study_results import text_table, write_results
 from ultrasound.target import Target
@@ -29,21 +29,23 @@ from ultrasound.target import Target
 TARGET: Target = "margin"
 MARGIN_MM, SPEED_MM_S = 5.0, 10.0
 SEEDS = range(3)
+# The tumour of a kidney that has none: its radius, the depth of its top under the surface [mm], and its place along the organ, a
+# share of the length from the lower pole.
+TUMOUR_MM, UNDER_MM, ALONG = 10.0, 1.5, 0.35
 PLANNED_ON = PRESETS["neo-hookean"]["balanced"]
 # Another grid and more iterations: a plan that suits only its own model scores badly here.
 JUDGED_ON = PLANNED_ON.but(cell_mm=2.7, iterations=8)
-HEADERS = (
-    "sweep",
-    "covered, %",
-    "compression, mean, mm",
-    "maximum, mm",
-    "contact, %",
-    "incidence, deg",
-    "path, mm",
-    "reachable, %",
-    "score",
-)
-FORMATS = ("", ".0f", ".1f", ".1f", ".0f", ".0f", ".0f", ".0f", ".1f")
+# The table's columns: header, factor and format of each figure of a row.
+COLUMNS = {
+    "seen": ("covered, %", 100, ".0f"),
+    "compression_mean_mm": ("compression, mean, mm", 1, ".1f"),
+    "compression_max_mm": ("maximum, mm", 1, ".1f"),
+    "contact": ("contact, %", 100, ".0f"),
+    "incidence_deg": ("incidence, deg", 1, ".0f"),
+    "path_mm": ("path, mm", 1, ".0f"),
+    "reachable": ("reachable, %", 100, ".0f"),
+    "score": ("score", 1, ".1f"),
+}
 
 
 @click.command("plan")
@@ -95,9 +97,9 @@ def compare(
     paths: list[Callable[[Trial], SweepPath]] = [
         partial(planned, sweep=sweep),
         *UNPLANNED.values(),
-        *random_sweeps(len(sweep.passes), SEEDS),
+        *(partial(random_sweep, count=len(sweep.passes), seed=seed) for seed in SEEDS),
     ]
-    outcomes: list[TrialResult] = []
+    outcomes = []
     with TrialWorkers(replace(problem, scene=scene_of(scene, JUDGED_ON)), jobs) as workers:
         for one in workers.try_paths(paths, SPEED_MM_S):
             outcomes.append(one)
@@ -115,32 +117,35 @@ def compare(
     )
 
 
+def with_tumour(anatomy: LoadedAnatomy, gravity: np.ndarray) -> LoadedAnatomy:
+    """The anatomy with a ball just under the highest point of its organ, unless it has a tumour of its own."""
+    if anatomy.tumour is not None:
+        return anatomy
+    organ, up = anatomy.organ, -np.asarray(gravity) / np.linalg.norm(gravity)
+    axis = np.linalg.svd(organ.vertices - organ.vertices.mean(axis=0), full_matrices=False)[2][0]
+    axis *= np.sign(axis[2])
+    along = organ.vertices @ axis
+    away = np.abs((along - along.min()) / np.ptp(along) - ALONG)
+    near = np.flatnonzero(away < 0.1)
+    top = near[np.argmax(organ.vertices[near] @ up)]
+    centre = organ.vertices[top] - (TUMOUR_MM + UNDER_MM) * organ.vertex_normals[top]
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=TUMOUR_MM)
+    return replace(anatomy, tumour=trimesh.Trimesh(ball.vertices + centre, ball.faces, process=False))
+
+
 def _row(name: str, outcomes: list[TrialResult]) -> dict[str, Any]:
     """Means over several sweeps, and their number."""
-    parts = [asdict(one.terms) for one in outcomes]
-    means = ScoreTerms(**{key: float(np.mean([each[key] for each in parts])) for key in parts[0]})
-    return dict(
-        sweep=name,
-        count=len(outcomes),
-        **asdict(means),
-        score=float(np.mean([score(one.terms) for one in outcomes])),
-    )
+    parts = [asdict(one.terms) | dict(score=score(one.terms)) for one in outcomes]
+    means = {key: float(np.mean([each[key] for each in parts])) for key in parts[0]}
+    return dict(sweep=name, count=len(outcomes), **means)
 
 
 def table(run: dict[str, Any]) -> str:
     """The figures of one patient."""
-    rows = [
-        [
-            row["sweep"] if row["count"] == 1 else f"{row['sweep']} ({row['count']})",
-            100 * row["seen"],
-            row["compression_mean_mm"],
-            row["compression_max_mm"],
-            100 * row["contact"],
-            row["incidence_deg"],
-            row["path_mm"],
-            100 * row["reachable"],
-            row["score"],
-        ]
-        for row in run["rows"]
-    ]
-    return f"{run['patient']}, {run['probe']}: {run['plan']}\n{text_table(HEADERS, rows, FORMATS)}\n"
+    headers, factors, formats = zip(*COLUMNS.values(), strict=True)
+    rows = []
+    for row in run["rows"]:
+        name = row["sweep"] if row["count"] == 1 else f"{row['sweep']} ({row['count']})"
+        rows.append([name, *(factor * row[key] for key, factor in zip(COLUMNS, factors, strict=True))])
+    figures = text_table(["sweep", *headers], rows, ["", *formats])
+    return f"{run['patient']}, {run['probe']}: {run['plan']}\n{figures}\n"

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csc_matrix
+from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import splu
 
 from studies.reference.fem_solid import FemSolid
@@ -38,6 +38,10 @@ class Balance:
         """Sum of the residual's magnitudes over the nodes [mN]."""
         return float(np.linalg.norm(self.residual, axis=1).sum())
 
+    def work(self, step: np.ndarray) -> float:
+        """Work of the residual along a step [mm], shape (nodes, 3)."""
+        return float((self.residual * step).sum())
+
 
 class Equilibrium:
     """A solid with its contacts and loads.
@@ -71,14 +75,11 @@ class Equilibrium:
         forces = sum(np.linalg.norm(part, axis=1).sum() for part in (self.load, reactions, *pushes))
         return Balance(np.where(self.fixed, 0.0, residual), float(forces))
 
-    def tangent(self, displacement: np.ndarray) -> csc_matrix:
+    def tangent(self, displacement: np.ndarray) -> csc_array:
         """Derivative of the residual by the displacements [mN/mm], shape (3 nodes, 3 nodes)."""
-        blocks = self.solid.stiffness(displacement)
-        for contact in self.contacts:
-            contact.add_stiffness(displacement, blocks)
-        matrix = self.solid.assembled(blocks)
-        matrix.setdiag(matrix.diagonal() + np.repeat(self.tether_kpa_mm2 * self.solid.volume_share, 3))
-        return matrix
+        tether = diags_array(np.repeat(self.tether_kpa_mm2 * self.solid.volume_share, 3))
+        contacts = sum(contact.stiffness(displacement) for contact in self.contacts)
+        return (self.solid.stiffness(displacement) + tether - contacts).tocsc()
 
     def solve(
         self,
@@ -173,7 +174,7 @@ class Equilibrium:
         Without friction the residual's work is the slope of the energy. Points that stick at one end of the step and
         slide at the other make Newton's method alternate between two states; shorter steps prevent that.
         """
-        reach, found = self._line_search(state, step)
+        reach, found = self._line_search(state, balance.work(step), step)
         for shorter in (reach / 2, reach / 4, reach / 8):
             if found.size <= balance.size:
                 break
@@ -182,8 +183,8 @@ class Equilibrium:
                 reach, found = shorter, tried
         return state + reach * step, found
 
-    def _line_search(self, state: np.ndarray, step: np.ndarray) -> tuple[float, Balance]:
-        """The share of a step at which the work is at most half, 1 where that is enough.
+    def _line_search(self, state: np.ndarray, before: float, step: np.ndarray) -> tuple[float, Balance]:
+        """The share of a step at which the work is at most half of that before, 1 where that is enough.
 
         Regula falsi with a safeguard (Crisfield, *Non-linear Finite Element Analysis of Solids and
         Structures* 1, 1991, section 9.2.2).
@@ -194,10 +195,10 @@ class Equilibrium:
             if reach < LEAST_REACH:
                 raise NotConvergedError("the step inverts tetrahedra")
         low, high = 0.0, np.inf
-        work_low = before = self._work(state, step)[0]
-        work_high = 0.0
+        work_low, work_high = before, 0.0
         for _ in range(SEARCHES):
-            work, found = self._work(state + reach * step, step)
+            found = self.balance(state + reach * step)
+            work = found.work(step)
             if before >= 0 or abs(work) <= abs(before) / 2 or (work < 0 and high == np.inf):
                 break
             if work > 0:
@@ -209,7 +210,3 @@ class Equilibrium:
         else:
             found = self.balance(state + reach * step)
         return reach, found
-
-    def _work(self, state: np.ndarray, step: np.ndarray) -> tuple[float, Balance]:
-        balance = self.balance(state)
-        return float((balance.residual * step).sum()), balance

@@ -13,7 +13,7 @@ from skfem import MeshTet2
 
 from studies.reference.equilibrium import LEAST_VOLUME_RATIO, Equilibrium, NotConvergedError
 from studies.reference.fem_solid import FemMaterial, FemSolid
-from studies.reference.penalty_contact import ContactSurface, Law, PenaltyContact
+from studies.reference.penalty_contact import Law, PenaltyContact
 from studies.reference.smooth_obstacles import FAR_MM, DistanceField, RoundedBox
 
 GRAVITY_M_S2, FRICTION = 9.81, 0.35
@@ -58,34 +58,6 @@ class FemStage:
     residual: float  # relative
 
 
-@dataclass
-class _Path:
-    """Progress of the press; displacements [mm], shape (nodes, 3)."""
-
-    home_mm: float  # height of the transducer's centre at first contact
-    state: np.ndarray
-    before: np.ndarray  # displacements an increment earlier
-    depth_mm: float = 0.0
-    last_mm: float = 0.0  # length of the last increment
-    step_mm: float = FIRST_INCREMENT_MM
-
-    def extrapolated(self, depth_mm: float) -> np.ndarray:
-        """Displacements at a depth [mm], extrapolated from the last increment."""
-        return self.state + (self.state - self.before) * (depth_mm - self.depth_mm) / self.last_mm
-
-    def append(self, state: np.ndarray, depth_mm: float, easily: bool) -> None:
-        """Take a solution; the next increment is longer if this one converged easily."""
-        self.before, self.state = self.state, state
-        self.last_mm, self.depth_mm = depth_mm - self.depth_mm, depth_mm
-        if easily:
-            self.step_mm = min(LONGER * self.step_mm, MOST_INCREMENT_MM)
-
-    def jump(self, state: np.ndarray, depth_mm: float) -> None:
-        """Take a solution after a jump; the extrapolation keeps the increment before the jump."""
-        self.before = state - (self.state - self.before)
-        self.state, self.depth_mm = state, depth_mm
-
-
 class FemExperiment:
     """One kidney on its support under one press.
 
@@ -99,59 +71,56 @@ class FemExperiment:
         support: trimesh.Trimesh,
         material: FemMaterial,
         press: FemPress,
-        friction: float = FRICTION,
         report: Callable[[str], None] = lambda text: None,
     ) -> None:
         """Meshes are in one frame [mm], and the kidney does not yet touch its support."""
         self.solid, self.press, self._report = FemSolid(mesh, material), press, report
         self.worst_residual = 0.0
-        surface = ContactSurface(self.solid)
-        box = RoundedBox(np.array(press.size_mm), press.edge_mm)
-        self.support = PenaltyContact(surface, DistanceField(support), Law(300.0, friction))
+        self.support = PenaltyContact(self.solid, DistanceField(support), Law(300.0, FRICTION))
         # 0.05 mm of overlap at 20 kPa; stiffer contact needs many more iterations at the edges of the probe.
-        law = Law(800.0, friction, soft_mm=0.05)
-        self.probe = PenaltyContact(surface, box, law, np.array([*press.over_mm, FAR_MM]))
+        law, box = Law(800.0, FRICTION, soft_mm=0.05), RoundedBox(np.array(press.size_mm), press.edge_mm)
+        self.probe = PenaltyContact(self.solid, box, law, (*press.over_mm, FAR_MM))
         weight = self.solid.weight(np.array([0.0, 0.0, -GRAVITY_M_S2]))
         self.equilibrium = Equilibrium(self.solid, [self.support, self.probe], weight)
 
     def stages(self) -> Iterator[FemStage]:
-        """Solve stage by stage. Raises NotConvergedError."""
+        """Solve stage by stage, in increments that are shorter or in slow motion where Newton's method does not converge.
+
+        Raises NotConvergedError.
+        """
         state, residual = self._settled()
-        path = _Path(home_mm=self._touching_height(state), state=state, before=state)
-        self._move_probe(path.home_mm)
+        home, depth, increment = self._touching_height(state), 0.0, FIRST_INCREMENT_MM
+        a_mm: np.ndarray | None = (
+            None  # displacements (nodes, 3) a mm of the last increment, which extrapolate it
+        )
+        self._move_probe(home)
         self._carry(state)
         yield self._stage(0.0, state, residual)
         for goal in self.press.indentations_mm[1:]:
-            while path.depth_mm < goal:
-                residual = self._advance(path, goal)
-            yield self._stage(goal, path.state, residual)
-
-    def _advance(self, path: _Path, goal: float) -> float:
-        """One increment towards a goal [mm], shorter or in slow motion where Newton's method does not converge.
-
-        Return the relative residual. Raises NotConvergedError.
-        """
-        # A remainder too short for its own increment is included.
-        after = goal if goal - path.depth_mm < 1.1 * path.step_mm else path.depth_mm + path.step_mm
-        self._move_probe(path.home_mm - after)
-        guess = path.extrapolated(after) if path.last_mm else self._first_guess(path.state)
-        tolerance = STAGE_TOLERANCE if after == goal else PATH_TOLERANCE
-        try:
-            solved, residual, steps = self.equilibrium.solve(guess, tolerance, most=MOST_ITERATIONS)
-        except NotConvergedError:
-            if after - path.depth_mm > LEAST_INCREMENT_MM:
-                path.step_mm = (after - path.depth_mm) / 2
-                return self._advance(path, goal)
-            valid = self.solid.least_volume_ratio(guess) > LEAST_VOLUME_RATIO
-            start = guess if valid else path.state
-            solved, residual, steps = self.equilibrium.relaxed(start, tolerance, JUMPING_KPA_MM2)
-            path.jump(solved, after)
-        else:
-            self._carry(solved)
-            path.append(solved, after, steps <= EASY_ITERATIONS)
-        self._report(f"{after:6.2f} mm deep, {steps} steps, residual {residual:.0e}")
-        self.worst_residual = max(self.worst_residual, residual)
-        return residual
+            while depth < goal:
+                # A remainder too short for its own increment is included.
+                after = goal if goal - depth < 1.1 * increment else depth + increment
+                self._move_probe(home - after)
+                guess = self._first_guess(state) if a_mm is None else state + (after - depth) * a_mm
+                tolerance = STAGE_TOLERANCE if after == goal else PATH_TOLERANCE
+                try:
+                    solved, residual, steps = self.equilibrium.solve(guess, tolerance, MOST_ITERATIONS)
+                except NotConvergedError:
+                    if after - depth > LEAST_INCREMENT_MM:
+                        increment = (after - depth) / 2
+                        continue
+                    valid = self.solid.least_volume_ratio(guess) > LEAST_VOLUME_RATIO
+                    start = guess if valid else state
+                    solved, residual, steps = self.equilibrium.relaxed(start, tolerance, JUMPING_KPA_MM2)
+                else:
+                    self._carry(solved)
+                    a_mm = (solved - state) / (after - depth)
+                    if steps <= EASY_ITERATIONS:
+                        increment = min(LONGER * increment, MOST_INCREMENT_MM)
+                state, depth = solved, after
+                self._report(f"{depth:6.2f} mm deep, {steps} steps, residual {residual:.0e}")
+                self.worst_residual = max(self.worst_residual, residual)
+            yield self._stage(goal, state, residual)
 
     def _settled(self) -> tuple[np.ndarray, float]:
         """Displacements and relative residual after lowering to contact and settling under gravity."""
@@ -178,12 +147,13 @@ class FemExperiment:
 
     def _touching_height(self, state: np.ndarray) -> float:
         """Height of the transducer's centre [mm] at first contact from above."""
-        height = self.probe.surface.points(state)[:, 2].max() + self.press.size_mm[2]
+        heights = self.support.places(state)[:, 2]
+        height = heights.max() + self.press.size_mm[2]
         self._move_probe(height)
         # Lowering by the gap cannot pass the first contact.
         while (gap := self.probe.gaps(state).min()) > TOUCHING_MM:
             height -= gap
-            if height < self.probe.surface.points(state)[:, 2].min():
+            if height < heights.min():
                 raise NotConvergedError("the transducer does not press on the kidney")
             self._move_probe(height)
         return height

@@ -1,58 +1,44 @@
 """Make the reference: the embedded patient's kidney on its support, solved on two meshes."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
 import trimesh
 from skfem import MeshTet2
 
-from studies.reference.fem_press import FRICTION, FemExperiment, FemPress
+from studies.reference.fem_press import FemExperiment, FemPress
 from studies.reference.fem_solid import FemMaterial
 from studies.reference.reference_case import ReferenceCase
 from studies.reference.smooth_obstacles import RoundedBox, signed_distance
 from studies.reference.tetrahedral_mesh import tetrahedra
 
 BEADS, BEAD_DEPTH_MM, BEAD_SEED, CANDIDATES_A_BEAD = 45, 3.0, 20160705, 10
+# Edges far from the transducer are longer; Mmg makes them shorter where the surface is round.
 GROWTH, BULK_OF_NEAR = 1.0, 5.0
 COARSER = 1.4
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """Lengths of the tetrahedra's edges [mm]: by the transducer, and far from it."""
+def graded_mesh(kidney: trimesh.Trimesh, press: FemPress, near_mm: float) -> MeshTet2:
+    """Tetrahedra that fill the kidney, with edges of ``near_mm`` where the transducer touches it. Raises MeshError."""
+    box = RoundedBox(np.array(press.size_mm), press.edge_mm)
+    beside = np.abs(kidney.vertices[:, :2] - press.over_mm) - np.array(press.size_mm[:2]) / 2
+    top = kidney.vertices[(beside <= 0).all(axis=1), 2].max()
+    touching = np.array([*press.over_mm, top + press.size_mm[2] / 2])
 
-    near_mm: float
+    def wanted(points: np.ndarray) -> np.ndarray:
+        away = np.maximum(box.gap(points - touching) - near_mm, 0.0)
+        return np.minimum(near_mm + GROWTH * away, BULK_OF_NEAR * near_mm)
 
-    @property
-    def bulk_mm(self) -> float:
-        """Far from the transducer, where Mmg makes them shorter still if the surface is round."""
-        return BULK_OF_NEAR * self.near_mm
-
-    def coarser(self) -> "Sizes":
-        """Sizes of the coarser mesh of the convergence study."""
-        return Sizes(COARSER * self.near_mm)
-
-    def mesh(self, kidney: trimesh.Trimesh, press: FemPress) -> MeshTet2:
-        """Tetrahedra that fill the kidney, fine where the transducer touches it. Raises MeshError."""
-        box = RoundedBox(np.array(press.size_mm), press.edge_mm)
-        beside = np.abs(kidney.vertices[:, :2] - press.over_mm) - np.array(press.size_mm[:2]) / 2
-        top = kidney.vertices[(beside <= 0).all(axis=1), 2].max()
-        touching = np.array([*press.over_mm, top + press.size_mm[2] / 2])
-
-        def wanted(points: np.ndarray) -> np.ndarray:
-            away = np.maximum(box.gap(points - touching) - self.near_mm, 0.0)
-            return np.minimum(self.near_mm + GROWTH * away, self.bulk_mm)
-
-        return tetrahedra(kidney, wanted)
+    return tetrahedra(kidney, wanted)
 
 
 def make_reference(
     organ: trimesh.Trimesh,
     mould: trimesh.Trimesh,
     gravity: np.ndarray,
-    sizes: Sizes,
+    near_mm: float,
     report: Callable[[str], None],
 ) -> ReferenceCase:
     """The case of the embedded patient, solved on a mesh and, for the discretisation error, on a coarser one.
@@ -61,7 +47,7 @@ def make_reference(
         organ: its surface in LPS [mm].
         mould: the support's surface in LPS [mm].
         gravity: its direction in LPS, shape (3,).
-        sizes: of the mesh that the case is made of.
+        near_mm: edges by the transducer of the mesh that the case is made of.
         report: called with each line of progress.
 
     Raises:
@@ -70,8 +56,8 @@ def make_reference(
     """
     kidney, support = in_case_frame(organ, gravity, organ), in_case_frame(mould, gravity, organ)
     beads = blue_noise(kidney)
-    coarse = solved(kidney, support, beads, sizes.coarser(), report)
-    case = solved(kidney, support, beads, sizes, report)
+    coarse = solved(kidney, support, beads, COARSER * near_mm, report)
+    case = solved(kidney, support, beads, near_mm, report)
     return replace(case, to_coarser_mm=np.linalg.norm(case.moved_beads - coarse.moved_beads, axis=2))
 
 
@@ -79,37 +65,24 @@ def solved(
     kidney: trimesh.Trimesh,
     support: trimesh.Trimesh,
     beads: np.ndarray,
-    sizes: Sizes,
+    near_mm: float,
     report: Callable[[str], None],
 ) -> ReferenceCase:
     """The experiment on one mesh; surfaces and beads (n, 3) in the frame of the files [mm]."""
     start = perf_counter()
     press = FemPress()
-    experiment = FemExperiment(sizes.mesh(kidney, press), support, FemMaterial(), press, report=report)
-    report(f"{len(experiment.solid.nodes_of)} tetrahedra, {len(experiment.solid.rest)} nodes")
+    mesh = graded_mesh(kidney, press, near_mm)
+    report(f"{mesh.nelements} tetrahedra, {mesh.doflocs.shape[1]} nodes")
+    experiment = FemExperiment(mesh, support, FemMaterial(), press, report)
     stages = list(experiment.stages())
-    return ReferenceCase(
-        name="phantom",
-        note="embedded patient of this project, straight central press",
-        kidney=kidney,
-        support=support,
-        beads=beads,
-        solid=experiment.solid,
-        press=press,
-        friction=FRICTION,
-        stages=stages,
-        mesh={
-            "edge_bulk_mm": sizes.bulk_mm,
-            "edge_near_probe_mm": sizes.near_mm,
-            "newton_residual_max": experiment.worst_residual,
-            "time_s": round(perf_counter() - start, 1),
-        },
-        provenance={
-            "kind": "analytic",
-            "formula": "scenes/phantom/kidney.py of Nephron, surface and support as its import makes them",
-            "licence": "no third-party data",
-        },
-    )
+    figures = {
+        "edge_bulk_mm": BULK_OF_NEAR * near_mm,
+        "edge_near_probe_mm": near_mm,
+        "newton_residual_max": experiment.worst_residual,
+        "time_s": round(perf_counter() - start, 1),
+    }
+    same = np.zeros((len(stages), len(beads)))
+    return ReferenceCase(kidney, support, beads, experiment.solid, press, stages, figures, same)
 
 
 def in_case_frame(surface: trimesh.Trimesh, gravity: np.ndarray, organ: trimesh.Trimesh) -> trimesh.Trimesh:

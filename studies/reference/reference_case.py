@@ -13,7 +13,7 @@ import tomli_w
 import trimesh
 
 from scenes.patients.moulded_support import least_gap
-from studies.reference.fem_press import GRAVITY_M_S2, FemPress, FemStage
+from studies.reference.fem_press import FRICTION, GRAVITY_M_S2, FemPress, FemStage
 from studies.reference.fem_solid import FemSolid
 
 # scikit-fem has the middles of edges 01 12 02 03 13 23, the case folder 01 02 03 12 13 23.
@@ -25,30 +25,20 @@ DIGITS = 6
 class ReferenceCase:
     """A solved experiment and its inputs; lengths mm, in the frame of the files."""
 
-    name: str
-    note: str
     kidney: trimesh.Trimesh
     support: trimesh.Trimesh
     beads: np.ndarray  # stress-free, shape (beads, 3)
     solid: FemSolid
     press: FemPress
-    friction: float
     stages: list[FemStage]
     mesh: dict  # for case.toml's [fem]
-    provenance: dict
-    # Distance of the beads from those of a coarser mesh [mm], shape (stages, beads).
-    to_coarser_mm: np.ndarray | None = None
+    to_coarser_mm: np.ndarray  # distance of the beads from those of a coarser mesh, shape (stages, beads)
 
     @cached_property
     def moved_beads(self) -> np.ndarray:
         """Positions of the beads at each stage [mm], shape (stages, beads, 3)."""
-        nodes, shares = self.solid.shares_at(self.beads)
-        return np.stack(
-            [
-                self.beads + np.einsum("ba,bai->bi", shares, stage.displacement_mm[nodes])
-                for stage in self.stages
-            ]
-        )
+        at_beads = self.solid.basis.probes(self.beads.T)
+        return np.stack([self.beads + at_beads @ stage.displacement_mm for stage in self.stages])
 
     def write(self, folder: Path) -> None:
         """Write the five files into an existing folder. Raises OSError."""
@@ -61,33 +51,26 @@ class ReferenceCase:
     def summary(self) -> str:
         """The solution and its discretisation error."""
         lines = [
-            f"mesh      {len(self.solid.nodes_of)} tetrahedra of 10 nodes, {len(self.solid.rest)} nodes; "
+            f"mesh      {self.solid.mesh.nelements} tetrahedra of 10 nodes, {len(self.solid.rest)} nodes; "
             f"{self.mesh['time_s']:.0f} s"
         ]
-        for index, (stage, beads) in enumerate(zip(self.stages, self.moved_beads, strict=True)):
+        for stage, beads, apart in zip(self.stages, self.moved_beads, self.to_coarser_mm, strict=True):
             moved = np.linalg.norm(beads - self.moved_beads[0], axis=1).mean()
             lines.append(
                 f"{stage.indentation_mm:5.2f} mm  beads moved {moved:.2f} mm in the mean, press "
-                f"{abs(stage.probe_force_n[2]):.2f} N"
+                f"{abs(stage.probe_force_n[2]):.2f} N; difference to a coarser mesh {apart.mean():.3f} mm, "
+                f"{apart.max():.3f} at most"
             )
-            if self.to_coarser_mm is not None:
-                apart = self.to_coarser_mm[index]
-                lines[-1] += (
-                    f"; difference to a coarser mesh {apart.mean():.3f} mm, {apart.max():.3f} at most"
-                )
         return "\n".join(lines)
 
     def description(self) -> dict:
         """Contents of case.toml."""
-        material, weight = (
-            self.solid.material,
-            np.linalg.norm(self.solid.weight(np.array([0, 0, -GRAVITY_M_S2])).sum(axis=0)),
-        )
-        moved = self.moved_beads
+        material, moved = self.solid.material, self.moved_beads
+        weight = np.linalg.norm(self.solid.weight(np.array([0, 0, -GRAVITY_M_S2])).sum(axis=0))
         sag = np.linalg.norm(moved[0] - self.beads, axis=1)
         return {
-            "name": self.name,
-            "note": self.note,
+            "name": "phantom",
+            "note": "embedded patient of this project, straight central press",
             "format_version": 1,
             "units": {
                 "length": "mm",
@@ -105,7 +88,7 @@ class ReferenceCase:
                 "weight_N": _rounded(weight / 1000),
             },
             "contact": {
-                "friction_coefficient": self.friction,
+                "friction_coefficient": FRICTION,
                 "friction_on_support": True,
                 "friction_on_probe": True,
                 "law": "Coulomb, penalty-regularised",
@@ -141,7 +124,7 @@ class ReferenceCase:
             },
             "fem": {
                 "element": "10-node tetrahedra",
-                "tets": len(self.solid.nodes_of),
+                "tets": self.solid.mesh.nelements,
                 "nodes": len(self.solid.rest),
                 "newton_residual_at_stages_max": max(stage.residual for stage in self.stages),
                 "min_det_F": _rounded(
@@ -151,17 +134,14 @@ class ReferenceCase:
                     _rounded(self.solid.volume_ratio(s.displacement_mm)) for s in self.stages
                 ],
                 **self.mesh,
-                **self._mesh_error(),
+                "bead_difference_to_coarser_mesh_mean_mm": _rounded(self.to_coarser_mm.mean(axis=1)),
+                "bead_difference_to_coarser_mesh_max_mm": _rounded(self.to_coarser_mm.max(axis=1)),
             },
-            "provenance": self.provenance,
-        }
-
-    def _mesh_error(self) -> dict:
-        if self.to_coarser_mm is None:
-            return {}
-        return {
-            "bead_difference_to_coarser_mesh_mean_mm": _rounded(self.to_coarser_mm.mean(axis=1)),
-            "bead_difference_to_coarser_mesh_max_mm": _rounded(self.to_coarser_mm.max(axis=1)),
+            "provenance": {
+                "kind": "analytic",
+                "formula": "scenes/phantom/kidney.py of Nephron, surface and support as its import makes them",
+                "licence": "no third-party data",
+            },
         }
 
     def _stage(self, index: int, from_first: np.ndarray) -> dict:
@@ -177,15 +157,13 @@ class ReferenceCase:
         }
 
     def _write_beads(self, path: Path) -> None:
-        columns = (
-            np.concatenate([self.beads[None], self.moved_beads])
-            .transpose(1, 0, 2)
-            .reshape(len(self.beads), -1)
-        )
         names = [f"{axis}{stage}" for stage in ("", *range(len(self.stages))) for axis in "xyz"]
-        lines = [",".join(["id", *names])]
-        lines += [f"{bead}," + ",".join(f"{value:.4f}" for value in row) for bead, row in enumerate(columns)]
-        path.write_text("\n".join(lines) + "\n", "utf-8")
+        places = (
+            np.concatenate([self.beads[None], self.moved_beads]).swapaxes(0, 1).reshape(len(self.beads), -1)
+        )
+        rows = np.column_stack([np.arange(len(places)), places])
+        formats = ["%d", *["%.4f"] * len(names)]
+        np.savetxt(path, rows, formats, ",", header=",".join(["id", *names]), comments="", encoding="utf-8")
 
     def _write_result(self, path: Path) -> None:
         mesh = self.solid.mesh
@@ -195,7 +173,7 @@ class ReferenceCase:
         np.savez_compressed(
             path,
             nodes=self.solid.rest,
-            tets10=self.solid.nodes_of[:, FILE_ORDER].astype(np.int32),
+            tets10=self.solid.basis.element_dofs.T[:, FILE_ORDER].astype(np.int32),
             displacement=np.stack([stage.displacement_mm for stage in self.stages]),
             surface_faces=np.asarray(surface.faces, np.int32),
             surface_nodes=np.unique(self.solid.basis.get_dofs(faces).all()).astype(np.int32),

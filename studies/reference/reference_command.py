@@ -31,7 +31,7 @@ def reference(out: Path, edge_mm: float) -> None:
     try:
         from studies.reference.equilibrium import NotConvergedError
         from studies.reference.fem_solid import MeshError
-        from studies.reference.make_reference import Sizes, make_reference
+        from studies.reference.make_reference import make_reference
     except ImportError as error:
         raise CommandError(
             f"the reference needs {error.name}, which is not installed: pip install -r requirements-dev.txt"
@@ -42,7 +42,7 @@ def reference(out: Path, edge_mm: float) -> None:
     assert isinstance(support, trimesh.Trimesh)
     try:
         gravity = np.array(scene.gravity.direction)
-        case = make_reference(anatomy.organ, support, gravity, Sizes(edge_mm), click.echo)
+        case = make_reference(anatomy.organ, support, gravity, edge_mm, click.echo)
     except (MeshError, NotConvergedError) as error:
         raise CommandError(
             f"no reference with edges of {edge_mm:g} mm: {error}; try another --edge"

@@ -1,11 +1,8 @@
-"""Rigid obstacles as smooth distances with first and second derivatives, which Newton's method needs."""
-
-from itertools import combinations_with_replacement
+"""Rigid obstacles as distances that are smooth enough for Newton's method, and their normals."""
 
 import igl
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike
 from scipy.interpolate import NdBSpline
 from scipy.ndimage import spline_filter
 
@@ -30,19 +27,12 @@ class RoundedBox:
         outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
         return outside + np.minimum(beyond.max(axis=1), 0.0) - self._edge
 
-    def slopes(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Gradient, shape (n, 3), and second derivatives [1/mm], shape (n, 3, 3)."""
+    def normal(self, points: np.ndarray) -> np.ndarray:
+        """Unit gradient of the distance, shape (n, 3)."""
         beyond = np.abs(points) - self._core
-        within = (beyond <= 0).all(axis=1)
         nearest = np.eye(3)[beyond.argmax(axis=1)]
-        out = np.where(within[:, None], nearest, np.maximum(beyond, 0.0))
-        length = np.linalg.norm(out, axis=1)[:, None]
-        normal = np.where(points < 0, -1.0, 1.0) * out / length
-        bend = (np.eye(3) * (out > 0)[:, None, :] - normal[:, :, None] * normal[:, None, :]) / length[
-            ..., None
-        ]
-        bend[within] = 0.0
-        return normal, bend
+        out = np.where((beyond <= 0).all(axis=1, keepdims=True), nearest, np.maximum(beyond, 0.0))
+        return np.where(points < 0, -1.0, 1.0) * out / np.linalg.norm(out, axis=1, keepdims=True)
 
 
 class DistanceField:
@@ -66,22 +56,13 @@ class DistanceField:
 
     def gap(self, points: np.ndarray) -> np.ndarray:
         """Signed distance [mm], shape (n,); FAR_MM outside the field."""
-        return self._derivative(points, (0, 0, 0), FAR_MM)
+        gap = self._spline(points)
+        return np.where(np.isnan(gap), FAR_MM, gap)
 
-    def slopes(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Gradient, shape (n, 3), and second derivatives [1/mm], shape (n, 3, 3)."""
-        axes = np.eye(3, dtype=int)
-        gradient = np.empty((len(points), 3))
-        second = np.empty((len(points), 3, 3))
-        for i, j in combinations_with_replacement(range(3), 2):
-            second[:, i, j] = second[:, j, i] = self._derivative(points, axes[i] + axes[j], 0.0)
-        for i in range(3):
-            gradient[:, i] = self._derivative(points, axes[i], 0.0)
-        return gradient, second
-
-    def _derivative(self, points: np.ndarray, order: ArrayLike, outside: float) -> np.ndarray:
-        values = self._spline(points, nu=order)
-        return np.where(np.isnan(values), outside, values)
+    def normal(self, points: np.ndarray) -> np.ndarray:
+        """Unit gradient of the distance, shape (n, 3); nan outside the field."""
+        gradient = np.stack([self._spline(points, nu=axis) for axis in np.eye(3, dtype=int)], axis=1)
+        return gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
 
 
 def signed_distance(surface: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:

@@ -35,8 +35,8 @@ from rehearsal.planning.sweep_candidates import (
 from rehearsal.planning.sweep_path import layout_towards
 from scenes.anatomy import LoadedAnatomy
 from sim.signed_distance import signed_distance
-from studies.planning import virtual_tumour
-from studies.planning.baseline_sweeps import planned, random_sweep, random_sweeps, row_by_row, straight
+from studies.planning import plan_comparison
+from studies.planning.baseline_sweeps import planned, random_sweep, row_by_row, straight
 from ultrasound.coverage import VOXEL_MM, Coverage
 from ultrasound.probe import load_probe
 
@@ -241,10 +241,6 @@ def test_random_sweeps_depend_on_the_seed_and_are_over_the_target(trial):
     assert all(
         abs(angle_deg(a / np.linalg.norm(a), b / np.linalg.norm(b))) > 1 for a, b in pairwise(headings)
     )
-    ways = random_sweeps(3, range(5, 7))
-    assert [
-        np.array_equal(make(trial).poses, path.poses) for make, path in zip(ways, (first, other), strict=True)
-    ] == [True] * 2
 
 
 def test_the_poses_of_a_plan_are_those_of_the_path_in_the_patient(rehearsal):
@@ -266,12 +262,12 @@ def test_the_poses_of_a_plan_are_those_of_the_path_in_the_patient(rehearsal):
 def test_a_kidney_without_a_tumour_is_given_one_under_its_highest_place():
     organ = trimesh.creation.icosphere(subdivisions=4, radius=1.0)
     organ.vertices *= [25.0, 25.0, 50.0]
-    given = virtual_tumour.with_tumour(LoadedAnatomy(organ, None, None, ()), np.array([0, 9.81, 0]))
+    given = plan_comparison.with_tumour(LoadedAnatomy(organ, None, None, ()), np.array([0, 9.81, 0]))
     tumour = given.tumour
-    assert tumour.volume == pytest.approx(4 / 3 * np.pi * virtual_tumour.RADIUS_MM**3, rel=0.02)
+    assert tumour.volume == pytest.approx(4 / 3 * np.pi * plan_comparison.TUMOUR_MM**3, rel=0.02)
     middle = tumour.vertices.mean(axis=0)
     share = (middle[2] + 50) / 100
-    assert share == pytest.approx(virtual_tumour.ALONG, abs=0.12) and middle[1] < 0 and abs(middle[0]) < 2
+    assert share == pytest.approx(plan_comparison.ALONG, abs=0.12) and middle[1] < 0 and abs(middle[0]) < 2
     depths = -signed_distance(organ.vertices, organ.faces, tumour.vertices)[0]
-    assert depths.min() == pytest.approx(virtual_tumour.UNDER_MM, abs=0.3)
-    assert virtual_tumour.with_tumour(given, Z) is given
+    assert depths.min() == pytest.approx(plan_comparison.UNDER_MM, abs=0.3)
+    assert plan_comparison.with_tumour(given, Z) is given

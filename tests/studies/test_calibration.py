@@ -115,9 +115,9 @@ def test_a_quartic_and_its_minimum_are_found():
     x = np.linspace(0.1, 1, 19)
     y = 1 + 2 * (x - 0.4) ** 2 + 3 * (x - 0.4) ** 4
     fallen = [trial(0.02, 900.0), trial(0.05, np.inf)]
-    fit = quartic([*fallen, *(trial(*pair) for pair in zip(x, y, strict=True))])
-    assert fit.stiffness == pytest.approx(0.4, abs=1e-3) and fit.error_mm == pytest.approx(1.0, abs=1e-6)
-    assert fit.polynomial(x) == pytest.approx(y) and fit.range == (0.1, 1.0)
+    curve, best = quartic([*fallen, *(trial(*pair) for pair in zip(x, y, strict=True))])
+    assert best == pytest.approx(0.4, abs=1e-3) and curve(best) == pytest.approx(1.0, abs=1e-6)
+    assert curve(x) == pytest.approx(y) and curve.domain.tolist() == [0.1, 1.0]
     assert quartic([trial(a, 1 + a) for a in (0.1, 0.2, 0.3, 0.4)]) is None
 
 

@@ -16,7 +16,7 @@ from studies.reference.equilibrium import Equilibrium, NotConvergedError
 from studies.reference.fem_press import FemExperiment, FemPress
 from studies.reference.fem_solid import FemMaterial, FemSolid
 from studies.reference.make_reference import blue_noise, in_case_frame
-from studies.reference.penalty_contact import ContactSurface, Law, PenaltyContact
+from studies.reference.penalty_contact import Law, PenaltyContact
 from studies.reference.reference_case import ReferenceCase
 from studies.reference.smooth_obstacles import DistanceField, RoundedBox
 from studies.reference.tetrahedral_mesh import tetrahedra
@@ -36,9 +36,9 @@ class Plane:
         """Height above the plane [mm], shape (n,)."""
         return points @ self._normal - self._height
 
-    def slopes(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The normal, shape (n, 3), and zeros, shape (n, 3, 3)."""
-        return np.tile(self._normal, (len(points), 1)), np.zeros((len(points), 3, 3))
+    def normal(self, points: np.ndarray) -> np.ndarray:
+        """The normal, shape (n, 3)."""
+        return np.tile(self._normal, (len(points), 1))
 
 
 def cube(cells: int, distortion_mm: float = 0.0) -> FemSolid:
@@ -122,18 +122,17 @@ def test_the_error_falls_with_the_third_power_of_the_mesh():
 def touching_cube(friction: float) -> tuple[Equilibrium, np.ndarray]:
     """A cube cut into by a box's edge, a ball and a plane, slid by less and more than what sticks."""
     solid = cube(3, distortion_mm=0.3)
-    surface = ContactSurface(solid)
     ball = trimesh.creation.icosphere(subdivisions=3, radius=6.0)
     ball.apply_translation([5.0, 5.0, -5.5])
     rng = np.random.default_rng(2)
     state = rng.normal(size=solid.rest.shape) * 0.02
     contacts = [
         PenaltyContact(
-            surface, RoundedBox(np.array([6.0, 4.0, 6.0]), 1.0), Law(2500.0, friction), np.array([5, 5, 12.9])
+            solid, RoundedBox(np.array([6.0, 4.0, 6.0]), 1.0), Law(2500.0, friction), (5.0, 5.0, 12.9)
         ),
-        PenaltyContact(surface, DistanceField(ball), Law(300.0, friction)),
+        PenaltyContact(solid, DistanceField(ball), Law(300.0, friction)),
         PenaltyContact(
-            surface, Plane(np.array([0.6, 0.0, 0.0]), np.array([1.0, 0.1, 0.1])), Law(300.0, friction)
+            solid, Plane(np.array([0.6, 0.0, 0.0]), np.array([1.0, 0.1, 0.1])), Law(300.0, friction)
         ),
     ]
     for contact in contacts:
@@ -163,9 +162,7 @@ def test_the_tangent_is_the_derivative_of_the_residual(friction):
 def test_friction_of_a_block_that_slides_is_coulombs():
     solid = cube(2)
     faces = on_faces(solid)
-    plane = PenaltyContact(
-        ContactSurface(solid), Plane(np.zeros(3), np.array([0.0, 0.0, 1.0])), Law(300.0, friction=0.35)
-    )
+    plane = PenaltyContact(solid, Plane(np.zeros(3), np.array([0.0, 0.0, 1.0])), Law(300.0, friction=0.35))
     lid = faces[:, 2, 1]
     equilibrium = held(solid, np.repeat(lid[:, None], 3, axis=1), [plane])
     equilibrium.tether_kpa_mm2 = 1e-6
@@ -216,19 +213,8 @@ def solved_case() -> ReferenceCase:
     made = dict(time_s=1.0, edge_near_probe_mm=9.0)
     # Deep, where tetrahedra are straight.
     beads = blue_noise(ball, count=12, depth_mm=6.0)
-    return ReferenceCase(
-        "ball",
-        "a test",
-        ball,
-        block,
-        beads,
-        experiment.solid,
-        experiment.press,
-        0.35,
-        stages,
-        made,
-        dict(kind="analytic"),
-    )
+    same = np.zeros((len(stages), len(beads)))
+    return ReferenceCase(ball, block, beads, experiment.solid, experiment.press, stages, made, same)
 
 
 def test_slow_motion_comes_to_the_same_rest_as_newtons_method(solved_case, monkeypatch):
@@ -281,6 +267,7 @@ def test_a_case_folder_follows_the_format(solved_case, tmp_path):
 
 def test_the_command_writes_a_case_that_validate_reads(solved_case, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr("studies.reference.make_reference.solved", lambda *arguments: solved_case)
+    monkeypatch.setattr("studies.reference.make_reference.blue_noise", lambda kidney: solved_case.beads)
     assert app.main(["reference", "--out", str(tmp_path / "case")]) == 0
     assert "difference to a coarser mesh 0.000 mm" in capsys.readouterr().out
     case = load_case(tmp_path / "case")
