@@ -2,21 +2,22 @@
 
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from types import UnionType
+from types import MappingProxyType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import click
 from pydantic import BaseModel, ConfigDict
 from pydantic.fields import FieldInfo
 
+from rehearsal.configuration import with_quality
 from rehearsal.result_files import write_json
 from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.atomic_files import check_writable
-from scenes.scene import OPTIONS, Scene, load_scene, scene_file
+from scenes.scene import OPTIONS, Scene, load_scene, scene_file, with_options
 from scenes.tissue import QUALITIES
 from ultrasound.probe import DetailLevel, Mode
 
@@ -92,13 +93,12 @@ def _remove_empty(folders: list[Path]) -> None:
             each.rmdir()
 
 
-def make_place(json_file: Path | None) -> None:
-    """Check that the file of --json, if given, can be written. Raises CommandError."""
-    if json_file is None:
-        return
-    make_folder(json_file.parent, "--json")
-    if json_file.is_dir():
-        raise CommandError(f"{json_file}: is a folder; name a file after --json")
+def make_place(file: Path | None, option: str = "--json") -> None:
+    """Check that the file of an option, if given, can be written. Raises CommandError."""
+    if file is not None:
+        make_folder(file.parent, option)
+        if file.is_dir():
+            raise CommandError(f"{file}: is a folder; name a file after {option}")
 
 
 def save_figures(figures: dict[str, Any], json_file: Path) -> None:
@@ -112,10 +112,12 @@ def save_figures(figures: dict[str, Any], json_file: Path) -> None:
     click.echo(f"\nWrote {json_file}")
 
 
-def load_patient(scene: Path) -> tuple[Scene, LoadedAnatomy]:
-    """Load a scene file or a patient's folder, and its anatomy. Raises SceneError, PatientError."""
+def load_patient(
+    scene: Path, changes: Mapping[str, Any] = MappingProxyType({}), quality: str | None = None
+) -> tuple[Scene, LoadedAnatomy]:
+    """Load a scene file or a patient's folder, changed by options, and its anatomy. Raises SceneError, PatientError."""
     path = scene_file(scene)
-    loaded = load_scene(path)
+    loaded = with_quality(with_options(load_scene(path), changes), quality)
     return loaded, load_anatomy(loaded, path.parent)
 
 

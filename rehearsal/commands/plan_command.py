@@ -7,11 +7,17 @@ import click
 from pydantic import Field, ValidationError
 from tqdm import tqdm
 
-from rehearsal.commands.command_line import ARGUMENT, CommandError, QualityOptions, command, make_folder
-from rehearsal.configuration import probe_of, with_quality
+from rehearsal.commands.command_line import (
+    ARGUMENT,
+    CommandError,
+    QualityOptions,
+    command,
+    load_patient,
+    make_place,
+)
+from rehearsal.configuration import probe_of
 from rehearsal.planning.plan_file import FASTEST_MM_S, MOST_MARGIN_MM, MOST_SWEEPS, SLOWEST_MM_S, write_plan
-from scenes.anatomy import load_anatomy
-from scenes.scene import EMBEDDED, Trocar, load_scene, scene_file, with_options
+from scenes.scene import EMBEDDED, Trocar
 from scenes.terminal import shell_command
 from ultrasound.target import Target
 
@@ -48,14 +54,10 @@ def plan(asked: PlanOptions) -> None:
 
     SCENE is a scene file or a patient's folder. The organ deforms under the probe.
     """
-    path, out = scene_file(asked.scene), asked.out
-    loaded = with_quality(with_options(load_scene(path), asked.changes), asked.quality)
-    port = trocar_of(loaded.trocar, asked)
-    anatomy = load_anatomy(loaded, path.parent)
-    scene_probe = probe_of(loaded)
-    make_folder(out.parent)
-    if out.is_dir():
-        raise CommandError(f"{out}: is a folder; name a file after --out")
+    out = asked.out
+    loaded, anatomy = load_patient(asked.scene, asked.changes, asked.quality)
+    port, scene_probe = trocar_of(loaded.trocar, asked), probe_of(loaded)
+    make_place(out, "--out")
     from rehearsal.planning.plan_search import make_plan, total_work
     from rehearsal.planning.trial_workers import PlanningProblem, TrialWorkers
 

@@ -43,8 +43,7 @@ def rehearse(asked: RehearseOptions) -> None:
     track = load_track(asked.track, asked.track_from) if asked.track else None
     plan = read_plan(asked.plan) if asked.plan else None
     log = session_of(asked.replay, asked.at) if asked.replay else None
-    loaded = as_asked(before, asked) if log is None else as_recorded(log, before)
-    probe = probe_of(loaded) if log is None else probe_of_log(log)
+    loaded, probe = as_asked(before, asked) if log is None else as_recorded(log, before)
     if no_display:
         click.echo(f"No display ({why_no_display()}): running the scripted press without a window.")
     if not asked.headless:
@@ -107,12 +106,15 @@ def check_vulkan() -> None:
         )
 
 
-def as_asked(scene: Scene, asked: RehearseOptions) -> Scene:
-    """A scene with the options of the command line; prints if they change the tissue model. Raises SceneError."""
+def as_asked(scene: Scene, asked: RehearseOptions) -> tuple[Scene, Probe]:
+    """A scene with the options of the command line, and its probe; prints if they change the tissue model.
+
+    Raises SceneError, ProbeError.
+    """
     changed = with_quality(with_options(scene, asked.changes), asked.quality)
     if asked.model is None and changed.tissue.model != scene.tissue.model:
         click.echo(f"Tissue model: {changed.tissue.model}, as the options ask for it.")
-    return changed
+    return changed, probe_of(changed)
 
 
 def session_of(path: Path, at_s: float) -> Log:
@@ -125,18 +127,12 @@ def session_of(path: Path, at_s: float) -> Log:
     return log
 
 
-def as_recorded(log: Log, scene: Scene) -> Scene:
-    """The patient of a scene with all other settings of a session. Raises SessionError."""
+def as_recorded(log: Log, scene: Scene) -> tuple[Scene, Probe]:
+    """The patient of a scene with all other settings of a session, and the session's probe. Raises SessionError."""
     try:
-        return scene_of_log(log.header, scene)
+        return scene_of_log(log.header, scene), probe_of_values(log.header.probe)
     except ValidationError as error:
         raise SessionError(f"the session's scene cannot be used: {explained(error)}") from None
-
-
-def probe_of_log(log: Log) -> Probe:
-    """The probe of a session. Raises SessionError."""
-    try:
-        return probe_of_values(log.header.probe)
     except ProbeError as error:
         raise SessionError(f"the session's probe cannot be used: {error}") from None
 

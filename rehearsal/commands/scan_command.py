@@ -16,14 +16,14 @@ from rehearsal.commands.command_line import (
     CommandError,
     ImageOptions,
     command,
+    load_patient,
     make_folder,
     start_taichi,
 )
 from rehearsal.configuration import probe_of
 from rehearsal.result_files import write_json
 from rehearsal.tracking.pose_file import load_poses
-from scenes.anatomy import load_anatomy
-from scenes.scene import load_scene, scene_file, with_options
+from scenes.scene import scene_file
 from sim.signed_distance import signed_distance
 from version import VERSION
 
@@ -55,12 +55,12 @@ def scan(asked: ScanOptions) -> None:
     SCENE is a scene file or a patient's folder, at rest as in the CT.
     Writes a PNG image for each pose of a file, and scan.json with the size of the pixels.
     """
-    path, out = scene_file(asked.scene), asked.out
-    loaded = with_options(load_scene(path), asked.changes)
-    pose_by_name = load_poses(asked.poses)
-    anatomy = load_anatomy(loaded, path.parent)
+    out, pose_by_name = asked.out, load_poses(asked.poses)
+    loaded, anatomy = load_patient(asked.scene, asked.changes)
     if anatomy.ct is None:
-        raise CommandError(f"{path}: has no CT: expected anatomy.ct, from which the images are made")
+        raise CommandError(
+            f"{scene_file(asked.scene)}: has no CT: expected anatomy.ct, from which the images are made"
+        )
     warn_of_deep_poses(pose_by_name.values(), anatomy.organ)
     scan_probe, settings = probe_of(loaded), loaded.image
     used = start_taichi(asked.arch)
