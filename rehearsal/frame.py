@@ -8,7 +8,8 @@ from time import perf_counter
 import click
 import numpy as np
 
-from rehearsal.cine import Caliper, Cine, CineFrame
+from rehearsal.caliper import Caliper
+from rehearsal.cine import Cine, CineFrame
 from rehearsal.frame_view import probe_with_settings
 from rehearsal.image_and_surface_files import save_screenshot, save_surfaces, save_view
 from rehearsal.inputs.input_source import InputSource, ReplayInput

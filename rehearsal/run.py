@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from time import time
 
 import click
@@ -13,7 +12,7 @@ from psutil import Process
 
 from rehearsal.adaptive_iterations import AdaptiveIterations
 from rehearsal.commands.command_line import STOPPED, CommandError
-from rehearsal.commands.option_checks import replay_warning
+from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.frame import Frames, WindowFrames
 from rehearsal.frame_view import initial_settings, open_viewer
 from rehearsal.headless import run_headless
@@ -31,7 +30,7 @@ from rehearsal.sessions.open_session import open_session
 from rehearsal.sessions.recorder import SessionRecorder, record
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session import Session
-from rehearsal.sessions.session_file import Log
+from rehearsal.sessions.session_file import Header, Log
 from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer
 from rehearsal.tracking.pose_file import TimedPoses
 from rehearsal.tracking.sweep_recording import SweepRecorder
@@ -41,28 +40,26 @@ from render.keys import Keys
 from render.viewer import Settings
 from render.window import NoVulkan
 from scenes.anatomy import LoadedAnatomy
+from scenes.scene import EMBEDDED
 from scenes.terminal import shell_command
+from version import VERSION
 
 
 @dataclass
 class RehearsalRun:
-    """One rehearsal, its anatomy, its output folder, and what moves the transducer beside the mouse.
+    """One rehearsal, its anatomy, the backend's name, what the user asked for, and the files that were read for it.
 
-    ``tracked`` is a probe that is tracked now, ``track`` recorded poses of one; ``scene`` is the path that the user named, if any.
+    ``track`` are recorded poses of a probe.
     """
 
     rehearsal: Rehearsal
     anatomy: LoadedAnatomy
     arch: str
-    out: Path
-    budget_ms: float | None = None
-    tracked: PoseSource | None = None
+    asked: RehearseOptions
     track: TimedPoses | None = None
     keys: Keys = field(default_factory=Keys)
-    gamepad: bool = False
     link: OpenIGTLinkServer | None = None
     plan: Plan | None = None
-    scene: Path | None = None
     recorder: SessionRecorder | None = field(default=None, init=False)
     notices: Notices = field(default_factory=Notices, init=False)
 
@@ -70,14 +67,14 @@ class RehearsalRun:
         guide = None if self.plan is None else PlanGuidance(self.rehearsal, self.plan)
         self.measurements = LiveMeasurements(self.rehearsal, guide)
 
-    def in_window(self, log: Log | None, at_s: float) -> None:
+    def in_window(self, log: Log | None) -> None:
         """Run in a window, after a replay of the log if there is one. Raises CommandError, SessionError."""
-        pad = Gamepad(SdlPads(), self.keys.buttons) if self.gamepad else None
+        pad = Gamepad(SdlPads(), self.keys.buttons) if self.asked.gamepad else None
         try:
             viewer = open_viewer(self.rehearsal, visible=True, keys=self.keys, gamepad=pad)
         except NoVulkan as reason:
             raise CommandError(f"{reason}; install a Vulkan driver, or run with --headless") from None
-        replay = None if log is None else self._replay(log, at_s, viewer.settings)
+        replay = None if log is None else self._replay(log, viewer.settings)
         source = self._user_input() if replay is None else self._replay_input(replay)
         after_s = time() - Process().create_time()
         text = (
@@ -91,10 +88,10 @@ class RehearsalRun:
             Tally(0.0),
             self.link,
             viewer=viewer,
-            out=self.out,
+            out=self.asked.out,
             notices=self.notices,
             sweeping=SweepRecorder(self.rehearsal),
-            plans=PlanControl(self.rehearsal, self.anatomy, self.measurements, self.out),
+            plans=PlanControl(self.rehearsal, self.anatomy, self.measurements, self.asked.out),
             keys=self.keys,
         )
         try:
@@ -105,38 +102,39 @@ class RehearsalRun:
             frames.plans.stop()
             _echo(frames.sweeping.end())
 
-    def headless(
-        self, log: Log | None, at_s: float, seconds: float | None, build_s: float, draws: bool = True
-    ) -> None:
+    def headless(self, log: Log | None, build_s: float) -> None:
         """Run the scripted press, a log or recorded poses to their end. Raises CommandError, SessionError."""
         settings = initial_settings(self.rehearsal)
-        replay = None if log is None else self._replay(log, at_s, settings)
+        replay = None if log is None else self._replay(log, settings)
         source: InputSource
         if replay is not None:
-            source, steps = self._replay_input(replay), self._replayed_steps(replay, at_s, seconds)
+            source, steps = self._replay_input(replay), self._replayed_steps(replay)
         elif self.track is not None:
-            source, steps = self._tracked_input(self.track, seconds)
+            source, steps = self._tracked_input(self.track)
         else:
-            source, steps = self._scripted_input(seconds)
+            source, steps = self._scripted_input()
         frames = Frames(self.rehearsal, source, self.measurements, Tally(build_s), self.link)
         with self._summarised(source, replay):
-            run_headless(frames, self.notices, steps, settings, self.arch, self.out, draws)
+            run_headless(
+                frames, self.notices, steps, settings, self.arch, self.asked.out, not self.asked.no_pictures
+            )
 
-    def _replayed_steps(self, replay: Replay, at_s: float, seconds: float | None) -> int:
+    def _replayed_steps(self, replay: Replay) -> int:
         steps = len(replay.log.poses) - replay.session.step_index
         if steps == 0:
             raise CommandError(
-                f"the session has nothing after {at_s:g} s: it is {replay.log.length_s:.1f} s long"
+                f"the session has nothing after {self.asked.at:g} s: it is {replay.log.length_s:.1f} s long"
             )
+        seconds = self.asked.seconds
         return steps if not seconds else min(steps, max(1, round(seconds / self._step_s)))
 
-    def _tracked_input(self, track: TimedPoses, seconds: float | None) -> tuple[InputSource, int]:
-        length_s = track.length_s if seconds is None else min(seconds, track.length_s)
+    def _tracked_input(self, track: TimedPoses) -> tuple[InputSource, int]:
+        length_s = min(self.asked.seconds or np.inf, track.length_s)
         # One step at 0 s and one at the end; without a budget, so that the bits do not depend on the machine's speed.
         return self._user_input(budget_ms=np.inf), 1 + int(length_s / self._step_s + 1e-9)
 
-    def _scripted_input(self, seconds: float | None) -> tuple[InputSource, int]:
-        steps = max(1, round((seconds or self.rehearsal.script_length_s()) / self._step_s))
+    def _scripted_input(self) -> tuple[InputSource, int]:
+        steps = max(1, round((self.asked.seconds or self.rehearsal.script_length_s()) / self._step_s))
         session = self._session()
         return ScriptedInput(session, self._record(session), steps), steps
 
@@ -148,10 +146,14 @@ class RehearsalRun:
         return Session(self.rehearsal, coverage=lambda: self.measurements.coverage.seen)
 
     def _user_input(self, begins: RehearsalState | None = None, budget_ms: float | None = None) -> UserInput:
-        adaptive = AdaptiveIterations(budget_ms or self.budget_ms or 1000 * self._step_s)
+        adaptive = AdaptiveIterations(budget_ms or self.asked.budget_ms or 1000 * self._step_s)
         session = self._session()
         recorder = self._record(session, begins)
-        tracked = self.tracked if self.track is None else PosePlayback(self.track, session)
+        tracked: PoseSource | None = None
+        if self.track is not None:
+            tracked = PosePlayback(self.track, session)
+        elif self.link is not None and self.asked.link_leads:
+            tracked = self.link.received_pose
         return UserInput(session, adaptive, recorder, begins is not None, tracked, self.notices)
 
     def _replay_input(self, replay: Replay) -> ReplayInput:
@@ -165,16 +167,16 @@ class RehearsalRun:
 
     def _record(self, session: Session, begins: RehearsalState | None = None) -> SessionRecorder | None:
         try:
-            self.recorder = record(session, self.anatomy, self.arch, self.out, begins, self.notices)
+            self.recorder = record(session, self.anatomy, self.arch, self.asked.out, begins, self.notices)
         except OSError as error:
             click.echo(
-                f"Warning: this session is not recorded: {self.out} cannot be written to ({error.strerror})"
+                f"Warning: this session is not recorded: {self.asked.out} cannot be written to ({error.strerror})"
             )
         return self.recorder
 
-    def _replay(self, log: Log, at_s: float, settings: Settings) -> Replay:
+    def _replay(self, log: Log, settings: Settings) -> Replay:
         _echo(replay_warning(log.header, self.arch))
-        return open_session(log, at_s, self.rehearsal, settings, self.measurements)
+        return open_session(log, self.asked.at, self.rehearsal, settings, self.measurements)
 
     @contextmanager
     def _summarised(self, source: InputSource, replay: Replay | None) -> Iterator[None]:
@@ -196,13 +198,21 @@ class RehearsalRun:
             _echo(guide.in_words(summary.get(f"seen_{guide.plan.target}")))
         if self.recorder is not None:
             self.recorder.close(summary)
-            text = f"Recorded; replay it with: {self._replay_command(self.recorder.recording.path)}"
+            scene = [] if self.asked.scene == EMBEDDED else [self.asked.scene]
+            again = shell_command("rehearse", *scene, "--replay", self.recorder.recording.path)
+            text = f"Recorded; replay it with: {again}"
             click.echo(self.recorder.recording.fault or text)
 
-    def _replay_command(self, session: Path) -> str:
-        """The command line that replays a session, quoted for the shell."""
-        scene = [] if self.scene is None else [self.scene]
-        return shell_command("rehearse", *scene, "--replay", session)
+
+def replay_warning(header: Header, arch: str) -> str:
+    """Why a replay may differ in bits from the recording: another version or backend; empty if both are the same."""
+    if header.version not in (None, VERSION):
+        return (
+            f"Warning: recorded by version {header.version}, replayed by {VERSION}: the results may differ."
+        )
+    if header.arch != arch:
+        return f"Warning: recorded on {header.arch}, replayed on {arch}: the same up to rounding, not bit for bit."
+    return ""
 
 
 def _verdict(replay: Replay | None) -> str:

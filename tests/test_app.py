@@ -22,8 +22,8 @@ from PIL import Image
 
 import app
 from rehearsal.commands.command_line import CommandError
-from rehearsal.commands.option_checks import refuse_no_pictures
-from rehearsal.commands.rehearse_command import found_display
+from rehearsal.commands.rehearse_command import why_no_display
+from rehearsal.commands.rehearse_options import RehearseOptions
 from studies.study_command import STUDIES
 from version import VERSION
 
@@ -122,11 +122,9 @@ def test_without_a_display_it_runs_headless_by_itself_and_says_so(pressed):
     assert len(list((pressed / "frames").glob("*.png"))) == len(list((pressed / "slices").glob("*.png")))
 
 
-def test_a_display_that_does_not_answer_is_named(monkeypatch, capsys):
-    monkeypatch.setattr("rehearsal.commands.rehearse_command.display_available", lambda: False)
+def test_a_display_that_does_not_answer_is_named(monkeypatch):
     monkeypatch.setenv("DISPLAY", ":4242")
-    assert not found_display()
-    assert "No display (DISPLAY is :4242, which does not answer): running" in capsys.readouterr().out
+    assert why_no_display() == "DISPLAY is :4242, which does not answer"
 
 
 def test_without_vulkan_it_says_so_in_one_line_and_still_writes_slices_and_report(tmp_path):
@@ -150,7 +148,7 @@ def test_without_vulkan_it_says_so_in_one_line_and_still_writes_slices_and_repor
 
 
 def test_a_window_without_vulkan_is_refused_before_anything_is_built(monkeypatch, tmp_path):
-    monkeypatch.setattr("rehearsal.commands.rehearse_command.found_display", lambda: True)
+    monkeypatch.setattr("rehearsal.commands.rehearse_command.display_available", lambda: True)
     monkeypatch.setattr("sim.device.is_available", lambda arch: arch != "vulkan")
     assert "install a Vulkan driver" in refused("rehearse", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -228,7 +226,7 @@ def test_mistakes_are_one_line(tmp_path):
     assert "Did you mean" not in refused("xyz")
     assert "leave out --no-pictures or --link" in refused("rehearse", "--headless", "--no-pictures", "--link")
     with pytest.raises(CommandError, match="add --headless"):
-        refuse_no_pictures(headless=False, link=False)
+        RehearseOptions(no_pictures=True).check()
     assert "--arch" in refused("rehearse", "--arch", "abacus")
     assert "--seconds" in refused("rehearse", "--seconds", "-1")
     assert "--radius = 0.0" in refused("rehearse", "--radius", "0")

@@ -13,7 +13,7 @@ from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 from test_session import header
 
-from rehearsal.commands.option_checks import replay_warning
+from rehearsal.run import replay_warning
 from version import PROJECT, VERSION
 
 # Licences that a program under Apache-2.0 can use, as packages name them.

@@ -1,23 +1,32 @@
-"""Shared by the commands: errors, types of options, scenes, output folders, the start of Taichi."""
+"""Shared by the commands: errors, options, scenes, output folders, the start of Taichi."""
 
+import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType, UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import click
+from pydantic import BaseModel, ConfigDict
+from pydantic.fields import FieldInfo
 
+from rehearsal.configuration import with_quality
 from rehearsal.result_files import write_json
 from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.atomic_files import check_writable
-from scenes.scene import Scene, load_scene, scene_file
+from scenes.scene import OPTIONS, Scene, load_scene, scene_file, with_options
 from scenes.tissue import QUALITIES
-from ultrasound.probe import DETAIL_LEVELS, MODES
+from ultrasound.probe import DetailLevel, Mode
 
 # Exit status after Ctrl-C.
 STOPPED = 130
+# What pydantic calls the ends of a range.
+BOUNDS = "ge", "gt", "le", "lt"
+# Marks an argument among ``CommandOptions``: given by its place, without a name.
+ARGUMENT = "argument"
 
 
 class CommandError(click.ClickException):
@@ -66,17 +75,14 @@ def make_folder(folder: Path, option: str = "--out") -> None:
     made = [each for each in (folder, *folder.parents) if not each.exists()]
     if context := click.get_current_context(silent=True):
         context.call_on_close(partial(_remove_empty, made))
+    fault = "created"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise CommandError(
-            f"{folder}: cannot be created ({error.strerror}); choose another {option}"
-        ) from None
-    try:
+        fault = "written to"
         check_writable(folder)
     except OSError as error:
         raise CommandError(
-            f"{folder}: cannot be written to ({error.strerror}); choose another {option}"
+            f"{folder}: cannot be {fault} ({error.strerror}); choose another {option}"
         ) from None
 
 
@@ -87,13 +93,12 @@ def _remove_empty(folders: list[Path]) -> None:
             each.rmdir()
 
 
-def make_place(json_file: Path | None) -> None:
-    """Check that the file of --json, if given, can be written. Raises CommandError."""
-    if json_file is None:
-        return
-    make_folder(json_file.parent, "--json")
-    if json_file.is_dir():
-        raise CommandError(f"{json_file}: is a folder; name a file after --json")
+def make_place(file: Path | None, option: str = "--json") -> None:
+    """Check that the file of an option, if given, can be written. Raises CommandError."""
+    if file is not None:
+        make_folder(file.parent, option)
+        if file.is_dir():
+            raise CommandError(f"{file}: is a folder; name a file after {option}")
 
 
 def save_figures(figures: dict[str, Any], json_file: Path) -> None:
@@ -107,10 +112,12 @@ def save_figures(figures: dict[str, Any], json_file: Path) -> None:
     click.echo(f"\nWrote {json_file}")
 
 
-def load_patient(scene: Path) -> tuple[Scene, LoadedAnatomy]:
-    """Load a scene file or a patient's folder, and its anatomy. Raises SceneError, PatientError."""
+def load_patient(
+    scene: Path, changes: Mapping[str, Any] = MappingProxyType({}), quality: str | None = None
+) -> tuple[Scene, LoadedAnatomy]:
+    """Load a scene file or a patient's folder, changed by options, and its anatomy. Raises SceneError, PatientError."""
     path = scene_file(scene)
-    loaded = load_scene(path)
+    loaded = with_quality(with_options(load_scene(path), changes), quality)
     return loaded, load_anatomy(loaded, path.parent)
 
 
@@ -134,26 +141,115 @@ arch_option = click.option(
     show_default=True,
     help="Where to compute; auto is CUDA where there is one, else the CPU.",
 )
-quality_option = click.option(
-    "--quality",
-    type=click.Choice(QUALITIES),
-    help="Resolution and iterations of a preset of the tissue model [the scene's].",
-)
 
 
-def image_options(command: Callable) -> Callable:
-    """Add --probe, --picture and --detail-level to a command."""
-    options = (
-        click.option("--probe", help="Probe, by its name or as a file [the scene's]."),
-        click.option("--picture", type=click.Choice(MODES), help="B-mode, CT or both [the scene's]."),
-        click.option(
-            "--detail-level",
-            "--rung",
-            "detail_level",
-            type=click.Choice(DETAIL_LEVELS),
-            help="Detail level (realism) of the B-mode image [the scene's].",
-        ),
+def field_of(option: str) -> str:
+    """The field of ``CommandOptions`` for an option without a name of its own."""
+    return option.strip("-").replace("-", "_")
+
+
+def _option(field: str) -> str:
+    return f"--{field.replace('_', '-')}"
+
+
+class CommandOptions(BaseModel):
+    """The arguments and options of a command: each field is one, with its default, its range, and as help the text below it.
+
+    A type may carry names that are not the field's (``Annotated[float, "--cell"]``), ARGUMENT, or the ``click.Choice`` it is among.
+    """
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """The values of a scene that the options change, by key; None for an option that was not given."""
+        fields = {key: field_of(option) for key, option in OPTIONS.items()}
+        return {
+            key: getattr(self, field) for key, field in fields.items() if field in type(self).model_fields
+        }
+
+    def given(self, *fields: str) -> list[str]:
+        """Those options among some fields that differ from their defaults, as the user names them."""
+        named = type(self).model_fields
+        return [_option(field) for field in fields if getattr(self, field) != named[field].default]
+
+
+Given = TypeVar("Given", bound=CommandOptions)
+
+
+def command(
+    options: type[Given], name: str | None = None
+) -> Callable[[Callable[[Given], None]], click.Command]:
+    """Make a function of some options a command; its help lists own options before inherited ones."""
+    fields = options.model_fields
+    own_first = sorted(fields, key=lambda field: field not in options.__annotations__)
+    parameters = [_parameter(field, fields[field]) for field in own_first]
+
+    def made(run: Callable[[Given], None]) -> click.Command:
+        def called(**given: Any) -> None:
+            run(options(**given))
+
+        return click.Command(
+            name or run.__name__, callback=called, params=parameters, help=inspect.getdoc(run)
+        )
+
+    return made
+
+
+def _parameter(name: str, field: FieldInfo) -> click.Parameter:
+    is_union = get_origin(field.annotation) in (Union, UnionType)
+    kind = get_args(field.annotation)[0] if is_union else field.annotation
+    items = get_args(kind) if get_origin(kind) is tuple else (kind,)
+    marks = [each for each in field.metadata if isinstance(each, str)]
+    common: dict[str, Any] = dict(
+        type=_click_type(items[0], field.metadata),
+        nargs=-1 if Ellipsis in items else len(items),
+        required=field.is_required(),
     )
-    for option in reversed(options):
-        command = option(command)
-    return command
+    if not field.is_required():
+        common["default"] = field.default
+    if ARGUMENT in marks:
+        return click.Argument([name], **common)
+    names = [*(marks or [_option(name)]), name]
+    shown = not (field.is_required() or field.default is None or kind is bool)
+    return click.Option(names, is_flag=kind is bool, help=field.description, show_default=shown, **common)
+
+
+def _click_type(kind: Any, about: list[Any]) -> click.ParamType:
+    """The type that click checks, from a field's type and what is annotated beside it."""
+    for choice in about:
+        if isinstance(choice, click.Choice):
+            return choice
+    if get_origin(kind) is Literal:
+        return click.Choice(get_args(kind))
+    bounds = {each: getattr(bound, each) for bound in about for each in BOUNDS if hasattr(bound, each)}
+    if bounds:
+        low, high = bounds.get("ge", bounds.get("gt")), bounds.get("le", bounds.get("lt"))
+        range_of = WholeRange if kind is int else NumberRange
+        return range_of(low, high, min_open="gt" in bounds, max_open="lt" in bounds)
+    return {Path: click.Path(path_type=Path), float: Number()}.get(kind) or click.types.convert_type(kind)
+
+
+class ArchOptions(CommandOptions):
+    """Where to compute."""
+
+    arch: Literal["auto", "cuda", "vulkan", "cpu"] = "auto"
+    """Where to compute; auto is CUDA where there is one, else the CPU."""
+
+
+class ImageOptions(CommandOptions):
+    """Values of a scene's image."""
+
+    probe: str | None = None
+    """Probe, by its name or as a file [the scene's]."""
+    picture: Mode | None = None
+    """B-mode, CT or both [the scene's]."""
+    detail_level: Annotated[DetailLevel | None, "--detail-level", "--rung"] = None
+    """Detail level (realism) of the B-mode image [the scene's]."""
+
+
+class QualityOptions(CommandOptions):
+    """A preset."""
+
+    quality: Annotated[str | None, click.Choice(QUALITIES)] = None
+    """Resolution and iterations of a preset of the tissue model [the scene's]."""

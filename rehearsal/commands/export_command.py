@@ -1,10 +1,12 @@
 """The command ``export``: the surfaces and volumes of a scene as files."""
 
 from pathlib import Path
+from typing import Annotated
 
 import click
 import trimesh
 
+from rehearsal.commands.command_line import ARGUMENT, CommandOptions, command
 from rehearsal.result_files import counted
 from scenes.anatomy import LoadedAnatomy, files_of, load_anatomy
 from scenes.atomic_files import check_folder, new_folder
@@ -14,26 +16,24 @@ from scenes.surfaces import FORMATS, save_surface
 from scenes.volumes.volume_files import file_volume, save_image
 
 
-@click.command()
-@click.argument("scene", type=click.Path(path_type=Path))
-@click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="Folder to write to; new or empty."
-)
-@click.option(
-    "--format",
-    "suffix",
-    type=click.Choice(FORMATS),
-    default="stl",
-    show_default=True,
-    help="Format of the surfaces; PLY keeps the order of their vertices.",
-)
-def export(scene: Path, out: Path, suffix: str) -> None:
+class ExportOptions(CommandOptions):
+    """What the user asks of an export."""
+
+    scene: Annotated[Path, ARGUMENT]
+    out: Path
+    """Folder to write to; new or empty."""
+    suffix: Annotated[str, "--format", click.Choice(FORMATS)] = "stl"
+    """Format of the surfaces; PLY keeps the order of their vertices."""
+
+
+@command(ExportOptions)
+def export(asked: ExportOptions) -> None:
     """Write surfaces, CT and labels of SCENE as files.
 
     SCENE is a scene file or a patient's folder. Surfaces become STL or PLY, CT and label map NRRD.
     All is in mm, in the patient's LPS, at rest; rehearse writes the deformed surfaces.
     """
-    path = scene_file(scene)
+    path, out, suffix = scene_file(asked.scene), asked.out, asked.suffix
     check_folder(out)
     loaded = load_scene(path)
     anatomy = load_anatomy(loaded, path.parent)

@@ -1,16 +1,19 @@
 """The command ``reconstruct``: the volume of a tracked sweep, compared with the patient."""
 
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import click
 import numpy as np
+from pydantic import Field
 from tqdm import tqdm
 
 from rehearsal.commands.command_line import (
+    ARGUMENT,
+    ArchOptions,
     CommandError,
-    NumberRange,
-    arch_option,
+    command,
     load_patient,
     make_folder,
     start_taichi,
@@ -41,106 +44,75 @@ MOST_REACH_MM = 5.0
 LEAST_SCANNED, SMALL_SCANNED = 0.01, 0.3
 
 
-@click.command()
-@click.argument("sweep", type=click.Path(path_type=Path))
-@click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="Folder for the volume and the report."
-)
-@click.option(
-    "--scene",
-    type=click.Path(path_type=Path),
-    help="Scene or patient's folder of the sweep, to compare with.",
-)
-@click.option(
-    "--config",
-    type=click.Path(path_type=Path),
-    help="PLUS configuration (XML) with ImageToProbe, where the sweep has none.",
-)
-@click.option(
-    "--reference",
-    default="Reference",
-    show_default=True,
-    help="Coordinate system of the volume, as PLUS names it.",
-)
-@click.option(
-    "--method",
-    type=click.Choice(METHODS),
-    default="smooth",
-    show_default=True,
-    help="Interpolation from pixels to voxels.",
-)
-@click.option(
-    "--spacing-mm", type=NumberRange(0.05, 10), default=0.5, show_default=True, help="Width of a voxel."
-)
-@click.option(
-    "--reach-mm",
-    type=NumberRange(0, 20),
-    help="Gaps up to twice this width are filled [the distance of most images].",
-)
-@click.option(
-    "--undo-compression",
-    is_flag=True,
-    help="Compression correction: press the scene's organ along the tracked path, and move each pixel to its place at rest.",
-)
-@click.option(
-    "--noise-mm", type=NumberRange(0), default=0.0, help="Simulated tracker noise: SD of each coordinate."
-)
-@click.option("--noise-deg", type=NumberRange(0), default=0.0, help="SD of the angle about each axis.")
-@click.option(
-    "--calibration-mm",
-    type=NumberRange(0),
-    default=0.0,
-    help="Constant offset of the image on the probe.",
-)
-@click.option(
-    "--calibration-deg", type=NumberRange(0), default=0.0, help="Constant rotation of the image on the probe."
-)
-@click.option("--latency-s", type=NumberRange(0), default=0.0, help="Delay of the poses.")
-@click.option("--lost", type=NumberRange(0, 1), default=0.0, help="Fraction of frames without a pose.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Random seed of these errors.")
-@arch_option
-def reconstruct(
-    sweep: Path,
-    out: Path,
-    scene: Path | None,
-    config: Path | None,
-    reference: str,
-    method: str,
-    spacing_mm: float,
-    reach_mm: float | None,
-    undo_compression: bool,
-    seed: int,
-    arch: str,
-    **tracker: float,
-) -> None:
+class ReconstructOptions(ArchOptions):
+    """What the user asks of a reconstruction."""
+
+    sweep: Annotated[Path, ARGUMENT]
+    out: Path
+    """Folder for the volume and the report."""
+    scene: Path | None = None
+    """Scene or patient's folder of the sweep, to compare with."""
+    config: Path | None = None
+    """PLUS configuration (XML) with ImageToProbe, where the sweep has none."""
+    reference: str = "Reference"
+    """Coordinate system of the volume, as PLUS names it."""
+    method: Annotated[str, click.Choice(METHODS)] = "smooth"
+    """Interpolation from pixels to voxels."""
+    spacing_mm: float = Field(0.5, ge=0.05, le=10)
+    """Width of a voxel."""
+    reach_mm: float | None = Field(None, ge=0, le=20)
+    """Gaps up to twice this width are filled [the distance of most images]."""
+    undo_compression: bool = False
+    """Compression correction: press the scene's organ along the tracked path, and move each pixel to its place at rest."""
+    noise_mm: float = Field(0.0, ge=0)
+    """Simulated tracker noise: SD of each coordinate."""
+    noise_deg: float = Field(0.0, ge=0)
+    """SD of the angle about each axis."""
+    calibration_mm: float = Field(0.0, ge=0)
+    """Constant offset of the image on the probe."""
+    calibration_deg: float = Field(0.0, ge=0)
+    """Constant rotation of the image on the probe."""
+    latency_s: float = Field(0.0, ge=0)
+    """Delay of the poses."""
+    lost: float = Field(0.0, ge=0, le=1)
+    """Fraction of frames without a pose."""
+    seed: int = 0
+    """Random seed of these errors."""
+
+
+@command(ReconstructOptions)
+def reconstruct(asked: ReconstructOptions) -> None:
     """Reconstruct a volume from SWEEP, a tracked sweep (.igs.mha).
 
     The sweep is from Nephron or PLUS. Writes volume.nrrd, volume.png and report.json; with ground-truth labels
     (SWEEP-marks.igs.mha, which a rehearsal records) also organ and tumour in labels.nrrd. With simulated tracker
     errors, it also writes the sweep that has them, tracked.igs.mha.
     """
-    if undo_compression and scene is None:
+    out, reference = asked.out, asked.reference
+    if asked.undo_compression and asked.scene is None:
         raise CommandError("--undo-compression: needs the organ of a scene; name it with --scene")
-    images = read_sweep(sweep)
-    images.constant |= load_constants(config) if config else {}
-    labels = read_ground_truth(sweep)
-    errors = _errors_of(tracker)
+    images = read_sweep(asked.sweep)
+    images.constant |= load_constants(asked.config) if asked.config else {}
+    labels = read_ground_truth(asked.sweep)
+    errors = TrackingErrors(**{each.name: getattr(asked, each.name) for each in fields(TrackingErrors)})
     if errors != TrackingErrors():
-        images = with_errors(images, reference, errors, seed)
+        images = with_errors(images, reference, errors, asked.seed)
     image_poses = image_poses_of(images, reference)
     about = _describe(images, image_poses)
-    patient = None if scene is None else load_patient(scene)
+    patient = None if asked.scene is None else load_patient(asked.scene)
     make_folder(out)
     if errors != TrackingErrors():
         write_sweep(out / "tracked.igs.mha", images)
     settings: dict[str, Any] = dict(
-        method=method,
-        spacing_mm=spacing_mm,
-        reach_mm=default_reach_mm(image_poses, spacing_mm) if reach_mm is None else reach_mm,
+        method=asked.method,
+        spacing_mm=asked.spacing_mm,
+        reach_mm=default_reach_mm(image_poses, asked.spacing_mm)
+        if asked.reach_mm is None
+        else asked.reach_mm,
     )
     places = None
-    if undo_compression and patient is not None:
-        places = _compression_correction(patient, images, image_poses, reference, arch)
+    if asked.undo_compression and patient is not None:
+        places = _compression_correction(patient, images, image_poses, reference, asked.arch)
     with tqdm(total=len(image_poses.frames), desc="reconstruct", unit="image") as bar:
         try:
             mask = lit_pixels(images.images)
@@ -148,14 +120,14 @@ def reconstruct(
                 images, image_poses, mask, **settings, labels=labels, places=places, progress=bar.update
             )
         except ValueError as error:
-            raise CommandError(f"{sweep.name}: {error}") from None
+            raise CommandError(f"{asked.sweep.name}: {error}") from None
     save_volumes(volumes, out)
     report = dict(
         version=VERSION,
         **settings,
         reference=reference,
-        undo_compression=undo_compression,
-        tracker=tracker,
+        undo_compression=asked.undo_compression,
+        tracker=asdict(errors),
         **about,
         shape=list(volumes.box.shape),
         agreement=_metrics(volumes, patient),
@@ -164,13 +136,6 @@ def reconstruct(
     write_json(report, out / "report.json")
     click.echo(in_words(report))
     click.echo(f"Wrote volume.nrrd, volume.png and report.json to {out}")
-
-
-def _errors_of(tracker: dict[str, float]) -> TrackingErrors:
-    try:
-        return TrackingErrors(**tracker)
-    except ValueError as error:
-        raise CommandError(f"errors of a tracker: {error}") from None
 
 
 def default_reach_mm(image_poses: ImagePoses, spacing_mm: float) -> float:

@@ -6,199 +6,82 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import click
+from pydantic import ValidationError
 
-from rehearsal.commands.command_line import (
-    CommandError,
-    Number,
-    NumberRange,
-    arch_option,
-    image_options,
-    make_folder,
-    quality_option,
-    start_taichi,
-)
-from rehearsal.commands.option_checks import (
-    as_recorded,
-    check_files,
-    refuse_headless,
-    refuse_inputs,
-    refuse_no_pictures,
-    refuse_no_vulkan,
-    refuse_sizes,
-    session_of,
-)
+from errors import explained
+from rehearsal.commands.command_line import CommandError, command, make_folder, start_taichi
+from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.configuration import Setup, probe_of, scene_of, with_quality
-from rehearsal.planning.plan_file import read_plan
-from rehearsal.tracking.openigtlink_options import link_options, open_link
-from rehearsal.tracking.track_file import PROBE_IN_PATIENT, load_track
+from rehearsal.planning.plan_file import Plan, PlanError, is_plan, read_plan
+from rehearsal.sessions.recorded_scene import scene_of_log
+from rehearsal.sessions.session_file import Log, SessionError, read_log
+from rehearsal.tracking.openigtlink_options import open_link
+from rehearsal.tracking.track_file import check_near, load_track
 from render.display import display_available
 from render.keys import Keys, keys_text, load_keys
-from scenes.anatomy import LoadedAnatomy, load_anatomy
-from scenes.scene import EMBEDDED, OPTIONS, Scene, load_scene, scene_file, with_options
+from scenes.anatomy import LoadedAnatomy, fingerprint, load_anatomy
+from scenes.scene import Scene, load_scene, scene_file, with_options
 from scenes.terminal import ReportProgress, stages
-from scenes.tissue import TISSUES
-from ultrasound.probe import Probe
+from ultrasound.probe import Probe, ProbeError, probe_of_values
 
 if TYPE_CHECKING:
     from rehearsal.rehearsal import Rehearsal
 
 
-@click.command()
-@click.argument("scene", type=click.Path(path_type=Path), default=EMBEDDED, required=False)
-@click.option(
-    "--headless", is_flag=True, help="No window: run the scripted press, write images and a report."
-)
-@click.option(
-    "--no-pictures",
-    is_flag=True,
-    help="With --headless: no images, which take most of the time; only report, surfaces and session.",
-)
-@click.option(
-    "--seconds",
-    type=NumberRange(0.02, 3600),
-    help="Simulated seconds without a window [the scene's press]; the scripted press is stretched to them, a replay or a track is cut off.",
-)
-@click.option(
-    "--replay",
-    type=click.Path(path_type=Path),
-    help="Replay a recorded session of this SCENE, bit for bit.",
-)
-@click.option("--at", type=NumberRange(0), default=0.0, help="With --replay: start at this second.")
-@click.option(
-    "--track",
-    "track_file",
-    type=click.Path(path_type=Path),
-    help="Recorded poses that move the probe: a tracked sweep (.igs.mha), or poses with times (CSV, JSON).",
-)
-@click.option(
-    "--track-from", help=f"With --track: the sweep's transform from probe to patient [{PROBE_IN_PATIENT}]."
-)
-@click.option("--gamepad", is_flag=True, help="Use a gamepad beside mouse and keys.")
-@click.option(
-    "--keys",
-    "keys_file",
-    type=click.Path(path_type=Path),
-    help="Your own key map: a TOML file as printed by app.py keys.",
-)
-@click.option(
-    "--plan", "plan_file", type=click.Path(path_type=Path), help="A sweep to follow: a file of app.py plan."
-)
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("out"),
-    show_default=True,
-    help="Folder for images and report; a run without a window replaces those of an earlier one.",
-)
-@arch_option
-@click.option("--model", type=click.Choice(list(TISSUES)), help="Tissue model [the scene's].")
-@click.option("--cell", type=Number(), help="neo-hookean: width of a cell in mm [the scene's].")
-@click.option("--young-kpa", type=Number(), help="neo-hookean: Young's modulus in kPa [the scene's].")
-@click.option("--poisson", type=Number(), help="neo-hookean: Poisson's ratio [the scene's].")
-@click.option("--radius", type=Number(), help="shape-matching: particle radius in mm [the scene's].")
-@click.option("--stiffness", type=Number(), help="shape-matching: cluster stiffness, 0 to 1 [the scene's].")
-@click.option("--substeps", type=int, help="Substeps of a time step [the model's].")
-@click.option("--iterations", type=int, help="Iterations of the solver in a substep [the model's].")
-@quality_option
-@image_options
-@click.option(
-    "--budget-ms",
-    type=NumberRange(0.01, 10_000),
-    help="Choose the most accurate resolution and iterations whose step takes no longer on this machine (measured first).",
-)
-@click.option(
-    "--error-mm",
-    type=NumberRange(0, 100),
-    help="Choose the fastest resolution and iterations whose mean bead error (study trade) is no larger.",
-)
-@link_options
-def rehearse(
-    scene: Path,
-    headless: bool,
-    no_pictures: bool,
-    seconds: float | None,
-    replay: Path | None,
-    at: float,
-    track_file: Path | None,
-    track_from: str | None,
-    gamepad: bool,
-    keys_file: Path | None,
-    plan_file: Path | None,
-    out: Path,
-    arch: str,
-    quality: str | None,
-    budget_ms: float | None,
-    error_mm: float | None,
-    link: bool,
-    link_host: str | None,
-    link_port: int | None,
-    link_leads: bool,
-    **changes: Any,
-) -> None:
+@command(RehearseOptions)
+def rehearse(asked: RehearseOptions) -> None:
     """Press the kidney of SCENE with the probe and see its ultrasound image.
 
     SCENE is a scene file or a patient's folder; without one it is the embedded patient.
     """
-    path = scene_file(scene)
-    changed = {key: changes[option.strip("-").replace("-", "_")] for key, option in OPTIONS.items()}
-    choosers = {"--quality": quality, "--budget-ms": budget_ms, "--error-mm": error_mm}
+    no_display = not asked.headless and not display_available()
+    asked.headless |= no_display
+    path = scene_file(asked.scene)
     before = load_scene(path)
-    keys = load_keys(keys_file) if keys_file is not None else Keys()
-    refuse_inputs(track_file, track_from, replay, link_leads)
-    refuse_sizes(changed, choosers)
-    track = load_track(track_file, track_from) if track_file is not None else None
-    plan = read_plan(plan_file) if plan_file is not None else None
-    log = session_of(replay, at, changed, choosers)
-    loaded, probe = as_asked(before, changed, quality) if log is None else as_recorded(log, before)
-    headless = headless or not found_display()
-    refuse_headless(headless, gamepad, link_leads)
-    refuse_no_vulkan(headless)
-    if no_pictures:
-        refuse_no_pictures(headless, link)
-    make_folder(out)
-    used = start_taichi(arch)
-    server = open_link(link, link_host, link_port, link_leads)
+    keys = load_keys(asked.keys) if asked.keys else Keys()
+    asked.check()
+    track = load_track(asked.track, asked.track_from) if asked.track else None
+    plan = read_plan(asked.plan) if asked.plan else None
+    log = session_of(asked.replay, asked.at) if asked.replay else None
+    loaded, probe = as_asked(before, asked) if log is None else as_recorded(log, before)
+    if no_display:
+        click.echo(f"No display ({why_no_display()}): running the scripted press without a window.")
+    if not asked.headless:
+        check_vulkan()
+    make_folder(asked.out)
+    used = start_taichi(asked.arch)
+    link = open_link(asked)
     with stages() as progress:
         anatomy = load_anatomy(loaded, path.parent, progress)
-        check_files(anatomy, before.title, probe, log, track_file, track, plan)
-        started, chosen = perf_counter(), ""
-        if budget_ms is not None or error_mm is not None:
-            model = changed["tissue.model"]
-            rehearsal, chosen = built_within(
-                loaded, anatomy, probe, used, progress, model, budget_ms, error_mm
+        if log is not None and fingerprint(anatomy) != log.header.anatomy:
+            raise SessionError(
+                f"the session belongs to other anatomy than this scene ({before.title or 'no title'}): name "
+                "its scene or patient's folder before --replay; a patient imported again counts as another"
             )
+        if track is not None and asked.track is not None:
+            check_near(track, anatomy.organ.vertices, asked.track)
+            if is_plan(asked.track):
+                check_plan(read_plan(asked.track), fingerprint(anatomy), probe)
+        if plan is not None:
+            check_plan(plan, fingerprint(anatomy), probe)
+        started, chosen = perf_counter(), ""
+        if asked.budget_ms is not None or asked.error_mm is not None:
+            rehearsal, chosen = built_within(loaded, anatomy, probe, used, progress, asked)
         else:
-            rehearsal = built(loaded, anatomy, probe, progress, not no_pictures)
+            rehearsal = built(loaded, anatomy, probe, progress, not asked.no_pictures)
         build_s = perf_counter() - started
-        if not no_pictures:
+        if not asked.no_pictures:
             progress("Building the model: the first picture")
             compile_picture(rehearsal)
     if chosen:
         click.echo(chosen)
     from rehearsal.run import RehearsalRun
 
-    tracked = server.received_pose if server is not None and link_leads else None
-    named = None if scene == EMBEDDED else scene
-    run = RehearsalRun(
-        rehearsal, anatomy, used, out, budget_ms, tracked, track, keys, gamepad, server, plan, named
-    )
-    if headless:
-        run.headless(log, at, seconds, build_s, not no_pictures)
+    run = RehearsalRun(rehearsal, anatomy, used, asked, track, keys, link, plan)
+    if asked.headless:
+        run.headless(log, build_s)
     else:
-        run.in_window(log, at)
-
-
-def as_asked(
-    scene: Scene, changed: dict[str, float | str | None], quality: str | None
-) -> tuple[Scene, Probe]:
-    """A scene with the options of the command line, and its probe; prints if they change the tissue model.
-
-    Raises SceneError, ProbeError.
-    """
-    asked = with_quality(with_options(scene, changed), quality)
-    if changed["tissue.model"] is None and asked.tissue.model != scene.tissue.model:
-        click.echo(f"Tissue model: {asked.tissue.model}, as the options ask for it.")
-    return asked, probe_of(asked)
+        run.in_window(log)
 
 
 @click.command("keys")
@@ -207,14 +90,70 @@ def keys_command() -> None:
     click.echo(keys_text(), nl=False)
 
 
-def found_display() -> bool:
-    """Whether there is a screen for a window; prints if there is none."""
-    found = display_available()
-    if not found:
-        display = os.environ.get("DISPLAY")
-        why = f"DISPLAY is {display}, which does not answer" if display else "DISPLAY is not set"
-        click.echo(f"No display ({why}): running the scripted press without a window.")
-    return found
+def why_no_display() -> str:
+    """What is wrong with the screen."""
+    display = os.environ.get("DISPLAY")
+    return f"DISPLAY is {display}, which does not answer" if display else "DISPLAY is not set"
+
+
+def check_vulkan() -> None:
+    """Raises CommandError if a window has no Vulkan driver, before minutes are spent on building the model."""
+    from sim.device import is_available
+
+    if not is_available("vulkan"):
+        raise CommandError(
+            "no Vulkan driver found: the window needs one; install a Vulkan driver, or run with --headless"
+        )
+
+
+def as_asked(scene: Scene, asked: RehearseOptions) -> tuple[Scene, Probe]:
+    """A scene with the options of the command line, and its probe; prints if they change the tissue model.
+
+    Raises SceneError, ProbeError.
+    """
+    changed = with_quality(with_options(scene, asked.changes), asked.quality)
+    if asked.model is None and changed.tissue.model != scene.tissue.model:
+        click.echo(f"Tissue model: {changed.tissue.model}, as the options ask for it.")
+    return changed, probe_of(changed)
+
+
+def session_of(path: Path, at_s: float) -> Log:
+    """The session to replay from a second on. Raises CommandError, SessionError."""
+    log = read_log(path)
+    if at_s > log.length_s:
+        raise CommandError(
+            f"--at {at_s:g}: the session is {log.length_s:.1f} s long; choose an earlier second"
+        )
+    return log
+
+
+def as_recorded(log: Log, scene: Scene) -> tuple[Scene, Probe]:
+    """The patient of a scene with all other settings of a session, and the session's probe. Raises SessionError."""
+    try:
+        return scene_of_log(log.header, scene), probe_of_values(log.header.probe)
+    except ValidationError as error:
+        raise SessionError(f"the session's scene cannot be used: {explained(error)}") from None
+    except ProbeError as error:
+        raise SessionError(f"the session's probe cannot be used: {error}") from None
+
+
+def check_plan(plan: Plan, anatomy: str, probe: Probe) -> None:
+    """Raises PlanError if a plan is for other anatomy (by its fingerprint) or for another probe."""
+    if plan.anatomy != anatomy:
+        raise PlanError(
+            "the plan is for other anatomy than this scene: name its scene or patient's folder before --plan; "
+            "a patient imported again counts as another"
+        )
+    planned = _probe_name(plan.probe.get("TransducerName"), plan.probe.get("HousingMm"))
+    found = _probe_name(probe.transducer_name, probe.housing_mm)
+    if planned != found:
+        raise PlanError(
+            f"the plan is for the probe {planned}, found {found}: choose it with --probe, or plan anew"
+        )
+
+
+def _probe_name(name: Any, housing_mm: Any) -> str:
+    return f"{name!r} of {' x '.join(f'{each:g}' for each in housing_mm or ())} mm"
 
 
 def built(
@@ -241,22 +180,17 @@ def built_within(
     probe: Probe,
     arch: str,
     progress: ReportProgress,
-    model: Any,
-    budget_ms: float | None,
-    error_mm: float | None,
+    asked: RehearseOptions,
 ) -> tuple["Rehearsal", str]:
     """The rehearsal with the settings that meet the budgets on this machine, and a text that names them. Raises CommandError."""
-    from rehearsal.speed_accuracy.budget_choice import NoPoint, choose, described
-    from rehearsal.speed_accuracy.pareto_front import front_of, load_points
+    from rehearsal.speed_accuracy import choose_within_budget, described, front_of, load_points
 
     def build(setup: Setup) -> "Rehearsal":
         start_taichi(arch)
         return built(scene_of(scene, setup), anatomy, probe, progress)
 
-    try:
-        rehearsal, point, step_ms = choose(front_of(load_points(), model), build, budget_ms, error_mm)
-    except NoPoint as reason:
-        raise CommandError(str(reason)) from None
+    front = front_of(load_points(), asked.model)
+    rehearsal, point, step_ms = choose_within_budget(front, build, asked.budget_ms, asked.error_mm)
     return rehearsal, (
         f"Chosen: {described(point.setup)}; a step takes {step_ms:.1f} ms here, expected error {point.error_mean_mm:.2f} mm."
     )

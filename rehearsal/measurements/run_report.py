@@ -7,7 +7,7 @@ import numpy as np
 from rehearsal.configuration import STEP, Setup
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import counted, spread
-from rehearsal.speed_accuracy.pareto_front import expected_error_mm, load_points
+from rehearsal.speed_accuracy import expected_error_mm, load_points
 from scenes.tissue import TISSUES
 from sim.fields import array_of
 from version import VERSION

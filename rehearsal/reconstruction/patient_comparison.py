@@ -1,17 +1,74 @@
-"""The volumes of a sweep compared with the patient: with the surfaces of the scene, at rest in the CT."""
+"""The volumes of a sweep compared with the patient: with the surfaces of the scene, at rest in the CT, by Dice, HD95, volume, centroid."""
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 import trimesh
+from scipy import ndimage
 
-from rehearsal.reconstruction.segmentation_metrics import SegmentationMetrics, segmentation_metrics
 from rehearsal.reconstruction.sweep_volumes import SweepVolumes
 from scenes.anatomy import LoadedAnatomy
 from sim.signed_distance import signed_distance
 from ultrasound.reconstruction import VoxelBox
+
+
+@dataclass(frozen=True)
+class SegmentationMetrics:
+    """Metrics of a region found, against the true region.
+
+    - ``dice``: Dice coefficient, 0 to 1.
+    - ``hd95_mm``: 95th percentile Hausdorff distance: the larger of the two directed percentiles (MONAI's definition). The
+      surface is the voxels of a region with one outside among their six neighbours.
+    - ``volume_percent``: volume relative to the truth, minus 100 %.
+    - ``centroid_mm``: distance of the centroids.
+
+    Where nothing was found, Dice is 0, the volume -100 %, and the two distances are nan.
+    """
+
+    dice: float
+    hd95_mm: float
+    volume_percent: float
+    centroid_mm: float
+
+
+def segmentation_metrics(found: np.ndarray, truth: np.ndarray, spacing_mm: float) -> SegmentationMetrics:
+    """Compare two regions (x, y, z) bool on one grid of cubic voxels.
+
+    Raises ValueError where the grids differ, or where the truth is empty.
+    """
+    found, truth = np.asarray(found, bool), np.asarray(truth, bool)
+    if found.shape != truth.shape:
+        raise ValueError(f"regions are on grids of {found.shape} and {truth.shape} voxels")
+    if not truth.any():
+        raise ValueError("the true region is empty")
+    if not found.any():
+        return SegmentationMetrics(0.0, math.nan, -100.0, math.nan)
+    # The bounding box of both: distances do not change.
+    both = ndimage.find_objects((found | truth).astype(np.uint8))[0]
+    found, truth = found[both], truth[both]
+    shared, count, true_count = (int(np.count_nonzero(a)) for a in (found & truth, found, truth))
+    return SegmentationMetrics(
+        dice=2 * shared / (count + true_count),
+        hd95_mm=spacing_mm * max(_distance95(found, truth), _distance95(truth, found)),
+        volume_percent=100 * (count / true_count - 1),
+        centroid_mm=spacing_mm * float(np.linalg.norm(_centroid(found) - _centroid(truth))),
+    )
+
+
+def _distance95(region: np.ndarray, other: np.ndarray) -> float:
+    """95th percentile of the distances [voxels] from the surface of one region to the other's."""
+    distances = ndimage.distance_transform_edt(~_surface(other))
+    return float(np.percentile(distances[_surface(region)], 95))
+
+
+def _surface(region: np.ndarray) -> np.ndarray:
+    return region & ~ndimage.binary_erosion(region)
+
+
+def _centroid(region: np.ndarray) -> np.ndarray:
+    return np.argwhere(region).mean(axis=0)
 
 
 def surfaces_of(anatomy: LoadedAnatomy) -> dict[str, trimesh.Trimesh]:
@@ -78,7 +135,7 @@ def compare_with_surfaces(
             scanned_part=None if part is None else _rounded(part),
         )
     if beads_mm is not None:
-        errors = landmark_errors_mm(volumes, beads_mm)
+        errors = [float(np.linalg.norm(place - beads_mm[bead])) for bead, place in volumes.beads.items()]
         found["landmarks"] = dict(
             count=len(errors),
             of=len(beads_mm),
@@ -86,11 +143,6 @@ def compare_with_surfaces(
             max_mm=float(np.max(errors)) if errors else None,
         )
     return found
-
-
-def landmark_errors_mm(volumes: SweepVolumes, beads_mm: np.ndarray) -> list[float]:
-    """The distances between the reconstructed beads and their places at rest [mm]."""
-    return [float(np.linalg.norm(place - beads_mm[bead])) for bead, place in volumes.beads.items()]
 
 
 def _rounded(figures: SegmentationMetrics) -> dict[str, float | None]:

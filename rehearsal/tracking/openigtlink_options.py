@@ -1,48 +1,40 @@
 """The OpenIGTLink options of ``rehearse``."""
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import click
+from pydantic import Field
 
-from rehearsal.commands.command_line import CommandError, WholeRange
+from rehearsal.commands.command_line import CommandError, CommandOptions
 
 if TYPE_CHECKING:
     from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer
 
 HOST, PORT = "127.0.0.1", 18944
-OPTIONS = (
-    click.option("--link", is_flag=True, help="Send the live image and the probe's pose over OpenIGTLink."),
-    click.option("--link-host", help=f"With --link: the address on which this machine listens [{HOST}]."),
-    click.option(
-        "--link-leads",
-        is_flag=True,
-        help="With --link: the probe follows the transform HandToReference that a client sends.",
-    ),
-    click.option("--link-port", type=WholeRange(1, 65535), help=f"With --link: its port [{PORT}]."),
-)
 
 
-def link_options(command: Callable) -> Callable:
-    """Give a command --link, --link-host, --link-leads and --link-port."""
-    for option in reversed(OPTIONS):
-        command = option(command)
-    return command
+class LinkOptions(CommandOptions):
+    """The options of the link."""
+
+    link: bool = False
+    """Send the live image and the probe's pose over OpenIGTLink."""
+    link_host: str | None = None
+    """With --link: the address on which this machine listens [127.0.0.1]."""
+    link_leads: bool = False
+    """With --link: the probe follows the transform HandToReference that a client sends."""
+    link_port: int | None = Field(None, ge=1, le=65535)
+    """With --link: its port [18944]."""
 
 
-def open_link(
-    link: bool, host: str | None, port: int | None, leads: bool = False
-) -> "OpenIGTLinkServer | None":
+def open_link(asked: LinkOptions) -> "OpenIGTLinkServer | None":
     """Open the server that the options describe; it closes when the command ends. Raises CommandError."""
-    if not link:
-        given = {"--link-host": host, "--link-port": port, "--link-leads": leads or None}
-        for option, value in given.items():
-            if value is not None:
-                raise CommandError(f"{option}: the link is off; add --link, or leave {option} out")
+    if not asked.link:
+        for option in asked.given("link_host", "link_port", "link_leads"):
+            raise CommandError(f"{option}: the link is off; add --link, or leave {option} out")
         return None
     from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer
 
-    host, port = host or HOST, port or PORT
+    host, port = asked.link_host or HOST, asked.link_port or PORT
     try:
         server = OpenIGTLinkServer(host, port, click.echo)
     except (OSError, TypeError) as error:  # TypeError: a text that cannot be a host name

@@ -2,13 +2,17 @@
 
 from pathlib import Path
 from time import perf_counter
+from typing import Annotated, Literal
 
 import click
+from pydantic import Field
 from tqdm import tqdm
 
 from rehearsal.commands.command_line import (
-    WholeRange,
-    arch_option,
+    ARGUMENT,
+    ArchOptions,
+    CommandOptions,
+    command,
     make_folder,
     make_place,
     numbers,
@@ -17,66 +21,58 @@ from rehearsal.commands.command_line import (
 )
 from rehearsal.configuration import choose_setup
 from scenes.scene import model_with
-from scenes.tissue import TISSUES, USUAL
+from scenes.tissue import QUALITIES, TISSUES, USUAL
 from studies.accuracy.bead_case import load_case
-from studies.study_options import jobs_option, number_option, out_option, preset_option
 
 
-@click.command()
-@click.argument("case", type=click.Path(path_type=Path))
-@click.option(
-    "--model", type=click.Choice(list(TISSUES)), help=f"[{USUAL}, or what the options below belong to]"
-)
-@preset_option
-@number_option(
-    "--cell", "cell_mm", low=0.5, high=20, help="neo-hookean: width of a cell in mm [the preset's]."
-)
-@number_option(
-    "--young-kpa", low=0, high=1e6, min_open=True, help="neo-hookean: Young's modulus in kPa [the case's]."
-)
-@number_option("--poisson", low=0, high=0.4999, help="neo-hookean: Poisson's ratio [the case's].")
-@number_option(
-    "--radius", "radius_mm", low=0.5, high=20, help="shape-matching: particle radius in mm [the preset's]."
-)
-@number_option("--stiffness", low=0, high=1, help="shape-matching: cluster stiffness [the preset's].")
-@click.option("--substeps", type=WholeRange(1, 100), help="Substeps of a time step [the preset's].")
-@click.option(
-    "--iterations",
-    type=WholeRange(1, 1000),
-    help="Iterations over the constraints in a substep [the preset's].",
-)
-@number_option("--time-step", "time_step_s", low=1e-4, high=0.1, help="Time step in s [1/60].")
-@click.option(
-    "--check",
-    "checked",
-    is_flag=True,
-    help="Also a convergence study of time step, iterations and size; takes long.",
-)
-@arch_option
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file.")
-def validate(
-    case: Path,
-    model: str | None,
-    quality: str,
-    checked: bool,
-    arch: str,
-    json_file: Path | None,
-    **changes: float | None,
-) -> None:
+class ValidateOptions(ArchOptions):
+    """What the user asks of a validation."""
+
+    case: Annotated[Path, ARGUMENT]
+    model: Annotated[str | None, click.Choice(list(TISSUES))] = None
+    """[neo-hookean, or what the options below belong to]"""
+    quality: Annotated[str, click.Choice(QUALITIES)] = "balanced"
+    """A preset of the model; other options change single values of it."""
+    cell_mm: Annotated[float | None, "--cell"] = Field(None, ge=0.5, le=20)
+    """neo-hookean: width of a cell in mm [the preset's]."""
+    young_kpa: float | None = Field(None, gt=0, le=1e6)
+    """neo-hookean: Young's modulus in kPa [the case's]."""
+    poisson: float | None = Field(None, ge=0, le=0.4999)
+    """neo-hookean: Poisson's ratio [the case's]."""
+    radius_mm: Annotated[float | None, "--radius"] = Field(None, ge=0.5, le=20)
+    """shape-matching: particle radius in mm [the preset's]."""
+    stiffness: float | None = Field(None, ge=0, le=1)
+    """shape-matching: cluster stiffness [the preset's]."""
+    substeps: int | None = Field(None, ge=1, le=100)
+    """Substeps of a time step [the preset's]."""
+    iterations: int | None = Field(None, ge=1, le=1000)
+    """Iterations over the constraints in a substep [the preset's]."""
+    time_step_s: Annotated[float | None, "--time-step"] = Field(None, ge=1e-4, le=0.1)
+    """Time step in s [1/60]."""
+    check: bool = False
+    """Also a convergence study of time step, iterations and size; takes long."""
+    json_file: Annotated[Path | None, "--json"] = None
+    """Write the figures to this file."""
+
+
+@command(ValidateOptions)
+def validate(asked: ValidateOptions) -> None:
     """Compare with the bead experiment of CASE, a folder.
 
     The organ is pressed as in the experiment, and its beads compared with the measured ones.
     """
-    given = [name for name, value in changes.items() if value is not None]
-    setup = choose_setup(model or model_with(given, USUAL), quality, **changes)
-    loaded = load_case(case)
-    make_place(json_file)
-    used = start_taichi(arch)
+    changes = asked.model_dump(
+        exclude={"case", "model", "quality", "check", "arch", "json_file"}, exclude_none=True
+    )
+    setup = choose_setup(asked.model or model_with(changes, USUAL), asked.quality, **changes)
+    loaded = load_case(asked.case)
+    make_place(asked.json_file)
+    used = start_taichi(asked.arch)
     from studies.accuracy import convergence_study
     from studies.accuracy.bead_errors import report, summary, table
     from studies.accuracy.bead_experiment import BeadExperiment
 
-    if checked:
+    if asked.check:
         convergence_study.changes_of(setup)
     started = perf_counter()
     experiment = BeadExperiment(loaded, setup)
@@ -86,65 +82,55 @@ def validate(
     click.echo(f"{summary(figures, experiment.describe(setup))}\nbuilt  in {built_s:.1f} s, on {used}\n")
     click.echo(table(loaded, run.beads))
     try:
-        if checked:
+        if asked.check:
             figures["independence"] = []
             click.echo(f"\n{convergence_study.HEAD}")
             for row in convergence_study.moved(experiment, setup, run.beads):
                 click.echo(convergence_study.line(row))
                 figures["independence"].append(row)
     finally:
-        if json_file is not None:
-            save_figures(figures, json_file)
+        if asked.json_file is not None:
+            save_figures(figures, asked.json_file)
 
 
-@click.command()
-@click.argument("cases", metavar="CASE...", type=click.Path(path_type=Path), nargs=-1, required=True)
-@out_option
-@click.option("--radii", default="2.2,2.5,2.7,3.0,3.3", show_default=True, help="Particle radii in mm.")
-@click.option(
-    "--hold-out",
-    type=click.Choice(["stages", "beads", "cases"]),
-    default="stages",
-    show_default=True,
-    help="Data that is not fitted but judges the fit: each case's deepest stage, every third bead, or the last CASE.",
-)
-@number_option(
-    "--grid",
-    "spacing",
-    low=0.01,
-    high=0.5,
-    default=0.05,
-    help="Spacing of the stiffnesses tried; around the best it is a fifth of that.",
-)
-@click.option(
-    "--search",
-    "generations",
-    type=WholeRange(1, 1000),
-    help="Instead of the stiffness alone, search stiffness, over-relaxation and iterations for this many generations.",
-)
-@jobs_option
-@click.option("--dask", "address", help="Run on the Dask cluster of this scheduler, such as tcp://host:8786.")
-def calibrate(
-    cases: tuple[Path, ...],
-    out: Path,
-    radii: str,
-    hold_out: str,
-    spacing: float,
-    generations: int | None,
-    jobs: int | None,
-    address: str | None,
-) -> None:
+class CalibrateOptions(CommandOptions):
+    """What the user asks of a calibration."""
+
+    case: Annotated[tuple[Path, ...], ARGUMENT]
+    out: Path
+    """Folder for tables and figures."""
+    radii: str = "2.2,2.5,2.7,3.0,3.3"
+    """Particle radii in mm."""
+    hold_out: Literal["stages", "beads", "cases"] = "stages"
+    """Data that is not fitted but judges the fit: each case's deepest stage, every third bead, or the last CASE."""
+    grid: float = Field(0.05, ge=0.01, le=0.5)
+    """Spacing of the stiffnesses tried; around the best it is a fifth of that."""
+    search: int | None = Field(None, ge=1, le=1000)
+    """Instead of the stiffness alone, search stiffness, over-relaxation and iterations for this many generations."""
+    jobs: int | None = Field(None, ge=1, le=1024)
+    """Processes on this machine [one a processor]."""
+    dask: str | None = None
+    """Run on the Dask cluster of this scheduler, such as tcp://host:8786."""
+
+
+@command(CalibrateOptions)
+def calibrate(asked: CalibrateOptions) -> None:
     """Fit shape matching to bead experiments, as the paper did.
 
     Every stiffness is tried for each particle radius, on the folders CASE..., and judged on held-out data.
     """
-    radii_mm = numbers(radii, "--radii", 0.5, 20)
-    loaded = [load_case(case) for case in cases]
+    out, generations, spacing = asked.out, asked.search, asked.grid
+    radii_mm = numbers(asked.radii, "--radii", 0.5, 20)
+    loaded = [load_case(case) for case in asked.case]
     make_folder(out)
     from studies.accuracy import calibration, calibration_results, case_workers
 
-    split = calibration.split_of(loaded, hold_out)
-    with case_workers.dask_workers(address) if address else case_workers.local_workers(jobs) as work:
+    split = calibration.split_of(loaded, asked.hold_out)
+    with (
+        case_workers.dask_workers(asked.dask)
+        if asked.dask
+        else case_workers.local_workers(asked.jobs) as work
+    ):
         if generations:
             count = calibration.search_count(len(loaded), len(radii_mm), generations)
         else:

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from rehearsal.commands.command_line import arch_option, make_folder, start_taichi
 from rehearsal.configuration import PRESETS, Setup, setup_of
 from rehearsal.result_files import rounded
-from rehearsal.speed_accuracy.pareto_front import SETTINGS, pareto, preset_of, setup_of_row
+from rehearsal.speed_accuracy import SETTINGS, pareto, preset_of, setup_of_row
 from rehearsal.stopwatch import timed
 from sim.device import start
 from studies.accuracy.bead_case import BeadCase, load_case

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from rehearsal.cine import KEPT_S, Caliper, Cine, CineFrame
+from rehearsal.caliper import Caliper
+from rehearsal.cine import KEPT_S, Cine, CineFrame
 from render.viewer import View
 
 HERE = np.eye(4)

@@ -3,7 +3,7 @@
 import json
 import socket
 from dataclasses import replace
-from pathlib import PurePosixPath
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +13,7 @@ from click.exceptions import Exit
 import app
 from rehearsal import frame, headless, run
 from rehearsal.commands import rehearse_command
+from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.frame import Frames, WindowFrames
 from rehearsal.notices import Notices
 from render.keys import DEFAULT_KEYS, Keys
@@ -299,7 +300,7 @@ def test_ctrl_c_in_a_run_says_so_before_how_it_went(monkeypatch, capsys):
     monkeypatch.setattr(run.RehearsalRun, "_end", lambda each, bookmarks: print(f"{bookmarks} bookmarks"))
     monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide: None)
     driver = SimpleNamespace(session=SimpleNamespace(time_s=1.25), bookmarks=3)
-    each = run.RehearsalRun(Fake(), None, "cpu", None)
+    each = run.RehearsalRun(Fake(), None, "cpu", RehearseOptions())
     with pytest.raises(Exit) as ended, each._summarised(driver, None):
         raise KeyboardInterrupt
     assert ended.value.exit_code == 130
@@ -312,8 +313,8 @@ def test_ctrl_c_in_a_run_says_so_before_how_it_went(monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("scene", "words"),
     [
-        (None, ["--replay", "a/session-001.jsonl"]),
-        (PurePosixPath("my patients/a"), ["my patients/a", "--replay", "a/session-001.jsonl"]),
+        (EMBEDDED, ["--replay", "a/session-001.jsonl"]),
+        (Path("my patients/a"), ["my patients/a", "--replay", "a/session-001.jsonl"]),
     ],
 )
 def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scene, words):
@@ -323,8 +324,8 @@ def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scen
         lambda rehearsal, guide: SimpleNamespace(guide=None, summary=lambda bookmarks: {}),
     )
     monkeypatch.setattr(run, "summary_text", lambda summary: "")
-    each = run.RehearsalRun(Fake(), None, "cpu", None, scene=scene)
-    recording = SimpleNamespace(path=PurePosixPath("a/session-001.jsonl"), fault="")
+    each = run.RehearsalRun(Fake(), None, "cpu", RehearseOptions(scene=scene))
+    recording = SimpleNamespace(path=Path("a/session-001.jsonl"), fault="")
     each.recorder = SimpleNamespace(recording=recording, close=lambda summary: None)
     each._end(0)
     assert capsys.readouterr().out.endswith(f"replay it with: {shell_command('rehearse', *words)}\n")
@@ -343,9 +344,9 @@ def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path
     monkeypatch.setattr(run, "Session", lambda rehearsal, coverage: None)
     for name in ("_user_input", "_record", "_end"):
         monkeypatch.setattr(run.RehearsalRun, name, lambda *_: SimpleNamespace(bookmarks=0))
-    each = run.RehearsalRun(Fake(), None, "cpu", tmp_path, link=link)
-    each.in_window(None, 0.0)
-    each.headless(None, 0.0, 1.0, 0.0)
+    each = run.RehearsalRun(Fake(), None, "cpu", RehearseOptions(out=tmp_path, seconds=1.0), link=link)
+    each.in_window(None)
+    each.headless(None, 0.0)
     assert given == [link, link]
 
 
@@ -359,7 +360,7 @@ def test_the_command_opens_the_link_for_as_long_as_it_runs_and_names_its_scene(m
 
     def headless_run(each: run.RehearsalRun, *_) -> None:
         socket.create_connection(("127.0.0.1", port), 5).close()
-        reached.append(each.link is not None and each.link.port == port and each.scene == scene)
+        reached.append(each.link is not None and each.link.port == port and each.asked.scene == scene)
 
     monkeypatch.setattr(rehearse_command, "start_taichi", lambda arch: "cpu")
     monkeypatch.setattr(rehearse_command, "built", lambda *_: None)

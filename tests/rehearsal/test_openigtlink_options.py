@@ -7,13 +7,13 @@ import pytest
 from click.testing import CliRunner
 from test_openigtlink import SOON_S, joined, said, server  # noqa: F401 fixtures
 
-from rehearsal.tracking.openigtlink_options import link_options, open_link
+from rehearsal.commands.command_line import command
+from rehearsal.tracking.openigtlink_options import LinkOptions, open_link
 
 
-@click.command()
-@link_options
-def linking(link: bool, link_host: str | None, link_leads: bool, link_port: int | None) -> None:
-    server = open_link(link, link_host, link_port, link_leads)
+@command(LinkOptions)
+def linking(asked: LinkOptions) -> None:
+    server = open_link(asked)
     if server is not None:
         joined(server).close()
         click.echo(f"on {server.server_address[0]}")

@@ -1,6 +1,7 @@
 """A plan's file, and what is refused of plans and of the command lines that make and follow them."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +11,8 @@ from plan_ball import ORIGIN, plan_of, straight_pass, sweep_of
 from pydantic import ValidationError
 
 import app
-from rehearsal.commands.option_checks import check_plan
-from rehearsal.commands.plan_command import trocar_of
+from rehearsal.commands.plan_command import PlanOptions, trocar_of
+from rehearsal.commands.rehearse_command import check_plan
 from rehearsal.planning import trial_workers
 from rehearsal.planning.plan_file import (
     APPROACH_S,
@@ -205,8 +206,10 @@ def test_a_trocar_out_of_range_is_refused(values):
 
 def test_the_command_line_changes_the_scenes_trocar():
     scenes = Trocar(at_mm=(1, 2, 3), axis=(0, 0, 2), cone_deg=40, wrist_deg=60, longest_mm=200)
-    assert trocar_of(scenes, None, None, None) == scenes
-    changed = trocar_of(scenes, (4, 5, 6), 30, 0)
+    assert trocar_of(scenes, PlanOptions(out=Path("plan.json"))) == scenes
+    changed = trocar_of(
+        scenes, PlanOptions(out=Path("plan.json"), trocar=(4, 5, 6), cone_deg=30, wrist_deg=0)
+    )
     assert changed == Trocar(at_mm=(4, 5, 6), axis=(0, 0, 2), cone_deg=30, wrist_deg=0, longest_mm=200)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rehearsal.reconstruction.segmentation_metrics import SegmentationMetrics, segmentation_metrics
+from rehearsal.reconstruction.patient_comparison import SegmentationMetrics, segmentation_metrics
 
 VOXEL = 0.5
 

@@ -13,6 +13,7 @@ from null_viewer import NullViewer
 
 from rehearsal import headless, run
 from rehearsal.build_solver import step_settings
+from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.coordinates import probe_in_patient
 from rehearsal.frame_view import initial_settings
 from rehearsal.measurements.live_measurements import LiveMeasurements
@@ -94,8 +95,8 @@ def rehearsed(built, monkeypatch, out: Path, script: Any, log: Log | None = None
     viewer = Watched(settings, script(settings))
     monkeypatch.setattr(run, "open_viewer", lambda *_, **__: viewer)
     # A budget that no step keeps: the ladder goes down.
-    each = run.RehearsalRun(rehearsal, anatomy, "cpu", out, budget_ms=0.01)
-    each.in_window(log, at_s)
+    each = run.RehearsalRun(rehearsal, anatomy, "cpu", RehearseOptions(out=out, budget_ms=0.01, at=at_s))
+    each.in_window(log)
     return viewer.seen, rehearsal.digest(), each.recorder and read_log(each.recorder.recording.path)
 
 
@@ -200,8 +201,9 @@ def test_a_tracked_file_is_followed_headless_and_replayed(built, monkeypatch, tm
     track = TimedPoses(
         np.linspace(2.0, 2.5, 31), [None if 8 <= k < 12 else pose for k, pose in enumerate(poses)]
     )
-    tracked = run.RehearsalRun(rehearsal, anatomy, "cpu", tmp_path, budget_ms=0.01, track=track)
-    tracked.headless(None, 0.0, None, 0.0)
+    asked = RehearseOptions(out=tmp_path, budget_ms=0.01)
+    tracked = run.RehearsalRun(rehearsal, anatomy, "cpu", asked, track)
+    tracked.headless(None, 0.0)
     log = read_log(tracked.recorder.recording.path)
     assert len(log.poses) == 31 and probe_in_patient(rehearsal) == pytest.approx(poses[-1])
     told = [event.value for events in log.events.values() for event in events if event.kind == "solver"]
@@ -209,7 +211,8 @@ def test_a_tracked_file_is_followed_headless_and_replayed(built, monkeypatch, tm
     assert "B-mode at detail level" in capsys.readouterr().out and (tmp_path / "slices").is_dir()
     rehearsal.reset()
     (tmp_path / "bare").mkdir()
-    run.RehearsalRun(rehearsal, anatomy, "cpu", tmp_path / "bare").headless(log, 0.0, None, 0.0, draws=False)
+    asked = RehearseOptions(out=tmp_path / "bare", no_pictures=True)
+    run.RehearsalRun(rehearsal, anatomy, "cpu", asked).headless(log, 0.0)
     told = capsys.readouterr().out
     assert "identical in all 1 states" in told and "no images" in told and "per image" not in told
     assert sorted(path.name for path in (tmp_path / "bare").iterdir()) == FILES

@@ -13,9 +13,13 @@ from PIL import Image
 
 from rehearsal.configuration import PRESETS
 from rehearsal.reconstruction import compression_correction
-from rehearsal.reconstruction.patient_comparison import compare_with_surfaces, enclosing, voxels_inside
+from rehearsal.reconstruction.patient_comparison import (
+    compare_with_surfaces,
+    enclosing,
+    segmentation_metrics,
+    voxels_inside,
+)
 from rehearsal.reconstruction.reconstruction_files import save_slices_figure, save_volumes
-from rehearsal.reconstruction.segmentation_metrics import segmentation_metrics
 from rehearsal.reconstruction.sweep_volumes import (
     SweepVolumes,
     image_poses_of,

@@ -10,15 +10,16 @@ from PIL import Image
 from small_bead_case import write_case
 
 import app
+from rehearsal import speed_accuracy
 from rehearsal.adaptive_iterations import LEVELS, STEPS_DOWN, STEPS_UP, AdaptiveIterations
 from rehearsal.build_solver import step_settings
-from rehearsal.commands.option_checks import refuse_sizes
 from rehearsal.commands.rehearse_command import as_asked
+from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.configuration import PRESETS, Setup, scene_of, setup_of
 from rehearsal.measurements.run_report import expected_error_of
-from rehearsal.speed_accuracy import budget_choice
-from rehearsal.speed_accuracy.pareto_front import (
+from rehearsal.speed_accuracy import (
     MEASURED,
+    NoPoint,
     Point,
     expected_error_mm,
     front_of,
@@ -26,7 +27,7 @@ from rehearsal.speed_accuracy.pareto_front import (
     pareto,
     preset_of,
 )
-from scenes.scene import EMBEDDED, OPTIONS, PAPER, SolverSection, load_scene, with_options
+from scenes.scene import EMBEDDED, PAPER, SolverSection, load_scene, with_options
 from scenes.tissue import QUALITIES
 from sim.neo_hookean import LATTICE_SETTINGS
 from studies.accuracy.bead_case import load_case
@@ -126,7 +127,7 @@ class Machine:
     def __init__(self, monkeypatch, slower: float) -> None:
         self.built: list[float] = []
         self.slower = slower
-        monkeypatch.setattr(budget_choice, "trial_ms", lambda rehearsal: rehearsal)
+        monkeypatch.setattr(speed_accuracy, "trial_ms", lambda rehearsal: rehearsal)
 
     def build(self, setup: Setup):
         self.built.append(setup.size_mm)
@@ -139,26 +140,26 @@ FRONT = [point(10 / cell, cell / 10, cell) for cell in (10.0, 5.0, 2.0, 1.0)]
 def test_a_time_budget_takes_the_most_accurate_setting_within_it(monkeypatch):
     for slower, budget, wanted in ((1.0, 5.0, 2.0), (2.0, 5.0, 5.0), (0.4, 5.0, 1.0), (1.0, 1.5, 10.0)):
         machine = Machine(monkeypatch, slower)
-        _, chosen, here_ms = budget_choice.choose(FRONT, machine.build, budget, None)
+        _, chosen, here_ms = speed_accuracy.choose_within_budget(FRONT, machine.build, budget, None)
         assert chosen.setup.size_mm == wanted
         assert here_ms <= budget and machine.built[-1] == wanted and len(machine.built) <= 2
 
 
 def test_an_error_budget_takes_the_fastest_setting_within_it(monkeypatch):
     machine = Machine(monkeypatch, 1.0)
-    assert budget_choice.choose(FRONT, machine.build, None, 0.4)[1].setup.size_mm == 2.0
+    assert speed_accuracy.choose_within_budget(FRONT, machine.build, None, 0.4)[1].setup.size_mm == 2.0
     # With time for more, both take the truest.
-    assert budget_choice.choose(FRONT, machine.build, 20.0, 0.4)[1].setup.size_mm == 1.0
+    assert speed_accuracy.choose_within_budget(FRONT, machine.build, 20.0, 0.4)[1].setup.size_mm == 1.0
 
 
 def test_budgets_that_no_setting_meets_are_refused(monkeypatch):
     machine = Machine(monkeypatch, 3.0)
-    with pytest.raises(budget_choice.NoPoint, match="--budget-ms 1: .* takes 3.00 ms here"):
-        budget_choice.choose(FRONT, machine.build, 1.0, None)
-    with pytest.raises(budget_choice.NoPoint, match=r"--error-mm 0.05: .* is 0.100 mm"):
-        budget_choice.choose(FRONT, machine.build, None, 0.05)
-    with pytest.raises(budget_choice.NoPoint, match="takes 15.00 ms here"):
-        budget_choice.choose(FRONT, machine.build, 10.0, 0.2)
+    with pytest.raises(NoPoint, match="--budget-ms 1: .* takes 3.00 ms here"):
+        speed_accuracy.choose_within_budget(FRONT, machine.build, 1.0, None)
+    with pytest.raises(NoPoint, match=r"--error-mm 0.05: .* is 0.100 mm"):
+        speed_accuracy.choose_within_budget(FRONT, machine.build, None, 0.05)
+    with pytest.raises(NoPoint, match="takes 15.00 ms here"):
+        speed_accuracy.choose_within_budget(FRONT, machine.build, 10.0, 0.2)
 
 
 @pytest.mark.parametrize(
@@ -180,18 +181,17 @@ def test_the_command_line_refuses_a_size_beside_what_chooses_it(line, words, cap
 
 
 def test_a_quality_sets_size_and_iterations_and_leaves_the_material():
-    scene, said = load_scene(PAPER), dict.fromkeys(OPTIONS)
-    firm = said | {"tissue.young_kpa": 33.0}
+    scene, firm = load_scene(PAPER), RehearseOptions(young_kpa=33.0)
     for quality, cell_mm, iterations in (("fast", 5.0, 4), ("accurate", 2.0, 12)):
-        asked, _ = as_asked(scene, firm, quality)
+        asked, _ = as_asked(scene, firm.model_copy(update={"quality": quality}))
         assert (asked.tissue.cell_mm, asked.tissue.young_kpa) == (cell_mm, 33.0)
         assert (asked.solver.substeps, asked.solver.iterations) == (1, iterations)
-    stiff = said | {"tissue.stiffness": 0.7}
-    asked, probe = as_asked(scene, stiff, "fast")
+    stiff = RehearseOptions(stiffness=0.7, quality="fast")
+    asked, _ = as_asked(scene, stiff)
     assert (asked.tissue.radius_mm, asked.tissue.stiffness, asked.solver.iterations) == (3.3, 0.7, 9)
-    refuse_sizes(stiff, {"--quality": "fast", "--budget-ms": None, "--error-mm": None})
-    refuse_sizes(firm, {"--quality": None, "--budget-ms": 5.0, "--error-mm": 0.1})
-    assert as_asked(scene, said, None) == (scene, probe)
+    stiff.check()
+    RehearseOptions(young_kpa=33.0, budget_ms=5.0, error_mm=0.1).check()
+    assert as_asked(scene, RehearseOptions())[0] == scene
 
 
 def test_a_slow_step_loses_iterations_rung_by_rung_and_gets_them_back():

@@ -5,7 +5,7 @@ import pytest
 from conftest import rotation_about
 from numpy.typing import ArrayLike
 
-from rehearsal.reconstruction.segmentation_metrics import SegmentationMetrics, segmentation_metrics
+from rehearsal.reconstruction.patient_comparison import SegmentationMetrics, segmentation_metrics
 from ultrasound.reconstruction import MAX_VOXELS, METHODS, Reconstruction, VoxelBox
 
 VOXEL = 0.5

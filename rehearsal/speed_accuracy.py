@@ -1,21 +1,31 @@
-"""The speed-accuracy points measured by ``study trade``, and their Pareto front."""
+"""The speed-accuracy points measured by ``study trade``, their Pareto front, and the best point of it for a budget on this machine."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from errors import UserError
 from rehearsal.configuration import PRESETS, Setup, setup_of
 
+if TYPE_CHECKING:
+    from rehearsal.rehearsal import Rehearsal
+
 # Written by ``study trade``, copied here whole.
-MEASURED = Path(__file__).with_name("points.json")
+MEASURED = Path(__file__).with_suffix(".json")
 SETTINGS = ("radius_mm", "cell_mm", "stiffness", "substeps", "iterations", "relaxation_factor")
 # Settings farther from every measured point than this factor in resolution times iterations have no expected error.
 NEAR = 1.6
+# The press that measures the time of a step on this machine.
+TRIAL_MM, TRIAL_STEPS = 8.0, 40
+
+
+class NoPoint(UserError):
+    """Raised for budgets that no settings meet; the message is one line."""
 
 
 @dataclass(frozen=True)
@@ -83,3 +93,66 @@ def expected_error_mm(points: Sequence[Point], setup: Setup) -> float | None:
     own = [point for point in points if point.setup.model == setup.model]
     nearest = min(own, key=away, default=None)
     return None if nearest is None or away(nearest) > np.log(NEAR) else nearest.error_mean_mm
+
+
+def choose_within_budget(
+    front: list[Point], build: Callable[[Setup], "Rehearsal"], budget_ms: float | None, error_mm: float | None
+) -> tuple["Rehearsal", Point, float]:
+    """A rehearsal within the budgets, its point, and the time of a step measured here [ms].
+
+    With a time alone it is the truest that keeps it, with an error the fastest that keeps that. The front's times are
+    another machine's and another organ's: a first trial says how much longer steps take here. Raises NoPoint.
+    """
+    front = sorted(front, key=lambda point: point.ms_median)
+    allowed = [point for point in front if error_mm is None or point.error_mean_mm <= error_mm]
+    if not allowed:
+        best = min(point.error_mean_mm for point in front)
+        raise NoPoint(
+            f"--error-mm {error_mm:g}: the least mean error that was measured is {best:.3f} mm; ask for that or more"
+        )
+
+    def tried(at: int) -> tuple["Rehearsal", float]:
+        rehearsal = build(allowed[at].setup)
+        return rehearsal, trial_ms(rehearsal)
+
+    if budget_ms is None:
+        rehearsal, here_ms = tried(0)
+        return rehearsal, allowed[0], here_ms
+    times = np.array([point.ms_median for point in allowed])
+    guess = _last(times <= budget_ms)
+    rehearsal, here_ms = tried(guess)
+    at = _last(here_ms / times[guess] * times <= budget_ms)
+    if at != guess:
+        rehearsal, here_ms = tried(at)
+    while here_ms > budget_ms:
+        if at == 0:
+            raise NoPoint(
+                f"--budget-ms {budget_ms:g}: a step of {described(allowed[0].setup)} takes {here_ms:.2f} ms here, and none "
+                f"that may be chosen is faster; ask for that or more"
+            )
+        at -= 1
+        rehearsal, here_ms = tried(at)
+    return rehearsal, allowed[at], here_ms
+
+
+def _last(true: np.ndarray) -> int:
+    """Index of the last that is true; 0 where none is."""
+    return int(np.flatnonzero(true)[-1]) if true.any() else 0
+
+
+def trial_ms(rehearsal: "Rehearsal") -> float:
+    """Median time of a step here [ms], over a press; the rehearsal is as it was afterwards."""
+    from rehearsal.stopwatch import timed
+
+    ms: list[float] = []
+    for depth in np.linspace(0.0, TRIAL_MM, TRIAL_STEPS):
+        pose = rehearsal.pose_at_depth(float(depth))
+        timed(lambda: rehearsal.advance(pose), ms)
+    rehearsal.reset()
+    return float(np.median(ms))
+
+
+def described(setup: Setup) -> str:
+    """Settings as text."""
+    size = f"{setup.tissue.piece_name} of {setup.size_mm:g} mm"
+    return f"{setup.model}, {size}, {setup.substeps} x {setup.iterations} iterations"

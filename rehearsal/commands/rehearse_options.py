@@ -1,0 +1,114 @@
+"""The options of ``rehearse``, and which of them exclude each other."""
+
+from pathlib import Path
+from typing import Annotated
+
+import click
+from pydantic import Field
+
+from rehearsal.commands.command_line import (
+    ARGUMENT,
+    ArchOptions,
+    CommandError,
+    ImageOptions,
+    QualityOptions,
+    field_of,
+)
+from rehearsal.tracking.openigtlink_options import LinkOptions
+from scenes.scene import EMBEDDED, OPTIONS
+from scenes.tissue import TISSUES
+
+# CommandOptions that choose resolution and iterations, and the options of tissue and solver that each leaves to the user.
+MATERIAL = ("model", "young_kpa", "poisson")
+LEFT = {"quality": (*MATERIAL, "stiffness"), "budget_ms": MATERIAL, "error_mm": MATERIAL}
+TISSUE_AND_STEP = [field_of(name) for key, name in OPTIONS.items() if key.startswith(("tissue.", "solver."))]
+# CommandOptions that exclude each other, and options that need another one.
+EXCLUDING = {
+    ("track", "replay"): "--track: a replay has the recorded poses; leave out --track or --replay",
+    (
+        "link_leads",
+        "track",
+    ): "--link-leads: a file moves the probe; leave out --link-leads, or --track and --replay",
+    (
+        "link_leads",
+        "replay",
+    ): "--link-leads: a file moves the probe; leave out --link-leads, or --track and --replay",
+    ("gamepad", "headless"): "--gamepad: needs a window; leave out --gamepad or --headless",
+    ("link_leads", "headless"): "--link-leads: needs a window; leave out --link-leads or --headless",
+    ("no_pictures", "link"): "--no-pictures: the link sends images; leave out --no-pictures or --link",
+    (
+        "quality",
+        "budget_ms",
+    ): "--quality: --budget-ms chooses resolution and iterations too; leave one of them out",
+    (
+        "quality",
+        "error_mm",
+    ): "--quality: --error-mm chooses resolution and iterations too; leave one of them out",
+}
+NEEDING = {
+    ("track_from", "track"): "--track-from: names a transform of a tracked sweep; add its file with --track",
+    ("at", "replay"): "--at: is a time in a session; name its file with --replay",
+    ("no_pictures", "headless"): "--no-pictures: a window needs images; leave it out, or add --headless",
+}
+
+
+class RehearseOptions(LinkOptions, ImageOptions, QualityOptions, ArchOptions):
+    """What the user asks of a rehearsal."""
+
+    scene: Annotated[Path, ARGUMENT] = EMBEDDED
+    headless: bool = False
+    """No window: run the scripted press, write images and a report."""
+    no_pictures: bool = False
+    """With --headless: no images, which take most of the time; only report, surfaces and session."""
+    seconds: float | None = Field(None, ge=0.02, le=3600)
+    """Simulated seconds without a window [the scene's press]; the scripted press is stretched to them, a replay or a track is cut off."""
+    replay: Path | None = None
+    """Replay a recorded session of this SCENE, bit for bit."""
+    at: float = Field(0.0, ge=0)
+    """With --replay: start at this second."""
+    track: Path | None = None
+    """Recorded poses that move the probe: a tracked sweep (.igs.mha), or poses with times (CSV, JSON)."""
+    track_from: str | None = None
+    """With --track: the sweep's transform from probe to patient [ProbeToReference]."""
+    gamepad: bool = False
+    """Use a gamepad beside mouse and keys."""
+    keys: Path | None = None
+    """Your own key map: a TOML file as printed by app.py keys."""
+    plan: Path | None = None
+    """A sweep to follow: a file of app.py plan."""
+    out: Path = Path("out")
+    """Folder for images and report; a run without a window replaces those of an earlier one."""
+    model: Annotated[str | None, click.Choice(list(TISSUES))] = None
+    """Tissue model [the scene's]."""
+    cell: float | None = None
+    """neo-hookean: width of a cell in mm [the scene's]."""
+    young_kpa: float | None = None
+    """neo-hookean: Young's modulus in kPa [the scene's]."""
+    poisson: float | None = None
+    """neo-hookean: Poisson's ratio [the scene's]."""
+    radius: float | None = None
+    """shape-matching: particle radius in mm [the scene's]."""
+    stiffness: float | None = None
+    """shape-matching: cluster stiffness, 0 to 1 [the scene's]."""
+    substeps: int | None = None
+    """Substeps of a time step [the model's]."""
+    iterations: int | None = None
+    """Iterations of the solver in a substep [the model's]."""
+    budget_ms: float | None = Field(None, ge=0.01, le=10_000)
+    """Choose the most accurate resolution and iterations whose step takes no longer on this machine (measured first)."""
+    error_mm: float | None = Field(None, ge=0, le=100)
+    """Choose the fastest resolution and iterations whose mean bead error (study trade) is no larger."""
+
+    def check(self) -> None:
+        """Raises CommandError for options that exclude each other, and for one without another that it needs."""
+        for table, wrong in ((EXCLUDING, 2), (NEEDING, 1)):
+            for (first, second), text in table.items():
+                if self.given(first) and len(self.given(first, second)) == wrong:
+                    raise CommandError(text)
+        choosers = [field for field in LEFT if self.given(field)]
+        for option in self.given(*choosers, *map(field_of, OPTIONS.values())) if self.replay else ():
+            raise CommandError(f"{option}: a replay computes what was recorded; leave it out")
+        for chooser in choosers[:1]:
+            for option in self.given(*(field for field in TISSUE_AND_STEP if field not in LEFT[chooser])):
+                (other,) = self.given(chooser)
+                raise CommandError(f"{option}: {other} chooses this too; leave one of them out")
