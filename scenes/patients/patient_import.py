@@ -13,9 +13,7 @@ import SimpleITK as sitk
 import trimesh
 
 from errors import PatientError
-from scenes.patients.bed_support import bed_of_file, bed_of_labels
 from scenes.patients.import_warnings import fat_warnings, label_warnings, orientation_warnings, stone_warnings
-from scenes.patients.moulded_support import mould
 from scenes.patients.organ_selection import (
     HILAR,
     LESIONS,
@@ -26,6 +24,7 @@ from scenes.patients.organ_selection import (
     find_organs,
     midline_x,
 )
+from scenes.patients.organ_support import bed_of_file, bed_of_labels, mould
 from scenes.patients.part_surfaces import (
     colours_of_labels,
     organ_surface,

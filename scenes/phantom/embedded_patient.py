@@ -25,7 +25,7 @@ PHANTOM_SOURCES = (
     "phantom/kidney.py",
     "phantom/abdomen.py",
     "patients/label_surfaces.py",
-    "patients/moulded_support.py",
+    "patients/organ_support.py",
     "patients/organ_selection.py",
     "patients/part_surfaces.py",
     "patients/patient_import.py",
