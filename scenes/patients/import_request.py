@@ -8,8 +8,7 @@ import numpy as np
 
 from errors import PatientError
 from scenes.patients.patient_import import Patient, import_patient
-from scenes.patients.readers.ct_files import open_ct
-from scenes.patients.readers.dicom_series import read_dicom_headers
+from scenes.patients.readers.ct_series import open_ct, read_dicom_headers
 from scenes.patients.readers.label_files import Segmentation, open_labels, segmentation_of
 from scenes.patients.readers.label_maps import LabelMap, assign_tissues, merge_label_maps
 from scenes.patients.readers.segment_names import Side

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from scipy import ndimage
@@ -10,7 +9,7 @@ from scipy import ndimage
 from errors import PatientError
 from scenes.patients.readers.label_maps import LabelMap, box_of, listed
 from scenes.patients.readers.segment_names import Side
-from scenes.volumes.voxel_grid import Box, VoxelGrid
+from scenes.volumes.voxel_grid import VoxelGrid
 
 PLAUSIBLE_ORGAN_ML = (20.0, 2000.0)
 ORGAN_FROM_ML = 20.0  # a smaller connected piece is an island of the label
@@ -63,9 +62,9 @@ def find_organs(labels: LabelMap, organ: Sequence[int] | None = None) -> list[Or
     own = _organ_values(labels, organ)
     lesions = [value for value in labels.of_tissues(*LESIONS) if value not in own]
     wanted = np.isin(labels.values, own + lesions)
-    box = box_of(wanted)
-    if box is None:
+    if not wanted.any():
         raise PatientError(f"the labels contain no voxel of an organ: {labels.listed()}; choose other labels")
+    box = box_of(wanted)
     part = box[::-1]
     parts, count = ndimage.label(wanted[part])
     volumes = np.bincount(parts.ravel(), minlength=count + 1) * labels.grid.voxel_ml
@@ -110,7 +109,7 @@ def _organ_values(labels: LabelMap, organ: Sequence[int] | None) -> list[int]:
 
 def _piece(labels: LabelMap, grid: VoxelGrid, values: np.ndarray, mask: np.ndarray, own: list[int]) -> Organ:
     """An organ in its box, with the hilar structures in its hollows."""
-    box = cast(Box, box_of(mask))  # never empty
+    box = box_of(mask)
     z, y, x = (slice(a.start, a.stop) for a in box[::-1])
     inside, around = mask[z, y, x], values[z, y, x]
     inner = np.isin(around, [v for v in labels.of_tissues(*HILAR) if v not in own])

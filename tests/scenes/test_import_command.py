@@ -14,7 +14,7 @@ from scenes.anatomy import load_anatomy
 from scenes.patients.import_command import position_mm
 from scenes.patients.import_request import ImportRequest, import_request, with_labels
 from scenes.patients.patient_folder import is_identifying, save_patient
-from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import LabelMap
 from scenes.scene import load_scene

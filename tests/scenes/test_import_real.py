@@ -11,7 +11,7 @@ from test_patient_import import label_map
 
 from scenes.patients.organ_support import mould
 from scenes.patients.patient_import import import_patient
-from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.ct_series import open_ct
 
 REAL = [
     ("crlm_1004", "crlm_1004_labels/kidneys_provisional.nii.gz", 1, "right", 108.8),
