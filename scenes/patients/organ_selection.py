@@ -11,7 +11,6 @@ from scenes.patients.readers.label_maps import LabelMap, box_of, listed
 from scenes.patients.readers.segment_names import Side
 from scenes.volumes.voxel_grid import VoxelGrid
 
-PLAUSIBLE_ORGAN_ML = (20.0, 2000.0)
 ORGAN_FROM_ML = 20.0  # a smaller connected piece is an island of the label
 BODY_ABOVE_HU = -300.0
 BODY_WIDTH_MM = 150.0
@@ -210,13 +209,3 @@ def _described(pieces: list[Organ], midline: float | None) -> str:
         + f"{p.volume_ml:.1f} ml"
         for p in pieces
     )
-
-
-def check_volume(organ: Organ) -> None:
-    """Raises PatientError where an organ's volume is implausible."""
-    least, most = PLAUSIBLE_ORGAN_ML
-    if not least <= organ.volume_ml <= most:
-        raise PatientError(
-            f"{organ.title} has {organ.volume_ml:.1f} ml: expected {least:g} to {most:g} ml; choose the organ's "
-            "label values with --organ"
-        )
