@@ -1,7 +1,9 @@
 """Errors that the user can mend, and what is wrong with the values of a file, in words; every layer reads files."""
 
 import difflib
-from collections.abc import Callable, Collection, Iterable
+import warnings
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -17,6 +19,19 @@ class PatientError(UserError):
 
     def __init__(self, line: str) -> None:
         super().__init__("".join(letter if letter.isprintable() else "?" for letter in line))
+
+
+@contextmanager
+def parsing(what: str, advice: str) -> Iterator[None]:
+    """A library's parser raises many kinds of error: each becomes a PatientError. Its warnings, which may name the patient, are dropped."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except PatientError:
+        raise
+    except Exception as error:
+        raise PatientError(f"{what} ({type(error).__name__}); {advice}") from error
 
 
 def explained(

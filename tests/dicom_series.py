@@ -27,7 +27,7 @@ from pydicom.uid import (
 from synthetic_body import DIRECTIONS
 
 from errors import PatientError
-from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.ct_series import open_ct
 from scenes.volumes.lazy_volume import LazyVolume
 
 PERSON = {

@@ -39,7 +39,7 @@ class Import(NamedTuple):
 
 
 def module_of(path: Path) -> str:
-    """The name of a file of the project: scenes/patients/readers/ct_files.py -> scenes.patients.readers.ct_files."""
+    """The name of a file of the project: scenes/patients/readers/ct_series.py -> scenes.patients.readers.ct_series."""
     return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 

@@ -1,4 +1,4 @@
-"""The check image of an import: slices with outlines, the surfaces, orientation letters, the summary."""
+"""The summary of an import, and its check image: slices with outlines, the surfaces, orientation letters, the summary."""
 
 import textwrap
 from dataclasses import dataclass
@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from scenes.patients.import_summary import as_table
+from scenes.patients.organ_selection import HILAR
+from scenes.patients.part_surfaces import PARTS, PEDICLE_MM
 from scenes.patients.patient_import import Patient
 from scenes.patients.readers.label_maps import Colour
 from scenes.volumes.lazy_volume import AIR_HU
@@ -48,6 +49,7 @@ LIGHT = np.array([-0.4, -0.8, 0.45])  # from the front, the patient's right and 
 AZIMUTH = {"from the front": (-105, np.ones(3)), "from behind": (75, np.array([-1.0, -1.0, 1.0]))}
 # The overview has a panel where it is this many times as wide as the CT around the organ.
 LEAST_WIDER = 1.2
+DRAFT = "made by region growing from a seed, drawn by nobody: check every outline in check.png"
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,35 @@ VIEWS = (
     CheckView("sagittal, from the left", (0, 1, 0), (0, 0, -1), ("A", "P", "S", "I")),
 )
 OVERVIEW = CheckView("coronal, full width", (1, 0, 0), (0, 0, -1), ("R", "L", "S", "I"))
+
+
+def summary_rows(patient: Patient) -> list[tuple[str, str]]:
+    """The summary for the terminal and the check image: a title and a line each, without names, dates or paths."""
+    volumes = patient.volumes_ml
+    size = " x ".join(str(n) for n in patient.ct.GetSize())
+    spacing = " x ".join(f"{s:.2f}" for s in patient.spacing_mm)
+    extent = " x ".join(f"{e:.0f}" for e in patient.organ.extents)
+    surface_ml = patient.organ.volume / 1000
+    rows = [("DRAFT", DRAFT)] if patient.draft else []
+    rows += [("WARNING", line) for line in patient.warnings]
+    rows.append(("organ", f"{patient.side} kidney, {volumes['organ']:.1f} ml (surface {surface_ml:.1f})"))
+    rows.append(("extent", f"{extent} mm (right-left x front-back x foot-head)"))
+    rows.append(("surface", f"{len(patient.organ.faces)} faces, watertight"))
+    for tissue, name in PARTS.items():
+        word = name.replace("-system", "")
+        if tissue in patient.parts:
+            where = f", as labelled, {PEDICLE_MM:g} mm from the organ at most" if tissue in HILAR else ""
+            rows.append((word, f"{volumes[tissue]:.1f} ml, {len(patient.parts[tissue].faces)} faces{where}"))
+        elif tissue == "tumour":
+            rows.append((word, "none labelled as one"))
+    rows.append(("support", f"{len(patient.support.faces)} faces, for a patient lying supine"))
+    rows.append(("CT", f"{size} voxels of {spacing} mm"))
+    return rows + [("note", note) for note in patient.notes]
+
+
+def as_table(rows: list[tuple[str, str]]) -> str:
+    """Rows as lines of text."""
+    return "\n".join(f"{word:<11}{line}" for word, line in rows)
 
 
 def draw_check(patient: Patient, rows: list[tuple[str, str]], folder: Path) -> None:

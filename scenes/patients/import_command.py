@@ -62,17 +62,14 @@ def import_patient_command(
     """
     check_folder(out)
     # Matplotlib and highdicom take 0.5 s to import.
-    from scenes.patients.check_picture import draw_check
-    from scenes.patients.import_request import ImportRequest, import_request
-    from scenes.patients.import_summary import as_table, summary_rows
+    from scenes.patients.check_picture import as_table, draw_check, summary_rows
+    from scenes.patients.import_request import import_request
     from scenes.patients.patient_scene import patient_scene
 
     tissues = {TISSUE_OPTIONS[o]: label_words(text, o) for o, text in words.items() if text is not None}
     own = [] if organ is None else label_words(organ, "organ")
     position = None if seed is None else position_mm(seed)
-    patient, identifiers = import_request(
-        ImportRequest(ct, labels, own, tissues, side, series, position, support), bar
-    )
+    patient, identifiers = import_request(ct, labels, own, tissues, side, series, position, support, bar)
     rows = summary_rows(patient)
     texts = {"scene.toml": scene_text(patient_scene(patient))}
     searched = save_patient(

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from scipy import ndimage
@@ -10,9 +9,8 @@ from scipy import ndimage
 from errors import PatientError
 from scenes.patients.readers.label_maps import LabelMap, box_of, listed
 from scenes.patients.readers.segment_names import Side
-from scenes.volumes.voxel_grid import Box, VoxelGrid
+from scenes.volumes.voxel_grid import VoxelGrid
 
-PLAUSIBLE_ORGAN_ML = (20.0, 2000.0)
 ORGAN_FROM_ML = 20.0  # a smaller connected piece is an island of the label
 BODY_ABOVE_HU = -300.0
 BODY_WIDTH_MM = 150.0
@@ -63,9 +61,9 @@ def find_organs(labels: LabelMap, organ: Sequence[int] | None = None) -> list[Or
     own = _organ_values(labels, organ)
     lesions = [value for value in labels.of_tissues(*LESIONS) if value not in own]
     wanted = np.isin(labels.values, own + lesions)
-    box = box_of(wanted)
-    if box is None:
+    if not wanted.any():
         raise PatientError(f"the labels contain no voxel of an organ: {labels.listed()}; choose other labels")
+    box = box_of(wanted)
     part = box[::-1]
     parts, count = ndimage.label(wanted[part])
     volumes = np.bincount(parts.ravel(), minlength=count + 1) * labels.grid.voxel_ml
@@ -110,7 +108,7 @@ def _organ_values(labels: LabelMap, organ: Sequence[int] | None) -> list[int]:
 
 def _piece(labels: LabelMap, grid: VoxelGrid, values: np.ndarray, mask: np.ndarray, own: list[int]) -> Organ:
     """An organ in its box, with the hilar structures in its hollows."""
-    box = cast(Box, box_of(mask))  # never empty
+    box = box_of(mask)
     z, y, x = (slice(a.start, a.stop) for a in box[::-1])
     inside, around = mask[z, y, x], values[z, y, x]
     inner = np.isin(around, [v for v in labels.of_tissues(*HILAR) if v not in own])
@@ -211,13 +209,3 @@ def _described(pieces: list[Organ], midline: float | None) -> str:
         + f"{p.volume_ml:.1f} ml"
         for p in pieces
     )
-
-
-def check_volume(organ: Organ) -> None:
-    """Raises PatientError where an organ's volume is implausible."""
-    least, most = PLAUSIBLE_ORGAN_ML
-    if not least <= organ.volume_ml <= most:
-        raise PatientError(
-            f"{organ.title} has {organ.volume_ml:.1f} ml: expected {least:g} to {most:g} ml; choose the organ's "
-            "label values with --organ"
-        )

@@ -141,11 +141,6 @@ def part_surface(grid: VoxelGrid, inside: np.ndarray, tissue: str) -> trimesh.Tr
     return surfaces[0] if len(surfaces) == 1 else cast(trimesh.Trimesh, trimesh.util.concatenate(surfaces))
 
 
-def volume_ml(grid: VoxelGrid, inside: np.ndarray) -> float:
-    """Volume of a label [ml]."""
-    return float(inside.sum() * grid.voxel_ml)
-
-
 def _area_mm2(grid: VoxelGrid, inside: np.ndarray) -> float:
     """Approximate area of a label's surface."""
     padded = np.pad(inside, 1)

@@ -13,25 +13,22 @@ import SimpleITK as sitk
 import trimesh
 
 from errors import PatientError
-from scenes.patients.bed_support import bed_of_file, bed_of_labels
 from scenes.patients.import_warnings import fat_warnings, label_warnings, orientation_warnings, stone_warnings
-from scenes.patients.moulded_support import mould
 from scenes.patients.organ_selection import (
     HILAR,
     LESIONS,
     PARENCHYMA,
     Organ,
-    check_volume,
     choose_organ,
     find_organs,
     midline_x,
 )
+from scenes.patients.organ_support import bed_of_file, bed_of_labels, mould
 from scenes.patients.part_surfaces import (
     colours_of_labels,
     organ_surface,
     part_masks,
     part_surfaces_in_processes,
-    volume_ml,
 )
 from scenes.patients.readers.label_maps import Colour, LabelMap, present_values, resample_nearest
 from scenes.patients.readers.segment_names import Side
@@ -41,6 +38,7 @@ from scenes.volumes.voxel_grid import Box, VoxelGrid
 
 SUPINE_GRAVITY = np.array([0.0, 1.0, 0.0])  # as in the CT: on the back, posterior is down
 PLAUSIBLE_ORGAN_HU = (-150.0, 600.0)
+PLAUSIBLE_ORGAN_ML = (20.0, 2000.0)
 CUT_AREA_MM2 = 100.0  # a pole that only touches the border is complete to within a slice
 LEAST_OVERLAP = 0.99
 MOST_VOLUME_OFF = 0.05
@@ -73,12 +71,6 @@ class Patient:
         return self.parts.get("tumour")
 
 
-def tissue_codes(tissues: Sequence[str]) -> dict[str, int]:
-    """The code of each tissue in a patient's label map: 1 = kidney, 2 = tumour, the rest by name from 3."""
-    others = sorted(set(tissues) - {"kidney", "tumour"})
-    return {"kidney": 1, "tumour": 2} | {tissue: code for code, tissue in enumerate(others, start=3)}
-
-
 def import_patient(
     ct: LazyVolume,
     labels: LabelMap,
@@ -105,60 +97,6 @@ def import_patient(
     Raises:
         PatientError: what was found, what was expected and what to do.
     """
-    at = _located(ct, labels, organ, side, margin_mm)
-    piece = at.piece
-    coded, tissues = _tissue_labels(labels, piece, at.grid, at.on_ct)
-
-    def of(*wanted: str) -> np.ndarray:
-        return np.isin(coded, [code for code, tissue in tissues.items() if tissue in wanted])
-
-    warnings = (
-        *orientation_warnings(at.level, at.level_hu, labels, at.midline),
-        *fat_warnings(at.grid, at.hounsfield, at.on_ct, of("kidney")),
-        *stone_warnings(at.grid, at.hounsfield, of("kidney", "cortex", "medulla", "sinus"), of("urine")),
-        *label_warnings(labels, piece, organ is not None),
-    )
-    found = part_masks(labels, piece, needed)
-    with part_surfaces_in_processes(found) as parts_made:
-        surface = organ_surface(piece)
-        _check_surface(surface, piece)
-        bed = _support(support, surface, labels, piece)
-        parts = parts_made(progress)
-    return Patient(
-        ct=at.grid.image(at.hounsfield),
-        labels=at.grid.image(coded),
-        tissues=tissues,
-        organ=surface,
-        parts=parts,
-        support=bed,
-        side=at.side,
-        volumes_ml={"organ": piece.volume_ml, **{part: volume_ml(*found[part]) for part in parts}},
-        overview=_overview(at.level, at.level_hu),
-        spacing_mm=tuple(at.grid.spacing.tolist()),
-        notes=ct.notes,
-        warnings=warnings,
-        colours=colours_of_labels(labels, [*parts]),
-    )
-
-
-@dataclass(frozen=True)
-class _Located:
-    """An organ in its CT: ``level`` is the CT at the level of all organs, ``grid`` the part around this one, each with its HU."""
-
-    piece: Organ
-    side: Side
-    midline: float | None
-    level: VoxelGrid
-    level_hu: np.ndarray
-    grid: VoxelGrid
-    hounsfield: np.ndarray
-    on_ct: np.ndarray  # organ mask on ``grid``
-
-
-def _located(
-    ct: LazyVolume, labels: LabelMap, organ: Sequence[int] | None, side: Side | None, margin_mm: float
-) -> _Located:
-    """The requested organ, complete and in soft tissue. Raises PatientError."""
     if not margin_mm >= 0:
         raise PatientError(f"the margin is {margin_mm} mm: expected 0 or more")
     pieces = find_organs(labels, organ)
@@ -167,12 +105,43 @@ def _located(
     heights = np.concatenate([piece.grid.corners()[:, 2] for piece in pieces])
     midline = midline_x(level, level_hu, heights.min(), heights.max())
     piece, actual_side = choose_organ(pieces, midline, side)
-    check_volume(piece)
-    _check_overlap(ct.grid, piece)
+    _check_complete(ct.grid, piece)
     grid, hounsfield = _cropped(ct.grid, slab, level_hu, piece, margin_mm)
     on_ct = resample_nearest(piece.grid, piece.mask, grid)
     _check_place(ct.grid, grid, on_ct, hounsfield, piece)
-    return _Located(piece, actual_side, midline, level, level_hu, grid, hounsfield, on_ct)
+    coded, tissues = _tissue_labels(labels, grid, on_ct)
+
+    def of(*wanted: str) -> np.ndarray:
+        return np.isin(coded, [code for code, tissue in tissues.items() if tissue in wanted])
+
+    warnings = (
+        *orientation_warnings(level, level_hu, labels, midline),
+        *fat_warnings(grid, hounsfield, on_ct, of("kidney")),
+        *stone_warnings(grid, hounsfield, of("kidney", "cortex", "medulla", "sinus"), of("urine")),
+        *label_warnings(labels, piece, organ is not None),
+    )
+    found = part_masks(labels, piece, needed)
+    with part_surfaces_in_processes(found) as parts_made:
+        surface = organ_surface(piece)
+        _check_surface(surface, piece)
+        bed = _support(support, surface, labels, piece)
+        parts = parts_made(progress)
+    volumes = {part: float(inside.sum() * part_grid.voxel_ml) for part, (part_grid, inside) in found.items()}
+    return Patient(
+        ct=grid.image(hounsfield),
+        labels=grid.image(coded),
+        tissues=tissues,
+        organ=surface,
+        parts=parts,
+        support=bed,
+        side=actual_side,
+        volumes_ml={"organ": piece.volume_ml, **{part: volumes[part] for part in parts}},
+        overview=_overview(level, level_hu),
+        spacing_mm=tuple(grid.spacing.tolist()),
+        notes=ct.notes,
+        warnings=warnings,
+        colours=colours_of_labels(labels, [*parts]),
+    )
 
 
 def _support(kind: str, organ: trimesh.Trimesh, labels: LabelMap, piece: Organ) -> trimesh.Trimesh:
@@ -221,7 +190,14 @@ def _overlap(grid: VoxelGrid, piece: Organ) -> float:
     return float(((found >= -0.5) & (found <= np.array(grid.size) - 0.5)).all(axis=1).mean())
 
 
-def _check_overlap(grid: VoxelGrid, piece: Organ) -> None:
+def _check_complete(grid: VoxelGrid, piece: Organ) -> None:
+    """Raises PatientError where an organ's volume is implausible, or some of it is outside the CT."""
+    least, most = PLAUSIBLE_ORGAN_ML
+    if not least <= piece.volume_ml <= most:
+        raise PatientError(
+            f"{piece.title} has {piece.volume_ml:.1f} ml: expected {least:g} to {most:g} ml; choose the organ's "
+            "label values with --organ"
+        )
     share = _overlap(grid, piece)
     if share < LEAST_OVERLAP:
         raise PatientError(
@@ -277,14 +253,16 @@ def _check_surface(surface: trimesh.Trimesh, piece: Organ) -> None:
         )
 
 
-def _tissue_labels(
-    labels: LabelMap, piece: Organ, grid: VoxelGrid, on_ct: np.ndarray
-) -> tuple[np.ndarray, dict[int, str]]:
-    """Tissue codes (z, y, x) of the cropped CT and their tissues: parts of this organ, and all of other tissues."""
+def _tissue_labels(labels: LabelMap, grid: VoxelGrid, on_ct: np.ndarray) -> tuple[np.ndarray, dict[int, str]]:
+    """Tissue codes (z, y, x) of the cropped CT and their tissues: parts of this organ, and all of other tissues.
+
+    1 = kidney, 2 = tumour, the rest by name from 3.
+    """
     values = resample_nearest(labels.grid, labels.values, grid)
     there = set(present_values(values))
     tissue_of = {v: s.tissue for v, s in labels.segments.items() if v in there and s.tissue}
-    codes = tissue_codes(list(tissue_of.values()))
+    others = sorted(set(tissue_of.values()) - {"kidney", "tumour"})
+    codes = {tissue: code for code, tissue in enumerate(["kidney", "tumour", *others], start=1)}
     coded = on_ct.astype(np.uint8)
     for value, tissue in tissue_of.items():
         if tissue != "kidney":

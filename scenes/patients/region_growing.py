@@ -6,7 +6,6 @@ seed is refused with the reason.
 """
 
 from collections.abc import Iterator
-from typing import cast
 
 import numpy as np
 import SimpleITK as sitk
@@ -16,7 +15,7 @@ from scipy.spatial import ConvexHull
 from errors import PatientError
 from scenes.patients.readers.label_maps import LabelMap, Segment, box_of
 from scenes.volumes.lazy_volume import LazyVolume
-from scenes.volumes.voxel_grid import Box, VoxelGrid
+from scenes.volumes.voxel_grid import VoxelGrid
 
 DRAFT = Segment("kidney (draft, region growing)", None, "kidney", None)
 REACH_MM = 110.0  # around the seed: a kidney is 9 to 13 cm long and the seed may be at its pole
@@ -59,7 +58,7 @@ def draft_segmentation(ct: LazyVolume, seed_mm: np.ndarray) -> LabelMap:
     share = VoxelGrid.of(tissue).image(_most_like_a_kidney(tissue, seed).astype(np.float32))
     # Linear: nearest neighbour would leave steps of WORKING_MM.
     on_ct = sitk.GetArrayFromImage(sitk.Resample(share, image, sitk.Transform(), sitk.sitkLinear)) >= 0.5
-    return cast(LabelMap, LabelMap.single(ct.grid.part(box), on_ct, DRAFT))  # never empty
+    return LabelMap.single(ct.grid.part(box), on_ct, DRAFT)
 
 
 def _check_in(grid: VoxelGrid, seed: np.ndarray) -> None:
@@ -158,7 +157,7 @@ def _reconstructed(core: np.ndarray, body: np.ndarray, radius: int) -> np.ndarra
         return core > 0
     rim = radius + 2 * CLOSING + 1
     voxels = np.pad(core, rim)
-    part = tuple(slice(a.start - rim, a.stop + rim) for a in cast(Box, box_of(voxels))[::-1])
+    part = tuple(slice(a.start - rim, a.stop + rim) for a in box_of(voxels)[::-1])
     dilated = sitk.BinaryDilate(sitk.GetImageFromArray(voxels[part]), [radius] * 3)
     region = dilated & sitk.GetImageFromArray(np.pad(body, rim)[part])
     if _ml(sitk.GetArrayViewFromImage(region)) <= VOLUME_ML[1]:  # larger ones have leaked

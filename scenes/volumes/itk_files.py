@@ -2,62 +2,49 @@
 
 import re
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import SimpleITK as sitk
 
-from errors import PatientError
-from scenes.volumes.lazy_volume import LazyVolume, check_size, cut_off, no_scalar, not_3d
-from scenes.volumes.voxel_grid import Box, VoxelGrid
+from errors import PatientError, parsing
+from scenes.volumes.lazy_volume import LazyVolume, check_size, no_scalar
+from scenes.volumes.voxel_grid import Box, VoxelGrid, check_3d
 
 NRRD, META = (".nrrd", ".nhdr"), (".mha", ".mhd")
 HEADER_BYTES, LINE_BYTES, NAME_LETTERS = 1 << 22, 1 << 16, 255
 
 
-def itk_volume(path: Path) -> LazyVolume:
-    """Read the header of a scalar volume; voxels are read on demand. Raises PatientError."""
-    reader = itk_header(path)
-    kind = sitk.GetPixelIDValueAsString(reader.GetPixelID())
-    if reader.GetNumberOfComponents() != 1 or "complex" in kind:
-        raise no_scalar(path, kind)
-    texts = [text for key, text in metadata(reader).items() if not key.startswith(("NRRD_", "ITK_"))]
-    grid = VoxelGrid.of(reader)
-    return LazyVolume(
-        str(path), grid, lambda box: _itk_box(path, box), identifiers=frozenset(t for t in texts if t)
-    )
+def itk_volume(path: Path, vectors: bool = False) -> LazyVolume:
+    """Read the header of an NRRD or MetaImage file; voxels (z, y, x), of vectors (z, y, x, n), are read on demand.
 
-
-def itk_header(path: Path) -> sitk.ImageFileReader:
-    """The header of an NRRD or MetaImage file, of one component or several. Raises PatientError."""
+    Raises PatientError: damaged, not 3D, of several numbers per voxel but for ``vectors``, without a place in the patient.
+    """
     data_file = file_with_voxels(path)
+    is_nrrd = path.suffix.lower() in NRRD
     reader = sitk.ImageFileReader()
-    reader.SetImageIO("NrrdImageIO" if path.suffix.lower() in NRRD else "MetaImageIO")
+    reader.SetImageIO("NrrdImageIO" if is_nrrd else "MetaImageIO")
     reader.SetFileName(str(path))
-    try:
+    with parsing(f"{path}: cannot be read as an image", "expected a whole file; copy or export it again"):
         reader.ReadImageInformation()
-    except RuntimeError as error:
-        raise PatientError(
-            f"{path}: cannot be read as an image; expected a whole file of its kind; copy or export it again"
-        ) from error
-    if reader.GetDimension() != 3:
-        raise not_3d(path, reader.GetSize())
-    if path.suffix.lower() in NRRD and not reader.HasMetaDataKey("NRRD_space"):
+    check_3d(str(path), reader.GetSize())
+    if is_nrrd and not reader.HasMetaDataKey("NRRD_space"):
         raise PatientError(
             f"{path}: has no space field (such as left-posterior-superior), so left and right may be exchanged; export it again"
         )
     grid = VoxelGrid.of(reader).checked(str(path))
-    check_size(path, grid, _bytes_of(reader), data_file.stat().st_size, compressed=True)
-    return reader
-
-
-def itk_layers(path: Path) -> list[np.ndarray]:
-    """The components (z, y, x) of an NRRD or MetaImage file. Raises PatientError."""
-    try:
-        voxels = sitk.GetArrayFromImage(sitk.ReadImage(str(path)))
-    except RuntimeError as error:
-        raise cut_off(path) from error
-    return [voxels] if voxels.ndim == 3 else list(np.moveaxis(voxels, -1, 0))
+    kind, components = sitk.GetPixelIDValueAsString(reader.GetPixelID()), reader.GetNumberOfComponents()
+    bits = re.search(r"(\d+)-bit", kind)
+    voxel_bytes = components * (int(bits[1]) // 8 if bits else 8)
+    check_size(path, grid, voxel_bytes, data_file.stat().st_size, compressed=True)
+    if (components != 1 and not vectors) or "complex" in kind:
+        raise no_scalar(path, kind)
+    metadata = {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys() if key.isprintable()}
+    own = {text for key, text in metadata.items() if not key.startswith(("NRRD_", "ITK_", "Segment"))}
+    return LazyVolume(
+        str(path), grid, partial(_itk_box, path), identifiers=frozenset(own - {""}), metadata=metadata
+    )
 
 
 def _itk_box(path: Path, box: Box) -> np.ndarray:
@@ -65,22 +52,8 @@ def _itk_box(path: Path, box: Box) -> np.ndarray:
     reader.SetFileName(str(path))
     reader.SetExtractIndex([a.start for a in box])
     reader.SetExtractSize([a.stop - a.start for a in box])
-    try:
+    with parsing(f"{path}: cannot be read to its end", "expected a whole file; copy or export it again"):
         return sitk.GetArrayFromImage(reader.Execute())
-    except RuntimeError as error:
-        raise cut_off(path) from error
-
-
-def metadata(reader: sitk.ImageFileReader) -> dict[str, str]:
-    """The metadata of a header whose keys are printable."""
-    return {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys() if key.isprintable()}
-
-
-def _bytes_of(reader: sitk.ImageFileReader) -> int:
-    """Bytes of one voxel with all its components."""
-    kind = sitk.GetPixelIDValueAsString(reader.GetPixelID())
-    bits = re.search(r"(\d+)-bit", kind)
-    return reader.GetNumberOfComponents() * (int(bits[1]) // 8 if bits else 8)
 
 
 def file_with_voxels(path: Path) -> Path:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ MOST_COMPRESSION = 1040
 
 @dataclass(frozen=True)
 class LazyVolume:
-    """A scalar volume in patient coordinates, on disk or in memory."""
+    """A volume in patient coordinates, on disk or in memory."""
 
     name: str  # for errors: the file or folder
     grid: VoxelGrid
@@ -33,6 +33,9 @@ class LazyVolume:
     notes: tuple[str, ...] = ()  # for the user: what was chosen, left out or resampled
     frame_of_reference: str = ""  # DICOM's UID, where there is one
     identifiers: frozenset[str] = frozenset()  # of the patient (PHI); no written file may contain them
+    metadata: Mapping[str, str] = field(
+        default_factory=dict
+    )  # of a file's header, with the names of its labels
 
     @classmethod
     def of(cls, image: sitk.Image, name: str = "the image") -> LazyVolume:
@@ -47,17 +50,6 @@ class LazyVolume:
     def read(self, box: Box | None = None) -> np.ndarray:
         """Voxels (z, y, x) of a box, or all. Raises PatientError: more than fit in memory, or not finite."""
         box = box or self.grid.full_box()
-        self._check_memory(box)
-        voxels = self.read_box(box)
-        if voxels.dtype.kind == "f":
-            count = int((~np.isfinite(voxels)).sum())
-            if count:
-                raise PatientError(
-                    f"{self.name}: {count} voxels are not finite numbers; export the volume again"
-                )
-        return voxels
-
-    def _check_memory(self, box: Box) -> None:
         needed = VOXEL_BYTES * float(np.prod([float(a.stop - a.start) for a in box]))
         free = psutil.virtual_memory().available
         if needed > free:
@@ -65,6 +57,11 @@ class LazyVolume:
                 f"{self.name}: takes {needed / 1e9:.1f} GB to read, and {free / 1e9:.1f} GB are free; close other programs, or "
                 "crop the volume around the kidney"
             )
+        voxels = self.read_box(box)
+        count = int((~np.isfinite(voxels)).sum()) if voxels.dtype.kind == "f" else 0
+        if count:
+            raise PatientError(f"{self.name}: {count} voxels are not finite numbers; export the volume again")
+        return voxels
 
     def hounsfield(self, box: Box | None = None) -> np.ndarray:
         """HU (z, y, x) of a box as int16; padding outside the field of view becomes air."""
@@ -89,17 +86,6 @@ def check_size(path: Path, grid: VoxelGrid, voxel_bytes: int, held_bytes: int, c
         )
 
 
-def not_3d(path: Path, shape: tuple[int, ...]) -> PatientError:
-    """The error for an image that is not a volume."""
-    size = " x ".join(map(str, shape))
-    return PatientError(f"{path}: the image has {size} voxels; expected one 3D volume; export one volume")
-
-
 def no_scalar(path: Path, kind: object) -> PatientError:
     """The error for voxels that are colours, vectors or complex numbers."""
     return PatientError(f"{path}: each voxel is a {kind}; expected one number; export a scalar volume")
-
-
-def cut_off(path: Path) -> PatientError:
-    """The error for a truncated file."""
-    return PatientError(f"{path}: cannot be read to its end; expected a whole file; copy or export it again")

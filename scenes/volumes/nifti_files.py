@@ -1,17 +1,17 @@
 """Read NIfTI with nibabel: RAS becomes LPS; a file without an orientation is refused."""
 
+import contextlib
 import logging
 import re
-import warnings
 from pathlib import Path
 from typing import Any, cast
 
 import nibabel
 import numpy as np
 
-from errors import PatientError
-from scenes.volumes.lazy_volume import LazyVolume, check_size, cut_off, no_scalar, not_3d
-from scenes.volumes.voxel_grid import Box, VoxelGrid
+from errors import PatientError, parsing
+from scenes.volumes.lazy_volume import LazyVolume, check_size, no_scalar
+from scenes.volumes.voxel_grid import Box, VoxelGrid, check_3d
 
 # Problems are reported as errors here.
 logging.getLogger("nibabel").setLevel(logging.CRITICAL)
@@ -27,18 +27,13 @@ RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0])
 
 def nifti_volume(path: Path) -> LazyVolume:
     """Read the header of a volume; voxels are read on demand. Raises PatientError: damaged, not 3D, sheared, no orientation."""
-    try:
+    with parsing(f"{path}: cannot be read as NIfTI", "expected a whole file; copy or export it again"):
         image: Any = nibabel.load(path, keep_file_open=True)
         header, shape = image.header, image.shape
         kind = image.get_data_dtype()
-    except Exception as error:  # a parser raises many kinds of error; each is the file's fault
-        raise PatientError(
-            f"{path}: cannot be read as NIfTI ({type(error).__name__}); expected a whole file; copy or export it again"
-        ) from error
     while len(shape) > 3 and shape[-1] == 1:
         shape = shape[:-1]
-    if len(shape) != 3:
-        raise not_3d(path, shape)
+    check_3d(str(path), shape)
     if kind.fields or kind.kind not in "iuf":
         raise no_scalar(path, kind)
     grid = _grid(path, header, shape).checked(str(path))
@@ -49,12 +44,10 @@ def nifti_volume(path: Path) -> LazyVolume:
         x, y, z = box
         slabs = max(1, SLAB_VOXELS // (grid.size[0] * grid.size[1]))
         planes = []
-        try:
+        with parsing(f"{path}: cannot be read to its end", "expected a whole file; copy or export it again"):
             for k in range(z.start, z.stop, slabs):
                 part = image.dataobj[(x, y, slice(k, min(k + slabs, z.stop)), *last)]
                 planes.append(_narrow(np.asarray(part)).T)
-        except Exception as error:  # a parser raises many kinds of error; each is the file's fault
-            raise cut_off(path) from error
         return np.concatenate(planes)
 
     texts = [
@@ -62,21 +55,20 @@ def nifti_volume(path: Path) -> LazyVolume:
         for key in ("descrip", "aux_file", "intent_name", "db_name")
         if key in header
     ]
-    return LazyVolume(str(path), grid, read_box, identifiers=frozenset(text for text in texts if text))
+    return LazyVolume(
+        str(path), grid, read_box, identifiers=frozenset(texts) - {""}, metadata=_label_names(header)
+    )
 
 
-def label_names(path: Path) -> dict[int, str]:
+def _label_names(header: Any) -> dict[str, str]:
     """Names of label values from the header extension of Connectome Workbench, which TotalSegmentator writes."""
-    try:
-        image: Any = nibabel.load(path)
-        texts = [extension.get_content() for extension in image.header.extensions]
-    except Exception:  # a damaged extension has no names
-        return {}
-    found: dict[int, str] = {}
-    for text in texts:
-        plain = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
-        for key, name in LABEL_ENTRY.findall(plain[:MOST_NAMES_BYTES]):
-            found[int(key)] = name.strip()
+    found: dict[str, str] = {}
+    with contextlib.suppress(Exception):  # a damaged extension has no names
+        for extension in header.extensions:
+            text = extension.get_content()
+            plain = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
+            for key, name in LABEL_ENTRY.findall(plain[:MOST_NAMES_BYTES]):
+                found[key] = name.strip()
     return found
 
 
@@ -91,18 +83,12 @@ def _narrow(voxels: np.ndarray) -> np.ndarray:
 
 
 def _grid(path: Path, header: Any, shape: tuple[int, ...]) -> VoxelGrid:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            unit = header.get_xyzt_units()[0]
-            forms = (
-                (int(header["sform_code"]), header.get_sform()),
-                (int(header["qform_code"]), header.get_qform()),
-            )
-        except Exception as error:  # a parser raises many kinds of error; each is the file's fault
-            raise PatientError(
-                f"{path}: its position in the patient cannot be read ({type(error).__name__}); export it again"
-            ) from error
+    with parsing(f"{path}: its position in the patient cannot be read", "export it again"):
+        unit = header.get_xyzt_units()[0]
+        forms = (
+            (int(header["sform_code"]), header.get_sform()),
+            (int(header["qform_code"]), header.get_qform()),
+        )
     affine = _affine(path, [form for form in forms if form[0] > 0], shape)
     scale = MM_OF_UNIT.get(unit, 1.0)
     columns = RAS_TO_LPS @ affine[:3, :3] * scale

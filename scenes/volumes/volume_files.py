@@ -18,10 +18,13 @@ def is_volume_file(path: Path) -> bool:
     return path.name.lower().endswith(ENDINGS)
 
 
-def file_volume(path: Path) -> LazyVolume:
-    """Read the header of a volume file; voxels are read on demand. Raises PatientError: damaged, not 3D, sheared, no orientation."""
+def file_volume(path: Path, vectors: bool = False) -> LazyVolume:
+    """Read the header of a volume file; voxels are read on demand. Raises PatientError: damaged, not 3D, sheared, no orientation.
+
+    With ``vectors``, an NRRD or MetaImage may have several numbers per voxel: the layers of a segmentation.
+    """
     if not path.name.lower().endswith(NIFTI):
-        return itk_volume(path)
+        return itk_volume(path, vectors)
     # nibabel takes 0.2 s to import.
     from scenes.volumes.nifti_files import nifti_volume
 

@@ -20,6 +20,14 @@ MOST_SHEAR = 2e-3
 MOST_VOXELS = 1_200_000_000
 
 
+def check_3d(name: str, shape: tuple[int, ...]) -> str:
+    """The size of a volume in words. Raises PatientError where it is a picture, or several volumes."""
+    size = " x ".join(map(str, shape))
+    if len(shape) != 3 or min(shape) < 2:
+        raise PatientError(f"{name}: the image has {size} voxels; expected one 3D volume; export one volume")
+    return size
+
+
 @dataclass(frozen=True)
 class VoxelGrid:
     """Size, spacing, origin and direction; indices in the order x, y, z."""
@@ -41,11 +49,7 @@ class VoxelGrid:
 
     def checked(self, name: str) -> VoxelGrid:
         """This grid, if it is plausible. Raises PatientError that begins with ``name``."""
-        size = " x ".join(map(str, self.size))
-        if min(self.size) < 2:
-            raise PatientError(
-                f"{name}: the image has {size} voxels; expected one 3D volume; export one volume"
-            )
+        size = check_3d(name, self.size)
         if float(np.prod(np.array(self.size, float))) > MOST_VOXELS:
             raise PatientError(
                 f"{name}: its header claims {size} voxels; expected at most {MOST_VOXELS / 1e9:.1f} billion; "

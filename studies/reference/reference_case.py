@@ -12,7 +12,7 @@ import numpy as np
 import tomli_w
 import trimesh
 
-from scenes.patients.moulded_support import least_gap
+from scenes.patients.organ_support import least_gap
 from studies.reference.fem_press import FRICTION, GRAVITY_M_S2, FemPress, FemStage
 from studies.reference.fem_solid import FemSolid
 
@@ -93,11 +93,7 @@ class ReferenceCase:
                 "friction_on_probe": True,
                 "law": "Coulomb, penalty-regularised",
                 "support": "rigid, fixed, frame of kidney.stl",
-                "support_min_clearance_at_rest_mm": _rounded(
-                    least_gap(
-                        self.support.vertices, self.support.faces, self.kidney.vertices, self.kidney.faces
-                    )
-                ),
+                "support_min_clearance_at_rest_mm": _rounded(least_gap(self.support, self.kidney)),
             },
             "files": {
                 "kidney": "kidney.stl",

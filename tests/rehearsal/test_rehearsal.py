@@ -16,7 +16,7 @@ from scenes.anatomy import load_anatomy
 from scenes.patients.patient_folder import save_patient
 from scenes.patients.patient_import import import_patient
 from scenes.patients.patient_scene import patient_scene
-from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_maps import LabelMap
 from scenes.phantom.embedded_patient import phantom_folder
 from scenes.scene import PAPER, Press, Scene, load_scene, with_options

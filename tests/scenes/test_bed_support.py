@@ -7,7 +7,7 @@ import trimesh
 from synthetic_body import LEFT, TUMOUR, assert_sound, body, drawn, grid_around, least_gap, level
 
 from errors import PatientError
-from scenes.patients.bed_support import bed_of_file, bed_of_labels
+from scenes.patients.organ_support import bed_of_file, bed_of_labels
 from scenes.patients.patient_import import SUPINE_GRAVITY, import_patient
 from scenes.patients.readers.label_maps import LabelMap
 from scenes.volumes.lazy_volume import LazyVolume

@@ -16,8 +16,8 @@ from scenes.patients.check_picture import (
     draw_check,
     is_wider,
     resample_plane,
+    summary_rows,
 )
-from scenes.patients.import_summary import summary_rows
 from scenes.patients.patient_import import import_patient
 from scenes.patients.readers.label_maps import LabelMap
 from scenes.volumes.lazy_volume import LazyVolume

@@ -12,13 +12,13 @@ from app import main
 from errors import PatientError
 from scenes.anatomy import load_anatomy
 from scenes.patients.import_command import position_mm
-from scenes.patients.import_request import ImportRequest, import_request, with_labels
+from scenes.patients.import_request import import_request, volume_of_labels
 from scenes.patients.patient_folder import is_identifying, save_patient
-from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import LabelMap
 from scenes.scene import load_scene
-from scenes.terminal import shell_command, silent
+from scenes.terminal import shell_command
 
 SPINE = np.array([0.0, 70.0, 0.0]), np.array([22.0, 20.0, 400.0])
 ORIGIN = (-175.0, -120.0, -56.0)
@@ -139,7 +139,7 @@ def test_contours_on_an_archive(hospital, tmp_path):
             contours.append(np.column_stack([x, y, np.full(90, z)]))
     structures = write_structures(tmp_path / "rt.dcm", {"Kidney_L": contours, "External": []}, series.uid)
     archive = zipped(folder / "ct", tmp_path / "ct.zip")
-    patient, _ = import_request(ImportRequest(archive, [structures]))
+    patient, _ = import_request(archive, [structures])
     assert patient.side == "left"
     assert patient.volumes_ml["organ"] == pytest.approx(4 / 3 * np.pi * LEFT[1].prod() / 1000, rel=0.02)
     np.testing.assert_allclose(patient.organ.center_mass, LEFT[0], atol=0.5)
@@ -150,9 +150,9 @@ def test_labels_of_another_examination(hospital, tmp_path):
     other = Series(tmp_path / "ct", DIRECTIONS["identity"], size=(20, 20, 6), origin=ORIGIN, field=hounsfield)
     other.write()
     with pytest.raises(PatientError, match="another frame of reference"):
-        import_request(ImportRequest(tmp_path / "ct", [folder / "seg"]))
+        import_request(tmp_path / "ct", [folder / "seg"])
     with pytest.raises(PatientError, match="no labels are with this CT.*--seed"):
-        import_request(ImportRequest(tmp_path / "ct"))
+        import_request(tmp_path / "ct")
 
 
 class TestIdentifiers:
@@ -216,7 +216,7 @@ def test_a_seed_is_three_numbers(text):
 
 def test_a_seed_or_labels(tmp_path):
     with pytest.raises(PatientError, match="not both"):
-        import_request(ImportRequest(tmp_path, [tmp_path], seed_mm=np.zeros(3)))
+        import_request(tmp_path, [tmp_path], seed_mm=np.zeros(3))
 
 
 def test_the_series_that_labels_were_drawn_on(tmp_path):
@@ -228,7 +228,7 @@ def test_the_series_that_labels_were_drawn_on(tmp_path):
     thin.write()
     thick.write()
     seg = write_segmentation(tmp_path / "seg.dcm", thick, {"Kidney": np.ones((3, 10, 12))})
-    assert with_labels(ImportRequest(tmp_path / "ct", [seg]), silent)[0].grid.spacing[2] == pytest.approx(5.0)
+    assert volume_of_labels(tmp_path / "ct", [open_labels(seg)]).grid.spacing[2] == pytest.approx(5.0)
 
 
 def test_identifiers_of_each_source(hospital, taken_in):
@@ -245,7 +245,7 @@ def test_identifiers_of_labels_and_paths(hospital, taken_in, tmp_path, monkeypat
     made.header["descrip"] = b"drawn by Roe"
     nibabel.save(made, tmp_path / "kidney.nii.gz")
     given = type(tmp_path)("../") / tmp_path.name / "kidney.nii.gz"
-    identifiers = import_request(ImportRequest(hospital[0] / "ct", [given]))[1]
+    identifiers = import_request(hospital[0] / "ct", [given])[1]
     assert {"drawn by Roe", "Doe^Jane", str(given), str(tmp_path.resolve() / "kidney.nii.gz")} <= identifiers
 
 
@@ -255,9 +255,7 @@ def test_a_seed_makes_a_draft(hospital, taken_in, monkeypatch):
     monkeypatch.setattr(
         "scenes.patients.import_request.import_patient", lambda ct, labels, *_, **__: taken_in[0]
     )
-    assert (
-        import_request(ImportRequest(hospital[0] / "ct", seed_mm=LEFT[0]))[0].draft and not taken_in[0].draft
-    )
+    assert import_request(hospital[0] / "ct", seed_mm=LEFT[0])[0].draft and not taken_in[0].draft
 
 
 def test_what_one_header_says(tmp_path):

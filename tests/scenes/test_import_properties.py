@@ -11,7 +11,7 @@ from synthetic_body import BODY, LEFT, RIGHT, drawn, grid_around, voxels_to_boun
 
 import scenes.patients.patient_import
 from scenes.patients.patient_import import import_patient
-from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import assign_tissues, merge_label_maps
 

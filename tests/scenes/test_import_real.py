@@ -9,9 +9,9 @@ from conftest import DATA
 from synthetic_body import assert_sound, least_gap, voxels_to_boundary
 from test_patient_import import label_map
 
-from scenes.patients.moulded_support import mould
+from scenes.patients.organ_support import mould
 from scenes.patients.patient_import import import_patient
-from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.ct_series import open_ct
 
 # The left kidney of the first is imported in test_app.py.
 REAL = [

@@ -24,12 +24,12 @@ from synthetic_body import (
 
 import scenes.patients.patient_import
 from errors import PatientError
-from scenes.patients.import_summary import as_table, summary_rows
+from scenes.patients.check_picture import as_table, summary_rows
 from scenes.patients.import_warnings import STONE_ABOVE_MEDIAN_HU
 from scenes.patients.organ_selection import choose_organ, find_organs, midline_x
 from scenes.patients.patient_folder import save_patient
 from scenes.patients.patient_import import import_patient
-from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_maps import LabelMap, assign_tissues
 from scenes.phantom import embedded_patient
 from scenes.scene import SceneError

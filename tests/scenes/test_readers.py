@@ -26,7 +26,7 @@ from pydicom.uid import DeflatedExplicitVRLittleEndian, generate_uid
 from synthetic_body import DIRECTIONS, grid_around, with_voxels
 
 from errors import PatientError
-from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_files import open_labels
 from scenes.volumes.lazy_volume import LazyVolume
 

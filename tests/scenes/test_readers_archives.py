@@ -6,7 +6,7 @@ from dicom_series import Series, write_segmentation, zipped
 from test_readers_hostile import refused  # noqa: F401
 from test_readers_labels import by_name, ct_grid
 
-from scenes.patients.readers import dicom_source
+from scenes.patients.readers import dicom_files
 from scenes.patients.readers.label_files import open_labels
 
 
@@ -14,12 +14,12 @@ class TestArchives:
     def test_many_large_entries(self, tmp_path, refused, monkeypatch):
         path = zipped(Series(tmp_path / "ct").write(), tmp_path / "a.zip")
         monkeypatch.setattr(
-            dicom_source, "MOST_ARCHIVE_BYTES", 2 * len((tmp_path / "ct" / "s1-0.dcm").read_bytes())
+            dicom_files, "MOST_ARCHIVE_BYTES", 2 * len((tmp_path / "ct" / "s1-0.dcm").read_bytes())
         )
         assert "GiB of DICOM; expected at most" in refused(path)
 
     def test_many_files(self, tmp_path, refused, monkeypatch):
-        monkeypatch.setattr(dicom_source, "MOST_FILES", 5)
+        monkeypatch.setattr(dicom_files, "MOST_FILES", 5)
         assert "more than 5 files" in refused(Series(tmp_path / "ct").write())
 
 

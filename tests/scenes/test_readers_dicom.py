@@ -16,7 +16,7 @@ from pydicom.uid import (
 from scipy.spatial.transform import Rotation
 from synthetic_body import DIRECTIONS
 
-from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.ct_series import open_ct
 
 SHUFFLED = (3, 0, 5, 1, 4, 2)
 TILT = 18.0

@@ -10,7 +10,7 @@ from synthetic_body import DIRECTIONS, grid_around, with_voxels
 from test_readers import AIR, ENDINGS, RAS, affine_of, nifti, noise, written
 
 from errors import PatientError
-from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_files import open_labels
 from scenes.volumes.voxel_grid import VoxelGrid
 

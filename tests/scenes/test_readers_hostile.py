@@ -22,8 +22,8 @@ from dicom_series import (
 )
 from pydicom.uid import DeflatedExplicitVRLittleEndian
 
-from scenes.patients.readers import dicom_file, dicom_source
-from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers import dicom_files
+from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_files import open_labels
 
 MIB = 2**20
@@ -123,12 +123,12 @@ class TestDicom:
 
     @pytest.mark.parametrize("honest", [True, False])
     def test_deflated_bomb(self, tmp_path, refused, honest, monkeypatch):
-        monkeypatch.setattr(dicom_file, "MOST_INFLATED", 64 * MIB)
+        monkeypatch.setattr(dicom_files, "MOST_INFLATED", 64 * MIB)
         save(Series(tmp_path).slice(0, syntax=DeflatedExplicitVRLittleEndian), tmp_path / "bomb.dcm")
         assert "inflates to more than" in refused(inflating(tmp_path / "bomb.dcm", honest))
 
     def test_deflated_medium(self, tmp_path, refused, monkeypatch):
-        monkeypatch.setattr(dicom_file, "MOST_INFLATED", 64 * MIB)
+        monkeypatch.setattr(dicom_files, "MOST_INFLATED", 64 * MIB)
         listed = listing_dicomdir(tmp_path / "cd", ["IM1"])
         data = pydicom.dcmread(listed)
         data.file_meta.TransferSyntaxUID = DeflatedExplicitVRLittleEndian
@@ -333,7 +333,7 @@ class TestArchives:
         assert "b.dcm" in refused(declared(bomb, size=len(slice_bytes)))
 
     def test_many_entries(self, tmp_path, refused, monkeypatch):
-        monkeypatch.setattr(dicom_source, "MOST_FILES", 20)
+        monkeypatch.setattr(dicom_files, "MOST_FILES", 20)
         assert "has 21 files" in refused(archive(tmp_path / "a.zip", {f"{n}": b"" for n in range(21)}))
 
     def test_archive_in_an_archive(self, tmp_path, refused, slice_bytes):

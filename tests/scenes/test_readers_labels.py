@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from synthetic_body import DIRECTIONS, drawn, grid_around, level
 
 from errors import PatientError
-from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_files import open_labels
 from scenes.patients.readers.label_maps import LabelMap, Segment, assign_tissues, merge_label_maps
 from scenes.patients.readers.segment_names import is_far, side_of, tissue_of

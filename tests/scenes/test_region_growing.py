@@ -10,7 +10,7 @@ from synthetic_body import DIRECTIONS, grid_around, level, points_of
 
 from errors import PatientError
 from scenes.anatomy import files_of
-from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_maps import LabelMap, box_of, resample_nearest
 from scenes.patients.region_growing import DRAFT, WORKING_MM, draft_segmentation
 from scenes.scene import EMBEDDED, load_scene

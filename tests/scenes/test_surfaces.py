@@ -21,7 +21,7 @@ from synthetic_body import (
 )
 
 from scenes.patients.label_surfaces import decimate, self_intersections, surface_from_mask
-from scenes.patients.moulded_support import mould
+from scenes.patients.organ_support import mould
 
 
 @pytest.fixture

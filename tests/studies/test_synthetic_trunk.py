@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 
-from scenes.patients.readers.ct_files import open_ct
+from scenes.patients.readers.ct_series import open_ct
 from scenes.patients.readers.label_files import open_labels
 from scenes.phantom.kidney import make_phantom
 from studies.performance.synthetic_trunk import GAP_MM, PIXELS, write_whole_body

@@ -1,24 +1,28 @@
 """Read DICOM headers: the series, their slices and positions, segmentations and structure sets."""
 
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from pydicom.dataset import Dataset, FileDataset
+from pydicom.dataset import Dataset
 
-from errors import PatientError
-from scenes.patients.readers.dicom_file import is_directory, parse_dicom, text_of
-from scenes.patients.readers.dicom_source import SourceFile
+from errors import PatientError, parsing
+from scenes.patients.readers.dicom_files import DAMAGED, SourceFile
 
 CT_CLASSES = {
     "1.2.840.10008.5.1.4.1.1.2",
     "1.2.840.10008.5.1.4.1.1.2.1",  # enhanced
     "1.2.840.10008.5.1.4.1.1.2.2",  # legacy converted enhanced
 }
-SEGMENTATIONS = {"1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7"}
-STRUCTURE_SET = "1.2.840.10008.5.1.4.1.1.481.3"
+LABEL_CLASSES = {
+    "1.2.840.10008.5.1.4.1.1.66.4": "SEG",
+    "1.2.840.10008.5.1.4.1.1.66.7": "SEG",  # label map
+    "1.2.840.10008.5.1.4.1.1.481.3": "RTSTRUCT",
+}
+MEDIA_DIRECTORY = "1.2.840.10008.1.3.10"
 MOST_PIXELS = 8192 * 8192
 TAGS = [
     "SOPClassUID", "SOPInstanceUID", "Modality", "SeriesInstanceUID", "SeriesNumber", "InstanceNumber",
@@ -56,6 +60,16 @@ class DicomSlice:
     padding: tuple[int, int] | None  # range of raw values outside the field of view
 
     @property
+    def normal(self) -> np.ndarray:
+        """(3,) across the slice, LPS."""
+        return np.cross(self.row, self.column)
+
+    @property
+    def along_mm(self) -> float:
+        """The position along the normal."""
+        return float(self.position @ self.normal)
+
+    @property
     def label(self) -> str:
         """Its name in errors."""
         return f"slice {'without a number' if self.number is None else self.number} ({self.item.name})"
@@ -78,9 +92,8 @@ class DicomContents:
     """The contents of DICOM files."""
 
     series: dict[str, Series] = field(default_factory=dict)
-    segmentations: list[SourceFile] = field(default_factory=list)  # DICOM-SEG
-    structure_sets: list[SourceFile] = field(default_factory=list)  # RTSTRUCT
-    others: dict[str, int] = field(default_factory=dict)  # modality -> number of other files
+    labels: list[tuple[str, SourceFile]] = field(default_factory=list)  # SEG or RTSTRUCT, and the file
+    others: Counter[str] = field(default_factory=Counter)  # of each modality, other files
 
 
 def read_headers(
@@ -89,67 +102,60 @@ def read_headers(
     """Read all headers and sort them by kind. Raises PatientError where a file is damaged."""
     found = DicomContents()
     for item in progress(items):
-        header = read_header(item)
-        sop_class = text_of(item.name, header, "SOPClassUID")
-        if not sop_class and is_directory(header):
-            continue
-        if sop_class in SEGMENTATIONS:
-            found.segmentations.append(item)
-        elif sop_class == STRUCTURE_SET:
-            found.structure_sets.append(item)
+        header = item.header(TAGS)
+        with parsing(f"{item.name}: a damaged DICOM file", DAMAGED):
+            sop_class, modality, uid, number, frame = (
+                str(header.get(name) or "")
+                for name in (
+                    "SOPClassUID",
+                    "Modality",
+                    "SeriesInstanceUID",
+                    "SeriesNumber",
+                    "FrameOfReferenceUID",
+                )
+            )
+            is_directory = header.file_meta.get("MediaStorageSOPClassUID", "") == MEDIA_DIRECTORY
+        if sop_class in LABEL_CLASSES:
+            found.labels.append((LABEL_CLASSES[sop_class], item))
         elif sop_class in CT_CLASSES:
-            _add_slices(found, item, header)
-        elif not sop_class and header.preamble is not None:
-            raise PatientError(f"{item.name}: a damaged DICOM file (no SOPClassUID); copy or export it again")
-        else:
-            what = text_of(item.name, header, "Modality")
+            named = number if number.isdecimal() else "without a number"
+            series = found.series.setdefault(uid, Series(uid, named))
+            series.frame_of_reference = frame
+            try:
+                slices = slices_of(item, header)
+                series.slices += [one for one in slices if one is not None]
+                series.localizers += slices.count(None)
+            except PatientError as error:
+                series.faults.append(str(error))
+        elif sop_class:
             # Free text may name the patient.
-            what = what if MODALITY.fullmatch(what) else "files of unknown kind"
-            found.others[what] = found.others.get(what, 0) + 1
+            found.others[modality if MODALITY.fullmatch(modality) else "files of unknown kind"] += 1
+        elif not is_directory and header.preamble is not None:
+            raise PatientError(f"{item.name}: a damaged DICOM file (no SOPClassUID); {DAMAGED}")
+        elif not is_directory:
+            found.others["files of unknown kind"] += 1
     return found
 
 
-def read_header(item: SourceFile, tags: list[str] | None = TAGS) -> FileDataset:
-    """The elements of a file without pixels; tags None: all. Raises PatientError."""
-    with item.open() as file:
-        return parse_dicom(file, item.name, stop_before_pixels=True, specific_tags=tags)
-
-
-def _add_slices(found: DicomContents, item: SourceFile, header: Dataset) -> None:
-    uid, number = text_of(item.name, header, "SeriesInstanceUID"), text_of(item.name, header, "SeriesNumber")
-    series = found.series.setdefault(uid, Series(uid, number if number.isdecimal() else "without a number"))
-    series.frame_of_reference = text_of(item.name, header, "FrameOfReferenceUID")
-    try:
-        for slice_ in slices_of(item, header):
-            if slice_ is None:
-                series.localizers += 1
-            else:
-                series.slices.append(slice_)
-    except PatientError as error:
-        series.faults.append(str(error))
-    except Exception as error:  # values that are not numbers, missing groups
-        series.faults.append(f"{item.name}: its header cannot be read ({type(error).__name__})")
-
-
-def slices_of(item: SourceFile, header: Dataset) -> Iterator[DicomSlice | None]:
+def slices_of(item: SourceFile, header: Dataset) -> list[DicomSlice | None]:
     """The slices of one file; None for a localizer. Raises PatientError."""
-    if str(header.get("BurnedInAnnotation", "NO")).upper() == "YES":
-        raise PatientError(f"{item.name}: has text burned into its pixels, which may name the patient")
-    if int(header.get("SamplesPerPixel", 1)) != 1:
-        raise PatientError(f"{item.name}: has colours; expected HU")
-    frames = header.get("PerFrameFunctionalGroupsSequence")
-    if frames is None:
-        if int(header.get("NumberOfFrames") or 1) > 1:
-            raise PatientError(f"{item.name}: has {header.NumberOfFrames} frames without positions")
-        yield _slice(item, None, header.get("InstanceNumber"), [header], header)
-        return
-    shared = (header.get("SharedFunctionalGroupsSequence") or [Dataset()])[0]
-    if len(frames) != int(header.get("NumberOfFrames") or 1):
-        raise PatientError(
-            f"{item.name}: has {header.get('NumberOfFrames')} frames and positions of {len(frames)}"
-        )
-    for n, frame in enumerate(frames):
-        yield _slice(item, n, n + 1, [*_groups(frame), *_groups(shared), header], header)
+    with parsing(f"{item.name}: its header cannot be read", "expected a CT's"):
+        if str(header.get("BurnedInAnnotation", "NO")).upper() == "YES":
+            raise PatientError(f"{item.name}: has text burned into its pixels, which may name the patient")
+        if int(header.get("SamplesPerPixel", 1)) != 1:
+            raise PatientError(f"{item.name}: has colours; expected HU")
+        frames, count = header.get("PerFrameFunctionalGroupsSequence"), int(header.get("NumberOfFrames") or 1)
+        if frames is None:
+            if count > 1:
+                raise PatientError(f"{item.name}: has {count} frames without positions")
+            return [_slice(item, None, header.get("InstanceNumber"), [header], header)]
+        if len(frames) != count:
+            raise PatientError(f"{item.name}: has {count} frames and positions of {len(frames)}")
+        shared = _groups((header.get("SharedFunctionalGroupsSequence") or [Dataset()])[0])
+        return [
+            _slice(item, n, n + 1, [*_groups(frame), *shared, header], header)
+            for n, frame in enumerate(frames)
+        ]
 
 
 def _groups(functional: Dataset) -> list[Dataset]:

@@ -1,17 +1,17 @@
 """Read DICOM segmentation objects (binary, fractional, label map) with highdicom."""
 
 import logging
-import warnings
 from dataclasses import replace
 
 import highdicom as hd
 import numpy as np
+from pydicom.dataset import Dataset
 
-from errors import PatientError
-from scenes.patients.readers.dicom_file import parse_dicom
-from scenes.patients.readers.dicom_headers import read_header, slices_of
-from scenes.patients.readers.dicom_source import SourceFile
-from scenes.patients.readers.label_maps import LabelMap, Segment
+from errors import PatientError, parsing
+from scenes.patients.readers.dicom_files import SourceFile
+from scenes.patients.readers.dicom_headers import TAGS, slices_of
+from scenes.patients.readers.identifiers import identifiers_of
+from scenes.patients.readers.label_maps import LabelMap, Segment, Segmentation
 from scenes.patients.readers.segment_names import tissue_of
 from scenes.patients.readers.slice_stack import stack_slices
 from scenes.volumes.voxel_grid import VoxelGrid
@@ -22,34 +22,29 @@ HALF = 0.5
 FULL_HU = 1000.0
 
 
-def read_segmentation(item: SourceFile) -> tuple[list[LabelMap], list[str], str]:
-    """One label map per segment; notes; and the UID of the referenced series.
-
-    Raises PatientError: damaged, or not in the patient's coordinates.
-    """
+def read_segmentation(item: SourceFile) -> Segmentation:
+    """One label map per segment. Raises PatientError: damaged, or not in the patient's coordinates."""
     logging.getLogger("highdicom").setLevel(logging.ERROR)
-    with item.open() as file:
-        data = parse_dicom(file, item.name)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            segmentation = hd.seg.Segmentation.from_dataset(data, copy=False)
-            found = _maps(item, segmentation)
-    except PatientError:
-        raise
-    except Exception as error:  # a parser raises many kinds of error; each is the file's fault
-        raise PatientError(
-            f"{item.name}: cannot be read as a DICOM segmentation ({type(error).__name__}); expected evenly spaced frames in the "
-            "patient's coordinates; export it as a label map, for example NRRD"
-        ) from error
-    if not found:
+    data = item.parsed()
+    with parsing(
+        f"{item.name}: cannot be read as a DICOM segmentation",
+        "expected evenly spaced frames in the patient's coordinates; export it as a label map, for example NRRD",
+    ):
+        segmentation = hd.seg.Segmentation.from_dataset(data, copy=False)
+        maps = _maps(item, segmentation)
+    if not maps:
         raise PatientError(
             f"{item.name}: is empty, no voxel is labelled; expected an organ; choose another file"
         )
     fractional = segmentation.segmentation_type == hd.seg.SegmentationTypeValues.FRACTIONAL
-    notes = [f"fractional segments were cut at {HALF:.0%}"] if fractional else []
-    referenced = data.get("ReferencedSeriesSequence") or []
-    return found, notes, str(referenced[0].get("SeriesInstanceUID", "")) if referenced else ""
+    series = data.get("ReferencedSeriesSequence") or [Dataset()]
+    return Segmentation(
+        lambda _: maps,
+        referenced=str(series[0].get("SeriesInstanceUID", "")),
+        notes=(f"fractional segments were cut at {HALF:.0%}",) * fractional,
+        identifiers=identifiers_of(item),
+        frame_of_reference=str(data.get("FrameOfReferenceUID") or ""),
+    )
 
 
 def _maps(item: SourceFile, segmentation: hd.seg.Segmentation) -> list[LabelMap]:
@@ -67,9 +62,9 @@ def _maps(item: SourceFile, segmentation: hd.seg.Segmentation) -> list[LabelMap]
         segment = Segment.named(described.segment_label, int(number))
         if segment.tissue is None:
             segment = replace(segment, tissue=tissue_of(described.segmented_property_type.meaning))
-        one = LabelMap.single(*read(item, segmentation, int(number)), segment)
-        if one is not None:
-            maps.append(one)
+        grid, inside = read(item, segmentation, int(number))
+        if inside.any():
+            maps.append(LabelMap.single(grid, inside, segment))
     return maps
 
 
@@ -91,8 +86,8 @@ def _tilted(item: SourceFile, segmentation: hd.seg.Segmentation, number: int) ->
     identified = [frame.get("SegmentIdentificationSequence", shared)[0] for frame in groups]
     own = [
         replace(one, slope=FULL_HU / most, intercept=0.0)
-        for one, frame in zip(slices_of(item, read_header(item)), identified, strict=True)
+        for one, frame in zip(slices_of(item, item.header(TAGS)), identified, strict=True)
         if one is not None and frame.ReferencedSegmentNumber == number
     ]
     stack = stack_slices(item.name, own)
-    return stack.grid, stack.read(stack.grid.full_box()) >= HALF * FULL_HU
+    return stack.grid, stack.read() >= HALF * FULL_HU

@@ -5,8 +5,7 @@ from collections.abc import Iterator
 from pydicom.dataelem import DataElement
 from pydicom.dataset import Dataset
 
-from scenes.patients.readers.dicom_headers import read_header
-from scenes.patients.readers.dicom_source import SourceFile
+from scenes.patients.readers.dicom_files import SourceFile
 
 # Value representations that identify persons, dates and objects; UI also has standard UIDs, which identify nobody.
 NAMING = ("PN", "DA", "DT", "UI")
@@ -22,7 +21,7 @@ PERSONAL_KEYWORDS = (
 
 def identifiers_of(item: SourceFile) -> frozenset[str]:
     """Names, IDs, dates, institutions, UIDs and private texts of one DICOM file; elements that cannot be parsed as raw text."""
-    return frozenset(text for text in _texts(read_header(item, tags=None)) if text)
+    return frozenset(text for text in _texts(item.header(None)) if text)
 
 
 def _texts(data: Dataset) -> Iterator[str]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import SimpleITK as sitk
+from scipy import ndimage
 
 from errors import PatientError
 from scenes.patients.readers.segment_names import Side, side_of, tissue_of
@@ -63,11 +64,9 @@ class LabelMap:
         return cls(grid, values, found)
 
     @classmethod
-    def single(cls, grid: VoxelGrid, inside: np.ndarray, segment: Segment) -> LabelMap | None:
-        """The map of one segment, cropped; None where it is empty."""
+    def single(cls, grid: VoxelGrid, inside: np.ndarray, segment: Segment) -> LabelMap:
+        """The map of one segment that is not empty, cropped to it."""
         box = box_of(inside)
-        if box is None:
-            return None
         return cls(grid.part(box), inside[box[::-1]].astype(np.uint8), {1: segment})
 
     def of_tissues(self, *tissues: str | None) -> list[int]:
@@ -83,6 +82,17 @@ class LabelMap:
     def listed(self) -> str:
         """All segments, for errors."""
         return listed([str(segment) for segment in self.segments.values()])
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """Labels of one source; contours are filled once the CT's grid is known."""
+
+    maps: Callable[[VoxelGrid], list[LabelMap]]  # on the CT's grid
+    referenced: str = ""  # UID of the referenced series
+    notes: tuple[str, ...] = ()
+    identifiers: frozenset[str] = frozenset()
+    frame_of_reference: str = ""  # DICOM's UID
 
 
 def listed(names: Sequence[str]) -> str:
@@ -165,16 +175,9 @@ def present_values(values: np.ndarray) -> list[int]:
     return [int(v) for v in np.flatnonzero(there) if v]
 
 
-def box_of(inside: np.ndarray) -> Box | None:
-    """The box (x, y, z) around non-zero voxels (z, y, x), or None."""
-    spans = []
-    for axis in range(3):
-        others = tuple(a for a in range(3) if a != axis)
-        there = np.flatnonzero(inside.any(axis=others))
-        if not len(there):
-            return None
-        spans.append(slice(int(there[0]), int(there[-1]) + 1))
-    z, y, x = spans
+def box_of(inside: np.ndarray) -> Box:
+    """The box (x, y, z) around non-zero voxels (z, y, x), of which there is one or more."""
+    z, y, x = ndimage.find_objects(np.asarray(inside, bool).view(np.uint8))[0]
     return x, y, z
 
 

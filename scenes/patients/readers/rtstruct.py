@@ -1,13 +1,15 @@
 """Read the contours of a DICOM RTSTRUCT and fill them on their planes."""
 
+import contextlib
+
 import numpy as np
 from pydicom.dataset import Dataset
 from skimage.draw import polygon
 
-from errors import PatientError
-from scenes.patients.readers.dicom_file import parse_dicom
-from scenes.patients.readers.dicom_source import SourceFile
-from scenes.patients.readers.label_maps import LabelMap, Segment
+from errors import PatientError, parsing
+from scenes.patients.readers.dicom_files import SourceFile
+from scenes.patients.readers.identifiers import identifiers_of
+from scenes.patients.readers.label_maps import LabelMap, Segment, Segmentation
 from scenes.volumes.voxel_grid import VoxelGrid
 
 # Largest deviation of a contour from the even planes, as a share of their distance.
@@ -15,45 +17,31 @@ OFF_PLANE = 0.3
 MOST_POINTS = 20_000_000
 
 
-def read_contours(item: SourceFile, ct: VoxelGrid) -> list[LabelMap]:
-    """One label map per region, with the pixels of a CT, on the planes of the contours.
-
-    Nested contours on one plane alternate between inside and outside.
-    Raises PatientError: damaged, or not parallel to the CT's slices.
-    """
-    with item.open() as file:
-        data = parse_dicom(file, item.name)
-    try:
+def read_structures(item: SourceFile) -> Segmentation:
+    """The regions of a structure set, which are filled once the CT's grid is known. Raises PatientError where it is damaged."""
+    data = item.parsed()
+    with parsing(f"{item.name}: cannot be read as an RTSTRUCT", "export it again"):
         names = {int(roi.ROINumber): str(roi.get("ROIName", "")) for roi in data.StructureSetROISequence}
         regions = [
             (Segment.named(names.get(number, ""), number, _colour(roi)), _contours(roi))
             for roi in data.ROIContourSequence
             for number in [int(roi.ReferencedROINumber)]
         ]
-    except Exception as error:  # a parser raises many kinds of error; each is the file's fault
-        raise PatientError(
-            f"{item.name}: cannot be read as an RTSTRUCT ({type(error).__name__}); export it again"
-        ) from error
-    maps = []
-    for segment, contours in regions:
-        if contours:
-            maps.append(LabelMap.single(*_filled(item.name, contours, ct), segment))
-    found = [one for one in maps if one is not None]
-    if not found:
-        raise PatientError(f"{item.name}: has no closed contour; expected an organ's; choose another file")
-    return found
+    referenced = ""
+    with contextlib.suppress(Exception):  # without it the best series is taken
+        study = data.ReferencedFrameOfReferenceSequence[0].RTReferencedStudySequence[0]
+        referenced = str(study.RTReferencedSeriesSequence[0].SeriesInstanceUID)
 
+    def maps(ct: VoxelGrid) -> list[LabelMap]:
+        filled = [(*_filled(item.name, contours, ct), segment) for segment, contours in regions if contours]
+        found = [LabelMap.single(*region) for region in filled if region[1].any()]
+        if not found:
+            raise PatientError(
+                f"{item.name}: has no closed contour; expected an organ's; choose another file"
+            )
+        return found
 
-def referenced_series(data: Dataset) -> str:
-    """The UID of the series that a structure set refers to, or an empty text."""
-    try:
-        for frame in data.get("ReferencedFrameOfReferenceSequence") or []:
-            for study in frame.get("RTReferencedStudySequence") or []:
-                for series in study.get("RTReferencedSeriesSequence") or []:
-                    return str(series.get("SeriesInstanceUID", ""))
-    except Exception:  # a parser raises many kinds of error; without it the best series is taken
-        return ""
-    return ""
+    return Segmentation(maps, referenced, identifiers=identifiers_of(item))
 
 
 def _colour(roi: Dataset) -> tuple[float, float, float] | None:
@@ -78,7 +66,10 @@ def _contours(roi: Dataset) -> list[np.ndarray]:
 
 
 def _filled(name: str, contours: list[np.ndarray], ct: VoxelGrid) -> tuple[VoxelGrid, np.ndarray]:
-    """Grid and mask (z, y, x) of a region: a CT's pixels on the planes of its contours."""
+    """Grid and mask (z, y, x) of a region: a CT's pixels on the planes of its contours.
+
+    Nested contours on one plane alternate between inside and outside. Raises PatientError: not parallel to the CT's slices.
+    """
     places = [ct.index(points) for points in contours]
     ends = np.array(ct.size)
     if any((place < -ends).any() or (place > 2 * ends).any() for place in places):

@@ -4,7 +4,6 @@ A tilted gantry shears the stack: its slices are shifted within their planes, wi
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
@@ -12,7 +11,7 @@ from scipy import ndimage
 from errors import PatientError
 from scenes.patients.readers.dicom_headers import DicomSlice
 from scenes.patients.readers.dicom_pixels import hounsfield
-from scenes.volumes.lazy_volume import AIR_HU
+from scenes.volumes.lazy_volume import AIR_HU, LazyVolume
 from scenes.volumes.voxel_grid import Box, VoxelGrid
 
 # Largest deviation of a slice from the even grid, as a share of the spacing: scanners round positions to 0.1 mm at worst.
@@ -30,47 +29,58 @@ SAME_PLACE_MM = 1e-3
 MOST_GAP_MM = 10.0
 
 
-@dataclass(frozen=True)
-class Stack:
-    """Sorted slices, and the rectangular, even grid that they are resampled on."""
+def stack_slices(
+    name: str,
+    slices: list[DicomSlice],
+    progress: Callable[[Iterable[DicomSlice]], Iterable[DicomSlice]] = iter,
+) -> LazyVolume:
+    """One volume of slices, in HU. Raises PatientError: too few, not parallel, or one missing or in conflict."""
+    if len(slices) < 2:
+        raise PatientError(
+            f"{name}: one slice only; expected a series of slices; give the folder of the whole series"
+        )
+    _check_same_geometry(name, slices)
+    normal = slices[0].normal
+    notes: list[str] = []
+    slices = sorted(slices, key=lambda s: (float(s.position @ normal), s.number or 0))
+    slices = _without_duplicates(name, slices, normal, notes)
+    if len(slices) < 2:
+        raise PatientError(f"{name}: all slices are at one position; expected a stack; choose another series")
+    along = np.array([s.position @ normal for s in slices])
+    planes, gap = _even(name, slices, along, notes)
+    origin, sideways, size = _straightened(name, slices, normal, notes)
+    direction = np.column_stack([slices[0].row, slices[0].column, normal])
+    planes_count = int(np.floor(planes[-1] + UNEVEN)) + 1
+    grid = VoxelGrid((*size, planes_count), np.array([*slices[0].spacing, gap]), origin, direction)
 
-    slices: list[DicomSlice]
-    grid: VoxelGrid
-    planes: np.ndarray  # (n,) position of each slice along the grid's third axis [voxels]
-    sideways: np.ndarray  # (n, 2) in-plane shift of each slice along row and column [pixels]
-    notes: tuple[str, ...]
-
-    def read(
-        self, box: Box, progress: Callable[[Iterable[DicomSlice]], Iterable[DicomSlice]] = iter
-    ) -> np.ndarray:
-        """HU (z, y, x) int16 of a box of the grid."""
+    def read_box(box: Box) -> np.ndarray:
         x, y, z = box
-        first = int(np.searchsorted(self.planes, z.start + UNEVEN, side="right")) - 1
-        last = int(np.searchsorted(self.planes, z.stop - 1 - UNEVEN, side="left"))
-        first, last = max(first, 0), min(last, len(self.slices) - 1)
-        used = range(first, last + 1)
+        first = max(int(np.searchsorted(planes, z.start + UNEVEN, side="right")) - 1, 0)
+        last = min(int(np.searchsorted(planes, z.stop - 1 - UNEVEN, side="left")), len(slices) - 1)
         voxels = np.empty((z.stop - z.start, y.stop - y.start, x.stop - x.start), np.int16)
         before: tuple[float, np.ndarray] | None = None
         k = z.start
-        pixels = hounsfield(list(progress([self.slices[n] for n in used])))
-        for n, plane in zip(used, pixels, strict=True):
-            here = float(self.planes[n]), self._shifted(plane, n)[y, x]
+        for n, plane in enumerate(hounsfield(list(progress(slices[first : last + 1]))), first):
+            here = float(planes[n]), _shifted(plane, sideways[n], size)[y, x]
             while k < z.stop and k <= here[0] + UNEVEN:
                 voxels[k - z.start] = _between(before, here, k)
                 k += 1
             before = here
         return voxels
 
-    def _shifted(self, plane: np.ndarray, n: int) -> np.ndarray:
-        """A slice resampled on the grid's pixels; air outside it."""
-        columns, rows, _ = self.grid.size
-        if plane.shape == (rows, columns) and not self.sideways[n].any():
-            return plane
-        right, down = self.sideways[n]
-        wide = np.full((rows, columns), AIR_HU, np.float32)
-        wide[: plane.shape[0], : plane.shape[1]] = plane
-        moved = ndimage.shift(wide, (down, right), order=1, mode="constant", cval=AIR_HU)
-        return np.rint(moved).astype(np.int16)
+    return LazyVolume(name, grid.checked(name), read_box, tuple(notes))
+
+
+def _shifted(plane: np.ndarray, sideways: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A slice shifted along row and column [pixels] onto a grid's columns and rows; air outside it."""
+    columns, rows = size
+    if plane.shape == (rows, columns) and not sideways.any():
+        return plane
+    right, down = sideways
+    wide = np.full((rows, columns), AIR_HU, np.float32)
+    wide[: plane.shape[0], : plane.shape[1]] = plane
+    moved = ndimage.shift(wide, (down, right), order=1, mode="constant", cval=AIR_HU)
+    return np.rint(moved).astype(np.int16)
 
 
 def _between(before: tuple[float, np.ndarray] | None, after: tuple[float, np.ndarray], k: int) -> np.ndarray:
@@ -81,30 +91,6 @@ def _between(before: tuple[float, np.ndarray] | None, after: tuple[float, np.nda
         return before[1]
     share = np.float32((k - before[0]) / (after[0] - before[0]))
     return np.rint(before[1] * (1 - share) + after[1] * share).astype(np.int16)
-
-
-def stack_slices(name: str, slices: list[DicomSlice]) -> Stack:
-    """Sort slices on one grid. Raises PatientError: too few, not parallel, or one missing or in conflict."""
-    if len(slices) < 2:
-        raise PatientError(
-            f"{name}: one slice only; expected a series of slices; give the folder of the whole series"
-        )
-    _check_same_geometry(name, slices)
-    normal = np.cross(slices[0].row, slices[0].column)
-    _check_phases(name, slices, normal)
-    notes: list[str] = []
-    slices = sorted(slices, key=lambda s: (float(s.position @ normal), s.number or 0))
-    slices = _without_duplicates(name, slices, normal, notes)
-    if len(slices) < 2:
-        raise PatientError(f"{name}: all slices are at one position; expected a stack; choose another series")
-    along = np.array([s.position @ normal for s in slices])
-    _check_gaps(name, slices, along)
-    planes, gap = _even(along, notes)
-    origin, sideways, size = _straightened(name, slices, normal, notes)
-    direction = np.column_stack([slices[0].row, slices[0].column, normal])
-    planes_count = int(np.floor(planes[-1] + UNEVEN)) + 1
-    grid = VoxelGrid((*size, planes_count), np.array([*slices[0].spacing, gap]), origin, direction)
-    return Stack(slices, grid.checked(name), planes, sideways, tuple(notes))
 
 
 def _check_same_geometry(name: str, slices: list[DicomSlice]) -> None:
@@ -120,48 +106,34 @@ def _check_same_geometry(name: str, slices: list[DicomSlice]) -> None:
             )
 
 
-def _check_phases(name: str, slices: list[DicomSlice], normal: np.ndarray) -> None:
-    """Raises PatientError where a series has several phases: every position occurs as often."""
-    places, counts = np.unique([round(float(s.position @ normal), 2) for s in slices], return_counts=True)
-    often = int(counts.min())
-    if (
-        len(places) > 2
-        and often > 1
-        and len({s.sop for s in slices}) == len(slices)
-        and not _first_two_equal(slices, normal)
-    ):
-        raise PatientError(
-            f"{name}: all {len(places)} positions occur {often} times: several phases in one series; expected one; put the slices "
-            "of one phase, by acquisition number or time, in a separate folder"
-        )
-
-
-def _first_two_equal(slices: list[DicomSlice], normal: np.ndarray) -> bool:
-    """Whether the first two slices at one position are equal."""
-    first = min(slices, key=lambda s: float(s.position @ normal))
-    twin = [s for s in slices if abs((s.position - first.position) @ normal) < SAME_PLACE_MM][:2]
-    return len(twin) == 2 and _same(*twin)
-
-
 def _without_duplicates(
     name: str, slices: list[DicomSlice], normal: np.ndarray, notes: list[str]
 ) -> list[DicomSlice]:
-    """The slices without equal copies. Raises PatientError where slices at one position differ."""
-    kept, copies = [slices[0]], []
+    """Sorted slices without equal copies. Raises PatientError where slices at one position differ, or are several phases."""
+    groups = [[slices[0]]]
     for one in slices[1:]:
-        if (one.position - kept[-1].position) @ normal > SAME_PLACE_MM:
-            kept.append(one)
-        elif _same(one, kept[-1]):
-            copies.append(one)
+        if (one.position - groups[-1][0].position) @ normal > SAME_PLACE_MM:
+            groups.append([one])
         else:
+            groups[-1].append(one)
+    often = min(map(len, groups))
+    for first, other in ((group[0], other) for group in groups for other in group[1:]):
+        if _same(other, first):
+            continue
+        if len(groups) > 2 and often > 1 and len({s.sop for s in slices}) == len(slices):
             raise PatientError(
-                f"{name}: {kept[-1].label} and {one.label} are at one position, at {one.position @ normal:.2f} mm, and differ; expected "
-                "each slice once; remove other phases, or the wrong copy"
+                f"{name}: all {len(groups)} positions occur {often} times: several phases in one series; expected one; put the slices "
+                "of one phase, by acquisition number or time, in a separate folder"
             )
+        raise PatientError(
+            f"{name}: {first.label} and {other.label} are at one position, at {other.position @ normal:.2f} mm, and differ; expected "
+            "each slice once; remove other phases, or the wrong copy"
+        )
+    copies = [copy for group in groups for copy in group[1:]]
     if copies:
         named = ", ".join(one.label for one in copies[:3]) + (" and others" if len(copies) > 3 else "")
         notes.append(f"duplicates, taken once: {named}")
-    return kept
+    return [group[0] for group in groups]
 
 
 def _same(one: DicomSlice, other: DicomSlice) -> bool:
@@ -170,7 +142,10 @@ def _same(one: DicomSlice, other: DicomSlice) -> bool:
     return bool(sideways) and np.array_equal(mine, its)
 
 
-def _check_gaps(name: str, slices: list[DicomSlice], along: np.ndarray) -> None:
+def _even(
+    name: str, slices: list[DicomSlice], along: np.ndarray, notes: list[str]
+) -> tuple[np.ndarray, float]:
+    """Positions of the slices on an even grid [voxels], and its spacing [mm]. Raises PatientError where one is missing or too many."""
     gaps = np.diff(along)
     usual = float(np.percentile(gaps, 50, method="lower"))
     least, most = GAPS
@@ -195,17 +170,11 @@ def _check_gaps(name: str, slices: list[DicomSlice], along: np.ndarray) -> None:
         raise PatientError(
             f"{name}: slices are {usual:.1f} mm apart; expected at most {MOST_GAP_MM:g} mm; choose a thinner series"
         )
-
-
-def _even(along: np.ndarray, notes: list[str]) -> tuple[np.ndarray, float]:
-    """Positions of the slices on an even grid [voxels], and its spacing [mm]."""
-    gap = (along[-1] - along[0]) / (len(along) - 1)
-    planes = (along - along[0]) / gap
-    if np.abs(planes - np.arange(len(along))).max() <= UNEVEN:
+    extent = along[-1] - along[0]
+    gap = extent / len(gaps)
+    if np.abs((along - along[0]) / gap - np.arange(len(along))).max() <= UNEVEN:
         return np.arange(len(along), dtype=float), float(gap)
-    gaps = np.diff(along)
-    usual = float(np.percentile(gaps, 50, method="lower"))
-    gap = (along[-1] - along[0]) / max(1, round((along[-1] - along[0]) / usual))
+    gap = extent / max(1, round(extent / usual))
     notes.append(
         f"slices are {gaps.min():.2f} to {gaps.max():.2f} mm apart: resampled to {gap:.2f} mm, linearly between neighbours"
     )

@@ -1,22 +1,47 @@
-"""Choose one CT series of several, and open it as a volume."""
+"""Open a CT: a volume file, or one series of DICOM files."""
 
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from errors import PatientError
+from scenes.patients.readers.dicom_files import find_dicom_files
 from scenes.patients.readers.dicom_headers import DicomContents, DicomSlice, Series, read_headers
-from scenes.patients.readers.dicom_source import find_dicom_files
 from scenes.patients.readers.identifiers import identifiers_of
 from scenes.patients.readers.slice_stack import stack_slices
-from scenes.terminal import Progress
+from scenes.terminal import Progress, silent
 from scenes.volumes.lazy_volume import LazyVolume
-from scenes.volumes.volume_files import ENDINGS
+from scenes.volumes.volume_files import ENDINGS, file_volume, is_volume_file
 
 # Up to this share of slices in another view are taken for unmarked localizers.
 STRAY = 0.1
 # Characters of a UID that identify a series; series numbers are shorter.
 UID_END = 6
+
+
+def open_ct(
+    path: Path, series: str | None = None, referenced: str = "", progress: Progress = silent
+) -> LazyVolume:
+    """Find a CT and read its headers; voxels are read on demand.
+
+    Args:
+        path: a folder with DICOM files, in subfolders too; a DICOMDIR; a zip archive of DICOM files; an enhanced CT;
+            a .nii, .nii.gz, .nrrd, .nhdr, .mha or .mhd file.
+        series: number or UID (or its end) of one of several series.
+        referenced: UID of the series that the labels refer to, which is preferred.
+
+    Raises:
+        PatientError: not readable, or not one complete CT.
+    """
+    if not path.exists():
+        raise PatientError(f"{path}: no such file or folder; check the path")
+    if path.is_file() and is_volume_file(path):
+        if series is not None:
+            raise PatientError(f"{path}: has no series; leave --series out")
+        return file_volume(path)
+    return _series_volume(path, read_dicom_headers(path, progress), series, referenced, progress)
 
 
 def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
@@ -34,7 +59,7 @@ def read_dicom_headers(path: Path, progress: Progress) -> DicomContents:
     return read_headers(items, lambda files: progress(files, "headers"))
 
 
-def series_volume(
+def _series_volume(
     path: Path, found: DicomContents, wanted: str | None, referenced: str, progress: Progress
 ) -> LazyVolume:
     """The CT of one series: the ``wanted`` one by number or UID, else the ``referenced`` one, else the best.
@@ -58,27 +83,25 @@ def series_volume(
     if series.localizers + left_out:
         notes.append(f"left out, localisers: {series.localizers + left_out}")
     if found.others:
-        others = ", ".join(f"{count} {what}" for what, count in sorted(found.others.items()))
-        notes.append(f"left out, no CT slices: {others}")
+        notes.append(f"left out, no CT slices: {', '.join(_counted(found.others))}")
     if not all(one.is_rescaled for one in slices):
         notes.append("the files have no rescale: their values were taken as HU")
-    stack = stack_slices(str(path), slices)
-    return LazyVolume(
-        name=str(path),
-        grid=stack.grid,
-        read_box=lambda box: stack.read(box, lambda files: progress(files, "slices")),
+    stack = stack_slices(str(path), slices, lambda files: progress(files, "slices"))
+    return replace(
+        stack,
         notes=(*notes, *stack.notes),
         frame_of_reference=series.frame_of_reference,
         identifiers=identifiers_of(slices[0].item),
     )
 
 
+def _counted(kinds: Counter[str]) -> list[str]:
+    return [f"{count} {what}" for what, count in sorted(kinds.items())]
+
+
 def _contents_without_ct(found: DicomContents) -> str:
-    kinds = [f"{count} {what}" for what, count in sorted(found.others.items())]
-    kinds += [f"{len(found.segmentations)} SEG"] * bool(found.segmentations)
-    kinds += [f"{len(found.structure_sets)} RTSTRUCT"] * bool(found.structure_sets)
-    views = sum(series.localizers for series in found.series.values())
-    kinds += [f"{views} localisers"] * bool(views)
+    localizers = Counter(localisers=sum(series.localizers for series in found.series.values()))
+    kinds = _counted(found.others) + _counted(Counter(kind for kind, _ in found.labels) + localizers)
     return f"no CT slices, but {', '.join(kinds)}" if kinds else "no CT slices"
 
 
@@ -117,8 +140,8 @@ def choose_series(
 
 def _rank(series: Series, referenced: str) -> tuple:
     """Sort key, larger is better: referenced by labels, usable, axial, extent in steps of 5 cm, number of slices."""
-    along = [float(s.position @ np.cross(s.row, s.column)) for s in series.slices] or [0.0]
-    axial = bool(series.slices) and abs(np.cross(series.slices[0].row, series.slices[0].column)[2]) > 0.9
+    along = [one.along_mm for one in series.slices] or [0.0]
+    axial = bool(series.slices) and abs(series.slices[0].normal[2]) > 0.9
     number = float(series.number) if series.number.isdecimal() else 1e9
     return (
         series.uid == referenced,
@@ -132,7 +155,7 @@ def _rank(series: Series, referenced: str) -> tuple:
 
 def _described(series: Series, with_uid: bool) -> str:
     """Number, slices and spacing, and if needed the end of the UID; no free text, which may name the patient."""
-    places = np.unique([round(float(s.position @ np.cross(s.row, s.column)), 2) for s in series.slices])
+    places = np.unique([round(one.along_mm, 2) for one in series.slices])
     gap = f", {np.median(np.diff(places)):.2f} mm apart" if len(places) > 1 else ""
     uid = f", UID ends in {series.uid[-UID_END:]}" if with_uid else ""
     return f"series {series.number} (CT, {len(series.slices)} slices{gap}{uid})"

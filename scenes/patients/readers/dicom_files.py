@@ -1,21 +1,37 @@
-"""Find the DICOM files of a folder, a DICOMDIR or a zip archive. Nothing is extracted to disk."""
+"""Find the DICOM files of a folder, a DICOMDIR or a zip archive, and parse them with bounded memory. Nothing is extracted to disk."""
 
 import io
+import logging
 import os
 import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import BinaryIO, cast
+from typing import Any, BinaryIO, cast
 
-from errors import PatientError
-from scenes.patients.readers.dicom_file import MAGIC, MAGIC_AT, looks_like_dicom, parse_dicom
+import pydicom
+from pydicom import config
+from pydicom.dataset import FileDataset
+from pydicom.filereader import read_dataset
+from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian, ImplicitVRLittleEndian
 
+from errors import PatientError, parsing
+
+# Values are validated where they are used; pydicom's warnings and logs would print them, also identifiers of the patient.
+config.settings.reading_validation_mode = config.IGNORE
+logging.getLogger("pydicom").setLevel(logging.CRITICAL)
+
+MAGIC_AT, MAGIC = 128, b"DICM"
+START_BYTES = MAGIC_AT + len(MAGIC)
+# The limit of a deflated data set, against decompression bombs.
+MOST_INFLATED = 2 * 2**30
 MOST_FILES = 100_000
 # One file of an archive may be an enhanced CT; an archive may have several series.
 MOST_FILE_BYTES = 2 * 2**30
 MOST_ARCHIVE_BYTES = 16 * 2**30
+DAMAGED = "copy or export it again"
 
 
 @dataclass(frozen=True)
@@ -25,6 +41,41 @@ class SourceFile:
     name: str  # relative to the user's path
     open: Callable[[], BinaryIO]
     path: Path | None  # None in an archive
+
+    def parsed(self, **options: Any) -> FileDataset:
+        """Its data set; ``options`` are pydicom.dcmread's. Raises PatientError."""
+        with self.open() as file, parsing(f"{self.name}: a damaged DICOM file", DAMAGED):
+            has_preamble = file.read(START_BYTES)[MAGIC_AT:] == MAGIC
+            if has_preamble:
+                _check_inflated(file, self.name)
+            file.seek(0)
+            data = pydicom.dcmread(file, force=not has_preamble, **options)
+            if "TransferSyntaxUID" not in data.file_meta:
+                implicit = data.original_encoding[0]
+                data.file_meta.TransferSyntaxUID = (
+                    ImplicitVRLittleEndian if implicit else ExplicitVRLittleEndian
+                )
+            return data
+
+    def header(self, tags: list[str] | None) -> FileDataset:
+        """The elements without pixels; tags None: all. Raises PatientError."""
+        return self.parsed(stop_before_pixels=True, specific_tags=tags)
+
+
+def _check_inflated(file: BinaryIO, name: str) -> None:
+    """Raises PatientError where a deflated data set inflates to more than MOST_INFLATED. The meta header's length is not trusted."""
+    meta = read_dataset(file, False, True, stop_when=lambda tag, vr, length: tag.group != 2)
+    if meta.get("TransferSyntaxUID") != DeflatedExplicitVRLittleEndian:
+        return
+    inflater, size = zlib.decompressobj(-zlib.MAX_WBITS), 0
+    while (chunk := file.read(1 << 16)) and not inflater.eof:
+        while chunk:
+            size += len(inflater.decompress(chunk, 1 << 22))
+            chunk = inflater.unconsumed_tail
+            if size > MOST_INFLATED:
+                raise PatientError(
+                    f"{name}: inflates to more than 2 GiB; expected one CT; export it uncompressed"
+                )
 
 
 def find_dicom_files(path: Path) -> list[SourceFile]:
@@ -51,11 +102,16 @@ def _disk_file(path: Path, name: str) -> SourceFile:
 def _begins_as_dicom(item: SourceFile) -> bool:
     try:
         with item.open() as file:
-            return looks_like_dicom(file.read(MAGIC_AT + len(MAGIC)))
+            return _looks_like_dicom(file.read(START_BYTES))
     except OSError as error:
         raise PatientError(
             f"{item.name}: cannot be read ({error.strerror}); check the file's permissions"
         ) from error
+
+
+def _looks_like_dicom(start: bytes) -> bool:
+    """Whether a file's first bytes are DICOM: with a preamble, or without one (group 2 or 8, little endian)."""
+    return start[MAGIC_AT:] == MAGIC or (start[:2] in (b"\x08\x00", b"\x02\x00") and start[3:4] == b"\x00")
 
 
 def _of_folder(folder: Path) -> list[SourceFile]:
@@ -99,44 +155,37 @@ def _of_directory_file(path: Path) -> list[SourceFile]:
 
 def _listed(path: Path) -> list[list[str]]:
     """The ReferencedFileID of each image record."""
-    try:
-        with path.open("rb") as file:
-            if not looks_like_dicom(file.read(MAGIC_AT + len(MAGIC))):
-                raise ValueError
-            file.seek(0)
-            records = parse_dicom(file, str(path)).get("DirectoryRecordSequence") or []
+    item = _disk_file(path, str(path))
+    with parsing(f"{path}: cannot be read as a DICOMDIR", "give the folder of the slices instead"):
+        if not _begins_as_dicom(item):
+            raise ValueError
+        records = item.parsed().get("DirectoryRecordSequence") or []
         names = [record.get("ReferencedFileID") for record in records]
         return [[name] if isinstance(name, str) else [str(part) for part in name] for name in names if name]
-    except PatientError:
-        raise
-    except Exception as error:  # a parser raises many kinds of error; each is the file's fault
-        raise PatientError(
-            f"{path}: cannot be read as a DICOMDIR; give the folder of the slices instead"
-        ) from error
 
 
 def _of_archive(path: Path) -> list[SourceFile]:
-    try:
+    with parsing(f"{path}: a damaged archive", DAMAGED):
         archive = zipfile.ZipFile(path)
         entries = [entry for entry in archive.infolist() if not entry.is_dir()]
-    except Exception as error:  # a parser raises many kinds of error; each is the archive's fault
-        raise PatientError(f"{path}: a damaged archive ({error}); copy or export it again") from error
     if len(entries) > MOST_FILES:
         raise PatientError(f"{path}: has {len(entries)} files; expected at most {MOST_FILES}")
     for entry in entries:
         _check_entry(path, entry)
-    found = [entry for entry in entries if looks_like_dicom(_extracted(path, archive, entry, 132))]
+
+    def extracted(entry: zipfile.ZipInfo, most: int = MOST_FILE_BYTES) -> BinaryIO:
+        where = f"{path}: {entry.filename[:60]} cannot be extracted"
+        with parsing(where, "the archive is damaged; copy it again"), archive.open(entry) as file:
+            return io.BytesIO(file.read(most))
+
+    found = [entry for entry in entries if _looks_like_dicom(extracted(entry, START_BYTES).read())]
     total = sum(entry.file_size for entry in found)
     if total > MOST_ARCHIVE_BYTES:
         raise PatientError(
             f"{path}: extracts to {total / 2**30:.0f} GiB of DICOM; expected at most {MOST_ARCHIVE_BYTES / 2**30:.0f}; "
             "give an archive of the CT alone"
         )
-
-    def opened(entry: zipfile.ZipInfo) -> BinaryIO:
-        return io.BytesIO(_extracted(path, archive, entry, MOST_FILE_BYTES))
-
-    return [SourceFile(entry.filename, partial(opened, entry), None) for entry in found]
+    return [SourceFile(entry.filename, partial(extracted, entry), None) for entry in found]
 
 
 def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:
@@ -159,13 +208,3 @@ def _is_outside(name: str) -> bool:
     """Whether a path is absolute or contains "..", on any system."""
     kinds = PurePosixPath(name), PureWindowsPath(name)
     return any(p.is_absolute() or p.drive or p.root or ".." in p.parts for p in kinds)
-
-
-def _extracted(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo, most: int) -> bytes:
-    try:
-        with archive.open(entry) as file:
-            return file.read(most)
-    except Exception as error:  # a decompressor raises many kinds of error; each is the archive's fault
-        raise PatientError(
-            f"{path}: {entry.filename[:60]} cannot be extracted; the archive is damaged; copy it again"
-        ) from error
