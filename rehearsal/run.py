@@ -93,8 +93,8 @@ class RehearsalRun:
             viewer=viewer,
             out=self.out,
             notices=self.notices,
-            sweeping=SweepRecorder(self.rehearsal),
-            plans=PlanControl(self.rehearsal, self.anatomy, self.measurements, self.out),
+            sweeping=SweepRecorder(self.rehearsal, self.notices),
+            plans=PlanControl(self.rehearsal, self.anatomy, self.measurements, self.out, self.notices),
             keys=self.keys,
         )
         try:
@@ -103,7 +103,8 @@ class RehearsalRun:
         finally:
             viewer.close()
             frames.plans.stop()
-            _echo(frames.sweeping.end())
+            frames.sweeping.end()
+            self.notices.present(self.keys.worded)
 
     def headless(
         self, log: Log | None, at_s: float, seconds: float | None, build_s: float, draws: bool = True

@@ -88,7 +88,8 @@ def plan(
     if out.is_dir():
         raise CommandError(f"{out}: is a folder; name a file after --out")
     from rehearsal.planning.plan_search import make_plan, total_work
-    from rehearsal.planning.trial_workers import PlanningProblem, TrialWorkers
+    from rehearsal.planning.sweep_trial import PlanningProblem
+    from rehearsal.planning.trial_workers import TrialWorkers
 
     chosen: Target = target or ("organ" if anatomy.tumour is None else "margin")
     problem = PlanningProblem(loaded, anatomy, scene_probe, chosen, margin_mm, port)
@@ -98,7 +99,7 @@ def plan(
         TrialWorkers(problem, jobs) as workers,
         tqdm(total=total_work(trials, speed_mm_s), desc="plan", unit="trial") as bar,
     ):
-        made = make_plan(problem, workers, speed_mm_s, trials, bar.update)
+        made = make_plan(workers, speed_mm_s, trials, bar.update)
         bar.update(bar.total - bar.n)
     write_plan(made, out)
     click.echo("\n".join(made.why))

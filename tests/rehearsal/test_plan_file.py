@@ -24,6 +24,7 @@ from rehearsal.planning.plan_file import (
     timed_poses,
     write_plan,
 )
+from rehearsal.planning.sweep_trial import PlanningProblem
 from rehearsal.tracking.track_file import load_track
 from scenes.scene import Trocar
 from ultrasound.probe import load_probe
@@ -250,7 +251,7 @@ def test_the_plan_command_refuses_in_one_line(ball_scene, capsys, options, words
 def test_a_plan_is_made_on_the_tissue_of_the_quality(ball_scene, monkeypatch, capsys):
     cells_mm: list[float] = []
 
-    def nobody(problem: trial_workers.PlanningProblem, jobs: int | None) -> None:
+    def nobody(problem: PlanningProblem, jobs: int | None) -> None:
         cells_mm.append(problem.scene.tissue.cell_mm)
         raise PlanError("no workers")
 

@@ -264,7 +264,7 @@ def step(live: UserInput, step_ms: float = 0.0, **did: Any) -> np.ndarray | None
 
 def shown(live: UserInput) -> str:
     """The notices since the last call."""
-    return "".join(notice.text for notice in live.notices.take())
+    return "".join(live.notices.present())
 
 
 def ray(x_mm: float) -> tuple[np.ndarray, np.ndarray]:
@@ -339,12 +339,12 @@ def test_the_iterations_that_were_done_are_recorded_not_those_asked_for():
     assert live.status == "REDUCED ITERATIONS   3 of 10"
 
 
-def test_a_step_that_is_too_slow_is_said_once():
+def test_a_step_that_is_too_slow_is_said_once(capsys):
     live = UserInput(Session(Numbers()), AdaptiveIterations(5.0))
     live.next_pose(Controls(Settings(young_kpa=15.0, iterations=8)))
     for _ in range(21):
         live.after_step(9.0)
-    assert [notice.text for notice in live.notices.take()] == ["REDUCED ITERATIONS   6 of 8"]
+    assert live.notices.present() == [] and capsys.readouterr().out == "REDUCED ITERATIONS   6 of 8\n"
 
 
 def test_only_what_changes_is_told():
