@@ -197,8 +197,8 @@ class RehearsalRun:
             _echo(guide.in_words(summary.get(f"seen_{guide.plan.target}")))
         if self.recorder is not None:
             self.recorder.close(summary)
-            text = f"Recorded; replay it with: {self._replay_command(self.recorder.recording.path)}"
-            click.echo(self.recorder.recording.fault or text)
+            text = f"Recorded; replay it with: {self._replay_command(self.recorder.path)}"
+            click.echo(self.recorder.fault or text)
 
     def _replay_command(self, session: Path) -> str:
         """The command line that replays a session, quoted for the shell."""

@@ -8,8 +8,7 @@ from pydantic import ValidationError
 from errors import explained
 from rehearsal.commands.command_line import CommandError
 from rehearsal.planning.plan_file import Plan, PlanError, is_plan, read_plan
-from rehearsal.sessions.recorded_scene import scene_of_log
-from rehearsal.sessions.session_file import Header, Log, SessionError, read_log
+from rehearsal.sessions.session_file import Header, Log, SessionError, read_log, scene_of_log
 from rehearsal.tracking.pose_file import TimedPoses
 from rehearsal.tracking.track_file import check_near
 from scenes.anatomy import LoadedAnatomy, fingerprint

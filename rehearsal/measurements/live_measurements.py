@@ -9,7 +9,7 @@ from rehearsal.measurements.session_summary import SessionCourse
 from rehearsal.measurements.tumour_measurements import Measurement, measure
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.rehearsal import Rehearsal
-from rehearsal.sessions.packed_coverage import unpack_seen
+from rehearsal.sessions.packed_arrays import unpack_seen
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import Log, SessionError
 from render.viewer import Settings, View

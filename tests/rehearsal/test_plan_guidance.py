@@ -10,8 +10,7 @@ from conftest import rotation_about
 from plan_ball import SIZE, over_ball, plan_of, straight_pass, sweep_of
 
 from rehearsal.planning.plan_guidance import ABOVE_MM, AHEAD, DEG_PER_MM_OFF, NEAR_MM, PlanGuidance
-from rehearsal.sessions.session import Session
-from rehearsal.sessions.undo_history import MOST_UNDONE, History
+from rehearsal.sessions.session import MOST_UNDONE, History, Session
 from render import plan_lines, transducer_shape
 from render.actions import begin
 from render.keys import Keys

@@ -19,7 +19,7 @@ from rehearsal.inputs.user_input import UserInput
 from rehearsal.sessions.recorder import SessionRecorder
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session import Session
-from rehearsal.sessions.session_file import Recording, read_log
+from rehearsal.sessions.session_file import read_log
 from rehearsal.tracking.pose_file import PoseError, TimedPoses
 from rehearsal.tracking.track_file import check_near, load_track
 from rehearsal.tracking.tracked_probe import PosePlayback, TrackEnded, has_moved, pose_at_time
@@ -252,7 +252,7 @@ def recorded(path: Path) -> str:
     session = Session(Patient())
     played = PosePlayback(way(25, lost=(5, 6, 13)), session)
     live = UserInput(
-        session, AdaptiveIterations(1e6), SessionRecorder(session, Recording(path, header())), tracked=played
+        session, AdaptiveIterations(1e6), SessionRecorder(session, path, header()), tracked=played
     )
     for moment in range(60):
         step(live, ray=ray(2.0), undo=moment == 30, reset=moment == 40, press=moment > 52)

@@ -12,8 +12,7 @@ import trimesh
 from rehearsal.adaptive_iterations import AdaptiveIterations
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.rehearsal import RehearsalState
-from rehearsal.sessions.session import SETTLED, Session
-from rehearsal.sessions.undo_history import MOST_UNDONE, History
+from rehearsal.sessions.session import MOST_UNDONE, SETTLED, History, Session
 from render.viewer import Controls, Settings
 from scenes.tissue import NeoHookeanTissue
 from sim.body import BodyState
@@ -56,7 +55,7 @@ class Numbers:
 
     def restore(self, state: RehearsalState) -> None:
         self.position, self.velocity = state.solver.body.position, state.solver.body.velocity
-        self.contacts, self.watch = state.solver.contacts, state.watch
+        self.contacts, self.watch = state.solver.contacts, state.divergence
         self.pose, self.steps, self.manipulator.state = state.pose, state.steps, state.manipulator
 
     def advance(self, pose: np.ndarray) -> None:
