@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from time import time
 
@@ -35,7 +36,7 @@ from rehearsal.sessions.session_file import Log
 from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer
 from rehearsal.tracking.pose_file import TimedPoses
 from rehearsal.tracking.sweep_recording import SweepRecorder
-from rehearsal.tracking.tracked_probe import PosePlayback, PoseSource
+from rehearsal.tracking.tracked_probe import PoseSource, played_pose
 from render.gamepad import Gamepad, SdlPads
 from render.keys import Keys
 from render.viewer import Settings
@@ -152,7 +153,7 @@ class RehearsalRun:
         adaptive = AdaptiveIterations(budget_ms or self.budget_ms or 1000 * self._step_s)
         session = self._session()
         recorder = self._record(session, begins)
-        tracked = self.tracked if self.track is None else PosePlayback(self.track, session)
+        tracked = self.tracked if self.track is None else partial(played_pose, self.track, session)
         return UserInput(session, adaptive, recorder, begins is not None, tracked, self.notices)
 
     def _replay_input(self, replay: Replay) -> ReplayInput:

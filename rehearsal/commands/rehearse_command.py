@@ -177,7 +177,7 @@ def rehearse(
         click.echo(chosen)
     from rehearsal.run import RehearsalRun
 
-    tracked = server.received_pose if server is not None and link_leads else None
+    tracked = server.received_pose.pose if server is not None and link_leads else None
     named = None if scene == EMBEDDED else scene
     run = RehearsalRun(
         rehearsal, anatomy, used, out, budget_ms, tracked, track, keys, gamepad, server, plan, named

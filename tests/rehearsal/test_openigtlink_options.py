@@ -16,7 +16,7 @@ def linking(link: bool, link_host: str | None, link_leads: bool, link_port: int 
     server = open_link(link, link_host, link_port, link_leads)
     if server is not None:
         joined(server).close()
-        click.echo(f"on {server.server_address[0]}")
+        click.echo(f"on {server.host}")
 
 
 def free_port() -> int:

@@ -95,10 +95,14 @@ ODD[3] = [0, 0, 0, 2.0]
         ("sweeps.0.passes", [], "sweeps.0.passes: list should have at least 1 item"),
         ("sweeps.0.passes.0", [], "sweeps.0.passes.0: list should have at least 2 items"),
         ("sweeps.0.passes.0", [np.eye(4).tolist()], "sweeps.0.passes.0: list should have at least 2 items"),
-        ("sweeps.0.passes.0.1", np.diag([1.0, 1, 1.01, 1]).tolist(), "a pose is not rigid"),
-        ("sweeps.0.passes.0.1", SHEARED.tolist(), "a pose is not rigid"),
+        (
+            "sweeps.0.passes.0.1",
+            np.diag([1.0, 1, 1.01, 1]).tolist(),
+            "sweeps.0.passes.0.1: value error, not rigid",
+        ),
+        ("sweeps.0.passes.0.1", SHEARED.tolist(), "sweeps.0.passes.0.1: value error, not rigid"),
         ("sweeps.0.passes.0.1", np.diag([1.0, 1, -1, 1]).tolist(), "three right-handed unit axes"),
-        ("sweeps.0.passes.0.1", ODD.tolist(), "and 0 0 0 1 below"),
+        ("sweeps.0.passes.0.1", ODD.tolist(), "a last row of 0 0 0 1"),
         (
             "sweeps.0.passes.0.1",
             np.eye(3).tolist(),
