@@ -5,7 +5,6 @@ from functools import partial
 from pathlib import Path
 from time import perf_counter
 
-import click
 import numpy as np
 
 from rehearsal.caliper import Caliper
@@ -116,7 +115,7 @@ class WindowFrames(Frames):
         if controls.reset:
             self.caliper.points = ()
         self.notices.post(controls.message)
-        self.notices.post(self.plans.watch(controls))
+        self.plans.watch(controls)
         if self.frozen:
             self.cine.go(controls.cine)
         return None if self.frozen else super().input(controls)
@@ -158,9 +157,9 @@ class WindowFrames(Frames):
 
     def _record_sweep(self, probe: Probe, view: View, controls: Controls) -> None:
         if not self.frozen:
-            self.notices.post(self.sweeping.watch(self.source.session.time_s, view, probe))
+            self.sweeping.watch(self.source.session.time_s, view, probe)
         if controls.sweep:
-            self.notices.post(self.sweeping.toggle(self.out))
+            self.sweeping.toggle(self.out)
 
     @property
     def _shows_earlier(self) -> bool:
@@ -203,12 +202,8 @@ class WindowFrames(Frames):
 
     def _show_notices(self) -> None:
         """Show the notices of this frame in the panel and in the terminal."""
-        for notice in self.notices.take():
-            text = self.keys.worded(notice.text)
-            if notice.in_terminal:
-                click.echo(text)
-            if notice.on_screen:
-                self._notice, self._notice_until = text[0].upper() + text[1:], perf_counter() + NOTICE_S
+        for text in self.notices.present(self.keys.worded):
+            self._notice, self._notice_until = text[0].upper() + text[1:], perf_counter() + NOTICE_S
 
     def _save(self, controls: Controls, view: View) -> None:
         """Save what the user asked for."""

@@ -88,9 +88,7 @@ def run_headless(
         if pictures is not None:
             frames.send(view, probe)
             pictures.draw(step, view, settings, frames.measurements)
-        for notice in notices.take():
-            if notice.in_terminal:
-                click.echo(notice.text)
+        notices.present()
     save_surfaces(rehearsal, out)
     drawn = [pictures.save()] if pictures is not None else []
     report = tally.report(rehearsal, arch) | dict(reading=frames.measurements.figures())

@@ -1,31 +1,28 @@
 """Messages to the user: whoever has one posts it, and the frame, or the run without a window, presents it."""
 
-from collections import deque
-from dataclasses import dataclass
+from collections.abc import Callable
 
-
-@dataclass(frozen=True)
-class Notice:
-    """One message. ``{action}`` in its text stands for the key of that action."""
-
-    text: str
-    on_screen: bool
-    in_terminal: bool
+import click
 
 
 class Notices:
-    """A queue of messages, in the order in which they were posted."""
+    """A queue of messages, in the order in which they were posted. ``{action}`` in a text stands for the key of that action."""
 
     def __init__(self) -> None:
-        self._queue: deque[Notice] = deque()
+        self._queue: list[tuple[str, bool, bool]] = []
 
     def post(self, text: str, on_screen: bool = True, in_terminal: bool = True) -> None:
         """Add a message; an empty text adds none."""
         if text:
-            self._queue.append(Notice(text, on_screen, in_terminal))
+            self._queue.append((text, on_screen, in_terminal))
 
-    def take(self) -> list[Notice]:
-        """Return the messages since the last call, and empty the queue."""
-        taken = list(self._queue)
-        self._queue.clear()
-        return taken
+    def present(self, worded: Callable[[str], str] = str) -> list[str]:
+        """Print the messages for the terminal and return those for the screen, with the keys in words; empty the queue."""
+        queue, self._queue = self._queue, []
+        shown = []
+        for text, on_screen, in_terminal in queue:
+            if in_terminal:
+                click.echo(worded(text))
+            if on_screen:
+                shown.append(worded(text))
+        return shown

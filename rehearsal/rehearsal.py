@@ -53,7 +53,7 @@ class RehearsalState:
     """What changes: the tissue, the divergence check, the transducer's pose (4, 4), its manipulator."""
 
     solver: SolverState
-    watch: DivergenceState
+    divergence: DivergenceState
     pose: np.ndarray
     steps: int
     manipulator: ManipulatorState
@@ -219,7 +219,7 @@ class Rehearsal:
     def restore(self, state: RehearsalState) -> None:
         """Restore a state; the steps that follow give the same bits as before."""
         self.solver.restore(state.solver)
-        self.divergence_check.state = state.watch
+        self.divergence_check.state = state.divergence
         self.pose, self.steps, self.manipulator.state = state.pose, state.steps, state.manipulator
 
     def keep_good(self) -> None:

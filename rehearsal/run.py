@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from time import time
 
 import click
@@ -34,7 +35,7 @@ from rehearsal.sessions.session_file import Header, Log
 from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer
 from rehearsal.tracking.pose_file import TimedPoses
 from rehearsal.tracking.sweep_recording import SweepRecorder
-from rehearsal.tracking.tracked_probe import PosePlayback, PoseSource
+from rehearsal.tracking.tracked_probe import PoseSource, played_pose
 from render.gamepad import Gamepad, SdlPads
 from render.keys import Keys
 from render.viewer import Settings
@@ -90,8 +91,8 @@ class RehearsalRun:
             viewer=viewer,
             out=self.asked.out,
             notices=self.notices,
-            sweeping=SweepRecorder(self.rehearsal),
-            plans=PlanControl(self.rehearsal, self.anatomy, self.measurements, self.asked.out),
+            sweeping=SweepRecorder(self.rehearsal, self.notices),
+            plans=PlanControl(self.rehearsal, self.anatomy, self.measurements, self.asked.out, self.notices),
             keys=self.keys,
         )
         try:
@@ -100,7 +101,8 @@ class RehearsalRun:
         finally:
             viewer.close()
             frames.plans.stop()
-            _echo(frames.sweeping.end())
+            frames.sweeping.end()
+            self.notices.present(self.keys.worded)
 
     def headless(self, log: Log | None, build_s: float) -> None:
         """Run the scripted press, a log or recorded poses to their end. Raises CommandError, SessionError."""
@@ -151,9 +153,9 @@ class RehearsalRun:
         recorder = self._record(session, begins)
         tracked: PoseSource | None = None
         if self.track is not None:
-            tracked = PosePlayback(self.track, session)
+            tracked = partial(played_pose, self.track, session)
         elif self.link is not None and self.asked.link_leads:
-            tracked = self.link.received_pose
+            tracked = self.link.received_pose.pose
         return UserInput(session, adaptive, recorder, begins is not None, tracked, self.notices)
 
     def _replay_input(self, replay: Replay) -> ReplayInput:
@@ -199,9 +201,8 @@ class RehearsalRun:
         if self.recorder is not None:
             self.recorder.close(summary)
             scene = [] if self.asked.scene == EMBEDDED else [self.asked.scene]
-            again = shell_command("rehearse", *scene, "--replay", self.recorder.recording.path)
-            text = f"Recorded; replay it with: {again}"
-            click.echo(self.recorder.recording.fault or text)
+            again = shell_command("rehearse", *scene, "--replay", self.recorder.path)
+            click.echo(self.recorder.fault or f"Recorded; replay it with: {again}")
 
 
 def replay_warning(header: Header, arch: str) -> str:

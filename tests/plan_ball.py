@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 
 from rehearsal.planning.plan_file import Plan, PlannedSweep
-from rehearsal.planning.sweep_path import SweepLayout, layout_towards
+from rehearsal.planning.sweep_path import frame_towards
 from rehearsal.planning.sweep_score import ScoreTerms
 from scenes.scene import Trocar
 from ultrasound.probe import load_probe
@@ -43,8 +43,8 @@ def big_ball() -> trimesh.Trimesh:
     return trimesh.creation.icosphere(subdivisions=4, radius=R)
 
 
-def from_above() -> SweepLayout:
-    return layout_towards(np.zeros(3), Z, X)
+def from_above() -> np.ndarray:
+    return frame_towards(np.zeros(3), Z, X)
 
 
 def faces_in(poses: np.ndarray, length_mm: float = SIZE[2]) -> np.ndarray:

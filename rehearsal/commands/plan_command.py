@@ -59,7 +59,8 @@ def plan(asked: PlanOptions) -> None:
     port, scene_probe = trocar_of(loaded.trocar, asked), probe_of(loaded)
     make_place(out, "--out")
     from rehearsal.planning.plan_search import make_plan, total_work
-    from rehearsal.planning.trial_workers import PlanningProblem, TrialWorkers
+    from rehearsal.planning.sweep_trial import PlanningProblem
+    from rehearsal.planning.trial_workers import TrialWorkers
 
     target: Target = asked.target or ("organ" if anatomy.tumour is None else "margin")
     problem = PlanningProblem(loaded, anatomy, scene_probe, target, asked.margin_mm, port)
@@ -69,7 +70,7 @@ def plan(asked: PlanOptions) -> None:
         TrialWorkers(problem, asked.jobs) as workers,
         tqdm(total=total_work(asked.trials, asked.speed_mm_s), desc="plan", unit="trial") as bar,
     ):
-        made = make_plan(problem, workers, asked.speed_mm_s, asked.trials, bar.update)
+        made = make_plan(workers, asked.speed_mm_s, asked.trials, bar.update)
         bar.update(bar.total - bar.n)
     write_plan(made, out)
     click.echo("\n".join(made.why))

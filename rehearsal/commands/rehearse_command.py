@@ -13,8 +13,7 @@ from rehearsal.commands.command_line import CommandError, command, make_folder, 
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.configuration import Setup, probe_of, scene_of, with_quality
 from rehearsal.planning.plan_file import Plan, PlanError, is_plan, read_plan
-from rehearsal.sessions.recorded_scene import scene_of_log
-from rehearsal.sessions.session_file import Log, SessionError, read_log
+from rehearsal.sessions.session_file import Log, SessionError, read_log, scene_of_log
 from rehearsal.tracking.openigtlink_options import open_link
 from rehearsal.tracking.track_file import check_near, load_track
 from render.display import display_available

@@ -8,8 +8,7 @@ from rehearsal.adaptive_iterations import AdaptiveIterations
 from rehearsal.notices import Notices
 from rehearsal.sessions.recorder import SessionRecorder
 from rehearsal.sessions.replay import set_solver
-from rehearsal.sessions.session import Session
-from rehearsal.sessions.undo_history import History
+from rehearsal.sessions.session import History, Session
 from rehearsal.tracking.tracked_probe import PoseSource, TrackEnded, TrackingInput
 from render.viewer import Controls, TissueSettings
 

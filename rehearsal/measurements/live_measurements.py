@@ -9,7 +9,7 @@ from rehearsal.measurements.session_summary import SessionCourse
 from rehearsal.measurements.tumour_measurements import Measurement, measure
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.rehearsal import Rehearsal
-from rehearsal.sessions.packed_coverage import unpack_seen
+from rehearsal.sessions.packed_arrays import unpack_seen
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import Log, SessionError
 from render.viewer import Settings, View
@@ -171,7 +171,12 @@ class LiveMeasurements:
 
     def findings(self) -> dict[str, str]:
         """Name -> figure with its unit."""
-        return self._tissue_findings() | (self.guide.findings() if self.guide is not None else {})
+        found, plan = self._tissue_findings(), self.guide.figures() if self.guide is not None else {}
+        if plan:
+            off_mm, off_deg = plan["plan_off_mm"], plan["plan_off_deg"]
+            found["plan"] = f"{100 * (plan['plan_followed'] or 0.0):.0f} %"
+            found["off plan"] = "" if off_mm is None else f"{off_mm:.1f} mm {off_deg:.0f} deg"
+        return found
 
     def _tissue_findings(self) -> dict[str, str]:
         latest = self.latest

@@ -11,20 +11,24 @@ from ultrasound.coverage import Gap
 
 # A press begins above the first compression [mm] and ends below the second.
 PRESSED_MM, RELEASED_MM = 1.0, 0.5
+FIGURES = (
+    *("duration_s", "path_mm", "fastest_mm_s"),
+    *("compression_max_mm", "compression_warning_mm", "over_warning_s"),
+)
 
 
 @dataclass
 class SessionCourse:
-    """Accumulates the figures of a summary, step by step."""
+    """Accumulates the figures of a summary, under their names in it, step by step."""
 
-    warning_mm: float
+    compression_warning_mm: float
     step_s: float
     duration_s: float = 0.0
     path_mm: float = 0.0
-    presses: int = 0
-    compression_mm: float = 0.0
-    too_deep_s: float = 0.0
     fastest_mm_s: float = 0.0
+    compression_max_mm: float = 0.0
+    over_warning_s: float = 0.0
+    presses: int = 0
     went_back: int = 0
     _is_pressed: bool = field(default=False, init=False)
     _at: np.ndarray | None = field(default=None, init=False)
@@ -41,28 +45,18 @@ class SessionCourse:
             self.path_mm += path
             self.fastest_mm_s = max(self.fastest_mm_s, path / self.step_s)
         self._at = pose[:3, 3].copy()
-        self.compression_mm = max(self.compression_mm, compression_mm)
-        self.too_deep_s += self.step_s * (compression_mm > self.warning_mm)
+        self.compression_max_mm = max(self.compression_max_mm, compression_mm)
+        self.over_warning_s += self.step_s * (compression_mm > self.compression_warning_mm)
         if not self._is_pressed and compression_mm > PRESSED_MM:
             self.presses += 1
         self._is_pressed = compression_mm > (RELEASED_MM if self._is_pressed else PRESSED_MM)
 
     def summary(self, latest: dict[str, Any], gaps: Iterable[Gap], bookmarks: int) -> dict[str, Any]:
         """The summary; ``latest`` is the last measurement, ``gaps`` are the regions not imaged."""
-        figures = dict(
-            duration_s=self.duration_s,
-            path_mm=self.path_mm,
-            fastest_mm_s=self.fastest_mm_s,
-            compression_max_mm=self.compression_mm,
-            compression_warning_mm=self.warning_mm,
-            over_warning_s=self.too_deep_s,
-        )
-        counts = dict(presses=self.presses, went_back=self.went_back, bookmarks=bookmarks)
-        seen = {name: value for name, value in latest.items() if name.startswith("seen_")}
         return {
-            **{name: round(float(value), 3) for name, value in figures.items()},
-            **counts,
-            **seen,
+            **{name: round(float(getattr(self, name)), 3) for name in FIGURES},
+            **dict(presses=self.presses, went_back=self.went_back, bookmarks=bookmarks),
+            **{name: value for name, value in latest.items() if name.startswith("seen_")},
             "gaps": [
                 dict(volume_ml=round(gap.volume_ml, 3), thickness_mm=round(gap.thickness_mm, 2))
                 for gap in gaps

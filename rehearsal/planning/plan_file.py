@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from errors import UserError
 from rehearsal.result_files import next_number
-from rehearsal.tracking.pose_file import Pose, TimedPoses, is_rigid
+from rehearsal.tracking.pose_file import Pose, TimedPoses
 from scenes.atomic_files import atomic_write
 from scenes.scene import Trocar
 from ultrasound.target import Target
@@ -60,15 +60,6 @@ class PlannedSweep(_FileModel):
         if "seen" not in parts:
             raise ValueError("seen is missing: expected the fraction of the target that the sweep covers")
         return parts
-
-    @field_validator("passes")
-    @classmethod
-    def _check_rigid(cls, passes: list[list[Pose]]) -> list[list[Pose]]:
-        if not is_rigid(np.array([pose for each in passes for pose in each])):
-            raise ValueError(
-                "a pose is not rigid: expected three right-handed unit axes at right angles, and 0 0 0 1 below"
-            )
-        return passes
 
     @property
     def coverage(self) -> float:

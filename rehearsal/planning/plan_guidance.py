@@ -116,34 +116,15 @@ class PlanGuidance:
         cosine = (np.einsum("nij,ij->n", others[:, :3, :3], pose[:3, :3]) - 1) / 2
         return np.column_stack([away, np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))])
 
-    @property
-    def followed(self) -> float:
-        """The completed fraction of the sweep, 0 to 1."""
-        return self.next_pose / len(self._poses) if len(self._poses) else 0.0
-
-    def _mean_deviation(self) -> tuple[float, float] | None:
-        """The mean deviation over the completed poses (mm, degrees); None before the first."""
-        if self.next_pose == 0:
-            return None
-        off_mm, off_deg = self._progress.deviation[: self.next_pose].mean(axis=0)
-        return float(off_mm), float(off_deg)
-
     def figures(self) -> dict[str, float | None]:
-        """For the record; empty where no sweep is shown."""
+        """The completed fraction of the sweep, 0 to 1, and the mean deviation over the completed poses; empty where none is shown."""
         if not self._is_shown:
             return {}
-        off_mm, off_deg = self._mean_deviation() or (None, None)
-        return dict(plan_followed=self.followed, plan_off_mm=off_mm, plan_off_deg=off_deg)
-
-    def findings(self) -> dict[str, str]:
-        """For the window; empty where no sweep is shown."""
-        if not self._is_shown:
-            return {}
-        off = self._mean_deviation()
-        return {
-            "plan": f"{100 * self.followed:.0f} %",
-            "off plan": f"{off[0]:.1f} mm {off[1]:.0f} deg" if off else "",
-        }
+        followed = self.next_pose / len(self._poses) if len(self._poses) else 0.0
+        off_mm, off_deg = None, None
+        if self.next_pose > 0:
+            off_mm, off_deg = map(float, self._progress.deviation[: self.next_pose].mean(axis=0))
+        return dict(plan_followed=followed, plan_off_mm=off_mm, plan_off_deg=off_deg)
 
     def guidance(self) -> Guidance | None:
         """For the 3D view; None where no sweep is shown."""
@@ -156,10 +137,12 @@ class PlanGuidance:
         """A line for the terminal, with the coverage of the target that was reached; empty where no sweep is shown."""
         if not self._is_shown:
             return ""
-        sweep = self.plan.sweeps[self.number]
-        text = f"plan      {sweep.name}: {100 * self.followed:.0f} % completed"
-        if off := self._mean_deviation():
-            text += f", mean deviation {off[0]:.1f} mm and {off[1]:.0f} degrees"
+        sweep, figures = self.plan.sweeps[self.number], self.figures()
+        text = f"plan      {sweep.name}: {100 * (figures['plan_followed'] or 0.0):.0f} % completed"
+        if figures["plan_off_mm"] is not None:
+            text += (
+                f", mean deviation {figures['plan_off_mm']:.1f} mm and {figures['plan_off_deg']:.0f} degrees"
+            )
         if coverage is not None:
             text += f"; coverage of {self.plan.target} {100 * coverage:.0f} % (planned {100 * sweep.coverage:.0f} %)"
         return text

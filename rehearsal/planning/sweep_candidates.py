@@ -1,22 +1,11 @@
 """The kinds of sweep that a plan chooses from; each has a few parameters with ranges, which define a path over the organ."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
-from rehearsal.planning.instrument_reach import InstrumentReach
-from rehearsal.planning.sweep_path import (
-    FAR_MM,
-    SweepLayout,
-    SweepPath,
-    layout_towards,
-    pose_over,
-    sliding,
-    tilting,
-)
-from rehearsal.rehearsal import Rehearsal
-from ultrasound.coverage import Coverage
+from rehearsal.planning.sweep_path import FAR_MM, frame_towards, pose_over, sliding, tilting, turned
+from rehearsal.planning.sweep_trial import Trial
 from ultrasound.probe_manipulator import ProbeManipulator
 
 # Directions sampled around the organ; the smallest cosine of one to "above"; the smallest angle between two sides.
@@ -26,23 +15,18 @@ MOST_PASSES = 6
 DEFAULT_DEPTH_MM = 3.0
 
 
-class ParameterRange(NamedTuple):
-    """The range and the default of a candidate's parameter."""
-
-    low: float
-    high: float
-    start: float
-
-
 @dataclass(frozen=True)
 class SweepCandidate:
-    """``motion`` is "slide" or "tilt", ``count`` the number of passes, ``layout`` their frame before the parameters rotate it."""
+    """``motion`` is "slide" or "tilt", ``count`` the number of passes, ``frame`` (4, 4) theirs before the parameters rotate it.
+
+    ``ranges`` are the least, the greatest and the default value of each parameter.
+    """
 
     side: str
     motion: str
     count: int
-    layout: SweepLayout
-    ranges: dict[str, ParameterRange]
+    frame: np.ndarray
+    ranges: dict[str, tuple[float, float, float]]
 
     def name(self, count: int) -> str:
         """The name of its sweep with so many passes."""
@@ -52,87 +36,75 @@ class SweepCandidate:
 
     def start(self) -> np.ndarray:
         """The default parameters (n,), scaled to 0 to 1."""
-        return np.array([(r.start - r.low) / (r.high - r.low) for r in self.ranges.values()])
+        return np.array([(start - low) / (high - low) for low, high, start in self.ranges.values()])
 
     def values(self, scaled: np.ndarray) -> dict[str, float]:
         """Name -> value of parameters (n,) that are scaled to 0 to 1; others are clipped."""
-        clipped = np.clip(scaled, 0.0, 1.0)
-        pairs = zip(self.ranges.items(), clipped, strict=True)
-        return {name: float(r.low + share * (r.high - r.low)) for (name, r), share in pairs}
+        pairs = zip(self.ranges.items(), np.clip(scaled, 0.0, 1.0), strict=True)
+        return {name: float(low + share * (high - low)) for (name, (low, high, _)), share in pairs}
 
-    def path(self, manipulator: ProbeManipulator, values: dict[str, float]) -> SweepPath:
-        """The path that the parameters define."""
-        layout = self.layout.turned((values["lean_deg"], values["lean_aside_deg"]), values["heading_deg"])
+    def path(self, manipulator: ProbeManipulator, values: dict[str, float]) -> list[np.ndarray]:
+        """The passes that the parameters define."""
+        frame = turned(self.frame, (values["lean_deg"], values["lean_aside_deg"]), values["heading_deg"])
         rows = np.arange(self.count) - (self.count - 1) / 2
         aside = values["aside_mm"] + values.get("apart_mm", 0.0) * rows
         if self.motion == "slide":
             along = values["start_mm"], values["end_mm"]
-            return sliding(manipulator, layout, aside, *along, values["depth_mm"], values["follow"])
+            return sliding(manipulator, frame, aside, *along, values["depth_mm"], values["follow"])
         angles = values["first_deg"], values["last_deg"]
-        return tilting(manipulator, layout, aside, values["ahead_mm"], angles, values["depth_mm"])
+        return tilting(manipulator, frame, aside, values["ahead_mm"], angles, values["depth_mm"])
 
 
-def candidates_of(
-    rehearsal: Rehearsal, coverage: Coverage, target: str, reach: InstrumentReach
-) -> list[SweepCandidate]:
-    """Candidates that may cover a target: from above and from the side nearest to it, sliding and tilting."""
-    places = coverage.voxel_centres(target)
-    centre = places.mean(axis=0)
-    above = -np.array(rehearsal.press.direction)
-    lateral = np.array(rehearsal.press.lateral)
+def candidates_of(trial: Trial) -> list[SweepCandidate]:
+    """Candidates that may cover the target: from above and from the side nearest to it, sliding and tilting."""
+    above = -np.array(trial.rehearsal.press.direction)
     outwards = {"from above": above}
-    nearest = nearest_side(rehearsal.manipulator, centre, above, reach, lateral)
+    nearest = nearest_side(trial)
     if nearest is not None and nearest @ above < np.cos(np.radians(APART_DEG)):
         outwards["from the nearest side"] = nearest
     found = []
     for side, outward in outwards.items():
-        layout = layout_towards(centre, outward, lateral)
-        half = half_extent_mm(layout, places)
-        width = image_width_mm(rehearsal, layout)
-        count = passes_needed(half[0], width)
-        found.append(_sliding_candidate(side, count, layout, half, width))
+        frame, half, width, count = target_from(trial, outward)
+        kinds = [("slide", count)]
         if side == list(outwards)[-1]:
-            if count < MOST_PASSES:
-                found.append(_sliding_candidate(side, count + 1, layout, half, width))
-            found.append(_tilting_candidate(side, count, layout, half, width))
+            kinds += [("slide", count + 1), ("tilt", count)]
+        found += [
+            SweepCandidate(side, motion, passes, frame, _ranges(motion, passes, half, width))
+            for motion, passes in kinds
+            if passes <= MOST_PASSES
+        ]
     return found
 
 
-def half_extent_mm(layout: SweepLayout, places: np.ndarray) -> np.ndarray:
-    """The largest distance (2,) of places (n, 3) from a layout's centre, across and along the passes."""
-    return np.abs((places - layout.centre) @ np.column_stack([layout.lateral, layout.ahead])).max(axis=0)
+def target_from(trial: Trial, outward: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, int]:
+    """The target as seen from a direction (3,), for passes over it.
+
+    The frame (4, 4) at its centre, half of its extent (2,) across and along the passes, the width of the image at the centre with the
+    probe on the surface above it, and how many passes cover the extent.
+    """
+    frame = frame_towards(trial.places.mean(axis=0), outward, np.array(trial.rehearsal.press.lateral))
+    half = np.abs((trial.places - frame[:3, 3]) @ frame[:3, :2]).max(axis=0)
+    outward, centre = frame[:3, 2], frame[:3, 3]
+    top = trial.rehearsal.manipulator.ray_hit(centre + FAR_MM * outward, -outward)
+    depth = 0.0 if top is None else max(float((top - centre) @ outward), 0.0)
+    probe = trial.rehearsal.probe
+    width = float(probe.number_of_scanlines * probe.line_spacing_mm(np.array([depth]))[0])
+    return frame, half, width, int(np.clip(np.ceil(2 * half[0] / width), 1, MOST_PASSES))
 
 
-def image_width_mm(rehearsal: Rehearsal, layout: SweepLayout) -> float:
-    """The width of the image at a layout's centre, with the probe on the surface above it."""
-    top = rehearsal.manipulator.ray_hit(layout.centre + FAR_MM * layout.outward, -layout.outward)
-    depth = 0.0 if top is None else float((top - layout.centre) @ layout.outward)
-    probe = rehearsal.probe
-    return float(probe.number_of_scanlines * probe.line_spacing_mm(np.array([max(depth, 0.0)]))[0])
-
-
-def passes_needed(half_mm: float, width_mm: float) -> int:
-    """How many passes with images of a width cover a distance to either side."""
-    return int(np.clip(np.ceil(2 * half_mm / width_mm), 1, MOST_PASSES))
-
-
-def nearest_side(
-    manipulator: ProbeManipulator,
-    centre: np.ndarray,
-    above: np.ndarray,
-    reach: InstrumentReach,
-    lateral: np.ndarray,
-) -> np.ndarray | None:
-    """The direction (3,) from a place to the nearest surface where a probe can be placed; None where there is none."""
+def nearest_side(trial: Trial) -> np.ndarray | None:
+    """The direction (3,) from the target to the nearest surface where a probe can be placed; None where there is none."""
+    manipulator, press, centre = trial.rehearsal.manipulator, trial.rehearsal.press, trial.places.mean(axis=0)
     least, found = np.inf, None
     for outward in directions(DIRECTIONS):
         place = manipulator.ray_hit(centre + FAR_MM * outward, -outward)
-        if outward @ above < LEAST_COSINE or place is None:
+        if outward @ -np.array(press.direction) < LEAST_COSINE or place is None:
             continue
         distance = float((place - centre) @ outward)
         if distance < least:
-            pose = pose_over(manipulator, layout_towards(centre, outward, lateral), 0.0, 0.0, 0.0, 1.0)
-            if pose is not None and reach(pose[None])[0]:
+            frame = frame_towards(centre, outward, np.array(press.lateral))
+            pose = pose_over(manipulator, frame, 0.0, 0.0, 0.0, 1.0)
+            if pose is not None and trial.reach(pose[None])[0]:
                 least, found = distance, outward
     return found
 
@@ -145,41 +117,27 @@ def directions(count: int) -> np.ndarray:
     return np.column_stack([across * np.cos(angle), across * np.sin(angle), z])
 
 
-def _sliding_candidate(
-    side: str, count: int, layout: SweepLayout, half: np.ndarray, width: float
-) -> SweepCandidate:
-    """Parallel passes; the defaults are straight rows."""
-    far = half[1]
-    own = {
-        "start_mm": ParameterRange(-1.4 * far, 0.0, -far),
-        "end_mm": ParameterRange(0.0, 1.4 * far, far),
-        "follow": ParameterRange(0.0, 1.0, 0.0),
-        "depth_mm": ParameterRange(0.0, 6.0, DEFAULT_DEPTH_MM),
+def _ranges(motion: str, count: int, half: np.ndarray, width: float) -> dict[str, tuple[float, float, float]]:
+    """The ranges of a motion's parameters; the defaults of "slide" are straight rows."""
+    aside, ahead = half
+    ranges = {
+        "lean_deg": (-40.0, 40.0, 0.0),
+        "lean_aside_deg": (-40.0, 40.0, 0.0),
+        "heading_deg": (-90.0, 90.0, 0.0),
+        "aside_mm": (-aside, aside, 0.0),
     }
-    return SweepCandidate(side, "slide", count, layout, _ranges(own, half, count, width))
-
-
-def _tilting_candidate(
-    side: str, count: int, layout: SweepLayout, half: np.ndarray, width: float
-) -> SweepCandidate:
-    own = {
-        "ahead_mm": ParameterRange(-half[1], half[1], 0.0),
-        "first_deg": ParameterRange(-45.0, 0.0, -30.0),
-        "last_deg": ParameterRange(0.0, 45.0, 30.0),
-        "depth_mm": ParameterRange(0.0, 6.0, 1.5),
-    }
-    return SweepCandidate(side, "tilt", count, layout, _ranges(own, half, count, width))
-
-
-def _ranges(
-    own: dict[str, ParameterRange], half: np.ndarray, count: int, width: float
-) -> dict[str, ParameterRange]:
-    """A motion's own parameters between those that all candidates have, and the spacing of several passes."""
-    layout = {
-        "lean_deg": ParameterRange(-40.0, 40.0, 0.0),
-        "lean_aside_deg": ParameterRange(-40.0, 40.0, 0.0),
-        "heading_deg": ParameterRange(-90.0, 90.0, 0.0),
-        "aside_mm": ParameterRange(-half[0], half[0], 0.0),
-    }
-    spacing = {} if count == 1 else {"apart_mm": ParameterRange(0.4 * width, 1.1 * width, width)}
-    return layout | own | spacing
+    if motion == "slide":
+        ranges |= {
+            "start_mm": (-1.4 * ahead, 0.0, -ahead),
+            "end_mm": (0.0, 1.4 * ahead, ahead),
+            "follow": (0.0, 1.0, 0.0),
+            "depth_mm": (0.0, 6.0, DEFAULT_DEPTH_MM),
+        }
+    else:
+        ranges |= {
+            "ahead_mm": (-ahead, ahead, 0.0),
+            "first_deg": (-45.0, 0.0, -30.0),
+            "last_deg": (0.0, 45.0, 30.0),
+            "depth_mm": (0.0, 6.0, 1.5),
+        }
+    return ranges if count == 1 else ranges | {"apart_mm": (0.4 * width, 1.1 * width, width)}

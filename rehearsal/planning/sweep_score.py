@@ -6,53 +6,39 @@ import numpy as np
 
 from ultrasound.probe_manipulator import ProbeManipulator
 
-# Points per unit of each term: full coverage of the target gives 100, costs are subtracted.
-POINTS = {
-    "seen": 100.0,
-    "compression_mean_mm": -3.0,
-    "over_limit": -50.0,
-    "contact": 5.0,
-    "incidence_deg": -0.2,
-    "path_mm": -0.01,
+# For each term: the points per unit (full coverage of the target gives 100, costs are subtracted), the verb phrase, the factor from
+# the value to the one that is printed, and the format of that.
+WORDING = {
+    "seen": (100.0, "covers {} of the target", 100, "{:.0f} %"),
+    "compression_mean_mm": (-3.0, "compresses the tissue by {} on average", 1, "{:.1f} mm"),
+    "over_limit": (-50.0, "exceeds the compression limit at {} of its poses", 100, "{:.0f} %"),
+    "contact": (5.0, "has contact on {} of the array", 100, "{:.0f} %"),
+    "incidence_deg": (-0.2, "has a mean angle of incidence of {}", 1, "{:.0f} degrees"),
+    "path_mm": (-0.01, "has a path of {}", 1, "{:.0f} mm"),
 }
 # A sweep with unreachable poses scores less than any sweep without.
 UNREACHABLE = -300.0
-# The verb phrase for each term, and the format of its value.
-WORDING = {
-    "seen": ("covers {} of the target", "{:.0f} %"),
-    "compression_mean_mm": ("compresses the tissue by {} on average", "{:.1f} mm"),
-    "over_limit": ("exceeds the compression limit at {} of its poses", "{:.0f} %"),
-    "contact": ("has contact on {} of the array", "{:.0f} %"),
-    "incidence_deg": ("has a mean angle of incidence of {}", "{:.0f} degrees"),
-    "path_mm": ("has a path of {}", "{:.0f} mm"),
-}
-FRACTIONS = ("seen", "over_limit", "contact")
 
 
 @dataclass(frozen=True)
 class ScoreTerms:
-    """What a sweep achieves and costs, under the names of the plan file. Means are over its poses."""
+    """What a sweep achieves and costs, under the names of the plan file. Means are over its poses; all are 0 without poses."""
 
-    seen: float
+    seen: float = 0.0
     """Coverage: fraction of the target that was in the image plane under contact, 0 to 1."""
-    compression_mean_mm: float
-    compression_max_mm: float
-    over_limit: float
+    compression_mean_mm: float = 0.0
+    compression_max_mm: float = 0.0
+    over_limit: float = 0.0
     """Fraction of poses with more compression than the scene's warning, or with a state restored by the divergence check."""
-    contact: float
+    contact: float = 0.0
     """Fraction of the scanlines in contact."""
-    incidence_deg: float
+    incidence_deg: float = 0.0
     """Mean angle between the probe's axis and the normal of the settled surface."""
-    path_mm: float
+    path_mm: float = 0.0
     """Path length of the centre of the array face, including the moves between passes."""
-    time_s: float
-    reachable: float
+    time_s: float = 0.0
+    reachable: float = 0.0
     """Fraction of poses that an instrument through the trocar can hold."""
-
-    @classmethod
-    def zero(cls) -> "ScoreTerms":
-        """The terms of a sweep without poses."""
-        return cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def face_centres(manipulator: ProbeManipulator, poses: np.ndarray) -> np.ndarray:
@@ -74,7 +60,7 @@ def incidence_deg(manipulator: ProbeManipulator, poses: np.ndarray) -> float:
 
 def points(terms: ScoreTerms) -> dict[str, float]:
     """The points of each term, by name."""
-    found = {name: weight * getattr(terms, name) for name, weight in POINTS.items()}
+    found = {name: weight * getattr(terms, name) for name, (weight, *_) in WORDING.items()}
     if terms.reachable < 1.0:
         found["reachable"] = UNREACHABLE * (1.0 + (1.0 - terms.reachable))
     return found
@@ -87,7 +73,7 @@ def score(terms: ScoreTerms) -> float:
 
 def in_words(terms: ScoreTerms) -> str:
     """All terms in one clause that begins with "it"."""
-    *phrases, last = (_phrase(terms, name) for name in POINTS)
+    *phrases, last = (_phrase(terms, name) for name in WORDING)
     return f"it {', '.join(phrases)}, and {last}"
 
 
@@ -96,22 +82,18 @@ def why_better(winner: ScoreTerms, other: ScoreTerms) -> str:
     if other.reachable < 1.0 <= winner.reachable:
         return f"it is reachable at all poses, the other is not at {100 * (1 - other.reachable):.0f} %"
     a, b = points(winner), points(other)
-    gains = sorted(((a[name] - b[name], name) for name in POINTS), reverse=True)
-    most, name = gains[0]
-    text = f"it {_comparison(winner, other, name)} ({most:+.1f} points)"
-    least, name = gains[-1]
+    gains = sorted(((a[name] - b[name], name) for name in WORDING), reverse=True)
+    (most, best), (least, worst) = gains[0], gains[-1]
+    text = f"it {_phrase(winner, best)} instead of {_value(other, best)} ({most:+.1f} points)"
     if least < -0.05:
-        text += f", although it {_comparison(winner, other, name)} ({least:+.1f})"
+        text += f", although it {_phrase(winner, worst)} instead of {_value(other, worst)} ({least:+.1f})"
     return text
 
 
-def _comparison(winner: ScoreTerms, other: ScoreTerms, name: str) -> str:
-    return f"{_phrase(winner, name)} instead of {_value(other, name)}"
-
-
 def _phrase(terms: ScoreTerms, name: str) -> str:
-    return WORDING[name][0].format(_value(terms, name))
+    return WORDING[name][1].format(_value(terms, name))
 
 
 def _value(terms: ScoreTerms, name: str) -> str:
-    return WORDING[name][1].format(getattr(terms, name) * (100 if name in FRACTIONS else 1))
+    _, _, factor, unit = WORDING[name]
+    return unit.format(getattr(terms, name) * factor)

@@ -1,19 +1,24 @@
-"""A sweep tried on the deforming organ, without a screen: its score terms."""
+"""A trial of a sweep on the deforming organ, as the transducer would be driven: its score terms."""
 
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
 
-from rehearsal.planning.instrument_reach import InstrumentReach
-from rehearsal.planning.plan_file import DEG_PER_MM, LIFT_MM
-from rehearsal.planning.sweep_path import SweepPath
+from rehearsal.planning.instrument_reach import reachable
+from rehearsal.planning.plan_file import DEG_PER_MM, LIFT_MM, PlanError
 from rehearsal.planning.sweep_score import ScoreTerms, face_centres, incidence_deg
 from rehearsal.rehearsal import Rehearsal
+from scenes.anatomy import LoadedAnatomy
+from scenes.scene import Scene, Trocar
 from sim.fields import array_of
 from ultrasound.array_contact import measure_contact
-from ultrasound.coverage import GRID_POINTS, Coverage
+from ultrasound.coverage import GRID_POINTS, VOXEL_MM, Coverage
 from ultrasound.image_plane import PlaneInTissue
+from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import advanced, poses_between
+from ultrasound.target import Target
 
 # The most steps of a move between passes.
 MOST_STEPS = 240
@@ -21,49 +26,105 @@ MOST_STEPS = 240
 ROUNDED_STEPS = 1e-3
 
 
+@dataclass(frozen=True)
+class PlanningProblem:
+    """The target of a patient that a plan is to cover. Raises PlanError for a tumour target without a tumour."""
+
+    scene: Scene
+    anatomy: LoadedAnatomy
+    probe: Probe
+    target: Target
+    margin_mm: float
+    trocar: Trocar
+
+    def __post_init__(self) -> None:
+        if self.target != "organ" and self.anatomy.tumour is None:
+            raise PlanError(
+                f"--target {self.target}: this scene has no tumour; expected organ, or another scene"
+            )
+
+    @property
+    def without_images(self) -> "PlanningProblem":
+        """The same without CT, labels and parts, which no trial needs."""
+        return replace(self, anatomy=replace(self.anatomy, ct=None, labels=None, parts={}))
+
+
 class Trial:
-    """Tries paths in one rehearsal, each from the settled organ; ``target`` is one of ``Coverage.targets``."""
+    """Tries paths in one rehearsal, each from the settled organ; ``places`` (n, 3) are the target's voxels. Raises PlanError."""
 
-    def __init__(self, rehearsal: Rehearsal, coverage: Coverage, target: str, reach: InstrumentReach) -> None:
-        self.rehearsal, self.coverage, self.target, self.reach = rehearsal, coverage, target, reach
-        self.plane = PlaneInTissue(rehearsal.embedding, GRID_POINTS)
+    def __init__(self, problem: PlanningProblem) -> None:
+        self.rehearsal = Rehearsal(problem.scene, problem.anatomy, problem.probe)
+        self.target = problem.target
+        self.coverage = Coverage(self.rehearsal.organ, self.rehearsal.tumour, problem.margin_mm)
+        self.places = self.coverage.voxel_centres(self.target)
+        if len(self.places) == 0:
+            raise PlanError(
+                f"--target {self.target}: it is smaller than a voxel of {VOXEL_MM:g} mm; expected a larger one"
+            )
+        held, origin = self.rehearsal.manipulator, self.rehearsal.origin
+        self.reach = partial(reachable, problem.trocar, held, origin, self.places.mean(axis=0))
+        self.plane = PlaneInTissue(self.rehearsal.embedding, GRID_POINTS)
 
-    def run(self, path: SweepPath, speed_mm_s: float) -> ScoreTerms:
+    def run(self, passes: list[np.ndarray], speed_mm_s: float) -> ScoreTerms:
         """Follow a path at a speed on its passes; deterministic."""
-        self._restart()
-        self._speed_mm_s = speed_mm_s
-        for poses in path.passes:
-            self._approach(poses[0])
-            self._measure()
-            for start, end in pairwise(poses):
-                self._move(start, end)
-                self._measure()
-        return self._terms(path)
-
-    def _restart(self) -> None:
         self.rehearsal.reset()
         self.coverage.clear()
         self._compressions: list[float] = []
         self._contacts: list[float] = []
         self._restored: list[bool] = []
         self._was_restored = False
-        self._path_mm, self._steps_taken = 0.0, 0
+        self._path_mm, self._steps_taken, self._speed_mm_s = 0.0, 0, speed_mm_s
+        for poses in passes:
+            self._approach(poses[0])
+            self._measure()
+            for start, end in pairwise(poses):
+                self._move(start, end)
+                self._measure()
+        return self.terms(
+            passes,
+            self._compressions,
+            self._contacts,
+            np.array(self._restored),
+            seen=self.coverage.fraction(self.target),
+            path_mm=self._path_mm,
+            time_s=self._steps_taken * self.rehearsal.settings.time_step_s,
+        )
+
+    def terms(
+        self,
+        passes: list[np.ndarray],
+        compression_mm: list[float],
+        contact: list[float],
+        restored: np.ndarray | bool = False,
+        **others: float,
+    ) -> ScoreTerms:
+        """The terms of a path, from the compression and contact at each of its poses and whether a state was restored before it."""
+        if not passes:
+            return ScoreTerms()
+        compression, poses = np.array(compression_mm), np.concatenate(passes)
+        limit = self.rehearsal.scene.transducer.compression_warning_mm
+        return ScoreTerms(
+            compression_mean_mm=float(compression.mean()),
+            compression_max_mm=float(compression.max()),
+            over_limit=float(((compression > limit) | restored).mean()),
+            contact=float(np.mean(contact)),
+            incidence_deg=incidence_deg(self.rehearsal.manipulator, poses),
+            reachable=float(self.reach(poses).mean()),
+            **others,
+        )
 
     def _approach(self, pose: np.ndarray) -> None:
-        """Lift the probe, move it above a pose, and lower it there."""
+        """Lift the probe, move it above a pose as the probe manipulator does, around the organ, and lower it there."""
+        rehearsal = self.rehearsal
         if self._steps_taken == 0:
-            self.rehearsal.pose = advanced(pose, -LIFT_MM)
+            rehearsal.pose = advanced(pose, -LIFT_MM)
         else:
-            for goal in (advanced(self.rehearsal.pose, -LIFT_MM), advanced(pose, -LIFT_MM)):
-                self._go_around_organ(goal)
-        self._move(self.rehearsal.pose, pose)
-
-    def _go_around_organ(self, goal: np.ndarray) -> None:
-        """Move to a goal as the probe manipulator does."""
-        for _ in range(MOST_STEPS):
-            if np.allclose(self.rehearsal.pose, goal, atol=1e-6):
-                return
-            self._step(self.rehearsal.pose_towards(goal))
+            for goal in (advanced(rehearsal.pose, -LIFT_MM), advanced(pose, -LIFT_MM)):
+                for _ in range(MOST_STEPS):
+                    if np.allclose(rehearsal.pose, goal, atol=1e-6):
+                        break
+                    self._step(rehearsal.pose_towards(goal))
+        self._move(rehearsal.pose, pose)
 
     def _move(self, start: np.ndarray, end: np.ndarray) -> None:
         for pose in poses_between(start, end, self._steps(start, end))[1:]:
@@ -87,14 +148,13 @@ class Trial:
         return max(1, int(np.ceil(steps - ROUNDED_STEPS)))
 
     def _measure(self) -> None:
-        rehearsal = self.rehearsal
+        rehearsal, organ, probe = self.rehearsal, self.rehearsal.organ, self.rehearsal.probe
         rehearsal.embedding.update()
         self.plane.locate(rehearsal.image_plane())
         gap = rehearsal.scene.image.contact_gap_mm
-        touches = self.coverage.add(self.plane.rest_grid(GRID_POINTS), rehearsal.probe, gap)
+        touches = self.coverage.add(self.plane.rest_grid(GRID_POINTS), probe, gap)
         rehearsal.organ_skin.update()
         now = array_of(rehearsal.organ_skin.vertices).astype(float)
-        organ, probe = rehearsal.organ, rehearsal.probe
         pressed = measure_contact(
             rehearsal.pose, rehearsal.size_mm, probe.radius_mm, now, np.asarray(organ.vertices), organ.faces
         )
@@ -102,20 +162,3 @@ class Trial:
         self._contacts.append(float(touches.mean()))
         self._restored.append(self._was_restored)
         self._was_restored = False
-
-    def _terms(self, path: SweepPath) -> ScoreTerms:
-        if not self._compressions:
-            return ScoreTerms.zero()
-        compression = np.array(self._compressions)
-        limit = self.rehearsal.scene.transducer.compression_warning_mm
-        return ScoreTerms(
-            seen=self.coverage.fraction(self.target),
-            compression_mean_mm=float(compression.mean()),
-            compression_max_mm=float(compression.max()),
-            over_limit=float(((compression > limit) | self._restored).mean()),
-            contact=float(np.mean(self._contacts)),
-            incidence_deg=incidence_deg(self.rehearsal.manipulator, path.poses),
-            path_mm=self._path_mm,
-            time_s=self._steps_taken * self.rehearsal.settings.time_step_s,
-            reachable=float(self.reach(path.poses).mean()),
-        )

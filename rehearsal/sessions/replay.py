@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from rehearsal.rehearsal import Rehearsal, RehearsalState
-from rehearsal.sessions.packed_state import StateError, from_text
+from rehearsal.sessions.packed_arrays import StateError, unpack_state
 from rehearsal.sessions.session import SETTLED, Session
 from rehearsal.sessions.session_file import Log, SessionError
 
@@ -138,7 +138,7 @@ class Replay:
 
     def _state(self, text: str) -> RehearsalState:
         try:
-            return from_text(text, self.rehearsal.settled)
+            return unpack_state(text, self.rehearsal.settled)
         except StateError as error:
             raise SessionError(f"the session holds {error}: it is damaged, or of another body") from None
 

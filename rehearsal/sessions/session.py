@@ -1,18 +1,21 @@
-"""A rehearsal as a sequence of steps and rollbacks: the basis of undo, bookmarks and replay."""
+"""A rehearsal as a sequence of steps and rollbacks; undo, redo and bookmarks, which restore states of it."""
 
+from collections import deque
 from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
 
 from rehearsal.rehearsal import Rehearsal, RehearsalState
-from rehearsal.sessions.packed_coverage import SeenVoxels, pack_seen
-from rehearsal.sessions.packed_state import to_text
+from rehearsal.sessions.packed_arrays import SeenVoxels, pack_seen, pack_state
 from rehearsal.sessions.session_file import Kind
 from ultrasound.probe_manipulator import ManipulatorState
 
 # The index before the first step: tissue settled, transducer just touching.
 SETTLED = -1
+MOST_UNDONE = 40
+# Input that follows the last one sooner than this belongs to the same action; an action lasts no longer than that.
+PAUSE_S, LONGEST_S = 0.5, 5.0
 
 
 class Recorder(Protocol):
@@ -86,7 +89,7 @@ class Session:
         The tissue also becomes what the divergence check would restore, so that it is recorded once; a replay does the same.
         """
         self.rehearsal.keep_good()
-        self.note("state", to_text(self.rehearsal.snapshot()))
+        self.note("state", pack_state(self.rehearsal.snapshot()))
         coverage = self.packed_coverage()
         if coverage is not None:
             self.note("seen", coverage)
@@ -95,13 +98,91 @@ class Session:
         """The voxels imaged so far; None if nobody measures them."""
         return None if self._coverage is None else pack_seen(self._coverage())
 
-    def discard_states(self, is_needed: Callable[[int], bool]) -> None:
+    def discard_states_but(self, needed: set[int]) -> None:
         """Discard the kept states that are no longer needed."""
         self.kept_states = {
-            index: state for index, state in self.kept_states.items() if index == SETTLED or is_needed(index)
+            index: state for index, state in self.kept_states.items() if index in {SETTLED, *needed}
         }
 
     def _count(self, pose: np.ndarray | None) -> None:
         if self.recorder is not None:
             self.recorder.add_step(pose)
         self.step_index += 1
+
+
+class History:
+    """An action is what the user does without a pause: a press, a turn, a path over the organ. Undo restores the state before it."""
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self.undone: list[int] = []
+        self.bookmarks: list[int] = []
+        self._before: deque[int] = deque(maxlen=MOST_UNDONE)
+        self._began_s = self._acted_s = -LONGEST_S
+        self._at = 0
+        self._was_pressing = False
+
+    def watch(self, is_acting: bool, is_pressing: bool, manipulator: ManipulatorState | None = None) -> None:
+        """Note the user's input before its step; ``manipulator`` is the manipulator's state before this input."""
+        now, begins = self.session.time_s, is_pressing and not self._was_pressing
+        self._was_pressing = is_pressing
+        if not is_acting:
+            return
+        if begins or now - self._acted_s > PAUSE_S or now - self._began_s > LONGEST_S:
+            self._begin(manipulator)
+        self._acted_s = now
+
+    def _begin(self, manipulator: ManipulatorState | None = None) -> None:
+        self._began_s = self.session.time_s
+        self._at = 0
+        self._before.append(self.session.keep_state(manipulator))
+        self.undone.clear()
+        self._discard()
+
+    def undo(self) -> bool:
+        """Restore the state before the last action; return whether there was one."""
+        if not self._before:
+            return False
+        self.undone.append(self.session.keep_state())
+        self._restore(self._before.pop())
+        return True
+
+    def redo(self) -> bool:
+        """Revert the last undo; return whether there was one."""
+        if not self.undone:
+            return False
+        self._before.append(self.session.keep_state())
+        self._restore(self.undone.pop())
+        return True
+
+    def reset(self) -> None:
+        """Restore the settled tissue: an action that can be undone."""
+        self._begin()
+        self._restore(SETTLED)
+
+    def set_bookmark(self) -> int:
+        """Keep this state; return the number of bookmarks."""
+        # A replay can start here, however much later the bookmark is used.
+        self.session.record_state()
+        self.bookmarks.append(self.session.keep_state())
+        self._at = 0
+        self.session.note("bookmark", len(self.bookmarks))
+        return len(self.bookmarks)
+
+    def to_bookmark(self) -> int:
+        """Restore the last bookmark, or the one before it when called again; return its number, 0 if there is none."""
+        if not self.bookmarks:
+            return 0
+        at = (self._at - 1) % len(self.bookmarks)
+        self._begin()
+        self._at = at
+        self._restore(self.bookmarks[at])
+        return at + 1
+
+    def _restore(self, step_index: int) -> None:
+        self.session.roll_back(step_index)
+        self._acted_s = -LONGEST_S
+        self._discard()
+
+    def _discard(self) -> None:
+        self.session.discard_states_but({*self._before, *self.undone, *self.bookmarks})

@@ -4,11 +4,7 @@ The first line names what is rehearsed; each other line is a second: events, the
 it. Once a minute and at the end a line has the whole state and the coverage; the last line has the summary. No line names a patient or a path.
 """
 
-import base64
 import json
-import os
-import zlib
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,13 +14,13 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 from typing_extensions import TypedDict
 
 from errors import UserError
-from rehearsal.sessions.packed_coverage import Seen, SeenVoxels
+from rehearsal.sessions.packed_arrays import Seen, SeenVoxels, unpack_poses
+from scenes.scene import Scene
 
 FORMAT = 1
-# Of a pose, all but its last row.
-NUMBERS = 12
-MOST_SECOND = 1_000_000
-MOST_BYTES = 2_000_000_000
+MOST_FILE_BYTES = 2_000_000_000
+# The parts of a scene that belong to the patient's folder and may name files.
+PATIENTS: dict[str, Any] = {"anatomy": True, "shape": True, "title": True, "transducer": {"probe"}}
 
 
 class SessionError(UserError):
@@ -121,98 +117,11 @@ class Log:
         return len(self.poses) * self.header.time_step_s
 
 
-def pack(poses: list[np.ndarray | None]) -> str:
-    """Poses (4, 4), or None for a rollback, with all of their bits."""
-    rows = np.full((len(poses), NUMBERS), np.nan)
-    for row, pose in zip(rows, poses, strict=True):
-        if pose is not None:
-            row[:] = np.asarray(pose, float)[:3].ravel()
-    return base64.b64encode(zlib.compress(rows.astype("<f8").tobytes())).decode("ascii")
-
-
-def unpack(text: str) -> np.ndarray:
-    """Poses (n, 4, 4). Raises ValueError or zlib.error."""
-    unzip = zlib.decompressobj()
-    raw = unzip.decompress(base64.b64decode(text, validate=True), MOST_SECOND * NUMBERS * 8)
-    rows = np.frombuffer(raw, "<f8").reshape(-1, NUMBERS)
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3] = rows.reshape(-1, 3, 4)
-    if np.isinf(poses).any():
-        raise ValueError("a pose that is not finite")
-    return poses
-
-
-class Recording:
-    """A session's file as it grows; a thread writes its lines, so that the rehearsal does not wait for the disk.
-
-    Raises OSError if the file cannot be created; a later error is in ``fault``, and the rehearsal continues.
-    """
-
-    def __init__(self, path: Path, header: Header) -> None:
-        self.path = path
-        self.fault = ""
-        self._at = 0
-        self._poses: list[np.ndarray | None] = []
-        self._events: list[Event] = []
-        self._file = path.open("x", encoding="utf-8")
-        self._disk = ThreadPoolExecutor(1, "session")
-        self._write(header)
-
-    @property
-    def pending_steps(self) -> int:
-        """Number of steps since the last line."""
-        return len(self._poses)
-
-    def note(self, kind: Kind, value: Any) -> None:
-        """Note something about the coming step."""
-        self._events.append(Event(at=self._at + len(self._poses), kind=kind, value=value))
-
-    def add_step(self, pose: np.ndarray | None) -> None:
-        """Add a step by its pose (4, 4), or a rollback by None."""
-        self._poses.append(pose)
-
-    def write_second(self, digest: str) -> None:
-        """Write the steps since the last line, with the tissue's present digest."""
-        if not self._poses:
-            return
-        self._write(Second(at=self._at, poses=pack(self._poses), events=self._events, digest=digest))
-        self._at += len(self._poses)
-        self._poses, self._events = [], []
-
-    def close(self, summary: dict[str, Any], state: str, seen: SeenVoxels | None = None) -> None:
-        """Write the end, and wait for the disk."""
-        self._write(End(summary=summary, state=state, seen=seen))
-        self._disk.shutdown()
-        try:
-            self._file.close()
-        except OSError as error:
-            # What a full disk did not take is tried once more.
-            self._fail(error)
-
-    def _write(self, line: BaseModel) -> None:
-        self._disk.submit(self._put, line)
-
-    def _put(self, line: BaseModel) -> None:
-        """On the disk's own thread; after a fault nothing more, or a line would be missing in between."""
-        if self.fault:
-            return
-        try:
-            self._file.write(line.model_dump_json(exclude_none=True) + "\n")
-            self._file.flush()
-            os.fsync(self._file.fileno())
-        except (OSError, ValueError) as error:
-            self._fail(error)
-
-    def _fail(self, error: OSError | ValueError) -> None:
-        if not self.fault:
-            self.fault = f"{self.path.name}: no longer written ({getattr(error, 'strerror', None) or error})"
-
-
 def read_log(path: Path) -> Log:
     """Read a session's file, without a last line that a crash cut off. Raises SessionError."""
     name = path.name
     try:
-        if path.stat().st_size > MOST_BYTES:
+        if path.stat().st_size > MOST_FILE_BYTES:
             raise SessionError(
                 f"{name}: is larger than any session; expected a file that rehearse has written"
             )
@@ -234,8 +143,22 @@ def read_log(path: Path) -> Log:
             if second.seen is not None:
                 log.seen[steps] = second.seen
             break
-        parts.append(_poses_of(name, number, second, steps))
-        _sort_events(second, len(parts[-1]), log)
+        try:
+            poses = unpack_poses(second.poses)
+        except ValueError:
+            poses = np.zeros((0, 4, 4))
+        if second.at != steps or len(poses) == 0:
+            raise SessionError(
+                f"{name}: line {number} does not follow the line before it: one is missing or damaged"
+            )
+        parts.append(poses)
+        for event in second.events:
+            if event.kind == "state":
+                log.states[event.at] = event.value
+            elif event.kind == "seen":
+                log.seen[event.at] = event.value
+            log.events.setdefault(event.at, []).append(event)
+        log.digests[steps + len(poses)] = second.digest
     log.poses = np.concatenate([log.poses, *parts])
     return log
 
@@ -260,35 +183,26 @@ def _line_of(name: str, number: int, line: bytes) -> Second | End:
         values = json.loads(line)
         return End.model_validate(values) if "summary" in values else Second.model_validate(values)
     except (ValueError, TypeError, RecursionError) as error:
-        what = _what(error) if isinstance(error, ValidationError) else str(error)
+        what = str(error)
+        if isinstance(error, ValidationError):
+            first = error.errors()[0]
+            what = str(first.get("ctx", {}).get("error", first["msg"]))
         raise SessionError(
             f"{name}: line {number} is damaged ({what}); what comes before it can be had by deleting from it on"
         ) from None
 
 
-def _what(error: ValidationError) -> str:
-    """What was first found wrong."""
-    first = error.errors()[0]
-    return str(first.get("ctx", {}).get("error", first["msg"]))
+def recorded_values(scene: Scene) -> dict[str, Any]:
+    """The part of a scene that a session records."""
+    return scene.model_dump(mode="json", exclude=PATIENTS)
 
 
-def _poses_of(name: str, number: int, second: Second, expected: int) -> np.ndarray:
-    try:
-        poses = unpack(second.poses)
-    except (ValueError, zlib.error):
-        poses = np.zeros((0, 4, 4))
-    if second.at != expected or len(poses) == 0:
-        raise SessionError(
-            f"{name}: line {number} does not follow the line before it: one is missing or damaged"
-        )
-    return poses
-
-
-def _sort_events(second: Second, count: int, log: Log) -> None:
-    for event in second.events:
-        if event.kind == "state":
-            log.states[event.at] = event.value
-        elif event.kind == "seen":
-            log.seen[event.at] = event.value
-        log.events.setdefault(event.at, []).append(event)
-    log.digests[second.at + count] = second.digest
+def scene_of_log(header: Header, scene: Scene) -> Scene:
+    """The patient of a scene, with all other settings as recorded. Raises ValidationError."""
+    values = scene.model_dump(mode="json", exclude_unset=True)
+    recorded = {name: section for name, section in header.scene.items() if PATIENTS.get(name) is not True}
+    if "transducer" in recorded:
+        kept = {key: value for key, value in recorded["transducer"].items() if key != "probe"}
+        own = values.get("transducer", {}).get("probe")
+        recorded["transducer"] = kept | ({"probe": own} if own else {})
+    return Scene.model_validate(values | recorded)

@@ -37,7 +37,7 @@ def open_link(asked: LinkOptions) -> "OpenIGTLinkServer | None":
     host, port = asked.link_host or HOST, asked.link_port or PORT
     try:
         server = OpenIGTLinkServer(host, port, click.echo)
-    except (OSError, TypeError) as error:  # TypeError: a text that cannot be a host name
+    except (OSError, UnicodeError) as error:  # UnicodeError: a text that cannot be a host name
         reason = getattr(error, "strerror", None) or "not a host name"
         raise CommandError(
             f"--link: {host} port {port} cannot be opened ({reason}); end the program that uses it, or choose another --link-host or "

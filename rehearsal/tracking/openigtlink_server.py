@@ -1,144 +1,208 @@
-"""An OpenIGTLink server, with pyigtl's messages and its own sockets.
+"""An OpenIGTLink server: the live image and the probe's pose out, a tracked pose in, with the names of PLUS and 3D Slicer.
 
-pyigtl's own server serves one client at a time, prints a traceback when it leaves, cannot be ended after half a header, takes
-over the signals of the process, and listens on the first network card or on none.
+A transform is named by its two coordinate systems, such as ``ImageToProbe``. Image is in pixels (column, row, 0), the others in mm.
+Reference is the patient: RAS in messages, as Slicer's world is, and LPS in the program.
+
+The messages are pyigtl's, the sockets asyncio's: pyigtl's own server serves one client at a time, prints a traceback when it leaves,
+cannot be ended after half a header, takes over the signals of the process, and listens on the first network card or on none.
 """
 
-import os
-import socket
+import asyncio
 from collections.abc import Callable
 from contextlib import suppress
 from ipaddress import ip_address
-from socketserver import BaseRequestHandler, ThreadingTCPServer
-from threading import Condition, Thread
+from threading import Thread
+from time import monotonic
+
+import numpy as np
+from pyigtl import ImageMessage, TransformMessage
+from pyigtl.messages import MessageBase
+from scipy.linalg import polar
 
 from rehearsal.coordinates import probe_in_patient
 from rehearsal.rehearsal import Rehearsal
-from rehearsal.tracking.openigtlink_messages import (
-    LiveImage,
-    MessageError,
-    ReceivedPose,
-    packed,
-    read_message,
-)
+from rehearsal.tracking.pose_file import is_rigid
 from render.viewer import View
 from ultrasound.probe import Probe
 
-POLL_S = 0.05
+# PLUS names an image by its own coordinate system and the one of its pose. Names have at most 20 letters.
+IMAGE, IMAGE_TO_PROBE, PROBE = "Image_Reference", "ImageToProbe", "ProbeToReference"
+# Its own inverse.
+RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+HEADER_VERSIONS = (1, 2)
+# A transform is 48 bytes, plus metadata.
+TRANSFORM_BYTES, CHUNK_BYTES = 1 << 16, 1 << 16
+# Not ProbeToReference: that is sent out, and a client with both could not tell them apart.
+HAND_TO_REFERENCE = "HandToReference"
+STALE_S = 1.0
+FARTHEST_MM = 10_000.0
 
 
-class OpenIGTLinkServer(ThreadingTCPServer):
+class MessageError(ValueError):
+    """Bytes that are not an OpenIGTLink message."""
+
+
+class ReceivedPose:
+    """The newest pose that a client sent as HandToReference. One thread may write while another reads."""
+
+    def __init__(self, message: Callable[[str], None], clock: Callable[[], float] = monotonic) -> None:
+        self._message, self._clock = message, clock
+        self._newest: tuple[np.ndarray, float] | None = None
+        self._has_refused = False
+
+    def pose(self) -> np.ndarray | None:
+        """The probe in the patient (4, 4) [mm, LPS], in PLUS's axes.
+
+        None before the first, ``STALE_S`` after the last, and after one that was not rigid.
+        """
+        newest = self._newest
+        return None if newest is None or self._clock() - newest[1] > STALE_S else newest[0]
+
+    def take(self, matrix: np.ndarray) -> None:
+        """Take a transform's matrix (4, 4) [mm, RAS]."""
+        if is_rigid(matrix) and np.abs(matrix[:3, 3]).max() <= FARTHEST_MM:
+            pose = RAS_FROM_LPS @ matrix
+            # The nearest orthonormal axes: later code inverts the pose by its transpose.
+            pose[:3, :3] = polar(pose[:3, :3])[0]
+            self._newest = pose, self._clock()
+            return
+        self._newest = None
+        if not self._has_refused:
+            self._has_refused = True
+            self._message(
+                f"Warning: {HAND_TO_REFERENCE} of the link is not a rigid transform within {FARTHEST_MM / 1000:.0f} m: it is ignored; "
+                "send a rotation and a translation in mm"
+            )
+
+
+class OpenIGTLinkServer:
     """Sends the newest image to each client; ``received_pose`` is the pose that clients send.
 
-    Each client has two threads, which pack, send and read; a slow one skips images. Listens from the start, on a free port where
-    ``port`` is 0; raises OSError where it cannot. As a context manager it closes at the end.
+    One thread packs, sends and reads; a slow client skips images. Listens from the start, on a free port where ``port`` is 0; raises
+    OSError where it cannot, UnicodeError for a text that cannot be a host's name. As a context manager it closes at the end.
     """
 
-    daemon_threads = True
-    # On Windows it would let two programs share a port.
-    allow_reuse_address = os.name == "posix"
-
     def __init__(self, host: str, port: int, message: Callable[[str], None]) -> None:
-        super().__init__((host, port), _Client)
         self.received_pose = ReceivedPose(message)
         self._message, self._has_refused = message, False
-        self._changed = Condition()
-        self._newest: LiveImage | None = None
-        self._clients: set[_Client] = set()
-        self._is_open = True
-        Thread(target=self.serve_forever, args=(POLL_S,), daemon=True).start()
-
-    @property
-    def port(self) -> int:
-        """The port on which it listens."""
-        return int(self.server_address[1])
+        self._newest: tuple[MessageBase, ...] = ()
+        self._loop = asyncio.new_event_loop()
+        # Set when there is a newer image, and replaced by one for the next.
+        self._has_newer = asyncio.Event()
+        try:
+            self._server = self._loop.run_until_complete(asyncio.start_server(self._serve, host, port))
+        except (OSError, UnicodeError):
+            self._loop.close()
+            raise
+        self._thread = Thread(target=self._loop.run_forever, daemon=True)
+        self._thread.start()
+        self.host, self.port = self._server.sockets[0].getsockname()[:2]
 
     @property
     def is_private(self) -> bool:
         """Whether only programs on this machine can connect."""
-        return ip_address(str(self.server_address[0])).is_loopback
+        return ip_address(self.host).is_loopback
 
-    def send(self, live: LiveImage) -> None:
-        """Send an image to all clients. Its arrays must not change any more."""
-        with self._changed:
-            self._newest = live
-            self._changed.notify_all()
+    def send(
+        self, grey: np.ndarray, image_to_probe: np.ndarray, probe_in_patient: np.ndarray, time_s: float
+    ) -> None:
+        """Send an image and its pose to all clients; the arrays must not change any more.
 
-    def close(self) -> None:
-        """Free the port and disconnect all clients."""
-        self.shutdown()
-        self.server_close()
-        with self._changed:
-            self._is_open = False
-            clients = list(self._clients)
-        for client in clients:
-            client.disconnect()
+        ``grey`` is uint8 (rows, columns) in orientation MF; ``image_to_probe`` and ``probe_in_patient`` are (4, 4) [mm, LPS], in PLUS's
+        axes of the probe. ``time_s`` is the rehearsal's time.
+        """
+        probe = RAS_FROM_LPS @ probe_in_patient
+        messages = (
+            TransformMessage(probe, device_name=PROBE, timestamp=time_s),
+            TransformMessage(image_to_probe, device_name=IMAGE_TO_PROBE, timestamp=time_s),
+            # pyigtl takes (slices, rows, columns); of an image without slices it sends the size reversed.
+            ImageMessage(grey[None], probe @ image_to_probe, "ras", device_name=IMAGE, timestamp=time_s),
+        )
+        self._loop.call_soon_threadsafe(self._publish, messages)
+
+    def __enter__(self) -> "OpenIGTLinkServer":
+        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def add(self, client: "_Client") -> None:
-        """A client has connected."""
-        with self._changed:
-            client.is_connected = self._is_open
-            self._clients.add(client)
+    def close(self) -> None:
+        """Free the port and disconnect all clients."""
+        asyncio.run_coroutine_threadsafe(self._shut(), self._loop).result()
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
 
-    def remove(self, client: "_Client") -> None:
-        """A client has disconnected."""
-        with self._changed:
-            client.is_connected = False
-            self._clients.discard(client)
-            self._changed.notify_all()
+    async def _shut(self) -> None:
+        self._server.close()
+        clients = asyncio.all_tasks() - {asyncio.current_task()}
+        for client in clients:
+            client.cancel()
+        await asyncio.gather(*clients, return_exceptions=True)
 
-    def wait_for_newer(self, client: "_Client", than: LiveImage | None) -> LiveImage | None:
-        """Wait for an image other than the last that a client got; None once it has disconnected."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._newest is not than or not client.is_connected)
-            return self._newest if client.is_connected else None
+    def _publish(self, messages: tuple[MessageBase, ...]) -> None:
+        self._newest = messages
+        self._has_newer.set()
+        self._has_newer = asyncio.Event()
 
-    def refuse(self, error: MessageError) -> None:
-        """Report, once, that a client was disconnected."""
-        if not self._has_refused:
-            self._has_refused = True
-            self._message(
-                f"Warning: a client of the link was disconnected: it sent no OpenIGTLink message: {error}"
-            )
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """One client, until it leaves or sends what is no message."""
+        both = [asyncio.create_task(each) for each in (self._send_to(writer), self._read_from(reader))]
+        try:
+            await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for each in both:
+                each.cancel()
+            writer.transport.abort()
 
-
-class _Client(BaseRequestHandler):
-    """One client: this thread sends, another one reads."""
-
-    server: OpenIGTLinkServer
-    is_connected = False
-
-    def setup(self) -> None:
-        # A client that has left already is noticed when something is sent.
+    async def _send_to(self, writer: asyncio.StreamWriter) -> None:
+        sent: tuple[MessageBase, ...] = ()
         with suppress(OSError):
-            self.request.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.server.add(self)
-        Thread(target=self._read, daemon=True).start()
+            while True:
+                has_newer = self._has_newer
+                if sent is self._newest:
+                    await has_newer.wait()
+                sent = self._newest
+                writer.write(b"".join(message.pack() for message in sent))
+                await writer.drain()
 
-    def handle(self) -> None:
-        live = None
-        with suppress(OSError):
-            while (live := self.server.wait_for_newer(self, live)) is not None:
-                self.request.sendall(packed(live))
-        self.disconnect()
-
-    def _read(self) -> None:
-        with suppress(OSError, EOFError), self.request.makefile("rb") as stream:
+    async def _read_from(self, reader: asyncio.StreamReader) -> None:
+        with suppress(OSError, EOFError):
             try:
                 while True:
-                    self.server.received_pose.take(*read_message(stream))
+                    await self._read_message(reader)
             except MessageError as error:
-                self.server.refuse(error)
-        self.disconnect()
+                if not self._has_refused:
+                    self._has_refused = True
+                    self._message(
+                        f"Warning: a client of the link was disconnected: it sent no OpenIGTLink message: {error}"
+                    )
 
-    def disconnect(self) -> None:
-        """End both threads, whatever they wait for."""
-        self.server.remove(self)
-        with suppress(OSError):
-            self.request.shutdown(socket.SHUT_RDWR)
+    async def _read_message(self, reader: asyncio.StreamReader) -> None:
+        """Take the next message; all but transforms are skipped. Raises MessageError, EOFError, OSError."""
+        header = await reader.readexactly(MessageBase.IGTL_HEADER_SIZE)
+        try:
+            fields = MessageBase.parse_header(header)
+        except UnicodeDecodeError as error:
+            raise MessageError("a name that is not text") from error
+        size = fields["body_size"]
+        if fields["header_version"] not in HEADER_VERSIONS:
+            raise MessageError(
+                f"header version {fields['header_version']}: expected one of {HEADER_VERSIONS}"
+            )
+        if fields["message_type"] != "TRANSFORM":
+            while size > 0:
+                size -= len(await reader.readexactly(min(size, CHUNK_BYTES)))
+            return
+        if size > TRANSFORM_BYTES:
+            raise MessageError(f"a transform of {size} bytes: expected at most {TRANSFORM_BYTES}")
+        body, message = await reader.readexactly(size), TransformMessage()
+        try:
+            message.unpack(fields, body)
+        except Exception as error:  # pyigtl's readers raise whatever their parsers do
+            raise MessageError("a transform that cannot be read") from error
+        if fields["device_name"] == HAND_TO_REFERENCE:
+            self.received_pose.take(message.matrix)
 
 
 def send_live(
@@ -147,4 +211,4 @@ def send_live(
     """Send the first image of a view, if there is a link."""
     if link is not None:
         grey = next(iter(view.pictures.values()))
-        link.send(LiveImage(grey, probe.image_to_probe(*grey.shape), probe_in_patient(rehearsal), time_s))
+        link.send(grey, probe.image_to_probe(*grey.shape), probe_in_patient(rehearsal), time_s)

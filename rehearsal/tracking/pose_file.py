@@ -3,24 +3,53 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from errors import UserError
+from ultrasound.probe_manipulator import interpolated
 
 # Tolerance of orthonormal axes: more than the rounding of six digits in a file or of a float32, less than a scaled matrix.
 RIGID = 1e-3
 EXPECTED = "expected poses as JSON or CSV"
+SIXTEEN = "sixteen, row by row, or before them the time in s"
 
 
 class PoseError(UserError):
     """Poses that cannot be used; the message is one line."""
 
 
+def is_rigid(pose: np.ndarray) -> bool:
+    """Whether a matrix (4, 4) is a finite rotation without mirroring, with a translation."""
+    axes, last = pose[:3, :3], pose[3]
+    is_right_handed = _axes_error(axes) <= RIGID and np.linalg.det(axes) > 0
+    return bool(np.isfinite(pose).all() and is_right_handed and np.allclose(last, [0, 0, 0, 1]))
+
+
+def check_rigid(pose: np.ndarray) -> None:
+    """Raises PoseError unless a matrix (4, 4) is a rigid pose."""
+    if not is_rigid(pose):
+        axes = pose[:3, :3]
+        raise PoseError(
+            "not rigid: expected three right-handed unit axes at right angles (found an error of "
+            f"{_axes_error(axes):.2g}, determinant {np.linalg.det(axes):.3g}) and a last row of 0 0 0 1"
+        )
+
+
+def _axes_error(axes: np.ndarray) -> float:
+    """The largest deviation of the axes' products from orthonormal."""
+    return float(np.abs(axes.T @ axes - np.eye(3)).max())
+
+
+def _rigid(rows: list[list[float]]) -> list[list[float]]:
+    check_rigid(np.array(rows))
+    return rows
+
+
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
-Pose = Annotated[list[Row], Field(min_length=4, max_length=4)]
+Pose = Annotated[list[Row], Field(min_length=4, max_length=4), AfterValidator(_rigid)]
 
 
 class _FilePose(BaseModel):
@@ -29,12 +58,6 @@ class _FilePose(BaseModel):
     name: str = Field("", max_length=40, pattern=r"^[A-Za-z0-9_-]*$")
     time_s: float | None = None
     probe_to_patient: Pose
-
-
-class _ReadPose(NamedTuple):
-    name: str
-    time_s: float | None
-    pose: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -57,6 +80,20 @@ class TimedPoses:
     def length_s(self) -> float:
         return float(self.times_s[-1] - self.times_s[0])
 
+    def at(self, time_s: float) -> np.ndarray | None:
+        """The pose (4, 4) at a time after the first, interpolated between two; None where one of the two was not tracked."""
+        times, last = self.times_s - self.times_s[0], len(self.times_s) - 1
+        after = min(int(np.searchsorted(times, time_s)), last)
+        end = self.poses[after]
+        if after == 0 or time_s >= times[after]:
+            return end
+        start = self.poses[after - 1]
+        if start is None or end is None:
+            return None
+        return interpolated(
+            start, end, float((time_s - times[after - 1]) / (times[after] - times[after - 1]))
+        )
+
 
 def load_poses(path: Path) -> dict[str, np.ndarray]:
     """Name -> pose (4, 4), probe to patient (LPS, mm), from a JSON or CSV file. Raises PoseError.
@@ -71,7 +108,7 @@ def load_poses(path: Path) -> dict[str, np.ndarray]:
             raise PoseError(
                 f"{path}: pose {number}: the name {placed.name!r} occurs twice; expected different names"
             )
-        poses[placed.name or f"{number:04d}"] = placed.pose
+        poses[placed.name or f"{number:04d}"] = np.array(placed.probe_to_patient)
     return poses
 
 
@@ -84,87 +121,50 @@ def load_timed_poses(path: Path) -> TimedPoses:
                 f"{path}: pose {number} has no time; expected time_s in JSON, or in CSV seconds and sixteen numbers per line"
             )
     try:
-        return TimedPoses(np.array([each.time_s for each in placed]), [each.pose for each in placed])
+        return TimedPoses(
+            np.array([each.time_s for each in placed]), [np.array(each.probe_to_patient) for each in placed]
+        )
     except PoseError as error:
         raise PoseError(f"{path}: {error}") from None
 
 
-def _read(path: Path) -> list[_ReadPose]:
+def _read(path: Path) -> list[_FilePose]:
     try:
         text = path.read_text("utf-8")
+        if not text.strip():
+            raise PoseError(f"{path}: is empty; expected a list of poses")
+        values = _of_csv(path, text) if path.suffix.lower() == ".csv" else json.loads(text)
+        found = TypeAdapter(list[_FilePose]).validate_python(values)
     except FileNotFoundError:
         raise PoseError(f"{path}: no such pose file") from None
     except UnicodeDecodeError:
         raise PoseError(f"{path}: is not text; {EXPECTED}") from None
     except OSError as error:
         raise PoseError(f"{path}: cannot be read as poses ({error.strerror})") from None
-    found = _of_csv(path, text) if path.suffix.lower() == ".csv" else _of_json(path, text)
-    for number, placed in enumerate(found, 1):
-        check_rigid(f"{path}: pose {number}", placed.pose)
+    except json.JSONDecodeError as error:
+        raise PoseError(f"{path}: not valid JSON: {error}; {EXPECTED}") from None
+    except ValidationError as error:
+        first, where = error.errors(include_url=False)[0], ""
+        if first["loc"]:
+            number, *field = first["loc"]
+            where = f"pose {int(number) + 1}, {'.'.join(map(str, field))}: "
+        found_wrong = str(first.get("ctx", {}).get("error", first["msg"].lower()))
+        raise PoseError(
+            f"{path}: {where}{found_wrong}; expected a list of poses with probe_to_patient, 4 rows of 4 numbers"
+        ) from None
     if not found:
         raise PoseError(f"{path}: holds no poses; expected at least one")
     return found
 
 
-def _of_json(path: Path, text: str) -> list[_ReadPose]:
-    try:
-        if not text.strip():
-            raise PoseError(f"{path}: is empty; expected a list of poses")
-        poses = TypeAdapter(list[_FilePose]).validate_python(json.loads(text))
-    except json.JSONDecodeError as error:
-        raise PoseError(f"{path}: not valid JSON: {error}; {EXPECTED}") from None
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ""
-        if first["loc"]:
-            number, *field = first["loc"]
-            where = f"pose {int(number) + 1}, {'.'.join(map(str, field))}: "
-        raise PoseError(
-            f"{path}: {where}{first['msg'].lower()}; expected a list of poses with probe_to_patient, 4 rows of 4 numbers"
-        ) from None
-    return [_ReadPose(pose.name, pose.time_s, np.array(pose.probe_to_patient)) for pose in poses]
-
-
-def _of_csv(path: Path, text: str) -> list[_ReadPose]:
-    rows = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    sixteen = "sixteen, row by row, or before them the time in s"
-    try:
-        numbers = [[float(value) for value in line.replace(";", ",").split(",")] for line in rows]
-    except ValueError as error:
-        found = str(error).partition(": ")[2]
-        raise PoseError(f"{path}: {found} is not a number; expected {sixteen}") from None
-    for number, row in enumerate(numbers, 1):
-        if len(row) not in (16, 17) or len(row) != len(numbers[0]):
-            raise PoseError(f"{path}: pose {number}: {len(row)} numbers; expected {sixteen}, as in each line")
-        if not np.isfinite(row[0]):
-            raise PoseError(f"{path}: pose {number}: starts with {row[0]}; expected a finite number")
+def _of_csv(path: Path, text: str) -> list[dict[str, Any]]:
+    """The poses as JSON has them, their numbers as text."""
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    rows = [line.replace(";", ",").split(",") for line in lines]
+    for number, row in enumerate(rows, 1):
+        if len(row) not in (16, 17) or len(row) != len(rows[0]):
+            raise PoseError(f"{path}: pose {number}: {len(row)} numbers; expected {SIXTEEN}, as in each line")
+    poses = [dict(probe_to_patient=np.reshape(row[-16:], (4, 4)).tolist()) for row in rows]
     return [
-        _ReadPose("", row[0] if len(row) == 17 else None, np.array(row[-16:]).reshape(4, 4))
-        for row in numbers
+        pose | ({"time_s": row[0]} if len(row) == 17 else {}) for pose, row in zip(poses, rows, strict=True)
     ]
-
-
-def is_rigid(poses: np.ndarray) -> bool:
-    """Whether all matrices (..., 4, 4) are finite rotations without mirroring, with a translation."""
-    axes = poses[..., :3, :3]
-    return bool(
-        np.isfinite(poses).all()
-        and _axes_error(axes) <= RIGID
-        and (np.linalg.det(axes) > 0).all()
-        and np.allclose(poses[..., 3, :], [0, 0, 0, 1])
-    )
-
-
-def check_rigid(what: str, pose: np.ndarray) -> None:
-    """Raises PoseError, with ``what`` it is, unless a matrix (4, 4) is a rigid pose."""
-    if not is_rigid(pose):
-        axes = pose[:3, :3]
-        raise PoseError(
-            f"{what} is not rigid: expected three right-handed unit axes at right angles (found an error of "
-            f"{_axes_error(axes):.2g}, determinant {np.linalg.det(axes):.3g}) and a last row of 0 0 0 1"
-        )
-
-
-def _axes_error(axes: np.ndarray) -> float:
-    """The largest deviation of the axes' products from orthonormal."""
-    return float(np.abs(np.swapaxes(axes, -1, -2) @ axes - np.eye(3)).max())

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from rehearsal.coordinates import probe_in_patient
+from rehearsal.notices import Notices
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import next_number
 from render.viewer import View
@@ -15,69 +16,67 @@ NAME = r"sweep-([0-9]{3,9})\.igs\.mha"
 
 
 class SweepRecorder:
-    """Records a sweep between two calls of ``toggle``; methods return a message for the user, or nothing."""
+    """Records a sweep between two calls of ``toggle``."""
 
-    def __init__(self, rehearsal: Rehearsal) -> None:
-        self.rehearsal = rehearsal
+    def __init__(self, rehearsal: Rehearsal, notices: Notices) -> None:
+        self.rehearsal, self.notices = rehearsal, notices
         self._sweep: LabelledSweep | None = None
         self._began_s = self._due_s = 0.0
         self._image_kind = ""
 
-    def toggle(self, out: Path) -> str:
+    def toggle(self, out: Path) -> None:
         """Begin a sweep under the next free number of a folder, or end the current one."""
         if self._sweep is not None:
-            return self.end()
+            self.end()
+            return
         if self.rehearsal.scanner is None:
-            return "No sweep: the scene has no CT"
+            self.notices.post("No sweep: the scene has no CT")
+            return
         stem = f"sweep-{next_number(out, NAME):03d}"
         try:
             self._sweep = LabelledSweep(out, stem, self.rehearsal.probe)
         except OSError as error:
-            return f"{stem} cannot be written: {_reason(error)}"
+            self.notices.post(f"{stem} cannot be written: {_reason(error)}")
+            return
         self._began_s, self._due_s, self._image_kind = 0.0, 0.0, ""
-        return f"{stem}: {{sweep}} ends it"
+        self.notices.post(f"{stem}: {{sweep}} ends it")
 
     @property
     def status(self) -> str:
         """A line for the panel during a recording."""
         return "" if self._sweep is None else f"RECORDING {self._due_s - self._began_s:.0f} s"
 
-    def end(self) -> str:
-        """End the current sweep."""
+    def end(self, why: str = "") -> None:
+        """End the current sweep, if there is one."""
         sweep, self._sweep = self._sweep, None
         if sweep is None:
-            return ""
+            return
         try:
             sweep.close()
+            self.notices.post(f"{sweep.name}: {sweep.count} images{why}")
         except (OSError, SweepError) as error:
-            return f"No sweep: {_reason(error)}"
-        return f"{sweep.name}: {sweep.count} images"
+            self.notices.post(f"No sweep: {_reason(error)}{why}")
 
-    def watch(self, time_s: float, view: View, probe: Probe) -> str:
+    def watch(self, time_s: float, view: View, probe: Probe) -> None:
         """Add the current image where a frame is due."""
-        if time_s < self._due_s - FRAME_S - 1e-9:
-            # After the end of a replay another session begins, with its own time.
-            return self.end()
+        kind, image = next(iter(view.pictures.items()))
+        # After the end of a replay another session begins, with its own time; a volume of B-mode and CT images would be neither.
+        if time_s < self._due_s - FRAME_S - 1e-9 or (self._image_kind and kind != self._image_kind):
+            self.end()
         if self._sweep is None or time_s < self._due_s - 1e-9 or self.rehearsal.scanner is None:
-            return ""
+            return
         if self._sweep.count == 0:
             self._began_s = time_s
-        self._due_s = time_s + FRAME_S
-        kind, image = next(iter(view.pictures.items()))
-        if kind != (self._image_kind or kind):
-            # A volume of B-mode and CT images would be neither.
-            return self.end()
-        self._image_kind = kind
+        self._due_s, self._image_kind = time_s + FRAME_S, kind
         labels = self.rehearsal.scanner.ground_truth.render()
         try:
             self._sweep.add(image, labels, probe, probe_in_patient(self.rehearsal), time_s)
         except SweepError as error:
-            return f"{self.end()}: {error}"
+            self.end(f": {error}")
         except OSError as error:
             # The file would contain an incomplete frame.
             self._sweep = None
-            return f"No sweep: {_reason(error)}"
-        return ""
+            self.notices.post(f"No sweep: {_reason(error)}")
 
 
 def _reason(error: OSError | SweepError) -> str:

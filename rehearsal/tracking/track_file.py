@@ -54,7 +54,10 @@ def _sweep_poses(path: Path, name: str) -> TimedPoses:
         poses = [sweep.transform(probe, patient, frame) for frame in range(len(sweep))]
         for frame, pose in enumerate(poses):
             if pose is not None:
-                check_rigid(f"frame {frame}: {name}", pose)
+                try:
+                    check_rigid(pose)
+                except PoseError as error:
+                    raise PoseError(f"frame {frame}: {name} is {error}") from None
         if all(pose is None for pose in poses):
             raise SweepError(f"{name} has the status OK in none of {len(poses)} frames; expected some")
         return TimedPoses(sweep.times_s, poses)

@@ -1,6 +1,6 @@
 """A tracked probe as input: the newest pose of a tracker, or the poses of a file at the rehearsal's time."""
 
-from typing import Protocol
+from collections.abc import Callable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -9,51 +9,23 @@ from rehearsal.coordinates import transducer_at
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions.session import Session
 from rehearsal.tracking.pose_file import TimedPoses
-from ultrasound.probe_manipulator import interpolated
 
 # A resting probe moves less than this: tremor of a hand, and noise of a tracker.
 STILL_MM, STILL_DEG = 3.0, 3.0
+# Gives the probe's newest pose in the patient (4, 4), in PLUS's axes (LPS, mm); None while it is not tracked. May raise TrackEnded.
+PoseSource = Callable[[], np.ndarray | None]
 
 
 class TrackEnded(Exception):
     """There are no more poses; the message is for the user."""
 
 
-class PoseSource(Protocol):
-    """Gives the pose of a probe."""
-
-    def pose(self) -> np.ndarray | None:
-        """The probe's newest pose in the patient (4, 4), in PLUS's axes (LPS, mm); None while it is not tracked.
-
-        May raise TrackEnded.
-        """
-        ...
-
-
-class PosePlayback:
-    """The poses of a file, at the simulated time of a session."""
-
-    def __init__(self, poses: TimedPoses, session: Session) -> None:
-        self.poses, self.session = poses, session
-
-    def pose(self) -> np.ndarray | None:
-        # The time is a sum of steps: its rounding must not skip the last pose.
-        if self.session.time_s > self.poses.length_s + 1e-9:
-            raise TrackEnded("End of the tracked file: mouse and keys control the probe")
-        return pose_at_time(self.poses, self.session.time_s)
-
-
-def pose_at_time(poses: TimedPoses, time_s: float) -> np.ndarray | None:
-    """The pose (4, 4) at a time after the first, interpolated between two; None where one of the two was not tracked."""
-    times, last = poses.times_s - poses.times_s[0], len(poses.times_s) - 1
-    after = min(int(np.searchsorted(times, time_s)), last)
-    end = poses.poses[after]
-    if after == 0 or time_s >= times[after]:
-        return end
-    start = poses.poses[after - 1]
-    if start is None or end is None:
-        return None
-    return interpolated(start, end, float((time_s - times[after - 1]) / (times[after] - times[after - 1])))
+def played_pose(poses: TimedPoses, session: Session) -> np.ndarray | None:
+    """The pose of a file at the simulated time of a session: a ``PoseSource``."""
+    # The time is a sum of steps: its rounding must not skip the last pose.
+    if session.time_s > poses.length_s + 1e-9:
+        raise TrackEnded("End of the tracked file: mouse and keys control the probe")
+    return poses.at(session.time_s)
 
 
 class TrackingInput:
@@ -71,17 +43,14 @@ class TrackingInput:
 
     def goal(self) -> np.ndarray | None:
         """The transducer's next goal (4, 4); None to stay. May raise TrackEnded."""
-        pose = self.tracked.pose()
+        pose = self.tracked()
         self.is_lost = pose is None
-        if pose is None or self._is_waiting(pose):
+        if pose is None:
             return None
-        return transducer_at(self.rehearsal, pose)
-
-    def _is_waiting(self, pose: np.ndarray) -> bool:
         if self._waits:
             self._resting_pose = pose if self._resting_pose is None else self._resting_pose
             self._waits = not has_moved(self._resting_pose, pose)
-        return self._waits
+        return None if self._waits else transducer_at(self.rehearsal, pose)
 
 
 def has_moved(before: np.ndarray, now: np.ndarray) -> bool:

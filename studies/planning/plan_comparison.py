@@ -14,11 +14,10 @@ from tqdm import tqdm
 from rehearsal.commands.command_line import WholeRange, make_folder
 from rehearsal.configuration import PRESETS, probe_of, scene_of
 from rehearsal.planning.plan_file import MOST_SWEEPS
-from rehearsal.planning.plan_search import make_plan, total_work, work_at
-from rehearsal.planning.sweep_path import SweepPath
-from rehearsal.planning.sweep_score import score
-from rehearsal.planning.sweep_trial import Trial
-from rehearsal.planning.trial_workers import PlanningProblem, TrialResult, TrialWorkers
+from rehearsal.planning.plan_search import make_plan, total_work, try_path, work_at
+from rehearsal.planning.sweep_score import ScoreTerms, score
+from rehearsal.planning.sweep_trial import PlanningProblem, Trial
+from rehearsal.planning.trial_workers import TrialWorkers
 from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.scene import EMBEDDED, Scene, load_scene, scene_file, with_options
 from studies.planning.baseline_sweeps import UNPLANNED, planned, random_sweep
@@ -92,17 +91,17 @@ def compare(
     probe = probe_of(scene)
     problem = PlanningProblem(scene_of(scene, PLANNED_ON), anatomy, probe, TARGET, MARGIN_MM, scene.trocar)
     with TrialWorkers(problem, jobs) as workers:
-        plan = make_plan(problem, workers, SPEED_MM_S, trials, done)
+        plan = make_plan(workers, SPEED_MM_S, trials, done)
     sweep = plan.sweeps[0]
-    paths: list[Callable[[Trial], SweepPath]] = [
+    paths: list[Callable[[Trial], list[np.ndarray]]] = [
         partial(planned, sweep=sweep),
         *UNPLANNED.values(),
         *(partial(random_sweep, count=len(sweep.passes), seed=seed) for seed in SEEDS),
     ]
-    outcomes = []
+    outcomes: list[ScoreTerms] = []
     with TrialWorkers(replace(problem, scene=scene_of(scene, JUDGED_ON)), jobs) as workers:
-        for one in workers.try_paths(paths, SPEED_MM_S):
-            outcomes.append(one)
+        for terms, _ in workers.map(try_path, [(make, SPEED_MM_S) for make in paths]):
+            outcomes.append(terms)
             done(work_at(SPEED_MM_S))
     rows = [_row(name, [one]) for name, one in zip(["planned", *UNPLANNED], outcomes, strict=False)]
     rows.append(_row("random", outcomes[len(rows) :]))
@@ -133,9 +132,9 @@ def with_tumour(anatomy: LoadedAnatomy, gravity: np.ndarray) -> LoadedAnatomy:
     return replace(anatomy, tumour=trimesh.Trimesh(ball.vertices + centre, ball.faces, process=False))
 
 
-def _row(name: str, outcomes: list[TrialResult]) -> dict[str, Any]:
+def _row(name: str, outcomes: list[ScoreTerms]) -> dict[str, Any]:
     """Means over several sweeps, and their number."""
-    parts = [asdict(one.terms) | dict(score=score(one.terms)) for one in outcomes]
+    parts = [asdict(one) | dict(score=score(one)) for one in outcomes]
     means = {key: float(np.mean([each[key] for each in parts])) for key in parts[0]}
     return dict(sweep=name, count=len(outcomes), **means)
 

@@ -59,7 +59,7 @@ def replay(scene: Path, out: Path, minutes: float, model: str, quality: str, arc
         live = UserInput(session, AdaptiveIterations(np.inf), recorded)
         Watch().rehearse(session.rehearsal, random_poses(live, session.rehearsal, steps, bar))
         recorded.close({})
-        path, digest = recorded.recording.path, session.rehearsal.digest()
+        path, digest = recorded.path, session.rehearsal.digest()
         log = read_log(path)
         runs = [replayed(rehearsal(), log, from_s, bar) for from_s in (0.0, 0.0, log.length_s / 2)]
     figures = dict(

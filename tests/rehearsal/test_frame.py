@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from click.exceptions import Exit
+from test_openigtlink import LiveImage
 
 import app
 from rehearsal import frame, headless, run
@@ -93,7 +94,7 @@ def looping(monkeypatch, tmp_path, sent) -> WindowFrames:
     fake = Fake()
     monkeypatch.setattr(frame, "image_view", fake.image_view)
     return WindowFrames(
-        *(fake, fake, fake, FakeTally(), SimpleNamespace(send=sent.append)),
+        *(fake, fake, fake, FakeTally(), SimpleNamespace(send=lambda *live: sent.append(LiveImage(*live)))),
         **dict(viewer=None, out=tmp_path, notices=Notices(), sweeping=fake, plans=fake),
     )
 
@@ -267,7 +268,9 @@ def test_without_a_window_pictures_go_to_the_link_and_the_tissue_into_the_folder
     monkeypatch.setattr(frame, "image_view", fake.image_view)
     monkeypatch.setattr(headless, "summary", lambda report: "")
     monkeypatch.setattr(headless, "save_surfaces", lambda rehearsal, out: saved.append((fake.steps, out)))
-    frames = Frames(fake, fake, fake, FakeTally(), SimpleNamespace(send=sent.append))
+    frames = Frames(
+        fake, fake, fake, FakeTally(), SimpleNamespace(send=lambda *live: sent.append(LiveImage(*live)))
+    )
     headless.run_headless(frames, Notices(), 3, Settings(), "cpu", tmp_path)
     assert [live.grey[0, 0] for live in sent] == [1, 2, 3] and sent[-1].time_s == 3 * STEP_S
     assert [live.image_to_probe[1, 1] for live in sent] == [51 / 4, 52 / 4, 53 / 4]
@@ -325,14 +328,14 @@ def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scen
     )
     monkeypatch.setattr(run, "summary_text", lambda summary: "")
     each = run.RehearsalRun(Fake(), None, "cpu", RehearseOptions(scene=scene))
-    recording = SimpleNamespace(path=Path("a/session-001.jsonl"), fault="")
-    each.recorder = SimpleNamespace(recording=recording, close=lambda summary: None)
+    path = Path("a/session-001.jsonl")
+    each.recorder = SimpleNamespace(path=path, fault="", close=lambda summary: None)
     each._end(0)
     assert capsys.readouterr().out.endswith(f"replay it with: {shell_command('rehearse', *words)}\n")
 
 
 def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path, sent):
-    link, given = SimpleNamespace(send=sent.append), []
+    link, given = SimpleNamespace(send=lambda *live: sent.append(LiveImage(*live))), []
     viewer = SimpleNamespace(close=lambda: None, settings=Settings())
     monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide: None)
     monkeypatch.setattr(run, "open_viewer", lambda rehearsal, **_: viewer)

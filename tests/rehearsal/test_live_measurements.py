@@ -11,7 +11,7 @@ from rehearsal.measurements import live_measurements
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.tumour_measurements import Measurement
 from rehearsal.planning.plan_guidance import PlanGuidance
-from rehearsal.sessions.packed_coverage import pack_seen
+from rehearsal.sessions.packed_arrays import pack_seen
 from rehearsal.sessions.session_file import Event, Log, SessionError
 from render.viewer import Settings, View
 from ultrasound.probe import load_probe

@@ -16,7 +16,7 @@ def linking(asked: LinkOptions) -> None:
     server = open_link(asked)
     if server is not None:
         joined(server).close()
-        click.echo(f"on {server.server_address[0]}")
+        click.echo(f"on {server.host}")
 
 
 def free_port() -> int:

@@ -28,11 +28,9 @@ from rehearsal.planning.sweep_candidates import (
     SweepCandidate,
     candidates_of,
     directions,
-    half_extent_mm,
     nearest_side,
-    passes_needed,
+    target_from,
 )
-from rehearsal.planning.sweep_path import layout_towards
 from scenes.anatomy import LoadedAnatomy
 from sim.signed_distance import signed_distance
 from studies.planning import plan_comparison
@@ -70,7 +68,11 @@ def aside_by(degrees: float) -> np.ndarray:
 
 
 def found_for(rehearsal, at: np.ndarray, reach=everywhere, radius: float = 7.0) -> list[SweepCandidate]:
-    return candidates_of(rehearsal, coverage_of(at, radius), "tumour", reach)
+    return candidates_of(trial_of(rehearsal, coverage_of(at, radius).voxel_centres("tumour"), reach))
+
+
+def trial_of(rehearsal, places: np.ndarray, reach=everywhere) -> SimpleNamespace:
+    return SimpleNamespace(rehearsal=rehearsal, places=places, reach=reach)
 
 
 def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
@@ -93,8 +95,8 @@ def test_a_tumour_on_top_has_candidates_from_above_only(rehearsal):
     assert all(each.side == "from above" for each in found)
     assert [each.count for each in found] == [1, 2, 1]
     for each in found:
-        assert each.layout.outward == pytest.approx(Z) and each.layout.lateral == pytest.approx(X)
-        assert each.layout.centre == pytest.approx(18.0 * Z, abs=VOXEL_MM / 2)
+        assert each.frame[:3, 2] == pytest.approx(Z) and each.frame[:3, 0] == pytest.approx(X)
+        assert each.frame[:3, 3] == pytest.approx(18.0 * Z, abs=VOXEL_MM / 2)
 
 
 @pytest.mark.parametrize("aside", [40.0, -60.0])
@@ -102,14 +104,14 @@ def test_a_tumour_at_the_side_has_candidates_from_there_too(rehearsal, aside):
     found = found_for(rehearsal, 18.0 * aside_by(aside))
     assert [each.motion for each in found] == ["slide", "slide", "slide", "tilt"]
     assert len(found) <= MOST_SWEEPS
-    assert found[0].layout.outward == pytest.approx(Z)
+    assert found[0].frame[:3, 2] == pytest.approx(Z)
     for each in found[1:]:
-        assert angle_deg(each.layout.outward, aside_by(aside)) < GRAIN_DEG
+        assert angle_deg(each.frame[:3, 2], aside_by(aside)) < GRAIN_DEG
         assert each.side == "from the nearest side"
 
 
 def test_no_side_is_below_the_organ(rehearsal):
-    outward = nearest_side(rehearsal.manipulator, -20.0 * Z, Z, everywhere, X)
+    outward = nearest_side(trial_of(rehearsal, -20.0 * Z[None]))
     assert outward @ Z >= LEAST_COSINE
     assert angle_deg(outward, np.array([*outward[:2], 0.0]) / np.linalg.norm(outward[:2])) < 2 * GRAIN_DEG
 
@@ -120,22 +122,27 @@ def test_the_nearest_side_is_one_that_can_be_reached(rehearsal):
     def from_left(poses: np.ndarray) -> np.ndarray:
         return poses[:, 1, 2] < -0.2
 
-    outward = nearest_side(rehearsal.manipulator, centre, Z, from_left, X)
+    outward = nearest_side(trial_of(rehearsal, centre[None], from_left))
     assert outward[1] < -0.1
-    assert nearest_side(rehearsal.manipulator, centre, Z, lambda poses: ~everywhere(poses), X) is None
+    assert nearest_side(trial_of(rehearsal, centre[None], lambda poses: ~everywhere(poses))) is None
     nowhere = found_for(rehearsal, centre, lambda poses: ~everywhere(poses))
     assert len(nowhere) == 3 and all(each.side == "from above" for each in nowhere)
 
 
-def test_half_of_a_target_is_measured_across_and_along():
-    layout = layout_towards(np.array([1.0, 1, 1]), Z, Y)
-    places = np.array([[1.0, 1, 1], [4, 1, 9], [1, -6, 1]])
-    assert half_extent_mm(layout, places) == pytest.approx([7, 3])
+def test_half_of_a_target_is_measured_across_and_along(rehearsal):
+    turned = SimpleNamespace(**vars(rehearsal) | dict(press=SimpleNamespace(lateral=Y)))
+    places = np.array([[1.0, 1, 1], [4, 1, 9], [-2, 1, 1], [1, -6, 1], [1, 8, 3]])
+    frame, half, width, _ = target_from(trial_of(turned, places), Z)
+    assert half == pytest.approx([7, 3]) and frame[:3, 3] == pytest.approx([1, 1, 3])
+    assert width == pytest.approx(WIDTH)
 
 
-def test_passes_are_as_many_as_the_target_is_wide_in_pictures():
-    assert passes_needed(0.4 * WIDTH, WIDTH) == 1
-    counts = [passes_needed(half, WIDTH) for half in np.arange(1.0, 200.0)]
+def test_passes_are_as_many_as_the_target_is_wide_in_pictures(rehearsal):
+    def needed(half: float) -> int:
+        return target_from(trial_of(rehearsal, half * np.array([X, -X])), Z)[3]
+
+    assert needed(0.4 * WIDTH) == 1
+    counts = [needed(half) for half in np.arange(1.0, 200.0)]
     assert sorted(counts) == counts and counts[-1] == MOST_PASSES and set(np.diff(counts)) == {0, 1}
 
 
@@ -143,15 +150,14 @@ def test_no_two_candidates_are_the_same_where_passes_are_at_their_most(rehearsal
     narrow = SimpleNamespace(
         **vars(rehearsal) | dict(probe=load_probe("linear").model_copy(update=dict(transducer_width_mm=3.0)))
     )
-    found = candidates_of(narrow, coverage_of(18.0 * Z), "organ", everywhere)
+    found = candidates_of(trial_of(narrow, coverage_of(18.0 * Z).voxel_centres("organ")))
     assert {each.count for each in found} == {MOST_PASSES}
     assert len({each.name(each.count) for each in found}) == len(found) == 3
 
 
 @pytest.mark.parametrize("radius", [7.0, 12.0])
 def test_each_begins_over_its_target_and_its_numbers_go_from_end_to_end(rehearsal, radius):
-    coverage = coverage_of(15.0 * aside_by(35), radius)
-    for each in candidates_of(rehearsal, coverage, "tumour", everywhere):
+    for each in found_for(rehearsal, 15.0 * aside_by(35), radius=radius):
         start = each.start()
         assert ((start >= 0) & (start <= 1)).all()
         values = each.values(start)
@@ -159,22 +165,22 @@ def test_each_begins_over_its_target_and_its_numbers_go_from_end_to_end(rehearsa
         for (name, value), (low, high, begins) in zip(values.items(), each.ranges.values(), strict=True):
             assert low < high and low <= begins <= high and value == pytest.approx(begins), name
         beyond = each.values(np.where(np.arange(len(start)) % 2, -3.0, 7.0))
-        ends = [q.low if n % 2 else q.high for n, q in enumerate(each.ranges.values())]
+        ends = [low if n % 2 else high for n, (low, high, _) in enumerate(each.ranges.values())]
         assert list(beyond.values()) == ends
-        passes = each.path(rehearsal.manipulator, values).passes
+        passes = each.path(rehearsal.manipulator, values)
         assert len(passes) == each.count
         faces = np.concatenate([faces_in(each) for each in passes])
-        over = np.linalg.norm(np.cross(faces - each.layout.centre, each.layout.outward), axis=1)
+        over = np.linalg.norm(np.cross(faces - each.frame[:3, 3], each.frame[:3, 2]), axis=1)
         assert over.min() < WIDTH and over.max() < 3 * radius
 
 
 def test_sliding_starts_as_straight_rows(rehearsal):
-    coverage = coverage_of(16.0 * Z, 12.0)
-    slide = next(each for each in candidates_of(rehearsal, coverage, "tumour", everywhere) if each.count > 1)
-    rows = row_by_row(SimpleNamespace(rehearsal=rehearsal, coverage=coverage, target="tumour"))
+    trial = trial_of(rehearsal, coverage_of(16.0 * Z, 12.0).voxel_centres("tumour"))
+    slide = next(each for each in candidates_of(trial) if each.count > 1)
+    rows = row_by_row(trial)
     begun = slide.path(rehearsal.manipulator, slide.values(slide.start()))
-    assert slide.motion == "slide" and len(rows.passes) == slide.count
-    assert begun.poses == pytest.approx(rows.poses, abs=1e-9)
+    assert slide.motion == "slide" and len(rows) == slide.count
+    assert np.concatenate(begun) == pytest.approx(np.concatenate(rows), abs=1e-9)
 
 
 def sliding_candidate(rehearsal, count: int) -> SweepCandidate:
@@ -191,24 +197,22 @@ def values_of(candidate: SweepCandidate, **changes: float) -> dict[str, float]:
 def test_sliding_follows_its_parameters(rehearsal):
     slide, manipulator = sliding_candidate(rehearsal, 2), rehearsal.manipulator
     numbers = values_of(slide, aside_mm=2.0, apart_mm=9.0, start_mm=-7.0, end_mm=5.0, depth_mm=0.0)
-    one, two = (faces_in(each) - slide.layout.centre for each in slide.path(manipulator, numbers).passes)
+    one, two = (faces_in(each) - slide.frame[:3, 3] for each in slide.path(manipulator, numbers))
     assert one[:, 0] == pytest.approx(2.0 - 4.5) and two[:, 0] == pytest.approx(2.0 + 4.5)
     assert one[[0, -1], 1] == pytest.approx([-7, 5]) and two[[0, -1], 1] == pytest.approx([5, -7])
-    deeper = slide.path(manipulator, numbers | dict(depth_mm=3.0)).passes[0]
-    assert faces_in(deeper) - slide.layout.centre == pytest.approx(one - 3.0 * Z)
-    turned = (
-        faces_in(slide.path(manipulator, numbers | dict(heading_deg=90.0)).passes[0]) - slide.layout.centre
-    )
+    deeper = slide.path(manipulator, numbers | dict(depth_mm=3.0))[0]
+    assert faces_in(deeper) - slide.frame[:3, 3] == pytest.approx(one - 3.0 * Z)
+    turned = faces_in(slide.path(manipulator, numbers | dict(heading_deg=90.0))[0]) - slide.frame[:3, 3]
     assert turned[[0, -1], 0] == pytest.approx([7, -5]) and turned[:, 1] == pytest.approx(-2.5)
     for name, axis in (("lean_deg", [0, -0.5, np.sqrt(0.75)]), ("lean_aside_deg", [0.5, 0, np.sqrt(0.75)])):
-        leant = slide.path(manipulator, numbers | {name: 30.0}).poses
+        leant = np.concatenate(slide.path(manipulator, numbers | {name: 30.0}))
         assert leant[:, :3, 2] == pytest.approx(np.tile(axis, (len(leant), 1)))
 
 
 def test_tilting_follows_its_parameters(rehearsal):
     tilt = next(each for each in found_for(rehearsal, 18.0 * Z) if each.motion == "tilt")
     numbers = values_of(tilt, ahead_mm=0.0, first_deg=-10.0, last_deg=24.0, depth_mm=1.0)
-    (poses,) = tilt.path(rehearsal.manipulator, numbers).passes
+    (poses,) = tilt.path(rehearsal.manipulator, numbers)
     angles = np.degrees(np.arctan2(-poses[:, 1, 2], poses[:, 2, 2]))
     assert angles[[0, -1]] == pytest.approx([-10, 24], abs=1.5)
     assert faces_in(poses)[:, 2] == pytest.approx(R - 1.0, abs=FACET_MM)
@@ -219,25 +223,25 @@ def test_tilting_follows_its_parameters(rehearsal):
 
 @pytest.fixture(scope="module")
 def trial(rehearsal) -> SimpleNamespace:
-    return SimpleNamespace(rehearsal=rehearsal, coverage=coverage_of(16.0 * Z, 12.0), target="tumour")
+    return trial_of(rehearsal, coverage_of(16.0 * Z, 12.0).voxel_centres("tumour"))
 
 
 def test_straight_sweeps_point_down_and_cover_the_target_side_by_side(trial):
-    (one,), rows = straight(trial).passes, row_by_row(trial).passes
+    (one,), rows = straight(trial), row_by_row(trial)
     assert np.array([one[0], one[-1]])[:, :3, 2] == pytest.approx(np.stack([Z, Z]))
     assert faces_in(one)[:, 0] == pytest.approx(0, abs=VOXEL_MM / 2)
     assert faces_in(one)[[0, -1], 1] == pytest.approx([-12, 12], abs=VOXEL_MM)
-    assert len(rows) == passes_needed(12.0, WIDTH) == 2
+    assert len(rows) == 2
     aside = [faces_in(each)[0, 0] for each in rows]
     assert np.diff(aside) == pytest.approx([WIDTH]) and np.mean(aside) == pytest.approx(0, abs=VOXEL_MM / 2)
 
 
 def test_random_sweeps_depend_on_the_seed_and_are_over_the_target(trial):
     first, again, other = (random_sweep(trial, 3, seed) for seed in (5, 5, 6))
-    assert len(first.passes) == 3
-    assert np.array_equal(first.poses, again.poses) and not np.array_equal(first.poses[0], other.poses[0])
-    assert (np.linalg.norm(faces_in(first.poses)[:, :2], axis=1) < 12 * (np.sqrt(2) + 1)).all()
-    headings = [each[-1, :3, 3] - each[0, :3, 3] for each in first.passes]
+    assert len(first) == 3
+    assert all(map(np.array_equal, first, again)) and not np.array_equal(first[0][0], other[0][0])
+    assert (np.linalg.norm(faces_in(np.concatenate(first))[:, :2], axis=1) < 12 * (np.sqrt(2) + 1)).all()
+    headings = [each[-1, :3, 3] - each[0, :3, 3] for each in first]
     assert all(
         abs(angle_deg(a / np.linalg.norm(a), b / np.linalg.norm(b))) > 1 for a, b in pairwise(headings)
     )
@@ -247,16 +251,17 @@ def test_the_poses_of_a_plan_are_those_of_the_path_in_the_patient(rehearsal):
     path = sliding_candidate(rehearsal, 2).path(
         rehearsal.manipulator, values_of(sliding_candidate(rehearsal, 2))
     )
-    placed = np.stack([probe_in_patient(rehearsal, pose) for pose in path.poses])
+    poses = np.concatenate(path)
+    placed = np.stack([probe_in_patient(rehearsal, pose) for pose in poses])
     # PLUS's axes of a probe: x to the marked side, y into the tissue, from the middle of the face.
-    assert placed[:, :3, 3] == pytest.approx(faces_in(path.poses) + ORIGIN)
-    assert placed[:, :3, 0] == pytest.approx(path.poses[:, :3, 0])
-    assert placed[:, :3, 1] == pytest.approx(-path.poses[:, :3, 2])
+    assert placed[:, :3, 3] == pytest.approx(faces_in(poses) + ORIGIN)
+    assert placed[:, :3, 0] == pytest.approx(poses[:, :3, 0])
+    assert placed[:, :3, 1] == pytest.approx(-poses[:, :3, 2])
     assert np.linalg.det(placed[:, :3, :3]) == pytest.approx(1)
-    assert placed.tolist() == pytest.approx(np.array(in_patient(path.poses)))
-    again = planned(SimpleNamespace(rehearsal=rehearsal), sweep_of(*path.passes))
-    assert [len(each) for each in again.passes] == [len(each) for each in path.passes]
-    assert again.poses == pytest.approx(path.poses, abs=1e-9)
+    assert placed.tolist() == pytest.approx(np.array(in_patient(poses)))
+    again = planned(SimpleNamespace(rehearsal=rehearsal), sweep_of(*path))
+    assert [len(each) for each in again] == [len(each) for each in path]
+    assert np.concatenate(again) == pytest.approx(poses, abs=1e-9)
 
 
 def test_a_kidney_without_a_tumour_is_given_one_under_its_highest_place():

@@ -25,6 +25,7 @@ from rehearsal.planning.plan_file import (
     timed_poses,
     write_plan,
 )
+from rehearsal.planning.sweep_trial import PlanningProblem
 from rehearsal.tracking.track_file import load_track
 from scenes.scene import Trocar
 from ultrasound.probe import load_probe
@@ -95,10 +96,14 @@ ODD[3] = [0, 0, 0, 2.0]
         ("sweeps.0.passes", [], "sweeps.0.passes: list should have at least 1 item"),
         ("sweeps.0.passes.0", [], "sweeps.0.passes.0: list should have at least 2 items"),
         ("sweeps.0.passes.0", [np.eye(4).tolist()], "sweeps.0.passes.0: list should have at least 2 items"),
-        ("sweeps.0.passes.0.1", np.diag([1.0, 1, 1.01, 1]).tolist(), "a pose is not rigid"),
-        ("sweeps.0.passes.0.1", SHEARED.tolist(), "a pose is not rigid"),
+        (
+            "sweeps.0.passes.0.1",
+            np.diag([1.0, 1, 1.01, 1]).tolist(),
+            "sweeps.0.passes.0.1: value error, not rigid",
+        ),
+        ("sweeps.0.passes.0.1", SHEARED.tolist(), "sweeps.0.passes.0.1: value error, not rigid"),
         ("sweeps.0.passes.0.1", np.diag([1.0, 1, -1, 1]).tolist(), "three right-handed unit axes"),
-        ("sweeps.0.passes.0.1", ODD.tolist(), "and 0 0 0 1 below"),
+        ("sweeps.0.passes.0.1", ODD.tolist(), "a last row of 0 0 0 1"),
         (
             "sweeps.0.passes.0.1",
             np.eye(3).tolist(),
@@ -253,7 +258,7 @@ def test_the_plan_command_refuses_in_one_line(ball_scene, capsys, options, words
 def test_a_plan_is_made_on_the_tissue_of_the_quality(ball_scene, monkeypatch, capsys):
     cells_mm: list[float] = []
 
-    def nobody(problem: trial_workers.PlanningProblem, jobs: int | None) -> None:
+    def nobody(problem: PlanningProblem, jobs: int | None) -> None:
         cells_mm.append(problem.scene.tissue.cell_mm)
         raise PlanError("no workers")
 

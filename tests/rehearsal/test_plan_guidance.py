@@ -10,8 +10,7 @@ from conftest import rotation_about
 from plan_ball import SIZE, over_ball, plan_of, straight_pass, sweep_of
 
 from rehearsal.planning.plan_guidance import ABOVE_MM, AHEAD, DEG_PER_MM_OFF, NEAR_MM, PlanGuidance
-from rehearsal.sessions.session import Session
-from rehearsal.sessions.undo_history import MOST_UNDONE, History
+from rehearsal.sessions.session import MOST_UNDONE, History, Session
 from render import plan_lines, transducer_shape
 from render.actions import begin
 from render.keys import Keys
@@ -42,16 +41,15 @@ def test_a_plan_followed_exactly_is_completed_without_deviation():
     guide = guide_of()
     for number, pose in enumerate([*FIRST, *SECOND]):
         assert guide.guidance().goal == pytest.approx(pose)
-        assert guide.followed == pytest.approx(number / 7)
+        assert guide.figures()["plan_followed"] == pytest.approx(number / 7)
         guide.watch(pose)
     assert guide.figures() == pytest.approx(dict(plan_followed=1.0, plan_off_mm=0.0, plan_off_deg=0.0))
     assert guide.guidance().goal is None and guide.guidance().done.all()
-    assert guide.findings() == {"plan": "100 %", "off plan": "0.0 mm 0 deg"}
     assert guide.in_words(0.5) == (
         "plan      two passes: 100 % completed, mean deviation 0.0 mm and 0 degrees; coverage of margin 50 % (planned 75 %)"
     )
     guide.watch(SECOND[-1])
-    assert guide.followed == 1.0
+    assert guide.figures()["plan_followed"] == 1.0
 
 
 def test_the_deviation_is_the_distance_of_the_face_and_the_angle():
@@ -142,19 +140,17 @@ def test_the_sweeps_are_shown_in_turn_and_then_none():
     assert guide.next_pose == 0 and guide.guidance().goal == pytest.approx(SECOND[0])
     assert guide.next_sweep() == "Plan hidden"
     guide.watch(FIRST[0])
-    assert guide.guidance() is None and guide.figures() == {} == guide.findings()
-    assert guide.in_words(0.5) == "" and guide.followed == 0.0
+    assert guide.guidance() is None and guide.figures() == {} and guide.in_words(0.5) == ""
     assert guide.next_sweep() == "Plan 1: two passes, covers 75 %" and len(guide.guidance().path_mm) == 3
 
 
 def test_a_restart_clears_the_progress():
     guide = guide_of()
-    assert guide.findings() == {"plan": "0 %", "off plan": ""}
+    assert guide.figures() == dict(plan_followed=0.0, plan_off_mm=None, plan_off_deg=None)
     assert guide.in_words(None) == "plan      two passes: 0 % completed"
     guide.watch(FIRST[0])
     guide.restart()
     assert guide.next_pose == 0 and guide.figures()["plan_followed"] == 0 and not guide.guidance().done.any()
-    assert guide.findings()["off plan"] == ""
 
 
 # Undo, reset and bookmarks

@@ -14,19 +14,28 @@ import pytest
 import trimesh
 from plan_ball import GOOD, big_ball, from_above, manipulator_on, straight_pass
 
-from rehearsal.planning import candidate_search
-from rehearsal.planning.candidate_search import GENERATION, TRIAL_SIGMA, CandidateSearch, surrogate_optimum
+from rehearsal.planning import plan_search, trial_workers
 from rehearsal.planning.plan_file import PlanError, read_plan, write_plan
-from rehearsal.planning.plan_search import SURROGATE_TRIALS, TRIAL_MM_S, make_plan, ranked, search, total_work
-from rehearsal.planning.sweep_candidates import ParameterRange, SweepCandidate
-from rehearsal.planning.sweep_score import ScoreTerms, score
-from rehearsal.planning.trial_workers import (
-    PlanningProblem,
-    SearchSpace,
-    TrialResult,
-    TrialWorkers,
-    _trial,
+from rehearsal.planning.plan_search import (
+    GENERATION,
+    SURROGATE_TRIALS,
+    TRIAL_MM_S,
+    TRIAL_SIGMA,
+    CandidateSearch,
+    TriedPath,
+    make_plan,
+    ranked,
+    search,
+    search_space,
+    surrogate_optimum,
+    total_work,
+    try_candidate,
+    try_path,
 )
+from rehearsal.planning.sweep_candidates import SweepCandidate
+from rehearsal.planning.sweep_score import ScoreTerms, score
+from rehearsal.planning.sweep_trial import PlanningProblem, Trial
+from rehearsal.planning.trial_workers import TrialWorkers
 from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.scene import Scene, Trocar
 from studies.planning import plan_comparison
@@ -34,9 +43,7 @@ from studies.planning.plan_comparison import table
 from ultrasound.probe import load_probe
 
 BEST = dict(a_mm=-3.0, b_mm=7.0, c_deg=20.0)
-RANGES = dict(
-    a_mm=ParameterRange(-10, 10, 0), b_mm=ParameterRange(0, 8, 2), c_deg=ParameterRange(-45, 45, -30)
-)
+RANGES = dict(a_mm=(-10, 10, 0), b_mm=(0, 8, 2), c_deg=(-45, 45, -30))
 
 
 def candidate(name: str, handicap: float = 0.0) -> SweepCandidate:
@@ -46,7 +53,7 @@ def candidate(name: str, handicap: float = 0.0) -> SweepCandidate:
 
 def worth(values: dict[str, float], handicap: float = 0.0) -> ScoreTerms:
     """Best in one place, and known how good there: how much is seen falls with the square of the distance."""
-    off = sum(((values[name] - BEST[name]) / (RANGES[name].high - RANGES[name].low)) ** 2 for name in BEST)
+    off = sum(((values[name] - BEST[name]) / np.ptp(RANGES[name][:2])) ** 2 for name in BEST)
     return replace(GOOD, seen=1.0 - handicap - off)
 
 
@@ -55,26 +62,29 @@ class Counting(TrialWorkers):
 
     def __init__(self, candidates: list[SweepCandidate], reachable: float = 1.0, ways: int = 1) -> None:
         self.candidates, self.reachable, self.ways = candidates, reachable, ways
+        self.problem = problem_of()
         self.tasks: list[tuple[SweepCandidate, dict[str, float], float]] = []
-        self.surrogate_optimum = 0
+        self.surrogate_optima = 0
 
-    def search_space(self) -> SearchSpace:
-        return SearchSpace(self.candidates, dict(model="neo-hookean", cell_mm=8.0))
+    def map(self, function, tasks) -> Iterator:
+        stand_ins = {search_space: self.space, surrogate_optimum: self.optimum, try_candidate: self.tried}
+        for number, task in enumerate(tasks):
+            if function is try_path:
+                yield replace(GOOD, seen=0.1 * number), [straight_pass(4)]
+            else:
+                yield stand_ins[function](*task)
 
-    def surrogate_optima(self, candidates) -> Iterator[np.ndarray]:
-        for each in candidates:
-            self.surrogate_optimum += 1
-            yield each.start()
+    def space(self) -> tuple[list[SweepCandidate], dict]:
+        return self.candidates, dict(model="neo-hookean", cell_mm=8.0)
 
-    def try_candidates(self, tasks) -> Iterator[TrialResult]:
-        for each, values, speed in tasks:
-            self.tasks.append((each, values, speed))
-            parts = replace(worth(values, each.count / 100), reachable=self.reachable)
-            yield TrialResult(parts, [straight_pass(4)] * self.ways)
+    def optimum(self, candidate: SweepCandidate) -> np.ndarray:
+        self.surrogate_optima += 1
+        return candidate.start()
 
-    def try_paths(self, ways, speed_mm_s) -> Iterator[TrialResult]:
-        for number, _ in enumerate(ways):
-            yield TrialResult(replace(GOOD, seen=0.1 * number), [straight_pass(4)])
+    def tried(self, candidate: SweepCandidate, values: dict[str, float], speed: float) -> TriedPath:
+        self.tasks.append((candidate, values, speed))
+        terms = replace(worth(values, candidate.count / 100), reachable=self.reachable)
+        return terms, [straight_pass(4)] * self.ways
 
 
 def four() -> list[SweepCandidate]:
@@ -110,7 +120,7 @@ def evolved(generations: int, beside: bool = False) -> CandidateSearch:
 def test_the_search_finds_the_best_parameters():
     found = evolved(40)
     for name, best in BEST.items():
-        assert found.values[name] == pytest.approx(best, abs=0.01 * (RANGES[name].high - RANGES[name].low))
+        assert found.values[name] == pytest.approx(best, abs=0.01 * np.ptp(RANGES[name][:2]))
     assert found.score == pytest.approx(score(replace(GOOD, seen=1.0)), abs=0.05)
     assert found.candidate.values(found.best) == found.values and found.trials == 40 * GENERATION
 
@@ -159,16 +169,25 @@ def test_part_of_a_generation_counts_and_the_best_so_far_stays():
     assert (found.trials, found.score) == (3 + GENERATION, 5.0) and np.array_equal(found.best, asked[1])
 
 
-def test_the_surrogate_optimum_is_no_worse_than_the_default():
+def test_the_surrogate_optimum_is_no_worse_than_the_default(monkeypatch):
     asked: list[dict[str, float]] = []
 
-    def seen(values: dict[str, float]) -> ScoreTerms:
-        asked.append(values)
-        return worth(values)
+    class Surrogate:
+        """Its path is the parameters."""
 
+        manipulator = None
+
+        def __init__(self, trial) -> None: ...
+
+        def evaluate(self, values: dict[str, float]) -> ScoreTerms:
+            asked.append(values)
+            return worth(values)
+
+    monkeypatch.setattr(plan_search, "RigidSurrogate", Surrogate)
+    monkeypatch.setattr(SweepCandidate, "path", lambda self, manipulator, values: values)
     one = candidate("one")
-    best = surrogate_optimum(one, seen)
-    assert len(asked) == -(-candidate_search.SURROGATE_EVALUATIONS // GENERATION) * GENERATION
+    best = surrogate_optimum(SimpleNamespace(rehearsal=SimpleNamespace(reset=lambda: None)), one)
+    assert len(asked) == -(-plan_search.SURROGATE_EVALUATIONS // GENERATION) * GENERATION
     assert asked[0] == pytest.approx(one.values(one.start()))
     assert worth(one.values(best)).seen == max(worth(values).seen for values in asked) > 0.99
 
@@ -186,7 +205,7 @@ def test_all_trials_are_made_and_counted(trials):
         SURROGATE_TRIALS: 4,
     }
     assert {one.candidate.side: one.trials for one in searches} == made
-    assert {speed for _, _, speed in workers.tasks} == {TRIAL_MM_S} and workers.surrogate_optimum == 4
+    assert {speed for _, _, speed in workers.tasks} == {TRIAL_MM_S} and workers.surrogate_optima == 4
 
 
 def test_the_better_half_has_the_rest():
@@ -222,9 +241,9 @@ def test_the_best_of_each_is_tried_once_more_and_ranked():
     searches = search(workers.candidates, workers, 48, lambda _: None)
     workers.tasks.clear()
     rows = ranked(searches, workers, 12.0, done.append)
-    assert [one.candidate.side for one, _ in rows] == ["sweep 1", "sweep 3", "sweep 2", "sweep 0"]
+    assert [one.candidate.side for one, _, _ in rows] == ["sweep 1", "sweep 3", "sweep 2", "sweep 0"]
     assert done == [3] * 4 and {speed for _, _, speed in workers.tasks} == {12.0}
-    assert all(outcome.terms == worth(one.values, one.candidate.count / 100) for one, outcome in rows)
+    assert all(terms == worth(one.values, one.candidate.count / 100) for one, terms, _ in rows)
     # A candidate without trials has no parameters to try.
     untried = CandidateSearch(candidate("untried"), np.zeros(3), TRIAL_SIGMA)
     assert len(ranked([*searches, untried], workers, 12.0, lambda _: None)) == 4
@@ -234,8 +253,11 @@ def test_the_best_of_each_is_tried_once_more_and_ranked():
 
 
 def test_a_plan_contains_the_ranked_sweeps(tmp_path):
-    problem, done = problem_of(trocar=Trocar(cone_deg=33)), []
-    plans = [make_plan(problem, Counting(four()), 12.0, 96, done.append) for _ in range(2)]
+    problem, done, plans = problem_of(trocar=Trocar(cone_deg=33)), [], []
+    for _ in range(2):
+        workers = Counting(four())
+        workers.problem = problem
+        plans.append(make_plan(workers, 12.0, 96, done.append))
     assert sum(done) == 2 * total_work(96, 12.0), "what the command's progress bar expects"
     assert done[0] == 0 and done.count(0) == 2
     plan = plans[0]
@@ -265,11 +287,8 @@ def test_a_plan_contains_the_ranked_sweeps(tmp_path):
     "workers", [Counting(four(), reachable=0.95), Counting(four(), ways=0), Counting([])]
 )
 def test_without_a_reachable_sweep_there_is_an_error(workers):
-    if not workers.candidates:
-        workers.search_space = lambda: SearchSpace([], {})
-        workers.try_candidates = lambda tasks: iter(())
     with pytest.raises(PlanError, match="no sweep was found.*move the trocar, widen its cone") as error:
-        make_plan(problem_of(), workers, 10.0, 4 if workers.candidates else 0, lambda _: None)
+        make_plan(workers, 10.0, 4 if workers.candidates else 0, lambda _: None)
     assert "\n" not in str(error.value)
 
 
@@ -303,34 +322,28 @@ def test_a_comparison_reports_its_progress_and_averages_the_random_sweeps(monkey
 # Processes
 
 
-def test_a_process_distinguishes_problems():
-    """Its key contains all that a trial depends on."""
-    problems = [
-        problem_of(),
-        problem_of(margin_mm=6.0),
-        with_tumour(),
-        with_tumour(target="tumour"),
-        problem_of(trocar=Trocar(at_mm=(0, 0, 90))),
-        problem_of(probe=load_probe("drop-in")),
-        problem_of(scene=Scene(anatomy={}, tissue=dict(cell_mm=8.0))),
-        problem_of(anatomy=LoadedAnatomy(trimesh.creation.box([9.0] * 3), None, None, ())),
-    ]
-    assert len({TrialWorkers(each, 1)._key for each in problems}) == len(problems)
-    assert TrialWorkers(problem_of(), 1)._key == TrialWorkers(problems[0], 1)._key
+@pytest.fixture
+def no_trial(monkeypatch):
+    """A process builds none. It imports this folder for what it computes."""
+    monkeypatch.setattr(trial_workers, "_call", _without_trial)
 
 
-def _end(key: str, problem: PlanningProblem) -> None:
+def _without_trial(problem: PlanningProblem, function, *task) -> object:
+    return function(None, *task)
+
+
+def _end(trial: None) -> None:
     os._exit(1)
 
 
-def _process(key: str, problem: PlanningProblem) -> tuple[int, list[str]]:
+def _process(trial: None) -> tuple[int, list[str]]:
     return os.getpid(), [thread.name for thread in threading.enumerate()]
 
 
-def test_one_process_is_not_this_one_and_watches_whether_this_one_is_there():
+def test_one_process_is_not_this_one_and_watches_whether_this_one_is_there(no_trial):
     """Taichi would be started anew under whatever this one computes."""
     with TrialWorkers(problem_of(), 1) as workers:
-        ((process, threads),) = workers._map(_process, [()])
+        ((process, threads),) = workers.map(_process, [()])
     assert process != os.getpid() and any("_watch" in name for name in threads)
 
 
@@ -340,21 +353,21 @@ def test_a_tumour_target_needs_a_tumour(target):
         problem_of(target=target)
 
 
-def test_stopping_the_processes_is_an_error_for_a_waiting_thread():
+def test_stopping_the_processes_is_an_error_for_a_waiting_thread(no_trial):
     with TrialWorkers(problem_of(), 1) as workers:
-        waiting = workers._map(_sleep, [()] * 9)
+        waiting = workers.map(_sleep, [()] * 9)
         threading.Timer(0.5, workers.stop).start()
         with pytest.raises(PlanError, match="was ended"):
             list(waiting)
 
 
-def _sleep(key: str, problem: PlanningProblem) -> None:
+def _sleep(trial: None) -> None:
     time.sleep(60)
 
 
-def test_a_process_that_ended_is_an_error_in_one_line():
+def test_a_process_that_ended_is_an_error_in_one_line(no_trial):
     with TrialWorkers(problem_of(), 2) as workers, pytest.raises(PlanError) as error:
-        list(workers._map(_end, [()]))
+        list(workers.map(_end, [()]))
     assert "a process of the search was ended" in str(error.value) and "\n" not in str(error.value)
 
 
@@ -365,12 +378,11 @@ def test_a_target_without_a_voxel_is_refused(monkeypatch, target, margin):
     built = SimpleNamespace(
         organ=big_ball(), tumour=speck, manipulator=manipulator_on(big_ball()), origin=np.zeros(3)
     )
-    monkeypatch.setattr("rehearsal.planning.trial_workers.Rehearsal", lambda *_: built)
-    monkeypatch.setattr("sim.device.start", lambda *_, **__: "cpu")
+    monkeypatch.setattr("rehearsal.planning.sweep_trial.Rehearsal", lambda *_: built)
     anatomy = replace(problem_of().anatomy, tumour=speck)
     # Not in a process of its own, which would build a rehearsal.
     with pytest.raises(PlanError, match=f"--target {target}: it is smaller than a voxel of 1.5 mm"):
-        _trial("speck", problem_of(anatomy=anatomy, target=target, margin_mm=margin))
+        Trial(problem_of(anatomy=anatomy, target=target, margin_mm=margin))
 
 
 def test_no_images_are_sent_to_the_processes():

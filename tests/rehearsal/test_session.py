@@ -21,8 +21,7 @@ from rehearsal.configuration import probe_of
 from rehearsal.inputs.input_source import ReplayInput
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.sessions import recorder
-from rehearsal.sessions.packed_coverage import pack_seen, unpack_seen
-from rehearsal.sessions.recorded_scene import scene_of_log
+from rehearsal.sessions.packed_arrays import pack_poses, pack_seen, unpack_poses, unpack_seen
 from rehearsal.sessions.recorder import SessionRecorder, record
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session import Session
@@ -30,11 +29,9 @@ from rehearsal.sessions.session_file import (
     Event,
     Header,
     Log,
-    Recording,
     SessionError,
-    pack,
     read_log,
-    unpack,
+    scene_of_log,
 )
 from render.viewer import Controls, Settings
 from scenes.anatomy import LoadedAnatomy
@@ -49,7 +46,7 @@ def header() -> Header:
 
 def live_into(path: Path, seen: Callable[[], np.ndarray] | None = None) -> UserInput:
     session = Session(Numbers(), coverage=seen)
-    return UserInput(session, AdaptiveIterations(1e6), SessionRecorder(session, Recording(path, header())))
+    return UserInput(session, AdaptiveIterations(1e6), SessionRecorder(session, path, header()))
 
 
 def lead(live: UserInput, moments: int, seed: int) -> str:
@@ -188,7 +185,7 @@ def test_what_was_seen_that_is_damaged_is_named_by_its_line(tmp_path):
 
 
 @pytest.mark.parametrize("at_back", [False, True])
-def test_a_digest_that_differs_is_said_with_its_second_once(tmp_path, at_back):
+def test_a_digest_that_differs_is_said_with_its_second_once(tmp_path, capsys, at_back):
     live = live_into(tmp_path / "session")
     for moment in range(50):
         step(live, reset=at_back and moment == 3 * SECOND - 1)
@@ -204,8 +201,9 @@ def test_a_digest_that_differs_is_said_with_its_second_once(tmp_path, at_back):
             driver.replay.rehearsal.advance(pose)
             driver.after_step(0.0)
     assert driver.replay.differs_s == 3.0
-    (notice,) = driver.notices.take()
-    assert "from 3 s on" in notice.text and "differs" in notice.text and notice.in_terminal
+    assert driver.notices.present() == []
+    (notice,) = capsys.readouterr().out.splitlines()
+    assert "from 3 s on" in notice and "differs" in notice
 
 
 @pytest.mark.parametrize(
@@ -235,14 +233,14 @@ def test_poses_keep_every_bit_and_ways_back_are_no_numbers():
     poses: list[np.ndarray | None] = [np.vstack([random.normal(size=(3, 4)), np.eye(4)[3]]) for _ in range(9)]
     poses[2][0] = [-0.0, 5e-324, 1e308, 1 / 3]
     poses[4] = None
-    back = unpack(pack(poses))
+    back = unpack_poses(pack_poses(poses))
     assert np.isnan(back[4, :3]).all()
     assert all(back[i].tobytes() == pose.tobytes() for i, pose in enumerate(poses) if pose is not None)
 
 
 def on_disk(live: UserInput) -> None:
     """Wait until the disk has all that was handed to it."""
-    live.recorder.recording._disk.submit(int).result(10)
+    live.recorder._disk.submit(int).result(10)
 
 
 def test_the_file_is_on_the_disk_each_second(tmp_path):
@@ -327,19 +325,19 @@ class FullDisk(io.RawIOBase):
         raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def test_a_full_disk_leaves_the_rehearsal_going_and_is_said_once(tmp_path):
+def test_a_full_disk_leaves_the_rehearsal_going_and_is_said_once(tmp_path, capsys):
     live = live_into(tmp_path / "session")
     for moment in range(50):
         if moment in (20, 40):
             on_disk(live)
         if moment == 20:
-            live.recorder.recording._file = io.TextIOWrapper(io.BufferedWriter(FullDisk()))
+            live.recorder._file = io.TextIOWrapper(io.BufferedWriter(FullDisk()))
         step(live)
         live.after_frame()
     live.recorder.close({})
-    (notice,) = live.recorder.notices.take()
-    assert notice.text == "session: no longer written (No space left on device)"
-    assert live.recorder.recording.fault == "session: no longer written (No space left on device)"
+    live.recorder.notices.present()
+    assert capsys.readouterr().out == "session: no longer written (No space left on device)\n"
+    assert live.recorder.fault == "session: no longer written (No space left on device)"
     assert live.session.step_index == 50 and len(read_log(tmp_path / "session").poses) == 16
 
 
@@ -366,7 +364,7 @@ def refused(*arguments: Any) -> str:
 
 
 def test_a_session_names_no_path_and_is_written_over_none(tmp_path, ball):
-    paths = [recorded_at(tmp_path, ball).recording.path for _ in range(2)]
+    paths = [recorded_at(tmp_path, ball).path for _ in range(2)]
     assert [path.name for path in paths] == ["session-001.jsonl", "session-002.jsonl"]
     text = paths[0].read_text()
     assert not any(word in text for word in ("doe", ".stl", ".toml", ".nrrd", str(tmp_path)))
@@ -374,7 +372,7 @@ def test_a_session_names_no_path_and_is_written_over_none(tmp_path, ball):
 
 
 def test_a_session_is_refused_with_another_patient_and_with_options_of_its_own(tmp_path, ball):
-    path = recorded_at(tmp_path, ball).recording.path
+    path = recorded_at(tmp_path, ball).path
     assert "other anatomy" in refused("--replay", path)
     for option, value in (("--cell", 7), ("--probe", "linear"), ("--budget-ms", 5), ("--quality", "fast")):
         assert refused("--replay", path, option, value).startswith(f"nephron: {option}: a replay computes")
@@ -388,14 +386,14 @@ def test_a_session_is_refused_with_another_patient_and_with_options_of_its_own(t
 
 def test_the_scene_of_a_session_is_the_patients_with_all_else_as_recorded(tmp_path, ball):
     embedded = load_scene(EMBEDDED)
-    scene = scene_of_log(read_log(recorded_at(tmp_path, ball).recording.path).header, embedded)
+    scene = scene_of_log(read_log(recorded_at(tmp_path, ball).path).header, embedded)
     assert scene.tissue.cell_mm == 7.0 != embedded.tissue.cell_mm
     assert (scene.anatomy, scene.shape, scene.title) == (embedded.anatomy, embedded.shape, embedded.title)
 
 
 @pytest.mark.parametrize("own", [load_scene(EMBEDDED), Scene(anatomy={"phantom": True})])
 def test_what_a_session_says_of_a_patient_or_of_files_is_not_believed(tmp_path, ball, own):
-    header = read_log(recorded_at(tmp_path, ball).recording.path).header
+    header = read_log(recorded_at(tmp_path, ball).path).header
     planted = dict(title="another", anatomy=dict(phantom=False, organ="other.stl"), shape=[])
     planted["transducer"] = header.scene["transducer"] | dict(probe="other.toml", speed_mm_s=33.0)
     scene = scene_of_log(header.model_copy(update=dict(scene=header.scene | planted)), own)

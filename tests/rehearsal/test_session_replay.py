@@ -20,7 +20,7 @@ from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions import recorder
 from rehearsal.sessions.open_session import open_session
-from rehearsal.sessions.packed_coverage import pack_seen
+from rehearsal.sessions.packed_arrays import pack_seen
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session_file import Log, SessionError, read_log
 from rehearsal.tracking.pose_file import TimedPoses
@@ -97,7 +97,7 @@ def rehearsed(built, monkeypatch, out: Path, script: Any, log: Log | None = None
     # A budget that no step keeps: the ladder goes down.
     each = run.RehearsalRun(rehearsal, anatomy, "cpu", RehearseOptions(out=out, budget_ms=0.01, at=at_s))
     each.in_window(log)
-    return viewer.seen, rehearsal.digest(), each.recorder and read_log(each.recorder.recording.path)
+    return viewer.seen, rehearsal.digest(), each.recorder and read_log(each.recorder.path)
 
 
 def user(settings: Settings, frames: int = 150) -> Iterator[Controls]:
@@ -204,7 +204,7 @@ def test_a_tracked_file_is_followed_headless_and_replayed(built, monkeypatch, tm
     asked = RehearseOptions(out=tmp_path, budget_ms=0.01)
     tracked = run.RehearsalRun(rehearsal, anatomy, "cpu", asked, track)
     tracked.headless(None, 0.0)
-    log = read_log(tracked.recorder.recording.path)
+    log = read_log(tracked.recorder.path)
     assert len(log.poses) == 31 and probe_in_patient(rehearsal) == pytest.approx(poses[-1])
     told = [event.value for events in log.events.values() for event in events if event.kind == "solver"]
     assert len({values["iterations"] for values in told if "iterations" in values}) == 1

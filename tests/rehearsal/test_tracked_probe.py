@@ -1,6 +1,7 @@
 """A tracked probe as input: the transducer follows, stays and waits; pose files; reproducibility."""
 
 import json
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,10 +20,10 @@ from rehearsal.inputs.user_input import UserInput
 from rehearsal.sessions.recorder import SessionRecorder
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session import Session
-from rehearsal.sessions.session_file import Recording, read_log
+from rehearsal.sessions.session_file import read_log
 from rehearsal.tracking.pose_file import PoseError, TimedPoses
 from rehearsal.tracking.track_file import check_near, load_track
-from rehearsal.tracking.tracked_probe import PosePlayback, TrackEnded, has_moved, pose_at_time
+from rehearsal.tracking.tracked_probe import TrackEnded, has_moved, played_pose
 from render.viewer import Controls, Settings
 from ultrasound.probe_manipulator import image_plane
 from ultrasound.sweep import SweepError
@@ -60,7 +61,7 @@ def placed(x: float, y: float = 0.0, tilt_deg: float = 0.0) -> np.ndarray:
 
 
 def live_of(tracker: Any) -> UserInput:
-    return UserInput(Session(Patient()), AdaptiveIterations(1e6), tracked=tracker)
+    return UserInput(Session(Patient()), AdaptiveIterations(1e6), tracked=tracker.pose)
 
 
 def at(live: UserInput) -> np.ndarray:
@@ -151,7 +152,7 @@ def test_after_an_undo_or_reset_it_stays_until_the_tracked_probe_moves():
 
 def test_one_that_takes_over_waits_as_well():
     tracker = Tracker(placed(5.0))
-    live = UserInput(Session(Patient()), AdaptiveIterations(1e6), waits=True, tracked=tracker)
+    live = UserInput(Session(Patient()), AdaptiveIterations(1e6), waits=True, tracked=tracker.pose)
     begun = at(live)
     assert np.array_equal(steps(live, 3), begun)
     tracker.now = placed(9.0)
@@ -187,7 +188,7 @@ def test_poses_are_interpolated_in_position_and_angle():
     track = way()
     for time, share in ((0.0, 0.0), (0.25, 1.0), (0.1, 0.4), (1.1, 4.4), (2.0, 8.0), (5.0, 8.0)):
         expected = placed(1.5 * share - 6.0, tilt_deg=4.0 * share)
-        assert pose_at_time(track, time) == pytest.approx(expected), time
+        assert track.at(time) == pytest.approx(expected), time
 
 
 def test_next_to_a_frame_that_is_lost_the_pose_is_lost():
@@ -203,14 +204,14 @@ def test_next_to_a_frame_that_is_lost_the_pose_is_lost():
         1.76: False,
         2.0: False,
     }
-    assert {time: pose_at_time(track, time) is not None for time in known} == known
+    assert {time: track.at(time) is not None for time in known} == known
     alone = TimedPoses(np.array([7.0]), [placed(1.0)])
-    assert np.array_equal(pose_at_time(alone, 0.0), placed(1.0))
+    assert np.array_equal(alone.at(0.0), placed(1.0))
 
 
 def test_a_file_is_played_at_the_sessions_time_and_then_the_user_is_the_input():
     session = Session(Patient())
-    live = UserInput(session, AdaptiveIterations(1e6), tracked=PosePlayback(way(), session))
+    live = UserInput(session, AdaptiveIterations(1e6), tracked=partial(played_pose, way(), session))
     places = [at(live) for _ in range(17) if step(live) is not None]
     # From the second on the transducer keeps up: 6 mm/s.
     assert places[-1] == pytest.approx(placed(6.0, tilt_deg=32.0)) and places[9] == pytest.approx(
@@ -230,29 +231,29 @@ def test_a_file_is_played_at_the_sessions_time_and_then_the_user_is_the_input():
 
 def test_time_continues_through_resets():
     session = Session(Patient())
-    played = PosePlayback(way(), session)
+    played = partial(played_pose, way(), session)
     live = UserInput(session, AdaptiveIterations(1e6), tracked=played)
     steps(live, 6)
     for _ in range(4):
         step(live, reset=True)
-    assert np.array_equal(played.pose(), pose_at_time(way(), 10 * STEP_S))
+    assert np.array_equal(played(), way().at(10 * STEP_S))
     # 0.57 - 0.07 is less than a half by rounding.
-    half = PosePlayback(TimedPoses(np.array([0.07, 0.57]), [placed(0.0), placed(1.0)]), Session(Patient()))
-    half.session.step_index = 4
-    assert half.poses.length_s < 0.5 and np.array_equal(half.pose(), placed(1.0))
+    half, other = TimedPoses(np.array([0.07, 0.57]), [placed(0.0), placed(1.0)]), Session(Patient())
+    other.step_index = 4
+    assert half.length_s < 0.5 and np.array_equal(played_pose(half, other), placed(1.0))
     session.step_index = 16
-    assert isinstance(played.pose(), np.ndarray)
+    assert isinstance(played(), np.ndarray)
     session.step_index = 17
     with pytest.raises(TrackEnded):
-        played.pose()
+        played()
 
 
 def recorded(path: Path) -> str:
     """A tracked session recorded in a file; the tissue's digest at its end."""
     session = Session(Patient())
-    played = PosePlayback(way(25, lost=(5, 6, 13)), session)
+    played = partial(played_pose, way(25, lost=(5, 6, 13)), session)
     live = UserInput(
-        session, AdaptiveIterations(1e6), SessionRecorder(session, Recording(path, header())), tracked=played
+        session, AdaptiveIterations(1e6), SessionRecorder(session, path, header()), tracked=played
     )
     for moment in range(60):
         step(live, ray=ray(2.0), undo=moment == 30, reset=moment == 40, press=moment > 52)

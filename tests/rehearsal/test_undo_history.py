@@ -12,8 +12,7 @@ import trimesh
 from rehearsal.adaptive_iterations import AdaptiveIterations
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.rehearsal import RehearsalState
-from rehearsal.sessions.session import SETTLED, Session
-from rehearsal.sessions.undo_history import MOST_UNDONE, History
+from rehearsal.sessions.session import MOST_UNDONE, SETTLED, History, Session
 from render.viewer import Controls, Settings
 from scenes.tissue import NeoHookeanTissue
 from sim.body import BodyState
@@ -56,7 +55,7 @@ class Numbers:
 
     def restore(self, state: RehearsalState) -> None:
         self.position, self.velocity = state.solver.body.position, state.solver.body.velocity
-        self.contacts, self.watch = state.solver.contacts, state.watch
+        self.contacts, self.watch = state.solver.contacts, state.divergence
         self.pose, self.steps, self.manipulator.state = state.pose, state.steps, state.manipulator
 
     def advance(self, pose: np.ndarray) -> None:
@@ -264,7 +263,7 @@ def step(live: UserInput, step_ms: float = 0.0, **did: Any) -> np.ndarray | None
 
 def shown(live: UserInput) -> str:
     """The notices since the last call."""
-    return "".join(notice.text for notice in live.notices.take())
+    return "".join(live.notices.present())
 
 
 def ray(x_mm: float) -> tuple[np.ndarray, np.ndarray]:
@@ -339,12 +338,12 @@ def test_the_iterations_that_were_done_are_recorded_not_those_asked_for():
     assert live.status == "REDUCED ITERATIONS   3 of 10"
 
 
-def test_a_step_that_is_too_slow_is_said_once():
+def test_a_step_that_is_too_slow_is_said_once(capsys):
     live = UserInput(Session(Numbers()), AdaptiveIterations(5.0))
     live.next_pose(Controls(Settings(young_kpa=15.0, iterations=8)))
     for _ in range(21):
         live.after_step(9.0)
-    assert [notice.text for notice in live.notices.take()] == ["REDUCED ITERATIONS   6 of 8"]
+    assert live.notices.present() == [] and capsys.readouterr().out == "REDUCED ITERATIONS   6 of 8\n"
 
 
 def test_only_what_changes_is_told():

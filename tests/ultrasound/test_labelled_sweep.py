@@ -15,6 +15,7 @@ from conftest import rotation_about
 
 import app
 from rehearsal.coordinates import probe_in_patient
+from rehearsal.notices import Notices
 from rehearsal.reconstruction import compression_correction
 from rehearsal.reconstruction.compression_correction import CompressionCorrection
 from rehearsal.reconstruction.sweep_volumes import image_poses_of
@@ -64,6 +65,25 @@ def recording(pixels: int = 24) -> tuple[SimpleNamespace, SimpleNamespace]:
     return rehearsal, view
 
 
+class Recording(SweepRecorder):
+    """A recorder whose methods return what they tell the user."""
+
+    def __init__(self, rehearsal: SimpleNamespace) -> None:
+        super().__init__(rehearsal, Notices())
+
+    def watch(self, *given) -> str:
+        super().watch(*given)
+        return "".join(self.notices.present())
+
+    def toggle(self, out: Path) -> str:
+        super().toggle(out)
+        return "".join(self.notices.present())
+
+    def stop(self) -> str:
+        self.end()
+        return "".join(self.notices.present())
+
+
 def moved_on(rehearsal: SimpleNamespace, by_mm: float) -> None:
     rehearsal.pose = rehearsal.pose.copy()
     rehearsal.pose[:3, 3] += by_mm * rehearsal.pose[:3, 1]
@@ -71,8 +91,8 @@ def moved_on(rehearsal: SimpleNamespace, by_mm: float) -> None:
 
 def test_a_recorded_sweep_gives_the_position_of_each_pixel(tmp_path):
     rehearsal, view = recording()
-    sweeping, places, pictures = SweepRecorder(rehearsal), [], []
-    assert sweeping.watch(0.0, view, rehearsal.probe) == "" and sweeping.end() == ""
+    sweeping, places, pictures = Recording(rehearsal), [], []
+    assert sweeping.watch(0.0, view, rehearsal.probe) == "" and sweeping.stop() == ""
     assert sweeping.toggle(tmp_path) == "sweep-001: {sweep} ends it"
     for step in range(8):
         # A step of 1/60 s: every other is a frame, the first among them.
@@ -104,13 +124,13 @@ def test_a_recorded_sweep_gives_the_position_of_each_pixel(tmp_path):
     # Times of a sweep are those of the rehearsal, and a new one begins at once, whenever the last ended.
     assert sweeping.toggle(tmp_path) == "sweep-002: {sweep} ends it"
     sweeping.watch(1.0, view, rehearsal.probe)
-    assert sweeping.end() == "sweep-002.igs.mha: 1 images"
+    assert sweeping.stop() == "sweep-002.igs.mha: 1 images"
     assert read_sweep(tmp_path / "sweep-002.igs.mha").times_s == [1.0]
 
 
 def test_the_length_of_a_sweep_is_shown_while_it_is_recorded(tmp_path):
     rehearsal, view = recording()
-    sweeping = SweepRecorder(rehearsal)
+    sweeping = Recording(rehearsal)
     said = []
     for first in (100.0, 200.0):
         said.append(sweeping.status)
@@ -125,11 +145,11 @@ def test_the_length_of_a_sweep_is_shown_while_it_is_recorded(tmp_path):
 
 
 def test_sweeps_are_numbered_after_the_last(tmp_path):
-    sweeping = SweepRecorder(recording()[0])
+    sweeping = Recording(recording()[0])
     for name in ("sweep-004.igs.mha", "sweep-009-marks.igs.mha", "sweep-x.igs.mha", "sweep-0.igs.mha"):
         (tmp_path / name).touch()
     assert sweeping.toggle(tmp_path).startswith("sweep-005:")
-    sweeping.end()
+    sweeping.stop()
     for name in ("sweep-999", "sweep-1000"):
         (tmp_path / f"{name}.igs.mha").touch()
     assert sweeping.toggle(tmp_path).startswith("sweep-1001:")
@@ -137,9 +157,9 @@ def test_sweeps_are_numbered_after_the_last(tmp_path):
 
 def test_a_sweep_without_frames_or_ct_leaves_words_and_no_file(tmp_path):
     rehearsal, _ = recording()
-    sweeping = SweepRecorder(rehearsal)
+    sweeping = Recording(rehearsal)
     sweeping.toggle(tmp_path)
-    assert sweeping.end() == "No sweep: a sweep without frames"
+    assert sweeping.stop() == "No sweep: a sweep without frames"
     assert "cannot be written: No such file" in sweeping.toggle(tmp_path / "none")
     rehearsal.scanner = None
     assert sweeping.toggle(tmp_path) == "No sweep: the scene has no CT"
@@ -151,7 +171,7 @@ def test_a_full_disk_ends_a_sweep_in_words_and_leaves_nothing(tmp_path, marks_to
     rehearsal, view = recording(pixels=256)
     if marks_too:
         rehearsal.scanner.ground_truth.render = lambda: view.pictures["B-mode"]
-    sweeping = SweepRecorder(rehearsal)
+    sweeping = Recording(rehearsal)
     sweeping.toggle(tmp_path)
     with bytes_to_a_file(150_000):
         # Noise: 65 kB each, of which two have room.
@@ -160,12 +180,12 @@ def test_a_full_disk_ends_a_sweep_in_words_and_leaves_nothing(tmp_path, marks_to
     assert list(tmp_path.iterdir()) == []
     sweeping.toggle(tmp_path)
     sweeping.watch(0.0, view, rehearsal.probe)
-    assert sweeping.end() == "sweep-001.igs.mha: 1 images"
+    assert sweeping.stop() == "sweep-001.igs.mha: 1 images"
 
 
 def test_a_picture_of_another_size_ends_a_sweep_with_what_there_is(tmp_path):
     rehearsal, view = recording()
-    sweeping = SweepRecorder(rehearsal)
+    sweeping = Recording(rehearsal)
     sweeping.toggle(tmp_path)
     sweeping.watch(0.0, view, rehearsal.probe)
     view.pictures["B-mode"] = np.zeros((8, 8), np.uint8)

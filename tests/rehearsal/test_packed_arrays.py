@@ -12,8 +12,8 @@ import pytest
 from test_undo_history import STEP_S, Numbers
 
 from rehearsal.measurements.session_summary import SessionCourse, summary_text
-from rehearsal.sessions import packed_state
-from rehearsal.sessions.packed_state import StateError, from_text, to_text
+from rehearsal.sessions import packed_arrays
+from rehearsal.sessions.packed_arrays import StateError, pack_state, unpack_state
 from ultrasound.coverage import Gap
 from ultrasound.probe_manipulator import ManipulatorState
 
@@ -36,7 +36,9 @@ def test_a_state_as_text_keeps_every_bit(aim):
     numbers.velocity = np.array([[-0.0, 1e-45, np.inf], [np.nan, 1 / 3, -7]], np.float32)
     numbers.manipulator.state = ManipulatorState(0.1, 2.3, (1 / 3, -4.0, 5.0), aim)
     before = numbers.snapshot()
-    pairs = list(zip(arrays_of(before), arrays_of(from_text(to_text(before), numbers.settled)), strict=True))
+    pairs = list(
+        zip(arrays_of(before), arrays_of(unpack_state(pack_state(before), numbers.settled)), strict=True)
+    )
     # Now and when last good: position, velocity and contacts; the watch's three; pose, steps; the hand's four.
     assert len(pairs) == 2 * 3 + 3 + 2 + 4
     assert all(old.dtype == new.dtype and old.tobytes() == new.tobytes() for old, new in pairs)
@@ -50,7 +52,7 @@ def packed(**arrays: np.ndarray) -> str:
 
 def test_what_is_no_state_of_this_body_is_refused(monkeypatch):
     numbers, random = Numbers(), np.random.default_rng(0)
-    text = to_text(numbers.snapshot())
+    text = pack_state(numbers.snapshot())
     whole = base64.b64decode(text)
     arrays = dict(np.load(io.BytesIO(whole)))
     hostile = ["", "no state", text[:-40], packed(), packed(**arrays | {"pose": np.full((4, 4), np.nan)})]
@@ -64,24 +66,24 @@ def test_what_is_no_state_of_this_body_is_refused(monkeypatch):
         members.writestr("pose.npy", npy.getvalue())
     for each in [*hostile, base64.b64encode(huge.getvalue()).decode()]:
         with pytest.raises(StateError, match=r"^[^\n]+$"):
-            from_text(each, numbers.settled)
+            unpack_state(each, numbers.settled)
     for _ in range(300):
         flipped = bytearray(whole)
         flipped[random.integers(len(whole))] ^= 1 << random.integers(8)
         with suppress(StateError):
-            assert to_text(from_text(base64.b64encode(flipped).decode(), numbers.settled)) == text
-    monkeypatch.setattr(packed_state, "MOST_BYTES", 500)
+            assert pack_state(unpack_state(base64.b64encode(flipped).decode(), numbers.settled)) == text
+    monkeypatch.setattr(packed_arrays, "MOST_BYTES", 500)
     with pytest.raises(StateError, match="too large"):
-        from_text(text, numbers.settled)
+        unpack_state(text, numbers.settled)
 
 
 def test_a_course_counts_presses_ways_and_time_over_the_limit():
-    course = SessionCourse(warning_mm=8.0, step_s=STEP_S)
+    course = SessionCourse(compression_warning_mm=8.0, step_s=STEP_S)
     pose = np.eye(4)
     # Squeezed over 1 mm is a press, until it is less than 0.5 mm.
     for compression_mm in (0.0, 1.0, 1.1, 0.6, 1.2, 0.5, 0.9, 1.5, 9.0, 8.0, 8.5):
         course.add(pose, compression_mm)
-    assert (course.presses, course.compression_mm, course.too_deep_s) == (2, 9.0, 2 * STEP_S)
+    assert (course.presses, course.compression_max_mm, course.over_warning_s) == (2, 9.0, 2 * STEP_S)
     assert course.path_mm == course.fastest_mm_s == 0.0
     for at_mm in ([3.0, 4.0, 0.0], [3.0, 4.0, 1.0], None, [90.0, 0.0, 0.0], [90.0, 0.0, 2.0]):
         pose[:3, 3] = at_mm or 0.0

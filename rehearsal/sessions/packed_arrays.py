@@ -1,0 +1,169 @@
+"""Arrays as text for a session's file, without loss of bits: poses, the coverage, and whole states of a rehearsal."""
+
+import base64
+import io
+import math
+import struct
+import zipfile
+import zlib
+from dataclasses import asdict
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import AfterValidator, ConfigDict, Field, with_config
+from typing_extensions import TypedDict
+
+from rehearsal.rehearsal import RehearsalState
+from sim.body import BodyState
+from sim.divergence_check import DivergenceState
+from sim.solver import SolverState
+from ultrasound.probe_manipulator import ManipulatorState
+
+# Of a pose, all but its last row.
+NUMBERS = 12
+# A second has fewer steps; a grid of 1.5 mm over half a metre fewer voxels; all arrays of a body of a million particles fewer bytes.
+MOST_STEPS, MOST_VOXELS, MOST_BYTES = 1_000_000, 100_000_000, 1 << 30
+
+# What NumPy and zipfile raise for unreadable data.
+UNREADABLE = (
+    *(ValueError, LookupError, TypeError, RuntimeError, OSError, EOFError, MemoryError),
+    *(zipfile.BadZipFile, zlib.error, struct.error),
+)
+
+
+class StateError(ValueError):
+    """A text that is no state of this body."""
+
+
+@with_config(ConfigDict(extra="forbid", strict=True))
+class SeenVoxels(TypedDict):
+    """``shape``: voxels along x, y and z. ``bits``: one for each, the last axis fastest; packed, zipped, as base64."""
+
+    shape: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=3, max_length=3)]
+    bits: str
+
+
+def _packed(array: np.ndarray) -> str:
+    return _as_text(zlib.compress(array.tobytes()))
+
+
+def _as_text(content: bytes) -> str:
+    return base64.b64encode(content).decode("ascii")
+
+
+def _unpacked(text: str, most: int) -> bytes:
+    """At most so many bytes of a text. Raises ValueError."""
+    unzip = zlib.decompressobj()
+    try:
+        content = unzip.decompress(base64.b64decode(text, validate=True), most)
+    except zlib.error as error:
+        raise ValueError(str(error)) from None
+    if not unzip.eof:
+        raise ValueError("a packed array that is cut off or too long")
+    return content
+
+
+def pack_poses(poses: list[np.ndarray | None]) -> str:
+    """Poses (4, 4), or None for a rollback."""
+    rows = np.full((len(poses), NUMBERS), np.nan)
+    for row, pose in zip(rows, poses, strict=True):
+        if pose is not None:
+            row[:] = np.asarray(pose, float)[:3].ravel()
+    return _packed(rows.astype("<f8"))
+
+
+def unpack_poses(text: str) -> np.ndarray:
+    """Poses (n, 4, 4), NaN for a rollback. Raises ValueError."""
+    rows = np.frombuffer(_unpacked(text, MOST_STEPS * NUMBERS * 8), "<f8").reshape(-1, NUMBERS)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = rows.reshape(-1, 3, 4)
+    if np.isinf(poses).any():
+        raise ValueError("a pose that is not finite")
+    return poses
+
+
+def pack_seen(seen: np.ndarray) -> SeenVoxels:
+    """Which voxels (nx, ny, nz) were imaged."""
+    return SeenVoxels(shape=list(seen.shape), bits=_packed(np.packbits(seen)))
+
+
+def unpack_seen(packed: SeenVoxels) -> np.ndarray:
+    """Which voxels (nx, ny, nz) were imaged. Raises ValueError."""
+    count = math.prod(packed["shape"])
+    if count > MOST_VOXELS:
+        raise ValueError(f"{count} voxels, expected at most {MOST_VOXELS}")
+    octets = _unpacked(packed["bits"], -(-count // 8) + 1)
+    if len(octets) != -(-count // 8):
+        raise ValueError(f"bits of other than its {count} voxels")
+    voxels = np.unpackbits(np.frombuffer(octets, np.uint8), count=count)
+    return voxels.view(bool).reshape(packed["shape"])
+
+
+def _unpackable(packed: SeenVoxels) -> SeenVoxels:
+    unpack_seen(packed)
+    return packed
+
+
+# As a file has it.
+Seen = Annotated[SeenVoxels, AfterValidator(_unpackable)]
+
+
+def pack_state(state: RehearsalState) -> str:
+    """A whole state."""
+    watch = state.divergence
+    now, good = _of_solver("now", state.solver), _of_solver("good", watch.good)
+    arrays: dict[str, Any] = {
+        **now,
+        **({} if all(map(np.array_equal, now.values(), good.values())) else good),
+        "pose": state.pose,
+        **{f"grip.{name}": value for name, value in asdict(state.manipulator).items() if value is not None},
+        "numbers": [state.steps, watch.steps_since_good, watch.steps_tangled, watch.is_restored],
+    }
+    packed = io.BytesIO()
+    np.savez_compressed(packed, allow_pickle=False, **arrays)
+    return _as_text(packed.getvalue())
+
+
+def unpack_state(text: str, like: RehearsalState) -> RehearsalState:
+    """A state of the same body as ``like``. Raises StateError."""
+    try:
+        packed = zipfile.ZipFile(io.BytesIO(base64.b64decode(text, validate=True)))
+        if sum(member.file_size for member in packed.infolist()) > MOST_BYTES:
+            raise StateError("a state that is too large")
+        arrays = dict(np.load(io.BytesIO(packed.fp.getvalue()), allow_pickle=False))  # type: ignore[union-attr]
+        now = _solver(arrays, "now", like.solver)
+        steps, since_good, tangled, restored = map(int, arrays["numbers"])
+        good = _solver(arrays, "good", like.solver) if "good.position" in arrays else now
+        watch = DivergenceState(good, since_good, tangled, bool(restored))
+        turn = tuple(map(float, arrays["grip.turn_deg"].reshape(3)))
+        depth, pressed = float(arrays["grip.depth_mm"]), float(arrays["grip.pressed_mm"])
+        aim = _pose(arrays, "grip.aim") if "grip.aim" in arrays else None
+        grip = ManipulatorState(depth, pressed, turn, aim)  # type: ignore[arg-type]
+        pose = _pose(arrays, "pose")
+    except UNREADABLE as error:
+        what = str(error) or type(error).__name__
+        raise StateError(f"a state that cannot be used ({what.splitlines()[0]})") from None
+    return RehearsalState(now, watch, pose, steps, grip)
+
+
+def _pose(arrays: dict[str, np.ndarray], name: str) -> np.ndarray:
+    pose = arrays[name]
+    if pose.shape != (4, 4) or pose.dtype != float or not np.isfinite(pose).all():
+        raise StateError(f"{name} is no pose")
+    return pose
+
+
+def _of_solver(name: str, state: SolverState) -> dict[str, np.ndarray]:
+    contacts = {f"{name}.contacts.{key}": values for key, values in state.contacts.items()}
+    return {f"{name}.position": state.body.position, f"{name}.velocity": state.body.velocity} | contacts
+
+
+def _solver(arrays: dict[str, np.ndarray], name: str, like: SolverState) -> SolverState:
+    def taken(key: str, model: np.ndarray) -> np.ndarray:
+        values = arrays[f"{name}.{key}"]
+        if values.shape != model.shape or values.dtype != model.dtype:
+            raise StateError(f"{key} of {values.dtype} {values.shape}: expected {model.dtype} {model.shape}")
+        return values
+
+    body = BodyState(taken("position", like.body.position), taken("velocity", like.body.velocity))
+    return SolverState(body, {key: taken(f"contacts.{key}", old) for key, old in like.contacts.items()})
