@@ -4,10 +4,9 @@ from typing import Any
 
 import numpy as np
 import taichi as ti
-import taichi.math as tm
 
 from sim.fields import field_of
-from ultrasound.image_plane import Picture, PlaneInTissue
+from ultrasound.image_plane import Image, PlaneInTissue
 from ultrasound.sampled_volume import SampledVolume
 from ultrasound.sweep import PixelLabel
 
@@ -41,14 +40,14 @@ class GroundTruthLabels:
 
     def render(self) -> np.ndarray:
         """Return labels (pixels, pixels) uint8."""
-        picture = np.empty((self.plane.pixels, self.plane.pixels), np.uint8)
-        self._render(self.plane.pixel_mm, self.plane.first_mm, picture)
-        return picture
+        image = np.empty((self.plane.pixels, self.plane.pixels), np.uint8)
+        self._render(image)
+        return image
 
     @ti.kernel
-    def _render(self, pixel_mm: tm.vec2, first_mm: tm.vec2, picture: Picture):
+    def _render(self, image: Image):
         for row, column in ti.ndrange(self.plane.pixels, self.plane.pixels):
-            rest = self.plane.rest_at(row, column, pixel_mm, first_mm)
+            rest = self.plane.rest_at(row, column, self.plane.grid[0], self.plane.grid[1])
             label = ti.cast(PixelLabel.OUTSIDE, ti.i32)
             if self.plane.is_tissue(row, column):
                 if self.organ.sample(rest) < 0.0:
@@ -60,4 +59,4 @@ class GroundTruthLabels:
                     for k in range(self.beads):
                         if (rest - self.bead[k]).norm_sqr() < self.radius_mm**2:
                             label = label % PixelLabel.BEAD + PixelLabel.BEAD * (k + 1)
-            picture[row, column] = ti.cast(label, ti.u8)
+            image[row, column] = ti.cast(label, ti.u8)

@@ -9,8 +9,9 @@ import trimesh
 from trimesh.intersections import mesh_plane
 
 from sim.embedding import Embedding, Unmoved
+from sim.fields import array_of, fill
 
-Picture = ti.types.ndarray(ti.u8, ndim=2)
+Image = ti.types.ndarray(ti.u8, ndim=2)
 # Pixels of a row that are computed together (SIMD).
 LANES = 8
 Lanes = ti.types.vector(LANES, ti.f32)
@@ -34,27 +35,30 @@ class ImagePlane:
 class PlaneInTissue:
     """The tetrahedron of an embedding that contains each of ``pixels`` x ``pixels`` pixels of an image plane.
 
-    ``owner`` (rows, columns) is its index, since the last ``locate``.
+    ``owner`` (rows, columns) is its index, since the last ``locate``; ``grid`` are the size of a pixel and the centre (u, v) of the
+    first one [mm].
     """
 
     def __init__(self, embedding: Embedding | Unmoved, pixels: int) -> None:
         self.embedding = embedding
         self.pixels = pixels
         self.owner = ti.field(ti.i32, (pixels, pixels))
+        self.grid = ti.Vector.field(2, ti.f32, 2)
 
     def locate(self, plane: ImagePlane) -> None:
-        """Find the tissue on a plane; the embedding must be up to date. Sets pixel size and first pixel's centre [mm]."""
+        """Find the tissue on a plane; the embedding must be up to date."""
         pixel = np.array([plane.width_mm, plane.depth_mm]) / self.pixels
         first = np.array([-plane.width_mm / 2, -plane.above_mm]) + pixel / 2
-        self.pixel_mm, self.first_mm = ti.Vector(pixel.tolist()), ti.Vector(first.tolist())
-        world = _matrix(plane.world_from_plane)
-        inverse = _matrix(np.linalg.inv(plane.world_from_plane))
-        self.embedding.locate_on_plane(inverse, world, self.pixel_mm, self.first_mm, self.owner)
+        fill((self.grid, np.stack([pixel, first])))
+        matrices = np.linalg.inv(plane.world_from_plane), plane.world_from_plane, pixel, first
+        self.embedding.locate_on_plane(
+            *(ti.Matrix(np.asarray(each, float).tolist()) for each in matrices), self.owner
+        )
 
     def rest_grid(self, count: int) -> np.ndarray:
         """Return rest positions (rows, columns, 3) [mm] at count x count points evenly over the plane."""
         places = np.empty((count, count, 3), np.float32)
-        self._rest_grid(self.pixel_mm, self.first_mm, places)
+        self._rest_grid(*(tm.vec2(*each) for each in array_of(self.grid)), places)
         return places
 
     @ti.kernel
@@ -68,13 +72,13 @@ class PlaneInTissue:
 
     @ti.func
     def rest_at(self, row, column, pixel_mm, first_mm):
-        """Return the rest position of the tissue at a pixel's centre [mm]."""
+        """Return the rest position of the tissue at a pixel's centre [mm]; the last two are ``grid``."""
         linear = self.embedding.rest_from_plane[self.owner[row, column]]
         u, v = first_mm.x + column * pixel_mm.x, first_mm.y + row * pixel_mm.y
         return linear[:, 0] * u + linear[:, 1] * v + linear[:, 3]
 
     @ti.func
-    def rest_lanes(self, row, first, pixel_mm, first_mm):
+    def rest_lanes(self, row, first):
         """As ``rest_at`` for LANES pixels of a row, axis by axis, and whether they are collinear at rest too.
 
         Pixels beyond the image repeat its last.
@@ -87,20 +91,20 @@ class PlaneInTissue:
             same &= self.owner[row, ti.min(first + lane, last)] == owner
         if same:
             # Most neighbours are in one tetrahedron, whose map keeps them on a line.
-            start = self.rest_at(row, first, pixel_mm, first_mm)
-            on = self.embedding.rest_from_plane[owner][:, 0] * pixel_mm.x
+            start = self.rest_at(row, first, self.grid[0], self.grid[1])
+            on = self.embedding.rest_from_plane[owner][:, 0] * self.grid[0].x
             steps = Lanes([float(lane) for lane in ti.static(range(LANES))])
             x, y, z = start.x + on.x * steps, start.y + on.y * steps, start.z + on.z * steps
         else:
             for lane in ti.static(range(LANES)):
-                rest = self.rest_at(row, ti.min(first + lane, last), pixel_mm, first_mm)
+                rest = self.rest_at(row, ti.min(first + lane, last), self.grid[0], self.grid[1])
                 x[lane], y[lane], z[lane] = rest.x, rest.y, rest.z
         return x, y, z, same
 
     @ti.func
-    def pixel_near(self, place, pixel_mm, first_mm):
+    def pixel_near(self, place):
         """Return row and column of the pixel nearest to (u, v) [mm]."""
-        at = ti.round((place - first_mm) / pixel_mm, ti.i32)
+        at = ti.round((place - self.grid[1]) / self.grid[0], ti.i32)
         return tm.clamp(at.y, 0, self.pixels - 1), tm.clamp(at.x, 0, self.pixels - 1)
 
     @ti.func
@@ -122,7 +126,3 @@ def plane_section(vertices: np.ndarray, faces: np.ndarray, plane_from_world: np.
     in_plane = vertices @ plane_from_world[:3, :3].T + plane_from_world[:3, 3]
     surface = trimesh.Trimesh(in_plane, faces, process=False)
     return mesh_plane(surface, plane_normal=[0.0, 0.0, 1.0], plane_origin=[0.0, 0.0, 0.0])[..., :2]
-
-
-def _matrix(values: np.ndarray) -> ti.Matrix:
-    return ti.Matrix(np.asarray(values, float).tolist())

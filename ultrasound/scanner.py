@@ -1,4 +1,7 @@
-"""The scanner: CT slice and B-mode image on the same image plane of a probe."""
+"""The scanner: CT slice and B-mode image on the same image plane of a probe.
+
+CT slice: image plane -> deformed tetrahedra -> voxels at rest (the paper's method).
+"""
 
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -6,19 +9,23 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+import taichi as ti
 import trimesh
 
 from sim.embedding import Embedding, Unmoved
 from ultrasound.acoustics import check_tissues, properties
 from ultrasound.bmode import BMode
-from ultrasound.ct_slice import CtSlice
 from ultrasound.ground_truth_labels import GroundTruthLabels
-from ultrasound.image_plane import ImagePlane, PlaneInTissue
+from ultrasound.image_plane import LANES, Image, ImagePlane, PlaneInTissue
 from ultrasound.probe import DetailLevel, Mode, Probe
-from ultrasound.sampled_volume import SampledVolume, distance_volume
+from ultrasound.sampled_volume import AIR_HU, SampledVolume, distance_volume
 
-# Impedance around the organ where the image does not show the CT there [MRayl].
-OUTSIDE_IMPEDANCE = {"background": None, "gel": 1.5, "air": 4e-4}
+# HU and impedance [MRayl] around the organ where the image does not show the CT there.
+OUTSIDE: dict[str, tuple[float, float | None]] = {
+    "background": (0.0, None),
+    "gel": (0.0, 1.5),
+    "air": (AIR_HU, 4e-4),
+}
 CT, B_MODE = "CT", "B-mode"
 IMAGES_OF_MODE: dict[Mode, tuple[str, ...]] = {"ct": (CT,), "b-mode": (B_MODE,), "both": (B_MODE, CT)}
 
@@ -51,11 +58,13 @@ def start_acoustics(anatomy: ScannedAnatomy) -> Future[np.ndarray]:
     return values
 
 
+@ti.data_oriented
 class Scanner:
     """Images of ``pixels`` x ``pixels`` of an anatomy that an embedding deforms.
 
-    ``outside`` see ``CtSlice``, ``contact`` and ``contact_gap_mm`` see ``BMode``. A mode is set up at its first image; ``acoustics``
-    are properties whose computation has already been started. Raises TissueError.
+    ``outside`` is what is shown outside the organ: ``background``, the CT around it, which deforms with the organ as far as the
+    embedding reaches; ``gel`` (0 HU); ``air`` (-1000 HU). ``contact`` and ``contact_gap_mm`` see ``BMode``. A mode is set up at its
+    first image; ``acoustics`` are properties whose computation has already been started. Raises TissueError.
     """
 
     def __init__(
@@ -74,42 +83,37 @@ class Scanner:
         self.embedding = embedding
         self.probe = probe
         self.plane = PlaneInTissue(embedding, pixels)
-        self.outside, self.contact, self.contact_gap_mm = outside, contact, contact_gap_mm
+        self.outside_hu, self.around = OUTSIDE[outside]
+        self.show_background = outside == "background"
+        self.contact, self.contact_gap_mm = contact, contact_gap_mm
         self._acoustics = acoustics
 
     @cached_property
-    def slice(self) -> CtSlice:
-        """The CT slice on the plane."""
-        ct = SampledVolume(self.anatomy.hu, self.anatomy.index_from_mm)
-        return CtSlice(ct, self._organ, self.plane, self.outside)
+    def ct(self) -> SampledVolume:
+        """HU at rest."""
+        return SampledVolume(self.anatomy.hu, self.anatomy.index_from_mm)
+
+    @cached_property
+    def organ(self) -> SampledVolume:
+        """Signed distance from the organ's surface at rest [mm], negative inside."""
+        return distance_volume(self.anatomy.organ)
 
     @cached_property
     def bmode(self) -> BMode:
         """The B-mode image of the plane."""
         values, self._acoustics = (self._acoustics or start_acoustics(self.anatomy)).result(), None
         tissue = SampledVolume(values, self.anatomy.index_from_mm, outside=0.0)
-        return BMode(
-            tissue,
-            self._organ,
-            self.plane,
-            self.probe,
-            float(self.anatomy.voxel_mm.mean()),
-            self.contact,
-            self.contact_gap_mm,
-            OUTSIDE_IMPEDANCE[self.outside],
-        )
+        voxel_mm = float(self.anatomy.voxel_mm.mean())
+        around = self.contact, self.contact_gap_mm, self.around
+        return BMode(tissue, self.organ, self.plane, self.probe, voxel_mm, *around)
 
     @cached_property
     def ground_truth(self) -> GroundTruthLabels:
         """The ground-truth labels of the plane."""
         tumour = self.anatomy.tumour
         return GroundTruthLabels(
-            self.plane, self._organ, None if tumour is None else distance_volume(tumour, 1.0)
+            self.plane, self.organ, None if tumour is None else distance_volume(tumour, 1.0)
         )
-
-    @cached_property
-    def _organ(self) -> SampledVolume:
-        return distance_volume(self.anatomy.organ)
 
     def locate(self, plane: ImagePlane) -> None:
         """Find the tissue on a plane, without an image."""
@@ -128,7 +132,41 @@ class Scanner:
         """Return the images of a plane in a mode by name, grey values (pixels, pixels) uint8, the main one first."""
         self.locate(plane)
         render = {
-            CT: lambda: self.slice.render(window_hu, level_hu),
+            CT: lambda: self.ct_slice(window_hu, level_hu),
             B_MODE: lambda: self.bmode.render(probe, detail_level),
         }
         return {name: render[name]() for name in IMAGES_OF_MODE[mode]}
+
+    def ct_slice(self, window_hu: float, level_hu: float) -> np.ndarray:
+        """Return grey values (pixels, pixels) uint8, 0 to 255 over the window, of the plane located last, at pixel centres."""
+        image = np.empty((self.plane.pixels, self.plane.pixels), np.uint8)
+        # Fields must exist before the kernel that reads them is compiled.
+        _ = self.ct, self.organ
+        self._window(window_hu, level_hu, image)
+        return image
+
+    @ti.kernel
+    def _window(self, window_hu: float, level_hu: float, image: Image):
+        for row, packet in ti.ndrange(self.plane.pixels, ti.static((self.plane.pixels + LANES - 1) // LANES)):
+            hu = self.hounsfield(row, packet * LANES)
+            grey = ti.min(ti.max((hu - level_hu) / window_hu + 0.5, 0.0), 1.0) * 255.0 + 0.5
+            for lane in ti.static(range(LANES)):
+                if packet * LANES + lane < self.plane.pixels:
+                    image[row, packet * LANES + lane] = ti.cast(grey[lane], ti.u8)
+
+    @ti.func
+    def hounsfield(self, row, first):
+        """Return HU of LANES pixels of a row."""
+        x, y, z, in_line = self.plane.rest_lanes(row, first)
+        hu = self.ct.sample_lanes(x, y, z, in_line)
+        if ti.static(not self.show_background):
+            for lane in ti.static(range(LANES)):
+                column = ti.min(first + lane, self.plane.pixels - 1)
+                if not self.in_organ(row, column, ti.Vector([x[lane], y[lane], z[lane]])):
+                    hu[lane] = self.outside_hu
+        return hu
+
+    @ti.func
+    def in_organ(self, row, column, rest):
+        """Whether the tissue of a pixel, at a rest position [mm], is of the organ."""
+        return self.plane.is_tissue(row, column) and self.organ.sample(rest) <= 0.0

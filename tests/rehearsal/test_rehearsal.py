@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 import trimesh
-from slicing import organ_mask
+from slicing import hounsfield, organ_mask
 
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import load_anatomy
@@ -72,9 +72,9 @@ def assert_at_rest_the_slice_is_the_ct(scene: Scene, folder: Path) -> None:
     rehearsal.pose = rehearsal.manipulator.pose()
     rehearsal.look(rehearsal.probe, *LOOK_AT_CT)
     plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], *rehearsal.probe.extent_mm)
-    cut = rehearsal.scanner.slice
+    cut = rehearsal.scanner
     inside = organ_mask(cut)
-    difference = np.abs(cut.hounsfield() - resampled(folder, plane, rehearsal.origin, scene.image.pixels))
+    difference = np.abs(hounsfield(cut) - resampled(folder, plane, rehearsal.origin, scene.image.pixels))
     print(f"mean {difference[inside].mean():.4f} HU, maximum {difference[inside].max():.3f} HU")
     assert inside.mean() > 0.1
     # The bar is 5 HU; float32 positions (1e-5 mm) in gradients of 500 HU/mm leave far less.
@@ -117,7 +117,7 @@ def test_a_pixel_shows_the_tissue_that_is_there_now(kept):
         rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
     rehearsal.look(rehearsal.probe, *LOOK_AT_CT)
     plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], *rehearsal.probe.extent_mm)
-    pixels = np.argwhere(organ_mask(rehearsal.scanner.slice))[::1009]
+    pixels = np.argwhere(organ_mask(rehearsal.scanner))[::1009]
     spacing = np.array([plane.width_mm, plane.depth_mm]) / rehearsal.scene.image.pixels
     local = (pixels[:, ::-1] + 0.5) * spacing - [plane.width_mm / 2, 0]
     shown_at = np.column_stack([local, np.zeros(len(local)), np.ones(len(local))]) @ plane.world_from_plane.T

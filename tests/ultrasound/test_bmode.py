@@ -248,8 +248,8 @@ def test_a_wire_is_drawn_as_wide_as_the_focus_makes_it(endless, focus_percent, t
     axial = 2 * 1.54 / 7.5 / 2 / FWHM
     u = probe.scanlines()[0][:, 0] - probe.scanlines()[0][LINES // 2, 0]
     profile = (u == 0).astype(float) if thin else np.exp(-0.5 * (u / axial) ** 2)
-    fill((endless.bmode.scanlines.real, np.repeat(profile[:, None], SAMPLES, axis=1)))
-    endless.bmode.scanlines.imaginary.fill(0.0)
+    fill((endless.bmode.real, np.repeat(profile[:, None], SAMPLES, axis=1)))
+    endless.bmode.imaginary.fill(0.0)
     endless.bmode._spread()
     for depth in (8.0, 16.0, 32.0, 56.0, 72.0):
         line = array_of(endless.bmode.decibel)[:, int(depth / 0.125)].astype(float)
