@@ -7,8 +7,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from render.actions import TILT_DEG_S, begin, hold
-from render.keys import BUTTONS
+from render.keys import BUTTONS, TILT_DEG_S, begin, hold
 from render.viewer import Controls
 
 SLIDE_MM_S = 40.0

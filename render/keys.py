@@ -1,4 +1,4 @@
-"""Assignment of keys and gamepad buttons to actions: the default, or a user's file."""
+"""Keys and gamepad buttons: their actions, what these change, and a user's own assignment."""
 
 import re
 import string
@@ -6,12 +6,14 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from errors import UserError, explained, meant
-from render.actions import ACTIONS, BY_MOUSE, HELD
-from render.viewer import KEY_MAP, KEY_MAP_ENTRIES
+from render.viewer import Controls
+from ultrasound.probe import DETAIL_LEVELS, MODES
+from ultrasound.target import TARGETS
 
 # A key as printed -> as GGUI names it. GGUI reports no digits and no punctuation.
 KEYS = {each: each.lower() for each in string.ascii_uppercase}
@@ -22,11 +24,63 @@ BUTTONS = (
     *("A", "B", "X", "Y", "Back", "Guide", "Start", "Left stick", "Right stick"),
     *("Left shoulder", "Right shoulder", "Pad up", "Pad down", "Pad left", "Pad right"),
 )
-_ALL_KEYS = {
-    action: key for line in KEY_MAP_ENTRIES for action, key in zip(line.actions, line.keys, strict=True)
+
+
+class KeyMapEntry(NamedTuple):
+    """A line of the key map: actions, each with its key as printed, and the text for the user."""
+
+    keys: dict[str, str]
+    text: str
+
+
+KEY_MAP = {
+    "Transducer": (
+        KeyMapEntry({"point": "Mouse"}, "move it over the organ"),
+        KeyMapEntry({"press": "Left button"}, "press it in, deeper the longer it is held"),
+        KeyMapEntry({"push": "W", "lift": "S"}, "push it in, lift it"),
+        KeyMapEntry({"rotate_left": "A", "rotate_right": "D"}, "rotate it about its axis"),
+        KeyMapEntry({"rock_left": "Q", "rock_right": "E"}, "rock it in the image plane, heel to toe"),
+        KeyMapEntry({"tilt_back": "Z", "tilt_forward": "C"}, "tilt it out of the image plane (fan)"),
+    ),
+    "View": (
+        KeyMapEntry({"orbit": "Right drag"}, "turn the view"),
+        KeyMapEntry({"pan": "Middle drag"}, "pan the view (also Shift + right drag)"),
+        KeyMapEntry({"zoom_in": "Up", "zoom_out": "Down"}, "zoom in and out"),
+        KeyMapEntry({"translucent": "T"}, "organ translucent or solid"),
+        KeyMapEntry({"cut": "X"}, "organ cut along the image plane"),
+        KeyMapEntry({"show_seen": "N"}, "coverage: imaged tissue in green"),
+    ),
+    "Image": (
+        KeyMapEntry({"mode": "B"}, "B-mode and CT, B-mode alone, CT alone"),
+        KeyMapEntry({"detail_level": "V"}, "detail level of the B-mode image"),
+        KeyMapEntry({"show_scanner": "G"}, "the scanner's sliders, with TGC"),
+        KeyMapEntry({"outline": "O"}, "outline of the tumour, now and in the CT"),
+        KeyMapEntry({"measure": "Click on image"}, "caliper from click to click, in mm; a third removes it"),
+        KeyMapEntry({"freeze": "F"}, "freeze and unfreeze"),
+        KeyMapEntry(
+            {"cine_back": "Left", "cine_forth": "Right"}, "while frozen: cine of the last ten seconds"
+        ),
+        KeyMapEntry({"export": "I"}, "save the image (PNG, DICOM) and the organ (PLY)"),
+    ),
+    "Plan": (
+        KeyMapEntry({"plan_for": "Space"}, "target: tumour and margin, tumour, kidney"),
+        KeyMapEntry({"plan": "Return"}, "plan a sweep of the target"),
+        KeyMapEntry({"next_plan": "Backspace"}, "stop planning; or show the next sweep, then none"),
+    ),
+    "Session": (
+        KeyMapEntry({"undo": "U", "redo": "Y"}, "undo the last press, turn or path; redo it"),
+        KeyMapEntry({"bookmark": "M", "to_bookmark": "J"}, "set a bookmark; return to bookmarks"),
+        KeyMapEntry({"sweep": "L"}, "start and stop recording a tracked sweep"),
+        KeyMapEntry({"take_over": "K"}, "take control from a replay or a tracked probe"),
+        KeyMapEntry({"reset": "R"}, "reset tissue, transducer and view"),
+        KeyMapEntry({"screenshot": "P"}, "save a screenshot of the window"),
+        KeyMapEntry({"help": "H"}, "show or hide this list"),
+        KeyMapEntry({"quit": "Esc"}, "quit"),
+    ),
 }
-DEFAULT_KEYS = {action: _ALL_KEYS[action] for action in ACTIONS}
-MOUSE = {action: _ALL_KEYS[action] for action in BY_MOUSE}
+_ALL = {action: key for group in KEY_MAP.values() for line in group for action, key in line.keys.items()}
+MOUSE = {action: place for action, place in _ALL.items() if place not in KEYS}
+DEFAULT_KEYS = {action: key for action, key in _ALL.items() if key in KEYS}
 DEFAULT_BUTTONS = {
     "freeze": "A",
     "undo": "B",
@@ -38,6 +92,23 @@ DEFAULT_BUTTONS = {
     "lift": "Pad down",
     "reset": "Start",
 }
+
+PUSH_MM_S, ROTATE_DEG_S, TILT_DEG_S = 15.0, 45.0, 30.0
+# Actions of held keys: the control that changes, and its rate per second.
+HELD = {
+    "push": ("push_mm", PUSH_MM_S),
+    "lift": ("push_mm", -PUSH_MM_S),
+    "rotate_left": ("rotate_deg", ROTATE_DEG_S),
+    "rotate_right": ("rotate_deg", -ROTATE_DEG_S),
+    "rock_left": ("rock_deg", TILT_DEG_S),
+    "rock_right": ("rock_deg", -TILT_DEG_S),
+    "tilt_back": ("tilt_deg", -TILT_DEG_S),
+    "tilt_forward": ("tilt_deg", TILT_DEG_S),
+}
+# The others act when the key goes down: cine steps, settings of several values, settings that are on or off, and controls with the
+# name of the action.
+STEPS = {"cine_back": -1, "cine_forth": 1}
+CYCLES = {"mode": MODES, "detail_level": DETAIL_LEVELS, "plan_for": TARGETS}
 # Actions of the 3D view itself.
 VIEW_ACTIONS = ("zoom_in", "zoom_out")
 
@@ -77,12 +148,11 @@ class Keys:
     def lines(self) -> dict[str, list[tuple[str, str]]]:
         """Return keys and texts of all actions by group, for the help."""
         return {
-            group: [(" / ".join(map(self._printed, line.actions, line.keys)), line.text) for line in lines]
+            group: [
+                (" / ".join(self.of.get(*usual) for usual in line.keys.items()), line.text) for line in lines
+            ]
             for group, lines in KEY_MAP.items()
         }
-
-    def _printed(self, action: str, usual: str) -> str:
-        return self.of.get(action, usual)
 
     def worded(self, text: str) -> str:
         """Return a text with actions in braces replaced by their keys: "{sweep} stops it"."""
@@ -101,9 +171,9 @@ def load_keys(path: Path) -> Keys:
     except ValidationError as error:
         raise KeysError(f"{path}: {explained(error, lambda _: SECTIONS)}") from None
     try:
-        buttons = [action for action in ACTIONS if action not in (*VIEW_ACTIONS, "help")]
+        buttons = [action for action in DEFAULT_KEYS if action not in (*VIEW_ACTIONS, "help")]
         return Keys(
-            _with("keys", given.keys, DEFAULT_KEYS, ACTIONS, KEYS),
+            _with("keys", given.keys, DEFAULT_KEYS, DEFAULT_KEYS, KEYS),
             _with("gamepad", given.gamepad, DEFAULT_BUTTONS, buttons, BUTTONS),
         )
     except KeysError as error:
@@ -116,8 +186,13 @@ def keys_text() -> str:
     head = HEAD.format(named=named, buttons=", ".join(BUTTONS))
     rows = []
     for group, lines in KEY_MAP.items():
-        keyed = [(action, line.text) for line in lines for action in line.actions if action in ACTIONS]
-        rows += [f"# {group}", *(f'{action} = "{DEFAULT_KEYS[action]}"  # {text}' for action, text in keyed)]
+        rows.append(f"# {group}")
+        rows += [
+            f'{action} = "{key}"  # {line.text}'
+            for line in lines
+            for action, key in line.keys.items()
+            if action in DEFAULT_KEYS
+        ]
     pad = [f'{action} = "{button}"' for action, button in DEFAULT_BUTTONS.items()]
     return "\n".join([head, "[keys]", *rows, "", "[gamepad]", *pad, ""])
 
@@ -133,7 +208,7 @@ def _with(
     printed = {place.lower(): place for place in places}
     chosen = dict(usual)
     for action, place in given.items():
-        if action in BY_MOUSE:
+        if action in MOUSE:
             raise KeysError(f"{section}.{action}: is an action of the mouse; leave it out")
         if action not in actions:
             raise KeysError(f"{section}.{action}: unknown action; {meant(action, actions)}")
@@ -149,3 +224,25 @@ def _with(
             raise KeysError(f"{section}: {taken[place]} and {action} are both on {place}; change one of them")
         taken[place] = action
     return chosen
+
+
+def hold(action: str, controls: Controls, seconds: float) -> None:
+    """Apply an action whose key was held for a time; ignore other actions."""
+    if action in HELD:
+        name, rate = HELD[action]
+        setattr(controls, name, getattr(controls, name) + rate * seconds)
+
+
+def begin(action: str, controls: Controls) -> None:
+    """Apply an action whose key went down; ignore held actions and those of the window itself."""
+    settings = controls.settings
+    if action in STEPS:
+        controls.cine += STEPS[action]
+    elif action in CYCLES:
+        values = CYCLES[action]
+        at = values.index(getattr(settings, action))
+        setattr(settings, action, values[(at + 1) % len(values)])
+    elif hasattr(settings, action):
+        setattr(settings, action, not getattr(settings, action))
+    elif hasattr(controls, action):
+        setattr(controls, action, True)

@@ -6,7 +6,7 @@ Lengths are in mm, angles in degrees, patient coordinates LPS. Nothing here need
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -16,72 +16,6 @@ from ultrasound.target import Target
 B_MODE, TGC = "B-mode", "TGC"
 # Groups of settings beside the image, as on a scanner.
 SCANNER_GROUPS = (B_MODE, TGC)
-
-
-class KeyMapEntry(NamedTuple):
-    """A line of the key map: ``keys`` as printed, names of ``actions``, ``text`` for the user."""
-
-    keys: tuple[str, ...]
-    actions: tuple[str, ...]
-    text: str
-
-
-KEY_MAP = {
-    "Transducer": (
-        KeyMapEntry(("Mouse",), ("point",), "move it over the organ"),
-        KeyMapEntry(("Left button",), ("press",), "press it in, deeper the longer it is held"),
-        KeyMapEntry(("W", "S"), ("push", "lift"), "push it in, lift it"),
-        KeyMapEntry(("A", "D"), ("rotate_left", "rotate_right"), "rotate it about its axis"),
-        KeyMapEntry(("Q", "E"), ("rock_left", "rock_right"), "rock it in the image plane, heel to toe"),
-        KeyMapEntry(("Z", "C"), ("tilt_back", "tilt_forward"), "tilt it out of the image plane (fan)"),
-    ),
-    "View": (
-        KeyMapEntry(("Right drag",), ("orbit",), "turn the view"),
-        KeyMapEntry(("Middle drag",), ("pan",), "pan the view (also Shift + right drag)"),
-        KeyMapEntry(("Up", "Down"), ("zoom_in", "zoom_out"), "zoom in and out"),
-        KeyMapEntry(("T",), ("translucent",), "organ translucent or solid"),
-        KeyMapEntry(("X",), ("cut",), "organ cut along the image plane"),
-        KeyMapEntry(("N",), ("show_seen",), "coverage: imaged tissue in green"),
-    ),
-    "Image": (
-        KeyMapEntry(("B",), ("mode",), "B-mode and CT, B-mode alone, CT alone"),
-        KeyMapEntry(("V",), ("detail_level",), "detail level of the B-mode image"),
-        KeyMapEntry(("G",), ("show_scanner",), "the scanner's sliders, with TGC"),
-        KeyMapEntry(("O",), ("outline",), "outline of the tumour, now and in the CT"),
-        KeyMapEntry(
-            ("Click on image",), ("measure",), "caliper from click to click, in mm; a third removes it"
-        ),
-        KeyMapEntry(("F",), ("freeze",), "freeze and unfreeze"),
-        KeyMapEntry(
-            ("Left", "Right"), ("cine_back", "cine_forth"), "while frozen: cine of the last ten seconds"
-        ),
-        KeyMapEntry(("I",), ("export",), "save the image (PNG, DICOM) and the organ (PLY)"),
-    ),
-    "Plan": (
-        KeyMapEntry(("Space",), ("plan_for",), "target: tumour and margin, tumour, kidney"),
-        KeyMapEntry(("Return",), ("plan",), "plan a sweep of the target"),
-        KeyMapEntry(("Backspace",), ("next_plan",), "stop planning; or show the next sweep, then none"),
-    ),
-    "Session": (
-        KeyMapEntry(("U", "Y"), ("undo", "redo"), "undo the last press, turn or path; redo it"),
-        KeyMapEntry(("M", "J"), ("bookmark", "to_bookmark"), "set a bookmark; return to bookmarks"),
-        KeyMapEntry(("L",), ("sweep",), "start and stop recording a tracked sweep"),
-        KeyMapEntry(("K",), ("take_over",), "take control from a replay or a tracked probe"),
-        KeyMapEntry(("R",), ("reset",), "reset tissue, transducer and view"),
-        KeyMapEntry(("P",), ("screenshot",), "save a screenshot of the window"),
-        KeyMapEntry(("H",), ("help",), "show or hide this list"),
-        KeyMapEntry(("Esc",), ("quit",), "quit"),
-    ),
-}
-KEY_MAP_ENTRIES = tuple(line for group in KEY_MAP.values() for line in group)
-
-
-def key_table() -> str:
-    """Return the key map as a Markdown table, for docs/keys.md."""
-    rows = ["| Key | What it does |", "| --- | --- |"]
-    for group, lines in KEY_MAP.items():
-        rows += [f"| **{group}** | |", *(f"| {' / '.join(line.keys)} | {line.text} |" for line in lines)]
-    return "\n".join(rows)
 
 
 def _slider(default, label: str, unit: str, low, high, group: str):

@@ -16,12 +16,11 @@ import numpy as np
 import taichi as ti
 from taichi.ui.utils import get_field_info
 
-from render.actions import begin, hold
 from render.background_image import BackgroundImage
 from render.camera import FIELD_OF_VIEW_DEG, OrbitCamera
 from render.display import display_available
 from render.gamepad import Gamepad
-from render.keys import Keys
+from render.keys import Keys, begin, hold
 from render.scene_view import SceneView
 from render.sliders import boxes_of, draw_sliders
 from render.viewer import Controls, Geometry, Settings, View

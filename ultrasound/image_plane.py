@@ -50,10 +50,9 @@ class PlaneInTissue:
         pixel = np.array([plane.width_mm, plane.depth_mm]) / self.pixels
         first = np.array([-plane.width_mm / 2, -plane.above_mm]) + pixel / 2
         fill((self.grid, np.stack([pixel, first])))
-        matrices = np.linalg.inv(plane.world_from_plane), plane.world_from_plane, pixel, first
-        self.embedding.locate_on_plane(
-            *(ti.Matrix(np.asarray(each, float).tolist()) for each in matrices), self.owner
-        )
+        given = np.linalg.inv(plane.world_from_plane), plane.world_from_plane, pixel, first
+        inverse, world, pixel_mm, first_mm = (ti.Matrix(np.asarray(each, float).tolist()) for each in given)
+        self.embedding.locate_on_plane(inverse, world, pixel_mm, first_mm, self.owner)
 
     def rest_grid(self, count: int) -> np.ndarray:
         """Return rest positions (rows, columns, 3) [mm] at count x count points evenly over the plane."""

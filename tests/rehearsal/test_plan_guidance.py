@@ -13,8 +13,7 @@ from rehearsal.planning.plan_guidance import ABOVE_MM, AHEAD, DEG_PER_MM_OFF, NE
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.undo_history import MOST_UNDONE, History
 from render import plan_lines, transducer_shape
-from render.actions import begin
-from render.keys import Keys
+from render.keys import Keys, begin
 from render.plan_lines import DONE, TO_GO, PlanLines
 from render.viewer import Controls, Guidance, Settings
 from sim.fields import array_of
