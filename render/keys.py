@@ -6,7 +6,6 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -24,61 +23,51 @@ BUTTONS = (
     *("A", "B", "X", "Y", "Back", "Guide", "Start", "Left stick", "Right stick"),
     *("Left shoulder", "Right shoulder", "Pad up", "Pad down", "Pad left", "Pad right"),
 )
-
-
-class KeyMapEntry(NamedTuple):
-    """A line of the key map: actions, each with its key as printed, and the text for the user."""
-
-    keys: dict[str, str]
-    text: str
-
-
+# Group -> text for the user -> actions, each with its key as printed.
 KEY_MAP = {
-    "Transducer": (
-        KeyMapEntry({"point": "Mouse"}, "move it over the organ"),
-        KeyMapEntry({"press": "Left button"}, "press it in, deeper the longer it is held"),
-        KeyMapEntry({"push": "W", "lift": "S"}, "push it in, lift it"),
-        KeyMapEntry({"rotate_left": "A", "rotate_right": "D"}, "rotate it about its axis"),
-        KeyMapEntry({"rock_left": "Q", "rock_right": "E"}, "rock it in the image plane, heel to toe"),
-        KeyMapEntry({"tilt_back": "Z", "tilt_forward": "C"}, "tilt it out of the image plane (fan)"),
-    ),
-    "View": (
-        KeyMapEntry({"orbit": "Right drag"}, "turn the view"),
-        KeyMapEntry({"pan": "Middle drag"}, "pan the view (also Shift + right drag)"),
-        KeyMapEntry({"zoom_in": "Up", "zoom_out": "Down"}, "zoom in and out"),
-        KeyMapEntry({"translucent": "T"}, "organ translucent or solid"),
-        KeyMapEntry({"cut": "X"}, "organ cut along the image plane"),
-        KeyMapEntry({"show_seen": "N"}, "coverage: imaged tissue in green"),
-    ),
-    "Image": (
-        KeyMapEntry({"mode": "B"}, "B-mode and CT, B-mode alone, CT alone"),
-        KeyMapEntry({"detail_level": "V"}, "detail level of the B-mode image"),
-        KeyMapEntry({"show_scanner": "G"}, "the scanner's sliders, with TGC"),
-        KeyMapEntry({"outline": "O"}, "outline of the tumour, now and in the CT"),
-        KeyMapEntry({"measure": "Click on image"}, "caliper from click to click, in mm; a third removes it"),
-        KeyMapEntry({"freeze": "F"}, "freeze and unfreeze"),
-        KeyMapEntry(
-            {"cine_back": "Left", "cine_forth": "Right"}, "while frozen: cine of the last ten seconds"
-        ),
-        KeyMapEntry({"export": "I"}, "save the image (PNG, DICOM) and the organ (PLY)"),
-    ),
-    "Plan": (
-        KeyMapEntry({"plan_for": "Space"}, "target: tumour and margin, tumour, kidney"),
-        KeyMapEntry({"plan": "Return"}, "plan a sweep of the target"),
-        KeyMapEntry({"next_plan": "Backspace"}, "stop planning; or show the next sweep, then none"),
-    ),
-    "Session": (
-        KeyMapEntry({"undo": "U", "redo": "Y"}, "undo the last press, turn or path; redo it"),
-        KeyMapEntry({"bookmark": "M", "to_bookmark": "J"}, "set a bookmark; return to bookmarks"),
-        KeyMapEntry({"sweep": "L"}, "start and stop recording a tracked sweep"),
-        KeyMapEntry({"take_over": "K"}, "take control from a replay or a tracked probe"),
-        KeyMapEntry({"reset": "R"}, "reset tissue, transducer and view"),
-        KeyMapEntry({"screenshot": "P"}, "save a screenshot of the window"),
-        KeyMapEntry({"help": "H"}, "show or hide this list"),
-        KeyMapEntry({"quit": "Esc"}, "quit"),
-    ),
+    "Transducer": {
+        "move it over the organ": {"point": "Mouse"},
+        "press it in, deeper the longer it is held": {"press": "Left button"},
+        "push it in, lift it": {"push": "W", "lift": "S"},
+        "rotate it about its axis": {"rotate_left": "A", "rotate_right": "D"},
+        "rock it in the image plane, heel to toe": {"rock_left": "Q", "rock_right": "E"},
+        "tilt it out of the image plane (fan)": {"tilt_back": "Z", "tilt_forward": "C"},
+    },
+    "View": {
+        "turn the view": {"orbit": "Right drag"},
+        "pan the view (also Shift + right drag)": {"pan": "Middle drag"},
+        "zoom in and out": {"zoom_in": "Up", "zoom_out": "Down"},
+        "organ translucent or solid": {"translucent": "T"},
+        "organ cut along the image plane": {"cut": "X"},
+        "coverage: imaged tissue in green": {"show_seen": "N"},
+    },
+    "Image": {
+        "B-mode and CT, B-mode alone, CT alone": {"mode": "B"},
+        "detail level of the B-mode image": {"detail_level": "V"},
+        "the scanner's sliders, with TGC": {"show_scanner": "G"},
+        "outline of the tumour, now and in the CT": {"outline": "O"},
+        "caliper from click to click, in mm; a third removes it": {"measure": "Click on image"},
+        "freeze and unfreeze": {"freeze": "F"},
+        "while frozen: cine of the last ten seconds": {"cine_back": "Left", "cine_forth": "Right"},
+        "save the image (PNG, DICOM) and the organ (PLY)": {"export": "I"},
+    },
+    "Plan": {
+        "target: tumour and margin, tumour, kidney": {"plan_for": "Space"},
+        "plan a sweep of the target": {"plan": "Return"},
+        "stop planning; or show the next sweep, then none": {"next_plan": "Backspace"},
+    },
+    "Session": {
+        "undo the last press, turn or path; redo it": {"undo": "U", "redo": "Y"},
+        "set a bookmark; return to bookmarks": {"bookmark": "M", "to_bookmark": "J"},
+        "start and stop recording a tracked sweep": {"sweep": "L"},
+        "take control from a replay or a tracked probe": {"take_over": "K"},
+        "reset tissue, transducer and view": {"reset": "R"},
+        "save a screenshot of the window": {"screenshot": "P"},
+        "show or hide this list": {"help": "H"},
+        "quit": {"quit": "Esc"},
+    },
 }
-_ALL = {action: key for group in KEY_MAP.values() for line in group for action, key in line.keys.items()}
+_ALL = {action: key for group in KEY_MAP.values() for keys in group.values() for action, key in keys.items()}
 MOUSE = {action: place for action, place in _ALL.items() if place not in KEYS}
 DEFAULT_KEYS = {action: key for action, key in _ALL.items() if key in KEYS}
 DEFAULT_BUTTONS = {
@@ -149,7 +138,8 @@ class Keys:
         """Return keys and texts of all actions by group, for the help."""
         return {
             group: [
-                (" / ".join(self.of.get(*usual) for usual in line.keys.items()), line.text) for line in lines
+                (" / ".join(self.of.get(*usual) for usual in keys.items()), text)
+                for text, keys in lines.items()
             ]
             for group, lines in KEY_MAP.items()
         }
@@ -187,12 +177,8 @@ def keys_text() -> str:
     rows = []
     for group, lines in KEY_MAP.items():
         rows.append(f"# {group}")
-        rows += [
-            f'{action} = "{key}"  # {line.text}'
-            for line in lines
-            for action, key in line.keys.items()
-            if action in DEFAULT_KEYS
-        ]
+        keyed = [(action, text) for text, keys in lines.items() for action in keys if action in DEFAULT_KEYS]
+        rows += [f'{action} = "{DEFAULT_KEYS[action]}"  # {text}' for action, text in keyed]
     pad = [f'{action} = "{button}"' for action, button in DEFAULT_BUTTONS.items()]
     return "\n".join([head, "[keys]", *rows, "", "[gamepad]", *pad, ""])
 
