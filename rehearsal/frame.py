@@ -9,12 +9,12 @@ import click
 import numpy as np
 
 from rehearsal.cine import Caliper, Cine, CineFrame
-from rehearsal.frame_view import image_view, probe_with_settings
+from rehearsal.frame_view import probe_with_settings
 from rehearsal.image_and_surface_files import save_screenshot, save_surfaces, save_view
 from rehearsal.inputs.input_source import InputSource, ReplayInput
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.measurements.live_measurements import LiveMeasurements
-from rehearsal.measurements.run_report import Tally
+from rehearsal.measurements.run_report import Tally, expected_error_of
 from rehearsal.notices import Notices
 from rehearsal.planning.plans_in_window import PlanControl
 from rehearsal.rehearsal import Rehearsal
@@ -22,7 +22,7 @@ from rehearsal.stopwatch import timed
 from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer, send_live
 from rehearsal.tracking.sweep_recording import SweepRecorder
 from render.keys import Keys
-from render.viewer import Controls, Settings, View, Viewer
+from render.viewer import Controls, ScannerSettings, Settings, View, Viewer
 from ultrasound.probe import Probe
 
 # How long a notice stays on the screen, and the one that the tissue's state was restored.
@@ -231,3 +231,57 @@ class WindowFrames(Frames):
             save_surfaces(self.rehearsal, self.out, begin)
         self.notices.post("   ".join([f"saved {begin.rstrip('-')}", *missing]), in_terminal=False)
         self.notices.post("; ".join(missing), on_screen=False)
+
+
+def image_view(rehearsal: Rehearsal, probe: Probe, settings: Settings, tally: Tally) -> View:
+    """Compute the images of the probe at its present pose, with overlays and read-outs."""
+    scanner, pixels = rehearsal.scanner, rehearsal.scene.image.pixels
+    shown = settings.mode, settings.detail_level, settings.window_hu, settings.level_hu
+
+    def images() -> dict[str, np.ndarray]:
+        if scanner is None:
+            return {"no CT": np.zeros((pixels, pixels), np.uint8)}
+        return scanner.images(rehearsal.image_plane(probe), probe, *shown)
+
+    width, depth, above = probe.extent_mm
+    return View(
+        transducer_pose=rehearsal.pose,
+        pictures=timed(images, tally.slice_ms),
+        width_mm=width,
+        depth_mm=depth,
+        above_mm=above,
+        sector=probe.sector,
+        focus_mm=None if settings.mode == "ct" else probe.focus_mm,
+        outline_mm=rehearsal.tumour_outline() if settings.outline else None,
+        outline_before_mm=rehearsal.tumour_outline(at_rest=True) if settings.outline else None,
+        captions=captions(probe, settings),
+        readouts=readouts(rehearsal, tally),
+        title=rehearsal.scene.title,
+    )
+
+
+def captions(probe: Probe, settings: ScannerSettings) -> tuple[str, str, str]:
+    """The probe's name, and the settings of the B-mode image and of the CT."""
+    b_mode = (
+        f"{probe.frequency_mhz:.1f} MHz   G {probe.gain_percent:.0f} %   DR {probe.dyn_range_db:.0f} dB   "
+        f"{settings.detail_level}"
+    )
+    ct = f"W {settings.window_hu}   L {settings.level_hu} HU"
+    return (
+        probe.transducer_name,
+        "" if settings.mode == "ct" else b_mode,
+        "" if settings.mode == "b-mode" else ct,
+    )
+
+
+def readouts(rehearsal: Rehearsal, tally: Tally) -> dict[str, str]:
+    """Name -> figure with its unit."""
+    size, count = next(iter(rehearsal.model.counts().items()))
+    error = expected_error_of(rehearsal)
+    return {
+        "step": f"{np.median(tally.step_ms[-30:]):.1f} ms" if tally.step_ms else "",
+        "error": "not known" if error is None else f"± {error:.2f} mm",
+        "image": f"{np.median(tally.slice_ms[-30:]):.1f} ms",
+        size: f"{count}",
+        "indentation": f"{max(rehearsal.indentation_mm(), 0.0):.1f} mm",
+    }

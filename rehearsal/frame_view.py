@@ -1,16 +1,12 @@
-"""The view of one frame: images, overlays and read-outs; the window's geometry; where the sliders start."""
-
-from functools import partial
+"""The window on a rehearsal: its geometry, and its settings: where the sliders start, and what they set of the probe."""
 
 import numpy as np
 
-from rehearsal.measurements.run_report import Tally, expected_error_of
 from rehearsal.rehearsal import Rehearsal
-from rehearsal.stopwatch import timed
 from render.display import window_size
 from render.gamepad import Gamepad
 from render.keys import Keys
-from render.viewer import Geometry, ScannerSettings, Settings, View, Viewer
+from render.viewer import Geometry, ScannerSettings, Settings, Viewer
 from render.window_layout import FULL_SIZE
 from ultrasound.probe import TGC_SLIDERS, Probe
 
@@ -88,51 +84,3 @@ def open_viewer(
         keys=keys,
         gamepad=gamepad,
     )
-
-
-def image_view(rehearsal: Rehearsal, probe: Probe, settings: Settings, tally: Tally) -> View:
-    """Compute the images of the probe at its present pose, with overlays and read-outs."""
-    shown = settings.mode, settings.detail_level, settings.window_hu, settings.level_hu
-    pictures = timed(partial(rehearsal.look, probe, *shown), tally.slice_ms)
-    width, depth, above = probe.extent_mm
-    return View(
-        transducer_pose=rehearsal.pose,
-        pictures=pictures,
-        width_mm=width,
-        depth_mm=depth,
-        above_mm=above,
-        sector=probe.sector,
-        focus_mm=None if settings.mode == "ct" else probe.focus_mm,
-        outline_mm=rehearsal.tumour_outline() if settings.outline else None,
-        outline_before_mm=rehearsal.tumour_outline(at_rest=True) if settings.outline else None,
-        captions=captions(probe, settings),
-        readouts=readouts(rehearsal, tally),
-        title=rehearsal.scene.title,
-    )
-
-
-def captions(probe: Probe, settings: ScannerSettings) -> tuple[str, str, str]:
-    """The probe's name, and the settings of the B-mode image and of the CT."""
-    b_mode = (
-        f"{probe.frequency_mhz:.1f} MHz   G {probe.gain_percent:.0f} %   DR {probe.dyn_range_db:.0f} dB   "
-        f"{settings.detail_level}"
-    )
-    ct = f"W {settings.window_hu}   L {settings.level_hu} HU"
-    return (
-        probe.transducer_name,
-        "" if settings.mode == "ct" else b_mode,
-        "" if settings.mode == "b-mode" else ct,
-    )
-
-
-def readouts(rehearsal: Rehearsal, tally: Tally) -> dict[str, str]:
-    """Name -> figure with its unit."""
-    size, count = next(iter(rehearsal.model.counts().items()))
-    error = expected_error_of(rehearsal)
-    return {
-        "step": f"{np.median(tally.step_ms[-30:]):.1f} ms" if tally.step_ms else "",
-        "error": "not known" if error is None else f"± {error:.2f} mm",
-        "image": f"{np.median(tally.slice_ms[-30:]):.1f} ms",
-        size: f"{count}",
-        "indentation": f"{max(rehearsal.indentation_mm(), 0.0):.1f} mm",
-    }

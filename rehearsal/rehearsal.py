@@ -25,21 +25,18 @@ from sim.skinning import Skin
 from sim.solver import SolverState
 from sim.tissue_model import FixedRegion, MaterialModel
 from ultrasound.image_plane import ImagePlane, plane_section
-from ultrasound.probe import DetailLevel, Mode, Probe
+from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import (
     ManipulatorState,
     ProbeManipulator,
     advanced,
     image_plane,
-    indentation,
-    moved_towards,
     pose_at,
     poses_between,
     touching,
 )
 from ultrasound.scanner import ScannedAnatomy, Scanner, start_acoustics
 
-TURN_DEG_S = 180.0
 AWAY_MM = 200.0
 # Where the tumour protrudes, organ and tumour share a surface: the tumour's is drawn this far outside.
 TUMOUR_LIFT_MM = 0.8
@@ -167,9 +164,10 @@ class Rehearsal:
         settled = array_of(self.organ_skin.vertices).astype(float)
         faces = np.array(self.organ.faces, np.int64)
         normals = np.array(trimesh.Trimesh(settled, faces, process=False).vertex_normals)
-        radius = self.probe.radius_mm
+        lateral, radius = np.array(self.press.lateral), self.probe.radius_mm
+        speed = self.scene.transducer.speed_mm_s
         manipulator = ProbeManipulator(
-            settled, faces, normals, self.size_mm, self.pose, np.array(self.press.lateral), radius
+            settled, faces, normals, self.size_mm, self.pose, lateral, radius, speed
         )
         manipulator.home = touching(self.pose, self.size_mm, manipulator.samples, radius)
         return manipulator
@@ -199,12 +197,7 @@ class Rehearsal:
 
     def pose_towards(self, goal: np.ndarray) -> np.ndarray:
         """The transducer's next pose towards a goal (4, 4): at most at the scene's speed, and not through the organ."""
-        most_mm = self.scene.transducer.speed_mm_s * self.settings.time_step_s
-        pose = moved_towards(self.pose, goal, most_mm, TURN_DEG_S * self.settings.time_step_s)
-        # The straight path between two points of the surface may cross the organ.
-        wanted = max(self._indentation(goal), 0.0)
-        through = self._indentation(pose) - max(wanted, self.indentation_mm())
-        return advanced(pose, -through) if through > 0 else pose
+        return self.manipulator.pose_towards(goal, self.pose, self.settings.time_step_s)
 
     def advance(self, pose: np.ndarray) -> None:
         """Advance one time step, at whose end the transducer has a pose (4, 4).
@@ -241,14 +234,6 @@ class Rehearsal:
         for skin in self.part_skins.values():
             skin.update()
 
-    def look(
-        self, probe: Probe, mode: Mode, detail_level: DetailLevel, window_hu: float, level_hu: float
-    ) -> dict[str, np.ndarray]:
-        """What the scanner shows now, by name (``Scanner.images``); black in a scene without a CT."""
-        if self.scanner is None:
-            return {"no CT": np.zeros((self.scene.image.pixels, self.scene.image.pixels), np.uint8)}
-        return self.scanner.images(self.image_plane(probe), probe, mode, detail_level, window_hu, level_hu)
-
     def find_plane(self, probe: Probe) -> None:
         """Locate the image plane in the tissue without computing an image."""
         if self.scanner is not None:
@@ -282,10 +267,7 @@ class Rehearsal:
 
     def indentation_mm(self) -> float:
         """Depth of the transducer below the settled surface [mm]; negative above it."""
-        return self._indentation(self.pose)
-
-    def _indentation(self, pose: np.ndarray) -> float:
-        return indentation(pose, self.size_mm, self.manipulator.samples, self.probe.radius_mm)
+        return self.manipulator.indentation_mm(self.pose)
 
     def volume_ratio(self) -> float:
         """Volume inside the deformed surface relative to the one at rest."""

@@ -18,6 +18,7 @@ MIN_DEPTH_MM, MAX_DEPTH_MM = -40.0, 15.0
 # Greatest depth in lengths of the transducer: its holder must stay out of the tissue.
 MAX_DEPTH_LENGTHS = 1.5
 PRESS_MM_S, RELEASE_MM_S = 12.0, 40.0
+TURN_DEG_S = 180.0
 
 
 def pose_at(
@@ -131,7 +132,7 @@ class ProbeManipulator:
     """Moves the transducer over the settled organ: aim, turn and depth.
 
     ``vertices`` (n, 3), ``faces`` (m, 3) and ``normals`` (n, 3) are the settled surface [mm]; ``home`` is the initial pose.
-    ``radius_mm`` is that of a curved face. ``depth_mm`` is set by keys, ``pressed_mm`` is added while a button is held.
+    ``radius_mm`` is that of a curved face, ``speed_mm_s`` the greatest speed. ``depth_mm`` is set by keys, ``pressed_mm`` is added while a button is held.
     """
 
     vertices: np.ndarray
@@ -141,6 +142,7 @@ class ProbeManipulator:
     home: np.ndarray
     lateral: np.ndarray
     radius_mm: float = 0.0
+    speed_mm_s: float = np.inf
     depth_mm: float = 0.0
     pressed_mm: float = 0.0
     turn_deg: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -164,9 +166,13 @@ class ProbeManipulator:
         self.depth_mm, self.pressed_mm = state.depth_mm, state.pressed_mm
         self.turn_deg, self.aim = np.array(state.turn_deg), state.aim
 
+    def indentation_mm(self, pose: np.ndarray) -> float:
+        """Depth of a transducer at a pose (4, 4) below the settled surface [mm]; negative above it."""
+        return indentation(pose, self.size_mm, self.samples, self.radius_mm)
+
     def match(self, pose: np.ndarray) -> None:
         """Take over a transducer at a pose (4, 4), as if a button had pressed it in that is now released."""
-        depth = indentation(pose, self.size_mm, self.samples, self.radius_mm)
+        depth = self.indentation_mm(pose)
         pressed = float(np.clip(depth, 0.0, self.max_mm)) if np.isfinite(depth) else 0.0
         self.state = ManipulatorState(
             depth - pressed if np.isfinite(depth) else 0.0, pressed, aim=pose.copy()
@@ -227,6 +233,14 @@ class ProbeManipulator:
         pose = self._turned(self.home if self.aim is None else self.aim)
         depth = min(self.depth_mm + self.pressed_mm, self.max_mm)
         return advanced(touching(pose, self.size_mm, self.samples, self.radius_mm), depth)
+
+    def pose_towards(self, goal: np.ndarray, pose: np.ndarray, time_s: float) -> np.ndarray:
+        """Return the pose after a time [s] from a pose towards a goal (4, 4): limited in speed, and not through the organ."""
+        moved = moved_towards(pose, goal, self.speed_mm_s * time_s, TURN_DEG_S * time_s)
+        # The straight path between two points of the surface may cross the organ.
+        wanted = max(self.indentation_mm(goal), 0.0)
+        through = self.indentation_mm(moved) - max(wanted, self.indentation_mm(pose))
+        return advanced(moved, -through) if through > 0 else moved
 
     def _turned(self, aim: np.ndarray) -> np.ndarray:
         pose, length = aim.copy(), self.size_mm[2]

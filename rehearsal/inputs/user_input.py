@@ -127,21 +127,21 @@ class UserInput:
         self.waits = self.waits and not acts(controls, self._ray)
         if self.waits:
             return self.session.rehearsal.pose
-        self._move_manipulator(controls)
-        return self.session.rehearsal.pose_towards(self.session.rehearsal.manipulator.pose())
+        return self._moved_manipulator(controls)
 
-    def _move_manipulator(self, controls: Controls) -> None:
+    def _moved_manipulator(self, controls: Controls) -> np.ndarray:
         rehearsal = self.session.rehearsal
-        manipulator = rehearsal.manipulator
+        manipulator, time_s = rehearsal.manipulator, rehearsal.settings.time_step_s
         if any(controls.slide_mm):
             manipulator.slide(*controls.slide_mm)
             self._ray_at_slide = controls.ray
         elif controls.ray is not None and mouse_moved(controls.ray, self._ray_at_slide):
             manipulator.point(*controls.ray)
             self._ray_at_slide = None
-        manipulator.press(controls.press, rehearsal.settings.time_step_s, controls.press_share)
+        manipulator.press(controls.press, time_s, controls.press_share)
         manipulator.push(controls.push_mm)
         manipulator.turn(controls.tilt_deg, controls.rock_deg, controls.rotate_deg)
+        return manipulator.pose_towards(manipulator.pose(), rehearsal.pose, time_s)
 
     def _restore_earlier(self, controls: Controls) -> bool:
         """Undo, redo, reset or a bookmark; whether the state was restored to an earlier one."""

@@ -16,7 +16,8 @@ from tqdm import tqdm
 from rehearsal.build_solver import build_solver, embedding_cell_mm, model_of, step_settings
 from rehearsal.commands.command_line import arch_option
 from rehearsal.configuration import PRESETS, Setup, probe_of, scene_of
-from rehearsal.frame_view import image_view, initial_settings, probe_with_settings
+from rehearsal.frame import image_view
+from rehearsal.frame_view import initial_settings, probe_with_settings
 from rehearsal.measurements.run_report import Tally
 from rehearsal.rehearsal import SURROUNDINGS_MM, Rehearsal, scanned_anatomy
 from rehearsal.stopwatch import timed

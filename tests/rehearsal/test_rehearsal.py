@@ -8,6 +8,9 @@ import SimpleITK as sitk
 import trimesh
 from slicing import hounsfield, organ_mask
 
+from rehearsal.frame import image_view
+from rehearsal.frame_view import initial_settings
+from rehearsal.measurements.run_report import Tally
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import load_anatomy
 from scenes.patients.patient_folder import save_patient
@@ -70,7 +73,7 @@ def assert_at_rest_the_slice_is_the_ct(scene: Scene, folder: Path) -> None:
     rehearsal = Rehearsal(scene, load_anatomy(scene, folder))
     rehearsal.manipulator.turn(20, 10, 35)
     rehearsal.pose = rehearsal.manipulator.pose()
-    rehearsal.look(rehearsal.probe, *LOOK_AT_CT)
+    rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK_AT_CT)
     plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], *rehearsal.probe.extent_mm)
     cut = rehearsal.scanner
     inside = organ_mask(cut)
@@ -91,7 +94,7 @@ def test_at_rest_the_slice_is_a_real_ct_however_its_voxels_lie(one_device, data,
 
 def test_pressing_moves_the_tissue_and_the_slice_follows(kept):
     rehearsal = kept(pressed_phantom)
-    before = rehearsal.look(rehearsal.probe, *LOOK)
+    before = rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK)
     top = array_of(rehearsal.organ_skin.vertices)
     for step in range(31):
         rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
@@ -99,14 +102,14 @@ def test_pressing_moves_the_tissue_and_the_slice_follows(kept):
     moved = array_of(rehearsal.organ_skin.vertices) - top
     assert rehearsal.indentation_mm() == pytest.approx(12.38)
     assert (moved @ rehearsal.gravity_direction).max() > 6.0
-    pressed = rehearsal.look(rehearsal.probe, *LOOK)
+    pressed = rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK)
     assert list(pressed) == ["B-mode", "CT"]
     assert all(np.abs(pressed[name].astype(int) - before[name]).mean() > 10 for name in before)
     assert 0.97 < rehearsal.volume_ratio() < 1.0
     assert rehearsal.contacts.measure_penetration() <= 0.5
     rehearsal.reset()
     rehearsal.update_surfaces()
-    after = rehearsal.look(rehearsal.probe, *LOOK)
+    after = rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK)
     assert all(np.array_equal(after[name], before[name]) for name in before)
     assert rehearsal.indentation_mm() == pytest.approx(0.0, abs=1e-6)
 
@@ -115,7 +118,7 @@ def test_a_pixel_shows_the_tissue_that_is_there_now(kept):
     rehearsal = kept(pressed_phantom)
     for step in range(31):
         rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
-    rehearsal.look(rehearsal.probe, *LOOK_AT_CT)
+    rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK_AT_CT)
     plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], *rehearsal.probe.extent_mm)
     pixels = np.argwhere(organ_mask(rehearsal.scanner))[::1009]
     spacing = np.array([plane.width_mm, plane.depth_mm]) / rehearsal.scene.image.pixels
@@ -187,7 +190,8 @@ def test_every_feature_at_once_without_a_ct_stays_finite_and_out_of_everything(o
     assert np.isfinite(array_of(rehearsal.body.position)).all()
     assert 0.6 < rehearsal.volume_ratio() < 1.1
     assert rehearsal.scanner is None and rehearsal.rest_grid() is None
-    assert not any(picture.any() for picture in rehearsal.look(rehearsal.probe, *LOOK).values())
+    view = image_view(rehearsal, rehearsal.probe, initial_settings(rehearsal), Tally(0.0))
+    assert not any(image.any() for image in view.pictures.values())
 
 
 def test_the_outline_is_the_tumours_border_not_what_is_drawn_of_it(kept):

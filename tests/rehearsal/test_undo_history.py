@@ -19,7 +19,7 @@ from scenes.tissue import NeoHookeanTissue
 from sim.body import BodyState
 from sim.divergence_check import DivergenceState
 from sim.solver import SolverState, StepSettings
-from ultrasound.probe_manipulator import ManipulatorState, ProbeManipulator, moved_towards, pose_at, touching
+from ultrasound.probe_manipulator import ManipulatorState, ProbeManipulator, pose_at, touching
 
 # A power of two, so that times are exact: 4 steps are PAUSE_S, 40 are LONGEST_S.
 STEP_S = 1 / 8
@@ -37,7 +37,7 @@ class Numbers:
         size = np.array([16.0, 9.0, 6.0])
         home = touching(pose_at(np.array([0, 0, 12.0]), DOWN, np.eye(3)[0], 6.0), size, vertices)
         self.manipulator = ProbeManipulator(
-            vertices, faces, np.array(ball.vertex_normals), size, home, np.eye(3)[0]
+            vertices, faces, np.array(ball.vertex_normals), size, home, np.eye(3)[0], speed_mm_s=150.0
         )
         self.pose = self.manipulator.pose()
         self.young_kpa, self.steps = 15.0, 0
@@ -77,7 +77,7 @@ class Numbers:
         self.watch = DivergenceState(self._solver())
 
     def pose_towards(self, goal: np.ndarray) -> np.ndarray:
-        return moved_towards(self.pose, goal, 150.0 * STEP_S, 180.0 * STEP_S)
+        return self.manipulator.pose_towards(goal, self.pose, STEP_S)
 
     def set_young(self, young_kpa: float) -> None:
         self.young_kpa = young_kpa

@@ -53,7 +53,7 @@ def test_two_runs_of_a_scene_give_the_same_bits():
         for step in range(20):
             rehearsal.advance(rehearsal.scripted_pose(step / 20 * rehearsal.script_length_s()))
         state = rehearsal.body.snapshot()
-        pictures = rehearsal.look(rehearsal.probe, *LOOK)
+        pictures = rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK)
         digests.append(
             hashlib.sha256(
                 state.position.tobytes()
