@@ -7,7 +7,7 @@ translucent organ are therefore part of the vertex colours, and faces are sorted
 import numpy as np
 import taichi as ti
 
-from sim.fields import array_of, fill
+from sim.fields import array_of, fields_of, fill
 
 ORGAN, TINT = (0.66, 0.27, 0.23), (0.24, 0.60, 0.36)
 SOLID, GLASS = 1.0, 0.30
@@ -73,6 +73,18 @@ def farthest_first(vertices: np.ndarray, faces: np.ndarray, ahead: np.ndarray) -
     """Return faces (m, 3) by decreasing distance along the view, as blending needs."""
     depth = vertices @ ahead.astype(vertices.dtype)
     return faces[np.argsort(-depth[faces].sum(axis=1), kind="stable")]
+
+
+class DrawnMesh:
+    """Fields of triangles with a normal and a colour (3 or 4 channels) at each of ``count`` vertices, given anew for each frame."""
+
+    def __init__(self, count: int, channels: int = 3) -> None:
+        self._fields = fields_of(*np.zeros((2, count, 3)), np.zeros((count, channels)), within=1)
+
+    def draw(self, scene, indices: np.ndarray, points, normals, colours) -> None:
+        """Draw the triangles of vertex ``indices`` (3 m,), int32, into a scene."""
+        fill(*zip(self._fields, (points, normals, colours), strict=True))
+        scene.mesh(self._fields[0], indices, self._fields[1], per_vertex_color=self._fields[2])
 
 
 class ShadedSurface:
