@@ -223,7 +223,7 @@ class WindowFrames(Frames):
         """Save images and surfaces; say what is missing, and why. Raises OSError."""
         probe = probe_with_settings(self.rehearsal.probe, settings)
         begin, missing = save_view(view, probe, self.out), []
-        if view.notes.keys() & view.pictures.keys():
+        if view.notes.keys() & view.images.keys():
             missing.append("B-mode image black: the probe does not touch the organ")
         if self._shows_earlier:
             missing.append("no organ (PLY), which has moved since: {freeze} continues")
@@ -246,7 +246,7 @@ def image_view(rehearsal: Rehearsal, probe: Probe, settings: Settings, tally: Ta
     width, depth, above = probe.extent_mm
     return View(
         transducer_pose=rehearsal.pose,
-        pictures=timed(images, tally.slice_ms),
+        images=timed(images, tally.slice_ms),
         width_mm=width,
         depth_mm=depth,
         above_mm=above,

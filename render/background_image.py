@@ -5,17 +5,17 @@ import time
 import numpy as np
 
 from render import window_frame
-from render.compass import compass_picture
 from render.keys import Keys
 from render.ultrasound_panel import (
     FIGURE_PX,
     OUTLINE,
     OUTLINE_AT_REST,
-    Panel,
     draw_caliper,
     draw_note,
     draw_segments,
-    paste_picture,
+    image_boxes,
+    paste_image,
+    to_plane,
 )
 from render.viewer import View
 from render.window_layout import Rect, WindowLayout
@@ -26,20 +26,10 @@ READOUT_PERIOD_S = 0.25
 Figures = tuple[dict[str, str], dict[str, str], str, str, str]
 
 
-def panel_of(view: View) -> Panel:
-    """Return the panel of a view."""
-    return Panel(
-        tuple(view.pictures),
-        view.width_mm,
-        view.depth_mm,
-        view.above_mm,
-        view.focus_mm,
-        view.captions,
-        view.title,
-        view.status,
-        view.marked_side,
-        view.outline_mm is not None,
-    )
+def backdrop_parts(view: View) -> tuple:
+    """Return what the backdrop of a view depends on."""
+    plane = view.width_mm, view.depth_mm, view.above_mm, view.focus_mm, view.marked_side
+    return *plane, tuple(view.images), view.captions, view.title, view.status, view.outline_mm is not None
 
 
 class BackgroundImage:
@@ -50,8 +40,8 @@ class BackgroundImage:
         self.pixels = np.full((layout.width, layout.height, 4), 255, dtype=np.uint8)
         # The same memory as rows, top down, for drawing.
         self._rows = self.pixels.transpose(1, 0, 2)[::-1]
-        self.panel: Panel | None = None
-        self._findings_shown = 0
+        self._view: View | None = None
+        self._backdrop: tuple = ()
         self._shows_help = False
         self._axes: np.ndarray | None = None
         self._figures: Figures | None = None
@@ -62,35 +52,36 @@ class BackgroundImage:
 
         With ``slow_figures``, figures change only every READOUT_PERIOD_S, so that they can be read.
         """
-        panel, findings = panel_of(view), window_frame.first_of(view.findings, self.layout.most_findings)
-        if self._shows_help or (self.panel, self._findings_shown) != (panel, len(findings)):
-            self._rows[:, :, :3] = window_frame.backdrop(self.layout, panel, self.keys.of["help"])
-            self.panel, self._findings_shown = panel, len(findings)
+        findings = window_frame.first_of(view.findings, self.layout.most_findings)
+        backdrop = *backdrop_parts(view), len(findings)
+        if self._shows_help or self._backdrop != backdrop:
+            self._rows[:, :, :3] = window_frame.backdrop(self.layout, view, self.keys.of["help"])
             self._figures, self._axes, self._shows_help = None, None, False
-        for (name, picture), box in zip(view.pictures.items(), panel.boxes(self.layout), strict=True):
-            paste_picture(self._rows, box, picture)
-            self._draw_over(view, panel, name, box)
+        self._view, self._backdrop = view, backdrop
+        for (name, image), box in zip(view.images.items(), image_boxes(self.layout, view), strict=True):
+            paste_image(self._rows, box, image)
+            self._draw_over(view, name, box)
         figures = dict(view.readouts), findings, view.alert, view.clock, view.pace
         self._compose_figures(figures, slow_figures)
         if self._axes is None or not np.array_equal(axes, self._axes):
-            self._put(self.layout.compass, compass_picture(self.layout, axes))
+            self._put(self.layout.compass, window_frame.compass_image(self.layout, axes))
             self._axes = axes
 
     def show_help(self) -> None:
         """Draw the list of all keys over everything, until the next ``compose``."""
         if not self._shows_help:
-            self._put(self.layout.whole, window_frame.help_picture(self.layout, self.keys.lines()))
+            self._put(self.layout.whole, window_frame.help_image(self.layout, self.keys.lines()))
             self._shows_help = True
 
-    def _draw_over(self, view: View, panel: Panel, name: str, box: Rect) -> None:
+    def _draw_over(self, view: View, name: str, box: Rect) -> None:
         """Draw outlines, note and caliper over an image."""
         if view.outline_before_mm is not None:
-            draw_segments(self._rows, panel, box, view.outline_before_mm, OUTLINE_AT_REST)
+            draw_segments(self._rows, view, box, view.outline_before_mm, OUTLINE_AT_REST)
         if view.outline_mm is not None:
-            draw_segments(self._rows, panel, box, view.outline_mm, OUTLINE)
+            draw_segments(self._rows, view, box, view.outline_mm, OUTLINE)
         if note := view.notes.get(name):
             draw_note(self._rows, self.layout, box, note)
-        draw_caliper(self._rows, panel, box, view.caliper_mm, view.caliper, self.layout.px(FIGURE_PX))
+        draw_caliper(self._rows, view, box, self.layout.px(FIGURE_PX))
 
     def _compose_figures(self, figures: Figures, slow: bool) -> None:
         now = time.perf_counter()
@@ -99,21 +90,19 @@ class BackgroundImage:
             return
         readouts, findings, alert, clock, pace = figures
         box = window_frame.clock_box(self.layout, self.keys.of["help"])
-        self._put(box, window_frame.clock_picture(self.layout, box, clock, pace))
-        self._put(self.layout.readouts, window_frame.readout_picture(self.layout, readouts))
+        self._put(box, window_frame.clock_image(self.layout, box, clock, pace))
+        self._put(self.layout.readouts, window_frame.readout_image(self.layout, readouts))
         if findings:
             box = self.layout.findings(len(findings))
-            self._put(box, window_frame.findings_picture(self.layout, findings, alert))
+            self._put(box, window_frame.findings_image(self.layout, findings, alert))
         self._figures, self._figures_at = figures, now
 
-    def _put(self, box: Rect, picture: np.ndarray) -> None:
-        rows, columns = box.slices
-        self._rows[rows, columns, :3] = picture
+    def _put(self, box: Rect, image: np.ndarray) -> None:
+        self._rows[box.slices][..., :3] = image
 
     def plane_point_at(self, column: float, row: float) -> tuple[float, float] | None:
         """Return the point of the image plane [mm] at a pixel of one of the images, None elsewhere."""
-        if self.panel is None or self._shows_help:
+        if self._view is None or self._shows_help:
             return None
-        boxes = self.panel.boxes(self.layout)
-        hit = (box for box in boxes if box.contains(column, row))
-        return next((self.panel.to_plane(box, column, row) for box in hit), None)
+        hit = (box for box in image_boxes(self.layout, self._view) if box.contains(column, row))
+        return next((to_plane(self._view, box, column, row) for box in hit), None)

@@ -151,7 +151,7 @@ class SceneView:
         toward = key - points
         # Normals towards the key light make the plane evenly bright: grey values are those of the image.
         normals = toward / np.linalg.norm(toward, axis=1, keepdims=True)
-        grey = transducer_shape.sampled(next(iter(view.pictures.values())), places, view)
+        grey = transducer_shape.sampled(next(iter(view.images.values())), places, view)
         self._plane_mesh.draw(
             scene, self._plane_indices, points, normals, np.repeat(grey[:, None], 3, axis=1)
         )

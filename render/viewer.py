@@ -140,7 +140,7 @@ class View:
 
     transducer_pose: np.ndarray
     """World from transducer [mm], shape (4, 4)."""
-    pictures: dict[str, np.ndarray]
+    images: dict[str, np.ndarray]
     """Name -> grey values, uint8, shape (rows = depth, columns = lateral, local x to the right). The 3D view shows the first."""
     width_mm: float
     depth_mm: float

@@ -1,9 +1,4 @@
-"""The frame around the 3D view: backdrop, title, clock, help, read-outs and findings.
-
-A picture is uint8 with shape (height, width, 3 or more); only its first three channels are written.
-"""
-
-from __future__ import annotations
+"""The frame around the 3D view: backdrop, title, clock, help, read-outs, findings and compass. Images are uint8 (height, width, 3)."""
 
 from collections.abc import Mapping
 from itertools import islice
@@ -12,7 +7,8 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from render.text import fitting_size, font, shortened
-from render.ultrasound_panel import ALERT, FINDINGS, LINE, MARK, QUIET, TEXT, Panel, draw_panel
+from render.ultrasound_panel import ALERT, FINDINGS, LINE, MARK, QUIET, TEXT, draw_panel
+from render.viewer import View
 from render.window_layout import CLOCK_WIDTH, FIGURE_HEIGHT, FIGURES_PAD, Rect, WindowLayout
 
 BACKDROP_TOP, BACKDROP_FOOT = (30, 35, 42), (13, 15, 19)
@@ -21,31 +17,38 @@ STRIP, HELP = (17, 20, 24), (22, 26, 31)
 LEAST_PITCH = 19
 # A figure without a value.
 NO_VALUE = "-"
+# The compass. Patient coordinates are LPS: towards the patient's left, back and head; and the other way.
+LETTERS = (("R", "L"), ("A", "P"), ("I", "S"))
+# In fractions of its box.
+ARM, BEYOND = 0.27, 0.11
+LETTER_PX, LINE_PX = 14, 2
+# A shorter projected axis has no letters.
+LEAST_LENGTH = 0.3
 HELP_COLUMNS, HELP_PX, HELP_GAP_PX, FIGURES_GAP_PX = 2, 17, 12, 18
 
 
-def backdrop(layout: WindowLayout, panel: Panel, help_key: str = "H") -> np.ndarray:
+def backdrop(layout: WindowLayout, view: View, help_key: str = "H") -> np.ndarray:
     """Return what stays the same from frame to frame, uint8, shape (height, width, 3)."""
     fade = np.linspace(0, 1, layout.scene.height)[:, None]
     rows = (1 - fade) * np.array(BACKDROP_TOP) + fade * np.array(BACKDROP_FOOT)
-    picture = np.empty((layout.height, layout.width, 3), dtype=np.uint8)
-    picture[:] = STRIP
-    picture[layout.scene.slices] = np.round(rows).astype(np.uint8)[:, None]
-    image = Image.fromarray(picture)
+    page = np.empty((layout.height, layout.width, 3), dtype=np.uint8)
+    page[:] = STRIP
+    page[layout.scene.slices] = np.round(rows).astype(np.uint8)[:, None]
+    image = Image.fromarray(page)
     draw = ImageDraw.Draw(image)
-    _draw_title(draw, layout, panel, help_key)
-    draw_panel(draw, layout, panel)
+    _draw_title(draw, layout, view, help_key)
+    draw_panel(draw, layout, view)
     for y in (layout.title.bottom - 1, layout.strip.top):
         draw.line([(0, y), (layout.strip.right, y)], fill=LINE)
     return np.array(image)
 
 
-def _draw_title(draw: ImageDraw.ImageDraw, layout: WindowLayout, panel: Panel, help_key: str) -> None:
+def _draw_title(draw: ImageDraw.ImageDraw, layout: WindowLayout, view: View, help_key: str) -> None:
     px, middle = layout.px, layout.title.height // 2
     right = layout.title.right - px(16)
     draw.text((right, middle), _help_hint(help_key), font=font(px(14)), fill=TEXT, anchor="rm")
     room = clock_box(layout, help_key).left - 2 * px(16)
-    title = shortened(panel.title or "Nephron", px(17), room)
+    title = shortened(view.title or "Nephron", px(17), room)
     draw.text((px(16), middle), title, font=font(px(17)), fill=TEXT, anchor="lm")
 
 
@@ -60,7 +63,7 @@ def clock_box(layout: WindowLayout, help_key: str = "H") -> Rect:
     return Rect(right - px(CLOCK_WIDTH), 0, px(CLOCK_WIDTH), layout.title.height - 1)
 
 
-def clock_picture(layout: WindowLayout, box: Rect, clock: str, pace: str) -> np.ndarray:
+def clock_image(layout: WindowLayout, box: Rect, clock: str, pace: str) -> np.ndarray:
     """Return the session's time and its rate, uint8, shape of the box."""
     image = Image.new("RGB", (box.width, box.height), STRIP)
     draw, letters, middle = ImageDraw.Draw(image), font(layout.px(14)), layout.title.height // 2
@@ -70,7 +73,7 @@ def clock_picture(layout: WindowLayout, box: Rect, clock: str, pace: str) -> np.
     return np.asarray(image)
 
 
-def help_picture(layout: WindowLayout, groups: Mapping[str, list[tuple[str, str]]]) -> np.ndarray:
+def help_image(layout: WindowLayout, groups: Mapping[str, list[tuple[str, str]]]) -> np.ndarray:
     """Return the list of keys by group, uint8, shape (height, width, 3)."""
     box, px = layout.whole, layout.px
     image = Image.new("RGB", (box.width, box.height), HELP)
@@ -101,7 +104,7 @@ def in_columns(groups: Mapping[str, list[tuple[str, str]]]) -> list[list[tuple[s
     return columns
 
 
-def readout_picture(layout: WindowLayout, readouts: Mapping[str, str]) -> np.ndarray:
+def readout_image(layout: WindowLayout, readouts: Mapping[str, str]) -> np.ndarray:
     """Return names and values, one line each, as many as fit, uint8, shape of layout.readouts."""
     box = layout.readouts
     image = Image.new("RGB", (box.width, box.height), STRIP)
@@ -113,7 +116,7 @@ def readout_picture(layout: WindowLayout, readouts: Mapping[str, str]) -> np.nda
     return np.asarray(image)
 
 
-def findings_picture(layout: WindowLayout, findings: Mapping[str, str], alert: str = "") -> np.ndarray:
+def findings_image(layout: WindowLayout, findings: Mapping[str, str], alert: str = "") -> np.ndarray:
     """Return names and values, uint8, shape of layout.findings(count); the one named ``alert`` is highlighted."""
     box = layout.findings(len(findings))
     image = Image.new("RGB", (box.width, box.height), FINDINGS)
@@ -140,3 +143,35 @@ def _draw_figures(
         colours = (ALERT, ALERT) if name == alert else (QUIET, TEXT)
         draw.text((8, y), name, font=font(size), fill=colours[0], anchor="lm")
         draw.text((box.width - 10, y), value or NO_VALUE, font=font(size), fill=colours[1], anchor="rm")
+
+
+def ends_of(axes: np.ndarray) -> list[tuple[str, np.ndarray]]:
+    """Return the letters of the patient's axes and their directions on the screen (2,), right and up, the farthest first.
+
+    ``axes`` (3, 3) are the camera's right, up and ahead, in the patient.
+    """
+    ends = [
+        (letters[side > 0], side * axes[:, axis])
+        for axis, letters in enumerate(LETTERS)
+        for side in (-1, 1)
+        if np.hypot(*axes[:2, axis]) > LEAST_LENGTH
+    ]
+    return [(letter, end[:2]) for letter, end in sorted(ends, key=lambda end: -end[1][2])]
+
+
+def compass_image(layout: WindowLayout, axes: np.ndarray) -> np.ndarray:
+    """Return the compass for a camera's axes (3, 3), uint8, shape of layout.compass."""
+    size = layout.compass.width
+    image = Image.new("RGB", (size, size), FINDINGS)
+    draw = ImageDraw.Draw(image)
+    draw.rectangle([0, 0, size - 1, size - 1], outline=LINE)
+    middle = np.array([size, size]) / 2
+    ends = ends_of(axes)
+    for place, (letter, axis) in enumerate(ends):
+        near = place >= len(ends) / 2
+        colour, down = TEXT if near else QUIET, axis * [1, -1]
+        tip = middle + size * ARM * down
+        end = tip + size * BEYOND * down / np.linalg.norm(down)
+        draw.line([*middle, *tip], fill=colour, width=layout.px(LINE_PX))
+        draw.text(tuple(end), letter, font=font(layout.px(LETTER_PX)), fill=colour, anchor="mm")
+    return np.asarray(image)

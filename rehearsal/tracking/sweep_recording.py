@@ -63,7 +63,7 @@ class SweepRecorder:
         if self._sweep.count == 0:
             self._began_s = time_s
         self._due_s = time_s + FRAME_S
-        kind, image = next(iter(view.pictures.items()))
+        kind, image = next(iter(view.images.items()))
         if kind != (self._image_kind or kind):
             # A volume of B-mode and CT images would be neither.
             return self.end()

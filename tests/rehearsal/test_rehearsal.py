@@ -191,7 +191,7 @@ def test_every_feature_at_once_without_a_ct_stays_finite_and_out_of_everything(o
     assert 0.6 < rehearsal.volume_ratio() < 1.1
     assert rehearsal.scanner is None and rehearsal.rest_grid() is None
     view = image_view(rehearsal, rehearsal.probe, initial_settings(rehearsal), Tally(0.0))
-    assert not any(image.any() for image in view.pictures.values())
+    assert not any(image.any() for image in view.images.values())
 
 
 def test_the_outline_is_the_tumours_border_not_what_is_drawn_of_it(kept):

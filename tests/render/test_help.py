@@ -6,7 +6,7 @@ from conftest import ROOT
 from PIL import ImageDraw
 
 from render.keys import KEY_MAP, Keys
-from render.window_frame import help_picture, in_columns
+from render.window_frame import help_image, in_columns
 from render.window_layout import FULL_SIZE, WindowLayout
 
 LINES = [keys for group in KEY_MAP.values() for keys in group.values()]
@@ -55,7 +55,7 @@ def test_all_keys_fit_into_the_help_of_any_window(monkeypatch, size):
         text(draw, place, words, **how)
 
     monkeypatch.setattr(ImageDraw.ImageDraw, "text", noted)
-    picture = help_picture(layout, Keys().lines())
+    picture = help_image(layout, Keys().lines())
     assert picture.shape == (size[1], size[0], 3)
     boxes = np.array([box for box, _ in written if box[2] > box[0]])
     assert (boxes[:, :2] >= 0).all() and (boxes[:, 2:] <= size).all()
