@@ -147,12 +147,36 @@ def load_constants(path: Path) -> dict[str, np.ndarray]:
 
     Raises SweepError for a file that cannot be read, has no transform, or an invalid one.
     """
+    constants: dict[str, np.ndarray] = {}
     try:
-        return _constants_of(_configuration(path))
-    except SweepError as error:
+        with path.open("rb") as file:
+            content = file.read(CONFIGURATION_LIMIT + 1)
+        if len(content) > CONFIGURATION_LIMIT:
+            raise SweepError(f"more than {CONFIGURATION_LIMIT >> 20} MB")
+        for each in ElementTree.fromstring(content).iterfind("CoordinateDefinitions/Transform"):
+            name = f"{each.get('From', '')}To{each.get('To', '')}"
+            if not TRANSFORM_NAME.fullmatch(name) or name in constants:
+                raise SweepError(
+                    f"Transform {reprlib.repr(name)}: expected From and To, each pair once, To with a capital"
+                )
+            constants[name] = matrix_of(each.get("Matrix", ""), f"{name} Matrix")
+        if not constants:
+            raise SweepError("no CoordinateDefinitions with a Transform")
+    except (OSError, SweepError, ElementTree.ParseError, LookupError, ValueError) as error:
+        found = error.strerror if isinstance(error, OSError) else str(error)
+        if not isinstance(error, (OSError, SweepError)):
+            found = f"no XML: {found}"
         raise SweepError(
-            f"{path.name}: {error}; expected a PLUS configuration (XML); a scene or a patient's folder goes after --scene"
+            f"{path.name}: {found}; expected a PLUS configuration (XML); a scene or a patient's folder goes after --scene"
         ) from error
+    return constants
+
+
+def transform_fields(name: str, matrix: np.ndarray | None) -> dict[str, str]:
+    """Return the fields of a frame for a transform, such as "ProbeToReference"; None is one that was not tracked."""
+    status = "INVALID" if matrix is None else "OK"
+    text = transform_text(np.eye(4) if matrix is None else matrix)
+    return {f"{name}Transform": text, f"{name}TransformStatus": status}
 
 
 def transform_text(matrix: np.ndarray) -> str:
@@ -188,31 +212,3 @@ def _inverse(matrix: np.ndarray, what: str) -> np.ndarray:
 
 def _is_ok(status: str) -> bool:
     return status.strip().upper() == "OK"
-
-
-def _configuration(path: Path) -> ElementTree.Element:
-    try:
-        with path.open("rb") as file:
-            content = file.read(CONFIGURATION_LIMIT + 1)
-    except OSError as error:
-        raise SweepError(f"{error.strerror}") from error
-    if len(content) > CONFIGURATION_LIMIT:
-        raise SweepError(f"more than {CONFIGURATION_LIMIT >> 20} MB")
-    try:
-        return ElementTree.fromstring(content)
-    except (ElementTree.ParseError, LookupError, ValueError) as error:
-        raise SweepError(f"no XML: {error}") from error
-
-
-def _constants_of(configuration: ElementTree.Element) -> dict[str, np.ndarray]:
-    constants: dict[str, np.ndarray] = {}
-    for each in configuration.iterfind("CoordinateDefinitions/Transform"):
-        name = f"{each.get('From', '')}To{each.get('To', '')}"
-        if not TRANSFORM_NAME.fullmatch(name) or name in constants:
-            raise SweepError(
-                f"Transform {reprlib.repr(name)}: expected From and To, each pair once, To with a capital"
-            )
-        constants[name] = matrix_of(each.get("Matrix", ""), f"{name} Matrix")
-    if not constants:
-        raise SweepError("no CoordinateDefinitions with a Transform")
-    return constants

@@ -88,8 +88,8 @@ def scan(
     from rehearsal.rehearsal import scanned_anatomy
     from sim.embedding import Unmoved
     from ultrasound.image_plane import ImagePlane
-    from ultrasound.labelled_sweep import LabelledSweep
     from ultrasound.scanner import Scanner
+    from ultrasound.sweep_file import LabelledSweep
 
     make_folder(out)
     scanned = scanned_anatomy(anatomy.organ, anatomy.ct, anatomy, np.zeros(3))

@@ -6,9 +6,9 @@ from rehearsal.coordinates import probe_in_patient
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import next_number
 from render.viewer import View
-from ultrasound.labelled_sweep import LabelledSweep
 from ultrasound.probe import Probe
 from ultrasound.sweep import SweepError
+from ultrasound.sweep_file import LabelledSweep
 
 FRAME_S = 1 / 30
 NAME = r"sweep-([0-9]{3,9})\.igs\.mha"

@@ -26,11 +26,17 @@ from sim.embedding import Unmoved
 from sim.signed_distance import signed_distance
 from studies.freehand.freehand_sweeps import sweep_of
 from ultrasound import reconstruction
-from ultrasound.labelled_sweep import LABELS_SUFFIX, SUFFIX, LabelledSweep, read_ground_truth
 from ultrasound.probe import load_probe
 from ultrasound.probe_manipulator import image_plane, pose_at, pose_of_image_plane
 from ultrasound.sweep import PixelLabel, SweepError
-from ultrasound.sweep_file import read_sweep, write_sweep
+from ultrasound.sweep_file import (
+    LABELS_SUFFIX,
+    SUFFIX,
+    LabelledSweep,
+    read_ground_truth,
+    read_sweep,
+    write_sweep,
+)
 from version import VERSION
 
 SPINE, NWIRE = "SpinePhantomFreehand", "NwirePhantomFreehand"
