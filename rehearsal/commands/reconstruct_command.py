@@ -123,7 +123,7 @@ def reconstruct(
     images = read_sweep(sweep)
     images.constant |= load_constants(config) if config else {}
     labels = read_ground_truth(sweep)
-    errors = _errors_of(tracker)
+    errors = TrackingErrors(**tracker)
     if errors != TrackingErrors():
         images = with_errors(images, reference, errors, seed)
     image_poses = image_poses_of(images, reference)
@@ -163,13 +163,6 @@ def reconstruct(
     write_json(report, out / "report.json")
     click.echo(in_words(report))
     click.echo(f"Wrote volume.nrrd, volume.png and report.json to {out}")
-
-
-def _errors_of(tracker: dict[str, float]) -> TrackingErrors:
-    try:
-        return TrackingErrors(**tracker)
-    except ValueError as error:
-        raise CommandError(f"errors of a tracker: {error}") from None
 
 
 def default_reach_mm(image_poses: ImagePoses, spacing_mm: float) -> float:
