@@ -59,24 +59,26 @@ def open_viewer(
     """Open the window, on the screen or off it. Raises NoVulkan."""
     from render.window import Window
 
-    support, tumour = rehearsal.supports, rehearsal.tumour
+    tumour, support = None, None
+    if rehearsal.tumour is not None and rehearsal.tumour_skin is not None:
+        tumour = rehearsal.tumour_skin.vertices, np.asarray(rehearsal.tumour.faces, np.int32)
+    if rehearsal.supports:
+        fixed = rehearsal.supports[0]
+        support = np.asarray(fixed.vertices, np.float32), np.asarray(fixed.faces, np.int32)
     return Window(
         Geometry(
-            organ_vertices=rehearsal.organ_skin.vertices,
-            organ_faces=np.asarray(rehearsal.organ.faces, np.int32),
+            organ=(rehearsal.organ_skin.vertices, np.asarray(rehearsal.organ.faces, np.int32)),
             bounds=rehearsal.organ.bounds,
             up=-rehearsal.gravity_direction,
             transducer_size_mm=rehearsal.size_mm,
             transducer_radius_mm=rehearsal.probe.radius_mm,
             frequency_range_mhz=rehearsal.probe.frequency_range_mhz,
-            tumour_vertices=rehearsal.tumour_skin and rehearsal.tumour_skin.vertices,
-            tumour_faces=None if tumour is None else np.asarray(tumour.faces, np.int32),
+            tumour=tumour,
             parts={
                 tissue: (skin.vertices, np.asarray(rehearsal.parts[tissue].faces, np.int32))
                 for tissue, skin in rehearsal.part_skins.items()
             },
-            support_vertices=np.asarray(support[0].vertices, np.float32) if support else None,
-            support_faces=np.asarray(support[0].faces, np.int32) if support else None,
+            support=support,
         ),
         initial_settings(rehearsal),
         window_size() if visible else FULL_SIZE,

@@ -31,16 +31,13 @@ class SceneView:
 
     def __init__(self, geometry: Geometry, camera: OrbitCamera):
         self.camera = camera
-        self._organ = ShadedSurface(geometry.organ_vertices, geometry.organ_faces)
+        self._organ = ShadedSurface(*geometry.organ)
         self._tumour = self._support = None
-        self._parts = [
-            ShadedSurface(vertices, faces, PARTS[tissue])
-            for tissue, (vertices, faces) in geometry.parts.items()
-        ]
-        if geometry.tumour_vertices is not None and geometry.tumour_faces is not None:
-            self._tumour = ShadedSurface(geometry.tumour_vertices, geometry.tumour_faces, TUMOUR)
-        if geometry.support_vertices is not None and geometry.support_faces is not None:
-            self._support = self._matt_support(geometry.support_vertices, geometry.support_faces)
+        self._parts = [ShadedSurface(*part, PARTS[tissue]) for tissue, part in geometry.parts.items()]
+        if geometry.tumour is not None:
+            self._tumour = ShadedSurface(*geometry.tumour, TUMOUR)
+        if geometry.support is not None:
+            self._support = self._matt_support(*geometry.support)
         self._half_axis_mm = geometry.transducer_size_mm[2] / 2
         shape = geometry.transducer_size_mm, geometry.transducer_radius_mm
         self._probe = transducer_shape.transducer(*shape)

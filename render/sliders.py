@@ -23,9 +23,9 @@ def groups_of(settings: Settings, geometry: Geometry) -> dict[str, list[dataclas
 
 def unused_settings(geometry: Geometry) -> set[str]:
     """Return the names of settings of structures that the scene does not have."""
-    tumour = {"show_tumour", "outline", "margin_mm"} if geometry.tumour_vertices is None else set()
+    tumour = {"show_tumour", "outline", "margin_mm"} if geometry.tumour is None else set()
     parts = set() if geometry.parts else {"show_parts"}
-    return tumour | parts | ({"show_support"} if geometry.support_vertices is None else set())
+    return tumour | parts | ({"show_support"} if geometry.support is None else set())
 
 
 def boxes_of(settings: Settings, geometry: Geometry, layout: WindowLayout) -> dict[str, Rect]:

@@ -94,14 +94,15 @@ class Settings(PlanSettings, ViewSettings, ScannerSettings, TissueSettings):
     """What the user sets; each part of the program is handed its own part. A session records them by their names."""
 
 
+# Vertices [mm], a Taichi field (n,) where they move and an array (n, 3) where they do not, and triangles, normals outward, int32 (m, 3).
+Surface = tuple[Any, np.ndarray]
+
+
 @dataclass(frozen=True)
 class Geometry:
-    """The fixed geometry of a scene. Moving vertices are Taichi fields, which the application updates."""
+    """The geometry of a scene. The application updates the vertices that move."""
 
-    organ_vertices: Any
-    """Surface of the organ [mm], ti.Vector.field(3, ti.f32), shape (n,)."""
-    organ_faces: np.ndarray
-    """Triangles, normals outward, int32, shape (m, 3)."""
+    organ: Surface
     bounds: np.ndarray
     """Box that the camera frames, minimum and maximum corner [mm], shape (2, 3)."""
     up: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
@@ -112,14 +113,11 @@ class Geometry:
     """Radius of a curved array face, in the x-z plane; 0 where it is flat."""
     frequency_range_mhz: tuple[float, float] = (2.0, 15.0)
     """Range of the probe's frequency."""
-    tumour_vertices: Any = None
-    """As organ_vertices, or None."""
-    tumour_faces: np.ndarray | None = None
-    parts: dict[str, tuple[Any, np.ndarray]] = field(default_factory=dict)
-    """Other structures in the organ: tissue -> vertices and triangles, as the organ's."""
-    support_vertices: np.ndarray | None = None
-    """Fixed [mm], shape (k, 3), or None."""
-    support_faces: np.ndarray | None = None
+    tumour: Surface | None = None
+    parts: dict[str, Surface] = field(default_factory=dict)
+    """Other structures in the organ, by tissue."""
+    support: Surface | None = None
+    """It does not move."""
 
 
 @dataclass(frozen=True)

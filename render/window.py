@@ -34,11 +34,6 @@ class NoVulkan(RuntimeError):
     """Taichi found no Vulkan driver to draw with."""
 
 
-def _put_image(canvas, pixels: np.ndarray) -> None:
-    """Show RGBA pixels, uint8 (width, height, 4), behind everything, without the 10 ms that Canvas.set_image needs to pack them."""
-    canvas.canvas.set_image(get_field_info(pixels.view(np.uint32)[..., 0]))
-
-
 class Window:
     """A `Viewer` on GGUI. `ti.init` comes before it, and one window is open at a time.
 
@@ -92,7 +87,7 @@ class Window:
         self._pressing = False
         self._before_drag: tuple[np.ndarray, tuple] | None = None
         self._boxes_placed = 0
-        self._slider_places: tuple[tuple[str, Rect], ...] = ()
+        self._slider_boxes: dict[str, Rect] = {}
         self._last_read = time.perf_counter()
         self._ui_camera = ti.ui.Camera()
         part = self.layout.window_coordinates(self.layout.clear)
@@ -139,7 +134,7 @@ class Window:
         if self._cursor is None:
             return False
         place = self._pixel(self._cursor)
-        over = self._boxes_over_scene() + [box for _, box in self._slider_places]
+        over = [*self._boxes_over_scene(), *self._slider_boxes.values()]
         return self.layout.scene.contains(*place) and not any(box.contains(*place) for box in over)
 
     def _boxes_over_scene(self) -> list[Rect]:
@@ -251,7 +246,8 @@ class Window:
             self._background.show_help()
         else:
             self._background.compose(view, np.stack(self.camera.axes()), self._visible)
-        _put_image(self._canvas, self._background.pixels)
+        # Without the 10 ms that Canvas.set_image needs to pack the pixels.
+        self._canvas.canvas.set_image(get_field_info(self._background.pixels.view(np.uint32)[..., 0]))
         self._set_camera()
         rects = [self.layout.panel, self.layout.title, self.layout.strip, *self._boxes_over_scene()]
         masked = [self.layout.window_coordinates(rect) for rect in rects]
@@ -273,9 +269,7 @@ class Window:
         self._scene.set_camera(self._ui_camera)
 
     def _draw_sliders(self) -> None:
-        places = tuple(boxes_of(self.settings, self._geometry, self.layout).items())
-        if places != self._slider_places:
-            self._slider_places, self._boxes_placed = places, self._boxes_placed + 1
-        draw_sliders(
-            self._gui, self.settings, self._geometry, dict(places), self._first_size, self._boxes_placed
-        )
+        boxes = boxes_of(self.settings, self._geometry, self.layout)
+        if boxes != self._slider_boxes:
+            self._slider_boxes, self._boxes_placed = boxes, self._boxes_placed + 1
+        draw_sliders(self._gui, self.settings, self._geometry, boxes, self._first_size, self._boxes_placed)

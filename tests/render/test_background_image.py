@@ -54,10 +54,10 @@ def apart(one: Rect, other: Rect) -> bool:
 
 
 def geometry(**parts) -> Geometry:
-    return Geometry(None, np.zeros((0, 3)), np.zeros((2, 3)), **parts)
+    return Geometry((None, np.zeros((0, 3))), np.zeros((2, 3)), **parts)
 
 
-WHOLE = geometry(tumour_vertices=1, parts={"vessel": (1, 1)}, support_vertices=np.zeros((1, 3)))
+WHOLE = geometry(tumour=(1, 1), parts={"vessel": (1, 1)}, support=(1, 1))
 
 
 @each_size
@@ -120,7 +120,7 @@ def test_a_missing_structure_has_no_slider():
         "show_support",
     } <= whole and "stiffness" not in whole
     assert whole - named(geometry()) == {"show_tumour", "outline", "margin_mm", "show_parts", "show_support"}
-    assert whole - named(geometry(tumour_vertices=1, parts={"cyst": (1, 1)})) == {"show_support"}
+    assert whole - named(geometry(tumour=(1, 1), parts={"cyst": (1, 1)})) == {"show_support"}
 
 
 # Texts

@@ -237,7 +237,7 @@ def window():
     vertices = ball.vertices.astype(np.float32)
     field = ti.Vector.field(3, ti.f32, shape=len(vertices))
     fill((field, vertices))
-    geometry = Geometry(field, ball.faces.astype(np.int32), np.array([[-45.0] * 3, [45.0] * 3]))
+    geometry = Geometry((field, ball.faces.astype(np.int32)), np.array([[-45.0] * 3, [45.0] * 3]))
     try:
         opened = Window(geometry, Settings(translucent=False), size=(640, 360), visible=False)
     except NoVulkan as reason:
@@ -345,7 +345,7 @@ from render.viewer import Geometry
 from render.window import NoVulkan, Window
 field = ti.Vector.field(3, ti.f32, shape=3)
 try:
-    Window(Geometry(field, np.array([[0, 1, 2]]), np.array([[-1.0] * 3, [1.0] * 3])), visible=False)
+    Window(Geometry((field, np.array([[0, 1, 2]])), np.array([[-1.0] * 3, [1.0] * 3])), visible=False)
 except NoVulkan as reason:
     assert "\\n" not in str(reason)
     print("said", reason)

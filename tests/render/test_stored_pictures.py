@@ -155,12 +155,10 @@ def window(scene):
 
     organ = scene.anatomy.organ
     geometry = Geometry(
-        scene.surface.vertices,
-        organ.faces.astype(np.int32),
+        (scene.surface.vertices, organ.faces.astype(np.int32)),
         np.array([[-FRAMED] * 3, [FRAMED] * 3]),
         transducer_size_mm=np.array([WIDTH, 10.0, 20.0]),
-        tumour_vertices=scene.tumour.vertices,
-        tumour_faces=TUMOUR_SURFACE.faces.astype(np.int32),
+        tumour=(scene.tumour.vertices, TUMOUR_SURFACE.faces.astype(np.int32)),
     )
     try:
         opened = Window(geometry, Settings(), size=WINDOW, visible=False)
