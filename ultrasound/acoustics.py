@@ -1,6 +1,6 @@
 """Acoustic properties of a CT's voxels from labels and HU: impedance, attenuation and backscatter. NumPy.
 
-A labelled voxel has its tissue's values (``tissues.toml``), as contrast agent raises HU by iodine, not by density. Fat and stones
+A labelled voxel has its tissue's values (``acoustic_tissues.toml``), as contrast agent raises HU by iodine, not by density. Fat and stones
 within a kidney are classified by HU: no agent lowers parenchyma to fat or raises it to stone. Enhanced urine is as bright as stone,
 so that it needs a label.
 """
@@ -17,7 +17,7 @@ from scipy import ndimage
 from errors import UserError
 from ultrasound.tissue_classification import classify_tissues
 
-TISSUES = Path(__file__).parent / "tissues.toml"
+TISSUES = Path(__file__).parent / "acoustic_tissues.toml"
 # Amplitude of renal cortex relative to a perfect reflector: its speckle is some 16 dB below the echo of fat on kidney.
 CORTEX_DB = -38.0
 # Smooths the voxel steps of labels.
@@ -71,17 +71,24 @@ def properties(
     """
     check_tissues(tissue_of_label or {})
     spacing = np.ones(3) if spacing_mm is None else np.asarray(spacing_mm, float)
-    values = _by_hounsfield(hu)
-    texture = _Texture(hu.shape, spacing)
+    values, noise = _by_hounsfield(hu), {}
     level = values[..., BACKSCATTER]
-    level += texture.of(tissue_table()["hounsfield"], ...)
+
+    def texture(table: dict, where: Any) -> np.ndarray:
+        """Return the texture of the backscatter level at some voxels [dB]."""
+        distance = float(table["texture_mm"])
+        if distance not in noise:
+            noise[distance] = _noise(hu.shape, distance / 2 / spacing)
+        return np.float32(table["texture_db"]) * noise[distance][where]
+
+    level += texture(tissue_table()["hounsfield"], ...)
     labelled = _labelled(hu, labels, tissue_of_label or {}, spacing)
     stone = labelled.pop("stone", None)
     for tissue, where in labelled.items():
         table = tissue_table()[tissue]
         values[where, IMPEDANCE] = table["impedance_mrayl"]
         values[where, ATTENUATION] = table["attenuation_db_cm_mhz"]
-        level[where] = table["backscatter_db"] + texture.of(table, where)
+        level[where] = table["backscatter_db"] + texture(table, where)
     values[..., BACKSCATTER] = np.float32(10) ** ((level + np.float32(CORTEX_DB)) / np.float32(20))
     for channel in range(3):
         values[..., channel] = ndimage.gaussian_filter(values[..., channel], SMOOTHING_VOXELS, truncate=2.5)
@@ -126,18 +133,8 @@ def _labelled(
     return {tissue: where for tissue, where in found.items() if where.any()}
 
 
-class _Texture:
-    """Texture of the backscatter level [dB], the same for the same voxels on every machine."""
-
-    def __init__(self, shape: tuple[int, ...], spacing_mm: np.ndarray) -> None:
-        self.shape, self.spacing_mm = shape, spacing_mm
-        self.fields: dict[float, np.ndarray] = {}
-
-    def of(self, table: dict, where: Any) -> np.ndarray:
-        """Return noise of SD ``texture_db`` correlated over ``texture_mm``, at some voxels; one field per distance."""
-        distance = float(table["texture_mm"])
-        if distance not in self.fields:
-            noise = np.random.default_rng(SEED).standard_normal(self.shape, dtype=np.float32)
-            noise = ndimage.gaussian_filter(noise, distance / 2 / self.spacing_mm, truncate=2, mode="wrap")
-            self.fields[distance] = noise / max(float(noise.std()), 1e-6)
-        return np.float32(table["texture_db"]) * self.fields[distance][where]
+def _noise(shape: tuple[int, ...], sd_voxels: np.ndarray) -> np.ndarray:
+    """Return noise of unit SD, smoothed by an SD along each axis, the same for the same voxels on every machine."""
+    noise = np.random.default_rng(SEED).standard_normal(shape, dtype=np.float32)
+    noise = ndimage.gaussian_filter(noise, sd_voxels, truncate=2, mode="wrap")
+    return noise / max(float(noise.std()), 1e-6)

@@ -27,6 +27,7 @@ DetailLevel = Literal["reflection", "speckle", "elevation"]
 DETAIL_LEVELS: tuple[DetailLevel, ...] = get_args(DetailLevel)
 
 Percent = Annotated[float, Field(ge=0, le=100)]
+Length = Annotated[float, Field(gt=0)]
 
 
 class ProbeError(UserError):
@@ -48,7 +49,7 @@ class Probe(BaseModel):
 
     transducer_name: str = Field(min_length=1, max_length=60)
     transducer_geometry: Literal["LINEAR", "CURVILINEAR", "PHASED"] = "LINEAR"
-    housing_mm: tuple[float, float, float] = (40.0, 10.0, 20.0)
+    housing_mm: tuple[Length, Length, Length] = (40.0, 10.0, 20.0)
     edge_radius_mm: float = Field(0.0, ge=0, le=20)
     transducer_width_mm: float = Field(40.0, gt=0, le=300)
     radius_start_mm: float = Field(0.0, ge=0, le=300)
@@ -66,17 +67,13 @@ class Probe(BaseModel):
     pulse_cycles: float = Field(2.0, ge=1, le=20)
     gain_percent: Percent = 56.0
     dyn_range_db: float = Field(60.0, ge=20, le=120)
-    time_gain_compensation: tuple[Percent, ...] = (50.0,) * TGC_SLIDERS
+    time_gain_compensation: tuple[Percent, ...] = Field(
+        (50.0,) * TGC_SLIDERS, min_length=TGC_SLIDERS, max_length=TGC_SLIDERS
+    )
     depth_compensation_db_cm_mhz: float = Field(0.85, ge=0, le=5)
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Probe":
-        if min(self.housing_mm) <= 0:
-            raise ValueError(f"HousingMm = {list(self.housing_mm)}: expected three positive lengths in mm")
-        if len(self.time_gain_compensation) != TGC_SLIDERS:
-            raise ValueError(
-                f"TimeGainCompensation has {len(self.time_gain_compensation)} values: expected {TGC_SLIDERS}, from the face down"
-            )
         if self.edge_radius_mm > min(self.housing_mm) / 2:
             raise ValueError(
                 f"EdgeRadiusMm = {self.edge_radius_mm:g}: expected at most half of the least of HousingMm, {min(self.housing_mm) / 2:g}"

@@ -48,7 +48,7 @@ class Label(IntEnum):
     TUMOUR = 6
 
 
-# The tissues of ultrasound/tissues.toml.
+# The tissues of ultrasound/acoustic_tissues.toml.
 TISSUE_OF_LABEL: dict[int, str] = {
     Label.CORTEX: "cortex",
     Label.MEDULLA: "medulla",
