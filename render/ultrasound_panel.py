@@ -48,14 +48,6 @@ def ruler_ticks(view: View, box: Rect) -> list[tuple[int, int | None]]:
     return ticks
 
 
-def marker_centre(layout: WindowLayout, box: Rect, marked_side: str) -> tuple[int, int]:
-    """Return the centre (x, y) of the marker dot, above the image at its marked side. Raises ValueError for another side."""
-    if marked_side not in ("left", "right"):
-        raise ValueError(f"marked_side is {marked_side!r}: it must be 'left' or 'right'")
-    x = box.left + layout.px(9) if marked_side == "left" else box.right - layout.px(10)
-    return x, box.top - layout.px(12)
-
-
 def paste_image(page: np.ndarray, box: Rect, image: np.ndarray) -> None:
     """Draw an image, uint8 (rows, columns), into its box, resampled unless it has the size of the box."""
     if image.shape != (box.height, box.width):
@@ -125,11 +117,10 @@ def draw_panel(draw: ImageDraw.ImageDraw, layout: WindowLayout, view: View) -> N
     _draw_ruler(draw, layout, view, boxes[0])
     _draw_wedge(draw, layout, boxes[-1])
     for name, box in zip(view.images, boxes, strict=True):
-        x, y = marker_centre(layout, box, view.marked_side)
-        radius = px(6)
+        # The marker dot: local +x is to the right.
+        x, y, radius = box.right - px(10), box.top - px(12), px(6)
         draw.ellipse([x - radius, y - radius, x + radius, y + radius], fill=MARK)
-        edge, anchor = (box.left, "lm") if view.marked_side == "right" else (box.right, "rm")
-        draw.text((edge, y), name, font=font(px(15)), fill=TEXT, anchor=anchor)
+        draw.text((box.left, y), name, font=font(px(15)), fill=TEXT, anchor="lm")
 
 
 def _draw_row(draw: ImageDraw.ImageDraw, x: int, width: int, y: int, left: Written, right: Written) -> None:

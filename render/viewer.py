@@ -176,8 +176,6 @@ class View:
     """Its rate, where slower than real time: "0.2 x real"."""
     title: str = ""
     """Scene or case; no identifiers of the patient."""
-    marked_side: str = "right"
-    """Side of the marker dot in the image: "right" is local +x, "left" for a probe marked at -x."""
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""The scanner: CT slice and B-mode image on the same image plane of a probe.
+"""The scanner: CT slice, B-mode image and ground-truth labels on the same image plane of a probe.
 
 CT slice: image plane -> deformed tetrahedra -> voxels at rest (the paper's method).
 """
@@ -7,18 +7,20 @@ from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import taichi as ti
 import trimesh
 
 from sim.embedding import Embedding, Unmoved
+from sim.fields import field_of
 from ultrasound.acoustics import check_tissues, properties
 from ultrasound.bmode import BMode
-from ultrasound.ground_truth_labels import GroundTruthLabels
 from ultrasound.image_plane import LANES, Image, ImagePlane, PlaneInTissue
 from ultrasound.probe import DetailLevel, Mode, Probe
 from ultrasound.sampled_volume import AIR_HU, SampledVolume, distance_volume
+from ultrasound.sweep import PixelLabel
 
 # HU and impedance [MRayl] around the organ where the image does not show the CT there.
 OUTSIDE: dict[str, tuple[float, float | None]] = {
@@ -26,6 +28,7 @@ OUTSIDE: dict[str, tuple[float, float | None]] = {
     "gel": (0.0, 1.5),
     "air": (AIR_HU, 4e-4),
 }
+MAX_BEADS = 255 // PixelLabel.BEAD
 CT, B_MODE = "CT", "B-mode"
 IMAGES_OF_MODE: dict[Mode, tuple[str, ...]] = {"ct": (CT,), "b-mode": (B_MODE,), "both": (B_MODE, CT)}
 
@@ -56,6 +59,55 @@ def start_acoustics(anatomy: ScannedAnatomy) -> Future[np.ndarray]:
     values = worker.submit(properties, anatomy.hu, anatomy.labels, anatomy.tissues, anatomy.voxel_mm)
     worker.shutdown(wait=False)
     return values
+
+
+@ti.data_oriented
+class GroundTruthLabels:
+    """``PixelLabel`` values of the plane located last, by the rest position of its tissue.
+
+    ``organ`` and ``tumour`` are signed distances [mm], negative inside; ``beads`` (n, 3) are centres of balls of a radius [mm].
+    Raises ValueError for more than MAX_BEADS beads.
+    """
+
+    def __init__(
+        self,
+        plane: PlaneInTissue,
+        organ: SampledVolume,
+        tumour: SampledVolume | None = None,
+        beads: np.ndarray | None = None,
+        radius_mm: float = 2.0,
+    ) -> None:
+        self.plane, self.organ, self.radius_mm = plane, organ, radius_mm
+        self.tumour: Any = tumour
+        self.has_tumour = tumour is not None
+        self.beads = 0 if beads is None else len(beads)
+        if self.beads > MAX_BEADS:
+            raise ValueError(f"{self.beads} beads: at most {MAX_BEADS} fit into 8-bit labels")
+        if beads is not None:
+            self.bead = field_of(np.asarray(beads, float), 1)
+
+    def render(self) -> np.ndarray:
+        """Return labels (pixels, pixels) uint8."""
+        image = np.empty((self.plane.pixels, self.plane.pixels), np.uint8)
+        self._render(image)
+        return image
+
+    @ti.kernel
+    def _render(self, image: Image):
+        for row, column in ti.ndrange(self.plane.pixels, self.plane.pixels):
+            rest = self.plane.rest_at(row, column, self.plane.grid[0], self.plane.grid[1])
+            label = ti.cast(PixelLabel.OUTSIDE, ti.i32)
+            if self.plane.is_tissue(row, column):
+                if self.organ.sample(rest) < 0.0:
+                    label = PixelLabel.ORGAN
+                if ti.static(self.has_tumour):
+                    if self.tumour.sample(rest) < 0.0:
+                        label = PixelLabel.TUMOUR
+                if ti.static(self.beads > 0):
+                    for k in range(self.beads):
+                        if (rest - self.bead[k]).norm_sqr() < self.radius_mm**2:
+                            label = label % PixelLabel.BEAD + PixelLabel.BEAD * (k + 1)
+            image[row, column] = ti.cast(label, ti.u8)
 
 
 @ti.data_oriented

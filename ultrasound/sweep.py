@@ -8,6 +8,7 @@ import re
 import reprlib
 from collections import deque
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
@@ -68,7 +69,16 @@ class Sweep:
     @property
     def times_s(self) -> np.ndarray:
         """Time of each frame (n,) [s]; SweepError where a timestamp is missing or not a finite number."""
-        return np.array([self._time(frame) for frame in range(len(self))])
+        times = np.full(len(self), np.nan)
+        for frame, fields in enumerate(self.frames):
+            text = fields.get("Timestamp", "")
+            with suppress(ValueError):
+                times[frame] = float(text)
+            if not np.isfinite(times[frame]):
+                raise SweepError(
+                    f"frame {frame}: Timestamp = {reprlib.repr(text)}: expected a finite number of seconds"
+                )
+        return times
 
     def transform(self, start: str, end: str, frame: int) -> np.ndarray | None:
         """Return the matrix (4, 4) from ``start`` to ``end``, such as "Image" and "Reference", along the shortest chain of transforms.
@@ -88,24 +98,15 @@ class Sweep:
             step = self._tracked(name, frame) if name in tracked else self.constant[name]
             if step is None:
                 return None
-            matrix = (_inverse(step, f"frame {frame}: {name}") if inverted else step) @ matrix
+            try:
+                matrix = (np.linalg.inv(step) if inverted else step) @ matrix
+            except np.linalg.LinAlgError as error:
+                raise SweepError(f"frame {frame}: {name} has no inverse") from error
         return matrix
 
     def is_image_ok(self, frame: int) -> bool:
         """Whether there are pixels and no status other than OK."""
         return self.images[frame].size > 0 and _is_ok(self.frames[frame].get("ImageStatus", "OK"))
-
-    def _time(self, frame: int) -> float:
-        text = self.frames[frame].get("Timestamp", "")
-        try:
-            time_s = float(text)
-        except ValueError:
-            time_s = np.nan
-        if not np.isfinite(time_s):
-            raise SweepError(
-                f"frame {frame}: Timestamp = {reprlib.repr(text)}: expected a finite number of seconds"
-            )
-        return time_s
 
     def _tracked(self, name: str, frame: int) -> np.ndarray | None:
         fields = self.frames[frame]
@@ -201,13 +202,6 @@ def _affine(matrix: np.ndarray, what: str, found: str) -> np.ndarray:
             f"{what} = {found}: expected sixteen finite numbers row by row, the last row 0 0 0 1"
         )
     return matrix
-
-
-def _inverse(matrix: np.ndarray, what: str) -> np.ndarray:
-    try:
-        return np.linalg.inv(matrix)
-    except np.linalg.LinAlgError as error:
-        raise SweepError(f"{what} has no inverse") from error
 
 
 def _is_ok(status: str) -> bool:

@@ -13,12 +13,11 @@ from scenes.anatomy import LoadedAnatomy
 from sim.embedding import Unmoved
 from sim.signed_distance import signed_distance
 from ultrasound.bmode import source_of_pixels
-from ultrasound.ground_truth_labels import MAX_BEADS, GroundTruthLabels
 from ultrasound.image_plane import ImagePlane, PlaneInTissue
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import advanced, touching
 from ultrasound.sampled_volume import distance_volume
-from ultrasound.scanner import Scanner
+from ultrasound.scanner import MAX_BEADS, GroundTruthLabels, Scanner
 from ultrasound.sweep import Sweep, transform_fields
 
 FRAMES_A_SECOND = 30

@@ -5,14 +5,21 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from render.background_image import BackgroundImage
+from render.background_image import (
+    ARM,
+    BackgroundImage,
+    clock_box,
+    compass_image,
+    ends_of,
+    findings_image,
+    readout_image,
+)
 from render.camera import OrbitCamera
 from render.keys import DEFAULT_KEYS, Keys
 from render.sliders import boxes_of, groups_of
 from render.text import fitting_size, font, shortened, write
 from render.ultrasound_panel import ALERT, CALIPER, OUTLINE, OUTLINE_AT_REST, QUIET, TEXT, to_plane
 from render.viewer import SCANNER_GROUPS, Geometry, Settings, View
-from render.window_frame import ARM, clock_box, compass_image, ends_of, findings_image, readout_image
 from render.window_layout import Rect, WindowLayout
 
 LAYOUT = WindowLayout(1280, 720)

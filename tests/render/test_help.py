@@ -5,8 +5,8 @@ import pytest
 from conftest import ROOT
 from PIL import ImageDraw
 
+from render.background_image import help_image, in_columns
 from render.keys import KEY_MAP, Keys
-from render.window_frame import help_image, in_columns
 from render.window_layout import FULL_SIZE, WindowLayout
 
 LINES = [keys for group in KEY_MAP.values() for keys in group.values()]

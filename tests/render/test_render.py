@@ -11,7 +11,7 @@ import trimesh
 from conftest import ROOT
 from null_viewer import NullViewer
 
-from render import transducer_shape, ultrasound_panel, window_frame
+from render import background_image, transducer_shape, ultrasound_panel
 from render.camera import OrbitCamera
 from render.cut_face import FLESH
 from render.display import display_available, fitted, window_size
@@ -294,11 +294,11 @@ def test_organ_never_covers_the_panel_the_title_or_the_readouts(window):
     red = _organ_pixels(picture)
     layout = opened.layout
     assert red[layout.scene.slices][:, -1].any(), "the organ does not reach the panel: this proves nothing"
-    expected = window_frame.backdrop(layout, _view())
+    expected = background_image.backdrop(layout, _view())
     ultrasound_panel.paste_image(expected, layout.image_boxes(1, 40.0, 60.0)[0], _view().images["CT"])
     for rect in (layout.panel, layout.title):
         assert np.array_equal(picture[rect.slices], expected[rect.slices])
-    assert np.array_equal(picture[layout.readouts.slices], window_frame.readout_image(layout, {}))
+    assert np.array_equal(picture[layout.readouts.slices], background_image.readout_image(layout, {}))
 
 
 def test_two_pictures_of_one_view_are_the_same(window):

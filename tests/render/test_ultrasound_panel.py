@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from render import ultrasound_panel, window_frame
+from render import background_image, ultrasound_panel
 from render.text import font
 from render.viewer import View
 from render.window_layout import HEADER_HEIGHT, RULER_WIDTH, WindowLayout
@@ -67,25 +67,17 @@ def test_ruler_ticks_stand_at_their_depth(depth_mm):
 def test_ruler_is_drawn_where_its_ticks_say():
     drawn_with = ct_view()
     box = LAYOUT.image_boxes(1, 40.0, 60.0)[0]
-    picture = window_frame.backdrop(LAYOUT, drawn_with)
+    picture = background_image.backdrop(LAYOUT, drawn_with)
     column = picture[box.top : box.bottom, box.left - 8]
     drawn = {box.top + int(row) for row in np.flatnonzero(np.any(column != ultrasound_panel.PANEL, axis=1))}
     assert drawn == {row for row, _ in ultrasound_panel.ruler_ticks(drawn_with, box)}
 
 
-@pytest.mark.parametrize("side", ["left", "right"])
-def test_marker_dot_is_on_the_marked_side(side):
-    picture = window_frame.backdrop(LAYOUT, ct_view(marked_side=side))
+def test_marker_dot_is_on_the_right():
+    page = background_image.backdrop(LAYOUT, ct_view())
     box = LAYOUT.image_boxes(1, 40.0, 60.0)[0]
-    columns = np.flatnonzero(np.any(np.all(picture == ultrasound_panel.MARK, axis=2), axis=0))
-    middle = (box.left + box.right) / 2
-    assert len(columns) > 0
-    assert np.all(columns < middle) if side == "left" else np.all(columns > middle)
-
-
-def test_unknown_marked_side_is_refused():
-    with pytest.raises(ValueError, match="marked_side"):
-        window_frame.backdrop(LAYOUT, ct_view(marked_side="top"))
+    columns = np.flatnonzero(np.any(np.all(page == ultrasound_panel.MARK, axis=2), axis=0))
+    assert len(columns) > 0 and np.all(columns > (box.left + box.right) / 2)
 
 
 def test_parts_of_the_window_do_not_overlap():
@@ -102,11 +94,11 @@ def test_parts_of_the_window_do_not_overlap():
 
 def test_readouts_and_status_change_the_picture():
     assert np.any(
-        window_frame.readout_image(LAYOUT, {"Step": "9 ms"})
-        != window_frame.readout_image(LAYOUT, {"Step": "8 ms"})
+        background_image.readout_image(LAYOUT, {"Step": "9 ms"})
+        != background_image.readout_image(LAYOUT, {"Step": "8 ms"})
     )
-    plain = window_frame.backdrop(LAYOUT, ct_view())
-    frozen = window_frame.backdrop(LAYOUT, ct_view(status="FROZEN"))
+    plain = background_image.backdrop(LAYOUT, ct_view())
+    frozen = background_image.backdrop(LAYOUT, ct_view(status="FROZEN"))
     changed = np.argwhere(np.any(plain != frozen, axis=2))
     assert len(changed) > 0 and changed[:, 1].min() > LAYOUT.panel.left
 
@@ -122,7 +114,7 @@ PLANNING = "PLANNING   43 %, some 18 min left; Backspace stops"
 def test_a_status_is_as_large_as_it_can_be_in_the_panel(size, status):
     layout = WindowLayout(*size)
     plain, with_status = (
-        window_frame.backdrop(layout, ct_view(status=each))[:, layout.panel.left :].astype(int)
+        background_image.backdrop(layout, ct_view(status=each))[:, layout.panel.left :].astype(int)
         for each in ("", status)
     )
     columns = np.flatnonzero(np.any(plain != with_status, axis=(0, 2)))
