@@ -22,7 +22,8 @@ from rehearsal.stopwatch import timed
 from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer, send_live
 from rehearsal.tracking.sweep_recording import SweepRecorder
 from render.keys import Keys
-from render.viewer import Controls, ScannerSettings, Settings, View, Viewer
+from render.viewer import Controls, ScannerSettings, Settings, View
+from render.window import Window
 from ultrasound.probe import Probe
 
 # How long a notice stays on the screen, and the one that the tissue's state was restored.
@@ -71,7 +72,7 @@ class Frames:
 class WindowFrames(Frames):
     """The frames in a window; a frozen one makes no step."""
 
-    viewer: Viewer
+    viewer: Window
     out: Path
     notices: Notices
     sweeping: SweepRecorder

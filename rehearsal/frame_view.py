@@ -6,7 +6,8 @@ from rehearsal.rehearsal import Rehearsal
 from render.display import window_size
 from render.gamepad import Gamepad
 from render.keys import Keys
-from render.viewer import Geometry, ScannerSettings, Settings, Viewer
+from render.viewer import Geometry, ScannerSettings, Settings
+from render.window import Window
 from render.window_layout import FULL_SIZE
 from ultrasound.probe import TGC_SLIDERS, Probe
 
@@ -55,10 +56,8 @@ def probe_with_settings(probe: Probe, settings: ScannerSettings) -> Probe:
 
 def open_viewer(
     rehearsal: Rehearsal, visible: bool, keys: Keys | None = None, gamepad: Gamepad | None = None
-) -> Viewer:
+) -> Window:
     """Open the window, on the screen or off it. Raises NoVulkan."""
-    from render.window import Window
-
     tumour, support = None, None
     if rehearsal.tumour is not None and rehearsal.tumour_skin is not None:
         tumour = rehearsal.tumour_skin.vertices, np.asarray(rehearsal.tumour.faces, np.int32)

@@ -13,19 +13,15 @@ AROUND_LABEL, AROUND_SWITCH = 16, 35
 
 def groups_of(settings: Settings, geometry: Geometry) -> dict[str, list[dataclasses.Field]]:
     """Return the adjustable settings by group."""
-    unused = unused_settings(geometry)
+    # Settings of structures that the scene does not have.
+    unused = {"show_tumour", "outline", "margin_mm"} if geometry.tumour is None else set()
+    unused |= set() if geometry.parts else {"show_parts"}
+    unused |= {"show_support"} if geometry.support is None else set()
     groups: dict[str, list[dataclasses.Field]] = {}
     for each in dataclasses.fields(settings):
         if each.metadata and getattr(settings, each.name) is not None and each.name not in unused:
             groups.setdefault(each.metadata["group"], []).append(each)
     return groups
-
-
-def unused_settings(geometry: Geometry) -> set[str]:
-    """Return the names of settings of structures that the scene does not have."""
-    tumour = {"show_tumour", "outline", "margin_mm"} if geometry.tumour is None else set()
-    parts = set() if geometry.parts else {"show_parts"}
-    return tumour | parts | ({"show_support"} if geometry.support is None else set())
 
 
 def boxes_of(settings: Settings, geometry: Geometry, layout: WindowLayout) -> dict[str, Rect]:

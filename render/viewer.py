@@ -1,4 +1,4 @@
-"""The interface of a front end: geometry, views, settings, controls.
+"""What the window is given and gives back: geometry, views, settings, controls.
 
 Lengths are in mm, angles in degrees, patient coordinates LPS. Nothing here needs a screen, Vulkan or Taichi.
 """
@@ -6,7 +6,7 @@ Lengths are in mm, angles in degrees, patient coordinates LPS. Nothing here need
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -223,22 +223,3 @@ class Controls:
     quit: bool = False
     message: str = ""
     """Message of an input device, such as that it was unplugged."""
-
-
-class Viewer(Protocol):
-    """A front end. The loop is: while running: read_controls, step, draw."""
-
-    settings: Settings
-
-    @property
-    def running(self) -> bool: ...
-
-    def read_controls(self) -> Controls: ...
-
-    def draw(self, view: View) -> None: ...
-
-    def picture(self) -> np.ndarray:
-        """The last view drawn, uint8, shape (height, width, 3), top row first."""
-        ...
-
-    def close(self) -> None: ...

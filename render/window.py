@@ -35,14 +35,15 @@ class NoVulkan(RuntimeError):
 
 
 class Window:
-    """A `Viewer` on GGUI. `ti.init` comes before it, and one window is open at a time.
+    """A window on GGUI. The loop is: while running: read_controls, step, draw.
+
+    `ti.init` comes before it, and one window is open at a time.
 
     Args:
         geometry: fixed geometry of the scene.
         settings: values of the sliders.
         size: width, height in pixels.
         visible: a real window, at most FRAMES_A_SECOND; else off-screen, drawn only by `picture`.
-        name: in the title bar.
         keys: assignment of keys.
         gamepad: read beside mouse and keys, if given.
 
@@ -57,7 +58,6 @@ class Window:
         settings: Settings | None = None,
         size: tuple[int, int] = FULL_SIZE,
         visible=True,
-        name="Nephron",
         keys: Keys | None = None,
         gamepad: Gamepad | None = None,
     ):
@@ -71,7 +71,9 @@ class Window:
         self._visible = visible
         self._ini_was_there = Path("imgui.ini").exists()
         try:
-            self._window = ti.ui.Window(name, tuple(size), show_window=visible, fps_limit=FRAMES_A_SECOND)
+            self._window = ti.ui.Window(
+                "Nephron", tuple(size), show_window=visible, fps_limit=FRAMES_A_SECOND
+            )
         except RuntimeError as error:
             raise NoVulkan("no Vulkan driver found: the window and its pictures need one") from error
         atexit.register(self.close)
