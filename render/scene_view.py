@@ -76,7 +76,7 @@ class SceneView:
         self._mask(scene, masked)
         if self._support is not None and settings.show_support:
             # A decimated mesh has slivers that face the wrong way, which would appear as black specks.
-            _draw_surface(scene, self._support, two_sided=True)
+            self._support.draw(scene, two_sided=True)
         self._draw_transducer(scene, view.transducer_pose)
         inner = self._inner(view, settings)
         cut = self._draw_cut_face(scene, view, inner, eye, key) if settings.cut else None
@@ -92,7 +92,7 @@ class SceneView:
         opacity = GLASS if settings.translucent else SOLID
         self._organ.tint(view.seen.get("organ"))
         self._organ.shade(eye, key, opacity, cut)
-        _draw_surface(scene, self._organ, ahead if opacity < SOLID or cut is not None else None, cut)
+        self._organ.draw(scene, ahead if opacity < SOLID or cut is not None else None, cut)
 
     def _inner(self, view: View, settings: Settings) -> list[ShadedSurface]:
         """Return the shown surfaces inside the organ."""
@@ -107,7 +107,7 @@ class SceneView:
     ) -> None:
         for surface in inner:
             surface.shade(eye, key, SOLID, cut)
-            _draw_surface(scene, surface, None if cut is None else ahead, cut)
+            surface.draw(scene, None if cut is None else ahead, cut)
 
     def _mask(self, scene, masked) -> None:
         """Draw quads of alpha 0 just behind the near plane: the background stays visible, what is drawn later is hidden."""
@@ -154,22 +154,6 @@ class SceneView:
         )
         fill((self._frame_points, transducer_shape.placed(transducer_shape.image_plane_frame(view), face)))
         scene.lines(self._frame_points, LINE_WIDTH, color=FRAME)
-
-
-def _draw_surface(
-    scene,
-    surface: ShadedSurface,
-    ahead: np.ndarray | None = None,
-    cut: Cut | None = None,
-    two_sided=False,
-) -> None:
-    scene.mesh(
-        surface.vertices,
-        surface.indices(ahead, cut),
-        surface.normal,
-        per_vertex_color=surface.colour,
-        two_sided=two_sided,
-    )
 
 
 class PlanLines:

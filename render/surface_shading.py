@@ -124,6 +124,13 @@ class ShadedSurface:
             else:
                 fill((self._tint, vertices))
 
+    def draw(
+        self, scene, ahead: np.ndarray | None = None, cut: Cut | None = None, two_sided: bool = False
+    ) -> None:
+        """Draw the surface into a scene, in the order of ``indices``."""
+        colours = dict(per_vertex_color=self.colour, two_sided=two_sided)
+        scene.mesh(self.vertices, self.indices(ahead, cut), self.normal, **colours)
+
     def indices(self, ahead: np.ndarray | None = None, cut: Cut | None = None) -> np.ndarray:
         """Return vertex indices of the faces, int32 (3 m,), farthest first along `ahead` if given, without faces removed by a cut."""
         if ahead is None:

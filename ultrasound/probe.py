@@ -125,12 +125,12 @@ class Probe(BaseModel):
     @property
     def extent_mm(self) -> tuple[float, float, float]:
         """Width and depth of the image's bounding box, and the part of the depth behind the centre of the face."""
-        if self.transducer_geometry == "LINEAR":
+        if self.sector is None:
             return self.transducer_width_mm, self.depth_mm, 0.0
-        reach = self.radius_mm + self.depth_mm
-        left, right = np.radians([self.theta_start_deg, self.theta_stop_deg])
+        radius, left, right = self.sector
+        reach = radius + self.depth_mm
         half = reach * max(np.sin(right), np.sin(-left))
-        above = self.radius_mm * (1 - np.cos(max(right, -left)))
+        above = radius * (1 - np.cos(max(right, -left)))
         return float(2 * half), float(self.depth_mm + above), float(above)
 
     def image_to_probe(self, rows: int, columns: int) -> np.ndarray:
@@ -145,24 +145,20 @@ class Probe(BaseModel):
 
     def scanlines(self) -> tuple[np.ndarray, np.ndarray]:
         """Return start [mm] and unit direction of each scanline, each (scanlines, 2) on the image plane."""
-        start, stop = np.radians([self.theta_start_deg, self.theta_stop_deg])
-        if self.transducer_geometry == "LINEAR":
-            start = stop = 0.0
-        angle = start + (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines * (
-            stop - start
-        )
+        if self.sector is None:
+            return self.elements(), np.tile([0.0, 1.0], (self.number_of_scanlines, 1))
+        radius, start, stop = self.sector
+        share = (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines
+        angle = start + share * (stop - start)
         direction = np.column_stack([np.sin(angle), np.cos(angle)])
-        if self.transducer_geometry == "LINEAR":
-            share = (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines - 0.5
-            return np.column_stack([share * self.transducer_width_mm, np.zeros_like(share)]), direction
-        return self.radius_mm * (direction - [0.0, 1.0]), direction
+        return radius * (direction - [0.0, 1.0]), direction
 
     def elements(self) -> np.ndarray:
         """Return the elements on the face (scanlines, 2) [mm]: the starts of the scanlines, or across a phased array."""
+        if self.transducer_geometry == "CURVILINEAR":
+            return self.scanlines()[0]
         share = (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines - 0.5
-        if self.transducer_geometry == "PHASED":
-            return np.column_stack([share * self.transducer_width_mm, np.zeros_like(share)])
-        return self.scanlines()[0]
+        return np.column_stack([share * self.transducer_width_mm, np.zeros_like(share)])
 
     def line_spacing_mm(self, depth_mm: np.ndarray) -> np.ndarray:
         """Return the distance of neighbouring scanlines at depths [mm]."""
@@ -173,13 +169,12 @@ class Probe(BaseModel):
 
     def beam_coordinates(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return scanline (fractional index) and depth along it [mm] of points on the plane [mm]."""
-        if self.transducer_geometry == "LINEAR":
+        if self.sector is None:
             line = (u / self.transducer_width_mm + 0.5) * self.number_of_scanlines - 0.5
             return line, np.array(v, float)
-        depth = np.hypot(u, v + self.radius_mm) - self.radius_mm
-        start, stop = np.radians([self.theta_start_deg, self.theta_stop_deg])
-        share = (np.arctan2(u, v + self.radius_mm) - start) / (stop - start)
-        return share * self.number_of_scanlines - 0.5, depth
+        radius, start, stop = self.sector
+        share = (np.arctan2(u, v + radius) - start) / (stop - start)
+        return share * self.number_of_scanlines - 0.5, np.hypot(u, v + radius) - radius
 
     def gain_db(self) -> np.ndarray:
         """Return gain and TGC at each sample of a scanline [dB], (samples,)."""

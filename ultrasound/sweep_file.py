@@ -141,7 +141,15 @@ class SweepWriter:
             header += self._lines + b"ElementDataFile = LOCAL\n"
             if len(header) > HEADER_LIMIT:
                 raise SweepError(f"a header of {len(header)} bytes: at most {HEADER_LIMIT} can be read again")
-            self._write_file(header)
+            partial = self.path.with_name(f".{self.path.name}.partial-{secrets.token_hex(4)}")
+            try:
+                with partial.open("xb") as file:
+                    file.write(header)
+                    self._pixels.seek(0)
+                    shutil.copyfileobj(self._pixels, file, 1 << 20)
+                os.replace(partial, self.path)
+            finally:
+                partial.unlink(missing_ok=True)
 
     def _final_header(self) -> dict[str, str]:
         rows, columns = self._shape
@@ -161,17 +169,6 @@ class SweepWriter:
             "CompressedData": "True",
             "CompressedDataSize": str(self._pixels.tell()).ljust(length),
         }
-
-    def _write_file(self, header: bytes) -> None:
-        partial = self.path.with_name(f".{self.path.name}.partial-{secrets.token_hex(4)}")
-        try:
-            with partial.open("xb") as file:
-                file.write(header)
-                self._pixels.seek(0)
-                shutil.copyfileobj(self._pixels, file, 1 << 20)
-            os.replace(partial, self.path)
-        finally:
-            partial.unlink(missing_ok=True)
 
 
 class LabelledSweep:
