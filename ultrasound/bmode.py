@@ -12,7 +12,6 @@ import taichi.math as tm
 
 from sim.fields import fill
 from ultrasound.image_plane import Image, PlaneInTissue
-from ultrasound.point_spread import MAX_HALF_WIDTH, axial_sd_mm, elevation_sd_mm, lateral_weights
 from ultrasound.probe import DETAIL_LEVELS, DetailLevel, Probe
 from ultrasound.sampled_volume import SampledVolume
 from ultrasound.speckle import Speckle
@@ -23,6 +22,8 @@ Packet = ti.types.vector(LANES, ti.f32)
 # Samples between two tissue samples: the larger stride where it is no longer than a voxel.
 STRIDES = (8, 4)
 NOISE_FLOOR = 1e-9
+# Half width of the lateral kernel, in standard deviations and at most in scanlines.
+HALF_WIDTH_SD, MAX_HALF_WIDTH = 2.5, 24
 # Parallel planes that sample the slice thickness: offset in standard deviations, weight in a mean, and weight in a sum of noise
 # that preserves its mean square.
 CENTRAL_PLANE = ((0.0, 1.0, 1.0),)
@@ -164,7 +165,7 @@ class BMode:
         # A phased array transmits every scanline with all of its elements.
         pitch = 0.0 if probe.transducer_geometry == "PHASED" else float(probe.line_spacing_mm(np.zeros(1))[0])
         aperture = 0.5 / (probe.f_number * pitch) if pitch else 1e6
-        beam = probe.sample_mm, probe.frequency_mhz, aperture, axial_sd_mm(probe), elevation_sd_mm(probe)
+        beam = probe.sample_mm, probe.frequency_mhz, aperture, probe.axial_sd_mm, probe.elevation_sd_mm
         stride = STRIDES[0] if STRIDES[0] * probe.sample_mm <= self.voxel_mm else STRIDES[1]
         self._simulate(DETAIL_LEVELS.index(detail_level), stride, *beam)
         if detail_level == "reflection":
@@ -399,3 +400,26 @@ def source_of_pixels(probe: Probe, pixels: int) -> np.ndarray:
     )
     source = np.stack([line, along / probe.sample_mm - 0.5], axis=-1)
     return np.where(within[..., None], source, -1.0).astype(np.float32)
+
+
+def lateral_weights(probe: Probe) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the lateral kernel of the point-spread function at each sample.
+
+    The function is separable: exp(-(x^2 / sa^2 + y^2 / sl^2 + z^2 / se^2) / 2), with the widths of the probe.
+
+    Weights (2 MAX_HALF_WIDTH + 1, samples), of sum 1; the half width in scanlines (samples,); and the speckle gain (samples,), which
+    restores unit mean square of noise with the axial width's correlation.
+    """
+    depth = (np.arange(probe.number_of_samples_per_scanline) + 0.5) * probe.sample_mm
+    axial, spacing = probe.axial_sd_mm, probe.line_spacing_mm(depth)
+    # The noise already has the width of the pulse in every direction.
+    width = np.sqrt(np.maximum(probe.lateral_sd_mm(depth) ** 2 - axial**2, 0)) / np.maximum(spacing, 1e-6)
+    half = np.clip(np.ceil(HALF_WIDTH_SD * width), 0, MAX_HALF_WIDTH).astype(np.int32)
+    lines = np.arange(-MAX_HALF_WIDTH, MAX_HALF_WIDTH + 1)[:, None]
+    weights = np.exp(-0.5 * (lines / np.maximum(width, 0.05)) ** 2) * (np.abs(lines) <= half)
+    weights /= weights.sum(axis=0)
+    energy = np.zeros(len(depth))
+    for lag in range(len(lines)):
+        together = (weights[: len(lines) - lag] * weights[lag:]).sum(axis=0) * (1 if lag == 0 else 2)
+        energy += together * np.exp(-((lag * spacing) ** 2) / (4 * axial**2))
+    return weights, half, 1 / np.sqrt(energy)

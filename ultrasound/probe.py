@@ -123,6 +123,21 @@ class Probe(BaseModel):
         return self.depth_mm * self.focus_depth_percent / 100
 
     @property
+    def axial_sd_mm(self) -> float:
+        """Axial width of the point-spread function: a pulse of n cycles is n wavelengths long, its echo half of that."""
+        return self.pulse_cycles * self.wavelength_mm / 2 / FWHM_OF_SD
+
+    @property
+    def elevation_sd_mm(self) -> float:
+        """Elevational width, the same at all depths."""
+        return self.elevation_width_mm / FWHM_OF_SD
+
+    def lateral_sd_mm(self, depth_mm: np.ndarray) -> np.ndarray:
+        """Return the lateral width at depths [mm]: full width at half maximum = wavelength * f-number at the focus."""
+        at_focus = self.wavelength_mm * self.f_number / FWHM_OF_SD
+        return at_focus * np.sqrt(1 + ((depth_mm - self.focus_mm) / self.focal_zone_mm) ** 2)
+
+    @property
     def extent_mm(self) -> tuple[float, float, float]:
         """Width and depth of the image's bounding box, and the part of the depth behind the centre of the face."""
         if self.sector is None:

@@ -11,7 +11,7 @@ from rehearsal.sessions.replay import set_solver
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.undo_history import History
 from rehearsal.tracking.tracked_probe import PoseSource, TrackEnded, TrackingInput
-from render.viewer import Controls, TissueSettings
+from render.viewer import Controls, Settings
 
 # A transducer that moves by no more than this in a step is at rest [mm].
 STILL_MM = 1e-3
@@ -164,7 +164,7 @@ class UserInput:
         self._show(what if done else f"Nothing to {what}")
         return done
 
-    def _set_solver(self, settings: TissueSettings) -> None:
+    def _set_solver(self, settings: Settings) -> None:
         self._iterations_set = settings.iterations
         values = dict(
             iterations=self.adaptive_iterations.iterations(settings.iterations),

@@ -13,7 +13,7 @@ from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.plan_search import make_plan, total_work
 from rehearsal.planning.trial_workers import PlanningProblem, TrialWorkers
 from rehearsal.rehearsal import Rehearsal
-from render.viewer import Controls, Settings, TissueSettings
+from render.viewer import Controls, Settings
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene, with_options
 from ultrasound.target import Target
@@ -168,7 +168,7 @@ def minutes_in_words(seconds: float) -> str:
     return f"about {minutes} min" if minutes > 0 else "under a minute"
 
 
-def _with_settings(scene: Scene, settings: TissueSettings) -> Scene:
+def _with_settings(scene: Scene, settings: Settings) -> Scene:
     """A scene with the tissue, solver settings and gravity of the sliders."""
     values = {
         "tissue.young_kpa": settings.young_kpa,
