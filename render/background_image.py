@@ -50,13 +50,8 @@ ARM, BEYOND = 0.27, 0.11
 LETTER_PX, LINE_PX = 14, 2
 # A shorter projected axis has no letters.
 LEAST_LENGTH = 0.3
+HELP_HINT = "{}  all keys"
 HELP_COLUMNS, HELP_PX, HELP_GAP_PX, FIGURES_GAP_PX = 2, 17, 12, 18
-
-
-def backdrop_parts(view: View) -> tuple:
-    """Return what the backdrop of a view depends on."""
-    plane = view.width_mm, view.depth_mm, view.above_mm, view.focus_mm
-    return *plane, tuple(view.images), view.captions, view.title, view.status, view.outline_mm is not None
 
 
 class BackgroundImage:
@@ -80,7 +75,9 @@ class BackgroundImage:
         With ``slow_figures``, figures change only every READOUT_PERIOD_S, so that they can be read.
         """
         findings = first_of(view.findings, self.layout.most_findings)
-        parts = *backdrop_parts(view), len(findings)
+        # What the backdrop depends on.
+        plane = view.width_mm, view.depth_mm, view.above_mm, view.focus_mm, view.outline_mm is not None
+        parts = *plane, tuple(view.images), view.captions, view.title, view.status, len(findings)
         if self._shows_help or self._backdrop != parts:
             self._rows[:, :, :3] = backdrop(self.layout, view, self.keys.of["help"])
             self._figures, self._axes, self._shows_help = None, None, False
@@ -144,30 +141,23 @@ def backdrop(layout: WindowLayout, view: View, help_key: str = "H") -> np.ndarra
     page[layout.scene.slices] = np.round(rows).astype(np.uint8)[:, None]
     image = Image.fromarray(page)
     draw = ImageDraw.Draw(image)
-    _draw_title(draw, layout, view, help_key)
+    px, middle, clock = layout.px, layout.title.height // 2, clock_box(layout, help_key)
+    hint, title = (
+        HELP_HINT.format(help_key),
+        shortened(view.title or "Nephron", px(17), clock.left - 2 * px(16)),
+    )
+    draw.text((layout.title.right - px(16), middle), hint, font=font(px(14)), fill=TEXT, anchor="rm")
+    draw.text((px(16), middle), title, font=font(px(17)), fill=TEXT, anchor="lm")
     draw_panel(draw, layout, view)
     for y in (layout.title.bottom - 1, layout.strip.top):
         draw.line([(0, y), (layout.strip.right, y)], fill=LINE)
     return np.array(image)
 
 
-def _draw_title(draw: ImageDraw.ImageDraw, layout: WindowLayout, view: View, help_key: str) -> None:
-    px, middle = layout.px, layout.title.height // 2
-    right = layout.title.right - px(16)
-    draw.text((right, middle), _help_hint(help_key), font=font(px(14)), fill=TEXT, anchor="rm")
-    room = clock_box(layout, help_key).left - 2 * px(16)
-    title = shortened(view.title or "Nephron", px(17), room)
-    draw.text((px(16), middle), title, font=font(px(17)), fill=TEXT, anchor="lm")
-
-
-def _help_hint(key: str) -> str:
-    return f"{key}  all keys"
-
-
 def clock_box(layout: WindowLayout, help_key: str = "H") -> Rect:
     """Return the box of the clock, in the title's row, left of the help hint."""
     px = layout.px
-    right = layout.title.right - 2 * px(16) - int(font(px(14)).getlength(_help_hint(help_key)))
+    right = layout.title.right - 2 * px(16) - int(font(px(14)).getlength(HELP_HINT.format(help_key)))
     return Rect(right - px(CLOCK_WIDTH), 0, px(CLOCK_WIDTH), layout.title.height - 1)
 
 

@@ -4,8 +4,6 @@ Local axes: x lateral, to the marked side; y elevation; z along the axis. The im
 z = -size_z / 2 in the direction -z.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -95,7 +95,14 @@ def properties(
         return np.float32(table["texture_db"]) * noise[distance][where]
 
     level += texture(tissue_table()["hounsfield"], ...)
-    labelled = _labelled(hu, labels, tissue_of_label or {}, spacing)
+    # Masks by tissue, from labels and from HU and shape, in rising priority.
+    labelled: dict[str, np.ndarray] = {}
+    tissues = tissue_of_label or {} if labels is not None else {}
+    for tissue in dict.fromkeys(tissues.values()):
+        labelled[tissue] = np.isin(labels, [v for v, name in tissues.items() if name == tissue])
+    for tissue, here in classify_tissues(hu, labelled, spacing).items():
+        labelled[tissue] = labelled[tissue] | here if tissue in labelled else here
+    labelled = {tissue: where for tissue, where in labelled.items() if where.any()}
     stone = labelled.pop("stone", None)
     for tissue, where in labelled.items():
         table = tissue_table()[tissue]
@@ -133,19 +140,6 @@ def _by_hounsfield(hu: np.ndarray) -> np.ndarray:
     return values[np.clip(np.rint(smooth), MIN_HU, MAX_HU).astype(np.int16) - MIN_HU]
 
 
-def _labelled(
-    hu: np.ndarray, labels: np.ndarray | None, tissue_of_label: Mapping[int, str], spacing_mm: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Return masks by tissue, from labels and from HU and shape, in rising priority."""
-    found: dict[str, np.ndarray] = {}
-    if labels is not None:
-        for tissue in dict.fromkeys(tissue_of_label.values()):
-            found[tissue] = np.isin(labels, [v for v, name in tissue_of_label.items() if name == tissue])
-    for tissue, here in classify_tissues(hu, found, spacing_mm).items():
-        found[tissue] = found[tissue] | here if tissue in found else here
-    return {tissue: where for tissue, where in found.items() if where.any()}
-
-
 def _noise(shape: tuple[int, ...], sd_voxels: np.ndarray) -> np.ndarray:
     """Return noise of unit SD, smoothed by an SD along each axis, the same for the same voxels on every machine."""
     noise = np.random.default_rng(SEED).standard_normal(shape, dtype=np.float32)
@@ -164,7 +158,10 @@ def classify_tissues(
     if kidney.any():
         median = float(np.median(hu[kidney]))
         if median > ENHANCED_FROM_HU:
-            found["vessel"] = _vessels(hu, any_label | bone)
+            smooth = ndimage.gaussian_filter(np.asarray(hu, np.float32), 1.0, truncate=2)
+            # Away from other tissues, whose partial-volume voxels are as bright.
+            others = ndimage.binary_dilation(any_label | bone, iterations=3)
+            found["vessel"] = (smooth > BLOOD_ABOVE_HU) & ~others
         if "sinus" not in labelled:
             found["sinus"] = enclosed(kidney, spacing_mm) & (hu < FAT_BELOW_HU)
         fat = kidney & (hu < FAT_BELOW_HU)
@@ -177,12 +174,6 @@ def classify_tissues(
     if tumour is not None and tumour.any():
         found["necrosis"] = tumour & (hu < np.median(hu[tumour]) - NECROSIS_BELOW_MEDIAN_HU)
     return found
-
-
-def _vessels(hu: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return enhanced blood, away from other tissues, whose partial-volume voxels are as bright."""
-    smooth = ndimage.gaussian_filter(np.asarray(hu, np.float32), 1.0, truncate=2)
-    return (smooth > BLOOD_ABOVE_HU) & ~ndimage.binary_dilation(others, iterations=3)
 
 
 def enclosed(kidney: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:

@@ -105,12 +105,6 @@ class TissueSample:
     linear: ti.types.matrix(3, 4, ti.f32)
 
 
-@ti.func
-def impedance_or(impedance, other):
-    """The impedance, or the other where it is not known."""
-    return ti.select(impedance < 1e-6, other, impedance)
-
-
 @ti.data_oriented
 class BMode:
     """B-mode images of an image plane in tissue.
@@ -151,15 +145,10 @@ class BMode:
         self._table_settings: tuple | None = None
 
     def render(self, probe: Probe, detail_level: DetailLevel = "speckle") -> np.ndarray:
-        """Return grey values (pixels, pixels) uint8 of the plane located last; ``decibel`` holds its scanlines, ``real`` and ``imaginary`` their echo.
+        """Return grey values (pixels, pixels) uint8 of the plane located last, for a probe with the same numbers of scanlines and samples.
 
-        Raises ValueError for a probe with other numbers of scanlines or samples.
+        ``decibel`` then holds its scanlines, ``real`` and ``imaginary`` their echo.
         """
-        if (probe.number_of_scanlines, probe.number_of_samples_per_scanline) != (self.lines, self.samples):
-            raise ValueError(
-                f"{probe.number_of_scanlines} scanlines of {probe.number_of_samples_per_scanline} samples: this image "
-                f"was made for {self.lines} of {self.samples}"
-            )
         self._make_tables(probe)
         self._find_contact()
         # A phased array transmits every scanline with all of its elements.
@@ -256,8 +245,8 @@ class BMode:
                 place = start + (depth + stride_mm) * direction
                 far = self.sample_tissue(planes, place, elevation_sd)
                 # Beyond the CT nothing is known: nothing scatters, nothing reflects.
-                far.tissue.x = impedance_or(far.tissue.x, near.tissue.x)
-                near.tissue.x = impedance_or(near.tissue.x, far.tissue.x)
+                far.tissue.x = ti.select(far.tissue.x < 1e-6, near.tissue.x, far.tissue.x)
+                near.tissue.x = ti.select(near.tissue.x < 1e-6, far.tissue.x, near.tissue.x)
                 before, after = near.tissue, far.tissue
                 step = (after.x - before.x) / ti.max(after.x + before.x, 1e-6)
                 if interface.ends(step, self.interface_mm):

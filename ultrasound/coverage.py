@@ -79,7 +79,11 @@ class Coverage:
         lines, in_image = _scanlines_of(probe, count)
         contact = np.ones(probe.number_of_scanlines, bool)
         if gap_mm is not None:
-            places = self._indices(rest_mm[_elements_of(probe, count)]).T
+            width, depth, above = probe.extent_mm
+            share = (probe.elements() + [width / 2, above]) / [width, depth]
+            # The grid point nearest to each element.
+            column, row = np.clip(np.rint(share * (count - 1)).astype(int), 0, count - 1).T
+            places = self._indices(rest_mm[row, column]).T
             contact = map_coordinates(self.distance, places, order=1, mode="constant", cval=np.inf) <= gap_mm
         shown = np.flatnonzero(in_image & contact[lines])
         # In voxels, axis by axis.
@@ -132,14 +136,6 @@ def _scanlines_of(probe: Probe, count: int) -> tuple[np.ndarray, np.ndarray]:
     # Only one of the two edges counts, so that the points together are as wide as the image.
     inside = (line >= -0.5) & (line < last + 0.5) & (along >= 0) & (along <= probe.depth_mm)
     return np.clip(np.rint(line).astype(int), 0, last), inside
-
-
-def _elements_of(probe: Probe, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return row and column of the grid point nearest to each element."""
-    width, depth, above = probe.extent_mm
-    share = (probe.elements() + [width / 2, above]) / [width, depth]
-    column, row = np.clip(np.rint(share * (count - 1)).astype(int), 0, count - 1).T
-    return row, column
 
 
 def _subdivisions(at: np.ndarray, shown: np.ndarray, probe: Probe, count: int) -> Iterator[np.ndarray]:

@@ -12,7 +12,6 @@ from test_bmode import (
     GEOMETRIES,
     LINES,
     PIXELS,
-    SAMPLES,
     SILENT_DB,
     TISSUE,
     Tank,
@@ -305,7 +304,7 @@ def test_gain_and_its_course_over_depth_are_added(tank):
 
 def test_a_probe_of_other_lines_or_samples_is_refused(tank):
     for other in (probe_of(number_of_scanlines=128), probe_of(number_of_samples_per_scanline=320)):
-        with pytest.raises(ValueError, match=f"made for {LINES} of {SAMPLES}"):
+        with pytest.raises(ValueError, match="for a field of shape"):
             tank.look(other)
     with pytest.raises(ValueError, match="multiple of 16"):
         probe_of(number_of_samples_per_scanline=648)
