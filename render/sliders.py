@@ -56,20 +56,17 @@ def draw_sliders(
         place = (box.left / width, box.top / height, box.width / width, box.height / height)
         with gui.sub_window(f"{name}##{placed}", *place):
             for member in groups[name]:
-                _draw_slider(gui, settings, member, geometry.frequency_range_mhz)
-
-
-def _draw_slider(gui, settings: Settings, member: dataclasses.Field, mhz: tuple[float, float]) -> None:
-    value, about = getattr(settings, member.name), member.metadata
-    low, high = mhz if member.name == "frequency_mhz" else (about["low"], about["high"])
-    label = _label(member)
-    if isinstance(low, bool):
-        value = gui.checkbox(label, bool(value))
-    elif isinstance(low, int):
-        value = gui.slider_int(label, int(value), low, high)
-    else:
-        value = gui.slider_float(label, float(value), low, high)
-    setattr(settings, member.name, value)
+                value, about, label = getattr(settings, member.name), member.metadata, _label(member)
+                low, high = about["low"], about["high"]
+                if member.name == "frequency_mhz":
+                    low, high = geometry.frequency_range_mhz
+                if isinstance(low, bool):
+                    value = gui.checkbox(label, bool(value))
+                elif isinstance(low, int):
+                    value = gui.slider_int(label, int(value), low, high)
+                else:
+                    value = gui.slider_float(label, float(value), low, high)
+                setattr(settings, member.name, value)
 
 
 def _width(members: list[dataclasses.Field]) -> float:

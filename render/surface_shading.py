@@ -4,6 +4,7 @@ GGUI shades by Lambert's law alone and blends by vertex alpha without sorting. S
 translucent organ are therefore part of the vertex colours, and faces are sorted farthest first.
 """
 
+import igl
 import numpy as np
 import taichi as ti
 
@@ -15,20 +16,6 @@ CUT_EDGE_MM = 0.4
 
 # A point on the plane of a cut, and the unit normal towards the side that is removed, (3,) each.
 Cut = tuple[np.ndarray, np.ndarray]
-
-
-def faces_around_vertices(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return CSR lists of the faces at each of `count` vertices: start (count + 1,), faces (3 m,), int32."""
-    corner = faces.reshape(-1)
-    order = np.argsort(corner, kind="stable")
-    start = np.concatenate([[0], np.cumsum(np.bincount(corner, minlength=count))])
-    return start.astype(np.int32), (order // 3).astype(np.int32)
-
-
-def farthest_first(vertices: np.ndarray, faces: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """Return faces (m, 3) by decreasing distance along the view, as blending needs."""
-    depth = vertices @ ahead.astype(vertices.dtype)
-    return faces[np.argsort(-depth[faces].sum(axis=1), kind="stable")]
 
 
 class DrawnMesh:
@@ -59,7 +46,7 @@ class ShadedSurface:
         self.faces = np.ascontiguousarray(faces, dtype=np.int32)
         self.base, self.gloss = base, gloss
         count = vertices.shape[0]
-        start, around = faces_around_vertices(self.faces, count)
+        around, start = igl.vertex_triangle_adjacency(self.faces, count)
         self.normal = ti.Vector.field(3, ti.f32, shape=count)
         self.colour = ti.Vector.field(4, ti.f32, shape=count)
         self._tint = ti.field(ti.f32, shape=count)
@@ -140,4 +127,6 @@ class ShadedSurface:
             point, side = cut
             # Though transparent, they would hide what is drawn behind them later.
             faces = faces[((vertices - point) @ side < 0)[faces].any(axis=1)]
-        return np.ascontiguousarray(farthest_first(vertices, faces, ahead)).reshape(-1)
+        depth = vertices @ ahead.astype(vertices.dtype)
+        # By decreasing distance along the view, as blending needs.
+        return faces[np.argsort(-depth[faces].sum(axis=1), kind="stable")].reshape(-1)

@@ -27,6 +27,7 @@ from render.viewer import Controls, Geometry, Settings, View
 from render.window_layout import FULL_SIZE, Rect, WindowLayout
 
 ZOOM_S = 0.5
+ZOOM_SENSE = {"zoom_in": -1.0, "zoom_out": 1.0}
 FRAMES_A_SECOND = 60
 
 
@@ -111,10 +112,12 @@ class Window:
             return controls
         self._read_cursor()
         self._read_events(controls)
-        held = [action for action, key in self.keys.held() if self._window.is_pressed(key)]
-        for action in held:
+        for action in (action for action, key in self.keys.held() if self._window.is_pressed(key)):
             hold(action, controls, elapsed)
-        self._move_camera(held, elapsed)
+            if action in ZOOM_SENSE:
+                self.camera.zoom(np.exp(ZOOM_SENSE[action] * elapsed / ZOOM_S))
+        if self._drag is not None:
+            {"orbit": self.camera.orbit, "pan": self.camera.pan}[self._drag](*self._moved)
         controls.press = self._pressing
         if self._drag is None and self._over_scene():
             controls.ray = self.camera.ray(self._cursor)
@@ -186,15 +189,6 @@ class Window:
         if moved and settings == dataclasses.astuple(self.settings):
             self._boxes_placed += 1
 
-    def _move_camera(self, held: list[str], elapsed: float) -> None:
-        if self._drag == "orbit":
-            self.camera.orbit(*self._moved)
-        elif self._drag == "pan":
-            self.camera.pan(*self._moved)
-        for action, sense in (("zoom_in", -1.0), ("zoom_out", 1.0)):
-            if action in held:
-                self.camera.zoom(np.exp(sense * elapsed / ZOOM_S))
-
     # Drawing
 
     def draw(self, view: View) -> None:
@@ -256,7 +250,11 @@ class Window:
         self._scene_view.draw(self._scene, view, self.settings, masked)
         self._canvas.scene(self._scene)
         if not self._help_shown:
-            self._draw_sliders()
+            boxes = boxes_of(self.settings, self._geometry, self.layout)
+            if boxes != self._slider_boxes:
+                self._slider_boxes, self._boxes_placed = boxes, self._boxes_placed + 1
+            placed = boxes, self._first_size, self._boxes_placed
+            draw_sliders(self._gui, self.settings, self._geometry, *placed)
 
     def _set_camera(self) -> None:
         _, up, ahead = self.camera.axes()
@@ -269,9 +267,3 @@ class Window:
         self._ui_camera.z_near(near)
         self._ui_camera.z_far(far)
         self._scene.set_camera(self._ui_camera)
-
-    def _draw_sliders(self) -> None:
-        boxes = boxes_of(self.settings, self._geometry, self.layout)
-        if boxes != self._slider_boxes:
-            self._slider_boxes, self._boxes_placed = boxes, self._boxes_placed + 1
-        draw_sliders(self._gui, self.settings, self._geometry, boxes, self._first_size, self._boxes_placed)
