@@ -3,7 +3,7 @@
 import numpy as np
 import taichi as ti
 
-from ultrasound.image_plane import LANES
+from ultrasound.sampled_volume import LANES
 from ultrasound.scanner import Scanner
 
 

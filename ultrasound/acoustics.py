@@ -97,9 +97,10 @@ def properties(
     level += texture(tissue_table()["hounsfield"], ...)
     # Masks by tissue, from labels and from HU and shape, in rising priority.
     labelled: dict[str, np.ndarray] = {}
-    tissues = tissue_of_label or {} if labels is not None else {}
-    for tissue in dict.fromkeys(tissues.values()):
-        labelled[tissue] = np.isin(labels, [v for v, name in tissues.items() if name == tissue])
+    tissues = tissue_of_label or {}
+    if labels is not None:
+        for tissue in dict.fromkeys(tissues.values()):
+            labelled[tissue] = np.isin(labels, [v for v, name in tissues.items() if name == tissue])
     for tissue, here in classify_tissues(hu, labelled, spacing).items():
         labelled[tissue] = labelled[tissue] | here if tissue in labelled else here
     labelled = {tissue: where for tissue, where in labelled.items() if where.any()}

@@ -6,12 +6,13 @@
 4. ``_scan_convert``: from scanlines and samples to the pixels of the image.
 """
 
+from typing import Any
+
 import numpy as np
 import taichi as ti
 import taichi.math as tm
 
 from sim.fields import fill
-from ultrasound.image_plane import Image, PlaneInTissue
 from ultrasound.probe import DETAIL_LEVELS, DetailLevel, Probe
 from ultrasound.sampled_volume import SampledVolume
 from ultrasound.speckle import Speckle
@@ -110,7 +111,7 @@ class BMode:
     """B-mode images of an image plane in tissue.
 
     ``tissue`` is a volume (.., 3) of impedance, attenuation and backscatter (``acoustics.properties``), ``organ`` the signed
-    distance from the organ's surface [mm], both at rest. An element transmits only in contact: with the organ, nearer than
+    distance from the organ's surface [mm], both at rest, ``plane`` a ``PlaneInTissue`` of the scanner. An element transmits only in contact: with the organ, nearer than
     ``contact_gap_mm``, or, where ``contact`` is "tissue", with anything but gas. ``around`` is the impedance [MRayl] of all that is
     outside the organ; None for what the CT shows there.
     """
@@ -119,7 +120,7 @@ class BMode:
         self,
         tissue: SampledVolume,
         organ: SampledVolume,
-        plane: PlaneInTissue,
+        plane: Any,
         probe: Probe,
         voxel_mm: float,
         contact: str = "organ",
@@ -364,7 +365,7 @@ class BMode:
         return Packet([field[row, first + i] for i in ti.static(range(LANES))])
 
     @ti.kernel
-    def _scan_convert(self, dynamic_range_db: float, image: Image):
+    def _scan_convert(self, dynamic_range_db: float, image: ti.types.ndarray(ti.u8, ndim=2)):
         for row, column in self.source:
             at = self.source[row, column]
             grey = 0.0

@@ -10,8 +10,6 @@ import igl
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from ultrasound.image_plane import ImagePlane
-
 # Radius of the surface patch to whose mean normal the probe is aligned.
 NORMAL_PATCH_MM = 12.0
 MIN_DEPTH_MM, MAX_DEPTH_MM = -40.0, 15.0
@@ -19,6 +17,20 @@ MIN_DEPTH_MM, MAX_DEPTH_MM = -40.0, 15.0
 MAX_DEPTH_LENGTHS = 1.5
 PRESS_MM_S, RELEASE_MM_S = 12.0, 40.0
 TURN_DEG_S = 180.0
+
+
+@dataclass(frozen=True)
+class ImagePlane:
+    """The imaged rectangle of the transducer's plane.
+
+    ``width_mm`` along the transducer's x, ``depth_mm`` along its -z, starting ``above_mm`` behind its face.
+    ``world_from_plane`` (4, 4): x to the marked side, y down into the tissue, z to the transducer's y [mm].
+    """
+
+    world_from_plane: np.ndarray
+    width_mm: float
+    depth_mm: float
+    above_mm: float = 0.0
 
 
 def pose_at(

@@ -87,7 +87,7 @@ def scan(
     from rehearsal.image_and_surface_files import save_images
     from rehearsal.rehearsal import scanned_anatomy
     from sim.embedding import Unmoved
-    from ultrasound.image_plane import ImagePlane
+    from ultrasound.probe_manipulator import ImagePlane
     from ultrasound.scanner import Scanner
     from ultrasound.sweep_file import LabelledSweep
 

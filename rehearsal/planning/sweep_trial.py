@@ -12,8 +12,8 @@ from rehearsal.rehearsal import Rehearsal
 from sim.fields import array_of
 from ultrasound.array_contact import measure_contact
 from ultrasound.coverage import GRID_POINTS, Coverage
-from ultrasound.image_plane import PlaneInTissue
 from ultrasound.probe_manipulator import advanced, poses_between
+from ultrasound.scanner import PlaneInTissue
 
 # The most steps of a move between passes.
 MOST_STEPS = 240

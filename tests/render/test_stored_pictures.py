@@ -21,10 +21,9 @@ from sim.device import start
 from sim.embedding import Embedding
 from sim.fields import array_of
 from sim.skinning import Skin
-from ultrasound.image_plane import ImagePlane, plane_section
 from ultrasound.probe import Probe
-from ultrasound.probe_manipulator import image_plane, pose_at, pose_of_image_plane
-from ultrasound.scanner import B_MODE, CT, ScannedAnatomy, Scanner
+from ultrasound.probe_manipulator import ImagePlane, image_plane, pose_at, pose_of_image_plane
+from ultrasound.scanner import B_MODE, CT, ScannedAnatomy, Scanner, plane_section
 
 STORED = Path(__file__).parent / "pictures"
 PIXELS, WIDTH, DEPTH = 256, 36.0, 30.0

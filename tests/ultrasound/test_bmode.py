@@ -15,10 +15,10 @@ from sim.device import start
 from sim.embedding import Embedding, Unmoved
 from sim.fields import array_of, fill
 from ultrasound.bmode import MAX_HALF_WIDTH, BMode
-from ultrasound.image_plane import PlaneInTissue
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import image_plane, pose_at
 from ultrasound.sampled_volume import SampledVolume
+from ultrasound.scanner import PlaneInTissue
 
 LINES, SAMPLES, PIXELS = 192, 640, 256
 TISSUE, FAT, GAS, STONE = 1.62, 1.38, 4e-4, 6.0

@@ -17,11 +17,10 @@ from sim.embedding import Embedding, Unmoved, tetrahedra_around
 from sim.fields import array_of, fill
 from sim.shape_matching import ShapeMatching
 from sim.skinning import Skin
-from ultrasound.image_plane import ImagePlane, PlaneInTissue
 from ultrasound.probe import load_probe
-from ultrasound.probe_manipulator import image_plane, pose_at
+from ultrasound.probe_manipulator import ImagePlane, image_plane, pose_at
 from ultrasound.sampled_volume import distance_volume
-from ultrasound.scanner import ScannedAnatomy, Scanner
+from ultrasound.scanner import PlaneInTissue, ScannedAnatomy, Scanner
 
 RADIUS = 2.0
 GRADIENT = np.array([11.0, -7.0, 5.0])  # HU / mm

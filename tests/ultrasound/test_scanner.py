@@ -11,9 +11,8 @@ from slicing import hounsfield
 from sim.embedding import Unmoved
 from sim.fields import array_of
 from ultrasound.acoustics import CORTEX_DB
-from ultrasound.image_plane import ImagePlane
 from ultrasound.probe import Probe
-from ultrasound.probe_manipulator import image_plane, pose_at
+from ultrasound.probe_manipulator import ImagePlane, image_plane, pose_at
 from ultrasound.scanner import CT, ScannedAnatomy, Scanner, start_acoustics
 
 PIXELS, RADIUS, REACH = 64, 12.0, 20.0
