@@ -25,7 +25,7 @@ def organ_mask(scanner: Scanner) -> np.ndarray:
 
 def hounsfield(scanner: Scanner) -> np.ndarray:
     """HU (pixels, pixels) float32 of the plane located last, before they become grey values."""
-    count = scanner.plane.pixels
+    plane, count = scanner.plane, scanner.plane.pixels
     packets = -(-count // LANES)
     values = np.zeros((count, packets * LANES), np.float32)
     _ = scanner.ct, scanner.organ
@@ -33,7 +33,7 @@ def hounsfield(scanner: Scanner) -> np.ndarray:
     @ti.kernel
     def ask(values: ti.types.ndarray(ti.f32, ndim=2)):
         for row, packet in ti.ndrange(count, packets):
-            hu = scanner.hounsfield(row, packet * LANES)
+            hu = scanner.hounsfield(row, packet * LANES, plane.grid[0], plane.grid[1])
             for lane in ti.static(range(LANES)):
                 values[row, packet * LANES + lane] = hu[lane]
 

@@ -86,10 +86,16 @@ class PlaneInTissue:
         inverse, world, pixel_mm, first_mm = (ti.Matrix(np.asarray(each, float).tolist()) for each in given)
         self.embedding.locate_on_plane(inverse, world, pixel_mm, first_mm, self.owner)
 
+    @property
+    def grid_mm(self) -> tuple[ti.Vector, ti.Vector]:
+        """The values of ``grid``: as arguments of a kernel they cost its pixels nothing."""
+        pixel, first = array_of(self.grid)
+        return tm.vec2(*pixel), tm.vec2(*first)
+
     def rest_grid(self, count: int) -> np.ndarray:
         """Return rest positions (rows, columns, 3) [mm] at count x count points evenly over the plane."""
         places = np.empty((count, count, 3), np.float32)
-        self._rest_grid(*(tm.vec2(*each) for each in array_of(self.grid)), places)
+        self._rest_grid(*self.grid_mm, places)
         return places
 
     @ti.kernel
@@ -109,7 +115,7 @@ class PlaneInTissue:
         return linear[:, 0] * u + linear[:, 1] * v + linear[:, 3]
 
     @ti.func
-    def rest_lanes(self, row, first):
+    def rest_lanes(self, row, first, pixel_mm, first_mm):
         """As ``rest_at`` for LANES pixels of a row, axis by axis, and whether they are collinear at rest too.
 
         Pixels beyond the image repeat its last.
@@ -122,13 +128,13 @@ class PlaneInTissue:
             same &= self.owner[row, ti.min(first + lane, last)] == owner
         if same:
             # Most neighbours are in one tetrahedron, whose map keeps them on a line.
-            start = self.rest_at(row, first, self.grid[0], self.grid[1])
-            on = self.embedding.rest_from_plane[owner][:, 0] * self.grid[0].x
+            start = self.rest_at(row, first, pixel_mm, first_mm)
+            on = self.embedding.rest_from_plane[owner][:, 0] * pixel_mm.x
             steps = Lanes([float(lane) for lane in ti.static(range(LANES))])
             x, y, z = start.x + on.x * steps, start.y + on.y * steps, start.z + on.z * steps
         else:
             for lane in ti.static(range(LANES)):
-                rest = self.rest_at(row, ti.min(first + lane, last), self.grid[0], self.grid[1])
+                rest = self.rest_at(row, ti.min(first + lane, last), pixel_mm, first_mm)
                 x[lane], y[lane], z[lane] = rest.x, rest.y, rest.z
         return x, y, z, same
 
@@ -282,22 +288,29 @@ class Scanner:
         image = np.empty((self.plane.pixels, self.plane.pixels), np.uint8)
         # Fields must exist before the kernel that reads them is compiled.
         _ = self.ct, self.organ
-        self._window(window_hu, level_hu, image)
+        self._window(*self.plane.grid_mm, window_hu, level_hu, image)
         return image
 
     @ti.kernel
-    def _window(self, window_hu: float, level_hu: float, image: ti.types.ndarray(ti.u8, ndim=2)):
+    def _window(
+        self,
+        pixel_mm: tm.vec2,
+        first_mm: tm.vec2,
+        window_hu: float,
+        level_hu: float,
+        image: ti.types.ndarray(ti.u8, ndim=2),
+    ):
         for row, packet in ti.ndrange(self.plane.pixels, ti.static((self.plane.pixels + LANES - 1) // LANES)):
-            hu = self.hounsfield(row, packet * LANES)
+            hu = self.hounsfield(row, packet * LANES, pixel_mm, first_mm)
             grey = ti.min(ti.max((hu - level_hu) / window_hu + 0.5, 0.0), 1.0) * 255.0 + 0.5
             for lane in ti.static(range(LANES)):
                 if packet * LANES + lane < self.plane.pixels:
                     image[row, packet * LANES + lane] = ti.cast(grey[lane], ti.u8)
 
     @ti.func
-    def hounsfield(self, row, first):
+    def hounsfield(self, row, first, pixel_mm, first_mm):
         """Return HU of LANES pixels of a row."""
-        x, y, z, in_line = self.plane.rest_lanes(row, first)
+        x, y, z, in_line = self.plane.rest_lanes(row, first, pixel_mm, first_mm)
         hu = self.ct.sample_lanes(x, y, z, in_line)
         if ti.static(not self.show_background):
             for lane in ti.static(range(LANES)):
