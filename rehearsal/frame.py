@@ -22,7 +22,8 @@ from rehearsal.stopwatch import timed
 from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer, send_live
 from rehearsal.tracking.sweep_recording import SweepRecorder
 from render.keys import Keys
-from render.viewer import Controls, ScannerSettings, Settings, View, Viewer
+from render.viewer import Controls, Settings, View
+from render.window import Window
 from ultrasound.probe import Probe
 
 # How long a notice stays on the screen, and the one that the tissue's state was restored.
@@ -71,7 +72,7 @@ class Frames:
 class WindowFrames(Frames):
     """The frames in a window; a frozen one makes no step."""
 
-    viewer: Viewer
+    viewer: Window
     out: Path
     notices: Notices
     sweeping: SweepRecorder
@@ -219,7 +220,7 @@ class WindowFrames(Frames):
         """Save images and surfaces; say what is missing, and why. Raises OSError."""
         probe = probe_with_settings(self.rehearsal.probe, settings)
         begin, missing = save_view(view, probe, self.out), []
-        if view.notes.keys() & view.pictures.keys():
+        if view.notes.keys() & view.images.keys():
             missing.append("B-mode image black: the probe does not touch the organ")
         if self._shows_earlier:
             missing.append("no organ (PLY), which has moved since: {freeze} continues")
@@ -242,7 +243,7 @@ def image_view(rehearsal: Rehearsal, probe: Probe, settings: Settings, tally: Ta
     width, depth, above = probe.extent_mm
     return View(
         transducer_pose=rehearsal.pose,
-        pictures=timed(images, tally.slice_ms),
+        images=timed(images, tally.slice_ms),
         width_mm=width,
         depth_mm=depth,
         above_mm=above,
@@ -256,7 +257,7 @@ def image_view(rehearsal: Rehearsal, probe: Probe, settings: Settings, tally: Ta
     )
 
 
-def captions(probe: Probe, settings: ScannerSettings) -> tuple[str, str, str]:
+def captions(probe: Probe, settings: Settings) -> tuple[str, str, str]:
     """The probe's name, and the settings of the B-mode image and of the CT."""
     b_mode = (
         f"{probe.frequency_mhz:.1f} MHz   G {probe.gain_percent:.0f} %   DR {probe.dyn_range_db:.0f} dB   "

@@ -6,7 +6,8 @@ from rehearsal.rehearsal import Rehearsal
 from render.display import window_size
 from render.gamepad import Gamepad
 from render.keys import Keys
-from render.viewer import Geometry, ScannerSettings, Settings, Viewer
+from render.viewer import Geometry, Settings
+from render.window import Window
 from render.window_layout import FULL_SIZE
 from ultrasound.probe import TGC_SLIDERS, Probe
 
@@ -38,7 +39,7 @@ def initial_settings(rehearsal: Rehearsal) -> Settings:
     return settings
 
 
-def probe_with_settings(probe: Probe, settings: ScannerSettings) -> Probe:
+def probe_with_settings(probe: Probe, settings: Settings) -> Probe:
     """The probe with the scanner's settings."""
     low, high = probe.frequency_range_mhz
     return probe.model_copy(
@@ -55,28 +56,28 @@ def probe_with_settings(probe: Probe, settings: ScannerSettings) -> Probe:
 
 def open_viewer(
     rehearsal: Rehearsal, visible: bool, keys: Keys | None = None, gamepad: Gamepad | None = None
-) -> Viewer:
+) -> Window:
     """Open the window, on the screen or off it. Raises NoVulkan."""
-    from render.window import Window
-
-    support, tumour = rehearsal.supports, rehearsal.tumour
+    tumour, support = None, None
+    if rehearsal.tumour is not None and rehearsal.tumour_skin is not None:
+        tumour = rehearsal.tumour_skin.vertices, np.asarray(rehearsal.tumour.faces, np.int32)
+    if rehearsal.supports:
+        fixed = rehearsal.supports[0]
+        support = np.asarray(fixed.vertices, np.float32), np.asarray(fixed.faces, np.int32)
     return Window(
         Geometry(
-            organ_vertices=rehearsal.organ_skin.vertices,
-            organ_faces=np.asarray(rehearsal.organ.faces, np.int32),
+            organ=(rehearsal.organ_skin.vertices, np.asarray(rehearsal.organ.faces, np.int32)),
             bounds=rehearsal.organ.bounds,
             up=-rehearsal.gravity_direction,
             transducer_size_mm=rehearsal.size_mm,
             transducer_radius_mm=rehearsal.probe.radius_mm,
             frequency_range_mhz=rehearsal.probe.frequency_range_mhz,
-            tumour_vertices=rehearsal.tumour_skin and rehearsal.tumour_skin.vertices,
-            tumour_faces=None if tumour is None else np.asarray(tumour.faces, np.int32),
+            tumour=tumour,
             parts={
                 tissue: (skin.vertices, np.asarray(rehearsal.parts[tissue].faces, np.int32))
                 for tissue, skin in rehearsal.part_skins.items()
             },
-            support_vertices=np.asarray(support[0].vertices, np.float32) if support else None,
-            support_faces=np.asarray(support[0].faces, np.int32) if support else None,
+            support=support,
         ),
         initial_settings(rehearsal),
         window_size() if visible else FULL_SIZE,

@@ -15,8 +15,8 @@ from rehearsal.notices import Notices
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import write_json
 from render.animation import ANIMATION_FPS, empty_folder, save_animation, scaled_down, side_by_side
-from render.viewer import Controls, Settings, View, Viewer
-from render.window import NoVulkan
+from render.viewer import Controls, Settings, View
+from render.window import NoVulkan, Window
 from scenes.atomic_files import atomic_write
 
 # An animation is held in memory: a long session has fewer images in it.
@@ -28,7 +28,7 @@ class Pictures:
 
     def __init__(self, rehearsal: Rehearsal, steps: int, out: Path) -> None:
         self.steps, self.out = steps, out
-        self.viewer: Viewer | None = None
+        self.viewer: Window | None = None
         try:
             self.viewer = open_viewer(rehearsal, visible=False)
         except NoVulkan as reason:

@@ -71,7 +71,7 @@ def save_screenshot(image: np.ndarray, out: Path) -> None:
 def save_view(view: View, probe: Probe, out: Path) -> str:
     """Write the images of a view under the next free number, and print their paths; return the prefix of their names."""
     prefix = out / f"{next_number(out, IMAGE):03d}"
-    for saved in save_images(view.pictures, view.width_mm, view.depth_mm, probe, prefix):
+    for saved in save_images(view.images, view.width_mm, view.depth_mm, probe, prefix):
         click.echo(f"Saved {saved.path}{' and .dcm' if saved.kind == B_MODE else ''}")
     return f"{prefix.name}-"
 

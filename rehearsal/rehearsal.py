@@ -24,9 +24,9 @@ from sim.shapes import Plane, SignedDistanceField
 from sim.skinning import Skin
 from sim.solver import SolverState
 from sim.tissue_model import FixedRegion
-from ultrasound.image_plane import ImagePlane, plane_section
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import (
+    ImagePlane,
     ManipulatorState,
     ProbeManipulator,
     advanced,
@@ -35,7 +35,7 @@ from ultrasound.probe_manipulator import (
     poses_between,
     touching,
 )
-from ultrasound.scanner import ScannedAnatomy, Scanner, start_acoustics
+from ultrasound.scanner import ScannedAnatomy, Scanner, plane_section, start_acoustics
 
 AWAY_MM = 200.0
 # Where the tumour protrudes, organ and tumour share a surface: the tumour's is drawn this far outside.

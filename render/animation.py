@@ -21,9 +21,7 @@ def with_square_pixels(picture: np.ndarray, width_mm: float, depth_mm: float) ->
 
 def side_by_side(view: View) -> Image.Image:
     """Return the images of a view in a row, with square pixels."""
-    pictures = [
-        with_square_pixels(picture, view.width_mm, view.depth_mm) for picture in view.pictures.values()
-    ]
+    pictures = [with_square_pixels(picture, view.width_mm, view.depth_mm) for picture in view.images.values()]
     row = np.concatenate([np.asarray(picture) for picture in pictures], axis=1)
     return Image.fromarray(row)
 

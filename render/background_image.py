@@ -1,45 +1,57 @@
-"""The full-window image behind the 3D view; each frame redraws only what changed."""
+"""The image behind the 3D view: ultrasound panel, title, clock, help, read-outs, findings and compass. Images are uint8 (height, width, 3).
+
+Each frame redraws only what changed.
+"""
 
 import time
+from collections.abc import Mapping
+from itertools import islice
 
 import numpy as np
+from PIL import Image, ImageDraw
 
-from render import window_frame
-from render.compass import compass_picture
 from render.keys import Keys
+from render.text import fitting_size, font, shortened
 from render.ultrasound_panel import (
+    ALERT,
     FIGURE_PX,
+    FINDINGS,
+    LINE,
+    MARK,
     OUTLINE,
     OUTLINE_AT_REST,
-    Panel,
+    QUIET,
+    TEXT,
     draw_caliper,
     draw_note,
+    draw_panel,
     draw_segments,
-    paste_picture,
+    image_boxes,
+    paste_image,
+    to_plane,
 )
 from render.viewer import View
-from render.window_layout import Rect, WindowLayout
+from render.window_layout import CLOCK_WIDTH, FIGURE_HEIGHT, FIGURES_PAD, Rect, WindowLayout
 
 READOUT_PERIOD_S = 0.25
 
 # Read-outs, findings, the finding above its limit, clock and pace.
 Figures = tuple[dict[str, str], dict[str, str], str, str, str]
-
-
-def panel_of(view: View) -> Panel:
-    """Return the panel of a view."""
-    return Panel(
-        tuple(view.pictures),
-        view.width_mm,
-        view.depth_mm,
-        view.above_mm,
-        view.focus_mm,
-        view.captions,
-        view.title,
-        view.status,
-        view.marked_side,
-        view.outline_mm is not None,
-    )
+BACKDROP_TOP, BACKDROP_FOOT = (30, 35, 42), (13, 15, 19)
+STRIP, HELP = (17, 20, 24), (22, 26, 31)
+# Least distance of lines of figures, in a small window.
+LEAST_PITCH = 19
+# A figure without a value.
+NO_VALUE = "-"
+# The compass. Patient coordinates are LPS: towards the patient's left, back and head; and the other way.
+LETTERS = (("R", "L"), ("A", "P"), ("I", "S"))
+# In fractions of its box.
+ARM, BEYOND = 0.27, 0.11
+LETTER_PX, LINE_PX = 14, 2
+# A shorter projected axis has no letters.
+LEAST_LENGTH = 0.3
+HELP_HINT = "{}  all keys"
+HELP_COLUMNS, HELP_PX, HELP_GAP_PX, FIGURES_GAP_PX = 2, 17, 12, 18
 
 
 class BackgroundImage:
@@ -50,8 +62,8 @@ class BackgroundImage:
         self.pixels = np.full((layout.width, layout.height, 4), 255, dtype=np.uint8)
         # The same memory as rows, top down, for drawing.
         self._rows = self.pixels.transpose(1, 0, 2)[::-1]
-        self.panel: Panel | None = None
-        self._findings_shown = 0
+        self._view: View | None = None
+        self._backdrop: tuple = ()
         self._shows_help = False
         self._axes: np.ndarray | None = None
         self._figures: Figures | None = None
@@ -62,35 +74,38 @@ class BackgroundImage:
 
         With ``slow_figures``, figures change only every READOUT_PERIOD_S, so that they can be read.
         """
-        panel, findings = panel_of(view), window_frame.first_of(view.findings, self.layout.most_findings)
-        if self._shows_help or (self.panel, self._findings_shown) != (panel, len(findings)):
-            self._rows[:, :, :3] = window_frame.backdrop(self.layout, panel, self.keys.of["help"])
-            self.panel, self._findings_shown = panel, len(findings)
+        findings = first_of(view.findings, self.layout.most_findings)
+        # What the backdrop depends on.
+        plane = view.width_mm, view.depth_mm, view.above_mm, view.focus_mm, view.outline_mm is not None
+        parts = *plane, tuple(view.images), view.captions, view.title, view.status, len(findings)
+        if self._shows_help or self._backdrop != parts:
+            self._rows[:, :, :3] = backdrop(self.layout, view, self.keys.of["help"])
             self._figures, self._axes, self._shows_help = None, None, False
-        for (name, picture), box in zip(view.pictures.items(), panel.boxes(self.layout), strict=True):
-            paste_picture(self._rows, box, picture)
-            self._draw_over(view, panel, name, box)
+        self._view, self._backdrop = view, parts
+        for (name, image), box in zip(view.images.items(), image_boxes(self.layout, view), strict=True):
+            paste_image(self._rows, box, image)
+            self._draw_over(view, name, box)
         figures = dict(view.readouts), findings, view.alert, view.clock, view.pace
         self._compose_figures(figures, slow_figures)
         if self._axes is None or not np.array_equal(axes, self._axes):
-            self._put(self.layout.compass, compass_picture(self.layout, axes))
+            self._put(self.layout.compass, compass_image(self.layout, axes))
             self._axes = axes
 
     def show_help(self) -> None:
         """Draw the list of all keys over everything, until the next ``compose``."""
         if not self._shows_help:
-            self._put(self.layout.whole, window_frame.help_picture(self.layout, self.keys.lines()))
+            self._put(self.layout.whole, help_image(self.layout, self.keys.lines()))
             self._shows_help = True
 
-    def _draw_over(self, view: View, panel: Panel, name: str, box: Rect) -> None:
+    def _draw_over(self, view: View, name: str, box: Rect) -> None:
         """Draw outlines, note and caliper over an image."""
         if view.outline_before_mm is not None:
-            draw_segments(self._rows, panel, box, view.outline_before_mm, OUTLINE_AT_REST)
+            draw_segments(self._rows, view, box, view.outline_before_mm, OUTLINE_AT_REST)
         if view.outline_mm is not None:
-            draw_segments(self._rows, panel, box, view.outline_mm, OUTLINE)
+            draw_segments(self._rows, view, box, view.outline_mm, OUTLINE)
         if note := view.notes.get(name):
             draw_note(self._rows, self.layout, box, note)
-        draw_caliper(self._rows, panel, box, view.caliper_mm, view.caliper, self.layout.px(FIGURE_PX))
+        draw_caliper(self._rows, view, box, self.layout.px(FIGURE_PX))
 
     def _compose_figures(self, figures: Figures, slow: bool) -> None:
         now = time.perf_counter()
@@ -98,22 +113,163 @@ class BackgroundImage:
         if self._figures is not None and (waits or figures == self._figures):
             return
         readouts, findings, alert, clock, pace = figures
-        box = window_frame.clock_box(self.layout, self.keys.of["help"])
-        self._put(box, window_frame.clock_picture(self.layout, box, clock, pace))
-        self._put(self.layout.readouts, window_frame.readout_picture(self.layout, readouts))
+        box = clock_box(self.layout, self.keys.of["help"])
+        self._put(box, clock_image(self.layout, box, clock, pace))
+        self._put(self.layout.readouts, readout_image(self.layout, readouts))
         if findings:
             box = self.layout.findings(len(findings))
-            self._put(box, window_frame.findings_picture(self.layout, findings, alert))
+            self._put(box, findings_image(self.layout, findings, alert))
         self._figures, self._figures_at = figures, now
 
-    def _put(self, box: Rect, picture: np.ndarray) -> None:
-        rows, columns = box.slices
-        self._rows[rows, columns, :3] = picture
+    def _put(self, box: Rect, image: np.ndarray) -> None:
+        self._rows[box.slices][..., :3] = image
 
     def plane_point_at(self, column: float, row: float) -> tuple[float, float] | None:
         """Return the point of the image plane [mm] at a pixel of one of the images, None elsewhere."""
-        if self.panel is None or self._shows_help:
+        if self._view is None or self._shows_help:
             return None
-        boxes = self.panel.boxes(self.layout)
-        hit = (box for box in boxes if box.contains(column, row))
-        return next((self.panel.to_plane(box, column, row) for box in hit), None)
+        hit = (box for box in image_boxes(self.layout, self._view) if box.contains(column, row))
+        return next((to_plane(self._view, box, column, row) for box in hit), None)
+
+
+def backdrop(layout: WindowLayout, view: View, help_key: str = "H") -> np.ndarray:
+    """Return what stays the same from frame to frame, uint8, shape (height, width, 3)."""
+    fade = np.linspace(0, 1, layout.scene.height)[:, None]
+    rows = (1 - fade) * np.array(BACKDROP_TOP) + fade * np.array(BACKDROP_FOOT)
+    page = np.empty((layout.height, layout.width, 3), dtype=np.uint8)
+    page[:] = STRIP
+    page[layout.scene.slices] = np.round(rows).astype(np.uint8)[:, None]
+    image = Image.fromarray(page)
+    draw = ImageDraw.Draw(image)
+    px, middle, clock = layout.px, layout.title.height // 2, clock_box(layout, help_key)
+    hint, title = (
+        HELP_HINT.format(help_key),
+        shortened(view.title or "Nephron", px(17), clock.left - 2 * px(16)),
+    )
+    draw.text((layout.title.right - px(16), middle), hint, font=font(px(14)), fill=TEXT, anchor="rm")
+    draw.text((px(16), middle), title, font=font(px(17)), fill=TEXT, anchor="lm")
+    draw_panel(draw, layout, view)
+    for y in (layout.title.bottom - 1, layout.strip.top):
+        draw.line([(0, y), (layout.strip.right, y)], fill=LINE)
+    return np.array(image)
+
+
+def clock_box(layout: WindowLayout, help_key: str = "H") -> Rect:
+    """Return the box of the clock, in the title's row, left of the help hint."""
+    px = layout.px
+    right = layout.title.right - 2 * px(16) - int(font(px(14)).getlength(HELP_HINT.format(help_key)))
+    return Rect(right - px(CLOCK_WIDTH), 0, px(CLOCK_WIDTH), layout.title.height - 1)
+
+
+def clock_image(layout: WindowLayout, box: Rect, clock: str, pace: str) -> np.ndarray:
+    """Return the session's time and its rate, uint8, shape of the box."""
+    image = Image.new("RGB", (box.width, box.height), STRIP)
+    draw, letters, middle = ImageDraw.Draw(image), font(layout.px(14)), layout.title.height // 2
+    draw.text((box.width, middle), clock, font=letters, fill=TEXT, anchor="rm")
+    right = box.width - int(letters.getlength(clock)) - layout.px(12)
+    draw.text((right, middle), pace, font=letters, fill=ALERT, anchor="rm")
+    return np.asarray(image)
+
+
+def help_image(layout: WindowLayout, groups: Mapping[str, list[tuple[str, str]]]) -> np.ndarray:
+    """Return the list of keys by group, uint8, shape (height, width, 3)."""
+    box, px = layout.whole, layout.px
+    image = Image.new("RGB", (box.width, box.height), HELP)
+    draw = ImageDraw.Draw(image)
+    columns = in_columns(groups)
+    pitch = (box.height - px(28)) / max(map(len, columns))
+    width, gap = box.width // HELP_COLUMNS - 2 * px(16), px(HELP_GAP_PX)
+    rows = [row for lines in groups.values() for row in lines]
+    size = fitting_size(rows, width - gap, min(int(0.75 * pitch), px(HELP_PX)))
+    key_width = max(font(size).getlength(key) for key, _ in rows)
+    for number, column in enumerate(columns):
+        x = px(16) + number * box.width // HELP_COLUMNS + key_width
+        for place, (key, text) in enumerate(column):
+            y = px(14) + (place + 0.5) * pitch
+            draw.text((x, y), key, font=font(size), fill=MARK, anchor="rm")
+            draw.text((x + gap, y), text, font=font(size), fill=TEXT if key else QUIET, anchor="lm")
+    return np.asarray(image)
+
+
+def in_columns(groups: Mapping[str, list[tuple[str, str]]]) -> list[list[tuple[str, str]]]:
+    """Arrange groups of rows in HELP_COLUMNS columns without splitting a group, each under its name."""
+    blocks = [[("", name), *rows, ("", "")] for name, rows in groups.items()]
+    columns: list[list[tuple[str, str]]] = [[] for _ in range(HELP_COLUMNS)]
+    share = sum(map(len, blocks)) / HELP_COLUMNS
+    for block in blocks:
+        column = next((each for each in columns if len(each) + len(block) / 2 <= share), columns[-1])
+        column += block
+    return columns
+
+
+def readout_image(layout: WindowLayout, readouts: Mapping[str, str]) -> np.ndarray:
+    """Return names and values, one line each, as many as fit, uint8, shape of layout.readouts."""
+    box = layout.readouts
+    image = Image.new("RGB", (box.width, box.height), STRIP)
+    draw = ImageDraw.Draw(image)
+    draw.line([(0, 0), (box.width, 0)], fill=LINE)
+    room = box.height - 2 * FIGURES_PAD
+    pitch = min(layout.px(FIGURE_HEIGHT), max(LEAST_PITCH, room // max(1, len(readouts))))
+    _draw_figures(draw, box, first_of(readouts, room // pitch), "", pitch)
+    return np.asarray(image)
+
+
+def findings_image(layout: WindowLayout, findings: Mapping[str, str], alert: str = "") -> np.ndarray:
+    """Return names and values, uint8, shape of layout.findings(count); the one named ``alert`` is highlighted."""
+    box = layout.findings(len(findings))
+    image = Image.new("RGB", (box.width, box.height), FINDINGS)
+    draw = ImageDraw.Draw(image)
+    draw.rectangle([0, 0, box.width - 1, box.height - 1], outline=ALERT if alert else LINE)
+    _draw_figures(draw, box, findings, alert, layout.px(FIGURE_HEIGHT))
+    return np.asarray(image)
+
+
+def first_of(figures: Mapping[str, str], most: int) -> dict[str, str]:
+    """Return the first figures, at most ``most``."""
+    return dict(islice(figures.items(), most))
+
+
+def _draw_figures(
+    draw: ImageDraw.ImageDraw, box: Rect, figures: Mapping[str, str], alert: str, pitch: float
+) -> None:
+    room, most = box.width - FIGURES_GAP_PX, int(0.68 * pitch)
+    size = min(
+        (fitting_size([(f"{name}  {value}",)], room, most) for name, value in figures.items()), default=most
+    )
+    for i, (name, value) in enumerate(figures.items()):
+        y = FIGURES_PAD + (i + 0.5) * pitch
+        colours = (ALERT, ALERT) if name == alert else (QUIET, TEXT)
+        draw.text((8, y), name, font=font(size), fill=colours[0], anchor="lm")
+        draw.text((box.width - 10, y), value or NO_VALUE, font=font(size), fill=colours[1], anchor="rm")
+
+
+def ends_of(axes: np.ndarray) -> list[tuple[str, np.ndarray]]:
+    """Return the letters of the patient's axes and their directions on the screen (2,), right and up, the farthest first.
+
+    ``axes`` (3, 3) are the camera's right, up and ahead, in the patient.
+    """
+    ends = [
+        (letters[side > 0], side * axes[:, axis])
+        for axis, letters in enumerate(LETTERS)
+        for side in (-1, 1)
+        if np.hypot(*axes[:2, axis]) > LEAST_LENGTH
+    ]
+    return [(letter, end[:2]) for letter, end in sorted(ends, key=lambda end: -end[1][2])]
+
+
+def compass_image(layout: WindowLayout, axes: np.ndarray) -> np.ndarray:
+    """Return the compass for a camera's axes (3, 3), uint8, shape of layout.compass."""
+    size = layout.compass.width
+    image = Image.new("RGB", (size, size), FINDINGS)
+    draw = ImageDraw.Draw(image)
+    draw.rectangle([0, 0, size - 1, size - 1], outline=LINE)
+    middle = np.array([size, size]) / 2
+    ends = ends_of(axes)
+    for place, (letter, axis) in enumerate(ends):
+        near = place >= len(ends) / 2
+        colour, down = TEXT if near else QUIET, axis * [1, -1]
+        tip = middle + size * ARM * down
+        end = tip + size * BEYOND * down / np.linalg.norm(down)
+        draw.line([*middle, *tip], fill=colour, width=layout.px(LINE_PX))
+        draw.text(tuple(end), letter, font=font(layout.px(LETTER_PX)), fill=colour, anchor="mm")
+    return np.asarray(image)

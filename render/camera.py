@@ -3,7 +3,7 @@
 Window coordinates run from (0, 0) bottom left to (1, 1) top right, as GGUI gives the mouse.
 """
 
-from __future__ import annotations
+from itertools import product
 
 import numpy as np
 
@@ -26,10 +26,10 @@ class OrbitCamera:
         bounds = np.asarray(bounds, dtype=np.float64)
         self.up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
         self._middle = bounds.mean(axis=0)
-        self.target = self._middle
         self.aspect = aspect
         self.part = part
-        self.azimuth_deg, self.elevation_deg = HOME_DEG
+        self.distance_home = 0.0
+        self.go_home()
         # The long side of the organ is horizontal in the view, as usual for a kidney.
         flat = np.eye(3) - np.outer(self.up, self.up)
         spread = (bounds[1] - bounds[0]) * np.linalg.norm(flat, axis=1)
@@ -45,11 +45,8 @@ class OrbitCamera:
         self.distance = self.distance_home
 
     def _framing_distance(self, bounds: np.ndarray) -> float:
-        corners = np.array(
-            [[bounds[i][0], bounds[j][1], bounds[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-        )
         right, up, ahead = self.axes()
-        offset = corners - self.target
+        offset = np.array(list(product(*bounds.T))) - self.target
         left, bottom, right_edge, top = self.part
         half = self._half_extent() * [right_edge - left, top - bottom]
         # The eye is beside the target: what is behind the target is shifted towards the centre of the window.

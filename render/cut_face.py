@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from render.surface_shading import ShadedSurface
-from sim.fields import array_of, fields_of, fill
+from render.surface_shading import DrawnMesh, ShadedSurface
+from render.transducer_shape import grid_triangles
+from sim.fields import array_of
 
 CELLS = 160
 FLESH = (0.78, 0.50, 0.44)
@@ -87,12 +88,8 @@ class CutFace:
     """Fields of the drawn section."""
 
     def __init__(self) -> None:
-        count = CELLS**2
-        self._points, self._normals, self._colours = fields_of(
-            *np.ones((2, count, 3)), np.zeros((count, 4)), within=1
-        )
-        first = (np.arange(CELLS - 1)[:, None] * CELLS + np.arange(CELLS - 1)).reshape(-1, 1)
-        self._quads = (first + [0, CELLS, 1, 1, CELLS, CELLS + 1]).astype(np.int32)
+        self._mesh = DrawnMesh(CELLS**2, channels=4)
+        self._quads = grid_triangles(CELLS, CELLS)
 
     def draw(
         self, scene, organ: ShadedSurface, inner: list[ShadedSurface], pose: np.ndarray, key: np.ndarray
@@ -109,10 +106,8 @@ class CutFace:
         points = pose[:3, 3] + places @ pose[:3, [0, 2]].T
         toward = key - points.mean(axis=0)
         normals = np.tile(toward / np.linalg.norm(toward), (len(points), 1))
-        fill((self._points, points), (self._normals, normals))
         # Not clamped: blending clamps each pixel.
         opacity = 0.5 + SHARPER * (most - BORDER)
-        fill((self._colours, np.hstack([colour, opacity])))
         shown = self._quads[(opacity[self._quads] > 0).any(axis=(1, 2))]
         if len(shown):
-            scene.mesh(self._points, shown.reshape(-1), self._normals, per_vertex_color=self._colours)
+            self._mesh.draw(scene, shown.reshape(-1), points, normals, np.hstack([colour, opacity]))

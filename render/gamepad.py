@@ -7,8 +7,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from render.actions import TILT_DEG_S, begin, hold
-from render.keys import BUTTONS
+from render.keys import BUTTONS, TILT_DEG_S, begin, hold
 from render.viewer import Controls
 
 SLIDE_MM_S = 40.0
@@ -43,7 +42,11 @@ class Gamepad:
     def read(self, controls: Controls, seconds: float) -> None:
         """Add the input of the last seconds to the controls."""
         state = self._pads.read()
-        self._watch(state is not None, controls)
+        connected = state is not None
+        if connected != self._connected:
+            lost = "No gamepad connected" if self._connected is None else "Gamepad disconnected"
+            controls.message = "Gamepad ready" if connected else f"{lost}: use mouse and keys"
+            self._connected = connected
         if state is None:
             return
         x, y = shaped(*state.left)
@@ -58,17 +61,6 @@ class Gamepad:
                 begin(action, controls)
             if button in state.held:
                 hold(action, controls, seconds)
-
-    def _watch(self, connected: bool, controls: Controls) -> None:
-        if connected == self._connected:
-            return
-        if connected:
-            controls.message = "Gamepad ready"
-        elif self._connected is None:
-            controls.message = "No gamepad connected: use mouse and keys"
-        else:
-            controls.message = "Gamepad disconnected: use mouse and keys"
-        self._connected = connected
 
 
 def shaped(x: float, y: float) -> tuple[float, float]:
@@ -109,17 +101,15 @@ class SdlPads:
             known = filter(self._controller.is_controller, range(self._controller.get_count()))
             first = next(known, None)
             self._pad = None if first is None else self._controller.Controller(first)
-        return None if self._pad is None else self._state(self._pad, events)
-
-    def _state(self, pad, events) -> PadState:
-        axes = [max(-1.0, pad.get_axis(axis) / FULL) for axis in range(RIGHT_TRIGGER + 1)]
+        if self._pad is None:
+            return None
+        axes = [max(-1.0, self._pad.get_axis(axis) / FULL) for axis in range(RIGHT_TRIGGER + 1)]
         # Only a gamepad that is open sends events.
         down = [event.button for event in events if event.type == self._pygame.CONTROLLERBUTTONDOWN]
-        held = frozenset(name for number, name in enumerate(BUTTONS) if pad.get_button(number))
         return PadState(
             (axes[LEFT_X], -axes[LEFT_Y]),
             (axes[RIGHT_X], -axes[RIGHT_Y]),
             axes[RIGHT_TRIGGER],
-            held,
+            frozenset(name for number, name in enumerate(BUTTONS) if self._pad.get_button(number)),
             tuple(BUTTONS[number] for number in down if number < len(BUTTONS)),
         )

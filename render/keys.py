@@ -1,4 +1,4 @@
-"""Assignment of keys and gamepad buttons to actions: the default, or a user's file."""
+"""Keys and gamepad buttons: their actions, what these change, and a user's own assignment."""
 
 import re
 import string
@@ -10,8 +10,9 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from errors import UserError, explained, meant
-from render.actions import ACTIONS, BY_MOUSE, HELD
-from render.viewer import KEY_MAP, KEY_MAP_ENTRIES
+from render.viewer import Controls
+from ultrasound.probe import DETAIL_LEVELS, MODES
+from ultrasound.target import TARGETS
 
 # A key as printed -> as GGUI names it. GGUI reports no digits and no punctuation.
 KEYS = {each: each.lower() for each in string.ascii_uppercase}
@@ -22,11 +23,53 @@ BUTTONS = (
     *("A", "B", "X", "Y", "Back", "Guide", "Start", "Left stick", "Right stick"),
     *("Left shoulder", "Right shoulder", "Pad up", "Pad down", "Pad left", "Pad right"),
 )
-_ALL_KEYS = {
-    action: key for line in KEY_MAP_ENTRIES for action, key in zip(line.actions, line.keys, strict=True)
+# Group -> text for the user -> actions, each with its key as printed.
+KEY_MAP = {
+    "Transducer": {
+        "move it over the organ": {"point": "Mouse"},
+        "press it in, deeper the longer it is held": {"press": "Left button"},
+        "push it in, lift it": {"push": "W", "lift": "S"},
+        "rotate it about its axis": {"rotate_left": "A", "rotate_right": "D"},
+        "rock it in the image plane, heel to toe": {"rock_left": "Q", "rock_right": "E"},
+        "tilt it out of the image plane (fan)": {"tilt_back": "Z", "tilt_forward": "C"},
+    },
+    "View": {
+        "turn the view": {"orbit": "Right drag"},
+        "pan the view (also Shift + right drag)": {"pan": "Middle drag"},
+        "zoom in and out": {"zoom_in": "Up", "zoom_out": "Down"},
+        "organ translucent or solid": {"translucent": "T"},
+        "organ cut along the image plane": {"cut": "X"},
+        "coverage: imaged tissue in green": {"show_seen": "N"},
+    },
+    "Image": {
+        "B-mode and CT, B-mode alone, CT alone": {"mode": "B"},
+        "detail level of the B-mode image": {"detail_level": "V"},
+        "the scanner's sliders, with TGC": {"show_scanner": "G"},
+        "outline of the tumour, now and in the CT": {"outline": "O"},
+        "caliper from click to click, in mm; a third removes it": {"measure": "Click on image"},
+        "freeze and unfreeze": {"freeze": "F"},
+        "while frozen: cine of the last ten seconds": {"cine_back": "Left", "cine_forth": "Right"},
+        "save the image (PNG, DICOM) and the organ (PLY)": {"export": "I"},
+    },
+    "Plan": {
+        "target: tumour and margin, tumour, kidney": {"plan_for": "Space"},
+        "plan a sweep of the target": {"plan": "Return"},
+        "stop planning; or show the next sweep, then none": {"next_plan": "Backspace"},
+    },
+    "Session": {
+        "undo the last press, turn or path; redo it": {"undo": "U", "redo": "Y"},
+        "set a bookmark; return to bookmarks": {"bookmark": "M", "to_bookmark": "J"},
+        "start and stop recording a tracked sweep": {"sweep": "L"},
+        "take control from a replay or a tracked probe": {"take_over": "K"},
+        "reset tissue, transducer and view": {"reset": "R"},
+        "save a screenshot of the window": {"screenshot": "P"},
+        "show or hide this list": {"help": "H"},
+        "quit": {"quit": "Esc"},
+    },
 }
-DEFAULT_KEYS = {action: _ALL_KEYS[action] for action in ACTIONS}
-MOUSE = {action: _ALL_KEYS[action] for action in BY_MOUSE}
+_ALL = {action: key for group in KEY_MAP.values() for keys in group.values() for action, key in keys.items()}
+MOUSE = {action: place for action, place in _ALL.items() if place not in KEYS}
+DEFAULT_KEYS = {action: key for action, key in _ALL.items() if key in KEYS}
 DEFAULT_BUTTONS = {
     "freeze": "A",
     "undo": "B",
@@ -38,6 +81,23 @@ DEFAULT_BUTTONS = {
     "lift": "Pad down",
     "reset": "Start",
 }
+
+PUSH_MM_S, ROTATE_DEG_S, TILT_DEG_S = 15.0, 45.0, 30.0
+# Actions of held keys: the control that changes, and its rate per second.
+HELD = {
+    "push": ("push_mm", PUSH_MM_S),
+    "lift": ("push_mm", -PUSH_MM_S),
+    "rotate_left": ("rotate_deg", ROTATE_DEG_S),
+    "rotate_right": ("rotate_deg", -ROTATE_DEG_S),
+    "rock_left": ("rock_deg", TILT_DEG_S),
+    "rock_right": ("rock_deg", -TILT_DEG_S),
+    "tilt_back": ("tilt_deg", -TILT_DEG_S),
+    "tilt_forward": ("tilt_deg", TILT_DEG_S),
+}
+# The others act when the key goes down: cine steps, settings of several values, settings that are on or off, and controls with the
+# name of the action.
+STEPS = {"cine_back": -1, "cine_forth": 1}
+CYCLES = {"mode": MODES, "detail_level": DETAIL_LEVELS, "plan_for": TARGETS}
 # Actions of the 3D view itself.
 VIEW_ACTIONS = ("zoom_in", "zoom_out")
 
@@ -77,12 +137,12 @@ class Keys:
     def lines(self) -> dict[str, list[tuple[str, str]]]:
         """Return keys and texts of all actions by group, for the help."""
         return {
-            group: [(" / ".join(map(self._printed, line.actions, line.keys)), line.text) for line in lines]
+            group: [
+                (" / ".join(self.of.get(*usual) for usual in keys.items()), text)
+                for text, keys in lines.items()
+            ]
             for group, lines in KEY_MAP.items()
         }
-
-    def _printed(self, action: str, usual: str) -> str:
-        return self.of.get(action, usual)
 
     def worded(self, text: str) -> str:
         """Return a text with actions in braces replaced by their keys: "{sweep} stops it"."""
@@ -101,9 +161,9 @@ def load_keys(path: Path) -> Keys:
     except ValidationError as error:
         raise KeysError(f"{path}: {explained(error, lambda _: SECTIONS)}") from None
     try:
-        buttons = [action for action in ACTIONS if action not in (*VIEW_ACTIONS, "help")]
+        buttons = [action for action in DEFAULT_KEYS if action not in (*VIEW_ACTIONS, "help")]
         return Keys(
-            _with("keys", given.keys, DEFAULT_KEYS, ACTIONS, KEYS),
+            _with("keys", given.keys, DEFAULT_KEYS, DEFAULT_KEYS, KEYS),
             _with("gamepad", given.gamepad, DEFAULT_BUTTONS, buttons, BUTTONS),
         )
     except KeysError as error:
@@ -116,8 +176,9 @@ def keys_text() -> str:
     head = HEAD.format(named=named, buttons=", ".join(BUTTONS))
     rows = []
     for group, lines in KEY_MAP.items():
-        keyed = [(action, line.text) for line in lines for action in line.actions if action in ACTIONS]
-        rows += [f"# {group}", *(f'{action} = "{DEFAULT_KEYS[action]}"  # {text}' for action, text in keyed)]
+        rows.append(f"# {group}")
+        keyed = [(action, text) for text, keys in lines.items() for action in keys if action in DEFAULT_KEYS]
+        rows += [f'{action} = "{DEFAULT_KEYS[action]}"  # {text}' for action, text in keyed]
     pad = [f'{action} = "{button}"' for action, button in DEFAULT_BUTTONS.items()]
     return "\n".join([head, "[keys]", *rows, "", "[gamepad]", *pad, ""])
 
@@ -133,7 +194,7 @@ def _with(
     printed = {place.lower(): place for place in places}
     chosen = dict(usual)
     for action, place in given.items():
-        if action in BY_MOUSE:
+        if action in MOUSE:
             raise KeysError(f"{section}.{action}: is an action of the mouse; leave it out")
         if action not in actions:
             raise KeysError(f"{section}.{action}: unknown action; {meant(action, actions)}")
@@ -149,3 +210,25 @@ def _with(
             raise KeysError(f"{section}: {taken[place]} and {action} are both on {place}; change one of them")
         taken[place] = action
     return chosen
+
+
+def hold(action: str, controls: Controls, seconds: float) -> None:
+    """Apply an action whose key was held for a time; ignore other actions."""
+    if action in HELD:
+        name, rate = HELD[action]
+        setattr(controls, name, getattr(controls, name) + rate * seconds)
+
+
+def begin(action: str, controls: Controls) -> None:
+    """Apply an action whose key went down; ignore held actions and those of the window itself."""
+    settings = controls.settings
+    if action in STEPS:
+        controls.cine += STEPS[action]
+    elif action in CYCLES:
+        values = CYCLES[action]
+        at = values.index(getattr(settings, action))
+        setattr(settings, action, values[(at + 1) % len(values)])
+    elif hasattr(settings, action):
+        setattr(settings, action, not getattr(settings, action))
+    elif hasattr(controls, action):
+        setattr(controls, action, True)

@@ -1,17 +1,17 @@
-"""The 3D view: organ, internal structures, support, transducer and image plane in a GGUI scene.
+"""The 3D view: organ, internal structures, support, transducer, image plane and planned sweep in a GGUI scene.
 
 The scene is a parameter: only window.py imports taichi.ui. Lengths in mm.
 """
 
 import numpy as np
+import taichi as ti
 
 from render import transducer_shape
 from render.camera import OrbitCamera
 from render.cut_face import CutFace, side_of_eye
-from render.plan_lines import PlanLines
-from render.surface_shading import CUT_EDGE_MM, GLASS, SOLID, Cut, ShadedSurface
-from render.viewer import Geometry, Settings, View
-from sim.fields import field_of, fields_of, fill
+from render.surface_shading import CUT_EDGE_MM, GLASS, SOLID, Cut, DrawnMesh, ShadedSurface
+from render.viewer import Geometry, Guidance, Settings, View
+from sim.fields import field_of, fill
 
 PLANE_ROWS, PLANE_COLUMNS = 96, 64
 KEY_LIGHT, FILL_LIGHT, AMBIENT = (0.82, 0.80, 0.77), (0.17, 0.19, 0.23), (0.17, 0.17, 0.19)
@@ -19,6 +19,11 @@ TUMOUR, SUPPORT, EDGE, FRAME = (0.93, 0.76, 0.28), (0.30, 0.33, 0.36), (0.85, 0.
 PARTS = {"cyst": (0.30, 0.60, 0.86), "urine": (0.62, 0.74, 0.33), "vessel": (0.80, 0.16, 0.20)}
 LINE_WIDTH = 1.2
 MASKS = 5
+# Lines of a planned sweep.
+MAX_SEGMENTS = 2000
+TO_GO, DONE = np.array([1.0, 0.72, 0.20], np.float32), np.array([0.30, 0.75, 0.42], np.float32)
+GOAL = (1.0, 0.86, 0.45)
+PLAN_WIDTH, GOAL_WIDTH = 2.6, 1.8
 
 
 class SceneView:
@@ -26,33 +31,27 @@ class SceneView:
 
     def __init__(self, geometry: Geometry, camera: OrbitCamera):
         self.camera = camera
-        self._organ = ShadedSurface(geometry.organ_vertices, geometry.organ_faces)
+        self._organ = ShadedSurface(*geometry.organ)
         self._tumour = self._support = None
-        self._parts = [
-            ShadedSurface(vertices, faces, PARTS[tissue])
-            for tissue, (vertices, faces) in geometry.parts.items()
-        ]
-        if geometry.tumour_vertices is not None and geometry.tumour_faces is not None:
-            self._tumour = ShadedSurface(geometry.tumour_vertices, geometry.tumour_faces, TUMOUR)
-        if geometry.support_vertices is not None and geometry.support_faces is not None:
-            self._support = self._matt_support(geometry.support_vertices, geometry.support_faces)
+        self._parts = [ShadedSurface(*part, PARTS[tissue]) for tissue, part in geometry.parts.items()]
+        if geometry.tumour is not None:
+            self._tumour = ShadedSurface(*geometry.tumour, TUMOUR)
+        if geometry.support is not None:
+            self._support = self._matt_support(*geometry.support)
         self._half_axis_mm = geometry.transducer_size_mm[2] / 2
-        self._probe = transducer_shape.transducer(geometry.transducer_size_mm, geometry.transducer_radius_mm)
-        self._probe_vertices, self._probe_normals, self._probe_colours = fields_of(*self._probe[:3], within=1)
-        self._probe_edges = transducer_shape.edges(geometry.transducer_size_mm, geometry.transducer_radius_mm)
+        shape = geometry.transducer_size_mm, geometry.transducer_radius_mm
+        self._probe = transducer_shape.transducer(*shape)
+        self._probe_mesh = DrawnMesh(len(self._probe.vertices))
+        self._probe_edges = transducer_shape.edges(*shape)
         self._edge_points = field_of(self._probe_edges, within=1)
-        self._guide: PlanLines | None = None
+        self._plan: PlanLines | None = None
         self._cut_face: CutFace | None = None
         self._cut_side = 0.0
-        self._plane, self._plane_indices = transducer_shape.image_plane_grid(PLANE_ROWS, PLANE_COLUMNS)
-        self._plane_points, self._plane_normals, self._plane_colours = fields_of(
-            *np.ones((3, len(self._plane), 3)), within=1
-        )
+        self._plane = transducer_shape.image_plane_grid(PLANE_ROWS, PLANE_COLUMNS)
+        self._plane_indices = transducer_shape.grid_triangles(PLANE_ROWS, PLANE_COLUMNS).reshape(-1)
+        self._plane_mesh = DrawnMesh(len(self._plane))
         self._frame_points = field_of(np.zeros((2 * transducer_shape.FRAME_SIDES, 3)), within=1)
-        self._mask_points, self._mask_normals, self._mask_colours = fields_of(
-            *np.ones((2, 6 * MASKS, 3)), np.zeros((6 * MASKS, 4)), within=1
-        )
-        self._mask_indices = np.arange(6 * MASKS, dtype=np.int32)
+        self._masks = DrawnMesh(6 * MASKS, channels=4)
 
     def _matt_support(self, vertices: np.ndarray, faces: np.ndarray) -> ShadedSurface:
         support = ShadedSurface(field_of(vertices, within=1), faces, SUPPORT, gloss=0.0)
@@ -77,7 +76,7 @@ class SceneView:
         self._mask(scene, masked)
         if self._support is not None and settings.show_support:
             # A decimated mesh has slivers that face the wrong way, which would appear as black specks.
-            _draw_surface(scene, self._support, two_sided=True)
+            self._support.draw(scene, two_sided=True)
         self._draw_transducer(scene, view.transducer_pose)
         inner = self._inner(view, settings)
         cut = self._draw_cut_face(scene, view, inner, eye, key) if settings.cut else None
@@ -88,12 +87,12 @@ class SceneView:
         if cut is not None:
             self._draw_inner(scene, inner, eye, key, ahead, cut)
         if view.guidance is not None:
-            self._guide = self._guide or PlanLines(self._probe_edges)
-            self._guide.draw(scene, view.guidance)
+            self._plan = self._plan or PlanLines(self._probe_edges)
+            self._plan.draw(scene, view.guidance)
         opacity = GLASS if settings.translucent else SOLID
         self._organ.tint(view.seen.get("organ"))
         self._organ.shade(eye, key, opacity, cut)
-        _draw_surface(scene, self._organ, ahead if opacity < SOLID or cut is not None else None, cut)
+        self._organ.draw(scene, ahead if opacity < SOLID or cut is not None else None, cut)
 
     def _inner(self, view: View, settings: Settings) -> list[ShadedSurface]:
         """Return the shown surfaces inside the organ."""
@@ -108,36 +107,27 @@ class SceneView:
     ) -> None:
         for surface in inner:
             surface.shade(eye, key, SOLID, cut)
-            _draw_surface(scene, surface, None if cut is None else ahead, cut)
+            surface.draw(scene, None if cut is None else ahead, cut)
 
     def _mask(self, scene, masked) -> None:
         """Draw quads of alpha 0 just behind the near plane: the background stays visible, what is drawn later is hidden."""
         corners = np.full((MASKS, 6, 2), -1.0)
-        for quad, (left, bottom, right, top) in zip(corners, masked, strict=False):
-            quad[:] = [
-                [left, bottom],
-                [right, bottom],
-                [right, top],
-                [left, bottom],
-                [right, top],
-                [left, top],
-            ]
+        for quad, box in zip(corners, masked, strict=False):
+            # Of left, bottom, right and top: the corners of two triangles.
+            quad[:] = np.array(box)[[[0, 1], [2, 1], [2, 3], [0, 1], [2, 3], [0, 3]]]
         depth = 1.02 * self.camera.near_far()[0]
-        fill((self._mask_points, self.camera.eye() + depth * self.camera.direction(corners.reshape(-1, 2))))
-        scene.mesh(
-            self._mask_points, self._mask_indices, self._mask_normals, per_vertex_color=self._mask_colours
+        points = self.camera.eye() + depth * self.camera.direction(corners.reshape(-1, 2))
+        count = len(points)
+        self._masks.draw(
+            scene, np.arange(count, dtype=np.int32), points, np.ones((count, 3)), np.zeros((count, 4))
         )
 
     def _draw_transducer(self, scene, pose: np.ndarray) -> None:
         probe = self._probe
-        fill(
-            (self._probe_vertices, transducer_shape.placed(probe.vertices, pose)),
-            (self._probe_normals, probe.normals @ pose[:3, :3].T),
-            (self._edge_points, transducer_shape.placed(self._probe_edges, pose)),
-        )
-        scene.mesh(
-            self._probe_vertices, probe.indices, self._probe_normals, per_vertex_color=self._probe_colours
-        )
+        indices = np.arange(len(probe.vertices), dtype=np.int32)
+        points, normals = transducer_shape.placed(probe.vertices, pose), probe.normals @ pose[:3, :3].T
+        self._probe_mesh.draw(scene, indices, points, normals, probe.colours)
+        fill((self._edge_points, transducer_shape.placed(self._probe_edges, pose)))
         scene.lines(self._edge_points, LINE_WIDTH, color=EDGE)
 
     def _draw_cut_face(self, scene, view: View, inner: list[ShadedSurface], eye, key) -> Cut:
@@ -157,30 +147,41 @@ class SceneView:
         points = transducer_shape.placed(transducer_shape.on_transducer(places), face)
         toward = key - points
         # Normals towards the key light make the plane evenly bright: grey values are those of the image.
-        grey = transducer_shape.sampled(next(iter(view.pictures.values())), places, view)
-        fill(
-            (self._plane_points, points),
-            (self._plane_normals, toward / np.linalg.norm(toward, axis=1, keepdims=True)),
-            (self._plane_colours, np.repeat(grey[:, None], 3, axis=1)),
-            (self._frame_points, transducer_shape.placed(transducer_shape.image_plane_frame(view), face)),
+        normals = toward / np.linalg.norm(toward, axis=1, keepdims=True)
+        grey = transducer_shape.sampled(next(iter(view.images.values())), places, view)
+        self._plane_mesh.draw(
+            scene, self._plane_indices, points, normals, np.repeat(grey[:, None], 3, axis=1)
         )
-        scene.mesh(
-            self._plane_points, self._plane_indices, self._plane_normals, per_vertex_color=self._plane_colours
-        )
+        fill((self._frame_points, transducer_shape.placed(transducer_shape.image_plane_frame(view), face)))
         scene.lines(self._frame_points, LINE_WIDTH, color=FRAME)
 
 
-def _draw_surface(
-    scene,
-    surface: ShadedSurface,
-    ahead: np.ndarray | None = None,
-    cut: Cut | None = None,
-    two_sided=False,
-) -> None:
-    scene.mesh(
-        surface.vertices,
-        surface.indices(ahead, cut),
-        surface.normal,
-        per_vertex_color=surface.colour,
-        two_sided=two_sided,
-    )
+class PlanLines:
+    """A planned sweep: the path of the array face, and the outline of the probe at the next pose. Of a path of more than MAX_SEGMENTS only every n-th segment is drawn."""
+
+    def __init__(self, edges: np.ndarray) -> None:
+        self._edges = edges
+        self._goal = ti.Vector.field(3, ti.f32, len(edges))
+        self._path, self._colours = (ti.Vector.field(3, ti.f32, 2 * MAX_SEGMENTS) for _ in range(2))
+        self._shown = np.zeros((0, 2, 3)), 0
+
+    def draw(self, scene, guidance: Guidance) -> None:
+        """Draw the lines into a scene."""
+        path, done = guidance.path_mm, int(guidance.done.sum())
+        if self._shown[0] is not path or self._shown[1] != done:
+            self._fill(guidance)
+            self._shown = path, done
+        scene.lines(self._path, PLAN_WIDTH, per_vertex_color=self._colours)
+        if guidance.goal is not None:
+            fill((self._goal, transducer_shape.placed(self._edges, guidance.goal)))
+            scene.lines(self._goal, GOAL_WIDTH, color=GOAL)
+
+    def _fill(self, guidance: Guidance) -> None:
+        every = -(-len(guidance.path_mm) // MAX_SEGMENTS)
+        segments, done = guidance.path_mm[::every], guidance.done[::every]
+        # Unused segments have no length.
+        points = np.repeat(segments[-1:, 1:], 2 * MAX_SEGMENTS, axis=1)[0].astype(np.float32)
+        colours = np.tile(DONE, (2 * MAX_SEGMENTS, 1))
+        points[: 2 * len(segments)] = segments.reshape(-1, 3)
+        colours[: 2 * len(segments)] = np.where(np.repeat(done, 2)[:, None], DONE, TO_GO)
+        fill((self._path, points), (self._colours, colours))

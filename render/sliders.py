@@ -13,19 +13,15 @@ AROUND_LABEL, AROUND_SWITCH = 16, 35
 
 def groups_of(settings: Settings, geometry: Geometry) -> dict[str, list[dataclasses.Field]]:
     """Return the adjustable settings by group."""
-    unused = unused_settings(geometry)
+    # Settings of structures that the scene does not have.
+    unused = {"show_tumour", "outline", "margin_mm"} if geometry.tumour is None else set()
+    unused |= set() if geometry.parts else {"show_parts"}
+    unused |= {"show_support"} if geometry.support is None else set()
     groups: dict[str, list[dataclasses.Field]] = {}
     for each in dataclasses.fields(settings):
         if each.metadata and getattr(settings, each.name) is not None and each.name not in unused:
             groups.setdefault(each.metadata["group"], []).append(each)
     return groups
-
-
-def unused_settings(geometry: Geometry) -> set[str]:
-    """Return the names of settings of structures that the scene does not have."""
-    tumour = {"show_tumour", "outline", "margin_mm"} if geometry.tumour_vertices is None else set()
-    parts = set() if geometry.parts else {"show_parts"}
-    return tumour | parts | ({"show_support"} if geometry.support_vertices is None else set())
 
 
 def boxes_of(settings: Settings, geometry: Geometry, layout: WindowLayout) -> dict[str, Rect]:
@@ -60,20 +56,17 @@ def draw_sliders(
         place = (box.left / width, box.top / height, box.width / width, box.height / height)
         with gui.sub_window(f"{name}##{placed}", *place):
             for member in groups[name]:
-                _draw_slider(gui, settings, member, geometry.frequency_range_mhz)
-
-
-def _draw_slider(gui, settings: Settings, member: dataclasses.Field, mhz: tuple[float, float]) -> None:
-    value, about = getattr(settings, member.name), member.metadata
-    low, high = mhz if member.name == "frequency_mhz" else (about["low"], about["high"])
-    label = _label(member)
-    if isinstance(low, bool):
-        value = gui.checkbox(label, bool(value))
-    elif isinstance(low, int):
-        value = gui.slider_int(label, int(value), low, high)
-    else:
-        value = gui.slider_float(label, float(value), low, high)
-    setattr(settings, member.name, value)
+                value, about, label = getattr(settings, member.name), member.metadata, _label(member)
+                low, high = about["low"], about["high"]
+                if member.name == "frequency_mhz":
+                    low, high = geometry.frequency_range_mhz
+                if isinstance(low, bool):
+                    value = gui.checkbox(label, bool(value))
+                elif isinstance(low, int):
+                    value = gui.slider_int(label, int(value), low, high)
+                else:
+                    value = gui.slider_float(label, float(value), low, high)
+                setattr(settings, member.name, value)
 
 
 def _width(members: list[dataclasses.Field]) -> float:

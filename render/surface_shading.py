@@ -4,10 +4,11 @@ GGUI shades by Lambert's law alone and blends by vertex alpha without sorting. S
 translucent organ are therefore part of the vertex colours, and faces are sorted farthest first.
 """
 
+import igl
 import numpy as np
 import taichi as ti
 
-from sim.fields import array_of, fill
+from sim.fields import array_of, fields_of, fill
 
 ORGAN, TINT = (0.66, 0.27, 0.23), (0.24, 0.60, 0.36)
 SOLID, GLASS = 1.0, 0.30
@@ -17,64 +18,19 @@ CUT_EDGE_MM = 0.4
 Cut = tuple[np.ndarray, np.ndarray]
 
 
-@ti.kernel
-def _area_normals(vertices: ti.template(), faces: ti.template(), area_normal: ti.template()):
-    for f in faces:
-        a, b, c = vertices[faces[f][0]], vertices[faces[f][1]], vertices[faces[f][2]]
-        area_normal[f] = (b - a).cross(c - a)
+class DrawnMesh:
+    """Fields of triangles with a normal and a colour (3 or 4 channels) at each of ``count`` vertices, given anew for each frame."""
+
+    def __init__(self, count: int, channels: int = 3) -> None:
+        self._fields = fields_of(*np.zeros((2, count, 3)), np.zeros((count, channels)), within=1)
+
+    def draw(self, scene, indices: np.ndarray, points, normals, colours) -> None:
+        """Draw the triangles of vertex ``indices`` (3 m,), int32, into a scene."""
+        fill(*zip(self._fields, (points, normals, colours), strict=True))
+        scene.mesh(self._fields[0], indices, self._fields[1], per_vertex_color=self._fields[2])
 
 
-@ti.kernel
-def _shade(
-    vertices: ti.template(),
-    area_normal: ti.template(),
-    start: ti.template(),
-    around: ti.template(),
-    base: ti.math.vec3,
-    eye: ti.math.vec3,
-    light: ti.math.vec3,
-    opacity: ti.f32,
-    gloss: ti.f32,
-    cut_point: ti.math.vec3,
-    cut_normal: ti.math.vec3,
-    tint: ti.template(),
-    normal: ti.template(),
-    colour: ti.template(),
-):
-    """A zero cut_normal cuts nothing; else what is on its side of the plane is transparent."""
-    for v in vertices:
-        total = ti.Vector([0.0, 0.0, 0.0])
-        for k in range(start[v], start[v + 1]):
-            total += area_normal[around[k]]
-        n = total / ti.max(total.norm(), 1e-12)
-        normal[v] = n
-        to_eye = (eye - vertices[v]).normalized()
-        half = ((light - vertices[v]).normalized() + to_eye).normalized()
-        sheen = gloss * ti.max(n.dot(half), 0.0) ** 36
-        rim = (1.0 - ti.abs(n.dot(to_eye))) ** 2
-        alpha = ti.min(opacity + (1.0 - opacity) * (0.75 * rim + sheen), 1.0)
-        if cut_normal.norm() > 0.5:
-            # Not clamped: blending clamps each pixel, and a linear alpha is cut along the plane, not along faces.
-            alpha = 0.5 - (vertices[v] - cut_point).dot(cut_normal) / CUT_EDGE_MM
-        tinted = base + tint[v] * (ti.Vector(TINT) - base)
-        grey = tinted * (1.0 - 0.25 * rim) + sheen
-        colour[v] = ti.Vector([grey[0], grey[1], grey[2], alpha])
-
-
-def faces_around_vertices(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return CSR lists of the faces at each of `count` vertices: start (count + 1,), faces (3 m,), int32."""
-    corner = faces.reshape(-1)
-    order = np.argsort(corner, kind="stable")
-    start = np.concatenate([[0], np.cumsum(np.bincount(corner, minlength=count))])
-    return start.astype(np.int32), (order // 3).astype(np.int32)
-
-
-def farthest_first(vertices: np.ndarray, faces: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """Return faces (m, 3) by decreasing distance along the view, as blending needs."""
-    depth = vertices @ ahead.astype(vertices.dtype)
-    return faces[np.argsort(-depth[faces].sum(axis=1), kind="stable")]
-
-
+@ti.data_oriented
 class ShadedSurface:
     """Normals and colours of one triangle mesh whose vertices move.
 
@@ -90,7 +46,7 @@ class ShadedSurface:
         self.faces = np.ascontiguousarray(faces, dtype=np.int32)
         self.base, self.gloss = base, gloss
         count = vertices.shape[0]
-        start, around = faces_around_vertices(self.faces, count)
+        around, start = igl.vertex_triangle_adjacency(self.faces, count)
         self.normal = ti.Vector.field(3, ti.f32, shape=count)
         self.colour = ti.Vector.field(4, ti.f32, shape=count)
         self._tint = ti.field(ti.f32, shape=count)
@@ -103,21 +59,48 @@ class ShadedSurface:
 
     def shade(self, eye, light, opacity: float = SOLID, cut: Cut | None = None) -> None:
         """Update normals and colours. A cut surface is solid."""
-        point, side = cut if cut is not None else (np.zeros(3), np.zeros(3))
-        _area_normals(self.vertices, self._faces, self._area_normal)
-        _shade(
-            self.vertices,
-            self._area_normal,
-            self._start,
-            self._around,
-            *(ti.math.vec3(*map(float, each)) for each in (self.base, eye, light)),
-            float(opacity),
-            float(self.gloss),
-            *(ti.math.vec3(*map(float, each)) for each in (point, side)),
-            self._tint,
-            self.normal,
-            self.colour,
-        )
+        self._find_normals()
+        vectors = (eye, light, *(cut if cut is not None else np.zeros((2, 3))))
+        self._shade(float(opacity), *(ti.math.vec3(*map(float, each)) for each in vectors))
+
+    @ti.kernel
+    def _find_normals(self):
+        for f in self._faces:
+            a, b, c = (
+                self.vertices[self._faces[f][0]],
+                self.vertices[self._faces[f][1]],
+                self.vertices[self._faces[f][2]],
+            )
+            self._area_normal[f] = (b - a).cross(c - a)
+
+    @ti.kernel
+    def _shade(
+        self,
+        opacity: ti.f32,
+        eye: ti.math.vec3,
+        light: ti.math.vec3,
+        cut_point: ti.math.vec3,
+        cut_normal: ti.math.vec3,
+    ):
+        """A zero cut_normal cuts nothing; else what is on its side of the plane is transparent."""
+        for v in self.vertices:
+            total = ti.Vector([0.0, 0.0, 0.0])
+            for k in range(self._start[v], self._start[v + 1]):
+                total += self._area_normal[self._around[k]]
+            n = total / ti.max(total.norm(), 1e-12)
+            self.normal[v] = n
+            to_eye = (eye - self.vertices[v]).normalized()
+            half = ((light - self.vertices[v]).normalized() + to_eye).normalized()
+            sheen = self.gloss * ti.max(n.dot(half), 0.0) ** 36
+            rim = (1.0 - ti.abs(n.dot(to_eye))) ** 2
+            alpha = ti.min(opacity + (1.0 - opacity) * (0.75 * rim + sheen), 1.0)
+            if cut_normal.norm() > 0.5:
+                # Not clamped: blending clamps each pixel, and a linear alpha is cut along the plane, not along faces.
+                alpha = 0.5 - (self.vertices[v] - cut_point).dot(cut_normal) / CUT_EDGE_MM
+            base = ti.Vector(self.base)
+            tinted = base + self._tint[v] * (ti.Vector(TINT) - base)
+            grey = tinted * (1.0 - 0.25 * rim) + sheen
+            self.colour[v] = ti.Vector([grey[0], grey[1], grey[2], alpha])
 
     def tint(self, vertices: np.ndarray | None) -> None:
         """Set which vertices (n,) bool are shown in TINT; None for none of them."""
@@ -128,6 +111,13 @@ class ShadedSurface:
             else:
                 fill((self._tint, vertices))
 
+    def draw(
+        self, scene, ahead: np.ndarray | None = None, cut: Cut | None = None, two_sided: bool = False
+    ) -> None:
+        """Draw the surface into a scene, in the order of ``indices``."""
+        colours = dict(per_vertex_color=self.colour, two_sided=two_sided)
+        scene.mesh(self.vertices, self.indices(ahead, cut), self.normal, **colours)
+
     def indices(self, ahead: np.ndarray | None = None, cut: Cut | None = None) -> np.ndarray:
         """Return vertex indices of the faces, int32 (3 m,), farthest first along `ahead` if given, without faces removed by a cut."""
         if ahead is None:
@@ -137,4 +127,6 @@ class ShadedSurface:
             point, side = cut
             # Though transparent, they would hide what is drawn behind them later.
             faces = faces[((vertices - point) @ side < 0)[faces].any(axis=1)]
-        return np.ascontiguousarray(farthest_first(vertices, faces, ahead)).reshape(-1)
+        depth = vertices @ ahead.astype(vertices.dtype)
+        # By decreasing distance along the view, as blending needs.
+        return faces[np.argsort(-depth[faces].sum(axis=1), kind="stable")].reshape(-1)

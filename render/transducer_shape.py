@@ -4,8 +4,6 @@ Local axes: x lateral, to the marked side; y elevation; z along the axis. The im
 z = -size_z / 2 in the direction -z.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -25,25 +23,19 @@ _EDGES = np.array(
 
 
 class TransducerShape(NamedTuple):
-    """Vertices (n, 3), unit normals (n, 3), colours (n, 3) in [0, 1], vertex indices of the triangles (3 m,)."""
+    """Vertices of triangles, three for each, unit normals, and colours in [0, 1], (3 m, 3) each."""
 
     vertices: np.ndarray
     normals: np.ndarray
     colours: np.ndarray
-    indices: np.ndarray
 
 
 def _prism(profile: np.ndarray, width: float, colour) -> TransducerShape:
     """Return the convex prism of a profile (n, 2) of x and z, centred on y = 0; each triangle has its own vertices."""
     ends = [np.insert(profile, 1, y, axis=1) for y in (-width / 2, width / 2)]
     hull = trimesh.convex.convex_hull(np.concatenate(ends))
-    count = 3 * len(hull.faces)
-    return TransducerShape(
-        hull.triangles.reshape(-1, 3),
-        np.repeat(hull.face_normals, 3, axis=0),
-        np.tile(colour, (count, 1)),
-        np.arange(count, dtype=np.int32),
-    )
+    colours = np.tile(colour, (3 * len(hull.faces), 1))
+    return TransducerShape(hull.triangles.reshape(-1, 3), np.repeat(hull.face_normals, 3, axis=0), colours)
 
 
 def _rectangle(left: float, right: float, bottom: float, top: float) -> np.ndarray:
@@ -65,10 +57,7 @@ def transducer(size, radius: float = 0.0) -> TransducerShape:
             _rectangle(x / 2 - 0.25, x / 2 + 0.25, middle - 0.225 * z, middle + 0.225 * z), 0.3 * y, MARKER
         ),
     ]
-    offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
-    vertices, normals, colours = (np.concatenate([part[i] for part in parts]) for i in range(3))
-    indices = np.concatenate([part.indices + offset for part, offset in zip(parts, offsets, strict=True)])
-    return TransducerShape(vertices, normals, colours, indices.astype(np.int32))
+    return TransducerShape(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 
 def _face(x: float, z: float, radius: float) -> np.ndarray:
@@ -87,13 +76,16 @@ def edges(size, radius: float = 0.0) -> np.ndarray:
     return (_CORNERS * (box + 0.15) + [0.0, 0.0, (z / 2 + foot) / 2])[_EDGES].reshape(-1, 3)
 
 
-def image_plane_grid(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a grid of the image: fractions (rows * columns, 2) of scanline and depth, and vertex indices of its triangles,
-    (6 (rows - 1)(columns - 1),)."""
+def image_plane_grid(rows: int, columns: int) -> np.ndarray:
+    """Return a grid of the image, row by row: fractions (rows * columns, 2) of scanline and depth."""
     down, across = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, columns), indexing="ij")
+    return np.stack([across, down], axis=-1).reshape(-1, 2)
+
+
+def grid_triangles(rows: int, columns: int) -> np.ndarray:
+    """Return the vertex indices of two triangles in each cell of a grid, int32, shape ((rows - 1)(columns - 1), 6)."""
     first = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1, 1)
-    shares = np.stack([across, down], axis=-1).reshape(-1, 2)
-    return shares, (first + [0, columns, 1, 1, columns, columns + 1]).astype(np.int32).reshape(-1)
+    return (first + [0, columns, 1, 1, columns, columns + 1]).astype(np.int32)
 
 
 def on_plane(shares: np.ndarray, view: View) -> np.ndarray:

@@ -3,14 +3,11 @@
 Pixels count from the top left. Points of the image plane are (u, v) [mm]: u from the centre to the right, v down from the face.
 """
 
-from __future__ import annotations
-
-from dataclasses import dataclass
-
 import numpy as np
 from PIL import Image, ImageDraw
 
 from render.text import PLATE_PX, fitting_size, font, shortened, write, written_size
+from render.viewer import View
 from render.window_layout import Rect, WindowLayout
 
 PANEL, FINDINGS, LINE = (8, 9, 11), (20, 24, 29), (44, 50, 58)
@@ -21,69 +18,42 @@ CROSS_PX, NUMBER_PX, NOTE_PX, HINT_PX, FIGURE_PX = 5, 16, 17, 14, 15
 # Legend of the tumour's outlines.
 LEGEND = (("tumour now", OUTLINE), ("in the CT", OUTLINE_AT_REST))
 
-Points = tuple[tuple[float, float], ...]
 # A text, its size and its colour.
 Written = tuple[str, int, tuple[int, int, int]]
 
 
-@dataclass(frozen=True)
-class Panel:
-    """The parts of the panel that stay the same for many frames.
-
-    ``captions`` are the probe's name, above, and the settings of B-mode and CT, below. ``legend``: whether to explain outlines.
-    """
-
-    names: tuple[str, ...]
-    width_mm: float
-    depth_mm: float
-    above_mm: float = 0.0
-    focus_mm: float | None = None
-    captions: tuple[str, str, str] = ("", "", "")
-    title: str = ""
-    status: str = ""
-    marked_side: str = "right"
-    legend: bool = False
-
-    def boxes(self, layout: WindowLayout) -> list[Rect]:
-        """Return the boxes of the images, one for each name."""
-        return layout.picture_boxes(len(self.names), self.width_mm, self.depth_mm)
-
-    def to_pixels(self, box: Rect, places_mm: np.ndarray) -> np.ndarray:
-        """Return columns and rows (..., 2), fractional, of points (..., 2) of the plane."""
-        share = (places_mm + [self.width_mm / 2, self.above_mm]) / [self.width_mm, self.depth_mm]
-        return share * [box.width, box.height] + [box.left, box.top]
-
-    def to_plane(self, box: Rect, column: float, row: float) -> tuple[float, float]:
-        """Return the point of the plane [mm] at a pixel."""
-        across, down = (column - box.left) / box.width, (row - box.top) / box.height
-        return (across - 0.5) * self.width_mm, down * self.depth_mm - self.above_mm
+def image_boxes(layout: WindowLayout, view: View) -> list[Rect]:
+    """Return the boxes of a view's images."""
+    return layout.image_boxes(len(view.images), view.width_mm, view.depth_mm)
 
 
-def ruler_ticks(panel: Panel, box: Rect) -> list[tuple[int, int | None]]:
+def to_pixels(view: View, box: Rect, places_mm: np.ndarray) -> np.ndarray:
+    """Return columns and rows (..., 2), fractional, of points (..., 2) of the plane."""
+    share = (places_mm + [view.width_mm / 2, view.above_mm]) / [view.width_mm, view.depth_mm]
+    return share * [box.width, box.height] + [box.left, box.top]
+
+
+def to_plane(view: View, box: Rect, column: float, row: float) -> tuple[float, float]:
+    """Return the point of the plane [mm] at a pixel."""
+    across, down = (column - box.left) / box.width, (row - box.top) / box.height
+    return (across - 0.5) * view.width_mm, down * view.depth_mm - view.above_mm
+
+
+def ruler_ticks(view: View, box: Rect) -> list[tuple[int, int | None]]:
     """Return ticks every 5 mm of depth: (row in pixels, whole centimetres or None between them)."""
     ticks = []
-    for half_cm in range(int((panel.depth_mm - panel.above_mm) / 5.0 + 1e-9) + 1):
-        share = (panel.above_mm + half_cm * 5.0) / panel.depth_mm
+    for half_cm in range(int((view.depth_mm - view.above_mm) / 5.0 + 1e-9) + 1):
+        share = (view.above_mm + half_cm * 5.0) / view.depth_mm
         ticks.append((box.top + round(share * (box.height - 1)), half_cm // 2 if half_cm % 2 == 0 else None))
     return ticks
 
 
-def marker_centre(layout: WindowLayout, box: Rect, marked_side: str) -> tuple[int, int]:
-    """Return the centre (x, y) of the marker dot, above the image at its marked side. Raises ValueError for another side."""
-    if marked_side not in ("left", "right"):
-        raise ValueError(f"marked_side is {marked_side!r}: it must be 'left' or 'right'")
-    x = box.left + layout.px(9) if marked_side == "left" else box.right - layout.px(10)
-    return x, box.top - layout.px(12)
-
-
-def paste_picture(page: np.ndarray, box: Rect, picture: np.ndarray) -> None:
+def paste_image(page: np.ndarray, box: Rect, image: np.ndarray) -> None:
     """Draw an image, uint8 (rows, columns), into its box, resampled unless it has the size of the box."""
-    if picture.shape != (box.height, box.width):
-        resized = Image.fromarray(picture).resize((box.width, box.height), Image.Resampling.BILINEAR)
-        picture = np.asarray(resized)
-    rows, columns = box.slices
-    for channel in range(3):
-        page[rows, columns, channel] = picture
+    if image.shape != (box.height, box.width):
+        resized = Image.fromarray(image).resize((box.width, box.height), Image.Resampling.BILINEAR)
+        image = np.asarray(resized)
+    page[box.slices][..., :3] = image[..., None]
 
 
 def draw_note(page: np.ndarray, layout: WindowLayout, box: Rect, note: str) -> None:
@@ -96,11 +66,11 @@ def draw_note(page: np.ndarray, layout: WindowLayout, box: Rect, note: str) -> N
         write(page, box, (x, y + 1.5 * px(NOTE_PX)), hint, size, QUIET)
 
 
-def draw_segments(page: np.ndarray, panel: Panel, box: Rect, segments_mm: np.ndarray, colour) -> None:
+def draw_segments(page: np.ndarray, view: View, box: Rect, segments_mm: np.ndarray, colour) -> None:
     """Draw line segments (n, 2, 2) of the plane [mm] over an image, clipped to its box."""
     if len(segments_mm) == 0:
         return
-    start, end = np.moveaxis(panel.to_pixels(box, np.asarray(segments_mm, float)), 1, 0)
+    start, end = np.moveaxis(to_pixels(view, box, np.asarray(segments_mm, float)), 1, 0)
     count = int(np.ceil(np.abs(end - start).max())) + 1
     along = np.linspace(0.0, 1.0, count + 1)[:, None, None]
     column, row = np.floor(start + along * (end - start)).astype(int).reshape(-1, 2).T
@@ -108,15 +78,15 @@ def draw_segments(page: np.ndarray, panel: Panel, box: Rect, segments_mm: np.nda
     page[row[inside], column[inside], :3] = colour
 
 
-def draw_caliper(page: np.ndarray, panel: Panel, box: Rect, points_mm: Points, figure: str, px: int) -> None:
-    """Draw a caliper: a cross at each of up to two points [mm], the line between them, and the distance beside it, ``px`` high."""
-    reach = CROSS_PX * np.array([panel.width_mm / box.width, panel.depth_mm / box.height])
-    points = np.array(points_mm, float).reshape(-1, 2)
+def draw_caliper(page: np.ndarray, view: View, box: Rect, px: int) -> None:
+    """Draw the caliper: a cross at each of its points, the line between them, and the distance beside it, ``px`` high."""
+    reach = CROSS_PX * np.array([view.width_mm / box.width, view.depth_mm / box.height])
+    points, figure = np.array(view.caliper_mm, float).reshape(-1, 2), view.caliper
     crosses = [[point - reach * axis, point + reach * axis] for point in points for axis in np.eye(2)]
     line = [points] if len(points) == 2 else []
-    draw_segments(page, panel, box, np.array([*crosses, *line]), CALIPER)
+    draw_segments(page, view, box, np.array([*crosses, *line]), CALIPER)
     if line and figure:
-        start, end = panel.to_pixels(box, points)
+        start, end = to_pixels(view, box, points)
         write(page, box, beside(start, end, written_size(figure, px), box), figure, px, CALIPER)
 
 
@@ -130,28 +100,27 @@ def beside(start: np.ndarray, end: np.ndarray, size: tuple[int, int], box: Rect)
     return float(x), float(y)
 
 
-def draw_panel(draw: ImageDraw.ImageDraw, layout: WindowLayout, panel: Panel) -> None:
+def draw_panel(draw: ImageDraw.ImageDraw, layout: WindowLayout, view: View) -> None:
     """Draw the panel without its images."""
-    area, boxes, px = layout.panel, panel.boxes(layout), layout.px
+    area, boxes, px = layout.panel, image_boxes(layout, view), layout.px
     draw.rectangle([area.left, area.top, area.right, area.bottom], fill=PANEL)
     draw.line([(area.left, 0), (area.left, area.bottom)], fill=LINE)
     left, width = area.left + px(16), area.width - 2 * px(16)
-    probe, b_mode, ct = panel.captions
-    depth = f"Depth {(panel.depth_mm - panel.above_mm) / 10:.1f} cm"
+    probe, b_mode, ct = view.captions
+    depth = f"Depth {(view.depth_mm - view.above_mm) / 10:.1f} cm"
     _draw_row(draw, left, width, px(22), (probe, px(17), TEXT), (depth, px(15), TEXT))
     _draw_row(draw, left, width, area.bottom - px(17), (b_mode, px(14), QUIET), (ct, px(14), QUIET))
-    status = shortened(panel.status, px(17), width)
+    status = shortened(view.status, px(17), width)
     draw.text((left + width // 2, px(43)), status, font=font(px(17)), fill=ALERT, anchor="mm")
-    if panel.legend:
+    if view.outline_mm is not None:
         _draw_legend(draw, layout, boxes[0].left, boxes[-1].bottom)
-    _draw_ruler(draw, layout, panel, boxes[0])
+    _draw_ruler(draw, layout, view, boxes[0])
     _draw_wedge(draw, layout, boxes[-1])
-    for name, box in zip(panel.names, boxes, strict=True):
-        x, y = marker_centre(layout, box, panel.marked_side)
-        radius = px(6)
+    for name, box in zip(view.images, boxes, strict=True):
+        # The marker dot: local +x is to the right.
+        x, y, radius = box.right - px(10), box.top - px(12), px(6)
         draw.ellipse([x - radius, y - radius, x + radius, y + radius], fill=MARK)
-        edge, anchor = (box.left, "lm") if panel.marked_side == "right" else (box.right, "rm")
-        draw.text((edge, y), name, font=font(px(15)), fill=TEXT, anchor=anchor)
+        draw.text((box.left, y), name, font=font(px(15)), fill=TEXT, anchor="lm")
 
 
 def _draw_row(draw: ImageDraw.ImageDraw, x: int, width: int, y: int, left: Written, right: Written) -> None:
@@ -172,19 +141,19 @@ def _draw_legend(draw: ImageDraw.ImageDraw, layout: WindowLayout, x: int, bottom
         x += int(font(px(14)).getlength(text)) + px(16)
 
 
-def _draw_ruler(draw: ImageDraw.ImageDraw, layout: WindowLayout, panel: Panel, box: Rect) -> None:
+def _draw_ruler(draw: ImageDraw.ImageDraw, layout: WindowLayout, view: View, box: Rect) -> None:
     px, x = layout.px, box.left - layout.px(6)
     # Where centimetres are too small, number only every few of them.
-    every = int(np.ceil(px(NUMBER_PX) / (10.0 * box.height / panel.depth_mm)))
-    for row, centimetres in ruler_ticks(panel, box):
+    every = int(np.ceil(px(NUMBER_PX) / (10.0 * box.height / view.depth_mm)))
+    for row, centimetres in ruler_ticks(view, box):
         length = px(5 if centimetres is None else 10)
         draw.line([(x - length, row), (x, row)], fill=QUIET if centimetres is None else TEXT)
         if centimetres and centimetres % every == 0:
             draw.text((x - px(15), row), str(centimetres), font=font(px(14)), fill=TEXT, anchor="rm")
         elif centimetres == 0:
             draw.text((x - px(15), row), "cm", font=font(px(13)), fill=QUIET, anchor="rm")
-    if panel.focus_mm is not None:
-        row = panel.to_pixels(box, np.array([0.0, panel.focus_mm]))[1]
+    if view.focus_mm is not None:
+        row = to_pixels(view, box, np.array([0.0, view.focus_mm]))[1]
         draw.polygon([(x + px(4), row), (x - px(4), row - px(5)), (x - px(4), row + px(5))], fill=ALERT)
 
 

@@ -1,12 +1,10 @@
-"""The interface of a front end: geometry, views, settings, controls.
+"""What the window is given and gives back: geometry, views, settings, controls.
 
 Lengths are in mm, angles in degrees, patient coordinates LPS. Nothing here needs a screen, Vulkan or Taichi.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -16,72 +14,6 @@ from ultrasound.target import Target
 B_MODE, TGC = "B-mode", "TGC"
 # Groups of settings beside the image, as on a scanner.
 SCANNER_GROUPS = (B_MODE, TGC)
-
-
-class KeyMapEntry(NamedTuple):
-    """A line of the key map: ``keys`` as printed, names of ``actions``, ``text`` for the user."""
-
-    keys: tuple[str, ...]
-    actions: tuple[str, ...]
-    text: str
-
-
-KEY_MAP = {
-    "Transducer": (
-        KeyMapEntry(("Mouse",), ("point",), "move it over the organ"),
-        KeyMapEntry(("Left button",), ("press",), "press it in, deeper the longer it is held"),
-        KeyMapEntry(("W", "S"), ("push", "lift"), "push it in, lift it"),
-        KeyMapEntry(("A", "D"), ("rotate_left", "rotate_right"), "rotate it about its axis"),
-        KeyMapEntry(("Q", "E"), ("rock_left", "rock_right"), "rock it in the image plane, heel to toe"),
-        KeyMapEntry(("Z", "C"), ("tilt_back", "tilt_forward"), "tilt it out of the image plane (fan)"),
-    ),
-    "View": (
-        KeyMapEntry(("Right drag",), ("orbit",), "turn the view"),
-        KeyMapEntry(("Middle drag",), ("pan",), "pan the view (also Shift + right drag)"),
-        KeyMapEntry(("Up", "Down"), ("zoom_in", "zoom_out"), "zoom in and out"),
-        KeyMapEntry(("T",), ("translucent",), "organ translucent or solid"),
-        KeyMapEntry(("X",), ("cut",), "organ cut along the image plane"),
-        KeyMapEntry(("N",), ("show_seen",), "coverage: imaged tissue in green"),
-    ),
-    "Image": (
-        KeyMapEntry(("B",), ("mode",), "B-mode and CT, B-mode alone, CT alone"),
-        KeyMapEntry(("V",), ("detail_level",), "detail level of the B-mode image"),
-        KeyMapEntry(("G",), ("show_scanner",), "the scanner's sliders, with TGC"),
-        KeyMapEntry(("O",), ("outline",), "outline of the tumour, now and in the CT"),
-        KeyMapEntry(
-            ("Click on image",), ("measure",), "caliper from click to click, in mm; a third removes it"
-        ),
-        KeyMapEntry(("F",), ("freeze",), "freeze and unfreeze"),
-        KeyMapEntry(
-            ("Left", "Right"), ("cine_back", "cine_forth"), "while frozen: cine of the last ten seconds"
-        ),
-        KeyMapEntry(("I",), ("export",), "save the image (PNG, DICOM) and the organ (PLY)"),
-    ),
-    "Plan": (
-        KeyMapEntry(("Space",), ("plan_for",), "target: tumour and margin, tumour, kidney"),
-        KeyMapEntry(("Return",), ("plan",), "plan a sweep of the target"),
-        KeyMapEntry(("Backspace",), ("next_plan",), "stop planning; or show the next sweep, then none"),
-    ),
-    "Session": (
-        KeyMapEntry(("U", "Y"), ("undo", "redo"), "undo the last press, turn or path; redo it"),
-        KeyMapEntry(("M", "J"), ("bookmark", "to_bookmark"), "set a bookmark; return to bookmarks"),
-        KeyMapEntry(("L",), ("sweep",), "start and stop recording a tracked sweep"),
-        KeyMapEntry(("K",), ("take_over",), "take control from a replay or a tracked probe"),
-        KeyMapEntry(("R",), ("reset",), "reset tissue, transducer and view"),
-        KeyMapEntry(("P",), ("screenshot",), "save a screenshot of the window"),
-        KeyMapEntry(("H",), ("help",), "show or hide this list"),
-        KeyMapEntry(("Esc",), ("quit",), "quit"),
-    ),
-}
-KEY_MAP_ENTRIES = tuple(line for group in KEY_MAP.values() for line in group)
-
-
-def key_table() -> str:
-    """Return the key map as a Markdown table, for docs/keys.md."""
-    rows = ["| Key | What it does |", "| --- | --- |"]
-    for group, lines in KEY_MAP.items():
-        rows += [f"| **{group}** | |", *(f"| {' / '.join(line.keys)} | {line.text} |" for line in lines)]
-    return "\n".join(rows)
 
 
 def _slider(default, label: str, unit: str, low, high, group: str):
@@ -100,19 +32,17 @@ def _level(number: int):
 # The metadata of a setting (label, unit, low, high, group) is all that its slider is made of. One that is None or has no metadata has
 # no slider.
 @dataclass
-class TissueSettings:
-    """Settings of tissue and solver; each tissue model has one of the first two."""
+class Settings:
+    """What the user sets: tissue and solver, scanner, view, plan. A session records them by their names.
+
+    Each tissue model has either ``young_kpa`` or ``stiffness``.
+    """
 
     young_kpa: float | None = _slider(None, "Young", "kPa", 1.0, 100.0, "Tissue")
     stiffness: float | None = _slider(None, "Stiffness", "", 0.1, 1.0, "Tissue")
     iterations: int = _slider(9, "Iter.", "", 1, 40, "Tissue")
     substeps: int = _slider(3, "Substeps", "", 1, 10, "Tissue")
     gravity_m_s2: float = _slider(9.81, "g", "m/s2", 0.0, 20.0, "Tissue")
-
-
-@dataclass
-class ScannerSettings:
-    """Settings of the ultrasound scanner, and of the CT beside it."""
 
     depth_mm: int = _slider(60, "Depth", "mm", 5, 300, "Image")
     window_hu: int = _slider(350, "W", "HU", 1, 2000, "Image")
@@ -132,11 +62,6 @@ class ScannerSettings:
     mode: Mode = "both"
     detail_level: DetailLevel = "speckle"
 
-
-@dataclass
-class ViewSettings:
-    """What the window shows."""
-
     translucent: bool = _switch(True, "Translucent")
     cut: bool = _switch(False, "Cut open")
     show_tumour: bool = _switch(True, "Tumour")
@@ -146,28 +71,19 @@ class ViewSettings:
     show_scanner: bool = False
     show_seen: bool = False
 
-
-@dataclass
-class PlanSettings:
-    """What the next plan is made for."""
-
     margin_mm: int = _slider(5, "Margin", "mm", 0, 20, "Image")
     plan_for: Target = "margin"
 
 
-@dataclass
-class Settings(PlanSettings, ViewSettings, ScannerSettings, TissueSettings):
-    """What the user sets; each part of the program is handed its own part. A session records them by their names."""
+# Vertices [mm], a Taichi field (n,) where they move and an array (n, 3) where they do not, and triangles, normals outward, int32 (m, 3).
+Surface = tuple[Any, np.ndarray]
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """The fixed geometry of a scene. Moving vertices are Taichi fields, which the application updates."""
+    """The geometry of a scene. The application updates the vertices that move."""
 
-    organ_vertices: Any
-    """Surface of the organ [mm], ti.Vector.field(3, ti.f32), shape (n,)."""
-    organ_faces: np.ndarray
-    """Triangles, normals outward, int32, shape (m, 3)."""
+    organ: Surface
     bounds: np.ndarray
     """Box that the camera frames, minimum and maximum corner [mm], shape (2, 3)."""
     up: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
@@ -178,14 +94,11 @@ class Geometry:
     """Radius of a curved array face, in the x-z plane; 0 where it is flat."""
     frequency_range_mhz: tuple[float, float] = (2.0, 15.0)
     """Range of the probe's frequency."""
-    tumour_vertices: Any = None
-    """As organ_vertices, or None."""
-    tumour_faces: np.ndarray | None = None
-    parts: dict[str, tuple[Any, np.ndarray]] = field(default_factory=dict)
-    """Other structures in the organ: tissue -> vertices and triangles, as the organ's."""
-    support_vertices: np.ndarray | None = None
-    """Fixed [mm], shape (k, 3), or None."""
-    support_faces: np.ndarray | None = None
+    tumour: Surface | None = None
+    parts: dict[str, Surface] = field(default_factory=dict)
+    """Other structures in the organ, by tissue."""
+    support: Surface | None = None
+    """It does not move."""
 
 
 @dataclass(frozen=True)
@@ -206,7 +119,7 @@ class View:
 
     transducer_pose: np.ndarray
     """World from transducer [mm], shape (4, 4)."""
-    pictures: dict[str, np.ndarray]
+    images: dict[str, np.ndarray]
     """Name -> grey values, uint8, shape (rows = depth, columns = lateral, local x to the right). The 3D view shows the first."""
     width_mm: float
     depth_mm: float
@@ -244,8 +157,6 @@ class View:
     """Its rate, where slower than real time: "0.2 x real"."""
     title: str = ""
     """Scene or case; no identifiers of the patient."""
-    marked_side: str = "right"
-    """Side of the marker dot in the image: "right" is local +x, "left" for a probe marked at -x."""
 
 
 @dataclass
@@ -293,22 +204,3 @@ class Controls:
     quit: bool = False
     message: str = ""
     """Message of an input device, such as that it was unplugged."""
-
-
-class Viewer(Protocol):
-    """A front end. The loop is: while running: read_controls, step, draw."""
-
-    settings: Settings
-
-    @property
-    def running(self) -> bool: ...
-
-    def read_controls(self) -> Controls: ...
-
-    def draw(self, view: View) -> None: ...
-
-    def picture(self) -> np.ndarray:
-        """The last view drawn, uint8, shape (height, width, 3), top row first."""
-        ...
-
-    def close(self) -> None: ...

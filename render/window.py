@@ -16,18 +16,18 @@ import numpy as np
 import taichi as ti
 from taichi.ui.utils import get_field_info
 
-from render.actions import begin, hold
 from render.background_image import BackgroundImage
 from render.camera import FIELD_OF_VIEW_DEG, OrbitCamera
 from render.display import display_available
 from render.gamepad import Gamepad
-from render.keys import Keys
+from render.keys import Keys, begin, hold
 from render.scene_view import SceneView
 from render.sliders import boxes_of, draw_sliders
 from render.viewer import Controls, Geometry, Settings, View
 from render.window_layout import FULL_SIZE, Rect, WindowLayout
 
 ZOOM_S = 0.5
+ZOOM_SENSE = {"zoom_in": -1.0, "zoom_out": 1.0}
 FRAMES_A_SECOND = 60
 
 
@@ -35,20 +35,16 @@ class NoVulkan(RuntimeError):
     """Taichi found no Vulkan driver to draw with."""
 
 
-def _put_image(canvas, pixels: np.ndarray) -> None:
-    """Show RGBA pixels, uint8 (width, height, 4), behind everything, without the 10 ms that Canvas.set_image needs to pack them."""
-    canvas.canvas.set_image(get_field_info(pixels.view(np.uint32)[..., 0]))
-
-
 class Window:
-    """A `Viewer` on GGUI. `ti.init` comes before it, and one window is open at a time.
+    """A window on GGUI. The loop is: while running: read_controls, step, draw.
+
+    `ti.init` comes before it, and one window is open at a time.
 
     Args:
         geometry: fixed geometry of the scene.
         settings: values of the sliders.
         size: width, height in pixels.
         visible: a real window, at most FRAMES_A_SECOND; else off-screen, drawn only by `picture`.
-        name: in the title bar.
         keys: assignment of keys.
         gamepad: read beside mouse and keys, if given.
 
@@ -63,7 +59,6 @@ class Window:
         settings: Settings | None = None,
         size: tuple[int, int] = FULL_SIZE,
         visible=True,
-        name="Nephron",
         keys: Keys | None = None,
         gamepad: Gamepad | None = None,
     ):
@@ -77,7 +72,9 @@ class Window:
         self._visible = visible
         self._ini_was_there = Path("imgui.ini").exists()
         try:
-            self._window = ti.ui.Window(name, tuple(size), show_window=visible, fps_limit=FRAMES_A_SECOND)
+            self._window = ti.ui.Window(
+                "Nephron", tuple(size), show_window=visible, fps_limit=FRAMES_A_SECOND
+            )
         except RuntimeError as error:
             raise NoVulkan("no Vulkan driver found: the window and its pictures need one") from error
         atexit.register(self.close)
@@ -93,7 +90,7 @@ class Window:
         self._pressing = False
         self._before_drag: tuple[np.ndarray, tuple] | None = None
         self._boxes_placed = 0
-        self._slider_places: tuple[tuple[str, Rect], ...] = ()
+        self._slider_boxes: dict[str, Rect] = {}
         self._last_read = time.perf_counter()
         self._ui_camera = ti.ui.Camera()
         part = self.layout.window_coordinates(self.layout.clear)
@@ -115,10 +112,12 @@ class Window:
             return controls
         self._read_cursor()
         self._read_events(controls)
-        held = [action for action, key in self.keys.held() if self._window.is_pressed(key)]
-        for action in held:
+        for action in (action for action, key in self.keys.held() if self._window.is_pressed(key)):
             hold(action, controls, elapsed)
-        self._move_camera(held, elapsed)
+            if action in ZOOM_SENSE:
+                self.camera.zoom(np.exp(ZOOM_SENSE[action] * elapsed / ZOOM_S))
+        if self._drag is not None:
+            {"orbit": self.camera.orbit, "pan": self.camera.pan}[self._drag](*self._moved)
         controls.press = self._pressing
         if self._drag is None and self._over_scene():
             controls.ray = self.camera.ray(self._cursor)
@@ -140,7 +139,7 @@ class Window:
         if self._cursor is None:
             return False
         place = self._pixel(self._cursor)
-        over = self._boxes_over_scene() + [box for _, box in self._slider_places]
+        over = [*self._boxes_over_scene(), *self._slider_boxes.values()]
         return self.layout.scene.contains(*place) and not any(box.contains(*place) for box in over)
 
     def _boxes_over_scene(self) -> list[Rect]:
@@ -189,15 +188,6 @@ class Window:
         moved = np.abs(self._cursor - cursor).max() > 0.002
         if moved and settings == dataclasses.astuple(self.settings):
             self._boxes_placed += 1
-
-    def _move_camera(self, held: list[str], elapsed: float) -> None:
-        if self._drag == "orbit":
-            self.camera.orbit(*self._moved)
-        elif self._drag == "pan":
-            self.camera.pan(*self._moved)
-        for action, sense in (("zoom_in", -1.0), ("zoom_out", 1.0)):
-            if action in held:
-                self.camera.zoom(np.exp(sense * elapsed / ZOOM_S))
 
     # Drawing
 
@@ -252,14 +242,19 @@ class Window:
             self._background.show_help()
         else:
             self._background.compose(view, np.stack(self.camera.axes()), self._visible)
-        _put_image(self._canvas, self._background.pixels)
+        # Without the 10 ms that Canvas.set_image needs to pack the pixels.
+        self._canvas.canvas.set_image(get_field_info(self._background.pixels.view(np.uint32)[..., 0]))
         self._set_camera()
         rects = [self.layout.panel, self.layout.title, self.layout.strip, *self._boxes_over_scene()]
         masked = [self.layout.window_coordinates(rect) for rect in rects]
         self._scene_view.draw(self._scene, view, self.settings, masked)
         self._canvas.scene(self._scene)
         if not self._help_shown:
-            self._draw_sliders()
+            boxes = boxes_of(self.settings, self._geometry, self.layout)
+            if boxes != self._slider_boxes:
+                self._slider_boxes, self._boxes_placed = boxes, self._boxes_placed + 1
+            placed = boxes, self._first_size, self._boxes_placed
+            draw_sliders(self._gui, self.settings, self._geometry, *placed)
 
     def _set_camera(self) -> None:
         _, up, ahead = self.camera.axes()
@@ -272,11 +267,3 @@ class Window:
         self._ui_camera.z_near(near)
         self._ui_camera.z_far(far)
         self._scene.set_camera(self._ui_camera)
-
-    def _draw_sliders(self) -> None:
-        places = tuple(boxes_of(self.settings, self._geometry, self.layout).items())
-        if places != self._slider_places:
-            self._slider_places, self._boxes_placed = places, self._boxes_placed + 1
-        draw_sliders(
-            self._gui, self.settings, self._geometry, dict(places), self._first_size, self._boxes_placed
-        )

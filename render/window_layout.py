@@ -11,7 +11,7 @@ PANEL_SHARE = 0.43
 TITLE_HEIGHT, CLOCK_WIDTH = 42, 150
 STRIP_HEIGHT, STRIP_GAP, READOUT_WIDTH = 184, 4, 134
 HEADER_HEIGHT, FOOTER_HEIGHT = 74, 52
-RULER_WIDTH, WEDGE_WIDTH, PICTURE_GAP, NAME_HEIGHT = 42, 30, 10, 26
+RULER_WIDTH, WEDGE_WIDTH, IMAGE_GAP, NAME_HEIGHT = 42, 30, 10, 26
 SCANNER_WIDTH, SCANNER_GAP = 196, 6
 FINDINGS_GAP, FINDINGS_WIDTH, FIGURE_HEIGHT, FIGURES_PAD = 10, 178, 20, 7
 COMPASS_SIZE = 92
@@ -45,7 +45,7 @@ class Rect(NamedTuple):
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Rows and columns, to index a picture."""
+        """Rows and columns, to index an image."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
 
@@ -148,14 +148,14 @@ class WindowLayout:
         """The whole window."""
         return Rect(0, 0, self.width, self.height)
 
-    def picture_boxes(self, count: int, width_mm: float, depth_mm: float) -> list[Rect]:
+    def image_boxes(self, count: int, width_mm: float, depth_mm: float) -> list[Rect]:
         """Return the largest boxes in the panel with the shape of the image plane, side by side or one under the other.
 
         Raises ValueError unless both lengths are positive.
         """
         if not (width_mm > 0 and depth_mm > 0):
             raise ValueError(f"image plane of {width_mm} x {depth_mm} mm: both lengths must be positive")
-        ruler, gap, between = self.px(RULER_WIDTH), self.px(PICTURE_GAP), self.px(NAME_HEIGHT)
+        ruler, gap, between = self.px(RULER_WIDTH), self.px(IMAGE_GAP), self.px(NAME_HEIGHT)
         header = self.px(HEADER_HEIGHT)
         room_x = self.panel.width - ruler - self.px(WEDGE_WIDTH)
         room_y = self.panel.height - header - self.px(FOOTER_HEIGHT)

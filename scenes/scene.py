@@ -48,7 +48,7 @@ class AnatomyFiles(Section):
     """The embedded patient, or files in the scene's folder; without a CT there is no image.
 
     ``parts`` are further surfaces in the organ, by tissue. ``tissues`` maps each value of ``labels`` to a tissue of
-    ``ultrasound/tissues.toml``.
+    ``ultrasound/acoustic_tissues.toml``.
     """
 
     phantom: bool = False

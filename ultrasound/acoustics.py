@@ -1,6 +1,6 @@
 """Acoustic properties of a CT's voxels from labels and HU: impedance, attenuation and backscatter. NumPy.
 
-A labelled voxel has its tissue's values (``tissues.toml``), as contrast agent raises HU by iodine, not by density. Fat and stones
+A labelled voxel has its tissue's values (``acoustic_tissues.toml``), as contrast agent raises HU by iodine, not by density. Fat and stones
 within a kidney are classified by HU: no agent lowers parenchyma to fat or raises it to stone. Enhanced urine is as bright as stone,
 so that it needs a label.
 """
@@ -15,9 +15,8 @@ import numpy as np
 from scipy import ndimage
 
 from errors import UserError
-from ultrasound.tissue_classification import classify_tissues
 
-TISSUES = Path(__file__).parent / "tissues.toml"
+TISSUES = Path(__file__).parent / "acoustic_tissues.toml"
 # Amplitude of renal cortex relative to a perfect reflector: its speckle is some 16 dB below the echo of fat on kidney.
 CORTEX_DB = -38.0
 # Smooths the voxel steps of labels.
@@ -26,6 +25,20 @@ SEED = 20160101
 MIN_HU, MAX_HU = -1024, 3071
 
 IMPEDANCE, ATTENUATION, BACKSCATTER = range(3)
+
+# Classification by HU: fat and stones of a kidney, tumour necrosis, bone, enhanced vessels.
+FAT_BELOW_HU = -30.0
+STONE_ABOVE_MEDIAN_HU = 130.0
+NECROSIS_BELOW_MEDIAN_HU = 40.0
+# Fat in a concavity of the kidney no wider than twice this is renal sinus.
+CONCAVITY_MM = 10.0
+# A kidney above this is enhanced by contrast agent; soft tissue above the second value is then blood.
+ENHANCED_FROM_HU, BLOOD_ABOVE_HU = 100.0, 140.0
+# Cortical bone; what only bone reaches; the least volume of that which is no stone or calcified vessel.
+SHELL_ABOVE_HU, BONE_ABOVE_HU, MIN_BONE_ML = 250.0, 350.0, 0.4
+# Bones are searched in blocks of voxels of this size, and continued beyond the CT's border as far as this.
+COARSE_MM, BEYOND_MM = 1.8, 45.0
+KIDNEY = ("kidney", "cortex", "medulla", "sinus", "urine")
 
 
 class TissueError(UserError):
@@ -71,17 +84,32 @@ def properties(
     """
     check_tissues(tissue_of_label or {})
     spacing = np.ones(3) if spacing_mm is None else np.asarray(spacing_mm, float)
-    values = _by_hounsfield(hu)
-    texture = _Texture(hu.shape, spacing)
+    values, noise = _by_hounsfield(hu), {}
     level = values[..., BACKSCATTER]
-    level += texture.of(tissue_table()["hounsfield"], ...)
-    labelled = _labelled(hu, labels, tissue_of_label or {}, spacing)
+
+    def texture(table: dict, where: Any) -> np.ndarray:
+        """Return the texture of the backscatter level at some voxels [dB]."""
+        distance = float(table["texture_mm"])
+        if distance not in noise:
+            noise[distance] = _noise(hu.shape, distance / 2 / spacing)
+        return np.float32(table["texture_db"]) * noise[distance][where]
+
+    level += texture(tissue_table()["hounsfield"], ...)
+    # Masks by tissue, from labels and from HU and shape, in rising priority.
+    labelled: dict[str, np.ndarray] = {}
+    tissues = tissue_of_label or {}
+    if labels is not None:
+        for tissue in dict.fromkeys(tissues.values()):
+            labelled[tissue] = np.isin(labels, [v for v, name in tissues.items() if name == tissue])
+    for tissue, here in classify_tissues(hu, labelled, spacing).items():
+        labelled[tissue] = labelled[tissue] | here if tissue in labelled else here
+    labelled = {tissue: where for tissue, where in labelled.items() if where.any()}
     stone = labelled.pop("stone", None)
     for tissue, where in labelled.items():
         table = tissue_table()[tissue]
         values[where, IMPEDANCE] = table["impedance_mrayl"]
         values[where, ATTENUATION] = table["attenuation_db_cm_mhz"]
-        level[where] = table["backscatter_db"] + texture.of(table, where)
+        level[where] = table["backscatter_db"] + texture(table, where)
     values[..., BACKSCATTER] = np.float32(10) ** ((level + np.float32(CORTEX_DB)) / np.float32(20))
     for channel in range(3):
         values[..., channel] = ndimage.gaussian_filter(values[..., channel], SMOOTHING_VOXELS, truncate=2.5)
@@ -113,31 +141,90 @@ def _by_hounsfield(hu: np.ndarray) -> np.ndarray:
     return values[np.clip(np.rint(smooth), MIN_HU, MAX_HU).astype(np.int16) - MIN_HU]
 
 
-def _labelled(
-    hu: np.ndarray, labels: np.ndarray | None, tissue_of_label: Mapping[int, str], spacing_mm: np.ndarray
+def _noise(shape: tuple[int, ...], sd_voxels: np.ndarray) -> np.ndarray:
+    """Return noise of unit SD, smoothed by an SD along each axis, the same for the same voxels on every machine."""
+    noise = np.random.default_rng(SEED).standard_normal(shape, dtype=np.float32)
+    noise = ndimage.gaussian_filter(noise, sd_voxels, truncate=2, mode="wrap")
+    return noise / max(float(noise.std()), 1e-6)
+
+
+def classify_tissues(
+    hu: np.ndarray, labelled: dict[str, np.ndarray], spacing_mm: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return masks by tissue, from labels and from HU and shape, in rising priority."""
-    found: dict[str, np.ndarray] = {}
-    if labels is not None:
-        for tissue in dict.fromkeys(tissue_of_label.values()):
-            found[tissue] = np.isin(labels, [v for v, name in tissue_of_label.items() if name == tissue])
-    for tissue, here in classify_tissues(hu, found, spacing_mm).items():
-        found[tissue] = found[tissue] | here if tissue in found else here
-    return {tissue: where for tissue, where in found.items() if where.any()}
+    """Return masks (nx, ny, nz) of tissues found besides the labelled ones, in rising priority."""
+    any_label = np.logical_or.reduce([np.zeros(hu.shape, bool), *labelled.values()])
+    bone = bones(hu, spacing_mm) & ~any_label
+    found = {"bone": bone}
+    kidney = np.logical_or.reduce([np.zeros(hu.shape, bool), *(labelled[t] for t in KIDNEY if t in labelled)])
+    if kidney.any():
+        median = float(np.median(hu[kidney]))
+        if median > ENHANCED_FROM_HU:
+            smooth = ndimage.gaussian_filter(np.asarray(hu, np.float32), 1.0, truncate=2)
+            # Away from other tissues, whose partial-volume voxels are as bright.
+            others = ndimage.binary_dilation(any_label | bone, iterations=3)
+            found["vessel"] = (smooth > BLOOD_ABOVE_HU) & ~others
+        if "sinus" not in labelled:
+            found["sinus"] = enclosed(kidney, spacing_mm) & (hu < FAT_BELOW_HU)
+        fat = kidney & (hu < FAT_BELOW_HU)
+        found["sinus"] = found["sinus"] | fat if "sinus" in found else fat
+        found["stone"] = kidney & (hu > median + STONE_ABOVE_MEDIAN_HU)
+        if median > ENHANCED_FROM_HU and "urine" in labelled:
+            # Partial-volume voxels around enhanced urine are as bright.
+            found["stone"] &= ~ndimage.binary_dilation(labelled["urine"])
+    tumour = labelled.get("tumour")
+    if tumour is not None and tumour.any():
+        found["necrosis"] = tumour & (hu < np.median(hu[tumour]) - NECROSIS_BELOW_MEDIAN_HU)
+    return found
 
 
-class _Texture:
-    """Texture of the backscatter level [dB], the same for the same voxels on every machine."""
+def enclosed(kidney: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
+    """Return the closing of a kidney by a ball of CONCAVITY_MM, without the kidney."""
+    rim = np.ceil(CONCAVITY_MM / spacing_mm).astype(int) + 1
+    box = ndimage.find_objects(kidney.astype(np.uint8))[0]
+    part = np.pad(kidney[box], [(int(r), int(r)) for r in rim])
+    grown = ndimage.distance_transform_edt(~part, sampling=spacing_mm) <= CONCAVITY_MM
+    closed = ndimage.distance_transform_edt(grown, sampling=spacing_mm) > CONCAVITY_MM
+    inside = np.zeros_like(kidney)
+    inner = tuple(slice(int(r), n - int(r)) for r, n in zip(rim, part.shape, strict=True))
+    inside[box] = (closed & ~part)[inner]
+    return inside
 
-    def __init__(self, shape: tuple[int, ...], spacing_mm: np.ndarray) -> None:
-        self.shape, self.spacing_mm = shape, spacing_mm
-        self.fields: dict[float, np.ndarray] = {}
 
-    def of(self, table: dict, where: Any) -> np.ndarray:
-        """Return noise of SD ``texture_db`` correlated over ``texture_mm``, at some voxels; one field per distance."""
-        distance = float(table["texture_mm"])
-        if distance not in self.fields:
-            noise = np.random.default_rng(SEED).standard_normal(self.shape, dtype=np.float32)
-            noise = ndimage.gaussian_filter(noise, distance / 2 / self.spacing_mm, truncate=2, mode="wrap")
-            self.fields[distance] = noise / max(float(noise.std()), 1e-6)
-        return np.float32(table["texture_db"]) * self.fields[distance][where]
+def bones(hu: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
+    """Return cortical bone and marrow. Marrow may be no denser than enhanced soft tissue, but is enclosed by cortical bone."""
+    step = np.maximum(1, np.rint(COARSE_MM / spacing_mm)).astype(int)
+    if not (hu > BONE_ABOVE_HU).any():
+        return np.zeros(hu.shape, bool)
+    # The maximum of each block, as cortical bone may be thinner than a block.
+    coarse = ndimage.maximum_filter(hu, size=tuple(step))[:: step[0], :: step[1], :: step[2]]
+    shell = _large_parts(coarse, float(np.prod(spacing_mm * step)))
+    # A bone cut by the CT's border is continued beyond it as its mirror image.
+    beyond = [min(n, int(BEYOND_MM / (s * k))) for n, s, k in zip(shell.shape, spacing_mm, step, strict=True)]
+    whole = np.pad(shell, [(n, n) for n in beyond], mode="symmetric")
+    whole = ndimage.binary_closing(whole, iterations=2)
+    filled = np.logical_or.reduce([_filled(whole, axis) for axis in range(3)])
+    inner = filled[tuple(slice(n, n + size) for n, size in zip(beyond, shell.shape, strict=True))]
+    fine = inner.repeat(step[0], 0).repeat(step[1], 1).repeat(step[2], 2)
+    return fine[: hu.shape[0], : hu.shape[1], : hu.shape[2]]
+
+
+def _filled(solid: np.ndarray, axis: int) -> np.ndarray:
+    """Fill the holes of each section across an axis."""
+    beside = ndimage.generate_binary_structure(3, 1)
+    beside[tuple(slice(None) if k != axis else [0, 2] for k in range(3))] = False
+    parts, count = ndimage.label(~solid, beside)
+    is_open = np.zeros(count + 1, bool)
+    for other in {0, 1, 2} - {axis}:
+        for edge in (0, -1):
+            is_open[parts.take(edge, other)] = True
+    is_open[0] = False
+    return ~is_open[parts]
+
+
+def _large_parts(hu: np.ndarray, voxel_mm3: float) -> np.ndarray:
+    """Return the connected parts above SHELL_ABOVE_HU that contain MIN_BONE_ML above BONE_ABOVE_HU."""
+    parts, count = ndimage.label(hu > SHELL_ABOVE_HU)
+    hard = np.bincount(parts[hu > BONE_ABOVE_HU], minlength=count + 1) * voxel_mm3 / 1000
+    is_bone = hard >= MIN_BONE_ML
+    is_bone[0] = False
+    return is_bone[parts]

@@ -54,7 +54,9 @@ def measure_contact(
     if not covered.any():
         return ArrayContact()
     z = np.einsum("tkc,tc->tk", weights, corners[under, :, 2])
-    upward = _upward(corners[under])[:, None]
+    a, b, c = (corners[under, i, :2] for i in range(3))
+    # Faces the transducer.
+    upward = (_cross(b - a, c - a) > 0)[:, None]
     enters = np.where(covered & upward & (z <= points[:, 2] + CONTACT_MM), z, -np.inf)
     first, top = enters.argmax(axis=0), enters.max(axis=0)
     contact = points[:, 2] - top <= CONTACT_MM
@@ -82,11 +84,6 @@ def _weights(corners: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.nd
     third = _cross((b - a)[:, None], to) / safe[:, None]
     weights = np.stack([1 - second - third, second, third], axis=-1)
     return weights, (weights >= -TOLERANCE).all(axis=-1) & (np.abs(twice) >= 1e-12)[:, None]
-
-
-def _upward(corners: np.ndarray) -> np.ndarray:
-    """Whether triangles (t, 3, 3) face the transducer."""
-    return _cross(corners[:, 1, :2] - corners[:, 0, :2], corners[:, 2, :2] - corners[:, 0, :2]) > 0
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

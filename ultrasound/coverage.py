@@ -79,7 +79,12 @@ class Coverage:
         lines, in_image = _scanlines_of(probe, count)
         contact = np.ones(probe.number_of_scanlines, bool)
         if gap_mm is not None:
-            contact = self._distance_at(rest_mm[_elements_of(probe, count)]) <= gap_mm
+            width, depth, above = probe.extent_mm
+            share = (probe.elements() + [width / 2, above]) / [width, depth]
+            # The grid point nearest to each element.
+            column, row = np.clip(np.rint(share * (count - 1)).astype(int), 0, count - 1).T
+            places = self._indices(rest_mm[row, column]).T
+            contact = map_coordinates(self.distance, places, order=1, mode="constant", cval=np.inf) <= gap_mm
         shown = np.flatnonzero(in_image & contact[lines])
         # In voxels, axis by axis.
         at = ((rest_mm.reshape(-1, 3) - self.origin_mm) / VOXEL_MM).astype(np.float32).T.copy()
@@ -88,13 +93,10 @@ class Coverage:
             near &= np.abs(along[shown] - last / 2) < (last + 1) / 2 + probe.elevation_width_mm / VOXEL_MM
         for part in _subdivisions(at, shown[near], probe, count):
             index = np.rint(part).astype(np.int32)
-            x, y, z = index[:, _within(index, self.seen.shape)]
+            within = ((index >= 0) & (index < np.array(self.seen.shape)[:, None])).all(axis=0)
+            x, y, z = index[:, within]
             self.seen[x, y, z] = True
         return contact
-
-    def _distance_at(self, points_mm: np.ndarray) -> np.ndarray:
-        at = self._indices(points_mm).T
-        return map_coordinates(self.distance, at, order=1, mode="constant", cval=np.inf)
 
     def fraction(self, target: str) -> float:
         """Return the imaged fraction of a target, 0 to 1; NaN without that target."""
@@ -136,20 +138,6 @@ def _scanlines_of(probe: Probe, count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.clip(np.rint(line).astype(int), 0, last), inside
 
 
-def _elements_of(probe: Probe, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return row and column of the grid point nearest to each element."""
-    width, depth, above = probe.extent_mm
-    share = (probe.elements() + [width / 2, above]) / [width, depth]
-    column, row = np.clip(np.rint(share * (count - 1)).astype(int), 0, count - 1).T
-    return row, column
-
-
-def _within(index: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Which indices (3, n) are within a grid."""
-    x, y, z = index
-    return (x >= 0) & (y >= 0) & (z >= 0) & (x < shape[0]) & (y < shape[1]) & (z < shape[2])
-
-
 def _subdivisions(at: np.ndarray, shown: np.ndarray, probe: Probe, count: int) -> Iterator[np.ndarray]:
     """Yield centres (3, n) of the parts, no larger than a voxel, into which the box of tissue around each grid point is divided.
 
@@ -166,13 +154,10 @@ def _subdivisions(at: np.ndarray, shown: np.ndarray, probe: Probe, count: int) -
     spacing = np.array([width, depth]) / (count - 1) / MIN_STRETCH
     sizes = [*spacing, probe.elevation_width_mm]
     middle = at[:, shown]
-    for shares in product(*(_offsets(int(np.ceil(size / VOXEL_MM))) for size in sizes)):
+    counts = (int(np.ceil(size / VOXEL_MM)) for size in sizes)
+    # The centres of equal parts of a unit length about 0.
+    for shares in product(*([(k + 0.5) / n - 0.5 for k in range(n)] for n in counts)):
         point = middle
         for share, along in zip(shares, (across, down, normal), strict=True):
             point = point + share * along if share else point
         yield point
-
-
-def _offsets(count: int) -> list[float]:
-    """Return the centres of the equal parts of a unit length about 0."""
-    return [(k + 0.5) / count - 0.5 for k in range(count)]

@@ -38,15 +38,8 @@ def save_dicom(
     """Write grey values (rows, columns) uint8 with row and column spacing [mm].
 
     With a probe, whose ``extent_mm`` the image covers, the file also has transducer data and the centre of the array face.
-    Raises ValueError for an invalid image or spacing, and OSError where the file cannot be written.
+    Raises OSError where the file cannot be written.
     """
-    if image.dtype != np.uint8 or image.ndim != 2 or image.size == 0:
-        raise ValueError(f"a image of {image.dtype} {image.shape}: expected uint8 (rows, columns)")
-    if len(spacing_mm) != 2 or not all(0 < each < np.inf for each in spacing_mm):
-        raise ValueError(
-            f"spacing {spacing_mm}: expected the distances of rows and of columns in mm, above 0"
-        )
-
     data = Dataset()
     for keyword in EMPTY:
         setattr(data, keyword, None)

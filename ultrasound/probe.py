@@ -27,6 +27,7 @@ DetailLevel = Literal["reflection", "speckle", "elevation"]
 DETAIL_LEVELS: tuple[DetailLevel, ...] = get_args(DetailLevel)
 
 Percent = Annotated[float, Field(ge=0, le=100)]
+Length = Annotated[float, Field(gt=0)]
 
 
 class ProbeError(UserError):
@@ -48,7 +49,7 @@ class Probe(BaseModel):
 
     transducer_name: str = Field(min_length=1, max_length=60)
     transducer_geometry: Literal["LINEAR", "CURVILINEAR", "PHASED"] = "LINEAR"
-    housing_mm: tuple[float, float, float] = (40.0, 10.0, 20.0)
+    housing_mm: tuple[Length, Length, Length] = (40.0, 10.0, 20.0)
     edge_radius_mm: float = Field(0.0, ge=0, le=20)
     transducer_width_mm: float = Field(40.0, gt=0, le=300)
     radius_start_mm: float = Field(0.0, ge=0, le=300)
@@ -66,17 +67,13 @@ class Probe(BaseModel):
     pulse_cycles: float = Field(2.0, ge=1, le=20)
     gain_percent: Percent = 56.0
     dyn_range_db: float = Field(60.0, ge=20, le=120)
-    time_gain_compensation: tuple[Percent, ...] = (50.0,) * TGC_SLIDERS
+    time_gain_compensation: tuple[Percent, ...] = Field(
+        (50.0,) * TGC_SLIDERS, min_length=TGC_SLIDERS, max_length=TGC_SLIDERS
+    )
     depth_compensation_db_cm_mhz: float = Field(0.85, ge=0, le=5)
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Probe":
-        if min(self.housing_mm) <= 0:
-            raise ValueError(f"HousingMm = {list(self.housing_mm)}: expected three positive lengths in mm")
-        if len(self.time_gain_compensation) != TGC_SLIDERS:
-            raise ValueError(
-                f"TimeGainCompensation has {len(self.time_gain_compensation)} values: expected {TGC_SLIDERS}, from the face down"
-            )
         if self.edge_radius_mm > min(self.housing_mm) / 2:
             raise ValueError(
                 f"EdgeRadiusMm = {self.edge_radius_mm:g}: expected at most half of the least of HousingMm, {min(self.housing_mm) / 2:g}"
@@ -126,14 +123,29 @@ class Probe(BaseModel):
         return self.depth_mm * self.focus_depth_percent / 100
 
     @property
+    def axial_sd_mm(self) -> float:
+        """Axial width of the point-spread function: a pulse of n cycles is n wavelengths long, its echo half of that."""
+        return self.pulse_cycles * self.wavelength_mm / 2 / FWHM_OF_SD
+
+    @property
+    def elevation_sd_mm(self) -> float:
+        """Elevational width, the same at all depths."""
+        return self.elevation_width_mm / FWHM_OF_SD
+
+    def lateral_sd_mm(self, depth_mm: np.ndarray) -> np.ndarray:
+        """Return the lateral width at depths [mm]: full width at half maximum = wavelength * f-number at the focus."""
+        at_focus = self.wavelength_mm * self.f_number / FWHM_OF_SD
+        return at_focus * np.sqrt(1 + ((depth_mm - self.focus_mm) / self.focal_zone_mm) ** 2)
+
+    @property
     def extent_mm(self) -> tuple[float, float, float]:
         """Width and depth of the image's bounding box, and the part of the depth behind the centre of the face."""
-        if self.transducer_geometry == "LINEAR":
+        if self.sector is None:
             return self.transducer_width_mm, self.depth_mm, 0.0
-        reach = self.radius_mm + self.depth_mm
-        left, right = np.radians([self.theta_start_deg, self.theta_stop_deg])
+        radius, left, right = self.sector
+        reach = radius + self.depth_mm
         half = reach * max(np.sin(right), np.sin(-left))
-        above = self.radius_mm * (1 - np.cos(max(right, -left)))
+        above = radius * (1 - np.cos(max(right, -left)))
         return float(2 * half), float(self.depth_mm + above), float(above)
 
     def image_to_probe(self, rows: int, columns: int) -> np.ndarray:
@@ -148,24 +160,20 @@ class Probe(BaseModel):
 
     def scanlines(self) -> tuple[np.ndarray, np.ndarray]:
         """Return start [mm] and unit direction of each scanline, each (scanlines, 2) on the image plane."""
-        start, stop = np.radians([self.theta_start_deg, self.theta_stop_deg])
-        if self.transducer_geometry == "LINEAR":
-            start = stop = 0.0
-        angle = start + (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines * (
-            stop - start
-        )
+        if self.sector is None:
+            return self.elements(), np.tile([0.0, 1.0], (self.number_of_scanlines, 1))
+        radius, start, stop = self.sector
+        share = (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines
+        angle = start + share * (stop - start)
         direction = np.column_stack([np.sin(angle), np.cos(angle)])
-        if self.transducer_geometry == "LINEAR":
-            share = (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines - 0.5
-            return np.column_stack([share * self.transducer_width_mm, np.zeros_like(share)]), direction
-        return self.radius_mm * (direction - [0.0, 1.0]), direction
+        return radius * (direction - [0.0, 1.0]), direction
 
     def elements(self) -> np.ndarray:
         """Return the elements on the face (scanlines, 2) [mm]: the starts of the scanlines, or across a phased array."""
+        if self.transducer_geometry == "CURVILINEAR":
+            return self.scanlines()[0]
         share = (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines - 0.5
-        if self.transducer_geometry == "PHASED":
-            return np.column_stack([share * self.transducer_width_mm, np.zeros_like(share)])
-        return self.scanlines()[0]
+        return np.column_stack([share * self.transducer_width_mm, np.zeros_like(share)])
 
     def line_spacing_mm(self, depth_mm: np.ndarray) -> np.ndarray:
         """Return the distance of neighbouring scanlines at depths [mm]."""
@@ -176,13 +184,12 @@ class Probe(BaseModel):
 
     def beam_coordinates(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return scanline (fractional index) and depth along it [mm] of points on the plane [mm]."""
-        if self.transducer_geometry == "LINEAR":
+        if self.sector is None:
             line = (u / self.transducer_width_mm + 0.5) * self.number_of_scanlines - 0.5
             return line, np.array(v, float)
-        depth = np.hypot(u, v + self.radius_mm) - self.radius_mm
-        start, stop = np.radians([self.theta_start_deg, self.theta_stop_deg])
-        share = (np.arctan2(u, v + self.radius_mm) - start) / (stop - start)
-        return share * self.number_of_scanlines - 0.5, depth
+        radius, start, stop = self.sector
+        share = (np.arctan2(u, v + radius) - start) / (stop - start)
+        return share * self.number_of_scanlines - 0.5, np.hypot(u, v + radius) - radius
 
     def gain_db(self) -> np.ndarray:
         """Return gain and TGC at each sample of a scanline [dB], (samples,)."""

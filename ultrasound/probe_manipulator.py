@@ -4,13 +4,11 @@ A pose is a rigid (4, 4) matrix, world from transducer [mm]. The transducer is a
 to the marked side, y elevation, z along its axis; the image leaves its face at z = -length / 2 along -z.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import igl
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
-
-from ultrasound.image_plane import ImagePlane
 
 # Radius of the surface patch to whose mean normal the probe is aligned.
 NORMAL_PATCH_MM = 12.0
@@ -19,6 +17,20 @@ MIN_DEPTH_MM, MAX_DEPTH_MM = -40.0, 15.0
 MAX_DEPTH_LENGTHS = 1.5
 PRESS_MM_S, RELEASE_MM_S = 12.0, 40.0
 TURN_DEG_S = 180.0
+
+
+@dataclass(frozen=True)
+class ImagePlane:
+    """The imaged rectangle of the transducer's plane.
+
+    ``width_mm`` along the transducer's x, ``depth_mm`` along its -z, starting ``above_mm`` behind its face.
+    ``world_from_plane`` (4, 4): x to the marked side, y down into the tissue, z to the transducer's y [mm].
+    """
+
+    world_from_plane: np.ndarray
+    width_mm: float
+    depth_mm: float
+    above_mm: float = 0.0
 
 
 def pose_at(
@@ -119,7 +131,10 @@ def interpolated(start: np.ndarray, end: np.ndarray, share: float | np.ndarray) 
 
 @dataclass(frozen=True)
 class ManipulatorState:
-    """State of the manipulator: depths [mm], turn (3,) [degrees], and the pose aimed at (4, 4), None for home."""
+    """State of the manipulator: depths [mm], turn (3,) [degrees], and the pose aimed at (4, 4), None for home.
+
+    ``depth_mm`` is set by keys, ``pressed_mm`` is added while a button is held.
+    """
 
     depth_mm: float = 0.0
     pressed_mm: float = 0.0
@@ -132,7 +147,7 @@ class ProbeManipulator:
     """Moves the transducer over the settled organ: aim, turn and depth.
 
     ``vertices`` (n, 3), ``faces`` (m, 3) and ``normals`` (n, 3) are the settled surface [mm]; ``home`` is the initial pose.
-    ``radius_mm`` is that of a curved face, ``speed_mm_s`` the greatest speed. ``depth_mm`` is set by keys, ``pressed_mm`` is added while a button is held.
+    ``radius_mm`` is that of a curved face, ``speed_mm_s`` the greatest speed.
     """
 
     vertices: np.ndarray
@@ -143,10 +158,7 @@ class ProbeManipulator:
     lateral: np.ndarray
     radius_mm: float = 0.0
     speed_mm_s: float = np.inf
-    depth_mm: float = 0.0
-    pressed_mm: float = 0.0
-    turn_deg: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    aim: np.ndarray | None = None
+    state: ManipulatorState = ManipulatorState()
 
     def __post_init__(self) -> None:
         # The corners of the transducer may be between vertices: edges and faces are sampled too.
@@ -156,15 +168,9 @@ class ProbeManipulator:
         self.max_mm = min(MAX_DEPTH_MM, MAX_DEPTH_LENGTHS * float(self.size_mm[2]))
 
     @property
-    def state(self) -> ManipulatorState:
-        """The current state; it can be set."""
-        tilt, rock, rotate = map(float, self.turn_deg)
-        return ManipulatorState(self.depth_mm, self.pressed_mm, (tilt, rock, rotate), self.aim)
-
-    @state.setter
-    def state(self, state: ManipulatorState) -> None:
-        self.depth_mm, self.pressed_mm = state.depth_mm, state.pressed_mm
-        self.turn_deg, self.aim = np.array(state.turn_deg), state.aim
+    def aim(self) -> np.ndarray:
+        """The pose aimed at (4, 4), before it is turned and pressed in."""
+        return self.home if self.state.aim is None else self.state.aim
 
     def indentation_mm(self, pose: np.ndarray) -> float:
         """Depth of a transducer at a pose (4, 4) below the settled surface [mm]; negative above it."""
@@ -187,7 +193,8 @@ class ProbeManipulator:
     def aim_at(self, target: np.ndarray, lateral: np.ndarray | None = None) -> None:
         """Aim at a point of the surface [mm], perpendicular to the patch around it, x nearest to ``lateral``."""
         lateral = self.lateral if lateral is None else lateral
-        self.aim = pose_at(target, -self.surface_normal(target), lateral, self.size_mm[2])
+        aim = pose_at(target, -self.surface_normal(target), lateral, self.size_mm[2])
+        self.state = replace(self.state, aim=aim)
 
     def surface_normal(self, point: np.ndarray) -> np.ndarray:
         """Return the unit normal (3,) of the surface patch around a point [mm]."""
@@ -203,7 +210,7 @@ class ProbeManipulator:
 
     def slide(self, lateral_mm: float, elevation_mm: float) -> None:
         """Move the aim over the surface, along the turned transducer's x and y [mm]."""
-        aim = self.home if self.aim is None else self.aim
+        aim = self.aim
         outward = aim[:3, 2]
         along = self._turned(aim)[:3, :2]
         along = along - np.outer(outward, outward @ along)
@@ -215,23 +222,26 @@ class ProbeManipulator:
 
     def push(self, depth_mm: float) -> None:
         """Push in by a depth [mm]; lift where negative."""
-        self.depth_mm = float(np.clip(self.depth_mm + depth_mm, MIN_DEPTH_MM, self.max_mm))
+        depth = float(np.clip(self.state.depth_mm + depth_mm, MIN_DEPTH_MM, self.max_mm))
+        self.state = replace(self.state, depth_mm=depth)
 
     def press(self, pressing: bool, time_s: float, share: float = 1.0) -> None:
         """Press further while the button is held, up to a fraction of the greatest depth; release otherwise."""
         goal = share * self.max_mm if pressing else 0.0
-        least, most = self.pressed_mm - RELEASE_MM_S * time_s, self.pressed_mm + PRESS_MM_S * time_s
-        self.pressed_mm = float(np.clip(goal, least, most))
+        before = self.state.pressed_mm
+        pressed = np.clip(goal, before - RELEASE_MM_S * time_s, before + PRESS_MM_S * time_s)
+        self.state = replace(self.state, pressed_mm=float(pressed))
 
     def turn(self, tilt_deg: float, rock_deg: float, rotate_deg: float) -> None:
         """Turn about the transducer's x, y and z axes [degrees]; tilt and rock are limited."""
-        self.turn_deg = self.turn_deg + [tilt_deg, rock_deg, rotate_deg]
-        self.turn_deg[:2] = np.clip(self.turn_deg[:2], -60.0, 60.0)
+        tilt, rock, rotate = map(float, np.add(self.state.turn_deg, [tilt_deg, rock_deg, rotate_deg]))
+        turn = min(max(tilt, -60.0), 60.0), min(max(rock, -60.0), 60.0), rotate
+        self.state = replace(self.state, turn_deg=turn)
 
     def pose(self) -> np.ndarray:
         """Return the commanded pose: turned about the face's centre, moved to contact, then pressed in."""
-        pose = self._turned(self.home if self.aim is None else self.aim)
-        depth = min(self.depth_mm + self.pressed_mm, self.max_mm)
+        pose = self._turned(self.aim)
+        depth = min(self.state.depth_mm + self.state.pressed_mm, self.max_mm)
         return advanced(touching(pose, self.size_mm, self.samples, self.radius_mm), depth)
 
     def pose_towards(self, goal: np.ndarray, pose: np.ndarray, time_s: float) -> np.ndarray:
@@ -244,7 +254,7 @@ class ProbeManipulator:
 
     def _turned(self, aim: np.ndarray) -> np.ndarray:
         pose, length = aim.copy(), self.size_mm[2]
-        turn = Rotation.from_euler("zyx", self.turn_deg[::-1], degrees=True).as_matrix()
+        turn = Rotation.from_euler("zyx", self.state.turn_deg[::-1], degrees=True).as_matrix()
         pose[:3, :3] = aim[:3, :3] @ turn
         pose[:3, 3] = _face_centre(aim, length) + length / 2 * pose[:3, 2]
         return pose

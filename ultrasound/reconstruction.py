@@ -26,7 +26,7 @@ class VoxelBox:
     """Cubic voxels along the axes of the reference frame.
 
     ``origin_mm`` (3,) is the centre of the first voxel, ``spacing_mm`` the distance to the next, ``shape`` the counts
-    along x, y and z. Raises ValueError for a spacing that is not above 0, no voxels, or more than MAX_VOXELS.
+    along x, y and z. Raises ValueError for no voxels, or more than MAX_VOXELS.
     """
 
     origin_mm: np.ndarray
@@ -34,22 +34,21 @@ class VoxelBox:
     shape: tuple[int, int, int]
 
     def __post_init__(self) -> None:
-        _check(self.spacing_mm, np.array(self.shape, float))
+        if min(self.shape) < 1:
+            raise ValueError(f"a box needs a voxel along each axis, not {self.shape}")
+        if math.prod(self.shape) > MAX_VOXELS:
+            raise ValueError(
+                f"{' x '.join(f'{n:g}' for n in self.shape)} voxels of {self.spacing_mm:g} mm are over {MAX_VOXELS:,}: "
+                "take larger voxels or a smaller region"
+            )
 
     @classmethod
     def around(cls, corners_mm: np.ndarray, spacing_mm: float) -> "VoxelBox":
-        """Return the smallest box from the minimum of ``corners_mm`` (n, 3) that covers their maximum.
-
-        Raises ValueError for corners that are none, not (n, 3) or not finite, and as the box itself does.
-        """
-        corners = np.asarray(corners_mm, float)
-        if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) == 0 or not np.isfinite(corners).all():
-            raise ValueError(f"the corners of a box must be finite, of shape (n, 3), not {corners.shape}")
-        _check(spacing_mm, np.ones(3))
-        counts = np.ceil(np.ptp(corners, axis=0) / spacing_mm) + 1
-        _check(spacing_mm, counts)
-        x, y, z = (int(n) for n in counts)
-        return cls(corners.min(axis=0), float(spacing_mm), (x, y, z))
+        """Return the smallest box from the minimum of ``corners_mm`` (n, 3) that covers their maximum."""
+        counts = np.ceil(np.ptp(corners_mm, axis=0) / spacing_mm) + 1
+        # Also a corner that is infinitely far away is beyond the limit.
+        x, y, z = (int(n) for n in np.fmin(counts, MAX_VOXELS + 1))
+        return cls(corners_mm.min(axis=0), float(spacing_mm), (x, y, z))
 
     @property
     def index_from_mm(self) -> np.ndarray:
@@ -63,18 +62,6 @@ class VoxelBox:
         return np.moveaxis(np.indices(self.shape), 0, -1) * self.spacing_mm + self.origin_mm
 
 
-def _check(spacing_mm: float, counts: np.ndarray) -> None:
-    if not (math.isfinite(spacing_mm) and spacing_mm > 0):
-        raise ValueError(f"the spacing of voxels must be above 0 mm, not {spacing_mm:g}")
-    if not (counts >= 1).all():
-        raise ValueError(f"a box needs a voxel along each axis, not {counts}")
-    if math.prod(counts.tolist()) > MAX_VOXELS:
-        raise ValueError(
-            f"{' x '.join(f'{n:g}' for n in counts)} voxels of {spacing_mm:g} mm are over {MAX_VOXELS:,}: "
-            "take larger voxels or a smaller region"
-        )
-
-
 class Reconstruction:
     """Images accumulated in a box of voxels. The same images in the same order give the same bits.
 
@@ -83,13 +70,9 @@ class Reconstruction:
     - "smooth": a pixel is distributed to the eight voxels around it by trilinear weights (PLUS's LINEAR). Holes are
       interpolated along sticks (``_along_sticks``) and smoothed by normalised convolution (Knutsson & Westin 1993,
       doi 10.1109/CVPR.1993.341081). Voxels with data are not changed.
-
-    Raises ValueError for another ``method``.
     """
 
     def __init__(self, box: VoxelBox, method: str) -> None:
-        if method not in METHODS:
-            raise ValueError(f"method {method!r} is none of {', '.join(METHODS)}")
         self.box, self.method = box, method
         # One voxel more on each side, for weights that fall outside the box.
         self._shape = np.array(box.shape) + 2
@@ -102,12 +85,8 @@ class Reconstruction:
         """Add an image (rows, columns) of any numbers, where ``mask`` (rows, columns) is true.
 
         ``reference_from_image`` (4, 4) maps (column, row, 0, 1), counted from the first pixel's centre, to the reference
-        frame [mm]; pixels outside the box are ignored. Raises ValueError for shapes that do not fit and a matrix that is not finite.
+        frame [mm]; pixels outside the box are ignored.
         """
-        if image.ndim != 2 or (mask is not None and mask.shape != image.shape):
-            raise ValueError("an image must be (rows, columns), and its mask of the same shape")
-        if np.shape(reference_from_image) != (4, 4) or not np.isfinite(reference_from_image).all():
-            raise ValueError("reference_from_image must be a finite matrix (4, 4)")
         matrix = self.box.index_from_mm @ reference_from_image
         along_row, along_column, first = (matrix[:3, k, None, None] for k in (0, 1, 3))
         rows, columns = np.arange(image.shape[0])[:, None], np.arange(image.shape[1])
@@ -119,12 +98,7 @@ class Reconstruction:
         self._distribute(values, at)
 
     def add_points(self, values: np.ndarray, points_mm: np.ndarray) -> None:
-        """As ``add`` for values (m,) at points (m, 3) [mm]; points that are not finite are ignored.
-
-        Raises ValueError where shapes do not fit.
-        """
-        if values.ndim != 1 or points_mm.shape != (len(values), 3):
-            raise ValueError("points must be values (m,) at positions (m, 3)")
+        """As ``add`` for values (m,) at points (m, 3) [mm]; points that are not finite are ignored."""
         self._distribute(values, (points_mm - self.box.origin_mm).T / self.box.spacing_mm)
 
     def _distribute(self, values: np.ndarray, at: np.ndarray) -> None:
@@ -155,10 +129,8 @@ class Reconstruction:
         """Return values (x, y, z) float32 and the mask (x, y, z) of voxels with data or in a hole.
 
         The mask is the closing, by a ball of ``reach_mm``, of the voxels with data: holes up to twice as wide are filled.
-        Elsewhere values are 0. Raises ValueError for a reach below 0 or not finite.
+        Elsewhere values are 0.
         """
-        if not (math.isfinite(reach_mm) and reach_mm >= 0):
-            raise ValueError(f"reach_mm must be 0 or more, not {reach_mm:g}")
         values, known = np.zeros(self.box.shape, np.float32), np.zeros(self.box.shape, bool)
         if self._seen.any():
             total, weight, seen = (
@@ -178,29 +150,16 @@ def _filled(values: np.ndarray, seen: np.ndarray, reach: float, method: str) -> 
     margin = int(reach) + 2
     inner = (slice(margin, -margin),) * 3
     values, seen = np.pad(values, margin), np.pad(seen, margin)
-    nearest = _nearest(seen)
+    distance, nearest = ndimage.distance_transform_edt(~seen, return_indices=True)
     # A reach of whole voxels is off them by rounding.
-    within = (reach + 1e-6) ** 2
-    grown = _squared_distance(nearest) <= within
-    closed = _squared_distance(_nearest(~grown)) > within
+    within = reach + 1e-6
+    closed = ndimage.distance_transform_edt(distance <= within) > within
     gaps = closed & ~seen
     if method == "nearest":
         values[gaps] = values[tuple(axis[gaps] for axis in nearest)]
     else:
         _fill_smoothly(values, seen, gaps, nearest, math.ceil(2 * reach))
     return values[inner], closed[inner]
-
-
-def _nearest(true: np.ndarray) -> np.ndarray:
-    """Return for each voxel the indices (3, x, y, z) of the nearest one where ``true``."""
-    return ndimage.distance_transform_edt(~true, return_distances=False, return_indices=True)
-
-
-def _squared_distance(nearest: np.ndarray) -> np.ndarray:
-    """Return the squared distance [voxels] of each voxel from its ``nearest`` (3, x, y, z)."""
-    own: tuple[np.ndarray, ...] = np.indices(nearest.shape[1:], np.int32, sparse=True)
-    x, y, z = (there - here for there, here in zip(nearest, own, strict=True))
-    return x * x + y * y + z * z
 
 
 def _fill_smoothly(

@@ -7,9 +7,11 @@ import trimesh
 
 from sim.fields import field_of
 from sim.signed_distance import distance_grid
-from ultrasound.image_plane import LANES, Lanes
 
 AIR_HU = -1000.0
+# Pixels of a row that are computed together (SIMD).
+LANES = 8
+Lanes = ti.types.vector(LANES, ti.f32)
 FAR_MM = 1e6
 
 

@@ -1,24 +1,36 @@
-"""The scanner: CT slice and B-mode image on the same image plane of a probe."""
+"""The scanner: the tissue on an image plane of a probe, and its CT slice, B-mode image and ground-truth labels.
+
+CT slice: image plane -> deformed tetrahedra -> voxels at rest (the paper's method).
+"""
 
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+import taichi as ti
+import taichi.math as tm
 import trimesh
+from trimesh.intersections import mesh_plane
 
 from sim.embedding import Embedding, Unmoved
+from sim.fields import array_of, field_of, fill
 from ultrasound.acoustics import check_tissues, properties
 from ultrasound.bmode import BMode
-from ultrasound.ct_slice import CtSlice
-from ultrasound.ground_truth_labels import GroundTruthLabels
-from ultrasound.image_plane import ImagePlane, PlaneInTissue
 from ultrasound.probe import DetailLevel, Mode, Probe
-from ultrasound.sampled_volume import SampledVolume, distance_volume
+from ultrasound.probe_manipulator import ImagePlane
+from ultrasound.sampled_volume import AIR_HU, LANES, Lanes, SampledVolume, distance_volume
+from ultrasound.sweep import PixelLabel
 
-# Impedance around the organ where the image does not show the CT there [MRayl].
-OUTSIDE_IMPEDANCE = {"background": None, "gel": 1.5, "air": 4e-4}
+# HU and impedance [MRayl] around the organ where the image does not show the CT there.
+OUTSIDE: dict[str, tuple[float, float | None]] = {
+    "background": (0.0, None),
+    "gel": (0.0, 1.5),
+    "air": (AIR_HU, 4e-4),
+}
+MAX_BEADS = 255 // PixelLabel.BEAD
 CT, B_MODE = "CT", "B-mode"
 IMAGES_OF_MODE: dict[Mode, tuple[str, ...]] = {"ct": (CT,), "b-mode": (B_MODE,), "both": (B_MODE, CT)}
 
@@ -51,11 +63,154 @@ def start_acoustics(anatomy: ScannedAnatomy) -> Future[np.ndarray]:
     return values
 
 
+@ti.data_oriented
+class PlaneInTissue:
+    """The tetrahedron of an embedding that contains each of ``pixels`` x ``pixels`` pixels of an image plane.
+
+    ``owner`` (rows, columns) is its index, since the last ``locate``; ``grid`` are the size of a pixel and the centre (u, v) of the
+    first one [mm].
+    """
+
+    def __init__(self, embedding: Embedding | Unmoved, pixels: int) -> None:
+        self.embedding = embedding
+        self.pixels = pixels
+        self.owner = ti.field(ti.i32, (pixels, pixels))
+        self.grid = ti.Vector.field(2, ti.f32, 2)
+
+    def locate(self, plane: ImagePlane) -> None:
+        """Find the tissue on a plane; the embedding must be up to date."""
+        pixel = np.array([plane.width_mm, plane.depth_mm]) / self.pixels
+        first = np.array([-plane.width_mm / 2, -plane.above_mm]) + pixel / 2
+        fill((self.grid, np.stack([pixel, first])))
+        given = np.linalg.inv(plane.world_from_plane), plane.world_from_plane, pixel, first
+        inverse, world, pixel_mm, first_mm = (ti.Matrix(np.asarray(each, float).tolist()) for each in given)
+        self.embedding.locate_on_plane(inverse, world, pixel_mm, first_mm, self.owner)
+
+    @property
+    def grid_mm(self) -> tuple[ti.Vector, ti.Vector]:
+        """The values of ``grid``: as arguments of a kernel they cost its pixels nothing."""
+        pixel, first = array_of(self.grid)
+        return tm.vec2(*pixel), tm.vec2(*first)
+
+    def rest_grid(self, count: int) -> np.ndarray:
+        """Return rest positions (rows, columns, 3) [mm] at count x count points evenly over the plane."""
+        places = np.empty((count, count, 3), np.float32)
+        self._rest_grid(*self.grid_mm, places)
+        return places
+
+    @ti.kernel
+    def _rest_grid(self, pixel_mm: tm.vec2, first_mm: tm.vec2, places: ti.types.ndarray(ti.f32, ndim=3)):
+        for i, j in ti.ndrange(places.shape[0], places.shape[1]):
+            row = (i * (self.pixels - 1)) // (places.shape[0] - 1)
+            column = (j * (self.pixels - 1)) // (places.shape[1] - 1)
+            rest = self.rest_at(row, column, pixel_mm, first_mm)
+            for axis in ti.static(range(3)):
+                places[i, j, axis] = rest[axis]
+
+    @ti.func
+    def rest_at(self, row, column, pixel_mm, first_mm):
+        """Return the rest position of the tissue at a pixel's centre [mm]; the last two are ``grid``."""
+        linear = self.embedding.rest_from_plane[self.owner[row, column]]
+        u, v = first_mm.x + column * pixel_mm.x, first_mm.y + row * pixel_mm.y
+        return linear[:, 0] * u + linear[:, 1] * v + linear[:, 3]
+
+    @ti.func
+    def rest_lanes(self, row, first, pixel_mm, first_mm):
+        """As ``rest_at`` for LANES pixels of a row, axis by axis, and whether they are collinear at rest too.
+
+        Pixels beyond the image repeat its last.
+        """
+        last = self.pixels - 1
+        x, y, z = Lanes(0.0), Lanes(0.0), Lanes(0.0)
+        owner = self.owner[row, first]
+        same = True
+        for lane in ti.static(range(1, LANES)):
+            same &= self.owner[row, ti.min(first + lane, last)] == owner
+        if same:
+            # Most neighbours are in one tetrahedron, whose map keeps them on a line.
+            start = self.rest_at(row, first, pixel_mm, first_mm)
+            on = self.embedding.rest_from_plane[owner][:, 0] * pixel_mm.x
+            steps = Lanes([float(lane) for lane in ti.static(range(LANES))])
+            x, y, z = start.x + on.x * steps, start.y + on.y * steps, start.z + on.z * steps
+        else:
+            for lane in ti.static(range(LANES)):
+                rest = self.rest_at(row, ti.min(first + lane, last), pixel_mm, first_mm)
+                x[lane], y[lane], z[lane] = rest.x, rest.y, rest.z
+        return x, y, z, same
+
+    @ti.func
+    def pixel_near(self, place):
+        """Return row and column of the pixel nearest to (u, v) [mm]."""
+        at = ti.round((place - self.grid[1]) / self.grid[0], ti.i32)
+        return tm.clamp(at.y, 0, self.pixels - 1), tm.clamp(at.x, 0, self.pixels - 1)
+
+    @ti.func
+    def rest_from_plane(self, row, column):
+        """Return the map (3, 4) from (u, v, w, 1) of the plane to the rest position [mm], at a pixel."""
+        return self.embedding.rest_from_plane[self.owner[row, column]]
+
+    @ti.func
+    def is_tissue(self, row, column):
+        """Whether the embedding contains the pixel."""
+        return self.owner[row, column] < self.embedding.count
+
+
+@ti.data_oriented
+class GroundTruthLabels:
+    """``PixelLabel`` values of the plane located last, by the rest position of its tissue.
+
+    ``organ`` and ``tumour`` are signed distances [mm], negative inside; ``beads`` (n, 3) are centres of balls of a radius [mm].
+    Raises ValueError for more than MAX_BEADS beads.
+    """
+
+    def __init__(
+        self,
+        plane: PlaneInTissue,
+        organ: SampledVolume,
+        tumour: SampledVolume | None = None,
+        beads: np.ndarray | None = None,
+        radius_mm: float = 2.0,
+    ) -> None:
+        self.plane, self.organ, self.radius_mm = plane, organ, radius_mm
+        self.tumour: Any = tumour
+        self.has_tumour = tumour is not None
+        self.beads = 0 if beads is None else len(beads)
+        if self.beads > MAX_BEADS:
+            raise ValueError(f"{self.beads} beads: at most {MAX_BEADS} fit into 8-bit labels")
+        if beads is not None:
+            self.bead = field_of(np.asarray(beads, float), 1)
+
+    def render(self) -> np.ndarray:
+        """Return labels (pixels, pixels) uint8."""
+        image = np.empty((self.plane.pixels, self.plane.pixels), np.uint8)
+        self._render(image)
+        return image
+
+    @ti.kernel
+    def _render(self, image: ti.types.ndarray(ti.u8, ndim=2)):
+        for row, column in ti.ndrange(self.plane.pixels, self.plane.pixels):
+            rest = self.plane.rest_at(row, column, self.plane.grid[0], self.plane.grid[1])
+            label = ti.cast(PixelLabel.OUTSIDE, ti.i32)
+            if self.plane.is_tissue(row, column):
+                if self.organ.sample(rest) < 0.0:
+                    label = PixelLabel.ORGAN
+                if ti.static(self.has_tumour):
+                    if self.tumour.sample(rest) < 0.0:
+                        label = PixelLabel.TUMOUR
+                if ti.static(self.beads > 0):
+                    for k in range(self.beads):
+                        if (rest - self.bead[k]).norm_sqr() < self.radius_mm**2:
+                            label = label % PixelLabel.BEAD + PixelLabel.BEAD * (k + 1)
+            image[row, column] = ti.cast(label, ti.u8)
+
+
+@ti.data_oriented
 class Scanner:
     """Images of ``pixels`` x ``pixels`` of an anatomy that an embedding deforms.
 
-    ``outside`` see ``CtSlice``, ``contact`` and ``contact_gap_mm`` see ``BMode``. A mode is set up at its first image; ``acoustics``
-    are properties whose computation has already been started. Raises TissueError.
+    ``outside`` is what is shown outside the organ: ``background``, the CT around it, which deforms with the organ as far as the
+    embedding reaches; ``gel`` (0 HU); ``air`` (-1000 HU). ``contact`` and ``contact_gap_mm`` see ``BMode``. A mode is set up at its
+    first image; ``acoustics`` are properties whose computation has already been started. Raises TissueError.
     """
 
     def __init__(
@@ -74,42 +229,37 @@ class Scanner:
         self.embedding = embedding
         self.probe = probe
         self.plane = PlaneInTissue(embedding, pixels)
-        self.outside, self.contact, self.contact_gap_mm = outside, contact, contact_gap_mm
+        self.outside_hu, self.around = OUTSIDE[outside]
+        self.show_background = outside == "background"
+        self.contact, self.contact_gap_mm = contact, contact_gap_mm
         self._acoustics = acoustics
 
     @cached_property
-    def slice(self) -> CtSlice:
-        """The CT slice on the plane."""
-        ct = SampledVolume(self.anatomy.hu, self.anatomy.index_from_mm)
-        return CtSlice(ct, self._organ, self.plane, self.outside)
+    def ct(self) -> SampledVolume:
+        """HU at rest."""
+        return SampledVolume(self.anatomy.hu, self.anatomy.index_from_mm)
+
+    @cached_property
+    def organ(self) -> SampledVolume:
+        """Signed distance from the organ's surface at rest [mm], negative inside."""
+        return distance_volume(self.anatomy.organ)
 
     @cached_property
     def bmode(self) -> BMode:
         """The B-mode image of the plane."""
         values, self._acoustics = (self._acoustics or start_acoustics(self.anatomy)).result(), None
         tissue = SampledVolume(values, self.anatomy.index_from_mm, outside=0.0)
-        return BMode(
-            tissue,
-            self._organ,
-            self.plane,
-            self.probe,
-            float(self.anatomy.voxel_mm.mean()),
-            self.contact,
-            self.contact_gap_mm,
-            OUTSIDE_IMPEDANCE[self.outside],
-        )
+        voxel_mm = float(self.anatomy.voxel_mm.mean())
+        around = self.contact, self.contact_gap_mm, self.around
+        return BMode(tissue, self.organ, self.plane, self.probe, voxel_mm, *around)
 
     @cached_property
     def ground_truth(self) -> GroundTruthLabels:
         """The ground-truth labels of the plane."""
         tumour = self.anatomy.tumour
         return GroundTruthLabels(
-            self.plane, self._organ, None if tumour is None else distance_volume(tumour, 1.0)
+            self.plane, self.organ, None if tumour is None else distance_volume(tumour, 1.0)
         )
-
-    @cached_property
-    def _organ(self) -> SampledVolume:
-        return distance_volume(self.anatomy.organ)
 
     def locate(self, plane: ImagePlane) -> None:
         """Find the tissue on a plane, without an image."""
@@ -128,7 +278,58 @@ class Scanner:
         """Return the images of a plane in a mode by name, grey values (pixels, pixels) uint8, the main one first."""
         self.locate(plane)
         render = {
-            CT: lambda: self.slice.render(window_hu, level_hu),
+            CT: lambda: self.ct_slice(window_hu, level_hu),
             B_MODE: lambda: self.bmode.render(probe, detail_level),
         }
         return {name: render[name]() for name in IMAGES_OF_MODE[mode]}
+
+    def ct_slice(self, window_hu: float, level_hu: float) -> np.ndarray:
+        """Return grey values (pixels, pixels) uint8, 0 to 255 over the window, of the plane located last, at pixel centres."""
+        image = np.empty((self.plane.pixels, self.plane.pixels), np.uint8)
+        # Fields must exist before the kernel that reads them is compiled.
+        _ = self.ct, self.organ
+        self._window(*self.plane.grid_mm, window_hu, level_hu, image)
+        return image
+
+    @ti.kernel
+    def _window(
+        self,
+        pixel_mm: tm.vec2,
+        first_mm: tm.vec2,
+        window_hu: float,
+        level_hu: float,
+        image: ti.types.ndarray(ti.u8, ndim=2),
+    ):
+        for row, packet in ti.ndrange(self.plane.pixels, ti.static((self.plane.pixels + LANES - 1) // LANES)):
+            hu = self.hounsfield(row, packet * LANES, pixel_mm, first_mm)
+            grey = ti.min(ti.max((hu - level_hu) / window_hu + 0.5, 0.0), 1.0) * 255.0 + 0.5
+            for lane in ti.static(range(LANES)):
+                if packet * LANES + lane < self.plane.pixels:
+                    image[row, packet * LANES + lane] = ti.cast(grey[lane], ti.u8)
+
+    @ti.func
+    def hounsfield(self, row, first, pixel_mm, first_mm):
+        """Return HU of LANES pixels of a row."""
+        x, y, z, in_line = self.plane.rest_lanes(row, first, pixel_mm, first_mm)
+        hu = self.ct.sample_lanes(x, y, z, in_line)
+        if ti.static(not self.show_background):
+            for lane in ti.static(range(LANES)):
+                column = ti.min(first + lane, self.plane.pixels - 1)
+                if not self.in_organ(row, column, ti.Vector([x[lane], y[lane], z[lane]])):
+                    hu[lane] = self.outside_hu
+        return hu
+
+    @ti.func
+    def in_organ(self, row, column, rest):
+        """Whether the tissue of a pixel, at a rest position [mm], is of the organ."""
+        return self.plane.is_tissue(row, column) and self.organ.sample(rest) <= 0.0
+
+
+def plane_section(vertices: np.ndarray, faces: np.ndarray, plane_from_world: np.ndarray) -> np.ndarray:
+    """Return the section of a closed surface (v, 3), (f, 3) [mm] with the plane w = 0: segments (n, 2, 2) of (u, v) [mm].
+
+    ``plane_from_world`` (4, 4) is rigid: u to the marked side, v down into the tissue, w out of the plane.
+    """
+    in_plane = vertices @ plane_from_world[:3, :3].T + plane_from_world[:3, 3]
+    surface = trimesh.Trimesh(in_plane, faces, process=False)
+    return mesh_plane(surface, plane_normal=[0.0, 0.0, 1.0], plane_origin=[0.0, 0.0, 0.0])[..., :2]

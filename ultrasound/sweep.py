@@ -8,6 +8,7 @@ import re
 import reprlib
 from collections import deque
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
@@ -68,7 +69,16 @@ class Sweep:
     @property
     def times_s(self) -> np.ndarray:
         """Time of each frame (n,) [s]; SweepError where a timestamp is missing or not a finite number."""
-        return np.array([self._time(frame) for frame in range(len(self))])
+        times = np.full(len(self), np.nan)
+        for frame, fields in enumerate(self.frames):
+            text = fields.get("Timestamp", "")
+            with suppress(ValueError):
+                times[frame] = float(text)
+            if not np.isfinite(times[frame]):
+                raise SweepError(
+                    f"frame {frame}: Timestamp = {reprlib.repr(text)}: expected a finite number of seconds"
+                )
+        return times
 
     def transform(self, start: str, end: str, frame: int) -> np.ndarray | None:
         """Return the matrix (4, 4) from ``start`` to ``end``, such as "Image" and "Reference", along the shortest chain of transforms.
@@ -88,24 +98,15 @@ class Sweep:
             step = self._tracked(name, frame) if name in tracked else self.constant[name]
             if step is None:
                 return None
-            matrix = (_inverse(step, f"frame {frame}: {name}") if inverted else step) @ matrix
+            try:
+                matrix = (np.linalg.inv(step) if inverted else step) @ matrix
+            except np.linalg.LinAlgError as error:
+                raise SweepError(f"frame {frame}: {name} has no inverse") from error
         return matrix
 
     def is_image_ok(self, frame: int) -> bool:
         """Whether there are pixels and no status other than OK."""
         return self.images[frame].size > 0 and _is_ok(self.frames[frame].get("ImageStatus", "OK"))
-
-    def _time(self, frame: int) -> float:
-        text = self.frames[frame].get("Timestamp", "")
-        try:
-            time_s = float(text)
-        except ValueError:
-            time_s = np.nan
-        if not np.isfinite(time_s):
-            raise SweepError(
-                f"frame {frame}: Timestamp = {reprlib.repr(text)}: expected a finite number of seconds"
-            )
-        return time_s
 
     def _tracked(self, name: str, frame: int) -> np.ndarray | None:
         fields = self.frames[frame]
@@ -147,12 +148,36 @@ def load_constants(path: Path) -> dict[str, np.ndarray]:
 
     Raises SweepError for a file that cannot be read, has no transform, or an invalid one.
     """
+    constants: dict[str, np.ndarray] = {}
     try:
-        return _constants_of(_configuration(path))
-    except SweepError as error:
+        with path.open("rb") as file:
+            content = file.read(CONFIGURATION_LIMIT + 1)
+        if len(content) > CONFIGURATION_LIMIT:
+            raise SweepError(f"more than {CONFIGURATION_LIMIT >> 20} MB")
+        for each in ElementTree.fromstring(content).iterfind("CoordinateDefinitions/Transform"):
+            name = f"{each.get('From', '')}To{each.get('To', '')}"
+            if not TRANSFORM_NAME.fullmatch(name) or name in constants:
+                raise SweepError(
+                    f"Transform {reprlib.repr(name)}: expected From and To, each pair once, To with a capital"
+                )
+            constants[name] = matrix_of(each.get("Matrix", ""), f"{name} Matrix")
+        if not constants:
+            raise SweepError("no CoordinateDefinitions with a Transform")
+    except (OSError, SweepError, ElementTree.ParseError, LookupError, ValueError) as error:
+        found = error.strerror if isinstance(error, OSError) else str(error)
+        if not isinstance(error, (OSError, SweepError)):
+            found = f"no XML: {found}"
         raise SweepError(
-            f"{path.name}: {error}; expected a PLUS configuration (XML); a scene or a patient's folder goes after --scene"
+            f"{path.name}: {found}; expected a PLUS configuration (XML); a scene or a patient's folder goes after --scene"
         ) from error
+    return constants
+
+
+def transform_fields(name: str, matrix: np.ndarray | None) -> dict[str, str]:
+    """Return the fields of a frame for a transform, such as "ProbeToReference"; None is one that was not tracked."""
+    status = "INVALID" if matrix is None else "OK"
+    text = transform_text(np.eye(4) if matrix is None else matrix)
+    return {f"{name}Transform": text, f"{name}TransformStatus": status}
 
 
 def transform_text(matrix: np.ndarray) -> str:
@@ -179,40 +204,5 @@ def _affine(matrix: np.ndarray, what: str, found: str) -> np.ndarray:
     return matrix
 
 
-def _inverse(matrix: np.ndarray, what: str) -> np.ndarray:
-    try:
-        return np.linalg.inv(matrix)
-    except np.linalg.LinAlgError as error:
-        raise SweepError(f"{what} has no inverse") from error
-
-
 def _is_ok(status: str) -> bool:
     return status.strip().upper() == "OK"
-
-
-def _configuration(path: Path) -> ElementTree.Element:
-    try:
-        with path.open("rb") as file:
-            content = file.read(CONFIGURATION_LIMIT + 1)
-    except OSError as error:
-        raise SweepError(f"{error.strerror}") from error
-    if len(content) > CONFIGURATION_LIMIT:
-        raise SweepError(f"more than {CONFIGURATION_LIMIT >> 20} MB")
-    try:
-        return ElementTree.fromstring(content)
-    except (ElementTree.ParseError, LookupError, ValueError) as error:
-        raise SweepError(f"no XML: {error}") from error
-
-
-def _constants_of(configuration: ElementTree.Element) -> dict[str, np.ndarray]:
-    constants: dict[str, np.ndarray] = {}
-    for each in configuration.iterfind("CoordinateDefinitions/Transform"):
-        name = f"{each.get('From', '')}To{each.get('To', '')}"
-        if not TRANSFORM_NAME.fullmatch(name) or name in constants:
-            raise SweepError(
-                f"Transform {reprlib.repr(name)}: expected From and To, each pair once, To with a capital"
-            )
-        constants[name] = matrix_of(each.get("Matrix", ""), f"{name} Matrix")
-    if not constants:
-        raise SweepError("no CoordinateDefinitions with a Transform")
-    return constants

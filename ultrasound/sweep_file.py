@@ -12,12 +12,13 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ultrasound.sweep import ORIENTATIONS, TRANSFORM_NAME, Sweep, SweepError, reoriented, transform_text
+from ultrasound.probe import Probe
+from ultrasound.sweep import ORIENTATIONS, Sweep, SweepError, reoriented, transform_fields
+from version import VERSION
 
 HEADER_LIMIT = 64 << 20
-COMPRESSION_LEVEL = (
-    1  # A higher level compresses speckle no better, and a sweep is written while it is recorded.
-)
+# A higher level compresses speckle no better, and a sweep is written while it is recorded.
+COMPRESSION_LEVEL = 1
 PIXEL_LIMIT = (1 << 32) - 1  # PLUS counts a sweep's bytes in 32 bits.
 FRAME_FIELD = re.compile(r"Seq_Frame([0-9]{4,9})_(.+)", re.DOTALL)
 # Accepted values of a sweep with pixels; the first is the default where the field is not required.
@@ -49,7 +50,15 @@ NEW_HEADER = {
     "UltrasoundImageOrientation": "MF",
     "UltrasoundImageType": "BRIGHTNESS",
 }
-NO_PIXELS = {"ElementType": "MET_OTHER", "UltrasoundImageOrientation": "XX", "UltrasoundImageType": "XX"}
+NO_PIXELS = {
+    "ElementType": "MET_OTHER",
+    "CompressedData": "False",
+    "UltrasoundImageOrientation": "XX",
+    "UltrasoundImageType": "XX",
+}
+SUFFIX, LABELS_SUFFIX = ".igs.mha", "-marks.igs.mha"
+# Fields of the header: the probe, and the version of Nephron.
+PROBE_FIELD, VERSION_FIELD = "TransducerName", "NephronVersion"
 
 
 def read_sweep(path: Path) -> Sweep:
@@ -64,14 +73,20 @@ def read_sweep(path: Path) -> Sweep:
         raise SweepError(f"{path.name}: {error.strerror if isinstance(error, OSError) else error}") from error
 
 
-def write_sweep(path: Path, sweep: Sweep, compress: bool = True) -> None:
+def write_sweep(path: Path, sweep: Sweep) -> None:
     """Write a sweep; a sweep that was read keeps the lines of its header. The same sweep gives the same bytes.
 
     Raises SweepError for a sweep that does not fit into a file, and OSError; an existing file is then not changed.
     """
-    with SweepWriter(path, sweep.fields, compress) as writer:
+    with SweepWriter(path, sweep.fields) as writer:
         for image, fields in zip(sweep.images, sweep.frames, strict=True):
-            writer.append(image if image.size else None, fields)
+            writer.append(image, fields)
+
+
+def read_ground_truth(sweep: Path) -> Sweep | None:
+    """Return the labels recorded with a sweep, None where there are none. Raises SweepError."""
+    path = sweep.with_name(sweep.name.removesuffix(SUFFIX) + LABELS_SUFFIX)
+    return read_sweep(path) if sweep.name.endswith(SUFFIX) and path != sweep and path.is_file() else None
 
 
 class SweepWriter:
@@ -81,13 +96,11 @@ class SweepWriter:
     end, and leaves no file after an exception.
     """
 
-    def __init__(self, path: Path, fields: dict[str, str] | None = None, compress: bool = True) -> None:
+    def __init__(self, path: Path, fields: dict[str, str]) -> None:
         self.path, self.count = path, 0
-        given = fields or {}
-        self._header = dict(given) if "ObjectType" in given else NEW_HEADER | given
-        self._shape: tuple[int, int] | None = None
-        self._lines, self._pending_black = bytearray(), 0
-        self._compress = zlib.compressobj(COMPRESSION_LEVEL) if compress else None
+        self._header = dict(fields) if "ObjectType" in fields else NEW_HEADER | fields
+        self._shape: tuple[int, ...] = ()
+        self._lines, self._compress = bytearray(), zlib.compressobj(COMPRESSION_LEVEL)
         # Deleted by the system, even if the process is killed.
         self._pixels = tempfile.TemporaryFile(dir=path.parent)
 
@@ -99,44 +112,21 @@ class SweepWriter:
             self.close()
         self._pixels.close()
 
-    def add(
-        self,
-        image: np.ndarray | None,
-        transforms: dict[str, np.ndarray | None],
-        time_s: float,
-        extra: dict[str, str] | None = None,
-    ) -> None:
-        """Add a frame: image uint8 (rows, columns) in MF, transforms (4, 4) by name ("ProbeToReference"), time [s].
-
-        A transform or image of None gets the status INVALID. Raises SweepError as ``append``.
-        """
-        fields: dict[str, str] = {}
-        for name, matrix in transforms.items():
-            if not TRANSFORM_NAME.fullmatch(name):
-                raise SweepError(f"transform {reprlib.repr(name)}: expected a name such as ProbeToReference")
-            fields[f"{name}Transform"] = transform_text(np.eye(4) if matrix is None else matrix)
-            fields[f"{name}TransformStatus"] = "INVALID" if matrix is None else "OK"
-        if not np.isfinite(time_s):
-            raise SweepError(f"frame {self.count}: time {time_s}: expected a finite number of seconds")
-        fields["Timestamp"] = repr(float(time_s))
-        fields |= extra or {}
-        fields["ImageStatus"] = "INVALID" if image is None else "OK"
-        self.append(image, fields)
-
-    def append(self, image: np.ndarray | None, fields: dict[str, str]) -> None:
-        """Add a frame with its fields as text; an image of None is black.
+    def append(self, image: np.ndarray, fields: dict[str, str]) -> None:
+        """Add a frame: uint8 (rows, columns) in MF, (0, 0) in a sweep of poses alone, and its fields as text.
 
         Raises SweepError for an image or text that does not fit into the file, which then continues without this frame.
         """
-        shape = self._shape_with(image)
+        if image.dtype != np.uint8 or image.ndim != 2 or image.shape != (self._shape or image.shape):
+            found, expected = f"{image.dtype} {image.shape}", self._shape or "(rows, columns)"
+            raise SweepError(f"frame {self.count}: image of {found}: expected uint8 {expected}")
+        if (self.count + 1) * image.size > PIXEL_LIMIT:
+            raise SweepError(f"frame {self.count}: more than {PIXEL_LIMIT} bytes of pixels")
         lines = b"".join(_line(f"Seq_Frame{self.count:04}_{name}", text) for name, text in fields.items())
-        self._shape, self.count = shape, self.count + 1
+        self._shape, self.count = image.shape, self.count + 1
         self._lines += lines
-        if image is None:
-            self._pending_black += 1
-        else:
-            self._write_black()
-            self._write(image.tobytes())
+        if image.size:
+            self._pixels.write(self._compress.compress(image.tobytes()))
 
     def close(self) -> None:
         """Write the file; SweepError without frames. A second call does nothing."""
@@ -145,68 +135,80 @@ class SweepWriter:
         with self._pixels:
             if not self.count:
                 raise SweepError("a sweep without frames")
-            self._write_black()
-            if self._compress and self._shape:
+            if any(self._shape):
                 self._pixels.write(self._compress.flush())
             header = b"".join(_line(*each) for each in self._final_header().items())
             header += self._lines + b"ElementDataFile = LOCAL\n"
             if len(header) > HEADER_LIMIT:
                 raise SweepError(f"a header of {len(header)} bytes: at most {HEADER_LIMIT} can be read again")
-            self._write_file(header)
-
-    def _shape_with(self, image: np.ndarray | None) -> tuple[int, int] | None:
-        shape = self._shape
-        if image is not None:
-            shape = shape or image.shape
-            if image.dtype != np.uint8 or image.ndim != 2 or image.size == 0 or image.shape != shape:
-                found, expected = f"{image.dtype} {image.shape}", self._shape or "(rows, columns)"
-                raise SweepError(f"frame {self.count}: image of {found}: expected uint8 {expected}")
-        if shape and (self.count + 1) * shape[0] * shape[1] > PIXEL_LIMIT:
-            raise SweepError(f"frame {self.count}: more than {PIXEL_LIMIT} bytes of pixels")
-        return shape
-
-    def _write_black(self) -> None:
-        """Write the pending black images, once their size is known."""
-        if self._shape:
-            black = bytes(self._shape[0] * self._shape[1])
-            for _ in range(self._pending_black):
-                self._write(black)
-            self._pending_black = 0
-
-    def _write(self, pixels: bytes) -> None:
-        self._pixels.write(self._compress.compress(pixels) if self._compress else pixels)
+            partial = self.path.with_name(f".{self.path.name}.partial-{secrets.token_hex(4)}")
+            try:
+                with partial.open("xb") as file:
+                    file.write(header)
+                    self._pixels.seek(0)
+                    shutil.copyfileobj(self._pixels, file, 1 << 20)
+                os.replace(partial, self.path)
+            finally:
+                partial.unlink(missing_ok=True)
 
     def _final_header(self) -> dict[str, str]:
-        rows, columns = self._shape or (0, 0)
+        rows, columns = self._shape
         header = dict(self._header)
         size = f"{columns} {rows} {self.count}"
         # An equal value keeps its text, with PLUS's spaces.
         if header.get("DimSize", "").split() != size.split():
             header["DimSize"] = size
-        if not self._shape:
+        if not any(self._shape):
             header |= NO_PIXELS
-        elif ORIENTATIONS.get(header.get("UltrasoundImageOrientation", "").strip()) != "MF":
-            header["UltrasoundImageOrientation"] = "MF"
-        if self._compress and self._shape:
-            header["CompressedData"] = "True"
-            header["CompressedDataSize"] = str(self._pixels.tell()).ljust(
-                len(header.get("CompressedDataSize", ""))
-            )
-        else:
-            header["CompressedData"] = "False"
             header.pop("CompressedDataSize", None)
-        return header
+            return header
+        if ORIENTATIONS.get(header.get("UltrasoundImageOrientation", "").strip()) != "MF":
+            header["UltrasoundImageOrientation"] = "MF"
+        length = len(header.get("CompressedDataSize", ""))
+        return header | {
+            "CompressedData": "True",
+            "CompressedDataSize": str(self._pixels.tell()).ljust(length),
+        }
 
-    def _write_file(self, header: bytes) -> None:
-        partial = self.path.with_name(f".{self.path.name}.partial-{secrets.token_hex(4)}")
+
+class LabelledSweep:
+    """Writes STEM.igs.mha and STEM-marks.igs.mha into a folder, both or none. Reference is the patient (LPS, mm). Raises OSError."""
+
+    def __init__(self, folder: Path, stem: str, probe: Probe) -> None:
+        self.name = f"{stem}{SUFFIX}"
+        fields = {PROBE_FIELD: probe.transducer_name, VERSION_FIELD: VERSION}
+        self._images, self._labels = (
+            SweepWriter(folder / f"{stem}{end}", fields) for end in (SUFFIX, LABELS_SUFFIX)
+        )
+
+    @property
+    def count(self) -> int:
+        """Number of frames so far."""
+        return self._images.count
+
+    def add(
+        self,
+        image: np.ndarray,
+        labels: np.ndarray,
+        probe: Probe,
+        reference_from_probe: np.ndarray,
+        time_s: float,
+    ) -> None:
+        """Add a frame: grey values and ``PixelLabel`` values (rows, columns), probe pose (4, 4), time. Raises OSError, SweepError."""
+        pose = transform_fields("ProbeToReference", reference_from_probe)
+        pose |= transform_fields("ImageToProbe", probe.image_to_probe(*image.shape))
+        fields = pose | {"Timestamp": repr(float(time_s)), "ImageStatus": "OK"}
+        self._images.append(image, fields)
+        self._labels.append(labels, fields)
+
+    def close(self) -> None:
+        """Write both files. Raises OSError, SweepError."""
+        self._labels.close()
         try:
-            with partial.open("xb") as file:
-                file.write(header)
-                self._pixels.seek(0)
-                shutil.copyfileobj(self._pixels, file, 1 << 20)
-            os.replace(partial, self.path)
-        finally:
-            partial.unlink(missing_ok=True)
+            self._images.close()
+        except (OSError, SweepError):
+            self._labels.path.unlink(missing_ok=True)
+            raise
 
 
 def _line(name: str, text: str) -> bytes:
@@ -248,30 +250,25 @@ def _read_header(file: BinaryIO) -> tuple[dict[str, str], dict[int, dict[str, st
         )
     file.seek(0)
     while True:
-        name, text = _read_line(file)
+        start = file.tell()
+        line = file.readline(HEADER_LIMIT - start).decode("latin-1")
+        if not line:
+            raise SweepError(f"no ElementDataFile = LOCAL in the first {start} bytes")
+        name, equals, text = line.removesuffix("\n").partition("=")
+        name, text = name.strip(), text.removeprefix(" ")
+        if not equals or not name:
+            raise SweepError(f"byte {start}: {reprlib.repr(line)}: expected Name = value")
         if name == "ElementDataFile":
             if text.strip() != "LOCAL":
                 raise SweepError(f"ElementDataFile = {reprlib.repr(text)}: expected LOCAL")
             return fields, frames
-        into, key = fields, name
-        if name.startswith("Seq_Frame"):
-            if not (match := FRAME_FIELD.fullmatch(name)):
-                raise SweepError(f"field {reprlib.repr(name)}: expected Seq_Frame0000_Name")
-            into, key = frames.setdefault(int(match[1]), {}), match[2]
+        match = FRAME_FIELD.fullmatch(name)
+        if name.startswith("Seq_Frame") and not match:
+            raise SweepError(f"field {reprlib.repr(name)}: expected Seq_Frame0000_Name")
+        into, key = (frames.setdefault(int(match[1]), {}), match[2]) if match else (fields, name)
         if key in into:
             raise SweepError(f"field {reprlib.repr(name)}: found twice")
         into[key] = text
-
-
-def _read_line(file: BinaryIO) -> tuple[str, str]:
-    start = file.tell()
-    line = file.readline(HEADER_LIMIT - start).decode("latin-1")
-    if not line:
-        raise SweepError(f"no ElementDataFile = LOCAL in the first {start} bytes")
-    name, equals, text = line.removesuffix("\n").partition("=")
-    if not equals or not name.strip():
-        raise SweepError(f"byte {start}: {reprlib.repr(line)}: expected Name = value")
-    return name.strip(), text.removeprefix(" ")
 
 
 def _dimensions(fields: dict[str, str]) -> tuple[int, int, int]:

@@ -32,10 +32,9 @@ from rehearsal.reconstruction.sweep_volumes import (
 from rehearsal.result_files import write_json
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
-from ultrasound.labelled_sweep import PROBE_FIELD, read_ground_truth
 from ultrasound.reconstruction import METHODS
 from ultrasound.sweep import Sweep, load_constants
-from ultrasound.sweep_file import read_sweep, write_sweep
+from ultrasound.sweep_file import PROBE_FIELD, read_ground_truth, read_sweep, write_sweep
 from ultrasound.tracking_errors import TrackingErrors
 from version import VERSION
 

@@ -67,9 +67,9 @@ def scan(asked: ScanOptions) -> None:
     from rehearsal.image_and_surface_files import save_images
     from rehearsal.rehearsal import scanned_anatomy
     from sim.embedding import Unmoved
-    from ultrasound.image_plane import ImagePlane
-    from ultrasound.labelled_sweep import LabelledSweep
+    from ultrasound.probe_manipulator import ImagePlane
     from ultrasound.scanner import Scanner
+    from ultrasound.sweep_file import LabelledSweep
 
     make_folder(out)
     scanned = scanned_anatomy(anatomy.organ, anatomy.ct, anatomy, np.zeros(3))

@@ -43,7 +43,7 @@ class PlannedSweep(_FileModel):
     """One candidate.
 
     ``parts`` are its ``ScoreTerms`` by name, ``points`` what each adds to the score, ``values`` its parameters. ``passes`` are its poses,
-    probe to patient; the probe's axes are PLUS's (``ultrasound.image_plane``).
+    probe to patient; the probe's axes are PLUS's (``ultrasound.probe_manipulator``).
     """
 
     name: str

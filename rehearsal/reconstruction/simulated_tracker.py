@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ultrasound.sweep import Sweep, SweepError, transform_text
+from ultrasound.sweep import Sweep, SweepError, transform_fields
 from ultrasound.tracking_errors import TrackingErrors, with_tracking_errors
 
 
@@ -22,16 +22,15 @@ def with_errors(sweep: Sweep, reference: str, errors: TrackingErrors, seed: int)
         found = with_tracking_errors(true_poses, sweep.times_s[known], errors, seed)
     except ValueError as error:
         raise SweepError(f"errors of a tracker cannot be added to this sweep: {error}") from None
-    name, frames = f"ProbeTo{reference}Transform", [dict(fields) for fields in sweep.frames]
+    name, frames = f"ProbeTo{reference}", [dict(fields) for fields in sweep.frames]
     for frame, pose in zip(known, found, strict=True):
-        frames[frame][name] = transform_text(np.eye(4) if pose is None else pose)
-        frames[frame][f"{name}Status"] = "INVALID" if pose is None else "OK"
+        frames[frame] |= transform_fields(name, pose)
     after = replace(sweep, frames=frames)
     first, pose = next(
         ((frame, pose) for frame, pose in zip(known, found, strict=True) if pose is not None), (0, None)
     )
     if pose is not None and not np.array_equal(pose, after.transform("Probe", reference, first)):  # type: ignore[arg-type]
         raise SweepError(
-            f"the sweep holds {reference}ToProbe, to which no errors can be added: expected {name}"
+            f"the sweep holds {reference}ToProbe, to which no errors can be added: expected {name}Transform"
         )
     return after

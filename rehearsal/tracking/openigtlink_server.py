@@ -210,5 +210,5 @@ def send_live(
 ) -> None:
     """Send the first image of a view, if there is a link."""
     if link is not None:
-        grey = next(iter(view.pictures.values()))
+        grey = next(iter(view.images.values()))
         link.send(grey, probe.image_to_probe(*grey.shape), probe_in_patient(rehearsal), time_s)

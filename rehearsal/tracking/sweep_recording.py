@@ -7,9 +7,9 @@ from rehearsal.notices import Notices
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import next_number
 from render.viewer import View
-from ultrasound.labelled_sweep import LabelledSweep
 from ultrasound.probe import Probe
 from ultrasound.sweep import SweepError
+from ultrasound.sweep_file import LabelledSweep
 
 FRAME_S = 1 / 30
 NAME = r"sweep-([0-9]{3,9})\.igs\.mha"
@@ -59,7 +59,7 @@ class SweepRecorder:
 
     def watch(self, time_s: float, view: View, probe: Probe) -> None:
         """Add the current image where a frame is due."""
-        kind, image = next(iter(view.pictures.items()))
+        kind, image = next(iter(view.images.items()))
         # After the end of a replay another session begins, with its own time; a volume of B-mode and CT images would be neither.
         if time_s < self._due_s - FRAME_S - 1e-9 or (self._image_kind and kind != self._image_kind):
             self.end()

@@ -18,7 +18,7 @@ LIVER_LEFT_MM = 15.0
 # The outer shell of a correct label contains little fat; the sinus is deeper.
 SHELL_MM, FAT_BELOW_HU, MOST_FAT = 4.0, -60, 0.05
 LEAST_LEFT_OUT_ML = 0.5
-# Above this ``ultrasound.tissue_classification`` takes parenchyma for stone; less volume gives no warning.
+# Above this ``ultrasound.acoustics`` takes parenchyma for stone; less volume gives no warning.
 STONE_ABOVE_MEDIAN_HU, LEAST_STONE_ML = 130.0, 0.1
 
 

@@ -34,7 +34,7 @@ NOISE_CORRELATION = 0.6
 
 
 class Label(IntEnum):
-    """Tissue of a voxel, by its name in ultrasound/tissues.toml; the union of 1..6 is the organ, one solid without cavities."""
+    """Tissue of a voxel, by its name in ultrasound/acoustic_tissues.toml; the union of 1..6 is the organ, one solid without cavities."""
 
     OUTSIDE = 0
     CORTEX = 1

@@ -13,13 +13,11 @@ from scenes.anatomy import LoadedAnatomy
 from sim.embedding import Unmoved
 from sim.signed_distance import signed_distance
 from ultrasound.bmode import source_of_pixels
-from ultrasound.ground_truth_labels import MAX_BEADS, GroundTruthLabels
-from ultrasound.image_plane import ImagePlane, PlaneInTissue
 from ultrasound.probe import Probe
-from ultrasound.probe_manipulator import advanced, touching
+from ultrasound.probe_manipulator import ImagePlane, advanced, touching
 from ultrasound.sampled_volume import distance_volume
-from ultrasound.scanner import Scanner
-from ultrasound.sweep import Sweep, transform_text
+from ultrasound.scanner import MAX_BEADS, GroundTruthLabels, PlaneInTissue, Scanner
+from ultrasound.sweep import Sweep, transform_fields
 
 FRAMES_A_SECOND = 30
 # The slow sweep: its speed, the height of the probe above the organ, and how far it goes beyond both ends.
@@ -154,11 +152,7 @@ def sweep_of(
 ) -> Sweep:
     """A sweep of images (n, rows, columns) and poses of the probe in the patient, None where they were lost."""
     frames = [
-        {
-            "ProbeToReferenceTransform": transform_text(np.eye(4) if pose is None else pose),
-            "ProbeToReferenceTransformStatus": "INVALID" if pose is None else "OK",
-            "Timestamp": repr(float(time_s)),
-        }
+        transform_fields("ProbeToReference", pose) | {"Timestamp": repr(float(time_s))}
         for pose, time_s in zip(poses, times_s, strict=True)
     ]
     return Sweep(images, frames, {}, {"ImageToProbe": on_probe})

@@ -103,7 +103,7 @@ def test_each_frame_goes_to_the_link_as_it_is_shown(looping, sent):
     settings = Settings()
     views = [looping.frame(Controls(settings)) for _ in range(3)]
     for number, (live, view) in enumerate(zip(sent, views, strict=True), 1):
-        assert live.grey is view.pictures["B-mode"] and live.time_s == number * STEP_S
+        assert live.grey is view.images["B-mode"] and live.time_s == number * STEP_S
         assert (
             np.array_equal(live.probe_in_patient[:3, 3], [100.0 + number, 200.0, 300.0])
             and view.alert == "measured"
@@ -243,7 +243,7 @@ def test_the_export_key_saves_the_tissue_beside_its_picture_and_says_what_it_can
     )
     assert looping.frame(Controls(settings)).status == "   ".join(["Saved 004", *missing])
     assert capsys.readouterr().out.endswith(f"\n{'; '.join(missing)}\n")
-    looping._save(Controls(settings, export=True), replace(before, pictures={"CT": before.pictures["CT"]}))
+    looping._save(Controls(settings, export=True), replace(before, images={"CT": before.images["CT"]}))
     assert looping.frame(Controls(settings)).status == f"Saved 005   {missing[1]}"
 
 

@@ -353,9 +353,9 @@ def test_the_first_image_of_a_view_is_sent_with_the_current_probe():
     rehearsal = SimpleNamespace(image_plane=lambda: SimpleNamespace(world_from_plane=plane), origin=origin)
     echo, ct = np.full((8, 6), 9, np.uint8), np.zeros((8, 6), np.uint8)
     probe = load_probe("linear").model_copy(update=dict(depth_mm=80.0, transducer_width_mm=30.0))
-    send_live(None, rehearsal, SimpleNamespace(pictures={"B-mode": echo}), probe, 1.5)
+    send_live(None, rehearsal, SimpleNamespace(images={"B-mode": echo}), probe, 1.5)
     link = SimpleNamespace(send=lambda *live: shown.append(LiveImage(*live)))
-    send_live(link, rehearsal, SimpleNamespace(pictures={"B-mode": echo, "CT": ct}), probe, 1.5)
+    send_live(link, rehearsal, SimpleNamespace(images={"B-mode": echo, "CT": ct}), probe, 1.5)
     (sent,) = shown
     assert sent.grey is echo and sent.time_s == 1.5
     assert np.allclose(sent.probe_in_patient[:3, 3], plane[:3, 3] + origin)

@@ -11,10 +11,9 @@ from plan_ball import SIZE, over_ball, plan_of, straight_pass, sweep_of
 
 from rehearsal.planning.plan_guidance import ABOVE_MM, AHEAD, DEG_PER_MM_OFF, NEAR_MM, PlanGuidance
 from rehearsal.sessions.session import MOST_UNDONE, History, Session
-from render import plan_lines, transducer_shape
-from render.actions import begin
-from render.keys import Keys
-from render.plan_lines import DONE, TO_GO, PlanLines
+from render import scene_view, transducer_shape
+from render.keys import Keys, begin
+from render.scene_view import DONE, TO_GO, PlanLines
 from render.viewer import Controls, Guidance, Settings
 from sim.fields import array_of
 from ultrasound.probe_manipulator import advanced
@@ -318,7 +317,7 @@ def test_two_sweeps_shown_in_turn_have_their_own_lines(one_device):
 
 
 def test_every_second_segment_of_a_path_with_too_many_is_drawn(one_device, monkeypatch):
-    monkeypatch.setattr(plan_lines, "MAX_SEGMENTS", 10)
+    monkeypatch.setattr(scene_view, "MAX_SEGMENTS", 10)
     way = np.arange(15 * 6, dtype=float).reshape(15, 2, 3)
     done = np.arange(15) < 7
     segments, colours, _ = drawn(PlanLines(EDGES), Guidance(None, way, done))

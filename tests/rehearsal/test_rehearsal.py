@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 import trimesh
-from slicing import organ_mask
+from slicing import hounsfield, organ_mask
 
 from rehearsal.frame import image_view
 from rehearsal.frame_view import initial_settings
@@ -75,9 +75,9 @@ def assert_at_rest_the_slice_is_the_ct(scene: Scene, folder: Path) -> None:
     rehearsal.pose = rehearsal.manipulator.pose()
     rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK_AT_CT)
     plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], *rehearsal.probe.extent_mm)
-    cut = rehearsal.scanner.slice
+    cut = rehearsal.scanner
     inside = organ_mask(cut)
-    difference = np.abs(cut.hounsfield() - resampled(folder, plane, rehearsal.origin, scene.image.pixels))
+    difference = np.abs(hounsfield(cut) - resampled(folder, plane, rehearsal.origin, scene.image.pixels))
     print(f"mean {difference[inside].mean():.4f} HU, maximum {difference[inside].max():.3f} HU")
     assert inside.mean() > 0.1
     # The bar is 5 HU; float32 positions (1e-5 mm) in gradients of 500 HU/mm leave far less.
@@ -120,7 +120,7 @@ def test_a_pixel_shows_the_tissue_that_is_there_now(kept):
         rehearsal.advance(rehearsal.scripted_pose(step / 30 * rehearsal.script_length_s()))
     rehearsal.scanner.images(rehearsal.image_plane(), rehearsal.probe, *LOOK_AT_CT)
     plane = image_plane(rehearsal.pose, rehearsal.size_mm[2], *rehearsal.probe.extent_mm)
-    pixels = np.argwhere(organ_mask(rehearsal.scanner.slice))[::1009]
+    pixels = np.argwhere(organ_mask(rehearsal.scanner))[::1009]
     spacing = np.array([plane.width_mm, plane.depth_mm]) / rehearsal.scene.image.pixels
     local = (pixels[:, ::-1] + 0.5) * spacing - [plane.width_mm / 2, 0]
     shown_at = np.column_stack([local, np.zeros(len(local)), np.ones(len(local))]) @ plane.world_from_plane.T
@@ -191,7 +191,7 @@ def test_every_feature_at_once_without_a_ct_stays_finite_and_out_of_everything(o
     assert 0.6 < rehearsal.volume_ratio() < 1.1
     assert rehearsal.scanner is None and rehearsal.rest_grid() is None
     view = image_view(rehearsal, rehearsal.probe, initial_settings(rehearsal), Tally(0.0))
-    assert not any(image.any() for image in view.pictures.values())
+    assert not any(image.any() for image in view.images.values())
 
 
 def test_the_outline_is_the_tumours_border_not_what_is_drawn_of_it(kept):

@@ -49,7 +49,7 @@ class Watched(NullViewer):
 
     def draw(self, view: View) -> None:
         if not self.is_frozen:
-            self.seen.append((view.transducer_pose.tobytes(), *(p.tobytes() for p in view.pictures.values())))
+            self.seen.append((view.transducer_pose.tobytes(), *(p.tobytes() for p in view.images.values())))
 
 
 def once(make: Any) -> Any:

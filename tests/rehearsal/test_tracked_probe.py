@@ -26,8 +26,8 @@ from rehearsal.tracking.track_file import check_near, load_track
 from rehearsal.tracking.tracked_probe import TrackEnded, has_moved, played_pose
 from render.viewer import Controls, Settings
 from ultrasound.probe_manipulator import image_plane
-from ultrasound.sweep import SweepError
-from ultrasound.sweep_file import SweepWriter
+from ultrasound.sweep import Sweep, SweepError, transform_fields
+from ultrasound.sweep_file import write_sweep
 
 LENGTH = 6.0
 
@@ -282,9 +282,12 @@ def test_a_tracked_session_is_the_same_again_and_when_it_is_replayed(tmp_path):
 
 
 def sweep_file(path: Path, track: TimedPoses, name: str = "ProbeToReference") -> Path:
-    with SweepWriter(path) as writer:
-        for time, pose in zip(track.times_s, track.poses, strict=True):
-            writer.add(None, {name: pose, "StylusToReference": None}, float(time))
+    unseen = transform_fields("StylusToReference", None)
+    frames = [
+        transform_fields(name, pose) | unseen | {"Timestamp": repr(float(time))}
+        for time, pose in zip(track.times_s, track.poses, strict=True)
+    ]
+    write_sweep(path, Sweep(np.zeros((len(frames), 0, 0), np.uint8), frames, {}))
     return path
 
 

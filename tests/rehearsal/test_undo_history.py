@@ -395,4 +395,4 @@ def test_a_press_by_a_share_goes_no_deeper():
     for _ in range(30):
         step(live, press=True, press_share=0.5)
     manipulator = live.session.rehearsal.manipulator
-    assert manipulator.pressed_mm == pytest.approx(manipulator.max_mm / 2)
+    assert manipulator.state.pressed_mm == pytest.approx(manipulator.max_mm / 2)

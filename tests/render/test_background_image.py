@@ -5,15 +5,21 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from render.background_image import BackgroundImage
+from render.background_image import (
+    ARM,
+    BackgroundImage,
+    clock_box,
+    compass_image,
+    ends_of,
+    findings_image,
+    readout_image,
+)
 from render.camera import OrbitCamera
-from render.compass import ARM, compass_picture, ends_of
 from render.keys import DEFAULT_KEYS, Keys
 from render.sliders import boxes_of, groups_of
 from render.text import fitting_size, font, shortened, write
-from render.ultrasound_panel import ALERT, CALIPER, OUTLINE, OUTLINE_AT_REST, QUIET, TEXT
+from render.ultrasound_panel import ALERT, CALIPER, OUTLINE, OUTLINE_AT_REST, QUIET, TEXT, to_plane
 from render.viewer import SCANNER_GROUPS, Geometry, Settings, View
-from render.window_frame import clock_box, findings_picture, readout_picture
 from render.window_layout import Rect, WindowLayout
 
 LAYOUT = WindowLayout(1280, 720)
@@ -26,7 +32,7 @@ each_size = pytest.mark.parametrize("size", [(700, 420), (1024, 576), (1280, 720
 def view(**changes) -> View:
     pictures = {"B-mode": np.zeros((64, 32), np.uint8), "CT": np.zeros((64, 32), np.uint8)}
     return View(
-        **{"transducer_pose": np.eye(4), "pictures": pictures, "width_mm": 16.0, "depth_mm": 40.0} | changes
+        **{"transducer_pose": np.eye(4), "images": pictures, "width_mm": 16.0, "depth_mm": 40.0} | changes
     )
 
 
@@ -36,8 +42,8 @@ def composed(page: BackgroundImage, **changes) -> np.ndarray:
     return page.pixels.transpose(1, 0, 2)[::-1, :, :3].copy()
 
 
-def picture_boxes(layout: WindowLayout) -> list[Rect]:
-    return layout.picture_boxes(2, 16.0, 40.0)
+def image_boxes(layout: WindowLayout) -> list[Rect]:
+    return layout.image_boxes(2, 16.0, 40.0)
 
 
 def coloured(picture: np.ndarray, box: Rect, colour) -> np.ndarray:
@@ -55,10 +61,10 @@ def apart(one: Rect, other: Rect) -> bool:
 
 
 def geometry(**parts) -> Geometry:
-    return Geometry(None, np.zeros((0, 3)), np.zeros((2, 3)), **parts)
+    return Geometry((None, np.zeros((0, 3))), np.zeros((2, 3)), **parts)
 
 
-WHOLE = geometry(tumour_vertices=1, parts={"vessel": (1, 1)}, support_vertices=np.zeros((1, 3)))
+WHOLE = geometry(tumour=(1, 1), parts={"vessel": (1, 1)}, support=(1, 1))
 
 
 @each_size
@@ -68,13 +74,13 @@ def test_no_part_of_the_window_overlaps_another(size):
     placed = boxes_of(settings, WHOLE, layout)
     over = [layout.findings(layout.most_findings), layout.compass, *(placed[name] for name in SCANNER_GROUPS)]
     below = [box for name, box in placed.items() if name not in SCANNER_GROUPS]
-    parts = [*over, *below, layout.readouts, *picture_boxes(layout)]
+    parts = [*over, *below, layout.readouts, *image_boxes(layout)]
     for one, other in combinations(parts, 2):
         assert apart(one, other) or 0 in (*one[2:], *other[2:])
     for within, area in (
         (over, layout.scene),
         ([*below, layout.readouts], layout.strip),
-        (picture_boxes(layout), layout.panel),
+        (image_boxes(layout), layout.panel),
     ):
         for box in within:
             assert area.left <= box.left and box.right <= area.right
@@ -82,7 +88,7 @@ def test_no_part_of_the_window_overlaps_another(size):
 
 
 def test_b_mode_and_ct_of_the_drop_in_probe_fill_the_panel():
-    box = picture_boxes(LAYOUT)[0]
+    box = image_boxes(LAYOUT)[0]
     assert box.height > 0.95 * (720 - 74 - 52) and LAYOUT.scene.width > 720
 
 
@@ -121,7 +127,7 @@ def test_a_missing_structure_has_no_slider():
         "show_support",
     } <= whole and "stiffness" not in whole
     assert whole - named(geometry()) == {"show_tumour", "outline", "margin_mm", "show_parts", "show_support"}
-    assert whole - named(geometry(tumour_vertices=1, parts={"cyst": (1, 1)})) == {"show_support"}
+    assert whole - named(geometry(tumour=(1, 1), parts={"cyst": (1, 1)})) == {"show_support"}
 
 
 # Texts
@@ -170,7 +176,7 @@ def test_no_contact_is_written_in_the_b_mode_image_only():
     plain, noted = (
         composed(BackgroundImage(LAYOUT), notes=notes) for notes in ({}, {"B-mode": "NO CONTACT"})
     )
-    b_mode, ct = picture_boxes(LAYOUT)
+    b_mode, ct = image_boxes(LAYOUT)
     at = coloured(noted, b_mode, QUIET)
     assert len(at) > 100 and len(coloured(plain, b_mode, QUIET)) == 0
     assert at.mean(axis=0) == pytest.approx([b_mode.height / 2, b_mode.width / 2], abs=6)
@@ -185,7 +191,7 @@ def test_what_to_do_stands_whole_under_a_note(size, hint):
         composed(BackgroundImage(layout), notes={"B-mode": note})
         for note in ("NO CONTACT", f"NO CONTACT\n{hint}")
     )
-    b_mode = layout.picture_boxes(2, 16.0, 40.0)[0]
+    b_mode = layout.image_boxes(2, 16.0, 40.0)[0]
     rows, columns = np.nonzero((plain != hinted).any(axis=2))
     assert b_mode.left <= columns.min() and columns.max() < b_mode.right
     assert np.ptp(columns) > 0.4 * b_mode.width
@@ -208,7 +214,7 @@ def test_the_calipers_figure_stands_at_its_line(points):
         composed(BackgroundImage(LAYOUT), caliper_mm=points, caliper=figure)
         for figure in ("", "24.0 mm\nat rest 25.1 mm")
     )
-    for box in picture_boxes(LAYOUT):
+    for box in image_boxes(LAYOUT):
         changed = np.argwhere((bare != told)[box.slices].any(axis=-1))
         assert len(changed) > 100
         middle = (np.mean(points, axis=0) + [8.0, 0.0])[::-1] * box.height / 40.0
@@ -219,7 +225,7 @@ def test_the_calipers_figure_stands_at_its_line(points):
         # The line stays whole.
         assert len(coloured(told, box, CALIPER)) > len(coloured(bare, box, CALIPER))
     outside = np.ones(bare.shape[:2], bool)
-    for box in picture_boxes(LAYOUT):
+    for box in image_boxes(LAYOUT):
         outside[box.slices] = False
     assert np.array_equal(bare[outside], told[outside])
 
@@ -228,7 +234,7 @@ def test_outlines_have_a_legend_under_the_picture():
     plain, outlined = (
         composed(BackgroundImage(LAYOUT), outline_mm=now, outline_before_mm=now) for now in (None, SQUARE)
     )
-    foot = picture_boxes(LAYOUT)[0].bottom
+    foot = image_boxes(LAYOUT)[0].bottom
     under = Rect(LAYOUT.panel.left, foot, LAYOUT.panel.width, 24)
     for colour in (OUTLINE, OUTLINE_AT_REST):
         assert len(coloured(outlined, under, colour)) > 30 and len(coloured(plain, under, colour)) == 0
@@ -245,14 +251,14 @@ def test_findings_that_become_fewer_leave_nothing_behind():
 
 
 def test_a_figure_without_a_value_is_a_dash():
-    pictures = [findings_picture(LAYOUT, {"margin": figure}) for figure in ("", "-", "4.2 mm")]
+    pictures = [findings_image(LAYOUT, {"margin": figure}) for figure in ("", "-", "4.2 mm")]
     assert np.array_equal(pictures[0], pictures[1]) and not np.array_equal(pictures[0], pictures[2])
 
 
 @pytest.mark.parametrize("size", [(1250, 703), (1280, 720), (1920, 1080), (3840, 2160)])
 def test_all_readouts_of_a_window_are_shown(size):
     layout = WindowLayout(*size)
-    ends = [readout_picture(layout, dict(list(FIGURES.items())[:count])) for count in (6, 7)]
+    ends = [readout_image(layout, dict(list(FIGURES.items())[:count])) for count in (6, 7)]
     rows = np.flatnonzero((ends[0] != ends[1]).any(axis=(1, 2)))
     # In a large window the lines move closer together for the seventh.
     assert len(rows) > 5 and rows.max() < layout.readouts.height - 2
@@ -290,9 +296,9 @@ def test_findings_grow_with_their_lines_and_the_last_are_left_out(size):
 def test_the_help_covers_all_and_leaves_nothing_behind():
     page = BackgroundImage(LAYOUT)
     before = composed(page, findings=FIGURES)
-    box = picture_boxes(LAYOUT)[0]
+    box = image_boxes(LAYOUT)[0]
     assert page.plane_point_at(box.left + 5, box.top + 5) == pytest.approx(
-        page.panel.to_plane(box, box.left + 5, box.top + 5)
+        to_plane(view(), box, box.left + 5, box.top + 5)
     )
     page.show_help()
     helped = page.pixels.transpose(1, 0, 2)[::-1, :, :3]
@@ -324,7 +330,7 @@ def test_the_ends_turn_with_the_camera_and_the_nearest_is_last():
 def test_what_points_up_in_the_compass_is_drawn_up():
     # From the front and above: the head is up and nearer than the middle, the feet are down and farther.
     sine, cosine = 0.28, 0.96
-    picture = compass_picture(LAYOUT, np.array([[1.0, 0, 0], [0, sine, cosine], [0, cosine, -sine]]))
+    picture = compass_image(LAYOUT, np.array([[1.0, 0, 0], [0, sine, cosine], [0, cosine, -sine]]))
     size = len(picture)
     away = round(0.5 * ARM * size)
     column = picture[:, size // 2].astype(int)
@@ -335,9 +341,9 @@ def test_the_compass_is_drawn_anew_when_the_camera_turns():
     page, turned = BackgroundImage(LAYOUT), np.array([[0, 0, -1.0], [1.0, 0, 0], [0, 1.0, 0]])
     box = LAYOUT.compass
     first = composed(page)[box.slices]
-    assert np.array_equal(first, compass_picture(LAYOUT, AXES))
+    assert np.array_equal(first, compass_image(LAYOUT, AXES))
     page.compose(view(), turned)
     assert np.array_equal(
-        page.pixels.transpose(1, 0, 2)[::-1, :, :3][box.slices], compass_picture(LAYOUT, turned)
+        page.pixels.transpose(1, 0, 2)[::-1, :, :3][box.slices], compass_image(LAYOUT, turned)
     )
-    assert not np.array_equal(first, compass_picture(LAYOUT, turned))
+    assert not np.array_equal(first, compass_image(LAYOUT, turned))

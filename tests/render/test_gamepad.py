@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from render.actions import TILT_DEG_S
 from render.gamepad import DEAD_STICK, SLIDE_MM_S, Gamepad, PadState, SdlPads, shaped
-from render.keys import BUTTONS, DEFAULT_BUTTONS
+from render.keys import BUTTONS, DEFAULT_BUTTONS, TILT_DEG_S
 from render.viewer import Controls, Settings
 
 SECONDS = 0.02

@@ -11,11 +11,10 @@ import trimesh
 from conftest import ROOT
 from null_viewer import NullViewer
 
-from render import transducer_shape, ultrasound_panel, window_frame
+from render import background_image, transducer_shape, ultrasound_panel
 from render.camera import OrbitCamera
 from render.cut_face import FLESH
 from render.display import display_available, fitted, window_size
-from render.ultrasound_panel import Panel
 from render.viewer import Controls, Geometry, Settings, View
 from render.window_layout import FULL_SIZE, RULER_WIDTH, WindowLayout
 from sim.fields import fill
@@ -34,7 +33,7 @@ def _view(**changes) -> View:
     rows, columns = np.indices((96, 64))
     grey = ((rows * 2 + columns) % 256).astype(np.uint8)
     return View(
-        **{"transducer_pose": pose, "pictures": {"CT": grey}, "width_mm": 40.0, "depth_mm": 60.0} | changes
+        **{"transducer_pose": pose, "images": {"CT": grey}, "width_mm": 40.0, "depth_mm": 60.0} | changes
     )
 
 
@@ -112,7 +111,7 @@ def test_up_is_up_and_the_tissue_follows_a_pan():
 def test_the_parts_of_the_transducer_are_closed_and_face_outward(radius):
     size = np.array([40.0, 10.0, 20.0])
     shape = transducer_shape.transducer(size, radius)
-    faces = shape.indices.reshape(-1, 3)
+    faces = np.arange(len(shape.vertices)).reshape(-1, 3)
     for colour in (transducer_shape.BODY, transducer_shape.LENS, transducer_shape.MARKER):
         part = faces[(shape.colours[faces[:, 0]] == colour).all(axis=1)]
         corners, normals = shape.vertices[part], shape.normals[part]
@@ -128,14 +127,15 @@ def test_the_parts_of_the_transducer_are_closed_and_face_outward(radius):
 
 
 def test_the_image_plane_shows_the_image_in_the_right_orientation():
-    shares, indices = transducer_shape.image_plane_grid(6, 4)
+    shares = transducer_shape.image_plane_grid(6, 4)
+    indices = transducer_shape.grid_triangles(6, 4)
     grey = np.zeros((60, 40), dtype=np.uint8)
     grey[0, -1] = 255
-    view = _view(pictures={"CT": grey})
+    view = _view(images={"CT": grey})
     places = transducer_shape.on_plane(shares, view)
     bright = transducer_shape.on_transducer(places)[transducer_shape.sampled(grey, places, view) == 1.0]
     assert np.allclose(bright, [[20.0, 0.0, 0.0]])
-    assert indices.max() == len(shares) - 1 and len(indices) == 6 * 5 * 3
+    assert indices.max() == len(shares) - 1 and indices.size == 6 * 5 * 3
 
 
 def test_a_sector_fans_out_from_its_arc():
@@ -143,7 +143,7 @@ def test_a_sector_fans_out_from_its_arc():
     above, width = radius * (1 - np.cos(half)), 2 * (radius + depth) * np.sin(half)
     grey = np.zeros((180, 180), dtype=np.uint8)
     view = _view(
-        pictures={"B-mode": grey},
+        images={"B-mode": grey},
         width_mm=width,
         depth_mm=depth + above,
         above_mm=above,
@@ -161,7 +161,7 @@ def test_a_sector_fans_out_from_its_arc():
 
 @pytest.mark.parametrize(("width_mm", "depth_mm"), [(16.0, 40.0), (40.0, 60.0), (180.0, 128.0)])
 def test_two_pictures_share_the_panel_without_overlap_as_large_as_they_can_be(width_mm, depth_mm):
-    boxes = LAYOUT.picture_boxes(2, width_mm, depth_mm)
+    boxes = LAYOUT.image_boxes(2, width_mm, depth_mm)
     taken = np.zeros((720, 1280), int)
     for box in boxes:
         taken[box.slices] += 1
@@ -173,26 +173,28 @@ def test_two_pictures_share_the_panel_without_overlap_as_large_as_they_can_be(wi
 
 
 def test_a_place_in_a_picture_is_found_again_under_its_pixel():
-    shown = Panel(("B-mode", "CT"), 40.0, 68.0, above_mm=8.0)
-    for box in shown.boxes(LAYOUT):
-        column, row = shown.to_pixels(box, np.array([-7.0, 31.0]))
-        assert shown.to_plane(box, column, row) == pytest.approx((-7.0, 31.0))
+    shown = _view(depth_mm=68.0, above_mm=8.0)
+    for box in ultrasound_panel.image_boxes(LAYOUT, shown):
+        column, row = ultrasound_panel.to_pixels(shown, box, np.array([-7.0, 31.0]))
+        assert ultrasound_panel.to_plane(shown, box, column, row) == pytest.approx((-7.0, 31.0))
         # Zero depth is the face's middle, an eighth of 68 mm below the top.
-        assert shown.to_pixels(box, np.zeros(2))[1] == pytest.approx(box.top + 8 / 68 * box.height)
+        assert ultrasound_panel.to_pixels(shown, box, np.zeros(2))[1] == pytest.approx(
+            box.top + 8 / 68 * box.height
+        )
 
 
 def test_segments_are_drawn_where_they_are_and_nowhere_else():
-    shown = Panel(("CT",), 40.0, 60.0)
-    box = shown.boxes(LAYOUT)[0]
+    shown = _view()
+    box = ultrasound_panel.image_boxes(LAYOUT, shown)[0]
     page = np.zeros((720, 1280, 4), np.uint8)
     ultrasound_panel.draw_segments(
         page, shown, box, np.array([[[-10.0, 20.0], [10.0, 20.0]], [[0.0, 50.0], [0.0, 90.0]]]), (1, 2, 3)
     )
     rows, columns = np.nonzero((page[..., :3] == (1, 2, 3)).all(axis=2))
-    level = shown.to_pixels(box, np.array([0.0, 20.0]))[1]
+    level = ultrasound_panel.to_pixels(shown, box, np.array([0.0, 20.0]))[1]
     assert set(rows[rows < level + 5]) == {int(level)}
     across = columns[rows == int(level)]
-    left, right = (shown.to_pixels(box, np.array([u, 20.0]))[0] for u in (-10.0, 10.0))
+    left, right = (ultrasound_panel.to_pixels(shown, box, np.array([u, 20.0]))[0] for u in (-10.0, 10.0))
     assert (
         across.min() == int(left)
         and across.max() == int(right)
@@ -235,7 +237,7 @@ def window():
     vertices = ball.vertices.astype(np.float32)
     field = ti.Vector.field(3, ti.f32, shape=len(vertices))
     fill((field, vertices))
-    geometry = Geometry(field, ball.faces.astype(np.int32), np.array([[-45.0] * 3, [45.0] * 3]))
+    geometry = Geometry((field, ball.faces.astype(np.int32)), np.array([[-45.0] * 3, [45.0] * 3]))
     try:
         opened = Window(geometry, Settings(translucent=False), size=(640, 360), visible=False)
     except NoVulkan as reason:
@@ -292,11 +294,11 @@ def test_organ_never_covers_the_panel_the_title_or_the_readouts(window):
     red = _organ_pixels(picture)
     layout = opened.layout
     assert red[layout.scene.slices][:, -1].any(), "the organ does not reach the panel: this proves nothing"
-    expected = window_frame.backdrop(layout, Panel(("CT",), 40.0, 60.0))
-    ultrasound_panel.paste_picture(expected, layout.picture_boxes(1, 40.0, 60.0)[0], _view().pictures["CT"])
+    expected = background_image.backdrop(layout, _view())
+    ultrasound_panel.paste_image(expected, layout.image_boxes(1, 40.0, 60.0)[0], _view().images["CT"])
     for rect in (layout.panel, layout.title):
         assert np.array_equal(picture[rect.slices], expected[rect.slices])
-    assert np.array_equal(picture[layout.readouts.slices], window_frame.readout_picture(layout, {}))
+    assert np.array_equal(picture[layout.readouts.slices], background_image.readout_image(layout, {}))
 
 
 def test_two_pictures_of_one_view_are_the_same(window):
@@ -343,7 +345,7 @@ from render.viewer import Geometry
 from render.window import NoVulkan, Window
 field = ti.Vector.field(3, ti.f32, shape=3)
 try:
-    Window(Geometry(field, np.array([[0, 1, 2]]), np.array([[-1.0] * 3, [1.0] * 3])), visible=False)
+    Window(Geometry((field, np.array([[0, 1, 2]])), np.array([[-1.0] * 3, [1.0] * 3])), visible=False)
 except NoVulkan as reason:
     assert "\\n" not in str(reason)
     print("said", reason)

@@ -14,17 +14,16 @@ from conftest import rotation_about
 from lattice_tissue import put, tissue_of
 from PIL import Image
 
-from render.ultrasound_panel import OUTLINE, Panel, draw_segments, paste_picture
+from render.ultrasound_panel import OUTLINE, draw_segments, image_boxes, paste_image
 from render.viewer import Geometry, Settings, View
 from render.window_layout import WindowLayout
 from sim.device import start
 from sim.embedding import Embedding
 from sim.fields import array_of
 from sim.skinning import Skin
-from ultrasound.image_plane import ImagePlane, plane_section
 from ultrasound.probe import Probe
-from ultrasound.probe_manipulator import image_plane, pose_at, pose_of_image_plane
-from ultrasound.scanner import B_MODE, CT, ScannedAnatomy, Scanner
+from ultrasound.probe_manipulator import ImagePlane, image_plane, pose_at, pose_of_image_plane
+from ultrasound.scanner import B_MODE, CT, ScannedAnatomy, Scanner, plane_section
 
 STORED = Path(__file__).parent / "pictures"
 PIXELS, WIDTH, DEPTH = 256, 36.0, 30.0
@@ -85,17 +84,19 @@ class Scene:
         face, axes = FACE + axes @ shift, axes @ turn
         return image_plane(pose_at(face, -axes[:, 2], axes[:, 0], 20.0), 20.0, WIDTH, DEPTH)
 
-    def pictures(self, plane: ImagePlane) -> dict[str, np.ndarray]:
+    def images(self, plane: ImagePlane) -> dict[str, np.ndarray]:
         """CT and B-mode as the panel shows them, with the organ's outline, uint8 (rows, columns, 3) each."""
         shown = self.scanner.images(plane, PROBE, "both", "speckle", 350.0, 40.0)
         outline = plane_section(
             array_of(self.surface.vertices), self.anatomy.organ.faces, np.linalg.inv(plane.world_from_plane)
         )
-        panel, page = Panel(tuple(shown), WIDTH, DEPTH), np.zeros((*SMALL_WINDOW[::-1], 3), np.uint8)
+        view, page = View(np.eye(4), shown, WIDTH, DEPTH), np.zeros((*SMALL_WINDOW[::-1], 3), np.uint8)
         pasted = {}
-        for (name, picture), box in zip(shown.items(), panel.boxes(WindowLayout(*SMALL_WINDOW)), strict=True):
-            paste_picture(page, box, picture)
-            draw_segments(page, panel, box, outline, OUTLINE)
+        for (name, picture), box in zip(
+            shown.items(), image_boxes(WindowLayout(*SMALL_WINDOW), view), strict=True
+        ):
+            paste_image(page, box, picture)
+            draw_segments(page, view, box, outline, OUTLINE)
             pasted[name] = page[box.slices].copy()
         return pasted
 
@@ -143,7 +144,7 @@ def check(name: str, picture_of, request: pytest.FixtureRequest) -> None:
 
 @pytest.mark.parametrize("name", [CT, B_MODE])
 def test_ct_and_b_mode_are_the_stored_ones(scene, request, name):
-    check(name, lambda shift, turn: scene.pictures(scene.plane(shift, turn))[name], request)
+    check(name, lambda shift, turn: scene.images(scene.plane(shift, turn))[name], request)
 
 
 @pytest.fixture
@@ -153,12 +154,10 @@ def window(scene):
 
     organ = scene.anatomy.organ
     geometry = Geometry(
-        scene.surface.vertices,
-        organ.faces.astype(np.int32),
+        (scene.surface.vertices, organ.faces.astype(np.int32)),
         np.array([[-FRAMED] * 3, [FRAMED] * 3]),
         transducer_size_mm=np.array([WIDTH, 10.0, 20.0]),
-        tumour_vertices=scene.tumour.vertices,
-        tumour_faces=TUMOUR_SURFACE.faces.astype(np.int32),
+        tumour=(scene.tumour.vertices, TUMOUR_SURFACE.faces.astype(np.int32)),
     )
     try:
         opened = Window(geometry, Settings(), size=WINDOW, visible=False)

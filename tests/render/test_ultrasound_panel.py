@@ -3,18 +3,24 @@
 import numpy as np
 import pytest
 
-from render import ultrasound_panel, window_frame
-from render.ultrasound_panel import Panel, font
+from render import background_image, ultrasound_panel
+from render.text import font
+from render.viewer import View
 from render.window_layout import HEADER_HEIGHT, RULER_WIDTH, WindowLayout
 
 LAYOUT = WindowLayout(1280, 720)
 
 
+def ct_view(width_mm: float = 40.0, depth_mm: float = 60.0, **more) -> View:
+    """A CT slice alone."""
+    return View(np.eye(4), {"CT": np.zeros((2, 2), np.uint8)}, width_mm, depth_mm, **more)
+
+
 def test_slice_of_the_size_of_its_box_appears_unchanged_and_nothing_else_is_written():
-    box = LAYOUT.picture_boxes(1, 40.0, 60.0)[0]
+    box = LAYOUT.image_boxes(1, 40.0, 60.0)[0]
     grey = np.random.default_rng(2).integers(0, 256, (box.height, box.width), dtype=np.uint8)
     picture = np.full((720, 1280, 4), 7, dtype=np.uint8)
-    ultrasound_panel.paste_picture(picture, box, grey)
+    ultrasound_panel.paste_image(picture, box, grey)
     assert np.array_equal(picture[box.slices][..., :3], np.repeat(grey[..., None], 3, axis=2))
     assert np.all(picture[..., 3] == 7)
     picture[box.slices] = 7
@@ -22,11 +28,11 @@ def test_slice_of_the_size_of_its_box_appears_unchanged_and_nothing_else_is_writ
 
 
 def test_resampled_slice_keeps_its_sides():
-    box = LAYOUT.picture_boxes(1, 40.0, 60.0)[0]
+    box = LAYOUT.image_boxes(1, 40.0, 60.0)[0]
     grey = np.zeros((512, 512), dtype=np.uint8)
     grey[:256, :256] = 200
     picture = np.zeros((720, 1280, 3), dtype=np.uint8)
-    ultrasound_panel.paste_picture(picture, box, grey)
+    ultrasound_panel.paste_image(picture, box, grey)
     inside = picture[box.slices][..., 0]
     rows, columns = box.height // 2, box.width // 2
     assert np.all(inside[: rows - 2, : columns - 2] == 200)
@@ -35,7 +41,7 @@ def test_resampled_slice_keeps_its_sides():
 
 @pytest.mark.parametrize(("width_mm", "depth_mm"), [(40.0, 60.0), (40.0, 20.0), (40.0, 120.0), (60.0, 45.0)])
 def test_picture_box_has_the_shape_of_the_image_plane_and_stays_in_the_panel(width_mm, depth_mm):
-    box = LAYOUT.picture_boxes(1, width_mm, depth_mm)[0]
+    box = LAYOUT.image_boxes(1, width_mm, depth_mm)[0]
     assert box.left >= LAYOUT.panel.left + RULER_WIDTH and box.right <= LAYOUT.panel.right
     assert box.top >= HEADER_HEIGHT and box.bottom <= LAYOUT.panel.bottom
     # Each side is rounded to whole pixels: half a pixel on either.
@@ -44,13 +50,13 @@ def test_picture_box_has_the_shape_of_the_image_plane_and_stays_in_the_panel(wid
 
 def test_image_plane_without_extent_is_refused():
     with pytest.raises(ValueError, match="positive"):
-        LAYOUT.picture_boxes(1, 40.0, 0.0)[0]
+        LAYOUT.image_boxes(1, 40.0, 0.0)[0]
 
 
 @pytest.mark.parametrize("depth_mm", [20.0, 60.0, 87.0, 120.0])
 def test_ruler_ticks_stand_at_their_depth(depth_mm):
-    box = LAYOUT.picture_boxes(1, 40.0, depth_mm)[0]
-    ticks = ultrasound_panel.ruler_ticks(Panel(("CT",), 40.0, depth_mm), box)
+    box = LAYOUT.image_boxes(1, 40.0, depth_mm)[0]
+    ticks = ultrasound_panel.ruler_ticks(ct_view(depth_mm=depth_mm), box)
     assert len(ticks) == int(depth_mm // 5) + 1
     for i, (row, centimetres) in enumerate(ticks):
         depth = (row - box.top) / (box.height - 1) * depth_mm
@@ -59,27 +65,19 @@ def test_ruler_ticks_stand_at_their_depth(depth_mm):
 
 
 def test_ruler_is_drawn_where_its_ticks_say():
-    drawn_with = Panel(("CT",), 40.0, 60.0)
-    box = LAYOUT.picture_boxes(1, 40.0, 60.0)[0]
-    picture = window_frame.backdrop(LAYOUT, drawn_with)
+    drawn_with = ct_view()
+    box = LAYOUT.image_boxes(1, 40.0, 60.0)[0]
+    picture = background_image.backdrop(LAYOUT, drawn_with)
     column = picture[box.top : box.bottom, box.left - 8]
     drawn = {box.top + int(row) for row in np.flatnonzero(np.any(column != ultrasound_panel.PANEL, axis=1))}
     assert drawn == {row for row, _ in ultrasound_panel.ruler_ticks(drawn_with, box)}
 
 
-@pytest.mark.parametrize("side", ["left", "right"])
-def test_marker_dot_is_on_the_marked_side(side):
-    picture = window_frame.backdrop(LAYOUT, Panel(("CT",), 40.0, 60.0, marked_side=side))
-    box = LAYOUT.picture_boxes(1, 40.0, 60.0)[0]
-    columns = np.flatnonzero(np.any(np.all(picture == ultrasound_panel.MARK, axis=2), axis=0))
-    middle = (box.left + box.right) / 2
-    assert len(columns) > 0
-    assert np.all(columns < middle) if side == "left" else np.all(columns > middle)
-
-
-def test_unknown_marked_side_is_refused():
-    with pytest.raises(ValueError, match="marked_side"):
-        window_frame.backdrop(LAYOUT, Panel(("CT",), 40.0, 60.0, marked_side="top"))
+def test_marker_dot_is_on_the_right():
+    page = background_image.backdrop(LAYOUT, ct_view())
+    box = LAYOUT.image_boxes(1, 40.0, 60.0)[0]
+    columns = np.flatnonzero(np.any(np.all(page == ultrasound_panel.MARK, axis=2), axis=0))
+    assert len(columns) > 0 and np.all(columns > (box.left + box.right) / 2)
 
 
 def test_parts_of_the_window_do_not_overlap():
@@ -96,11 +94,11 @@ def test_parts_of_the_window_do_not_overlap():
 
 def test_readouts_and_status_change_the_picture():
     assert np.any(
-        window_frame.readout_picture(LAYOUT, {"Step": "9 ms"})
-        != window_frame.readout_picture(LAYOUT, {"Step": "8 ms"})
+        background_image.readout_image(LAYOUT, {"Step": "9 ms"})
+        != background_image.readout_image(LAYOUT, {"Step": "8 ms"})
     )
-    plain = window_frame.backdrop(LAYOUT, Panel(("CT",), 40.0, 60.0))
-    frozen = window_frame.backdrop(LAYOUT, Panel(("CT",), 40.0, 60.0, status="FROZEN"))
+    plain = background_image.backdrop(LAYOUT, ct_view())
+    frozen = background_image.backdrop(LAYOUT, ct_view(status="FROZEN"))
     changed = np.argwhere(np.any(plain != frozen, axis=2))
     assert len(changed) > 0 and changed[:, 1].min() > LAYOUT.panel.left
 
@@ -116,9 +114,7 @@ PLANNING = "PLANNING   43 %, some 18 min left; Backspace stops"
 def test_a_status_is_as_large_as_it_can_be_in_the_panel(size, status):
     layout = WindowLayout(*size)
     plain, with_status = (
-        window_frame.backdrop(layout, Panel(("CT",), 40.0, 60.0, status=each))[:, layout.panel.left :].astype(
-            int
-        )
+        background_image.backdrop(layout, ct_view(status=each))[:, layout.panel.left :].astype(int)
         for each in ("", status)
     )
     columns = np.flatnonzero(np.any(plain != with_status, axis=(0, 2)))

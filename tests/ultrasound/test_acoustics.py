@@ -7,13 +7,14 @@ from ultrasound.acoustics import (
     ATTENUATION,
     BACKSCATTER,
     CORTEX_DB,
+    FAT_BELOW_HU,
     IMPEDANCE,
+    STONE_ABOVE_MEDIAN_HU,
     TissueError,
     impedance_of_hu,
     properties,
     tissue_table,
 )
-from ultrasound.tissue_classification import FAT_BELOW_HU, STONE_ABOVE_MEDIAN_HU
 
 TISSUES = [name for name in tissue_table() if name != "hounsfield"]
 # Of contrast agent in the corticomedullary phase, far above what density makes of it.

@@ -14,12 +14,11 @@ from sim.body import BodyState
 from sim.device import start
 from sim.embedding import Embedding, Unmoved
 from sim.fields import array_of, fill
-from ultrasound.bmode import BMode
-from ultrasound.image_plane import PlaneInTissue
-from ultrasound.point_spread import MAX_HALF_WIDTH, axial_sd_mm, elevation_sd_mm, lateral_sd_mm
+from ultrasound.bmode import MAX_HALF_WIDTH, BMode
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import image_plane, pose_at
 from ultrasound.sampled_volume import SampledVolume
+from ultrasound.scanner import PlaneInTissue
 
 LINES, SAMPLES, PIXELS = 192, 640, 256
 TISSUE, FAT, GAS, STONE = 1.62, 1.38, 4e-4, 6.0
@@ -167,8 +166,8 @@ def test_the_echo_of_an_interface_has_its_reflection_and_depth(request, size, ti
         # voxel widens it by 1 / sqrt(6). One line is off by up to an SD of the pulse, square to the interface.
         nearer = REFLECTION * np.hypot(blur, tank.voxel_mm / np.sqrt(6)) / np.sqrt(np.pi) / cosine
         off = found - depth + u[lines] * np.tan(np.radians(tilt)) + nearer
-        assert abs(off.mean()) < 0.02 and np.abs(off).max() < axial_sd_mm(probe) / cosine
-        assert width == pytest.approx(axial_sd_mm(probe), rel=1e-3)
+        assert abs(off.mean()) < 0.02 and np.abs(off).max() < probe.axial_sd_mm / cosine
+        assert width == pytest.approx(probe.axial_sd_mm, rel=1e-3)
         # Equal impedance reflects nothing.
         tank.fill(TISSUE, interface(0.1, 1.0, blur, tilt, depth))
         assert tank.look(probe).max() < SILENT_DB
@@ -194,7 +193,7 @@ def test_the_echo_of_an_interface_is_attenuated_by_the_tissue_before_it(fine, be
     wanted = REFLECTION * 10 ** (-0.2 * before * probe.frequency_mhz * 40.0 / 20)
     # As at normal incidence above; and depth, to an SD of the pulse, counts by the round trip's loss.
     assert amplitude == pytest.approx(wanted, rel=0.015 + 0.2 * before * probe.frequency_mhz / 8.69 * 0.0872)
-    assert np.abs(found - 40.0).max() < axial_sd_mm(probe)
+    assert np.abs(found - 40.0).max() < probe.axial_sd_mm
 
 
 @pytest.mark.parametrize("within, more", [(FAT, 0.0), (GAS, 0.0), (STONE, 1.5)], ids=["fat", "gas", "stone"])
@@ -248,8 +247,8 @@ def test_a_wire_is_drawn_as_wide_as_the_focus_makes_it(endless, focus_percent, t
     axial = 2 * 1.54 / 7.5 / 2 / FWHM
     u = probe.scanlines()[0][:, 0] - probe.scanlines()[0][LINES // 2, 0]
     profile = (u == 0).astype(float) if thin else np.exp(-0.5 * (u / axial) ** 2)
-    fill((endless.bmode.scanlines.real, np.repeat(profile[:, None], SAMPLES, axis=1)))
-    endless.bmode.scanlines.imaginary.fill(0.0)
+    fill((endless.bmode.real, np.repeat(profile[:, None], SAMPLES, axis=1)))
+    endless.bmode.imaginary.fill(0.0)
     endless.bmode._spread()
     for depth in (8.0, 16.0, 32.0, 56.0, 72.0):
         line = array_of(endless.bmode.decibel)[:, int(depth / 0.125)].astype(float)
@@ -278,8 +277,8 @@ def test_speckle_is_rayleigh(endless, detail_level):
     probe = probe_of()
     endless.fill(backscatter=0.1)
     # Four SD apart intensities correlate by exp(-8).
-    along = int(4 * axial_sd_mm(probe) / 0.125) + 1
-    across = int(4 * lateral_sd_mm(probe, depths(probe)).max() / (40.0 / LINES)) + 1
+    along = int(4 * probe.axial_sd_mm / 0.125) + 1
+    across = int(4 * probe.lateral_sd_mm(depths(probe)).max() / (40.0 / LINES)) + 1
     amplitude = 10 ** (endless.look(probe, detail_level, (3.0, 7.0, 0.4))[::across, ::along].ravel() / 20)
     assert len(amplitude) > 2000
     scale = np.sqrt((amplitude**2).mean() / 2)
@@ -312,7 +311,7 @@ def test_speckle_correlates_as_the_point_spread_function_does(endless):
     # Noise held over an entry correlates by chords of that, 0.04 off; 3000 cells of its block leave an SD of 0.02.
     for axis, first, last in ((2, 0, SAMPLES), (1, 40, 160), (1, 200, 310), (1, 500, 620)):
         field = np.moveaxis(intensity[..., first:last], axis, 0)
-        width = lateral_sd_mm(probe, depths(probe)[first:last]) if axis == 1 else axial_sd_mm(probe)
+        width = probe.lateral_sd_mm(depths(probe)[first:last]) if axis == 1 else probe.axial_sd_mm
         step = 40.0 / LINES if axis == 1 else probe.sample_mm
         for lag in range(1, 7):
             correlation = (field[lag:] * field[:-lag]).mean() / (field**2).mean()
@@ -386,7 +385,7 @@ def test_tracked_speckle_moves_as_the_tissue_does(moved, across, along, shear):
 def test_a_target_off_the_plane_is_dimmed_as_the_thick_plane_weighs_it():
     probe, thickness = probe_of(elevation_width_mm=4.0), 4.0 / FWHM
     tank = Tank((BOUNDLESS, BOUNDLESS, 0.05), (1, 1, 321), (0, 0, -8.0))
-    assert elevation_sd_mm(probe) == pytest.approx(thickness)
+    assert probe.elevation_sd_mm == pytest.approx(thickness)
     tank.fill(backscatter=0.1)
     uniform = tank.look(probe, "elevation")
     for off in (0.0, 0.6, 1.0, 1.2, 2.0):

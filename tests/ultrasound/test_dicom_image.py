@@ -169,22 +169,6 @@ def test_uids_are_random_and_never_the_same(tmp_path):
     assert {uuid.UUID(int=int(uid[5:])).version for uid in uids} == {4}
 
 
-@pytest.mark.parametrize(
-    "picture", [PICTURE.astype(np.float32), np.stack([PICTURE] * 3, axis=2), np.empty((0, 7), np.uint8)]
-)
-def test_what_is_no_grey_picture_is_refused(tmp_path, picture):
-    with pytest.raises(ValueError, match=r"expected uint8 \(rows, columns\)"):
-        save_dicom(tmp_path / "picture.dcm", picture, SPACING_MM)
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("spacing_mm", [(0.0, 1.0), (1.0, -0.1), (np.nan, 1.0), (1.0, np.inf), (1.0,)])
-def test_a_spacing_that_is_no_length_is_refused(tmp_path, spacing_mm):
-    with pytest.raises(ValueError, match="expected the distances of rows and of columns in mm"):
-        save_dicom(tmp_path / "picture.dcm", PICTURE, spacing_mm)
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_place_that_cannot_be_written_is_an_os_error_of_one_line(tmp_path):
     with pytest.raises(OSError, match=r"^[^\n]*missing[^\n]*$"):
         save_dicom(tmp_path / "missing" / "picture.dcm", PICTURE, SPACING_MM)

@@ -10,12 +10,10 @@ from conftest import rotation_about
 from rehearsal.coordinates import probe_in_patient
 from sim.embedding import Unmoved
 from sim.fields import fill
-from ultrasound.ground_truth_labels import GroundTruthLabels
-from ultrasound.image_plane import ImagePlane, PlaneInTissue
 from ultrasound.probe import load_probe
-from ultrasound.probe_manipulator import image_plane, pose_at
+from ultrasound.probe_manipulator import ImagePlane, image_plane, pose_at
 from ultrasound.sampled_volume import distance_volume
-from ultrasound.scanner import ScannedAnatomy, Scanner
+from ultrasound.scanner import GroundTruthLabels, PlaneInTissue, ScannedAnatomy, Scanner
 from ultrasound.sweep import PixelLabel
 
 PIXELS = 120

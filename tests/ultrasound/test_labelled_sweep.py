@@ -27,11 +27,17 @@ from sim.embedding import Unmoved
 from sim.signed_distance import signed_distance
 from studies.freehand.freehand_sweeps import sweep_of
 from ultrasound import reconstruction
-from ultrasound.labelled_sweep import LABELS_SUFFIX, SUFFIX, LabelledSweep, read_ground_truth
 from ultrasound.probe import load_probe
 from ultrasound.probe_manipulator import image_plane, pose_at, pose_of_image_plane
 from ultrasound.sweep import PixelLabel, SweepError
-from ultrasound.sweep_file import read_sweep, write_sweep
+from ultrasound.sweep_file import (
+    LABELS_SUFFIX,
+    SUFFIX,
+    LabelledSweep,
+    read_ground_truth,
+    read_sweep,
+    write_sweep,
+)
 from version import VERSION
 
 SPINE, NWIRE = "SpinePhantomFreehand", "NwirePhantomFreehand"
@@ -59,8 +65,8 @@ def recording(pixels: int = 24) -> tuple[SimpleNamespace, SimpleNamespace]:
     )
     rehearsal.image_plane = lambda: image_plane(rehearsal.pose, rehearsal.size_mm[2], *probe.extent_mm)
     draw = np.random.default_rng(5)
-    view = SimpleNamespace(pictures={"B-mode": draw.integers(0, 256, (pixels, pixels), np.uint8), "CT": None})
-    marks = SimpleNamespace(render=lambda: view.pictures["B-mode"] % 3)
+    view = SimpleNamespace(images={"B-mode": draw.integers(0, 256, (pixels, pixels), np.uint8), "CT": None})
+    marks = SimpleNamespace(render=lambda: view.images["B-mode"] % 3)
     rehearsal.scanner = SimpleNamespace(ground_truth=marks)
     return rehearsal, view
 
@@ -103,9 +109,9 @@ def test_a_recorded_sweep_gives_the_position_of_each_pixel(tmp_path):
             deep = plane.depth_mm * (1 - 1.5 / 24) - plane.above_mm
             aside = plane.width_mm * 0.5 / 24
             places.append((plane.world_from_plane @ [aside, deep, 0, 1])[:3] + rehearsal.origin)
-            pictures.append(view.pictures["B-mode"])
+            pictures.append(view.images["B-mode"])
         moved_on(rehearsal, 0.7)
-        view.pictures["B-mode"] = np.roll(view.pictures["B-mode"], 1, axis=step % 2)
+        view.images["B-mode"] = np.roll(view.images["B-mode"], 1, axis=step % 2)
     assert sweeping.toggle(tmp_path) == "sweep-001.igs.mha: 4 images"
     sweep = read_sweep(tmp_path / "sweep-001.igs.mha")
     assert np.array_equal(sweep.images, pictures)
@@ -170,7 +176,7 @@ def test_a_sweep_without_frames_or_ct_leaves_words_and_no_file(tmp_path):
 def test_a_full_disk_ends_a_sweep_in_words_and_leaves_nothing(tmp_path, marks_too, bytes_to_a_file):
     rehearsal, view = recording(pixels=256)
     if marks_too:
-        rehearsal.scanner.ground_truth.render = lambda: view.pictures["B-mode"]
+        rehearsal.scanner.ground_truth.render = lambda: view.images["B-mode"]
     sweeping = Recording(rehearsal)
     sweeping.toggle(tmp_path)
     with bytes_to_a_file(150_000):
@@ -188,7 +194,7 @@ def test_a_picture_of_another_size_ends_a_sweep_with_what_there_is(tmp_path):
     sweeping = Recording(rehearsal)
     sweeping.toggle(tmp_path)
     sweeping.watch(0.0, view, rehearsal.probe)
-    view.pictures["B-mode"] = np.zeros((8, 8), np.uint8)
+    view.images["B-mode"] = np.zeros((8, 8), np.uint8)
     said = sweeping.watch(1.0, view, rehearsal.probe)
     assert said.startswith("sweep-001.igs.mha: 1 images: frame 1: image of uint8 (8, 8)")
     assert len(read_sweep(tmp_path / "sweep-001.igs.mha")) == len(
@@ -199,7 +205,7 @@ def test_a_picture_of_another_size_ends_a_sweep_with_what_there_is(tmp_path):
 def test_both_files_or_none(tmp_path):
     rehearsal, view = recording()
     sweep = LabelledSweep(tmp_path, "s", rehearsal.probe)
-    picture = view.pictures["B-mode"]
+    picture = view.images["B-mode"]
     sweep.add(picture, picture % 3, rehearsal.probe, probe_in_patient(rehearsal), 0.0)
     # The pictures find a folder where their file should be.
     (tmp_path / "s.igs.mha").mkdir()

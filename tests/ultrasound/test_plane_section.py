@@ -6,8 +6,8 @@ import trimesh
 from conftest import rotation_about
 from scipy.spatial.distance import cdist
 
-from ultrasound.image_plane import plane_section
 from ultrasound.probe_manipulator import image_plane, pose_at
+from ultrasound.scanner import plane_section
 
 RADIUS = 12.0
 

@@ -7,7 +7,7 @@ from test_bmode import LINES, flat_tank, probe_of
 
 from sim.device import start
 from sim.fields import array_of
-from ultrasound.point_spread import HALF_WIDTH_SD, MAX_HALF_WIDTH, axial_sd_mm, lateral_sd_mm, lateral_weights
+from ultrasound.bmode import HALF_WIDTH_SD, MAX_HALF_WIDTH, lateral_weights
 from ultrasound.probe import Probe
 
 GEOMETRIES = {
@@ -26,7 +26,7 @@ def probe(request) -> Probe:
 
 def width_lines(probe: Probe, depth_mm: float) -> float:
     """What a line's neighbours add to the noise's own width at a depth, as an SD in lines."""
-    more = lateral_sd_mm(probe, depth_mm) ** 2 - axial_sd_mm(probe) ** 2
+    more = probe.lateral_sd_mm(depth_mm) ** 2 - probe.axial_sd_mm**2
     return np.sqrt(more) / probe.line_spacing_mm(np.array([depth_mm]))[0]
 
 
@@ -49,7 +49,7 @@ def test_the_speckle_gain_restores_the_mean_square_of_noise(probe):
     for sample in (0, 20, 40, 63):
         apart = (lines[:, None] - lines) * probe.line_spacing_mm(np.array([sample + 0.5]))[0]
         # Noise of the axial width: of white one through a Gaussian of SD s, exp(-d^2 / 4 s^2).
-        correlation = np.exp(-(apart**2) / (4 * axial_sd_mm(probe) ** 2))
+        correlation = np.exp(-(apart**2) / (4 * probe.axial_sd_mm**2))
         mean_square = weights[:, sample] @ correlation @ weights[:, sample]
         assert speckle_gain[sample] ** 2 * mean_square == pytest.approx(1.0)
 
@@ -61,9 +61,7 @@ def test_lines_are_spread_by_all_weights_and_mirrored_at_the_arrays_ends():
     found = tank.look(probe, "speckle") - probe.gain_db()
     weights, half, speckle_gain = lateral_weights(probe)
     assert half.max() > 8 and np.ptp(half) > 4
-    real, imaginary = (
-        array_of(each).astype(float) for each in (tank.bmode.scanlines.real, tank.bmode.scanlines.imaginary)
-    )
+    real, imaginary = (array_of(each).astype(float) for each in (tank.bmode.real, tank.bmode.imaginary))
     ti.reset()
     lines = np.arange(LINES)
     echo = np.zeros(real.shape, complex)

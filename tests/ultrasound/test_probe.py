@@ -12,7 +12,6 @@ from test_bmode import (
     GEOMETRIES,
     LINES,
     PIXELS,
-    SAMPLES,
     SILENT_DB,
     TISSUE,
     Tank,
@@ -79,7 +78,7 @@ WRONG = {
     ),
     "a slider too few": (
         GOOD + f"TimeGainCompensation = {[50.0] * 7}\n",
-        "TimeGainCompensation has 7 values: expected 8",
+        "TimeGainCompensation = .*: tuple should have at least 8 items",
     ),
     "a slider beyond": (
         GOOD + f"TimeGainCompensation = {[50.0] * 7 + [101.0]}\n",
@@ -88,7 +87,7 @@ WRONG = {
     "no depth": (GOOD + "DepthMm = nan\n", "DepthMm = nan"),
     "a flat housing": (
         GOOD + "HousingMm = [40.0, 0.0, 20.0]\n",
-        r"HousingMm = \[40.0, 0.0, 20.0\]: expected three positive",
+        "HousingMm.1 = 0.0: input should be greater than 0",
     ),
     "a sector of no angle": (GOOD + 'TransducerGeometry = "PHASED"\n', "ThetaStartDeg < 0 < ThetaStopDeg"),
     "a curve of no radius": (
@@ -305,7 +304,7 @@ def test_gain_and_its_course_over_depth_are_added(tank):
 
 def test_a_probe_of_other_lines_or_samples_is_refused(tank):
     for other in (probe_of(number_of_scanlines=128), probe_of(number_of_samples_per_scanline=320)):
-        with pytest.raises(ValueError, match=f"made for {LINES} of {SAMPLES}"):
+        with pytest.raises(ValueError, match="for a field of shape"):
             tank.look(other)
     with pytest.raises(ValueError, match="multiple of 16"):
         probe_of(number_of_samples_per_scanline=648)

@@ -194,7 +194,7 @@ def test_normals_count_by_a_gaussian_of_their_distance(manipulator):
 
 def test_tilts_end_where_a_hand_does(manipulator):
     manipulator.turn(500, -500, 500)
-    assert manipulator.turn_deg == pytest.approx([60, -60, 500])
+    assert manipulator.state.turn_deg == pytest.approx([60, -60, 500])
 
 
 def test_a_curved_face_touches_where_its_arc_does():
@@ -223,7 +223,7 @@ def test_the_tool_of_a_curved_array_is_its_arc_to_a_tenth_of_a_millimetre(one_de
 
 def test_a_probe_of_short_housing_is_not_pushed_in_beyond_what_holds_it(manipulator):
     manipulator.push(100.0)
-    assert manipulator.depth_mm == manipulator.max_mm == 15.0
+    assert manipulator.state.depth_mm == manipulator.max_mm == 15.0
     short = ProbeManipulator(
         manipulator.vertices,
         manipulator.faces,
@@ -233,18 +233,18 @@ def test_a_probe_of_short_housing_is_not_pushed_in_beyond_what_holds_it(manipula
         manipulator.lateral,
     )
     short.push(100.0)
-    assert short.depth_mm == 9.0
+    assert short.state.depth_mm == 9.0
 
 
 def test_the_depth_of_a_press_follows_its_share(manipulator):
     for share, depth in ((0.4, 6.0), (0.8, 12.0), (0.2, 3.0)):
         for _ in range(20):
             manipulator.press(True, 0.1, share)
-        assert manipulator.pressed_mm == pytest.approx(depth)
+        assert manipulator.state.pressed_mm == pytest.approx(depth)
     manipulator.press(True, 0.1, 1.0)
-    assert manipulator.pressed_mm == pytest.approx(3.0 + 1.2)
+    assert manipulator.state.pressed_mm == pytest.approx(3.0 + 1.2)
     manipulator.press(True, 0.1, 0.0)
-    assert manipulator.pressed_mm == pytest.approx(4.2 - 4.0)
+    assert manipulator.state.pressed_mm == pytest.approx(4.2 - 4.0)
 
 
 RADIUS = 30.0
@@ -305,4 +305,4 @@ def test_a_slide_goes_over_the_surface_not_with_the_depth(rider):
     rider.push(4.0)
     rider.turn(20.0, -10.0, 0.0)
     assert np.linalg.norm(slid(rider, 5.0, 5.0)) == pytest.approx(RADIUS, abs=0.03)
-    assert (rider.depth_mm, tuple(rider.turn_deg)) == (4.0, (20.0, -10.0, 0.0))
+    assert (rider.state.depth_mm, tuple(rider.state.turn_deg)) == (4.0, (20.0, -10.0, 0.0))

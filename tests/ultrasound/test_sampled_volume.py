@@ -8,8 +8,7 @@ import trimesh
 from conftest import rotation_about
 
 from sim.fields import array_of, fill
-from ultrasound.image_plane import LANES, Lanes
-from ultrasound.sampled_volume import SampledVolume, distance_volume
+from ultrasound.sampled_volume import LANES, Lanes, SampledVolume, distance_volume
 
 
 def test_a_volume_of_vectors_is_sampled_as_each_of_its_parts(device):

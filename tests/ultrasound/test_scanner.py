@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import rotation_about
+from slicing import hounsfield
 
 from sim.embedding import Unmoved
 from sim.fields import array_of
 from ultrasound.acoustics import CORTEX_DB
-from ultrasound.image_plane import ImagePlane
 from ultrasound.probe import Probe
-from ultrasound.probe_manipulator import image_plane, pose_at
+from ultrasound.probe_manipulator import ImagePlane, image_plane, pose_at
 from ultrasound.scanner import CT, ScannedAnatomy, Scanner, start_acoustics
 
 PIXELS, RADIUS, REACH = 64, 12.0, 20.0
@@ -64,7 +64,7 @@ def test_voxels_are_measured_along_their_own_axes(spacing):
 def test_the_slice_is_windowed_as_asked_for(device):
     scanner = Scanner(anatomy(), Unmoved(), PROBE, PIXELS)
     picture = scanner.images(plane_at(), PROBE, "ct", "speckle", 400.0, 20.0)[CT]
-    wanted = np.clip((scanner.slice.hounsfield().astype(float) - 20.0) / 400.0 + 0.5, 0, 1) * 255
+    wanted = np.clip((hounsfield(scanner).astype(float) - 20.0) / 400.0 + 0.5, 0, 1) * 255
     assert np.ptp(wanted) > 50 and np.abs(picture - wanted).max() <= 0.51
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_sweep import PIXELS, SCALED, file_of, written
 
-from ultrasound.sweep import SweepError, load_constants, transform_text
+from ultrasound.sweep import SweepError, load_constants, transform_fields, transform_text
 from ultrasound.sweep_file import SweepWriter, read_sweep
 
 SQUEEZED = zlib.compress(bytes(12))
@@ -107,8 +107,8 @@ def test_after_an_exception_all_is_as_before(tmp_path):
         yield PIXELS[0]
         raise RuntimeError("stop")
 
-    with pytest.raises(RuntimeError, match="stop"), SweepWriter(path) as writer:
-        list(map(writer.add, images(), [{}], [0.0]))
+    with pytest.raises(RuntimeError, match="stop"), SweepWriter(path, {}) as writer:
+        list(map(writer.append, images(), [{}, {}]))
     assert [each.name for each in tmp_path.iterdir()] == [path.name]
     assert path.read_text() == "what stood here"
 
@@ -121,44 +121,46 @@ def test_a_file_that_cannot_be_put_in_place_leaves_nothing(tmp_path):
 
 
 def test_a_sweep_without_frames_is_none(tmp_path):
-    with pytest.raises(SweepError, match="without frames"), SweepWriter(tmp_path / "a.igs.mha"):
+    with pytest.raises(SweepError, match="without frames"), SweepWriter(tmp_path / "a.igs.mha", {}):
         pass
     assert not list(tmp_path.iterdir())
 
 
 REFUSED = {
-    "of floats": ((PIXELS[0] / 2, {}, 0.0), "image of float64"),
-    "of colours": ((PIXELS, {}, 0.0), r"image of uint8 \(2, 3, 4\): expected"),
-    "empty": ((PIXELS[0, :0], {}, 0.0), "image of uint8"),
-    "of another size": ((PIXELS[0, :2], {}, 0.0), r"expected uint8 \(3, 4\)"),
-    "time": ((PIXELS[0], {}, np.nan), "time nan"),
-    "name": ((PIXELS[0], {"Probe": SCALED}, 0.0), "'Probe': expected a name such as"),
-    "no affine": ((PIXELS[0], {"AToB": SCALED[:3]}, 0.0), "expected sixteen finite numbers"),
-    "not finite": ((PIXELS[0], {"AToB": SCALED * np.nan}, 0.0), "expected sixteen finite numbers"),
-    "two lines": ((PIXELS[0], {}, 0.0, {"Note": "a\nDimSize = 1 1 1"}), "expected one line"),
-    "equals": ((PIXELS[0], {}, 0.0, {"a=b": "c"}), "no = in the name"),
-    "beyond Latin-1": ((PIXELS[0], {}, 0.0, {"Note": "\u03bcm"}), "beyond Latin-1"),
+    "of floats": ((PIXELS[0] / 2, {}), "image of float64"),
+    "of colours": ((PIXELS, {}), r"image of uint8 \(2, 3, 4\): expected"),
+    "empty": ((PIXELS[0, :0], {}), "image of uint8"),
+    "of another size": ((PIXELS[0, :2], {}), r"expected uint8 \(3, 4\)"),
+    "two lines": ((PIXELS[0], {"Note": "a\nDimSize = 1 1 1"}), "expected one line"),
+    "equals": ((PIXELS[0], {"a=b": "c"}), "no = in the name"),
+    "beyond Latin-1": ((PIXELS[0], {"Note": "\u03bcm"}), "beyond Latin-1"),
 }
 
 
 @pytest.mark.parametrize("arguments, words", REFUSED.values(), ids=REFUSED.keys())
 def test_a_frame_refused_leaves_the_others(tmp_path, arguments, words):
-    with SweepWriter(tmp_path / "a.igs.mha") as writer:
-        writer.add(PIXELS[0], {}, 1.0)
+    with SweepWriter(tmp_path / "a.igs.mha", {}) as writer:
+        writer.append(PIXELS[0], {"A": "b"})
         with pytest.raises(SweepError, match=words):
-            writer.add(*arguments)
+            writer.append(*arguments)
     sweep = read_sweep(tmp_path / "a.igs.mha")
     assert len(sweep) == 1
     assert np.array_equal(sweep.images, PIXELS[:1])
 
 
+@pytest.mark.parametrize("matrix", [SCALED[:3], SCALED * np.nan])
+def test_what_is_no_transform_is_not_written(matrix):
+    with pytest.raises(SweepError, match="expected sixteen finite numbers"):
+        transform_fields("AToB", matrix)
+
+
 def test_a_frame_beyond_the_limit_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("ultrasound.sweep_file.PIXEL_LIMIT", 30)
-    with SweepWriter(tmp_path / "a.igs.mha") as writer:
-        writer.add(None, {}, 0.0)
-        writer.add(PIXELS[0], {}, 1.0)
+    with SweepWriter(tmp_path / "a.igs.mha", {}) as writer:
+        for _ in range(2):
+            writer.append(PIXELS[0], {"A": "b"})
         with pytest.raises(SweepError, match="frame 2: more than 30 bytes"):
-            writer.add(None, {}, 2.0)
+            writer.append(PIXELS[0], {"A": "b"})
     assert len(read_sweep(tmp_path / "a.igs.mha")) == 2
 
 

@@ -7,8 +7,17 @@ import pytest
 from scipy import ndimage
 
 from scenes.patients import import_warnings
-from ultrasound.acoustics import ATTENUATION, IMPEDANCE, properties, tissue_table
-from ultrasound.tissue_classification import STONE_ABOVE_MEDIAN_HU, _filled, bones, classify_tissues, enclosed
+from ultrasound.acoustics import (
+    ATTENUATION,
+    IMPEDANCE,
+    STONE_ABOVE_MEDIAN_HU,
+    _filled,
+    bones,
+    classify_tissues,
+    enclosed,
+    properties,
+    tissue_table,
+)
 
 SPACING = np.array([0.9, 0.9, 0.9])
 FAT, MARROW, SHELL, CORTEX, BLOOD = -100.0, 150.0, 600.0, 180.0, 200.0

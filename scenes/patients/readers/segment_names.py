@@ -35,7 +35,7 @@ SIDE_OF_NAME: tuple[tuple[Side, str], ...] = (
 
 
 def tissue_of(name: str) -> str | None:
-    """The tissue of ``ultrasound/tissues.toml`` that a name means, or None."""
+    """The tissue of ``ultrasound/acoustic_tissues.toml`` that a name means, or None."""
     plain = _plain(name)
     found = next((tissue for tissue, pattern in TISSUE_OF_NAME if re.search(pattern, plain)), "")
     return found or None
