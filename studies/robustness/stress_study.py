@@ -183,10 +183,12 @@ def _apply(specimen: Specimen, case: StressCase, extremes: Extremes) -> None:
         specimen.solver.contacts.reset()
     _set_material(specimen, case.heaviest, case.material)
     motion, *numbers = case.probe
-    path = PROBES[motion](specimen.home, specimen.thickness_mm, dt, *numbers)
+    pose_at = PROBES[motion]
     within = np.linspace(0.0, 1.0, settings.substeps + 1)
     for step in range(max(LEAST_STEPS, round(LEAST_S / dt))):
-        extremes.advance(settings, np.stack([path(float(t)) for t in dt * (step + within)]))
+        extremes.advance(
+            settings, np.stack([pose_at(float(t), specimen, dt, *numbers) for t in dt * (step + within)])
+        )
         extremes.record()
     _set_material(specimen, 1.0, {})
 

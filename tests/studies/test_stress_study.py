@@ -2,6 +2,7 @@
 
 import csv
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -47,15 +48,14 @@ def test_initial_states_and_motions_match_their_names():
     two = np.concatenate([x - [9, 0, 0], x + [9, 0, 0]])
     wholly = STATES["overlapped"](two, up, 1.0)[0]
     assert wholly[50:].mean(axis=0) == pytest.approx(wholly[:50].mean(axis=0))
-    press = PROBES["press"](home, 30.0, 1 / 60, 12.0)
-    assert press(0.0) == pytest.approx(home)
-    assert press(10.0) == pytest.approx(advanced(home, 12.0))
-    flat = PROBES["flat"](home, 30.0, 1 / 60, -2.0)
-    assert flat(10.0) == pytest.approx(advanced(home, 32.0))
-    sweep = PROBES["sweep"](home, 30.0, 1 / 60, 1000.0, 5.0)
-    assert np.linalg.norm(sweep(0.11)[:3, 3] - sweep(0.10)[:3, 3]) == pytest.approx(10.0)
-    spin = PROBES["spin"](home, 30.0, 1 / 60, 10.0, 2)
-    assert spin(0.1)[:3, :3] == pytest.approx(rotation_about([0, 0, 1], np.degrees(1.0)))
+    body, dt = SimpleNamespace(home=home, thickness_mm=30.0), 1 / 60
+    assert PROBES["press"](0.0, body, dt, 12.0) == pytest.approx(home)
+    assert PROBES["press"](10.0, body, dt, 12.0) == pytest.approx(advanced(home, 12.0))
+    assert PROBES["flat"](10.0, body, dt, -2.0) == pytest.approx(advanced(home, 32.0))
+    first, last = (PROBES["sweep"](t, body, dt, 1000.0, 5.0) for t in (0.10, 0.11))
+    assert np.linalg.norm(last[:3, 3] - first[:3, 3]) == pytest.approx(10.0)
+    spun = PROBES["spin"](0.1, body, dt, 10.0, 2)
+    assert spun[:3, :3] == pytest.approx(rotation_about([0, 0, 1], np.degrees(1.0)))
 
 
 @pytest.mark.parametrize("model", MODELS)
