@@ -1,6 +1,6 @@
 """The table, the files and the figure that a study leaves."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -21,11 +21,13 @@ def text_table(headers: Sequence[str], rows: Sequence[Sequence[Any]], formats: S
     return tabulate(rows, headers, tablefmt="plain", floatfmt=formats or "g", missingval="")
 
 
-def table_of(columns: Mapping[str, str], rows: Iterable[Mapping[str, Any]]) -> str:
-    """Aligned columns: under each header a format of a row's values, such as "{ms:.2f}"; empty where that value is None."""
-    cells = [[_formatted(form, row) for form in columns.values()] for row in rows]
-    sides = ["right" if ":" in form else "left" for form in columns.values()]
-    return tabulate(cells, list(columns), tablefmt="plain", disable_numparse=True, colalign=sides)
+def table_of(columns: Collection[tuple[str, str]], rows: Iterable[Mapping[str, Any]]) -> str:
+    """Aligned columns: under each header (first of a pair) a format of a row's values, such as "{ms:.2f}"; empty where that value is None."""
+    cells = [[_formatted(form, row) for _, form in columns] for row in rows]
+    sides = ["right" if ":" in form else "left" for _, form in columns]
+    return tabulate(
+        cells, [header for header, _ in columns], tablefmt="plain", disable_numparse=True, colalign=sides
+    )
 
 
 def _formatted(form: str, row: Mapping[str, Any]) -> str:

@@ -277,7 +277,7 @@ def _added(row: dict[str, Any], name: str) -> float | None:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """What each feature adds: time of a step or of a part of a frame, memory, parallel kernels and their launches."""
-    return table_of(COLUMNS, [row | {name: _added(row, name) for name in MEASURED} for row in rows])
+    return table_of(COLUMNS.items(), [row | {name: _added(row, name) for name in MEASURED} for row in rows])
 
 
 def figure_of(rows: list[dict[str, Any]]) -> Figure:

@@ -226,7 +226,7 @@ def table(cases: list[dict], sizes: list[dict]) -> str:
     """The paper's Table 5, and the blocks."""
     title = "Time of a step (ms), over warm-up and press (the paper's Table 5):"
     of_cases, of_sizes = (
-        table_of(COLUMNS, [_flat(case) | dict(size_mm=_size(case)) for case in given])
+        table_of(COLUMNS.items(), [_flat(case) | dict(size_mm=_size(case)) for case in given])
         for given in (cases, sizes)
     )
     return "\n".join([title, of_cases, "\nBlocks at rest on a plane:", of_sizes])
@@ -299,7 +299,7 @@ def _pieces(axes: Axes, presses: list[TimedPress]) -> None:
     shares = 100 * ms.div(ms.sum(axis=1), axis=0)
     names = [*BEFORE, *IN_ITERATION[False], *IN_ITERATION[True], *AFTER, "frames"]
     shown = shares[[name for name in names if shares.get(name, np.zeros(1)).max() > LEAST_SHARE]]
-    colours = [*colormaps["tab20"].colors[: shown.shape[1]], "0.8"]
+    colours = [*(colormaps["tab20"](number) for number in range(shown.shape[1])), "0.8"]
     shown = shown.assign(**{"the rest": 100 - shown.sum(axis=1)})
     shown.plot.barh(stacked=True, width=0.8, color=colours, ax=axes)
     axes.set_yticks(

@@ -199,7 +199,7 @@ def table(points: list[dict[str, Any]]) -> str:
         name = preset_of(setup) or ("the paper's" if setup in PAPER else "")
         words = ", ".join(filter(None, (stiffness, front, name)))
         rows.append(point | dict(size_mm=setup.size_mm, words=words))
-    return table_of(COLUMNS, rows)
+    return table_of(COLUMNS.items(), rows)
 
 
 def figure_of(points: list[dict[str, Any]]) -> Figure:

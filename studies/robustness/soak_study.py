@@ -165,7 +165,7 @@ def table(runs: list[dict[str, Any]]) -> str:
             f"{run['model']}: shape at most {worst:.4f} mm from the first rest; memory {run['memory_growth_mb']:+.1f} MB; "
             f"replay {same['replay']}; reset {same['reset']}; state restored {run['fallbacks']} times"
         )
-    return "\n".join([table_of(COLUMNS, rows), *lines])
+    return "\n".join([table_of(COLUMNS.items(), rows), *lines])
 
 
 def figure_of(runs: list[dict[str, Any]]) -> Figure:

@@ -265,7 +265,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             most=("volume_ratio", "max"),
         )
     )
-    return table_of(COLUMNS, found.reset_index().to_dict("records"))
+    return table_of(COLUMNS.items(), found.reset_index().to_dict("records"))
 
 
 def summary(rows: list[dict[str, Any]]) -> str:
