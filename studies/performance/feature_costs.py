@@ -35,7 +35,7 @@ from studies.harness import build, memory_mb
 from studies.study_options import open_study, out_option, scene_argument
 from studies.study_results import finish_axes, table_of, write_results
 from ultrasound.probe import DetailLevel, Mode
-from ultrasound.probe_manipulator import image_plane, poses_between
+from ultrasound.probe_manipulator import advanced, image_plane, pose_at, poses_between, touching
 from ultrasound.scanner import ScannedAnatomy, Scanner
 
 # Depth and steps of the press, and the steps before it in which the body settles.
@@ -124,7 +124,10 @@ class FeatureBody:
     def __init__(self, scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str) -> None:
         rehearsal = build(scene, anatomy, setup, arch)
         self.tissue, self.settings = rehearsal.scene.tissue, rehearsal.settings
-        self.size_mm, self.pose_at_depth = rehearsal.size_mm, rehearsal.pose_at_depth
+        self.size_mm, down = rehearsal.size_mm, rehearsal.gravity_direction
+        side = np.eye(3)[np.abs(down).argmin()]
+        pose = pose_at(np.zeros(3), down, side, self.size_mm[2])
+        self.home = touching(pose, self.size_mm, rehearsal.organ.vertices)
         meshes = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
         self.supports = [translated(mesh, -rehearsal.origin) for mesh in meshes]
         organ = rehearsal.organ
@@ -150,7 +153,7 @@ class FeatureBody:
     def poses(self, step: int) -> np.ndarray:
         """Poses of the transducer in a step of the press."""
         depth = PRESS_MM * np.clip((step + np.array([0, 1]) - SETTLE_STEPS) / PRESS_STEPS, 0, 1)
-        first, last = (self.pose_at_depth(float(mm)) for mm in depth)
+        first, last = (advanced(self.home, mm) for mm in depth)
         return poses_between(first, last, self.settings.substeps)
 
 
