@@ -22,7 +22,7 @@ from rehearsal.stopwatch import timed
 from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer, send_live
 from rehearsal.tracking.sweep_recording import SweepRecorder
 from render.keys import Keys
-from render.viewer import Controls, Settings, View
+from render.viewer import Controls, ScannerSettings, Settings, View
 from render.window import Window
 from ultrasound.probe import Probe
 
@@ -257,7 +257,7 @@ def image_view(rehearsal: Rehearsal, probe: Probe, settings: Settings, tally: Ta
     )
 
 
-def captions(probe: Probe, settings: Settings) -> tuple[str, str, str]:
+def captions(probe: Probe, settings: ScannerSettings) -> tuple[str, str, str]:
     """The probe's name, and the settings of the B-mode image and of the CT."""
     b_mode = (
         f"{probe.frequency_mhz:.1f} MHz   G {probe.gain_percent:.0f} %   DR {probe.dyn_range_db:.0f} dB   "

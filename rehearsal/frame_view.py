@@ -6,7 +6,7 @@ from rehearsal.rehearsal import Rehearsal
 from render.display import window_size
 from render.gamepad import Gamepad
 from render.keys import Keys
-from render.viewer import Geometry, Settings
+from render.viewer import Geometry, ScannerSettings, Settings
 from render.window import Window
 from render.window_layout import FULL_SIZE
 from ultrasound.probe import TGC_SLIDERS, Probe
@@ -39,7 +39,7 @@ def initial_settings(rehearsal: Rehearsal) -> Settings:
     return settings
 
 
-def probe_with_settings(probe: Probe, settings: Settings) -> Probe:
+def probe_with_settings(probe: Probe, settings: ScannerSettings) -> Probe:
     """The probe with the scanner's settings."""
     low, high = probe.frequency_range_mhz
     return probe.model_copy(

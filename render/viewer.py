@@ -32,17 +32,19 @@ def _level(number: int):
 # The metadata of a setting (label, unit, low, high, group) is all that its slider is made of. One that is None or has no metadata has
 # no slider.
 @dataclass
-class Settings:
-    """What the user sets: tissue and solver, scanner, view, plan. A session records them by their names.
-
-    Each tissue model has either ``young_kpa`` or ``stiffness``.
-    """
+class TissueSettings:
+    """Settings of tissue and solver; each tissue model has one of the first two."""
 
     young_kpa: float | None = _slider(None, "Young", "kPa", 1.0, 100.0, "Tissue")
     stiffness: float | None = _slider(None, "Stiffness", "", 0.1, 1.0, "Tissue")
     iterations: int = _slider(9, "Iter.", "", 1, 40, "Tissue")
     substeps: int = _slider(3, "Substeps", "", 1, 10, "Tissue")
     gravity_m_s2: float = _slider(9.81, "g", "m/s2", 0.0, 20.0, "Tissue")
+
+
+@dataclass
+class ScannerSettings:
+    """Settings of the ultrasound scanner, and of the CT beside it."""
 
     depth_mm: int = _slider(60, "Depth", "mm", 5, 300, "Image")
     window_hu: int = _slider(350, "W", "HU", 1, 2000, "Image")
@@ -62,6 +64,11 @@ class Settings:
     mode: Mode = "both"
     detail_level: DetailLevel = "speckle"
 
+
+@dataclass
+class ViewSettings:
+    """What the window shows."""
+
     translucent: bool = _switch(True, "Translucent")
     cut: bool = _switch(False, "Cut open")
     show_tumour: bool = _switch(True, "Tumour")
@@ -71,8 +78,18 @@ class Settings:
     show_scanner: bool = False
     show_seen: bool = False
 
+
+@dataclass
+class PlanSettings:
+    """What the next plan is made for."""
+
     margin_mm: int = _slider(5, "Margin", "mm", 0, 20, "Image")
     plan_for: Target = "margin"
+
+
+@dataclass
+class Settings(PlanSettings, ViewSettings, ScannerSettings, TissueSettings):
+    """What the user sets; each part of the program is handed its own part. A session records them by their names."""
 
 
 # Vertices [mm], a Taichi field (n,) where they move and an array (n, 3) where they do not, and triangles, normals outward, int32 (m, 3).

@@ -1,8 +1,7 @@
-"""What the studies share: a rehearsal built with a setup, driven by an input step by step, and watched."""
+"""What the studies share: a rehearsal built with a setup, and what is measured of it."""
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import psutil
@@ -11,14 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from rehearsal.configuration import Setup, scene_of
 from rehearsal.rehearsal import Rehearsal
-from rehearsal.stopwatch import timed
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
 from sim.device import start
 from sim.fields import array_of
 from sim.solver import Solver
-
-Input = TypeVar("Input")
 
 
 def build(
@@ -34,32 +30,6 @@ def restart(solver: Solver) -> None:
     solver.body.restore(solver.body.rest_state())
     solver.contacts.reset()
     solver.model.update_frames()
-
-
-@dataclass
-class Watch:
-    """The duration of each step [ms], and the messages of the divergence check where it restored the state."""
-
-    step_ms: list[float] = field(default_factory=list)
-    restored: list[str] = field(default_factory=list)
-
-    def drive(self, advance: Callable[[Input], str], inputs: Iterable[Input]) -> Iterator[str]:
-        """Take a step for each input, and yield its message; an input may depend on the state that it finds."""
-        for each in inputs:
-            notice = timed(lambda: advance(each), self.step_ms)
-            if notice:
-                self.restored.append(notice)
-            yield notice
-
-    def rehearse(self, rehearsal: Rehearsal, poses: Iterable[np.ndarray]) -> None:
-        """Advance a rehearsal over poses (4, 4)."""
-
-        def advance(pose: np.ndarray) -> str:
-            rehearsal.advance(pose)
-            return rehearsal.notice
-
-        for _ in self.drive(advance, poses):
-            pass
 
 
 def memory_of_process_mb() -> float:

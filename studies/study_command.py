@@ -15,10 +15,10 @@ STUDIES = {
         "Measure the error of beads against the time of a step.",
     ),
     "stability": (
-        "studies.robustness.stress_test:stability",
+        "studies.robustness.stress_study:stability",
         "Stress-test the tissue and see whether it recovers.",
     ),
-    "soak": ("studies.robustness.soak_test:soak", "Rehearse for an hour in SCENE, faster than real time."),
+    "soak": ("studies.robustness.soak_study:soak", "Rehearse for an hour in SCENE, faster than real time."),
     "import": ("studies.performance.import_timing_command:intake", "Measure an import: seconds and memory."),
     "freehand": (
         "studies.freehand.freehand_accuracy:freehand",

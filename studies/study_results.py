@@ -1,6 +1,6 @@
 """The table, the files and the figure that a study leaves."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,6 +19,22 @@ DPI = 130
 def text_table(headers: Sequence[str], rows: Sequence[Sequence[Any]], formats: Sequence[str] = ()) -> str:
     """Aligned columns; ``formats`` are those of the columns' numbers, None is an empty cell."""
     return tabulate(rows, headers, tablefmt="plain", floatfmt=formats or "g", missingval="")
+
+
+def table_of(columns: Collection[tuple[str, str]], rows: Iterable[Mapping[str, Any]]) -> str:
+    """Aligned columns: under each header (first of a pair) a format of a row's values, such as "{ms:.2f}"; empty where that value is None."""
+    cells = [[_formatted(form, row) for _, form in columns] for row in rows]
+    sides = ["right" if ":" in form else "left" for _, form in columns]
+    return tabulate(
+        cells, [header for header, _ in columns], tablefmt="plain", disable_numparse=True, colalign=sides
+    )
+
+
+def _formatted(form: str, row: Mapping[str, Any]) -> str:
+    try:
+        return form.format(**row)
+    except TypeError:  # None has no format of numbers
+        return ""
 
 
 def finish_axes(

@@ -10,7 +10,7 @@ from rehearsal.sessions.recorder import SessionRecorder
 from rehearsal.sessions.replay import set_solver
 from rehearsal.sessions.session import History, Session
 from rehearsal.tracking.tracked_probe import PoseSource, TrackEnded, TrackingInput
-from render.viewer import Controls, Settings
+from render.viewer import Controls, TissueSettings
 
 # A transducer that moves by no more than this in a step is at rest [mm].
 STILL_MM = 1e-3
@@ -163,7 +163,7 @@ class UserInput:
         self._show(what if done else f"Nothing to {what}")
         return done
 
-    def _set_solver(self, settings: Settings) -> None:
+    def _set_solver(self, settings: TissueSettings) -> None:
         self._iterations_set = settings.iterations
         values = dict(
             iterations=self.adaptive_iterations.iterations(settings.iterations),

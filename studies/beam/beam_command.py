@@ -12,6 +12,7 @@ from tqdm import tqdm
 from rehearsal.commands.command_line import make_folder, make_place, save_figures, start_taichi
 from rehearsal.result_files import save_figure
 from studies.beam.beam_comparison import check, compare, figure_of, table
+from studies.beam.cantilever import ITERATIONS, REST_RELAXATION, REST_TOLERANCE_MM, BeamMaterial, Cantilever
 from studies.beam.motion_capture import BeamError, load_captures
 from studies.study_options import number_option
 
@@ -58,14 +59,6 @@ def beam(
         make_folder(out)
     make_place(json_path)
     start_taichi("cpu")
-    from studies.beam.cantilever import (
-        ITERATIONS,
-        REST_RELAXATION,
-        REST_TOLERANCE_MM,
-        BeamMaterial,
-        Cantilever,
-    )
-
     material = BeamMaterial(young_kpa, poisson, density)
     groups = [list(group) for _, group in groupby(captures, key=lambda capture: capture.load_g)]
 
@@ -85,20 +78,20 @@ def beam(
         damping=0.0,
         rest_cell_mm=cell_mm / 2,
         rest_relaxation_factor=REST_RELAXATION,
-        rest_left_mm=max(row.rest_left_mm for row in rows),
+        rest_left_mm=max(row["rest_left_mm"] for row in rows),
     )
     click.echo(", ".join(f"{name} {value:.4g}" for name, value in settings.items()))
     click.echo(table(rows))
     for row in rows:
-        if row.rest_left_mm > REST_TOLERANCE_MM:
+        if row["rest_left_mm"] > REST_TOLERANCE_MM:
             click.echo(
-                f"{row.load_g:.0f} g: not quite at rest, it moved {row.rest_left_mm:.3f} mm in the last iterations"
+                f"{row['load_g']:.0f} g: not quite at rest, it moved {row['rest_left_mm']:.3f} mm in the last iterations"
             )
     if checked:
         for first_or_last in sorted({0, len(rows) - 1}):
-            click.echo(check(build, cell_mm, rows[first_or_last].load_g, traces[first_or_last]))
+            click.echo(check(build, cell_mm, rows[first_or_last]["load_g"], traces[first_or_last][0]))
     if json_path is not None:
-        save_figures(dict(settings=settings, loads=[asdict(row) for row in rows]), json_path)
+        save_figures(dict(settings=settings, loads=rows), json_path)
     if out is not None:
         save_figure(figure_of(groups, traces, rows), out / "beam.png", dpi=DPI)
         click.echo(f"Wrote {out / 'beam.png'}")

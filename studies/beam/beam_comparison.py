@@ -1,18 +1,16 @@
 """A clamped beam measured, from beam theory and computed by the tissue model: rows, table, figure."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from scipy.optimize import brentq
 
+from studies.beam.cantilever import ITERATIONS, BeamMaterial, Cantilever
 from studies.beam.motion_capture import BeamError, Capture, Oscillation, oscillation
-from studies.study_results import text_table
-
-if TYPE_CHECKING:
-    from studies.beam.cantilever import BeamMaterial, Cantilever
+from studies.study_results import table_of
 
 FRAME_S = 0.01
 # Computed duration, in periods of beam theory.
@@ -20,45 +18,21 @@ PERIODS = 5.0
 # The computed beam is sampled as often as the recorded one, or at least this often in a period.
 FRAMES_A_PERIOD = 10
 GRAVITY_M_S2 = 9.81
-HEADERS = (
-    "load, g",
-    "tip, measured, mm",
-    "computed",
-    "off, %",
-    "theory",
-    "first frequency, measured, Hz",
-    "computed",
-    "off, %",
-    "theory",
-    "damping ratio",
+COLUMNS = (
+    ("load, g", "{load_g:.0f}"),
+    ("tip, measured, mm", "{measured_mm:.2f} ± {measured_error_mm:.2f}"),
+    ("computed", "{computed_mm:.2f}"),
+    ("off, %", "{off_mm:+.1f}"),
+    ("theory", "{theory_mm:.2f}"),
+    ("first frequency, measured, Hz", "{measured_hz:.3f} ± {measured_error_hz:.3f}"),
+    ("computed", "{computed_hz:.3f}"),
+    ("off, %", "{off_hz:+.1f}"),
+    ("theory", "{theory_hz:.3f}"),
+    ("damping ratio", "{measured_damping_ratio:.3f}"),
 )
-FORMATS = (".0f", "", ".2f", "+.1f", ".2f", "", ".3f", "+.1f", ".3f", ".3f")
 
 
-@dataclass(frozen=True)
-class Row:
-    """Measured and computed for one load: length of the tip's final displacement [mm], first frequency [Hz].
-
-    Measurement errors cover the repeats; ``rest_left_mm`` is the change of the computed rest position when its
-    iterations were doubled.
-    """
-
-    load_g: float
-    recordings: int
-    measured_mm: float
-    measured_error_mm: float
-    computed_mm: float
-    theory_mm: float
-    measured_hz: float
-    measured_error_hz: float
-    computed_hz: float
-    theory_hz: float
-    measured_damping_ratio: float
-    computed_damping_ratio: float
-    rest_left_mm: float
-
-
-def theory(size_mm: np.ndarray, material: "BeamMaterial", load_g: float) -> tuple[float, float]:
+def theory(size_mm: np.ndarray, material: BeamMaterial, load_g: float) -> tuple[float, float]:
     """Sag [mm] of a Timoshenko cantilever, frequency [Hz] of an Euler-Bernoulli one with a mass at its tip.
 
     Small deflections, a clamped end that is free to change its width; the frequency is without shear and rotary inertia.
@@ -82,28 +56,30 @@ def theory(size_mm: np.ndarray, material: "BeamMaterial", load_g: float) -> tupl
 
 
 def compare(
-    captures: list[Capture], build: Callable[..., "Cantilever"], cell_mm: float
-) -> tuple[Row, np.ndarray]:
+    captures: list[Capture], build: Callable[..., Cantilever], cell_mm: float
+) -> tuple[dict[str, Any], np.ndarray]:
     """One load's row, and time [s] and computed height [mm] of the markers after the release, shape (2, frames).
 
-    ``build`` makes a beam from a cell width and a load; the rest position is computed on cells of half the width.
+    ``build`` makes a beam from a cell width and a load; the rest position is computed on cells of half the width. In the row are
+    lengths of the tip's final displacement [mm] and first frequencies [Hz]; measurement errors cover the repeats;
+    ``rest_left_mm`` is the change of the computed rest position when its iterations were doubled.
     """
     load_g = captures[0].load_g
     beam = build(cell_mm=cell_mm, load_g=load_g)
     sag, theory_hz = theory(beam.size_mm, beam.material, load_g)
-    rest = build(cell_mm=cell_mm / 2, load_g=load_g).rest()
+    rest_mm, rest_left_mm = build(cell_mm=cell_mm / 2, load_g=load_g).rest()
     frame_s = min(FRAME_S, 1 / (FRAMES_A_PERIOD * theory_hz))
     trace = released(beam, int(np.ceil(PERIODS / theory_hz / frame_s)), frame_s)
     computed = computed_oscillation(beam, trace)
     finals = [mean_length(capture.final_mm()) for capture in captures]
     swings = [measured_oscillation(capture) for capture in captures]
     hz = [swing.hz for swing in swings]
-    row = Row(
+    row = dict(
         load_g=load_g,
         recordings=len(captures),
         measured_mm=float(np.mean(finals)),
         measured_error_mm=float(np.ptp(finals) / 2),
-        computed_mm=mean_length(rest.displacement_mm),
+        computed_mm=mean_length(rest_mm),
         theory_mm=float(sag),
         measured_hz=float(np.mean(hz)),
         measured_error_hz=float(max(np.ptp(hz) / 2, *(swing.error_hz for swing in swings))),
@@ -111,20 +87,20 @@ def compare(
         theory_hz=float(theory_hz),
         measured_damping_ratio=float(np.mean([swing.damping_ratio for swing in swings])),
         computed_damping_ratio=computed.damping_ratio,
-        rest_left_mm=rest.left_mm,
+        rest_left_mm=rest_left_mm,
     )
     return row, trace
 
 
 def released(
-    beam: "Cantilever", frames: int, frame_s: float, finer: int = 1, iterations: int | None = None
+    beam: Cantilever, frames: int, frame_s: float, finer: int = 1, iterations: int | None = None
 ) -> np.ndarray:
     """Time [s] and mean height [mm] of the markers after a release, shape (2, frames + 1)."""
     height = beam.swing(frames, frame_s, finer * beam.substeps(frame_s), iterations)[:, :, 0].mean(axis=1)
     return np.array([frame_s * np.arange(frames + 1), height])
 
 
-def computed_oscillation(beam: "Cantilever", trace: np.ndarray) -> Oscillation:
+def computed_oscillation(beam: Cantilever, trace: np.ndarray) -> Oscillation:
     """Of a computed trace (2, frames). Raises BeamError, naming the beam."""
     try:
         return oscillation(*trace)
@@ -146,70 +122,53 @@ def measured_oscillation(capture: Capture) -> Oscillation:
         raise BeamError(f"{capture.name}: {error}") from None
 
 
-def table(rows: list[Row]) -> str:
+def table(rows: list[dict[str, Any]]) -> str:
     """Final displacement of the tip, first frequency and damping ratio of each load."""
-    lines = [
-        [
-            row.load_g,
-            f"{row.measured_mm:.2f} ± {row.measured_error_mm:.2f}",
-            row.computed_mm,
-            100 * (row.computed_mm / row.measured_mm - 1),
-            row.theory_mm,
-            f"{row.measured_hz:.3f} ± {row.measured_error_hz:.3f}",
-            row.computed_hz,
-            100 * (row.computed_hz / row.measured_hz - 1),
-            row.theory_hz,
-            row.measured_damping_ratio,
-        ]
+    off = [
+        {
+            f"off_{unit}": 100 * (row[f"computed_{unit}"] / row[f"measured_{unit}"] - 1)
+            for unit in ("mm", "hz")
+        }
         for row in rows
     ]
-    return text_table(HEADERS, lines, FORMATS)
+    return table_of(COLUMNS, [row | more for row, more in zip(rows, off, strict=True)])
 
 
-def check(build: Callable[..., "Cantilever"], cell_mm: float, load_g: float, trace: np.ndarray) -> str:
+def check(build: Callable[..., Cantilever], cell_mm: float, load_g: float, time_s: np.ndarray) -> str:
     """Convergence study: frequency against time step and iterations; frequency and rest against cells, material and load.
 
     Args:
         build: makes a beam from a cell width, a load, a material and the height at which the load hangs.
         cell_mm: cell width of motion and rest.
         load_g: at the tip.
-        trace: of ``compare``, shape (2, frames).
+        time_s: times after the release, of ``compare``, shape (frames,).
     """
-    from studies.beam.cantilever import ITERATIONS
+    frames, frame_s = len(time_s) - 1, float(time_s[1])
 
-    frames, frame_s = trace.shape[1] - 1, float(trace[0, 1])
-
-    def line(name: str, beam: "Cantilever", trace: np.ndarray, rest: bool = True) -> str:
-        sag = f"{mean_length(beam.rest().displacement_mm):8.3f} mm" if rest else " " * 11
+    def line(name: str, beam: Cantilever, rests: bool = True, **changes: int) -> str:
+        sag = f"{mean_length(beam.rest()[0]):8.3f} mm" if rests else " " * 11
+        trace = released(beam, frames, frame_s, **changes)
         return f"  {name:32s} {sag}  {computed_oscillation(beam, trace).hz:7.4f} Hz"
 
-    def changed_line(name: str, beam: "Cantilever") -> str:
-        return line(name, beam, released(beam, frames, frame_s))
-
     beam = build(cell_mm=cell_mm, load_g=load_g)
+    softer, stiffer = (replace(beam.material, poisson=poisson) for poisson in (0.45, 0.49))
     lines = [
         f"Convergence study, {load_g:.0f} g, cells of {cell_mm:g} mm:",
-        line("as above", beam, trace),
-        line("half the time step", beam, released(beam, frames, frame_s, finer=2), rest=False),
-        line(
-            "twice the iterations",
-            beam,
-            released(beam, frames, frame_s, iterations=2 * ITERATIONS),
-            rest=False,
-        ),
+        line("as above", beam),
+        line("half the time step", beam, rests=False, finer=2),
+        line("twice the iterations", beam, rests=False, iterations=2 * ITERATIONS),
+        line("Poisson's ratio 0.45", build(cell_mm, load_g, softer)),
+        line("Poisson's ratio 0.49", build(cell_mm, load_g, stiffer)),
+        line(f"0.45 on cells of {cell_mm / 2:g} mm", build(cell_mm / 2, load_g, softer)),
     ]
-    for poisson in (0.45, 0.49):
-        material = replace(beam.material, poisson=poisson)
-        lines.append(changed_line(f"Poisson's ratio {poisson:g}", build(cell_mm, load_g, material)))
-    material = replace(beam.material, poisson=0.45)
-    lines.append(changed_line(f"0.45 on cells of {cell_mm / 2:g} mm", build(cell_mm / 2, load_g, material)))
     if load_g > 0:
-        middle = beam.size_mm[0] / 2
-        lines.append(changed_line("load across the end's middle", build(cell_mm, load_g, hung_mm=middle)))
+        lines.append(
+            line("load across the end's middle", build(cell_mm, load_g, hung_mm=beam.size_mm[0] / 2))
+        )
     return "\n".join(lines)
 
 
-def figure_of(groups: list[list[Capture]], traces: list[np.ndarray], rows: list[Row]) -> Figure:
+def figure_of(groups: list[list[Capture]], traces: list[np.ndarray], rows: list[dict[str, Any]]) -> Figure:
     """Tip height over time, measured and computed, a panel a load."""
     figure = Figure(figsize=(11, 3.2 * len(rows)), layout="constrained")
     panels = figure.subplots(len(rows), squeeze=False)[:, 0]
@@ -221,8 +180,8 @@ def figure_of(groups: list[list[Capture]], traces: list[np.ndarray], rows: list[
         axes.plot(*trace, "k--", lw=1, label="computed, undamped")
         axes.set_xlim(0, 1.2 * trace[0, -1])
         axes.set_ylabel("tip height, mm")
-        measured, computed = f"measured {row.measured_hz:.2f} Hz", f"computed {row.computed_hz:.2f} Hz"
-        axes.set_title(f"{row.load_g:.0f} g at the tip: {measured}, {computed}", loc="left")
+        measured, computed = f"measured {row['measured_hz']:.2f} Hz", f"computed {row['computed_hz']:.2f} Hz"
+        axes.set_title(f"{row['load_g']:.0f} g at the tip: {measured}, {computed}", loc="left")
         axes.grid(alpha=0.3)
         axes.legend(loc="upper right", fontsize=8)
     panels[-1].set_xlabel("time since the release, s")

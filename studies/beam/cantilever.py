@@ -46,15 +46,6 @@ class BeamMaterial:
         return float(np.sqrt(e * (1 - nu) / ((1 + nu) * (1 - 2 * nu)) / (1e-3 * self.density_g_cm3)))
 
 
-@dataclass(frozen=True)
-class Rest:
-    """Marker displacements (n, 3) [mm] at rest, and their change [mm] in the last half of the iterations."""
-
-    displacement_mm: np.ndarray
-    left_mm: float
-    iterations: int
-
-
 class Cantilever:
     """A beam of size_mm (height, width, length), clamped at length 0; gravity is against the first axis.
 
@@ -113,8 +104,8 @@ class Cantilever:
         gravity = (-GRAVITY_MM_S2, 0.0, 0.0)
         return StepSettings(stabilisation_iterations=0, damping=0.0, gravity=gravity, **changes)
 
-    def rest(self) -> Rest:
-        """Rest position, found from the straight beam."""
+    def rest(self) -> tuple[np.ndarray, float]:
+        """Marker displacements (n, 3) [mm] at rest, from the straight beam, and their change [mm] in the last half of the iterations."""
         self.body.restore(self.body.rest_state())
         if self.material.poisson > EASY_POISSON:
             self.model.set_material(self.material.young_kpa, EASY_POISSON)
@@ -123,7 +114,7 @@ class Cantilever:
             return self._settle(HARD_ITERATIONS)
         return self._settle(REST_ITERATIONS)
 
-    def _settle(self, iterations: int) -> Rest:
+    def _settle(self, iterations: int) -> tuple[np.ndarray, float]:
         """Over-relaxed steps of 1 s, in which inertia is negligible, each with as many iterations as all before it."""
         total, left = 0, np.inf
         before = self.displacement()
@@ -135,7 +126,7 @@ class Cantilever:
             now = self.displacement()
             left = float(np.abs(now - before).max())
             before, total, iterations = now, total + iterations, total + iterations
-        return Rest(before, left, total)
+        return before, left
 
     def substeps(self, frame_s: float) -> int:
         """Time steps in a frame, so that a pressure wave crosses CELLS_A_STEP cells in one."""

@@ -1,9 +1,9 @@
 """The command ``study features``: the cost of each feature of a scene, by the same press with it and without it, in turn."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
 import numpy as np
@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from taichi.profiler.kernel_profiler import get_default_kernel_profiler
 from tqdm import tqdm
 
-from rehearsal.build_solver import build_solver, embedding_cell_mm, model_of, step_settings
+from rehearsal.build_solver import build_solver, embedding_cell_mm, static_shape
 from rehearsal.commands.command_line import arch_option
-from rehearsal.configuration import PRESETS, Setup, probe_of, scene_of
+from rehearsal.configuration import PRESETS, Setup
 from rehearsal.frame import image_view
 from rehearsal.frame_view import initial_settings, probe_with_settings
 from rehearsal.measurements.run_report import Tally
@@ -30,12 +30,11 @@ from scenes.tissue import TISSUES, USUAL, ShapeMatchingTissue
 from sim.device import start
 from sim.embedding import Embedding
 from sim.shape_matching import fill_organ
-from sim.shapes import GRID_MM, ConvexTool, SignedDistanceField
-from sim.signed_distance import distance_grid
+from sim.shapes import ConvexTool
 from sim.solver import Solver
-from studies.harness import memory_mb
+from studies.harness import build, memory_mb
 from studies.study_options import open_study, out_option, scene_argument
-from studies.study_results import finish_axes, text_table, write_results
+from studies.study_results import finish_axes, table_of, write_results
 from ultrasound.probe import DetailLevel, Mode
 from ultrasound.probe_manipulator import advanced, image_plane, pose_at, poses_between, touching
 from ultrasound.scanner import ScannedAnatomy, Scanner
@@ -45,15 +44,22 @@ PRESS_MM, PRESS_STEPS, SETTLE_STEPS = 8.0, 60, 30
 CALLS = 40
 NOT_COUNTED: dict[str, Any] = dict(kernels=None, launches=None)
 MEASURED = ("ms", "mb", "kernels", "launches")
-COLUMNS = ("model", "feature", *(f"{name}_{state}" for name in MEASURED for state in ("on", "off")))
-HEADERS = ("model", "feature", "ms with", "without", "adds", "MB", "kernels", "launches")
-FORMATS = ("", "", ".3f", ".3f", "+.3f", "+.2f", "+g", "+g")
+NAMES = ("model", "feature", *(f"{name}_{state}" for name in MEASURED for state in ("on", "off")))
+COLUMNS = {
+    "model": "{model}",
+    "feature": "{feature}",
+    "ms with": "{ms_on:.3f}",
+    "without": "{ms_off:.3f}",
+    "adds": "{ms:+.3f}",
+    "MB": "{mb:+.2f}",
+    "kernels": "{kernels:+g}",
+    "launches": "{launches:+g}",
+}
 FRAME = "frame"
 UNITS = {"ms": "time (ms)", "mb": "memory: fields on the device (MB)"}
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(NamedTuple):
     """The features of a scene that a step computes; the defaults are those of the embedded patient."""
 
     support: bool = True
@@ -64,30 +70,21 @@ class Options:
     mass_scaling_per_mm: float = 0.0
 
 
-@dataclass(frozen=True)
-class Feature:
-    """One feature: the options of a step ``having`` it, and of the same step ``without``."""
-
-    name: str
-    having: Options
-    without: Options
-
-
+# A feature: the options of a step with it, and of the same step without.
+Feature = tuple[Options, Options]
 BASE = Options()
-EVERYWHERE = (
-    Feature("contact with the support", Options(transducer=False), Options(transducer=False, support=False)),
-    Feature("the transducer", BASE, Options(transducer=False)),
-    Feature("friction on shapes", BASE, Options(shape_friction=0.0)),
-)
-OF_PARTICLES = (
-    Feature("contacts of particles", Options(particles=True), BASE),
-    Feature(
-        "friction of particles", Options(particles=True, particle_friction=0.25), Options(particles=True)
-    ),
-    Feature("scaled masses", Options(mass_scaling_per_mm=0.02), BASE),
-)
+EVERYWHERE: dict[str, Feature] = {
+    "contact with the support": (Options(transducer=False), Options(transducer=False, support=False)),
+    "the transducer": (BASE, Options(transducer=False)),
+    "friction on shapes": (BASE, Options(shape_friction=0.0)),
+}
+OF_PARTICLES: dict[str, Feature] = {
+    "contacts of particles": (Options(particles=True), BASE),
+    "friction of particles": (Options(particles=True, particle_friction=0.25), Options(particles=True)),
+    "scaled masses": (Options(mass_scaling_per_mm=0.02), BASE),
+}
 FEATURES = {
-    model: (*EVERYWHERE, *OF_PARTICLES) if section.supports_self_contact else EVERYWHERE
+    model: EVERYWHERE | (OF_PARTICLES if section.supports_self_contact else {})
     for model, section in TISSUES.items()
 }
 
@@ -98,7 +95,7 @@ FEATURES = {
 @click.option(
     "--quick",
     is_flag=True,
-    help="Neo-Hookean alone, coarse, not in turn, no kernels counted: in less than a minute.",
+    help="Neo-Hookean alone, coarse, no kernels counted: in less than a minute.",
 )
 @arch_option
 def features(scene: Path, out: Path, quick: bool, arch: str) -> None:
@@ -112,47 +109,38 @@ def features(scene: Path, out: Path, quick: bool, arch: str) -> None:
     total = sum(len(FEATURES[model]) for model in models) + 1
     with tqdm(total=total, desc="features", unit="feature") as bar:
         for model in models:
-            body = FeatureBody(loaded, anatomy, PRESETS[model]["fast" if quick else "balanced"])
+            body = FeatureBody(loaded, anatomy, PRESETS[model]["fast" if quick else "balanced"], used)
             for row in of_steps(body, FEATURES[model], used, quick):
                 rows.append(dict(model=model) | row)
                 bar.update()
         rows += [dict(model=FRAME) | row for row in of_frame(loaded, anatomy, used)]
         bar.update()
-    rows = [{name: row[name] for name in COLUMNS} for row in rows]
+    rows = [{name: row[name] for name in NAMES} for row in rows]
     write_results(out, "features", dict(arch=used, features=rows), table(rows), rows, figure_of(rows))
 
 
 class FeatureBody:
     """A scene's organ and support, for solvers with different features; positions relative to the organ's middle [mm]."""
 
-    def __init__(self, scene: Scene, anatomy: LoadedAnatomy, setup: Setup) -> None:
-        scene = scene_of(scene, setup)
-        tissue = self.tissue = scene.tissue
-        self.settings = step_settings(tissue, scene.solver)
-        middle = anatomy.organ.bounds.mean(axis=0)
-        self.organ = translated(anatomy.organ, -middle)
-        reach_mm = model_of(tissue).reach_mm(tissue)
-        self.supports = [
-            distance_grid(shape.vertices - middle, shape.faces, GRID_MM, reach_mm)
-            for shape in anatomy.shapes
-            if isinstance(shape, trimesh.Trimesh)
-        ]
-        self.filled = (
-            fill_organ(self.organ, tissue) if isinstance(tissue, ShapeMatchingTissue) else self.organ
-        )
-        down = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
-        x, y, z = (1e3 * scene.gravity.acceleration_m_s2 * down).tolist()
-        self.settings.gravity = (x, y, z)
-        self.size_mm = np.array(probe_of(scene).housing_mm)
+    def __init__(self, scene: Scene, anatomy: LoadedAnatomy, setup: Setup, arch: str) -> None:
+        rehearsal = build(scene, anatomy, setup, arch)
+        self.tissue, self.settings = rehearsal.scene.tissue, rehearsal.settings
+        self.size_mm, down = rehearsal.size_mm, rehearsal.gravity_direction
         side = np.eye(3)[np.abs(down).argmin()]
         pose = pose_at(np.zeros(3), down, side, self.size_mm[2])
-        self.home = touching(pose, self.size_mm, self.organ.vertices)
+        self.home = touching(pose, self.size_mm, rehearsal.organ.vertices)
+        meshes = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
+        self.supports = [translated(mesh, -rehearsal.origin) for mesh in meshes]
+        organ = rehearsal.organ
+        self.filled = (
+            fill_organ(organ, self.tissue) if isinstance(self.tissue, ShapeMatchingTissue) else organ
+        )
 
     def solver(self, options: Options, serial: bool | None = None) -> Solver:
         """A solver with some features."""
         tool = ConvexTool.cuboid(self.size_mm) if options.transducer else None
         supports = self.supports if options.support else []
-        shapes: list = [SignedDistanceField(*grid, np.full(3, GRID_MM)) for grid in supports]
+        shapes: list = [static_shape(mesh, self.tissue) for mesh in supports]
         contact = Contact(
             shape_friction=options.shape_friction,
             particles=options.particles,
@@ -163,46 +151,36 @@ class FeatureBody:
             shapes.append(tool)
         return build_solver(self.filled, self.tissue, shapes, tool, contact, section, serial=serial)
 
-    def poses(self, solver: Solver, step: int) -> np.ndarray | None:
-        """Poses of the transducer in a step of the press; None without a transducer."""
-        if not solver.has_tool:
-            return None
+    def poses(self, step: int) -> np.ndarray:
+        """Poses of the transducer in a step of the press."""
         depth = PRESS_MM * np.clip((step + np.array([0, 1]) - SETTLE_STEPS) / PRESS_STEPS, 0, 1)
         first, last = (advanced(self.home, mm) for mm in depth)
         return poses_between(first, last, self.settings.substeps)
 
 
 def of_steps(
-    body: FeatureBody, features: tuple[Feature, ...], arch: str, quick: bool
+    body: FeatureBody, features: dict[str, Feature], arch: str, quick: bool
 ) -> Iterator[dict[str, Any]]:
     """Each feature's row of features.json: median times, memory and parallel kernels, with it and without it.
 
-    Solvers with and without are stepped in turn; ``quick`` steps each of them once and counts no kernels.
+    Solvers with and without are stepped in turn; ``quick`` counts no kernels.
     """
-    counted: dict[Options, dict[str, Any]] = {}
-    alone: dict[Options, dict[str, float]] = {}
-    for feature in features:
-        both = [feature.having, feature.without]
-        for options in both:
-            if quick and options not in alone:
-                (alone[options],) = _stepped(body, [options], arch)
-            if options not in counted:
-                counted[options] = NOT_COUNTED if quick else kernels_of(body, options, arch)
-        stepped = [alone[options] for options in both] if quick else _stepped(body, both, arch)
-        row: dict[str, Any] = dict(feature=feature.name)
-        for state, options, figures in zip(("on", "off"), both, stepped, strict=True):
-            row |= {f"{name}_{state}": value for name, value in (figures | counted[options]).items()}
+    counted = cache(lambda options: NOT_COUNTED if quick else kernels_of(body, options, arch))
+    for name, both in features.items():
+        row: dict[str, Any] = dict(feature=name)
+        for state, options, figures in zip(("on", "off"), both, _stepped(body, both, arch), strict=True):
+            row |= {f"{each}_{state}": value for each, value in (figures | counted(options)).items()}
         yield row
 
 
-def _stepped(body: FeatureBody, variants: list[Options], arch: str) -> list[dict[str, Any]]:
+def _stepped(body: FeatureBody, variants: Feature, arch: str) -> list[dict[str, Any]]:
     """Median time of a step [ms] in a press, and memory [MB], of solvers that are stepped in turn."""
     start(arch)
     solvers = [body.solver(options) for options in variants]
     ms: list[list[float]] = [[] for _ in solvers]
     for step in range(SETTLE_STEPS + PRESS_STEPS):
         for solver, into in zip(solvers, ms, strict=True):
-            timed(lambda: solver.step(body.settings, body.poses(solver, step)), into)
+            timed(lambda: solver.step(body.settings, body.poses(step)), into)
     return [
         dict(ms=round(float(np.median(into[SETTLE_STEPS:])), 4), mb=round(memory_mb(solver), 4))
         for solver, into in zip(solvers, ms, strict=True)
@@ -216,7 +194,7 @@ def kernels_of(body: FeatureBody, options: Options, arch: str) -> dict[str, int]
     for _ in range(2):
         ti.sync()
         ti.profiler.clear_kernel_profiler_info()
-        solver.step(body.settings, body.poses(solver, 0))
+        solver.step(body.settings, body.poses(0))
     ti.sync()
     profiler = get_default_kernel_profiler()
     profiler._update_records()
@@ -303,20 +281,17 @@ def _added(row: dict[str, Any], name: str) -> float | None:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """What each feature adds: time of a step or of a part of a frame, memory, parallel kernels and their launches."""
-    lines = [
-        [row["model"], row["feature"], row["ms_on"], row["ms_off"], *(_added(row, name) for name in MEASURED)]
-        for row in rows
-    ]
-    return text_table(HEADERS, lines, FORMATS)
+    return table_of(COLUMNS.items(), [row | {name: _added(row, name) for name in MEASURED} for row in rows])
 
 
 def figure_of(rows: list[dict[str, Any]]) -> Figure:
     """What features add to a step, and below it what the parts of a frame take."""
+    titles = (
+        "A time step: with each feature, less without it",
+        "A frame: each part, and all that it needs, by itself",
+    )
     parts = {
-        "A time step: with each feature, less without it": [row for row in rows if row["model"] != FRAME],
-        "A frame: each part, and all that it needs, by itself": [
-            row for row in rows if row["model"] == FRAME
-        ],
+        title: [row for row in rows if (row["model"] == FRAME) == (title == titles[1])] for title in titles
     }
     figure = Figure(figsize=(12, 0.34 * len(rows) + 3), layout="constrained")
     heights = [len(part) + 3 for part in parts.values()]

@@ -11,6 +11,7 @@ from typing import Any
 
 import click
 import numpy as np
+import pandas as pd
 import psutil
 import taichi as ti
 from matplotlib import colormaps
@@ -32,13 +33,14 @@ from studies.harness import build, memory_mb, memory_of_process_mb, restart
 from studies.performance.lower_bound import compare
 from studies.performance.step_phases import AFTER, BEFORE, CONTACTS, IN_ITERATION, Phases, without_calls
 from studies.study_options import open_study, out_option, scene_argument
-from studies.study_results import finish_axes, text_table, write_results
+from studies.study_results import finish_axes, table_of, write_results
 from studies.uniform_blocks import block_of_cells, block_of_particles
 from ultrasound.probe_manipulator import advanced, poses_between
 
 AWAY_MM = 100.0
 # The particle distance of a block is the paper's smallest.
 BLOCK_RADIUS_MM, BLOCK_CELL_MM = 2.2, 4.0
+UP = np.array([0.0, 0.0, 1.0])
 # A block takes at most this share of the free memory.
 MOST_MEMORY = 0.6
 RADII_MM = (2.2, 2.5, 2.7, 3.0, 3.3)
@@ -50,8 +52,14 @@ STEPS, QUICK_STEPS, QUICK_SHARE = 7, 3, 0.1
 # Figures of a case that are not in the table of CSV, beside the times.
 JSON_ONLY = ("time_step_s", "ms", "phases_ms", "bound_ms")
 MS = ("mean", "sd", "min", "max", "median")
-HEADERS = ("model", "size, mm", "particles", "substeps x iterations", *MS, "MB")
-FORMATS = ("", "g", "g", "", *[".2f"] * len(MS), ".1f")
+COLUMNS = {
+    "model": "{model}",
+    "size, mm": "{size_mm:g}",
+    "particles": "{particles:g}",
+    "substeps x iterations": "{substeps} x {iterations}",
+    **{name: f"{{{name}_ms:.2f}}" for name in MS},
+    "MB": "{memory_mb:.1f}",
+}
 # The paper's Table 5: radius [mm], mean, minimum and maximum [ms].
 PAPER_MS = (
     (2.2, 12.10, 11.68, 12.77),
@@ -134,14 +142,14 @@ def measure(rehearsal: Rehearsal, setup: Setup, share: float, arch: str) -> Time
     """Press twice: once timed as a whole, once piece by piece; the first step, which compiles, is not timed."""
     solver, settings, home = rehearsal.solver, rehearsal.settings, rehearsal.manipulator.home
     warm_up_steps = max(1, round(share * rehearsal.press.warm_up_steps))
-    phases = Phases(solver)
-    phases.step(settings, poses_between(home, home, settings.substeps))
+    phases = Phases(solver, settings)
+    phases.step(poses_between(home, home, settings.substeps))
     step_ms: list[float] = []
     for poses in press(rehearsal, warm_up_steps, share):
         timed(lambda: solver.step(settings, poses), step_ms)
     pieces: list[dict[str, float]] = []
     for poses, ms in zip(press(rehearsal, warm_up_steps, share), step_ms, strict=True):
-        phases.step(settings, poses)
+        phases.step(poses)
         pieces.append(without_calls(phases.ms, phases.calls, ms))
     means = {name: round(float(np.mean([ms[name] for ms in pieces])), 4) for name in pieces[0]}
     case = describe(setup, solver, arch) | dict(ms=spread(step_ms), phases_ms=means)
@@ -190,16 +198,18 @@ def blocks(counts: list[int], arch: str, steps: int) -> Iterator[dict[str, Any]]
 def _block_of_particles(count: int) -> tuple[Solver, StepSettings, Setup]:
     side = max(4, round(count ** (1 / 3)))
     points = BLOCK_RADIUS_MM * np.indices((side, side, side)).reshape(3, -1).T
-    floor = Plane(np.array([0.0, 0.0, 1.0]), -BLOCK_RADIUS_MM / 2)
-    solver = block_of_particles(points, BLOCK_RADIUS_MM, [floor])
-    return solver, StepSettings(), setup_of("shape-matching", radius_mm=BLOCK_RADIUS_MM)
+    floor = Plane(UP, -BLOCK_RADIUS_MM / 2)
+    return (
+        block_of_particles(points, BLOCK_RADIUS_MM, [floor]),
+        StepSettings(),
+        setup_of("shape-matching", radius_mm=BLOCK_RADIUS_MM),
+    )
 
 
 def _block_of_cells(count: int) -> tuple[Solver, StepSettings, Setup]:
     side = max(2, round(count ** (1 / 3)) - 1)
-    solver = block_of_cells(side, BLOCK_CELL_MM, [Plane(np.array([0.0, 0.0, 1.0]), 0.0)])
     setup = setup_of("neo-hookean", cell_mm=BLOCK_CELL_MM, iterations=8)
-    return solver, LATTICE_SETTINGS, setup
+    return block_of_cells(side, BLOCK_CELL_MM, [Plane(UP, 0.0)]), LATTICE_SETTINGS, setup
 
 
 def _flat(case: dict) -> dict[str, Any]:
@@ -214,19 +224,12 @@ def _size(case: dict) -> float:
 
 def table(cases: list[dict], sizes: list[dict]) -> str:
     """The paper's Table 5, and the blocks."""
-
-    def rows(given: list[dict]) -> str:
-        lines = []
-        for case in given:
-            iterations = f"{case['substeps']} x {case['iterations']}"
-            times = [case["ms"][name] for name in MS]
-            lines.append(
-                [case["model"], _size(case), case["particles"], iterations, *times, case["memory_mb"]]
-            )
-        return text_table(HEADERS, lines, FORMATS)
-
     title = "Time of a step (ms), over warm-up and press (the paper's Table 5):"
-    return "\n".join([title, rows(cases), "\nBlocks at rest on a plane:", rows(sizes)])
+    of_cases, of_sizes = (
+        table_of(COLUMNS.items(), [_flat(case) | dict(size_mm=_size(case)) for case in given])
+        for given in (cases, sizes)
+    )
+    return "\n".join([title, of_cases, "\nBlocks at rest on a plane:", of_sizes])
 
 
 def pieces(cases: list[dict]) -> list[str]:
@@ -292,19 +295,13 @@ def _over_time(axes: Axes, press: TimedPress) -> None:
 
 def _pieces(axes: Axes, presses: list[TimedPress]) -> None:
     """The paper's Figure 8, for every model and size."""
-    shares = []
-    for press in presses:
-        phases = press.case["phases_ms"]
-        shares.append({name: 100 * ms / sum(phases.values()) for name, ms in phases.items()})
+    ms = pd.DataFrame([press.case["phases_ms"] for press in presses]).fillna(0.0)
+    shares = 100 * ms.div(ms.sum(axis=1), axis=0)
     names = [*BEFORE, *IN_ITERATION[False], *IN_ITERATION[True], *AFTER, "frames"]
-    shown = [name for name in names if max(share.get(name, 0.0) for share in shares) > LEAST_SHARE]
-    left = np.zeros(len(presses))
-    for number, name in enumerate(shown):
-        width = np.array([share.get(name, 0.0) for share in shares])
-        colour = colormaps["tab20"](number)
-        axes.barh(range(len(presses)), width, left=left, color=colour, label=name)
-        left += width
-    axes.barh(range(len(presses)), 100 - left, left=left, color="0.8", label="the rest")
+    shown = shares[[name for name in names if shares.get(name, np.zeros(1)).max() > LEAST_SHARE]]
+    colours = [*(colormaps["tab20"](number) for number in range(shown.shape[1])), "0.8"]
+    shown = shown.assign(**{"the rest": 100 - shown.sum(axis=1)})
+    shown.plot.barh(stacked=True, width=0.8, color=colours, ax=axes)
     axes.set_yticks(
         range(len(presses)), [f"{each.case['model']} {_size(each.case):g} mm" for each in presses]
     )

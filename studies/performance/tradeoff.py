@@ -3,7 +3,7 @@
 Bead experiments give the error of each setting, presses in turn its time.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any
 
 import click
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from tqdm import tqdm
@@ -25,13 +26,21 @@ from studies.accuracy.bead_case import BeadCase, load_case
 from studies.accuracy.bead_errors import bead_errors
 from studies.accuracy.bead_experiment import BeadExperiment
 from studies.study_options import out_option
-from studies.study_results import finish_axes, text_table, write_results
+from studies.study_results import finish_axes, table_of, write_results
 from ultrasound.probe_manipulator import poses_between
 
 EMBEDDED_CASE = Path(__file__).parents[1] / "reference" / "embedded"
 FRAME_MS = 1000 / 60
-HEADERS = ("model", "size, mm", "substeps x iterations", "relax.", "ms a step", "error, mm", "arriving", "")
-FORMATS = ("", "g", "", "g", ".2f", ".3f", ".3f")
+COLUMNS = {
+    "model": "{model}",
+    "size, mm": "{size_mm:g}",
+    "substeps x iterations": "{substeps} x {iterations}",
+    "relax.": "{relaxation_factor:g}",
+    "ms a step": "{ms_median:.2f}",
+    "error, mm": "{error_mean_mm:.3f}",
+    "arriving": "{error_arriving_mm:.3f}",
+    "": "{words}",
+}
 CELLS_MM = (10.0, 8.0, 6.0, 5.0, 4.0, 3.5, 3.0, 2.5, 2.0)
 CELL_ITERATIONS = (1, 2, 4, 8, 12, 20)
 RADII_MM = (2.2, 2.5, 2.7, 3.0, 3.3, 4.0, 5.0)
@@ -69,8 +78,8 @@ def trade(cases: tuple[Path, ...], out: Path, quick: bool, arch: str) -> None:
     loaded = [load_case(EMBEDDED_CASE), *(load_case(case) for case in cases)]
     used = start_taichi(arch)
     tried, rounds = setups(quick), 0 if quick else ROUNDS
-    with tqdm(total=(len(loaded) + rounds) * len(tried), desc="trade", unit="run") as bar:
-        found = points(loaded, tried, used, rounds, bar.update)
+    runs = _runs(loaded, tried, used, rounds)
+    found = points(tried, list(tqdm(runs, "trade", (len(loaded) + rounds) * len(tried), unit="run")))
     report = dict(arch=used, cases=[case.name for case in loaded], points=found)
     # In the table the errors of single cases have columns of their own.
     rows = [
@@ -108,55 +117,59 @@ def _sorted(given: list[Setup]) -> list[Setup]:
     return sorted(dict.fromkeys(given), key=lambda setup: (setup.model, -setup.size_mm))
 
 
-def points(
-    cases: list[BeadCase], tried: list[Setup], arch: str, rounds: int, done: Callable[[], Any]
-) -> list[dict[str, Any]]:
-    """Rows of trade.json: error over all cases, time on the first; ``done`` is called after each run.
+def _runs(cases: list[BeadCase], tried: list[Setup], arch: str, rounds: int) -> Iterator[dict[str, Any]]:
+    """One run each: the setup's number, and its errors in a case or, on the first case, its time.
 
     Each stage counts twice: when the transducer arrives, as in a moving press, and after it has rested.
     With 0 ``rounds`` the time is that of the steps whose error was measured.
     """
-    resting: dict[Setup, dict[str, float]] = {setup: {} for setup in tried}
-    arriving: dict[Setup, dict[str, float]] = {setup: {} for setup in tried}
-    ms: dict[Setup, list[float]] = {setup: [] for setup in tried}
     for case in cases:
-        for experiment, setup in _built(case, tried, arch):
+        for number, experiment, setup in _built(case, tried, arch):
             run = experiment.run(setup)
-            if rounds == 0 and case is cases[0]:
-                ms[setup].append(float(np.median(run.step_ms)))
-            resting[setup][case.name] = _mean_error(case, run.beads, run.finite)
-            arriving[setup][case.name] = _mean_error(case, run.arriving, run.finite)
-            done()
+            errors = dict(
+                resting=_mean_error(case, run.beads, run.finite),
+                arriving=_mean_error(case, run.arriving, run.finite),
+            )
+            ms = float(np.median(run.step_ms)) if rounds == 0 and case is cases[0] else None
+            yield dict(setup=number, case=case.name, ms=ms, **errors)
     for _ in range(rounds):
-        for experiment, setup in _built(cases[0], tried, arch):
-            ms[setup].append(_time(experiment, setup))
-            done()
-    time_ms = np.array([np.median(ms[setup]) for setup in tried])
-    error = np.array([np.mean([*resting[setup].values(), *arriving[setup].values()]) for setup in tried])
-    figures = zip(tried, time_ms, error, pareto(time_ms, error), strict=True)
+        for number, experiment, setup in _built(cases[0], tried, arch):
+            yield dict(setup=number, ms=_time(experiment, setup))
+
+
+def points(tried: list[Setup], runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of trade.json: error over all cases, and time."""
+    by_setup = pd.DataFrame(runs).groupby("setup")
+    time_ms, resting, arriving = by_setup.ms.median(), by_setup.resting.mean(), by_setup.arriving.mean()
+    error = (resting + arriving) / 2
+    best = pareto(time_ms.to_numpy(), error.to_numpy())
     return [
         dict(
             model=setup.model,
             **{name: getattr(setup, name, getattr(setup.tissue, name, None)) for name in SETTINGS},
             time_step_s=setup.solver.time_step_s,
-            ms_median=round(float(median), 4),
-            error_mean_mm=rounded(mean),
-            error_resting_mm=rounded(float(np.mean(list(resting[setup].values())))),
-            error_arriving_mm=rounded(float(np.mean(list(arriving[setup].values())))),
-            errors_mm={name: rounded(value) for name, value in resting[setup].items()},
-            pareto=bool(best),
+            ms_median=round(float(time_ms[number]), 4),
+            error_mean_mm=rounded(error[number]),
+            error_resting_mm=rounded(resting[number]),
+            error_arriving_mm=rounded(arriving[number]),
+            errors_mm={
+                run["case"]: rounded(run["resting"])
+                for run in runs
+                if run["setup"] == number and "case" in run
+            },
+            pareto=bool(best[number]),
         )
-        for setup, median, mean, best in figures
+        for number, setup in enumerate(tried)
     ]
 
 
-def _built(case: BeadCase, tried: list[Setup], arch: str) -> Iterator[tuple[BeadExperiment, Setup]]:
-    """Each setting with the experiment for it, built anew on a freshly started device for each model and size."""
-    for _, sharing in groupby(tried, key=lambda setup: (setup.model, setup.size_mm)):
-        first, *others = sharing
+def _built(case: BeadCase, tried: list[Setup], arch: str) -> Iterator[tuple[int, BeadExperiment, Setup]]:
+    """Each setting and its number, with the experiment for it, built anew on a freshly started device for each model and size."""
+    for _, sharing in groupby(enumerate(tried), key=lambda each: (each[1].model, each[1].size_mm)):
+        numbered = list(sharing)
         start(arch)
-        experiment = BeadExperiment(case, first)
-        yield from ((experiment, setup) for setup in (first, *others))
+        experiment = BeadExperiment(case, numbered[0][1])
+        yield from ((number, experiment, setup) for number, setup in numbered)
 
 
 def _mean_error(case: BeadCase, beads: np.ndarray, finite: bool) -> float:
@@ -176,10 +189,6 @@ def _time(experiment: BeadExperiment, setup: Setup) -> float:
     return float(np.median(ms))
 
 
-def _size(point: dict[str, Any]) -> float:
-    return point["cell_mm"] or point["radius_mm"]
-
-
 def table(points: list[dict[str, Any]]) -> str:
     """All points, fastest first; those on the front, the presets and the paper's are marked."""
     rows = []
@@ -188,19 +197,9 @@ def table(points: list[dict[str, Any]]) -> str:
         stiffness = "" if point["stiffness"] is None else f"alpha {point['stiffness']:g}"
         front = "front" if point["pareto"] else ""
         name = preset_of(setup) or ("the paper's" if setup in PAPER else "")
-        rows.append(
-            [
-                point["model"],
-                _size(point),
-                f"{point['substeps']} x {point['iterations']}",
-                point["relaxation_factor"],
-                point["ms_median"],
-                point["error_mean_mm"],
-                point["error_arriving_mm"],
-                ", ".join(filter(None, (stiffness, front, name))),
-            ]
-        )
-    return text_table(HEADERS, rows, FORMATS)
+        words = ", ".join(filter(None, (stiffness, front, name)))
+        rows.append(point | dict(size_mm=setup.size_mm, words=words))
+    return table_of(COLUMNS.items(), rows)
 
 
 def figure_of(points: list[dict[str, Any]]) -> Figure:
@@ -233,7 +232,7 @@ def _place(point: dict[str, Any]) -> tuple[float, float]:
 
 def _scatter(axes: Axes, points: list[dict[str, Any]], model: str) -> None:
     ms, error = np.array([_place(point) for point in points]).T
-    size = np.array([_size(point) for point in points])
+    size = np.array([setup_of_row(point).size_mm for point in points])
     axes.scatter(ms, error, s=7 * size, alpha=0.55, label=f"{model} (area: size of cells or particles)")
     for k, point in enumerate(point for point in points if setup_of_row(point) in PAPER):
         label = "the paper's radii (mm), with its best stiffness" if k == 0 else None

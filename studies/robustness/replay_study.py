@@ -21,14 +21,15 @@ from rehearsal.sessions.session_file import Log, read_log
 from render.viewer import Controls
 from scenes.scene import EMBEDDED
 from scenes.tissue import TISSUES, USUAL
-from studies.harness import Watch, build
+from studies.harness import build
 from studies.study_options import number_option, open_study, out_option, preset_option, scene_argument
 from studies.study_results import write_results
 
 SEED = 20161130
 # Time between two changes of the input, and distance of the mouse ray's origin from the organ.
 CHANGE_S, FROM_MM = 0.7, 60.0
-# Probability of each of these at a change of the input.
+# Standard deviation of the moves in a frame, and probability of each action at a change of the input.
+MOVES = {"push_mm": 0.05, "rotate_deg": 0.3, "rock_deg": 0.2, "tilt_deg": 0.2}
 PROBABILITY = {"undo": 0.06, "redo": 0.03, "bookmark": 0.03, "to_bookmark": 0.02, "reset": 0.01}
 
 
@@ -57,7 +58,8 @@ def replay(scene: Path, out: Path, minutes: float, model: str, quality: str, arc
         recorded = record(session, anatomy, used, out)
         # Without a limit of time: iterations that adapt to it would record another session each time.
         live = UserInput(session, AdaptiveIterations(np.inf), recorded)
-        Watch().rehearse(session.rehearsal, random_poses(live, session.rehearsal, steps, bar))
+        for pose in random_poses(live, session.rehearsal, steps, bar):
+            session.rehearsal.advance(pose)
         recorded.close({})
         path, digest = recorded.path, session.rehearsal.digest()
         log = read_log(path)
@@ -88,14 +90,10 @@ def random_poses(live: UserInput, rehearsal: Rehearsal, steps: int, bar: tqdm) -
         controls = Controls(settings)
         if step % every == 0:
             at = int(random.choice(above))
-            lasting = dict(
-                ray=(manipulator.vertices[at] + FROM_MM * manipulator.normals[at], -manipulator.normals[at]),
-                press=bool(random.random() < 0.5),
-                push_mm=float(random.normal(0, 0.05)),
-                rotate_deg=float(random.normal(0, 0.3)),
-                rock_deg=float(random.normal(0, 0.2)),
-                tilt_deg=float(random.normal(0, 0.2)),
-            )
+            normal = manipulator.normals[at]
+            ray = (manipulator.vertices[at] + FROM_MM * normal, -normal)
+            lasting = dict(ray=ray, press=bool(random.random() < 0.5))
+            lasting |= {name: float(random.normal(0, deviation)) for name, deviation in MOVES.items()}
             for name, probability in PROBABILITY.items():
                 setattr(controls, name, bool(random.random() < probability))
             if settings.young_kpa is not None and random.random() < 0.1:

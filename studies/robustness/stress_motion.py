@@ -1,6 +1,7 @@
 """Initial states of the stress test, and motions of the transducer."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,11 +14,12 @@ SWEEP_MM, MIDDLE_MM = 80.0, 15.0
 # Duration of a press, or its number of steps where that is longer.
 PRESS_S, PRESS_STEPS = 0.02, 20
 SEED = 20161130
+# Depths [mm] and rotations of the transducer, one a time step.
+DEPTHS_MM = MIDDLE_MM + np.random.default_rng(SEED).uniform(-MIDDLE_MM, MIDDLE_MM, 1000)
+TURNS = Rotation.random(1000, random_state=SEED).as_matrix()
 
 # From settled positions and the upward direction: positions (n, 3) [mm] and velocities (n, 3) [mm/s].
 State = Callable[..., tuple[np.ndarray, np.ndarray]]
-# From the pose of first contact, the thickness below it [mm] and the time step [s]: the pose (4, 4) at a time [s].
-Path = Callable[[float], np.ndarray]
 
 
 def _placed(positions: Callable[..., np.ndarray]) -> State:
@@ -64,55 +66,36 @@ STATES: dict[str, State] = {
 }
 
 
-def _pressed(home: np.ndarray, thickness_mm: float, dt: float, depth_mm: float) -> Path:
-    takes_s = max(PRESS_S, PRESS_STEPS * dt)
-    return lambda t: advanced(home, depth_mm * min(t / takes_s, 1.0))
+def _pressed(t: float, body: Any, dt: float, depth_mm: float) -> np.ndarray:
+    return advanced(body.home, depth_mm * min(t / max(PRESS_S, PRESS_STEPS * dt), 1.0))
 
 
-def _swept(home: np.ndarray, thickness_mm: float, dt: float, speed: float, depth_mm: float) -> Path:
-    pose = advanced(home, depth_mm)
-
-    def at(t: float) -> np.ndarray:
-        moved = pose.copy()
-        moved[:3, 3] += (speed * t % (2 * SWEEP_MM) - SWEEP_MM) * pose[:3, 0]
-        return moved
-
-    return at
+def _swept(t: float, body: Any, dt: float, speed: float, depth_mm: float) -> np.ndarray:
+    pose = advanced(body.home, depth_mm)
+    pose[:3, 3] += (speed * t % (2 * SWEEP_MM) - SWEEP_MM) * pose[:3, 0]
+    return pose
 
 
-def _turned(pose: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    turned = pose.copy()
-    turned[:3, :3] = rotation
-    return turned
+def _turned(body: Any, rotation: np.ndarray) -> np.ndarray:
+    """In the middle of the tissue, with another rotation (3, 3)."""
+    pose = advanced(body.home, MIDDLE_MM)
+    pose[:3, :3] = rotation
+    return pose
 
 
-def _spun(home: np.ndarray, thickness_mm: float, dt: float, rad_s: float, axis: int) -> Path:
-    pose = advanced(home, MIDDLE_MM)
-    return lambda t: _turned(
-        pose, pose[:3, :3] @ Rotation.from_rotvec(rad_s * t * np.eye(3)[axis]).as_matrix()
-    )
+def _spun(t: float, body: Any, dt: float, rad_s: float, axis: int) -> np.ndarray:
+    return _turned(body, body.home[:3, :3] @ Rotation.from_rotvec(rad_s * t * np.eye(3)[axis]).as_matrix())
 
 
-def _jitter(home: np.ndarray, thickness_mm: float, dt: float) -> Path:
-    depths = MIDDLE_MM + _random().uniform(-MIDDLE_MM, MIDDLE_MM, 1000)
-    return lambda t: advanced(home, float(np.interp(t / dt, np.arange(1000), depths)))
-
-
-def _tumble(home: np.ndarray, thickness_mm: float, dt: float) -> Path:
-    pose, turns = advanced(home, MIDDLE_MM), Rotation.random(1000, random_state=SEED).as_matrix()
-    return lambda t: _turned(pose, turns[round(t / dt) % 1000])
-
-
-PROBES: dict[str, Callable[..., Path]] = {
-    "away": lambda home, thickness_mm, dt: lambda t: advanced(home, -AWAY_MM),
+# The pose (4, 4) at a time [s], from a body with the pose of first contact and the thickness below it, and the time step [s].
+PROBES: dict[str, Callable[..., np.ndarray]] = {
+    "away": lambda t, body, dt: advanced(body.home, -AWAY_MM),
     "press": _pressed,
-    "teleport": lambda home, thickness_mm, dt, depth_mm: lambda t: advanced(home, depth_mm),
-    "flat": lambda home, thickness_mm, dt, gap_mm: _pressed(home, thickness_mm, dt, thickness_mm - gap_mm),
+    "teleport": lambda t, body, dt, depth_mm: advanced(body.home, depth_mm),
+    "flat": lambda t, body, dt, gap_mm: _pressed(t, body, dt, body.thickness_mm - gap_mm),
     "sweep": _swept,
     "spin": _spun,
-    "in and out": lambda home, thickness_mm, dt: (
-        lambda t: advanced(home, 20.0 if round(t / dt) % 2 else -50.0)
-    ),
-    "jitter": _jitter,
-    "tumble": _tumble,
+    "in and out": lambda t, body, dt: advanced(body.home, 20.0 if round(t / dt) % 2 else -50.0),
+    "jitter": lambda t, body, dt: advanced(body.home, float(np.interp(t / dt, np.arange(1000), DEPTHS_MM))),
+    "tumble": lambda t, body, dt: _turned(body, TURNS[round(t / dt) % 1000]),
 }

@@ -19,7 +19,7 @@ from sim.surface_contact import SurfaceContacts
 from studies import study_options
 from studies.harness import memory_mb
 from studies.performance import feature_costs
-from studies.robustness import soak_test
+from studies.robustness import soak_study
 
 SETUPS = {
     "neo-hookean": setup_of("neo-hookean", cell_mm=6.0),
@@ -47,7 +47,7 @@ WITHOUT = (
 
 
 def body_of(model: str) -> feature_costs.FeatureBody:
-    return feature_costs.FeatureBody(load_scene(PAPER), small_anatomy(), SETUPS[model])
+    return feature_costs.FeatureBody(load_scene(PAPER), small_anatomy(), SETUPS[model], "cpu")
 
 
 @pytest.mark.parametrize("model", list(feature_costs.FEATURES))
@@ -60,21 +60,21 @@ def test_what_is_off_is_not_compiled_and_not_allocated(device, monkeypatch, mode
     def compiled(*_):
         raise AssertionError("compiled")
 
-    for feature in feature_costs.FEATURES[model]:
-        if feature.name in OWN:
-            on, off = solver_of(feature.having), solver_of(feature.without)
-            assert memory_mb(off) < memory_mb(on), feature.name
+    for feature, both in feature_costs.FEATURES[model].items():
+        if feature in OWN:
+            on, off = map(solver_of, both)
+            assert memory_mb(off) < memory_mb(on), feature
             with monkeypatch.context() as forbidden:
-                for owner, name in OWN[feature.name]:
+                for owner, name in OWN[feature]:
                     forbidden.setattr(owner, name, compiled)
                 with pytest.raises(ti.TaichiCompilationError, match="compiled"):
-                    on.step(body.settings, body.poses(on, 0))
+                    on.step(body.settings, body.poses(0))
     for options, names in WITHOUT:
         off = solver_of(options)
         with monkeypatch.context() as forbidden:
             for owner, method in [part for name in names for part in OWN[name]]:
                 forbidden.setattr(owner, method, compiled)
-            off.step(body.settings, body.poses(off, 0))
+            off.step(body.settings, body.poses(0))
 
 
 def test_kernels_are_counted_where_a_step_is_parallel(device):
@@ -89,7 +89,11 @@ def test_the_command_writes_table_figure_and_json(tmp_path, monkeypatch, capsys)
     monkeypatch.setattr(study_options, "load_patient", lambda _: (briefly(20), small_anatomy()))
     monkeypatch.setattr(feature_costs, "SETTLE_STEPS", 3)
     monkeypatch.setattr(feature_costs, "PRESS_STEPS", 3)
-    monkeypatch.setitem(feature_costs.FEATURES, "neo-hookean", feature_costs.EVERYWHERE[2:])
+    monkeypatch.setitem(
+        feature_costs.FEATURES,
+        "neo-hookean",
+        {"friction on shapes": feature_costs.EVERYWHERE["friction on shapes"]},
+    )
     assert app.main(["study", "features", "--quick", "--out", str(tmp_path)]) == 0
     rows = json.loads((tmp_path / "features.json").read_text())["features"]
     assert [row["feature"] for row in rows] == [
@@ -110,10 +114,10 @@ def test_the_command_writes_table_figure_and_json(tmp_path, monkeypatch, capsys)
     ids=lambda setup: setup.model,
 )
 def test_a_soak_ends_where_it_began_and_replays(setup, monkeypatch):
-    monkeypatch.setattr(soak_test, "REST_S", 3.0)
-    monkeypatch.setattr(soak_test, "REPLAYED_MINUTES", 1)
+    monkeypatch.setattr(soak_study, "REST_S", 3.0)
+    monkeypatch.setattr(soak_study, "REPLAYED_MINUTES", 1)
     done = []
-    found = soak_test.run_soak(briefly(60), small_anatomy(), setup, 2, 5.0, "cpu", lambda: done.append(1))
+    found = soak_study.run_soak(briefly(60), small_anatomy(), setup, 2, 5.0, "cpu", lambda: done.append(1))
     assert len(found["minutes"]) == 2 and len(done) == 3
     assert found["replay_equal"] and found["reset_equal"] and found["fallbacks"] == 0
     for row in found["minutes"]:

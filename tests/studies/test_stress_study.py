@@ -2,6 +2,7 @@
 
 import csv
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,10 +11,10 @@ from PIL import Image
 
 import app
 from studies.harness import distances_after_fit
-from studies.robustness import stress_bodies, stress_test
+from studies.robustness import stress_bodies, stress_study
 from studies.robustness.stress_cases import MODELS, StressCase, Subject, cases_of, quick_cases_of
 from studies.robustness.stress_motion import PROBES, STATES
-from studies.robustness.stress_test import OUTCOMES, outcome_of
+from studies.robustness.stress_study import OUTCOMES, outcome_of
 from ultrasound.probe_manipulator import advanced
 
 ONE = Subject("one")
@@ -47,15 +48,14 @@ def test_initial_states_and_motions_match_their_names():
     two = np.concatenate([x - [9, 0, 0], x + [9, 0, 0]])
     wholly = STATES["overlapped"](two, up, 1.0)[0]
     assert wholly[50:].mean(axis=0) == pytest.approx(wholly[:50].mean(axis=0))
-    press = PROBES["press"](home, 30.0, 1 / 60, 12.0)
-    assert press(0.0) == pytest.approx(home)
-    assert press(10.0) == pytest.approx(advanced(home, 12.0))
-    flat = PROBES["flat"](home, 30.0, 1 / 60, -2.0)
-    assert flat(10.0) == pytest.approx(advanced(home, 32.0))
-    sweep = PROBES["sweep"](home, 30.0, 1 / 60, 1000.0, 5.0)
-    assert np.linalg.norm(sweep(0.11)[:3, 3] - sweep(0.10)[:3, 3]) == pytest.approx(10.0)
-    spin = PROBES["spin"](home, 30.0, 1 / 60, 10.0, 2)
-    assert spin(0.1)[:3, :3] == pytest.approx(rotation_about([0, 0, 1], np.degrees(1.0)))
+    body, dt = SimpleNamespace(home=home, thickness_mm=30.0), 1 / 60
+    assert PROBES["press"](0.0, body, dt, 12.0) == pytest.approx(home)
+    assert PROBES["press"](10.0, body, dt, 12.0) == pytest.approx(advanced(home, 12.0))
+    assert PROBES["flat"](10.0, body, dt, -2.0) == pytest.approx(advanced(home, 32.0))
+    first, last = (PROBES["sweep"](t, body, dt, 1000.0, 5.0) for t in (0.10, 0.11))
+    assert np.linalg.norm(last[:3, 3] - first[:3, 3]) == pytest.approx(10.0)
+    spun = PROBES["spin"](0.1, body, dt, 10.0, 2)
+    assert spun[:3, :3] == pytest.approx(rotation_about([0, 0, 1], np.degrees(1.0)))
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -66,7 +66,7 @@ def test_a_small_body_is_stressed_released_and_measured(model):
         StressCase("gone", "", ONE, state=("lifted", 1e6)),
         StressCase("beside", "", ONE, state=("lifted", 100.0)),
     ]
-    rest, lost, gone, beside = (stress_test.run(model, case) for case in cases)
+    rest, lost, gone, beside = (stress_study.run(model, case) for case in cases)
     assert rest["finite"] and rest["recovered"] and rest["fallback"] is None and rest["reason"] is None
     assert rest["rest_error_mm"] < 0.01
     assert rest["volume_ratio"] == pytest.approx(1.0, abs=0.01)
@@ -87,18 +87,18 @@ def test_two_bodies_are_fitted_apart(device):
     assert distances_after_fit(turned, specimen.body.rest_points).mean() > 1.0
     state = specimen.solver.snapshot().body
     specimen.body.restore(type(state)(turned.astype(np.float32), state.velocity))
-    assert stress_test._shape_error(specimen) < 1e-4
+    assert stress_study._shape_error(specimen) < 1e-4
 
 
 def test_reasons_distinguish_position_and_shape():
-    assert stress_test._reason(0.05, None) is None
-    assert "shape has recovered, 12 mm" in stress_test._reason(12.0, 0.01)
-    assert "shape differs by 3 mm" in stress_test._reason(12.0, 3.0)
+    assert stress_study._reason(0.05, None) is None
+    assert "shape has recovered, 12 mm" in stress_study._reason(12.0, 0.01)
+    assert "shape differs by 3 mm" in stress_study._reason(12.0, 3.0)
 
 
 def test_the_command_writes_table_figure_and_json(tmp_path, monkeypatch, capsys):
     few = [StressCase("rest", "long", ONE), StressCase("lost", "wholly", ONE, state=("nothing",))]
-    monkeypatch.setattr(stress_test, "quick_cases_of", lambda model: few)
+    monkeypatch.setattr(stress_study, "quick_cases_of", lambda model: few)
     assert app.main(["study", "stability", "--quick", "--jobs", "1", "--out", str(tmp_path)]) == 0
     cases = json.loads((tmp_path / "stability.json").read_text())["cases"]
     assert [(case["model"], case["name"]) for case in cases] == [

@@ -4,16 +4,15 @@ An extreme is applied to a body and released, and what remains of the deformatio
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
-from functools import partial
-from itertools import groupby, repeat
+from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
+import pandas as pd
 from joblib import Parallel, delayed
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from tqdm import tqdm
@@ -24,8 +23,8 @@ from rehearsal.worker_processes import processes
 from sim.body import BodyState
 from sim.fields import fill
 from sim.neo_hookean import NeoHookean
-from sim.solver import SolverState
-from studies.harness import Watch, distances_after_fit, positions_of
+from sim.solver import SolverState, StepSettings
+from studies.harness import distances_after_fit, positions_of
 from studies.robustness.stress_bodies import Specimen, prepared
 from studies.robustness.stress_cases import (
     MODELS,
@@ -37,7 +36,7 @@ from studies.robustness.stress_cases import (
 )
 from studies.robustness.stress_motion import AWAY_MM, PROBES, STATES
 from studies.study_options import jobs_option, out_option
-from studies.study_results import finish_axes, text_table, write_results
+from studies.study_results import finish_axes, table_of, write_results
 from ultrasound.probe_manipulator import advanced
 
 # Cases of one body in a task, after which the progress bar advances; the process keeps the body for the next task.
@@ -51,7 +50,16 @@ OUTCOMES = {
     "shape changed": "#f0a030",
     "not finite": "#c0202a",
 }
-HEADERS = ("model", "kind", "cases", "finite", "recovered", "restored", "worst rest error, mm", "volume")
+COLUMNS = {
+    "model": "{model}",
+    "kind": "{kind}",
+    "cases": "{cases:g}",
+    "finite": "{finite:g}",
+    "recovered": "{recovered:g}",
+    "restored": "{restored:g}",
+    "worst rest error, mm": "{worst:.2f}",
+    "volume": "{least:.2f}-{most:.2f}",
+}
 # Long enough for the divergence check to restore a state, and for a thrown body to fall and come to rest.
 RELEASE_STEPS, LIFT_STEPS, CHECK_EVERY = 300, 240, 30
 LEAST_STEPS, LEAST_S = 40, 0.04
@@ -95,24 +103,28 @@ def _run_all(model: str, cases: list[StressCase]) -> list[dict[str, Any]]:
     return [run(model, case) for case in cases]
 
 
-@dataclass
-class Extremes(Watch):
-    """Extreme values over a whole stress test."""
+class Extremes:
+    """Extreme values over a whole stress test, and the messages of the divergence check where it restored the state."""
 
-    finite: bool = True
-    kinetic_peak_mj: float = 0.0
-    volume_least: float = 1.0
-    volume_most: float = 1.0
+    def __init__(self, specimen: Specimen) -> None:
+        self.specimen = specimen
+        self.finite = True
+        self.volumes, self.kinetic_mj = [1.0], [0.0]
+        self.restored: list[str] = []
 
-    def record(self, specimen: Specimen) -> None:
+    def advance(self, settings: StepSettings, poses: np.ndarray) -> bool:
+        """Take a step; whether the state was restored."""
+        notice = self.specimen.advance(settings, poses)
+        self.restored += [notice] if notice else []
+        return bool(notice)
+
+    def record(self) -> None:
         """Take the state after a step."""
-        if not specimen.is_finite():
+        if not self.specimen.is_finite():
             self.finite = False
             return
-        volume = specimen.volume_ratio()
-        self.volume_least = min(self.volume_least, volume)
-        self.volume_most = max(self.volume_most, volume)
-        self.kinetic_peak_mj = max(self.kinetic_peak_mj, specimen.kinetic_mj())
+        self.volumes.append(self.specimen.volume_ratio())
+        self.kinetic_mj.append(self.specimen.kinetic_mj())
 
     def fallback(self) -> str | None:
         """The first message of the divergence check, and how many there were."""
@@ -129,7 +141,7 @@ def run(model: str, case: StressCase) -> dict[str, Any]:
         _prepared.clear()
         _prepared[key] = prepared(model, case.subject)
     specimen = _prepared[key]
-    extremes = Extremes()
+    extremes = Extremes(specimen)
     _apply(specimen, case, extremes)
     _release(specimen, extremes)
     rest_error, volume, kinetic = specimen.rest_error_mm(), specimen.volume_ratio(), specimen.kinetic_mj()
@@ -148,9 +160,9 @@ def run(model: str, case: StressCase) -> dict[str, Any]:
         shape_error_mm=rounded(shape_error),
         volume_ratio=rounded(volume),
         kinetic_end_mj=rounded(kinetic),
-        volume_ratio_min=rounded(extremes.volume_least),
-        volume_ratio_max=rounded(extremes.volume_most),
-        kinetic_peak_mj=rounded(extremes.kinetic_peak_mj),
+        volume_ratio_min=rounded(min(extremes.volumes)),
+        volume_ratio_max=rounded(max(extremes.volumes)),
+        kinetic_peak_mj=rounded(max(extremes.kinetic_mj)),
         fallback=extremes.fallback(),
         reason=_reason(rest_error, shape_error),
     )
@@ -171,14 +183,13 @@ def _apply(specimen: Specimen, case: StressCase, extremes: Extremes) -> None:
         specimen.solver.contacts.reset()
     _set_material(specimen, case.heaviest, case.material)
     motion, *numbers = case.probe
-    path = PROBES[motion](specimen.home, specimen.thickness_mm, dt, *numbers)
+    pose_at = PROBES[motion]
     within = np.linspace(0.0, 1.0, settings.substeps + 1)
-    moves = (
-        np.stack([path(float(t)) for t in dt * (step + within)])
-        for step in range(max(LEAST_STEPS, round(LEAST_S / dt)))
-    )
-    for _ in extremes.drive(partial(specimen.advance, settings), moves):
-        extremes.record(specimen)
+    for step in range(max(LEAST_STEPS, round(LEAST_S / dt))):
+        extremes.advance(
+            settings, np.stack([pose_at(float(t), specimen, dt, *numbers) for t in dt * (step + within)])
+        )
+        extremes.record()
     _set_material(specimen, 1.0, {})
 
 
@@ -194,10 +205,9 @@ def _set_material(specimen: Specimen, heaviest: float, material: Mapping[str, fl
 def _release(specimen: Specimen, extremes: Extremes) -> None:
     """The default settings without the transducer, until the body is at rest or RELEASE_STEPS are over."""
     away = np.stack([advanced(specimen.home, -AWAY_MM)] * (specimen.settings.substeps + 1))
-    released = extremes.drive(partial(specimen.advance, specimen.settings), repeat(away, RELEASE_STEPS))
-    for step, notice in enumerate(released, 1):
-        if notice or step % CHECK_EVERY == 0:
-            extremes.record(specimen)
+    for step in range(1, RELEASE_STEPS + 1):
+        if extremes.advance(specimen.settings, away) or step % CHECK_EVERY == 0:
+            extremes.record()
         if step % CHECK_EVERY == 0 and specimen.rest_error_mm() < RECOVERED_MM / 2:
             return
 
@@ -242,74 +252,66 @@ def _reason(rest_error: float, shape_error: float | None) -> str | None:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """A line a model and kind of case: how many, and how they ended."""
-    lines = []
-    for model, kind in dict.fromkeys((row["model"], row["kind"]) for row in rows):
-        cases = [row for row in rows if (row["model"], row["kind"]) == (model, kind)]
-        volumes = [row["volume_ratio"] for row in cases if row["volume_ratio"] is not None]
-        worst = max(row["rest_error_mm"] or 0.0 for row in cases)
-        counts = [_count(cases, key) for key in ("finite", "recovered", "fallback")]
-        volume = f"{min(volumes):.2f}-{max(volumes):.2f}"
-        lines.append([model, kind, len(cases), *counts, f"{worst:.2f}", volume])
-    return text_table(HEADERS, lines)
+    found = (
+        pd.DataFrame(rows)
+        .groupby(["model", "kind"], sort=False)
+        .agg(
+            cases=("name", "size"),
+            finite=("finite", "sum"),
+            recovered=("recovered", "sum"),
+            restored=("fallback", "count"),
+            worst=("rest_error_mm", "max"),
+            least=("volume_ratio", "min"),
+            most=("volume_ratio", "max"),
+        )
+    )
+    return table_of(COLUMNS.items(), found.reset_index().to_dict("records"))
 
 
 def summary(rows: list[dict[str, Any]]) -> str:
     """The outcome of all cases of a model, and the reasons of those that did not recover."""
     lines = []
-    for model, group in groupby(rows, key=lambda row: row["model"]):
-        cases = list(group)
-        changed = [row for row in cases if outcome_of(row) in ("shape changed", "not finite")]
-        elsewhere = len(cases) - len(changed) - _count(cases, "recovered")
+    for model, cases in pd.DataFrame(rows).groupby("model", sort=False):
+        changed = cases[cases.apply(outcome_of, axis=1).isin(["shape changed", "not finite"])]
+        recovered = cases.recovered.sum()
         lines.append(
-            f"{model}: {len(cases)} cases, {_count(cases, 'finite')} finite; {_count(cases, 'recovered')} recovered to "
-            f"within {RECOVERED_MM:g} mm; the state was restored in {_count(cases, 'fallback')}; {elsewhere} recovered their "
-            f"shape in another position; {len(changed)} did not"
+            f"{model}: {len(cases)} cases, {cases.finite.sum()} finite; {recovered} recovered to "
+            f"within {RECOVERED_MM:g} mm; the state was restored in {cases.fallback.count()}; "
+            f"{len(cases) - len(changed) - recovered} recovered their shape in another position; {len(changed)} did not"
         )
-        lines += [f"  {row['name']}: {row['reason']}" for row in changed]
+        lines += [f"  {row['name']}: {row['reason']}" for _, row in changed.iterrows()]
     return "\n".join(lines)
 
 
-def _count(rows: list[dict[str, Any]], key: str) -> int:
-    return sum(bool(row[key]) for row in rows)
-
-
-def outcome_of(row: dict[str, Any]) -> str:
+def outcome_of(row: Mapping[str, Any]) -> str:
     """How a case ended: one of ``OUTCOMES``."""
     if not row["finite"]:
         return "not finite"
-    if not row["recovered"] and (row["shape_error_mm"] is None or row["shape_error_mm"] > RECOVERED_MM):
-        return "shape changed"
-    position, restored, shape, shape_restored, *_ = OUTCOMES
     if row["recovered"]:
-        return restored if row["fallback"] else position
-    return shape_restored if row["fallback"] else shape
+        end = "recovered its position"
+    elif row["shape_error_mm"] is not None and row["shape_error_mm"] <= RECOVERED_MM:
+        end = "recovered its shape in another position"
+    else:
+        return "shape changed"
+    return end + (" after the state was restored" if isinstance(row["fallback"], str) else "")
 
 
 def figure_of(rows: list[dict[str, Any]]) -> Figure:
     """A panel a model, a bar a kind of case."""
-    kinds = list(dict.fromkeys(row["kind"] for row in rows))
-    models = list(dict.fromkeys(row["model"] for row in rows))
+    frame = pd.DataFrame(rows).assign(outcome=[outcome_of(row) for row in rows])
+    kinds, models = list(frame.kind.unique()), list(frame.model.unique())
     figure = Figure(figsize=(12, 0.25 * len(kinds) + 2), layout="constrained")
     panels = figure.subplots(1, len(models), sharey=True, squeeze=False)[0]
-    for axes, model in zip(panels, models, strict=True):
-        _bars(axes, [row for row in rows if row["model"] == model], kinds)
-        axes.set_title(model)
+    for axes, (model, cases) in zip(panels, frame.groupby("model", sort=False), strict=True):
+        counts = pd.crosstab(cases.kind, cases.outcome).reindex(kinds, columns=list(OUTCOMES), fill_value=0)
+        counts.plot.barh(stacked=True, color=OUTCOMES, width=0.8, legend=False, title=model, ax=axes)
+        finish_axes(axes, grid="x", xlabel=f"cases, of {len(cases)}", ylabel="", axisbelow=True)
     panels[0].invert_yaxis()
-    ends = [[outcome_of(row) for row in rows if row["model"] == model] for model in models]
+    ends = pd.crosstab(frame.outcome, frame.model).reindex(OUTCOMES, columns=models, fill_value=0)
     handles = [
-        Patch(color=colour, label=f"{outcome}: {', '.join(str(each.count(outcome)) for each in ends)}")
+        Patch(color=colour, label=f"{outcome}: {', '.join(map(str, ends.loc[outcome]))}")
         for outcome, colour in OUTCOMES.items()
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
     figure.suptitle("How the tissue ended after the stress test")
     return figure
-
-
-def _bars(axes: Axes, rows: list[dict[str, Any]], kinds: list[str]) -> None:
-    ends = [(row["kind"], outcome_of(row)) for row in rows]
-    begins = [0] * len(kinds)
-    for outcome, colour in OUTCOMES.items():
-        counts = [ends.count((kind, outcome)) for kind in kinds]
-        axes.barh(kinds, counts, left=begins, color=colour)
-        begins = [begin + count for begin, count in zip(begins, counts, strict=True)]
-    finish_axes(axes, grid="x", xlabel=f"cases, of {len(rows)}", axisbelow=True)

@@ -13,11 +13,12 @@ from tqdm import tqdm
 from rehearsal.commands.command_line import WholeRange, arch_option
 from rehearsal.configuration import PRESETS, Setup
 from rehearsal.rehearsal import Rehearsal, RehearsalState
+from rehearsal.stopwatch import timed
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import PAPER, Scene
-from studies.harness import Watch, build, distances_after_fit, memory_of_process_mb, positions_of
+from studies.harness import build, distances_after_fit, memory_of_process_mb, positions_of
 from studies.study_options import open_study, out_option, scene_argument
-from studies.study_results import finish_axes, text_table, write_results
+from studies.study_results import finish_axes, table_of, write_results
 from ultrasound.probe_manipulator import advanced
 
 SEED = 20161130
@@ -38,9 +39,15 @@ SHOWN = {
 }
 # Half the least range of the axis of memory.
 LEAST_MB = 10.0
-HEADERS = ("model", "minute", "moved, mm", "shape, mm", "volume", "ms a step", "memory, MB")
-FORMATS = ("", "g", ".3f", ".4f", ".4f", ".2f", ".1f")
-COLUMNS = ("minute", "moved_mm", "shape_mm", "volume_ratio", "ms_median", "memory_mb")
+COLUMNS = {
+    "model": "{model}",
+    "minute": "{minute:g}",
+    "moved, mm": "{moved_mm:.3f}",
+    "shape, mm": "{shape_mm:.4f}",
+    "volume": "{volume_ratio:.4f}",
+    "ms a step": "{ms_median:.2f}",
+    "memory, MB": "{memory_mb:.1f}",
+}
 
 
 @click.command()
@@ -109,8 +116,11 @@ def run_soak(
 
 def _minute(rehearsal: Rehearsal, minute: int, minute_s: float, first: RehearsalState) -> dict[str, Any]:
     """One minute of rehearsal, and the distance of the tissue from its first rest position."""
-    watch = Watch()
-    watch.rehearse(rehearsal, _poses(rehearsal, minute, minute_s))
+    step_ms: list[float] = []
+    fallbacks = 0
+    for pose in _poses(rehearsal, minute, minute_s):
+        timed(lambda: rehearsal.advance(pose), step_ms)
+        fallbacks += bool(rehearsal.notice)
     position = positions_of(rehearsal.solver)
     rest = first.solver.body.position.astype(float)
     rehearsal.update_surfaces()
@@ -121,8 +131,8 @@ def _minute(rehearsal: Rehearsal, minute: int, minute_s: float, first: Rehearsal
         volume_ratio=round(rehearsal.volume_ratio(), 6),
         tangled=rehearsal.divergence_check.health().tangled,
         finite=bool(np.isfinite(position).all()),
-        fallbacks=len(watch.restored),
-        ms_median=round(float(np.median(watch.step_ms)), 4),
+        fallbacks=fallbacks,
+        ms_median=round(float(np.median(step_ms)), 4),
         memory_mb=round(memory_of_process_mb(), 3),
     )
 
@@ -147,15 +157,15 @@ def table(runs: list[dict[str, Any]]) -> str:
     rows, lines = [], []
     for run in runs:
         minutes = run["minutes"]
-        for at in sorted({0, len(minutes) // 2, len(minutes) - 1}):
-            rows.append([run["model"], *(minutes[at][name] for name in COLUMNS)])
+        shown = sorted({0, len(minutes) // 2, len(minutes) - 1})
+        rows += [dict(model=run["model"]) | minutes[at] for at in shown]
         worst = max(row["shape_mm"] for row in minutes)
         same = {name: "identical" if run[f"{name}_equal"] else "DIFFERS" for name in ("replay", "reset")}
         lines.append(
             f"{run['model']}: shape at most {worst:.4f} mm from the first rest; memory {run['memory_growth_mb']:+.1f} MB; "
             f"replay {same['replay']}; reset {same['reset']}; state restored {run['fallbacks']} times"
         )
-    return "\n".join([text_table(HEADERS, rows, FORMATS), *lines])
+    return "\n".join([table_of(COLUMNS.items(), rows), *lines])
 
 
 def figure_of(runs: list[dict[str, Any]]) -> Figure:
