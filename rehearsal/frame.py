@@ -9,13 +9,13 @@ import numpy as np
 
 from rehearsal.caliper import Caliper
 from rehearsal.cine import Cine, CineFrame
-from rehearsal.frame_view import probe_with_settings
 from rehearsal.image_and_surface_files import save_screenshot, save_surfaces, save_view
 from rehearsal.inputs.input_source import InputSource, ReplayInput
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import Tally, expected_error_of
 from rehearsal.notices import Notices
+from rehearsal.open_window import probe_with_settings
 from rehearsal.planning.plans_in_window import PlanControl
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.stopwatch import timed

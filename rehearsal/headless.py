@@ -7,11 +7,11 @@ from PIL import Image
 from tqdm import tqdm
 
 from rehearsal.frame import Frames
-from rehearsal.frame_view import open_viewer, probe_with_settings
 from rehearsal.image_and_surface_files import save_image_file, save_surfaces
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import summary
 from rehearsal.notices import Notices
+from rehearsal.open_window import open_viewer, probe_with_settings
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.result_files import write_json
 from render.animation import ANIMATION_FPS, empty_folder, save_animation, scaled_down, side_by_side

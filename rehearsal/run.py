@@ -15,7 +15,6 @@ from rehearsal.adaptive_iterations import AdaptiveIterations
 from rehearsal.commands.command_line import STOPPED, CommandError
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.frame import Frames, WindowFrames
-from rehearsal.frame_view import initial_settings, open_viewer
 from rehearsal.headless import run_headless
 from rehearsal.inputs.input_source import InputSource, ReplayInput, ScriptedInput
 from rehearsal.inputs.user_input import UserInput
@@ -23,6 +22,7 @@ from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import Tally
 from rehearsal.measurements.session_summary import summary_text
 from rehearsal.notices import Notices
+from rehearsal.open_window import initial_settings, open_viewer
 from rehearsal.planning.plan_file import Plan
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.plans_in_window import PlanControl

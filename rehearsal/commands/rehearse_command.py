@@ -167,8 +167,8 @@ def built(
 def compile_picture(rehearsal: "Rehearsal") -> None:
     """Compute one image in advance, so that the first frame need not wait for its kernels."""
     from rehearsal.frame import image_view
-    from rehearsal.frame_view import initial_settings
     from rehearsal.measurements.run_report import Tally
+    from rehearsal.open_window import initial_settings
 
     image_view(rehearsal, rehearsal.probe, initial_settings(rehearsal), Tally(0.0))
 

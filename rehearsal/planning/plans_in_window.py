@@ -6,9 +6,9 @@ from time import perf_counter
 
 from joblib import cpu_count
 
-from rehearsal.frame_view import probe_with_settings
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.notices import Notices
+from rehearsal.open_window import probe_with_settings
 from rehearsal.planning.plan_file import Plan, PlanError, next_plan_path, write_plan
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.plan_search import make_plan, total_work

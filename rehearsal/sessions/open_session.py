@@ -3,9 +3,9 @@
 import click
 from tqdm import tqdm
 
-from rehearsal.frame_view import probe_with_settings
 from rehearsal.inputs.input_source import set_settings
 from rehearsal.measurements.live_measurements import LiveMeasurements
+from rehearsal.open_window import probe_with_settings
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session_file import Log

@@ -17,8 +17,8 @@ from rehearsal.build_solver import build_solver, embedding_cell_mm, static_shape
 from rehearsal.commands.command_line import arch_option
 from rehearsal.configuration import PRESETS, Setup
 from rehearsal.frame import image_view
-from rehearsal.frame_view import initial_settings, probe_with_settings
 from rehearsal.measurements.run_report import Tally
+from rehearsal.open_window import initial_settings, probe_with_settings
 from rehearsal.rehearsal import SURROUNDINGS_MM, Rehearsal, scanned_anatomy
 from rehearsal.stopwatch import timed
 from render.background_image import BackgroundImage

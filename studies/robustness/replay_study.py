@@ -11,8 +11,8 @@ from tqdm import tqdm
 from rehearsal.adaptive_iterations import AdaptiveIterations
 from rehearsal.commands.command_line import arch_option
 from rehearsal.configuration import PRESETS
-from rehearsal.frame_view import initial_settings
 from rehearsal.inputs.user_input import UserInput
+from rehearsal.open_window import initial_settings
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions.recorder import record
 from rehearsal.sessions.replay import Replay

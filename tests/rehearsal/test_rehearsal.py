@@ -9,8 +9,8 @@ import trimesh
 from slicing import hounsfield, organ_mask
 
 from rehearsal.frame import image_view
-from rehearsal.frame_view import initial_settings
 from rehearsal.measurements.run_report import Tally
+from rehearsal.open_window import initial_settings
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import load_anatomy
 from scenes.patients.patient_folder import save_patient

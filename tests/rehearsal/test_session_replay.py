@@ -15,8 +15,8 @@ from rehearsal import headless, run
 from rehearsal.build_solver import step_settings
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.coordinates import probe_in_patient
-from rehearsal.frame_view import initial_settings
 from rehearsal.measurements.live_measurements import LiveMeasurements
+from rehearsal.open_window import initial_settings
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions import recorder
 from rehearsal.sessions.open_session import open_session
