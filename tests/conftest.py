@@ -2,10 +2,16 @@
 
 import gc
 import inspect
+import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
+
+# Each worker has a core of its own: threads of several libraries on each would wait for one another. Read when these are imported.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    for threads in ("TI_CPU_MAX_NUM", "OMP_NUM", "OPENBLAS_NUM", "ITK_GLOBAL_DEFAULT_NUMBER_OF"):
+        os.environ.setdefault(f"{threads}_THREADS", "1")
 
 import numpy as np
 import pytest
