@@ -18,11 +18,11 @@ from rehearsal.tracking.openigtlink_options import LinkOptions
 from scenes.scene import EMBEDDED, OPTIONS
 from scenes.tissue import TISSUES
 
-# CommandOptions that choose resolution and iterations, and the options of tissue and solver that each leaves to the user.
+# Options that choose resolution and iterations, and the options of tissue and solver that each leaves to the user.
 MATERIAL = ("model", "young_kpa", "poisson")
 LEFT = {"quality": (*MATERIAL, "stiffness"), "budget_ms": MATERIAL, "error_mm": MATERIAL}
 TISSUE_AND_STEP = [field_of(name) for key, name in OPTIONS.items() if key.startswith(("tissue.", "solver."))]
-# CommandOptions that exclude each other, and options that need another one.
+# Options that exclude each other, and options that need another one.
 EXCLUDING = {
     ("track", "replay"): "--track: a replay has the recorded poses; leave out --track or --replay",
     (
