@@ -324,6 +324,8 @@ def test_a_real_kidney_comes_in_and_gives_way(data, tmp_path, monkeypatch, capsy
     files = str(data / "ct" / ct), str(data / "ct" / labels)
     assert app.main(["import", *files, "--side", side, "--out", str(patient)]) == 0
     said = capsys.readouterr().out
+    organ = trimesh.load_mesh(patient / "organ.stl")
+    assert organ.is_watertight and organ.volume / 1000 == pytest.approx(125.6, rel=0.01)
     assert f"{side} kidney" in said and "crlm" not in (patient / "scene.toml").read_text()
     monkeypatch.setattr("rehearsal.headless.open_viewer", lambda *_, **__: None)
     assert app.main(["rehearse", str(patient), "--headless", *SHORT, "--out", str(tmp_path / "out")]) == 0

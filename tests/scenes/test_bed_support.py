@@ -4,7 +4,7 @@ import igl
 import numpy as np
 import pytest
 import trimesh
-from synthetic_body import LEFT, TUMOUR, assert_sound, body, drawn, grid_around, least_gap, level
+from synthetic_body import LEFT, TUMOUR, assert_sound, body, coarsely, drawn, grid_around, least_gap, level
 
 from errors import PatientError
 from scenes.patients.organ_support import bed_of_file, bed_of_labels
@@ -36,7 +36,9 @@ def ct_and_labels():
 @pytest.fixture(scope="module")
 def patient(ct_and_labels):
     ct, labels = ct_and_labels
-    return import_patient(ct, LabelMap.of(labels, NAMES), margin_mm=10.0, support="labels")
+    with pytest.MonkeyPatch.context() as patch:
+        coarsely(patch)
+        yield import_patient(ct, LabelMap.of(labels, NAMES), margin_mm=10.0, support="labels")
 
 
 class TestBedOfLabels:

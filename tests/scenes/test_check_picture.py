@@ -5,7 +5,7 @@ from dataclasses import replace
 import matplotlib.image
 import numpy as np
 import pytest
-from synthetic_body import LEFT, TUMOUR, body, points_of, with_voxels
+from synthetic_body import LEFT, TUMOUR, body, coarsely, points_of, with_voxels
 
 from scenes.patients.check_picture import (
     COLOUR,
@@ -30,7 +30,9 @@ NAMES = {2: "kidney_left", 3: "tumour"}
 @pytest.fixture(scope="module")
 def patient():
     ct, labels = body(spacing=(3.0, 3.0, 3.0))
-    return import_patient(LazyVolume.of(ct), LabelMap.of(labels, NAMES), side="left", margin_mm=30.0)
+    with pytest.MonkeyPatch.context() as patch:
+        coarsely(patch)
+        return import_patient(LazyVolume.of(ct), LabelMap.of(labels, NAMES), side="left", margin_mm=30.0)
 
 
 @pytest.mark.parametrize("view", [*VIEWS, OVERVIEW], ids=lambda view: view.name)
