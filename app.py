@@ -76,7 +76,7 @@ def cli() -> None:
 
 
 def _stop_in_order() -> None:
-    """Asked to end, clean up as after Ctrl-C: no half of a patient's folder stays."""
+    """On SIGTERM, clean up as after Ctrl-C, so that no incomplete patient's folder remains."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
 

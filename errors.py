@@ -1,4 +1,4 @@
-"""Errors that the user can mend, and what is wrong with the values of a file, in words; every layer reads files."""
+"""Errors that the user can correct, and their messages; used by all folders."""
 
 import difflib
 import warnings

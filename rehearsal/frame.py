@@ -25,6 +25,7 @@ from render.keys import Keys
 from render.viewer import Controls, ScannerSettings, Settings, View
 from render.window import Window
 from ultrasound.probe import Probe
+from ultrasound.probe_manipulator import image_plane
 
 # How long a notice stays on the screen, and the one that the tissue's state was restored.
 NOTICE_S, RESTORED_S = 2.0, 4.0
@@ -189,7 +190,7 @@ class WindowFrames(Frames):
         return self.keys.worded(f"{note}\n{HOW_TO_PRESS}")
 
     def _status(self, view: View) -> str:
-        """The text over the images, the most important first: the last words are cut where room ends."""
+        """The text over the images, the most important first: text that does not fit is cut at the end."""
         now = perf_counter()
         restored = "STATE RESTORED" if now < self._restored_until else ""
         news = [self._notice] if now < self._notice_until else [self._state(), self.plans.status]
@@ -233,12 +234,13 @@ class WindowFrames(Frames):
 def image_view(rehearsal: Rehearsal, probe: Probe, settings: Settings, tally: Tally) -> View:
     """Compute the images of the probe at its present pose, with overlays and read-outs."""
     scanner, pixels = rehearsal.scanner, rehearsal.scene.image.pixels
+    plane = image_plane(rehearsal.pose, probe.housing_mm[2], *probe.extent_mm)
     shown = settings.mode, settings.detail_level, settings.window_hu, settings.level_hu
 
     def images() -> dict[str, np.ndarray]:
         if scanner is None:
             return {"no CT": np.zeros((pixels, pixels), np.uint8)}
-        return scanner.images(rehearsal.image_plane(probe), probe, *shown)
+        return scanner.images(plane, probe, *shown)
 
     width, depth, above = probe.extent_mm
     return View(

@@ -83,17 +83,17 @@ class Rehearsal:
         self.gravity_direction = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
         meshes = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
         self.supports = [_shrunk(translated(mesh, -self.origin), SUPPORT_SUNK_MM) for mesh in meshes]
-        scanned, echo = None, None
+        scanned, acoustics = None, None
         if anatomy.ct is not None:
             scanned = scanned_anatomy(self.organ, anatomy.ct, anatomy, self.origin)
-            echo = start_acoustics(scanned) if needs_b_mode else None
+            acoustics = start_acoustics(scanned) if needs_b_mode else None
         progress("Building the model: tissue and contacts")
         self._build_solver(anatomy)
         self.divergence_check = DivergenceCheck(self.solver)
         self.notice = ""
         progress("Building the model: surfaces")
         self._build_surfaces()
-        self._build_scanner(scanned, echo)
+        self._build_scanner(scanned, acoustics)
         self.press = press_on(scene.press, anatomy, self.gravity_direction)
         self.steps = 0
         progress("Building the model: the tissue comes to rest")
@@ -140,14 +140,14 @@ class Rehearsal:
             self.tumour_skin = Skin(self.model, drawn)
         self.part_skins = {tissue: Skin(self.model, part.vertices) for tissue, part in self.parts.items()}
 
-    def _build_scanner(self, scanned: ScannedAnatomy | None, echo: Future[np.ndarray] | None) -> None:
+    def _build_scanner(self, scanned: ScannedAnatomy | None, acoustics: Future[np.ndarray] | None) -> None:
         image = self.scene.image
         margin = SURROUNDINGS_MM if image.outside == "background" else 0.0
         self.embedding = Embedding(self.model, self.organ, embedding_cell_mm(self.scene.tissue), margin)
         self.scanner = None
         if scanned is not None:
             around = image.outside, image.contact, image.contact_gap_mm
-            self.scanner = Scanner(scanned, self.embedding, self.probe, image.pixels, *around, echo)
+            self.scanner = Scanner(scanned, self.embedding, self.probe, image.pixels, *around, acoustics)
 
     def _settle(self) -> np.ndarray:
         """Let the organ come to rest on its support with the transducer far away: the paper's warm-up."""
@@ -202,7 +202,7 @@ class Rehearsal:
     def advance(self, pose: np.ndarray) -> None:
         """Advance one time step, at whose end the transducer has a pose (4, 4).
 
-        ``notice`` says if the divergence check restored the state; it is empty after most steps.
+        ``notice`` is the message of the divergence check if it restored the state, else empty.
         """
         self.solver.step(self.settings, poses_between(self.pose, pose, self.settings.substeps))
         self.notice = self.divergence_check.check(self.settings.time_step_s)
@@ -211,9 +211,9 @@ class Rehearsal:
 
     def snapshot(self, manipulator: ManipulatorState | None = None) -> RehearsalState:
         """A copy of the present state, with the manipulator's present state or another one."""
-        held = manipulator or self.manipulator.state
+        manipulator = manipulator or self.manipulator.state
         return RehearsalState(
-            self.solver.snapshot(), self.divergence_check.state, self.pose, self.steps, held
+            self.solver.snapshot(), self.divergence_check.state, self.pose, self.steps, manipulator
         )
 
     def restore(self, state: RehearsalState) -> None:
@@ -222,7 +222,7 @@ class Rehearsal:
         self.divergence_check.state = state.divergence
         self.pose, self.steps, self.manipulator.state = state.pose, state.steps, state.manipulator
 
-    def keep_good(self) -> None:
+    def store_valid_state(self) -> None:
         """Make the present tissue, if it is valid, the state that the divergence check restores."""
         self.divergence_check.store_if_healthy()
 
@@ -296,6 +296,6 @@ def scanned_anatomy(
     labels = anatomy.labels
     shift = np.eye(4)
     shift[:3, 3] = origin
-    marks = None if labels is None else labels.voxels.astype(np.int32)
+    label_values = None if labels is None else labels.voxels.astype(np.int32)
     tumour = anatomy.tumour and translated(anatomy.tumour, -origin)
-    return ScannedAnatomy(organ, ct.voxels, ct.index_from_mm @ shift, marks, anatomy.tissues, tumour)
+    return ScannedAnatomy(organ, ct.voxels, ct.index_from_mm @ shift, label_values, anatomy.tissues, tumour)

@@ -9,7 +9,7 @@ from scenes.section import Section
 
 Stiffness = Annotated[float, Field(ge=0, le=1)]
 QUALITIES = ("fast", "balanced", "accurate")
-# What a scene's tissue is where it does not say.
+# The default tissue of a scene.
 USUAL = "neo-hookean"
 
 

@@ -6,7 +6,7 @@
 
 import taichi as ti
 
-# Keeps the fraction of no slip finite.
+# Avoids a division by zero where there is no slip.
 LEAST_SLIP_MM = 1e-12
 
 
@@ -17,6 +17,6 @@ def tangential(vector, normal):
 
 
 @ti.func
-def sticking_fraction(slip, most):
-    """The fraction of a tangential slip that friction withstands, up to the length ``most``: 1 where it sticks."""
-    return ti.min(1.0, most / ti.max(slip.norm(), LEAST_SLIP_MM))
+def sticking_fraction(slip, limit_mm):
+    """The fraction of a tangential slip that friction withstands, up to a length [mm]: 1 where it sticks."""
+    return ti.min(1.0, limit_mm / ti.max(slip.norm(), LEAST_SLIP_MM))

@@ -14,7 +14,7 @@ out_option = click.option(
     "--out", type=click.Path(path_type=Path), required=True, help="Folder for tables and figures."
 )
 jobs_option = click.option(
-    "--jobs", type=WholeRange(1, 1024), help="Processes on this machine [one a processor]."
+    "--jobs", type=WholeRange(1, 1024), help="Number of processes [one for each processor]."
 )
 preset_option = click.option(
     "--quality",

@@ -61,7 +61,7 @@ class RehearseOptions(LinkOptions, ImageOptions, QualityOptions, ArchOptions):
     no_pictures: bool = False
     """With --headless: no images, which take most of the time; only report, surfaces and session."""
     seconds: float | None = Field(None, ge=0.02, le=3600)
-    """Simulated seconds without a window [the scene's press]; the scripted press is stretched to them, a replay or a track is cut off."""
+    """Simulated seconds without a window [the scene's press]; the scripted press takes this time; a replay or a track stops then."""
     replay: Path | None = None
     """Replay a recorded session of this SCENE, bit for bit."""
     at: float = Field(0.0, ge=0)

@@ -107,7 +107,7 @@ class Replay:
             elif event.kind == "back":
                 back = event.value
             elif event.kind == "state":
-                self.rehearsal.keep_good()
+                self.rehearsal.store_valid_state()
             elif event.kind == "bookmark":
                 self.bookmarks += 1
         return back, settings

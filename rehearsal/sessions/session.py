@@ -88,7 +88,7 @@ class Session:
 
         The tissue also becomes what the divergence check would restore, so that it is recorded once; a replay does the same.
         """
-        self.rehearsal.keep_good()
+        self.rehearsal.store_valid_state()
         self.note("state", pack_state(self.rehearsal.snapshot()))
         coverage = self.packed_coverage()
         if coverage is not None:

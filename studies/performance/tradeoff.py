@@ -64,9 +64,7 @@ ROUNDS, TIMED_STEPS = 3, 45
 @click.command()
 @click.argument("cases", metavar="[CASE]...", type=click.Path(path_type=Path), nargs=-1)
 @out_option
-@click.option(
-    "--quick", is_flag=True, help="A handful of settings on the embedded case, in less than a minute."
-)
+@click.option("--quick", is_flag=True, help="A few settings on the embedded case, in less than a minute.")
 @arch_option
 def trade(cases: tuple[Path, ...], out: Path, quick: bool, arch: str) -> None:
     """Measure the error of beads against the time of a step.

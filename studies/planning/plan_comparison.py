@@ -55,7 +55,7 @@ COLUMNS = {
     type=WholeRange(MOST_SWEEPS, 100_000),
     default=96,
     show_default=True,
-    help="Scans a search.",
+    help="Simulated sweeps in a search.",
 )
 @click.option("--probe", default="drop-in", show_default=True, help="Probe, by its name or as a file.")
 @jobs_option

@@ -72,7 +72,7 @@ class Numbers:
         self.pose = pose
         self.steps += 1
 
-    def keep_good(self) -> None:
+    def store_valid_state(self) -> None:
         self.watch = DivergenceState(self._solver())
 
     def pose_towards(self, goal: np.ndarray) -> np.ndarray:
