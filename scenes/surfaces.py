@@ -1,7 +1,8 @@
-"""Closed surfaces in LPS [mm]: read and written as files, translated, and the volume inside one."""
+"""Closed surfaces in LPS [mm]: read and written as files, translated; the volume inside one, and distances from it."""
 
 from pathlib import Path
 
+import igl
 import numpy as np
 import trimesh
 from trimesh.exchange.ply import export_ply
@@ -72,3 +73,13 @@ def volume_mm3(vertices: np.ndarray, faces: np.ndarray) -> float:
     """Volume [mm^3] inside a closed surface of vertices (n, 3) [mm] and faces (m, 3)."""
     corner = vertices[faces].astype(float)
     return float(np.einsum("ij,ij->", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6)
+
+
+def signed_distance_from(surface: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
+    """Distance [mm] of points (n, 3) from a closed surface, negative inside; shape (n,)."""
+    return igl.signed_distance(
+        np.ascontiguousarray(points, float),
+        np.ascontiguousarray(surface.vertices, float),
+        np.ascontiguousarray(surface.faces, np.int64),
+        igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER,
+    )[0]

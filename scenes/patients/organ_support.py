@@ -7,7 +7,6 @@ the labelled tissue under the organ and the fat between, carved in the same mann
 
 from pathlib import Path
 
-import igl
 import numpy as np
 import trimesh
 from scipy import ndimage
@@ -16,7 +15,7 @@ from skimage.measure import marching_cubes
 from errors import PatientError
 from scenes.patients.label_surfaces import FACES, decimate
 from scenes.patients.readers.label_maps import LabelMap, resample_nearest
-from scenes.surfaces import load_surface
+from scenes.surfaces import load_surface, signed_distance_from
 from scenes.volumes.voxel_grid import VoxelGrid
 
 # Spacing of the sampling grid.
@@ -148,17 +147,12 @@ def bed_of_file(path: Path, organ: trimesh.Trimesh) -> trimesh.Trimesh:
 
 def least_gap(support: trimesh.Trimesh, organ: trimesh.Trimesh) -> float:
     """Least signed distance [mm] between closed surfaces, at the vertices of both; negative: overlap."""
-    return float(min(_distance(support.vertices, organ).min(), _distance(organ.vertices, support).min()))
-
-
-def _distance(points: np.ndarray, surface: trimesh.Trimesh) -> np.ndarray:
-    """Signed distance [mm] of points (n, 3) to a closed surface, negative inside."""
-    return igl.signed_distance(
-        np.ascontiguousarray(points, float),
-        np.ascontiguousarray(surface.vertices, float),
-        np.ascontiguousarray(surface.faces, np.int64),
-        igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER,
-    )[0]
+    return float(
+        min(
+            signed_distance_from(organ, support.vertices).min(),
+            signed_distance_from(support, organ.vertices).min(),
+        )
+    )
 
 
 def _gravity_frame(gravity: np.ndarray) -> np.ndarray:
@@ -192,7 +186,7 @@ def _distance_to_swept(surface: trimesh.Trimesh, grid: tuple[np.ndarray, ...]) -
     a point as the organ is from the point t lower: a running minimum along the upward axis.
     """
     nodes = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1)
-    distance = _distance(nodes.reshape(-1, 3), surface)
+    distance = signed_distance_from(surface, nodes.reshape(-1, 3))
     return np.minimum.accumulate(distance.reshape(nodes.shape[:3]), axis=2)
 
 

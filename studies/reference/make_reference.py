@@ -8,10 +8,11 @@ import numpy as np
 import trimesh
 from skfem import MeshTet2
 
+from scenes.surfaces import signed_distance_from
 from studies.reference.fem_press import FemExperiment, FemPress
 from studies.reference.fem_solid import FemMaterial
 from studies.reference.reference_case import ReferenceCase
-from studies.reference.smooth_obstacles import RoundedBox, signed_distance
+from studies.reference.smooth_obstacles import RoundedBox
 from studies.reference.tetrahedral_mesh import tetrahedra
 
 BEADS, BEAD_DEPTH_MM, BEAD_SEED, CANDIDATES_A_BEAD = 45, 3.0, 20160705, 10
@@ -106,7 +107,7 @@ def blue_noise(surface: trimesh.Trimesh, count: int = BEADS, depth_mm: float = B
     while len(chosen) < count:
         low, high = surface.bounds
         points = rng.uniform(low, high, size=(CANDIDATES_A_BEAD * (len(chosen) + 1), 3))
-        points = points[signed_distance(surface, points) <= -depth_mm]
+        points = points[signed_distance_from(surface, points) <= -depth_mm]
         if len(points):
             apart = np.linalg.norm(points[:, None] - chosen[None], axis=2).min(axis=1, initial=np.inf)
             chosen = np.vstack([chosen, points[apart.argmax()]])

@@ -1,10 +1,11 @@
 """Rigid obstacles as distances that are smooth enough for Newton's method, and their normals."""
 
-import igl
 import numpy as np
 import trimesh
 from scipy.interpolate import NdBSpline
 from scipy.ndimage import spline_filter
+
+from scenes.surfaces import signed_distance_from
 
 FAR_MM = 1e3
 
@@ -49,7 +50,9 @@ class DistanceField:
         origin = low - margin_mm
         count = np.ceil((high - low + 2 * margin_mm) / grid_mm).astype(int) + 1
         nodes = origin + grid_mm * np.indices(count).reshape(3, -1).T
-        coefficients = spline_filter(signed_distance(surface, nodes).reshape(count), order=3, mode="mirror")
+        coefficients = spline_filter(
+            signed_distance_from(surface, nodes).reshape(count), order=3, mode="mirror"
+        )
         # Basis function j is centred at sample j, so the first of its five knots is at j - 2.
         knots = [start + grid_mm * np.arange(-2, n + 2) for start, n in zip(origin, count, strict=True)]
         self._spline = NdBSpline(tuple(knots), coefficients, 3, extrapolate=False)
@@ -63,13 +66,3 @@ class DistanceField:
         """Unit gradient of the distance, shape (n, 3); nan outside the field."""
         gradient = np.stack([self._spline(points, nu=axis) for axis in np.eye(3, dtype=int)], axis=1)
         return gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
-
-
-def signed_distance(surface: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
-    """Distance [mm] of points (n, 3) from a closed surface, negative inside; shape (n,)."""
-    return igl.signed_distance(
-        np.ascontiguousarray(points, float),
-        np.ascontiguousarray(surface.vertices, float),
-        np.ascontiguousarray(surface.faces, np.int64),
-        igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER,
-    )[0]

@@ -12,8 +12,8 @@ import trimesh
 from mmgpy import MmgMesh3D
 from skfem import Basis, ElementTetP2, MeshTet, MeshTet2
 
+from scenes.surfaces import signed_distance_from
 from studies.reference.fem_solid import MeshError
-from studies.reference.smooth_obstacles import signed_distance
 
 GRID_MM = 3.0
 CHORD_OF_SIZE = 0.05
@@ -45,7 +45,7 @@ def tetrahedra(surface: trimesh.Trimesh, size_mm: Callable[[np.ndarray], np.ndar
     remesher.set_field("metric", np.ascontiguousarray(sizes[:, None]))
     try:
         remesher.remesh_levelset(
-            signed_distance(surface, nodes)[:, None],
+            signed_distance_from(surface, nodes)[:, None],
             hausd=CHORD_OF_SIZE * float(sizes.max()),
             hgrad=GRADATION,
             hmin=0.5 * float(sizes.min()),
@@ -67,7 +67,7 @@ def _inside(remesher: MmgMesh3D, surface: trimesh.Trimesh) -> MeshTet:
     """The part of Mmg's mesh that is inside the surface."""
     corners = remesher.get_vertices()
     tets, part = remesher.get_elements_with_refs()
-    middles = signed_distance(surface, corners[tets].mean(axis=1))
+    middles = signed_distance_from(surface, corners[tets].mean(axis=1))
     tets = tets[part == min(np.unique(part), key=lambda p: float(np.median(middles[part == p])))]
     used, corner = np.unique(tets, return_inverse=True)
     return MeshTet(
