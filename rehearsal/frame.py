@@ -1,22 +1,28 @@
-"""One frame: input -> step -> image -> observe -> present. Data flows in this direction only."""
+"""One frame: input -> step -> image -> observe -> present. Data flows in this direction only.
+
+In a window, a process of its own makes the steps (``real_time/``); a frame shows the newest of them.
+"""
 
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from time import perf_counter
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from rehearsal.caliper import Caliper
 from rehearsal.cine import Cine, CineFrame
 from rehearsal.image_and_surface_files import save_screenshot, save_surfaces, save_view
-from rehearsal.inputs.input_source import InputSource, ReplayInput
+from rehearsal.inputs.input_source import InputSource, ReplayInput, WindowInput
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import Tally, expected_error_of
 from rehearsal.notices import Notices
 from rehearsal.open_window import probe_with_settings
 from rehearsal.planning.plans_in_window import PlanControl
+from rehearsal.pressed_organ import Step
+from rehearsal.real_time.frame_times import FrameTimes
+from rehearsal.real_time.solver_process import SolverProcess
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.stopwatch import timed
 from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer, send_live
@@ -31,15 +37,20 @@ from ultrasound.probe_manipulator import image_plane
 NOTICE_S, RESTORED_S = 2.0, 4.0
 # The simulation counts as real time from this share of it on.
 REAL_TIME = 0.9
+# What the figures of speed on the screen are of.
+RECENT_S, RECENT_FRAMES = 1.0, 20
+# A frame that took longer moves the transducer as if it had taken this long.
+MOST_ELAPSED_S = 0.25
+Source = TypeVar("Source", bound=InputSource)
 HOW_TO_PRESS = "{press} or {push} presses"
 
 
 @dataclass
-class Frames:
+class Frames(Generic[Source]):
     """The frames of one rehearsal, with a window (``WindowFrames``) or without one."""
 
     rehearsal: Rehearsal
-    source: InputSource
+    source: Source
     measurements: LiveMeasurements
     tally: Tally
     link: OpenIGTLinkServer | None = None
@@ -51,17 +62,23 @@ class Frames:
     def step(self, pose: np.ndarray | None) -> None:
         """Advance the tissue by a time step to a pose, and the surfaces with it."""
         if pose is not None:
-            timed(partial(self.rehearsal.advance, pose), self.tally.step_ms)
+            step = self.rehearsal.timed_step(pose)
             self.rehearsal.update_surfaces()
-            self.source.after_step(self.tally.step_ms[-1])
+            self.take(step)
+
+    def take(self, step: Step) -> None:
+        """Note a step that was made."""
+        self.tally.step_ms.append(step.took_ms)
+        self.source.after_step(step)
 
     def image(self, probe: Probe, settings: Settings) -> View:
         """Compute the images of the probe at its present pose."""
         return image_view(self.rehearsal, probe, settings, self.tally)
 
     def observe(self, probe: Probe, pose: np.ndarray | None) -> None:
-        """Measure, and record the session."""
-        self.measurements.watch(self.source.session, probe, pose)
+        """Measure, and record the session; no pose is a rollback."""
+        self.measurements.watch(self.source.session, probe, is_rollback=pose is None)
+        self.measurements.count(pose, self.rehearsal.settings.time_step_s)
         self.source.after_frame()
 
     def send(self, view: View, probe: Probe) -> None:
@@ -70,9 +87,10 @@ class Frames:
 
 
 @dataclass(kw_only=True)
-class WindowFrames(Frames):
-    """The frames in a window; a frozen one makes no step."""
+class WindowFrames(Frames[WindowInput]):
+    """The frames in a window; while it is frozen the solver makes no step."""
 
+    solver: SolverProcess
     viewer: Window
     out: Path
     notices: Notices
@@ -81,62 +99,88 @@ class WindowFrames(Frames):
     keys: Keys = field(default_factory=Keys)
     cine: Cine = field(default_factory=Cine)
     caliper: Caliper = field(default_factory=Caliper)
+    times: FrameTimes = field(default_factory=FrameTimes)
     frozen: bool = False
-    rate: float = 0.0
+    _last_step: Step | None = field(default=None, init=False)
+    _steps: list[Step] = field(default_factory=list, init=False)
+    _rollbacks: int = field(default=0, init=False)
+    _input_at_s: float | None = field(default=None, init=False)
     _notice: str = field(default="", init=False)
     _notice_until: float = field(default=0.0, init=False)
     _restored_until: float = field(default=0.0, init=False)
 
+    def __post_init__(self) -> None:
+        self.solver.on_step = self.take
+
     def run(self) -> None:
         """Draw frames until the window is closed."""
-        before = perf_counter()
         while self.viewer.running:
             controls = self.viewer.read_controls()
             view = self.frame(controls)
-            now = perf_counter()
-            self.rate = 0.9 * self.rate + 0.1 / max(now - before, 1e-6)
-            before = now
-            self.viewer.draw(view)
+            with self.times.stage("drawing"):
+                self.viewer.draw(view)
+            shown = self._last_step.input_s if self._last_step is not None and not self.frozen else None
+            self.times.end_frame(self.source.session.time_s, shown or None)
             self._save(controls, view)
 
     def frame(self, controls: Controls) -> View:
         """One frame."""
-        pose = self.input(controls)
-        self.step(pose)
+        with self.times.stage("input"):
+            self.solver.collect()
+            self.drive(controls)
+            self.rehearsal.update_surfaces()
         probe = probe_with_settings(self.rehearsal.probe, controls.settings)
-        view = self.image(probe, controls.settings)
-        self.observe(probe, pose)
-        self._record_sweep(probe, view, controls)
-        return self.present(view, probe, controls)
+        with self.times.stage("image"):
+            view = self.image(probe, controls.settings)
+        with self.times.stage("measurements"):
+            self.observe_window(probe)
+            self._record_sweep(probe, view, controls)
+            return self.present(view, probe, controls)
 
-    def input(self, controls: Controls) -> np.ndarray | None:
-        """Apply the keys of freeze, cine and plans; return the next pose, None if frozen or after a rollback."""
+    def drive(self, controls: Controls) -> None:
+        """Apply the keys of freeze, cine and plans; then tell the solver what to do, unless frozen."""
         ends_freeze = (controls.reset, controls.undo, controls.redo, controls.bookmark, controls.to_bookmark)
         if controls.freeze or (self.frozen and (any(ends_freeze) or controls.take_over)):
             self.frozen = not self.frozen
+            self.times.restart()
         if controls.reset:
             self.caliper.points = ()
         self.notices.post(controls.message)
         self.plans.watch(controls)
+        now, before = perf_counter(), self._input_at_s
+        self._input_at_s = now
         if self.frozen:
+            self.solver.pause()
             self.cine.go(controls.cine)
-        return None if self.frozen else super().input(controls)
+        else:
+            elapsed_s = self.rehearsal.settings.time_step_s if before is None else now - before
+            self.source.drive(self.solver, controls, min(elapsed_s, MOST_ELAPSED_S))
 
-    def step(self, pose: np.ndarray | None) -> None:
-        """Advance the tissue; post a notice if the divergence check restored its state."""
-        super().step(pose)
-        if pose is not None and self.rehearsal.notice:
-            self.notices.post(self.rehearsal.notice, on_screen=False)
+    def take(self, step: Step) -> None:
+        """Note a step that was made; post a notice if the divergence check restored its state."""
+        super().take(step)
+        self._last_step = step
+        self._steps.append(step)
+        if step.notice:
+            self.notices.post(step.notice, on_screen=False)
             self._restored_until = perf_counter() + RESTORED_S
 
     def image(self, probe: Probe, settings: Settings) -> View:
         """Compute the images, also of frozen tissue with other settings; of an earlier frame return those that it had."""
         return self.cine.shown.view if self._shows_earlier else super().image(probe, settings)
 
-    def observe(self, probe: Probe, pose: np.ndarray | None) -> None:
+    def observe_window(self, probe: Probe) -> None:
         """Measure and record, unless frozen."""
         if not self.frozen:
-            super().observe(probe, pose)
+            session = self.source.session
+            rollbacks, self._rollbacks = session.rollbacks - self._rollbacks, session.rollbacks
+            self.measurements.watch(session, probe, is_rollback=rollbacks > 0)
+            for step in self._steps:
+                self.measurements.count(step.pose, step.length_s)
+            for _ in range(rollbacks):
+                self.measurements.count(None, self.rehearsal.settings.time_step_s)
+            self._steps.clear()
+            self.source.while_running()
 
     def present(self, view: View, probe: Probe, controls: Controls) -> View:
         """Add measurements, caliper and status to the view."""
@@ -150,7 +194,7 @@ class WindowFrames(Frames):
             view,
             caliper_mm=self.caliper.points,
             caliper=self.caliper.figure(shown),
-            readouts=view.readouts | {"frames": f"{self.rate:.0f} /s"},
+            readouts=view.readouts | self._speeds(),
             clock=f"{self.source.session.time_s:.1f} s",
             pace=self._pace(),
             status=self._status(view),
@@ -177,10 +221,19 @@ class WindowFrames(Frames):
             self.cine.keep(shown)
         return shown
 
+    def _speeds(self) -> dict[str, str]:
+        """Pictures a second, and the time from an input to its picture."""
+        latency_ms = self.times.latency_ms
+        recent = [latency_ms[-n] for n in range(1, min(len(latency_ms), RECENT_FRAMES) + 1)]
+        return {
+            "frames": f"{self.times.rates(RECENT_S)[0]:.0f} /s",
+            "latency": f"{np.median(recent):.0f} ms" if recent else "",
+        }
+
     def _pace(self) -> str:
         """Simulated over real time, if the simulation is slower; empty while frozen."""
-        speed = self.rate * self.rehearsal.settings.time_step_s
-        return "" if self.frozen or speed >= REAL_TIME else f"{speed:.1g} x real"
+        factor = self.times.rates(RECENT_S)[1]
+        return "" if self.frozen or factor >= REAL_TIME else f"{factor:.1g} x real"
 
     def _with_hint(self, note: str) -> str:
         """A note that there is no contact, with the keys that press if these control the probe."""

@@ -3,7 +3,7 @@
 The window, the headless run and every study use this class, so that they compute the same.
 """
 
-import hashlib
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 
@@ -11,19 +11,15 @@ import numpy as np
 import taichi as ti
 import trimesh
 
-from rehearsal.build_solver import build_solver, embedding_cell_mm, static_shape, step_settings, tool_of
-from rehearsal.configuration import probe_of
-from scenes.anatomy import Grid, LoadedAnatomy, press_on
-from scenes.scene import PlaneShape, Scene
+from rehearsal.build_solver import embedding_cell_mm
+from rehearsal.pressed_organ import OrganState, PressedOrgan
+from scenes.anatomy import Grid, LoadedAnatomy
+from scenes.scene import Scene
 from scenes.surfaces import translated, volume_mm3
 from scenes.terminal import ReportProgress, no_progress
-from sim.divergence_check import DivergenceCheck, DivergenceState
 from sim.embedding import Embedding
 from sim.fields import array_of
-from sim.shapes import Plane, SignedDistanceField
 from sim.skinning import Skin
-from sim.solver import SolverState
-from sim.tissue_model import FixedRegion
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import (
     ImagePlane,
@@ -31,13 +27,10 @@ from ultrasound.probe_manipulator import (
     ProbeManipulator,
     advanced,
     image_plane,
-    pose_at,
-    poses_between,
     touching,
 )
 from ultrasound.scanner import ScannedAnatomy, Scanner, plane_section, start_acoustics
 
-AWAY_MM = 200.0
 # Where the tumour protrudes, organ and tumour share a surface: the tumour's is drawn this far outside.
 TUMOUR_LIFT_MM = 0.8
 # Organ and support share a surface where they touch: the support is drawn this far inside.
@@ -49,21 +42,17 @@ REST_PLACES = 48
 
 
 @dataclass(frozen=True)
-class RehearsalState:
-    """What changes: the tissue, the divergence check, the transducer's pose (4, 4), its manipulator."""
+class RehearsalState(OrganState):
+    """What changes: the state of the organ and its transducer, and of the transducer's manipulator."""
 
-    solver: SolverState
-    divergence: DivergenceState
-    pose: np.ndarray
-    steps: int
     manipulator: ManipulatorState
 
 
-class Rehearsal:
-    """A scene on the device. All positions are mm relative to ``origin``, the middle of the resting organ (LPS).
+class Rehearsal(PressedOrgan):
+    """A scene on the device: the organ under its probe, its surfaces, its images, and the manipulator that moves the probe.
 
-    Taichi must be initialised, and initialised again for another scene, which frees this one. ``progress`` is called with what is
-    being built; ``needs_b_mode`` prepares the B-mode image meanwhile.
+    ``progress`` is called with what is being built; ``needs_b_mode`` prepares the B-mode image meanwhile. ``settled`` gives the
+    state of the organ at rest where another process computes it.
     """
 
     def __init__(
@@ -73,63 +62,34 @@ class Rehearsal:
         probe: Probe | None = None,
         progress: ReportProgress = no_progress,
         needs_b_mode: bool = False,
+        settled: Callable[[], OrganState] | None = None,
     ) -> None:
-        self.scene = scene
-        self.probe = probe or probe_of(scene)
-        self.origin = anatomy.organ.bounds.mean(axis=0)
-        self.organ = translated(anatomy.organ, -self.origin)
-        self.tumour = anatomy.tumour and translated(anatomy.tumour, -self.origin)
-        self.parts = {tissue: translated(part, -self.origin) for tissue, part in anatomy.parts.items()}
-        self.gravity_direction = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
-        meshes = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
-        self.supports = [_shrunk(translated(mesh, -self.origin), SUPPORT_SUNK_MM) for mesh in meshes]
         scanned, acoustics = None, None
         if anatomy.ct is not None:
-            scanned = scanned_anatomy(self.organ, anatomy.ct, anatomy, self.origin)
+            origin = anatomy.organ.bounds.mean(axis=0)
+            scanned = scanned_anatomy(translated(anatomy.organ, -origin), anatomy.ct, anatomy, origin)
             acoustics = start_acoustics(scanned) if needs_b_mode else None
         progress("Building the model: tissue and contacts")
-        self._build_solver(anatomy)
-        self.divergence_check = DivergenceCheck(self.solver)
-        self.notice = ""
+        super().__init__(scene, anatomy, probe)
+        self.tumour = anatomy.tumour and translated(anatomy.tumour, -self.origin)
+        self.parts = {tissue: translated(part, -self.origin) for tissue, part in anatomy.parts.items()}
+        meshes = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
+        self.supports = [_shrunk(translated(mesh, -self.origin), SUPPORT_SUNK_MM) for mesh in meshes]
         progress("Building the model: surfaces")
         self._build_surfaces()
         self._build_scanner(scanned, acoustics)
-        self.press = press_on(scene.press, anatomy, self.gravity_direction)
-        self.steps = 0
         progress("Building the model: the tissue comes to rest")
-        self.pose = self._settle()
+        self._take_settled(self.settle() if settled is None else settled())
+
+    def _take_settled(self, state: OrganState) -> None:
+        """Begin with the organ at rest and the transducer just touching."""
+        self.restore_organ(state)
+        self.divergence_check.set_initial_state()
+        self.update_surfaces()
+        self.pose = self._press_pose()
         self.manipulator = self._manipulator()
         self.pose = self.manipulator.pose()
-        self.divergence_check.set_initial_state()
         self.settled = self.snapshot()
-
-    def _build_solver(self, anatomy: LoadedAnatomy) -> None:
-        self.size_mm = np.array(self.probe.housing_mm)
-        self.tool = tool_of(self.probe)
-        shapes = [*(self._shape(shape) for shape in anatomy.shapes), self.tool]
-        tissue, section = self.scene.tissue, self.scene.solver
-        fixed = self._fixed_region()
-        self.solver = build_solver(
-            self.organ, tissue, shapes, self.tool, self.scene.contact, section, fixed=fixed
-        )
-        self.body, self.model, self.contacts = self.solver.body, self.solver.model, self.solver.contacts
-        self.settings = step_settings(tissue, section)
-        self.set_gravity(self.scene.gravity.acceleration_m_s2)
-
-    def _fixed_region(self) -> FixedRegion | None:
-        attachment = self.scene.attachment
-        if attachment.radius_mm == 0 or attachment.at_mm is None:
-            return None
-        return FixedRegion(np.array(attachment.at_mm) - self.origin, attachment.radius_mm)
-
-    def _shape(self, shape: PlaneShape | trimesh.Trimesh | Grid) -> Plane | SignedDistanceField:
-        if isinstance(shape, PlaneShape):
-            normal = np.array(shape.normal) / np.linalg.norm(shape.normal)
-            return Plane(normal, shape.offset_mm / np.linalg.norm(shape.normal) - normal @ self.origin)
-        if isinstance(shape, trimesh.Trimesh):
-            return static_shape(translated(shape, -self.origin), self.scene.tissue)
-        spacing = 1 / np.diag(shape.index_from_mm)[:3]
-        return SignedDistanceField(shape.voxels, -spacing * shape.index_from_mm[:3, 3] - self.origin, spacing)
 
     def _build_surfaces(self) -> None:
         self.organ_skin = Skin(self.model, self.organ.vertices)
@@ -149,17 +109,6 @@ class Rehearsal:
             around = image.outside, image.contact, image.contact_gap_mm
             self.scanner = Scanner(scanned, self.embedding, self.probe, image.pixels, *around, acoustics)
 
-    def _settle(self) -> np.ndarray:
-        """Let the organ come to rest on its support with the transducer far away: the paper's warm-up."""
-        target = np.array(self.press.target_mm) - self.origin
-        pose = pose_at(target, np.array(self.press.direction), np.array(self.press.lateral), self.size_mm[2])
-        self.pose = advanced(pose, -AWAY_MM)
-        for _ in range(self.press.warm_up_steps):
-            self.advance(self.pose)
-        self.steps = 0
-        self.update_surfaces()
-        return pose
-
     def _manipulator(self) -> ProbeManipulator:
         settled = array_of(self.organ_skin.vertices).astype(float)
         faces = np.array(self.organ.faces, np.int64)
@@ -171,15 +120,6 @@ class Rehearsal:
         )
         manipulator.home = touching(self.pose, self.size_mm, manipulator.samples, radius)
         return manipulator
-
-    def set_gravity(self, acceleration_m_s2: float) -> None:
-        """Change the acceleration due to gravity; its direction is the scene's."""
-        self.settings.gravity = tuple(1000.0 * acceleration_m_s2 * self.gravity_direction)
-
-    def set_young(self, young_kpa: float) -> None:
-        """Change Young's modulus, if the tissue model has one."""
-        if hasattr(self.model, "set_material"):
-            self.model.set_material(young_kpa)
 
     def scripted_pose(self, time_s: float) -> np.ndarray:
         """The transducer's pose at a time of the scripted press: touching at first, then deeper stage by stage."""
@@ -199,32 +139,17 @@ class Rehearsal:
         """The transducer's next pose towards a goal (4, 4): at most at the scene's speed, and not through the organ."""
         return self.manipulator.pose_towards(goal, self.pose, self.settings.time_step_s)
 
-    def advance(self, pose: np.ndarray) -> None:
-        """Advance one time step, at whose end the transducer has a pose (4, 4).
-
-        ``notice`` is the message of the divergence check if it restored the state, else empty.
-        """
-        self.solver.step(self.settings, poses_between(self.pose, pose, self.settings.substeps))
-        self.notice = self.divergence_check.check(self.settings.time_step_s)
-        self.pose = pose
-        self.steps += 1
-
     def snapshot(self, manipulator: ManipulatorState | None = None) -> RehearsalState:
         """A copy of the present state, with the manipulator's present state or another one."""
-        manipulator = manipulator or self.manipulator.state
+        organ = self.snapshot_of_organ()
         return RehearsalState(
-            self.solver.snapshot(), self.divergence_check.state, self.pose, self.steps, manipulator
+            organ.solver, organ.divergence, organ.pose, organ.steps, manipulator or self.manipulator.state
         )
 
     def restore(self, state: RehearsalState) -> None:
         """Restore a state; the steps that follow give the same bits as before."""
-        self.solver.restore(state.solver)
-        self.divergence_check.state = state.divergence
-        self.pose, self.steps, self.manipulator.state = state.pose, state.steps, state.manipulator
-
-    def store_valid_state(self) -> None:
-        """Make the present tissue, if it is valid, the state that the divergence check restores."""
-        self.divergence_check.store_if_healthy()
+        self.restore_organ(state)
+        self.manipulator.state = state.manipulator
 
     def update_surfaces(self) -> None:
         """Move the drawn surfaces with the body."""
@@ -278,11 +203,6 @@ class Rehearsal:
         """Restore the start: tissue settled, transducer just touching."""
         self.restore(self.settled)
         ti.sync()
-
-    def digest(self) -> str:
-        """A hash of the tissue's state: it changes with every bit."""
-        state = self.body.snapshot()
-        return hashlib.sha256(state.position.tobytes() + state.velocity.tobytes()).hexdigest()[:16]
 
 
 def _shrunk(mesh: trimesh.Trimesh, by_mm: float) -> trimesh.Trimesh:

@@ -11,7 +11,6 @@ import numpy as np
 from click.exceptions import Exit
 from psutil import Process
 
-from rehearsal.adaptive_iterations import AdaptiveIterations
 from rehearsal.commands.command_line import STOPPED, CommandError
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.frame import Frames, WindowFrames
@@ -26,6 +25,7 @@ from rehearsal.open_window import initial_settings, open_viewer
 from rehearsal.planning.plan_file import Plan
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.plans_in_window import PlanControl
+from rehearsal.real_time.solver_process import SolverProcess
 from rehearsal.rehearsal import Rehearsal, RehearsalState
 from rehearsal.sessions.open_session import open_session
 from rehearsal.sessions.recorder import SessionRecorder, record
@@ -68,8 +68,8 @@ class RehearsalRun:
         guide = None if self.plan is None else PlanGuidance(self.rehearsal, self.plan)
         self.measurements = LiveMeasurements(self.rehearsal, guide)
 
-    def in_window(self, log: Log | None) -> None:
-        """Run in a window, after a replay of the log if there is one. Raises CommandError, SessionError."""
+    def in_window(self, log: Log | None, solver: SolverProcess) -> None:
+        """Run in a window, after a replay of the log if there is one. Raises CommandError, SessionError, SolverEnded."""
         pad = Gamepad(SdlPads(), self.keys.buttons) if self.asked.gamepad else None
         try:
             viewer = open_viewer(self.rehearsal, visible=True, keys=self.keys, gamepad=pad)
@@ -88,6 +88,7 @@ class RehearsalRun:
             self.measurements,
             Tally(0.0),
             self.link,
+            solver=solver,
             viewer=viewer,
             out=self.asked.out,
             notices=self.notices,
@@ -132,8 +133,8 @@ class RehearsalRun:
 
     def _tracked_input(self, track: TimedPoses) -> tuple[InputSource, int]:
         length_s = min(self.asked.seconds or np.inf, track.length_s)
-        # One step at 0 s and one at the end; without a budget, so that the bits do not depend on the machine's speed.
-        return self._user_input(budget_ms=np.inf), 1 + int(length_s / self._step_s + 1e-9)
+        # One step at 0 s and one at the end.
+        return self._user_input(), 1 + int(length_s / self._step_s + 1e-9)
 
     def _scripted_input(self) -> tuple[InputSource, int]:
         steps = max(1, round((self.asked.seconds or self.rehearsal.script_length_s()) / self._step_s))
@@ -147,8 +148,7 @@ class RehearsalRun:
     def _session(self) -> Session:
         return Session(self.rehearsal, coverage=lambda: self.measurements.coverage.seen)
 
-    def _user_input(self, begins: RehearsalState | None = None, budget_ms: float | None = None) -> UserInput:
-        adaptive = AdaptiveIterations(budget_ms or self.asked.budget_ms or 1000 * self._step_s)
+    def _user_input(self, begins: RehearsalState | None = None) -> UserInput:
         session = self._session()
         recorder = self._record(session, begins)
         tracked: PoseSource | None = None
@@ -156,7 +156,7 @@ class RehearsalRun:
             tracked = partial(played_pose, self.track, session)
         elif self.link is not None and self.asked.link_leads:
             tracked = self.link.received_pose.pose
-        return UserInput(session, adaptive, recorder, begins is not None, tracked, self.notices)
+        return UserInput(session, recorder, begins is not None, tracked, self.notices)
 
     def _replay_input(self, replay: Replay) -> ReplayInput:
         return ReplayInput(replay, self._take_over, self.notices)
@@ -164,6 +164,7 @@ class RehearsalRun:
     def _take_over(self) -> UserInput:
         """The user continues where the replay is: in a new session."""
         self.rehearsal.manipulator.match(self.rehearsal.pose)
+        self.rehearsal.settings.time_step_s = self.rehearsal.scene.solver.time_step_s
         self.measurements.restart()
         return self._user_input(self.rehearsal.snapshot())
 

@@ -1,11 +1,13 @@
 """The command ``rehearse``: press a kidney, in a window or without one."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import click
+import numpy as np
 from pydantic import ValidationError
 
 from errors import explained
@@ -24,6 +26,8 @@ from scenes.terminal import ReportProgress, stages
 from ultrasound.probe import Probe, ProbeError, probe_of_values
 
 if TYPE_CHECKING:
+    from rehearsal.pressed_organ import OrganState
+    from rehearsal.real_time.solver_process import SolverProcess
     from rehearsal.rehearsal import Rehearsal
 
 
@@ -63,11 +67,15 @@ def rehearse(asked: RehearseOptions) -> None:
                 check_plan(read_plan(asked.track), fingerprint(anatomy), probe)
         if plan is not None:
             check_plan(plan, fingerprint(anatomy), probe)
-        started, chosen = perf_counter(), ""
+        started, chosen, solver = perf_counter(), "", None
         if asked.budget_ms is not None or asked.error_mm is not None:
             rehearsal, chosen = built_within(loaded, anatomy, probe, used, progress, asked)
-        else:
-            rehearsal = built(loaded, anatomy, probe, progress, not asked.no_pictures)
+            loaded = rehearsal.scene
+        if not asked.headless:
+            solver = start_solver(loaded, anatomy, probe, used, asked)
+        if not chosen:
+            settled = None if solver is None else solver.settled
+            rehearsal = built(loaded, anatomy, probe, progress, not asked.no_pictures, settled)
         build_s = perf_counter() - started
         if not asked.no_pictures:
             progress("Building the model: the first picture")
@@ -77,10 +85,25 @@ def rehearse(asked: RehearseOptions) -> None:
     from rehearsal.run import RehearsalRun
 
     run = RehearsalRun(rehearsal, anatomy, used, asked, track, keys, link, plan)
-    if asked.headless:
+    if solver is None:
         run.headless(log, build_s)
-    else:
-        run.in_window(log)
+        return
+    if chosen:
+        solver.settled()
+    try:
+        solver.attach(rehearsal)
+        run.in_window(log, solver)
+    finally:
+        solver.close()
+
+
+def start_solver(
+    scene: Scene, anatomy: LoadedAnatomy, probe: Probe, arch: str, asked: RehearseOptions
+) -> "SolverProcess":
+    """Start the process that makes the steps of a window, so that it builds its model while this one builds the rest."""
+    from rehearsal.real_time.solver_process import SolverProcess
+
+    return SolverProcess(scene, anatomy, probe, arch, asked.budget_ms or np.inf)
 
 
 @click.command("keys")
@@ -156,12 +179,18 @@ def _probe_name(name: Any, housing_mm: Any) -> str:
 
 
 def built(
-    scene: Scene, anatomy: LoadedAnatomy, probe: Probe, progress: ReportProgress, draws: bool = True
+    scene: Scene,
+    anatomy: LoadedAnatomy,
+    probe: Probe,
+    progress: ReportProgress,
+    draws: bool = True,
+    settled: Callable[[], "OrganState"] | None = None,
 ) -> "Rehearsal":
-    """The rehearsal of a scene; ``draws``: images will be computed."""
+    """The rehearsal of a scene; ``draws``: images will be computed; ``settled`` waits for the organ at rest, if another process makes it."""
     from rehearsal.rehearsal import Rehearsal
 
-    return Rehearsal(scene, anatomy, probe, progress, needs_b_mode=draws and scene.image.mode != "ct")
+    needs_b_mode = draws and scene.image.mode != "ct"
+    return Rehearsal(scene, anatomy, probe, progress, needs_b_mode, settled)
 
 
 def compile_picture(rehearsal: "Rehearsal") -> None:

@@ -8,6 +8,8 @@ import numpy as np
 
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.notices import Notices
+from rehearsal.pressed_organ import Step
+from rehearsal.real_time.solver_process import SolverProcess
 from rehearsal.sessions.recorder import SessionRecorder
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session import Session
@@ -19,6 +21,10 @@ from ultrasound.target import TARGETS
 CHOICES: dict[str, tuple[str, ...]] = {"mode": MODES, "detail_level": DETAIL_LEVELS, "plan_for": TARGETS}
 # What sessions of version 1.0 call a setting -> its name now.
 RENAMED = {"rung": "detail_level"}
+
+
+# A replay that is further behind than this goes on from there.
+MOST_DUE_S = 0.25
 
 
 class InputSource(Protocol):
@@ -39,11 +45,21 @@ class InputSource(Protocol):
     def next_pose(self, controls: Controls) -> np.ndarray | None:
         """Return the pose (4, 4) to step to; None where the state was restored to an earlier one."""
 
-    def after_step(self, step_ms: float) -> None:
-        """The rehearsal has just made the step, in so many ms."""
+    def after_step(self, step: Step) -> None:
+        """Note a step that was made."""
 
     def after_frame(self) -> None:
         """The frame is complete."""
+
+
+class WindowInput(InputSource, Protocol):
+    """An input source for a window, where the solver makes steps by itself."""
+
+    def drive(self, solver: SolverProcess, controls: Controls, elapsed_s: float) -> None:
+        """Tell the solver what to do, after a time [s]; ``after_step`` follows for each step."""
+
+    def while_running(self) -> None:
+        """The frame is complete, and the solver may be ahead of the rehearsal."""
 
 
 class ReplayInput:
@@ -56,6 +72,7 @@ class ReplayInput:
         self.user_input: UserInput | None = None
         self.notices = notices or Notices()
         self._has_warned = False
+        self._due_s = 0.0
 
     @property
     def _source(self) -> "UserInput | Replay":
@@ -76,21 +93,45 @@ class ReplayInput:
         return self._source.bookmarks
 
     def next_pose(self, controls: Controls) -> np.ndarray | None:
-        if self.user_input is None and (controls.take_over or self.replay.is_over):
-            ended = "" if controls.take_over else "The replay has ended. "
-            self.notices.post(f"{ended}Mouse and keys control the probe", in_terminal=False)
-            self.user_input, controls = self._make_user_input(), replace(controls, take_over=False)
+        controls = self._with_take_over(controls)
         if self.user_input is not None:
             return self.user_input.next_pose(controls)
         pose, settings = self.replay.move()
         set_settings(controls.settings, settings)
         return pose
 
-    def after_step(self, step_ms: float) -> None:
+    def drive(self, solver: SolverProcess, controls: Controls, elapsed_s: float) -> None:
+        """Play what was recorded in a time [s], once the steps before are made."""
+        if self.user_input is None:
+            solver.pause()
+        controls = self._with_take_over(controls)
         if self.user_input is not None:
-            self.user_input.after_step(step_ms)
+            self.user_input.drive(solver, controls, elapsed_s)
             return
-        self.replay.end_step()
+        self._due_s = min(self._due_s + elapsed_s, MOST_DUE_S)
+        poses = np.zeros((0, 4, 4))
+        while self._due_s > 0 and not self.replay.is_over and len(poses) == 0:
+            poses, lengths_s, settings = self.replay.next_steps(self._due_s)
+            set_settings(controls.settings, settings)
+            self._due_s -= lengths_s.sum()
+        if len(poses):
+            solver.hand_over()
+            solver.play(poses, lengths_s)
+
+    def _with_take_over(self, controls: Controls) -> Controls:
+        """The controls; at the end of the replay, or when the user takes over, mouse and keys control the probe."""
+        if self.user_input is not None or not (controls.take_over or self.replay.is_over):
+            return controls
+        ended = "" if controls.take_over else "The replay has ended. "
+        self.notices.post(f"{ended}Mouse and keys control the probe", in_terminal=False)
+        self.user_input = self._make_user_input()
+        return replace(controls, take_over=False)
+
+    def after_step(self, step: Step) -> None:
+        if self.user_input is not None:
+            self.user_input.after_step(step)
+            return
+        self.replay.end_step(step.pose, step.length_s)
         if self.replay.differs_s is not None and not self._has_warned:
             self._has_warned = True
             self.notices.post(
@@ -101,6 +142,11 @@ class ReplayInput:
     def after_frame(self) -> None:
         if self.user_input is not None:
             self.user_input.after_frame()
+
+    def while_running(self) -> None:
+        """Let the session's file keep up, if there is one."""
+        if self.user_input is not None:
+            self.user_input.while_running()
 
 
 def set_settings(settings: Settings, values: dict[str, Any]) -> None:
@@ -140,7 +186,7 @@ class ScriptedInput:
         share = (self.session.step_index + 1) / self.steps
         return rehearsal.pose_towards(rehearsal.scripted_pose(rehearsal.script_length_s() * share))
 
-    def after_step(self, step_ms: float) -> None:
+    def after_step(self, step: Step) -> None:
         self.session.end_step()
 
     def after_frame(self) -> None:

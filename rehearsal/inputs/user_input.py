@@ -1,11 +1,15 @@
 """The user's input: mouse, keys and gamepad, or a tracked probe, move the transducer; undo, redo, reset and bookmarks."""
 
 from dataclasses import asdict, dataclass, field
+from time import perf_counter
+from typing import Any
 
 import numpy as np
 
-from rehearsal.adaptive_iterations import AdaptiveIterations
 from rehearsal.notices import Notices
+from rehearsal.pressed_organ import Step
+from rehearsal.real_time.pace import pace_text
+from rehearsal.real_time.solver_process import SolverProcess
 from rehearsal.sessions.recorder import SessionRecorder
 from rehearsal.sessions.replay import set_solver
 from rehearsal.sessions.session import History, Session
@@ -25,16 +29,18 @@ class UserInput:
     """
 
     session: Session
-    adaptive_iterations: AdaptiveIterations
     recorder: SessionRecorder | None = None
     waits: bool = False
     tracked: PoseSource | None = None
     notices: Notices = field(default_factory=Notices)
     _ray: Ray | None = field(default=None, init=False)
     _ray_at_slide: Ray | None = field(default=None, init=False)
-    _iterations_set: int = field(default=0, init=False)
+    _pace: str = field(default="", init=False)
+    _solver_values: dict[str, Any] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
+        # The pose that was asked for last; the transducer follows it.
+        self._goal = self.session.rehearsal.pose
         self.history = History(self.session)
         self._follower = None if self.tracked is None else TrackingInput(self.tracked, self.session.rehearsal)
         if self.waits:
@@ -42,10 +48,10 @@ class UserInput:
 
     @property
     def status(self) -> str:
-        """The text in the panel: the tracker has lost the probe, or the iterations are reduced."""
+        """The text in the panel: the tracker has lost the probe, or the steps are not as they are set."""
         if self._follower is not None and self._follower.is_lost:
             return "TRACKING LOST"
-        return self.adaptive_iterations.status(self._iterations_set)
+        return self._pace
 
     @property
     def is_manual(self) -> bool:
@@ -57,35 +63,70 @@ class UserInput:
         """Number of bookmarks that the user has set."""
         return len(self.history.bookmarks)
 
-    def next_pose(self, controls: Controls) -> np.ndarray | None:
-        """Return the pose (4, 4) to step to, or None where the state was restored to an earlier one."""
+    def drive(self, solver: SolverProcess, controls: Controls, elapsed_s: float) -> None:
+        """Give the solver the user's input after a time [s]; pause it for what changes more than the transducer's pose."""
+        if self._interrupts(controls):
+            solver.pause()
+        pose = self.next_pose(controls, elapsed_s)
+        if solver.is_paused:
+            self.after_frame()
+            solver.hand_over()
+            solver.run()
+        if pose is not None:
+            solver.go_to(pose, perf_counter(), elapsed_s)
+
+    def _interrupts(self, controls: Controls) -> bool:
+        """Whether the controls change more than the pose, or the whole state is to be recorded."""
+        restores = (controls.reset, controls.undo, controls.redo, controls.bookmark, controls.to_bookmark)
+        changes = solver_values(controls.settings) != self._solver_values
+        return any(restores) or changes or (self.recorder is not None and self.recorder.is_state_due)
+
+    def next_pose(self, controls: Controls, elapsed_s: float | None = None) -> np.ndarray | None:
+        """Return the pose (4, 4) to step to, or None where the state was restored to an earlier one.
+
+        ``elapsed_s`` is the time since the last input, if not one step.
+        """
         self.session.note_changes("settings", asdict(controls.settings))
+        rehearsal, follower = self.session.rehearsal, self._follower
         if self._restore_earlier(controls):
             self._wait(controls.ray)
+            self._goal = rehearsal.pose
             return None
         if controls.take_over:
             self._take_over()
+            follower = None
         self._set_solver(controls.settings)
-        rehearsal, follower = self.session.rehearsal, self._follower
+        time_s = rehearsal.settings.time_step_s if elapsed_s is None else elapsed_s
         before = rehearsal.manipulator.state
-        pose = self._manual_pose(controls) if follower is None else self._tracked_pose(follower, controls)
-        moves = bool(np.abs(pose - rehearsal.pose).max() > STILL_MM)
+        if follower is None:
+            pose = self._manual_pose(controls, time_s)
+        else:
+            pose = self._tracked_pose(follower, controls, time_s)
+        moves = bool(np.abs(pose - self._goal).max() > STILL_MM)
         presses = controls.press and follower is None
         self.history.watch(moves or presses, presses, before)
+        self._goal = pose
         return pose
 
-    def after_step(self, step_ms: float) -> None:
-        """Note the step that the rehearsal has just made, and its duration [ms]."""
-        self.session.end_step()
-        before = self.status
-        if self.adaptive_iterations.watch(step_ms) and self.status != before:
-            text = self.status or f"All {self._iterations_set} iterations again."
-            self.notices.post(text, on_screen=False)
+    def after_step(self, step: Step) -> None:
+        """Note a step that was made."""
+        self.session.note_changes("solver", dict(iterations=step.iterations))
+        self.session.end_step(step.pose, step.length_s)
+        settings = self.session.rehearsal.settings
+        pace = pace_text(step.length_s, settings.time_step_s, step.iterations, settings.iterations)
+        if pace != self._pace:
+            self._pace = pace
+            self.notices.post(pace or "Steps as they are set again.", on_screen=False)
 
     def after_frame(self) -> None:
         """Let the session's file keep up."""
         if self.recorder is not None:
             self.recorder.keep_up()
+
+    def while_running(self) -> None:
+        """Let the session's file keep up while the solver is ahead: without a whole state."""
+        if self.recorder is not None:
+            self.recorder.keep_up(may_record_state=False)
 
     def _take_over(self) -> None:
         """Mouse, keys and gamepad replace the tracked probe."""
@@ -105,32 +146,31 @@ class UserInput:
         if self._follower is not None:
             self._follower.wait()
 
-    def _tracked_pose(self, follower: TrackingInput, controls: Controls) -> np.ndarray:
+    def _tracked_pose(self, follower: TrackingInput, controls: Controls, time_s: float) -> np.ndarray:
         """The next pose towards the tracked probe."""
-        rehearsal = self.session.rehearsal
+        manipulator = self.session.rehearsal.manipulator
         try:
             goal = follower.goal()
         except TrackEnded as over:
             self._follower = None
             self._show(str(over))
             self._wait(controls.ray)
-            return rehearsal.pose
-        pose = rehearsal.pose if goal is None else rehearsal.pose_towards(goal)
-        rehearsal.manipulator.match(pose)
+            return self._goal
+        pose = self._goal if goal is None else manipulator.pose_towards(goal, self._goal, time_s)
+        manipulator.match(pose)
         return pose
 
-    def _manual_pose(self, controls: Controls) -> np.ndarray:
+    def _manual_pose(self, controls: Controls, time_s: float) -> np.ndarray:
         """The next pose as mouse, keys and gamepad ask for it."""
         if self.waits and self._ray is None:
             self._ray = controls.ray
         self.waits = self.waits and not acts(controls, self._ray)
         if self.waits:
-            return self.session.rehearsal.pose
-        return self._moved_manipulator(controls)
+            return self._goal
+        return self._moved_manipulator(controls, time_s)
 
-    def _moved_manipulator(self, controls: Controls) -> np.ndarray:
-        rehearsal = self.session.rehearsal
-        manipulator, time_s = rehearsal.manipulator, rehearsal.settings.time_step_s
+    def _moved_manipulator(self, controls: Controls, time_s: float) -> np.ndarray:
+        manipulator = self.session.rehearsal.manipulator
         if any(controls.slide_mm):
             manipulator.slide(*controls.slide_mm)
             self._ray_at_slide = controls.ray
@@ -140,7 +180,7 @@ class UserInput:
         manipulator.press(controls.press, time_s, controls.press_share)
         manipulator.push(controls.push_mm)
         manipulator.turn(controls.tilt_deg, controls.rock_deg, controls.rotate_deg)
-        return manipulator.pose_towards(manipulator.pose(), rehearsal.pose, time_s)
+        return manipulator.pose_towards(manipulator.pose(), self._goal, time_s)
 
     def _restore_earlier(self, controls: Controls) -> bool:
         """Undo, redo, reset or a bookmark; whether the state was restored to an earlier one."""
@@ -164,17 +204,24 @@ class UserInput:
         return done
 
     def _set_solver(self, settings: TissueSettings) -> None:
-        self._iterations_set = settings.iterations
-        values = dict(
-            iterations=self.adaptive_iterations.iterations(settings.iterations),
-            substeps=settings.substeps,
-            stiffness=settings.stiffness,
-            young_kpa=settings.young_kpa,
-            gravity_m_s2=settings.gravity_m_s2,
-        )
-        given = {name: value for name, value in values.items() if value is not None}
-        self.session.note_changes("solver", given)
-        set_solver(self.session.rehearsal, given)
+        values = solver_values(settings)
+        self._solver_values = values
+        # The iterations that a step had are noted with it.
+        noted = {name: value for name, value in values.items() if name != "iterations"}
+        self.session.note_changes("solver", noted)
+        set_solver(self.session.rehearsal, values)
+
+
+def solver_values(settings: TissueSettings) -> dict[str, Any]:
+    """The settings of solver and tissue that the tissue model has."""
+    values = dict(
+        iterations=settings.iterations,
+        substeps=settings.substeps,
+        stiffness=settings.stiffness,
+        young_kpa=settings.young_kpa,
+        gravity_m_s2=settings.gravity_m_s2,
+    )
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def acts(controls: Controls, ray: Ray | None) -> bool:

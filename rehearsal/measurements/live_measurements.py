@@ -33,17 +33,13 @@ class LiveMeasurements:
         self.rehearsal, self.guide = rehearsal, guide
         self.margin_mm = MARGIN_MM if guide is None else guide.plan.margin_mm
         self._coverage: Coverage | None = None
-        step_s = rehearsal.settings.time_step_s
-        self._measure_every, self._coverage_every = (
-            max(1, round(s / step_s)) for s in (MEASURE_S, COVERAGE_S)
-        )
         self._begin()
 
     def _begin(self) -> None:
         rehearsal = self.rehearsal
-        self.course = SessionCourse(
-            rehearsal.scene.transducer.compression_warning_mm, rehearsal.settings.time_step_s
-        )
+        self.course = SessionCourse(rehearsal.scene.transducer.compression_warning_mm)
+        # The last period of each in which it was done.
+        self._measured = self._covered = -1
         self.latest: Measurement | None = None
         self._seen: dict[str, np.ndarray] = {}
         self._findings: dict[str, str] = {}
@@ -77,7 +73,7 @@ class LiveMeasurements:
             is_rollback = bool(np.isnan(pose).any())
             if self.guide is not None and not is_rollback:
                 self.guide.watch(pose)
-            self._count(None if is_rollback else pose)
+            self.count(None if is_rollback else pose, log.lengths_s[step - 1])
         self._show()
         return True
 
@@ -99,25 +95,29 @@ class LiveMeasurements:
     def _new_coverage(self) -> Coverage:
         return Coverage(self.rehearsal.organ, self.rehearsal.tumour, self.margin_mm)
 
-    def watch(self, session: Session, probe: Probe, pose: np.ndarray | None) -> None:
-        """Update the coverage, and measure and record when due, after the images of a step (its pose, None for a rollback)."""
+    def watch(self, session: Session, probe: Probe, is_rollback: bool = False) -> None:
+        """Update the coverage, measure and record when due, after an image: of a step, or of a rollback."""
         # After a rollback the latest measurement is out of date.
-        is_due = pose is None or self.latest is None
-        if (is_due or session.step_index % self._coverage_every == 0) and self.rehearsal.scanner is not None:
+        is_due = is_rollback or self.latest is None
+        if (
+            is_due or periods(session.time_s, COVERAGE_S) != self._covered
+        ) and self.rehearsal.scanner is not None:
+            self._covered = periods(session.time_s, COVERAGE_S)
             image = self.rehearsal.scene.image
             rest = self.rehearsal.scanner.plane.rest_grid(GRID_POINTS)
             self._touches = self.coverage.add(rest, probe, image.contact_gap_mm)
         if self.guide is not None:
             self.guide.go_with(session)
-        if is_due or session.step_index % self._measure_every == 0:
+        if is_due or periods(session.time_s, MEASURE_S) != self._measured:
+            self._measured = periods(session.time_s, MEASURE_S)
             self.latest = measure(self.rehearsal, probe, self._touches)
             session.note("reading", self.figures())
             self._show()
-        self._count(pose)
 
-    def _count(self, pose: np.ndarray | None) -> None:
+    def count(self, pose: np.ndarray | None, length_s: float) -> None:
+        """Count a step by its pose (4, 4) and its length [s], or a rollback by None, for the summary."""
         if self.latest is not None:
-            self.course.add(pose, round(self.latest.compression_mm, DIGITS))
+            self.course.add(pose, round(self.latest.compression_mm, DIGITS), length_s)
 
     def _show(self) -> None:
         """Update what the window shows."""
@@ -199,6 +199,11 @@ class LiveMeasurements:
 
     def _share(self, target: str) -> str:
         return f"{100 * self.coverage.fraction(target):.0f} %"
+
+
+def periods(time_s: float, period_s: float) -> int:
+    """How many whole periods a sum of steps has lasted."""
+    return int(time_s / period_s + 1e-6)
 
 
 def _mm(length: float | None) -> str:

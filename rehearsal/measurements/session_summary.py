@@ -22,7 +22,6 @@ class SessionCourse:
     """Accumulates the figures of a summary, under their names in it, step by step."""
 
     compression_warning_mm: float
-    step_s: float
     duration_s: float = 0.0
     path_mm: float = 0.0
     fastest_mm_s: float = 0.0
@@ -33,9 +32,9 @@ class SessionCourse:
     _is_pressed: bool = field(default=False, init=False)
     _at: np.ndarray | None = field(default=None, init=False)
 
-    def add(self, pose: np.ndarray | None, compression_mm: float) -> None:
-        """Add a step by its pose (4, 4), or a rollback by None, with the compression [mm]."""
-        self.duration_s += self.step_s
+    def add(self, pose: np.ndarray | None, compression_mm: float, length_s: float) -> None:
+        """Add a step by its pose (4, 4), or a rollback by None, with the compression [mm] and the length [s]."""
+        self.duration_s += length_s
         if pose is None:
             self.went_back += 1
             self._at = None
@@ -43,10 +42,10 @@ class SessionCourse:
         if self._at is not None:
             path = float(np.linalg.norm(pose[:3, 3] - self._at))
             self.path_mm += path
-            self.fastest_mm_s = max(self.fastest_mm_s, path / self.step_s)
+            self.fastest_mm_s = max(self.fastest_mm_s, path / length_s)
         self._at = pose[:3, 3].copy()
         self.compression_max_mm = max(self.compression_max_mm, compression_mm)
-        self.over_warning_s += self.step_s * (compression_mm > self.compression_warning_mm)
+        self.over_warning_s += length_s * (compression_mm > self.compression_warning_mm)
         if not self._is_pressed and compression_mm > PRESSED_MM:
             self.presses += 1
         self._is_pressed = compression_mm > (RELEASED_MM if self._is_pressed else PRESSED_MM)

@@ -17,7 +17,7 @@ def open_session(
 ) -> Replay:
     """Replay a session up to a time [s], from the last state recorded before it. Raises SessionError."""
     replay = Replay(rehearsal, log)
-    begins, aim = replay.begin_at(at_s), replay.step_at(at_s)
+    begins, aim = replay.begin_at(at_s), log.step_at(at_s)
     set_settings(settings, replay.settings_until_now())
     if not measurements.recall(log, begins):
         click.echo(
@@ -36,5 +36,6 @@ def open_session(
         probe = probe_with_settings(rehearsal.probe, settings)
         rehearsal.update_surfaces()
         rehearsal.find_plane(probe)
-        measurements.watch(replay.session, probe, pose)
+        measurements.watch(replay.session, probe, is_rollback=pose is None)
+        measurements.count(pose, rehearsal.settings.time_step_s)
     return replay

@@ -24,6 +24,9 @@ NUMBERS = 12
 # A second has fewer steps; a grid of 1.5 mm over half a metre fewer voxels; all arrays of a body of a million particles fewer bytes.
 MOST_STEPS, MOST_VOXELS, MOST_BYTES = 1_000_000, 100_000_000, 1 << 30
 
+# The range of StepSettings.
+LEAST_STEP_S, MOST_STEP_S = 1e-6, 10.0
+
 # What NumPy and zipfile raise for unreadable data.
 UNREADABLE = (
     *(ValueError, LookupError, TypeError, RuntimeError, OSError, EOFError, MemoryError),
@@ -80,6 +83,19 @@ def unpack_poses(text: str) -> np.ndarray:
     if np.isinf(poses).any():
         raise ValueError("a pose that is not finite")
     return poses
+
+
+def pack_lengths(lengths_s: list[float]) -> str:
+    """The lengths of steps [s]."""
+    return _packed(np.array(lengths_s, "<f8"))
+
+
+def unpack_lengths(text: str) -> np.ndarray:
+    """The lengths (n,) of steps [s]. Raises ValueError."""
+    lengths_s = np.frombuffer(_unpacked(text, MOST_STEPS * 8), "<f8")
+    if not ((lengths_s >= LEAST_STEP_S) & (lengths_s <= MOST_STEP_S)).all():
+        raise ValueError(f"a step that is not {LEAST_STEP_S:g} to {MOST_STEP_S:g} s long")
+    return lengths_s
 
 
 def pack_seen(seen: np.ndarray) -> SeenVoxels:

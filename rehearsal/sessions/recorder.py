@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from rehearsal.notices import Notices
 from rehearsal.rehearsal import RehearsalState
 from rehearsal.result_files import next_number
-from rehearsal.sessions.packed_arrays import pack_poses, pack_state
+from rehearsal.sessions.packed_arrays import pack_lengths, pack_poses, pack_state
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import End, Event, Header, Kind, Second, recorded_values
 from scenes.anatomy import LoadedAnatomy, fingerprint
@@ -19,6 +19,8 @@ from version import VERSION
 
 # Interval of whole states: a replay that opens in the middle of a session computes at most this long.
 STATE_S = 60.0
+# A second is a sum of steps: this much less counts as one.
+ROUNDING_S = 1e-6
 NAME = r"session-([0-9]{3,9})\.jsonl"
 
 
@@ -34,9 +36,10 @@ class SessionRecorder:
         self.fault = ""
         self._has_warned = False
         self._poses: list[np.ndarray | None] = []
+        self._lengths_s: list[float] = []
+        self._usual_s = header.time_step_s
+        self._state_due_s = STATE_S
         self._events: list[Event] = []
-        step_s = session.rehearsal.settings.time_step_s
-        self._line_every, self._state_every = max(1, round(1 / step_s)), max(1, round(STATE_S / step_s))
         self._file = path.open("x", encoding="utf-8")
         self._disk = ThreadPoolExecutor(1, "session")
         self._write(header)
@@ -46,15 +49,27 @@ class SessionRecorder:
         """Note something about the coming step."""
         self._events.append(Event(at=self.session.step_index, kind=kind, value=value))
 
-    def add_step(self, pose: np.ndarray | None) -> None:
-        """Add a step by its pose (4, 4), or a rollback by None."""
+    def add_step(self, pose: np.ndarray | None, length_s: float) -> None:
+        """Add a step by its pose (4, 4), or a rollback by None, and its length [s]."""
         self._poses.append(pose)
+        self._lengths_s.append(length_s)
 
-    def keep_up(self) -> None:
-        """Write each complete second; post once what went wrong with the file."""
-        if len(self._poses) >= self._line_every:
+    @property
+    def is_state_due(self) -> bool:
+        """Whether ``keep_up`` will record the whole state."""
+        return self._is_second_over and self.session.time_s > self._state_due_s - ROUNDING_S
+
+    @property
+    def _is_second_over(self) -> bool:
+        return sum(self._lengths_s) > 1.0 - ROUNDING_S
+
+    def keep_up(self, may_record_state: bool = True) -> None:
+        """Write each complete second, and the whole state if it is due and may be recorded; post once what went wrong with the file."""
+        if self._is_second_over:
+            records_state = may_record_state and self.is_state_due
             self._write_second()
-            if self.session.step_index % self._state_every < self._line_every:
+            if records_state:
+                self._state_due_s += STATE_S
                 self.session.record_state()
         if self.fault and not self._has_warned:
             self._has_warned = True
@@ -76,8 +91,11 @@ class SessionRecorder:
         """Write the steps since the last line, with the tissue's present digest."""
         if self._poses:
             at, digest = self.session.step_index - len(self._poses), self.session.rehearsal.digest()
-            self._write(Second(at=at, poses=pack_poses(self._poses), events=self._events, digest=digest))
-            self._poses, self._events = [], []
+            varies = any(length_s != self._usual_s for length_s in self._lengths_s)
+            lengths_s = pack_lengths(self._lengths_s) if varies else None
+            poses = pack_poses(self._poses)
+            self._write(Second(at=at, poses=poses, lengths_s=lengths_s, events=self._events, digest=digest))
+            self._poses, self._lengths_s, self._events = [], [], []
 
     def _write(self, line: BaseModel) -> None:
         self._disk.submit(self._put, line)

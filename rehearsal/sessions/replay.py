@@ -10,6 +10,9 @@ from rehearsal.sessions.packed_arrays import StateError, unpack_state
 from rehearsal.sessions.session import SETTLED, Session
 from rehearsal.sessions.session_file import Log, SessionError
 
+# Events that change the tissue, or the solver's settings.
+CHANGING = ("solver", "back", "state")
+
 
 class Replay:
     """Repeat a log on a rehearsal. ``differs_s`` is the time [s] at which the tissue first differed from the recorded one, if it did;
@@ -32,6 +35,9 @@ class Replay:
         if {index for index, _ in backs} != set(np.flatnonzero(np.isnan(log.poses).any(axis=(1, 2)))):
             raise SessionError("the session has a step without a pose: its file is damaged")
         self._backs = backs
+        changing = {i for i, e in log.events.items() if any(event.kind in CHANGING for event in e)}
+        # Steps before which something else than a step happens.
+        self._stops = changing | set(log.digests) | {to for _, to in backs if isinstance(to, int)}
         if log.header.begins is not None:
             rehearsal.restore(self._state(log.header.begins))
 
@@ -45,25 +51,21 @@ class Replay:
         """Simulated time since the session began."""
         return self.session.time_s
 
-    def step_at(self, seconds: float) -> int:
-        """The step at a time [s], or the last."""
-        return min(round(seconds / self.log.header.time_step_s), len(self.log.poses))
-
     def begin_at(self, seconds: float) -> int:
         """Restore the last recorded state before a time [s] from which the rest can be replayed; return its step."""
-        aim = self.step_at(seconds)
+        aim = self.log.step_at(seconds)
         start = max((index for index in self.log.states if index <= aim and self._holds(index)), default=0)
         if start > 0:
             for index in range(start):
                 self._set(index)
             self.rehearsal.restore(self._state(self.log.states[start]))
-            self.session.step_index = start
+            self.session.step_index, self.session.time_s = start, float(self.log.lengths_s[:start].sum())
         self.rehearsal.update_surfaces()
         return start
 
     def go_to(self, seconds: float) -> Iterator[tuple[np.ndarray | None, dict[str, Any]]]:
         """Continue to a time [s] and yield what ``move`` returned for each step. The drawn surfaces are not updated."""
-        aim = self.step_at(seconds)
+        aim = self.log.step_at(seconds)
         while self.session.step_index < aim:
             pose, settings = self.move()
             if pose is not None:
@@ -72,7 +74,7 @@ class Replay:
             yield pose, settings
 
     def move(self) -> tuple[np.ndarray | None, dict[str, Any]]:
-        """Return the pose to step to, None for a rollback, and the settings of the images that changed.
+        """Return the pose to step to, None for a rollback, and the settings of the images that changed; set the step's length.
 
         Call ``end_step`` after the step. Raises SessionError at the end of the log.
         """
@@ -80,6 +82,7 @@ class Replay:
         if self.is_over:
             raise SessionError("the session is over")
         back, settings = self._set(index)
+        self.rehearsal.settings.time_step_s = float(self.log.lengths_s[index])
         if any(to == index for _, to in self._backs):
             self.session.keep_state()
         if back is not None:
@@ -90,9 +93,27 @@ class Replay:
             return None, settings
         return self.log.poses[index], settings
 
-    def end_step(self) -> None:
-        """Count the step that the rehearsal has just made."""
-        self.session.end_step()
+    def next_steps(self, most_s: float) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+        """Poses (n, 4, 4) and lengths (n,) [s] of the next steps, and the settings of the images that change in them.
+
+        They last about a time [s], and at most until something else happens than a step; none for a rollback. Raises SessionError at
+        the end of the log.
+        """
+        first = last = self.session.step_index
+        pose, settings = self.move()
+        if pose is not None:
+            lengths_s = self.log.lengths_s
+            last += 1
+            while last < len(self.log.poses) and last not in self._stops:
+                if lengths_s[first : last + 1].sum() > most_s:
+                    break
+                settings |= self._set(last)[1]
+                last += 1
+        return self.log.poses[first:last], self.log.lengths_s[first:last], settings
+
+    def end_step(self, pose: np.ndarray | None = None, length_s: float | None = None) -> None:
+        """Count a step that was made; left out, pose and length are the rehearsal's present ones."""
+        self.session.end_step(pose, length_s)
         self._compare()
 
     def _set(self, index: int) -> tuple[int | None, dict[str, Any]]:

@@ -23,14 +23,15 @@ class Recorder(Protocol):
 
     def note(self, kind: Kind, value: Any) -> None: ...
 
-    def add_step(self, pose: np.ndarray | None) -> None: ...
+    def add_step(self, pose: np.ndarray | None, length_s: float) -> None: ...
 
 
 class Session:
     """``step_index`` counts the steps and the rollbacks since the session began, so that no two states share an index.
 
+    ``time_s`` is the simulated time since then: the sum of the steps' lengths, where a rollback counts as a step of the scene's length.
     ``recorder``, if any, gets everything that a replay needs. ``coverage`` returns which voxels (nx, ny, nz) of the organ have been
-    imaged so far. ``rolled_back_to`` is the index that the last rollback restored, None after a step.
+    imaged so far. ``rolled_back_to`` is the index that the last rollback restored, None after a step; ``rollbacks`` counts them.
     """
 
     def __init__(
@@ -43,14 +44,11 @@ class Session:
         self.recorder = recorder
         self._coverage = coverage
         self.step_index = 0
+        self.time_s = 0.0
         self.rolled_back_to: int | None = None
+        self.rollbacks = 0
         self.kept_states: dict[int, RehearsalState] = {SETTLED: rehearsal.settled}
         self._noted: dict[str, Any] = {}
-
-    @property
-    def time_s(self) -> float:
-        """Simulated time since the session began."""
-        return self.step_index * self.rehearsal.settings.time_step_s
 
     def note_changes(self, kind: Kind, values: dict[str, Any]) -> None:
         """Note those of some values that differ from the last ones noted."""
@@ -64,10 +62,10 @@ class Session:
         if self.recorder is not None:
             self.recorder.note(kind, value)
 
-    def end_step(self) -> None:
-        """Count the step that the rehearsal has just made."""
+    def end_step(self, pose: np.ndarray | None = None, length_s: float | None = None) -> None:
+        """Count a step that was made: to a pose (4, 4), of a length [s]; left out, they are the rehearsal's present ones."""
         self.rolled_back_to = None
-        self._count(self.rehearsal.pose)
+        self._count(self.rehearsal.pose if pose is None else pose, length_s)
 
     def roll_back(self, step_index: int) -> None:
         """Restore a state that was kept; time goes on."""
@@ -75,6 +73,7 @@ class Session:
         self.rehearsal.restore(self.kept_states[step_index])
         self.rehearsal.update_surfaces()
         self.rolled_back_to = step_index
+        self.rollbacks += 1
         self._count(None)
 
     def keep_state(self, manipulator: ManipulatorState | None = None) -> int:
@@ -104,10 +103,12 @@ class Session:
             index: state for index, state in self.kept_states.items() if index in {SETTLED, *needed}
         }
 
-    def _count(self, pose: np.ndarray | None) -> None:
+    def _count(self, pose: np.ndarray | None, length_s: float | None = None) -> None:
+        length_s = length_s or self.rehearsal.settings.time_step_s
         if self.recorder is not None:
-            self.recorder.add_step(pose)
+            self.recorder.add_step(pose, length_s)
         self.step_index += 1
+        self.time_s += length_s
 
 
 class History:

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 from typing_extensions import TypedDict
 
 from errors import UserError
-from rehearsal.sessions.packed_arrays import Seen, SeenVoxels, unpack_poses
+from rehearsal.sessions.packed_arrays import Seen, SeenVoxels, unpack_lengths, unpack_poses
 from scenes.scene import Scene
 
 FORMAT = 1
@@ -87,6 +87,8 @@ class Second(_Line):
 
     at: int = Field(ge=0)
     poses: str
+    lengths_s: str | None = None
+    """The steps' lengths, packed, where one is not the header's."""
     events: list[Event] = Field(default_factory=list)
     digest: str
 
@@ -101,10 +103,11 @@ class End(_Line):
 
 @dataclass
 class Log:
-    """A session as read: ``poses`` (steps, 4, 4), NaN for a rollback; the rest by step index."""
+    """A session as read: ``poses`` (steps, 4, 4), NaN for a rollback, and ``lengths_s`` (steps,); the rest by step index."""
 
     header: Header
     poses: np.ndarray
+    lengths_s: np.ndarray
     events: dict[int, list[Event]] = field(default_factory=dict)
     digests: dict[int, str] = field(default_factory=dict)
     states: dict[int, str] = field(default_factory=dict)
@@ -114,7 +117,12 @@ class Log:
     @property
     def length_s(self) -> float:
         """Simulated time."""
-        return len(self.poses) * self.header.time_step_s
+        return float(self.lengths_s.sum())
+
+    def step_at(self, seconds: float) -> int:
+        """The number of steps whose end is nearest to a time [s]."""
+        ends = np.concatenate([[0.0], np.cumsum(self.lengths_s)])
+        return int(np.argmin(np.abs(ends - seconds)))
 
 
 def read_log(path: Path) -> Log:
@@ -131,8 +139,9 @@ def read_log(path: Path) -> Log:
     except OSError as error:
         raise SessionError(f"{name}: cannot be read as a session ({str(error).splitlines()[0]})") from None
     header = _header(name, lines[0])
-    log = Log(header, np.zeros((0, 4, 4)))
+    log = Log(header, np.zeros((0, 4, 4)), np.zeros(0))
     parts: list[np.ndarray] = []
+    lengths: list[np.ndarray] = []
     # A last line without its end was being written when the session was cut off.
     for number, line in enumerate(lines[1:-1], 2):
         second = _line_of(name, number, line)
@@ -145,6 +154,7 @@ def read_log(path: Path) -> Log:
             break
         try:
             poses = unpack_poses(second.poses)
+            lengths_s = _lengths_of(second, len(poses), header.time_step_s)
         except ValueError:
             poses = np.zeros((0, 4, 4))
         if second.at != steps or len(poses) == 0:
@@ -152,6 +162,7 @@ def read_log(path: Path) -> Log:
                 f"{name}: line {number} does not follow the line before it: one is missing or damaged"
             )
         parts.append(poses)
+        lengths.append(lengths_s)
         for event in second.events:
             if event.kind == "state":
                 log.states[event.at] = event.value
@@ -160,7 +171,18 @@ def read_log(path: Path) -> Log:
             log.events.setdefault(event.at, []).append(event)
         log.digests[steps + len(poses)] = second.digest
     log.poses = np.concatenate([log.poses, *parts])
+    log.lengths_s = np.concatenate([log.lengths_s, *lengths])
     return log
+
+
+def _lengths_of(second: Second, steps: int, usual_s: float) -> np.ndarray:
+    """The lengths (steps,) [s] of a line's steps. Raises ValueError."""
+    if second.lengths_s is None:
+        return np.full(steps, usual_s)
+    lengths_s = unpack_lengths(second.lengths_s)
+    if len(lengths_s) != steps:
+        raise ValueError(f"{len(lengths_s)} lengths of {steps} steps")
+    return lengths_s
 
 
 def _header(name: str, line: bytes) -> Header:

@@ -8,11 +8,11 @@ import click
 import numpy as np
 from tqdm import tqdm
 
-from rehearsal.adaptive_iterations import AdaptiveIterations
 from rehearsal.commands.command_line import arch_option
 from rehearsal.configuration import PRESETS
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.open_window import initial_settings
+from rehearsal.real_time.pace import Pace
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions.recorder import record
 from rehearsal.sessions.replay import Replay
@@ -31,6 +31,8 @@ CHANGE_S, FROM_MM = 0.7, 60.0
 # Standard deviation of the moves in a frame, and probability of each action at a change of the input.
 MOVES = {"push_mm": 0.05, "rotate_deg": 0.3, "rock_deg": 0.2, "tilt_deg": 0.2}
 PROBABILITY = {"undo": 0.06, "redo": 0.03, "bookmark": 0.03, "to_bookmark": 0.02, "reset": 0.01}
+# Probability of another length or number of iterations at a step.
+PACE_PROBABILITY = 0.02
 
 
 @click.command()
@@ -56,10 +58,14 @@ def replay(scene: Path, out: Path, minutes: float, model: str, quality: str, arc
     with tqdm(total=round(3.5 * steps), desc="replay", unit="step") as bar:
         session = Session(rehearsal())
         recorded = record(session, anatomy, used, out)
-        # Without a limit of time: iterations that adapt to it would record another session each time.
-        live = UserInput(session, AdaptiveIterations(np.inf), recorded)
+        live = UserInput(session, recorded)
+        pace, random = Pace(loaded.solver.time_step_s), np.random.default_rng(SEED)
         for pose in random_poses(live, session.rehearsal, steps, bar):
-            session.rehearsal.advance(pose)
+            # As on a machine whose load changes.
+            if random.random() < PACE_PROBABILITY:
+                pace.level = int(random.integers(len(pace.levels)))
+            iterations = pace.iterations(session.rehearsal.settings.iterations)
+            live.after_step(session.rehearsal.timed_step(pose, pace.length_s, iterations))
         recorded.close({})
         path, digest = recorded.path, session.rehearsal.digest()
         log = read_log(path)
@@ -80,7 +86,7 @@ def replay(scene: Path, out: Path, minutes: float, model: str, quality: str, arc
 
 
 def random_poses(live: UserInput, rehearsal: Rehearsal, steps: int, bar: tqdm) -> Iterator[np.ndarray]:
-    """Poses of a restless user, who also undoes, redoes and resets; the same each time."""
+    """Poses of a restless user, who also undoes, redoes and resets; the same each time. The step to each is the caller's."""
     random, settings = np.random.default_rng(SEED), initial_settings(rehearsal)
     manipulator = rehearsal.manipulator
     above = np.flatnonzero(manipulator.normals @ rehearsal.gravity_direction < -0.5)
@@ -105,7 +111,6 @@ def random_poses(live: UserInput, rehearsal: Rehearsal, steps: int, bar: tqdm) -
         pose = live.next_pose(controls)
         if pose is not None:
             yield pose
-            live.after_step(0.0)
         live.after_frame()
         bar.update()
 
@@ -115,7 +120,7 @@ def replayed(rehearsal: Rehearsal, log: Log, from_s: float, bar: tqdm) -> dict[s
     replay = Replay(rehearsal, log)
     begins = replay.begin_at(from_s)
     # The steps from there to the time itself are not counted.
-    bar.update(begins - replay.step_at(from_s))
+    bar.update(begins - log.step_at(from_s))
     for _ in replay.go_to(log.length_s):
         bar.update()
     return dict(

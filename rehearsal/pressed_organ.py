@@ -1,0 +1,173 @@
+"""An organ under its probe, advanced step by step: the part of a rehearsal that a process of its own can compute."""
+
+import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import trimesh
+
+from rehearsal.build_solver import build_solver, static_shape, step_settings, tool_of
+from rehearsal.configuration import probe_of
+from rehearsal.stopwatch import timed
+from scenes.anatomy import Grid, LoadedAnatomy, press_on
+from scenes.scene import PlaneShape, Scene
+from scenes.surfaces import translated
+from sim.divergence_check import DivergenceCheck, DivergenceState
+from sim.shapes import Plane, SignedDistanceField
+from sim.solver import SolverState
+from sim.tissue_model import FixedRegion
+from ultrasound.probe import Probe
+from ultrasound.probe_manipulator import advanced, pose_at, poses_between
+
+AWAY_MM = 200.0
+
+
+@dataclass(frozen=True)
+class OrganState:
+    """What steps change: the tissue, the divergence check, the transducer's pose (4, 4)."""
+
+    solver: SolverState
+    divergence: DivergenceState
+    pose: np.ndarray
+    steps: int
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step that was made: the transducer's pose (4, 4) at its end, its length [s], its iterations, the time that it took [ms].
+
+    ``notice`` is the message of the divergence check if it restored the state. ``input_s`` is the time of the input that the pose
+    shows, and ``late_ms`` how much later than due the step began, where the steps follow a clock.
+    """
+
+    pose: np.ndarray
+    length_s: float
+    iterations: int
+    took_ms: float
+    notice: str = ""
+    input_s: float = 0.0
+    late_ms: float = 0.0
+
+
+class PressedOrgan:
+    """The solver of a scene's organ. All positions are mm relative to ``origin``, the middle of the resting organ (LPS).
+
+    Taichi must be initialised, and initialised again for another scene, which frees this one.
+    """
+
+    def __init__(self, scene: Scene, anatomy: LoadedAnatomy, probe: Probe | None = None) -> None:
+        self.scene = scene
+        self.probe = probe or probe_of(scene)
+        self.origin = anatomy.organ.bounds.mean(axis=0)
+        self.organ = translated(anatomy.organ, -self.origin)
+        self.gravity_direction = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
+        self.press = press_on(scene.press, anatomy, self.gravity_direction)
+        self._build_solver(anatomy)
+        self.divergence_check = DivergenceCheck(self.solver)
+        self.notice = ""
+        self.steps = 0
+        self.pose = advanced(self._press_pose(), -AWAY_MM)
+
+    def _build_solver(self, anatomy: LoadedAnatomy) -> None:
+        self.size_mm = np.array(self.probe.housing_mm)
+        self.tool = tool_of(self.probe)
+        shapes = [*(self._shape(shape) for shape in anatomy.shapes), self.tool]
+        tissue, section = self.scene.tissue, self.scene.solver
+        fixed = self._fixed_region()
+        self.solver = build_solver(
+            self.organ, tissue, shapes, self.tool, self.scene.contact, section, fixed=fixed
+        )
+        self.body, self.model, self.contacts = self.solver.body, self.solver.model, self.solver.contacts
+        self.settings = step_settings(tissue, section)
+        self.young_kpa: float | None = getattr(tissue, "young_kpa", None)
+        self.set_gravity(self.scene.gravity.acceleration_m_s2)
+
+    def _fixed_region(self) -> FixedRegion | None:
+        attachment = self.scene.attachment
+        if attachment.radius_mm == 0 or attachment.at_mm is None:
+            return None
+        return FixedRegion(np.array(attachment.at_mm) - self.origin, attachment.radius_mm)
+
+    def _shape(self, shape: PlaneShape | trimesh.Trimesh | Grid) -> Plane | SignedDistanceField:
+        if isinstance(shape, PlaneShape):
+            normal = np.array(shape.normal) / np.linalg.norm(shape.normal)
+            return Plane(normal, shape.offset_mm / np.linalg.norm(shape.normal) - normal @ self.origin)
+        if isinstance(shape, trimesh.Trimesh):
+            return static_shape(translated(shape, -self.origin), self.scene.tissue)
+        spacing = 1 / np.diag(shape.index_from_mm)[:3]
+        return SignedDistanceField(shape.voxels, -spacing * shape.index_from_mm[:3, 3] - self.origin, spacing)
+
+    def _press_pose(self) -> np.ndarray:
+        """The pose of the scripted press before it is moved to contact."""
+        target = np.array(self.press.target_mm) - self.origin
+        return pose_at(target, np.array(self.press.direction), np.array(self.press.lateral), self.size_mm[2])
+
+    def settle(self) -> OrganState:
+        """Let the organ come to rest on its support with the transducer far away: the paper's warm-up. Return that state."""
+        for _ in range(self.press.warm_up_steps):
+            self.advance(self.pose)
+        self.steps = 0
+        self.divergence_check.set_initial_state()
+        return self.snapshot_of_organ()
+
+    def set_gravity(self, acceleration_m_s2: float) -> None:
+        """Change the acceleration due to gravity; its direction is the scene's."""
+        self.settings.gravity = tuple(1000.0 * acceleration_m_s2 * self.gravity_direction)
+
+    def set_young(self, young_kpa: float) -> None:
+        """Change Young's modulus, if the tissue model has one."""
+        if hasattr(self.model, "set_material"):
+            self.young_kpa = young_kpa
+            self.model.set_material(young_kpa)
+
+    @contextmanager
+    def step_of(self, length_s: float, iterations: int) -> Iterator[None]:
+        """Settings of single steps that differ from those of the scene."""
+        usual = self.settings.time_step_s, self.settings.iterations
+        self.settings.time_step_s, self.settings.iterations = length_s, iterations
+        try:
+            yield
+        finally:
+            self.settings.time_step_s, self.settings.iterations = usual
+
+    def advance(self, pose: np.ndarray) -> None:
+        """Advance one time step, at whose end the transducer has a pose (4, 4).
+
+        ``notice`` is the message of the divergence check if it restored the state, else empty.
+        """
+        self.solver.step(self.settings, poses_between(self.pose, pose, self.settings.substeps))
+        self.notice = self.divergence_check.check(self.settings.time_step_s)
+        self.pose = pose
+        self.steps += 1
+
+    def timed_step(
+        self, pose: np.ndarray, length_s: float | None = None, iterations: int | None = None
+    ) -> Step:
+        """Advance by a step of a length [s] with so many iterations, where given, and return it."""
+        took_ms: list[float] = []
+        with self.step_of(length_s or self.settings.time_step_s, iterations or self.settings.iterations):
+            timed(partial(self.advance, pose), took_ms)
+            settings = self.settings
+            return Step(pose, settings.time_step_s, settings.iterations, took_ms[0], self.notice)
+
+    def snapshot_of_organ(self) -> OrganState:
+        """A copy of the present state."""
+        return OrganState(self.solver.snapshot(), self.divergence_check.state, self.pose, self.steps)
+
+    def restore_organ(self, state: OrganState) -> None:
+        """Restore a state; the steps that follow give the same bits as before."""
+        self.solver.restore(state.solver)
+        self.divergence_check.state = state.divergence
+        self.pose, self.steps = state.pose, state.steps
+
+    def store_valid_state(self) -> None:
+        """Make the present tissue, if it is valid, the state that the divergence check restores."""
+        self.divergence_check.store_if_healthy()
+
+    def digest(self) -> str:
+        """A hash of the tissue's state: it changes with every bit."""
+        state = self.body.snapshot()
+        return hashlib.sha256(state.position.tobytes() + state.velocity.tobytes()).hexdigest()[:16]

@@ -1,0 +1,82 @@
+"""The pace of the steps: simulated time keeps up with the clock, by longer steps and then by fewer iterations where it must."""
+
+from collections import deque
+from dataclasses import dataclass
+from math import ceil
+
+import numpy as np
+
+LEAST_ITERATIONS = 2
+LONGEST_STEP_S = 1 / 15
+# A level is left for a cheaper one when its steps take more than BUSY of the time that they simulate, and for a dearer one when that
+# one's would take less than SPARE: the median of so many steps.
+BUSY, SPARE = 0.8, 0.6
+STEPS_DOWN, STEPS_UP = 12, 90
+
+
+@dataclass(frozen=True)
+class Level:
+    """How many times longer steps are than the scene's, and the share of the iterations that they have."""
+
+    times_longer: int = 1
+    iterations: float = 1.0
+
+
+# An implicit step comes to the same rest at each length, and with fewer iterations to the same rest later: so steps get longer first.
+LONGER = tuple(Level(times) for times in (1, 2, 3, 4))
+FEWER_ITERATIONS = (0.75, 0.5, 0.25)
+
+
+class Pace:
+    """Chooses length and iterations of the steps by the time that they take.
+
+    ``time_step_s`` is the length of the scene's steps. ``budget_ms`` is a limit for the time of a step, beside the one that it simulates.
+    ``level`` 0 is the scene's own step.
+    """
+
+    def __init__(self, time_step_s: float, budget_ms: float = np.inf) -> None:
+        self.time_step_s, self.budget_ms = time_step_s, budget_ms
+        longer = [level for level in LONGER if level.times_longer * time_step_s <= LONGEST_STEP_S + 1e-9]
+        longer = longer or [LONGER[0]]
+        fewer = [Level(longer[-1].times_longer, share) for share in FEWER_ITERATIONS]
+        self.levels = [*longer, *fewer]
+        self.level = 0
+        self._recent: deque[float] = deque(maxlen=STEPS_UP)
+
+    @property
+    def length_s(self) -> float:
+        """Length of the next step."""
+        return self._length_s(self.level)
+
+    def iterations(self, full: int) -> int:
+        """Iterations of the next step where ``full`` are set."""
+        return min(full, max(LEAST_ITERATIONS, ceil(self.levels[self.level].iterations * full)))
+
+    def watch(self, took_ms: float) -> None:
+        """Note the duration of a step, and change the level if it is time to."""
+        self._recent.append(took_ms)
+        recent = np.array(self._recent)
+        if len(recent) >= STEPS_DOWN and np.median(recent[-STEPS_DOWN:]) > self._limit_ms(self.level, BUSY):
+            self._change_to(min(self.level + 1, len(self.levels) - 1))
+        elif self.level > 0 and len(recent) == STEPS_UP:
+            ratio = self.levels[self.level - 1].iterations / self.levels[self.level].iterations
+            if np.median(recent) * ratio < self._limit_ms(self.level - 1, SPARE):
+                self._change_to(self.level - 1)
+
+    def _length_s(self, level: int) -> float:
+        return self.levels[level].times_longer * self.time_step_s
+
+    def _limit_ms(self, level: int, share: float) -> float:
+        return share * min(1000 * self._length_s(level), self.budget_ms / BUSY)
+
+    def _change_to(self, level: int) -> None:
+        if level != self.level:
+            self.level = level
+            self._recent.clear()
+
+
+def pace_text(length_s: float, usual_s: float, iterations: int, full: int) -> str:
+    """What the user reads where steps are longer than usual or have fewer iterations than are set; else empty."""
+    longer = f"LONGER STEPS   1/{1 / length_s:.0f} s" if length_s > 1.01 * usual_s else ""
+    fewer = f"REDUCED ITERATIONS   {iterations} of {full}" if iterations < full else ""
+    return "   ".join(filter(None, [longer, fewer]))

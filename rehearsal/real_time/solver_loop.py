@@ -1,0 +1,133 @@
+"""What the solver's process does: requests of the other process, and steps in between."""
+
+import signal
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from multiprocessing.synchronize import Lock
+from time import perf_counter
+
+import numpy as np
+
+import sim.device
+from rehearsal.pressed_organ import OrganState, PressedOrgan
+from rehearsal.real_time.pace import Pace
+from rehearsal.real_time.pose_path import PosePath
+from rehearsal.real_time.shared_state import SharedState
+from rehearsal.worker_processes import end_with_parent
+from scenes.anatomy import LoadedAnatomy
+from scenes.scene import Scene
+from sim.solver import StepSettings
+from ultrasound.probe import Probe
+
+# Time by which the simulation may be behind the clock and still catch up; more is lost: slow motion.
+MOST_BEHIND_S = 0.1
+PAUSED = "paused"
+
+
+def compute(
+    connection: Connection,
+    lock: Lock,
+    parent: int,
+    arch: str,
+    scene: Scene,
+    anatomy: LoadedAnatomy,
+    probe: Probe,
+    budget_ms: float,
+) -> None:
+    """Send the organ at rest, then serve requests until ``stop``. The parent is a process id."""
+    # Ctrl-C reaches both processes: the other one ends this.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent(parent)
+    sim.device.start(arch)
+    organ = PressedOrgan(scene, anatomy, probe)
+    connection.send(organ.settle())
+    SolverLoop(organ, connection, lock, Pace(scene.solver.time_step_s, budget_ms)).serve()
+
+
+class SolverLoop:
+    """Serves requests, each the name of a public method and its arguments, and makes the steps that are due."""
+
+    def __init__(self, organ: PressedOrgan, connection: Connection, lock: Lock, pace: Pace) -> None:
+        self.organ, self.pace = organ, pace
+        self._connection, self._lock = connection, lock
+        self._path = PosePath(organ.pose)
+        self._played: deque[tuple[np.ndarray, float]] = deque()
+        self._runs = self._is_stopped = False
+        # The clock's time up to which steps were made.
+        self._simulated_s = 0.0
+        self._made = 0
+
+    def serve(self) -> None:
+        """Serve until ``stop``."""
+        while not self._is_stopped:
+            for request, values in self._requests():
+                getattr(self, request)(*values)
+            if self._played:
+                self._step(*self._played.popleft())
+            elif self._runs and self._left_s() <= 0.0:
+                self._keep_pace()
+
+    def share(self, memory: str) -> None:
+        """Write all states to a memory from now on."""
+        self._memory = SharedState(self.organ.snapshot_of_organ(), self._lock, memory)
+
+    def take_over(self, state: OrganState, settings: StepSettings, young_kpa: float | None) -> None:
+        """Continue from a state, with settings."""
+        self.organ.restore_organ(state)
+        self.organ.settings = replace(settings)
+        if young_kpa is not None and young_kpa != self.organ.young_kpa:
+            self.organ.set_young(young_kpa)
+
+    def run(self) -> None:
+        """Keep pace with the clock, the transducer at rest."""
+        self._runs, self._simulated_s = True, perf_counter()
+        self._path.stay(self.organ.pose, self._simulated_s)
+
+    def go_to(self, pose: np.ndarray, input_s: float, took_s: float) -> None:
+        """Move the transducer to an input's pose (4, 4) at a time [s], a time [s] after the last one."""
+        self._path.go_to(pose, input_s, took_s)
+
+    def play(self, poses: np.ndarray, lengths_s: np.ndarray) -> None:
+        """Make steps of given poses (n, 4, 4) and lengths (n,) [s]."""
+        self._played += zip(poses, map(float, lengths_s), strict=True)
+
+    def pause(self) -> None:
+        """Make no more steps by the clock."""
+        self._runs = False
+        self._connection.send(PAUSED)
+
+    def stop(self) -> None:
+        """End the process."""
+        self._is_stopped = True
+
+    def _requests(self) -> Iterator[tuple[str, tuple]]:
+        """The requests that wait; if nothing else is to be done, wait for one, or until a step is due."""
+        wait_s: float | None = 0.0
+        if not self._played:
+            wait_s = max(self._left_s(), 0.0) if self._runs else None
+        while self._connection.poll(wait_s):
+            yield self._connection.recv()
+            wait_s = 0.0
+
+    def _left_s(self) -> float:
+        """Time until the next step is due: at its end, so that it follows the input."""
+        return self._simulated_s + self.pace.length_s - perf_counter()
+
+    def _keep_pace(self) -> None:
+        length_s, late_s = self.pace.length_s, -self._left_s()
+        self._simulated_s += length_s + max(late_s - MOST_BEHIND_S, 0.0)
+        iterations = self.pace.iterations(self.organ.settings.iterations)
+        pose = self._path.pose_after(length_s)
+        self.pace.watch(self._step(pose, length_s, iterations, late_s))
+
+    def _step(
+        self, pose: np.ndarray, length_s: float, iterations: int | None = None, late_s: float = 0.0
+    ) -> float:
+        """Make a step, and send it; return how long it took [ms]."""
+        step = self.organ.timed_step(pose, length_s, iterations)
+        self._made += 1
+        self._connection.send(replace(step, input_s=self._path.input_s, late_ms=1000 * late_s))
+        self._memory.write(self.organ.snapshot_of_organ(), self._made)
+        return step.took_ms

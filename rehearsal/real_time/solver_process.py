@@ -1,0 +1,158 @@
+"""The solver in a process of its own, which keeps pace with the clock while this process makes pictures.
+
+The rehearsal of this process is a copy: ``collect`` sets it to the newest state. Whatever else changes the tissue, such as an undo, is
+done to the copy while the solver is paused, and ``hand_over`` gives it to the solver.
+"""
+
+import multiprocessing
+import os
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from errors import UserError
+from rehearsal.pressed_organ import OrganState, Step
+from rehearsal.real_time.shared_state import SharedState
+from rehearsal.real_time.solver_loop import PAUSED, compute
+from rehearsal.rehearsal import Rehearsal
+from scenes.anatomy import LoadedAnatomy
+from scenes.scene import Scene
+from ultrasound.probe import Probe
+
+# How long the process may take to end in order.
+END_S = 2.0
+
+
+class SolverEnded(UserError):
+    """The process has ended by itself."""
+
+
+class SolverProcess:
+    """Starts the process; ``settled`` waits for the organ at rest, then ``attach`` gives it the rehearsal that copies its states.
+
+    ``budget_ms`` limits the time of a step. ``on_step`` is called with each step that is collected. ``pending`` counts the steps of
+    ``play`` that were not collected yet. Every method may raise SolverEnded.
+    """
+
+    def __init__(
+        self, scene: Scene, anatomy: LoadedAnatomy, probe: Probe, arch: str, budget_ms: float = np.inf
+    ) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        self._lock = context.Lock()
+        without_images = replace(anatomy, ct=None, labels=None, parts={})
+        given = theirs, self._lock, os.getpid(), arch, scene, without_images, probe, budget_ms
+        self._process = context.Process(target=compute, args=given, name="solver", daemon=True)
+        self._process.start()
+        theirs.close()
+        self._memory: SharedState | None = None
+        self.on_step: Callable[[Step], None] = lambda step: None
+        self.is_paused = True
+        self.pending = 0
+        self._received = 0
+        self._uncollected: deque[Step] = deque()
+
+    def settled(self) -> OrganState:
+        """Return the organ at rest, as soon as it is known."""
+        return self._receive()
+
+    def attach(self, rehearsal: Rehearsal) -> None:
+        """Copy the states to a rehearsal from now on; it is at rest."""
+        self.rehearsal = rehearsal
+        self._memory = SharedState(rehearsal.snapshot_of_organ(), self._lock)
+        self._send("share", self._memory.name)
+
+    def collect(self) -> None:
+        """Set the rehearsal to the newest state."""
+        while self._connection.poll():
+            self._receive_step()
+        self._take()
+
+    def pause(self) -> None:
+        """Wait for the end of the steps that are being made; then as ``collect``."""
+        if not self.is_paused:
+            self._send("pause")
+            while self._receive_step():
+                pass
+            self.is_paused = True
+        self._take()
+        while self.pending:
+            self._receive_step()
+            self._take()
+
+    def hand_over(self) -> None:
+        """Give the rehearsal's state and settings to the paused solver."""
+        rehearsal = self.rehearsal
+        self._send("take_over", rehearsal.snapshot_of_organ(), rehearsal.settings, rehearsal.young_kpa)
+
+    def run(self) -> None:
+        """Keep pace with the clock from now on."""
+        self._send("run")
+        self.is_paused = False
+
+    def go_to(self, pose: np.ndarray, input_s: float, took_s: float) -> None:
+        """Move the transducer to a pose (4, 4) that the input had at a time [s] (``perf_counter``), a time [s] after the last one."""
+        self._send("go_to", pose, input_s, took_s)
+
+    def play(self, poses: np.ndarray, lengths_s: np.ndarray) -> None:
+        """Make steps to these poses (n, 4, 4), of these lengths (n,) [s], at once; the solver stays paused."""
+        self.pending += len(poses)
+        self._send("play", poses, lengths_s)
+
+    def close(self) -> None:
+        """End the process."""
+        with suppress(OSError):
+            self._connection.send(("stop", ()))
+        self._process.join(END_S)
+        self._process.kill()
+        self._connection.close()
+        if self._memory is not None:
+            self._memory.close()
+            self._memory = None
+
+    def _receive_step(self) -> bool:
+        """Receive a step; return whether it was one, and not the answer to a pause."""
+        message = self._receive()
+        if message == PAUSED:
+            return False
+        self._uncollected.append(message)
+        self._received += 1
+        return True
+
+    def _take(self) -> None:
+        """Set the rehearsal to the newest state, and hand on the steps up to it."""
+        if self._memory is None or not self._uncollected:
+            return
+        state, number = self._memory.read()
+        while self._received < number:
+            self._receive_step()
+        # A step is sent before its state is in the memory.
+        count = len(self._uncollected) - (self._received - number)
+        if count > 0:
+            self.rehearsal.restore_organ(state)
+        self.pending = max(0, self.pending - count)
+        for _ in range(count):
+            self.on_step(self._uncollected.popleft())
+
+    def _send(self, request: str, *values: Any) -> None:
+        try:
+            self._connection.send((request, values))
+        except OSError:
+            raise self._ended() from None
+
+    def _receive(self) -> Any:
+        try:
+            return self._connection.recv()
+        except (EOFError, OSError):
+            raise self._ended() from None
+
+    def _ended(self) -> SolverEnded:
+        self._process.join(END_S)
+        return SolverEnded(
+            f"the solver's process has ended (exit status {self._process.exitcode}), perhaps for lack of memory; what was recorded "
+            "until then can be replayed: close other programs and start again"
+        )
