@@ -161,6 +161,7 @@ class WindowFrames(Frames[WindowInput]):
         super().take(step)
         self._last_step = step
         self._steps.append(step)
+        self.times.steps.append(step)
         if step.notice:
             self.notices.post(step.notice, on_screen=False)
             self._restored_until = perf_counter() + RESTORED_S

@@ -39,8 +39,9 @@ class OrganState:
 class Step:
     """A step that was made: the transducer's pose (4, 4) at its end, its length [s], its iterations, the time that it took [ms].
 
-    ``notice`` is the message of the divergence check if it restored the state. ``input_s`` is the time of the input that the pose
-    shows, and ``late_ms`` how much later than due the step began, where the steps follow a clock.
+    ``notice`` is the message of the divergence check if it restored the state. Where the steps follow a clock, ``input_s`` is the time
+    of the input that the pose shows, ``late_ms`` how much later than due the step began, and ``pace`` says how it differs from what is
+    set.
     """
 
     pose: np.ndarray
@@ -50,6 +51,7 @@ class Step:
     notice: str = ""
     input_s: float = 0.0
     late_ms: float = 0.0
+    pace: str = ""
 
 
 class PressedOrgan:

@@ -1,15 +1,13 @@
 """A rehearsal from start to end: its input source, its recording, and its summary."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from time import time
 
 import click
 import numpy as np
 from click.exceptions import Exit
-from psutil import Process
 
 from rehearsal.commands.command_line import STOPPED, CommandError
 from rehearsal.commands.rehearse_options import RehearseOptions
@@ -26,6 +24,7 @@ from rehearsal.planning.plan_file import Plan
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.plans_in_window import PlanControl
 from rehearsal.real_time.solver_process import SolverProcess
+from rehearsal.real_time.start_times import StartTimes
 from rehearsal.rehearsal import Rehearsal, RehearsalState
 from rehearsal.sessions.open_session import open_session
 from rehearsal.sessions.recorder import SessionRecorder, record
@@ -50,17 +49,22 @@ from version import VERSION
 class RehearsalRun:
     """One rehearsal, its anatomy, the backend's name, what the user asked for, and the files that were read for it.
 
-    ``track`` are recorded poses of a probe.
+    ``solver`` makes the steps of a window. ``log`` is a session to replay, ``track`` are recorded poses of a probe. ``build_s`` is the
+    time that building took.
     """
 
     rehearsal: Rehearsal
     anatomy: LoadedAnatomy
     arch: str
     asked: RehearseOptions
+    solver: SolverProcess | None = None
+    log: Log | None = None
     track: TimedPoses | None = None
     keys: Keys = field(default_factory=Keys)
     link: OpenIGTLinkServer | None = None
     plan: Plan | None = None
+    build_s: float = 0.0
+    start: StartTimes = field(default_factory=StartTimes)
     recorder: SessionRecorder | None = field(default=None, init=False)
     notices: Notices = field(default_factory=Notices, init=False)
 
@@ -68,19 +72,23 @@ class RehearsalRun:
         guide = None if self.plan is None else PlanGuidance(self.rehearsal, self.plan)
         self.measurements = LiveMeasurements(self.rehearsal, guide)
 
-    def in_window(self, log: Log | None, solver: SolverProcess) -> None:
-        """Run in a window, after a replay of the log if there is one. Raises CommandError, SessionError, SolverEnded."""
+    def in_window(self, prepare: Callable[[WindowFrames], None] = lambda frames: None) -> None:
+        """Run in a window, after a replay if there is one; ``prepare`` is called with its frames before the first.
+
+        Raises CommandError, SessionError, SolverEnded.
+        """
+        if self.solver is None:
+            raise ValueError("a window needs the process of the solver")
+        self.start.begin("Window")
         pad = Gamepad(SdlPads(), self.keys.buttons) if self.asked.gamepad else None
         try:
             viewer = open_viewer(self.rehearsal, visible=True, keys=self.keys, gamepad=pad)
         except NoVulkan as reason:
             raise CommandError(f"{reason}; install a Vulkan driver, or run with --headless") from None
-        replay = None if log is None else self._replay(log, viewer.settings)
+        replay = None if self.log is None else self._replay(self.log, viewer.settings)
         source = self._user_input() if replay is None else self._replay_input(replay)
-        after_s = time() - Process().create_time()
-        text = (
-            f"The window is open, {after_s:.0f} s after the start; {{help}} shows the keys, {{quit}} quits."
-        )
+        self.start.begin("First picture")
+        text = f"The window is open, {self.start.now_s:.0f} s after the start; {{help}} shows the keys, {{quit}} quits."
         click.echo(self.keys.worded(text))
         frames = WindowFrames(
             self.rehearsal,
@@ -88,7 +96,7 @@ class RehearsalRun:
             self.measurements,
             Tally(0.0),
             self.link,
-            solver=solver,
+            solver=self.solver,
             viewer=viewer,
             out=self.asked.out,
             notices=self.notices,
@@ -96,6 +104,7 @@ class RehearsalRun:
             plans=PlanControl(self.rehearsal, self.anatomy, self.measurements, self.asked.out, self.notices),
             keys=self.keys,
         )
+        prepare(frames)
         try:
             with self._summarised(source, replay):
                 frames.run()
@@ -105,10 +114,10 @@ class RehearsalRun:
             frames.sweeping.end()
             self.notices.present(self.keys.worded)
 
-    def headless(self, log: Log | None, build_s: float) -> None:
-        """Run the scripted press, a log or recorded poses to their end. Raises CommandError, SessionError."""
+    def headless(self) -> None:
+        """Run the scripted press, a replay or recorded poses to their end. Raises CommandError, SessionError."""
         settings = initial_settings(self.rehearsal)
-        replay = None if log is None else self._replay(log, settings)
+        replay = None if self.log is None else self._replay(self.log, settings)
         source: InputSource
         if replay is not None:
             source, steps = self._replay_input(replay), self._replayed_steps(replay)
@@ -116,7 +125,7 @@ class RehearsalRun:
             source, steps = self._tracked_input(self.track)
         else:
             source, steps = self._scripted_input()
-        frames = Frames(self.rehearsal, source, self.measurements, Tally(build_s), self.link)
+        frames = Frames(self.rehearsal, source, self.measurements, Tally(self.build_s), self.link)
         with self._summarised(source, replay):
             run_headless(
                 frames, self.notices, steps, settings, self.arch, self.asked.out, not self.asked.no_pictures

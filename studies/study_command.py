@@ -10,6 +10,10 @@ STUDIES = {
         "studies.performance.feature_costs:features",
         "Measure what each feature of SCENE costs.",
     ),
+    "frames": (
+        "studies.performance.frame_rate:frames",
+        "Measure pictures a second, pace and latency in a window.",
+    ),
     "trade": (
         "studies.performance.tradeoff:trade",
         "Measure the error of beads against the time of a step.",

@@ -36,6 +36,7 @@ EXCLUDING = {
     ("gamepad", "headless"): "--gamepad: needs a window; leave out --gamepad or --headless",
     ("link_leads", "headless"): "--link-leads: needs a window; leave out --link-leads or --headless",
     ("no_pictures", "link"): "--no-pictures: the link sends images; leave out --no-pictures or --link",
+    ("rate", "headless"): "--rate: needs a window; leave out --rate or --headless",
     (
         "quality",
         "budget_ms",
@@ -70,6 +71,8 @@ class RehearseOptions(LinkOptions, ImageOptions, QualityOptions, ArchOptions):
     """Recorded poses that move the probe: a tracked sweep (.igs.mha), or poses with times (CSV, JSON)."""
     track_from: str | None = None
     """With --track: the sweep's transform from probe to patient [ProbeToReference]."""
+    rate: float | None = Field(None, ge=15, le=1000)
+    """Steps a second in a window, as for a haptic device [60]; with a preset fast where nothing else chooses the tissue."""
     gamepad: bool = False
     """Use a gamepad beside mouse and keys."""
     keys: Path | None = None
@@ -98,6 +101,12 @@ class RehearseOptions(LinkOptions, ImageOptions, QualityOptions, ArchOptions):
     """Choose the most accurate resolution and iterations whose step takes no longer on this machine (measured first)."""
     error_mm: float | None = Field(None, ge=0, le=100)
     """Choose the fastest resolution and iterations whose mean bead error (study trade) is no larger."""
+
+    @property
+    def preset(self) -> str | None:
+        """The preset: of --quality, or the one for --rate."""
+        chosen = self.given(*LEFT, *TISSUE_AND_STEP)
+        return "fast" if self.rate is not None and not chosen else self.quality
 
     def check(self) -> None:
         """Raises CommandError for options that exclude each other, and for one without another that it needs."""

@@ -8,7 +8,6 @@ import numpy as np
 
 from rehearsal.notices import Notices
 from rehearsal.pressed_organ import Step
-from rehearsal.real_time.pace import pace_text
 from rehearsal.real_time.solver_process import SolverProcess
 from rehearsal.sessions.recorder import SessionRecorder
 from rehearsal.sessions.replay import set_solver
@@ -112,11 +111,9 @@ class UserInput:
         """Note a step that was made."""
         self.session.note_changes("solver", dict(iterations=step.iterations))
         self.session.end_step(step.pose, step.length_s)
-        settings = self.session.rehearsal.settings
-        pace = pace_text(step.length_s, settings.time_step_s, step.iterations, settings.iterations)
-        if pace != self._pace:
-            self._pace = pace
-            self.notices.post(pace or "Steps as they are set again.", on_screen=False)
+        if step.pace != self._pace:
+            self._pace = step.pace
+            self.notices.post(step.pace or "Steps as they are set again.", on_screen=False)
 
     def after_frame(self) -> None:
         """Let the session's file keep up."""

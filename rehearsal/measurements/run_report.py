@@ -57,7 +57,7 @@ class Tally:
             arch=arch,
             **(NOT_EVERYWHERE | rehearsal.scene.tissue.model_dump() | rehearsal.model.counts()),
             tetrahedra=rehearsal.embedding.count,
-            time_step_s=settings.time_step_s,
+            time_step_s=rehearsal.scene.solver.time_step_s,
             substeps=settings.substeps,
             iterations=settings.iterations,
             probe=rehearsal.probe.transducer_name,

@@ -7,16 +7,20 @@ from time import perf_counter
 
 import numpy as np
 
+from rehearsal.pressed_organ import Step
+
 # Frames that are kept.
 MOST_FRAMES = 20_000
 
 
 class FrameTimes:
-    """``stages_ms`` are the times of each part of a frame; ``latency_ms`` from an input to the end of the first frame that shows it."""
+    """``stages_ms`` are the times of each part of a frame; ``latency_ms`` from an input to the end of the frame that shows it; ``steps``
+    are the steps in between."""
 
     def __init__(self) -> None:
         self.stages_ms: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=MOST_FRAMES))
         self.latency_ms: deque[float] = deque(maxlen=MOST_FRAMES)
+        self.steps: deque[Step] = deque(maxlen=MOST_FRAMES)
         # The end of each frame by the clock, and the simulated time then [s].
         self.ends_s: deque[tuple[float, float]] = deque(maxlen=MOST_FRAMES)
 

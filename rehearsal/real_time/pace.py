@@ -1,7 +1,7 @@
 """The pace of the steps: simulated time keeps up with the clock, by longer steps and then by fewer iterations where it must."""
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 
 import numpy as np
@@ -16,30 +16,29 @@ STEPS_DOWN, STEPS_UP = 12, 90
 
 @dataclass(frozen=True)
 class Level:
-    """How many times longer steps are than the scene's, and the share of the iterations that they have."""
+    """How many times longer steps are, and the share of the iterations that they have."""
 
     times_longer: int = 1
     iterations: float = 1.0
 
 
 # An implicit step comes to the same rest at each length, and with fewer iterations to the same rest later: so steps get longer first.
-LONGER = tuple(Level(times) for times in (1, 2, 3, 4))
+TIMES_LONGER = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 FEWER_ITERATIONS = (0.75, 0.5, 0.25)
 
 
 class Pace:
     """Chooses length and iterations of the steps by the time that they take.
 
-    ``time_step_s`` is the length of the scene's steps. ``budget_ms`` is a limit for the time of a step, beside the one that it simulates.
-    ``level`` 0 is the scene's own step.
+    ``time_step_s`` is the length that steps have where the machine can. ``budget_ms`` is a limit for the time of a step, beside the one that it simulates.
+    ``level`` 0 is that length with all iterations.
     """
 
     def __init__(self, time_step_s: float, budget_ms: float = np.inf) -> None:
         self.time_step_s, self.budget_ms = time_step_s, budget_ms
-        longer = [level for level in LONGER if level.times_longer * time_step_s <= LONGEST_STEP_S + 1e-9]
-        longer = longer or [LONGER[0]]
-        fewer = [Level(longer[-1].times_longer, share) for share in FEWER_ITERATIONS]
-        self.levels = [*longer, *fewer]
+        most = max(1.0, LONGEST_STEP_S / time_step_s + 1e-9)
+        longer = [Level(times) for times in TIMES_LONGER if times <= most]
+        self.levels = [*longer, *(replace(longer[-1], iterations=share) for share in FEWER_ITERATIONS)]
         self.level = 0
         self._recent: deque[float] = deque(maxlen=STEPS_UP)
 
@@ -51,6 +50,15 @@ class Pace:
     def iterations(self, full: int) -> int:
         """Iterations of the next step where ``full`` are set."""
         return min(full, max(LEAST_ITERATIONS, ceil(self.levels[self.level].iterations * full)))
+
+    def text(self, full: int) -> str:
+        """What the user reads where steps are longer, or have fewer iterations than the ``full`` ones that are set; else empty."""
+        longer = (
+            f"LONGER STEPS   1/{1 / self.length_s:.0f} s" if self.levels[self.level].times_longer > 1 else ""
+        )
+        iterations = self.iterations(full)
+        fewer = f"REDUCED ITERATIONS   {iterations} of {full}" if iterations < full else ""
+        return "   ".join(filter(None, [longer, fewer]))
 
     def watch(self, took_ms: float) -> None:
         """Note the duration of a step, and change the level if it is time to."""
@@ -73,10 +81,3 @@ class Pace:
         if level != self.level:
             self.level = level
             self._recent.clear()
-
-
-def pace_text(length_s: float, usual_s: float, iterations: int, full: int) -> str:
-    """What the user reads where steps are longer than usual or have fewer iterations than are set; else empty."""
-    longer = f"LONGER STEPS   1/{1 / length_s:.0f} s" if length_s > 1.01 * usual_s else ""
-    fewer = f"REDUCED ITERATIONS   {iterations} of {full}" if iterations < full else ""
-    return "   ".join(filter(None, [longer, fewer]))

@@ -11,7 +11,7 @@ from time import perf_counter
 import numpy as np
 
 import sim.device
-from rehearsal.pressed_organ import OrganState, PressedOrgan
+from rehearsal.pressed_organ import OrganState, PressedOrgan, Step
 from rehearsal.real_time.pace import Pace
 from rehearsal.real_time.pose_path import PosePath
 from rehearsal.real_time.shared_state import SharedState
@@ -26,33 +26,24 @@ MOST_BEHIND_S = 0.1
 PAUSED = "paused"
 
 
-def compute(
-    connection: Connection,
-    lock: Lock,
-    parent: int,
-    arch: str,
-    scene: Scene,
-    anatomy: LoadedAnatomy,
-    probe: Probe,
-    budget_ms: float,
-) -> None:
-    """Send the organ at rest, then serve requests until ``stop``. The parent is a process id."""
+def compute(connection: Connection, lock: Lock, parent: int) -> None:
+    """Serve requests until ``stop``. The parent is a process id."""
     # Ctrl-C reaches both processes: the other one ends this.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent(parent)
-    sim.device.start(arch)
-    organ = PressedOrgan(scene, anatomy, probe)
-    connection.send(organ.settle())
-    SolverLoop(organ, connection, lock, Pace(scene.solver.time_step_s, budget_ms)).serve()
+    SolverLoop(connection, lock).serve()
 
 
 class SolverLoop:
     """Serves requests, each the name of a public method and its arguments, and makes the steps that are due."""
 
-    def __init__(self, organ: PressedOrgan, connection: Connection, lock: Lock, pace: Pace) -> None:
-        self.organ, self.pace = organ, pace
+    organ: PressedOrgan
+    pace: Pace
+    _memory: SharedState
+
+    def __init__(self, connection: Connection, lock: Lock) -> None:
         self._connection, self._lock = connection, lock
-        self._path = PosePath(organ.pose)
+        self._path = PosePath(np.eye(4))
         self._played: deque[tuple[np.ndarray, float]] = deque()
         self._runs = self._is_stopped = False
         # The clock's time up to which steps were made.
@@ -65,9 +56,15 @@ class SolverLoop:
             for request, values in self._requests():
                 getattr(self, request)(*values)
             if self._played:
-                self._step(*self._played.popleft())
+                self._hand_on(self.organ.timed_step(*self._played.popleft()))
             elif self._runs and self._left_s() <= 0.0:
                 self._keep_pace()
+
+    def build(self, scene: Scene, anatomy: LoadedAnatomy, probe: Probe, arch: str, pace: Pace) -> None:
+        """Build the solver of a scene, and send the organ at rest."""
+        sim.device.start(arch)
+        self.organ, self.pace = PressedOrgan(scene, anatomy, probe), pace
+        self._connection.send(self.organ.settle())
 
     def share(self, memory: str) -> None:
         """Write all states to a memory from now on."""
@@ -116,18 +113,15 @@ class SolverLoop:
         return self._simulated_s + self.pace.length_s - perf_counter()
 
     def _keep_pace(self) -> None:
-        length_s, late_s = self.pace.length_s, -self._left_s()
+        pace, full, late_s = self.pace, self.organ.settings.iterations, -self._left_s()
+        length_s, text = pace.length_s, pace.text(full)
         self._simulated_s += length_s + max(late_s - MOST_BEHIND_S, 0.0)
-        iterations = self.pace.iterations(self.organ.settings.iterations)
-        pose = self._path.pose_after(length_s)
-        self.pace.watch(self._step(pose, length_s, iterations, late_s))
+        step = self.organ.timed_step(self._path.pose_after(length_s), length_s, pace.iterations(full))
+        self._hand_on(replace(step, input_s=self._path.input_s, late_ms=1000 * late_s, pace=text))
+        pace.watch(step.took_ms)
 
-    def _step(
-        self, pose: np.ndarray, length_s: float, iterations: int | None = None, late_s: float = 0.0
-    ) -> float:
-        """Make a step, and send it; return how long it took [ms]."""
-        step = self.organ.timed_step(pose, length_s, iterations)
+    def _hand_on(self, step: Step) -> None:
+        """Send a step, then write its state."""
         self._made += 1
-        self._connection.send(replace(step, input_s=self._path.input_s, late_ms=1000 * late_s))
+        self._connection.send(step)
         self._memory.write(self.organ.snapshot_of_organ(), self._made)
-        return step.took_ms

@@ -16,6 +16,7 @@ import numpy as np
 
 from errors import UserError
 from rehearsal.pressed_organ import OrganState, Step
+from rehearsal.real_time.pace import Pace
 from rehearsal.real_time.shared_state import SharedState
 from rehearsal.real_time.solver_loop import PAUSED, compute
 from rehearsal.rehearsal import Rehearsal
@@ -24,7 +25,7 @@ from scenes.scene import Scene
 from ultrasound.probe import Probe
 
 # How long the process may take to end in order.
-END_S = 2.0
+END_S = 0.5
 
 
 class SolverEnded(UserError):
@@ -32,20 +33,17 @@ class SolverEnded(UserError):
 
 
 class SolverProcess:
-    """Starts the process; ``settled`` waits for the organ at rest, then ``attach`` gives it the rehearsal that copies its states.
+    """Starts the process; ``build`` gives it an organ, ``settled`` waits for it at rest, ``attach`` names the rehearsal that copies it.
 
-    ``budget_ms`` limits the time of a step. ``on_step`` is called with each step that is collected. ``pending`` counts the steps of
-    ``play`` that were not collected yet. Every method may raise SolverEnded.
+    ``on_step`` is called with each step that is collected. ``pending`` counts the steps of ``play`` that were not collected yet.
+    Every method may raise SolverEnded.
     """
 
-    def __init__(
-        self, scene: Scene, anatomy: LoadedAnatomy, probe: Probe, arch: str, budget_ms: float = np.inf
-    ) -> None:
+    def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
         self._lock = context.Lock()
-        without_images = replace(anatomy, ct=None, labels=None, parts={})
-        given = theirs, self._lock, os.getpid(), arch, scene, without_images, probe, budget_ms
+        given = theirs, self._lock, os.getpid()
         self._process = context.Process(target=compute, args=given, name="solver", daemon=True)
         self._process.start()
         theirs.close()
@@ -55,6 +53,10 @@ class SolverProcess:
         self.pending = 0
         self._received = 0
         self._uncollected: deque[Step] = deque()
+
+    def build(self, scene: Scene, anatomy: LoadedAnatomy, probe: Probe, arch: str, pace: Pace) -> None:
+        """Build the solver of a scene on a backend; ``pace`` chooses its steps by the clock."""
+        self._send("build", scene, replace(anatomy, ct=None, labels=None, parts={}), probe, arch, pace)
 
     def settled(self) -> OrganState:
         """Return the organ at rest, as soon as it is known."""

@@ -1,0 +1,218 @@
+"""The command ``study frames``: is a rehearsal in a window in real time, and how soon does it show what the hand does?"""
+
+from collections import defaultdict
+from collections.abc import Iterable
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated, Any
+
+import numpy as np
+import psutil
+from pydantic import Field
+
+from rehearsal.commands.command_line import (
+    ARGUMENT,
+    ArchOptions,
+    CommandError,
+    ImageOptions,
+    QualityOptions,
+    command,
+)
+from rehearsal.commands.rehearse_options import RehearseOptions
+from rehearsal.frame import WindowFrames
+from rehearsal.opening import opened
+from rehearsal.pressed_organ import Step
+from rehearsal.real_time.frame_times import FrameTimes
+from rehearsal.real_time.start_times import StartTimes
+from rehearsal.run import RehearsalRun
+from render.display import display_available
+from render.viewer import Controls, View
+from scenes.scene import EMBEDDED
+from studies.study_results import write_results
+from version import VERSION
+
+# The scripted hand presses for a part of each period, while it drags the probe to and fro over the organ.
+PRESS_PERIOD_S, PRESS_S = 3.0, 1.8
+DRAG_PERIOD_S, DRAG_MM = 5.0, 12.0
+# Distance of the mouse ray's origin from the organ.
+FROM_MM = 60.0
+# The first frames are not measured: kernels are loaded in them.
+BEGIN_S = 2.0
+MEMORY_EVERY_S = 60.0
+
+
+class FrameOptions(ImageOptions, QualityOptions, ArchOptions):
+    """What is measured."""
+
+    scene: Annotated[Path, ARGUMENT] = EMBEDDED
+    out: Path
+    """Folder for the figures; the session is recorded there too."""
+    seconds: float = Field(20.0, ge=2, le=36_000)
+    """Seconds of the scripted press and drag."""
+    rate: float | None = Field(None, ge=15, le=1000)
+    """Steps a second, as for a haptic device [the scene's]; with a preset fast."""
+
+
+class ScriptedHand:
+    """The window of some frames, in which a script moves the probe by the clock; it closes after some seconds.
+
+    ``times`` are those of the frames after BEGIN_S; ``processor_s`` is what the processes have used since then, and ``memory_mb`` what
+    they have had, every MEMORY_EVERY_S.
+    """
+
+    def __init__(self, frames: WindowFrames, start: StartTimes, seconds: float) -> None:
+        self.frames, self.window, self.start, self.seconds = frames, frames.viewer, start, seconds
+        self.first_picture_s = 0.0
+        self.times = FrameTimes()
+        self.processor_s = 0.0
+        self.memory_mb: list[float] = []
+        self._began_s = 0.0
+        self._used_s: float | None = None
+        self._home = frames.rehearsal.manipulator.home
+
+    @property
+    def running(self) -> bool:
+        return self.window.running and not self._passed_s > BEGIN_S + self.seconds
+
+    @property
+    def _passed_s(self) -> float:
+        return perf_counter() - self._began_s if self._began_s else 0.0
+
+    def read_controls(self) -> Controls:
+        """The window's controls, with the script's ray and press."""
+        controls, now_s = self.window.read_controls(), self._passed_s
+        face = self._home[:3, 3] - self.frames.rehearsal.size_mm[2] / 2 * self._home[:3, 2]
+        aside = DRAG_MM * np.sin(2 * np.pi * now_s / DRAG_PERIOD_S) * self._home[:3, 0]
+        controls.ray = face + aside + FROM_MM * self._home[:3, 2], -self._home[:3, 2]
+        controls.press = now_s % PRESS_PERIOD_S < PRESS_S
+        return controls
+
+    def draw(self, view: View) -> None:
+        """Draw a view, and measure."""
+        self.window.draw(view)
+        if not self._began_s:
+            self._began_s = perf_counter()
+            self.start.begin("Rehearsal")
+            self.first_picture_s = self.start.now_s
+        if self._passed_s > BEGIN_S and self._used_s is None:
+            self._used_s = self._used()
+            self.frames.times = self.times
+        if self._used_s is not None:
+            self.processor_s = self._used() - self._used_s
+            if self._passed_s - BEGIN_S >= MEMORY_EVERY_S * len(self.memory_mb):
+                self.memory_mb.append(sum(each.memory_info().rss for each in self._processes()) / 1e6)
+
+    def picture(self) -> np.ndarray:
+        """The window's picture."""
+        return self.window.picture()
+
+    def close(self) -> None:
+        """Close the window."""
+        self.window.close()
+
+    def _processes(self) -> list[psutil.Process]:
+        this = psutil.Process()
+        return [this, *this.children(recursive=True)]
+
+    def _used(self) -> float:
+        times = [each.cpu_times() for each in self._processes()]
+        return sum(each.user + each.system for each in times)
+
+
+@command(FrameOptions)
+def frames(asked: FrameOptions) -> None:
+    """Measure pictures a second, pace and latency of SCENE in a window.
+
+    A script presses and drags the probe by the clock.
+    """
+    if not display_available():
+        raise CommandError("study frames: needs a display; on a machine without one start it under Xvfb")
+    shared = {name: getattr(asked, name) for name in FrameOptions.model_fields if name != "seconds"}
+    hands: list[ScriptedHand] = []
+
+    with opened(RehearseOptions(**shared)) as run:
+
+        def lead(window_frames: WindowFrames) -> None:
+            hands.append(ScriptedHand(window_frames, run.start, asked.seconds))
+            window_frames.viewer = hands[0]  # type: ignore[assignment]
+
+        run.in_window(prepare=lead)
+        figures = figures_of(run, hands[0], asked)
+    write_results(asked.out, "frames", figures, summary(figures))
+
+
+def figures_of(run: RehearsalRun, hand: ScriptedHand, asked: FrameOptions) -> dict[str, Any]:
+    """The figures of a run; times without the first BEGIN_S."""
+    times, layout, steps = hand.times, hand.window.layout, hand.times.steps
+    seconds = times.ends_s[-1][0] - times.ends_s[0][0]
+    frames_per_s, real_time_factor = times.rates()
+    settings, scene = run.rehearsal.settings, run.rehearsal.scene
+    return dict(
+        version=VERSION,
+        arch=run.arch,
+        **scene.tissue.model_dump(),
+        time_step_s=scene.solver.time_step_s,
+        rate=asked.rate,
+        substeps=settings.substeps,
+        iterations=settings.iterations,
+        window=[layout.width, layout.height],
+        picture=scene.image.mode,
+        seconds=round(seconds, 2),
+        frames_per_s=round(frames_per_s, 2),
+        real_time_factor=round(real_time_factor, 4),
+        latency_ms=spread_of(times.latency_ms),
+        start_s=round(hand.first_picture_s, 2),
+        start_stages_s=run.start.seconds(),
+        stages_ms={name: spread_of(ms) for name, ms in times.stages_ms.items()},
+        step_ms=spread_of(step.took_ms for step in steps),
+        step_late_ms=spread_of(step.late_ms for step in steps),
+        steps_per_s=round(len(steps) / sum(step.length_s for step in steps), 1),
+        step_lengths_s=lengths_of(steps),
+        iterations_least=min(step.iterations for step in steps),
+        processor_s_per_s=round(hand.processor_s / seconds, 3),
+        memory_mb=[round(each, 1) for each in hand.memory_mb],
+    )
+
+
+def spread_of(values: Iterable[float]) -> dict[str, float]:
+    """Median, 95th percentile and maximum."""
+    known = np.fromiter(values, float)
+    if len(known) == 0:
+        return {}
+    figures = dict(median=np.median(known), p95=np.percentile(known, 95), max=known.max())
+    return {name: round(float(value), 2) for name, value in figures.items()}
+
+
+def lengths_of(steps: Iterable[Step]) -> dict[str, float]:
+    """The share of the simulated time in steps of each length, by the length as a fraction of a second."""
+    lengths: dict[float, float] = defaultdict(float)
+    for step in steps:
+        lengths[step.length_s] += step.length_s
+    total = sum(lengths.values())
+    return {
+        f"1/{1 / length:.0f}": round(time / total, 3) for length, time in sorted(lengths.items())
+    }
+
+
+def summary(figures: dict[str, Any]) -> str:
+    """The main figures for the terminal."""
+    latency, step, late = figures["latency_ms"], figures["step_ms"], figures["step_late_ms"]
+    stages = ", ".join(f"{name} {ms['median']:.1f}" for name, ms in figures["stages_ms"].items())
+    lengths = ", ".join(
+        f"{length} s {100 * share:.0f} %" for length, share in figures["step_lengths_s"].items()
+    )
+    start = ", ".join(f"{name.lower()} {seconds:.1f}" for name, seconds in figures["start_stages_s"].items())
+    width, height = figures["window"]
+    return "\n".join(
+        [
+            f"pictures  {figures['frames_per_s']:.1f} a second in a window of {width} x {height}, real-time factor "
+            f"{figures['real_time_factor']:.3f}, over {figures['seconds']:.0f} s",
+            f"latency   {latency['median']:.0f} ms from an input to its picture, 95 % within {latency['p95']:.0f} ms",
+            f"frame     medians in ms: {stages}",
+            f"steps     {step['median']:.1f} ms each; of the simulated time {lengths}; begun late by {late['median']:.2f} ms, "
+            f"95 % within {late['p95']:.2f} ms, at most {late['max']:.1f} ms",
+            f"load      {figures['processor_s_per_s']:.2f} processor seconds a second; memory {figures['memory_mb'][0]:.0f} MB, "
+            f"at the end {figures['memory_mb'][-1]:.0f} MB",
+            f"start     {figures['start_s']:.1f} s to the first picture: {start}",
+        ]
+    )
