@@ -121,7 +121,7 @@ class SolverLoop:
         pace.watch(step.took_ms)
 
     def _hand_on(self, step: Step) -> None:
-        """Send a step, then write its state."""
+        """Write a step's state, then send the step."""
         self._made += 1
-        self._connection.send(step)
         self._memory.write(self.organ.snapshot_of_organ(), self._made)
+        self._connection.send(step)

@@ -129,15 +129,13 @@ class SolverProcess:
         """Set the rehearsal to the newest state, and hand on the steps up to it."""
         if self._memory is None or not self._uncollected:
             return
+        # A state is written before its step is sent.
         state, number = self._memory.read()
         while self._received < number:
             self._receive_step()
-        # A step is sent before its state is in the memory.
-        count = len(self._uncollected) - (self._received - number)
-        if count > 0:
-            self.rehearsal.restore_organ(state)
-        self.pending = max(0, self.pending - count)
-        for _ in range(count):
+        self.rehearsal.restore_organ(state)
+        self.pending = max(0, self.pending - len(self._uncollected))
+        while self._uncollected:
             self.on_step(self._uncollected.popleft())
 
     def _send(self, request: str, *values: Any) -> None:

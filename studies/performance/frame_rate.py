@@ -189,9 +189,7 @@ def lengths_of(steps: Iterable[Step]) -> dict[str, float]:
     for step in steps:
         lengths[step.length_s] += step.length_s
     total = sum(lengths.values())
-    return {
-        f"1/{1 / length:.0f}": round(time / total, 3) for length, time in sorted(lengths.items())
-    }
+    return {f"1/{1 / length:.0f}": round(time / total, 3) for length, time in sorted(lengths.items())}
 
 
 def summary(figures: dict[str, Any]) -> str:

@@ -12,11 +12,11 @@ from click.exceptions import Exit
 from test_openigtlink import LiveImage
 
 import app
-from rehearsal import frame, headless, run
-from rehearsal.commands import rehearse_command
+from rehearsal import frame, headless, opening, run
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.frame import Frames, WindowFrames
 from rehearsal.notices import Notices
+from rehearsal.pressed_organ import Step
 from render.keys import DEFAULT_KEYS, Keys
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
@@ -28,7 +28,8 @@ STEP_S = 0.25
 
 
 class Fake:
-    """A rehearsal, its input source and its measurements in one: each step is 1 mm further, and sets the depth as a replay does."""
+    """A rehearsal, its solver, its input source and its measurements in one: each step is 1 mm further, and sets the depth as a replay
+    does."""
 
     def __init__(self) -> None:
         self.probe, self.origin = load_probe("linear"), np.array([100.0, 200.0, 300.0])
@@ -36,7 +37,7 @@ class Fake:
 
     @property
     def session(self) -> SimpleNamespace:
-        return SimpleNamespace(time_s=self.steps * STEP_S)
+        return SimpleNamespace(time_s=self.steps * STEP_S, rollbacks=0)
 
     def next_pose(self, controls: Controls) -> np.ndarray:
         self.steps += 1
@@ -53,12 +54,21 @@ class Fake:
         width, depth, _ = probe.extent_mm
         return View(np.eye(4), {"B-mode": grey, "CT": 255 - grey}, width, depth)
 
-    def advance(self, pose) -> None: ...
+    def timed_step(self, pose: np.ndarray) -> Step:
+        return Step(pose, STEP_S, 4, 1.0, self.notice)
+
+    def drive(self, solver: "Fake", controls: Controls, elapsed_s: float) -> None:
+        self.on_step(self.timed_step(self.next_pose(controls)))
+
+    def collect(self) -> None: ...
+    def pause(self) -> None: ...
+    def while_running(self) -> None: ...
+    def count(self, *_) -> None: ...
     def update_surfaces(self) -> None: ...
     def rest_grid(self) -> None: ...
-    def after_step(self, step_ms: float) -> None: ...
+    def after_step(self, step: Step) -> None: ...
     def after_frame(self) -> None: ...
-    def watch(self, *_) -> str:
+    def watch(self, *_, **__) -> str:
         return ""
 
     def onto(self, view: View, settings: Settings) -> View:
@@ -79,11 +89,6 @@ class FakeTally:
         return {}
 
 
-@pytest.fixture(autouse=True)
-def no_device(monkeypatch):
-    monkeypatch.setattr(frame, "timed", lambda work, into_ms: into_ms.append(1.0) or work())
-
-
 @pytest.fixture
 def sent() -> list:
     return []
@@ -95,7 +100,7 @@ def looping(monkeypatch, tmp_path, sent) -> WindowFrames:
     monkeypatch.setattr(frame, "image_view", fake.image_view)
     return WindowFrames(
         *(fake, fake, fake, FakeTally(), SimpleNamespace(send=lambda *live: sent.append(LiveImage(*live)))),
-        **dict(viewer=None, out=tmp_path, notices=Notices(), sweeping=fake, plans=fake),
+        **dict(solver=fake, viewer=None, out=tmp_path, notices=Notices(), sweeping=fake, plans=fake),
     )
 
 
@@ -189,12 +194,14 @@ def test_a_frozen_picture_keeps_its_caliper_and_a_live_one_until_the_probe_moves
 
 
 def test_the_clock_is_the_sessions_and_says_where_it_is_slow(looping):
-    told = []
-    for looping.rate in (1.0, 0.15, 0.89 / STEP_S, 0.91 / STEP_S):
+    told, rates = [], []
+    looping.times.rates = lambda recent_s: rates[-1]
+    for factor in (0.25, 0.04, 0.89, 0.91):
+        rates.append((10.0, factor))
         view = looping.frame(Controls(Settings()))
         told.append((view.clock, view.pace))
     assert told == [("0.2 s", "0.2 x real"), ("0.5 s", "0.04 x real"), ("0.8 s", "0.9 x real"), ("1.0 s", "")]
-    looping.rate = 1.0
+    rates.append((10.0, 0.25))
     frozen = looping.frame(Controls(Settings(), freeze=True))
     assert (frozen.clock, frozen.pace) == ("1.0 s", "") and "time" not in frozen.readouts
 
@@ -281,11 +288,12 @@ def test_without_pictures_none_is_taken_and_the_rest_is_written(monkeypatch, tmp
     fake, done = Fake(), []
     monkeypatch.setattr(headless, "summary", lambda report: "")
     monkeypatch.setattr(headless, "save_surfaces", lambda rehearsal, out: done.append("surfaces"))
-    fake.advance = lambda pose: done.append("step")
+    timed_step = fake.timed_step
+    fake.timed_step = lambda pose: done.append("step") or timed_step(pose)
     fake.update_surfaces = lambda: done.append("surfaces moved")
     # The plane of the depth that the replay has just set.
     fake.find_plane = lambda probe: done.append(probe.depth_mm)
-    fake.watch = lambda *given: done.append("measured")
+    fake.watch = lambda *given, **_: done.append("measured")
     monkeypatch.setattr(FakeTally, "watch", lambda tally, rehearsal: done.append("tallied"))
     next_pose = fake.next_pose
     # The last frame is a rollback: nothing is stepped, and the tool is not yet where the tissue has it.
@@ -347,9 +355,10 @@ def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path
     monkeypatch.setattr(run, "Session", lambda rehearsal, coverage: None)
     for name in ("_user_input", "_record", "_end"):
         monkeypatch.setattr(run.RehearsalRun, name, lambda *_: SimpleNamespace(bookmarks=0))
-    each = run.RehearsalRun(Fake(), None, "cpu", RehearseOptions(out=tmp_path, seconds=1.0), link=link)
-    each.in_window(None)
-    each.headless(None, 0.0)
+    asked = RehearseOptions(out=tmp_path, seconds=1.0)
+    each = run.RehearsalRun(Fake(), None, "cpu", asked, solver=Fake(), link=link)
+    each.in_window()
+    each.headless()
     assert given == [link, link]
 
 
@@ -365,9 +374,9 @@ def test_the_command_opens_the_link_for_as_long_as_it_runs_and_names_its_scene(m
         socket.create_connection(("127.0.0.1", port), 5).close()
         reached.append(each.link is not None and each.link.port == port and each.asked.scene == scene)
 
-    monkeypatch.setattr(rehearse_command, "start_taichi", lambda arch: "cpu")
-    monkeypatch.setattr(rehearse_command, "built", lambda *_: None)
-    monkeypatch.setattr(rehearse_command, "compile_picture", lambda rehearsal: None)
+    monkeypatch.setattr(opening, "start_taichi", lambda arch: "cpu")
+    monkeypatch.setattr(opening, "built", lambda *_: (None, ""))
+    monkeypatch.setattr(opening, "compile_picture", lambda rehearsal: None)
     monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide: None)
     monkeypatch.setattr(run.RehearsalRun, "headless", headless_run)
     line = [

@@ -44,12 +44,12 @@ def watching(monkeypatch, rehearsal) -> LiveMeasurements:
 def test_the_instruments_watch_the_guide_and_record_it(watching, rehearsal, one_device):
     noted: list[dict] = []
     session = SimpleNamespace(
-        step_index=0, kept_states={}, rolled_back_to=None, note=lambda name, figures: noted.append(figures)
+        time_s=0.0, kept_states={}, rolled_back_to=None, note=lambda name, figures: noted.append(figures)
     )
     for pose in FIRST:
         rehearsal.pose = pose
-        watching.watch(session, rehearsal.probe, pose)
-        session.step_index += 5
+        watching.watch(session, rehearsal.probe)
+        session.time_s += live_measurements.MEASURE_S
     assert [round(each["plan_followed"], 3) for each in noted] == [round(n / 7, 3) for n in (1, 2, 3, 4)]
     assert all(each["plan_off_mm"] == 0 and "seen_margin" in each for each in noted)
     view = watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings())
@@ -67,16 +67,18 @@ def test_what_a_session_holds_is_recalled_as_it_was_watched(watching, rehearsal,
         live_measurements, "measure", lambda *_: Measurement(next(squeezed), 20.0, 5.0, 2.0, 1.0)
     )
     events: dict[int, list] = {}
-    session = SimpleNamespace(step_index=0, kept_states={}, rolled_back_to=None)
+    session = SimpleNamespace(step_index=0, time_s=0.0, kept_states={}, rolled_back_to=None)
     session.note = lambda kind, value: events.setdefault(session.step_index, []).append(
         Event(at=session.step_index, kind=kind, value=value)
     )
     for session.step_index, rehearsal.pose in enumerate(FIRST, 1):
-        watching._measure_every = 1
-        watching.watch(session, rehearsal.probe, rehearsal.pose)
-    watching.course.add(None, 0.2)
+        session.time_s += live_measurements.MEASURE_S
+        watching.watch(session, rehearsal.probe)
+        watching.count(rehearsal.pose, live_measurements.MEASURE_S)
+    watching.count(None, live_measurements.MEASURE_S)
     watching.coverage.seen[watching.coverage.targets["tumour"]] = True
-    log = Log(None, np.stack([*FIRST, np.full((4, 4), np.nan)]), events)
+    lengths_s = np.full(5, live_measurements.MEASURE_S)
+    log = Log(None, np.stack([*FIRST, np.full((4, 4), np.nan)]), lengths_s, events)
     again = LiveMeasurements(rehearsal, PlanGuidance(rehearsal, watching.guide.plan))
     assert again.recall(log, 0) and not again.recall(log, 5) and again.course.duration_s == 0
     log.seen[5] = pack_seen(watching.coverage.seen)
@@ -97,11 +99,10 @@ def test_a_way_back_is_looked_at_and_read_anew_at_once(watching, rehearsal, one_
     looks = iter([lines, ~lines])
     monkeypatch.setattr(watching.coverage, "add", lambda *_: next(looks))
     noted: list[float] = []
-    watching._coverage_every = 2
-    session = SimpleNamespace(step_index=0, kept_states={}, rolled_back_to=None)
+    session = SimpleNamespace(time_s=0.0, kept_states={}, rolled_back_to=None)
     session.note = lambda kind, figures: noted.append(figures["compression_mm"])
-    for session.step_index, pose in ((0, FIRST[0]), (1, FIRST[0]), (3, None)):
-        watching.watch(session, rehearsal.probe, pose)
+    for session.time_s, is_rollback in ((0.0, False), (1 / 60, False), (1 / 45, True)):
+        watching.watch(session, rehearsal.probe, is_rollback)
     view = watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings())
     assert view.findings["compression"] == "0.2 mm" and noted == [9.0, 0.2] and view.notes
     assert view.alert == ""
@@ -115,10 +116,9 @@ def test_a_session_that_begins_is_read_with_what_touches_then(watching, rehearsa
     )
     touches = np.arange(rehearsal.probe.number_of_scanlines) < 30
     monkeypatch.setattr(watching.coverage, "add", lambda *_: touches)
-    watching._coverage_every = 2
     for _ in range(2):
-        session = SimpleNamespace(step_index=1, kept_states={}, rolled_back_to=None, note=lambda *_: None)
-        watching.watch(session, rehearsal.probe, FIRST[0])
+        session = SimpleNamespace(time_s=1 / 60, kept_states={}, rolled_back_to=None, note=lambda *_: None)
+        watching.watch(session, rehearsal.probe)
         watching.restart()
     assert len(given) == 2 and all(np.array_equal(each, touches) for each in given)
 
@@ -144,9 +144,8 @@ def test_an_echo_is_said_to_be_black_where_hardly_a_line_touches(
     touches = np.arange(rehearsal.probe.number_of_scanlines) < touching
     monkeypatch.setattr(watching.coverage, "add", lambda *_: touches)
     watching.watch(
-        SimpleNamespace(step_index=0, kept_states={}, rolled_back_to=None, note=lambda *_: None),
+        SimpleNamespace(time_s=0.0, kept_states={}, rolled_back_to=None, note=lambda *_: None),
         rehearsal.probe,
-        FIRST[0],
     )
     assert watching.onto(View(np.eye(4), {}, 40.0, 60.0), Settings()).notes == notes
 

@@ -78,16 +78,16 @@ def test_what_is_no_state_of_this_body_is_refused(monkeypatch):
 
 
 def test_a_course_counts_presses_ways_and_time_over_the_limit():
-    course = SessionCourse(compression_warning_mm=8.0, step_s=STEP_S)
+    course = SessionCourse(compression_warning_mm=8.0)
     pose = np.eye(4)
     # Squeezed over 1 mm is a press, until it is less than 0.5 mm.
     for compression_mm in (0.0, 1.0, 1.1, 0.6, 1.2, 0.5, 0.9, 1.5, 9.0, 8.0, 8.5):
-        course.add(pose, compression_mm)
+        course.add(pose, compression_mm, STEP_S)
     assert (course.presses, course.compression_max_mm, course.over_warning_s) == (2, 9.0, 2 * STEP_S)
     assert course.path_mm == course.fastest_mm_s == 0.0
     for at_mm in ([3.0, 4.0, 0.0], [3.0, 4.0, 1.0], None, [90.0, 0.0, 0.0], [90.0, 0.0, 2.0]):
         pose[:3, 3] = at_mm or 0.0
-        course.add(None if at_mm is None else pose, 0.0)
+        course.add(None if at_mm is None else pose, 0.0, STEP_S)
     # 5 mm, 1 mm, a way back, whose leap is no way of the transducer, 2 mm.
     assert (course.path_mm, course.fastest_mm_s, course.went_back) == (8.0, 5.0 / STEP_S, 1)
     figures = course.summary({"seen_organ": 0.25, "contact_mm2": 3.0}, [Gap(1.5, 2.0)], 4)

@@ -16,7 +16,6 @@ import trimesh
 from test_undo_history import STEP_S, Numbers, ray, step
 
 import app
-from rehearsal.adaptive_iterations import AdaptiveIterations
 from rehearsal.configuration import probe_of
 from rehearsal.inputs.input_source import ReplayInput
 from rehearsal.inputs.user_input import UserInput
@@ -46,11 +45,11 @@ def header() -> Header:
 
 def live_into(path: Path, seen: Callable[[], np.ndarray] | None = None) -> UserInput:
     session = Session(Numbers(), coverage=seen)
-    return UserInput(session, AdaptiveIterations(1e6), SessionRecorder(session, path, header()))
+    return UserInput(session, SessionRecorder(session, path, header()))
 
 
-def lead(live: UserInput, moments: int, seed: int) -> str:
-    """A user who does all there is to do, at random; the tissue's digest at the end."""
+def lead(live: UserInput, moments: int, seed: int, lengths_s: tuple[float, ...] = (STEP_S,)) -> str:
+    """A user who does all there is to do, at random, in steps of these lengths; the tissue's digest at the end."""
     random = np.random.default_rng(seed)
     settings = Settings(young_kpa=15.0)
     pressing = False
@@ -58,18 +57,25 @@ def lead(live: UserInput, moments: int, seed: int) -> str:
         pressing ^= random.random() < 0.1
         settings.young_kpa = float(random.choice([5.0, 15.0, 1 / 3])) if random.random() < 0.05 else 15.0
         settings.iterations = int(random.integers(1, 20)) if random.random() < 0.1 else settings.iterations
-        live.adaptive_iterations.level = int(random.integers(4))
+        taken = dict(length_s=float(random.choice(lengths_s)), iterations=int(random.integers(1, 20)))
         keys = ("undo", "redo", "reset", "bookmark", "to_bookmark")
         did = {key: bool(random.random() < 0.04) for key in keys}
         x_mm = float(random.uniform(-8, 8))
-        step(live, settings=settings, ray=ray(x_mm) if random.random() < 0.2 else None, press=pressing, **did)
+        step(
+            live,
+            settings=settings,
+            ray=ray(x_mm) if random.random() < 0.2 else None,
+            press=pressing,
+            **taken,
+            **did,
+        )
         live.after_frame()
     return live.session.rehearsal.digest()
 
 
-def written(path: Path, moments: int = 100, seed: int = 0) -> str:
+def written(path: Path, moments: int = 100, seed: int = 0, lengths_s: tuple[float, ...] = (STEP_S,)) -> str:
     live = live_into(path)
-    digest = lead(live, moments, seed)
+    digest = lead(live, moments, seed, lengths_s)
     live.recorder.close({"presses": 1})
     return digest
 
@@ -78,7 +84,7 @@ def played(log: Log, at_s: float = 0.0) -> Replay:
     """A replay opened at a time and played to its end."""
     replay = Replay(Numbers(), log)
     replay.begin_at(at_s)
-    assert len(list(replay.go_to(at_s))) <= replay.session.step_index == replay.step_at(at_s)
+    assert len(list(replay.go_to(at_s))) <= replay.session.step_index == log.step_at(at_s)
     for _ in replay.go_to(log.length_s):
         pass
     assert replay.is_over
@@ -105,6 +111,17 @@ def test_a_session_replays_from_its_beginning_and_from_anywhere(often, tmp_path,
     replay = played(replace(log, states={}), 9.0)
     assert replay.differs_s is None and replay.compared == len(log.digests) == 19
     assert replay.rehearsal.digest() == digest
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_steps_of_different_lengths_replay_from_their_beginning_and_from_anywhere(often, tmp_path, seed):
+    digest = written(tmp_path / "session", 150, seed, (STEP_S / 2, STEP_S, 2 * STEP_S))
+    log = read_log(tmp_path / "session")
+    assert set(log.lengths_s) == {STEP_S / 2, STEP_S, 2 * STEP_S} and len(log.states) >= 10
+    for at_s in (0.0, 7.6, log.length_s / 2):
+        replay = played(log, at_s)
+        assert replay.differs_s is None and replay.rehearsal.digest() == digest
+        assert replay.time_s == log.length_s
 
 
 def marked_then_gone_to(path: Path) -> Log:
@@ -198,8 +215,7 @@ def test_a_digest_that_differs_is_said_with_its_second_once(tmp_path, capsys, at
     while not driver.replay.is_over:
         pose = driver.next_pose(Controls(Settings()))
         if pose is not None:
-            driver.replay.rehearsal.advance(pose)
-            driver.after_step(0.0)
+            driver.after_step(driver.replay.rehearsal.timed_step(pose))
     assert driver.replay.differs_s == 3.0
     assert driver.notices.present() == []
     (notice,) = capsys.readouterr().out.splitlines()
@@ -350,7 +366,7 @@ def recorded_at(folder: Path, ball: trimesh.Trimesh) -> SessionRecorder:
     numbers.scene = Scene(anatomy=files, shape=shape, tissue=dict(cell_mm=7.0), transducer=probe)
     numbers.probe = probe_of(load_scene(EMBEDDED))
     kept = record(Session(numbers), LoadedAnatomy(ball, None, None, ()), "x64", folder)
-    lead(UserInput(kept.session, AdaptiveIterations(1e6), kept), 30, 0)
+    lead(UserInput(kept.session, kept), 30, 0)
     kept.close({})
     return kept
 

@@ -13,7 +13,6 @@ from test_session import header
 from test_undo_history import STEP_S, Numbers, ray, shown, step
 
 import app
-from rehearsal.adaptive_iterations import AdaptiveIterations
 from rehearsal.coordinates import probe_in_patient
 from rehearsal.inputs.input_source import ReplayInput
 from rehearsal.inputs.user_input import UserInput
@@ -61,7 +60,7 @@ def placed(x: float, y: float = 0.0, tilt_deg: float = 0.0) -> np.ndarray:
 
 
 def live_of(tracker: Any) -> UserInput:
-    return UserInput(Session(Patient()), AdaptiveIterations(1e6), tracked=tracker.pose)
+    return UserInput(Session(Patient()), tracked=tracker.pose)
 
 
 def at(live: UserInput) -> np.ndarray:
@@ -116,9 +115,7 @@ def test_a_second_take_over_is_answered():
         said.append(shown(live))
     assert said == ["Mouse and keys control the probe", "Mouse and keys control the probe already"]
     replay, said = (
-        ReplayInput(
-            SimpleNamespace(is_over=False), lambda: UserInput(Session(Patient()), AdaptiveIterations(1e6))
-        ),
+        ReplayInput(SimpleNamespace(is_over=False), lambda: UserInput(Session(Patient()))),
         [],
     )
     for controls in (Controls(Settings(), take_over=True), Controls(Settings())):
@@ -152,7 +149,7 @@ def test_after_an_undo_or_reset_it_stays_until_the_tracked_probe_moves():
 
 def test_one_that_takes_over_waits_as_well():
     tracker = Tracker(placed(5.0))
-    live = UserInput(Session(Patient()), AdaptiveIterations(1e6), waits=True, tracked=tracker.pose)
+    live = UserInput(Session(Patient()), waits=True, tracked=tracker.pose)
     begun = at(live)
     assert np.array_equal(steps(live, 3), begun)
     tracker.now = placed(9.0)
@@ -211,7 +208,7 @@ def test_next_to_a_frame_that_is_lost_the_pose_is_lost():
 
 def test_a_file_is_played_at_the_sessions_time_and_then_the_user_is_the_input():
     session = Session(Patient())
-    live = UserInput(session, AdaptiveIterations(1e6), tracked=partial(played_pose, way(), session))
+    live = UserInput(session, tracked=partial(played_pose, way(), session))
     places = [at(live) for _ in range(17) if step(live) is not None]
     # From the second on the transducer keeps up: 6 mm/s.
     assert places[-1] == pytest.approx(placed(6.0, tilt_deg=32.0)) and places[9] == pytest.approx(
@@ -232,18 +229,18 @@ def test_a_file_is_played_at_the_sessions_time_and_then_the_user_is_the_input():
 def test_time_continues_through_resets():
     session = Session(Patient())
     played = partial(played_pose, way(), session)
-    live = UserInput(session, AdaptiveIterations(1e6), tracked=played)
+    live = UserInput(session, tracked=played)
     steps(live, 6)
     for _ in range(4):
         step(live, reset=True)
     assert np.array_equal(played(), way().at(10 * STEP_S))
     # 0.57 - 0.07 is less than a half by rounding.
     half, other = TimedPoses(np.array([0.07, 0.57]), [placed(0.0), placed(1.0)]), Session(Patient())
-    other.step_index = 4
+    other.time_s = 4 * STEP_S
     assert half.length_s < 0.5 and np.array_equal(played_pose(half, other), placed(1.0))
-    session.step_index = 16
+    session.time_s = 16 * STEP_S
     assert isinstance(played(), np.ndarray)
-    session.step_index = 17
+    session.time_s = 17 * STEP_S
     with pytest.raises(TrackEnded):
         played()
 
@@ -252,9 +249,7 @@ def recorded(path: Path) -> str:
     """A tracked session recorded in a file; the tissue's digest at its end."""
     session = Session(Patient())
     played = partial(played_pose, way(25, lost=(5, 6, 13)), session)
-    live = UserInput(
-        session, AdaptiveIterations(1e6), SessionRecorder(session, path, header()), tracked=played
-    )
+    live = UserInput(session, SessionRecorder(session, path, header()), tracked=played)
     for moment in range(60):
         step(live, ray=ray(2.0), undo=moment == 30, reset=moment == 40, press=moment > 52)
         live.after_frame()

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from rehearsal.adaptive_iterations import AdaptiveIterations
 from rehearsal.inputs.user_input import UserInput
+from rehearsal.pressed_organ import PressedOrgan, Step
 from rehearsal.rehearsal import RehearsalState
 from rehearsal.sessions.session import MOST_UNDONE, SETTLED, History, Session
 from render.viewer import Controls, Settings
@@ -63,7 +63,8 @@ class Numbers:
         told = 1e-3 * self.young_kpa + 1e-2 * self.settings.iterations + 1e-3 * self.settings.gravity[2]
         drawn = self.contacts["plane"][:, :3] + 0.01 * (self.watch.steps_since_good % 7)
         self.velocity = (0.9 * self.velocity + told + drawn + 0.01 * pose[:3, 3]).astype(np.float32)
-        self.position = (0.99 * self.position + STEP_S * self.velocity).astype(np.float32)
+        length_s = np.float32(self.settings.time_step_s)
+        self.position = (0.99 * self.position + length_s * self.velocity).astype(np.float32)
         self.contacts = {"plane": np.sin(np.pad(self.position, ((0, 0), (0, 1))))}
         since = self.watch.steps_since_good + 1
         self.watch = (
@@ -71,6 +72,15 @@ class Numbers:
         )
         self.pose = pose
         self.steps += 1
+
+    step_of = PressedOrgan.step_of
+
+    def timed_step(
+        self, pose: np.ndarray, length_s: float | None = None, iterations: int | None = None
+    ) -> Step:
+        with self.step_of(length_s or self.settings.time_step_s, iterations or self.settings.iterations):
+            self.advance(pose)
+            return Step(pose, self.settings.time_step_s, self.settings.iterations, 0.0)
 
     def store_valid_state(self) -> None:
         self.watch = DivergenceState(self._solver())
@@ -100,7 +110,9 @@ class Told:
     def note(self, kind: str, value: Any) -> None:
         self.notes.append((kind, value))
 
-    def add_step(self, pose: np.ndarray | None) -> None:
+    is_state_due = False
+
+    def add_step(self, pose: np.ndarray | None, length_s: float) -> None:
         self.poses.append(pose)
 
     def of(self, kind: str) -> list[Any]:
@@ -248,16 +260,18 @@ def test_undo_and_redo_in_turn_keep_no_more_and_more(history):
 
 
 def live_of(told: Told | None = None) -> UserInput:
-    return UserInput(Session(Numbers(), told), AdaptiveIterations(1e6))
+    return UserInput(Session(Numbers(), told))
 
 
-def step(live: UserInput, step_ms: float = 0.0, **did: Any) -> np.ndarray | None:
-    """A moment in which the user did something."""
+def step(
+    live: UserInput, length_s: float | None = None, iterations: int | None = None, pace: str = "", **did: Any
+) -> np.ndarray | None:
+    """A moment in which the user did something, with a step of its own length and iterations."""
     settings = did.pop("settings", None) or Settings(young_kpa=15.0)
     pose = live.next_pose(Controls(settings, **did))
     if pose is not None:
-        live.session.rehearsal.advance(pose)
-        live.after_step(step_ms)
+        made = live.session.rehearsal.timed_step(pose, length_s, iterations)
+        live.after_step(replace(made, pace=pace))
     return pose
 
 
@@ -328,22 +342,19 @@ def test_a_way_back_gives_the_hand_as_it_was_before_the_input():
 def test_the_iterations_that_were_done_are_recorded_not_those_asked_for():
     told = Told()
     live = live_of(told)
-    live.adaptive_iterations.level = 2
-    step(live, settings=Settings(young_kpa=15.0, iterations=10))
-    assert told.of("solver")[0]["iterations"] == live.session.rehearsal.settings.iterations == 5
-    assert told.of("settings")[0]["iterations"] == 10
-    live.adaptive_iterations.level = 3
-    step(live, settings=Settings(young_kpa=15.0, iterations=10))
-    assert told.of("solver")[1:] == [{"iterations": 3}] and len(told.of("settings")) == 1
-    assert live.status == "REDUCED ITERATIONS   3 of 10"
+    step(live, settings=Settings(young_kpa=15.0, iterations=10), iterations=5)
+    assert {"iterations": 5} in told.of("solver") and told.of("settings")[0]["iterations"] == 10
+    step(live, settings=Settings(young_kpa=15.0, iterations=10), iterations=3)
+    assert told.of("solver")[-1] == {"iterations": 3} and len(told.of("settings")) == 1
+    assert live.session.rehearsal.settings.iterations == 10
 
 
-def test_a_step_that_is_too_slow_is_said_once(capsys):
-    live = UserInput(Session(Numbers()), AdaptiveIterations(5.0))
-    live.next_pose(Controls(Settings(young_kpa=15.0, iterations=8)))
-    for _ in range(21):
-        live.after_step(9.0)
-    assert live.notices.present() == [] and capsys.readouterr().out == "REDUCED ITERATIONS   6 of 8\n"
+def test_a_pace_that_differs_is_said_once(capsys):
+    live = live_of()
+    for pace in ("", "LONGER STEPS   1/30 s", "LONGER STEPS   1/30 s", ""):
+        step(live, pace=pace)
+        assert live.status == pace and live.notices.present() == []
+    assert capsys.readouterr().out == "LONGER STEPS   1/30 s\nSteps as they are set again.\n"
 
 
 def test_only_what_changes_is_told():
@@ -353,7 +364,7 @@ def test_only_what_changes_is_told():
     for young_kpa, gain in ((15.0, 50), (15.0, 50), (30.0, 50), (30.0, 70)):
         settings.young_kpa, settings.gain_percent = young_kpa, gain
         step(live, settings=settings)
-    assert told.of("solver")[1:] == [{"young_kpa": 30.0}]
+    assert told.of("solver")[2:] == [{"young_kpa": 30.0}]
     assert told.of("settings")[1:] == [{"young_kpa": 30.0}, {"gain_percent": 70}]
     assert live.session.rehearsal.young_kpa == 30.0
 

@@ -11,12 +11,11 @@ from small_bead_case import write_case
 
 import app
 from rehearsal import speed_accuracy
-from rehearsal.adaptive_iterations import LEVELS, STEPS_DOWN, STEPS_UP, AdaptiveIterations
 from rehearsal.build_solver import step_settings
-from rehearsal.commands.rehearse_command import as_asked
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.configuration import PRESETS, Setup, scene_of, setup_of
 from rehearsal.measurements.run_report import expected_error_of
+from rehearsal.opening import as_asked
 from rehearsal.speed_accuracy import (
     MEASURED,
     NoPoint,
@@ -192,24 +191,6 @@ def test_a_quality_sets_size_and_iterations_and_leaves_the_material():
     stiff.check()
     RehearseOptions(young_kpa=33.0, budget_ms=5.0, error_mm=0.1).check()
     assert as_asked(scene, RehearseOptions())[0] == scene
-
-
-def test_a_slow_step_loses_iterations_rung_by_rung_and_gets_them_back():
-    ladder = AdaptiveIterations(10.0)
-    assert not any(ladder.watch(9.0) for _ in range(STEPS_UP)) and ladder.status(8) == ""
-    rungs = []
-    for _ in range(4 * STEPS_DOWN):
-        if ladder.watch(11.0):
-            rungs.append(ladder.iterations(8))
-    # No further than the last rung, and said.
-    assert rungs == [6, 4, 2] and ladder.level == len(LEVELS) - 1
-    assert ladder.status(8) == "REDUCED ITERATIONS   2 of 8"
-    # At half the budget twice the iterations would just fill it: not enough room.
-    assert not any(ladder.watch(5.0) for _ in range(2 * STEPS_UP))
-    assert [ladder.watch(3.0) for _ in range(STEPS_UP)].count(True) == 1 and ladder.iterations(8) == 4
-    # Single long steps change nothing.
-    assert not any(ladder.watch(100.0 if n % 3 == 0 else 7.0) for n in range(2 * STEPS_UP))
-    assert ladder.iterations(1) == 1
 
 
 def test_the_command_writes_table_figure_and_json(tmp_path, monkeypatch, capsys):

@@ -1,0 +1,245 @@
+"""The solver in a process of its own: the same bits, states of one instant, pace with the clock."""
+
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import rotation_about
+
+from rehearsal.pressed_organ import PressedOrgan, Step
+from rehearsal.real_time.frame_times import FrameTimes
+from rehearsal.real_time.pace import BUSY, LEAST_ITERATIONS, SPARE, STEPS_DOWN, STEPS_UP, Pace
+from rehearsal.real_time.pose_path import CATCH_UP, LONGEST_S, PosePath
+from rehearsal.real_time.solver_process import SolverEnded, SolverProcess
+from rehearsal.rehearsal import Rehearsal
+from scenes.anatomy import LoadedAnatomy
+from scenes.scene import AnatomyFiles, Attachment, Scene, with_options
+from ultrasound.probe_manipulator import advanced
+
+# A process that makes a step of a small body in less than a millisecond; the machine may be busy.
+LONGEST_WAIT_S = 30.0
+RATE = 200.0
+
+
+def small_rehearsal(settled=None) -> Rehearsal:
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=15.0)
+    scene = Scene(
+        anatomy=AnatomyFiles(),
+        attachment=Attachment(at_mm=(0.0, 0.0, -15.0), radius_mm=8.0),
+        press={"warm_up_steps": 3},
+    )
+    scene = with_options(scene, {"tissue.cell_mm": 6.0})
+    return Rehearsal(scene, LoadedAnatomy(ball, None, None, ()), settled=settled)
+
+
+@pytest.fixture(scope="module")
+def reference(one_device) -> PressedOrgan:
+    """The same organ, computed in this process."""
+    return small_rehearsal()
+
+
+@pytest.fixture(scope="module")
+def started(one_device) -> Iterator[SolverProcess]:
+    solver = SolverProcess()
+    copy = small_rehearsal()
+    anatomy = LoadedAnatomy(trimesh.creation.icosphere(subdivisions=3, radius=15.0), None, None, ())
+    solver.build(copy.scene, anatomy, copy.probe, "cpu", Pace(1 / RATE))
+    copy._take_settled(solver.settled())
+    solver.attach(copy)
+    yield solver
+    solver.close()
+
+
+@pytest.fixture
+def solver(started) -> Iterator[SolverProcess]:
+    """The process, paused and at rest."""
+    started.pause()
+    started.rehearsal.reset()
+    started.hand_over()
+    yield started
+    started.pause()
+
+
+def pressing(solver: SolverProcess, steps: int) -> list[tuple[list[Step], str]]:
+    """The steps of each collection and the digest after it, while the probe is pressed in and turned, until so many steps."""
+    collected: list[list[Step]] = [[]]
+    solver.on_step = lambda step: collected[-1].append(step)
+    digests, end_s = [], time.monotonic() + LONGEST_WAIT_S
+    home = solver.rehearsal.pose
+    while sum(map(len, collected)) < steps and time.monotonic() < end_s:
+        collected.append([])
+        solver.collect()
+        digests.append(solver.rehearsal.digest())
+        goal = advanced(home, 4.0 * np.sin(len(collected) / 9) ** 2)
+        solver.go_to(goal, time.perf_counter(), 0.01)
+        time.sleep(0.007)
+    return list(zip(collected[1:], digests, strict=True))
+
+
+def test_each_state_is_of_one_instant_and_has_the_bits_of_the_same_steps_here(solver, reference):
+    reference.restore_organ(solver.rehearsal.snapshot_of_organ())
+    solver.run()
+    frames = pressing(solver, 300)
+    lengths, moved = set(), 0.0
+    for steps, digest in frames:
+        for step in steps:
+            moved = max(moved, float(np.abs(step.pose - reference.pose).max()))
+            reference.timed_step(step.pose, step.length_s, step.iterations)
+            lengths.add(step.length_s)
+        assert reference.digest() == digest
+    assert sum(len(steps) for steps, _ in frames) >= 300 and moved > 0.01
+    assert np.array_equal(reference.pose, solver.rehearsal.pose)
+
+
+def test_steps_keep_pace_with_the_clock(solver):
+    made: list[Step] = []
+    solver.on_step = made.append
+    solver.run()
+    began = time.perf_counter()
+    time.sleep(0.5)
+    solver.pause()
+    passed = time.perf_counter() - began
+    simulated = sum(step.length_s for step in made)
+    # No faster than the clock; how much slower depends on the machine.
+    assert 0 < simulated <= passed + made[-1].length_s
+    assert all(step.late_ms >= 0 for step in made)
+
+
+def test_paused_it_makes_no_steps_and_continues_from_what_it_is_handed(solver, reference):
+    solver.run()
+    pressing(solver, 30)
+    solver.pause()
+    before = solver.rehearsal.digest()
+    time.sleep(0.05)
+    solver.collect()
+    assert solver.rehearsal.digest() == before
+    # An undo: back to the start, with other settings.
+    solver.rehearsal.reset()
+    solver.rehearsal.set_young(30.0)
+    solver.hand_over()
+    poses = np.stack([advanced(solver.rehearsal.pose, depth) for depth in np.linspace(0.1, 2.0, 8)])
+    lengths = np.linspace(1 / 200, 1 / 20, 8)
+    reference.restore_organ(solver.rehearsal.snapshot_of_organ())
+    reference.set_young(30.0)
+    solver.play(poses, lengths)
+    solver.pause()
+    for pose, length in zip(poses, lengths, strict=True):
+        reference.timed_step(pose, float(length))
+    for each in (solver.rehearsal, reference):
+        each.set_young(15.0)
+    assert solver.pending == 0 and reference.digest() == solver.rehearsal.digest() != before
+
+
+def test_a_state_that_the_check_would_restore_crosses_too(solver):
+    solver.run()
+    pressing(solver, round(1.5 * RATE))
+    solver.pause()
+    state = solver.rehearsal.divergence_check.state
+    # Good states are stored every second: it is not the one at rest any more.
+    assert not np.array_equal(state.good.body.position, solver.rehearsal.settled.solver.body.position)
+
+
+def test_a_process_that_ends_is_an_error_in_words():
+    solver = SolverProcess()
+    solver._process.kill()
+    with pytest.raises(SolverEnded, match=r"the solver's process has ended \(exit status -9\)"):
+        solver.settled()
+    solver.close()
+
+
+# The path of the transducer
+
+
+def test_the_transducer_moves_as_fast_as_its_input():
+    start, goal = np.eye(4), np.eye(4)
+    goal[:3, 3] = [6.0, 0.0, 0.0]
+    goal[:3, :3] = rotation_about([0, 0, 1], 30.0)
+    path = PosePath(start, 1.0)
+    path.go_to(goal, 1.06, 0.06)
+    places = [path.pose_after(0.01) for _ in range(8)]
+    assert [pose[0, 3] for pose in places] == pytest.approx([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 6.0, 6.0])
+    assert places[2][:3, :3] == pytest.approx(rotation_about([0, 0, 1], 15.0))
+    assert path.input_s == 1.06 and np.array_equal(places[-1], goal)
+
+
+def test_behind_its_input_it_catches_up_at_a_limited_rate():
+    path, goal = PosePath(np.eye(4), 1.0), np.eye(4)
+    goal[0, 3] = 10.0
+    # Inputs every 10 ms, and a step of only 1 ms: it is 109 ms behind the last one.
+    for number in range(1, 12):
+        path.go_to(goal * [[number / 10], [1], [1], [1]], 1.0 + number / 100, 0.01)
+    behind = 1.11 - path.input_s
+    path.pose_after(behind / CATCH_UP / 2)
+    assert path.input_s == pytest.approx(1.0 + 0.11 / 2)
+    path.stay(goal, 5.0)
+    path.go_to(np.eye(4), 50.0, 0.0)
+    assert np.array_equal(path.pose_after(0.5 * LONGEST_S / CATCH_UP)[:3, 3], [5.0, 0.0, 0.0])
+
+
+# The pace
+
+
+def watched(pace: Pace, took_ms: float, steps: int) -> tuple[float, int]:
+    for _ in range(steps):
+        pace.watch(took_ms)
+    return pace.length_s, pace.iterations(8)
+
+
+def test_slow_steps_get_longer_then_have_fewer_iterations_and_return():
+    pace = Pace(1 / 60)
+    step_ms = 1000 / 60
+    assert watched(pace, 0.9 * BUSY * step_ms, STEPS_UP) == (1 / 60, 8) and pace.text(8) == ""
+    assert watched(pace, 1.1 * BUSY * step_ms, STEPS_DOWN) == (2 / 60, 8)
+    assert pace.text(8) == "LONGER STEPS   1/30 s"
+    # Twice as long, they take half of the time that they simulate: more than is spare for short ones.
+    assert watched(pace, 1.1 * BUSY * step_ms, 2 * STEPS_UP) == (2 / 60, 8)
+    assert watched(pace, 100.0, 2 * STEPS_DOWN) == (4 / 60, 8)
+    assert [watched(pace, 100.0, STEPS_DOWN)[1] for _ in range(4)] == [6, 4, 2, 2]
+    assert pace.text(8) == "LONGER STEPS   1/15 s   REDUCED ITERATIONS   2 of 8"
+    assert watched(pace, 0.9 * SPARE * step_ms / 4, 6 * STEPS_UP) == (1 / 60, 8)
+    assert Pace(1 / 60).iterations(1) == 1
+    pace.level = len(pace.levels) - 1
+    assert pace.iterations(3) == LEAST_ITERATIONS
+
+
+def test_single_long_steps_change_nothing():
+    pace = Pace(1 / 60)
+    for number in range(2 * STEPS_UP):
+        pace.watch(100.0 if number % 3 == 0 else 5.0)
+    assert pace.level == 0
+
+
+def test_steps_are_at_most_a_fifteenth_of_a_second_unless_the_scenes_are_longer():
+    assert max(level.times_longer for level in Pace(1 / 60).levels) == 4
+    assert max(level.times_longer for level in Pace(1 / 1000).levels) == 64
+    assert {level.times_longer for level in Pace(1 / 10).levels} == {1}
+
+
+def test_a_budget_limits_the_time_of_a_step():
+    pace = Pace(1 / 60, budget_ms=2.0)
+    assert watched(pace, 1.9, STEPS_UP) == (1 / 60, 8)
+    assert watched(pace, 2.1, 10 * STEPS_DOWN) == (4 / 60, 2)
+
+
+# The figures of the frames
+
+
+def test_rates_are_those_of_the_recent_frames(monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr("rehearsal.real_time.frame_times.perf_counter", lambda: clock[0])
+    times = FrameTimes()
+    assert times.rates() == (0.0, 1.0)
+    # Ten frames a second at half the pace, then twenty in real time.
+    for number in range(11):
+        clock[0] = 100.0 + number / 10
+        times.end_frame(simulated_s=number / 20, input_s=clock[0] - 0.05)
+    for number in range(1, 21):
+        clock[0] = 101.0 + number / 20
+        times.end_frame(simulated_s=0.5 + number / 20, input_s=None)
+    assert times.rates(0.999) == pytest.approx((20.0, 1.0))
+    assert times.rates() == pytest.approx((15.0, 0.75))
+    assert list(times.latency_ms) == pytest.approx([50.0] * 11)
+    times.restart()
+    assert times.rates() == (0.0, 1.0)
