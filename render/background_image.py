@@ -4,7 +4,7 @@ Each frame redraws only what changed.
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import islice
 
 import numpy as np
@@ -69,10 +69,17 @@ class BackgroundImage:
         self._figures: Figures | None = None
         self._figures_at = 0.0
 
-    def compose(self, view: View, axes: np.ndarray, slow_figures: bool = False) -> None:
+    def compose(
+        self,
+        view: View,
+        axes: np.ndarray,
+        slow_figures: bool = False,
+        draw_scene: Callable[[np.ndarray], None] | None = None,
+    ) -> None:
         """Draw a view, with the compass for a camera's axes (3, 3): right, up and ahead, in patient coordinates.
 
-        With ``slow_figures``, figures change only every READOUT_PERIOD_S, so that they can be read.
+        With ``slow_figures``, figures change only every READOUT_PERIOD_S, so that they can be read. ``draw_scene`` draws the 3D view
+        into ``pixels``, if it is not drawn over them.
         """
         findings = first_of(view.findings, self.layout.most_findings)
         # What the backdrop depends on.
@@ -81,6 +88,7 @@ class BackgroundImage:
         if self._shows_help or self._backdrop != parts:
             self._rows[:, :, :3] = backdrop(self.layout, view, self.keys.of["help"])
             self._figures, self._axes, self._shows_help = None, None, False
+            self._empty_scene = self._scene.copy()
         self._view, self._backdrop = view, parts
         for (name, image), box in zip(view.images.items(), image_boxes(self.layout, view), strict=True):
             paste_image(self._rows, box, image)
@@ -90,6 +98,19 @@ class BackgroundImage:
         if self._axes is None or not np.array_equal(axes, self._axes):
             self._put(self.layout.compass, compass_image(self.layout, axes))
             self._axes = axes
+        if draw_scene is not None:
+            boxes = [self.layout.compass, *([self.layout.findings(len(findings))] if findings else [])]
+            over = [self._rows[box.slices].copy() for box in boxes]
+            self._scene[:] = self._empty_scene
+            draw_scene(self.pixels)
+            for box, image in zip(boxes, over, strict=True):
+                self._rows[box.slices] = image
+
+    @property
+    def _scene(self) -> np.ndarray:
+        """The 3D view's part of ``pixels``."""
+        box, height = self.layout.scene, self.layout.height
+        return self.pixels[box.left : box.right, height - box.bottom : height - box.top]
 
     def show_help(self) -> None:
         """Draw the list of all keys over everything, until the next ``compose``."""

@@ -48,7 +48,7 @@ class OrbitCamera:
         right, up, ahead = self.axes()
         offset = np.array(list(product(*bounds.T))) - self.target
         left, bottom, right_edge, top = self.part
-        half = self._half_extent() * [right_edge - left, top - bottom]
+        half = self.half_extent() * [right_edge - left, top - bottom]
         # The eye is beside the target: what is behind the target is shifted towards the centre of the window.
         shift = np.outer(offset @ ahead, self._aside())
         reach = np.abs(np.stack([offset @ right, offset @ up], axis=1) - shift) / half
@@ -63,7 +63,7 @@ class OrbitCamera:
         right /= np.linalg.norm(right)
         return right, np.cross(right, ahead), ahead
 
-    def _half_extent(self) -> np.ndarray:
+    def half_extent(self) -> np.ndarray:
         """Half width and half height of the window at distance 1."""
         half_height = np.tan(np.radians(FIELD_OF_VIEW_DEG / 2))
         return np.array([half_height * self.aspect, half_height])
@@ -71,7 +71,7 @@ class OrbitCamera:
     def _aside(self) -> np.ndarray:
         """Slopes to the right and up of the ray through the centre of the part."""
         left, bottom, right_edge, top = self.part
-        return np.array([left + right_edge - 1.0, bottom + top - 1.0]) * self._half_extent()
+        return np.array([left + right_edge - 1.0, bottom + top - 1.0]) * self.half_extent()
 
     def eye(self) -> np.ndarray:
         """Position [mm]. It is beside the target, so that the target is in the centre of its part."""
@@ -81,7 +81,7 @@ class OrbitCamera:
 
     def direction(self, cursor) -> np.ndarray:
         """Direction, of length 1 along the view, from the eye through window coordinates (2,) or (k, 2)."""
-        slope = (2.0 * np.asarray(cursor, dtype=np.float64) - 1.0) * self._half_extent()
+        slope = (2.0 * np.asarray(cursor, dtype=np.float64) - 1.0) * self.half_extent()
         right, up, ahead = self.axes()
         return ahead + slope[..., :1] * right + slope[..., 1:] * up
 
@@ -95,7 +95,7 @@ class OrbitCamera:
         offset = np.asarray(points, dtype=np.float64) - self.eye()
         right, up, ahead = self.axes()
         plane = np.stack([offset @ right, offset @ up], axis=-1) / (offset @ ahead)[..., None]
-        return 0.5 + 0.5 * plane / self._half_extent()
+        return 0.5 + 0.5 * plane / self.half_extent()
 
     def orbit(self, across: float, along: float) -> None:
         """Turn by a drag of the mouse, in window coordinates. The poles are excluded: up is undefined there."""
@@ -105,7 +105,7 @@ class OrbitCamera:
     def pan(self, across: float, along: float) -> None:
         """Shift so that the tissue follows a drag of the mouse, in window coordinates."""
         right, up, _ = self.axes()
-        half_width, half_height = self._half_extent()
+        half_width, half_height = self.half_extent()
         self.target = self.target - 2.0 * self.distance * (
             across * half_width * right + along * half_height * up
         )

@@ -3,6 +3,8 @@
 The scene is a parameter: only window.py imports taichi.ui. Lengths in mm.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import taichi as ti
 
@@ -61,7 +63,7 @@ class SceneView:
         return support
 
     def draw(
-        self, scene, view: View, settings: Settings, masked: list[tuple[float, float, float, float]]
+        self, scene, view: View, settings: Settings, masked: Sequence[tuple[float, float, float, float]] = ()
     ) -> None:
         """Draw everything into `scene`, in the order that depth and blending need.
 
@@ -73,7 +75,8 @@ class SceneView:
         scene.ambient_light(AMBIENT)
         scene.point_light(key.tolist(), KEY_LIGHT)
         scene.point_light((eye + distance * (0.9 * right - 0.2 * up)).tolist(), FILL_LIGHT)
-        self._mask(scene, masked)
+        if masked:
+            self._mask(scene, masked)
         if self._support is not None and settings.show_support:
             # A decimated mesh has slivers that face the wrong way, which would appear as black specks.
             self._support.draw(scene, two_sided=True)

@@ -1,8 +1,9 @@
 """The window, on a screen or off-screen: 3D view, ultrasound panel, sliders, mouse and keys.
 
 The only file that imports taichi.ui. A frame is drawn in this order:
-1. a full-window background image (background_image.py): panel, images, texts;
-2. invisible quads near the camera, over the panel and the strip, which fill the depth buffer there, so that no organ covers them;
+1. a full-window background image (background_image.py): panel, images, texts; where no graphics card draws, the 3D view too
+   (software_scene.py);
+2. elsewhere, invisible quads near the camera, over the panel and the strip, which fill the depth buffer there, so that no organ covers them;
 3. support, transducer, image plane, tumour, and last the organ, whose faces may be translucent;
 4. the sliders, from the metadata of `Settings`.
 """
@@ -10,6 +11,7 @@ The only file that imports taichi.ui. A frame is drawn in this order:
 import atexit
 import dataclasses
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +25,9 @@ from render.gamepad import Gamepad
 from render.keys import Keys, begin, hold
 from render.scene_view import SceneView
 from render.sliders import boxes_of, draw_sliders
+from render.software_scene import SoftwareScene
 from render.viewer import Controls, Geometry, Settings, View
+from render.vulkan_device import draws_by_processor
 from render.window_layout import FULL_SIZE, Rect, WindowLayout
 
 ZOOM_S = 0.5
@@ -47,6 +51,7 @@ class Window:
         visible: a real window, at most FRAMES_A_SECOND; else off-screen, drawn only by `picture`.
         keys: assignment of keys.
         gamepad: read beside mouse and keys, if given.
+        by_processor: the 3D view is drawn by our own kernels on the processor; None where no graphics card draws.
 
     Raises:
         NoVulkan: no Vulkan loader, driver or device.
@@ -61,6 +66,7 @@ class Window:
         visible=True,
         keys: Keys | None = None,
         gamepad: Gamepad | None = None,
+        by_processor: bool | None = None,
     ):
         if visible and not display_available():
             raise RuntimeError("no display to open a window on")
@@ -96,6 +102,9 @@ class Window:
         part = self.layout.window_coordinates(self.layout.clear)
         self.camera = OrbitCamera(geometry.bounds, geometry.up, part, size[0] / size[1])
         self._scene_view = SceneView(geometry, self.camera)
+        if by_processor is None:
+            by_processor = draws_by_processor() and ti.cfg.arch in (ti.x64, ti.arm64)
+        self._software = SoftwareScene(self.camera, size) if by_processor else None
         self._background = BackgroundImage(self.layout, self.keys)
 
     # Input
@@ -234,6 +243,8 @@ class Window:
         self.layout = WindowLayout(*size)
         self._boxes_placed += 1
         self._background = BackgroundImage(self.layout, self.keys)
+        if self._software is not None:
+            self._software = SoftwareScene(self.camera, size)
         self.camera.aspect = size[0] / size[1]
         self.camera.part = self.layout.window_coordinates(self.layout.clear)
 
@@ -241,20 +252,33 @@ class Window:
         if self._help_shown:
             self._background.show_help()
         else:
-            self._background.compose(view, np.stack(self.camera.axes()), self._visible)
+            software = None if self._software is None else partial(self._draw_by_processor, view)
+            self._background.compose(view, np.stack(self.camera.axes()), self._visible, software)
         # Without the 10 ms that Canvas.set_image needs to pack the pixels.
         self._canvas.canvas.set_image(get_field_info(self._background.pixels.view(np.uint32)[..., 0]))
-        self._set_camera()
-        rects = [self.layout.panel, self.layout.title, self.layout.strip, *self._boxes_over_scene()]
-        masked = [self.layout.window_coordinates(rect) for rect in rects]
-        self._scene_view.draw(self._scene, view, self.settings, masked)
-        self._canvas.scene(self._scene)
+        if self._software is None:
+            self._draw_scene(view)
         if not self._help_shown:
             boxes = boxes_of(self.settings, self._geometry, self.layout)
             if boxes != self._slider_boxes:
                 self._slider_boxes, self._boxes_placed = boxes, self._boxes_placed + 1
             placed = boxes, self._first_size, self._boxes_placed
             draw_sliders(self._gui, self.settings, self._geometry, *placed)
+
+    def _draw_by_processor(self, view: View, pixels: np.ndarray) -> None:
+        """Draw the 3D view into the background image."""
+        if self._software is not None:
+            self._software.look()
+            self._scene_view.draw(self._software, view, self.settings)
+            self._software.render(self.layout.scene, pixels)
+
+    def _draw_scene(self, view: View) -> None:
+        """Draw the 3D view over the background image."""
+        self._set_camera()
+        rects = [self.layout.panel, self.layout.title, self.layout.strip, *self._boxes_over_scene()]
+        masked = [self.layout.window_coordinates(rect) for rect in rects]
+        self._scene_view.draw(self._scene, view, self.settings, masked)
+        self._canvas.scene(self._scene)
 
     def _set_camera(self) -> None:
         _, up, ahead = self.camera.axes()

@@ -9,8 +9,9 @@ from taichi.lang import impl
 
 from sim.device import on_cpu
 
-# Address of each tree of fields, for each start of Taichi.
+# Address of each tree of fields, for each start of Taichi; and the memory of each field.
 _ROOTS: WeakKeyDictionary[object, dict[int, int]] = WeakKeyDictionary()
+_VIEWS: WeakKeyDictionary[ti.Field, np.ndarray] = WeakKeyDictionary()
 
 
 def field_of(values: np.ndarray, within: int = 0) -> ti.Field:
@@ -67,6 +68,12 @@ def _element(field: ti.Field) -> tuple[int, ...]:
 
 def _memory(field: ti.Field) -> np.ndarray:
     """View of a field's memory; each element is contiguous, next to those of the other fields of a struct."""
+    if field not in _VIEWS:
+        _VIEWS[field] = _view(field)
+    return _VIEWS[field]
+
+
+def _view(field: ti.Field) -> np.ndarray:
     impl.get_runtime().materialize()
     place = field.snode.ptr
     size = place.parent.cell_size_bytes
