@@ -16,7 +16,7 @@ from rehearsal.image_and_surface_files import save_screenshot, save_surfaces, sa
 from rehearsal.inputs.input_source import InputSource, ReplayInput, WindowInput
 from rehearsal.inputs.user_input import UserInput
 from rehearsal.measurements.live_measurements import LiveMeasurements
-from rehearsal.measurements.run_report import Tally, expected_error_of
+from rehearsal.measurements.run_report import Tally
 from rehearsal.notices import Notices
 from rehearsal.open_window import probe_with_settings
 from rehearsal.planning.plans_in_window import PlanControl
@@ -330,7 +330,7 @@ def captions(probe: Probe, settings: ScannerSettings) -> tuple[str, str, str]:
 def readouts(rehearsal: Rehearsal, tally: Tally) -> dict[str, str]:
     """Name -> figure with its unit."""
     size, count = next(iter(rehearsal.model.counts().items()))
-    error = expected_error_of(rehearsal)
+    error = tally.expected_error_mm(rehearsal)
     return {
         "step": f"{np.median(tally.step_ms[-30:]):.1f} ms" if tally.step_ms else "",
         "error": "not known" if error is None else f"± {error:.2f} mm",

@@ -10,11 +10,11 @@ import taichi.math as tm
 
 from render.camera import OrbitCamera
 from render.window_layout import Rect
+from sim.device import TASK
 from sim.fields import array_of
 
-# Each band of columns is drawn by one thread, all triangles in their order: so the picture does not depend on the threads. Taichi
-# gives a thread at least BLOCK iterations of a loop.
-BANDS, BLOCK = 4, 512
+# Each band of columns is drawn by one thread, all triangles in their order: so the picture does not depend on the threads.
+BANDS = 4
 # Farther outside, a column or row is cut off before it becomes an integer.
 MOST_PIXELS = 1e6
 # Lines are drawn this much nearer, as a share of their distance, so that the surface that they are on does not hide them.
@@ -153,9 +153,9 @@ def _draw(
     pixels: ti.types.ndarray(ti.u32, ndim=2),
 ):
     """Draw triangles in their order into columns left to right - 1 and rows bottom to top - 1."""
-    for n in range(BANDS * BLOCK):
-        if n % BLOCK == 0:
-            band = n // BLOCK
+    for n in range(BANDS * TASK):
+        if n % TASK == 0:
+            band = n // TASK
             first, end = left + (right - left) * band // BANDS, left + (right - left) * (band + 1) // BANDS
             for column in range(first, end):
                 for row in range(bottom, top):

@@ -29,6 +29,7 @@ from render.software_scene import SoftwareScene
 from render.viewer import Controls, Geometry, Settings, View
 from render.vulkan_device import draws_by_processor
 from render.window_layout import FULL_SIZE, Rect, WindowLayout
+from sim.device import on_cpu
 
 ZOOM_S = 0.5
 ZOOM_SENSE = {"zoom_in": -1.0, "zoom_out": 1.0}
@@ -103,7 +104,7 @@ class Window:
         self.camera = OrbitCamera(geometry.bounds, geometry.up, part, size[0] / size[1])
         self._scene_view = SceneView(geometry, self.camera)
         if by_processor is None:
-            by_processor = draws_by_processor() and ti.cfg.arch in (ti.x64, ti.arm64)
+            by_processor = draws_by_processor() and on_cpu()
         self._software = SoftwareScene(self.camera, size) if by_processor else None
         self._background = BackgroundImage(self.layout, self.keys)
 

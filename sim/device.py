@@ -20,6 +20,9 @@ FEW_CORES = 4
 # Taichi's default for its kernel cache is 100 MB. A rehearsal adds 4 MB for each patient and each choice of settings.
 CACHE_BYTES = 1 << 30
 COUNTS = 64
+# Taichi gives a thread of a CPU at least so many iterations of a loop. A loop of fewer and longer ones runs over TASK times as many,
+# and does something in every TASK-th.
+TASK = 512
 TEMPORARY = Path(tempfile.gettempdir()) / "nephron" / "kernels"
 
 

@@ -23,7 +23,7 @@ FORBIDDEN = {
 }
 # What of other layers the screen may name: which choices there are, and the folder itself, which keeps Taichi quiet.
 # Solvers, bodies and scanners stay out: it is handed arrays.
-KNOWN_TO_RENDER = {"sim", "sim.fields", "ultrasound.probe", "ultrasound.target"}
+KNOWN_TO_RENDER = {"sim", "sim.device", "sim.fields", "ultrasound.probe", "ultrasound.target"}
 
 
 class Import(NamedTuple):

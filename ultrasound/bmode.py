@@ -12,6 +12,7 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
+from sim.device import TASK
 from sim.fields import fill
 from ultrasound.probe import DETAIL_LEVELS, DetailLevel, Probe
 from ultrasound.sampled_volume import SampledVolume
@@ -231,43 +232,62 @@ class BMode:
 
         The tissue is sampled every ``stride`` samples. ``aperture`` is in elements to each side, per mm of depth.
         """
+        for n in range(self.lines * TASK):
+            if n % TASK == 0:
+                line = n // TASK
+                self.simulate_line(
+                    line, detail_level, stride, sample_mm, frequency_mhz, aperture, axial_sd, elevation_sd
+                )
+
+    @ti.func
+    def simulate_line(
+        self,
+        line,
+        detail_level: ti.template(),
+        stride: ti.template(),
+        sample_mm: float,
+        frequency_mhz: float,
+        aperture: float,
+        axial_sd: float,
+        elevation_sd: float,
+    ):
+        """Follow the pulse along a scanline."""
         planes = ti.static(THICK_PLANE if detail_level == 2 else CENTRAL_PLANE)
         stride_mm = stride * sample_mm
-        for line in range(self.lines):
-            start, direction = self.start[line], self.direction[line]
-            for i in range(self.samples):
-                self.real[line, i] = 0.0
-            near = self.sample_tissue(planes, start, elevation_sd)
-            loss_db, transmitted, amplitude = 0.0, 1.0, 1.0
-            interface = Interface()
-            interface.begin(near.tissue, 0.0, amplitude)
-            for k in range(self.samples // stride):
-                depth = k * stride_mm
-                place = start + (depth + stride_mm) * direction
-                far = self.sample_tissue(planes, place, elevation_sd)
-                # Beyond the CT nothing is known: nothing scatters, nothing reflects.
-                far.tissue.x = ti.select(far.tissue.x < 1e-6, near.tissue.x, far.tissue.x)
-                near.tissue.x = ti.select(near.tissue.x < 1e-6, far.tissue.x, near.tissue.x)
-                before, after = near.tissue, far.tissue
-                step = (after.x - before.x) / ti.max(after.x + before.x, 1e-6)
-                if interface.ends(step, self.interface_mm):
-                    at = interface.depth_mm()
-                    echo = interface.echo(before.x, frequency_mhz) * self.contact_fraction(line, at, aperture)
-                    self.add_reflection(detail_level, line, at, echo, sample_mm, axial_sd)
-                    transmitted *= 1.0 - interface.reflection(before.x) ** 2
-                    interface.begin(before, depth, amplitude)
-                if interface.steps == 0.0:
-                    interface.begin(before, depth, amplitude)
-                if ti.abs(step) >= MIN_REFLECTION:
-                    incidence = self.incidence_factor(0.5 * (near.rest + far.rest), far.linear, direction)
-                    interface.add(step, depth + 0.5 * stride_mm, incidence, stride_mm)
-                # Both directions, over the stride in cm.
-                loss_db += (before.y + after.y) * frequency_mhz * stride_mm / 10.0
-                amplitude_far = transmitted * ti.exp(-loss_db / DB)
-                contact = self.contact_fraction(line, depth + 0.5 * stride_mm, aperture)
-                levels = tm.vec3(amplitude, amplitude_far, contact)
-                self.add_scatter(detail_level, stride, line, k, near, far, levels, axial_sd, elevation_sd)
-                near, amplitude = far, amplitude_far
+        start, direction = self.start[line], self.direction[line]
+        for i in range(self.samples):
+            self.real[line, i] = 0.0
+        near = self.sample_tissue(planes, start, elevation_sd)
+        loss_db, transmitted, amplitude = 0.0, 1.0, 1.0
+        interface = Interface()
+        interface.begin(near.tissue, 0.0, amplitude)
+        for k in range(self.samples // stride):
+            depth = k * stride_mm
+            place = start + (depth + stride_mm) * direction
+            far = self.sample_tissue(planes, place, elevation_sd)
+            # Beyond the CT nothing is known: nothing scatters, nothing reflects.
+            far.tissue.x = ti.select(far.tissue.x < 1e-6, near.tissue.x, far.tissue.x)
+            near.tissue.x = ti.select(near.tissue.x < 1e-6, far.tissue.x, near.tissue.x)
+            before, after = near.tissue, far.tissue
+            step = (after.x - before.x) / ti.max(after.x + before.x, 1e-6)
+            if interface.ends(step, self.interface_mm):
+                at = interface.depth_mm()
+                echo = interface.echo(before.x, frequency_mhz) * self.contact_fraction(line, at, aperture)
+                self.add_reflection(detail_level, line, at, echo, sample_mm, axial_sd)
+                transmitted *= 1.0 - interface.reflection(before.x) ** 2
+                interface.begin(before, depth, amplitude)
+            if interface.steps == 0.0:
+                interface.begin(before, depth, amplitude)
+            if ti.abs(step) >= MIN_REFLECTION:
+                incidence = self.incidence_factor(0.5 * (near.rest + far.rest), far.linear, direction)
+                interface.add(step, depth + 0.5 * stride_mm, incidence, stride_mm)
+            # Both directions, over the stride in cm.
+            loss_db += (before.y + after.y) * frequency_mhz * stride_mm / 10.0
+            amplitude_far = transmitted * ti.exp(-loss_db / DB)
+            contact = self.contact_fraction(line, depth + 0.5 * stride_mm, aperture)
+            levels = tm.vec3(amplitude, amplitude_far, contact)
+            self.add_scatter(detail_level, stride, line, k, near, far, levels, axial_sd, elevation_sd)
+            near, amplitude = far, amplitude_far
 
     @ti.func
     def add_scatter(

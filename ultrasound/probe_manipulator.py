@@ -17,6 +17,8 @@ MIN_DEPTH_MM, MAX_DEPTH_MM = -40.0, 15.0
 MAX_DEPTH_LENGTHS = 1.5
 PRESS_MM_S, RELEASE_MM_S = 12.0, 40.0
 TURN_DEG_S = 180.0
+# Positions of points are known to this in float32, half a metre from the origin.
+FOOTPRINT_MARGIN_MM = 1e-2
 
 
 @dataclass(frozen=True)
@@ -77,11 +79,18 @@ def indentation(pose: np.ndarray, size_mm: np.ndarray, surface: np.ndarray, radi
 
     Negative above the surface; -inf where the footprint misses it. The face is flat, or an arc of a radius.
     """
-    local = (surface - pose[:3, 3]) @ pose[:3, :3]
     half = np.asarray(size_mm) / 2
+    local = (surface[_near_footprint(pose, half, surface)] - pose[:3, 3]) @ pose[:3, :3]
     under = (np.abs(local[:, :2]) <= half[:2]).all(axis=1)
     behind = sagitta(local[under, 0], radius_mm)
     return float((local[under, 2] + half[2] - behind).max()) if under.any() else -np.inf
+
+
+def _near_footprint(pose: np.ndarray, half_mm: np.ndarray, surface: np.ndarray) -> np.ndarray:
+    """Indices of the points (n, 3) that may be under the footprint, found in float32: of a whole organ these are few."""
+    axes = pose[:3, :2].T.astype(np.float32)
+    x, y = np.abs(axes @ surface.T.astype(np.float32) - (axes @ pose[:3, 3].astype(np.float32))[:, None])
+    return np.flatnonzero((x <= half_mm[0] + FOOTPRINT_MARGIN_MM) & (y <= half_mm[1] + FOOTPRINT_MARGIN_MM))
 
 
 def sagitta(x_mm: np.ndarray, radius_mm: float) -> np.ndarray:

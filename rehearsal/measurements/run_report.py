@@ -36,6 +36,14 @@ class Tally:
     volume_ratio_min: float = 1.0
     max_penetration_mm: float = 0.0
     indentation_max_mm: float = 0.0
+    _expected: dict[tuple, float | None] = field(default_factory=dict, init=False)
+
+    def expected_error_mm(self, rehearsal: Rehearsal) -> float | None:
+        """``expected_error_of``, computed once for each choice of settings: the window asks in each frame."""
+        settings = tuple(getattr(rehearsal.settings, name) for name in STEP)
+        if settings not in self._expected:
+            self._expected[settings] = expected_error_of(rehearsal)
+        return self._expected[settings]
 
     def watch(self, rehearsal: Rehearsal) -> None:
         """Add the state after a step; the surfaces must be up to date."""
