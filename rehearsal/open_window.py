@@ -4,8 +4,6 @@ import numpy as np
 
 from rehearsal.rehearsal import Rehearsal
 from render.display import window_size
-from render.gamepad import Gamepad
-from render.keys import Keys
 from render.viewer import Geometry, ScannerSettings, Settings
 from render.window import Window
 from render.window_layout import FULL_SIZE
@@ -54,34 +52,31 @@ def probe_with_settings(probe: Probe, settings: ScannerSettings) -> Probe:
     )
 
 
-def open_viewer(
-    rehearsal: Rehearsal, visible: bool, keys: Keys | None = None, gamepad: Gamepad | None = None
-) -> Window:
-    """Open the window, on the screen or off it. Raises NoVulkan."""
+def open_viewer(rehearsal: Rehearsal, visible: bool) -> Window:
+    """Open a window that shows a rehearsal, on the screen or off it. Raises NoVulkan."""
+    size = window_size() if visible else FULL_SIZE
+    return Window(geometry_of(rehearsal), initial_settings(rehearsal), size, visible)
+
+
+def geometry_of(rehearsal: Rehearsal) -> Geometry:
+    """The geometry that a window draws."""
     tumour, support = None, None
     if rehearsal.tumour is not None and rehearsal.tumour_skin is not None:
         tumour = rehearsal.tumour_skin.vertices, np.asarray(rehearsal.tumour.faces, np.int32)
     if rehearsal.supports:
         fixed = rehearsal.supports[0]
         support = np.asarray(fixed.vertices, np.float32), np.asarray(fixed.faces, np.int32)
-    return Window(
-        Geometry(
-            organ=(rehearsal.organ_skin.vertices, np.asarray(rehearsal.organ.faces, np.int32)),
-            bounds=rehearsal.organ.bounds,
-            up=-rehearsal.gravity_direction,
-            transducer_size_mm=rehearsal.size_mm,
-            transducer_radius_mm=rehearsal.probe.radius_mm,
-            frequency_range_mhz=rehearsal.probe.frequency_range_mhz,
-            tumour=tumour,
-            parts={
-                tissue: (skin.vertices, np.asarray(rehearsal.parts[tissue].faces, np.int32))
-                for tissue, skin in rehearsal.part_skins.items()
-            },
-            support=support,
-        ),
-        initial_settings(rehearsal),
-        window_size() if visible else FULL_SIZE,
-        visible,
-        keys=keys,
-        gamepad=gamepad,
+    return Geometry(
+        organ=(rehearsal.organ_skin.vertices, np.asarray(rehearsal.organ.faces, np.int32)),
+        bounds=rehearsal.organ.bounds,
+        up=-rehearsal.gravity_direction,
+        transducer_size_mm=rehearsal.size_mm,
+        transducer_radius_mm=rehearsal.probe.radius_mm,
+        frequency_range_mhz=rehearsal.probe.frequency_range_mhz,
+        tumour=tumour,
+        parts={
+            tissue: (skin.vertices, np.asarray(rehearsal.parts[tissue].faces, np.int32))
+            for tissue, skin in rehearsal.part_skins.items()
+        },
+        support=support,
     )

@@ -9,6 +9,7 @@ import click
 import numpy as np
 from click.exceptions import Exit
 
+from rehearsal.asked_files import AskedFiles
 from rehearsal.commands.command_line import STOPPED, CommandError
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.frame import Frames, WindowFrames
@@ -19,8 +20,7 @@ from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import Tally
 from rehearsal.measurements.session_summary import summary_text
 from rehearsal.notices import Notices
-from rehearsal.open_window import initial_settings, open_viewer
-from rehearsal.planning.plan_file import Plan
+from rehearsal.open_window import geometry_of, initial_settings
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.plans_in_window import PlanControl
 from rehearsal.real_time.solver_process import SolverProcess
@@ -35,10 +35,8 @@ from rehearsal.tracking.openigtlink_server import OpenIGTLinkServer
 from rehearsal.tracking.pose_file import TimedPoses
 from rehearsal.tracking.sweep_recording import SweepRecorder
 from rehearsal.tracking.tracked_probe import PoseSource, played_pose
-from render.gamepad import Gamepad, SdlPads
-from render.keys import Keys
 from render.viewer import Settings
-from render.window import NoVulkan
+from render.window import Window
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import EMBEDDED
 from scenes.terminal import shell_command
@@ -49,47 +47,39 @@ from version import VERSION
 class RehearsalRun:
     """One rehearsal, its anatomy, the backend's name, what the user asked for, and the files that were read for it.
 
-    ``solver`` makes the steps of a window. ``log`` is a session to replay, ``track`` are recorded poses of a probe. ``build_s`` is the
-    time that building took.
+    ``viewer`` is the window, if there is one, and ``solver`` makes its steps. ``build_s`` is the time that building took.
     """
 
     rehearsal: Rehearsal
     anatomy: LoadedAnatomy
     arch: str
     asked: RehearseOptions
+    files: AskedFiles
+    viewer: Window | None = None
     solver: SolverProcess | None = None
-    log: Log | None = None
-    track: TimedPoses | None = None
-    keys: Keys = field(default_factory=Keys)
     link: OpenIGTLinkServer | None = None
-    plan: Plan | None = None
     build_s: float = 0.0
     start: StartTimes = field(default_factory=StartTimes)
     recorder: SessionRecorder | None = field(default=None, init=False)
     notices: Notices = field(default_factory=Notices, init=False)
 
     def __post_init__(self) -> None:
-        guide = None if self.plan is None else PlanGuidance(self.rehearsal, self.plan)
+        guide = None if self.files.plan is None else PlanGuidance(self.rehearsal, self.files.plan)
         self.measurements = LiveMeasurements(self.rehearsal, guide)
 
     def in_window(self, prepare: Callable[[WindowFrames], None] = lambda frames: None) -> None:
         """Run in a window, after a replay if there is one; ``prepare`` is called with its frames before the first.
 
-        Raises CommandError, SessionError, SolverEnded.
+        Raises SessionError, SolverEnded.
         """
-        if self.solver is None:
-            raise ValueError("a window needs the process of the solver")
-        self.start.begin("Window")
-        pad = Gamepad(SdlPads(), self.keys.buttons) if self.asked.gamepad else None
-        try:
-            viewer = open_viewer(self.rehearsal, visible=True, keys=self.keys, gamepad=pad)
-        except NoVulkan as reason:
-            raise CommandError(f"{reason}; install a Vulkan driver, or run with --headless") from None
-        replay = None if self.log is None else self._replay(self.log, viewer.settings)
+        if self.solver is None or self.viewer is None:
+            raise ValueError("expected a window and the process of the solver")
+        viewer = self.viewer
+        viewer.show_scene(geometry_of(self.rehearsal), initial_settings(self.rehearsal))
+        replay = None if self.files.log is None else self._replay(self.files.log, viewer.settings)
         source = self._user_input() if replay is None else self._replay_input(replay)
-        self.start.begin("First picture")
         text = f"The window is open, {self.start.now_s:.0f} s after the start; {{help}} shows the keys, {{quit}} quits."
-        click.echo(self.keys.worded(text))
+        click.echo(self.files.keys.worded(text))
         frames = WindowFrames(
             self.rehearsal,
             source,
@@ -102,27 +92,26 @@ class RehearsalRun:
             notices=self.notices,
             sweeping=SweepRecorder(self.rehearsal, self.notices),
             plans=PlanControl(self.rehearsal, self.anatomy, self.measurements, self.asked.out, self.notices),
-            keys=self.keys,
+            keys=self.files.keys,
         )
         prepare(frames)
         try:
             with self._summarised(source, replay):
                 frames.run()
         finally:
-            viewer.close()
             frames.plans.stop()
             frames.sweeping.end()
-            self.notices.present(self.keys.worded)
+            self.notices.present(self.files.keys.worded)
 
     def headless(self) -> None:
         """Run the scripted press, a replay or recorded poses to their end. Raises CommandError, SessionError."""
         settings = initial_settings(self.rehearsal)
-        replay = None if self.log is None else self._replay(self.log, settings)
+        replay = None if self.files.log is None else self._replay(self.files.log, settings)
         source: InputSource
         if replay is not None:
             source, steps = self._replay_input(replay), self._replayed_steps(replay)
-        elif self.track is not None:
-            source, steps = self._tracked_input(self.track)
+        elif self.files.track is not None:
+            source, steps = self._tracked_input(self.files.track)
         else:
             source, steps = self._scripted_input()
         frames = Frames(self.rehearsal, source, self.measurements, Tally(self.build_s), self.link)
@@ -161,8 +150,8 @@ class RehearsalRun:
         session = self._session()
         recorder = self._record(session, begins)
         tracked: PoseSource | None = None
-        if self.track is not None:
-            tracked = partial(played_pose, self.track, session)
+        if self.files.track is not None:
+            tracked = partial(played_pose, self.files.track, session)
         elif self.link is not None and self.asked.link_leads:
             tracked = self.link.received_pose.pose
         return UserInput(session, recorder, begins is not None, tracked, self.notices)

@@ -51,6 +51,7 @@ LETTER_PX, LINE_PX = 14, 2
 # A shorter projected axis has no letters.
 LEAST_LENGTH = 0.3
 HELP_HINT = "{}  all keys"
+PROGRAM_PX = 40
 HELP_COLUMNS, HELP_PX, HELP_GAP_PX, FIGURES_GAP_PX = 2, 17, 12, 18
 
 
@@ -111,6 +112,10 @@ class BackgroundImage:
         """The 3D view's part of ``pixels``."""
         box, height = self.layout.scene, self.layout.height
         return self.pixels[box.left : box.right, height - box.bottom : height - box.top]
+
+    def show_progress(self, text: str) -> None:
+        """Draw what is being prepared, until the first ``compose``."""
+        self._put(self.layout.whole, progress_image(self.layout, text))
 
     def show_help(self) -> None:
         """Draw the list of all keys over everything, until the next ``compose``."""
@@ -189,6 +194,16 @@ def clock_image(layout: WindowLayout, box: Rect, clock: str, pace: str) -> np.nd
     draw.text((box.width, middle), clock, font=letters, fill=TEXT, anchor="rm")
     right = box.width - int(letters.getlength(clock)) - layout.px(12)
     draw.text((right, middle), pace, font=letters, fill=ALERT, anchor="rm")
+    return np.asarray(image)
+
+
+def progress_image(layout: WindowLayout, text: str) -> np.ndarray:
+    """Return the program's name and what it prepares, uint8, shape (height, width, 3)."""
+    box, px = layout.whole, layout.px
+    image = Image.new("RGB", (box.width, box.height), HELP)
+    draw, middle = ImageDraw.Draw(image), (box.width // 2, box.height // 2)
+    draw.text(middle, "Nephron", font=font(px(PROGRAM_PX)), fill=TEXT, anchor="ms")
+    draw.text((middle[0], middle[1] + px(PROGRAM_PX)), text, font=font(px(HELP_PX)), fill=QUIET, anchor="mm")
     return np.asarray(image)
 
 

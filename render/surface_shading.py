@@ -60,8 +60,8 @@ class ShadedSurface:
     def shade(self, eye, light, opacity: float = SOLID, cut: Cut | None = None) -> None:
         """Update normals and colours. A cut surface is solid."""
         self._find_normals()
-        vectors = (eye, light, *(cut if cut is not None else np.zeros((2, 3))))
-        self._shade(float(opacity), *(ti.math.vec3(*map(float, each)) for each in vectors))
+        places = eye, light, *(cut if cut is not None else np.zeros((2, 3)))
+        self._shade(float(opacity), np.array(places, np.float32))
 
     @ti.kernel
     def _find_normals(self):
@@ -77,13 +77,16 @@ class ShadedSurface:
     def _shade(
         self,
         opacity: ti.f32,
-        eye: ti.math.vec3,
-        light: ti.math.vec3,
-        cut_point: ti.math.vec3,
-        cut_normal: ti.math.vec3,
+        places: ti.types.ndarray(ti.f32, ndim=2),
     ):
-        """A zero cut_normal cuts nothing; else what is on its side of the plane is transparent."""
+        """``places`` (4, 3) are the eye, the light, a point of the cut and its normal.
+
+        A zero normal cuts nothing; else what is on its side of the plane is transparent.
+        """
         for v in self.vertices:
+            eye, light, cut_point, cut_normal = [
+                ti.Vector([places[k, 0], places[k, 1], places[k, 2]]) for k in ti.static(range(4))
+            ]
             total = ti.Vector([0.0, 0.0, 0.0])
             for k in range(self._start[v], self._start[v + 1]):
                 total += self._area_normal[self._around[k]]

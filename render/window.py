@@ -46,7 +46,7 @@ class Window:
     `ti.init` comes before it, and one window is open at a time.
 
     Args:
-        geometry: fixed geometry of the scene.
+        geometry: fixed geometry of the scene; without it the window shows progress until `show_scene`.
         settings: values of the sliders.
         size: width, height in pixels.
         visible: a real window, at most FRAMES_A_SECOND; else off-screen, drawn only by `picture`.
@@ -61,7 +61,7 @@ class Window:
 
     def __init__(
         self,
-        geometry: Geometry,
+        geometry: Geometry | None = None,
         settings: Settings | None = None,
         size: tuple[int, int] = FULL_SIZE,
         visible=True,
@@ -71,7 +71,6 @@ class Window:
     ):
         if visible and not display_available():
             raise RuntimeError("no display to open a window on")
-        self.settings = settings or Settings()
         self.keys, self._gamepad = keys or Keys(), gamepad
         self.layout = WindowLayout(*size)
         # GGUI measures sliders in fractions of the size that the window was opened with.
@@ -90,7 +89,6 @@ class Window:
         self._view: View | None = None
         self._quit = False
         self._help_shown = False
-        self._geometry = geometry
         self._warm_up = 2
         self._drag: str | None = None
         self._cursor: np.ndarray | None = None
@@ -100,13 +98,28 @@ class Window:
         self._slider_boxes: dict[str, Rect] = {}
         self._last_read = time.perf_counter()
         self._ui_camera = ti.ui.Camera()
-        part = self.layout.window_coordinates(self.layout.clear)
+        self._background = BackgroundImage(self.layout, self.keys)
+        self._by_processor = draws_by_processor() and on_cpu() if by_processor is None else by_processor
+        if geometry is not None:
+            self.show_scene(geometry, settings)
+
+    def show_scene(self, geometry: Geometry, settings: Settings | None = None) -> None:
+        """Show a scene from now on, with these values of the sliders."""
+        self.settings, self._geometry = settings or Settings(), geometry
+        part, size = (
+            self.layout.window_coordinates(self.layout.clear),
+            (self.layout.width, self.layout.height),
+        )
         self.camera = OrbitCamera(geometry.bounds, geometry.up, part, size[0] / size[1])
         self._scene_view = SceneView(geometry, self.camera)
-        if by_processor is None:
-            by_processor = draws_by_processor() and on_cpu()
-        self._software = SoftwareScene(self.camera, size) if by_processor else None
-        self._background = BackgroundImage(self.layout, self.keys)
+        self._software = SoftwareScene(self.camera, size) if self._by_processor else None
+
+    def show_progress(self, text: str) -> None:
+        """Show what is being prepared."""
+        if self._visible:
+            self._background.show_progress(text)
+            self._put_image()
+            self._window.show()
 
     # Input
 
@@ -255,8 +268,7 @@ class Window:
         else:
             software = None if self._software is None else partial(self._draw_by_processor, view)
             self._background.compose(view, np.stack(self.camera.axes()), self._visible, software)
-        # Without the 10 ms that Canvas.set_image needs to pack the pixels.
-        self._canvas.canvas.set_image(get_field_info(self._background.pixels.view(np.uint32)[..., 0]))
+        self._put_image()
         if self._software is None:
             self._draw_scene(view)
         if not self._help_shown:
@@ -265,6 +277,10 @@ class Window:
                 self._slider_boxes, self._boxes_placed = boxes, self._boxes_placed + 1
             placed = boxes, self._first_size, self._boxes_placed
             draw_sliders(self._gui, self.settings, self._geometry, *placed)
+
+    def _put_image(self) -> None:
+        # Without the 10 ms that Canvas.set_image needs to pack the pixels.
+        self._canvas.canvas.set_image(get_field_info(self._background.pixels.view(np.uint32)[..., 0]))
 
     def _draw_by_processor(self, view: View, pixels: np.ndarray) -> None:
         """Draw the 3D view into the background image."""

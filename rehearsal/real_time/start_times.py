@@ -1,12 +1,9 @@
 """How long each stage of the start takes, from the begin of the process on."""
 
-from collections.abc import Callable
 from itertools import pairwise
 from time import time
 
 import psutil
-
-from scenes.terminal import ReportProgress
 
 
 class StartTimes:
@@ -24,15 +21,6 @@ class StartTimes:
     def begin(self, stage: str) -> None:
         """The next stage begins."""
         self._begins.append((stage, self.now_s))
-
-    def reporting(self, progress: ReportProgress) -> Callable[[str], None]:
-        """A progress that also begins a stage."""
-
-        def report(stage: str) -> None:
-            self.begin(stage)
-            progress(stage)
-
-        return report
 
     def seconds(self) -> dict[str, float]:
         """How long each stage but the last has lasted."""

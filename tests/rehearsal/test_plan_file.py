@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 import app
 from rehearsal.commands.plan_command import PlanOptions, trocar_of
-from rehearsal.opening import check_plan
+from rehearsal.asked_files import check_plan
 from rehearsal.planning import trial_workers
 from rehearsal.planning.plan_file import (
     APPROACH_S,

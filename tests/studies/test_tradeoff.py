@@ -15,7 +15,7 @@ from rehearsal.build_solver import step_settings
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.configuration import PRESETS, Setup, scene_of, setup_of
 from rehearsal.measurements.run_report import expected_error_of
-from rehearsal.opening import as_asked
+from rehearsal.asked_files import as_asked
 from rehearsal.speed_accuracy import (
     MEASURED,
     NoPoint,

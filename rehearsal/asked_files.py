@@ -1,0 +1,113 @@
+"""The files that the user of ``rehearse`` names: read, and checked against each other."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+from pydantic import ValidationError
+
+from errors import explained
+from rehearsal.commands.command_line import CommandError
+from rehearsal.commands.rehearse_options import RehearseOptions
+from rehearsal.configuration import probe_of, with_quality
+from rehearsal.planning.plan_file import Plan, PlanError, is_plan, read_plan
+from rehearsal.sessions.session_file import Log, SessionError, read_log, scene_of_log
+from rehearsal.tracking.pose_file import TimedPoses
+from rehearsal.tracking.track_file import check_near, load_track
+from render.keys import Keys, load_keys
+from scenes.anatomy import LoadedAnatomy, fingerprint
+from scenes.scene import Scene, load_scene, scene_file, with_options
+from ultrasound.probe import Probe, ProbeError, probe_of_values
+
+
+@dataclass(frozen=True)
+class AskedFiles:
+    """What the user names, as read: the scene and its folder, the probe, and what else was named."""
+
+    folder: Path
+    scene: Scene
+    probe: Probe
+    keys: Keys
+    track: TimedPoses | None = None
+    plan: Plan | None = None
+    log: Log | None = None
+
+
+def read_files(asked: RehearseOptions) -> AskedFiles:
+    """Read the files that the user names. Raises UserError, CommandError."""
+    path = scene_file(asked.scene)
+    scene = load_scene(path)
+    keys = load_keys(asked.keys) if asked.keys else Keys()
+    asked.check()
+    track = load_track(asked.track, asked.track_from) if asked.track else None
+    plan = read_plan(asked.plan) if asked.plan else None
+    log = session_of(asked.replay, asked.at) if asked.replay else None
+    changed, probe = as_asked(scene, asked) if log is None else as_recorded(log, scene)
+    return AskedFiles(path.parent, changed, probe, keys, track, plan, log)
+
+
+def check_anatomy(files: AskedFiles, asked: RehearseOptions, anatomy: LoadedAnatomy) -> None:
+    """Raises UserError if session, track or plan belong to other anatomy than the scene."""
+    log = files.log
+    if log is not None and fingerprint(anatomy) != log.header.anatomy:
+        raise SessionError(
+            f"the session belongs to other anatomy than this scene ({files.scene.title or 'no title'}): name "
+            "its scene or patient's folder before --replay; a patient imported again counts as another"
+        )
+    if files.track is not None and asked.track is not None:
+        check_near(files.track, anatomy.organ.vertices, asked.track)
+        if is_plan(asked.track):
+            check_plan(read_plan(asked.track), fingerprint(anatomy), files.probe)
+    if files.plan is not None:
+        check_plan(files.plan, fingerprint(anatomy), files.probe)
+
+
+def as_asked(scene: Scene, asked: RehearseOptions) -> tuple[Scene, Probe]:
+    """A scene with the options of the command line, and its probe; prints if they change the tissue model.
+
+    Raises SceneError, ProbeError.
+    """
+    changed = with_quality(with_options(scene, asked.changes), asked.quality)
+    if asked.model is None and changed.tissue.model != scene.tissue.model:
+        click.echo(f"Tissue model: {changed.tissue.model}, as the options ask for it.")
+    return changed, probe_of(changed)
+
+
+def session_of(path: Path, at_s: float) -> Log:
+    """The session to replay from a second on. Raises CommandError, SessionError."""
+    log = read_log(path)
+    if at_s > log.length_s:
+        raise CommandError(
+            f"--at {at_s:g}: the session is {log.length_s:.1f} s long; choose an earlier second"
+        )
+    return log
+
+
+def as_recorded(log: Log, scene: Scene) -> tuple[Scene, Probe]:
+    """The patient of a scene with all other settings of a session, and the session's probe. Raises SessionError."""
+    try:
+        return scene_of_log(log.header, scene), probe_of_values(log.header.probe)
+    except ValidationError as error:
+        raise SessionError(f"the session's scene cannot be used: {explained(error)}") from None
+    except ProbeError as error:
+        raise SessionError(f"the session's probe cannot be used: {error}") from None
+
+
+def check_plan(plan: Plan, anatomy: str, probe: Probe) -> None:
+    """Raises PlanError if a plan is for other anatomy (by its fingerprint) or for another probe."""
+    if plan.anatomy != anatomy:
+        raise PlanError(
+            "the plan is for other anatomy than this scene: name its scene or patient's folder before --plan; "
+            "a patient imported again counts as another"
+        )
+    planned = _probe_name(plan.probe.get("TransducerName"), plan.probe.get("HousingMm"))
+    found = _probe_name(probe.transducer_name, probe.housing_mm)
+    if planned != found:
+        raise PlanError(
+            f"the plan is for the probe {planned}, found {found}: choose it with --probe, or plan anew"
+        )
+
+
+def _probe_name(name: Any, housing_mm: Any) -> str:
+    return f"{name!r} of {' x '.join(f'{each:g}' for each in housing_mm or ())} mm"
