@@ -103,7 +103,7 @@ class WindowFrames(Frames[WindowInput]):
     frozen: bool = False
     _last_step: Step | None = field(default=None, init=False)
     _steps: list[Step] = field(default_factory=list, init=False)
-    _rollbacks: int = field(default=0, init=False)
+    _rollbacks: int = field(init=False)
     _input_at_s: float | None = field(default=None, init=False)
     _notice: str = field(default="", init=False)
     _notice_until: float = field(default=0.0, init=False)
@@ -111,6 +111,7 @@ class WindowFrames(Frames[WindowInput]):
 
     def __post_init__(self) -> None:
         self.solver.on_step = self.take
+        self._rollbacks = self.source.session.rollbacks
 
     def run(self) -> None:
         """Draw frames until the window is closed."""

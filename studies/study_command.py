@@ -12,7 +12,7 @@ STUDIES = {
     ),
     "frames": (
         "studies.performance.frame_rate:frames",
-        "Measure pictures a second, pace and latency in a window.",
+        "Measure pictures a second, pace and latency of SCENE in a window.",
     ),
     "trade": (
         "studies.performance.tradeoff:trade",

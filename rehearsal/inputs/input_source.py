@@ -11,7 +11,7 @@ from rehearsal.notices import Notices
 from rehearsal.pressed_organ import Step
 from rehearsal.real_time.solver_process import SolverProcess
 from rehearsal.sessions.recorder import SessionRecorder
-from rehearsal.sessions.replay import Replay
+from rehearsal.sessions.replay import ROUNDING_S, Replay
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import SessionError
 from render.viewer import Controls, Settings
@@ -110,7 +110,7 @@ class ReplayInput:
             return
         self._due_s = min(self._due_s + elapsed_s, MOST_DUE_S)
         poses = np.zeros((0, 4, 4))
-        while self._due_s > 0 and not self.replay.is_over and len(poses) == 0:
+        while self._due_s > ROUNDING_S and not self.replay.is_over and len(poses) == 0:
             poses, lengths_s, settings = self.replay.next_steps(self._due_s)
             set_settings(controls.settings, settings)
             self._due_s -= lengths_s.sum()

@@ -10,6 +10,8 @@ from rehearsal.sessions.packed_arrays import StateError, unpack_state
 from rehearsal.sessions.session import SETTLED, Session
 from rehearsal.sessions.session_file import Log, SessionError
 
+# Times are sums of steps.
+ROUNDING_S = 1e-9
 # Events that change the tissue, or the solver's settings.
 CHANGING = ("solver", "back", "state")
 
@@ -96,20 +98,21 @@ class Replay:
     def next_steps(self, most_s: float) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
         """Poses (n, 4, 4) and lengths (n,) [s] of the next steps, and the settings of the images that change in them.
 
-        They last about a time [s], and at most until something else happens than a step; none for a rollback. Raises SessionError at
-        the end of the log.
+        They last about a time [s], and at most until something else happens than a step. A rollback, which is done here, has a length
+        and no pose. Raises SessionError at the end of the log.
         """
         first = last = self.session.step_index
         pose, settings = self.move()
-        if pose is not None:
-            lengths_s = self.log.lengths_s
+        lengths_s = self.log.lengths_s
+        if pose is None:
+            return self.log.poses[:0], lengths_s[first : first + 1], settings
+        last += 1
+        while last < len(self.log.poses) and last not in self._stops:
+            if lengths_s[first : last + 1].sum() > most_s + ROUNDING_S:
+                break
+            settings |= self._set(last)[1]
             last += 1
-            while last < len(self.log.poses) and last not in self._stops:
-                if lengths_s[first : last + 1].sum() > most_s:
-                    break
-                settings |= self._set(last)[1]
-                last += 1
-        return self.log.poses[first:last], self.log.lengths_s[first:last], settings
+        return self.log.poses[first:last], lengths_s[first:last], settings
 
     def end_step(self, pose: np.ndarray | None = None, length_s: float | None = None) -> None:
         """Count a step that was made; left out, pose and length are the rehearsal's present ones."""

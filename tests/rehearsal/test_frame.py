@@ -13,6 +13,7 @@ from test_openigtlink import LiveImage
 
 import app
 from rehearsal import frame, headless, opening, run
+from rehearsal.asked_files import AskedFiles
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.frame import Frames, WindowFrames
 from rehearsal.notices import Notices
@@ -20,11 +21,12 @@ from rehearsal.pressed_organ import Step
 from render.keys import DEFAULT_KEYS, Keys
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
-from scenes.scene import EMBEDDED
+from scenes.scene import EMBEDDED, load_scene
 from scenes.terminal import shell_command
 from ultrasound.probe import load_probe
 
 STEP_S = 0.25
+FILES = AskedFiles(Path(), load_scene(EMBEDDED), load_probe("linear"), Keys())
 
 
 class Fake:
@@ -311,7 +313,7 @@ def test_ctrl_c_in_a_run_says_so_before_how_it_went(monkeypatch, capsys):
     monkeypatch.setattr(run.RehearsalRun, "_end", lambda each, bookmarks: print(f"{bookmarks} bookmarks"))
     monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide: None)
     driver = SimpleNamespace(session=SimpleNamespace(time_s=1.25), bookmarks=3)
-    each = run.RehearsalRun(Fake(), None, "cpu", RehearseOptions())
+    each = run.RehearsalRun(Fake(), None, "cpu", RehearseOptions(), FILES)
     with pytest.raises(Exit) as ended, each._summarised(driver, None):
         raise KeyboardInterrupt
     assert ended.value.exit_code == 130
@@ -335,7 +337,7 @@ def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scen
         lambda rehearsal, guide: SimpleNamespace(guide=None, summary=lambda bookmarks: {}),
     )
     monkeypatch.setattr(run, "summary_text", lambda summary: "")
-    each = run.RehearsalRun(Fake(), None, "cpu", RehearseOptions(scene=scene))
+    each = run.RehearsalRun(Fake(), None, "cpu", RehearseOptions(scene=scene), FILES)
     path = Path("a/session-001.jsonl")
     each.recorder = SimpleNamespace(path=path, fault="", close=lambda summary: None)
     each._end(0)
@@ -344,9 +346,9 @@ def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scen
 
 def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path, sent):
     link, given = SimpleNamespace(send=lambda *live: sent.append(LiveImage(*live))), []
-    viewer = SimpleNamespace(close=lambda: None, settings=Settings())
+    viewer = SimpleNamespace(show_scene=lambda *_: None, settings=Settings())
     monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide: None)
-    monkeypatch.setattr(run, "open_viewer", lambda rehearsal, **_: viewer)
+    monkeypatch.setattr(run, "geometry_of", lambda rehearsal: None)
     monkeypatch.setattr(run, "initial_settings", lambda rehearsal: Settings())
     looping = SimpleNamespace(run=lambda: None)
     looping.plans = looping.sweeping = SimpleNamespace(stop=lambda: None, end=lambda: "")
@@ -356,7 +358,7 @@ def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path
     for name in ("_user_input", "_record", "_end"):
         monkeypatch.setattr(run.RehearsalRun, name, lambda *_: SimpleNamespace(bookmarks=0))
     asked = RehearseOptions(out=tmp_path, seconds=1.0)
-    each = run.RehearsalRun(Fake(), None, "cpu", asked, solver=Fake(), link=link)
+    each = run.RehearsalRun(Fake(), None, "cpu", asked, FILES, viewer, Fake(), link)
     each.in_window()
     each.headless()
     assert given == [link, link]
@@ -375,7 +377,7 @@ def test_the_command_opens_the_link_for_as_long_as_it_runs_and_names_its_scene(m
         reached.append(each.link is not None and each.link.port == port and each.asked.scene == scene)
 
     monkeypatch.setattr(opening, "start_taichi", lambda arch: "cpu")
-    monkeypatch.setattr(opening, "built", lambda *_: (None, ""))
+    monkeypatch.setattr(opening, "built", lambda *_: None)
     monkeypatch.setattr(opening, "compile_picture", lambda rehearsal: None)
     monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide: None)
     monkeypatch.setattr(run.RehearsalRun, "headless", headless_run)

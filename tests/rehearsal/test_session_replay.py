@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 import taichi as ti
 from null_viewer import NullViewer
+from one_step_solver import OneStepSolver
 
 from rehearsal import headless, run
+from rehearsal.asked_files import AskedFiles
 from rehearsal.build_solver import step_settings
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.coordinates import probe_in_patient
@@ -24,6 +26,7 @@ from rehearsal.sessions.packed_arrays import pack_seen
 from rehearsal.sessions.replay import Replay
 from rehearsal.sessions.session_file import Log, SessionError, read_log
 from rehearsal.tracking.pose_file import TimedPoses
+from render.keys import Keys
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
 from scenes.anatomy import LoadedAnatomy, load_anatomy
@@ -41,8 +44,13 @@ class Watched(NullViewer):
         super().__init__(settings, script)
         self.seen: list[tuple] = []
         self.is_frozen = False
+        self.now_s = 0.0
+
+    def show_scene(self, geometry: Any, settings: Settings) -> None: ...
 
     def read_controls(self) -> Controls:
+        # A frame for each step.
+        self.now_s += 1 / 60
         controls = super().read_controls()
         self.is_frozen ^= controls.freeze
         return controls
@@ -88,15 +96,19 @@ def rewound(rehearsal: Rehearsal) -> Rehearsal:
     return rehearsal
 
 
+def files_of(rehearsal: Rehearsal, **named: Any) -> AskedFiles:
+    return AskedFiles(Path(), rehearsal.scene, rehearsal.probe, Keys(), **named)
+
+
 def rehearsed(built, monkeypatch, out: Path, script: Any, log: Log | None = None, at_s: float = 0.0):
     """What a rehearsal showed, frame by frame, the tissue's digest at its end, and what it recorded."""
     rehearsal, anatomy = rewound(built[0]), built[1]
     settings = initial_settings(rehearsal)
     viewer = Watched(settings, script(settings))
-    monkeypatch.setattr(run, "open_viewer", lambda *_, **__: viewer)
-    # A budget that no step keeps: the ladder goes down.
-    each = run.RehearsalRun(rehearsal, anatomy, "cpu", RehearseOptions(out=out, budget_ms=0.01, at=at_s))
-    each.in_window(log)
+    monkeypatch.setattr("rehearsal.frame.perf_counter", lambda: viewer.now_s)
+    asked, files = RehearseOptions(out=out, at=at_s), files_of(rehearsal, log=log)
+    each = run.RehearsalRun(rehearsal, anatomy, "cpu", asked, files, viewer, OneStepSolver(rehearsal))
+    each.in_window()
     return viewer.seen, rehearsal.digest(), each.recorder and read_log(each.recorder.path)
 
 
@@ -201,9 +213,9 @@ def test_a_tracked_file_is_followed_headless_and_replayed(built, monkeypatch, tm
     track = TimedPoses(
         np.linspace(2.0, 2.5, 31), [None if 8 <= k < 12 else pose for k, pose in enumerate(poses)]
     )
-    asked = RehearseOptions(out=tmp_path, budget_ms=0.01)
-    tracked = run.RehearsalRun(rehearsal, anatomy, "cpu", asked, track)
-    tracked.headless(None, 0.0)
+    files = files_of(rehearsal, track=track)
+    tracked = run.RehearsalRun(rehearsal, anatomy, "cpu", RehearseOptions(out=tmp_path), files)
+    tracked.headless()
     log = read_log(tracked.recorder.path)
     assert len(log.poses) == 31 and probe_in_patient(rehearsal) == pytest.approx(poses[-1])
     told = [event.value for events in log.events.values() for event in events if event.kind == "solver"]
@@ -212,7 +224,7 @@ def test_a_tracked_file_is_followed_headless_and_replayed(built, monkeypatch, tm
     rehearsal.reset()
     (tmp_path / "bare").mkdir()
     asked = RehearseOptions(out=tmp_path / "bare", no_pictures=True)
-    run.RehearsalRun(rehearsal, anatomy, "cpu", asked).headless(log, 0.0)
+    run.RehearsalRun(rehearsal, anatomy, "cpu", asked, files_of(rehearsal, log=log)).headless()
     told = capsys.readouterr().out
     assert "identical in all 1 states" in told and "no images" in told and "per image" not in told
     assert sorted(path.name for path in (tmp_path / "bare").iterdir()) == FILES
