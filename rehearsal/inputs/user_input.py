@@ -66,9 +66,9 @@ class UserInput:
         """Give the solver the user's input after a time [s]; pause it for what changes more than the transducer's pose."""
         if self._interrupts(controls):
             solver.pause()
+            self.after_frame()
         pose = self.next_pose(controls, elapsed_s)
         if solver.is_paused:
-            self.after_frame()
             solver.hand_over()
             solver.run()
         if pose is not None:

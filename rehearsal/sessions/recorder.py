@@ -64,9 +64,12 @@ class SessionRecorder:
         return sum(self._lengths_s) > 1.0 - ROUNDING_S
 
     def keep_up(self, may_record_state: bool = True) -> None:
-        """Write each complete second, and the whole state if it is due and may be recorded; post once what went wrong with the file."""
-        if self._is_second_over:
-            records_state = may_record_state and self.is_state_due
+        """Write each complete second, and with it the whole state if that is due; post once what went wrong with the file.
+
+        Where the state may not be recorded now, a second with it waits.
+        """
+        records_state = self.is_state_due
+        if self._is_second_over and (may_record_state or not records_state):
             self._write_second()
             if records_state:
                 self._state_due_s += STATE_S
