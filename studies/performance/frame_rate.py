@@ -27,6 +27,7 @@ from rehearsal.real_time.start_times import StartTimes
 from rehearsal.run import RehearsalRun
 from render.display import display_available
 from render.viewer import Controls, View
+from render.vulkan_device import vulkan_devices
 from scenes.scene import EMBEDDED
 from studies.study_results import write_results
 from version import VERSION
@@ -155,6 +156,7 @@ def figures_of(run: RehearsalRun, hand: ScriptedHand, asked: FrameOptions) -> di
         rate=asked.rate,
         substeps=settings.substeps,
         iterations=settings.iterations,
+        drivers=[device.name for device in vulkan_devices()],
         window=[layout.width, layout.height],
         picture=scene.image.mode,
         seconds=round(seconds, 2),
@@ -200,10 +202,10 @@ def summary(figures: dict[str, Any]) -> str:
         f"{length} s {100 * share:.0f} %" for length, share in figures["step_lengths_s"].items()
     )
     start = ", ".join(f"{name.lower()} {seconds:.1f}" for name, seconds in figures["start_stages_s"].items())
-    width, height = figures["window"]
+    (width, height), drivers = figures["window"], ", ".join(figures["drivers"]) or "driver not known"
     return "\n".join(
         [
-            f"pictures  {figures['frames_per_s']:.1f} a second in a window of {width} x {height}, real-time factor "
+            f"pictures  {figures['frames_per_s']:.1f} a second in a window of {width} x {height} ({drivers}), real-time factor "
             f"{figures['real_time_factor']:.3f}, over {figures['seconds']:.0f} s",
             f"latency   {latency['median']:.0f} ms from an input to its picture, 95 % within {latency['p95']:.0f} ms",
             f"frame     medians in ms: {stages}",
