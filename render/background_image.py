@@ -76,11 +76,12 @@ class BackgroundImage:
         axes: np.ndarray,
         slow_figures: bool = False,
         draw_scene: Callable[[np.ndarray], None] | None = None,
+        keeps_scene: bool = False,
     ) -> None:
         """Draw a view, with the compass for a camera's axes (3, 3): right, up and ahead, in patient coordinates.
 
         With ``slow_figures``, figures change only every READOUT_PERIOD_S, so that they can be read. ``draw_scene`` draws the 3D view
-        into ``pixels``, if it is not drawn over them.
+        into ``pixels``, if it is not drawn over them; with ``keeps_scene`` only where it must be drawn anew.
         """
         findings = first_of(view.findings, self.layout.most_findings)
         # What the backdrop depends on.
@@ -89,7 +90,7 @@ class BackgroundImage:
         if self._shows_help or self._backdrop != parts:
             self._rows[:, :, :3] = backdrop(self.layout, view, self.keys.of["help"])
             self._figures, self._axes, self._shows_help = None, None, False
-            self._empty_scene = self._scene.copy()
+            self._empty_scene, keeps_scene = self._scene.copy(), False
         self._view, self._backdrop = view, parts
         for (name, image), box in zip(view.images.items(), image_boxes(self.layout, view), strict=True):
             paste_image(self._rows, box, image)
@@ -99,7 +100,7 @@ class BackgroundImage:
         if self._axes is None or not np.array_equal(axes, self._axes):
             self._put(self.layout.compass, compass_image(self.layout, axes))
             self._axes = axes
-        if draw_scene is not None:
+        if draw_scene is not None and not keeps_scene:
             boxes = [self.layout.compass, *([self.layout.findings(len(findings))] if findings else [])]
             over = [self._rows[box.slices].copy() for box in boxes]
             self._scene[:] = self._empty_scene

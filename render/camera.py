@@ -38,6 +38,11 @@ class OrbitCamera:
         self._ahead = np.cross(self.up, self._side)
         self.distance = self.distance_home = self._framing_distance(bounds)
 
+    @property
+    def state(self) -> tuple[float, ...]:
+        """What the user changes: target, angles and distance."""
+        return (*map(float, self.target), self.azimuth_deg, self.elevation_deg, self.distance)
+
     def go_home(self) -> None:
         """Return to the initial view."""
         self.target = self._middle

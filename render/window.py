@@ -34,6 +34,8 @@ from sim.device import on_cpu
 ZOOM_S = 0.5
 ZOOM_SENSE = {"zoom_in": -1.0, "zoom_out": 1.0}
 FRAMES_A_SECOND = 60
+# Where a frame takes longer than this, the processor draws the 3D view in every other one only.
+SLOW_FRAME_S = 1 / 20
 
 
 class NoVulkan(RuntimeError):
@@ -113,6 +115,8 @@ class Window:
         self.camera = OrbitCamera(geometry.bounds, geometry.up, part, size[0] / size[1])
         self._scene_view = SceneView(geometry, self.camera)
         self._software = SoftwareScene(self.camera, size) if self._by_processor else None
+        self._drawn_at, self._has_kept = 0.0, False
+        self._seen: tuple[object, ...] = ()
 
     def show_progress(self, text: str) -> None:
         """Show what is being prepared."""
@@ -267,7 +271,8 @@ class Window:
             self._background.show_help()
         else:
             software = None if self._software is None else partial(self._draw_by_processor, view)
-            self._background.compose(view, np.stack(self.camera.axes()), self._visible, software)
+            keeps = software is not None and self._keeps_scene()
+            self._background.compose(view, np.stack(self.camera.axes()), self._visible, software, keeps)
         self._put_image()
         if self._software is None:
             self._draw_scene(view)
@@ -288,6 +293,14 @@ class Window:
             self._software.look()
             self._scene_view.draw(self._software, view, self.settings)
             self._software.render(self.layout.scene, pixels)
+
+    def _keeps_scene(self) -> bool:
+        """Whether the 3D view may stay as it is in this frame: every other one where frames are slow, unless the user changes the view."""
+        now, seen = time.perf_counter(), (*self.camera.state, dataclasses.astuple(self.settings))
+        is_slow, self._drawn_at = now - self._drawn_at > SLOW_FRAME_S, now
+        self._has_kept = is_slow and not self._has_kept and seen == self._seen and self._visible
+        self._seen = seen
+        return self._has_kept
 
     def _draw_scene(self, view: View) -> None:
         """Draw the 3D view over the background image."""

@@ -15,6 +15,7 @@ from sim.device import is_too_small
 from sim.fields import field_of, fill
 from sim.signed_distance import signed_distance
 from sim.skinning import Skin
+from sim.stored_arrays import stored
 from sim.tissue_model import TissueModel
 
 # Barycentric tolerance, so that rounding leaves no gaps between tetrahedra.
@@ -43,15 +44,7 @@ class Embedding:
     def __init__(
         self, model: TissueModel, surface: trimesh.Trimesh, cell_mm: float, margin_mm: float = 0.0
     ) -> None:
-        vertices, tetrahedra = tetrahedra_around(surface, cell_mm, margin_mm)
-        # A tetrahedron that contains tissue extends this far outside: all of its vertices must move with the tissue.
-        extent = np.sqrt(3) * cell_mm
-        outside = np.maximum(signed_distance(surface.vertices, surface.faces, vertices)[0], 0.0)
-        beyond = np.maximum(outside - extent, 0.0)
-        # Where tetrahedra overlap after deformation, the lowest index is taken: those in or nearest to the organ come first.
-        layer = np.ceil(outside[tetrahedra].min(axis=1) / cell_mm)
-        tetrahedra = tetrahedra[np.argsort(layer, kind="stable")]
-        share = np.clip(1.0 - beyond / max(margin_mm - extent, cell_mm), 0.0, 1.0)
+        vertices, tetrahedra, share = stored(_embedding_mesh, surface, cell_mm, margin_mm)
         self.skin = Skin(model, vertices)
         self.share = field_of(share)
         self.count = len(tetrahedra)
@@ -180,6 +173,21 @@ class Unmoved:
         fill(
             (owner, np.zeros(owner.shape, int)), (self.rest_from_plane, world_from_plane.to_numpy()[None, :3])
         )
+
+
+def _embedding_mesh(
+    surface: trimesh.Trimesh, cell_mm: float, margin_mm: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices (v, 3) [mm], tetrahedra (t, 4) in their order, and each vertex's share (v,)."""
+    vertices, tetrahedra = tetrahedra_around(surface, cell_mm, margin_mm)
+    # A tetrahedron that contains tissue extends this far outside: all of its vertices must move with the tissue.
+    extent = np.sqrt(3) * cell_mm
+    outside = np.maximum(signed_distance(surface.vertices, surface.faces, vertices)[0], 0.0)
+    beyond = np.maximum(outside - extent, 0.0)
+    # Where tetrahedra overlap after deformation, the lowest index is taken: those in or nearest to the organ come first.
+    layer = np.ceil(outside[tetrahedra].min(axis=1) / cell_mm)
+    share = np.clip(1.0 - beyond / max(margin_mm - extent, cell_mm), 0.0, 1.0)
+    return vertices, tetrahedra[np.argsort(layer, kind="stable")], share
 
 
 def tetrahedra_around(

@@ -4,7 +4,7 @@ No mesh has to fit the organ: cells that contain tissue are kept, and those cut 
 filled part (finite cell method, Parvizian, Duester & Rank 2007).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import igl
 import numpy as np
@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from sim.sampling import SamplingError, check_memory
 from sim.signed_distance import signed_distance
+from sim.stored_arrays import stored
 
 # Corners of a cell, x slowest.
 CORNERS = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
@@ -93,16 +94,28 @@ def fill_with_cells(surface: trimesh.Trimesh, cell_mm: float) -> Lattice:
 
     Raises SamplingError when the cells are too many for a step or for the memory, or too large for the surface's shape.
     """
-    low = surface.bounds[0] - cell_mm / 2
-    size = np.ceil((surface.bounds[1] - low) / cell_mm).astype(int)
+    size = _grid_around(surface, cell_mm)[1]
     if size.prod() > 50 * MOST_CELLS or surface.volume / cell_mm**3 > MOST_CELLS:
         raise SamplingError(
             f"cells of {cell_mm:g} mm are more than {MOST_CELLS} in an organ of {surface.volume / 1000:.0f} ml: "
             "choose larger ones"
         )
     check_memory(CELL_BYTES * surface.volume / cell_mm**3, f"cells of {cell_mm:g} mm", "choose larger ones")
-    indices = np.indices(size).reshape(3, -1).T
-    return _assemble(low, cell_mm, size, *_filled(surface, low, cell_mm, indices))
+    return Lattice(cell_mm, *stored(_arrays_of_cells, surface, cell_mm))
+
+
+def _arrays_of_cells(surface: trimesh.Trimesh, cell_mm: float) -> tuple[np.ndarray, ...]:
+    """All of a surface's lattice but ``cell_mm``. Raises SamplingError."""
+    low, size = _grid_around(surface, cell_mm)
+    indices = np.indices(tuple(size.tolist())).reshape(3, -1).T
+    lattice = _assemble(low, cell_mm, size, *_filled(surface, low, cell_mm, indices))
+    return tuple(getattr(lattice, field.name) for field in fields(Lattice)[1:])
+
+
+def _grid_around(surface: trimesh.Trimesh, cell_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest corner (3,) [mm] and number of cells (3,) of a grid around a surface."""
+    low = surface.bounds[0] - cell_mm / 2
+    return low, np.ceil((surface.bounds[1] - low) / cell_mm).astype(int)
 
 
 def fill_block(counts: tuple[int, int, int], cell_mm: float) -> Lattice:

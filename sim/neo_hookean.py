@@ -21,6 +21,7 @@ from sim.lattice import CORNERS, Lattice, fill_with_cells, surface_points
 from sim.linear_algebra import cross, four, row, solve
 from sim.rigid_correction import RigidCorrection
 from sim.solver import StepSettings
+from sim.stored_arrays import stored
 from sim.surface_contact import PENALTY_DEPTH_MM, REACH_MM, SurfaceContacts
 from sim.tissue_model import ModelInputs
 
@@ -59,7 +60,8 @@ class NeoHookean:
         body = Body(lattice.nodes)
         contacts = None
         if inputs.shapes:
-            points, area_mm2 = surface_points(inputs.organ, POINT_SPACING_CELLS * tissue.cell_mm)
+            spacing_mm = POINT_SPACING_CELLS * tissue.cell_mm
+            points, area_mm2 = stored(surface_points, inputs.organ, spacing_mm)
             contacts = SurfaceContacts(body, lattice, points, area_mm2, inputs.shapes, inputs.friction)
         material = (tissue.young_kpa, tissue.poisson, tissue.density_g_cm3)
         fixed = None if inputs.fixed is None else inputs.fixed.nodes(lattice.nodes)

@@ -6,6 +6,8 @@ import taichi as ti
 import taichi.math as tm
 from scipy.ndimage import label
 
+from sim.stored_arrays import stored
+
 # Grid points nearer to the surface than EXACT_MM get exact distances, the others are interpolated from every third point.
 COARSENESS, EXACT_MM = 3, 5.0
 # A little more than half of the spacing.
@@ -38,6 +40,16 @@ def distance_grid(
     that it separates.
     """
     vertices, faces = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
+    distance, low = stored(
+        _distances, vertices, faces, float(spacing_mm), float(reach_mm), backend=str(ti.cfg.arch)
+    )
+    return distance, low
+
+
+def _distances(
+    vertices: np.ndarray, faces: np.ndarray, spacing_mm: float, reach_mm: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """As ``distance_grid``, computed."""
     low = vertices.min(axis=0) - reach_mm
     shape = np.ceil((vertices.max(axis=0) + reach_mm - low) / spacing_mm).astype(int) + 1
     squared = np.full(tuple(shape), EXACT_MM**2, np.float32)
