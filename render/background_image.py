@@ -28,12 +28,13 @@ from render.ultrasound_panel import (
     draw_segments,
     image_boxes,
     paste_image,
+    status_image,
     to_plane,
 )
 from render.viewer import View
 from render.window_layout import CLOCK_WIDTH, FIGURE_HEIGHT, FIGURES_PAD, Rect, WindowLayout
 
-READOUT_PERIOD_S = 0.25
+READOUT_PERIOD_S = 0.4
 
 # Read-outs, findings, the finding above its limit, clock and pace.
 Figures = tuple[dict[str, str], dict[str, str], str, str, str]
@@ -67,6 +68,7 @@ class BackgroundImage:
         self._backdrop: tuple = ()
         self._shows_help = False
         self._axes: np.ndarray | None = None
+        self._status: str | None = None
         self._figures: Figures | None = None
         self._figures_at = 0.0
 
@@ -86,15 +88,18 @@ class BackgroundImage:
         findings = first_of(view.findings, self.layout.most_findings)
         # What the backdrop depends on.
         plane = view.width_mm, view.depth_mm, view.above_mm, view.focus_mm, view.outline_mm is not None
-        parts = *plane, tuple(view.images), view.captions, view.title, view.status, len(findings)
+        parts = *plane, tuple(view.images), view.captions, view.title, len(findings)
         if self._shows_help or self._backdrop != parts:
             self._rows[:, :, :3] = backdrop(self.layout, view, self.keys.of["help"])
-            self._figures, self._axes, self._shows_help = None, None, False
+            self._figures, self._axes, self._status, self._shows_help = None, None, None, False
             self._empty_scene, keeps_scene = self._scene.copy(), False
         self._view, self._backdrop = view, parts
         for (name, image), box in zip(view.images.items(), image_boxes(self.layout, view), strict=True):
             paste_image(self._rows, box, image)
             self._draw_over(view, name, box)
+        if view.status != self._status:
+            self._put(self.layout.status, status_image(self.layout, view.status))
+            self._status = view.status
         figures = dict(view.readouts), findings, view.alert, view.clock, view.pace
         self._compose_figures(figures, slow_figures)
         if self._axes is None or not np.array_equal(axes, self._axes):

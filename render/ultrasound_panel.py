@@ -110,8 +110,6 @@ def draw_panel(draw: ImageDraw.ImageDraw, layout: WindowLayout, view: View) -> N
     depth = f"Depth {(view.depth_mm - view.above_mm) / 10:.1f} cm"
     _draw_row(draw, left, width, px(22), (probe, px(17), TEXT), (depth, px(15), TEXT))
     _draw_row(draw, left, width, area.bottom - px(17), (b_mode, px(14), QUIET), (ct, px(14), QUIET))
-    status = shortened(view.status, px(17), width)
-    draw.text((left + width // 2, px(43)), status, font=font(px(17)), fill=ALERT, anchor="mm")
     if view.outline_mm is not None:
         _draw_legend(draw, layout, boxes[0].left, boxes[-1].bottom)
     _draw_ruler(draw, layout, view, boxes[0])
@@ -121,6 +119,16 @@ def draw_panel(draw: ImageDraw.ImageDraw, layout: WindowLayout, view: View) -> N
         x, y, radius = box.right - px(10), box.top - px(12), px(6)
         draw.ellipse([x - radius, y - radius, x + radius, y + radius], fill=MARK)
         draw.text((box.left, y), name, font=font(px(15)), fill=TEXT, anchor="lm")
+
+
+def status_image(layout: WindowLayout, status: str) -> np.ndarray:
+    """Return the status over the images, uint8, shape of layout.status."""
+    box, px = layout.status, layout.px
+    image = Image.new("RGB", (box.width, box.height), PANEL)
+    text = shortened(status, px(17), box.width)
+    middle = box.width // 2, box.height // 2
+    ImageDraw.Draw(image).text(middle, text, font=font(px(17)), fill=ALERT, anchor="mm")
+    return np.asarray(image)
 
 
 def _draw_row(draw: ImageDraw.ImageDraw, x: int, width: int, y: int, left: Written, right: Written) -> None:

@@ -34,8 +34,8 @@ from sim.device import on_cpu
 ZOOM_S = 0.5
 ZOOM_SENSE = {"zoom_in": -1.0, "zoom_out": 1.0}
 FRAMES_A_SECOND = 60
-# Where a frame takes longer than this, the processor draws the 3D view in every other one only.
-SLOW_FRAME_S = 1 / 20
+# Where a frame takes longer than the first, the processor draws the 3D view only this often.
+SLOW_FRAME_S, SCENE_S = 1 / 20, 1 / 8
 
 
 class NoVulkan(RuntimeError):
@@ -115,7 +115,7 @@ class Window:
         self.camera = OrbitCamera(geometry.bounds, geometry.up, part, size[0] / size[1])
         self._scene_view = SceneView(geometry, self.camera)
         self._software = SoftwareScene(self.camera, size) if self._by_processor else None
-        self._drawn_at, self._has_kept = 0.0, False
+        self._frame_at = self._scene_at = 0.0
         self._seen: tuple[object, ...] = ()
 
     def show_progress(self, text: str) -> None:
@@ -295,12 +295,13 @@ class Window:
             self._software.render(self.layout.scene, pixels)
 
     def _keeps_scene(self) -> bool:
-        """Whether the 3D view may stay as it is in this frame: every other one where frames are slow, unless the user changes the view."""
+        """Whether the 3D view may stay as it is in this frame: for SCENE_S where frames are slow, unless the user changes the view."""
         now, seen = time.perf_counter(), (*self.camera.state, dataclasses.astuple(self.settings))
-        is_slow, self._drawn_at = now - self._drawn_at > SLOW_FRAME_S, now
-        self._has_kept = is_slow and not self._has_kept and seen == self._seen and self._visible
-        self._seen = seen
-        return self._has_kept
+        is_slow, self._frame_at = now - self._frame_at > SLOW_FRAME_S, now
+        keeps = is_slow and now - self._scene_at < SCENE_S and seen == self._seen and self._visible
+        if not keeps:
+            self._scene_at, self._seen = now, seen
+        return keeps
 
     def _draw_scene(self, view: View) -> None:
         """Draw the 3D view over the background image."""

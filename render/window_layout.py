@@ -11,6 +11,7 @@ PANEL_SHARE = 0.43
 TITLE_HEIGHT, CLOCK_WIDTH = 42, 150
 STRIP_HEIGHT, STRIP_GAP, READOUT_WIDTH = 184, 4, 134
 HEADER_HEIGHT, FOOTER_HEIGHT = 74, 52
+STATUS_MIDDLE, STATUS_HEIGHT = 43, 22
 RULER_WIDTH, WEDGE_WIDTH, IMAGE_GAP, NAME_HEIGHT = 42, 30, 10, 26
 SCANNER_WIDTH, SCANNER_GAP = 196, 6
 FINDINGS_GAP, FINDINGS_WIDTH, FIGURE_HEIGHT, FIGURES_PAD = 10, 178, 20, 7
@@ -70,6 +71,13 @@ class WindowLayout:
     def panel(self) -> Rect:
         width = round(self.width * PANEL_SHARE)
         return Rect(self.width - width, 0, width, self.height)
+
+    @property
+    def status(self) -> Rect:
+        """The status over the images."""
+        margin, height = self.px(16), self.px(STATUS_HEIGHT)
+        top = self.px(STATUS_MIDDLE) - height // 2
+        return Rect(self.panel.left + margin, top, self.panel.width - 2 * margin, height)
 
     @property
     def strip(self) -> Rect:

@@ -10,7 +10,7 @@ LEAST_ITERATIONS = 2
 LONGEST_STEP_S = 1 / 15
 # A level is left for a cheaper one when its steps take more than BUSY of the time that they simulate, and for a dearer one when that
 # one's would take less than SPARE: the median of so many steps.
-BUSY, SPARE = 0.8, 0.6
+BUSY, SPARE = 0.5, 0.35
 STEPS_DOWN, STEPS_UP = 12, 90
 
 
