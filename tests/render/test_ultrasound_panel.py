@@ -97,10 +97,16 @@ def test_readouts_and_status_change_the_picture():
         background_image.readout_image(LAYOUT, {"Step": "9 ms"})
         != background_image.readout_image(LAYOUT, {"Step": "8 ms"})
     )
-    plain = background_image.backdrop(LAYOUT, ct_view())
-    frozen = background_image.backdrop(LAYOUT, ct_view(status="FROZEN"))
-    changed = np.argwhere(np.any(plain != frozen, axis=2))
-    assert len(changed) > 0 and changed[:, 1].min() > LAYOUT.panel.left
+    composed = background_image.BackgroundImage(LAYOUT)
+    shown = []
+    for status in ("", "FROZEN", ""):
+        composed.compose(ct_view(status=status), np.eye(3))
+        shown.append(composed.pixels.transpose(1, 0, 2)[::-1].astype(int))
+    changed = np.argwhere(np.any(shown[0] != shown[1], axis=2))
+    # Within its own box, and nothing of it is left.
+    low, high = changed.min(axis=0), changed.max(axis=0)
+    assert LAYOUT.status.contains(low[1], low[0]) and LAYOUT.status.contains(high[1], high[0])
+    assert np.array_equal(shown[0], shown[2])
 
 
 PLANNING = "PLANNING   43 %, some 18 min left; Backspace stops"
@@ -113,13 +119,10 @@ PLANNING = "PLANNING   43 %, some 18 min left; Backspace stops"
 )
 def test_a_status_is_as_large_as_it_can_be_in_the_panel(size, status):
     layout = WindowLayout(*size)
-    plain, with_status = (
-        background_image.backdrop(layout, ct_view(status=each))[:, layout.panel.left :].astype(int)
-        for each in ("", status)
-    )
+    plain, with_status = (ultrasound_panel.status_image(layout, each).astype(int) for each in ("", status))
     columns = np.flatnonzero(np.any(plain != with_status, axis=(0, 2)))
     room = layout.panel.width - 2 * layout.px(16)
-    assert layout.px(16) <= columns[0] and columns[-1] <= layout.panel.width - layout.px(16)
+    assert layout.status.width == room
     # The usual font where that fits, but for the room beside its first and last letter; else one size more would not, which
     # makes it wider by a ninth at most.
     usual = font(layout.px(17)).getlength(status)
