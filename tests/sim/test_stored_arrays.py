@@ -47,7 +47,7 @@ def test_surfaces_and_arrays_count_by_their_values():
     stored(computed, ball)
     stored(computed, ball.copy())
     assert len(CALLS) == 1
-    stored(computed, ball.copy().apply_scale(1.0 + 1e-12))
+    stored(computed, ball.copy().apply_scale(1.001))
     stored(computed, np.arange(4.0))
     stored(computed, np.arange(4.0, dtype=np.float32))
     stored(computed, np.arange(4.0), backend="cuda")
