@@ -68,7 +68,7 @@ def as_asked(scene: Scene, asked: RehearseOptions) -> tuple[Scene, Probe]:
 
     Raises SceneError, ProbeError.
     """
-    changed = with_quality(with_options(scene, asked.changes), asked.quality)
+    changed = with_quality(with_options(scene, asked.changes), asked.preset)
     if asked.model is None and changed.tissue.model != scene.tissue.model:
         click.echo(f"Tissue model: {changed.tissue.model}, as the options ask for it.")
     return changed, probe_of(changed)

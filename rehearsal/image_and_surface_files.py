@@ -16,7 +16,6 @@ from render.viewer import View
 from scenes.atomic_files import atomic_write
 from scenes.surfaces import save_surface
 from sim.fields import array_of
-from ultrasound.dicom_image import save_dicom
 from ultrasound.probe import Probe
 from ultrasound.scanner import B_MODE
 
@@ -48,6 +47,9 @@ def save_images(
     dicom: bool = True,
 ) -> list[SavedImage]:
     """Write images (rows, columns) by kind, with square pixels, to files that share a prefix. Raises OSError."""
+    # A quarter of a second, which the start of a rehearsal does not need.
+    from ultrasound.dicom_image import save_dicom
+
     saved = []
     for kind, grey in images.items():
         image = with_square_pixels(grey, width_mm, depth_mm)

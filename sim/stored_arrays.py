@@ -22,7 +22,7 @@ import trimesh
 Arrays: TypeAlias = tuple[np.ndarray, ...]
 # Where the files are, readable to their owner alone; None keeps nothing.
 FOLDER: Path | None = Path(__file__).parents[1] / ".cache" / "arrays"
-# The files used least recently are removed beyond this size. A patient of the default settings has 20 MB.
+# The files used least recently are removed beyond this size. The embedded patient has 13 MB.
 MOST_BYTES = 256 << 20
 LIBRARIES = " ".join([sys.version, *map(version, ("numpy", "scipy", "libigl", "trimesh", "taichi"))])
 DAMAGED = (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error)

@@ -18,7 +18,11 @@ import pytest
 import taichi as ti
 import trimesh
 
+from sim import stored_arrays
 from sim.device import start
+
+# Tests compute: one that changes a function must not leave its arrays to others.
+stored_arrays.FOLDER = None
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 ROOT = Path(__file__).resolve().parents[1]

@@ -191,6 +191,11 @@ def test_a_quality_sets_size_and_iterations_and_leaves_the_material():
     stiff.check()
     RehearseOptions(young_kpa=33.0, budget_ms=5.0, error_mm=0.1).check()
     assert as_asked(scene, RehearseOptions())[0] == scene
+    # For a haptic device the fast preset, unless the user chooses something else.
+    quick, _ = as_asked(scene, RehearseOptions(rate=250.0))
+    assert quick.tissue.cell_mm == 5.0 and quick.solver.time_step_s == scene.solver.time_step_s
+    for own in (dict(cell=4.0), dict(quality="balanced"), dict(iterations=2), dict(error_mm=0.1)):
+        assert RehearseOptions(rate=250.0, **own).preset == own.get("quality")
 
 
 def test_the_command_writes_table_figure_and_json(tmp_path, monkeypatch, capsys):
