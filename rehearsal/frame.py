@@ -39,6 +39,8 @@ NOTICE_S, RESTORED_S = 2.0, 4.0
 REAL_TIME = 0.9
 # What the figures of speed on the screen are of.
 RECENT_S, RECENT_FRAMES = 1.0, 20
+# Times of steps and images that a window keeps.
+MOST_TIMES = 100
 # A frame that took longer moves the transducer as if it had taken this long.
 MOST_ELAPSED_S = 0.25
 Source = TypeVar("Source", bound=InputSource)
@@ -133,6 +135,8 @@ class WindowFrames(Frames[WindowInput]):
         probe = probe_with_settings(self.rehearsal.probe, controls.settings)
         with self.times.stage("image"):
             view = self.image(probe, controls.settings)
+        for times_ms in (self.tally.step_ms, self.tally.slice_ms):
+            del times_ms[:-MOST_TIMES]
         with self.times.stage("measurements"):
             self.observe_window(probe)
             self._record_sweep(probe, view, controls)

@@ -85,6 +85,7 @@ class FakeTally:
 
     def __init__(self) -> None:
         self.step_ms: list[float] = []
+        self.slice_ms: list[float] = []
 
     def watch(self, rehearsal: Fake) -> None: ...
     def report(self, rehearsal: Fake, arch: str) -> dict:
