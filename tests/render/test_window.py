@@ -61,6 +61,8 @@ class Screen:
             text=True,
         )
         self.window = self._wait_for_window()
+        # The window opens before the organ is built.
+        self.picture(within_s=START_S)
 
     def _wait_for_window(self) -> str:
         end = time.monotonic() + START_S
@@ -94,10 +96,10 @@ class Screen:
             before = after
         pytest.fail("the picture does not come to rest")
 
-    def picture(self) -> np.ndarray:
+    def picture(self, within_s: float = 20) -> np.ndarray:
         """What the window shows, saved by its own screenshot key."""
         before = len(self._screenshots())
-        end = time.monotonic() + 20
+        end = time.monotonic() + within_s
         while time.monotonic() < end:
             self.do("key", "--window", self.window, "p")
             asked = time.monotonic()
