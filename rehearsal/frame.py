@@ -3,7 +3,9 @@
 In a window, a process of its own makes the steps (``real_time/``); a frame shows the newest of them.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Generic, TypeVar
@@ -104,6 +106,7 @@ class WindowFrames(Frames[WindowInput]):
     times: FrameTimes = field(default_factory=FrameTimes)
     frozen: bool = False
     _last_step: Step | None = field(default=None, init=False)
+    _shown_input_s: float | None = field(default=None, init=False)
     _steps: list[Step] = field(default_factory=list, init=False)
     _rollbacks: int = field(init=False)
     _input_at_s: float | None = field(default=None, init=False)
@@ -116,22 +119,24 @@ class WindowFrames(Frames[WindowInput]):
         self._rollbacks = self.source.session.rollbacks
 
     def run(self) -> None:
-        """Draw frames until the window is closed."""
+        """Draw frames until the window is closed. The solver makes its next step while the last view is drawn."""
+        view: View | None = None
         while self.viewer.running:
             controls = self.viewer.read_controls()
-            view = self.frame(controls)
-            with self.times.stage("drawing"):
-                self.viewer.draw(view)
-            shown = self._last_step.input_s if self._last_step is not None and not self.frozen else None
-            self.times.end_frame(self.source.session.time_s, shown or None)
-            self._save(controls, view)
+            with self.times.stage("input"):
+                self.drive(controls)
+            if view is not None:
+                self._draw(view, controls)
+            view = self.next_view(controls)
+            if controls.export:
+                self._save(partial(self._export, controls.settings, view))
 
-    def frame(self, controls: Controls) -> View:
-        """One frame."""
-        with self.times.stage("input"):
+    def next_view(self, controls: Controls) -> View:
+        """Take the newest state over, and return its view."""
+        with self.times.stage("state"):
             self.solver.collect()
-            self.drive(controls)
             self.rehearsal.update_surfaces()
+        self._shown_input_s = None if self.frozen or self._last_step is None else self._last_step.input_s
         probe = probe_with_settings(self.rehearsal.probe, controls.settings)
         with self.times.stage("image"):
             view = self.image(probe, controls.settings)
@@ -141,6 +146,13 @@ class WindowFrames(Frames[WindowInput]):
             self.observe_window(probe)
             self._record_sweep(probe, view, controls)
             return self.present(view, probe, controls)
+
+    def _draw(self, view: View, controls: Controls) -> None:
+        with self.times.stage("drawing"):
+            self.viewer.draw(view)
+        self.times.end_frame(self.source.session.time_s, self._shown_input_s or None)
+        if controls.screenshot:
+            self._save(lambda: save_screenshot(self.viewer.picture(), self.out))
 
     def drive(self, controls: Controls) -> None:
         """Apply the keys of freeze, cine and plans; then tell the solver what to do, unless frozen."""
@@ -266,13 +278,10 @@ class WindowFrames(Frames[WindowInput]):
         for text in self.notices.present(self.keys.worded):
             self._notice, self._notice_until = text[0].upper() + text[1:], perf_counter() + NOTICE_S
 
-    def _save(self, controls: Controls, view: View) -> None:
-        """Save what the user asked for."""
+    def _save(self, write: Callable[[], None]) -> None:
+        """Write files that the user asked for."""
         try:
-            if controls.screenshot:
-                save_screenshot(self.viewer.picture(), self.out)
-            if controls.export:
-                self._export(controls.settings, view)
+            write()
         except OSError as error:
             self.notices.post(f"Not saved: {error.strerror}", in_terminal=False)
 

@@ -64,6 +64,7 @@ class UserInput:
 
     def drive(self, solver: SolverProcess, controls: Controls, elapsed_s: float) -> None:
         """Give the solver the user's input after a time [s]; pause it for what changes more than the transducer's pose."""
+        input_s = perf_counter()
         if self._interrupts(controls):
             solver.pause()
             self.after_frame()
@@ -72,7 +73,7 @@ class UserInput:
             solver.hand_over()
             solver.run()
         if pose is not None:
-            solver.go_to(pose, perf_counter(), elapsed_s)
+            solver.go_to(pose, input_s, elapsed_s)
 
     def _interrupts(self, controls: Controls) -> bool:
         """Whether the controls change more than the pose, or the whole state is to be recorded."""

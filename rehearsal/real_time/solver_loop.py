@@ -12,7 +12,7 @@ import numpy as np
 
 import sim.device
 from rehearsal.pressed_organ import OrganState, PressedOrgan, Step
-from rehearsal.real_time.pace import Pace
+from rehearsal.real_time.pace import MOST_WAIT_S, Pace
 from rehearsal.real_time.pose_path import PosePath
 from rehearsal.real_time.shared_state import SharedState
 from rehearsal.worker_processes import end_with_parent
@@ -46,8 +46,10 @@ class SolverLoop:
         self._path = PosePath(np.eye(4))
         self._played: deque[tuple[np.ndarray, float]] = deque()
         self._runs = self._is_stopped = False
-        # The clock's time up to which steps were made.
-        self._simulated_s = 0.0
+        # The clock's times: up to which steps were made, and at which the newest input came.
+        self._simulated_s = self._input_at_s = 0.0
+        # Those of the steps that are due now.
+        self._lengths_s: deque[float] = deque()
         self._made = 0
 
     def serve(self) -> None:
@@ -57,7 +59,7 @@ class SolverLoop:
                 getattr(self, request)(*values)
             if self._played:
                 self._hand_on(self.organ.timed_step(*self._played.popleft()))
-            elif self._runs and self._left_s() <= 0.0:
+            elif self._runs and perf_counter() >= self._due_s:
                 self._keep_pace()
 
     def build(self, scene: Scene, anatomy: LoadedAnatomy, probe: Probe, arch: str, pace: Pace) -> None:
@@ -81,10 +83,12 @@ class SolverLoop:
         """Keep pace with the clock, the transducer at rest."""
         self._runs, self._simulated_s = True, perf_counter()
         self._path.stay(self.organ.pose, self._simulated_s)
+        self._lengths_s.clear()
 
     def go_to(self, pose: np.ndarray, input_s: float, took_s: float) -> None:
         """Move the transducer to an input's pose (4, 4) at a time [s], a time [s] after the last one."""
         self._path.go_to(pose, input_s, took_s)
+        self._input_at_s = perf_counter()
 
     def play(self, poses: np.ndarray, lengths_s: np.ndarray) -> None:
         """Make steps of given poses (n, 4, 4) and lengths (n,) [s]."""
@@ -103,22 +107,41 @@ class SolverLoop:
         """The requests that wait; if nothing else is to be done, wait for one, or until a step is due."""
         wait_s: float | None = 0.0
         if not self._played:
-            wait_s = max(self._left_s(), 0.0) if self._runs else None
+            wait_s = max(self._due_s - perf_counter(), 0.0) if self._runs else None
         while self._connection.poll(wait_s):
             yield self._connection.recv()
             wait_s = 0.0
 
-    def _left_s(self) -> float:
-        """Time until the next step is due: at its end, so that it follows the input."""
-        return self._simulated_s + self.pace.length_s - perf_counter()
+    @property
+    def _due_s(self) -> float:
+        """The clock's time at which the next step is due: at its end, so that it follows the input."""
+        if self._lengths_s:
+            return self._simulated_s
+        at_end_s = self._simulated_s + self.pace.length_s
+        if not self.pace.waits_for_input:
+            return at_end_s
+        return max(at_end_s, self._input_at_s if self._path.has_news else self._simulated_s + MOST_WAIT_S)
 
     def _keep_pace(self) -> None:
-        pace, full, late_s = self.pace, self.organ.settings.iterations, -self._left_s()
-        length_s, text = pace.length_s, pace.text(full)
-        self._simulated_s += length_s + max(late_s - MOST_BEHIND_S, 0.0)
+        pace, full = self.pace, self.organ.settings.iterations
+        late_s = 0.0
+        if not self._lengths_s:
+            late_s = perf_counter() - self._due_s
+            self._plan_steps()
+        length_s, text = self._lengths_s.popleft(), pace.text(full)
+        self._simulated_s += length_s
         step = self.organ.timed_step(self._path.pose_after(length_s), length_s, pace.iterations(full))
         self._hand_on(replace(step, input_s=self._path.input_s, late_ms=1000 * late_s, pace=text))
-        pace.watch(step.took_ms)
+        pace.watch(step.took_ms, length_s)
+
+    def _plan_steps(self) -> None:
+        """Choose the lengths of the steps that are due now."""
+        behind_s = perf_counter() - self._simulated_s
+        most_s = MOST_BEHIND_S + self.pace.length_s
+        self._simulated_s += max(behind_s - most_s, 0.0)
+        self._lengths_s += self.pace.lengths_s(min(behind_s, most_s))
+        if self.pace.waits_for_input:
+            self._path.arrive_in(sum(self._lengths_s))
 
     def _hand_on(self, step: Step) -> None:
         """Write a step's state, then send the step."""

@@ -107,9 +107,14 @@ def looping(monkeypatch, tmp_path, sent) -> WindowFrames:
     )
 
 
+def next_view(frames: WindowFrames, controls: Controls) -> View:
+    frames.drive(controls)
+    return frames.next_view(controls)
+
+
 def test_each_frame_goes_to_the_link_as_it_is_shown(looping, sent):
     settings = Settings()
-    views = [looping.frame(Controls(settings)) for _ in range(3)]
+    views = [next_view(looping, Controls(settings)) for _ in range(3)]
     for number, (live, view) in enumerate(zip(sent, views, strict=True), 1):
         assert live.grey is view.images["B-mode"] and live.time_s == number * STEP_S
         assert (
@@ -122,12 +127,12 @@ def test_each_frame_goes_to_the_link_as_it_is_shown(looping, sent):
 
 def test_a_frozen_picture_is_sent_as_the_scanner_is_set_and_one_looked_back_at_is_not(looping, sent):
     settings = Settings()
-    looping.frame(Controls(settings))
+    next_view(looping, Controls(settings))
     looping.cine.frames.append(looping.cine.frames[-1])
     settings.depth_mm = 80
-    looping.frame(Controls(settings, freeze=True))
+    next_view(looping, Controls(settings, freeze=True))
     assert sent[-1].grey[0, 0] == 1 and sent[-1].image_to_probe[1, 1] == 20 and len(sent) == 2
-    looping.frame(Controls(settings, cine=-1))
+    next_view(looping, Controls(settings, cine=-1))
     assert len(sent) == 2
 
 
@@ -135,10 +140,10 @@ def test_a_restored_state_is_a_notice_and_stands_in_the_panel_for_a_while(loopin
     clock = [100.0]
     monkeypatch.setattr(frame, "perf_counter", lambda: clock[0])
     looping.rehearsal.notice = "Tissue restored"
-    shown = [looping.frame(Controls(Settings())).status]
+    shown = [next_view(looping, Controls(Settings())).status]
     looping.rehearsal.notice = ""
     for clock[0] in (103.9, 104.1):
-        shown.append(looping.frame(Controls(Settings())).status)
+        shown.append(next_view(looping, Controls(Settings())).status)
     assert (
         shown == ["STATE RESTORED", "STATE RESTORED", ""] and capsys.readouterr().out == "Tissue restored\n"
     )
@@ -150,13 +155,13 @@ def test_a_sweep_that_is_recorded_stands_in_the_panel_beside_all_else(looping, m
     looping.sweeping = SimpleNamespace(status="RECORDING 3 s", watch=lambda *_: "")
     looping.plans = SimpleNamespace(status="PLANNING; {next_plan} stops", watch=lambda *_: "")
     controls = Controls(Settings())
-    assert looping.frame(controls).status == "RECORDING 3 s   PLANNING; Backspace stops"
+    assert next_view(looping, controls).status == "RECORDING 3 s   PLANNING; Backspace stops"
     looping.source.status = "TRACKING LOST"
-    assert looping.frame(controls).status == "RECORDING 3 s   TRACKING LOST   PLANNING; Backspace stops"
+    assert next_view(looping, controls).status == "RECORDING 3 s   TRACKING LOST   PLANNING; Backspace stops"
     looping.notices.post("undo: {undo}", in_terminal=False)
-    assert looping.frame(controls).status == "RECORDING 3 s   Undo: U"
+    assert next_view(looping, controls).status == "RECORDING 3 s   Undo: U"
     clock[0] += 2.1
-    assert looping.frame(Controls(Settings(), freeze=True)).status == (
+    assert next_view(looping, Controls(Settings(), freeze=True)).status == (
         "RECORDING 3 s   FROZEN   PLANNING; Backspace stops"
     )
 
@@ -164,7 +169,7 @@ def test_a_sweep_that_is_recorded_stands_in_the_panel_beside_all_else(looping, m
 def test_notices_name_the_users_keys_on_the_screen_and_in_the_terminal(looping, capsys):
     looping.keys = Keys(of=DEFAULT_KEYS | {"sweep": "Space", "plan_for": "L"})
     looping.notices.post("sweep-001: {sweep} ends it")
-    assert looping.frame(Controls(Settings())).status == "Sweep-001: Space ends it"
+    assert next_view(looping, Controls(Settings())).status == "Sweep-001: Space ends it"
     assert capsys.readouterr().out == "sweep-001: Space ends it\n"
 
 
@@ -175,11 +180,11 @@ def test_what_is_wrong_with_the_tissue_stands_before_all_that_is_technical(loopi
     looping.plans = SimpleNamespace(status="PLANNING", watch=lambda *_: "")
     looping.source.status = "REDUCED ITERATIONS"
     controls = Controls(Settings())
-    assert looping.frame(controls).status == "SQUEEZED   RECORDING 3 s   REDUCED ITERATIONS   PLANNING"
+    assert next_view(looping, controls).status == "SQUEEZED   RECORDING 3 s   REDUCED ITERATIONS   PLANNING"
     looping.notices.post("undo", in_terminal=False)
-    assert looping.frame(controls).status == "SQUEEZED   RECORDING 3 s   Undo"
+    assert next_view(looping, controls).status == "SQUEEZED   RECORDING 3 s   Undo"
     looping._notice_until, looping._restored_until = 0.0, 104.0
-    status = looping.frame(Controls(Settings(), freeze=True)).status
+    status = next_view(looping, Controls(Settings(), freeze=True)).status
     assert status == "STATE RESTORED   SQUEEZED   RECORDING 3 s   FROZEN   PLANNING"
 
 
@@ -189,11 +194,11 @@ def test_a_frozen_picture_keeps_its_caliper_and_a_live_one_until_the_probe_moves
         frame, "image_view", lambda *given: replace(image_view(*given), transducer_pose=at.copy())
     )
     place = (1.0, 2.0)
-    assert looping.frame(Controls(Settings(), pointed_mm=place)).caliper_mm == (place,)
-    assert looping.frame(Controls(Settings(), pointed_mm=place)).caliper == "0.0 mm"
+    assert next_view(looping, Controls(Settings(), pointed_mm=place)).caliper_mm == (place,)
+    assert next_view(looping, Controls(Settings(), pointed_mm=place)).caliper == "0.0 mm"
     at[0, 3] = 5.0
-    assert looping.frame(Controls(Settings(), freeze=True)).caliper == "0.0 mm"
-    assert looping.frame(Controls(Settings(), freeze=True)).caliper_mm == ()
+    assert next_view(looping, Controls(Settings(), freeze=True)).caliper == "0.0 mm"
+    assert next_view(looping, Controls(Settings(), freeze=True)).caliper_mm == ()
 
 
 def test_the_clock_is_the_sessions_and_says_where_it_is_slow(looping):
@@ -201,11 +206,11 @@ def test_the_clock_is_the_sessions_and_says_where_it_is_slow(looping):
     looping.times.rates = lambda recent_s: rates[-1]
     for factor in (0.25, 0.04, 0.89, 0.91):
         rates.append((10.0, factor))
-        view = looping.frame(Controls(Settings()))
+        view = next_view(looping, Controls(Settings()))
         told.append((view.clock, view.pace))
     assert told == [("0.2 s", "0.2 x real"), ("0.5 s", "0.04 x real"), ("0.8 s", "0.9 x real"), ("1.0 s", "")]
     rates.append((10.0, 0.25))
-    frozen = looping.frame(Controls(Settings(), freeze=True))
+    frozen = next_view(looping, Controls(Settings(), freeze=True))
     assert (frozen.clock, frozen.pace) == ("1.0 s", "") and "time" not in frozen.readouts
 
 
@@ -217,16 +222,16 @@ def test_without_contact_whoever_leads_by_hand_is_told_how_to_press(looping, mon
     by_hand, tracked = (SimpleNamespace(is_manual=each) for each in (True, False))
     told = []
     for looping.source.user_input in (None, by_hand, tracked):
-        told.append(looping.frame(Controls(Settings())).notes["B-mode"])
+        told.append(next_view(looping, Controls(Settings())).notes["B-mode"])
     assert told == ["NO CONTACT", "NO CONTACT\nLeft button or Return presses", "NO CONTACT"]
     looping.source.user_input = by_hand
-    frozen = looping.frame(Controls(Settings(), freeze=True))
+    frozen = next_view(looping, Controls(Settings(), freeze=True))
     assert frozen.notes["B-mode"] == "NO CONTACT"
 
 
 def test_without_a_link_the_loop_goes_on(looping, sent):
     looping.link = None
-    looping.frame(Controls(Settings()))
+    next_view(looping, Controls(Settings()))
     assert sent == []
 
 
@@ -237,24 +242,23 @@ def test_the_export_key_saves_the_tissue_beside_its_picture_and_says_what_it_can
     monkeypatch.setattr(frame, "save_surfaces", lambda rehearsal, out, begin: begins.append(begin))
     settings = Settings()
     for _ in range(2):
-        controls = Controls(settings, export=True)
-        looping._save(controls, looping.frame(controls))
+        looping._export(settings, next_view(looping, Controls(settings)))
     looping.cine.frames.append(looping.cine.frames[-1])
-    looping._save(Controls(settings, export=True), looping.frame(Controls(settings, freeze=True)))
+    looping._export(settings, next_view(looping, Controls(settings, freeze=True)))
     assert begins == ["001-", "002-", "003-"] and (tmp_path / "003-b-mode.dcm").is_file()
-    assert looping.frame(Controls(settings)).status == "Saved 003"
+    assert next_view(looping, Controls(settings)).status == "Saved 003"
     # What is looked back at lay otherwise than the tissue does now.
-    before = replace(looping.frame(Controls(settings, cine=-1)), notes={"B-mode": "NO CONTACT"})
-    looping._save(Controls(settings, export=True), before)
+    before = replace(next_view(looping, Controls(settings, cine=-1)), notes={"B-mode": "NO CONTACT"})
+    looping._export(settings, before)
     assert len(begins) == 3 and (tmp_path / "004-b-mode.png").is_file()
     missing = (
         "B-mode image black: the probe does not touch the organ",
         "no organ (PLY), which has moved since: F continues",
     )
-    assert looping.frame(Controls(settings)).status == "   ".join(["Saved 004", *missing])
+    assert next_view(looping, Controls(settings)).status == "   ".join(["Saved 004", *missing])
     assert capsys.readouterr().out.endswith(f"\n{'; '.join(missing)}\n")
-    looping._save(Controls(settings, export=True), replace(before, images={"CT": before.images["CT"]}))
-    assert looping.frame(Controls(settings)).status == f"Saved 005   {missing[1]}"
+    looping._export(settings, replace(before, images={"CT": before.images["CT"]}))
+    assert next_view(looping, Controls(settings)).status == f"Saved 005   {missing[1]}"
 
 
 @pytest.mark.parametrize("earlier", [True, False])

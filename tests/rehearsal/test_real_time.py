@@ -12,10 +12,12 @@ from rehearsal.pressed_organ import PressedOrgan, Step
 from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.real_time.pace import BUSY, LEAST_ITERATIONS, SPARE, STEPS_DOWN, STEPS_UP, Pace
 from rehearsal.real_time.pose_path import CATCH_UP, LONGEST_S, PosePath
+from rehearsal.real_time.solver_loop import SolverLoop
 from rehearsal.real_time.solver_process import SolverEnded, SolverProcess
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import AnatomyFiles, Attachment, Scene, with_options
+from sim.solver import StepSettings
 from ultrasound.probe_manipulator import advanced
 
 # A process that makes a step of a small body in less than a millisecond; the machine may be busy.
@@ -149,6 +151,75 @@ def test_a_process_that_ends_is_an_error_in_words():
     solver.close()
 
 
+# The time of each step, by a clock that only waiting and steps advance
+
+
+class ClockedLoop(SolverLoop):
+    """A loop without tissue, whose steps take 10 ms; inputs come at given times, each 1 mm further."""
+
+    def __init__(self, monkeypatch, level: int, inputs_s: list[float], end_s: float) -> None:
+        self.now_s, self.begun = 0.0, []
+        monkeypatch.setattr("rehearsal.real_time.solver_loop.perf_counter", lambda: self.now_s)
+        super().__init__(self, None)
+        poses = [np.eye(4) + np.eye(4, k=3) * number for number in range(1, len(inputs_s) + 1)]
+        self.requests = [("go_to", (pose, at_s, 0.0)) for pose, at_s in zip(poses, inputs_s, strict=True)]
+        self.times_s = [*inputs_s, end_s, np.inf]
+        self.requests.append(("stop", ()))
+        self.organ = self._memory = self
+        self.settings, self.pace = StepSettings(time_step_s=1 / 60, substeps=1, iterations=4), Pace(1 / 60)
+        self.pose, self.pace.level = np.eye(4), level
+        self.pace.watch = lambda *_: None
+        self.run()
+        self.serve()
+
+    def poll(self, wait_s: float) -> bool:
+        """Whether a request comes within a time."""
+        self.now_s = min(self.now_s + wait_s, max(self.times_s[0], self.now_s))
+        return self.now_s >= self.times_s[0]
+
+    def recv(self) -> tuple[str, tuple]:
+        self.times_s.pop(0)
+        return self.requests.pop(0)
+
+    def timed_step(self, pose: np.ndarray, length_s: float, iterations: int) -> Step:
+        self.begun.append((self.now_s, round(60 * length_s), pose[0, 3]))
+        self.now_s += 0.01
+        return Step(pose, length_s, iterations, 10.0)
+
+    def snapshot_of_organ(self) -> None: ...
+    def write(self, *_) -> None: ...
+    def send(self, step: Step) -> None: ...
+
+
+def test_a_long_step_is_made_as_soon_as_the_input_comes_and_shows_it(monkeypatch):
+    inputs_s = [0.055, 0.11, 0.165, 0.22]
+    loop = ClockedLoop(monkeypatch, 1, inputs_s, end_s=0.23)
+    assert [at_s for at_s, _, _ in loop.begun] == pytest.approx(inputs_s)
+    assert [place for _, _, place in loop.begun] == [1.0, 2.0, 3.0, 4.0]
+    # 3.3 sixtieths are due each time; what remains is made up for.
+    assert [sixtieths for _, sixtieths, _ in loop.begun] == [3, 3, 3, 4]
+
+
+def test_of_two_long_steps_for_one_input_the_last_shows_it(monkeypatch):
+    loop = ClockedLoop(monkeypatch, 1, [0.09], end_s=0.13)
+    assert [step[1:] for step in loop.begun] == [(2, pytest.approx(0.4)), (3, 1.0)]
+    assert [step[0] for step in loop.begun] == pytest.approx([0.09, 0.1])
+
+
+def test_long_steps_do_not_wait_longer_than_a_tenth_of_a_second(monkeypatch):
+    loop = ClockedLoop(monkeypatch, 1, [], end_s=0.45)
+    simulated = np.cumsum([sixtieths / 60 for _, sixtieths, _ in loop.begun])
+    assert np.all(np.array([at_s for at_s, _, _ in loop.begun]) - simulated < 0.1)
+    assert simulated[-1] == pytest.approx(0.4)
+
+
+def test_short_steps_are_made_by_the_clock(monkeypatch):
+    loop = ClockedLoop(monkeypatch, 0, [0.05], end_s=0.1)
+    assert [at_s for at_s, _, _ in loop.begun] == pytest.approx([n / 60 for n in range(1, 7)])
+    moved = CATCH_UP / 60 / 0.05
+    assert [place for _, _, place in loop.begun] == pytest.approx([0.0, 0.0, moved, 2 * moved, 1.0, 1.0])
+
+
 # The path of the transducer
 
 
@@ -183,7 +254,7 @@ def test_behind_its_input_it_catches_up_at_a_limited_rate():
 
 def watched(pace: Pace, took_ms: float, steps: int) -> tuple[float, int]:
     for _ in range(steps):
-        pace.watch(took_ms)
+        pace.watch(took_ms, pace.length_s)
     return pace.length_s, pace.iterations(8)
 
 
@@ -192,7 +263,7 @@ def test_slow_steps_get_longer_then_have_fewer_iterations_and_return():
     step_ms = 1000 / 60
     assert watched(pace, 0.9 * BUSY * step_ms, STEPS_UP) == (1 / 60, 8) and pace.text(8) == ""
     assert watched(pace, 1.1 * BUSY * step_ms, STEPS_DOWN) == (2 / 60, 8)
-    assert pace.text(8) == "LONGER STEPS   1/30 s"
+    assert pace.waits_for_input and pace.text(8) == "LONGER STEPS   1/15 s"
     # Twice as long, they take half of the time that they simulate: more than is spare for short ones.
     assert watched(pace, 1.1 * BUSY * step_ms, 2 * STEPS_UP) == (2 / 60, 8)
     assert watched(pace, 100.0, 2 * STEPS_DOWN) == (4 / 60, 8)
@@ -207,7 +278,7 @@ def test_slow_steps_get_longer_then_have_fewer_iterations_and_return():
 def test_single_long_steps_change_nothing():
     pace = Pace(1 / 60)
     for number in range(2 * STEPS_UP):
-        pace.watch(100.0 if number % 3 == 0 else 5.0)
+        pace.watch(100.0 if number % 3 == 0 else 5.0, 1 / 60)
     assert pace.level == 0
 
 
@@ -215,6 +286,21 @@ def test_steps_are_at_most_a_fifteenth_of_a_second_unless_the_scenes_are_longer(
     assert max(level.times_longer for level in Pace(1 / 60).levels) == 4
     assert max(level.times_longer for level in Pace(1 / 1000).levels) == 64
     assert {level.times_longer for level in Pace(1 / 10).levels} == {1}
+
+
+def test_long_steps_wait_for_the_input_and_simulate_what_is_due_then():
+    pace = Pace(1 / 60)
+    assert not pace.waits_for_input and pace.lengths_s(0.1) == [1 / 60]
+    pace.level = 1
+    assert pace.waits_for_input and pace.length_s == 2 / 60
+    for units, lengths in {2: [2], 3: [3], 4: [4], 5: [2, 3], 6: [3, 3], 9: [3, 3, 3], 11: [3, 4, 4]}.items():
+        for due_s in (units / 60, (units + 0.9) / 60):
+            assert pace.lengths_s(due_s) == [1 / 60 * times for times in lengths]
+    # A haptic device's steps do not wait, unless they are as long.
+    pace = Pace(1 / 1000)
+    pace.level = 7
+    assert pace.length_s == 0.016 and not pace.waits_for_input
+    assert Pace(1 / 10).lengths_s(0.25) == [0.1, 0.1]
 
 
 def test_a_budget_limits_the_time_of_a_step():

@@ -17,6 +17,7 @@ from rehearsal.asked_files import AskedFiles
 from rehearsal.build_solver import step_settings
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.coordinates import probe_in_patient
+from rehearsal.frame import WindowFrames
 from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.open_window import initial_settings
 from rehearsal.rehearsal import Rehearsal
@@ -38,12 +39,11 @@ from version import VERSION
 
 
 class Watched(NullViewer):
-    """A window that draws nothing, and keeps what each frame showed, but for frozen ones."""
+    """A window that draws nothing. ``seen`` is what each view of its frames shows, but for frozen ones."""
 
     def __init__(self, settings: Settings, script: Any) -> None:
         super().__init__(settings, script)
         self.seen: list[tuple] = []
-        self.is_frozen = False
         self.now_s = 0.0
 
     def show_scene(self, geometry: Any, settings: Settings) -> None: ...
@@ -51,13 +51,19 @@ class Watched(NullViewer):
     def read_controls(self) -> Controls:
         # A frame for each step.
         self.now_s += 1 / 60
-        controls = super().read_controls()
-        self.is_frozen ^= controls.freeze
-        return controls
+        return super().read_controls()
 
-    def draw(self, view: View) -> None:
-        if not self.is_frozen:
-            self.seen.append((view.transducer_pose.tobytes(), *(p.tobytes() for p in view.images.values())))
+    def watch(self, frames: WindowFrames) -> None:
+        next_view = frames.next_view
+
+        def watched(controls: Controls) -> View:
+            view = next_view(controls)
+            if not frames.frozen:
+                images = (image.tobytes() for image in view.images.values())
+                self.seen.append((view.transducer_pose.tobytes(), *images))
+            return view
+
+        frames.next_view = watched
 
 
 def once(make: Any) -> Any:
@@ -108,7 +114,7 @@ def rehearsed(built, monkeypatch, out: Path, script: Any, log: Log | None = None
     monkeypatch.setattr("rehearsal.frame.perf_counter", lambda: viewer.now_s)
     asked, files = RehearseOptions(out=out, at=at_s), files_of(rehearsal, log=log)
     each = run.RehearsalRun(rehearsal, anatomy, "cpu", asked, files, viewer, OneStepSolver(rehearsal))
-    each.in_window()
+    each.in_window(prepare=viewer.watch)
     return viewer.seen, rehearsal.digest(), each.recorder and read_log(each.recorder.path)
 
 
