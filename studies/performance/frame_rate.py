@@ -73,7 +73,10 @@ class ScriptedHand:
 
     @property
     def running(self) -> bool:
-        return self.window.running and not self._passed_s > BEGIN_S + self.seconds
+        runs = self.window.running and self._passed_s <= BEGIN_S + self.seconds
+        if not runs and self._used_s is not None:
+            self.processor_s = self._used() - self._used_s
+        return runs
 
     @property
     def _passed_s(self) -> float:
@@ -98,10 +101,8 @@ class ScriptedHand:
         if self._passed_s > BEGIN_S and self._used_s is None:
             self._used_s = self._used()
             self.frames.times = self.times
-        if self._used_s is not None:
-            self.processor_s = self._used() - self._used_s
-            if self._passed_s - BEGIN_S >= MEMORY_EVERY_S * len(self.memory_mb):
-                self.memory_mb.append(sum(each.memory_info().rss for each in self._processes()) / 1e6)
+        if self._used_s is not None and self._passed_s - BEGIN_S >= MEMORY_EVERY_S * len(self.memory_mb):
+            self.memory_mb.append(sum(each.memory_info().rss for each in self._processes()) / 1e6)
 
     def picture(self) -> np.ndarray:
         """The window's picture."""
