@@ -4,6 +4,8 @@ Where there is no graphics card, Mesa imitates one at 100 ms a picture; this tak
 triangles drawn in their order with a depth buffer, blended by alpha, and clipped to a box of the window.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import taichi as ti
 import taichi.math as tm
@@ -25,12 +27,27 @@ LINE_NEARER = 1e-3
 Projected = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
+class Layer(NamedTuple):
+    """The pixels of a box before and after something was drawn, and their 1 / distance after it."""
+
+    drawn: Projected
+    box: Rect
+    before: np.ndarray
+    after: np.ndarray
+    depth: np.ndarray
+
+
 class SoftwareScene:
-    """Collects what is drawn from a camera in a window of a size [pixels]; ``render`` draws it into an image and forgets it."""
+    """Collects what is drawn from a camera in a window of a size [pixels]; ``render`` draws it into an image and forgets it.
+
+    The first mesh, which fills most of the view, is drawn again only if it has changed.
+    """
 
     def __init__(self, camera: OrbitCamera, size: tuple[int, int]) -> None:
         self.camera, self.size = camera, size
         self._depth = np.zeros(size, np.float32)
+        self._first: tuple[list[np.ndarray], Projected] | None = None
+        self._layer: Layer | None = None
         self._clear()
         self.look()
 
@@ -54,11 +71,22 @@ class SoftwareScene:
 
     def mesh(self, vertices, indices: np.ndarray, normals, per_vertex_color, two_sided: bool = False) -> None:
         """Add triangles of vertex ``indices`` (3 m,); fields (n,) of vertices [mm], normals, and colours with or without alpha."""
-        points, colours = array_of(vertices), array_of(per_vertex_color)
+        given = array_of(vertices), array_of(normals), array_of(per_vertex_color), indices
+        if self._drawn:
+            self._drawn.append(self._lit(*given, two_sided))
+            return
+        seen_by = self._eye, self._axes, self._ambient, np.array(self._lights), two_sided
+        inputs = list(map(np.asarray, (*given, *seen_by)))
+        if self._first is None or not all(map(np.array_equal, inputs, self._first[0])):
+            self._first = [each.copy() for each in inputs], self._lit(*given, two_sided)
+        self._drawn.append(self._first[1])
+
+    def _lit(self, points, normals, colours, indices, two_sided: bool) -> Projected:
         lit = np.ones((len(points), 4), np.float32)
         lit[:, : colours.shape[1]] = colours
-        self._light(points, array_of(normals), lit, two_sided)
-        self._drawn.append((self._projected(points), lit, np.asarray(indices, np.int32).reshape(-1, 3)))
+        lights = np.array([(self._eye, self._ambient), *self._lights], np.float32)
+        _light(points, normals, lights, int(two_sided), lit)
+        return self._projected(points), lit, np.array(indices, np.int32).reshape(-1, 3)
 
     def lines(self, points, width: float, color=None, per_vertex_color=None) -> None:
         """Add line segments between the points of a field (2 n,), of a width [pixels]."""
@@ -78,10 +106,6 @@ class SoftwareScene:
         triangles = (first + [[0, 1, 2], [2, 1, 3]]).reshape(-1, 3).astype(np.int32)
         self._drawn.append((corners.reshape(-1, 3), colours.reshape(-1, 4), triangles))
 
-    def _light(self, points: np.ndarray, normals: np.ndarray, colours: np.ndarray, two_sided: bool) -> None:
-        lights = np.array([(self._eye, self._ambient), *self._lights], np.float32)
-        _light(points, normals, lights, int(two_sided), colours)
-
     def _projected(self, points: np.ndarray) -> np.ndarray:
         """The points (n, 3) on the screen; what is nearer than the near plane or behind has a distance of 0."""
         local = (points - self._eye) @ self._axes
@@ -93,24 +117,33 @@ class SoftwareScene:
 
     def render(self, box: Rect, pixels: np.ndarray) -> None:
         """Draw all into a box of the window; ``pixels`` (width, height, 4) uint8 are its columns, bottom up."""
-        starts = np.cumsum([0, *(len(screen) for screen, _, _ in self._drawn)])
-        screen, colours = (np.concatenate([each[k] for each in self._drawn]) for k in (0, 1))
-        triangles = np.concatenate(
-            [each[2] + start for each, start in zip(self._drawn, starts, strict=False)], dtype=np.int32
-        )
+        drawn, columns = self._drawn, pixels.view(np.uint32)[..., 0]
         self._clear()
-        height = self.size[1]
-        _draw(
-            screen,
-            colours,
-            triangles,
-            box.left,
-            box.right,
-            height - box.bottom,
-            height - box.top,
-            self._depth,
-            pixels.view(np.uint32)[..., 0],
+        rows = slice(self.size[1] - box.bottom, self.size[1] - box.top)
+        part, depth = columns[box.left : box.right, rows], self._depth[box.left : box.right, rows]
+        layer = self._layer
+        if (
+            layer is None
+            or layer.drawn is not drawn[0]
+            or layer.box != box
+            or not np.array_equal(layer.before, part)
+        ):
+            before, depth[:] = part.copy(), 0.0
+            self._draw(drawn[:1], box, columns)
+            self._layer = Layer(drawn[0], box, before, part.copy(), depth.copy())
+        else:
+            part[:], depth[:] = layer.after, layer.depth
+        if drawn[1:]:
+            self._draw(drawn[1:], box, columns)
+
+    def _draw(self, drawn: list[Projected], box: Rect, columns: np.ndarray) -> None:
+        starts = np.cumsum([0, *(len(screen) for screen, _, _ in drawn)])
+        screen, colours = (np.concatenate([each[k] for each in drawn]) for k in (0, 1))
+        triangles = np.concatenate(
+            [each[2] + start for each, start in zip(drawn, starts, strict=False)], dtype=np.int32
         )
+        rows = self.size[1] - box.bottom, self.size[1] - box.top
+        _draw(screen, colours, triangles, box.left, box.right, *rows, self._depth, columns)
 
 
 @ti.kernel
@@ -152,14 +185,11 @@ def _draw(
     depth: ti.types.ndarray(ti.f32, ndim=2),
     pixels: ti.types.ndarray(ti.u32, ndim=2),
 ):
-    """Draw triangles in their order into columns left to right - 1 and rows bottom to top - 1."""
+    """Draw triangles in their order into columns left to right - 1 and rows bottom to top - 1, where nearer than ``depth``."""
     for n in range(BANDS * TASK):
         if n % TASK == 0:
             band = n // TASK
             first, end = left + (right - left) * band // BANDS, left + (right - left) * (band + 1) // BANDS
-            for column in range(first, end):
-                for row in range(bottom, top):
-                    depth[column, row] = 0.0
             for t in range(triangles.shape[0]):
                 corners = ti.Vector([triangles[t, 0], triangles[t, 1], triangles[t, 2]])
                 x = ti.Vector([screen[corners[0], 0], screen[corners[1], 0], screen[corners[2], 0]])

@@ -6,7 +6,7 @@ import pytest
 from render.camera import OrbitCamera
 from render.software_scene import SoftwareScene, _draw
 from render.window_layout import Rect
-from sim.fields import fields_of
+from sim.fields import fields_of, fill
 
 WIDTH, HEIGHT = 48, 40
 GREY = 60
@@ -18,7 +18,7 @@ def drawn(screen, colours, triangles, box=(0, WIDTH, 0, HEIGHT), pixels=None) ->
     """The pixels (WIDTH, HEIGHT, 3) after the triangles."""
     if pixels is None:
         pixels = np.full((WIDTH, HEIGHT, 4), GREY, np.uint8)
-    depth = np.full((WIDTH, HEIGHT), 7.0, np.float32)
+    depth = np.zeros((WIDTH, HEIGHT), np.float32)
     arrays = (
         np.asarray(screen, np.float32),
         np.asarray(colours, np.float32),
@@ -185,3 +185,37 @@ def test_a_line_has_its_width_and_is_drawn_over_the_surface_it_is_on(scene):
     scene.lines(ends, 3.0, color=(1.0, 0.0, 0.0))
     red = (shown(scene) == [255, 0, 0]).all(axis=2)
     assert red[WIDTH // 2].sum() == 3
+
+
+def test_what_is_kept_of_the_first_mesh_is_what_would_be_drawn_anew(scene):
+    points, normal = facing(scene)
+    bars = np.array([0, 1, 2, 0, 2, 3])
+    (vertices, normals, colours), behind = (
+        fields_of(at, np.tile(normal, (4, 1)), np.tile([0.4, 0.5, 0.6], (4, 1)), within=1)
+        for at in (points, 0.5 * points - 3.0 * normal)
+    )
+
+    def drawn(by: SoftwareScene, grey: int = GREY) -> np.ndarray:
+        by.look()
+        by.ambient_light((1.0, 1.0, 1.0))
+        by.mesh(vertices, bars, normals, colours)
+        by.mesh(behind[0], bars, behind[1], behind[2])
+        by.lines(behind[0], 2.0, color=(1.0, 0.0, 0.0))
+        pixels = np.full((WIDTH, HEIGHT, 4), grey, np.uint8)
+        by.render(Rect(0, 0, WIDTH, HEIGHT), pixels)
+        return pixels
+
+    def anew(grey: int = GREY) -> np.ndarray:
+        return drawn(SoftwareScene(scene.camera, (WIDTH, HEIGHT)), grey)
+
+    first = drawn(scene)
+    kept = scene._layer
+    assert np.array_equal(drawn(scene), first) and scene._layer is kept
+    # Another background, other colours, another place, another camera.
+    assert np.array_equal(drawn(scene, 20), anew(20))
+    fill((colours, np.tile([0.9, 0.1, 0.2], (4, 1))))
+    assert np.array_equal(drawn(scene), anew()) and not np.array_equal(anew(), first)
+    fill((vertices, points + 2.0))
+    assert np.array_equal(drawn(scene), anew())
+    scene.camera.orbit(0.1, 0.05)
+    assert np.array_equal(drawn(scene), anew())
