@@ -8,7 +8,7 @@ import numpy as np
 
 LEAST_ITERATIONS = 2
 LONGEST_STEP_S = 1 / 15
-# Steps that are longer than this wait for the user's input, so that they show it at once: until so much time is to be simulated.
+# Steps that had to become longer than this wait for the user's input, to show it at once, until so much time is to be simulated.
 SHORT_STEP_S, MOST_WAIT_S = 1 / 60, 0.1
 ROUNDING = 1e-6
 # A level is left for a cheaper one when its steps take more than BUSY of the time that they simulate, and for a dearer one when that
@@ -52,8 +52,8 @@ class Pace:
 
     @property
     def waits_for_input(self) -> bool:
-        """Whether steps are so long that they wait for the input, up to MOST_WAIT_S."""
-        return self.length_s > SHORT_STEP_S + ROUNDING
+        """Whether steps had to become so long that they wait for the input, up to MOST_WAIT_S."""
+        return self.level > 0 and self.length_s > SHORT_STEP_S + ROUNDING
 
     def lengths_s(self, due_s: float) -> list[float]:
         """Lengths of the steps that simulate a time [s], without what remains of it: as few and as equal as can be.
@@ -73,7 +73,7 @@ class Pace:
     def text(self, full: int) -> str:
         """What the user reads where steps are longer, or have fewer iterations than the ``full`` ones that are set; else empty."""
         length_s = self._length_s(len(self.levels) - 1) if self.waits_for_input else self.length_s
-        longer = f"LONGER STEPS   1/{1 / length_s:.0f} s" if length_s > self.time_step_s else ""
+        longer = f"LONGER STEPS   1/{1 / length_s:.0f} s" if self.levels[self.level].times_longer > 1 else ""
         iterations = self.iterations(full)
         fewer = f"REDUCED ITERATIONS   {iterations} of {full}" if iterations < full else ""
         return "   ".join(filter(None, [longer, fewer]))

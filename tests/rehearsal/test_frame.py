@@ -220,10 +220,10 @@ def test_without_contact_whoever_leads_by_hand_is_told_how_to_press(looping, mon
     looping.keys = Keys({**DEFAULT_KEYS, "push": "Return"})
     monkeypatch.setattr(frame, "ReplayInput", Fake)
     by_hand, tracked = (SimpleNamespace(is_manual=each) for each in (True, False))
-    told = []
+    notes = []
     for looping.source.user_input in (None, by_hand, tracked):
-        told.append(next_view(looping, Controls(Settings())).notes["B-mode"])
-    assert told == ["NO CONTACT", "NO CONTACT\nLeft button or Return presses", "NO CONTACT"]
+        notes.append(next_view(looping, Controls(Settings())).notes["B-mode"])
+    assert notes == ["NO CONTACT", "NO CONTACT\nLeft button or Return presses", "NO CONTACT"]
     looping.source.user_input = by_hand
     frozen = next_view(looping, Controls(Settings(), freeze=True))
     assert frozen.notes["B-mode"] == "NO CONTACT"

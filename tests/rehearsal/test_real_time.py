@@ -300,7 +300,14 @@ def test_long_steps_wait_for_the_input_and_simulate_what_is_due_then():
     pace = Pace(1 / 1000)
     pace.level = 7
     assert pace.length_s == 0.016 and not pace.waits_for_input
-    assert Pace(1 / 10).lengths_s(0.25) == [0.1, 0.1]
+    # Nor do those that are set so long, until the machine needs longer ones or fewer iterations.
+    pace = Pace(1 / 30)
+    assert not pace.waits_for_input and pace.lengths_s(0.1) == [1 / 30] and pace.text(8) == ""
+    pace.level = 1
+    assert pace.waits_for_input and pace.text(8) == "LONGER STEPS   1/15 s"
+    pace = Pace(1 / 10)
+    pace.level = 1
+    assert pace.lengths_s(0.25) == [0.1, 0.1] and pace.text(8) == "REDUCED ITERATIONS   6 of 8"
 
 
 def test_a_budget_limits_the_time_of_a_step():
