@@ -92,7 +92,11 @@ class Frames(Generic[Source]):
 
 @dataclass(kw_only=True)
 class WindowFrames(Frames[WindowInput]):
-    """The frames in a window; while it is frozen the solver makes no step."""
+    """The frames in a window; while it is frozen the solver makes no step.
+
+    While the solver makes the step towards an input, this process measures the last state and draws it in 3D; then it makes the image
+    of the new one.
+    """
 
     solver: SolverProcess
     viewer: Window
@@ -110,6 +114,9 @@ class WindowFrames(Frames[WindowInput]):
     _steps: list[Step] = field(default_factory=list, init=False)
     _rollbacks: int = field(init=False)
     _input_at_s: float | None = field(default=None, init=False)
+    # Probe and pose of the last image, and whether its state was measured.
+    _imaged: tuple[Probe, np.ndarray] | None = field(default=None, init=False)
+    _is_observed: bool = field(default=False, init=False)
     _notice: str = field(default="", init=False)
     _notice_until: float = field(default=0.0, init=False)
     _restored_until: float = field(default=0.0, init=False)
@@ -119,20 +126,24 @@ class WindowFrames(Frames[WindowInput]):
         self._rollbacks = self.source.session.rollbacks
 
     def run(self) -> None:
-        """Draw frames until the window is closed. The solver makes its next step while the last view is drawn."""
+        """Draw frames until the window is closed."""
         view: View | None = None
         while self.viewer.running:
             controls = self.viewer.read_controls()
             with self.times.stage("input"):
                 self.drive(controls)
             if view is not None:
-                self._draw(view, controls)
+                with self.times.stage("last state"):
+                    self._use_waiting_time(view)
             view = self.next_view(controls)
+            self._draw(view, controls)
             if controls.export:
                 self._save(partial(self._export, controls.settings, view))
+        self._observe_last()
 
     def next_view(self, controls: Controls) -> View:
         """Take the newest state over, and return its view."""
+        has_changed = not self._has_imaged_state
         with self.times.stage("state"):
             self.solver.collect()
             self.rehearsal.update_surfaces()
@@ -140,12 +151,30 @@ class WindowFrames(Frames[WindowInput]):
         probe = probe_with_settings(self.rehearsal.probe, controls.settings)
         with self.times.stage("image"):
             view = self.image(probe, controls.settings)
+        self._imaged, self._is_observed = (probe, self.rehearsal.pose), False
         for times_ms in (self.tally.step_ms, self.tally.slice_ms):
             del times_ms[:-MOST_TIMES]
         with self.times.stage("measurements"):
-            self.observe_window(probe)
+            if has_changed:
+                self.observe_window(probe)
             self._record_sweep(probe, view, controls)
             return self.present(view, probe, controls)
+
+    def _use_waiting_time(self, view: View) -> None:
+        """While the solver makes the next step, measure the last state and draw it in 3D, unless it has been changed since its image."""
+        before = self.measurements.latest
+        self._observe_last()
+        self.viewer.draw_scene(view, may_wait=self.measurements.latest is not before)
+
+    def _observe_last(self) -> None:
+        """Measure the state of the last image, unless that was done or it has been changed since."""
+        if self._imaged is not None and self._has_imaged_state and not self._is_observed:
+            self.observe_window(self._imaged[0])
+
+    @property
+    def _has_imaged_state(self) -> bool:
+        """Whether the rehearsal has the state of the last image: each that is taken over has a pose of its own."""
+        return self._imaged is not None and self.rehearsal.pose is self._imaged[1]
 
     def _draw(self, view: View, controls: Controls) -> None:
         with self.times.stage("drawing"):
@@ -190,6 +219,7 @@ class WindowFrames(Frames[WindowInput]):
     def observe_window(self, probe: Probe) -> None:
         """Measure and record, unless frozen."""
         if not self.frozen:
+            self._is_observed = True
             session = self.source.session
             rollbacks, self._rollbacks = session.rollbacks - self._rollbacks, session.rollbacks
             self.measurements.watch(session, probe, is_rollback=rollbacks > 0)

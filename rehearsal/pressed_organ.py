@@ -41,7 +41,7 @@ class Step:
 
     ``notice`` is the message of the divergence check if it restored the state. Where the steps follow a clock, ``input_s`` is the time
     of the input that the pose shows, ``late_ms`` how much later than due the step began, and ``pace`` says how it differs from what is
-    set.
+    set. ``awaited`` says whether it waited for its input, because steps had to become long.
     """
 
     pose: np.ndarray
@@ -52,6 +52,7 @@ class Step:
     input_s: float = 0.0
     late_ms: float = 0.0
     pace: str = ""
+    awaited: bool = False
 
 
 class PressedOrgan:

@@ -57,7 +57,10 @@ HELP_COLUMNS, HELP_PX, HELP_GAP_PX, FIGURES_GAP_PX = 2, 17, 12, 18
 
 
 class BackgroundImage:
-    """``pixels`` uint8 (width, height, 4) as GGUI wants them: columns first, bottom up."""
+    """``pixels`` uint8 (width, height, 4) as GGUI wants them: columns first, bottom up.
+
+    ``has_scene`` says whether ``draw_scene`` has drawn the 3D view since what is around it changed.
+    """
 
     def __init__(self, layout: WindowLayout, keys: Keys | None = None) -> None:
         self.layout, self.keys = layout, keys or Keys()
@@ -66,7 +69,7 @@ class BackgroundImage:
         self._rows = self.pixels.transpose(1, 0, 2)[::-1]
         self._view: View | None = None
         self._backdrop: tuple = ()
-        self._shows_help = False
+        self.has_scene = self._shows_help = False
         self._axes: np.ndarray | None = None
         self._status: str | None = None
         self._figures: Figures | None = None
@@ -77,13 +80,10 @@ class BackgroundImage:
         view: View,
         axes: np.ndarray,
         slow_figures: bool = False,
-        draw_scene: Callable[[np.ndarray], None] | None = None,
-        keeps_scene: bool = False,
     ) -> None:
         """Draw a view, with the compass for a camera's axes (3, 3): right, up and ahead, in patient coordinates.
 
-        With ``slow_figures``, figures change only every READOUT_PERIOD_S, so that they can be read. ``draw_scene`` draws the 3D view
-        into ``pixels``, if it is not drawn over them; with ``keeps_scene`` only where it must be drawn anew.
+        With ``slow_figures``, figures change only every READOUT_PERIOD_S, so that they can be read.
         """
         findings = first_of(view.findings, self.layout.most_findings)
         # What the backdrop depends on.
@@ -92,7 +92,7 @@ class BackgroundImage:
         if self._shows_help or self._backdrop != parts:
             self._rows[:, :, :3] = backdrop(self.layout, view, self.keys.of["help"])
             self._figures, self._axes, self._status, self._shows_help = None, None, None, False
-            self._empty_scene, keeps_scene = self._scene.copy(), False
+            self._empty_scene, self.has_scene = self._scene.copy(), False
         self._view, self._backdrop = view, parts
         for (name, image), box in zip(view.images.items(), image_boxes(self.layout, view), strict=True):
             paste_image(self._rows, box, image)
@@ -105,13 +105,17 @@ class BackgroundImage:
         if self._axes is None or not np.array_equal(axes, self._axes):
             self._put(self.layout.compass, compass_image(self.layout, axes))
             self._axes = axes
-        if draw_scene is not None and not keeps_scene:
-            boxes = [self.layout.compass, *([self.layout.findings(len(findings))] if findings else [])]
-            over = [self._rows[box.slices].copy() for box in boxes]
-            self._scene[:] = self._empty_scene
-            draw_scene(self.pixels)
-            for box, image in zip(boxes, over, strict=True):
-                self._rows[box.slices] = image
+
+    def draw_scene(self, draw: Callable[[np.ndarray], None]) -> None:
+        """Draw the 3D view into ``pixels``, behind what ``compose`` has drawn; ``draw`` does it."""
+        findings = self._figures[1] if self._figures is not None else {}
+        boxes = [self.layout.compass, *([self.layout.findings(len(findings))] if findings else [])]
+        over = [self._rows[box.slices].copy() for box in boxes]
+        self._scene[:] = self._empty_scene
+        draw(self.pixels)
+        for box, image in zip(boxes, over, strict=True):
+            self._rows[box.slices] = image
+        self.has_scene = True
 
     @property
     def _scene(self) -> np.ndarray:

@@ -116,6 +116,8 @@ class Window:
         self._scene_view = SceneView(geometry, self.camera)
         self._software = SoftwareScene(self.camera, size) if self._by_processor else None
         self._frame_at = self._scene_at = 0.0
+        # Whether `draw_scene` has dealt with the 3D view of the next frame.
+        self._is_ahead = False
         self._seen: tuple[object, ...] = ()
 
     def show_progress(self, text: str) -> None:
@@ -218,6 +220,13 @@ class Window:
 
     # Drawing
 
+    def draw_scene(self, view: View, may_wait: bool) -> None:
+        """Where the processor draws the 3D view, draw it already, for the next `draw`; with `may_wait` only if the user changed it."""
+        if self._software is not None and not self._help_shown and self._background.has_scene:
+            self._is_ahead = True
+            if not self._keeps_scene(may_wait):
+                self._draw_by_processor(self._software, view)
+
     def draw(self, view: View) -> None:
         """Show a view. Off-screen, only store it for `picture`."""
         self._view = view
@@ -270,9 +279,11 @@ class Window:
         if self._help_shown:
             self._background.show_help()
         else:
-            software = None if self._software is None else partial(self._draw_by_processor, view)
-            keeps = software is not None and self._keeps_scene()
-            self._background.compose(view, np.stack(self.camera.axes()), self._visible, software, keeps)
+            self._background.compose(view, np.stack(self.camera.axes()), self._visible)
+            keeps = self._is_ahead or self._keeps_scene()
+            if self._software is not None and not (keeps and self._background.has_scene):
+                self._draw_by_processor(self._software, view)
+            self._is_ahead = False
         self._put_image()
         if self._software is None:
             self._draw_scene(view)
@@ -287,18 +298,20 @@ class Window:
         # Without the 10 ms that Canvas.set_image needs to pack the pixels.
         self._canvas.canvas.set_image(get_field_info(self._background.pixels.view(np.uint32)[..., 0]))
 
-    def _draw_by_processor(self, view: View, pixels: np.ndarray) -> None:
+    def _draw_by_processor(self, software: SoftwareScene, view: View) -> None:
         """Draw the 3D view into the background image."""
-        if self._software is not None:
-            self._software.look()
-            self._scene_view.draw(self._software, view, self.settings)
-            self._software.render(self.layout.scene, pixels)
+        software.look()
+        self._scene_view.draw(software, view, self.settings)
+        self._background.draw_scene(partial(software.render, self.layout.scene))
 
-    def _keeps_scene(self) -> bool:
-        """Whether the 3D view may stay as it is in this frame: for SCENE_S where frames are slow, unless the user changes the view."""
+    def _keeps_scene(self, may_wait: bool = False) -> bool:
+        """Whether the 3D view may stay as it is in this frame: for SCENE_S where frames are slow, or where it may wait, unless the user
+        changes the view.
+        """
         now, seen = time.perf_counter(), (*self.camera.state, dataclasses.astuple(self.settings))
         is_slow, self._frame_at = now - self._frame_at > SLOW_FRAME_S, now
-        keeps = is_slow and now - self._scene_at < SCENE_S and seen == self._seen and self._visible
+        waits = may_wait or now - self._scene_at < SCENE_S
+        keeps = is_slow and waits and seen == self._seen and self._visible
         if not keeps:
             self._scene_at, self._seen = now, seen
         return keeps

@@ -24,6 +24,8 @@ class NullViewer:
         self._running = self._running and not controls.quit
         return controls
 
+    def draw_scene(self, view: View, may_wait: bool) -> None: ...
+
     def draw(self, view: View) -> None:
         self.frames += 1
 

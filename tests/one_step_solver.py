@@ -37,4 +37,4 @@ class OneStepSolver:
             self._make(pose, float(length_s), None)
 
     def _make(self, pose: np.ndarray, length_s: float | None, iterations: int | None) -> None:
-        self.on_step(self.rehearsal.timed_step(pose, length_s, iterations))
+        self.on_step(self.rehearsal.timed_step(pose.copy(), length_s, iterations))

@@ -131,7 +131,15 @@ class SolverLoop:
         length_s, text = self._lengths_s.popleft(), pace.text(full)
         self._simulated_s += length_s
         step = self.organ.timed_step(self._path.pose_after(length_s), length_s, pace.iterations(full))
-        self._hand_on(replace(step, input_s=self._path.input_s, late_ms=1000 * late_s, pace=text))
+        self._hand_on(
+            replace(
+                step,
+                input_s=self._path.input_s,
+                late_ms=1000 * late_s,
+                pace=text,
+                awaited=pace.waits_for_input,
+            )
+        )
         pace.watch(step.took_ms, length_s)
 
     def _plan_steps(self) -> None:

@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,8 @@ from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
 from ultrasound.probe import Probe
 
-# How long the process may take to end in order.
-END_S = 0.5
+# How long the process may take to end in order, and how long a picture waits for the step that shows its input.
+END_S, MOST_WAIT_S = 0.5, 0.1
 
 
 class SolverEnded(UserError):
@@ -53,6 +54,8 @@ class SolverProcess:
         self.pending = 0
         self._received = 0
         self._uncollected: deque[Step] = deque()
+        # The time of the last input before the newest, while a step towards the newest is to come.
+        self._input_s, self._awaits_after_s, self._awaited = 0.0, np.inf, False
 
     def build(self, scene: Scene, anatomy: LoadedAnatomy, probe: Probe, arch: str, pace: Pace) -> None:
         """Build the solver of a scene on a backend; ``pace`` chooses its steps by the clock."""
@@ -69,13 +72,17 @@ class SolverProcess:
         self._send("share", self._memory.name)
 
     def collect(self) -> None:
-        """Set the rehearsal to the newest state."""
-        while self._connection.poll():
+        """Set the rehearsal to the newest state: where steps wait for the input, to one that shows the newest input."""
+        until_s = perf_counter() + MOST_WAIT_S
+        while self._connection.poll(
+            max(until_s - perf_counter(), 0.0) if self._awaits_after_s < np.inf else 0.0
+        ):
             self._receive_step()
         self._take()
 
     def pause(self) -> None:
         """Wait for the end of the steps that are being made; then as ``collect``."""
+        self._awaits_after_s = np.inf
         if not self.is_paused:
             self._send("pause")
             while self._receive_step():
@@ -99,6 +106,9 @@ class SolverProcess:
     def go_to(self, pose: np.ndarray, input_s: float, took_s: float) -> None:
         """Move the transducer to a pose (4, 4) that the input had at a time [s] (``perf_counter``), a time [s] after the last one."""
         self._send("go_to", pose, input_s, took_s)
+        if self._awaited:
+            self._awaits_after_s = self._input_s
+        self._input_s = input_s
 
     def play(self, poses: np.ndarray, lengths_s: np.ndarray) -> None:
         """Make steps to these poses (n, 4, 4), of these lengths (n,) [s], at once; the solver stays paused."""
@@ -121,6 +131,9 @@ class SolverProcess:
         message = self._receive()
         if message == PAUSED:
             return False
+        self._awaited = message.awaited
+        if message.input_s > self._awaits_after_s or not message.awaited:
+            self._awaits_after_s = np.inf
         self._uncollected.append(message)
         self._received += 1
         return True

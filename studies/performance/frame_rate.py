@@ -91,6 +91,10 @@ class ScriptedHand:
         controls.press = now_s % PRESS_PERIOD_S < PRESS_S
         return controls
 
+    def draw_scene(self, view: View, may_wait: bool) -> None:
+        """Draw the 3D view ahead."""
+        self.window.draw_scene(view, may_wait)
+
     def draw(self, view: View) -> None:
         """Draw a view, and measure."""
         self.window.draw(view)

@@ -36,6 +36,7 @@ class Fake:
     def __init__(self) -> None:
         self.probe, self.origin = load_probe("linear"), np.array([100.0, 200.0, 300.0])
         self.settings, self.notice, self.status, self.steps = SimpleNamespace(time_step_s=STEP_S), "", "", 0
+        self.pose, self.latest = np.eye(4), None
 
     @property
     def session(self) -> SimpleNamespace:
@@ -110,6 +111,67 @@ def looping(monkeypatch, tmp_path, sent) -> WindowFrames:
 def next_view(frames: WindowFrames, controls: Controls) -> View:
     frames.drive(controls)
     return frames.next_view(controls)
+
+
+class Ordered(Fake):
+    """Notes what is done; as a viewer too, with scripted controls."""
+
+    def __init__(self, script: list[Controls]) -> None:
+        super().__init__()
+        self.script, self.done = script, []
+
+    @property
+    def running(self) -> bool:
+        return bool(self.script)
+
+    def read_controls(self) -> Controls:
+        self.done.append("|")
+        return self.script.pop(0)
+
+    def drive(self, solver: Fake, controls: Controls, elapsed_s: float) -> None:
+        # An undo changes the state at once.
+        self.pose = np.eye(4) if controls.undo else self.pose
+        self.done.append("undo" if controls.undo else "input")
+
+    def collect(self) -> None:
+        self.on_step(self.timed_step(self.next_pose(Controls(Settings()))))
+        self.pose = np.eye(4)
+        self.done.append("state")
+
+    def image_view(self, *given) -> View:
+        self.done.append("image")
+        return super().image_view(*given)
+
+    def watch(self, *_, **__) -> str:
+        # A new measurement every second time.
+        measured = self.done.count("measure") % 2 == 0
+        self.latest = object() if measured else self.latest
+        self.done.append("measure")
+        return ""
+
+    def draw_scene(self, view: View, may_wait: bool) -> None:
+        self.done.append("3D may wait" if may_wait else "3D")
+
+    def draw(self, view: View) -> None:
+        self.done.append("draw")
+
+
+def test_a_state_is_measured_once_while_the_next_step_is_made_unless_it_has_changed(monkeypatch, looping):
+    live, undo = Controls(Settings()), Controls(Settings(), undo=True)
+    ordered = Ordered([live, live, live, undo, live])
+    monkeypatch.setattr(frame, "image_view", ordered.image_view)
+    looping.rehearsal = looping.source = looping.measurements = looping.solver = looping.viewer = ordered
+    ordered.on_step = looping.take
+    looping._measured = lambda view, *_: SimpleNamespace(view=view)
+    looping.run()
+    frames = [frame.split() for frame in " ".join(ordered.done).replace("may wait", "later").split("|")[1:]]
+    assert frames == [
+        ["input", "state", "image", "measure", "draw"],
+        ["input", "3D", "state", "image", "draw"],
+        ["input", "measure", "3D", "state", "image", "draw"],
+        ["undo", "3D", "state", "image", "measure", "draw"],
+        ["input", "3D", "state", "image", "draw", "measure"],
+    ]
 
 
 def test_each_frame_goes_to_the_link_as_it_is_shown(looping, sent):

@@ -220,6 +220,59 @@ def test_short_steps_are_made_by_the_clock(monkeypatch):
     assert [place for _, _, place in loop.begun] == pytest.approx([0.0, 0.0, moved, 2 * moved, 1.0, 1.0])
 
 
+class ScriptedPipe:
+    """Gives steps at given times, by a clock that only waiting advances."""
+
+    def __init__(self, monkeypatch, steps: list[tuple[float, Step]]) -> None:
+        self.now_s, self.steps, self.sent = 0.0, steps, []
+        monkeypatch.setattr("rehearsal.real_time.solver_process.perf_counter", lambda: self.now_s)
+
+    def poll(self, wait_s: float = 0.0) -> bool:
+        comes_s = self.steps[0][0] if self.steps else np.inf
+        self.now_s = max(self.now_s, min(self.now_s + wait_s, comes_s))
+        return self.now_s >= comes_s
+
+    def recv(self) -> Step:
+        return self.steps.pop(0)[1]
+
+    def send(self, request: tuple) -> None:
+        self.sent.append(request)
+
+    def close(self) -> None: ...
+
+
+def collected_at(monkeypatch, steps: list[tuple[float, float, bool]], inputs_s: list[float]) -> list[float]:
+    """When the state of each input was collected; steps are (made at, of the input at, awaited) [s]."""
+    made = [
+        (at_s, Step(np.eye(4), 1 / 15, 4, 10.0, input_s=of_s, awaited=awaited))
+        for at_s, of_s, awaited in steps
+    ]
+    solver = SolverProcess()
+    solver._process.kill()
+    solver._connection.close()
+    solver._connection = pipe = ScriptedPipe(monkeypatch, made)
+    times = []
+    for input_s in inputs_s:
+        pipe.now_s = max(pipe.now_s, input_s)
+        solver.go_to(np.eye(4), input_s, 0.06)
+        solver.collect()
+        times.append(pipe.now_s)
+    solver.close()
+    return times
+
+
+def test_a_picture_waits_for_the_step_of_its_input_where_steps_wait_for_inputs(monkeypatch):
+    # The first input knows of no step that waited; the third is on its way when the second step for the input before comes.
+    steps = [(0.0, 0.0, True), (0.115, 0.1, True), (0.205, 0.1, True), (0.22, 0.2, True)]
+    assert collected_at(monkeypatch, steps, [0.0, 0.1, 0.2]) == pytest.approx([0.0, 0.115, 0.22])
+
+
+def test_a_picture_does_not_wait_for_steps_by_the_clock_nor_long_for_any(monkeypatch):
+    assert collected_at(monkeypatch, [(0.0, 0.0, False), (0.11, 0.1, False)], [0.0, 0.1]) == [0.0, 0.1]
+    late = collected_at(monkeypatch, [(0.0, 0.0, True), (0.5, 0.1, True)], [0.0, 0.1])
+    assert late == pytest.approx([0.0, 0.2])
+
+
 # The path of the transducer
 
 

@@ -324,6 +324,21 @@ def test_processor_and_vulkan_draw_the_same_picture(window):
     assert np.mean(away > 3) < 0.02 and np.ptp(shown[True]) > 100
 
 
+@pytest.mark.parametrize("window", [True], indirect=True)
+def test_a_3d_view_that_was_drawn_ahead_is_shown_beside_a_newer_image(window):
+    opened, field, vertices = window
+    opened.draw(_far_view())
+    first = opened.picture()
+    opened.draw_scene(_far_view(), may_wait=False)
+    fill((field, (vertices + np.float32([18.0, 0.0, 0.0])).astype(np.float32)))
+    newer = dataclasses.replace(_far_view(), images={"CT": 255 - _far_view().images["CT"]})
+    opened.draw(newer)
+    scene, panel = opened.layout.scene.slices, opened.layout.panel.slices
+    ahead, moved = opened.picture(), opened.picture()
+    assert np.array_equal(ahead[scene], first[scene]) and np.any(ahead[panel] != first[panel])
+    assert np.any(moved[scene] != ahead[scene]) and np.array_equal(moved[panel], ahead[panel])
+
+
 def test_two_pictures_of_one_view_are_the_same(window):
     opened, _, _ = window
     opened.draw(_view(status="FROZEN"))
