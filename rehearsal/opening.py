@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from rehearsal.real_time.solver_process import SolverProcess
     from rehearsal.rehearsal import Rehearsal
     from rehearsal.run import RehearsalRun
+    from render.viewer import View
     from render.window import Window
 
 
@@ -67,9 +68,14 @@ def opened(asked: RehearseOptions) -> Iterator["RehearsalRun"]:
                 scene, chosen = scene_within_budget(files, anatomy, arch, progress, asked)
                 if not asked.headless:
                     viewer = resources.enter_context(window(asked, files.keys))
-            rehearsal = built(asked, scene, anatomy, files.probe, arch, solver, progress)
+            if solver is None or viewer is None:
+                rehearsal = built_headless(asked, scene, anatomy, files.probe, progress)
+            else:
+                rehearsal = built_for_window(
+                    asked, scene, anatomy, files.probe, arch, solver, viewer, progress
+                )
             build_s = perf_counter() - began
-            if not asked.no_pictures:
+            if solver is None and not asked.no_pictures:
                 progress("Building the model: the first picture")
                 compile_picture(rehearsal)
         start.begin("First picture")
@@ -108,24 +114,37 @@ def window(asked: RehearseOptions, keys: Keys) -> Iterator["Window"]:
         opened.close()
 
 
-def built(
+def built_headless(
+    asked: RehearseOptions, scene: Scene, anatomy: LoadedAnatomy, probe: Probe, progress: ReportProgress
+) -> "Rehearsal":
+    """The rehearsal without a window."""
+    from rehearsal.rehearsal import Rehearsal
+
+    return Rehearsal(scene, anatomy, probe, progress, scene.image.mode != "ct" and not asked.no_pictures)
+
+
+def built_for_window(
     asked: RehearseOptions,
     scene: Scene,
     anatomy: LoadedAnatomy,
     probe: Probe,
     arch: str,
-    solver: "SolverProcess | None",
+    solver: "SolverProcess",
+    viewer: "Window",
     progress: ReportProgress,
 ) -> "Rehearsal":
-    """The rehearsal; the process of the solver builds its part at the same time."""
+    """The rehearsal that a window shows. While the process of the solver brings the tissue to rest, this one prepares the first picture."""
+    from rehearsal.open_window import geometry_of, initial_settings
     from rehearsal.rehearsal import Rehearsal
 
-    needs_b_mode = scene.image.mode != "ct" and not asked.no_pictures
-    if solver is None:
-        return Rehearsal(scene, anatomy, probe, progress, needs_b_mode)
     time_step_s = scene.solver.time_step_s if asked.rate is None else 1.0 / asked.rate
     solver.build(scene, anatomy, probe, arch, Pace(time_step_s, asked.budget_ms or np.inf))
-    rehearsal = Rehearsal(scene, anatomy, probe, progress, needs_b_mode, solver.settled)
+    rehearsal = Rehearsal(scene, anatomy, probe, progress, scene.image.mode != "ct", settles=False)
+    progress("Building the model: the first picture")
+    viewer.show_scene(geometry_of(rehearsal), initial_settings(rehearsal))
+    viewer.prepare(compile_picture(rehearsal))
+    progress("Building the model: the tissue comes to rest")
+    rehearsal.take_settled(solver.settled())
     solver.attach(rehearsal)
     return rehearsal
 
@@ -140,13 +159,13 @@ def check_vulkan() -> None:
         )
 
 
-def compile_picture(rehearsal: "Rehearsal") -> None:
-    """Compute one image in advance, so that the first frame need not wait for its kernels."""
+def compile_picture(rehearsal: "Rehearsal") -> "View":
+    """Compute one view in advance, so that the first frame need not wait for its kernels."""
     from rehearsal.frame import image_view
     from rehearsal.measurements.run_report import Tally
     from rehearsal.open_window import initial_settings
 
-    image_view(rehearsal, rehearsal.probe, initial_settings(rehearsal), Tally(0.0))
+    return image_view(rehearsal, rehearsal.probe, initial_settings(rehearsal), Tally(0.0))
 
 
 def scene_within_budget(

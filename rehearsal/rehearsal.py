@@ -3,7 +3,6 @@
 The window, the headless run and every study use this class, so that they compute the same.
 """
 
-from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 
@@ -51,8 +50,8 @@ class RehearsalState(OrganState):
 class Rehearsal(PressedOrgan):
     """A scene on the device: the organ under its probe, its surfaces, its images, and the manipulator that moves the probe.
 
-    ``progress`` is called with what is being built; ``needs_b_mode`` prepares the B-mode image meanwhile. ``settled`` gives the
-    state of the organ at rest where another process computes it.
+    ``progress`` is called with what is being built; ``needs_b_mode`` prepares the B-mode image meanwhile. Without
+    ``settles`` the organ is as it was segmented until ``take_settled``, for where another process brings it to rest.
     """
 
     def __init__(
@@ -62,7 +61,7 @@ class Rehearsal(PressedOrgan):
         probe: Probe | None = None,
         progress: ReportProgress = no_progress,
         needs_b_mode: bool = False,
-        settled: Callable[[], OrganState] | None = None,
+        settles: bool = True,
     ) -> None:
         scanned, acoustics = None, None
         if anatomy.ct is not None:
@@ -78,10 +77,11 @@ class Rehearsal(PressedOrgan):
         progress("Building the model: surfaces")
         self._build_surfaces()
         self._build_scanner(scanned, acoustics)
-        progress("Building the model: the tissue comes to rest")
-        self._take_settled(self.settle() if settled is None else settled())
+        if settles:
+            progress("Building the model: the tissue comes to rest")
+        self.take_settled(self.settle() if settles else self.snapshot_of_organ())
 
-    def _take_settled(self, state: OrganState) -> None:
+    def take_settled(self, state: OrganState) -> None:
         """Begin with the organ at rest and the transducer just touching."""
         self.restore_organ(state)
         self.divergence_check.set_initial_state()

@@ -20,7 +20,7 @@ from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.run_report import Tally
 from rehearsal.measurements.session_summary import summary_text
 from rehearsal.notices import Notices
-from rehearsal.open_window import geometry_of, initial_settings
+from rehearsal.open_window import initial_settings
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.plans_in_window import PlanControl
 from rehearsal.real_time.solver_process import SolverProcess
@@ -68,14 +68,13 @@ class RehearsalRun:
         self.measurements = LiveMeasurements(self.rehearsal, guide)
 
     def in_window(self, prepare: Callable[[WindowFrames], None] = lambda frames: None) -> None:
-        """Run in a window, after a replay if there is one; ``prepare`` is called with its frames before the first.
+        """Run in a window that shows the scene, after a replay if there is one; ``prepare`` is called with its frames before the first.
 
         Raises SessionError, SolverEnded.
         """
         if self.solver is None or self.viewer is None:
             raise ValueError("expected a window and the process of the solver")
         viewer = self.viewer
-        viewer.show_scene(geometry_of(self.rehearsal), initial_settings(self.rehearsal))
         replay = None if self.files.log is None else self._replay(self.files.log, viewer.settings)
         source = self._user_input() if replay is None else self._replay_input(replay)
         text = f"The window is open, {self.start.now_s:.0f} s after the start; {{help}} shows the keys, {{quit}} quits."

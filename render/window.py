@@ -120,6 +120,13 @@ class Window:
         self._is_ahead = False
         self._seen: tuple[object, ...] = ()
 
+    def prepare(self, view: View) -> None:
+        """Where the processor draws the 3D view, draw it once without showing it, so that the first `draw` need not wait for its kernels."""
+        if self._software is not None:
+            self._software.look()
+            self._scene_view.draw(self._software, view, self.settings)
+            self._software.render(self.layout.scene, self._background.pixels.copy())
+
     def show_progress(self, text: str) -> None:
         """Show what is being prepared."""
         if self._visible:

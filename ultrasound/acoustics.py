@@ -5,6 +5,7 @@ within a kidney are classified by HU: no agent lowers parenchyma to fat or raise
 so that it needs a label.
 """
 
+import json
 import tomllib
 from collections.abc import Mapping
 from functools import cache
@@ -15,6 +16,7 @@ import numpy as np
 from scipy import ndimage
 
 from errors import UserError
+from sim.stored_arrays import stored
 
 TISSUES = Path(__file__).parent / "acoustic_tissues.toml"
 # Amplitude of renal cortex relative to a perfect reflector: its speckle is some 16 dB below the echo of fat on kidney.
@@ -70,6 +72,21 @@ def impedance_of_hu(hu: np.ndarray) -> np.ndarray:
     offset = np.select(pieces, [-5.680404011, 103.6151457, 539.9977189], 348.8555178).astype(np.float32)
     density = np.maximum(slope * h + offset, np.float32(1.2))
     return density * (density + np.float32(349)) / np.float32(0.893e6)
+
+
+def stored_properties(
+    hu: np.ndarray, labels: np.ndarray | None, tissue_of_label: Mapping[int, str], spacing_mm: np.ndarray
+) -> np.ndarray:
+    """As ``properties``, but computed only once from the same arguments. Raises TissueError."""
+    tissues, table = json.dumps(dict(tissue_of_label)), TISSUES.read_text("utf-8")
+    return stored(_properties_of_texts, hu, labels, tissues, table, spacing_mm)[0]
+
+
+def _properties_of_texts(
+    hu: np.ndarray, labels: np.ndarray | None, tissues: str, table: str, spacing_mm: np.ndarray
+) -> tuple[np.ndarray]:
+    tissue_of_label = {int(label): tissue for label, tissue in json.loads(tissues).items()}
+    return (properties(hu, labels, tissue_of_label, spacing_mm),)
 
 
 def properties(

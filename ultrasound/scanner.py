@@ -17,7 +17,7 @@ from trimesh.intersections import mesh_plane
 
 from sim.embedding import Embedding, Unmoved
 from sim.fields import array_of, field_of, fill
-from ultrasound.acoustics import check_tissues, properties
+from ultrasound.acoustics import check_tissues, stored_properties
 from ultrasound.bmode import BMode
 from ultrasound.probe import DetailLevel, Mode, Probe
 from ultrasound.probe_manipulator import ImagePlane
@@ -58,7 +58,7 @@ class ScannedAnatomy:
 def start_acoustics(anatomy: ScannedAnatomy) -> Future[np.ndarray]:
     """Start computing the acoustic properties that B-mode images need, on a thread of its own."""
     worker = ThreadPoolExecutor(1)
-    values = worker.submit(properties, anatomy.hu, anatomy.labels, anatomy.tissues, anatomy.voxel_mm)
+    values = worker.submit(stored_properties, anatomy.hu, anatomy.labels, anatomy.tissues, anatomy.voxel_mm)
     worker.shutdown(wait=False)
     return values
 

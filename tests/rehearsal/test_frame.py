@@ -413,9 +413,8 @@ def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scen
 
 def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path, sent):
     link, given = SimpleNamespace(send=lambda *live: sent.append(LiveImage(*live))), []
-    viewer = SimpleNamespace(show_scene=lambda *_: None, settings=Settings())
+    viewer = SimpleNamespace(settings=Settings())
     monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide: None)
-    monkeypatch.setattr(run, "geometry_of", lambda rehearsal: None)
     monkeypatch.setattr(run, "initial_settings", lambda rehearsal: Settings())
     looping = SimpleNamespace(run=lambda: None)
     looping.plans = looping.sweeping = SimpleNamespace(stop=lambda: None, end=lambda: "")
@@ -444,7 +443,7 @@ def test_the_command_opens_the_link_for_as_long_as_it_runs_and_names_its_scene(m
         reached.append(each.link is not None and each.link.port == port and each.asked.scene == scene)
 
     monkeypatch.setattr(opening, "start_taichi", lambda arch: "cpu")
-    monkeypatch.setattr(opening, "built", lambda *_: None)
+    monkeypatch.setattr(opening, "built_headless", lambda *_: None)
     monkeypatch.setattr(opening, "compile_picture", lambda rehearsal: None)
     monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide: None)
     monkeypatch.setattr(run.RehearsalRun, "headless", headless_run)

@@ -25,7 +25,7 @@ LONGEST_WAIT_S = 30.0
 RATE = 200.0
 
 
-def small_rehearsal(settled=None) -> Rehearsal:
+def small_rehearsal() -> Rehearsal:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=15.0)
     scene = Scene(
         anatomy=AnatomyFiles(),
@@ -33,7 +33,7 @@ def small_rehearsal(settled=None) -> Rehearsal:
         press={"warm_up_steps": 3},
     )
     scene = with_options(scene, {"tissue.cell_mm": 6.0})
-    return Rehearsal(scene, LoadedAnatomy(ball, None, None, ()), settled=settled)
+    return Rehearsal(scene, LoadedAnatomy(ball, None, None, ()))
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def started(one_device) -> Iterator[SolverProcess]:
     copy = small_rehearsal()
     anatomy = LoadedAnatomy(trimesh.creation.icosphere(subdivisions=3, radius=15.0), None, None, ())
     solver.build(copy.scene, anatomy, copy.probe, "cpu", Pace(1 / RATE))
-    copy._take_settled(solver.settled())
+    copy.take_settled(solver.settled())
     solver.attach(copy)
     yield solver
     solver.close()

@@ -46,8 +46,6 @@ class Watched(NullViewer):
         self.seen: list[tuple] = []
         self.now_s = 0.0
 
-    def show_scene(self, geometry: Any, settings: Settings) -> None: ...
-
     def read_controls(self) -> Controls:
         # A frame for each step.
         self.now_s += 1 / 60
