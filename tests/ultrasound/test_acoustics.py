@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from sim import stored_arrays
+from ultrasound import acoustics
 from ultrasound.acoustics import (
     ATTENUATION,
     BACKSCATTER,
@@ -13,6 +15,7 @@ from ultrasound.acoustics import (
     TissueError,
     impedance_of_hu,
     properties,
+    stored_properties,
     tissue_table,
 )
 
@@ -152,6 +155,25 @@ def test_an_unknown_tissue_is_refused_with_those_known():
         ) as refused:
             properties(hu, labels, {1: name})
         assert all(tissue in str(refused.value) for tissue in TISSUES)
+
+
+def test_stored_properties_are_computed_once_and_anew_for_another_table(monkeypatch, tmp_path):
+    computed: list[int] = []
+    monkeypatch.setattr(stored_arrays, "FOLDER", tmp_path / "arrays")
+    monkeypatch.setattr(acoustics, "properties", lambda *given: computed.append(1) or properties(*given))
+    hu = np.random.default_rng(0).integers(-50, 90, (9, 8, 7)).astype(np.float32)
+    labels, spacing = np.zeros(hu.shape, np.uint8), np.array([1.0, 2.0, 3.0])
+    labels[3:6, 2:6, 2:5] = 2
+    for tissues in ({2: "tumour"}, {2: "kidney"}):
+        expected = properties(hu, labels, tissues, spacing)
+        for _ in range(2):
+            assert np.array_equal(stored_properties(hu, labels, tissues, spacing), expected)
+    assert len(computed) == 2
+    table = tmp_path / "tissues.toml"
+    table.write_text(f"{acoustics.TISSUES.read_text('utf-8')}\n# Changed.\n", "utf-8")
+    monkeypatch.setattr(acoustics, "TISSUES", table)
+    stored_properties(hu, labels, tissues, spacing)
+    assert len(computed) == 3
 
 
 def test_the_same_voxels_have_the_same_properties():
