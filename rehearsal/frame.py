@@ -186,6 +186,9 @@ class WindowFrames(Frames[WindowInput]):
     def drive(self, controls: Controls) -> None:
         """Apply the keys of freeze, cine and plans; then tell the solver what to do, unless frozen."""
         ends_freeze = (controls.reset, controls.undo, controls.redo, controls.bookmark, controls.to_bookmark)
+        if any(ends_freeze):
+            # They change the state, whose image counts for the coverage.
+            self._observe_last()
         if controls.freeze or (self.frozen and (any(ends_freeze) or controls.take_over)):
             self.frozen = not self.frozen
             self.times.restart()

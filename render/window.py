@@ -123,9 +123,7 @@ class Window:
     def prepare(self, view: View) -> None:
         """Where the processor draws the 3D view, draw it once without showing it, so that the first `draw` need not wait for its kernels."""
         if self._software is not None:
-            self._software.look()
-            self._scene_view.draw(self._software, view, self.settings)
-            self._software.render(self.layout.scene, self._background.pixels.copy())
+            self._render(self._software, view, self._background.pixels.copy())
 
     def show_progress(self, text: str) -> None:
         """Show what is being prepared."""
@@ -307,9 +305,13 @@ class Window:
 
     def _draw_by_processor(self, software: SoftwareScene, view: View) -> None:
         """Draw the 3D view into the background image."""
+        self._background.draw_scene(partial(self._render, software, view))
+
+    def _render(self, software: SoftwareScene, view: View, pixels: np.ndarray) -> None:
+        """Render the 3D view into pixels as those of the background image."""
         software.look()
         self._scene_view.draw(software, view, self.settings)
-        self._background.draw_scene(partial(software.render, self.layout.scene))
+        software.render(self.layout.scene, pixels)
 
     def _keeps_scene(self, may_wait: bool = False) -> bool:
         """Whether the 3D view may stay as it is in this frame: for SCENE_S where frames are slow, or where it may wait, unless the user

@@ -54,8 +54,9 @@ class SolverProcess:
         self.pending = 0
         self._received = 0
         self._uncollected: deque[Step] = deque()
-        # The time of the last input before the newest, while a step towards the newest is to come.
-        self._input_s, self._awaits_after_s, self._awaited = 0.0, np.inf, False
+        # The times of the input before the newest and of the newest, and the last step that was received.
+        self._inputs_s = 0.0, 0.0
+        self._last_step: Step | None = None
 
     def build(self, scene: Scene, anatomy: LoadedAnatomy, probe: Probe, arch: str, pace: Pace) -> None:
         """Build the solver of a scene on a backend; ``pace`` chooses its steps by the clock."""
@@ -74,15 +75,12 @@ class SolverProcess:
     def collect(self) -> None:
         """Set the rehearsal to the newest state: where steps wait for the input, to one that shows the newest input."""
         until_s = perf_counter() + MOST_WAIT_S
-        while self._connection.poll(
-            max(until_s - perf_counter(), 0.0) if self._awaits_after_s < np.inf else 0.0
-        ):
+        while self._connection.poll(max(until_s - perf_counter(), 0.0) if self._awaits_step else 0.0):
             self._receive_step()
         self._take()
 
     def pause(self) -> None:
         """Wait for the end of the steps that are being made; then as ``collect``."""
-        self._awaits_after_s = np.inf
         if not self.is_paused:
             self._send("pause")
             while self._receive_step():
@@ -106,9 +104,7 @@ class SolverProcess:
     def go_to(self, pose: np.ndarray, input_s: float, took_s: float) -> None:
         """Move the transducer to a pose (4, 4) that the input had at a time [s] (``perf_counter``), a time [s] after the last one."""
         self._send("go_to", pose, input_s, took_s)
-        if self._awaited:
-            self._awaits_after_s = self._input_s
-        self._input_s = input_s
+        self._inputs_s = self._inputs_s[1], input_s
 
     def play(self, poses: np.ndarray, lengths_s: np.ndarray) -> None:
         """Make steps to these poses (n, 4, 4), of these lengths (n,) [s], at once; the solver stays paused."""
@@ -126,14 +122,18 @@ class SolverProcess:
             self._memory.close()
             self._memory = None
 
+    @property
+    def _awaits_step(self) -> bool:
+        """Whether steps wait for the input, and none towards the newest one was received."""
+        last = self._last_step
+        return not self.is_paused and last is not None and last.awaited and last.input_s <= self._inputs_s[0]
+
     def _receive_step(self) -> bool:
         """Receive a step; return whether it was one, and not the answer to a pause."""
         message = self._receive()
         if message == PAUSED:
             return False
-        self._awaited = message.awaited
-        if message.input_s > self._awaits_after_s or not message.awaited:
-            self._awaits_after_s = np.inf
+        self._last_step = message
         self._uncollected.append(message)
         self._received += 1
         return True

@@ -169,7 +169,7 @@ def test_a_state_is_measured_once_while_the_next_step_is_made_unless_it_has_chan
         ["input", "state", "image", "measure", "draw"],
         ["input", "3D", "state", "image", "draw"],
         ["input", "measure", "3D", "state", "image", "draw"],
-        ["undo", "3D", "state", "image", "measure", "draw"],
+        ["measure", "undo", "3D", "state", "image", "measure", "draw"],
         ["input", "3D", "state", "image", "draw", "measure"],
     ]
 

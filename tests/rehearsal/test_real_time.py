@@ -251,6 +251,7 @@ def collected_at(monkeypatch, steps: list[tuple[float, float, bool]], inputs_s: 
     solver._process.kill()
     solver._connection.close()
     solver._connection = pipe = ScriptedPipe(monkeypatch, made)
+    solver.is_paused = False
     times = []
     for input_s in inputs_s:
         pipe.now_s = max(pipe.now_s, input_s)
@@ -263,14 +264,14 @@ def collected_at(monkeypatch, steps: list[tuple[float, float, bool]], inputs_s: 
 
 def test_a_picture_waits_for_the_step_of_its_input_where_steps_wait_for_inputs(monkeypatch):
     # The first input knows of no step that waited; the third is on its way when the second step for the input before comes.
-    steps = [(0.0, 0.0, True), (0.115, 0.1, True), (0.205, 0.1, True), (0.22, 0.2, True)]
-    assert collected_at(monkeypatch, steps, [0.0, 0.1, 0.2]) == pytest.approx([0.0, 0.115, 0.22])
+    steps = [(0.1, 0.1, True), (0.215, 0.2, True), (0.305, 0.2, True), (0.32, 0.3, True)]
+    assert collected_at(monkeypatch, steps, [0.1, 0.2, 0.3]) == pytest.approx([0.1, 0.215, 0.32])
 
 
 def test_a_picture_does_not_wait_for_steps_by_the_clock_nor_long_for_any(monkeypatch):
-    assert collected_at(monkeypatch, [(0.0, 0.0, False), (0.11, 0.1, False)], [0.0, 0.1]) == [0.0, 0.1]
-    late = collected_at(monkeypatch, [(0.0, 0.0, True), (0.5, 0.1, True)], [0.0, 0.1])
-    assert late == pytest.approx([0.0, 0.2])
+    assert collected_at(monkeypatch, [(0.1, 0.1, False), (0.21, 0.2, False)], [0.1, 0.2]) == [0.1, 0.2]
+    late = collected_at(monkeypatch, [(0.1, 0.1, True), (0.6, 0.2, True)], [0.1, 0.2])
+    assert late == pytest.approx([0.1, 0.3])
 
 
 # The path of the transducer
