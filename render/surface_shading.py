@@ -7,8 +7,9 @@ translucent organ are therefore part of the vertex colours, and faces are sorted
 import igl
 import numpy as np
 import taichi as ti
+import taichi.math as tm
 
-from sim.fields import array_of, fields_of, fill
+from sim.fields import array_of, fields_of, fill, run_kernel
 
 ORGAN, TINT = (0.66, 0.27, 0.23), (0.24, 0.60, 0.36)
 SOLID, GLASS = 1.0, 0.30
@@ -16,6 +17,10 @@ CUT_EDGE_MM = 0.4
 
 # A point on the plane of a cut, and the unit normal towards the side that is removed, (3,) each.
 Cut = tuple[np.ndarray, np.ndarray]
+
+Numbers, Indices = ti.types.ndarray(ti.f32, ndim=1), ti.types.ndarray(ti.i32, ndim=1)
+Points, Triangles = ti.types.ndarray(tm.vec3, ndim=1), ti.types.ndarray(tm.ivec3, ndim=1)
+Colours = ti.types.ndarray(tm.vec4, ndim=1)
 
 
 class DrawnMesh:
@@ -30,7 +35,6 @@ class DrawnMesh:
         scene.mesh(self._fields[0], indices, self._fields[1], per_vertex_color=self._fields[2])
 
 
-@ti.data_oriented
 class ShadedSurface:
     """Normals and colours of one triangle mesh whose vertices move.
 
@@ -51,7 +55,6 @@ class ShadedSurface:
         self.colour = ti.Vector.field(4, ti.f32, shape=count)
         self._tint = ti.field(ti.f32, shape=count)
         self._tinted: np.ndarray | None = None
-        self._area_normal = ti.Vector.field(3, ti.f32, shape=len(self.faces))
         self._faces = ti.Vector.field(3, ti.i32, shape=len(self.faces))
         self._start = ti.field(ti.i32, shape=count + 1)
         self._around = ti.field(ti.i32, shape=len(around))
@@ -59,58 +62,17 @@ class ShadedSurface:
 
     def shade(self, eye, light, opacity: float = SOLID, cut: Cut | None = None) -> None:
         """Update normals and colours. A cut surface is solid."""
-        self._find_normals()
-        places = eye, light, *(cut if cut is not None else np.zeros((2, 3)))
-        self._shade(float(opacity), np.array(places, np.float32))
-
-    @ti.kernel
-    def _find_normals(self):
-        for f in self._faces:
-            a, b, c = (
-                self.vertices[self._faces[f][0]],
-                self.vertices[self._faces[f][1]],
-                self.vertices[self._faces[f][2]],
-            )
-            self._area_normal[f] = (b - a).cross(c - a)
-
-    @ti.kernel
-    def _shade(
-        self,
-        opacity: ti.f32,
-        places: ti.types.ndarray(ti.f32, ndim=2),
-    ):
-        """``places`` (4, 3) are the eye, the light, a point of the cut and its normal.
-
-        A zero normal cuts nothing; else what is on its side of the plane is transparent.
-        """
-        for v in self.vertices:
-            eye, light, cut_point, cut_normal = [
-                ti.Vector([places[k, 0], places[k, 1], places[k, 2]]) for k in ti.static(range(4))
-            ]
-            total = ti.Vector([0.0, 0.0, 0.0])
-            for k in range(self._start[v], self._start[v + 1]):
-                total += self._area_normal[self._around[k]]
-            n = total / ti.max(total.norm(), 1e-12)
-            self.normal[v] = n
-            to_eye = (eye - self.vertices[v]).normalized()
-            half = ((light - self.vertices[v]).normalized() + to_eye).normalized()
-            sheen = self.gloss * ti.max(n.dot(half), 0.0) ** 36
-            rim = (1.0 - ti.abs(n.dot(to_eye))) ** 2
-            alpha = ti.min(opacity + (1.0 - opacity) * (0.75 * rim + sheen), 1.0)
-            if cut_normal.norm() > 0.5:
-                # Not clamped: blending clamps each pixel, and a linear alpha is cut along the plane, not along faces.
-                alpha = 0.5 - (self.vertices[v] - cut_point).dot(cut_normal) / CUT_EDGE_MM
-            base = ti.Vector(self.base)
-            tinted = base + self._tint[v] * (ti.Vector(TINT) - base)
-            grey = tinted * (1.0 - 0.25 * rim) + sheen
-            self.colour[v] = ti.Vector([grey[0], grey[1], grey[2], alpha])
+        places = eye, light, *(cut if cut is not None else np.zeros((2, 3))), self.base
+        fields = self._faces, self._start, self._around, self._tint, self.vertices, self.normal, self.colour
+        values = np.array(places, np.float32), float(opacity), self.gloss
+        run_kernel(_shade_in_memory, _shade_in_fields, fields, *values)
 
     def tint(self, vertices: np.ndarray | None) -> None:
         """Set which vertices (n,) bool are shown in TINT; None for none of them."""
         if vertices is not self._tinted:
             self._tinted = vertices
             if vertices is None:
-                self._tint.fill(0.0)
+                fill((self._tint, np.zeros(self._tint.shape)))
             else:
                 fill((self._tint, vertices))
 
@@ -133,3 +95,73 @@ class ShadedSurface:
         depth = vertices @ ahead.astype(vertices.dtype)
         # By decreasing distance along the view, as blending needs.
         return faces[np.argsort(-depth[faces].sum(axis=1), kind="stable")].reshape(-1)
+
+
+@ti.func
+def _shade(
+    faces: ti.template(),
+    start: ti.template(),
+    around: ti.template(),
+    tint: ti.template(),
+    vertices: ti.template(),
+    normal: ti.template(),
+    colour: ti.template(),
+    places: ti.template(),
+    opacity,
+    gloss,
+):
+    """``places`` (5,) are the eye, the light, a point of the cut and its normal, and the surface's colour.
+
+    A zero normal cuts nothing; else what is on its side of the plane is transparent.
+    """
+    for v in range(vertices.shape[0]):
+        eye, light, cut_point, cut_normal, base = places[0], places[1], places[2], places[3], places[4]
+        total = tm.vec3(0.0)
+        for k in range(start[v], start[v + 1]):
+            face = faces[around[k]]
+            a = vertices[face[0]]
+            total += (vertices[face[1]] - a).cross(vertices[face[2]] - a)
+        n = total / ti.max(total.norm(), 1e-12)
+        normal[v] = n
+        to_eye = (eye - vertices[v]).normalized()
+        half = ((light - vertices[v]).normalized() + to_eye).normalized()
+        sheen = gloss * ti.max(n.dot(half), 0.0) ** 36
+        rim = (1.0 - ti.abs(n.dot(to_eye))) ** 2
+        alpha = ti.min(opacity + (1.0 - opacity) * (0.75 * rim + sheen), 1.0)
+        if cut_normal.norm() > 0.5:
+            # Not clamped: blending clamps each pixel, and a linear alpha is cut along the plane, not along faces.
+            alpha = 0.5 - (vertices[v] - cut_point).dot(cut_normal) / CUT_EDGE_MM
+        tinted = base + tint[v] * (tm.vec3(TINT) - base)
+        colour[v] = tm.vec4(tinted * (1.0 - 0.25 * rim) + sheen, alpha)
+
+
+@ti.kernel
+def _shade_in_memory(
+    faces: Triangles,
+    start: Indices,
+    around: Indices,
+    tint: Numbers,
+    vertices: Points,
+    normal: Points,
+    colour: Colours,
+    places: Points,
+    opacity: float,
+    gloss: float,
+):
+    _shade(faces, start, around, tint, vertices, normal, colour, places, opacity, gloss)
+
+
+@ti.kernel
+def _shade_in_fields(
+    faces: ti.template(),
+    start: ti.template(),
+    around: ti.template(),
+    tint: ti.template(),
+    vertices: ti.template(),
+    normal: ti.template(),
+    colour: ti.template(),
+    places: Points,
+    opacity: float,
+    gloss: float,
+):
+    _shade(faces, start, around, tint, vertices, normal, colour, places, opacity, gloss)

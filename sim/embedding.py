@@ -99,46 +99,58 @@ class Embedding:
     @ti.func
     def mark(self, t, node, pixel_mm, first_mm, owner: ti.template()):
         """Mark the pixels of a tetrahedron that the plane cuts, and store its map to rest positions, if any are in the image."""
-        corner, rest = tm.mat4(0.0), ti.Matrix.zero(ti.f32, 3, 4)
-        low, high = tm.vec2(FAR_MM), tm.vec2(-FAR_MM)
-        for k in ti.static(range(4)):
-            p, r = self.on_plane[node[k]], self.skin.rest[node[k]]
-            corner[0, k], corner[1, k], corner[2, k], corner[3, k] = p.x, p.y, self.above_plane[node[k]], 1.0
-            rest[0, k], rest[1, k], rest[2, k] = r.x, r.y, r.z
-            low, high = ti.min(low, p), ti.max(high, p)
+        x = self.on_plane[node[0]]
+        low, high = x, x
+        for k in ti.static(range(1, 4)):
+            low, high = ti.min(low, self.on_plane[node[k]]), ti.max(high, self.on_plane[node[k]])
         last_mm = first_mm + tm.vec2(owner.shape[1] - 1, owner.shape[0] - 1) * pixel_mm
-        if (
-            (high >= first_mm - SEAM_MM).all()
-            and (low <= last_mm + SEAM_MM).all()
-            and -corner.determinant() > FLAT
-        ):
-            weights = corner.inverse()
-            self.rest_from_plane[t] = rest @ weights
-            self.mark_pixels(t, corner, weights, pixel_mm, first_mm, owner)
+        if (high >= first_mm - SEAM_MM).all() and (low <= last_mm + SEAM_MM).all():
+            a = self.edge(node, 1)
+            b, c = self.edge(node, 2), self.edge(node, 3)
+            six_volumes = a.dot(b.cross(c))
+            if six_volumes > FLAT:
+                # Gradients of the barycentric coordinates of the last three corners, and these coordinates at the plane's origin.
+                slopes = ti.Matrix.rows([b.cross(c), c.cross(a), a.cross(b)]) / six_volumes
+                at = -(slopes @ tm.vec3(x, self.above_plane[node[0]]))
+                origin = self.skin.rest[node[0]]
+                columns = [self.skin.rest[node[k]] - origin for k in ti.static(range(1, 4))]
+                moved = ti.Matrix.cols(columns)
+                linear, offset = moved @ slopes, moved @ at + origin
+                self.rest_from_plane[t] = ti.Matrix.cols([linear[:, 0], linear[:, 1], linear[:, 2], offset])
+                self.mark_pixels(t, node, slopes, at, pixel_mm, first_mm, owner)
 
     @ti.func
-    def mark_pixels(self, t, corner, weights, pixel_mm, first_mm, owner: ti.template()):
+    def edge(self, node, k):
+        """The edge from a tetrahedron's first corner to corner k, along the axes of the plane."""
+        along = self.on_plane[node[k]] - self.on_plane[node[0]]
+        return tm.vec3(along, self.above_plane[node[k]] - self.above_plane[node[0]])
+
+    @ti.func
+    def mark_pixels(self, t, node, slopes, at, pixel_mm, first_mm, owner: ti.template()):
         """Row by row, the span of columns in which all four barycentric coordinates are positive."""
         bottom, top = 1e30, -1e30
         for a, b in ti.static([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]):
-            wa, wb = corner[2, a], corner[2, b]
+            wa, wb = self.above_plane[node[a]], self.above_plane[node[b]]
             if wa * wb <= 0.0 and wa != wb:
-                v = corner[1, a] + (corner[1, b] - corner[1, a]) * wa / (wa - wb)
+                va = self.on_plane[node[a]].y
+                v = va + (self.on_plane[node[b]].y - va) * wa / (wa - wb)
                 bottom, top = ti.min(bottom, v), ti.max(top, v)
         first_row = ti.max(0, ti.cast(ti.floor((bottom - first_mm.y) / pixel_mm.y), ti.i32))
         last_row = ti.min(owner.shape[0] - 1, ti.cast(ti.ceil((top - first_mm.y) / pixel_mm.y), ti.i32))
+        # Each coordinate is at + by_row * row + by_column * column; together they are 1.
+        by_column, by_row = slopes[:, 0] * pixel_mm.x, slopes[:, 1] * pixel_mm.y
+        start = at + slopes[:, 0] * first_mm.x + slopes[:, 1] * first_mm.y
+        columns = tm.vec4(-by_column.sum(), by_column)
+        rows, starts = tm.vec4(-by_row.sum(), by_row), tm.vec4(1.0 - start.sum(), start)
         for row in range(first_row, last_row + 1):
-            v = first_mm.y + row * pixel_mm.y
             left, right = -0.5, owner.shape[1] - 0.5
             for k in ti.static(range(4)):
-                # Coordinate k along the row is at + slope * column.
-                slope = weights[k, 0] * pixel_mm.x
-                at = weights[k, 0] * first_mm.x + weights[k, 1] * v + weights[k, 3] + SEAM
-                if slope > PARALLEL:
-                    left = ti.max(left, -at / slope)
-                elif slope < -PARALLEL:
-                    right = ti.min(right, -at / slope)
-                elif at < 0.0:
+                inside = starts[k] + rows[k] * row + SEAM
+                if columns[k] > PARALLEL:
+                    left = ti.max(left, -inside / columns[k])
+                elif columns[k] < -PARALLEL:
+                    right = ti.min(right, -inside / columns[k])
+                elif inside < 0.0:
                     right = -1.0
             # The ends may be NaN for a nearly flat tetrahedron: clamp them to the image.
             first = ti.max(ti.cast(ti.ceil(left), ti.i32), 0)

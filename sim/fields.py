@@ -1,6 +1,7 @@
 """Copy arrays to and from Taichi fields. On a CPU directly in memory: compiling a kernel for each field takes longer."""
 
 import ctypes
+from collections.abc import Callable, Sequence
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -52,6 +53,17 @@ def fill(*pairs: tuple[ti.Field, np.ndarray]) -> None:
 def array_of(field: ti.Field) -> np.ndarray:
     """The values of a field, of shape (*field, *element)."""
     return _memory(field).copy() if on_cpu() else field.to_numpy()
+
+
+def run_kernel(on_memory: Callable, on_fields: Callable, fields: Sequence[ti.Field], *values: object) -> None:
+    """Run the one of two equal kernels that suits the backend, on fields and then on other values.
+
+    On a CPU it is the one that takes arrays, and gets the memory of the fields: Taichi compiles it once, the other one for each field.
+    """
+    if on_cpu():
+        on_memory(*map(_memory, fields), *values)
+    else:
+        on_fields(*fields, *values)
 
 
 def _kind(field: ti.Field) -> type[np.float32] | type[np.int32]:

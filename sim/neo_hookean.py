@@ -278,15 +278,13 @@ class NeoHookean:
         """Nodes (n, 8) around points (n, 3) [mm], and their trilinear weights (n, 8)."""
         return self.lattice.interpolation(points)
 
-    @ti.kernel
-    def carry(self, rest: ti.template(), frame: ti.template(), weight: ti.template(), out: ti.template()):
-        """Write the current positions of points by the weighted displacements of their nodes."""
-        for v in rest:
-            x = rest[v]
-            for k in ti.static(range(frame.n)):
-                i = frame[v][k]
-                x += weight[v][k] * (self.body.position[i] - self.body.rest[i])
-            out[v] = x
+    @ti.func
+    def carried(self, point, frame, weight):
+        """The current position of a point at rest [mm], by the weighted displacements of its nodes."""
+        x = point
+        for k in ti.static(range(frame.n)):
+            x += weight[k] * (self.body.position[frame[k]] - self.body.rest[frame[k]])
+        return x
 
 
 @ti.func

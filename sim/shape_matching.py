@@ -322,7 +322,7 @@ class ShapeMatching:
 
     @ti.kernel
     def update_frames(self):
-        """Fit the frames to the current positions, for ``carry``, independently of earlier frames."""
+        """Fit the frames to the current positions, for ``carried``, independently of earlier frames."""
         if ti.static(self.serial):
             ti.loop_config(serialize=True)
             for _ in range(1):
@@ -345,17 +345,16 @@ class ShapeMatching:
         weight = 1.0 / (distance**2 + LEAST_SQUARED_MM2)
         return nearest, weight / weight.sum(axis=1, keepdims=True)
 
-    @ti.kernel
-    def carry(self, rest: ti.template(), frame: ti.template(), weight: ti.template(), out: ti.template()):
-        """Write the current positions of points by their weighted frames (weighted matrix blending)."""
-        for v in rest:
-            x = tm.vec4(0.0)
-            for k in ti.static(range(frame.n)):
-                moved = self.frame[frame[v][k]]
-                for axis in ti.static(range(3)):
-                    x += weight[v][k] * rest[v][axis] * row(moved, axis)
-                x += weight[v][k] * row(moved, 3)
-            out[v] = x.xyz
+    @ti.func
+    def carried(self, point, frame, weight):
+        """The current position of a point at rest [mm], by its weighted frames (weighted matrix blending)."""
+        x = tm.vec4(0.0)
+        for k in ti.static(range(frame.n)):
+            moved = self.frame[frame[k]]
+            for axis in ti.static(range(3)):
+                x += weight[k] * point[axis] * row(moved, axis)
+            x += weight[k] * row(moved, 3)
+        return x.xyz
 
 
 def fill_organ(organ: trimesh.Trimesh, tissue: Any) -> RestBody:

@@ -2,12 +2,14 @@
 
 import numpy as np
 import taichi as ti
+import taichi.math as tm
 
-from sim.fields import fields_of
+from sim.fields import fields_of, run_kernel
 from sim.tissue_model import TissueModel
 
+Floats, Integers = ti.types.ndarray(ti.f32, ndim=2), ti.types.ndarray(ti.i32, ndim=2)
 
-@ti.data_oriented
+
 class Skin:
     """Points (n, 3) [mm] attached to a tissue model's frames (the paper's "skinning").
 
@@ -24,4 +26,31 @@ class Skin:
 
     def update(self) -> None:
         """Move the points with the model's current frames."""
-        self.model.carry(self.rest, self.frame, self.weight, self.vertices)
+        fields = self.rest, self.frame, self.weight, self.vertices
+        run_kernel(_carry_in_memory, _carry_in_fields, fields, self.model, self.frame.n)
+
+
+@ti.kernel
+def _carry_in_memory(
+    rest: Floats, frame: Integers, weight: Floats, out: Floats, model: ti.template(), frames: ti.template()
+):
+    for v in range(rest.shape[0]):
+        at = tm.vec3(rest[v, 0], rest[v, 1], rest[v, 2])
+        own = ti.Vector([frame[v, k] for k in ti.static(range(frames))])
+        share = ti.Vector([weight[v, k] for k in ti.static(range(frames))])
+        carried = model.carried(at, own, share)
+        for axis in ti.static(range(3)):
+            out[v, axis] = carried[axis]
+
+
+@ti.kernel
+def _carry_in_fields(
+    rest: ti.template(),
+    frame: ti.template(),
+    weight: ti.template(),
+    out: ti.template(),
+    model: ti.template(),
+    frames: ti.template(),
+):
+    for v in rest:
+        out[v] = model.carried(rest[v], frame[v], weight[v])

@@ -57,7 +57,7 @@ class TissueModel(Protocol):
     """Rest state, projection of the constraints on the predicted positions, and interpolation of points in the tissue.
 
     ``serial``: the model is too small for more than one core of a CPU. ``EMBEDDING_CELL_RATIO``: width of the coarse tetrahedra
-    that carry the image plane, over the resolution of the tissue. ``begin`` to ``project`` are ti.funcs that the solver's
+    that carry the image plane, over the resolution of the tissue. ``begin`` to ``project`` and ``carried`` are ti.funcs that
     kernels inline, so their outermost loops are parallel. A model whose material can be changed between steps also has
     ``set_material(young_kpa)``.
     """
@@ -96,14 +96,15 @@ class TissueModel(Protocol):
         """One iteration over all constraints, contacts with shapes included."""
 
     def update_frames(self) -> None:
-        """Prepare ``carry``. Called once a step, when positions are final."""
+        """Prepare ``carried``. Called once a step, when positions are final."""
 
     def attach(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Frames (n, k) and weights (n, k) of rest points (n, 3) [mm], for ``carry``."""
+        """Frames (n, k) and weights (n, k) of rest points (n, 3) [mm], for ``carried``."""
         ...
 
-    def carry(self, rest: ti.Field, frame: ti.Field, weight: ti.Field, out: ti.Field) -> None:
-        """Write the current positions of attached points."""
+    def carried(self, point: ti.Vector, frame: ti.Vector, weight: ti.Vector) -> ti.Vector:
+        """Return the current position (3,) [mm] of an attached point, from its rest position, frames (k,) and weights (k,)."""
+        ...
 
     def counts(self) -> dict[str, int]:
         """Sizes of the model, for reports: ``particles`` or ``nodes`` first."""
