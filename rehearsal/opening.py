@@ -1,5 +1,6 @@
 """Open a rehearsal: read what the user names, build the model, and for a window start the process of its solver."""
 
+import gc
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from time import perf_counter
@@ -14,6 +15,7 @@ from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.configuration import Setup, scene_of
 from rehearsal.real_time.pace import Pace
 from rehearsal.real_time.start_times import StartTimes
+from rehearsal.real_time.started_process import StartedProcess
 from rehearsal.tracking.openigtlink_options import open_link
 from render.display import window_size
 from render.gamepad import Gamepad, SdlPads
@@ -32,15 +34,14 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def opened(asked: RehearseOptions) -> Iterator["RehearsalRun"]:
-    """The rehearsal that the user asks for. Raises UserError, CommandError."""
+def opened(asked: RehearseOptions, process: StartedProcess | None) -> Iterator["RehearsalRun"]:
+    """The rehearsal that the user asks for, in a window with the process for its solver. Raises UserError, CommandError."""
     start = StartTimes()
     start.begin("Files")
     files = read_files(asked)
     with ExitStack() as resources:
-        # The process is started first, because it loads Taichi too.
-        solver = None if asked.headless else resources.enter_context(solver_process())
         start.begin("Taichi")
+        solver = None if process is None else resources.enter_context(solver_process(process))
         if solver is not None:
             check_vulkan()
         make_folder(asked.out)
@@ -78,6 +79,8 @@ def opened(asked: RehearseOptions) -> Iterator["RehearsalRun"]:
             if solver is None and not asked.no_pictures:
                 progress("Building the model: the first picture")
                 compile_picture(rehearsal)
+        # All this lives as long as the rehearsal: to look for garbage in it would delay single frames by a tenth of a second.
+        gc.freeze()
         start.begin("First picture")
         if chosen:
             click.echo(chosen)
@@ -87,11 +90,11 @@ def opened(asked: RehearseOptions) -> Iterator["RehearsalRun"]:
 
 
 @contextmanager
-def solver_process() -> Iterator["SolverProcess"]:
+def solver_process(started: StartedProcess) -> Iterator["SolverProcess"]:
     """The process of a window's solver."""
     from rehearsal.real_time.solver_process import SolverProcess
 
-    solver = SolverProcess()
+    solver = SolverProcess(started)
     try:
         yield solver
     finally:

@@ -15,9 +15,12 @@ from rehearsal.stopwatch import timed
 from scenes.anatomy import Grid, LoadedAnatomy, press_on
 from scenes.scene import PlaneShape, Scene
 from scenes.surfaces import translated
+from sim.body import BodyState
+from sim.device import backend
 from sim.divergence_check import DivergenceCheck, DivergenceState
 from sim.shapes import Plane, SignedDistanceField
 from sim.solver import SolverState
+from sim.stored_arrays import stored
 from sim.tissue_model import FixedRegion
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import advanced, pose_at, poses_between
@@ -69,6 +72,7 @@ class PressedOrgan:
         self.gravity_direction = np.array(scene.gravity.direction) / np.linalg.norm(scene.gravity.direction)
         self.press = press_on(scene.press, anatomy, self.gravity_direction)
         self._build_solver(anatomy)
+        self._shapes = anatomy.shapes
         self.divergence_check = DivergenceCheck(self.solver)
         self.notice = ""
         self.steps = 0
@@ -109,12 +113,40 @@ class PressedOrgan:
         return pose_at(target, np.array(self.press.direction), np.array(self.press.lateral), self.size_mm[2])
 
     def settle(self) -> OrganState:
-        """Let the organ come to rest on its support with the transducer far away: the paper's warm-up. Return that state."""
-        for _ in range(self.press.warm_up_steps):
-            self.advance(self.pose)
+        """Let the organ come to rest on its support with the transducer far away: the paper's warm-up. Return that state.
+
+        It is computed once for the same scene, probe and anatomy.
+        """
+        position, velocity, *contacts = stored(self._warm_up, *self._inputs(), backend=backend())
+        names = self.solver.snapshot().contacts
+        self.solver.restore(
+            SolverState(BodyState(position, velocity), dict(zip(names, contacts, strict=True)))
+        )
         self.steps = 0
         self.divergence_check.set_initial_state()
         return self.snapshot_of_organ()
+
+    def _warm_up(self, *_: object) -> tuple[np.ndarray, ...]:
+        """The state at rest: positions, velocities and contacts."""
+        for _ in range(self.press.warm_up_steps):
+            self.advance(self.pose)
+        state = self.solver.snapshot()
+        return state.body.position, state.body.velocity, *state.contacts.values()
+
+    def _inputs(self) -> Iterator[object]:
+        """All that the state at rest depends on."""
+        yield from (
+            self.scene.model_dump_json(),
+            self.probe.model_dump_json(),
+            self.organ,
+            self.origin,
+            self.pose,
+        )
+        for shape in self._shapes:
+            if isinstance(shape, Grid):
+                yield from (shape.voxels, shape.index_from_mm)
+            elif isinstance(shape, trimesh.Trimesh):
+                yield shape
 
     def set_gravity(self, acceleration_m_s2: float) -> None:
         """Change the acceleration due to gravity; its direction is the scene's."""

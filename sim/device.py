@@ -99,6 +99,11 @@ def _count(count: ti.types.ndarray(ndim=1), least: ti.types.ndarray(ndim=1)):
         count[t] = counted
 
 
+def backend() -> str:
+    """The name of the backend that Taichi was started on, with the kind of processor."""
+    return str(ti.cfg.arch)
+
+
 def is_available(arch: str) -> bool:
     """Whether ``cuda`` or ``vulkan`` has a device and a driver; output of a missing driver is discarded."""
     stderr, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)

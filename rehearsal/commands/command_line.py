@@ -7,7 +7,7 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType, UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import click
 from pydantic import BaseModel, ConfigDict
@@ -15,11 +15,13 @@ from pydantic.fields import FieldInfo
 
 from rehearsal.configuration import with_quality
 from rehearsal.result_files import write_json
-from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.atomic_files import check_writable
 from scenes.scene import OPTIONS, Scene, load_scene, scene_file, with_options
 from scenes.tissue import QUALITIES
 from ultrasound.probe import DetailLevel, Mode
+
+if TYPE_CHECKING:
+    from scenes.anatomy import LoadedAnatomy
 
 # Exit status after Ctrl-C.
 STOPPED = 130
@@ -114,8 +116,10 @@ def save_figures(figures: dict[str, Any], json_file: Path) -> None:
 
 def load_patient(
     scene: Path, changes: Mapping[str, Any] = MappingProxyType({}), quality: str | None = None
-) -> tuple[Scene, LoadedAnatomy]:
+) -> tuple[Scene, "LoadedAnatomy"]:
     """Load a scene file or a patient's folder, changed by options, and its anatomy. Raises SceneError, PatientError."""
+    from scenes.anatomy import load_anatomy
+
     path = scene_file(scene)
     loaded = with_quality(with_options(load_scene(path), changes), quality)
     return loaded, load_anatomy(loaded, path.parent)

@@ -6,7 +6,7 @@ import click
 
 from rehearsal.commands.command_line import command
 from rehearsal.commands.rehearse_options import RehearseOptions
-from rehearsal.opening import opened
+from rehearsal.real_time.started_process import started_process
 from render.display import display_available
 from render.keys import keys_text
 
@@ -20,11 +20,14 @@ def rehearse(asked: RehearseOptions) -> None:
     if not asked.headless and not display_available():
         click.echo(f"No display ({why_no_display()}): running the scripted press without a window.")
         asked.headless = True
-    with opened(asked) as run:
-        if asked.headless:
-            run.headless()
-        else:
-            run.in_window()
+    with started_process(not asked.headless) as process:
+        from rehearsal.opening import opened
+
+        with opened(asked, process) as run:
+            if asked.headless:
+                run.headless()
+            else:
+                run.in_window()
 
 
 @click.command("keys")

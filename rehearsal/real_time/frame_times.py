@@ -4,10 +4,12 @@ from collections import defaultdict, deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from time import perf_counter
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rehearsal.pressed_organ import Step
+if TYPE_CHECKING:
+    from rehearsal.pressed_organ import Step
 
 # Frames that are kept.
 MOST_FRAMES = 20_000

@@ -66,7 +66,11 @@ class SolverLoop:
         """Build the solver of a scene, and send the organ at rest."""
         sim.device.start(arch)
         self.organ, self.pace = PressedOrgan(scene, anatomy, probe), pace
-        self._connection.send(self.organ.settle())
+        at_rest = self.organ.settle()
+        # The first step, which loads the kernels, if the state at rest was stored. The other process is not ready yet.
+        self.organ.advance(self.organ.pose)
+        self.organ.restore_organ(at_rest)
+        self._connection.send(at_rest)
 
     def share(self, memory: str) -> None:
         """Write all states to a memory from now on."""

@@ -4,11 +4,8 @@ The rehearsal of this process is a copy: ``collect`` sets it to the newest state
 done to the copy while the solver is paused, and ``hand_over`` gives it to the solver.
 """
 
-import multiprocessing
-import os
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -19,14 +16,15 @@ from errors import UserError
 from rehearsal.pressed_organ import OrganState, Step
 from rehearsal.real_time.pace import Pace
 from rehearsal.real_time.shared_state import SharedState
-from rehearsal.real_time.solver_loop import PAUSED, compute
+from rehearsal.real_time.solver_loop import PAUSED
+from rehearsal.real_time.started_process import END_S, StartedProcess
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
 from ultrasound.probe import Probe
 
-# How long the process may take to end in order, and how long a picture waits for the step that shows its input.
-END_S, MOST_WAIT_S = 0.5, 0.1
+# How long a picture waits for the step that shows its input.
+MOST_WAIT_S = 0.1
 
 
 class SolverEnded(UserError):
@@ -34,20 +32,14 @@ class SolverEnded(UserError):
 
 
 class SolverProcess:
-    """Starts the process; ``build`` gives it an organ, ``settled`` waits for it at rest, ``attach`` names the rehearsal that copies it.
+    """Talks with the process; ``build`` gives it an organ, ``settled`` waits for it at rest, ``attach`` names the rehearsal that copies it.
 
     ``on_step`` is called with each step that is collected. ``pending`` counts the steps of ``play`` that were not collected yet.
     Every method may raise SolverEnded.
     """
 
-    def __init__(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        self._lock = context.Lock()
-        given = theirs, self._lock, os.getpid()
-        self._process = context.Process(target=compute, args=given, name="solver", daemon=True)
-        self._process.start()
-        theirs.close()
+    def __init__(self, started: StartedProcess) -> None:
+        self._started, self._connection = started, started.connection
         self._memory: SharedState | None = None
         self.on_step: Callable[[Step], None] = lambda step: None
         self.is_paused = True
@@ -69,7 +61,7 @@ class SolverProcess:
     def attach(self, rehearsal: Rehearsal) -> None:
         """Copy the states to a rehearsal from now on; it is at rest."""
         self.rehearsal = rehearsal
-        self._memory = SharedState(rehearsal.snapshot_of_organ(), self._lock)
+        self._memory = SharedState(rehearsal.snapshot_of_organ(), self._started.lock)
         self._send("share", self._memory.name)
 
     def collect(self) -> None:
@@ -113,11 +105,7 @@ class SolverProcess:
 
     def close(self) -> None:
         """End the process."""
-        with suppress(OSError):
-            self._connection.send(("stop", ()))
-        self._process.join(END_S)
-        self._process.kill()
-        self._connection.close()
+        self._started.close()
         if self._memory is not None:
             self._memory.close()
             self._memory = None
@@ -164,8 +152,9 @@ class SolverProcess:
             raise self._ended() from None
 
     def _ended(self) -> SolverEnded:
-        self._process.join(END_S)
+        process = self._started.process
+        process.join(END_S)
         return SolverEnded(
-            f"the solver's process has ended (exit status {self._process.exitcode}), perhaps for lack of memory; what was recorded "
+            f"the solver's process has ended (exit status {process.exitcode}), perhaps for lack of memory; what was recorded "
             "until then can be replayed: close other programs and start again"
         )

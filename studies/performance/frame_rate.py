@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import psutil
@@ -19,18 +19,20 @@ from rehearsal.commands.command_line import (
     command,
 )
 from rehearsal.commands.rehearse_options import RehearseOptions
-from rehearsal.frame import WindowFrames
-from rehearsal.opening import opened
-from rehearsal.pressed_organ import Step
 from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.real_time.start_times import StartTimes
-from rehearsal.run import RehearsalRun
+from rehearsal.real_time.started_process import started_process
 from render.display import display_available
 from render.viewer import Controls, View
 from render.vulkan_device import vulkan_devices
 from scenes.scene import EMBEDDED
 from studies.study_results import write_results
 from version import VERSION
+
+if TYPE_CHECKING:
+    from rehearsal.frame import WindowFrames
+    from rehearsal.pressed_organ import Step
+    from rehearsal.run import RehearsalRun
 
 # The scripted hand presses for a part of each period, while it drags the probe to and fro over the organ.
 PRESS_PERIOD_S, PRESS_S = 3.0, 1.8
@@ -61,7 +63,7 @@ class ScriptedHand:
     they have had, every MEMORY_EVERY_S.
     """
 
-    def __init__(self, frames: WindowFrames, start: StartTimes, seconds: float) -> None:
+    def __init__(self, frames: "WindowFrames", start: StartTimes, seconds: float) -> None:
         self.frames, self.window, self.start, self.seconds = frames, frames.viewer, start, seconds
         self.first_picture_s = 0.0
         self.times = FrameTimes()
@@ -136,18 +138,21 @@ def frames(asked: FrameOptions) -> None:
     shared = {name: getattr(asked, name) for name in FrameOptions.model_fields if name != "seconds"}
     hands: list[ScriptedHand] = []
 
-    with opened(RehearseOptions(**shared)) as run:
+    with started_process(True) as process:
+        from rehearsal.opening import opened
 
-        def lead(window_frames: WindowFrames) -> None:
-            hands.append(ScriptedHand(window_frames, run.start, asked.seconds))
-            window_frames.viewer = hands[0]  # type: ignore[assignment]
+        with opened(RehearseOptions(**shared), process) as run:
 
-        run.in_window(prepare=lead)
-        figures = figures_of(run, hands[0], asked)
+            def lead(window_frames: "WindowFrames") -> None:
+                hands.append(ScriptedHand(window_frames, run.start, asked.seconds))
+                window_frames.viewer = hands[0]  # type: ignore[assignment]
+
+            run.in_window(prepare=lead)
+            figures = figures_of(run, hands[0], asked)
     write_results(asked.out, "frames", figures, summary(figures))
 
 
-def figures_of(run: RehearsalRun, hand: ScriptedHand, asked: FrameOptions) -> dict[str, Any]:
+def figures_of(run: "RehearsalRun", hand: ScriptedHand, asked: FrameOptions) -> dict[str, Any]:
     """The figures of a run; times without the first BEGIN_S."""
     times, layout, steps = hand.times, hand.window.layout, hand.times.steps
     seconds = times.ends_s[-1][0] - times.ends_s[0][0]
@@ -190,7 +195,7 @@ def spread_of(values: Iterable[float]) -> dict[str, float]:
     return {name: round(float(value), 2) for name, value in figures.items()}
 
 
-def lengths_of(steps: Iterable[Step]) -> dict[str, float]:
+def lengths_of(steps: Iterable["Step"]) -> dict[str, float]:
     """The share of the simulated time in steps of each length, by the length as a fraction of a second."""
     lengths: dict[float, float] = defaultdict(float)
     for step in steps:

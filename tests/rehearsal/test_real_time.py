@@ -14,6 +14,7 @@ from rehearsal.real_time.pace import BUSY, LEAST_ITERATIONS, SPARE, STEPS_DOWN, 
 from rehearsal.real_time.pose_path import CATCH_UP, LONGEST_S, PosePath
 from rehearsal.real_time.solver_loop import SolverLoop
 from rehearsal.real_time.solver_process import SolverEnded, SolverProcess
+from rehearsal.real_time.started_process import start_process
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import AnatomyFiles, Attachment, Scene, with_options
@@ -44,7 +45,7 @@ def reference(one_device) -> PressedOrgan:
 
 @pytest.fixture(scope="module")
 def started(one_device) -> Iterator[SolverProcess]:
-    solver = SolverProcess()
+    solver = SolverProcess(start_process())
     copy = small_rehearsal()
     anatomy = LoadedAnatomy(trimesh.creation.icosphere(subdivisions=3, radius=15.0), None, None, ())
     solver.build(copy.scene, anatomy, copy.probe, "cpu", Pace(1 / RATE))
@@ -144,8 +145,8 @@ def test_a_state_that_the_check_would_restore_crosses_too(solver):
 
 
 def test_a_process_that_ends_is_an_error_in_words():
-    solver = SolverProcess()
-    solver._process.kill()
+    solver = SolverProcess(start_process())
+    solver._started.process.kill()
     with pytest.raises(SolverEnded, match=r"the solver's process has ended \(exit status -9\)"):
         solver.settled()
     solver.close()
@@ -247,8 +248,8 @@ def collected_at(monkeypatch, steps: list[tuple[float, float, bool]], inputs_s: 
         (at_s, Step(np.eye(4), 1 / 15, 4, 10.0, input_s=of_s, awaited=awaited))
         for at_s, of_s, awaited in steps
     ]
-    solver = SolverProcess()
-    solver._process.kill()
+    solver = SolverProcess(start_process())
+    solver._started.process.kill()
     solver._connection.close()
     solver._connection = pipe = ScriptedPipe(monkeypatch, made)
     solver.is_paused = False

@@ -1,0 +1,62 @@
+"""The solver's process, started before this program loads its libraries: the two load them at the same time.
+
+So nothing is imported here that takes long.
+"""
+
+import multiprocessing
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from multiprocessing.synchronize import Lock
+
+# How long the process may take to end in order.
+END_S = 0.5
+
+
+@dataclass(frozen=True)
+class StartedProcess:
+    """A process that waits for requests on a connection; the lock is for the memory that it shares."""
+
+    process: BaseProcess
+    connection: Connection
+    lock: Lock
+
+    def close(self) -> None:
+        """End the process. A second call does nothing."""
+        if not self.connection.closed:
+            with suppress(OSError):
+                self.connection.send(("stop", ()))
+            self.process.join(END_S)
+            self.process.kill()
+            self.connection.close()
+
+
+def start_process() -> StartedProcess:
+    """Start the process of a solver."""
+    context = multiprocessing.get_context("spawn")
+    connection, theirs = context.Pipe()
+    lock = context.Lock()
+    process = context.Process(target=_compute, args=(theirs, lock, os.getpid()), name="solver", daemon=True)
+    process.start()
+    theirs.close()
+    return StartedProcess(process, connection, lock)
+
+
+@contextmanager
+def started_process(is_needed: bool) -> Iterator[StartedProcess | None]:
+    """The process of a solver, if one is needed; it ends with this context."""
+    started = start_process() if is_needed else None
+    try:
+        yield started
+    finally:
+        if started is not None:
+            started.close()
+
+
+def _compute(connection: Connection, lock: Lock, parent: int) -> None:
+    from rehearsal.real_time.solver_loop import compute
+
+    compute(connection, lock, parent)
