@@ -216,8 +216,15 @@ class WindowFrames(Frames[WindowInput]):
             self._restored_until = perf_counter() + RESTORED_S
 
     def image(self, probe: Probe, settings: Settings) -> View:
-        """Compute the images, also of frozen tissue with other settings; of an earlier frame return those that it had."""
-        return self.cine.shown.view if self._shows_earlier else super().image(probe, settings)
+        """Compute the images, also of frozen tissue with other settings; of an earlier frame return those that it had.
+
+        They have the pixels of their boxes in the window, unless they are recorded or sent too.
+        """
+        if self._shows_earlier:
+            return self.cine.shown.view
+        is_only_shown = not self.sweeping.status and self.link is None
+        shape = self.viewer.image_shape(settings, probe) if is_only_shown else None
+        return image_view(self.rehearsal, probe, settings, self.tally, shape)
 
     def observe_window(self, probe: Probe) -> None:
         """Measure and record, unless frozen."""
@@ -321,6 +328,10 @@ class WindowFrames(Frames[WindowInput]):
     def _export(self, settings: Settings, view: View) -> None:
         """Save images and surfaces; say what is missing, and why. Raises OSError."""
         probe = probe_with_settings(self.rehearsal.probe, settings)
+        if not self._shows_earlier:
+            # With all pixels of the scene.
+            whole = image_view(self.rehearsal, probe, settings, Tally(0.0))
+            view = replace(view, images=whole.images)
         begin, missing = save_view(view, probe, self.out), []
         if view.notes.keys() & view.images.keys():
             missing.append("B-mode image black: the probe does not touch the organ")
@@ -332,8 +343,17 @@ class WindowFrames(Frames[WindowInput]):
         self.notices.post("; ".join(missing), on_screen=False)
 
 
-def image_view(rehearsal: Rehearsal, probe: Probe, settings: Settings, tally: Tally) -> View:
-    """Compute the images of the probe at its present pose, with overlays and read-outs."""
+def image_view(
+    rehearsal: Rehearsal,
+    probe: Probe,
+    settings: Settings,
+    tally: Tally,
+    shape: tuple[int, int] | None = None,
+) -> View:
+    """Compute the images of the probe at its present pose, with overlays and read-outs.
+
+    ``shape`` are the rows and columns of the images, at most the scene's pixels each, which is also the default.
+    """
     scanner, pixels = rehearsal.scanner, rehearsal.scene.image.pixels
     plane = image_plane(rehearsal.pose, probe.housing_mm[2], *probe.extent_mm)
     shown = settings.mode, settings.detail_level, settings.window_hu, settings.level_hu
@@ -341,7 +361,7 @@ def image_view(rehearsal: Rehearsal, probe: Probe, settings: Settings, tally: Ta
     def images() -> dict[str, np.ndarray]:
         if scanner is None:
             return {"no CT": np.zeros((pixels, pixels), np.uint8)}
-        return scanner.images(plane, probe, *shown)
+        return scanner.images(plane, probe, *shown, shape and (min(shape[0], pixels), min(shape[1], pixels)))
 
     width, depth, above = probe.extent_mm
     return View(

@@ -81,6 +81,8 @@ def opened(asked: RehearseOptions, process: StartedProcess | None) -> Iterator["
                 compile_picture(rehearsal)
         # All this lives as long as the rehearsal: to look for garbage in it would delay single frames by a tenth of a second.
         gc.freeze()
+        # At the end it is garbage: when Taichi is removed, it writes its kernels to their cache.
+        resources.callback(gc.unfreeze)
         start.begin("First picture")
         if chosen:
             click.echo(chosen)

@@ -126,8 +126,8 @@ class PressedOrgan:
         self.divergence_check.set_initial_state()
         return self.snapshot_of_organ()
 
-    def _warm_up(self, *_: object) -> tuple[np.ndarray, ...]:
-        """The state at rest: positions, velocities and contacts."""
+    def _warm_up(self, *inputs: object) -> tuple[np.ndarray, ...]:
+        """The state at rest: positions, velocities and contacts. The inputs are those of the organ itself."""
         for _ in range(self.press.warm_up_steps):
             self.advance(self.pose)
         state = self.solver.snapshot()

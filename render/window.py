@@ -26,10 +26,12 @@ from render.keys import Keys, begin, hold
 from render.scene_view import SceneView
 from render.sliders import boxes_of, draw_sliders
 from render.software_scene import SoftwareScene
-from render.viewer import Controls, Geometry, Settings, View
+from render.viewer import Controls, Geometry, ScannerSettings, Settings, View
 from render.vulkan_device import draws_by_processor
 from render.window_layout import FULL_SIZE, Rect, WindowLayout
 from sim.device import on_cpu
+from ultrasound.probe import Probe
+from ultrasound.scanner import IMAGES_OF_MODE
 
 ZOOM_S = 0.5
 ZOOM_SENSE = {"zoom_in": -1.0, "zoom_out": 1.0}
@@ -224,6 +226,12 @@ class Window:
             self._boxes_placed += 1
 
     # Drawing
+
+    def image_shape(self, settings: ScannerSettings, probe: Probe) -> tuple[int, int]:
+        """Rows and columns of the boxes in which the images of a probe are drawn."""
+        width, depth, _ = probe.extent_mm
+        box = self.layout.image_boxes(len(IMAGES_OF_MODE[settings.mode]), width, depth)[0]
+        return box.height, box.width
 
     def draw_scene(self, view: View, may_wait: bool) -> None:
         """Where the processor draws the 3D view, draw it already, for the next `draw`; with `may_wait` only if the user changed it."""

@@ -73,16 +73,19 @@ class Embedding:
         world_from_plane: tm.mat4,
         pixel_mm: tm.vec2,
         first_mm: tm.vec2,
+        rows: int,
+        columns: int,
         owner: ti.template(),
     ):
-        """Write to ``owner`` (rows, columns), i32, the tetrahedron at each pixel of an image plane, ``count`` where there is none.
+        """Write to the first rows and columns of ``owner``, i32, the tetrahedron at each pixel of an image plane, ``count`` where there is none.
 
         The two matrices map world [mm] to (u, v, w), with the plane at w = 0, and back; pixel (row, column) is at u =
         first.x + column * pixel.x, v = first.y + row * pixel.y. Of overlapping tetrahedra the lowest index is taken,
         independent of threads; inverted and flat ones are left out.
         """
-        for pixel in ti.grouped(owner):
-            owner[pixel] = self.count
+        for row in range(rows):
+            for column in range(columns):
+                owner[row, column] = self.count
         self.rest_from_plane[self.count] = world_from_plane[:3, :]
         for v in self.on_plane:
             projected = plane_from_world @ tm.vec4(self.skin.vertices[v], 1.0)
@@ -94,16 +97,16 @@ class Embedding:
             node = self.tetrahedron[t]
             w = ti.Vector([self.above_plane[node[k]] for k in ti.static(range(4))])
             if w.min() <= 0.0 and w.max() >= 0.0:
-                self.mark(t, node, pixel_mm, first_mm, owner)
+                self.mark(t, node, pixel_mm, first_mm, rows, columns, owner)
 
     @ti.func
-    def mark(self, t, node, pixel_mm, first_mm, owner: ti.template()):
+    def mark(self, t, node, pixel_mm, first_mm, rows, columns, owner: ti.template()):
         """Mark the pixels of a tetrahedron that the plane cuts, and store its map to rest positions, if any are in the image."""
         x = self.on_plane[node[0]]
         low, high = x, x
         for k in ti.static(range(1, 4)):
             low, high = ti.min(low, self.on_plane[node[k]]), ti.max(high, self.on_plane[node[k]])
-        last_mm = first_mm + tm.vec2(owner.shape[1] - 1, owner.shape[0] - 1) * pixel_mm
+        last_mm = first_mm + tm.vec2(columns - 1, rows - 1) * pixel_mm
         if (high >= first_mm - SEAM_MM).all() and (low <= last_mm + SEAM_MM).all():
             a = self.edge(node, 1)
             b, c = self.edge(node, 2), self.edge(node, 3)
@@ -113,11 +116,11 @@ class Embedding:
                 slopes = ti.Matrix.rows([b.cross(c), c.cross(a), a.cross(b)]) / six_volumes
                 at = -(slopes @ tm.vec3(x, self.above_plane[node[0]]))
                 origin = self.skin.rest[node[0]]
-                columns = [self.skin.rest[node[k]] - origin for k in ti.static(range(1, 4))]
-                moved = ti.Matrix.cols(columns)
+                edges = [self.skin.rest[node[k]] - origin for k in ti.static(range(1, 4))]
+                moved = ti.Matrix.cols(edges)
                 linear, offset = moved @ slopes, moved @ at + origin
                 self.rest_from_plane[t] = ti.Matrix.cols([linear[:, 0], linear[:, 1], linear[:, 2], offset])
-                self.mark_pixels(t, node, slopes, at, pixel_mm, first_mm, owner)
+                self.mark_pixels(t, node, slopes, at, pixel_mm, first_mm, rows, columns, owner)
 
     @ti.func
     def edge(self, node, k):
@@ -126,7 +129,7 @@ class Embedding:
         return tm.vec3(along, self.above_plane[node[k]] - self.above_plane[node[0]])
 
     @ti.func
-    def mark_pixels(self, t, node, slopes, at, pixel_mm, first_mm, owner: ti.template()):
+    def mark_pixels(self, t, node, slopes, at, pixel_mm, first_mm, rows, columns, owner: ti.template()):
         """Row by row, the span of columns in which all four barycentric coordinates are positive."""
         bottom, top = 1e30, -1e30
         for a, b in ti.static([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]):
@@ -136,25 +139,25 @@ class Embedding:
                 v = va + (self.on_plane[node[b]].y - va) * wa / (wa - wb)
                 bottom, top = ti.min(bottom, v), ti.max(top, v)
         first_row = ti.max(0, ti.cast(ti.floor((bottom - first_mm.y) / pixel_mm.y), ti.i32))
-        last_row = ti.min(owner.shape[0] - 1, ti.cast(ti.ceil((top - first_mm.y) / pixel_mm.y), ti.i32))
+        last_row = ti.min(rows - 1, ti.cast(ti.ceil((top - first_mm.y) / pixel_mm.y), ti.i32))
         # Each coordinate is at + by_row * row + by_column * column; together they are 1.
         by_column, by_row = slopes[:, 0] * pixel_mm.x, slopes[:, 1] * pixel_mm.y
         start = at + slopes[:, 0] * first_mm.x + slopes[:, 1] * first_mm.y
-        columns = tm.vec4(-by_column.sum(), by_column)
-        rows, starts = tm.vec4(-by_row.sum(), by_row), tm.vec4(1.0 - start.sum(), start)
+        per_column, per_row = tm.vec4(-by_column.sum(), by_column), tm.vec4(-by_row.sum(), by_row)
+        starts = tm.vec4(1.0 - start.sum(), start)
         for row in range(first_row, last_row + 1):
-            left, right = -0.5, owner.shape[1] - 0.5
+            left, right = -0.5, columns - 0.5
             for k in ti.static(range(4)):
-                inside = starts[k] + rows[k] * row + SEAM
-                if columns[k] > PARALLEL:
-                    left = ti.max(left, -inside / columns[k])
-                elif columns[k] < -PARALLEL:
-                    right = ti.min(right, -inside / columns[k])
+                inside = starts[k] + per_row[k] * row + SEAM
+                if per_column[k] > PARALLEL:
+                    left = ti.max(left, -inside / per_column[k])
+                elif per_column[k] < -PARALLEL:
+                    right = ti.min(right, -inside / per_column[k])
                 elif inside < 0.0:
                     right = -1.0
             # The ends may be NaN for a nearly flat tetrahedron: clamp them to the image.
             first = ti.max(ti.cast(ti.ceil(left), ti.i32), 0)
-            last = ti.min(ti.cast(ti.floor(right), ti.i32), owner.shape[1] - 1)
+            last = ti.min(ti.cast(ti.floor(right), ti.i32), columns - 1)
             for column in range(first, last + 1):
                 if ti.static(self.serial):
                     owner[row, column] = t
@@ -179,6 +182,8 @@ class Unmoved:
         world_from_plane: ti.Matrix,
         pixel_mm: ti.Matrix,
         first_mm: ti.Matrix,
+        rows: int,
+        columns: int,
         owner: ti.Field,
     ) -> None:
         """As ``Embedding.locate_on_plane``."""

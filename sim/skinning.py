@@ -7,8 +7,6 @@ import taichi.math as tm
 from sim.fields import fields_of, run_kernel
 from sim.tissue_model import TissueModel
 
-Floats, Integers = ti.types.ndarray(ti.f32, ndim=2), ti.types.ndarray(ti.i32, ndim=2)
-
 
 class Skin:
     """Points (n, 3) [mm] attached to a tissue model's frames (the paper's "skinning").
@@ -32,7 +30,12 @@ class Skin:
 
 @ti.kernel
 def _carry_in_memory(
-    rest: Floats, frame: Integers, weight: Floats, out: Floats, model: ti.template(), frames: ti.template()
+    rest: ti.types.ndarray(ti.f32, ndim=2),
+    frame: ti.types.ndarray(ti.i32, ndim=2),
+    weight: ti.types.ndarray(ti.f32, ndim=2),
+    out: ti.types.ndarray(ti.f32, ndim=2),
+    model: ti.template(),
+    frames: ti.template(),
 ):
     for v in range(rest.shape[0]):
         at = tm.vec3(rest[v, 0], rest[v, 1], rest[v, 2])

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from render.viewer import Controls, Settings, View
+from render.viewer import Controls, ScannerSettings, Settings, View
+from ultrasound.probe import Probe
 
 
 class NullViewer:
@@ -23,6 +24,9 @@ class NullViewer:
         controls = next(self._script, None) or Controls(settings=self.settings)
         self._running = self._running and not controls.quit
         return controls
+
+    def image_shape(self, settings: ScannerSettings, probe: Probe) -> tuple[int, int]:
+        return self._size
 
     def draw_scene(self, view: View, may_wait: bool) -> None: ...
 

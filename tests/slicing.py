@@ -33,7 +33,7 @@ def hounsfield(scanner: Scanner) -> np.ndarray:
     @ti.kernel
     def ask(values: ti.types.ndarray(ti.f32, ndim=2)):
         for row, packet in ti.ndrange(count, packets):
-            hu = scanner.hounsfield(row, packet * LANES, plane.grid[0], plane.grid[1])
+            hu = scanner.hounsfield(row, packet * LANES, plane.grid[0], plane.grid[1], count - 1)
             for lane in ti.static(range(LANES)):
                 values[row, packet * LANES + lane] = hu[lane]
 

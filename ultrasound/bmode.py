@@ -147,7 +147,7 @@ class BMode:
         self._table_settings: tuple | None = None
 
     def render(self, probe: Probe, detail_level: DetailLevel = "speckle") -> np.ndarray:
-        """Return grey values (pixels, pixels) uint8 of the plane located last, for a probe with the same numbers of scanlines and samples.
+        """Return grey values (rows, columns) uint8 of the plane located last, for a probe with the same numbers of scanlines and samples.
 
         ``decibel`` then holds its scanlines, ``real`` and ``imaginary`` their echo.
         """
@@ -163,7 +163,7 @@ class BMode:
             self._add()
         else:
             self._spread()
-        image = np.empty((self.plane.pixels, self.plane.pixels), np.uint8)
+        image = np.empty(self.plane.shape, np.uint8)
         self._scan_convert(probe.dyn_range_db, image)
         return image
 
@@ -171,9 +171,13 @@ class BMode:
         """Update the tables of the probe's settings, if these changed."""
         fill((self.gain, probe.gain_db()))
         fixed = probe.model_dump(exclude={"gain_percent", "dyn_range_db", "time_gain_compensation"})
-        if self._table_settings == tuple(fixed.items()):
+        settings = *fixed.items(), self.plane.shape
+        if self._table_settings == settings:
             return
-        self._table_settings = tuple(fixed.items())
+        self._table_settings = settings
+        source = np.zeros(self.source.shape + (2,), np.float32)
+        rows, columns = self.plane.shape
+        source[:rows, :columns] = source_of_pixels(probe, rows, columns)
         start, direction = probe.scanlines()
         weights, half, speckle_gain = lateral_weights(probe)
         fill(
@@ -183,7 +187,7 @@ class BMode:
             (self.speckle_gain, speckle_gain),
             (self.weight, weights),
             (self.half, half.reshape(-1, LANES).max(axis=1)),
-            (self.source, source_of_pixels(probe, self.plane.pixels)),
+            (self.source, source),
         )
 
     @ti.kernel
@@ -386,7 +390,7 @@ class BMode:
 
     @ti.kernel
     def _scan_convert(self, dynamic_range_db: float, image: ti.types.ndarray(ti.u8, ndim=2)):
-        for row, column in self.source:
+        for row, column in ti.ndrange(image.shape[0], image.shape[1]):
             at = self.source[row, column]
             grey = 0.0
             if at.x >= -0.5:
@@ -399,11 +403,11 @@ class BMode:
             image[row, column] = ti.cast(tm.clamp(grey, 0.0, 255.0) + 0.5, ti.u8)
 
 
-def source_of_pixels(probe: Probe, pixels: int) -> np.ndarray:
-    """Return scanline and sample index, fractional, of each pixel's centre, (pixels, pixels, 2) float32; -1 outside the image."""
+def source_of_pixels(probe: Probe, rows: int, columns: int) -> np.ndarray:
+    """Return scanline and sample index, fractional, of each pixel's centre, (rows, columns, 2) float32; -1 outside the image."""
     width, depth, above = probe.extent_mm
-    u = (np.arange(pixels) + 0.5) / pixels * width - width / 2
-    v = (np.arange(pixels) + 0.5) / pixels * depth - above
+    u = (np.arange(columns) + 0.5) / columns * width - width / 2
+    v = (np.arange(rows) + 0.5) / rows * depth - above
     line, along = probe.beam_coordinates(*np.meshgrid(u, v))
     within = (
         (line >= -0.5) & (line <= probe.number_of_scanlines - 0.5) & (along >= 0) & (along <= probe.depth_mm)

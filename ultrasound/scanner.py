@@ -65,26 +65,31 @@ def start_acoustics(anatomy: ScannedAnatomy) -> Future[np.ndarray]:
 
 @ti.data_oriented
 class PlaneInTissue:
-    """The tetrahedron of an embedding that contains each of ``pixels`` x ``pixels`` pixels of an image plane.
+    """The tetrahedron of an embedding that contains each pixel of an image plane, which has at most ``pixels`` x ``pixels``.
 
-    ``owner`` (rows, columns) is its index, since the last ``locate``; ``grid`` are the size of a pixel and the centre (u, v) of the
-    first one [mm].
+    Since the last ``locate`` the image has ``shape`` (rows, columns), ``owner`` is the tetrahedron's index at these, and ``grid`` are the
+    size of a pixel and the centre (u, v) of the first one [mm].
     """
 
     def __init__(self, embedding: Embedding | Unmoved, pixels: int) -> None:
         self.embedding = embedding
         self.pixels = pixels
+        self.shape = pixels, pixels
         self.owner = ti.field(ti.i32, (pixels, pixels))
         self.grid = ti.Vector.field(2, ti.f32, 2)
+        self._last = ti.Vector.field(2, ti.i32, ())
+        self._rest_grids: dict[int, np.ndarray] = {}
 
-    def locate(self, plane: ImagePlane) -> None:
-        """Find the tissue on a plane; the embedding must be up to date."""
-        pixel = np.array([plane.width_mm, plane.depth_mm]) / self.pixels
+    def locate(self, plane: ImagePlane, shape: tuple[int, int] | None = None) -> None:
+        """Find the tissue on a plane, for an image of a shape [all pixels]; the embedding must be up to date."""
+        rows, columns = self.shape = shape or (self.pixels, self.pixels)
+        pixel = np.array([plane.width_mm / columns, plane.depth_mm / rows])
         first = np.array([-plane.width_mm / 2, -plane.above_mm]) + pixel / 2
-        fill((self.grid, np.stack([pixel, first])))
+        fill((self.grid, np.stack([pixel, first])), (self._last, np.array([rows - 1, columns - 1])))
+        self._rest_grids.clear()
         given = np.linalg.inv(plane.world_from_plane), plane.world_from_plane, pixel, first
         inverse, world, pixel_mm, first_mm = (ti.Matrix(np.asarray(each, float).tolist()) for each in given)
-        self.embedding.locate_on_plane(inverse, world, pixel_mm, first_mm, self.owner)
+        self.embedding.locate_on_plane(inverse, world, pixel_mm, first_mm, rows, columns, self.owner)
 
     @property
     def grid_mm(self) -> tuple[ti.Vector, ti.Vector]:
@@ -93,16 +98,24 @@ class PlaneInTissue:
         return tm.vec2(*pixel), tm.vec2(*first)
 
     def rest_grid(self, count: int) -> np.ndarray:
-        """Return rest positions (rows, columns, 3) [mm] at count x count points evenly over the plane."""
-        places = np.empty((count, count, 3), np.float32)
-        self._rest_grid(*self.grid_mm, places)
-        return places
+        """Return rest positions (count, count, 3) [mm] at points evenly over the plane. They are not to be changed."""
+        if count not in self._rest_grids:
+            self._rest_grids[count] = np.empty((count, count, 3), np.float32)
+            self._rest_grid(*self.grid_mm, *self.shape, self._rest_grids[count])
+        return self._rest_grids[count]
 
     @ti.kernel
-    def _rest_grid(self, pixel_mm: tm.vec2, first_mm: tm.vec2, places: ti.types.ndarray(ti.f32, ndim=3)):
+    def _rest_grid(
+        self,
+        pixel_mm: tm.vec2,
+        first_mm: tm.vec2,
+        rows: int,
+        columns: int,
+        places: ti.types.ndarray(ti.f32, ndim=3),
+    ):
         for i, j in ti.ndrange(places.shape[0], places.shape[1]):
-            row = (i * (self.pixels - 1)) // (places.shape[0] - 1)
-            column = (j * (self.pixels - 1)) // (places.shape[1] - 1)
+            row = (i * (rows - 1)) // (places.shape[0] - 1)
+            column = (j * (columns - 1)) // (places.shape[1] - 1)
             rest = self.rest_at(row, column, pixel_mm, first_mm)
             for axis in ti.static(range(3)):
                 places[i, j, axis] = rest[axis]
@@ -115,12 +128,11 @@ class PlaneInTissue:
         return linear[:, 0] * u + linear[:, 1] * v + linear[:, 3]
 
     @ti.func
-    def rest_lanes(self, row, first, pixel_mm, first_mm):
+    def rest_lanes(self, row, first, pixel_mm, first_mm, last):
         """As ``rest_at`` for LANES pixels of a row, axis by axis, and whether they are collinear at rest too.
 
-        Pixels beyond the image repeat its last.
+        Pixels beyond the last column of the image repeat it.
         """
-        last = self.pixels - 1
         x, y, z = Lanes(0.0), Lanes(0.0), Lanes(0.0)
         owner = self.owner[row, first]
         same = True
@@ -142,7 +154,8 @@ class PlaneInTissue:
     def pixel_near(self, place):
         """Return row and column of the pixel nearest to (u, v) [mm]."""
         at = ti.round((place - self.grid[1]) / self.grid[0], ti.i32)
-        return tm.clamp(at.y, 0, self.pixels - 1), tm.clamp(at.x, 0, self.pixels - 1)
+        last = self._last[None]
+        return tm.clamp(at.y, 0, last[0]), tm.clamp(at.x, 0, last[1])
 
     @ti.func
     def rest_from_plane(self, row, column):
@@ -181,14 +194,14 @@ class GroundTruthLabels:
             self.bead = field_of(np.asarray(beads, float), 1)
 
     def render(self) -> np.ndarray:
-        """Return labels (pixels, pixels) uint8."""
-        image = np.empty((self.plane.pixels, self.plane.pixels), np.uint8)
+        """Return labels (rows, columns) uint8."""
+        image = np.empty(self.plane.shape, np.uint8)
         self._render(image)
         return image
 
     @ti.kernel
     def _render(self, image: ti.types.ndarray(ti.u8, ndim=2)):
-        for row, column in ti.ndrange(self.plane.pixels, self.plane.pixels):
+        for row, column in ti.ndrange(image.shape[0], image.shape[1]):
             rest = self.plane.rest_at(row, column, self.plane.grid[0], self.plane.grid[1])
             label = ti.cast(PixelLabel.OUTSIDE, ti.i32)
             if self.plane.is_tissue(row, column):
@@ -261,10 +274,10 @@ class Scanner:
             self.plane, self.organ, None if tumour is None else distance_volume(tumour, 1.0)
         )
 
-    def locate(self, plane: ImagePlane) -> None:
-        """Find the tissue on a plane, without an image."""
+    def locate(self, plane: ImagePlane, shape: tuple[int, int] | None = None) -> None:
+        """Find the tissue on a plane, without an image; ``shape`` (rows, columns) is that of the next images."""
         self.embedding.update()
-        self.plane.locate(plane)
+        self.plane.locate(plane, shape)
 
     def images(
         self,
@@ -274,9 +287,13 @@ class Scanner:
         detail_level: DetailLevel,
         window_hu: float,
         level_hu: float,
+        shape: tuple[int, int] | None = None,
     ) -> dict[str, np.ndarray]:
-        """Return the images of a plane in a mode by name, grey values (pixels, pixels) uint8, the main one first."""
-        self.locate(plane)
+        """Return the images of a plane in a mode by name, grey values of a shape (rows, columns) uint8, the main one first.
+
+        No row or column is beyond the scene's number of pixels, which is also the default.
+        """
+        self.locate(plane, shape)
         render = {
             CT: lambda: self.ct_slice(window_hu, level_hu),
             B_MODE: lambda: self.bmode.render(probe, detail_level),
@@ -284,8 +301,8 @@ class Scanner:
         return {name: render[name]() for name in IMAGES_OF_MODE[mode]}
 
     def ct_slice(self, window_hu: float, level_hu: float) -> np.ndarray:
-        """Return grey values (pixels, pixels) uint8, 0 to 255 over the window, of the plane located last, at pixel centres."""
-        image = np.empty((self.plane.pixels, self.plane.pixels), np.uint8)
+        """Return grey values (rows, columns) uint8, 0 to 255 over the window, of the plane located last, at pixel centres."""
+        image = np.empty(self.plane.shape, np.uint8)
         # Fields must exist before the kernel that reads them is compiled.
         _ = self.ct, self.organ
         self._window(*self.plane.grid_mm, window_hu, level_hu, image)
@@ -300,21 +317,22 @@ class Scanner:
         level_hu: float,
         image: ti.types.ndarray(ti.u8, ndim=2),
     ):
-        for row, packet in ti.ndrange(self.plane.pixels, ti.static((self.plane.pixels + LANES - 1) // LANES)):
-            hu = self.hounsfield(row, packet * LANES, pixel_mm, first_mm)
+        columns = image.shape[1]
+        for row, packet in ti.ndrange(image.shape[0], (columns + LANES - 1) // LANES):
+            hu = self.hounsfield(row, packet * LANES, pixel_mm, first_mm, columns - 1)
             grey = ti.min(ti.max((hu - level_hu) / window_hu + 0.5, 0.0), 1.0) * 255.0 + 0.5
             for lane in ti.static(range(LANES)):
-                if packet * LANES + lane < self.plane.pixels:
+                if packet * LANES + lane < columns:
                     image[row, packet * LANES + lane] = ti.cast(grey[lane], ti.u8)
 
     @ti.func
-    def hounsfield(self, row, first, pixel_mm, first_mm):
-        """Return HU of LANES pixels of a row."""
-        x, y, z, in_line = self.plane.rest_lanes(row, first, pixel_mm, first_mm)
+    def hounsfield(self, row, first, pixel_mm, first_mm, last):
+        """Return HU of LANES pixels of a row, whose last column is ``last``."""
+        x, y, z, in_line = self.plane.rest_lanes(row, first, pixel_mm, first_mm, last)
         hu = self.ct.sample_lanes(x, y, z, in_line)
         if ti.static(not self.show_background):
             for lane in ti.static(range(LANES)):
-                column = ti.min(first + lane, self.plane.pixels - 1)
+                column = ti.min(first + lane, last)
                 if not self.in_organ(row, column, ti.Vector([x[lane], y[lane], z[lane]])):
                     hu[lane] = self.outside_hu
         return hu

@@ -143,7 +143,7 @@ def _truth(
     images: np.ndarray, poses: np.ndarray, times_s: np.ndarray, probe: Probe, beads_mm: np.ndarray
 ) -> GroundTruthSweep:
     on_probe = probe.image_to_probe(*images.shape[1:])
-    mask = source_of_pixels(probe, images.shape[1])[..., 0] > -1.0
+    mask = source_of_pixels(probe, *images.shape[1:])[..., 0] > -1.0
     return GroundTruthSweep(sweep_of(images, poses, times_s, on_probe), poses, beads_mm, on_probe, mask)
 
 

@@ -23,10 +23,11 @@ from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.real_time.start_times import StartTimes
 from rehearsal.real_time.started_process import started_process
 from render.display import display_available
-from render.viewer import Controls, View
+from render.viewer import Controls, ScannerSettings, View
 from render.vulkan_device import vulkan_devices
 from scenes.scene import EMBEDDED
 from studies.study_results import write_results
+from ultrasound.probe import Probe
 from version import VERSION
 
 if TYPE_CHECKING:
@@ -92,6 +93,10 @@ class ScriptedHand:
         controls.ray = face + aside + FROM_MM * self._home[:3, 2], -self._home[:3, 2]
         controls.press = now_s % PRESS_PERIOD_S < PRESS_S
         return controls
+
+    def image_shape(self, settings: ScannerSettings, probe: Probe) -> tuple[int, int]:
+        """Rows and columns of the boxes of the images."""
+        return self.window.image_shape(settings, probe)
 
     def draw_scene(self, view: View, may_wait: bool) -> None:
         """Draw the 3D view ahead."""

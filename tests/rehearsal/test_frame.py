@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from click.exceptions import Exit
+from null_viewer import NullViewer
 from test_openigtlink import LiveImage
 
 import app
@@ -52,8 +53,8 @@ class Fake:
         place[0, 3] = self.steps
         return SimpleNamespace(world_from_plane=place)
 
-    def image_view(self, rehearsal, probe, settings, tally) -> View:
-        grey = np.full((4, 4), self.steps, np.uint8)
+    def image_view(self, rehearsal, probe, settings, tally, shape=None) -> View:
+        grey = np.full(shape or (4, 4), self.steps, np.uint8)
         width, depth, _ = probe.extent_mm
         return View(np.eye(4), {"B-mode": grey, "CT": 255 - grey}, width, depth)
 
@@ -104,7 +105,7 @@ def looping(monkeypatch, tmp_path, sent) -> WindowFrames:
     monkeypatch.setattr(frame, "image_view", fake.image_view)
     return WindowFrames(
         *(fake, fake, fake, FakeTally(), SimpleNamespace(send=lambda *live: sent.append(LiveImage(*live)))),
-        **dict(solver=fake, viewer=None, out=tmp_path, notices=Notices(), sweeping=fake, plans=fake),
+        **dict(solver=fake, viewer=NullViewer(), out=tmp_path, notices=Notices(), sweeping=fake, plans=fake),
     )
 
 
@@ -228,6 +229,16 @@ def test_a_sweep_that_is_recorded_stands_in_the_panel_beside_all_else(looping, m
     )
 
 
+def test_images_have_the_pixels_of_their_boxes_unless_they_are_sent_or_recorded(looping, monkeypatch):
+    controls, of_boxes = Controls(Settings()), (12, 7)
+    looping.viewer = SimpleNamespace(image_shape=lambda settings, probe: of_boxes)
+    assert next_view(looping, controls).images["CT"].shape == (4, 4)
+    looping.link = None
+    assert next_view(looping, controls).images["CT"].shape == of_boxes
+    looping.sweeping = SimpleNamespace(status="RECORDING 0 s", watch=lambda *_: "")
+    assert next_view(looping, controls).images["CT"].shape == (4, 4)
+
+
 def test_notices_name_the_users_keys_on_the_screen_and_in_the_terminal(looping, capsys):
     looping.keys = Keys(of=DEFAULT_KEYS | {"sweep": "Space", "plan_for": "L"})
     looping.notices.post("sweep-001: {sweep} ends it")
@@ -302,7 +313,10 @@ def test_the_export_key_saves_the_tissue_beside_its_picture_and_says_what_it_can
 ):
     begins: list[str] = []
     monkeypatch.setattr(frame, "save_surfaces", lambda rehearsal, out, begin: begins.append(begin))
-    settings = Settings()
+    saved: list[View] = []
+    save = frame.save_view
+    monkeypatch.setattr(frame, "save_view", lambda view, *given: saved.append(view) or save(view, *given))
+    settings, looping.link = Settings(), None
     for _ in range(2):
         looping._export(settings, next_view(looping, Controls(settings)))
     looping.cine.frames.append(looping.cine.frames[-1])
@@ -313,6 +327,13 @@ def test_the_export_key_saves_the_tissue_beside_its_picture_and_says_what_it_can
     before = replace(next_view(looping, Controls(settings, cine=-1)), notes={"B-mode": "NO CONTACT"})
     looping._export(settings, before)
     assert len(begins) == 3 and (tmp_path / "004-b-mode.png").is_file()
+    # Of the live image all pixels are computed; the earlier one is saved as it was shown.
+    assert [view.images["CT"].shape for view in saved] == [
+        (4, 4),
+        (4, 4),
+        (4, 4),
+        looping.viewer.image_shape(settings, looping.rehearsal.probe),
+    ]
     missing = (
         "B-mode image black: the probe does not touch the organ",
         "no organ (PLY), which has moved since: F continues",

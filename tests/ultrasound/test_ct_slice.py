@@ -284,7 +284,7 @@ def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(kept
     other = copy(embedding)
     other.serial = not embedding.serial
     cut.plane.owner.fill(-1)
-    other.locate_on_plane(*matrices, cut.plane.owner)
+    other.locate_on_plane(*matrices, *cut.plane.shape, cut.plane.owner)
     assert np.array_equal(array_of(cut.plane.owner), owner)
 
 
