@@ -51,6 +51,8 @@ licences: .cache/release/.tools
 .venv/.run: requirements.txt .venv/pyvenv.cfg
 	@echo "Installing what Nephron needs into .venv: 1.1 GB, two to six minutes, once."
 	@$(BIN)/python $(INSTALL) -r requirements.txt
+	@echo "Making the embedded patient: fifteen seconds, once."
+	-@$(BIN)/python -c "from scenes.phantom.embedded_patient import phantom_folder; phantom_folder()"
 	@touch $@
 
 .venv/.dev: requirements-dev.txt .venv/.run
