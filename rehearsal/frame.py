@@ -34,6 +34,7 @@ from render.viewer import Controls, ScannerSettings, Settings, View
 from render.window import Window
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import image_plane
+from ultrasound.scanner import IMAGES_OF_MODE
 
 # How long a notice stays on the screen, and the one that the tissue's state was restored.
 NOTICE_S, RESTORED_S = 2.0, 4.0
@@ -223,7 +224,8 @@ class WindowFrames(Frames[WindowInput]):
         if self._shows_earlier:
             return self.cine.shown.view
         is_only_shown = not self.sweeping.status and self.link is None
-        shape = self.viewer.image_shape(settings, probe) if is_only_shown else None
+        count, (width, depth, _) = len(IMAGES_OF_MODE[settings.mode]), probe.extent_mm
+        shape = self.viewer.image_shape(count, width, depth) if is_only_shown else None
         return image_view(self.rehearsal, probe, settings, self.tally, shape)
 
     def observe_window(self, probe: Probe) -> None:

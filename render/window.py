@@ -26,12 +26,10 @@ from render.keys import Keys, begin, hold
 from render.scene_view import SceneView
 from render.sliders import boxes_of, draw_sliders
 from render.software_scene import SoftwareScene
-from render.viewer import Controls, Geometry, ScannerSettings, Settings, View
+from render.viewer import Controls, Geometry, Settings, View
 from render.vulkan_device import draws_by_processor
 from render.window_layout import FULL_SIZE, Rect, WindowLayout
 from sim.device import on_cpu
-from ultrasound.probe import Probe
-from ultrasound.scanner import IMAGES_OF_MODE
 
 ZOOM_S = 0.5
 ZOOM_SENSE = {"zoom_in": -1.0, "zoom_out": 1.0}
@@ -227,10 +225,9 @@ class Window:
 
     # Drawing
 
-    def image_shape(self, settings: ScannerSettings, probe: Probe) -> tuple[int, int]:
-        """Rows and columns of the boxes in which the images of a probe are drawn."""
-        width, depth, _ = probe.extent_mm
-        box = self.layout.image_boxes(len(IMAGES_OF_MODE[settings.mode]), width, depth)[0]
+    def image_shape(self, count: int, width_mm: float, depth_mm: float) -> tuple[int, int]:
+        """Rows and columns of the boxes in which so many images of a width and a depth [mm] are drawn."""
+        box = self.layout.image_boxes(count, width_mm, depth_mm)[0]
         return box.height, box.width
 
     def draw_scene(self, view: View, may_wait: bool) -> None:

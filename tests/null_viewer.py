@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from render.viewer import Controls, ScannerSettings, Settings, View
-from ultrasound.probe import Probe
+from render.viewer import Controls, Settings, View
 
 
 class NullViewer:
@@ -25,7 +24,7 @@ class NullViewer:
         self._running = self._running and not controls.quit
         return controls
 
-    def image_shape(self, settings: ScannerSettings, probe: Probe) -> tuple[int, int]:
+    def image_shape(self, count: int, width_mm: float, depth_mm: float) -> tuple[int, int]:
         return self._size
 
     def draw_scene(self, view: View, may_wait: bool) -> None: ...

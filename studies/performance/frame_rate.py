@@ -23,11 +23,10 @@ from rehearsal.real_time.frame_times import FrameTimes
 from rehearsal.real_time.start_times import StartTimes
 from rehearsal.real_time.started_process import started_process
 from render.display import display_available
-from render.viewer import Controls, ScannerSettings, View
+from render.viewer import Controls, View
 from render.vulkan_device import vulkan_devices
 from scenes.scene import EMBEDDED
 from studies.study_results import write_results
-from ultrasound.probe import Probe
 from version import VERSION
 
 if TYPE_CHECKING:
@@ -94,9 +93,9 @@ class ScriptedHand:
         controls.press = now_s % PRESS_PERIOD_S < PRESS_S
         return controls
 
-    def image_shape(self, settings: ScannerSettings, probe: Probe) -> tuple[int, int]:
+    def image_shape(self, count: int, width_mm: float, depth_mm: float) -> tuple[int, int]:
         """Rows and columns of the boxes of the images."""
-        return self.window.image_shape(settings, probe)
+        return self.window.image_shape(count, width_mm, depth_mm)
 
     def draw_scene(self, view: View, may_wait: bool) -> None:
         """Draw the 3D view ahead."""

@@ -231,7 +231,7 @@ def test_a_sweep_that_is_recorded_stands_in_the_panel_beside_all_else(looping, m
 
 def test_images_have_the_pixels_of_their_boxes_unless_they_are_sent_or_recorded(looping, monkeypatch):
     controls, of_boxes = Controls(Settings()), (12, 7)
-    looping.viewer = SimpleNamespace(image_shape=lambda settings, probe: of_boxes)
+    looping.viewer = SimpleNamespace(image_shape=lambda *_: of_boxes)
     assert next_view(looping, controls).images["CT"].shape == (4, 4)
     looping.link = None
     assert next_view(looping, controls).images["CT"].shape == of_boxes
@@ -332,7 +332,7 @@ def test_the_export_key_saves_the_tissue_beside_its_picture_and_says_what_it_can
         (4, 4),
         (4, 4),
         (4, 4),
-        looping.viewer.image_shape(settings, looping.rehearsal.probe),
+        looping.viewer.image_shape(2, 1.0, 1.0),
     ]
     missing = (
         "B-mode image black: the probe does not touch the organ",
