@@ -18,6 +18,7 @@ from rehearsal.real_time.started_process import start_process
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import AnatomyFiles, Attachment, Scene, with_options
+from sim import stored_arrays
 from sim.solver import StepSettings
 from ultrasound.probe_manipulator import advanced
 
@@ -26,15 +27,18 @@ LONGEST_WAIT_S = 30.0
 RATE = 200.0
 
 
-def small_rehearsal() -> Rehearsal:
+def small_rehearsal(floor_mm: float | None = None, **changes: float) -> Rehearsal:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=15.0)
     scene = Scene(
         anatomy=AnatomyFiles(),
         attachment=Attachment(at_mm=(0.0, 0.0, -15.0), radius_mm=8.0),
         press={"warm_up_steps": 3},
     )
-    scene = with_options(scene, {"tissue.cell_mm": 6.0})
-    return Rehearsal(scene, LoadedAnatomy(ball, None, None, ()))
+    scene = with_options(scene, {"tissue.cell_mm": 6.0} | changes)
+    floor = () if floor_mm is None else (trimesh.creation.box([60.0, 60.0, 10.0]),)
+    for each in floor:
+        each.apply_translation([0.0, 0.0, floor_mm - 20.0])
+    return Rehearsal(scene, LoadedAnatomy(ball, None, None, floor))
 
 
 @pytest.fixture(scope="module")
@@ -142,6 +146,32 @@ def test_a_state_that_the_check_would_restore_crosses_too(solver):
     state = solver.rehearsal.divergence_check.state
     # Good states are stored every second: it is not the one at rest any more.
     assert not np.array_equal(state.good.body.position, solver.rehearsal.settled.solver.body.position)
+
+
+def test_the_state_at_rest_is_stored_by_all_that_it_depends_on(one_device, monkeypatch, tmp_path):
+    monkeypatch.setattr(stored_arrays, "FOLDER", tmp_path)
+    steps: list[int] = []
+    advance = PressedOrgan.advance
+    monkeypatch.setattr(PressedOrgan, "advance", lambda organ, pose: steps.append(1) or advance(organ, pose))
+
+    def rested(**given: float) -> tuple[int, str, str]:
+        steps.clear()
+        rehearsal = small_rehearsal(**given)
+        made, at_rest = len(steps), rehearsal.digest()
+        for depth_mm in (1.0, 2.0, 3.0):
+            rehearsal.advance(rehearsal.pose_at_depth(depth_mm))
+        return made, at_rest, rehearsal.digest()
+
+    first, again = rested(), rested()
+    assert (first[0], again[0]) == (3, 0) and first[1:] == again[1:]
+    others = (
+        dict(floor_mm=0.0),
+        dict(floor_mm=0.5),
+        {"tissue.young_kpa": 9.0},
+        {"gravity.acceleration_m_s2": 5.0},
+    )
+    for other in others:
+        assert [rested(**other)[0] for _ in range(2)] == [3, 0]
 
 
 def test_a_process_that_ends_is_an_error_in_words():
