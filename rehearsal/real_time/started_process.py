@@ -13,7 +13,7 @@ from multiprocessing.process import BaseProcess
 from multiprocessing.synchronize import Lock
 
 # How long the process may take to end in order.
-END_S = 0.5
+END_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -25,13 +25,16 @@ class StartedProcess:
     lock: Lock
 
     def close(self) -> None:
-        """End the process. A second call does nothing."""
-        if not self.connection.closed:
-            with suppress(OSError):
-                self.connection.send(("stop", ()))
-            self.process.join(END_S)
-            self.process.kill()
-            self.connection.close()
+        """End the process in order, so that it stores its kernels."""
+        with suppress(OSError):
+            self.connection.send(("stop", ()))
+        self.process.join(END_S)
+        self.kill()
+
+    def kill(self) -> None:
+        """End the process at once, if it has not ended."""
+        self.process.kill()
+        self.connection.close()
 
 
 def start_process() -> StartedProcess:
@@ -47,13 +50,13 @@ def start_process() -> StartedProcess:
 
 @contextmanager
 def started_process(is_needed: bool) -> Iterator[StartedProcess | None]:
-    """The process of a solver, if one is needed; it ends with this context."""
+    """The process of a solver, if one is needed; at the end of this context it is killed, unless ``SolverProcess`` has ended it."""
     started = start_process() if is_needed else None
     try:
         yield started
     finally:
         if started is not None:
-            started.close()
+            started.kill()
 
 
 def _compute(connection: Connection, lock: Lock, parent: int) -> None:
