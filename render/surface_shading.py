@@ -9,7 +9,7 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
-from sim.fields import array_of, fields_of, fill, run_kernel
+from sim.fields import array_of, fields_of, fill, fill_evenly, run_kernel
 
 ORGAN, TINT = (0.66, 0.27, 0.23), (0.24, 0.60, 0.36)
 SOLID, GLASS = 1.0, 0.30
@@ -72,7 +72,7 @@ class ShadedSurface:
         if vertices is not self._tinted:
             self._tinted = vertices
             if vertices is None:
-                fill((self._tint, np.zeros(self._tint.shape)))
+                fill_evenly(self._tint, 0.0)
             else:
                 fill((self._tint, vertices))
 

@@ -75,11 +75,14 @@ def fingerprint(anatomy: LoadedAnatomy) -> str:
     parts = [anatomy.parts[name] for name in sorted(anatomy.parts)]
     for each in (anatomy.organ, anatomy.tumour, *parts, anatomy.ct, anatomy.labels, *anatomy.shapes):
         if isinstance(each, trimesh.Trimesh):
-            digest.update(np.ascontiguousarray(each.vertices).tobytes() + each.faces.tobytes())
+            arrays = each.vertices, each.faces
         elif isinstance(each, Grid):
-            digest.update(np.ascontiguousarray(each.voxels).tobytes() + each.index_from_mm.tobytes())
+            arrays = each.voxels, each.index_from_mm
         else:
             digest.update(repr(each).encode())
+            continue
+        for array in arrays:
+            digest.update(memoryview(np.ascontiguousarray(array)).cast("B"))
     return digest.hexdigest()[:16]
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
-from sim.fields import array_of, field_of, fill
+from sim.fields import array_of, field_of, fill, fill_evenly
 from sim.sampling import RestBody
 
 
@@ -66,4 +66,4 @@ class ParticleBody(Body):
         self.mass_scaled = mass_scaling_per_mm > 0
         if self.mass_scaled:
             self.mass_scale = ti.field(ti.f32, self.count)
-            self.mass_scale.fill(1.0)
+            fill_evenly(self.mass_scale, 1.0)

@@ -50,6 +50,14 @@ def fill(*pairs: tuple[ti.Field, np.ndarray]) -> None:
             field.from_numpy(np.ascontiguousarray(values, _kind(field)))
 
 
+def fill_evenly(field: ti.Field, value: float) -> None:
+    """Write one number into all of a field."""
+    if on_cpu():
+        _memory(field)[...] = value
+    else:
+        field.fill(value)
+
+
 def array_of(field: ti.Field) -> np.ndarray:
     """The values of a field, of shape (*field, *element)."""
     return _memory(field).copy() if on_cpu() else field.to_numpy()

@@ -5,7 +5,7 @@ import taichi as ti
 import taichi.math as tm
 
 from sim.body import ParticleBody
-from sim.fields import array_of, fill
+from sim.fields import array_of, fill, fill_evenly
 from sim.friction import sticking_fraction, tangential
 from sim.shapes import FAR, TimeOfImpact
 
@@ -49,7 +49,7 @@ class ShapeContacts:
 
     def reset(self) -> None:
         """Clear stored distances; call it after other code has moved the particles."""
-        self.found.fill(-FAR)
+        fill_evenly(self.found, -FAR)
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """A copy of what persists from step to step: contact planes, and where they were found."""

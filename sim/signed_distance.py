@@ -6,6 +6,7 @@ import taichi as ti
 import taichi.math as tm
 from scipy.ndimage import label
 
+from sim.device import backend
 from sim.stored_arrays import stored
 
 # Grid points nearer to the surface than EXACT_MM get exact distances, the others are interpolated from every third point.
@@ -40,9 +41,7 @@ def distance_grid(
     that it separates.
     """
     vertices, faces = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
-    distance, low = stored(
-        _distances, vertices, faces, float(spacing_mm), float(reach_mm), backend=str(ti.cfg.arch)
-    )
+    distance, low = stored(_distances, vertices, faces, float(spacing_mm), float(reach_mm), backend=backend())
     return distance, low
 
 

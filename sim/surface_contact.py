@@ -11,7 +11,7 @@ import taichi.math as tm
 from scipy.sparse import csr_array
 
 from sim.body import Body
-from sim.fields import array_of, fields_of, fill
+from sim.fields import array_of, fields_of, fill, fill_evenly
 from sim.friction import sticking_fraction, tangential
 from sim.lattice import Lattice
 from sim.shapes import FAR, TimeOfImpact
@@ -76,10 +76,10 @@ class SurfaceContacts:
 
     def reset(self) -> None:
         """Clear stored distances and friction; call it after other code has moved the body."""
-        self.found.fill(-FAR)
-        self.near.fill(0)
+        fill_evenly(self.found, -FAR)
+        fill_evenly(self.near, 0)
         if self.friction > 0:
-            self.slip.fill(0.0)
+            fill_evenly(self.slip, 0.0)
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """A copy of what persists from step to step: friction and contact planes."""

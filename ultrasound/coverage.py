@@ -13,6 +13,7 @@ import trimesh
 from scipy.ndimage import distance_transform_edt, label, map_coordinates
 
 from sim.signed_distance import distance_grid, signed_distance
+from sim.stored_arrays import stored
 from ultrasound.probe import Probe
 
 VOXEL_MM = 1.5
@@ -59,7 +60,8 @@ class Coverage:
         high = np.minimum(np.ceil(high).astype(int) + 1, self.distance.shape)
         box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
         points = self.origin_mm + VOXEL_MM * (np.indices(high - low).reshape(3, -1).T + low)
-        around[box] = signed_distance(tumour.vertices, tumour.faces, points)[0].reshape(high - low)
+        distance = stored(signed_distance, tumour.vertices, tumour.faces, points)[0]
+        around[box] = distance.reshape(high - low)
         return around
 
     def _indices(self, points_mm: np.ndarray) -> np.ndarray:
