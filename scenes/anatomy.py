@@ -82,7 +82,7 @@ def fingerprint(anatomy: LoadedAnatomy) -> str:
             digest.update(repr(each).encode())
             continue
         for array in arrays:
-            digest.update(memoryview(np.ascontiguousarray(array)).cast("B"))
+            digest.update(np.ascontiguousarray(array).data.cast("B"))
     return digest.hexdigest()[:16]
 
 
