@@ -73,6 +73,7 @@ def fingerprint(anatomy: LoadedAnatomy) -> str:
     """A hash of all surfaces and voxels."""
     digest = hashlib.sha256()
     parts = [anatomy.parts[name] for name in sorted(anatomy.parts)]
+    arrays: tuple[np.ndarray, ...]
     for each in (anatomy.organ, anatomy.tumour, *parts, anatomy.ct, anatomy.labels, *anatomy.shapes):
         if isinstance(each, trimesh.Trimesh):
             arrays = each.vertices, each.faces
