@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import taichi as ti
+from coarse_patient import coarse_patient
 from null_viewer import NullViewer
 from one_step_solver import OneStepSolver
 
@@ -30,9 +31,7 @@ from rehearsal.tracking.pose_file import TimedPoses
 from render.keys import Keys
 from render.viewer import Controls, Settings, View
 from render.window import NoVulkan
-from scenes.anatomy import LoadedAnatomy, load_anatomy
-from scenes.phantom.embedded_patient import phantom_folder
-from scenes.scene import EMBEDDED, load_scene, with_options
+from scenes.anatomy import LoadedAnatomy
 from sim.device import start
 from ultrasound import coverage
 from version import VERSION
@@ -77,16 +76,11 @@ def once(make: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def built() -> Iterator[tuple[Rehearsal, LoadedAnatomy]]:
-    """The embedded patient, coarse and with small pictures."""
     start("cpu")
-    scene = with_options(load_scene(EMBEDDED), {"tissue.cell_mm": 8.0, "image.mode": "b-mode"})
-    short = dict(press=scene.press.model_copy(update={"warm_up_steps": 20}))
-    small = dict(image=scene.image.model_copy(update={"pixels": 32}))
-    anatomy = load_anatomy(scene, phantom_folder())
     with pytest.MonkeyPatch.context() as patch:
         # Every run begins with a new coverage of the one organ.
         patch.setattr(coverage, "distance_grid", once(coverage.distance_grid))
-        yield Rehearsal(scene.model_copy(update=short | small), anatomy), anatomy
+        yield coarse_patient()
     ti.reset()
 
 
