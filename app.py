@@ -22,8 +22,8 @@ from errors import UserError
 from rehearsal.commands.lazy_group import LazyGroup
 from version import VERSION
 
-# Loading modules and building kernels allocates much that is no garbage: Python's own 700 objects between two searches for garbage cost a
-# tenth of the start.
+# While modules are loaded and kernels built, much is allocated and almost nothing becomes garbage. Python would look for garbage so often
+# that this took a tenth of the start.
 gc.set_threshold(100_000)
 
 # Where each command is, and what it does in a line.

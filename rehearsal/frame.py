@@ -223,10 +223,14 @@ class WindowFrames(Frames[WindowInput]):
         """
         if self._shows_earlier:
             return self.cine.shown.view
-        is_only_shown = not self.sweeping.status and self.link is None
         count, (width, depth, _) = len(IMAGES_OF_MODE[settings.mode]), probe.extent_mm
-        shape = self.viewer.image_shape(count, width, depth) if is_only_shown else None
+        shape = self.viewer.image_shape(count, width, depth) if self._only_shows else None
         return image_view(self.rehearsal, probe, settings, self.tally, shape)
+
+    @property
+    def _only_shows(self) -> bool:
+        """Whether the images are only shown, and neither recorded nor sent."""
+        return not self.sweeping.status and self.link is None
 
     def observe_window(self, probe: Probe) -> None:
         """Measure and record, unless frozen."""
@@ -330,7 +334,7 @@ class WindowFrames(Frames[WindowInput]):
     def _export(self, settings: Settings, view: View) -> None:
         """Save images and surfaces; say what is missing, and why. Raises OSError."""
         probe = probe_with_settings(self.rehearsal.probe, settings)
-        if not self._shows_earlier:
+        if self._only_shows and not self._shows_earlier:
             # With all pixels of the scene.
             whole = image_view(self.rehearsal, probe, settings, Tally(0.0))
             view = replace(view, images=whole.images)

@@ -81,7 +81,7 @@ def opened(asked: RehearseOptions, process: StartedProcess | None) -> Iterator["
                 compile_picture(rehearsal)
         # All this lives as long as the rehearsal: to look for garbage in it would delay single frames by a tenth of a second.
         gc.freeze()
-        # At the end it is garbage: when Taichi is removed, it writes its kernels to their cache.
+        # At the end Python must be able to delete it: Taichi writes its kernels to their cache only when it is deleted.
         resources.callback(gc.unfreeze)
         start.begin("First picture")
         if chosen:

@@ -135,18 +135,16 @@ class PressedOrgan:
 
     def _inputs(self) -> Iterator[object]:
         """All that the state at rest depends on."""
-        yield from (
-            self.scene.model_dump_json(),
-            self.probe.model_dump_json(),
-            self.organ,
-            self.origin,
-            self.pose,
-        )
+        sections = self.scene.model_dump_json(include={"tissue", "solver", "contact", "attachment"})
+        yield from (sections, repr(self.settings), self.young_kpa, self.press.warm_up_steps)
+        yield from (self.probe.model_dump_json(), self.organ, self.origin, self.pose)
         for shape in self._shapes:
             if isinstance(shape, Grid):
                 yield from (shape.voxels, shape.index_from_mm)
             elif isinstance(shape, trimesh.Trimesh):
                 yield shape
+            else:
+                yield shape.model_dump_json()
 
     def set_gravity(self, acceleration_m_s2: float) -> None:
         """Change the acceleration due to gravity; its direction is the scene's."""

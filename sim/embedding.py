@@ -24,7 +24,6 @@ SEAM_MM = 1e-2
 PARALLEL = 1e-12
 # Six times the volume [mm^3] up to which a tetrahedron is flat and contains no pixel.
 FLAT = 1e-3
-FAR_MM = 1e9
 # With fewer tetrahedra, one core of a CPU is faster than several.
 PARALLEL_FROM = 1_000_000
 
@@ -83,9 +82,8 @@ class Embedding:
         first.x + column * pixel.x, v = first.y + row * pixel.y. Of overlapping tetrahedra the lowest index is taken,
         independent of threads; inverted and flat ones are left out.
         """
-        for row in range(rows):
-            for column in range(columns):
-                owner[row, column] = self.count
+        for row, column in ti.ndrange(rows, columns):
+            owner[row, column] = self.count
         self.rest_from_plane[self.count] = world_from_plane[:3, :]
         for v in self.on_plane:
             projected = plane_from_world @ tm.vec4(self.skin.vertices[v], 1.0)

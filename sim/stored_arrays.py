@@ -22,7 +22,7 @@ import trimesh
 Arrays: TypeAlias = tuple[np.ndarray, ...]
 # Where the files are, readable to their owner alone; None keeps nothing.
 FOLDER: Path | None = Path(__file__).parents[1] / ".cache" / "arrays"
-# The files used least recently are removed beyond this size. The embedded patient has 13 MB.
+# The files used least recently are removed beyond this size. The embedded patient has 60 MB.
 MOST_BYTES = 256 << 20
 LIBRARIES = " ".join([sys.version, *map(version, ("numpy", "scipy", "libigl", "trimesh", "taichi"))])
 DAMAGED = (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error)
@@ -42,8 +42,10 @@ def stored(compute: Callable[..., Arrays], *arguments: object, backend: str = ""
         os.utime(file)
         return found
     arrays = _in_order(compute(*arguments))
-    with suppress(OSError):
-        _write(file, arrays)
+    # Larger ones would displace all others.
+    if sum(each.nbytes for each in arrays) < MOST_BYTES // 2:
+        with suppress(OSError):
+            _write(file, arrays)
     return arrays
 
 

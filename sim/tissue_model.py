@@ -57,8 +57,8 @@ class TissueModel(Protocol):
     """Rest state, projection of the constraints on the predicted positions, and interpolation of points in the tissue.
 
     ``serial``: the model is too small for more than one core of a CPU. ``EMBEDDING_CELL_RATIO``: width of the coarse tetrahedra
-    that carry the image plane, over the resolution of the tissue. ``begin`` to ``project`` and ``carried`` are ti.funcs that
-    kernels inline, so their outermost loops are parallel. A model whose material can be changed between steps also has
+    that carry the image plane, over the resolution of the tissue. ``begin`` to ``project`` are ti.funcs that the solver's
+    kernels inline, so their outermost loops are parallel; ``carried`` is one for a single point. A model whose material can be changed between steps also has
     ``set_material(young_kpa)``.
     """
 

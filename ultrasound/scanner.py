@@ -78,13 +78,21 @@ class PlaneInTissue:
         self.owner = ti.field(ti.i32, (pixels, pixels))
         self.grid = ti.Vector.field(2, ti.f32, 2)
         self._last = ti.Vector.field(2, ti.i32, ())
+        # Size of a pixel and centre of the first one, of an image of all pixels.
+        self._whole = np.zeros((2, 2))
         self._rest_grids: dict[int, np.ndarray] = {}
 
     def locate(self, plane: ImagePlane, shape: tuple[int, int] | None = None) -> None:
         """Find the tissue on a plane, for an image of a shape [all pixels]; the embedding must be up to date."""
         rows, columns = self.shape = shape or (self.pixels, self.pixels)
-        pixel = np.array([plane.width_mm / columns, plane.depth_mm / rows])
-        first = np.array([-plane.width_mm / 2, -plane.above_mm]) + pixel / 2
+        size, corner = (
+            np.array([plane.width_mm, plane.depth_mm]),
+            np.array([-plane.width_mm / 2, -plane.above_mm]),
+        )
+        whole = size / self.pixels
+        self._whole = np.stack([whole, corner + whole / 2])
+        pixel = size / [columns, rows]
+        first = corner + pixel / 2
         fill((self.grid, np.stack([pixel, first])), (self._last, np.array([rows - 1, columns - 1])))
         self._rest_grids.clear()
         given = np.linalg.inv(plane.world_from_plane), plane.world_from_plane, pixel, first
@@ -98,25 +106,21 @@ class PlaneInTissue:
         return tm.vec2(*pixel), tm.vec2(*first)
 
     def rest_grid(self, count: int) -> np.ndarray:
-        """Return rest positions (count, count, 3) [mm] at points evenly over the plane. They are not to be changed."""
+        """Return rest positions (count, count, 3) [mm] at pixels evenly over the plane, whatever the shape. They are not to be changed."""
         if count not in self._rest_grids:
             self._rest_grids[count] = np.empty((count, count, 3), np.float32)
-            self._rest_grid(*self.grid_mm, *self.shape, self._rest_grids[count])
+            pixel, first = self._whole
+            self._rest_grid(tm.vec2(*pixel), tm.vec2(*first), self._rest_grids[count])
         return self._rest_grids[count]
 
     @ti.kernel
-    def _rest_grid(
-        self,
-        pixel_mm: tm.vec2,
-        first_mm: tm.vec2,
-        rows: int,
-        columns: int,
-        places: ti.types.ndarray(ti.f32, ndim=3),
-    ):
+    def _rest_grid(self, pixel_mm: tm.vec2, first_mm: tm.vec2, places: ti.types.ndarray(ti.f32, ndim=3)):
         for i, j in ti.ndrange(places.shape[0], places.shape[1]):
-            row = (i * (rows - 1)) // (places.shape[0] - 1)
-            column = (j * (columns - 1)) // (places.shape[1] - 1)
-            rest = self.rest_at(row, column, pixel_mm, first_mm)
+            row = (i * (self.pixels - 1)) // (places.shape[0] - 1)
+            column = (j * (self.pixels - 1)) // (places.shape[1] - 1)
+            place = first_mm + tm.vec2(column, row) * pixel_mm
+            near_row, near_column = self.pixel_near(place)
+            rest = self.rest_from_plane(near_row, near_column) @ tm.vec4(place, 0.0, 1.0)
             for axis in ti.static(range(3)):
                 places[i, j, axis] = rest[axis]
 
@@ -219,7 +223,7 @@ class GroundTruthLabels:
 
 @ti.data_oriented
 class Scanner:
-    """Images of ``pixels`` x ``pixels`` of an anatomy that an embedding deforms.
+    """Images of at most ``pixels`` x ``pixels`` of an anatomy that an embedding deforms.
 
     ``outside`` is what is shown outside the organ: ``background``, the CT around it, which deforms with the organ as far as the
     embedding reaches; ``gel`` (0 HU); ``air`` (-1000 HU). ``contact`` and ``contact_gap_mm`` see ``BMode``. A mode is set up at its

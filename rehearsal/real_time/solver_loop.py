@@ -1,6 +1,5 @@
 """What the solver's process does: requests of the other process, and steps in between."""
 
-import signal
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
@@ -28,8 +27,6 @@ PAUSED = "paused"
 
 def compute(connection: Connection, lock: Lock, parent: int) -> None:
     """Serve requests until ``stop``. The parent is a process id."""
-    # Ctrl-C reaches both processes: the other one ends this.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent(parent)
     SolverLoop(connection, lock).serve()
 
@@ -67,7 +64,7 @@ class SolverLoop:
         sim.device.start(arch)
         self.organ, self.pace = PressedOrgan(scene, anatomy, probe), pace
         at_rest = self.organ.settle()
-        # The first step, which loads the kernels, if the state at rest was stored. The other process is not ready yet.
+        # A step and back loads the kernels, also where the state at rest was stored. The other process is not ready yet.
         self.organ.advance(self.organ.pose)
         self.organ.restore_organ(at_rest)
         self._connection.send(at_rest)

@@ -61,6 +61,8 @@ class SolverProcess:
     def attach(self, rehearsal: Rehearsal) -> None:
         """Copy the states to a rehearsal from now on; it is at rest."""
         self.rehearsal = rehearsal
+        if self._memory is not None:
+            self._memory.close()
         self._memory = SharedState(rehearsal.snapshot_of_organ(), self._started.lock)
         self._send("share", self._memory.name)
 

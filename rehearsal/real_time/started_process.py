@@ -5,6 +5,8 @@ So nothing is imported here that takes long.
 
 import multiprocessing
 import os
+import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -43,9 +45,23 @@ def start_process() -> StartedProcess:
     connection, theirs = context.Pipe()
     lock = context.Lock()
     process = context.Process(target=_compute, args=(theirs, lock, os.getpid()), name="solver", daemon=True)
-    process.start()
+    with _without_interrupts():
+        process.start()
     theirs.close()
     return StartedProcess(process, connection, lock)
+
+
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Processes that start in this context ignore Ctrl-C, which reaches them too: the one that started them ends them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager
@@ -60,6 +76,8 @@ def started_process(is_needed: bool) -> Iterator[StartedProcess | None]:
 
 
 def _compute(connection: Connection, lock: Lock, parent: int) -> None:
+    # Where processes do not inherit this.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     from rehearsal.real_time.solver_loop import compute
 
     compute(connection, lock, parent)

@@ -36,11 +36,10 @@ from ultrasound.sweep_file import read_sweep
 
 
 class SlowMachine(Pace):
-    """Steps take longer than the longest one simulates."""
+    """Each step takes longer than the longest one simulates."""
 
-    def iterations(self, full: int) -> int:
+    def watch(self, took_ms: float, length_s: float) -> None:
         sleep(0.12)
-        return super().iterations(full)
 
 
 def pace_at(level: int, kind: type[Pace] = Pace) -> Pace:

@@ -231,7 +231,11 @@ def test_a_sweep_that_is_recorded_stands_in_the_panel_beside_all_else(looping, m
 
 def test_images_have_the_pixels_of_their_boxes_unless_they_are_sent_or_recorded(looping, monkeypatch):
     controls, of_boxes = Controls(Settings()), (12, 7)
-    looping.viewer = SimpleNamespace(image_shape=lambda *_: of_boxes)
+    looping.viewer = SimpleNamespace(
+        image_shape=lambda count, width_mm, depth_mm: (
+            of_boxes if (count, width_mm < depth_mm) == (2, True) else None
+        )
+    )
     assert next_view(looping, controls).images["CT"].shape == (4, 4)
     looping.link = None
     assert next_view(looping, controls).images["CT"].shape == of_boxes

@@ -18,6 +18,7 @@ from rehearsal.real_time.started_process import start_process
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import AnatomyFiles, Attachment, Scene, with_options
+from scenes.tissue import NeoHookeanTissue
 from sim import stored_arrays
 from sim.solver import StepSettings
 from ultrasound.probe_manipulator import advanced
@@ -172,6 +173,8 @@ def test_the_state_at_rest_is_stored_by_all_that_it_depends_on(one_device, monke
     )
     for other in others:
         assert [rested(**other)[0] for _ in range(2)] == [3, 0]
+    monkeypatch.setitem(NeoHookeanTissue.step_defaults, "iterations", 7)
+    assert [rested()[0] for _ in range(2)] == [3, 0]
 
 
 def test_a_process_that_ends_is_an_error_in_words():

@@ -56,6 +56,13 @@ def test_surfaces_and_arrays_count_by_their_values():
         stored(computed, [1, 2])
 
 
+def test_what_would_displace_all_others_is_not_stored(folder, monkeypatch):
+    stored(computed, "organ")
+    monkeypatch.setattr(stored_arrays, "MOST_BYTES", 80)
+    stored(computed, "larger")
+    assert len(list(folder.iterdir())) == 1
+
+
 @pytest.mark.parametrize("damage", [b"", b"no array", None])
 def test_a_damaged_file_is_computed_anew(folder, damage):
     stored(computed, 1)

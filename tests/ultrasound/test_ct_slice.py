@@ -257,6 +257,22 @@ def test_no_pixel_falls_between_tetrahedra_where_the_plane_goes_along_their_side
         assert (array_of(plane.owner) < embedding.count).all()
 
 
+@pytest.mark.parametrize("shape", [(32, 96), (96, 32), (32, 32)])
+def test_fewer_pixels_are_in_the_tetrahedra_of_the_places_that_they_show(kept, ball, shape):
+    cut, plane, _, embedding = sliced(kept, ball, ramp_image, bent)
+    owner, rest = array_of(cut.plane.owner), cut.plane.rest_grid(96).copy()
+    # Of three pixels the middle one has the centre of a pixel three times as large.
+    middle = tuple(slice(1, None, 3) if count == 32 else slice(None) for count in shape)
+    cut.plane.locate(plane, shape)
+    found = array_of(cut.plane.owner)[: shape[0], : shape[1]]
+    # Rounding decides on what is between two tetrahedra.
+    assert (found != owner[middle]).mean() < 0.002 and (found < embedding.count).mean() > 0.2
+    # Places that are measured stay where they are; a map continues up to 0.4 mm beyond its tetrahedron, which is bent by 0.1 per mm.
+    inside = owner < embedding.count
+    assert np.abs(cut.plane.rest_grid(96) - rest)[inside].mean() < 0.02
+    assert np.abs(cut.plane.rest_grid(96) - rest)[middle][inside[middle]].max() < 1e-3
+
+
 def test_of_overlapping_tetrahedra_the_lowest_is_taken_whatever_the_threads(kept, ball):
     def folded(x):
         return x - np.column_stack([0 * x[:, 0], 0 * x[:, 0], 10.0 * (x[:, 2] > 1.0)])
