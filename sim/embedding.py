@@ -82,8 +82,8 @@ class Embedding:
         first.x + column * pixel.x, v = first.y + row * pixel.y. Of overlapping tetrahedra the lowest index is taken,
         independent of threads; inverted and flat ones are left out.
         """
-        for row, column in ti.ndrange(rows, columns):
-            owner[row, column] = self.count
+        for pixel in ti.grouped(owner):
+            owner[pixel] = self.count
         self.rest_from_plane[self.count] = world_from_plane[:3, :]
         for v in self.on_plane:
             projected = plane_from_world @ tm.vec4(self.skin.vertices[v], 1.0)

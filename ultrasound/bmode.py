@@ -390,7 +390,10 @@ class BMode:
 
     @ti.kernel
     def _scan_convert(self, dynamic_range_db: float, image: ti.types.ndarray(ti.u8, ndim=2)):
-        for row, column in ti.ndrange(image.shape[0], image.shape[1]):
+        for row, column in self.source:
+            # A range known only now would cost a division for each pixel.
+            if row >= image.shape[0] or column >= image.shape[1]:
+                continue
             at = self.source[row, column]
             grey = 0.0
             if at.x >= -0.5:
