@@ -3,6 +3,7 @@
 from collections import defaultdict, deque
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import takewhile
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -47,8 +48,9 @@ class FrameTimes:
     def rates(self, recent_s: float = np.inf) -> tuple[float, float]:
         """Return frames a second and the real-time factor, over the last seconds; 0, 1 where too little is known."""
         last_s = self.ends_s[-1][0] if self.ends_s else 0.0
-        recent = [end for end in self.ends_s if last_s - end[0] <= recent_s]
+        # The newest first: after an hour there are many older ones.
+        recent = list(takewhile(lambda end: last_s - end[0] <= recent_s, reversed(self.ends_s)))
         if len(recent) < 2:
             return 0.0, 1.0
-        (first_s, began_s), (_, simulated_s) = recent[0], recent[-1]
+        (_, simulated_s), (first_s, began_s) = recent[0], recent[-1]
         return (len(recent) - 1) / (last_s - first_s), (simulated_s - began_s) / (last_s - first_s)

@@ -59,15 +59,15 @@ class FrameOptions(ImageOptions, QualityOptions, ArchOptions):
 class ScriptedHand:
     """The window of some frames, in which a script moves the probe by the clock; it closes after some seconds.
 
-    ``times`` are those of the frames after BEGIN_S; ``processor_s`` is what the processes have used since then, and ``memory_mb`` what
-    they have had, every MEMORY_EVERY_S.
+    ``times`` are those of the frames after BEGIN_S, of the last ones in a long run; ``load`` is the processor time that the processes have
+    used since then, a second, and ``memory_mb`` what they have had, every MEMORY_EVERY_S.
     """
 
     def __init__(self, frames: "WindowFrames", start: StartTimes, seconds: float) -> None:
         self.frames, self.window, self.start, self.seconds = frames, frames.viewer, start, seconds
         self.first_picture_s = 0.0
         self.times = FrameTimes()
-        self.processor_s = 0.0
+        self.load = 0.0
         self.memory_mb: list[float] = []
         self._began_s = 0.0
         self._used_s: float | None = None
@@ -77,7 +77,7 @@ class ScriptedHand:
     def running(self) -> bool:
         runs = self.window.running and self._passed_s <= BEGIN_S + self.seconds
         if not runs and self._used_s is not None:
-            self.processor_s = self._used() - self._used_s
+            self.load = (self._used() - self._used_s) / (self._passed_s - BEGIN_S)
         return runs
 
     @property
@@ -185,7 +185,7 @@ def figures_of(run: "RehearsalRun", hand: ScriptedHand, asked: FrameOptions) -> 
         steps_per_s=round(len(steps) / sum(step.length_s for step in steps), 1),
         step_lengths_s=lengths_of(steps),
         iterations_least=min(step.iterations for step in steps),
-        processor_s_per_s=round(hand.processor_s / seconds, 3),
+        processor_s_per_s=round(hand.load, 3),
         memory_mb=[round(each, 1) for each in hand.memory_mb],
     )
 
