@@ -58,8 +58,8 @@ class TissueModel(Protocol):
 
     ``serial``: the model is too small for more than one core of a CPU. ``EMBEDDING_CELL_RATIO``: width of the coarse tetrahedra
     that carry the image plane, over the resolution of the tissue. ``begin`` to ``project`` are ti.funcs that the solver's
-    kernels inline, so their outermost loops are parallel; ``carried`` is one for a single point. A model whose material can be changed between steps also has
-    ``set_material(young_kpa)``.
+    kernels inline, so their outermost loops are parallel; ``carried`` is one for a single point. A model whose material can be
+    changed between steps also has ``set_material(young_kpa)``.
     """
 
     EMBEDDING_CELL_RATIO: ClassVar[float]

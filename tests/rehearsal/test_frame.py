@@ -1,5 +1,6 @@
 """The loops around a rehearsal, with a fake one: what goes to the link and into files."""
 
+import gc
 import json
 import socket
 from dataclasses import replace
@@ -466,6 +467,7 @@ def test_the_command_opens_the_link_for_as_long_as_it_runs_and_names_its_scene(m
     def headless_run(each: run.RehearsalRun, *_) -> None:
         socket.create_connection(("127.0.0.1", port), 5).close()
         reached.append(each.link is not None and each.link.port == port and each.asked.scene == scene)
+        assert gc.get_freeze_count() > 0
 
     monkeypatch.setattr(opening, "start_taichi", lambda arch: "cpu")
     monkeypatch.setattr(opening, "built_headless", lambda *_: None)
@@ -485,6 +487,8 @@ def test_the_command_opens_the_link_for_as_long_as_it_runs_and_names_its_scene(m
         str(port),
     ]
     assert app.main(line) == 0 and reached == [True]
+    # Taichi stores its kernels when it is deleted, and what is frozen never is.
+    assert gc.get_freeze_count() == 0
     with socket.create_server(("127.0.0.1", port)):
         capsys.readouterr()
         assert app.main(line) == 2

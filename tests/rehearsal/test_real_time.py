@@ -1,5 +1,8 @@
 """The solver in a process of its own: the same bits, states of one instant, pace with the clock."""
 
+import os
+import signal
+import sys
 import time
 from collections.abc import Iterator
 
@@ -183,6 +186,18 @@ def test_a_process_that_ends_is_an_error_in_words():
     with pytest.raises(SolverEnded, match=r"the solver's process has ended \(exit status -9\)"):
         solver.settled()
     solver.close()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no signals to single processes")
+@pytest.mark.parametrize("after_s", [0.0, 0.2])
+def test_ctrl_c_does_not_reach_the_process_while_it_loads(capfd, after_s):
+    started = start_process()
+    time.sleep(after_s)
+    os.kill(started.process.pid, signal.SIGINT)
+    time.sleep(0.3)
+    assert started.process.is_alive() and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    started.kill()
+    assert capfd.readouterr().err == ""
 
 
 # The time of each step, by a clock that only waiting and steps advance
