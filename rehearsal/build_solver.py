@@ -1,5 +1,6 @@
 """Build the solver of a scene: tissue model, contacts and tool; the settings of its steps."""
 
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -8,13 +9,15 @@ import trimesh
 
 from scenes.scene import Contact, SolverSection
 from scenes.tissue import TissueSection
+from sim.attachment import FixedRegion, Tether
+from sim.material import Part
 from sim.neo_hookean import NeoHookean
 from sim.sampling import RestBody
 from sim.self_contact import SelfContacts
 from sim.shape_matching import ShapeMatching
 from sim.shapes import ConvexTool, SignedDistanceField
 from sim.solver import Solver, StepSettings
-from sim.tissue_model import FixedRegion, ModelInputs, TissueModel
+from sim.tissue_model import ModelInputs, TissueModel
 from ultrasound.probe import Probe
 
 # Flats that approximate the arc of a curved array: of 60 mm and 60 degrees, to 0.1 mm.
@@ -70,18 +73,29 @@ def build_solver(
     contact: Contact | None = None,
     section: SolverSection | None = None,
     serial: bool | None = None,
-    fixed: FixedRegion | None = None,
+    fixed: Sequence[FixedRegion] = (),
+    tethers: Sequence[Tether] = (),
+    parts: Sequence[Part] = (),
 ) -> Solver:
-    """A solver of the organ [mm] among shapes, the tool among them. Raises SamplingError.
+    """A solver of the organ [mm] among shapes, the tool among them; ``parts`` of it have their own material. Raises SamplingError.
 
     Shape matching also takes an organ that was filled before (``sim.shape_matching.fill_organ``). ``serial`` says whether a step is one
     kernel on one core; left open, the body's size and the machine decide.
     """
     contact, section = contact or Contact(), section or SolverSection()
     scaling = section.mass_scaling_per_mm
-    parts = ModelInputs(
-        organ, tissue, shapes, contact.shape_friction, fixed, serial, section.relaxation, scaling
+    inputs = ModelInputs(
+        organ,
+        tissue,
+        shapes,
+        contact.shape_friction,
+        fixed,
+        tethers,
+        parts,
+        serial,
+        section.relaxation,
+        scaling,
     )
-    model: Any = model_of(tissue).make(parts)
+    model: Any = model_of(tissue).make(inputs)
     self_contacts = SelfContacts(model, contact.particle_friction) if contact.particles else None
     return Solver(model, self_contacts, tool)

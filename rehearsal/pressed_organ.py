@@ -1,10 +1,11 @@
 """An organ under its probe, advanced step by step: the part of a rehearsal that a process of its own can compute."""
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from typing import get_args
 
 import numpy as np
 import trimesh
@@ -13,17 +14,21 @@ from rehearsal.build_solver import build_solver, static_shape, step_settings, to
 from rehearsal.configuration import probe_of
 from rehearsal.stopwatch import timed
 from scenes.anatomy import Grid, LoadedAnatomy, press_on
-from scenes.scene import PlaneShape, Scene
+from scenes.mechanical_tissues import mechanical_properties
+from scenes.scene import PlaneShape, Scene, SceneError
 from scenes.surfaces import translated
+from scenes.tissue import PartMaterial, PartName
+from sim.attachment import FixedRegion, Pedicle, PerirenalFat, Tether
 from sim.body import BodyState
 from sim.device import backend
 from sim.divergence_check import DivergenceCheck, DivergenceState
+from sim.material import Material, Part
 from sim.shapes import Plane, SignedDistanceField
 from sim.solver import SolverState
 from sim.stored_arrays import stored
-from sim.tissue_model import FixedRegion
+from sim.surface_contact import SurfaceContacts
 from ultrasound.probe import Probe
-from ultrasound.probe_manipulator import advanced, pose_at, poses_between
+from ultrasound.probe_manipulator import advanced, array_face_centre, pose_at, poses_between
 
 AWAY_MM = 200.0
 
@@ -44,7 +49,7 @@ class Step:
 
     ``notice`` is the message of the divergence check if it restored the state. Where the steps follow a clock, ``input_s`` is the time
     of the input that the pose shows, ``late_ms`` how much later than due the step began, and ``pace`` says how it differs from what is
-    set. ``awaited`` says whether it waited for its input, because steps had to become long.
+    set. ``awaited`` says whether it waited for its input, because steps had to become long. ``wrench`` is that of ``PressedOrgan.wrench``.
     """
 
     pose: np.ndarray
@@ -56,13 +61,17 @@ class Step:
     late_ms: float = 0.0
     pace: str = ""
     awaited: bool = False
+    wrench: np.ndarray | None = None
 
 
 class PressedOrgan:
     """The solver of a scene's organ. All positions are mm relative to ``origin``, the middle of the resting organ (LPS).
 
-    Taichi must be initialised, and initialised again for another scene, which frees this one.
+    Taichi must be initialised, and initialised again for another scene, which frees this one. ``on_wrench`` is called after each timed step
+    with the transducer's pose (4, 4) and its ``wrench``, at the rate of the steps: for a haptic device.
     """
+
+    on_wrench: Callable[[np.ndarray, np.ndarray], None] | None = None
 
     def __init__(self, scene: Scene, anatomy: LoadedAnatomy, probe: Probe | None = None) -> None:
         self.scene = scene
@@ -83,20 +92,37 @@ class PressedOrgan:
         self.tool = tool_of(self.probe)
         shapes = [*(self._shape(shape) for shape in anatomy.shapes), self.tool]
         tissue, section = self.scene.tissue, self.scene.solver
-        fixed = self._fixed_region()
+        fixed, tethers = self._attachments()
+        self.parts_of_tissue = parts_of(self.scene, anatomy, self.origin)
         self.solver = build_solver(
-            self.organ, tissue, shapes, self.tool, self.scene.contact, section, fixed=fixed
+            self.organ,
+            tissue,
+            shapes,
+            self.tool,
+            self.scene.contact,
+            section,
+            fixed=fixed,
+            tethers=tethers,
+            parts=self.parts_of_tissue,
         )
         self.body, self.model, self.contacts = self.solver.body, self.solver.model, self.solver.contacts
         self.settings = step_settings(tissue, section)
         self.young_kpa: float | None = getattr(tissue, "young_kpa", None)
         self.set_gravity(self.scene.gravity.acceleration_m_s2)
 
-    def _fixed_region(self) -> FixedRegion | None:
+    def _attachments(self) -> tuple[list[FixedRegion], list[Tether]]:
         attachment = self.scene.attachment
-        if attachment.radius_mm == 0 or attachment.at_mm is None:
-            return None
-        return FixedRegion(np.array(attachment.at_mm) - self.origin, attachment.radius_mm)
+        fixed: list[FixedRegion] = []
+        tethers: list[Tether] = []
+        if attachment.radius_mm > 0 and attachment.at_mm is not None:
+            place = np.array(attachment.at_mm) - self.origin, attachment.radius_mm
+            if attachment.stiffness_n_mm > 0:
+                tethers.append(Pedicle(*place, attachment.stiffness_n_mm))
+            else:
+                fixed.append(FixedRegion(*place))
+        if attachment.fat_kpa_mm > 0:
+            tethers.append(PerirenalFat(attachment.fat_kpa_mm, -np.array(self.press.direction)))
+        return fixed, tethers
 
     def _shape(self, shape: PlaneShape | trimesh.Trimesh | Grid) -> Plane | SignedDistanceField:
         if isinstance(shape, PlaneShape):
@@ -117,27 +143,35 @@ class PressedOrgan:
 
         It is computed once for the same scene, probe and anatomy.
         """
-        position, velocity, *contacts = stored(self._warm_up, *self._inputs(), backend=backend())
-        names = self.solver.snapshot().contacts
+        position, velocity, *history = stored(self._warm_up, *self._inputs(), backend=backend())
+        names = self.solver.snapshot().history
         self.solver.restore(
-            SolverState(BodyState(position, velocity), dict(zip(names, contacts, strict=True)))
+            SolverState(BodyState(position, velocity), dict(zip(names, history, strict=True)))
         )
         self.steps = 0
         self.divergence_check.set_initial_state()
         return self.snapshot_of_organ()
 
     def _warm_up(self, *inputs: object) -> tuple[np.ndarray, ...]:
-        """The state at rest: positions, velocities and contacts. The inputs are those of the organ itself."""
+        """The state at rest: positions, velocities and history. The inputs are those of the organ itself."""
         for _ in range(self.press.warm_up_steps):
             self.advance(self.pose)
         state = self.solver.snapshot()
-        return state.body.position, state.body.velocity, *state.contacts.values()
+        return state.body.position, state.body.velocity, *state.history.values()
 
     def _inputs(self) -> Iterator[object]:
         """All that the state at rest depends on."""
         sections = self.scene.model_dump_json(include={"tissue", "solver", "contact", "attachment"})
         yield from (sections, repr(self.settings), self.young_kpa, self.press.warm_up_steps)
-        yield from (self.probe.model_dump_json(), self.organ, self.origin, self.pose)
+        yield from (
+            self.probe.model_dump_json(),
+            self.organ,
+            self.origin,
+            self.pose,
+            repr(self.press.direction),
+        )
+        for part in self.parts_of_tissue:
+            yield from (part.surface, repr(part.material))
         for shape in self._shapes:
             if isinstance(shape, Grid):
                 yield from (shape.voxels, shape.index_from_mm)
@@ -183,8 +217,20 @@ class PressedOrgan:
         took_ms: list[float] = []
         with self.step_of(length_s or self.settings.time_step_s, iterations or self.settings.iterations):
             timed(partial(self.advance, pose), took_ms)
-            settings = self.settings
-            return Step(pose, settings.time_step_s, settings.iterations, took_ms[0], self.notice)
+            settings, wrench = self.settings, self.wrench()
+            if self.on_wrench is not None and wrench is not None:
+                self.on_wrench(pose, wrench)
+            return Step(
+                pose, settings.time_step_s, settings.iterations, took_ms[0], self.notice, wrench=wrench
+            )
+
+    def wrench(self) -> np.ndarray | None:
+        """Force (3,) [N] of the tissue on the probe after the last step, and its torque (3,) [N mm] about the centre of the array face, along the
+        patient's axes (LPS); None for a tissue model whose contacts have no forces.
+        """
+        if not isinstance(self.contacts, SurfaceContacts):
+            return None
+        return self.contacts.wrench(self.tool, array_face_centre(self.pose, self.size_mm[2]))
 
     def snapshot_of_organ(self) -> OrganState:
         """A copy of the present state."""
@@ -204,3 +250,27 @@ class PressedOrgan:
         """A hash of the tissue's state: it changes with every bit."""
         state = self.body.snapshot()
         return hashlib.sha256(state.position.tobytes() + state.velocity.tobytes()).hexdigest()[:16]
+
+
+def parts_of(scene: Scene, anatomy: LoadedAnatomy, origin: np.ndarray) -> list[Part]:
+    """The parts of the organ that have their own material, relative to an origin, in the order of ``PartName``."""
+    asked = getattr(scene.tissue, "parts", {})
+    surfaces = {**anatomy.parts, **({} if anatomy.tumour is None else {"tumour": anatomy.tumour})}
+    found = []
+    for name in get_args(PartName):
+        if name in asked:
+            if name not in surfaces:
+                raise SceneError(f"tissue.parts.{name}: this patient has no {name}; leave it out")
+            found.append(Part(translated(surfaces[name], -origin), material_of(name, asked[name])))
+    return found
+
+
+def material_of(name: str, given: PartMaterial) -> Material:
+    """The material of a part: what is given, and what is typical of it."""
+    typical = mechanical_properties()[name]
+    return Material(
+        *(
+            getattr(typical, key)[1] if getattr(given, key) is None else getattr(given, key)
+            for key in ("young_kpa", "poisson", "density_g_cm3")
+        )
+    )

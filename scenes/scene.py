@@ -37,7 +37,7 @@ OPTIONS = {
 }
 
 
-UNIT = re.compile("_(mm2|mm|m_s2|mm_s|g_cm3|per_mm|per_s|deg|hu|s)$")
+UNIT = re.compile("_(n_mm|kpa_mm|kpa|mm2|mm|m_s2|mm_s|g_cm3|per_mm|per_s|deg|hu|s)$")
 
 
 class SceneError(UserError):
@@ -54,7 +54,7 @@ class AnatomyFiles(Section):
     phantom: bool = False
     organ: str = "organ.stl"
     tumour: str | None = None
-    parts: dict[Literal["cyst", "urine", "vessel"], str] = Field(default_factory=dict)
+    parts: dict[Literal["sinus", "vessel", "urine", "cyst"], str] = Field(default_factory=dict)
     ct: str | None = None
     labels: str | None = None
     tissues: dict[Annotated[str, Field(pattern=r"^[1-9]\d*$")], str] = Field(default_factory=dict)
@@ -98,10 +98,17 @@ class Contact(Section):
 
 
 class Attachment(Section):
-    """A fixed boundary, such as the hilum: all nodes within ``radius_mm`` of ``at_mm``; 0: none."""
+    """What holds the organ: its pedicle at the hilum, and perirenal fat.
+
+    The tissue within ``radius_mm`` of ``at_mm`` is tied to its place at rest by a tether of ``stiffness_n_mm`` in all; with 0 it is
+    fixed. A radius of 0: no pedicle. ``fat_kpa_mm`` is the stiffness of the fat around the organ, but for the side that faces the
+    transducer; 0: none.
+    """
 
     at_mm: Vector3 | None = None
     radius_mm: float = Field(0.0, ge=0, le=100)
+    stiffness_n_mm: float = Field(0.0, ge=0, le=1000)
+    fat_kpa_mm: float = Field(0.0, ge=0, le=1000)
 
     @model_validator(mode="after")
     def _somewhere(self) -> "Attachment":
@@ -109,7 +116,16 @@ class Attachment(Section):
             raise ValueError(
                 "attachment.radius_mm needs a position: give attachment.at_mm, or leave both out"
             )
+        if self.stiffness_n_mm > 0 and self.radius_mm == 0:
+            raise ValueError(
+                "attachment.stiffness_n_mm needs the tissue that it holds: give attachment.radius_mm, or leave both out"
+            )
         return self
+
+    @property
+    def holds(self) -> bool:
+        """Whether anything holds the organ."""
+        return self.radius_mm > 0 or self.fat_kpa_mm > 0
 
 
 class PlaneShape(Section):
@@ -212,6 +228,16 @@ class Scene(Section):
     press: Press = Press()
 
     @model_validator(mode="after")
+    def _has_its_parts(self) -> "Scene":
+        anatomy = self.anatomy
+        has = {*anatomy.parts, *(["tumour"] if anatomy.tumour else [])}
+        for name in getattr(self.tissue, "parts", {}):
+            if name not in has and not anatomy.phantom:
+                where = "anatomy.tumour" if name == "tumour" else f"anatomy.parts.{name}"
+                raise ValueError(f"tissue.parts.{name} needs a surface: give {where}, or leave it out")
+        return self
+
+    @model_validator(mode="after")
     def _suits_its_tissue(self) -> "Scene":
         for wanted, support, refusal in (
             (
@@ -220,9 +246,9 @@ class Scene(Section):
                 "contact.particles = true needs particles: {}, or leave it out",
             ),
             (
-                self.attachment.radius_mm > 0,
+                self.attachment.holds,
                 "attachment",
-                "attachment.radius_mm fixes nodes: {}, or the radius to 0",
+                "attachment.radius_mm and fat_kpa_mm hold nodes: {}, or them to 0",
             ),
         ):
             able = [name for name, each in TISSUES.items() if getattr(each, f"supports_{support}")]
@@ -295,15 +321,18 @@ def load_scene(path: Path) -> Scene:
 def with_options(scene: Scene, options: Mapping[str, float | int | str | None]) -> Scene:
     """The scene with single values changed, such as ``{"tissue.radius_mm": 3.0}``; None leaves what is there.
 
-    A value that only another tissue model has selects that model, which starts from its own defaults. A probe's file is named
+    A value that only another tissue model has selects that model, which starts from its own defaults, and without an attachment where
+    it has none. A probe's file is named
     from where the program was started, not from beside the scene. Raises SceneError for a value out of range, and for values of
     two models.
     """
     values = scene.model_dump(exclude_unset=True)
     asked = [name.removeprefix("tissue.") for name, value in options.items() if value is not None]
-    model = options.get("tissue.model") or model_with(asked, scene.tissue.model)
+    model = str(options.get("tissue.model") or model_with(asked, scene.tissue.model))
     if model != scene.tissue.model:
         values["tissue"] = {"model": model}
+        if not TISSUES[model].supports_attachment:
+            values.pop("attachment", None)
     for name, value in options.items():
         if value is not None:
             section, key = name.split(".")

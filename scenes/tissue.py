@@ -9,6 +9,8 @@ from scenes.section import Section
 
 Stiffness = Annotated[float, Field(ge=0, le=1)]
 QUALITIES = ("fast", "balanced", "accurate")
+# The parts of an organ that can have their own material; where two overlap, the later one counts.
+PartName = Literal["sinus", "vessel", "urine", "cyst", "tumour"]
 # The default tissue of a scene.
 USUAL = "neo-hookean"
 
@@ -37,9 +39,26 @@ class TissueSection(Section):
         return getattr(self, self.size_key)
 
 
+class PartMaterial(Section):
+    """The material of a part of the organ; what is left out is typical of it (``mechanical_tissues.toml``)."""
+
+    young_kpa: float | None = Field(None, gt=0, le=1e6)
+    poisson: float | None = Field(None, ge=0, le=0.4999)
+    density_g_cm3: float | None = Field(None, gt=0, le=20)
+
+
+class Prony(Section):
+    """A term of relaxation: a modulus relative to that at rest, which decays with this time constant."""
+
+    modulus_ratio: float = Field(gt=0, le=100)
+    time_s: float = Field(ge=0.01, le=1e4)
+
+
 class NeoHookeanTissue(TissueSection):
     """Tissue true to a material, on cubic cells. Smaller cells are truer and slower; the material stays the same.
 
+    ``parts`` have their own materials, ``young_kpa`` to ``density_g_cm3`` are those of the parenchyma. ``capsule_n_mm`` is the
+    stiffness of the capsule, modulus times thickness; 0: none. ``prony``: the terms of its relaxation.
     The presets are points of the front that ``study trade`` measures.
     """
 
@@ -58,6 +77,9 @@ class NeoHookeanTissue(TissueSection):
     young_kpa: float = Field(15.0, gt=0, le=1e6)
     poisson: float = Field(0.45, ge=0, le=0.4999)
     density_g_cm3: float = Field(1.05, gt=0, le=20)
+    parts: dict[PartName, PartMaterial] = Field(default_factory=dict)
+    capsule_n_mm: float = Field(0.0, ge=0, le=100)
+    prony: tuple[Prony, ...] = Field((), max_length=3)
 
 
 class ShapeMatchingTissue(TissueSection):

@@ -127,7 +127,7 @@ class DivergenceCheck:
         if self.state.is_restored:
             state, where = self.initial, "as it was at the start"
         still = replace(state.body, velocity=np.zeros_like(state.body.velocity))
-        self.solver.restore(SolverState(still, state.contacts))
+        self.solver.restore(SolverState(still, state.history))
         self.state = DivergenceState(state, is_restored=True)
         self.restorations += 1
         return f"State restored, {where}: {fault}"

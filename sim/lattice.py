@@ -4,6 +4,7 @@ No mesh has to fit the organ: cells that contain tissue are kept, and those cut 
 filled part (finite cell method, Parvizian, Duester & Rank 2007).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import igl
@@ -43,8 +44,8 @@ class Lattice:
     nodes (n, 3); colour_start (9,): first node of each of the 8 colours; cells (m, 8): nodes at CORNERS; gradient
     (m, 8, 3) [1/mm]: B, the gradients of the corners' shape functions, averaged over the cell's filled part; volume (m,)
     [mm^3]: elastic volume; hourglass (m, 8, 8) [mm]: integral of (B - mean B)(B - mean B)^T over the filled part;
-    tissue (n,) [mm^3]: volume of tissue of each node; index_of (x, y, z): the cell at a position of the grid that starts at
-    low_mm, -1 where there is none.
+    tissue (m, 8) [mm^3]: volume of tissue of each corner; share (m, parts): volume share of each part of the organ;
+    index_of (x, y, z): the cell at a position of the grid that starts at low_mm, -1 where there is none.
     """
 
     cell_mm: float
@@ -56,24 +57,36 @@ class Lattice:
     volume: np.ndarray
     hourglass: np.ndarray
     tissue: np.ndarray
+    share: np.ndarray
     index_of: np.ndarray
+
+    def node_mass(self, density: np.ndarray) -> np.ndarray:
+        """Mass (n,) of each node for a density (m,) of each cell, in the density's unit of mass for 1 mm^3."""
+        return np.bincount(self.cells.ravel(), (density[:, None] * self.tissue).ravel(), len(self.nodes))
 
     def interpolation(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nodes (k, 8) and trilinear weights (k, 8), which sum to 1, of points (k, 3) [mm].
 
         Points outside all cells are extrapolated linearly from the nearest cell, for one width of a cell at most.
         """
-        at = (np.asarray(points, float) - self.low_mm) / self.cell_mm
-        index = np.clip(np.floor(at).astype(int), 0, np.array(self.index_of.shape) - 1)
-        cell = self.index_of[tuple(index.T)]
-        centres = np.argwhere(self.index_of >= 0)
-        outside = cell < 0
-        if outside.any():
-            nearest = cKDTree(centres + 0.5).query(at[outside])[1]
-            index[outside] = centres[nearest]
-            cell[outside] = self.index_of[tuple(index[outside].T)]
-        inside = np.clip(at - index, -EXTRAPOLATED_CELLS, 1 + EXTRAPOLATED_CELLS)
+        cell, inside = places_in_cells(points, self.cell_mm, self.low_mm, self.index_of)
         return self.cells[cell], shape_functions(inside)
+
+
+def places_in_cells(
+    points: np.ndarray, cell_mm: float, low_mm: np.ndarray, index_of: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The cell (k,) of points (k, 3) [mm], or the nearest one, and their places (k, 3) in the unit cell, in it or beside it."""
+    at = (np.asarray(points, float) - low_mm) / cell_mm
+    index = np.clip(np.floor(at).astype(int), 0, np.array(index_of.shape) - 1)
+    cell = index_of[tuple(index.T)]
+    centres = np.argwhere(index_of >= 0)
+    outside = cell < 0
+    if outside.any():
+        nearest = cKDTree(centres + 0.5).query(at[outside])[1]
+        index[outside] = centres[nearest]
+        cell[outside] = index_of[tuple(index[outside].T)]
+    return cell, np.clip(at - index, -EXTRAPOLATED_CELLS, 1 + EXTRAPOLATED_CELLS)
 
 
 def shape_functions(at: np.ndarray) -> np.ndarray:
@@ -89,8 +102,10 @@ def shape_gradients(at: np.ndarray) -> np.ndarray:
     return sign * np.stack(other, axis=2)
 
 
-def fill_with_cells(surface: trimesh.Trimesh, cell_mm: float) -> Lattice:
-    """The lattice of a closed surface [mm].
+def fill_with_cells(
+    surface: trimesh.Trimesh, cell_mm: float, parts: Sequence[trimesh.Trimesh] = ()
+) -> Lattice:
+    """The lattice of a closed surface [mm], with the shares of parts inside it; where parts overlap, the later one counts.
 
     Raises SamplingError when the cells are too many for a step or for the memory, or too large for the surface's shape.
     """
@@ -101,14 +116,22 @@ def fill_with_cells(surface: trimesh.Trimesh, cell_mm: float) -> Lattice:
             "choose larger ones"
         )
     check_memory(CELL_BYTES * surface.volume / cell_mm**3, f"cells of {cell_mm:g} mm", "choose larger ones")
-    return Lattice(cell_mm, *stored(_arrays_of_cells, surface, cell_mm))
+    return Lattice(cell_mm, *stored(_arrays_of_cells, surface, cell_mm, *parts))
 
 
-def _arrays_of_cells(surface: trimesh.Trimesh, cell_mm: float) -> tuple[np.ndarray, ...]:
+def _arrays_of_cells(
+    surface: trimesh.Trimesh, cell_mm: float, *parts: trimesh.Trimesh
+) -> tuple[np.ndarray, ...]:
     """All of a surface's lattice but ``cell_mm``. Raises SamplingError."""
     low, size = _grid_around(surface, cell_mm)
     indices = np.indices(tuple(size.tolist())).reshape(3, -1).T
-    lattice = _assemble(low, cell_mm, size, *_filled(surface, low, cell_mm, indices))
+    indices, filled, volume = _filled(surface, low, cell_mm, indices)
+    if abs(volume / surface.volume - 1) > MOST_VOLUME_ERROR:
+        raise SamplingError(
+            f"cells of {cell_mm:g} mm fill {100 * volume / surface.volume:.0f} % of the organ's "
+            f"{surface.volume / 1000:.3g} ml: choose smaller ones"
+        )
+    lattice = _assemble(low, cell_mm, size, indices, filled, parts)
     return tuple(getattr(lattice, field.name) for field in fields(Lattice)[1:])
 
 
@@ -127,8 +150,11 @@ def fill_block(counts: tuple[int, int, int], cell_mm: float) -> Lattice:
 
 def _filled(
     surface: trimesh.Trimesh, low: np.ndarray, cell_mm: float, indices: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Grid positions (m, 3) of the cells that contain tissue, and the filled fraction (m, s) around each integration point."""
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Those grid positions (m, 3) whose cells contain tissue, and the filled fraction (m, s) around each integration point.
+
+    Also the volume [mm^3] that linear interpolation of the distance found before it was corrected.
+    """
     centre = signed_distance(surface.vertices, surface.faces, low + cell_mm * (indices + 0.5))[0]
     reach = cell_mm * np.sqrt(3) / 2
     indices, centre = indices[centre < reach], centre[centre < reach]
@@ -140,18 +166,29 @@ def _filled(
     known = signed_distance(surface.vertices, surface.faces, low + cell_mm / 2 * unique)[0]
     distance = known[back].reshape(-1, 27) @ _from_halves(SAMPLE_POINTS).T
     # Linear interpolation cuts off convex surfaces: offset the surface outwards until the volume is right.
-    offset = 0.0
-    for iteration in range(VOLUME_ITERATIONS):
+    offset, volumes = 0.0, []
+    for _ in range(VOLUME_ITERATIONS):
         filled[cut] = np.clip(0.5 - (distance - offset) / (cell_mm / SAMPLES), 0, 1)
-        volume = cell_mm**3 * filled.mean(axis=1).sum()
-        if iteration == 0 and abs(volume / surface.volume - 1) > MOST_VOLUME_ERROR:
-            raise SamplingError(
-                f"cells of {cell_mm:g} mm fill {100 * volume / surface.volume:.0f} % of the organ's "
-                f"{surface.volume / 1000:.3g} ml: choose smaller ones"
-            )
-        offset += (surface.volume - volume) / surface.area
+        volumes.append(cell_mm**3 * filled.mean(axis=1).sum())
+        offset += (surface.volume - volumes[-1]) / surface.area
     has_tissue = filled.sum(axis=1) > 0
-    return indices[has_tissue], filled[has_tissue]
+    return indices[has_tissue], filled[has_tissue], volumes[0]
+
+
+def _shares(
+    filled: np.ndarray, indices: np.ndarray, low: np.ndarray, cell_mm: float, parts: Sequence[trimesh.Trimesh]
+) -> np.ndarray:
+    """Volume shares (m, parts) of the parts in the tissue of each cell."""
+    shares = np.zeros((*filled.shape, len(parts)))
+    for number, part in enumerate(parts):
+        inside, fraction, _ = _filled(part, low, cell_mm, indices)
+        where = _unique_rows(np.concatenate([indices, inside]))[1]
+        row = np.empty(where.max() + 1, int)
+        row[where[: len(indices)]] = np.arange(len(indices))
+        cell = row[where[len(indices) :]]
+        shares[cell] *= 1 - fraction[..., None]
+        shares[cell, :, number] = fraction
+    return np.einsum("ms,msp->mp", filled, shares) / filled.sum(axis=1, keepdims=True)
 
 
 def _from_halves(at: np.ndarray) -> np.ndarray:
@@ -161,7 +198,12 @@ def _from_halves(at: np.ndarray) -> np.ndarray:
 
 
 def _assemble(
-    low: np.ndarray, cell_mm: float, size: np.ndarray, indices: np.ndarray, filled: np.ndarray
+    low: np.ndarray,
+    cell_mm: float,
+    size: np.ndarray,
+    indices: np.ndarray,
+    filled: np.ndarray,
+    parts: Sequence[trimesh.Trimesh] = (),
 ) -> Lattice:
     corner = indices[:, None] + CORNERS
     flat = np.ravel_multi_index(tuple(np.moveaxis(corner, 2, 0)), tuple(size + 1))
@@ -188,7 +230,8 @@ def _assemble(
         gradient=mean / cell_mm,
         volume=volume,
         hourglass=volume[:, None, None] / cell_mm**2 * variance,
-        tissue=np.bincount(cells.ravel(), carried.ravel(), len(used)),
+        tissue=carried,
+        share=_shares(filled, indices, low, cell_mm, parts),
         index_of=index_of,
     )
 
@@ -201,20 +244,50 @@ def _gradients(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return mean, (weight @ square).reshape(-1, 8, 8) - np.einsum("mia,mja->mij", mean, mean)
 
 
-def surface_points(surface: trimesh.Trimesh, spacing_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points (k, 3) [mm] on a surface, about a spacing apart, and the area (k,) [mm^2] of each."""
+def surface_patches(
+    surface: trimesh.Trimesh, cell_mm: float, low_mm: np.ndarray, cells: np.ndarray, index_of: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Patches of a surface, one for each cell and direction that it faces: nodes (p, 8), tangential gradients (p, 8, 2) [1/mm] of
+    their shape functions, averaged over the patch, and areas (p,) [mm^2].
+    """
+    middle, area, normal = _small_faces(surface, cell_mm / 2)
+    cell, inside = places_in_cells(middle, cell_mm, low_mm, index_of)
+    keys, owner = _unique_rows(np.column_stack([cell, _sides(normal)]))
+    total = np.bincount(owner, area)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        columns = [np.bincount(owner, area * column) for column in values.reshape(len(values), -1).T]
+        return (np.column_stack(columns) / total[:, None]).reshape(len(total), *values.shape[1:])
+
+    gradient = mean(shape_gradients(inside)) / cell_mm
+    # Two axes in the plane whose normal is the mean one.
+    tangents = np.linalg.svd(mean(normal)[:, None])[2][:, 1:]
+    return cells[keys[:, 0]], np.einsum("pka,pta->pkt", gradient, tangents), total
+
+
+def _small_faces(surface: trimesh.Trimesh, longest_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Middles (f, 3) [mm], areas (f,) [mm^2] and unit normals (f, 3) of a surface's faces, divided until no edge is longer."""
     vertices, faces = trimesh.remesh.subdivide_to_size(
-        surface.vertices, surface.faces, spacing_mm / 2, max_iter=30
+        surface.vertices, surface.faces, longest_mm, max_iter=30
     )
     corner = vertices[faces]
-    middle = corner.mean(axis=1)
-    area = trimesh.triangles.area(corner)
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    return corner.mean(axis=1), length[:, 0] / 2, normal / np.maximum(length, 1e-30)
+
+
+def _sides(normal: np.ndarray) -> np.ndarray:
+    """The side of a cube (n,), 0 to 5, that normals (n, 3) face."""
+    axis = np.abs(normal).argmax(axis=1)
+    return 2 * axis + (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] > 0)
+
+
+def surface_points(surface: trimesh.Trimesh, spacing_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points (k, 3) [mm] on a surface, about a spacing apart, and the area (k,) [mm^2] of each."""
+    middle, area, normal = _small_faces(surface, spacing_mm / 2)
     bins = np.floor((middle - surface.bounds[0]) / spacing_mm).astype(int)
     # Points are separate for faces of different direction: only what faces a support is in contact with it.
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    axis = np.abs(normal).argmax(axis=1)
-    side = 2 * axis + (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] > 0)
-    keys, owner = _unique_rows(np.column_stack([bins, side]))
+    keys, owner = _unique_rows(np.column_stack([bins, _sides(normal)]))
     total = np.bincount(owner, area)
     mean = np.column_stack([np.bincount(owner, area * middle[:, axis]) for axis in range(3)]) / total[:, None]
     # A point of very small area would have little stiffness and penetrate deeply.

@@ -7,6 +7,8 @@ stabilisation (Flanagan & Belytschko 1981); those cut by the surface are integra
 At convergence every node is in equilibrium, so the rest state does not depend on iterations, substeps or time step.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -14,20 +16,26 @@ import numpy as np
 import taichi as ti
 import taichi.math as tm
 
+from sim.attachment import total_stiffness
 from sim.body import Body
+from sim.capsule import N_MM, Capsule
 from sim.device import is_too_small
-from sim.fields import field_of, fields_of
+from sim.fields import field_of, fields_of, fill
 from sim.lattice import CORNERS, Lattice, fill_with_cells, surface_points
 from sim.linear_algebra import cross, four, row, solve
+from sim.material import Material, mixture
 from sim.rigid_correction import RigidCorrection
 from sim.solver import StepSettings
 from sim.stored_arrays import stored
 from sim.surface_contact import PENALTY_DEPTH_MM, REACH_MM, SurfaceContacts
 from sim.tissue_model import ModelInputs
+from sim.viscoelasticity import PronyTerm, Relaxation
 
 # Stiffness, in units of the shear modulus, of deformation that varies inside an element. 1 is exact for u_x ~ y z and
 # 1 + nu for bending; at nu = 0.45 their geometric mean is 1.2. Bead errors hardly depend on it (docs/method.md).
 HOURGLASS_STIFFNESS = 1.2
+# That of elements cut by the surface: elements so wide are too stiff around the edges of a probe, which made its force 5 to 8 % too large.
+SURFACE_HOURGLASS_STIFFNESS = 0.2
 # Below this volume ratio J, ln J is continued by its tangent, so that inverted elements recover.
 LEAST_J = 0.2
 LN2 = 0.6931471805599453
@@ -38,6 +46,8 @@ PARALLEL_NODES = 16_000
 POINT_SPACING_CELLS = 0.5
 # Largest displacement of a node in one iteration, in widths of a cell.
 MOST_CELLS_AN_ITERATION = 0.5
+# The tissue of a model that is given none.
+ORGAN = Material()
 LATTICE_SETTINGS = StepSettings(substeps=1, iterations=4, relaxation_factor=1.7, stabilisation_iterations=0)
 
 
@@ -56,16 +66,36 @@ class NeoHookean:
     def make(cls, inputs: ModelInputs) -> "NeoHookean":
         """Elements that fill the organ, with contact points on its surface where there are shapes. Raises SamplingError."""
         tissue = inputs.tissue
-        lattice = fill_with_cells(inputs.organ, tissue.cell_mm)
+        lattice = fill_with_cells(inputs.organ, tissue.cell_mm, [part.surface for part in inputs.parts])
         body = Body(lattice.nodes)
         contacts = None
         if inputs.shapes:
             spacing_mm = POINT_SPACING_CELLS * tissue.cell_mm
             points, area_mm2 = stored(surface_points, inputs.organ, spacing_mm)
             contacts = SurfaceContacts(body, lattice, points, area_mm2, inputs.shapes, inputs.friction)
-        material = (tissue.young_kpa, tissue.poisson, tissue.density_g_cm3)
-        fixed = None if inputs.fixed is None else inputs.fixed.nodes(lattice.nodes)
-        return cls(body, lattice, contacts, *material, fixed=fixed, serial=inputs.serial)
+        material = Material(tissue.young_kpa, tissue.poisson, tissue.density_g_cm3)
+        parts = [part.material for part in inputs.parts]
+        fixed = None
+        if inputs.fixed:
+            fixed = np.any([region.nodes(lattice.nodes) for region in inputs.fixed], axis=0)
+        tether_n_mm, capsule = None, None
+        if inputs.tethers:
+            tether_n_mm = total_stiffness(inputs.tethers, lattice, inputs.organ)
+        if tissue.capsule_n_mm > 0:
+            capsule = Capsule(body, lattice, inputs.organ, tissue.capsule_n_mm)
+        prony = [PronyTerm(term.modulus_ratio, term.time_s) for term in tissue.prony]
+        return cls(
+            body,
+            lattice,
+            contacts,
+            material,
+            parts,
+            fixed=fixed,
+            serial=inputs.serial,
+            tether_n_mm=tether_n_mm,
+            capsule=capsule,
+            prony=prony,
+        )
 
     @staticmethod
     def reach_mm(tissue: Any) -> float:
@@ -77,12 +107,14 @@ class NeoHookean:
         body: Body,
         lattice: Lattice,
         contacts: SurfaceContacts | None = None,
-        young_kpa: float = 15.0,
-        poisson: float = 0.45,
-        density_g_cm3: float = 1.05,
+        material: Material = ORGAN,
+        parts: Sequence[Material] = (),
         fixed: np.ndarray | None = None,
         serial: bool | None = None,
         load_g: np.ndarray | float = 0.0,
+        tether_n_mm: np.ndarray | None = None,
+        capsule: Capsule | None = None,
+        prony: Sequence[PronyTerm] = (),
     ) -> None:
         starts = [int(v) for v in lattice.colour_start]
         self.body = body
@@ -94,54 +126,85 @@ class NeoHookean:
         self.has_fixed = fixed is not None
         if fixed is not None:
             self.fixed = field_of(fixed)
+        self.has_tether = tether_n_mm is not None
+        if tether_n_mm is not None:
+            self.tether = field_of(N_MM * tether_n_mm)
+        self.capsule: Any = capsule
+        self.has_capsule = capsule is not None
         self.count = len(lattice.cells)
+        self.has_relaxation = bool(prony)
+        self.history: dict[str, ti.Field] = {}
+        if prony:
+            self.relaxation = Relaxation(prony, self.count)
+            self.history = self.relaxation.state
         self.most_mm = MOST_CELLS_AN_ITERATION * lattice.cell_mm
         self.mu = ti.field(ti.f32, ())
         self.lambda_ = ti.field(ti.f32, ())
         self.inertial_target = ti.Vector.field(3, ti.f32, body.count)
         self.predicted = ti.Vector.field(4, ti.f32, body.count)
-        self.mass = field_of(1e-3 * density_g_cm3 * lattice.tissue + load_g)
-        self._store_elements()
-        self._store_hourglass()
+        self.parts = tuple(parts)
+        self.has_parts = bool(parts)
+        density = mixture(material, self.parts, lattice.share)[2]
+        self.mass = field_of(lattice.node_mass(density) + load_g)
+        self._make_fields()
         self.rigid: Any = None
         if not self.has_fixed:
-            self.rigid = RigidCorrection(body, self.mass, self.inertial_target, contacts, self.serial)
-        self.poisson = poisson
-        self.set_material(young_kpa)
+            tether = self.tether if self.has_tether else None
+            self.rigid = RigidCorrection(body, self.mass, self.inertial_target, contacts, self.serial, tether)
+        self.material = material
+        self._fill_stiffness(np.ones(self.count))
+        self.set_material(material.young_kpa)
 
-    def _store_elements(self) -> None:
+    def _make_fields(self) -> None:
+        """The elements around each node and its 27 neighbours, itself included; without stiffness."""
         cells, nodes = self.lattice.cells, self.body.count
         around = np.full((nodes, 8), self.count)
-        gradient = np.zeros((nodes, 8, 4))
-        for corner in range(8):
-            around[cells[:, corner], corner] = np.arange(self.count)
-            gradient[cells[:, corner], corner, :3] = self.lattice.gradient[:, corner]
-            gradient[cells[:, corner], corner, 3] = self.lattice.volume
-        shear = (gradient[:, :, 3] * (gradient[:, :, :3] ** 2).sum(axis=2)).sum(axis=1)
-        self.around, self.shear = fields_of(around, shear)
-        self.gradient, self.cell = fields_of(gradient, cells, within=1)
-        self.deformation = field_of(np.tile(np.eye(3, 4), (self.count + 1, 1, 1)), 2)
-
-    def _store_hourglass(self) -> None:
-        """Rows of the hourglass matrix over the 27 nodes around each node, itself included, for a shear modulus of 1."""
-        cells, nodes = self.lattice.cells, self.body.count
         neighbour = np.tile(np.arange(nodes)[:, None], (1, 27))
-        weight = np.zeros((nodes, 27))
         for a in range(8):
+            around[cells[:, a], a] = np.arange(self.count)
             for b in range(8):
-                place = (CORNERS[b] - CORNERS[a] + 1) @ [9, 3, 1]
-                neighbour[cells[:, a], place] = cells[:, b]
-                weight[cells[:, a], place] += HOURGLASS_STIFFNESS * self.lattice.hourglass[:, a, b]
-        self.neighbour, self.hourglass = fields_of(neighbour, weight)
+                neighbour[cells[:, a], place_of(a, b)] = cells[:, b]
+        self.around, self.neighbour = fields_of(around, neighbour)
+        self.cell = field_of(cells, 1)
+        self.deformation = field_of(np.tile(np.eye(3, 4), (self.count + 1, 1, 1)), 2)
+        self.gradient = ti.Vector.field(4, ti.f32, (nodes, 8))
+        self.shear = ti.field(ti.f32, nodes)
+        self.hourglass = ti.field(ti.f32, (nodes, 27))
+        if self.has_parts:
+            self.lame_ratio = ti.field(ti.f32, self.count + 1)
 
-    def set_material(self, young_kpa: float, poisson: float | None = None) -> None:
-        """Change Young's modulus [kPa], and the contacts' penalty stiffness with it; without a Poisson's ratio that stays the same."""
-        self.poisson = poisson = self.poisson if poisson is None else poisson
-        # 1 kPa is 1000 g/(mm s^2).
-        self.mu[None] = 1e3 * young_kpa / (2 * (1 + poisson))
-        self.lambda_[None] = 1e3 * young_kpa * poisson / ((1 + poisson) * (1 - 2 * poisson))
+    def _fill_stiffness(self, stiffness: np.ndarray) -> None:
+        """Fill the fields that contain the shear modulus (m,) of the elements, in units of ``mu``."""
+        cells, lattice = self.lattice.cells, self.lattice
+        hourglass_stiffness = stiffness * hourglass_stiffness_of(lattice)
+        gradient = np.zeros((self.body.count, 8, 4))
+        hourglass = np.zeros((self.body.count, 27))
+        for a in range(8):
+            gradient[cells[:, a], a, :3] = lattice.gradient[:, a]
+            gradient[cells[:, a], a, 3] = stiffness * lattice.volume
+            for b in range(8):
+                weight = hourglass_stiffness * lattice.hourglass[:, a, b]
+                hourglass[cells[:, a], place_of(a, b)] += weight
+        shear = (gradient[:, :, 3] * (gradient[:, :, :3] ** 2).sum(axis=2)).sum(axis=1)
+        fill((self.gradient, gradient), (self.shear, shear), (self.hourglass, hourglass))
+
+    def set_material(
+        self, young_kpa: float, poisson: float | None = None, parts: Sequence[Material] | None = None
+    ) -> None:
+        """Change Young's modulus [kPa] of the tissue outside the parts, and the contacts' penalty stiffness with it.
+
+        Without a Poisson's ratio, or without parts, these stay the same; densities do so always.
+        """
+        poisson = self.material.poisson if poisson is None else poisson
+        self.material = replace(self.material, young_kpa=young_kpa, poisson=poisson)
+        self.parts = self.parts if parts is None else tuple(parts)
+        self.mu[None], self.lambda_[None] = self.material.mu, self.material.lambda_
         if self.contacts is not None:
             self.contacts.stiffness[None] = young_kpa / PENALTY_DEPTH_MM
+        if self.has_parts:
+            mu, lambda_, _ = mixture(self.material, self.parts, self.lattice.share)
+            self._fill_stiffness(mu / self.material.mu)
+            fill((self.lame_ratio, np.append(lambda_ / mu, 0.0)))
 
     def counts(self) -> dict[str, int]:
         """Nodes (also as particles), cells, and contact points on the surface."""
@@ -165,6 +228,10 @@ class NeoHookean:
                 y += b.y * at
                 z += b.z * at
             self.deformation[c] = ti.Matrix.rows([x, y, z])
+        if ti.static(self.has_capsule):
+            self.capsule.begin()
+        if ti.static(self.has_relaxation):
+            self.relaxation.begin(dt)
         # Nodes at the surface add zero to it, but zero times infinity would make it NaN for ever.
         self.deformation[self.count] = ti.Matrix.rows(
             [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
@@ -204,7 +271,14 @@ class NeoHookean:
         inertia = self.mass[i] / (dt * dt)
         force, hessian, least = self.elastic(i)
         force += inertia * (four(self.inertial_target[i]) - self.predicted[i])
+        if ti.static(self.has_tether):
+            force += self.tether[i] * (four(self.body.rest[i]) - self.predicted[i])
+            inertia += self.tether[i]
         hessian += inertia * tm.eye(3)
+        if ti.static(self.has_capsule):
+            tension, stiffness = self.capsule.node_force(i)
+            force += four(tension)
+            hessian += stiffness
         factor = relaxation_factor
         if ti.static(self.has_contacts):
             contact_force, stiffness = self.contacts.node_force(i)
@@ -217,6 +291,8 @@ class NeoHookean:
         if ti.static(self.has_fixed):
             change *= 1.0 - self.fixed[i]
         self.move(i, four(change))
+        if ti.static(self.has_capsule):
+            self.capsule.follow(i, change)
         if ti.static(self.has_contacts):
             self.contacts.follow(i, change)
 
@@ -242,9 +318,18 @@ class NeoHookean:
         mu, lambda_ = self.mu[None], self.lambda_[None]
         force = -mu * self.hourglass_gradient(i)
         x, y, z = tm.vec4(0.0), tm.vec4(0.0), tm.vec4(0.0)
+        # Shear and hourglass stiffness are isotropic and do not depend on the positions.
+        isotropic = mu * (self.shear[i] + self.hourglass[i, 13])
+        if ti.static(self.has_relaxation):
+            factor = self.relaxation.factor[None]
+            isotropic += (factor - 1.0) * mu * self.shear[i]
+            mu *= factor
+            lambda_ *= factor
         for k in range(8):
             b = self.gradient[i, k]
             f = self.deformation[self.around[i, k]]
+            if ti.static(self.has_parts):
+                lambda_ = mu * self.lame_ratio[self.around[i, k]]
             f1, f2, f3 = row(f, 0), row(f, 1), row(f, 2)
             f23 = cross(f2, f3)
             j = f1.dot(f23)
@@ -253,13 +338,15 @@ class NeoHookean:
             one_by = 1.0 / at
             pressure = (lambda_ * (ln(at) + j * one_by - 1.0) - mu) * one_by
             force -= b.w * (mu * (b.x * f1 + b.y * f2 + b.z * f3) + pressure * g)
+            if ti.static(self.has_relaxation):
+                past = times(self.relaxation.history[self.around[i, k]], b.xyz)
+                force -= b.w * (past.x * f1 + past.y * f2 + past.z * f3)
+                isotropic += ti.max(b.w * past.dot(b.xyz), 0.0)
             curvature = lambda_ * one_by * one_by - (pressure * one_by if j > LEAST_J else 0.0)
             weighted = (b.w * ti.max(curvature, 0.0)) * g
             x += g.x * weighted
             y += g.y * weighted
             z += g.z * weighted
-        # Shear and hourglass stiffness are isotropic and do not depend on the positions.
-        isotropic = mu * (self.shear[i] + self.hourglass[i, 13])
         return force, tm.mat3(x.x, x.y, x.z, y.x, y.y, y.z, z.x, z.y, z.z) + isotropic * tm.eye(3), isotropic
 
     @ti.func
@@ -270,6 +357,39 @@ class NeoHookean:
         for k in range(27):
             gradient += self.hourglass[i, k] * (self.predicted[self.neighbour[i, k]] - x)
         return gradient
+
+    @ti.func
+    def finish(self, dt: float):
+        """End of a substep: store what the next one needs of the stress, if the tissue relaxes."""
+        if ti.static(self.has_relaxation):
+            for c in range(self.count):
+                self.relaxation.finish(c, self.elastic_stress(c), dt)
+
+    @ti.func
+    def elastic_stress(self, c):
+        """Second Piola-Kirchhoff stress S = mu (1 - C^-1) + lambda ln J C^-1 of element c: 11, 22, 33, 12, 13, 23, relative to
+        the element's stiffness.
+        """
+        mu, lambda_ = self.mu[None], self.lambda_[None]
+        if ti.static(self.has_parts):
+            lambda_ = mu * self.lame_ratio[c]
+        f = self.deformation[c]
+        f1, f2, f3 = row(f, 0).xyz, row(f, 1).xyz, row(f, 2).xyz
+        g1, g2, g3 = f2.cross(f3), f3.cross(f1), f1.cross(f2)
+        j = f1.dot(g1)
+        at = ti.max(j, LEAST_J)
+        # The rows of F^-1 are g1, g2, g3 over J, and C^-1 = F^-1 F^-T.
+        volumetric = (lambda_ * (ln(at) + j / at - 1.0) - mu) / (at * at)
+        return ti.Vector(
+            [
+                mu + volumetric * g1.dot(g1),
+                mu + volumetric * g2.dot(g2),
+                mu + volumetric * g3.dot(g3),
+                volumetric * g1.dot(g2),
+                volumetric * g1.dot(g3),
+                volumetric * g2.dot(g3),
+            ]
+        )
 
     def update_frames(self) -> None:
         """Nothing to do: points are interpolated from the nodes."""
@@ -285,6 +405,27 @@ class NeoHookean:
         for k in ti.static(range(frame.n)):
             x += weight[k] * (self.body.position[frame[k]] - self.body.rest[frame[k]])
         return x
+
+
+def hourglass_stiffness_of(lattice: Lattice) -> np.ndarray:
+    """Stiffness (m,) of the hourglass modes of each element, in units of its shear modulus."""
+    is_whole = lattice.volume > (1 - 1e-9) * lattice.cell_mm**3
+    return np.where(is_whole, HOURGLASS_STIFFNESS, SURFACE_HOURGLASS_STIFFNESS)
+
+
+def place_of(a: int, b: int) -> int:
+    """The place of a cell's corner b among the 27 neighbours of its corner a."""
+    return int((CORNERS[b] - CORNERS[a] + 1) @ [9, 3, 1])
+
+
+@ti.func
+def times(s, b):
+    """A symmetric tensor (11, 22, 33, 12, 13, 23) times a vector."""
+    return tm.vec3(
+        s[0] * b.x + s[3] * b.y + s[4] * b.z,
+        s[3] * b.x + s[1] * b.y + s[5] * b.z,
+        s[4] * b.x + s[5] * b.y + s[2] * b.z,
+    )
 
 
 @ti.func

@@ -41,7 +41,8 @@ def nothing():
 
 @ti.data_oriented
 class RigidCorrection:
-    """Moves a body's predicted positions rigidly towards ``inertial_target`` (n,) [mm], weighted with ``mass`` (n,) [g].
+    """Moves a body's predicted positions rigidly towards ``inertial_target`` (n,) [mm], weighted with ``mass`` (n,) [g],
+    and to the places at rest to which a ``tether`` (n,) [g/s^2] holds.
 
     The unknowns are the translation and the rotation vector about the node ``centre``.
     """
@@ -53,6 +54,7 @@ class RigidCorrection:
         inertial_target: ti.Field,
         contacts: SurfaceContacts | None = None,
         serial: bool = False,
+        tether: ti.Field | None = None,
     ) -> None:
         self.body = body
         self.mass = mass
@@ -60,6 +62,8 @@ class RigidCorrection:
         self.contacts: Any = contacts
         self.has_contacts = contacts is not None
         self.serial = serial
+        self.tether: Any = tether
+        self.has_tether = tether is not None
         self.terms = body.count + (contacts.count if contacts else 0)
         self.blocks = -(-self.terms // BLOCK)
         middle = body.rest_points.mean(axis=0)
@@ -134,6 +138,10 @@ class RigidCorrection:
                 f = inertia * dt * self.body.velocity[term]
                 if has_forces:
                     f = inertia * (self.inertial_target[term] - x)
+                if ti.static(self.has_tether):
+                    if has_forces:
+                        f += self.tether[term] * (self.body.rest[term] - x)
+                    inertia += self.tether[term]
                 k = inertia * tm.eye(3)
             elif ti.static(self.has_contacts):
                 q = term - self.body.count

@@ -10,6 +10,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from sim.body import BodyState
+from sim.fields import array_of, fill, fill_evenly
 from sim.self_contact import SelfContacts
 from sim.shapes import MOST_SUBSTEPS, ConvexTool
 from sim.tissue_model import TissueModel
@@ -38,10 +39,10 @@ class StepSettings:
 
 @dataclass(frozen=True)
 class SolverState:
-    """All that steps change: the state of the body and of its contacts."""
+    """All that steps change: the body, and what contacts and tissue carry from step to step, by name."""
 
     body: BodyState
-    contacts: dict[str, np.ndarray]
+    history: dict[str, np.ndarray]
 
 
 @ti.data_oriented
@@ -65,6 +66,8 @@ class Solver:
         self.has_tool = tool is not None
         self.has_contacts = model.contacts is not None
         self.has_self_contacts = self_contacts is not None
+        self.history: dict[str, ti.Field] = getattr(model, "history", {})
+        self.has_history = bool(self.history)
 
     def step(self, settings: StepSettings, tool_poses: np.ndarray | None = None) -> None:
         """Advance by one time step.
@@ -99,13 +102,26 @@ class Solver:
 
     def snapshot(self) -> SolverState:
         """A copy of the current state."""
-        return SolverState(self.body.snapshot(), self.contacts.snapshot() if self.contacts else {})
+        contacts = self.contacts.snapshot() if self.contacts else {}
+        tissue = {name: array_of(field) for name, field in self.history.items()}
+        return SolverState(self.body.snapshot(), contacts | tissue)
+
+    def restart(self) -> None:
+        """The stress-free shape, without velocities, contacts and history."""
+        self.body.restore(self.body.rest_state())
+        if self.contacts:
+            self.contacts.reset()
+        for field in self.history.values():
+            fill_evenly(field, 0.0)
+        self.model.update_frames()
 
     def restore(self, state: SolverState) -> None:
         """Restore a state; the steps that follow give the same bits as they did from it before."""
         self.body.restore(state.body)
         if self.contacts:
-            self.contacts.restore(state.contacts)
+            contacts = {name: each for name, each in state.history.items() if name not in self.history}
+            self.contacts.restore(contacts)
+        fill(*((field, state.history[name]) for name, field in self.history.items()))
         self.model.update_frames()
 
     @ti.kernel
@@ -196,6 +212,8 @@ class Solver:
     def finish(self, dt: float):
         """Lines 23-26: velocities and positions from the predicted positions."""
         self.model.scatter()
+        if ti.static(self.has_history):
+            self.model.finish(dt)  # type: ignore[attr-defined]
         if ti.static(self.has_contacts):
             self.contacts.finish()
         self.update_velocities(dt)

@@ -24,6 +24,8 @@ TANGENTIAL_RATIO = 0.5
 REUSE_MM = 0.15
 # Points nearer than this to a shape may touch it within the step.
 NEAR_MM = 3.0
+# Forces are summed in blocks of this many points, in an order that does not depend on threads.
+BLOCK = 64
 # Distance around a static shape within which the distance to it must be known [mm].
 REACH_MM = 6.0
 
@@ -72,6 +74,8 @@ class SurfaceContacts:
             self.state["stick"] = self.slip
         self.stiffness = ti.field(ti.f32, ())
         self.penetration = ti.field(ti.f32, ())
+        self.blocks = -(-self.count // BLOCK)
+        self.block_wrench = ti.Vector.field(6, ti.f32, self.blocks)
         self.reset()
 
     def reset(self) -> None:
@@ -221,6 +225,31 @@ class SurfaceContacts:
                     if depth > 0.0:
                         slip, _ = self.tangential_slip(s, q, depth)
                     self.slip[s, q] = slip
+
+    def wrench(self, shape: object, about: np.ndarray) -> np.ndarray:
+        """Force [N] of the tissue on a shape, and its torque [N mm] about a point (3,) [mm]: (6,), in the last step.
+
+        These are the forces that balance those in the tissue, friction included.
+        """
+        self._sum_forces(self.shapes.index(shape), *about.tolist())
+        return -1e-6 * array_of(self.block_wrench).sum(axis=0, dtype=np.float64)
+
+    @ti.kernel
+    def _sum_forces(self, s: ti.template(), x: float, y: float, z: float):
+        """Force [uN] of shape s on the points of each block, and its torque [uN mm]."""
+        for block in range(self.blocks):
+            force, torque = tm.vec3(0.0), tm.vec3(0.0)
+            for q in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.count)):
+                depth = self.depth(s, q)
+                if depth > 0.0:
+                    pressure = depth * self.plane[s, q].xyz
+                    if ti.static(self.friction > 0):
+                        pressure -= TANGENTIAL_RATIO * self.slip[s, q]
+                    at_point = 1e3 * self.stiffness[None] * self.area[q] * pressure
+                    force += at_point
+                    torque += (self.point[q] - tm.vec3(x, y, z)).cross(at_point)
+            for k in ti.static(range(3)):
+                self.block_wrench[block][k], self.block_wrench[block][k + 3] = force[k], torque[k]
 
     @ti.kernel
     def measure_penetration(self) -> float:

@@ -3,35 +3,18 @@
 docs/adding-a-tissue-model.md shows how to add one.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import taichi as ti
 
+from sim.attachment import FixedRegion, Tether
 from sim.body import Body
+from sim.material import Part
 from sim.particle_contact import ShapeContacts
-from sim.sampling import SamplingError
 from sim.surface_contact import SurfaceContacts
-
-
-@dataclass(frozen=True)
-class FixedRegion:
-    """Tissue that cannot move (Dirichlet boundary): all within a distance [mm] of a point (3,) [mm]."""
-
-    at_mm: np.ndarray
-    radius_mm: float
-
-    def nodes(self, nodes: np.ndarray) -> np.ndarray:
-        """Mask (n,) of the nodes (n, 3) that are fixed. Raises SamplingError where it is none or all of them."""
-        distance = np.linalg.norm(nodes - self.at_mm, axis=1)
-        fixed = distance <= self.radius_mm
-        if fixed.all() or not fixed.any():
-            raise SamplingError(
-                f"attachment.radius_mm = {self.radius_mm:g} fixes {'all' if fixed.all() else 'none'} of the organ, which is "
-                f"{distance.min():.1f} to {distance.max():.1f} mm from attachment.at_mm: choose another radius or point"
-            )
-        return fixed
 
 
 @dataclass(frozen=True)
@@ -39,7 +22,7 @@ class ModelInputs:
     """What a tissue model is made from: an organ [mm], the shapes around it, and the scene's settings of the tissue.
 
     ``organ`` is a closed surface, or what the model itself accepts instead; ``tissue`` has the model's parameters by the names
-    of its section; ``friction`` is Coulomb's coefficient on shapes. ``serial``: run a step as one kernel on one core; None
+    of its section; ``friction`` is Coulomb's coefficient on shapes; ``parts`` have their own material, a later one where they overlap. ``serial``: run a step as one kernel on one core; None
     decides by size and machine. ``relaxation`` and ``mass_scaling_per_mm`` are for shape matching.
     """
 
@@ -47,7 +30,9 @@ class ModelInputs:
     tissue: Any
     shapes: list
     friction: float
-    fixed: FixedRegion | None
+    fixed: Sequence[FixedRegion]
+    tethers: Sequence[Tether]
+    parts: Sequence[Part]
     serial: bool | None
     relaxation: str
     mass_scaling_per_mm: float
@@ -59,7 +44,8 @@ class TissueModel(Protocol):
     ``serial``: the model is too small for more than one core of a CPU. ``EMBEDDING_CELL_RATIO``: width of the coarse tetrahedra
     that carry the image plane, over the resolution of the tissue. ``begin`` to ``project`` are ti.funcs that the solver's
     kernels inline, so their outermost loops are parallel; ``carried`` is one for a single point. A model whose material can be
-    changed between steps also has ``set_material(young_kpa)``.
+    changed between steps also has ``set_material(young_kpa)``. One that carries more than the body from step to step has ``history``, these
+    fields by name, which its ti.func ``finish(dt)`` updates at the end of each substep.
     """
 
     EMBEDDING_CELL_RATIO: ClassVar[float]

@@ -25,13 +25,6 @@ def build(
     return Rehearsal(scene_of(scene, setup), anatomy if with_image else replace(anatomy, ct=None))
 
 
-def restart(solver: Solver) -> None:
-    """The stress-free shape, without velocities and contacts."""
-    solver.body.restore(solver.body.rest_state())
-    solver.contacts.reset()
-    solver.model.update_frames()
-
-
 def memory_of_process_mb() -> float:
     """Memory of this process [MB]."""
     return psutil.Process().memory_info().rss / 1e6

@@ -6,7 +6,8 @@ import trimesh
 from sim.body import Body, BodyState
 from sim.fields import array_of
 from sim.lattice import Lattice, fill_with_cells, surface_points
-from sim.neo_hookean import HOURGLASS_STIFFNESS, LATTICE_SETTINGS, LEAST_J, NeoHookean
+from sim.material import Material
+from sim.neo_hookean import LATTICE_SETTINGS, LEAST_J, NeoHookean, hourglass_stiffness_of
 from sim.shapes import ConvexTool
 from sim.solver import Solver, StepSettings
 from sim.surface_contact import SurfaceContacts
@@ -38,7 +39,7 @@ def tissue_of(
         points, area = surface_points(mesh, cell_mm / 2)
         contacts = SurfaceContacts(body, lattice, points, area, shapes, friction)
     fixed = None if fixed is None else fixed(lattice.nodes)
-    model = NeoHookean(body, lattice, contacts, YOUNG_KPA, poisson, 1e3 * DENSITY, fixed)
+    model = NeoHookean(body, lattice, contacts, Material(YOUNG_KPA, poisson, 1e3 * DENSITY), fixed=fixed)
     return Solver(model, tool=next((s for s in shapes if isinstance(s, ConvexTool)), None))
 
 
@@ -73,13 +74,15 @@ def lame_parameters(poisson: float) -> tuple[float, float]:
 class Energy:
     """Elastic and hourglass energy of each cell in float64 or complex128, and its derivatives colour by colour.
 
+    ``mu`` and ``lambda_`` are those of all cells, or (m,) of each.
+
     Nodes of one colour have no cell in common: all of them can be moved at once, and the cells around a node tell
     its own derivative.
     """
 
-    def __init__(self, lattice: Lattice, poisson: float) -> None:
+    def __init__(self, lattice: Lattice, poisson: float = 0.45, mu=None, lambda_=None) -> None:
         self.lattice = lattice
-        self.mu, self.lambda_ = lame_parameters(poisson)
+        self.mu, self.lambda_ = lame_parameters(poisson) if mu is None else (mu, lambda_)
 
     def of_cells(self, x: np.ndarray) -> np.ndarray:
         corner = x[self.lattice.cells]
@@ -89,7 +92,7 @@ class Energy:
         log_j = np.where(above, np.log(np.where(above, j, 1.0)), np.log(LEAST_J) + j / LEAST_J - 1)
         density = self.mu / 2 * ((f * f).sum(axis=(1, 2)) - 3) - self.mu * log_j + self.lambda_ / 2 * log_j**2
         inside = np.einsum("mia,mij,mja->m", corner, self.lattice.hourglass, corner)
-        return self.lattice.volume * density + self.mu / 2 * HOURGLASS_STIFFNESS * inside
+        return self.lattice.volume * density + self.mu / 2 * hourglass_stiffness_of(self.lattice) * inside
 
     def slope(self, x: np.ndarray, colour: int, axis: int) -> np.ndarray:
         """dE/dx (n of the colour,) along an axis, by a complex step: exact to rounding."""

@@ -35,6 +35,11 @@ class ImagePlane:
     above_mm: float = 0.0
 
 
+def array_face_centre(pose: np.ndarray, length_mm: float) -> np.ndarray:
+    """The centre (3,) [mm] of the array face of a transducer of a length [mm] at a pose (4, 4)."""
+    return pose[:3, 3] - length_mm / 2 * pose[:3, 2]
+
+
 def pose_at(
     face_centre: np.ndarray, direction: np.ndarray, lateral: np.ndarray, length_mm: float
 ) -> np.ndarray:

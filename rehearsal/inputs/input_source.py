@@ -131,7 +131,7 @@ class ReplayInput:
         if self.user_input is not None:
             self.user_input.after_step(step)
             return
-        self.replay.end_step(step.pose, step.length_s)
+        self.replay.end_step(step.pose, step.length_s, step.wrench)
         if self.replay.differs_s is not None and not self._has_warned:
             self._has_warned = True
             self.notices.post(
@@ -187,7 +187,7 @@ class ScriptedInput:
         return rehearsal.pose_towards(rehearsal.scripted_pose(rehearsal.script_length_s() * share))
 
     def after_step(self, step: Step) -> None:
-        self.session.end_step()
+        self.session.end_step(step.pose, step.length_s, step.wrench)
 
     def after_frame(self) -> None:
         if self.recorder is not None:

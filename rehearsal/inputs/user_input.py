@@ -111,7 +111,7 @@ class UserInput:
     def after_step(self, step: Step) -> None:
         """Note a step that was made."""
         self.session.note_changes("solver", dict(iterations=step.iterations))
-        self.session.end_step(step.pose, step.length_s)
+        self.session.end_step(step.pose, step.length_s, step.wrench)
         if step.pace != self._pace:
             self._pace = step.pace
             self.notices.post(step.pace or "Steps as they are set again.", on_screen=False)

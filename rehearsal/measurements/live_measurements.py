@@ -117,7 +117,13 @@ class LiveMeasurements:
     def count(self, pose: np.ndarray | None, length_s: float) -> None:
         """Count a step by its pose (4, 4) and its length [s], or a rollback by None, for the summary."""
         if self.latest is not None:
-            self.course.add(pose, round(self.latest.compression_mm, DIGITS), length_s)
+            force_n = self.latest.force_n
+            self.course.add(
+                pose,
+                round(self.latest.compression_mm, DIGITS),
+                length_s,
+                None if force_n is None else round(force_n, DIGITS),
+            )
 
     def _show(self) -> None:
         """Update what the window shows."""
@@ -183,6 +189,8 @@ class LiveMeasurements:
         if latest is None:
             return {}
         found = {COMPRESSION: _mm(latest.compression_mm), "contact": f"{latest.contact_mm2:.0f} mm2"}
+        if latest.force_n is not None:
+            found["force"] = f"{latest.force_n:.2f} N"
         if latest.to_tumour_mm is None:
             return found if self.rehearsal.scanner is None else found | {"organ seen": self._share("organ")}
         found |= {

@@ -36,6 +36,7 @@ class Tally:
     volume_ratio_min: float = 1.0
     max_penetration_mm: float = 0.0
     indentation_max_mm: float = 0.0
+    force_max_n: float = 0.0
     _expected: dict[tuple, float | None] = field(default_factory=dict, init=False)
 
     def expected_error_mm(self, rehearsal: Rehearsal) -> float | None:
@@ -55,10 +56,14 @@ class Tally:
         self.volume_ratio_min = min(self.volume_ratio_min, rehearsal.volume_ratio())
         self.max_penetration_mm = max(self.max_penetration_mm, rehearsal.contacts.measure_penetration())
         self.indentation_max_mm = max(self.indentation_max_mm, rehearsal.indentation_mm())
+        wrench = rehearsal.wrench()
+        if wrench is not None:
+            self.force_max_n = max(self.force_max_n, float(np.linalg.norm(wrench[:3])))
 
     def report(self, rehearsal: Rehearsal, arch: str) -> dict:
         """The report; times [ms] without the first step, None if nothing was timed; no figures of tissue that is not finite."""
         settings = rehearsal.settings
+        wrench = rehearsal.wrench() if self.finite else None
         return dict(
             version=VERSION,
             title=rehearsal.scene.title,
@@ -84,6 +89,9 @@ class Tally:
             volume_ratio_min=round(self.volume_ratio_min, 6) if self.finite else None,
             max_penetration_mm=round(self.max_penetration_mm, 6) if self.finite else None,
             indentation_max_mm=round(self.indentation_max_mm, 4) if self.finite else None,
+            force_max_n=None if wrench is None else round(self.force_max_n, 4),
+            probe_force_n=None if wrench is None else [round(v, 4) for v in wrench[:3].tolist()],
+            probe_torque_n_mm=None if wrench is None else [round(v, 3) for v in wrench[3:].tolist()],
         )
 
 
@@ -114,9 +122,13 @@ def _press(report: dict) -> str:
     if not report["finite"]:
         return "NOT FINITE: the tissue diverged, and there are no figures of it"
     return (
-        f"{report['indentation_max_mm']:.2f} mm deep; least volume {100 * report['volume_ratio_min']:.1f} %; "
+        f"{report['indentation_max_mm']:.2f} mm deep{_force(report['force_max_n'])}; least volume {100 * report['volume_ratio_min']:.1f} %; "
         f"penetration at most {report['max_penetration_mm']:.3f} mm; all finite"
     )
+
+
+def _force(most_n: float | None) -> str:
+    return "" if most_n is None else f", with {most_n:.2f} N at most"
 
 
 def _error(expected_mm: float | None) -> str:

@@ -13,7 +13,7 @@ from ultrasound.coverage import Gap
 PRESSED_MM, RELEASED_MM = 1.0, 0.5
 FIGURES = (
     *("duration_s", "path_mm", "fastest_mm_s"),
-    *("compression_max_mm", "compression_warning_mm", "over_warning_s"),
+    *("compression_max_mm", "compression_warning_mm", "over_warning_s", "force_max_n"),
 )
 
 
@@ -27,13 +27,16 @@ class SessionCourse:
     fastest_mm_s: float = 0.0
     compression_max_mm: float = 0.0
     over_warning_s: float = 0.0
+    force_max_n: float = 0.0
     presses: int = 0
     went_back: int = 0
     _is_pressed: bool = field(default=False, init=False)
     _at: np.ndarray | None = field(default=None, init=False)
 
-    def add(self, pose: np.ndarray | None, compression_mm: float, length_s: float) -> None:
-        """Add a step by its pose (4, 4), or a rollback by None, with the compression [mm] and the length [s]."""
+    def add(
+        self, pose: np.ndarray | None, compression_mm: float, length_s: float, force_n: float | None = None
+    ) -> None:
+        """Add a step by its pose (4, 4), or a rollback by None, with compression [mm], length [s], and force on the probe [N]."""
         self.duration_s += length_s
         if pose is None:
             self.went_back += 1
@@ -45,6 +48,7 @@ class SessionCourse:
             self.fastest_mm_s = max(self.fastest_mm_s, path / length_s)
         self._at = pose[:3, 3].copy()
         self.compression_max_mm = max(self.compression_max_mm, compression_mm)
+        self.force_max_n = max(self.force_max_n, force_n or 0.0)
         self.over_warning_s += length_s * (compression_mm > self.compression_warning_mm)
         if not self._is_pressed and compression_mm > PRESSED_MM:
             self.presses += 1
@@ -81,6 +85,7 @@ def summary_text(summary: dict[str, Any]) -> str:
             f"{summary['path_mm']:.0f} mm, at most {summary['fastest_mm_s']:.0f} mm/s; {counted(summary['bookmarks'], 'bookmark')}",
             f"compression {summary['compression_max_mm']:.1f} mm at most; {summary['over_warning_s']:.1f} s above the limit of "
             f"{summary['compression_warning_mm']:g} mm",
+            f"force       {summary['force_max_n']:.2f} N at most on the probe",
             f"coverage    {seen or 'none: there is no CT'}{largest}",
         ]
     )

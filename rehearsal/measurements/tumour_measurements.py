@@ -14,12 +14,16 @@ from ultrasound.probe import Probe
 
 @dataclass(frozen=True)
 class Measurement:
-    """Lengths in mm; None where there is no tumour, or none on the image plane."""
+    """Lengths in mm, forces in N; None where there is no tumour, or none on the image plane."""
 
     compression_mm: float
     """Greatest compression of the tissue in front of the array face (``ultrasound.array_contact.ArrayContact``)."""
     contact_mm2: float
     """Area of the array face in contact."""
+    force_n: float | None = None
+    """Force [N] of the tissue on the probe."""
+    torque_n_mm: float | None = None
+    """Torque [N mm] of that force about the centre of the array face."""
     to_tumour_mm: float | None = None
     """Distance from the array face to the nearest point of the tumour."""
     tumour_depth_mm: float | None = None
@@ -40,6 +44,11 @@ def measure(rehearsal: Rehearsal, probe: Probe, touches: np.ndarray) -> Measurem
         rehearsal.pose, rehearsal.size_mm, probe.radius_mm, now, np.asarray(organ.vertices), organ.faces
     )
     always: dict[str, Any] = dict(compression_mm=pressed.compression_mm, contact_mm2=pressed.area_mm2)
+    wrench = rehearsal.wrench()
+    if wrench is not None:
+        always |= dict(
+            force_n=float(np.linalg.norm(wrench[:3])), torque_n_mm=float(np.linalg.norm(wrench[3:]))
+        )
     outline = rehearsal.tumour_outline()
     if outline is None or rehearsal.tumour is None:
         return Measurement(**always)

@@ -78,7 +78,7 @@ class SharedState:
 
 
 def _arrays_of(state: SolverState) -> Arrays:
-    return dict(position=state.body.position, velocity=state.body.velocity, **state.contacts)
+    return dict(position=state.body.position, velocity=state.body.velocity, **state.history)
 
 
 def _solver_state(arrays: Mapping[str, np.ndarray]) -> SolverState:

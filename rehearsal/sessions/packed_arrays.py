@@ -21,6 +21,8 @@ from ultrasound.probe_manipulator import ManipulatorState
 
 # Of a pose, all but its last row.
 NUMBERS = 12
+# Of a wrench: force and torque.
+COMPONENTS = 6
 # A second has fewer steps; a grid of 1.5 mm over half a metre fewer voxels; all arrays of a body of a million particles fewer bytes.
 MOST_STEPS, MOST_VOXELS, MOST_BYTES = 1_000_000, 100_000_000, 1 << 30
 
@@ -83,6 +85,23 @@ def unpack_poses(text: str) -> np.ndarray:
     if np.isinf(poses).any():
         raise ValueError("a pose that is not finite")
     return poses
+
+
+def pack_wrenches(wrenches: list[np.ndarray | None]) -> str:
+    """Wrenches (6,) [N, N mm] on the probe, or None where there is none."""
+    rows = np.full((len(wrenches), COMPONENTS), np.nan)
+    for row, wrench in zip(rows, wrenches, strict=True):
+        if wrench is not None:
+            row[:] = wrench
+    return _packed(rows.astype("<f4"))
+
+
+def unpack_wrenches(text: str) -> np.ndarray:
+    """Wrenches (n, 6) [N, N mm], NaN where there is none. Raises ValueError."""
+    rows = np.frombuffer(_unpacked(text, MOST_STEPS * COMPONENTS * 4), "<f4")
+    if np.isinf(rows).any():
+        raise ValueError("a force that is not finite")
+    return rows.reshape(-1, COMPONENTS)
 
 
 def pack_lengths(lengths_s: list[float]) -> str:
@@ -170,7 +189,7 @@ def _pose(arrays: dict[str, np.ndarray], name: str) -> np.ndarray:
 
 
 def _of_solver(name: str, state: SolverState) -> dict[str, np.ndarray]:
-    contacts = {f"{name}.contacts.{key}": values for key, values in state.contacts.items()}
+    contacts = {f"{name}.contacts.{key}": values for key, values in state.history.items()}
     return {f"{name}.position": state.body.position, f"{name}.velocity": state.body.velocity} | contacts
 
 
@@ -182,4 +201,4 @@ def _solver(arrays: dict[str, np.ndarray], name: str, like: SolverState) -> Solv
         return values
 
     body = BodyState(taken("position", like.body.position), taken("velocity", like.body.velocity))
-    return SolverState(body, {key: taken(f"contacts.{key}", old) for key, old in like.contacts.items()})
+    return SolverState(body, {key: taken(f"contacts.{key}", old) for key, old in like.history.items()})

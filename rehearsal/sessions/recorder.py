@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from rehearsal.notices import Notices
 from rehearsal.rehearsal import RehearsalState
 from rehearsal.result_files import next_number
-from rehearsal.sessions.packed_arrays import pack_lengths, pack_poses, pack_state
+from rehearsal.sessions.packed_arrays import pack_lengths, pack_poses, pack_state, pack_wrenches
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import End, Event, Header, Kind, Second, recorded_values
 from scenes.anatomy import LoadedAnatomy, fingerprint
@@ -37,6 +37,7 @@ class SessionRecorder:
         self._has_warned = False
         self._poses: list[np.ndarray | None] = []
         self._lengths_s: list[float] = []
+        self._wrenches: list[np.ndarray | None] = []
         self._usual_s = header.time_step_s
         self._state_due_s = STATE_S
         self._events: list[Event] = []
@@ -49,10 +50,11 @@ class SessionRecorder:
         """Note something about the coming step."""
         self._events.append(Event(at=self.session.step_index, kind=kind, value=value))
 
-    def add_step(self, pose: np.ndarray | None, length_s: float) -> None:
-        """Add a step by its pose (4, 4), or a rollback by None, and its length [s]."""
+    def add_step(self, pose: np.ndarray | None, length_s: float, wrench: np.ndarray | None = None) -> None:
+        """Add a step by its pose (4, 4), or a rollback by None, its length [s] and the wrench (6,) on the probe."""
         self._poses.append(pose)
         self._lengths_s.append(length_s)
+        self._wrenches.append(wrench)
 
     @property
     def is_state_due(self) -> bool:
@@ -96,9 +98,15 @@ class SessionRecorder:
             at, digest = self.session.step_index - len(self._poses), self.session.rehearsal.digest()
             varies = any(length_s != self._usual_s for length_s in self._lengths_s)
             lengths_s = pack_lengths(self._lengths_s) if varies else None
-            poses = pack_poses(self._poses)
-            self._write(Second(at=at, poses=poses, lengths_s=lengths_s, events=self._events, digest=digest))
-            self._poses, self._lengths_s, self._events = [], [], []
+            poses, events = pack_poses(self._poses), self._events
+            has_force = any(wrench is not None for wrench in self._wrenches)
+            wrenches = pack_wrenches(self._wrenches) if has_force else None
+            self._write(
+                Second(
+                    at=at, poses=poses, lengths_s=lengths_s, wrenches=wrenches, events=events, digest=digest
+                )
+            )
+            self._poses, self._lengths_s, self._wrenches, self._events = [], [], [], []
 
     def _write(self, line: BaseModel) -> None:
         self._disk.submit(self._put, line)

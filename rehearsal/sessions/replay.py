@@ -114,9 +114,11 @@ class Replay:
             last += 1
         return self.log.poses[first:last], lengths_s[first:last], settings
 
-    def end_step(self, pose: np.ndarray | None = None, length_s: float | None = None) -> None:
+    def end_step(
+        self, pose: np.ndarray | None = None, length_s: float | None = None, wrench: np.ndarray | None = None
+    ) -> None:
         """Count a step that was made; left out, pose and length are the rehearsal's present ones."""
-        self.session.end_step(pose, length_s)
+        self.session.end_step(pose, length_s, wrench)
         self._compare()
 
     def _set(self, index: int) -> tuple[int | None, dict[str, Any]]:

@@ -23,7 +23,9 @@ class Recorder(Protocol):
 
     def note(self, kind: Kind, value: Any) -> None: ...
 
-    def add_step(self, pose: np.ndarray | None, length_s: float) -> None: ...
+    def add_step(
+        self, pose: np.ndarray | None, length_s: float, wrench: np.ndarray | None = None
+    ) -> None: ...
 
 
 class Session:
@@ -62,10 +64,18 @@ class Session:
         if self.recorder is not None:
             self.recorder.note(kind, value)
 
-    def end_step(self, pose: np.ndarray | None = None, length_s: float | None = None) -> None:
-        """Count a step that was made: to a pose (4, 4), of a length [s]; left out, they are the rehearsal's present ones."""
+    def end_step(
+        self,
+        pose: np.ndarray | None = None,
+        length_s: float | None = None,
+        wrench: np.ndarray | None = None,
+    ) -> None:
+        """Count a step that was made: to a pose (4, 4), of a length [s], with a wrench (6,) on the probe.
+
+        Pose and length that are left out are the rehearsal's present ones.
+        """
         self.rolled_back_to = None
-        self._count(self.rehearsal.pose if pose is None else pose, length_s)
+        self._count(self.rehearsal.pose if pose is None else pose, length_s, wrench)
 
     def roll_back(self, step_index: int) -> None:
         """Restore a state that was kept; time goes on."""
@@ -103,10 +113,12 @@ class Session:
             index: state for index, state in self.kept_states.items() if index in {SETTLED, *needed}
         }
 
-    def _count(self, pose: np.ndarray | None, length_s: float | None = None) -> None:
+    def _count(
+        self, pose: np.ndarray | None, length_s: float | None = None, wrench: np.ndarray | None = None
+    ) -> None:
         length_s = length_s or self.rehearsal.settings.time_step_s
         if self.recorder is not None:
-            self.recorder.add_step(pose, length_s)
+            self.recorder.add_step(pose, length_s, wrench)
         self.step_index += 1
         self.time_s += length_s
 

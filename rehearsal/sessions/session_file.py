@@ -89,6 +89,8 @@ class Second(_Line):
     poses: str
     lengths_s: str | None = None
     """The steps' lengths, packed, where one is not the header's."""
+    wrenches: str | None = None
+    """Force [N] of the tissue on the probe, and its torque [N mm] about the centre of the array face, of each step (LPS), packed."""
     events: list[Event] = Field(default_factory=list)
     digest: str
 

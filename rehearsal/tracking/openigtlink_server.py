@@ -8,6 +8,7 @@ cannot be ended after half a header, takes over the signals of the process, and 
 """
 
 import asyncio
+import json
 from collections.abc import Callable
 from contextlib import suppress
 from ipaddress import ip_address
@@ -15,7 +16,7 @@ from threading import Thread
 from time import monotonic
 
 import numpy as np
-from pyigtl import ImageMessage, TransformMessage
+from pyigtl import ImageMessage, StringMessage, TransformMessage
 from pyigtl.messages import MessageBase
 from scipy.linalg import polar
 
@@ -27,6 +28,8 @@ from ultrasound.probe import Probe
 
 # PLUS names an image by its own coordinate system and the one of its pose. Names have at most 20 letters.
 IMAGE, IMAGE_TO_PROBE, PROBE = "Image_Reference", "ImageToProbe", "ProbeToReference"
+# A text, because pyigtl has no SENSOR message, nor has Slicer.
+FORCE = "ProbeForce"
 # Its own inverse.
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 HEADER_VERSIONS = (1, 2)
@@ -104,20 +107,28 @@ class OpenIGTLinkServer:
         return ip_address(self.host).is_loopback
 
     def send(
-        self, grey: np.ndarray, image_to_probe: np.ndarray, probe_in_patient: np.ndarray, time_s: float
+        self,
+        grey: np.ndarray,
+        image_to_probe: np.ndarray,
+        probe_in_patient: np.ndarray,
+        time_s: float,
+        wrench: np.ndarray | None = None,
     ) -> None:
         """Send an image and its pose to all clients; the arrays must not change any more.
 
         ``grey`` is uint8 (rows, columns) in orientation MF; ``image_to_probe`` and ``probe_in_patient`` are (4, 4) [mm, LPS], in PLUS's
-        axes of the probe. ``time_s`` is the rehearsal's time.
+        axes of the probe. ``time_s`` is the rehearsal's time. ``wrench`` (6,): force [N] of the tissue on the probe and torque [N mm] about
+        the centre of the array face (LPS).
         """
         probe = RAS_FROM_LPS @ probe_in_patient
-        messages = (
+        messages: tuple[MessageBase, ...] = (
             TransformMessage(probe, device_name=PROBE, timestamp=time_s),
             TransformMessage(image_to_probe, device_name=IMAGE_TO_PROBE, timestamp=time_s),
             # pyigtl takes (slices, rows, columns); of an image without slices it sends the size reversed.
             ImageMessage(grey[None], probe @ image_to_probe, "ras", device_name=IMAGE, timestamp=time_s),
         )
+        if wrench is not None:
+            messages += (StringMessage(force_text(wrench), device_name=FORCE, timestamp=time_s),)
         self._loop.call_soon_threadsafe(self._publish, messages)
 
     def __enter__(self) -> "OpenIGTLinkServer":
@@ -211,4 +222,16 @@ def send_live(
     """Send the first image of a view, if there is a link."""
     if link is not None:
         grey = next(iter(view.images.values()))
-        link.send(grey, probe.image_to_probe(*grey.shape), probe_in_patient(rehearsal), time_s)
+        image_to_probe = probe.image_to_probe(*grey.shape)
+        link.send(grey, image_to_probe, probe_in_patient(rehearsal), time_s, rehearsal.wrench())
+
+
+def force_text(wrench: np.ndarray) -> str:
+    """A wrench (6,) [N, N mm, LPS] as JSON: force and torque along the axes of Reference (RAS)."""
+    rotation = RAS_FROM_LPS[:3, :3]
+    return json.dumps(
+        dict(
+            force_N=(rotation @ wrench[:3]).round(5).tolist(),
+            torque_N_mm=(rotation @ wrench[3:]).round(4).tolist(),
+        )
+    )

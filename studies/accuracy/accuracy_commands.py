@@ -5,6 +5,7 @@ from time import perf_counter
 from typing import Annotated, Literal
 
 import click
+import numpy as np
 from pydantic import Field
 from tqdm import tqdm
 
@@ -69,7 +70,7 @@ def validate(asked: ValidateOptions) -> None:
     make_place(asked.json_file)
     used = start_taichi(asked.arch)
     from studies.accuracy import convergence_study
-    from studies.accuracy.bead_errors import report, summary, table
+    from studies.accuracy.bead_errors import force_table, report, summary, table
     from studies.accuracy.bead_experiment import BeadExperiment
 
     if asked.check:
@@ -81,6 +82,8 @@ def validate(asked: ValidateOptions) -> None:
     figures = report(experiment, setup, run)
     click.echo(f"{summary(figures, experiment.describe(setup))}\nbuilt  in {built_s:.1f} s, on {used}\n")
     click.echo(table(loaded, run.beads))
+    if np.isfinite(run.force_n).all():
+        click.echo(f"\n{force_table(loaded, run.force_n)}")
     try:
         if asked.check:
             figures["independence"] = []

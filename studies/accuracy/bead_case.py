@@ -17,10 +17,14 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from errors import PatientError, UserError, explained
 from scenes.section import Direction, Vector3
 from scenes.surfaces import load_surface
+from sim.attachment import FixedRegion
+from sim.material import Material, Part
 from sim.signed_distance import signed_distance
 from studies.number_table import read_numbers
 
-UNITS = ("_mm", "_kPa")
+# The paper's, where a case has none.
+DENSITY_KG_M3 = 1050.0
+UNITS = ("_mm", "_kPa", "_N")
 # Between the nominal indentation and the measured position of the probe.
 MOST_APART_MM = 0.5
 
@@ -66,12 +70,23 @@ class CaseGravity(CaseSection):
     direction: Direction
 
 
+class CasePart(CaseSection):
+    """A part of the organ within a closed surface, with its own material."""
+
+    name: str
+    surface: str
+    young_kPa: float = Field(gt=0, le=1e6)
+    poisson: float = Field(ge=0, le=0.4999)
+    density: float = Field(DENSITY_KG_M3, ge=100, le=20000)
+
+
 class CaseMaterial(CaseSection):
-    """Material of the tissue; not every model needs all of it."""
+    """Material of the tissue outside the parts; not every model needs all of it."""
 
     young_kPa: float | None = Field(None, gt=0, le=1e6)
     poisson: float | None = Field(None, ge=0, lt=0.5)
     density: float | None = Field(None, ge=100, le=20000)
+    part: tuple[CasePart, ...] = ()
 
 
 class CaseContact(CaseSection):
@@ -106,11 +121,24 @@ class CaseProbe(CaseSection):
         return self
 
 
+class CaseHold(CaseSection):
+    """A ball in which the tissue stays at its stress-free place."""
+
+    shape: Literal["sphere"]
+    centre: Vector3
+    radius_mm: float = Field(gt=0, le=500)
+
+
 class CaseStage(CaseSection):
-    """Centre of the probe and its travel since stage 0; with its own rotation if it has turned."""
+    """Centre of the probe and its travel since stage 0; with its own rotation if it has turned.
+
+    ``slide_mm``: how far it moved sideways from the line of the press. ``probe_force_N``: the probe's force on the tissue.
+    """
 
     index: int
     indentation_mm: float = Field(ge=0, le=500)
+    slide_mm: float | None = None
+    probe_force_N: Vector3 | None = None
     position: Vector3
     rotation: Rotation | None = None
 
@@ -126,6 +154,7 @@ class CaseFile(CaseSection):
     contact: CaseContact = CaseContact()
     files: Files = Files()
     probe: CaseProbe
+    hold: tuple[CaseHold, ...] = ()
     stage: tuple[CaseStage, ...] = Field(min_length=2)
 
     @model_validator(mode="after")
@@ -138,7 +167,8 @@ class CaseFile(CaseSection):
                 raise ValueError(
                     f"stage 0 has indentation_mm {stage.indentation_mm:g}: expected 0, just touching"
                 )
-            if place > 0 and stage.indentation_mm <= self.stage[place - 1].indentation_mm:
+            slides = stage.slide_mm is not None
+            if place > 0 and not slides and stage.indentation_mm <= self.stage[place - 1].indentation_mm:
                 raise ValueError(
                     f"stage {place} has indentation_mm {stage.indentation_mm:g}: expected more than "
                     f"{self.stage[place - 1].indentation_mm:g} of the stage before"
@@ -158,7 +188,8 @@ class BeadCase:
 
     ``beads`` (n, 3) stress-free, ``measured`` (stages, n, 3), ``poses`` (stages, 4, 4) world from probe,
     ``indentation_mm`` (stages,), ``press_direction`` (3,) unit, ``size_mm`` (3,), ``gravity`` (3,) in mm/s^2. Unknown
-    material values are None. ``digest`` is a hash of all files.
+    material values are None. ``parts`` have their own material; tissue in the regions ``fixed`` does not move. ``probe_force_n``
+    (stages, 3) [N] is the tissue's force on the probe, NaN where unknown. ``digest`` is a hash of all files.
     """
 
     name: str
@@ -177,6 +208,10 @@ class BeadCase:
     young_kpa: float | None
     poisson: float | None
     density_kg_m3: float | None
+    part_names: tuple[str, ...]
+    parts: tuple[Part, ...]
+    fixed: tuple[FixedRegion, ...]
+    probe_force_n: np.ndarray
 
 
 def load_case(folder: Path) -> BeadCase:
@@ -189,7 +224,8 @@ def load_case(folder: Path) -> BeadCase:
     poses = np.tile(np.eye(4), (len(file.stage), 1, 1))
     poses[:, :3, :3] = [stage.rotation or probe.rotation for stage in file.stage]
     poses[:, :3, 3] = [stage.position for stage in file.stage]
-    contents = [folder / name for name in ("case.toml", files.kidney, files.support, files.beads)]
+    names = ("case.toml", files.kidney, files.support, files.beads, *(part.surface for part in material.part))
+    contents = [folder / name for name in names]
     return BeadCase(
         name=file.name or folder.resolve().name,
         digest=hashlib.sha256(b"".join(path.read_bytes() for path in contents)).hexdigest(),
@@ -207,7 +243,15 @@ def load_case(folder: Path) -> BeadCase:
         young_kpa=material.young_kPa,
         poisson=material.poisson,
         density_kg_m3=material.density,
+        part_names=tuple(part.name for part in material.part),
+        parts=tuple(_part(folder, part) for part in material.part),
+        fixed=tuple(FixedRegion(np.array(hold.centre), hold.radius_mm) for hold in file.hold),
+        probe_force_n=-np.array([stage.probe_force_N or (np.nan,) * 3 for stage in file.stage]),
     )
+
+
+def _part(folder: Path, part: CasePart) -> Part:
+    return Part(_surface(folder, part.surface), Material(part.young_kPa, part.poisson, part.density / 1000))
 
 
 def _read_file(folder: Path) -> CaseFile:

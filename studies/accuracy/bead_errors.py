@@ -12,8 +12,12 @@ from studies.reference.smooth_obstacles import RoundedBox
 from studies.study_results import text_table
 
 DISTANCE_BANDS = 4
+# Shares of smaller forces say nothing.
+LEAST_FORCE_N = 0.05
 HEADERS = ("stage", "indentation, mm", "mean", "% of travel", "SD", "max", "unmoved", "ratio", "r(distance)")
 FORMATS = ("", ".2f", ".2f", ".0f", *[".2f"] * 5)
+FORCE_HEADERS = ("stage", "force on the probe x, y, z, N", "measured", "difference, N", "%")
+FORCE_FORMATS = ("", "", "", ".3f", ".1f")
 
 
 def bead_errors(case: BeadCase, beads: np.ndarray) -> np.ndarray:
@@ -53,6 +57,24 @@ def stage_figures(
     ]
 
 
+def force_figures(case: BeadCase, run: BeadRun) -> list[dict[str, Any]]:
+    """Each stage's force of the tissue on the probe, simulated and measured, x, y, z [N], None where unknown; and the centroids of the
+    parts [mm].
+    """
+    return [
+        dict(
+            probe_force_N=_vector(found),
+            measured_probe_force_N=_vector(measured),
+            part_centroids_mm=[_vector(part) for part in parts],
+        )
+        for found, measured, parts in zip(run.force_n, case.probe_force_n, run.parts_mm, strict=True)
+    ]
+
+
+def _vector(values: np.ndarray) -> list[float] | None:
+    return None if np.isnan(values).any() else [round(v, 4) + 0.0 for v in values.tolist()]
+
+
 def correlation(first: np.ndarray, second: np.ndarray) -> float | None:
     """Pearson's correlation of two arrays of one shape; None where one of them is the same everywhere."""
     a, b = first.ravel() - first.mean(), second.ravel() - second.mean()
@@ -71,7 +93,15 @@ def report(experiment: BeadExperiment, setup: Setup, run: BeadRun) -> dict:
         substeps=setup.substeps,
         iterations=setup.iterations,
         time_step_s=setup.solver.time_step_s,
-        stages=stage_figures(case.indentation_mm, errors, null_errors(case)),
+        parts=list(case.part_names),
+        stages=[
+            figures | forces
+            for figures, forces in zip(
+                stage_figures(case.indentation_mm, errors, null_errors(case)),
+                force_figures(case, run),
+                strict=True,
+            )
+        ],
         overall_mean_mm=rounded(errors.mean()),
         ms_per_step=spread(run.step_ms),
         distance_correlation=correlation(probe_distances(case)[1:], errors[1:]),
@@ -114,6 +144,20 @@ def table(case: BeadCase, beads: np.ndarray) -> str:
     title = f"Error by distance from the probe, stages pressed; correlation {shown}:"
     bands = _bands(distances[1:].ravel(), errors[1:].ravel())
     return "\n".join([text_table(HEADERS, rows, FORMATS), "", title, *bands])
+
+
+def force_table(case: BeadCase, force_n: np.ndarray) -> str:
+    """The tissue's force on the probe (stages, 3) [N] beside the measured one."""
+    rows: list[list[Any]] = []
+    for stage, (found, measured) in enumerate(zip(force_n, case.probe_force_n, strict=True)):
+        apart, size = np.linalg.norm(found - measured), np.linalg.norm(measured)
+        share = 100 * apart / size if size > LEAST_FORCE_N else None
+        rows.append([stage, _in_words(found), _in_words(measured), None if np.isnan(apart) else apart, share])
+    return text_table(FORCE_HEADERS, rows, FORCE_FORMATS)
+
+
+def _in_words(force_n: np.ndarray) -> str:
+    return "not known" if np.isnan(force_n).any() else " ".join(f"{v + 0.0:6.3f}" for v in force_n.round(3))
 
 
 def _bands(distances: np.ndarray, errors: np.ndarray) -> list[str]:

@@ -17,28 +17,29 @@ from sim.shape_matching import fill_organ
 from sim.shapes import ConvexTool
 from sim.skinning import Skin
 from sim.solver import StepSettings
-from studies.accuracy.bead_case import BeadCase
-from studies.harness import positions_of, restart
+from sim.surface_contact import SurfaceContacts
+from studies.accuracy.bead_case import DENSITY_KG_M3, BeadCase
+from studies.harness import positions_of
 from ultrasound.probe_manipulator import poses_between
 
 # Share of a stage's steps in which the probe moves; in the others the tissue comes to rest, as before the scan.
 MOVING = 2 / 3
 # Distance of the probe, back along the press, while the organ settles.
 AWAY_MM = 60.0
-# The paper's, where a case has none. It scales all masses equally.
-DENSITY_KG_M3 = 1050.0
 
 
 @dataclass
 class BeadRun:
-    """One run: ``beads`` (stages, n, 3) [mm] at the end of each stage, and ``arriving`` when the probe has just arrived;
-    the time of each step in the stages, and whether all positions are finite.
+    """One run: ``beads`` (stages, n, 3) [mm] at the end of each stage, and ``arriving`` when the probe has just arrived; the tissue's
+    force on the probe ``force_n`` (stages, 3) [N], NaN for a model that has none, and the centroids ``parts_mm`` (stages, parts, 3) of the parts; the time of each step in the stages, and whether all positions are finite.
     """
 
     beads: np.ndarray
     step_ms: list[float] = field(default_factory=list)
     finite: bool = True
     arriving: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    force_n: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    parts_mm: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
 
 
 class BeadExperiment:
@@ -54,8 +55,13 @@ class BeadExperiment:
         tool = ConvexTool.cuboid(case.size_mm, case.edge_radius_mm)
         shapes = [static_shape(translated(case.support, -self.origin), tissue), tool]
         contact = Contact(shape_friction=case.friction)
-        self.solver = build_solver(rest or _organ(case), tissue, shapes, tool, contact)
+        parts = [replace(part, surface=translated(part.surface, -self.origin)) for part in case.parts]
+        fixed = [replace(region, at_mm=region.at_mm - self.origin) for region in case.fixed]
+        self.solver = build_solver(
+            rest or _organ(case), tissue, shapes, tool, contact, fixed=fixed, parts=parts
+        )
         self.body, self.model = self.solver.body, self.solver.model
+        self.parts = [(Skin(self.model, part.surface.vertices), part.surface.faces) for part in parts]
         self.beads = Skin(self.model, case.beads - self.origin)
 
     def run(self, setup: Setup) -> BeadRun:
@@ -66,7 +72,9 @@ class BeadExperiment:
         """
         step = self.prepare(setup)
         pose = self._away()
-        run = BeadRun(np.zeros_like(self.case.measured), arriving=np.zeros_like(self.case.measured))
+        nothing = np.zeros_like(self.case.measured)
+        run = BeadRun(nothing, arriving=nothing.copy(), force_n=np.full((len(nothing), 3), np.nan))
+        run.parts_mm = np.zeros((len(nothing), len(self.case.parts), 3))
         moving = max(1, round(MOVING * setup.stage_steps))
         for stage, goal in enumerate(self.case.poses):
             path = poses_between(pose, self.relative(goal), moving)
@@ -77,13 +85,16 @@ class BeadExperiment:
                     run.arriving[stage] = self._bead_positions()
             pose = path[-1]
             run.beads[stage] = self._bead_positions()
+            run.parts_mm[stage] = self._part_centroids()
+            if isinstance(self.model.contacts, SurfaceContacts):
+                run.force_n[stage] = self.model.contacts.wrench(self.solver.tool, pose[:3, 3])[:3]
             run.finite &= bool(np.isfinite(positions_of(self.solver)).all())
         run.finite &= bool(np.isfinite(run.beads).all())
         return run
 
     def prepare(self, setup: Setup) -> StepSettings:
         """Warm up from the stress-free shape, with the probe away; return the settings of its steps."""
-        restart(self.solver)
+        self.solver.restart()
         x, y, z = self.case.gravity.tolist()
         step = replace(step_settings(tissue_of(self.case, setup), setup.solver), gravity=(x, y, z))
         pose = self._away()
@@ -94,6 +105,16 @@ class BeadExperiment:
     def _bead_positions(self) -> np.ndarray:
         self.beads.update()
         return array_of(self.beads.vertices) + self.origin
+
+    def _part_centroids(self) -> np.ndarray:
+        """Present centroids (parts, 3) [mm] of the parts' volumes."""
+        found = np.zeros((len(self.parts), 3))
+        for centroid, (skin, faces) in zip(found, self.parts, strict=True):
+            skin.update()
+            corner = array_of(skin.vertices)[faces].astype(float)
+            six_volumes = np.einsum("fi,fi->f", corner[:, 0], np.cross(corner[:, 1], corner[:, 2]))
+            centroid[:] = six_volumes @ corner.sum(axis=1) / 4 / six_volumes.sum() + self.origin
+        return found
 
     def relative(self, pose: np.ndarray) -> np.ndarray:
         """A pose (4, 4) of the case's frame, in that of the device."""

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from sim.body import Body
 from sim.fields import array_of
 from sim.lattice import fill_block
+from sim.material import Material
 from sim.neo_hookean import NeoHookean
 from sim.solver import Solver, StepSettings
 from studies.beam.motion_capture import BeamError
@@ -83,8 +84,8 @@ class Cantilever:
         load = np.bincount(node.ravel(), load_g / len(line) * share.ravel(), len(lattice.nodes))
         fixed = lattice.nodes[:, 2] < 1e-6 * size[2]
         self.body = Body(lattice.nodes)
-        values = (material.young_kpa, material.poisson, material.density_g_cm3)
-        self.model = NeoHookean(self.body, lattice, None, *values, fixed, load_g=load)
+        tissue = Material(material.young_kpa, material.poisson, material.density_g_cm3)
+        self.model = NeoHookean(self.body, lattice, None, tissue, fixed=fixed, load_g=load)
         self.solver = Solver(self.model)
 
     def displacement(self) -> np.ndarray:

@@ -29,7 +29,7 @@ from sim.device import start
 from sim.neo_hookean import LATTICE_SETTINGS
 from sim.shapes import Plane
 from sim.solver import Solver, StepSettings
-from studies.harness import build, memory_mb, memory_of_process_mb, restart
+from studies.harness import build, memory_mb, memory_of_process_mb
 from studies.performance.lower_bound import compare
 from studies.performance.step_phases import AFTER, BEFORE, CONTACTS, IN_ITERATION, Phases, without_calls
 from studies.study_options import open_study, out_option, scene_argument
@@ -128,7 +128,7 @@ def _setups(quick: bool) -> list[Setup]:
 
 def press(rehearsal: Rehearsal, warm_up_steps: int, share: float) -> Iterator[np.ndarray]:
     """Poses of each step, from the stress-free shape: the paper's warm-up, then the scripted press or a share of it."""
-    restart(rehearsal.solver)
+    rehearsal.solver.restart()
     substeps, script = rehearsal.settings.substeps, rehearsal.script_length_s()
     away = advanced(rehearsal.manipulator.home, -AWAY_MM)
     yield from repeat(poses_between(away, away, substeps), warm_up_steps)

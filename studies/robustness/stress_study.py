@@ -199,7 +199,7 @@ def _set_material(specimen: Specimen, heaviest: float, material: Mapping[str, fl
         mass = specimen.mass.copy()
         mass[len(mass) // 2] *= heaviest
         fill((specimen.model.mass, mass))
-        specimen.model.set_material(**{"young_kpa": YOUNG_KPA, "poisson": POISSON, **material})
+        specimen.model.set_material(material.get("young_kpa", YOUNG_KPA), material.get("poisson", POISSON))
 
 
 def _release(specimen: Specimen, extremes: Extremes) -> None:
@@ -219,7 +219,7 @@ def _free_shape_error(specimen: Specimen) -> float:
     """
     state = specimen.solver.snapshot()
     up = (state.body.position + LIFT_MM * specimen.up).astype(np.float32)
-    specimen.solver.restore(SolverState(BodyState(up, np.zeros_like(up)), state.contacts))
+    specimen.solver.restore(SolverState(BodyState(up, np.zeros_like(up)), state.history))
     specimen.solver.contacts.reset()
     weightless = replace(specimen.settings, gravity=(0.0, 0.0, 0.0))
     error = np.inf

@@ -239,7 +239,7 @@ def test_a_state_of_another_body_is_refused(tmp_path):
     log = read_log(tmp_path / "session")
     log.header.begins = log.states[20]
     other = Numbers()
-    other.settled.solver.contacts["plane"] = np.zeros((3, 4), np.float32)
+    other.settled.solver.history["plane"] = np.zeros((3, 4), np.float32)
     with pytest.raises(SessionError, match="another body"):
         Replay(other, log)
 

@@ -55,7 +55,7 @@ class Numbers:
 
     def restore(self, state: RehearsalState) -> None:
         self.position, self.velocity = state.solver.body.position, state.solver.body.velocity
-        self.contacts, self.watch = state.solver.contacts, state.divergence
+        self.contacts, self.watch = state.solver.history, state.divergence
         self.pose, self.steps, self.manipulator.state = state.pose, state.steps, state.manipulator
 
     def advance(self, pose: np.ndarray) -> None:

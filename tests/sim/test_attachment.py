@@ -54,9 +54,9 @@ def test_without_a_radius_no_node_is_fixed(device):
 
 
 def test_a_region_with_no_or_all_nodes_is_refused(device):
-    with pytest.raises(SamplingError, match="fixes none of the organ"):
+    with pytest.raises(SamplingError, match="holds none of the organ"):
         hanging(1.0, at=(100.0, 0.0, 0.0))
-    with pytest.raises(SamplingError, match="fixes all of the organ"):
+    with pytest.raises(SamplingError, match="holds all of the organ"):
         hanging(100.0)
     with pytest.raises(ValueError, match=r"give attachment\.at_mm"):
         Attachment(radius_mm=5.0)
