@@ -403,10 +403,8 @@ def captions(probe: Probe, settings: ScannerSettings) -> tuple[str, str, str]:
 def readouts(rehearsal: Rehearsal, tally: Tally) -> dict[str, str]:
     """Name -> figure with its unit."""
     size, count = next(iter(rehearsal.model.counts().items()))
-    error = tally.expected_error_mm(rehearsal)
     return {
         "step": f"{np.median(tally.step_ms[-30:]):.1f} ms" if tally.step_ms else "",
-        "error": "not known" if error is None else f"± {error:.2f} mm",
         "image": f"{np.median(tally.slice_ms[-30:]):.1f} ms",
         size: f"{count}",
         "indentation": f"{max(rehearsal.indentation_mm(), 0.0):.1f} mm",

@@ -267,7 +267,7 @@ def parts_of(scene: Scene, anatomy: LoadedAnatomy, origin: np.ndarray) -> list[P
 
 def material_of(name: str, given: PartMaterial) -> Material:
     """The material of a part: what is given, and what is typical of it."""
-    typical = mechanical_properties()[name]
+    typical = mechanical_properties().parts[name]
     return Material(
         *(
             getattr(typical, key)[1] if getattr(given, key) is None else getattr(given, key)

@@ -71,7 +71,9 @@ class Rehearsal(PressedOrgan):
         progress("Building the model: tissue and contacts")
         super().__init__(scene, anatomy, probe)
         self.tumour = anatomy.tumour and translated(anatomy.tumour, -self.origin)
-        self.parts = {tissue: translated(part, -self.origin) for tissue, part in anatomy.parts.items()}
+        # The sinus surrounds the other parts, and would hide them.
+        drawn = {tissue: part for tissue, part in anatomy.parts.items() if tissue != "sinus"}
+        self.parts = {tissue: translated(part, -self.origin) for tissue, part in drawn.items()}
         meshes = [shape for shape in anatomy.shapes if isinstance(shape, trimesh.Trimesh)]
         self.supports = [_shrunk(translated(mesh, -self.origin), SUPPORT_SUNK_MM) for mesh in meshes]
         progress("Building the model: surfaces")

@@ -5,7 +5,7 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AfterValidator, Field, TypeAdapter
+from pydantic import AfterValidator
 
 from scenes.section import Section
 
@@ -21,17 +21,25 @@ def _ascending(values: tuple[float, float, float]) -> tuple[float, float, float]
 Range = Annotated[tuple[float, float, float], AfterValidator(_ascending)]
 
 
-class MechanicalProperties(Section):
-    """Low, typical and high values of a part."""
+class PartProperties(Section):
+    """Young's modulus [kPa], Poisson's ratio and density [g/cm^3] of a part."""
 
     young_kpa: Range
-    poisson: Annotated[Range, Field(min_length=3)]
+    poisson: Range
     density_g_cm3: Range
 
 
+class MechanicalProperties(Section):
+    """Low, typical and high values: stiffness of capsule and pedicle [N/mm], of perirenal fat [kPa/mm], friction, and the parts' own."""
+
+    capsule_n_mm: Range
+    pedicle_n_mm: Range
+    fat_kpa_mm: Range
+    friction: Range
+    parts: dict[str, PartProperties]
+
+
 @cache
-def mechanical_properties() -> dict[str, MechanicalProperties]:
-    """The table, by part."""
-    return TypeAdapter(dict[str, MechanicalProperties]).validate_python(
-        tomllib.loads(TABLE.read_text("utf-8"))
-    )
+def mechanical_properties() -> MechanicalProperties:
+    """The table."""
+    return MechanicalProperties.model_validate(tomllib.loads(TABLE.read_text("utf-8")))

@@ -125,13 +125,7 @@ def _arrays_of_cells(
     """All of a surface's lattice but ``cell_mm``. Raises SamplingError."""
     low, size = _grid_around(surface, cell_mm)
     indices = np.indices(tuple(size.tolist())).reshape(3, -1).T
-    indices, filled, volume = _filled(surface, low, cell_mm, indices)
-    if abs(volume / surface.volume - 1) > MOST_VOLUME_ERROR:
-        raise SamplingError(
-            f"cells of {cell_mm:g} mm fill {100 * volume / surface.volume:.0f} % of the organ's "
-            f"{surface.volume / 1000:.3g} ml: choose smaller ones"
-        )
-    lattice = _assemble(low, cell_mm, size, indices, filled, parts)
+    lattice = _assemble(low, cell_mm, size, *_filled(surface, low, cell_mm, indices), parts)
     return tuple(getattr(lattice, field.name) for field in fields(Lattice)[1:])
 
 
@@ -141,20 +135,19 @@ def _grid_around(surface: trimesh.Trimesh, cell_mm: float) -> tuple[np.ndarray, 
     return low, np.ceil((surface.bounds[1] - low) / cell_mm).astype(int)
 
 
-def fill_block(counts: tuple[int, int, int], cell_mm: float) -> Lattice:
-    """The lattice of a block with a corner at the origin and ``counts`` cells along each axis."""
+def fill_block(
+    counts: tuple[int, int, int], cell_mm: float, parts: Sequence[trimesh.Trimesh] = ()
+) -> Lattice:
+    """The lattice of a block with a corner at the origin and ``counts`` cells along each axis; parts as in ``fill_with_cells``."""
     indices = np.indices(counts).reshape(3, -1).T
     filled = np.ones((len(indices), len(SAMPLE_POINTS)))
-    return _assemble(np.zeros(3), cell_mm, np.array(counts), indices, filled)
+    return _assemble(np.zeros(3), cell_mm, np.array(counts), indices, filled, parts)
 
 
 def _filled(
     surface: trimesh.Trimesh, low: np.ndarray, cell_mm: float, indices: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Those grid positions (m, 3) whose cells contain tissue, and the filled fraction (m, s) around each integration point.
-
-    Also the volume [mm^3] that linear interpolation of the distance found before it was corrected.
-    """
+) -> tuple[np.ndarray, np.ndarray]:
+    """Grid positions (m, 3) of the cells that contain tissue, and the filled fraction (m, s) around each integration point."""
     centre = signed_distance(surface.vertices, surface.faces, low + cell_mm * (indices + 0.5))[0]
     reach = cell_mm * np.sqrt(3) / 2
     indices, centre = indices[centre < reach], centre[centre < reach]
@@ -166,13 +159,18 @@ def _filled(
     known = signed_distance(surface.vertices, surface.faces, low + cell_mm / 2 * unique)[0]
     distance = known[back].reshape(-1, 27) @ _from_halves(SAMPLE_POINTS).T
     # Linear interpolation cuts off convex surfaces: offset the surface outwards until the volume is right.
-    offset, volumes = 0.0, []
-    for _ in range(VOLUME_ITERATIONS):
+    offset = 0.0
+    for iteration in range(VOLUME_ITERATIONS):
         filled[cut] = np.clip(0.5 - (distance - offset) / (cell_mm / SAMPLES), 0, 1)
-        volumes.append(cell_mm**3 * filled.mean(axis=1).sum())
-        offset += (surface.volume - volumes[-1]) / surface.area
+        volume = cell_mm**3 * filled.mean(axis=1).sum()
+        if iteration == 0 and abs(volume / surface.volume - 1) > MOST_VOLUME_ERROR:
+            raise SamplingError(
+                f"cells of {cell_mm:g} mm fill {100 * volume / surface.volume:.0f} % of the organ's "
+                f"{surface.volume / 1000:.3g} ml: choose smaller ones"
+            )
+        offset += (surface.volume - volume) / surface.area
     has_tissue = filled.sum(axis=1) > 0
-    return indices[has_tissue], filled[has_tissue], volumes[0]
+    return indices[has_tissue], filled[has_tissue]
 
 
 def _shares(
@@ -181,13 +179,15 @@ def _shares(
     """Volume shares (m, parts) of the parts in the tissue of each cell."""
     shares = np.zeros((*filled.shape, len(parts)))
     for number, part in enumerate(parts):
-        inside, fraction, _ = _filled(part, low, cell_mm, indices)
-        where = _unique_rows(np.concatenate([indices, inside]))[1]
-        row = np.empty(where.max() + 1, int)
-        row[where[: len(indices)]] = np.arange(len(indices))
-        cell = row[where[len(indices) :]]
-        shares[cell] *= 1 - fraction[..., None]
-        shares[cell, :, number] = fraction
+        centre = signed_distance(part.vertices, part.faces, low + cell_mm * (indices + 0.5))[0]
+        fraction = np.repeat((centre < 0)[:, None].astype(float), len(SAMPLE_POINTS), axis=1)
+        cut = np.abs(centre) < cell_mm * np.sqrt(3) / 2
+        # The distance at each sample: parts may be thin, or extend beyond the organ, so that no volume could correct it.
+        samples = low + cell_mm * (indices[cut][:, None] + SAMPLE_POINTS)
+        distance = signed_distance(part.vertices, part.faces, samples.reshape(-1, 3))[0]
+        fraction[cut] = np.clip(0.5 - distance.reshape(-1, len(SAMPLE_POINTS)) / (cell_mm / SAMPLES), 0, 1)
+        shares *= 1 - fraction[..., None]
+        shares[:, :, number] = fraction
     return np.einsum("ms,msp->mp", filled, shares) / filled.sum(axis=1, keepdims=True)
 
 

@@ -16,8 +16,8 @@ from version import VERSION
 NOT_EVERYWHERE = dict(radius_mm=None, stiffness=None, clusters=0, memberships=0)
 
 
-def expected_error_of(rehearsal: Rehearsal) -> float | None:
-    """Mean bead error [mm] that ``study trade`` measured with similar settings; None if there are none."""
+def numerical_error_of(rehearsal: Rehearsal) -> float | None:
+    """Mean bead error [mm] on other kidneys, of known material, that ``study trade`` measured with similar settings; None if there are none."""
     step = rehearsal.settings
     changed = {name: getattr(step, name) for name in STEP}
     setup = Setup(rehearsal.scene.tissue, rehearsal.scene.solver.model_copy(update=changed))
@@ -37,14 +37,6 @@ class Tally:
     max_penetration_mm: float = 0.0
     indentation_max_mm: float = 0.0
     force_max_n: float = 0.0
-    _expected: dict[tuple, float | None] = field(default_factory=dict, init=False)
-
-    def expected_error_mm(self, rehearsal: Rehearsal) -> float | None:
-        """``expected_error_of``, computed once for each choice of settings: the window asks in each frame."""
-        settings = tuple(getattr(rehearsal.settings, name) for name in STEP)
-        if settings not in self._expected:
-            self._expected[settings] = expected_error_of(rehearsal)
-        return self._expected[settings]
 
     def watch(self, rehearsal: Rehearsal) -> None:
         """Add the state after a step; the surfaces must be up to date."""
@@ -84,7 +76,7 @@ class Tally:
             ms_per_slice=_times(self.slice_ms),
             build_s=round(self.build_s, 3),
             finite=self.finite,
-            expected_error_mm=expected_error_of(rehearsal),
+            numerical_error_mm=numerical_error_of(rehearsal),
             fallbacks=self.fallbacks,
             volume_ratio_min=round(self.volume_ratio_min, 6) if self.finite else None,
             max_penetration_mm=round(self.max_penetration_mm, 6) if self.finite else None,
@@ -112,7 +104,7 @@ def summary(report: dict) -> str:
             f"speed     {times} (medians of {report['steps']}) on {report['arch']}; built in {report['build_s']:.1f} s",
             f"probe     {report['probe']}; {shown if measured['image'] else 'no images'}",
             f"press     {_press(report)}",
-            f"error     {_error(report['expected_error_mm'])}",
+            f"numerical {_error(report['numerical_error_mm'])}",
             *(f"WARNING   {text}" for text in report["fallbacks"]),
         ]
     )
@@ -133,5 +125,5 @@ def _force(most_n: float | None) -> str:
 
 def _error(expected_mm: float | None) -> str:
     if expected_mm is None:
-        return "not known: study trade measured no similar settings"
-    return f"{expected_mm:.2f} mm expected: mean bead error with similar settings (study trade)"
+        return "error not known: study trade measured no similar settings"
+    return f"error {expected_mm:.2f} mm: mean bead error with similar settings on other kidneys, of known material (study trade)"

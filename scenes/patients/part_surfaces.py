@@ -1,4 +1,4 @@
-"""Surfaces of an organ and of its parts: tumours, cysts, vessels, collecting system."""
+"""Surfaces of an organ and of its parts: tumours, cysts, vessels, collecting system, sinus."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
@@ -30,7 +30,13 @@ SMOOTH_AREA = 2 / 3
 # Surfaces of less area than this are made sooner than a process starts.
 PROCESSES_FROM_MM2 = 5000.0
 # Parts with a surface: tissue -> file name.
-PARTS = {"tumour": "tumour", "cyst": "cyst", "urine": "collecting-system", "vessel": "vessels"}
+PARTS = {
+    "tumour": "tumour",
+    "cyst": "cyst",
+    "urine": "collecting-system",
+    "vessel": "vessels",
+    "sinus": "sinus",
+}
 # Tissue -> grid and mask (z, y, x).
 PartMasks: TypeAlias = dict[str, tuple[VoxelGrid, np.ndarray]]
 

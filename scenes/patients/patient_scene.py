@@ -4,6 +4,7 @@ import numpy as np
 import SimpleITK as sitk
 import trimesh
 
+from scenes.mechanical_tissues import mechanical_properties
 from scenes.patients.organ_selection import LESIONS, PARENCHYMA
 from scenes.patients.part_surfaces import PARTS
 from scenes.patients.patient_import import Patient
@@ -15,6 +16,8 @@ LEAST_WINDOW_HU = 310.0  # up to 200 HU at least, or an unenhanced kidney is whi
 
 # The hilum is the mean of the vertices within this distance of the deepest one.
 FLOOR_MM = 8.0
+# The pedicle holds the tissue within this distance of the hilum's centre.
+PEDICLE_RADIUS_MM = 15.0
 # Least medial component of the normal at the hilum.
 LEAST_MEDIAL = 0.3
 
@@ -54,6 +57,10 @@ def patient_scene(patient: Patient) -> Scene:
                 tissues={str(code): tissue for code, tissue in patient.tissues.items()},
             )
         ),
-        attachment=Attachment(at_mm=hilum(patient.organ, patient.side)),
+        attachment=Attachment(
+            at_mm=hilum(patient.organ, patient.side),
+            radius_mm=PEDICLE_RADIUS_MM,
+            stiffness_n_mm=mechanical_properties().pedicle_n_mm[1],
+        ),
         shape=(MeshShape(kind="mesh", file="support.stl"),),
     )

@@ -15,7 +15,7 @@ from rehearsal.configuration import PRESETS, Setup
 from rehearsal.rehearsal import Rehearsal, RehearsalState
 from rehearsal.stopwatch import timed
 from scenes.anatomy import LoadedAnatomy
-from scenes.scene import PAPER, Scene
+from scenes.scene import EMBEDDED, Scene
 from studies.harness import build, distances_after_fit, memory_of_process_mb, positions_of
 from studies.study_options import open_study, out_option, scene_argument
 from studies.study_results import finish_axes, table_of, write_results
@@ -33,7 +33,7 @@ AWAY_MM = 100.0
 REPLAYED_MINUTES = 2
 SHOWN = {
     "shape_mm": "shape: mean distance from the first rest,\nafter a rigid fit (mm)",
-    "moved_mm": "position: mean distance from the first rest (mm);\nfriction alone holds the pushed kidney",
+    "moved_mm": "position: mean distance from the first rest (mm);\nheld by its pedicle, in shape matching by friction alone",
     "memory_mb": "memory of the process since the first minute (MB)",
     "ms_median": "time of a step (ms)",
 }
@@ -51,7 +51,7 @@ COLUMNS = {
 
 
 @click.command()
-@scene_argument(PAPER)
+@scene_argument(EMBEDDED)
 @out_option
 @click.option(
     "--minutes", type=WholeRange(1, 6000), default=HOUR, show_default=True, help="Simulated minutes."

@@ -1,5 +1,6 @@
 """The bodies of the stress test: each at rest, with its divergence check, its transducer and its surface."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -88,7 +89,7 @@ class Specimen:
 def prepared(model: str, subject: Subject) -> Specimen:
     """A body on a freshly started device, at rest."""
     if subject.kind == "kidney":
-        return _kidney(model)
+        return _kidney(model, subject)
     start("cpu")
     mesh = _mesh(model, subject)
     tool = ConvexTool.cuboid(TRANSDUCER_MM)
@@ -110,9 +111,10 @@ def prepared(model: str, subject: Subject) -> Specimen:
     return specimen
 
 
-def _kidney(model: str) -> Specimen:
-    scene = load_scene(PAPER)
-    rehearsal = build(scene, load_anatomy(scene, PAPER.parent), PRESETS[model]["fast"], "cpu")
+def _kidney(model: str, subject: Subject) -> Specimen:
+    scene, setup = load_scene(PAPER), PRESETS[model]["fast"]
+    setup = setup.but(**json.loads(subject.tissue or "{}"))
+    rehearsal = build(scene, load_anatomy(scene, PAPER.parent), setup, "cpu")
     # Recovery is measured from where the tissue has stopped moving.
     away = advanced(rehearsal.manipulator.home, -AWAY_MM)
     for _ in range(SETTLE_STEPS):

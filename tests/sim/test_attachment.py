@@ -8,7 +8,7 @@ from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.patients.patient_scene import hilum
 from scenes.phantom.embedded_patient import phantom_folder
-from scenes.scene import PAPER, AnatomyFiles, Attachment, Scene, SceneError, load_scene, with_options
+from scenes.scene import PAPER, AnatomyFiles, Attachment, Scene, load_scene, with_options
 from sim.fields import array_of
 from sim.sampling import SamplingError
 
@@ -60,9 +60,61 @@ def test_a_region_with_no_or_all_nodes_is_refused(device):
         hanging(100.0)
     with pytest.raises(ValueError, match=r"give attachment\.at_mm"):
         Attachment(radius_mm=5.0)
-    scene = load_scene(PAPER).model_copy(update={"attachment": Attachment(at_mm=AT, radius_mm=5.0)})
-    with pytest.raises(SceneError, match="set --model to neo-hookean"):
-        with_options(scene, {"tissue.model": "shape-matching"})
+    with pytest.raises(ValueError, match=r"give attachment\.radius_mm"):
+        Attachment(stiffness_n_mm=5.0)
+
+
+def test_a_model_that_cannot_be_attached_starts_without_an_attachment():
+    attached = Attachment(at_mm=AT, radius_mm=5.0, fat_kpa_mm=0.3)
+    scene = load_scene(PAPER).model_copy(update={"attachment": attached})
+    assert with_options(scene, {"tissue.cell_mm": 4.0}).attachment == attached
+    assert not with_options(scene, {"tissue.model": "shape-matching"}).attachment.holds
+    with pytest.raises(ValueError, match=r"set tissue\.model to neo-hookean"):
+        Scene.model_validate(scene.model_dump() | {"tissue": {"model": "shape-matching"}})
+
+
+def spring_scene(**attachment) -> Rehearsal:
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=15.0)
+    scene = Scene(
+        anatomy=AnatomyFiles(),
+        attachment=Attachment(**attachment),
+        press={"warm_up_steps": 0, "direction": (0, 0, 1), "target_mm": (0, 0, 0)},
+    )
+    return Rehearsal(with_options(scene, {"tissue.cell_mm": 3.0}), LoadedAnatomy(ball, None, None, ()))
+
+
+def drop_mm(rehearsal: Rehearsal) -> tuple[float, float]:
+    """How far the centre of mass sinks until it rests, by its springs alone, and the weight [N]."""
+    model = rehearsal.model
+    rehearsal.settings.damping = 60.0
+    for _ in range(400):
+        rehearsal.advance(rehearsal.pose)
+    mass = array_of(model.mass)
+    moved = array_of(rehearsal.body.position) - rehearsal.body.rest_points
+    assert np.abs(array_of(rehearsal.body.velocity)).max() < 0.05
+    return float(mass @ moved @ rehearsal.gravity_direction / mass.sum()), 9.81e-3 * float(mass.sum())
+
+
+def test_a_pedicles_tether_stretches_by_the_weight_over_its_stiffness(device):
+    # It reaches all but the farthest tissue, so that the ball neither turns nor deforms by more than a hundredth of the sag.
+    sag, weight_n = drop_mm(spring_scene(at_mm=(0.0, 0.0, 0.0), radius_mm=15.0, stiffness_n_mm=0.05))
+    assert sag == pytest.approx(weight_n / 0.05, rel=0.02) and sag > 2
+
+
+def test_fat_is_a_foundation_on_the_covered_half_of_the_surface(device):
+    # On half a ball of radius R and stiffness k per area: 2 pi R^2 k in all. Its springs are in the covered half, which
+    # turns the ball a little; the centre of mass sinks by the weight over that stiffness.
+    rehearsal = spring_scene(fat_kpa_mm=0.05)
+    stiffness = array_of(rehearsal.model.tether) / 1e6
+    assert stiffness.sum() == pytest.approx(2 * np.pi * 15.0**2 * 0.05e-3, rel=0.03)
+    # The transducer comes along +z, so that the fat is on that side of the ball which faces +z.
+    outside = rehearsal.body.rest_points[stiffness > 0]
+    assert outside[:, 2].min() > -3.0 and outside[:, 2].max() > 14.0
+    assert drop_mm(rehearsal)[0] > 0.5
+
+
+def test_an_organ_that_nothing_holds_has_no_springs(device):
+    assert not spring_scene().model.has_tether
 
 
 def test_the_hilum_is_the_hollow_of_the_medial_side():

@@ -15,7 +15,7 @@ from rehearsal.asked_files import as_asked
 from rehearsal.build_solver import step_settings
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.configuration import PRESETS, Setup, scene_of, setup_of
-from rehearsal.measurements.run_report import expected_error_of
+from rehearsal.measurements.run_report import numerical_error_of
 from rehearsal.speed_accuracy import (
     MEASURED,
     NoPoint,
@@ -103,10 +103,10 @@ def test_a_rehearsals_expected_error_is_of_its_current_iterations():
     passes = {name: getattr(setup, name) for name in ("substeps", "iterations", "relaxation_factor")}
     measured = {point.setup: point.error_mean_mm for point in load_points()}
     rehearsal = SimpleNamespace(scene=scene, settings=SimpleNamespace(**passes))
-    assert expected_error_of(rehearsal) == measured[setup]
+    assert numerical_error_of(rehearsal) == measured[setup]
     for changed in (dict(substeps=40), dict(iterations=900), dict(relaxation_factor=9.0)):
         rehearsal.settings = SimpleNamespace(**(passes | changed))
-        assert expected_error_of(rehearsal) is None
+        assert numerical_error_of(rehearsal) is None
 
 
 def test_a_scene_has_the_settings_of_the_setup_it_was_made_with():
