@@ -33,6 +33,10 @@ class TissueSection(Section):
 
     model: str
 
+    def __hash__(self) -> int:
+        # Lists and tables among the values have no hash of their own.
+        return hash(self.model_dump_json())
+
     @property
     def size_mm(self) -> float:
         """The resolution [mm]."""

@@ -31,11 +31,9 @@ from sim.surface_contact import PENALTY_DEPTH_MM, REACH_MM, SurfaceContacts
 from sim.tissue_model import ModelInputs
 from sim.viscoelasticity import PronyTerm, Relaxation
 
-# Stiffness, in units of the shear modulus, of deformation that varies inside an element. 1 is exact for u_x ~ y z and
-# 1 + nu for bending; at nu = 0.45 their geometric mean is 1.2. Bead errors hardly depend on it (docs/method.md).
-HOURGLASS_STIFFNESS = 1.2
-# That of elements cut by the surface: elements so wide are too stiff around the edges of a probe, which made its force 5 to 8 % too large.
-SURFACE_HOURGLASS_STIFFNESS = 0.2
+# Stiffness, in units of the shear modulus, of deformation that varies inside an element. 1 + nu is exact for bending, 1 for u_x ~ y z,
+# 0.5 for torsion: the least of them, because elements so wide are too stiff around the edges of a probe (docs/method.md).
+HOURGLASS_STIFFNESS = 0.5
 # Below this volume ratio J, ln J is continued by its tangent, so that inverted elements recover.
 LEAST_J = 0.2
 LN2 = 0.6931471805599453
@@ -115,6 +113,7 @@ class NeoHookean:
         tether_n_mm: np.ndarray | None = None,
         capsule: Capsule | None = None,
         prony: Sequence[PronyTerm] = (),
+        hourglass_stiffness: float = HOURGLASS_STIFFNESS,
     ) -> None:
         starts = [int(v) for v in lattice.colour_start]
         self.body = body
@@ -152,6 +151,7 @@ class NeoHookean:
             tether = self.tether if self.has_tether else None
             self.rigid = RigidCorrection(body, self.mass, self.inertial_target, contacts, self.serial, tether)
         self.material = material
+        self.hourglass_stiffness = hourglass_stiffness
         self._fill_stiffness(np.ones(self.count))
         self.set_material(material.young_kpa)
 
@@ -176,14 +176,13 @@ class NeoHookean:
     def _fill_stiffness(self, stiffness: np.ndarray) -> None:
         """Fill the fields that contain the shear modulus (m,) of the elements, in units of ``mu``."""
         cells, lattice = self.lattice.cells, self.lattice
-        hourglass_stiffness = stiffness * hourglass_stiffness_of(lattice)
         gradient = np.zeros((self.body.count, 8, 4))
         hourglass = np.zeros((self.body.count, 27))
         for a in range(8):
             gradient[cells[:, a], a, :3] = lattice.gradient[:, a]
             gradient[cells[:, a], a, 3] = stiffness * lattice.volume
             for b in range(8):
-                weight = hourglass_stiffness * lattice.hourglass[:, a, b]
+                weight = self.hourglass_stiffness * stiffness * lattice.hourglass[:, a, b]
                 hourglass[cells[:, a], place_of(a, b)] += weight
         shear = (gradient[:, :, 3] * (gradient[:, :, :3] ** 2).sum(axis=2)).sum(axis=1)
         fill((self.gradient, gradient), (self.shear, shear), (self.hourglass, hourglass))
@@ -405,12 +404,6 @@ class NeoHookean:
         for k in ti.static(range(frame.n)):
             x += weight[k] * (self.body.position[frame[k]] - self.body.rest[frame[k]])
         return x
-
-
-def hourglass_stiffness_of(lattice: Lattice) -> np.ndarray:
-    """Stiffness (m,) of the hourglass modes of each element, in units of its shear modulus."""
-    is_whole = lattice.volume > (1 - 1e-9) * lattice.cell_mm**3
-    return np.where(is_whole, HOURGLASS_STIFFNESS, SURFACE_HOURGLASS_STIFFNESS)
 
 
 def place_of(a: int, b: int) -> int:

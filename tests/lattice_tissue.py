@@ -7,7 +7,7 @@ from sim.body import Body, BodyState
 from sim.fields import array_of
 from sim.lattice import Lattice, fill_with_cells, surface_points
 from sim.material import Material
-from sim.neo_hookean import LATTICE_SETTINGS, LEAST_J, NeoHookean, hourglass_stiffness_of
+from sim.neo_hookean import HOURGLASS_STIFFNESS, LATTICE_SETTINGS, LEAST_J, NeoHookean
 from sim.shapes import ConvexTool
 from sim.solver import Solver, StepSettings
 from sim.surface_contact import SurfaceContacts
@@ -92,7 +92,7 @@ class Energy:
         log_j = np.where(above, np.log(np.where(above, j, 1.0)), np.log(LEAST_J) + j / LEAST_J - 1)
         density = self.mu / 2 * ((f * f).sum(axis=(1, 2)) - 3) - self.mu * log_j + self.lambda_ / 2 * log_j**2
         inside = np.einsum("mia,mij,mja->m", corner, self.lattice.hourglass, corner)
-        return self.lattice.volume * density + self.mu / 2 * hourglass_stiffness_of(self.lattice) * inside
+        return self.lattice.volume * density + self.mu / 2 * HOURGLASS_STIFFNESS * inside
 
     def slope(self, x: np.ndarray, colour: int, axis: int) -> np.ndarray:
         """dE/dx (n of the colour,) along an axis, by a complex step: exact to rounding."""

@@ -20,10 +20,6 @@ class Measurement:
     """Greatest compression of the tissue in front of the array face (``ultrasound.array_contact.ArrayContact``)."""
     contact_mm2: float
     """Area of the array face in contact."""
-    force_n: float | None = None
-    """Force [N] of the tissue on the probe."""
-    torque_n_mm: float | None = None
-    """Torque [N mm] of that force about the centre of the array face."""
     to_tumour_mm: float | None = None
     """Distance from the array face to the nearest point of the tumour."""
     tumour_depth_mm: float | None = None
@@ -34,6 +30,10 @@ class Measurement:
     """Share of the tumour's outline on the image plane that is in the image, 0 to 1."""
     margin_mm: float | None = None
     """Least width of tissue that the image shows beside and below that outline; negative if it is cut off."""
+    force_n: float | None = None
+    """Force [N] of the tissue on the probe."""
+    torque_n_mm: float | None = None
+    """Torque [N mm] of that force about the centre of the array face."""
 
 
 def measure(rehearsal: Rehearsal, probe: Probe, touches: np.ndarray) -> Measurement:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, field_validator
 from scipy.spatial.transform import Rotation
 
 from errors import UserError
@@ -82,7 +82,7 @@ class Plan(_FileModel):
     speed_mm_s: float = Field(ge=SLOWEST_MM_S, le=FASTEST_MM_S)
     probe: dict[str, Any]
     trocar: Trocar
-    model: dict[str, float | int | str]
+    model: dict[str, JsonValue]
     seed: int
     why: list[str]
     sweeps: list[PlannedSweep] = Field(min_length=1)

@@ -225,6 +225,7 @@ def load_case(folder: Path) -> BeadCase:
     poses[:, :3, :3] = [stage.rotation or probe.rotation for stage in file.stage]
     poses[:, :3, 3] = [stage.position for stage in file.stage]
     names = ("case.toml", files.kidney, files.support, files.beads, *(part.surface for part in material.part))
+    parts = tuple(_part(folder, part) for part in material.part)
     contents = [folder / name for name in names]
     return BeadCase(
         name=file.name or folder.resolve().name,
@@ -244,7 +245,7 @@ def load_case(folder: Path) -> BeadCase:
         poisson=material.poisson,
         density_kg_m3=material.density,
         part_names=tuple(part.name for part in material.part),
-        parts=tuple(_part(folder, part) for part in material.part),
+        parts=parts,
         fixed=tuple(FixedRegion(np.array(hold.centre), hold.radius_mm) for hold in file.hold),
         probe_force_n=-np.array([stage.probe_force_N or (np.nan,) * 3 for stage in file.stage]),
     )

@@ -49,6 +49,9 @@ class Fake:
         controls.settings.depth_mm = 50 + self.steps
         return np.eye(4)
 
+    def wrench(self) -> None:
+        return None
+
     def image_plane(self) -> SimpleNamespace:
         place = np.eye(4)
         place[0, 3] = self.steps

@@ -1,6 +1,7 @@
 """The OpenIGTLink server over real sockets: messages, coordinates, and clients that misbehave."""
 
 import asyncio
+import json
 import socket
 import struct
 import threading
@@ -16,6 +17,7 @@ from conftest import rotation_about
 from pyigtl.messages import CRC64
 
 from rehearsal.tracking.openigtlink_server import (
+    FORCE,
     HAND_TO_REFERENCE,
     IMAGE,
     IMAGE_TO_PROBE,
@@ -41,6 +43,7 @@ class LiveImage(NamedTuple):
     image_to_probe: np.ndarray
     probe_in_patient: np.ndarray
     time_s: float
+    wrench: np.ndarray | None = None
 
 
 def pose() -> np.ndarray:
@@ -199,6 +202,14 @@ def test_no_identifiers_are_sent_and_the_pose_comes_before_the_image(server):
     assert kinds == [b"TRANSFORM", b"TRANSFORM", b"IMAGE"]
 
 
+def test_the_force_on_the_probe_comes_as_a_text_along_the_axes_of_the_picture(server, client):
+    wrench = np.array([1.0, 2.0, -3.0, 10.0, 20.0, -30.0])
+    server.send(*live()._replace(wrench=wrench))
+    text = client.wait_for_message(FORCE, timeout=SOON_S).string
+    # From LPS to RAS the first two axes turn round.
+    assert json.loads(text) == dict(force_N=[-1.0, -2.0, -3.0], torque_N_mm=[-10.0, -20.0, -30.0])
+
+
 def test_sending_packs_nothing_without_a_client(server, monkeypatch):
     packers: list[int] = []
     pack = pyigtl.ImageMessage.pack
@@ -350,13 +361,16 @@ def test_a_pose_that_is_not_rigid_is_refused_with_one_warning(said, matrix):
 def test_the_first_image_of_a_view_is_sent_with_the_current_probe():
     shown: list[LiveImage] = []
     plane, origin = pose(), np.array([10.0, 20.0, 30.0])
-    rehearsal = SimpleNamespace(image_plane=lambda: SimpleNamespace(world_from_plane=plane), origin=origin)
+    wrench = np.array([1.0, 2.0, -3.0, 0.0, 5.0, 6.0])
+    rehearsal = SimpleNamespace(
+        image_plane=lambda: SimpleNamespace(world_from_plane=plane), origin=origin, wrench=lambda: wrench
+    )
     echo, ct = np.full((8, 6), 9, np.uint8), np.zeros((8, 6), np.uint8)
     probe = load_probe("linear").model_copy(update=dict(depth_mm=80.0, transducer_width_mm=30.0))
     send_live(None, rehearsal, SimpleNamespace(images={"B-mode": echo}), probe, 1.5)
     link = SimpleNamespace(send=lambda *live: shown.append(LiveImage(*live)))
     send_live(link, rehearsal, SimpleNamespace(images={"B-mode": echo, "CT": ct}), probe, 1.5)
     (sent,) = shown
-    assert sent.grey is echo and sent.time_s == 1.5
+    assert sent.grey is echo and sent.time_s == 1.5 and sent.wrench is wrench
     assert np.allclose(sent.probe_in_patient[:3, 3], plane[:3, 3] + origin)
     assert np.allclose(np.diag(sent.image_to_probe), [30 / 6, 80 / 8, 1, 1])

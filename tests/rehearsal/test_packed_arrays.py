@@ -82,8 +82,9 @@ def test_a_course_counts_presses_ways_and_time_over_the_limit():
     pose = np.eye(4)
     # Squeezed over 1 mm is a press, until it is less than 0.5 mm.
     for compression_mm in (0.0, 1.0, 1.1, 0.6, 1.2, 0.5, 0.9, 1.5, 9.0, 8.0, 8.5):
-        course.add(pose, compression_mm, STEP_S)
+        course.add(pose, compression_mm, STEP_S, compression_mm / 4)
     assert (course.presses, course.compression_max_mm, course.over_warning_s) == (2, 9.0, 2 * STEP_S)
+    assert course.force_max_n == 9.0 / 4
     assert course.path_mm == course.fastest_mm_s == 0.0
     for at_mm in ([3.0, 4.0, 0.0], [3.0, 4.0, 1.0], None, [90.0, 0.0, 0.0], [90.0, 0.0, 2.0]):
         pose[:3, 3] = at_mm or 0.0
@@ -93,8 +94,18 @@ def test_a_course_counts_presses_ways_and_time_over_the_limit():
     figures = course.summary({"seen_organ": 0.25, "contact_mm2": 3.0}, [Gap(1.5, 2.0)], 4)
     assert (figures["duration_s"], figures["bookmarks"], figures["seen_organ"]) == (2.0, 4, 0.25)
     assert "contact_mm2" not in figures and "2 presses" in summary_text(figures)
+    assert "2.25 N at most on the probe" in summary_text(figures)
+
     assert "4 bookmarks" in summary_text(
         figures
     ) and "largest region not imaged is 1.5 ml, up to 2.0 mm thick" in summary_text(figures)
     said = summary_text(figures | dict(presses=1, bookmarks=1))
     assert "1 press," in said and "1 bookmark\n" in said
+
+
+def test_forces_of_steps_are_kept_as_float32_and_none_where_there_is_none():
+    wrench = np.array([0.125, -2.0, 1 / 3, 1e-7, 50.0, -1.0])
+    found = packed_arrays.unpack_wrenches(packed_arrays.pack_wrenches([wrench, None]))
+    assert (found[0] == wrench.astype(np.float32)).all() and np.isnan(found[1]).all()
+    with pytest.raises(ValueError, match="not finite"):
+        packed_arrays.unpack_wrenches(packed_arrays.pack_wrenches([wrench / 0.0]))

@@ -27,6 +27,7 @@ def rehearsed() -> SimpleNamespace:
         contacts=SimpleNamespace(measure_penetration=lambda: 0.25),
         volume_ratio=lambda: 0.97,
         indentation_mm=lambda: 3.5,
+        wrench=lambda: np.array([0.0, 0.3, -0.4, 1.0, 2.0, 3.0]),
         notice="",
         steps=2,
     )
@@ -46,5 +47,8 @@ def test_figures_are_those_of_tissue_that_is_there(one_device, lost):
     json.dumps(report, allow_nan=False)
     names = "volume_ratio_min", "max_penetration_mm", "indentation_max_mm"
     assert [report[name] for name in names] == ([0.97, 0.25, 3.5] if lost is None else [None] * 3)
+    assert report["force_max_n"] == (0.5 if lost is None else None)
+    assert report["probe_force_n"] == ([0.0, 0.3, -0.4] if lost is None else None)
+    assert report["probe_torque_n_mm"] == ([1.0, 2.0, 3.0] if lost is None else None)
     (press,) = (line for line in summary(report).splitlines() if line.startswith("press"))
-    assert ("3.50 mm deep" in press) == (lost is None) != ("NOT FINITE" in press)
+    assert ("3.50 mm deep, with 0.50 N at most" in press) == (lost is None) != ("NOT FINITE" in press)

@@ -28,7 +28,7 @@ def posed(face=(0.0, 0.0, 40.0), probe=LINEAR) -> np.ndarray:
 
 
 def rehearsed(
-    organ=None, tumour=None, shift=(0, 0, 0), now=None, pose=None, probe=LINEAR, outline=NOWHERE
+    organ=None, tumour=None, shift=(0, 0, 0), now=None, pose=None, probe=LINEAR, outline=NOWHERE, wrench=None
 ) -> SimpleNamespace:
     """The part of a rehearsal that is measured: an organ at rest, or deformed as ``now``, and a tumour that has shifted."""
     organ = organ or ball(30.0)
@@ -39,6 +39,7 @@ def rehearsed(
         pose=posed() if pose is None else pose,
         size_mm=np.array(probe.housing_mm),
         tumour=tumour,
+        wrench=lambda: wrench,
         tumour_vertices=lambda: np.asarray(tumour.vertices) + shift,
         tumour_outline=lambda: None if tumour is None else outline,
     )
@@ -222,3 +223,9 @@ def test_a_curvilinear_picture_ends_behind_its_face():
     in_view = (66 * 24 * 2 * np.sin(np.radians(0.5)) + 12) / (120 * 24 * 2 * np.sin(np.radians(0.5)) + 24)
     # Behind the face lines are taken to be as far apart as on it.
     assert seen(CURVED, sector(-12, 12, -6, 6)) == pytest.approx((in_view, 60 * np.radians(18)))
+
+
+def test_force_and_torque_are_the_sizes_of_the_wrench():
+    with_force = reading(wrench=np.array([1.0, -2.0, 2.0, 0.0, 6.0, 8.0]))
+    assert (with_force.force_n, with_force.torque_n_mm) == (3.0, 10.0)
+    assert reading().force_n is None and reading().torque_n_mm is None

@@ -112,7 +112,7 @@ class Told:
 
     is_state_due = False
 
-    def add_step(self, pose: np.ndarray | None, length_s: float) -> None:
+    def add_step(self, pose: np.ndarray | None, length_s: float, wrench: np.ndarray | None = None) -> None:
         self.poses.append(pose)
 
     def of(self, kind: str) -> list[Any]:

@@ -34,6 +34,6 @@ def test_the_embedded_patient_is_a_patients_folder():
     embedded = load_anatomy(load_scene(EMBEDDED), EMBEDDED.parent)
     folder = phantom_folder()
     assert fingerprint(embedded) == fingerprint(load_anatomy(load_scene(folder / "scene.toml"), folder))
-    assert set(embedded.parts) == {"urine", "vessel"} and isinstance(embedded.ct, Grid)
+    assert set(embedded.parts) == {"urine", "vessel", "sinus"} and isinstance(embedded.ct, Grid)
     assert isinstance(embedded.shapes[0], trimesh.Trimesh)
     assert embedded.tissues[1] == "kidney" and embedded.tissues[2] == "tumour"

@@ -90,7 +90,9 @@ def test_the_folder_is_a_scene(written):
     assert scene.title == "Left kidney"
     np.testing.assert_allclose(anatomy.tumour.center_mass, TUMOUR[0], atol=1.0)
     assert anatomy.organ.center_mass[0] > 0 and anatomy.ct.voxels.ndim == 3
-    assert scene.attachment.at_mm is not None and scene.attachment.radius_mm == 0
+    # Held by its pedicle.
+    held = scene.attachment
+    assert held.at_mm is not None and held.radius_mm == 15 and held.stiffness_n_mm == 0.5
     assert {file.name for file in written.iterdir()} == {
         "check.png", "ct.nrrd", "labels.nrrd", "organ.stl", "scene.toml", "support.stl", "tumour.stl",
     }  # fmt: skip

@@ -167,7 +167,7 @@ def test_a_hanging_block_stretches_as_tissue_and_capsule_side_by_side(one_device
     sag = -float(low[1][0] @ moved[low[0][0]])
     tissue, capsule = 1e3 * young * side**2, N_MM * stiffness_n_mm * 4 * side
     load = DENSITY * gravity * side**2 * (length - 2.0) ** 2 / 2
-    assert load / (tissue + 4 / 3 * capsule) < sag < load / (tissue + capsule) < 0.6 * load / tissue
+    assert load / (tissue + 4 / 3 * capsule) < sag < load / (tissue + capsule) < 0.65 * load / tissue
 
 
 def test_without_a_stiffness_there_is_no_capsule(one_device, ball):

@@ -347,9 +347,9 @@ def beam_error(poisson: float, cell: float, side: float = 8.0, span: float = 40.
 
 def test_a_cantilevers_sag_is_beam_theorys(one_device):
     coarse, fine = 1 - sag(0.0, 4.0, 700), 1 - sag(0.0, 8 / 3, 1200)
-    assert abs(coarse) < beam_error(0.0, 4.0) < 0.25
-    assert abs(fine) < beam_error(0.0, 8 / 3) < 0.12
+    assert abs(coarse) < beam_error(0.0, 4.0) < 0.26
+    assert abs(fine) < beam_error(0.0, 8 / 3) < 0.13
 
 
 def test_a_cantilever_of_nearly_incompressible_tissue_does_not_lock(one_device):
-    assert abs(1 - sag(0.45, 8 / 3, 1500)) < beam_error(0.45, 8 / 3) < 0.15
+    assert abs(1 - sag(0.45, 8 / 3, 1500)) < beam_error(0.45, 8 / 3) < 0.18

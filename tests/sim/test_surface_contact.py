@@ -382,3 +382,43 @@ def test_a_restored_body_is_free_of_nan(kept, dome):
     solver.restore(built)
     rest(solver, 2, settings_of(4, DOWN), AWAY)
     assert np.isfinite(position(solver)).all()
+
+
+def test_the_wrench_on_a_floor_is_the_weight_under_the_centre_of_mass(one_device, block):
+    floor = Plane(UP, -8.0)
+    solver = tissue_of(block, 4.0, [floor], FRICTION)
+    rest(solver, 200, settings_of(8, gravity=DOWN))
+    weight_n = 1e-6 * weight(solver)
+    about = np.array([2.0, -1.0, -8.0])
+    wrench = solver.contacts.wrench(floor, about)
+    # The floor carries all of it: sums of float32 over some hundred points.
+    assert wrench[:3] == pytest.approx([0.0, 0.0, -weight_n], abs=1e-3 * weight_n)
+    centre = array_of(solver.model.mass) @ position(solver) / array_of(solver.model.mass).sum()
+    assert wrench[3:] == pytest.approx(np.cross(centre - about, [0, 0, -weight_n]), abs=0.01 * weight_n * 4)
+
+
+def test_the_wrench_is_the_sum_of_the_forces_on_the_points(one_device, block):
+    """Of a tool that presses and drags: beside NumPy, and opposite to the forces on the nodes, in all as large."""
+    tool = ConvexTool.cuboid([12.0, 12.0, 8.0], 1.0)
+    floor = Plane(UP, -8.0)
+    solver = tissue_of(block, 4.0, [floor, tool], FRICTION)
+    for n in range(40):
+        poses = np.stack([lifted(12.0 - 0.05 * n), lifted(12.0 - 0.05 * (n + 1))])
+        poses[:, 0, 3] = 0.03 * n, 0.03 * (n + 1)
+        solver.step(settings_of(8, gravity=(0.0, 0.0, -G)), poses)
+    contacts, about = solver.contacts, np.array([1.0, 2.0, 3.0])
+    plane, near = array_of(contacts.plane)[1].astype(float), array_of(contacts.near) >> 1 & 1
+    point, slip = array_of(contacts.point).astype(float), array_of(contacts.slip)[1].astype(float)
+    depth = np.maximum(plane[:, 3] - (plane[:, :3] * point).sum(axis=1), 0.0) * near
+    stiffness = 1e3 * contacts.stiffness[None] * array_of(contacts.area).astype(float)
+    force = (stiffness * depth)[:, None] * plane[:, :3]
+    force -= TANGENTIAL_RATIO * (stiffness * (depth > 0))[:, None] * slip
+    wanted = -1e-6 * np.concatenate([force.sum(axis=0), np.cross(point - about, force).sum(axis=0)])
+    # A depth is a difference of positions of 10 mm, off by 1e-6 mm of 0.05.
+    assert contacts.wrench(tool, about) == pytest.approx(wanted, rel=1e-3, abs=1e-4 * np.abs(wanted).max())
+    assert wanted[2] > 0.5 and wanted[0] < -0.05 * wanted[2]
+    # At rest the floor carries the weight and the press.
+    for _ in range(100):
+        solver.step(settings_of(8, gravity=(0.0, 0.0, -G)))
+    total = contacts.wrench(tool, about)[:3] + contacts.wrench(floor, about)[:3]
+    assert total == pytest.approx([0, 0, -1e-6 * weight(solver)], abs=0.01 * wanted[2])

@@ -138,3 +138,46 @@ def test_beads_elsewhere_are_refused(tmp_path):
     places = beads()
     places[2, 5] *= 1000
     assert "the bead on line 7 is" in refused(write_case(tmp_path / "metres", places=places))
+
+
+def with_parts(tmp_path: Path) -> dict:
+    case = values()
+    tumour = dict(name="tumour", surface="tumour.stl", young_kPa=60.0, poisson=0.4, density=1100.0)
+    case["material"]["part"] = [tumour]
+    trimesh.creation.icosphere(subdivisions=2, radius=4.0).export(tmp_path / "tumour.stl")
+    return case
+
+
+def test_parts_holds_and_forces_are_read(tmp_path):
+    case = with_parts(tmp_path)
+    case["hold"] = [dict(name="hilum", shape="sphere", centre=[-9.0, 0.0, 0.0], radius_mm=4.0)]
+    case["stage"][1]["probe_force_N"] = [0.5, 0.0, -2.0]
+    found = load_case(write_case(tmp_path, case))
+    (part,), (region,) = found.parts, found.fixed
+    assert found.part_names == ("tumour",)
+    assert (part.material.young_kpa, part.material.poisson, part.material.density_g_cm3) == (60.0, 0.4, 1.1)
+    assert part.surface.volume == pytest.approx(4 / 3 * np.pi * 4**3, rel=0.05)
+    assert region.at_mm.tolist() == [-9.0, 0.0, 0.0] and region.radius_mm == 4.0
+    # The file has the force on the tissue.
+    assert found.probe_force_n[1].tolist() == [-0.5, -0.0, 2.0] and np.isnan(found.probe_force_n[0]).all()
+    other = dict(case["material"]["part"][0], young_kPa=50.0)
+    case["material"]["part"] = [other]
+    assert load_case(write_case(tmp_path, case)).digest != found.digest
+
+
+def test_a_probe_may_slide_at_the_same_depth(tmp_path):
+    case = values()
+    case["stage"][2] |= dict(indentation_mm=2.0, slide_mm=3.0, position=[3.0, 0.0, 15.0])
+    found = load_case(write_case(tmp_path, case))
+    assert found.indentation_mm.tolist() == [0.0, 2.0, 2.0] and found.poses[2, :3, 3].tolist() == [3, 0, 15]
+    del case["stage"][2]["slide_mm"]
+    assert "expected more than 2 of the stage before" in refused(write_case(tmp_path, case))
+
+
+def test_a_part_without_its_surface_is_refused(tmp_path):
+    case = with_parts(tmp_path)
+    case["material"]["part"][0]["young_kPa"] = -1.0
+    assert "material.part.0.young_kPa = -1.0" in refused(write_case(tmp_path, case))
+    case["material"]["part"][0]["young_kPa"] = 60.0
+    (tmp_path / "tumour.stl").unlink()
+    assert "tumour.stl" in refused(write_case(tmp_path, case))

@@ -20,6 +20,8 @@ from studies.accuracy.bead_case import BeadCase, load_case
 from studies.accuracy.bead_errors import (
     bead_errors,
     correlation,
+    force_figures,
+    force_table,
     null_errors,
     probe_distances,
     report,
@@ -37,6 +39,7 @@ KEYS = {
     "substeps",
     "iterations",
     "time_step_s",
+    "parts",
     "stages",
     "overall_mean_mm",
     "ms_per_step",
@@ -97,7 +100,8 @@ def test_distance_from_the_probe_is_that_of_the_rounded_cuboid_at_its_pose(case)
 def test_report_and_table_show_these_figures(device, case):
     experiment = BeadExperiment(case, COARSE)
     off = np.linspace(0, 1, 12)[:, None] * np.array([0.0, 0.0, 1.0])
-    run = BeadRun(case.measured + off, step_ms=[1.0, 2.0, 6.0])
+    unknown = np.full((3, 3), np.nan)
+    run = BeadRun(case.measured + off, step_ms=[1.0, 2.0, 6.0], force_n=unknown, parts_mm=np.zeros((3, 0, 3)))
     figures = report(experiment, COARSE, run)
     assert set(figures) == KEYS | {"clusters", "memberships"} and figures["case"] == "ball"
     assert figures["overall_mean_mm"] == pytest.approx(0.5)
@@ -114,7 +118,7 @@ def test_report_and_table_show_these_figures(device, case):
     assert rows[4].split() == ["all", "0.50", "1.00", f"{null.mean():.2f}", f"{0.5 / null.mean():.2f}"]
     assert sum(int(row.split("(")[1].split()[0]) for row in rows if "bead positions" in row) == 24
     # A result that is not finite is reported, in valid JSON.
-    lost = BeadRun(np.full_like(case.measured, np.nan), [1.0], finite=False)
+    lost = replace(run, beads=np.full_like(case.measured, np.nan), step_ms=[1.0], finite=False)
     figures = report(experiment, COARSE, lost)
     assert figures["finite"] is False and figures["overall_mean_mm"] is None
     json.dumps(figures, allow_nan=False)
@@ -220,3 +224,16 @@ def test_a_real_case_is_pressed(device, data):
     setup = BRIEF.but(radius_mm=6.0)
     run = BeadExperiment(case, setup).run(setup)
     assert run.finite and 0.3 < bead_errors(case, run.beads).mean() < 2.0
+
+
+def test_forces_are_compared_as_vectors_and_what_is_unknown_is_none(case):
+    known = replace(case, probe_force_n=np.array([[0.0, 0, 0], [0, 0, 2.0], [np.nan] * 3]))
+    found = np.array([[0.0, 0, 0.01], [0.3, 0, 2.4], [0, 0, 4.0]])
+    run = BeadRun(case.measured, force_n=found, parts_mm=np.zeros((3, 0, 3)))
+    figures = force_figures(known, run)
+    assert figures[1]["probe_force_N"] == [0.3, 0, 2.4] and figures[1]["measured_probe_force_N"] == [0, 0, 2]
+    assert figures[2]["measured_probe_force_N"] is None
+    rows = force_table(known, found).splitlines()[1:]
+    # 0.5 N of 2 N; of no force there is no share.
+    assert rows[1].split()[-2:] == ["0.500", "25.0"] and rows[0].split()[-1] == "0.010"
+    assert "not known" in rows[2]

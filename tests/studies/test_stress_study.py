@@ -33,7 +33,7 @@ def test_the_cases_are_many_and_each_is_another(model):
     assert {case.gravity for case in cases} >= {0.0, 1000.0}
     assert {case.subject.size_mm for case in cases} >= {1.0, 10.0}
     assert max(max(case.heaviest, case.subject.mass_ratio) for case in cases) == 1e6
-    kinds = {case.kind for case in cases if case.subject == stress_bodies.Subject("kidney")}
+    kinds = {case.kind for case in cases if case.subject.kind == "kidney"}
     assert {case.kind for case in quick_cases_of(model)} == kinds | {"one alone"}
 
 
