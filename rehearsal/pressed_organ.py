@@ -261,7 +261,7 @@ def parts_of(scene: Scene, anatomy: LoadedAnatomy, origin: np.ndarray) -> list[P
         if name in asked:
             if name not in surfaces:
                 raise SceneError(f"tissue.parts.{name}: this patient has no {name}; leave it out")
-            found.append(Part(translated(surfaces[name], -origin), material_of(name, asked[name])))
+            found.append(Part(name, translated(surfaces[name], -origin), material_of(name, asked[name])))
     return found
 
 

@@ -35,6 +35,7 @@ class Material:
 class Part:
     """A part of the organ that has its own material: all within a closed surface [mm]."""
 
+    name: str
     surface: trimesh.Trimesh
     material: Material
 

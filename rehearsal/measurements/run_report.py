@@ -60,7 +60,15 @@ class Tally:
             version=VERSION,
             title=rehearsal.scene.title,
             arch=arch,
-            **(NOT_EVERYWHERE | rehearsal.scene.tissue.model_dump() | rehearsal.model.counts()),
+            **(
+                NOT_EVERYWHERE
+                | rehearsal.scene.tissue.model_dump(exclude={"parts"})
+                | rehearsal.model.counts()
+            ),
+            parts={
+                part.name: dict(young_kpa=part.material.young_kpa, poisson=part.material.poisson)
+                for part in rehearsal.parts_of_tissue
+            },
             tetrahedra=rehearsal.embedding.count,
             time_step_s=rehearsal.scene.solver.time_step_s,
             substeps=settings.substeps,
@@ -99,6 +107,7 @@ def summary(report: dict) -> str:
     return "\n".join(
         [
             f"model     {TISSUES[report['model']].report_line.format(**report)}, {report['tetrahedra']} tetrahedra",
+            *([f"parts     {_parts(report['parts'])}"] if report["parts"] else []),
             f"step      1/{1 / report['time_step_s']:.0f} s in {counted(report['substeps'], 'substep')} of "
             f"{counted(report['iterations'], 'iteration')}",
             f"speed     {times} (medians of {report['steps']}) on {report['arch']}; built in {report['build_s']:.1f} s",
@@ -107,6 +116,12 @@ def summary(report: dict) -> str:
             f"numerical {_error(report['numerical_error_mm'])}",
             *(f"WARNING   {text}" for text in report["fallbacks"]),
         ]
+    )
+
+
+def _parts(parts: dict[str, dict[str, float]]) -> str:
+    return ", ".join(
+        f"{name} {each['young_kpa']:g} kPa (nu {each['poisson']:g})" for name, each in parts.items()
     )
 
 

@@ -208,7 +208,6 @@ class BeadCase:
     young_kpa: float | None
     poisson: float | None
     density_kg_m3: float | None
-    part_names: tuple[str, ...]
     parts: tuple[Part, ...]
     fixed: tuple[FixedRegion, ...]
     probe_force_n: np.ndarray
@@ -244,7 +243,6 @@ def load_case(folder: Path) -> BeadCase:
         young_kpa=material.young_kPa,
         poisson=material.poisson,
         density_kg_m3=material.density,
-        part_names=tuple(part.name for part in material.part),
         parts=parts,
         fixed=tuple(FixedRegion(np.array(hold.centre), hold.radius_mm) for hold in file.hold),
         probe_force_n=-np.array([stage.probe_force_N or (np.nan,) * 3 for stage in file.stage]),
@@ -252,7 +250,9 @@ def load_case(folder: Path) -> BeadCase:
 
 
 def _part(folder: Path, part: CasePart) -> Part:
-    return Part(_surface(folder, part.surface), Material(part.young_kPa, part.poisson, part.density / 1000))
+    return Part(
+        part.name, _surface(folder, part.surface), Material(part.young_kPa, part.poisson, part.density / 1000)
+    )
 
 
 def _read_file(folder: Path) -> CaseFile:

@@ -93,7 +93,7 @@ def report(experiment: BeadExperiment, setup: Setup, run: BeadRun) -> dict:
         substeps=setup.substeps,
         iterations=setup.iterations,
         time_step_s=setup.solver.time_step_s,
-        parts=list(case.part_names),
+        parts=[part.name for part in case.parts],
         stages=[
             figures | forces
             for figures, forces in zip(

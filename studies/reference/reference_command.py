@@ -19,7 +19,7 @@ from studies.study_options import number_option
     "edge_mm",
     low=2,
     high=10,
-    default=4.0,
+    default=2.5,
     help="Length in mm of the elements' edges by the transducer.",
 )
 def reference(out: Path, edge_mm: float) -> None:

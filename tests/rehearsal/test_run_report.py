@@ -11,6 +11,7 @@ from rehearsal.configuration import probe_of
 from rehearsal.measurements.run_report import Tally, summary
 from scenes.scene import EMBEDDED, load_scene
 from sim.fields import field_of, fill
+from sim.material import Material, Part
 
 SCENE = load_scene(EMBEDDED)
 
@@ -28,6 +29,7 @@ def rehearsed() -> SimpleNamespace:
         volume_ratio=lambda: 0.97,
         indentation_mm=lambda: 3.5,
         wrench=lambda: np.array([0.0, 0.3, -0.4, 1.0, 2.0, 3.0]),
+        parts_of_tissue=[Part("tumour", None, Material(60.0, 0.4))],
         notice="",
         steps=2,
     )
@@ -50,5 +52,6 @@ def test_figures_are_those_of_tissue_that_is_there(one_device, lost):
     assert report["force_max_n"] == (0.5 if lost is None else None)
     assert report["probe_force_n"] == ([0.0, 0.3, -0.4] if lost is None else None)
     assert report["probe_torque_n_mm"] == ([1.0, 2.0, 3.0] if lost is None else None)
+    assert "parts     tumour 60 kPa (nu 0.4)" in summary(report)
     (press,) = (line for line in summary(report).splitlines() if line.startswith("press"))
     assert ("3.50 mm deep, with 0.50 N at most" in press) == (lost is None) != ("NOT FINITE" in press)

@@ -154,7 +154,7 @@ def test_parts_holds_and_forces_are_read(tmp_path):
     case["stage"][1]["probe_force_N"] = [0.5, 0.0, -2.0]
     found = load_case(write_case(tmp_path, case))
     (part,), (region,) = found.parts, found.fixed
-    assert found.part_names == ("tumour",)
+    assert part.name == "tumour"
     assert (part.material.young_kpa, part.material.poisson, part.material.density_g_cm3) == (60.0, 0.4, 1.1)
     assert part.surface.volume == pytest.approx(4 / 3 * np.pi * 4**3, rel=0.05)
     assert region.at_mm.tolist() == [-9.0, 0.0, 0.0] and region.radius_mm == 4.0
