@@ -12,7 +12,7 @@ import trimesh
 from scipy.sparse import csr_array
 
 from sim.body import Body
-from sim.fields import field_of, fields_of
+from sim.fields import field_of, fields_of, fill
 from sim.lattice import Lattice, surface_patches
 from sim.stored_arrays import stored
 
@@ -34,6 +34,7 @@ class Capsule:
         self.body = body
         self.count = len(nodes)
         self.node, self.gradient = field_of(nodes, 1), field_of(gradient, 1)
+        self.area_mm2 = area
         self.weight = field_of(N_MM * stiffness_n_mm / 3 * area)
         self.deformation = ti.Matrix.field(3, 2, ti.f32, self.count)
         places = csr_array(
@@ -42,6 +43,10 @@ class Capsule:
         ).tocsc()
         self.start, self.patch = fields_of(places.indptr, places.indices)
         self.slope = field_of(gradient.reshape(-1, 2)[places.data], 1)
+
+    def set_stiffness(self, stiffness_n_mm: float) -> None:
+        """Change modulus times thickness [N/mm]."""
+        fill((self.weight, N_MM * stiffness_n_mm / 3 * self.area_mm2))
 
     @ti.func
     def begin(self):

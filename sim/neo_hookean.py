@@ -205,6 +205,10 @@ class NeoHookean:
             self._fill_stiffness(mu / self.material.mu)
             fill((self.lame_ratio, np.append(lambda_ / mu, 0.0)))
 
+    def set_tether(self, tether_n_mm: np.ndarray) -> None:
+        """Change the stiffness (n,) of the springs [N/mm]; only where there were any from the start."""
+        fill((self.tether, N_MM * tether_n_mm))
+
     def counts(self) -> dict[str, int]:
         """Nodes (also as particles), cells, and contact points on the surface."""
         nodes, points = self.body.count, self.contacts.count if self.has_contacts else 0

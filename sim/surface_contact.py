@@ -36,7 +36,7 @@ class SurfaceContacts:
 
     point (p,): current positions [mm]. plane (shapes, p): normal and offset of n . x >= offset [mm]. slip (shapes, p): elastic
     tangential slip [mm]. near (p,): bits of the shapes that are near. found (shapes, p): point and distance [mm] of the last
-    distance query. ``stiffness`` [kPa/mm]: penalty stiffness.
+    distance query. ``stiffness`` [kPa/mm]: penalty stiffness; ``coefficient``: Coulomb's, where there was friction from the start.
     """
 
     def __init__(
@@ -52,6 +52,8 @@ class SurfaceContacts:
         self.shapes = list(shapes)
         self.time_of_impact = TimeOfImpact(shapes)
         self.friction = friction
+        self.coefficient = ti.field(ti.f32, ())
+        self.coefficient[None] = friction
         self.count = len(points)
         nodes, weights = lattice.interpolation(points)
         self.point = ti.Vector.field(3, ti.f32, self.count)
@@ -143,7 +145,7 @@ class SurfaceContacts:
         normal = self.plane[s, q].xyz
         p = self.point[q]
         slip = tangential(self.slip[s, q] + p - self.start[q] - self.shapes[s].motion(p), normal)
-        fraction = sticking_fraction(slip, self.friction * depth / TANGENTIAL_RATIO)
+        fraction = sticking_fraction(slip, self.coefficient[None] * depth / TANGENTIAL_RATIO)
         return slip * fraction, fraction
 
     @ti.func
@@ -193,7 +195,9 @@ class SurfaceContacts:
                         force += penalty * depth * normal
                         if ti.static(self.friction > 0):
                             slip = tangential(self.slip[s, q] + shift - self.point[q], normal)
-                            factor = sticking_fraction(slip, self.friction * depth / TANGENTIAL_RATIO)
+                            factor = sticking_fraction(
+                                slip, self.coefficient[None] * depth / TANGENTIAL_RATIO
+                            )
                             force -= penalty * TANGENTIAL_RATIO * factor * slip
                             stiffness += (
                                 penalty

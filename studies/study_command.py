@@ -23,6 +23,10 @@ STUDIES = {
         "Stress-test the tissue and see whether it recovers.",
     ),
     "soak": ("studies.robustness.soak_study:soak", "Rehearse for an hour in SCENE, faster than real time."),
+    "uncertainty": (
+        "studies.uncertainty.uncertainty_command:uncertainty",
+        "Estimate how far SCENE's press depends on what is not known of the tissue.",
+    ),
     "import": ("studies.performance.import_timing_command:intake", "Measure an import: seconds and memory."),
     "freehand": (
         "studies.freehand.freehand_accuracy:freehand",

@@ -16,6 +16,9 @@ out_option = click.option(
 jobs_option = click.option(
     "--jobs", type=WholeRange(1, 1024), help="Number of processes [one for each processor]."
 )
+dask_option = click.option(
+    "--dask", metavar="ADDRESS", help="Run on the Dask cluster of this scheduler, such as tcp://host:8786."
+)
 preset_option = click.option(
     "--quality",
     type=click.Choice(QUALITIES),

@@ -17,7 +17,7 @@ LEAST_WINDOW_HU = 310.0  # up to 200 HU at least, or an unenhanced kidney is whi
 # The hilum is the mean of the vertices within this distance of the deepest one.
 FLOOR_MM = 8.0
 # The pedicle holds the tissue within this distance of the hilum's centre.
-PEDICLE_RADIUS_MM = 15.0
+PEDICLE_RADIUS_MM = 20.0
 # Least medial component of the normal at the hilum.
 LEAST_MEDIAL = 0.3
 

@@ -1,5 +1,6 @@
 """The commands ``validate`` and ``calibrate``: the tissue models against bead experiments."""
 
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Literal
@@ -21,6 +22,7 @@ from rehearsal.commands.command_line import (
     start_taichi,
 )
 from rehearsal.configuration import choose_setup
+from rehearsal.worker_processes import workers
 from scenes.scene import model_with
 from scenes.tissue import QUALITIES, TISSUES, USUAL
 from studies.accuracy.bead_case import load_case
@@ -129,17 +131,14 @@ def calibrate(asked: CalibrateOptions) -> None:
     from studies.accuracy import calibration, calibration_results, case_workers
 
     split = calibration.split_of(loaded, asked.hold_out)
-    with (
-        case_workers.dask_workers(asked.dask)
-        if asked.dask
-        else case_workers.local_workers(asked.jobs) as work
-    ):
+    with workers(asked.jobs, asked.dask) as work:
+        evaluate = partial(work, case_workers.evaluate)
         if generations:
             count = calibration.search_count(len(loaded), len(radii_mm), generations)
         else:
             count = calibration.exhaustive_count(len(loaded), len(radii_mm), spacing)
         with tqdm(total=count, desc="calibrate", unit="press") as bar:
-            found = calibration.Calibration(loaded, split, work, bar.update)
+            found = calibration.Calibration(loaded, split, evaluate, bar.update)
             if generations:
                 found.search(radii_mm, generations)
             else:

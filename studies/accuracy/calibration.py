@@ -11,7 +11,7 @@ from errors import UserError
 from rehearsal.configuration import Setup, setup_of
 from studies.accuracy.bead_case import BeadCase
 from studies.accuracy.bead_errors import null_errors
-from studies.accuracy.case_workers import Map, Measured
+from studies.accuracy.case_workers import Evaluate, Measured
 
 MODEL = "shape-matching"
 # Every third bead is held out, so that neighbours on a thread are in both parts.
@@ -66,7 +66,7 @@ class Calibration:
 
     cases: Sequence[BeadCase]
     split: Split
-    workers: Map
+    workers: Evaluate
     done: Callable[[int], object]
     trials: dict[float, list[CalibrationTrial]] = field(default_factory=dict)
 

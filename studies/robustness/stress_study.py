@@ -12,14 +12,13 @@ from typing import Any
 import click
 import numpy as np
 import pandas as pd
-from joblib import Parallel, delayed
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from tqdm import tqdm
 
 from rehearsal.commands.command_line import make_folder
 from rehearsal.result_files import rounded
-from rehearsal.worker_processes import processes
+from rehearsal.worker_processes import workers
 from sim.body import BodyState
 from sim.fields import fill
 from sim.neo_hookean import NeoHookean
@@ -35,7 +34,7 @@ from studies.robustness.stress_cases import (
     quick_cases_of,
 )
 from studies.robustness.stress_motion import AWAY_MM, PROBES, STATES
-from studies.study_options import jobs_option, out_option
+from studies.study_options import dask_option, jobs_option, out_option
 from studies.study_results import finish_axes, table_of, write_results
 from ultrasound.probe_manipulator import advanced
 
@@ -72,7 +71,8 @@ _prepared: dict[tuple[str, Subject], Specimen] = {}
 @out_option
 @click.option("--quick", is_flag=True, help="One case of each kind, in one to two minutes.")
 @jobs_option
-def stability(out: Path, quick: bool, jobs: int | None) -> None:
+@dask_option
+def stability(out: Path, quick: bool, jobs: int | None, dask: str | None) -> None:
     """Stress-test the tissue and see whether it recovers.
 
     Each model, under extremes of settings, tool and state.
@@ -81,22 +81,24 @@ def stability(out: Path, quick: bool, jobs: int | None) -> None:
     given = {model: quick_cases_of(model) if quick else cases_of(model) for model in MODELS}
     rows: list[dict[str, Any]] = []
     with tqdm(total=sum(map(len, given.values())), desc="stability", unit="case") as bar:
-        for found in _figures(given, jobs):
+        for found in _figures(given, jobs, dask):
             rows += found
             bar.update(len(found))
     text = f"{table(rows)}\n\n{summary(rows)}"
     write_results(out, "stability", dict(cases=rows), text, rows, figure_of(rows))
 
 
-def _figures(given: dict[str, list[StressCase]], jobs: int | None) -> Iterator[list[dict[str, Any]]]:
+def _figures(
+    given: dict[str, list[StressCase]], jobs: int | None, dask: str | None
+) -> Iterator[list[dict[str, Any]]]:
     """Batches of figures in the order of the cases, as they are done."""
     tasks = []
     for model, cases in given.items():
         for _, group in groupby(cases, key=lambda case: case.subject):
             same = list(group)
             tasks += [(model, same[first : first + BATCH]) for first in range(0, len(same), BATCH)]
-    with processes(jobs):
-        yield from Parallel(return_as="generator", batch_size=1)(delayed(_run_all)(*task) for task in tasks)
+    with workers(jobs, dask) as work:
+        yield from work(_run_all, tasks)
 
 
 def _run_all(model: str, cases: list[StressCase]) -> list[dict[str, Any]]:

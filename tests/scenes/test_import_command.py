@@ -92,7 +92,7 @@ def test_the_folder_is_a_scene(written):
     assert anatomy.organ.center_mass[0] > 0 and anatomy.ct.voxels.ndim == 3
     # Held by its pedicle.
     held = scene.attachment
-    assert held.at_mm is not None and held.radius_mm == 15 and held.stiffness_n_mm == 0.5
+    assert held.at_mm is not None and held.radius_mm == 20 and held.stiffness_n_mm == 2.0
     assert {file.name for file in written.iterdir()} == {
         "check.png", "ct.nrrd", "labels.nrrd", "organ.stl", "scene.toml", "support.stl", "tumour.stl",
     }  # fmt: skip

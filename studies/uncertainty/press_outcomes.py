@@ -1,0 +1,65 @@
+"""The scripted press with given values of what is not known, in a worker: what the surgeon would see and feel."""
+
+import threading
+from dataclasses import dataclass
+
+import numpy as np
+
+import sim.device
+from rehearsal.measurements.tumour_measurements import measure
+from rehearsal.rehearsal import Rehearsal
+from scenes.anatomy import LoadedAnatomy
+from scenes.scene import Scene
+from studies.uncertainty.unknowns import set_values
+
+# Measured at each depth; those of the tumour only where there is one. Its centroid follows.
+QUANTITIES = ("tumour_shift_mm", "to_tumour_mm", "tumour_depth_mm", "margin_mm", "force_n", "compression_mm")
+
+
+@dataclass(frozen=True)
+class PressProblem:
+    """A scene and its anatomy, whose press is computed; ``digest`` tells problems apart."""
+
+    scene: Scene
+    anatomy: LoadedAnatomy
+    digest: str
+
+
+_built: dict[str, Rehearsal] = {}
+# A Dask worker may run several threads; Taichi serves one.
+_turn = threading.Lock()
+
+
+def press_outcome(problem: PressProblem, values: dict[str, float]) -> np.ndarray:
+    """The quantities and the tumour's centroid (depths, 9) [mm, N] of a press with these values, NaN for what there is not."""
+    with _turn:
+        if problem.digest not in _built:
+            _built.clear()
+            sim.device.start("cpu", cpu_max_num_threads=1)
+            _built[problem.digest] = Rehearsal(problem.scene, problem.anatomy)
+        return _press(_built[problem.digest], values)
+
+
+def _press(rehearsal: Rehearsal, values: dict[str, float]) -> np.ndarray:
+    """Settle from the stress-free shape, then press stage by stage, to the same poses of the probe for all values."""
+    set_values(rehearsal, values)
+    solver, press = rehearsal.solver, rehearsal.press
+    solver.restart()
+    rehearsal.divergence_check.set_initial_state()
+    rehearsal.pose = rehearsal.pose_at_depth(-200.0)
+    for _ in range(press.warm_up_steps):
+        rehearsal.advance(rehearsal.pose)
+    rehearsal.pose = rehearsal.pose_at_depth(0.0)
+    step_s, touches = rehearsal.settings.time_step_s, np.ones(rehearsal.probe.number_of_scanlines, bool)
+    outcomes = []
+    for stage in range(len(press.indentations_mm)):
+        for step in range(press.stage_steps):
+            rehearsal.advance(rehearsal.scripted_pose((stage * press.stage_steps + step + 1) * step_s))
+        rehearsal.update_surfaces()
+        found = measure(rehearsal, rehearsal.probe, touches)
+        quantities = [getattr(found, name) for name in QUANTITIES]
+        centroid = (
+            np.full(3, np.nan) if rehearsal.tumour is None else rehearsal.tumour_vertices().mean(axis=0)
+        )
+        outcomes.append([*(np.nan if q is None else q for q in quantities), *centroid])
+    return np.array(outcomes, float)

@@ -1,0 +1,151 @@
+"""The command ``study uncertainty``: how far a press depends on what is not known of the patient's tissue."""
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+from rehearsal.commands.command_line import CommandError, load_patient, make_folder
+from rehearsal.configuration import PRESETS, scene_of
+from rehearsal.worker_processes import workers
+from scenes.anatomy import fingerprint
+from scenes.scene import EMBEDDED
+from scenes.tissue import USUAL
+from studies.study_options import dask_option, jobs_option, out_option, scene_argument
+from studies.study_results import finish_axes, text_table, write_results
+from studies.uncertainty.press_outcomes import PressProblem, press_outcome
+from studies.uncertainty.sensitivity import bands_of, count_of, indices_of, samples_of
+from studies.uncertainty.unknowns import Unknown, unknowns_of, with_all_parts
+from version import VERSION
+
+QUALITY = "fast"
+HEADERS = ("quantity", "5 %", "median", "95 %", "depends most on", "index", "next", "index")
+WORDS = {
+    "tumour_shift_mm": "tumour shift, mm",
+    "to_tumour_mm": "face to tumour, mm",
+    "tumour_depth_mm": "tumour depth, mm",
+    "margin_mm": "margin in the image, mm",
+    "force_n": "force on the probe, N",
+    "compression_mm": "compression, mm",
+    "tumour_position_mm": "tumour from its median place, mm",
+}
+
+
+def _power_of_two(context: click.Context, parameter: click.Parameter, value: int) -> int:
+    if value < 2 or value & (value - 1):
+        raise click.BadParameter(f"{value}: expected a power of two, such as 16, 32 or 64")
+    return value
+
+
+@click.command()
+@scene_argument(EMBEDDED)
+@out_option
+@click.option(
+    "--samples",
+    type=int,
+    default=32,
+    show_default=True,
+    callback=_power_of_two,
+    help="Base of the quasi-random sample, a power of two; the presses are this times the number of parameters and two.",
+)
+@jobs_option
+@dask_option
+def uncertainty(scene: Path, out: Path, samples: int, jobs: int | None, dask: str | None) -> None:
+    """Estimate how far SCENE's press depends on what is not known of the tissue.
+
+    Stiffness of kidney and parts, attachment and friction vary over the ranges of scenes/mechanical_tissues.toml.
+    """
+    make_folder(out)
+    loaded, anatomy = load_patient(scene)
+    if loaded.tissue.model != USUAL:
+        raise CommandError(f"{loaded.tissue.model} has no material to vary: expected a scene of {USUAL}")
+    varied = with_all_parts(scene_of(loaded, PRESETS[USUAL][QUALITY]), anatomy)
+    unknowns = unknowns_of(varied, anatomy)
+    name = fingerprint(anatomy)
+    digest = hashlib.sha256((varied.model_dump_json() + name).encode()).hexdigest()
+    problem = PressProblem(varied, replace(anatomy, ct=None, labels=None), digest)
+    tried = samples_of(unknowns, samples)
+    with (
+        workers(jobs, dask) as work,
+        tqdm(total=count_of(unknowns, samples), desc="uncertainty", unit="press") as bar,
+    ):
+        outcomes = []
+        for outcome in work(press_outcome, [(problem, values) for values in tried]):
+            outcomes.append(outcome)
+            bar.update()
+    figures = report_of(np.array(outcomes), unknowns, tuple(varied.press.indentations_mm))
+    report = figures | dict(
+        nephron_uncertainty=1,
+        version=VERSION,
+        anatomy=name,
+        quality=QUALITY,
+        cell_mm=varied.tissue.size_mm,
+        samples=len(tried),
+    )
+    rows = [values | _flat(outcome) for values, outcome in zip(tried, outcomes, strict=True)]
+    write_results(out, "uncertainty", report, table(report), rows, figure_of(report))
+    click.echo(
+        f'To see the bands in the window, name {out / "uncertainty.json"} as "uncertainty" in the scene.'
+    )
+
+
+def report_of(outcomes: np.ndarray, unknowns: list[Unknown], depths_mm: tuple[float, ...]) -> dict[str, Any]:
+    """The figures of uncertainty.json, from outcomes (samples, depths, 9)."""
+    return dict(
+        indentations_mm=list(depths_mm),
+        parameters=[
+            dict(name=each.name, unit=each.unit, low=each.low, typical=each.typical, high=each.high)
+            for each in unknowns
+        ],
+        bands=bands_of(outcomes),
+        sobol_total=indices_of(unknowns, outcomes),
+    )
+
+
+def _flat(outcome: np.ndarray) -> dict[str, float]:
+    return {f"{name} (deepest)": float(value) for name, value in zip(WORDS, outcome[-1], strict=False)}
+
+
+def table(report: dict[str, Any]) -> str:
+    """The bands at the greatest depth, and the two parameters that each quantity depends on most."""
+    rows: list[list[Any]] = []
+    for name, band in report["bands"][-1].items():
+        indices = report["sobol_total"].get(name, {})
+        ranked = sorted(indices, key=lambda each: -indices[each]["total"])[:2]
+        matters = [word for each in ranked for word in (each, indices[each]["total"])]
+        rows.append([WORDS[name], band["low"], band["median"], band["high"], *matters])
+    ranges = [
+        f"  {each['name']:<16} {each['low']:g} to {each['high']:g} {each['unit']}"
+        for each in report["parameters"]
+    ]
+    head = f"At {report['indentations_mm'][-1]:g} mm, over {report['samples']} presses:"
+    formats = ("", ".2f", ".2f", ".2f", "", ".2f", "", ".2f")
+    return "\n".join([head, text_table(HEADERS, rows, formats), "", "Varied:", *ranges])
+
+
+def figure_of(report: dict[str, Any]) -> Figure:
+    """The bands over the depth, and the total indices."""
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    shown = [name for name in ("to_tumour_mm", "margin_mm", "force_n") if name in report["bands"][-1]]
+    panels = figure.subplots(2, len(shown), squeeze=False)
+    depths = report["indentations_mm"]
+    for column, name in enumerate(shown):
+        bands = [row[name] for row in report["bands"] if name in row]
+        low, middle, high = ([band[key] for band in bands] for key in ("low", "median", "high"))
+        axes = panels[0, column]
+        axes.fill_between(depths[-len(bands) :], low, high, alpha=0.25, label="90 % band")
+        axes.plot(depths[-len(bands) :], middle, marker=".", label="median")
+        finish_axes(axes, legend={}, title=WORDS[name], xlabel="indentation, mm")
+        indices = report["sobol_total"].get(name, {})
+        names = list(indices)
+        axes = panels[1, column]
+        errors = [indices[each]["confidence"] for each in names]
+        axes.barh(names, [indices[each]["total"] for each in names], xerr=errors)
+        finish_axes(axes, grid="x", xlabel="total Sobol index at the greatest depth", xlim=(0, 1.1))
+    figure.suptitle("What is not known of the tissue, and what it changes")
+    return figure

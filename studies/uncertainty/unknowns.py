@@ -1,0 +1,105 @@
+"""What is not known of a patient's tissue: the parameters that the study of uncertainty varies, and their ranges."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import get_args
+
+import numpy as np
+
+from rehearsal.pressed_organ import parts_of
+from rehearsal.rehearsal import Rehearsal
+from scenes.anatomy import LoadedAnatomy
+from scenes.mechanical_tissues import mechanical_properties
+from scenes.scene import Scene
+from scenes.tissue import NeoHookeanTissue, PartMaterial, PartName
+from sim.attachment import Pedicle, PerirenalFat, total_stiffness
+from sim.material import Material
+from sim.neo_hookean import NeoHookean
+
+# Fluid has hardly any shear modulus, whatever the value in the table.
+FLUID_POISSON = 0.495
+PARENCHYMA = "kidney"
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A parameter: name, unit, range, and whether equal ratios are equally likely (log-uniform), or equal differences (uniform)."""
+
+    name: str
+    unit: str
+    low: float
+    typical: float
+    high: float
+    is_ratio: bool = True
+
+    def value(self, share: np.ndarray | float) -> np.ndarray | float:
+        """The value at a share of the range, 0 to 1."""
+        if self.is_ratio:
+            return self.low * (self.high / self.low) ** share
+        return self.low + (self.high - self.low) * share
+
+
+def with_all_parts(scene: Scene, anatomy: LoadedAnatomy) -> Scene:
+    """The scene, in which each part that has a surface has its own material: the scene's, or what is typical of it."""
+    assert isinstance(scene.tissue, NeoHookeanTissue)
+    present = {*anatomy.parts, *(() if anatomy.tumour is None else ("tumour",))}
+    typical = {name: PartMaterial() for name in get_args(PartName) if name in present}
+    tissue = scene.tissue.model_copy(update={"parts": typical | dict(scene.tissue.parts)})
+    return scene.model_copy(update={"tissue": tissue})
+
+
+def unknowns_of(scene: Scene, anatomy: LoadedAnatomy) -> list[Unknown]:
+    """The parameters of a scene ``with_all_parts``, with the ranges of the table of mechanical properties."""
+    table, attachment = mechanical_properties(), scene.attachment
+    kidney = table.parts[PARENCHYMA]
+    found = [
+        Unknown(f"{PARENCHYMA} young", "kPa", *kidney.young_kpa),
+        Unknown(f"{PARENCHYMA} poisson", "", *kidney.poisson, is_ratio=False),
+    ]
+    for part in parts_of(scene, anatomy, np.zeros(3)):
+        if part.material.poisson < FLUID_POISSON:
+            found.append(Unknown(f"{part.name} young", "kPa", *table.parts[part.name].young_kpa))
+    if getattr(scene.tissue, "capsule_n_mm", 0) > 0:
+        found.append(Unknown("capsule", "N/mm", *table.capsule_n_mm))
+    if attachment.radius_mm > 0 and attachment.stiffness_n_mm > 0:
+        found.append(Unknown("pedicle", "N/mm", *table.pedicle_n_mm))
+    if attachment.fat_kpa_mm > 0:
+        found.append(Unknown("fat", "kPa/mm", *table.fat_kpa_mm))
+    if scene.contact.shape_friction > 0:
+        found.append(Unknown("friction", "", *table.friction, is_ratio=False))
+    return found
+
+
+def set_values(rehearsal: Rehearsal, values: Mapping[str, float]) -> None:
+    """Give a rehearsal values of the parameters, by their names; others stay as they are."""
+    model, tissue = rehearsal.model, rehearsal.scene.tissue
+    assert isinstance(model, NeoHookean) and isinstance(tissue, NeoHookeanTissue)
+    parts = [
+        Material(
+            values.get(f"{part.name} young", part.material.young_kpa),
+            part.material.poisson,
+            part.material.density_g_cm3,
+        )
+        for part in rehearsal.parts_of_tissue
+    ]
+    model.set_material(
+        values.get(f"{PARENCHYMA} young", tissue.young_kpa),
+        values.get(f"{PARENCHYMA} poisson", tissue.poisson),
+        parts,
+    )
+    if "capsule" in values:
+        model.capsule.set_stiffness(values["capsule"])
+    if "friction" in values:
+        rehearsal.contacts.coefficient[None] = values["friction"]
+    if "pedicle" in values or "fat" in values:
+        attachment = rehearsal.scene.attachment
+        tethers: list = []
+        if attachment.radius_mm > 0 and attachment.stiffness_n_mm > 0:
+            at = np.array(attachment.at_mm) - rehearsal.origin
+            tethers.append(
+                Pedicle(at, attachment.radius_mm, values.get("pedicle", attachment.stiffness_n_mm))
+            )
+        if attachment.fat_kpa_mm > 0:
+            exposed = -np.array(rehearsal.press.direction)
+            tethers.append(PerirenalFat(values.get("fat", attachment.fat_kpa_mm), exposed))
+        model.set_tether(total_stiffness(tethers, model.lattice, rehearsal.organ))
