@@ -11,6 +11,7 @@ from errors import explained
 from rehearsal.commands.command_line import CommandError
 from rehearsal.commands.rehearse_options import RehearseOptions
 from rehearsal.configuration import probe_of, with_quality
+from rehearsal.measurements.uncertainty_bands import UncertaintyBands, UncertaintyError, read_bands
 from rehearsal.planning.plan_file import Plan, PlanError, is_plan, read_plan
 from rehearsal.sessions.session_file import Log, SessionError, read_log, scene_of_log
 from rehearsal.tracking.pose_file import TimedPoses
@@ -32,6 +33,7 @@ class AskedFiles:
     track: TimedPoses | None = None
     plan: Plan | None = None
     log: Log | None = None
+    bands: UncertaintyBands | None = None
 
 
 def read_files(asked: RehearseOptions) -> AskedFiles:
@@ -44,7 +46,8 @@ def read_files(asked: RehearseOptions) -> AskedFiles:
     plan = read_plan(asked.plan) if asked.plan else None
     log = session_of(asked.replay, asked.at) if asked.replay else None
     changed, probe = as_asked(scene, asked) if log is None else as_recorded(log, scene)
-    return AskedFiles(path.parent, changed, probe, keys, track, plan, log)
+    bands = None if scene.uncertainty is None else read_bands(path.parent / scene.uncertainty)
+    return AskedFiles(path.parent, changed, probe, keys, track, plan, log, bands)
 
 
 def check_anatomy(files: AskedFiles, asked: RehearseOptions, anatomy: LoadedAnatomy) -> None:
@@ -54,6 +57,11 @@ def check_anatomy(files: AskedFiles, asked: RehearseOptions, anatomy: LoadedAnat
         raise SessionError(
             f"the session belongs to other anatomy than this scene ({files.scene.title or 'no title'}): name "
             "its scene or patient's folder before --replay; a patient imported again counts as another"
+        )
+    if files.bands is not None and files.bands.anatomy != fingerprint(anatomy):
+        raise UncertaintyError(
+            f"{files.scene.uncertainty}: is of other anatomy than this scene; make it anew with: app.py study uncertainty, or leave "
+            "uncertainty out"
         )
     if files.track is not None and asked.track is not None:
         check_near(files.track, anatomy.organ.vertices, asked.track)

@@ -65,7 +65,7 @@ class RehearsalRun:
 
     def __post_init__(self) -> None:
         guide = None if self.files.plan is None else PlanGuidance(self.rehearsal, self.files.plan)
-        self.measurements = LiveMeasurements(self.rehearsal, guide)
+        self.measurements = LiveMeasurements(self.rehearsal, guide, self.files.bands)
 
     def in_window(self, prepare: Callable[[WindowFrames], None] = lambda frames: None) -> None:
         """Run in a window that shows the scene, after a replay if there is one; ``prepare`` is called with its frames before the first.

@@ -212,9 +212,10 @@ class Press(Section):
 
 
 class Scene(Section):
-    """A scene. ``shape`` lists the rigid shapes: the support first."""
+    """A scene. ``shape`` lists the rigid shapes: the support first. ``uncertainty`` is a file of ``study uncertainty``."""
 
     title: str = ""
+    uncertainty: str | None = None
     anatomy: AnatomyFiles
     tissue: Tissue = NeoHookeanTissue()
     solver: SolverSection = SolverSection()

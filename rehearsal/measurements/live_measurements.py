@@ -7,6 +7,7 @@ import numpy as np
 
 from rehearsal.measurements.session_summary import SessionCourse
 from rehearsal.measurements.tumour_measurements import Measurement, measure
+from rehearsal.measurements.uncertainty_bands import UncertaintyBands
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.rehearsal import Rehearsal
 from rehearsal.sessions.packed_arrays import unpack_seen
@@ -27,10 +28,17 @@ DIGITS = 4
 
 
 class LiveMeasurements:
-    """``latest`` is the last measurement, ``coverage`` that of the whole session, ``guide`` the guidance along a plan, if any."""
+    """``latest`` is the last measurement, ``coverage`` that of the whole session, ``guide`` the guidance along a plan, ``bands`` how far
+    measurements may differ, if any.
+    """
 
-    def __init__(self, rehearsal: Rehearsal, guide: PlanGuidance | None = None) -> None:
-        self.rehearsal, self.guide = rehearsal, guide
+    def __init__(
+        self,
+        rehearsal: Rehearsal,
+        guide: PlanGuidance | None = None,
+        bands: UncertaintyBands | None = None,
+    ) -> None:
+        self.rehearsal, self.guide, self.bands = rehearsal, guide, bands
         self.margin_mm = MARGIN_MM if guide is None else guide.plan.margin_mm
         self._coverage: Coverage | None = None
         self._begin()
@@ -190,20 +198,33 @@ class LiveMeasurements:
             return {}
         found = {COMPRESSION: _mm(latest.compression_mm), "contact": f"{latest.contact_mm2:.0f} mm2"}
         if latest.force_n is not None:
-            found["force"] = f"{latest.force_n:.2f} N"
+            found["force"] = self._with_band("force_n", latest.force_n, "N", 2)
         if latest.to_tumour_mm is None:
             return found if self.rehearsal.scanner is None else found | {"organ seen": self._share("organ")}
         found |= {
-            "to tumour": _mm(latest.to_tumour_mm),
-            "tumour depth": _mm(latest.tumour_depth_mm),
-            "tumour shift": _mm(latest.tumour_shift_mm),
+            "to tumour": self._with_band("to_tumour_mm", latest.to_tumour_mm),
+            "tumour depth": self._with_band("tumour_depth_mm", latest.tumour_depth_mm),
+            "tumour shift": self._with_band("tumour_shift_mm", latest.tumour_shift_mm),
             "in view": "not cut" if latest.in_view is None else f"{100 * latest.in_view:.0f} %",
-            "margin": _mm(latest.margin_mm) if latest.in_view else "",
+            "margin": self._with_band("margin_mm", latest.margin_mm) if latest.in_view else "",
         }
         return found | {
             "tumour seen": self._share("tumour"),
             f"+{self.margin_mm:.0f} mm seen": self._share("margin"),
         }
+
+    def _with_band(self, name: str, value: float | None, unit: str = "mm", digits: int = 1) -> str:
+        """A figure with its unit and, where the scene has it, its 90 % band."""
+        if value is None:
+            return ""
+        band = None
+        if self.bands is not None:
+            band = self.bands.around(name, value, self.rehearsal.indentation_mm())
+        if band is None:
+            return f"{_rounded(value, digits)} {unit}"
+        # Of these only a margin can be negative.
+        low, high = band if name == "margin_mm" else (max(each, 0.0) for each in band)
+        return f"{_rounded(value, digits)} ({_rounded(low, digits)} to {_rounded(high, digits)}) {unit}"
 
     def _share(self, target: str) -> str:
         return f"{100 * self.coverage.fraction(target):.0f} %"
@@ -214,9 +235,14 @@ def periods(time_s: float, period_s: float) -> int:
     return int(time_s / period_s + 1e-6)
 
 
-def _mm(length: float | None) -> str:
-    """A length as the window shows it, never "-0.0"; empty for None."""
-    return "" if length is None else f"{round(length, 1) + 0.0:.1f} mm"
+def _mm(length: float) -> str:
+    """A length as the window shows it."""
+    return f"{_rounded(length, 1)} mm"
+
+
+def _rounded(value: float, digits: int) -> str:
+    """A number with so many digits, never "-0.0"."""
+    return f"{round(value, digits) + 0.0:.{digits}f}"
 
 
 def _recorded_measurement(values: dict[str, float | None]) -> Measurement:

@@ -20,7 +20,10 @@ from scenes.scene import Scene
 FORMAT = 1
 MOST_FILE_BYTES = 2_000_000_000
 # The parts of a scene that belong to the patient's folder and may name files.
-PATIENTS: dict[str, Any] = {"anatomy": True, "shape": True, "title": True, "transducer": {"probe"}}
+PATIENTS: dict[str, Any] = {
+    **{"anatomy": True, "shape": True, "title": True, "uncertainty": True},
+    "transducer": {"probe"},
+}
 
 
 class SessionError(UserError):

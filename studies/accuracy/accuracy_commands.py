@@ -104,6 +104,10 @@ class CalibrateOptions(CommandOptions):
     case: Annotated[tuple[Path, ...], ARGUMENT]
     out: Path
     """Folder for tables and figures."""
+    model: Annotated[str, click.Choice(list(TISSUES))] = "shape-matching"
+    """neo-hookean: estimate moduli and friction; the options for radii, hold-out, grid and search are of shape-matching."""
+    quality: Annotated[str, click.Choice(QUALITIES)] = "balanced"
+    """neo-hookean: a preset."""
     radii: str = "2.2,2.5,2.7,3.0,3.3"
     """Particle radii in mm."""
     hold_out: Literal["stages", "beads", "cases"] = "stages"
@@ -120,10 +124,31 @@ class CalibrateOptions(CommandOptions):
 
 @command(CalibrateOptions)
 def calibrate(asked: CalibrateOptions) -> None:
-    """Fit shape matching to bead experiments, as the paper did.
+    """Fit a tissue model to bead experiments, the folders CASE...
 
-    Every stiffness is tried for each particle radius, on the folders CASE..., and judged on held-out data.
+    Shape matching as the paper did: every stiffness is tried for each particle radius, and judged on held-out data.
+    neo-hookean: moduli, Poisson's ratio and friction by least squares, from beads and, where the case has them, forces on the probe.
     """
+    if asked.model == USUAL:
+        _fit_material(asked)
+    else:
+        _fit_shape_matching(asked)
+
+
+def _fit_material(asked: CalibrateOptions) -> None:
+    loaded = [load_case(case) for case in asked.case]
+    make_folder(asked.out)
+    from studies.accuracy import material_fit
+
+    setup = choose_setup(asked.model, asked.quality)
+    with workers(asked.jobs, asked.dask) as work, tqdm(desc="calibrate", unit="press") as bar:
+        fit = material_fit.fitted(loaded, setup, work, bar.update)
+    figures = fit.report()
+    save_figures(figures, asked.out / "material.json")
+    click.echo(f"\n{material_fit.table(figures)}\n\nWrote material.json to {asked.out}")
+
+
+def _fit_shape_matching(asked: CalibrateOptions) -> None:
     out, generations, spacing = asked.out, asked.search, asked.grid
     radii_mm = numbers(asked.radii, "--radii", 0.5, 20)
     loaded = [load_case(case) for case in asked.case]

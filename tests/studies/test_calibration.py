@@ -14,9 +14,12 @@ from joblib import Parallel, delayed
 from PIL import Image
 from small_bead_case import beads, write_case
 
-import studies.accuracy.case_workers as workers
+import rehearsal.worker_processes as worker_processes
+import studies.accuracy.accuracy_commands as accuracy_commands
+import studies.accuracy.case_workers as case_workers
 from app import main
 from rehearsal.configuration import Setup, setup_of
+from rehearsal.worker_processes import WorkerError, workers
 from sim.sampling import SamplingError
 from studies.accuracy.bead_case import BeadCase, load_case
 from studies.accuracy.bead_errors import null_errors
@@ -33,7 +36,7 @@ from studies.accuracy.calibration import (
     stiffness_grid,
 )
 from studies.accuracy.calibration_results import best_so_far
-from studies.accuracy.case_workers import Measured, WorkerError, dask_workers, local_workers
+from studies.accuracy.case_workers import Measured, evaluate
 
 BEST = {3.0: 0.62, 4.0: 0.33}
 
@@ -136,13 +139,17 @@ def test_a_search_of_several_settings_is_reproducible(cases):
 
 
 @contextmanager
-def pretended_workers(jobs=None):
-    yield pretending
+def pretended_workers(jobs=None, dask=None):
+    def work(function, tasks):
+        assert function is evaluate
+        return pretending(tasks)
+
+    yield work
 
 
 @pytest.mark.parametrize("searched", [False, True])
 def test_calibrate_writes_tables_figures_and_json(monkeypatch, folders, cases, tmp_path, capsys, searched):
-    monkeypatch.setattr(workers, "local_workers", pretended_workers)
+    monkeypatch.setattr(accuracy_commands, "workers", pretended_workers)
     out = tmp_path / "out"
     more = ["--search", "2"] if searched else ["--grid", "0.1"]
     assert main(["calibrate", *map(str, folders), "--radii", "4,3", "--out", str(out), *more]) == 0
@@ -202,7 +209,7 @@ def test_calibrate_reports_mistakes_in_one_line(monkeypatch, folders, tmp_path, 
     assert "--radii is '0.1'" in refused(a, *out, "--radii", "0.1")
     assert "--hold-out" in refused(a, *out, "--hold-out", "nothing")
     assert "there is one case" in refused(a, *out, "--hold-out", "cases")
-    monkeypatch.setattr(workers, "CONNECT_S", 0.3)
+    monkeypatch.setattr(worker_processes, "CONNECT_S", 0.3)
     assert "no scheduler answers there" in refused(a, *out, "--dask", "tcp://127.0.0.1:9")
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     assert "pip install dask distributed" in refused(a, *out, "--dask", "tcp://127.0.0.1:9")
@@ -217,26 +224,26 @@ def test_processes_here_and_a_cluster_of_one_worker_find_the_same(monkeypatch, c
     from distributed import LocalCluster
 
     # The cluster's worker is this process, reached as any other would be.
-    monkeypatch.setattr(workers, "_built", {})
-    monkeypatch.setattr(workers, "_filled", {})
+    monkeypatch.setattr(case_workers, "_built", {})
+    monkeypatch.setattr(case_workers, "_filled", {})
 
     setup = setup_of(MODEL, radius_mm=5.0, warm_up_steps=6, stage_steps=3)
     pairs = [(cases[0], setup.but(stiffness=a)) for a in (0.9, 0.5)]
     too_large = [(cases[0], setup_of(MODEL, radius_mm=20.0))]
-    with local_workers(2) as work:
-        here = list(work(pairs))
+    with workers(2) as work:
+        here = list(work(evaluate, pairs))
         assert all(Parallel()(delayed(_watches)() for _ in range(2)))
         with pytest.raises(SamplingError, match="choose a smaller radius"):
-            list(work(too_large))
+            list(work(evaluate, too_large))
     with (
         LocalCluster(
             n_workers=1, threads_per_worker=2, processes=False, protocol="tcp", dashboard_address=None
         ) as cluster,
-        dask_workers(cluster.scheduler_address) as work,
+        workers(dask=cluster.scheduler_address) as work,
     ):
-        there = list(work(pairs))
+        there = list(work(evaluate, pairs))
         with pytest.raises(SamplingError, match="choose a smaller radius"):
-            list(work(too_large))
+            list(work(evaluate, too_large))
     ti.reset()
     assert all(np.array_equal(a.errors, b.errors) for a, b in zip(here, there, strict=True))
     assert here[0].errors.mean() != here[1].errors.mean() and np.isfinite(here[0].errors).all()
@@ -250,22 +257,22 @@ def test_a_cluster_without_workers_or_with_some_that_lack_modules_is_refused(mon
 
     with distributed.LocalCluster(n_workers=0, dashboard_address=None) as cluster:
         for words in ("has no workers", "No module named 'studies'.*its folder in PYTHONPATH"):
-            with pytest.raises(WorkerError, match=words), dask_workers(cluster.scheduler_address):
+            with pytest.raises(WorkerError, match=words), workers(dask=cluster.scheduler_address):
                 pytest.fail("it went on without workers")
             monkeypatch.setattr(distributed.Client, "run", failing)
 
 
 def test_experiments_are_kept_up_to_the_limit_of_taichi(monkeypatch, cases):
-    monkeypatch.setattr(workers, "_built", {})
-    monkeypatch.setattr(workers, "_filled", {})
+    monkeypatch.setattr(case_workers, "_built", {})
+    monkeypatch.setattr(case_workers, "_filled", {})
     started, filled = [], []
-    monkeypatch.setattr(workers.sim.device, "start", lambda *a, **options: started.append(options))
-    monkeypatch.setattr(workers, "rest_body", lambda case, setup: filled.append(case.digest))
-    monkeypatch.setattr(workers, "BeadExperiment", lambda case, setup, rest: None)
+    monkeypatch.setattr(case_workers.sim.device, "start", lambda *a, **options: started.append(options))
+    monkeypatch.setattr(case_workers, "rest_body", lambda case, setup: filled.append(case.digest))
+    monkeypatch.setattr(case_workers, "BeadExperiment", lambda case, setup, rest: None)
     for radius in (2.0, 3.0, 4.0, 5.0, 6.0, 2.0, 6.0):
         setup = setup_of(MODEL, radius_mm=radius)
         key = (cases[0].digest, radius)
-        if key not in workers._built:
-            workers._build(key, cases[0], setup)
+        if key not in case_workers._built:
+            case_workers._build(key, cases[0], setup)
     assert len(started) == 2 and started[0] == {"cpu_max_num_threads": 1}
     assert len(filled) == 5

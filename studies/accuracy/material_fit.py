@@ -1,0 +1,222 @@
+"""Estimation of the material from bead experiments: moduli, Poisson's ratio and friction by nonlinear least squares.
+
+The residuals are positions of the beads and, where a case has them, forces on the probe. The confidence intervals are those of the
+linearised model (Seber & Wild 2003, Sec. 5.1); a parameter whose interval is wide, or that ends at a bound, is not determined.
+"""
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.stats import t as student
+
+import sim.device
+from rehearsal.configuration import Setup
+from rehearsal.worker_processes import Map
+from scenes.mechanical_tissues import mechanical_properties
+from sim.material import Material
+from sim.neo_hookean import NeoHookean
+from studies.accuracy.bead_case import BeadCase
+from studies.accuracy.bead_experiment import BeadExperiment
+from studies.study_results import text_table
+
+# What a bead's position and a force are known to, and the elements are off by: the residuals are in these units.
+BEAD_MM, FORCE_SHARE, LEAST_FORCE_N = 0.1, 0.03, 0.03
+# A wider 95 % interval, relative to the value, means that the data do not determine it.
+MOST_UNCERTAIN = 0.25
+# Moduli are searched over this many times the table's range.
+BEYOND = 3.0
+# Relative step of finite differences: the residuals are rounded to 1e-4 of their unit.
+STEP = 0.05
+POISSON, FRICTION = (0.3, 0.495), (0.05, 0.8)
+# Of parts that the table does not have.
+ANY_YOUNG_KPA = (0.5, 15.0, 500.0)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A parameter: its name, unit and bounds, and whether it is searched by its logarithm."""
+
+    name: str
+    unit: str
+    low: float
+    start: float
+    high: float
+    is_ratio: bool = True
+
+    def value(self, x: float) -> float:
+        """The value at a place of the search."""
+        return float(np.exp(x)) if self.is_ratio else x
+
+    def place(self, value: float) -> float:
+        """The place of a value in the search."""
+        return float(np.log(value)) if self.is_ratio else value
+
+
+@dataclass
+class MaterialFit:
+    """The parameters as found, places (p,) in the search with their covariance (p, p), and how well they fit."""
+
+    parameters: list[Fitted]
+    place: np.ndarray
+    covariance: np.ndarray
+    degrees: int
+    bead_rms_mm: float
+    force_rms_n: float | None
+    presses: int
+    cases: list[str] = field(default_factory=list)
+    size: dict[str, Any] = field(default_factory=dict)
+
+    def report(self) -> dict[str, Any]:
+        """The figures of material.json."""
+        quantile = float(student.ppf(0.975, max(self.degrees, 1)))
+        half = quantile * np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        rows = []
+        for each, x, width in zip(self.parameters, self.place, half, strict=True):
+            found = each.value(x)
+            low, high = each.value(x - width), each.value(min(x + width, 50.0))
+            at_bound = min(x - each.place(each.low), each.place(each.high) - x) < 1e-3
+            determined = bool((high - low) / 2 < MOST_UNCERTAIN * found and not at_bound)
+            rows.append(
+                dict(name=each.name, unit=each.unit, found=found, low=low, high=high, determined=determined)
+            )
+        return dict(
+            cases=self.cases,
+            **self.size,
+            parameters=rows,
+            bead_rms_mm=self.bead_rms_mm,
+            force_rms_n=self.force_rms_n,
+            presses=self.presses,
+        )
+
+
+def parameters_of(cases: Sequence[BeadCase]) -> list[Fitted]:
+    """What is estimated: modulus and Poisson's ratio outside the parts, the modulus of each part, friction."""
+    table = mechanical_properties().parts
+    found = [_young("young", table["kidney"].young_kpa)]
+    for name in dict.fromkeys(part.name for case in cases for part in case.parts):
+        ranges = table[name].young_kpa if name in table else ANY_YOUNG_KPA
+        found.append(_young(f"{name} young", ranges))
+    found.append(Fitted("poisson", "", POISSON[0], 0.42, POISSON[1], is_ratio=False))
+    found.append(Fitted("friction", "", *(FRICTION[0], 0.25, FRICTION[1]), is_ratio=False))
+    return found
+
+
+def _young(name: str, ranges: tuple[float, float, float]) -> Fitted:
+    low, _, high = ranges
+    return Fitted(name, "kPa", low / BEYOND, float(np.sqrt(low * high)), high * BEYOND)
+
+
+def fitted(cases: Sequence[BeadCase], setup: Setup, work: Map, done: Callable[[int], object]) -> MaterialFit:
+    """Fit all cases together. ``done`` is called with the number of finished presses."""
+    parameters = parameters_of(cases)
+    presses = 0
+
+    def residuals(places: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Residuals of all cases at several places of the search, computed in parallel."""
+        nonlocal presses
+        tried = [
+            {each.name: each.value(x) for each, x in zip(parameters, place, strict=True)} for place in places
+        ]
+        found = []
+        # Case by case, as a worker keeps what it has built.
+        for result in work(residuals_of, [(case, setup, values) for case in cases for values in tried]):
+            found.append(result)
+            presses += 1
+            done(1)
+        return [np.concatenate(found[n :: len(tried)]) for n in range(len(tried))]
+
+    def jacobian(place: np.ndarray) -> np.ndarray:
+        steps = np.array([STEP if each.is_ratio else STEP * (each.high - each.low) for each in parameters])
+        high = np.array([each.place(each.high) for each in parameters])
+        steps = np.where(place + steps > high, -steps, steps)
+        first, *moved = residuals([place, *(place + np.diag(steps))])
+        return np.column_stack([(each - first) / step for each, step in zip(moved, steps, strict=True)])
+
+    bounds = [[each.place(getattr(each, end)) for each in parameters] for end in ("low", "high")]
+    result = least_squares(
+        lambda place: residuals([place])[0],
+        [each.place(each.start) for each in parameters],
+        jac=jacobian,
+        bounds=bounds,
+        x_scale=[1.0 if each.is_ratio else each.high - each.low for each in parameters],
+        xtol=1e-3,
+        ftol=1e-4,
+        max_nfev=12,
+    )
+    degrees = len(result.fun) - len(parameters)
+    variance = float(result.fun @ result.fun) / max(degrees, 1)
+    covariance = variance * np.linalg.pinv(result.jac.T @ result.jac)
+    beads = sum(case.measured.size for case in cases)
+    bead, force = result.fun[:beads] if len(cases) == 1 else result.fun, None
+    if len(cases) == 1 and len(result.fun) > beads:
+        scale = _force_scale(cases[0])
+        force = float(np.sqrt(np.mean((result.fun[beads:] * scale) ** 2)))
+    return MaterialFit(
+        parameters=parameters,
+        place=result.x,
+        covariance=covariance,
+        degrees=degrees,
+        bead_rms_mm=float(BEAD_MM * np.sqrt(3 * np.mean(bead**2))),
+        force_rms_n=force,
+        presses=presses,
+        cases=[case.name for case in cases],
+        size={setup.tissue.size_key: setup.size_mm, "iterations": setup.iterations},
+    )
+
+
+_built: dict[tuple[str, float], BeadExperiment] = {}
+_turn = threading.Lock()
+
+
+def residuals_of(case: BeadCase, setup: Setup, values: dict[str, float]) -> np.ndarray:
+    """Residuals of one case: beads in units of BEAD_MM, then known forces in units of what they are known to."""
+    with _turn:
+        key = case.digest, setup.size_mm
+        if key not in _built:
+            _built.clear()
+            sim.device.start("cpu", cpu_max_num_threads=1)
+            _built[key] = BeadExperiment(case, setup.but(young_kpa=15.0, poisson=0.45))
+        experiment = _built[key]
+        model = experiment.model
+        assert isinstance(model, NeoHookean)
+        parts = [_with_young(part.material, values[f"{part.name} young"]) for part in case.parts]
+        model.set_material(values["young"], values["poisson"], parts)
+        model.contacts.coefficient[None] = values["friction"]
+        run = experiment.run(setup.but(young_kpa=values["young"], poisson=values["poisson"]))
+    beads = (run.beads - case.measured).ravel() / BEAD_MM
+    known = np.isfinite(case.probe_force_n).all(axis=1)
+    forces = (run.force_n - case.probe_force_n)[known].ravel() / _force_scale(case)
+    return np.nan_to_num(np.concatenate([beads, forces]), nan=1e3, posinf=1e3, neginf=-1e3)
+
+
+def _force_scale(case: BeadCase) -> np.ndarray:
+    """What each component of the known forces is known to [N]."""
+    known = case.probe_force_n[np.isfinite(case.probe_force_n).all(axis=1)]
+    size = np.linalg.norm(known, axis=1, keepdims=True)
+    return np.repeat(np.maximum(FORCE_SHARE * size, LEAST_FORCE_N), 3, axis=1).ravel()
+
+
+def _with_young(material: Material, young_kpa: float) -> Material:
+    return Material(young_kpa, material.poisson, material.density_g_cm3)
+
+
+def table(report: dict[str, Any]) -> str:
+    """The parameters with their 95 % intervals, and which the data do not determine."""
+    rows = [
+        [
+            f"{each['name']}{', ' if each['unit'] else ''}{each['unit']}",
+            each["found"],
+            each["low"],
+            each["high"],
+            "" if each["determined"] else "not determined by these data",
+        ]
+        for each in report["parameters"]
+    ]
+    figures = text_table(("parameter", "found", "95 % from", "to", ""), rows, ("", ".3g", ".3g", ".3g", ""))
+    force = "" if report["force_rms_n"] is None else f", forces {report['force_rms_n']:.3f} N"
+    fit = f"Root mean square of the residuals: beads {report['bead_rms_mm']:.3f} mm{force}; {report['presses']} presses"
+    return f"{figures}\n\n{fit}"

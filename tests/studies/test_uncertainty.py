@@ -1,0 +1,220 @@
+"""The study of uncertainty: what is varied, its bands and indices against a known function, and the panel's bands."""
+
+import json
+
+import numpy as np
+import pytest
+import taichi as ti
+import trimesh
+from small_bead_case import briefly, small_anatomy
+
+import app
+from rehearsal.asked_files import AskedFiles, check_anatomy
+from rehearsal.measurements.live_measurements import LiveMeasurements
+from rehearsal.measurements.tumour_measurements import Measurement
+from rehearsal.measurements.uncertainty_bands import UncertaintyBands, UncertaintyError, read_bands
+from rehearsal.rehearsal import Rehearsal
+from rehearsal.worker_processes import workers
+from scenes.anatomy import LoadedAnatomy
+from scenes.mechanical_tissues import mechanical_properties
+from scenes.scene import Attachment, Scene, with_options
+from sim.fields import array_of
+from studies.uncertainty import press_outcomes, uncertainty_command
+from studies.uncertainty.press_outcomes import QUANTITIES, PressProblem, press_outcome
+from studies.uncertainty.sensitivity import POSITION, bands_of, count_of, indices_of, samples_of
+from studies.uncertainty.unknowns import Unknown, set_values, unknowns_of, with_all_parts
+
+
+def patient() -> LoadedAnatomy:
+    """A ball in a bowl, with a tumour on its back and a cyst."""
+    ball = small_anatomy()
+    tumour = trimesh.creation.icosphere(subdivisions=2, radius=4.0).apply_translation([0.0, 5.0, 0.0])
+    cyst = trimesh.creation.icosphere(subdivisions=2, radius=2.0).apply_translation([6.0, -3.0, 0.0])
+    return LoadedAnatomy(ball.organ, tumour, None, ball.shapes, parts={"cyst": cyst})
+
+
+def scene() -> Scene:
+    held = Attachment(at_mm=(-12.0, 0.0, 0.0), radius_mm=5.0, stiffness_n_mm=1.0, fat_kpa_mm=0.2)
+    tissue = briefly(20).tissue.model_copy(update=dict(cell_mm=4.0, capsule_n_mm=0.3))
+    press = briefly(20).press.model_copy(update=dict(indentations_mm=(1.0, 2.0), stage_steps=15))
+    asked = briefly(20).model_copy(update=dict(attachment=held, tissue=tissue, press=press))
+    return with_all_parts(asked, patient())
+
+
+@pytest.fixture(scope="module")
+def problem() -> PressProblem:
+    return PressProblem(scene(), patient(), "one")
+
+
+def test_what_is_declared_or_has_a_surface_is_varied_over_the_tables_range():
+    found = {each.name: each for each in unknowns_of(scene(), patient())}
+    # The cyst is fluid: it has no stiffness to vary.
+    assert list(found) == [
+        "kidney young",
+        "kidney poisson",
+        "tumour young",
+        "capsule",
+        "pedicle",
+        "fat",
+        "friction",
+    ]
+    table = mechanical_properties()
+    tumour = found["tumour young"]
+    assert (tumour.low, tumour.typical, tumour.high) == table.parts["tumour"].young_kpa
+    assert tumour.value(0.5) == pytest.approx((tumour.low * tumour.high) ** 0.5)
+    poisson = found["kidney poisson"]
+    assert poisson.value(0.5) == pytest.approx((poisson.low + poisson.high) / 2)
+    plain = briefly(20).model_copy(update=dict(attachment=Attachment()))
+    assert [each.name for each in unknowns_of(plain, small_anatomy())] == [
+        "kidney young",
+        "kidney poisson",
+        "friction",
+    ]
+
+
+def test_values_reach_the_solver(device, problem):
+    rehearsal = Rehearsal(problem.scene, problem.anatomy)
+    model = rehearsal.model
+    tether, weight = array_of(model.tether), array_of(model.capsule.weight)
+    values = {
+        "kidney young": 7.0,
+        "kidney poisson": 0.4,
+        "tumour young": 20.0,
+        "capsule": 0.6,
+        "friction": 0.2,
+    }
+    set_values(rehearsal, values | {"pedicle": 2.0, "fat": 0.4})
+    assert (model.material.young_kpa, model.material.poisson) == (7.0, 0.4)
+    assert [part.young_kpa for part in model.parts] == [0.3, 20.0]
+    assert array_of(model.capsule.weight) == pytest.approx(2 * weight) and array_of(
+        model.tether
+    ) == pytest.approx(2 * tether)
+    assert rehearsal.contacts.coefficient[None] == pytest.approx(0.2)
+
+
+def test_an_outcome_depends_on_its_values_alone(problem, monkeypatch):
+    monkeypatch.setattr(press_outcomes, "_built", {})
+    usual, stiff = {"kidney young": 10.0}, {"kidney young": 20.0}
+    first = press_outcome(problem, usual)
+    other = press_outcome(problem, stiff)
+    assert (press_outcome(problem, usual) == first).all()
+    ti.reset()
+    force = QUANTITIES.index("force_n")
+    assert first.shape == (2, len(QUANTITIES) + 3) and first[1, force] > first[0, force] > 0
+    assert 1.4 < other[1, force] / first[1, force] < 2.1
+
+
+def test_bands_and_indices_are_those_of_a_known_function():
+    """y = a + 4 b + 0 c over uniform parameters: variances as 1 to 16 to 0, and additive."""
+    unknowns = [Unknown(name, "", 0.0, 0.5, 1.0, is_ratio=False) for name in "abc"]
+    values = samples_of(unknowns, 256)
+    assert len(values) == count_of(unknowns, 256) == 256 * 5
+    y = np.array([each["a"] + 4 * each["b"] for each in values])
+    outcomes = np.full((len(y), 2, len(QUANTITIES) + 3), np.nan)
+    outcomes[:, :, 0] = y[:, None] * [0.5, 1.0]
+    total = indices_of(unknowns, outcomes)
+    assert list(total) == [QUANTITIES[0]]
+    found = [total[QUANTITIES[0]][name]["total"] for name in "abc"]
+    assert found == pytest.approx([1 / 17, 16 / 17, 0.0], abs=0.02)
+    shallow, deep = (row[QUANTITIES[0]] for row in bands_of(outcomes))
+    # b's own percentiles 5, 50 and 95, to what a varies.
+    assert (deep["low"], deep["median"], deep["high"]) == pytest.approx((0.7, 2.5, 4.3), abs=0.1)
+    assert shallow["median"] == pytest.approx(deep["median"] / 2, abs=1e-3)
+    assert POSITION not in bands_of(outcomes)[0]
+
+
+def test_processes_here_and_on_a_cluster_find_the_same(problem, monkeypatch):
+    from distributed import LocalCluster
+
+    monkeypatch.setattr(press_outcomes, "_built", {})
+    tasks = [(problem, {"kidney young": young}) for young in (8.0, 16.0)]
+    with workers(1) as work:
+        here = list(work(press_outcome, tasks))
+    with (
+        LocalCluster(
+            n_workers=1, threads_per_worker=2, processes=False, protocol="tcp", dashboard_address=None
+        ) as cluster,
+        workers(dask=cluster.scheduler_address) as work,
+    ):
+        there = list(work(press_outcome, tasks))
+    ti.reset()
+    assert all(np.array_equal(a, b) for a, b in zip(here, there, strict=True))
+
+
+def test_the_command_reports_writes_and_is_read_again(tmp_path, monkeypatch, capsys):
+    def known(problem: PressProblem, values: dict[str, float]) -> np.ndarray:
+        row = np.array([1.0, 2.0, 3.0, 4.0, values["tumour young"] / 10, 6.0, 0.0, 0.0, 0.0])
+        return np.stack([row / 2, row, row * 2])
+
+    class Here:
+        def __enter__(self):
+            return lambda function, tasks: (known(*task) for task in tasks)
+
+        def __exit__(self, *_):
+            return None
+
+    monkeypatch.setattr(uncertainty_command, "workers", lambda jobs, dask: Here())
+    out = tmp_path / "out"
+    assert app.main(["study", "uncertainty", "--samples", "8", "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "tumour young" in printed and "force on the probe" in printed and "Varied:" in printed
+    report = json.loads((out / "uncertainty.json").read_text())
+    total = report["sobol_total"]["force_n"]
+    assert max(total, key=lambda name: total[name]["total"]) == "tumour young"
+    assert (out / "uncertainty.png").stat().st_size > 10_000 and (out / "uncertainty.csv").is_file()
+    bands = read_bands(out / "uncertainty.json")
+    assert bands.indentations_mm == [2.0, 4.0, 6.0]
+    assert app.main(["study", "uncertainty", "--samples", "12", "--out", str(out)]) == 2
+    assert "expected a power of two" in capsys.readouterr().err
+
+
+def bands(**changes) -> UncertaintyBands:
+    band = dict(low=1.0, median=2.0, high=4.0)
+    rows = [dict(force_n=band, to_tumour_mm=band), dict(force_n=band, margin_mm=band)]
+    return UncertaintyBands.model_validate(
+        dict(nephron_uncertainty=1, anatomy="a", indentations_mm=[2.0, 4.0], bands=rows) | changes
+    )
+
+
+def test_a_band_is_around_the_value_and_grows_with_the_depth():
+    assert bands().around("force_n", 10.0, 2.0) == (9.0, 12.0)
+    assert bands().around("force_n", 10.0, 1.0) == (9.5, 11.0)
+    assert bands().around("force_n", 10.0, 9.0) == (9.0, 12.0)
+    # Not at all depths.
+    assert bands().around("margin_mm", 10.0, 4.0) is None and bands().around("contact_mm2", 1.0, 1.0) is None
+
+
+def test_the_panel_shows_the_band_beside_the_measurement(device):
+    rehearsal = Rehearsal(with_options(briefly(2), {"tissue.cell_mm": 4.0}), small_anatomy())
+    rehearsal.pose = rehearsal.pose_at_depth(2.0)
+    measurements = LiveMeasurements(rehearsal, bands=bands())
+    measurements.latest = Measurement(1.0, 20.0, force_n=0.5)
+    found = measurements.findings()
+    # Nothing pulls: a force below zero is none.
+    assert found["force"] == "0.50 (0.00 to 2.50) N" and found["compression"] == "1.0 mm"
+    measurements.bands = None
+    assert measurements.findings()["force"] == "0.50 N"
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        (None, "no such file, which the scene names as uncertainty"),
+        ("{", "cannot be read as JSON"),
+        ("{}", "nephron_uncertainty: missing"),
+        (bands().model_copy(update=dict(bands=[])).model_dump_json(), "0 bands for 2 depths"),
+    ],
+)
+def test_a_file_of_bands_that_cannot_be_used_is_refused(tmp_path, text, words):
+    file = tmp_path / "uncertainty.json"
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(UncertaintyError, match=words) as error:
+        read_bands(file)
+    assert "app.py study uncertainty" in str(error.value) and "\n" not in str(error.value)
+
+
+def test_bands_of_another_patient_are_refused():
+    files = AskedFiles(None, briefly(1), None, None, bands=bands())
+    with pytest.raises(UncertaintyError, match="is of other anatomy than this scene"):
+        check_anatomy(files, None, small_anatomy())
