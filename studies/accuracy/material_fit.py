@@ -1,16 +1,18 @@
 """Estimation of the material from bead experiments: moduli, Poisson's ratio and friction by nonlinear least squares.
 
 The residuals are positions of the beads and, where a case has them, forces on the probe. The confidence intervals are those of the
-linearised model (Seber & Wild 2003, Sec. 5.1); a parameter whose interval is wide, or that ends at a bound, is not determined.
+linearised model (Seber & Wild 2003, Sec. 5.1). The residuals of a computation are not random: neighbouring beads are off alike, so that
+each stage counts as three independent observations only, one for each axis. A parameter whose interval is wide, or that ends at a
+bound, is not determined.
 """
 
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 from scipy.stats import t as student
 
 import sim.device
@@ -25,12 +27,17 @@ from studies.study_results import text_table
 
 # What a bead's position and a force are known to, and the elements are off by: the residuals are in these units.
 BEAD_MM, FORCE_SHARE, LEAST_FORCE_N = 0.1, 0.03, 0.03
-# A wider 95 % interval, relative to the value, means that the data do not determine it.
+# A wider half of an interval, relative to the value, means that the data do not determine it.
 MOST_UNCERTAIN = 0.25
+# Independent observations of a stage.
+AXES = 3
 # Moduli are searched over this many times the table's range.
 BEYOND = 3.0
 # Relative step of finite differences: the residuals are rounded to 1e-4 of their unit.
 STEP = 0.05
+MOST_STEPS = 12
+# Places of logarithms beyond which a value is no number, and nearer than which to a bound they are on it.
+MOST_PLACE, AT_BOUND = 50.0, 1e-3
 POISSON, FRICTION = (0.3, 0.495), (0.05, 0.8)
 # Of parts that the table does not have.
 ANY_YOUNG_KPA = (0.5, 15.0, 500.0)
@@ -56,40 +63,30 @@ class Fitted:
         return float(np.log(value)) if self.is_ratio else value
 
 
-@dataclass
+@dataclass(frozen=True)
 class MaterialFit:
-    """The parameters as found, places (p,) in the search with their covariance (p, p), and how well they fit."""
+    """The parameters as found, places (p,) in the search, with half of their 95 % intervals (p,), and how well they fit."""
 
     parameters: list[Fitted]
     place: np.ndarray
-    covariance: np.ndarray
-    degrees: int
-    bead_rms_mm: float
-    force_rms_n: float | None
+    half_width: np.ndarray
+    rms_mm: float
     presses: int
-    cases: list[str] = field(default_factory=list)
-    size: dict[str, Any] = field(default_factory=dict)
+    cases: list[str]
+    size: dict[str, Any]
 
     def report(self) -> dict[str, Any]:
         """The figures of material.json."""
-        quantile = float(student.ppf(0.975, max(self.degrees, 1)))
-        half = quantile * np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         rows = []
-        for each, x, width in zip(self.parameters, self.place, half, strict=True):
-            found = each.value(x)
-            low, high = each.value(x - width), each.value(min(x + width, 50.0))
-            at_bound = min(x - each.place(each.low), each.place(each.high) - x) < 1e-3
+        for each, x, width in zip(self.parameters, self.place, self.half_width, strict=True):
+            found, low, high = (each.value(v) for v in (x, x - width, min(x + width, MOST_PLACE)))
+            at_bound = min(x - each.place(each.low), each.place(each.high) - x) < AT_BOUND
             determined = bool((high - low) / 2 < MOST_UNCERTAIN * found and not at_bound)
             rows.append(
                 dict(name=each.name, unit=each.unit, found=found, low=low, high=high, determined=determined)
             )
         return dict(
-            cases=self.cases,
-            **self.size,
-            parameters=rows,
-            bead_rms_mm=self.bead_rms_mm,
-            force_rms_n=self.force_rms_n,
-            presses=self.presses,
+            cases=self.cases, **self.size, parameters=rows, bead_rms_mm=self.rms_mm, presses=self.presses
         )
 
 
@@ -112,60 +109,80 @@ def _young(name: str, ranges: tuple[float, float, float]) -> Fitted:
 
 def fitted(cases: Sequence[BeadCase], setup: Setup, work: Map, done: Callable[[int], object]) -> MaterialFit:
     """Fit all cases together. ``done`` is called with the number of finished presses."""
-    parameters = parameters_of(cases)
-    presses = 0
-
-    def residuals(places: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Residuals of all cases at several places of the search, computed in parallel."""
-        nonlocal presses
-        tried = [
-            {each.name: each.value(x) for each, x in zip(parameters, place, strict=True)} for place in places
-        ]
-        found = []
-        # Case by case, as a worker keeps what it has built.
-        for result in work(residuals_of, [(case, setup, values) for case in cases for values in tried]):
-            found.append(result)
-            presses += 1
-            done(1)
-        return [np.concatenate(found[n :: len(tried)]) for n in range(len(tried))]
-
-    def jacobian(place: np.ndarray) -> np.ndarray:
-        steps = np.array([STEP if each.is_ratio else STEP * (each.high - each.low) for each in parameters])
-        high = np.array([each.place(each.high) for each in parameters])
-        steps = np.where(place + steps > high, -steps, steps)
-        first, *moved = residuals([place, *(place + np.diag(steps))])
-        return np.column_stack([(each - first) / step for each, step in zip(moved, steps, strict=True)])
-
-    bounds = [[each.place(getattr(each, end)) for each in parameters] for end in ("low", "high")]
-    result = least_squares(
-        lambda place: residuals([place])[0],
-        [each.place(each.start) for each in parameters],
-        jac=jacobian,
-        bounds=bounds,
-        x_scale=[1.0 if each.is_ratio else each.high - each.low for each in parameters],
-        xtol=1e-3,
-        ftol=1e-4,
-        max_nfev=12,
-    )
-    degrees = len(result.fun) - len(parameters)
-    variance = float(result.fun @ result.fun) / max(degrees, 1)
-    covariance = variance * np.linalg.pinv(result.jac.T @ result.jac)
-    beads = sum(case.measured.size for case in cases)
-    bead, force = result.fun[:beads] if len(cases) == 1 else result.fun, None
-    if len(cases) == 1 and len(result.fun) > beads:
-        scale = _force_scale(cases[0])
-        force = float(np.sqrt(np.mean((result.fun[beads:] * scale) ** 2)))
+    search = _Search(parameters_of(cases), cases, work, done)
+    result = search.run(setup, [each.place(each.start) for each in search.parameters])
+    independent = AXES * sum(len(case.poses) for case in cases)
+    variance = float(result.fun @ result.fun) / independent
+    deviation = np.sqrt(np.diag(variance * np.linalg.pinv(result.jac.T @ result.jac)))
+    quantile = student.ppf(0.975, max(independent - len(result.x), 1))
+    beads = np.concatenate(search.split(result.fun))
     return MaterialFit(
-        parameters=parameters,
+        parameters=search.parameters,
         place=result.x,
-        covariance=covariance,
-        degrees=degrees,
-        bead_rms_mm=float(BEAD_MM * np.sqrt(3 * np.mean(bead**2))),
-        force_rms_n=force,
-        presses=presses,
+        half_width=quantile * deviation,
+        rms_mm=float(BEAD_MM * np.sqrt(3 * np.mean(beads**2))),
+        presses=search.presses,
         cases=[case.name for case in cases],
         size={setup.tissue.size_key: setup.size_mm, "iterations": setup.iterations},
     )
+
+
+@dataclass
+class _Search:
+    """Least squares over the parameters, whose presses ``work`` computes in parallel."""
+
+    parameters: list[Fitted]
+    cases: Sequence[BeadCase]
+    work: Map
+    done: Callable[[int], object]
+    presses: int = 0
+
+    def run(self, setup: Setup, start: Sequence[float]) -> OptimizeResult:
+        """The best places, from a start."""
+        bounds = [[each.place(getattr(each, end)) for each in self.parameters] for end in ("low", "high")]
+        return least_squares(
+            lambda place: self._residuals(setup, [place])[0],
+            start,
+            jac=lambda place: self._jacobian(setup, place),
+            bounds=bounds,
+            x_scale=[1.0 if each.is_ratio else each.high - each.low for each in self.parameters],
+            xtol=3e-4,
+            ftol=1e-5,
+            max_nfev=MOST_STEPS,
+        )
+
+    def split(self, residuals: np.ndarray) -> list[np.ndarray]:
+        """Those of the beads, case by case."""
+        found, start = [], 0
+        for case in self.cases:
+            found.append(residuals[start : start + case.measured.size])
+            start += case.measured.size + len(_force_scale(case))
+        return found
+
+    def _residuals(self, setup: Setup, places: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Residuals of all cases at several places of the search."""
+        tried = [
+            {each.name: each.value(x) for each, x in zip(self.parameters, place, strict=True)}
+            for place in places
+        ]
+        found = []
+        # Case by case, as a worker keeps what it has built.
+        for result in self.work(
+            residuals_of, [(case, setup, values) for case in self.cases for values in tried]
+        ):
+            found.append(result)
+            self.presses += 1
+            self.done(1)
+        return [np.concatenate(found[n :: len(tried)]) for n in range(len(tried))]
+
+    def _jacobian(self, setup: Setup, place: np.ndarray) -> np.ndarray:
+        high = np.array([each.place(each.high) for each in self.parameters])
+        steps = np.array(
+            [STEP if each.is_ratio else STEP * (each.high - each.low) for each in self.parameters]
+        )
+        steps = np.where(place + steps > high, -steps, steps)
+        first, *moved = self._residuals(setup, [place, *(place + np.diag(steps))])
+        return np.column_stack([(each - first) / step for each, step in zip(moved, steps, strict=True)])
 
 
 _built: dict[tuple[str, float], BeadExperiment] = {}
@@ -217,6 +234,4 @@ def table(report: dict[str, Any]) -> str:
         for each in report["parameters"]
     ]
     figures = text_table(("parameter", "found", "95 % from", "to", ""), rows, ("", ".3g", ".3g", ".3g", ""))
-    force = "" if report["force_rms_n"] is None else f", forces {report['force_rms_n']:.3f} N"
-    fit = f"Root mean square of the residuals: beads {report['bead_rms_mm']:.3f} mm{force}; {report['presses']} presses"
-    return f"{figures}\n\n{fit}"
+    return f"{figures}\n\nThe beads are {report['bead_rms_mm']:.3f} mm off (root mean square); {report['presses']} presses"
