@@ -34,7 +34,7 @@ AXES = 3
 # Moduli are searched over this many times the table's range.
 BEYOND = 3.0
 # Relative step of finite differences: the residuals are rounded to 1e-4 of their unit.
-STEP = 0.05
+STEP = 0.1
 MOST_STEPS = 12
 # Places of logarithms beyond which a value is no number, and nearer than which to a bound they are on it.
 MOST_PLACE, AT_BOUND = 50.0, 1e-3
