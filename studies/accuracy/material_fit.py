@@ -93,11 +93,11 @@ class MaterialFit:
 def parameters_of(cases: Sequence[BeadCase]) -> list[Fitted]:
     """What is estimated: modulus and Poisson's ratio outside the parts, the modulus of each part, friction."""
     table = mechanical_properties().parts
-    found = [_young("young", table["kidney"].young_kpa)]
+    found = [_young("modulus", table["kidney"].young_kpa)]
     for name in dict.fromkeys(part.name for case in cases for part in case.parts):
         ranges = table[name].young_kpa if name in table else ANY_YOUNG_KPA
-        found.append(_young(f"{name} young", ranges))
-    found.append(Fitted("poisson", "", POISSON[0], 0.42, POISSON[1], is_ratio=False))
+        found.append(_young(f"{name} modulus", ranges))
+    found.append(Fitted("Poisson's ratio", "", POISSON[0], 0.42, POISSON[1], is_ratio=False))
     found.append(Fitted("friction", "", *(FRICTION[0], 0.25, FRICTION[1]), is_ratio=False))
     return found
 
@@ -200,10 +200,10 @@ def residuals_of(case: BeadCase, setup: Setup, values: dict[str, float]) -> np.n
         experiment = _built[key]
         model = experiment.model
         assert isinstance(model, NeoHookean)
-        parts = [_with_young(part.material, values[f"{part.name} young"]) for part in case.parts]
-        model.set_material(values["young"], values["poisson"], parts)
+        parts = [_with_young(part.material, values[f"{part.name} modulus"]) for part in case.parts]
+        model.set_material(values["modulus"], values["Poisson's ratio"], parts)
         model.contacts.coefficient[None] = values["friction"]
-        run = experiment.run(setup.but(young_kpa=values["young"], poisson=values["poisson"]))
+        run = experiment.run(setup.but(young_kpa=values["modulus"], poisson=values["Poisson's ratio"]))
     beads = (run.beads - case.measured).ravel() / BEAD_MM
     known = np.isfinite(case.probe_force_n).all(axis=1)
     forces = (run.force_n - case.probe_force_n)[known].ravel() / _force_scale(case)

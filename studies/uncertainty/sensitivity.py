@@ -13,8 +13,8 @@ from studies.uncertainty.unknowns import Unknown
 SEED = 20161130
 BAND = (5.0, 50.0, 95.0)
 POSITION = "tumour_position_mm"
-# Quantities that vary by less than this, in mm or N, depend on nothing.
-LEAST_RANGE = 1e-3
+# Quantities whose 90 % band is narrower than this, in mm or N, depend on nothing that matters.
+LEAST_BAND = 0.05
 
 
 def samples_of(unknowns: Sequence[Unknown], base: int) -> list[dict[str, float]]:
@@ -54,7 +54,7 @@ def indices_of(unknowns: Sequence[Unknown], outcomes: np.ndarray) -> dict[str, d
     found = {}
     for n, name in enumerate(QUANTITIES):
         values = outcomes[:, -1, n]
-        if not np.isfinite(values).all() or np.ptp(values) < LEAST_RANGE:
+        if not np.isfinite(values).all() or np.ptp(np.percentile(values, BAND)) < LEAST_BAND:
             continue
         result = sobol_indices.analyze(
             _problem(unknowns), values, calc_second_order=False, print_to_console=False, seed=SEED

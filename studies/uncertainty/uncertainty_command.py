@@ -131,8 +131,9 @@ def table(report: dict[str, Any]) -> str:
 def figure_of(report: dict[str, Any]) -> Figure:
     """The bands over the depth, and the total indices."""
     figure = Figure(figsize=(11, 7), layout="constrained")
-    shown = [name for name in ("to_tumour_mm", "margin_mm", "force_n") if name in report["bands"][-1]]
-    panels = figure.subplots(2, len(shown), squeeze=False)
+    wanted = ("tumour_shift_mm", "to_tumour_mm", "margin_mm", "force_n")
+    shown = [name for name in wanted if name in report["sobol_total"]]
+    panels = figure.subplots(2, max(len(shown), 1), squeeze=False)
     depths = report["indentations_mm"]
     for column, name in enumerate(shown):
         bands = [row[name] for row in report["bands"] if name in row]
@@ -141,11 +142,11 @@ def figure_of(report: dict[str, Any]) -> Figure:
         axes.fill_between(depths[-len(bands) :], low, high, alpha=0.25, label="90 % band")
         axes.plot(depths[-len(bands) :], middle, marker=".", label="median")
         finish_axes(axes, legend={}, title=WORDS[name], xlabel="indentation, mm")
-        indices = report["sobol_total"].get(name, {})
+        indices = report["sobol_total"][name]
         names = list(indices)
         axes = panels[1, column]
         errors = [indices[each]["confidence"] for each in names]
         axes.barh(names, [indices[each]["total"] for each in names], xerr=errors)
-        finish_axes(axes, grid="x", xlabel="total Sobol index at the greatest depth", xlim=(0, 1.1))
+        finish_axes(axes, grid="x", xlabel="total Sobol index at full depth", xlim=(0, None))
     figure.suptitle("What is not known of the tissue, and what it changes")
     return figure

@@ -53,12 +53,12 @@ def unknowns_of(scene: Scene, anatomy: LoadedAnatomy) -> list[Unknown]:
     table, attachment = mechanical_properties(), scene.attachment
     kidney = table.parts[PARENCHYMA]
     found = [
-        Unknown(f"{PARENCHYMA} young", "kPa", *kidney.young_kpa),
-        Unknown(f"{PARENCHYMA} poisson", "", *kidney.poisson, is_ratio=False),
+        Unknown(f"{PARENCHYMA} modulus", "kPa", *kidney.young_kpa),
+        Unknown(f"{PARENCHYMA} Poisson's ratio", "", *kidney.poisson, is_ratio=False),
     ]
     for part in parts_of(scene, anatomy, np.zeros(3)):
         if part.material.poisson < FLUID_POISSON:
-            found.append(Unknown(f"{part.name} young", "kPa", *table.parts[part.name].young_kpa))
+            found.append(Unknown(f"{part.name} modulus", "kPa", *table.parts[part.name].young_kpa))
     if getattr(scene.tissue, "capsule_n_mm", 0) > 0:
         found.append(Unknown("capsule", "N/mm", *table.capsule_n_mm))
     if attachment.radius_mm > 0 and attachment.stiffness_n_mm > 0:
@@ -76,15 +76,15 @@ def set_values(rehearsal: Rehearsal, values: Mapping[str, float]) -> None:
     assert isinstance(model, NeoHookean) and isinstance(tissue, NeoHookeanTissue)
     parts = [
         Material(
-            values.get(f"{part.name} young", part.material.young_kpa),
+            values.get(f"{part.name} modulus", part.material.young_kpa),
             part.material.poisson,
             part.material.density_g_cm3,
         )
         for part in rehearsal.parts_of_tissue
     ]
     model.set_material(
-        values.get(f"{PARENCHYMA} young", tissue.young_kpa),
-        values.get(f"{PARENCHYMA} poisson", tissue.poisson),
+        values.get(f"{PARENCHYMA} modulus", tissue.young_kpa),
+        values.get(f"{PARENCHYMA} Poisson's ratio", tissue.poisson),
         parts,
     )
     if "capsule" in values:

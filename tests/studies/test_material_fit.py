@@ -51,14 +51,16 @@ def found_by(case: BeadCase) -> dict[str, dict]:
 
 def test_moduli_that_it_is_not_told_are_found(case):
     found = found_by(case)
-    wanted = {"young": 22.0, "sinus young": 5.0, "poisson": 0.4, "friction": FRICTION}
+    wanted = {"modulus": 22.0, "sinus modulus": 5.0, "Poisson's ratio": 0.4, "friction": FRICTION}
     assert found.keys() == wanted.keys()
     # Points come into contact one by one, which makes the residuals of so small a body rough: its beads are within 0.01 mm at
-    # values up to 15 % apart. It started at half of the modulus.
+    # values up to 20 % apart. It started at half of the modulus.
     for name, value in wanted.items():
-        assert found[name]["found"] == pytest.approx(value, rel=0.15), name
+        assert found[name]["found"] == pytest.approx(
+            value, rel=0.1 if name in ("modulus", "Poisson's ratio") else 0.25
+        ), name
         assert found[name]["low"] <= found[name]["found"] <= found[name]["high"]
-    assert found["young"]["determined"] and found["sinus young"]["determined"]
+    assert found["modulus"]["determined"] and found["sinus modulus"]["determined"]
 
 
 def test_what_the_data_do_not_determine_is_said(case):
@@ -71,13 +73,13 @@ def test_what_the_data_do_not_determine_is_said(case):
     )
     noisy = replace(noisy, digest="noisy")
     found = found_by(noisy)
-    assert not found["crumb young"]["determined"]
-    assert found["young"]["high"] - found["young"]["low"] > 0.5
+    assert not found["crumb modulus"]["determined"]
+    assert found["modulus"]["high"] - found["modulus"]["low"] > 0.5
 
 
 def test_residuals_are_in_units_of_what_is_known(case, monkeypatch):
     monkeypatch.setattr(material_fit, "_built", {})
-    true = {"young": 22.0, "poisson": 0.4, "friction": FRICTION, "sinus young": 5.0}
+    true = {"modulus": 22.0, "Poisson's ratio": 0.4, "friction": FRICTION, "sinus modulus": 5.0}
     shifted = replace(case, measured=case.measured + [BEAD_MM, 0, 0])
     residuals = residuals_of(shifted, SETUP, true)
     beads = residuals[: case.measured.size].reshape(-1, 3)
@@ -92,7 +94,7 @@ def test_bounds_and_starts_come_from_the_table(case):
     low, _, high = mechanical_properties().parts["sinus"].young_kpa
     assert (sinus.low, sinus.high) == (low / 3, high * 3) and sinus.low < sinus.start < sinus.high
     assert sinus.value(sinus.place(4.0)) == pytest.approx(4.0) and poisson.place(0.4) == 0.4
-    assert young.name == "young" and friction.start != FRICTION
+    assert young.name == "modulus" and friction.start != FRICTION
 
 
 def test_the_command_prints_and_writes_the_parameters(case, tmp_path, monkeypatch, capsys):
@@ -106,7 +108,7 @@ def test_the_command_prints_and_writes_the_parameters(case, tmp_path, monkeypatc
     out = tmp_path / "out"
     assert main(["calibrate", str(folder), "--model", "neo-hookean", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
-    assert "sinus young, kPa" in printed and printed.count("not determined by these data") == 1
+    assert "sinus modulus, kPa" in printed and printed.count("not determined by these data") == 1
     report = json.loads((out / "material.json").read_text())
     assert [each["determined"] for each in report["parameters"]] == [True, False, True, True]
     assert "0.100 mm off" in table(report)

@@ -50,24 +50,24 @@ def test_what_is_declared_or_has_a_surface_is_varied_over_the_tables_range():
     found = {each.name: each for each in unknowns_of(scene(), patient())}
     # The cyst is fluid: it has no stiffness to vary.
     assert list(found) == [
-        "kidney young",
-        "kidney poisson",
-        "tumour young",
+        "kidney modulus",
+        "kidney Poisson's ratio",
+        "tumour modulus",
         "capsule",
         "pedicle",
         "fat",
         "friction",
     ]
     table = mechanical_properties()
-    tumour = found["tumour young"]
+    tumour = found["tumour modulus"]
     assert (tumour.low, tumour.typical, tumour.high) == table.parts["tumour"].young_kpa
     assert tumour.value(0.5) == pytest.approx((tumour.low * tumour.high) ** 0.5)
-    poisson = found["kidney poisson"]
+    poisson = found["kidney Poisson's ratio"]
     assert poisson.value(0.5) == pytest.approx((poisson.low + poisson.high) / 2)
     plain = briefly(20).model_copy(update=dict(attachment=Attachment()))
     assert [each.name for each in unknowns_of(plain, small_anatomy())] == [
-        "kidney young",
-        "kidney poisson",
+        "kidney modulus",
+        "kidney Poisson's ratio",
         "friction",
     ]
 
@@ -77,9 +77,9 @@ def test_values_reach_the_solver(device, problem):
     model = rehearsal.model
     tether, weight = array_of(model.tether), array_of(model.capsule.weight)
     values = {
-        "kidney young": 7.0,
-        "kidney poisson": 0.4,
-        "tumour young": 20.0,
+        "kidney modulus": 7.0,
+        "kidney Poisson's ratio": 0.4,
+        "tumour modulus": 20.0,
         "capsule": 0.6,
         "friction": 0.2,
     }
@@ -94,7 +94,7 @@ def test_values_reach_the_solver(device, problem):
 
 def test_an_outcome_depends_on_its_values_alone(problem, monkeypatch):
     monkeypatch.setattr(press_outcomes, "_built", {})
-    usual, stiff = {"kidney young": 10.0}, {"kidney young": 20.0}
+    usual, stiff = {"kidney modulus": 10.0}, {"kidney modulus": 20.0}
     first = press_outcome(problem, usual)
     other = press_outcome(problem, stiff)
     assert (press_outcome(problem, usual) == first).all()
@@ -127,7 +127,7 @@ def test_processes_here_and_on_a_cluster_find_the_same(problem, monkeypatch):
     from distributed import LocalCluster
 
     monkeypatch.setattr(press_outcomes, "_built", {})
-    tasks = [(problem, {"kidney young": young}) for young in (8.0, 16.0)]
+    tasks = [(problem, {"kidney modulus": young}) for young in (8.0, 16.0)]
     with workers(1) as work:
         here = list(work(press_outcome, tasks))
     with (
@@ -143,7 +143,7 @@ def test_processes_here_and_on_a_cluster_find_the_same(problem, monkeypatch):
 
 def test_the_command_reports_writes_and_is_read_again(tmp_path, monkeypatch, capsys):
     def known(problem: PressProblem, values: dict[str, float]) -> np.ndarray:
-        row = np.array([1.0, 2.0, 3.0, 4.0, values["tumour young"] / 10, 6.0, 0.0, 0.0, 0.0])
+        row = np.array([1.0, 2.0, 3.0, 4.0, values["tumour modulus"] / 10, 6.0, 0.0, 0.0, 0.0])
         return np.stack([row / 2, row, row * 2])
 
     class Here:
@@ -157,10 +157,10 @@ def test_the_command_reports_writes_and_is_read_again(tmp_path, monkeypatch, cap
     out = tmp_path / "out"
     assert app.main(["study", "uncertainty", "--samples", "8", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
-    assert "tumour young" in printed and "force on the probe" in printed and "Varied:" in printed
+    assert "tumour modulus" in printed and "force on the probe" in printed and "Varied:" in printed
     report = json.loads((out / "uncertainty.json").read_text())
     total = report["sobol_total"]["force_n"]
-    assert max(total, key=lambda name: total[name]["total"]) == "tumour young"
+    assert max(total, key=lambda name: total[name]["total"]) == "tumour modulus"
     assert (out / "uncertainty.png").stat().st_size > 10_000 and (out / "uncertainty.csv").is_file()
     bands = read_bands(out / "uncertainty.json")
     assert bands.indentations_mm == [2.0, 4.0, 6.0]
