@@ -407,7 +407,7 @@ def test_without_pictures_none_is_taken_and_the_rest_is_written(monkeypatch, tmp
 
 def test_ctrl_c_in_a_run_says_so_before_how_it_went(monkeypatch, capsys):
     monkeypatch.setattr(run.RehearsalRun, "_end", lambda each, bookmarks: print(f"{bookmarks} bookmarks"))
-    monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide: None)
+    monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide, bands: None)
     driver = SimpleNamespace(session=SimpleNamespace(time_s=1.25), bookmarks=3)
     each = run.RehearsalRun(Fake(), None, "cpu", RehearseOptions(), FILES)
     with pytest.raises(Exit) as ended, each._summarised(driver, None):
@@ -430,7 +430,7 @@ def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scen
     monkeypatch.setattr(
         run,
         "LiveMeasurements",
-        lambda rehearsal, guide: SimpleNamespace(guide=None, summary=lambda bookmarks: {}),
+        lambda rehearsal, guide, bands: SimpleNamespace(guide=None, summary=lambda bookmarks: {}),
     )
     monkeypatch.setattr(run, "summary_text", lambda summary: "")
     each = run.RehearsalRun(Fake(), None, "cpu", RehearseOptions(scene=scene), FILES)
@@ -443,7 +443,7 @@ def test_at_the_end_stands_the_command_that_replays_it(monkeypatch, capsys, scen
 def test_a_run_hands_its_link_on_with_a_window_and_without(monkeypatch, tmp_path, sent):
     link, given = SimpleNamespace(send=lambda *live: sent.append(LiveImage(*live))), []
     viewer = SimpleNamespace(settings=Settings())
-    monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide: None)
+    monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide, bands: None)
     monkeypatch.setattr(run, "initial_settings", lambda rehearsal: Settings())
     looping = SimpleNamespace(run=lambda: None)
     looping.plans = looping.sweeping = SimpleNamespace(stop=lambda: None, end=lambda: "")
@@ -475,7 +475,7 @@ def test_the_command_opens_the_link_for_as_long_as_it_runs_and_names_its_scene(m
     monkeypatch.setattr(opening, "start_taichi", lambda arch: "cpu")
     monkeypatch.setattr(opening, "built_headless", lambda *_: None)
     monkeypatch.setattr(opening, "compile_picture", lambda rehearsal: None)
-    monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide: None)
+    monkeypatch.setattr(run, "LiveMeasurements", lambda rehearsal, guide, bands: None)
     monkeypatch.setattr(run.RehearsalRun, "headless", headless_run)
     line = [
         "rehearse",
