@@ -56,7 +56,7 @@ COMMANDS = {
     ),
     "calibrate": (
         "studies.accuracy.accuracy_commands:calibrate",
-        "Fit a tissue model to bead experiments, the folders CASE...",
+        "Fit a tissue model to bead experiments.",
     ),
     "beam": ("studies.beam.beam_command:beam", "Compare with the silicone beam of FOLDER (motion capture)."),
     "reference": (

@@ -124,8 +124,9 @@ class CalibrateOptions(CommandOptions):
 
 @command(CalibrateOptions)
 def calibrate(asked: CalibrateOptions) -> None:
-    """Fit a tissue model to bead experiments, the folders CASE...
+    """Fit a tissue model to bead experiments.
 
+    The experiments are the folders CASE.
     Shape matching as the paper did: every stiffness is tried for each particle radius, and judged on held-out data.
     neo-hookean: moduli, Poisson's ratio and friction by least squares, from beads and, where the case has them, forces on the probe.
     """
