@@ -176,7 +176,8 @@ def compression(
     """Figures of sweeps pressed over the tumour at several depths, without and with the compression correction."""
     start(arch)
     small = with_options(scene_of(scene, setup), {"image.pixels": PIXELS})
-    fixed = scene.attachment.model_copy(update={"radius_mm": FIXED_MM if scene.attachment.at_mm else 0.0})
+    radius_mm = FIXED_MM if scene.attachment.at_mm else 0.0
+    fixed = scene.attachment.model_copy(update={"radius_mm": radius_mm, "stiffness_n_mm": 0.0})
     rehearsal = Rehearsal(small.model_copy(update={"attachment": fixed}), anatomy)
     surfaces = surfaces_of(anatomy)
     rows = []
