@@ -154,10 +154,17 @@ class PressedOrgan:
 
     def _warm_up(self, *inputs: object) -> tuple[np.ndarray, ...]:
         """The state at rest: positions, velocities and history. The inputs are those of the organ itself."""
-        for _ in range(self.press.warm_up_steps):
-            self.advance(self.pose)
+        self.come_to_rest()
         state = self.solver.snapshot()
         return state.body.position, state.body.velocity, *state.history.values()
+
+    def come_to_rest(self) -> None:
+        """The paper's warm-up, from the present state. The patient has lain for long, so that the tissue relaxes wholly."""
+        relaxation = getattr(self.model, "relaxation", None)
+        for _ in range(self.press.warm_up_steps):
+            self.advance(self.pose)
+            if relaxation is not None:
+                relaxation.complete()
 
     def _inputs(self) -> Iterator[object]:
         """All that the state at rest depends on."""

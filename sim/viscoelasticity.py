@@ -52,6 +52,10 @@ class Relaxation:
         for field in (*self.state.values(), self.history):
             fill_evenly(field, 0.0)
 
+    def complete(self) -> None:
+        """Relax wholly: tissue that has been at rest for long has its elastic stress alone."""
+        fill_evenly(self.overstress, 0.0)
+
     @ti.func
     def begin(self, dt: float):
         """The part of the stress that does not depend on the new positions, and the factor of the part that does."""

@@ -47,8 +47,7 @@ def _press(rehearsal: Rehearsal, values: dict[str, float]) -> np.ndarray:
     solver.restart()
     rehearsal.divergence_check.set_initial_state()
     rehearsal.pose = rehearsal.pose_at_depth(-200.0)
-    for _ in range(press.warm_up_steps):
-        rehearsal.advance(rehearsal.pose)
+    rehearsal.come_to_rest()
     rehearsal.pose = rehearsal.pose_at_depth(0.0)
     step_s, touches = rehearsal.settings.time_step_s, np.ones(rehearsal.probe.number_of_scanlines, bool)
     outcomes = []
