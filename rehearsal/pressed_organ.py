@@ -27,6 +27,7 @@ from sim.shapes import Plane, SignedDistanceField
 from sim.solver import SolverState
 from sim.stored_arrays import stored
 from sim.surface_contact import SurfaceContacts
+from sim.viscoelasticity import Relaxation
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import advanced, array_face_centre, pose_at, poses_between
 
@@ -163,7 +164,7 @@ class PressedOrgan:
         relaxation = getattr(self.model, "relaxation", None)
         for _ in range(self.press.warm_up_steps):
             self.advance(self.pose)
-            if relaxation is not None:
+            if isinstance(relaxation, Relaxation):
                 relaxation.complete()
 
     def _inputs(self) -> Iterator[object]:
