@@ -3,36 +3,119 @@
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from typing import Any, TypeAlias
+from collections.abc import Callable, Hashable, Iterable, Iterator
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
+from itertools import islice
+from typing import Any, Self, TypeVar
 
 import psutil
-from joblib import Parallel, cpu_count, delayed, parallel_config
+from joblib import cpu_count
+from joblib.externals.loky import ProcessPoolExecutor
+from joblib.externals.loky.process_executor import ShutdownExecutorError
 
+import sim.device
 from errors import UserError
 
 WATCH_S = 0.5
 CONNECT_S = 10
-# ``map(function, tasks)``: results of function(*task) in the order of the tasks, each as soon as it is there.
-Map: TypeAlias = Callable[[Callable[..., Any], Sequence[tuple]], Iterator[Any]]
+# What a future raises whose worker has ended.
+ENDED = (BrokenExecutor, ShutdownExecutorError, CancelledError)
+T = TypeVar("T")
 
 
 class WorkerError(UserError):
-    """Workers that are not available; the message is one line."""
+    """Workers that are not available, or no longer; the message is one line."""
 
 
-@contextmanager
-def workers(jobs: int | None = None, dask: str | None = None) -> Iterator[Map]:
-    """Workers for functions of modules, with arguments that can be pickled; the results do not depend on their number.
+class Workers:
+    """Workers for functions of modules, with arguments that can be pickled; a context manager.
 
-    ``jobs`` processes on this machine, or one a processor; or those of the Dask cluster of the scheduler at an address, with this
-    project in their PYTHONPATH. Raises WorkerError.
+    They are ``jobs`` processes on this machine, or one a processor; or those of the Dask cluster of the scheduler at an address,
+    with this project in their PYTHONPATH. Even a single process is another one than this, where Taichi may be in use.
+    ``count`` is their number. Raises WorkerError.
     """
-    if dask is None:
-        with processes(jobs):
-            yield _map
-        return
+
+    def __init__(self, jobs: int | None = None, dask: str | None = None) -> None:
+        self._client: Any = None
+        if dask is None:
+            self.count = jobs or cpu_count()
+            self._executor: Executor = ProcessPoolExecutor(
+                self.count, initializer=end_with_parent, initargs=(os.getpid(),)
+            )
+        else:
+            self._client, self.count = _connect(dask)
+            self._executor = self._client.get_executor(pure=False)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def map(self, function: Callable[..., T], tasks: Iterable[tuple]) -> Iterator[T]:
+        """The results of ``function(*task)`` in the order of the tasks, which do not depend on the number of workers.
+
+        Raises what the function raises, and WorkerError where a worker has ended.
+        """
+        done: dict[int, Future] = {}
+        due = 0
+        for number, future in self.completed(function, tasks):
+            done[number] = future
+            while due in done:
+                try:
+                    yield done.pop(due).result()
+                except ENDED:
+                    raise WorkerError(
+                        "a worker process was ended, perhaps for lack of memory; close other programs, or give fewer --jobs"
+                    ) from None
+                due += 1
+
+    def completed(self, function: Callable[..., T], tasks: Iterable[tuple]) -> Iterator[tuple[int, Future]]:
+        """The number of each task and its future, as soon as it has ended. Tasks are taken as there is a worker for them soon."""
+        left, running = enumerate(tasks), dict[Future, int]()
+        while True:
+            # With more tasks queued than its processes soon take, loky's own thread fails when it is stopped.
+            for number, task in islice(left, 2 * self.count - len(running)):
+                running[self._submit(function, task)] = number
+            if not running:
+                return
+            ended, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in sorted(ended, key=running.__getitem__):
+                yield running.pop(future), future
+
+    def _submit(self, function: Callable[..., Any], task: tuple) -> Future:
+        try:
+            if self._client is not None:
+                return self._executor.submit(_in_one_thread, function, *task)
+            return self._executor.submit(function, *task)
+        except (*ENDED, RuntimeError) as error:
+            refused: Future = Future()
+            refused.set_exception(error if isinstance(error, ENDED) else CancelledError())
+            return refused
+
+    def share(self, value: T) -> T:
+        """A large argument of many tasks, sent once to each worker of a cluster. It must be an argument of its own."""
+        return value if self._client is None else self._client.scatter(value, broadcast=True)
+
+    def stop(self) -> None:
+        """End the tasks, and the processes of this machine; a thread that waits for them gets a WorkerError."""
+        if self._client is None:
+            self._executor.shutdown(wait=False, kill_workers=True)  # type: ignore[call-arg]
+        else:
+            self._executor.shutdown(wait=False)
+            self._client.close()
+
+
+def _connect(dask: str) -> tuple[Any, int]:
+    """A client of the cluster at an address, and the number of its workers. Raises WorkerError."""
     try:
         from distributed import Client
     except ImportError:
@@ -45,20 +128,18 @@ def workers(jobs: int | None = None, dask: str | None = None) -> Iterator[Map]:
         raise WorkerError(
             f"--dask {dask}: no scheduler answers there ({error}); start one, or correct it"
         ) from None
-    with client:
-        try:
-            found = client.run(_ready)
-        except Exception as error:  # any exception of a worker
-            raise WorkerError(
-                f"--dask {dask}: a worker is not ready ({error}); start workers with this project's requirements "
-                f"installed and its folder in PYTHONPATH"
-            ) from None
-        if not found:
-            raise WorkerError(
-                f"--dask {dask}: the cluster has no workers; start some with: dask worker {dask}"
-            )
-        with parallel_config(backend="dask", client=client, wait_for_workers_timeout=CONNECT_S):
-            yield _map
+    try:
+        ready = client.run(_ready)
+    except Exception as error:  # any exception of a worker
+        client.close()
+        raise WorkerError(
+            f"--dask {dask}: a worker is not ready ({error}); start workers with this project's requirements "
+            f"installed and its folder in PYTHONPATH"
+        ) from None
+    if not ready:
+        client.close()
+        raise WorkerError(f"--dask {dask}: the cluster has no workers; start some with: dask worker {dask}")
+    return client, len(ready)
 
 
 def _ready() -> bool:
@@ -66,20 +147,28 @@ def _ready() -> bool:
     return True
 
 
-def _map(function: Callable[..., Any], tasks: Sequence[tuple]) -> Iterator[Any]:
-    calls = (delayed(_attempt)(function, task) for task in tasks)
-    for result in Parallel(batch_size=1, return_as="generator")(calls):
-        if isinstance(result, Exception):
-            raise result
-        yield result
+# A Dask worker may run several threads; Taichi serves the one that has started it.
+_one_thread = ThreadPoolExecutor(1)
 
 
-def _attempt(function: Callable[..., Any], task: tuple) -> Any:
-    # joblib would wait forever for a task that raises on Dask.
-    try:
-        return function(*task)
-    except Exception as error:
-        return error
+def _in_one_thread(function: Callable[..., Any], *task: Any) -> Any:
+    return _one_thread.submit(function, *task).result()
+
+
+_built: dict[Hashable, Any] = {}
+
+
+def built_once(key: Hashable, build: Callable[[], T], most: int = 1) -> T:
+    """What this worker keeps from task to task: what was built under this key, or is built now, on one CPU thread of Taichi.
+
+    Taichi starts anew for it, and all else is lost, where already ``most`` are kept.
+    """
+    if key not in _built:
+        if not _built or len(_built) >= most:
+            _built.clear()
+            sim.device.start("cpu", cpu_max_num_threads=1)
+        _built[key] = build()
+    return _built[key]
 
 
 def end_with_parent(parent: int) -> None:
@@ -88,13 +177,6 @@ def end_with_parent(parent: int) -> None:
     Workers of a pool whose process was killed would otherwise finish their tasks and wait for more.
     """
     threading.Thread(target=_watch, args=(parent,), daemon=True).start()
-
-
-def processes(jobs: int | None = None) -> parallel_config:
-    """A context in which joblib uses so many processes, or one per processor, that end with this one."""
-    return parallel_config(
-        backend="loky", n_jobs=jobs or cpu_count(), initializer=end_with_parent, initargs=(os.getpid(),)
-    )
 
 
 def _watch(parent: int) -> None:

@@ -18,6 +18,7 @@ import pytest
 import taichi as ti
 import trimesh
 
+from rehearsal import worker_processes
 from sim import stored_arrays
 from sim.device import start
 
@@ -87,6 +88,26 @@ def kept(one_device) -> Callable:
         return thing
 
     return keep
+
+
+@pytest.fixture
+def nothing_built() -> Iterator[None]:
+    """What tasks build in this process is of a Taichi that the next test starts anew."""
+    worker_processes._built.clear()
+    yield
+    worker_processes._built.clear()
+    ti.reset()
+
+
+@pytest.fixture(scope="session")
+def cluster() -> Iterator[str]:
+    """The address of a Dask cluster of one worker with two threads: this process, reached as any other would be."""
+    from distributed import LocalCluster
+
+    with LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, protocol="tcp", dashboard_address=None
+    ) as local:
+        yield local.scheduler_address
 
 
 @pytest.fixture

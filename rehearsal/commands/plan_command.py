@@ -46,6 +46,8 @@ class PlanOptions(QualityOptions):
     """Simulated sweeps in the search."""
     jobs: int | None = Field(None, ge=1, le=256)
     """Processes [as many as there are processors]."""
+    dask: str | None = None
+    """Run on the Dask cluster of this scheduler, such as tcp://host:8786."""
 
 
 @command(PlanOptions)
@@ -61,16 +63,17 @@ def plan(asked: PlanOptions) -> None:
     from rehearsal.planning.plan_search import make_plan, total_work
     from rehearsal.planning.sweep_trial import PlanningProblem
     from rehearsal.planning.trial_workers import TrialWorkers
+    from rehearsal.worker_processes import Workers
 
     target: Target = asked.target or ("organ" if anatomy.tumour is None else "margin")
     problem = PlanningProblem(loaded, anatomy, scene_probe, target, asked.margin_mm, port)
     if port.at_mm is None:
         click.echo("No trocar is given: all poses count as reachable.")
     with (
-        TrialWorkers(problem, asked.jobs) as workers,
+        Workers(asked.jobs, asked.dask) as workers,
         tqdm(total=total_work(asked.trials, asked.speed_mm_s), desc="plan", unit="trial") as bar,
     ):
-        made = make_plan(workers, asked.speed_mm_s, asked.trials, bar.update)
+        made = make_plan(TrialWorkers(problem, workers), asked.speed_mm_s, asked.trials, bar.update)
         bar.update(bar.total - bar.n)
     write_plan(made, out)
     click.echo("\n".join(made.why))

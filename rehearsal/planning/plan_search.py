@@ -16,7 +16,7 @@ from rehearsal.planning.rigid_surrogate import RigidSurrogate
 from rehearsal.planning.sweep_candidates import SweepCandidate, candidates_of
 from rehearsal.planning.sweep_score import ScoreTerms, in_words, points, score, why_better
 from rehearsal.planning.sweep_trial import Trial
-from rehearsal.planning.trial_workers import TrialWorkers
+from rehearsal.planning.trial_workers import Trials
 from scenes.anatomy import fingerprint
 from version import VERSION
 
@@ -138,7 +138,7 @@ def work_at(speed_mm_s: float) -> int:
     return max(1, round((1 + TRIAL_MM_S / speed_mm_s) / 2))
 
 
-def make_plan(workers: TrialWorkers, speed_mm_s: float, trials: int, progress: Progress) -> Plan:
+def make_plan(workers: Trials, speed_mm_s: float, trials: int, progress: Progress) -> Plan:
     """Search a plan for the workers' problem. Raises PlanError where no sweep is reachable.
 
     ``progress`` is called with 0 when the search begins, then with the work done, in trials; the sum is ``total_work``.
@@ -186,7 +186,7 @@ def make_plan(workers: TrialWorkers, speed_mm_s: float, trials: int, progress: P
 
 
 def search(
-    candidates: list[SweepCandidate], workers: TrialWorkers, trials: int, progress: Progress
+    candidates: list[SweepCandidate], workers: Trials, trials: int, progress: Progress
 ) -> list[CandidateSearch]:
     """Search all candidates with a total of trials: one generation of each, then the better half with the rest."""
     searches = []
@@ -201,7 +201,7 @@ def search(
     return searches
 
 
-def _generation(active: list[CandidateSearch], workers: TrialWorkers, most: int, progress: Progress) -> int:
+def _generation(active: list[CandidateSearch], workers: Trials, most: int, progress: Progress) -> int:
     """Run one generation of each search, with at most so many trials; return how many were run."""
     share = [most // len(active) + (number < most % len(active)) for number in range(len(active))]
     asked = [one.ask()[:count] for one, count in zip(active, share, strict=True)]
@@ -222,7 +222,7 @@ def _generation(active: list[CandidateSearch], workers: TrialWorkers, most: int,
 
 
 def ranked(
-    searches: list[CandidateSearch], workers: TrialWorkers, speed_mm_s: float, progress: Progress
+    searches: list[CandidateSearch], workers: Trials, speed_mm_s: float, progress: Progress
 ) -> list[tuple[CandidateSearch, ScoreTerms, list[np.ndarray]]]:
     """The best of each candidate, tried once more at the planned speed; highest score first."""
     tried = [one for one in searches if one.trials]

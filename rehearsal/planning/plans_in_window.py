@@ -15,6 +15,7 @@ from rehearsal.planning.plan_search import make_plan, total_work
 from rehearsal.planning.sweep_trial import PlanningProblem
 from rehearsal.planning.trial_workers import TrialWorkers
 from rehearsal.rehearsal import Rehearsal
+from rehearsal.worker_processes import WorkerError, Workers
 from render.viewer import Controls, Settings
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import with_options
@@ -34,7 +35,7 @@ class PlanJob:
     def __init__(self, problem: PlanningProblem, path: Path) -> None:
         self.path, self._problem = path, problem
         self._work_done, self._began_s = 0, 0.0
-        self._workers: TrialWorkers | None = None
+        self._workers: Workers | None = None
         self._is_stopped = False
         self.result = ThreadPoolExecutor(1, "plan").submit(self._run)
 
@@ -57,10 +58,10 @@ class PlanJob:
 
     def _run(self) -> Plan:
         # One processor is left to the rehearsal.
-        with TrialWorkers(self._problem, max(1, cpu_count() - 1)) as self._workers:
+        with Workers(max(1, cpu_count() - 1)) as self._workers:
             # Either stop() has seen these workers, or this sees that it was called.
             self._count(0)
-            plan = make_plan(self._workers, SPEED_MM_S, TRIALS, self._count)
+            plan = make_plan(TrialWorkers(self._problem, self._workers), SPEED_MM_S, TRIALS, self._count)
         write_plan(plan, self.path)
         return plan
 
@@ -148,7 +149,7 @@ class PlanControl:
     def _take(self, job: PlanJob) -> None:
         try:
             guide = PlanGuidance(self.rehearsal, job.result.result())
-        except PlanError as error:
+        except (PlanError, WorkerError) as error:
             self.notices.post(str(error))
         except OSError as error:
             self.notices.post(f"{job.path.name} cannot be written: {error.strerror}")

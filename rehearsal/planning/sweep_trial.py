@@ -45,8 +45,10 @@ class PlanningProblem:
 
     @property
     def without_images(self) -> "PlanningProblem":
-        """The same without CT, labels and parts, which no trial needs."""
-        return replace(self, anatomy=replace(self.anatomy, ct=None, labels=None, parts={}))
+        """The same without CT and labels, and without parts that have no material of their own, which no trial needs."""
+        material = getattr(self.scene.tissue, "parts", {})
+        parts = {name: part for name, part in self.anatomy.parts.items() if name in material}
+        return replace(self, anatomy=replace(self.anatomy, ct=None, labels=None, parts=parts))
 
 
 class Trial:

@@ -1,69 +1,44 @@
-"""Trials in parallel processes; the results do not depend on how many.
+"""Trials of one problem: in parallel on workers, or in this process; the results are the same."""
 
-Each process computes on one CPU thread and keeps the trial that it has built.
-"""
-
-import os
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError, Future
-from itertools import islice
-from typing import Any, Self
+from typing import Any, Protocol
+from uuid import uuid4
 
-from joblib import cpu_count
-from joblib.externals.loky import ProcessPoolExecutor
-from joblib.externals.loky.process_executor import ShutdownExecutorError
-
-import sim.device
-from rehearsal.planning.plan_file import PlanError
 from rehearsal.planning.sweep_trial import PlanningProblem, Trial
-from rehearsal.worker_processes import end_with_parent
+from rehearsal.worker_processes import Workers, built_once
+
+
+class Trials(Protocol):
+    """What tries sweeps for a problem."""
+
+    problem: PlanningProblem
+
+    def map(self, function: Callable, tasks: Sequence[tuple]) -> Iterator[Any]:
+        """The results of ``function(trial, *task)`` in the order of the tasks, each as soon as it is there."""
 
 
 class TrialWorkers:
-    """Processes with a trial of one problem each, as many as there are processors where ``jobs`` is None; a context manager.
+    """Workers with a trial of one problem each."""
 
-    Even a single one is a separate process, because Taichi may be in use in this one.
-    """
-
-    def __init__(self, problem: PlanningProblem, jobs: int | None = None) -> None:
-        self.problem, self._jobs = problem, jobs or cpu_count()
-        self._pool = ProcessPoolExecutor(self._jobs, initializer=end_with_parent, initargs=(os.getpid(),))
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
+    def __init__(self, problem: PlanningProblem, workers: Workers) -> None:
+        self.problem, self._workers = problem, workers
+        self._key, self._sent = uuid4().hex, workers.share(problem.without_images)
 
     def map(self, function: Callable, tasks: Sequence[tuple]) -> Iterator[Any]:
-        """The results of ``function(trial, *task)`` in the order of the tasks, each as soon as it is there. Raises PlanError."""
-        waiting: deque[Future] = deque()
-        left, problem = iter(tasks), self.problem.without_images
-        try:
-            while True:
-                # With more tasks queued than its processes soon take, loky's own thread fails when it is stopped.
-                for task in islice(left, 2 * self._jobs - len(waiting)):
-                    waiting.append(self._pool.submit(_call, problem, function, *task))
-                if not waiting:
-                    return
-                yield waiting.popleft().result()
-        except (BrokenExecutor, ShutdownExecutorError, CancelledError):
-            raise PlanError(
-                "a process of the search was ended, perhaps for lack of memory; close other programs, or give fewer --jobs"
-            ) from None
-
-    def stop(self) -> None:
-        """End the processes; a thread that waits for them gets a PlanError."""
-        self._pool.shutdown(wait=False, kill_workers=True)
+        """As ``Trials.map``. Raises WorkerError."""
+        return self._workers.map(_call, ((self._key, self._sent, function, *task) for task in tasks))
 
 
-# The trial of this process, which has one problem only.
-_built: list[Trial] = []
+class TrialHere:
+    """The one trial of this process."""
+
+    def __init__(self, problem: PlanningProblem, trial: Trial) -> None:
+        self.problem, self._trial = problem, trial
+
+    def map(self, function: Callable, tasks: Sequence[tuple]) -> Iterator[Any]:
+        """As ``Trials.map``."""
+        return (function(self._trial, *task) for task in tasks)
 
 
-def _call(problem: PlanningProblem, function: Callable, *task: object) -> Any:
-    if not _built:
-        sim.device.start("cpu", cpu_max_num_threads=1)
-        _built.append(Trial(problem))
-    return function(_built[0], *task)
+def _call(key: str, problem: PlanningProblem, function: Callable, *task: object) -> Any:
+    return function(built_once(key, lambda: Trial(problem)), *task)

@@ -22,7 +22,7 @@ from rehearsal.commands.command_line import (
     start_taichi,
 )
 from rehearsal.configuration import choose_setup
-from rehearsal.worker_processes import workers
+from rehearsal.worker_processes import Workers
 from scenes.scene import model_with
 from scenes.tissue import QUALITIES, TISSUES, USUAL
 from studies.accuracy.bead_case import load_case
@@ -142,8 +142,8 @@ def _fit_material(asked: CalibrateOptions) -> None:
     from studies.accuracy import material_fit
 
     setup = choose_setup(asked.model, asked.quality)
-    with workers(asked.jobs, asked.dask) as work, tqdm(desc="calibrate", unit="press") as bar:
-        fit = material_fit.fitted(loaded, setup, work, bar.update)
+    with Workers(asked.jobs, asked.dask) as workers, tqdm(desc="calibrate", unit="press") as bar:
+        fit = material_fit.fitted(loaded, setup, workers, bar.update)
     figures = fit.report()
     save_figures(figures, asked.out / "material.json")
     click.echo(f"\n{material_fit.table(figures)}\n\nWrote material.json to {asked.out}")
@@ -157,8 +157,8 @@ def _fit_shape_matching(asked: CalibrateOptions) -> None:
     from studies.accuracy import calibration, calibration_results, case_workers
 
     split = calibration.split_of(loaded, asked.hold_out)
-    with workers(asked.jobs, asked.dask) as work:
-        evaluate = partial(work, case_workers.evaluate)
+    with Workers(asked.jobs, asked.dask) as workers:
+        evaluate = partial(workers.map, case_workers.evaluate)
         if generations:
             count = calibration.search_count(len(loaded), len(radii_mm), generations)
         else:

@@ -6,7 +6,6 @@ each stage counts as three independent observations only, one for each axis. A p
 bound, is not determined.
 """
 
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,9 +14,8 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.stats import t as student
 
-import sim.device
 from rehearsal.configuration import Setup
-from rehearsal.worker_processes import Map
+from rehearsal.worker_processes import Workers, built_once
 from scenes.mechanical_tissues import mechanical_properties
 from sim.material import Material
 from sim.neo_hookean import NeoHookean
@@ -107,9 +105,11 @@ def _young(name: str, ranges: tuple[float, float, float]) -> Fitted:
     return Fitted(name, "kPa", low / BEYOND, float(np.sqrt(low * high)), high * BEYOND)
 
 
-def fitted(cases: Sequence[BeadCase], setup: Setup, work: Map, done: Callable[[int], object]) -> MaterialFit:
+def fitted(
+    cases: Sequence[BeadCase], setup: Setup, workers: Workers, done: Callable[[int], object]
+) -> MaterialFit:
     """Fit all cases together. ``done`` is called with the number of finished presses."""
-    search = _Search(parameters_of(cases), cases, work, done)
+    search = _Search(parameters_of(cases), cases, workers, done)
     result = search.run(setup, [each.place(each.start) for each in search.parameters])
     independent = AXES * sum(len(case.poses) for case in cases)
     variance = float(result.fun @ result.fun) / independent
@@ -129,11 +129,11 @@ def fitted(cases: Sequence[BeadCase], setup: Setup, work: Map, done: Callable[[i
 
 @dataclass
 class _Search:
-    """Least squares over the parameters, whose presses ``work`` computes in parallel."""
+    """Least squares over the parameters, whose presses ``workers`` compute in parallel."""
 
     parameters: list[Fitted]
     cases: Sequence[BeadCase]
-    work: Map
+    workers: Workers
     done: Callable[[int], object]
     presses: int = 0
 
@@ -167,7 +167,7 @@ class _Search:
         ]
         found = []
         # Case by case, as a worker keeps what it has built.
-        for result in self.work(
+        for result in self.workers.map(
             residuals_of, [(case, setup, values) for case in self.cases for values in tried]
         ):
             found.append(result)
@@ -185,25 +185,17 @@ class _Search:
         return np.column_stack([(each - first) / step for each, step in zip(moved, steps, strict=True)])
 
 
-_built: dict[tuple[str, float], BeadExperiment] = {}
-_turn = threading.Lock()
-
-
 def residuals_of(case: BeadCase, setup: Setup, values: dict[str, float]) -> np.ndarray:
     """Residuals of one case: beads in units of BEAD_MM, then known forces in units of what they are known to."""
-    with _turn:
-        key = case.digest, setup.size_mm
-        if key not in _built:
-            _built.clear()
-            sim.device.start("cpu", cpu_max_num_threads=1)
-            _built[key] = BeadExperiment(case, setup.but(young_kpa=15.0, poisson=0.45))
-        experiment = _built[key]
-        model = experiment.model
-        assert isinstance(model, NeoHookean)
-        parts = [_with_young(part.material, values[f"{part.name} modulus"]) for part in case.parts]
-        model.set_material(values["modulus"], values["Poisson's ratio"], parts)
-        model.contacts.coefficient[None] = values["friction"]
-        run = experiment.run(setup.but(young_kpa=values["modulus"], poisson=values["Poisson's ratio"]))
+    usual = setup.but(young_kpa=15.0, poisson=0.45)
+    key = "material fit", case.digest, setup.size_mm
+    experiment = built_once(key, lambda: BeadExperiment(case, usual))
+    model = experiment.model
+    assert isinstance(model, NeoHookean)
+    parts = [_with_young(part.material, values[f"{part.name} modulus"]) for part in case.parts]
+    model.set_material(values["modulus"], values["Poisson's ratio"], parts)
+    model.contacts.coefficient[None] = values["friction"]
+    run = experiment.run(setup.but(young_kpa=values["modulus"], poisson=values["Poisson's ratio"]))
     beads = (run.beads - case.measured).ravel() / BEAD_MM
     known = np.isfinite(case.probe_force_n).all(axis=1)
     forces = (run.force_n - case.probe_force_n)[known].ravel() / _force_scale(case)

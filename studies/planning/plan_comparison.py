@@ -18,10 +18,11 @@ from rehearsal.planning.plan_search import make_plan, total_work, try_path, work
 from rehearsal.planning.sweep_score import ScoreTerms, score
 from rehearsal.planning.sweep_trial import PlanningProblem, Trial
 from rehearsal.planning.trial_workers import TrialWorkers
+from rehearsal.worker_processes import Workers
 from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.scene import EMBEDDED, Scene, load_scene, scene_file, with_options
 from studies.planning.baseline_sweeps import UNPLANNED, planned, random_sweep
-from studies.study_options import jobs_option, out_option
+from studies.study_options import dask_option, jobs_option, out_option
 from studies.study_results import text_table, write_results
 from ultrasound.target import Target
 
@@ -59,7 +60,10 @@ COLUMNS = {
 )
 @click.option("--probe", default="drop-in", show_default=True, help="Probe, by its name or as a file.")
 @jobs_option
-def plan_study(scenes: tuple[Path, ...], out: Path, trials: int, probe: str, jobs: int | None) -> None:
+@dask_option
+def plan_study(
+    scenes: tuple[Path, ...], out: Path, trials: int, probe: str, jobs: int | None, dask: str | None
+) -> None:
     """Compare planned sweeps with straight and random ones.
 
     Over the tumour and 5 mm around it, in SCENES [the embedded patient].
@@ -68,12 +72,15 @@ def plan_study(scenes: tuple[Path, ...], out: Path, trials: int, probe: str, job
     make_folder(out)
     runs = []
     patients = scenes or (EMBEDDED,)
-    with tqdm(total=len(patients) * count_of(trials), desc="plan", unit="trial") as bar:
+    with (
+        Workers(jobs, dask) as workers,
+        tqdm(total=len(patients) * count_of(trials), desc="plan", unit="trial") as bar,
+    ):
         for number, each in enumerate(patients, 1):
             path = scene_file(each)
             scene = with_options(load_scene(path), {"transducer.probe": probe})
             anatomy = with_tumour(load_anatomy(scene, path.parent), np.array(scene.gravity.direction))
-            run = compare(scene, anatomy, trials, jobs, bar.update)
+            run = compare(scene, anatomy, trials, workers, bar.update)
             runs.append(dict(patient=scene.title or f"patient {number}") | run)
             bar.update(number * bar.total // len(patients) - bar.n)
     write_results(out, "plan", dict(trials=trials, runs=runs), "\n".join(map(table, runs)))
@@ -85,13 +92,12 @@ def count_of(trials: int) -> int:
 
 
 def compare(
-    scene: Scene, anatomy: LoadedAnatomy, trials: int, jobs: int | None, done: Callable[[int], Any]
+    scene: Scene, anatomy: LoadedAnatomy, trials: int, workers: Workers, done: Callable[[int], Any]
 ) -> dict[str, Any]:
     """Plan for the tumour and its margin, and compute planned, straight and random sweeps. Raises PlanError."""
     probe = probe_of(scene)
     problem = PlanningProblem(scene_of(scene, PLANNED_ON), anatomy, probe, TARGET, MARGIN_MM, scene.trocar)
-    with TrialWorkers(problem, jobs) as workers:
-        plan = make_plan(workers, SPEED_MM_S, trials, done)
+    plan = make_plan(TrialWorkers(problem, workers), SPEED_MM_S, trials, done)
     sweep = plan.sweeps[0]
     paths: list[Callable[[Trial], list[np.ndarray]]] = [
         partial(planned, sweep=sweep),
@@ -99,10 +105,10 @@ def compare(
         *(partial(random_sweep, count=len(sweep.passes), seed=seed) for seed in SEEDS),
     ]
     outcomes: list[ScoreTerms] = []
-    with TrialWorkers(replace(problem, scene=scene_of(scene, JUDGED_ON)), jobs) as workers:
-        for terms, _ in workers.map(try_path, [(make, SPEED_MM_S) for make in paths]):
-            outcomes.append(terms)
-            done(work_at(SPEED_MM_S))
+    judges = TrialWorkers(replace(problem, scene=scene_of(scene, JUDGED_ON)), workers)
+    for terms, _ in judges.map(try_path, [(make, SPEED_MM_S) for make in paths]):
+        outcomes.append(terms)
+        done(work_at(SPEED_MM_S))
     rows = [_row(name, [one]) for name, one in zip(["planned", *UNPLANNED], outcomes, strict=False)]
     rows.append(_row("random", outcomes[len(rows) :]))
     return dict(

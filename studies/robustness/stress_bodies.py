@@ -8,17 +8,17 @@ import trimesh
 
 from rehearsal.build_solver import build_solver, step_settings
 from rehearsal.configuration import PRESETS, scene_of, setup_of
+from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import load_anatomy
 from scenes.scene import PAPER, Contact, SolverSection, load_scene
 from scenes.surfaces import volume_mm3
-from sim.device import start
 from sim.divergence_check import DivergenceCheck
 from sim.fields import array_of
 from sim.neo_hookean import LATTICE_SETTINGS, NeoHookean
 from sim.shapes import ConvexTool, Plane
 from sim.skinning import Skin
 from sim.solver import Solver, StepSettings
-from studies.harness import build, positions_of
+from studies.harness import positions_of
 from studies.robustness.stress_cases import Subject
 from studies.robustness.stress_motion import AWAY_MM
 from studies.uniform_blocks import block_of_cells, block_of_particles
@@ -87,10 +87,9 @@ class Specimen:
 
 
 def prepared(model: str, subject: Subject) -> Specimen:
-    """A body on a freshly started device, at rest."""
+    """A body at rest."""
     if subject.kind == "kidney":
         return _kidney(model, subject)
-    start("cpu")
     mesh = _mesh(model, subject)
     tool = ConvexTool.cuboid(TRANSDUCER_MM)
     shapes = [Plane(np.array([0.0, 0.0, 1.0]), mesh.bounds[0, 2]), tool]
@@ -114,7 +113,7 @@ def prepared(model: str, subject: Subject) -> Specimen:
 def _kidney(model: str, subject: Subject) -> Specimen:
     scene, setup = load_scene(PAPER), PRESETS[model]["fast"]
     setup = setup.but(**json.loads(subject.tissue or "{}"))
-    rehearsal = build(scene, load_anatomy(scene, PAPER.parent), setup, "cpu")
+    rehearsal = Rehearsal(scene_of(scene, setup), replace(load_anatomy(scene, PAPER.parent), ct=None))
     # Recovery is measured from where the tissue has stopped moving.
     away = advanced(rehearsal.manipulator.home, -AWAY_MM)
     for _ in range(SETTLE_STEPS):

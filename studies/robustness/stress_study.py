@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from rehearsal.commands.command_line import make_folder
 from rehearsal.result_files import rounded
-from rehearsal.worker_processes import workers
+from rehearsal.worker_processes import Workers, built_once
 from sim.body import BodyState
 from sim.fields import fill
 from sim.neo_hookean import NeoHookean
@@ -29,7 +29,6 @@ from studies.robustness.stress_cases import (
     MODELS,
     RECOVERED_MM,
     StressCase,
-    Subject,
     cases_of,
     quick_cases_of,
 )
@@ -64,7 +63,6 @@ RELEASE_STEPS, LIFT_STEPS, CHECK_EVERY = 300, 240, 30
 LEAST_STEPS, LEAST_S = 40, 0.04
 LIFT_MM = 400.0
 YOUNG_KPA, POISSON = 15.0, 0.45
-_prepared: dict[tuple[str, Subject], Specimen] = {}
 
 
 @click.command()
@@ -97,12 +95,15 @@ def _figures(
         for _, group in groupby(cases, key=lambda case: case.subject):
             same = list(group)
             tasks += [(model, same[first : first + BATCH]) for first in range(0, len(same), BATCH)]
-    with workers(jobs, dask) as work:
-        yield from work(_run_all, tasks)
+    with Workers(jobs, dask) as workers:
+        yield from workers.map(_run_all, tasks)
 
 
 def _run_all(model: str, cases: list[StressCase]) -> list[dict[str, Any]]:
-    return [run(model, case) for case in cases]
+    """The figures of cases with the same subject."""
+    subject = cases[0].subject
+    specimen = built_once((model, subject), lambda: prepared(model, subject))
+    return [run(specimen, model, case) for case in cases]
 
 
 class Extremes:
@@ -136,13 +137,8 @@ class Extremes:
         return self.restored[0] + times
 
 
-def run(model: str, case: StressCase) -> dict[str, Any]:
+def run(specimen: Specimen, model: str, case: StressCase) -> dict[str, Any]:
     """One case's figures, under the names of stability.json."""
-    key = (model, case.subject)
-    if key not in _prepared:
-        _prepared.clear()
-        _prepared[key] = prepared(model, case.subject)
-    specimen = _prepared[key]
     extremes = Extremes(specimen)
     _apply(specimen, case, extremes)
     _release(specimen, extremes)

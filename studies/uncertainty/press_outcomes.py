@@ -1,13 +1,12 @@
 """The scripted press with given values of what is not known, in a worker: what the surgeon would see and feel."""
 
-import threading
 from dataclasses import dataclass
 
 import numpy as np
 
-import sim.device
 from rehearsal.measurements.tumour_measurements import measure
 from rehearsal.rehearsal import Rehearsal
+from rehearsal.worker_processes import built_once
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
 from studies.uncertainty.unknowns import set_values
@@ -25,19 +24,9 @@ class PressProblem:
     digest: str
 
 
-_built: dict[str, Rehearsal] = {}
-# A Dask worker may run several threads; Taichi serves one.
-_turn = threading.Lock()
-
-
 def press_outcome(problem: PressProblem, values: dict[str, float]) -> np.ndarray:
     """The quantities and the tumour's centroid (depths, 9) [mm, N] of a press with these values, NaN for what there is not."""
-    with _turn:
-        if problem.digest not in _built:
-            _built.clear()
-            sim.device.start("cpu", cpu_max_num_threads=1)
-            _built[problem.digest] = Rehearsal(problem.scene, problem.anatomy)
-        return _press(_built[problem.digest], values)
+    return _press(built_once(problem.digest, lambda: Rehearsal(problem.scene, problem.anatomy)), values)
 
 
 def _press(rehearsal: Rehearsal, values: dict[str, float]) -> np.ndarray:

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from rehearsal.commands.command_line import CommandError, load_patient, make_folder
 from rehearsal.configuration import PRESETS, scene_of
-from rehearsal.worker_processes import workers
+from rehearsal.worker_processes import Workers
 from scenes.anatomy import fingerprint
 from scenes.scene import EMBEDDED
 from scenes.tissue import USUAL
@@ -71,11 +71,12 @@ def uncertainty(scene: Path, out: Path, samples: int, jobs: int | None, dask: st
     problem = PressProblem(varied, replace(anatomy, ct=None, labels=None), digest)
     tried = samples_of(unknowns, samples)
     with (
-        workers(jobs, dask) as work,
+        Workers(jobs, dask) as workers,
         tqdm(total=count_of(unknowns, samples), desc="uncertainty", unit="press") as bar,
     ):
         outcomes = []
-        for outcome in work(press_outcome, [(problem, values) for values in tried]):
+        sent = workers.share(problem)
+        for outcome in workers.map(press_outcome, [(sent, values) for values in tried]):
             outcomes.append(outcome)
             bar.update()
     figures = report_of(np.array(outcomes), unknowns, tuple(varied.press.indentations_mm))

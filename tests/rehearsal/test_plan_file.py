@@ -40,13 +40,6 @@ offset_mm = -20.0
 """
 
 
-@pytest.fixture(autouse=True)
-def nothing_built():
-    """What a command built here is of a Taichi that the next test starts anew."""
-    yield
-    trial_workers._built.clear()
-
-
 def test_a_plan_read_is_the_one_written_and_two_are_the_same_bytes(tmp_path):
     plan = plan_of(sweep_of(straight_pass(5), straight_pass(3, 9.0)), sweep_of(straight_pass(2)))
     for name in "ab":
@@ -258,7 +251,7 @@ def test_the_plan_command_refuses_in_one_line(ball_scene, capsys, options, words
 def test_a_plan_is_made_on_the_tissue_of_the_quality(ball_scene, monkeypatch, capsys):
     cells_mm: list[float] = []
 
-    def nobody(problem: PlanningProblem, jobs: int | None) -> None:
+    def nobody(problem: PlanningProblem, workers: object) -> None:
         cells_mm.append(problem.scene.tissue.cell_mm)
         raise PlanError("no workers")
 

@@ -13,8 +13,8 @@ import pytest
 import trimesh
 
 import app
-from rehearsal import headless
-from rehearsal.planning import plan_search, trial_workers
+from rehearsal import headless, worker_processes
+from rehearsal.planning import plan_search
 from rehearsal.planning.plan_file import Plan, read_plan
 from rehearsal.planning.sweep_path import frame_towards, sliding
 from rehearsal.planning.sweep_score import ScoreTerms
@@ -88,27 +88,27 @@ class Made:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Iterator[Made]:
+def made(tmp_path_factory, cluster) -> Iterator[Made]:
     folder = folder_of_ball(tmp_path_factory.mktemp("ball"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plan_search, "SURROGATE_EVALUATIONS", 8)
-        patch.setattr(trial_workers, "ProcessPoolExecutor", Here)
+        patch.setattr(worker_processes, "ProcessPoolExecutor", Here)
         patch.setattr(headless, "open_viewer", lambda *_, **__: None)
-        said = planned_into(folder / "plan.json")
+        said = planned_into(folder / "plan.json", "--dask", cluster)
         follow = ["--track", folder / "plan.json", "--plan", folder / "plan.json"]
         followed = told("rehearse", folder, "--headless", "--arch", "cpu", *follow, "--out", folder / "out")
         # The last starts Taichi for the trial, which stays.
         planned_into(folder / "again.json")
-    (trial,) = trial_workers._built
+    (trial,) = worker_processes._built.values()
     yield Made(folder, read_plan(folder / "plan.json"), said, followed, trial)
-    trial_workers._built.clear()
+    worker_processes._built.clear()
 
 
-def planned_into(path: Path) -> list[str]:
+def planned_into(path: Path, *options: str) -> list[str]:
     """What the command says. Each begins with nothing built, as in a process of its own."""
-    trial_workers._built.clear()
+    worker_processes._built.clear()
     few = ["--trials", TRIALS, "--speed-mm-s", SPEED_MM_S, "--jobs", 1]
-    return told("plan", path.parent, "--out", path, *few)
+    return told("plan", path.parent, "--out", path, *few, *options)
 
 
 def told(*line: object) -> list[str]:
@@ -118,7 +118,7 @@ def told(*line: object) -> list[str]:
     return printed.getvalue().splitlines()
 
 
-def test_two_runs_write_the_same_bytes(made):
+def test_processes_and_a_cluster_write_the_same_bytes(made):
     assert (made.folder / "plan.json").read_bytes() == (made.folder / "again.json").read_bytes()
     assert sum(sweep.trials for sweep in made.plan.sweeps) == TRIALS
     *why, wrote = made.said

@@ -1,9 +1,6 @@
 """The search for a plan: candidate_search, who has how many trials, and what a plan is made of; with processes that only count."""
 
-import os
 import re
-import threading
-import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,7 +11,7 @@ import pytest
 import trimesh
 from plan_ball import GOOD, big_ball, from_above, manipulator_on, straight_pass
 
-from rehearsal.planning import plan_search, trial_workers
+from rehearsal.planning import plan_search
 from rehearsal.planning.plan_file import PlanError, read_plan, write_plan
 from rehearsal.planning.plan_search import (
     GENERATION,
@@ -35,7 +32,6 @@ from rehearsal.planning.plan_search import (
 from rehearsal.planning.sweep_candidates import SweepCandidate
 from rehearsal.planning.sweep_score import ScoreTerms, score
 from rehearsal.planning.sweep_trial import PlanningProblem, Trial
-from rehearsal.planning.trial_workers import TrialWorkers
 from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.scene import Scene, Trocar
 from studies.planning import plan_comparison
@@ -57,7 +53,7 @@ def worth(values: dict[str, float], handicap: float = 0.0) -> ScoreTerms:
     return replace(GOOD, seen=1.0 - handicap - off)
 
 
-class Counting(TrialWorkers):
+class Counting:
     """No processes: a way is worth what its numbers say, and every task is written down."""
 
     def __init__(self, candidates: list[SweepCandidate], reachable: float = 1.0, ways: int = 1) -> None:
@@ -293,22 +289,18 @@ def test_without_a_reachable_sweep_there_is_an_error(workers):
 
 
 def test_a_comparison_reports_its_progress_and_averages_the_random_sweeps(monkeypatch):
-    jobs: list[int | None] = []
+    shared: list[object] = []
+    workers = object()
 
     class Crew(Counting):
-        def __init__(self, problem: PlanningProblem, count: int | None) -> None:
+        def __init__(self, problem: PlanningProblem, workers: object) -> None:
             super().__init__(four())
-            jobs.append(count)
-
-        def __enter__(self) -> "Crew":
-            return self
-
-        def __exit__(self, *_) -> None: ...
+            shared.append(workers)
 
     monkeypatch.setattr(plan_comparison, "TrialWorkers", Crew)
     done: list[int] = []
-    run = plan_comparison.compare(Scene(anatomy={}), with_tumour().anatomy, 40, 3, done.append)
-    assert sum(done) == plan_comparison.count_of(40) and jobs == [3, 3]
+    run = plan_comparison.compare(Scene(anatomy={}), with_tumour().anatomy, 40, workers, done.append)
+    assert sum(done) == plan_comparison.count_of(40) and shared == [workers, workers]
     rows = {row["sweep"]: row for row in run["rows"]}
     assert list(rows) == ["planned", "straight", "row by row", "random"]
     assert [row["count"] for row in rows.values()] == [1, 1, 1, len(plan_comparison.SEEDS)]
@@ -319,56 +311,13 @@ def test_a_comparison_reports_its_progress_and_averages_the_random_sweeps(monkey
     assert lines[-1].startswith(f"random ({len(plan_comparison.SEEDS)})") and lines[-1].split()[2] == "40"
 
 
-# Processes
-
-
-@pytest.fixture
-def no_trial(monkeypatch):
-    """A process builds none. It imports this folder for what it computes."""
-    monkeypatch.setattr(trial_workers, "_call", _without_trial)
-
-
-def _without_trial(problem: PlanningProblem, function, *task) -> object:
-    return function(None, *task)
-
-
-def _end(trial: None) -> None:
-    os._exit(1)
-
-
-def _process(trial: None) -> tuple[int, list[str]]:
-    return os.getpid(), [thread.name for thread in threading.enumerate()]
-
-
-def test_one_process_is_not_this_one_and_watches_whether_this_one_is_there(no_trial):
-    """Taichi would be started anew under whatever this one computes."""
-    with TrialWorkers(problem_of(), 1) as workers:
-        ((process, threads),) = workers.map(_process, [()])
-    assert process != os.getpid() and any("_watch" in name for name in threads)
+# Problems
 
 
 @pytest.mark.parametrize("target", ["tumour", "margin"])
 def test_a_tumour_target_needs_a_tumour(target):
     with pytest.raises(PlanError, match=f"--target {target}: this scene has no tumour; expected organ"):
         problem_of(target=target)
-
-
-def test_stopping_the_processes_is_an_error_for_a_waiting_thread(no_trial):
-    with TrialWorkers(problem_of(), 1) as workers:
-        waiting = workers.map(_sleep, [()] * 9)
-        threading.Timer(0.5, workers.stop).start()
-        with pytest.raises(PlanError, match="was ended"):
-            list(waiting)
-
-
-def _sleep(trial: None) -> None:
-    time.sleep(60)
-
-
-def test_a_process_that_ended_is_an_error_in_one_line(no_trial):
-    with TrialWorkers(problem_of(), 2) as workers, pytest.raises(PlanError) as error:
-        list(workers.map(_end, [()]))
-    assert "a process of the search was ended" in str(error.value) and "\n" not in str(error.value)
 
 
 @pytest.mark.usefixtures("one_device")
@@ -391,3 +340,7 @@ def test_no_images_are_sent_to_the_processes():
     bare = problem_of(anatomy=anatomy).without_images
     assert bare.anatomy.ct is None and bare.anatomy.labels is None and bare.anatomy.parts == {}
     assert bare.anatomy.organ is anatomy.organ
+    # Parts with their own material are of the tissue.
+    stiff = Scene(anatomy=dict(parts=dict(vessel="vessel.stl")), tissue=dict(parts=dict(vessel={})))
+    parts = problem_of(anatomy=anatomy, scene=stiff).without_images.anatomy.parts
+    assert parts == anatomy.parts

@@ -16,6 +16,7 @@ from rehearsal.planning.plan_file import PlanError, read_plan
 from rehearsal.planning.plan_guidance import PlanGuidance
 from rehearsal.planning.plan_search import total_work
 from rehearsal.planning.plans_in_window import SPEED_MM_S, TRIALS, PlanControl, minutes_in_words
+from rehearsal.worker_processes import WorkerError
 from render.viewer import Controls, Settings
 from scenes.scene import Scene
 from ultrasound.probe import load_probe
@@ -34,13 +35,18 @@ class SteppedSearch:
         self.is_stopped = False
         self.counted = threading.Semaphore(0)
         monkeypatch.setattr(plans_in_window, "make_plan", self.make)
-        monkeypatch.setattr(plans_in_window, "TrialWorkers", self.workers)
+        monkeypatch.setattr(plans_in_window, "Workers", self.workers)
+        monkeypatch.setattr(plans_in_window, "TrialWorkers", self.trials)
 
     @contextmanager
-    def workers(self, problem, jobs):
+    def workers(self, jobs):
         self.jobs.append(jobs)
-        self.problem = problem
         yield self
+
+    def trials(self, problem, workers):
+        assert workers is self
+        self.problem = problem
+        return self
 
     def make(self, workers, speed_mm_s, trials, done):
         assert workers is self and trials == TRIALS
@@ -164,7 +170,7 @@ def test_the_key_stops_a_search_and_otherwise_shows_the_next_sweep(
             with workers(*given) as each:
                 yield each
 
-        monkeypatch.setattr(plans_in_window, "TrialWorkers", late)
+        monkeypatch.setattr(plans_in_window, "Workers", late)
     plans.measurements.guide = guide = PlanGuidance(plans.rehearsal, plan_of(sweep_of(straight_pass(3))))
     message(plans, plan=True)
     search = plans._job
@@ -183,6 +189,7 @@ def test_the_key_stops_a_search_and_otherwise_shows_the_next_sweep(
     ("error", "words"),
     [
         (PlanError("no sweep was found"), "no sweep was found"),
+        (WorkerError("a worker process was ended"), "a worker process was ended"),
         (OSError(28, "No space left on device"), "plan-001.json cannot be written: No space left on device"),
     ],
 )

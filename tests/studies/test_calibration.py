@@ -2,15 +2,13 @@
 
 import csv
 import json
-import threading
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import taichi as ti
-from joblib import Parallel, delayed
 from PIL import Image
 from small_bead_case import beads, write_case
 
@@ -19,7 +17,7 @@ import studies.accuracy.accuracy_commands as accuracy_commands
 import studies.accuracy.case_workers as case_workers
 from app import main
 from rehearsal.configuration import Setup, setup_of
-from rehearsal.worker_processes import WorkerError, workers
+from rehearsal.worker_processes import Workers
 from sim.sampling import SamplingError
 from studies.accuracy.bead_case import BeadCase, load_case
 from studies.accuracy.bead_errors import null_errors
@@ -140,16 +138,16 @@ def test_a_search_of_several_settings_is_reproducible(cases):
 
 @contextmanager
 def pretended_workers(jobs=None, dask=None):
-    def work(function, tasks):
+    def mapped(function, tasks):
         assert function is evaluate
         return pretending(tasks)
 
-    yield work
+    yield SimpleNamespace(map=mapped)
 
 
 @pytest.mark.parametrize("searched", [False, True])
 def test_calibrate_writes_tables_figures_and_json(monkeypatch, folders, cases, tmp_path, capsys, searched):
-    monkeypatch.setattr(accuracy_commands, "workers", pretended_workers)
+    monkeypatch.setattr(accuracy_commands, "Workers", pretended_workers)
     out = tmp_path / "out"
     more = ["--search", "2"] if searched else ["--grid", "0.1"]
     assert main(["calibrate", *map(str, folders), "--radii", "4,3", "--out", str(out), *more]) == 0
@@ -215,64 +213,40 @@ def test_calibrate_reports_mistakes_in_one_line(monkeypatch, folders, tmp_path, 
     assert "pip install dask distributed" in refused(a, *out, "--dask", "tcp://127.0.0.1:9")
 
 
-def _watches() -> bool:
-    """Whether a process looks to whether the one that started it is there."""
-    return any("_watch" in thread.name for thread in threading.enumerate())
-
-
-def test_processes_here_and_a_cluster_of_one_worker_find_the_same(monkeypatch, cases):
-    from distributed import LocalCluster
-
-    # The cluster's worker is this process, reached as any other would be.
-    monkeypatch.setattr(case_workers, "_built", {})
-    monkeypatch.setattr(case_workers, "_filled", {})
-
+@pytest.mark.usefixtures("nothing_built")
+def test_processes_here_and_a_cluster_find_the_same(cases, cluster):
     setup = setup_of(MODEL, radius_mm=5.0, warm_up_steps=6, stage_steps=3)
     pairs = [(cases[0], setup.but(stiffness=a)) for a in (0.9, 0.5)]
     too_large = [(cases[0], setup_of(MODEL, radius_mm=20.0))]
-    with workers(2) as work:
-        here = list(work(evaluate, pairs))
-        assert all(Parallel()(delayed(_watches)() for _ in range(2)))
+    with Workers(2) as workers:
+        here = list(workers.map(evaluate, pairs))
         with pytest.raises(SamplingError, match="choose a smaller radius"):
-            list(work(evaluate, too_large))
-    with (
-        LocalCluster(
-            n_workers=1, threads_per_worker=2, processes=False, protocol="tcp", dashboard_address=None
-        ) as cluster,
-        workers(dask=cluster.scheduler_address) as work,
-    ):
-        there = list(work(evaluate, pairs))
+            list(workers.map(evaluate, too_large))
+    with Workers(dask=cluster) as workers:
+        there = list(workers.map(evaluate, pairs))
         with pytest.raises(SamplingError, match="choose a smaller radius"):
-            list(work(evaluate, too_large))
-    ti.reset()
+            list(workers.map(evaluate, too_large))
     assert all(np.array_equal(a.errors, b.errors) for a, b in zip(here, there, strict=True))
     assert here[0].errors.mean() != here[1].errors.mean() and np.isfinite(here[0].errors).all()
 
 
-def test_a_cluster_without_workers_or_with_some_that_lack_modules_is_refused(monkeypatch):
-    import distributed
-
-    def failing(client, work):
-        raise Exception("ModuleNotFoundError(\"No module named 'studies'\")")
-
-    with distributed.LocalCluster(n_workers=0, dashboard_address=None) as cluster:
-        for words in ("has no workers", "No module named 'studies'.*its folder in PYTHONPATH"):
-            with pytest.raises(WorkerError, match=words), workers(dask=cluster.scheduler_address):
-                pytest.fail("it went on without workers")
-            monkeypatch.setattr(distributed.Client, "run", failing)
-
-
-def test_experiments_are_kept_up_to_the_limit_of_taichi(monkeypatch, cases):
-    monkeypatch.setattr(case_workers, "_built", {})
+@pytest.mark.usefixtures("nothing_built")
+def test_a_case_is_filled_once_for_each_radius(monkeypatch, cases):
     monkeypatch.setattr(case_workers, "_filled", {})
-    started, filled = [], []
-    monkeypatch.setattr(case_workers.sim.device, "start", lambda *a, **options: started.append(options))
+    filled, built = [], []
+
+    class Experiment:
+        model = SimpleNamespace(counts=lambda: dict(particles=1, clusters=1))
+
+        def __init__(self, case, setup, rest) -> None:
+            built.append(rest)
+
+        def run(self, setup) -> SimpleNamespace:
+            return SimpleNamespace(finite=False, step_ms=[])
+
     monkeypatch.setattr(case_workers, "rest_body", lambda case, setup: filled.append(case.digest))
-    monkeypatch.setattr(case_workers, "BeadExperiment", lambda case, setup, rest: None)
+    monkeypatch.setattr(case_workers, "BeadExperiment", Experiment)
     for radius in (2.0, 3.0, 4.0, 5.0, 6.0, 2.0, 6.0):
-        setup = setup_of(MODEL, radius_mm=radius)
-        key = (cases[0].digest, radius)
-        if key not in case_workers._built:
-            case_workers._build(key, cases[0], setup)
-    assert len(started) == 2 and started[0] == {"cpu_max_num_threads": 1}
-    assert len(filled) == 5
+        assert np.isinf(evaluate(cases[0], setup_of(MODEL, radius_mm=radius)).errors).all()
+    # The fifth is one too many for Taichi: all are built anew.
+    assert len(filled) == 5 and len(built) == 6

@@ -11,7 +11,7 @@ from small_bead_case import values, write_case
 
 from app import main
 from rehearsal.configuration import setup_of
-from rehearsal.worker_processes import workers
+from rehearsal.worker_processes import Workers
 from scenes.mechanical_tissues import mechanical_properties
 from studies.accuracy import accuracy_commands, material_fit
 from studies.accuracy.bead_case import BeadCase, load_case
@@ -43,8 +43,8 @@ def case(tmp_path_factory, one_device) -> BeadCase:
 
 def found_by(case: BeadCase) -> dict[str, dict]:
     done: list[int] = []
-    with workers(2) as work:
-        fit = fitted([case], SETUP, work, done.append)
+    with Workers(2) as workers:
+        fit = fitted([case], SETUP, workers, done.append)
     assert sum(done) == fit.presses
     return {each["name"]: each for each in fit.report()["parameters"]}
 
@@ -77,8 +77,8 @@ def test_what_the_data_do_not_determine_is_said(case):
     assert found["modulus"]["high"] - found["modulus"]["low"] > 0.5
 
 
-def test_residuals_are_in_units_of_what_is_known(case, monkeypatch):
-    monkeypatch.setattr(material_fit, "_built", {})
+@pytest.mark.usefixtures("nothing_built")
+def test_residuals_are_in_units_of_what_is_known(case):
     true = {"modulus": 22.0, "Poisson's ratio": 0.4, "friction": FRICTION, "sinus modulus": 5.0}
     shifted = replace(case, measured=case.measured + [BEAD_MM, 0, 0])
     residuals = residuals_of(shifted, SETUP, true)

@@ -59,14 +59,15 @@ def test_initial_states_and_motions_match_their_names():
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_a_small_body_is_stressed_released_and_measured(model):
+def test_a_small_body_is_stressed_released_and_measured(device, model):
     cases = [
         StressCase("rest", "", ONE),
         StressCase("lost", "", ONE, state=("nothing",)),
         StressCase("gone", "", ONE, state=("lifted", 1e6)),
         StressCase("beside", "", ONE, state=("lifted", 100.0)),
     ]
-    rest, lost, gone, beside = (stress_study.run(model, case) for case in cases)
+    specimen = stress_bodies.prepared(model, ONE)
+    rest, lost, gone, beside = (stress_study.run(specimen, model, case) for case in cases)
     assert rest["finite"] and rest["recovered"] and rest["fallback"] is None and rest["reason"] is None
     assert rest["rest_error_mm"] < 0.01
     assert rest["volume_ratio"] == pytest.approx(1.0, abs=0.01)

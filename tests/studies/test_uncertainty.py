@@ -14,12 +14,12 @@ from rehearsal.measurements.live_measurements import LiveMeasurements
 from rehearsal.measurements.tumour_measurements import Measurement
 from rehearsal.measurements.uncertainty_bands import UncertaintyBands, UncertaintyError, read_bands
 from rehearsal.rehearsal import Rehearsal
-from rehearsal.worker_processes import workers
+from rehearsal.worker_processes import Workers
 from scenes.anatomy import LoadedAnatomy
 from scenes.mechanical_tissues import mechanical_properties
 from scenes.scene import Attachment, Scene, with_options
 from sim.fields import array_of
-from studies.uncertainty import press_outcomes, uncertainty_command
+from studies.uncertainty import uncertainty_command
 from studies.uncertainty.press_outcomes import QUANTITIES, PressProblem, press_outcome
 from studies.uncertainty.sensitivity import POSITION, bands_of, count_of, indices_of, samples_of
 from studies.uncertainty.unknowns import Unknown, set_values, unknowns_of, with_all_parts
@@ -92,8 +92,8 @@ def test_values_reach_the_solver(device, problem):
     assert rehearsal.contacts.coefficient[None] == pytest.approx(0.2)
 
 
-def test_an_outcome_depends_on_its_values_alone(problem, monkeypatch):
-    monkeypatch.setattr(press_outcomes, "_built", {})
+@pytest.mark.usefixtures("nothing_built")
+def test_an_outcome_depends_on_its_values_alone(problem):
     usual, stiff = {"kidney modulus": 10.0}, {"kidney modulus": 20.0}
     first = press_outcome(problem, usual)
     other = press_outcome(problem, stiff)
@@ -123,22 +123,15 @@ def test_bands_and_indices_are_those_of_a_known_function():
     assert POSITION not in bands_of(outcomes)[0]
 
 
-def test_processes_here_and_on_a_cluster_find_the_same(problem, monkeypatch):
-    from distributed import LocalCluster
-
-    monkeypatch.setattr(press_outcomes, "_built", {})
-    tasks = [(problem, {"kidney modulus": young}) for young in (8.0, 16.0)]
-    with workers(1) as work:
-        here = list(work(press_outcome, tasks))
-    with (
-        LocalCluster(
-            n_workers=1, threads_per_worker=2, processes=False, protocol="tcp", dashboard_address=None
-        ) as cluster,
-        workers(dask=cluster.scheduler_address) as work,
-    ):
-        there = list(work(press_outcome, tasks))
-    ti.reset()
-    assert all(np.array_equal(a, b) for a, b in zip(here, there, strict=True))
+@pytest.mark.usefixtures("nothing_built")
+def test_processes_here_and_on_a_cluster_find_the_same(problem, cluster):
+    outcomes = []
+    for dask in (None, cluster):
+        with Workers(1, dask) as workers:
+            sent = workers.share(problem)
+            tasks = [(sent, {"kidney modulus": young}) for young in (8.0, 16.0)]
+            outcomes.append(list(workers.map(press_outcome, tasks)))
+    assert all(np.array_equal(a, b) for a, b in zip(*outcomes, strict=True))
 
 
 def test_the_command_reports_writes_and_is_read_again(tmp_path, monkeypatch, capsys):
@@ -148,12 +141,18 @@ def test_the_command_reports_writes_and_is_read_again(tmp_path, monkeypatch, cap
 
     class Here:
         def __enter__(self):
-            return lambda function, tasks: (known(*task) for task in tasks)
+            return self
+
+        def share(self, value):
+            return value
+
+        def map(self, function, tasks):
+            return (known(*task) for task in tasks)
 
         def __exit__(self, *_):
             return None
 
-    monkeypatch.setattr(uncertainty_command, "workers", lambda jobs, dask: Here())
+    monkeypatch.setattr(uncertainty_command, "Workers", lambda jobs, dask: Here())
     out = tmp_path / "out"
     assert app.main(["study", "uncertainty", "--samples", "8", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
