@@ -27,6 +27,10 @@ STUDIES = {
         "studies.uncertainty.uncertainty_command:uncertainty",
         "Estimate how far SCENE's press depends on what is not known of the tissue.",
     ),
+    "cohort": (
+        "studies.cohort.cohort_command:cohort",
+        "Settle, press and plan for many patients, in one table.",
+    ),
     "import": ("studies.performance.import_timing_command:intake", "Measure an import: seconds and memory."),
     "freehand": (
         "studies.freehand.freehand_accuracy:freehand",

@@ -17,7 +17,6 @@ from rehearsal.planning.sweep_candidates import SweepCandidate, candidates_of
 from rehearsal.planning.sweep_score import ScoreTerms, in_words, points, score, why_better
 from rehearsal.planning.sweep_trial import Trial
 from rehearsal.planning.trial_workers import Trials
-from scenes.anatomy import fingerprint
 from version import VERSION
 
 SEED = 20161130
@@ -172,7 +171,7 @@ def make_plan(workers: Trials, speed_mm_s: float, trials: int, progress: Progres
         why.append(f"It comes before {name}, with {score(terms):.1f} points: {reason}.")
     return Plan(
         version=VERSION,
-        anatomy=fingerprint(problem.anatomy),
+        anatomy=problem.fingerprint,
         target=problem.target,
         margin_mm=problem.margin_mm,
         speed_mm_s=speed_mm_s,

@@ -10,7 +10,7 @@ from rehearsal.planning.instrument_reach import reachable
 from rehearsal.planning.plan_file import DEG_PER_MM, LIFT_MM, PlanError
 from rehearsal.planning.sweep_score import ScoreTerms, face_centres, incidence_deg
 from rehearsal.rehearsal import Rehearsal
-from scenes.anatomy import LoadedAnatomy
+from scenes.anatomy import LoadedAnatomy, fingerprint
 from scenes.scene import Scene, Trocar
 from sim.fields import array_of
 from ultrasound.array_contact import measure_contact
@@ -36,6 +36,8 @@ class PlanningProblem:
     target: Target
     margin_mm: float
     trocar: Trocar
+    whole_fingerprint: str | None = None
+    """Of the anatomy with all its images, where this one lacks them."""
 
     def __post_init__(self) -> None:
         if self.target != "organ" and self.anatomy.tumour is None:
@@ -44,11 +46,17 @@ class PlanningProblem:
             )
 
     @property
+    def fingerprint(self) -> str:
+        """Of the patient's anatomy with all its images."""
+        return self.whole_fingerprint or fingerprint(self.anatomy)
+
+    @property
     def without_images(self) -> "PlanningProblem":
         """The same without CT and labels, and without parts that have no material of their own, which no trial needs."""
         material = getattr(self.scene.tissue, "parts", {})
         parts = {name: part for name, part in self.anatomy.parts.items() if name in material}
-        return replace(self, anatomy=replace(self.anatomy, ct=None, labels=None, parts=parts))
+        bare = replace(self.anatomy, ct=None, labels=None, parts=parts)
+        return replace(self, anatomy=bare, whole_fingerprint=self.fingerprint)
 
 
 class Trial:
