@@ -19,16 +19,20 @@ from rehearsal.configuration import PRESETS, Setup
 from rehearsal.frame import image_view
 from rehearsal.measurements.run_report import Tally
 from rehearsal.open_window import initial_settings, probe_with_settings
+from rehearsal.pressed_organ import material_of
 from rehearsal.rehearsal import SURROUNDINGS_MM, Rehearsal, scanned_anatomy
 from rehearsal.stopwatch import timed
 from render.background_image import BackgroundImage
 from render.window_layout import WindowLayout
 from scenes.anatomy import LoadedAnatomy
+from scenes.mechanical_tissues import mechanical_properties
 from scenes.scene import PAPER, Contact, Scene, SolverSection
 from scenes.surfaces import translated
-from scenes.tissue import TISSUES, USUAL, ShapeMatchingTissue
+from scenes.tissue import TISSUES, USUAL, PartMaterial, Prony, ShapeMatchingTissue, TissueSection
+from sim.attachment import Pedicle, Tether
 from sim.device import start
 from sim.embedding import Embedding
+from sim.material import Part
 from sim.shape_matching import fill_organ
 from sim.shapes import ConvexTool
 from sim.solver import Solver
@@ -68,6 +72,10 @@ class Options(NamedTuple):
     particles: bool = False
     particle_friction: float = 0.0
     mass_scaling_per_mm: float = 0.0
+    stiff_part: bool = False
+    capsule: bool = False
+    relaxation: bool = False
+    pedicle: bool = False
 
 
 # A feature: the options of a step with it, and of the same step without.
@@ -83,10 +91,20 @@ OF_PARTICLES: dict[str, Feature] = {
     "friction of particles": (Options(particles=True, particle_friction=0.25), Options(particles=True)),
     "scaled masses": (Options(mass_scaling_per_mm=0.02), BASE),
 }
+OF_ELEMENTS: dict[str, Feature] = {
+    "a part with its own material": (Options(stiff_part=True), BASE),
+    "capsule": (Options(capsule=True), BASE),
+    "relaxation, one term": (Options(relaxation=True), BASE),
+    "pedicle": (Options(pedicle=True), BASE),
+}
 FEATURES = {
-    model: EVERYWHERE | (OF_PARTICLES if section.supports_self_contact else {})
+    model: EVERYWHERE
+    | (OF_PARTICLES if section.supports_self_contact else {})
+    | (OF_ELEMENTS if model == USUAL else {})
     for model, section in TISSUES.items()
 }
+# A ball of this radius in the organ's middle is a tumour [mm]; a term of relaxation: its share and its time [s].
+PART_MM, TERM = 10.0, (0.5, 1.0)
 
 
 @click.command()
@@ -149,7 +167,26 @@ class FeatureBody:
         section = SolverSection(mass_scaling_per_mm=options.mass_scaling_per_mm)
         if tool:
             shapes.append(tool)
-        return build_solver(self.filled, self.tissue, shapes, tool, contact, section, serial=serial)
+        tissue, tethers, parts = self._tissue(options)
+        return build_solver(
+            self.filled, tissue, shapes, tool, contact, section, serial, tethers=tethers, parts=parts
+        )
+
+    def _tissue(self, options: Options) -> tuple[TissueSection, list[Tether], list[Part]]:
+        """The tissue with some features, what holds it, and its parts, with typical properties."""
+        table, changes = mechanical_properties(), dict[str, Any]()
+        tethers: list[Tether] = []
+        parts: list[Part] = []
+        if options.capsule:
+            changes["capsule_n_mm"] = table.capsule_n_mm[1]
+        if options.relaxation:
+            changes["prony"] = (Prony(modulus_ratio=TERM[0], time_s=TERM[1]),)
+        if options.pedicle:
+            tethers.append(Pedicle(np.zeros(3), PART_MM, table.pedicle_n_mm[1]))
+        if options.stiff_part:
+            ball = trimesh.creation.icosphere(subdivisions=3, radius=PART_MM)
+            parts.append(Part("tumour", ball, material_of("tumour", PartMaterial())))
+        return self.tissue.model_copy(update=changes), tethers, parts
 
     def poses(self, step: int) -> np.ndarray:
         """Poses of the transducer in a step of the press."""

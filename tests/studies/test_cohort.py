@@ -55,7 +55,9 @@ def test_patients_are_settled_pressed_and_planned_for_on_a_cluster(
     printed = capsys.readouterr().out
     ball, soft, broken = table_in(out)
     assert [row["state"] for row in (ball, soft, broken)] == ["done", "done", "failed"]
-    assert "FOLDER/scene.toml: anatomy: missing" in broken["message"] and "2 of 3 patients are done" in printed
+    assert (
+        "FOLDER/scene.toml: anatomy: missing" in broken["message"] and "2 of 3 patients are done" in printed
+    )
     # A quarter of 4/3 pi, by facets, 25 and 7 mm.
     assert ball["kidney_ml"] == pytest.approx(65.4, rel=0.02) and ball["tumour_ml"] == pytest.approx(
         1.44, rel=0.02

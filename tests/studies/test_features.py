@@ -11,11 +11,13 @@ from small_bead_case import briefly, small_anatomy
 import app
 from rehearsal.configuration import PRESETS, setup_of
 from scenes.scene import PAPER, load_scene
+from sim.capsule import Capsule
 from sim.particle_contact import ShapeContacts
 from sim.self_contact import SelfContacts
 from sim.shape_matching import ShapeMatching
 from sim.shapes import ConvexTool, SignedDistanceField
 from sim.surface_contact import SurfaceContacts
+from sim.viscoelasticity import Relaxation
 from studies import study_options
 from studies.harness import memory_mb
 from studies.performance import feature_costs
@@ -31,13 +33,21 @@ OWN = {
     "the transducer": [(ConvexTool, "surface"), (ConvexTool, "motion")],
     "friction on shapes": [(SurfaceContacts, "tangential_slip"), (ShapeContacts, "friction_change")],
     "contacts of particles": [(SelfContacts, "find"), (SelfContacts, "project")],
+    "capsule": [(Capsule, "begin"), (Capsule, "node_force"), (Capsule, "follow")],
+    "relaxation, one term": [(Relaxation, "begin"), (Relaxation, "finish")],
     "scaled masses": [(ShapeMatching, "update_patch_masses"), (ShapeMatching, "update_cluster_masses")],
 }
 # Options, and the features that none of them has.
 WITHOUT = (
     (
         feature_costs.Options(support=False, transducer=False),
-        ("contact with the support", "the transducer", "friction on shapes"),
+        (
+            "capsule",
+            "relaxation, one term",
+            "contact with the support",
+            "the transducer",
+            "friction on shapes",
+        ),
     ),
     (
         feature_costs.Options(shape_friction=0.0),
