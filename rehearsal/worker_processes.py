@@ -39,7 +39,7 @@ class Workers:
     """Workers for functions of modules, with arguments that can be pickled; a context manager.
 
     They are ``jobs`` processes on this machine, or one a processor; or those of the Dask cluster of the scheduler at an address,
-    with this project in their PYTHONPATH. Even a single process is another one than this, where Taichi may be in use.
+    with this project in the PYTHONPATH of all. Even a single process is another one than this, where Taichi may be in use.
     ``count`` is their number. Raises WorkerError.
     """
 
@@ -129,11 +129,13 @@ def _connect(dask: str) -> tuple[Any, int]:
             f"--dask {dask}: no scheduler answers there ({error}); start one, or correct it"
         ) from None
     try:
+        # The scheduler unpickles tasks too.
+        client.run_on_scheduler(_ready)
         ready = client.run(_ready)
-    except Exception as error:  # any exception of a worker
+    except Exception as error:  # any exception of scheduler or worker
         client.close()
         raise WorkerError(
-            f"--dask {dask}: a worker is not ready ({error}); start workers with this project's requirements "
+            f"--dask {dask}: scheduler or worker is not ready ({error}); start both with this project's requirements "
             f"installed and its folder in PYTHONPATH"
         ) from None
     if not ready:
