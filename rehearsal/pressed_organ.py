@@ -15,7 +15,7 @@ from rehearsal.configuration import probe_of
 from rehearsal.stopwatch import timed
 from scenes.anatomy import Grid, LoadedAnatomy, press_on
 from scenes.mechanical_tissues import mechanical_properties
-from scenes.scene import PlaneShape, Scene, SceneError
+from scenes.scene import Attachment, PlaneShape, Scene, SceneError
 from scenes.surfaces import translated
 from scenes.tissue import PartMaterial, PartName
 from sim.attachment import FixedRegion, Pedicle, PerirenalFat, Tether
@@ -93,7 +93,7 @@ class PressedOrgan:
         self.tool = tool_of(self.probe)
         shapes = [*(self._shape(shape) for shape in anatomy.shapes), self.tool]
         tissue, section = self.scene.tissue, self.scene.solver
-        fixed, tethers = self._attachments()
+        fixed, tethers = attachments_of(self.scene.attachment, self.origin, np.array(self.press.direction))
         self.parts_of_tissue = parts_of(self.scene, anatomy, self.origin)
         self.solver = build_solver(
             self.organ,
@@ -110,20 +110,6 @@ class PressedOrgan:
         self.settings = step_settings(tissue, section)
         self.young_kpa: float | None = getattr(tissue, "young_kpa", None)
         self.set_gravity(self.scene.gravity.acceleration_m_s2)
-
-    def _attachments(self) -> tuple[list[FixedRegion], list[Tether]]:
-        attachment = self.scene.attachment
-        fixed: list[FixedRegion] = []
-        tethers: list[Tether] = []
-        if attachment.radius_mm > 0 and attachment.at_mm is not None:
-            place = np.array(attachment.at_mm) - self.origin, attachment.radius_mm
-            if attachment.stiffness_n_mm > 0:
-                tethers.append(Pedicle(*place, attachment.stiffness_n_mm))
-            else:
-                fixed.append(FixedRegion(*place))
-        if attachment.fat_kpa_mm > 0:
-            tethers.append(PerirenalFat(attachment.fat_kpa_mm, -np.array(self.press.direction)))
-        return fixed, tethers
 
     def _shape(self, shape: PlaneShape | trimesh.Trimesh | Grid) -> Plane | SignedDistanceField:
         if isinstance(shape, PlaneShape):
@@ -258,6 +244,23 @@ class PressedOrgan:
         """A hash of the tissue's state: it changes with every bit."""
         state = self.body.snapshot()
         return hashlib.sha256(state.position.tobytes() + state.velocity.tobytes()).hexdigest()[:16]
+
+
+def attachments_of(
+    attachment: Attachment, origin: np.ndarray, press_direction: np.ndarray
+) -> tuple[list[FixedRegion], list[Tether]]:
+    """What a scene's attachment fixes and what holds it elastically, relative to an origin; fat leaves the pressed side free."""
+    fixed: list[FixedRegion] = []
+    tethers: list[Tether] = []
+    if attachment.radius_mm > 0 and attachment.at_mm is not None:
+        place = np.array(attachment.at_mm) - origin, attachment.radius_mm
+        if attachment.stiffness_n_mm > 0:
+            tethers.append(Pedicle(*place, attachment.stiffness_n_mm))
+        else:
+            fixed.append(FixedRegion(*place))
+    if attachment.fat_kpa_mm > 0:
+        tethers.append(PerirenalFat(attachment.fat_kpa_mm, -press_direction))
+    return fixed, tethers
 
 
 def parts_of(scene: Scene, anatomy: LoadedAnatomy, origin: np.ndarray) -> list[Part]:

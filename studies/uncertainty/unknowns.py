@@ -6,13 +6,13 @@ from typing import get_args
 
 import numpy as np
 
-from rehearsal.pressed_organ import parts_of
+from rehearsal.pressed_organ import attachments_of, parts_of
 from rehearsal.rehearsal import Rehearsal
 from scenes.anatomy import LoadedAnatomy
 from scenes.mechanical_tissues import mechanical_properties
 from scenes.scene import Scene
 from scenes.tissue import NeoHookeanTissue, PartMaterial, PartName
-from sim.attachment import Pedicle, PerirenalFat, total_stiffness
+from sim.attachment import total_stiffness
 from sim.material import Material
 from sim.neo_hookean import NeoHookean
 
@@ -92,14 +92,8 @@ def set_values(rehearsal: Rehearsal, values: Mapping[str, float]) -> None:
     if "friction" in values:
         rehearsal.contacts.coefficient[None] = values["friction"]
     if "pedicle" in values or "fat" in values:
-        attachment = rehearsal.scene.attachment
-        tethers: list = []
-        if attachment.radius_mm > 0 and attachment.stiffness_n_mm > 0:
-            at = np.array(attachment.at_mm) - rehearsal.origin
-            tethers.append(
-                Pedicle(at, attachment.radius_mm, values.get("pedicle", attachment.stiffness_n_mm))
-            )
-        if attachment.fat_kpa_mm > 0:
-            exposed = -np.array(rehearsal.press.direction)
-            tethers.append(PerirenalFat(values.get("fat", attachment.fat_kpa_mm), exposed))
+        given = {"stiffness_n_mm": "pedicle", "fat_kpa_mm": "fat"}
+        changed = {key: values[name] for key, name in given.items() if name in values}
+        attachment = rehearsal.scene.attachment.model_copy(update=changed)
+        _, tethers = attachments_of(attachment, rehearsal.origin, np.array(rehearsal.press.direction))
         model.set_tether(total_stiffness(tethers, model.lattice, rehearsal.organ))
