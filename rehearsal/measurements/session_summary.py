@@ -27,7 +27,7 @@ class SessionCourse:
     fastest_mm_s: float = 0.0
     compression_max_mm: float = 0.0
     over_warning_s: float = 0.0
-    force_max_n: float = 0.0
+    force_max_n: float | None = None
     presses: int = 0
     went_back: int = 0
     _is_pressed: bool = field(default=False, init=False)
@@ -48,7 +48,8 @@ class SessionCourse:
             self.fastest_mm_s = max(self.fastest_mm_s, path / length_s)
         self._at = pose[:3, 3].copy()
         self.compression_max_mm = max(self.compression_max_mm, compression_mm)
-        self.force_max_n = max(self.force_max_n, force_n or 0.0)
+        if force_n is not None:
+            self.force_max_n = max(self.force_max_n or 0.0, force_n)
         self.over_warning_s += length_s * (compression_mm > self.compression_warning_mm)
         if not self._is_pressed and compression_mm > PRESSED_MM:
             self.presses += 1
@@ -57,7 +58,7 @@ class SessionCourse:
     def summary(self, latest: dict[str, Any], gaps: Iterable[Gap], bookmarks: int) -> dict[str, Any]:
         """The summary; ``latest`` is the last measurement, ``gaps`` are the regions not imaged."""
         return {
-            **{name: round(float(getattr(self, name)), 3) for name in FIGURES},
+            **{name: _rounded(getattr(self, name)) for name in FIGURES},
             **dict(presses=self.presses, went_back=self.went_back, bookmarks=bookmarks),
             **{name: value for name, value in latest.items() if name.startswith("seen_")},
             "gaps": [
@@ -65,6 +66,14 @@ class SessionCourse:
                 for gap in gaps
             ],
         }
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(float(value), 3)
+
+
+def _force(most_n: float | None) -> list[str]:
+    return [] if most_n is None else [f"force       {most_n:.2f} N at most on the probe"]
 
 
 def summary_text(summary: dict[str, Any]) -> str:
@@ -85,7 +94,7 @@ def summary_text(summary: dict[str, Any]) -> str:
             f"{summary['path_mm']:.0f} mm, at most {summary['fastest_mm_s']:.0f} mm/s; {counted(summary['bookmarks'], 'bookmark')}",
             f"compression {summary['compression_max_mm']:.1f} mm at most; {summary['over_warning_s']:.1f} s above the limit of "
             f"{summary['compression_warning_mm']:g} mm",
-            f"force       {summary['force_max_n']:.2f} N at most on the probe",
+            *_force(summary["force_max_n"]),
             f"coverage    {seen or 'none: there is no CT'}{largest}",
         ]
     )

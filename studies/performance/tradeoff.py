@@ -21,6 +21,7 @@ from rehearsal.configuration import PRESETS, Setup, setup_of
 from rehearsal.result_files import rounded
 from rehearsal.speed_accuracy import SETTINGS, pareto, preset_of, setup_of_row
 from rehearsal.stopwatch import timed
+from scenes.tissue import USUAL
 from sim.device import start
 from studies.accuracy.bead_case import BeadCase, load_case
 from studies.accuracy.bead_errors import bead_errors
@@ -239,7 +240,7 @@ def _scatter(axes: Axes, points: list[dict[str, Any]], model: str) -> None:
     for point in points:
         name = preset_of(setup_of_row(point))
         # The presets of shape matching have the paper's particles, and finer ones are not more accurate.
-        if name and point["pareto"]:
+        if name and model == USUAL:
             axes.scatter(*_place(point), marker="D", facecolors="none", edgecolors="black", zorder=3)
             _annotate(axes, point, name, -15, fontsize=10, weight="bold")
 

@@ -100,6 +100,10 @@ def test_a_course_counts_presses_ways_and_time_over_the_limit():
         figures
     ) and "largest region not imaged is 1.5 ml, up to 2.0 mm thick" in summary_text(figures)
     said = summary_text(figures | dict(presses=1, bookmarks=1))
+    # Shape matching has no forces.
+    without = SessionCourse(8.0)
+    without.add(np.eye(4), 3.0, STEP_S)
+    assert "on the probe" not in summary_text(without.summary({}, [], 0))
     assert "1 press," in said and "1 bookmark\n" in said
 
 
