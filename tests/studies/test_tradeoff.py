@@ -76,9 +76,7 @@ def test_what_was_measured_is_measured_again(device):
     row = next(
         r
         for r in rows
-        if r["model"] == setup.model
-        and r["cell_mm"] == setup.size_mm
-        and r["iterations"] == setup.iterations
+        if r["model"] == setup.model and r["cell_mm"] == setup.size_mm and r["iterations"] == setup.iterations
     )
     run = BeadExperiment(case, setup).run(setup)
     found = np.linalg.norm(run.beads - case.measured, axis=2).mean()
