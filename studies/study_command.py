@@ -29,7 +29,7 @@ STUDIES = {
     ),
     "cohort": (
         "studies.cohort.cohort_command:cohort",
-        "Settle, press and plan for many patients, in one table.",
+        "Settle, press and plan for each patient, in one table.",
     ),
     "import": ("studies.performance.import_timing_command:intake", "Measure an import: seconds and memory."),
     "freehand": (

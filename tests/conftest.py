@@ -99,7 +99,7 @@ def nothing_built() -> Iterator[None]:
     ti.reset()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def cluster() -> Iterator[str]:
     """The address of a Dask cluster of one worker with two threads: this process, reached as any other would be."""
     from distributed import LocalCluster

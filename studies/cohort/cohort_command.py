@@ -28,7 +28,7 @@ MARGIN_MM = 5.0
 
 
 @dataclass(frozen=True)
-class Patient:
+class CohortPatient:
     """A patient who was read: the row so far, and the problem for a worker, without images."""
 
     row: PatientRow
@@ -90,7 +90,7 @@ class CohortStudy:
         numbered = enumerate(folders, 1)
         ended = 0
 
-        def to_do() -> Iterator[Patient]:
+        def to_do() -> Iterator[CohortPatient]:
             nonlocal ended
             for number, folder in numbered:
                 patient = self._read(number, folder, quality)
@@ -105,7 +105,7 @@ class CohortStudy:
             ended = 0
         yield from [None] * ended
 
-    def _read(self, number: int, folder: Path, quality: str | None) -> Patient | None:
+    def _read(self, number: int, folder: Path, quality: str | None) -> CohortPatient | None:
         """The patient, who is to be computed; None where that was done before, or is not possible."""
         row = PatientRow(patient=number)
         try:
@@ -121,9 +121,9 @@ class CohortStudy:
         if row.key in self._finished:
             self._write(self._finished[row.key].model_copy(update=dict(patient=number)))
             return None
-        return Patient(row, problem)
+        return CohortPatient(row, problem)
 
-    def _take(self, patient: Patient, future: Future) -> None:
+    def _take(self, patient: CohortPatient, future: Future) -> None:
         """The result of a patient, or why there is none."""
         error = future.exception()
         if isinstance(error, ENDED):
@@ -153,8 +153,8 @@ class CohortStudy:
 
 
 def in_workers(
-    patients: Iterator[Patient], trials: int, jobs: int | None, dask: str | None
-) -> Iterator[tuple[Patient, Future]]:
+    patients: Iterator[CohortPatient], trials: int, jobs: int | None, dask: str | None
+) -> Iterator[tuple[CohortPatient, Future]]:
     """Each patient and the future of the result, as soon as it has ended.
 
     Where a process is ended, all that were in work with it are computed again, each alone: one who takes too much memory does not
@@ -162,8 +162,8 @@ def in_workers(
     """
     is_last = False
     while not is_last:
-        sent: list[Patient] = []
-        lost: list[Patient] = []
+        sent: list[CohortPatient] = []
+        lost: list[CohortPatient] = []
 
         def tasks() -> Iterator[tuple]:
             nonlocal is_last
