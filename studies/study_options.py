@@ -6,6 +6,7 @@ from typing import Any
 import click
 
 from rehearsal.commands.command_line import NumberRange, WholeRange, load_patient, make_folder, start_taichi
+from rehearsal.planning.plan_file import MOST_SWEEPS
 from scenes.anatomy import LoadedAnatomy
 from scenes.scene import Scene
 from scenes.tissue import QUALITIES
@@ -18,6 +19,13 @@ jobs_option = click.option(
 )
 dask_option = click.option(
     "--dask", metavar="ADDRESS", help="Run on the Dask cluster of this scheduler, such as tcp://host:8786."
+)
+trials_option = click.option(
+    "--trials",
+    type=WholeRange(MOST_SWEEPS, 100_000),
+    default=96,
+    show_default=True,
+    help="Simulated sweeps in the search for a plan.",
 )
 preset_option = click.option(
     "--quality",

@@ -10,9 +10,9 @@ import click
 from tqdm import tqdm
 
 from errors import UserError
-from rehearsal.commands.command_line import WholeRange, load_patient, make_folder
+from rehearsal.commands.command_line import load_patient, make_folder
 from rehearsal.configuration import probe_of
-from rehearsal.planning.plan_file import MOST_SWEEPS, write_plan
+from rehearsal.planning.plan_file import write_plan
 from rehearsal.planning.sweep_trial import PlanningProblem
 from rehearsal.result_files import rounded, write_csv, write_json
 from rehearsal.worker_processes import ENDED, Workers
@@ -20,7 +20,7 @@ from scenes.surfaces import volume_mm3
 from scenes.tissue import QUALITIES
 from studies.cohort.cohort_table import CohortFile, PatientRow, read_rows, text_of, write_rows
 from studies.cohort.patient_run import MEASURED, PatientResult, run_patient
-from studies.study_options import dask_option, jobs_option, out_option
+from studies.study_options import dask_option, jobs_option, out_option, trials_option
 from ultrasound.target import Target
 from version import VERSION
 
@@ -39,13 +39,7 @@ class CohortPatient:
 @click.argument("folders", metavar="FOLDER...", type=click.Path(path_type=Path), nargs=-1, required=True)
 @out_option
 @click.option("--quality", type=click.Choice(QUALITIES), help="A preset of the tissue model [each scene's].")
-@click.option(
-    "--trials",
-    type=WholeRange(MOST_SWEEPS, 100_000),
-    default=96,
-    show_default=True,
-    help="Simulated sweeps in the search for each plan.",
-)
+@trials_option
 @jobs_option
 @dask_option
 def cohort(
@@ -118,7 +112,7 @@ class CohortStudy:
         except UserError as error:
             self._write(row.model_copy(update=dict(message=_without_paths(str(error), folder))))
             return None
-        if row.key in self._finished:
+        if row.key in self._finished and (self.out / row.key / "report.json").is_file():
             self._write(self._finished[row.key].model_copy(update=dict(patient=number)))
             return None
         return CohortPatient(row, problem)
@@ -162,13 +156,13 @@ def in_workers(
     """
     is_last = False
     while not is_last:
-        sent: list[CohortPatient] = []
+        sent: dict[int, CohortPatient] = {}
         lost: list[CohortPatient] = []
 
         def tasks() -> Iterator[tuple]:
             nonlocal is_last
-            for patient in patients:
-                sent.append(patient)
+            for number, patient in enumerate(patients):
+                sent[number] = patient
                 yield patient.row.key, patient.problem, trials
                 if lost:
                     return
@@ -177,9 +171,9 @@ def in_workers(
         with Workers(jobs, dask) as workers:
             for number, future in workers.completed(run_patient, tasks()):
                 if isinstance(future.exception(), ENDED):
-                    lost.append(sent[number])
+                    lost.append(sent.pop(number))
                 else:
-                    yield sent[number], future
+                    yield sent.pop(number), future
         for patient in lost:
             with Workers(1, dask) as alone:
                 task = patient.row.key, patient.problem, trials

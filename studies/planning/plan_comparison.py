@@ -11,9 +11,8 @@ import numpy as np
 import trimesh
 from tqdm import tqdm
 
-from rehearsal.commands.command_line import WholeRange, make_folder
+from rehearsal.commands.command_line import make_folder
 from rehearsal.configuration import PRESETS, probe_of, scene_of
-from rehearsal.planning.plan_file import MOST_SWEEPS
 from rehearsal.planning.plan_search import make_plan, total_work, try_path, work_at
 from rehearsal.planning.sweep_score import ScoreTerms, score
 from rehearsal.planning.sweep_trial import PlanningProblem, Trial
@@ -22,7 +21,7 @@ from rehearsal.worker_processes import Workers
 from scenes.anatomy import LoadedAnatomy, load_anatomy
 from scenes.scene import EMBEDDED, Scene, load_scene, scene_file, with_options
 from studies.planning.baseline_sweeps import UNPLANNED, planned, random_sweep
-from studies.study_options import dask_option, jobs_option, out_option
+from studies.study_options import dask_option, jobs_option, out_option, trials_option
 from studies.study_results import text_table, write_results
 from ultrasound.target import Target
 
@@ -51,13 +50,7 @@ COLUMNS = {
 @click.command("plan")
 @click.argument("scenes", type=click.Path(path_type=Path), nargs=-1)
 @out_option
-@click.option(
-    "--trials",
-    type=WholeRange(MOST_SWEEPS, 100_000),
-    default=96,
-    show_default=True,
-    help="Simulated sweeps in a search.",
-)
+@trials_option
 @click.option("--probe", default="drop-in", show_default=True, help="Probe, by its name or as a file.")
 @jobs_option
 @dask_option

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -131,6 +132,10 @@ def test_a_patient_who_fails_costs_no_other_and_is_tried_again(
         # Other settings are another computation.
         assert run(folders[:2], out, "--quality", "fast") == 0
         assert len(tried) == 3
+        # A row whose files somebody removed is computed again.
+        shutil.rmtree(out / rows[0]["key"])
+        assert run(folders[:1], out) == 0
+        assert len(tried) == 4
 
 
 class Here:
