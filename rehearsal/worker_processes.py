@@ -13,13 +13,11 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
-from itertools import islice
 from typing import Any, Self, TypeVar
 
 import psutil
 from joblib import cpu_count
-from joblib.externals.loky import ProcessPoolExecutor
-from joblib.externals.loky.process_executor import ShutdownExecutorError
+from joblib.externals.loky import ProcessPoolExecutor, process_executor
 
 import sim.device
 from errors import UserError
@@ -27,7 +25,7 @@ from errors import UserError
 WATCH_S = 0.5
 CONNECT_S = 10
 # What a future raises whose worker has ended.
-ENDED = (BrokenExecutor, ShutdownExecutorError, CancelledError)
+ENDED = (BrokenExecutor, process_executor.ShutdownExecutorError, CancelledError)
 T = TypeVar("T")
 
 
@@ -48,7 +46,7 @@ class Workers:
         if dask is None:
             self.count = jobs or cpu_count()
             self._executor: Executor = ProcessPoolExecutor(
-                self.count, initializer=end_with_parent, initargs=(os.getpid(),)
+                self.count, initializer=_begin, initargs=(os.getpid(),)
             )
         else:
             self._client, self.count = _connect(dask)
@@ -70,23 +68,26 @@ class Workers:
         for number, future in self.completed(function, tasks):
             done[number] = future
             while due in done:
-                try:
-                    yield done.pop(due).result()
-                except ENDED:
+                found = done.pop(due)
+                if has_ended(error_of(found)):
                     raise WorkerError(
                         "a worker process was ended, perhaps for lack of memory; close other programs, or give fewer --jobs"
-                    ) from None
+                    )
+                yield found.result()
                 due += 1
 
     def completed(self, function: Callable[..., T], tasks: Iterable[tuple]) -> Iterator[tuple[int, Future]]:
         """The number of each task and its future, as soon as it has ended. Tasks are taken as there is a worker for them soon."""
         left, running = enumerate(tasks), dict[Future, int]()
-        while True:
-            # With more tasks queued than its processes soon take, loky's own thread fails when it is stopped.
-            for number, task in islice(left, 2 * self.count - len(running)):
-                running[self._submit(function, task)] = number
-            if not running:
-                return
+        # With more tasks queued than its processes soon take, loky's own thread fails when it is stopped.
+        most, is_more = 2 * self.count, True
+        while is_more or running:
+            # What has ended meanwhile comes before the next task, which may take long to make.
+            while is_more and len(running) < most and not any(future.done() for future in running):
+                number, task = next(left, (0, None))
+                is_more = task is not None
+                if task is not None:
+                    running[self._submit(function, task)] = number
             ended, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in sorted(ended, key=running.__getitem__):
                 yield running.pop(future), future
@@ -96,9 +97,9 @@ class Workers:
             if self._client is not None:
                 return self._executor.submit(_in_one_thread, function, *task)
             return self._executor.submit(function, *task)
-        except (*ENDED, RuntimeError) as error:
+        except (*ENDED, RuntimeError):
             refused: Future = Future()
-            refused.set_exception(error if isinstance(error, ENDED) else CancelledError())
+            refused.set_exception(BrokenExecutor())
             return refused
 
     def share(self, value: T) -> T:
@@ -171,6 +172,26 @@ def built_once(key: Hashable, build: Callable[[], T], most: int = 1) -> T:
             sim.device.start("cpu", cpu_max_num_threads=1)
         _built[key] = build()
     return _built[key]
+
+
+def error_of(future: Future) -> BaseException | None:
+    """The error of a future that has ended; also that it was cancelled."""
+    try:
+        return future.exception()
+    except CancelledError as error:
+        return error
+
+
+def has_ended(error: BaseException | None) -> bool:
+    """Whether an error means that a worker has ended, and not that its task has failed."""
+    # Dask's error, without importing Dask.
+    return isinstance(error, ENDED) or type(error).__name__ == "KilledWorker"
+
+
+def _begin(parent: int) -> None:
+    # A worker keeps what it has built. loky would take that for a leak of memory, and replace the worker.
+    process_executor._MAX_MEMORY_LEAK_SIZE = 1 << 60
+    end_with_parent(parent)
 
 
 def end_with_parent(parent: int) -> None:

@@ -1,9 +1,12 @@
 """The command ``study cohort``: many patients, each settled, pressed and planned for, in one table."""
 
 import hashlib
-from collections.abc import Iterator
+import json
+import re
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import click
@@ -15,7 +18,7 @@ from rehearsal.configuration import probe_of
 from rehearsal.planning.plan_file import write_plan
 from rehearsal.planning.sweep_trial import PlanningProblem
 from rehearsal.result_files import rounded, write_csv, write_json
-from rehearsal.worker_processes import ENDED, Workers
+from rehearsal.worker_processes import Workers, error_of, has_ended
 from scenes.surfaces import volume_mm3
 from scenes.tissue import QUALITIES
 from studies.cohort.cohort_table import CohortFile, PatientRow, read_rows, text_of, write_rows
@@ -25,6 +28,9 @@ from ultrasound.target import Target
 from version import VERSION
 
 MARGIN_MM = 5.0
+ENDED_MESSAGE = (
+    "its worker process was ended, perhaps for lack of memory; give fewer --jobs, or a coarser --quality"
+)
 
 
 @dataclass(frozen=True)
@@ -33,10 +39,13 @@ class CohortPatient:
 
     row: PatientRow
     problem: PlanningProblem
+    folder: Path
 
 
 @click.command()
-@click.argument("folders", metavar="FOLDER...", type=click.Path(path_type=Path), nargs=-1, required=True)
+@click.argument(
+    "folders", metavar="FOLDER...", type=click.Path(path_type=Path, readable=False), nargs=-1, required=True
+)
 @out_option
 @click.option("--quality", type=click.Choice(QUALITIES), help="A preset of the tissue model [each scene's].")
 @trials_option
@@ -55,10 +64,9 @@ def cohort(
     FOLDER... are patients' folders or scene files. Started again with the same --out, it goes on where it was interrupted.
     """
     make_folder(out)
-    study = CohortStudy(out, trials, read_rows(out))
+    study = CohortStudy(out, trials)
     with tqdm(total=len(folders), desc="cohort", unit="patient") as bar:
-        for _ in study.run(folders, quality, jobs, dask):
-            bar.update()
+        study.run(folders, quality, jobs, dask, bar.update)
     write_csv([row.model_dump() for row in study.rows()], out / "cohort.csv")
     click.echo(
         f"\n{text_of(study.rows())}\n\nWrote cohort.json, cohort.csv, and report and plan of each to {out}"
@@ -66,11 +74,12 @@ def cohort(
 
 
 class CohortStudy:
-    """The rows of a cohort, each written as soon as its patient has ended."""
+    """The rows of a cohort, each written as soon as its patient has ended. Raises CohortError."""
 
-    def __init__(self, out: Path, trials: int, earlier: list[PatientRow]) -> None:
+    def __init__(self, out: Path, trials: int) -> None:
         self.out, self.trials = out, trials
-        self._finished = {row.key: row for row in earlier if row.state != "failed"}
+        self._done: Callable[[], object] = lambda: None
+        self._finished = {row.key: row for row in read_rows(out) if row.state != "failed"}
         self._rows: dict[int, PatientRow] = {}
 
     def rows(self) -> list[PatientRow]:
@@ -78,56 +87,52 @@ class CohortStudy:
         return [self._rows[number] for number in sorted(self._rows)]
 
     def run(
-        self, folders: tuple[Path, ...], quality: str | None, jobs: int | None, dask: str | None
-    ) -> Iterator[None]:
-        """Read, compute and write; one turn for each patient who has ended. Raises WorkerError, OSError."""
-        numbered = enumerate(folders, 1)
-        ended = 0
-
-        def to_do() -> Iterator[CohortPatient]:
-            nonlocal ended
-            for number, folder in numbered:
-                patient = self._read(number, folder, quality)
-                if patient is None:
-                    ended += 1
-                else:
-                    yield patient
-
-        for patient, future in in_workers(to_do(), self.trials, jobs, dask):
+        self,
+        folders: tuple[Path, ...],
+        quality: str | None,
+        jobs: int | None,
+        dask: str | None,
+        done: Callable[[], object],
+    ) -> None:
+        """Read, compute and write; ``done`` is called for each patient who has ended. Raises WorkerError, OSError."""
+        self._done = done
+        read = (self._read(number, folder, quality) for number, folder in enumerate(folders, 1))
+        to_do = (patient for patient in read if patient is not None)
+        for patient, future in in_workers(to_do, self.trials, jobs, dask):
             self._take(patient, future)
-            yield from [None] * (ended + 1)
-            ended = 0
-        yield from [None] * ended
 
     def _read(self, number: int, folder: Path, quality: str | None) -> CohortPatient | None:
         """The patient, who is to be computed; None where that was done before, or is not possible."""
-        row = PatientRow(patient=number)
+        row = PatientRow(patient=number, trials=self.trials)
         try:
             scene, anatomy = load_patient(folder, quality=quality)
             target: Target = "organ" if anatomy.tumour is None else "margin"
             problem = PlanningProblem(
                 scene, anatomy, probe_of(scene), target, MARGIN_MM, scene.trocar
             ).without_images
-            row = _described(row, problem, self.trials)
-        except UserError as error:
-            self._write(row.model_copy(update=dict(message=_without_paths(str(error), folder))))
+            row = _described(row, problem)
+        except Exception as error:  # whatever is wrong with one patient, the others are computed
+            self._write(row.model_copy(update=dict(message=_message_of(error, folder))))
             return None
-        if row.key in self._finished and (self.out / row.key / "report.json").is_file():
-            self._write(self._finished[row.key].model_copy(update=dict(patient=number)))
+        finished = self._finished.get(row.key)
+        if finished is not None and self._has_files(finished):
+            self._write(finished.model_copy(update=dict(patient=number)))
             return None
-        return CohortPatient(row, problem)
+        return CohortPatient(row, problem, folder)
+
+    def _has_files(self, row: PatientRow) -> bool:
+        """Whether report and plan of a row are there still."""
+        names = ["report.json", *(["plan.json"] if row.state == "done" else [])]
+        return all((self.out / row.key / name).is_file() for name in names)
 
     def _take(self, patient: CohortPatient, future: Future) -> None:
         """The result of a patient, or why there is none."""
-        error = future.exception()
-        if isinstance(error, ENDED):
-            message = "its worker process was ended, perhaps for lack of memory; give fewer --jobs, or a coarser --quality"
-        elif error is not None:
-            message = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
-        else:
+        error = error_of(future)
+        if error is None:
             self._write(self._written(patient.row, future.result()))
-            return
-        self._write(patient.row.model_copy(update=dict(message=" ".join(message.split()))))
+        else:
+            message = ENDED_MESSAGE if has_ended(error) else _message_of(error, patient.folder)
+            self._write(patient.row.model_copy(update=dict(message=message)))
 
     def _written(self, row: PatientRow, result: PatientResult) -> PatientRow:
         """Write report and plan of a patient; the row of the table."""
@@ -139,11 +144,14 @@ class CohortStudy:
         return row.model_copy(update=_figures(result))
 
     def _write(self, row: PatientRow) -> None:
+        """Write the table with one row more; rows of patients that are not reached yet, or of another command line, stay."""
+        assert row.patient is not None
         self._rows[row.patient] = row
-        # Rows that are not reached yet stay in the file: the next interruption must not lose them.
         reached = {each.key for each in self._rows.values()}
-        later = [each for key, each in self._finished.items() if key not in reached]
-        write_rows(CohortFile(version=VERSION, trials=self.trials, patients=[*self.rows(), *later]), self.out)
+        kept = [each for each in read_rows(self.out) if each.state != "failed" and each.key not in reached]
+        others = [each.model_copy(update=dict(patient=None)) for each in kept]
+        write_rows(CohortFile(version=VERSION, patients=[*self.rows(), *others]), self.out)
+        self._done()
 
 
 def in_workers(
@@ -151,43 +159,58 @@ def in_workers(
 ) -> Iterator[tuple[CohortPatient, Future]]:
     """Each patient and the future of the result, as soon as it has ended.
 
-    Where a process is ended, all that were in work with it are computed again, each alone: one who takes too much memory does not
+    Where a process is ended, those that were in work are computed again, each alone: one who takes too much memory does not
     cost the others their results. Raises WorkerError.
     """
-    is_last = False
-    while not is_last:
+    left = iter(patients)
+    while True:
         sent: dict[int, CohortPatient] = {}
-        lost: list[CohortPatient] = []
+        lost: dict[int, CohortPatient] = {}
 
-        def tasks() -> Iterator[tuple]:
-            nonlocal is_last
-            for number, patient in enumerate(patients):
+        def tasks(
+            left: Iterator[CohortPatient] = left, sent: dict = sent, lost: dict = lost
+        ) -> Iterator[tuple]:
+            for number, patient in enumerate(left):
                 sent[number] = patient
                 yield patient.row.key, patient.problem, trials
                 if lost:
                     return
-            is_last = True
 
         with Workers(jobs, dask) as workers:
             for number, future in workers.completed(run_patient, tasks()):
-                if isinstance(future.exception(), ENDED):
-                    lost.append(sent.pop(number))
+                patient = sent.pop(number)
+                if has_ended(error_of(future)):
+                    lost[number] = patient
                 else:
-                    yield sent.pop(number), future
-        for patient in lost:
+                    yield patient, future
+        if not lost:
+            return
+        in_order = [lost[number] for number in sorted(lost)]
+        # The others had not begun.
+        left = chain(in_order[workers.count :], left)
+        for patient in in_order[: workers.count]:
             with Workers(1, dask) as alone:
-                task = patient.row.key, patient.problem, trials
-                for _, future in alone.completed(run_patient, [task]):
+                for _, future in alone.completed(run_patient, [(patient.row.key, patient.problem, trials)]):
                     yield patient, future
 
 
-def _described(row: PatientRow, problem: PlanningProblem, trials: int) -> PatientRow:
+def _described(row: PatientRow, problem: PlanningProblem) -> PatientRow:
     """What is known of a patient before anything is computed."""
     scene, organ, tumour = problem.scene, problem.anatomy.organ, problem.anatomy.tumour
-    settings = scene.model_dump_json(), problem.fingerprint, str(trials), VERSION
+    values = scene.model_dump(
+        mode="json", exclude={"title": True, "uncertainty": True, "transducer": {"probe"}}
+    )
+    # The probe itself, and not the path of its file.
+    settings = (
+        json.dumps(values),
+        problem.probe.model_dump_json(),
+        problem.fingerprint,
+        str(row.trials),
+        VERSION,
+    )
     return row.model_copy(
         update=dict(
-            title=scene.title,
+            title=_printable(scene.title),
             key=hashlib.sha256("\n".join(settings).encode()).hexdigest()[:12],
             kidney_ml=rounded(volume_mm3(organ.vertices, organ.faces) / 1000),
             tumour_ml=None if tumour is None else rounded(volume_mm3(tumour.vertices, tumour.faces) / 1000),
@@ -219,8 +242,21 @@ def _figures(result: PatientResult) -> dict[str, object]:
     return figures
 
 
-def _without_paths(message: str, folder: Path) -> str:
-    """A message for a table that others may read: a patient's path may name the patient."""
-    for path in (str(folder.resolve()), str(folder)):
-        message = message.replace(path, "FOLDER")
-    return message
+def _message_of(error: BaseException, folder: Path) -> str:
+    """What is wrong with a patient, in one line without paths: the table may be read by others, and a path may name the patient."""
+    text = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+    places = [folder.absolute(), folder.resolve(), folder]
+    if folder.suffix == ".toml":
+        places += [folder.absolute().parent, folder.resolve().parent]
+    names = {name for place in places for name in (str(place), _printable(str(place)))} - {".", "/"}
+    # The longest first: a folder is the beginning of its file.
+    for name in sorted(names, key=len, reverse=True):
+        text = re.sub(rf"(?<![\w./\\-]){re.escape(name)}(?=[/\\:'\"]|$)", "FOLDER", text)
+    # Any other absolute path, up to what ends it.
+    text = re.sub(r"(?<![\w./\\-])(?:[A-Za-z]:[/\\]|/)[^:'\"]*", "FILE", text)
+    return " ".join(_printable(text).split())
+
+
+def _printable(text: str) -> str:
+    """Letters that do not print, which could control a terminal, become question marks."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)

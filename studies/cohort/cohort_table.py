@@ -25,10 +25,11 @@ class PatientRow(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    patient: int
-    """Place in the command line, from 1."""
+    patient: int | None
+    """Place in the command line, from 1; None for a patient of an earlier one."""
     title: str = ""
     key: str = ""
+    trials: int
     state: Literal["done", "no plan", "failed"] = "failed"
     message: str = ""
     kidney_ml: float | None = None
@@ -61,7 +62,6 @@ class CohortFile(BaseModel):
 
     nephron_cohort: Literal[1] = 1
     version: str
-    trials: int
     patients: list[PatientRow] = []
 
 

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import Future
 from types import SimpleNamespace
 
 import psutil
@@ -14,7 +15,7 @@ from conftest import ROOT
 from app import main
 from errors import UserError
 from rehearsal import worker_processes
-from rehearsal.worker_processes import WATCH_S, WorkerError, Workers, built_once
+from rehearsal.worker_processes import WATCH_S, WorkerError, Workers, built_once, error_of, has_ended
 
 # A pool of two, one of them busy for longer than the test and one idle, which says who they are and waits.
 PARENT = """
@@ -99,6 +100,33 @@ def test_tasks_are_taken_as_there_is_a_worker_for_them_soon():
     with Workers(1) as workers:
         next(workers.map(late, tasks()))
         assert len(taken) <= 3
+
+
+def test_what_has_ended_comes_before_the_next_task_is_made():
+    """Which may take long."""
+    made = []
+
+    def tasks():
+        for number in range(4):
+            made.append(number)
+            yield number, 0.0
+            time.sleep(1.0)
+
+    with Workers(2) as workers:
+        list(workers.map(late, LATE))
+        _, future = next(workers.completed(late, tasks()))
+        assert future.result()[0] == 0 and len(made) <= 3
+
+
+class KilledWorker(Exception):
+    """As Dask's."""
+
+
+def test_cancelled_futures_and_killed_workers_are_no_errors_of_a_task():
+    cancelled: Future = Future()
+    cancelled.cancel()
+    assert has_ended(error_of(cancelled)) and has_ended(KilledWorker())
+    assert not has_ended(None) and not has_ended(UserError("two"))
 
 
 def test_a_stop_is_an_error_for_a_waiting_thread():

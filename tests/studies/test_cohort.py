@@ -4,19 +4,24 @@ import csv
 import json
 import os
 import shutil
+from concurrent.futures import Future
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from ball_patient import folder_of_ball
 
 import app
+from errors import UserError
 from rehearsal.planning import plan_search
 from rehearsal.planning.plan_file import MOST_SWEEPS, Plan, PlanError, read_plan
+from rehearsal.worker_processes import error_of, has_ended
 from scenes.anatomy import fingerprint, load_anatomy
 from scenes.scene import load_scene
 from studies.cohort import cohort_command, patient_run
 from studies.cohort.cohort_table import PatientRow
 from studies.cohort.patient_run import PatientResult
+from ultrasound.probe import PROBES
 from version import VERSION
 
 TRIALS = ["--trials", str(MOST_SWEEPS)]
@@ -141,6 +146,8 @@ def test_a_patient_who_fails_costs_no_other_and_is_tried_again(
 class Here:
     """Instead of workers: each task as it comes."""
 
+    count = 1
+
     def __init__(self, *_: object) -> None: ...
 
     def __enter__(self) -> "Here":
@@ -149,8 +156,6 @@ class Here:
     def __exit__(self, *_: object) -> None: ...
 
     def completed(self, function, tasks):
-        from concurrent.futures import Future
-
         for number, task in enumerate(tasks):
             future: Future = Future()
             try:
@@ -184,6 +189,106 @@ def test_an_interrupted_cohort_goes_on_where_it_was(patients, tmp_path, monkeypa
     assert [each["state"] for each in table_in(out)] == ["no plan", "no plan", "failed"]
 
 
+def message(text: str, folder: Path) -> str:
+    return cohort_command._message_of(UserError(text), folder)
+
+
+@pytest.mark.parametrize(
+    ("text", "folder", "words"),
+    [
+        ("/data/Jane Doe/scene.toml: bad", "/data/Jane Doe", "FOLDER/scene.toml: bad"),
+        ("/data/Jane Doe/organ.stl: bad", "/data/Jane Doe/scene.toml", "FOLDER/organ.stl: bad"),
+        ("/data/Jane?Doe/organ.stl: bad", "/data/Jane\u00a0Doe", "FOLDER/organ.stl: bad"),
+        ("/else/Jane Doe/organ.stl: bad", "/data/x", "FILE: bad"),
+        ("no (Not a directory: '/else/Doe/x')", "/data/x", "no (Not a directory: 'FILE')"),
+        ("C:\\Doe\\organ.stl: bad", "/data/x", "FILE: bad"),
+        ("a/organ.stl: give a surface", "a", "FOLDER/organ.stl: give a surface"),
+        ("a: give a surface and/or a line", "a", "FOLDER: give a surface and/or a line"),
+        ("organ.stl: bad\x1b[31m\nline", ".", "organ.stl: bad?[31m?line"),
+    ],
+)
+def test_messages_have_no_paths_and_nothing_that_controls_a_terminal(text, folder, words):
+    assert message(text, Path(folder)) == words
+
+
+def test_what_is_wrong_with_one_patient_does_not_stop_the_others(patients, tmp_path, monkeypatch):
+    """Whatever it is, also what no message was written for."""
+    out, load = tmp_path / "out", cohort_command.load_patient
+
+    def failing(folder: Path, **options):
+        if folder == patients[1]:
+            raise PermissionError(13, "Permission denied", str(folder / "scene.toml"))
+        return load(folder, **options)
+
+    monkeypatch.setattr(cohort_command, "load_patient", failing)
+    monkeypatch.setattr(cohort_command, "Workers", Here)
+    monkeypatch.setattr(cohort_command, "run_patient", lambda *_: result("no sweep was found"))
+    assert run([patients[1], patients[0]], out) == 0
+    refused, computed = table_in(out)
+    assert refused["message"] == "PermissionError: [Errno 13] Permission denied: 'FOLDER/scene.toml'"
+    assert computed["state"] == "no plan"
+    # Another study with the same folder meanwhile: the rows of both stay.
+    assert run([patients[2]], out) == 0
+    assert [row["patient"] for row in table_in(out)] == [1, None]
+
+
+def test_a_key_depends_on_the_probe_and_not_on_where_its_file_is(patients, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    monkeypatch.setattr(cohort_command, "Workers", Here)
+    monkeypatch.setattr(cohort_command, "run_patient", lambda *_: result("no sweep was found"))
+    probe = (PROBES / "drop-in.toml").read_text()
+    folder = patients[0]
+    scene = folder / "scene.toml"
+    scene.write_text(scene.read_text().replace('"drop-in"', '"mine.toml"'))
+    keys = []
+    for depth in ("40.0", "33.0"):
+        (folder / "mine.toml").write_text(probe.replace("DepthMm = 40.0", f"DepthMm = {depth}"))
+        assert run([folder], out) == 0
+        keys.append(table_in(out)[0]["key"])
+    folder = folder.rename(tmp_path / "elsewhere")
+    assert run([folder], out) == 0
+    assert keys[0] != keys[1] == table_in(out)[0]["key"]
+
+
+class KilledWorker(Exception):
+    """As Dask's."""
+
+
+def test_who_was_in_work_beside_one_that_killed_its_worker_is_computed_again(monkeypatch):
+    """Alone, and only those: the others go on in parallel."""
+    begun: list[tuple[int, str]] = []
+
+    class Cluster(Here):
+        count = 2
+
+        def __init__(self, jobs: int | None, dask: str | None) -> None:
+            self.jobs = jobs
+
+        def completed(self, function, tasks):
+            killed = 0
+            for number, task in enumerate(tasks):
+                begun.append((self.jobs, task[0]))
+                future: Future = Future()
+                if task[0] == "poison" or (self.jobs is None and killed in (1, 2)):
+                    killed += 1
+                    future.set_exception(KilledWorker("tcp://10.0.0.1"))
+                else:
+                    future.set_result(task[0])
+                yield number, future
+
+    monkeypatch.setattr(cohort_command, "Workers", Cluster)
+    patients = [
+        SimpleNamespace(row=SimpleNamespace(key=key), problem=None) for key in ("a", "poison", "b", "c")
+    ]
+    ended = {
+        patient.row.key: error_of(future)
+        for patient, future in cohort_command.in_workers(iter(patients), 4, None, "tcp://x")
+    }
+    assert list(ended) == ["a", "poison", "b", "c"] and has_ended(ended.pop("poison"))
+    assert list(ended.values()) == [None] * 3
+    assert (1, "poison") in begun and (None, "c") in begun
+
+
 def test_no_plan_is_searched_for_tissue_that_diverged(monkeypatch):
     monkeypatch.setattr(patient_run, "built_once", lambda key, build: type("Trial", (), dict(rehearsal=None)))
     monkeypatch.setattr(patient_run, "press", lambda *_: dict(finite=False, stages=[]))
@@ -203,9 +308,9 @@ def test_no_plan_is_searched_for_tissue_that_diverged(monkeypatch):
     [
         ("{", "is no table of a cohort of this version"),
         ("[]", "is no table of a cohort of this version"),
-        (json.dumps(dict(nephron_cohort=2, version=VERSION, trials=8)), "nephron_cohort = 2"),
+        (json.dumps(dict(nephron_cohort=2, version=VERSION)), "nephron_cohort = 2"),
         (
-            json.dumps(dict(nephron_cohort=1, version=VERSION, trials=8, patients=[dict(patient="x")])),
+            json.dumps(dict(nephron_cohort=1, version=VERSION, patients=[dict(patient="x")])),
             "patient",
         ),
         ("\xff".encode("latin-1"), "cannot be read"),
