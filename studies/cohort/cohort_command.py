@@ -64,9 +64,10 @@ def cohort(
     FOLDER... are patients' folders or scene files. Started again with the same --out, it goes on where it was interrupted.
     """
     make_folder(out)
-    study = CohortStudy(out, trials)
+    earlier = read_rows(out)
     with tqdm(total=len(folders), desc="cohort", unit="patient") as bar:
-        study.run(folders, quality, jobs, dask, bar.update)
+        study = CohortStudy(out, trials, earlier, bar.update)
+        study.run(folders, quality, jobs, dask)
     write_csv([row.model_dump() for row in study.rows()], out / "cohort.csv")
     click.echo(
         f"\n{text_of(study.rows())}\n\nWrote cohort.json, cohort.csv, and report and plan of each to {out}"
@@ -74,28 +75,19 @@ def cohort(
 
 
 class CohortStudy:
-    """The rows of a cohort, each written as soon as its patient has ended. Raises CohortError."""
+    """The rows of a cohort, each written as soon as its patient has ended; ``done`` is then called."""
 
-    def __init__(self, out: Path, trials: int) -> None:
-        self.out, self.trials = out, trials
-        self._done: Callable[[], object] = lambda: None
-        self._finished = {row.key: row for row in read_rows(out) if row.state != "failed"}
-        self._rows: dict[int, PatientRow] = {}
+    def __init__(self, out: Path, trials: int, earlier: list[PatientRow], done: Callable[[], object]) -> None:
+        self.out, self.trials, self._done = out, trials, done
+        self._finished = {row.key: row for row in earlier if row.state != "failed"}
+        self._rows: list[PatientRow] = []
 
     def rows(self) -> list[PatientRow]:
         """In the order of the command line."""
-        return [self._rows[number] for number in sorted(self._rows)]
+        return sorted(self._rows, key=lambda row: row.patient or 0)
 
-    def run(
-        self,
-        folders: tuple[Path, ...],
-        quality: str | None,
-        jobs: int | None,
-        dask: str | None,
-        done: Callable[[], object],
-    ) -> None:
-        """Read, compute and write; ``done`` is called for each patient who has ended. Raises WorkerError, OSError."""
-        self._done = done
+    def run(self, folders: tuple[Path, ...], quality: str | None, jobs: int | None, dask: str | None) -> None:
+        """Read, compute and write. Raises CohortError, WorkerError, OSError."""
         read = (self._read(number, folder, quality) for number, folder in enumerate(folders, 1))
         to_do = (patient for patient in read if patient is not None)
         for patient, future in in_workers(to_do, self.trials, jobs, dask):
@@ -145,9 +137,8 @@ class CohortStudy:
 
     def _write(self, row: PatientRow) -> None:
         """Write the table with one row more; rows of patients that are not reached yet, or of another command line, stay."""
-        assert row.patient is not None
-        self._rows[row.patient] = row
-        reached = {each.key for each in self._rows.values()}
+        self._rows.append(row)
+        reached = {each.key for each in self._rows}
         kept = [each for each in read_rows(self.out) if each.state != "failed" and each.key not in reached]
         others = [each.model_copy(update=dict(patient=None)) for each in kept]
         write_rows(CohortFile(version=VERSION, patients=[*self.rows(), *others]), self.out)
