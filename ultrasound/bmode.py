@@ -1,9 +1,11 @@
 """The B-mode image: the echo signal of each scanline through the deformed tissue, converted to grey values.
 
-1. ``_find_contact``: which elements of the array are in contact.
-2. ``_simulate``: a pulse travels along each scanline, is attenuated, reflected and scattered.
-3. ``_spread``: the point-spread function across the scanlines, then the envelope in dB, with gain and TGC.
-4. ``_scan_convert``: from scanlines and samples to the pixels of the image.
+1. ``Propagation``: what each scanline passes through, and how much sound arrives.
+2. ``_scatter``: the signal of scatterers, with the clutter that side lobes receive.
+3. ``_lengthen``: attenuation takes the high frequencies, so that the pulse becomes longer.
+4. ``_reflect``: the echoes of interfaces.
+5. ``_spread``: the beam's width across the scanlines, electronic noise, then the envelope in dB, with gain and TGC.
+6. ``_scan_convert``: from scanlines and samples to the pixels of the image.
 """
 
 from typing import Any
@@ -14,97 +16,29 @@ import taichi.math as tm
 
 from sim.device import TASK
 from sim.fields import fill
-from ultrasound.probe import DETAIL_LEVELS, DetailLevel, Probe
-from ultrasound.sampled_volume import SampledVolume
-from ultrasound.speckle import Speckle
-
-# A probe's samples are a multiple of this.
-LANES = 16
-Packet = ti.types.vector(LANES, ti.f32)
-# Samples between two tissue samples: the larger stride where it is no longer than a voxel.
-STRIDES = (8, 4)
-NOISE_FLOOR = 1e-9
-# Half width of the lateral kernel, in standard deviations and at most in scanlines.
-HALF_WIDTH_SD, MAX_HALF_WIDTH = 2.5, 24
-# Parallel planes that sample the slice thickness: offset in standard deviations, weight in a mean, and weight in a sum of noise
-# that preserves its mean square.
-CENTRAL_PLANE = ((0.0, 1.0, 1.0),)
-THICK_PLANE = tuple(
-    (offset, weight / 2.0, weight / 1.5**0.5) for offset, weight in ((0.0, 1.0), (-1.2, 0.5), (1.2, 0.5))
+from ultrasound.beam import elevation_profiles, profile_depths
+from ultrasound.lateral_kernel import (
+    CLASSES,
+    GROUP,
+    LANES,
+    MAX_HALF_WIDTH,
+    clutter_weights,
+    lateral_kernel,
+    scanline_classes,
 )
-# A smaller relative change of impedance between two samples is no interface.
-MIN_REFLECTION = 3e-4
+from ultrasound.probe import DetailLevel, Probe
+from ultrasound.propagation import Propagation
+from ultrasound.pulse import PATH_ENTRIES
+from ultrasound.sampled_volume import SampledVolume
+from ultrasound.speckle import COMPONENTS, LEAST_WEIGHT, SIZE, UNIT, Speckle, elevation_levels
+
+Packet = ti.types.vector(LANES, ti.f32)
+# The least amplitude that has a logarithm.
+SILENCE = 1e-9
+# Kernels that lengthen the pulse: by so many SDs, in steps of samples, with so many taps to each side, up to so many SDs.
+LENGTHS, LENGTH_STEP, LENGTH_TAPS, HALF_WIDTH_SD = 33, 0.125, 10, 2.5
 # Decibels per neper of amplitude.
 DB = 8.685889638065037
-
-
-@ti.dataclass
-class Interface:
-    """A step of impedance that the CT blurs over several tissue samples.
-
-    ``steps`` is the sum of the reflections; ``middle`` and ``incidence`` are depth [mm] and incidence factor, weighted by them;
-    ``thickness`` is in mm. ``before`` is the tissue in front of it, from depth ``begins`` [mm], where the pulse has ``amplitude``.
-    """
-
-    steps: ti.f32
-    middle: ti.f32
-    incidence: ti.f32
-    thickness: ti.f32
-    before: tm.vec3
-    begins: ti.f32
-    amplitude: ti.f32
-
-    @ti.func
-    def begin(self, tissue, depth_mm, amplitude):
-        """Reset to no reflection, behind the given tissue."""
-        self.steps, self.middle, self.incidence, self.thickness = 0.0, 0.0, 0.0, 0.0
-        self.before, self.begins, self.amplitude = tissue, depth_mm, amplitude
-
-    @ti.func
-    def add(self, step, depth_mm, incidence, path_mm):
-        """Add one step of impedance over a part of the path."""
-        self.steps += step
-        self.middle += step * depth_mm
-        self.incidence += step * incidence
-        # Thickness along the normal, not along the beam.
-        self.thickness += incidence * incidence * path_mm
-
-    @ti.func
-    def ends(self, step, max_mm):
-        """Whether the next step no longer belongs to this interface."""
-        other = step * self.steps <= 0.0 or ti.abs(step) < MIN_REFLECTION or self.thickness > max_mm
-        return self.steps != 0.0 and other
-
-    @ti.func
-    def reflection(self, after):
-        """Reflection coefficient of amplitude between the impedance before it and the one after it [MRayl]."""
-        return (after - self.before.x) / (after + self.before.x)
-
-    @ti.func
-    def depth_mm(self):
-        """Depth of its centre."""
-        return self.middle / self.steps
-
-    @ti.func
-    def echo(self, after, frequency_mhz):
-        """Amplitude of its echo, as one step at its centre; the tissue before it attenuates up to there."""
-        path_db = 2.0 * self.before.y * frequency_mhz * (self.depth_mm() - self.begins) / 10.0
-        return (
-            ti.abs(self.reflection(after))
-            * self.amplitude
-            * ti.exp(-path_db / DB)
-            * self.incidence
-            / self.steps
-        )
-
-
-@ti.dataclass
-class TissueSample:
-    """Impedance, attenuation and backscatter; the rest position [mm]; the map (3, 4) from the image plane to it."""
-
-    tissue: tm.vec3
-    rest: tm.vec3
-    linear: ti.types.matrix(3, 4, ti.f32)
 
 
 @ti.data_oriented
@@ -128,20 +62,26 @@ class BMode:
         contact_gap_mm: float = 1.5,
         around: float | None = None,
     ) -> None:
-        self.tissue, self.organ, self.plane, self.voxel_mm = tissue, organ, plane, voxel_mm
-        # A CT blurs an interface by about a voxel to each side.
-        self.interface_mm = 5.0 * voxel_mm
-        self.by_organ, self.gap_mm = contact == "organ", contact_gap_mm
-        self.organ_alone, self.around = around is not None, around or 0.0
-        self.speckle = Speckle()
+        self.plane, self.speckle = plane, Speckle()
         shape = self.lines, self.samples = probe.number_of_scanlines, probe.number_of_samples_per_scanline
-        self.start, self.direction, self.element = (ti.Vector.field(2, ti.f32, self.lines) for _ in range(3))
-        self.contacts_before = ti.field(ti.i32, self.lines + 1)
+        self.sound = Propagation(tissue, organ, plane, probe, voxel_mm, contact, contact_gap_mm, around)
+        most, packets, self.groups = self.sound.most, self.samples // LANES, -(-self.lines // GROUP)
+        # Scattered signal, with room for the taps that lengthen it; and the signal of the scanlines.
+        padded = self.lines, self.samples + 2 * LENGTH_TAPS
+        self.scattered_real, self.scattered_imaginary = (ti.field(ti.f32, padded) for _ in range(2))
         self.real, self.imaginary, self.decibel = (ti.field(ti.f32, shape) for _ in range(3))
-        # Factor by sample that restores unit mean square of speckle after the point-spread function.
-        self.speckle_gain = ti.field(ti.f32, self.samples)
-        self.weight = ti.field(ti.f32, (2 * MAX_HALF_WIDTH + 1, self.samples))
-        self.half = ti.field(ti.i32, self.samples // LANES)
+        self.level = ti.field(ti.f32, (self.lines, most))
+        self.energy, self.clutter = (ti.field(ti.f32, (self.groups, most)) for _ in range(2))
+        self.clutter_weight = ti.field(ti.f32, (most, 2 * self.groups - 1))
+        # Shorter length of the noise across the plane, weights of it and of the next; extra length of the pulse at a path.
+        self.elevation = ti.Vector.field(3, ti.f32, most)
+        self.axial_sd = ti.field(ti.f32, PATH_ENTRIES)
+        self.length_weight = ti.field(ti.f32, (LENGTHS, 2 * LENGTH_TAPS + 1))
+        self.weight = ti.field(ti.f32, (CLASSES, packets, 2 * MAX_HALF_WIDTH + 1))
+        self.half = ti.field(ti.i32, (CLASSES, packets))
+        # Factor that restores unit mean square of speckle after the spread.
+        self.speckle_gain = ti.field(ti.f32, (CLASSES, packets))
+        self.scanline_class, self.side = ti.field(ti.i32, self.lines), ti.field(ti.i32, self.lines)
         self.gain = ti.field(ti.f32, self.samples)
         self.source = ti.Vector.field(2, ti.f32, (plane.pixels, plane.pixels))
         self._table_settings: tuple | None = None
@@ -152,17 +92,21 @@ class BMode:
         ``decibel`` then holds its scanlines, ``real`` and ``imaginary`` their echo.
         """
         self._make_tables(probe)
-        self._find_contact()
-        # A phased array transmits every scanline with all of its elements.
-        pitch = 0.0 if probe.transducer_geometry == "PHASED" else float(probe.line_spacing_mm(np.zeros(1))[0])
-        aperture = 0.5 / (probe.f_number * pitch) if pitch else 1e6
-        beam = probe.sample_mm, probe.frequency_mhz, aperture, probe.axial_sd_mm, probe.elevation_sd_mm
-        stride = STRIDES[0] if STRIDES[0] * probe.sample_mm <= self.voxel_mm else STRIDES[1]
-        self._simulate(DETAIL_LEVELS.index(detail_level), stride, *beam)
-        if detail_level == "reflection":
-            self._add()
+        self.sound.run(probe, thick=detail_level == "elevation")
+        stride = self.sound.stride_of(probe)
+        has_speckle = detail_level != "reflection"
+        axial_sd = probe.axial_sd_mm
+        self._set_levels(has_speckle, self.samples // stride + 1)
+        if has_speckle:
+            self._scatter(stride, axial_sd)
+            self._lengthen(stride, axial_sd, probe.sample_mm)
         else:
-            self._spread()
+            self._scatter_evenly(stride)
+        self._reflect(has_speckle, stride, probe.sample_mm, axial_sd)
+        if has_speckle:
+            self._spread(10.0 ** (probe.noise_db / 20.0), self.plane.noise_key)
+        else:
+            self._add()
         image = np.empty(self.plane.shape, np.uint8)
         self._scan_convert(probe.dyn_range_db, image)
         return image
@@ -170,7 +114,9 @@ class BMode:
     def _make_tables(self, probe: Probe) -> None:
         """Update the tables of the probe's settings, if these changed."""
         fill((self.gain, probe.gain_db()))
-        fixed = probe.model_dump(exclude={"gain_percent", "dyn_range_db", "time_gain_compensation"})
+        fixed = probe.model_dump(
+            exclude={"gain_percent", "dyn_range_db", "time_gain_compensation", "noise_db"}
+        )
         settings = *fixed.items(), self.plane.shape
         if self._table_settings == settings:
             return
@@ -178,210 +124,188 @@ class BMode:
         source = np.zeros(self.source.shape + (2,), np.float32)
         rows, columns = self.plane.shape
         source[:rows, :columns] = source_of_pixels(probe, rows, columns)
-        start, direction = probe.scanlines()
-        weights, half, speckle_gain = lateral_weights(probe)
+        depth = self.sound.stride_of(probe) * probe.sample_mm * np.arange(self.sound.most)
+        nodes = profile_depths(probe)
+        slice_sd, correlation_sd = (
+            np.interp(depth, nodes, each) for each in elevation_profiles(probe, nodes)
+        )
+        self.sound.set_probe(probe, slice_sd)
+        weights, half, speckle_gain = lateral_kernel(probe)
+        classes, side = scanline_classes(probe)
         fill(
-            (self.start, start),
-            (self.direction, direction),
-            (self.element, probe.elements()),
+            (self.clutter_weight, clutter_weights(probe, depth)),
+            (self.elevation, elevation_levels(correlation_sd)),
+            (self.axial_sd, probe.pulse.axial_sd_mm),
+            (self.length_weight, length_weights(probe.axial_sd_mm / probe.sample_mm)),
             (self.speckle_gain, speckle_gain),
             (self.weight, weights),
-            (self.half, half.reshape(-1, LANES).max(axis=1)),
+            (self.half, half),
+            (self.scanline_class, classes),
+            (self.side, side),
             (self.source, source),
         )
 
     @ti.kernel
-    def _find_contact(self):
-        """Count the array elements in contact: ``contacts_before[i]`` is the number among the elements before i."""
-        ti.loop_config(serialize=True)
-        for i in range(self.lines):
-            place = self.element[i]
-            if ti.static(not self.by_organ):
-                place.y += 0.5 * self.gap_mm
-            row, column = self.plane.pixel_near(place)
-            rest = self.plane.rest_from_plane(row, column) @ tm.vec4(place, 0.0, 1.0)
-            near = 0
-            if ti.static(self.by_organ):
-                near = self.plane.is_tissue(row, column) and self.organ.sample(rest) <= self.gap_mm
-            else:
-                near = self.tissue.sample(rest)[0] > 1.0
-            self.contacts_before[i + 1] = self.contacts_before[i] + near
-
-    @ti.func
-    def sample_tissue(self, planes: ti.template(), place, elevation_sd: ti.f32):
-        """The TissueSample at (u, v) of the image plane [mm]."""
-        row, column = self.plane.pixel_near(place)
-        linear = self.plane.rest_from_plane(row, column)
-        rest = linear @ tm.vec4(place, 0.0, 1.0)
-        found = tm.vec3(0.0)
-        for off, weight, _ in ti.static(planes):
-            found += weight * self.tissue.sample(rest + (off * elevation_sd) * linear[:, 2])
-        if ti.static(self.organ_alone):
-            if not (self.plane.is_tissue(row, column) and self.organ.sample(rest) <= 0.0):
-                found = tm.vec3(self.around, 0.0, 0.0)
-        return TissueSample(found, rest, linear)  # type: ignore[call-arg]
+    def _set_levels(self, has_clutter: ti.template(), count: int):
+        """Set the level of scattering at each tissue sample, with the clutter."""
+        for line, k in ti.ndrange(self.lines, count):
+            self.level[line, k] = self.sound.amplitude[line, k] * self.sound.tissue[line, k].z
+        if ti.static(has_clutter):
+            for group, k in ti.ndrange(self.groups, count):
+                first, last = group * GROUP, ti.min((group + 1) * GROUP, self.lines)
+                total = 0.0
+                for line in range(first, last):
+                    total += self.level[line, k] ** 2
+                self.energy[group, k] = total / (last - first)
+            for group, k in ti.ndrange(self.groups, count):
+                total = 0.0
+                for other in range(self.groups):
+                    total += self.clutter_weight[k, other - group + self.groups - 1] * self.energy[other, k]
+                self.clutter[group, k] = total
+            for line, k in ti.ndrange(self.lines, count):
+                at = tm.clamp((line + 0.5) / GROUP - 0.5, 0.0, self.groups - 1.001)
+                group = ti.cast(at, ti.i32)
+                clutter = tm.mix(self.clutter[group, k], self.clutter[group + 1, k], at - group)
+                self.level[line, k] = ti.sqrt(self.level[line, k] ** 2 + clutter)
 
     @ti.kernel
-    def _simulate(
-        self,
-        detail_level: ti.template(),
-        stride: ti.template(),
-        sample_mm: float,
-        frequency_mhz: float,
-        aperture: float,
-        axial_sd: float,
-        elevation_sd: float,
-    ):
-        """Write the echo signal of every scanline, at a detail level (its index); needs ``_find_contact`` before.
+    def _scatter_evenly(self, stride: ti.template()):
+        """Write the level itself, without speckle."""
+        for line, k in ti.ndrange(self.lines, self.samples // stride):
+            for j in ti.static(range(stride)):
+                level = tm.mix(self.level[line, k], self.level[line, k + 1], (j + 0.5) / stride)
+                self.real[line, stride * k + j] = level
 
-        The tissue is sampled every ``stride`` samples. ``aperture`` is in elements to each side, per mm of depth.
-        """
+    @ti.kernel
+    def _scatter(self, stride: ti.template(), axial_sd: float):
+        """Write the signal of scatterers: noise of the rest position, times the level."""
+        for line, k in ti.ndrange(self.lines, self.samples // stride):
+            first = LENGTH_TAPS + stride * k
+            for j in range(stride):
+                self.scattered_real[line, first + j] = 0.0
+                self.scattered_imaginary[line, first + j] = 0.0
+            axis = self.speckle.long_axis(self.sound.across[line, k])
+            for each in range(COMPONENTS):
+                weight, key, matrix = self.speckle.component(each, axis, self.elevation[k], axial_sd)
+                if weight > LEAST_WEIGHT:
+                    near, far = matrix @ self.sound.rest[line, k], matrix @ self.sound.rest[line, k + 1]
+                    for j in range(stride):
+                        t = (j + 0.5) / stride
+                        noise = self.speckle.at(tm.mix(near, far, t), key)
+                        noise *= weight * tm.mix(self.level[line, k], self.level[line, k + 1], t)
+                        i = first + j
+                        self.scattered_real[line, i] = self.scattered_real[line, i] + noise.x
+                        self.scattered_imaginary[line, i] = self.scattered_imaginary[line, i] + noise.y
+
+    @ti.kernel
+    def _lengthen(self, stride: ti.template(), axial_sd: float, sample_mm: float):
+        """Lengthen the pulse as attenuation on the path has done."""
+        for packet, line in ti.ndrange(self.samples // LANES, self.lines):
+            first = packet * LANES
+            path = self.sound.path[line, (first + LANES // 2) // stride]
+            more = (
+                ti.sqrt(ti.max(self.sound.at_path(self.axial_sd, path) ** 2 - axial_sd**2, 0.0)) / sample_mm
+            )
+            length = ti.min(ti.round(more / LENGTH_STEP, ti.i32), LENGTHS - 1)
+            half = ti.min(ti.ceil(HALF_WIDTH_SD * length * LENGTH_STEP, ti.i32), LENGTH_TAPS)
+            real, imaginary = Packet(0.0), Packet(0.0)
+            for tap in range(-half, half + 1):
+                weight, at = self.length_weight[length, tap + LENGTH_TAPS], first + tap + LENGTH_TAPS
+                real += weight * self.packet(self.scattered_real, line, at)
+                imaginary += weight * self.packet(self.scattered_imaginary, line, at)
+            for i in ti.static(range(LANES)):
+                self.real[line, first + i] = real[i]
+                self.imaginary[line, first + i] = imaginary[i]
+
+    @ti.kernel
+    def _reflect(self, has_speckle: ti.template(), stride: ti.template(), sample_mm: float, axial_sd: float):
+        """Add the echoes of the interfaces."""
         for n in range(self.lines * TASK):
             if n % TASK == 0:
-                line = n // TASK
-                self.simulate_line(
-                    line, detail_level, stride, sample_mm, frequency_mhz, aperture, axial_sd, elevation_sd
-                )
+                for k in range(1, self.samples // stride + 1):
+                    if self.sound.echo[n // TASK, k].z > 0.0:
+                        self.reflect(has_speckle, n // TASK, k, stride * sample_mm, sample_mm, axial_sd)
 
     @ti.func
-    def simulate_line(
-        self,
-        line,
-        detail_level: ti.template(),
-        stride: ti.template(),
-        sample_mm: float,
-        frequency_mhz: float,
-        aperture: float,
-        axial_sd: float,
-        elevation_sd: float,
-    ):
-        """Follow the pulse along a scanline."""
-        planes = ti.static(THICK_PLANE if detail_level == 2 else CENTRAL_PLANE)
-        stride_mm = stride * sample_mm
-        start, direction = self.start[line], self.direction[line]
-        for i in range(self.samples):
-            self.real[line, i] = 0.0
-        near = self.sample_tissue(planes, start, elevation_sd)
-        loss_db, transmitted, amplitude = 0.0, 1.0, 1.0
-        interface = Interface()
-        interface.begin(near.tissue, 0.0, amplitude)
-        for k in range(self.samples // stride):
-            depth = k * stride_mm
-            place = start + (depth + stride_mm) * direction
-            far = self.sample_tissue(planes, place, elevation_sd)
-            # Beyond the CT nothing is known: nothing scatters, nothing reflects.
-            far.tissue.x = ti.select(far.tissue.x < 1e-6, near.tissue.x, far.tissue.x)
-            near.tissue.x = ti.select(near.tissue.x < 1e-6, far.tissue.x, near.tissue.x)
-            before, after = near.tissue, far.tissue
-            step = (after.x - before.x) / ti.max(after.x + before.x, 1e-6)
-            if interface.ends(step, self.interface_mm):
-                at = interface.depth_mm()
-                echo = interface.echo(before.x, frequency_mhz) * self.contact_fraction(line, at, aperture)
-                self.add_reflection(detail_level, line, at, echo, sample_mm, axial_sd)
-                transmitted *= 1.0 - interface.reflection(before.x) ** 2
-                interface.begin(before, depth, amplitude)
-            if interface.steps == 0.0:
-                interface.begin(before, depth, amplitude)
-            if ti.abs(step) >= MIN_REFLECTION:
-                incidence = self.incidence_factor(0.5 * (near.rest + far.rest), far.linear, direction)
-                interface.add(step, depth + 0.5 * stride_mm, incidence, stride_mm)
-            # Both directions, over the stride in cm.
-            loss_db += (before.y + after.y) * frequency_mhz * stride_mm / 10.0
-            amplitude_far = transmitted * ti.exp(-loss_db / DB)
-            contact = self.contact_fraction(line, depth + 0.5 * stride_mm, aperture)
-            levels = tm.vec3(amplitude, amplitude_far, contact)
-            self.add_scatter(detail_level, stride, line, k, near, far, levels, axial_sd, elevation_sd)
-            near, amplitude = far, amplitude_far
-
-    @ti.func
-    def add_scatter(
-        self,
-        detail_level: ti.template(),
-        stride: ti.template(),
-        line,
-        k,
-        near,
-        far,
-        levels,
-        axial_sd,
-        elevation_sd,
-    ):
-        """Write the scattered signal of stride ``k``; ``levels`` are the amplitude at its two ends and the contact fraction."""
-        for j in range(stride):
-            t = (j + 0.5) / stride
-            rest, across = tm.mix(near.rest, far.rest, t), tm.mix(near.linear[:, 2], far.linear[:, 2], t)
-            echo = self.scatter(detail_level, rest, across, axial_sd, elevation_sd)
-            echo *= levels.z * tm.mix(levels.x, levels.y, t) * tm.mix(near.tissue.z, far.tissue.z, t)
-            self.real[line, stride * k + j] = self.real[line, stride * k + j] + echo.x
-            self.imaginary[line, stride * k + j] = echo.y
-
-    @ti.func
-    def scatter(self, detail_level: ti.template(), rest, across, axial_sd, elevation_sd):
-        """Speckle (2,) at a rest position [mm], of unit mean square; the constant 1 at the level without speckle."""
-        echo = tm.vec2(ti.static(1.0 if detail_level == 0 else 0.0), 0.0)
-        for off, _, weight in ti.static(((), CENTRAL_PLANE, THICK_PLANE)[detail_level]):
-            echo += weight * self.speckle.at(rest + (off * elevation_sd) * across, axial_sd)
-        return echo
-
-    @ti.func
-    def contact_fraction(self, line, depth_mm, aperture):
-        """Fraction of the active aperture of a scanline at a depth that is in contact."""
-        half = ti.min(ti.cast(depth_mm * aperture, ti.i32), self.lines)
-        first, last = ti.max(line - half, 0), ti.min(line + half + 1, self.lines)
-        return (self.contacts_before[last] - self.contacts_before[first]) / ti.cast(last - first, ti.f32)
-
-    @ti.func
-    def incidence_factor(self, rest, linear, direction):
-        """Root of the cosine between beam and interface normal: Lambert's law for the intensity (Wein 2008)."""
-        # The gradient at rest is carried into the deformed tissue by the inverse transpose of the deformation gradient.
-        slope = linear[:, :3].transpose() @ self.tissue.slope(rest)
-        # An interface thinner than the distance between samples has no gradient halfway: perpendicular incidence is assumed.
-        factor, steep = 1.0, slope.norm()
-        if steep > 1e-9:
-            factor = ti.sqrt(ti.abs(slope.x * direction.x + slope.y * direction.y) / steep)
-        return factor
-
-    @ti.func
-    def add_reflection(self, detail_level: ti.template(), line, depth_mm, amplitude, sample_mm, axial_sd):
-        """Add the echo of an interface to a scanline, as wide as the pulse and not scaled by ``speckle_gain``."""
-        at, reach = depth_mm / sample_mm - 0.5, ti.ceil(3.5 * axial_sd / sample_mm, ti.i32)
+    def reflect(self, has_speckle: ti.template(), line, k, step_mm, sample_mm, axial_sd):
+        """Add the echo of the interface in front of a tissue sample: as long as the pulse, and not scaled by ``speckle_gain``."""
+        echo = self.sound.echo[line, k]
+        amplitude, path = self.sound.echo_amplitude(line, echo, step_mm)
+        diffuse, sd = tm.vec2(0.0, 0.0), axial_sd
+        if ti.static(has_speckle):
+            diffuse = amplitude * echo.y * self.speckle_at(line, echo.z / step_mm, axial_sd)
+            sd = self.sound.at_path(self.axial_sd, path)
+        at, reach = echo.z / sample_mm - 0.5, ti.ceil(3.5 * sd / sample_mm, ti.i32)
         first = ti.max(ti.floor(at, ti.i32) - reach, 0)
         last = ti.min(ti.floor(at, ti.i32) + reach + 1, self.samples - 1)
         for i in range(first, last + 1):
-            off = (i - at) * sample_mm / axial_sd
-            echo = amplitude * ti.exp(-0.5 * off * off)
-            if ti.static(detail_level > 0):
-                echo /= self.speckle_gain[i]
-            self.real[line, i] = self.real[line, i] + echo
+            off = (i - at) * sample_mm / sd
+            pulse = ti.exp(-0.5 * off * off)
+            if ti.static(has_speckle):
+                mirror = amplitude * echo.x / self.speckle_gain[self.scanline_class[line], i // LANES]
+                self.real[line, i] = self.real[line, i] + pulse * (mirror + diffuse.x)
+                self.imaginary[line, i] = self.imaginary[line, i] + pulse * diffuse.y
+            else:
+                both = amplitude * ti.sqrt(echo.x**2 + echo.y**2)
+                self.real[line, i] = self.real[line, i] + pulse * both
+
+    @ti.func
+    def speckle_at(self, line, at, axial_sd):
+        """Return the speckle (2,) at a fractional tissue sample of a scanline."""
+        k = ti.cast(at, ti.i32)
+        rest = tm.mix(self.sound.rest[line, k], self.sound.rest[line, k + 1], at - k)
+        axis, speckle = self.speckle.long_axis(self.sound.across[line, k]), tm.vec2(0.0)
+        for each in range(COMPONENTS):
+            weight, key, matrix = self.speckle.component(each, axis, self.elevation[k], axial_sd)
+            if weight > LEAST_WEIGHT:
+                speckle += weight * self.speckle.at(matrix @ rest, key)
+        return speckle
 
     @ti.kernel
     def _add(self):
         for line, sample in self.decibel:
             envelope = ti.abs(self.real[line, sample])
-            self.decibel[line, sample] = DB * ti.log(envelope + NOISE_FLOOR) + self.gain[sample]
+            self.decibel[line, sample] = DB * ti.log(envelope + SILENCE) + self.gain[sample]
 
     @ti.kernel
-    def _spread(self):
+    def _spread(self, noise: float, key: int):
+        """Spread the scanlines as the beam is wide, add electronic noise, and take the envelope in dB."""
         # Scanline by scanline at one depth: the samples that neighbours share stay in the L1 cache.
         for packet, line in ti.ndrange(self.samples // LANES, self.lines):
             first = packet * LANES
             real, imaginary = Packet(0.0), Packet(0.0)
-            half = self.half[packet]
+            each, side = self.scanline_class[line], self.side[line]
+            half = self.half[each, packet]
             for k in range(-half, half + 1):
                 # Beyond the ends of the array the scanlines are mirrored.
                 m = ti.abs(line + k)
                 m = ti.min(m, 2 * (self.lines - 1) - m)
                 # Conjugate, so that noise does not add coherently to itself; reflections are real.
                 turned = 1.0 if m == line + k else -1.0
-                weight = self.packet(self.weight, k + MAX_HALF_WIDTH, first)
+                weight = self.weight[each, packet, side * k + MAX_HALF_WIDTH]
                 real += weight * self.packet(self.real, m, first)
                 imaginary += turned * weight * self.packet(self.imaginary, m, first)
-            speckle_gain = Packet([self.speckle_gain[first + i] for i in ti.static(range(LANES))])
-            envelope = speckle_gain * ti.sqrt(real * real + imaginary * imaginary)
+            electronic = self.electronic_noise(line, packet, key)
+            speckle_gain = self.speckle_gain[each, packet]
+            real = speckle_gain * real + noise * electronic[0, :]
+            imaginary = speckle_gain * imaginary + noise * electronic[1, :]
             gain = Packet([self.gain[first + i] for i in ti.static(range(LANES))])
-            decibel = DB * ti.log(envelope + NOISE_FLOOR) + gain
+            decibel = DB * ti.log(ti.sqrt(real * real + imaginary * imaginary) + SILENCE) + gain
             for i in ti.static(range(LANES)):
                 self.decibel[line, first + i] = decibel[i]
+
+    @ti.func
+    def electronic_noise(self, line, packet, key):
+        """Return noise (2, LANES) of unit mean square, which changes with the key; as long as the pulse, but on one scanline."""
+        rows, packets = ti.static(SIZE * SIZE, SIZE // LANES)
+        row = (line * 3 + (line // 21) * 320 + (packet // packets) * 448 + key) & (rows - 1)
+        at = row * SIZE + (packet % packets) * LANES
+        noise = ti.Matrix.zero(ti.f32, 2, LANES)
+        for i in ti.static(range(LANES)):
+            word = self.speckle.noise[at + i]
+            noise[0, i] = UNIT * ((word << 16) >> 16)
+            noise[1, i] = UNIT * (word >> 16)
+        return noise
 
     @ti.func
     def packet(self, field: ti.template(), row, first):
@@ -419,24 +343,14 @@ def source_of_pixels(probe: Probe, rows: int, columns: int) -> np.ndarray:
     return np.where(within[..., None], source, -1.0).astype(np.float32)
 
 
-def lateral_weights(probe: Probe) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the lateral kernel of the point-spread function at each sample.
+def length_weights(pulse_sd: float) -> np.ndarray:
+    """Return kernels (LENGTHS, 2 LENGTH_TAPS + 1) that lengthen noise of a correlation SD, by SDs of LENGTH_STEP each, in samples.
 
-    The function is separable: exp(-(x^2 / sa^2 + y^2 / sl^2 + z^2 / se^2) / 2), with the widths of the probe.
-
-    Weights (2 MAX_HALF_WIDTH + 1, samples), of sum 1; the half width in scanlines (samples,); and the speckle gain (samples,), which
-    restores unit mean square of noise with the axial width's correlation.
+    They preserve the mean square.
     """
-    depth = (np.arange(probe.number_of_samples_per_scanline) + 0.5) * probe.sample_mm
-    axial, spacing = probe.axial_sd_mm, probe.line_spacing_mm(depth)
-    # The noise already has the width of the pulse in every direction.
-    width = np.sqrt(np.maximum(probe.lateral_sd_mm(depth) ** 2 - axial**2, 0)) / np.maximum(spacing, 1e-6)
-    half = np.clip(np.ceil(HALF_WIDTH_SD * width), 0, MAX_HALF_WIDTH).astype(np.int32)
-    lines = np.arange(-MAX_HALF_WIDTH, MAX_HALF_WIDTH + 1)[:, None]
-    weights = np.exp(-0.5 * (lines / np.maximum(width, 0.05)) ** 2) * (np.abs(lines) <= half)
-    weights /= weights.sum(axis=0)
-    energy = np.zeros(len(depth))
-    for lag in range(len(lines)):
-        together = (weights[: len(lines) - lag] * weights[lag:]).sum(axis=0) * (1 if lag == 0 else 2)
-        energy += together * np.exp(-((lag * spacing) ** 2) / (4 * axial**2))
-    return weights, half, 1 / np.sqrt(energy)
+    tap = np.arange(-LENGTH_TAPS, LENGTH_TAPS + 1)
+    sd = LENGTH_STEP * np.arange(LENGTHS)[:, None]
+    half = np.minimum(np.ceil(HALF_WIDTH_SD * sd), LENGTH_TAPS)
+    weights = np.exp(-0.5 * (tap / np.maximum(sd, 0.05)) ** 2) * (np.abs(tap) <= half)
+    correlation = np.exp(-(((tap[:, None] - tap) / pulse_sd) ** 2) / 4)
+    return weights / np.sqrt(np.einsum("ni,ij,nj->n", weights, correlation, weights))[:, None]

@@ -14,10 +14,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pydantic.alias_generators import to_pascal
 
 from errors import UserError, explained, meant
+from ultrasound.pulse import DB_OF_NEPER, PATH_STEP, SOUND_MM_US, AttenuatedPulse, attenuated_pulse
 
 PROBES = Path(__file__).parent / "probes"
-SOUND_MM_US = 1.54
-FWHM_OF_SD = float(np.sqrt(8 * np.log(2)))
 GAIN_RANGE_DB, TGC_RANGE_DB, TGC_SLIDERS = 60.0, 24.0, 8
 
 Mode = Literal["both", "b-mode", "ct"]
@@ -38,9 +37,11 @@ class Probe(BaseModel):
     """One probe with the scanner's settings, as its file has them in PLUS's spelling (``frequency_mhz`` is FrequencyMhz).
 
     ``housing_mm`` is the cuboid in contact: lateral x elevation x length. ``edge_radius_mm`` rounds its edges; sharp ones cut into
-    tissue that they slide over. ``elevation_width_mm`` is the slice thickness, ``focal_zone_mm`` the distance from the focus at
-    which the beam is wider by sqrt(2). ``depth_compensation_db_cm_mhz`` is the scanner's built-in TGC, to which the sliders of
-    ``time_gain_compensation`` [%] add.
+    tissue that they slide over. ``f_number`` is that of the transmit and of the receive aperture. ``element_height_mm`` and the
+    lens, focused at ``elevation_focus_mm``, shape the beam across the image plane; ``elevation_width_mm`` is the slice thickness
+    that counts as scanned (coverage). ``bandwidth_percent`` is the -6 dB width of a round trip through the array, relative to the
+    frequency. ``noise_db`` is the scanner's electronic noise before gain; 0 dB is the echo of a perfect reflector at the face.
+    ``depth_compensation_db_cm_mhz`` is the attenuation that the scanner's built-in TGC compensates, to which the sliders of ``time_gain_compensation`` [%] add.
     """
 
     model_config = ConfigDict(
@@ -61,10 +62,13 @@ class Probe(BaseModel):
     frequency_mhz: float = Field(7.5, ge=1, le=40)
     depth_mm: float = Field(60.0, ge=5, le=300)
     focus_depth_percent: Percent = 40.0
+    number_of_elements: int = Field(128, ge=8, le=4096)
     f_number: float = Field(2.5, ge=0.5, le=20)
-    focal_zone_mm: float = Field(15.0, gt=0, le=300)
+    element_height_mm: float = Field(5.0, gt=0, le=40)
+    elevation_focus_mm: float = Field(25.0, gt=0, le=300)
     elevation_width_mm: float = Field(2.0, gt=0, le=20)
-    pulse_cycles: float = Field(2.0, ge=1, le=20)
+    bandwidth_percent: float = Field(75.0, ge=20, le=150)
+    noise_db: float = Field(-105.0, ge=-200, le=0)
     gain_percent: Percent = 56.0
     dyn_range_db: float = Field(60.0, ge=20, le=120)
     time_gain_compensation: tuple[Percent, ...] = Field(
@@ -100,6 +104,16 @@ class Probe(BaseModel):
         return SOUND_MM_US / self.frequency_mhz
 
     @property
+    def pulse(self) -> AttenuatedPulse:
+        """The pulse, and how attenuation changes it."""
+        return attenuated_pulse(self.frequency_mhz, self.bandwidth_percent)
+
+    @property
+    def axial_sd_mm(self) -> float:
+        """Length of the pulse's echo at the face."""
+        return float(self.pulse.axial_sd_mm[0])
+
+    @property
     def sample_mm(self) -> float:
         """Distance between samples."""
         return self.depth_mm / self.number_of_samples_per_scanline
@@ -123,19 +137,16 @@ class Probe(BaseModel):
         return self.depth_mm * self.focus_depth_percent / 100
 
     @property
-    def axial_sd_mm(self) -> float:
-        """Axial width of the point-spread function: a pulse of n cycles is n wavelengths long, its echo half of that."""
-        return self.pulse_cycles * self.wavelength_mm / 2 / FWHM_OF_SD
+    def array_width_mm(self) -> float:
+        """Length of the array along its face."""
+        if self.transducer_geometry != "CURVILINEAR":
+            return self.transducer_width_mm
+        return self.radius_mm * float(np.radians(self.theta_stop_deg - self.theta_start_deg))
 
     @property
-    def elevation_sd_mm(self) -> float:
-        """Elevational width, the same at all depths."""
-        return self.elevation_width_mm / FWHM_OF_SD
-
-    def lateral_sd_mm(self, depth_mm: np.ndarray) -> np.ndarray:
-        """Return the lateral width at depths [mm]: full width at half maximum = wavelength * f-number at the focus."""
-        at_focus = self.wavelength_mm * self.f_number / FWHM_OF_SD
-        return at_focus * np.sqrt(1 + ((depth_mm - self.focus_mm) / self.focal_zone_mm) ** 2)
+    def pitch_mm(self) -> float:
+        """Distance of neighbouring elements."""
+        return self.array_width_mm / self.number_of_elements
 
     @property
     def extent_mm(self) -> tuple[float, float, float]:
@@ -194,7 +205,9 @@ class Probe(BaseModel):
     def gain_db(self) -> np.ndarray:
         """Return gain and TGC at each sample of a scanline [dB], (samples,)."""
         depth = (np.arange(self.number_of_samples_per_scanline) + 0.5) * self.sample_mm
-        own = 2 * self.depth_compensation_db_cm_mhz * self.frequency_mhz * depth / 10
+        path = 2 * self.depth_compensation_db_cm_mhz * depth / 10 / DB_OF_NEPER
+        loss = self.pulse.speckle_db
+        own = -np.interp(path, PATH_STEP * np.arange(len(loss)), loss)
         places = (np.arange(TGC_SLIDERS) + 0.5) * self.depth_mm / TGC_SLIDERS
         sliders = np.interp(depth, places, self.time_gain_compensation)
         return own + (self.gain_percent - 50) / 100 * GAIN_RANGE_DB + (sliders - 50) / 100 * TGC_RANGE_DB

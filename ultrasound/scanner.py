@@ -3,6 +3,7 @@
 CT slice: image plane -> deformed tetrahedra -> voxels at rest (the paper's method).
 """
 
+import zlib
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -81,6 +82,8 @@ class PlaneInTissue:
         # Size of a pixel and centre of the first one, of an image of all pixels.
         self._whole = np.zeros((2, 2))
         self._rest_grids: dict[int, np.ndarray] = {}
+        # Changes with the plane: electronic noise is still only where the probe is.
+        self.noise_key = 0
 
     def locate(self, plane: ImagePlane, shape: tuple[int, int] | None = None) -> None:
         """Find the tissue on a plane, for an image of a shape [all pixels]; the embedding must be up to date."""
@@ -95,6 +98,7 @@ class PlaneInTissue:
         first = corner + pixel / 2
         fill((self.grid, np.stack([pixel, first])), (self._last, np.array([rows - 1, columns - 1])))
         self._rest_grids.clear()
+        self.noise_key = zlib.crc32(np.asarray(plane.world_from_plane, np.float32).tobytes()) & 0xFFFF
         given = np.linalg.inv(plane.world_from_plane), plane.world_from_plane, pixel, first
         inverse, world, pixel_mm, first_mm = (ti.Matrix(np.asarray(each, float).tolist()) for each in given)
         self.embedding.locate_on_plane(inverse, world, pixel_mm, first_mm, rows, columns, self.owner)

@@ -30,7 +30,7 @@ SILENT_DB, BOUNDLESS = -179.9, 1e4
 # No gain: 0 dB is all of the sound; 0.125 mm a sample, and 0.5 mm from look to look.
 SCANNER = dict(gain_percent=50.0, dyn_range_db=60.0, depth_compensation_db_cm_mhz=0.0, depth_mm=80.0)
 ARRAY = dict(number_of_scanlines=LINES, number_of_samples_per_scanline=SAMPLES, housing_mm=(50.0, 10.0, 20.0))
-BEAM = dict(frequency_mhz=7.5, focus_depth_percent=40.0, f_number=3.0, focal_zone_mm=20.0, pulse_cycles=2.0)
+BEAM = dict(frequency_mhz=7.5, focus_depth_percent=40.0, f_number=3.0, bandwidth_percent=75.0)
 GEOMETRIES = {
     "LINEAR": {"transducer_width_mm": 40.0},
     "CURVILINEAR": {"radius_start_mm": 60.0, "theta_start_deg": -25.0, "theta_stop_deg": 20.0},

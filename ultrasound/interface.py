@@ -1,0 +1,98 @@
+"""The echo of an interface between two tissues: how strong it is, and how it depends on the angle of incidence."""
+
+import numpy as np
+import taichi as ti
+import taichi.math as tm
+
+# A smaller relative change of impedance between two samples is no interface.
+MIN_REFLECTION = 3e-4
+# Roughness of tissue interfaces: SD of height [mm] and of slope. An estimate: no measurement of renal surfaces was found.
+ROUGHNESS_MM, ROUGH_SLOPE = 0.012, 0.14
+# Amplitude that the fibres of capsules and fasciae scatter evenly in all directions (Lambert's law). An estimate, as above.
+SCATTERED = 0.25
+# Edge waves of the aperture: amplitude of a smooth interface that reflects just past the aperture, and its fall [1 / half angle].
+EDGE, EDGE_FALL = 0.056, 3.3
+
+
+def roughness_factors(roughness_mm: float, wavelength_mm: float) -> tuple[float, float]:
+    """Return the amplitudes that a rough interface reflects as a mirror and diffusely, of 1 (Beckmann & Spizzichino 1963)."""
+    phase = (2 * 2 * np.pi / wavelength_mm * roughness_mm) ** 2
+    return float(np.exp(-phase / 2)), float(np.sqrt(-np.expm1(-phase)))
+
+
+@ti.func
+def specular(tilt, half_angle):
+    """Amplitude of the echo of a smooth interface, relative to no tilt; angles in radians.
+
+    A mirror tilted by an angle turns the beam by twice that: the part of the aperture that it returns to receives it. Beyond are edge
+    waves.
+    """
+    share = tilt / half_angle
+    return ti.max(1.0 - share, EDGE * ti.exp(EDGE_FALL * (1.0 - share)))
+
+
+@ti.func
+def diffuse(tilt, half_angle, slope):
+    """Energy that a rough interface returns to the aperture, of all that it scatters along one axis; angles in radians.
+
+    It scatters around the mirror direction by twice the slope's SD; the beam's own range of angles adds to that.
+    """
+    spread = 4.0 * slope**2 + 2.0 / 3.0 * half_angle**2
+    share = ti.min(2.0 * half_angle / ti.sqrt(2.0 * tm.pi * spread), 1.0)
+    return share * ti.exp(-2.0 * tilt**2 / spread)
+
+
+@ti.dataclass
+class Interface:
+    """A step of impedance that the CT blurs over several tissue samples.
+
+    ``steps`` is the sum of the reflections; ``middle`` is the depth [mm], weighted by them; ``normal`` (u, v, w) the sum of the
+    gradients; ``thickness`` is in mm. ``before`` is the impedance in front of it, from sample ``begins``.
+    """
+
+    steps: ti.f32
+    middle: ti.f32
+    normal: tm.vec3
+    thickness: ti.f32
+    before: ti.f32
+    begins: ti.i32
+
+    @ti.func
+    def begin(self, impedance, sample):
+        """Reset to no reflection, behind the tissue of a sample."""
+        self.steps, self.middle, self.normal, self.thickness = 0.0, 0.0, tm.vec3(0.0), 0.0
+        self.before, self.begins = impedance, sample
+
+    @ti.func
+    def add(self, step, depth_mm, gradient, direction, path_mm):
+        """Add one step of impedance over a part of the path."""
+        self.steps += step
+        self.middle += step * depth_mm
+        self.normal += gradient
+        # Thickness along the normal, not along the beam. An interface thinner than the distance between samples has no gradient.
+        size = gradient.norm()
+        cosine = ti.select(size > 1e-9, gradient.dot(direction) / ti.max(size, 1e-9), 1.0)
+        self.thickness += cosine**2 * path_mm
+
+    @ti.func
+    def ends(self, step, max_mm):
+        """Whether the next step no longer belongs to this interface."""
+        other = step * self.steps <= 0.0 or ti.abs(step) < MIN_REFLECTION or self.thickness > max_mm
+        return self.steps != 0.0 and other
+
+    @ti.func
+    def reflection(self, after):
+        """Reflection coefficient of amplitude between the impedance before it and the one after it [MRayl]."""
+        return (after - self.before) / (after + self.before)
+
+    @ti.func
+    def tilts(self, direction):
+        """Angles [rad] between the beam's direction (u, v, 0) and the normal, along and across the image plane."""
+        lateral = tm.vec3(direction.y, -direction.x, 0.0)
+        along = ti.max(ti.abs(self.normal.dot(direction)), 1e-9)
+        tilts = tm.vec2(0.0)
+        if self.normal.norm() > 1e-9:
+            tilts = tm.vec2(
+                ti.atan2(ti.abs(self.normal.dot(lateral)), along), ti.atan2(ti.abs(self.normal.z), along)
+            )
+        return tilts

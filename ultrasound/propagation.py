@@ -1,0 +1,311 @@
+"""Sound in tissue: what each scanline passes through, which interfaces reflect it, and how much of it arrives.
+
+1. ``_sample``: the tissue along each scanline.
+2. ``_find_interfaces``: the steps of impedance, their echoes and what they let pass.
+3. ``_transmit``: the amplitude that arrives at each sample, along several rays from the aperture.
+"""
+
+from typing import Any
+
+import numpy as np
+import taichi as ti
+import taichi.math as tm
+
+from sim.device import TASK
+from sim.fields import array_of, fill
+from ultrasound.beam import half_apertures_mm
+from ultrasound.interface import (
+    MIN_REFLECTION,
+    ROUGH_SLOPE,
+    ROUGHNESS_MM,
+    SCATTERED,
+    Interface,
+    diffuse,
+    roughness_factors,
+    specular,
+)
+from ultrasound.probe import Probe
+from ultrasound.pulse import DB_OF_NEPER, PATH_ENTRIES, PATH_STEP
+from ultrasound.sampled_volume import SampledVolume
+
+# Scanline samples between two tissue samples: the larger stride where it is no longer than a voxel.
+STRIDES = (8, 4)
+# Parallel planes that sample the slice thickness: offset in standard deviations of the beam, and weight of energy. Gauss-Hermite
+# quadrature with three nodes, exact for what changes as a polynomial of fifth degree.
+CENTRAL_PLANE = ((0.0, 1.0),)
+THICK_PLANE = ((0.0, 2 / 3), (-(1.5**0.5), 1 / 6), (1.5**0.5, 1 / 6))
+# Rays from the aperture to each sample.
+RAYS = 7
+OFF_ARRAY = -1.0
+
+
+@ti.dataclass
+class TissueSample:
+    """Impedance, attenuation and backscatter; the rest position [mm]; the map (3, 4) from the image plane to it."""
+
+    tissue: tm.vec3
+    rest: tm.vec3
+    linear: ti.types.matrix(3, 4, ti.f32)
+
+
+@ti.data_oriented
+class Propagation:
+    """Sound along the scanlines of a probe (arguments: see ``BMode``), at tissue samples ``stride`` scanline samples apart.
+
+    ``tissue`` and ``rest`` (scanlines, samples) are what is there; ``across`` is the rest direction across the image plane.
+    ``amplitude`` of the round trip, and ``path`` [Np/MHz], its attenuation. ``echo`` holds for the sample behind an interface:
+    amplitude reflected as a mirror (with its sign) and diffusely, depth [mm], and the sample where the tissue before it begins.
+    """
+
+    def __init__(
+        self,
+        tissue: SampledVolume,
+        organ: SampledVolume,
+        plane: Any,
+        probe: Probe,
+        voxel_mm: float,
+        contact: str,
+        contact_gap_mm: float,
+        around: float | None,
+    ) -> None:
+        self.tissue_volume, self.organ, self.plane, self.voxel_mm = tissue, organ, plane, voxel_mm
+        # A CT blurs an interface by about a voxel to each side.
+        self.interface_mm = 5.0 * voxel_mm
+        self.by_organ, self.gap_mm = contact == "organ", contact_gap_mm
+        self.organ_alone, self.around = around is not None, around or 0.0
+        self.roughness_mm, self.slope, self.scattered = ROUGHNESS_MM, ROUGH_SLOPE, SCATTERED
+        self.lines, samples = probe.number_of_scanlines, probe.number_of_samples_per_scanline
+        self.most = samples // STRIDES[1] + 1
+        shape = self.lines, self.most
+        self.start, self.direction, self.element = (ti.Vector.field(2, ti.f32, self.lines) for _ in range(3))
+        self.contact = ti.field(ti.f32, self.lines)
+        self.tissue, self.rest, self.across = (ti.Vector.field(3, ti.f32, shape) for _ in range(3))
+        self.echo = ti.Vector.field(4, ti.f32, shape)
+        self.passed, self.amplitude, self.path = (ti.field(ti.f32, shape) for _ in range(3))
+        self.ray_amplitude, self.ray_path = (ti.field(ti.f32, (RAYS, *shape)) for _ in range(2))
+        # How many scanlines a ray is from its end at a sample, where it leaves the face.
+        self.ray_offset = ti.field(ti.f32, (RAYS, self.most))
+        # Half angle of the aperture [rad] and SD of the beam across the image plane [mm], at each sample.
+        self.aperture_angle, self.slice_sd = (ti.field(ti.f32, self.most) for _ in range(2))
+        self.speckle_db, self.echo_db = (ti.field(ti.f32, PATH_ENTRIES) for _ in range(2))
+        self.angles = ti.field(ti.f32, 3)
+
+    def stride_of(self, probe: Probe) -> int:
+        """Return the scanline samples between two tissue samples."""
+        return STRIDES[0] if STRIDES[0] * probe.sample_mm <= self.voxel_mm else STRIDES[1]
+
+    def set_probe(self, probe: Probe, slice_sd_mm: np.ndarray) -> None:
+        """Update the tables of a probe's settings; the SD of the beam across the plane is given at each sample."""
+        step_mm = self.stride_of(probe) * probe.sample_mm
+        depth = step_mm * np.arange(self.most)
+        transmit, receive = half_apertures_mm(probe, np.maximum(depth, 0.5 * step_mm))
+        receive = np.minimum(receive, probe.array_width_mm / 2)
+        transmit = np.minimum(transmit, probe.array_width_mm / 2)
+        angle = (
+            np.arctan(transmit / probe.focus_mm) + np.arctan(receive / np.maximum(depth, 0.5 * step_mm))
+        ) / 2
+        pulse = probe.pulse
+        start, direction = probe.scanlines()
+        elevation = np.arctan(probe.element_height_mm / 2 / probe.elevation_focus_mm)
+        fill(
+            (self.start, start),
+            (self.direction, direction),
+            (self.element, probe.elements()),
+            (self.ray_offset, ray_offsets(probe, depth)),
+            (self.aperture_angle, angle),
+            (self.slice_sd, slice_sd_mm),
+            (self.speckle_db, pulse.speckle_db),
+            (self.echo_db, pulse.echo_db),
+            (self.angles, np.array([elevation, *roughness_factors(self.roughness_mm, probe.wavelength_mm)])),
+        )
+
+    def run(self, probe: Probe, thick: bool) -> None:
+        """Propagate sound through the plane located last; ``thick`` averages the tissue over the slice thickness."""
+        stride = self.stride_of(probe)
+        count = probe.number_of_samples_per_scanline // stride + 1
+        self._find_contact()
+        if probe.transducer_geometry == "PHASED":
+            # A phased array transmits every scanline with all of its elements.
+            fill((self.contact, np.full(self.lines, array_of(self.contact).mean())))
+        self._sample(thick, count, stride * probe.sample_mm)
+        self._find_interfaces(count, stride * probe.sample_mm)
+        self._transmit(count, stride * probe.sample_mm)
+        self._combine(count)
+
+    @ti.kernel
+    def _find_contact(self):
+        """Set for each element of the array whether it is in contact."""
+        for i in self.element:
+            place = self.element[i]
+            if ti.static(not self.by_organ):
+                place.y += 0.5 * self.gap_mm
+            row, column = self.plane.pixel_near(place)
+            rest = self.plane.rest_from_plane(row, column) @ tm.vec4(place, 0.0, 1.0)
+            near = 0
+            if ti.static(self.by_organ):
+                near = self.plane.is_tissue(row, column) and self.organ.sample(rest) <= self.gap_mm
+            else:
+                near = self.tissue_volume.sample(rest)[0] > 1.0
+            self.contact[i] = ti.cast(near, ti.f32)
+
+    @ti.kernel
+    def _sample(self, thick: ti.template(), count: int, step_mm: float):
+        for line, k in ti.ndrange(self.lines, count):
+            place = self.start[line] + k * step_mm * self.direction[line]
+            found = self.tissue_at(
+                ti.static(THICK_PLANE if thick else CENTRAL_PLANE), place, self.slice_sd[k]
+            )
+            self.tissue[line, k] = found.tissue
+            self.rest[line, k] = found.rest
+            self.across[line, k] = found.linear[:, 2]
+
+    @ti.func
+    def tissue_at(self, planes: ti.template(), place, slice_sd):
+        """The TissueSample at (u, v) of the image plane [mm]; backscatter is the root of its mean energy."""
+        row, column = self.plane.pixel_near(place)
+        linear = self.plane.rest_from_plane(row, column)
+        rest = linear @ tm.vec4(place, 0.0, 1.0)
+        found = tm.vec3(0.0)
+        for off, weight in ti.static(planes):
+            there = self.tissue_volume.sample(rest + (off * slice_sd) * linear[:, 2])
+            found += weight * tm.vec3(there.x, there.y, there.z**2)
+        found.z = ti.sqrt(found.z)
+        if ti.static(self.organ_alone):
+            if not (self.plane.is_tissue(row, column) and self.organ.sample(rest) <= 0.0):
+                found = tm.vec3(self.around, 0.0, 0.0)
+        return TissueSample(found, rest, linear)  # type: ignore[call-arg]
+
+    @ti.kernel
+    def _find_interfaces(self, count: int, step_mm: float):
+        """Write ``echo`` and ``passed``, the amplitude that goes on at each sample, one way."""
+        for n in range(self.lines * TASK):
+            if n % TASK == 0:
+                self.find_on_scanline(n // TASK, count, step_mm)
+
+    @ti.func
+    def find_on_scanline(self, line, count, step_mm):
+        """Find the interfaces on a scanline."""
+        direction = tm.vec3(self.direction[line], 0.0)
+        interface = Interface()
+        before = self.tissue[line, 0].x
+        interface.begin(before, 0)
+        self.passed[line, 0] = 1.0
+        self.echo[line, 0] = tm.vec4(0.0)
+        for k in range(1, count):
+            self.passed[line, k] = 1.0
+            self.echo[line, k] = tm.vec4(0.0)
+            after = self.tissue[line, k].x
+            # Beyond the CT nothing is known: nothing reflects.
+            after = ti.select(after < 1e-6, before, after)
+            before = ti.select(before < 1e-6, after, before)
+            step = (after - before) / ti.max(after + before, 1e-6)
+            if interface.ends(step, self.interface_mm):
+                self.end_interface(interface, line, k - 1, before, direction, step_mm)
+                interface.begin(before, k - 1)
+            if interface.steps == 0.0:
+                interface.begin(before, k - 1)
+            if ti.abs(step) >= MIN_REFLECTION:
+                gradient = self.gradient_at(line, k, step_mm)
+                interface.add(step, (k - 0.5) * step_mm, gradient, direction, step_mm)
+            before = after
+
+    @ti.func
+    def gradient_at(self, line, k, step_mm):
+        """Return the gradient (u, v, w) of impedance halfway before a sample, in the deformed tissue."""
+        place = self.start[line] + (k - 0.5) * step_mm * self.direction[line]
+        row, column = self.plane.pixel_near(place)
+        linear = self.plane.rest_from_plane(row, column)
+        # Carried into the deformed tissue by the inverse transpose of the deformation gradient.
+        rest = 0.5 * (self.rest[line, k - 1] + self.rest[line, k])
+        return linear[:, :3].transpose() @ self.tissue_volume.slope(rest)
+
+    @ti.func
+    def end_interface(self, interface, line, k, after, direction, step_mm):
+        """Write the echo of an interface that ends at a sample, and what it lets pass."""
+        depth = interface.middle / interface.steps
+        reflection = interface.reflection(after)
+        tilts, half_angle = interface.tilts(direction), self.aperture_angle[ti.cast(depth / step_mm, ti.i32)]
+        mirror = specular(tilts.x, half_angle) * specular(tilts.y, self.angles[0])
+        rough = diffuse(tilts.x, half_angle, self.slope) * diffuse(tilts.y, self.angles[0], self.slope)
+        even = self.scattered**2 * ti.cos(tilts.x) * ti.cos(tilts.y)
+        echo = reflection * tm.vec2(self.angles[1] * mirror, ti.sqrt(self.angles[2] ** 2 * rough + even))
+        self.echo[line, k] = tm.vec4(echo, depth, ti.cast(interface.begins, ti.f32))
+        self.passed[line, k] = ti.sqrt(1.0 - reflection**2)
+
+    @ti.kernel
+    def _transmit(self, count: int, step_mm: float):
+        """Follow each ray to the samples of all scanlines: amplitude, one way, and attenuation of its path [Np/MHz]."""
+        for n in range(RAYS * TASK):
+            if n % TASK == 0:
+                ray = n // TASK
+                for line in range(self.lines):
+                    self.ray_amplitude[ray, line, 0] = self.contact[line]
+                    self.ray_path[ray, line, 0] = 0.0
+                for k in range(1, count):
+                    aside = self.ray_offset[ray, k] - self.ray_offset[ray, k - 1]
+                    for line in range(self.lines):
+                        self.follow_ray(ray, line, k, aside, step_mm)
+
+    @ti.func
+    def follow_ray(self, ray, line, k, aside, step_mm):
+        """Continue a ray from the sample before, where it was ``aside`` scanlines away."""
+        x = tm.clamp(line - aside, 0.0, self.lines - 1.001)
+        m = ti.cast(x, ti.i32)
+        t = x - m
+        amplitude = tm.mix(self.ray_amplitude[ray, m, k - 1], self.ray_amplitude[ray, m + 1, k - 1], t)
+        path = tm.mix(self.ray_path[ray, m, k - 1], self.ray_path[ray, m + 1, k - 1], t)
+        attenuation = 0.5 * (self.tissue[line, k - 1].y + self.tissue[line, k].y)
+        self.ray_amplitude[ray, line, k] = amplitude * self.passed[line, k]
+        self.ray_path[ray, line, k] = path + attenuation * step_mm / (10.0 * DB_OF_NEPER)
+
+    @ti.kernel
+    def _combine(self, count: int):
+        """Write amplitude and path of the round trip: the mean over the rays that start on the array, squared."""
+        for line, k in ti.ndrange(self.lines, count):
+            total, path, found = 0.0, 0.0, 0.0
+            for ray in ti.static(range(RAYS)):
+                origin = line - self.ray_offset[ray, k]
+                if origin > -0.5 and origin < self.lines - 0.5:
+                    along = self.ray_path[ray, line, k]
+                    one_way = self.ray_amplitude[ray, line, k] * 10.0 ** (
+                        self.at_path(self.speckle_db, 2.0 * along) / 40.0
+                    )
+                    total += one_way
+                    path += one_way * along
+                    found += 1.0
+            self.amplitude[line, k] = (total / found) ** 2
+            self.path[line, k] = 2.0 * path / ti.max(total, 1e-30)
+
+    @ti.func
+    def at_path(self, table: ti.template(), path):
+        """Return an entry of a table of ``beam.AttenuatedPulse`` for an attenuation of the path [Np/MHz]."""
+        at = ti.min(path / PATH_STEP, PATH_ENTRIES - 1.001)
+        first = ti.cast(at, ti.i32)
+        return tm.mix(table[first], table[first + 1], at - first)
+
+    @ti.func
+    def echo_amplitude(self, line, echo, step_mm):
+        """Return the amplitude of a perfect reflector at an interface, and its path [Np/MHz].
+
+        The tissue before the interface attenuates up to its depth.
+        """
+        k = ti.cast(echo.w, ti.i32)
+        before = self.path[line, k]
+        further_mm = ti.max(echo.z - k * step_mm, 0.0)
+        path = before + 2.0 * self.tissue[line, k].y * further_mm / (10.0 * DB_OF_NEPER)
+        # ``amplitude`` is that of speckle.
+        more_db = self.at_path(self.echo_db, path) - self.at_path(self.speckle_db, before)
+        return self.amplitude[line, k] * 10.0 ** (more_db / 20.0), path
+
+
+def ray_offsets(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
+    """Return how many scanlines beside its end at a depth each ray leaves the face (RAYS, depths), at even angles of the aperture."""
+    if probe.transducer_geometry == "PHASED":
+        # All scanlines start at one point: rays of other elements are not among them.
+        return np.zeros((RAYS, len(depth_mm)))
+    slope = np.linspace(-1, 1, RAYS)[:, None] / (2 * probe.f_number)
+    spacing = probe.line_spacing_mm(np.zeros(1))[0]
+    if probe.sector is None:
+        return slope * depth_mm / spacing
+    radius = probe.radius_mm
+    return slope * np.log1p(depth_mm / radius) * radius / spacing
