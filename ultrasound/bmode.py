@@ -71,7 +71,9 @@ class BMode:
         self.scattered_real, self.scattered_imaginary = (ti.field(ti.f32, padded) for _ in range(2))
         self.real, self.imaginary, self.decibel = (ti.field(ti.f32, shape) for _ in range(3))
         self.level = ti.field(ti.f32, (self.lines, most))
-        self.energy, self.clutter = (ti.field(ti.f32, (self.groups, most)) for _ in range(2))
+        self.energy = ti.field(ti.f32, (self.groups, most))
+        # Energy that side lobes receive, and what they would receive if it were 1 everywhere.
+        self.clutter = ti.Vector.field(2, ti.f32, (self.groups, most))
         self.clutter_weight = ti.field(ti.f32, (most, 2 * self.groups - 1))
         # Shorter length of the noise across the plane, weights of it and of the next; extra length of the pulse at a path.
         self.elevation = ti.Vector.field(3, ti.f32, most)
@@ -117,7 +119,7 @@ class BMode:
         fixed = probe.model_dump(
             exclude={"gain_percent", "dyn_range_db", "time_gain_compensation", "noise_db"}
         )
-        settings = *fixed.items(), self.plane.shape
+        settings = *fixed.items(), self.plane.shape, self.sound.surface
         if self._table_settings == settings:
             return
         self._table_settings = settings
@@ -158,15 +160,16 @@ class BMode:
                     total += self.level[line, k] ** 2
                 self.energy[group, k] = total / (last - first)
             for group, k in ti.ndrange(self.groups, count):
-                total = 0.0
+                received = tm.vec2(0.0)
                 for other in range(self.groups):
-                    total += self.clutter_weight[k, other - group + self.groups - 1] * self.energy[other, k]
-                self.clutter[group, k] = total
+                    weight = self.clutter_weight[k, other - group + self.groups - 1]
+                    received += weight * tm.vec2(self.energy[other, k], 1.0)
+                self.clutter[group, k] = received
             for line, k in ti.ndrange(self.lines, count):
                 at = tm.clamp((line + 0.5) / GROUP - 0.5, 0.0, self.groups - 1.001)
                 group = ti.cast(at, ti.i32)
                 clutter = tm.mix(self.clutter[group, k], self.clutter[group + 1, k], at - group)
-                self.level[line, k] = ti.sqrt(self.level[line, k] ** 2 + clutter)
+                self.level[line, k] = ti.sqrt((self.level[line, k] ** 2 + clutter.x) / (1.0 + clutter.y))
 
     @ti.kernel
     def _scatter_evenly(self, stride: ti.template()):
@@ -199,7 +202,7 @@ class BMode:
 
     @ti.kernel
     def _lengthen(self, stride: ti.template(), axial_sd: float, sample_mm: float):
-        """Lengthen the pulse as attenuation on the path has done."""
+        """Lengthen the pulse as attenuation on the path has done, and scale speckle for the spread that follows."""
         for packet, line in ti.ndrange(self.samples // LANES, self.lines):
             first = packet * LANES
             path = self.sound.path[line, (first + LANES // 2) // stride]
@@ -213,9 +216,10 @@ class BMode:
                 weight, at = self.length_weight[length, tap + LENGTH_TAPS], first + tap + LENGTH_TAPS
                 real += weight * self.packet(self.scattered_real, line, at)
                 imaginary += weight * self.packet(self.scattered_imaginary, line, at)
+            gain = self.speckle_gain[self.scanline_class[line], packet]
             for i in ti.static(range(LANES)):
-                self.real[line, first + i] = real[i]
-                self.imaginary[line, first + i] = imaginary[i]
+                self.real[line, first + i] = gain * real[i]
+                self.imaginary[line, first + i] = gain * imaginary[i]
 
     @ti.kernel
     def _reflect(self, has_speckle: ti.template(), stride: ti.template(), sample_mm: float, axial_sd: float):
@@ -228,7 +232,7 @@ class BMode:
 
     @ti.func
     def reflect(self, has_speckle: ti.template(), line, k, step_mm, sample_mm, axial_sd):
-        """Add the echo of the interface in front of a tissue sample: as long as the pulse, and not scaled by ``speckle_gain``."""
+        """Add the echo of the interface in front of a tissue sample: as long as the pulse."""
         echo = self.sound.echo[line, k]
         amplitude, path = self.sound.echo_amplitude(line, echo, step_mm)
         diffuse, sd = tm.vec2(0.0, 0.0), axial_sd
@@ -242,9 +246,9 @@ class BMode:
             off = (i - at) * sample_mm / sd
             pulse = ti.exp(-0.5 * off * off)
             if ti.static(has_speckle):
-                mirror = amplitude * echo.x / self.speckle_gain[self.scanline_class[line], i // LANES]
-                self.real[line, i] = self.real[line, i] + pulse * (mirror + diffuse.x)
-                self.imaginary[line, i] = self.imaginary[line, i] + pulse * diffuse.y
+                gain = self.speckle_gain[self.scanline_class[line], i // LANES]
+                self.real[line, i] = self.real[line, i] + pulse * (amplitude * echo.x + gain * diffuse.x)
+                self.imaginary[line, i] = self.imaginary[line, i] + pulse * gain * diffuse.y
             else:
                 both = amplitude * ti.sqrt(echo.x**2 + echo.y**2)
                 self.real[line, i] = self.real[line, i] + pulse * both
@@ -286,9 +290,8 @@ class BMode:
                 real += weight * self.packet(self.real, m, first)
                 imaginary += turned * weight * self.packet(self.imaginary, m, first)
             electronic = self.electronic_noise(line, packet, key)
-            speckle_gain = self.speckle_gain[each, packet]
-            real = speckle_gain * real + noise * electronic[0, :]
-            imaginary = speckle_gain * imaginary + noise * electronic[1, :]
+            real += noise * electronic[0, :]
+            imaginary += noise * electronic[1, :]
             gain = Packet([self.gain[first + i] for i in ti.static(range(LANES))])
             decibel = DB * ti.log(ti.sqrt(real * real + imaginary * imaginary) + SILENCE) + gain
             for i in ti.static(range(LANES)):

@@ -1,23 +1,33 @@
 """The echo of an interface between two tissues: how strong it is, and how it depends on the angle of incidence."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import taichi as ti
 import taichi.math as tm
 
 # A smaller relative change of impedance between two samples is no interface.
 MIN_REFLECTION = 3e-4
-# Roughness of tissue interfaces: SD of height [mm] and of slope. An estimate: no measurement of renal surfaces was found.
-ROUGHNESS_MM, ROUGH_SLOPE = 0.012, 0.14
-# Amplitude that the fibres of capsules and fasciae scatter evenly in all directions (Lambert's law). An estimate, as above.
-SCATTERED = 0.25
 # Edge waves of the aperture: amplitude of a smooth interface that reflects just past the aperture, and its fall [1 / half angle].
 EDGE, EDGE_FALL = 0.056, 3.3
 
 
-def roughness_factors(roughness_mm: float, wavelength_mm: float) -> tuple[float, float]:
-    """Return the amplitudes that a rough interface reflects as a mirror and diffusely, of 1 (Beckmann & Spizzichino 1963)."""
-    phase = (2 * 2 * np.pi / wavelength_mm * roughness_mm) ** 2
-    return float(np.exp(-phase / 2)), float(np.sqrt(-np.expm1(-phase)))
+@dataclass(frozen=True)
+class Surface:
+    """The surface of tissue interfaces: SD of its height, SD of its slope, and the amplitude, relative to a smooth surface, that
+    the fibres of capsules and fasciae scatter evenly in all directions (Lambert's law).
+
+    The values are an estimate: no measurement of renal surfaces was found.
+    """
+
+    roughness_mm: float = 0.012
+    slope: float = 0.14
+    scattered: float = 0.25
+
+    def mirror_and_diffuse(self, wavelength_mm: float) -> tuple[float, float]:
+        """Return the amplitudes, of 1, that it reflects as a mirror and diffusely (Beckmann & Spizzichino 1963)."""
+        phase = (4 * np.pi / wavelength_mm * self.roughness_mm) ** 2
+        return float(np.exp(-phase / 2)), float(np.sqrt(-np.expm1(-phase)))
 
 
 @ti.func
@@ -28,7 +38,7 @@ def specular(tilt, half_angle):
     waves.
     """
     share = tilt / half_angle
-    return ti.max(1.0 - share, EDGE * ti.exp(EDGE_FALL * (1.0 - share)))
+    return ti.max(1.0 - share, EDGE * ti.exp(EDGE_FALL * ti.min(1.0 - share, 0.0)))
 
 
 @ti.func

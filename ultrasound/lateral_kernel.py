@@ -44,6 +44,7 @@ def lateral_kernel(probe: Probe) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         weights[each] = narrowed(profiles[each], pulse[each[1]])
     outside = weights < LEAST
     half = MAX_HALF_WIDTH - np.minimum(outside.argmin(axis=-1), outside[..., ::-1].argmin(axis=-1))
+    weights[np.abs(lag) > half[..., None]] = 0.0
     weights /= weights.sum(axis=-1, keepdims=True)
     energy = np.zeros(half.shape)
     for apart in range(len(lag)):

@@ -16,12 +16,9 @@ from sim.fields import array_of, fill
 from ultrasound.beam import half_apertures_mm
 from ultrasound.interface import (
     MIN_REFLECTION,
-    ROUGH_SLOPE,
-    ROUGHNESS_MM,
-    SCATTERED,
     Interface,
+    Surface,
     diffuse,
-    roughness_factors,
     specular,
 )
 from ultrasound.probe import Probe
@@ -36,7 +33,6 @@ CENTRAL_PLANE = ((0.0, 1.0),)
 THICK_PLANE = ((0.0, 2 / 3), (-(1.5**0.5), 1 / 6), (1.5**0.5, 1 / 6))
 # Rays from the aperture to each sample.
 RAYS = 7
-OFF_ARRAY = -1.0
 
 
 @ti.dataclass
@@ -73,7 +69,7 @@ class Propagation:
         self.interface_mm = 5.0 * voxel_mm
         self.by_organ, self.gap_mm = contact == "organ", contact_gap_mm
         self.organ_alone, self.around = around is not None, around or 0.0
-        self.roughness_mm, self.slope, self.scattered = ROUGHNESS_MM, ROUGH_SLOPE, SCATTERED
+        self.surface = Surface()
         self.lines, samples = probe.number_of_scanlines, probe.number_of_samples_per_scanline
         self.most = samples // STRIDES[1] + 1
         shape = self.lines, self.most
@@ -83,12 +79,14 @@ class Propagation:
         self.echo = ti.Vector.field(4, ti.f32, shape)
         self.passed, self.amplitude, self.path = (ti.field(ti.f32, shape) for _ in range(3))
         self.ray_amplitude, self.ray_path = (ti.field(ti.f32, (RAYS, *shape)) for _ in range(2))
-        # How many scanlines a ray is from its end at a sample, where it leaves the face.
-        self.ray_offset = ti.field(ti.f32, (RAYS, self.most))
+        # How many scanlines a ray is from its end at a sample, where it leaves the face. It goes from scanline to scanline: mixing
+        # two would spread shadows.
+        self.ray_offset = ti.field(ti.i32, (RAYS, self.most))
         # Half angle of the aperture [rad] and SD of the beam across the image plane [mm], at each sample.
         self.aperture_angle, self.slice_sd = (ti.field(ti.f32, self.most) for _ in range(2))
         self.speckle_db, self.echo_db = (ti.field(ti.f32, PATH_ENTRIES) for _ in range(2))
-        self.angles = ti.field(ti.f32, 3)
+        # Half angle of the aperture across the plane [rad]; of interfaces: amplitudes reflected as a mirror, diffusely and evenly; slope.
+        self.reflection = ti.field(ti.f32, 5)
 
     def stride_of(self, probe: Probe) -> int:
         """Return the scanline samples between two tissue samples."""
@@ -106,6 +104,7 @@ class Propagation:
         ) / 2
         pulse = probe.pulse
         start, direction = probe.scanlines()
+        surface = self.surface.mirror_and_diffuse(probe.wavelength_mm)
         elevation = np.arctan(probe.element_height_mm / 2 / probe.elevation_focus_mm)
         fill(
             (self.start, start),
@@ -116,7 +115,7 @@ class Propagation:
             (self.slice_sd, slice_sd_mm),
             (self.speckle_db, pulse.speckle_db),
             (self.echo_db, pulse.echo_db),
-            (self.angles, np.array([elevation, *roughness_factors(self.roughness_mm, probe.wavelength_mm)])),
+            (self.reflection, np.array([elevation, *surface, self.surface.scattered, self.surface.slope])),
         )
 
     def run(self, probe: Probe, thick: bool) -> None:
@@ -217,7 +216,7 @@ class Propagation:
         linear = self.plane.rest_from_plane(row, column)
         # Carried into the deformed tissue by the inverse transpose of the deformation gradient.
         rest = 0.5 * (self.rest[line, k - 1] + self.rest[line, k])
-        return linear[:, :3].transpose() @ self.tissue_volume.slope(rest)
+        return linear[:, :3].transpose() @ self.tissue_volume.gradient(rest)
 
     @ti.func
     def end_interface(self, interface, line, k, after, direction, step_mm):
@@ -225,10 +224,11 @@ class Propagation:
         depth = interface.middle / interface.steps
         reflection = interface.reflection(after)
         tilts, half_angle = interface.tilts(direction), self.aperture_angle[ti.cast(depth / step_mm, ti.i32)]
-        mirror = specular(tilts.x, half_angle) * specular(tilts.y, self.angles[0])
-        rough = diffuse(tilts.x, half_angle, self.slope) * diffuse(tilts.y, self.angles[0], self.slope)
-        even = self.scattered**2 * ti.cos(tilts.x) * ti.cos(tilts.y)
-        echo = reflection * tm.vec2(self.angles[1] * mirror, ti.sqrt(self.angles[2] ** 2 * rough + even))
+        across, slope = self.reflection[0], self.reflection[4]
+        mirror = self.reflection[1] * specular(tilts.x, half_angle) * specular(tilts.y, across)
+        rough = diffuse(tilts.x, half_angle, slope) * diffuse(tilts.y, across, slope)
+        even = self.reflection[3] ** 2 * ti.cos(tilts.x) * ti.cos(tilts.y)
+        echo = reflection * tm.vec2(mirror, ti.sqrt(self.reflection[2] ** 2 * rough + even))
         self.echo[line, k] = tm.vec4(echo, depth, ti.cast(interface.begins, ti.f32))
         self.passed[line, k] = ti.sqrt(1.0 - reflection**2)
 
@@ -244,19 +244,15 @@ class Propagation:
                 for k in range(1, count):
                     aside = self.ray_offset[ray, k] - self.ray_offset[ray, k - 1]
                     for line in range(self.lines):
-                        self.follow_ray(ray, line, k, aside, step_mm)
+                        self.follow_ray(ray, line, k, tm.clamp(line - aside, 0, self.lines - 1), step_mm)
 
     @ti.func
-    def follow_ray(self, ray, line, k, aside, step_mm):
-        """Continue a ray from the sample before, where it was ``aside`` scanlines away."""
-        x = tm.clamp(line - aside, 0.0, self.lines - 1.001)
-        m = ti.cast(x, ti.i32)
-        t = x - m
-        amplitude = tm.mix(self.ray_amplitude[ray, m, k - 1], self.ray_amplitude[ray, m + 1, k - 1], t)
-        path = tm.mix(self.ray_path[ray, m, k - 1], self.ray_path[ray, m + 1, k - 1], t)
+    def follow_ray(self, ray, line, k, from_line, step_mm):
+        """Continue a ray from the sample before, on a scanline."""
         attenuation = 0.5 * (self.tissue[line, k - 1].y + self.tissue[line, k].y)
-        self.ray_amplitude[ray, line, k] = amplitude * self.passed[line, k]
+        path = self.ray_path[ray, from_line, k - 1]
         self.ray_path[ray, line, k] = path + attenuation * step_mm / (10.0 * DB_OF_NEPER)
+        self.ray_amplitude[ray, line, k] = self.ray_amplitude[ray, from_line, k - 1] * self.passed[line, k]
 
     @ti.kernel
     def _combine(self, count: int):
@@ -265,7 +261,7 @@ class Propagation:
             total, path, found = 0.0, 0.0, 0.0
             for ray in ti.static(range(RAYS)):
                 origin = line - self.ray_offset[ray, k]
-                if origin > -0.5 and origin < self.lines - 0.5:
+                if origin >= 0 and origin < self.lines:
                     along = self.ray_path[ray, line, k]
                     one_way = self.ray_amplitude[ray, line, k] * 10.0 ** (
                         self.at_path(self.speckle_db, 2.0 * along) / 40.0
@@ -299,13 +295,18 @@ class Propagation:
 
 
 def ray_offsets(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
-    """Return how many scanlines beside its end at a depth each ray leaves the face (RAYS, depths), at even angles of the aperture."""
+    """Return how many scanlines beside its end at a depth each ray leaves the face (RAYS, depths) int32.
+
+    Each ray stands for an equal part of the aperture.
+    """
     if probe.transducer_geometry == "PHASED":
         # All scanlines start at one point: rays of other elements are not among them.
-        return np.zeros((RAYS, len(depth_mm)))
-    slope = np.linspace(-1, 1, RAYS)[:, None] / (2 * probe.f_number)
+        return np.zeros((RAYS, len(depth_mm)), np.int32)
+    slope = (2 * (np.arange(RAYS) + 0.5) / RAYS - 1)[:, None] / (2 * probe.f_number)
     spacing = probe.line_spacing_mm(np.zeros(1))[0]
     if probe.sector is None:
-        return slope * depth_mm / spacing
-    radius = probe.radius_mm
-    return slope * np.log1p(depth_mm / radius) * radius / spacing
+        offset = slope * depth_mm / spacing
+    else:
+        radius = probe.radius_mm
+        offset = slope * np.log1p(depth_mm / radius) * radius / spacing
+    return np.rint(offset).astype(np.int32)

@@ -113,22 +113,36 @@ class SampledVolume:
         return tm.mix(self.voxels[voxel], self.voxels[voxel + 1], t)
 
     @ti.func
-    def slope(self, p):
-        """Return the gradient [1/mm] of the first trilinear value at p [mm]; zero outside."""
-        first, t, inside = self.cell_at(p)
+    def gradient(self, p):
+        """Return the gradient [1/mm] of the first trilinear value at p [mm], over a voxel to each side; zero outside.
+
+        The derivative of the trilinear value itself is constant along its axis in each cell: of a thin interface it gives a wrong
+        direction.
+        """
+        at = self.linear @ p + self.offset
+        last = tm.vec3(self.shape[0] - 1, self.shape[1] - 1, self.shape[2] - 1)
         along = tm.vec3(0.0)
-        if inside:
-            x, y = ti.static(self.strides)
-            low = tm.vec4([self.voxels[first + i][0] for i in ti.static((0, y, x, x + y))])
-            high = tm.vec4([self.voxels[first + i + 1][0] for i in ti.static((0, y, x, x + y))])
-            at_y = tm.mix(
-                tm.vec2(high.x - low.x, high.z - low.z), tm.vec2(high.y - low.y, high.w - low.w), t.y
-            )
-            ends = tm.mix(low, high, t.z)
-            along.z = tm.mix(at_y.x, at_y.y, t.x)
-            along.y = tm.mix(ends.y - ends.x, ends.w - ends.z, t.x)
-            along.x = tm.mix(ends.z, ends.w, t.y) - tm.mix(ends.x, ends.y, t.y)
+        if (at >= -0.5).all() and (at <= last + 0.5).all():
+            for axis in ti.static(range(3)):
+                low, high = tm.clamp(at, 0.0, last), tm.clamp(at, 0.0, last)
+                low[axis] = ti.max(at[axis] - 1.0, 0.0)
+                high[axis] = ti.min(at[axis] + 1.0, last[axis])
+                change = self.first_value(high) - self.first_value(low)
+                along[axis] = change / ti.max(high[axis] - low[axis], 0.5)
         return self.linear.transpose() @ along
+
+    @ti.func
+    def first_value(self, at):
+        """Return the first trilinear value at an index within the grid."""
+        most = ti.Vector([self.count[0] - 2, self.count[1] - 2, self.count[2] - 2])
+        base = ti.min(ti.cast(at, ti.i32), most)
+        t = at - base
+        x, y = ti.static(self.strides)
+        first = base.x * x + base.y * y + base.z
+        low = tm.vec4([self.voxels[first + i][0] for i in ti.static((0, y, x, x + y))])
+        high = tm.vec4([self.voxels[first + i + 1][0] for i in ti.static((0, y, x, x + y))])
+        ends = tm.mix(low, high, t.z)
+        return tm.mix(tm.mix(ends.x, ends.y, t.y), tm.mix(ends.z, ends.w, t.y), t.x)
 
 
 def distance_volume(
