@@ -37,6 +37,10 @@ STUDIES = {
         "Compare volumes of tracked sweeps with the ground truth.",
     ),
     "replay": ("studies.robustness.replay_study:replay", "Record a session in SCENE and compute it again."),
+    "echo": (
+        "studies.echo.echo_command:echo",
+        "Compare B-mode images of test objects with a wave simulator.",
+    ),
     "plan": (
         "studies.planning.plan_comparison:plan_study",
         "Compare planned sweeps with straight and random ones.",

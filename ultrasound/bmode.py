@@ -4,7 +4,7 @@
 2. ``_scatter``: the signal of scatterers, with the clutter that side lobes receive.
 3. ``_lengthen``: attenuation takes the high frequencies, so that the pulse becomes longer.
 4. ``_reflect``: the echoes of interfaces.
-5. ``_spread``: the beam's width across the scanlines, electronic noise, then the envelope in dB, with gain and TGC.
+5. ``spread``: the beam's width across the scanlines, electronic noise, then the envelope in dB, with gain and TGC.
 6. ``_scan_convert``: from scanlines and samples to the pixels of the image.
 """
 
@@ -75,9 +75,9 @@ class BMode:
         # Energy that side lobes receive, and what they would receive if it were 1 everywhere.
         self.clutter = ti.Vector.field(2, ti.f32, (self.groups, most))
         self.clutter_weight = ti.field(ti.f32, (most, 2 * self.groups - 1))
-        # Shorter length of the noise across the plane, weights of it and of the next; extra length of the pulse at a path.
+        # Shorter length of the noise across the plane, weights of it and of the next; lengths along the beam by the path.
         self.elevation = ti.Vector.field(3, ti.f32, most)
-        self.axial_sd = ti.field(ti.f32, PATH_ENTRIES)
+        self.axial_sd, self.speckle_sd = (ti.field(ti.f32, PATH_ENTRIES) for _ in range(2))
         self.length_weight = ti.field(ti.f32, (LENGTHS, 2 * LENGTH_TAPS + 1))
         self.weight = ti.field(ti.f32, (CLASSES, packets, 2 * MAX_HALF_WIDTH + 1))
         self.half = ti.field(ti.i32, (CLASSES, packets))
@@ -97,16 +97,16 @@ class BMode:
         self.sound.run(probe, thick=detail_level == "elevation")
         stride = self.sound.stride_of(probe)
         has_speckle = detail_level != "reflection"
-        axial_sd = probe.axial_sd_mm
+        speckle_sd = probe.speckle_sd_mm
         self._set_levels(has_speckle, self.samples // stride + 1)
         if has_speckle:
-            self._scatter(stride, axial_sd)
-            self._lengthen(stride, axial_sd, probe.sample_mm)
+            self._scatter(stride, speckle_sd)
+            self._lengthen(stride, speckle_sd, probe.sample_mm)
         else:
             self._scatter_evenly(stride)
-        self._reflect(has_speckle, stride, probe.sample_mm, axial_sd)
+        self._reflect(has_speckle, stride, probe.sample_mm, speckle_sd)
         if has_speckle:
-            self._spread(10.0 ** (probe.noise_db / 20.0), self.plane.noise_key)
+            self.spread(10.0 ** (probe.noise_db / 20.0), self.plane.noise_key)
         else:
             self._add()
         image = np.empty(self.plane.shape, np.uint8)
@@ -138,7 +138,8 @@ class BMode:
             (self.clutter_weight, clutter_weights(probe, depth)),
             (self.elevation, elevation_levels(correlation_sd)),
             (self.axial_sd, probe.pulse.axial_sd_mm),
-            (self.length_weight, length_weights(probe.axial_sd_mm / probe.sample_mm)),
+            (self.speckle_sd, probe.pulse.speckle_sd_mm),
+            (self.length_weight, length_weights(probe.speckle_sd_mm / probe.sample_mm)),
             (self.speckle_gain, speckle_gain),
             (self.weight, weights),
             (self.half, half),
@@ -180,7 +181,7 @@ class BMode:
                 self.real[line, stride * k + j] = level
 
     @ti.kernel
-    def _scatter(self, stride: ti.template(), axial_sd: float):
+    def _scatter(self, stride: ti.template(), speckle_sd: float):
         """Write the signal of scatterers: noise of the rest position, times the level."""
         for line, k in ti.ndrange(self.lines, self.samples // stride):
             first = LENGTH_TAPS + stride * k
@@ -189,7 +190,7 @@ class BMode:
                 self.scattered_imaginary[line, first + j] = 0.0
             axis = self.speckle.long_axis(self.sound.across[line, k])
             for each in range(COMPONENTS):
-                weight, key, matrix = self.speckle.component(each, axis, self.elevation[k], axial_sd)
+                weight, key, matrix = self.speckle.component(each, axis, self.elevation[k], speckle_sd)
                 if weight > LEAST_WEIGHT:
                     near, far = matrix @ self.sound.rest[line, k], matrix @ self.sound.rest[line, k + 1]
                     for j in range(stride):
@@ -201,13 +202,14 @@ class BMode:
                         self.scattered_imaginary[line, i] = self.scattered_imaginary[line, i] + noise.y
 
     @ti.kernel
-    def _lengthen(self, stride: ti.template(), axial_sd: float, sample_mm: float):
+    def _lengthen(self, stride: ti.template(), speckle_sd: float, sample_mm: float):
         """Lengthen the pulse as attenuation on the path has done, and scale speckle for the spread that follows."""
         for packet, line in ti.ndrange(self.samples // LANES, self.lines):
             first = packet * LANES
             path = self.sound.path[line, (first + LANES // 2) // stride]
             more = (
-                ti.sqrt(ti.max(self.sound.at_path(self.axial_sd, path) ** 2 - axial_sd**2, 0.0)) / sample_mm
+                ti.sqrt(ti.max(self.sound.at_path(self.speckle_sd, path) ** 2 - speckle_sd**2, 0.0))
+                / sample_mm
             )
             length = ti.min(ti.round(more / LENGTH_STEP, ti.i32), LENGTHS - 1)
             half = ti.min(ti.ceil(HALF_WIDTH_SD * length * LENGTH_STEP, ti.i32), LENGTH_TAPS)
@@ -222,22 +224,24 @@ class BMode:
                 self.imaginary[line, first + i] = gain * imaginary[i]
 
     @ti.kernel
-    def _reflect(self, has_speckle: ti.template(), stride: ti.template(), sample_mm: float, axial_sd: float):
+    def _reflect(
+        self, has_speckle: ti.template(), stride: ti.template(), sample_mm: float, speckle_sd: float
+    ):
         """Add the echoes of the interfaces."""
         for n in range(self.lines * TASK):
             if n % TASK == 0:
                 for k in range(1, self.samples // stride + 1):
                     if self.sound.echo[n // TASK, k].z > 0.0:
-                        self.reflect(has_speckle, n // TASK, k, stride * sample_mm, sample_mm, axial_sd)
+                        self.reflect(has_speckle, n // TASK, k, stride * sample_mm, sample_mm, speckle_sd)
 
     @ti.func
-    def reflect(self, has_speckle: ti.template(), line, k, step_mm, sample_mm, axial_sd):
+    def reflect(self, has_speckle: ti.template(), line, k, step_mm, sample_mm, speckle_sd):
         """Add the echo of the interface in front of a tissue sample: as long as the pulse."""
         echo = self.sound.echo[line, k]
         amplitude, path = self.sound.echo_amplitude(line, echo, step_mm)
-        diffuse, sd = tm.vec2(0.0, 0.0), axial_sd
+        diffuse, sd = tm.vec2(0.0, 0.0), self.axial_sd[0]
         if ti.static(has_speckle):
-            diffuse = amplitude * echo.y * self.speckle_at(line, echo.z / step_mm, axial_sd)
+            diffuse = amplitude * echo.y * self.speckle_at(line, echo.z / step_mm, speckle_sd)
             sd = self.sound.at_path(self.axial_sd, path)
         at, reach = echo.z / sample_mm - 0.5, ti.ceil(3.5 * sd / sample_mm, ti.i32)
         first = ti.max(ti.floor(at, ti.i32) - reach, 0)
@@ -254,13 +258,13 @@ class BMode:
                 self.real[line, i] = self.real[line, i] + pulse * both
 
     @ti.func
-    def speckle_at(self, line, at, axial_sd):
+    def speckle_at(self, line, at, speckle_sd):
         """Return the speckle (2,) at a fractional tissue sample of a scanline."""
         k = ti.cast(at, ti.i32)
         rest = tm.mix(self.sound.rest[line, k], self.sound.rest[line, k + 1], at - k)
         axis, speckle = self.speckle.long_axis(self.sound.across[line, k]), tm.vec2(0.0)
         for each in range(COMPONENTS):
-            weight, key, matrix = self.speckle.component(each, axis, self.elevation[k], axial_sd)
+            weight, key, matrix = self.speckle.component(each, axis, self.elevation[k], speckle_sd)
             if weight > LEAST_WEIGHT:
                 speckle += weight * self.speckle.at(matrix @ rest, key)
         return speckle
@@ -272,7 +276,7 @@ class BMode:
             self.decibel[line, sample] = DB * ti.log(envelope + SILENCE) + self.gain[sample]
 
     @ti.kernel
-    def _spread(self, noise: float, key: int):
+    def spread(self, noise: float, key: int):
         """Spread the scanlines as the beam is wide, add electronic noise, and take the envelope in dB."""
         # Scanline by scanline at one depth: the samples that neighbours share stay in the L1 cache.
         for packet, line in ti.ndrange(self.samples // LANES, self.lines):

@@ -9,7 +9,8 @@ import taichi.math as tm
 # A smaller relative change of impedance between two samples is no interface.
 MIN_REFLECTION = 3e-4
 # Edge waves of the aperture: amplitude of a smooth interface that reflects just past the aperture, and its fall [1 / half angle].
-EDGE, EDGE_FALL = 0.056, 3.3
+# Fitted to SIMUS (``study echo``).
+EDGE, EDGE_FALL = 0.08, 2.75
 
 
 @dataclass(frozen=True)

@@ -33,11 +33,11 @@ def lateral_kernel(probe: Probe) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the weights of neighbouring scanlines for each class of scanlines and LANES samples.
 
     Weights (CLASSES, packets, 2 MAX_HALF_WIDTH + 1), of sum 1; the half width in scanlines (CLASSES, packets); and the speckle gain
-    (CLASSES, packets), which restores unit mean square of noise with the axial width's correlation.
+    (CLASSES, packets), which restores unit mean square of noise with the pulse's correlation.
     """
     depth, lag = packet_depths(probe), np.arange(-MAX_HALF_WIDTH, MAX_HALF_WIDTH + 1)
     # The noise already has the width of the pulse in every direction.
-    pulse = probe.axial_sd_mm / np.maximum(probe.line_spacing_mm(depth), 1e-6)
+    pulse = probe.speckle_sd_mm / np.maximum(probe.line_spacing_mm(depth), 1e-6)
     profiles = np.stack([_profiles(probe, each, lag, depth) for each in range(CLASSES)])
     weights = np.empty_like(profiles)
     for each in np.ndindex(profiles.shape[:2]):

@@ -110,8 +110,13 @@ class Probe(BaseModel):
 
     @property
     def axial_sd_mm(self) -> float:
-        """Length of the pulse's echo at the face."""
+        """Length of an interface's echo at the face."""
         return float(self.pulse.axial_sd_mm[0])
+
+    @property
+    def speckle_sd_mm(self) -> float:
+        """Length of speckle at the face."""
+        return float(self.pulse.speckle_sd_mm[0])
 
     @property
     def sample_mm(self) -> float:

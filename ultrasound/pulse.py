@@ -20,13 +20,15 @@ PATH_STEP, PATH_ENTRIES = 0.05, 256
 class AttenuatedPulse:
     """How attenuation over the path changes the pulse; each (PATH_ENTRIES,), at multiples of PATH_STEP [Np/MHz].
 
-    ``speckle_db`` is the change of the mean square of speckle, ``echo_db`` of the peak of an interface's echo, ``axial_sd_mm``
-    the pulse's length.
+    ``speckle_db`` is the change of the mean square of speckle, ``echo_db`` of the peak of an interface's echo. ``axial_sd_mm`` is
+    the length of that echo, as an SD of the same full width at half maximum; ``speckle_sd_mm`` that of speckle, which correlates by
+    1/2 in intensity where exp(-d^2 / (2 SD^2)) does.
     """
 
     speckle_db: np.ndarray
     echo_db: np.ndarray
     axial_sd_mm: np.ndarray
+    speckle_sd_mm: np.ndarray
 
 
 def pulse_spectrum(frequency_mhz: float, bandwidth_percent: float) -> tuple[np.ndarray, np.ndarray]:
@@ -52,19 +54,22 @@ def attenuated_pulse(frequency_mhz: float, bandwidth_percent: float) -> Attenuat
     spectrum = amplitude * np.exp(-path * (frequency - frequency[0]))
     square, peak = (spectrum**2).sum(axis=1), spectrum.sum(axis=1)
     lowest_db = -DB_OF_NEPER * path[:, 0] * frequency[0]
-    # Both are 6 dB down; half of the round trip is the distance.
-    length_mm = np.array([_half_width(s, frequency) for s in spectrum]) * SOUND_MM_US / 2
+    # Half of the round trip is the distance.
+    half_mm = np.array([_time_to(0.5, each, frequency) for each in spectrum]) * SOUND_MM_US / 2
+    together_mm = np.array([_time_to(0.5**0.5, each**2, frequency) for each in spectrum]) * SOUND_MM_US / 2
     return AttenuatedPulse(
         10 * np.log10(square / square[0]) + lowest_db,
         20 * np.log10(peak / peak[0]) + lowest_db,
-        2 * length_mm / FWHM_OF_SD,
+        2 * half_mm / FWHM_OF_SD,
+        together_mm / np.sqrt(2 * np.log(2)),
     )
 
 
-def _half_width(spectrum: np.ndarray, frequency: np.ndarray) -> float:
-    """Return the time [us] at which the envelope of a pulse is half of its peak."""
-    count = 1 << 15
+def _time_to(level: float, spectrum: np.ndarray, frequency: np.ndarray) -> float:
+    """Return the time [us] at which the envelope of a spectrum's signal falls to a level of its peak."""
+    count = 1 << 14
     envelope = np.abs(np.fft.fft(spectrum, count))
-    below = int(np.argmax(envelope < envelope[0] / 2))
-    at = below - (envelope[0] / 2 - envelope[below]) / (envelope[below - 1] - envelope[below])
+    limit = level * envelope[0]
+    below = int(np.argmax(envelope < limit))
+    at = below - (limit - envelope[below]) / (envelope[below - 1] - envelope[below])
     return float(at / count / (frequency[1] - frequency[0]))

@@ -121,10 +121,10 @@ class Speckle:
         return LongAxis(face, index, step, share)  # type: ignore[call-arg]
 
     @ti.func
-    def component(self, each, axis, lengths, axial_sd):
+    def component(self, each, axis, lengths, sd_mm):
         """Return weight, key and matrix (3, 3) from the rest position [mm] to entries of one of the COMPONENTS noises.
 
-        ``lengths`` is of ``elevation_levels``.
+        ``lengths`` is of ``elevation_levels``, ``sd_mm`` the length along the image plane.
         """
         other, longer = ti.Vector([(each >> 2) & 1, (each >> 1) & 1]), each & 1
         share = ti.select(other == 1, axis.share, 1.0 - axis.share)
@@ -132,7 +132,7 @@ class Speckle:
         index = axis.index + other * axis.step
         level = ti.cast(lengths.x, ti.i32) + longer
         matrix = self.axes(axis.face, index)
-        fine, coarse = PITCHES / axial_sd, PITCHES / (SHORTEST_SD_MM * ti.cast(1 << level, ti.f32))
+        fine, coarse = PITCHES / sd_mm, PITCHES / (SHORTEST_SD_MM * ti.cast(1 << level, ti.f32))
         for column in ti.static(range(3)):
             matrix[0, column] *= fine
             matrix[1, column] *= fine

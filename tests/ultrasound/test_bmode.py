@@ -421,7 +421,7 @@ def test_speckle_correlates_as_the_point_spread_function_does(endless):
             field = field[60:132]
         for lag in range(1, 7):
             correlation = (field[lag:] * field[:-lag]).mean() / (field**2).mean()
-            axial = np.exp(-0.5 * (lag * probe.sample_mm / probe.axial_sd_mm) ** 2)
+            axial = np.exp(-0.5 * (lag * probe.sample_mm / probe.speckle_sd_mm) ** 2)
             assert correlation == pytest.approx(lateral[lag] if axis == 1 else axial, abs=0.07)
 
 

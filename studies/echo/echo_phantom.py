@@ -1,0 +1,83 @@
+"""A virtual test object in front of a probe, and what its B-mode image measures."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from sim.embedding import Unmoved
+from sim.fields import array_of, fill
+from ultrasound.bmode import BMode
+from ultrasound.interface import Surface
+from ultrasound.probe import DetailLevel, Probe
+from ultrasound.probe_manipulator import image_plane, pose_at
+from ultrasound.sampled_volume import SampledVolume
+from ultrasound.scanner import PlaneInTissue
+
+VOXEL_MM, MARGIN_MM = 0.25, 2.0
+IMPEDANCE, PIXELS = 1.62, 64
+FAR_MM = 1e4
+Values = float | np.ndarray | Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+class EchoPhantom:
+    """Tissue whose properties are functions of u and v of the image plane [mm], the same across it, filled anew for each image."""
+
+    def __init__(self, probe: Probe) -> None:
+        self.probe = probe
+        width, depth, above = probe.extent_mm
+        low = np.array([-width / 2 - MARGIN_MM, -above - MARGIN_MM])
+        count = round((width + 2 * MARGIN_MM) / VOXEL_MM), round((depth + 2 * MARGIN_MM) / VOXEL_MM)
+        index_from_mm = np.diag([1 / VOXEL_MM, 1 / VOXEL_MM, 1 / FAR_MM, 1.0])
+        index_from_mm[:2, 3] = -low / VOXEL_MM
+        self.u, self.v = low[:, None, None] + VOXEL_MM * np.indices(count)
+        self.tissue = SampledVolume(np.zeros((*count, 1, 3)), index_from_mm, outside=0.0)
+        organ = SampledVolume(np.full((1, 1, 1), -1.0), np.diag([1 / FAR_MM] * 3 + [1.0]))
+        self.plane = PlaneInTissue(Unmoved(), PIXELS)
+        self.bmode = BMode(self.tissue, organ, self.plane, probe, VOXEL_MM)
+
+    @property
+    def depth_mm(self) -> np.ndarray:
+        """Depth of each sample of a scanline."""
+        return (np.arange(self.probe.number_of_samples_per_scanline) + 0.5) * self.probe.sample_mm
+
+    def set_surface(self, surface: Surface) -> None:
+        """Give the interfaces another surface."""
+        self.bmode.sound.surface = surface
+
+    def fill(
+        self, impedance: Values = IMPEDANCE, attenuation: Values = 0.0, backscatter: Values = 0.0
+    ) -> None:
+        """Set impedance [MRayl], attenuation [dB/cm/MHz] and backscatter."""
+        values = np.empty((*self.u.shape, 1, 3), np.float32)
+        for channel, given in enumerate((impedance, attenuation, backscatter)):
+            values[..., 0, channel] = given(self.u, self.v) if callable(given) else given
+        thin = np.pad(values, [(0, 0), (0, 0), (0, 1), (0, 0)], mode="edge")
+        fill((self.tissue.voxels, thin.reshape(-1, 3)))
+
+    def amplitude(
+        self,
+        across_mm: float = 0.0,
+        detail_level: DetailLevel = "speckle",
+        probe: Probe | None = None,
+    ) -> np.ndarray:
+        """Return the echo (scanlines, samples) without gain, of a probe that is moved out of its image plane."""
+        probe = probe or self.probe
+        place = np.array([0.0, 0.0, across_mm])
+        pose = pose_at(place, np.array([0.0, 1, 0]), np.array([1.0, 0, 0]), probe.housing_mm[2])
+        self.plane.locate(image_plane(pose, probe.housing_mm[2], *probe.extent_mm))
+        self.bmode.render(probe, detail_level)
+        return 10 ** ((array_of(self.bmode.decibel).astype(float) - probe.gain_db()) / 20)
+
+    def point_response(self, scanline: int, depth_mm: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return distance [mm] along an arc and amplitude on each scanline of a point scatterer on one of them."""
+        self.fill()
+        self.amplitude()
+        spacing = float(self.probe.line_spacing_mm(np.array([depth_mm]))[0])
+        place = spacing * (np.arange(self.probe.number_of_scanlines) - scanline)
+        echo = np.exp(-0.5 * (place / self.probe.speckle_sd_mm) ** 2)
+        fill((self.bmode.real, np.repeat(echo[:, None], len(self.depth_mm), axis=1)))
+        self.bmode.imaginary.fill(0.0)
+        self.bmode.spread(0.0, 0)
+        sample = int(depth_mm / self.probe.sample_mm)
+        decibel = array_of(self.bmode.decibel).astype(float) - self.probe.gain_db()
+        return place, 10 ** (decibel[:, sample] / 20)
