@@ -21,8 +21,11 @@ from sim.stored_arrays import stored
 TISSUES = Path(__file__).parent / "acoustic_tissues.toml"
 # Amplitude of renal cortex relative to a perfect reflector: its speckle is some 16 dB below the echo of fat on kidney.
 CORTEX_DB = -38.0
-# Smooths the voxel steps of labels.
-SMOOTHING_VOXELS = 0.8
+# Smooths the voxel steps of labels; the level of scattering, in dB, by less, so that a cyst of three voxels reaches its level.
+SMOOTHING_VOXELS, LEVEL_SMOOTHING_VOXELS = 0.8, 0.5
+# From the first to the second HU unlabelled tissue has the impedance of the first: contrast agent raises HU, not density. From the
+# third on it is calcified.
+AGENT_FROM_HU, AGENT_TO_HU, CALCIFIED_HU = 55.0, 200.0, 300.0
 SEED = 20160101
 MIN_HU, MAX_HU = -1024, 3071
 
@@ -72,6 +75,14 @@ def impedance_of_hu(hu: np.ndarray) -> np.ndarray:
     offset = np.select(pieces, [-5.680404011, 103.6151457, 539.9977189], 348.8555178).astype(np.float32)
     density = np.maximum(slope * h + offset, np.float32(1.2))
     return density * (density + np.float32(349)) / np.float32(0.893e6)
+
+
+def impedance_of_tissue(hu: np.ndarray) -> np.ndarray:
+    """Return acoustic impedance [MRayl] of unlabelled tissue, perhaps with contrast agent: see AGENT_FROM_HU."""
+    without = np.interp(
+        hu, [AGENT_FROM_HU, AGENT_TO_HU, CALCIFIED_HU], [AGENT_FROM_HU, AGENT_FROM_HU, CALCIFIED_HU]
+    )
+    return impedance_of_hu(np.where((hu > AGENT_FROM_HU) & (hu < CALCIFIED_HU), without, hu))
 
 
 def stored_properties(
@@ -127,9 +138,10 @@ def properties(
         values[where, IMPEDANCE] = table["impedance_mrayl"]
         values[where, ATTENUATION] = table["attenuation_db_cm_mhz"]
         level[where] = table["backscatter_db"] + texture(table, where)
-    values[..., BACKSCATTER] = np.float32(10) ** ((level + np.float32(CORTEX_DB)) / np.float32(20))
-    for channel in range(3):
+    for channel in (IMPEDANCE, ATTENUATION):
         values[..., channel] = ndimage.gaussian_filter(values[..., channel], SMOOTHING_VOXELS, truncate=2.5)
+    level = ndimage.gaussian_filter(level, LEVEL_SMOOTHING_VOXELS, truncate=2.5)
+    values[..., BACKSCATTER] = np.float32(10) ** ((level + np.float32(CORTEX_DB)) / np.float32(20))
     if stone is not None:
         _add_stones(values, stone)
     return values
@@ -152,7 +164,7 @@ def _by_hounsfield(hu: np.ndarray) -> np.ndarray:
     every = np.arange(MIN_HU, MAX_HU + 1)
     attenuation = np.interp(every, table["hu"], table["attenuation_db_cm_mhz"])
     level = np.interp(every, table["hu"], table["backscatter_db"])
-    values = np.column_stack([impedance_of_hu(every), attenuation, level]).astype(np.float32)
+    values = np.column_stack([impedance_of_tissue(every), attenuation, level]).astype(np.float32)
     # Removes the noise of the CT.
     smooth = ndimage.gaussian_filter(np.asarray(hu, np.float32), SMOOTHING_VOXELS, truncate=2.5)
     return values[np.clip(np.rint(smooth), MIN_HU, MAX_HU).astype(np.int16) - MIN_HU]

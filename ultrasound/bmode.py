@@ -26,7 +26,7 @@ from ultrasound.lateral_kernel import (
     lateral_kernel,
     scanline_classes,
 )
-from ultrasound.probe import DetailLevel, Probe
+from ultrasound.probe import GREY_EXPONENTS, DetailLevel, Probe
 from ultrasound.propagation import Propagation
 from ultrasound.pulse import PATH_ENTRIES
 from ultrasound.sampled_volume import SampledVolume
@@ -37,6 +37,7 @@ Packet = ti.types.vector(LANES, ti.f32)
 SILENCE = 1e-9
 # Kernels that lengthen the pulse: by so many SDs, in steps of samples, with so many taps to each side, up to so many SDs.
 LENGTHS, LENGTH_STEP, LENGTH_TAPS, HALF_WIDTH_SD = 33, 0.125, 10, 2.5
+GREY_STEPS = 64
 # Decibels per neper of amplitude.
 DB = 8.685889638065037
 
@@ -85,6 +86,8 @@ class BMode:
         self.speckle_gain = ti.field(ti.f32, (CLASSES, packets))
         self.scanline_class, self.side = ti.field(ti.i32, self.lines), ti.field(ti.i32, self.lines)
         self.gain = ti.field(ti.f32, self.samples)
+        # Grey value at even steps of the dynamic range.
+        self.grey = ti.field(ti.f32, GREY_STEPS + 1)
         self.source = ti.Vector.field(2, ti.f32, (plane.pixels, plane.pixels))
         self._table_settings: tuple | None = None
 
@@ -115,7 +118,8 @@ class BMode:
 
     def _make_tables(self, probe: Probe) -> None:
         """Update the tables of the probe's settings, if these changed."""
-        fill((self.gain, probe.gain_db()))
+        grey = 255 * np.linspace(0, 1, GREY_STEPS + 1) ** GREY_EXPONENTS[probe.grey_map]
+        fill((self.gain, probe.gain_db()), (self.grey, grey))
         fixed = probe.model_dump(
             exclude={"gain_percent", "dyn_range_db", "time_gain_compensation", "noise_db"}
         )
@@ -333,8 +337,10 @@ class BMode:
                 along = y - sample
                 low = tm.mix(self.decibel[line, sample], self.decibel[line, sample + 1], along)
                 high = tm.mix(self.decibel[line + 1, sample], self.decibel[line + 1, sample + 1], along)
-                grey = 255.0 * (tm.mix(low, high, x - line) / dynamic_range_db + 1.0)
-            image[row, column] = ti.cast(tm.clamp(grey, 0.0, 255.0) + 0.5, ti.u8)
+                share = tm.clamp(tm.mix(low, high, x - line) / dynamic_range_db + 1.0, 0.0, 1.0)
+                step = ti.min(ti.cast(share * GREY_STEPS, ti.i32), GREY_STEPS - 1)
+                grey = tm.mix(self.grey[step], self.grey[step + 1], share * GREY_STEPS - step)
+            image[row, column] = ti.cast(grey + 0.5, ti.u8)
 
 
 def source_of_pixels(probe: Probe, rows: int, columns: int) -> np.ndarray:

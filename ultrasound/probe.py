@@ -25,6 +25,10 @@ MODES: tuple[Mode, ...] = get_args(Mode)
 DetailLevel = Literal["reflection", "speckle", "elevation"]
 DETAIL_LEVELS: tuple[DetailLevel, ...] = get_args(DetailLevel)
 
+# Grey values: the exponent of the share of the dynamic range. On a scanner's screen most of the tissue is dark.
+GreyMap = Literal["linear", "dark"]
+GREY_EXPONENTS: dict[GreyMap, float] = {"linear": 1.0, "dark": 1.5}
+
 Percent = Annotated[float, Field(ge=0, le=100)]
 Length = Annotated[float, Field(gt=0)]
 
@@ -69,8 +73,9 @@ class Probe(BaseModel):
     elevation_width_mm: float = Field(2.0, gt=0, le=20)
     bandwidth_percent: float = Field(75.0, ge=20, le=150)
     noise_db: float = Field(-105.0, ge=-200, le=0)
-    gain_percent: Percent = 56.0
+    gain_percent: Percent = 50.0
     dyn_range_db: float = Field(60.0, ge=20, le=120)
+    grey_map: GreyMap = "dark"
     time_gain_compensation: tuple[Percent, ...] = Field(
         (50.0,) * TGC_SLIDERS, min_length=TGC_SLIDERS, max_length=TGC_SLIDERS
     )

@@ -33,7 +33,9 @@ FWHM = np.sqrt(8 * np.log(2))
 # The least that lines hold is 20 log10(1e-9).
 SILENT_DB, BOUNDLESS = -179.9, 1e4
 # No gain: 0 dB is all of the sound; 0.125 mm a sample, and 0.5 mm from look to look.
-SCANNER = dict(gain_percent=50.0, dyn_range_db=60.0, depth_compensation_db_cm_mhz=0.0, depth_mm=80.0)
+SCANNER = dict(
+    grey_map="linear", gain_percent=50.0, dyn_range_db=60.0, depth_compensation_db_cm_mhz=0.0, depth_mm=80.0
+)
 ARRAY = dict(number_of_scanlines=LINES, number_of_samples_per_scanline=SAMPLES, housing_mm=(50.0, 10.0, 20.0))
 BEAM = dict(frequency_mhz=7.5, focus_depth_percent=40.0, f_number=3.0, noise_db=-200.0)
 MIRROR = Surface(roughness_mm=0.0, scattered=0.0)

@@ -304,6 +304,14 @@ def test_gain_and_its_course_over_depth_are_added(tank):
     )
 
 
+def test_the_grey_map_bends_the_greys_between_black_and_white(tank):
+    tank.fill(attenuation=0.5, backscatter=0.3)
+    tank.look(probe_of())
+    linear = tank.picture / 255.0
+    tank.look(probe_of(grey_map="dark"))
+    assert np.ptp(linear) > 0.5 and np.abs(tank.picture / 255.0 - linear**1.5).max() < 1.3 / 255
+
+
 def test_a_probe_of_other_lines_or_samples_is_refused(tank):
     for other in (probe_of(number_of_scanlines=128), probe_of(number_of_samples_per_scanline=320)):
         with pytest.raises(ValueError, match="for a field of shape"):
