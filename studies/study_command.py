@@ -39,7 +39,7 @@ STUDIES = {
     "replay": ("studies.robustness.replay_study:replay", "Record a session in SCENE and compute it again."),
     "echo": (
         "studies.echo.echo_command:echo",
-        "Compare B-mode images of test objects with a wave simulator.",
+        "Compare the B-mode image with an independent wave simulator.",
     ),
     "plan": (
         "studies.planning.plan_comparison:plan_study",

@@ -8,6 +8,8 @@ import taichi.math as tm
 
 # A smaller relative change of impedance between two samples is no interface.
 MIN_REFLECTION = 3e-4
+# An interface that reflects more of the amplitude than this is that of a stone, a bone or gas.
+HARD = 0.3
 # Edge waves of the aperture: amplitude of a smooth interface that reflects just past the aperture, and its fall [1 / half angle].
 # Fitted to SIMUS (``study echo``).
 EDGE, EDGE_FALL = 0.08, 2.75
@@ -16,7 +18,7 @@ EDGE, EDGE_FALL = 0.08, 2.75
 @dataclass(frozen=True)
 class Surface:
     """The surface of tissue interfaces: SD of its height, SD of its slope, and the amplitude, relative to a smooth surface, that
-    the fibres of capsules and fasciae scatter evenly in all directions (Lambert's law).
+    it scatters evenly in all directions (Lambert's law): by fibres of capsules and fasciae, and, of a stone, a bone or gas, all of it.
 
     The values are an estimate: no measurement of renal surfaces was found.
     """
@@ -24,6 +26,7 @@ class Surface:
     roughness_mm: float = 0.012
     slope: float = 0.14
     scattered: float = 0.25
+    scattered_hard: float = 0.7
 
     def mirror_and_diffuse(self, wavelength_mm: float) -> tuple[float, float]:
         """Return the amplitudes, of 1, that it reflects as a mirror and diffusely (Beckmann & Spizzichino 1963)."""

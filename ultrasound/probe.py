@@ -28,6 +28,8 @@ DETAIL_LEVELS: tuple[DetailLevel, ...] = get_args(DetailLevel)
 # Grey values: the exponent of the share of the dynamic range. On a scanner's screen most of the tissue is dark.
 GreyMap = Literal["linear", "dark"]
 GREY_EXPONENTS: dict[GreyMap, float] = {"linear": 1.0, "dark": 1.5}
+# Keys of earlier versions, and what now sets the same.
+FORMER_KEYS = {"PulseCycles": "BandwidthPercent", "FocalZoneMm": "FNumber"}
 
 Percent = Annotated[float, Field(ge=0, le=100)]
 Length = Annotated[float, Field(gt=0)]
@@ -240,6 +242,8 @@ def load_probe(name: str) -> Probe:
 
 def probe_of_values(values: Mapping[str, Any]) -> Probe:
     """Return the probe of a file's values. Raises ProbeError, which names the key."""
+    for key in FORMER_KEYS.keys() & values.keys():
+        raise ProbeError(f"{key} no longer exists; delete it ({FORMER_KEYS[key]} sets the same)")
     try:
         return Probe.model_validate(values)
     except ValidationError as error:

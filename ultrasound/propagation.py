@@ -15,6 +15,7 @@ from sim.device import TASK
 from sim.fields import array_of, fill
 from ultrasound.beam import half_apertures_mm
 from ultrasound.interface import (
+    HARD,
     MIN_REFLECTION,
     Interface,
     Surface,
@@ -85,8 +86,9 @@ class Propagation:
         # Half angle of the aperture [rad] and SD of the beam across the image plane [mm], at each sample.
         self.aperture_angle, self.slice_sd = (ti.field(ti.f32, self.most) for _ in range(2))
         self.speckle_db, self.echo_db = (ti.field(ti.f32, PATH_ENTRIES) for _ in range(2))
-        # Half angle of the aperture across the plane [rad]; of interfaces: amplitudes reflected as a mirror, diffusely and evenly; slope.
-        self.reflection = ti.field(ti.f32, 5)
+        # Half angle of the aperture across the plane [rad]; of interfaces: amplitudes reflected as a mirror and diffusely, slope,
+        # amplitudes scattered evenly by soft and by hard ones.
+        self.reflection = ti.field(ti.f32, 6)
 
     def stride_of(self, probe: Probe) -> int:
         """Return the scanline samples between two tissue samples."""
@@ -104,7 +106,7 @@ class Propagation:
         ) / 2
         pulse = probe.pulse
         start, direction = probe.scanlines()
-        surface = self.surface.mirror_and_diffuse(probe.wavelength_mm)
+        own = self.surface.slope, self.surface.scattered, self.surface.scattered_hard
         elevation = np.arctan(probe.element_height_mm / 2 / probe.elevation_focus_mm)
         fill(
             (self.start, start),
@@ -115,7 +117,10 @@ class Propagation:
             (self.slice_sd, slice_sd_mm),
             (self.speckle_db, pulse.speckle_db),
             (self.echo_db, pulse.echo_db),
-            (self.reflection, np.array([elevation, *surface, self.surface.scattered, self.surface.slope])),
+            (
+                self.reflection,
+                np.array([elevation, *self.surface.mirror_and_diffuse(probe.wavelength_mm), *own]),
+            ),
         )
 
     def run(self, probe: Probe, thick: bool) -> None:
@@ -224,10 +229,11 @@ class Propagation:
         depth = interface.middle / interface.steps
         reflection = interface.reflection(after)
         tilts, half_angle = interface.tilts(direction), self.aperture_angle[ti.cast(depth / step_mm, ti.i32)]
-        across, slope = self.reflection[0], self.reflection[4]
+        across, slope = self.reflection[0], self.reflection[3]
+        scattered = ti.select(ti.abs(reflection) > HARD, self.reflection[5], self.reflection[4])
         mirror = self.reflection[1] * specular(tilts.x, half_angle) * specular(tilts.y, across)
         rough = diffuse(tilts.x, half_angle, slope) * diffuse(tilts.y, across, slope)
-        even = self.reflection[3] ** 2 * ti.cos(tilts.x) * ti.cos(tilts.y)
+        even = scattered**2 * ti.cos(tilts.x) * ti.cos(tilts.y)
         echo = reflection * tm.vec2(mirror, ti.sqrt(self.reflection[2] ** 2 * rough + even))
         self.echo[line, k] = tm.vec4(echo, depth, ti.cast(interface.begins, ti.f32))
         self.passed[line, k] = ti.sqrt(1.0 - reflection**2)

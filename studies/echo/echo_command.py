@@ -75,7 +75,8 @@ def figure_of(found: list[Row]) -> "Figure":
         reference = np.array([row.reference for row in chosen])
         for name in [*DEPTHS_MM]:
             own = [row for row in chosen if row.name.startswith(name)]
-            axes.plot([row.reference for row in own], [row.ours for row in own], "o", label=name)
+            if own:
+                axes.plot([row.reference for row in own], [row.ours for row in own], "o", label=name)
         ends = np.array([reference.min(), reference.max()])
         bar = LEVEL_BAR_DB if "dB" in title else WIDTH_BAR * ends
         axes.plot(ends, ends, color="grey", lw=0.8)

@@ -22,8 +22,8 @@ DEPTHS_MM = {
 }
 TILTS_DEG = (5, 10, 20, 40)
 CYST_RADIUS_MM = 2.0
-SMOOTH = Surface(roughness_mm=0.0, scattered=0.0)
-ROUGH = Surface(roughness_mm=0.03, slope=0.14, scattered=0.0)
+SMOOTH = Surface(roughness_mm=0.0, scattered=0.0, scattered_hard=0.0)
+ROUGH = Surface(roughness_mm=0.03, slope=0.14, scattered=0.0, scattered_hard=0.0)
 # Correlation length of a rough surface of that slope, and draws of it.
 ROUGH_LENGTH_MM, DRAWS = float(np.sqrt(2) * 0.03 / 0.14), 40
 SEED = 20181029

@@ -38,7 +38,7 @@ SCANNER = dict(
 )
 ARRAY = dict(number_of_scanlines=LINES, number_of_samples_per_scanline=SAMPLES, housing_mm=(50.0, 10.0, 20.0))
 BEAM = dict(frequency_mhz=7.5, focus_depth_percent=40.0, f_number=3.0, noise_db=-200.0)
-MIRROR = Surface(roughness_mm=0.0, scattered=0.0)
+MIRROR = Surface(roughness_mm=0.0, scattered=0.0, scattered_hard=0.0)
 GEOMETRIES = {
     "LINEAR": {"transducer_width_mm": 40.0},
     "CURVILINEAR": {"radius_start_mm": 60.0, "theta_start_deg": -25.0, "theta_stop_deg": 20.0},
@@ -231,7 +231,10 @@ def test_a_tilt_across_the_image_plane_counts_by_the_elements_height(fine, tilt)
 
 @pytest.mark.parametrize("tilt", [0, 10, 20, 30])
 def test_a_rough_interface_is_seen_aslant(fine, tilt):
-    probe, rough = probe_of(frequency_mhz=9.0), Surface(roughness_mm=0.03, slope=0.14, scattered=0.0)
+    probe, rough = (
+        probe_of(frequency_mhz=9.0),
+        Surface(roughness_mm=0.03, slope=0.14, scattered=0.0, scattered_hard=0.0),
+    )
     fine.bmode.sound.surface = rough
     fine.fill(interface(FAT, TISSUE, 0.4, tilt))
     _, amplitude, _ = peaks(fine.look(probe), probe)
@@ -540,7 +543,7 @@ def test_tracked_speckle_moves_as_the_tissue_does(moved, across, along, shear):
 
 
 def test_a_target_off_the_plane_is_dimmed_as_the_thick_plane_weighs_it():
-    # The element is so low that the beam is as thick at every depth as at its focus, nearly; the SD is checked in test_beam.
+    # The element is so low that the beam is as thick at every depth as at its focus, nearly; the SD is checked in test_beam_profiles.
     probe = probe_of(element_height_mm=1.5, elevation_focus_mm=40.0)
     tank = Tank((BOUNDLESS, BOUNDLESS, 0.05), (1, 1, 641), (0, 0, -16.0))
     tank.fill(backscatter=0.1)

@@ -62,6 +62,10 @@ WRONG = {
         GOOD + "FrequencyMHz = 7.5\n",
         "FrequencyMHz: unknown key; did you mean FrequencyMhz",
     ),
+    "a key of an earlier version": (
+        GOOD + "PulseCycles = 2.0\n",
+        r"PulseCycles no longer exists; delete it \(BandwidthPercent sets the same\)",
+    ),
     "a wrong type": (GOOD + 'DepthMm = "deep"\n', "DepthMm = 'deep': input should be a valid number"),
     "a missing name": ("DepthMm = 60.0\n", "TransducerName: missing"),
     "an array wider than its housing": (

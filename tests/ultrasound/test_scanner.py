@@ -126,7 +126,7 @@ def test_the_surroundings_reflect_as_gel_or_as_air(device):
     peak = {}
     for outside in ("gel", "air"):
         scanner = Scanner(anatomy(around_hu=KIDNEY_HU), Unmoved(), PROBE, PIXELS, outside)
-        scanner.bmode.sound.surface = Surface(roughness_mm=0.0, scattered=0.0)
+        scanner.bmode.sound.surface = Surface(roughness_mm=0.0, scattered=0.0, scattered_hard=0.0)
         # A millimetre in, so that facets leave no place of the face outside.
         peak[outside] = echo(scanner, plane_at(-1.0))[border].max()
     # Kidney has 1.62 MRayl: gel reflects (1.62 - 1.5) / (1.62 + 1.5) of the sound, air all; what scatters is added. Texture has 1 dB.
