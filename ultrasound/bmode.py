@@ -28,7 +28,7 @@ from ultrasound.lateral_kernel import (
 )
 from ultrasound.probe import GREY_EXPONENTS, DetailLevel, Probe
 from ultrasound.propagation import Propagation
-from ultrasound.pulse import PATH_ENTRIES
+from ultrasound.pulse import DB_OF_NEPER, PATH_ENTRIES
 from ultrasound.sampled_volume import SampledVolume
 from ultrasound.speckle import COMPONENTS, LEAST_WEIGHT, SIZE, UNIT, Speckle, elevation_levels
 
@@ -38,8 +38,6 @@ SILENCE = 1e-9
 # Kernels that lengthen the pulse: by so many SDs, in steps of samples, with so many taps to each side, up to so many SDs.
 LENGTHS, LENGTH_STEP, LENGTH_TAPS, HALF_WIDTH_SD = 33, 0.125, 10, 2.5
 GREY_STEPS = 64
-# Decibels per neper of amplitude.
-DB = 8.685889638065037
 
 
 @ti.data_oriented
@@ -194,8 +192,9 @@ class BMode:
                 self.scattered_imaginary[line, first + j] = 0.0
             axis = self.speckle.long_axis(self.sound.across[line, k])
             for each in range(COMPONENTS):
-                weight, key, matrix = self.speckle.component(each, axis, self.elevation[k], speckle_sd)
+                weight = self.speckle.weight(each, axis, self.elevation[k])
                 if weight > LEAST_WEIGHT:
+                    key, matrix = self.speckle.component(each, axis, self.elevation[k], speckle_sd)
                     near, far = matrix @ self.sound.rest[line, k], matrix @ self.sound.rest[line, k + 1]
                     for j in range(stride):
                         t = (j + 0.5) / stride
@@ -268,8 +267,9 @@ class BMode:
         rest = tm.mix(self.sound.rest[line, k], self.sound.rest[line, k + 1], at - k)
         axis, speckle = self.speckle.long_axis(self.sound.across[line, k]), tm.vec2(0.0)
         for each in range(COMPONENTS):
-            weight, key, matrix = self.speckle.component(each, axis, self.elevation[k], speckle_sd)
+            weight = self.speckle.weight(each, axis, self.elevation[k])
             if weight > LEAST_WEIGHT:
+                key, matrix = self.speckle.component(each, axis, self.elevation[k], speckle_sd)
                 speckle += weight * self.speckle.at(matrix @ rest, key)
         return speckle
 
@@ -277,7 +277,7 @@ class BMode:
     def _add(self):
         for line, sample in self.decibel:
             envelope = ti.abs(self.real[line, sample])
-            self.decibel[line, sample] = DB * ti.log(envelope + SILENCE) + self.gain[sample]
+            self.decibel[line, sample] = DB_OF_NEPER * ti.log(envelope + SILENCE) + self.gain[sample]
 
     @ti.kernel
     def spread(self, noise: float, key: int):
@@ -301,7 +301,7 @@ class BMode:
             real += noise * electronic[0, :]
             imaginary += noise * electronic[1, :]
             gain = Packet([self.gain[first + i] for i in ti.static(range(LANES))])
-            decibel = DB * ti.log(ti.sqrt(real * real + imaginary * imaginary) + SILENCE) + gain
+            decibel = DB_OF_NEPER * ti.log(ti.sqrt(real * real + imaginary * imaginary) + SILENCE) + gain
             for i in ti.static(range(LANES)):
                 self.decibel[line, first + i] = decibel[i]
 

@@ -75,13 +75,13 @@ class Probe(BaseModel):
     elevation_width_mm: float = Field(2.0, gt=0, le=20)
     bandwidth_percent: float = Field(75.0, ge=20, le=150)
     noise_db: float = Field(-105.0, ge=-200, le=0)
-    gain_percent: Percent = 50.0
+    gain_percent: Percent = 54.0
     dyn_range_db: float = Field(60.0, ge=20, le=120)
     grey_map: GreyMap = "dark"
     time_gain_compensation: tuple[Percent, ...] = Field(
         (50.0,) * TGC_SLIDERS, min_length=TGC_SLIDERS, max_length=TGC_SLIDERS
     )
-    depth_compensation_db_cm_mhz: float = Field(0.85, ge=0, le=5)
+    depth_compensation_db_cm_mhz: float = Field(0.95, ge=0, le=5)
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Probe":

@@ -269,9 +269,8 @@ class Propagation:
                 origin = line - self.ray_offset[ray, k]
                 if origin >= 0 and origin < self.lines:
                     along = self.ray_path[ray, line, k]
-                    one_way = self.ray_amplitude[ray, line, k] * 10.0 ** (
-                        self.at_path(self.speckle_db, 2.0 * along) / 40.0
-                    )
+                    decibel = self.at_path(self.speckle_db, 2.0 * along)
+                    one_way = self.ray_amplitude[ray, line, k] * ti.exp(decibel / (2.0 * DB_OF_NEPER))
                     total += one_way
                     path += one_way * along
                     found += 1.0
@@ -297,7 +296,7 @@ class Propagation:
         path = before + 2.0 * self.tissue[line, k].y * further_mm / (10.0 * DB_OF_NEPER)
         # ``amplitude`` is that of speckle.
         more_db = self.at_path(self.echo_db, path) - self.at_path(self.speckle_db, before)
-        return self.amplitude[line, k] * 10.0 ** (more_db / 20.0), path
+        return self.amplitude[line, k] * ti.exp(more_db / DB_OF_NEPER), path
 
 
 def ray_offsets(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:

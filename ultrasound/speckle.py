@@ -30,7 +30,7 @@ UNIT = 1 / 4096
 SHORTEST_SD_MM, LEVELS = 0.05, 8
 ELEVATION_SD_MM = SHORTEST_SD_MM * 2.0 ** np.arange(LEVELS)
 # Directions of the long axis: so many each way on a face of a cube; two of them are mixed in this part of the way between them.
-DIRECTIONS, MIXED = 23, 0.4
+DIRECTIONS, MIXED = 23, 0.2
 QUARTER = float(np.pi / 4)
 # Two directions each way on the cube's face, two lengths.
 COMPONENTS, LEAST_WEIGHT = 8, 1e-3
@@ -77,7 +77,7 @@ class LongAxis:
 class Speckle:
     """The noise block on the device. Each block of space holds it, shifted by a hash of the block, so that it does not repeat.
 
-    Speckle of unit mean square is the sum of COMPONENTS noises (``component``), most of which have weight 0.
+    Speckle of unit mean square is the sum of COMPONENTS noises, each with its ``weight``; most have none.
     """
 
     def __init__(self) -> None:
@@ -102,7 +102,9 @@ class Speckle:
         mixed = (mixed ^ ((mixed >> 15) & 0x1FFFF)) * 0x2C1B3C6D
         local = cell + ti.Vector([mixed >> 2, mixed >> 10, mixed >> 18])
         low, high = self.entry(local.x, local.y, local.z), self.entry(local.x, local.y, local.z + 1)
-        return tm.mix(low, high, t) / ti.sqrt(1.0 - 2.0 * (1.0 - NEXT) * t * (1.0 - t))
+        # Restores unit mean square: the first terms of 1 / sqrt(1 - lost), to 1e-4.
+        lost = 2.0 * (1.0 - NEXT) * t * (1.0 - t)
+        return (1.0 + 0.5 * lost + 0.375 * lost * lost) * tm.mix(low, high, t)
 
     @ti.func
     def long_axis(self, across):
@@ -121,14 +123,19 @@ class Speckle:
         return LongAxis(face, index, step, share)  # type: ignore[call-arg]
 
     @ti.func
-    def component(self, each, axis, lengths, sd_mm):
-        """Return weight, key and matrix (3, 3) from the rest position [mm] to entries of one of the COMPONENTS noises.
+    def weight(self, each, axis, lengths):
+        """Return the weight of one of the COMPONENTS noises; ``lengths`` is of ``elevation_levels``."""
+        other = ti.Vector([(each >> 2) & 1, (each >> 1) & 1])
+        share = ti.select(other == 1, axis.share, 1.0 - axis.share)
+        return ti.sqrt(share.x * share.y) * ti.select((each & 1) == 1, lengths.z, lengths.y)
 
-        ``lengths`` is of ``elevation_levels``, ``sd_mm`` the length along the image plane.
+    @ti.func
+    def component(self, each, axis, lengths, sd_mm):
+        """Return key and matrix (3, 3) from the rest position [mm] to entries of one of the COMPONENTS noises.
+
+        ``sd_mm`` is the length along the image plane.
         """
         other, longer = ti.Vector([(each >> 2) & 1, (each >> 1) & 1]), each & 1
-        share = ti.select(other == 1, axis.share, 1.0 - axis.share)
-        weight = ti.sqrt(share.x * share.y) * ti.select(longer == 1, lengths.z, lengths.y)
         index = axis.index + other * axis.step
         level = ti.cast(lengths.x, ti.i32) + longer
         matrix = self.axes(axis.face, index)
@@ -138,7 +145,7 @@ class Speckle:
             matrix[1, column] *= fine
             matrix[2, column] *= coarse
         key = ((index.x * 64 + index.y) * 4 + axis.face) * 8 + level
-        return weight, key * 40503, matrix
+        return key * 40503, matrix
 
     @ti.func
     def axes(self, face, index):
