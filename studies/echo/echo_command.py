@@ -72,6 +72,8 @@ def figure_of(found: list[Row]) -> "Figure":
     figure = Figure((11, 10), layout="constrained")
     for axes, (part, title) in zip(figure.subplots(2, 2).flat, QUANTITIES.items(), strict=True):
         chosen = [row for row in found if part in row.name]
+        if not chosen:
+            continue
         reference = np.array([row.reference for row in chosen])
         for name in [*DEPTHS_MM]:
             own = [row for row in chosen if row.name.startswith(name)]

@@ -180,7 +180,8 @@ def test_scan_leaves_a_picture_of_each_pose_and_mode(tmp_path, capsys):
     corners = image_to_probe @ np.array([[-0.5, -0.5, 0, 1], [columns - 0.5, rows - 0.5, 0, 1]]).T
     assert pytest.approx(np.array([[-8.0, 0.0], [8.0, 40.0]])) == corners[:2].T
     assert np.array(row["probe_to_patient"]) == pytest.approx(pose_on_tumour())
-    assert shown["on-b-mode"].mean() > 20 and shown["off-b-mode"].max() == 0 and shown["off-ct"].max() > 0
+    # Without contact there is electronic noise alone.
+    assert shown["on-b-mode"].mean() > 20 and shown["off-b-mode"].mean() < 3 and shown["off-ct"].max() > 0
     assert (out / "on-b-mode.dcm").is_file() and not (out / "on-ct.dcm").exists()
 
 
