@@ -25,7 +25,7 @@ CYST_RADIUS_MM = 2.0
 SMOOTH = Surface(roughness_mm=0.0, scattered=0.0, scattered_hard=0.0)
 ROUGH = Surface(roughness_mm=0.03, slope=0.14, scattered=0.0, scattered_hard=0.0)
 # Correlation length of a rough surface of that slope, and draws of it.
-ROUGH_LENGTH_MM, DRAWS = float(np.sqrt(2) * 0.03 / 0.14), 40
+ROUGH_LENGTH_MM, DRAWS = float(np.sqrt(2) * 0.03 / 0.14), 100
 SEED = 20181029
 NEAR_FIELD = "pymust counts the phase of the distance across the plane twice; this matters away from the elevation focus"
 INVISIBLE = "no scanner shows it: below the speckle behind it"
