@@ -8,8 +8,6 @@
 6. ``_scan_convert``: from scanlines and samples to the pixels of the image.
 """
 
-from typing import Any
-
 import numpy as np
 import taichi as ti
 import taichi.math as tm
@@ -29,7 +27,6 @@ from ultrasound.lateral_kernel import (
 from ultrasound.probe import GREY_EXPONENTS, DetailLevel, Probe
 from ultrasound.propagation import Propagation
 from ultrasound.pulse import DB_OF_NEPER, PATH_ENTRIES
-from ultrasound.sampled_volume import SampledVolume
 from ultrasound.speckle import COMPONENTS, LEAST_WEIGHT, SIZE, UNIT, Speckle, elevation_levels
 
 Packet = ti.types.vector(LANES, ti.f32)
@@ -42,28 +39,11 @@ GREY_STEPS = 64
 
 @ti.data_oriented
 class BMode:
-    """B-mode images of an image plane in tissue.
+    """B-mode images of the image plane that sound propagates through, for probes with the same numbers of scanlines and samples."""
 
-    ``tissue`` is a volume (.., 3) of impedance, attenuation and backscatter (``acoustics.properties``), ``organ`` the signed
-    distance from the organ's surface [mm], both at rest, ``plane`` a ``PlaneInTissue`` of the scanner. An element transmits only in contact: with the organ, nearer than
-    ``contact_gap_mm``, or, where ``contact`` is "tissue", with anything but gas. ``around`` is the impedance [MRayl] of all that is
-    outside the organ; None for what the CT shows there.
-    """
-
-    def __init__(
-        self,
-        tissue: SampledVolume,
-        organ: SampledVolume,
-        plane: Any,
-        probe: Probe,
-        voxel_mm: float,
-        contact: str = "organ",
-        contact_gap_mm: float = 1.5,
-        around: float | None = None,
-    ) -> None:
-        self.plane, self.speckle = plane, Speckle()
+    def __init__(self, sound: Propagation, probe: Probe) -> None:
+        self.sound, self.plane, self.speckle = sound, sound.plane, Speckle()
         shape = self.lines, self.samples = probe.number_of_scanlines, probe.number_of_samples_per_scanline
-        self.sound = Propagation(tissue, organ, plane, probe, voxel_mm, contact, contact_gap_mm, around)
         most, packets, self.groups = self.sound.most, self.samples // LANES, -(-self.lines // GROUP)
         # Scattered signal, with room for the taps that lengthen it; and the signal of the scanlines.
         padded = self.lines, self.samples + 2 * LENGTH_TAPS
@@ -86,7 +66,7 @@ class BMode:
         self.gain = ti.field(ti.f32, self.samples)
         # Grey value at even steps of the dynamic range.
         self.grey = ti.field(ti.f32, GREY_STEPS + 1)
-        self.source = ti.Vector.field(2, ti.f32, (plane.pixels, plane.pixels))
+        self.source = ti.Vector.field(2, ti.f32, (self.plane.pixels, self.plane.pixels))
         self._table_settings: tuple | None = None
 
     def render(self, probe: Probe, detail_level: DetailLevel = "speckle") -> np.ndarray:
@@ -118,9 +98,8 @@ class BMode:
         """Update the tables of the probe's settings, if these changed."""
         grey = 255 * np.linspace(0, 1, GREY_STEPS + 1) ** GREY_EXPONENTS[probe.grey_map]
         fill((self.gain, probe.gain_db()), (self.grey, grey))
-        fixed = probe.model_dump(
-            exclude={"gain_percent", "dyn_range_db", "time_gain_compensation", "noise_db"}
-        )
+        free = {"gain_percent", "dyn_range_db", "grey_map", "time_gain_compensation", "noise_db"}
+        fixed = probe.model_dump(exclude=free)
         settings = *fixed.items(), self.plane.shape, self.sound.surface
         if self._table_settings == settings:
             return

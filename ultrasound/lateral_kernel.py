@@ -76,13 +76,14 @@ def clutter_weights(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
     Relative to the energy within the kernel, of a scanline in the middle; nothing within the kernel.
     """
     groups = -(-probe.number_of_scanlines // GROUP)
-    apart = np.arange(-(groups - 1), groups)
-    # Side lobes of a pulse are smooth: one scanline of three stands for its neighbours.
-    lag = (GROUP * apart[:, None] + np.arange(1, GROUP, 3) - GROUP // 2).ravel()
-    nodes = profile_depths(probe)
-    middle = (probe.number_of_scanlines - 1) / 2
+    nodes, middle = profile_depths(probe), (probe.number_of_scanlines - 1) / 2
     near = np.arange(-MAX_HALF_WIDTH, MAX_HALF_WIDTH + 1)
     main = (lateral_profiles(probe, middle, nodes, near) ** 2).sum(axis=1)
-    beside = lateral_profiles(probe, middle, nodes, lag) ** 2 * (np.abs(lag) > MAX_HALF_WIDTH)
-    share = beside.reshape(len(nodes), len(apart), -1).mean(axis=2) * GROUP / main[:, None]
-    return np.stack([np.interp(depth_mm, nodes, each) for each in share.T], axis=-1)
+    # Side lobes of a pulse are smooth and, in the middle, the same on both sides: every second scanline stands for both.
+    beyond = np.arange(MAX_HALF_WIDTH // GROUP, groups)
+    lag = (GROUP * beyond[:, None] + np.arange(1, GROUP, 2) - GROUP // 2).ravel()
+    energy = lateral_profiles(probe, middle, nodes, lag) ** 2 * (lag > MAX_HALF_WIDTH)
+    share = np.zeros((len(nodes), groups))
+    share[:, beyond] = energy.reshape(len(nodes), len(beyond), -1).mean(axis=2) * GROUP / main[:, None]
+    both = np.concatenate([share[:, :0:-1], share], axis=1)
+    return np.stack([np.interp(depth_mm, nodes, each) for each in both.T], axis=-1)

@@ -47,7 +47,12 @@ class TissueSample:
 
 @ti.data_oriented
 class Propagation:
-    """Sound along the scanlines of a probe (arguments: see ``BMode``), at tissue samples ``stride`` scanline samples apart.
+    """Sound along the scanlines of a probe, at tissue samples ``stride_of`` scanline samples apart.
+
+    ``tissue_volume`` (.., 3) has impedance, attenuation and backscatter (``acoustics.properties``), ``organ`` the signed distance
+    from the organ's surface [mm], both at rest; ``plane`` is a ``PlaneInTissue`` of the scanner. An element transmits and receives
+    only in contact: with the organ, nearer than ``contact_gap_mm``, or, where ``contact`` is "tissue", with anything but gas.
+    ``around`` is the impedance [MRayl] of all that is outside the organ; None for what the CT shows there.
 
     ``tissue`` and ``rest`` (scanlines, samples) are what is there; ``across`` is the rest direction across the image plane.
     ``amplitude`` of the round trip, and ``path`` [Np/MHz], its attenuation. ``echo`` holds for the sample behind an interface:
@@ -56,16 +61,16 @@ class Propagation:
 
     def __init__(
         self,
-        tissue: SampledVolume,
+        tissue_volume: SampledVolume,
         organ: SampledVolume,
         plane: Any,
         probe: Probe,
         voxel_mm: float,
-        contact: str,
-        contact_gap_mm: float,
-        around: float | None,
+        contact: str = "organ",
+        contact_gap_mm: float = 1.5,
+        around: float | None = None,
     ) -> None:
-        self.tissue_volume, self.organ, self.plane, self.voxel_mm = tissue, organ, plane, voxel_mm
+        self.tissue_volume, self.organ, self.plane, self.voxel_mm = tissue_volume, organ, plane, voxel_mm
         # A CT blurs an interface by about a voxel to each side.
         self.interface_mm = 5.0 * voxel_mm
         self.by_organ, self.gap_mm = contact == "organ", contact_gap_mm

@@ -14,6 +14,8 @@ FWHM_OF_SD = float(np.sqrt(8 * np.log(2)))
 DB_OF_NEPER = float(20 / np.log(10))
 # Attenuation of the round trip [Np/MHz] at the entries of the tables.
 PATH_STEP, PATH_ENTRIES = 0.05, 256
+# Lengths, which change little, are computed at one entry of so many.
+LENGTHS_EVERY = 3
 
 
 @dataclass(frozen=True)
@@ -54,20 +56,24 @@ def attenuated_pulse(frequency_mhz: float, bandwidth_percent: float) -> Attenuat
     spectrum = amplitude * np.exp(-path * (frequency - frequency[0]))
     square, peak = (spectrum**2).sum(axis=1), spectrum.sum(axis=1)
     lowest_db = -DB_OF_NEPER * path[:, 0] * frequency[0]
-    # Half of the round trip is the distance.
-    half_mm = np.array([_time_to(0.5, each, frequency) for each in spectrum]) * SOUND_MM_US / 2
-    together_mm = np.array([_time_to(0.5**0.5, each**2, frequency) for each in spectrum]) * SOUND_MM_US / 2
     return AttenuatedPulse(
         10 * np.log10(square / square[0]) + lowest_db,
         20 * np.log10(peak / peak[0]) + lowest_db,
-        2 * half_mm / FWHM_OF_SD,
-        together_mm / np.sqrt(2 * np.log(2)),
+        2 * _lengths_mm(0.5, spectrum, frequency) / FWHM_OF_SD,
+        _lengths_mm(0.5**0.5, spectrum**2, frequency) / np.sqrt(2 * np.log(2)),
     )
+
+
+def _lengths_mm(level: float, spectrum: np.ndarray, frequency: np.ndarray) -> np.ndarray:
+    """Return the distance (PATH_ENTRIES,) at which the envelope falls to a level; half of the round trip is the distance."""
+    entries = np.arange(0, PATH_ENTRIES, LENGTHS_EVERY)
+    at_entries = [_time_to(level, spectrum[each], frequency) * SOUND_MM_US / 2 for each in entries]
+    return np.interp(np.arange(PATH_ENTRIES), entries, at_entries)
 
 
 def _time_to(level: float, spectrum: np.ndarray, frequency: np.ndarray) -> float:
     """Return the time [us] at which the envelope of a spectrum's signal falls to a level of its peak."""
-    count = 1 << 14
+    count = 1 << 13
     envelope = np.abs(np.fft.fft(spectrum, count))
     limit = level * envelope[0]
     below = int(np.argmax(envelope < limit))

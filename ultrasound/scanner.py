@@ -22,6 +22,7 @@ from ultrasound.acoustics import check_tissues, stored_properties
 from ultrasound.bmode import BMode
 from ultrasound.probe import DetailLevel, Mode, Probe
 from ultrasound.probe_manipulator import ImagePlane
+from ultrasound.propagation import Propagation
 from ultrasound.sampled_volume import AIR_HU, LANES, Lanes, SampledVolume, distance_volume
 from ultrasound.sweep import PixelLabel
 
@@ -230,7 +231,7 @@ class Scanner:
     """Images of at most ``pixels`` x ``pixels`` of an anatomy that an embedding deforms.
 
     ``outside`` is what is shown outside the organ: ``background``, the CT around it, which deforms with the organ as far as the
-    embedding reaches; ``gel`` (0 HU); ``air`` (-1000 HU). ``contact`` and ``contact_gap_mm`` see ``BMode``. A mode is set up at its
+    embedding reaches; ``gel`` (0 HU); ``air`` (-1000 HU). ``contact`` and ``contact_gap_mm`` see ``Propagation``. A mode is set up at its
     first image; ``acoustics`` are properties whose computation has already been started. Raises TissueError.
     """
 
@@ -272,7 +273,8 @@ class Scanner:
         tissue = SampledVolume(values, self.anatomy.index_from_mm, outside=0.0)
         voxel_mm = float(self.anatomy.voxel_mm.mean())
         around = self.contact, self.contact_gap_mm, self.around
-        return BMode(tissue, self.organ, self.plane, self.probe, voxel_mm, *around)
+        sound = Propagation(tissue, self.organ, self.plane, self.probe, voxel_mm, *around)
+        return BMode(sound, self.probe)
 
     @cached_property
     def ground_truth(self) -> GroundTruthLabels:

@@ -10,6 +10,7 @@ from ultrasound.bmode import BMode
 from ultrasound.interface import Surface
 from ultrasound.probe import DetailLevel, Probe
 from ultrasound.probe_manipulator import image_plane, pose_at
+from ultrasound.propagation import Propagation
 from ultrasound.sampled_volume import SampledVolume
 from ultrasound.scanner import PlaneInTissue
 
@@ -33,7 +34,7 @@ class EchoPhantom:
         self.tissue = SampledVolume(np.zeros((*count, 1, 3)), index_from_mm, outside=0.0)
         organ = SampledVolume(np.full((1, 1, 1), -1.0), np.diag([1 / FAR_MM] * 3 + [1.0]))
         self.plane = PlaneInTissue(Unmoved(), PIXELS)
-        self.bmode = BMode(self.tissue, organ, self.plane, probe, VOXEL_MM)
+        self.bmode = BMode(Propagation(self.tissue, organ, self.plane, probe, VOXEL_MM), probe)
 
     @property
     def depth_mm(self) -> np.ndarray:

@@ -22,6 +22,7 @@ from ultrasound.bmode import MAX_HALF_WIDTH, BMode
 from ultrasound.interface import Surface
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import image_plane, pose_at
+from ultrasound.propagation import Propagation
 from ultrasound.sampled_volume import SampledVolume
 from ultrasound.scanner import PlaneInTissue
 
@@ -71,8 +72,9 @@ class Tank:
         self.tissue = SampledVolume(np.zeros((*count, 3)), index_from_mm, outside=0.0)
         organ = organ or SampledVolume(np.full((1, 1, 1), -1.0), np.diag([1e-6, 1e-6, 1e-6, 1.0]))
         self.plane = PlaneInTissue(embedding or Unmoved(), PIXELS)
-        self.bmode = BMode(self.tissue, organ, self.plane, probe_of(), voxel_mm.min(), contact, 1.0)
-        self.bmode.sound.surface = MIRROR
+        sound = Propagation(self.tissue, organ, self.plane, probe_of(), voxel_mm.min(), contact, 1.0)
+        sound.surface = MIRROR
+        self.bmode = BMode(sound, probe_of())
 
     def fill(self, impedance=TISSUE, attenuation=0.0, backscatter=0.0) -> None:
         """Each a number or a function of x, y, z [mm]."""

@@ -82,7 +82,7 @@ def test_clutter_is_the_energy_of_the_profile_beyond_the_kernel():
     for row, at in zip(weights, depth, strict=True):
         energy = lateral_profiles(probe, (LINES - 1) / 2, np.array([at]), lag)[0] ** 2
         beyond = np.abs(lag) > MAX_HALF_WIDTH
-        # One scanline of three is summed, at depths between which it is interpolated.
+        # One scanline of two is summed, at depths between which it is interpolated.
         assert row.sum() == pytest.approx(energy[beyond].sum() / energy[~beyond].sum(), rel=0.35)
 
 
