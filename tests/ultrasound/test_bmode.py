@@ -20,6 +20,7 @@ from sim.fields import array_of, fill
 from ultrasound.beam import elevation_profiles, lateral_profiles
 from ultrasound.bmode import MAX_HALF_WIDTH, BMode
 from ultrasound.interface import Surface
+from ultrasound.lateral_kernel import GROUP, clutter_weights
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import image_plane, pose_at
 from ultrasound.propagation import Propagation
@@ -255,6 +256,37 @@ def test_a_rough_interface_is_seen_aslant(fine, tilt):
     assert 20 * np.log10(amplitude / REFLECTION).mean() == pytest.approx(wanted, abs=1.0)
 
 
+def test_the_echo_of_a_rough_interface_is_attenuated_too(fine):
+    probe = probe_of(frequency_mhz=5.0)
+    fine.bmode.sound.surface = Surface(roughness_mm=0.3, scattered=0.5)
+    echoes = []
+    for attenuation in (0.0, 0.5):
+        fine.fill(interface(FAT, TISSUE, 0.4), attenuation)
+        echoes.append(fine.look(probe, "speckle")[:, 280:360].max(axis=1))
+    fine.bmode.sound.surface = MIRROR
+    # So rough that none of it is a mirror's: the echo is speckle, which attenuation leaves as it is, but for a longer pulse.
+    assert echoes[0].std() > 3.0
+    lost = loss_db(0.2 * 0.5 * 40.0, 5.0, "echo")[0]
+    assert (echoes[0] - echoes[1]).mean() == pytest.approx(lost, abs=0.7)
+
+
+def test_side_lobes_receive_the_energy_beside_the_kernel(fine):
+    probe = probe_of()
+    fine.fill(backscatter=lambda x, y, z: 0.1 * (x < -6.0))
+    fine.look(probe, "speckle")
+    sample, groups = 40, LINES // GROUP
+    depth = fine.bmode.sound.stride_of(probe) * probe.sample_mm * sample
+    weights = clutter_weights(probe, np.array([depth]))[0]
+    found = array_of(fine.bmode.level)[:, sample]
+    energy = 0.01 * (probe.scanlines()[0][:, 0] < -6.0).reshape(groups, GROUP).mean(axis=1)
+    for group in (18, 20, 22):
+        received = [weights[other - group + groups - 1] for other in range(groups)]
+        wanted = np.dot(received, energy) / (1 + np.sum(received))
+        # Between the middles of two groups it is interpolated.
+        middle = found[group * GROUP + GROUP // 2 - 1 : group * GROUP + GROUP // 2 + 1]
+        assert np.mean(middle**2) == pytest.approx(wanted, rel=0.1) and wanted > 0
+
+
 def test_an_interfaces_echo_counts_the_elements_in_contact_of_its_aperture(fine):
     """The organ, and so contact, is where x > 0."""
     x = np.arange(-100, 100) * 0.5 + 0.25
@@ -432,12 +464,14 @@ def test_speckle_correlates_as_the_point_spread_function_does(endless):
             assert correlation == pytest.approx(lateral[lag] if axis == 1 else axial, abs=0.07)
 
 
-@pytest.mark.parametrize("tilt", [0.0, 25.0, 62.0])
-def test_speckle_decorrelates_across_the_plane_as_the_beam_does(endless, tilt):
+@pytest.mark.parametrize(
+    "axis, tilt", [((1, 0.4, 0.2), 0), ((1, 0.4, 0.2), 25), ((1, 0.4, 0.2), 62), ((0.1, 1, 0), 75)]
+)
+def test_speckle_decorrelates_across_the_plane_as_the_beam_does(endless, axis, tilt):
     """Elevational steps of a sweep, also where the plane is aslant to all axes of the tissue."""
     probe = probe_of(depth_mm=40.0)
     endless.fill(backscatter=0.1)
-    turn = rotation_about([1.0, 0.4, 0.2], tilt)
+    turn = rotation_about(axis, tilt)
     across = turn @ [0, 0, 1]
     steps = np.array([0.0, 0.1, 0.2, 0.3, 0.5, 0.8, 1.2])
     draw, curves = np.random.default_rng(8), []
