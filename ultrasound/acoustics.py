@@ -26,6 +26,8 @@ SMOOTHING_VOXELS, LEVEL_SMOOTHING_VOXELS = 0.8, 0.5
 # From the first to the second HU unlabelled tissue has the impedance of the first: contrast agent raises HU, not density. From the
 # third on it is calcified.
 AGENT_FROM_HU, AGENT_TO_HU, CALCIFIED_HU = 55.0, 200.0, 300.0
+# Mast 2000: density [kg/m3] = slope * speed of sound [m/s] - offset.
+MAST_SLOPE, MAST_OFFSET = 0.893, 349.0
 SEED = 20160101
 MIN_HU, MAX_HU = -1024, 3071
 
@@ -74,7 +76,7 @@ def impedance_of_hu(hu: np.ndarray) -> np.ndarray:
     slope = np.select(pieces, [1.025793065, 0.9082709691, 0.5108369316], 0.6625370912).astype(np.float32)
     offset = np.select(pieces, [-5.680404011, 103.6151457, 539.9977189], 348.8555178).astype(np.float32)
     density = np.maximum(slope * h + offset, np.float32(1.2))
-    return density * (density + np.float32(349)) / np.float32(0.893e6)
+    return density * (density + np.float32(MAST_OFFSET)) / np.float32(1e6 * MAST_SLOPE)
 
 
 def impedance_of_tissue(hu: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ import taichi.math as tm
 
 from sim.device import TASK
 from sim.fields import array_of, fill
+from ultrasound.acoustics import MAST_OFFSET, MAST_SLOPE
 from ultrasound.beam import half_apertures_mm
 from ultrasound.interface import (
     HARD,
@@ -23,7 +24,7 @@ from ultrasound.interface import (
     specular,
 )
 from ultrasound.probe import Probe
-from ultrasound.pulse import DB_OF_NEPER, PATH_ENTRIES, PATH_STEP
+from ultrasound.pulse import DB_OF_NEPER, PATH_ENTRIES, PATH_STEP, SOUND_MM_US
 from ultrasound.sampled_volume import SampledVolume
 
 # Scanline samples between two tissue samples: the larger stride where it is no longer than a voxel.
@@ -54,7 +55,8 @@ class Propagation:
     only in contact: with the organ, nearer than ``contact_gap_mm``, or, where ``contact`` is "tissue", with anything but gas.
     ``around`` is the impedance [MRayl] of all that is outside the organ; None for what the CT shows there.
 
-    ``tissue`` and ``rest`` (scanlines, samples) are what is there; ``across`` is the rest direction across the image plane.
+    ``tissue`` and ``rest`` (scanlines, samples) are what is there; ``across`` is the rest direction across the image plane. ``depth`` is
+    where a sample is [mm]; the scanner shows it where it would be if sound were as fast everywhere (SOUND_MM_US).
     ``amplitude`` of the round trip, and ``path`` [Np/MHz], its attenuation. ``echo`` holds for the sample behind an interface:
     amplitude reflected as a mirror (with its sign) and diffusely, depth [mm], and the sample where the tissue before it begins.
     """
@@ -83,7 +85,7 @@ class Propagation:
         self.contact = ti.field(ti.f32, self.lines)
         self.tissue, self.rest, self.across = (ti.Vector.field(3, ti.f32, shape) for _ in range(3))
         self.echo = ti.Vector.field(4, ti.f32, shape)
-        self.passed, self.amplitude, self.path = (ti.field(ti.f32, shape) for _ in range(3))
+        self.depth, self.passed, self.amplitude, self.path = (ti.field(ti.f32, shape) for _ in range(4))
         self.ray_amplitude, self.ray_path = (ti.field(ti.f32, (RAYS, *shape)) for _ in range(2))
         # How many scanlines a ray is from its end at a sample, where it leaves the face. It goes from scanline to scanline: mixing
         # two would spread shadows.
@@ -138,7 +140,7 @@ class Propagation:
             fill((self.contact, np.full(self.lines, array_of(self.contact).mean())))
         self._sample(thick, count, stride * probe.sample_mm)
         self._find_interfaces(count, stride * probe.sample_mm)
-        self._transmit(count, stride * probe.sample_mm)
+        self._transmit(count)
         self._combine(count)
 
     @ti.kernel
@@ -159,14 +161,29 @@ class Propagation:
 
     @ti.kernel
     def _sample(self, thick: ti.template(), count: int, step_mm: float):
-        for line, k in ti.ndrange(self.lines, count):
-            place = self.start[line] + k * step_mm * self.direction[line]
-            found = self.tissue_at(
-                ti.static(THICK_PLANE if thick else CENTRAL_PLANE), place, self.slice_sd[k]
-            )
+        for n in range(self.lines * TASK):
+            if n % TASK == 0:
+                self.sample_scanline(thick, n // TASK, count, step_mm)
+
+    @ti.func
+    def sample_scanline(self, thick: ti.template(), line, count, step_mm):
+        """Sample a scanline at even steps of time, which are as long as sound is fast in the tissue."""
+        depth = 0.0
+        for k in range(count):
+            planes = ti.static(THICK_PLANE if thick else CENTRAL_PLANE)
+            found = self.tissue_at(planes, self.start[line] + depth * self.direction[line], self.slice_sd[k])
             self.tissue[line, k] = found.tissue
             self.rest[line, k] = found.rest
             self.across[line, k] = found.linear[:, 2]
+            self.depth[line, k] = depth
+            depth += step_mm * speed_ratio(found.tissue.x)
+
+    @ti.func
+    def place(self, line, k):
+        """Return where on the image plane (u, v) [mm] a tissue sample is, fractional."""
+        first = ti.min(ti.cast(k, ti.i32), self.most - 2)
+        depth = tm.mix(self.depth[line, first], self.depth[line, first + 1], k - first)
+        return self.start[line] + depth * self.direction[line]
 
     @ti.func
     def tissue_at(self, planes: ti.template(), place, slice_sd):
@@ -214,15 +231,14 @@ class Propagation:
             if interface.steps == 0.0:
                 interface.begin(before, k - 1)
             if ti.abs(step) >= MIN_REFLECTION:
-                gradient = self.gradient_at(line, k, step_mm)
+                gradient = self.gradient_at(line, k)
                 interface.add(step, (k - 0.5) * step_mm, gradient, direction, step_mm)
             before = after
 
     @ti.func
-    def gradient_at(self, line, k, step_mm):
+    def gradient_at(self, line, k):
         """Return the gradient (u, v, w) of impedance halfway before a sample, in the deformed tissue."""
-        place = self.start[line] + (k - 0.5) * step_mm * self.direction[line]
-        row, column = self.plane.pixel_near(place)
+        row, column = self.plane.pixel_near(self.place(line, k - 0.5))
         linear = self.plane.rest_from_plane(row, column)
         # Carried into the deformed tissue by the inverse transpose of the deformation gradient.
         rest = 0.5 * (self.rest[line, k - 1] + self.rest[line, k])
@@ -244,7 +260,7 @@ class Propagation:
         self.passed[line, k] = ti.sqrt(1.0 - reflection**2)
 
     @ti.kernel
-    def _transmit(self, count: int, step_mm: float):
+    def _transmit(self, count: int):
         """Follow each ray to the samples of all scanlines: amplitude, one way, and attenuation of its path [Np/MHz]."""
         for n in range(RAYS * TASK):
             if n % TASK == 0:
@@ -255,12 +271,13 @@ class Propagation:
                 for k in range(1, count):
                     aside = self.ray_offset[ray, k] - self.ray_offset[ray, k - 1]
                     for line in range(self.lines):
-                        self.follow_ray(ray, line, k, tm.clamp(line - aside, 0, self.lines - 1), step_mm)
+                        self.follow_ray(ray, line, k, tm.clamp(line - aside, 0, self.lines - 1))
 
     @ti.func
-    def follow_ray(self, ray, line, k, from_line, step_mm):
+    def follow_ray(self, ray, line, k, from_line):
         """Continue a ray from the sample before, on a scanline."""
         attenuation = 0.5 * (self.tissue[line, k - 1].y + self.tissue[line, k].y)
+        step_mm = self.depth[line, k] - self.depth[line, k - 1]
         path = self.ray_path[ray, from_line, k - 1]
         self.ray_path[ray, line, k] = path + attenuation * step_mm / (10.0 * DB_OF_NEPER)
         self.ray_amplitude[ray, line, k] = self.ray_amplitude[ray, from_line, k - 1] * self.passed[line, k]
@@ -297,11 +314,21 @@ class Propagation:
         """
         k = ti.cast(echo.w, ti.i32)
         before = self.path[line, k]
-        further_mm = ti.max(echo.z - k * step_mm, 0.0)
+        further_mm = ti.max(echo.z - k * step_mm, 0.0) * speed_ratio(self.tissue[line, k].x)
         path = before + 2.0 * self.tissue[line, k].y * further_mm / (10.0 * DB_OF_NEPER)
         # ``amplitude`` is that of speckle.
         more_db = self.at_path(self.echo_db, path) - self.at_path(self.speckle_db, before)
         return self.amplitude[line, k] * ti.exp(more_db / DB_OF_NEPER), path
+
+
+@ti.func
+def speed_ratio(impedance):
+    """Speed of sound for an impedance [MRayl], relative to SOUND_MM_US; 1 where nothing is known.
+
+    Density by Mast's fit of speed to density in soft tissue (2000), as ``acoustics.impedance_of_hu``.
+    """
+    density = 0.5 * (ti.sqrt(MAST_OFFSET**2 + 4.0e6 * MAST_SLOPE * impedance) - MAST_OFFSET)
+    return ti.select(impedance < 1e-6, 1.0, (density + MAST_OFFSET) / (1000.0 * MAST_SLOPE * SOUND_MM_US))
 
 
 def ray_offsets(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
