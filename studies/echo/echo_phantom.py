@@ -15,7 +15,8 @@ from ultrasound.sampled_volume import SampledVolume
 from ultrasound.scanner import PlaneInTissue
 
 VOXEL_MM, MARGIN_MM = 0.25, 2.0
-IMPEDANCE, PIXELS = 1.62, 64
+# Of tissue in which sound is as fast as the scanner assumes.
+IMPEDANCE, PIXELS = 1.5804, 64
 FAR_MM = 1e4
 Values = float | np.ndarray | Callable[[np.ndarray, np.ndarray], np.ndarray]
 

@@ -15,6 +15,7 @@ from test_bmode import (
     PIXELS,
     SILENT_DB,
     TISSUE,
+    USUAL,
     Tank,
     depths,
     flat_tank,
@@ -287,7 +288,9 @@ def test_the_picture_is_the_lines_bilinearly_and_black_beyond_them(tank, geometr
 @pytest.mark.parametrize("geometry", list(GEOMETRIES))
 @pytest.mark.parametrize("target", [(-13.3, 22.1), (12.2, 55.7)])
 def test_a_target_is_drawn_where_it_is(tank, geometry, target):
-    tank.fill(backscatter=lambda x, y, z: 0.5 * np.exp(-((x - target[0]) ** 2 + (y - target[1]) ** 2) / 2))
+    tank.fill(
+        USUAL, backscatter=lambda x, y, z: 0.5 * np.exp(-((x - target[0]) ** 2 + (y - target[1]) ** 2) / 2)
+    )
     tank.look(probe_of(geometry))
     amplitude = 10 ** (tank.picture / 255.0 * 60 / 20) - 1
     u, v = pixel_places(geometry)
