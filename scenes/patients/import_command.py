@@ -13,7 +13,14 @@ from scenes.scene import scene_text
 from scenes.terminal import bar, shell_command
 
 # Options that assign labels to a tissue.
-TISSUE_OPTIONS = {"tumour": "tumour", "cyst": "cyst", "vessels": "vessel", "collecting": "urine"}
+TISSUE_OPTIONS = {
+    "tumour": "tumour",
+    "cyst": "cyst",
+    "vessels": "vessel",
+    "arteries": "artery",
+    "veins": "vein",
+    "collecting": "urine",
+}
 LABEL = "Names or values of the labels"
 
 
@@ -28,7 +35,9 @@ LABEL = "Names or values of the labels"
 )
 @click.option("--tumour", help=f"{LABEL} of the tumour [by name].")
 @click.option("--cyst", help=f"{LABEL} of cysts [by name].")
-@click.option("--vessels", help=f"{LABEL} of blood vessels [by name].")
+@click.option("--vessels", help=f"{LABEL} of blood vessels of either kind [by name].")
+@click.option("--arteries", help=f"{LABEL} of arteries [by name].")
+@click.option("--veins", help=f"{LABEL} of veins [by name].")
 @click.option("--collecting", help=f"{LABEL} of the collecting system [by name].")
 @click.option("--side", type=click.Choice(["left", "right"]), help="Which kidney, where there are both.")
 @click.option("--series", help="Number of the CT series, or the end of its uid [the best guess].")

@@ -22,7 +22,8 @@ COARSE_MM = 4.0
 CLOSING_MM = 10.0
 PARENCHYMA = ("kidney", "cortex", "medulla", "sinus", "stone")
 LESIONS = ("tumour", "cyst", "necrosis")  # part of the organ, also where they protrude
-HILAR = ("vessel", "urine", "fat")
+VESSELS = ("vessel", "vein", "artery")
+HILAR = (*VESSELS, "urine", "fat")
 
 
 @dataclass(frozen=True)

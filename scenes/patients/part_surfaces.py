@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from errors import PatientError
 from scenes.patients.label_surfaces import surface_from_mask
-from scenes.patients.organ_selection import HILAR, LESIONS, Organ
+from scenes.patients.organ_selection import HILAR, LESIONS, VESSELS, Organ
 from scenes.patients.readers.label_maps import Colour, LabelMap
 from scenes.terminal import Progress
 from scenes.volumes.voxel_grid import VoxelGrid
@@ -29,7 +29,7 @@ BRANCHING = 3.0
 SMOOTH_AREA = 2 / 3
 # Surfaces of less area than this are made sooner than a process starts.
 PROCESSES_FROM_MM2 = 5000.0
-# Parts with a surface: tissue -> file name.
+# Parts with a surface: tissue -> file name. Arteries and veins are in one surface.
 PARTS = {
     "tumour": "tumour",
     "cyst": "cyst",
@@ -52,7 +52,7 @@ def part_masks(labels: LabelMap, piece: Organ, needed: Collection[str]) -> PartM
     """
     found = {}
     for tissue in PARTS:
-        values = labels.of_tissues(tissue)
+        values = labels.of_tissues(*(VESSELS if tissue == "vessel" else (tissue,)))
         if not values:
             continue
         grid, inside = piece.grid, piece.mask & np.isin(piece.values, values)

@@ -34,15 +34,16 @@ NOISE_CORRELATION = 0.6
 
 
 class Label(IntEnum):
-    """Tissue of a voxel, by its name in ultrasound/acoustic_tissues.toml; the union of 1..6 is the organ, one solid without cavities."""
+    """Tissue of a voxel, by its name in ultrasound/acoustic_tissues.toml; the union of all but 0 is the organ, one solid without cavities."""
 
     OUTSIDE = 0
     CORTEX = 1
     MEDULLA = 2
     SINUS = 3
     URINE = 4
-    VESSEL = 5
+    ARTERY = 5
     TUMOUR = 6
+    VEIN = 7
 
 
 # Half-axes along (u, v, w): a kidney of 11 x 6 x 4.5 cm, blunter at the poles than an ellipsoid.
@@ -326,7 +327,8 @@ def _labels(near: tuple, points: np.ndarray, parts: dict[str, np.ndarray]) -> np
     tissue[inside & (parts["sinus"] < 0)] = Label.SINUS
     tissue[with_stubs & (parts["urine"][near] < 0)] = Label.URINE
     tissue[inside & (parts["medulla"] < 0)] = Label.MEDULLA
-    tissue[with_stubs & (np.minimum(parts["arteries"], parts["veins"])[near] < 0)] = Label.VESSEL
+    tissue[with_stubs & (parts["veins"][near] < 0)] = Label.VEIN
+    tissue[with_stubs & (parts["arteries"][near] < 0)] = Label.ARTERY
     tissue[parts["tumour"] < 0] = Label.TUMOUR
     labels = np.zeros(parts["urine"].shape, dtype=np.uint8)
     labels[near] = tissue

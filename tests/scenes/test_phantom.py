@@ -114,7 +114,8 @@ def test_organ_keeps_clear_of_the_border(labels):
         (Label.MEDULLA, 2, 100, 120),
         (Label.SINUS, 2, -115, -80),
         (Label.URINE, 2, 0, 20),
-        (Label.VESSEL, 2, 175, 215),
+        (Label.ARTERY, 2, 175, 215),
+        (Label.VEIN, 2, 175, 215),
         (Label.TUMOUR, 1, 70, 90),
     ],
 )
@@ -167,7 +168,7 @@ def test_upper_pole_leans_medially_and_backward(phantom, labels):
 def test_calyces_and_vessels_lie_within_the_kidney_or_a_few_mm_out_of_the_hilum(phantom, labels):
     """All that is labelled beyond cortex and tumour is central; only the medial side may show it."""
     surface = (labels > 0) & ~ndimage.binary_erosion(labels > 0)
-    shown = surface & np.isin(labels, (Label.SINUS, Label.URINE, Label.VESSEL))
+    shown = surface & np.isin(labels, (Label.SINUS, Label.URINE, Label.ARTERY, Label.VEIN))
     assert 20 < shown.sum() < 0.1 * surface.sum()
     assert _positions(shown, phantom[1])[:, 0].max() < _positions(labels > 0, phantom[1])[:, 0].mean()
 
@@ -175,7 +176,9 @@ def test_calyces_and_vessels_lie_within_the_kidney_or_a_few_mm_out_of_the_hilum(
 def test_renal_vessels_run_on_to_the_aorta_without_a_label(phantom, hu, labels):
     beyond = (ndimage.gaussian_filter(hu, 0.7) > 130) & (labels == Label.OUTSIDE)
     parts, _ = ndimage.label(beyond)
-    touching = np.unique(parts[ndimage.binary_dilation(labels == Label.VESSEL, iterations=2) & beyond])
+    touching = np.unique(
+        parts[ndimage.binary_dilation(np.isin(labels, (Label.ARTERY, Label.VEIN)), iterations=2) & beyond]
+    )
     runs = [_positions(parts == part, phantom[0]) for part in touching if part]
     assert any(np.ptp(run[:, 0]) > 40 for run in runs)
 

@@ -14,7 +14,7 @@ from scenes.patients.readers.segment_names import Side, side_of, tissue_of
 from scenes.volumes.voxel_grid import Box, VoxelGrid
 
 # Of overlapping segments, later tissues cover earlier ones: small structures cover their surroundings.
-MERGE_ORDER = (None, "fat", "muscle", "bone", "liver", "kidney", "cortex", "medulla", "sinus", "vessel", "urine", "cyst", "tumour", "necrosis", "stone")  # fmt: skip
+MERGE_ORDER = (None, "fat", "muscle", "bone", "liver", "kidney", "cortex", "medulla", "sinus", "vessel", "vein", "artery", "urine", "cyst", "tumour", "necrosis", "stone")  # fmt: skip
 
 
 Colour = tuple[float, float, float]  # red, green, blue, 0 to 1
