@@ -32,9 +32,10 @@ from rehearsal.tracking.sweep_recording import SweepRecorder
 from render.keys import Keys
 from render.viewer import Controls, ScannerSettings, Settings, View
 from render.window import Window
+from ultrasound.doppler import scale_colours
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import image_plane
-from ultrasound.scanner import IMAGES_OF_MODE
+from ultrasound.scanner import B_MODE, IMAGES_OF_MODE
 
 # How long a notice stays on the screen, and the one that the tissue's state was restored.
 NOTICE_S, RESTORED_S = 2.0, 4.0
@@ -367,12 +368,17 @@ def image_view(
     def images() -> dict[str, np.ndarray]:
         if scanner is None:
             return {"no CT": np.zeros((pixels, pixels), np.uint8)}
-        return scanner.images(plane, probe, *shown, shape and (min(shape[0], pixels), min(shape[1], pixels)))
+        shown_shape = shape and (min(shape[0], pixels), min(shape[1], pixels))
+        return scanner.images(plane, probe, *shown, shown_shape, settings.persistence_percent / 100)
 
+    made, doppler = timed(lambda: with_doppler(rehearsal, probe, settings, images()), tally.slice_ms)
     width, depth, above = probe.extent_mm
     return View(
         transducer_pose=rehearsal.pose,
-        images=timed(images, tally.slice_ms),
+        images=made,
+        doppler=doppler,
+        scale=scale_texts(probe, settings) if doppler is not None else ("", ""),
+        scale_colours=None if doppler is None else scale_colours(settings.doppler),
         width_mm=width,
         depth_mm=depth,
         above_mm=above,
@@ -386,11 +392,29 @@ def image_view(
     )
 
 
+def with_doppler(
+    rehearsal: Rehearsal, probe: Probe, settings: ScannerSettings, images: dict[str, np.ndarray]
+) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
+    """The images, and the B-mode image of them with Doppler over it; None where that is off."""
+    if rehearsal.scanner is None or settings.doppler == "off" or B_MODE not in images:
+        return images, None
+    # The pulse goes on with the steps.
+    time_s = rehearsal.steps * rehearsal.settings.time_step_s
+    given = images[B_MODE], settings.doppler, time_s, settings.clamped
+    return images, rehearsal.scanner.doppler(probe, *given)
+
+
+def scale_texts(probe: Probe, settings: ScannerSettings) -> tuple[str, str]:
+    """Both ends of the scale of Doppler, of velocity in cm/s."""
+    limit = f"{probe.velocity_limit_cm_s:.0f}"
+    return ("power", "") if settings.doppler == "power" else (f"+{limit}", f"-{limit}")
+
+
 def captions(probe: Probe, settings: ScannerSettings) -> tuple[str, str, str]:
     """The probe's name, and the settings of the B-mode image and of the CT."""
     b_mode = (
         f"{probe.frequency_mhz:.1f} MHz   G {probe.gain_percent:.0f} %   DR {probe.dyn_range_db:.0f} dB   "
-        f"{settings.detail_level}"
+        f"{settings.detail_level}{'   hilum clamped' * settings.clamped}"
     )
     ct = f"W {settings.window_hu}   L {settings.level_hu} HU"
     return (

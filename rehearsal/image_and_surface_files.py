@@ -17,7 +17,7 @@ from scenes.atomic_files import atomic_write
 from scenes.surfaces import save_surface
 from sim.fields import array_of
 from ultrasound.probe import Probe
-from ultrasound.scanner import B_MODE
+from ultrasound.scanner import B_MODE, CT, DOPPLER
 
 SCREENSHOT, IMAGE = r"screenshot-([0-9]{3,9})\.png", r"([0-9]{3,9})-.*\.png"
 
@@ -46,7 +46,7 @@ def save_images(
     prefix: Path,
     dicom: bool = True,
 ) -> list[SavedImage]:
-    """Write images (rows, columns) by kind, with square pixels, to files that share a prefix. Raises OSError."""
+    """Write images (rows, columns), or (rows, columns, 3) of Doppler, by kind, with square pixels, to files that share a prefix. Raises OSError."""
     # A quarter of a second, which the start of a rehearsal does not need.
     from ultrasound.dicom_image import save_dicom
 
@@ -56,7 +56,7 @@ def save_images(
         path = prefix.with_name(f"{prefix.name}-{kind.lower()}.png")
         save_image_file(image, path)
         spacing_mm = depth_mm / image.height, width_mm / image.width
-        if dicom and kind == B_MODE:
+        if dicom and kind in (B_MODE, DOPPLER):
             with atomic_write(path.with_suffix(".dcm")) as partial:
                 save_dicom(partial, np.asarray(image), spacing_mm, probe)
         saved.append(SavedImage(kind, path, (image.height, image.width), spacing_mm))
@@ -73,8 +73,9 @@ def save_screenshot(image: np.ndarray, out: Path) -> None:
 def save_view(view: View, probe: Probe, out: Path) -> str:
     """Write the images of a view under the next free number, and print their paths; return the prefix of their names."""
     prefix = out / f"{next_number(out, IMAGE):03d}"
-    for saved in save_images(view.images, view.width_mm, view.depth_mm, probe, prefix):
-        click.echo(f"Saved {saved.path}{' and .dcm' if saved.kind == B_MODE else ''}")
+    shown = view.images if view.doppler is None else view.images | {DOPPLER: view.doppler}
+    for saved in save_images(shown, view.width_mm, view.depth_mm, probe, prefix):
+        click.echo(f"Saved {saved.path}{' and .dcm' if saved.kind != CT else ''}")
     return f"{prefix.name}-"
 
 

@@ -29,6 +29,14 @@ def initial_settings(rehearsal: Rehearsal) -> Settings:
         dyn_range_db=round(probe.dyn_range_db),
         frequency_mhz=probe.frequency_mhz,
         focus_percent=round(probe.focus_depth_percent),
+        persistence_percent=0,
+        compounding=probe.compound_angles > 1,
+        harmonics=probe.harmonics,
+        dark_map=probe.grey_map == "dark",
+        velocity_scale_cm_s=round(probe.velocity_scale_cm_s),
+        wall_filter_cm_s=probe.wall_filter_cm_s,
+        colour_gain_percent=round(probe.colour_gain_percent),
+        colour_steering_deg=round(probe.colour_steering_deg),
         mode=scene.image.mode,
         detail_level=scene.image.detail_level,
     )
@@ -40,6 +48,8 @@ def initial_settings(rehearsal: Rehearsal) -> Settings:
 def probe_with_settings(probe: Probe, settings: ScannerSettings) -> Probe:
     """The probe with the scanner's settings."""
     low, high = probe.frequency_range_mhz
+    geometry = probe.transducer_geometry
+    compounded = probe.compound_angles if probe.compound_angles > 1 else 3
     return probe.model_copy(
         update=dict(
             depth_mm=float(settings.depth_mm),
@@ -47,6 +57,13 @@ def probe_with_settings(probe: Probe, settings: ScannerSettings) -> Probe:
             dyn_range_db=float(settings.dyn_range_db),
             frequency_mhz=min(max(settings.frequency_mhz, low), high),
             focus_depth_percent=float(settings.focus_percent),
+            compound_angles=compounded if settings.compounding and geometry != "PHASED" else 1,
+            harmonics=settings.harmonics,
+            grey_map="dark" if settings.dark_map else "linear",
+            velocity_scale_cm_s=float(settings.velocity_scale_cm_s),
+            wall_filter_cm_s=float(settings.wall_filter_cm_s),
+            colour_gain_percent=float(settings.colour_gain_percent),
+            colour_steering_deg=float(settings.colour_steering_deg) if geometry == "LINEAR" else 0.0,
             time_gain_compensation=tuple(float(getattr(settings, name)) for name in TGC),
         )
     )

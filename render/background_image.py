@@ -88,13 +88,13 @@ class BackgroundImage:
         findings = first_of(view.findings, self.layout.most_findings)
         # What the backdrop depends on.
         plane = view.width_mm, view.depth_mm, view.above_mm, view.focus_mm, view.outline_mm is not None
-        parts = *plane, tuple(view.images), view.captions, view.title, len(findings)
+        parts = *plane, tuple(view.images), view.captions, view.scale, view.title, len(findings)
         if self._shows_help or self._backdrop != parts:
             self._rows[:, :, :3] = backdrop(self.layout, view, self.keys.of["help"])
             self._figures, self._axes, self._status, self._shows_help = None, None, None, False
             self._empty_scene, self.has_scene = self._scene.copy(), False
         self._view, self._backdrop = view, parts
-        for (name, image), box in zip(view.images.items(), image_boxes(self.layout, view), strict=True):
+        for (name, image), box in zip(view.shown.items(), image_boxes(self.layout, view), strict=True):
             paste_image(self._rows, box, image)
             self._draw_over(view, name, box)
         if view.status != self._status:

@@ -11,13 +11,13 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from errors import UserError, explained, meant
 from render.viewer import Controls
-from ultrasound.probe import DETAIL_LEVELS, MODES
+from ultrasound.probe import DETAIL_LEVELS, DOPPLER_MODES, MODES
 from ultrasound.target import TARGETS
 
 # A key as printed -> as GGUI names it. GGUI reports no digits and no punctuation.
 KEYS = {each: each.lower() for each in string.ascii_uppercase}
 KEYS |= {each: each for each in ("Up", "Down", "Left", "Right", "Return")}
-KEYS |= {"Esc": "Escape", "Space": " ", "Backspace": "BackSpace"}
+KEYS |= {"Esc": "Escape", "Space": " ", "Backspace": "BackSpace", "Tab": "Tab"}
 # In the order of SDL's game controllers.
 BUTTONS = (
     *("A", "B", "X", "Y", "Back", "Guide", "Start", "Left stick", "Right stick"),
@@ -44,6 +44,7 @@ KEY_MAP = {
     "Image": {
         "B-mode and CT, B-mode alone, CT alone": {"mode": "B"},
         "detail level of the B-mode image": {"detail_level": "V"},
+        "Doppler: colour, power, off": {"doppler": "Tab"},
         "the scanner's sliders, with TGC": {"show_scanner": "G"},
         "outline of the tumour, now and in the CT": {"outline": "O"},
         "caliper from click to click, in mm; a third removes it": {"measure": "Click on image"},
@@ -97,7 +98,7 @@ HELD = {
 # The others act when the key goes down: cine steps, settings of several values, settings that are on or off, and controls with the
 # name of the action.
 STEPS = {"cine_back": -1, "cine_forth": 1}
-CYCLES = {"mode": MODES, "detail_level": DETAIL_LEVELS, "plan_for": TARGETS}
+CYCLES = {"mode": MODES, "detail_level": DETAIL_LEVELS, "doppler": DOPPLER_MODES, "plan_for": TARGETS}
 # Actions of the 3D view itself.
 VIEW_ACTIONS = ("zoom_in", "zoom_out")
 

@@ -8,7 +8,7 @@ from PIL import Image, ImageDraw
 
 from render.text import PLATE_PX, fitting_size, font, shortened, write, written_size
 from render.viewer import View
-from render.window_layout import Rect, WindowLayout
+from render.window_layout import WEDGE_WIDTH, Rect, WindowLayout
 
 PANEL, FINDINGS, LINE = (8, 9, 11), (20, 24, 29), (44, 50, 58)
 TEXT, QUIET = (222, 227, 232), (132, 142, 153)
@@ -49,13 +49,13 @@ def ruler_ticks(view: View, box: Rect) -> list[tuple[int, int | None]]:
 
 
 def paste_image(page: np.ndarray, box: Rect, image: np.ndarray) -> None:
-    """Draw an image, uint8 (rows, columns), into its box, resampled unless it has the size of the box."""
-    if image.shape != (box.height, box.width):
+    """Draw an image, uint8 (rows, columns) or (rows, columns, 3), into its box, resampled unless it has the size of the box."""
+    if image.shape[:2] != (box.height, box.width):
         resized = Image.fromarray(image).resize((box.width, box.height), Image.Resampling.BILINEAR)
         image = np.asarray(resized)
     # Channel by channel is five times as fast as all three at once.
     for channel in range(3):
-        page[box.slices][..., channel] = image
+        page[box.slices][..., channel] = image if image.ndim == 2 else image[..., channel]
 
 
 def draw_note(page: np.ndarray, layout: WindowLayout, box: Rect, note: str) -> None:
@@ -115,7 +115,7 @@ def draw_panel(draw: ImageDraw.ImageDraw, layout: WindowLayout, view: View) -> N
     if view.outline_mm is not None:
         _draw_legend(draw, layout, boxes[0].left, boxes[-1].bottom)
     _draw_ruler(draw, layout, view, boxes[0])
-    _draw_wedge(draw, layout, boxes[-1])
+    _draw_scale(draw, layout, view, boxes[-1])
     for name, box in zip(view.images, boxes, strict=True):
         # The marker dot: local +x is to the right.
         x, y, radius = box.right - px(10), box.top - px(12), px(6)
@@ -167,10 +167,15 @@ def _draw_ruler(draw: ImageDraw.ImageDraw, layout: WindowLayout, view: View, box
         draw.polygon([(x + px(4), row), (x - px(4), row - px(5)), (x - px(4), row + px(5))], fill=ALERT)
 
 
-def _draw_wedge(draw: ImageDraw.ImageDraw, layout: WindowLayout, box: Rect) -> None:
-    """Draw the grey scale beside the image, white at the top."""
-    height = min(layout.px(128), box.height)
-    left, right = box.right + layout.px(12), box.right + layout.px(19)
+def _draw_scale(draw: ImageDraw.ImageDraw, layout: WindowLayout, view: View, box: Rect) -> None:
+    """Draw the grey scale beside the image, white at the top, or that of Doppler."""
+    px, colours = layout.px, view.scale_colours
+    if colours is None:
+        colours = np.repeat(np.arange(255, -1, -1)[:, None], 3, axis=1)
+    height = min(px(128), box.height)
+    left, right = box.right + px(12), box.right + px(19)
     for i in range(height):
-        grey = 255 - i * 255 // max(1, height - 1)
-        draw.line([(left, box.top + i), (right, box.top + i)], fill=(grey, grey, grey))
+        colour = tuple(colours[i * (len(colours) - 1) // max(1, height - 1)].tolist())
+        draw.line([(left, box.top + i), (right, box.top + i)], fill=colour)
+    for text, row, anchor in zip(view.scale, (box.top - px(2), box.top + height + px(2)), "ba", strict=True):
+        draw.text((box.right + WEDGE_WIDTH, row), text, font=font(px(13)), fill=QUIET, anchor=f"r{anchor}")

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from ultrasound.probe import DetailLevel, Mode
+from ultrasound.probe import DetailLevel, DopplerMode, Mode
 from ultrasound.target import Target
 
-B_MODE, TGC = "B-mode", "TGC"
-# Groups of settings beside the image, as on a scanner.
-SCANNER_GROUPS = (B_MODE, TGC)
+B_MODE, TGC, DOPPLER = "B-mode", "TGC", "Doppler"
+# Groups of settings beside the image, as on a scanner: one of the last two is shown.
+SCANNER_GROUPS = (B_MODE, TGC, DOPPLER)
 
 
 def _slider(default, label: str, unit: str, low, high, group: str):
@@ -21,8 +21,8 @@ def _slider(default, label: str, unit: str, low, high, group: str):
     return field(default=default, metadata=about)
 
 
-def _switch(default: bool, label: str):
-    return _slider(default, label, "", False, True, "View")
+def _switch(default: bool, label: str, group: str = "View"):
+    return _slider(default, label, "", False, True, group)
 
 
 def _level(number: int):
@@ -53,6 +53,15 @@ class ScannerSettings:
     dyn_range_db: int = _slider(60, "DR", "dB", 20, 120, B_MODE)
     frequency_mhz: float = _slider(7.5, "", "MHz", 2.0, 15.0, B_MODE)
     focus_percent: int = _slider(40, "Focus", "%", 0, 100, B_MODE)
+    persistence_percent: int = _slider(0, "Persist.", "%", 0, 95, B_MODE)
+    compounding: bool = _switch(False, "Spatial compounding", B_MODE)
+    harmonics: bool = _switch(False, "Harmonics", B_MODE)
+    dark_map: bool = _switch(True, "Dark grey map", B_MODE)
+    velocity_scale_cm_s: int = _slider(25, "Scale", "cm/s", 2, 200, DOPPLER)
+    wall_filter_cm_s: float = _slider(1.5, "Filter", "cm/s", 0.2, 20.0, DOPPLER)
+    colour_gain_percent: int = _slider(50, "Gain", "%##colour", 0, 100, DOPPLER)
+    colour_steering_deg: int = _slider(0, "Steer", "deg", -30, 30, DOPPLER)
+    clamped: bool = _switch(False, "Hilum clamped", DOPPLER)
     tgc_1: int = _level(1)
     tgc_2: int = _level(2)
     tgc_3: int = _level(3)
@@ -63,6 +72,7 @@ class ScannerSettings:
     tgc_8: int = _level(8)
     mode: Mode = "both"
     detail_level: DetailLevel = "speckle"
+    doppler: DopplerMode = "off"
 
 
 @dataclass
@@ -140,6 +150,12 @@ class View:
     """Name -> grey values, uint8, shape (rows = depth, columns = lateral, local x to the right). The 3D view shows the first."""
     width_mm: float
     depth_mm: float
+    doppler: np.ndarray | None = None
+    """The first image with Doppler over it, uint8, shape (rows, columns, 3)."""
+    scale: tuple[str, str] = ("", "")
+    """Texts at both ends of the scale of Doppler."""
+    scale_colours: np.ndarray | None = None
+    """Its colours from the top, uint8, shape (n, 3)."""
     above_mm: float = 0.0
     """Part of the depth behind the centre of the array face."""
     sector: tuple[float, float, float] | None = None
@@ -174,6 +190,13 @@ class View:
     """Its rate, where slower than real time: "0.2 x real"."""
     title: str = ""
     """Scene or case; no identifiers of the patient."""
+
+    @property
+    def shown(self) -> dict[str, np.ndarray]:
+        """The images by name, the first with Doppler over it if there is any."""
+        if self.doppler is None:
+            return self.images
+        return self.images | {next(iter(self.images)): self.doppler}
 
 
 @dataclass

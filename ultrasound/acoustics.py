@@ -121,7 +121,7 @@ def properties(
         """Return the texture of the backscatter level at some voxels [dB]."""
         distance = float(table["texture_mm"])
         if distance not in noise:
-            noise[distance] = _noise(hu.shape, distance / 2 / spacing)
+            noise[distance] = noise_of(hu.shape, distance / 2 / spacing)
         return np.float32(table["texture_db"]) * noise[distance][where]
 
     level += texture(tissue_table()["hounsfield"], ...)
@@ -172,7 +172,7 @@ def _by_hounsfield(hu: np.ndarray) -> np.ndarray:
     return values[np.clip(np.rint(smooth), MIN_HU, MAX_HU).astype(np.int16) - MIN_HU]
 
 
-def _noise(shape: tuple[int, ...], sd_voxels: np.ndarray) -> np.ndarray:
+def noise_of(shape: tuple[int, ...], sd_voxels: np.ndarray) -> np.ndarray:
     """Return noise of unit SD, smoothed by an SD along each axis, the same for the same voxels on every machine."""
     noise = np.random.default_rng(SEED).standard_normal(shape, dtype=np.float32)
     noise = ndimage.gaussian_filter(noise, sd_voxels, truncate=2, mode="wrap")

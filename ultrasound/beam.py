@@ -55,6 +55,11 @@ def lateral_profiles(probe: Probe, scanline: float, depth_mm: np.ndarray, lag: n
         for half, focus in zip(half_apertures_mm(probe, depth_mm), (axis, at), strict=True):
             elements = _aperture(probe, scanline, half)
             fields.append([_field(*elements, focus, place, frequency, probe.pitch_mm) for place in (to, at)])
+        if probe.harmonics:
+            # Sound of twice the frequency arises as the square of the transmitted field.
+            elements = _aperture(probe, scanline, half_apertures_mm(probe, depth_mm)[0])
+            sent = [_field(*elements, axis, place, frequency / 2, probe.pitch_mm) for place in (to, at)]
+            fields[0] = [each**2 for each in sent]
         energy += share * np.abs(fields[0][0] * fields[1][0]) ** 2
         on_axis += share * np.abs(fields[0][1] * fields[1][1])[:, 0] ** 2
     return np.sqrt(energy / on_axis[:, None])
@@ -76,7 +81,9 @@ def elevation_profiles(probe: Probe, depth_mm: np.ndarray) -> tuple[np.ndarray, 
     lens = np.broadcast_to([0.0, focus], (len(depth_mm), 1, 2))
     energy, correlation = np.zeros(offset.shape), np.zeros((len(depth_mm), 256))
     for frequency, share in zip(*summed_frequencies(probe), strict=True):
-        echo = _field(points, normals, lens, place, frequency) ** 2
+        received = _field(points, normals, lens, place, frequency)
+        sent = _field(points, normals, lens, place, frequency / 2) ** 2 if probe.harmonics else received
+        echo = sent * received
         energy += share * np.abs(echo) ** 2
         spectrum = np.abs(np.fft.fft(echo, 256)) ** 2
         correlation = correlation + share * np.fft.ifft(spectrum).real
@@ -92,15 +99,15 @@ def _nodes() -> np.ndarray:
 
 def _on_scanlines(probe: Probe, index: float | np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
     """Return points (depths, indices, 2) [mm] of the image plane on scanlines, of which the indices are fractional."""
-    share = (np.atleast_1d(index) + 0.5) / probe.number_of_scanlines
+    share, steering = (np.atleast_1d(index) + 0.5) / probe.number_of_scanlines, np.radians(probe.steering_deg)
     depth = np.asarray(depth_mm, float)[:, None]
     if probe.sector is None:
-        u = (share - 0.5) * probe.transducer_width_mm
-        return np.stack(np.broadcast_arrays(u[None], depth), axis=-1)
+        u = (share - 0.5) * probe.transducer_width_mm + depth * np.sin(steering)
+        return np.stack(np.broadcast_arrays(u, depth * np.cos(steering)), axis=-1)
     radius, start, stop = probe.sector
     angle = start + share * (stop - start)
-    radial = radius + depth
-    return np.stack([radial * np.sin(angle), radial * np.cos(angle) - radius], axis=-1)
+    u, v = (radius * turn(angle) + depth * turn(angle + steering) for turn in (np.sin, np.cos))
+    return np.stack([u, v - radius], axis=-1)
 
 
 def _aperture(probe: Probe, scanline: float, half_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

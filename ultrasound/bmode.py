@@ -24,7 +24,7 @@ from ultrasound.lateral_kernel import (
     lateral_kernel,
     scanline_classes,
 )
-from ultrasound.probe import GREY_EXPONENTS, DetailLevel, Probe
+from ultrasound.probe import DOPPLER_SETTINGS, GREY_EXPONENTS, DetailLevel, Probe
 from ultrasound.propagation import Propagation
 from ultrasound.pulse import DB_OF_NEPER, PATH_ENTRIES
 from ultrasound.speckle import COMPONENTS, LEAST_WEIGHT, SIZE, UNIT, Speckle, elevation_levels
@@ -68,6 +68,8 @@ class BMode:
         self.grey = ti.field(ti.f32, GREY_STEPS + 1)
         self.source = ti.Vector.field(2, ti.f32, (self.plane.pixels, self.plane.pixels))
         self._table_settings: tuple | None = None
+        # Whether the scanlines reach a pixel (rows, columns).
+        self.covered = np.zeros(self.plane.shape, bool)
 
     def render(self, probe: Probe, detail_level: DetailLevel = "speckle") -> np.ndarray:
         """Return grey values (rows, columns) uint8 of the plane located last, for a probe with the same numbers of scanlines and samples.
@@ -78,16 +80,16 @@ class BMode:
         self.sound.run(probe, thick=detail_level == "elevation")
         stride = self.sound.stride_of(probe)
         has_speckle = detail_level != "reflection"
-        speckle_sd = probe.speckle_sd_mm
+        speckle_sd, look = probe.speckle_sd_mm, round(8 * probe.steering_deg)
         self._set_levels(has_speckle, self.samples // stride + 1)
         if has_speckle:
-            self._scatter(stride, speckle_sd)
+            self._scatter(stride, speckle_sd, look)
             self._lengthen(stride, speckle_sd, probe.sample_mm)
         else:
             self._scatter_evenly(stride)
-        self._reflect(has_speckle, stride, probe.sample_mm, speckle_sd)
+        self._reflect(has_speckle, stride, probe.sample_mm, speckle_sd, look)
         if has_speckle:
-            self.spread(10.0 ** (probe.noise_db / 20.0), self.plane.noise_key)
+            self.spread(10.0 ** (probe.noise_before_gain_db / 20.0), self.plane.noise_key)
         else:
             self._add()
         image = np.empty(self.plane.shape, np.uint8)
@@ -98,15 +100,21 @@ class BMode:
         """Update the tables of the probe's settings, if these changed."""
         grey = 255 * np.linspace(0, 1, GREY_STEPS + 1) ** GREY_EXPONENTS[probe.grey_map]
         fill((self.gain, probe.gain_db()), (self.grey, grey))
-        free = {"gain_percent", "dyn_range_db", "grey_map", "time_gain_compensation", "noise_db"}
+        free = {
+            "gain_percent",
+            "dyn_range_db",
+            "grey_map",
+            "time_gain_compensation",
+            "noise_db",
+            *DOPPLER_SETTINGS,
+        }
         fixed = probe.model_dump(exclude=free)
         settings = *fixed.items(), self.plane.shape, self.sound.surface
         if self._table_settings == settings:
             return
         self._table_settings = settings
-        source = np.zeros(self.source.shape + (2,), np.float32)
-        rows, columns = self.plane.shape
-        source[:rows, :columns] = source_of_pixels(probe, rows, columns)
+        source = padded_source(probe, self.plane.shape, self.source.shape)
+        self.covered = source[: self.plane.shape[0], : self.plane.shape[1], 0] >= -0.5
         depth = self.sound.stride_of(probe) * probe.sample_mm * np.arange(self.sound.most)
         nodes = profile_depths(probe)
         slice_sd, correlation_sd = (
@@ -162,7 +170,7 @@ class BMode:
                 self.real[line, stride * k + j] = level
 
     @ti.kernel
-    def _scatter(self, stride: ti.template(), speckle_sd: float):
+    def _scatter(self, stride: ti.template(), speckle_sd: float, look: int):
         """Write the signal of scatterers: noise of the rest position, times the level."""
         for line, k in ti.ndrange(self.lines, self.samples // stride):
             first = LENGTH_TAPS + stride * k
@@ -173,7 +181,7 @@ class BMode:
             for each in range(COMPONENTS):
                 weight = self.speckle.weight(each, axis, self.elevation[k])
                 if weight > LEAST_WEIGHT:
-                    key, matrix = self.speckle.component(each, axis, self.elevation[k], speckle_sd)
+                    key, matrix = self.speckle.component(each, axis, self.elevation[k], speckle_sd, look)
                     near, far = matrix @ self.sound.rest[line, k], matrix @ self.sound.rest[line, k + 1]
                     for j in range(stride):
                         t = (j + 0.5) / stride
@@ -207,23 +215,30 @@ class BMode:
 
     @ti.kernel
     def _reflect(
-        self, has_speckle: ti.template(), stride: ti.template(), sample_mm: float, speckle_sd: float
+        self,
+        has_speckle: ti.template(),
+        stride: ti.template(),
+        sample_mm: float,
+        speckle_sd: float,
+        look: int,
     ):
         """Add the echoes of the interfaces."""
         for n in range(self.lines * TASK):
             if n % TASK == 0:
                 for k in range(1, self.samples // stride + 1):
                     if self.sound.echo[n // TASK, k].z > 0.0:
-                        self.reflect(has_speckle, n // TASK, k, stride * sample_mm, sample_mm, speckle_sd)
+                        self.reflect(
+                            has_speckle, n // TASK, k, stride * sample_mm, sample_mm, speckle_sd, look
+                        )
 
     @ti.func
-    def reflect(self, has_speckle: ti.template(), line, k, step_mm, sample_mm, speckle_sd):
+    def reflect(self, has_speckle: ti.template(), line, k, step_mm, sample_mm, speckle_sd, look):
         """Add the echo of the interface in front of a tissue sample: as long as the pulse."""
         echo = self.sound.echo[line, k]
         amplitude, path = self.sound.echo_amplitude(line, echo, step_mm)
         diffuse, sd = tm.vec2(0.0, 0.0), self.axial_sd[0]
         if ti.static(has_speckle):
-            diffuse = amplitude * echo.y * self.speckle_at(line, echo.z / step_mm, speckle_sd)
+            diffuse = amplitude * echo.y * self.speckle_at(line, echo.z / step_mm, speckle_sd, look)
             sd = self.sound.at_path(self.axial_sd, path)
         at, reach = echo.z / sample_mm - 0.5, ti.ceil(3.5 * sd / sample_mm, ti.i32)
         first = ti.max(ti.floor(at, ti.i32) - reach, 0)
@@ -240,7 +255,7 @@ class BMode:
                 self.real[line, i] = self.real[line, i] + pulse * both
 
     @ti.func
-    def speckle_at(self, line, at, speckle_sd):
+    def speckle_at(self, line, at, speckle_sd, look):
         """Return the speckle (2,) at a fractional tissue sample of a scanline."""
         k = ti.cast(at, ti.i32)
         rest = tm.mix(self.sound.rest[line, k], self.sound.rest[line, k + 1], at - k)
@@ -248,7 +263,7 @@ class BMode:
         for each in range(COMPONENTS):
             weight = self.speckle.weight(each, axis, self.elevation[k])
             if weight > LEAST_WEIGHT:
-                key, matrix = self.speckle.component(each, axis, self.elevation[k], speckle_sd)
+                key, matrix = self.speckle.component(each, axis, self.elevation[k], speckle_sd, look)
                 speckle += weight * self.speckle.at(matrix @ rest, key)
         return speckle
 
@@ -333,6 +348,13 @@ def source_of_pixels(probe: Probe, rows: int, columns: int) -> np.ndarray:
     )
     source = np.stack([line, along / probe.sample_mm - 0.5], axis=-1)
     return np.where(within[..., None], source, -1.0).astype(np.float32)
+
+
+def padded_source(probe: Probe, shape: tuple[int, int], most: tuple[int, ...]) -> np.ndarray:
+    """Return ``source_of_pixels`` of an image of a shape, filled up to the shape ``most``."""
+    source = np.zeros((*most, 2), np.float32)
+    source[: shape[0], : shape[1]] = source_of_pixels(probe, *shape)
+    return source
 
 
 def length_weights(pulse_sd: float) -> np.ndarray:

@@ -29,13 +29,13 @@ EMPTY = (
     "PatientOrientation",
 )
 TRANSDUCER_TYPES = {"LINEAR": "LINEAR", "CURVILINEAR": "CURVED LINEAR", "PHASED": "SECTOR_PHASED"}
-REGION_2D, REGION_TISSUE, CENTIMETRES = 1, 1, 3
+REGION_2D, REGION_TISSUE, REGION_COLOUR_FLOW, CENTIMETRES = 1, 1, 2, 3
 
 
 def save_dicom(
     path: Path, image: np.ndarray, spacing_mm: tuple[float, float], probe: Probe | None = None
 ) -> None:
-    """Write grey values (rows, columns) uint8 with row and column spacing [mm].
+    """Write grey values (rows, columns) uint8, or colours (rows, columns, 3) of Doppler, with row and column spacing [mm].
 
     With a probe, whose ``extent_mm`` the image covers, the file also has transducer data and the centre of the array face.
     Raises OSError where the file cannot be written.
@@ -67,7 +67,9 @@ def save_dicom(
 
     data.file_meta = FileMetaDataset()
     data.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
-    data.set_pixel_data(image, "MONOCHROME2", bits_stored=8, generate_instance_uid=False)
+    data.set_pixel_data(
+        image, "MONOCHROME2" if image.ndim == 2 else "RGB", bits_stored=8, generate_instance_uid=False
+    )
     content = io.BytesIO()  # so that an error of the disk names the file
     data.save_as(content, enforce_file_format=True)
     path.write_bytes(content.getvalue())
@@ -75,11 +77,11 @@ def save_dicom(
 
 def _region(shape: tuple[int, ...], spacing_mm: tuple[float, float], probe: Probe | None) -> Dataset:
     """Return the whole image as one region; its reference pixel contains the centre of the face, where (u, v) is 0 [cm]."""
-    rows, columns = shape
+    rows, columns = shape[:2]
     row_cm, column_cm = (float(each) / 10 for each in spacing_mm)
     region = Dataset()
     region.RegionSpatialFormat = REGION_2D
-    region.RegionDataType = REGION_TISSUE
+    region.RegionDataType = REGION_TISSUE if len(shape) == 2 else REGION_COLOUR_FLOW
     region.RegionFlags = 0
     region.RegionLocationMinX0, region.RegionLocationMinY0 = 0, 0
     region.RegionLocationMaxX1, region.RegionLocationMaxY1 = columns - 1, rows - 1

@@ -25,9 +25,18 @@ MODES: tuple[Mode, ...] = get_args(Mode)
 DetailLevel = Literal["reflection", "speckle", "elevation"]
 DETAIL_LEVELS: tuple[DetailLevel, ...] = get_args(DetailLevel)
 
+DopplerMode = Literal["off", "colour", "power"]
+DOPPLER_MODES: tuple[DopplerMode, ...] = get_args(DopplerMode)
+
 # Grey values: the exponent of the share of the dynamic range. On a scanner's screen most of the tissue is dark.
 GreyMap = Literal["linear", "dark"]
 GREY_EXPONENTS: dict[GreyMap, float] = {"linear": 1.0, "dark": 1.5}
+# How much weaker harmonics are, where they have built up; and the depth at which they have half of that amplitude. An estimate.
+HARMONIC_LOSS_DB, BUILD_UP_MM = 15.0, 12.0
+# Range of the angles of spatial compounding.
+COMPOUND_RANGE_DEG = 24.0
+# Settings of Doppler alone.
+DOPPLER_SETTINGS = ("velocity_scale_cm_s", "wall_filter_cm_s", "colour_gain_percent", "colour_steering_deg")
 # Keys of earlier versions, and what now sets the same.
 FORMER_KEYS = {"PulseCycles": "BandwidthPercent", "FocalZoneMm": "FNumber"}
 
@@ -47,7 +56,9 @@ class Probe(BaseModel):
     lens, focused at ``elevation_focus_mm``, shape the beam across the image plane; ``elevation_width_mm`` is the slice thickness
     that counts as scanned (coverage). ``bandwidth_percent`` is the -6 dB width of a round trip through the array, relative to the
     frequency. ``noise_db`` is the scanner's electronic noise before gain; 0 dB is the echo of a perfect reflector at the face.
-    ``depth_compensation_db_cm_mhz`` is the attenuation that the scanner's built-in TGC compensates, to which the sliders of ``time_gain_compensation`` [%] add.
+    ``harmonics`` receives at ``frequency_mhz`` what arises in tissue from half of it. ``compound_angles`` images, steered by different
+    angles, are averaged. ``steering_deg`` turns the scanlines from the face's normal towards +u, ``colour_steering_deg`` those of Doppler on a linear array. ``velocity_scale_cm_s`` is the greatest velocity that Doppler
+    shows without aliasing, ``wall_filter_cm_s`` the least. ``depth_compensation_db_cm_mhz`` is the attenuation that the scanner's built-in TGC compensates, to which the sliders of ``time_gain_compensation`` [%] add.
     """
 
     model_config = ConfigDict(
@@ -78,6 +89,13 @@ class Probe(BaseModel):
     gain_percent: Percent = 54.0
     dyn_range_db: float = Field(60.0, ge=20, le=120)
     grey_map: GreyMap = "dark"
+    steering_deg: float = Field(0.0, ge=-30, le=30)
+    compound_angles: Literal[1, 3, 5] = 1
+    harmonics: bool = False
+    velocity_scale_cm_s: float = Field(25.0, ge=2, le=200)
+    wall_filter_cm_s: float = Field(1.5, gt=0, le=50)
+    colour_gain_percent: Percent = 50.0
+    colour_steering_deg: float = Field(0.0, ge=-30, le=30)
     time_gain_compensation: tuple[Percent, ...] = Field(
         (50.0,) * TGC_SLIDERS, min_length=TGC_SLIDERS, max_length=TGC_SLIDERS
     )
@@ -98,6 +116,15 @@ class Probe(BaseModel):
             raise ValueError("a sector needs ThetaStartDeg < 0 < ThetaStopDeg, at least 1 degree apart")
         if self.transducer_geometry == "CURVILINEAR" and self.radius_start_mm <= 0:
             raise ValueError("a curvilinear array needs its radius: RadiusStartMm > 0")
+        if self.transducer_geometry == "PHASED" and (self.steering_deg or self.compound_angles > 1):
+            raise ValueError(
+                f"SteeringDeg = {self.steering_deg:g}, CompoundAngles = {self.compound_angles}: the sector of a phased array is steered "
+                "already; expected 0 and 1"
+            )
+        if self.transducer_geometry != "LINEAR" and self.colour_steering_deg:
+            raise ValueError(
+                f"ColourSteeringDeg = {self.colour_steering_deg:g}: only linear arrays steer Doppler; expected 0"
+            )
         array = np.ptp(self.elements()[:, 0])
         if array > self.housing_mm[0]:
             raise ValueError(
@@ -149,6 +176,24 @@ class Probe(BaseModel):
         return self.depth_mm * self.focus_depth_percent / 100
 
     @property
+    def noise_before_gain_db(self) -> float:
+        """Electronic noise relative to the echo, which is weaker with harmonics."""
+        return self.noise_db + HARMONIC_LOSS_DB * self.harmonics
+
+    @property
+    def compound_angles_deg(self) -> list[float]:
+        """Steering angles of the images that spatial compounding averages, that of no steering first."""
+        half = COMPOUND_RANGE_DEG / 2 if self.compound_angles > 1 else 0.0
+        return sorted((self.steering_deg + np.linspace(-half, half, self.compound_angles)).tolist(), key=abs)
+
+    @property
+    def velocity_limit_cm_s(self) -> float:
+        """The scale of velocity, or less where echoes of the whole depth must return before the next pulse."""
+        pulse_mhz = SOUND_MM_US / (2 * self.depth_mm)
+        most = SOUND_MM_US * pulse_mhz / (4 * self.frequency_mhz) * 1e5
+        return min(self.velocity_scale_cm_s, most)
+
+    @property
     def array_width_mm(self) -> float:
         """Length of the array along its face."""
         if self.transducer_geometry != "CURVILINEAR":
@@ -183,13 +228,18 @@ class Probe(BaseModel):
 
     def scanlines(self) -> tuple[np.ndarray, np.ndarray]:
         """Return start [mm] and unit direction of each scanline, each (scanlines, 2) on the image plane."""
+        steering = np.radians(self.steering_deg)
         if self.sector is None:
-            return self.elements(), np.tile([0.0, 1.0], (self.number_of_scanlines, 1))
+            return self.elements(), np.tile(
+                [np.sin(steering), np.cos(steering)], (self.number_of_scanlines, 1)
+            )
         radius, start, stop = self.sector
         share = (np.arange(self.number_of_scanlines) + 0.5) / self.number_of_scanlines
         angle = start + share * (stop - start)
-        direction = np.column_stack([np.sin(angle), np.cos(angle)])
-        return radius * (direction - [0.0, 1.0]), direction
+        normal, direction = (
+            np.column_stack([np.sin(each), np.cos(each)]) for each in (angle, angle + steering)
+        )
+        return radius * (normal - [0.0, 1.0]), direction
 
     def elements(self) -> np.ndarray:
         """Return the elements on the face (scanlines, 2) [mm]: the starts of the scanlines, or across a phased array."""
@@ -201,18 +251,27 @@ class Probe(BaseModel):
     def line_spacing_mm(self, depth_mm: np.ndarray) -> np.ndarray:
         """Return the distance of neighbouring scanlines at depths [mm]."""
         if self.transducer_geometry == "LINEAR":
-            return np.full_like(depth_mm, self.transducer_width_mm / self.number_of_scanlines)
+            spacing = (
+                self.transducer_width_mm / self.number_of_scanlines * np.cos(np.radians(self.steering_deg))
+            )
+            return np.full_like(depth_mm, spacing)
         step = np.radians(self.theta_stop_deg - self.theta_start_deg) / self.number_of_scanlines
         return (self.radius_mm + depth_mm) * step
 
     def beam_coordinates(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return scanline (fractional index) and depth along it [mm] of points on the plane [mm]."""
+        steering = np.radians(self.steering_deg)
         if self.sector is None:
-            line = (u / self.transducer_width_mm + 0.5) * self.number_of_scanlines - 0.5
-            return line, np.array(v, float)
+            at_face = u - v * np.tan(steering)
+            line = (at_face / self.transducer_width_mm + 0.5) * self.number_of_scanlines - 0.5
+            return line, v / np.cos(steering)
         radius, start, stop = self.sector
-        share = (np.arctan2(u, v + radius) - start) / (stop - start)
-        return share * self.number_of_scanlines - 0.5, np.hypot(u, v + radius) - radius
+        away = np.hypot(u, v + radius)
+        # The triangle of the array's centre, the start of the scanline and the point.
+        depth = np.sqrt(np.maximum(away**2 - (radius * np.sin(steering)) ** 2, 0)) - radius * np.cos(steering)
+        turn = np.arcsin(np.clip(depth * np.sin(steering) / np.maximum(away, 1e-9), -1, 1))
+        share = (np.arctan2(u, v + radius) - turn - start) / (stop - start)
+        return share * self.number_of_scanlines - 0.5, depth
 
     def gain_db(self) -> np.ndarray:
         """Return gain and TGC at each sample of a scanline [dB], (samples,)."""

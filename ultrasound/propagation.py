@@ -23,7 +23,7 @@ from ultrasound.interface import (
     diffuse,
     specular,
 )
-from ultrasound.probe import Probe
+from ultrasound.probe import BUILD_UP_MM, Probe
 from ultrasound.pulse import DB_OF_NEPER, PATH_ENTRIES, PATH_STEP, SOUND_MM_US
 from ultrasound.sampled_volume import SampledVolume
 
@@ -90,8 +90,8 @@ class Propagation:
         # How many scanlines a ray is from its end at a sample, where it leaves the face. It goes from scanline to scanline: mixing
         # two would spread shadows.
         self.ray_offset = ti.field(ti.i32, (RAYS, self.most))
-        # Half angle of the aperture [rad] and SD of the beam across the image plane [mm], at each sample.
-        self.aperture_angle, self.slice_sd = (ti.field(ti.f32, self.most) for _ in range(2))
+        # Half angle of the aperture [rad], SD of the beam across the image plane [mm] and amplitude of harmonics, at each sample.
+        self.aperture_angle, self.slice_sd, self.build_up = (ti.field(ti.f32, self.most) for _ in range(3))
         self.speckle_db, self.echo_db = (ti.field(ti.f32, PATH_ENTRIES) for _ in range(2))
         # Half angle of the aperture across the plane [rad]; of interfaces: amplitudes reflected as a mirror and diffusely, slope,
         # amplitudes scattered evenly by soft and by hard ones.
@@ -122,6 +122,7 @@ class Propagation:
             (self.ray_offset, ray_offsets(probe, depth)),
             (self.aperture_angle, angle),
             (self.slice_sd, slice_sd_mm),
+            (self.build_up, depth / (depth + BUILD_UP_MM) if probe.harmonics else np.ones_like(depth)),
             (self.speckle_db, pulse.speckle_db),
             (self.echo_db, pulse.echo_db),
             (
@@ -296,7 +297,7 @@ class Propagation:
                     total += one_way
                     path += one_way * along
                     found += 1.0
-            self.amplitude[line, k] = (total / found) ** 2
+            self.amplitude[line, k] = self.build_up[k] * (total / found) ** 2
             self.path[line, k] = 2.0 * path / ti.max(total, 1e-30)
 
     @ti.func

@@ -19,8 +19,10 @@ from trimesh.intersections import mesh_plane
 from sim.embedding import Embedding, Unmoved
 from sim.fields import array_of, field_of, fill
 from ultrasound.acoustics import check_tissues, stored_properties
+from ultrasound.blood_flow import stored_flow
 from ultrasound.bmode import BMode
-from ultrasound.probe import DetailLevel, Mode, Probe
+from ultrasound.doppler import Doppler
+from ultrasound.probe import DetailLevel, DopplerMode, Mode, Probe
 from ultrasound.probe_manipulator import ImagePlane
 from ultrasound.propagation import Propagation
 from ultrasound.sampled_volume import AIR_HU, LANES, Lanes, SampledVolume, distance_volume
@@ -33,7 +35,7 @@ OUTSIDE: dict[str, tuple[float, float | None]] = {
     "air": (AIR_HU, 4e-4),
 }
 MAX_BEADS = 255 // PixelLabel.BEAD
-CT, B_MODE = "CT", "B-mode"
+CT, B_MODE, DOPPLER = "CT", "B-mode", "Doppler"
 IMAGES_OF_MODE: dict[Mode, tuple[str, ...]] = {"ct": (CT,), "b-mode": (B_MODE,), "both": (B_MODE, CT)}
 
 
@@ -255,6 +257,10 @@ class Scanner:
         self.show_background = outside == "background"
         self.contact, self.contact_gap_mm = contact, contact_gap_mm
         self._acoustics = acoustics
+        self._dopplers: dict[bool, Doppler] = {}
+        self._steered: dict[float, BMode] = {}
+        # The last B-mode image, for persistence.
+        self._last: np.ndarray | None = None
 
     @cached_property
     def ct(self) -> SampledVolume:
@@ -269,12 +275,40 @@ class Scanner:
     @cached_property
     def bmode(self) -> BMode:
         """The B-mode image of the plane."""
+        return BMode(self._propagation(), self.probe)
+
+    @cached_property
+    def tissue(self) -> SampledVolume:
+        """Acoustic properties at rest."""
         values, self._acoustics = (self._acoustics or start_acoustics(self.anatomy)).result(), None
-        tissue = SampledVolume(values, self.anatomy.index_from_mm, outside=0.0)
+        return SampledVolume(values, self.anatomy.index_from_mm, outside=0.0)
+
+    @cached_property
+    def flow(self) -> SampledVolume:
+        """Blood flow at rest, of ``blood_flow.CHANNELS``; no flow where the anatomy has no vessels."""
+        anatomy = self.anatomy
+        low, values = stored_flow(anatomy.hu, anatomy.labels, anatomy.tissues, anatomy.voxel_mm)
+        values = values.astype(np.float32)
+        axes = np.linalg.inv(anatomy.index_from_mm[:3, :3]) / anatomy.voxel_mm
+        values[..., :3] = values[..., :3] @ axes.T.astype(np.float32)
+        from_mm = anatomy.index_from_mm.copy()
+        from_mm[:3, 3] -= low
+        return SampledVolume(values, from_mm, outside=0.0)
+
+    def _propagation(self) -> Propagation:
         voxel_mm = float(self.anatomy.voxel_mm.mean())
         around = self.contact, self.contact_gap_mm, self.around
-        sound = Propagation(tissue, self.organ, self.plane, self.probe, voxel_mm, *around)
-        return BMode(sound, self.probe)
+        return Propagation(self.tissue, self.organ, self.plane, self.probe, voxel_mm, *around)
+
+    def doppler(
+        self, probe: Probe, grey: np.ndarray, mode: DopplerMode, time_s: float = 0.0, clamped: bool = False
+    ) -> np.ndarray:
+        """Return the B-mode image ``grey`` that was made last, with Doppler (rows, columns, 3) uint8: see ``Doppler.render``."""
+        steered = probe.colour_steering_deg != 0.0
+        if steered not in self._dopplers:
+            sound = self._propagation() if steered else self.bmode.sound
+            self._dopplers[steered] = Doppler(sound, self.bmode, self.flow)
+        return self._dopplers[steered].render(probe, grey, mode, time_s, clamped)
 
     @cached_property
     def ground_truth(self) -> GroundTruthLabels:
@@ -298,17 +332,46 @@ class Scanner:
         window_hu: float,
         level_hu: float,
         shape: tuple[int, int] | None = None,
+        persistence: float = 0.0,
     ) -> dict[str, np.ndarray]:
         """Return the images of a plane in a mode by name, grey values of a shape (rows, columns) uint8, the main one first.
 
-        No row or column is beyond the scene's number of pixels, which is also the default.
+        No row or column is beyond the scene's number of pixels, which is also the default. ``persistence`` is the share of the last B-mode
+        image in the next.
         """
         self.locate(plane, shape)
         render = {
             CT: lambda: self.ct_slice(window_hu, level_hu),
-            B_MODE: lambda: self.bmode.render(probe, detail_level),
+            B_MODE: lambda: self.b_mode_image(probe, detail_level, persistence),
         }
         return {name: render[name]() for name in IMAGES_OF_MODE[mode]}
+
+    def b_mode_image(self, probe: Probe, detail_level: DetailLevel, persistence: float = 0.0) -> np.ndarray:
+        """Return the B-mode image (rows, columns) uint8 of the plane located last, with compounding and persistence."""
+        image = self._compounded(probe, detail_level)
+        if persistence == 0.0:
+            self._last = None
+            return image
+        if self._last is None or self._last.shape != image.shape:
+            self._last = image.astype(np.float32)
+        self._last += (1 - persistence) * (image - self._last)
+        return np.rint(self._last).astype(np.uint8)
+
+    def _compounded(self, probe: Probe, detail_level: DetailLevel) -> np.ndarray:
+        """Return the mean of images that are steered by different angles, where these reach."""
+        angles = probe.compound_angles_deg[1:]
+        first = self.bmode.render(probe, detail_level)
+        if not angles:
+            return first
+        total, count = first.astype(np.float32), np.ones(first.shape, np.float32)
+        for angle in angles:
+            if angle not in self._steered:
+                self._steered[angle] = BMode(self._propagation(), self.probe)
+            steered = probe.model_copy(update={"steering_deg": angle})
+            total += self._steered[angle].render(steered, detail_level)
+            count += self._steered[angle].covered
+        # The image is as wide as without compounding.
+        return np.where(self.bmode.covered, np.rint(total / count), 0).astype(np.uint8)
 
     def ct_slice(self, window_hu: float, level_hu: float) -> np.ndarray:
         """Return grey values (rows, columns) uint8, 0 to 255 over the window, of the plane located last, at pixel centres."""

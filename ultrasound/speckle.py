@@ -130,10 +130,10 @@ class Speckle:
         return ti.sqrt(share.x * share.y) * ti.select((each & 1) == 1, lengths.z, lengths.y)
 
     @ti.func
-    def component(self, each, axis, lengths, sd_mm):
+    def component(self, each, axis, lengths, sd_mm, look):
         """Return key and matrix (3, 3) from the rest position [mm] to entries of one of the COMPONENTS noises.
 
-        ``sd_mm`` is the length along the image plane.
+        ``sd_mm`` is the length along the image plane. Another ``look``, of an image steered by another angle, has other noise.
         """
         other, longer = ti.Vector([(each >> 2) & 1, (each >> 1) & 1]), each & 1
         index = axis.index + other * axis.step
@@ -144,7 +144,7 @@ class Speckle:
             matrix[0, column] *= fine
             matrix[1, column] *= fine
             matrix[2, column] *= coarse
-        key = ((index.x * 64 + index.y) * 4 + axis.face) * 8 + level
+        key = (((look * 64 + index.x) * 64 + index.y) * 4 + axis.face) * 8 + level
         return key * 40503, matrix
 
     @ti.func

@@ -44,6 +44,8 @@ class ScanOptions(ImageOptions, ArchOptions):
     """What counts as contact with the array: everything but gas in the CT, or the organ only."""
     dicom: bool = False
     """Write each B-mode image as DICOM too."""
+    doppler: Literal["off", "colour", "power"] = "off"
+    """Write each B-mode image with colour or power Doppler too, at the peak of systole."""
     sweep: bool = False
     """Write all images as one tracked sweep too (PLUS), with ground-truth labels."""
 
@@ -67,8 +69,9 @@ def scan(asked: ScanOptions) -> None:
     from rehearsal.image_and_surface_files import save_images
     from rehearsal.rehearsal import scanned_anatomy
     from sim.embedding import Unmoved
+    from ultrasound.blood_flow import SYSTOLE_S
     from ultrasound.probe_manipulator import ImagePlane
-    from ultrasound.scanner import Scanner
+    from ultrasound.scanner import B_MODE, DOPPLER, Scanner
     from ultrasound.sweep_file import LabelledSweep
 
     make_folder(out)
@@ -90,6 +93,9 @@ def scan(asked: ScanOptions) -> None:
         if recording is not None:
             grey = next(iter(images.values()))
             recording.add(grey, labels, scan_probe, pose, recording.count / FRAMES_PER_SECOND)
+        if asked.doppler != "off" and B_MODE in images:
+            given = scan_probe, images[B_MODE], asked.doppler, SYSTOLE_S
+            images[DOPPLER] = scanner.doppler(*given)
         saved = save_images(images, *scan_probe.extent_mm[:2], scan_probe, out / name, asked.dicom)
         rows += [
             dict(

@@ -15,10 +15,15 @@ from rehearsal.sessions.replay import ROUNDING_S, Replay
 from rehearsal.sessions.session import Session
 from rehearsal.sessions.session_file import SessionError
 from render.viewer import Controls, Settings
-from ultrasound.probe import DETAIL_LEVELS, MODES
+from ultrasound.probe import DETAIL_LEVELS, DOPPLER_MODES, MODES
 from ultrasound.target import TARGETS
 
-CHOICES: dict[str, tuple[str, ...]] = {"mode": MODES, "detail_level": DETAIL_LEVELS, "plan_for": TARGETS}
+CHOICES: dict[str, tuple[str, ...]] = {
+    "mode": MODES,
+    "detail_level": DETAIL_LEVELS,
+    "doppler": DOPPLER_MODES,
+    "plan_for": TARGETS,
+}
 # What sessions of version 1.0 call a setting -> its name now.
 RENAMED = {"rung": "detail_level"}
 

@@ -114,7 +114,7 @@ def test_organ_keeps_clear_of_the_border(labels):
         (Label.MEDULLA, 2, 100, 120),
         (Label.SINUS, 2, -115, -80),
         (Label.URINE, 2, 0, 20),
-        (Label.ARTERY, 2, 175, 215),
+        (Label.ARTERY, 1, 145, 215),
         (Label.VEIN, 2, 175, 215),
         (Label.TUMOUR, 1, 70, 90),
     ],

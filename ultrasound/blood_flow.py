@@ -1,0 +1,189 @@
+"""Blood flow at the CT's voxels: in labelled vessels by their kind and width, and in small vessels of the parenchyma. NumPy.
+
+``blood_flow.toml`` is the table. A vessel has a parabolic profile along its centreline, whose direction is that of the shortest path
+within the vessel to its end far from the kidney.
+"""
+
+import json
+import tomllib
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import SimpleITK as sitk
+from scipy import ndimage
+
+from sim.stored_arrays import stored
+from ultrasound.acoustics import KIDNEY, classify_tissues, noise_of
+
+TABLE = Path(__file__).parent / "blood_flow.toml"
+# At each voxel: peak systolic velocity along the grid's axes [m/s], resistive index, and amplitude against blood in a vessel.
+CHANNELS = 5
+KINDS = ("vessel", "vein", "artery")
+PARENCHYMA = ("kidney", "cortex", "medulla")
+# Enhanced vessels without a label are of the kind of a labelled one up to this distance. Smaller bodies than this are noise.
+SAME_KIND_MM, LEAST_VOXELS = 25.0, 20
+# The path within a vessel, and the direction to the capsule, are smoothed before they are differentiated [voxels].
+PATH_SD, CAPSULE_SD = 1.5, 3.0
+# Half width [voxels] of the neighbourhood whose greatest distance from the wall is a vessel's radius: wider ones have plug flow.
+WIDEST = 3
+# Paths longer than a tenth of this do not exist.
+FAR_MM = 1e6
+# Noise of unit SD above this has small vessels: a quarter of the parenchyma.
+SPARSE = 0.7
+# One heartbeat [s], the time to its peak, and the time constant of the fall after it.
+BEAT_S, SYSTOLE_S, FALL_S = 60 / 70, 0.09, 0.22
+
+
+@cache
+def flow_table() -> dict[str, dict]:
+    """Return the values by kind of vessel, as in the file."""
+    return tomllib.loads(TABLE.read_text("utf-8"))
+
+
+def pulse_share(time_s: float) -> float:
+    """Return how much of its pulsatile part the velocity has at a time: 0 at the end of diastole, 1 at the peak of systole."""
+    phase = time_s % BEAT_S
+    if phase < SYSTOLE_S:
+        return float(np.sin(np.pi / 2 * phase / SYSTOLE_S) ** 2)
+    end = np.exp(-(BEAT_S - SYSTOLE_S) / FALL_S)
+    return float((np.exp(-(phase - SYSTOLE_S) / FALL_S) - end) / (1 - end))
+
+
+def stored_flow(
+    hu: np.ndarray, labels: np.ndarray | None, tissue_of_label: Mapping[int, str], spacing_mm: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """As ``blood_flow`` in float16, but computed only once from the same arguments."""
+    texts = json.dumps(dict(tissue_of_label)), TABLE.read_text("utf-8")
+    low, values = stored(_flow_of_texts, hu, labels, *texts, spacing_mm)
+    return low, values
+
+
+def _flow_of_texts(
+    hu: np.ndarray, labels: np.ndarray | None, tissues: str, table: str, spacing_mm: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    tissue_of_label = {int(label): tissue for label, tissue in json.loads(tissues).items()}
+    low, values = blood_flow(hu, labels, tissue_of_label, spacing_mm)
+    return low, values.astype(np.float16)
+
+
+def blood_flow(
+    hu: np.ndarray, labels: np.ndarray | None, tissue_of_label: Mapping[int, str], spacing_mm: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the index (3,) of the first voxel of a box that contains all flow, and the flow in it (nx, ny, nz, CHANNELS) float32.
+
+    ``labels`` of the shape of ``hu``; without one, the kind of an enhanced vessel is unknown. The box has at least one voxel.
+    """
+    masks = {name: np.zeros(hu.shape, bool) for name in (*KINDS, *KIDNEY, "tumour")}
+    if labels is not None:
+        for tissue in set(tissue_of_label.values()) | masks.keys():
+            masks[tissue] = np.isin(labels, [v for v, name in tissue_of_label.items() if name == tissue])
+    found = classify_tissues(hu, masks, spacing_mm).get("vessel")
+    if found is not None:
+        _add_of_same_kind(masks, found, spacing_mm)
+    kidney = np.logical_or.reduce([masks[name] for name in (*KIDNEY, "tumour")])
+    flowing = np.logical_or.reduce([masks[name] for name in (*KINDS, *PARENCHYMA)])
+    box = _box(flowing)
+    part = {name: mask[box] for name, mask in masks.items()}
+    values = np.zeros((*part["artery"].shape, CHANNELS), np.float32)
+    for tissue in PARENCHYMA:
+        if part[tissue].any():
+            _add_small_vessels(values, flow_table()["small"][tissue], part[tissue], kidney[box], spacing_mm)
+    for kind in KINDS:
+        if part[kind].any():
+            own = _box(part[kind])
+            _add_vessels(values[own], flow_table()[kind], part[kind][own], kidney[box][own], spacing_mm)
+    return np.array([axis.start for axis in box]), values
+
+
+def _box(mask: np.ndarray) -> tuple[slice, ...]:
+    """Return the box around a mask, one voxel wider; one voxel of an empty one."""
+    found = ndimage.find_objects(mask.astype(np.uint8))
+    box = found[0] if found else (slice(0, 1),) * 3
+    return tuple(slice(max(a.start - 1, 0), min(a.stop + 1, n)) for a, n in zip(box, mask.shape, strict=True))
+
+
+def _add_of_same_kind(masks: dict[str, np.ndarray], found: np.ndarray, spacing_mm: np.ndarray) -> None:
+    """Add enhanced vessels without a label to the kind of the nearest labelled one."""
+    kinds = np.zeros(found.shape, np.uint8)
+    for code, kind in enumerate(KINDS, start=1):
+        kinds[masks[kind]] = code
+    if kinds.any():
+        distance, nearest = ndimage.distance_transform_edt(
+            kinds == 0, sampling=spacing_mm, return_indices=True
+        )
+        near = found & (distance <= SAME_KIND_MM)
+        for code, kind in enumerate(KINDS, start=1):
+            masks[kind] = masks[kind] | (near & (kinds[tuple(nearest)] == code))
+        found = found & (distance > SAME_KIND_MM)
+    masks["vessel"] = masks["vessel"] | found
+
+
+def _add_small_vessels(
+    values: np.ndarray, table: dict, where: np.ndarray, kidney: np.ndarray, spacing_mm: np.ndarray
+) -> None:
+    """Add flow from the middle of the kidney to its surface, in clusters."""
+    depth = _distance_to_border(kidney, spacing_mm)
+    outward = -_direction(ndimage.gaussian_filter(depth, CAPSULE_SD), spacing_mm)
+    share = np.clip(noise_of(where.shape, table["distance_mm"] / 4 / spacing_mm) - SPARSE, 0, 1)
+    velocity = outward * (np.float32(table["peak_cm_s"] / 100) * share)[..., None]
+    _write(values, table, where, velocity)
+
+
+def _add_vessels(
+    values: np.ndarray, table: dict, where: np.ndarray, kidney: np.ndarray, spacing_mm: np.ndarray
+) -> None:
+    """Add flow along the vessels of one kind."""
+    body, path = _path_to_ends(where, kidney, spacing_mm)
+    inside = ndimage.gaussian_filter(body.astype(np.float32), PATH_SD)
+    smooth = ndimage.gaussian_filter(np.where(body, path, 0), PATH_SD) / np.maximum(inside, 1e-3)
+    direction = _direction(smooth, spacing_mm) * (1 if table["towards_kidney"] else -1)
+    wall = _distance_to_border(where, spacing_mm)
+    radius = ndimage.maximum_filter(wall, 2 * WIDEST + 1)
+    peak = np.interp(radius, table["radius_mm"], table["peak_cm_s"]) / 100
+    profile = 1 - (1 - np.minimum(wall / np.maximum(radius, 1e-6), 1)) ** 2
+    _write(values, table, where & body, direction * (peak * profile)[..., None])
+
+
+def _distance_to_border(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
+    """Return the distance [mm] of the voxels of a mask to the nearest outside it, float32."""
+    distance = ndimage.distance_transform_edt(np.pad(mask, 1), sampling=spacing_mm)
+    return distance[1:-1, 1:-1, 1:-1].astype(np.float32)
+
+
+def _path_to_ends(
+    where: np.ndarray, kidney: np.ndarray, spacing_mm: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mask of the connected vessels, and the length [mm] of the path within them to each one's end far from the kidney."""
+    parts, count = ndimage.label(ndimage.binary_dilation(where))
+    # The surface of the kidney has vessels of its own.
+    inner = ndimage.binary_erosion(kidney)
+    away = ndimage.distance_transform_edt(~inner, sampling=spacing_mm) if inner.any() else 1.0 * where
+    sizes = np.bincount(parts.ravel(), minlength=count + 1)
+    large = [n for n in range(1, count + 1) if sizes[n] >= LEAST_VOXELS]
+    body = np.isin(parts, large)
+    ends = ndimage.maximum_position(away, parts, large) if large else []
+    speed = sitk.GetImageFromArray(body.astype(np.float32))
+    speed.SetSpacing([float(each) for each in spacing_mm[::-1]])
+    trial = [[int(each) for each in end[::-1]] for end in ends]
+    path = sitk.GetArrayFromImage(sitk.FastMarching(speed, trial, 1.0, FAR_MM))
+    path = np.minimum(path, FAR_MM).astype(np.float32)
+    return body & (path < FAR_MM / 10), path
+
+
+def _direction(potential: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
+    """Return the unit direction (nx, ny, nz, 3) in which a potential rises; 0 where it does not."""
+    gradient = [
+        np.gradient(potential, spacing, axis=axis) if potential.shape[axis] > 1 else np.zeros(potential.shape)
+        for axis, spacing in enumerate(spacing_mm)
+    ]
+    along = np.stack(gradient, axis=-1)
+    size = np.linalg.norm(along, axis=-1, keepdims=True)
+    return np.where(size > 1e-6, along / np.maximum(size, 1e-6), 0)
+
+
+def _write(values: np.ndarray, table: dict, where: np.ndarray, velocity: np.ndarray) -> None:
+    values[where, :3] = velocity[where]
+    values[where, 3] = table["resistive_index"]
+    values[where, 4] = 10 ** (table["blood_db"] / 20)
