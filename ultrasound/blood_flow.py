@@ -1,7 +1,7 @@
 """Blood flow at the CT's voxels: in labelled vessels by their kind and width, and in small vessels of the parenchyma. NumPy.
 
-``blood_flow.toml`` is the table. A vessel has a parabolic profile along its centreline, whose direction is that of the shortest path
-within the vessel to its end far from the kidney.
+``blood_flow.toml`` is the table. A vessel has a parabolic profile. Its direction is that of a potential flow from, or to, its
+end far from the kidney.
 """
 
 import json
@@ -11,8 +11,8 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import SimpleITK as sitk
-from scipy import ndimage
+from scipy import ndimage, sparse
+from scipy.sparse import linalg
 
 from sim.stored_arrays import stored
 from ultrasound.acoustics import KIDNEY, classify_tissues, noise_of
@@ -24,12 +24,12 @@ KINDS = ("vessel", "vein", "artery")
 PARENCHYMA = ("kidney", "cortex", "medulla")
 # Enhanced vessels without a label are of the kind of a labelled one up to this distance. Smaller bodies than this are noise.
 SAME_KIND_MM, LEAST_VOXELS = 25.0, 20
-# The path within a vessel, and the direction to the capsule, are smoothed before they are differentiated [voxels].
-PATH_SD, CAPSULE_SD = 1.5, 3.0
+# The potential in a vessel, and the depth below the capsule, are smoothed before they are differentiated [voxels].
+POTENTIAL_SD, CAPSULE_SD = 1.0, 3.0
 # Half width [voxels] of the neighbourhood whose greatest distance from the wall is a vessel's radius: wider ones have plug flow.
 WIDEST = 3
-# Paths longer than a tenth of this do not exist.
-FAR_MM = 1e6
+# The end of a vessel is all that is so near to its furthest voxel.
+END_MM = 1.5
 # Noise of unit SD above this has small vessels: a quarter of the parenchyma.
 SPARSE = 0.7
 # One heartbeat [s], the time to its peak, and the time constant of the fall after it.
@@ -90,10 +90,13 @@ def blood_flow(
     for tissue in PARENCHYMA:
         if part[tissue].any():
             _add_small_vessels(values, flow_table()["small"][tissue], part[tissue], kidney[box], spacing_mm)
+    # Vessels within the kidney have their ends away from its surface: it is not counted.
+    inner = ndimage.binary_erosion(kidney[box])
+    away = _distance_from(inner, spacing_mm)
     for kind in KINDS:
         if part[kind].any():
             own = _box(part[kind])
-            _add_vessels(values[own], flow_table()[kind], part[kind][own], kidney[box][own], spacing_mm)
+            _add_vessels(values[own], flow_table()[kind], part[kind][own], away[own], spacing_mm)
     return np.array([axis.start for axis in box]), values
 
 
@@ -132,18 +135,27 @@ def _add_small_vessels(
 
 
 def _add_vessels(
-    values: np.ndarray, table: dict, where: np.ndarray, kidney: np.ndarray, spacing_mm: np.ndarray
+    values: np.ndarray, table: dict, where: np.ndarray, away: np.ndarray, spacing_mm: np.ndarray
 ) -> None:
-    """Add flow along the vessels of one kind."""
-    body, path = _path_to_ends(where, kidney, spacing_mm)
-    inside = ndimage.gaussian_filter(body.astype(np.float32), PATH_SD)
-    smooth = ndimage.gaussian_filter(np.where(body, path, 0), PATH_SD) / np.maximum(inside, 1e-3)
+    """Add flow along the vessels of one kind, by the distance [mm] from the kidney."""
+    body, potential = _potential(where, away, spacing_mm)
+    inside = ndimage.gaussian_filter(body.astype(np.float32), POTENTIAL_SD)
+    smooth = ndimage.gaussian_filter(potential, POTENTIAL_SD) / np.maximum(inside, 1e-3)
     direction = _direction(smooth, spacing_mm) * (1 if table["towards_kidney"] else -1)
-    wall = _distance_to_border(where, spacing_mm)
+    # From the middle of a voxel to the face of the next.
+    wall = _distance_to_border(where, spacing_mm) - spacing_mm.mean() / 2
     radius = ndimage.maximum_filter(wall, 2 * WIDEST + 1)
     peak = np.interp(radius, table["radius_mm"], table["peak_cm_s"]) / 100
-    profile = 1 - (1 - np.minimum(wall / np.maximum(radius, 1e-6), 1)) ** 2
+    profile = 1 - (1 - np.clip(wall / np.maximum(radius, 1e-6), 0, 1)) ** 2
     _write(values, table, where & body, direction * (peak * profile)[..., None])
+
+
+def _distance_from(kidney: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
+    """Return the distance [mm] from the kidney; without one, from the middle."""
+    if kidney.any():
+        return ndimage.distance_transform_edt(~kidney, sampling=spacing_mm)
+    middle = (np.array(kidney.shape) - 1) / 2
+    return np.linalg.norm((np.moveaxis(np.indices(kidney.shape), 0, -1) - middle) * spacing_mm, axis=-1)
 
 
 def _distance_to_border(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
@@ -152,24 +164,42 @@ def _distance_to_border(mask: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
     return distance[1:-1, 1:-1, 1:-1].astype(np.float32)
 
 
-def _path_to_ends(
-    where: np.ndarray, kidney: np.ndarray, spacing_mm: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mask of the connected vessels, and the length [mm] of the path within them to each one's end far from the kidney."""
+def _potential(where: np.ndarray, away: np.ndarray, spacing_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mask of the connected vessels, and a potential in them whose gradient leads from each one's end far from the kidney.
+
+    It is that of a flow which enters at that end, runs along the walls and is lost evenly on its way: its divergence is -1. ``away`` is the
+    distance from the kidney.
+    """
     parts, count = ndimage.label(ndimage.binary_dilation(where))
-    # The surface of the kidney has vessels of its own.
-    inner = ndimage.binary_erosion(kidney)
-    away = ndimage.distance_transform_edt(~inner, sampling=spacing_mm) if inner.any() else 1.0 * where
     sizes = np.bincount(parts.ravel(), minlength=count + 1)
     large = [n for n in range(1, count + 1) if sizes[n] >= LEAST_VOXELS]
-    body = np.isin(parts, large)
-    ends = ndimage.maximum_position(away, parts, large) if large else []
-    speed = sitk.GetImageFromArray(body.astype(np.float32))
-    speed.SetSpacing([float(each) for each in spacing_mm[::-1]])
-    trial = [[int(each) for each in end[::-1]] for end in ends]
-    path = sitk.GetArrayFromImage(sitk.FastMarching(speed, trial, 1.0, FAR_MM))
-    path = np.minimum(path, FAR_MM).astype(np.float32)
-    return body & (path < FAR_MM / 10), path
+    body, potential = np.isin(parts, large), np.zeros(where.shape, np.float32)
+    furthest = np.full(count + 1, np.inf)
+    furthest[large] = ndimage.maximum(away, parts, large) if large else []
+    unknown = body & (away <= furthest[parts] - END_MM)
+    if unknown.any():
+        laplacian = _laplacian(body, spacing_mm)
+        free = unknown[body]
+        system = laplacian[free][:, free]
+        scale = sparse.diags(1 / system.diagonal())
+        potential[unknown], _ = linalg.cg(system, np.ones(free.sum()), rtol=1e-4, maxiter=3000, M=scale)
+    return body, potential
+
+
+def _laplacian(body: np.ndarray, spacing_mm: np.ndarray) -> sparse.csr_array:
+    """Return minus the Laplacian of the voxels of a mask, through whose border nothing flows [1/mm2]."""
+    index = np.full(body.shape, -1)
+    index[body] = np.arange(body.sum())
+    joined = []
+    for axis, spacing in enumerate(spacing_mm):
+        one, next_one = np.moveaxis(index, axis, 0)[:-1], np.moveaxis(index, axis, 0)[1:]
+        both = (one >= 0) & (next_one >= 0)
+        joined.append((one[both], next_one[both], np.full(both.sum(), spacing**-2.0)))
+    first, second, weight = (np.concatenate(each) for each in zip(*joined, strict=True))
+    size = int(body.sum())
+    pairs = sparse.coo_array((weight, (first, second)), (size, size)).tocsr()
+    pairs = pairs + pairs.T
+    return sparse.csr_array(sparse.diags(pairs.sum(axis=1)) - pairs)
 
 
 def _direction(potential: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:

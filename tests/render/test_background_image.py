@@ -67,12 +67,16 @@ def geometry(**parts) -> Geometry:
 WHOLE = geometry(tumour=(1, 1), parts={"vessel": (1, 1)}, support=(1, 1))
 
 
+@pytest.mark.parametrize("doppler", ["off", "colour"])
 @each_size
-def test_no_part_of_the_window_overlaps_another(size):
+def test_no_part_of_the_window_overlaps_another(size, doppler):
     layout = WindowLayout(*size)
     settings = Settings(young_kpa=15.0, show_scanner=True)
+    settings.doppler = doppler
     placed = boxes_of(settings, WHOLE, layout)
-    over = [layout.findings(layout.most_findings), layout.compass, *(placed[name] for name in SCANNER_GROUPS)]
+    shown = [box for name, box in placed.items() if name in SCANNER_GROUPS]
+    assert len(shown) == 2 and ("Doppler" in placed) == (doppler != "off")
+    over = [layout.findings(layout.most_findings), layout.compass, *shown]
     below = [box for name, box in placed.items() if name not in SCANNER_GROUPS]
     parts = [*over, *below, layout.readouts, *image_boxes(layout)]
     for one, other in combinations(parts, 2):
@@ -101,16 +105,16 @@ def test_the_first_sliders_are_left_out_where_there_is_no_room(size):
 
 
 @pytest.mark.parametrize("width", [*range(704, 1600, 64), 1250])
-@pytest.mark.parametrize("tissue", ["young_kpa", "stiffness"])
-def test_labels_of_sliders_are_whole(width, tissue):
-    settings = Settings(**{tissue: 0.9}, show_scanner=True)
+@pytest.mark.parametrize("tissue, doppler", [("young_kpa", "off"), ("stiffness", "power")])
+def test_labels_of_sliders_are_whole(width, tissue, doppler):
+    settings = Settings(**{tissue: 0.9}, show_scanner=True, doppler=doppler)
     layout = WindowLayout(width, width * 9 // 16)
     groups = groups_of(settings, WHOLE)
     for name, box in boxes_of(settings, WHOLE, layout).items():
         for about in (member.metadata for member in groups[name]):
             label = 7 * len(f"{about['label']} {about['unit']}".strip())
             # Pixels around a label, and of a switch, as Dear ImGui draws them.
-            assert label <= (box.width - 35 if name == "View" else 0.35 * box.width - 16)
+            assert label <= (box.width - 35 if isinstance(about["low"], bool) else 0.35 * box.width - 16)
 
 
 def test_a_missing_structure_has_no_slider():

@@ -1,5 +1,6 @@
 """Probe files, the geometry of scanlines, what of the array touches, and from lines to the picture."""
 
+import json
 import re
 
 import numpy as np
@@ -52,7 +53,7 @@ def test_a_probe_goes_through_plus_names_and_back(tmp_path):
     )
     assert list(named) == [to_pascal(name) for name in Probe.model_fields]
     texts = {key: list(value) if isinstance(value, tuple) else value for key, value in named.items()}
-    written = "\n".join(f"{key} = {value!r}" for key, value in texts.items())
+    written = "\n".join(f"{key} = {json.dumps(value)}" for key, value in texts.items())
     (tmp_path / "mine.toml").write_text(written)
     assert load_probe(str(tmp_path / "mine.toml")) == probe
 

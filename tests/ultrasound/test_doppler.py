@@ -1,0 +1,179 @@
+"""Doppler against 2 f v cos(theta) / c: a vessel phantom, aliasing, the wall filter, tissue that turns, colours."""
+
+import numpy as np
+import pytest
+import taichi as ti
+from test_bmode import BOUNDLESS, TISSUE, Tank, flat_tank, probe_of
+
+from sim.device import start
+from sim.fields import array_of, fill
+from ultrasound.blood_flow import BEAT_S, SYSTOLE_S
+from ultrasound.doppler import BLOOD, STOPPED, Doppler, doppler_shift_khz, noise_energy
+from ultrasound.probe import Probe
+from ultrasound.propagation import Propagation
+from ultrasound.sampled_volume import SampledVolume
+
+SETTINGS = dict(depth_mm=40.0, velocity_scale_cm_s=60.0, wall_filter_cm_s=1.5)
+QUIET, BEATS = {"noise_db": -200.0}, 12
+
+
+class Vessel:
+    """A tank in which blood flows everywhere, or within a slab."""
+
+    def __init__(self) -> None:
+        self.tank: Tank = flat_tank(0.5)
+        self.flow = SampledVolume(np.zeros((1, 1, 1, 5)), np.diag([1e-6, 1e-6, 1e-6, 1.0]), outside=0.0)
+        sound = self.tank.bmode.sound
+        self.straight = Doppler(sound, self.tank.bmode, self.flow)
+        steered = Propagation(
+            sound.tissue_volume,
+            sound.organ,
+            sound.plane,
+            probe_of(),
+            0.5,
+            contact="tissue",
+            contact_gap_mm=1.0,
+        )
+        self.steered = Doppler(steered, self.tank.bmode, self.flow)
+
+    def set_flow(self, velocity_m_s, resistive_index=0.0, amplitude=1.0) -> None:
+        fill((self.flow.voxels, np.tile([*velocity_m_s, resistive_index, amplitude], (8, 1))))
+
+    def look(self, probe: Probe, time_s: float = SYSTOLE_S, **given) -> np.ndarray:
+        """Velocities (beats, scanlines, samples) [cm/s] of the middle of the image at the same time of several beats."""
+        self.tank.look(probe, "speckle")
+        doppler = self.steered if probe.colour_steering_deg else self.straight
+        found = []
+        for beat in range(BEATS):
+            doppler.estimate(probe, time_s + beat * BEAT_S, **given)
+            found.append(doppler.velocity_cm_s(probe)[40:150, 8:60])
+        return np.stack(found)
+
+
+@pytest.fixture(scope="module")
+def vessel():
+    start("cpu")
+    yield Vessel()
+    ti.reset()
+
+
+@pytest.mark.parametrize("angle", [20, 45, 60, 75, 120])
+@pytest.mark.parametrize("speed_cm_s", [12.0, 55.0])
+def test_the_velocity_is_that_of_the_doppler_equation(vessel, angle, speed_cm_s):
+    probe = probe_of(**SETTINGS)
+    vessel.tank.fill(backscatter=0.01)
+    turn = np.radians(angle)
+    # The angle is between the flow and the direction to the array, which is -y.
+    vessel.set_flow(np.array([np.sin(turn), -np.cos(turn), 0.0]) * speed_cm_s / 100)
+    found = np.median(vessel.look(probe))
+    shift_khz = 2 * probe.frequency_mhz * 1e3 * (speed_cm_s / 100) * np.cos(turn) / 1540
+    assert doppler_shift_khz(probe, found) == pytest.approx(shift_khz, rel=0.05)
+
+
+@pytest.mark.parametrize("steering", [-15.0, 12.0])
+def test_steered_scanlines_see_a_vessel_parallel_to_the_face(vessel, steering):
+    vessel.tank.fill(backscatter=0.01)
+    vessel.set_flow([0.4, 0.0, 0.0])
+    probe = probe_of(**SETTINGS, colour_steering_deg=steering)
+    found = np.median(vessel.look(probe))
+    assert found == pytest.approx(-40.0 * np.sin(np.radians(steering)), rel=0.05)
+    # Unsteered, nothing passes the wall filter.
+    vessel.look(probe_of(**SETTINGS))
+    energy = array_of(vessel.straight.moment)[40:150, 8:60, 2]
+    assert energy.max() < 2 * STOPPED * 0.01**2
+
+
+def test_a_velocity_beyond_the_scale_aliases(vessel):
+    vessel.tank.fill(backscatter=0.01)
+    vessel.set_flow([0.0, -0.7, 0.0])
+    probe = probe_of(**SETTINGS)
+    assert np.median(vessel.look(probe)) == pytest.approx(70.0 - 2 * 60.0, rel=0.05)
+
+
+def test_the_scale_ends_where_echoes_of_the_whole_depth_cannot_return_in_time():
+    deep = probe_of(depth_mm=200.0, velocity_scale_cm_s=200.0)
+    # c / (2 depth) pulses a second; c PRF / (4 f).
+    assert deep.velocity_limit_cm_s == pytest.approx(100 * 1540 * (1540 / 0.4) / (4 * 7.5e6))
+    assert probe_of(**SETTINGS).velocity_limit_cm_s == 60.0
+
+
+@pytest.mark.parametrize("share, passed", [(0.5, 0.5**8), (1.0, 0.5), (2.0, 1.0)])
+def test_the_wall_filter_stops_what_is_slow(vessel, share, passed):
+    vessel.tank.fill()
+    vessel.set_flow([0.0, -share * 0.1, 0.0])
+    vessel.look(probe_of(**SETTINGS | {"wall_filter_cm_s": 10.0}))
+    energy = array_of(vessel.straight.moment)[100, 20:40, 2]
+    assert energy == pytest.approx(BLOOD**2 * passed / (1 if share < 2 else 1 + 2.0**-8), rel=0.01)
+
+
+def test_blood_of_a_clamped_kidney_rests_and_pulses_otherwise(vessel):
+    vessel.tank.fill(backscatter=0.01)
+    vessel.set_flow([0.0, -0.4, 0.0], resistive_index=0.6)
+    probe = probe_of(**SETTINGS)
+    systole, diastole = (np.median(vessel.look(probe, time_s=t)) for t in (SYSTOLE_S, BEAT_S - 1e-4))
+    # The error of the median of some thousand independent samples of 4 cm/s each, three times.
+    assert systole == pytest.approx(40.0, abs=0.6) and diastole == pytest.approx(16.0, abs=0.6)
+    assert np.median(vessel.look(probe, time_s=SYSTOLE_S + 3 * BEAT_S)) == pytest.approx(systole, rel=0.02)
+    vessel.look(probe, clamped=True)
+    assert array_of(vessel.straight.moment)[40:150, 8:60, 2].max() < 2 * STOPPED * 0.01**2
+
+
+def test_the_sample_volume_averages_and_keeps_the_energy(vessel):
+    """Blood is where y > 20, moving towards the array."""
+    vessel.tank.fill()
+    ramp = SampledVolume(
+        np.tile([0.0, -0.3, 0.0, 0.0, 1.0], (1, 200, 1, 1)) * (np.arange(200) >= 100)[None, :, None, None],
+        np.array([[1e-6, 0, 0, 0], [0, 5.0, 0, 0], [0, 0, 1e-6, 0], [0, 0, 0, 1.0]]),
+        outside=0.0,
+    )
+    doppler, probe = Doppler(vessel.tank.bmode.sound, vessel.tank.bmode, ramp), probe_of(**SETTINGS, **QUIET)
+    vessel.tank.look(probe, "speckle")
+    doppler.estimate(probe, SYSTOLE_S)
+    energy = array_of(doppler.mean)[60:130, :, 2].mean(axis=0) / BLOOD**2
+    step = vessel.tank.bmode.sound.stride_of(probe) * probe.sample_mm
+    depth = step * np.arange(len(energy))
+    at = np.interp(0.5, energy[(depth > 15) & (depth < 25)], depth[(depth > 15) & (depth < 25)])
+    assert at == pytest.approx(20.0 * 1.54 / 1.5588, abs=step)
+    assert energy[depth < 17].max() < 1e-6 and energy[(depth > 23) & (depth < 38)] == pytest.approx(
+        1, rel=0.2
+    )
+
+
+def test_noise_without_flow_is_not_shown_and_moving_blood_has_its_colour(vessel):
+    probe = probe_of(**SETTINGS | {"noise_db": -105.0})
+    vessel.tank.fill(backscatter=1e-4)
+    vessel.set_flow([0.0, 0.0, 0.0])
+    vessel.tank.look(probe, "speckle")
+    grey = vessel.tank.picture
+    rest = vessel.straight.render(probe, grey, "colour", SYSTOLE_S)
+    # Exceeding the threshold of 6 dB is rare: exp(-4) of the samples, of which some are slow.
+    assert (rest != grey[..., None]).any(axis=-1).mean() < 0.02
+    for sign, brighter, darker in ((-1, 0, 2), (1, 2, 0)):
+        vessel.set_flow([0.0, 0.3 * sign, 0.0])
+        shown = vessel.straight.render(probe, grey, "colour", SYSTOLE_S)[40:200, 40:200].astype(int)
+        assert (shown[..., brighter] > shown[..., darker] + 50).mean() > 0.95
+    power = vessel.straight.render(probe, grey, "power", SYSTOLE_S)[40:200, 40:200].astype(int)
+    assert (power[..., 0] > power[..., 2]).mean() > 0.95
+    # A bright B-mode image has priority.
+    white = vessel.straight.render(probe, np.full_like(grey, 220), "colour", SYSTOLE_S)
+    assert (white == 220).all()
+
+
+def test_the_error_of_an_estimate_is_that_of_ten_pulses(vessel):
+    """Kasai's estimate of N pulses: the autocorrelation has a relative error of 1 / sqrt(N), half of it across its phase."""
+    probe = probe_of(**SETTINGS | {"noise_db": -105.0})
+    vessel.tank.fill()
+    vessel.set_flow([0.0, -0.3, 0.0])
+    found = vessel.look(probe)
+    assert noise_energy(probe) < 1e-3 * BLOOD**2
+    assert np.std(found) / 60.0 * np.pi == pytest.approx(np.sqrt(0.5 / 10), rel=0.15)
+
+
+def test_an_anatomy_has_flow_only_within_its_volume(vessel):
+    tank = Tank((BOUNDLESS,) * 3, (1, 1, 1), (0.0, 0.0, 0.0))
+    tank.fill(TISSUE, 0.0, 0.01)
+    nowhere = SampledVolume(np.ones((1, 1, 1, 5)), np.array([[1, 0, 0, 500.0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), outside=0.0)  # fmt: skip
+    doppler, probe = Doppler(tank.bmode.sound, tank.bmode, nowhere), probe_of(**SETTINGS, **QUIET)
+    tank.look(probe, "speckle")
+    doppler.estimate(probe)
+    assert array_of(doppler.moment)[..., 2].max() < 2 * STOPPED * 0.01**2
