@@ -33,7 +33,7 @@ PRIORITY = 0.65
 # Amplitude of blood in a vessel, relative to a perfect reflector.
 BLOOD = 10 ** ((CORTEX_DB + tissue_table()["vessel"]["backscatter_db"]) / 20)
 # Share of the energy of tissue at rest that the wall filter lets pass.
-STOPPED = 1e-8
+STOPPED = 2e-9
 # Scanlines from one independent value of noise to the next.
 NOISE_LINES = 3.0
 # Colours from no velocity to the limit of the scale, towards the array and away from it; and from no power to the most.
