@@ -178,4 +178,6 @@ def _draw_scale(draw: ImageDraw.ImageDraw, layout: WindowLayout, view: View, box
         colour = tuple(colours[i * (len(colours) - 1) // max(1, height - 1)].tolist())
         draw.line([(left, box.top + i), (right, box.top + i)], fill=colour)
     for text, row, anchor in zip(view.scale, (box.top - px(2), box.top + height + px(2)), "ba", strict=True):
-        draw.text((box.right + WEDGE_WIDTH, row), text, font=font(px(13)), fill=QUIET, anchor=f"r{anchor}")
+        draw.text(
+            (box.right + WEDGE_WIDTH - px(4), row), text, font=font(px(12)), fill=QUIET, anchor=f"r{anchor}"
+        )
