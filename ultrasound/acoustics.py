@@ -31,10 +31,11 @@ MAST_SLOPE, MAST_OFFSET = 0.893, 349.0
 SEED = 20160101
 MIN_HU, MAX_HU = -1024, 3071
 
-IMPEDANCE, ATTENUATION, BACKSCATTER = range(3)
+CHANNELS = IMPEDANCE, ATTENUATION, BACKSCATTER, ANISOTROPY = range(4)
 
 # Classification by HU: fat and stones of a kidney, tumour necrosis, bone, enhanced vessels.
 FAT_BELOW_HU = -30.0
+HARD_TISSUES = ("stone", "metal")
 STONE_ABOVE_MEDIAN_HU = 130.0
 NECROSIS_BELOW_MEDIAN_HU = 40.0
 # Fat in a concavity of the kidney no wider than twice this is renal sinus.
@@ -45,6 +46,10 @@ ENHANCED_FROM_HU, BLOOD_ABOVE_HU = 100.0, 140.0
 SHELL_ABOVE_HU, BONE_ABOVE_HU, MIN_BONE_ML = 250.0, 350.0, 0.4
 # Bones are searched in blocks of voxels of this size, and continued beyond the CT's border as far as this.
 COARSE_MM, BEYOND_MM = 1.8, 45.0
+# Above this only metal.
+METAL_ABOVE_HU = 2500.0
+# A tumour's pseudocapsule, and the arcuate vessels: thickness of the layer, distance and share of the places that have them.
+PSEUDOCAPSULE_MM, ARCUATE_MM, ARCUATE_APART_MM, ARCUATE_SHARE = 1.0, 1.0, 2.5, 0.25
 KIDNEY = ("kidney", "cortex", "medulla", "sinus", "urine")
 
 
@@ -108,7 +113,8 @@ def properties(
     tissue_of_label: Mapping[int, str] | None = None,
     spacing_mm: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return impedance [MRayl], attenuation [dB/cm/MHz] and backscattered amplitude (1: perfect reflector), (..., 3) float32.
+    """Return impedance [MRayl], attenuation [dB/cm/MHz], backscattered amplitude (1: perfect reflector) and its anisotropy [dB], (..., 4)
+    float32.
 
     ``hu`` and ``labels`` are integers of the same shape; 0 and labels without a tissue are classified by HU. Raises TissueError.
     """
@@ -134,26 +140,28 @@ def properties(
     for tissue, here in classify_tissues(hu, labelled, spacing).items():
         labelled[tissue] = labelled[tissue] | here if tissue in labelled else here
     labelled = {tissue: where for tissue, where in labelled.items() if where.any()}
-    stone = labelled.pop("stone", None)
+    hard = [labelled.pop(tissue, None) for tissue in HARD_TISSUES]
     for tissue, where in labelled.items():
         table = tissue_table()[tissue]
         values[where, IMPEDANCE] = table["impedance_mrayl"]
         values[where, ATTENUATION] = table["attenuation_db_cm_mhz"]
+        values[where, ANISOTROPY] = table.get("anisotropy_db", 0.0)
         level[where] = table["backscatter_db"] + texture(table, where)
-    for channel in (IMPEDANCE, ATTENUATION):
+    for channel in (IMPEDANCE, ATTENUATION, ANISOTROPY):
         values[..., channel] = ndimage.gaussian_filter(values[..., channel], SMOOTHING_VOXELS, truncate=2.5)
     level = ndimage.gaussian_filter(level, LEVEL_SMOOTHING_VOXELS, truncate=2.5)
     values[..., BACKSCATTER] = np.float32(10) ** ((level + np.float32(CORTEX_DB)) / np.float32(20))
-    if stone is not None:
-        _add_stones(values, stone)
+    for tissue, where in zip(HARD_TISSUES, hard, strict=True):
+        if where is not None:
+            _add_hard(values, tissue, where)
     return values
 
 
-def _add_stones(values: np.ndarray, stone: np.ndarray) -> None:
-    """Add stones at full impedance: smoothed like the rest, one of a few voxels would be soft."""
-    table = tissue_table()["stone"]
+def _add_hard(values: np.ndarray, tissue: str, where: np.ndarray) -> None:
+    """Add stones or clips at full impedance: smoothed like the rest, one of a few voxels would be soft."""
+    table = tissue_table()[tissue]
     share = np.minimum(
-        2 * ndimage.gaussian_filter(stone.astype(np.float32), SMOOTHING_VOXELS, truncate=2.5), 1
+        2 * ndimage.gaussian_filter(where.astype(np.float32), SMOOTHING_VOXELS, truncate=2.5), 1
     )
     level = 10 ** ((table["backscatter_db"] + CORTEX_DB) / 20)
     for channel, value in enumerate((table["impedance_mrayl"], table["attenuation_db_cm_mhz"], level)):
@@ -161,12 +169,12 @@ def _add_stones(values: np.ndarray, stone: np.ndarray) -> None:
 
 
 def _by_hounsfield(hu: np.ndarray) -> np.ndarray:
-    """Return values (..., 3) of HU, backscatter in dB, from a table of integer HU."""
+    """Return values (..., 4) of HU, backscatter in dB, from a table of integer HU."""
     table = tissue_table()["hounsfield"]
     every = np.arange(MIN_HU, MAX_HU + 1)
     attenuation = np.interp(every, table["hu"], table["attenuation_db_cm_mhz"])
     level = np.interp(every, table["hu"], table["backscatter_db"])
-    values = np.column_stack([impedance_of_tissue(every), attenuation, level]).astype(np.float32)
+    values = np.column_stack([impedance_of_tissue(every), attenuation, level, 0 * level]).astype(np.float32)
     # Removes the noise of the CT.
     smooth = ndimage.gaussian_filter(np.asarray(hu, np.float32), SMOOTHING_VOXELS, truncate=2.5)
     return values[np.clip(np.rint(smooth), MIN_HU, MAX_HU).astype(np.int16) - MIN_HU]
@@ -202,10 +210,33 @@ def classify_tissues(
         if median > ENHANCED_FROM_HU and "urine" in labelled:
             # Partial-volume voxels around enhanced urine are as bright.
             found["stone"] &= ~ndimage.binary_dilation(labelled["urine"])
+    if "cortex" in labelled and "medulla" in labelled:
+        found["arcuate"] = _arcuate(labelled["cortex"], labelled["medulla"], spacing_mm)
+    found["metal"] = hu > METAL_ABOVE_HU
     tumour = labelled.get("tumour")
     if tumour is not None and tumour.any():
+        found["pseudocapsule"] = _border(tumour, ~tumour, PSEUDOCAPSULE_MM, spacing_mm)
         found["necrosis"] = tumour & (hu < np.median(hu[tumour]) - NECROSIS_BELOW_MEDIAN_HU)
     return found
+
+
+def _arcuate(cortex: np.ndarray, medulla: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:
+    """Return the places between cortex and medulla where arcuate vessels are."""
+    border = _border(medulla, cortex, ARCUATE_MM, spacing_mm)
+    if not border.any():
+        return border
+    places = noise_of(border.shape, ARCUATE_APART_MM / 2 / spacing_mm)
+    return border & (places > np.quantile(places[border], 1 - ARCUATE_SHARE))
+
+
+def _border(
+    inside: np.ndarray, outside: np.ndarray, thickness_mm: float, spacing_mm: np.ndarray
+) -> np.ndarray:
+    """Return the part of a mask within a thickness of another, at least one voxel thick."""
+    if not (inside.any() and outside.any()):
+        return np.zeros_like(inside)
+    distance = ndimage.distance_transform_edt(~outside, sampling=spacing_mm)
+    return inside & (distance <= max(thickness_mm, spacing_mm.min()) + 1e-6)
 
 
 def enclosed(kidney: np.ndarray, spacing_mm: np.ndarray) -> np.ndarray:

@@ -27,6 +27,7 @@ from ultrasound.lateral_kernel import (
 from ultrasound.probe import DOPPLER_SETTINGS, GREY_EXPONENTS, DetailLevel, Probe
 from ultrasound.propagation import Propagation
 from ultrasound.pulse import DB_OF_NEPER, PATH_ENTRIES
+from ultrasound.reverberation import FACE, LEAST_REPEATED, Reverberation, ringing
 from ultrasound.speckle import COMPONENTS, LEAST_WEIGHT, SIZE, UNIT, Speckle, elevation_levels
 
 Packet = ti.types.vector(LANES, ti.f32)
@@ -43,6 +44,7 @@ class BMode:
 
     def __init__(self, sound: Propagation, probe: Probe) -> None:
         self.sound, self.plane, self.speckle = sound, sound.plane, Speckle()
+        self.reverberation = Reverberation(sound)
         shape = self.lines, self.samples = probe.number_of_scanlines, probe.number_of_samples_per_scanline
         most, packets, self.groups = self.sound.most, self.samples // LANES, -(-self.lines // GROUP)
         # Scattered signal, with room for the taps that lengthen it; and the signal of the scanlines.
@@ -64,6 +66,7 @@ class BMode:
         self.speckle_gain = ti.field(ti.f32, (CLASSES, packets))
         self.scanline_class, self.side = ti.field(ti.i32, self.lines), ti.field(ti.i32, self.lines)
         self.gain = ti.field(ti.f32, self.samples)
+        self.ringing = ti.field(ti.f32, (2, self.samples))
         # Grey value at even steps of the dynamic range.
         self.grey = ti.field(ti.f32, GREY_STEPS + 1)
         self.source = ti.Vector.field(2, ti.f32, (self.plane.pixels, self.plane.pixels))
@@ -80,6 +83,8 @@ class BMode:
         self.sound.run(probe, thick=detail_level == "elevation")
         stride = self.sound.stride_of(probe)
         has_speckle = detail_level != "reflection"
+        if has_speckle:
+            self.reverberation.run(self.samples // stride + 1, stride * probe.sample_mm)
         speckle_sd, look = probe.speckle_sd_mm, round(8 * probe.steering_deg)
         self._set_levels(has_speckle, self.samples // stride + 1)
         if has_speckle:
@@ -134,6 +139,7 @@ class BMode:
             (self.half, half),
             (self.scanline_class, classes),
             (self.side, side),
+            (self.ringing, ringing(probe)),
             (self.source, source),
         )
 
@@ -141,7 +147,10 @@ class BMode:
     def _set_levels(self, has_clutter: ti.template(), count: int):
         """Set the level of scattering at each tissue sample, with the clutter."""
         for line, k in ti.ndrange(self.lines, count):
-            self.level[line, k] = self.sound.amplitude[line, k] * self.sound.tissue[line, k].z
+            level = self.sound.amplitude[line, k] * self.sound.tissue[line, k].z
+            if ti.static(has_clutter):
+                level += self.reverberation.level[line, k]
+            self.level[line, k] = level
         if ti.static(has_clutter):
             for group, k in ti.ndrange(self.groups, count):
                 first, last = group * GROUP, ti.min((group + 1) * GROUP, self.lines)
@@ -209,8 +218,10 @@ class BMode:
                 real += weight * self.packet(self.scattered_real, line, at)
                 imaginary += weight * self.packet(self.scattered_imaginary, line, at)
             gain = self.speckle_gain[self.scanline_class[line], packet]
+            contact = self.sound.contact[line]
             for i in ti.static(range(LANES)):
-                self.real[line, first + i] = gain * real[i]
+                rings = tm.mix(self.ringing[0, first + i], self.ringing[1, first + i], contact)
+                self.real[line, first + i] = gain * real[i] + rings
                 self.imaginary[line, first + i] = gain * imaginary[i]
 
     @ti.kernel
@@ -240,6 +251,10 @@ class BMode:
         if ti.static(has_speckle):
             diffuse = amplitude * echo.y * self.speckle_at(line, echo.z / step_mm, speckle_sd, look)
             sd = self.sound.at_path(self.axial_sd, path)
+            mirror = ti.abs(amplitude * echo.x)
+            if mirror > LEAST_REPEATED:
+                # Once more by way of the face.
+                self.add_pulse(line, 2.0 * echo.z / sample_mm - 0.5, sd / sample_mm, FACE * mirror**2)
         at, reach = echo.z / sample_mm - 0.5, ti.ceil(3.5 * sd / sample_mm, ti.i32)
         first = ti.max(ti.floor(at, ti.i32) - reach, 0)
         last = ti.min(ti.floor(at, ti.i32) + reach + 1, self.samples - 1)
@@ -253,6 +268,14 @@ class BMode:
             else:
                 both = amplitude * ti.sqrt(echo.x**2 + echo.y**2)
                 self.real[line, i] = self.real[line, i] + pulse * both
+
+    @ti.func
+    def add_pulse(self, line, at, sd, amplitude):
+        """Add an echo at a fractional sample, of a length in samples."""
+        reach = ti.ceil(3.5 * sd, ti.i32)
+        for i in range(ti.floor(at, ti.i32) - reach, ti.min(ti.floor(at, ti.i32) + reach + 2, self.samples)):
+            off = (i - at) / sd
+            self.real[line, i] = self.real[line, i] + amplitude * ti.exp(-0.5 * off * off)
 
     @ti.func
     def speckle_at(self, line, at, speckle_sd, look):

@@ -56,6 +56,7 @@ class Probe(BaseModel):
     lens, focused at ``elevation_focus_mm``, shape the beam across the image plane; ``elevation_width_mm`` is the slice thickness
     that counts as scanned (coverage). ``bandwidth_percent`` is the -6 dB width of a round trip through the array, relative to the
     frequency. ``noise_db`` is the scanner's electronic noise before gain; 0 dB is the echo of a perfect reflector at the face.
+    ``ringing_db`` is the array's own vibration there, which dies down in the near field.
     ``harmonics`` receives at ``frequency_mhz`` what arises in tissue from half of it. ``compound_angles`` images, steered by different
     angles, are averaged. ``steering_deg`` turns the scanlines from the face's normal towards +u, ``colour_steering_deg`` those of Doppler on a linear array. ``velocity_scale_cm_s`` is the greatest velocity that Doppler
     shows without aliasing, ``wall_filter_cm_s`` the least. ``depth_compensation_db_cm_mhz`` is the attenuation that the scanner's built-in TGC compensates, to which the sliders of ``time_gain_compensation`` [%] add.
@@ -86,6 +87,7 @@ class Probe(BaseModel):
     elevation_width_mm: float = Field(2.0, gt=0, le=20)
     bandwidth_percent: float = Field(75.0, ge=20, le=150)
     noise_db: float = Field(-105.0, ge=-200, le=0)
+    ringing_db: float = Field(-36.0, ge=-200, le=0)
     gain_percent: Percent = 54.0
     dyn_range_db: float = Field(60.0, ge=20, le=120)
     grey_map: GreyMap = "dark"

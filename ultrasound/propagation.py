@@ -39,9 +39,9 @@ RAYS = 7
 
 @ti.dataclass
 class TissueSample:
-    """Impedance, attenuation and backscatter; the rest position [mm]; the map (3, 4) from the image plane to it."""
+    """Impedance, attenuation, backscatter and its anisotropy; the rest position [mm]; the map (3, 4) from the image plane to it."""
 
-    tissue: tm.vec3
+    tissue: tm.vec4
     rest: tm.vec3
     linear: ti.types.matrix(3, 4, ti.f32)
 
@@ -50,7 +50,7 @@ class TissueSample:
 class Propagation:
     """Sound along the scanlines of a probe, at tissue samples ``stride_of`` scanline samples apart.
 
-    ``tissue_volume`` (.., 3) has impedance, attenuation and backscatter (``acoustics.properties``), ``organ`` the signed distance
+    ``tissue_volume`` (.., 4) has impedance, attenuation, backscatter and its anisotropy (``acoustics.properties``), ``organ`` the signed distance
     from the organ's surface [mm], both at rest; ``plane`` is a ``PlaneInTissue`` of the scanner. An element transmits and receives
     only in contact: with the organ, nearer than ``contact_gap_mm``, or, where ``contact`` is "tissue", with anything but gas.
     ``around`` is the impedance [MRayl] of all that is outside the organ; None for what the CT shows there.
@@ -173,11 +173,25 @@ class Propagation:
         for k in range(count):
             planes = ti.static(THICK_PLANE if thick else CENTRAL_PLANE)
             found = self.tissue_at(planes, self.start[line] + depth * self.direction[line], self.slice_sd[k])
-            self.tissue[line, k] = found.tissue
+            self.tissue[line, k] = found.tissue.xyz
+            if found.tissue.w > 0.0:
+                self.tissue[line, k].z *= self.anisotropy(found, self.direction[line])
             self.rest[line, k] = found.rest
             self.across[line, k] = found.linear[:, 2]
             self.depth[line, k] = depth
             depth += step_mm * speed_ratio(found.tissue.x)
+
+    @ti.func
+    def anisotropy(self, found, direction):
+        """Return the factor of backscattered amplitude where the beam meets tubules, which run to the capsule, at an angle.
+
+        Its mean over all directions, in dB, is 0.
+        """
+        tubule = self.organ.slope(found.rest)
+        along = found.linear[:, 0] * direction.x + found.linear[:, 1] * direction.y
+        size = tubule.norm_sqr() * along.norm_sqr()
+        squarely = 1.0 - tubule.dot(along) ** 2 / ti.max(size, 1e-12)
+        return ti.exp(found.tissue.w * (squarely - 2.0 / 3.0) / DB_OF_NEPER)
 
     @ti.func
     def place(self, line, k):
@@ -192,14 +206,14 @@ class Propagation:
         row, column = self.plane.pixel_near(place)
         linear = self.plane.rest_from_plane(row, column)
         rest = linear @ tm.vec4(place, 0.0, 1.0)
-        found = tm.vec3(0.0)
+        found = tm.vec4(0.0)
         for off, weight in ti.static(planes):
             there = self.tissue_volume.sample(rest + (off * slice_sd) * linear[:, 2])
-            found += weight * tm.vec3(there.x, there.y, there.z**2)
+            found += weight * tm.vec4(there.x, there.y, there.z**2, there.w)
         found.z = ti.sqrt(found.z)
         if ti.static(self.organ_alone):
             if not (self.plane.is_tissue(row, column) and self.organ.sample(rest) <= 0.0):
-                found = tm.vec3(self.around, 0.0, 0.0)
+                found = tm.vec4(self.around, 0.0, 0.0, 0.0)
         return TissueSample(found, rest, linear)  # type: ignore[call-arg]
 
     @ti.kernel

@@ -132,6 +132,24 @@ class SampledVolume:
         return self.linear.transpose() @ along
 
     @ti.func
+    def slope(self, p):
+        """Return the gradient [1/mm] of the trilinear value at p [mm] of a volume of scalars, within its cell; zero outside."""
+        first, t, inside = self.cell_at(p)
+        along = tm.vec3(0.0)
+        if inside:
+            x, y = ti.static(self.strides)
+            low = tm.vec4([self.voxels[first + i] for i in ti.static((0, y, x, x + y))])
+            high = tm.vec4([self.voxels[first + i + 1] for i in ti.static((0, y, x, x + y))])
+            v = tm.mix(low, high, t.z)
+            rise = high - low
+            along = tm.vec3(
+                tm.mix(v.z - v.x, v.w - v.y, t.y),
+                tm.mix(v.y - v.x, v.w - v.z, t.x),
+                tm.mix(tm.mix(rise.x, rise.y, t.y), tm.mix(rise.z, rise.w, t.y), t.x),
+            )
+        return self.linear.transpose() @ along
+
+    @ti.func
     def first_value(self, at):
         """Return the first trilinear value at an index within the grid."""
         most = ti.Vector([self.count[0] - 2, self.count[1] - 2, self.count[2] - 2])

@@ -32,7 +32,7 @@ class EchoPhantom:
         index_from_mm = np.diag([1 / VOXEL_MM, 1 / VOXEL_MM, 1 / FAR_MM, 1.0])
         index_from_mm[:2, 3] = -low / VOXEL_MM
         self.u, self.v = low[:, None, None] + VOXEL_MM * np.indices(count)
-        self.tissue = SampledVolume(np.zeros((*count, 1, 3)), index_from_mm, outside=0.0)
+        self.tissue = SampledVolume(np.zeros((*count, 1, 4)), index_from_mm, outside=0.0)
         organ = SampledVolume(np.full((1, 1, 1), -1.0), np.diag([1 / FAR_MM] * 3 + [1.0]))
         self.plane = PlaneInTissue(Unmoved(), PIXELS)
         self.bmode = BMode(Propagation(self.tissue, organ, self.plane, probe, VOXEL_MM), probe)
@@ -50,11 +50,11 @@ class EchoPhantom:
         self, impedance: Values = IMPEDANCE, attenuation: Values = 0.0, backscatter: Values = 0.0
     ) -> None:
         """Set impedance [MRayl], attenuation [dB/cm/MHz] and backscatter."""
-        values = np.empty((*self.u.shape, 1, 3), np.float32)
+        values = np.zeros((*self.u.shape, 1, 4), np.float32)
         for channel, given in enumerate((impedance, attenuation, backscatter)):
             values[..., 0, channel] = given(self.u, self.v) if callable(given) else given
         thin = np.pad(values, [(0, 0), (0, 0), (0, 1), (0, 0)], mode="edge")
-        fill((self.tissue.voxels, thin.reshape(-1, 3)))
+        fill((self.tissue.voxels, thin.reshape(-1, 4)))
 
     def amplitude(
         self,

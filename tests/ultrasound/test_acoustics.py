@@ -6,6 +6,7 @@ import pytest
 from sim import stored_arrays
 from ultrasound import acoustics
 from ultrasound.acoustics import (
+    ANISOTROPY,
     ATTENUATION,
     BACKSCATTER,
     CORTEX_DB,
@@ -70,7 +71,7 @@ def test_impedance_of_kidney_is_that_of_tables_and_rises_with_hu():
 def test_without_labels_everything_goes_by_hu():
     for hu in (-100.0, 40.0, 300.0):
         values = properties(np.full(SHAPE, hu, np.float32))
-        assert values.dtype == np.float32 and values.shape == (*SHAPE, 3)
+        assert values.dtype == np.float32 and values.shape == (*SHAPE, 4)
         table = tissue_table()["hounsfield"]
         assert values[..., IMPEDANCE] == pytest.approx(float(impedance_of_hu(hu)), rel=1e-6)
         wanted = np.interp(hu, table["hu"], table["attenuation_db_cm_mhz"])
@@ -82,8 +83,9 @@ def test_a_label_wins_over_hu_away_from_borders(tissue):
     hu, labels = labelled()
     by_hu = properties(hu)
     values = properties(hu, labels, {1: tissue, 2: "bone"})
-    # Smoothing reaches two voxels; what a tumour's or a kidney's HU tell of its parts is not told by even ones.
-    core = values[block(12)][..., :2]
+    # Smoothing reaches two voxels, and a tumour's pseudocapsule is one thick; what a tumour's or a kidney's HU tell of its parts is
+    # not told by even ones.
+    core = values[block(10)][..., :2]
     assert core == pytest.approx(np.broadcast_to(expected(tissue), core.shape), rel=1e-6)
     away = np.ones(SHAPE, bool)
     away[block(20)] = False
@@ -131,11 +133,49 @@ def test_a_stone_scatters_as_the_table_says():
 
 
 def test_what_of_a_tumour_takes_up_no_agent_is_necrosis():
-    hu, labels = labelled()
+    hu, labels = labelled(20)
     hu[block(6)] = 30.0
     values = properties(hu, labels, {1: "tumour"})
     assert values[12, 12, 12, :2] == pytest.approx(expected("necrosis"), rel=1e-6)
     assert values[6, 6, 6, :2] == pytest.approx(expected("tumour"), rel=1e-6)
+
+
+def test_a_tumour_has_a_dark_pseudocapsule_one_millimetre_thick():
+    hu, labels = labelled(20)
+    values = properties(hu, labels, {1: "tumour"}, np.full(3, 0.5))
+    # Voxels of 0.5 mm: two layers of it, smoothed.
+    along = values[:, 12, 12]
+    assert along[3, IMPEDANCE] == pytest.approx(expected("pseudocapsule")[0], abs=0.02)
+    level = 20 * np.log10(along[:, BACKSCATTER]) - CORTEX_DB
+    table = tissue_table()
+    rim, core = (table[tissue]["backscatter_db"] for tissue in ("pseudocapsule", "tumour"))
+    assert level[2:4].mean() == pytest.approx(rim, abs=3.0) and np.median(level[6:18]) == pytest.approx(core, abs=5.0)
+
+
+def test_arcuate_vessels_are_bright_in_places_between_cortex_and_medulla():
+    hu, labels = labelled(20)
+    labels[block(10)] = 2
+    values = properties(hu, labels, {1: "cortex", 2: "medulla"}, np.full(3, 1.0))
+    level = 20 * np.log10(values[..., BACKSCATTER]) - CORTEX_DB
+    border, deep = level[7, 8:16, 8:16], level[block(4)]
+    assert 0.1 < (border > 0).mean() < 0.5 and deep.max() < -4
+
+
+def test_only_parenchyma_is_anisotropic():
+    hu, labels = labelled()
+    table = tissue_table()
+    for tissue in ("kidney", "cortex", "medulla", "tumour", "liver"):
+        found = properties(hu, labels, {1: tissue})[block(8)][..., ANISOTROPY]
+        assert found == pytest.approx(table[tissue].get("anisotropy_db", 0.0), rel=1e-5)
+        assert (found > 0).all() == (tissue in ("kidney", "cortex", "medulla"))
+    assert (properties(hu)[..., ANISOTROPY] == 0).all()
+
+
+def test_what_is_brighter_than_bone_is_metal():
+    hu = np.full(SHAPE, 55.0, np.float32)
+    hu[block(2)] = 3000.0
+    values = properties(hu)
+    assert values[12, 12, 12, IMPEDANCE] > 20 and values[2, 2, 2, IMPEDANCE] < 1.8
 
 
 def test_fat_in_a_kidneys_hollow_is_sinus_and_fat_around_it_is_not():
@@ -184,7 +224,7 @@ def test_the_same_voxels_have_the_same_properties():
     first = properties(hu, labels, {1: "kidney"}, np.array([0.8, 0.9, 1.0]))
     assert (properties(hu, labels, {1: "kidney"}, np.array([0.8, 0.9, 1.0])) == first).all()
     assert (hu == given[0]).all() and (labels == given[1]).all()
-    assert np.isfinite(first).all() and (first > 0).all()
+    assert np.isfinite(first).all() and (first[..., :ANISOTROPY] > 0).all()
 
 
 @pytest.mark.parametrize("hu", [60.0, 110.0, 150.0])
@@ -213,9 +253,9 @@ def test_a_labelled_cyst_of_3_mm_reaches_its_level():
 def test_every_tissue_has_sane_values(tissue):
     table = tissue_table()[tissue]
     keys = {"impedance_mrayl", "attenuation_db_cm_mhz", "backscatter_db", "texture_db", "texture_mm"}
-    assert set(table) == keys
-    # From fat to cortical bone, from water to what nothing passes; and no echo above all of the sound.
-    assert 1.3 < table["impedance_mrayl"] < 8.0 and 0 < table["attenuation_db_cm_mhz"] <= 12.0
+    assert set(table) - {"anisotropy_db"} == keys and 0 <= table.get("anisotropy_db", 0) < 6
+    # From fat to cortical bone, or titanium, from water to what nothing passes; and no echo above all of the sound.
+    assert 1.3 < table["impedance_mrayl"] < (28.0 if tissue == "metal" else 8.0) and 0 < table["attenuation_db_cm_mhz"] <= 12.0
     assert -50.0 < table["backscatter_db"] < -10.0 - CORTEX_DB
     assert 0 <= table["texture_db"] < 6.0 and 0.5 <= table["texture_mm"] <= 5.0
 

@@ -41,7 +41,9 @@ SCANNER = dict(
     grey_map="linear", gain_percent=50.0, dyn_range_db=60.0, depth_compensation_db_cm_mhz=0.0, depth_mm=80.0
 )
 ARRAY = dict(number_of_scanlines=LINES, number_of_samples_per_scanline=SAMPLES, housing_mm=(50.0, 10.0, 20.0))
-BEAM = dict(frequency_mhz=7.5, focus_depth_percent=40.0, f_number=3.0, noise_db=-200.0)
+BEAM = dict(
+    frequency_mhz=7.5, focus_depth_percent=40.0, f_number=3.0, noise_db=-200.0, ringing_db=-200.0
+)
 MIRROR = Surface(roughness_mm=0.0, scattered=0.0, scattered_hard=0.0)
 GEOMETRIES = {
     "LINEAR": {"transducer_width_mm": 40.0},
@@ -72,20 +74,20 @@ class Tank:
         self.at = low_mm[:, None, None, None] + voxel_mm[:, None, None, None] * np.indices(count)
         index_from_mm = np.diag([*(1 / voxel_mm), 1.0])
         index_from_mm[:3, 3] = -low_mm / voxel_mm
-        self.tissue = SampledVolume(np.zeros((*count, 3)), index_from_mm, outside=0.0)
+        self.tissue = SampledVolume(np.zeros((*count, 4)), index_from_mm, outside=0.0)
         organ = organ or SampledVolume(np.full((1, 1, 1), -1.0), np.diag([1e-6, 1e-6, 1e-6, 1.0]))
         self.plane = PlaneInTissue(embedding or Unmoved(), PIXELS)
         sound = Propagation(self.tissue, organ, self.plane, probe_of(), voxel_mm.min(), contact, 1.0)
         sound.surface = MIRROR
         self.bmode = BMode(sound, probe_of())
 
-    def fill(self, impedance=TISSUE, attenuation=0.0, backscatter=0.0) -> None:
+    def fill(self, impedance=TISSUE, attenuation=0.0, backscatter=0.0, anisotropy=0.0) -> None:
         """Each a number or a function of x, y, z [mm]."""
-        values = np.empty((*self.at[0].shape, 3), np.float32)
-        for channel, given in enumerate((impedance, attenuation, backscatter)):
+        values = np.empty((*self.at[0].shape, 4), np.float32)
+        for channel, given in enumerate((impedance, attenuation, backscatter, anisotropy)):
             values[..., channel] = given(*self.at) if callable(given) else given
         more = [(0, n) for n in np.subtract(self.tissue.count, self.tissue.shape)]
-        fill((self.tissue.voxels, np.pad(values, [*more, (0, 0)], mode="edge").reshape(-1, 3)))
+        fill((self.tissue.voxels, np.pad(values, [*more, (0, 0)], mode="edge").reshape(-1, 4)))
 
     def look(
         self, probe, detail_level="reflection", at=(0, 0, 0), along=(0, 1, 0), lateral=(1, 0, 0)
