@@ -122,7 +122,7 @@ class Propagation:
             (self.ray_offset, ray_offsets(probe, depth)),
             (self.aperture_angle, angle),
             (self.slice_sd, slice_sd_mm),
-            (self.build_up, depth / (depth + BUILD_UP_MM) if probe.harmonics else np.ones_like(depth)),
+            (self.build_up, (depth + 0.1) / (depth + BUILD_UP_MM) if probe.harmonics else np.ones_like(depth)),
             (self.speckle_db, pulse.speckle_db),
             (self.echo_db, pulse.echo_db),
             (
@@ -206,10 +206,13 @@ class Propagation:
         row, column = self.plane.pixel_near(place)
         linear = self.plane.rest_from_plane(row, column)
         rest = linear @ tm.vec4(place, 0.0, 1.0)
-        found = tm.vec4(0.0)
+        found, within = tm.vec4(0.0), 0.0
         for off, weight in ti.static(planes):
             there = self.tissue_volume.sample(rest + (off * slice_sd) * linear[:, 2])
             found += weight * tm.vec4(there.x, there.y, there.z**2, there.w)
+            within += ti.select(there.x > 1e-6, weight, 0.0)
+        # Half of a slice beyond the CT is no tissue of half the impedance.
+        found.x /= ti.max(within, 1e-6)
         found.z = ti.sqrt(found.z)
         if ti.static(self.organ_alone):
             if not (self.plane.is_tissue(row, column) and self.organ.sample(rest) <= 0.0):

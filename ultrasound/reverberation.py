@@ -22,6 +22,8 @@ FACE, LEAST_REPEATED = 0.25, 0.01
 BY_GAS = 0.35
 # Bubbles: share of the surface of gas, distance, amplitude and fall.
 BUBBLE_SHARE, BUBBLE_MM, BUBBLE_AMPLITUDE, BUBBLE_FALL_DB_MM = 0.08, 1.5, 0.06, 0.5
+# Bubbles ring where the beam meets the gas nearly squarely: where a third of it is returned as by a mirror, or more.
+BUBBLE_SQUARELY = 3.0
 # A clip is taken to be at least so thick [mm]; it may be thinner than the distance of tissue samples.
 LEAST_METAL_MM = 0.8
 # Vibration of the array in contact, and in air: the length in wavelengths over which it falls to 1 / e; how much stronger it is in
@@ -62,13 +64,22 @@ class Reverberation:
     def add_behind_gas(self, line, gas, front, count, step_mm):
         """Add what is seen by way of gas: the tissue in front, from the surface of the gas back to the face, then forth again."""
         arrived, path = self.sound.amplitude[line, front], self.sound.path[line, front]
-        bubble = BUBBLE_AMPLITUDE * arrived * self.has_bubble(self.sound.rest[line, front])
+        squarely = ti.min(BUBBLE_SQUARELY * ti.abs(self.sound.echo[line, gas].x), 1.0)
+        bubble = BUBBLE_AMPLITUDE * arrived * squarely * self.has_bubble(self.sound.rest[line, front])
         for k in range(gas, count):
             turns, further = (k - gas) // front, (k - gas) % front
-            there = front - further if turns % 2 == 0 else further
-            # On the way from the gas to the tissue there and back.
-            passed = arrived / ti.max(self.sound.amplitude[line, there], 1e-9)
-            seen = BY_GAS * FACE**turns * arrived * ti.min(passed, 1.0) * self.sound.tissue[line, there].z
+            # Each second turn begins at the face, which sound has reached by way of the gas.
+            seen = BY_GAS * (FACE * arrived) ** ((turns + 1) // 2)
+            there = further
+            if turns % 2 == 0:
+                there = front - further
+                # From the gas to the tissue there and back, and from the gas to the face.
+                lost = arrived / ti.max(self.sound.amplitude[line, there], 1e-9)
+                lost *= self.sound.build_up[there] / self.sound.build_up[front]
+                seen *= arrived * ti.min(lost, 1.0)
+            else:
+                seen *= self.sound.amplitude[line, there]
+            seen *= self.sound.tissue[line, there].z
             fall_db = BUBBLE_FALL_DB_MM * (k - gas) * step_mm
             self.level[line, k] += seen + bubble * ti.exp(-fall_db / DB_OF_NEPER)
             self.sound.path[line, k] = path
