@@ -140,7 +140,7 @@ def properties(
     for tissue, here in classify_tissues(hu, labelled, spacing).items():
         labelled[tissue] = labelled[tissue] | here if tissue in labelled else here
     labelled = {tissue: where for tissue, where in labelled.items() if where.any()}
-    hard = [labelled.pop(tissue, None) for tissue in HARD_TISSUES]
+    hard = {tissue: labelled.pop(tissue) for tissue in HARD_TISSUES if tissue in labelled}
     for tissue, where in labelled.items():
         table = tissue_table()[tissue]
         values[where, IMPEDANCE] = table["impedance_mrayl"]
@@ -151,9 +151,8 @@ def properties(
         values[..., channel] = ndimage.gaussian_filter(values[..., channel], SMOOTHING_VOXELS, truncate=2.5)
     level = ndimage.gaussian_filter(level, LEVEL_SMOOTHING_VOXELS, truncate=2.5)
     values[..., BACKSCATTER] = np.float32(10) ** ((level + np.float32(CORTEX_DB)) / np.float32(20))
-    for tissue, where in zip(HARD_TISSUES, hard, strict=True):
-        if where is not None:
-            _add_hard(values, tissue, where)
+    for tissue, where in hard.items():
+        _add_hard(values, tissue, where)
     return values
 
 

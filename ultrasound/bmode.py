@@ -8,12 +8,14 @@
 6. ``_scan_convert``: from scanlines and samples to the pixels of the image.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import taichi as ti
 import taichi.math as tm
 
 from sim.device import TASK
-from sim.fields import fill
+from sim.fields import array_of, fill
 from ultrasound.beam import elevation_profiles, profile_depths
 from ultrasound.lateral_kernel import (
     CLASSES,
@@ -38,6 +40,27 @@ LENGTHS, LENGTH_STEP, LENGTH_TAPS, HALF_WIDTH_SD = 33, 0.125, 10, 2.5
 GREY_STEPS = 64
 
 
+@dataclass(frozen=True)
+class Wavefront:
+    """A wavefront of a probe in the tissue at rest: around ``apex`` (3,) [mm], or, where it is flat, along ``direction`` (3,) from it.
+
+    At ``radius_mm`` from the apex it leaves the array. It is the reference of phases: those of images by the same one can be compared.
+    """
+
+    apex: np.ndarray
+    direction: np.ndarray
+    radius_mm: float
+    is_flat: bool
+
+    @classmethod
+    def of(cls, probe: Probe, world_from_plane: np.ndarray) -> "Wavefront":
+        """Return that of a probe at a pose (4, 4), of tissue that has not moved."""
+        steering = np.radians(probe.steering_deg)
+        apex = world_from_plane @ [0.0, -probe.radius_mm, 0.0, 1.0]
+        direction = world_from_plane[:3, :2] @ [np.sin(steering), np.cos(steering)]
+        return cls(apex[:3], direction, probe.radius_mm, probe.sector is None)
+
+
 @ti.data_oriented
 class BMode:
     """B-mode images of the image plane that sound propagates through, for probes with the same numbers of scanlines and samples."""
@@ -51,6 +74,8 @@ class BMode:
         padded = self.lines, self.samples + 2 * LENGTH_TAPS
         self.scattered_real, self.scattered_imaginary = (ti.field(ti.f32, padded) for _ in range(2))
         self.real, self.imaginary, self.decibel = (ti.field(ti.f32, shape) for _ in range(3))
+        # Signal after the spread, where it is asked for.
+        self.iq = ti.Vector.field(2, ti.f32, shape)
         self.level = ti.field(ti.f32, (self.lines, most))
         self.energy = ti.field(ti.f32, (self.groups, most))
         # Energy that side lobes receive, and what they would receive if it were 1 everywhere.
@@ -94,12 +119,54 @@ class BMode:
             self._scatter_evenly(stride)
         self._reflect(has_speckle, stride, probe.sample_mm, speckle_sd, look)
         if has_speckle:
-            self.spread(10.0 ** (probe.noise_before_gain_db / 20.0), self.plane.noise_key)
+            self.spread(10.0 ** (probe.noise_before_gain_db / 20.0), self.plane.noise_key, False)
         else:
             self._add()
         image = np.empty(self.plane.shape, np.uint8)
         self._scan_convert(probe.dyn_range_db, image)
         return image
+
+    def iq_of_last(self, probe: Probe, wavefront: Wavefront) -> tuple[np.ndarray, np.ndarray]:
+        """Return the IQ signal (scanlines, samples) complex64 of the image rendered last, and rest positions (.., 3) [mm] of its samples.
+
+        Its phase is that of the carrier: it turns with the distance of the tissue from the array, so that motion can be measured.
+        """
+        stride = self.sound.stride_of(probe)
+        rest = np.empty((self.lines, self.samples, 3), np.float32)
+        turn = 4 * np.pi / probe.wavelength_mm
+        apex, direction = (tm.vec3(*map(float, each)) for each in (wavefront.apex, wavefront.direction))
+        self._turn(
+            stride, probe.sample_mm, turn, wavefront.is_flat, apex, direction, wavefront.radius_mm, rest
+        )
+        self.spread(10.0 ** (probe.noise_before_gain_db / 20.0), self.plane.noise_key, True)
+        return array_of(self.iq) @ np.array([1, 1j], np.complex64), rest
+
+    @ti.kernel
+    def _turn(
+        self,
+        stride: int,
+        sample_mm: float,
+        turn: float,
+        is_flat: ti.template(),
+        apex: tm.vec3,
+        direction: tm.vec3,
+        radius_mm: float,
+        rest_mm: ti.types.ndarray(ti.f32, ndim=3),
+    ):
+        """Turn the phase of the signal by its distance from where a wavefront meets its tissue."""
+        for line, i in ti.ndrange(self.lines, self.samples):
+            at = (i + 0.5) / stride
+            k = ti.cast(at, ti.i32)
+            rest = tm.mix(self.sound.rest[line, k], self.sound.rest[line, k + 1], at - k)
+            away = (rest - apex).dot(direction)
+            if ti.static(not is_flat):
+                away = (rest - apex).norm() - radius_mm
+            phase = -turn * ((i + 0.5) * sample_mm - away)
+            real, imaginary = self.real[line, i], self.imaginary[line, i]
+            self.real[line, i] = real * ti.cos(phase) - imaginary * ti.sin(phase)
+            self.imaginary[line, i] = real * ti.sin(phase) + imaginary * ti.cos(phase)
+            for axis in ti.static(range(3)):
+                rest_mm[line, i, axis] = rest[axis]
 
     def _make_tables(self, probe: Probe) -> None:
         """Update the tables of the probe's settings, if these changed."""
@@ -297,8 +364,8 @@ class BMode:
             self.decibel[line, sample] = DB_OF_NEPER * ti.log(envelope + SILENCE) + self.gain[sample]
 
     @ti.kernel
-    def spread(self, noise: float, key: int):
-        """Spread the scanlines as the beam is wide, add electronic noise, and take the envelope in dB."""
+    def spread(self, noise: float, key: int, keeps: ti.template()):
+        """Spread the scanlines as the beam is wide, add electronic noise, and take the envelope in dB; keep the signal or not."""
         # Scanline by scanline at one depth: the samples that neighbours share stay in the L1 cache.
         for packet, line in ti.ndrange(self.samples // LANES, self.lines):
             first = packet * LANES
@@ -317,6 +384,9 @@ class BMode:
             electronic = self.electronic_noise(line, packet, key)
             real += noise * electronic[0, :]
             imaginary += noise * electronic[1, :]
+            if ti.static(keeps):
+                for i in ti.static(range(LANES)):
+                    self.iq[line, first + i] = tm.vec2(real[i], imaginary[i])
             gain = Packet([self.gain[first + i] for i in ti.static(range(LANES))])
             decibel = DB_OF_NEPER * ti.log(ti.sqrt(real * real + imaginary * imaginary) + SILENCE) + gain
             for i in ti.static(range(LANES)):

@@ -122,7 +122,10 @@ class Propagation:
             (self.ray_offset, ray_offsets(probe, depth)),
             (self.aperture_angle, angle),
             (self.slice_sd, slice_sd_mm),
-            (self.build_up, (depth + 0.1) / (depth + BUILD_UP_MM) if probe.harmonics else np.ones_like(depth)),
+            (
+                self.build_up,
+                (depth + 0.1) / (depth + BUILD_UP_MM) if probe.harmonics else np.ones_like(depth),
+            ),
             (self.speckle_db, pulse.speckle_db),
             (self.echo_db, pulse.echo_db),
             (

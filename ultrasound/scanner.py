@@ -20,8 +20,9 @@ from sim.embedding import Embedding, Unmoved
 from sim.fields import array_of, field_of, fill
 from ultrasound.acoustics import check_tissues, stored_properties
 from ultrasound.blood_flow import stored_flow
-from ultrasound.bmode import BMode
+from ultrasound.bmode import BMode, Wavefront
 from ultrasound.doppler import Doppler
+from ultrasound.iq_signal import IQSignal, iq_signal
 from ultrasound.probe import DetailLevel, DopplerMode, Mode, Probe
 from ultrasound.probe_manipulator import ImagePlane
 from ultrasound.propagation import Propagation
@@ -299,6 +300,14 @@ class Scanner:
         voxel_mm = float(self.anatomy.voxel_mm.mean())
         around = self.contact, self.contact_gap_mm, self.around
         return Propagation(self.tissue, self.organ, self.plane, self.probe, voxel_mm, *around)
+
+    def iq(self, probe: Probe, plane: ImagePlane, before: ImagePlane | None, first: ImagePlane) -> IQSignal:
+        """Return IQ and RF signals of the B-mode image of a plane that was made last, in tissue that has not moved.
+
+        ``before`` is the plane of the image before, ``first`` that of the first image, by which phases are compared.
+        """
+        wavefront = Wavefront.of(probe, np.asarray(first.world_from_plane, float))
+        return iq_signal(*self.bmode.iq_of_last(probe, wavefront), probe, plane, before)
 
     def doppler(
         self, probe: Probe, grey: np.ndarray, mode: DopplerMode, time_s: float = 0.0, clamped: bool = False

@@ -46,6 +46,8 @@ class ScanOptions(ImageOptions, ArchOptions):
     """Write each B-mode image as DICOM too."""
     doppler: Literal["off", "colour", "power"] = "off"
     """Write each B-mode image with colour or power Doppler too, at the peak of systole."""
+    iq: Literal["npz", "mat"] | None = None
+    """Write IQ and RF signals of each B-mode image too, before gain, for NumPy or MATLAB, with the motion of the tissue."""
     sweep: bool = False
     """Write all images as one tracked sweep too (PLUS), with ground-truth labels."""
 
@@ -70,6 +72,7 @@ def scan(asked: ScanOptions) -> None:
     from rehearsal.rehearsal import scanned_anatomy
     from sim.embedding import Unmoved
     from ultrasound.blood_flow import SYSTOLE_S
+    from ultrasound.iq_signal import save_iq
     from ultrasound.probe_manipulator import ImagePlane
     from ultrasound.scanner import B_MODE, DOPPLER, Scanner
     from ultrasound.sweep_file import LabelledSweep
@@ -81,6 +84,7 @@ def scan(asked: ScanOptions) -> None:
     )
     recording = LabelledSweep(out, "sweep", scan_probe) if asked.sweep else None
     rows, ms, empty = [], [], 0
+    planes: list[ImagePlane] = []
     for name, pose in tqdm(pose_by_name.items(), desc="scan", unit="pose"):
         began = perf_counter()
         plane = ImagePlane(pose, *scan_probe.extent_mm)
@@ -93,6 +97,12 @@ def scan(asked: ScanOptions) -> None:
         if recording is not None:
             grey = next(iter(images.values()))
             recording.add(grey, labels, scan_probe, pose, recording.count / FRAMES_PER_SECOND)
+        if asked.iq is not None and B_MODE in images:
+            signals = scanner.iq(
+                scan_probe, plane, planes[-1] if planes else None, planes[0] if planes else plane
+            )
+            save_iq(signals, out / f"{name}-iq.{asked.iq}")
+            planes.append(plane)
         if asked.doppler != "off" and B_MODE in images:
             given = scan_probe, images[B_MODE], asked.doppler, SYSTOLE_S
             images[DOPPLER] = scanner.doppler(*given)

@@ -79,7 +79,7 @@ class EchoPhantom:
         echo = np.exp(-0.5 * (place / self.probe.speckle_sd_mm) ** 2)
         fill((self.bmode.real, np.repeat(echo[:, None], len(self.depth_mm), axis=1)))
         self.bmode.imaginary.fill(0.0)
-        self.bmode.spread(0.0, 0)
+        self.bmode.spread(0.0, 0, False)
         sample = int(depth_mm / self.probe.sample_mm)
         decibel = array_of(self.bmode.decibel).astype(float) - self.probe.gain_db()
         return place, 10 ** (decibel[:, sample] / 20)

@@ -149,7 +149,9 @@ def test_a_tumour_has_a_dark_pseudocapsule_one_millimetre_thick():
     level = 20 * np.log10(along[:, BACKSCATTER]) - CORTEX_DB
     table = tissue_table()
     rim, core = (table[tissue]["backscatter_db"] for tissue in ("pseudocapsule", "tumour"))
-    assert level[2:4].mean() == pytest.approx(rim, abs=3.0) and np.median(level[6:18]) == pytest.approx(core, abs=5.0)
+    assert level[2:4].mean() == pytest.approx(rim, abs=3.0) and np.median(level[6:18]) == pytest.approx(
+        core, abs=5.0
+    )
 
 
 def test_arcuate_vessels_are_bright_in_places_between_cortex_and_medulla():
@@ -255,7 +257,10 @@ def test_every_tissue_has_sane_values(tissue):
     keys = {"impedance_mrayl", "attenuation_db_cm_mhz", "backscatter_db", "texture_db", "texture_mm"}
     assert set(table) - {"anisotropy_db"} == keys and 0 <= table.get("anisotropy_db", 0) < 6
     # From fat to cortical bone, or titanium, from water to what nothing passes; and no echo above all of the sound.
-    assert 1.3 < table["impedance_mrayl"] < (28.0 if tissue == "metal" else 8.0) and 0 < table["attenuation_db_cm_mhz"] <= 12.0
+    assert (
+        1.3 < table["impedance_mrayl"] < (28.0 if tissue == "metal" else 8.0)
+        and 0 < table["attenuation_db_cm_mhz"] <= 12.0
+    )
     assert -50.0 < table["backscatter_db"] < -10.0 - CORTEX_DB
     assert 0 <= table["texture_db"] < 6.0 and 0.5 <= table["texture_mm"] <= 5.0
 

@@ -41,9 +41,7 @@ SCANNER = dict(
     grey_map="linear", gain_percent=50.0, dyn_range_db=60.0, depth_compensation_db_cm_mhz=0.0, depth_mm=80.0
 )
 ARRAY = dict(number_of_scanlines=LINES, number_of_samples_per_scanline=SAMPLES, housing_mm=(50.0, 10.0, 20.0))
-BEAM = dict(
-    frequency_mhz=7.5, focus_depth_percent=40.0, f_number=3.0, noise_db=-200.0, ringing_db=-200.0
-)
+BEAM = dict(frequency_mhz=7.5, focus_depth_percent=40.0, f_number=3.0, noise_db=-200.0, ringing_db=-200.0)
 MIRROR = Surface(roughness_mm=0.0, scattered=0.0, scattered_hard=0.0)
 GEOMETRIES = {
     "LINEAR": {"transducer_width_mm": 40.0},

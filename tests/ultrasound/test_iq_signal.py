@@ -1,0 +1,93 @@
+"""IQ and RF signals: phases of motion along the beam, the carrier, positions of the tissue, files."""
+
+import numpy as np
+import pytest
+import taichi as ti
+from scipy import io, signal
+from test_bmode import BOUNDLESS, Tank, probe_of
+
+from sim.device import start
+from ultrasound.bmode import Wavefront
+from ultrasound.iq_signal import RF_PER_PERIOD, iq_signal, rf_of, save_iq
+from ultrasound.probe import Probe
+from ultrasound.probe_manipulator import ImagePlane, image_plane, pose_at
+
+SETTINGS = dict(depth_mm=20.0, transducer_width_mm=16.0, focus_depth_percent=50.0)
+
+
+@pytest.fixture(scope="module")
+def tank():
+    start("cpu")
+    tank = Tank((BOUNDLESS,) * 3, (1, 1, 1), (0.0, 0.0, 0.0))
+    tank.fill(1.5804, 0.0, 0.1)
+    yield tank
+    ti.reset()
+
+
+def plane_at(probe: Probe, at) -> ImagePlane:
+    pose = pose_at(at, (0, 1, 0), (1, 0, 0), probe.housing_mm[2])
+    return image_plane(pose, probe.housing_mm[2], *probe.extent_mm)
+
+
+def look(tank: Tank, probe: Probe, at, first=(0, 0, 0)) -> tuple[np.ndarray, np.ndarray]:
+    """IQ (scanlines, samples) and rest positions of a probe at a place; phases are those of another place."""
+    tank.look(probe, "speckle", at)
+    plane = np.asarray(plane_at(probe, first).world_from_plane, float)
+    return tank.bmode.iq_of_last(probe, Wavefront.of(probe, plane))
+
+
+@pytest.mark.parametrize("geometry", ["LINEAR", "CURVILINEAR"])
+@pytest.mark.parametrize("towards_mm", [0.004, -0.01])
+def test_motion_along_the_beam_turns_the_phase_by_two_wavenumbers(tank, geometry, towards_mm):
+    probe = probe_of(geometry, **SETTINGS) if geometry == "LINEAR" else probe_of(geometry, depth_mm=20.0)
+    before, _ = look(tank, probe, (0, 0, 0))
+    after, _ = look(tank, probe, (0, towards_mm, 0))
+    middle = slice(90, 102) if geometry == "LINEAR" else slice(104, 108)
+    found = np.angle((after * before.conj())[middle, 60:600].sum())
+    # The tissue is nearer by as much as the probe moved towards it: the echo is earlier.
+    assert found == pytest.approx(2 * 2 * np.pi / probe.wavelength_mm * towards_mm, rel=0.05)
+
+
+def test_the_signal_is_that_of_the_image(tank):
+    probe = probe_of(**SETTINGS)
+    decibel = tank.look(probe, "speckle")
+    plane = np.asarray(plane_at(probe, (0, 0, 0)).world_from_plane, float)
+    iq, rest = tank.bmode.iq_of_last(probe, Wavefront.of(probe, plane))
+    # At the place of reference the phase of all scanlines turns alike: it changes no magnitude, but for rounding of 0.1 rad.
+    found = 20 * np.log10(np.abs(iq) + 1e-9)
+    assert np.median(np.abs(found - decibel + probe.gain_db())) < 0.01
+    u, depth = probe.scanlines()[0][:, 0], (np.arange(640) + 0.5) * probe.sample_mm
+    assert rest[..., 0] == pytest.approx(np.broadcast_to(u[:, None], rest.shape[:2]), abs=1e-3)
+    assert rest[..., 1] == pytest.approx(np.broadcast_to(depth, rest.shape[:2]), abs=1e-2)
+
+
+def test_rf_has_the_centre_frequency_and_the_envelope_of_iq(tank):
+    probe = probe_of(**SETTINGS)
+    iq, _ = look(tank, probe, (0, 0, 0))
+    rf, sampling_mhz = rf_of(iq.T, probe)
+    assert sampling_mhz == pytest.approx(RF_PER_PERIOD * probe.frequency_mhz, rel=1e-3)
+    power = (np.abs(np.fft.rfft(rf, axis=0)) ** 2).sum(axis=1)
+    frequency = np.fft.rfftfreq(len(rf), 1 / sampling_mhz)
+    assert np.average(frequency, weights=power) == pytest.approx(probe.frequency_mhz, rel=0.02)
+    envelope = np.abs(signal.hilbert(rf, axis=0))
+    at = np.interp(np.arange(640) + 0.5, np.arange(len(rf)) * 640 / len(rf) + 0.5, np.arange(len(rf)))
+    there = np.abs(envelope[np.rint(at).astype(int)])[40:600]
+    assert np.corrcoef(there.ravel(), np.abs(iq.T)[40:600].ravel())[0, 1] > 0.95
+
+
+@pytest.mark.parametrize("suffix", ["npz", "mat"])
+def test_files_have_the_sampling_and_the_motion_of_the_tissue(tank, tmp_path, suffix):
+    probe = probe_of(**SETTINGS)
+    iq, rest = look(tank, probe, (1.0, 0.0, 0.25))
+    planes = plane_at(probe, (1.0, 0.0, 0.25)), plane_at(probe, (0, 0, 0))
+    written = iq_signal(iq, rest, probe, *planes)
+    save_iq(written, tmp_path / f"a.{suffix}")
+    found = np.load(tmp_path / "a.npz") if suffix == "npz" else io.loadmat(tmp_path / "a.mat")
+    assert found["iq"].shape == (640, 192) and np.iscomplexobj(found["iq"]) and (found["iq"] == iq.T).all()
+    assert float(np.squeeze(found["iq_sampling_mhz"])) == pytest.approx(1.54 / 2 / (20 / 640))
+    # The probe moved by 1 mm to its marked side and 0.25 mm across the plane: the tissue moved the other way.
+    across = planes[0].world_from_plane[2, 2] * 0.25
+    assert found["motion_mm"].reshape(-1, 3) == pytest.approx(
+        np.broadcast_to([-1.0, 0.0, -across], (640 * 192, 3)), abs=1e-4
+    )
+    assert (iq_signal(iq, rest, probe, planes[0], None).motion_mm == 0).all()
