@@ -2,7 +2,6 @@
 
 from collections.abc import Collection
 from pathlib import Path
-from time import perf_counter
 from typing import Annotated, Literal
 
 import click
@@ -27,7 +26,6 @@ from scenes.scene import scene_file
 from sim.signed_distance import signed_distance
 from version import VERSION
 
-FRAMES_PER_SECOND = 30
 # A probe never reaches this depth below the surface of the organ at rest.
 DEEP_MM = 20.0
 
@@ -51,6 +49,11 @@ class ScanOptions(ImageOptions, ArchOptions):
     sweep: bool = False
     """Write all images as one tracked sweep too (PLUS), with ground-truth labels."""
 
+    @property
+    def mode_needs_b_mode(self) -> bool:
+        """Whether something is made from the B-mode image."""
+        return self.iq is not None or self.doppler != "off"
+
 
 @command(ScanOptions)
 def scan(asked: ScanOptions) -> None:
@@ -67,60 +70,25 @@ def scan(asked: ScanOptions) -> None:
         )
     warn_of_deep_poses(pose_by_name.values(), anatomy.organ)
     scan_probe, settings = probe_of(loaded), loaded.image
+    if asked.mode_needs_b_mode and settings.mode == "ct":
+        raise CommandError(
+            "--picture ct: --doppler and --iq are made from a B-mode image; leave them out, or choose both or b-mode"
+        )
+    if asked.iq is not None and settings.detail_level == "reflection":
+        raise CommandError("--iq: the detail level reflection has no phase; choose speckle or elevation")
     used = start_taichi(asked.arch)
-    from rehearsal.image_and_surface_files import save_images
-    from rehearsal.rehearsal import scanned_anatomy
-    from sim.embedding import Unmoved
-    from ultrasound.blood_flow import SYSTOLE_S
-    from ultrasound.iq_signal import save_iq
-    from ultrasound.probe_manipulator import ImagePlane
-    from ultrasound.scanner import B_MODE, DOPPLER, Scanner
-    from ultrasound.sweep_file import LabelledSweep
+    from rehearsal.pose_scans import PoseScans
 
     make_folder(out)
-    scanned = scanned_anatomy(anatomy.organ, anatomy.ct, anatomy, np.zeros(3))
-    scanner = Scanner(
-        scanned, Unmoved(), scan_probe, settings.pixels, "background", asked.contact, settings.contact_gap_mm
-    )
-    recording = LabelledSweep(out, "sweep", scan_probe) if asked.sweep else None
-    rows, ms, empty = [], [], 0
-    planes: list[ImagePlane] = []
-    for name, pose in tqdm(pose_by_name.items(), desc="scan", unit="pose"):
-        began = perf_counter()
-        plane = ImagePlane(pose, *scan_probe.extent_mm)
-        images = scanner.images(
-            plane, scan_probe, settings.mode, settings.detail_level, settings.window_hu, settings.level_hu
-        )
-        ms.append(1000 * (perf_counter() - began))
-        labels = scanner.ground_truth.render()
-        empty += not labels.any()
-        if recording is not None:
-            grey = next(iter(images.values()))
-            recording.add(grey, labels, scan_probe, pose, recording.count / FRAMES_PER_SECOND)
-        if asked.iq is not None and B_MODE in images:
-            signals = scanner.iq(
-                scan_probe, plane, planes[-1] if planes else None, planes[0] if planes else plane
-            )
-            save_iq(signals, out / f"{name}-iq.{asked.iq}")
-            planes.append(plane)
-        if asked.doppler != "off" and B_MODE in images:
-            given = scan_probe, images[B_MODE], asked.doppler, SYSTOLE_S
-            images[DOPPLER] = scanner.doppler(*given)
-        saved = save_images(images, *scan_probe.extent_mm[:2], scan_probe, out / name, asked.dicom)
-        rows += [
-            dict(
-                pose=name,
-                probe_to_patient=pose.tolist(),
-                picture=each.kind,
-                file=each.path.name,
-                row_mm=each.spacing_mm[0],
-                column_mm=each.spacing_mm[1],
-                image_to_probe=scan_probe.image_to_probe(*each.shape).tolist(),
-            )
-            for each in saved
-        ]
-    if recording is not None:
-        recording.close()
+    scans = PoseScans(anatomy, anatomy.ct, scan_probe, settings, asked.contact, out)
+    with scans.recording(asked.sweep):
+        for name, pose in tqdm(pose_by_name.items(), desc="scan", unit="pose"):
+            images = scans.images(name, pose)
+            if asked.iq is not None:
+                scans.save_iq(name, asked.iq)
+            if asked.doppler != "off":
+                images = scans.with_doppler(images, asked.doppler)
+            scans.save(name, images, asked.dicom)
     report = dict(
         version=VERSION,
         probe=scan_probe.model_dump(by_alias=True),
@@ -128,15 +96,15 @@ def scan(asked: ScanOptions) -> None:
         contact=asked.contact,
         contact_gap_mm=settings.contact_gap_mm,
         arch=used,
-        pictures=rows,
+        pictures=scans.rows,
     )
     write_json(report, out / "scan.json")
-    if empty:
+    if scans.empty:
         click.echo(
-            f"Warning: {empty} of {len(pose_by_name)} poses show nothing of the organ; they may be of another patient."
+            f"Warning: {scans.empty} of {len(pose_by_name)} poses show nothing of the organ; they may be of another patient."
         )
     click.echo(
-        f"Wrote {len(rows)} images of {len(pose_by_name)} poses and scan.json to {out}; {np.median(ms):.1f} ms per pose (median)."
+        f"Wrote {len(scans.rows)} images of {len(pose_by_name)} poses and scan.json to {out}; {np.median(scans.ms):.1f} ms per pose (median)."
     )
 
 

@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from conftest import rotation_about
 from PIL import Image
+from pydicom import dcmread
 
 import app
 from rehearsal.commands.scan_command import warn_of_deep_poses
@@ -159,16 +160,15 @@ def test_scan_leaves_a_picture_of_each_pose_and_mode(tmp_path, capsys):
         "--contact",
         "organ",
         "--dicom",
+        "--doppler",
+        "power",
+        "--iq",
+        "npz",
     ]
     assert app.main([str(part) for part in [*command, "--arch", "cpu"]]) == 0
     report = json.loads((out / "scan.json").read_text())
     assert [row["file"] for row in report["pictures"]] == [
-        "on-b-mode.png",
-        "on-ct.png",
-        "off-b-mode.png",
-        "off-ct.png",
-        "past-b-mode.png",
-        "past-ct.png",
+        f"{name}-{kind}.png" for name in ("on", "off", "past") for kind in ("b-mode", "ct", "doppler")
     ]
     assert "1 of 3 poses show nothing of the organ; they may be of another" in capsys.readouterr().out
     assert report["probe"]["FrequencyMhz"] == 9.0 and report["version"] == VERSION
@@ -180,9 +180,42 @@ def test_scan_leaves_a_picture_of_each_pose_and_mode(tmp_path, capsys):
     corners = image_to_probe @ np.array([[-0.5, -0.5, 0, 1], [columns - 0.5, rows - 0.5, 0, 1]]).T
     assert pytest.approx(np.array([[-8.0, 0.0], [8.0, 40.0]])) == corners[:2].T
     assert np.array(row["probe_to_patient"]) == pytest.approx(pose_on_tumour())
-    # Without contact there is electronic noise alone.
-    assert shown["on-b-mode"].mean() > 20 and shown["off-b-mode"].mean() < 3 and shown["off-ct"].max() > 0
+    # Without contact there is electronic noise, and the vibration of the array near its face.
+    assert shown["on-b-mode"].mean() > 20 and shown["off-b-mode"][100:].mean() < 3 and shown["off-ct"].max() > 0
     assert (out / "on-b-mode.dcm").is_file() and not (out / "on-ct.dcm").exists()
+    # Where Doppler shows nothing, it is the B-mode image.
+    doppler = shown["on-doppler"]
+    grey = (doppler == shown["on-b-mode"][..., None]).all(axis=-1)
+    assert 0 < (~grey).mean() < 0.5 and (doppler[~grey][:, 0] > doppler[~grey][:, 2]).mean() > 0.9
+    assert dcmread(out / "on-doppler.dcm").PhotometricInterpretation == "RGB"
+    signals = {name: np.load(out / f"{name}-iq.npz") for name in ("on", "off")}
+    assert signals["on"]["iq"].shape == (640, 192) and (signals["on"]["motion_mm"] == 0).all()
+    # The probe moved away by 30 mm: the tissue is that much deeper.
+    assert signals["off"]["motion_mm"][..., 1] == pytest.approx(30.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    "options, meant",
+    [
+        (["--picture", "ct", "--doppler", "colour"], "made from a B-mode image"),
+        (["--picture", "ct", "--iq", "mat"], "made from a B-mode image"),
+        (["--detail-level", "reflection", "--iq", "npz"], "choose speckle or elevation"),
+    ],
+)
+def test_what_needs_a_b_mode_image_is_refused_without_one(tmp_path, capsys, options, meant):
+    (tmp_path / "poses.json").write_text(json.dumps([dict(probe_to_patient=pose_on_tumour().tolist())]))
+    command = [
+        "scan",
+        str(EMBEDDED),
+        "--pose",
+        str(tmp_path / "poses.json"),
+        "--out",
+        str(tmp_path),
+        *options,
+    ]
+    assert app.main(command) == 2
+    told = capsys.readouterr().err
+    assert meant in told and len(told.strip().splitlines()) == 1
 
 
 def test_poses_deep_inside_the_organ_are_counted(capsys):

@@ -1,0 +1,101 @@
+"""Images of an anatomy at rest for a list of probe poses, and their files."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from rehearsal.image_and_surface_files import save_images
+from rehearsal.rehearsal import scanned_anatomy
+from scenes.anatomy import Grid, LoadedAnatomy
+from scenes.scene import Image
+from sim.embedding import Unmoved
+from ultrasound.blood_flow import SYSTOLE_S
+from ultrasound.iq_signal import save_iq
+from ultrasound.probe import DopplerMode, Probe
+from ultrasound.probe_manipulator import ImagePlane
+from ultrasound.scanner import B_MODE, DOPPLER, Scanner
+from ultrasound.sweep_file import LabelledSweep
+
+FRAMES_PER_SECOND = 30
+
+
+class PoseScans:
+    """Images of one probe at poses, in the order of the calls: first ``images``, then the others of the same pose.
+
+    ``rows`` describe the images that were saved, ``ms`` are the times of each pose, ``empty`` counts poses that show nothing of the organ.
+    """
+
+    def __init__(
+        self,
+        anatomy: LoadedAnatomy,
+        ct: Grid,
+        probe: Probe,
+        settings: Image,
+        contact: str,
+        out: Path,
+    ) -> None:
+        self.probe, self.settings, self.out = probe, settings, out
+        scanned = scanned_anatomy(anatomy.organ, ct, anatomy, np.zeros(3))
+        around = "background", contact, settings.contact_gap_mm
+        self.scanner = Scanner(scanned, Unmoved(), probe, settings.pixels, *around)
+        self.rows: list[dict] = []
+        self.ms: list[float] = []
+        self.empty = 0
+        self._planes: list[ImagePlane] = []
+        self._sweep: LabelledSweep | None = None
+
+    @contextmanager
+    def recording(self, records: bool) -> Iterator[None]:
+        """Record the images as a tracked sweep meanwhile, if asked to."""
+        self._sweep = LabelledSweep(self.out, "sweep", self.probe) if records else None
+        yield
+        if self._sweep is not None:
+            self._sweep.close()
+
+    def images(self, name: str, pose: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the images of a pose (4, 4) by their names."""
+        began = perf_counter()
+        self._planes.append(ImagePlane(pose, *self.probe.extent_mm))
+        shown = (
+            self.settings.mode,
+            self.settings.detail_level,
+            self.settings.window_hu,
+            self.settings.level_hu,
+        )
+        images = self.scanner.images(self._planes[-1], self.probe, *shown)
+        self.ms.append(1000 * (perf_counter() - began))
+        labels = self.scanner.ground_truth.render()
+        self.empty += not labels.any()
+        if self._sweep is not None:
+            grey = next(iter(images.values()))
+            self._sweep.add(grey, labels, self.probe, pose, self._sweep.count / FRAMES_PER_SECOND)
+        return images
+
+    def save_iq(self, name: str, suffix: str) -> None:
+        """Write the IQ and RF signals of the last B-mode image. Raises OSError."""
+        before = self._planes[-2] if len(self._planes) > 1 else None
+        signals = self.scanner.iq(self.probe, self._planes[-1], before, self._planes[0])
+        save_iq(signals, self.out / f"{name}-iq.{suffix}")
+
+    def with_doppler(self, images: dict[str, np.ndarray], mode: DopplerMode) -> dict[str, np.ndarray]:
+        """Return the images, with Doppler of the last B-mode image at the peak of systole."""
+        return images | {DOPPLER: self.scanner.doppler(self.probe, images[B_MODE], mode, SYSTOLE_S)}
+
+    def save(self, name: str, images: dict[str, np.ndarray], dicom: bool) -> None:
+        """Write the images of the last pose, and note them in ``rows``. Raises OSError."""
+        prefix = self.out / name
+        for each in save_images(images, *self.probe.extent_mm[:2], self.probe, prefix, dicom):
+            self.rows.append(
+                dict(
+                    pose=name,
+                    probe_to_patient=self._planes[-1].world_from_plane.tolist(),
+                    picture=each.kind,
+                    file=each.path.name,
+                    row_mm=each.spacing_mm[0],
+                    column_mm=each.spacing_mm[1],
+                    image_to_probe=self.probe.image_to_probe(*each.shape).tolist(),
+                )
+            )
