@@ -21,7 +21,7 @@ TABLE = Path(__file__).parent / "blood_flow.toml"
 # At each voxel: peak systolic velocity along the grid's axes [m/s], resistive index, and amplitude against blood in a vessel.
 CHANNELS = 5
 KINDS = ("vessel", "vein", "artery")
-PARENCHYMA = ("kidney", "cortex", "medulla")
+WITH_SMALL_VESSELS = ("kidney", "cortex", "medulla", "tumour")
 # Enhanced vessels without a label are of the kind of a labelled one up to this distance. Smaller bodies than this are noise.
 SAME_KIND_MM, LEAST_VOXELS = 25.0, 20
 # The potential in a vessel, and the depth below the capsule, are smoothed before they are differentiated [voxels].
@@ -79,15 +79,17 @@ def blood_flow(
     if labels is not None:
         for tissue in set(tissue_of_label.values()) | masks.keys():
             masks[tissue] = np.isin(labels, [v for v, name in tissue_of_label.items() if name == tissue])
-    found = classify_tissues(hu, masks, spacing_mm).get("vessel")
-    if found is not None:
-        _add_of_same_kind(masks, found, spacing_mm)
+    found = classify_tissues(hu, masks, spacing_mm)
+    if "vessel" in found:
+        _add_of_same_kind(masks, found["vessel"], spacing_mm)
+    if "necrosis" in found:
+        masks["tumour"] = masks["tumour"] & ~found["necrosis"]
     kidney = np.logical_or.reduce([masks[name] for name in (*KIDNEY, "tumour")])
-    flowing = np.logical_or.reduce([masks[name] for name in (*KINDS, *PARENCHYMA)])
+    flowing = np.logical_or.reduce([masks[name] for name in (*KINDS, *WITH_SMALL_VESSELS)])
     box = _box(flowing)
     part = {name: mask[box] for name, mask in masks.items()}
     values = np.zeros((*part["artery"].shape, CHANNELS), np.float32)
-    for tissue in PARENCHYMA:
+    for tissue in WITH_SMALL_VESSELS:
         if part[tissue].any():
             _add_small_vessels(values, flow_table()["small"][tissue], part[tissue], kidney[box], spacing_mm)
     # Vessels within the kidney have their ends away from its surface: it is not counted.

@@ -99,6 +99,14 @@ def test_small_vessels_of_the_parenchyma_run_outward():
     assert (outward[rim] > 0.9 * speed[rim] * np.linalg.norm(x, axis=0)[rim]).mean() > 0.95
 
 
+def test_the_necrotic_part_of_a_tumour_has_no_flow():
+    x = SPACING[:, None, None, None] * np.indices(SHAPE) - np.array([36.0, 16.0, 16.0])[:, None, None, None]
+    radius = np.linalg.norm(x, axis=0)
+    hu = np.where(radius < 8.0, 20.0, 110.0)
+    flow = flow_of((radius < 14.0).astype(int), hu, {1: "tumour"})
+    assert (flow[radius < 7.5] == 0).all() and (flow[(radius > 8.5) & (radius < 13.5), 4] > 0).all()
+
+
 def test_no_flow_without_vessels_and_kidney(monkeypatch):
     low, values = blood_flow(np.zeros(SHAPE, np.float32), None, {}, SPACING)
     assert values.shape[-1] == CHANNELS and (values == 0).all()
