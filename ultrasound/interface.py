@@ -10,6 +10,8 @@ import taichi.math as tm
 MIN_REFLECTION = 3e-4
 # An interface that reflects more of the amplitude than this is that of a stone, a bone or gas.
 HARD = 0.3
+# A weaker interface is taken to be noise, and does not refract. Beyond this angle of incidence [rad] refraction is as at it.
+LEAST_REFRACTING, MOST_REFRACTED = 0.008, 1.25
 # Edge waves of the aperture: amplitude of a smooth interface that reflects just past the aperture, and its fall [1 / half angle].
 # Fitted to SIMUS (``study echo``).
 EDGE, EDGE_FALL = 0.08, 2.75
@@ -98,6 +100,17 @@ class Interface:
     def reflection(self, after):
         """Reflection coefficient of amplitude between the impedance before it and the one after it [MRayl]."""
         return (after - self.before) / (after + self.before)
+
+    @ti.func
+    def refraction(self, direction, ratio):
+        """Angle [rad] by which sound is turned on the image plane, towards the next scanline; ``ratio`` is of the speeds behind and before.
+
+        Snell's law; where all is reflected, as at the angle at which that begins.
+        """
+        along, lateral = self.normal.dot(direction), self.normal.dot(tm.vec3(direction.y, -direction.x, 0.0))
+        lateral *= ti.select(along < 0.0, -1.0, 1.0)
+        incidence = tm.clamp(ti.atan2(lateral, ti.max(ti.abs(along), 1e-9)), -MOST_REFRACTED, MOST_REFRACTED)
+        return incidence - ti.asin(tm.clamp(ratio * ti.sin(incidence), -1.0, 1.0))
 
     @ti.func
     def tilts(self, direction):

@@ -17,6 +17,7 @@ from ultrasound.acoustics import MAST_OFFSET, MAST_SLOPE
 from ultrasound.beam import half_apertures_mm
 from ultrasound.interface import (
     HARD,
+    LEAST_REFRACTING,
     MIN_REFLECTION,
     Interface,
     Surface,
@@ -33,6 +34,8 @@ STRIDES = (8, 4)
 # quadrature with three nodes, exact for what changes as a polynomial of fifth degree.
 CENTRAL_PLANE = ((0.0, 1.0),)
 THICK_PLANE = ((0.0, 2 / 3), (-(1.5**0.5), 1 / 6), (1.5**0.5, 1 / 6))
+# Intensity changes by refraction by no more than this factor.
+MOST_FOCUSED = 3.0
 # Rays from the aperture to each sample.
 RAYS = 7
 
@@ -87,6 +90,11 @@ class Propagation:
         self.echo = ti.Vector.field(4, ti.f32, shape)
         self.depth, self.passed, self.amplitude, self.path = (ti.field(ti.f32, shape) for _ in range(4))
         self.ray_amplitude, self.ray_path = (ti.field(ti.f32, (RAYS, *shape)) for _ in range(2))
+        # Turned by refraction at a sample [rad]; of a ray: direction [rad] and offset [scanlines].
+        self.turn = ti.field(ti.f32, shape)
+        self.ray_refraction = ti.Vector.field(2, ti.f32, (RAYS, *shape))
+        # Scanlines per mm; half of the Fresnel zone in scanlines.
+        self.lines_per_mm, self.zone = ti.field(ti.f32, self.most), ti.field(ti.i32, self.most)
         # How many scanlines a ray is from its end at a sample, where it leaves the face. It goes from scanline to scanline: mixing
         # two would spread shadows.
         self.ray_offset = ti.field(ti.i32, (RAYS, self.most))
@@ -122,6 +130,8 @@ class Propagation:
             (self.ray_offset, ray_offsets(probe, depth)),
             (self.aperture_angle, angle),
             (self.slice_sd, slice_sd_mm),
+            (self.lines_per_mm, 1 / np.maximum(probe.line_spacing_mm(depth), 1e-3)),
+            (self.zone, fresnel_zones(probe, depth)),
             (
                 self.build_up,
                 (depth + 0.1) / (depth + BUILD_UP_MM) if probe.harmonics else np.ones_like(depth),
@@ -237,9 +247,11 @@ class Propagation:
         before = self.tissue[line, 0].x
         interface.begin(before, 0)
         self.passed[line, 0] = 1.0
+        self.turn[line, 0] = 0.0
         self.echo[line, 0] = tm.vec4(0.0)
         for k in range(1, count):
             self.passed[line, k] = 1.0
+            self.turn[line, k] = 0.0
             self.echo[line, k] = tm.vec4(0.0)
             after = self.tissue[line, k].x
             # Beyond the CT nothing is known: nothing reflects.
@@ -279,6 +291,9 @@ class Propagation:
         echo = reflection * tm.vec2(mirror, ti.sqrt(self.reflection[2] ** 2 * rough + even))
         self.echo[line, k] = tm.vec4(echo, depth, ti.cast(interface.begins, ti.f32))
         self.passed[line, k] = ti.sqrt(1.0 - reflection**2)
+        if ti.abs(reflection) > LEAST_REFRACTING and ti.abs(reflection) < HARD:
+            ratio = speed_ratio(after) / speed_ratio(interface.before)
+            self.turn[line, k] = interface.refraction(direction, ratio)
 
     @ti.kernel
     def _transmit(self, count: int):
@@ -289,6 +304,7 @@ class Propagation:
                 for line in range(self.lines):
                     self.ray_amplitude[ray, line, 0] = self.contact[line]
                     self.ray_path[ray, line, 0] = 0.0
+                    self.ray_refraction[ray, line, 0] = tm.vec2(0.0)
                 for k in range(1, count):
                     aside = self.ray_offset[ray, k] - self.ray_offset[ray, k - 1]
                     for line in range(self.lines):
@@ -302,6 +318,11 @@ class Propagation:
         path = self.ray_path[ray, from_line, k - 1]
         self.ray_path[ray, line, k] = path + attenuation * step_mm / (10.0 * DB_OF_NEPER)
         self.ray_amplitude[ray, line, k] = self.ray_amplitude[ray, from_line, k - 1] * self.passed[line, k]
+        refraction = self.ray_refraction[ray, from_line, k - 1]
+        turned = refraction.x + self.turn[line, k]
+        self.ray_refraction[ray, line, k] = tm.vec2(
+            turned, refraction.y + turned * step_mm * self.lines_per_mm[k]
+        )
 
     @ti.kernel
     def _combine(self, count: int):
@@ -314,11 +335,21 @@ class Propagation:
                     along = self.ray_path[ray, line, k]
                     decibel = self.at_path(self.speckle_db, 2.0 * along)
                     one_way = self.ray_amplitude[ray, line, k] * ti.exp(decibel / (2.0 * DB_OF_NEPER))
+                    one_way *= self.focusing(ray, line, k)
                     total += one_way
                     path += one_way * along
                     found += 1.0
             self.amplitude[line, k] = self.build_up[k] * (total / found) ** 2
             self.path[line, k] = 2.0 * path / ti.max(total, 1e-30)
+
+    @ti.func
+    def focusing(self, ray, line, k):
+        """Return the factor of amplitude of rays that refraction has moved together or apart, over a Fresnel zone."""
+        zone = self.zone[k]
+        low, high = ti.max(line - zone, 0), ti.min(line + zone, self.lines - 1)
+        further = self.ray_refraction[ray, high, k].y - self.ray_refraction[ray, low, k].y
+        apart = 1.0 + further / ti.max(high - low, 1)
+        return 1.0 / ti.sqrt(tm.clamp(apart, 1.0 / MOST_FOCUSED, MOST_FOCUSED))
 
     @ti.func
     def at_path(self, table: ti.template(), path):
@@ -350,6 +381,14 @@ def speed_ratio(impedance):
     """
     density = 0.5 * (ti.sqrt(MAST_OFFSET**2 + 4.0e6 * MAST_SLOPE * impedance) - MAST_OFFSET)
     return ti.select(impedance < 1e-6, 1.0, (density + MAST_OFFSET) / (1000.0 * MAST_SLOPE * SOUND_MM_US))
+
+
+def fresnel_zones(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
+    """Return half of the Fresnel zone halfway to each depth, at least one scanline, (depths,) int32: less does not bend a wave."""
+    zone_mm = np.sqrt(probe.wavelength_mm * depth_mm) / 2
+    return np.maximum(np.rint(zone_mm / np.maximum(probe.line_spacing_mm(depth_mm), 1e-3)), 1).astype(
+        np.int32
+    )
 
 
 def ray_offsets(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:

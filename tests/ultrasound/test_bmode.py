@@ -636,3 +636,37 @@ def test_the_incidence_angle_is_that_in_deformed_tissue(moved):
     # Some interfaces lie in two tetrahedra.
     assert np.median(np.abs(amplitude[80:112] / REFLECTION - wanted)) < 0.03
     assert 3.0 < tilts[:, 0].mean() < 7.0 and np.mean(wanted) < 0.7
+
+
+@pytest.mark.parametrize("inside", [1.50, 1.66])
+def test_refraction_by_a_cylinder_moves_sound_together_or_apart(fine, inside):
+    """Parallel rays through a cylinder of 7 mm, Snell's law at both faces, and their distances over a Fresnel zone 20 mm behind it."""
+    outside, radius, y0, probe = 1.5804, 7.0, 15.0, probe_of(f_number=20.0)
+    edge = 0.4
+
+    def cylinder(x, y, z):
+        return outside + (inside - outside) * special.ndtr((radius - np.hypot(x, y - y0)) / edge)
+
+    fine.fill(cylinder, 0.0, 0.1)
+    decibel = fine.look(probe)
+    ratio = speed_ratio(inside) / speed_ratio(outside)
+    # The image is displaced by less than 1 mm.
+    sample = int(42.0 / probe.sample_mm)
+    zone = round(np.sqrt(probe.wavelength_mm * 42.0) / 2 / (40.0 / LINES)) * 40.0 / LINES
+
+    def offset(x):
+        half = np.sqrt(np.maximum(radius**2 - x**2, 0))
+        incidence = np.arcsin(np.clip(x / radius, -1, 1))
+        turn = np.arcsin(np.clip(ratio * np.sin(incidence), -1, 1)) - incidence
+        behind = np.arcsin(np.clip(np.sin(incidence) / ratio, -1, 1)) - incidence
+        shift = turn * (42.0 - y0 + half) - behind * (42.0 - y0 - half)
+        return np.where(np.abs(x) < radius, shift, 0.0)
+
+    u = probe.scanlines()[0][:, 0]
+    apart = 1 + (offset(u + zone) - offset(u - zone)) / (2 * zone)
+    wanted = -20 * np.log10(np.clip(apart, 1 / 3, 3))
+    found = decibel[:, sample] - np.median(decibel[np.abs(u) > 14, sample])
+    inner = np.abs(u) < radius - zone - 1.0
+    assert np.abs(found - wanted)[inner].max() < 1.0
+    # It is a lens; and beside its rays is a shadow, or a bright edge.
+    assert (np.median(found[np.abs(u) < 2]) > 0.5) == (inside < outside)
