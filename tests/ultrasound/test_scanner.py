@@ -133,3 +133,46 @@ def test_the_surroundings_reflect_as_gel_or_as_air(device):
     scattered = 10 ** (CORTEX_DB / 20)
     wanted = 20 * np.log10((1 + scattered) / (0.12 / 3.12 + scattered))
     assert peak["air"] - peak["gel"] == pytest.approx(wanted, abs=1.0)
+
+
+@pytest.fixture
+def scattering(device) -> Scanner:
+    return Scanner(anatomy(around_hu=KIDNEY_HU), Unmoved(), PROBE, PIXELS, contact="tissue")
+
+
+def b_mode(scanner: Scanner, probe: Probe, persistence: float = 0.0, above: float = -10.0) -> np.ndarray:
+    shown = "b-mode", "speckle", 350.0, 40.0, None, persistence
+    return scanner.images(plane_at(above), probe, *shown)["B-mode"].astype(float)
+
+
+def test_compounding_averages_the_speckle_of_three_angles(scattering):
+    settings = dict(gain_percent=50.0, dyn_range_db=80.0, grey_map="linear")
+    one, three = (
+        b_mode(scattering, PROBE.model_copy(update=settings | {"compound_angles": n})) for n in (1, 3)
+    )
+    middle = slice(6, 18), slice(24, 40)
+    # The dB of three independent speckles, of 5.6 dB each, have 1 / sqrt(3) of its SD.
+    assert three[middle].std() / one[middle].std() == pytest.approx(3**-0.5, rel=0.25)
+    assert three[middle].mean() == pytest.approx(one[middle].mean(), abs=6.0)
+
+
+def test_persistence_mixes_the_image_before_and_none_is_bit_for_bit_the_image(scattering):
+    first, second = b_mode(scattering, PROBE), b_mode(scattering, PROBE, above=-9.0)
+    assert (first != second).any()
+    b_mode(scattering, PROBE, 0.6)
+    mixed = b_mode(scattering, PROBE, 0.6, above=-9.0)
+    assert np.abs(mixed - (0.6 * first + 0.4 * second)).max() <= 1.0
+    for _ in range(30):
+        mixed = b_mode(scattering, PROBE, 0.6, above=-9.0)
+    assert np.abs(mixed - second).max() <= 1.0
+    assert (b_mode(scattering, PROBE, above=-9.0) == second).all()
+
+
+def test_doppler_of_a_scene_is_shown_over_its_image_and_not_while_clamped(scattering):
+    grey = b_mode(scattering, PROBE).astype(np.uint8)
+    slow = PROBE.model_copy(update={"velocity_scale_cm_s": 5.0, "wall_filter_cm_s": 0.5})
+    flowing, clamped = (scattering.doppler(slow, grey, "colour", 0.09, each) for each in (False, True))
+    coloured = (flowing != grey[..., None]).any(axis=-1)
+    assert 0.01 < coloured.mean() < 0.5 and (clamped == grey[..., None]).all(axis=-1).mean() > 0.99
+    # Small vessels run outward: below the middle of the ball, away from a probe in it.
+    assert (flowing[coloured][:, 0] < flowing[coloured][:, 2]).mean() > 0.8
