@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import optimize
 
 from ultrasound.beam import (
     elevation_profiles,
@@ -9,6 +10,7 @@ from ultrasound.beam import (
     lateral_profiles,
     summed_frequencies,
 )
+from ultrasound.lateral_kernel import clutter_weights
 from ultrasound.probe import Probe, load_probe
 from ultrasound.pulse import FWHM_OF_SD
 
@@ -33,6 +35,19 @@ def test_at_the_focus_the_beam_is_the_square_of_a_sinc(name):
     # aperture a little smaller; the mean over the pulse's frequencies is wider by some per cent.
     wanted = 0.886 * probe.wavelength_mm * probe.f_number
     assert width_mm(probe, middle(probe), probe.focus_mm) == pytest.approx(wanted, rel=0.1)
+
+
+@pytest.mark.parametrize("name", ["drop-in", "linear"])
+def test_harmonics_have_the_square_of_the_beam_of_half_the_frequency_and_less_side_lobes(name):
+    probe = load_probe(name)
+    harmonic = probe.model_copy(update={"harmonics": True})
+    # Transmitted sinc^2 of half the frequency, received sinc.
+    half = optimize.brentq(lambda t: np.sinc(t / 2) ** 2 * np.sinc(t) - 0.5, 0.1, 0.9)
+    wanted = 2 * half * probe.wavelength_mm * probe.f_number
+    assert width_mm(harmonic, middle(probe), probe.focus_mm) == pytest.approx(wanted, rel=0.1)
+    depth = np.array([probe.focus_mm])
+    plain, less = (clutter_weights(each, depth).sum() for each in (probe, harmonic))
+    assert less < 0.5 * plain
 
 
 def test_the_beam_is_wider_at_the_arrays_end_and_where_it_is_steered():

@@ -638,6 +638,22 @@ def test_the_incidence_angle_is_that_in_deformed_tissue(moved):
     assert 3.0 < tilts[:, 0].mean() < 7.0 and np.mean(wanted) < 0.7
 
 
+@pytest.mark.parametrize("angle", [0, 30, 60, 90])
+def test_tubules_are_bright_where_the_beam_meets_them_squarely(fine, angle):
+    """Tubules run along the gradient of the distance to the capsule, here at an angle to the beam."""
+    along = np.radians(angle)
+    corners = np.moveaxis(np.indices((2, 2, 2)), 0, -1) * 200.0 - 100.0
+    organ = SampledVolume(
+        corners @ [np.sin(along), np.cos(along), 0.0],
+        np.diag([1 / 200, 1 / 200, 1 / 200, 1.0]) + 0.5 * np.pad(np.ones((3, 1)), [(0, 1), (3, 0)]),
+    )
+    tank, probe = flat_tank(0.5, organ=organ), probe_of()
+    tank.fill(USUAL, 0.0, 0.1, anisotropy=4.0)
+    found = np.median(tank.look(probe)[40:150, 100:500]) + 20.0
+    # The mean of sin^2 over all directions is 2/3.
+    assert found == pytest.approx(4.0 * (np.sin(along) ** 2 - 2 / 3), abs=0.01)
+
+
 @pytest.mark.parametrize("inside", [1.50, 1.66])
 def test_refraction_by_a_cylinder_moves_sound_together_or_apart(fine, inside):
     """Parallel rays through a cylinder of 7 mm, Snell's law at both faces, and their distances over a Fresnel zone 20 mm behind it."""
