@@ -253,10 +253,7 @@ class Probe(BaseModel):
     def line_spacing_mm(self, depth_mm: np.ndarray) -> np.ndarray:
         """Return the distance of neighbouring scanlines at depths [mm]."""
         if self.transducer_geometry == "LINEAR":
-            spacing = (
-                self.transducer_width_mm / self.number_of_scanlines * np.cos(np.radians(self.steering_deg))
-            )
-            return np.full_like(depth_mm, spacing)
+            return np.full_like(depth_mm, self.transducer_width_mm / self.number_of_scanlines)
         step = np.radians(self.theta_stop_deg - self.theta_start_deg) / self.number_of_scanlines
         return (self.radius_mm + depth_mm) * step
 
