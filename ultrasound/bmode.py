@@ -81,8 +81,8 @@ class BMode:
         # Energy that side lobes receive, and what they would receive if it were 1 everywhere.
         self.clutter = ti.Vector.field(2, ti.f32, (self.groups, most))
         self.clutter_weight = ti.field(ti.f32, (most, 2 * self.groups - 1))
-        # Shorter length of the noise across the plane, weights of it and of the next; lengths along the beam by the path.
-        self.elevation = ti.Vector.field(3, ti.f32, most)
+        # Lengths of the noise across the plane (``elevation_levels``); lengths along the beam by the path.
+        self.elevation = ti.Vector.field(4, ti.f32, most)
         self.axial_sd, self.speckle_sd = (ti.field(ti.f32, PATH_ENTRIES) for _ in range(2))
         self.length_weight = ti.field(ti.f32, (LENGTHS, 2 * LENGTH_TAPS + 1))
         self.weight = ti.field(ti.f32, (CLASSES, packets, 2 * MAX_HALF_WIDTH + 1))

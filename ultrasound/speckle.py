@@ -5,7 +5,7 @@ correlation is that of the pulse and of the beam (Wagner 1983). So the noise has
 and the beam's correlation length across it. The phase of the carrier, which does not affect the magnitude, is left out.
 
 Across the plane the noise is longer than along it. Its long axis has one of many fixed directions, two of which are mixed where the
-plane turns from one to the next; and one of the fixed lengths ELEVATION_SD_MM, two of which are mixed for a length between them.
+plane turns from one to the next; and one of the fixed lengths ELEVATION_SD_MM.
 So speckle depends on nothing but the tissue's rest position and on where the plane lies: a sweep that comes back shows it again.
 """
 
@@ -26,10 +26,11 @@ SEED = 20130629
 CELL_OFFSET = 0.37
 # Real and imaginary part share one 32-bit word, so that the block fits into the cache.
 UNIT = 1 / 4096
-# Lengths across the image plane: an octave each.
-SHORTEST_SD_MM, LEVELS = 0.05, 8
-ELEVATION_SD_MM = SHORTEST_SD_MM * 2.0 ** np.arange(LEVELS)
-# Directions of the long axis: so many each way on a face of a cube; two of them are mixed in this part of the way between them.
+# Lengths across the image plane, in steps of a quarter of an octave.
+SHORTEST_SD_MM, LENGTH_STEP, LEVELS = 0.05, 2.0**0.25, 29
+ELEVATION_SD_MM = SHORTEST_SD_MM * LENGTH_STEP ** np.arange(LEVELS)
+# Directions of the long axis: so many each way on a face of a cube. Two directions, or two lengths, are mixed in this part of the way
+# between them: elsewhere there is one noise to compute.
 DIRECTIONS, MIXED = 23, 0.2
 QUARTER = float(np.pi / 4)
 # Two directions each way on the cube's face, two lengths.
@@ -51,16 +52,15 @@ def noise_block() -> np.ndarray:
 
 
 def elevation_levels(sd_mm: np.ndarray) -> np.ndarray:
-    """Return, for correlation SDs (n,) [mm], index of the shorter length and weights of it and of the next one, (n, 3) float32.
+    """Return, for correlation SDs (n,) [mm], index of the shorter length, its weight, that of the next one, and the shorter length.
 
-    Intensity correlates by 1/2 at the same distance as with exp(-d^2 / (2 SD^2)), the square of the field's.
+    (n, 4) float32. The length is that of the nearest index, up to 9 % off.
     """
-    sd_mm = np.clip(sd_mm, ELEVATION_SD_MM[0], ELEVATION_SD_MM[-1])
-    level = np.clip(np.searchsorted(ELEVATION_SD_MM, sd_mm, side="right") - 1, 0, LEVELS - 2)
-    half = sd_mm * np.sqrt(2 * np.log(2))
-    short, long = (np.exp(-(half**2) / (4 * ELEVATION_SD_MM[level + k] ** 2)) for k in range(2))
-    share = np.clip((long - np.sqrt(0.5)) / np.maximum(long - short, 1e-12), 0, 1)
-    return np.column_stack([level, np.sqrt(share), np.sqrt(1 - share)]).astype(np.float32)
+    at = np.clip(np.log(sd_mm / SHORTEST_SD_MM) / np.log(LENGTH_STEP), 0, LEVELS - 1.001)
+    level = np.floor(at)
+    share = np.clip((at - level - 0.5) / MIXED + 0.5, 0, 1)
+    shorter = SHORTEST_SD_MM * LENGTH_STEP**level
+    return np.column_stack([level, np.sqrt(1 - share), np.sqrt(share), shorter]).astype(np.float32)
 
 
 @ti.dataclass
@@ -139,12 +139,13 @@ class Speckle:
         index = axis.index + other * axis.step
         level = ti.cast(lengths.x, ti.i32) + longer
         matrix = self.axes(axis.face, index)
-        fine, coarse = PITCHES / sd_mm, PITCHES / (SHORTEST_SD_MM * ti.cast(1 << level, ti.f32))
+        longer_mm = lengths.w * ti.select(longer == 1, LENGTH_STEP, 1.0)
+        fine, coarse = PITCHES / sd_mm, PITCHES / longer_mm
         for column in ti.static(range(3)):
             matrix[0, column] *= fine
             matrix[1, column] *= fine
             matrix[2, column] *= coarse
-        key = (((look * 64 + index.x) * 64 + index.y) * 4 + axis.face) * 8 + level
+        key = (((look * 64 + index.x) * 64 + index.y) * 4 + axis.face) * 32 + level
         return key * 40503, matrix
 
     @ti.func
