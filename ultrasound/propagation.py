@@ -36,6 +36,8 @@ CENTRAL_PLANE = ((0.0, 1.0),)
 THICK_PLANE = ((0.0, 2 / 3), (-(1.5**0.5), 1 / 6), (1.5**0.5, 1 / 6))
 # Intensity changes by refraction by no more than this factor.
 MOST_FOCUSED = 3.0
+# Entries of the table of amplitudes for each of the table in dB, between which these are straight.
+FINER = 4
 # Rays from the aperture to each sample.
 RAYS = 7
 
@@ -101,6 +103,7 @@ class Propagation:
         # Half angle of the aperture [rad], SD of the beam across the image plane [mm] and amplitude of harmonics, at each sample.
         self.aperture_angle, self.slice_sd, self.build_up = (ti.field(ti.f32, self.most) for _ in range(3))
         self.speckle_db, self.echo_db = (ti.field(ti.f32, PATH_ENTRIES) for _ in range(2))
+        self.one_way = ti.field(ti.f32, FINER * PATH_ENTRIES)
         # Half angle of the aperture across the plane [rad]; of interfaces: amplitudes reflected as a mirror and diffusely, slope,
         # amplitudes scattered evenly by soft and by hard ones.
         self.reflection = ti.field(ti.f32, 6)
@@ -137,6 +140,16 @@ class Propagation:
                 (depth + 0.1) / (depth + BUILD_UP_MM) if probe.harmonics else np.ones_like(depth),
             ),
             (self.speckle_db, pulse.speckle_db),
+            (
+                self.one_way,
+                10
+                ** (
+                    np.interp(
+                        np.arange(FINER * PATH_ENTRIES) / FINER, np.arange(PATH_ENTRIES), pulse.speckle_db
+                    )
+                    / 40
+                ),
+            ),
             (self.echo_db, pulse.echo_db),
             (
                 self.reflection,
@@ -333,8 +346,7 @@ class Propagation:
                 origin = line - self.ray_offset[ray, k]
                 if origin >= 0 and origin < self.lines:
                     along = self.ray_path[ray, line, k]
-                    decibel = self.at_path(self.speckle_db, 2.0 * along)
-                    one_way = self.ray_amplitude[ray, line, k] * ti.exp(decibel / (2.0 * DB_OF_NEPER))
+                    one_way = self.ray_amplitude[ray, line, k] * self.attenuated(along)
                     one_way *= self.focusing(ray, line, k)
                     total += one_way
                     path += one_way * along
@@ -350,6 +362,13 @@ class Propagation:
         further = self.ray_refraction[ray, high, k].y - self.ray_refraction[ray, low, k].y
         apart = 1.0 + further / ti.max(high - low, 1)
         return 1.0 / ti.sqrt(tm.clamp(apart, 1.0 / MOST_FOCUSED, MOST_FOCUSED))
+
+    @ti.func
+    def attenuated(self, path):
+        """Return the amplitude of speckle that attenuation on a path one way [Np/MHz] leaves, one way."""
+        at = ti.min(path * (2.0 * FINER / PATH_STEP), FINER * PATH_ENTRIES - 1.001)
+        first = ti.cast(at, ti.i32)
+        return tm.mix(self.one_way[first], self.one_way[first + 1], at - first)
 
     @ti.func
     def at_path(self, table: ti.template(), path):
