@@ -1,7 +1,7 @@
 """The command ``study features``: the cost of each feature of a scene, by the same press with it and without it, in turn."""
 
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,7 +26,7 @@ from render.background_image import BackgroundImage
 from render.window_layout import WindowLayout
 from scenes.anatomy import LoadedAnatomy
 from scenes.mechanical_tissues import mechanical_properties
-from scenes.scene import PAPER, Contact, Scene, SolverSection
+from scenes.scene import PAPER, Contact, Image, Scene, SolverSection
 from scenes.surfaces import translated
 from scenes.tissue import TISSUES, USUAL, PartMaterial, Prony, ShapeMatchingTissue, TissueSection
 from sim.attachment import Pedicle, Tether
@@ -39,8 +39,8 @@ from sim.solver import Solver
 from studies.harness import build, memory_mb
 from studies.study_options import open_study, out_option, scene_argument
 from studies.study_results import finish_axes, table_of, write_results
-from ultrasound.probe import DetailLevel, Mode
-from ultrasound.probe_manipulator import advanced, image_plane, pose_at, poses_between, touching
+from ultrasound.probe import DetailLevel, DopplerMode, Mode, Probe
+from ultrasound.probe_manipulator import ImagePlane, advanced, image_plane, pose_at, poses_between, touching
 from ultrasound.scanner import ScannedAnatomy, Scanner
 
 # Depth and steps of the press, and the steps before it in which the body settles.
@@ -276,6 +276,31 @@ def _images(rehearsal: Rehearsal, scanned: ScannedAnatomy) -> Iterator[dict[str,
             scanner.images(plane, probe, mode, detail_level, image.window_hu, image.level_hu)
 
         yield _alone(f"image, {name}", draw, [embedding, scanner], rehearsal.model)
+        if name == "B-mode: and elevation":
+            yield from _switches(scanner, plane, probe, image, rehearsal.model)
+
+
+def _switches(
+    scanner: Scanner, plane: ImagePlane, probe: Probe, image: Image, apart: Any
+) -> Iterator[dict[str, Any]]:
+    """The B-mode image with harmonics, compounding, persistence and Doppler, each with all detail."""
+
+    def b_mode(settings: dict[str, Any], persistence: float = 0.0) -> np.ndarray:
+        changed, window = probe.model_copy(update=settings), (image.window_hu, image.level_hu)
+        return scanner.images(plane, changed, "b-mode", "elevation", *window, None, persistence)["B-mode"]
+
+    def with_doppler(mode: DopplerMode) -> None:
+        scanner.doppler(probe, b_mode({}), mode)
+
+    switches: dict[str, Callable[[], Any]] = {
+        "harmonics": partial(b_mode, {"harmonics": True}),
+        "compounding of 3 angles": partial(b_mode, {"compound_angles": 3}),
+        "persistence": partial(b_mode, {}, 0.5),
+        "colour Doppler": partial(with_doppler, "colour"),
+        "power Doppler": partial(with_doppler, "power"),
+    }
+    for name, draw in switches.items():
+        yield _alone(f"image, B-mode with {name}", draw, [scanner], apart)
 
 
 def _whole_frame(rehearsal: Rehearsal) -> dict[str, Any]:
