@@ -5,6 +5,8 @@ not from the pulses themselves (Kasai et al. 1985, IEEE Trans Sonics Ultrason 32
 aliases; a wall filter removes what is slow; the sample volume averages it; noise is that of so many pulses.
 """
 
+import zlib
+
 import numpy as np
 import taichi as ti
 import taichi.math as tm
@@ -107,8 +109,9 @@ class Doppler:
         limits = probe.velocity_limit_cm_s / 100, probe.wall_filter_cm_s / 100
         self._find_flow(count, share, pulse_share(time_s), *limits)
         gate = max(round(GATE_MM / (2 * stride * probe.sample_mm)), 0)
-        key = int(time_s * 997) + self.sound.plane.noise_key
-        self._average(count, gate, noise_energy(probe), key & 0xFFFF)
+        # Noise changes with time, and with the plane.
+        key = zlib.crc32(np.array([time_s, self.sound.plane.noise_key]).tobytes()) & 0x3FFFF
+        self._average(count, gate, noise_energy(probe), key)
 
     def velocity_cm_s(self, probe: Probe) -> np.ndarray:
         """Return the velocity towards the array (scanlines, samples) [cm/s] of the last estimate, aliased."""
@@ -193,8 +196,10 @@ class Doppler:
         """Return noise (2,) of unit mean square that changes with the key, as wide as a beam."""
         at = line / NOISE_LINES
         first = ti.cast(at, ti.i32)
-        near = self.bmode.speckle.entry(key + 17 * (k // SIZE), k, first)
-        return tm.mix(near, self.bmode.speckle.entry(key + 17 * (k // SIZE), k, first + 1), at - first)
+        # Another part of the block for each of its three axes' SIZE shifts.
+        i, j, along = key + 17 * (k // SIZE), k + key // SIZE, first + key // (SIZE * SIZE)
+        near, far = self.bmode.speckle.entry(i, j, along), self.bmode.speckle.entry(i, j, along + 1)
+        return tm.mix(near, far, at - first)
 
     @ti.kernel
     def _paint(

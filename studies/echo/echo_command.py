@@ -8,7 +8,7 @@ import click
 import numpy as np
 
 from rehearsal.commands.command_line import make_folder, start_taichi
-from studies.echo.echo_rows import CYST_RADIUS_MM, DEPTHS_MM, LEVEL_BAR_DB, WIDTH_BAR, Row, rows
+from studies.echo.echo_rows import CYST_RADIUS_MM, DEPTHS_MM, LEVEL_BAR_DB, SHIFT_BAR, WIDTH_BAR, Row, rows
 from studies.echo.simus_beam import pymust
 from studies.study_options import out_option
 from studies.study_results import finish_axes, table_of, write_results
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 COLUMNS = (
     ("quantity", "{name}"),
     ("ours", "{ours:.3g}"),
-    ("SIMUS", "{reference:.3g}"),
+    ("reference", "{reference:.3g}"),
     ("unit", "{unit}"),
     ("within", "{within}"),
     ("if not, why", "{reason}"),
@@ -47,12 +47,13 @@ def echo(out: Path) -> None:
     outside = sum(not row.is_within for row in found)
     text = (
         f"{table_of(COLUMNS, described)}\n\n{len(found) - outside} of {len(found)} within {100 * WIDTH_BAR:g} % "
-        f"(lengths) or {LEVEL_BAR_DB:g} dB (levels) of SIMUS"
+        f"(lengths) or {LEVEL_BAR_DB:g} dB (levels) of SIMUS, or {100 * SHIFT_BAR:g} % of the Doppler equation"
     )
     report = dict(
         backend=backend,
         length_bar=WIDTH_BAR,
         level_bar_db=LEVEL_BAR_DB,
+        shift_bar=SHIFT_BAR,
         rows=[asdict(row) | {"within": row.is_within} for row in found],
     )
     write_results(out, "echo", report, text, described, figure_of(found))

@@ -6,7 +6,9 @@ import numpy as np
 
 from sim.embedding import Unmoved
 from sim.fields import array_of, fill
+from ultrasound.blood_flow import BEAT_S, CHANNELS, SYSTOLE_S
 from ultrasound.bmode import BMode
+from ultrasound.doppler import Doppler
 from ultrasound.interface import Surface
 from ultrasound.probe import DetailLevel, Probe
 from ultrasound.probe_manipulator import image_plane, pose_at
@@ -18,6 +20,8 @@ VOXEL_MM, MARGIN_MM = 0.25, 2.0
 # Of tissue in which sound is as fast as the scanner assumes.
 IMPEDANCE, PIXELS = 1.5804, 64
 FAR_MM = 1e4
+# A vessel, and the heartbeats over which its velocities are averaged.
+VESSEL_RADIUS_MM, BEATS = 3.0, 200
 Values = float | np.ndarray | Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -26,6 +30,7 @@ class EchoPhantom:
 
     def __init__(self, probe: Probe) -> None:
         self.probe = probe
+        self.doppler: Doppler | None = None
         width, depth, above = probe.extent_mm
         low = np.array([-width / 2 - MARGIN_MM, -above - MARGIN_MM])
         count = round((width + 2 * MARGIN_MM) / VOXEL_MM), round((depth + 2 * MARGIN_MM) / VOXEL_MM)
@@ -35,6 +40,7 @@ class EchoPhantom:
         self.tissue = SampledVolume(np.zeros((*count, 1, 4)), index_from_mm, outside=0.0)
         organ = SampledVolume(np.full((1, 1, 1), -1.0), np.diag([1 / FAR_MM] * 3 + [1.0]))
         self.plane = PlaneInTissue(Unmoved(), PIXELS)
+        self.flow = SampledVolume(np.zeros((*count, 1, CHANNELS)), index_from_mm, outside=0.0)
         self.bmode = BMode(Propagation(self.tissue, organ, self.plane, probe, VOXEL_MM), probe)
 
     @property
@@ -46,6 +52,28 @@ class EchoPhantom:
         """Give the interfaces another surface."""
         self.bmode.sound.surface = surface
 
+    def vessel_velocity(self, speed_cm_s: float, angle_deg: float, depth_mm: float) -> np.ndarray:
+        """Return the velocities [cm/s] that Doppler finds in a straight vessel whose flow has an angle to the direction of the array."""
+        turn = np.radians(angle_deg)
+        along = np.array([np.sin(turn), -np.cos(turn)])
+        off = np.abs(self.u * along[1] - (self.v - depth_mm) * along[0])
+        values = np.zeros((*self.u.shape, 1, CHANNELS), np.float32)
+        values[..., 0, :2] = np.where(off < VESSEL_RADIUS_MM, speed_cm_s / 100, 0.0)[..., None] * along
+        values[..., 0, 4] = off < VESSEL_RADIUS_MM
+        fill((self.flow.voxels, _thin(values)))
+        self.fill(backscatter=lambda u, v: 0.01 * (off >= VESSEL_RADIUS_MM))
+        self.amplitude()
+        if self.doppler is None:
+            self.doppler = Doppler(self.bmode.sound, self.bmode, self.flow)
+        found = []
+        for beat in range(BEATS):
+            self.doppler.estimate(self.probe, SYSTOLE_S + beat * BEAT_S)
+            found.append(self.doppler.velocity_cm_s(self.probe))
+        middle = self.probe.number_of_scanlines // 2
+        step_mm = self.bmode.sound.stride_of(self.probe) * self.probe.sample_mm
+        sample = round(depth_mm / step_mm)
+        return np.stack(found)[:, middle - 4 : middle + 5, sample - 1 : sample + 2]
+
     def fill(
         self, impedance: Values = IMPEDANCE, attenuation: Values = 0.0, backscatter: Values = 0.0
     ) -> None:
@@ -53,8 +81,7 @@ class EchoPhantom:
         values = np.zeros((*self.u.shape, 1, 4), np.float32)
         for channel, given in enumerate((impedance, attenuation, backscatter)):
             values[..., 0, channel] = given(self.u, self.v) if callable(given) else given
-        thin = np.pad(values, [(0, 0), (0, 0), (0, 1), (0, 0)], mode="edge")
-        fill((self.tissue.voxels, thin.reshape(-1, 4)))
+        fill((self.tissue.voxels, _thin(values)))
 
     def amplitude(
         self,
@@ -83,3 +110,8 @@ class EchoPhantom:
         sample = int(depth_mm / self.probe.sample_mm)
         decibel = array_of(self.bmode.decibel).astype(float) - self.probe.gain_db()
         return place, 10 ** (decibel[:, sample] / 20)
+
+
+def _thin(values: np.ndarray) -> np.ndarray:
+    """Return voxels (nx, ny, 1, c) as a field of a thin ``SampledVolume`` has them."""
+    return np.pad(values, [(0, 0), (0, 0), (0, 1), (0, 0)], mode="edge").reshape(-1, values.shape[-1])

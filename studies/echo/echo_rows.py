@@ -8,11 +8,12 @@ from tqdm import tqdm
 
 from studies.echo.echo_phantom import IMPEDANCE, EchoPhantom
 from studies.echo.simus_beam import SimusBeam, full_width, half_correlation
+from ultrasound.doppler import doppler_shift_khz
 from ultrasound.interface import Surface
 from ultrasound.probe import Probe, load_probe
 
-# Bars: share of a width or length, decibels of a level.
-WIDTH_BAR, LEVEL_BAR_DB = 0.2, 3.0
+# Bars: share of a width or length, decibels of a level, share of a Doppler shift.
+WIDTH_BAR, LEVEL_BAR_DB, SHIFT_BAR = 0.2, 3.0, 0.05
 RAYLEIGH_SNR = float(np.sqrt(np.pi / (4 - np.pi)))
 DEPTHS_MM = {
     "drop-in": (9.0, 18.0, 30.0),
@@ -22,6 +23,8 @@ DEPTHS_MM = {
 }
 TILTS_DEG = (5, 10, 20, 40)
 CYST_RADIUS_MM = 2.0
+# Speed of blood, and its angles to the direction of the array.
+BLOOD_CM_S, FLOW_ANGLES_DEG = 20.0, (30, 45, 60, 75)
 SMOOTH = Surface(roughness_mm=0.0, scattered=0.0, scattered_hard=0.0)
 ROUGH = Surface(roughness_mm=0.03, slope=0.14, scattered=0.0, scattered_hard=0.0)
 # Correlation length of a rough surface of that slope, and draws of it.
@@ -51,7 +54,8 @@ class Row:
         """Whether ours is within the bar of the reference."""
         if self.unit == "dB":
             return bool(abs(self.ours - self.reference) <= LEVEL_BAR_DB)
-        return bool(abs(self.ours / self.reference - 1) <= WIDTH_BAR)
+        bar = SHIFT_BAR if self.unit == "kHz" else WIDTH_BAR
+        return bool(abs(self.ours / self.reference - 1) <= bar)
 
 
 def rows() -> Iterator[Row]:
@@ -255,6 +259,19 @@ def attenuation(phantom: EchoPhantom, name: str) -> Iterator[Row]:
             yield Row(f"{text}: length of the pulse {when} it", found, reference, "mm")
 
 
+def doppler_shifts(phantom: EchoPhantom, name: str) -> Iterator[Row]:
+    """Doppler shift of a vessel, against 2 f v cos(angle) / c."""
+    probe, depth = phantom.probe, DEPTHS_MM[name][1]
+    for angle in FLOW_ANGLES_DEG:
+        found = float(phantom.vessel_velocity(BLOOD_CM_S, angle, depth).mean())
+        yield Row(
+            f"{name}, Doppler shift of {BLOOD_CM_S:g} cm/s at {angle} degrees (by 2 f v cos / c)",
+            doppler_shift_khz(probe, found),
+            doppler_shift_khz(probe, BLOOD_CM_S * np.cos(np.radians(angle))),
+            "kHz",
+        )
+
+
 def _length(depth: np.ndarray, amplitude: np.ndarray) -> float:
     """Full width at half maximum of a Gaussian, whose samples are about as far apart."""
     top = amplitude > 0.01 * amplitude.max()
@@ -262,4 +279,4 @@ def _length(depth: np.ndarray, amplitude: np.ndarray) -> float:
     return float(np.sqrt(-4 * np.log(2) / curve))
 
 
-DROP_IN_PARTS = (speckle_statistics, edge_width, interfaces, cysts, attenuation)
+DROP_IN_PARTS = (speckle_statistics, edge_width, interfaces, cysts, attenuation, doppler_shifts)

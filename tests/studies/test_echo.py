@@ -14,6 +14,7 @@ from studies.echo.echo_rows import (
     Row,
     attenuation,
     cysts,
+    doppler_shifts,
     edge_width,
     elevation_lengths,
     lateral_widths,
@@ -35,9 +36,13 @@ def phantom(request):
 def test_widths_lengths_and_levels_are_within_the_bars_of_simus(phantom):
     name, test_object = phantom
     parts = [lateral_widths]
-    parts += [edge_width, speckle_statistics, cysts, attenuation] if name == "drop-in" else [steered_width]
+    parts += (
+        [edge_width, speckle_statistics, cysts, attenuation, doppler_shifts]
+        if name == "drop-in"
+        else [steered_width]
+    )
     found = [row for part in parts for row in part(test_object, name)]
-    assert len(found) == (19 if name == "drop-in" else 4)
+    assert len(found) == (23 if name == "drop-in" else 4)
     assert [row for row in found if not row.is_within] == []
 
 
@@ -49,6 +54,7 @@ def test_speckle_decorrelates_across_the_plane_as_in_simus(phantom):
 
 def test_a_row_is_judged_by_its_unit():
     assert Row("a", 1.19, 1.0, "mm").is_within and not Row("a", 0.79, 1.0, "mm").is_within
+    assert Row("a", 1.04, 1.0, "kHz").is_within and not Row("a", 1.06, 1.0, "kHz").is_within
     assert Row("a", -12.9, -10.0, "dB").is_within and not Row("a", -6.9, -10.0, "dB").is_within
 
 
