@@ -80,9 +80,12 @@ class PoseScans:
         signals = self.scanner.iq(self.probe, self._planes[-1], before, self._planes[0])
         save_iq(signals, self.out / f"{name}-iq.{suffix}")
 
-    def with_doppler(self, images: dict[str, np.ndarray], mode: DopplerMode) -> dict[str, np.ndarray]:
+    def with_doppler(
+        self, images: dict[str, np.ndarray], mode: DopplerMode, clamped: bool = False
+    ) -> dict[str, np.ndarray]:
         """Return the images, with Doppler of the last B-mode image at the peak of systole."""
-        return images | {DOPPLER: self.scanner.doppler(self.probe, images[B_MODE], mode, SYSTOLE_S)}
+        shown = self.scanner.doppler(self.probe, images[B_MODE], mode, SYSTOLE_S, clamped)
+        return images | {DOPPLER: shown}
 
     def save(self, name: str, images: dict[str, np.ndarray], dicom: bool) -> None:
         """Write the images of the last pose, and note them in ``rows``. Raises OSError."""

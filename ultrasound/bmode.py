@@ -259,7 +259,7 @@ class BMode:
                 if weight > LEAST_WEIGHT:
                     key, matrix = self.speckle.component(each, axis, self.elevation[k], speckle_sd, look)
                     near, far = matrix @ self.sound.rest[line, k], matrix @ self.sound.rest[line, k + 1]
-                    for j in range(stride):
+                    for j in ti.static(range(stride)):
                         t = (j + 0.5) / stride
                         noise = self.speckle.at(tm.mix(near, far, t), key)
                         noise *= weight * tm.mix(self.level[line, k], self.level[line, k + 1], t)
@@ -280,10 +280,12 @@ class BMode:
             length = ti.min(ti.round(more / LENGTH_STEP, ti.i32), LENGTHS - 1)
             half = ti.min(ti.ceil(HALF_WIDTH_SD * length * LENGTH_STEP, ti.i32), LENGTH_TAPS)
             real, imaginary = Packet(0.0), Packet(0.0)
-            for tap in range(-half, half + 1):
+            tap = -half
+            while tap <= half:
                 weight, at = self.length_weight[length, tap + LENGTH_TAPS], first + tap + LENGTH_TAPS
                 real += weight * self.packet(self.scattered_real, line, at)
                 imaginary += weight * self.packet(self.scattered_imaginary, line, at)
+                tap += 1
             gain = self.speckle_gain[self.scanline_class[line], packet]
             contact = self.sound.contact[line]
             for i in ti.static(range(LANES)):
@@ -372,7 +374,9 @@ class BMode:
             real, imaginary = Packet(0.0), Packet(0.0)
             each, side = self.scanline_class[line], self.side[line]
             half = self.half[each, packet]
-            for k in range(-half, half + 1):
+            k = -half
+            # LLVM would vectorize a for loop over scanlines instead of lanes, which takes four times as long.
+            while k <= half:
                 # Beyond the ends of the array the scanlines are mirrored.
                 m = ti.abs(line + k)
                 m = ti.min(m, 2 * (self.lines - 1) - m)
@@ -381,6 +385,7 @@ class BMode:
                 weight = self.weight[each, packet, side * k + MAX_HALF_WIDTH]
                 real += weight * self.packet(self.real, m, first)
                 imaginary += turned * weight * self.packet(self.imaginary, m, first)
+                k += 1
             electronic = self.electronic_noise(line, packet, key)
             real += noise * electronic[0, :]
             imaginary += noise * electronic[1, :]

@@ -36,6 +36,8 @@ PRIORITY = 0.65
 BLOOD = 10 ** ((CORTEX_DB + tissue_table()["vessel"]["backscatter_db"]) / 20)
 # Share of the energy of tissue at rest that the wall filter lets pass.
 STOPPED = 2e-9
+# A clamp at the hilum is so far from the organ.
+CLAMP_MM = 5.0
 # Scanlines from one independent value of noise to the next.
 NOISE_LINES = 3.0
 # Colours from no velocity to the limit of the scale, towards the array and away from it; and from no power to the most.
@@ -84,7 +86,7 @@ class Doppler:
     ) -> np.ndarray:
         """Return an image (rows, columns, 3) uint8: a B-mode image ``grey`` of the plane, with Doppler over it.
 
-        The B-mode image must have been rendered last for the same probe. ``time_s`` is that of the heart; blood of a clamped kidney rests.
+        The B-mode image must have been rendered last for the same probe. ``time_s`` is that of the heart; blood of a clamped kidney rests, and beyond the clamp it flows on.
         """
         self.estimate(probe, time_s, clamped)
         power = mode == "power"
@@ -105,9 +107,8 @@ class Doppler:
             self.sound.run(steered, thick=False)
         stride = self.sound.stride_of(probe)
         count = probe.number_of_samples_per_scanline // stride + 1
-        share = 0.0 if clamped else 1.0
         limits = probe.velocity_limit_cm_s / 100, probe.wall_filter_cm_s / 100
-        self._find_flow(count, share, pulse_share(time_s), *limits)
+        self._find_flow(count, int(clamped), pulse_share(time_s), *limits)
         gate = max(round(GATE_MM / (2 * stride * probe.sample_mm)), 0)
         # Noise changes with time, and with the plane.
         key = zlib.crc32(np.array([time_s, self.sound.plane.noise_key]).tobytes()) & 0x3FFFF
@@ -144,7 +145,7 @@ class Doppler:
             self.sound.set_probe(probe, array_of(self.bmode.sound.slice_sd))
 
     @ti.kernel
-    def _find_flow(self, count: int, share: float, systole: float, limit: float, wall: float):
+    def _find_flow(self, count: int, clamped: int, systole: float, limit: float, wall: float):
         """Set ``moment`` at each tissue sample: that of moving blood, behind the wall filter, and what is left of tissue."""
         for line, k in ti.ndrange(self.lines, count):
             flow = self.flow.sample(self.sound.rest[line, k])
@@ -152,7 +153,9 @@ class Doppler:
             tissue = (amplitude * self.sound.tissue[line, k].z) ** 2 * STOPPED
             velocity = tm.vec3(flow[0], flow[1], flow[2])
             pulsatile = 1.0 - flow[3] * (1.0 - systole)
-            towards = share * pulsatile * self.towards_array(line, k, velocity)
+            towards = pulsatile * self.towards_array(line, k, velocity)
+            if clamped == 1 and self.sound.organ.sample(self.sound.rest[line, k]) < CLAMP_MM:
+                towards = 0.0
             # What aliases is filtered as what it seems to be.
             seen = towards - 2.0 * limit * ti.round(towards / (2.0 * limit))
             energy = (amplitude * BLOOD * flow[4]) ** 2 * passed_by_wall_filter(seen / wall)

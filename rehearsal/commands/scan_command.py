@@ -44,6 +44,8 @@ class ScanOptions(ImageOptions, ArchOptions):
     """Write each B-mode image as DICOM too."""
     doppler: Literal["off", "colour", "power"] = "off"
     """Write each B-mode image with colour or power Doppler too, at the peak of systole."""
+    clamped: bool = False
+    """With --doppler: the renal hilum is clamped, and no blood flows."""
     iq: Literal["npz", "mat"] | None = None
     """Write IQ and RF signals of each B-mode image too, before gain, for NumPy or MATLAB, with the motion of the tissue."""
     sweep: bool = False
@@ -87,7 +89,7 @@ def scan(asked: ScanOptions) -> None:
             if asked.iq is not None:
                 scans.save_iq(name, asked.iq)
             if asked.doppler != "off":
-                images = scans.with_doppler(images, asked.doppler)
+                images = scans.with_doppler(images, asked.doppler, asked.clamped)
             scans.save(name, images, asked.dicom)
     report = dict(
         version=VERSION,

@@ -177,3 +177,21 @@ def test_an_anatomy_has_flow_only_within_its_volume(vessel):
     tank.look(probe, "speckle")
     doppler.estimate(probe)
     assert array_of(doppler.moment)[..., 2].max() < 2 * STOPPED * 0.01**2
+
+
+def test_beyond_the_clamp_blood_flows_on():
+    """The organ is where y < 15; the clamp is 5 mm from it."""
+    start("cpu")
+    y = np.arange(0, 60, 1.0)
+    organ = SampledVolume((y - 15.0)[None, :, None], np.diag([1e-6, 1.0, 1e-6, 1.0]) @ np.eye(4), outside=1e6)
+    tank = flat_tank(0.5, organ=organ, contact="tissue")
+    tank.fill()
+    everywhere = SampledVolume(
+        np.tile([0.0, -0.3, 0.0, 0.0, 1.0], (1, 1, 1, 1)), np.diag([1e-6, 1e-6, 1e-6, 1.0]), outside=0.0
+    )
+    doppler, probe = Doppler(tank.bmode.sound, tank.bmode, everywhere), probe_of(**SETTINGS, **QUIET)
+    tank.look(probe, "speckle")
+    doppler.estimate(probe, SYSTOLE_S, clamped=True)
+    energy = array_of(doppler.moment)[90, :, 2]
+    depth = tank.bmode.sound.stride_of(probe) * probe.sample_mm * np.arange(len(energy))
+    assert (energy[depth < 18] == 0).all() and (energy[(depth > 22) & (depth < 38)] > 0).all()
