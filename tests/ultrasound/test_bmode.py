@@ -638,6 +638,34 @@ def test_the_incidence_angle_is_that_in_deformed_tissue(moved):
     assert 3.0 < tilts[:, 0].mean() < 7.0 and np.mean(wanted) < 0.7
 
 
+def test_each_ray_is_turned_by_the_interfaces_on_its_own_path(fine):
+    probe = probe_of(f_number=2.0)
+    fine.fill(lambda x, y, z: 1.58 + 0.08 * special.ndtr((6.0 - np.hypot(x - 2.0, y - 14.0)) / 0.4))
+    fine.look(probe)
+    sound = fine.bmode.sound
+    turn, depth, offset = (array_of(each) for each in (sound.turn, sound.depth, sound.ray_offset))
+    found, per_mm = array_of(sound.ray_refraction), array_of(sound.lines_per_mm)
+    for ray, line, k in ((0, 100, 60), (1, 120, 55), (3, 96, 50), (6, 80, 65)):
+        turned = shift = 0.0
+        for j in range(1, k + 1):
+            here = np.clip(line - offset[ray, k] + offset[ray, j], 0, LINES - 1)
+            turned += turn[here, j]
+            shift += turned * (depth[here, j] - depth[here, j - 1]) * per_mm[j]
+        assert found[ray, line, k] == pytest.approx([turned, shift], abs=1e-4)
+    assert np.abs(turn).max() > 0.01
+
+
+def test_half_of_a_slice_beyond_the_ct_has_the_impedance_of_the_other_half():
+    """The CT ends 0.6 mm beside the image plane, within the slice."""
+    tank = Tank((1.0, 1.0, 1.0), (60, 100, 12), (-30.0, -10.0, -11.1))
+    tank.fill(USUAL, 0.0, 0.1)
+    tank.look(probe_of(depth_mm=60.0), "elevation")
+    inside = array_of(tank.bmode.sound.tissue)[20:170, 2:60]
+    assert inside[..., 0] == pytest.approx(USUAL, rel=1e-5)
+    # Scatterers are only where there is tissue.
+    assert inside[..., 2].min() < 0.095
+
+
 @pytest.mark.parametrize("angle", [0, 30, 60, 90])
 def test_tubules_are_bright_where_the_beam_meets_them_squarely(fine, angle):
     """Tubules run along the gradient of the distance to the capsule, here at an angle to the beam."""

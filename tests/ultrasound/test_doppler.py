@@ -3,12 +3,18 @@
 import numpy as np
 import pytest
 import taichi as ti
+import trimesh
+from conftest import rotation_about
+from particle_tissue import tissue_of
 from test_bmode import BOUNDLESS, TISSUE, Tank, flat_tank, probe_of
 
+from sim.body import BodyState
 from sim.device import start
+from sim.embedding import Embedding
 from sim.fields import array_of, fill
 from ultrasound.blood_flow import BEAT_S, SYSTOLE_S
 from ultrasound.doppler import BLOOD, STOPPED, Doppler, doppler_shift_khz, noise_energy
+from ultrasound.lateral_kernel import MAX_HALF_WIDTH
 from ultrasound.probe import Probe
 from ultrasound.propagation import Propagation
 from ultrasound.sampled_volume import SampledVolume
@@ -104,6 +110,58 @@ def test_the_wall_filter_stops_what_is_slow(vessel, share, passed):
     vessel.look(probe_of(**SETTINGS | {"wall_filter_cm_s": 10.0}))
     energy = array_of(vessel.straight.moment)[100, 20:40, 2]
     assert energy == pytest.approx(BLOOD**2 * passed / (1 if share < 2 else 1 + 2.0**-8), rel=0.01)
+
+
+def test_what_aliases_to_rest_is_stopped_too(vessel):
+    vessel.tank.fill()
+    vessel.set_flow([0.0, -1.2, 0.0])
+    # Twice the limit of 60 cm/s.
+    vessel.look(probe_of(**SETTINGS))
+    assert array_of(vessel.straight.moment)[40:150, 8:60, 2].max() < 1e-6 * BLOOD**2
+
+
+def test_tissue_that_turns_turns_its_flow(vessel):
+    """Blood that flows to the left at rest, in tissue that is turned by 40 degrees."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=12.0)
+    model = tissue_of(ball)
+    embedding = Embedding(model, ball, 4.0)
+    turn = rotation_about([0, 0, 1], 40.0)
+    x = (model.body.rest_points @ turn.T).astype(np.float32)
+    model.body.restore(BodyState(x, np.zeros_like(x)))
+    model.update_frames()
+    embedding.update()
+    tank = flat_tank(0.5, embedding=embedding)
+    tank.fill(backscatter=0.01)
+    fill((vessel.flow.voxels, np.tile([0.3, 0.0, 0.0, 0.0, 1.0], (8, 1))))
+    small = dict(transducer_width_mm=12.0, depth_mm=16.0)
+    doppler, probe = Doppler(tank.bmode.sound, tank.bmode, vessel.flow), probe_of(**SETTINGS | small, **QUIET)
+    tank.look(probe, "speckle", at=(0.0, -8.0, 0.0))
+    doppler.estimate(probe, SYSTOLE_S)
+    real, imaginary, _ = np.moveaxis(array_of(doppler.moment)[80:110, 20:40], -1, 0)
+    found = np.arctan2(imaginary, real) / np.pi * probe.velocity_limit_cm_s
+    # Turned, it is (cos 40, sin 40), of which the second is away from the array.
+    assert found == pytest.approx(-30.0 * np.sin(np.radians(40.0)), rel=0.02)
+
+
+def test_the_sample_volume_is_as_wide_as_the_beam(vessel):
+    """Blood is where x > 0."""
+    vessel.tank.fill()
+    half = SampledVolume(
+        np.tile([0.0, -0.3, 0.0, 0.0, 1.0], (400, 1, 1, 1)) * (np.arange(400) >= 200)[:, None, None, None],
+        np.array([[10.0, 0, 0, 200.0], [0, 1e-6, 0, 0], [0, 0, 1e-6, 0], [0, 0, 0, 1.0]]),
+        outside=0.0,
+    )
+    doppler, probe = Doppler(vessel.tank.bmode.sound, vessel.tank.bmode, half), probe_of(**SETTINGS, **QUIET)
+    vessel.tank.look(probe, "speckle")
+    doppler.estimate(probe, SYSTOLE_S)
+    mean, moment = (array_of(each)[:, 60, 2] for each in (doppler.mean, doppler.moment))
+    weight = array_of(doppler.weight)[60]
+    assert weight.sum() == pytest.approx(1.0, abs=1e-5) and 1 < array_of(doppler.half)[60] < MAX_HALF_WIDTH
+    wanted = np.convolve(moment, weight[::-1], mode="same")[30:160]
+    # The error of the estimate adds to its energy.
+    assert np.abs(mean[30:160] - wanted).max() < 0.7 * wanted.max()
+    shape = np.array([np.mean(mean[92:96]), np.mean(mean[98:102])]) / np.mean(mean[120:160])
+    assert shape[0] > 0.05 and shape[1] < 1.3
 
 
 def test_blood_of_a_clamped_kidney_rests_and_pulses_otherwise(vessel):

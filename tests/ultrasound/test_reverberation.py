@@ -8,6 +8,7 @@ from test_bmode import GAS, TISSUE, depths, flat_tank, peaks, probe_of, speed_ra
 from sim.device import start
 from sim.fields import array_of
 from ultrasound.interface import Surface
+from ultrasound.probe import BUILD_UP_MM
 from ultrasound.reverberation import (
     BUBBLE_AMPLITUDE,
     BUBBLE_SHARE,
@@ -19,6 +20,7 @@ from ultrasound.reverberation import (
     MORE_IN_AIR_DB,
     ringing,
 )
+from ultrasound.sampled_volume import SampledVolume
 
 TITANIUM, USUAL = 27.3, 1.58038
 SILENT = 1e-9
@@ -62,6 +64,15 @@ def test_behind_gas_is_the_mirror_image_of_what_is_in_front_of_it(tank, attenuat
     # Behind the mirror image of the face, all of it again by way of the face.
     again = np.interp(60.0 + 23.5 if depth[-1] > 84 else 70.0, depth, middle)
     assert again < BY_GAS * FACE * surface * 0.011
+
+
+def test_harmonics_build_up_once_on_the_way_by_gas(tank):
+    tank.fill(lambda x, y, z: np.where(y < 30, USUAL, GAS), 0.2, 0.01)
+    plain, step = level_of(tank, probe_of())
+    harmonic, _ = level_of(tank, probe_of(harmonics=True))
+    behind = slice(int(33 / step), int(50 / step))
+    ratio = np.median(harmonic[40:150, behind] / plain[40:150, behind], axis=0)
+    assert ratio == pytest.approx(30.0 / (30.0 + BUILD_UP_MM), rel=0.03)
 
 
 def test_bubbles_are_at_a_share_of_places_and_ring_on(tank):
@@ -124,5 +135,10 @@ def test_the_array_vibrates_in_the_near_field_longer_in_air(tank):
     echo = 10 ** (tank.look(probe, "speckle")[60:130] / 20)
     # All scanlines vibrate alike: the beam's width does not matter.
     assert np.median(echo[:, :30], axis=0) == pytest.approx(contact[:30], rel=0.02)
+    nowhere = SampledVolume(np.full((1, 1, 1), 9.0), np.diag([1e-6, 1e-6, 1e-6, 1.0]))
+    in_air = flat_tank(0.5, organ=nowhere, contact="organ")
+    in_air.fill(USUAL)
+    echo = 10 ** (in_air.look(probe, "speckle")[60:130] / 20)
+    assert np.median(echo[:, :60], axis=0) == pytest.approx(air[:60], rel=0.02)
     quiet = ringing(probe_of(ringing_db=-30.0, harmonics=True))
     assert quiet == pytest.approx(0.1 * np.stack([air, contact]), rel=1e-5)

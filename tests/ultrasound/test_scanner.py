@@ -157,6 +157,17 @@ def test_compounding_averages_the_speckle_of_three_angles(scattering):
     assert three[middle].mean() == pytest.approx(one[middle].mean(), abs=6.0)
 
 
+def test_images_of_different_steering_have_independent_speckle(scattering):
+    settings = dict(gain_percent=50.0, dyn_range_db=80.0, grey_map="linear")
+    first, second = (
+        b_mode(scattering, PROBE.model_copy(update=settings | {"steering_deg": angle}))
+        for angle in (0.0, 2.0)
+    )
+    middle = slice(4, 20), slice(24, 40)
+    # Turned by 2 degrees, the same scatterers would be seen alike.
+    assert abs(np.corrcoef(first[middle].ravel(), second[middle].ravel())[0, 1]) < 0.35
+
+
 def test_persistence_mixes_the_image_before_and_none_is_bit_for_bit_the_image(scattering):
     first, second = b_mode(scattering, PROBE), b_mode(scattering, PROBE, above=-9.0)
     assert (first != second).any()
@@ -169,7 +180,9 @@ def test_persistence_mixes_the_image_before_and_none_is_bit_for_bit_the_image(sc
     assert (b_mode(scattering, PROBE, above=-9.0) == second).all()
 
 
-def test_doppler_of_a_scene_is_shown_over_its_image_and_not_while_clamped(scattering):
+@pytest.mark.parametrize("turn", [UPRIGHT, np.diag([1.0, -1.0, -1.0])], ids=["upright", "turned"])
+def test_doppler_of_a_scene_is_shown_over_its_image_and_not_while_clamped(device, turn):
+    scattering = Scanner(anatomy(turn=turn, around_hu=KIDNEY_HU), Unmoved(), PROBE, PIXELS, contact="tissue")
     grey = b_mode(scattering, PROBE).astype(np.uint8)
     slow = PROBE.model_copy(update={"velocity_scale_cm_s": 5.0, "wall_filter_cm_s": 0.5})
     flowing, clamped = (scattering.doppler(slow, grey, "colour", 0.09, each) for each in (False, True))
