@@ -161,11 +161,12 @@ def test_images_of_different_steering_have_independent_speckle(scattering):
     settings = dict(gain_percent=50.0, dyn_range_db=80.0, grey_map="linear")
     first, second = (
         b_mode(scattering, PROBE.model_copy(update=settings | {"steering_deg": angle}))
-        for angle in (0.0, 2.0)
+        for angle in (0.0, 0.25)
     )
     middle = slice(4, 20), slice(24, 40)
-    # Turned by 2 degrees, the same scatterers would be seen alike.
-    assert abs(np.corrcoef(first[middle].ravel(), second[middle].ravel())[0, 1]) < 0.35
+    # Turned by a quarter of a degree, the same scatterers would be seen alike.
+    apart = (np.diff(each[middle], axis=0).ravel() for each in (first, second))
+    assert abs(np.corrcoef(*apart)[0, 1]) < 0.3
 
 
 def test_persistence_mixes_the_image_before_and_none_is_bit_for_bit_the_image(scattering):
