@@ -56,7 +56,7 @@ class Propagation:
     """Sound along the scanlines of a probe, at tissue samples ``stride_of`` scanline samples apart.
 
     ``tissue_volume`` (.., 4) has impedance, attenuation, backscatter and its anisotropy (``acoustics.properties``), ``organ`` the signed distance
-    from the organ's surface [mm], both at rest; ``plane`` is a ``PlaneInTissue`` of the scanner. An element transmits and receives
+    from the organ's surface [mm], both at rest; ``plane`` is a ``PlaneInTissue``. An element transmits and receives
     only in contact: with the organ, nearer than ``contact_gap_mm``, or, where ``contact`` is "tissue", with anything but gas.
     ``around`` is the impedance [MRayl] of all that is outside the organ; None for what the CT shows there.
 

@@ -1,14 +1,12 @@
-"""The scanner: the tissue on an image plane of a probe, and its CT slice, B-mode image and ground-truth labels.
+"""The scanner: CT slice, B-mode image, Doppler, signals and ground-truth labels of an anatomy on the image plane of a probe.
 
 CT slice: image plane -> deformed tetrahedra -> voxels at rest (the paper's method).
 """
 
-import zlib
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import taichi as ti
@@ -17,17 +15,17 @@ import trimesh
 from trimesh.intersections import mesh_plane
 
 from sim.embedding import Embedding, Unmoved
-from sim.fields import array_of, field_of, fill
 from ultrasound.acoustics import check_tissues, stored_properties
 from ultrasound.blood_flow import stored_flow
 from ultrasound.bmode import BMode, Wavefront
 from ultrasound.doppler import Doppler
+from ultrasound.ground_truth_labels import GroundTruthLabels
 from ultrasound.iq_signal import IQSignal, iq_signal
+from ultrasound.plane_in_tissue import PlaneInTissue
 from ultrasound.probe import DetailLevel, DopplerMode, Mode, Probe
 from ultrasound.probe_manipulator import ImagePlane
 from ultrasound.propagation import Propagation
-from ultrasound.sampled_volume import AIR_HU, LANES, Lanes, SampledVolume, distance_volume
-from ultrasound.sweep import PixelLabel
+from ultrasound.sampled_volume import AIR_HU, LANES, SampledVolume, distance_volume
 
 # HU and impedance [MRayl] around the organ where the image does not show the CT there.
 OUTSIDE: dict[str, tuple[float, float | None]] = {
@@ -35,7 +33,6 @@ OUTSIDE: dict[str, tuple[float, float | None]] = {
     "gel": (0.0, 1.5),
     "air": (AIR_HU, 4e-4),
 }
-MAX_BEADS = 255 // PixelLabel.BEAD
 CT, B_MODE, DOPPLER = "CT", "B-mode", "Doppler"
 IMAGES_OF_MODE: dict[Mode, tuple[str, ...]] = {"ct": (CT,), "b-mode": (B_MODE,), "both": (B_MODE, CT)}
 
@@ -66,167 +63,6 @@ def start_acoustics(anatomy: ScannedAnatomy) -> Future[np.ndarray]:
     values = worker.submit(stored_properties, anatomy.hu, anatomy.labels, anatomy.tissues, anatomy.voxel_mm)
     worker.shutdown(wait=False)
     return values
-
-
-@ti.data_oriented
-class PlaneInTissue:
-    """The tetrahedron of an embedding that contains each pixel of an image plane, which has at most ``pixels`` x ``pixels``.
-
-    Since the last ``locate`` the image has ``shape`` (rows, columns), ``owner`` is the tetrahedron's index at these, and ``grid`` are the
-    size of a pixel and the centre (u, v) of the first one [mm].
-    """
-
-    def __init__(self, embedding: Embedding | Unmoved, pixels: int) -> None:
-        self.embedding = embedding
-        self.pixels = pixels
-        self.shape = pixels, pixels
-        self.owner = ti.field(ti.i32, (pixels, pixels))
-        self.grid = ti.Vector.field(2, ti.f32, 2)
-        self._last = ti.Vector.field(2, ti.i32, ())
-        # Size of a pixel and centre of the first one, of an image of all pixels.
-        self._whole = np.zeros((2, 2))
-        self._rest_grids: dict[int, np.ndarray] = {}
-        # Changes with the plane: electronic noise is still only where the probe is.
-        self.noise_key = 0
-
-    def locate(self, plane: ImagePlane, shape: tuple[int, int] | None = None) -> None:
-        """Find the tissue on a plane, for an image of a shape [all pixels]; the embedding must be up to date."""
-        rows, columns = self.shape = shape or (self.pixels, self.pixels)
-        size, corner = (
-            np.array([plane.width_mm, plane.depth_mm]),
-            np.array([-plane.width_mm / 2, -plane.above_mm]),
-        )
-        whole = size / self.pixels
-        self._whole = np.stack([whole, corner + whole / 2])
-        pixel = size / [columns, rows]
-        first = corner + pixel / 2
-        fill((self.grid, np.stack([pixel, first])), (self._last, np.array([rows - 1, columns - 1])))
-        self._rest_grids.clear()
-        self.noise_key = zlib.crc32(np.asarray(plane.world_from_plane, np.float32).tobytes()) & 0xFFFF
-        given = np.linalg.inv(plane.world_from_plane), plane.world_from_plane, pixel, first
-        inverse, world, pixel_mm, first_mm = (ti.Matrix(np.asarray(each, float).tolist()) for each in given)
-        self.embedding.locate_on_plane(inverse, world, pixel_mm, first_mm, rows, columns, self.owner)
-
-    @property
-    def grid_mm(self) -> tuple[ti.Vector, ti.Vector]:
-        """The values of ``grid``: as arguments of a kernel they cost its pixels nothing."""
-        pixel, first = array_of(self.grid)
-        return tm.vec2(*pixel), tm.vec2(*first)
-
-    def rest_grid(self, count: int) -> np.ndarray:
-        """Return rest positions (count, count, 3) [mm] at pixels evenly over the plane, whatever the shape. They are not to be changed."""
-        if count not in self._rest_grids:
-            self._rest_grids[count] = np.empty((count, count, 3), np.float32)
-            pixel, first = self._whole
-            self._rest_grid(tm.vec2(*pixel), tm.vec2(*first), self._rest_grids[count])
-        return self._rest_grids[count]
-
-    @ti.kernel
-    def _rest_grid(self, pixel_mm: tm.vec2, first_mm: tm.vec2, places: ti.types.ndarray(ti.f32, ndim=3)):
-        for i, j in ti.ndrange(places.shape[0], places.shape[1]):
-            row = (i * (self.pixels - 1)) // (places.shape[0] - 1)
-            column = (j * (self.pixels - 1)) // (places.shape[1] - 1)
-            place = first_mm + tm.vec2(column, row) * pixel_mm
-            near_row, near_column = self.pixel_near(place)
-            rest = self.rest_from_plane(near_row, near_column) @ tm.vec4(place, 0.0, 1.0)
-            for axis in ti.static(range(3)):
-                places[i, j, axis] = rest[axis]
-
-    @ti.func
-    def rest_at(self, row, column, pixel_mm, first_mm):
-        """Return the rest position of the tissue at a pixel's centre [mm]; the last two are ``grid``."""
-        linear = self.embedding.rest_from_plane[self.owner[row, column]]
-        u, v = first_mm.x + column * pixel_mm.x, first_mm.y + row * pixel_mm.y
-        return linear[:, 0] * u + linear[:, 1] * v + linear[:, 3]
-
-    @ti.func
-    def rest_lanes(self, row, first, pixel_mm, first_mm, last):
-        """As ``rest_at`` for LANES pixels of a row, axis by axis, and whether they are collinear at rest too.
-
-        Pixels beyond the last column of the image repeat it.
-        """
-        x, y, z = Lanes(0.0), Lanes(0.0), Lanes(0.0)
-        owner = self.owner[row, first]
-        same = True
-        for lane in ti.static(range(1, LANES)):
-            same &= self.owner[row, ti.min(first + lane, last)] == owner
-        if same:
-            # Most neighbours are in one tetrahedron, whose map keeps them on a line.
-            start = self.rest_at(row, first, pixel_mm, first_mm)
-            on = self.embedding.rest_from_plane[owner][:, 0] * pixel_mm.x
-            steps = Lanes([float(lane) for lane in ti.static(range(LANES))])
-            x, y, z = start.x + on.x * steps, start.y + on.y * steps, start.z + on.z * steps
-        else:
-            for lane in ti.static(range(LANES)):
-                rest = self.rest_at(row, ti.min(first + lane, last), pixel_mm, first_mm)
-                x[lane], y[lane], z[lane] = rest.x, rest.y, rest.z
-        return x, y, z, same
-
-    @ti.func
-    def pixel_near(self, place):
-        """Return row and column of the pixel nearest to (u, v) [mm]."""
-        at = ti.round((place - self.grid[1]) / self.grid[0], ti.i32)
-        last = self._last[None]
-        return tm.clamp(at.y, 0, last[0]), tm.clamp(at.x, 0, last[1])
-
-    @ti.func
-    def rest_from_plane(self, row, column):
-        """Return the map (3, 4) from (u, v, w, 1) of the plane to the rest position [mm], at a pixel."""
-        return self.embedding.rest_from_plane[self.owner[row, column]]
-
-    @ti.func
-    def is_tissue(self, row, column):
-        """Whether the embedding contains the pixel."""
-        return self.owner[row, column] < self.embedding.count
-
-
-@ti.data_oriented
-class GroundTruthLabels:
-    """``PixelLabel`` values of the plane located last, by the rest position of its tissue.
-
-    ``organ`` and ``tumour`` are signed distances [mm], negative inside; ``beads`` (n, 3) are centres of balls of a radius [mm].
-    Raises ValueError for more than MAX_BEADS beads.
-    """
-
-    def __init__(
-        self,
-        plane: PlaneInTissue,
-        organ: SampledVolume,
-        tumour: SampledVolume | None = None,
-        beads: np.ndarray | None = None,
-        radius_mm: float = 2.0,
-    ) -> None:
-        self.plane, self.organ, self.radius_mm = plane, organ, radius_mm
-        self.tumour: Any = tumour
-        self.has_tumour = tumour is not None
-        self.beads = 0 if beads is None else len(beads)
-        if self.beads > MAX_BEADS:
-            raise ValueError(f"{self.beads} beads: at most {MAX_BEADS} fit into 8-bit labels")
-        if beads is not None:
-            self.bead = field_of(np.asarray(beads, float), 1)
-
-    def render(self) -> np.ndarray:
-        """Return labels (rows, columns) uint8."""
-        image = np.empty(self.plane.shape, np.uint8)
-        self._render(image)
-        return image
-
-    @ti.kernel
-    def _render(self, image: ti.types.ndarray(ti.u8, ndim=2)):
-        for row, column in ti.ndrange(image.shape[0], image.shape[1]):
-            rest = self.plane.rest_at(row, column, self.plane.grid[0], self.plane.grid[1])
-            label = ti.cast(PixelLabel.OUTSIDE, ti.i32)
-            if self.plane.is_tissue(row, column):
-                if self.organ.sample(rest) < 0.0:
-                    label = PixelLabel.ORGAN
-                if ti.static(self.has_tumour):
-                    if self.tumour.sample(rest) < 0.0:
-                        label = PixelLabel.TUMOUR
-                if ti.static(self.beads > 0):
-                    for k in range(self.beads):
-                        if (rest - self.bead[k]).norm_sqr() < self.radius_mm**2:
-                            label = label % PixelLabel.BEAD + PixelLabel.BEAD * (k + 1)
-            image[row, column] = ti.cast(label, ti.u8)
 
 
 @ti.data_oriented

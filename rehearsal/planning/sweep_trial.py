@@ -15,9 +15,9 @@ from scenes.scene import Scene, Trocar
 from sim.fields import array_of
 from ultrasound.array_contact import measure_contact
 from ultrasound.coverage import GRID_POINTS, VOXEL_MM, Coverage
+from ultrasound.plane_in_tissue import PlaneInTissue
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import advanced, poses_between
-from ultrasound.scanner import PlaneInTissue
 from ultrasound.target import Target
 
 # The most steps of a move between passes.

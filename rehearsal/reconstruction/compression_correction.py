@@ -5,8 +5,8 @@ import numpy as np
 from rehearsal.coordinates import transducer_at
 from rehearsal.reconstruction.sweep_volumes import ImagePoses
 from rehearsal.rehearsal import Rehearsal
+from ultrasound.plane_in_tissue import PlaneInTissue
 from ultrasound.probe_manipulator import ImagePlane, advanced, image_plane, poses_between
-from ultrasound.scanner import PlaneInTissue
 from ultrasound.sweep import Sweep, SweepError
 
 # The probe starts this far above its first pose, takes this time to come there, and this time for the tissue to come to rest.

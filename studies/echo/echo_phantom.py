@@ -10,11 +10,11 @@ from ultrasound.blood_flow import BEAT_S, CHANNELS, SYSTOLE_S
 from ultrasound.bmode import BMode
 from ultrasound.doppler import Doppler
 from ultrasound.interface import Surface
+from ultrasound.plane_in_tissue import PlaneInTissue
 from ultrasound.probe import DetailLevel, Probe
 from ultrasound.probe_manipulator import image_plane, pose_at
 from ultrasound.propagation import Propagation
 from ultrasound.sampled_volume import SampledVolume
-from ultrasound.scanner import PlaneInTissue
 
 VOXEL_MM, MARGIN_MM = 0.25, 2.0
 # Of tissue in which sound is as fast as the scanner assumes.

@@ -13,10 +13,12 @@ from scenes.anatomy import LoadedAnatomy
 from sim.embedding import Unmoved
 from sim.signed_distance import signed_distance
 from ultrasound.bmode import source_of_pixels
+from ultrasound.ground_truth_labels import MAX_BEADS, GroundTruthLabels
+from ultrasound.plane_in_tissue import PlaneInTissue
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import ImagePlane, advanced, touching
 from ultrasound.sampled_volume import distance_volume
-from ultrasound.scanner import MAX_BEADS, GroundTruthLabels, PlaneInTissue, Scanner
+from ultrasound.scanner import Scanner
 from ultrasound.sweep import Sweep, transform_fields
 
 FRAMES_A_SECOND = 30

@@ -21,11 +21,11 @@ from ultrasound.beam import elevation_profiles, lateral_profiles
 from ultrasound.bmode import MAX_HALF_WIDTH, BMode
 from ultrasound.interface import Surface
 from ultrasound.lateral_kernel import GROUP, clutter_weights
+from ultrasound.plane_in_tissue import PlaneInTissue
 from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import image_plane, pose_at
 from ultrasound.propagation import Propagation
 from ultrasound.sampled_volume import SampledVolume
-from ultrasound.scanner import PlaneInTissue
 
 LINES, SAMPLES, PIXELS = 192, 640, 256
 TISSUE, FAT, GAS, STONE = 1.62, 1.38, 4e-4, 6.0

@@ -18,10 +18,11 @@ from sim.embedding import Embedding, Unmoved, tetrahedra_around
 from sim.fields import array_of, fill
 from sim.shape_matching import ShapeMatching
 from sim.skinning import Skin
+from ultrasound.plane_in_tissue import PlaneInTissue
 from ultrasound.probe import load_probe
 from ultrasound.probe_manipulator import ImagePlane, image_plane, pose_at
 from ultrasound.sampled_volume import distance_volume
-from ultrasound.scanner import PlaneInTissue, ScannedAnatomy, Scanner
+from ultrasound.scanner import ScannedAnatomy, Scanner
 
 RADIUS = 2.0
 GRADIENT = np.array([11.0, -7.0, 5.0])  # HU / mm

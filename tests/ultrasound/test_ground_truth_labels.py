@@ -10,10 +10,12 @@ from conftest import rotation_about
 from rehearsal.coordinates import probe_in_patient
 from sim.embedding import Unmoved
 from sim.fields import fill
+from ultrasound.ground_truth_labels import GroundTruthLabels
+from ultrasound.plane_in_tissue import PlaneInTissue
 from ultrasound.probe import load_probe
 from ultrasound.probe_manipulator import ImagePlane, image_plane, pose_at
 from ultrasound.sampled_volume import distance_volume
-from ultrasound.scanner import GroundTruthLabels, PlaneInTissue, ScannedAnatomy, Scanner
+from ultrasound.scanner import ScannedAnatomy, Scanner
 from ultrasound.sweep import PixelLabel
 
 PIXELS = 120
