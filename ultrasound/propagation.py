@@ -2,7 +2,7 @@
 
 1. ``_sample``: the tissue along each scanline.
 2. ``_find_interfaces``: the steps of impedance, their echoes and what they let pass.
-3. ``_transmit``: the amplitude that arrives at each sample, along several rays from the aperture.
+3. ``ApertureRays``: the amplitude that arrives at each sample, along several rays from the aperture.
 """
 
 from typing import Any
@@ -14,6 +14,7 @@ import taichi.math as tm
 from sim.device import TASK
 from sim.fields import array_of, fill
 from ultrasound.acoustics import MAST_OFFSET, MAST_SLOPE
+from ultrasound.aperture_rays import ApertureRays
 from ultrasound.beam import half_apertures_mm
 from ultrasound.interface import (
     HARD,
@@ -34,12 +35,6 @@ STRIDES = (8, 4)
 # quadrature with three nodes, exact for what changes as a polynomial of fifth degree.
 CENTRAL_PLANE = ((0.0, 1.0),)
 THICK_PLANE = ((0.0, 2 / 3), (-(1.5**0.5), 1 / 6), (1.5**0.5, 1 / 6))
-# Intensity changes by refraction by no more than this factor.
-MOST_FOCUSED = 3.0
-# Entries of the table of amplitudes for each of the table in dB, between which these are straight.
-FINER = 4
-# Rays from the aperture to each sample.
-RAYS = 7
 
 
 @ti.dataclass
@@ -91,22 +86,15 @@ class Propagation:
         self.tissue, self.rest, self.across = (ti.Vector.field(3, ti.f32, shape) for _ in range(3))
         self.echo = ti.Vector.field(4, ti.f32, shape)
         self.depth, self.passed, self.amplitude, self.path = (ti.field(ti.f32, shape) for _ in range(4))
-        self.ray_amplitude, self.ray_path = (ti.field(ti.f32, (RAYS, *shape)) for _ in range(2))
-        # Turned by refraction at a sample [rad]; of a ray: direction [rad] and offset [scanlines].
+        # Turned by refraction at a sample [rad].
         self.turn = ti.field(ti.f32, shape)
-        self.ray_refraction = ti.Vector.field(2, ti.f32, (RAYS, *shape))
-        # Scanlines per mm; half of the Fresnel zone in scanlines.
-        self.lines_per_mm, self.zone = ti.field(ti.f32, self.most), ti.field(ti.i32, self.most)
-        # How many scanlines a ray is from its end at a sample, where it leaves the face. It goes from scanline to scanline: mixing
-        # two would spread shadows.
-        self.ray_offset = ti.field(ti.i32, (RAYS, self.most))
         # Half angle of the aperture [rad], SD of the beam across the image plane [mm] and amplitude of harmonics, at each sample.
         self.aperture_angle, self.slice_sd, self.build_up = (ti.field(ti.f32, self.most) for _ in range(3))
         self.speckle_db, self.echo_db = (ti.field(ti.f32, PATH_ENTRIES) for _ in range(2))
-        self.one_way = ti.field(ti.f32, FINER * PATH_ENTRIES)
         # Half angle of the aperture across the plane [rad]; of interfaces: amplitudes reflected as a mirror and diffusely, slope,
         # amplitudes scattered evenly by soft and by hard ones.
         self.reflection = ti.field(ti.f32, 6)
+        self.rays = ApertureRays(self)
 
     def stride_of(self, probe: Probe) -> int:
         """Return the scanline samples between two tissue samples."""
@@ -126,30 +114,18 @@ class Propagation:
         start, direction = probe.scanlines()
         own = self.surface.slope, self.surface.scattered, self.surface.scattered_hard
         elevation = np.arctan(probe.element_height_mm / 2 / probe.elevation_focus_mm)
+        self.rays.set_probe(probe, depth)
         fill(
             (self.start, start),
             (self.direction, direction),
             (self.element, probe.elements()),
-            (self.ray_offset, ray_offsets(probe, depth)),
             (self.aperture_angle, angle),
             (self.slice_sd, slice_sd_mm),
-            (self.lines_per_mm, 1 / np.maximum(probe.line_spacing_mm(depth), 1e-3)),
-            (self.zone, fresnel_zones(probe, depth)),
             (
                 self.build_up,
                 (depth + 0.1) / (depth + BUILD_UP_MM) if probe.harmonics else np.ones_like(depth),
             ),
             (self.speckle_db, pulse.speckle_db),
-            (
-                self.one_way,
-                10
-                ** (
-                    np.interp(
-                        np.arange(FINER * PATH_ENTRIES) / FINER, np.arange(PATH_ENTRIES), pulse.speckle_db
-                    )
-                    / 40
-                ),
-            ),
             (self.echo_db, pulse.echo_db),
             (
                 self.reflection,
@@ -167,8 +143,8 @@ class Propagation:
             fill((self.contact, np.full(self.lines, array_of(self.contact).mean())))
         self._sample(thick, count, stride * probe.sample_mm)
         self._find_interfaces(count, stride * probe.sample_mm)
-        self._transmit(count)
-        self._combine(count)
+        self.rays.follow(count)
+        self.rays.combine(count)
 
     @ti.kernel
     def _find_contact(self):
@@ -308,68 +284,6 @@ class Propagation:
             ratio = speed_ratio(after) / speed_ratio(interface.before)
             self.turn[line, k] = interface.refraction(direction, ratio)
 
-    @ti.kernel
-    def _transmit(self, count: int):
-        """Follow each ray to the samples of all scanlines: amplitude, one way, and attenuation of its path [Np/MHz]."""
-        for n in range(RAYS * TASK):
-            if n % TASK == 0:
-                ray = n // TASK
-                for line in range(self.lines):
-                    self.ray_amplitude[ray, line, 0] = self.contact[line]
-                    self.ray_path[ray, line, 0] = 0.0
-                    self.ray_refraction[ray, line, 0] = tm.vec2(0.0)
-                for k in range(1, count):
-                    aside = self.ray_offset[ray, k] - self.ray_offset[ray, k - 1]
-                    for line in range(self.lines):
-                        self.follow_ray(ray, line, k, tm.clamp(line - aside, 0, self.lines - 1))
-
-    @ti.func
-    def follow_ray(self, ray, line, k, from_line):
-        """Continue a ray from the sample before, on a scanline."""
-        attenuation = 0.5 * (self.tissue[line, k - 1].y + self.tissue[line, k].y)
-        step_mm = self.depth[line, k] - self.depth[line, k - 1]
-        path = self.ray_path[ray, from_line, k - 1]
-        self.ray_path[ray, line, k] = path + attenuation * step_mm / (10.0 * DB_OF_NEPER)
-        self.ray_amplitude[ray, line, k] = self.ray_amplitude[ray, from_line, k - 1] * self.passed[line, k]
-        refraction = self.ray_refraction[ray, from_line, k - 1]
-        turned = refraction.x + self.turn[line, k]
-        self.ray_refraction[ray, line, k] = tm.vec2(
-            turned, refraction.y + turned * step_mm * self.lines_per_mm[k]
-        )
-
-    @ti.kernel
-    def _combine(self, count: int):
-        """Write amplitude and path of the round trip: the mean over the rays that start on the array, squared."""
-        for line, k in ti.ndrange(self.lines, count):
-            total, path, found = 0.0, 0.0, 0.0
-            for ray in ti.static(range(RAYS)):
-                origin = line - self.ray_offset[ray, k]
-                if origin >= 0 and origin < self.lines:
-                    along = self.ray_path[ray, line, k]
-                    one_way = self.ray_amplitude[ray, line, k] * self.attenuated(along)
-                    one_way *= self.focusing(ray, line, k)
-                    total += one_way
-                    path += one_way * along
-                    found += 1.0
-            self.amplitude[line, k] = self.build_up[k] * (total / found) ** 2
-            self.path[line, k] = 2.0 * path / ti.max(total, 1e-30)
-
-    @ti.func
-    def focusing(self, ray, line, k):
-        """Return the factor of amplitude of rays that refraction has moved together or apart, over a Fresnel zone."""
-        zone = self.zone[k]
-        low, high = ti.max(line - zone, 0), ti.min(line + zone, self.lines - 1)
-        further = self.ray_refraction[ray, high, k].y - self.ray_refraction[ray, low, k].y
-        apart = 1.0 + further / ti.max(high - low, 1)
-        return 1.0 / ti.sqrt(tm.clamp(apart, 1.0 / MOST_FOCUSED, MOST_FOCUSED))
-
-    @ti.func
-    def attenuated(self, path):
-        """Return the amplitude of speckle that attenuation on a path one way [Np/MHz] leaves, one way."""
-        at = ti.min(path * (2.0 * FINER / PATH_STEP), FINER * PATH_ENTRIES - 1.001)
-        first = ti.cast(at, ti.i32)
-        return tm.mix(self.one_way[first], self.one_way[first + 1], at - first)
-
     @ti.func
     def at_path(self, table: ti.template(), path):
         """Return an entry of a table of ``beam.AttenuatedPulse`` for an attenuation of the path [Np/MHz]."""
@@ -400,29 +314,3 @@ def speed_ratio(impedance):
     """
     density = 0.5 * (ti.sqrt(MAST_OFFSET**2 + 4.0e6 * MAST_SLOPE * impedance) - MAST_OFFSET)
     return ti.select(impedance < 1e-6, 1.0, (density + MAST_OFFSET) / (1000.0 * MAST_SLOPE * SOUND_MM_US))
-
-
-def fresnel_zones(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
-    """Return half of the Fresnel zone halfway to each depth, at least one scanline, (depths,) int32: less does not bend a wave."""
-    zone_mm = np.sqrt(probe.wavelength_mm * depth_mm) / 2
-    return np.maximum(np.rint(zone_mm / np.maximum(probe.line_spacing_mm(depth_mm), 1e-3)), 1).astype(
-        np.int32
-    )
-
-
-def ray_offsets(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
-    """Return how many scanlines beside its end at a depth each ray leaves the face (RAYS, depths) int32.
-
-    Each ray stands for an equal part of the aperture.
-    """
-    if probe.transducer_geometry == "PHASED":
-        # All scanlines start at one point: rays of other elements are not among them.
-        return np.zeros((RAYS, len(depth_mm)), np.int32)
-    slope = (2 * (np.arange(RAYS) + 0.5) / RAYS - 1)[:, None] / (2 * probe.f_number)
-    spacing = probe.line_spacing_mm(np.zeros(1))[0]
-    if probe.sector is None:
-        offset = slope * depth_mm / spacing
-    else:
-        radius = probe.radius_mm
-        offset = slope * np.log1p(depth_mm / radius) * radius / spacing
-    return np.rint(offset).astype(np.int32)

@@ -643,8 +643,8 @@ def test_each_ray_is_turned_by_the_interfaces_on_its_own_path(fine):
     fine.fill(lambda x, y, z: 1.58 + 0.08 * special.ndtr((6.0 - np.hypot(x - 2.0, y - 14.0)) / 0.4))
     fine.look(probe)
     sound = fine.bmode.sound
-    turn, depth, offset = (array_of(each) for each in (sound.turn, sound.depth, sound.ray_offset))
-    found, per_mm = array_of(sound.ray_refraction), array_of(sound.lines_per_mm)
+    turn, depth, offset = (array_of(each) for each in (sound.turn, sound.depth, sound.rays.offset))
+    found, per_mm = array_of(sound.rays.refraction), array_of(sound.rays.lines_per_mm)
     for ray, line, k in ((0, 100, 60), (1, 120, 55), (3, 96, 50), (6, 80, 65)):
         turned = shift = 0.0
         for j in range(1, k + 1):

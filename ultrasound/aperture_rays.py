@@ -1,0 +1,141 @@
+"""Rays from the aperture to each sample of a scanline: contact, attenuation and refraction on their paths.
+
+A shadow is soft where a part of the aperture sees past an obstacle, and beside a round one where refraction moves the rays apart.
+"""
+
+from typing import Any
+
+import numpy as np
+import taichi as ti
+import taichi.math as tm
+
+from sim.device import TASK
+from sim.fields import fill
+from ultrasound.probe import Probe
+from ultrasound.pulse import DB_OF_NEPER, PATH_ENTRIES, PATH_STEP
+
+# Rays to each sample.
+RAYS = 7
+# Intensity changes by refraction by no more than this factor.
+MOST_FOCUSED = 3.0
+# Entries of the table of amplitudes for each of the table in dB, between which these are straight.
+FINER = 4
+
+
+@ti.data_oriented
+class ApertureRays:
+    """Rays through the tissue of a ``Propagation``, each (RAYS, scanlines, samples), at their ends on the scanlines.
+
+    ``amplitude`` and ``path`` [Np/MHz] are one way. ``refraction`` has the angle by which a ray is turned [rad], and its offset [scanlines].
+    """
+
+    def __init__(self, sound: Any) -> None:
+        self.sound = sound
+        shape = RAYS, sound.lines, sound.most
+        self.amplitude, self.path = (ti.field(ti.f32, shape) for _ in range(2))
+        self.refraction = ti.Vector.field(2, ti.f32, shape)
+        # How many scanlines a ray is from its end at a sample, where it leaves the face. It goes from scanline to scanline: mixing
+        # two would spread shadows.
+        self.offset = ti.field(ti.i32, (RAYS, sound.most))
+        # Scanlines per mm; half of the Fresnel zone in scanlines.
+        self.lines_per_mm, self.zone = ti.field(ti.f32, sound.most), ti.field(ti.i32, sound.most)
+        self.one_way = ti.field(ti.f32, FINER * PATH_ENTRIES)
+
+    def set_probe(self, probe: Probe, depth_mm: np.ndarray) -> None:
+        """Update the tables of a probe's settings, at the depths of the samples."""
+        entries = np.arange(FINER * PATH_ENTRIES) / FINER
+        decibel = np.interp(entries, np.arange(PATH_ENTRIES), probe.pulse.speckle_db)
+        fill(
+            (self.offset, ray_offsets(probe, depth_mm)),
+            (self.lines_per_mm, 1 / np.maximum(probe.line_spacing_mm(depth_mm), 1e-3)),
+            (self.zone, fresnel_zones(probe, depth_mm)),
+            (self.one_way, 10 ** (decibel / 40)),
+        )
+
+    @ti.kernel
+    def follow(self, count: int):
+        """Follow each ray to the samples of all scanlines: amplitude, one way, and attenuation of its path [Np/MHz]."""
+        for n in range(RAYS * TASK):
+            if n % TASK == 0:
+                ray = n // TASK
+                for line in range(self.sound.lines):
+                    self.amplitude[ray, line, 0] = self.sound.contact[line]
+                    self.path[ray, line, 0] = 0.0
+                    self.refraction[ray, line, 0] = tm.vec2(0.0)
+                for k in range(1, count):
+                    aside = self.offset[ray, k] - self.offset[ray, k - 1]
+                    for line in range(self.sound.lines):
+                        self.follow_ray(ray, line, k, tm.clamp(line - aside, 0, self.sound.lines - 1))
+
+    @ti.func
+    def follow_ray(self, ray, line, k, from_line):
+        """Continue a ray from the sample before, on a scanline."""
+        attenuation = 0.5 * (self.sound.tissue[line, k - 1].y + self.sound.tissue[line, k].y)
+        step_mm = self.sound.depth[line, k] - self.sound.depth[line, k - 1]
+        path = self.path[ray, from_line, k - 1]
+        self.path[ray, line, k] = path + attenuation * step_mm / (10.0 * DB_OF_NEPER)
+        self.amplitude[ray, line, k] = self.amplitude[ray, from_line, k - 1] * self.sound.passed[line, k]
+        refraction = self.refraction[ray, from_line, k - 1]
+        turned = refraction.x + self.sound.turn[line, k]
+        self.refraction[ray, line, k] = tm.vec2(
+            turned, refraction.y + turned * step_mm * self.lines_per_mm[k]
+        )
+
+    @ti.kernel
+    def combine(self, count: int):
+        """Write amplitude and path of the round trip: the mean over the rays that start on the array, squared."""
+        for line, k in ti.ndrange(self.sound.lines, count):
+            total, path, found = 0.0, 0.0, 0.0
+            for ray in ti.static(range(RAYS)):
+                origin = line - self.offset[ray, k]
+                if origin >= 0 and origin < self.sound.lines:
+                    along = self.path[ray, line, k]
+                    one_way = self.amplitude[ray, line, k] * self.attenuated(along)
+                    one_way *= self.focusing(ray, line, k)
+                    total += one_way
+                    path += one_way * along
+                    found += 1.0
+            self.sound.amplitude[line, k] = self.sound.build_up[k] * (total / found) ** 2
+            self.sound.path[line, k] = 2.0 * path / ti.max(total, 1e-30)
+
+    @ti.func
+    def focusing(self, ray, line, k):
+        """Return the factor of amplitude of rays that refraction has moved together or apart, over a Fresnel zone."""
+        zone = self.zone[k]
+        low, high = ti.max(line - zone, 0), ti.min(line + zone, self.sound.lines - 1)
+        further = self.refraction[ray, high, k].y - self.refraction[ray, low, k].y
+        apart = 1.0 + further / ti.max(high - low, 1)
+        return 1.0 / ti.sqrt(tm.clamp(apart, 1.0 / MOST_FOCUSED, MOST_FOCUSED))
+
+    @ti.func
+    def attenuated(self, path):
+        """Return the amplitude of speckle that attenuation on a path one way [Np/MHz] leaves, one way."""
+        at = ti.min(path * (2.0 * FINER / PATH_STEP), FINER * PATH_ENTRIES - 1.001)
+        first = ti.cast(at, ti.i32)
+        return tm.mix(self.one_way[first], self.one_way[first + 1], at - first)
+
+
+def fresnel_zones(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
+    """Return half of the Fresnel zone halfway to each depth, at least one scanline, (depths,) int32: less does not bend a wave."""
+    zone_mm = np.sqrt(probe.wavelength_mm * depth_mm) / 2
+    return np.maximum(np.rint(zone_mm / np.maximum(probe.line_spacing_mm(depth_mm), 1e-3)), 1).astype(
+        np.int32
+    )
+
+
+def ray_offsets(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
+    """Return how many scanlines beside its end at a depth each ray leaves the face (RAYS, depths) int32.
+
+    Each ray stands for an equal part of the aperture.
+    """
+    if probe.transducer_geometry == "PHASED":
+        # All scanlines start at one point: rays of other elements are not among them.
+        return np.zeros((RAYS, len(depth_mm)), np.int32)
+    slope = (2 * (np.arange(RAYS) + 0.5) / RAYS - 1)[:, None] / (2 * probe.f_number)
+    spacing = probe.line_spacing_mm(np.zeros(1))[0]
+    if probe.sector is None:
+        offset = slope * depth_mm / spacing
+    else:
+        radius = probe.radius_mm
+        offset = slope * np.log1p(depth_mm / radius) * radius / spacing
+    return np.rint(offset).astype(np.int32)
