@@ -79,7 +79,7 @@ class Frames(Generic[Source]):
 
     def image(self, probe: Probe, settings: Settings) -> View:
         """Compute the images of the probe at its present pose."""
-        return image_view(self.rehearsal, probe, settings, self.tally)
+        return image_view(self.rehearsal, probe, settings, self.tally, None, self.source.session.time_s)
 
     def observe(self, probe: Probe, pose: np.ndarray | None) -> None:
         """Measure, and record the session; no pose is a rollback."""
@@ -226,7 +226,7 @@ class WindowFrames(Frames[WindowInput]):
             return self.cine.shown.view
         count, (width, depth, _) = len(IMAGES_OF_MODE[settings.mode]), probe.extent_mm
         shape = self.viewer.image_shape(count, width, depth) if self._only_shows else None
-        return image_view(self.rehearsal, probe, settings, self.tally, shape)
+        return image_view(self.rehearsal, probe, settings, self.tally, shape, self.source.session.time_s)
 
     @property
     def _only_shows(self) -> bool:
@@ -337,8 +337,9 @@ class WindowFrames(Frames[WindowInput]):
         probe = probe_with_settings(self.rehearsal.probe, settings)
         if self._only_shows and not self._shows_earlier:
             # With all pixels of the scene.
-            whole = image_view(self.rehearsal, probe, settings, Tally(0.0))
-            view = replace(view, images=whole.images)
+            plain = replace(settings, persistence_percent=0)
+            whole = image_view(self.rehearsal, probe, plain, Tally(0.0), None, self.source.session.time_s)
+            view = replace(view, images=whole.images, doppler=whole.doppler)
         begin, missing = save_view(view, probe, self.out), []
         if view.notes.keys() & view.images.keys():
             missing.append("B-mode image black: the probe does not touch the organ")
@@ -356,8 +357,9 @@ def image_view(
     settings: Settings,
     tally: Tally,
     shape: tuple[int, int] | None = None,
+    time_s: float = 0.0,
 ) -> View:
-    """Compute the images of the probe at its present pose, with overlays and read-outs.
+    """Compute the images of the probe at its present pose, with overlays and read-outs, at a time of the session.
 
     ``shape`` are the rows and columns of the images, at most the scene's pixels each, which is also the default.
     """
@@ -371,7 +373,7 @@ def image_view(
         shown_shape = shape and (min(shape[0], pixels), min(shape[1], pixels))
         return scanner.images(plane, probe, *shown, shown_shape, settings.persistence_percent / 100)
 
-    made, doppler = timed(lambda: with_doppler(rehearsal, probe, settings, images()), tally.slice_ms)
+    made, doppler = timed(lambda: with_doppler(rehearsal, probe, settings, images(), time_s), tally.slice_ms)
     width, depth, above = probe.extent_mm
     return View(
         transducer_pose=rehearsal.pose,
@@ -393,13 +395,15 @@ def image_view(
 
 
 def with_doppler(
-    rehearsal: Rehearsal, probe: Probe, settings: ScannerSettings, images: dict[str, np.ndarray]
+    rehearsal: Rehearsal,
+    probe: Probe,
+    settings: ScannerSettings,
+    images: dict[str, np.ndarray],
+    time_s: float,
 ) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
     """The images, and the B-mode image of them with Doppler over it; None where that is off."""
     if rehearsal.scanner is None or settings.doppler == "off" or B_MODE not in images:
         return images, None
-    # The pulse goes on with the steps.
-    time_s = rehearsal.steps * rehearsal.settings.time_step_s
     given = images[B_MODE], settings.doppler, time_s, settings.clamped
     return images, rehearsal.scanner.doppler(probe, *given)
 

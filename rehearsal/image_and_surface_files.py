@@ -17,7 +17,7 @@ from scenes.atomic_files import atomic_write
 from scenes.surfaces import save_surface
 from sim.fields import array_of
 from ultrasound.probe import Probe
-from ultrasound.scanner import B_MODE, CT, DOPPLER
+from ultrasound.scanner import B_MODE, DOPPLER
 
 SCREENSHOT, IMAGE = r"screenshot-([0-9]{3,9})\.png", r"([0-9]{3,9})-.*\.png"
 
@@ -75,7 +75,7 @@ def save_view(view: View, probe: Probe, out: Path) -> str:
     prefix = out / f"{next_number(out, IMAGE):03d}"
     shown = view.images if view.doppler is None else view.images | {DOPPLER: view.doppler}
     for saved in save_images(shown, view.width_mm, view.depth_mm, probe, prefix):
-        click.echo(f"Saved {saved.path}{' and .dcm' if saved.kind != CT else ''}")
+        click.echo(f"Saved {saved.path}{' and .dcm' if saved.kind in (B_MODE, DOPPLER) else ''}")
     return f"{prefix.name}-"
 
 

@@ -10,9 +10,11 @@ import numpy as np
 from rehearsal.image_and_surface_files import save_images
 from rehearsal.rehearsal import scanned_anatomy
 from scenes.anatomy import Grid, LoadedAnatomy
+from scenes.atomic_files import atomic_write
 from scenes.scene import Image
 from sim.embedding import Unmoved
 from ultrasound.blood_flow import SYSTOLE_S
+from ultrasound.bmode import Wavefront
 from ultrasound.iq_signal import save_iq
 from ultrasound.probe import DopplerMode, Probe
 from ultrasound.probe_manipulator import ImagePlane
@@ -20,6 +22,8 @@ from ultrasound.scanner import B_MODE, DOPPLER, Scanner
 from ultrasound.sweep_file import LabelledSweep
 
 FRAMES_PER_SECOND = 30
+# A pose that turns further from the wavefront by which phases are compared begins another one.
+MOST_TURNED_DEG = 3.0
 
 
 class PoseScans:
@@ -45,6 +49,7 @@ class PoseScans:
         self.ms: list[float] = []
         self.empty = 0
         self._planes: list[ImagePlane] = []
+        self._wavefronts: list[Wavefront] = []
         self._sweep: LabelledSweep | None = None
 
     @contextmanager
@@ -76,9 +81,14 @@ class PoseScans:
 
     def save_iq(self, name: str, suffix: str) -> None:
         """Write the IQ and RF signals of the last B-mode image. Raises OSError."""
-        before = self._planes[-2] if len(self._planes) > 1 else None
-        signals = self.scanner.iq(self.probe, self._planes[-1], before, self._planes[0])
-        save_iq(signals, self.out / f"{name}-iq.{suffix}")
+        before, plane = self._planes[-2] if len(self._planes) > 1 else None, self._planes[-1]
+        world = np.asarray(plane.world_from_plane, float)
+        if not self._wavefronts or self._wavefronts[-1].angle_deg(self.probe, world) > MOST_TURNED_DEG:
+            self._wavefronts.append(Wavefront.of(self.probe, world))
+        reference = self._wavefronts[-1], len(self._wavefronts) - 1
+        signals = self.scanner.iq(self.probe, plane, before, *reference)
+        with atomic_write(self.out / f"{name}-iq.{suffix}") as partial:
+            save_iq(signals, partial, suffix)
 
     def with_doppler(
         self, images: dict[str, np.ndarray], mode: DopplerMode, clamped: bool = False

@@ -165,6 +165,7 @@ def _add_hard(values: np.ndarray, tissue: str, where: np.ndarray) -> None:
     level = 10 ** ((table["backscatter_db"] + CORTEX_DB) / 20)
     for channel, value in enumerate((table["impedance_mrayl"], table["attenuation_db_cm_mhz"], level)):
         values[..., channel] += share * (np.float32(value) - values[..., channel])
+    values[..., ANISOTROPY] *= 1 - share
 
 
 def _by_hounsfield(hu: np.ndarray) -> np.ndarray:

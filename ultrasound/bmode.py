@@ -60,6 +60,21 @@ class Wavefront:
         direction = world_from_plane[:3, :2] @ [np.sin(steering), np.cos(steering)]
         return cls(apex[:3], direction, probe.radius_mm, probe.sector is None)
 
+    def angle_deg(self, probe: Probe, world_from_plane: np.ndarray) -> float:
+        """Return the largest angle between it and the scanlines of a pose, halfway down: a phase that turns along them would be another
+        frequency.
+        """
+        start, direction = probe.scanlines()
+        place = (start + probe.depth_mm / 2 * direction) @ world_from_plane[:3, :2].T + world_from_plane[
+            :3, 3
+        ]
+        along = direction @ world_from_plane[:3, :2].T
+        normal = place - self.apex
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        if self.is_flat:
+            normal = np.broadcast_to(self.direction, along.shape)
+        return float(np.degrees(np.arccos(np.clip((normal * along).sum(axis=1), -1, 1)).max()))
+
 
 @ti.data_oriented
 class BMode:
@@ -161,7 +176,10 @@ class BMode:
             away = (rest - apex).dot(direction)
             if ti.static(not is_flat):
                 away = (rest - apex).norm() - radius_mm
-            phase = -turn * ((i + 0.5) * sample_mm - away)
+            depth = tm.mix(self.sound.depth[line, k], self.sound.depth[line, k + 1], at - k)
+            # Where sound is slower, the same distance is a longer time.
+            slower = (i + 0.5) * sample_mm / ti.max(depth, 1e-6)
+            phase = -turn * slower * (depth - away)
             real, imaginary = self.real[line, i], self.imaginary[line, i]
             self.real[line, i] = real * ti.cos(phase) - imaginary * ti.sin(phase)
             self.imaginary[line, i] = real * ti.sin(phase) + imaginary * ti.cos(phase)
@@ -342,7 +360,8 @@ class BMode:
     def add_pulse(self, line, at, sd, amplitude):
         """Add an echo at a fractional sample, of a length in samples."""
         reach = ti.ceil(3.5 * sd, ti.i32)
-        for i in range(ti.floor(at, ti.i32) - reach, ti.min(ti.floor(at, ti.i32) + reach + 2, self.samples)):
+        first = ti.max(ti.floor(at, ti.i32) - reach, 0)
+        for i in range(first, ti.min(ti.floor(at, ti.i32) + reach + 2, self.samples)):
             off = (i - at) / sd
             self.real[line, i] = self.real[line, i] + amplitude * ti.exp(-0.5 * off * off)
 

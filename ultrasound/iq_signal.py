@@ -4,6 +4,7 @@ Names and axes as in USTB and MUST: depth along the columns, one column for each
 """
 
 from dataclasses import asdict, dataclass
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from ultrasound.probe import Probe
 from ultrasound.probe_manipulator import ImagePlane
 from ultrasound.pulse import SOUND_MM_US
 
+MAT_HEADER, MAT_HEADER_BYTES = b"MATLAB 5.0 MAT-file, simulated by Nephron", 116
 # Samples of RF per period.
 RF_PER_PERIOD = 4
 
@@ -46,10 +48,17 @@ class IQSignal:
     """Shape (samples, scanlines, 3)."""
     probe_to_patient: np.ndarray
     """Shape (4, 4), LPS [mm]."""
+    phase_reference: int
+    """Images with the same number have phases that can be compared."""
 
 
 def iq_signal(
-    iq: np.ndarray, rest_mm: np.ndarray, probe: Probe, plane: ImagePlane, before: ImagePlane | None
+    iq: np.ndarray,
+    rest_mm: np.ndarray,
+    probe: Probe,
+    plane: ImagePlane,
+    before: ImagePlane | None,
+    phase_reference: int = 0,
 ) -> IQSignal:
     """Return the signals of IQ (scanlines, samples) of tissue at rest positions (scanlines, samples, 3) [mm]."""
     iq, rest_mm = iq.T.astype(np.complex64), np.swapaxes(rest_mm, 0, 1)
@@ -69,6 +78,7 @@ def iq_signal(
         rest_mm=rest_mm.astype(np.float32),
         motion_mm=motion.astype(np.float32),
         probe_to_patient=np.asarray(plane.world_from_plane, float),
+        phase_reference=phase_reference,
     )
 
 
@@ -89,10 +99,15 @@ def _on(plane: ImagePlane, places_mm: np.ndarray) -> np.ndarray:
     return places_mm @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def save_iq(signals: IQSignal, path: Path) -> None:
-    """Write signals as NumPy's .npz or MATLAB's .mat, by the suffix. Raises OSError."""
+def save_iq(signals: IQSignal, path: Path, suffix: str) -> None:
+    """Write signals in the format of NumPy ("npz") or MATLAB ("mat"). Raises OSError."""
     arrays = asdict(signals)
-    if path.suffix == ".mat":
-        io.savemat(path, arrays, do_compression=True)
+    content = BytesIO()
+    if suffix == "mat":
+        io.savemat(content, arrays, do_compression=True)
+        # SciPy writes the date and the operating system.
+        content.seek(0)
+        content.write(MAT_HEADER.ljust(MAT_HEADER_BYTES))
     else:
-        np.savez_compressed(path, **arrays)
+        np.savez_compressed(content, **arrays)
+    path.write_bytes(content.getvalue())

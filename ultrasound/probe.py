@@ -74,7 +74,7 @@ class Probe(BaseModel):
     radius_start_mm: float = Field(0.0, ge=0, le=300)
     theta_start_deg: float = Field(0.0, ge=-80, le=0)
     theta_stop_deg: float = Field(0.0, ge=0, le=80)
-    number_of_scanlines: int = Field(192, ge=8, le=1024)
+    number_of_scanlines: int = Field(192, ge=32, le=1024)
     number_of_samples_per_scanline: int = Field(640, ge=32, le=4096, multiple_of=16)
     frequency_range_mhz: tuple[float, float] = (2.0, 15.0)
     frequency_mhz: float = Field(7.5, ge=1, le=40)
@@ -95,7 +95,7 @@ class Probe(BaseModel):
     compound_angles: Literal[1, 3, 5] = 1
     harmonics: bool = False
     velocity_scale_cm_s: float = Field(25.0, ge=2, le=200)
-    wall_filter_cm_s: float = Field(1.5, gt=0, le=50)
+    wall_filter_cm_s: float = Field(1.5, ge=0.2, le=20)
     colour_gain_percent: Percent = 50.0
     colour_steering_deg: float = Field(0.0, ge=-30, le=30)
     time_gain_compensation: tuple[Percent, ...] = Field(
@@ -184,9 +184,12 @@ class Probe(BaseModel):
 
     @property
     def compound_angles_deg(self) -> list[float]:
-        """Steering angles of the images that spatial compounding averages, that of no steering first."""
+        """Steering angles of the images that spatial compounding averages, the probe's own first."""
         half = COMPOUND_RANGE_DEG / 2 if self.compound_angles > 1 else 0.0
-        return sorted((self.steering_deg + np.linspace(-half, half, self.compound_angles)).tolist(), key=abs)
+        return sorted(
+            (self.steering_deg + np.linspace(-half, half, self.compound_angles)).tolist(),
+            key=lambda angle: abs(angle - self.steering_deg),
+        )
 
     @property
     def velocity_limit_cm_s(self) -> float:

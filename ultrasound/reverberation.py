@@ -57,7 +57,7 @@ class Reverberation:
                 if behind < GAS_MRAYL:
                     gas = k
                     self.add_behind_gas(line, k, ti.max(ti.cast(echo.w, ti.i32), 1), count, step_mm)
-                elif behind > METAL_MRAYL:
+                elif behind > METAL_MRAYL and self.before(line, k) < METAL_MRAYL:
                     self.add_comet_tail(line, k, count, step_mm)
 
     @ti.func
@@ -93,6 +93,11 @@ class Reverberation:
         return ti.select(((mixed >> 8) & 0xFFFF) < BUBBLE_SHARE * 65536, 1.0, 0.0)
 
     @ti.func
+    def before(self, line, k):
+        """Return the impedance [MRayl] in front of the interface whose echo is at a sample."""
+        return self.sound.tissue[line, ti.cast(self.sound.echo[line, k].w, ti.i32)].x
+
+    @ti.func
     def add_comet_tail(self, line, metal, count, step_mm):
         """Add the echoes within metal: at each of its faces a part of the sound leaves it."""
         echo, impedance = self.sound.echo[line, metal], self.sound.tissue[line, metal].x
@@ -101,7 +106,7 @@ class Reverberation:
             inside += 1
         ratio = speed_ratio(impedance)
         thickness = ti.max(inside * step_mm * ratio, LEAST_METAL_MM)
-        before = self.sound.tissue[line, ti.cast(echo.w, ti.i32)].x
+        before = self.before(line, metal)
         reflection = (impedance - before) / (impedance + before)
         fall_db_mm = -2.0 * DB_OF_NEPER * ti.log(reflection) / (thickness / ratio)
         front = ti.max(metal - 1, 0)

@@ -98,6 +98,7 @@ class Scanner:
         self._steered: dict[float, BMode] = {}
         # The last B-mode image, for persistence.
         self._last: np.ndarray | None = None
+        self._last_settings: dict[str, object] = {}
 
     @cached_property
     def ct(self) -> SampledVolume:
@@ -137,13 +138,19 @@ class Scanner:
         around = self.contact, self.contact_gap_mm, self.around
         return Propagation(self.tissue, self.organ, self.plane, self.probe, voxel_mm, *around)
 
-    def iq(self, probe: Probe, plane: ImagePlane, before: ImagePlane | None, first: ImagePlane) -> IQSignal:
+    def iq(
+        self,
+        probe: Probe,
+        plane: ImagePlane,
+        before: ImagePlane | None,
+        wavefront: Wavefront,
+        phase_reference: int,
+    ) -> IQSignal:
         """Return IQ and RF signals of the B-mode image of a plane that was made last, in tissue that has not moved.
 
-        ``before`` is the plane of the image before, ``first`` that of the first image, by which phases are compared.
+        ``before`` is the plane of the image before, ``wavefront`` the reference of phases, with its number.
         """
-        wavefront = Wavefront.of(probe, np.asarray(first.world_from_plane, float))
-        return iq_signal(*self.bmode.iq_of_last(probe, wavefront), probe, plane, before)
+        return iq_signal(*self.bmode.iq_of_last(probe, wavefront), probe, plane, before, phase_reference)
 
     def doppler(
         self, probe: Probe, grey: np.ndarray, mode: DopplerMode, time_s: float = 0.0, clamped: bool = False
@@ -185,6 +192,8 @@ class Scanner:
         image in the next.
         """
         self.locate(plane, shape)
+        if mode == "ct":
+            self._last = None
         render = {
             CT: lambda: self.ct_slice(window_hu, level_hu),
             B_MODE: lambda: self.b_mode_image(probe, detail_level, persistence),
@@ -195,10 +204,13 @@ class Scanner:
         """Return the B-mode image (rows, columns) uint8 of the plane located last, with compounding and persistence."""
         image = self._compounded(probe, detail_level)
         if persistence == 0.0:
-            self._last = None
+            # An image of another shape is one that is saved beside those that are shown.
+            if self._last is not None and self._last.shape == image.shape:
+                self._last = None
             return image
-        if self._last is None or self._last.shape != image.shape:
-            self._last = image.astype(np.float32)
+        settings = probe.model_dump()
+        if self._last is None or self._last.shape != image.shape or self._last_settings != settings:
+            self._last, self._last_settings = image.astype(np.float32), settings
         self._last += (1 - persistence) * (image - self._last)
         return np.rint(self._last).astype(np.uint8)
 

@@ -45,7 +45,7 @@ class ScanOptions(ImageOptions, ArchOptions):
     doppler: Literal["off", "colour", "power"] = "off"
     """Write each B-mode image with colour or power Doppler too, at the peak of systole."""
     clamped: bool = False
-    """With --doppler: the renal hilum is clamped, and no blood flows."""
+    """With --doppler: the renal hilum is clamped, and no blood flows in the kidney."""
     iq: Literal["npz", "mat"] | None = None
     """Write IQ and RF signals of each B-mode image too, before gain, for NumPy or MATLAB, with the motion of the tissue."""
     sweep: bool = False
@@ -78,6 +78,13 @@ def scan(asked: ScanOptions) -> None:
         )
     if asked.iq is not None and settings.detail_level == "reflection":
         raise CommandError("--iq: the detail level reflection has no phase; choose speckle or elevation")
+    if asked.clamped and asked.doppler == "off":
+        raise CommandError("--clamped: changes only Doppler; add --doppler colour or power, or leave it out")
+    if asked.iq is not None and scan_probe.compound_angles > 1:
+        raise CommandError(
+            f"--iq: CompoundAngles = {scan_probe.compound_angles} of the probe averages images, which have no one signal; "
+            "choose a probe with 1"
+        )
     used = start_taichi(asked.arch)
     from rehearsal.pose_scans import PoseScans
 
@@ -97,6 +104,8 @@ def scan(asked: ScanOptions) -> None:
         detail_level=settings.detail_level,
         contact=asked.contact,
         contact_gap_mm=settings.contact_gap_mm,
+        doppler=asked.doppler,
+        clamped=asked.clamped,
         arch=used,
         pictures=scans.rows,
     )

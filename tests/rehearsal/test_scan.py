@@ -201,6 +201,7 @@ def test_scan_leaves_a_picture_of_each_pose_and_mode(tmp_path, capsys):
     [
         (["--picture", "ct", "--doppler", "colour"], "made from a B-mode image"),
         (["--picture", "ct", "--iq", "mat"], "made from a B-mode image"),
+        (["--clamped"], "changes only Doppler"),
         (["--detail-level", "reflection", "--iq", "npz"], "choose speckle or elevation"),
     ],
 )

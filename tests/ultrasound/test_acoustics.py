@@ -173,6 +173,13 @@ def test_only_parenchyma_is_anisotropic():
     assert (properties(hu)[..., ANISOTROPY] == 0).all()
 
 
+def test_a_stone_in_a_kidney_is_not_anisotropic():
+    hu, labels = labelled()
+    hu[block(4)] = 900.0
+    values = properties(hu, labels, {1: "kidney"})
+    assert values[12, 12, 12, ANISOTROPY] < 0.1 and values[7, 7, 7, ANISOTROPY] > 1.5
+
+
 def test_what_is_brighter_than_bone_is_metal():
     hu = np.full(SHAPE, 55.0, np.float32)
     hu[block(2)] = 3000.0

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 import taichi as ti
+from conftest import rotation_about
 from scipy import io, signal
-from test_bmode import BOUNDLESS, Tank, probe_of
+from test_bmode import BOUNDLESS, Tank, probe_of, speed_ratio
 
 from sim.device import start
 from ultrasound.bmode import Wavefront
@@ -48,6 +49,34 @@ def test_motion_along_the_beam_turns_the_phase_by_two_wavenumbers(tank, geometry
     assert found == pytest.approx(2 * 2 * np.pi / probe.wavelength_mm * towards_mm, rel=0.05)
 
 
+@pytest.mark.parametrize("impedance", [1.38, 1.62])
+def test_tissue_that_slows_sound_turns_the_phase_further_and_keeps_the_frequency(tank, impedance):
+    probe = probe_of(**SETTINGS)
+    tank.fill(impedance, 0.0, 0.1)
+    before, _ = look(tank, probe, (0, 0, 0))
+    after, _ = look(tank, probe, (0, 0.004, 0))
+    tank.fill(1.5804, 0.0, 0.1)
+    middle = slice(90, 102), slice(60, 600)
+    found = np.angle((after * before.conj())[middle].sum())
+    assert found == pytest.approx(4 * np.pi / probe.wavelength_mm * 0.004 / speed_ratio(impedance), rel=0.05)
+    # Phase from sample to sample: at the centre frequency, none.
+    step = np.angle((before[middle][:, 1:] * before[middle][:, :-1].conj()).sum())
+    assert abs(step) * 1.54 / (4 * np.pi * probe.sample_mm) < 0.01 * probe.frequency_mhz
+
+
+@pytest.mark.parametrize("geometry", ["LINEAR", "CURVILINEAR"])
+def test_the_angle_to_a_wavefront_is_that_of_the_turn_or_of_the_way_around_the_apex(geometry):
+    probe = probe_of(geometry, depth_mm=40.0)
+    first = np.asarray(plane_at(probe, (0, 0, 0)).world_from_plane, float)
+    wavefront = Wavefront.of(probe, first)
+    assert wavefront.angle_deg(probe, first) < 1e-3
+    turned = first.copy()
+    turned[:3, :3] = rotation_about([0, 0, 1], 4.0) @ first[:3, :3]
+    found = wavefront.angle_deg(probe, turned)
+    # Turned about the middle of the face, 20 mm above the middle of the image and, of a curved array, 60 mm below the apex.
+    assert found == pytest.approx(4.0 if geometry == "LINEAR" else 4.0 * 60 / 80, rel=0.05)
+
+
 def test_the_signal_is_that_of_the_image(tank):
     probe = probe_of(**SETTINGS)
     decibel = tank.look(probe, "speckle")
@@ -81,7 +110,9 @@ def test_files_have_the_sampling_and_the_motion_of_the_tissue(tank, tmp_path, su
     iq, rest = look(tank, probe, (1.0, 0.0, 0.25))
     planes = plane_at(probe, (1.0, 0.0, 0.25)), plane_at(probe, (0, 0, 0))
     written = iq_signal(iq, rest, probe, *planes)
-    save_iq(written, tmp_path / f"a.{suffix}")
+    save_iq(written, tmp_path / f"a.{suffix}", suffix)
+    # No date, and no name of the machine.
+    assert suffix == "npz" or b"reated on" not in (tmp_path / "a.mat").read_bytes()[:128]
     found = np.load(tmp_path / "a.npz") if suffix == "npz" else io.loadmat(tmp_path / "a.mat")
     assert found["iq"].shape == (640, 192) and np.iscomplexobj(found["iq"]) and (found["iq"] == iq.T).all()
     assert float(np.squeeze(found["iq_sampling_mhz"])) == pytest.approx(1.54 / 2 / (20 / 640))

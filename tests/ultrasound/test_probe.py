@@ -167,6 +167,12 @@ def test_beam_coordinates_invert_steered_scanlines_of_a_curved_array():
     assert depth == pytest.approx(np.tile([1.0, 40.0, 79.0], (LINES, 1)), abs=1e-6)
 
 
+def test_angles_of_compounding_are_around_that_of_the_probe_which_is_the_first():
+    assert probe_of(compound_angles=3).compound_angles_deg == [0.0, -12.0, 12.0]
+    assert probe_of(compound_angles=3, steering_deg=10.0).compound_angles_deg == [10.0, -2.0, 22.0]
+    assert probe_of(steering_deg=10.0).compound_angles_deg == [10.0]
+
+
 @pytest.mark.parametrize(
     "geometry, settings, meant",
     [
