@@ -65,8 +65,8 @@ class Doppler:
     """Doppler images of the plane of a B-mode image, along the scanlines of ``sound``: its own or, where they are steered, others.
 
     ``flow`` (.., 5) has velocity [m/s] along the rest axes at the peak of systole, resistive index and amplitude of blood
-    (``blood_flow.blood_flow``). ``moment`` (scanlines, samples) has, at the tissue samples, real and
-    imaginary part of the autocorrelation, and the energy.
+    (``blood_flow.blood_flow``). ``moment`` (scanlines, samples) has, at the tissue samples, real and imaginary part of the
+    autocorrelation, and the energy; ``mean`` is that of the sample volume, with noise.
     """
 
     def __init__(self, sound: Propagation, bmode: BMode, flow: SampledVolume) -> None:
@@ -86,7 +86,8 @@ class Doppler:
     ) -> np.ndarray:
         """Return an image (rows, columns, 3) uint8: a B-mode image ``grey`` of the plane, with Doppler over it.
 
-        The B-mode image must have been rendered last for the same probe. ``time_s`` is that of the heart; blood of a clamped kidney rests, and beyond the clamp it flows on.
+        The B-mode image must have been rendered last for the same probe. ``time_s`` is that of the heart. Blood of a clamped kidney rests;
+        beyond the clamp it flows on.
         """
         self.estimate(probe, time_s, clamped)
         power = mode == "power"
@@ -252,5 +253,5 @@ def doppler_shift_khz(probe: Probe, velocity_cm_s: float) -> float:
 @ti.func
 def passed_by_wall_filter(share):
     """Energy that the wall filter lets pass of a velocity, in units of its limit: a Butterworth high-pass of fourth order."""
-    fourth = share**8
-    return fourth / (1.0 + fourth)
+    eighth = share**8
+    return eighth / (1.0 + eighth)
