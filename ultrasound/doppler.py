@@ -97,7 +97,7 @@ class Doppler:
         threshold = noise_energy(probe) * 10 ** (threshold_db / 10)
         image = np.empty((*grey.shape, 3), np.uint8)
         least_share = probe.wall_filter_cm_s / probe.velocity_limit_cm_s
-        self._paint(power, self.sound.stride_of(probe), threshold, least_share, grey, image)
+        self._paint(power, 1 / self.sound.stride_of(probe), threshold, least_share, grey, image)
         return image
 
     def estimate(self, probe: Probe, time_s: float = 0.0, clamped: bool = False) -> None:
@@ -209,25 +209,29 @@ class Doppler:
     def _paint(
         self,
         power: ti.template(),
-        stride: int,
+        per_stride: float,
         threshold: float,
         least_share: float,
         grey: ti.types.ndarray(ti.u8, ndim=2),
         image: ti.types.ndarray(ti.u8, ndim=3),
     ):
-        for row, column in ti.ndrange(grey.shape[0], grey.shape[1]):
+        for row, column in self.source:
+            # A range known only now would cost a division for each pixel.
+            if row >= grey.shape[0] or column >= grey.shape[1]:
+                continue
             colour = tm.vec3(ti.cast(grey[row, column], ti.f32))
             at = self.source[row, column]
             if at.x >= -0.5 and colour.x < PRIORITY * 255.0:
-                mean = self.mean_at(at.x, (at.y + 0.5) / stride)
-                share = ti.atan2(mean.y, mean.x) / tm.pi
-                if mean.z > threshold and ti.abs(share) > least_share:
-                    scale = ti.cast(share < 0.0, ti.i32)
-                    if ti.static(power):
-                        above_db = 0.5 * DB_OF_NEPER * ti.log(mean.z / threshold)
-                        share, scale = above_db / POWER_RANGE_DB, 0
-                    step = ti.round(tm.clamp(ti.abs(share), 0.0, 1.0) * STEPS, ti.i32)
-                    colour = self.colour[scale, step]
+                mean = self.mean_at(at.x, (at.y + 0.5) * per_stride)
+                if mean.z > threshold:
+                    share = ti.atan2(mean.y, mean.x) / tm.pi
+                    if ti.abs(share) > least_share:
+                        scale = ti.cast(share < 0.0, ti.i32)
+                        if ti.static(power):
+                            above_db = 0.5 * DB_OF_NEPER * ti.log(mean.z / threshold)
+                            share, scale = above_db / POWER_RANGE_DB, 0
+                        step = ti.round(tm.clamp(ti.abs(share), 0.0, 1.0) * STEPS, ti.i32)
+                        colour = self.colour[scale, step]
             for k in ti.static(range(3)):
                 image[row, column, k] = ti.cast(colour[k] + 0.5, ti.u8)
 
