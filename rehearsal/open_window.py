@@ -29,7 +29,6 @@ def initial_settings(rehearsal: Rehearsal) -> Settings:
         dyn_range_db=round(probe.dyn_range_db),
         frequency_mhz=probe.frequency_mhz,
         focus_percent=round(probe.focus_depth_percent),
-        persistence_percent=0,
         compounding=probe.compound_angles > 1,
         harmonics=probe.harmonics,
         dark_map=probe.grey_map == "dark",

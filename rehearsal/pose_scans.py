@@ -60,7 +60,7 @@ class PoseScans:
         if self._sweep is not None:
             self._sweep.close()
 
-    def images(self, name: str, pose: np.ndarray) -> dict[str, np.ndarray]:
+    def images(self, pose: np.ndarray) -> dict[str, np.ndarray]:
         """Return the images of a pose (4, 4) by their names."""
         began = perf_counter()
         self._planes.append(ImagePlane(pose, *self.probe.extent_mm))

@@ -92,7 +92,7 @@ def scan(asked: ScanOptions) -> None:
     scans = PoseScans(anatomy, anatomy.ct, scan_probe, settings, asked.contact, out)
     with scans.recording(asked.sweep):
         for name, pose in tqdm(pose_by_name.items(), desc="scan", unit="pose"):
-            images = scans.images(name, pose)
+            images = scans.images(pose)
             if asked.iq is not None:
                 scans.save_iq(name, asked.iq)
             if asked.doppler != "off":

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -196,6 +197,13 @@ def test_scan_leaves_a_picture_of_each_pose_and_mode(tmp_path, capsys):
     assert signals["off"]["motion_mm"][..., 1] == pytest.approx(30.0, abs=1e-3)
 
 
+def scan_of_one_pose(folder: Path, pose: np.ndarray, *options: str) -> int:
+    """Exit code of ``scan`` of the embedded patient, into a folder."""
+    poses = folder / "poses.json"
+    poses.write_text(json.dumps([dict(probe_to_patient=pose.tolist())]))
+    return app.main(["scan", str(EMBEDDED), "--pose", str(poses), "--out", str(folder), *options])
+
+
 @pytest.mark.parametrize(
     "options, meant",
     [
@@ -206,19 +214,9 @@ def test_scan_leaves_a_picture_of_each_pose_and_mode(tmp_path, capsys):
     ],
 )
 def test_what_needs_a_b_mode_image_is_refused_without_one(tmp_path, capsys, options, meant):
-    (tmp_path / "poses.json").write_text(json.dumps([dict(probe_to_patient=pose_on_tumour().tolist())]))
-    command = [
-        "scan",
-        str(EMBEDDED),
-        "--pose",
-        str(tmp_path / "poses.json"),
-        "--out",
-        str(tmp_path),
-        *options,
-    ]
-    assert app.main(command) == 2
-    told = capsys.readouterr().err
-    assert meant in told and len(told.strip().splitlines()) == 1
+    assert scan_of_one_pose(tmp_path, pose_on_tumour(), *options) == 2
+    message = capsys.readouterr().err
+    assert meant in message and len(message.strip().splitlines()) == 1
 
 
 def test_poses_deep_inside_the_organ_are_counted(capsys):
@@ -237,18 +235,7 @@ def test_poses_deep_inside_the_organ_are_counted(capsys):
 def test_an_unknown_probe_is_named_with_those_that_are_known_and_poses_that_are_too_deep(tmp_path, capsys):
     deep = np.eye(4)
     deep[:3, 3] = [69.7, 26.8, -341.1]
-    (tmp_path / "poses.json").write_text(json.dumps([dict(probe_to_patient=deep.tolist())]))
-    command = [
-        "scan",
-        str(EMBEDDED),
-        "--pose",
-        str(tmp_path / "poses.json"),
-        "--out",
-        str(tmp_path),
-        "--probe",
-        "x.toml",
-    ]
-    assert app.main(command) == 2
+    assert scan_of_one_pose(tmp_path, deep, "--probe", "x.toml") == 2
     told = capsys.readouterr()
     assert "known by name are curvilinear, drop-in, linear, phased" in told.err and "1 of 1 poses" in told.out
 

@@ -83,8 +83,7 @@ def test_a_label_wins_over_hu_away_from_borders(tissue):
     hu, labels = labelled()
     by_hu = properties(hu)
     values = properties(hu, labels, {1: tissue, 2: "bone"})
-    # Smoothing reaches two voxels, and a tumour's pseudocapsule is one thick; what a tumour's or a kidney's HU tell of its parts is
-    # not told by even ones.
+    # Smoothing reaches two voxels, and a tumour's pseudocapsule is one thick. Even HU show no parts of a tumour or a kidney.
     core = values[block(10)][..., :2]
     assert core == pytest.approx(np.broadcast_to(expected(tissue), core.shape), rel=1e-6)
     away = np.ones(SHAPE, bool)
